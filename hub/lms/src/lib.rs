@@ -1,3 +1,27 @@
-//! Bytes to telegrams and back, and the conversation with a SICK LMS 2xx. No I/O, no clock, no heap.
+//! Bytes to telegrams and back, and the conversation with a SICK LMS 2xx laser scanner.
+//!
+//! Sans-I/O: this crate has no port, no clock, no thread and no heap. Time comes in as an argument ([`Nanos`]),
+//! deadlines go out as return values. The wire never yields an error: what is not a telegram becomes a bigger counter.
+//! Both directions are here, because the simulator is the protocol's second user.
 #![no_std]
 #![forbid(unsafe_code)]
+
+pub mod command;
+pub mod crc;
+pub mod measured;
+pub mod reply;
+pub mod telegram;
+pub mod variant;
+
+/// A point in time or a span, in nanoseconds of one monotonic clock that the caller chooses.
+pub type Nanos = u64;
+
+/// One millisecond in [`Nanos`].
+pub const MILLIS: Nanos = 1_000_000;
+/// One microsecond in [`Nanos`].
+pub const MICROS: Nanos = 1_000;
+
+/// Time of `bytes` bytes on a line of `baud` bits per second: 8N1 is 10 bits a byte (Telegram listing 4).
+pub const fn line_time(bytes: usize, baud: u32) -> Nanos {
+    bytes as u64 * 10 * 1_000_000_000 / baud as u64
+}
