@@ -8,6 +8,8 @@
 
 pub mod command;
 pub mod crc;
+pub mod framer;
+pub mod header;
 pub mod measured;
 pub mod reply;
 pub mod telegram;
