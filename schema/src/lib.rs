@@ -1,5 +1,30 @@
-//! The words everyone speaks: what the hub publishes, and the names under which it does. Knows nobody.
+//! The words everyone speaks: what the hub publishes, and the names under which it does. Knows nobody: no serial line,
+//! no configuration, no verb. Without feature `ipc` it is plain bytes and names, enough for a receiver on the LAN.
 
+mod domain;
 mod failure;
+mod header;
+mod scan;
+mod status;
+mod telegram;
+mod text;
+mod topic;
 
+#[cfg(feature = "ipc")]
+mod access;
+#[cfg(feature = "ipc")]
+pub mod ipc;
+pub mod limits;
+#[cfg(feature = "ipc")]
+mod lock;
+
+pub use domain::{DEFAULT_DOMAIN, Domain, Environment};
 pub use failure::{Failure, Kind};
+pub use header::{Flags, Header, Quality};
+pub use scan::{BEAMS, CONTENTS_UPPER, Code, Scan, TURN_NS};
+pub use status::{COUNTERS, Counter, Counters, State, Status};
+pub use telegram::Telegram;
+pub use topic::{Topic, WAKE, Wake, check_sensor, of_service};
+
+#[cfg(feature = "ipc")]
+pub use lock::{HubLock, holder};

@@ -6,12 +6,23 @@
 #![no_std]
 #![forbid(unsafe_code)]
 
+mod arrival;
 pub mod command;
 pub mod crc;
+mod dialogue;
+pub mod framer;
+pub mod header;
 pub mod measured;
+mod outgoing;
 pub mod reply;
+mod sensor;
+pub mod session;
 pub mod telegram;
 pub mod variant;
+
+pub use dialogue::{Reason, Settings};
+pub use sensor::{Sensor, State, Trouble};
+pub use session::Session;
 
 /// A point in time or a span, in nanoseconds of one monotonic clock that the caller chooses.
 pub type Nanos = u64;

@@ -35,6 +35,12 @@ impl<'a> Telegram<'a> {
         (whole && crc(covered) == u16::from_le_bytes([crc_low, crc_high])).then_some(Telegram(bytes))
     }
 
+    /// The telegram in bytes that [`Telegram::check`] has seen before.
+    pub(crate) fn checked(bytes: &'a [u8]) -> Self {
+        debug_assert!(Telegram::check(bytes).is_some());
+        Telegram(bytes)
+    }
+
     /// All bytes, STX to checksum.
     pub fn bytes(&self) -> &'a [u8] {
         self.0

@@ -1,0 +1,165 @@
+//! When a byte arrived, and when to look at the line again. The port only tells when a read returned and how many
+//! bytes it brought; this file turns that into a stamp for any byte, and learns how long a telegram takes, so that
+//! the host can sleep through it.
+
+use crate::{MICROS, MILLIS, Nanos, line_time};
+
+/// Reads, newest last, by the number of the byte after their last one.
+#[derive(Clone, Debug)]
+pub(crate) struct Arrivals {
+    reads: [Read; Arrivals::CAPACITY],
+    next: usize,
+    total: u64,
+}
+
+#[derive(Clone, Copy, Debug, Default)]
+struct Read {
+    end: u64,
+    now: Nanos,
+}
+
+/// A stamp, and whether more than the pace of a UART stands between it and the truth.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) struct Stamp {
+    pub(crate) at: Nanos,
+    pub(crate) estimated: bool,
+}
+
+impl Arrivals {
+    /// A telegram in pieces of 16 bytes, twice.
+    const CAPACITY: usize = 128;
+
+    pub(crate) fn new() -> Self {
+        Arrivals { reads: [Read::default(); Arrivals::CAPACITY], next: 0, total: 0 }
+    }
+
+    pub(crate) fn note(&mut self, now: Nanos, len: usize) {
+        self.total += len as u64;
+        self.reads[self.next % Arrivals::CAPACITY] = Read { end: self.total, now };
+        self.next += 1;
+    }
+
+    /// When byte number `offset` arrived at the latest: the bytes that came behind it in the same read took their
+    /// time on the line.
+    pub(crate) fn stamp(&self, offset: u64, baud: u32) -> Stamp {
+        let oldest = self.next.saturating_sub(Arrivals::CAPACITY);
+        let mut found = Read { end: offset + 1, now: 0 };
+        for n in (oldest..self.next).rev() {
+            let read = self.reads[n % Arrivals::CAPACITY];
+            if read.end <= offset {
+                break;
+            }
+            found = read;
+        }
+        let behind = (found.end - offset - 1) as usize;
+        let at = found.now.saturating_sub(line_time(behind, baud));
+        Stamp { at, estimated: behind > ESTIMATED }
+    }
+}
+
+/// How a telegram of the stream comes in, learned from those that came.
+#[derive(Clone, Copy, Debug, Default)]
+pub(crate) struct Rhythm {
+    learned: u32,
+    duration: Nanos,
+    /// First byte of the telegram that is coming.
+    first: Option<Nanos>,
+    /// The host slept through this telegram.
+    rested: bool,
+}
+
+impl Rhythm {
+    /// The first byte of a telegram arrived.
+    pub(crate) fn begin(&mut self, first: Nanos) {
+        if self.first.is_none() {
+            self.first = Some(first);
+            self.rested = false;
+        }
+    }
+
+    /// Until when nothing can be complete; answered once per telegram.
+    pub(crate) fn rest(&mut self, now: Nanos) -> Option<Nanos> {
+        let until = self.first? + self.duration.checked_sub(LEAD)?;
+        (self.learned >= LESSONS && !self.rested && until > now + MIN_REST).then(|| {
+            self.rested = true;
+            until
+        })
+    }
+
+    /// A telegram is complete; `at_once` says that the first look after the rest found all of it.
+    pub(crate) fn complete(&mut self, first: Nanos, last: Nanos, at_once: bool) {
+        let took = last.saturating_sub(first);
+        self.first = None;
+        if self.learned < LESSONS {
+            self.duration = if self.learned == 0 { took } else { self.duration.min(took) };
+            self.learned += 1;
+        } else if self.rested && at_once {
+            // Too late by an unknown amount: creep forward until the end is seen to come.
+            self.duration = self.duration.saturating_sub(CREEP);
+        } else if took < self.duration + SLOW {
+            self.duration = (7 * self.duration + took) / 8;
+        }
+    }
+
+    /// What was coming is not known any more.
+    pub(crate) fn lose(&mut self) {
+        self.first = None;
+    }
+
+    /// Whether `took` is longer than usual by more than noise.
+    pub(crate) fn is_slow(&self, took: Nanos) -> bool {
+        self.learned >= LESSONS && took > self.duration + SLOW
+    }
+}
+
+/// More bytes than so behind a stamped one in the same read make the stamp an estimate: an adapter's chunk of 62.
+const ESTIMATED: usize = 64;
+/// The host looks again so long before the expected end: a chunk or two of 16 bytes.
+const LEAD: Nanos = 600 * MICROS;
+/// A shorter rest is not worth a system call.
+const MIN_REST: Nanos = 500 * MICROS;
+/// Telegrams that are read as they come before the first rest.
+const LESSONS: u32 = 3;
+/// Step towards an end that was slept through.
+const CREEP: Nanos = 100 * MICROS;
+/// A telegram that takes so much longer than usual is suspect (framing: quality, reason 4).
+const SLOW: Nanos = 8 * MILLIS;
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_stamp_knows_what_came_behind_it() {
+        let mut arrivals = Arrivals::new();
+        arrivals.note(1_000_000, 16);
+        arrivals.note(11_000_000, 484);
+        assert_eq!(arrivals.stamp(0, 500_000), Stamp { at: 1_000_000 - 15 * 20_000, estimated: false });
+        assert_eq!(arrivals.stamp(499, 500_000), Stamp { at: 11_000_000, estimated: false });
+        assert_eq!(arrivals.stamp(16, 500_000), Stamp { at: 11_000_000 - 483 * 20_000, estimated: true });
+        for _ in 0..200 {
+            arrivals.note(20_000_000, 1);
+        }
+        // Older than what is remembered: the oldest remembered read.
+        assert!(arrivals.stamp(0, 500_000).estimated);
+    }
+
+    #[test]
+    fn after_three_lessons_the_host_may_rest() {
+        let mut rhythm = Rhythm::default();
+        for n in 0..3 {
+            let first = n * 26_640_000;
+            rhythm.begin(first);
+            assert_eq!(rhythm.rest(first), None);
+            rhythm.complete(first, first + 18_000_000, false);
+        }
+        rhythm.begin(100_000_000);
+        assert_eq!(rhythm.rest(100_000_000), Some(117_400_000));
+        assert_eq!(rhythm.rest(117_400_000), None, "once per telegram");
+        // It was all there already: look a little earlier next time.
+        rhythm.complete(100_000_000, 118_500_000, true);
+        rhythm.begin(200_000_000);
+        assert_eq!(rhythm.rest(200_000_000), Some(217_300_000));
+        assert!(rhythm.is_slow(26_000_000) && !rhythm.is_slow(25_000_000));
+    }
+}

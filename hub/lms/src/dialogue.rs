@@ -1,0 +1,360 @@
+//! What to say to the sensor next: from a line of unknown rate to a stream, and back when the stream ends. Knows
+//! telegrams and deadlines, no bytes and no port. It never says anything that outlives a power cycle.
+
+use crate::command::Request;
+use crate::header::{Expect, StreamHeader};
+use crate::measured::Measured;
+use crate::outgoing::{NAK_PAUSE, Outgoing};
+use crate::reply::Reply;
+use crate::sensor::{Sensor, State, Trouble};
+use crate::telegram::{REPLY, Telegram};
+use crate::variant::{Baud, Variant};
+use crate::{MILLIS, Nanos};
+
+/// What a session shall do.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Settings {
+    /// Angle and resolution to ask for; a sensor that refuses streams what it has.
+    pub variant: Variant,
+    /// Rate to stream at.
+    pub baud: Baud,
+    /// Whether anybody hears us: a recording is only listened to.
+    pub listen_only: bool,
+}
+
+/// Why [`Dialogue::deadline`] is when it is.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Reason {
+    /// A running stream would have been heard by then.
+    Listening,
+    /// The reply should have come.
+    Reply,
+    /// The stream should have gone on.
+    Silence,
+    /// Nothing is expected by any time.
+    Never,
+}
+
+#[derive(Clone, Debug)]
+pub(crate) struct Dialogue {
+    settings: Settings,
+    phase: Phase,
+    open: Option<Outgoing>,
+    change_baud: Option<Baud>,
+    pub(crate) baud: Baud,
+    pub(crate) sensor: Sensor,
+    pub(crate) trouble: Option<Trouble>,
+    pub(crate) resyncs: u64,
+}
+
+#[derive(Clone, Copy, Debug)]
+enum Phase {
+    /// Whoever streams at the wanted rate is adopted undisturbed; meanwhile the state is as `shown`.
+    Listening { give_up_at: Nanos, shown: State },
+    /// A status request at one rate after the other.
+    Probing { attempt: usize },
+    /// The rate was found and is changed to the wanted one.
+    Switching,
+    /// At the wanted rate: settings, then the stream.
+    Starting { step: Step },
+    /// Measured data come.
+    Streaming { header: StreamHeader, silent_at: Nanos, questions: u8 },
+    /// Bytes come from a recording.
+    Following,
+}
+
+/// Steps of [`Phase::Starting`] in their order.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Step {
+    Stop,
+    Variant,
+    Type,
+    Configuration,
+    Stream,
+}
+
+impl Dialogue {
+    pub(crate) fn new(settings: Settings, now: Nanos) -> Self {
+        let phase = if settings.listen_only {
+            Phase::Following
+        } else {
+            Phase::Listening { give_up_at: now + LISTEN, shown: State::Probing }
+        };
+        Dialogue {
+            settings,
+            phase,
+            open: None,
+            change_baud: None,
+            baud: settings.baud,
+            sensor: Sensor::default(),
+            trouble: None,
+            resyncs: 0,
+        }
+    }
+
+    pub(crate) fn state(&self) -> State {
+        match self.phase {
+            Phase::Listening { shown, .. } => shown,
+            Phase::Probing { .. } => State::Probing,
+            Phase::Switching => State::Switching,
+            Phase::Starting { .. } => State::Starting,
+            Phase::Streaming { .. } | Phase::Following => State::Streaming,
+        }
+    }
+
+    /// The rate to set on the port now.
+    pub(crate) fn take_change_baud(&mut self) -> Option<Baud> {
+        self.change_baud.take()
+    }
+
+    pub(crate) fn outgoing(&mut self) -> Option<&mut Outgoing> {
+        self.open.as_mut()
+    }
+
+    pub(crate) fn awaits_acknowledge(&self) -> bool {
+        self.open.is_some()
+    }
+
+    /// Which headers may come.
+    pub(crate) fn expect(&self) -> Expect {
+        match self.phase {
+            Phase::Streaming { header, .. } => {
+                Expect::Stream { header, reply: self.open.as_ref().map(Outgoing::reply) }
+            }
+            _ => Expect::Anything,
+        }
+    }
+
+    pub(crate) fn deadline(&self) -> (Nanos, Reason) {
+        let reply = self.open.as_ref().map_or(Nanos::MAX, Outgoing::give_up_at);
+        let (own, reason) = match self.phase {
+            Phase::Listening { give_up_at, .. } => (give_up_at, Reason::Listening),
+            Phase::Streaming { silent_at, .. } => (silent_at, Reason::Silence),
+            _ => (Nanos::MAX, Reason::Never),
+        };
+        if reply < own { (reply, Reason::Reply) } else { (own, reason) }
+    }
+
+    pub(crate) fn handle_timeout(&mut self, now: Nanos) {
+        match self.phase {
+            Phase::Listening { give_up_at, .. } if now >= give_up_at => return self.probe(now, 0),
+            Phase::Streaming { silent_at, .. } if now >= silent_at => {
+                self.resyncs += 1;
+                self.trouble = Some(Trouble::Silence);
+                return self.listen(now);
+            }
+            _ => {}
+        }
+        if self.open.as_ref().is_some_and(|open| now >= open.give_up_at()) {
+            self.retry(now);
+        }
+    }
+
+    pub(crate) fn on_acknowledge(&mut self, now: Nanos) {
+        let baud = self.baud;
+        if let Some(open) = self.open.as_mut().filter(|open| open.is_out()) {
+            open.acknowledged(now, baud);
+        }
+    }
+
+    pub(crate) fn on_nak(&mut self, now: Nanos) {
+        if self.open.as_ref().is_some_and(Outgoing::is_out) {
+            self.retry(now + NAK_PAUSE);
+        }
+    }
+
+    pub(crate) fn on_telegram(&mut self, telegram: Telegram<'_>, now: Nanos) {
+        let Some(reply) = Reply::decode(telegram) else { return };
+        self.sensor.learn(&reply, telegram);
+        if let Reply::Measured(measured) = reply {
+            return self.on_measured(telegram, measured, now);
+        }
+        let expected = telegram.command() == crate::reply::REFUSED
+            || self.open.as_ref().is_some_and(|open| open.reply() == telegram.command());
+        if let Some(open) = self.open.take_if(|open| expected && open.is_out()) {
+            self.on_reply(open.request, reply, now);
+        }
+    }
+
+    fn on_measured(&mut self, telegram: Telegram<'_>, measured: Measured<'_>, now: Nanos) {
+        let silent_at = now + SILENCE;
+        match self.phase {
+            Phase::Streaming { silent_at: ref mut at, .. } => *at = silent_at,
+            Phase::Following => {}
+            Phase::Listening { .. } | Phase::Probing { .. } if self.baud != self.settings.baud => {
+                self.sensor.streams = true;
+                self.switch(now);
+            }
+            Phase::Listening { .. } | Phase::Probing { .. } if !self.is_wanted(measured) => {
+                self.sensor.streams = true;
+                self.start(Step::Stop, now);
+            }
+            Phase::Listening { .. } | Phase::Probing { .. } => self.stream(telegram, now),
+            Phase::Starting { step: Step::Stream } if self.open.as_ref().is_none_or(Outgoing::is_out) => {
+                self.stream(telegram, now);
+            }
+            Phase::Switching | Phase::Starting { .. } => {}
+        }
+    }
+
+    /// Whether a running stream has the beams asked for; a sensor that refused them is taken as it is.
+    fn is_wanted(&self, measured: Measured<'_>) -> bool {
+        self.trouble == Some(Trouble::VariantRefused) || measured.count() == self.settings.variant.beams()
+    }
+
+    fn on_reply(&mut self, request: Request, reply: Reply<'_>, now: Nanos) {
+        match (self.phase, request) {
+            (Phase::Probing { .. }, _) if self.baud == self.settings.baud => self.start(Step::Stop, now),
+            (Phase::Probing { .. }, _) => self.switch(now),
+            (Phase::Switching, Request::Stop) => {
+                self.sensor.streams = false;
+                self.switch(now);
+            }
+            (Phase::Switching, Request::Baud(baud)) if reply == (Reply::Mode { done: true }) => {
+                self.change_baud(baud);
+                self.start(Step::Stop, now + SETTLE);
+            }
+            (Phase::Starting { step }, _) => {
+                if matches!(reply, Reply::Variant { done: false, .. }) {
+                    self.trouble = Some(Trouble::VariantRefused);
+                }
+                let failed = matches!(reply, Reply::Refused | Reply::Mode { done: false });
+                match step {
+                    Step::Stop | Step::Stream if failed => {
+                        self.trouble = Some(Trouble::Refused(request));
+                        self.probe(now + PAUSE, 0);
+                    }
+                    // The stream is there when its first telegram is; until then its request stays unrepeated.
+                    Step::Stream => self.await_stream(now),
+                    Step::Stop => {
+                        self.sensor.streams = false;
+                        self.start(Step::Variant, now);
+                    }
+                    Step::Variant => self.start(Step::Type, now),
+                    Step::Type => self.start(Step::Configuration, now),
+                    Step::Configuration => self.start(Step::Stream, now),
+                }
+            }
+            (Phase::Streaming { .. }, _) => self.question(now),
+            _ => {
+                self.trouble = Some(Trouble::Refused(request));
+                self.probe(now + PAUSE, 0);
+            }
+        }
+    }
+
+    /// No reply to the open request: again, or on without it.
+    fn retry(&mut self, at: Nanos) {
+        let Some(open) = &mut self.open else { return };
+        let request = open.request;
+        if open.again(at) {
+            return;
+        }
+        self.open = None;
+        match self.phase {
+            Phase::Probing { attempt } => {
+                if attempt % Baud::ALL.len() == Baud::ALL.len() - 1 {
+                    self.trouble = Some(Trouble::NoAnswer);
+                }
+                self.probe(at, attempt + 1);
+            }
+            // Some sensors do not answer these right after a reset: the stream matters more.
+            Phase::Starting { step: Step::Type } => self.start(Step::Configuration, at),
+            Phase::Starting { step: Step::Configuration } => self.start(Step::Stream, at),
+            Phase::Streaming { .. } => self.question(at),
+            _ => {
+                self.trouble = Some(Trouble::Unanswered(request));
+                self.probe(at, 0);
+            }
+        }
+    }
+
+    fn listen(&mut self, now: Nanos) {
+        self.open = None;
+        self.phase = Phase::Listening { give_up_at: now + LISTEN, shown: State::Silent };
+    }
+
+    fn probe(&mut self, now: Nanos, attempt: usize) {
+        self.phase = Phase::Probing { attempt };
+        let wanted = self.settings.baud;
+        let mut others = Baud::ALL.into_iter().filter(|&baud| baud != wanted);
+        let turn = attempt % Baud::ALL.len();
+        let baud = if turn == 0 { wanted } else { others.nth(turn - 1).unwrap_or(wanted) };
+        self.change_baud(baud);
+        self.ask(Request::Status, now + SETTLE, 1);
+    }
+
+    fn switch(&mut self, now: Nanos) {
+        self.phase = Phase::Switching;
+        let request = if self.sensor.streams { Request::Stop } else { Request::Baud(self.settings.baud) };
+        self.ask(request, now, TRIES);
+    }
+
+    /// Begins with `step`, or the first one after it that has something to say.
+    fn start(&mut self, step: Step, now: Nanos) {
+        let same_variant = self.sensor.variant == Some(self.settings.variant);
+        let (step, request) = match step {
+            Step::Stop if self.sensor.streams => (step, Request::Stop),
+            Step::Stop | Step::Variant if !same_variant => {
+                (Step::Variant, Request::Variant(self.settings.variant))
+            }
+            Step::Stop | Step::Variant | Step::Type => (Step::Type, Request::Type),
+            Step::Configuration => (step, Request::Configuration),
+            Step::Stream => (step, Request::Stream),
+        };
+        self.phase = Phase::Starting { step };
+        self.ask(request, now, TRIES);
+    }
+
+    /// The sensor said that it streams: the first telegram is due like one that went missing.
+    fn await_stream(&mut self, now: Nanos) {
+        self.phase = Phase::Listening { give_up_at: now + SILENCE, shown: State::Starting };
+    }
+
+    fn stream(&mut self, telegram: Telegram<'_>, now: Nanos) {
+        if let Some(&header) = telegram.bytes().first_chunk() {
+            self.sensor.streams = true;
+            self.trouble = self.trouble.filter(|&trouble| trouble == Trouble::VariantRefused);
+            self.open = None;
+            self.phase = Phase::Streaming { header, silent_at: now + SILENCE, questions: QUESTIONS };
+            self.question(now);
+        }
+    }
+
+    /// Asks an adopted sensor for what its stream does not tell. Each reply costs the scan that it interrupts.
+    fn question(&mut self, now: Nanos) {
+        let Phase::Streaming { questions, .. } = &mut self.phase else { return };
+        let Some(left) = questions.checked_sub(1) else { return };
+        *questions = left;
+        if self.sensor.mode.is_none() {
+            self.ask(Request::Status, now, TRIES);
+        } else if self.sensor.kind().is_empty() {
+            self.ask(Request::Type, now, TRIES);
+        }
+    }
+
+    fn ask(&mut self, request: Request, not_before: Nanos, tries: u8) {
+        let address = self.sensor.address.map_or(0, |address| address & !REPLY);
+        self.open = Some(Outgoing::new(request, address, not_before, tries));
+    }
+
+    fn change_baud(&mut self, baud: Baud) {
+        if self.baud != baud {
+            self.baud = baud;
+            self.change_baud = Some(baud);
+        }
+    }
+}
+
+/// Two scans of the slowest variant, and some.
+const LISTEN: Nanos = 120 * MILLIS;
+/// Without measured data for so long, the session begins again (paper: resynchronise after one second).
+const SILENCE: Nanos = 1_000 * MILLIS;
+/// After a change of rate the sensor's and the adapter's UART need a moment.
+const SETTLE: Nanos = 20 * MILLIS;
+/// After a refusal, before everything begins again.
+const PAUSE: Nanos = 500 * MILLIS;
+/// A sensor may overlook a request while its mirror turns; three tries are what all drivers give it.
+const TRIES: u8 = 3;
+/// Status and type, and each once more.
+const QUESTIONS: u8 = 4;

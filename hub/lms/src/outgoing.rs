@@ -1,0 +1,110 @@
+//! One request on its way: paced byte by byte, acknowledged or not, tried again or given up. The sensor wants at
+//! least 55 us and at most 6 ms between bytes and may overlook a request while its mirror turns (Telegram listing
+//! 4.3), so a request is never just written.
+
+use crate::command::Request;
+use crate::telegram::{Encoded, REPLY};
+use crate::variant::Baud;
+use crate::{MICROS, MILLIS, Nanos, line_time};
+
+/// The open request.
+#[derive(Clone, Debug)]
+pub(crate) struct Outgoing {
+    pub(crate) request: Request,
+    encoded: Encoded,
+    sent: usize,
+    not_before: Nanos,
+    tries_left: u8,
+    /// When its reply is given up; counts from the last byte.
+    give_up_at: Nanos,
+}
+
+impl Outgoing {
+    /// `request` to the sensor at `address`, from `not_before` on, at most `tries` times.
+    pub(crate) fn new(request: Request, address: u8, not_before: Nanos, tries: u8) -> Self {
+        let encoded = request.encode(address);
+        Outgoing { request, encoded, sent: 0, not_before, tries_left: tries - 1, give_up_at: Nanos::MAX }
+    }
+
+    /// The next byte, and when it may leave at the earliest.
+    pub(crate) fn byte(&self) -> Option<(u8, Nanos)> {
+        self.encoded.bytes().get(self.sent).map(|&byte| (byte, self.not_before))
+    }
+
+    /// The byte left at `now`.
+    pub(crate) fn transmitted(&mut self, now: Nanos, baud: Baud) {
+        self.sent += 1;
+        self.not_before = now + line_time(1, baud.rate()) + GAP;
+        if self.sent == self.encoded.bytes().len() {
+            self.give_up_at = now + line_time(1, baud.rate()) + ACKNOWLEDGE_TIMEOUT;
+        }
+    }
+
+    /// The sensor acknowledged: its reply may take longer.
+    pub(crate) fn acknowledged(&mut self, now: Nanos, baud: Baud) {
+        let work = match self.request {
+            Request::Stream | Request::Stop | Request::Baud(_) => MODE_TIMEOUT,
+            _ => REPLY_TIMEOUT,
+        };
+        self.give_up_at = now + work + line_time(LONGEST_REPLY, baud.rate());
+    }
+
+    /// Begins again not before `at`; `false` if all tries are used up.
+    pub(crate) fn again(&mut self, at: Nanos) -> bool {
+        self.sent = 0;
+        self.not_before = at;
+        self.give_up_at = Nanos::MAX;
+        self.tries_left.checked_sub(1).map(|left| self.tries_left = left).is_some()
+    }
+
+    /// When to call [`Outgoing::again`], if no reply came; never while it still leaves.
+    pub(crate) fn give_up_at(&self) -> Nanos {
+        self.give_up_at
+    }
+
+    /// Command byte of its reply.
+    pub(crate) fn reply(&self) -> u8 {
+        self.request.command() | REPLY
+    }
+
+    /// Whether all of it left.
+    pub(crate) fn is_out(&self) -> bool {
+        self.byte().is_none()
+    }
+}
+
+/// Between the end of a byte and the next: more than 55 us, far less than 6 ms (Telegram listing 4.3).
+const GAP: Nanos = 120 * MICROS;
+/// ACK or NAK comes within 60 ms (Telegram listing 4.3); the rest is for adapters.
+const ACKNOWLEDGE_TIMEOUT: Nanos = 100 * MILLIS;
+/// Type, status and configuration were captured to take up to 158 ms.
+const REPLY_TIMEOUT: Nanos = 500 * MILLIS;
+/// A change of mode takes up to 3 s (Telegram listing 7.3).
+const MODE_TIMEOUT: Nanos = 3_000 * MILLIS;
+/// Bytes of the status reply.
+const LONGEST_REPLY: usize = 160;
+/// After a NAK the sensor wants 30 ms of peace (Telegram listing 4.3).
+pub(crate) const NAK_PAUSE: Nanos = 30 * MILLIS;
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn bytes_leave_with_their_gap() {
+        let mut outgoing = Outgoing::new(Request::Status, 0, 5, 2);
+        let mut now = 5;
+        for &expected in Request::Status.encode(0).bytes() {
+            let (byte, not_before) = outgoing.byte().unwrap();
+            assert_eq!(byte, expected);
+            assert!(not_before >= now);
+            now = not_before + 7;
+            outgoing.transmitted(now, Baud::B500000);
+        }
+        assert!(outgoing.is_out());
+        assert_eq!(outgoing.give_up_at(), now + 100_020_000);
+        assert!(outgoing.again(now));
+        assert!(!outgoing.is_out());
+        assert!(!outgoing.again(now));
+    }
+}

@@ -1,0 +1,237 @@
+//! A sensor behind a line, driven from outside: bytes and the time go in, bytes and telegrams and the next deadline
+//! come out. It never waits, reads or writes itself.
+//!
+//! After every call that changes it, drain [`Session::poll_output`] until it answers [`Output::Wait`] or
+//! [`Output::Rest`].
+
+use crate::Nanos;
+use crate::arrival::{Arrivals, Rhythm};
+use crate::dialogue::{Dialogue, Reason, Settings};
+use crate::framer::{Advance, Framer, Place, Tally, suspect};
+use crate::sensor::{Sensor, State, Trouble};
+use crate::telegram::Telegram;
+use crate::variant::Baud;
+
+/// What the session wants, in the order in which it wants it.
+#[derive(Debug)]
+pub enum Output<'a> {
+    /// Set the port to this rate and forget what it had received, then go on draining.
+    SetBaud(Baud),
+    /// Write this byte, not before the time given, then say so by [`Session::transmitted`]. Do nothing else meanwhile:
+    /// the sensor drops a request whose bytes are more than 6 ms apart.
+    Transmit {
+        /// The byte.
+        byte: u8,
+        /// Earliest time to write it.
+        not_before: Nanos,
+    },
+    /// A telegram arrived.
+    Telegram(Received<'a>),
+    /// Leave the port alone until then: nothing can be complete before.
+    Rest(Nanos),
+    /// Read when the port has bytes; at the deadline, if a read finds none, call [`Session::handle_timeout`].
+    Wait {
+        /// The deadline; [`Nanos::MAX`] is none.
+        until: Nanos,
+        /// What it is for.
+        reason: Why,
+    },
+}
+
+/// What a deadline is for.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Why {
+    /// A step of the conversation.
+    Dialogue(Reason),
+    /// A telegram is held back until the line was idle for so long.
+    Held,
+}
+
+/// A telegram with its stamps.
+#[derive(Clone, Copy, Debug)]
+pub struct Received<'a> {
+    /// The telegram, in the session's buffer.
+    pub telegram: Telegram<'a>,
+    /// When its first byte arrived.
+    pub first: Nanos,
+    /// When its last byte was read.
+    pub last: Nanos,
+    /// Whether `first` is an estimate from bytes that came in one read.
+    pub estimated: bool,
+    /// Why it is suspect, bits of [`suspect`]; 0 is clean.
+    pub reasons: u8,
+}
+
+/// One sensor's session.
+#[derive(Clone, Debug)]
+pub struct Session {
+    framer: Framer,
+    dialogue: Dialogue,
+    arrivals: Arrivals,
+    rhythm: Rhythm,
+    now: Nanos,
+    last_byte: Nanos,
+    /// Reads since the host rested.
+    looks: u32,
+    cut: bool,
+}
+
+impl Session {
+    /// A session on a port that is open at the rate of `settings`.
+    pub fn new(settings: Settings, now: Nanos) -> Self {
+        Session {
+            framer: Framer::default(),
+            dialogue: Dialogue::new(settings, now),
+            arrivals: Arrivals::new(),
+            rhythm: Rhythm::default(),
+            now,
+            last_byte: now,
+            looks: 0,
+            cut: false,
+        }
+    }
+
+    /// Room for the next read; never empty once the outputs are drained.
+    pub fn spare(&mut self) -> &mut [u8] {
+        self.framer.spare()
+    }
+
+    /// A read returned at `now` and brought `len` bytes into [`Session::spare`].
+    pub fn commit(&mut self, now: Nanos, len: usize) {
+        self.now = now;
+        if len == 0 {
+            return;
+        }
+        let was_empty = self.framer.buffered() == 0;
+        self.framer.commit(len);
+        self.arrivals.note(now, len);
+        self.last_byte = now;
+        self.looks += 1;
+        if was_empty {
+            self.begin_rhythm();
+        }
+    }
+
+    /// The deadline passed, and a read found nothing.
+    pub fn handle_timeout(&mut self, now: Nanos) {
+        self.now = now;
+        self.framer.release(now.saturating_sub(self.last_byte));
+        self.dialogue.handle_timeout(now);
+    }
+
+    /// The byte of [`Output::Transmit`] was written at `now`.
+    pub fn transmitted(&mut self, now: Nanos) {
+        self.now = now;
+        let baud = self.dialogue.baud;
+        if let Some(outgoing) = self.dialogue.outgoing() {
+            outgoing.transmitted(now, baud);
+        }
+    }
+
+    /// What the session wants next.
+    pub fn poll_output(&mut self) -> Output<'_> {
+        while let Some(found) = self.framer.advance() {
+            match found {
+                Advance::Telegram(place) => return Output::Telegram(self.receive(place)),
+                Advance::Ack => self.dialogue.on_acknowledge(self.now),
+                Advance::Nak => self.dialogue.on_nak(self.now),
+            }
+        }
+        if let Some(baud) = self.dialogue.take_change_baud() {
+            self.framer.clear();
+            self.rhythm.lose();
+            return Output::SetBaud(baud);
+        }
+        self.framer.expect(self.dialogue.expect());
+        self.framer.await_acknowledge(self.dialogue.awaits_acknowledge());
+        if let Some((byte, not_before)) = self.dialogue.outgoing().and_then(|outgoing| outgoing.byte()) {
+            return Output::Transmit { byte, not_before };
+        }
+        if self.framer.buffered() == 0 {
+            self.rhythm.lose();
+        } else if self.state() == State::Streaming
+            && let Some(until) = self.rhythm.rest(self.now)
+        {
+            self.looks = 0;
+            return Output::Rest(until);
+        }
+        let (until, reason) = self.dialogue.deadline();
+        match self.framer.hold() {
+            Some(hold) if self.last_byte + hold < until => {
+                Output::Wait { until: self.last_byte + hold, reason: Why::Held }
+            }
+            _ => Output::Wait { until, reason: Why::Dialogue(reason) },
+        }
+    }
+
+    /// How far it is.
+    pub fn state(&self) -> State {
+        self.dialogue.state()
+    }
+
+    /// The rate at which it listens and talks.
+    pub fn baud(&self) -> Baud {
+        self.dialogue.baud
+    }
+
+    /// What it knows of the sensor.
+    pub fn sensor(&self) -> &Sensor {
+        &self.dialogue.sensor
+    }
+
+    /// Why it is not where it should be.
+    pub fn trouble(&self) -> Option<Trouble> {
+        self.dialogue.trouble
+    }
+
+    /// What became of the bytes.
+    pub fn tally(&self) -> &Tally {
+        self.framer.tally()
+    }
+
+    /// Bytes read whose fate is open.
+    pub fn buffered(&self) -> usize {
+        self.framer.buffered()
+    }
+
+    /// How often measured data stayed out for a second.
+    pub fn resyncs(&self) -> u64 {
+        self.dialogue.resyncs
+    }
+
+    /// Whether the first telegram came after a piece of one: what was in flight when the port was opened.
+    pub fn began_with_a_cut(&self) -> bool {
+        self.cut
+    }
+
+    fn receive(&mut self, place: Place) -> Received<'_> {
+        let baud = self.dialogue.baud.rate();
+        let len = self.framer.view(place).telegram.bytes().len() as u64;
+        let first = self.arrivals.stamp(place.offset, baud);
+        let last = self.arrivals.stamp(place.offset + len - 1, baud).at;
+        self.cut |= self.tally().telegrams == 1 && place.offset > 0;
+        let slow = !first.estimated && self.rhythm.is_slow(last.saturating_sub(first.at));
+        if first.estimated {
+            self.rhythm.lose();
+        } else {
+            self.rhythm.complete(first.at, last, self.looks <= 1);
+        }
+        if self.framer.buffered() > 0 {
+            self.begin_rhythm();
+        }
+        self.dialogue.on_telegram(self.framer.view(place).telegram, self.now);
+        let framed = self.framer.view(place);
+        Received {
+            telegram: framed.telegram,
+            first: first.at,
+            last,
+            estimated: first.estimated,
+            reasons: framed.reasons | if slow { suspect::SLOW } else { 0 },
+        }
+    }
+
+    fn begin_rhythm(&mut self) {
+        let open = self.tally().read - self.framer.buffered() as u64;
+        self.rhythm.begin(self.arrivals.stamp(open, self.dialogue.baud.rate()).at);
+    }
+}

@@ -1,0 +1,219 @@
+//! Where the shared memory of one hub lives: a root directory and a prefix that no other hub shares. Pure: which
+//! places there are, in which order; refuses to look whether a hub lives there.
+
+use std::path::{Path, PathBuf};
+
+use crate::{Failure, Kind};
+
+/// The domain of those who name none.
+pub const DEFAULT_DOMAIN: &str = "scanhub";
+
+/// Root and prefix together stay below this many bytes: with 75 listeners fail while everything else works.
+const PLACE_LIMIT: usize = 65;
+
+/// What systemd makes for the service; clients outside of the service look there too.
+const SERVICE_BASE: &str = "/run/scanhub";
+
+/// A domain at its place.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Domain {
+    name: String,
+    root: PathBuf,
+}
+
+impl Domain {
+    /// Domain `name` below the directory `base` (`--root`); a relative one counts from the working directory.
+    ///
+    /// [`Kind::Configuration`] if the name is not possible, or root and prefix are too long together.
+    pub fn at(name: &str, base: &Path) -> Result<Domain, Failure> {
+        check_name(name)?;
+        let base = std::path::absolute(base).unwrap_or_else(|_| base.to_owned());
+        let domain = Domain { name: name.to_owned(), root: base.join(name) };
+        let length = domain.root.as_os_str().len() + domain.prefix().len();
+        if length < PLACE_LIMIT {
+            return Ok(domain);
+        }
+        Err(Failure::new(
+            Kind::Configuration,
+            format!(
+                "domain {name} at {} is too long: root and prefix {} have {length} bytes, at most {} are possible",
+                domain.root.display(),
+                domain.prefix(),
+                PLACE_LIMIT - 1
+            ),
+            "choose a shorter --root or --domain",
+        ))
+    }
+
+    /// Where a hub puts domain `name`: below `base` if given, else the first place that the environment offers.
+    ///
+    /// [`Kind::Configuration`] as [`Domain::at`].
+    pub fn of_hub(name: &str, base: Option<&Path>, environment: &Environment) -> Result<Domain, Failure> {
+        let base = match (base, &environment.runtime_directory, &environment.xdg_runtime_dir) {
+            (Some(base), _, _) => base.to_owned(),
+            (None, Some(service), _) => service.clone(),
+            (None, None, Some(user)) => user.join("scanhub"),
+            (None, None, None) => environment.fallback(),
+        };
+        Domain::at(name, &base)
+    }
+
+    /// Where a client looks for domain `name`: below `base` only if given, else every place that a hub may have
+    /// chosen, in order; the first one that is live is taken. Places that are too long for a hub are left out.
+    ///
+    /// [`Kind::Configuration`] if the name is not possible or no place is left.
+    pub fn candidates(
+        name: &str,
+        base: Option<&Path>,
+        environment: &Environment,
+    ) -> Result<Vec<Domain>, Failure> {
+        check_name(name)?;
+        if let Some(base) = base {
+            return Ok(vec![Domain::at(name, base)?]);
+        }
+        let mut domains = Vec::new();
+        for base in environment.bases() {
+            match Domain::at(name, &base) {
+                Ok(domain) if !domains.contains(&domain) => domains.push(domain),
+                _ => {}
+            }
+        }
+        Ok(domains)
+    }
+
+    /// The domain's name.
+    pub fn name(&self) -> &str {
+        &self.name
+    }
+
+    /// The directory of all its files, the lock among them.
+    pub fn root(&self) -> &Path {
+        &self.root
+    }
+
+    /// How the names of its shared memory begin.
+    pub fn prefix(&self) -> String {
+        format!("sh_{}_", self.name)
+    }
+}
+
+/// What the process's environment says about places.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub struct Environment {
+    /// RUNTIME_DIRECTORY: set for the service, by systemd.
+    pub runtime_directory: Option<PathBuf>,
+    /// XDG_RUNTIME_DIR: set for a user who logged in.
+    pub xdg_runtime_dir: Option<PathBuf>,
+    /// The user's number.
+    pub uid: u32,
+}
+
+impl Environment {
+    /// The environment of this process.
+    #[cfg(feature = "ipc")]
+    pub fn of_process() -> Environment {
+        let path = |name| std::env::var_os(name).and_then(first_path);
+        Environment {
+            runtime_directory: path("RUNTIME_DIRECTORY"),
+            xdg_runtime_dir: path("XDG_RUNTIME_DIR"),
+            uid: rustix::process::getuid().as_raw(),
+        }
+    }
+
+    /// Every directory that may hold domains, in the order in which clients look.
+    pub fn bases(&self) -> Vec<PathBuf> {
+        let mut bases: Vec<PathBuf> = self.runtime_directory.iter().cloned().collect();
+        bases.push(SERVICE_BASE.into());
+        bases.extend(self.xdg_runtime_dir.iter().map(|user| user.join("scanhub")));
+        bases.push(self.fallback());
+        bases.dedup();
+        bases
+    }
+
+    fn fallback(&self) -> PathBuf {
+        format!("/tmp/scanhub-{}", self.uid).into()
+    }
+}
+
+/// Refuses a domain's name that is not `[a-z0-9-]{1,16}`.
+fn check_name(name: &str) -> Result<(), Failure> {
+    let allowed = |c: char| c.is_ascii_lowercase() || c.is_ascii_digit() || c == '-';
+    if (1..=16).contains(&name.len()) && name.chars().all(allowed) {
+        return Ok(());
+    }
+    Err(Failure::new(
+        Kind::Configuration,
+        format!("domain name {name:?} is not possible"),
+        "1 to 16 of a-z, 0-9 and -, for example scanhub",
+    ))
+}
+
+/// The first of a colon-separated list (systemd lists several runtime directories so), if it is absolute.
+#[cfg(any(feature = "ipc", test))]
+fn first_path(value: std::ffi::OsString) -> Option<PathBuf> {
+    let text = value.into_string().ok()?;
+    let first = PathBuf::from(text.split(':').next()?);
+    first.is_absolute().then_some(first)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn environment(service: Option<&str>, user: Option<&str>) -> Environment {
+        Environment {
+            runtime_directory: service.map(Into::into),
+            xdg_runtime_dir: user.map(Into::into),
+            uid: 7,
+        }
+    }
+
+    fn root(domain: Result<Domain, Failure>) -> PathBuf {
+        domain.unwrap().root().to_owned()
+    }
+
+    #[test]
+    fn a_hub_takes_the_first_place() {
+        let all = environment(Some("/run/scanhub"), Some("/run/user/7"));
+        let user = environment(None, Some("/run/user/7"));
+        let none = environment(None, None);
+        assert_eq!(root(Domain::of_hub("a", Some(Path::new("/b")), &all)), Path::new("/b/a"));
+        assert_eq!(root(Domain::of_hub("a", None, &all)), Path::new("/run/scanhub/a"));
+        assert_eq!(root(Domain::of_hub("a", None, &user)), Path::new("/run/user/7/scanhub/a"));
+        assert_eq!(root(Domain::of_hub("a", None, &none)), Path::new("/tmp/scanhub-7/a"));
+    }
+
+    #[test]
+    fn a_client_looks_everywhere_in_order() {
+        let roots: Vec<_> = Domain::candidates("a", None, &environment(None, Some("/run/user/7")))
+            .unwrap()
+            .iter()
+            .map(|domain| domain.root().display().to_string())
+            .collect();
+        assert_eq!(roots, ["/run/scanhub/a", "/run/user/7/scanhub/a", "/tmp/scanhub-7/a"]);
+    }
+
+    #[test]
+    fn names_and_lengths() {
+        assert_eq!(Domain::at("t-1", Path::new("/x")).unwrap().prefix(), "sh_t-1_");
+        for bad in ["", "A", "a_b", "a/b", &"a".repeat(17)] {
+            assert_eq!(
+                Domain::at(bad, Path::new("/x")).map_err(|failure| failure.kind),
+                Err(Kind::Configuration)
+            );
+        }
+        // "/" + 57 + "/a" and "sh_a_" are 65.
+        let base = format!("/{}", "b".repeat(57));
+        assert_eq!(
+            Domain::at("a", Path::new(&base)).map_err(|failure| failure.kind),
+            Err(Kind::Configuration)
+        );
+        assert!(Domain::at("a", Path::new(&base[..57])).is_ok());
+    }
+
+    #[test]
+    fn the_first_of_several_directories_counts() {
+        assert_eq!(first_path("/run/a:/run/b".into()), Some("/run/a".into()));
+        assert_eq!(first_path("relative".into()), None);
+    }
+}

@@ -1,0 +1,79 @@
+//! What every sample carries besides its payload: numbers that show loss, stamps that join topics, the hub's life.
+//! Refuses to know what the payload is.
+
+use bytemuck::{Pod, Zeroable};
+#[cfg(feature = "ipc")]
+use iceoryx2::prelude::ZeroCopySend;
+
+/// The user header of every topic, 64 bytes, the same for all.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Pod, Zeroable)]
+#[cfg_attr(feature = "ipc", derive(ZeroCopySend), type_name("scanhub.Header.v1"))]
+#[repr(C)]
+pub struct Header {
+    /// Number of the telegram that the sample came from: per sensor and hub life, from 0. In a status it is the last
+    /// telegram's.
+    pub seq: u64,
+    /// Number of the sample in its topic, from 0, gap-free as sent: a gap is what a consumer missed.
+    pub topic_seq: u64,
+    /// CLOCK_MONOTONIC of the telegram's first byte, in ns.
+    pub stamp_first_ns: u64,
+    /// CLOCK_MONOTONIC of the telegram's last byte, in ns.
+    pub stamp_last_ns: u64,
+    /// The wall clock of the telegram's first byte, ns since 1970.
+    pub wall_ns: u64,
+    /// Random per start of the hub: another value means that the numbers began again.
+    pub boot: u64,
+    /// Position of the sensor's link in the hub's configuration, from 0.
+    pub sensor: u8,
+    /// 0 clean, 1 suspect; see [`Quality`].
+    pub quality: u8,
+    /// Bits of [`Flags`].
+    pub flags: u16,
+    /// Nominal time between two samples of a scan, in us; 0 unknown.
+    pub period_us: u32,
+    /// Process of the hub.
+    pub hub_pid: u32,
+    /// 0.
+    pub reserved: u32,
+}
+
+impl Header {
+    /// The quality as a word; unknown values are suspect.
+    pub fn quality(&self) -> Quality {
+        if self.quality == Quality::Clean as u8 { Quality::Clean } else { Quality::Suspect }
+    }
+}
+
+/// What the hub thinks of a telegram whose CRC was right.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[repr(u8)]
+pub enum Quality {
+    /// Nothing speaks against it.
+    Clean = 0,
+    /// Something around it was wrong.
+    Suspect = 1,
+}
+
+impl Quality {
+    /// `clean` or `suspect`.
+    pub fn name(self) -> &'static str {
+        match self {
+            Quality::Clean => "clean",
+            Quality::Suspect => "suspect",
+        }
+    }
+}
+
+/// The bits of [`Header::flags`]; the numbers are those of the LAN form.
+pub struct Flags;
+
+impl Flags {
+    /// The port resolves to a pty.
+    pub const SIMULATED: u16 = 2;
+    /// The link is a recording.
+    pub const REPLAYED: u16 = 4;
+    /// The stamps were computed, not taken when the bytes came.
+    pub const STAMP_ESTIMATED: u16 = 8;
+    /// The sample came from another machine.
+    pub const REMOTE: u16 = 32;
+}

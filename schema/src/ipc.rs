@@ -1,0 +1,234 @@
+//! From a topic to its service in shared memory, with all limits. The only file that names the builders of iceoryx2:
+//! everybody else gets ports. Refuses to know when something is sent and who reads it.
+
+mod trouble;
+
+use std::fmt::Debug;
+use std::os::unix::ffi::OsStrExt;
+use std::time::Duration;
+
+use iceoryx2::config::Config;
+use iceoryx2::port;
+use iceoryx2::prelude::{
+    AttributeVerifier, CallbackProgression, EventId, FileName, IceoryxSend, LogLevel, NodeBuilder,
+    SemanticString, ServiceName, SignalHandlingMode, set_log_level_from_env_or,
+};
+use iceoryx2::service::Service as _;
+use iceoryx2::service::port_factory::{event, publish_subscribe};
+
+use self::trouble::{Trouble, create, no_port, no_publisher, open};
+use crate::{Domain, Failure, Header, Kind, Scan, Status, Topic, Wake, access, limits, of_service};
+
+pub use iceoryx2::port::update_connections::UpdateConnections;
+pub use iceoryx2::port::{LoanError, ReceiveError, SendError};
+pub use iceoryx2::prelude::PortFactory;
+/// Shared memory between processes; ports of it stay in their thread, nodes and services may move.
+pub use iceoryx2::prelude::ipc::Service;
+
+/// The membership of a process in a domain.
+pub type Node = iceoryx2::node::Node<Service>;
+/// A topic of one sensor.
+pub type TopicService<P> = publish_subscribe::PortFactory<Service, P, Header>;
+/// Sends the samples of a topic.
+pub type Publisher<P> = port::publisher::Publisher<Service, P, Header>;
+/// Receives the samples of a topic.
+pub type Subscriber<P> = port::subscriber::Subscriber<Service, P, Header>;
+/// A received sample: the payload by `*`, read-only, in shared memory; the header by `user_header()`.
+pub type Sample<P> = iceoryx2::sample::Sample<Service, P, Header>;
+/// What wakes the consumers of one sensor.
+pub type WakeService = event::PortFactory<Service>;
+/// Wakes consumers.
+pub type Notifier = port::notifier::Notifier<Service>;
+/// Sleeps until it is woken.
+pub type Listener = port::listener::Listener<Service>;
+
+/// The hub's node in `domain`. Cleans up what dead hubs and consumers left.
+///
+/// [`Kind::Failed`] with owner, mode and remedy if the directory is another user's.
+pub fn hub_node(domain: &Domain) -> Result<Node, Failure> {
+    node(domain, true)
+}
+
+/// A consumer's node in `domain`; cleaning up is the hub's business.
+///
+/// [`Kind::Failed`] with owner, mode and remedy if the directory is another user's.
+pub fn client_node(domain: &Domain) -> Result<Node, Failure> {
+    node(domain, false)
+}
+
+/// What a topic carries; implemented by `[u8]` (telegram), [`Scan`] and [`Status`].
+pub trait Payload: IceoryxSend + Debug + 'static {
+    /// The topic that carries it.
+    const TOPIC: Topic;
+
+    /// The topic of `sensor`, made if it is not there: for the hub. What a dead hub's consumers keep alive is reused.
+    fn create(node: &Node, sensor: &str) -> Result<TopicService<Self>, Failure>;
+
+    /// The topic of `sensor`, or nothing as long as no hub has made it: for consumers.
+    fn open(node: &Node, sensor: &str) -> Result<Option<TopicService<Self>>, Failure>;
+
+    /// The publisher of a topic. A sample is loaned, written in place, and sent with `send()`, which returns how many
+    /// consumers got it: `loan()` for scan and status, `loan_slice_uninit(n)` + `write_from_slice` for a telegram.
+    ///
+    /// [`Kind::DomainHeld`] if the topic has a publisher already.
+    fn publisher(topic: &TopicService<Self>) -> Result<Publisher<Self>, Failure>;
+
+    /// A consumer's end of a topic.
+    fn subscriber(topic: &TopicService<Self>) -> Result<Subscriber<Self>, Failure>;
+
+    /// The oldest sample that waits, or nothing.
+    fn receive(subscriber: &Subscriber<Self>) -> Result<Option<Sample<Self>>, ReceiveError>;
+}
+
+/// iceoryx2 has a slice and a value behind two impl blocks of the same words; this says them once.
+macro_rules! payload {
+    ($payload:ty, $topic:expr, |$builder:ident| $sized:expr) => {
+        impl Payload for $payload {
+            const TOPIC: Topic = $topic;
+
+            fn create(node: &Node, sensor: &str) -> Result<TopicService<Self>, Failure> {
+                let (service, revision) = (name(&$topic.service(sensor))?, revision($topic)?);
+                create(node, &service, || {
+                    let builder = node.service_builder(&service).publish_subscribe::<$payload>();
+                    builder
+                        .user_header::<Header>()
+                        .max_publishers(limits::PUBLISHERS)
+                        .max_subscribers(limits::SUBSCRIBERS)
+                        .max_nodes(limits::NODES)
+                        .subscriber_max_buffer_size(limits::buffer($topic))
+                        .subscriber_max_borrowed_samples(limits::BORROWED)
+                        .history_size(limits::history($topic))
+                        .enable_safe_overflow(true)
+                        .open_or_create_with_attributes(&revision)
+                        .map_err(Trouble::from)
+                })
+            }
+
+            fn open(node: &Node, sensor: &str) -> Result<Option<TopicService<Self>>, Failure> {
+                let service = name(&$topic.service(sensor))?;
+                let builder = node.service_builder(&service).publish_subscribe::<$payload>();
+                open(node, &service, builder.user_header::<Header>().open())
+            }
+
+            fn publisher(topic: &TopicService<Self>) -> Result<Publisher<Self>, Failure> {
+                let $builder = topic
+                    .publisher_builder()
+                    .max_loaned_samples(limits::LOANED)
+                    .override_sample_preallocation(|_| limits::samples($topic));
+                $sized.create().map_err(|error| no_publisher(topic.name(), error))
+            }
+
+            fn subscriber(topic: &TopicService<Self>) -> Result<Subscriber<Self>, Failure> {
+                topic.subscriber_builder().create().map_err(|error| no_port(topic.name(), &error))
+            }
+
+            fn receive(subscriber: &Subscriber<Self>) -> Result<Option<Sample<Self>>, ReceiveError> {
+                subscriber.receive()
+            }
+        }
+    };
+}
+
+payload!([u8], Topic::Telegram, |builder| builder.initial_max_slice_len(crate::Telegram::MAX));
+payload!(Scan, Topic::Scan, |builder| builder);
+payload!(Status, Topic::Status, |builder| builder);
+
+/// The wake service of `sensor`, made if it is not there: for the hub.
+pub fn create_wake(node: &Node, sensor: &str) -> Result<WakeService, Failure> {
+    let service = name(&Wake::service(sensor))?;
+    create(node, &service, || {
+        let builder = node.service_builder(&service).event();
+        builder
+            .max_notifiers(limits::NOTIFIERS)
+            .max_listeners(limits::LISTENERS)
+            .max_nodes(limits::NODES)
+            .event_id_max_value(limits::EVENT_ID)
+            .notifier_created_event(EventId::new(Wake::HubUp as usize))
+            .notifier_dropped_event(EventId::new(Wake::HubDown as usize))
+            .notifier_dead_event(EventId::new(Wake::HubDown as usize))
+            .open_or_create()
+            .map_err(Trouble::from)
+    })
+}
+
+/// The wake service of `sensor`, or nothing as long as no hub has made it: for consumers.
+pub fn open_wake(node: &Node, sensor: &str) -> Result<Option<WakeService>, Failure> {
+    let service = name(&Wake::service(sensor))?;
+    open(node, &service, node.service_builder(&service).event().open())
+}
+
+/// The hub's end of a wake service; consumers wake at once by [`Wake::HubUp`].
+pub fn notifier(wake: &WakeService) -> Result<Notifier, Failure> {
+    wake.notifier_builder()
+        .default_event_id(EventId::new(Wake::Telegram as usize))
+        .create()
+        .map_err(|error| no_port(wake.name(), &error))
+}
+
+/// Wakes all consumers for `why`; returns how many were told.
+pub fn notify(notifier: &Notifier, why: Wake) -> Result<usize, Failure> {
+    notifier
+        .notify_with_custom_event_id(EventId::new(why as usize))
+        .map_err(|error| Failure::new(Kind::Failed, format!("cannot wake consumers: {error:?}"), ""))
+}
+
+/// A consumer's end of a wake service.
+pub fn listener(wake: &WakeService) -> Result<Listener, Failure> {
+    wake.listener_builder().create().map_err(|error| no_port(wake.name(), &error))
+}
+
+/// The sensors that have topics in `domain`, sorted. Those of a dead hub stay as long as a consumer keeps them.
+pub fn sensors(domain: &Domain) -> Result<Vec<String>, Failure> {
+    let mut sensors = Vec::new();
+    let listed = Service::list(&config(domain)?, |service| {
+        if let Some((sensor, Some(_))) = of_service(service.static_details.name().as_str()) {
+            sensors.push(sensor.to_owned());
+        }
+        CallbackProgression::Continue
+    });
+    listed.map_err(|error| access::failure(domain.root(), format!("cannot list topics: {error:?}")))?;
+    sensors.sort();
+    sensors.dedup();
+    Ok(sensors)
+}
+
+fn node(domain: &Domain, cleanup: bool) -> Result<Node, Failure> {
+    set_log_level_from_env_or(LogLevel::Error);
+    let mut config = config(domain)?;
+    config.global.node.cleanup_dead_nodes_on_creation = cleanup;
+    config.global.node.cleanup_dead_nodes_on_destruction = false;
+    config.global.service.cleanup_dead_nodes_on_open = false;
+    if !cleanup {
+        config.global.creation_timeout = Duration::from_millis(100);
+    }
+    NodeBuilder::new()
+        .signal_handling_mode(SignalHandlingMode::Disabled)
+        .config(&config)
+        .create::<Service>()
+        .map_err(|error| access::failure(domain.root(), format!("cannot join {}: {error:?}", domain.name())))
+}
+
+/// In code, never from a file: the library would search the working directory for one.
+fn config(domain: &Domain) -> Result<Config, Failure> {
+    let unusable =
+        || Failure::new(Kind::Configuration, format!("{} cannot be a root", domain.root().display()), "");
+    let root = iceoryx2::prelude::Path::new(domain.root().as_os_str().as_bytes()).map_err(|_| unusable())?;
+    let mut config = Config::default();
+    config.global.prefix = FileName::new(domain.prefix().as_bytes()).map_err(|_| unusable())?;
+    config.global.set_root_path(&root);
+    Ok(config)
+}
+
+fn name(service: &str) -> Result<ServiceName, Failure> {
+    ServiceName::new(service).map_err(|error| {
+        Failure::new(Kind::Configuration, format!("{service:?} is no service: {error:?}"), "")
+    })
+}
+
+fn revision(topic: Topic) -> Result<AttributeVerifier, Failure> {
+    let impossible = |_| Failure::new(Kind::Failed, "the payload's revision is no attribute", "");
+    let value = topic.revision().to_string();
+    let key = "revision".try_into().map_err(|_| impossible(()))?;
+    let value = value.as_str().try_into().map_err(|_| impossible(()))?;
+    AttributeVerifier::new().require(&key, &value).map_err(|_| impossible(()))
+}

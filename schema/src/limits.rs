@@ -1,0 +1,42 @@
+//! How much every service holds. Explicit, because the defaults of the shared-memory library (8 consumers, 20 nodes,
+//! 2 samples) are too small, and because a consumer that asks for more than was created is refused.
+
+use crate::Topic;
+
+/// Publishers of a topic: the hub's link.
+pub const PUBLISHERS: usize = 1;
+/// Consumers of a topic.
+pub const SUBSCRIBERS: usize = 200;
+/// Processes that have a service open.
+pub const NODES: usize = 260;
+/// Samples that a consumer may hold at a time.
+pub const BORROWED: usize = 4;
+/// Samples that the publisher may have in work at a time.
+pub const LOANED: usize = 2;
+/// Consumers asleep at a wake service.
+pub const LISTENERS: usize = 200;
+/// Notifiers of a wake service: the hub's link, and those of dead hubs that are not cleaned up yet.
+pub const NOTIFIERS: usize = 4;
+/// The greatest event id of a wake service.
+pub const EVENT_ID: usize = 7;
+
+/// Samples that wait for a consumer of `topic`; with one more the oldest is dropped.
+pub const fn buffer(topic: Topic) -> usize {
+    match topic {
+        Topic::Telegram | Topic::Scan => 16,
+        Topic::Status => 4,
+    }
+}
+
+/// Samples that a consumer gets which comes later.
+pub const fn history(topic: Topic) -> usize {
+    match topic {
+        Topic::Telegram | Topic::Scan => 0,
+        Topic::Status => 1,
+    }
+}
+
+/// Samples to reserve memory for. All queues hold the same latest samples, so that their number does not count.
+pub const fn samples(topic: Topic) -> usize {
+    buffer(topic) + SUBSCRIBERS * BORROWED + history(topic) + LOANED
+}

@@ -1,0 +1,104 @@
+//! One hub per domain: a lock on `<root>/hub.lock` that dies with its process. Consumers ask who holds it and never
+//! hold it themselves. Refuses to know what the hub does.
+
+use std::fs::{DirBuilder, File, OpenOptions};
+use std::io::{self, ErrorKind};
+use std::os::fd::AsRawFd;
+use std::os::unix::fs::{DirBuilderExt, FileExt, OpenOptionsExt};
+use std::path::Path;
+
+use nix::errno::Errno;
+use nix::fcntl::{FcntlArg, fcntl};
+use nix::libc::{self, flock};
+
+use crate::{Failure, Kind, access};
+
+/// The lock of a hub on its domain; it ends with the value or with the process, however that ends.
+#[derive(Debug)]
+pub struct HubLock {
+    _file: File,
+}
+
+impl HubLock {
+    /// Makes the directory `root` for this user alone, takes the lock and writes this process's id into it.
+    ///
+    /// [`Kind::DomainHeld`] if another hub has it (the message names its pid), [`Kind::Failed`] if the directory is
+    /// another user's or cannot be made.
+    pub fn acquire(root: &Path) -> Result<HubLock, Failure> {
+        DirBuilder::new().recursive(true).mode(0o700).create(root).map_err(|error| unusable(root, &error))?;
+        if let Some(failure) = access::foreign(root) {
+            return Err(failure);
+        }
+        let path = root.join(NAME);
+        let file = OpenOptions::new()
+            .read(true)
+            .write(true)
+            .create(true)
+            .truncate(false)
+            .mode(0o600)
+            .open(&path)
+            .map_err(|error| unusable(root, &error))?;
+        match fcntl(file.as_raw_fd(), FcntlArg::F_OFD_SETLK(&whole_file(libc::F_WRLCK))) {
+            Ok(_) => {}
+            Err(Errno::EAGAIN | Errno::EACCES) => return Err(held(root, pid_in(&file))),
+            Err(error) => return Err(unusable(root, &error.into())),
+        }
+        let pid = format!("{}\n", std::process::id());
+        file.set_len(0)
+            .and_then(|()| file.write_all_at(pid.as_bytes(), 0))
+            .map_err(|error| unusable(root, &error))?;
+        Ok(HubLock { _file: file })
+    }
+}
+
+/// The process that holds the domain in `root`, if a hub lives there; 0 in the moment in which it has not yet written
+/// its pid.
+///
+/// [`Kind::Failed`] if the directory is another user's.
+pub fn holder(root: &Path) -> Result<Option<u32>, Failure> {
+    let file = match File::open(root.join(NAME)) {
+        Ok(file) => file,
+        Err(error) if matches!(error.kind(), ErrorKind::NotFound | ErrorKind::NotADirectory) => {
+            return Ok(None);
+        }
+        Err(error) => return Err(unusable(root, &error)),
+    };
+    let mut lock = whole_file(libc::F_RDLCK);
+    fcntl(file.as_raw_fd(), FcntlArg::F_OFD_GETLK(&mut lock))
+        .map_err(|error| unusable(root, &error.into()))?;
+    if lock.l_type == libc::F_UNLCK as libc::c_short { Ok(None) } else { Ok(Some(pid_in(&file))) }
+}
+
+const NAME: &str = "hub.lock";
+
+/// A lock of the whole file, however long; `l_pid` has to be 0 for open file descriptions.
+fn whole_file(kind: libc::c_int) -> flock {
+    flock {
+        l_type: kind as libc::c_short,
+        l_whence: libc::SEEK_SET as libc::c_short,
+        l_start: 0,
+        l_len: 0,
+        l_pid: 0,
+    }
+}
+
+/// The lock itself tells no pid (the kernel answers -1), the file's content does.
+fn pid_in(file: &File) -> u32 {
+    let mut bytes = [0; 16];
+    let length = file.read_at(&mut bytes, 0).unwrap_or_default();
+    str::from_utf8(&bytes[..length]).ok().and_then(|text| text.trim_end().parse().ok()).unwrap_or_default()
+}
+
+fn held(root: &Path, pid: u32) -> Failure {
+    Failure::new(
+        Kind::DomainHeld,
+        format!("another hub holds {}: pid {pid}", root.display()),
+        "stop it, or choose another --domain",
+    )
+}
+
+fn unusable(root: &Path, error: &io::Error) -> Failure {
+    access::foreign(root).unwrap_or_else(|| {
+        Failure::new(Kind::Failed, format!("{}: {error}", root.display()), "choose another place with --root")
+    })
+}

@@ -1,0 +1,226 @@
+//! How a link and its sensor are: the state, what was found out, and counters that only grow. Refuses to know how a
+//! state is reached.
+
+use std::ops::{Index, IndexMut};
+
+use bytemuck::{Pod, Zeroable};
+#[cfg(feature = "ipc")]
+use iceoryx2::prelude::ZeroCopySend;
+
+use crate::text;
+
+/// Room for counters in a [`Status`]; new ones append.
+pub const COUNTERS: usize = 32;
+
+/// The payload of topic `status`, 592 bytes: published each second and on every change.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Pod, Zeroable)]
+#[cfg_attr(feature = "ipc", derive(ZeroCopySend), type_name("scanhub.Status.v1"))]
+#[repr(C)]
+pub struct Status {
+    /// See [`Status::state`].
+    pub state: u8,
+    /// The sensor's measuring-mode byte; FFh unknown.
+    pub mode: u8,
+    /// Millimetres per device unit: 1 or 10; 0 unknown.
+    pub unit_mm: u8,
+    /// 0.
+    pub reserved: u8,
+    /// Rate of the line in bits per second; 0 unknown.
+    pub baud: u32,
+    /// CLOCK_MONOTONIC when the state began, in ns.
+    pub since_ns: u64,
+    /// Scans per second, in mHz.
+    pub rate_mhz: u32,
+    /// Field of view in degrees: 100 or 180; 0 unknown.
+    pub angle_deg: u16,
+    /// Angle between two beams in 1/100 degree; 0 unknown.
+    pub resolution_cdeg: u16,
+    /// See [`Status::sensor_type`].
+    pub type_text: [u8; 24],
+    /// See [`Status::port`].
+    pub port_text: [u8; 128],
+    /// See [`Status::last_error`].
+    pub last_error_text: [u8; 160],
+    /// See [`Counter`].
+    pub counters: Counters,
+}
+
+impl Default for Status {
+    fn default() -> Self {
+        Status { mode: Status::MODE_UNKNOWN, ..Zeroable::zeroed() }
+    }
+}
+
+impl Status {
+    /// The measuring mode as long as the sensor has not told it.
+    pub const MODE_UNKNOWN: u8 = 0xFF;
+
+    /// The state as a word; nothing if a newer hub has one that this program does not know.
+    pub fn state(&self) -> Option<State> {
+        State::ALL.get(usize::from(self.state)).copied()
+    }
+
+    /// What the sensor calls itself; empty if unknown.
+    pub fn sensor_type(&self) -> &str {
+        text::read(&self.type_text)
+    }
+
+    /// Sets the sensor's type: at most 24 bytes, the rest is cut.
+    pub fn set_sensor_type(&mut self, value: &str) {
+        text::write(&mut self.type_text, value);
+    }
+
+    /// The port that the link is configured for.
+    pub fn port(&self) -> &str {
+        text::read(&self.port_text)
+    }
+
+    /// Sets the port: at most 128 bytes, the rest is cut.
+    pub fn set_port(&mut self, value: &str) {
+        text::write(&mut self.port_text, value);
+    }
+
+    /// The last error in words; empty if there was none.
+    pub fn last_error(&self) -> &str {
+        text::read(&self.last_error_text)
+    }
+
+    /// Sets the last error: at most 160 bytes, the rest is cut.
+    pub fn set_last_error(&mut self, value: &str) {
+        text::write(&mut self.last_error_text, value);
+    }
+}
+
+/// What the link is doing.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[repr(u8)]
+pub enum State {
+    /// The port is not there.
+    Absent = 0,
+    /// Looking for the sensor and its baud rate.
+    Probing = 1,
+    /// Changing the baud rate.
+    Switching = 2,
+    /// Asking what the sensor is and switching its stream on.
+    Starting = 3,
+    /// Telegrams come.
+    Streaming = 4,
+    /// Telegrams came and stopped.
+    Silent = 5,
+    /// Stopped on request.
+    Paused = 6,
+}
+
+impl State {
+    /// All states, by their number.
+    pub const ALL: [State; 7] = [
+        State::Absent,
+        State::Probing,
+        State::Switching,
+        State::Starting,
+        State::Streaming,
+        State::Silent,
+        State::Paused,
+    ];
+
+    /// The state's name in all output.
+    pub fn name(self) -> &'static str {
+        match self {
+            State::Absent => "absent",
+            State::Probing => "probing",
+            State::Switching => "switching",
+            State::Starting => "starting",
+            State::Streaming => "streaming",
+            State::Silent => "silent",
+            State::Paused => "paused",
+        }
+    }
+}
+
+/// The counters of a link. All grow only, except `bytes_buffered`.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Pod, Zeroable)]
+#[cfg_attr(feature = "ipc", derive(ZeroCopySend), type_name("scanhub.Counters.v1"))]
+#[repr(C)]
+pub struct Counters(pub [u64; COUNTERS]);
+
+impl Counters {
+    /// Name and value of every counter that has a name, in their order.
+    pub fn named(&self) -> impl Iterator<Item = (&'static str, u64)> + '_ {
+        Counter::ALL.iter().map(|&counter| (counter.name(), self[counter]))
+    }
+}
+
+impl Index<Counter> for Counters {
+    type Output = u64;
+
+    fn index(&self, counter: Counter) -> &u64 {
+        &self.0[counter as usize]
+    }
+}
+
+impl IndexMut<Counter> for Counters {
+    fn index_mut(&mut self, counter: Counter) -> &mut u64 {
+        &mut self.0[counter as usize]
+    }
+}
+
+/// Declares the counters once: number, variant, name and meaning stand in one line.
+macro_rules! counters {
+    ($($variant:ident $name:literal $meaning:literal,)*) => {
+        /// The counters by name; the number is the place in [`Counters`].
+        #[derive(Clone, Copy, Debug, PartialEq, Eq)]
+        #[repr(usize)]
+        pub enum Counter { $(#[doc = $meaning] $variant,)* }
+
+        impl Counter {
+            /// All counters, in the order of the output.
+            pub const ALL: &'static [Counter] = &[$(Counter::$variant,)*];
+
+            /// The counter's key in all output.
+            pub fn name(self) -> &'static str {
+                match self { $(Counter::$variant => $name,)* }
+            }
+        }
+    };
+}
+
+counters! {
+    BytesRead "bytes_read" "Bytes read from the port.",
+    BytesInTelegrams "bytes_in_telegrams" "Bytes that became part of a telegram.",
+    BytesAcknowledge "bytes_acknowledge" "Bytes that were ACK or NAK.",
+    BytesDiscarded "bytes_discarded" "Bytes that belonged to nothing.",
+    BytesBuffered "bytes_buffered" "Bytes read and not yet decided: a gauge.",
+    Telegrams "telegrams" "Telegrams published.",
+    Suspect "suspect" "Telegrams of quality suspect.",
+    Aborted "aborted" "Telegrams that broke off.",
+    Resyncs "resyncs" "Times that the beginning of a telegram was lost and found again.",
+    Reconnects "reconnects" "Times that the port was opened again.",
+    LostInRestart "lost_in_restart" "Telegrams lost while the stream was started again.",
+    Wakeups "wakeups" "Times that the link's thread woke up.",
+    LoanFailed "loan_failed" "Samples not published because no chunk was free.",
+    RejectedAddress "rejected_address" "Candidates rejected: the address is no sensor's.",
+    RejectedLength "rejected_length" "Candidates rejected: the length is impossible.",
+    RejectedCommand "rejected_command" "Candidates rejected: the command is unknown.",
+    RejectedCount "rejected_count" "Candidates rejected: the data's count contradicts the length.",
+    RejectedCrc "rejected_crc" "Candidates rejected: the CRC is wrong.",
+    RejectedVetoed "rejected_vetoed" "Candidates rejected: they cannot be what is expected now.",
+    RejectedSuperseded "rejected_superseded" "Candidates rejected: another one was right.",
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn states_stand_at_their_numbers() {
+        for (number, state) in State::ALL.iter().enumerate() {
+            assert_eq!(*state as usize, number);
+        }
+        assert_eq!(Status { state: 7, ..Status::default() }.state(), None);
+    }
+
+    #[test]
+    fn counters_fit() {
+        assert!(Counter::ALL.len() <= COUNTERS);
+    }
+}

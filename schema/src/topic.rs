@@ -1,0 +1,125 @@
+//! The names: topics, their services, sensors. Refuses to know how a service is made.
+
+use crate::{Failure, Kind};
+
+/// What the hub publishes for each sensor.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
+pub enum Topic {
+    /// The telegrams' bytes, replies too.
+    Telegram,
+    /// Decoded measurements.
+    Scan,
+    /// State, properties and counters of the link.
+    Status,
+}
+
+impl Topic {
+    /// All topics, in the order of all output.
+    pub const ALL: [Topic; 3] = [Topic::Telegram, Topic::Scan, Topic::Status];
+
+    /// The topic's name, as in `front/scan`.
+    pub fn name(self) -> &'static str {
+        match self {
+            Topic::Telegram => "telegram",
+            Topic::Scan => "scan",
+            Topic::Status => "status",
+        }
+    }
+
+    /// The topic called `name`.
+    pub fn parse(name: &str) -> Option<Topic> {
+        Topic::ALL.into_iter().find(|topic| topic.name() == name)
+    }
+
+    /// The payload's type, the same in all languages.
+    pub fn payload(self) -> &'static str {
+        match self {
+            Topic::Telegram => "u8[]",
+            Topic::Scan => "scanhub.Scan.v1",
+            Topic::Status => "scanhub.Status.v1",
+        }
+    }
+
+    /// The payload's revision: a greater one only appends.
+    pub fn revision(self) -> u32 {
+        1
+    }
+
+    /// Name of the topic's service for `sensor`.
+    pub fn service(self, sensor: &str) -> String {
+        service(sensor, self.name())
+    }
+}
+
+/// Name of the service that wakes the consumers of a sensor, beside its topics.
+pub const WAKE: &str = "wake";
+
+/// Why consumers are woken: the event's id.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[repr(usize)]
+pub enum Wake {
+    /// All samples of a telegram are sent.
+    Telegram = 1,
+    /// The status changed.
+    Status = 2,
+    /// The hub is up; sent by itself when the notifier is created.
+    HubUp = 3,
+    /// The hub is down; sent by itself when the notifier is dropped or its process is found dead.
+    HubDown = 4,
+}
+
+impl Wake {
+    /// Name of the wake service of `sensor`.
+    pub fn service(sensor: &str) -> String {
+        service(sensor, WAKE)
+    }
+}
+
+/// The sensor and topic that a service's name stands for, if it is one of ours: the other direction of
+/// [`Topic::service`]; the wake service has no topic.
+pub fn of_service(name: &str) -> Option<(&str, Option<Topic>)> {
+    let (sensor, topic) = name.strip_prefix("scanhub/v1/")?.split_once('/')?;
+    if topic == WAKE { Some((sensor, None)) } else { Some((sensor, Some(Topic::parse(topic)?))) }
+}
+
+/// Refuses a sensor's name that is not `[a-z0-9_-]`, 1 to 24 of them: [`Kind::Configuration`].
+pub fn check_sensor(name: &str) -> Result<(), Failure> {
+    let allowed = |c: char| c.is_ascii_lowercase() || c.is_ascii_digit() || c == '_' || c == '-';
+    if (1..=24).contains(&name.len()) && name.chars().all(allowed) {
+        return Ok(());
+    }
+    Err(Failure::new(
+        Kind::Configuration,
+        format!("sensor name {name:?} is not possible"),
+        "1 to 24 of a-z, 0-9, _ and -, for example front",
+    ))
+}
+
+fn service(sensor: &str, topic: &str) -> String {
+    format!("scanhub/v1/{sensor}/{topic}")
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn service_names_go_there_and_back() {
+        assert_eq!(Topic::Scan.service("front"), "scanhub/v1/front/scan");
+        for topic in Topic::ALL {
+            assert_eq!(of_service(&topic.service("rear")), Some(("rear", Some(topic))));
+            assert_eq!(Topic::parse(topic.name()), Some(topic));
+        }
+        assert_eq!(of_service(&Wake::service("rear")), Some(("rear", None)));
+        assert_eq!(of_service("scanhub/v2/rear/scan"), None);
+        assert_eq!(of_service("scanhub/v1/control"), None);
+    }
+
+    #[test]
+    fn names_of_sensors() {
+        assert!(check_sensor("front_2-b").is_ok());
+        for bad in ["", "Front", "a/b", "a b", "ä", &"a".repeat(25)] {
+            assert_eq!(check_sensor(bad).map_err(|failure| failure.kind), Err(Kind::Configuration), "{bad}");
+        }
+    }
+}

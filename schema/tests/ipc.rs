@@ -1,0 +1,192 @@
+//! Topics in shared memory, each test in a domain of its own.
+#![cfg(feature = "ipc")]
+
+use std::path::PathBuf;
+use std::sync::atomic::{AtomicU32, Ordering};
+
+use schema::ipc::{self, Payload, PortFactory};
+use schema::{Domain, Header, HubLock, Kind, Scan, Status, Topic, Wake, holder, limits};
+
+/// A domain that goes with the test.
+struct Place {
+    base: PathBuf,
+    domain: Domain,
+}
+
+impl Place {
+    fn new() -> Place {
+        static NEXT: AtomicU32 = AtomicU32::new(0);
+        let number = NEXT.fetch_add(1, Ordering::Relaxed);
+        let base = PathBuf::from(format!("/tmp/shs{}-{number}", std::process::id()));
+        let domain = Domain::at(&format!("s{}-{number}", std::process::id()), &base).unwrap();
+        Place { base, domain }
+    }
+}
+
+impl Drop for Place {
+    fn drop(&mut self) {
+        let _ = std::fs::remove_dir_all(&self.base);
+        // The node management of a domain outlives its nodes.
+        for entry in std::fs::read_dir("/dev/shm").into_iter().flatten().flatten() {
+            if entry.file_name().to_string_lossy().starts_with(&self.domain.prefix()) {
+                let _ = std::fs::remove_file(entry.path());
+            }
+        }
+    }
+}
+
+#[test]
+fn a_scan_is_written_and_read_in_place() {
+    let place = Place::new();
+    let hub = ipc::hub_node(&place.domain).unwrap();
+    let topic = Scan::create(&hub, "front").unwrap();
+    let publisher = Scan::publisher(&topic).unwrap();
+
+    let client = ipc::client_node(&place.domain).unwrap();
+    let seen = Scan::open(&client, "front").unwrap().expect("the hub made it");
+    let subscriber = Scan::subscriber(&seen).unwrap();
+
+    let mut sample = publisher.loan().unwrap();
+    *sample.user_header_mut() = Header { seq: 7, topic_seq: 3, ..Header::default() };
+    let scan = sample.payload_mut();
+    scan.count = 2;
+    scan.range_array[..2].copy_from_slice(&[11, 12]);
+    assert_eq!(sample.send().unwrap(), 1);
+
+    let received = Scan::receive(&subscriber).unwrap().expect("one was sent");
+    assert_eq!((received.user_header().seq, received.user_header().topic_seq), (7, 3));
+    assert_eq!(received.ranges(), [11, 12]);
+    assert!(Scan::receive(&subscriber).unwrap().is_none());
+    let types = seen.static_config().message_type_details();
+    assert_eq!((types.payload.size(), types.user_header.size()), (1216, 64));
+    assert_eq!(types.payload.type_name().to_string(), Topic::Scan.payload());
+    assert_eq!(types.user_header.type_name().to_string(), "scanhub.Header.v1");
+    let revision = seen.attributes().iter().next().map(|it| (it.key().to_string(), it.value().to_string()));
+    assert_eq!(revision, Some(("revision".into(), "1".into())));
+}
+
+#[test]
+fn a_telegram_is_as_long_as_it_is() {
+    let place = Place::new();
+    let hub = ipc::hub_node(&place.domain).unwrap();
+    let topic = <[u8]>::create(&hub, "front").unwrap();
+    let publisher = <[u8]>::publisher(&topic).unwrap();
+    let subscriber = <[u8]>::subscriber(&topic).unwrap();
+    for length in [9, 814] {
+        let bytes: Vec<u8> = (0..length).map(|i| i as u8).collect();
+        publisher.loan_slice_uninit(length).unwrap().write_from_slice(&bytes).send().unwrap();
+        assert_eq!(*<[u8]>::receive(&subscriber).unwrap().expect("one was sent"), *bytes);
+    }
+    assert!(publisher.loan_slice_uninit(815).is_err());
+}
+
+#[test]
+fn a_late_consumer_gets_the_last_status() {
+    let place = Place::new();
+    let hub = ipc::hub_node(&place.domain).unwrap();
+    let topic = Status::create(&hub, "front").unwrap();
+    let publisher = Status::publisher(&topic).unwrap();
+    for baud in [9600, 38400] {
+        let mut sample = publisher.loan().unwrap();
+        sample.payload_mut().baud = baud;
+        assert_eq!(sample.send().unwrap(), 0);
+    }
+    let subscriber = Status::subscriber(&topic).unwrap();
+    schema::ipc::UpdateConnections::update_connections(&publisher).unwrap();
+    assert_eq!(Status::receive(&subscriber).unwrap().expect("history").baud, 38400);
+    assert!(Status::receive(&subscriber).unwrap().is_none());
+}
+
+#[test]
+fn a_full_queue_drops_the_oldest_and_nobody_waits() {
+    let place = Place::new();
+    let hub = ipc::hub_node(&place.domain).unwrap();
+    let topic = Scan::create(&hub, "front").unwrap();
+    let publisher = Scan::publisher(&topic).unwrap();
+    let subscriber = Scan::subscriber(&topic).unwrap();
+    for seq in 0..100 {
+        let mut sample = publisher.loan().unwrap();
+        sample.user_header_mut().seq = seq;
+        sample.send().unwrap();
+    }
+    let held: Vec<_> =
+        (0..4).map(|_| Scan::receive(&subscriber).unwrap().unwrap().user_header().seq).collect();
+    assert_eq!(held, [84, 85, 86, 87]);
+}
+
+#[test]
+fn a_second_publisher_is_refused() {
+    let place = Place::new();
+    let hub = ipc::hub_node(&place.domain).unwrap();
+    let topic = Scan::create(&hub, "front").unwrap();
+    let _first = Scan::publisher(&topic).unwrap();
+    let other = ipc::hub_node(&place.domain).unwrap();
+    let again = Scan::create(&other, "front").unwrap();
+    assert_eq!(Scan::publisher(&again).unwrap_err().kind, Kind::DomainHeld);
+}
+
+#[test]
+fn limits_are_those_of_the_contract() {
+    let place = Place::new();
+    let hub = ipc::hub_node(&place.domain).unwrap();
+    let scan = Scan::create(&hub, "front").unwrap();
+    let config = scan.static_config();
+    assert_eq!((config.max_publishers(), config.max_subscribers(), config.max_nodes()), (1, 200, 260));
+    assert_eq!((config.subscriber_max_buffer_size(), config.subscriber_max_borrowed_samples()), (16, 4));
+    assert_eq!((config.history_size(), config.has_safe_overflow()), (0, true));
+    let status = Status::create(&hub, "front").unwrap();
+    let config = status.static_config();
+    assert_eq!((config.subscriber_max_buffer_size(), config.history_size()), (4, 1));
+    let wake = ipc::create_wake(&hub, "front").unwrap();
+    let config = wake.static_config();
+    assert_eq!((config.max_listeners(), config.max_nodes(), config.event_id_max_value()), (200, 260, 7));
+    assert_eq!(limits::samples(Topic::Scan), 16 + 800 + 2);
+}
+
+#[test]
+fn consumers_wake_for_every_reason() {
+    let place = Place::new();
+    let hub = ipc::hub_node(&place.domain).unwrap();
+    let wake = ipc::create_wake(&hub, "front").unwrap();
+    let client = ipc::client_node(&place.domain).unwrap();
+    let seen = ipc::open_wake(&client, "front").unwrap().expect("the hub made it");
+    let listener = ipc::listener(&seen).unwrap();
+    let heard = || {
+        let mut ids = Vec::new();
+        listener.try_wait(|event| ids.push(event.id.as_value())).unwrap();
+        ids
+    };
+    let notifier = ipc::notifier(&wake).unwrap();
+    assert_eq!(heard(), [Wake::HubUp as usize]);
+    assert_eq!(ipc::notify(&notifier, Wake::Telegram).unwrap(), 1);
+    assert_eq!(heard(), [Wake::Telegram as usize]);
+    drop(notifier);
+    assert_eq!(heard(), [Wake::HubDown as usize]);
+}
+
+#[test]
+fn what_is_not_there_is_nothing_and_sensors_are_listed() {
+    let place = Place::new();
+    let hub = ipc::hub_node(&place.domain).unwrap();
+    assert!(Scan::open(&hub, "front").unwrap().is_none());
+    assert!(ipc::open_wake(&hub, "front").unwrap().is_none());
+    assert!(ipc::sensors(&place.domain).unwrap().is_empty());
+    let _topics = (Scan::create(&hub, "rear").unwrap(), Status::create(&hub, "rear").unwrap());
+    let _other = <[u8]>::create(&hub, "front").unwrap();
+    assert_eq!(ipc::sensors(&place.domain).unwrap(), ["front", "rear"]);
+}
+
+#[test]
+fn one_hub_holds_a_domain() {
+    let place = Place::new();
+    let root = place.domain.root();
+    assert_eq!(holder(root), Ok(None));
+    let lock = HubLock::acquire(root).unwrap();
+    assert_eq!(holder(root), Ok(Some(std::process::id())));
+    let second = HubLock::acquire(root).unwrap_err();
+    assert_eq!(second.kind, Kind::DomainHeld);
+    assert!(second.message.contains(&format!("pid {}", std::process::id())), "{second}");
+    drop(lock);
+    assert_eq!(holder(root), Ok(None));
+    let _again = HubLock::acquire(root).unwrap();
+}
