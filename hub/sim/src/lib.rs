@@ -1,1 +1,18 @@
-//! hub/sim
+//! The sensor at the other end of the wire: a simulated SICK LMS 2xx on a pty, for tests, demonstrations and
+//! measurements without hardware.
+//!
+//! [`machine`] is the sensor itself, without I/O and clock; [`room`] is what it sees; [`fault`] and [`noise`] are what
+//! happens on the line; [`pty`] is the only file that knows real time and ports; [`simulate`] is the verb. It uses the
+//! protocol crate's other direction and knows nothing of the hub.
+
+mod answer;
+mod ear;
+pub mod machine;
+mod people;
+pub mod room;
+mod shape;
+pub mod source;
+mod transmission;
+
+pub use ear::Arrival;
+pub use transmission::ChunkSize;
