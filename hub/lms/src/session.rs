@@ -10,7 +10,7 @@ use crate::dialogue::{Dialogue, Reason, Settings};
 use crate::framer::{Advance, Framer, Place, Tally, suspect};
 use crate::sensor::{Sensor, State, Trouble};
 use crate::telegram::Telegram;
-use crate::variant::Baud;
+use crate::variant::{Baud, Mode};
 
 /// What the session wants, in the order in which it wants it.
 #[derive(Debug)]
@@ -58,8 +58,21 @@ pub struct Received<'a> {
     pub last: Nanos,
     /// Whether `first` is an estimate from bytes that came in one read.
     pub estimated: bool,
+    /// Whether its values can be read, if it is measured data.
+    pub values: Values,
     /// Why it is suspect, bits of [`suspect`]; 0 is clean.
     pub reasons: u8,
+}
+
+/// Whether it is known how a measured value is split into range and upper bits.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Values {
+    /// As this mode has it.
+    Known(Mode),
+    /// The sensor was asked, its answer is on the way.
+    Asked,
+    /// The sensor does not say.
+    Unknown,
 }
 
 /// One sensor's session.
@@ -226,6 +239,11 @@ impl Session {
             first: first.at,
             last,
             estimated: first.estimated,
+            values: match self.dialogue.sensor.mode {
+                Some(mode) => Values::Known(mode),
+                None if self.dialogue.awaits_acknowledge() => Values::Asked,
+                None => Values::Unknown,
+            },
             reasons: framed.reasons | if slow { suspect::SLOW } else { 0 },
         }
     }
