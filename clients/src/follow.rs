@@ -46,6 +46,8 @@ pub(crate) enum Notice {
 
 /// What a verb does with what it follows.
 pub(crate) trait Sink {
+    /// A topic will be followed.
+    fn begin(&mut self, _name: &TopicName) {}
     /// A sample came.
     fn sample(&mut self, name: &TopicName, sample: &Sample) -> Result<(), End>;
     /// Something went wrong, or right again; without a name as long as it is not known what is followed.
@@ -67,6 +69,7 @@ pub(crate) fn follow(
     sink: &mut dyn Sink,
 ) -> Result<(), End> {
     let mut run = Run::new(names, places, bounds);
+    names.iter().for_each(|name| sink.begin(name));
     let end = run.run(stop, sink);
     if !matches!(end, Err(End::ReaderGone)) {
         for track in &run.tracks {
@@ -154,7 +157,9 @@ impl<'a> Run<'a> {
         {
             for sensor in self.sensors()? {
                 for topic in Topic::ALL {
-                    self.tracks.push(Track::new(TopicName { sensor: sensor.clone(), topic }));
+                    let track = Track::new(TopicName { sensor: sensor.clone(), topic });
+                    sink.begin(&track.name);
+                    self.tracks.push(track);
                 }
             }
         }

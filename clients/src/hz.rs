@@ -42,7 +42,7 @@ pub fn hz(
     let mut hz = Hz {
         json: options.json,
         length: options.window,
-        windows: names.iter().map(|name| (name.clone(), Window::new(options.window))).collect(),
+        windows: Vec::new(),
         next: Instant::now() + EVERY,
         out: Output::new(out),
         notes: Output::new(notes),
@@ -61,19 +61,15 @@ struct Hz<'a> {
     notes: Output<'a>,
 }
 
-impl Hz<'_> {
-    fn window(&mut self, name: &TopicName) -> &mut Window {
-        let place = self.windows.iter().position(|(known, _)| known == name).unwrap_or_else(|| {
-            self.windows.push((name.clone(), Window::new(self.length)));
-            self.windows.len() - 1
-        });
-        &mut self.windows[place].1
-    }
-}
-
 impl Sink for Hz<'_> {
+    fn begin(&mut self, name: &TopicName) {
+        self.windows.push((name.clone(), Window::new(self.length)));
+    }
+
     fn sample(&mut self, name: &TopicName, sample: &Sample) -> Result<(), End> {
-        self.window(name).arrived(Instant::now(), sample.missed());
+        if let Some((_, window)) = self.windows.iter_mut().find(|(known, _)| known == name) {
+            window.arrived(Instant::now(), sample.missed());
+        }
         Ok(())
     }
 

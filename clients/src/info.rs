@@ -47,7 +47,8 @@ pub fn info(options: &InfoOptions, out: &mut dyn Write, stop: &AtomicBool) -> Re
         quiet(if options.json {
             output.json(&json::status(&sensor, &status))
         } else {
-            table(&mut output, &rows(&sensor, &status, now_ns))
+            table(&mut output, &properties(&sensor, &status, now_ns))
+                .and_then(|()| table(&mut output, &counters(&status)))
         })?;
     }
     Ok(())
@@ -86,30 +87,41 @@ const PATIENCE: Duration = Duration::from_millis(1500);
 /// The history comes without a wake-up.
 const ASK_AGAIN: Duration = Duration::from_millis(10);
 
-fn rows(sensor: &str, status: &Status, now_ns: u64) -> Vec<Vec<String>> {
-    let unknown = |text: String, known: bool| if known { text } else { "unknown".into() };
+fn properties(sensor: &str, status: &Status, now_ns: u64) -> Vec<Vec<String>> {
     let seconds = now_ns.saturating_sub(status.since_ns) as f64 / 1e9;
     let state = status.state().map_or("unknown", |state| state.name());
     let step_deg = f64::from(status.resolution_cdeg) / 100.0;
+    let known = |text: String, known: bool| if known { text } else { "unknown".into() };
+    let row = |label: &str, value: String| vec![format!("{label:<WIDTH$}"), value];
     let mut rows = vec![
-        vec![sensor.to_owned(), format!("{state} for {seconds:.1} s")],
-        vec!["  type".into(), unknown(status.sensor_type().into(), !status.sensor_type().is_empty())],
-        vec!["  port".into(), status.port().into()],
-        vec!["  baud rate".into(), unknown(status.baud.to_string(), status.baud != 0)],
-        vec!["  mode".into(), unknown(format!("{:02x}", status.mode), status.mode != Status::MODE_UNKNOWN)],
-        vec!["  unit".into(), unknown(format!("{} mm", status.unit_mm), status.unit_mm != 0)],
-        vec![
-            "  view".into(),
-            unknown(format!("{} degrees in steps of {step_deg}", status.angle_deg), status.angle_deg != 0),
-        ],
-        vec!["  rate".into(), format!("{:.2} Hz", f64::from(status.rate_mhz) / 1000.0)],
+        row(sensor, format!("{state} for {seconds:.1} s")),
+        row("  type", known(status.sensor_type().into(), !status.sensor_type().is_empty())),
+        row("  port", status.port().into()),
+        row("  baud rate", known(format!("{} Bd", status.baud), status.baud != 0)),
+        row("  mode", known(format!("{:02x}h", status.mode), status.mode != Status::MODE_UNKNOWN)),
+        row("  unit", known(format!("{} mm", status.unit_mm), status.unit_mm != 0)),
+        row(
+            "  view",
+            known(format!("{} deg in steps of {step_deg}", status.angle_deg), status.angle_deg != 0),
+        ),
+        row("  rate", format!("{:.2} Hz", f64::from(status.rate_mhz) / 1000.0)),
     ];
     if !status.last_error().is_empty() {
-        rows.push(vec!["  last error".into(), status.last_error().into()]);
+        rows.push(row("  last error", status.last_error().into()));
     }
-    rows.extend(status.counters.named().map(|(name, value)| vec![format!("  {name}"), value.to_string()]));
     rows
 }
+
+fn counters(status: &Status) -> Vec<Vec<String>> {
+    status
+        .counters
+        .named()
+        .map(|(name, value)| vec![format!("  {name:<0$}", WIDTH - 2), value.to_string()])
+        .collect()
+}
+
+/// Of the labels: the longest counter's name and its indent.
+const WIDTH: usize = 21;
 
 fn monotonic_ns() -> u64 {
     let now = rustix::time::clock_gettime(rustix::time::ClockId::Monotonic);

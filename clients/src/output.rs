@@ -81,7 +81,7 @@ pub(crate) fn table(output: &mut Output<'_>, rows: &[Vec<String>]) -> Result<(),
         output.line(|line| {
             let start = line.len();
             for (cell, width) in row.iter().zip(&widths) {
-                if cell.starts_with(|c: char| c.is_ascii_digit() || c == '-') {
+                if cell.chars().all(|c| c.is_ascii_digit() || c == '.' || c == '-') {
                     write!(line, "{cell:>width$}  ")?;
                 } else {
                     write!(line, "{cell:<width$}  ")?;
