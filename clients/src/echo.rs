@@ -82,10 +82,10 @@ impl Sink for Echo<'_> {
         }
     }
 
-    fn notice(&mut self, name: Option<&TopicName>, notice: Notice) -> Result<(), End> {
+    fn notice(&mut self, names: &[&TopicName], notice: Notice) -> Result<(), End> {
         match self.format {
-            Format::Json => self.out.json(&json::notice(name, notice)),
-            _ => self.notes.line(|line| text::notice(line, name, notice)),
+            Format::Json => json::notices(&mut self.out, names, notice),
+            _ => self.notes.line(|line| text::notice(line, names, notice)),
         }
     }
 

@@ -50,8 +50,8 @@ pub(crate) trait Sink {
     fn begin(&mut self, _name: &TopicName) {}
     /// A sample came.
     fn sample(&mut self, name: &TopicName, sample: &Sample) -> Result<(), End>;
-    /// Something went wrong, or right again; without a name as long as it is not known what is followed.
-    fn notice(&mut self, name: Option<&TopicName>, notice: Notice) -> Result<(), End>;
+    /// Something went wrong, or right again, in the streams of `names`; none as long as it is not known what is followed.
+    fn notice(&mut self, names: &[&TopicName], notice: Notice) -> Result<(), End>;
     /// Called about ten times a second and after every sample.
     fn tick(&mut self, _now: Instant) -> Result<(), End> {
         Ok(())
@@ -179,7 +179,7 @@ impl<'a> Run<'a> {
                     let missed = sample.missed();
                     track.account.count(now, missed, sample.header());
                     if missed > 0 {
-                        sink.notice(Some(&track.name), Notice::Missed(missed))?;
+                        sink.notice(&[&track.name], Notice::Missed(missed))?;
                     }
                     sink.sample(&track.name, &sample)?;
                     self.last_sample = now;
@@ -201,7 +201,7 @@ impl<'a> Run<'a> {
         if self.session.domain().is_some() {
             for track in &mut self.tracks {
                 if track.account.stale(now) {
-                    sink.notice(Some(&track.name), Notice::Stale)?;
+                    sink.notice(&[&track.name], Notice::Stale)?;
                 }
             }
         }
@@ -258,10 +258,8 @@ impl<'a> Run<'a> {
 
     /// News of the hub concern every stream.
     fn notice(&self, sink: &mut dyn Sink, notice: Notice) -> Result<(), End> {
-        if self.tracks.is_empty() {
-            return sink.notice(None, notice);
-        }
-        self.tracks.iter().try_for_each(|track| sink.notice(Some(&track.name), notice))
+        let names: Vec<_> = self.tracks.iter().map(|track| &track.name).collect();
+        sink.notice(&names, notice)
     }
 
     fn wake_at(&self) -> Option<Instant> {

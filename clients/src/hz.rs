@@ -73,11 +73,11 @@ impl Sink for Hz<'_> {
         Ok(())
     }
 
-    fn notice(&mut self, name: Option<&TopicName>, notice: Notice) -> Result<(), End> {
+    fn notice(&mut self, names: &[&TopicName], notice: Notice) -> Result<(), End> {
         if self.json {
-            return self.out.json(&json::notice(name, notice));
+            return json::notices(&mut self.out, names, notice);
         }
-        self.notes.line(|line| text::notice(line, name, notice))
+        self.notes.line(|line| text::notice(line, names, notice))
     }
 
     fn tick(&mut self, now: Instant) -> Result<(), End> {

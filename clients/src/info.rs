@@ -10,7 +10,7 @@ use crate::follower::Follower;
 use crate::json;
 use crate::names::no_sensor;
 use crate::output::{Output, quiet, table};
-use crate::presence::find;
+use crate::presence::{GRACE, find};
 use crate::session::Session;
 
 /// What `info` is asked for.
@@ -30,13 +30,7 @@ pub struct InfoOptions {
 /// [`Kind::Timeout`] if a sensor's status does not come, [`Kind::Interrupted`] if `stop` is set.
 pub fn info(options: &InfoOptions, out: &mut dyn Write, stop: &AtomicBool) -> Result<(), Failure> {
     let domain = find(&options.places)?;
-    let mut sensors = ipc::sensors(&domain)?;
-    if let Some(wanted) = &options.sensor {
-        if !sensors.contains(wanted) {
-            return Err(no_sensor(wanted, &sensors));
-        }
-        sensors.retain(|sensor| sensor == wanted);
-    }
+    let sensors = wanted(options.sensor.as_deref(), &domain)?;
     let now_ns = monotonic_ns();
     let mut output = Output::new(out);
     for (sensor, status) in statuses(&domain, &sensors, stop)? {
@@ -52,6 +46,20 @@ pub fn info(options: &InfoOptions, out: &mut dyn Write, stop: &AtomicBool) -> Re
         })?;
     }
     Ok(())
+}
+
+/// The sensors to tell of. One that is not there may belong to a hub that is just starting.
+fn wanted(sensor: Option<&str>, domain: &Domain) -> Result<Vec<String>, Failure> {
+    let give_up_at = Instant::now() + GRACE;
+    loop {
+        let sensors = ipc::sensors(domain)?;
+        match sensor {
+            None => return Ok(sensors),
+            Some(sensor) if sensors.iter().any(|it| it == sensor) => return Ok(vec![sensor.to_owned()]),
+            Some(sensor) if Instant::now() >= give_up_at => return Err(no_sensor(sensor, &sensors)),
+            Some(_) => std::thread::sleep(ASK_AGAIN),
+        }
+    }
 }
 
 /// The last status of each of `sensors`, or none for one whose status does not come in time.

@@ -7,6 +7,7 @@ use serde::ser::{SerializeMap, Serializer};
 use crate::account::Account;
 use crate::follow::Notice;
 use crate::names::TopicName;
+use crate::output::{End, Output};
 
 /// What all samples of telegrams begin with.
 #[derive(Serialize)]
@@ -127,8 +128,8 @@ pub(crate) fn status<'a>(sensor: &'a str, status: &'a Status) -> impl Serialize 
     }
 }
 
-/// Class `notice`.
-pub(crate) fn notice(name: Option<&TopicName>, notice: Notice) -> impl Serialize + '_ {
+/// Class `notice`: a line for each of `names`, or one without a name.
+pub(crate) fn notices(output: &mut Output<'_>, names: &[&TopicName], notice: Notice) -> Result<(), End> {
     #[derive(Serialize)]
     struct Line<'a> {
         class: &'static str,
@@ -143,8 +144,13 @@ pub(crate) fn notice(name: Option<&TopicName>, notice: Notice) -> impl Serialize
         Notice::HubGone => ("hub_gone", 0),
         Notice::HubBack => ("hub_back", 0),
     };
-    let sensor = name.map(|name| name.sensor.as_str());
-    Line { class: "notice", kind, sensor, topic: name.map(|name| name.topic.name()), missed }
+    if names.is_empty() {
+        return output.json(&Line { class: "notice", kind, sensor: None, topic: None, missed });
+    }
+    names.iter().try_for_each(|name| {
+        let (sensor, topic) = (Some(name.sensor.as_str()), Some(name.topic.name()));
+        output.json(&Line { class: "notice", kind, sensor, topic, missed })
+    })
 }
 
 /// Class `summary`.

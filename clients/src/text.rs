@@ -29,16 +29,19 @@ pub(crate) fn sample(line: &mut Vec<u8>, name: &TopicName, sample: &Sample) -> i
     }
 }
 
-/// One notice, for stderr.
-pub(crate) fn notice(line: &mut Vec<u8>, name: Option<&TopicName>, notice: Notice) -> io::Result<()> {
-    if let Some(name) = name {
+/// One notice, for stderr; news of the hub are the same for all streams.
+pub(crate) fn notice(line: &mut Vec<u8>, names: &[&TopicName], notice: Notice) -> io::Result<()> {
+    match notice {
+        Notice::HubGone => return write!(line, "no hub, waiting for one"),
+        Notice::HubBack => return write!(line, "the hub is here"),
+        Notice::Missed(_) | Notice::Stale => {}
+    }
+    for name in names {
         write!(line, "{name}: ")?;
     }
     match notice {
         Notice::Missed(missed) => write!(line, "missed {missed}"),
-        Notice::Stale => write!(line, "nothing comes any more"),
-        Notice::HubGone => write!(line, "no hub, waiting for one"),
-        Notice::HubBack => write!(line, "the hub is here"),
+        _ => write!(line, "nothing comes any more"),
     }
 }
 

@@ -13,20 +13,20 @@ use schema::ipc::{self, Node, Notifier, Payload, PortFactory, Publisher, TopicSe
 use schema::{Domain, Failure, Header, HubLock, Scan, State, Status, Wake};
 
 /// A domain that goes with the test.
-pub struct Place {
-    pub base: PathBuf,
-    pub domain: Domain,
+pub(crate) struct Place {
+    pub(crate) base: PathBuf,
+    pub(crate) domain: Domain,
 }
 
 impl Place {
-    pub fn new() -> Place {
+    pub(crate) fn new() -> Place {
         static NEXT: AtomicU32 = AtomicU32::new(0);
         let name = format!("c{}-{}", std::process::id(), NEXT.fetch_add(1, Ordering::Relaxed));
         let base = PathBuf::from(format!("/tmp/sh{name}"));
         Place { domain: Domain::at(&name, &base).unwrap(), base }
     }
 
-    pub fn places(&self) -> Vec<Domain> {
+    pub(crate) fn places(&self) -> Vec<Domain> {
         vec![self.domain.clone()]
     }
 }
@@ -44,10 +44,10 @@ impl Drop for Place {
 }
 
 /// A topic with its own numbers.
-pub struct Port<P: Payload + ?Sized> {
-    pub service: TopicService<P>,
-    pub publisher: Publisher<P>,
-    pub topic_seq: u64,
+pub(crate) struct Port<P: Payload + ?Sized> {
+    pub(crate) service: TopicService<P>,
+    pub(crate) publisher: Publisher<P>,
+    pub(crate) topic_seq: u64,
 }
 
 impl<P: Payload + ?Sized> Port<P> {
@@ -57,19 +57,19 @@ impl<P: Payload + ?Sized> Port<P> {
     }
 
     /// Waits until `count` consumers are there.
-    pub fn await_subscribers(&self, count: usize) {
+    pub(crate) fn await_subscribers(&self, count: usize) {
         until("subscribers", || self.service.dynamic_config().number_of_subscribers() == count);
     }
 }
 
 /// One sensor of a hub.
-pub struct FakeSensor {
-    pub telegram: Port<[u8]>,
-    pub scan: Port<Scan>,
-    pub status: Port<Status>,
-    pub notifier: Notifier,
-    pub boot: u64,
-    pub seq: u64,
+pub(crate) struct FakeSensor {
+    pub(crate) telegram: Port<[u8]>,
+    pub(crate) scan: Port<Scan>,
+    pub(crate) status: Port<Status>,
+    pub(crate) notifier: Notifier,
+    pub(crate) boot: u64,
+    pub(crate) seq: u64,
 }
 
 impl FakeSensor {
@@ -88,7 +88,7 @@ impl FakeSensor {
     }
 
     /// Publishes a scan of these ranges and wakes the consumers.
-    pub fn scan(&mut self, ranges: &[u16]) {
+    pub(crate) fn scan(&mut self, ranges: &[u16]) {
         let header = self.header(self.scan.topic_seq);
         let mut sample = self.scan.publisher.loan().unwrap();
         *sample.user_header_mut() = header;
@@ -103,7 +103,7 @@ impl FakeSensor {
     }
 
     /// Publishes a telegram and wakes the consumers.
-    pub fn telegram(&mut self, bytes: &[u8]) {
+    pub(crate) fn telegram(&mut self, bytes: &[u8]) {
         let header = self.header(self.telegram.topic_seq);
         let mut sample = self.telegram.publisher.loan_slice_uninit(bytes.len()).unwrap();
         *sample.user_header_mut() = header;
@@ -114,7 +114,7 @@ impl FakeSensor {
     }
 
     /// Publishes a status and wakes the consumers.
-    pub fn status(&mut self, change: impl FnOnce(&mut Status)) {
+    pub(crate) fn status(&mut self, change: impl FnOnce(&mut Status)) {
         let header = self.header(self.status.topic_seq);
         let mut sample = self.status.publisher.loan().unwrap();
         *sample.user_header_mut() = header;
@@ -128,14 +128,14 @@ impl FakeSensor {
 }
 
 /// A hub.
-pub struct FakeHub {
-    pub sensors: Vec<FakeSensor>,
+pub(crate) struct FakeHub {
+    pub(crate) sensors: Vec<FakeSensor>,
     _node: Node,
     _lock: HubLock,
 }
 
 impl FakeHub {
-    pub fn new(domain: &Domain, sensors: &[&str], boot: u64) -> FakeHub {
+    pub(crate) fn new(domain: &Domain, sensors: &[&str], boot: u64) -> FakeHub {
         let lock = HubLock::acquire(domain.root()).unwrap();
         let node = ipc::hub_node(domain).unwrap();
         let sensor = |name: &&str| FakeSensor {
@@ -149,12 +149,12 @@ impl FakeHub {
         FakeHub { sensors: sensors.iter().map(sensor).collect(), _node: node, _lock: lock }
     }
 
-    pub fn front(&mut self) -> &mut FakeSensor {
+    pub(crate) fn front(&mut self) -> &mut FakeSensor {
         &mut self.sensors[0]
     }
 
     /// Hands the last status to newcomers until `done`.
-    pub fn serve_history(&self, done: impl Fn() -> bool) {
+    pub(crate) fn serve_history(&self, done: impl Fn() -> bool) {
         until("history taken", || {
             for sensor in &self.sensors {
                 sensor.status.publisher.update_connections().unwrap();
@@ -165,15 +165,15 @@ impl FakeHub {
 }
 
 /// A verb at work in a thread of its own, its output as it comes.
-pub struct Verb {
-    pub out: Sink,
-    pub notes: Sink,
-    pub stop: Arc<AtomicBool>,
+pub(crate) struct Verb {
+    pub(crate) out: Sink,
+    pub(crate) notes: Sink,
+    pub(crate) stop: Arc<AtomicBool>,
     thread: JoinHandle<Result<(), Failure>>,
 }
 
 impl Verb {
-    pub fn start(
+    pub(crate) fn start(
         verb: impl FnOnce(&mut dyn Write, &mut dyn Write, &AtomicBool) -> Result<(), Failure> + Send + 'static,
     ) -> Verb {
         let (out, notes, stop) = (Sink::default(), Sink::default(), Arc::new(AtomicBool::new(false)));
@@ -182,16 +182,16 @@ impl Verb {
         Verb { out, notes, stop, thread }
     }
 
-    pub fn stop(&self) {
+    pub(crate) fn stop(&self) {
         self.stop.store(true, Ordering::Relaxed);
     }
 
-    pub fn finished(&self) -> bool {
+    pub(crate) fn finished(&self) -> bool {
         self.thread.is_finished()
     }
 
     /// Waits for the end.
-    pub fn join(self) -> (Result<(), Failure>, String, String) {
+    pub(crate) fn join(self) -> (Result<(), Failure>, String, String) {
         until("the verb's end", || self.thread.is_finished());
         (self.thread.join().unwrap(), self.out.text(), self.notes.text())
     }
@@ -199,19 +199,19 @@ impl Verb {
 
 /// Bytes that were written, for another thread to look at.
 #[derive(Clone, Default)]
-pub struct Sink(Arc<Mutex<Vec<u8>>>);
+pub(crate) struct Sink(Arc<Mutex<Vec<u8>>>);
 
 impl Sink {
-    pub fn bytes(&self) -> Vec<u8> {
+    pub(crate) fn bytes(&self) -> Vec<u8> {
         self.0.lock().unwrap().clone()
     }
 
-    pub fn text(&self) -> String {
+    pub(crate) fn text(&self) -> String {
         String::from_utf8(self.bytes()).unwrap()
     }
 
     /// Waits until `count` lines contain `text`.
-    pub fn await_lines(&self, text: &str, count: usize) {
+    pub(crate) fn await_lines(&self, text: &str, count: usize) {
         until(text, || self.text().lines().filter(|line| line.contains(text)).count() >= count);
     }
 }
@@ -228,7 +228,7 @@ impl Write for Sink {
 }
 
 /// Waits until `done`, and fails after ten seconds.
-pub fn until(what: &str, mut done: impl FnMut() -> bool) {
+pub(crate) fn until(what: &str, mut done: impl FnMut() -> bool) {
     let give_up_at = Instant::now() + Duration::from_secs(10);
     while !done() {
         assert!(Instant::now() < give_up_at, "waited in vain for {what}");
