@@ -223,11 +223,13 @@ impl Session {
         let first = self.arrivals.stamp(place.offset, baud);
         let last = self.arrivals.stamp(place.offset + len - 1, baud).at;
         self.cut |= self.tally().telegrams == 1 && place.offset > 0;
-        let slow = !first.estimated && self.rhythm.is_slow(last.saturating_sub(first.at));
-        if first.estimated {
-            self.rhythm.lose();
-        } else {
+        // A recording has the pace of whoever reads it.
+        let has_rhythm = !first.estimated && !self.dialogue.settings.listen_only;
+        let slow = has_rhythm && self.rhythm.is_slow(last.saturating_sub(first.at));
+        if has_rhythm {
             self.rhythm.complete(first.at, last, self.looks <= 1);
+        } else {
+            self.rhythm.lose();
         }
         if self.framer.buffered() > 0 {
             self.begin_rhythm();
