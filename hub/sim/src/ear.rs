@@ -38,7 +38,8 @@ impl Ear {
     /// Takes a byte on a line of `baud` bits per second; returns the bytes of a request that is whole and whose gaps
     /// were not provably wrong. Its checksum was not looked at.
     pub(crate) fn hear(&mut self, byte: u8, arrival: Arrival, baud: u32) -> Option<Vec<u8>> {
-        let scaled = |span: Nanos| (span as f64 * self.speed) as Nanos;
+        let speed = self.speed;
+        let scaled = |span: Nanos| (span as f64 * speed) as Nanos;
         if let Some(last) = self.last.replace(arrival) {
             let byte_ns = scaled(line_time(1, baud));
             let shortest = arrival.not_before.saturating_sub(last.not_after + byte_ns);
