@@ -1,1 +1,154 @@
-fn main() {}
+//! The program: parses the command line, starts the log, calls one library function per verb, and turns its outcome
+//! into lines and an exit code. The only place that sees all crates.
+
+mod cli;
+
+use std::io::{self, Write};
+use std::process::ExitCode;
+use std::sync::Arc;
+use std::sync::atomic::AtomicBool;
+
+use clap::Parser;
+use clap::error::ErrorKind;
+use clients::{EchoOptions, Format, HzOptions, InfoOptions, ListOptions};
+use daemon::Config;
+use daemon::config::Sources;
+use schema::{Environment, Failure, Kind};
+use serde_json::json;
+use signal_hook::consts::{SIGINT, SIGTERM};
+use tracing::level_filters::LevelFilter;
+
+use cli::{Cli, Common, Verb};
+
+fn main() -> ExitCode {
+    let cli = match Cli::try_parse() {
+        Ok(cli) => cli,
+        Err(error) => return refuse(&error),
+    };
+    start_log();
+    match dispatch(&cli) {
+        Ok(()) => ExitCode::SUCCESS,
+        Err(failure) => {
+            // What these two print on stdout is one line that says that they are up.
+            let quiet = matches!(cli.verb, Verb::Run(_) | Verb::Simulate(_));
+            report(&failure, cli.common.json, quiet);
+            ExitCode::from(failure.kind.exit_code())
+        }
+    }
+}
+
+fn dispatch(cli: &Cli) -> Result<(), Failure> {
+    let common = &cli.common;
+    let mut out = io::stdout().lock();
+    match &cli.verb {
+        Verb::Run(run) => run_hub(run, common),
+        Verb::Demo(_) => Ok(()),
+        Verb::Simulate(_) => Ok(()),
+        Verb::List { domains: true } => {
+            clients::list_domains(&Environment::of_process().bases(), common.json, &mut out)
+        }
+        Verb::List { domains: false } => {
+            let options = ListOptions { json: common.json, places: common.places()? };
+            clients::list(&options, &mut out, &*interrupt()?)
+        }
+        Verb::Info { sensor } => {
+            let options = InfoOptions { sensor: sensor.clone(), json: common.json, places: common.places()? };
+            clients::info(&options, &mut out, &*interrupt()?)
+        }
+        Verb::Echo(echo) => {
+            let format = match (common.json, echo.csv, echo.raw) {
+                (true, ..) => Format::Json,
+                (_, true, _) => Format::Csv,
+                (_, _, true) => Format::Raw,
+                _ => Format::Text,
+            };
+            let options = EchoOptions {
+                topics: echo.topics.clone(),
+                format,
+                bounds: echo.limits.bounds(),
+                places: common.places()?,
+            };
+            clients::echo(&options, &mut out, &mut io::stderr(), &*interrupt()?)
+        }
+        Verb::Hz(hz) => {
+            let options = HzOptions {
+                topics: hz.topics.clone(),
+                json: common.json,
+                window: hz.window,
+                bounds: hz.limits.bounds(),
+                places: common.places()?,
+            };
+            clients::hz(&options, &mut out, &mut io::stderr(), &*interrupt()?)
+        }
+    }
+}
+
+fn run_hub(run: &cli::Run, common: &Common) -> Result<(), Failure> {
+    let mut files = Sources::system();
+    files.extend(run.config.clone());
+    let config = Config::load(&Sources { files, set: run.set.clone(), links: run.link.clone() })?;
+    let domain = common.hub_domain()?;
+    daemon::run(&config, &domain, |ready| {
+        let line = if common.json {
+            json!({
+                "class": "ready",
+                "domain": domain.name(),
+                "root": domain.root(),
+                "pid": std::process::id(),
+                "boot": format!("{:016x}", ready.boot),
+                "sensors": ready.sensors,
+            })
+            .to_string()
+        } else {
+            let place = domain.root().display();
+            format!("ready {} in {place}, sensors: {}", domain.name(), ready.sensors.join(", "))
+        };
+        say(&line);
+    })
+}
+
+/// A flag that SIGINT and SIGTERM set; either one also ends a wait.
+fn interrupt() -> Result<Arc<AtomicBool>, Failure> {
+    let flag = Arc::new(AtomicBool::new(false));
+    for signal in [SIGINT, SIGTERM] {
+        signal_hook::flag::register(signal, flag.clone())
+            .map_err(|error| Failure::new(Kind::Failed, format!("no signal handler: {error}"), ""))?;
+    }
+    Ok(flag)
+}
+
+/// Writes one line to stdout; whoever closed it does not want it.
+fn say(line: &str) {
+    let _ = io::stdout().lock().write_all(format!("{line}\n").as_bytes());
+}
+
+fn report(failure: &Failure, json: bool, quiet: bool) {
+    match (json, quiet) {
+        (true, false) => say(&clients::error_line(failure)),
+        (true, true) => eprintln!("{}", clients::error_line(failure)),
+        (false, _) => eprintln!("scanhub: {failure}"),
+    }
+}
+
+/// The command line cannot be understood, or asks for help only.
+fn refuse(error: &clap::Error) -> ExitCode {
+    let wants_text = matches!(error.kind(), ErrorKind::DisplayHelp | ErrorKind::DisplayVersion);
+    if !wants_text && std::env::args().any(|word| word == "--json") {
+        let text = error.to_string();
+        let message = text.lines().next().unwrap_or_default().trim_start_matches("error: ");
+        report(&Failure::new(Kind::Usage, message, "scanhub --help"), true, false);
+    } else {
+        let _ = error.print();
+    }
+    ExitCode::from(if wants_text { 0 } else { Kind::Usage.exit_code() })
+}
+
+/// To stderr, down to the level in SCANHUB_LOG: error, warn, info (default), debug, trace, off.
+fn start_log() {
+    let level = std::env::var("SCANHUB_LOG").ok().and_then(|level| level.parse().ok());
+    tracing_subscriber::fmt()
+        .with_writer(io::stderr)
+        .with_max_level(level.unwrap_or(LevelFilter::INFO))
+        .with_target(false)
+        .init();
+}

@@ -10,7 +10,7 @@ use crate::dialogue::{Dialogue, Reason, Settings};
 use crate::framer::{Advance, Framer, Place, Tally, suspect};
 use crate::sensor::{Sensor, State, Trouble};
 use crate::telegram::Telegram;
-use crate::variant::Baud;
+use crate::variant::{Baud, Mode};
 
 /// What the session wants, in the order in which it wants it.
 #[derive(Debug)]
@@ -58,8 +58,21 @@ pub struct Received<'a> {
     pub last: Nanos,
     /// Whether `first` is an estimate from bytes that came in one read.
     pub estimated: bool,
+    /// Whether its values can be read, if it is measured data.
+    pub values: Values,
     /// Why it is suspect, bits of [`suspect`]; 0 is clean.
     pub reasons: u8,
+}
+
+/// Whether it is known how a measured value is split into range and upper bits.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Values {
+    /// As this mode has it.
+    Known(Mode),
+    /// The sensor was asked, its answer is on the way.
+    Asked,
+    /// The sensor does not say.
+    Unknown,
 }
 
 /// One sensor's session.
@@ -210,11 +223,13 @@ impl Session {
         let first = self.arrivals.stamp(place.offset, baud);
         let last = self.arrivals.stamp(place.offset + len - 1, baud).at;
         self.cut |= self.tally().telegrams == 1 && place.offset > 0;
-        let slow = !first.estimated && self.rhythm.is_slow(last.saturating_sub(first.at));
-        if first.estimated {
-            self.rhythm.lose();
-        } else {
+        // A recording has the pace of whoever reads it.
+        let has_rhythm = !first.estimated && !self.dialogue.settings.listen_only;
+        let slow = has_rhythm && self.rhythm.is_slow(last.saturating_sub(first.at));
+        if has_rhythm {
             self.rhythm.complete(first.at, last, self.looks <= 1);
+        } else {
+            self.rhythm.lose();
         }
         if self.framer.buffered() > 0 {
             self.begin_rhythm();
@@ -226,6 +241,11 @@ impl Session {
             first: first.at,
             last,
             estimated: first.estimated,
+            values: match self.dialogue.sensor.mode {
+                Some(mode) => Values::Known(mode),
+                None if self.dialogue.awaits_acknowledge() => Values::Asked,
+                None => Values::Unknown,
+            },
             reasons: framed.reasons | if slow { suspect::SLOW } else { 0 },
         }
     }

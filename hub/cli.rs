@@ -1,0 +1,150 @@
+//! The command line: which verbs there are and what they take. Syntax only; what a value means is checked by whoever
+//! uses it.
+
+use std::path::PathBuf;
+use std::time::Duration;
+
+use clap::{Args, Parser, Subcommand};
+use clients::{Bounds, duration};
+use schema::{DEFAULT_DOMAIN, Domain, Environment, Failure};
+
+/// Laser scanners on serial lines, for more than one program: a hub that publishes telegrams and scans into shared
+/// memory, and the programs that listen.
+#[derive(Debug, Parser)]
+#[command(version, max_term_width = 100)]
+pub(crate) struct Cli {
+    #[command(subcommand)]
+    pub(crate) verb: Verb,
+    #[command(flatten)]
+    pub(crate) common: Common,
+}
+
+/// What every verb takes.
+#[derive(Args, Clone, Debug)]
+pub(crate) struct Common {
+    /// Domain of the hub: 1 to 16 of a-z, 0-9 and -
+    #[arg(long, global = true, env = "SCANHUB_DOMAIN", default_value = DEFAULT_DOMAIN, value_name = "NAME")]
+    pub(crate) domain: String,
+    /// Directory that holds the domain, instead of the usual ones
+    #[arg(long, global = true, value_name = "DIR")]
+    pub(crate) root: Option<PathBuf>,
+    /// One JSON object per line
+    #[arg(long, global = true)]
+    pub(crate) json: bool,
+}
+
+impl Common {
+    /// The domain as a hub opens it.
+    pub(crate) fn hub_domain(&self) -> Result<Domain, Failure> {
+        Domain::of_hub(&self.domain, self.root.as_deref(), &Environment::of_process())
+    }
+
+    /// The places in which a client looks for it.
+    pub(crate) fn places(&self) -> Result<Vec<Domain>, Failure> {
+        Domain::candidates(&self.domain, self.root.as_deref(), &Environment::of_process())
+    }
+}
+
+#[derive(Debug, Subcommand)]
+pub(crate) enum Verb {
+    /// The hub, in the foreground, until SIGINT or SIGTERM
+    Run(Run),
+    /// Two simulated sensors, the hub and a consumer for each, in one terminal
+    Demo(Demo),
+    /// Sensors at the other end of ptys
+    Simulate(Simulate),
+    /// Sensors and topics of the running hub
+    List {
+        /// Every live domain of this user instead
+        #[arg(long)]
+        domains: bool,
+    },
+    /// State, settings and counters of sensors
+    Info {
+        /// One sensor instead of all
+        sensor: Option<String>,
+    },
+    /// Samples as they come
+    Echo(Echo),
+    /// Rate, jitter and loss of topics
+    Hz(Hz),
+}
+
+#[derive(Args, Debug)]
+pub(crate) struct Run {
+    /// TOML file, read after those in /etc/scanhub
+    #[arg(long, env = "SCANHUB_CONFIG", value_name = "FILE")]
+    pub(crate) config: Option<PathBuf>,
+    /// A link with its defaults; PORT is a tty or file:PATH[?rate=max]
+    #[arg(long, value_name = "NAME=PORT")]
+    pub(crate) link: Vec<String>,
+    /// One value, for example link.front.angle=100
+    #[arg(long, value_name = "KEY=VALUE")]
+    pub(crate) set: Vec<String>,
+}
+
+#[derive(Args, Debug)]
+pub(crate) struct Demo {
+    /// No live view: a summary line per sensor at the end, and exit 5 if a telegram was lost
+    #[arg(long)]
+    pub(crate) headless: bool,
+    /// How long, for example 10s; without it until Ctrl-C
+    #[arg(long = "for", value_name = "DURATION", value_parser = duration::parse)]
+    pub(crate) run_for: Option<Duration>,
+    /// Seed of rooms and people
+    #[arg(long, default_value_t = 1)]
+    pub(crate) seed: u64,
+}
+
+#[derive(Args, Debug)]
+pub(crate) struct Limits {
+    /// End after so many samples
+    #[arg(short = 'n', value_name = "COUNT", value_parser = clap::value_parser!(u64).range(1..))]
+    count: Option<u64>,
+    /// End after so long, for example 10s, 250ms, 5m
+    #[arg(long = "for", value_name = "DURATION", value_parser = duration::parse)]
+    run_for: Option<Duration>,
+    /// Longest silence, before the first sample and between two; then exit 3
+    #[arg(long, value_name = "DURATION", value_parser = duration::parse)]
+    timeout: Option<Duration>,
+}
+
+impl Limits {
+    pub(crate) fn bounds(&self) -> Bounds {
+        Bounds { count: self.count, run_for: self.run_for, timeout: self.timeout }
+    }
+}
+
+#[derive(Args, Debug)]
+pub(crate) struct Echo {
+    /// What to follow: front/scan, rear/telegram, front/status ..
+    #[arg(required = true, value_name = "SENSOR/TOPIC")]
+    pub(crate) topics: Vec<String>,
+    /// Comma-separated values
+    #[arg(long, conflicts_with_all = ["json", "raw"])]
+    pub(crate) csv: bool,
+    /// The bytes themselves: telegrams, or the payload of another topic
+    #[arg(long, conflicts_with = "json")]
+    pub(crate) raw: bool,
+    #[command(flatten)]
+    pub(crate) limits: Limits,
+}
+
+#[derive(Args, Debug)]
+pub(crate) struct Hz {
+    /// What to follow; all topics if nothing is named
+    #[arg(value_name = "SENSOR/TOPIC")]
+    pub(crate) topics: Vec<String>,
+    /// Span of time that a line looks back on
+    #[arg(long, default_value = "10s", value_name = "DURATION", value_parser = duration::parse)]
+    pub(crate) window: Duration,
+    #[command(flatten)]
+    pub(crate) limits: Limits,
+}
+
+#[derive(Args, Debug)]
+pub(crate) struct Simulate {
+    /// Where each sensor's pty shall appear, as a symlink
+    #[arg(long, required = true, value_name = "PATH")]
+    pub(crate) port: Vec<PathBuf>,
+}

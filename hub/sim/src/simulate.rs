@@ -1,0 +1,172 @@
+//! The verb `simulate`: sensors on ptys until it is told to stop. Builds them from the options, gives each a thread,
+//! and writes the truth. Printing and signals are the program's affair.
+
+use std::os::fd::{AsFd, BorrowedFd, OwnedFd};
+use std::path::PathBuf;
+
+use lms::variant::{Mode, Unit, Variant};
+use recording::{Encoding, Frame, Recording};
+use rustix::event::{EventfdFlags, eventfd};
+use schema::{Failure, Kind};
+
+use crate::fault::Loss;
+use crate::line::{Line, Time};
+use crate::machine::{Machine, Settings};
+use crate::options::SimulateOptions;
+use crate::place::Place;
+use crate::pty::{Pty, now_ns};
+use crate::room::Room;
+use crate::source::Source;
+use crate::truth::{Record, Summary, Truth};
+
+/// A port that is there to be opened.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Ready {
+    /// The symlink as the user named it.
+    pub port: PathBuf,
+    /// The pty behind it.
+    pub pty: PathBuf,
+}
+
+/// Simulates the sensors of `options` until `stop` is readable, and says what each port sent. `on_ready` is called once
+/// all ports are there, `tell` with each telegram sent, from the port's thread and in its pace. The symlinks are gone
+/// when this returns.
+pub fn simulate(
+    options: &SimulateOptions,
+    stop: impl AsFd,
+    on_ready: impl FnOnce(&[Ready]),
+    tell: impl Fn(&Record) + Sync,
+) -> Result<Vec<Summary>, Failure> {
+    check(options)?;
+    let recording = options.replay.as_ref().map(Recording::open).transpose()?;
+    let truth = options.truth.as_deref().map(Truth::create).transpose()?;
+    let tell = |record: &Record| {
+        tell(record);
+        truth.as_ref().map_or(Ok(()), |truth| truth.write(&record.line()))
+    };
+    let mut places = Vec::new();
+    let mut ready = Vec::new();
+    let mut lines = Vec::new();
+    let time = Time { zero_ns: now_ns(), speed: options.speed };
+    for (number, port) in options.ports.iter().enumerate() {
+        let seed = options.seed.wrapping_add(number as u64);
+        let (settings, source) = sensor(options, recording.as_ref(), seed)?;
+        let machine = Machine::new(settings, source);
+        let pty = Pty::open()?;
+        places.push(Place::new(port, pty.name())?);
+        ready.push(Ready { port: port.clone(), pty: pty.name().to_owned() });
+        let loss = Loss::new(options.faults, seed);
+        lines.push(Line { port: port.clone(), pty, machine, loss, time, tell: &tell });
+    }
+    on_ready(&ready);
+    let summaries = run(lines, stop.as_fd())?;
+    if let Some(truth) = &truth {
+        for summary in &summaries {
+            truth.write(&summary.line())?;
+        }
+    }
+    Ok(summaries)
+}
+
+/// Runs each line in a thread of its own; if one fails, the others end too.
+fn run(lines: Vec<Line<'_>>, stop: BorrowedFd<'_>) -> Result<Vec<Summary>, Failure> {
+    let failed: OwnedFd = eventfd(0, EventfdFlags::CLOEXEC)
+        .map_err(|errno| Failure::new(Kind::Short, format!("cannot make an eventfd: {errno}"), ""))?;
+    std::thread::scope(|scope| {
+        let threads: Vec<_> = lines
+            .into_iter()
+            .map(|line| {
+                let failed = &failed;
+                scope.spawn(move || {
+                    let outcome = line.run([stop, failed.as_fd()]);
+                    if outcome.is_err() {
+                        let _ = rustix::io::write(failed, &1u64.to_ne_bytes());
+                    }
+                    outcome
+                })
+            })
+            .collect();
+        let join = |thread: std::thread::ScopedJoinHandle<'_, _>| match thread.join() {
+            Ok(outcome) => outcome,
+            Err(panic) => std::panic::resume_unwind(panic),
+        };
+        threads.into_iter().map(join).collect()
+    })
+}
+
+/// A sensor as the flags, else the recording, else the factory have it, and what it sends.
+fn sensor(
+    options: &SimulateOptions,
+    recording: Option<&Recording>,
+    seed: u64,
+) -> Result<(Settings, Source), Failure> {
+    let contents = recording.map(Recording::contents);
+    let variant = options.variant.or(contents.and_then(|c| c.variant)).unwrap_or(Variant::HALF);
+    let unit = options.unit.or(contents.and_then(|c| c.unit)).unwrap_or(Unit::Mm);
+    let mode = options.mode.or(contents.and_then(|c| c.mode)).unwrap_or(Mode(0x01));
+    let settings = Settings {
+        type_name: options.model.type_name().into(),
+        baud: options.baud,
+        variant,
+        unit,
+        mode,
+        chunk: options.chunk,
+        speed: options.speed,
+        seed,
+        ..Settings::default()
+    };
+    let source = match recording {
+        None => Source::Room(Room::new(options.world, seed)),
+        Some(recording) => {
+            let telegrams = scans(recording, Encoding { unit, mode }, options.looped)?;
+            Source::Recorded { variant, telegrams }
+        }
+    };
+    Ok((settings, source))
+}
+
+/// The scans of `recording`, once or again and again.
+fn scans(
+    recording: &Recording,
+    encoding: Encoding,
+    looped: bool,
+) -> Result<Box<dyn Iterator<Item = Vec<u8>> + Send>, Failure> {
+    if recording.contents().scans == 0 {
+        return Err(Failure::new(
+            Kind::Configuration,
+            format!("recording {} holds no scan", recording.path().display()),
+            "replay a stream with measured-value telegrams (B0h), or a CARMEN log with FLASER lines",
+        ));
+    }
+    let recording = recording.clone();
+    let mut telegrams = recording.telegrams(encoding)?;
+    Ok(Box::new(std::iter::from_fn(move || {
+        if let Some(frame) = telegrams.find(Frame::is_scan) {
+            return Some(frame.telegram);
+        }
+        if !looped {
+            return None;
+        }
+        telegrams = recording.telegrams(encoding).ok()?;
+        telegrams.find(Frame::is_scan).map(|frame| frame.telegram)
+    })))
+}
+
+fn check(options: &SimulateOptions) -> Result<(), Failure> {
+    let wrong = |message: String, hint: &str| Err(Failure::new(Kind::Configuration, message, hint));
+    if options.ports.is_empty() {
+        return wrong("no port to simulate".into(), "name one with --port PATH");
+    }
+    for (number, port) in options.ports.iter().enumerate() {
+        if options.ports[..number].contains(port) {
+            return wrong(format!("port {} is named twice", port.display()), "each sensor needs a path of its own");
+        }
+    }
+    if !(0.01..=100.0).contains(&options.speed) {
+        return wrong(format!("speed {} is out of range", options.speed), "a number from 0.01 to 100");
+    }
+    if options.looped && options.replay.is_none() {
+        return wrong("--loop without a recording".into(), "name one with --replay FILE");
+    }
+    Ok(())
+}

@@ -1,0 +1,132 @@
+//! What was really sent: one record per telegram and one per port at the end, as lines for a file. Knows neither the
+//! sensor nor the port; nothing here is ever told to the hub.
+
+use std::fs::File;
+use std::io::Write;
+use std::path::{Path, PathBuf};
+use std::sync::Mutex;
+
+use schema::{Failure, Kind};
+use serde_json::json;
+use sha2::{Digest, Sha256};
+
+use crate::fault::Fault;
+
+/// A telegram that the sensor sent.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Record {
+    /// The port as it was named.
+    pub port: PathBuf,
+    /// Number of the telegram on this port, data and replies together, from 0.
+    pub index: u64,
+    /// Whether it is a reply, and not data of the stream.
+    pub is_reply: bool,
+    /// Bytes of the intact telegram.
+    pub length: usize,
+    /// SHA-256 of the intact telegram.
+    pub sha256: [u8; 32],
+    /// CLOCK_MONOTONIC after its last byte was written, in nanoseconds.
+    pub sent_ns: u64,
+    /// Why it did not arrive as it should have, if so.
+    pub fault: Option<Fault>,
+}
+
+impl Record {
+    /// SHA-256 of `telegram`.
+    pub fn hash(telegram: &[u8]) -> [u8; 32] {
+        Sha256::digest(telegram).into()
+    }
+
+    /// Its line, without the end; the keys in the order of the contract.
+    pub fn line(&self) -> String {
+        let port = json!(self.port.to_string_lossy());
+        let kind = if self.is_reply { "reply" } else { "data" };
+        let sha256 = self.sha256.map(|byte| format!("{byte:02x}")).concat();
+        let fault = json!(self.fault.map(Fault::name));
+        let Record { index, length, sent_ns, .. } = self;
+        format!(
+            r#"{{"class":"truth","port":{port},"index":{index},"kind":"{kind}","length":{length},"sha256":"{sha256}","sent_ns":{sent_ns},"fault":{fault}}}"#
+        )
+    }
+}
+
+/// What a port sent in all.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Summary {
+    /// The port as it was named.
+    pub port: PathBuf,
+    /// Telegrams sent: the number of its records, those with a fault too.
+    pub sent: u64,
+    /// Requests heard that would have written the sensor's EEPROM.
+    pub eeprom_writes: u64,
+}
+
+impl Summary {
+    /// Its line, without the end.
+    pub fn line(&self) -> String {
+        let port = json!(self.port.to_string_lossy());
+        let Summary { sent, eeprom_writes, .. } = self;
+        format!(r#"{{"class":"simulated","port":{port},"sent":{sent},"eeprom_writes":{eeprom_writes}}}"#)
+    }
+}
+
+/// A file of lines that several ports write to, one write per line.
+#[derive(Debug)]
+pub struct Truth {
+    path: PathBuf,
+    file: Mutex<File>,
+}
+
+impl Truth {
+    /// Makes or empties the file at `path`.
+    pub fn create(path: &Path) -> Result<Self, Failure> {
+        let file = File::create(path).map_err(|error| failure(path, &error))?;
+        Ok(Truth { path: path.to_owned(), file: Mutex::new(file) })
+    }
+
+    /// Appends `line`.
+    pub fn write(&self, line: &str) -> Result<(), Failure> {
+        // A thread that panicked with the lock wrote its line or not: either way the next one begins a new line.
+        let mut file = self.file.lock().unwrap_or_else(std::sync::PoisonError::into_inner);
+        file.write_all(format!("{line}\n").as_bytes()).map_err(|error| failure(&self.path, &error))
+    }
+}
+
+fn failure(path: &Path, error: &std::io::Error) -> Failure {
+    Failure::new(
+        Kind::Failed,
+        format!("cannot write the truth to {}: {error}", path.display()),
+        "give a path in a directory that exists and is writable",
+    )
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn lines_are_as_the_contract_says() {
+        let record = Record {
+            port: "/tmp/a".into(),
+            index: 3,
+            is_reply: false,
+            length: 3,
+            sha256: Record::hash(b"abc"),
+            sent_ns: 12_345_678_901_234,
+            fault: None,
+        };
+        let value: serde_json::Value = serde_json::from_str(&record.line()).unwrap();
+        assert_eq!(
+            value,
+            json!({
+                "class": "truth", "port": "/tmp/a", "index": 3, "kind": "data", "length": 3,
+                "sha256": "ba7816bf8f01cfea414140de5dae2223b00361a396177a9cb410ff61f20015ad",
+                "sent_ns": 12_345_678_901_234u64, "fault": null,
+            })
+        );
+        let reply = Record { is_reply: true, fault: Some(Fault::Unread), ..record }.line();
+        assert!(reply.contains(r#""kind":"reply""#) && reply.contains(r#""fault":"unread""#));
+        let summary = Summary { port: "/tmp/a".into(), sent: 7, eeprom_writes: 0 }.line();
+        assert!(summary.contains(r#""class":"simulated""#) && summary.contains(r#""sent":7"#));
+    }
+}
