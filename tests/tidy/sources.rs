@@ -128,7 +128,9 @@ pub(crate) fn names_say_something(tree: &Tree) -> Vec<String> {
         }
         for (number, line) in code(text) {
             let word = |c: char| !c.is_alphanumeric() && c != '_';
-            if line.contains("fn get_") || line.split(word).any(empty) {
+            // What stands between quotes is for people.
+            let named = line.split('"').step_by(2).any(|outside| outside.split(word).any(empty));
+            if line.contains("fn get_") || named {
                 breaches.push(format!("{path}:{number}: {}", line.trim()));
             }
         }
