@@ -4,13 +4,15 @@
 #![allow(missing_docs)] // criterion's macros make public functions
 
 use criterion::{Criterion, criterion_group, criterion_main};
+use daemon::scanner;
 use fastrand::Rng;
 use lms::crc::crc;
 use lms::framer::{Found, Framer};
 use lms::header::Expect;
 use lms::measured::{self, Measured};
 use lms::telegram::Telegram;
-use lms::variant::{MAX_BEAMS, Mode, Unit};
+use lms::variant::{Mode, Unit};
+use schema::Scan;
 use std::hint::black_box;
 
 /// Lengths of the reads for one telegram: as the hub reads, late on purpose, and as a UART hands bytes over.
@@ -67,18 +69,12 @@ fn framing(c: &mut Criterion) {
 fn decoding(c: &mut Criterion) {
     let telegrams = telegrams();
     let telegram = Telegram::check(&telegrams[0]).expect("a telegram");
-    let mut ranges = [0u16; MAX_BEAMS];
-    let mut upper = [0u8; MAX_BEAMS];
+    let mut scan = Scan::default();
     c.bench_function("decode of 361 beams", |b| {
         b.iter(|| {
             let measured = Measured::decode(black_box(telegram)).expect("a scan");
-            let mode = black_box(Mode(1));
-            let (mask, bits) = (mode.max_value(), mode.range_bits());
-            for ((range, upper), word) in ranges.iter_mut().zip(&mut upper).zip(measured.words()) {
-                *range = word & mask;
-                *upper = (word >> bits) as u8;
-            }
-            black_box((&mut ranges, &mut upper));
+            black_box(scanner::decode(&measured, black_box(Mode(1)), &mut scan));
+            black_box(&mut scan);
         });
     });
 }
