@@ -8,6 +8,7 @@ use crate::Nanos;
 use crate::arrival::{Arrivals, Rhythm};
 use crate::dialogue::{Dialogue, Reason, Settings};
 use crate::framer::{Advance, Framer, Place, Tally, suspect};
+use crate::measured::MEASURED;
 use crate::sensor::{Sensor, State, Trouble};
 use crate::telegram::Telegram;
 use crate::variant::{Baud, Mode};
@@ -162,7 +163,7 @@ impl Session {
         }
         if self.framer.buffered() == 0 {
             self.rhythm.lose();
-        } else if self.state() == State::Streaming
+        } else if self.is_live()
             && let Some(until) = self.rhythm.rest(self.now)
         {
             self.looks = 0;
@@ -219,12 +220,13 @@ impl Session {
 
     fn receive(&mut self, place: Place) -> Received<'_> {
         let baud = self.dialogue.baud.rate();
-        let len = self.framer.view(place).telegram.bytes().len() as u64;
+        let telegram = self.framer.view(place).telegram;
+        let (len, is_scan) = (telegram.bytes().len() as u64, telegram.command() == MEASURED);
         let first = self.arrivals.stamp(place.offset, baud);
         let last = self.arrivals.stamp(place.offset + len - 1, baud).at;
-        self.cut |= self.tally().telegrams == 1 && place.offset > 0;
-        // A recording has the pace of whoever reads it.
-        let has_rhythm = !first.estimated && !self.dialogue.settings.listen_only;
+        self.cut |= is_scan && self.tally().telegrams == 1 && self.tally().discarded > 0;
+        // Replies come when they are asked for, and a recording has the pace of whoever reads it.
+        let has_rhythm = is_scan && self.is_live() && !first.estimated;
         let slow = has_rhythm && self.rhythm.is_slow(last.saturating_sub(first.at));
         if has_rhythm {
             self.rhythm.complete(first.at, last, self.looks <= 1);
@@ -248,6 +250,11 @@ impl Session {
             },
             reasons: framed.reasons | if slow { suspect::SLOW } else { 0 },
         }
+    }
+
+    /// Whether a sensor streams, not a recording.
+    fn is_live(&self) -> bool {
+        self.state() == State::Streaming && !self.dialogue.settings.listen_only
     }
 
     fn begin_rhythm(&mut self) {
