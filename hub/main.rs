@@ -2,6 +2,7 @@
 //! into lines and an exit code. The only place that sees all crates.
 
 mod cli;
+mod demo;
 
 use std::io::{self, Write};
 use std::os::unix::net::UnixStream;
@@ -15,14 +16,22 @@ use clap::error::ErrorKind;
 use clients::{EchoOptions, Format, HzOptions, InfoOptions, ListOptions};
 use daemon::Config;
 use daemon::config::Sources;
+use rustix::process::Signal;
 use schema::{Environment, Failure, Kind};
 use serde::Serialize;
 use signal_hook::consts::{SIGINT, SIGTERM};
 use tracing::level_filters::LevelFilter;
 
 use cli::{Cli, Common, Verb};
+use demo::DemoOptions;
+
+/// In the environment of a process that shall not outlive the one that started it.
+const END_WITH_PARENT: &str = "SCANHUB_END_WITH_PARENT";
 
 fn main() -> ExitCode {
+    if std::env::var_os(END_WITH_PARENT).is_some() {
+        let _ = rustix::process::set_parent_process_death_signal(Some(Signal::TERM));
+    }
     let cli = match Cli::try_parse() {
         Ok(cli) => cli,
         Err(error) => return refuse(&error),
@@ -44,7 +53,15 @@ fn dispatch(cli: &Cli) -> Result<(), Failure> {
     let mut out = io::stdout().lock();
     match &cli.verb {
         Verb::Run(run) => run_hub(run, common),
-        Verb::Demo(_) => Ok(()),
+        Verb::Demo(demo) => {
+            let options = DemoOptions {
+                headless: demo.headless,
+                run_for: demo.run_for,
+                seed: demo.seed,
+                json: common.json,
+            };
+            demo::demo(&options, &mut out, &*interrupt()?)
+        }
         Verb::Simulate(simulate) => run_simulator(simulate, common),
         Verb::List { domains: true } => {
             clients::list_domains(&Environment::of_process().bases(), common.json, &mut out)
