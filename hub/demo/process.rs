@@ -44,7 +44,9 @@ impl Child {
             .stdout(Stdio::piped())
             .spawn()
             .map_err(failed)?;
-        if let (Some((of, lines)), Some(stdout)) = (listener, process.stdout.take()) {
+        if let Some((of, lines)) = listener
+            && let Some(stdout) = process.stdout.take()
+        {
             forward(BufReader::new(stdout), of, lines);
         }
         Ok(Child { process })
