@@ -45,7 +45,8 @@ fn scan(first: u16) -> Vec<u8> {
 
 #[test]
 fn a_stream_gives_its_telegrams_bit_for_bit_and_says_what_the_sensor_was() {
-    let telegrams = [scan(700), reply::configuration(0, Mode(4), Unit::Cm, 0x11).bytes().to_vec(), scan(1700)];
+    let telegrams =
+        [scan(700), reply::configuration(0, Mode(4), Unit::Cm, 0x11).bytes().to_vec(), scan(1700)];
     let mut bytes = b"\x06\x02\x80noise".to_vec();
     bytes.extend_from_slice(&telegrams.concat());
     // A scan that broke off for a reply, at the very end.
@@ -119,8 +120,10 @@ fn bytes_without_a_telegram_are_a_stream_without_telegrams() {
 
 #[test]
 fn recordings_of_real_sensors() {
-    let data = std::env::var_os("SCANHUB_DATA")
-        .map_or_else(|| PathBuf::from(concat!(env!("CARGO_MANIFEST_DIR"), "/../../../shared/data")), PathBuf::from);
+    let data = std::env::var_os("SCANHUB_DATA").map_or_else(
+        || PathBuf::from(concat!(env!("CARGO_MANIFEST_DIR"), "/../../../shared/data")),
+        PathBuf::from,
+    );
     if !data.is_dir() {
         println!("skipped: no recordings at {}", data.display());
         return;

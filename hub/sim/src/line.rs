@@ -139,7 +139,9 @@ impl Way {
         if self.garbled.as_ref().is_none_or(|(known, _)| *known != rates) {
             self.garbled = Some((rates, Receiver::new(rates.0, rates.1)));
         }
-        self.garbled.as_mut().map_or(Vec::new(), |(_, receiver)| receiver.receive(&chunk.bytes, chunk.idle_after))
+        self.garbled
+            .as_mut()
+            .map_or(Vec::new(), |(_, receiver)| receiver.receive(&chunk.bytes, chunk.idle_after))
     }
 }
 

@@ -135,7 +135,8 @@ mod tests {
             PathBuf::from,
         );
         let read = |name: &str| std::fs::read(data.join("captures").join(name));
-        let (Ok(real), Ok(sent)) = (read("host19200_while_sensor_38400.bin"), read("lms200_38400.bin")) else {
+        let (Ok(real), Ok(sent)) = (read("host19200_while_sensor_38400.bin"), read("lms200_38400.bin"))
+        else {
             println!("skipped: no recordings at {}", data.display());
             return;
         };

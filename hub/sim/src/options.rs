@@ -129,12 +129,8 @@ pub fn parse_unit(text: &str) -> Result<Unit, Failure> {
 
 /// `9600` and the other rates of the sensor.
 pub fn parse_baud(text: &str) -> Result<Baud, Failure> {
-    let named = [
-        ("9600", Baud::B9600),
-        ("19200", Baud::B19200),
-        ("38400", Baud::B38400),
-        ("500000", Baud::B500000),
-    ];
+    let named =
+        [("9600", Baud::B9600), ("19200", Baud::B19200), ("38400", Baud::B38400), ("500000", Baud::B500000)];
     one_of("baud", text, &named)
 }
 

@@ -59,7 +59,11 @@ impl Pty {
             Ok(pty)
         };
         make().map_err(|errno| {
-            Failure::new(Kind::Short, format!("cannot make a pty: {errno}"), "see /proc/sys/kernel/pty/nr and max")
+            Failure::new(
+                Kind::Short,
+                format!("cannot make a pty: {errno}"),
+                "see /proc/sys/kernel/pty/nr and max",
+            )
         })
     }
 
@@ -118,8 +122,7 @@ impl Pty {
     /// waited for: it would say so all the time.
     pub(crate) fn wait(&self, stops: [BorrowedFd<'_>; 2], is_open: bool, deadline_ns: Nanos) -> Wake {
         let left = deadline_ns.saturating_sub(now_ns());
-        let timeout =
-            Timespec { tv_sec: (left / 1_000_000_000) as _, tv_nsec: (left % 1_000_000_000) as _ };
+        let timeout = Timespec { tv_sec: (left / 1_000_000_000) as _, tv_nsec: (left % 1_000_000_000) as _ };
         let mut fds = [
             PollFd::from_borrowed_fd(stops[0], PollFlags::IN),
             PollFd::from_borrowed_fd(stops[1], PollFlags::IN),

@@ -101,8 +101,8 @@ impl Room {
         let mut before_mm = None;
         (0..variant.beams())
             .map(|beam| {
-                let angle_mdeg =
-                    f64::from(variant.first_angle_mdeg()) + beam as f64 * 10.0 * f64::from(variant.resolution_cdeg);
+                let angle_mdeg = f64::from(variant.first_angle_mdeg())
+                    + beam as f64 * 10.0 * f64::from(variant.resolution_cdeg);
                 let (sin, cos) = (angle_mdeg / 1000.0).to_radians().sin_cos();
                 // The beams between whole degrees are measured in the turns after the first.
                 let (range_mm, surface) = self.nearest((cos, sin), &legs[beam % turns as usize]);

@@ -159,7 +159,10 @@ fn check(options: &SimulateOptions) -> Result<(), Failure> {
     }
     for (number, port) in options.ports.iter().enumerate() {
         if options.ports[..number].contains(port) {
-            return wrong(format!("port {} is named twice", port.display()), "each sensor needs a path of its own");
+            return wrong(
+                format!("port {} is named twice", port.display()),
+                "each sensor needs a path of its own",
+            );
         }
     }
     if !(0.01..=100.0).contains(&options.speed) {
