@@ -1,5 +1,7 @@
 //! The sensor in virtual time: what it answers, when its bytes are through, and what a request does to its stream.
 
+mod bench;
+
 use lms::command::{EEPROM_WRITES, Request};
 use lms::measured::Measured;
 use lms::reply::Reply;
@@ -7,65 +9,12 @@ use lms::telegram::{ACK, NAK, Telegram, Writer};
 use lms::variant::{Baud, MIRROR_TURN, Mode, Unit, Variant};
 use lms::{MICROS, MILLIS, Nanos, line_time};
 use proptest::prelude::*;
-use sim::machine::{Chunk, Machine, Part, Sent, Settings};
+use sim::machine::{Machine, Part, Settings};
 use sim::room::{Room, World};
 use sim::source::Source;
 use sim::{Arrival, ChunkSize};
 
-/// A machine with a clock of its own and everything that it has sent.
-struct Bench {
-    machine: Machine,
-    now: Nanos,
-    chunks: Vec<(Nanos, Chunk)>,
-}
-
-impl Bench {
-    fn new(settings: Settings) -> Bench {
-        Bench::with(settings, Source::Room(Room::new(World::Room, 1)))
-    }
-
-    fn with(settings: Settings, source: Source) -> Bench {
-        Bench { machine: Machine::new(settings, source), now: 0, chunks: Vec::new() }
-    }
-
-    fn run_until(&mut self, end: Nanos) {
-        while let Some(at) = self.machine.poll_timeout().filter(|&at| at <= end) {
-            self.now = self.now.max(at);
-            while let Some(chunk) = self.machine.poll_transmit(self.now) {
-                self.chunks.push((self.now, chunk));
-            }
-        }
-        self.now = end;
-    }
-
-    /// Says `bytes` with `gap` of idle time between them.
-    fn say(&mut self, bytes: &[u8], gap: Nanos) {
-        for &byte in bytes {
-            self.run_until(self.now + line_time(1, self.machine.baud().rate()) + gap);
-            self.machine.receive(byte, Arrival::at(self.now));
-        }
-    }
-
-    /// Says `request` as it should be said, and lets half a second pass; returns what came in answer.
-    fn ask(&mut self, bytes: &[u8]) -> Vec<u8> {
-        let before = self.chunks.len();
-        self.say(bytes, 60 * MICROS);
-        self.run_until(self.now + 500 * MILLIS);
-        self.bytes_from(before)
-    }
-
-    fn bytes_from(&self, first: usize) -> Vec<u8> {
-        self.chunks[first..].iter().flat_map(|(_, chunk)| chunk.bytes.clone()).collect()
-    }
-
-    fn sent(&self) -> Vec<(Nanos, Sent)> {
-        let end = |(at, chunk): &(Nanos, Chunk)| match &chunk.part {
-            Part::End(sent) => Some((*at, sent.clone())),
-            Part::Acknowledge | Part::Telegram => None,
-        };
-        self.chunks.iter().filter_map(end).collect()
-    }
-}
+use bench::Bench;
 
 /// The reply in `bytes`, which are an ACK and one telegram.
 fn reply(bytes: &[u8]) -> Reply<'_> {
