@@ -1,1 +1,222 @@
-fn main() {}
+//! The program: parses the command line, starts the log, calls one library function per verb, and turns its outcome
+//! into lines and an exit code. The only place that sees all crates.
+
+mod cli;
+mod demo;
+
+use std::io::{self, Write};
+use std::os::unix::net::UnixStream;
+use std::path::Path;
+use std::process::ExitCode;
+use std::sync::Arc;
+use std::sync::atomic::AtomicBool;
+
+use clap::Parser;
+use clap::error::ErrorKind;
+use clients::{EchoOptions, Format, HzOptions, InfoOptions, ListOptions};
+use daemon::Config;
+use daemon::config::Sources;
+use rustix::process::Signal;
+use schema::{Environment, Failure, Kind};
+use serde::Serialize;
+use signal_hook::consts::{SIGINT, SIGTERM};
+use tracing::level_filters::LevelFilter;
+
+use cli::{Cli, Common, Verb};
+use demo::DemoOptions;
+
+/// In the environment of a process that shall not outlive the one that started it.
+const END_WITH_PARENT: &str = "SCANHUB_END_WITH_PARENT";
+
+fn main() -> ExitCode {
+    if std::env::var_os(END_WITH_PARENT).is_some() {
+        let _ = rustix::process::set_parent_process_death_signal(Some(Signal::TERM));
+    }
+    let cli = match Cli::try_parse() {
+        Ok(cli) => cli,
+        Err(error) => return refuse(&error),
+    };
+    start_log();
+    match dispatch(&cli) {
+        Ok(()) => ExitCode::SUCCESS,
+        Err(failure) => {
+            // What these two print on stdout is one line that says that they are up.
+            let quiet = matches!(cli.verb, Verb::Run(_) | Verb::Simulate(_));
+            report(&failure, cli.common.json, quiet);
+            ExitCode::from(failure.kind.exit_code())
+        }
+    }
+}
+
+fn dispatch(cli: &Cli) -> Result<(), Failure> {
+    let common = &cli.common;
+    let mut out = io::stdout().lock();
+    match &cli.verb {
+        Verb::Run(run) => run_hub(run, common),
+        Verb::Demo(demo) => {
+            let options = DemoOptions {
+                headless: demo.headless,
+                run_for: demo.run_for,
+                seed: demo.seed,
+                json: common.json,
+            };
+            demo::demo(&options, &mut out, &*interrupt()?)
+        }
+        Verb::Simulate(simulate) => run_simulator(simulate, common),
+        Verb::List { domains: true } => {
+            clients::list_domains(&Environment::of_process().bases(), common.json, &mut out)
+        }
+        Verb::List { domains: false } => {
+            let options = ListOptions { json: common.json, places: common.places()? };
+            clients::list(&options, &mut out, &*interrupt()?)
+        }
+        Verb::Info { sensor } => {
+            let options = InfoOptions { sensor: sensor.clone(), json: common.json, places: common.places()? };
+            clients::info(&options, &mut out, &*interrupt()?)
+        }
+        Verb::Echo(echo) => {
+            let format = match (common.json, echo.csv, echo.raw) {
+                (true, ..) => Format::Json,
+                (_, true, _) => Format::Csv,
+                (_, _, true) => Format::Raw,
+                _ => Format::Text,
+            };
+            let options = EchoOptions {
+                topics: echo.topics.clone(),
+                format,
+                bounds: echo.limits.bounds(),
+                places: common.places()?,
+            };
+            clients::echo(&options, &mut out, &mut io::stderr(), &*interrupt()?)
+        }
+        Verb::Hz(hz) => {
+            let options = HzOptions {
+                topics: hz.topics.clone(),
+                json: common.json,
+                window: hz.window,
+                bounds: hz.limits.bounds(),
+                places: common.places()?,
+            };
+            clients::hz(&options, &mut out, &mut io::stderr(), &*interrupt()?)
+        }
+    }
+}
+
+fn run_hub(run: &cli::Run, common: &Common) -> Result<(), Failure> {
+    let mut files = Sources::system();
+    files.extend(run.config.clone());
+    let config = Config::load(&Sources { files, set: run.set.clone(), links: run.link.clone() })?;
+    let domain = common.hub_domain()?;
+    daemon::run(&config, &domain, |ready| {
+        let line = if common.json {
+            line(&HubReady {
+                class: "ready",
+                domain: domain.name(),
+                root: domain.root(),
+                pid: std::process::id(),
+                boot: format!("{:016x}", ready.boot),
+                sensors: &ready.sensors,
+            })
+        } else {
+            let place = domain.root().display();
+            format!("ready {} in {place}, sensors: {}", domain.name(), ready.sensors.join(", "))
+        };
+        say(&line);
+    })
+}
+
+fn run_simulator(simulate: &cli::Simulate, common: &Common) -> Result<(), Failure> {
+    let options = simulate.options()?;
+    let (stop, write) = UnixStream::pair().map_err(no_handler)?;
+    for signal in [SIGINT, SIGTERM] {
+        let write = write.try_clone().map_err(no_handler)?;
+        signal_hook::low_level::pipe::register(signal, write).map_err(no_handler)?;
+    }
+    let announce = |ready: &[sim::Ready]| {
+        if common.json {
+            let ports = ready.iter().map(|one| ReadyPort { port: &one.port, pty: &one.pty }).collect();
+            say(&line(&SimulatorReady { class: "ready", ports }));
+        } else {
+            let ports: Vec<_> = ready.iter().map(|one| one.port.display().to_string()).collect();
+            say(&format!("ready {}", ports.join(" ")));
+        }
+    };
+    sim::simulate(&options, &stop, announce, |_| {}).map(drop)
+}
+
+/// The line that says that the hub is up; keys in the order of their contract.
+#[derive(Serialize)]
+struct HubReady<'a> {
+    class: &'static str,
+    domain: &'a str,
+    root: &'a Path,
+    pid: u32,
+    boot: String,
+    sensors: &'a [String],
+}
+
+/// The line that says that the simulator is up.
+#[derive(Serialize)]
+struct SimulatorReady<'a> {
+    class: &'static str,
+    ports: Vec<ReadyPort<'a>>,
+}
+
+#[derive(Serialize)]
+struct ReadyPort<'a> {
+    port: &'a Path,
+    pty: &'a Path,
+}
+
+fn line(value: &impl Serialize) -> String {
+    serde_json::to_string(value).unwrap_or_default()
+}
+
+/// A flag that SIGINT and SIGTERM set; either one also ends a wait.
+fn interrupt() -> Result<Arc<AtomicBool>, Failure> {
+    let flag = Arc::new(AtomicBool::new(false));
+    for signal in [SIGINT, SIGTERM] {
+        signal_hook::flag::register(signal, flag.clone()).map_err(no_handler)?;
+    }
+    Ok(flag)
+}
+
+fn no_handler(error: io::Error) -> Failure {
+    Failure::new(Kind::Failed, format!("no signal handler: {error}"), "")
+}
+
+/// Writes one line to stdout; whoever closed it does not want it.
+fn say(line: &str) {
+    let _ = io::stdout().lock().write_all(format!("{line}\n").as_bytes());
+}
+
+fn report(failure: &Failure, json: bool, quiet: bool) {
+    match (json, quiet) {
+        (true, false) => say(&clients::error_line(failure)),
+        (true, true) => eprintln!("{}", clients::error_line(failure)),
+        (false, _) => eprintln!("scanhub: {failure}"),
+    }
+}
+
+/// The command line cannot be understood, or asks for help only.
+fn refuse(error: &clap::Error) -> ExitCode {
+    let wants_text = matches!(error.kind(), ErrorKind::DisplayHelp | ErrorKind::DisplayVersion);
+    if !wants_text && std::env::args().any(|word| word == "--json") {
+        let text = error.to_string();
+        let message = text.lines().next().unwrap_or_default().trim_start_matches("error: ");
+        report(&Failure::new(Kind::Usage, message, "scanhub --help"), true, false);
+    } else {
+        let _ = error.print();
+    }
+    ExitCode::from(if wants_text { 0 } else { Kind::Usage.exit_code() })
+}
+
+/// To stderr, down to the level in SCANHUB_LOG: error, warn, info (default), debug, trace, off.
+fn start_log() {
+    let level = std::env::var("SCANHUB_LOG").ok().and_then(|level| level.parse().ok());
+    tracing_subscriber::fmt()
+        .with_writer(io::stderr)
+        .with_max_level(level.unwrap_or(LevelFilter::INFO))
+        .with_target(false)
+        .init();
+}

@@ -1,1 +1,31 @@
-//! clients
+//! Everyone who listens: the attach library, and the verbs that show what the hub publishes. Knows only `schema`; a hub
+//! is a lock that is held and topics that are there. Refuses to know command lines and signals: options come as structs,
+//! the wish to stop as a flag.
+
+mod account;
+mod attach;
+pub mod duration;
+mod echo;
+mod follow;
+mod follower;
+mod hz;
+mod info;
+mod json;
+mod list;
+mod names;
+mod output;
+mod presence;
+mod sample;
+mod session;
+mod text;
+mod window;
+
+pub use attach::{Attachment, attach};
+pub use echo::{EchoOptions, Format, echo};
+pub use follow::Bounds;
+pub use follower::Received;
+pub use hz::{HzOptions, hz};
+pub use info::{InfoOptions, info};
+pub use json::error as error_line;
+pub use list::{ListOptions, list, list_domains};
+pub use names::TopicName;

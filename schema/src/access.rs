@@ -17,7 +17,10 @@ pub(crate) fn failure(root: &Path, what: impl Into<String>) -> Failure {
 
 /// The failure to speak of if `root`, or the nearest directory above that exists, may not be used by this user.
 pub(crate) fn foreign(root: &Path) -> Option<Failure> {
-    let uid = rustix::process::getuid().as_raw();
+    foreign_to(rustix::process::getuid().as_raw(), root)
+}
+
+fn foreign_to(uid: u32, root: &Path) -> Option<Failure> {
     let (path, metadata) = root.ancestors().find_map(|path| Some((path, path.metadata().ok()?)))?;
     let (owner, mode) = (metadata.uid(), metadata.mode() & 0o7777);
     let other_may_enter = path != root && mode & 0o001 != 0;
@@ -29,4 +32,27 @@ pub(crate) fn foreign(root: &Path) -> Option<Failure> {
         format!("{} belongs to user {owner} with mode {mode:04o}, this is user {uid}", path.display()),
         "shared memory is for one user: run as that user, choose another --root, or take `scanhub listen` or a pipe",
     ))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_directory_of_another_user_is_named_with_owner_and_mode() {
+        let base = std::env::temp_dir().join(format!("sha{}", std::process::id()));
+        std::fs::create_dir(&base).unwrap();
+        std::fs::set_permissions(&base, std::os::unix::fs::PermissionsExt::from_mode(0o700)).unwrap();
+        let own = rustix::process::getuid().as_raw();
+        let (root, domain) = (foreign_to(own + 1, &base), foreign_to(own + 1, &base.join("domain")));
+        let (mine, shared) =
+            (foreign_to(own, &base), foreign_to(own + 1, Path::new("/tmp/there-is-no-such-place")));
+        std::fs::remove_dir(&base).unwrap();
+        for failure in [root.unwrap(), domain.unwrap()] {
+            let said =
+                format!("{} belongs to user {own} with mode 0700, this is user {}", base.display(), own + 1);
+            assert_eq!(failure.message, said);
+        }
+        assert_eq!((mine, shared), (None, None));
+    }
 }

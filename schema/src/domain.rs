@@ -61,7 +61,7 @@ impl Domain {
     /// Where a client looks for domain `name`: below `base` only if given, else every place that a hub may have
     /// chosen, in order; the first one that is live is taken. Places that are too long for a hub are left out.
     ///
-    /// [`Kind::Configuration`] if the name is not possible or no place is left.
+    /// [`Kind::Configuration`] as [`Domain::at`].
     pub fn candidates(
         name: &str,
         base: Option<&Path>,

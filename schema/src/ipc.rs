@@ -1,6 +1,8 @@
 //! From a topic to its service in shared memory, with all limits. The only file that names the builders of iceoryx2:
 //! everybody else gets ports. Refuses to know when something is sent and who reads it.
 
+mod leftover;
+mod sleep;
 mod trouble;
 
 use std::fmt::Debug;
@@ -10,8 +12,8 @@ use std::time::Duration;
 use iceoryx2::config::Config;
 use iceoryx2::port;
 use iceoryx2::prelude::{
-    AttributeVerifier, CallbackProgression, EventId, FileName, IceoryxSend, LogLevel, NodeBuilder,
-    SemanticString, ServiceName, SignalHandlingMode, set_log_level_from_env_or,
+    AttributeSet, AttributeVerifier, CallbackProgression, EventId, FileName, IceoryxSend, LogLevel,
+    NodeBuilder, SemanticString, ServiceName, SignalHandlingMode, set_log_level_from_env_or,
 };
 use iceoryx2::service::Service as _;
 use iceoryx2::service::port_factory::{event, publish_subscribe};
@@ -19,6 +21,7 @@ use iceoryx2::service::port_factory::{event, publish_subscribe};
 use self::trouble::{Trouble, create, no_port, no_publisher, open};
 use crate::{Domain, Failure, Header, Kind, Scan, Status, Topic, Wake, access, limits, of_service};
 
+pub use self::sleep::sleep;
 pub use iceoryx2::port::update_connections::UpdateConnections;
 pub use iceoryx2::port::{LoanError, ReceiveError, SendError};
 pub use iceoryx2::prelude::PortFactory;
@@ -42,7 +45,8 @@ pub type Notifier = port::notifier::Notifier<Service>;
 /// Sleeps until it is woken.
 pub type Listener = port::listener::Listener<Service>;
 
-/// The hub's node in `domain`. Cleans up what dead hubs and consumers left.
+/// The hub's node in `domain`, for who holds its [`HubLock`](crate::HubLock). Cleans up what dead hubs and consumers
+/// left.
 ///
 /// [`Kind::Failed`] with owner, mode and remedy if the directory is another user's.
 pub fn hub_node(domain: &Domain) -> Result<Node, Failure> {
@@ -78,6 +82,9 @@ pub trait Payload: IceoryxSend + Debug + 'static {
 
     /// The oldest sample that waits, or nothing.
     fn receive(subscriber: &Subscriber<Self>) -> Result<Option<Sample<Self>>, ReceiveError>;
+
+    /// The payload of a sample, in shared memory.
+    fn read(sample: &Sample<Self>) -> &Self;
 }
 
 /// iceoryx2 has a slice and a value behind two impl blocks of the same words; this says them once.
@@ -124,6 +131,10 @@ macro_rules! payload {
 
             fn receive(subscriber: &Subscriber<Self>) -> Result<Option<Sample<Self>>, ReceiveError> {
                 subscriber.receive()
+            }
+
+            fn read(sample: &Sample<Self>) -> &Self {
+                sample
             }
         }
     };
@@ -192,13 +203,23 @@ pub fn sensors(domain: &Domain) -> Result<Vec<String>, Failure> {
     Ok(sensors)
 }
 
+/// The payload's revision that the maker of a service wrote into its `attributes`; 0 if it wrote none.
+pub fn payload_revision(attributes: &AttributeSet) -> u32 {
+    let revision = attributes.iter().find(|attribute| attribute.key().as_bytes() == REVISION.as_bytes());
+    revision.and_then(|attribute| attribute.value().to_string().parse().ok()).unwrap_or_default()
+}
+
+const REVISION: &str = "revision";
+
 fn node(domain: &Domain, cleanup: bool) -> Result<Node, Failure> {
     set_log_level_from_env_or(LogLevel::Error);
     let mut config = config(domain)?;
     config.global.node.cleanup_dead_nodes_on_creation = cleanup;
     config.global.node.cleanup_dead_nodes_on_destruction = false;
     config.global.service.cleanup_dead_nodes_on_open = false;
-    if !cleanup {
+    if cleanup {
+        leftover::sweep(std::path::Path::new(&config.global.service_dir().to_string()));
+    } else {
         config.global.creation_timeout = Duration::from_millis(100);
     }
     NodeBuilder::new()
@@ -228,7 +249,7 @@ fn name(service: &str) -> Result<ServiceName, Failure> {
 fn revision(topic: Topic) -> Result<AttributeVerifier, Failure> {
     let impossible = |_| Failure::new(Kind::Failed, "the payload's revision is no attribute", "");
     let value = topic.revision().to_string();
-    let key = "revision".try_into().map_err(|_| impossible(()))?;
+    let key = REVISION.try_into().map_err(|_| impossible(()))?;
     let value = value.as_str().try_into().map_err(|_| impossible(()))?;
     AttributeVerifier::new().require(&key, &value).map_err(|_| impossible(()))
 }

@@ -1,1 +1,18 @@
-//! hub/daemon
+//! The hub: all the I/O there is. It owns the serial links, one thread each, and publishes what they say into shared
+//! memory; who listens is not its business.
+
+mod bus_error;
+mod clock;
+pub mod config;
+mod link;
+mod origin;
+mod port;
+mod preflight;
+mod replay;
+pub mod scanner;
+mod status;
+mod supervise;
+mod topics;
+
+pub use config::Config;
+pub use supervise::{Ready, run};

@@ -37,7 +37,7 @@ pub enum Reason {
 
 #[derive(Clone, Debug)]
 pub(crate) struct Dialogue {
-    settings: Settings,
+    pub(crate) settings: Settings,
     phase: Phase,
     open: Option<Outgoing>,
     change_baud: Option<Baud>,

@@ -211,7 +211,7 @@ mod tests {
         assert_eq!(judge(&[0x02, 0x80, 0x02, 0x80], &any), Judgement::Refused(Reject::Length));
         assert_eq!(judge(&[0x02, 0x80, 3, 0, 0x20], &any), Judgement::Refused(Reject::Command));
         assert_eq!(
-            judge(&[0x02, 0x80, 0xD6, 0x02, 0xB0, 0x68, 0x41], &any),
+            judge(&[0x02, 0x80, 0xD6, 0x02, 0xB0, 0x67, 0x41], &any),
             Judgement::Refused(Reject::Count)
         );
         assert_eq!(judge(&HEADER, &any), Judgement::Candidate { len: 732 });

@@ -8,9 +8,10 @@ use crate::Nanos;
 use crate::arrival::{Arrivals, Rhythm};
 use crate::dialogue::{Dialogue, Reason, Settings};
 use crate::framer::{Advance, Framer, Place, Tally, suspect};
+use crate::measured::MEASURED;
 use crate::sensor::{Sensor, State, Trouble};
 use crate::telegram::Telegram;
-use crate::variant::Baud;
+use crate::variant::{Baud, Mode};
 
 /// What the session wants, in the order in which it wants it.
 #[derive(Debug)]
@@ -58,8 +59,21 @@ pub struct Received<'a> {
     pub last: Nanos,
     /// Whether `first` is an estimate from bytes that came in one read.
     pub estimated: bool,
+    /// Whether its values can be read, if it is measured data.
+    pub values: Values,
     /// Why it is suspect, bits of [`suspect`]; 0 is clean.
     pub reasons: u8,
+}
+
+/// Whether it is known how a measured value is split into range and upper bits.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Values {
+    /// As this mode has it.
+    Known(Mode),
+    /// The sensor was asked, its answer is on the way.
+    Asked,
+    /// The sensor does not say.
+    Unknown,
 }
 
 /// One sensor's session.
@@ -149,7 +163,7 @@ impl Session {
         }
         if self.framer.buffered() == 0 {
             self.rhythm.lose();
-        } else if self.state() == State::Streaming
+        } else if self.is_live()
             && let Some(until) = self.rhythm.rest(self.now)
         {
             self.looks = 0;
@@ -206,15 +220,18 @@ impl Session {
 
     fn receive(&mut self, place: Place) -> Received<'_> {
         let baud = self.dialogue.baud.rate();
-        let len = self.framer.view(place).telegram.bytes().len() as u64;
+        let telegram = self.framer.view(place).telegram;
+        let (len, is_scan) = (telegram.bytes().len() as u64, telegram.command() == MEASURED);
         let first = self.arrivals.stamp(place.offset, baud);
         let last = self.arrivals.stamp(place.offset + len - 1, baud).at;
-        self.cut |= self.tally().telegrams == 1 && place.offset > 0;
-        let slow = !first.estimated && self.rhythm.is_slow(last.saturating_sub(first.at));
-        if first.estimated {
-            self.rhythm.lose();
-        } else {
+        self.cut |= is_scan && self.tally().telegrams == 1 && self.tally().discarded > 0;
+        // Replies come when they are asked for, and a recording has the pace of whoever reads it.
+        let has_rhythm = is_scan && self.is_live() && !first.estimated;
+        let slow = has_rhythm && self.rhythm.is_slow(last.saturating_sub(first.at));
+        if has_rhythm {
             self.rhythm.complete(first.at, last, self.looks <= 1);
+        } else {
+            self.rhythm.lose();
         }
         if self.framer.buffered() > 0 {
             self.begin_rhythm();
@@ -226,8 +243,18 @@ impl Session {
             first: first.at,
             last,
             estimated: first.estimated,
+            values: match self.dialogue.sensor.mode {
+                Some(mode) => Values::Known(mode),
+                None if self.dialogue.awaits_acknowledge() => Values::Asked,
+                None => Values::Unknown,
+            },
             reasons: framed.reasons | if slow { suspect::SLOW } else { 0 },
         }
+    }
+
+    /// Whether a sensor streams, not a recording.
+    fn is_live(&self) -> bool {
+        self.state() == State::Streaming && !self.dialogue.settings.listen_only
     }
 
     fn begin_rhythm(&mut self) {

@@ -1,0 +1,98 @@
+//! What was received of one topic and what was not, and how long its silence may be.
+
+use std::time::{Duration, Instant};
+
+use schema::{Header, Topic};
+
+/// The account of one topic in one run.
+#[derive(Clone, Debug)]
+pub(crate) struct Account {
+    topic: Topic,
+    /// Samples received.
+    pub(crate) received: u64,
+    /// Samples sent meanwhile and not received: missing numbers.
+    pub(crate) lost: u64,
+    first: Option<Instant>,
+    last: Option<Instant>,
+    period: Duration,
+    stale_said: bool,
+}
+
+impl Account {
+    /// Nothing received yet.
+    pub(crate) fn new(topic: Topic) -> Account {
+        Account {
+            topic,
+            received: 0,
+            lost: 0,
+            first: None,
+            last: None,
+            period: Duration::ZERO,
+            stale_said: false,
+        }
+    }
+
+    /// A sample came, `missed` before it did not.
+    pub(crate) fn count(&mut self, now: Instant, missed: u64, header: &Header) {
+        self.received += 1;
+        self.lost += missed;
+        self.first.get_or_insert(now);
+        self.last = Some(now);
+        self.period = Duration::from_micros(header.period_us.into());
+        self.stale_said = false;
+    }
+
+    /// Time between the first and the last sample.
+    pub(crate) fn seconds(&self) -> f64 {
+        match (self.first, self.last) {
+            (Some(first), Some(last)) => (last - first).as_secs_f64(),
+            _ => 0.0,
+        }
+    }
+
+    /// Samples per second between the first and the last, if there were two.
+    pub(crate) fn hz(&self) -> Option<f64> {
+        let seconds = self.seconds();
+        (seconds > 0.0).then(|| (self.received - 1) as f64 / seconds)
+    }
+
+    /// The silence since the last sample became too long just now; said once per silence.
+    pub(crate) fn stale(&mut self, now: Instant) -> bool {
+        let Some(last) = self.last else { return false };
+        if self.stale_said || now - last < self.deadline() {
+            return false;
+        }
+        self.stale_said = true;
+        true
+    }
+
+    /// A status comes each second; of anything else ten may be missing before it is worth a word.
+    fn deadline(&self) -> Duration {
+        match self.topic {
+            Topic::Status => Duration::from_secs(3),
+            Topic::Telegram | Topic::Scan => (self.period * 10).max(Duration::from_secs(1)),
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn rate_and_silence() {
+        let mut account = Account::new(Topic::Scan);
+        let start = Instant::now();
+        assert!(!account.stale(start + Duration::from_secs(9)));
+        for i in 0..5 {
+            account.count(start + Duration::from_millis(500 * i), i, &Header::default());
+        }
+        assert_eq!(
+            (account.received, account.lost, account.seconds(), account.hz()),
+            (5, 10, 2.0, Some(2.0))
+        );
+        assert!(!account.stale(start + Duration::from_millis(2900)));
+        assert!(account.stale(start + Duration::from_millis(3000)));
+        assert!(!account.stale(start + Duration::from_millis(9000)));
+    }
+}

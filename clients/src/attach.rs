@@ -1,0 +1,71 @@
+//! The attach library: one topic of one sensor, in place, for as long as you like. Waits for a hub that is not there
+//! yet and goes on after one that was killed. Hides what it is woken by.
+
+use std::time::{Duration, Instant};
+
+use schema::ipc::Payload;
+use schema::{DEFAULT_DOMAIN, Domain, Environment, Failure, check_sensor};
+
+use crate::follower::{Follower, Received};
+use crate::session::Session;
+
+/// Follows the topic of `sensor` that carries `P` (`[u8]`: telegram, `Scan`, `Status`), in the domain that
+/// SCANHUB_DOMAIN names. There need not be a hub yet.
+///
+/// [`Kind::Configuration`](schema::Kind) if a name is not possible.
+pub fn attach<P: Payload + ?Sized>(sensor: &str) -> Result<Attachment<P>, Failure> {
+    let name = std::env::var("SCANHUB_DOMAIN").unwrap_or_else(|_| DEFAULT_DOMAIN.to_owned());
+    Attachment::in_domain(Domain::candidates(&name, None, &Environment::of_process())?, sensor)
+}
+
+/// A topic that is being followed.
+pub struct Attachment<P: Payload + ?Sized> {
+    session: Session,
+    follower: Follower<P>,
+    timeout: Option<Duration>,
+}
+
+impl<P: Payload + ?Sized> Attachment<P> {
+    /// As [`attach`], in the first live one of `places`.
+    ///
+    /// [`Kind::Configuration`](schema::Kind) if the sensor's name is not possible.
+    pub fn in_domain(places: Vec<Domain>, sensor: &str) -> Result<Self, Failure> {
+        check_sensor(sensor)?;
+        Ok(Attachment { session: Session::new(places), follower: Follower::new(sensor), timeout: None })
+    }
+
+    /// Lets [`next`](Self::next) answer `None` after a silence of `timeout`; without it waits forever.
+    pub fn timeout(mut self, timeout: Duration) -> Self {
+        self.timeout = Some(timeout);
+        self
+    }
+
+    /// Waits for the next sample; `None` only after the timeout. Drop the sample before the next call.
+    ///
+    /// [`Kind::Short`](schema::Kind) if descriptors or places are short, [`Kind::Failed`](schema::Kind) if the domain
+    /// is another user's or the topic has another layout.
+    #[allow(clippy::should_implement_trait)] // An iterator would have to hold samples over waits.
+    pub fn next(&mut self) -> Result<Option<Received<P>>, Failure> {
+        let until = self.timeout.map(|timeout| Instant::now() + timeout);
+        loop {
+            if let Some(received) = self.try_next()? {
+                return Ok(Some(received));
+            }
+            if until.is_some_and(|until| Instant::now() >= until) {
+                return Ok(None);
+            }
+            self.session.wait(until)?;
+        }
+    }
+
+    /// The next sample if one waits; never waits itself. Failures as [`next`](Self::next).
+    pub fn try_next(&mut self) -> Result<Option<Received<P>>, Failure> {
+        self.session.look()?;
+        self.follower.receive(&mut self.session)
+    }
+
+    /// A hub lives in the domain, as of the last call of [`next`](Self::next) or [`try_next`](Self::try_next).
+    pub fn hub_lives(&self) -> bool {
+        self.session.domain().is_some()
+    }
+}

@@ -1,0 +1,134 @@
+//! `scanhub echo`: samples as text, JSON, CSV or bytes. Refuses to know where they come from.
+
+use std::io::{self, Write};
+use std::sync::atomic::AtomicBool;
+
+use schema::{Domain, Failure, Header, Kind, Scan, Topic};
+
+use crate::account::Account;
+use crate::follow::{Bounds, Notice, Sink, follow};
+use crate::names::TopicName;
+use crate::output::{End, Output, quiet};
+use crate::sample::Sample;
+use crate::{json, text};
+
+/// What `echo` is asked for.
+#[derive(Clone, Debug)]
+pub struct EchoOptions {
+    /// `SENSOR/TOPIC`, at least one; CSV and bytes take exactly one.
+    pub topics: Vec<String>,
+    /// How samples are written.
+    pub format: Format,
+    /// When it ends by itself.
+    pub bounds: Bounds,
+    /// Where the domain may be, see [`Domain::candidates`].
+    pub places: Vec<Domain>,
+}
+
+/// How samples are written.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum Format {
+    /// A line for people; notices go to `notes`.
+    #[default]
+    Text,
+    /// An object per line, notices and summary too.
+    Json,
+    /// Columns, scans only; notices and summary go to `notes`.
+    Csv,
+    /// The payloads' bytes, one after the other; notices and summary go to `notes`.
+    Raw,
+}
+
+/// Writes the samples of topics to `out` as they come; what is no sample to `notes` (stderr) if `out` is not JSON.
+/// Ends when the bounds are reached, `stop` is set, or nobody reads any more.
+///
+/// [`Kind::Usage`] if the format does not go with the topics, [`Kind::NoTopic`] with what there is,
+/// [`Kind::NoHub`] if bounded and there is none at the start, [`Kind::Timeout`], [`Kind::Interrupted`] if bounded and
+/// `stop` came first.
+pub fn echo(
+    options: &EchoOptions,
+    out: &mut dyn Write,
+    notes: &mut dyn Write,
+    stop: &AtomicBool,
+) -> Result<(), Failure> {
+    let names: Vec<_> = options.topics.iter().map(|text| TopicName::parse(text)).collect::<Result<_, _>>()?;
+    check(options.format, &names)?;
+    let mut echo =
+        Echo { format: options.format, out: Output::new(out), notes: Output::new(notes), columns: None };
+    quiet(follow(&names, &options.places, &options.bounds, stop, &mut echo))
+}
+
+struct Echo<'a> {
+    format: Format,
+    out: Output<'a>,
+    notes: Output<'a>,
+    columns: Option<usize>,
+}
+
+impl Sink for Echo<'_> {
+    fn sample(&mut self, name: &TopicName, sample: &Sample) -> Result<(), End> {
+        match (self.format, sample) {
+            (Format::Text, _) => self.out.line(|line| text::sample(line, name, sample)),
+            (Format::Raw, _) => self.out.raw(sample.bytes()),
+            (Format::Csv, Sample::Scan(scan)) => self.csv(scan.header(), scan),
+            (Format::Csv, _) => Ok(()),
+            (Format::Json, Sample::Telegram(found)) => {
+                self.out.json(&json::telegram(&name.sensor, found.header(), found))
+            }
+            (Format::Json, Sample::Scan(found)) => {
+                self.out.json(&json::scan(&name.sensor, found.header(), found))
+            }
+            (Format::Json, Sample::Status(found)) => self.out.json(&json::status(&name.sensor, found)),
+        }
+    }
+
+    fn notice(&mut self, names: &[&TopicName], notice: Notice) -> Result<(), End> {
+        match self.format {
+            Format::Json => json::notices(&mut self.out, names, notice),
+            _ => self.notes.line(|line| text::notice(line, names, notice)),
+        }
+    }
+
+    fn summary(&mut self, name: &TopicName, account: &Account) -> Result<(), End> {
+        match self.format {
+            Format::Json => self.out.json(&json::summary(name, account)),
+            Format::Text => self.out.line(|line| text::summary(line, name, account)),
+            Format::Csv | Format::Raw => self.notes.line(|line| text::summary(line, name, account)),
+        }
+    }
+}
+
+impl Echo<'_> {
+    /// A line of columns; the names of the columns first, and again if their number changes.
+    fn csv(&mut self, header: &Header, scan: &Scan) -> Result<(), End> {
+        if self.columns != Some(scan.beams()) {
+            self.columns = Some(scan.beams());
+            self.out.line(|line| {
+                write!(line, "seq,topic_seq,stamp_ns,wall_ns,quality,unit_mm,first_angle_deg,step_deg")?;
+                (0..scan.beams()).try_for_each(|i| write!(line, ",range_{i}"))
+            })?;
+        }
+        self.out.line(|line| csv(line, header, scan))
+    }
+}
+
+fn csv(line: &mut Vec<u8>, header: &Header, scan: &Scan) -> io::Result<()> {
+    let (stamp_ns, wall_ns) = (header.stamp_first_ns, header.wall_ns);
+    write!(line, "{},{},{stamp_ns},{wall_ns},{}", header.seq, header.topic_seq, header.quality().name())?;
+    write!(line, ",{},{},{}", scan.unit_mm, scan.angle_deg(0), f64::from(scan.step_mdeg) / 1000.0)?;
+    (0..scan.beams()).try_for_each(|i| match scan.range(i) {
+        Some(range) => write!(line, ",{range}"),
+        None => write!(line, ","),
+    })
+}
+
+fn check(format: Format, names: &[TopicName]) -> Result<(), Failure> {
+    let usage = |what: &str| Err(Failure::new(Kind::Usage, what, "for example `scanhub echo front/scan`"));
+    match (format, names) {
+        (_, []) => usage("echo needs a topic"),
+        (Format::Csv, [one]) if one.topic == Topic::Scan => Ok(()),
+        (Format::Csv, _) => usage("--csv takes one topic, and that a scan"),
+        (Format::Raw, [_, _, ..]) => usage("--raw takes one topic"),
+        _ => Ok(()),
+    }
+}

@@ -1,0 +1,287 @@
+//! The loop of every verb that follows topics: receive, account, say what is wrong, end when the bounds say so.
+//! Refuses to know what becomes of a sample.
+
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::{Duration, Instant};
+
+use schema::{Domain, Failure, Kind, Topic, ipc};
+
+use crate::account::Account;
+use crate::names::{TopicName, no_sensor};
+use crate::output::End;
+use crate::presence::GRACE;
+use crate::sample::{Sample, Source};
+use crate::session::Session;
+
+/// When a verb that follows ends by itself.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Bounds {
+    /// After so many samples, of all topics together (`-n`).
+    pub count: Option<u64>,
+    /// After this time (`--for`).
+    pub run_for: Option<Duration>,
+    /// As a failure, after a silence this long, before the first sample or between two (`--timeout`).
+    pub timeout: Option<Duration>,
+}
+
+impl Bounds {
+    /// The run ends by itself: no hub at its start is a failure, an interrupt too.
+    pub(crate) fn bounded(&self) -> bool {
+        self.count.is_some() || self.run_for.is_some()
+    }
+}
+
+/// What went wrong in a stream, beside its samples.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Notice {
+    /// So many samples were sent and not received.
+    Missed(u64),
+    /// Nothing came for longer than the topic's samples are apart.
+    Stale,
+    /// No hub lives in the domain.
+    HubGone,
+    /// A hub lives in the domain again.
+    HubBack,
+}
+
+/// What a verb does with what it follows.
+pub(crate) trait Sink {
+    /// A topic will be followed.
+    fn begin(&mut self, _name: &TopicName) {}
+    /// A sample came.
+    fn sample(&mut self, name: &TopicName, sample: &Sample) -> Result<(), End>;
+    /// Something went wrong, or right again, in the streams of `names`; none as long as it is not known what is followed.
+    fn notice(&mut self, names: &[&TopicName], notice: Notice) -> Result<(), End>;
+    /// Called about ten times a second and after every sample.
+    fn tick(&mut self, _now: Instant) -> Result<(), End> {
+        Ok(())
+    }
+    /// The run is over, for good or ill; nothing comes any more.
+    fn summary(&mut self, name: &TopicName, account: &Account) -> Result<(), End>;
+}
+
+/// Follows `names` (none: all topics of the hub) in the first live one of `places` until `bounds` or `stop` end it.
+pub(crate) fn follow(
+    names: &[TopicName],
+    places: &[Domain],
+    bounds: &Bounds,
+    stop: &AtomicBool,
+    sink: &mut dyn Sink,
+) -> Result<(), End> {
+    let mut run = Run::new(names, places, bounds);
+    names.iter().for_each(|name| sink.begin(name));
+    let end = run.run(stop, sink);
+    if !matches!(end, Err(End::ReaderGone)) {
+        for track in &run.tracks {
+            sink.summary(&track.name, &track.account)?;
+        }
+    }
+    end
+}
+
+struct Track {
+    name: TopicName,
+    source: Source,
+    account: Account,
+}
+
+impl Track {
+    fn new(name: TopicName) -> Track {
+        Track { source: Source::new(&name), account: Account::new(name.topic), name }
+    }
+}
+
+struct Run<'a> {
+    session: Session,
+    tracks: Vec<Track>,
+    all: bool,
+    bounds: &'a Bounds,
+    started: Instant,
+    last_sample: Instant,
+    hub_seen: Option<Instant>,
+    waiting_said: bool,
+    received: u64,
+}
+
+/// Samples taken from one topic before the next one has its turn.
+const TURN: usize = 32;
+
+impl<'a> Run<'a> {
+    fn new(names: &[TopicName], places: &[Domain], bounds: &'a Bounds) -> Run<'a> {
+        let now = Instant::now();
+        Run {
+            session: Session::new(places.to_vec()),
+            tracks: names.iter().cloned().map(Track::new).collect(),
+            all: names.is_empty(),
+            bounds,
+            started: now,
+            last_sample: now,
+            hub_seen: None,
+            waiting_said: false,
+            received: 0,
+        }
+    }
+
+    fn run(&mut self, stop: &AtomicBool, sink: &mut dyn Sink) -> Result<(), End> {
+        loop {
+            self.look(sink)?;
+            if self.take(stop, sink)? {
+                return Ok(());
+            }
+            let now = Instant::now();
+            sink.tick(now)?;
+            self.check(sink, now)?;
+            if stop.load(Ordering::Relaxed) {
+                return self.stopped();
+            }
+            if self.bounds.run_for.is_some_and(|limit| now >= self.started + limit) {
+                return self.time_is_over();
+            }
+            self.session.wait(self.wake_at())?;
+        }
+    }
+
+    /// News of the hub, and the topics of one that was waited for.
+    fn look(&mut self, sink: &mut dyn Sink) -> Result<(), End> {
+        let change = self.session.look()?;
+        if change.gone {
+            self.notice(sink, Notice::HubGone)?;
+        }
+        if change.back {
+            if self.hub_seen.is_some() || self.waiting_said {
+                self.notice(sink, Notice::HubBack)?;
+            }
+            self.hub_seen = Some(Instant::now());
+        }
+        if self.all && self.tracks.is_empty() && self.hub_seen.is_some_and(|seen| seen.elapsed() >= GRACE / 2)
+        {
+            for sensor in self.sensors()? {
+                for topic in Topic::ALL {
+                    let track = Track::new(TopicName { sensor: sensor.clone(), topic });
+                    sink.begin(&track.name);
+                    self.tracks.push(track);
+                }
+            }
+        }
+        Ok(())
+    }
+
+    /// Receives what waits; true if that was all that was asked for.
+    fn take(&mut self, stop: &AtomicBool, sink: &mut dyn Sink) -> Result<bool, End> {
+        let mut more = true;
+        while more && !stop.load(Ordering::Relaxed) {
+            more = false;
+            for track in &mut self.tracks {
+                for turn in 0..TURN {
+                    let Some(sample) = track.source.receive(&mut self.session)? else { break };
+                    more |= turn + 1 == TURN;
+                    let now = Instant::now();
+                    let missed = sample.missed();
+                    track.account.count(now, missed, sample.header());
+                    if missed > 0 {
+                        sink.notice(&[&track.name], Notice::Missed(missed))?;
+                    }
+                    sink.sample(&track.name, &sample)?;
+                    self.last_sample = now;
+                    self.received += 1;
+                    if self.bounds.count.is_some_and(|count| self.received >= count) {
+                        return Ok(true);
+                    }
+                }
+            }
+            let now = Instant::now();
+            sink.tick(now)?;
+            more &= self.bounds.run_for.is_none_or(|limit| now < self.started + limit);
+        }
+        Ok(self.bounds.count == Some(0))
+    }
+
+    /// Everything that is wrong because nothing comes.
+    fn check(&mut self, sink: &mut dyn Sink, now: Instant) -> Result<(), End> {
+        if self.session.domain().is_some() {
+            for track in &mut self.tracks {
+                if track.account.stale(now) {
+                    sink.notice(&[&track.name], Notice::Stale)?;
+                }
+            }
+        }
+        match self.hub_seen {
+            None if now - self.started >= GRACE => {
+                if self.bounds.bounded() {
+                    return Err(self.session.no_hub().into());
+                }
+                if !self.waiting_said {
+                    self.waiting_said = true;
+                    self.notice(sink, Notice::HubGone)?;
+                }
+            }
+            Some(seen) if now - seen >= GRACE => self.check_sensors()?,
+            _ => {}
+        }
+        if self.bounds.timeout.is_some_and(|limit| now - self.last_sample >= limit) {
+            let limit = self.bounds.timeout.unwrap_or_default();
+            let hint =
+                if self.session.domain().is_some() { "`scanhub info` shows why" } else { "there is no hub" };
+            return Err(Failure::new(Kind::Timeout, format!("nothing came for {limit:?}"), hint).into());
+        }
+        Ok(())
+    }
+
+    /// A hub that is up has all its topics: a sensor that is not among them is no sensor of it.
+    fn check_sensors(&mut self) -> Result<(), End> {
+        if !self.tracks.is_empty() && self.tracks.iter().all(|track| track.source.attached()) {
+            return Ok(());
+        }
+        if self.session.domain().is_none() {
+            return Ok(());
+        }
+        let sensors = self.sensors()?;
+        if self.tracks.is_empty() && sensors.is_empty() {
+            return Err(Failure::new(
+                Kind::NoTopic,
+                "the hub has no sensors",
+                "scanhub run --link NAME=PORT",
+            )
+            .into());
+        }
+        for track in &self.tracks {
+            if !track.source.attached() && !sensors.contains(&track.name.sensor) {
+                return Err(no_sensor(&track.name.sensor, &sensors).into());
+            }
+        }
+        Ok(())
+    }
+
+    fn sensors(&self) -> Result<Vec<String>, Failure> {
+        self.session.domain().map(ipc::sensors).transpose().map(Option::unwrap_or_default)
+    }
+
+    /// News of the hub concern every stream.
+    fn notice(&self, sink: &mut dyn Sink, notice: Notice) -> Result<(), End> {
+        let names: Vec<_> = self.tracks.iter().map(|track| &track.name).collect();
+        sink.notice(&names, notice)
+    }
+
+    fn wake_at(&self) -> Option<Instant> {
+        let end = self.bounds.run_for.map(|limit| self.started + limit);
+        let silence = self.bounds.timeout.map(|limit| self.last_sample + limit);
+        [end, silence].into_iter().flatten().min()
+    }
+
+    fn stopped(&self) -> Result<(), End> {
+        if self.bounds.bounded() {
+            return Err(Failure::new(Kind::Interrupted, "interrupted before it was through", "").into());
+        }
+        Ok(())
+    }
+
+    fn time_is_over(&self) -> Result<(), End> {
+        match self.bounds.count {
+            Some(count) => {
+                let what = format!("{} of {count} samples came in time", self.received);
+                Err(Failure::new(Kind::Timeout, what, "`scanhub info` shows why").into())
+            }
+            None => Ok(()),
+        }
+    }
+}

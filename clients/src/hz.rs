@@ -1,0 +1,153 @@
+//! `scanhub hz`: rate, jitter, minimum, maximum and loss of topics, once a second, as they arrive here.
+
+use std::io::Write;
+use std::sync::atomic::AtomicBool;
+use std::time::{Duration, Instant};
+
+use schema::{Domain, Failure};
+use serde::Serialize;
+
+use crate::account::Account;
+use crate::follow::{Bounds, Notice, Sink, follow};
+use crate::names::TopicName;
+use crate::output::{End, Output, quiet};
+use crate::sample::Sample;
+use crate::window::Window;
+use crate::{json, text};
+
+/// What `hz` is asked for.
+#[derive(Clone, Debug)]
+pub struct HzOptions {
+    /// `SENSOR/TOPIC`; none: all topics of the hub.
+    pub topics: Vec<String>,
+    /// Objects instead of text.
+    pub json: bool,
+    /// The sliding window; ten seconds is a good one.
+    pub window: Duration,
+    /// When it ends by itself.
+    pub bounds: Bounds,
+    /// Where the domain may be, see [`Domain::candidates`].
+    pub places: Vec<Domain>,
+}
+
+/// Writes a line per topic and second to `out`, notices to `notes` (stderr) if `out` is not JSON, the summaries at the
+/// end. Ends and fails as [`echo`](crate::echo()).
+pub fn hz(
+    options: &HzOptions,
+    out: &mut dyn Write,
+    notes: &mut dyn Write,
+    stop: &AtomicBool,
+) -> Result<(), Failure> {
+    let names: Vec<_> = options.topics.iter().map(|text| TopicName::parse(text)).collect::<Result<_, _>>()?;
+    let mut hz = Hz {
+        json: options.json,
+        length: options.window,
+        windows: Vec::new(),
+        next: Instant::now() + EVERY,
+        out: Output::new(out),
+        notes: Output::new(notes),
+    };
+    quiet(follow(&names, &options.places, &options.bounds, stop, &mut hz))
+}
+
+const EVERY: Duration = Duration::from_secs(1);
+
+struct Hz<'a> {
+    json: bool,
+    length: Duration,
+    windows: Vec<(TopicName, Window)>,
+    next: Instant,
+    out: Output<'a>,
+    notes: Output<'a>,
+}
+
+impl Sink for Hz<'_> {
+    fn begin(&mut self, name: &TopicName) {
+        self.windows.push((name.clone(), Window::new(self.length)));
+    }
+
+    fn sample(&mut self, name: &TopicName, sample: &Sample) -> Result<(), End> {
+        if let Some((_, window)) = self.windows.iter_mut().find(|(known, _)| known == name) {
+            window.arrived(Instant::now(), sample.missed());
+        }
+        Ok(())
+    }
+
+    fn notice(&mut self, names: &[&TopicName], notice: Notice) -> Result<(), End> {
+        if self.json {
+            return json::notices(&mut self.out, names, notice);
+        }
+        self.notes.line(|line| text::notice(line, names, notice))
+    }
+
+    fn tick(&mut self, now: Instant) -> Result<(), End> {
+        if now < self.next {
+            return Ok(());
+        }
+        while self.next <= now {
+            self.next += EVERY;
+        }
+        for (name, window) in &mut self.windows {
+            window.slide(now);
+            let line = Line::new(name, window);
+            if self.json {
+                self.out.json(&line)?;
+            } else {
+                self.out.line(|out| line.text(out))?;
+            }
+        }
+        Ok(())
+    }
+
+    fn summary(&mut self, name: &TopicName, account: &Account) -> Result<(), End> {
+        if self.json {
+            return self.out.json(&json::summary(name, account));
+        }
+        self.out.line(|line| text::summary(line, name, account))
+    }
+}
+
+/// Class `hz`; what two arrivals would be needed for is null.
+#[derive(Serialize)]
+struct Line<'a> {
+    class: &'static str,
+    sensor: &'a str,
+    topic: &'static str,
+    hz: Option<f64>,
+    jitter_ms: Option<f64>,
+    min_ms: Option<f64>,
+    max_ms: Option<f64>,
+    received: u64,
+    lost: u64,
+    window_s: f64,
+}
+
+impl<'a> Line<'a> {
+    fn new(name: &'a TopicName, window: &Window) -> Line<'a> {
+        let rate = window.rate();
+        Line {
+            class: "hz",
+            sensor: &name.sensor,
+            topic: name.topic.name(),
+            hz: rate.map(|rate| rate.hz),
+            jitter_ms: rate.map(|rate| rate.jitter_ms),
+            min_ms: rate.map(|rate| rate.min_ms),
+            max_ms: rate.map(|rate| rate.max_ms),
+            received: window.received(),
+            lost: window.lost(),
+            window_s: window.seconds(),
+        }
+    }
+
+    fn text(&self, line: &mut Vec<u8>) -> std::io::Result<()> {
+        let name = format!("{}/{}", self.sensor, self.topic);
+        match (self.hz, self.jitter_ms, self.min_ms, self.max_ms) {
+            (Some(hz), Some(jitter), Some(min), Some(max)) => write!(
+                line,
+                "{name:<16} {hz:8.2} Hz  jitter {jitter:7.2} ms  min {min:7.2} ms  max {max:8.2} ms  lost {}",
+                self.lost
+            ),
+            _ => write!(line, "{name:<16}        - Hz  {} received", self.received),
+        }
+    }
+}

@@ -1,0 +1,219 @@
+//! The classes of `--json`: which keys, in which order. A contract with scripts and other languages: add, never change.
+
+use schema::{Counters, Failure, Header, Scan, Status, Telegram};
+use serde::Serialize;
+use serde::ser::{SerializeMap, Serializer};
+
+use crate::account::Account;
+use crate::follow::Notice;
+use crate::names::TopicName;
+use crate::output::{End, Output};
+
+/// What all samples of telegrams begin with.
+#[derive(Serialize)]
+struct Stamp<'a> {
+    class: &'static str,
+    sensor: &'a str,
+    seq: u64,
+    topic_seq: u64,
+    stamp_ns: u64,
+    wall_ns: u64,
+    #[serde(serialize_with = "id")]
+    boot: u64,
+    quality: &'static str,
+}
+
+impl<'a> Stamp<'a> {
+    fn new(class: &'static str, sensor: &'a str, header: &Header) -> Stamp<'a> {
+        Stamp {
+            class,
+            sensor,
+            seq: header.seq,
+            topic_seq: header.topic_seq,
+            stamp_ns: header.stamp_first_ns,
+            wall_ns: header.wall_ns,
+            boot: header.boot,
+            quality: header.quality().name(),
+        }
+    }
+}
+
+/// Class `telegram`.
+pub(crate) fn telegram<'a>(sensor: &'a str, header: &Header, bytes: &'a [u8]) -> impl Serialize + 'a {
+    #[derive(Serialize)]
+    struct Line<'a> {
+        #[serde(flatten)]
+        stamp: Stamp<'a>,
+        address: u8,
+        command: u8,
+        length: u16,
+        #[serde(serialize_with = "hex")]
+        data: &'a [u8],
+    }
+    let telegram = Telegram(bytes);
+    Line {
+        stamp: Stamp::new("telegram", sensor, header),
+        address: telegram.address(),
+        command: telegram.command(),
+        length: telegram.length(),
+        data: bytes,
+    }
+}
+
+/// Class `scan`.
+pub(crate) fn scan<'a>(sensor: &'a str, header: &Header, scan: &'a Scan) -> impl Serialize + 'a {
+    #[derive(Serialize)]
+    struct Line<'a> {
+        #[serde(flatten)]
+        stamp: Stamp<'a>,
+        unit_mm: u8,
+        first_angle_deg: f64,
+        step_deg: f64,
+        count: usize,
+        #[serde(serialize_with = "ranges")]
+        ranges: &'a Scan,
+        #[serde(serialize_with = "codes")]
+        codes: &'a Scan,
+        #[serde(skip_serializing_if = "<[u8]>::is_empty")]
+        intensities: &'a [u8],
+    }
+    Line {
+        stamp: Stamp::new("scan", sensor, header),
+        unit_mm: scan.unit_mm,
+        first_angle_deg: scan.angle_deg(0),
+        step_deg: f64::from(scan.step_mdeg) / 1000.0,
+        count: scan.beams(),
+        ranges: scan,
+        codes: scan,
+        intensities: scan.intensities(),
+    }
+}
+
+/// Class `status`; what is not known is null.
+pub(crate) fn status<'a>(sensor: &'a str, status: &'a Status) -> impl Serialize + 'a {
+    #[derive(Serialize)]
+    struct Line<'a> {
+        class: &'static str,
+        sensor: &'a str,
+        state: &'static str,
+        baud: Option<u32>,
+        mode: Option<u8>,
+        #[serde(rename = "type")]
+        sensor_type: &'a str,
+        unit_mm: Option<u8>,
+        angle_deg: Option<u16>,
+        step_deg: Option<f64>,
+        hz: f64,
+        port: &'a str,
+        since_ns: u64,
+        #[serde(serialize_with = "counters")]
+        counters: &'a Counters,
+        last_error: &'a str,
+    }
+    Line {
+        class: "status",
+        sensor,
+        state: status.state().map_or("unknown", |state| state.name()),
+        baud: known(status.baud, 0),
+        mode: known(status.mode, Status::MODE_UNKNOWN),
+        sensor_type: status.sensor_type(),
+        unit_mm: known(status.unit_mm, 0),
+        angle_deg: known(status.angle_deg, 0),
+        step_deg: known(status.resolution_cdeg, 0).map(|step| f64::from(step) / 100.0),
+        hz: f64::from(status.rate_mhz) / 1000.0,
+        port: status.port(),
+        since_ns: status.since_ns,
+        counters: &status.counters,
+        last_error: status.last_error(),
+    }
+}
+
+/// Class `notice`: a line for each of `names`, or one without a name.
+pub(crate) fn notices(output: &mut Output<'_>, names: &[&TopicName], notice: Notice) -> Result<(), End> {
+    #[derive(Serialize)]
+    struct Line<'a> {
+        class: &'static str,
+        kind: &'static str,
+        sensor: Option<&'a str>,
+        topic: Option<&'static str>,
+        missed: u64,
+    }
+    let (kind, missed) = match notice {
+        Notice::Missed(missed) => ("missed", missed),
+        Notice::Stale => ("stale", 0),
+        Notice::HubGone => ("hub_gone", 0),
+        Notice::HubBack => ("hub_back", 0),
+    };
+    if names.is_empty() {
+        return output.json(&Line { class: "notice", kind, sensor: None, topic: None, missed });
+    }
+    names.iter().try_for_each(|name| {
+        let (sensor, topic) = (Some(name.sensor.as_str()), Some(name.topic.name()));
+        output.json(&Line { class: "notice", kind, sensor, topic, missed })
+    })
+}
+
+/// Class `summary`.
+pub(crate) fn summary<'a>(name: &'a TopicName, account: &Account) -> impl Serialize + 'a {
+    #[derive(Serialize)]
+    struct Line<'a> {
+        class: &'static str,
+        sensor: &'a str,
+        topic: &'static str,
+        received: u64,
+        lost: u64,
+        seconds: f64,
+        hz: Option<f64>,
+    }
+    Line {
+        class: "summary",
+        sensor: &name.sensor,
+        topic: name.topic.name(),
+        received: account.received,
+        lost: account.lost,
+        seconds: account.seconds(),
+        hz: account.hz(),
+    }
+}
+
+/// Class `error`, as the line that a program writes when a verb failed; without its end.
+pub fn error(failure: &Failure) -> String {
+    #[derive(Serialize)]
+    struct Line<'a> {
+        class: &'a str,
+        kind: &'a str,
+        message: &'a str,
+        hint: &'a str,
+    }
+    let line =
+        Line { class: "error", kind: failure.kind.name(), message: &failure.message, hint: &failure.hint };
+    serde_json::to_string(&line).unwrap_or_default()
+}
+
+fn known<T: PartialEq>(value: T, unknown: T) -> Option<T> {
+    (value != unknown).then_some(value)
+}
+
+fn id<S: Serializer>(value: &u64, serializer: S) -> Result<S::Ok, S::Error> {
+    serializer.collect_str(&format_args!("{value:016x}"))
+}
+
+fn hex<S: Serializer>(bytes: &[u8], serializer: S) -> Result<S::Ok, S::Error> {
+    serializer.collect_str(&crate::text::Hex(bytes))
+}
+
+fn ranges<S: Serializer>(scan: &Scan, serializer: S) -> Result<S::Ok, S::Error> {
+    serializer.collect_seq((0..scan.beams()).map(|i| scan.range(i)))
+}
+
+fn codes<S: Serializer>(scan: &Scan, serializer: S) -> Result<S::Ok, S::Error> {
+    serializer.collect_seq((0..scan.beams()).filter_map(|i| Some((i, scan.code(i)?.0))))
+}
+
+fn counters<S: Serializer>(counters: &Counters, serializer: S) -> Result<S::Ok, S::Error> {
+    let mut map = serializer.serialize_map(None)?;
+    for (name, value) in counters.named() {
+        map.serialize_entry(name, &value)?;
+    }
+    map.end()
+}

@@ -1,0 +1,70 @@
+//! `SENSOR/TOPIC` on the command line, and what to say if there is no such thing.
+
+use std::fmt;
+
+use schema::{Failure, Kind, Topic, check_sensor};
+
+/// One topic of one sensor.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct TopicName {
+    /// The sensor's name.
+    pub sensor: String,
+    /// The topic.
+    pub topic: Topic,
+}
+
+impl TopicName {
+    /// The topic that `text` names, as in `front/scan`.
+    ///
+    /// [`Kind::NoTopic`] with the topics that there are, [`Kind::Configuration`] if the sensor's name is not possible.
+    pub fn parse(text: &str) -> Result<TopicName, Failure> {
+        let unknown = |sensor: &str| {
+            let topics: Vec<_> =
+                Topic::ALL.iter().map(|topic| format!("{sensor}/{}", topic.name())).collect();
+            Failure::new(
+                Kind::NoTopic,
+                format!("no topic {text:?}"),
+                format!("there are {}", topics.join(", ")),
+            )
+        };
+        let (sensor, topic) = text.split_once('/').ok_or_else(|| unknown(text))?;
+        let topic = Topic::parse(topic).ok_or_else(|| unknown(sensor))?;
+        check_sensor(sensor)?;
+        Ok(TopicName { sensor: sensor.to_owned(), topic })
+    }
+}
+
+impl fmt::Display for TopicName {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "{}/{}", self.sensor, self.topic.name())
+    }
+}
+
+/// The hub has no `sensor`, but `sensors`.
+pub(crate) fn no_sensor(sensor: &str, sensors: &[String]) -> Failure {
+    let hint = match sensors {
+        [] => "it has no sensors: `scanhub run --link NAME=PORT`".to_owned(),
+        some => format!("there are {}", some.join(", ")),
+    };
+    Failure::new(Kind::NoTopic, format!("the hub has no sensor {sensor}"), hint)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn names() {
+        let name = TopicName::parse("front/scan").unwrap();
+        assert_eq!(
+            (name.sensor.as_str(), name.topic, name.to_string()),
+            ("front", Topic::Scan, "front/scan".into())
+        );
+        for bad in ["front", "front/scam", "front/scan/x", ""] {
+            let failure = TopicName::parse(bad).unwrap_err();
+            assert_eq!(failure.kind, Kind::NoTopic, "{bad}");
+            assert!(failure.hint.contains("/telegram"), "{failure}");
+        }
+        assert_eq!(TopicName::parse("Front/scan").unwrap_err().kind, Kind::Configuration);
+    }
+}

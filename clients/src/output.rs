@@ -1,0 +1,97 @@
+//! Lines to whoever reads: each is written with one call, so that a killed verb loses none, and a reader that went
+//! away is a quiet end. Refuses to know what the lines say.
+
+use std::io::{self, ErrorKind, Write};
+
+use schema::{Failure, Kind};
+use serde::Serialize;
+
+/// Why a verb ended early.
+#[derive(Debug)]
+pub(crate) enum End {
+    /// Whoever read the output does not any more.
+    ReaderGone,
+    /// It failed.
+    Failure(Failure),
+}
+
+impl From<Failure> for End {
+    fn from(failure: Failure) -> End {
+        End::Failure(failure)
+    }
+}
+
+impl From<io::Error> for End {
+    fn from(error: io::Error) -> End {
+        if error.kind() == ErrorKind::BrokenPipe {
+            return End::ReaderGone;
+        }
+        End::Failure(Failure::new(Kind::Failed, format!("cannot write: {error}"), ""))
+    }
+}
+
+/// A reader that went away is no failure: `scanhub echo front/scan | head` is normal use.
+pub(crate) fn quiet(result: Result<(), End>) -> Result<(), Failure> {
+    match result {
+        Ok(()) | Err(End::ReaderGone) => Ok(()),
+        Err(End::Failure(failure)) => Err(failure),
+    }
+}
+
+/// Writes whole lines; the buffer is used again and again.
+pub(crate) struct Output<'a> {
+    out: &'a mut dyn Write,
+    line: Vec<u8>,
+}
+
+impl<'a> Output<'a> {
+    /// Lines to `out`.
+    pub(crate) fn new(out: &'a mut dyn Write) -> Output<'a> {
+        Output { out, line: Vec::with_capacity(8192) }
+    }
+
+    /// A line of JSON.
+    pub(crate) fn json(&mut self, value: &impl Serialize) -> Result<(), End> {
+        self.line(|line| serde_json::to_writer(line, value).map_err(io::Error::from))
+    }
+
+    /// A line that `build` makes, without its end.
+    pub(crate) fn line(&mut self, build: impl FnOnce(&mut Vec<u8>) -> io::Result<()>) -> Result<(), End> {
+        self.line.clear();
+        build(&mut self.line)?;
+        self.line.push(b'\n');
+        self.out.write_all(&self.line)?;
+        Ok(self.out.flush()?)
+    }
+
+    /// Bytes as they are.
+    pub(crate) fn raw(&mut self, bytes: &[u8]) -> Result<(), End> {
+        self.out.write_all(bytes)?;
+        Ok(self.out.flush()?)
+    }
+}
+
+/// Writes `rows` as columns, each as wide as its widest cell; numbers to the right, for people.
+pub(crate) fn table(output: &mut Output<'_>, rows: &[Vec<String>]) -> Result<(), End> {
+    let columns = rows.iter().map(Vec::len).max().unwrap_or_default();
+    let width =
+        |column: usize| rows.iter().filter_map(|row| row.get(column)).map(|cell| cell.chars().count()).max();
+    let widths: Vec<usize> = (0..columns).map(|column| width(column).unwrap_or_default()).collect();
+    for row in rows {
+        output.line(|line| {
+            let start = line.len();
+            for (cell, width) in row.iter().zip(&widths) {
+                if cell.chars().all(|c| c.is_ascii_digit() || c == '.' || c == '-') {
+                    write!(line, "{cell:>width$}  ")?;
+                } else {
+                    write!(line, "{cell:<width$}  ")?;
+                }
+            }
+            while line.len() > start && line.ends_with(b" ") {
+                line.pop();
+            }
+            Ok(())
+        })?;
+    }
+    Ok(())
+}

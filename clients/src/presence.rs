@@ -1,0 +1,95 @@
+//! Is there a hub, and where? Asks the locks of the places that a domain may be at; refuses to open anything there.
+
+use std::time::{Duration, Instant};
+
+use schema::{Domain, Failure, Kind, holder};
+
+/// How often the locks are looked at.
+const LOOK_EVERY: Duration = Duration::from_millis(100);
+
+/// The hub of a domain, as far as its lock tells.
+pub(crate) struct Presence {
+    places: Vec<Domain>,
+    hub: Option<(Domain, u32)>,
+    looked_at: Option<Instant>,
+    denied: Option<Failure>,
+}
+
+/// What became different since the last look. Both: the hub was replaced in between.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub(crate) struct Change {
+    /// The hub that was there is not there any more.
+    pub(crate) gone: bool,
+    /// A hub is there that was not there before.
+    pub(crate) back: bool,
+}
+
+impl Presence {
+    /// Watches for a hub at `places`; the first live one is taken.
+    pub(crate) fn new(places: Vec<Domain>) -> Presence {
+        Presence { places, hub: None, looked_at: None, denied: None }
+    }
+
+    /// Looks again, if the last look is long enough ago.
+    pub(crate) fn look(&mut self) -> Change {
+        if self.looked_at.is_some_and(|at| at.elapsed() < LOOK_EVERY) {
+            return Change::default();
+        }
+        self.looked_at = Some(Instant::now());
+        self.denied = None;
+        let now = self.live();
+        let change =
+            Change { gone: self.hub.is_some() && self.hub != now, back: now.is_some() && self.hub != now };
+        self.hub = now;
+        change
+    }
+
+    /// Where the hub lives, if there is one.
+    pub(crate) fn domain(&self) -> Option<&Domain> {
+        self.hub.as_ref().map(|(domain, _)| domain)
+    }
+
+    /// What to tell who cannot wait for a hub.
+    pub(crate) fn no_hub(&self) -> Failure {
+        let name = self.places.first().map(Domain::name).unwrap_or_default();
+        let roots: Vec<_> = self.places.iter().map(|place| place.root().display().to_string()).collect();
+        let hint = match &self.denied {
+            Some(denied) => denied.to_string(),
+            None => format!("start one with `scanhub run`; looked at {}", roots.join(", ")),
+        };
+        Failure::new(Kind::NoHub, format!("no hub in domain {name}"), hint)
+    }
+
+    fn live(&mut self) -> Option<(Domain, u32)> {
+        for place in &self.places {
+            match holder(place.root()) {
+                // 0: it has the lock and not yet written who it is.
+                Ok(None | Some(0)) => {}
+                Ok(Some(pid)) => return Some((place.clone(), pid)),
+                Err(failure) => self.denied = Some(failure),
+            }
+        }
+        None
+    }
+}
+
+/// The hub at the first live one of `places`, waiting a moment for one that is just starting.
+///
+/// [`Kind::NoHub`] after half a second.
+pub(crate) fn find(places: &[Domain]) -> Result<Domain, Failure> {
+    let give_up_at = Instant::now() + GRACE;
+    let mut presence = Presence::new(places.to_vec());
+    loop {
+        presence.look();
+        if let Some(domain) = presence.domain() {
+            return Ok(domain.clone());
+        }
+        if Instant::now() >= give_up_at {
+            return Err(presence.no_hub());
+        }
+        std::thread::sleep(LOOK_EVERY);
+    }
+}
+
+/// How long what has to be there may take to appear while a hub is starting: a verb without a hub ends within a second.
+pub(crate) const GRACE: Duration = Duration::from_millis(500);

@@ -1,0 +1,237 @@
+//! A hub without sensors: the lock, the topics and whatever a test publishes. Each in a domain of its own that goes
+//! with the test.
+#![allow(dead_code)] // Every test file takes what it needs.
+
+use std::io::{self, Write};
+use std::path::PathBuf;
+use std::sync::atomic::{AtomicBool, AtomicU32, Ordering};
+use std::sync::{Arc, Mutex};
+use std::thread::JoinHandle;
+use std::time::{Duration, Instant};
+
+use schema::ipc::{self, Node, Notifier, Payload, PortFactory, Publisher, TopicService, UpdateConnections};
+use schema::{Domain, Failure, Header, HubLock, Scan, State, Status, Wake};
+
+/// A domain that goes with the test.
+pub(crate) struct Place {
+    pub(crate) base: PathBuf,
+    pub(crate) domain: Domain,
+}
+
+impl Place {
+    pub(crate) fn new() -> Place {
+        static NEXT: AtomicU32 = AtomicU32::new(0);
+        let name = format!("c{}-{}", std::process::id(), NEXT.fetch_add(1, Ordering::Relaxed));
+        let base = PathBuf::from(format!("/tmp/sh{name}"));
+        Place { domain: Domain::at(&name, &base).unwrap(), base }
+    }
+
+    pub(crate) fn places(&self) -> Vec<Domain> {
+        vec![self.domain.clone()]
+    }
+}
+
+impl Drop for Place {
+    fn drop(&mut self) {
+        let _ = std::fs::remove_dir_all(&self.base);
+        // The node management of a domain outlives its nodes.
+        for entry in std::fs::read_dir("/dev/shm").into_iter().flatten().flatten() {
+            if entry.file_name().to_string_lossy().starts_with(&self.domain.prefix()) {
+                let _ = std::fs::remove_file(entry.path());
+            }
+        }
+    }
+}
+
+/// A topic with its own numbers.
+pub(crate) struct Port<P: Payload + ?Sized> {
+    pub(crate) service: TopicService<P>,
+    pub(crate) publisher: Publisher<P>,
+    pub(crate) topic_seq: u64,
+}
+
+impl<P: Payload + ?Sized> Port<P> {
+    fn new(node: &Node, sensor: &str) -> Port<P> {
+        let service = P::create(node, sensor).unwrap();
+        Port { publisher: P::publisher(&service).unwrap(), service, topic_seq: 0 }
+    }
+
+    /// Waits until `count` consumers are there.
+    pub(crate) fn await_subscribers(&self, count: usize) {
+        until("subscribers", || self.service.dynamic_config().number_of_subscribers() == count);
+    }
+}
+
+/// One sensor of a hub.
+pub(crate) struct FakeSensor {
+    pub(crate) telegram: Port<[u8]>,
+    pub(crate) scan: Port<Scan>,
+    pub(crate) status: Port<Status>,
+    pub(crate) notifier: Notifier,
+    pub(crate) boot: u64,
+    pub(crate) seq: u64,
+}
+
+impl FakeSensor {
+    fn header(&mut self, topic_seq: u64) -> Header {
+        Header {
+            seq: self.seq,
+            topic_seq,
+            stamp_first_ns: 1_000_000_000 + self.seq,
+            stamp_last_ns: 1_010_000_000 + self.seq,
+            wall_ns: 1_700_000_000_000_000_000 + self.seq,
+            boot: self.boot,
+            period_us: 26_640,
+            hub_pid: std::process::id(),
+            ..Header::default()
+        }
+    }
+
+    /// Publishes a scan of these ranges and wakes the consumers.
+    pub(crate) fn scan(&mut self, ranges: &[u16]) {
+        let header = self.header(self.scan.topic_seq);
+        let mut sample = self.scan.publisher.loan().unwrap();
+        *sample.user_header_mut() = header;
+        let scan = sample.payload_mut();
+        (scan.count, scan.unit_mm, scan.range_bits) = (ranges.len() as u16, 10, 13);
+        scan.step_mdeg = 500;
+        scan.range_array[..ranges.len()].copy_from_slice(ranges);
+        sample.send().unwrap();
+        self.scan.topic_seq += 1;
+        self.seq += 1;
+        ipc::notify(&self.notifier, Wake::Telegram).unwrap();
+    }
+
+    /// Publishes a telegram and wakes the consumers.
+    pub(crate) fn telegram(&mut self, bytes: &[u8]) {
+        let header = self.header(self.telegram.topic_seq);
+        let mut sample = self.telegram.publisher.loan_slice_uninit(bytes.len()).unwrap();
+        *sample.user_header_mut() = header;
+        sample.write_from_slice(bytes).send().unwrap();
+        self.telegram.topic_seq += 1;
+        self.seq += 1;
+        ipc::notify(&self.notifier, Wake::Telegram).unwrap();
+    }
+
+    /// Publishes a status and wakes the consumers.
+    pub(crate) fn status(&mut self, change: impl FnOnce(&mut Status)) {
+        let header = self.header(self.status.topic_seq);
+        let mut sample = self.status.publisher.loan().unwrap();
+        *sample.user_header_mut() = header;
+        let status = sample.payload_mut();
+        status.state = State::Streaming as u8;
+        change(status);
+        sample.send().unwrap();
+        self.status.topic_seq += 1;
+        ipc::notify(&self.notifier, Wake::Status).unwrap();
+    }
+}
+
+/// A hub.
+pub(crate) struct FakeHub {
+    pub(crate) sensors: Vec<FakeSensor>,
+    _node: Node,
+    _lock: HubLock,
+}
+
+impl FakeHub {
+    pub(crate) fn new(domain: &Domain, sensors: &[&str], boot: u64) -> FakeHub {
+        let lock = HubLock::acquire(domain.root()).unwrap();
+        let node = ipc::hub_node(domain).unwrap();
+        let sensor = |name: &&str| FakeSensor {
+            telegram: Port::new(&node, name),
+            scan: Port::new(&node, name),
+            status: Port::new(&node, name),
+            notifier: ipc::notifier(&ipc::create_wake(&node, name).unwrap()).unwrap(),
+            boot,
+            seq: 0,
+        };
+        FakeHub { sensors: sensors.iter().map(sensor).collect(), _node: node, _lock: lock }
+    }
+
+    pub(crate) fn front(&mut self) -> &mut FakeSensor {
+        &mut self.sensors[0]
+    }
+
+    /// Hands the last status to newcomers until `done`.
+    pub(crate) fn serve_history(&self, done: impl Fn() -> bool) {
+        until("history taken", || {
+            for sensor in &self.sensors {
+                sensor.status.publisher.update_connections().unwrap();
+            }
+            done()
+        });
+    }
+}
+
+/// A verb at work in a thread of its own, its output as it comes.
+pub(crate) struct Verb {
+    pub(crate) out: Sink,
+    pub(crate) notes: Sink,
+    pub(crate) stop: Arc<AtomicBool>,
+    thread: JoinHandle<Result<(), Failure>>,
+}
+
+impl Verb {
+    pub(crate) fn start(
+        verb: impl FnOnce(&mut dyn Write, &mut dyn Write, &AtomicBool) -> Result<(), Failure> + Send + 'static,
+    ) -> Verb {
+        let (out, notes, stop) = (Sink::default(), Sink::default(), Arc::new(AtomicBool::new(false)));
+        let (mut to, mut beside, flag) = (out.clone(), notes.clone(), stop.clone());
+        let thread = std::thread::spawn(move || verb(&mut to, &mut beside, &flag));
+        Verb { out, notes, stop, thread }
+    }
+
+    pub(crate) fn stop(&self) {
+        self.stop.store(true, Ordering::Relaxed);
+    }
+
+    pub(crate) fn finished(&self) -> bool {
+        self.thread.is_finished()
+    }
+
+    /// Waits for the end.
+    pub(crate) fn join(self) -> (Result<(), Failure>, String, String) {
+        until("the verb's end", || self.thread.is_finished());
+        (self.thread.join().unwrap(), self.out.text(), self.notes.text())
+    }
+}
+
+/// Bytes that were written, for another thread to look at.
+#[derive(Clone, Default)]
+pub(crate) struct Sink(Arc<Mutex<Vec<u8>>>);
+
+impl Sink {
+    pub(crate) fn bytes(&self) -> Vec<u8> {
+        self.0.lock().unwrap().clone()
+    }
+
+    pub(crate) fn text(&self) -> String {
+        String::from_utf8(self.bytes()).unwrap()
+    }
+
+    /// Waits until `count` lines contain `text`.
+    pub(crate) fn await_lines(&self, text: &str, count: usize) {
+        until(text, || self.text().lines().filter(|line| line.contains(text)).count() >= count);
+    }
+}
+
+impl Write for Sink {
+    fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
+        self.0.lock().unwrap().extend_from_slice(bytes);
+        Ok(bytes.len())
+    }
+
+    fn flush(&mut self) -> io::Result<()> {
+        Ok(())
+    }
+}
+
+/// Waits until `done`, and fails after ten seconds.
+pub(crate) fn until(what: &str, mut done: impl FnMut() -> bool) {
+    let give_up_at = Instant::now() + Duration::from_secs(10);
+    while !done() {
+        assert!(Instant::now() < give_up_at, "waited in vain for {what}");
+        std::thread::sleep(Duration::from_millis(2));
+    }
+}

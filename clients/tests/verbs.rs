@@ -1,0 +1,138 @@
+//! `list`, `info` and `hz` with a hub and without one.
+
+mod fake;
+
+use std::time::{Duration, Instant};
+
+use clients::{Bounds, HzOptions, InfoOptions, ListOptions, hz, info, list, list_domains};
+use fake::{FakeHub, Place, Verb};
+use schema::{Counter, Kind};
+
+fn start_list(place: &Place, json: bool) -> Verb {
+    let options = ListOptions { json, places: place.places() };
+    Verb::start(move |out, _, stop| list(&options, out, stop))
+}
+
+fn start_info(place: &Place, sensor: Option<&str>, json: bool) -> Verb {
+    let options = InfoOptions { sensor: sensor.map(Into::into), json, places: place.places() };
+    Verb::start(move |out, _, stop| info(&options, out, stop))
+}
+
+#[test]
+fn without_a_hub_they_end_within_a_second() {
+    let place = Place::new();
+    let began = Instant::now();
+    let verbs = [start_list(&place, true), start_info(&place, None, true)];
+    for verb in verbs {
+        assert_eq!(verb.join().0.unwrap_err().kind, Kind::NoHub);
+    }
+    assert!(began.elapsed() < Duration::from_secs(1), "{:?}", began.elapsed());
+}
+
+#[test]
+fn topics_of_a_hub() {
+    let place = Place::new();
+    let mut hub = FakeHub::new(&place.domain, &["rear", "front"], 1);
+    for sensor in &mut hub.sensors {
+        sensor.status(|status| status.rate_mhz = 37_540);
+    }
+    let verb = start_list(&place, true);
+    hub.serve_history(|| verb.finished());
+    let (end, out, _) = verb.join();
+    assert_eq!(end, Ok(()));
+    assert_eq!(
+        out.lines().take(3).collect::<Vec<_>>(),
+        [
+            r#"{"class":"topic","sensor":"front","topic":"telegram","payload":"u8[]","revision":1,"hz":37.54,"subscribers":0}"#,
+            r#"{"class":"topic","sensor":"front","topic":"scan","payload":"scanhub.Scan.v1","revision":1,"hz":37.54,"subscribers":0}"#,
+            r#"{"class":"topic","sensor":"front","topic":"status","payload":"scanhub.Status.v1","revision":1,"hz":null,"subscribers":0}"#,
+        ]
+    );
+    assert_eq!(out.lines().count(), 6);
+    let verb = start_list(&place, false);
+    hub.serve_history(|| verb.finished());
+    let (_, out, _) = verb.join();
+    assert_eq!(
+        out.lines().nth(2),
+        Some("front/scan      37.54          0  scanhub.Scan.v1           1"),
+        "{out}"
+    );
+}
+
+#[test]
+fn live_domains() {
+    let place = Place::new();
+    let mut out = Vec::new();
+    list_domains(std::slice::from_ref(&place.base), true, &mut out).unwrap();
+    assert!(out.is_empty());
+    let _hub = FakeHub::new(&place.domain, &[], 1);
+    list_domains(std::slice::from_ref(&place.base), true, &mut out).unwrap();
+    let (name, root, pid) = (place.domain.name(), place.domain.root().display(), std::process::id());
+    let expected =
+        format!("{{\"class\":\"domain\",\"domain\":\"{name}\",\"root\":\"{root}\",\"pid\":{pid}}}\n");
+    assert_eq!(String::from_utf8(out).unwrap(), expected);
+}
+
+#[test]
+fn info_of_a_sensor() {
+    let place = Place::new();
+    let mut hub = FakeHub::new(&place.domain, &["front", "rear"], 1);
+    for sensor in &mut hub.sensors {
+        sensor.status(|status| {
+            status.set_sensor_type("LMS200");
+            status.counters[Counter::Telegrams] = 12;
+        });
+    }
+    let verb = start_info(&place, Some("rear"), true);
+    hub.serve_history(|| verb.finished());
+    let (end, out, _) = verb.join();
+    assert_eq!((end, out.lines().count()), (Ok(()), 1));
+    assert!(out.starts_with(r#"{"class":"status","sensor":"rear","state":"streaming""#), "{out}");
+    let verb = start_info(&place, None, false);
+    hub.serve_history(|| verb.finished());
+    let (_, out, _) = verb.join();
+    assert!(out.starts_with("front                  streaming for"), "{out}");
+    assert!(out.contains("  telegrams            12\n"), "{out}");
+    let failure = start_info(&place, Some("left"), true).join().0.unwrap_err();
+    assert_eq!((failure.kind, failure.hint.as_str()), (Kind::NoTopic, "there are front, rear"));
+}
+
+#[test]
+fn a_hub_that_says_nothing() {
+    let place = Place::new();
+    let _hub = FakeHub::new(&place.domain, &["front"], 1);
+    assert_eq!(start_info(&place, None, true).join().0.unwrap_err().kind, Kind::Timeout);
+    let (end, out, _) = start_list(&place, true).join();
+    assert_eq!((end, out.matches(r#""hz":null"#).count()), (Ok(()), 3));
+}
+
+#[test]
+fn rates_of_all_topics() {
+    let place = Place::new();
+    let mut hub = FakeHub::new(&place.domain, &["front"], 1);
+    let options = HzOptions {
+        topics: Vec::new(),
+        json: true,
+        window: Duration::from_secs(10),
+        bounds: Bounds::default(),
+        places: place.places(),
+    };
+    let verb = Verb::start(move |out, notes, stop| hz(&options, out, notes, stop));
+    hub.front().scan.await_subscribers(1);
+    while !verb.out.text().contains(r#""topic":"scan","hz":"#) {
+        hub.front().scan(&[1]);
+        std::thread::sleep(Duration::from_millis(10));
+    }
+    verb.stop();
+    let (end, out, _) = verb.join();
+    assert_eq!(end, Ok(()));
+    let line = out.lines().find(|line| line.contains(r#""topic":"scan""#)).unwrap();
+    let keys: Vec<_> =
+        line.split("\"").skip(1).step_by(2).filter(|it| !["hz", "front", "scan"].contains(it)).collect();
+    assert_eq!(keys.join(" "), "class sensor topic jitter_ms min_ms max_ms received lost window_s", "{line}");
+    assert!(
+        out.lines().any(|line| line.contains(r#""topic":"telegram","hz":null,"jitter_ms":null"#)),
+        "{out}"
+    );
+    assert_eq!(out.lines().filter(|line| line.contains("summary")).count(), 3);
+}

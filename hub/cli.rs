@@ -1,0 +1,219 @@
+//! The command line: which verbs there are and what they take. Syntax only; what a value means is checked by whoever
+//! uses it.
+
+use std::path::PathBuf;
+use std::time::Duration;
+
+use clap::{Args, Parser, Subcommand};
+use clients::{Bounds, duration};
+use schema::{DEFAULT_DOMAIN, Domain, Environment, Failure};
+use sim::fault::Faults;
+use sim::options::{self, SimulateOptions};
+
+/// Laser scanners on serial lines, for more than one program: a hub that publishes telegrams and scans into shared
+/// memory, and the programs that listen.
+#[derive(Debug, Parser)]
+#[command(version, max_term_width = 100)]
+pub(crate) struct Cli {
+    #[command(subcommand)]
+    pub(crate) verb: Verb,
+    #[command(flatten)]
+    pub(crate) common: Common,
+}
+
+/// What every verb takes.
+#[derive(Args, Clone, Debug)]
+pub(crate) struct Common {
+    /// Domain of the hub: 1 to 16 of a-z, 0-9 and -
+    #[arg(long, global = true, env = "SCANHUB_DOMAIN", default_value = DEFAULT_DOMAIN, value_name = "NAME")]
+    pub(crate) domain: String,
+    /// Directory that holds the domain, instead of the usual ones
+    #[arg(long, global = true, value_name = "DIR")]
+    pub(crate) root: Option<PathBuf>,
+    /// One JSON object per line
+    #[arg(long, global = true)]
+    pub(crate) json: bool,
+}
+
+impl Common {
+    /// The domain as a hub opens it.
+    pub(crate) fn hub_domain(&self) -> Result<Domain, Failure> {
+        Domain::of_hub(&self.domain, self.root.as_deref(), &Environment::of_process())
+    }
+
+    /// The places in which a client looks for it.
+    pub(crate) fn places(&self) -> Result<Vec<Domain>, Failure> {
+        Domain::candidates(&self.domain, self.root.as_deref(), &Environment::of_process())
+    }
+}
+
+#[derive(Debug, Subcommand)]
+pub(crate) enum Verb {
+    /// The hub, in the foreground, until SIGINT or SIGTERM
+    Run(Run),
+    /// Two simulated sensors, the hub and a consumer for each, in one terminal
+    Demo(Demo),
+    /// Sensors at the other end of ptys
+    #[command(after_help = fault_table())]
+    Simulate(Simulate),
+    /// Sensors and topics of the running hub
+    List {
+        /// Every live domain of this user instead
+        #[arg(long)]
+        domains: bool,
+    },
+    /// State, settings and counters of sensors
+    Info {
+        /// One sensor instead of all
+        sensor: Option<String>,
+    },
+    /// Samples as they come
+    Echo(Echo),
+    /// Rate, jitter and loss of topics
+    Hz(Hz),
+}
+
+#[derive(Args, Debug)]
+pub(crate) struct Run {
+    /// TOML file, read after those in /etc/scanhub
+    #[arg(long, env = "SCANHUB_CONFIG", value_name = "FILE")]
+    pub(crate) config: Option<PathBuf>,
+    /// A link with its defaults; PORT is a tty or file:PATH[?rate=max]
+    #[arg(long, value_name = "NAME=PORT")]
+    pub(crate) link: Vec<String>,
+    /// One value, for example link.front.angle=100
+    #[arg(long, value_name = "KEY=VALUE")]
+    pub(crate) set: Vec<String>,
+}
+
+#[derive(Args, Debug)]
+pub(crate) struct Demo {
+    /// No live view: a summary line per sensor at the end, and exit 5 if a telegram was lost
+    #[arg(long)]
+    pub(crate) headless: bool,
+    /// How long, for example 10s; without it until Ctrl-C
+    #[arg(long = "for", value_name = "DURATION", value_parser = duration::parse)]
+    pub(crate) run_for: Option<Duration>,
+    /// Seed of rooms and people
+    #[arg(long, default_value_t = 1)]
+    pub(crate) seed: u64,
+}
+
+#[derive(Args, Debug)]
+pub(crate) struct Limits {
+    /// End after so many samples
+    #[arg(short = 'n', value_name = "COUNT", value_parser = clap::value_parser!(u64).range(1..))]
+    count: Option<u64>,
+    /// End after so long, for example 10s, 250ms, 5m
+    #[arg(long = "for", value_name = "DURATION", value_parser = duration::parse)]
+    run_for: Option<Duration>,
+    /// Longest silence, before the first sample and between two; then exit 3
+    #[arg(long, value_name = "DURATION", value_parser = duration::parse)]
+    timeout: Option<Duration>,
+}
+
+impl Limits {
+    pub(crate) fn bounds(&self) -> Bounds {
+        Bounds { count: self.count, run_for: self.run_for, timeout: self.timeout }
+    }
+}
+
+#[derive(Args, Debug)]
+pub(crate) struct Echo {
+    /// What to follow: front/scan, rear/telegram, front/status ..
+    #[arg(required = true, value_name = "SENSOR/TOPIC")]
+    pub(crate) topics: Vec<String>,
+    /// Comma-separated values
+    #[arg(long, conflicts_with_all = ["json", "raw"])]
+    pub(crate) csv: bool,
+    /// The bytes themselves: telegrams, or the payload of another topic
+    #[arg(long, conflicts_with = "json")]
+    pub(crate) raw: bool,
+    #[command(flatten)]
+    pub(crate) limits: Limits,
+}
+
+#[derive(Args, Debug)]
+pub(crate) struct Hz {
+    /// What to follow; all topics if nothing is named
+    #[arg(value_name = "SENSOR/TOPIC")]
+    pub(crate) topics: Vec<String>,
+    /// Span of time that a line looks back on
+    #[arg(long, default_value = "10s", value_name = "DURATION", value_parser = duration::parse)]
+    pub(crate) window: Duration,
+    #[command(flatten)]
+    pub(crate) limits: Limits,
+}
+
+#[derive(Args, Debug)]
+pub(crate) struct Simulate {
+    /// Where each sensor's pty shall appear, as a symlink
+    #[arg(long, required = true, value_name = "PATH")]
+    port: Vec<PathBuf>,
+    /// Rate at power-on: 9600, 19200, 38400 or 500000
+    #[arg(long, default_value = "9600", value_name = "RATE")]
+    baud: String,
+    /// What the sensors see: room, empty, wall640 or random
+    #[arg(long, default_value = "room", value_name = "NAME", conflicts_with = "replay")]
+    world: String,
+    /// A recording to send instead: telegram stream or CARMEN log, plain or gzipped
+    #[arg(long, value_name = "FILE")]
+    replay: Option<PathBuf>,
+    /// Begin the recording anew at its end
+    #[arg(long = "loop")]
+    looped: bool,
+    /// How many times faster than the clock everything runs, the bit time too
+    #[arg(long, default_value_t = 1.0, value_name = "FACTOR")]
+    speed: f64,
+    /// Seed of worlds, delays and faults
+    #[arg(long, default_value_t = 0)]
+    seed: u64,
+    /// What goes wrong, for example loss=0.00135,burst=1.89; see below
+    #[arg(long, default_value = "", hide_default_value = true, value_name = "KEY=VALUE,..")]
+    fault: String,
+    /// File for a line of JSON per telegram: what was sent, with its hash
+    #[arg(long, value_name = "FILE")]
+    truth: Option<PathBuf>,
+    /// What the sensors call themselves: lms200, lms211, lms221 or lms291
+    #[arg(long = "type", default_value = "lms200", value_name = "TYPE")]
+    model: String,
+    /// Angle and resolution [default: the recording's, else 180/0.5]
+    #[arg(long, value_name = "DEGREES/STEP")]
+    variant: Option<String>,
+    /// Unit: mm, cm or dm [default: the recording's, else mm]
+    #[arg(long)]
+    unit: Option<String>,
+    /// Measuring mode [default: the recording's, else 0x01]
+    #[arg(long, value_name = "BYTE")]
+    mode: Option<String>,
+    /// In which pieces bytes arrive: uart (16 bytes) or usb (62)
+    #[arg(long, default_value = "uart", value_name = "KIND")]
+    chunk: String,
+}
+
+impl Simulate {
+    pub(crate) fn options(&self) -> Result<SimulateOptions, Failure> {
+        Ok(SimulateOptions {
+            ports: self.port.clone(),
+            baud: options::parse_baud(&self.baud)?,
+            world: self.world.parse()?,
+            replay: self.replay.clone(),
+            looped: self.looped,
+            speed: self.speed,
+            seed: self.seed,
+            faults: self.fault.parse()?,
+            truth: self.truth.clone(),
+            model: self.model.parse()?,
+            variant: self.variant.as_deref().map(options::parse_variant).transpose()?,
+            unit: self.unit.as_deref().map(options::parse_unit).transpose()?,
+            mode: self.mode.as_deref().map(options::parse_mode).transpose()?,
+            chunk: self.chunk.parse()?,
+        })
+    }
+}
+
+/// The table of faults, for the end of the help.
+pub(crate) fn fault_table() -> String {
+    let rows = Faults::KEYS.iter().map(|(key, meaning)| format!("  {key:6} {meaning}"));
+    format!("Faults:\n{}", rows.collect::<Vec<_>>().join("\n"))
+}

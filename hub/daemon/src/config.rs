@@ -1,0 +1,389 @@
+//! What the hub is told: links with their ports and what to ask of their sensors. Several sources, the last one wins;
+//! every value is checked where it stands, so that an error names file, line and column.
+
+use std::path::{Path, PathBuf};
+
+use lms::variant::{Baud, Unit, Variant};
+use schema::{Failure, Kind, check_sensor};
+use serde::Deserialize;
+use toml::Spanned;
+
+use crate::origin::Origin;
+
+/// The effective configuration.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Config {
+    /// The links in their order: a sensor's number is its place here.
+    pub links: Vec<Link>,
+}
+
+/// One link and what to ask of its sensor.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Link {
+    /// The sensor's name in topics.
+    pub name: String,
+    /// Where its bytes come from.
+    pub port: Source,
+    /// Angle and resolution.
+    pub variant: Variant,
+    /// Unit that the sensor is expected to measure in, if the user said one; it is compared, never written.
+    pub unit: Option<Unit>,
+    /// Rate to stream at.
+    pub baud: Baud,
+}
+
+/// What stands behind a link.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum Source {
+    /// A serial line.
+    Tty(PathBuf),
+    /// A recording (`file:PATH`), paced by its scan period or, with `?rate=max`, as fast as it can be read.
+    File {
+        /// The recording.
+        path: PathBuf,
+        /// Whether its pace is kept.
+        paced: bool,
+    },
+}
+
+impl Source {
+    /// The source as it is written in a configuration.
+    pub fn name(&self) -> String {
+        match self {
+            Source::Tty(path) => path.display().to_string(),
+            Source::File { path, paced: true } => format!("file:{}", path.display()),
+            Source::File { path, paced: false } => format!("file:{}?rate=max", path.display()),
+        }
+    }
+
+    fn parse(text: &str) -> Result<Source, &'static str> {
+        let Some(file) = text.strip_prefix("file:") else {
+            return if text.is_empty() { Err("the port is empty") } else { Ok(Source::Tty(text.into())) };
+        };
+        let (path, paced) = match file.split_once('?') {
+            None => (file, true),
+            Some((path, "rate=max")) => (path, false),
+            Some(_) => return Err("the only option of a file is rate=max"),
+        };
+        if path.is_empty() {
+            Err("the file has no name")
+        } else {
+            Ok(Source::File { path: path.into(), paced })
+        }
+    }
+}
+
+/// Where to look for values, besides the defaults.
+#[derive(Clone, Debug, Default)]
+pub struct Sources {
+    /// Files in their order; each must be there.
+    pub files: Vec<PathBuf>,
+    /// `--set KEY=VALUE`, as given.
+    pub set: Vec<String>,
+    /// `--link NAME=PORT`, as given.
+    pub links: Vec<String>,
+}
+
+impl Sources {
+    /// The system's files as far as they are there: `/etc/scanhub/scanhub.toml`, then `/etc/scanhub/conf.d/*.toml`
+    /// in the order of their names.
+    pub fn system() -> Vec<PathBuf> {
+        let base = Path::new("/etc/scanhub");
+        let mut files: Vec<_> =
+            [base.join("scanhub.toml")].into_iter().filter(|file| file.exists()).collect();
+        let entries = std::fs::read_dir(base.join("conf.d")).into_iter().flatten().flatten();
+        let mut more: Vec<_> = entries.map(|entry| entry.path()).collect();
+        more.retain(|path| path.extension().is_some_and(|extension| extension == "toml"));
+        more.sort();
+        files.extend(more);
+        files
+    }
+}
+
+impl Config {
+    /// Reads all sources. Without any link in them there are two, `front` and `rear`, at the first two USB adapters.
+    ///
+    /// [`Kind::Configuration`] with place, value and remedy.
+    pub fn load(sources: &Sources) -> Result<Config, Failure> {
+        let mut links: Vec<Draft> = Vec::new();
+        for path in &sources.files {
+            let origin = Origin::read(path)?;
+            let Origin::File { text, .. } = &origin else { continue };
+            merge(&mut links, layer(&origin, text)?, &origin, true)?;
+        }
+        for flag in &sources.links {
+            let origin = Origin::Flag(format!("--link {flag}"));
+            let (name, port) = flag.split_once('=').ok_or_else(|| {
+                origin.refuse(None, "no = in it", "write --link NAME=PORT, for example front=/dev/ttyUSB0")
+            })?;
+            let text = format!("[[link]]\nname = {}\nport = {}", quoted(name), quoted(port));
+            merge(&mut links, layer(&origin, &text)?, &origin, true)?;
+        }
+        if links.is_empty() {
+            merge(&mut links, layer(&Origin::Default, DEFAULT)?, &Origin::Default, true)?;
+        }
+        for flag in &sources.set {
+            let origin = Origin::Flag(format!("--set {flag}"));
+            let text = setting(flag).ok_or_else(|| {
+                origin.refuse(
+                    None,
+                    "not a setting",
+                    "write --set link.NAME.KEY=VALUE, as link.front.angle=100",
+                )
+            })?;
+            merge(&mut links, layer(&origin, &text)?, &origin, false)?;
+        }
+        let links = links.into_iter().map(Draft::finish).collect::<Result<_, _>>()?;
+        Ok(Config { links })
+    }
+}
+
+/// What one source says.
+#[derive(Deserialize)]
+#[serde(deny_unknown_fields)]
+struct Layer {
+    #[serde(default)]
+    link: Vec<LinkLayer>,
+}
+
+#[derive(Deserialize)]
+#[serde(deny_unknown_fields)]
+struct LinkLayer {
+    name: Spanned<String>,
+    port: Option<Spanned<String>>,
+    angle: Option<Spanned<f64>>,
+    resolution: Option<Spanned<f64>>,
+    unit: Option<Spanned<String>>,
+    baud: Option<Spanned<u32>>,
+}
+
+/// A link while sources are merged.
+struct Draft {
+    name: String,
+    place: String,
+    port: Option<Source>,
+    angle_deg: u16,
+    resolution_cdeg: u16,
+    unit: Option<Unit>,
+    baud: Baud,
+}
+
+impl Draft {
+    fn finish(self) -> Result<Link, Failure> {
+        let Draft { name, place, port, angle_deg, resolution_cdeg, unit, baud } = self;
+        let refuse = |what: String, remedy: &str| {
+            Failure::new(Kind::Configuration, format!("{place}: link {name}: {what}"), remedy)
+        };
+        let port = port.ok_or_else(|| refuse("no port".into(), "add port = \"/dev/ttyUSB0\""))?;
+        let variant = Variant::new(angle_deg, resolution_cdeg).ok_or_else(|| {
+            let step = f64::from(resolution_cdeg) / 100.0;
+            let remedy = "180 degrees at 0.5 or 1, 100 degrees at 0.25, 0.5 or 1";
+            refuse(format!("no sensor scans {angle_deg} degrees at {step}"), remedy)
+        })?;
+        Ok(Link { name, port, variant, unit, baud })
+    }
+}
+
+fn layer(origin: &Origin, text: &str) -> Result<Layer, Failure> {
+    toml::from_str(text).map_err(|error| origin.explain(&error))
+}
+
+/// Lays `layer` over `links`; only where `may_add` may it bring links that were not there.
+fn merge(links: &mut Vec<Draft>, layer: Layer, origin: &Origin, may_add: bool) -> Result<(), Failure> {
+    let mut seen: Vec<String> = Vec::new();
+    for link in layer.link {
+        let (span, name) = (Some(link.name.span()), link.name.into_inner());
+        check_sensor(&name).map_err(|failure| origin.refuse(span.clone(), failure.message, failure.hint))?;
+        if seen.contains(&name) {
+            return Err(origin.refuse(
+                span,
+                format!("a second link {name}"),
+                "give each link a name of its own",
+            ));
+        }
+        seen.push(name.clone());
+        let known = links.iter().position(|draft| draft.name == name);
+        let at = match known {
+            Some(at) => at,
+            None if may_add => {
+                links.push(Draft {
+                    name: name.clone(),
+                    place: origin.place(span),
+                    port: None,
+                    angle_deg: Variant::HALF.angle_deg,
+                    resolution_cdeg: Variant::HALF.resolution_cdeg,
+                    unit: None,
+                    baud: Baud::B500000,
+                });
+                links.len() - 1
+            }
+            None => {
+                let names: Vec<_> = links.iter().map(|draft| draft.name.as_str()).collect();
+                let remedy = format!("there are: {}", names.join(", "));
+                return Err(origin.refuse(span, format!("no link {name}"), remedy));
+            }
+        };
+        let draft = &mut links[at];
+        if let Some(port) = link.port {
+            let port_span = Some(port.span());
+            let port = port.into_inner();
+            draft.port = Some(Source::parse(&port).map_err(|what| {
+                origin.refuse(port_span, what, "name a tty, or file:PATH with ?rate=max if you like")
+            })?);
+        }
+        if let Some(angle) = link.angle {
+            draft.angle_deg = whole(origin, &angle, 1.0, "angle", "100 or 180")?;
+        }
+        if let Some(resolution) = link.resolution {
+            draft.resolution_cdeg = whole(origin, &resolution, 100.0, "resolution", "0.25, 0.5 or 1")?;
+        }
+        if let Some(unit) = link.unit {
+            draft.unit = Some(match unit.get_ref().as_str() {
+                "mm" => Unit::Mm,
+                "cm" => Unit::Cm,
+                other => {
+                    let what = format!("unit = \"{other}\"");
+                    return Err(origin.refuse(Some(unit.span()), what, "\"mm\" or \"cm\""));
+                }
+            });
+        }
+        if let Some(baud) = link.baud {
+            draft.baud = Baud::of_rate(*baud.get_ref()).ok_or_else(|| {
+                let what = format!("baud = {}", baud.get_ref());
+                origin.refuse(Some(baud.span()), what, "500000, 38400, 19200 or 9600")
+            })?;
+        }
+    }
+    Ok(())
+}
+
+/// `value * scale` as one of the numbers that `allowed` names.
+fn whole(
+    origin: &Origin,
+    value: &Spanned<f64>,
+    scale: f64,
+    key: &str,
+    allowed: &str,
+) -> Result<u16, Failure> {
+    let scaled = value.get_ref() * scale;
+    let known = |v: &Variant| if scale == 1.0 { v.angle_deg } else { v.resolution_cdeg };
+    let found = Variant::ALL.iter().map(known).find(|&number| f64::from(number) == scaled);
+    found.ok_or_else(|| origin.refuse(Some(value.span()), format!("{key} = {}", value.get_ref()), allowed))
+}
+
+/// `link.NAME.KEY=VALUE` as TOML; a value that is none is taken as text.
+fn setting(flag: &str) -> Option<String> {
+    let (path, value) = flag.split_once('=')?;
+    let mut words = path.split('.');
+    let (Some("link"), Some(name), Some(key), None) =
+        (words.next(), words.next(), words.next(), words.next())
+    else {
+        return None;
+    };
+    let is_key = |c: char| c.is_ascii_alphanumeric() || c == '_' || c == '-';
+    if key.is_empty() || key == "name" || !key.chars().all(is_key) {
+        return None;
+    }
+    let value = match toml::from_str::<toml::Table>(&format!("v = {value}")) {
+        Ok(table) if table.len() == 1 => value.to_owned(),
+        _ => quoted(value),
+    };
+    Some(format!("[[link]]\nname = {}\n{key} = {value}", quoted(name)))
+}
+
+/// As a TOML string.
+fn quoted(text: &str) -> String {
+    let escaped: String = text
+        .chars()
+        .map(|c| match c {
+            '"' | '\\' => format!("\\{c}"),
+            c if c.is_control() => format!("\\u{:04X}", c as u32),
+            c => c.to_string(),
+        })
+        .collect();
+    format!("\"{escaped}\"")
+}
+
+/// What a hub without any link in its configuration does.
+const DEFAULT: &str = r#"
+[[link]]
+name = "front"
+port = "/dev/ttyUSB0"
+
+[[link]]
+name = "rear"
+port = "/dev/ttyUSB1"
+"#;
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn sources(set: &[&str], links: &[&str]) -> Sources {
+        let owned = |flags: &[&str]| flags.iter().map(|flag| (*flag).to_owned()).collect();
+        Sources { files: Vec::new(), set: owned(set), links: owned(links) }
+    }
+
+    fn refusal(set: &[&str], links: &[&str]) -> String {
+        let failure = Config::load(&sources(set, links)).expect_err("must be refused");
+        assert_eq!(failure.kind, Kind::Configuration);
+        failure.to_string()
+    }
+
+    #[test]
+    fn two_links_by_default() {
+        let config = Config::load(&Sources::default()).unwrap();
+        let names: Vec<_> = config.links.iter().map(|link| (link.name.as_str(), link.port.name())).collect();
+        assert_eq!(names, [("front", "/dev/ttyUSB0".to_owned()), ("rear", "/dev/ttyUSB1".to_owned())]);
+        assert_eq!((config.links[0].variant, config.links[0].baud), (Variant::HALF, Baud::B500000));
+    }
+
+    #[test]
+    fn flags_win() {
+        let config = Config::load(&sources(
+            &["link.a.angle=100", "link.a.resolution=0.25", "link.a.unit=cm", "link.b.baud=38400"],
+            &["a=/dev/x", "b=file:/tmp/a b.bin?rate=max"],
+        ))
+        .unwrap();
+        assert_eq!(config.links[0].variant, Variant { angle_deg: 100, resolution_cdeg: 25 });
+        assert_eq!((config.links[0].unit, config.links[1].baud), (Some(Unit::Cm), Baud::B38400));
+        assert_eq!(config.links[1].port, Source::File { path: "/tmp/a b.bin".into(), paced: false });
+    }
+
+    #[test]
+    fn refusals_name_place_value_and_remedy() {
+        let unknown = refusal(&["link.front.prot=/dev/x"], &[]);
+        assert!(unknown.contains("--set link.front.prot=/dev/x: unknown key `prot`"), "{unknown}");
+        assert!(unknown.contains("did you mean `port`?"), "{unknown}");
+        assert!(refusal(&["link.front.angle=170"], &[]).contains("angle = 170\n  100 or 180"));
+        assert!(refusal(&["link.side.angle=100"], &[]).contains("no link side\n  there are: front, rear"));
+        assert!(
+            refusal(&["link.front.resolution=0.25"], &[]).contains("no sensor scans 180 degrees at 0.25")
+        );
+        assert!(refusal(&["baud=3"], &[]).contains("not a setting"));
+        assert!(refusal(&[], &["front"]).contains("--link front: no = in it"));
+        assert!(refusal(&[], &["Front=/dev/x"]).contains("sensor name \"Front\" is not possible"));
+        assert!(refusal(&[], &["front=file:x?rate=2"]).contains("rate=max"));
+    }
+
+    #[test]
+    fn a_file_error_has_line_and_column() {
+        let path = std::env::temp_dir().join(format!("scanhub-config-{}.toml", std::process::id()));
+        let load = |text: &str| {
+            std::fs::write(&path, text).unwrap();
+            Config::load(&Sources { files: vec![path.clone()], ..Sources::default() })
+        };
+        let error = load("[[link]]\nname = \"front\"\nprot = \"/dev/x\"\n").unwrap_err().to_string();
+        assert!(error.contains(&format!("{}:3:1: unknown key `prot`", path.display())), "{error}");
+        let error =
+            load("[[link]]\nname = \"front\"\nport = \"/dev/x\"\nbaud = 115200\n").unwrap_err().to_string();
+        assert!(error.contains(":4:8: baud = 115200"), "{error}");
+        let error =
+            load("[[link]]\nname = \"a\"\nport = \"x\"\n[[link]]\nname = \"a\"\n").unwrap_err().to_string();
+        assert!(error.contains(":5:8: a second link a"), "{error}");
+        let error = load("[[link]]\nname = \"a\"\n").unwrap_err().to_string();
+        assert!(error.contains("link a: no port"), "{error}");
+        assert!(load("[[link]]\nname = \"a\"\nport = \"x\"\nangle = 100\n").is_ok());
+        std::fs::remove_file(&path).unwrap();
+    }
+}

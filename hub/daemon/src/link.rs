@@ -1,0 +1,324 @@
+//! One link: the thread that owns a port and its topics, from the first open to the hub's end. It sleeps until bytes
+//! come or a deadline passes, and does nothing twice per telegram.
+
+use std::io;
+use std::os::fd::OwnedFd;
+use std::path::Path;
+
+use lms::reply::Reply;
+use lms::session::{Output, Received, Values};
+use lms::variant::{Mode, Unit, Variant};
+use lms::{MILLIS, Nanos, Session, Settings, Trouble};
+use rustix::event::{PollFd, PollFlags, poll};
+use schema::{Failure, Flags, Kind, State, Wake};
+
+use crate::clock;
+use crate::config::{Link, Source};
+use crate::port::Tty;
+use crate::replay;
+use crate::scanner;
+use crate::status::Account;
+use crate::topics::Topics;
+
+/// A link with everything that belongs to its thread.
+pub(crate) struct LinkThread<'a> {
+    link: &'a Link,
+    topics: Topics,
+    account: Account,
+    /// Readable once the hub shall end.
+    stop: &'a OwnedFd,
+    next_greeting: Nanos,
+    next_status: Nanos,
+    /// What `error` was made from.
+    facts: Option<(State, Option<Trouble>, Option<Unit>)>,
+    /// What is wrong, in words; empty if nothing is.
+    error: String,
+    /// Statuses in a row that said that consumers got nothing.
+    unreached: u32,
+}
+
+/// Why a wait is over.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Woken {
+    /// The hub shall end.
+    Stop,
+    /// There is something to do at the port.
+    Ready,
+    /// The time is up.
+    Timeout,
+}
+
+impl<'a> LinkThread<'a> {
+    /// The thread's values; nothing happens yet.
+    pub(crate) fn new(link: &'a Link, topics: Topics, stop: &'a OwnedFd) -> Self {
+        let now = clock::now();
+        let account = Account::new(&link.port.name(), now);
+        LinkThread {
+            link,
+            topics,
+            account,
+            stop,
+            next_greeting: now,
+            next_status: now,
+            facts: None,
+            error: String::new(),
+            unreached: 0,
+        }
+    }
+
+    /// Runs until the hub shall end. `report` is called once, when it is clear whether the link can work: an absent
+    /// port can, one that is busy, forbidden or no tty cannot.
+    pub(crate) fn run(mut self, report: impl FnOnce(Result<(), Failure>)) {
+        match &self.link.port {
+            Source::File { path, paced } => match replay::Recorded::open(path, self.link) {
+                Ok(recorded) => {
+                    report(Ok(()));
+                    self.topics.set_flags(Flags::REPLAYED);
+                    let mut session = Session::new(self.settings(true), clock::now());
+                    replay::play(&mut self, &mut session, recorded, *paced);
+                }
+                Err(failure) => report(Err(failure)),
+            },
+            Source::Tty(path) => match Tty::open(path, self.link.baud.rate()) {
+                Err(failure) if failure.kind != Kind::PortMissing => report(Err(failure)),
+                first => {
+                    report(Ok(()));
+                    self.keep_open(path, first);
+                }
+            },
+        }
+    }
+
+    /// Streams from the port, and takes it back whenever it was away.
+    fn keep_open(&mut self, path: &Path, mut opened: Result<Tty, Failure>) {
+        loop {
+            let trouble = match opened {
+                Ok(tty) => {
+                    self.topics.set_flags(if tty.simulated { Flags::SIMULATED } else { 0 });
+                    let mut session = Session::new(self.settings(false), clock::now());
+                    let end = self.stream(&tty, &mut session);
+                    self.account.close(&session);
+                    match end {
+                        Ok(()) => return,
+                        Err(error) => {
+                            self.account.reconnects += 1;
+                            format!("{} went away: {error}", path.display())
+                        }
+                    }
+                }
+                Err(failure) => failure.message,
+            };
+            self.facts = None;
+            self.show(None, State::Absent, &trouble);
+            if self.wait(None, clock::now() + REOPEN) == Woken::Stop {
+                return;
+            }
+            opened = Tty::open(path, self.link.baud.rate());
+        }
+    }
+
+    /// Drives `session` on `tty` until the hub shall end; an error says that the port is gone.
+    fn stream(&mut self, tty: &Tty, session: &mut Session) -> io::Result<()> {
+        loop {
+            let (watch, until) = self.drain(tty, session)?;
+            let woken = self.wait(watch.then_some(tty), until);
+            if woken == Woken::Stop {
+                return Ok(());
+            }
+            let len = tty.read(session.spare())?;
+            let now = clock::now();
+            session.commit(now, len);
+            if len == 0 && now >= until {
+                session.handle_timeout(now);
+            }
+        }
+    }
+
+    /// Does what the session wants, until it wants to wait: whether for bytes, and until when.
+    fn drain(&mut self, tty: &Tty, session: &mut Session) -> io::Result<(bool, Nanos)> {
+        let mut published = false;
+        let (watch, until) = loop {
+            match session.poll_output() {
+                Output::SetBaud(baud) => tty.set_baud(baud.rate())?,
+                Output::Transmit { byte, not_before } => {
+                    self.pause(not_before);
+                    tty.write(byte)?;
+                    session.transmitted(clock::now());
+                }
+                Output::Telegram(received) => {
+                    self.publish(&received, None);
+                    self.wake(Wake::Telegram);
+                    published = true;
+                }
+                Output::Rest(until) => break (false, until),
+                Output::Wait { until, .. } => break (true, until),
+            }
+        };
+        let facts = (state_of(session), session.trouble(), session.sensor().unit);
+        if self.facts != Some(facts) {
+            self.facts = Some(facts);
+            self.error = self.trouble(session);
+        }
+        let (state, ..) = facts;
+        let error = std::mem::take(&mut self.error);
+        self.show(Some(session), state, &error);
+        self.error = error;
+        // While telegrams come there is no need for wake-ups of the status' own.
+        let bound = if published || state == State::Streaming { Nanos::MAX } else { self.next_status };
+        Ok((watch, until.min(bound)))
+    }
+
+    /// Publishes a telegram and, if it is measured data that can be read, its scan. `fallback` is the mode of a sensor
+    /// that cannot be asked.
+    pub(crate) fn publish(&mut self, received: &Received<'_>, fallback: Option<Mode>) {
+        let reply = Reply::decode(received.telegram);
+        let measured = match reply {
+            Some(Reply::Measured(measured)) => Some(measured),
+            _ => None,
+        };
+        let variant = measured.and_then(|measured| Variant::of_beams(measured.count()));
+        self.topics.telegram(received, scanner::period_us(variant, self.link.baud.rate()));
+        self.account.suspect += u64::from(received.reasons != 0);
+        let Some(measured) = measured else { return };
+        let mode = match received.values {
+            Values::Known(mode) => mode,
+            // The answer is on the way: better no range than a wrong one.
+            Values::Asked => return,
+            Values::Unknown => fallback.unwrap_or(Mode(0)),
+        };
+        self.account.scans += 1;
+        self.topics.scan(received.reasons, |scan| {
+            let forbidden = scanner::decode(&measured, mode, scan);
+            if forbidden { lms::framer::suspect::FORBIDDEN_BITS } else { 0 }
+        });
+    }
+
+    /// Wakes the consumers.
+    pub(crate) fn wake(&self, why: Wake) {
+        self.topics.wake(why);
+    }
+
+    /// Publishes the status if it changed or is due, and greets late joiners.
+    pub(crate) fn show(&mut self, session: Option<&Session>, state: State, error: &str) {
+        let now = clock::now();
+        let changed = self.account.update(state, error, now);
+        if changed {
+            let name = &self.link.name;
+            match error {
+                "" => tracing::info!("{name}: {}", state.name()),
+                error => tracing::warn!("{name}: {}: {error}", state.name()),
+            }
+        }
+        if changed || now >= self.next_status {
+            self.next_status = now + STATUS_PERIOD;
+            let status = self.account.status(session, self.topics.loan_failed, now);
+            self.topics.status(status, now);
+            if changed || state != State::Streaming {
+                self.topics.wake(Wake::Status);
+            }
+            self.watch_reach();
+        }
+        if now >= self.next_greeting {
+            self.next_greeting = now + GREETING_PERIOD;
+            self.topics.greet();
+        }
+    }
+
+    /// Sleeps until the port has bytes (or is gone), `until`, or the hub's end.
+    pub(crate) fn wait(&mut self, tty: Option<&Tty>, until: Nanos) -> Woken {
+        loop {
+            let now = clock::now();
+            // Whoever attaches to a silent sensor is greeted in time all the same.
+            let bound =
+                if self.account.is_streaming() { until } else { until.min(self.next_greeting.max(now)) };
+            let span = clock::span(now, bound);
+            let stop = PollFd::new(self.stop, PollFlags::IN);
+            let woken = match tty {
+                Some(tty) => {
+                    let mut fds = [stop, PollFd::new(tty, PollFlags::IN)];
+                    poll(&mut fds, Some(&span)).map(|_| (is_ready(&fds[0]), is_ready(&fds[1])))
+                }
+                None => {
+                    let mut fds = [stop];
+                    poll(&mut fds, Some(&span)).map(|_| (is_ready(&fds[0]), false))
+                }
+            };
+            self.account.wakeups += 1;
+            match woken {
+                Ok((true, _)) => return Woken::Stop,
+                Ok((_, true)) => return Woken::Ready,
+                _ => {}
+            }
+            let now = clock::now();
+            if now >= until {
+                return Woken::Timeout;
+            }
+            if now >= self.next_greeting {
+                self.next_greeting = now + GREETING_PERIOD;
+                self.topics.greet();
+            }
+        }
+    }
+
+    /// Sleeps until `not_before`, too short a time to watch anything meanwhile.
+    fn pause(&self, not_before: Nanos) {
+        let now = clock::now();
+        if not_before > now {
+            std::thread::sleep(std::time::Duration::from_nanos(not_before - now));
+        }
+    }
+
+    fn settings(&self, listen_only: bool) -> Settings {
+        Settings { variant: self.link.variant, baud: self.link.baud, listen_only }
+    }
+
+    /// What is wrong, in words; empty if nothing is.
+    fn trouble(&self, session: &Session) -> String {
+        let unit = session.sensor().unit;
+        match (session.trouble(), unit, self.link.unit) {
+            (Some(trouble), _, _) => trouble.to_string(),
+            (None, Some(is), Some(expected)) if is != expected => format!(
+                "the sensor measures in units of {} mm, the configuration says {} mm; the unit lives in its EEPROM, \
+                 which the hub never writes",
+                is.mm(),
+                expected.mm()
+            ),
+            _ => String::new(),
+        }
+    }
+
+    fn watch_reach(&mut self) {
+        self.unreached = if self.topics.unreached() > 0 { self.unreached + 1 } else { 0 };
+        if self.unreached == UNREACHED_LIMIT {
+            tracing::warn!(
+                "{}: {} consumers are attached but get nothing: raise the limit of open descriptors (ulimit -n)",
+                self.link.name,
+                self.topics.unreached()
+            );
+        }
+    }
+}
+
+/// The word for how far `session` is.
+pub(crate) fn state_of(session: &Session) -> State {
+    match session.state() {
+        lms::State::Probing => State::Probing,
+        lms::State::Switching => State::Switching,
+        lms::State::Starting => State::Starting,
+        lms::State::Streaming => State::Streaming,
+        lms::State::Silent => State::Silent,
+    }
+}
+
+fn is_ready(fd: &PollFd<'_>) -> bool {
+    !fd.revents().is_empty()
+}
+
+/// Between two attempts to open a port that is away.
+const REOPEN: Nanos = 500 * MILLIS;
+/// A status goes out at least so often.
+const STATUS_PERIOD: Nanos = 1_000 * MILLIS;
+/// A late joiner gets the last status after so long at the most.
+const GREETING_PERIOD: Nanos = 100 * MILLIS;
+/// Statuses after which unreached consumers are more than ones that are just attaching.
+const UNREACHED_LIMIT: u32 = 3;

@@ -1,0 +1,126 @@
+//! What a link tells of itself: the words of a session and the hub's own counts as the payload of topic `status`.
+
+use lms::header::Reject;
+use lms::variant::Variant;
+use lms::{Nanos, Session};
+use schema::{Counter, Counters, State, Status};
+
+/// The link's account, across all sessions on its port.
+pub(crate) struct Account {
+    status: Status,
+    /// Counters of the sessions that ended.
+    past: Counters,
+    /// Counters as they were when the rate was last computed.
+    measured_at: Option<(Nanos, u64)>,
+    /// Scans published.
+    pub(crate) scans: u64,
+    /// Times that the thread woke up.
+    pub(crate) wakeups: u64,
+    /// Telegrams that were suspect.
+    pub(crate) suspect: u64,
+    pub(crate) reconnects: u64,
+}
+
+impl Account {
+    pub(crate) fn new(port: &str, now: Nanos) -> Self {
+        let mut status = Status { since_ns: now, ..Status::default() };
+        status.set_port(port);
+        Account {
+            status,
+            past: Counters::default(),
+            measured_at: None,
+            scans: 0,
+            wakeups: 0,
+            suspect: 0,
+            reconnects: 0,
+        }
+    }
+
+    /// Takes over the state and the trouble of the moment; returns whether either is new.
+    pub(crate) fn update(&mut self, state: State, error: &str, now: Nanos) -> bool {
+        let changed = self.status.state != state as u8 || self.status.last_error() != error;
+        if self.status.state != state as u8 {
+            self.status.state = state as u8;
+            self.status.since_ns = now;
+            self.measured_at = None;
+        }
+        self.status.set_last_error(error);
+        changed
+    }
+
+    /// The status with everything that `session`, if there is one, knows.
+    pub(crate) fn status(&mut self, session: Option<&Session>, loan_failed: u64, now: Nanos) -> &Status {
+        let mut counters = self.past;
+        if let Some(session) = session {
+            add(&mut counters, session);
+            self.describe(session);
+        }
+        counters[Counter::Suspect] = self.suspect;
+        counters[Counter::Reconnects] = self.reconnects;
+        counters[Counter::Wakeups] = self.wakeups;
+        counters[Counter::LoanFailed] = loan_failed;
+        self.status.counters = counters;
+        let (since, scans) = *self.measured_at.get_or_insert((now, self.scans));
+        if now > since {
+            self.status.rate_mhz = ((self.scans - scans) * 1_000_000_000_000 / (now - since)) as u32;
+        }
+        if now > since + RATE_WINDOW {
+            self.measured_at = Some((now, self.scans));
+        }
+        &self.status
+    }
+
+    /// Whether telegrams come.
+    pub(crate) fn is_streaming(&self) -> bool {
+        self.status.state == State::Streaming as u8
+    }
+
+    /// The session is over: its counters stay.
+    pub(crate) fn close(&mut self, session: &Session) {
+        add(&mut self.past, session);
+        self.past[Counter::BytesDiscarded] += session.buffered() as u64;
+        self.past[Counter::BytesBuffered] = 0;
+    }
+
+    fn describe(&mut self, session: &Session) {
+        let sensor = session.sensor();
+        let known_rate = matches!(self.status.state(), Some(State::Streaming | State::Starting));
+        self.status.baud = if known_rate { session.baud().rate() } else { 0 };
+        self.status.mode = sensor.mode.map_or(Status::MODE_UNKNOWN, |mode| mode.0);
+        self.status.unit_mm = sensor.unit.map_or(0, |unit| unit.mm());
+        let Variant { angle_deg, resolution_cdeg } =
+            sensor.variant.unwrap_or(Variant { angle_deg: 0, resolution_cdeg: 0 });
+        self.status.angle_deg = angle_deg;
+        self.status.resolution_cdeg = resolution_cdeg;
+        self.status.set_sensor_type(&String::from_utf8_lossy(sensor.kind()));
+    }
+}
+
+fn add(counters: &mut Counters, session: &Session) {
+    let tally = session.tally();
+    counters[Counter::BytesRead] += tally.read;
+    counters[Counter::BytesInTelegrams] += tally.in_telegrams;
+    counters[Counter::BytesAcknowledge] += tally.acknowledge;
+    counters[Counter::BytesDiscarded] += tally.discarded;
+    counters[Counter::BytesBuffered] = session.buffered() as u64;
+    counters[Counter::Telegrams] += tally.telegrams;
+    counters[Counter::Aborted] += tally.aborted;
+    counters[Counter::Resyncs] += session.resyncs();
+    counters[Counter::LostInRestart] += u64::from(session.began_with_a_cut());
+    for (reject, counter) in REJECTS {
+        counters[counter] += tally.rejected[reject as usize];
+    }
+}
+
+const REJECTS: [(Reject, Counter); Reject::COUNT] = [
+    (Reject::Address, Counter::RejectedAddress),
+    (Reject::Length, Counter::RejectedLength),
+    (Reject::Command, Counter::RejectedCommand),
+    (Reject::Count, Counter::RejectedCount),
+    (Reject::Crc, Counter::RejectedCrc),
+    (Reject::Vetoed, Counter::RejectedVetoed),
+    (Reject::Superseded, Counter::RejectedSuperseded),
+];
+
+/// The rate is that of the last seconds.
+const RATE_WINDOW: Nanos = 5_000_000_000;

@@ -1,0 +1,114 @@
+//! The hub as a process: one per domain, one thread per link, an orderly end. It knows signals, threads and the
+//! domain's upkeep; bytes and topics are the links' business.
+
+use std::os::fd::OwnedFd;
+use std::os::unix::net::UnixStream;
+use std::sync::mpsc;
+use std::thread;
+
+use rustix::event::{EventfdFlags, PollFd, PollFlags, Timespec, eventfd, poll};
+use schema::ipc::{self, Node};
+use schema::{Domain, Failure, HubLock, Kind};
+use signal_hook::consts::{SIGINT, SIGTERM};
+
+use crate::config::Config;
+use crate::link::LinkThread;
+use crate::topics::Topics;
+use crate::{bus_error, preflight};
+
+/// What is up.
+#[derive(Clone, Debug)]
+pub struct Ready {
+    /// Number of this hub's life, random.
+    pub boot: u64,
+    /// The sensors' names.
+    pub sensors: Vec<String>,
+}
+
+/// Runs the hub in `domain` until SIGINT or SIGTERM; `on_ready` is called once, when all topics exist.
+///
+/// [`Kind::DomainHeld`] if another hub has the domain, [`Kind::Short`] if memory is, the port kinds if a port is there
+/// but cannot be used, [`Kind::Failed`] if shared memory refuses.
+pub fn run(config: &Config, domain: &Domain, on_ready: impl FnOnce(&Ready)) -> Result<(), Failure> {
+    let signals = end_signals()?;
+    let _lock = HubLock::acquire(domain.root())?;
+    preflight::raise_descriptor_limit();
+    preflight::check_memory(config.links.len())?;
+    bus_error::explain();
+    let node = ipc::hub_node(domain)?;
+    node.try_cleanup_dead_nodes();
+    let ready =
+        Ready { boot: random(), sensors: config.links.iter().map(|link| link.name.clone()).collect() };
+    let stop = eventfd(0, EventfdFlags::CLOEXEC).map_err(|error| no_resource("an eventfd", &error))?;
+    thread::scope(|scope| {
+        let (report, reports) = mpsc::channel();
+        let mut threads = Vec::new();
+        for (number, link) in config.links.iter().enumerate() {
+            let (node, stop, report) = (&node, &stop, report.clone());
+            let body = move || match Topics::new(node, &link.name, number as u8, ready.boot) {
+                Ok(topics) => LinkThread::new(link, topics, stop).run(|outcome| drop(report.send(outcome))),
+                Err(failure) => drop(report.send(Err(failure))),
+            };
+            let thread = thread::Builder::new().name(link.name.clone()).spawn_scoped(scope, body);
+            threads.push(thread.map_err(|error| no_resource("a thread", &error))?);
+        }
+        drop(report);
+        let mut outcome = reports.iter().take(config.links.len()).find(Result::is_err).unwrap_or(Ok(()));
+        if outcome.is_ok() {
+            outcome = preflight::allocate(domain);
+        }
+        if outcome.is_ok() {
+            on_ready(&ready);
+            let is_alive = || threads.iter().all(|thread| !thread.is_finished());
+            outcome = keep_up(&node, &signals, is_alive);
+        }
+        end_links(&stop);
+        outcome
+    })
+}
+
+/// Once a second looks after what dead consumers left, until a signal says to end.
+fn keep_up(node: &Node, signals: &UnixStream, is_alive: impl Fn() -> bool) -> Result<(), Failure> {
+    loop {
+        let mut fds = [PollFd::new(signals, PollFlags::IN)];
+        if poll(&mut fds, Some(&UPKEEP)).is_ok() && !fds[0].revents().is_empty() {
+            return Ok(());
+        }
+        if !is_alive() {
+            return Err(Failure::new(
+                Kind::Failed,
+                "a link's thread ended",
+                "this is a bug: please report it",
+            ));
+        }
+        node.try_cleanup_dead_nodes();
+    }
+}
+
+/// A socket that becomes readable at SIGINT or SIGTERM.
+fn end_signals() -> Result<UnixStream, Failure> {
+    let register = || {
+        let (read, write) = UnixStream::pair()?;
+        signal_hook::low_level::pipe::register(SIGINT, write.try_clone()?)?;
+        signal_hook::low_level::pipe::register(SIGTERM, write)?;
+        Ok(read)
+    };
+    register().map_err(|error: std::io::Error| no_resource("a signal handler", &error))
+}
+
+fn end_links(stop: &OwnedFd) {
+    // An eventfd that nobody reads takes one write for sure.
+    let _ = rustix::io::write(stop, &1u64.to_ne_bytes());
+}
+
+fn random() -> u64 {
+    use std::hash::{BuildHasher, RandomState};
+    RandomState::new().hash_one(std::process::id())
+}
+
+fn no_resource(what: &str, error: &dyn std::fmt::Display) -> Failure {
+    Failure::new(Kind::Short, format!("{what} cannot be had: {error}"), "try again later")
+}
+
+/// Between two looks at what dead processes left.
+const UPKEEP: Timespec = Timespec { tv_sec: 1, tv_nsec: 0 };
