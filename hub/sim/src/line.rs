@@ -70,6 +70,7 @@ impl Line<'_> {
             let read_ns = now_ns();
             let count = self.pty.read(&mut buffer)?;
             let now_ns = now_ns();
+            self.slip(now_ns);
             while let Some(chunk) = self.machine.poll_transmit(self.time.of_machine(now_ns)) {
                 self.hand_over(chunk, &mut way)?;
             }
@@ -92,6 +93,14 @@ impl Line<'_> {
                 return Ok(Summary { port: self.port, sent: way.sent, eeprom_writes });
             }
         }
+    }
+
+    /// A line never brings more at once than it carries: where this thread was kept from running for long, the
+    /// sensor's time stood still too.
+    fn slip(&mut self, now_ns: Nanos) {
+        let Some(due_ns) = self.machine.poll_timeout() else { return };
+        let latest_ns = self.time.of_clock(due_ns + MOST_LATE_NS);
+        self.time.zero_ns += now_ns.saturating_sub(latest_ns);
     }
 
     fn hand_over(&mut self, mut chunk: Chunk, way: &mut Way) -> Result<(), Failure> {
@@ -150,6 +159,8 @@ fn same_rate(a: u32, b: u32) -> bool {
     u64::from(a.abs_diff(b)) * 100 <= 3 * u64::from(b)
 }
 
+/// How late the sensor may be, in its own time: 5 kB at its highest rate, a quarter of what a pty holds.
+const MOST_LATE_NS: Nanos = 100 * MILLIS;
 /// A byte may lie in the kernel for so long before it can be read: a worker thread carries it over.
 const PTY_DELAY_NS: Nanos = 2 * MILLIS;
 /// How often an open port is looked at even if nothing happens: how well it is known when a byte came. At 9600, where
