@@ -4,7 +4,6 @@
 //! After every call that changes it, drain [`Session::poll_output`] until it answers [`Output::Wait`] or
 //! [`Output::Rest`].
 
-use crate::Nanos;
 use crate::arrival::{Arrivals, Rhythm};
 use crate::dialogue::{Dialogue, Reason, Settings};
 use crate::framer::{Advance, Framer, Place, Tally, suspect};
@@ -12,6 +11,7 @@ use crate::measured::MEASURED;
 use crate::sensor::{Sensor, State, Trouble};
 use crate::telegram::Telegram;
 use crate::variant::{Baud, Mode};
+use crate::{MILLIS, Nanos};
 
 /// What the session wants, in the order in which it wants it.
 #[derive(Debug)]
@@ -75,6 +75,9 @@ pub enum Values {
     /// The sensor does not say.
     Unknown,
 }
+
+/// A byte that may leave within so long is asked for at once; a later one is waited for as for anything else.
+const SOON: Nanos = 5 * MILLIS;
 
 /// One sensor's session.
 #[derive(Clone, Debug)]
@@ -154,7 +157,8 @@ impl Session {
         }
         self.framer.expect(self.dialogue.expect());
         self.framer.await_acknowledge(self.dialogue.awaits_acknowledge());
-        if let Some((byte, not_before)) = self.dialogue.outgoing().and_then(|outgoing| outgoing.byte()) {
+        let next_byte = self.dialogue.outgoing().and_then(|outgoing| outgoing.byte());
+        if let Some((byte, not_before)) = next_byte.filter(|&(_, at)| at <= self.now + SOON) {
             return Output::Transmit { byte, not_before };
         }
         if self.framer.buffered() == 0 {
