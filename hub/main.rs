@@ -2,8 +2,11 @@
 //! into lines and an exit code. The only place that sees all crates.
 
 mod cli;
+mod demo;
 
 use std::io::{self, Write};
+use std::os::unix::net::UnixStream;
+use std::path::Path;
 use std::process::ExitCode;
 use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
@@ -13,14 +16,22 @@ use clap::error::ErrorKind;
 use clients::{EchoOptions, Format, HzOptions, InfoOptions, ListOptions};
 use daemon::Config;
 use daemon::config::Sources;
+use rustix::process::Signal;
 use schema::{Environment, Failure, Kind};
-use serde_json::json;
+use serde::Serialize;
 use signal_hook::consts::{SIGINT, SIGTERM};
 use tracing::level_filters::LevelFilter;
 
 use cli::{Cli, Common, Verb};
+use demo::DemoOptions;
+
+/// In the environment of a process that shall not outlive the one that started it.
+const END_WITH_PARENT: &str = "SCANHUB_END_WITH_PARENT";
 
 fn main() -> ExitCode {
+    if std::env::var_os(END_WITH_PARENT).is_some() {
+        let _ = rustix::process::set_parent_process_death_signal(Some(Signal::TERM));
+    }
     let cli = match Cli::try_parse() {
         Ok(cli) => cli,
         Err(error) => return refuse(&error),
@@ -42,8 +53,16 @@ fn dispatch(cli: &Cli) -> Result<(), Failure> {
     let mut out = io::stdout().lock();
     match &cli.verb {
         Verb::Run(run) => run_hub(run, common),
-        Verb::Demo(_) => Ok(()),
-        Verb::Simulate(_) => Ok(()),
+        Verb::Demo(demo) => {
+            let options = DemoOptions {
+                headless: demo.headless,
+                run_for: demo.run_for,
+                seed: demo.seed,
+                json: common.json,
+            };
+            demo::demo(&options, &mut out, &*interrupt()?)
+        }
+        Verb::Simulate(simulate) => run_simulator(simulate, common),
         Verb::List { domains: true } => {
             clients::list_domains(&Environment::of_process().bases(), common.json, &mut out)
         }
@@ -90,15 +109,14 @@ fn run_hub(run: &cli::Run, common: &Common) -> Result<(), Failure> {
     let domain = common.hub_domain()?;
     daemon::run(&config, &domain, |ready| {
         let line = if common.json {
-            json!({
-                "class": "ready",
-                "domain": domain.name(),
-                "root": domain.root(),
-                "pid": std::process::id(),
-                "boot": format!("{:016x}", ready.boot),
-                "sensors": ready.sensors,
+            line(&HubReady {
+                class: "ready",
+                domain: domain.name(),
+                root: domain.root(),
+                pid: std::process::id(),
+                boot: format!("{:016x}", ready.boot),
+                sensors: &ready.sensors,
             })
-            .to_string()
         } else {
             let place = domain.root().display();
             format!("ready {} in {place}, sensors: {}", domain.name(), ready.sensors.join(", "))
@@ -107,14 +125,64 @@ fn run_hub(run: &cli::Run, common: &Common) -> Result<(), Failure> {
     })
 }
 
+fn run_simulator(simulate: &cli::Simulate, common: &Common) -> Result<(), Failure> {
+    let options = simulate.options()?;
+    let (stop, write) = UnixStream::pair().map_err(no_handler)?;
+    for signal in [SIGINT, SIGTERM] {
+        let write = write.try_clone().map_err(no_handler)?;
+        signal_hook::low_level::pipe::register(signal, write).map_err(no_handler)?;
+    }
+    let announce = |ready: &[sim::Ready]| {
+        if common.json {
+            let ports = ready.iter().map(|one| ReadyPort { port: &one.port, pty: &one.pty }).collect();
+            say(&line(&SimulatorReady { class: "ready", ports }));
+        } else {
+            let ports: Vec<_> = ready.iter().map(|one| one.port.display().to_string()).collect();
+            say(&format!("ready {}", ports.join(" ")));
+        }
+    };
+    sim::simulate(&options, &stop, announce, |_| {}).map(drop)
+}
+
+/// The line that says that the hub is up; keys in the order of their contract.
+#[derive(Serialize)]
+struct HubReady<'a> {
+    class: &'static str,
+    domain: &'a str,
+    root: &'a Path,
+    pid: u32,
+    boot: String,
+    sensors: &'a [String],
+}
+
+/// The line that says that the simulator is up.
+#[derive(Serialize)]
+struct SimulatorReady<'a> {
+    class: &'static str,
+    ports: Vec<ReadyPort<'a>>,
+}
+
+#[derive(Serialize)]
+struct ReadyPort<'a> {
+    port: &'a Path,
+    pty: &'a Path,
+}
+
+fn line(value: &impl Serialize) -> String {
+    serde_json::to_string(value).unwrap_or_default()
+}
+
 /// A flag that SIGINT and SIGTERM set; either one also ends a wait.
 fn interrupt() -> Result<Arc<AtomicBool>, Failure> {
     let flag = Arc::new(AtomicBool::new(false));
     for signal in [SIGINT, SIGTERM] {
-        signal_hook::flag::register(signal, flag.clone())
-            .map_err(|error| Failure::new(Kind::Failed, format!("no signal handler: {error}"), ""))?;
+        signal_hook::flag::register(signal, flag.clone()).map_err(no_handler)?;
     }
     Ok(flag)
+}
+
+fn no_handler(error: io::Error) -> Failure {
+    Failure::new(Kind::Failed, format!("no signal handler: {error}"), "")
 }
 
 /// Writes one line to stdout; whoever closed it does not want it.

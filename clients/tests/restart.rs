@@ -7,6 +7,7 @@ use std::time::Duration;
 
 use clients::{Attachment, Bounds, EchoOptions, Format, echo};
 use fake::{FakeHub, Place, Verb, until};
+use schema::ipc::PortFactory;
 use schema::{Domain, Scan, holder};
 
 /// The hub of these tests when it has to be a process of its own: run by them, ignored otherwise.
@@ -108,4 +109,34 @@ fn an_attachment_times_out_and_goes_on() {
     let scan = scans.next().unwrap().expect("one was sent");
     assert_eq!((scan.beams(), scan.missed, scan.restarted), (361, 0, false));
     assert_eq!(scan.beam_time_ns(360), scan.header().stamp_first_ns - schema::TURN_NS);
+}
+
+#[test]
+fn an_attachment_goes_on_after_a_hub_that_ended_well() {
+    let place = Place::new();
+    let mut scans = Attachment::<Scan>::in_domain(place.places(), "front").unwrap();
+    for boot in 1..4 {
+        let mut hub = FakeHub::new(&place.domain, &["front"], boot);
+        until("the consumer", || {
+            assert!(scans.try_next().unwrap().is_none());
+            hub.front().scan.service.dynamic_config().number_of_subscribers() == 1
+        });
+        hub.front().scan(&[5]);
+        let scan = scans.next().unwrap().expect("without a timeout it waits");
+        assert_eq!((scan.header().boot, scan.missed, scan.restarted), (boot, 0, boot > 1));
+    }
+}
+
+#[test]
+fn a_client_that_comes_between_two_hubs() {
+    let place = Place::new();
+    let hub = Hub::start(&place, 1);
+    until("a hub", || matches!(holder(place.domain.root()), Ok(Some(1..))));
+    until("its topics", || schema::ipc::sensors(&place.domain).is_ok_and(|sensors| !sensors.is_empty()));
+    hub.kill(&place);
+    let timeout = Duration::from_millis(50);
+    let mut scans = Attachment::<Scan>::in_domain(place.places(), "front").unwrap().timeout(timeout);
+    assert!(scans.next().unwrap().is_none() && !scans.hub_lives());
+    let _hub = Hub::start(&place, 2);
+    until("a scan", || scans.next().unwrap().is_some_and(|scan| scan.header().boot == 2 && !scan.restarted));
 }

@@ -1,6 +1,7 @@
 //! From a topic to its service in shared memory, with all limits. The only file that names the builders of iceoryx2:
 //! everybody else gets ports. Refuses to know when something is sent and who reads it.
 
+mod leftover;
 mod sleep;
 mod trouble;
 
@@ -44,7 +45,8 @@ pub type Notifier = port::notifier::Notifier<Service>;
 /// Sleeps until it is woken.
 pub type Listener = port::listener::Listener<Service>;
 
-/// The hub's node in `domain`. Cleans up what dead hubs and consumers left.
+/// The hub's node in `domain`, for who holds its [`HubLock`](crate::HubLock). Cleans up what dead hubs and consumers
+/// left.
 ///
 /// [`Kind::Failed`] with owner, mode and remedy if the directory is another user's.
 pub fn hub_node(domain: &Domain) -> Result<Node, Failure> {
@@ -215,7 +217,9 @@ fn node(domain: &Domain, cleanup: bool) -> Result<Node, Failure> {
     config.global.node.cleanup_dead_nodes_on_creation = cleanup;
     config.global.node.cleanup_dead_nodes_on_destruction = false;
     config.global.service.cleanup_dead_nodes_on_open = false;
-    if !cleanup {
+    if cleanup {
+        leftover::sweep(std::path::Path::new(&config.global.service_dir().to_string()));
+    } else {
         config.global.creation_timeout = Duration::from_millis(100);
     }
     NodeBuilder::new()

@@ -16,7 +16,7 @@ use crate::{Failure, Kind, access};
 /// The lock of a hub on its domain; it ends with the value or with the process, however that ends.
 #[derive(Debug)]
 pub struct HubLock {
-    _file: File,
+    file: File,
 }
 
 impl HubLock {
@@ -47,7 +47,14 @@ impl HubLock {
         file.set_len(0)
             .and_then(|()| file.write_all_at(pid.as_bytes(), 0))
             .map_err(|error| unusable(root, &error))?;
-        Ok(HubLock { _file: file })
+        Ok(HubLock { file })
+    }
+}
+
+impl Drop for HubLock {
+    /// Closing is not enough: a process that is just being started has a copy of the descriptor for a moment.
+    fn drop(&mut self) {
+        let _ = fcntl(self.file.as_raw_fd(), FcntlArg::F_OFD_SETLK(&whole_file(libc::F_UNLCK)));
     }
 }
 

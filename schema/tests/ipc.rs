@@ -190,3 +190,19 @@ fn one_hub_holds_a_domain() {
     assert_eq!(holder(root), Ok(None));
     let _again = HubLock::acquire(root).unwrap();
 }
+
+#[test]
+fn a_hub_that_was_killed_while_making_a_topic_leaves_no_obstacle() {
+    let place = Place::new();
+    let hub = ipc::hub_node(&place.domain).unwrap();
+    let topic = Scan::create(&hub, "front").unwrap();
+    let services = place.domain.root().join("services");
+    let description = std::fs::read_dir(&services).unwrap().next().unwrap().unwrap().path();
+    let text = std::fs::read(&description).unwrap();
+    drop((topic, hub));
+    assert!(!description.exists());
+    // Written, but not yet made read-only.
+    std::fs::write(&description, text).unwrap();
+    let hub = ipc::hub_node(&place.domain).unwrap();
+    Scan::create(&hub, "front").unwrap();
+}

@@ -1,13 +1,11 @@
-//! What the hub is told: links with their ports and what to ask of their sensors. Several sources, the last one wins;
-//! every value is checked where it stands, so that an error names file, line and column.
+//! What the hub is told: links with their ports and what to ask of their sensors. Several sources, the last one wins.
 
 use std::path::{Path, PathBuf};
 
 use lms::variant::{Baud, Unit, Variant};
-use schema::{Failure, Kind, check_sensor};
-use serde::Deserialize;
-use toml::Spanned;
+use schema::Failure;
 
+use crate::layer::{Draft, merge, parse, quoted, setting};
 use crate::origin::Origin;
 
 /// The effective configuration.
@@ -56,7 +54,7 @@ impl Source {
         }
     }
 
-    fn parse(text: &str) -> Result<Source, &'static str> {
+    pub(crate) fn parse(text: &str) -> Result<Source, &'static str> {
         let Some(file) = text.strip_prefix("file:") else {
             return if text.is_empty() { Err("the port is empty") } else { Ok(Source::Tty(text.into())) };
         };
@@ -103,13 +101,13 @@ impl Sources {
 impl Config {
     /// Reads all sources. Without any link in them there are two, `front` and `rear`, at the first two USB adapters.
     ///
-    /// [`Kind::Configuration`] with place, value and remedy.
+    /// [`schema::Kind::Configuration`] with place, value and remedy.
     pub fn load(sources: &Sources) -> Result<Config, Failure> {
         let mut links: Vec<Draft> = Vec::new();
         for path in &sources.files {
             let origin = Origin::read(path)?;
             let Origin::File { text, .. } = &origin else { continue };
-            merge(&mut links, layer(&origin, text)?, &origin, true)?;
+            merge(&mut links, parse(&origin, text)?, &origin, true)?;
         }
         for flag in &sources.links {
             let origin = Origin::Flag(format!("--link {flag}"));
@@ -117,10 +115,10 @@ impl Config {
                 origin.refuse(None, "no = in it", "write --link NAME=PORT, for example front=/dev/ttyUSB0")
             })?;
             let text = format!("[[link]]\nname = {}\nport = {}", quoted(name), quoted(port));
-            merge(&mut links, layer(&origin, &text)?, &origin, true)?;
+            merge(&mut links, parse(&origin, &text)?, &origin, true)?;
         }
         if links.is_empty() {
-            merge(&mut links, layer(&Origin::Default, DEFAULT)?, &Origin::Default, true)?;
+            merge(&mut links, parse(&Origin::Default, DEFAULT)?, &Origin::Default, true)?;
         }
         for flag in &sources.set {
             let origin = Origin::Flag(format!("--set {flag}"));
@@ -131,177 +129,11 @@ impl Config {
                     "write --set link.NAME.KEY=VALUE, as link.front.angle=100",
                 )
             })?;
-            merge(&mut links, layer(&origin, &text)?, &origin, false)?;
+            merge(&mut links, parse(&origin, &text)?, &origin, false)?;
         }
         let links = links.into_iter().map(Draft::finish).collect::<Result<_, _>>()?;
         Ok(Config { links })
     }
-}
-
-/// What one source says.
-#[derive(Deserialize)]
-#[serde(deny_unknown_fields)]
-struct Layer {
-    #[serde(default)]
-    link: Vec<LinkLayer>,
-}
-
-#[derive(Deserialize)]
-#[serde(deny_unknown_fields)]
-struct LinkLayer {
-    name: Spanned<String>,
-    port: Option<Spanned<String>>,
-    angle: Option<Spanned<f64>>,
-    resolution: Option<Spanned<f64>>,
-    unit: Option<Spanned<String>>,
-    baud: Option<Spanned<u32>>,
-}
-
-/// A link while sources are merged.
-struct Draft {
-    name: String,
-    place: String,
-    port: Option<Source>,
-    angle_deg: u16,
-    resolution_cdeg: u16,
-    unit: Option<Unit>,
-    baud: Baud,
-}
-
-impl Draft {
-    fn finish(self) -> Result<Link, Failure> {
-        let Draft { name, place, port, angle_deg, resolution_cdeg, unit, baud } = self;
-        let refuse = |what: String, remedy: &str| {
-            Failure::new(Kind::Configuration, format!("{place}: link {name}: {what}"), remedy)
-        };
-        let port = port.ok_or_else(|| refuse("no port".into(), "add port = \"/dev/ttyUSB0\""))?;
-        let variant = Variant::new(angle_deg, resolution_cdeg).ok_or_else(|| {
-            let step = f64::from(resolution_cdeg) / 100.0;
-            let remedy = "180 degrees at 0.5 or 1, 100 degrees at 0.25, 0.5 or 1";
-            refuse(format!("no sensor scans {angle_deg} degrees at {step}"), remedy)
-        })?;
-        Ok(Link { name, port, variant, unit, baud })
-    }
-}
-
-fn layer(origin: &Origin, text: &str) -> Result<Layer, Failure> {
-    toml::from_str(text).map_err(|error| origin.explain(&error))
-}
-
-/// Lays `layer` over `links`; only where `may_add` may it bring links that were not there.
-fn merge(links: &mut Vec<Draft>, layer: Layer, origin: &Origin, may_add: bool) -> Result<(), Failure> {
-    let mut seen: Vec<String> = Vec::new();
-    for link in layer.link {
-        let (span, name) = (Some(link.name.span()), link.name.into_inner());
-        check_sensor(&name).map_err(|failure| origin.refuse(span.clone(), failure.message, failure.hint))?;
-        if seen.contains(&name) {
-            return Err(origin.refuse(
-                span,
-                format!("a second link {name}"),
-                "give each link a name of its own",
-            ));
-        }
-        seen.push(name.clone());
-        let known = links.iter().position(|draft| draft.name == name);
-        let at = match known {
-            Some(at) => at,
-            None if may_add => {
-                links.push(Draft {
-                    name: name.clone(),
-                    place: origin.place(span),
-                    port: None,
-                    angle_deg: Variant::HALF.angle_deg,
-                    resolution_cdeg: Variant::HALF.resolution_cdeg,
-                    unit: None,
-                    baud: Baud::B500000,
-                });
-                links.len() - 1
-            }
-            None => {
-                let names: Vec<_> = links.iter().map(|draft| draft.name.as_str()).collect();
-                let remedy = format!("there are: {}", names.join(", "));
-                return Err(origin.refuse(span, format!("no link {name}"), remedy));
-            }
-        };
-        let draft = &mut links[at];
-        if let Some(port) = link.port {
-            let port_span = Some(port.span());
-            let port = port.into_inner();
-            draft.port = Some(Source::parse(&port).map_err(|what| {
-                origin.refuse(port_span, what, "name a tty, or file:PATH with ?rate=max if you like")
-            })?);
-        }
-        if let Some(angle) = link.angle {
-            draft.angle_deg = whole(origin, &angle, 1.0, "angle", "100 or 180")?;
-        }
-        if let Some(resolution) = link.resolution {
-            draft.resolution_cdeg = whole(origin, &resolution, 100.0, "resolution", "0.25, 0.5 or 1")?;
-        }
-        if let Some(unit) = link.unit {
-            draft.unit = Some(match unit.get_ref().as_str() {
-                "mm" => Unit::Mm,
-                "cm" => Unit::Cm,
-                other => {
-                    let what = format!("unit = \"{other}\"");
-                    return Err(origin.refuse(Some(unit.span()), what, "\"mm\" or \"cm\""));
-                }
-            });
-        }
-        if let Some(baud) = link.baud {
-            draft.baud = Baud::of_rate(*baud.get_ref()).ok_or_else(|| {
-                let what = format!("baud = {}", baud.get_ref());
-                origin.refuse(Some(baud.span()), what, "500000, 38400, 19200 or 9600")
-            })?;
-        }
-    }
-    Ok(())
-}
-
-/// `value * scale` as one of the numbers that `allowed` names.
-fn whole(
-    origin: &Origin,
-    value: &Spanned<f64>,
-    scale: f64,
-    key: &str,
-    allowed: &str,
-) -> Result<u16, Failure> {
-    let scaled = value.get_ref() * scale;
-    let known = |v: &Variant| if scale == 1.0 { v.angle_deg } else { v.resolution_cdeg };
-    let found = Variant::ALL.iter().map(known).find(|&number| f64::from(number) == scaled);
-    found.ok_or_else(|| origin.refuse(Some(value.span()), format!("{key} = {}", value.get_ref()), allowed))
-}
-
-/// `link.NAME.KEY=VALUE` as TOML; a value that is none is taken as text.
-fn setting(flag: &str) -> Option<String> {
-    let (path, value) = flag.split_once('=')?;
-    let mut words = path.split('.');
-    let (Some("link"), Some(name), Some(key), None) =
-        (words.next(), words.next(), words.next(), words.next())
-    else {
-        return None;
-    };
-    let is_key = |c: char| c.is_ascii_alphanumeric() || c == '_' || c == '-';
-    if key.is_empty() || key == "name" || !key.chars().all(is_key) {
-        return None;
-    }
-    let value = match toml::from_str::<toml::Table>(&format!("v = {value}")) {
-        Ok(table) if table.len() == 1 => value.to_owned(),
-        _ => quoted(value),
-    };
-    Some(format!("[[link]]\nname = {}\n{key} = {value}", quoted(name)))
-}
-
-/// As a TOML string.
-fn quoted(text: &str) -> String {
-    let escaped: String = text
-        .chars()
-        .map(|c| match c {
-            '"' | '\\' => format!("\\{c}"),
-            c if c.is_control() => format!("\\u{:04X}", c as u32),
-            c => c.to_string(),
-        })
-        .collect();
-    format!("\"{escaped}\"")
 }
 
 /// What a hub without any link in its configuration does.
@@ -318,6 +150,7 @@ port = "/dev/ttyUSB1"
 #[cfg(test)]
 mod tests {
     use super::*;
+    use schema::Kind;
 
     fn sources(set: &[&str], links: &[&str]) -> Sources {
         let owned = |flags: &[&str]| flags.iter().map(|flag| (*flag).to_owned()).collect();

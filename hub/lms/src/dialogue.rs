@@ -22,11 +22,13 @@ pub struct Settings {
     pub listen_only: bool,
 }
 
-/// Why [`Dialogue::deadline`] is when it is.
+/// Why a session waits until its deadline.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Reason {
     /// A running stream would have been heard by then.
     Listening,
+    /// A request may leave.
+    Request,
     /// The reply should have come.
     Reply,
     /// The stream should have gone on.
@@ -132,7 +134,11 @@ impl Dialogue {
             Phase::Streaming { silent_at, .. } => (silent_at, Reason::Silence),
             _ => (Nanos::MAX, Reason::Never),
         };
-        if reply < own { (reply, Reason::Reply) } else { (own, reason) }
+        let request =
+            self.open.as_ref().and_then(Outgoing::byte).map_or(Nanos::MAX, |(_, not_before)| not_before);
+        [(reply, Reason::Reply), (request, Reason::Request)]
+            .into_iter()
+            .fold((own, reason), |a, b| if b.0 < a.0 { b } else { a })
     }
 
     pub(crate) fn handle_timeout(&mut self, now: Nanos) {
@@ -164,9 +170,12 @@ impl Dialogue {
     }
 
     pub(crate) fn on_telegram(&mut self, telegram: Telegram<'_>, now: Nanos) {
-        let Some(reply) = Reply::decode(telegram) else { return };
-        self.sensor.learn(&reply, telegram);
-        if let Reply::Measured(measured) = reply {
+        // What cannot be read is an answer all the same.
+        let reply = Reply::decode(telegram);
+        if let Some(reply) = &reply {
+            self.sensor.learn(reply, telegram);
+        }
+        if let Some(Reply::Measured(measured)) = reply {
             return self.on_measured(telegram, measured, now);
         }
         let expected = telegram.command() == crate::reply::REFUSED
@@ -202,7 +211,7 @@ impl Dialogue {
         self.trouble == Some(Trouble::VariantRefused) || measured.count() == self.settings.variant.beams()
     }
 
-    fn on_reply(&mut self, request: Request, reply: Reply<'_>, now: Nanos) {
+    fn on_reply(&mut self, request: Request, reply: Option<Reply<'_>>, now: Nanos) {
         match (self.phase, request) {
             (Phase::Probing { .. }, _) if self.baud == self.settings.baud => self.start(Step::Stop, now),
             (Phase::Probing { .. }, _) => self.switch(now),
@@ -210,15 +219,15 @@ impl Dialogue {
                 self.sensor.streams = false;
                 self.switch(now);
             }
-            (Phase::Switching, Request::Baud(baud)) if reply == (Reply::Mode { done: true }) => {
+            (Phase::Switching, Request::Baud(baud)) if reply == Some(Reply::Mode { done: true }) => {
                 self.change_baud(baud);
                 self.start(Step::Stop, now + SETTLE);
             }
             (Phase::Starting { step }, _) => {
-                if matches!(reply, Reply::Variant { done: false, .. }) {
+                if matches!(reply, Some(Reply::Variant { done: false, .. })) {
                     self.trouble = Some(Trouble::VariantRefused);
                 }
-                let failed = matches!(reply, Reply::Refused | Reply::Mode { done: false });
+                let failed = matches!(reply, Some(Reply::Refused | Reply::Mode { done: false }));
                 match step {
                     Step::Stop | Step::Stream if failed => {
                         self.trouble = Some(Trouble::Refused(request));

@@ -9,7 +9,8 @@
 //! Knows no clock and no meaning beyond the header; answers for every byte: [`Tally`] obeys
 //! `read == in_telegrams + acknowledge + discarded + buffered`.
 
-use crate::header::{Expect, HEADER_DISTANCE, Judgement, MAX_HEADER, Reject, State, judge};
+use crate::candidates::{Candidate, Candidates};
+use crate::header::{Expect, Judgement, MAX_HEADER, Reject, State, judge};
 use crate::measured::MEASURED;
 use crate::telegram::{ACK, MAX_TELEGRAM, NAK, STX, Telegram};
 use crate::{MILLIS, Nanos};
@@ -122,7 +123,7 @@ impl Default for Framer {
             start: 0,
             end: 0,
             cursor: 0,
-            live: Candidates { list: [Candidate::default(); Candidates::CAPACITY], len: 0 },
+            live: Candidates::new(),
             held: None,
             expect: Expect::Anything,
             awaits_acknowledge: false,
@@ -223,7 +224,7 @@ impl Framer {
 
     /// Gives up all bytes that are still open, for example because the line's rate changes.
     pub fn clear(&mut self) {
-        self.live.len = 0;
+        self.live = Candidates::new();
         self.held = None;
         self.discard(self.end, None);
         self.cursor = self.end;
@@ -361,70 +362,8 @@ impl Framer {
     }
 }
 
-/// A position with an acceptable header, and where its telegram would end.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-struct Candidate {
-    at: u16,
-    end: u16,
-}
-
-/// The candidates in a full buffer, ascending by position.
-#[derive(Clone, Debug)]
-struct Candidates {
-    list: [Candidate; Candidates::CAPACITY],
-    len: usize,
-}
-
-impl Candidates {
-    const CAPACITY: usize = CAPACITY.div_ceil(HEADER_DISTANCE);
-
-    fn as_slice(&self) -> &[Candidate] {
-        &self.list[..self.len]
-    }
-
-    fn push(&mut self, at: usize, end: usize) {
-        self.list[self.len] = Candidate { at: at as u16, end: end as u16 };
-        self.len += 1;
-    }
-
-    fn first(&self) -> Option<Candidate> {
-        self.as_slice().first().copied()
-    }
-
-    /// The one that is complete first with bytes up to `end`; of two with one end the inner, which may refute the
-    /// outer.
-    fn first_complete(&self, end: usize) -> Option<Candidate> {
-        let complete = self.as_slice().iter().filter(|candidate| usize::from(candidate.end) <= end);
-        complete.copied().min_by_key(|candidate| (candidate.end, core::cmp::Reverse(candidate.at)))
-    }
-
-    fn any_before(&self, at: usize) -> bool {
-        self.first().is_some_and(|candidate| usize::from(candidate.at) < at)
-    }
-
-    fn remove(&mut self, candidate: Candidate) {
-        if let Ok(at) = self.as_slice().binary_search_by_key(&candidate.at, |other| other.at) {
-            self.list.copy_within(at + 1..self.len, at);
-            self.len -= 1;
-        }
-    }
-
-    fn drop_before(&mut self, at: usize) {
-        let gone = self.as_slice().partition_point(|candidate| usize::from(candidate.at) < at);
-        self.list.copy_within(gone..self.len, 0);
-        self.len -= gone;
-    }
-
-    fn shift(&mut self, by: usize) {
-        for candidate in &mut self.list[..self.len] {
-            candidate.at -= by as u16;
-            candidate.end -= by as u16;
-        }
-    }
-}
-
 /// A held frame and a header that begins with its last byte must fit.
-const CAPACITY: usize = 2 * MAX_TELEGRAM;
+pub(crate) const CAPACITY: usize = 2 * MAX_TELEGRAM;
 /// The longest pause inside a telegram (Telegram listing 4.3): a header inside a held frame is given up after it.
 pub const VETO_HOLD: Nanos = 14 * MILLIS;
 /// A frame whose last bytes might begin a header is delivered when nothing followed for so long.

@@ -7,6 +7,7 @@
 #![forbid(unsafe_code)]
 
 mod arrival;
+mod candidates;
 pub mod command;
 pub mod crc;
 mod dialogue;

@@ -4,13 +4,14 @@
 //! After every call that changes it, drain [`Session::poll_output`] until it answers [`Output::Wait`] or
 //! [`Output::Rest`].
 
-use crate::Nanos;
 use crate::arrival::{Arrivals, Rhythm};
 use crate::dialogue::{Dialogue, Reason, Settings};
 use crate::framer::{Advance, Framer, Place, Tally, suspect};
+use crate::measured::MEASURED;
 use crate::sensor::{Sensor, State, Trouble};
 use crate::telegram::Telegram;
 use crate::variant::{Baud, Mode};
+use crate::{MILLIS, Nanos};
 
 /// What the session wants, in the order in which it wants it.
 #[derive(Debug)]
@@ -75,6 +76,9 @@ pub enum Values {
     Unknown,
 }
 
+/// A byte that may leave within so long is asked for at once; a later one is waited for as for anything else.
+const SOON: Nanos = 5 * MILLIS;
+
 /// One sensor's session.
 #[derive(Clone, Debug)]
 pub struct Session {
@@ -84,8 +88,6 @@ pub struct Session {
     rhythm: Rhythm,
     now: Nanos,
     last_byte: Nanos,
-    /// Reads since the host rested.
-    looks: u32,
     cut: bool,
 }
 
@@ -96,10 +98,9 @@ impl Session {
             framer: Framer::default(),
             dialogue: Dialogue::new(settings, now),
             arrivals: Arrivals::new(),
-            rhythm: Rhythm::default(),
+            rhythm: Rhythm::new(),
             now,
             last_byte: now,
-            looks: 0,
             cut: false,
         }
     }
@@ -119,7 +120,6 @@ impl Session {
         self.framer.commit(len);
         self.arrivals.note(now, len);
         self.last_byte = now;
-        self.looks += 1;
         if was_empty {
             self.begin_rhythm();
         }
@@ -157,15 +157,15 @@ impl Session {
         }
         self.framer.expect(self.dialogue.expect());
         self.framer.await_acknowledge(self.dialogue.awaits_acknowledge());
-        if let Some((byte, not_before)) = self.dialogue.outgoing().and_then(|outgoing| outgoing.byte()) {
+        let next_byte = self.dialogue.outgoing().and_then(|outgoing| outgoing.byte());
+        if let Some((byte, not_before)) = next_byte.filter(|&(_, at)| at <= self.now + SOON) {
             return Output::Transmit { byte, not_before };
         }
         if self.framer.buffered() == 0 {
             self.rhythm.lose();
-        } else if self.state() == State::Streaming
+        } else if self.is_live()
             && let Some(until) = self.rhythm.rest(self.now)
         {
-            self.looks = 0;
             return Output::Rest(until);
         }
         let (until, reason) = self.dialogue.deadline();
@@ -219,15 +219,17 @@ impl Session {
 
     fn receive(&mut self, place: Place) -> Received<'_> {
         let baud = self.dialogue.baud.rate();
-        let len = self.framer.view(place).telegram.bytes().len() as u64;
+        let telegram = self.framer.view(place).telegram;
+        let (len, is_scan) = (telegram.bytes().len() as u64, telegram.command() == MEASURED);
         let first = self.arrivals.stamp(place.offset, baud);
         let last = self.arrivals.stamp(place.offset + len - 1, baud).at;
-        self.cut |= self.tally().telegrams == 1 && place.offset > 0;
-        // A recording has the pace of whoever reads it.
-        let has_rhythm = !first.estimated && !self.dialogue.settings.listen_only;
-        let slow = has_rhythm && self.rhythm.is_slow(last.saturating_sub(first.at));
+        self.cut |= is_scan && self.tally().telegrams == 1 && self.tally().discarded > 0;
+        // Replies come when they are asked for, and a recording has the pace of whoever reads it.
+        let has_rhythm = is_scan && self.is_live() && !first.estimated;
+        let took = last.saturating_sub(first.at);
+        let slow = has_rhythm && self.rhythm.is_slow(took);
         if has_rhythm {
-            self.rhythm.complete(first.at, last, self.looks <= 1);
+            self.rhythm.complete(took);
         } else {
             self.rhythm.lose();
         }
@@ -248,6 +250,11 @@ impl Session {
             },
             reasons: framed.reasons | if slow { suspect::SLOW } else { 0 },
         }
+    }
+
+    /// Whether a sensor streams, not a recording.
+    fn is_live(&self) -> bool {
+        self.state() == State::Streaming && !self.dialogue.settings.listen_only
     }
 
     fn begin_rhythm(&mut self) {

@@ -70,6 +70,7 @@ impl Line<'_> {
             let read_ns = now_ns();
             let count = self.pty.read(&mut buffer)?;
             let now_ns = now_ns();
+            self.slip(now_ns);
             while let Some(chunk) = self.machine.poll_transmit(self.time.of_machine(now_ns)) {
                 self.hand_over(chunk, &mut way)?;
             }
@@ -86,12 +87,20 @@ impl Line<'_> {
                 quiet_ns = read_ns;
             }
             let due_ns = self.machine.poll_timeout().map_or(Nanos::MAX, |at| self.time.of_clock(at));
-            let look_ns = now_ns + if way.is_open { LOOK_NS } else { CLOSED_LOOK_NS };
+            let look_ns = now_ns + LOOK_NS;
             if self.pty.wait(stops, way.is_open, due_ns.min(look_ns)) == Wake::Stop {
                 let eeprom_writes = self.machine.eeprom_writes();
                 return Ok(Summary { port: self.port, sent: way.sent, eeprom_writes });
             }
         }
+    }
+
+    /// A line never brings more at once than it carries: where this thread was kept from running for long, the
+    /// sensor's time stood still too.
+    fn slip(&mut self, now_ns: Nanos) {
+        let Some(due_ns) = self.machine.poll_timeout() else { return };
+        let latest_ns = self.time.of_clock(due_ns + MOST_LATE_NS);
+        self.time.zero_ns += now_ns.saturating_sub(latest_ns);
     }
 
     fn hand_over(&mut self, mut chunk: Chunk, way: &mut Way) -> Result<(), Failure> {
@@ -150,10 +159,11 @@ fn same_rate(a: u32, b: u32) -> bool {
     u64::from(a.abs_diff(b)) * 100 <= 3 * u64::from(b)
 }
 
+/// How late the sensor may be, in its own time: 5 kB at its highest rate, a quarter of what a pty holds.
+const MOST_LATE_NS: Nanos = 100 * MILLIS;
 /// A byte may lie in the kernel for so long before it can be read: a worker thread carries it over.
 const PTY_DELAY_NS: Nanos = 2 * MILLIS;
-/// How often an open port is looked at even if nothing happens: how well it is known when a byte came. At 9600, where
-/// every host begins, this proves a request that was written without gaps.
+/// How often the port is looked at even if nothing happens: nothing announces that it was opened, and how well it is
+/// known when a byte came depends on it. At 9600, where every host begins, this proves that a request was written
+/// without gaps.
 const LOOK_NS: Nanos = 4 * MILLIS;
-/// How often a closed port is looked at: nothing announces that it was opened.
-const CLOSED_LOOK_NS: Nanos = 10 * MILLIS;

@@ -120,7 +120,7 @@ mod tests {
 
     #[test]
     fn a_slower_host_reads_less() {
-        let bytes: Vec<u8> = (0..20_000u32).map(|i| (i * i >> 3) as u8).collect();
+        let bytes: Vec<u8> = (0..20_000u32).map(|i| ((i * i) >> 3) as u8).collect();
         for (rate, share) in [(19_200, 0.5), (9_600, 0.25)] {
             let read = Receiver::new(38_400, rate).receive(&bytes, true).len() as f64 / bytes.len() as f64;
             assert!((read - share).abs() < 0.08 * share, "{rate}: {read}");

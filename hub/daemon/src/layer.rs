@@ -1,0 +1,182 @@
+//! One source of configuration laid over the others: every value is checked where it stands, so that an error names
+//! file, line and column, or the flag.
+
+use lms::variant::{Baud, Unit, Variant};
+use schema::{Failure, Kind, check_sensor};
+use serde::Deserialize;
+use toml::Spanned;
+
+use crate::config::{Link, Source};
+use crate::origin::Origin;
+
+/// What one source says. Knows the keys; what is not here is an unknown key.
+#[derive(Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(crate) struct Layer {
+    #[serde(default)]
+    link: Vec<LinkLayer>,
+}
+
+#[derive(Deserialize)]
+#[serde(deny_unknown_fields)]
+struct LinkLayer {
+    name: Spanned<String>,
+    port: Option<Spanned<String>>,
+    angle: Option<Spanned<f64>>,
+    resolution: Option<Spanned<f64>>,
+    unit: Option<Spanned<String>>,
+    baud: Option<Spanned<u32>>,
+}
+
+/// A link while sources are merged.
+pub(crate) struct Draft {
+    pub(crate) name: String,
+    place: String,
+    port: Option<Source>,
+    angle_deg: u16,
+    resolution_cdeg: u16,
+    unit: Option<Unit>,
+    baud: Baud,
+}
+
+impl Draft {
+    pub(crate) fn finish(self) -> Result<Link, Failure> {
+        let Draft { name, place, port, angle_deg, resolution_cdeg, unit, baud } = self;
+        let refuse = |what: String, remedy: &str| {
+            Failure::new(Kind::Configuration, format!("{place}: link {name}: {what}"), remedy)
+        };
+        let port = port.ok_or_else(|| refuse("no port".into(), "add port = \"/dev/ttyUSB0\""))?;
+        let variant = Variant::new(angle_deg, resolution_cdeg).ok_or_else(|| {
+            let step = f64::from(resolution_cdeg) / 100.0;
+            let remedy = "180 degrees at 0.5 or 1, 100 degrees at 0.25, 0.5 or 1";
+            refuse(format!("no sensor scans {angle_deg} degrees at {step}"), remedy)
+        })?;
+        Ok(Link { name, port, variant, unit, baud })
+    }
+}
+
+/// The TOML `text` as a layer.
+pub(crate) fn parse(origin: &Origin, text: &str) -> Result<Layer, Failure> {
+    toml::from_str(text).map_err(|error| origin.explain(&error))
+}
+
+/// Lays `layer` over `links`; only where `may_add` may it bring links that were not there.
+pub(crate) fn merge(
+    links: &mut Vec<Draft>,
+    layer: Layer,
+    origin: &Origin,
+    may_add: bool,
+) -> Result<(), Failure> {
+    let mut seen: Vec<String> = Vec::new();
+    for link in layer.link {
+        let (span, name) = (Some(link.name.span()), link.name.into_inner());
+        check_sensor(&name).map_err(|failure| origin.refuse(span.clone(), failure.message, failure.hint))?;
+        if seen.contains(&name) {
+            return Err(origin.refuse(
+                span,
+                format!("a second link {name}"),
+                "give each link a name of its own",
+            ));
+        }
+        seen.push(name.clone());
+        let known = links.iter().position(|draft| draft.name == name);
+        let at = match known {
+            Some(at) => at,
+            None if may_add => {
+                links.push(Draft {
+                    name: name.clone(),
+                    place: origin.place(span),
+                    port: None,
+                    angle_deg: Variant::HALF.angle_deg,
+                    resolution_cdeg: Variant::HALF.resolution_cdeg,
+                    unit: None,
+                    baud: Baud::B500000,
+                });
+                links.len() - 1
+            }
+            None => {
+                let names: Vec<_> = links.iter().map(|draft| draft.name.as_str()).collect();
+                let remedy = format!("there are: {}", names.join(", "));
+                return Err(origin.refuse(span, format!("no link {name}"), remedy));
+            }
+        };
+        let draft = &mut links[at];
+        if let Some(port) = link.port {
+            let port_span = Some(port.span());
+            let port = port.into_inner();
+            draft.port = Some(Source::parse(&port).map_err(|what| {
+                origin.refuse(port_span, what, "name a tty, or file:PATH with ?rate=max if you like")
+            })?);
+        }
+        if let Some(angle) = link.angle {
+            draft.angle_deg = whole(origin, &angle, 1.0, "angle", "100 or 180")?;
+        }
+        if let Some(resolution) = link.resolution {
+            draft.resolution_cdeg = whole(origin, &resolution, 100.0, "resolution", "0.25, 0.5 or 1")?;
+        }
+        if let Some(unit) = link.unit {
+            draft.unit = Some(match unit.get_ref().as_str() {
+                "mm" => Unit::Mm,
+                "cm" => Unit::Cm,
+                other => {
+                    let what = format!("unit = \"{other}\"");
+                    return Err(origin.refuse(Some(unit.span()), what, "\"mm\" or \"cm\""));
+                }
+            });
+        }
+        if let Some(baud) = link.baud {
+            draft.baud = Baud::of_rate(*baud.get_ref()).ok_or_else(|| {
+                let what = format!("baud = {}", baud.get_ref());
+                origin.refuse(Some(baud.span()), what, "500000, 38400, 19200 or 9600")
+            })?;
+        }
+    }
+    Ok(())
+}
+
+/// `value * scale` as one of the numbers that `allowed` names.
+fn whole(
+    origin: &Origin,
+    value: &Spanned<f64>,
+    scale: f64,
+    key: &str,
+    allowed: &str,
+) -> Result<u16, Failure> {
+    let scaled = value.get_ref() * scale;
+    let known = |v: &Variant| if scale == 1.0 { v.angle_deg } else { v.resolution_cdeg };
+    let found = Variant::ALL.iter().map(known).find(|&number| f64::from(number) == scaled);
+    found.ok_or_else(|| origin.refuse(Some(value.span()), format!("{key} = {}", value.get_ref()), allowed))
+}
+
+/// `link.NAME.KEY=VALUE` as TOML; a value that is none is taken as text.
+pub(crate) fn setting(flag: &str) -> Option<String> {
+    let (path, value) = flag.split_once('=')?;
+    let mut words = path.split('.');
+    let (Some("link"), Some(name), Some(key), None) =
+        (words.next(), words.next(), words.next(), words.next())
+    else {
+        return None;
+    };
+    let is_key = |c: char| c.is_ascii_alphanumeric() || c == '_' || c == '-';
+    if key.is_empty() || key == "name" || !key.chars().all(is_key) {
+        return None;
+    }
+    let value = match toml::from_str::<toml::Table>(&format!("v = {value}")) {
+        Ok(table) if table.len() == 1 => value.to_owned(),
+        _ => quoted(value),
+    };
+    Some(format!("[[link]]\nname = {}\n{key} = {value}", quoted(name)))
+}
+
+/// As a TOML string.
+pub(crate) fn quoted(text: &str) -> String {
+    let escaped: String = text
+        .chars()
+        .map(|c| match c {
+            '"' | '\\' => format!("\\{c}"),
+            c if c.is_control() => format!("\\u{:04X}", c as u32),
+            c => c.to_string(),
+        })
+        .collect();
+    format!("\"{escaped}\"")
+}

@@ -1,0 +1,251 @@
+//! What was sent and what arrived: the simulator's truth on one side, the consumers' telegrams on the other, told
+//! apart by their hash, so that a damaged telegram is a lost one.
+
+use std::collections::HashMap;
+use std::fs::File;
+use std::io::{Read, Seek, SeekFrom, Write};
+use std::path::PathBuf;
+use std::time::Instant;
+
+use serde::Serialize;
+use serde_json::Value;
+use sha2::{Digest, Sha256};
+
+/// The account of all sensors.
+pub(crate) struct Account {
+    pub(crate) sensors: Vec<Sensor>,
+    truth: PathBuf,
+    read: u64,
+    /// Telegrams whose last byte left after this moment do not count.
+    cut_ns: u64,
+    hub: Option<Work>,
+    /// Processor time of the hub in percent of one processor, over the last look and over all.
+    pub(crate) hub_cpu_percent: f64,
+}
+
+/// One sensor's account.
+#[derive(Default)]
+pub(crate) struct Sensor {
+    pub(crate) name: String,
+    pub(crate) state: String,
+    pub(crate) baud: u64,
+    /// Hash of each telegram of measured data that was sent whole, with the time of its last byte.
+    sent: Vec<(String, u64)>,
+    received: HashMap<String, u64>,
+    pub(crate) received_count: u64,
+    /// Ranges of the last scan, in mm; none where there is no reading.
+    pub(crate) ranges: Vec<Option<u64>>,
+    pub(crate) nearest_mm: Option<u64>,
+    pub(crate) nearest_deg: f64,
+    pub(crate) first_ns: u64,
+    pub(crate) last_ns: u64,
+    eeprom_writes: u64,
+}
+
+/// A moment in the hub's life: when, and how much processor time it had used.
+#[derive(Clone, Copy)]
+struct Work {
+    since: Instant,
+    used_ns: u64,
+}
+
+/// The last line per sensor, keys in the order of their contract.
+#[derive(Serialize)]
+struct Summary<'a> {
+    class: &'static str,
+    sensor: &'a str,
+    state: &'a str,
+    sent: u64,
+    received: u64,
+    lost: u64,
+    hz: f64,
+    seconds: f64,
+    nearest_mm: Option<u64>,
+    hub_cpu_percent: f64,
+    eeprom_writes: u64,
+}
+
+impl Account {
+    pub(crate) fn new(names: Vec<String>, truth: PathBuf) -> Self {
+        let sensors =
+            names.into_iter().map(|name| Sensor { name, state: "absent".into(), ..Sensor::default() });
+        Account {
+            sensors: sensors.collect(),
+            truth,
+            read: 0,
+            cut_ns: u64::MAX,
+            hub: None,
+            hub_cpu_percent: 0.0,
+        }
+    }
+
+    /// Takes a line that the consumer of sensor number `of` printed.
+    pub(crate) fn take(&mut self, of: usize, line: &Value) {
+        let Some(sensor) = self.sensors.get_mut(of) else { return };
+        match line["class"].as_str() {
+            Some("telegram") => sensor.take_telegram(line),
+            Some("scan") => sensor.take_scan(line),
+            Some("status") => {
+                sensor.state = line["state"].as_str().unwrap_or_default().to_owned();
+                sensor.baud = line["baud"].as_u64().unwrap_or_default();
+            }
+            _ => {}
+        }
+    }
+
+    /// Reads what the simulator wrote since the last time.
+    pub(crate) fn read_truth(&mut self) {
+        let mut text = String::new();
+        let read = File::open(&self.truth).and_then(|mut file| {
+            file.seek(SeekFrom::Start(self.read))?;
+            file.read_to_string(&mut text)
+        });
+        if read.is_err() {
+            return;
+        }
+        let whole = text.rfind('\n').map_or(0, |end| end + 1);
+        self.read += whole as u64;
+        for line in text[..whole].lines() {
+            let value: Value = serde_json::from_str(line).unwrap_or_default();
+            let of = self.sensors.iter_mut().find(|sensor| {
+                value["port"]
+                    .as_str()
+                    .is_some_and(|port| port.rsplit('/').next() == Some(sensor.name.as_str()))
+            });
+            let Some(sensor) = of else { continue };
+            if value["class"] == "simulated" {
+                sensor.eeprom_writes = value["eeprom_writes"].as_u64().unwrap_or(u64::MAX);
+            } else if value["kind"] == "data" && value["fault"].is_null() {
+                let hash = value["sha256"].as_str().unwrap_or_default().to_owned();
+                sensor.sent.push((hash, value["sent_ns"].as_u64().unwrap_or_default()));
+            }
+        }
+    }
+
+    /// What leaves a sensor from now on does not count any more.
+    pub(crate) fn cut(&mut self) {
+        let now = rustix::time::clock_gettime(rustix::time::ClockId::Monotonic);
+        self.cut_ns = now.tv_sec as u64 * 1_000_000_000 + now.tv_nsec as u64;
+    }
+
+    /// Looks at the processor time of the hub, process `pid`.
+    pub(crate) fn look_at_hub(&mut self, pid: u32) {
+        let now = Work { since: Instant::now(), used_ns: processor_time_ns(pid) };
+        // From the first scan on: finding the sensors is another matter.
+        if self.sensors.iter().any(|sensor| sensor.ranges.is_empty()) {
+            self.hub = Some(now);
+            return;
+        }
+        if let Some(begin) = self.hub {
+            let span = now.since.duration_since(begin.since).as_nanos().max(1);
+            self.hub_cpu_percent = 100.0 * (now.used_ns - begin.used_ns) as f64 / span as f64;
+        }
+    }
+
+    /// Prints a line per sensor; returns how many telegrams were lost in all.
+    pub(crate) fn summary(&self, out: &mut dyn Write, json: bool) -> u64 {
+        for sensor in &self.sensors {
+            let (sent, lost) = sensor.sent_and_lost(self.cut_ns);
+            let summary = Summary {
+                class: "summary",
+                sensor: &sensor.name,
+                state: &sensor.state,
+                sent,
+                received: sent - lost,
+                lost,
+                hz: sensor.hz(),
+                seconds: sensor.seconds(),
+                nearest_mm: sensor.nearest_mm,
+                hub_cpu_percent: self.hub_cpu_percent,
+                eeprom_writes: sensor.eeprom_writes,
+            };
+            let line = if json {
+                serde_json::to_string(&summary).unwrap_or_default()
+            } else {
+                format!(
+                    "{:6} {}: {sent} telegrams sent, {} received, {lost} lost in {:.1} s, {:.2} Hz, nearest {}, hub \
+                     {:.1} % of a processor, {} EEPROM writes",
+                    summary.sensor,
+                    summary.state,
+                    summary.received,
+                    summary.seconds,
+                    summary.hz,
+                    sensor.nearest_mm.map_or("nothing".into(), |mm| format!("{mm} mm")),
+                    summary.hub_cpu_percent,
+                    summary.eeprom_writes,
+                )
+            };
+            let _ = out.write_all(format!("{line}\n").as_bytes());
+        }
+        self.sensors.iter().map(|sensor| sensor.sent_and_lost(self.cut_ns).1).sum()
+    }
+}
+
+impl Sensor {
+    /// Telegrams sent whole before the cut, and how many of them did not arrive.
+    pub(crate) fn sent_and_lost(&self, cut_ns: u64) -> (u64, u64) {
+        let mut received = self.received.clone();
+        let (mut sent, mut lost) = (0, 0);
+        for (hash, _) in self.sent.iter().filter(|(_, at)| *at <= cut_ns) {
+            sent += 1;
+            match received.get_mut(hash) {
+                Some(count) if *count > 0 => *count -= 1,
+                _ => lost += 1,
+            }
+        }
+        (sent, lost)
+    }
+
+    /// Telegrams per second from the first to the last.
+    pub(crate) fn hz(&self) -> f64 {
+        if self.seconds() > 0.0 { (self.received_count - 1) as f64 / self.seconds() } else { 0.0 }
+    }
+
+    fn seconds(&self) -> f64 {
+        (self.last_ns - self.first_ns) as f64 / 1e9
+    }
+
+    fn take_telegram(&mut self, line: &Value) {
+        if line["command"] != MEASURED {
+            return;
+        }
+        let bytes = from_hex(line["data"].as_str().unwrap_or_default());
+        let hash = Sha256::digest(&bytes).iter().map(|byte| format!("{byte:02x}")).collect();
+        *self.received.entry(hash).or_default() += 1;
+        self.received_count += 1;
+        self.last_ns = line["stamp_ns"].as_u64().unwrap_or_default();
+        if self.first_ns == 0 {
+            self.first_ns = self.last_ns;
+        }
+    }
+
+    fn take_scan(&mut self, line: &Value) {
+        let unit = line["unit_mm"].as_u64().unwrap_or(1);
+        let ranges = line["ranges"].as_array().map(Vec::as_slice).unwrap_or_default();
+        self.ranges = ranges.iter().map(|range| range.as_u64().map(|range| range * unit)).collect();
+        let valid = self.ranges.iter().enumerate().filter_map(|(i, range)| Some(((*range)?, i)));
+        let nearest = valid.min();
+        self.nearest_mm = nearest.map(|(mm, _)| mm);
+        let angle = |key: &str| line[key].as_f64().unwrap_or_default();
+        self.nearest_deg =
+            nearest.map_or(0.0, |(_, i)| angle("first_angle_deg") + i as f64 * angle("step_deg"));
+    }
+}
+
+fn from_hex(text: &str) -> Vec<u8> {
+    let digits = |at| text.get(at..at + 2).and_then(|pair| u8::from_str_radix(pair, 16).ok());
+    (0..text.len()).step_by(2).map_while(digits).collect()
+}
+
+/// Processor time of all threads of `pid`, user and system.
+fn processor_time_ns(pid: u32) -> u64 {
+    let tasks = std::fs::read_dir(format!("/proc/{pid}/task")).into_iter().flatten().flatten();
+    let spent = tasks.filter_map(|task| {
+        let text = std::fs::read_to_string(task.path().join("schedstat")).ok()?;
+        text.split_whitespace().next()?.parse::<u64>().ok()
+    });
+    spent.sum()
+}
+
+/// Command of a measured-value telegram.
+const MEASURED: u64 = 0xB0;

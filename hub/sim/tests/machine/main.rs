@@ -1,0 +1,274 @@
+//! The sensor in virtual time: what it answers, when its bytes are through, and what a request does to its stream.
+
+mod bench;
+
+use lms::command::{EEPROM_WRITES, Request};
+use lms::measured::Measured;
+use lms::reply::Reply;
+use lms::telegram::{ACK, NAK, Telegram, Writer};
+use lms::variant::{Baud, MIRROR_TURN, Mode, Unit, Variant};
+use lms::{MICROS, MILLIS, Nanos, line_time};
+use proptest::prelude::*;
+use sim::machine::{Machine, Part, Settings};
+use sim::room::{Room, World};
+use sim::source::Source;
+use sim::{Arrival, ChunkSize};
+
+use bench::Bench;
+
+/// The reply in `bytes`, which are an ACK and one telegram.
+fn reply(bytes: &[u8]) -> Reply<'_> {
+    assert_eq!(bytes[0], ACK);
+    Reply::decode(Telegram::check(&bytes[1..]).expect("a whole telegram")).expect("a reply")
+}
+
+fn fast() -> Settings {
+    Settings { baud: Baud::B500000, ..Settings::default() }
+}
+
+#[test]
+fn a_start_up_at_9600_to_a_stream_at_500k() {
+    let mut bench = Bench::new(Settings::default());
+    bench.run_until(5_000 * MILLIS);
+    assert!(bench.chunks.is_empty(), "streams unasked");
+    let Reply::Status(_) = reply(&bench.ask(Request::Status.encode(0).bytes())) else { panic!("no status") };
+    let bytes = bench.ask(Request::Status.encode(0).bytes());
+    let Reply::Status(status) = reply(&bytes) else { panic!("no status") };
+    assert_eq!((status.operating_mode(), status.mode(), status.unit()), (0x25, Mode(1), Some(Unit::Mm)));
+    assert_eq!(status.variant(), Some(Variant::HALF));
+    let bytes = bench.ask(Request::Type.encode(0).bytes());
+    assert_eq!(reply(&bytes), Reply::Type(b"LMS200;301063;V02.30"));
+    let bytes = bench.ask(Request::Configuration.encode(0).bytes());
+    let Reply::Configuration(configuration) = reply(&bytes) else { panic!("no configuration") };
+    assert_eq!((configuration.mode(), configuration.unit()), (Mode(1), Some(Unit::Mm)));
+    let whole_degrees = Variant::new(180, 100).unwrap();
+    let bytes = bench.ask(Request::Variant(whole_degrees).encode(0).bytes());
+    assert_eq!(reply(&bytes), Reply::Variant { done: true, angle_deg: 180, resolution_cdeg: 100 });
+
+    let first = bench.chunks.len();
+    let bytes = bench.ask(Request::Baud(Baud::B500000).encode(0).bytes());
+    assert_eq!(reply(&bytes), Reply::Mode { done: true });
+    assert!(bench.chunks[first..].iter().all(|(_, chunk)| chunk.baud == Baud::B9600), "not at the old rate");
+    assert_eq!(bench.machine.baud(), Baud::B500000);
+
+    let first = bench.sent().len();
+    bench.ask(Request::Stream.encode(0).bytes());
+    let sent = bench.sent().split_off(first);
+    assert!(sent[0].1.is_reply && sent.len() > 20);
+    for pair in sent[1..].windows(2) {
+        assert_eq!(pair[1].0 - pair[0].0, MIRROR_TURN, "181 beams at 500k come once a turn");
+        assert_eq!(pair[1].1.telegram.len(), 372);
+    }
+    assert_eq!(bench.machine.eeprom_writes(), 0);
+}
+
+#[test]
+fn the_times_of_an_answer() {
+    for (request, least, most) in
+        [(Request::Status, 0, 60 * MILLIS), (Request::Stop, 50 * MILLIS, 120 * MILLIS)]
+    {
+        let mut bench = Bench::new(fast());
+        bench.say(request.encode(0).bytes(), 60 * MICROS);
+        let asked = bench.now;
+        bench.run_until(asked + 3_000 * MILLIS);
+        assert_eq!((&bench.chunks[0].1.bytes[..], &bench.chunks[0].1.part), (&[ACK][..], &Part::Acknowledge));
+        assert!(bench.chunks[0].0 - asked <= 60 * MILLIS);
+        let answered = bench.chunks.last().unwrap().0 - asked;
+        assert!((least..=most).contains(&answered), "{request:?} after {answered} ns");
+    }
+}
+
+#[test]
+fn a_stream_keeps_its_grid_and_pauses_with_the_mirror() {
+    let mut bench = Bench::new(fast());
+    bench.ask(Request::Stream.encode(0).bytes());
+    bench.run_until(60_000 * MILLIS);
+    let sent: Vec<_> = bench.sent().into_iter().filter(|(_, sent)| !sent.is_reply).collect();
+    let (first, last) = (sent[0].0, sent[sent.len() - 1].0);
+    assert_eq!(last - first, (sent.len() as Nanos - 1) * 2 * MIRROR_TURN, "drifts");
+    assert!(sent.iter().all(|(_, sent)| !sent.aborted && Telegram::check(&sent.telegram).is_some()));
+    // Of the last telegram: 508 bytes in 10.16 ms, a pause, the rest in the next turn.
+    let start = last - MIRROR_TURN - line_time(224, 500_000);
+    let mut through = 0;
+    let mut pauses = 0;
+    for (at, chunk) in bench.chunks.iter().filter(|(at, _)| (start..=last).contains(at)) {
+        assert!(chunk.bytes.len() <= 16);
+        through += chunk.bytes.len();
+        if through == 508 {
+            assert_eq!((*at - start, chunk.idle_after), (10_160 * MICROS, true));
+            pauses += 1;
+        }
+    }
+    assert_eq!((through, pauses), (732, 1));
+}
+
+#[test]
+fn each_rate_and_variant_has_the_period_of_the_listing() {
+    for baud in Baud::ALL {
+        for variant in Variant::ALL {
+            let mut bench =
+                Bench::new(Settings { baud, variant, chunk: ChunkSize::Usb, ..Settings::default() });
+            bench.ask(Request::Stream.encode(0).bytes());
+            bench.run_until(10_000 * MILLIS);
+            let sent = bench.sent();
+            let period = variant.period(sent[1].1.telegram.len(), baud.rate());
+            for pair in sent[1..].windows(2) {
+                assert_eq!(pair[1].0 - pair[0].0, period, "{baud:?} {variant:?}");
+            }
+        }
+    }
+}
+
+#[test]
+fn a_request_breaks_the_scan_off_and_a_fresh_one_follows() {
+    let mut bench = Bench::new(fast());
+    bench.ask(Request::Stream.encode(0).bytes());
+    // Into the middle of the first burst.
+    let next = bench.sent().last().unwrap().0 + 2 * MIRROR_TURN - 17_800 * MICROS;
+    bench.run_until(next + 3 * MILLIS);
+    let (before, sent_before) = (bench.chunks.len(), bench.sent().len());
+    let bytes = bench.ask(Request::Type.encode(0).bytes());
+    let sent = bench.sent().split_off(sent_before);
+    assert_eq!((sent[0].1.is_reply, sent[0].1.aborted), (false, true));
+    assert_eq!((sent[1].1.is_reply, sent[1].1.aborted), (true, false));
+    assert!(sent[2..].iter().all(|(_, sent)| !sent.is_reply && !sent.aborted));
+    // On the wire: the scan's head, ACK, the whole reply, a whole scan.
+    let broken = &sent[0].1.telegram;
+    let head = bench.chunks[..before].iter().rev().take_while(|(_, chunk)| chunk.part == Part::Telegram);
+    let head: usize = head.map(|(_, chunk)| chunk.bytes.len()).sum();
+    let rest = bytes.iter().zip(&broken[head..]).take_while(|(a, b)| a == b).count();
+    assert!(head + rest < 300, "{} bytes of it left", head + rest);
+    assert_eq!(bytes[rest], ACK);
+    let answer = &bytes[rest + 1..][..29];
+    assert_eq!(answer, sent[1].1.telegram);
+    assert_eq!(bytes[rest + 30..][..732], sent[2].1.telegram);
+    // The new scan begins where the mirror begins one.
+    assert_eq!((sent[2].0 - 17_800 * MICROS) % (2 * MIRROR_TURN), 0);
+}
+
+#[test]
+fn stopping_stops_and_a_second_request_replaces_the_first() {
+    let mut bench = Bench::new(fast());
+    bench.ask(Request::Stream.encode(0).bytes());
+    bench.ask(Request::Stop.encode(0).bytes());
+    let chunks = bench.chunks.len();
+    bench.run_until(bench.now + 5_000 * MILLIS);
+    assert_eq!(bench.chunks.len(), chunks);
+    assert_eq!(bench.machine.poll_timeout(), None);
+    let replies = bench.sent().len();
+    bench.say(Request::Status.encode(0).bytes(), 60 * MICROS);
+    bench.ask(Request::Type.encode(0).bytes());
+    let sent = bench.sent().split_off(replies);
+    assert_eq!(sent.len(), 1);
+    assert_eq!(sent[0].1.telegram[4], 0xBA);
+}
+
+#[test]
+fn what_is_not_heard_and_what_is_refused() {
+    let mut bench = Bench::new(Settings { address: 5, ..fast() });
+    let status = Request::Status.encode(0);
+    bench.say(status.bytes(), 10 * MICROS);
+    bench.run_until(bench.now + 500 * MILLIS);
+    assert!(bench.chunks.is_empty(), "bytes without gaps were heard");
+    bench.say(status.bytes(), 7 * MILLIS);
+    bench.run_until(bench.now + 500 * MILLIS);
+    assert!(bench.chunks.is_empty(), "bytes with long gaps were heard");
+    assert!(bench.ask(Request::Status.encode(4).bytes()).is_empty(), "another address");
+    let mut wrong = status.bytes().to_vec();
+    wrong[6] ^= 1;
+    assert_eq!(bench.ask(&wrong), [NAK]);
+    let bytes = bench.ask(Request::Status.encode(5).bytes());
+    assert_eq!(Telegram::check(&bytes[1..]).unwrap().address(), 0x85);
+    for impossible in [Writer::new(0, 0x20).byte(0x2A).finish(), Writer::new(0, 0x55).finish()] {
+        assert_eq!(reply(&bench.ask(impossible.bytes())), Reply::Refused);
+    }
+    let no_variant = Writer::new(0, 0x3B).word(180).word(25).finish();
+    let in_force = Reply::Variant { done: false, angle_deg: 180, resolution_cdeg: 50 };
+    assert_eq!(reply(&bench.ask(no_variant.bytes())), in_force);
+    let errors = bench.ask(&[0x02, 0, 1, 0, 0x32, 0x16, 0x12]);
+    assert_eq!(errors[5], 0xB2);
+}
+
+#[test]
+fn every_write_to_the_eeprom_is_counted_and_only_installation_mode_does_one() {
+    let mut bench = Bench::new(fast());
+    for (count, command) in EEPROM_WRITES.into_iter().enumerate() {
+        assert_eq!(reply(&bench.ask(Writer::new(0, command).byte(0).finish().bytes())), Reply::Refused);
+        assert_eq!(bench.machine.eeprom_writes(), count as u64 + 1);
+    }
+    let wrong = Writer::new(0, 0x20).byte(0).slice(b"SICK_XXX").finish();
+    assert_eq!(reply(&bench.ask(wrong.bytes())), Reply::Mode { done: false });
+    let installation = Writer::new(0, 0x20).byte(0).slice(b"SICK_LMS").finish();
+    assert_eq!(reply(&bench.ask(installation.bytes())), Reply::Mode { done: true });
+    let centimetres = Writer::new(0, 0x77).slice(&[0, 0, 0x70, 0, 0, 4, 0]).finish();
+    let written = bench.ask(centimetres.bytes());
+    assert_eq!((written[5], written[6], written.len()), (0xF7, 1, 44));
+    let bytes = bench.ask(Request::Configuration.encode(0).bytes());
+    let Reply::Configuration(configuration) = reply(&bytes) else { panic!("no configuration") };
+    assert_eq!((configuration.mode(), configuration.unit()), (Mode(4), Some(Unit::Cm)));
+    assert_eq!(bench.machine.eeprom_writes(), 7);
+}
+
+#[test]
+fn a_recording_is_sent_once_from_its_beginning_whatever_the_host_does() {
+    let telegrams: Vec<Vec<u8>> =
+        (0..30u16).map(|i| lms::measured::encode(0, Unit::Cm, &[i; 181], 0x10).bytes().to_vec()).collect();
+    let variant = Variant::new(180, 100).unwrap();
+    let source = Source::Recorded { variant, telegrams: Box::new(telegrams.clone().into_iter()) };
+    let mut bench = Bench::with(Settings { variant, ..fast() }, source);
+    let bytes = bench.ask(Request::Variant(Variant::HALF).encode(0).bytes());
+    assert_eq!(reply(&bytes), Reply::Variant { done: false, angle_deg: 180, resolution_cdeg: 100 });
+    bench.say(Request::Stream.encode(0).bytes(), 60 * MICROS);
+    bench.run_until(bench.now + 200 * MILLIS);
+    bench.ask(Request::Type.encode(0).bytes());
+    let data = bench.sent().into_iter().filter(|(_, sent)| !sent.is_reply).map(|(_, sent)| sent.telegram);
+    assert_eq!(data.collect::<Vec<_>>(), telegrams);
+    assert_eq!(bench.machine.poll_timeout(), None, "after the last one the line is silent");
+    let bytes = bench.ask(Request::Status.encode(0).bytes());
+    assert!(matches!(reply(&bytes), Reply::Status(_)));
+}
+
+proptest! {
+    /// Without faults everything that leaves is intact, byte for byte, in every setting and however late it is asked.
+    #[test]
+    fn everything_sent_is_intact(
+        seed in any::<u64>(),
+        world in 0..World::ALL.len(),
+        variant in 0..Variant::ALL.len(),
+        baud in 0..Baud::ALL.len(),
+        usb in any::<bool>(),
+        steps in proptest::collection::vec(1..40_000_000u64, 20..60),
+    ) {
+        let settings = Settings {
+            baud: Baud::ALL[baud],
+            variant: Variant::ALL[variant],
+            chunk: if usb { ChunkSize::Usb } else { ChunkSize::Uart },
+            seed,
+            ..Settings::default()
+        };
+        let mut machine = Machine::new(settings, Source::Room(Room::new(World::ALL[world].1, seed)));
+        let mut now = 0;
+        for &byte in Request::Stream.encode(0).bytes() {
+            now += line_time(1, machine.baud().rate()) + 60 * MICROS;
+            machine.receive(byte, Arrival::at(now));
+        }
+        let mut bytes = Vec::new();
+        for step in steps {
+            now += step;
+            while let Some(chunk) = machine.poll_transmit(now) {
+                bytes.extend_from_slice(&chunk.bytes);
+                match chunk.part {
+                    Part::Acknowledge => bytes.clear(),
+                    Part::Telegram => {}
+                    Part::End(sent) => {
+                        prop_assert!(!sent.aborted);
+                        prop_assert_eq!(&bytes, &sent.telegram);
+                        let telegram = Telegram::check(&bytes).expect("intact");
+                        prop_assert_eq!(Measured::decode(telegram).is_none(), sent.is_reply);
+                        bytes.clear();
+                    }
+                }
+            }
+        }
+    }
+}

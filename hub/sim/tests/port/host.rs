@@ -1,0 +1,86 @@
+//! A host with a port open: says requests with their gaps, and finds the telegrams in what comes.
+
+use std::os::fd::OwnedFd;
+use std::path::Path;
+use std::time::{Duration, Instant};
+
+use lms::command::Request;
+use lms::framer::{Found, Framer};
+use rustix::event::{PollFd, PollFlags, Timespec, poll};
+use rustix::fs::{Mode, OFlags, open};
+use rustix::termios::{OptionalActions, tcgetattr, tcsetattr};
+
+/// A host with the port open.
+pub(crate) struct Host {
+    pub(crate) port: OwnedFd,
+    framer: Framer,
+}
+
+impl Host {
+    pub(crate) fn open(path: &Path, rate: u32) -> Host {
+        let flags = OFlags::RDWR | OFlags::NOCTTY | OFlags::NONBLOCK | OFlags::CLOEXEC;
+        let port = open(path, flags, Mode::empty()).unwrap();
+        let host = Host { port, framer: Framer::default() };
+        host.set_rate(rate);
+        host
+    }
+
+    pub(crate) fn set_rate(&self, rate: u32) {
+        let mut termios = tcgetattr(&self.port).unwrap();
+        termios.make_raw();
+        termios.set_speed(rate).unwrap();
+        tcsetattr(&self.port, OptionalActions::Now, &termios).unwrap();
+    }
+
+    /// Says `request` with the gaps that the sensor wants.
+    pub(crate) fn say(&self, request: Request, rate: u32) {
+        let byte_time = Duration::from_nanos(lms::line_time(1, rate)) + Duration::from_micros(80);
+        let mut next = Instant::now();
+        for &byte in request.encode(0).bytes() {
+            while Instant::now() < next {
+                std::hint::spin_loop();
+            }
+            assert_eq!(rustix::io::write(&self.port, &[byte]), Ok(1));
+            next = Instant::now() + byte_time;
+        }
+    }
+
+    /// The next telegram that comes within `patience`.
+    pub(crate) fn telegram(&mut self, patience: Duration) -> Option<Vec<u8>> {
+        let end = Instant::now() + patience;
+        loop {
+            while let Some(found) = self.framer.poll() {
+                if let Found::Telegram(framed) = found {
+                    return Some(framed.telegram.bytes().to_vec());
+                }
+            }
+            let left = end.saturating_duration_since(Instant::now());
+            let timeout = Timespec { tv_sec: left.as_secs() as _, tv_nsec: left.subsec_nanos() as _ };
+            let mut fds = [PollFd::new(&self.port, PollFlags::IN)];
+            if poll(&mut fds, Some(&timeout)).unwrap() == 0 {
+                // A frame whose end looks like a beginning is delivered when nothing follows.
+                self.framer.release(lms::framer::VETO_HOLD);
+                if let Some(Found::Telegram(framed)) = self.framer.poll() {
+                    return Some(framed.telegram.bytes().to_vec());
+                }
+                return None;
+            }
+            let count = rustix::io::read(&self.port, self.framer.spare()).unwrap_or(0);
+            self.framer.commit(count);
+        }
+    }
+
+    /// Asks until it is answered: a request may be said too slowly on a busy machine.
+    pub(crate) fn ask(&mut self, request: Request, rate: u32) -> Vec<u8> {
+        for _ in 0..10 {
+            self.say(request, rate);
+            let end = Instant::now() + Duration::from_secs(1);
+            while let Some(telegram) = self.telegram(end.saturating_duration_since(Instant::now())) {
+                if telegram[4] == request.command() | 0x80 {
+                    return telegram;
+                }
+            }
+        }
+        panic!("no answer to {request:?}");
+    }
+}

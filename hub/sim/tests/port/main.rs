@@ -1,0 +1,222 @@
+//! The verb on real ptys: a host opens the port, asks, and reads; what it got is compared with the truth. Every wait
+//! is for something, with a deadline far beyond what it takes.
+
+mod host;
+mod simulator;
+
+use std::fs;
+use std::os::unix::net::UnixStream;
+use std::path::PathBuf;
+use std::time::Duration;
+
+use lms::command::Request;
+use lms::measured;
+use lms::reply::Reply;
+use lms::telegram::Telegram;
+use lms::variant::{Baud, Unit, Variant};
+use sim::fault::{Fault, Faults};
+use sim::options::SimulateOptions;
+use sim::simulate;
+use sim::truth::Record;
+
+use host::Host;
+use simulator::{Folder, Simulator};
+
+/// Far longer than anything takes.
+const PATIENCE: Duration = Duration::from_secs(20);
+
+fn options(port: PathBuf) -> SimulateOptions {
+    SimulateOptions { ports: vec![port], baud: Baud::B500000, seed: 5, ..SimulateOptions::default() }
+}
+
+fn is_data(record: &Record) -> bool {
+    !record.is_reply
+}
+
+#[test]
+fn from_9600_to_a_stream_at_500k_bit_for_bit_as_the_truth_says() {
+    let folder = Folder::new("stream");
+    let (port, truth) = (folder.path("front"), folder.path("truth.jsonl"));
+    std::os::unix::fs::symlink("/dev/pts/999999", &port).unwrap();
+    let simulator = Simulator::start(SimulateOptions {
+        baud: Baud::B9600,
+        truth: Some(truth.clone()),
+        ..options(port.clone())
+    });
+    assert_eq!(simulator.ready[0].port, port);
+    assert_eq!(fs::read_link(&port).unwrap(), simulator.ready[0].pty);
+    let mut host = Host::open(&port, 9_600);
+    let status = host.ask(Request::Status, 9_600);
+    let Some(Reply::Status(status)) = Reply::decode(Telegram::check(&status).unwrap()) else { panic!() };
+    assert_eq!(status.variant(), Some(Variant::HALF));
+    host.ask(Request::Baud(Baud::B500000), 9_600);
+    host.set_rate(500_000);
+    let begin = host.ask(Request::Stream, 500_000);
+    assert_eq!(begin[4], 0xA0);
+    let received: Vec<Vec<u8>> = (0..40).map(|_| host.telegram(PATIENCE).expect("a scan")).collect();
+    let (summaries, records) = simulator.end();
+    assert!(fs::symlink_metadata(&port).is_err(), "the symlink is left");
+    let sent: Vec<&Record> = records.iter().filter(|record| is_data(record)).collect();
+    let first = sent.iter().position(|record| record.sha256 == Record::hash(&received[0])).expect("was sent");
+    let sent = &sent[first..];
+    for (telegram, record) in received.iter().zip(sent) {
+        assert_eq!((Record::hash(telegram), record.fault), (record.sha256, None));
+        assert_eq!(record.length, 732);
+    }
+    // They were sent at the pace of the sensor, whatever the machine did in between.
+    let span = (sent[39].sent_ns - sent[0].sent_ns) as f64 / 39.0;
+    assert!((span / 26_640_000.0 - 1.0).abs() < 0.1, "{span} ns");
+    let lines: Vec<serde_json::Value> =
+        fs::read_to_string(&truth).unwrap().lines().map(|line| serde_json::from_str(line).unwrap()).collect();
+    assert_eq!(lines.len(), records.len() + 1);
+    let last = lines.last().unwrap();
+    assert_eq!(
+        (last["class"].as_str(), last["sent"].as_u64()),
+        (Some("simulated"), Some(records.len() as u64))
+    );
+    assert_eq!((last["eeprom_writes"].as_u64(), summaries[0].sent), (Some(0), records.len() as u64));
+}
+
+#[test]
+fn a_closed_port_loses_what_is_sent_and_keeps_nothing_for_the_next_host() {
+    let folder = Folder::new("closed");
+    let port = folder.path("front");
+    let simulator = Simulator::start(options(port.clone()));
+    let mut host = Host::open(&port, 500_000);
+    rustix::termios::ioctl_tiocexcl(&host.port).unwrap();
+    host.ask(Request::Stream, 500_000);
+    simulator.record_where(|record| is_data(record) && record.fault.is_none());
+    drop(host);
+    for _ in 0..5 {
+        simulator.record_where(|record| record.fault == Some(Fault::Unread));
+    }
+    let mut host = Host::open(&port, 500_000);
+    let first = Record::hash(&host.telegram(PATIENCE).expect("a scan"));
+    let mut next = simulator.record();
+    while next.sha256 != first {
+        assert!(next.fault.is_some(), "an intact telegram was not read");
+        next = simulator.record();
+    }
+    assert_eq!(next.fault, None);
+    simulator.end();
+}
+
+#[test]
+fn at_another_rate_nothing_is_understood_on_either_side() {
+    let folder = Folder::new("rate");
+    let port = folder.path("front");
+    let simulator = Simulator::start(options(port.clone()));
+    let mut host = Host::open(&port, 38_400);
+    host.say(Request::Status, 38_400);
+    assert_eq!(host.telegram(Duration::from_millis(300)), None, "answered at the wrong rate");
+    host.set_rate(500_000);
+    host.ask(Request::Stream, 500_000);
+    host.set_rate(250_000);
+    for _ in 0..3 {
+        simulator.record_where(|record| record.fault == Some(Fault::Baud));
+    }
+    // What is in the host's buffer now was garbled, except for a scan that came before.
+    let mut buffer = vec![0; 30_000];
+    assert!(rustix::io::read(&host.port, &mut buffer).unwrap() > 0);
+    host.set_rate(500_000);
+    assert_eq!(host.telegram(PATIENCE).expect("a scan").len(), 732);
+    simulator.end();
+}
+
+#[test]
+fn a_host_that_does_not_read_loses_what_has_no_room() {
+    let folder = Folder::new("overrun");
+    let port = folder.path("front");
+    let simulator = Simulator::start(SimulateOptions { speed: 10.0, ..options(port.clone()) });
+    let mut host = Host::open(&port, 500_000);
+    host.ask(Request::Stream, 500_000);
+    simulator.record_where(|record| record.fault == Some(Fault::Overrun));
+    drop(host);
+    simulator.end();
+}
+
+#[test]
+fn a_replay_is_sent_once_in_order_and_then_the_line_is_silent() {
+    let folder = Folder::new("replay");
+    let (port, file) = (folder.path("front"), folder.path("stream.bin"));
+    let scans: Vec<Vec<u8>> =
+        (0..100u16).map(|i| measured::encode(3, Unit::Cm, &[700 + i; 361], 0x11).bytes().to_vec()).collect();
+    let mut bytes = Request::Stop.encode(0).bytes().to_vec();
+    bytes.extend_from_slice(lms::reply::mode(3, true, 0x10).bytes());
+    bytes.extend(scans.concat());
+    fs::write(&file, bytes).unwrap();
+    let replay = Some(file);
+    let simulator = Simulator::start(SimulateOptions { replay, ..options(port.clone()) });
+    let mut host = Host::open(&port, 500_000);
+    let status = host.ask(Request::Status, 500_000);
+    let Some(Reply::Status(status)) = Reply::decode(Telegram::check(&status).unwrap()) else { panic!() };
+    assert_eq!((status.unit(), status.mode().0), (Some(Unit::Cm), 1));
+    host.ask(Request::Stream, 500_000);
+    for (number, scan) in scans.iter().enumerate() {
+        let telegram = host.telegram(PATIENCE).expect("a scan");
+        assert!(&telegram == scan, "not scan {number}; sent: {:?}", simulator.faults());
+    }
+    assert_eq!(host.telegram(Duration::from_millis(200)), None);
+    host.ask(Request::Status, 500_000);
+    let (summaries, records) = simulator.end();
+    assert_eq!(records.iter().filter(|record| is_data(record)).count(), 100);
+    assert_eq!(summaries[0].sent, records.len() as u64);
+}
+
+#[test]
+fn lost_bytes_damage_exactly_the_telegrams_that_the_truth_names() {
+    let folder = Folder::new("loss");
+    let port = folder.path("front");
+    let faults = Faults { loss: 0.00135, burst: 1.89 };
+    let simulator = Simulator::start(SimulateOptions { faults, speed: 2.0, ..options(port.clone()) });
+    let mut host = Host::open(&port, 500_000);
+    host.ask(Request::Stream, 500_000);
+    let received: Vec<[u8; 32]> =
+        (0..60).map(|_| Record::hash(&host.telegram(PATIENCE).expect("a scan"))).collect();
+    let (_, records) = simulator.end();
+    let data: Vec<&Record> = records.iter().filter(|record| is_data(record)).collect();
+    let last = data.iter().position(|record| record.sha256 == received[59]).expect("was sent");
+    let intact: Vec<[u8; 32]> =
+        data[..=last].iter().filter(|record| record.fault.is_none()).map(|record| record.sha256).collect();
+    assert_eq!(received, intact);
+    assert!(data[..=last].iter().filter(|record| record.fault == Some(Fault::Loss)).count() > 15);
+}
+
+#[test]
+fn two_ports_and_what_is_refused() {
+    let folder = Folder::new("two");
+    let ports = vec![folder.path("front"), folder.path("rear")];
+    let truth = Some(folder.path("truth"));
+    let simulator = Simulator::start(SimulateOptions { ports: ports.clone(), truth, ..options("".into()) });
+    for port in &ports {
+        let mut host = Host::open(port, 500_000);
+        host.ask(Request::Stream, 500_000);
+        host.telegram(PATIENCE).expect("a scan");
+    }
+    let (summaries, records) = simulator.end();
+    assert_eq!(
+        summaries.iter().map(|summary| &summary.port).collect::<Vec<_>>(),
+        ports.iter().collect::<Vec<_>>()
+    );
+    assert_eq!(summaries.iter().map(|summary| summary.sent).sum::<u64>(), records.len() as u64);
+
+    let (_keep, stop) = UnixStream::pair().unwrap();
+    let file = folder.path("file");
+    fs::write(&file, "PARAM a b\n").unwrap();
+    for (options, code) in [
+        (SimulateOptions::default(), 78),
+        (SimulateOptions { ports: vec![file.clone()], ..SimulateOptions::default() }, 4),
+        (SimulateOptions { ports: vec![folder.path("no/port")], ..SimulateOptions::default() }, 4),
+        (SimulateOptions { ports: vec!["a".into(), "a".into()], ..SimulateOptions::default() }, 78),
+        (SimulateOptions { speed: 0.0, ..options(folder.path("x")) }, 78),
+        (SimulateOptions { looped: true, ..options(folder.path("x")) }, 78),
+        (SimulateOptions { replay: Some(file), ..options(folder.path("x")) }, 78),
+        (SimulateOptions { replay: Some("/no/file".into()), ..options(folder.path("x")) }, 78),
+        (SimulateOptions { truth: Some("/no/file".into()), ..options(folder.path("x")) }, 1),
+    ] {
+        let failure = simulate(&options, &stop, |_| panic!("ready"), |_| {}).unwrap_err();
+        assert_eq!(failure.kind.exit_code(), code, "{failure}");
+        assert!(!failure.hint.is_empty(), "{failure}");
+        assert!(fs::symlink_metadata(folder.path("x")).is_err());
+    }
+}
