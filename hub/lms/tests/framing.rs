@@ -19,6 +19,8 @@ fn no_intact_telegram_is_lost_and_none_is_late() {
         assert!((700..=900).contains(&account.damaged), "{} damaged", account.damaged);
         assert_eq!((account.intact_lost, account.wrong_clean), (0, 0), "{}", scene.name());
         assert!(account.extra_max_ms() <= 2.1, "{} ms late", account.extra_max_ms());
+        // One telegram in 256 ends with what might be a start byte.
+        assert!(account.extra_mean_ms() <= 0.05, "{} ms late on average", account.extra_mean_ms());
         let Tally { read, in_telegrams, acknowledge, discarded, .. } = *framer.tally();
         assert_eq!(read, line.received.len() as u64);
         assert_eq!(read, in_telegrams + acknowledge + discarded + framer.buffered() as u64);
