@@ -1,6 +1,6 @@
 //! The classes of `--json`: which keys, in which order. A contract with scripts and other languages: add, never change.
 
-use schema::{Counters, Failure, Header, Scan, Status, Telegram};
+use schema::{Counters, Failure, Header, Reasons, Scan, Status, Telegram};
 use serde::Serialize;
 use serde::ser::{SerializeMap, Serializer};
 
@@ -21,6 +21,8 @@ struct Stamp<'a> {
     #[serde(serialize_with = "id")]
     boot: u64,
     quality: &'static str,
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    reasons: Vec<&'static str>,
 }
 
 impl<'a> Stamp<'a> {
@@ -34,6 +36,7 @@ impl<'a> Stamp<'a> {
             wall_ns: header.wall_ns,
             boot: header.boot,
             quality: header.quality().name(),
+            reasons: Reasons::names(header.reasons).collect(),
         }
     }
 }

@@ -3,7 +3,7 @@
 use std::fmt;
 use std::io::{self, Write};
 
-use schema::{Header, Scan, Status, Telegram};
+use schema::{Header, Reasons, Scan, Status, Telegram};
 
 use crate::account::Account;
 use crate::follow::Notice;
@@ -68,7 +68,11 @@ fn numbers(line: &mut Vec<u8>, header: &Header) -> io::Result<()> {
         header.seq,
         header.topic_seq,
         header.quality().name()
-    )
+    )?;
+    for reason in Reasons::names(header.reasons) {
+        write!(line, " {reason}")?;
+    }
+    Ok(())
 }
 
 fn telegram(line: &mut Vec<u8>, header: &Header, bytes: &[u8]) -> io::Result<()> {

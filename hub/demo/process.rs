@@ -1,6 +1,7 @@
 //! A child process of this very program: started with its verb, read line by line, ended by its id.
 
 use std::io::{BufRead, BufReader};
+use std::os::unix::process::CommandExt;
 use std::process::{Child as Process, ChildStdout, Command, Stdio};
 use std::sync::mpsc::Sender;
 use std::thread;
@@ -40,6 +41,8 @@ impl Child {
             .args(["--domain", domain])
             .env("SCANHUB_LOG", std::env::var("SCANHUB_LOG").unwrap_or("error".into()))
             .env(crate::END_WITH_PARENT, "1")
+            // Ctrl-C is for the demonstration; it ends its children itself, in their order.
+            .process_group(0)
             .stdin(Stdio::null())
             .stdout(Stdio::piped())
             .spawn()

@@ -33,8 +33,10 @@ pub struct Header {
     pub period_us: u32,
     /// Process of the hub.
     pub hub_pid: u32,
+    /// Why the telegram is suspect: bits of [`Reasons`]; 0 if it is clean.
+    pub reasons: u8,
     /// 0.
-    pub reserved: u32,
+    pub reserved: [u8; 3],
 }
 
 impl Header {
@@ -61,6 +63,34 @@ impl Quality {
             Quality::Clean => "clean",
             Quality::Suspect => "suspect",
         }
+    }
+}
+
+/// The bits of [`Header::reasons`].
+pub struct Reasons;
+
+impl Reasons {
+    /// The line's error counters moved.
+    pub const LINE_ERROR: u8 = 1;
+    /// Bytes just before it belonged to nothing.
+    pub const NEIGHBOUR: u8 = 2;
+    /// It took longer than usual.
+    pub const SLOW: u8 = 4;
+    /// Bits are set that the measuring mode never sets.
+    pub const FORBIDDEN_BITS: u8 = 8;
+    /// The header of another telegram began inside.
+    pub const HEADER_INSIDE: u8 = 16;
+
+    /// The names of the bits that are set, as in all output.
+    pub fn names(reasons: u8) -> impl Iterator<Item = &'static str> {
+        let named = [
+            (Reasons::LINE_ERROR, "line_error"),
+            (Reasons::NEIGHBOUR, "neighbour"),
+            (Reasons::SLOW, "slow"),
+            (Reasons::FORBIDDEN_BITS, "forbidden_bits"),
+            (Reasons::HEADER_INSIDE, "header_inside"),
+        ];
+        named.into_iter().filter(move |(bit, _)| reasons & bit != 0).map(|(_, name)| name)
     }
 }
 

@@ -20,7 +20,7 @@ mod lock;
 
 pub use domain::{DEFAULT_DOMAIN, Domain, Environment};
 pub use failure::{Failure, Kind};
-pub use header::{Flags, Header, Quality};
+pub use header::{Flags, Header, Quality, Reasons};
 pub use scan::{BEAMS, CONTENTS_UPPER, Code, Scan, TURN_NS};
 pub use status::{COUNTERS, Counter, Counters, State, Status};
 pub use telegram::Telegram;

@@ -28,7 +28,8 @@ fn header_layout() {
     assert_eq!(offset_of!(Header, flags), 50);
     assert_eq!(offset_of!(Header, period_us), 52);
     assert_eq!(offset_of!(Header, hub_pid), 56);
-    assert_eq!(offset_of!(Header, reserved), 60);
+    assert_eq!(offset_of!(Header, reasons), 60);
+    assert_eq!(offset_of!(Header, reserved), 61);
 }
 
 #[test]
@@ -45,7 +46,8 @@ fn header_bytes() {
         flags: 0x0102,
         period_us: 26_640,
         hub_pid: 7,
-        reserved: 0,
+        reasons: 0x12,
+        reserved: [0; 3],
     };
     let expected = golden(
         64,
@@ -59,6 +61,7 @@ fn header_bytes() {
             (48, &[5, 1, 0x02, 0x01]),
             (52, &[0x10, 0x68, 0, 0]),
             (56, &[7]),
+            (60, &[0x12]),
         ],
     );
     assert_eq!(bytemuck::bytes_of(&header), expected);

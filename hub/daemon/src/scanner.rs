@@ -1,9 +1,10 @@
 //! From a telegram of the sensor's to a scan of ours: the one file that knows both. Ranges are born here, in the
 //! shared memory that consumers read.
 
+use lms::framer::suspect;
 use lms::measured::Measured;
 use lms::variant::{MAX_BEAMS, MIRROR_TURN, Mode, Variant};
-use schema::{BEAMS, CONTENTS_UPPER, Scan};
+use schema::{BEAMS, CONTENTS_UPPER, Reasons, Scan};
 
 /// Writes `measured` into `scan`, every byte of it, with its values split as `mode` says. Returns whether bits were
 /// set that the mode forbids.
@@ -47,6 +48,13 @@ pub(crate) fn period_us(variant: Option<Variant>, baud: u32) -> u32 {
 
 const _: () = assert!(MAX_BEAMS == BEAMS && MIRROR_TURN == schema::TURN_NS);
 const _: () = assert!(lms::telegram::MAX_TELEGRAM == schema::Telegram::MAX);
+const _: () = assert!(
+    suspect::LINE_ERROR == Reasons::LINE_ERROR
+        && suspect::NEIGHBOUR == Reasons::NEIGHBOUR
+        && suspect::SLOW == Reasons::SLOW
+        && suspect::FORBIDDEN_BITS == Reasons::FORBIDDEN_BITS
+        && suspect::HEADER_INSIDE == Reasons::HEADER_INSIDE
+);
 
 #[cfg(test)]
 mod tests {

@@ -121,7 +121,7 @@ impl Topics {
             stamp_last_ns: now,
             wall_ns: clock::wall(now),
             quality: Quality::Clean as u8,
-            reserved: 0,
+            reasons: 0,
             ..self.header
         };
         let Ok(mut sample) = self.status.publisher.loan() else {
@@ -159,6 +159,6 @@ impl Topics {
     fn set_quality(&mut self, reasons: u8) {
         let suspect = reasons != 0;
         self.header.quality = if suspect { Quality::Suspect } else { Quality::Clean } as u8;
-        self.header.reserved = u32::from(reasons);
+        self.header.reasons = reasons;
     }
 }

@@ -57,47 +57,44 @@ impl Arrivals {
     }
 }
 
-/// How a telegram of the stream comes in, learned from those that came.
-#[derive(Clone, Copy, Debug, Default)]
+/// How long a telegram of the stream takes, learned from those that came. A busy host only ever sees them take
+/// longer, so the least of several is the truth.
+#[derive(Clone, Copy, Debug)]
 pub(crate) struct Rhythm {
-    learned: u32,
-    duration: Nanos,
+    duration: Option<Nanos>,
+    /// The shortest of the `counted` telegrams since it was learned.
+    least: Nanos,
+    counted: u32,
     /// First byte of the telegram that is coming.
     first: Option<Nanos>,
-    /// The host slept through this telegram.
-    rested: bool,
 }
 
 impl Rhythm {
+    pub(crate) fn new() -> Self {
+        Rhythm { duration: None, least: Nanos::MAX, counted: 0, first: None }
+    }
+
     /// The first byte of a telegram arrived.
     pub(crate) fn begin(&mut self, first: Nanos) {
-        if self.first.is_none() {
-            self.first = Some(first);
-            self.rested = false;
-        }
+        self.first = Some(first);
     }
 
     /// Until when nothing can be complete; answered once per telegram.
     pub(crate) fn rest(&mut self, now: Nanos) -> Option<Nanos> {
-        let until = self.first? + self.duration.checked_sub(LEAD)?;
-        (self.learned >= LESSONS && !self.rested && until > now + MIN_REST).then(|| {
-            self.rested = true;
-            until
-        })
+        let until = self.first? + self.duration?.checked_sub(LEAD)?;
+        self.first = None;
+        (until > now + MIN_REST).then_some(until)
     }
 
-    /// A telegram is complete; `at_once` says that the first look after the rest found all of it.
-    pub(crate) fn complete(&mut self, first: Nanos, last: Nanos, at_once: bool) {
-        let took = last.saturating_sub(first);
+    /// A telegram is complete that took so long from its first to its last byte.
+    pub(crate) fn complete(&mut self, took: Nanos) {
         self.first = None;
-        if self.learned < LESSONS {
-            self.duration = if self.learned == 0 { took } else { self.duration.min(took) };
-            self.learned += 1;
-        } else if self.rested && at_once {
-            // Too late by an unknown amount: creep forward until the end is seen to come.
-            self.duration = self.duration.saturating_sub(CREEP);
-        } else if took < self.duration + SLOW {
-            self.duration = (7 * self.duration + took) / 8;
+        self.least = self.least.min(took);
+        self.counted += 1;
+        if self.counted >= if self.duration.is_none() { LESSONS } else { WINDOW } {
+            self.duration = Some(self.least);
+            self.least = Nanos::MAX;
+            self.counted = 0;
         }
     }
 
@@ -108,7 +105,7 @@ impl Rhythm {
 
     /// Whether `took` is longer than usual by more than noise.
     pub(crate) fn is_slow(&self, took: Nanos) -> bool {
-        self.learned >= LESSONS && took > self.duration + SLOW
+        self.duration.is_some_and(|duration| took > duration + SLOW)
     }
 }
 
@@ -120,8 +117,9 @@ const LEAD: Nanos = 600 * MICROS;
 const MIN_REST: Nanos = 500 * MICROS;
 /// Telegrams that are read as they come before the first rest.
 const LESSONS: u32 = 3;
-/// Step towards an end that was slept through.
-const CREEP: Nanos = 100 * MICROS;
+/// Telegrams of which the shortest counts, from then on. One that was slept through to its end took the rest at most,
+/// so too long a rest shortens itself.
+const WINDOW: u32 = 16;
 /// A telegram that takes so much longer than usual is suspect (framing: quality, reason 4).
 const SLOW: Nanos = 8 * MILLIS;
 
@@ -146,20 +144,21 @@ mod tests {
 
     #[test]
     fn after_three_lessons_the_host_may_rest() {
-        let mut rhythm = Rhythm::default();
-        for n in 0..3 {
-            let first = n * 26_640_000;
-            rhythm.begin(first);
-            assert_eq!(rhythm.rest(first), None);
-            rhythm.complete(first, first + 18_000_000, false);
+        let mut rhythm = Rhythm::new();
+        for took in [18_300_000, 18_000_000, 90_000_000] {
+            rhythm.begin(0);
+            assert_eq!(rhythm.rest(0), None);
+            rhythm.complete(took);
         }
         rhythm.begin(100_000_000);
         assert_eq!(rhythm.rest(100_000_000), Some(117_400_000));
         assert_eq!(rhythm.rest(117_400_000), None, "once per telegram");
-        // It was all there already: look a little earlier next time.
-        rhythm.complete(100_000_000, 118_500_000, true);
+        assert!(rhythm.is_slow(26_000_001) && !rhythm.is_slow(26_000_000));
+        // All of them were there before the host looked: it looks earlier from then on.
+        for _ in 0..16 {
+            rhythm.complete(17_500_000);
+        }
         rhythm.begin(200_000_000);
-        assert_eq!(rhythm.rest(200_000_000), Some(217_300_000));
-        assert!(rhythm.is_slow(26_000_000) && !rhythm.is_slow(25_000_000));
+        assert_eq!(rhythm.rest(200_000_000), Some(216_900_000));
     }
 }

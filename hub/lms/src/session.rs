@@ -85,8 +85,6 @@ pub struct Session {
     rhythm: Rhythm,
     now: Nanos,
     last_byte: Nanos,
-    /// Reads since the host rested.
-    looks: u32,
     cut: bool,
 }
 
@@ -97,10 +95,9 @@ impl Session {
             framer: Framer::default(),
             dialogue: Dialogue::new(settings, now),
             arrivals: Arrivals::new(),
-            rhythm: Rhythm::default(),
+            rhythm: Rhythm::new(),
             now,
             last_byte: now,
-            looks: 0,
             cut: false,
         }
     }
@@ -120,7 +117,6 @@ impl Session {
         self.framer.commit(len);
         self.arrivals.note(now, len);
         self.last_byte = now;
-        self.looks += 1;
         if was_empty {
             self.begin_rhythm();
         }
@@ -166,7 +162,6 @@ impl Session {
         } else if self.is_live()
             && let Some(until) = self.rhythm.rest(self.now)
         {
-            self.looks = 0;
             return Output::Rest(until);
         }
         let (until, reason) = self.dialogue.deadline();
@@ -227,9 +222,10 @@ impl Session {
         self.cut |= is_scan && self.tally().telegrams == 1 && self.tally().discarded > 0;
         // Replies come when they are asked for, and a recording has the pace of whoever reads it.
         let has_rhythm = is_scan && self.is_live() && !first.estimated;
-        let slow = has_rhythm && self.rhythm.is_slow(last.saturating_sub(first.at));
+        let took = last.saturating_sub(first.at);
+        let slow = has_rhythm && self.rhythm.is_slow(took);
         if has_rhythm {
-            self.rhythm.complete(first.at, last, self.looks <= 1);
+            self.rhythm.complete(took);
         } else {
             self.rhythm.lose();
         }
