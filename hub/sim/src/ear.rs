@@ -24,6 +24,7 @@ impl Arrival {
 #[derive(Debug)]
 pub(crate) struct Ear {
     bytes: Vec<u8>,
+    /// When the last byte can have come if every gap of the request before it was right; `None` before the first.
     last: Option<Arrival>,
     broken: bool,
     /// Machine time per host time: the host keeps its gaps by its own clock, however fast the sensor runs.
@@ -40,19 +41,26 @@ impl Ear {
     pub(crate) fn hear(&mut self, byte: u8, arrival: Arrival, baud: u32) -> Option<Vec<u8>> {
         let speed = self.speed;
         let scaled = |span: Nanos| (span as f64 * speed) as Nanos;
-        if let Some(last) = self.last.replace(arrival) {
+        let mut possible = arrival;
+        if let Some(last) = self.last {
             let byte_ns = scaled(line_time(1, baud));
-            let shortest = arrival.not_before.saturating_sub(last.not_after + byte_ns);
-            let longest = arrival.not_after.saturating_sub(last.not_before + byte_ns);
-            if shortest > scaled(MAX_GAP) {
+            let soonest = last.not_before + byte_ns + scaled(MIN_GAP);
+            let latest = last.not_after + byte_ns + scaled(MAX_GAP);
+            if arrival.not_before > latest {
                 self.forget();
+            } else if soonest > arrival.not_after {
+                self.broken = true;
+            } else {
+                // Several bytes seen at once must have come one after the other: each leaves less for the next.
+                possible.not_before = arrival.not_before.max(soonest);
+                possible.not_after = arrival.not_after.min(latest);
             }
-            self.broken |= !self.bytes.is_empty() && longest < scaled(MIN_GAP);
         }
         if self.bytes.is_empty() && byte != STX {
             return None;
         }
         self.bytes.push(byte);
+        self.last = Some(possible);
         let [_, _, low, high, ..] = self.bytes[..] else { return None };
         let length = usize::from(u16::from_le_bytes([low, high]));
         if !(1..=MAX_LENGTH).contains(&length) {
@@ -69,6 +77,7 @@ impl Ear {
 
     fn forget(&mut self) {
         self.bytes.clear();
+        self.last = None;
         self.broken = false;
     }
 }
@@ -104,13 +113,27 @@ mod tests {
             (0, 0, false),
             (6 * MILLIS, 0, true),
             (6 * MILLIS + MICROS, 0, false),
-            // Nothing is proved by a byte that may have come long before it was seen.
-            (0, 28 * MICROS, true),
-            (7 * MILLIS, MILLIS, true),
+            // Nothing is proved by bytes that may have come long before they were seen; but seven bytes within 2 ms,
+            // however they came, were too fast for 9600.
+            (40 * MICROS, 50 * MICROS, true),
+            (0, 100 * MICROS, false),
+            (6_100 * MICROS, MILLIS, true),
         ] {
             let mut ear = Ear::new(1.0);
             assert_eq!(heard(&mut ear, 1_000 * MILLIS, gap, width), expected, "{gap} {width}");
             assert!(heard(&mut ear, 2_000 * MILLIS, 100 * MICROS, 0), "not heard again after {gap}");
+        }
+    }
+
+    #[test]
+    fn a_request_that_came_all_at_once_needs_time_to_have_come_rightly() {
+        let request = Request::Status.encode(0);
+        let least = 6 * (line_time(1, 9_600) + MIN_GAP);
+        for (window, expected) in [(least, true), (least - 1, false)] {
+            let mut ear = Ear::new(1.0);
+            let arrival = Arrival { not_before: 5 * MILLIS, not_after: 5 * MILLIS + window };
+            let heard = request.bytes().iter().filter_map(|&byte| ear.hear(byte, arrival, 9_600)).count();
+            assert_eq!(heard == 1, expected, "{window}");
         }
     }
 

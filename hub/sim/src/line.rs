@@ -87,7 +87,7 @@ impl Line<'_> {
                 quiet_ns = read_ns;
             }
             let due_ns = self.machine.poll_timeout().map_or(Nanos::MAX, |at| self.time.of_clock(at));
-            let look_ns = now_ns + if way.is_open { LOOK_NS } else { CLOSED_LOOK_NS };
+            let look_ns = now_ns + LOOK_NS;
             if self.pty.wait(stops, way.is_open, due_ns.min(look_ns)) == Wake::Stop {
                 let eeprom_writes = self.machine.eeprom_writes();
                 return Ok(Summary { port: self.port, sent: way.sent, eeprom_writes });
@@ -163,8 +163,7 @@ fn same_rate(a: u32, b: u32) -> bool {
 const MOST_LATE_NS: Nanos = 100 * MILLIS;
 /// A byte may lie in the kernel for so long before it can be read: a worker thread carries it over.
 const PTY_DELAY_NS: Nanos = 2 * MILLIS;
-/// How often an open port is looked at even if nothing happens: how well it is known when a byte came. At 9600, where
-/// every host begins, this proves a request that was written without gaps.
+/// How often the port is looked at even if nothing happens: nothing announces that it was opened, and how well it is
+/// known when a byte came depends on it. At 9600, where every host begins, this proves that a request was written
+/// without gaps.
 const LOOK_NS: Nanos = 4 * MILLIS;
-/// How often a closed port is looked at: nothing announces that it was opened.
-const CLOSED_LOOK_NS: Nanos = 10 * MILLIS;
