@@ -153,7 +153,7 @@ pub(crate) struct Simulate {
     /// Rate at power-on: 9600, 19200, 38400 or 500000
     #[arg(long, default_value = "9600", value_name = "RATE")]
     baud: String,
-    /// What the sensors see: room, empty, wall640 or random
+    /// What the sensors see: room, bare, empty, wall640 or random
     #[arg(long, default_value = "room", value_name = "NAME", conflicts_with = "replay")]
     world: String,
     /// A recording to send instead: telegram stream or CARMEN log, plain or gzipped

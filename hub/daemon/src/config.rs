@@ -101,7 +101,7 @@ impl Sources {
 impl Config {
     /// Reads all sources. Without any link in them there are two, `front` and `rear`, at the first two USB adapters.
     ///
-    /// [`Kind::Configuration`] with place, value and remedy.
+    /// [`schema::Kind::Configuration`] with place, value and remedy.
     pub fn load(sources: &Sources) -> Result<Config, Failure> {
         let mut links: Vec<Draft> = Vec::new();
         for path in &sources.files {

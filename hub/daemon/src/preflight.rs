@@ -2,7 +2,6 @@
 //! segment of its own, really allocated. A sparse segment that finds /dev/shm full would kill the hub later.
 
 use std::fs::{self, OpenOptions};
-use std::path::Path;
 
 use rustix::fs::{FallocateFlags, fallocate, statvfs};
 use rustix::io::Errno;
@@ -58,7 +57,7 @@ pub(crate) fn allocate(domain: &Domain) -> Result<(), Failure> {
 }
 
 fn short(what: String) -> Failure {
-    let place = Path::new(SHARED_MEMORY).display();
+    let place = SHARED_MEMORY;
     Failure::new(
         Kind::Short,
         format!("shared memory is short: {place}: {what}"),

@@ -22,7 +22,7 @@ pub struct Settings {
     pub listen_only: bool,
 }
 
-/// Why [`Dialogue::deadline`] is when it is.
+/// Why a session waits until its deadline.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Reason {
     /// A running stream would have been heard by then.
