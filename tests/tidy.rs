@@ -183,7 +183,7 @@ fn nobody_writes_the_eeprom() {
 fn files_are_short_and_say_what_they_are_for() {
     holds(sources::files_are_short_and_say_what_they_are_for, |tree| {
         vec![
-            tree.with("clients/src/planted.rs", &format!("//! Long.\n{}", "const N: u8 = 0;\n".repeat(450))),
+            tree.with("clients/src/planted.rs", &format!("//! Long.\n{}", "const N: u8 = 0;\n".repeat(400))),
             tree.with("clients/src/planted.rs", "use std::fmt;\n"),
         ]
     });
