@@ -1,0 +1,82 @@
+//! Two parsers as they are usually written, to compare the framer with. Both judge headers as strictly as it does:
+//! they differ only in what they do with bytes that turned out to be no telegram.
+
+use crate::line::TELEGRAM;
+use crate::line::account::{Accepted, Parser};
+use lms::header::StreamHeader;
+use lms::telegram::{STX, Telegram};
+
+/// Six states that collect a telegram and throw away what they collected when it is none.
+pub(crate) struct Discarding {
+    header: StreamHeader,
+    collected: Vec<u8>,
+    read: usize,
+}
+
+impl Discarding {
+    pub(crate) fn new(header: StreamHeader) -> Self {
+        Discarding { header, collected: Vec::with_capacity(TELEGRAM), read: 0 }
+    }
+}
+
+impl Parser for Discarding {
+    fn read(&mut self, bytes: &[u8], accept: &mut dyn FnMut(Accepted<'_>)) {
+        for &byte in bytes {
+            self.read += 1;
+            self.collected.push(byte);
+            let fits = match *self.collected.as_slice() {
+                [stx] => stx == STX,
+                [_, address] => address == self.header[1],
+                // The low byte of the length is not judged alone.
+                [_, _, _] => true,
+                [_, _, low, high] => [low, high] == self.header[2..4],
+                ref collected if collected.len() < TELEGRAM => true,
+                ref collected => {
+                    if Telegram::check(collected).is_some() {
+                        accept(Accepted { offset: self.read - TELEGRAM, bytes: collected, reasons: 0 });
+                    }
+                    false
+                }
+            };
+            if !fits {
+                self.collected.clear();
+            }
+        }
+    }
+}
+
+/// Collects a telegram behind a strict header and, when it is none, goes back to the byte after its start byte.
+pub(crate) struct Rewinding {
+    header: StreamHeader,
+    open: Vec<u8>,
+    read: usize,
+}
+
+impl Rewinding {
+    pub(crate) fn new(header: StreamHeader) -> Self {
+        Rewinding { header, open: Vec::with_capacity(2 * TELEGRAM), read: 0 }
+    }
+}
+
+impl Parser for Rewinding {
+    fn read(&mut self, bytes: &[u8], accept: &mut dyn FnMut(Accepted<'_>)) {
+        self.open.extend(bytes);
+        self.read += bytes.len();
+        let mut at = 0;
+        while at < self.open.len() {
+            let open = &self.open[at..];
+            let known = open.len().min(self.header.len());
+            if open[..known] != self.header[..known] {
+                at += 1;
+            } else if open.len() < TELEGRAM {
+                break;
+            } else if Telegram::check(&open[..TELEGRAM]).is_some() {
+                accept(Accepted { offset: self.read - open.len(), bytes: &open[..TELEGRAM], reasons: 0 });
+                at += TELEGRAM;
+            } else {
+                at += 1;
+            }
+        }
+        self.open.drain(..at);
+    }
+}

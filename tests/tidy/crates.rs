@@ -1,0 +1,137 @@
+//! Who may know whom: walls between the crates, read from the manifests and from what Cargo makes of them.
+
+use crate::tree::{Tree, find};
+use std::collections::BTreeSet;
+use std::process::Command;
+
+/// Names of the crates of this project that a manifest names under `section`, such as `dependencies`.
+fn ours(manifest: &toml::Table, sections: &[&str]) -> BTreeSet<String> {
+    let mut found = BTreeSet::new();
+    for section in sections {
+        let names =
+            manifest.get(*section).and_then(toml::Value::as_table).into_iter().flat_map(toml::Table::keys);
+        found.extend(names.filter(|name| name.starts_with("scanhub-")).cloned());
+    }
+    found
+}
+
+const ALL: [&str; 3] = ["dependencies", "dev-dependencies", "build-dependencies"];
+const NORMAL: [&str; 1] = ["dependencies"];
+
+pub(crate) fn schema_knows_nobody(tree: &Tree) -> Vec<String> {
+    ours(&tree.members()["scanhub-schema"], &ALL).into_iter().collect()
+}
+
+pub(crate) fn lms_stands_alone(tree: &Tree) -> Vec<String> {
+    let manifest = &tree.members()["scanhub-lms"];
+    let mut breaches: Vec<String> = ours(manifest, &ALL).into_iter().collect();
+    for section in ["dependencies", "build-dependencies"] {
+        let names =
+            manifest.get(section).and_then(toml::Value::as_table).into_iter().flat_map(toml::Table::keys);
+        breaches.extend(names.cloned());
+    }
+    let lib = tree.text("hub/lms/src/lib.rs");
+    for attribute in ["#![no_std]", "#![forbid(unsafe_code)]"] {
+        if !lib.lines().any(|line| line == attribute) {
+            breaches.push(format!("hub/lms/src/lib.rs lacks {attribute}"));
+        }
+    }
+    breaches
+        .extend(find(tree, &["std::", "extern crate", "alloc::"], |path| path.starts_with("hub/lms/src/")));
+    breaches
+}
+
+pub(crate) fn clients_know_only_schema(tree: &Tree) -> Vec<String> {
+    let mut names = ours(&tree.members()["scanhub-clients"], &ALL);
+    names.remove("scanhub-schema");
+    names.into_iter().collect()
+}
+
+pub(crate) fn the_daemon_knows_neither_clients_nor_sim(tree: &Tree) -> Vec<String> {
+    let members = tree.members();
+    let mut reached = BTreeSet::new();
+    let mut open = vec!["scanhub-daemon".to_owned()];
+    while let Some(name) = open.pop() {
+        open.extend(ours(&members[&name], &NORMAL).into_iter().filter(|name| !reached.contains(name)));
+        reached.insert(name);
+    }
+    reached.into_iter().filter(|name| name == "scanhub-clients" || name == "scanhub-sim").collect()
+}
+
+/// The daemon, the clients and the simulator meet nowhere but in the program.
+pub(crate) fn only_the_program_sees_all(tree: &Tree) -> Vec<String> {
+    let ends = ["scanhub-daemon", "scanhub-clients", "scanhub-sim"];
+    let mut breaches = Vec::new();
+    for (name, manifest) in tree.members() {
+        let known = ours(&manifest, &NORMAL);
+        let found = known.iter().filter(|known| ends.contains(&known.as_str()));
+        breaches.extend(found.map(|known| format!("{name} depends on {known}")));
+    }
+    breaches
+}
+
+/// Without it `cargo test` at the top would leave a crate out.
+pub(crate) fn every_crate_is_tested_from_the_top(tree: &Tree) -> Vec<String> {
+    let manifest = tree.manifest("Cargo.toml");
+    let list = |key: &str| -> BTreeSet<String> {
+        let list = manifest["workspace"].get(key).and_then(toml::Value::as_array).into_iter().flatten();
+        list.filter_map(toml::Value::as_str).map(str::to_owned).collect()
+    };
+    let mut wanted = list("members");
+    wanted.insert(".".to_owned());
+    wanted
+        .difference(&list("default-members"))
+        .map(|member| format!("{member} is no default member"))
+        .collect()
+}
+
+/// Every crate takes over the workspace's lints, which deny unsafe code.
+pub(crate) fn every_crate_obeys_the_lints(tree: &Tree) -> Vec<String> {
+    let top = tree.manifest("Cargo.toml");
+    let mut breaches = Vec::new();
+    if top["workspace"]["lints"]["rust"]["unsafe_code"].as_str() != Some("deny") {
+        breaches.push("the workspace does not deny unsafe code".to_owned());
+    }
+    let manifests = tree.members().into_iter().chain([("scanhub".to_owned(), top)]);
+    breaches.extend(manifests.filter_map(|(name, manifest)| {
+        let obeys =
+            manifest.get("lints").and_then(|lints| lints.get("workspace")).and_then(toml::Value::as_bool);
+        (obeys != Some(true)).then(|| format!("{name} has lints of its own"))
+    }));
+    breaches
+}
+
+/// Hub and clients with two versions of it refuse each other.
+pub(crate) fn shared_memory_is_pinned(tree: &Tree) -> Vec<String> {
+    let manifest = tree.manifest("Cargo.toml");
+    let version = manifest["workspace"]["dependencies"]["iceoryx2"]["version"].as_str().unwrap_or_default();
+    if version.starts_with('=') { Vec::new() } else { vec![format!("iceoryx2 {version:?}")] }
+}
+
+/// Names of the crates that `package` is built from, itself included, as Cargo resolves it on this machine.
+pub(crate) fn built_from(package: &str, features: &[&str]) -> BTreeSet<String> {
+    let output = Command::new(env!("CARGO"))
+        .current_dir(env!("CARGO_MANIFEST_DIR"))
+        .args([
+            "tree",
+            "--offline",
+            "--edges",
+            "normal",
+            "--prefix",
+            "none",
+            "--format",
+            "{p}",
+            "--package",
+            package,
+        ])
+        .args(features)
+        .output()
+        .expect("cargo can be called");
+    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+    let listing = String::from_utf8(output.stdout).expect("names are text");
+    // "name v1.2.3 (path or *)": two versions of a crate are two crates.
+    let names: BTreeSet<String> =
+        listing.lines().map(|line| line.split(' ').take(2).collect::<Vec<_>>().join(" ")).collect();
+    assert!(names.iter().any(|name| name.starts_with(package)), "{package} is built from {names:?}");
+    names
+}

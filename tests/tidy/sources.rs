@@ -1,0 +1,158 @@
+//! What may stand in which source: clocks, unsafe code, shared memory, the sensor's EEPROM, the shape of a file.
+
+use crate::tree::{Tree, code, find};
+
+/// Integration tests and benches may look at a clock and do as they like with telegrams.
+fn is_test(path: &str) -> bool {
+    path.starts_with("tests/") || path.starts_with("benches/") || path.contains("/tests/")
+}
+
+pub(crate) fn clocks_are_read_in_few_places(tree: &Tree) -> Vec<String> {
+    // The last one waits for a service that another process has half created.
+    const ALLOWED: [&str; 5] = [
+        "clients/",
+        "hub/daemon/src/clock.rs",
+        "hub/sim/src/pty.rs",
+        "hub/demo",
+        "schema/src/ipc/trouble.rs",
+    ];
+    find(tree, &["Instant::now", "SystemTime::now", "clock_gettime"], |path| {
+        !is_test(path) && !ALLOWED.iter().any(|allowed| path.starts_with(allowed))
+    })
+}
+
+/// Files that may hold unsafe code, each for something that no safe crate offers.
+const UNSAFE: [&str; 2] = [
+    // A handler for SIGBUS.
+    "hub/daemon/src/bus_error.rs",
+    // The descriptor of a serial port as a file.
+    "hub/daemon/src/port.rs",
+];
+const MOST_UNSAFE_BLOCKS: usize = 10;
+
+pub(crate) fn unsafe_code_is_rare_and_explained(tree: &Tree) -> Vec<String> {
+    let mut breaches =
+        find(tree, &["allow(unsafe_code)", "expect(unsafe_code)"], |path| !UNSAFE.contains(&path));
+    let mut blocks = 0;
+    for (path, text) in tree.sources() {
+        let lines: Vec<&str> = text.lines().collect();
+        for (number, line) in code(text) {
+            if !["unsafe {", "unsafe impl", "unsafe fn", "unsafe extern"]
+                .iter()
+                .any(|form| line.contains(form))
+            {
+                continue;
+            }
+            blocks += 1;
+            let before = &lines[number.saturating_sub(6)..number];
+            if !UNSAFE.contains(&path) || !before.iter().any(|line| line.contains("// SAFETY:")) {
+                breaches.push(format!("{path}:{number}: {}", line.trim()));
+            }
+        }
+    }
+    if blocks > MOST_UNSAFE_BLOCKS {
+        breaches.push(format!("{blocks} unsafe blocks"));
+    }
+    breaches
+}
+
+/// Services are built in one module; the payloads elsewhere in schema derive one trait.
+pub(crate) fn shared_memory_is_built_in_one_module(tree: &Tree) -> Vec<String> {
+    let mut places = find(tree, &["iceoryx2::"], |path| !path.starts_with("schema/src/ipc"));
+    let derives =
+        |place: &String| place.starts_with("schema/src/") && place.ends_with("prelude::ZeroCopySend;");
+    places.retain(|place| !derives(place));
+    places
+}
+
+/// Words of the wire become ranges in a unit in one file, between the protocol and what consumers see.
+pub(crate) fn ranges_are_born_in_one_file(tree: &Tree) -> Vec<String> {
+    find(tree, &[".words()", "range_array", "upper_array"], |path| {
+        path.starts_with("hub/daemon/src/") && path != "hub/daemon/src/scanner.rs"
+    })
+}
+
+/// No request that writes the sensor's EEPROM can be said: requests are written in `lms` and nowhere else, and none of
+/// its commands is one of those. The simulator knows them, to count and to refuse.
+pub(crate) fn nobody_writes_the_eeprom(tree: &Tree) -> Vec<String> {
+    const WRITES: [&str; 6] = ["0x40", "0x42", "0x46", "0x66", "0x77", "0x7C"];
+    let sim = |path: &str| path.starts_with("hub/sim/");
+    let mut breaches = find(tree, &["Writer::new", "EEPROM_WRITES"], |path| {
+        !is_test(path) && !sim(path) && !path.starts_with("hub/lms/src/")
+    });
+    for (path, text) in tree.sources().filter(|(path, _)| path.starts_with("hub/lms/src/")) {
+        for (number, line) in code(text) {
+            let constant = line.split_once(": u8 = ").map(|(_, value)| value.trim_end_matches(';'));
+            let said = line.split_once("Writer::new(").map(|(_, arguments)| arguments);
+            if constant.is_some_and(|value| WRITES.contains(&value))
+                || said.is_some_and(|arguments| WRITES.iter().any(|command| arguments.contains(command)))
+            {
+                breaches.push(format!("{path}:{number}: {}", line.trim()));
+            }
+        }
+    }
+    breaches
+}
+
+/// A file longer than so is about more than one concept.
+const MOST_LINES: usize = 450;
+
+pub(crate) fn files_are_short_and_say_what_they_are_for(tree: &Tree) -> Vec<String> {
+    let mut breaches = Vec::new();
+    for (path, text) in tree.files(".rs") {
+        let lines = text.lines().count();
+        if lines > MOST_LINES {
+            breaches.push(format!("{path} has {lines} lines"));
+        }
+        if !text.starts_with("//! ") {
+            breaches.push(format!("{path} does not begin with the problem that it solves"));
+        }
+    }
+    breaches
+}
+
+/// Names that say nothing.
+pub(crate) fn names_say_something(tree: &Tree) -> Vec<String> {
+    const EMPTY: [&str; 7] = ["manager", "util", "utils", "helper", "helpers", "common", "misc"];
+    let empty = |name: &str| {
+        let spread: String = name
+            .chars()
+            .flat_map(|c| if c.is_uppercase() { vec!['_', c.to_ascii_lowercase()] } else { vec![c] })
+            .collect();
+        spread.split('_').any(|part| EMPTY.contains(&part))
+    };
+    let mut breaches = Vec::new();
+    for (path, text) in tree.sources() {
+        if path.split(['/', '.']).any(empty) {
+            breaches.push(path.to_owned());
+        }
+        for (number, line) in code(text) {
+            let word = |c: char| !c.is_alphanumeric() && c != '_';
+            // What stands between quotes is for people.
+            let named = line.split('"').step_by(2).any(|outside| outside.split(word).any(empty));
+            if line.contains("fn get_") || named {
+                breaches.push(format!("{path}:{number}: {}", line.trim()));
+            }
+        }
+    }
+    breaches
+}
+
+/// This is no safety device, and nothing may read as if it were one. Only README says what it is not at length.
+pub(crate) fn nothing_promises_safety(tree: &Tree) -> Vec<String> {
+    let mut breaches = Vec::new();
+    for ending in [".rs", ".md", ".toml", ".service", ".rules", ".run"] {
+        for (path, text) in tree.files(ending) {
+            if path == "README.md" || path.starts_with("tests/tidy") {
+                continue;
+            }
+            for (number, line) in text.lines().enumerate() {
+                let line = line.replace("SAFETY:", "").to_lowercase().replace("not a safety device", "");
+                if line.contains("safety") || line.contains("protective") {
+                    breaches.push(format!("{path}:{}: {}", number + 1, line.trim()));
+                }
+            }
+        }
+    }
+    breaches
+}
