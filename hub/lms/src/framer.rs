@@ -298,7 +298,7 @@ impl Framer {
     fn deliver(&mut self, held: Held) -> Place {
         let Held { at, end, header_inside } = held;
         let command = self.buffer[at + 4];
-        self.discard(at, Some(command));
+        self.discard(at, Some((command, end)));
         self.held = None;
         self.start = end;
         self.live.drop_before(end);
@@ -312,9 +312,10 @@ impl Framer {
         Place { at, end, offset, reasons }
     }
 
-    /// Gives up the bytes before `to`; `winner` is the command of the telegram that begins there.
-    fn discard(&mut self, to: usize, winner: Option<u8>) {
-        let reply = winner.is_some_and(|command| command != MEASURED);
+    /// Gives up the bytes before `to`; `winner` is the command of the telegram that begins there, and its end.
+    fn discard(&mut self, to: usize, winner: Option<(u8, usize)>) {
+        let reply = winner.is_some_and(|(command, _)| command != MEASURED);
+        let decided = winner.map_or(self.end, |(_, end)| end);
         let mut until = to;
         if reply && self.awaits_acknowledge && until > self.start && self.buffer[until - 1] == ACK {
             until -= 1;
@@ -322,7 +323,7 @@ impl Framer {
         }
         for at in self.start..until {
             if self.buffer[at] == STX {
-                self.count_refusal(at, reply);
+                self.count_refusal(at, reply, decided);
             }
         }
         self.damage |= until > self.start && !reply;
@@ -330,11 +331,12 @@ impl Framer {
         self.start = to;
     }
 
-    fn count_refusal(&mut self, at: usize, winner_is_reply: bool) {
+    /// Counts why the start byte at `at` was none, as it stood when the bytes before `decided` were there.
+    fn count_refusal(&mut self, at: usize, winner_is_reply: bool, decided: usize) {
         let reject = match judge(&self.buffer[at..self.end.min(at + MAX_HEADER)], &self.expect) {
             Judgement::Refused(reject) => reject,
             Judgement::Prefix(_) => Reject::Superseded,
-            Judgement::Candidate { len } if at + len > self.end => {
+            Judgement::Candidate { len } if at + len > decided => {
                 if winner_is_reply && self.buffer[at + 4] == MEASURED {
                     self.tally.aborted += 1;
                     return;

@@ -203,7 +203,7 @@ fn a_scan_broken_off_by_a_reply() {
     let Some(bytes) = capture("scan_interrupted_by_reply.bin") else { return };
     let header = header_of(&bytes);
     for expect in [Expect::Anything, Expect::Stream { header, reply: Some(0xBA) }] {
-        for piece in [1, 16, 300] {
+        for piece in [1, 16, 732] {
             let mut line = Line::default();
             line.framer.expect(expect);
             line.framer.await_acknowledge(true);
