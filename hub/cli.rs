@@ -18,12 +18,12 @@ pub(crate) struct Cli {
     #[command(subcommand)]
     pub(crate) verb: Verb,
     #[command(flatten)]
-    pub(crate) common: Common,
+    pub(crate) everywhere: Everywhere,
 }
 
 /// What every verb takes.
 #[derive(Args, Clone, Debug)]
-pub(crate) struct Common {
+pub(crate) struct Everywhere {
     /// Domain of the hub: 1 to 16 of a-z, 0-9 and -
     #[arg(long, global = true, env = "SCANHUB_DOMAIN", default_value = DEFAULT_DOMAIN, value_name = "NAME")]
     pub(crate) domain: String,
@@ -35,7 +35,7 @@ pub(crate) struct Common {
     pub(crate) json: bool,
 }
 
-impl Common {
+impl Everywhere {
     /// The domain as a hub opens it.
     pub(crate) fn hub_domain(&self) -> Result<Domain, Failure> {
         Domain::of_hub(&self.domain, self.root.as_deref(), &Environment::of_process())

@@ -22,7 +22,7 @@ use serde::Serialize;
 use signal_hook::consts::{SIGINT, SIGTERM};
 use tracing::level_filters::LevelFilter;
 
-use cli::{Cli, Common, Verb};
+use cli::{Cli, Everywhere, Verb};
 use demo::DemoOptions;
 
 /// In the environment of a process that shall not outlive the one that started it.
@@ -42,40 +42,41 @@ fn main() -> ExitCode {
         Err(failure) => {
             // What these two print on stdout is one line that says that they are up.
             let quiet = matches!(cli.verb, Verb::Run(_) | Verb::Simulate(_));
-            report(&failure, cli.common.json, quiet);
+            report(&failure, cli.everywhere.json, quiet);
             ExitCode::from(failure.kind.exit_code())
         }
     }
 }
 
 fn dispatch(cli: &Cli) -> Result<(), Failure> {
-    let common = &cli.common;
+    let everywhere = &cli.everywhere;
     let mut out = io::stdout().lock();
     match &cli.verb {
-        Verb::Run(run) => run_hub(run, common),
+        Verb::Run(run) => run_hub(run, everywhere),
         Verb::Demo(demo) => {
             let options = DemoOptions {
                 headless: demo.headless,
                 run_for: demo.run_for,
                 seed: demo.seed,
-                json: common.json,
+                json: everywhere.json,
             };
             demo::demo(&options, &mut out, &*interrupt()?)
         }
-        Verb::Simulate(simulate) => run_simulator(simulate, common),
+        Verb::Simulate(simulate) => run_simulator(simulate, everywhere),
         Verb::List { domains: true } => {
-            clients::list_domains(&Environment::of_process().bases(), common.json, &mut out)
+            clients::list_domains(&Environment::of_process().bases(), everywhere.json, &mut out)
         }
         Verb::List { domains: false } => {
-            let options = ListOptions { json: common.json, places: common.places()? };
+            let options = ListOptions { json: everywhere.json, places: everywhere.places()? };
             clients::list(&options, &mut out, &*interrupt()?)
         }
         Verb::Info { sensor } => {
-            let options = InfoOptions { sensor: sensor.clone(), json: common.json, places: common.places()? };
+            let options =
+                InfoOptions { sensor: sensor.clone(), json: everywhere.json, places: everywhere.places()? };
             clients::info(&options, &mut out, &*interrupt()?)
         }
         Verb::Echo(echo) => {
-            let format = match (common.json, echo.csv, echo.raw) {
+            let format = match (everywhere.json, echo.csv, echo.raw) {
                 (true, ..) => Format::Json,
                 (_, true, _) => Format::Csv,
                 (_, _, true) => Format::Raw,
@@ -85,30 +86,30 @@ fn dispatch(cli: &Cli) -> Result<(), Failure> {
                 topics: echo.topics.clone(),
                 format,
                 bounds: echo.limits.bounds(),
-                places: common.places()?,
+                places: everywhere.places()?,
             };
             clients::echo(&options, &mut out, &mut io::stderr(), &*interrupt()?)
         }
         Verb::Hz(hz) => {
             let options = HzOptions {
                 topics: hz.topics.clone(),
-                json: common.json,
+                json: everywhere.json,
                 window: hz.window,
                 bounds: hz.limits.bounds(),
-                places: common.places()?,
+                places: everywhere.places()?,
             };
             clients::hz(&options, &mut out, &mut io::stderr(), &*interrupt()?)
         }
     }
 }
 
-fn run_hub(run: &cli::Run, common: &Common) -> Result<(), Failure> {
+fn run_hub(run: &cli::Run, everywhere: &Everywhere) -> Result<(), Failure> {
     let mut files = Sources::system();
     files.extend(run.config.clone());
     let config = Config::load(&Sources { files, set: run.set.clone(), links: run.link.clone() })?;
-    let domain = common.hub_domain()?;
+    let domain = everywhere.hub_domain()?;
     daemon::run(&config, &domain, |ready| {
-        let line = if common.json {
+        let line = if everywhere.json {
             line(&HubReady {
                 class: "ready",
                 domain: domain.name(),
@@ -125,7 +126,7 @@ fn run_hub(run: &cli::Run, common: &Common) -> Result<(), Failure> {
     })
 }
 
-fn run_simulator(simulate: &cli::Simulate, common: &Common) -> Result<(), Failure> {
+fn run_simulator(simulate: &cli::Simulate, everywhere: &Everywhere) -> Result<(), Failure> {
     let options = simulate.options()?;
     let (stop, write) = UnixStream::pair().map_err(no_handler)?;
     for signal in [SIGINT, SIGTERM] {
@@ -133,7 +134,7 @@ fn run_simulator(simulate: &cli::Simulate, common: &Common) -> Result<(), Failur
         signal_hook::low_level::pipe::register(signal, write).map_err(no_handler)?;
     }
     let announce = |ready: &[sim::Ready]| {
-        if common.json {
+        if everywhere.json {
             let ports = ready.iter().map(|one| ReadyPort { port: &one.port, pty: &one.pty }).collect();
             say(&line(&SimulatorReady { class: "ready", ports }));
         } else {
