@@ -1,0 +1,219 @@
+//! What is refused: the exit code of each kind of failure, and a message that names the place, the value and the
+//! remedy; with `--json` an object, on stdout unless that belongs to the line that says that all is up.
+
+mod stage;
+
+use std::process::Command;
+use std::time::{Duration, Instant};
+
+use serde_json::Value;
+use stage::{Outcome, Stage, TERM};
+
+/// Runs the program, which must refuse with `code` and `kind` and say all of `words`, in text and in JSON.
+fn refused(stage: &Stage, arguments: &[&str], code: i32, kind: &str, words: &[&str]) {
+    let outcome = stage.run(arguments);
+    assert_eq!((outcome.code, outcome.out.is_empty()), (Some(code), true), "{outcome}");
+    says_all(&outcome.errors, words, &outcome);
+
+    let outcome = stage.run(&[arguments, &["--json"]].concat());
+    assert_eq!(outcome.code, Some(code), "{outcome}");
+    let text = match arguments.first() {
+        // The log goes to stderr too, before it.
+        Some(&("run" | "simulate")) if kind != "usage" => {
+            assert!(outcome.out.is_empty(), "{outcome}");
+            outcome.errors.lines().last().unwrap_or_default().to_owned()
+        }
+        _ => {
+            let out = String::from_utf8_lossy(&outcome.out).into_owned();
+            assert_eq!(out.lines().count(), 1, "{outcome}");
+            out
+        }
+    };
+    let line: Value = serde_json::from_str(&text).unwrap_or_else(|error| panic!("{error}: {outcome}"));
+    assert_eq!((line["class"].as_str(), line["kind"].as_str()), (Some("error"), Some(kind)), "{outcome}");
+    let [message, hint] = ["message", "hint"].map(|key| line[key].as_str().unwrap_or_default());
+    assert!(!message.is_empty() && !hint.is_empty(), "{outcome}");
+    if kind != "usage" {
+        says_all(&format!("{message}\n{hint}"), words, &outcome);
+    }
+}
+
+fn says_all(text: &str, words: &[&str], outcome: &Outcome) {
+    for word in words {
+        assert!(text.contains(word), "does not say {word:?}: {outcome}");
+    }
+}
+
+#[test]
+fn what_is_no_command_line() {
+    let stage = Stage::new();
+    for (arguments, word) in [
+        (&["fly"][..], "fly"),
+        (&["lst"], "list"),
+        (&["list", "--colour"], "--colour"),
+        (&["echo"], "SENSOR/TOPIC"),
+        (&["echo", "front/scan", "-n", "0"], "0"),
+        (&["echo", "front/scan", "-n", "many"], "many"),
+        (&["echo", "front/scan", "--for", "10"], "10"),
+        (&["echo", "front/scan", "--csv", "--raw"], "--raw"),
+        (&["simulate"], "--port"),
+        (&["simulate", "--port=a", "--world=room", "--replay=x"], "--replay"),
+        (&["run", "--link"], "--link"),
+    ] {
+        refused(&stage, arguments, 2, "usage", &[word]);
+    }
+    let help = stage.run(&["--help"]);
+    assert_eq!((help.code, help.errors.as_str()), (Some(0), ""));
+}
+
+#[test]
+fn formats_that_do_not_go_with_their_topics() {
+    let stage = Stage::new();
+    for (arguments, word) in [
+        (["echo", "front/telegram", "--csv"], "--csv takes one topic"),
+        (["echo", "front/status", "--csv"], "--csv takes one topic"),
+    ] {
+        let outcome = stage.run(&arguments);
+        assert_eq!(outcome.code, Some(2), "{outcome}");
+        says_all(&outcome.errors, &[word], &outcome);
+    }
+    let outcome = stage.run(&["echo", "front/telegram", "rear/telegram", "--raw"]);
+    assert_eq!(outcome.code, Some(2), "{outcome}");
+}
+
+#[test]
+fn configuration_that_cannot_be() {
+    let stage = Stage::new();
+    let file = stage.file("hub.toml", "[[link]]\nname = \"front\"\nport = \"/dev/x\"\nbaud = 115200\n");
+    let unknown = stage.file("key.toml", "[[link]]\nname = \"front\"\nprot = \"/dev/x\"\n");
+    let broken = stage.file("toml.toml", "[[link]\n");
+    let (place, key, missing) = (format!("{file}:4:8"), format!("{unknown}:3:1"), stage.word("no.toml"));
+    for (arguments, words) in [
+        (&["run", "--set", "link.front.prot=/dev/x"][..], &["link.front.prot", "`prot`", "`port`"][..]),
+        (&["run", "--set", "link.front.angle=170"], &["--set", "angle = 170", "100 or 180"]),
+        (&["run", "--set", "link.front.resolution=0.25"], &["180", "0.25", "0.5 or 1"]),
+        (&["run", "--set", "link.side.angle=100"], &["no link side", "front, rear"]),
+        (&["run", "--set", "speed=3"], &["speed=3", "link.NAME.KEY"]),
+        (&["run", "--link", "front"], &["--link front", "NAME=PORT"]),
+        (&["run", "--link", "Front=/dev/x"], &["Front"]),
+        (&["run", "--link", "front=file:x?rate=2"], &["rate=max"]),
+        (&["run", "--link", "front=file:/no/such"], &["/no/such", "existing"]),
+        (&["run", "--config", &file], &[&place, "baud = 115200", "38400"]),
+        (&["run", "--config", &unknown], &[&key, "`prot`", "`port`"]),
+        (&["run", "--config", &broken], &["toml.toml:1:"]),
+        (&["run", "--config", &missing], &["no.toml"]),
+        (&["simulate", "--port=a", "--fault=los=1"], &["los=1", "loss, burst"]),
+        (&["simulate", "--port=a", "--baud=115200"], &["115200", "9600"]),
+        (&["simulate", "--port=a", "--variant=180/0.25"], &["180/0.25", "one of"]),
+        (&["simulate", "--port=a", "--speed=0"], &["speed"]),
+        (&["simulate", "--port=a", "--replay=/no/such"], &["/no/such", "existing"]),
+        (&["echo", "Front/scan"], &["Front"]),
+    ] {
+        refused(&stage, arguments, 78, "configuration", words);
+    }
+}
+
+#[test]
+fn domains_that_cannot_be() {
+    let at = |domain: &str, root: &str| {
+        let mut command = Command::new(env!("CARGO_BIN_EXE_scanhub"));
+        command.args(["list", "--json", "--domain", domain, "--root", root]);
+        stage::Program::start(command).wait()
+    };
+    for (domain, root, word) in [
+        ("Robot", "/tmp", "a-z"),
+        ("a-domain-of-much-too-many-letters", "/tmp", "1 to 16"),
+        ("robot", &format!("/tmp/{}", "long".repeat(16)), "shorter --root"),
+    ] {
+        let outcome = at(domain, root);
+        let [line] = &outcome.lines()[..] else { panic!("{outcome}") };
+        assert_eq!((outcome.code, &line["kind"]), (Some(78), &"configuration".into()), "{outcome}");
+        says_all(line["hint"].as_str().unwrap_or_default(), &[word], &outcome);
+    }
+}
+
+#[test]
+fn without_a_hub_the_answer_comes_at_once() {
+    let stage = Stage::new();
+    for arguments in [
+        &["list"][..],
+        &["info"],
+        &["info", "front"],
+        &["echo", "front/scan", "-n", "1"],
+        &["echo", "front/scan", "--for", "9s"],
+        &["hz", "-n", "1"],
+    ] {
+        let begun = Instant::now();
+        let outcome = stage.run(arguments);
+        // Promised within a second; the machine may have other things to do.
+        assert!(begun.elapsed() < Duration::from_secs(3), "{:?}: {outcome}", begun.elapsed());
+        assert_eq!(outcome.code, Some(3), "{outcome}");
+        says_all(&outcome.errors, &["no hub", "scanhub run"], &outcome);
+    }
+    for arguments in [&["list", "--json"][..], &["info", "--json"], &["echo", "a/scan", "-n1", "--json"]] {
+        let outcome = stage.run(arguments);
+        assert_eq!((outcome.code, &outcome.of_class("error")[0]["kind"]), (Some(3), &"no_hub".into()));
+    }
+}
+
+#[test]
+fn what_the_hub_does_not_have_and_what_does_not_come() {
+    let stage = Stage::new();
+    // A port that is not there is a state of the hub's, no failure.
+    let hub = stage.hub(&[stage.link("front")]);
+    let info = stage.await_info("front", |info| info["state"] == "absent");
+    assert!(info["last_error"].as_str().is_some_and(|error| error.contains("no such port")), "{info}");
+    for (arguments, kind, words) in [
+        (&["echo", "front/scam", "-n", "1"][..], "no_topic", &["front/scam", "front/scan"][..]),
+        (&["echo", "side/scan", "-n", "1"], "no_topic", &["side", "front"]),
+        (&["echo", "side/scan"], "no_topic", &["side", "front"]),
+        (&["hz", "side/scan"], "no_topic", &["side", "front"]),
+        (&["info", "side"], "no_topic", &["side", "front"]),
+    ] {
+        let outcome = stage.run(arguments);
+        assert_eq!(outcome.code, Some(3), "{outcome}");
+        says_all(&outcome.errors, words, &outcome);
+        let outcome = stage.run(&[arguments, &["--json"]].concat());
+        assert_eq!(outcome.of_class("error")[0]["kind"], kind, "{outcome}");
+    }
+    for bound in [&["--timeout", "300ms"][..], &["-n", "1", "--for", "300ms"], &["-n", "1", "--timeout=0.3s"]]
+    {
+        let outcome = stage.run(&[&["echo", "front/scan", "--json"], bound].concat());
+        assert_eq!(
+            (outcome.code, &outcome.of_class("error")[0]["kind"]),
+            (Some(3), &"timeout".into()),
+            "{outcome}"
+        );
+        assert_eq!(outcome.of_class("summary")[0]["received"], 0, "{outcome}");
+    }
+    assert_eq!(hub.end(TERM).code, Some(0));
+}
+
+#[test]
+fn ports_that_cannot_be_used() {
+    let stage = Stage::new();
+    let file = stage.file("file", "not a tty");
+    refused(&stage, &["run", "--link=front=/dev/null"], 4, "port_not_tty", &["/dev/null", "name a tty"]);
+    refused(&stage, &["run", &format!("--link=front={file}")], 4, "port_not_tty", &[&file, "name a tty"]);
+    refused(&stage, &["simulate", "--port=/no/where/front"], 4, "port_missing", &["/no/where/front"]);
+
+    let _simulator = stage.simulator(&["front"], &["--baud=500000"]);
+    let hub = stage.hub(&[stage.link("front")]);
+    stage.await_info("front", |info| info["state"] == "streaming");
+    let other = Stage::new();
+    let pid = format!("process {}", hub.pid());
+    refused(&other, &["run", &stage.link("front")], 4, "port_busy", &[&stage.word("front"), &pid, "stop it"]);
+    assert_eq!(stage.info("front")["state"], "streaming", "was disturbed");
+}
+
+#[test]
+fn a_second_hub_in_the_domain() {
+    let stage = Stage::new();
+    let hub = stage.hub(&[stage.link("front")]);
+    let pid = format!("pid {}", hub.pid());
+    refused(&stage, &["run", &stage.link("front")], 1, "domain_held", &[&pid, "--domain"]);
+    assert_eq!(hub.end(TERM).code, Some(0));
+    // It is free again.
+    let hub = stage.hub(&[stage.link("front")]);
+    assert_eq!(hub.end(TERM).code, Some(0));
+}

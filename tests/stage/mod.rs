@@ -1,0 +1,197 @@
+//! Where a test of the program takes place: a domain, a directory and children of its own, gone with the test however
+//! it ends. Everything is waited for by what it says, with a deadline far beyond what it takes.
+#![allow(dead_code, unused_imports)] // Every test file takes what it needs.
+
+mod program;
+mod telegrams;
+
+use std::fs;
+use std::path::{Path, PathBuf};
+use std::process::Command;
+use std::sync::atomic::{AtomicU32, Ordering};
+use std::thread;
+use std::time::{Duration, Instant};
+
+use serde_json::Value;
+
+pub(crate) use program::{INT, KILL, Outcome, Program, TERM};
+pub(crate) use telegrams::{MEASURED, Sent, bytes_of, hash, is_class, number, scan, sequence};
+
+/// Far longer than anything takes on a busy machine.
+pub(crate) const PATIENCE: Duration = Duration::from_secs(20);
+
+/// A domain and a directory of one test.
+pub(crate) struct Stage {
+    directory: PathBuf,
+    domain: String,
+}
+
+impl Stage {
+    pub(crate) fn new() -> Stage {
+        static NEXT: AtomicU32 = AtomicU32::new(0);
+        let domain = format!("t{}-{}", std::process::id(), NEXT.fetch_add(1, Ordering::Relaxed));
+        // Not TMPDIR: root and prefix of a domain have to be short.
+        let directory = PathBuf::from(format!("/tmp/{domain}"));
+        fs::create_dir_all(&directory).unwrap_or_else(|error| panic!("{}: {error}", directory.display()));
+        Stage { directory, domain }
+    }
+
+    pub(crate) fn path(&self, name: &str) -> PathBuf {
+        self.directory.join(name)
+    }
+
+    /// `path` as an argument.
+    pub(crate) fn word(&self, name: &str) -> String {
+        self.path(name).display().to_string()
+    }
+
+    /// Writes a file of this test and returns its path as an argument.
+    pub(crate) fn file(&self, name: &str, content: impl AsRef<[u8]>) -> String {
+        fs::write(self.path(name), content).unwrap_or_else(|error| panic!("{name}: {error}"));
+        self.word(name)
+    }
+
+    /// `--link NAME=PORT` for a port in this directory.
+    pub(crate) fn link(&self, name: &str) -> String {
+        format!("--link={name}={}", self.word(name))
+    }
+
+    /// The program with `arguments`, in this domain.
+    pub(crate) fn command<S: AsRef<str>>(&self, arguments: &[S]) -> Command {
+        let mut command = Command::new(env!("CARGO_BIN_EXE_scanhub"));
+        command.args(arguments.iter().map(AsRef::as_ref));
+        command.args(["--domain", &self.domain, "--root"]).arg(&self.directory);
+        // Should the whole test be killed, its children end too.
+        command.env("SCANHUB_END_WITH_PARENT", "1").env("SCANHUB_LOG", "info").env_remove("SCANHUB_CONFIG");
+        command
+    }
+
+    /// Starts the program.
+    pub(crate) fn start<S: AsRef<str>>(&self, arguments: &[S]) -> Program {
+        Program::start(self.command(arguments))
+    }
+
+    /// Starts the program and lets it come to its end.
+    pub(crate) fn run<S: AsRef<str>>(&self, arguments: &[S]) -> Outcome {
+        self.start(arguments).wait()
+    }
+
+    /// A hub with these flags that is up.
+    pub(crate) fn hub<S: AsRef<str>>(&self, flags: &[S]) -> Program {
+        self.start(&with(&["run", "--json"], flags)).ready()
+    }
+
+    /// A simulator with a port of each of these names that is up; its truth is in the file `truth`.
+    pub(crate) fn simulator<S: AsRef<str>>(&self, ports: &[&str], flags: &[S]) -> Program {
+        let ports: Vec<_> = ports.iter().map(|port| format!("--port={}", self.word(port))).collect();
+        let truth = format!("--truth={}", self.word("truth"));
+        let words = with(&["simulate", "--json", &truth], &with(&ports, flags));
+        self.start(&words).ready()
+    }
+
+    /// `echo --json` of these topics, attached to all of them.
+    pub(crate) fn echo(&self, topics: &[&str]) -> Program {
+        let before: Vec<_> = topics.iter().map(|topic| self.subscribers(topic)).collect();
+        let program = self.start(&with(&["echo", "--json"], topics));
+        until("the consumer is attached", || {
+            topics.iter().zip(&before).all(|(topic, before)| self.subscribers(topic) > *before)
+        });
+        program
+    }
+
+    /// How many consumers `topic` has.
+    pub(crate) fn subscribers(&self, topic: &str) -> u64 {
+        let outcome = self.run(&["list", "--json"]);
+        let lines = outcome.lines();
+        let line = lines.iter().find(|line| {
+            topic.split_once('/').is_some_and(|(sensor, topic)| {
+                line["class"] == "topic" && line["sensor"] == sensor && line["topic"] == topic
+            })
+        });
+        line.map_or_else(|| panic!("no {topic}: {outcome}"), |line| number(line, "subscribers"))
+    }
+
+    /// What `info` says of `sensor`.
+    pub(crate) fn info(&self, sensor: &str) -> Value {
+        let outcome = self.run(&["info", sensor, "--json"]);
+        let [line] = &outcome.lines()[..] else { panic!("not one line: {outcome}") };
+        line.clone()
+    }
+
+    /// Waits until `info` of `sensor` says what is `wanted`, and returns it.
+    pub(crate) fn await_info(&self, sensor: &str, wanted: impl Fn(&Value) -> bool) -> Value {
+        let mut last = Value::Null;
+        until("the status", || {
+            last = self.info(sensor);
+            wanted(&last)
+        });
+        last
+    }
+
+    /// The telegrams that the simulator has sent so far, those of `port` in their order.
+    pub(crate) fn truth(&self, port: &str) -> Vec<Sent> {
+        let port = self.word(port);
+        self.truth_lines("truth").iter().filter(|line| line["port"] == port.as_str()).map(Sent::of).collect()
+    }
+
+    /// The simulator's last line about `port`: how many telegrams it sent, and how often it would have written the
+    /// sensor's EEPROM.
+    pub(crate) fn simulated(&self, port: &str) -> (u64, u64) {
+        let port = self.word(port);
+        let lines = self.truth_lines("simulated");
+        let line = lines.iter().find(|line| line["port"] == port.as_str());
+        let line = line.unwrap_or_else(|| panic!("no account of {port}"));
+        (number(line, "sent"), number(line, "eeprom_writes"))
+    }
+
+    fn truth_lines(&self, class: &str) -> Vec<Value> {
+        let text = fs::read_to_string(self.path("truth")).expect("the truth is there");
+        text.lines()
+            .map(|line| serde_json::from_str::<Value>(line).unwrap_or_else(|error| panic!("{line}: {error}")))
+            .filter(|line| line["class"] == class)
+            .collect()
+    }
+
+    /// Files of this domain's shared memory that are longer than what the library always leaves.
+    pub(crate) fn left_behind(&self) -> Vec<PathBuf> {
+        shared_memory(&format!("sh_{}_", self.domain))
+            .into_iter()
+            .filter(|path| fs::metadata(path).is_ok_and(|metadata| metadata.len() > 16))
+            .collect()
+    }
+}
+
+impl Drop for Stage {
+    fn drop(&mut self) {
+        let _ = fs::remove_dir_all(&self.directory);
+        for path in shared_memory(&format!("sh_{}_", self.domain)) {
+            let _ = fs::remove_file(path);
+        }
+    }
+}
+
+/// Files in shared memory whose names begin with `prefix`.
+pub(crate) fn shared_memory(prefix: &str) -> Vec<PathBuf> {
+    let entries = fs::read_dir("/dev/shm").into_iter().flatten().flatten();
+    let named = entries.filter(|entry| entry.file_name().to_string_lossy().starts_with(prefix));
+    named.map(|entry| entry.path()).collect()
+}
+
+/// Waits until `is_so`.
+pub(crate) fn until(what: &str, mut is_so: impl FnMut() -> bool) {
+    let give_up_at = Instant::now() + PATIENCE;
+    while !is_so() {
+        assert!(Instant::now() < give_up_at, "waited in vain: {what}");
+        thread::sleep(Duration::from_millis(20));
+    }
+}
+
+/// Whether anything is at `path`, be it a symlink to nothing.
+pub(crate) fn is_there(path: &Path) -> bool {
+    fs::symlink_metadata(path).is_ok()
+}
+
+fn with<S: AsRef<str>, T: AsRef<str>>(first: &[S], rest: &[T]) -> Vec<String> {
+    let first = first.iter().map(|word| word.as_ref().to_owned());
+    first.chain(rest.iter().map(|word| word.as_ref().to_owned())).collect()
+}

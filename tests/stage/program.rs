@@ -1,0 +1,198 @@
+//! The program as a child of a test: read line by line, ended by its id, and ended in any case.
+
+use std::fmt;
+use std::io::{BufRead, BufReader, Read};
+use std::process::{Child, Command, Stdio};
+use std::sync::mpsc::{Receiver, RecvTimeoutError, channel};
+use std::thread::{self, JoinHandle};
+use std::time::{Duration, Instant};
+
+use rustix::process::{Pid, Signal, kill_process};
+use serde_json::Value;
+
+use super::PATIENCE;
+
+pub(crate) const INT: Signal = Signal::INT;
+pub(crate) const TERM: Signal = Signal::TERM;
+pub(crate) const KILL: Signal = Signal::KILL;
+
+/// A running child.
+pub(crate) struct Program {
+    name: String,
+    process: Child,
+    /// Its stdout, a line or what is left of one each.
+    pieces: Receiver<Vec<u8>>,
+    /// What was received of it.
+    out: Vec<u8>,
+    errors: Option<JoinHandle<String>>,
+}
+
+/// What came of a child.
+pub(crate) struct Outcome {
+    /// Its exit code; `None` if a signal ended it.
+    pub(crate) code: Option<i32>,
+    /// All of its stdout.
+    pub(crate) out: Vec<u8>,
+    /// All of its stderr.
+    pub(crate) errors: String,
+    name: String,
+}
+
+impl Program {
+    pub(crate) fn start(mut command: Command) -> Program {
+        let words: Vec<_> = command.get_args().map(|word| word.to_string_lossy()).collect();
+        let name = words.join(" ");
+        command.stdin(Stdio::null()).stdout(Stdio::piped()).stderr(Stdio::piped());
+        let mut process = command.spawn().unwrap_or_else(|error| panic!("cannot start {name}: {error}"));
+        let (send, pieces) = channel();
+        let stdout = process.stdout.take();
+        thread::spawn(move || {
+            let Some(mut stdout) = stdout.map(BufReader::new) else { return };
+            let mut piece = Vec::new();
+            while stdout.read_until(b'\n', &mut piece).is_ok_and(|len| len > 0) {
+                if send.send(std::mem::take(&mut piece)).is_err() {
+                    return;
+                }
+            }
+        });
+        let stderr = process.stderr.take();
+        let errors = thread::spawn(move || {
+            let mut text = Vec::new();
+            let _ = stderr.map(|mut stderr| stderr.read_to_end(&mut text));
+            String::from_utf8_lossy(&text).into_owned()
+        });
+        Program { name, process, pieces, out: Vec::new(), errors: Some(errors) }
+    }
+
+    /// Waits for its line that says that it is up.
+    pub(crate) fn ready(mut self) -> Program {
+        self.await_line("ready", |line| line["class"] == "ready");
+        self
+    }
+
+    pub(crate) fn pid(&self) -> u32 {
+        self.process.id()
+    }
+
+    /// Its first line from now on that is `wanted`.
+    pub(crate) fn await_line(&mut self, what: &str, wanted: impl Fn(&Value) -> bool) -> Value {
+        let give_up_at = Instant::now() + PATIENCE;
+        loop {
+            let line = self.next_line(give_up_at).unwrap_or_else(|why| self.give_up(what, why));
+            if wanted(&line) {
+                return line;
+            }
+        }
+    }
+
+    /// Its next `count` lines from now on that are `wanted`.
+    pub(crate) fn await_lines(
+        &mut self,
+        count: usize,
+        what: &str,
+        wanted: impl Fn(&Value) -> bool,
+    ) -> Vec<Value> {
+        (0..count).map(|_| self.await_line(what, &wanted)).collect()
+    }
+
+    /// Waits until it has written more than `len` bytes in all.
+    pub(crate) fn await_bytes(&mut self, len: usize) {
+        let give_up_at = Instant::now() + PATIENCE;
+        while self.out.len() <= len {
+            self.receive(give_up_at).unwrap_or_else(|why| self.give_up("bytes", why));
+        }
+    }
+
+    /// Sends a signal.
+    pub(crate) fn signal(&self, signal: Signal) {
+        let pid = Pid::from_child(&self.process);
+        kill_process(pid, signal).unwrap_or_else(|error| panic!("{}: no {signal:?}: {error}", self.name));
+    }
+
+    /// Sends a signal and waits for the end.
+    pub(crate) fn end(self, signal: Signal) -> Outcome {
+        self.signal(signal);
+        self.wait()
+    }
+
+    /// Waits for the end.
+    pub(crate) fn wait(mut self) -> Outcome {
+        let give_up_at = Instant::now() + PATIENCE;
+        let why = loop {
+            match self.receive(give_up_at) {
+                Ok(()) => {}
+                Err(why) => break why,
+            }
+        };
+        if why == RecvTimeoutError::Timeout {
+            self.give_up("its end", why);
+        }
+        let status = self.process.wait().unwrap_or_else(|error| panic!("{}: {error}", self.name));
+        let errors = self.errors.take().map(JoinHandle::join);
+        Outcome {
+            code: status.code(),
+            out: std::mem::take(&mut self.out),
+            errors: errors.and_then(Result::ok).unwrap_or_default(),
+            name: self.name.clone(),
+        }
+    }
+
+    fn receive(&mut self, give_up_at: Instant) -> Result<(), RecvTimeoutError> {
+        let left = give_up_at.saturating_duration_since(Instant::now());
+        self.pieces.recv_timeout(left).map(|piece| self.out.extend(piece))
+    }
+
+    fn next_line(&mut self, give_up_at: Instant) -> Result<Value, RecvTimeoutError> {
+        let begin = self.out.len();
+        self.receive(give_up_at)?;
+        let text = String::from_utf8_lossy(&self.out[begin..]);
+        Ok(serde_json::from_str(&text).unwrap_or_else(|error| panic!("{}: {text}: {error}", self.name)))
+    }
+
+    fn give_up(&mut self, what: &str, why: RecvTimeoutError) -> ! {
+        let _ = self.process.kill();
+        let errors = self.errors.take().and_then(|errors| errors.join().ok()).unwrap_or_default();
+        let out = String::from_utf8_lossy(&self.out);
+        let tail = &out[out.floor_char_boundary(out.len().saturating_sub(2000))..];
+        panic!("scanhub {}: waited in vain ({why}) for {what}; it said: .. {tail}\n{errors}", self.name);
+    }
+}
+
+impl Drop for Program {
+    fn drop(&mut self) {
+        // First the gentle way: it may have children or files of its own.
+        let _ = kill_process(Pid::from_child(&self.process), Signal::TERM);
+        let give_up_at = Instant::now() + Duration::from_secs(2);
+        while let Ok(None) = self.process.try_wait() {
+            if Instant::now() > give_up_at {
+                let _ = self.process.kill();
+                let _ = self.process.wait();
+                return;
+            }
+            thread::sleep(Duration::from_millis(5));
+        }
+    }
+}
+
+impl Outcome {
+    /// Its stdout as lines of JSON.
+    pub(crate) fn lines(&self) -> Vec<Value> {
+        let text = String::from_utf8_lossy(&self.out);
+        assert!(text.is_empty() || text.ends_with('\n'), "half a line: {self}");
+        text.lines()
+            .map(|line| serde_json::from_str(line).unwrap_or_else(|error| panic!("{line}: {error}\n{self}")))
+            .collect()
+    }
+
+    /// Its lines of `class`.
+    pub(crate) fn of_class(&self, class: &str) -> Vec<Value> {
+        self.lines().into_iter().filter(|line| line["class"] == class).collect()
+    }
+}
+
+impl fmt::Display for Outcome {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let Outcome { name, code, out, errors } = self;
+        write!(f, "scanhub {name}: exit {code:?}\n{}\n{errors}", String::from_utf8_lossy(out))
+    }
+}

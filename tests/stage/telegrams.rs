@@ -1,0 +1,74 @@
+//! What a test knows of telegrams: the lines in which programs tell of them, and whether they are what was sent.
+
+use lms::telegram::Telegram;
+use lms::variant::Unit;
+use serde_json::Value;
+use sha2::{Digest, Sha256};
+
+/// Command of a measured-value telegram.
+pub(crate) const MEASURED: u64 = 0xB0;
+
+/// A telegram as the simulator tells of it.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub(crate) struct Sent {
+    pub(crate) is_reply: bool,
+    pub(crate) hash: String,
+    pub(crate) fault: Option<String>,
+}
+
+impl Sent {
+    pub(crate) fn of(line: &Value) -> Sent {
+        let text = |key: &str| line[key].as_str().map(str::to_owned);
+        Sent {
+            is_reply: line["kind"] == "reply",
+            hash: text("sha256").unwrap_or_else(|| panic!("no hash: {line}")),
+            fault: text("fault"),
+        }
+    }
+
+    /// Whether it is a scan that reached the host as it was sent.
+    pub(crate) fn is_intact_scan(&self) -> bool {
+        !self.is_reply && self.fault.is_none()
+    }
+}
+
+/// Lower hex of SHA-256.
+pub(crate) fn hash(bytes: &[u8]) -> String {
+    Sha256::digest(bytes).iter().map(|byte| format!("{byte:02x}")).collect()
+}
+
+/// The telegram in a line of class `telegram`; its checksum is right, and the line says the truth about it.
+pub(crate) fn bytes_of(line: &Value) -> Vec<u8> {
+    let text = line["data"].as_str().unwrap_or_else(|| panic!("no data: {line}"));
+    let pair = |at| u8::from_str_radix(&text[at..at + 2], 16).unwrap_or_else(|_| panic!("no hex: {text}"));
+    let bytes: Vec<u8> = (0..text.len()).step_by(2).map(pair).collect();
+    let telegram = Telegram::check(&bytes).unwrap_or_else(|| panic!("torn: {line}"));
+    assert_eq!(u64::from(telegram.command()), number(line, "command"), "{line}");
+    assert_eq!(u64::from(telegram.address()), number(line, "address"), "{line}");
+    bytes
+}
+
+/// A scan of 361 beams, of which no two with different seeds are equal, as a telegram.
+pub(crate) fn scan(seed: u16) -> Vec<u8> {
+    let words: [u16; 361] = std::array::from_fn(|beam| 500 + (seed * 7 + beam as u16 * 11) % 4000);
+    lms::measured::encode(0, Unit::Mm, &words, 0x10).bytes().to_vec()
+}
+
+/// A number in a line.
+pub(crate) fn number(line: &Value, key: &str) -> u64 {
+    line[key].as_u64().unwrap_or_else(|| panic!("no number {key}: {line}"))
+}
+
+/// A numbering of lines, which has no gap.
+pub(crate) fn sequence(lines: &[Value], key: &str) -> Vec<u64> {
+    let numbers: Vec<u64> = lines.iter().map(|line| number(line, key)).collect();
+    for pair in numbers.windows(2) {
+        assert_eq!(pair[1], pair[0] + 1, "a gap in {key}");
+    }
+    numbers
+}
+
+/// Whether a line is of `class`, as a condition to wait for.
+pub(crate) fn is_class(class: &str) -> impl Fn(&Value) -> bool {
+    move |line| line["class"] == class
+}
