@@ -60,7 +60,7 @@ impl Default for Settings {
 /// Bytes that the host's hardware hands over at once.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Chunk {
-    /// 1 to 62 bytes.
+    /// Up to 62 bytes; none at the end of a telegram that was broken off between two bursts.
     pub bytes: Vec<u8>,
     /// The rate they were sent at.
     pub baud: Baud,

@@ -64,9 +64,10 @@ impl<T> Transmission<T> {
         self.baud
     }
 
-    /// The next chunk, if it is complete at `now`, and whether the line is idle after it.
+    /// The next chunk, if it is complete at `now`, and whether the line is idle after it. It is empty where everything
+    /// that leaves was taken: broken off between two bursts.
     pub(crate) fn take_chunk(&mut self, now: Nanos) -> Option<(&[u8], bool)> {
-        if self.is_done() || self.next_chunk_ns() > now {
+        if self.next_chunk_ns() > now {
             return None;
         }
         let (from, to) = (self.handed, self.chunk_end());

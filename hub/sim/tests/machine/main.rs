@@ -147,6 +147,20 @@ fn a_request_breaks_the_scan_off_and_a_fresh_one_follows() {
 }
 
 #[test]
+fn a_request_between_two_bursts_breaks_the_scan_off_too() {
+    let mut bench = Bench::new(fast());
+    bench.ask(Request::Stream.encode(0).bytes());
+    // 508 bytes are through, the others wait for the mirror.
+    let next = bench.sent().last().unwrap().0 + 2 * MIRROR_TURN - 17_800 * MICROS;
+    bench.run_until(next + 11 * MILLIS);
+    let sent_before = bench.sent().len();
+    bench.ask(Request::Type.encode(0).bytes());
+    let sent = bench.sent().split_off(sent_before);
+    let kinds: Vec<_> = sent.iter().map(|(_, sent)| (sent.is_reply, sent.aborted)).collect();
+    assert_eq!(kinds[..3], [(false, true), (true, false), (false, false)]);
+}
+
+#[test]
 fn stopping_stops_and_a_second_request_replaces_the_first() {
     let mut bench = Bench::new(fast());
     bench.ask(Request::Stream.encode(0).bytes());
