@@ -163,8 +163,10 @@ impl Dialogue {
         }
     }
 
+    /// While the rate is sought, a NAK proves nothing: the scan that the request broke off, or a stream at another
+    /// rate, has such bytes, and who believes them leaves the right rate. Then only time says no.
     pub(crate) fn on_nak(&mut self, now: Nanos) {
-        if self.open.as_ref().is_some_and(Outgoing::is_out) {
+        if !matches!(self.phase, Phase::Probing { .. }) && self.open.as_ref().is_some_and(Outgoing::is_out) {
             self.retry(now + NAK_PAUSE);
         }
     }
