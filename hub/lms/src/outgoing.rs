@@ -15,6 +15,7 @@ pub(crate) struct Outgoing {
     sent: usize,
     not_before: Nanos,
     tries_left: u8,
+    acknowledged: bool,
     /// When its reply is given up; counts from the last byte.
     give_up_at: Nanos,
 }
@@ -23,7 +24,15 @@ impl Outgoing {
     /// `request` to the sensor at `address`, from `not_before` on, at most `tries` times.
     pub(crate) fn new(request: Request, address: u8, not_before: Nanos, tries: u8) -> Self {
         let encoded = request.encode(address);
-        Outgoing { request, encoded, sent: 0, not_before, tries_left: tries - 1, give_up_at: Nanos::MAX }
+        Outgoing {
+            request,
+            encoded,
+            sent: 0,
+            not_before,
+            tries_left: tries - 1,
+            acknowledged: false,
+            give_up_at: Nanos::MAX,
+        }
     }
 
     /// The next byte, and when it may leave at the earliest.
@@ -36,12 +45,17 @@ impl Outgoing {
         self.sent += 1;
         self.not_before = now + line_time(1, baud.rate()) + GAP;
         if self.sent == self.encoded.bytes().len() {
-            self.give_up_at = now + line_time(1, baud.rate()) + ACKNOWLEDGE_TIMEOUT;
+            // Behind the head of a scan that the request broke off, the acknowledgement is not seen: the reply is.
+            self.give_up_at = now + ACKNOWLEDGE_TIMEOUT + line_time(1 + LONGEST_REPLY, baud.rate());
         }
     }
 
-    /// The sensor acknowledged: its reply may take longer.
+    /// The sensor acknowledged: its reply may take longer. It does so once; a stream at another rate looks like
+    /// acknowledgements without end, which must not put the deadline off again and again.
     pub(crate) fn acknowledged(&mut self, now: Nanos, baud: Baud) {
+        if core::mem::replace(&mut self.acknowledged, true) {
+            return;
+        }
         let work = match self.request {
             Request::Stream | Request::Stop | Request::Baud(_) => MODE_TIMEOUT,
             _ => REPLY_TIMEOUT,
@@ -53,6 +67,7 @@ impl Outgoing {
     pub(crate) fn again(&mut self, at: Nanos) -> bool {
         self.sent = 0;
         self.not_before = at;
+        self.acknowledged = false;
         self.give_up_at = Nanos::MAX;
         self.tries_left.checked_sub(1).map(|left| self.tries_left = left).is_some()
     }
@@ -102,7 +117,7 @@ mod tests {
             outgoing.transmitted(now, Baud::B500000);
         }
         assert!(outgoing.is_out());
-        assert_eq!(outgoing.give_up_at(), now + 100_020_000);
+        assert_eq!(outgoing.give_up_at(), now + 103_220_000);
         assert!(outgoing.again(now));
         assert!(!outgoing.is_out());
         assert!(!outgoing.again(now));
