@@ -1,0 +1,46 @@
+//! A sensor that streams already when the session begins: left by a hub that was killed, or by another program.
+
+use lms::variant::Baud;
+use lms::{MICROS, MILLIS, State};
+
+use crate::bench::{Bench, make_stream, sensor};
+
+#[test]
+fn at_the_wanted_rate_it_is_taken_as_it_streams() {
+    // Begun at any moment of a scan's period.
+    for phase in 0..28 {
+        let mut machine = sensor(Baud::B500000);
+        let begun = make_stream(&mut machine) + phase * 970 * MICROS;
+        let mut bench = Bench::new(machine, begun);
+        bench.until("streaming", 60 * MILLIS, Bench::is_streaming);
+        bench.run(2_000 * MILLIS);
+        assert!(bench.said.iter().all(|(at, _)| *at >= bench.received[0].at), "spoke before it listened");
+        assert_eq!(bench.states, [State::Probing, State::Streaming], "{bench}");
+        // Two questions, for measuring mode and type.
+        let aborted = bench.sent.iter().filter(|sent| sent.aborted).count();
+        assert!(aborted <= 2, "{aborted} scans were broken off");
+        assert!(bench.session.sensor().mode.is_some() && !bench.session.sensor().kind().is_empty());
+        // The scan in flight when it began is no telegram of ours, all others are.
+        let (scans, intact) = (bench.received_scans(0), bench.intact_scans(begun));
+        let skipped = intact.iter().position(|scan| scans.first() == Some(scan)).expect("was sent");
+        assert_eq!(scans, intact[skipped..][..scans.len()], "{bench}");
+        assert!(skipped <= 1 && intact.len() - skipped - scans.len() <= 1, "{bench}");
+        assert_eq!(bench.session.began_with_a_cut(), skipped == 1, "{bench}");
+    }
+}
+
+#[test]
+fn at_another_rate_it_is_found_and_brought_to_the_wanted_one() {
+    for baud in [Baud::B9600, Baud::B19200, Baud::B38400] {
+        for phase in 0..30 {
+            let mut machine = sensor(baud);
+            let begun = make_stream(&mut machine) + phase * 27 * MILLIS;
+            let mut bench = Bench::new(machine, begun);
+            let took = bench.until("streaming", 4_000 * MILLIS, Bench::is_streaming);
+            bench.run(500 * MILLIS);
+            assert_eq!((bench.session.baud(), bench.machine.baud()), (Baud::B500000, Baud::B500000));
+            assert!(bench.is_streaming() && bench.received_scans(0).len() > 15, "{took} ns: {bench}");
+            assert_eq!(bench.session.trouble(), None);
+        }
+    }
+}

@@ -1,0 +1,280 @@
+//! A session and a simulated sensor at the two ends of a line, with a clock that only this file moves. What the line
+//! does to bytes is said by a test; what always has to hold is checked at every step.
+
+use std::collections::VecDeque;
+
+use lms::command::Request;
+use lms::session::{Output, Session};
+use lms::variant::{Baud, Variant};
+use lms::{MICROS, MILLIS, Nanos, Settings, State, line_time};
+use sim::Arrival;
+use sim::machine::{self, Chunk, Machine, Part};
+use sim::noise::Receiver;
+use sim::room::{Room, World};
+use sim::source::Source;
+
+/// From sensor to host: what becomes of a chunk that is through at this time.
+pub(crate) type ToHost = Box<dyn FnMut(Nanos, Vec<u8>) -> Vec<u8>>;
+/// From host to sensor: what becomes of the byte with this number.
+pub(crate) type ToSensor = Box<dyn FnMut(usize, u8) -> Option<u8>>;
+
+/// Both ends, the line, and everything that went over it.
+pub(crate) struct Bench {
+    pub(crate) session: Session,
+    pub(crate) machine: Machine,
+    pub(crate) now: Nanos,
+    pub(crate) to_host: ToHost,
+    pub(crate) to_sensor: ToSensor,
+    /// Bytes that the session said, with the time.
+    pub(crate) said: Vec<(Nanos, u8)>,
+    pub(crate) sent: Vec<Sent>,
+    pub(crate) received: Vec<Received>,
+    /// Every state that was seen, once in a row.
+    pub(crate) states: Vec<State>,
+    port: Baud,
+    /// Bytes that came and were not read.
+    inbox: VecDeque<u8>,
+    garbled: Option<((Baud, Baud), Receiver)>,
+    damaged: bool,
+    read: u64,
+    looks: u32,
+    /// Bytes said of the request that is being said.
+    request: Vec<u8>,
+}
+
+/// A telegram as the sensor sent it.
+#[derive(Clone, Debug)]
+pub(crate) struct Sent {
+    /// When its last byte was through.
+    pub(crate) at: Nanos,
+    pub(crate) telegram: Vec<u8>,
+    pub(crate) is_reply: bool,
+    pub(crate) aborted: bool,
+    /// Whether the line did something to it.
+    pub(crate) damaged: bool,
+}
+
+/// A telegram as the session delivered it.
+#[derive(Clone, Debug)]
+pub(crate) struct Received {
+    pub(crate) at: Nanos,
+    pub(crate) telegram: Vec<u8>,
+    /// Reads since the one before it.
+    pub(crate) looks: u32,
+}
+
+/// What the session is asked for in all tests here.
+pub(crate) const WANTED: Settings =
+    Settings { variant: Variant::HALF, baud: Baud::B500000, listen_only: false };
+
+/// A sensor in a room, at this rate.
+pub(crate) fn sensor(baud: Baud) -> Machine {
+    let settings = machine::Settings { baud, seed: 1, ..machine::Settings::default() };
+    Machine::new(settings, Source::Room(Room::new(World::Room, 1)))
+}
+
+/// Makes `machine` stream, as a host did that is gone; returns the time.
+pub(crate) fn make_stream(machine: &mut Machine) -> Nanos {
+    let mut now = 10 * MILLIS;
+    for &byte in Request::Stream.encode(0).bytes() {
+        now += line_time(1, machine.baud().rate()) + 60 * MICROS;
+        machine.receive(byte, Arrival::at(now));
+    }
+    // The reply is through, and some scans.
+    now += 2_000 * MILLIS;
+    while machine.poll_transmit(now).is_some() {}
+    now
+}
+
+impl Bench {
+    /// The session begins at `now` of the machine's time, on a line that does no harm.
+    pub(crate) fn new(mut machine: Machine, now: Nanos) -> Bench {
+        while machine.poll_transmit(now).is_some() {}
+        Bench {
+            session: Session::new(WANTED, now),
+            machine,
+            now,
+            to_host: Box::new(|_, bytes| bytes),
+            to_sensor: Box::new(|_, byte| Some(byte)),
+            said: Vec::new(),
+            sent: Vec::new(),
+            received: Vec::new(),
+            states: Vec::new(),
+            port: WANTED.baud,
+            inbox: VecDeque::new(),
+            garbled: None,
+            damaged: false,
+            read: 0,
+            looks: 0,
+            request: Vec::new(),
+        }
+    }
+
+    /// Runs for `span`.
+    pub(crate) fn run(&mut self, span: Nanos) {
+        let end = self.now + span;
+        while self.now < end {
+            self.step(end);
+        }
+    }
+
+    /// Runs until `is_so`, which must be within `span`; returns the time it took.
+    pub(crate) fn until(&mut self, what: &str, span: Nanos, is_so: impl Fn(&Bench) -> bool) -> Nanos {
+        let begun = self.now;
+        while !is_so(self) {
+            assert!(self.now < begun + span, "not {what} within {} ms: {self}", span / MILLIS);
+            self.step(begun + span);
+        }
+        self.now - begun
+    }
+
+    pub(crate) fn is_streaming(&self) -> bool {
+        self.session.state() == State::Streaming
+    }
+
+    /// Scans that were sent whole and undamaged with their last byte after `since`.
+    pub(crate) fn intact_scans(&self, since: Nanos) -> Vec<&[u8]> {
+        let intact = |sent: &&Sent| sent.at > since && !(sent.is_reply || sent.aborted || sent.damaged);
+        self.sent.iter().filter(intact).map(|sent| &sent.telegram[..]).collect()
+    }
+
+    /// Scans that were delivered after `since`.
+    pub(crate) fn received_scans(&self, since: Nanos) -> Vec<&[u8]> {
+        let is_scan = |got: &&Received| got.at > since && got.telegram[4] == lms::measured::MEASURED;
+        self.received.iter().filter(is_scan).map(|got| &got.telegram[..]).collect()
+    }
+
+    /// One round of the host: everything that the session wants, then a wait, then a read.
+    fn step(&mut self, limit: Nanos) {
+        let (watch, until) = self.drain();
+        self.wait(watch, until.min(limit));
+        self.looks += 1;
+        let spare = self.session.spare();
+        let len = spare.len().min(self.inbox.len());
+        for (place, byte) in spare.iter_mut().zip(self.inbox.drain(..len)) {
+            *place = byte;
+        }
+        self.read += len as u64;
+        self.session.commit(self.now, len);
+        if len == 0 && self.now >= until {
+            self.session.handle_timeout(self.now);
+        }
+    }
+
+    fn drain(&mut self) -> (bool, Nanos) {
+        let wait = loop {
+            match self.session.poll_output() {
+                Output::SetBaud(baud) => {
+                    self.port = baud;
+                    self.damaged |= !self.inbox.is_empty();
+                    self.inbox.clear();
+                }
+                Output::Transmit { byte, not_before } => self.transmit(byte, not_before),
+                Output::Telegram(received) => {
+                    let telegram = received.telegram.bytes().to_vec();
+                    let looks = std::mem::take(&mut self.looks);
+                    self.received.push(Received { at: self.now, telegram, looks });
+                }
+                Output::Rest(until) => break (false, until),
+                Output::Wait { until, .. } => break (true, until),
+            }
+        };
+        let tally = self.session.tally();
+        let known = tally.in_telegrams + tally.acknowledge + tally.discarded + self.session.buffered() as u64;
+        assert_eq!((tally.read, known), (self.read, self.read), "bytes vanished");
+        assert_eq!(self.machine.eeprom_writes(), 0);
+        if self.states.last() != Some(&self.session.state()) {
+            self.states.push(self.session.state());
+        }
+        wait
+    }
+
+    /// Waits until `until`, or for bytes if they are watched for.
+    fn wait(&mut self, watch: bool, until: Nanos) {
+        while !(watch && !self.inbox.is_empty()) {
+            match self.machine.poll_timeout() {
+                Some(at) if at <= until => self.advance(at),
+                _ => break,
+            }
+        }
+        let woken = if watch && !self.inbox.is_empty() { self.now } else { until };
+        self.advance(woken.max(self.now) + WAKE);
+    }
+
+    fn transmit(&mut self, byte: u8, not_before: Nanos) {
+        self.advance(not_before);
+        let byte_ns = line_time(1, self.port.rate());
+        if !self.request.is_empty() {
+            let (last, _) = self.said[self.said.len() - 1];
+            let gap = self.now - last - byte_ns;
+            assert!((55 * MICROS..=6 * MILLIS).contains(&gap), "{gap} ns between two bytes of a request");
+        }
+        self.request.push(byte);
+        if let [_, _, low, high, ..] = self.request[..]
+            && self.request.len() == usize::from(u16::from_le_bytes([low, high])) + lms::telegram::FRAME
+        {
+            self.request.clear();
+        }
+        let number = self.said.len();
+        self.said.push((self.now, byte));
+        self.session.transmitted(self.now);
+        self.advance(self.now + byte_ns);
+        if let Some(byte) = (self.to_sensor)(number, byte)
+            && self.machine.baud() == self.port
+        {
+            self.machine.receive(byte, Arrival::at(self.now));
+        }
+    }
+
+    /// Lets the time be `to`, unless it is later already.
+    fn advance(&mut self, to: Nanos) {
+        while let Some(at) = self.machine.poll_timeout().filter(|&at| at <= to) {
+            self.now = self.now.max(at);
+            while let Some(chunk) = self.machine.poll_transmit(self.now) {
+                self.carry(chunk);
+            }
+        }
+        self.now = self.now.max(to);
+    }
+
+    /// What the sensor sent is through.
+    fn carry(&mut self, chunk: Chunk) {
+        let sent = chunk.bytes.clone();
+        let mut bytes = (self.to_host)(self.now, chunk.bytes);
+        if chunk.baud != self.port {
+            let rates = (chunk.baud, self.port);
+            if self.garbled.as_ref().is_none_or(|(known, _)| *known != rates) {
+                self.garbled = Some((rates, Receiver::new(rates.0.rate(), rates.1.rate())));
+            }
+            let receiver = self.garbled.as_mut().map(|(_, receiver)| receiver);
+            bytes = receiver.map_or(Vec::new(), |receiver| receiver.receive(&bytes, chunk.idle_after));
+        }
+        self.damaged |= bytes != sent;
+        self.inbox.extend(bytes);
+        match chunk.part {
+            Part::Telegram => {}
+            Part::Acknowledge => self.damaged = false,
+            Part::End(machine::Sent { is_reply, telegram, aborted }) => {
+                let damaged = std::mem::take(&mut self.damaged);
+                self.sent.push(Sent { at: self.now, telegram, is_reply, aborted, damaged });
+            }
+        }
+    }
+}
+
+impl std::fmt::Display for Bench {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        let Bench { session, now, states, .. } = self;
+        let trouble = session.trouble();
+        write!(
+            f,
+            "at {} us, {:?}: {states:?}, {trouble:?}, {:?}",
+            now / MICROS,
+            session.baud(),
+            session.tally()
+        )
+    }
+}
+
+/// From what it waits for to a running host.
+const WAKE: Nanos = 50 * MICROS;

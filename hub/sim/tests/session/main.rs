@@ -1,0 +1,8 @@
+//! The conversation of a session with a simulated sensor, in virtual time: one file per situation.
+
+mod adoption;
+mod bench;
+mod loss;
+mod rest;
+mod start;
+mod trouble;

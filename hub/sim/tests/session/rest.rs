@@ -1,0 +1,46 @@
+//! How often the host looks at the line, and how soon it has what it waits for: once a session has learned how long a
+//! telegram takes, it lets it come, and is there when it ends.
+
+use lms::variant::{Baud, Variant};
+use lms::{MICROS, MILLIS};
+use sim::ChunkSize;
+use sim::machine::{Machine, Settings};
+use sim::room::{Room, World};
+use sim::source::Source;
+
+use crate::bench::{Bench, Received, Sent};
+
+/// Whether the end of a telegram could be the beginning of the next one: such a telegram is held until the line is
+/// idle (framing, rule 4).
+fn is_held(telegram: &[u8]) -> bool {
+    (1..=6).any(|len| telegram.ends_with(&telegram[..len]))
+}
+
+#[test]
+fn a_telegram_is_there_soon_after_its_last_byte() {
+    for chunk in [ChunkSize::Uart, ChunkSize::Usb] {
+        for variant in [Variant::HALF, Variant::ALL[0]] {
+            let settings = Settings { baud: Baud::B500000, variant, chunk, ..Settings::default() };
+            let machine = Machine::new(settings, Source::Room(Room::new(World::Room, 5)));
+            let mut bench = Bench::new(machine, 0);
+            bench.until("streaming", 3_000 * MILLIS, Bench::is_streaming);
+            bench.run(20_000 * MILLIS);
+            let scans: Vec<_> = bench.received.iter().filter(|got| got.telegram.len() > 300).collect();
+            let sent: Vec<_> = bench.sent.iter().filter(|sent| !sent.is_reply).collect();
+            let pairs: Vec<(&&Received, &&Sent)> = scans.iter().zip(&sent).skip(LESSONS).collect();
+            assert!(pairs.len() > 600 && pairs.iter().all(|(got, sent)| got.telegram == sent.telegram));
+            let late = |(got, sent): &&(&&Received, &&Sent)| got.at - sent.at;
+            let prompt: Vec<_> = pairs.iter().filter(|(_, sent)| !is_held(&sent.telegram)).collect();
+            assert!(prompt.len() * 10 > pairs.len() * 9);
+            let latest = prompt.iter().map(|pair| late(pair)).max().unwrap_or_default();
+            assert!(latest <= 1_500 * MICROS, "{variant:?} {chunk:?}: {latest} ns");
+            let latest = pairs.iter().map(|pair| late(&pair)).max().unwrap_or_default();
+            assert!(latest <= 3_500 * MICROS, "{variant:?} {chunk:?}: {latest} ns for one that was held");
+            let most = prompt.iter().map(|(got, _)| got.looks).max().unwrap_or_default();
+            assert!((1..=6).contains(&most), "{variant:?} {chunk:?}: {most} looks for a telegram");
+        }
+    }
+}
+
+/// Telegrams that are read as they come, before the first rest.
+const LESSONS: usize = 6;
