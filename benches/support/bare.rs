@@ -14,7 +14,7 @@ use super::line::Line;
 use super::{Outcome, PART, clock, truth};
 
 /// Reads `count` telegrams (0: for ever) from each of `ports` in a thread of its own, waking a process per port, then
-/// prints the hash of each. The first line says that it is up.
+/// prints the hash of each and when it was read. The first line says that it is up.
 pub(crate) fn chain(ports: &[&str], count: usize) -> Outcome<()> {
     let mut sleepers = Vec::new();
     let mut ends = Vec::new();
@@ -28,8 +28,8 @@ pub(crate) fn chain(ports: &[&str], count: usize) -> Outcome<()> {
         ends.into_iter().map(|(line, wake)| thread::spawn(move || read(&line, &wake, count))).collect();
     for (number, thread) in threads.into_iter().enumerate() {
         let telegrams = thread.join().map_err(|_| "a reader panicked")?.map_err(|words| words.to_string())?;
-        for telegram in telegrams {
-            println!("read {number} {}", truth::hash(&telegram));
+        for (telegram, at) in telegrams {
+            println!("read {number} {} {at}", truth::hash(&telegram));
         }
     }
     sleepers.into_iter().try_for_each(Guard::wait)?;
@@ -64,7 +64,7 @@ fn start_sleeper(number: usize, count: usize, wake: OwnedFd) -> Outcome<Guard> {
 }
 
 /// The loop. What it keeps of each telegram is kept after the wake-up, in the pause before the next one.
-fn read(line: &Line, wake: impl AsFd, count: usize) -> Result<Vec<[u8; LENGTH]>, String> {
+fn read(line: &Line, wake: impl AsFd, count: usize) -> Result<Vec<([u8; LENGTH], u64)>, String> {
     let words = |error: Box<dyn std::error::Error>| error.to_string();
     line.await_pause(PAUSE).map_err(words)?;
     let mut kept = Vec::with_capacity(count);
@@ -80,21 +80,21 @@ fn read(line: &Line, wake: impl AsFd, count: usize) -> Result<Vec<[u8; LENGTH]>,
             filled += len;
             if fresh {
                 first = clock::now();
-                if let Some(duration) = duration.known {
+                if let Some(duration) = duration.known.filter(|_| filled < LENGTH) {
                     clock::rest(first + duration - LEAD);
                     // As in the hub: bytes are there for sure, no need to ask.
                     filled += line.read(&mut telegram[filled..]).map_err(words)?;
                 }
             }
         }
-        let took = clock::now() - first;
+        let last = clock::now();
         rustix::io::write(&wake, &1u64.to_ne_bytes()).map_err(|error| error.to_string())?;
-        duration.learn(took);
+        duration.learn(last - first);
         if telegram[0] != lms::telegram::STX {
             return Err("lost the beginning of a telegram".into());
         }
         if count > 0 {
-            kept.push(telegram);
+            kept.push((telegram, last));
         }
     }
     Ok(kept)

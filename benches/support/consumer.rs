@@ -5,7 +5,7 @@ use std::io::Write;
 
 use clients::Attachment;
 use schema::ipc::Payload;
-use schema::{Domain, Environment, Scan, Status};
+use schema::{Domain, Environment, Header, Scan, Status};
 
 use super::{Outcome, clock, truth};
 
@@ -23,7 +23,8 @@ pub(crate) fn scans(domain: &str, sensor: &str) -> Outcome<()> {
 }
 
 /// Follows the telegrams of `sensor` until `count` of measured data came, then prints them; with 0 for ever, and
-/// prints each as it comes. A line is `telegram SENSOR RECEIVED_NS BOOT MISSED INTACT HASH`.
+/// prints each as it comes. A line is `telegram SENSOR RECEIVED_NS BOOT MISSED INTACT HASH
+/// READ_NS`, the last the hub's stamp of the last byte.
 pub(crate) fn telegrams(domain: &str, sensor: &str, count: usize) -> Outcome<()> {
     let mut telegrams = attach::<[u8]>(domain, sensor)?;
     let mut kept = Vec::with_capacity(count);
@@ -35,7 +36,8 @@ pub(crate) fn telegrams(domain: &str, sensor: &str, count: usize) -> Outcome<()>
         if schema::Telegram(&telegram).command() != lms::measured::MEASURED {
             continue;
         }
-        let found = (now, telegram.header().boot, telegram.missed, telegram.to_vec());
+        let header = *telegram.header();
+        let found = Found { now, header, missed: telegram.missed, bytes: telegram.to_vec() };
         drop(telegram);
         if count == 0 {
             write(&mut out, sensor, &found)?;
@@ -65,8 +67,16 @@ pub(crate) fn attach<P: Payload + ?Sized>(domain: &str, sensor: &str) -> Outcome
     Ok(Attachment::in_domain(places, sensor)?)
 }
 
-fn write(out: &mut impl Write, sensor: &str, found: &(u64, u64, u64, Vec<u8>)) -> Outcome<()> {
-    let (now, boot, missed, bytes) = found;
+struct Found {
+    now: u64,
+    header: Header,
+    missed: u64,
+    bytes: Vec<u8>,
+}
+
+fn write(out: &mut impl Write, sensor: &str, found: &Found) -> Outcome<()> {
+    let Found { now, header, missed, bytes } = found;
     let intact = lms::telegram::Telegram::check(bytes).is_some();
-    Ok(writeln!(out, "telegram {sensor} {now} {boot} {missed} {intact} {}", truth::hash(bytes))?)
+    let (boot, read, hash) = (header.boot, header.stamp_last_ns, truth::hash(bytes));
+    Ok(writeln!(out, "telegram {sensor} {now} {boot} {missed} {intact} {hash} {read}")?)
 }
