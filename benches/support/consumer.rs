@@ -13,6 +13,7 @@ use super::{Outcome, clock, truth};
 pub(crate) fn scans(domain: &str, sensor: &str) -> Outcome<()> {
     let mut scans = attach::<Scan>(domain, sensor)?;
     let mut boot = 0;
+    println!("attaching {sensor}");
     loop {
         let Some(scan) = scans.next()? else { continue };
         if scan.header().boot != boot {
