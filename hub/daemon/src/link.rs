@@ -6,7 +6,7 @@ use std::os::fd::OwnedFd;
 use std::path::Path;
 
 use lms::reply::Reply;
-use lms::session::{Output, Received, Values};
+use lms::session::{Output, Received};
 use lms::variant::{Mode, Unit, Variant};
 use lms::{MILLIS, Nanos, Session, Settings, Trouble};
 use rustix::event::{PollFd, PollFlags, poll};
@@ -180,12 +180,8 @@ impl<'a> LinkThread<'a> {
         self.topics.telegram(received, scanner::period_us(variant, self.link.baud.rate()));
         self.account.suspect += u64::from(received.reasons != 0);
         let Some(measured) = measured else { return };
-        let mode = match received.values {
-            Values::Known(mode) => mode,
-            // The answer is on the way: better no range than a wrong one.
-            Values::Asked => return,
-            Values::Unknown => fallback.unwrap_or(Mode(0)),
-        };
+        // Better no range than a wrong one.
+        let Some(mode) = received.mode.or(fallback) else { return };
         self.account.scans += 1;
         self.topics.scan(received.reasons, |scan| {
             let forbidden = scanner::decode(&measured, mode, scan);

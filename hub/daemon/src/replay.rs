@@ -19,8 +19,8 @@ use crate::scanner;
 /// A recording as a line's bytes.
 pub(crate) struct Recorded {
     bytes: Box<dyn Read + Send>,
-    /// How its values are split, where it says so.
-    mode: Option<Mode>,
+    /// How its values are split; one that does not say so is read as ranges of 13 bits.
+    mode: Mode,
 }
 
 impl Recorded {
@@ -29,8 +29,8 @@ impl Recorded {
     /// [`schema::Kind::Configuration`] if it cannot be read or is none.
     pub(crate) fn open(path: &Path, link: &Link) -> Result<Recorded, Failure> {
         let recording = Recording::open(path)?;
-        let mode = recording.contents().mode;
-        let encoding = Encoding { unit: link.unit.unwrap_or(Unit::Mm), mode: mode.unwrap_or(Mode(0)) };
+        let mode = recording.contents().mode.unwrap_or(Mode(0));
+        let encoding = Encoding { unit: link.unit.unwrap_or(Unit::Mm), mode };
         let bytes = match recording.contents().form {
             Form::Telegrams => recording.bytes()?,
             Form::Carmen => Box::new(Telegrams { frames: recording.telegrams(encoding)?, rest: Vec::new() }),
@@ -61,7 +61,7 @@ pub(crate) fn play(link: &mut LinkThread<'_>, session: &mut Session, mut recorde
         }
         while let Output::Telegram(received) = session.poll_output() {
             let is_scan = received.telegram.command() == MEASURED;
-            link.publish(&received, recorded.mode);
+            link.publish(&received, Some(recorded.mode));
             link.wake(Wake::Telegram);
             if is_scan && paced {
                 due += period(session);

@@ -60,7 +60,7 @@ enum Phase {
     /// At the wanted rate: settings, then the stream.
     Starting { step: Step },
     /// Measured data come.
-    Streaming { header: StreamHeader, silent_at: Nanos, questions: u8 },
+    Streaming { header: StreamHeader, silent_at: Nanos, questions: &'static [Request] },
     /// Bytes come from a recording.
     Following,
 }
@@ -80,9 +80,9 @@ impl Dialogue {
         let phase = if settings.listen_only {
             Phase::Following
         } else {
-            Phase::Listening { give_up_at: now + LISTEN, shown: State::Probing }
+            Phase::Listening { give_up_at: now, shown: State::Probing }
         };
-        Dialogue {
+        let mut dialogue = Dialogue {
             settings,
             phase,
             open: None,
@@ -91,7 +91,11 @@ impl Dialogue {
             sensor: Sensor::default(),
             trouble: None,
             resyncs: 0,
+        };
+        if !settings.listen_only {
+            dialogue.listen(now, State::Probing);
         }
+        dialogue
     }
 
     pub(crate) fn state(&self) -> State {
@@ -147,7 +151,7 @@ impl Dialogue {
             Phase::Streaming { silent_at, .. } if now >= silent_at => {
                 self.resyncs += 1;
                 self.trouble = Some(Trouble::Silence);
-                return self.listen(now);
+                return self.listen(now, State::Silent);
             }
             _ => {}
         }
@@ -188,7 +192,7 @@ impl Dialogue {
     }
 
     fn on_measured(&mut self, telegram: Telegram<'_>, measured: Measured<'_>, now: Nanos) {
-        let silent_at = now + SILENCE;
+        let silent_at = self.silent_at(now);
         match self.phase {
             Phase::Streaming { silent_at: ref mut at, .. } => *at = silent_at,
             Phase::Following => {}
@@ -210,7 +214,14 @@ impl Dialogue {
 
     /// Whether a running stream has the beams asked for; a sensor that refused them is taken as it is.
     fn is_wanted(&self, measured: Measured<'_>) -> bool {
-        self.trouble == Some(Trouble::VariantRefused) || measured.count() == self.settings.variant.beams()
+        let same = measured.count() == self.settings.variant.beams();
+        measured.partial().is_none() && (same || self.trouble == Some(Trouble::VariantRefused))
+    }
+
+    /// Time between two telegrams of the variant asked for.
+    fn period(&self) -> Nanos {
+        let Settings { variant, baud, .. } = self.settings;
+        variant.period(2 * variant.beams() + BESIDE_VALUES, baud.rate())
     }
 
     fn on_reply(&mut self, request: Request, reply: Option<Reply<'_>>, now: Nanos) {
@@ -226,7 +237,7 @@ impl Dialogue {
                 self.start(Step::Stop, now + SETTLE);
             }
             (Phase::Starting { step }, _) => {
-                if matches!(reply, Some(Reply::Variant { done: false, .. })) {
+                if step == Step::Variant && !matches!(reply, Some(Reply::Variant { done: true, .. })) {
                     self.trouble = Some(Trouble::VariantRefused);
                 }
                 let failed = matches!(reply, Some(Reply::Refused | Reply::Mode { done: false }));
@@ -269,7 +280,11 @@ impl Dialogue {
                 }
                 self.probe(at, attempt + 1);
             }
-            // Some sensors do not answer these right after a reset: the stream matters more.
+            // Some sensors do not have it, some do not answer these right after a reset: the stream matters more.
+            Phase::Starting { step: Step::Variant } => {
+                self.trouble = Some(Trouble::VariantRefused);
+                self.start(Step::Type, at);
+            }
             Phase::Starting { step: Step::Type } => self.start(Step::Configuration, at),
             Phase::Starting { step: Step::Configuration } => self.start(Step::Stream, at),
             Phase::Streaming { .. } => self.question(at),
@@ -280,13 +295,20 @@ impl Dialogue {
         }
     }
 
-    fn listen(&mut self, now: Nanos) {
+    fn listen(&mut self, now: Nanos, shown: State) {
         self.open = None;
-        self.phase = Phase::Listening { give_up_at: now + LISTEN, shown: State::Silent };
+        self.phase = Phase::Listening { give_up_at: now + LISTEN.max(2 * self.period()), shown };
+    }
+
+    /// Until when measured data may stay out: the paper's second, and on a slow line two telegrams' worth.
+    fn silent_at(&self, now: Nanos) -> Nanos {
+        now + SILENCE.max(5 * self.period() / 2)
     }
 
     fn probe(&mut self, now: Nanos, attempt: usize) {
         self.phase = Phase::Probing { attempt };
+        // Who answers next may be another sensor: address 0 is for all.
+        self.sensor.address = None;
         let wanted = self.settings.baud;
         let mut others = Baud::ALL.into_iter().filter(|&baud| baud != wanted);
         let turn = attempt % Baud::ALL.len();
@@ -319,7 +341,7 @@ impl Dialogue {
 
     /// The sensor said that it streams: the first telegram is due like one that went missing.
     fn await_stream(&mut self, now: Nanos) {
-        self.phase = Phase::Listening { give_up_at: now + SILENCE, shown: State::Starting };
+        self.phase = Phase::Listening { give_up_at: self.silent_at(now), shown: State::Starting };
     }
 
     fn stream(&mut self, telegram: Telegram<'_>, now: Nanos) {
@@ -327,7 +349,7 @@ impl Dialogue {
             self.sensor.streams = true;
             self.trouble = self.trouble.filter(|&trouble| trouble == Trouble::VariantRefused);
             self.open = None;
-            self.phase = Phase::Streaming { header, silent_at: now + SILENCE, questions: QUESTIONS };
+            self.phase = Phase::Streaming { header, silent_at: self.silent_at(now), questions: QUESTIONS };
             self.question(now);
         }
     }
@@ -335,12 +357,18 @@ impl Dialogue {
     /// Asks an adopted sensor for what its stream does not tell. Each reply costs the scan that it interrupts.
     fn question(&mut self, now: Nanos) {
         let Phase::Streaming { questions, .. } = &mut self.phase else { return };
-        let Some(left) = questions.checked_sub(1) else { return };
-        *questions = left;
+        while let Some((&question, rest)) = questions.split_first() {
+            *questions = rest;
+            let is_known = match question {
+                Request::Type => !self.sensor.kind().is_empty(),
+                _ => self.sensor.mode.is_some(),
+            };
+            if !is_known {
+                return self.ask(question, now, TRIES);
+            }
+        }
         if self.sensor.mode.is_none() {
-            self.ask(Request::Status, now, TRIES);
-        } else if self.sensor.kind().is_empty() {
-            self.ask(Request::Type, now, TRIES);
+            self.trouble = Some(Trouble::ModeUnknown);
         }
     }
 
@@ -357,7 +385,7 @@ impl Dialogue {
     }
 }
 
-/// Two scans of the slowest variant, and some.
+/// Two scans of the slowest variant, and some; longer where the line is slower than the scans.
 const LISTEN: Nanos = 120 * MILLIS;
 /// Without measured data for so long, the session begins again (paper: resynchronise after one second).
 const SILENCE: Nanos = 1_000 * MILLIS;
@@ -367,5 +395,7 @@ const SETTLE: Nanos = 20 * MILLIS;
 const PAUSE: Nanos = 500 * MILLIS;
 /// A sensor may overlook a request while its mirror turns; three tries are what all drivers give it.
 const TRIES: u8 = 3;
-/// Status and type, and each once more.
-const QUESTIONS: u8 = 4;
+/// What a stream does not tell: how values are split, from the one reply or the other, and who sends them.
+const QUESTIONS: &[Request] = &[Request::Status, Request::Configuration, Request::Type];
+/// STX to count word, status and checksum: bytes of a telegram beside its values.
+const BESIDE_VALUES: usize = 10;

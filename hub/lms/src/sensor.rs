@@ -34,6 +34,8 @@ pub enum Trouble {
     VariantRefused,
     /// One second without measured data.
     Silence,
+    /// The sensor does not tell its measuring mode, so nobody knows where a range ends in its 16 bits.
+    ModeUnknown,
 }
 
 impl fmt::Display for Trouble {
@@ -45,6 +47,7 @@ impl fmt::Display for Trouble {
             Trouble::Unanswered(request) => write!(f, "no reply to {request:?} in three tries"),
             Trouble::Refused(request) => write!(f, "the sensor refused {request:?}"),
             Trouble::VariantRefused => f.write_str("the sensor keeps its own angle and resolution"),
+            Trouble::ModeUnknown => f.write_str("the sensor does not tell its measuring mode: no scans"),
             Trouble::Silence => f.write_str("no measured data for one second"),
         }
     }

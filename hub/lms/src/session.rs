@@ -59,21 +59,10 @@ pub struct Received<'a> {
     pub last: Nanos,
     /// Whether `first` is an estimate from bytes that came in one read.
     pub estimated: bool,
-    /// Whether its values can be read, if it is measured data.
-    pub values: Values,
+    /// How measured values are split; `None` while the sensor has not told it.
+    pub mode: Option<Mode>,
     /// Why it is suspect, bits of [`suspect`]; 0 is clean.
     pub reasons: u8,
-}
-
-/// Whether it is known how a measured value is split into range and upper bits.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Values {
-    /// As this mode has it.
-    Known(Mode),
-    /// The sensor was asked, its answer is on the way.
-    Asked,
-    /// The sensor does not say.
-    Unknown,
 }
 
 /// A byte that may leave within so long is asked for at once; a later one is waited for as for anything else.
@@ -243,11 +232,7 @@ impl Session {
             first: first.at,
             last,
             estimated: first.estimated,
-            values: match self.dialogue.sensor.mode {
-                Some(mode) => Values::Known(mode),
-                None if self.dialogue.awaits_acknowledge() => Values::Asked,
-                None => Values::Unknown,
-            },
+            mode: self.dialogue.sensor.mode,
             reasons: framed.reasons | if slow { suspect::SLOW } else { 0 },
         }
     }
