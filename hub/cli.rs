@@ -78,6 +78,9 @@ pub(crate) struct Run {
     /// TOML file, read after those in /etc/scanhub
     #[arg(long, env = "SCANHUB_CONFIG", value_name = "FILE")]
     pub(crate) config: Option<PathBuf>,
+    /// Do not read /etc/scanhub
+    #[arg(long)]
+    pub(crate) no_system_config: bool,
     /// A link with its defaults; PORT is a tty or file:PATH[?rate=max]
     #[arg(long, value_name = "NAME=PORT")]
     pub(crate) link: Vec<String>,

@@ -5,12 +5,15 @@ mod account;
 mod process;
 mod view;
 
+use std::fs::{File, OpenOptions};
 use std::io::{self, IsTerminal, Write};
+use std::os::unix::fs::OpenOptionsExt;
 use std::path::PathBuf;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::mpsc::{self, RecvTimeoutError};
 use std::time::{Duration, Instant};
 
+use rustix::fs::{CWD, FileType, Mode, OFlags, mknodat};
 use schema::{Domain, Environment, Failure, Kind};
 use serde_json::Value;
 
@@ -33,13 +36,13 @@ pub(crate) struct DemoOptions {
 /// Runs until `run_for` is over or `stop` is set, then prints a summary per sensor.
 ///
 /// [`Kind::Check`] if a telegram that a sensor sent did not arrive, [`Kind::Interrupted`] if a bounded run was stopped,
-/// [`Kind::Timeout`] if no sensor streams within ten seconds, [`Kind::Failed`] if a process ends early.
+/// [`Kind::Timeout`] if a sensor does not stream within ten seconds, [`Kind::Failed`] if a process ends early.
 pub(crate) fn demo(options: &DemoOptions, out: &mut dyn Write, stop: &AtomicBool) -> Result<(), Failure> {
     let stage = Stage::new()?;
     let (lines, received) = mpsc::channel();
     let hub = stage.start_hub(lines.clone())?;
     let consumers = stage.start_consumers(&lines)?;
-    let mut account = Account::new(SENSORS.map(String::from).to_vec(), stage.truth());
+    let mut account = Account::new(SENSORS.map(String::from).to_vec(), stage.open_truth()?);
     // The sensors come last: whoever listens from the beginning can tell whether something was lost.
     let mut simulator = None;
     let mut ready = 0;
@@ -59,10 +62,10 @@ pub(crate) fn demo(options: &DemoOptions, out: &mut dyn Write, stop: &AtomicBool
                         simulator = Some(stage.start_simulator(options.seed, lines.clone())?);
                     }
                 }
-                if value["class"] == "scan" {
+                account.take(of, &value);
+                if account.all_stream() {
                     first_sample.get_or_insert_with(Instant::now);
                 }
-                account.take(of, &value);
             }
             Ok(Line::Ended { of }) => return Err(ended(of)),
             Err(RecvTimeoutError::Timeout | RecvTimeoutError::Disconnected) => {}
@@ -79,7 +82,7 @@ pub(crate) fn demo(options: &DemoOptions, out: &mut dyn Write, stop: &AtomicBool
         if first_sample.is_none() && begun.elapsed() > START_LIMIT {
             return Err(Failure::new(
                 Kind::Timeout,
-                "no sensor streams after ten seconds",
+                "not every sensor streams after ten seconds",
                 "run with SCANHUB_LOG=debug to see what the hub says",
             ));
         }
@@ -131,14 +134,28 @@ impl Stage {
         self.directory.join("truth")
     }
 
+    /// The reading end of what the simulator will tell: a pipe, because a demonstration may run for days.
+    fn open_truth(&self) -> Result<File, Failure> {
+        let open = || -> io::Result<File> {
+            mknodat(CWD, self.truth(), FileType::Fifo, Mode::RUSR | Mode::WUSR, 0)?;
+            OpenOptions::new().read(true).custom_flags(OFlags::NONBLOCK.bits() as i32).open(self.truth())
+        };
+        open().map_err(|error| {
+            Failure::new(Kind::Failed, format!("cannot make a pipe {}: {error}", self.truth().display()), "")
+        })
+    }
+
     fn port(&self, sensor: &str) -> String {
         self.directory.join(sensor).display().to_string()
     }
 
     fn start_hub(&self, lines: mpsc::Sender<Line>) -> Result<Child, Failure> {
         let links: Vec<_> = SENSORS.iter().flat_map(|sensor| ["--link".into(), self.link(sensor)]).collect();
-        let hub =
-            Child::start(&[&["run".into(), "--json".into()], &links[..]].concat(), self.domain.name(), None)?;
+        let hub = Child::start(
+            &[&["run".into(), "--json".into(), "--no-system-config".into()], &links[..]].concat(),
+            self.domain.name(),
+            None,
+        )?;
         hub.await_ready(HUB, lines)
     }
 

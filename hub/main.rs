@@ -104,7 +104,7 @@ fn dispatch(cli: &Cli) -> Result<(), Failure> {
 }
 
 fn run_hub(run: &cli::Run, everywhere: &Everywhere) -> Result<(), Failure> {
-    let mut files = Sources::system();
+    let mut files = if run.no_system_config { Vec::new() } else { Sources::system() };
     files.extend(run.config.clone());
     let config = Config::load(&Sources { files, set: run.set.clone(), links: run.link.clone() })?;
     let domain = everywhere.hub_domain()?;
@@ -202,7 +202,7 @@ fn report(failure: &Failure, json: bool, quiet: bool) {
 /// The command line cannot be understood, or asks for help only.
 fn refuse(error: &clap::Error) -> ExitCode {
     let wants_text = matches!(error.kind(), ErrorKind::DisplayHelp | ErrorKind::DisplayVersion);
-    if !wants_text && std::env::args().any(|word| word == "--json") {
+    if !wants_text && std::env::args_os().any(|word| word == "--json") {
         let text = error.to_string();
         let message = text.lines().next().unwrap_or_default().trim_start_matches("error: ");
         report(&Failure::new(Kind::Usage, message, "scanhub --help"), true, false);

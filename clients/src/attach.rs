@@ -46,7 +46,8 @@ impl<P: Payload + ?Sized> Attachment<P> {
     /// is another user's or the topic has another layout.
     #[allow(clippy::should_implement_trait)] // An iterator would have to hold samples over waits.
     pub fn next(&mut self) -> Result<Option<Received<P>>, Failure> {
-        let until = self.timeout.map(|timeout| Instant::now() + timeout);
+        // A timeout beyond all time is none.
+        let until = self.timeout.and_then(|timeout| Instant::now().checked_add(timeout));
         loop {
             if let Some(received) = self.try_next()? {
                 return Ok(Some(received));

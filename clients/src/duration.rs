@@ -19,8 +19,14 @@ pub fn parse(text: &str) -> Result<Duration, String> {
         "h" => 3600.0,
         _ => return Err(wrong()),
     };
-    Duration::try_from_secs_f64(number * seconds).map_err(|_| wrong())
+    match Duration::try_from_secs_f64(number * seconds) {
+        Ok(duration) if duration <= LONGEST => Ok(duration),
+        _ => Err(format!("{text:?} is too long: a year, 8760h, at most")),
+    }
 }
+
+/// Longer than anybody waits, and short enough to be added to any time.
+const LONGEST: Duration = Duration::from_secs(365 * 24 * 3600);
 
 #[cfg(test)]
 mod tests {
@@ -33,7 +39,9 @@ mod tests {
         assert_eq!(parse("5m"), Ok(Duration::from_secs(300)));
         assert_eq!(parse("1.5s"), Ok(Duration::from_millis(1500)));
         assert_eq!(parse("0s"), Ok(Duration::ZERO));
-        for bad in ["", "10", "s", "-1s", "1d", "1 s", "1e3s", "infs", "1s1ms", "99999999999999999999h"] {
+        for bad in
+            ["", "10", "s", "-1s", "1d", "1 s", "1e3s", "infs", "1s1ms", "99999999999999999999h", "8761h"]
+        {
             assert!(parse(bad).is_err(), "{bad}");
         }
     }

@@ -134,7 +134,7 @@ impl<'a> Run<'a> {
             if stop.load(Ordering::Relaxed) {
                 return self.stopped();
             }
-            if self.bounds.run_for.is_some_and(|limit| now >= self.started + limit) {
+            if self.bounds.run_for.is_some_and(|limit| now - self.started >= limit) {
                 return self.time_is_over();
             }
             self.session.wait(self.wake_at())?;
@@ -191,7 +191,7 @@ impl<'a> Run<'a> {
             }
             let now = Instant::now();
             sink.tick(now)?;
-            more &= self.bounds.run_for.is_none_or(|limit| now < self.started + limit);
+            more &= self.bounds.run_for.is_none_or(|limit| now - self.started < limit);
         }
         Ok(self.bounds.count == Some(0))
     }
@@ -263,8 +263,8 @@ impl<'a> Run<'a> {
     }
 
     fn wake_at(&self) -> Option<Instant> {
-        let end = self.bounds.run_for.map(|limit| self.started + limit);
-        let silence = self.bounds.timeout.map(|limit| self.last_sample + limit);
+        let end = self.bounds.run_for.and_then(|limit| self.started.checked_add(limit));
+        let silence = self.bounds.timeout.and_then(|limit| self.last_sample.checked_add(limit));
         [end, silence].into_iter().flatten().min()
     }
 

@@ -3,8 +3,7 @@
 
 use std::collections::HashMap;
 use std::fs::File;
-use std::io::{Read, Seek, SeekFrom, Write};
-use std::path::PathBuf;
+use std::io::{Read, Write};
 use std::time::Instant;
 
 use serde::Serialize;
@@ -14,8 +13,10 @@ use sha2::{Digest, Sha256};
 /// The account of all sensors.
 pub(crate) struct Account {
     pub(crate) sensors: Vec<Sensor>,
-    truth: PathBuf,
-    read: u64,
+    /// What the simulator says, line by line; reading never waits.
+    truth: File,
+    /// The beginning of a line.
+    unfinished: Vec<u8>,
     /// Telegrams whose last byte left after this moment do not count.
     cut_ns: u64,
     hub: Option<Work>,
@@ -29,9 +30,12 @@ pub(crate) struct Sensor {
     pub(crate) name: String,
     pub(crate) state: String,
     pub(crate) baud: u64,
-    /// Hash of each telegram of measured data that was sent whole, with the time of its last byte.
-    sent: Vec<(String, u64)>,
-    received: HashMap<String, u64>,
+    /// Telegrams of measured data that were sent whole before the cut.
+    pub(crate) sent: u64,
+    /// Hash of each that was sent and has not arrived.
+    missing: HashMap<String, u64>,
+    /// Hash of each that arrived before the simulator said that it was sent.
+    early: HashMap<String, u64>,
     pub(crate) received_count: u64,
     /// Ranges of the last scan, in mm; none where there is no reading.
     pub(crate) ranges: Vec<Option<u64>>,
@@ -66,13 +70,12 @@ struct Summary<'a> {
 }
 
 impl Account {
-    pub(crate) fn new(names: Vec<String>, truth: PathBuf) -> Self {
+    pub(crate) fn new(names: Vec<String>, truth: File) -> Self {
         let sensors =
             names.into_iter().map(|name| Sensor { name, state: "absent".into(), ..Sensor::default() });
         Account {
             sensors: sensors.collect(),
             truth,
-            read: 0,
             cut_ns: u64::MAX,
             hub: None,
             hub_cpu_percent: 0.0,
@@ -93,20 +96,20 @@ impl Account {
         }
     }
 
+    /// Whether every sensor has sent a scan.
+    pub(crate) fn all_stream(&self) -> bool {
+        self.sensors.iter().all(|sensor| !sensor.ranges.is_empty())
+    }
+
     /// Reads what the simulator wrote since the last time.
     pub(crate) fn read_truth(&mut self) {
-        let mut text = String::new();
-        let read = File::open(&self.truth).and_then(|mut file| {
-            file.seek(SeekFrom::Start(self.read))?;
-            file.read_to_string(&mut text)
-        });
-        if read.is_err() {
-            return;
-        }
-        let whole = text.rfind('\n').map_or(0, |end| end + 1);
-        self.read += whole as u64;
-        for line in text[..whole].lines() {
-            let value: Value = serde_json::from_str(line).unwrap_or_default();
+        // Ends with an error where there is nothing more to read now; what was read before it is kept.
+        let _ = self.truth.read_to_end(&mut self.unfinished);
+        let whole = self.unfinished.iter().rposition(|&byte| byte == b'\n').map_or(0, |end| end + 1);
+        let rest = self.unfinished.split_off(whole);
+        let lines = std::mem::replace(&mut self.unfinished, rest);
+        for line in lines.split(|&byte| byte == b'\n').filter(|line| !line.is_empty()) {
+            let value: Value = serde_json::from_slice(line).unwrap_or_default();
             let of = self.sensors.iter_mut().find(|sensor| {
                 value["port"]
                     .as_str()
@@ -116,8 +119,10 @@ impl Account {
             if value["class"] == "simulated" {
                 sensor.eeprom_writes = value["eeprom_writes"].as_u64().unwrap_or(u64::MAX);
             } else if value["kind"] == "data" && value["fault"].is_null() {
-                let hash = value["sha256"].as_str().unwrap_or_default().to_owned();
-                sensor.sent.push((hash, value["sent_ns"].as_u64().unwrap_or_default()));
+                let sent_ns = value["sent_ns"].as_u64().unwrap_or_default();
+                if sent_ns <= self.cut_ns {
+                    sensor.take_sent(value["sha256"].as_str().unwrap_or_default());
+                }
             }
         }
     }
@@ -138,14 +143,14 @@ impl Account {
         }
         if let Some(begin) = self.hub {
             let span = now.since.duration_since(begin.since).as_nanos().max(1);
-            self.hub_cpu_percent = 100.0 * (now.used_ns - begin.used_ns) as f64 / span as f64;
+            self.hub_cpu_percent = 100.0 * now.used_ns.saturating_sub(begin.used_ns) as f64 / span as f64;
         }
     }
 
     /// Prints a line per sensor; returns how many telegrams were lost in all.
     pub(crate) fn summary(&self, out: &mut dyn Write, json: bool) -> u64 {
         for sensor in &self.sensors {
-            let (sent, lost) = sensor.sent_and_lost(self.cut_ns);
+            let (sent, lost) = (sensor.sent, sensor.lost());
             let summary = Summary {
                 class: "summary",
                 sensor: &sensor.name,
@@ -177,23 +182,21 @@ impl Account {
             };
             let _ = out.write_all(format!("{line}\n").as_bytes());
         }
-        self.sensors.iter().map(|sensor| sensor.sent_and_lost(self.cut_ns).1).sum()
+        self.sensors.iter().map(Sensor::lost).sum()
     }
 }
 
 impl Sensor {
-    /// Telegrams sent whole before the cut, and how many of them did not arrive.
-    pub(crate) fn sent_and_lost(&self, cut_ns: u64) -> (u64, u64) {
-        let mut received = self.received.clone();
-        let (mut sent, mut lost) = (0, 0);
-        for (hash, _) in self.sent.iter().filter(|(_, at)| *at <= cut_ns) {
-            sent += 1;
-            match received.get_mut(hash) {
-                Some(count) if *count > 0 => *count -= 1,
-                _ => lost += 1,
-            }
+    /// Telegrams sent and not arrived, or not yet.
+    pub(crate) fn lost(&self) -> u64 {
+        self.missing.values().sum()
+    }
+
+    fn take_sent(&mut self, hash: &str) {
+        self.sent += 1;
+        if !take(&mut self.early, hash) {
+            *self.missing.entry(hash.to_owned()).or_default() += 1;
         }
-        (sent, lost)
     }
 
     /// Telegrams per second from the first to the last.
@@ -210,8 +213,10 @@ impl Sensor {
             return;
         }
         let bytes = from_hex(line["data"].as_str().unwrap_or_default());
-        let hash = Sha256::digest(&bytes).iter().map(|byte| format!("{byte:02x}")).collect();
-        *self.received.entry(hash).or_default() += 1;
+        let hash: String = Sha256::digest(&bytes).iter().map(|byte| format!("{byte:02x}")).collect();
+        if !take(&mut self.missing, &hash) {
+            *self.early.entry(hash).or_default() += 1;
+        }
         self.received_count += 1;
         self.last_ns = line["stamp_ns"].as_u64().unwrap_or_default();
         if self.first_ns == 0 {
@@ -230,6 +235,16 @@ impl Sensor {
         self.nearest_deg =
             nearest.map_or(0.0, |(_, i)| angle("first_angle_deg") + i as f64 * angle("step_deg"));
     }
+}
+
+/// Takes one of `hash` out of `pile`, if it is there.
+fn take(pile: &mut HashMap<String, u64>, hash: &str) -> bool {
+    let Some(count) = pile.get_mut(hash) else { return false };
+    *count -= 1;
+    if *count == 0 {
+        pile.remove(hash);
+    }
+    true
 }
 
 fn from_hex(text: &str) -> Vec<u8> {

@@ -65,9 +65,8 @@ impl View {
 }
 
 fn sensor_lines(sensor: &Sensor) -> [String; 3] {
-    let (sent, lost) = sensor.sent_and_lost(u64::MAX);
     // What is on its way is not lost: the truth is a little ahead of the consumers.
-    let late = sent.saturating_sub(sensor.received_count).min(IN_FLIGHT);
+    let lost = sensor.lost().saturating_sub(IN_FLIGHT);
     let nearest = match sensor.nearest_mm {
         Some(mm) => format!("nearest {:.2} m at {:.1} degrees", mm as f64 / 1000.0, sensor.nearest_deg),
         None => "nothing seen".to_owned(),
@@ -80,7 +79,7 @@ fn sensor_lines(sensor: &Sensor) -> [String; 3] {
             sensor.baud,
             sensor.hz(),
             sensor.received_count,
-            lost - late.min(lost),
+            lost,
         ),
         format!("  left  {}  right", profile(sensor)),
         format!("        {:<COLUMNS$}", "(the taller, the nearer)"),

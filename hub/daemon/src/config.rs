@@ -3,7 +3,7 @@
 use std::path::{Path, PathBuf};
 
 use lms::variant::{Baud, Unit, Variant};
-use schema::Failure;
+use schema::{Failure, Kind};
 
 use crate::layer::{Draft, merge, parse, quoted, setting};
 use crate::origin::Origin;
@@ -55,6 +55,9 @@ impl Source {
     }
 
     pub(crate) fn parse(text: &str) -> Result<Source, &'static str> {
+        if text.starts_with("tcp:") {
+            return Err("serial servers (tcp:) are not supported");
+        }
         let Some(file) = text.strip_prefix("file:") else {
             return if text.is_empty() { Err("the port is empty") } else { Ok(Source::Tty(text.into())) };
         };
@@ -131,10 +134,17 @@ impl Config {
             })?;
             merge(&mut links, parse(&origin, &text)?, &origin, false)?;
         }
+        if links.len() > MAX_LINKS {
+            let message = format!("{} links: a sample names its sensor in one byte", links.len());
+            return Err(Failure::new(Kind::Configuration, message, format!("{MAX_LINKS} links for one hub")));
+        }
         let links = links.into_iter().map(Draft::finish).collect::<Result<_, _>>()?;
         Ok(Config { links })
     }
 }
+
+/// Links of one hub.
+const MAX_LINKS: usize = 256;
 
 /// What a hub without any link in its configuration does.
 const DEFAULT: &str = r#"
@@ -150,7 +160,6 @@ port = "/dev/ttyUSB1"
 #[cfg(test)]
 mod tests {
     use super::*;
-    use schema::Kind;
 
     fn sources(set: &[&str], links: &[&str]) -> Sources {
         let owned = |flags: &[&str]| flags.iter().map(|flag| (*flag).to_owned()).collect();
@@ -197,6 +206,7 @@ mod tests {
         assert!(refusal(&[], &["front"]).contains("--link front: no = in it"));
         assert!(refusal(&[], &["Front=/dev/x"]).contains("sensor name \"Front\" is not possible"));
         assert!(refusal(&[], &["front=file:x?rate=2"]).contains("rate=max"));
+        assert!(refusal(&[], &["front=tcp:box:4001"]).contains("not supported"));
     }
 
     #[test]

@@ -5,6 +5,7 @@ use std::io;
 use std::os::fd::OwnedFd;
 use std::path::Path;
 
+use lms::framer::suspect;
 use lms::reply::Reply;
 use lms::session::{Output, Received};
 use lms::variant::{Mode, Unit, Variant};
@@ -171,22 +172,21 @@ impl<'a> LinkThread<'a> {
     /// Publishes a telegram and, if it is measured data that can be read, its scan. `fallback` is the mode of a sensor
     /// that cannot be asked.
     pub(crate) fn publish(&mut self, received: &Received<'_>, fallback: Option<Mode>) {
-        let reply = Reply::decode(received.telegram);
-        let measured = match reply {
+        let measured = match Reply::decode(received.telegram) {
             Some(Reply::Measured(measured)) => Some(measured),
             _ => None,
         };
+        let mode = received.mode.or(fallback);
+        let forbidden =
+            measured.zip(mode).is_some_and(|(measured, mode)| scanner::is_forbidden(&measured, mode));
+        let reasons = received.reasons | if forbidden { suspect::FORBIDDEN_BITS } else { 0 };
+        self.account.suspect += u64::from(reasons != 0);
         let variant = measured.and_then(|measured| Variant::of_beams(measured.count()));
-        self.topics.telegram(received, scanner::period_us(variant, self.link.baud.rate()));
-        self.account.suspect += u64::from(received.reasons != 0);
-        let Some(measured) = measured else { return };
+        self.topics.telegram(received, reasons, scanner::period_us(variant, self.link.baud.rate()));
         // Better no range than a wrong one.
-        let Some(mode) = received.mode.or(fallback) else { return };
+        let (Some(measured), Some(mode)) = (measured, mode) else { return };
         self.account.scans += 1;
-        self.topics.scan(received.reasons, |scan| {
-            let forbidden = scanner::decode(&measured, mode, scan);
-            if forbidden { lms::framer::suspect::FORBIDDEN_BITS } else { 0 }
-        });
+        self.topics.scan(|scan| scanner::decode(&measured, mode, scan));
     }
 
     /// Wakes the consumers.

@@ -1,5 +1,5 @@
-//! A link whose other end is a recording: its bytes take the way that a line's bytes take, at the pace of the scans or
-//! as fast as they can be read. Nobody hears what the hub would say, so nothing is asked.
+//! A link whose other end is a recording: its bytes take the way that a line's bytes take, at the pace of its stamps,
+//! else of the scans, or as fast as they can be read. Nobody hears what the hub would say, so nothing is asked.
 
 use std::io::{self, Read};
 use std::path::Path;
@@ -18,9 +18,20 @@ use crate::scanner;
 
 /// A recording as a line's bytes.
 pub(crate) struct Recorded {
-    bytes: Box<dyn Read + Send>,
+    bytes: Bytes,
     /// How its values are split; one that does not say so is read as ranges of 13 bits.
     mode: Mode,
+}
+
+enum Bytes {
+    /// As they came down a line, without stamps.
+    Stream(Box<dyn Read + Send>),
+    /// Telegram by telegram, with stamps where the recording has them.
+    Frames {
+        frames: Box<dyn Iterator<Item = Frame> + Send>,
+        /// Of the telegram that was begun.
+        rest: Vec<u8>,
+    },
 }
 
 impl Recorded {
@@ -32,27 +43,57 @@ impl Recorded {
         let mode = recording.contents().mode.unwrap_or(Mode(0));
         let encoding = Encoding { unit: link.unit.unwrap_or(Unit::Mm), mode };
         let bytes = match recording.contents().form {
-            Form::Telegrams => recording.bytes()?,
-            Form::Carmen => Box::new(Telegrams { frames: recording.telegrams(encoding)?, rest: Vec::new() }),
+            Form::Telegrams => Bytes::Stream(recording.bytes()?),
+            Form::Carmen => Bytes::Frames { frames: recording.telegrams(encoding)?, rest: Vec::new() },
         };
         Ok(Recorded { bytes, mode })
+    }
+
+    /// Writes the next bytes into `room`: how many, none at the end, and the stamp of a telegram that begins with them,
+    /// if it has one.
+    fn read(&mut self, room: &mut [u8]) -> (usize, Option<u64>) {
+        match &mut self.bytes {
+            Bytes::Stream(stream) => loop {
+                let piece = room.len().min(PIECE);
+                match stream.read(&mut room[..piece]) {
+                    Err(error) if error.kind() == io::ErrorKind::Interrupted => {}
+                    Err(error) => {
+                        tracing::warn!(%error, "the recording became unreadable");
+                        return (0, None);
+                    }
+                    Ok(len) => return (len, None),
+                }
+            },
+            Bytes::Frames { frames, rest } => {
+                let mut stamp = None;
+                if rest.is_empty()
+                    && let Some(frame) = frames.next()
+                {
+                    (*rest, stamp) = (frame.telegram, frame.wall_ns);
+                }
+                let len = rest.len().min(room.len());
+                room[..len].copy_from_slice(&rest[..len]);
+                rest.drain(..len);
+                (len, stamp)
+            }
+        }
     }
 }
 
 /// Plays `recorded` through `session` into the topics of `link`, then stays silent until the hub ends.
 pub(crate) fn play(link: &mut LinkThread<'_>, session: &mut Session, mut recorded: Recorded, paced: bool) {
     let mut due = clock::now();
+    let mut last_stamp = None;
     loop {
-        let spare = session.spare();
-        let room = spare.len().min(PIECE);
-        let len = match recorded.bytes.read(&mut spare[..room]) {
-            Err(error) if error.kind() == io::ErrorKind::Interrupted => continue,
-            Err(error) => {
-                tracing::warn!(%error, "the recording became unreadable");
-                0
-            }
-            Ok(len) => len,
-        };
+        let (len, stamp) = recorded.read(session.spare());
+        if let Some(stamp) = stamp {
+            due += stamp.saturating_sub(last_stamp.unwrap_or(stamp)).min(LONGEST_GAP);
+            last_stamp = Some(stamp);
+        }
+        // Also where nothing is waited for, the hub's end is looked for.
+        if link.wait(None, if paced { due } else { 0 }) == Woken::Stop {
+            return;
+        }
         let now = clock::now();
         session.commit(now, len);
         if len == 0 {
@@ -63,7 +104,7 @@ pub(crate) fn play(link: &mut LinkThread<'_>, session: &mut Session, mut recorde
             let is_scan = received.telegram.command() == MEASURED;
             link.publish(&received, Some(recorded.mode));
             link.wake(Wake::Telegram);
-            if is_scan && paced {
+            if is_scan && paced && last_stamp.is_none() {
                 due += period(session);
                 if link.wait(None, due) == Woken::Stop {
                     return;
@@ -73,9 +114,6 @@ pub(crate) fn play(link: &mut LinkThread<'_>, session: &mut Session, mut recorde
         link.show(Some(session), State::Streaming, "");
         if len == 0 {
             break;
-        }
-        if !paced && link.wait(None, 0) == Woken::Stop {
-            return;
         }
     }
     while link.wait(None, clock::now() + IDLE) != Woken::Stop {
@@ -88,25 +126,9 @@ fn period(session: &Session) -> Nanos {
     Nanos::from(scanner::period_us(variant, Baud::B500000.rate())) * 1000
 }
 
-/// Frames one behind the other.
-struct Telegrams {
-    frames: Box<dyn Iterator<Item = Frame> + Send>,
-    rest: Vec<u8>,
-}
-
-impl Read for Telegrams {
-    fn read(&mut self, buffer: &mut [u8]) -> io::Result<usize> {
-        if self.rest.is_empty() {
-            self.rest = self.frames.next().map_or(Vec::new(), |frame| frame.telegram);
-        }
-        let len = self.rest.len().min(buffer.len());
-        buffer[..len].copy_from_slice(&self.rest[..len]);
-        self.rest.drain(..len);
-        Ok(len)
-    }
-}
-
-/// Bytes given to the session at a time: less than a telegram, so that stamps stay near.
+/// Bytes of a stream given to the session at a time: less than a telegram, so that stamps stay near.
 const PIECE: usize = 128;
 /// Between two statuses of a recording that is at its end.
 const IDLE: Nanos = 100 * lms::MILLIS;
+/// A recording that was interrupted does not keep its listeners waiting for longer.
+const LONGEST_GAP: Nanos = 10_000 * lms::MILLIS;

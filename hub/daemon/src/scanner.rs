@@ -6,11 +6,10 @@ use lms::measured::Measured;
 use lms::variant::{MAX_BEAMS, MIRROR_TURN, Mode, Variant};
 use schema::{BEAMS, CONTENTS_UPPER, Reasons, Scan};
 
-/// Writes `measured` into `scan`, every byte of it, with its values split as `mode` says. Returns whether bits were
-/// set that the mode forbids.
+/// Writes `measured` into `scan`, every byte of it, with its values split as `mode` says.
 ///
 /// Beams come as the sensor sends them: counter-clockwise seen from above, the first one right.
-pub fn decode(measured: &Measured<'_>, mode: Mode, scan: &mut Scan) -> bool {
+pub fn decode(measured: &Measured<'_>, mode: Mode, scan: &mut Scan) {
     let count = measured.count();
     let variant = Variant::of_beams(count);
     let mask = mode.max_value();
@@ -27,17 +26,19 @@ pub fn decode(measured: &Measured<'_>, mode: Mode, scan: &mut Scan) -> bool {
     scan.intensity_bits = mode.intensity_bits();
     scan.contents = CONTENTS_UPPER;
     scan.pad = [0];
-    let mut seen = 0;
     let (ranges, unused_ranges) = scan.range_array.split_at_mut(count);
     let (upper, unused_upper) = scan.upper_array.split_at_mut(count);
     for ((range, upper), word) in ranges.iter_mut().zip(upper).zip(measured.words()) {
         *range = word & mask;
         *upper = (word >> bits) as u8;
-        seen |= word;
     }
     unused_ranges.fill(0);
     unused_upper.fill(0);
-    seen & mode.forbidden() != 0
+}
+
+/// Whether a value of `measured` has bits set that `mode` never sets.
+pub(crate) fn is_forbidden(measured: &Measured<'_>, mode: Mode) -> bool {
+    mode.forbidden() != 0 && measured.words().any(|word| word & mode.forbidden() != 0)
 }
 
 /// Nominal time between two scans of `variant` at `baud`, in microseconds; 0 if the variant is not known.
@@ -67,7 +68,7 @@ mod tests {
         let encoded = lms::measured::encode(0, Unit::Cm, &words, 0x10);
         let measured = Measured::decode(encoded.telegram()).unwrap();
         let mut scan = Scan { range_array: [7; BEAMS], upper_array: [7; BEAMS], ..Scan::default() };
-        assert!(!decode(&measured, Mode(1), &mut scan));
+        decode(&measured, Mode(1), &mut scan);
         assert_eq!((scan.count, scan.unit_mm, scan.range_bits, scan.intensity_bits), (181, 10, 13, 3));
         assert_eq!((scan.first_angle_mdeg, scan.step_mdeg), (0, 1000));
         assert_eq!((scan.ranges()[5], scan.intensities()[5]), (1005, 5));
@@ -75,7 +76,7 @@ mod tests {
         decode(&measured, Mode(4), &mut scan);
         assert_eq!((scan.range_bits, scan.intensity_bits), (14, 0));
         assert_eq!((scan.ranges()[3], scan.upper()[3]), ((3 << 13 | 1003) & 0x3FFF, 1));
-        assert!(decode(&measured, Mode(0x0F), &mut scan));
+        assert!(is_forbidden(&measured, Mode(0x0F)) && !is_forbidden(&measured, Mode(4)));
     }
 
     #[test]

@@ -38,22 +38,26 @@ impl Account {
 
     /// Takes over the state and the trouble of the moment; returns whether either is new.
     pub(crate) fn update(&mut self, state: State, error: &str, now: Nanos) -> bool {
-        let changed = self.status.state != state as u8 || self.status.last_error() != error;
+        let before = (self.status.state, self.status.last_error_text);
         if self.status.state != state as u8 {
             self.status.state = state as u8;
             self.status.since_ns = now;
+            self.status.rate_mhz = 0;
             self.measured_at = None;
         }
         self.status.set_last_error(error);
-        changed
+        before != (self.status.state, self.status.last_error_text)
     }
 
     /// The status with everything that `session`, if there is one, knows.
     pub(crate) fn status(&mut self, session: Option<&Session>, loan_failed: u64, now: Nanos) -> &Status {
         let mut counters = self.past;
-        if let Some(session) = session {
-            add(&mut counters, session);
-            self.describe(session);
+        match session {
+            Some(session) => {
+                add(&mut counters, session);
+                self.describe(session);
+            }
+            None => self.status.baud = 0,
         }
         counters[Counter::Suspect] = self.suspect;
         counters[Counter::Reconnects] = self.reconnects;

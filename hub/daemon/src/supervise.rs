@@ -50,7 +50,13 @@ pub fn run(config: &Config, domain: &Domain, on_ready: impl FnOnce(&Ready)) -> R
                 Err(failure) => drop(report.send(Err(failure))),
             };
             let thread = thread::Builder::new().name(link.name.clone()).spawn_scoped(scope, body);
-            threads.push(thread.map_err(|error| no_resource("a thread", &error))?);
+            match thread {
+                Ok(thread) => threads.push(thread),
+                Err(error) => {
+                    end_links(stop);
+                    return Err(no_resource("a thread", &error));
+                }
+            }
         }
         drop(report);
         let mut outcome = reports.iter().take(config.links.len()).find(Result::is_err).unwrap_or(Ok(()));
@@ -63,7 +69,9 @@ pub fn run(config: &Config, domain: &Domain, on_ready: impl FnOnce(&Ready)) -> R
             outcome = keep_up(&node, &signals, is_alive);
         }
         end_links(&stop);
-        outcome
+        // Joined one by one, a thread that panicked is a failure of this function, not a panic of its own.
+        let ended = threads.into_iter().map(|thread| thread.join()).collect::<Result<Vec<()>, _>>();
+        outcome.and(ended.map(drop).map_err(|_| broken_thread()))
     })
 }
 
@@ -75,11 +83,7 @@ fn keep_up(node: &Node, signals: &UnixStream, is_alive: impl Fn() -> bool) -> Re
             return Ok(());
         }
         if !is_alive() {
-            return Err(Failure::new(
-                Kind::Failed,
-                "a link's thread ended",
-                "this is a bug: please report it",
-            ));
+            return Err(broken_thread());
         }
         node.try_cleanup_dead_nodes();
     }
@@ -99,6 +103,14 @@ fn end_signals() -> Result<UnixStream, Failure> {
 fn end_links(stop: &OwnedFd) {
     // An eventfd that nobody reads takes one write for sure.
     let _ = rustix::io::write(stop, &1u64.to_ne_bytes());
+}
+
+fn broken_thread() -> Failure {
+    Failure::new(
+        Kind::Failed,
+        "a link's thread ended",
+        "this is a bug: please report it with what stands above",
+    )
 }
 
 fn random() -> u64 {

@@ -72,14 +72,17 @@ impl Topics {
     }
 
     /// Publishes the telegram and takes its number and stamps for all that follows from it.
-    pub(crate) fn telegram(&mut self, received: &Received<'_>, period_us: u32) {
+    /// `reasons` are why it is suspect.
+    pub(crate) fn telegram(&mut self, received: &Received<'_>, reasons: u8, period_us: u32) {
         self.header.seq = self.next_seq;
         self.next_seq += 1;
         self.header.stamp_first_ns = received.first;
         self.header.stamp_last_ns = received.last;
         self.header.wall_ns = clock::wall(received.first);
         self.header.period_us = period_us;
-        self.set_quality(received.reasons);
+        let quality = if reasons == 0 { Quality::Clean } else { Quality::Suspect };
+        self.header.quality = quality as u8;
+        self.header.reasons = reasons;
         self.header.flags &= !Flags::STAMP_ESTIMATED;
         self.header.flags |= if received.estimated { Flags::STAMP_ESTIMATED } else { 0 };
         let bytes = received.telegram.bytes();
@@ -96,15 +99,14 @@ impl Topics {
         }
     }
 
-    /// Publishes a scan of the last telegram; `fill` writes it in place and returns more reasons to suspect it.
-    pub(crate) fn scan(&mut self, reasons: u8, fill: impl FnOnce(&mut Scan) -> u8) {
+    /// Publishes a scan of the last telegram, which `fill` writes in place.
+    pub(crate) fn scan(&mut self, fill: impl FnOnce(&mut Scan)) {
         let topic_seq = self.scan.take_number();
         let Ok(mut sample) = self.scan.publisher.loan() else {
             self.loan_failed += 1;
             return;
         };
-        let more = fill(sample.payload_mut());
-        self.set_quality(reasons | more);
+        fill(sample.payload_mut());
         *sample.user_header_mut() = Header { topic_seq, ..self.header };
         match sample.send() {
             Ok(reached) => self.scan.reached = reached,
@@ -154,11 +156,5 @@ impl Topics {
     /// all the same.
     pub(crate) fn unreached(&self) -> usize {
         self.telegram.missed_out().max(self.scan.missed_out()).max(self.status.missed_out())
-    }
-
-    fn set_quality(&mut self, reasons: u8) {
-        let suspect = reasons != 0;
-        self.header.quality = if suspect { Quality::Suspect } else { Quality::Clean } as u8;
-        self.header.reasons = reasons;
     }
 }

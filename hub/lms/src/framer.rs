@@ -192,7 +192,8 @@ impl Framer {
                 self.complete(candidate);
                 continue;
             }
-            if self.held.is_some() {
+            if let Some(held) = self.held {
+                self.give_up_before(held);
                 return None;
             }
             let decided = self.live.first().map_or(self.cursor, |candidate| usize::from(candidate.at));
@@ -297,8 +298,7 @@ impl Framer {
 
     fn deliver(&mut self, held: Held) -> Place {
         let Held { at, end, header_inside } = held;
-        let command = self.buffer[at + 4];
-        self.discard(at, Some((command, end)));
+        self.give_up_before(held);
         self.held = None;
         self.start = end;
         self.live.drop_before(end);
@@ -310,6 +310,11 @@ impl Framer {
             | if header_inside { suspect::HEADER_INSIDE } else { 0 };
         let offset = self.tally.read - (self.end - at) as u64;
         Place { at, end, offset, reasons }
+    }
+
+    /// Whatever becomes of `held`, what came before it is in nothing.
+    fn give_up_before(&mut self, held: Held) {
+        self.discard(held.at, Some((self.buffer[held.at + 4], held.end)));
     }
 
     /// Gives up the bytes before `to`; `winner` is the command of the telegram that begins there, and its end.

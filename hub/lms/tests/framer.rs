@@ -204,6 +204,31 @@ fn a_flood_of_headers_is_bounded() {
     assert_eq!(feed(&mut framer, &good, 16).len(), 1);
 }
 
+#[test]
+fn frames_that_refute_each_other_leave_room() {
+    // The longest frames, each with a right checksum, and each beginning eight bytes before the one before it ends.
+    let header = [0x02, 0x80, 0x28, 0x03, 0xB1];
+    let frame = |begins_with: &[u8]| {
+        let mut writer = lms::telegram::Writer::new(0x80, 0xB1).slice(begins_with);
+        for _ in 0..806 - begins_with.len() - header.len() {
+            writer = writer.byte(0x33);
+        }
+        writer.slice(&header).byte(0x10).finish().bytes().to_vec()
+    };
+    let mut bytes = frame(&[]);
+    for _ in 0..3 {
+        let shared = bytes.len() - 8;
+        let next = frame(&bytes[shared + 5..]);
+        assert_eq!(next[..8], bytes[shared..]);
+        bytes.extend(&next[8..]);
+    }
+    for piece in [1, 16, 1628] {
+        let mut framer = framer(Expect::Anything);
+        feed(&mut framer, &bytes, piece);
+        assert!(!framer.spare().is_empty());
+    }
+}
+
 prop_compose! {
     fn content()(kind in 0..4, seed in any::<u64>()) -> Vec<u8> {
         let mut state = seed | 1;

@@ -75,6 +75,9 @@ impl Recording {
             Form::Carmen => survey_log(&path, reader)?,
             Form::Telegrams => survey_stream(&path, reader)?,
         };
+        if contents.telegrams == 0 {
+            return Err(refused(&path, "holds no telegram"));
+        }
         Ok(Recording { path, contents })
     }
 
@@ -159,6 +162,10 @@ fn survey_stream(path: &Path, reader: impl Read) -> Result<Contents, Failure> {
 
 fn reader(path: &Path) -> Result<Box<dyn BufRead + Send>, Failure> {
     let open = || -> io::Result<Box<dyn BufRead + Send>> {
+        // A pipe or a device has no end, and would be waited for.
+        if !std::fs::metadata(path)?.is_file() {
+            return Err(io::Error::new(io::ErrorKind::InvalidInput, "it is no regular file"));
+        }
         let mut file = BufReader::with_capacity(BUFFER, File::open(path)?);
         if file.fill_buf()?.starts_with(GZIP) {
             return Ok(Box::new(BufReader::with_capacity(BUFFER, MultiGzDecoder::new(file))));
