@@ -119,6 +119,8 @@ impl Line<'_> {
         } else {
             fault = fault.or(Some(Fault::Unread));
         }
+        // Before the hash, which takes longer than a host that waits for this byte.
+        let sent_ns = now_ns();
         way.fault = way.fault.or(fault);
         match chunk.part {
             Part::Telegram => {}
@@ -131,7 +133,7 @@ impl Line<'_> {
                     is_reply: sent.is_reply,
                     length: sent.telegram.len(),
                     sha256: Record::hash(&sent.telegram),
-                    sent_ns: now_ns(),
+                    sent_ns,
                     fault,
                 })?;
                 way.sent += 1;

@@ -1,0 +1,48 @@
+//! The few things that can be asked of a bench: `--json`, `--pairs N`, `--seconds N`, `--count N`.
+
+use super::Outcome;
+
+/// What was asked for; what was not is the bench's own.
+#[derive(Clone, Copy, Debug, Default)]
+pub(crate) struct Options {
+    /// One line of JSON per measurement instead of the table.
+    pub(crate) json: bool,
+    pairs: Option<usize>,
+    seconds: Option<u64>,
+    count: Option<usize>,
+}
+
+impl Options {
+    pub(crate) fn parse(words: &[String]) -> Outcome<Options> {
+        let mut options = Options::default();
+        let mut words = words.iter();
+        while let Some(word) = words.next() {
+            let mut value = || words.next().ok_or_else(|| format!("{word} needs a number"));
+            match word.as_str() {
+                "--json" => options.json = true,
+                "--pairs" => options.pairs = Some(value()?.parse()?),
+                "--seconds" => options.seconds = Some(value()?.parse()?),
+                "--count" => options.count = Some(value()?.parse()?),
+                // Cargo says so to every bench.
+                "--bench" => {}
+                _ => return Err(format!("{word}? --json, --pairs N, --seconds N, --count N").into()),
+            }
+        }
+        Ok(options)
+    }
+
+    /// Pairs of a run of the hub and one of the floor.
+    pub(crate) fn pairs(&self) -> usize {
+        self.pairs.unwrap_or(5).clamp(1, 100)
+    }
+
+    /// Length of a run, if the bench is one of time.
+    pub(crate) fn seconds(&self, default: u64) -> u64 {
+        self.seconds.unwrap_or(default).clamp(1, 3600)
+    }
+
+    /// Number of telegrams or repetitions, if the bench is one of counts.
+    pub(crate) fn count(&self, default: usize) -> usize {
+        self.count.unwrap_or(default).clamp(1, 1_000_000)
+    }
+}

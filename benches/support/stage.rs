@@ -1,0 +1,94 @@
+//! Where it all takes place: a domain and a directory of its own, gone afterwards, and the processes in it.
+
+use std::path::PathBuf;
+use std::time::Duration;
+
+use schema::{Domain, Environment};
+
+use super::child::Child;
+use super::{Outcome, PART};
+
+/// A domain and a directory.
+pub(crate) struct Stage {
+    pub(crate) domain: Domain,
+    directory: PathBuf,
+}
+
+impl Stage {
+    /// A new one of this process.
+    pub(crate) fn new() -> Outcome<Stage> {
+        let name = format!("bench-{}", std::process::id());
+        let domain = Domain::of_hub(&name, None, &Environment::of_process())?;
+        let directory = std::env::temp_dir().join(format!("scanhub-{name}"));
+        std::fs::create_dir_all(&directory)?;
+        Ok(Stage { domain, directory })
+    }
+
+    /// The file with the truth.
+    pub(crate) fn truth(&self) -> PathBuf {
+        self.directory.join("truth")
+    }
+
+    /// Where the pty of `sensor` appears.
+    pub(crate) fn port(&self, sensor: &str) -> String {
+        self.directory.join(sensor).display().to_string()
+    }
+
+    /// Sensors at the other end of ptys, idle, at `rate`.
+    pub(crate) fn simulate(&self, sensors: &[&str], rate: u32) -> Outcome<Child> {
+        let mut words =
+            vec!["simulate".into(), "--baud".into(), rate.to_string(), "--seed".into(), "1".into()];
+        words.extend(["--truth".into(), self.truth().display().to_string()]);
+        words.extend(sensors.iter().flat_map(|sensor| ["--port".into(), self.port(sensor)]));
+        let child = Child::start(PROGRAM, &words)?;
+        child.await_line("ready", PATIENCE)?;
+        Ok(child)
+    }
+
+    /// The hub; its first line says that it is up.
+    pub(crate) fn hub(&self, sensors: &[&str]) -> Outcome<Child> {
+        let mut words = vec!["run".into(), "--domain".into(), self.domain.name().into()];
+        let link = |sensor: &&str| ["--link".into(), format!("{sensor}={}", self.port(sensor))];
+        words.extend(sensors.iter().flat_map(link));
+        Child::start(PROGRAM, &words)
+    }
+
+    /// This program as a consumer of `topic`, with more `words`.
+    pub(crate) fn consumer(&self, topic: &str, sensor: &str, words: &[&str]) -> Outcome<Child> {
+        self.part(&[&["consume", topic, self.domain.name(), sensor], words].concat())
+    }
+
+    /// This program as the floor that reads `count` telegrams from each port.
+    pub(crate) fn bare(&self, sensors: &[&str], count: usize) -> Outcome<Child> {
+        let ports: Vec<String> = sensors.iter().map(|sensor| self.port(sensor)).collect();
+        let mut words: Vec<&str> = ports.iter().map(String::as_str).collect();
+        let count = count.to_string();
+        words.splice(0..0, ["bare", &count]);
+        self.part(&words)
+    }
+
+    /// This program in one of its parts.
+    pub(crate) fn part(&self, words: &[&str]) -> Outcome<Child> {
+        let words: Vec<String> = std::iter::once(&PART).chain(words).map(|word| word.to_string()).collect();
+        Child::start(&std::env::current_exe()?.display().to_string(), &words)
+    }
+}
+
+impl Drop for Stage {
+    fn drop(&mut self) {
+        // All of it is ours alone: the domain's name has our process id.
+        let _ = std::fs::remove_dir_all(&self.directory);
+        let _ = std::fs::remove_dir_all(self.domain.root());
+        let entries = std::fs::read_dir("/dev/shm").into_iter().flatten().flatten();
+        let prefix = self.domain.prefix();
+        for entry in entries.filter(|entry| entry.file_name().to_string_lossy().starts_with(&prefix)) {
+            let _ = std::fs::remove_file(entry.path());
+        }
+    }
+}
+
+/// The two sensors of a vehicle.
+pub(crate) const SENSORS: [&str; 2] = ["front", "rear"];
+/// Far longer than anything takes.
+pub(crate) const PATIENCE: Duration = Duration::from_secs(20);
+const PROGRAM: &str = env!("CARGO_BIN_EXE_scanhub");
