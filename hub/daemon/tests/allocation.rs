@@ -5,7 +5,6 @@
 use std::alloc::{GlobalAlloc, Layout, System};
 use std::fs;
 use std::os::fd::OwnedFd;
-use std::path::PathBuf;
 use std::sync::atomic::{AtomicI32, AtomicI64, AtomicU64, Ordering::Relaxed};
 use std::sync::mpsc::channel;
 use std::thread;
@@ -145,6 +144,20 @@ fn stream(sensor: &mut Sensor, subscriber: &Subscriber<Scan>, count: u64) {
     }
 }
 
+/// A domain that goes with the test, however it ends.
+struct Place(Domain);
+
+impl Drop for Place {
+    fn drop(&mut self) {
+        let _ = self.0.root().parent().map(fs::remove_dir_all);
+        for entry in fs::read_dir("/dev/shm").into_iter().flatten().flatten() {
+            if entry.file_name().to_string_lossy().starts_with(&self.0.prefix()) {
+                let _ = fs::remove_file(entry.path());
+            }
+        }
+    }
+}
+
 /// The thread of this process with this name.
 fn thread_named(name: &str) -> i32 {
     let tasks = fs::read_dir("/proc/self/task").expect("threads").flatten();
@@ -157,8 +170,8 @@ fn thread_named(name: &str) -> i32 {
 #[test]
 fn a_scan_takes_nothing_from_the_heap() {
     let name = format!("a{}", std::process::id());
-    let base = PathBuf::from(format!("/tmp/{name}"));
-    let domain = Domain::at(&name, &base).expect("a domain");
+    let place = Place(Domain::at(&name, format!("/tmp/{name}").as_ref()).expect("a domain"));
+    let domain = &place.0;
     let (mut sensor, port) = Sensor::new();
     let sources = Sources { links: vec![format!("heap={port}")], ..Sources::default() };
     let config = Config::load(&sources).expect("a configuration");
@@ -168,7 +181,7 @@ fn a_scan_takes_nothing_from_the_heap() {
         move || daemon::run(&config, &domain, |_| send.send(()).unwrap_or_default())
     });
     ready.recv_timeout(Duration::from_secs(20)).expect("the hub is up");
-    let node = ipc::client_node(&domain).expect("a node");
+    let node = ipc::client_node(domain).expect("a node");
     let topic = Scan::open(&node, "heap").expect("a topic").expect("is there");
     let subscriber = Scan::subscriber(&topic).expect("a subscriber");
     // The rate, both questions, and what is made once.
@@ -188,12 +201,6 @@ fn a_scan_takes_nothing_from_the_heap() {
     drop((subscriber, topic, node));
     kill_process(getpid(), Signal::TERM).expect("a signal");
     assert_eq!(hub.join().expect("no panic"), Ok(()));
-    let _ = fs::remove_dir_all(&base);
-    for entry in fs::read_dir("/dev/shm").into_iter().flatten().flatten() {
-        if entry.file_name().to_string_lossy().starts_with(&domain.prefix()) {
-            let _ = fs::remove_file(entry.path());
-        }
-    }
     for (scans, taken, held) in windows {
         // A loan for the telegram and one for the scan; now and then one for the status.
         let loans = 2 * scans..=2 * scans + STATUSES;
