@@ -17,9 +17,9 @@ fn demo(arguments: &[&str], end: impl FnOnce(Program) -> Outcome) -> Outcome {
     let name = format!("demo-{}", program.pid());
     let outcome = end(program);
     assert_eq!(shared_memory(&format!("sh_{name}_")), [] as [&Path; 0]);
-    assert!(!is_there(&format!("/tmp/scanhub-{name}").as_ref()), "its directory is left");
+    assert!(!is_there(format!("/tmp/scanhub-{name}").as_ref()), "its directory is left");
     let uid = rustix::process::getuid().as_raw();
-    assert!(!is_there(&format!("/tmp/scanhub-{uid}/{name}").as_ref()), "its domain is left");
+    assert!(!is_there(format!("/tmp/scanhub-{uid}/{name}").as_ref()), "its domain is left");
     assert_eq!(processes(&name), [] as [String; 0]);
     outcome
 }

@@ -8,6 +8,7 @@ use std::os::unix::fs::symlink;
 use std::process::Stdio;
 use std::time::{Duration, Instant};
 
+use rustix::pipe::{PipeFlags, pipe_with};
 use serde_json::Value;
 use stage::{INT, KILL, Program, Stage, TERM, is_class, is_there, until};
 
@@ -77,6 +78,25 @@ fn a_reader_that_has_enough_is_no_failure() {
         let errors = String::from_utf8_lossy(&outcome.stderr);
         assert_eq!((outcome.status.code(), &*errors), (Some(0), ""));
     }
+}
+
+#[test]
+fn every_line_is_one_write() {
+    let stage = Stage::new();
+    let _hub = hub(&stage);
+    // A pipe that keeps writes apart: what is read at once was written at once.
+    let (read, write) = pipe_with(PipeFlags::DIRECT | PipeFlags::CLOEXEC).expect("a pipe");
+    let mut command = stage.command(&["echo", "--json", "front/scan", "front/telegram", "front/status"]);
+    let mut echo = command.stdout(write).stderr(Stdio::null()).spawn().expect("starts");
+    drop(command);
+    for _ in 0..60 {
+        let mut buffer = [0; 8192];
+        let len = rustix::io::read(&read, &mut buffer).expect("a line");
+        let whole = buffer[..len].ends_with(b"\n") && buffer[..len].starts_with(b"{");
+        assert!(whole, "a piece: {:?}", String::from_utf8_lossy(&buffer[..len]));
+    }
+    echo.kill().expect("is killed");
+    echo.wait().expect("is dead");
 }
 
 #[test]

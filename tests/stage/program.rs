@@ -153,8 +153,8 @@ impl Program {
         let _ = self.process.kill();
         let errors = self.errors.take().and_then(|errors| errors.join().ok()).unwrap_or_default();
         let out = String::from_utf8_lossy(&self.out);
-        let tail = &out[out.floor_char_boundary(out.len().saturating_sub(2000))..];
-        panic!("scanhub {}: waited in vain ({why}) for {what}; it said: .. {tail}\n{errors}", self.name);
+        let tail: Vec<_> = out.lines().rev().take(5).collect();
+        panic!("scanhub {}: waited in vain ({why}) for {what}; it said last: {tail:#?}\n{errors}", self.name);
     }
 }
 

@@ -191,7 +191,7 @@ impl Bench {
 
     /// Waits until `until`, or for bytes if they are watched for.
     fn wait(&mut self, watch: bool, until: Nanos) {
-        while !(watch && !self.inbox.is_empty()) {
+        while !watch || self.inbox.is_empty() {
             match self.machine.poll_timeout() {
                 Some(at) if at <= until => self.advance(at),
                 _ => break,

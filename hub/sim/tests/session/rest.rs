@@ -29,12 +29,12 @@ fn a_telegram_is_there_soon_after_its_last_byte() {
             let sent: Vec<_> = bench.sent.iter().filter(|sent| !sent.is_reply).collect();
             let pairs: Vec<(&&Received, &&Sent)> = scans.iter().zip(&sent).skip(LESSONS).collect();
             assert!(pairs.len() > 600 && pairs.iter().all(|(got, sent)| got.telegram == sent.telegram));
-            let late = |(got, sent): &&(&&Received, &&Sent)| got.at - sent.at;
+            let late = |(got, sent): &(&&Received, &&Sent)| got.at - sent.at;
             let prompt: Vec<_> = pairs.iter().filter(|(_, sent)| !is_held(&sent.telegram)).collect();
             assert!(prompt.len() * 10 > pairs.len() * 9);
-            let latest = prompt.iter().map(|pair| late(pair)).max().unwrap_or_default();
+            let latest = prompt.iter().copied().map(late).max().unwrap_or_default();
             assert!(latest <= 1_500 * MICROS, "{variant:?} {chunk:?}: {latest} ns");
-            let latest = pairs.iter().map(|pair| late(&pair)).max().unwrap_or_default();
+            let latest = pairs.iter().map(late).max().unwrap_or_default();
             assert!(latest <= 3_500 * MICROS, "{variant:?} {chunk:?}: {latest} ns for one that was held");
             let most = prompt.iter().map(|(got, _)| got.looks).max().unwrap_or_default();
             assert!((1..=6).contains(&most), "{variant:?} {chunk:?}: {most} looks for a telegram");

@@ -1,0 +1,213 @@
+//! The hub's memory is fixed once a sensor streams, however many scans come. Its link takes nothing from the heap for a
+//! scan but what the shared-memory library takes for each loan of a sample: one small piece, given back when it is sent.
+#![allow(unsafe_code)]
+
+use std::alloc::{GlobalAlloc, Layout, System};
+use std::fs;
+use std::os::fd::OwnedFd;
+use std::sync::atomic::{AtomicI32, AtomicI64, AtomicU64, Ordering::Relaxed};
+use std::sync::mpsc::channel;
+use std::thread;
+use std::time::{Duration, Instant};
+
+use daemon::Config;
+use daemon::config::Sources;
+use lms::command::Request;
+use lms::reply::{self, Health};
+use lms::telegram::ACK;
+use lms::variant::{Baud, Mode, Unit, Variant};
+use rustix::fs::{OFlags, fcntl_setfl};
+use rustix::process::{Signal, getpid, kill_process};
+use rustix::pty::{OpenptFlags, grantpt, openpt, ptsname, unlockpt};
+use rustix::thread::gettid;
+use schema::ipc::{self, Payload, Subscriber};
+use schema::{Domain, Scan};
+
+/// Counts what one thread asks for.
+struct Counting;
+
+static WATCHED: AtomicI32 = AtomicI32::new(0);
+/// Pieces taken.
+static TAKEN: AtomicU64 = AtomicU64::new(0);
+/// Bytes taken and not given back.
+static HELD: AtomicI64 = AtomicI64::new(0);
+
+fn note(taken: u64, bytes: i64) {
+    let watched = WATCHED.load(Relaxed);
+    if watched != 0 && gettid().as_raw_nonzero().get() == watched {
+        TAKEN.fetch_add(taken, Relaxed);
+        HELD.fetch_add(bytes, Relaxed);
+    }
+}
+
+// SAFETY: every call goes to the system's allocator as it came; counting asks for no memory.
+unsafe impl GlobalAlloc for Counting {
+    // SAFETY: the caller keeps the promises of the trait, which are those of the system's allocator.
+    unsafe fn alloc(&self, layout: Layout) -> *mut u8 {
+        note(1, layout.size() as i64);
+        // SAFETY: as above.
+        unsafe { System.alloc(layout) }
+    }
+
+    // SAFETY: as above.
+    unsafe fn dealloc(&self, memory: *mut u8, layout: Layout) {
+        note(0, -(layout.size() as i64));
+        // SAFETY: as above.
+        unsafe { System.dealloc(memory, layout) }
+    }
+
+    // SAFETY: as above.
+    unsafe fn realloc(&self, memory: *mut u8, layout: Layout, size: usize) -> *mut u8 {
+        note(1, size as i64 - layout.size() as i64);
+        // SAFETY: as above.
+        unsafe { System.realloc(memory, layout, size) }
+    }
+}
+
+#[global_allocator]
+static ALLOCATOR: Counting = Counting;
+
+/// A sensor of few words at the other end of a pty: it streams when it is told to, and answers two questions.
+struct Sensor {
+    line: OwnedFd,
+    heard: Vec<u8>,
+    scans: u64,
+}
+
+impl Sensor {
+    fn new() -> (Sensor, String) {
+        let make = || -> rustix::io::Result<_> {
+            let line = openpt(OpenptFlags::RDWR | OpenptFlags::NOCTTY)?;
+            grantpt(&line)?;
+            unlockpt(&line)?;
+            let name = ptsname(&line, Vec::new())?;
+            fcntl_setfl(&line, OFlags::RDWR | OFlags::NONBLOCK)?;
+            Ok((line, name))
+        };
+        let (line, name) = make().expect("a pty");
+        let name = name.into_string().expect("a name of ASCII");
+        (Sensor { line, heard: Vec::new(), scans: 0 }, name)
+    }
+
+    fn say(&self, bytes: &[u8]) {
+        let written = rustix::io::write(&self.line, bytes);
+        assert_eq!(written, Ok(bytes.len()), "the hub does not read");
+    }
+
+    fn send_scan(&mut self) {
+        self.scans += 1;
+        let words = [1000 + (self.scans % 1000) as u16; 361];
+        self.say(lms::measured::encode(0, Unit::Mm, &words, 0x10).bytes());
+    }
+
+    /// Answers what was asked.
+    fn answer(&mut self) {
+        let mut buffer = [0; 64];
+        let len = rustix::io::read(&self.line, &mut buffer).unwrap_or(0);
+        self.heard.extend(&buffer[..len]);
+        let health = Health {
+            software: *b"V02.30 ",
+            operating_mode: 0x24,
+            mode: Mode(1),
+            variant: Variant::HALF,
+            unit: Unit::Mm,
+            baud: Baud::B500000,
+        };
+        let answer = if self.heard.ends_with(Request::Status.encode(0).bytes()) {
+            reply::status(0, &health, 0x10)
+        } else if self.heard.ends_with(Request::Type.encode(0).bytes()) {
+            reply::kind(0, b"LMS200;301063;V02.30 ", 0x10)
+        } else {
+            return;
+        };
+        self.heard.clear();
+        self.say(&[&[ACK], answer.bytes()].concat());
+    }
+}
+
+/// Sends scans until `count` more were published.
+fn stream(sensor: &mut Sensor, subscriber: &Subscriber<Scan>, count: u64) {
+    let give_up_at = Instant::now() + Duration::from_secs(30);
+    for number in 0..count {
+        sensor.send_scan();
+        let mut next_scan = Instant::now() + Duration::from_millis(50);
+        while !matches!(Scan::receive(subscriber), Ok(Some(_))) {
+            assert!(Instant::now() < give_up_at, "scan {number} of {count} did not come");
+            sensor.answer();
+            if Instant::now() > next_scan {
+                // Until the sensor was asked for its mode a scan cannot be read, and is none.
+                sensor.send_scan();
+                next_scan += Duration::from_millis(50);
+            }
+            thread::sleep(Duration::from_micros(100));
+        }
+    }
+}
+
+/// A domain that goes with the test, however it ends.
+struct Place(Domain);
+
+impl Drop for Place {
+    fn drop(&mut self) {
+        let _ = self.0.root().parent().map(fs::remove_dir_all);
+        for entry in fs::read_dir("/dev/shm").into_iter().flatten().flatten() {
+            if entry.file_name().to_string_lossy().starts_with(&self.0.prefix()) {
+                let _ = fs::remove_file(entry.path());
+            }
+        }
+    }
+}
+
+/// The thread of this process with this name.
+fn thread_named(name: &str) -> i32 {
+    let tasks = fs::read_dir("/proc/self/task").expect("threads").flatten();
+    let found = tasks
+        .filter(|task| fs::read_to_string(task.path().join("comm")).is_ok_and(|comm| comm.trim() == name))
+        .find_map(|task| task.file_name().to_str()?.parse().ok());
+    found.expect("the link has a thread")
+}
+
+#[test]
+fn a_scan_takes_nothing_from_the_heap() {
+    let name = format!("a{}", std::process::id());
+    let place = Place(Domain::at(&name, format!("/tmp/{name}").as_ref()).expect("a domain"));
+    let domain = &place.0;
+    let (mut sensor, port) = Sensor::new();
+    let sources = Sources { links: vec![format!("heap={port}")], ..Sources::default() };
+    let config = Config::load(&sources).expect("a configuration");
+    let (send, ready) = channel();
+    let hub = thread::spawn({
+        let domain = domain.clone();
+        move || daemon::run(&config, &domain, |_| send.send(()).unwrap_or_default())
+    });
+    ready.recv_timeout(Duration::from_secs(20)).expect("the hub is up");
+    let node = ipc::client_node(domain).expect("a node");
+    let topic = Scan::open(&node, "heap").expect("a topic").expect("is there");
+    let subscriber = Scan::subscriber(&topic).expect("a subscriber");
+    // The rate, both questions, and what is made once.
+    stream(&mut sensor, &subscriber, 50);
+    WATCHED.store(thread_named("heap"), Relaxed);
+    let windows = [50, 400, 50, 400].map(|count| {
+        let (scans, taken, held) = (sensor.scans, TAKEN.load(Relaxed), HELD.load(Relaxed));
+        stream(&mut sensor, &subscriber, count);
+        // A scan is here before the link has given back what the loan took.
+        let give_up_at = Instant::now() + Duration::from_secs(5);
+        while HELD.load(Relaxed) != held && Instant::now() < give_up_at {
+            thread::sleep(Duration::from_millis(1));
+        }
+        (sensor.scans - scans, TAKEN.load(Relaxed) - taken, HELD.load(Relaxed) - held)
+    });
+
+    drop((subscriber, topic, node));
+    kill_process(getpid(), Signal::TERM).expect("a signal");
+    assert_eq!(hub.join().expect("no panic"), Ok(()));
+    for (scans, taken, held) in windows {
+        // A loan for the telegram and one for the scan; now and then one for the status.
+        let loans = 2 * scans..=2 * scans + STATUSES;
+        assert!(loans.contains(&taken), "{taken} pieces of memory for {scans} scans");
+        assert_eq!(held, 0, "bytes kept of {scans} scans");
+    }
+}
+
+/// At most so many in a window: one a second.
+const STATUSES: u64 = 10;
