@@ -76,6 +76,7 @@ impl Account {
         Account {
             sensors: sensors.collect(),
             truth,
+            unfinished: Vec::new(),
             cut_ns: u64::MAX,
             hub: None,
             hub_cpu_percent: 0.0,
