@@ -37,7 +37,7 @@ enum Bytes {
 impl Recorded {
     /// Opens the recording at `path`; metres become units of `link`'s.
     ///
-    /// [`schema::Kind::Configuration`] if it cannot be read or is none.
+    /// [`schema::Kind::Configuration`] if it cannot be read. A file without a telegram is a line that only brings noise.
     pub(crate) fn open(path: &Path, link: &Link) -> Result<Recorded, Failure> {
         let recording = Recording::open(path)?;
         let mode = recording.contents().mode.unwrap_or(Mode(0));
