@@ -1,41 +1,18 @@
 //! What to say to the sensor next: from a line of unknown rate to a stream, and back when the stream ends. Knows
 //! telegrams and deadlines, no bytes and no port. It never says anything that outlives a power cycle.
 
+use crate::Nanos;
 use crate::command::Request;
-use crate::header::{Expect, StreamHeader};
+use crate::header::Expect;
 use crate::measured::Measured;
 use crate::outgoing::{NAK_PAUSE, Outgoing};
+use crate::phase::{
+    BESIDE_VALUES, LISTEN, PAUSE, Phase, QUESTIONS, Reason, SETTLE, SILENCE, Settings, Step, TRIES,
+};
 use crate::reply::Reply;
 use crate::sensor::{Sensor, State, Trouble};
 use crate::telegram::{REPLY, Telegram};
-use crate::variant::{Baud, Variant};
-use crate::{MILLIS, Nanos};
-
-/// What a session shall do.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct Settings {
-    /// Angle and resolution to ask for; a sensor that refuses streams what it has.
-    pub variant: Variant,
-    /// Rate to stream at.
-    pub baud: Baud,
-    /// Whether anybody hears us: a recording is only listened to.
-    pub listen_only: bool,
-}
-
-/// Why a session waits until its deadline.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Reason {
-    /// A running stream would have been heard by then.
-    Listening,
-    /// A request may leave.
-    Request,
-    /// The reply should have come.
-    Reply,
-    /// The stream should have gone on.
-    Silence,
-    /// Nothing is expected by any time.
-    Never,
-}
+use crate::variant::Baud;
 
 #[derive(Clone, Debug)]
 pub(crate) struct Dialogue {
@@ -47,32 +24,6 @@ pub(crate) struct Dialogue {
     pub(crate) sensor: Sensor,
     pub(crate) trouble: Option<Trouble>,
     pub(crate) resyncs: u64,
-}
-
-#[derive(Clone, Copy, Debug)]
-enum Phase {
-    /// Whoever streams at the wanted rate is adopted undisturbed; meanwhile the state is as `shown`.
-    Listening { give_up_at: Nanos, shown: State },
-    /// A status request at one rate after the other.
-    Probing { attempt: usize },
-    /// The rate was found and is changed to the wanted one.
-    Switching,
-    /// At the wanted rate: settings, then the stream.
-    Starting { step: Step },
-    /// Measured data come.
-    Streaming { header: StreamHeader, silent_at: Nanos, questions: &'static [Request] },
-    /// Bytes come from a recording.
-    Following,
-}
-
-/// Steps of [`Phase::Starting`] in their order.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-enum Step {
-    Stop,
-    Variant,
-    Type,
-    Configuration,
-    Stream,
 }
 
 impl Dialogue {
@@ -384,18 +335,3 @@ impl Dialogue {
         }
     }
 }
-
-/// Two scans of the slowest variant, and some; longer where the line is slower than the scans.
-const LISTEN: Nanos = 120 * MILLIS;
-/// Without measured data for so long, the session begins again (paper: resynchronise after one second).
-const SILENCE: Nanos = 1_000 * MILLIS;
-/// After a change of rate the sensor's and the adapter's UART need a moment.
-const SETTLE: Nanos = 20 * MILLIS;
-/// After a refusal, before everything begins again.
-const PAUSE: Nanos = 500 * MILLIS;
-/// A sensor may overlook a request while its mirror turns; three tries are what all drivers give it.
-const TRIES: u8 = 3;
-/// What a stream does not tell: how values are split, from the one reply or the other, and who sends them.
-const QUESTIONS: &[Request] = &[Request::Status, Request::Configuration, Request::Type];
-/// STX to count word, status and checksum: bytes of a telegram beside its values.
-const BESIDE_VALUES: usize = 10;

@@ -15,13 +15,14 @@ pub mod framer;
 pub mod header;
 pub mod measured;
 mod outgoing;
+mod phase;
 pub mod reply;
 mod sensor;
 pub mod session;
 pub mod telegram;
 pub mod variant;
 
-pub use dialogue::{Reason, Settings};
+pub use phase::{Reason, Settings};
 pub use sensor::{Sensor, State, Trouble};
 pub use session::Session;
 

@@ -5,9 +5,10 @@
 //! [`Output::Rest`].
 
 use crate::arrival::{Arrivals, Rhythm};
-use crate::dialogue::{Dialogue, Reason, Settings};
+use crate::dialogue::Dialogue;
 use crate::framer::{Advance, Framer, Place, Tally, suspect};
 use crate::measured::MEASURED;
+use crate::phase::{Reason, Settings};
 use crate::sensor::{Sensor, State, Trouble};
 use crate::telegram::Telegram;
 use crate::variant::{Baud, Mode};

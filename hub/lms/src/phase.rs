@@ -1,0 +1,75 @@
+//! Where a conversation with a sensor can be, what it was asked to reach, and how long each wait lasts. No behaviour:
+//! that is [`crate::dialogue`].
+
+use crate::command::Request;
+use crate::header::StreamHeader;
+use crate::sensor::State;
+use crate::variant::{Baud, Variant};
+use crate::{MILLIS, Nanos};
+
+/// What a session shall do.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Settings {
+    /// Angle and resolution to ask for; a sensor that refuses streams what it has.
+    pub variant: Variant,
+    /// Rate to stream at.
+    pub baud: Baud,
+    /// Whether anybody hears us: a recording is only listened to.
+    pub listen_only: bool,
+}
+
+/// Why a session waits until its deadline.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Reason {
+    /// A running stream would have been heard by then.
+    Listening,
+    /// A request may leave.
+    Request,
+    /// The reply should have come.
+    Reply,
+    /// The stream should have gone on.
+    Silence,
+    /// Nothing is expected by any time.
+    Never,
+}
+
+#[derive(Clone, Copy, Debug)]
+pub(crate) enum Phase {
+    /// Whoever streams at the wanted rate is adopted undisturbed; meanwhile the state is as `shown`.
+    Listening { give_up_at: Nanos, shown: State },
+    /// A status request at one rate after the other.
+    Probing { attempt: usize },
+    /// The rate was found and is changed to the wanted one.
+    Switching,
+    /// At the wanted rate: settings, then the stream.
+    Starting { step: Step },
+    /// Measured data come.
+    Streaming { header: StreamHeader, silent_at: Nanos, questions: &'static [Request] },
+    /// Bytes come from a recording.
+    Following,
+}
+
+/// Steps of [`Phase::Starting`] in their order.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Step {
+    Stop,
+    Variant,
+    Type,
+    Configuration,
+    Stream,
+}
+
+/// Two scans of the slowest variant, and some; longer where the line is slower than the scans.
+pub(crate) const LISTEN: Nanos = 120 * MILLIS;
+/// Without measured data for so long, the session begins again (paper: resynchronise after one second).
+pub(crate) const SILENCE: Nanos = 1_000 * MILLIS;
+/// After a change of rate the sensor's and the adapter's UART need a moment.
+pub(crate) const SETTLE: Nanos = 20 * MILLIS;
+/// After a refusal, before everything begins again.
+pub(crate) const PAUSE: Nanos = 500 * MILLIS;
+/// A sensor may overlook a request while its mirror turns; three tries are what all drivers give it.
+pub(crate) const TRIES: u8 = 3;
+/// What a stream does not tell: how values are split, from the one reply or the other, and who sends them.
+pub(crate) const QUESTIONS: &[Request] = &[Request::Status, Request::Configuration, Request::Type];
+/// STX to count word, status and checksum: bytes of a telegram beside its values.
+pub(crate) const BESIDE_VALUES: usize = 10;
