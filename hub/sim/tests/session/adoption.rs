@@ -1,9 +1,9 @@
 //! A sensor that streams already when the session begins: left by a hub that was killed, or by another program.
 
 use lms::variant::Baud;
-use lms::{MICROS, MILLIS, State};
+use lms::{MICROS, MILLIS, Settings, State};
 
-use crate::bench::{Bench, make_stream, sensor};
+use crate::bench::{Bench, WANTED, make_stream, sensor};
 
 #[test]
 fn at_the_wanted_rate_it_is_taken_as_it_streams() {
@@ -42,5 +42,20 @@ fn at_another_rate_it_is_found_and_brought_to_the_wanted_one() {
             assert!(bench.is_streaming() && bench.received_scans(0).len() > 15, "{took} ns: {bench}");
             assert_eq!(bench.session.trouble(), None);
         }
+    }
+}
+
+#[test]
+fn on_a_slow_line_it_is_waited_for() {
+    // A telegram takes 0.19 s at 38400 and 0.76 s at 9600, the next one comes 0.21 and 0.77 s later.
+    for baud in [Baud::B9600, Baud::B38400] {
+        let mut machine = sensor(baud);
+        let begun = make_stream(&mut machine) + 100 * MILLIS;
+        let mut bench = Bench::wanting(Settings { baud, ..WANTED }, machine, begun);
+        bench.until("streaming", 2_000 * MILLIS, Bench::is_streaming);
+        let first = bench.received[0].at;
+        assert!(bench.said.iter().all(|(at, _)| *at >= first), "spoke before it listened: {bench}");
+        bench.run(10_000 * MILLIS);
+        assert_eq!(bench.states, [State::Probing, State::Streaming], "{bench}");
     }
 }

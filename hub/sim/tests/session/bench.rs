@@ -88,10 +88,15 @@ pub(crate) fn make_stream(machine: &mut Machine) -> Nanos {
 
 impl Bench {
     /// The session begins at `now` of the machine's time, on a line that does no harm.
-    pub(crate) fn new(mut machine: Machine, now: Nanos) -> Bench {
+    pub(crate) fn new(machine: Machine, now: Nanos) -> Bench {
+        Bench::wanting(WANTED, machine, now)
+    }
+
+    /// As [`Bench::new`], with a session that wants something else.
+    pub(crate) fn wanting(wanted: Settings, mut machine: Machine, now: Nanos) -> Bench {
         while machine.poll_transmit(now).is_some() {}
         Bench {
-            session: Session::new(WANTED, now),
+            session: Session::new(wanted, now),
             machine,
             now,
             to_host: Box::new(|_, bytes| bytes),
@@ -100,7 +105,7 @@ impl Bench {
             sent: Vec::new(),
             received: Vec::new(),
             states: Vec::new(),
-            port: WANTED.baud,
+            port: wanted.baud,
             inbox: VecDeque::new(),
             garbled: None,
             damaged: false,

@@ -3,6 +3,7 @@
 use lms::variant::{Baud, Unit, Variant};
 use lms::{MILLIS, State, Trouble};
 use sim::machine::{Machine, Settings};
+use sim::room::{Room, World};
 use sim::source::Source;
 
 use crate::bench::{Bench, make_stream, sensor};
@@ -115,4 +116,36 @@ fn a_sensor_whose_power_was_cycled() {
     bench.run(500 * MILLIS);
     assert!(bench.is_streaming() && bench.session.baud() == Baud::B500000, "{bench}");
     assert_eq!((bench.session.resyncs(), bench.session.trouble()), (1, None));
+}
+
+#[test]
+fn a_variant_that_gets_no_answer_is_done_without() {
+    let settings =
+        Settings { variant: Variant { angle_deg: 180, resolution_cdeg: 100 }, ..Settings::default() };
+    let mut bench = Bench::new(Machine::new(settings, Source::Room(Room::new(World::Room, 1))), 0);
+    // Every request to switch arrives damaged, and is answered with NAK.
+    let mut heard = Vec::new();
+    bench.to_sensor = Box::new(move |_, byte| {
+        heard.push(byte);
+        Some(if heard.ends_with(&[0x02, 0x00, 0x05, 0x00, 0x3B]) { byte ^ 1 } else { byte })
+    });
+    bench.until("streaming", 4_000 * MILLIS, Bench::is_streaming);
+    bench.run(1_000 * MILLIS);
+    assert!(bench.is_streaming(), "{bench}");
+    assert_eq!(bench.session.trouble(), Some(Trouble::VariantRefused));
+    assert_eq!(bench.received_scans(0)[0].len(), 372);
+}
+
+#[test]
+fn a_sensor_that_was_swapped_may_have_another_address() {
+    let at = |address| {
+        let settings = Settings { address, ..Settings::default() };
+        Machine::new(settings, Source::Room(Room::new(World::Room, 1)))
+    };
+    let mut bench = Bench::new(at(1), 0);
+    bench.until("streaming", 3_000 * MILLIS, Bench::is_streaming);
+    bench.machine = at(2);
+    bench.until("silent", 2_000 * MILLIS, |bench| !bench.is_streaming());
+    bench.until("streaming again", 4_000 * MILLIS, Bench::is_streaming);
+    assert_eq!(bench.session.sensor().address, Some(0x82));
 }
