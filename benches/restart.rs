@@ -34,11 +34,12 @@ fn measure(options: &Options) -> Outcome<()> {
     let each = options.count(20).div_ceil(options.pairs());
     for _ in 0..options.pairs() {
         for _ in 0..each {
-            thread::sleep(LIFE);
+            thread::sleep(life(hub.len()));
             hub.push(lives.restart()?);
         }
         lives.kill()?;
         for _ in 0..each {
+            thread::sleep(life(floor.len()));
             floor.push(start_floor(&stage)?);
         }
         lives.restart()?;
@@ -137,7 +138,6 @@ impl Lives<'_> {
 }
 
 fn start_floor(stage: &Stage) -> Outcome<Start> {
-    thread::sleep(LIFE);
     let floor = stage.bare(&SENSORS, 0)?;
     let up_ns = floor.await_line("ready", PATIENCE)?.at_ns;
     let mut first_ns = [0; 2];
@@ -153,5 +153,7 @@ fn start_floor(stage: &Stage) -> Outcome<Start> {
     Ok(start)
 }
 
-/// A hub lives so long between two kills.
-const LIFE: Duration = Duration::from_millis(700);
+/// How long life number `n` is: another phase of the stream each time.
+fn life(n: usize) -> Duration {
+    Duration::from_millis(700 + 11 * (n as u64 % 20))
+}

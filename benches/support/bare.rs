@@ -24,10 +24,12 @@ pub(crate) fn chain(ports: &[&str], count: usize) -> Outcome<()> {
         ends.push((Line::open(Path::new(port), RATE)?, wake));
     }
     println!("ready");
-    let threads: Vec<_> =
-        ends.into_iter().map(|(line, wake)| thread::spawn(move || read(&line, &wake, count))).collect();
+    let threads: Vec<_> = ends
+        .into_iter()
+        .map(|(line, wake)| thread::spawn(move || read_or_end(&line, &wake, count)))
+        .collect();
     for (number, thread) in threads.into_iter().enumerate() {
-        let telegrams = thread.join().map_err(|_| "a reader panicked")?.map_err(|words| words.to_string())?;
+        let telegrams = thread.join().map_err(|_| "a reader panicked")?;
         for (telegram, at) in telegrams {
             println!("read {number} {} {at}", truth::hash(&telegram));
         }
@@ -37,17 +39,18 @@ pub(crate) fn chain(ports: &[&str], count: usize) -> Outcome<()> {
     Ok(())
 }
 
-/// Sleeps at the eventfd that is its stdin until `count` telegrams were told (0: for ever, and says each), then prints
-/// when it was told of each.
+/// Sleeps at the eventfd that is its stdin until `count` telegrams were told (0: for ever, and says the first), then
+/// prints when it was told of each.
 pub(crate) fn sleeper(number: &str, count: usize) -> Outcome<()> {
     let wake = rustix::stdio::stdin();
     let mut times = Vec::with_capacity(count);
+    let mut said = false;
     while count == 0 || times.len() < count {
         if clock::readable(wake, None)? {
             let mut told = [0; 8];
             rustix::io::read(wake, &mut told)?;
             let now = clock::now();
-            if count == 0 {
+            if count == 0 && !std::mem::replace(&mut said, true) {
                 println!("woken {number} {now}");
             }
             times.extend((0..u64::from_ne_bytes(told)).map(|_| now).take(count));
@@ -61,6 +64,14 @@ fn start_sleeper(number: usize, count: usize, wake: OwnedFd) -> Outcome<Guard> {
     let words = [PART, "sleeper", &number.to_string(), &count.to_string()].map(String::from);
     let process = Command::new(std::env::current_exe()?).args(words).stdin(Stdio::from(wake)).spawn()?;
     Ok(Guard::new(process))
+}
+
+/// One reader less would be a floor too low: if one ends early, all do.
+fn read_or_end(line: &Line, wake: &OwnedFd, count: usize) -> Vec<([u8; LENGTH], u64)> {
+    read(line, wake, count).unwrap_or_else(|error| {
+        eprintln!("floor: {error}");
+        std::process::exit(1)
+    })
 }
 
 /// The loop. What it keeps of each telegram is kept after the wake-up, in the pause before the next one.
@@ -88,11 +99,13 @@ fn read(line: &Line, wake: impl AsFd, count: usize) -> Result<Vec<([u8; LENGTH],
             }
         }
         let last = clock::now();
+        if telegram[0] != lms::telegram::STX {
+            // A pause that was none: whoever writes was kept from running.
+            line.await_pause(PAUSE).map_err(words)?;
+            continue;
+        }
         rustix::io::write(&wake, &1u64.to_ne_bytes()).map_err(|error| error.to_string())?;
         duration.learn(last - first);
-        if telegram[0] != lms::telegram::STX {
-            return Err("lost the beginning of a telegram".into());
-        }
         if count > 0 {
             kept.push((telegram, last));
         }

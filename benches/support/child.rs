@@ -24,8 +24,11 @@ impl Guard {
         self.0.id()
     }
 
-    /// Ends it as a crash would.
+    /// Ends it as a crash would; an error if it ended by itself before.
     pub(crate) fn kill(mut self) -> Outcome<()> {
+        if let Some(status) = self.0.try_wait()? {
+            return Err(format!("process {} ended early: {status}", self.pid()).into());
+        }
         self.0.kill()?;
         self.wait()
     }

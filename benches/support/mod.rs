@@ -28,7 +28,9 @@ pub(crate) fn main(measure: impl FnOnce(&options::Options) -> Outcome<()>) -> Ex
     let words: Vec<String> = std::env::args().skip(1).collect();
     let outcome = match words.first().map(String::as_str) {
         Some(PART) => play(&words[1..]),
-        _ => options::Options::parse(&words).and_then(|options| measure(&options)),
+        _ => stage::Stage::sweep()
+            .and_then(|()| options::Options::parse(&words))
+            .and_then(|options| measure(&options)),
     };
     match outcome {
         Ok(()) => ExitCode::SUCCESS,

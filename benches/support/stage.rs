@@ -1,6 +1,6 @@
 //! Where it all takes place: a domain and a directory of its own, gone afterwards, and the processes in it.
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 use schema::{Domain, Environment};
@@ -17,11 +17,27 @@ pub(crate) struct Stage {
 impl Stage {
     /// A new one of this process.
     pub(crate) fn new() -> Outcome<Stage> {
-        let name = format!("bench-{}", std::process::id());
+        let stage = Stage::of(std::process::id())?;
+        std::fs::create_dir_all(&stage.directory)?;
+        Ok(stage)
+    }
+
+    fn of(pid: u32) -> Outcome<Stage> {
+        let name = format!("bench-{pid}");
         let domain = Domain::of_hub(&name, None, &Environment::of_process())?;
-        let directory = std::env::temp_dir().join(format!("scanhub-{name}"));
-        std::fs::create_dir_all(&directory)?;
-        Ok(Stage { domain, directory })
+        Ok(Stage { domain, directory: std::env::temp_dir().join(format!("scanhub-{name}")) })
+    }
+
+    /// Removes what benches left that were interrupted.
+    pub(crate) fn sweep() -> Outcome<()> {
+        for entry in std::fs::read_dir(std::env::temp_dir())? {
+            let name = entry?.file_name().to_string_lossy().into_owned();
+            let pid = name.strip_prefix("scanhub-bench-").and_then(|pid| pid.parse().ok());
+            if let Some(pid) = pid.filter(|pid| !Path::new(&format!("/proc/{pid}")).exists()) {
+                drop(Stage::of(pid)?);
+            }
+        }
+        Ok(())
     }
 
     /// The file with the truth.

@@ -61,11 +61,18 @@ impl<P: Payload + ?Sized> Attachment<P> {
 
     /// The next sample if one waits; never waits itself. Failures as [`next`](Self::next).
     pub fn try_next(&mut self) -> Result<Option<Received<P>>, Failure> {
+        // What is there comes before the question whether the hub still is: that takes longer than receiving.
+        if self.follower.attached()
+            && let Some(received) = self.follower.receive(&mut self.session)?
+        {
+            return Ok(Some(received));
+        }
         self.session.look()?;
         self.follower.receive(&mut self.session)
     }
 
-    /// A hub lives in the domain, as of the last call of [`next`](Self::next) or [`try_next`](Self::try_next).
+    /// A hub lives in the domain, as of the last call of [`next`](Self::next) or [`try_next`](Self::try_next) that found
+    /// no sample waiting.
     pub fn hub_lives(&self) -> bool {
         self.session.domain().is_some()
     }

@@ -156,14 +156,17 @@ impl<'a> LinkThread<'a> {
             }
         };
         let facts = (state_of(session), session.trouble(), session.sensor().unit);
-        if self.facts != Some(facts) {
+        let (state, ..) = facts;
+        let changed = self.facts != Some(facts);
+        if changed {
             self.facts = Some(facts);
             self.error = self.trouble(session);
         }
-        let (state, ..) = facts;
-        let error = std::mem::take(&mut self.error);
-        self.show(Some(session), state, &error);
-        self.error = error;
+        if changed || clock::now() >= self.next_status.min(self.next_greeting) {
+            let error = std::mem::take(&mut self.error);
+            self.show(Some(session), state, &error);
+            self.error = error;
+        }
         // While telegrams come there is no need for wake-ups of the status' own.
         let bound = if published || state == State::Streaming { Nanos::MAX } else { self.next_status };
         Ok((watch, until.min(bound)))

@@ -75,18 +75,21 @@ pub fn run(config: &Config, domain: &Domain, on_ready: impl FnOnce(&Ready)) -> R
     })
 }
 
-/// Once a second looks after what dead consumers left, until a signal says to end.
+/// Looks after the links and after what dead consumers left, until a signal says to end.
 fn keep_up(node: &Node, signals: &UnixStream, is_alive: impl Fn() -> bool) -> Result<(), Failure> {
-    loop {
+    for look in 1_u64.. {
         let mut fds = [PollFd::new(signals, PollFlags::IN)];
-        if poll(&mut fds, Some(&UPKEEP)).is_ok() && !fds[0].revents().is_empty() {
+        if poll(&mut fds, Some(&LOOK)).is_ok() && !fds[0].revents().is_empty() {
             return Ok(());
         }
         if !is_alive() {
             return Err(broken_thread());
         }
-        node.try_cleanup_dead_nodes();
+        if look % UPKEEP == 0 {
+            node.try_cleanup_dead_nodes();
+        }
     }
+    Ok(())
 }
 
 /// A socket that becomes readable at SIGINT or SIGTERM.
@@ -122,5 +125,7 @@ fn no_resource(what: &str, error: &dyn std::fmt::Display) -> Failure {
     Failure::new(Kind::Short, format!("{what} cannot be had: {error}"), "try again later")
 }
 
-/// Between two looks at what dead processes left.
-const UPKEEP: Timespec = Timespec { tv_sec: 1, tv_nsec: 0 };
+/// Between two looks whether the links are alive.
+const LOOK: Timespec = Timespec { tv_sec: 1, tv_nsec: 0 };
+/// Looks between two at what dead processes left: each reads the directory of all nodes, and nobody waits for it.
+const UPKEEP: u64 = 5;
