@@ -16,6 +16,8 @@ pub(crate) struct Session {
     presence: Presence,
     joined: Option<Joined>,
     number: u32,
+    /// Wake-ups were taken since the last sleep, and samples looked for since.
+    taken: bool,
 }
 
 struct Joined {
@@ -27,7 +29,7 @@ struct Joined {
 impl Session {
     /// Will join the first live one of `places`, as soon as one is.
     pub(crate) fn new(places: Vec<Domain>) -> Session {
-        Session { presence: Presence::new(places), joined: None, number: 0 }
+        Session { presence: Presence::new(places), joined: None, number: 0, taken: false }
     }
 
     /// Looks whether the hub is there, and joins its domain if it is a new place.
@@ -77,13 +79,19 @@ impl Session {
         P::open(&joined.node, sensor)?.map(|topic| P::subscriber(&topic)).transpose()
     }
 
-    /// Sleeps until something was sent, at the latest until `until`, and 100 ms at most. Hold no sample meanwhile.
-    pub(crate) fn wait(&self, until: Option<Instant>) -> Result<(), Failure> {
+    /// Sleeps until something was sent, at the latest until `until`, and 100 ms at most; returns at once if something
+    /// may have been sent since the caller looked. Hold no sample meanwhile.
+    pub(crate) fn wait(&mut self, until: Option<Instant>) -> Result<(), Failure> {
         let left = until.map_or(LONGEST_WAIT, |until| until.saturating_duration_since(Instant::now()));
         let listeners: Vec<&Listener> = match &self.joined {
             Some(joined) => joined.listeners.iter().map(|(_, listener)| listener).collect(),
             None => Vec::new(),
         };
+        if !self.taken && ipc::take_wakeups(&listeners)? {
+            self.taken = true;
+            return Ok(());
+        }
+        self.taken = false;
         ipc::sleep(&listeners, left.min(LONGEST_WAIT))
     }
 }

@@ -6,6 +6,7 @@ mod sleep;
 mod trouble;
 
 use std::fmt::Debug;
+use std::mem::MaybeUninit;
 use std::os::unix::ffi::OsStrExt;
 use std::time::Duration;
 
@@ -21,7 +22,7 @@ use iceoryx2::service::port_factory::{event, publish_subscribe};
 use self::trouble::{Trouble, create, no_port, no_publisher, open};
 use crate::{Domain, Failure, Header, Kind, Scan, Status, Topic, Wake, access, limits, of_service};
 
-pub use self::sleep::sleep;
+pub use self::sleep::{sleep, take_wakeups};
 pub use iceoryx2::port::update_connections::UpdateConnections;
 pub use iceoryx2::port::{LoanError, ReceiveError, SendError};
 pub use iceoryx2::prelude::PortFactory;
@@ -38,6 +39,10 @@ pub type Publisher<P> = port::publisher::Publisher<Service, P, Header>;
 pub type Subscriber<P> = port::subscriber::Subscriber<Service, P, Header>;
 /// A received sample: the payload by `*`, read-only, in shared memory; the header by `user_header()`.
 pub type Sample<P> = iceoryx2::sample::Sample<Service, P, Header>;
+/// A loaned sample that is not sent yet.
+pub type SampleMut<P> = iceoryx2::sample_mut::SampleMut<Service, P, Header>;
+/// A loaned slice of bytes that is not written yet.
+pub type BytesMut = iceoryx2::sample_mut_uninit::SampleMutUninit<Service, [MaybeUninit<u8>], Header>;
 /// What wakes the consumers of one sensor.
 pub type WakeService = event::PortFactory<Service>;
 /// Wakes consumers.

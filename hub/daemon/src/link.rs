@@ -126,6 +126,10 @@ impl<'a> LinkThread<'a> {
             if woken == Woken::Stop {
                 return Ok(());
             }
+            if !watch {
+                // The telegram's end is near: what can be done before it is not done after it.
+                self.topics.prepare();
+            }
             let len = tty.read(session.spare())?;
             let now = clock::now();
             session.commit(now, len);

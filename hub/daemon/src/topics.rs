@@ -3,7 +3,8 @@
 
 use lms::session::Received;
 use schema::ipc::{
-    self, Node, Notifier, Payload, PortFactory, Publisher, TopicService, UpdateConnections, WakeService,
+    self, BytesMut, Node, Notifier, Payload, PortFactory, Publisher, SampleMut, TopicService,
+    UpdateConnections, WakeService,
 };
 use schema::{Failure, Flags, Header, Quality, Scan, Status, Wake};
 
@@ -13,6 +14,11 @@ use crate::clock;
 pub(crate) struct Topics {
     telegram: Outlet<[u8]>,
     scan: Outlet<Scan>,
+    /// Loaned while there was time, for the telegram that is coming.
+    next_telegram: Option<BytesMut>,
+    next_scan: Option<SampleMut<Scan>>,
+    /// Length of the last telegram.
+    last_len: usize,
     status: Outlet<Status>,
     notifier: Notifier,
     _wake: WakeService,
@@ -57,6 +63,9 @@ impl Topics {
         Ok(Topics {
             telegram: Outlet::new(node, sensor)?,
             scan: Outlet::new(node, sensor)?,
+            next_telegram: None,
+            next_scan: None,
+            last_len: 0,
             status: Outlet::new(node, sensor)?,
             notifier: ipc::notifier(&wake)?,
             _wake: wake,
@@ -69,6 +78,16 @@ impl Topics {
     /// What all samples from now on have in common: bits of [`Flags`].
     pub(crate) fn set_flags(&mut self, flags: u16) {
         self.header.flags = flags;
+    }
+
+    /// Takes loans for a telegram as long as the last one and for its scan, which will be there in a moment.
+    pub(crate) fn prepare(&mut self) {
+        if self.next_telegram.is_none() {
+            self.next_telegram = self.telegram.publisher.loan_slice_uninit(self.last_len).ok();
+        }
+        if self.next_scan.is_none() {
+            self.next_scan = self.scan.publisher.loan().ok();
+        }
     }
 
     /// Publishes the telegram and takes its number and stamps for all that follows from it.
@@ -87,7 +106,10 @@ impl Topics {
         self.header.flags |= if received.estimated { Flags::STAMP_ESTIMATED } else { 0 };
         let bytes = received.telegram.bytes();
         let header = Header { topic_seq: self.telegram.take_number(), ..self.header };
-        let Ok(loan) = self.telegram.publisher.loan_slice_uninit(bytes.len()) else {
+        self.last_len = bytes.len();
+        let prepared = self.next_telegram.take().filter(|loan| loan.payload().len() == bytes.len());
+        let Some(loan) = prepared.or_else(|| self.telegram.publisher.loan_slice_uninit(bytes.len()).ok())
+        else {
             self.loan_failed += 1;
             return;
         };
@@ -102,7 +124,7 @@ impl Topics {
     /// Publishes a scan of the last telegram, which `fill` writes in place.
     pub(crate) fn scan(&mut self, fill: impl FnOnce(&mut Scan)) {
         let topic_seq = self.scan.take_number();
-        let Ok(mut sample) = self.scan.publisher.loan() else {
+        let Some(mut sample) = self.next_scan.take().or_else(|| self.scan.publisher.loan().ok()) else {
             self.loan_failed += 1;
             return;
         };

@@ -1,44 +1,54 @@
-//! Sleeping at several wake services at once. Hides what consumers are woken by; refuses to know why they wait.
+//! Sleeping at the wake services of several sensors at once. Hides what consumers are woken by; refuses to know why
+//! they wait.
+//!
+//! Being woken and taking the wake-ups are two calls, because what was sent shall be received between them: a wake-up
+//! that is left pending loses nothing, and taking it costs several system calls.
+#![allow(unsafe_code)]
 
-use std::thread;
+use std::os::fd::BorrowedFd;
 use std::time::Duration;
 
 use iceoryx2::port::listener::ListenerWaitError;
-use iceoryx2::prelude::{CallbackProgression, SignalHandlingMode, WaitSetBuilder};
+use iceoryx2::prelude::FileDescriptorBased;
+use rustix::event::{PollFd, PollFlags, Timespec, poll};
+use rustix::io::Errno;
 
-use super::{Listener, Service};
+use super::Listener;
 use crate::{Failure, Kind};
 
-/// Sleeps until one of `listeners` is woken, a signal comes or `timeout` is over, and takes all that woke it:
-/// receive what there is before the next sleep, notifications coalesce.
+/// Sleeps until one of `listeners` is woken, a signal comes or `timeout` is over. Wake-ups stay pending: take them by
+/// [`take_wakeups`], then look once more for samples, before the next sleep.
 ///
-/// [`Kind::Short`] if there are too few descriptors to wait with.
+/// [`Kind::Short`] if the system cannot wait.
 pub fn sleep(listeners: &[&Listener], timeout: Duration) -> Result<(), Failure> {
-    match listeners {
-        [] => thread::sleep(timeout),
-        [one] => match one.timed_wait(|_| {}, timeout) {
+    let mut fds: Vec<PollFd<'_>> = listeners
+        .iter()
+        .map(|listener| {
+            // SAFETY: the descriptor is open as long as the listener lives, which is borrowed for the whole call.
+            let fd = unsafe { BorrowedFd::borrow_raw(listener.file_descriptor().native_handle()) };
+            PollFd::from_borrowed_fd(fd, PollFlags::IN)
+        })
+        .collect();
+    let timeout = Timespec { tv_sec: timeout.as_secs() as i64, tv_nsec: i64::from(timeout.subsec_nanos()) };
+    match poll(&mut fds, Some(&timeout)) {
+        Ok(_) | Err(Errno::INTR) => Ok(()),
+        Err(error) => Err(broken(&error)),
+    }
+}
+
+/// Takes all wake-ups of `listeners` that are pending; returns whether there were any. What was sent before this call
+/// has to be looked for after it.
+///
+/// [`Kind::Short`] if a listener does not work.
+pub fn take_wakeups(listeners: &[&Listener]) -> Result<bool, Failure> {
+    let mut any = false;
+    for listener in listeners {
+        match listener.try_wait(|_| any = true) {
             Ok(_) | Err(ListenerWaitError::InterruptSignal) => {}
             Err(error) => return Err(broken(&error)),
-        },
-        several => {
-            let set = WaitSetBuilder::new()
-                .signal_handling_mode(SignalHandlingMode::Disabled)
-                .create::<Service>()
-                .map_err(|error| broken(&error))?;
-            let guards: Result<Vec<_>, _> = several.iter().map(|one| set.attach_notification(*one)).collect();
-            let guards = guards.map_err(|error| broken(&error))?;
-            set.wait_and_process_once_with_timeout(|_| CallbackProgression::Continue, timeout)
-                .map_err(|error| broken(&error))?;
-            drop(guards);
-            for one in several {
-                match one.try_wait(|_| {}) {
-                    Ok(_) | Err(ListenerWaitError::InterruptSignal) => {}
-                    Err(error) => return Err(broken(&error)),
-                }
-            }
         }
     }
-    Ok(())
+    Ok(any)
 }
 
 fn broken(error: &dyn std::fmt::Debug) -> Failure {
