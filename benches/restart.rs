@@ -1,7 +1,7 @@
 //! What does a crash of the hub cost its consumers? The hub is killed with SIGKILL and started again, twenty times in
 //! all, while a process per sensor follows its telegrams: how long until the services are up and until each consumer
 //! has a telegram in its hands, beside a bare reader that opens the same streaming ptys and wakes a process. Counts
-//! what was torn (CRC), whom the restart lost, and writes to the sensors' EEPROM. It does not tell how long a service
+//! what was torn (CRC), what was missed within a life, and writes to the sensors' EEPROM. It does not tell how long a service
 //! manager takes to notice.
 
 mod support;
