@@ -4,7 +4,9 @@
 mod cli;
 mod demo;
 
+use std::fs::File;
 use std::io::{self, Write};
+use std::os::fd::AsFd;
 use std::os::unix::net::UnixStream;
 use std::path::Path;
 use std::process::ExitCode;
@@ -50,7 +52,9 @@ fn main() -> ExitCode {
 
 fn dispatch(cli: &Cli) -> Result<(), Failure> {
     let everywhere = &cli.everywhere;
-    let mut out = io::stdout().lock();
+    // Without the standard library's buffer, which cuts at line feeds: one write is one sample, a raw one too.
+    let stdout = io::stdout().as_fd().try_clone_to_owned().map(File::from);
+    let mut out = stdout.map_err(|error| Failure::new(Kind::Failed, format!("no stdout: {error}"), ""))?;
     match &cli.verb {
         Verb::Run(run) => run_hub(run, everywhere),
         Verb::Demo(demo) => {
