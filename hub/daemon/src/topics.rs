@@ -88,6 +88,9 @@ impl Topics {
         if self.next_scan.is_none() {
             self.next_scan = self.scan.publisher.loan().ok();
         }
+        // Who came is connected now, not while the telegram waits; and what sending looks at is near the processor.
+        connect(&self.telegram.publisher);
+        connect(&self.scan.publisher);
     }
 
     /// Publishes the telegram and takes its number and stamps for all that follows from it.
@@ -169,14 +172,18 @@ impl Topics {
 
     /// Gives late joiners what they would else get with the next status.
     pub(crate) fn greet(&self) {
-        if let Err(error) = self.status.publisher.update_connections() {
-            tracing::debug!(?error, "a consumer could not be connected");
-        }
+        connect(&self.status.publisher);
     }
 
     /// Consumers that got nothing although they are attached: their descriptors or ours ran out, and sending says Ok
     /// all the same.
     pub(crate) fn unreached(&self) -> usize {
         self.telegram.missed_out().max(self.scan.missed_out()).max(self.status.missed_out())
+    }
+}
+
+fn connect(publisher: &impl UpdateConnections) {
+    if let Err(error) = publisher.update_connections() {
+        tracing::debug!(?error, "a consumer could not be connected");
     }
 }
