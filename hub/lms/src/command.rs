@@ -39,8 +39,11 @@ impl Request {
         }
     }
 
-    /// The request that `telegram` says; `None` if it is another one or its data are not as they should be.
+    /// The request that `telegram` says; `None` if it is another one, a reply, or its data are not as they should be.
     pub fn decode(telegram: Telegram<'_>) -> Option<Request> {
+        if telegram.is_reply() {
+            return None;
+        }
         match (telegram.command(), telegram.data()) {
             (STATUS, []) => Some(Request::Status),
             (TYPE, []) => Some(Request::Type),
