@@ -23,7 +23,9 @@ pub const TARGETS: [Target; 4] =
 /// The first byte says what to expect, the second the size of the pieces.
 pub fn framer(data: &[u8]) {
     let [expects, piece, bytes @ ..] = data else { return };
-    let expect = match (expects & 3, bytes.first_chunk()) {
+    // The head of a stream is that of a telegram that came, so its length is possible.
+    let head = bytes.first_chunk().filter(|head: &&[u8; 7]| head[3] < 3);
+    let expect = match (expects & 3, head) {
         (1, Some(&header)) => Expect::Stream { header, reply: None },
         (2, Some(&header)) => Expect::Stream { header, reply: Some(expects | 0x80) },
         _ => Expect::Anything,
