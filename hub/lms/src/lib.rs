@@ -20,8 +20,10 @@ mod outgoing;
 pub mod parameters;
 mod phase;
 pub mod reply;
+mod search;
 mod sensor;
 pub mod session;
+mod start;
 pub mod telegram;
 pub mod variant;
 
