@@ -73,6 +73,11 @@ pub(crate) fn sensor(baud: Baud) -> Machine {
     Machine::new(settings, Source::Room(Room::new(World::Room, 1)))
 }
 
+/// The sensor of `settings` in a room.
+pub(crate) fn sensor_with(settings: machine::Settings) -> Machine {
+    Machine::new(settings, Source::Room(Room::new(World::Room, 1)))
+}
+
 /// Makes `machine` stream, as a host did that is gone; returns the time.
 pub(crate) fn make_stream(machine: &mut Machine) -> Nanos {
     let mut now = 10 * MILLIS;

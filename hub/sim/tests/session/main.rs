@@ -3,7 +3,12 @@
 mod adoption;
 mod bench;
 mod control;
+mod figures;
+mod habits;
+mod installation;
 mod loss;
+mod modes;
+mod power;
 mod rest;
 mod start;
 mod trouble;
