@@ -120,6 +120,12 @@ impl Bench {
         }
     }
 
+    /// A session with a past, none of whose requests is half said, gets this machine.
+    pub(crate) fn adopting(session: Session, machine: Machine, now: Nanos) -> Bench {
+        let (port, read) = (session.baud(), session.tally().read);
+        Bench { port, read, session, ..Bench::new(machine, now) }
+    }
+
     /// Runs for `span`.
     pub(crate) fn run(&mut self, span: Nanos) {
         let end = self.now + span;

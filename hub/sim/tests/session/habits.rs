@@ -33,27 +33,27 @@ fn all_stream(habits: Habits, seeds: std::ops::Range<u64>, limit: u64) {
 
 #[test]
 fn a_third_of_the_requests_is_overlooked() {
-    all_stream(Habits { overlooks: 0.3, ..Habits::default() }, 0..20, 15_000);
+    all_stream(Habits { overlooks: 0.3, ..Habits::default() }, 0..5, 15_000);
 }
 
 #[test]
 fn a_third_of_the_requests_gets_a_nak() {
-    all_stream(Habits { naks: 0.3, ..Habits::default() }, 0..10, 15_000);
+    all_stream(Habits { naks: 0.3, ..Habits::default() }, 0..3, 15_000);
 }
 
 #[test]
 fn replies_come_twice() {
-    all_stream(Habits { doubles: 1.0, ..Habits::default() }, 0..5, 5_000);
-    all_stream(Habits { doubles: 0.5, overlooks: 0.2, ..Habits::default() }, 0..5, 15_000);
+    all_stream(Habits { doubles: 1.0, ..Habits::default() }, 0..2, 5_000);
+    all_stream(Habits { doubles: 0.5, overlooks: 0.2, ..Habits::default() }, 0..3, 15_000);
 }
 
 #[test]
 fn acknowledgements_and_replies_are_late() {
-    for late in [50, 100, 200, 300] {
+    for late in [100, 300] {
         let late_ns = late * MILLIS;
         all_stream(Habits { late_acknowledge_ns: late_ns, ..Habits::default() }, 0..1, 20_000);
         all_stream(Habits { late_reply_ns: late_ns, ..Habits::default() }, 0..1, 20_000);
-        all_stream(Habits { late_reply_ns: late_ns, doubles: 0.5, ..Habits::default() }, 0..2, 20_000);
+        all_stream(Habits { late_reply_ns: late_ns, doubles: 0.5, ..Habits::default() }, 0..1, 20_000);
     }
 }
 

@@ -9,6 +9,7 @@ mod installation;
 mod loss;
 mod modes;
 mod power;
+mod property;
 mod rest;
 mod start;
 mod trouble;

@@ -54,7 +54,7 @@ impl Bench {
 #[test]
 fn whatever_streams_at_500k_is_the_wanted_stream_within_half_a_second() {
     for operating in modes() {
-        for age in [1_000, 1_007, 1_019, 1_333] {
+        for age in [1_000, 1_019] {
             for (address, availability) in [(0, 0), (5, 2)] {
                 let settings = Settings { baud: Baud::B500000, address, availability, ..Settings::default() };
                 let (machine, now) = streaming(settings, &operating, age * MILLIS);
@@ -86,7 +86,7 @@ fn another_variant_is_switched_within_half_a_second() {
 fn whatever_streams_at_another_rate_is_found_within_five_seconds() {
     for baud in [Baud::B9600, Baud::B19200, Baud::B38400] {
         for operating in modes() {
-            for age in [1_000, 1_111, 1_357] {
+            for age in [1_000, 1_357] {
                 let settings = Settings { baud, address: 1, ..Settings::default() };
                 let (machine, now) = streaming(settings, &operating, age * MILLIS);
                 let mut bench = Bench::new(machine, now);
@@ -100,7 +100,7 @@ fn whatever_streams_at_another_rate_is_found_within_five_seconds() {
 fn a_slow_link_takes_over_what_streams_too() {
     for wanted in [Baud::B9600, Baud::B19200, Baud::B38400] {
         for baud in Baud::ALL {
-            for operating in modes() {
+            for operating in [Operating::All, Operating::Partial, Operating::Means(250)] {
                 let (machine, now) =
                     streaming(Settings { baud, ..Settings::default() }, &operating, 1_003 * MILLIS);
                 let mut bench = Bench::wanting(lms::Settings { baud: wanted, ..WANTED }, machine, now);
