@@ -11,8 +11,10 @@ mod candidates;
 pub mod command;
 pub mod crc;
 mod dialogue;
+pub mod exchange;
 pub mod framer;
 pub mod header;
+pub mod inquiry;
 pub mod measured;
 mod outgoing;
 mod phase;
@@ -22,6 +24,7 @@ pub mod session;
 pub mod telegram;
 pub mod variant;
 
+pub use inquiry::Inquiry;
 pub use phase::{Reason, Settings};
 pub use sensor::{Sensor, State, Trouble};
 pub use session::Session;
