@@ -50,10 +50,10 @@ impl Arrivals {
                 break;
             }
             let behind = (read.end - offset - 1) as usize;
-            let at = read.now.saturating_sub(line_time(behind, baud));
-            if at < stamp.at {
-                stamp = Stamp { at, estimated: behind > ESTIMATED };
-            }
+            let own = read.now.saturating_sub(line_time(behind, baud));
+            let at = own.min(stamp.at);
+            // The last one here is the read that brought it: it came with others, or long before it was read.
+            stamp = Stamp { at, estimated: behind > ESTIMATED || own > at + line_time(ESTIMATED, baud) };
         }
         stamp
     }

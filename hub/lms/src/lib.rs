@@ -12,8 +12,10 @@ pub mod command;
 pub mod crc;
 mod dialogue;
 pub mod eeprom;
+pub mod exchange;
 pub mod framer;
 pub mod header;
+pub mod inquiry;
 pub mod measured;
 pub mod operating;
 mod outgoing;
@@ -25,6 +27,7 @@ pub mod session;
 pub mod telegram;
 pub mod variant;
 
+pub use inquiry::Inquiry;
 pub use phase::{Control, Reason, Settings};
 pub use sensor::{Sensor, State, Trouble};
 pub use session::Session;

@@ -7,10 +7,37 @@ use crate::telegram::{Encoded, REPLY};
 use crate::variant::Baud;
 use crate::{MICROS, MILLIS, Nanos, line_time};
 
+/// What can be said: a telegram that has a reply, which takes its time.
+pub(crate) trait Say {
+    /// The telegram that says it to the sensor at `address`.
+    fn encode(&self, address: u8) -> Encoded;
+    /// Its command byte.
+    fn command(&self) -> u8;
+    /// How long the sensor may work between acknowledgement and reply.
+    fn work(&self) -> Nanos;
+}
+
+impl Say for Request {
+    fn encode(&self, address: u8) -> Encoded {
+        Request::encode(*self, address)
+    }
+
+    fn command(&self) -> u8 {
+        Request::command(*self)
+    }
+
+    fn work(&self) -> Nanos {
+        match self {
+            Request::Stream | Request::Stop | Request::Baud(_) => MODE_TIMEOUT,
+            _ => REPLY_TIMEOUT,
+        }
+    }
+}
+
 /// The open request.
 #[derive(Clone, Debug)]
-pub(crate) struct Outgoing {
-    pub(crate) request: Request,
+pub(crate) struct Outgoing<R = Request> {
+    pub(crate) request: R,
     encoded: Encoded,
     sent: usize,
     not_before: Nanos,
@@ -20,9 +47,9 @@ pub(crate) struct Outgoing {
     give_up_at: Nanos,
 }
 
-impl Outgoing {
+impl<R: Say> Outgoing<R> {
     /// `request` to the sensor at `address`, from `not_before` on, at most `tries` times.
-    pub(crate) fn new(request: Request, address: u8, not_before: Nanos, tries: u8) -> Self {
+    pub(crate) fn new(request: R, address: u8, not_before: Nanos, tries: u8) -> Self {
         let encoded = request.encode(address);
         Outgoing {
             request,
@@ -56,11 +83,7 @@ impl Outgoing {
         if core::mem::replace(&mut self.acknowledged, true) {
             return;
         }
-        let work = match self.request {
-            Request::Stream | Request::Stop | Request::Baud(_) => MODE_TIMEOUT,
-            _ => REPLY_TIMEOUT,
-        };
-        self.give_up_at = now + work + line_time(LONGEST_REPLY, baud.rate());
+        self.give_up_at = now + self.request.work() + line_time(LONGEST_REPLY, baud.rate());
     }
 
     /// Begins again not before `at`; `false` if all tries are used up.
@@ -100,9 +123,9 @@ const GAP: Nanos = 120 * MICROS;
 /// ACK or NAK comes within 60 ms (Telegram listing 4.3); the rest is for adapters.
 const ACKNOWLEDGE_TIMEOUT: Nanos = 100 * MILLIS;
 /// Type, status and configuration were captured to take up to 158 ms.
-const REPLY_TIMEOUT: Nanos = 500 * MILLIS;
+pub(crate) const REPLY_TIMEOUT: Nanos = 500 * MILLIS;
 /// A change of mode takes up to 3 s (Telegram listing 7.3).
-const MODE_TIMEOUT: Nanos = 3_000 * MILLIS;
+pub(crate) const MODE_TIMEOUT: Nanos = 3_000 * MILLIS;
 /// Bytes of the status reply.
 const LONGEST_REPLY: usize = 160;
 /// After a NAK the sensor wants 30 ms of peace (Telegram listing 4.3).
