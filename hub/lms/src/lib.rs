@@ -25,7 +25,7 @@ pub mod session;
 pub mod telegram;
 pub mod variant;
 
-pub use phase::{Reason, Settings};
+pub use phase::{Control, Reason, Settings};
 pub use sensor::{Sensor, State, Trouble};
 pub use session::Session;
 
