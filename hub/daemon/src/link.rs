@@ -115,7 +115,10 @@ impl<'a> LinkThread<'a> {
                     port.write(byte)?;
                     session.transmitted(clock::now());
                 }
-                Output::Telegram(received) => {
+                Output::Telegram(mut received) => {
+                    let line_errors = port.line_errors();
+                    self.account.line_errors += line_errors;
+                    received.reasons |= if line_errors > 0 { suspect::LINE_ERROR } else { 0 };
                     self.publish(&received, None);
                     self.wake(Wake::Telegram);
                     published = true;
