@@ -310,6 +310,7 @@ pub(crate) fn state_of(session: &Session) -> State {
         lms::State::Starting => State::Starting,
         lms::State::Streaming => State::Streaming,
         lms::State::Silent => State::Silent,
+        lms::State::Paused => State::Paused,
     }
 }
 

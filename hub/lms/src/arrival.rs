@@ -39,21 +39,23 @@ impl Arrivals {
         self.next += 1;
     }
 
-    /// When byte number `offset` arrived at the latest: the bytes that came behind it in the same read took their
-    /// time on the line.
+    /// When byte number `offset` arrived at the latest: whatever came behind it, in the same read or in one right after
+    /// it, took its time on the line.
     pub(crate) fn stamp(&self, offset: u64, baud: u32) -> Stamp {
         let oldest = self.next.saturating_sub(Arrivals::CAPACITY);
-        let mut found = Read { end: offset + 1, now: 0 };
+        let mut stamp = Stamp { at: Nanos::MAX, estimated: true };
         for n in (oldest..self.next).rev() {
             let read = self.reads[n % Arrivals::CAPACITY];
             if read.end <= offset {
                 break;
             }
-            found = read;
+            let behind = (read.end - offset - 1) as usize;
+            let at = read.now.saturating_sub(line_time(behind, baud));
+            if at < stamp.at {
+                stamp = Stamp { at, estimated: behind > ESTIMATED };
+            }
         }
-        let behind = (found.end - offset - 1) as usize;
-        let at = found.now.saturating_sub(line_time(behind, baud));
-        Stamp { at, estimated: behind > ESTIMATED }
+        stamp
     }
 }
 
@@ -135,6 +137,9 @@ mod tests {
         assert_eq!(arrivals.stamp(0, 500_000), Stamp { at: 1_000_000 - 15 * 20_000, estimated: false });
         assert_eq!(arrivals.stamp(499, 500_000), Stamp { at: 11_000_000, estimated: false });
         assert_eq!(arrivals.stamp(16, 500_000), Stamp { at: 11_000_000 - 483 * 20_000, estimated: true });
+        // Two reads of what had been waiting: the line was not faster because of that.
+        arrivals.note(11_010_000, 500);
+        assert_eq!(arrivals.stamp(499, 500_000), Stamp { at: 11_010_000 - 500 * 20_000, estimated: true });
         for _ in 0..200 {
             arrivals.note(20_000_000, 1);
         }

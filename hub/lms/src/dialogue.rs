@@ -5,9 +5,10 @@ use crate::Nanos;
 use crate::command::Request;
 use crate::header::Expect;
 use crate::measured::Measured;
-use crate::outgoing::{NAK_PAUSE, Outgoing};
+use crate::outgoing::{FORGOTTEN, NAK_PAUSE, Outgoing};
 use crate::phase::{
-    BESIDE_VALUES, LISTEN, PAUSE, Phase, QUESTIONS, Reason, SETTLE, SILENCE, Settings, Step, TRIES,
+    BESIDE_VALUES, Control, LISTEN, PAUSE, Phase, QUESTIONS, Reason, SETTLE, SILENCE, STOPS, Settings, Step,
+    TRIES,
 };
 use crate::reply::Reply;
 use crate::sensor::{Sensor, State, Trouble};
@@ -56,6 +57,7 @@ impl Dialogue {
             Phase::Switching => State::Switching,
             Phase::Starting { .. } => State::Starting,
             Phase::Streaming { .. } | Phase::Following => State::Streaming,
+            Phase::Paused { .. } => State::Paused,
         }
     }
 
@@ -111,6 +113,23 @@ impl Dialogue {
         }
     }
 
+    pub(crate) fn control(&mut self, control: Control, now: Nanos) {
+        match (control, self.phase) {
+            (_, Phase::Following) | (Control::Pause, Phase::Paused { .. }) => {}
+            (Control::Pause, _) => {
+                self.phase = Phase::Paused { stops_left: STOPS };
+                self.trouble = None;
+                self.ask(Request::Stop, now, TRIES);
+            }
+            (Control::Resume, Phase::Paused { .. }) => self.begin(now),
+            (Control::Resync, _) => {
+                self.resyncs += 1;
+                self.begin(now);
+            }
+            (Control::Resume, _) => {}
+        }
+    }
+
     pub(crate) fn on_acknowledge(&mut self, now: Nanos) {
         let baud = self.baud;
         if let Some(open) = self.open.as_mut().filter(|open| open.is_out()) {
@@ -147,6 +166,12 @@ impl Dialogue {
         match self.phase {
             Phase::Streaming { silent_at: ref mut at, .. } => *at = silent_at,
             Phase::Following => {}
+            Phase::Paused { ref mut stops_left } => {
+                if self.open.is_none() && *stops_left > 0 {
+                    *stops_left -= 1;
+                    self.ask(Request::Stop, now, TRIES);
+                }
+            }
             Phase::Listening { .. } | Phase::Probing { .. } if self.baud != self.settings.baud => {
                 self.sensor.streams = true;
                 self.switch(now);
@@ -209,6 +234,7 @@ impl Dialogue {
                 }
             }
             (Phase::Streaming { .. }, _) => self.question(now),
+            (Phase::Paused { .. }, _) => self.sensor.streams = false,
             _ => {
                 self.trouble = Some(Trouble::Refused(request));
                 self.probe(now + PAUSE, 0);
@@ -239,11 +265,19 @@ impl Dialogue {
             Phase::Starting { step: Step::Type } => self.start(Step::Configuration, at),
             Phase::Starting { step: Step::Configuration } => self.start(Step::Stream, at),
             Phase::Streaming { .. } => self.question(at),
+            Phase::Paused { .. } => {}
             _ => {
                 self.trouble = Some(Trouble::Unanswered(request));
                 self.probe(at, 0);
             }
         }
+    }
+
+    /// As a new session does: at the wanted rate, without a word.
+    fn begin(&mut self, now: Nanos) {
+        self.trouble = None;
+        self.change_baud(self.settings.baud);
+        self.listen(now, State::Probing);
     }
 
     fn listen(&mut self, now: Nanos, shown: State) {
@@ -325,6 +359,9 @@ impl Dialogue {
 
     fn ask(&mut self, request: Request, not_before: Nanos, tries: u8) {
         let address = self.sensor.address.map_or(0, |address| address & !REPLY);
+        // What the sensor has half heard must be forgotten first.
+        let is_cut = self.open.as_ref().is_some_and(Outgoing::is_partly_out);
+        let not_before = if is_cut { not_before + FORGOTTEN } else { not_before };
         self.open = Some(Outgoing::new(request, address, not_before, tries));
     }
 

@@ -11,10 +11,13 @@ mod candidates;
 pub mod command;
 pub mod crc;
 mod dialogue;
+pub mod eeprom;
 pub mod framer;
 pub mod header;
 pub mod measured;
+pub mod operating;
 mod outgoing;
+pub mod parameters;
 mod phase;
 pub mod reply;
 mod sensor;
@@ -22,7 +25,7 @@ pub mod session;
 pub mod telegram;
 pub mod variant;
 
-pub use phase::{Reason, Settings};
+pub use phase::{Control, Reason, Settings};
 pub use sensor::{Sensor, State, Trouble};
 pub use session::Session;
 

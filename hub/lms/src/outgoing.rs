@@ -82,12 +82,19 @@ impl Outgoing {
         self.request.command() | REPLY
     }
 
+    /// Whether it began to leave and has not ended.
+    pub(crate) fn is_partly_out(&self) -> bool {
+        self.sent > 0 && !self.is_out()
+    }
+
     /// Whether all of it left.
     pub(crate) fn is_out(&self) -> bool {
         self.byte().is_none()
     }
 }
 
+/// A request that stops in the middle is dropped by the sensor after 6 ms (Telegram listing 4.3).
+pub(crate) const FORGOTTEN: Nanos = 10 * MILLIS;
 /// Between the end of a byte and the next: more than 55 us, far less than 6 ms (Telegram listing 4.3).
 const GAP: Nanos = 120 * MICROS;
 /// ACK or NAK comes within 60 ms (Telegram listing 4.3); the rest is for adapters.

@@ -47,6 +47,19 @@ pub(crate) enum Phase {
     Streaming { header: StreamHeader, silent_at: Nanos, questions: &'static [Request] },
     /// Bytes come from a recording.
     Following,
+    /// Nothing is wanted. A stream that goes on all the same is stopped so many times more.
+    Paused { stops_left: u8 },
+}
+
+/// What a user may ask of a running session.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Control {
+    /// Stop the stream, then say nothing and expect nothing.
+    Pause,
+    /// End the pause: begin as a new session does.
+    Resume,
+    /// Begin anew, whatever the state is; ends a pause too.
+    Resync,
 }
 
 /// Steps of [`Phase::Starting`] in their order.
@@ -69,6 +82,8 @@ pub(crate) const SETTLE: Nanos = 20 * MILLIS;
 pub(crate) const PAUSE: Nanos = 500 * MILLIS;
 /// A sensor may overlook a request while its mirror turns; three tries are what all drivers give it.
 pub(crate) const TRIES: u8 = 3;
+/// Stops that a pause says beside the first one: a sensor that went on after so many does not listen.
+pub(crate) const STOPS: u8 = 2;
 /// What a stream does not tell: how values are split, from the one reply or the other, and who sends them.
 pub(crate) const QUESTIONS: &[Request] = &[Request::Status, Request::Configuration, Request::Type];
 /// STX to count word, status and checksum: bytes of a telegram beside its values.

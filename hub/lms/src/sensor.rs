@@ -19,6 +19,8 @@ pub enum State {
     Streaming,
     /// They stopped coming.
     Silent,
+    /// Nothing is wanted of the sensor.
+    Paused,
 }
 
 /// Why a session is not where it should be.

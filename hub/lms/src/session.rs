@@ -8,7 +8,7 @@ use crate::arrival::{Arrivals, Rhythm};
 use crate::dialogue::Dialogue;
 use crate::framer::{Advance, Framer, Place, Tally, suspect};
 use crate::measured::MEASURED;
-use crate::phase::{Reason, Settings};
+use crate::phase::{Control, Reason, Settings};
 use crate::sensor::{Sensor, State, Trouble};
 use crate::telegram::Telegram;
 use crate::variant::{Baud, Mode};
@@ -122,6 +122,13 @@ impl Session {
         self.dialogue.handle_timeout(now);
     }
 
+    /// A user wants this from now on. Asking twice changes nothing, but a [`Control::Resync`] counts each time. A
+    /// recording cannot be controlled.
+    pub fn control(&mut self, control: Control, now: Nanos) {
+        self.now = now;
+        self.dialogue.control(control, now);
+    }
+
     /// The byte of [`Output::Transmit`] was written at `now`.
     pub fn transmitted(&mut self, now: Nanos) {
         self.now = now;
@@ -197,7 +204,7 @@ impl Session {
         self.framer.buffered()
     }
 
-    /// How often measured data stayed out for a second.
+    /// How often everything began anew: measured data stayed out for a second, or a user asked for it.
     pub fn resyncs(&self) -> u64 {
         self.dialogue.resyncs
     }

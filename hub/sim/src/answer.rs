@@ -55,7 +55,7 @@ impl Machine {
             Some(Request::Baud(baud)) => {
                 Answer { reply: reply::mode(address, true, STATUS), delay_ns: MODE_NS, baud: Some(baud) }
             }
-            None => self.answer_other(request),
+            _ => self.answer_other(request),
         }
     }
 
