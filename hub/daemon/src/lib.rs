@@ -4,6 +4,7 @@
 mod bus_error;
 mod clock;
 pub mod config;
+mod control;
 mod layer;
 mod link;
 mod origin;

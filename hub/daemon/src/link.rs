@@ -9,12 +9,13 @@ use lms::framer::suspect;
 use lms::reply::Reply;
 use lms::session::{Output, Received};
 use lms::variant::{Mode, Unit, Variant};
-use lms::{MILLIS, Nanos, Session, Settings, Trouble};
+use lms::{Control, MILLIS, Nanos, Session, Settings, Trouble};
 use rustix::event::{PollFd, PollFlags, poll};
 use schema::{Failure, Flags, Kind, State, Wake};
 
 use crate::clock;
 use crate::config::{Link, Source};
+use crate::control::Orders;
 use crate::port::Tty;
 use crate::replay;
 use crate::scanner;
@@ -28,6 +29,8 @@ pub(crate) struct LinkThread<'a> {
     account: Account,
     /// Readable once the hub shall end.
     stop: &'a OwnedFd,
+    /// What users ask for.
+    pub(crate) orders: Orders,
     next_greeting: Nanos,
     next_status: Nanos,
     /// What `error` was made from.
@@ -43,6 +46,8 @@ pub(crate) struct LinkThread<'a> {
 pub(crate) enum Woken {
     /// The hub shall end.
     Stop,
+    /// A user wants something.
+    Order,
     /// There is something to do at the port.
     Ready,
     /// The time is up.
@@ -51,7 +56,7 @@ pub(crate) enum Woken {
 
 impl<'a> LinkThread<'a> {
     /// The thread's values; nothing happens yet.
-    pub(crate) fn new(link: &'a Link, topics: Topics, stop: &'a OwnedFd) -> Self {
+    pub(crate) fn new(link: &'a Link, topics: Topics, stop: &'a OwnedFd, orders: Orders) -> Self {
         let now = clock::now();
         let account = Account::new(&link.port.name(), now);
         LinkThread {
@@ -59,6 +64,7 @@ impl<'a> LinkThread<'a> {
             topics,
             account,
             stop,
+            orders,
             next_greeting: now,
             next_status: now,
             facts: None,
@@ -97,6 +103,9 @@ impl<'a> LinkThread<'a> {
                 Ok(tty) => {
                     self.topics.set_flags(if tty.simulated { Flags::SIMULATED } else { 0 });
                     let mut session = Session::new(self.settings(false), clock::now());
+                    if self.orders.is_paused() {
+                        session.control(Control::Pause, clock::now());
+                    }
                     let end = self.stream(&tty, &mut session);
                     self.account.close(&session);
                     match end {
@@ -111,8 +120,13 @@ impl<'a> LinkThread<'a> {
             };
             self.facts = None;
             self.show(None, State::Absent, &trouble);
-            if self.wait(None, clock::now() + REOPEN) == Woken::Stop {
-                return;
+            let reopen_at = clock::now() + REOPEN;
+            loop {
+                match self.wait(None, reopen_at) {
+                    Woken::Stop => return,
+                    Woken::Order => self.orders.obey(None),
+                    Woken::Ready | Woken::Timeout => break,
+                }
             }
             opened = Tty::open(path, self.link.baud.rate());
         }
@@ -122,9 +136,13 @@ impl<'a> LinkThread<'a> {
     fn stream(&mut self, tty: &Tty, session: &mut Session) -> io::Result<()> {
         loop {
             let (watch, until) = self.drain(tty, session)?;
-            let woken = self.wait(watch.then_some(tty), until);
-            if woken == Woken::Stop {
-                return Ok(());
+            match self.wait(watch.then_some(tty), until) {
+                Woken::Stop => return Ok(()),
+                Woken::Order => {
+                    self.orders.obey(Some(session));
+                    continue;
+                }
+                Woken::Ready | Woken::Timeout => {}
             }
             if !watch {
                 // The telegram's end is near: what can be done before it is not done after it.
@@ -236,20 +254,22 @@ impl<'a> LinkThread<'a> {
                 if self.account.is_streaming() { until } else { until.min(self.next_greeting.max(now)) };
             let span = clock::span(now, bound);
             let stop = PollFd::new(self.stop, PollFlags::IN);
+            let orders = PollFd::new(&self.orders, PollFlags::IN);
             let woken = match tty {
                 Some(tty) => {
-                    let mut fds = [stop, PollFd::new(tty, PollFlags::IN)];
-                    poll(&mut fds, Some(&span)).map(|_| (is_ready(&fds[0]), is_ready(&fds[1])))
+                    let mut fds = [stop, orders, PollFd::new(tty, PollFlags::IN)];
+                    poll(&mut fds, Some(&span)).map(|_| fds.each_ref().map(is_ready))
                 }
                 None => {
-                    let mut fds = [stop];
-                    poll(&mut fds, Some(&span)).map(|_| (is_ready(&fds[0]), false))
+                    let mut fds = [stop, orders];
+                    poll(&mut fds, Some(&span)).map(|_| [is_ready(&fds[0]), is_ready(&fds[1]), false])
                 }
             };
             self.account.wakeups += 1;
             match woken {
-                Ok((true, _)) => return Woken::Stop,
-                Ok((_, true)) => return Woken::Ready,
+                Ok([true, ..]) => return Woken::Stop,
+                Ok([_, true, _]) => return Woken::Order,
+                Ok([.., true]) => return Woken::Ready,
                 _ => {}
             }
             let now = clock::now();
