@@ -5,6 +5,7 @@ mod attend;
 mod bus_error;
 mod clock;
 pub mod config;
+mod control;
 mod layer;
 mod link;
 mod origin;
