@@ -15,6 +15,7 @@ pub mod crc;
 mod dialogue;
 pub mod eeprom;
 pub mod errors;
+pub mod family;
 pub mod framer;
 pub mod header;
 pub mod measured;
