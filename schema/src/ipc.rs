@@ -2,6 +2,7 @@
 //! everybody else gets ports. Refuses to know when something is sent and who reads it.
 
 mod leftover;
+mod nodes;
 mod sleep;
 mod trouble;
 
@@ -22,6 +23,7 @@ use iceoryx2::service::port_factory::{event, publish_subscribe};
 use self::trouble::{Trouble, create, no_port, no_publisher, open};
 use crate::{Domain, Failure, Header, Kind, Scan, Status, Topic, Wake, access, limits, of_service};
 
+pub use self::nodes::{Nodes, nodes};
 pub use self::sleep::{sleep, take_wakeups};
 pub use iceoryx2::port::update_connections::UpdateConnections;
 pub use iceoryx2::port::{LoanError, ReceiveError, SendError};

@@ -2,6 +2,7 @@
 //! it ends. Everything is waited for by what it says, with a deadline far beyond what it takes.
 #![allow(dead_code, unused_imports)] // Every test file takes what it needs.
 
+mod line;
 mod program;
 mod telegrams;
 
@@ -14,6 +15,7 @@ use std::time::{Duration, Instant};
 
 use serde_json::Value;
 
+pub(crate) use line::Line;
 pub(crate) use program::{INT, KILL, Outcome, Program, TERM};
 pub(crate) use telegrams::{MEASURED, Sent, bytes_of, hash, is_class, number, scan, sequence};
 

@@ -7,7 +7,7 @@ pub mod config;
 mod layer;
 mod link;
 mod origin;
-mod port;
+pub mod port;
 mod preflight;
 mod replay;
 pub mod scanner;

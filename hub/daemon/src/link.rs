@@ -3,7 +3,6 @@
 
 use std::io;
 use std::os::fd::OwnedFd;
-use std::path::Path;
 
 use lms::framer::suspect;
 use lms::reply::Reply;
@@ -15,7 +14,7 @@ use schema::{Failure, Flags, Kind, State, Wake};
 
 use crate::clock;
 use crate::config::{Link, Source};
-use crate::port::Tty;
+use crate::port::Port;
 use crate::replay;
 use crate::scanner;
 use crate::status::Account;
@@ -80,30 +79,30 @@ impl<'a> LinkThread<'a> {
                 }
                 Err(failure) => report(Err(failure)),
             },
-            Source::Tty(path) => match Tty::open(path, self.link.baud.rate()) {
+            source @ Source::Tty(_) => match Port::open(source, self.link.baud.rate()) {
                 Err(failure) if failure.kind != Kind::PortMissing => report(Err(failure)),
                 first => {
                     report(Ok(()));
-                    self.keep_open(path, first);
+                    self.keep_open(first);
                 }
             },
         }
     }
 
     /// Streams from the port, and takes it back whenever it was away.
-    fn keep_open(&mut self, path: &Path, mut opened: Result<Tty, Failure>) {
+    fn keep_open(&mut self, mut opened: Result<Port, Failure>) {
         loop {
             let trouble = match opened {
-                Ok(tty) => {
-                    self.topics.set_flags(if tty.simulated { Flags::SIMULATED } else { 0 });
+                Ok(port) => {
+                    self.topics.set_flags(if port.simulated() { Flags::SIMULATED } else { 0 });
                     let mut session = Session::new(self.settings(false), clock::now());
-                    let end = self.stream(&tty, &mut session);
+                    let end = self.stream(&port, &mut session);
                     self.account.close(&session);
                     match end {
                         Ok(()) => return,
                         Err(error) => {
                             self.account.reconnects += 1;
-                            format!("{} went away: {error}", path.display())
+                            format!("{} went away: {error}", self.link.port.name())
                         }
                     }
                 }
@@ -114,15 +113,15 @@ impl<'a> LinkThread<'a> {
             if self.wait(None, clock::now() + REOPEN) == Woken::Stop {
                 return;
             }
-            opened = Tty::open(path, self.link.baud.rate());
+            opened = Port::open(&self.link.port, self.link.baud.rate());
         }
     }
 
     /// Drives `session` on `tty` until the hub shall end; an error says that the port is gone.
-    fn stream(&mut self, tty: &Tty, session: &mut Session) -> io::Result<()> {
+    fn stream(&mut self, port: &Port, session: &mut Session) -> io::Result<()> {
         loop {
-            let (watch, until) = self.drain(tty, session)?;
-            let woken = self.wait(watch.then_some(tty), until);
+            let (watch, until) = self.drain(port, session)?;
+            let woken = self.wait(watch.then_some(port), until);
             if woken == Woken::Stop {
                 return Ok(());
             }
@@ -130,7 +129,7 @@ impl<'a> LinkThread<'a> {
                 // The telegram's end is near: what can be done before it is not done after it.
                 self.topics.prepare();
             }
-            let len = tty.read(session.spare())?;
+            let len = port.read(session.spare())?;
             let now = clock::now();
             session.commit(now, len);
             if len == 0 && now >= until {
@@ -140,14 +139,14 @@ impl<'a> LinkThread<'a> {
     }
 
     /// Does what the session wants, until it wants to wait: whether for bytes, and until when.
-    fn drain(&mut self, tty: &Tty, session: &mut Session) -> io::Result<(bool, Nanos)> {
+    fn drain(&mut self, port: &Port, session: &mut Session) -> io::Result<(bool, Nanos)> {
         let mut published = false;
         let (watch, until) = loop {
             match session.poll_output() {
-                Output::SetBaud(baud) => tty.set_baud(baud.rate())?,
+                Output::SetBaud(baud) => port.set_baud(baud.rate())?,
                 Output::Transmit { byte, not_before } => {
                     self.pause(not_before);
-                    tty.write(byte)?;
+                    port.write(byte)?;
                     session.transmitted(clock::now());
                 }
                 Output::Telegram(received) => {
@@ -228,7 +227,7 @@ impl<'a> LinkThread<'a> {
     }
 
     /// Sleeps until the port has bytes (or is gone), `until`, or the hub's end.
-    pub(crate) fn wait(&mut self, tty: Option<&Tty>, until: Nanos) -> Woken {
+    pub(crate) fn wait(&mut self, port: Option<&Port>, until: Nanos) -> Woken {
         loop {
             let now = clock::now();
             // Whoever attaches to a silent sensor is greeted in time all the same.
@@ -236,9 +235,9 @@ impl<'a> LinkThread<'a> {
                 if self.account.is_streaming() { until } else { until.min(self.next_greeting.max(now)) };
             let span = clock::span(now, bound);
             let stop = PollFd::new(self.stop, PollFlags::IN);
-            let woken = match tty {
-                Some(tty) => {
-                    let mut fds = [stop, PollFd::new(tty, PollFlags::IN)];
+            let woken = match port {
+                Some(port) => {
+                    let mut fds = [stop, PollFd::new(port, PollFlags::IN)];
                     poll(&mut fds, Some(&span)).map(|_| (is_ready(&fds[0]), is_ready(&fds[1])))
                 }
                 None => {
@@ -310,6 +309,7 @@ pub(crate) fn state_of(session: &Session) -> State {
         lms::State::Starting => State::Starting,
         lms::State::Streaming => State::Streaming,
         lms::State::Silent => State::Silent,
+        lms::State::Paused => State::Paused,
     }
 }
 

@@ -108,7 +108,7 @@ impl Request {
             (VALUES, &[selection]) => Request::Values(selection),
             (STATUS, []) => Request::Status,
             (ERRORS, []) => Request::Errors,
-            (COUNTERS, [] | [0, 0]) => Request::Counters,
+            (COUNTERS, []) => Request::Counters,
             (MEANS, &[shots]) => Request::Means(shots),
             (RANGE, data) => Request::Range(Span::read(data)?),
             (TYPE, []) => Request::Type,
@@ -284,8 +284,6 @@ mod tests {
             assert_eq!(encoded.telegram().address(), 3);
             assert_eq!(Request::decode(encoded.telegram()), Some(request));
         }
-        let padded = Writer::new(0, COUNTERS).word(0).finish();
-        assert_eq!(Request::decode(padded.telegram()), Some(Request::Counters));
     }
 
     #[test]

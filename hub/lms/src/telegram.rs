@@ -146,6 +146,13 @@ impl Writer {
 pub struct Encoded(Writer);
 
 impl Encoded {
+    /// A copy of `telegram`.
+    pub fn of(telegram: Telegram<'_>) -> Encoded {
+        let mut bytes = [0; MAX_TELEGRAM];
+        bytes[..telegram.0.len()].copy_from_slice(telegram.0);
+        Encoded(Writer { bytes, len: telegram.0.len() })
+    }
+
     /// The telegram's bytes, STX to checksum.
     pub fn bytes(&self) -> &[u8] {
         &self.0.bytes[..self.0.len]

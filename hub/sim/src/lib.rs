@@ -7,15 +7,18 @@
 
 mod answer;
 mod ear;
+mod eeprom;
 pub mod fault;
 mod line;
 pub mod machine;
 pub mod noise;
+pub mod operating;
 pub mod options;
 mod people;
 mod place;
 pub mod pty;
 pub mod room;
+mod settings;
 mod shape;
 mod simulate;
 pub mod source;
