@@ -10,7 +10,7 @@ use lms::session::{Output, Received};
 use lms::variant::{Mode, Unit, Variant};
 use lms::{MILLIS, Nanos, Session, Settings, Trouble};
 use rustix::event::{PollFd, PollFlags, poll};
-use schema::{Failure, Flags, Kind, State, Wake};
+use schema::{Failure, Flags, State, Wake};
 
 use crate::clock;
 use crate::config::{Link, Source};
@@ -22,9 +22,9 @@ use crate::topics::Topics;
 
 /// A link with everything that belongs to its thread.
 pub(crate) struct LinkThread<'a> {
-    link: &'a Link,
-    topics: Topics,
-    account: Account,
+    pub(crate) link: &'a Link,
+    pub(crate) topics: Topics,
+    pub(crate) account: Account,
     /// Readable once the hub shall end.
     stop: &'a OwnedFd,
     next_greeting: Nanos,
@@ -79,46 +79,12 @@ impl<'a> LinkThread<'a> {
                 }
                 Err(failure) => report(Err(failure)),
             },
-            source @ Source::Tty(_) => match Port::open(source, self.link.baud.rate()) {
-                Err(failure) if failure.kind != Kind::PortMissing => report(Err(failure)),
-                first => {
-                    report(Ok(()));
-                    self.keep_open(first);
-                }
-            },
-        }
-    }
-
-    /// Streams from the port, and takes it back whenever it was away.
-    fn keep_open(&mut self, mut opened: Result<Port, Failure>) {
-        loop {
-            let trouble = match opened {
-                Ok(port) => {
-                    self.topics.set_flags(if port.simulated() { Flags::SIMULATED } else { 0 });
-                    let mut session = Session::new(self.settings(false), clock::now());
-                    let end = self.stream(&port, &mut session);
-                    self.account.close(&session);
-                    match end {
-                        Ok(()) => return,
-                        Err(error) => {
-                            self.account.reconnects += 1;
-                            format!("{} went away: {error}", self.link.port.name())
-                        }
-                    }
-                }
-                Err(failure) => failure.message,
-            };
-            self.facts = None;
-            self.show(None, State::Absent, &trouble);
-            if self.wait(None, clock::now() + REOPEN) == Woken::Stop {
-                return;
-            }
-            opened = Port::open(&self.link.port, self.link.baud.rate());
+            Source::Tty(_) => self.attend(report),
         }
     }
 
     /// Drives `session` on `tty` until the hub shall end; an error says that the port is gone.
-    fn stream(&mut self, port: &Port, session: &mut Session) -> io::Result<()> {
+    pub(crate) fn stream(&mut self, port: &Port, session: &mut Session) -> io::Result<()> {
         loop {
             let (watch, until) = self.drain(port, session)?;
             let woken = self.wait(watch.then_some(port), until);
@@ -149,7 +115,10 @@ impl<'a> LinkThread<'a> {
                     port.write(byte)?;
                     session.transmitted(clock::now());
                 }
-                Output::Telegram(received) => {
+                Output::Telegram(mut received) => {
+                    let line_errors = port.line_errors();
+                    self.account.line_errors += line_errors;
+                    received.reasons |= if line_errors > 0 { suspect::LINE_ERROR } else { 0 };
                     self.publish(&received, None);
                     self.wake(Wake::Telegram);
                     published = true;
@@ -193,6 +162,11 @@ impl<'a> LinkThread<'a> {
         let (Some(measured), Some(mode)) = (measured, mode) else { return };
         self.account.scans += 1;
         self.topics.scan(|scan| scanner::decode(&measured, mode, scan));
+    }
+
+    /// The session is over: what is wrong is not what was.
+    pub(crate) fn forget(&mut self) {
+        self.facts = None;
     }
 
     /// Wakes the consumers.
@@ -270,7 +244,7 @@ impl<'a> LinkThread<'a> {
         }
     }
 
-    fn settings(&self, listen_only: bool) -> Settings {
+    pub(crate) fn settings(&self, listen_only: bool) -> Settings {
         Settings { variant: self.link.variant, baud: self.link.baud, listen_only }
     }
 
@@ -317,8 +291,6 @@ fn is_ready(fd: &PollFd<'_>) -> bool {
     !fd.revents().is_empty()
 }
 
-/// Between two attempts to open a port that is away.
-const REOPEN: Nanos = 500 * MILLIS;
 /// A status goes out at least so often.
 const STATUS_PERIOD: Nanos = 1_000 * MILLIS;
 /// A late joiner gets the last status after so long at the most.

@@ -15,6 +15,10 @@ pub(crate) trait Say {
     fn command(&self) -> u8;
     /// How long the sensor may work between acknowledgement and reply.
     fn work(&self) -> Nanos;
+    /// How long the first sign of an answer may take.
+    fn sign(&self) -> Nanos {
+        ACKNOWLEDGE_TIMEOUT
+    }
 }
 
 impl Say for Request {
@@ -31,6 +35,10 @@ impl Say for Request {
             Request::Stream | Request::Stop | Request::Baud(_) => MODE_TIMEOUT,
             _ => REPLY_TIMEOUT,
         }
+    }
+
+    fn sign(&self) -> Nanos {
+        if *self == Request::Stop { STOP_TIMEOUT } else { ACKNOWLEDGE_TIMEOUT }
     }
 }
 
@@ -88,9 +96,8 @@ impl<R: Say> Outgoing<R> {
             self.out_at = Some(now);
             // Behind the head of a scan that the request broke off, the acknowledgement is not seen: the reply is.
             // A sensor that is slower than it should be needs a longer wait, not more tries: each breaks off the last.
-            let base = if self.request == Request::Stop { STOP_TIMEOUT } else { ACKNOWLEDGE_TIMEOUT };
             let tried = Nanos::from(self.tries - self.tries_left - 1);
-            let wait = base + tried * ACKNOWLEDGE_TIMEOUT + self.patience;
+            let wait = self.request.sign() + tried * ACKNOWLEDGE_TIMEOUT + self.patience;
             self.give_up_at = now + wait + line_time(1 + LONGEST_REPLY, baud.rate());
         }
     }
