@@ -93,7 +93,7 @@ impl Request {
     }
 
     /// The request that `telegram` says; `None` if it is a reply, unknown, one that writes the EEPROM, or its data are
-    /// not as they should be. 35h may carry a word of zeros, which is not kept.
+    /// not as they should be.
     pub fn decode(telegram: Telegram<'_>) -> Option<Request> {
         if telegram.is_reply() {
             return None;
