@@ -104,6 +104,7 @@ fn dispatch(cli: &Cli) -> Result<(), Failure> {
             };
             clients::hz(&options, &mut out, &mut io::stderr(), &*interrupt()?)
         }
+        Verb::Control(control) => clients::control(&control.options(everywhere)?, &mut out, &*interrupt()?),
     }
 }
 

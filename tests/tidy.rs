@@ -175,6 +175,15 @@ fn nobody_writes_the_eeprom() {
             ),
             tree.with("hub/lms/src/planted.rs", "//! Knows.\npub const CONFIGURE: u8 = 0x77;\n"),
             tree.with("hub/lms/src/planted.rs", "//! Writes.\nlet telegram = Writer::new(address, 0x66);\n"),
+            tree.with("hub/lms/src/dialogue.rs", "//! Talks.\nuse crate::eeprom::Write;\n"),
+            tree.with("hub/lms/src/session.rs", "//! Talks.\nuse crate::{Nanos, eeprom};\n"),
+            tree.with(
+                "hub/lms/src/outgoing.rs",
+                "//! Sends.\nlet request = crate::eeprom::Write::Field(&[]);\n",
+            ),
+            tree.with("hub/daemon/src/link.rs", "//! A link.\nuse lms::eeprom;\n"),
+            tree.with("hub/daemon/src/probe.rs", "//! Probes.\nuse lms::{eeprom, command};\n"),
+            tree.with("clients/src/planted.rs", "//! Knows.\nuse lms::eeprom::Write;\n"),
         ]
     });
 }

@@ -1,7 +1,9 @@
 //! From a topic to its service in shared memory, with all limits. The only file that names the builders of iceoryx2:
 //! everybody else gets ports. Refuses to know when something is sent and who reads it.
 
+mod control;
 mod leftover;
+mod nodes;
 mod sleep;
 mod trouble;
 
@@ -22,7 +24,9 @@ use iceoryx2::service::port_factory::{event, publish_subscribe};
 use self::trouble::{Trouble, create, no_port, no_publisher, open};
 use crate::{Domain, Failure, Header, Kind, Scan, Status, Topic, Wake, access, limits, of_service};
 
-pub use self::sleep::{sleep, take_wakeups};
+pub use self::control::{Asked, ControlClient, ControlServer, Pending};
+pub use self::nodes::{Nodes, nodes};
+pub use self::sleep::{descriptor, sleep, take_wakeups};
 pub use iceoryx2::port::update_connections::UpdateConnections;
 pub use iceoryx2::port::{LoanError, ReceiveError, SendError};
 pub use iceoryx2::prelude::PortFactory;

@@ -58,14 +58,17 @@ pub(crate) fn the_daemon_knows_neither_clients_nor_sim(tree: &Tree) -> Vec<Strin
     reached.into_iter().filter(|name| name == "scanhub-clients" || name == "scanhub-sim").collect()
 }
 
-/// The daemon, the clients and the simulator meet nowhere but in the program.
+/// The daemon, the clients and the simulator meet nowhere but in the program: no crate has two of them.
 pub(crate) fn only_the_program_sees_all(tree: &Tree) -> Vec<String> {
     let ends = ["scanhub-daemon", "scanhub-clients", "scanhub-sim"];
     let mut breaches = Vec::new();
     for (name, manifest) in tree.members() {
-        let known = ours(&manifest, &NORMAL);
-        let found = known.iter().filter(|known| ends.contains(&known.as_str()));
-        breaches.extend(found.map(|known| format!("{name} depends on {known}")));
+        let mut known = ours(&manifest, &NORMAL);
+        known.insert(name.clone());
+        known.retain(|known| ends.contains(&known.as_str()));
+        if known.len() > 1 {
+            breaches.push(format!("{name} brings {known:?} together"));
+        }
     }
     breaches
 }

@@ -9,20 +9,34 @@
 mod arrival;
 mod candidates;
 pub mod command;
+pub mod condition;
+pub mod configuration;
 pub mod crc;
 mod dialogue;
+pub mod eeprom;
+pub mod errors;
+pub mod exchange;
 pub mod framer;
 pub mod header;
+pub mod inquiry;
 pub mod measured;
+pub mod operating;
 mod outgoing;
+pub mod parameters;
 mod phase;
+pub mod reflectivity;
 pub mod reply;
+mod search;
 mod sensor;
 pub mod session;
+mod start;
+pub mod status_report;
 pub mod telegram;
+pub mod value;
 pub mod variant;
 
-pub use phase::{Reason, Settings};
+pub use inquiry::Inquiry;
+pub use phase::{Control, Reason, Settings};
 pub use sensor::{Sensor, State, Trouble};
 pub use session::Session;
 

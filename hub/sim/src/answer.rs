@@ -61,7 +61,7 @@ impl Machine {
             Some(Request::Baud(baud)) => {
                 Answer { after: After::Baud(baud), ..answer(&reply::mode(address, true, status), MODE_NS) }
             }
-            None => self.answer_other(request, now),
+            _ => self.answer_other(request, now),
         }
     }
 

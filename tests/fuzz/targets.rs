@@ -1,0 +1,194 @@
+//! What has to hold whatever comes: one function for each place where the world's bytes enter. The fuzzer calls them
+//! with what it invents, `tests/fuzzed.rs` with the corpus and with seeded noise. They know invariants, no examples.
+
+use lms::command::Request;
+use lms::framer::{Found, Framer, SUFFIX_HOLD, Tally, VETO_HOLD};
+use lms::header::Expect;
+use lms::measured::Measured;
+use lms::reply::Reply;
+use lms::session::{Output, Session};
+use lms::telegram::{MAX_LENGTH, Telegram, Writer};
+use lms::variant::{Baud, Variant};
+use lms::{MILLIS, Nanos, Settings};
+
+/// A target by its name.
+pub type Target = (&'static str, fn(&[u8]));
+
+/// All of them; the names are those of the corpus' folders.
+pub const TARGETS: [Target; 4] =
+    [("framer", framer), ("replies", replies), ("session", session), ("configuration", configuration)];
+
+/// Any bytes in any pieces: what is delivered stood there and has a right checksum, in order, and no byte vanishes.
+///
+/// The first byte says what to expect, the second the size of the pieces.
+pub fn framer(data: &[u8]) {
+    let [expects, piece, bytes @ ..] = data else { return };
+    // The head of a stream is that of a telegram that came, so its length is possible.
+    let head = bytes.first_chunk().filter(|head: &&[u8; 7]| head[3] < 3);
+    let expect = match (expects & 3, head) {
+        (1, Some(&header)) => Expect::Stream { header, reply: None },
+        (2, Some(&header)) => Expect::Stream { header, reply: Some(expects | 0x80) },
+        _ => Expect::Anything,
+    };
+    let mut framer = Framer::default();
+    framer.expect(expect);
+    framer.await_acknowledge(expects & 4 != 0);
+    let mut looked_at = 0;
+    let mut rest = bytes;
+    while !rest.is_empty() {
+        let spare = framer.spare();
+        let len = rest.len().min(spare.len()).min(usize::from(*piece) + 1);
+        assert!(len > 0, "no room although everything was polled");
+        spare[..len].copy_from_slice(&rest[..len]);
+        framer.commit(len);
+        rest = &rest[len..];
+        drain(&mut framer, bytes, &mut looked_at);
+    }
+    framer.release(SUFFIX_HOLD);
+    drain(&mut framer, bytes, &mut looked_at);
+    framer.release(VETO_HOLD);
+    drain(&mut framer, bytes, &mut looked_at);
+}
+
+fn drain(framer: &mut Framer, bytes: &[u8], looked_at: &mut usize) {
+    while let Some(found) = framer.poll() {
+        let Found::Telegram(framed) = found else { continue };
+        let telegram = framed.telegram.bytes();
+        assert!(Telegram::check(telegram).is_some());
+        let ahead = &bytes[*looked_at..];
+        let at = ahead.windows(telegram.len()).position(|window| window == telegram);
+        let at = at.expect("a telegram that nobody sent, or one out of order");
+        *looked_at += at + telegram.len();
+    }
+    let Tally { read, in_telegrams, acknowledge, discarded, .. } = *framer.tally();
+    assert_eq!(read, in_telegrams + acknowledge + discarded + framer.buffered() as u64);
+}
+
+/// Any data in a telegram with a right checksum, either direction: whatever can be read can be said again.
+pub fn replies(data: &[u8]) {
+    let [address, command, rest @ ..] = data else { return };
+    let rest = &rest[..rest.len().min(MAX_LENGTH - 1)];
+    let encoded = Writer::new(*address, *command).slice(rest).finish();
+    let telegram = Telegram::check(encoded.bytes()).expect("as it was written");
+    let _ = telegram.status();
+    if let Some(request) = Request::decode(telegram) {
+        assert_eq!(request.encode(*address).bytes(), encoded.bytes(), "{request:?}");
+    }
+    if let Some(measured) = Measured::decode(telegram) {
+        assert_eq!(measured.words().len(), measured.count());
+        assert!((1..=401).contains(&measured.count()));
+    }
+    let _ = Reply::decode(telegram);
+}
+
+/// Any order of events: bytes, time, bytes that leave or stay. Read as a program of two-byte instructions.
+pub fn session(data: &[u8]) {
+    let [variant, baud, program @ ..] = data else { return };
+    let settings = Settings {
+        variant: Variant::ALL[usize::from(*variant) % Variant::ALL.len()],
+        baud: Baud::ALL[usize::from(*baud) % Baud::ALL.len()],
+        listen_only: false,
+    };
+    let mut now: Nanos = 1_000 * MILLIS;
+    let mut session = Session::new(settings, now);
+    let mut read = 0;
+    let mut said = Vec::new();
+    let mut rest = program;
+    while let [what, much, after @ ..] = rest {
+        rest = after;
+        let mut until = Nanos::MAX;
+        loop {
+            match session.poll_output() {
+                Output::Transmit { byte, not_before } if what & 0x80 == 0 => {
+                    now = now.max(not_before);
+                    said.push(byte);
+                    session.transmitted(now);
+                }
+                Output::Transmit { .. } => break,
+                Output::SetBaud(_) => said.clear(),
+                Output::Telegram(received) => {
+                    assert!(Telegram::check(received.telegram.bytes()).is_some());
+                    assert!(received.first <= received.last && received.last <= now);
+                }
+                Output::Rest(at) | Output::Wait { until: at, .. } => {
+                    until = at;
+                    break;
+                }
+            }
+        }
+        assert_harmless(&mut said);
+        let tally = session.tally();
+        let known = tally.in_telegrams + tally.acknowledge + tally.discarded + session.buffered() as u64;
+        assert_eq!((tally.read, known), (read, read), "bytes vanished");
+        match what & 3 {
+            // Bytes of the program itself.
+            0 => {
+                let spare = session.spare();
+                let len = rest.len().min(usize::from(*much)).min(spare.len());
+                spare[..len].copy_from_slice(&rest[..len]);
+                rest = &rest[len..];
+                read += len as u64;
+                session.commit(now, len);
+            }
+            // Time that need not be enough.
+            1 => {
+                now += Nanos::from(*much) * MILLIS / 8;
+                session.commit(now, 0);
+                session.handle_timeout(now);
+            }
+            // Whatever was waited for.
+            2 if until != Nanos::MAX => {
+                now = now.max(until);
+                session.handle_timeout(now);
+            }
+            // A reply with a right checksum, its data from the program.
+            _ => {
+                let len = rest.len().min(usize::from(*much)).min(120);
+                let (reply, after) = rest.split_at(len);
+                rest = after;
+                let [command, reply @ ..] = reply else { continue };
+                let telegram = Writer::new(0x80, command | 0x80).slice(reply).byte(0x10).finish();
+                let spare = session.spare();
+                let len = telegram.bytes().len().min(spare.len());
+                spare[..len].copy_from_slice(&telegram.bytes()[..len]);
+                read += len as u64;
+                session.commit(now, len);
+            }
+        }
+    }
+}
+
+/// Each whole request among the bytes said is one that writes nothing, and is taken off.
+fn assert_harmless(said: &mut Vec<u8>) {
+    while let [_, _, low, high, command, ..] = said[..] {
+        let len = usize::from(u16::from_le_bytes([low, high])) + lms::telegram::FRAME;
+        if said.len() < len {
+            return;
+        }
+        assert!(!lms::command::EEPROM_WRITES.contains(&command), "{command:02X}h was said");
+        said.drain(..len);
+    }
+}
+
+/// Any text as flags and as a file: it is taken, or refused with a remedy.
+///
+/// The text is cut at zero bytes: the first piece is a file, the others are `--set` and `--link` in turn.
+pub fn configuration(data: &[u8]) {
+    use daemon::config::{Config, Sources};
+    let text = String::from_utf8_lossy(data);
+    let mut pieces = text.split('\0');
+    let path = std::env::temp_dir().join(format!("scanhub-fuzz-{}.toml", std::process::id()));
+    std::fs::write(&path, pieces.next().unwrap_or_default()).expect("a writable directory");
+    let (mut set, mut links) = (Vec::new(), Vec::new());
+    for (number, piece) in pieces.enumerate() {
+        if number % 2 == 0 { &mut set } else { &mut links }.push(piece.to_owned());
+    }
+    match Config::load(&Sources { files: vec![path.clone()], set, links }) {
+        Ok(config) => assert!(!config.links.is_empty()),
+        Err(failure) => {
+            assert_eq!(failure.kind.exit_code(), 78, "{failure}");
+            assert!(!failure.message.is_empty());
+        }
+    }
+    let _ = std::fs::remove_file(&path);
+}

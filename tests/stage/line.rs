@@ -1,0 +1,69 @@
+//! A serial line of which the test has the sensor's end: a pty that it writes to as fast as the hub reads.
+
+use std::ffi::OsStr;
+use std::os::fd::OwnedFd;
+use std::os::unix::ffi::OsStrExt;
+use std::path::Path;
+use std::time::Instant;
+
+use rustix::event::{PollFd, PollFlags, Timespec, poll};
+use rustix::fs::{Mode, OFlags, fcntl_setfl, open};
+use rustix::io::{Errno, read, write};
+use rustix::pty::{OpenptFlags, grantpt, openpt, ptsname, unlockpt};
+use rustix::termios::{OptionalActions, tcgetattr, tcsetattr};
+
+use super::PATIENCE;
+
+/// The sensor's end.
+pub(crate) struct Line(OwnedFd);
+
+impl Line {
+    /// A raw pty whose other end is found at `place`.
+    pub(crate) fn at(place: &Path) -> Line {
+        let make = || -> Result<Line, Errno> {
+            let master = openpt(OpenptFlags::RDWR | OpenptFlags::NOCTTY | OpenptFlags::CLOEXEC)?;
+            grantpt(&master)?;
+            unlockpt(&master)?;
+            let name = ptsname(&master, Vec::new())?;
+            fcntl_setfl(&master, OFlags::RDWR | OFlags::NONBLOCK)?;
+            let flags = OFlags::RDWR | OFlags::NOCTTY | OFlags::CLOEXEC;
+            let slave = open(OsStr::from_bytes(name.as_bytes()), flags, Mode::empty())?;
+            let mut termios = tcgetattr(&slave)?;
+            termios.make_raw();
+            tcsetattr(&slave, OptionalActions::Now, &termios)?;
+            rustix::fs::symlink(OsStr::from_bytes(name.as_bytes()), place)?;
+            Ok(Line(master))
+        };
+        make().unwrap_or_else(|error| panic!("no pty at {}: {error}", place.display()))
+    }
+
+    /// Waits until the hub has the line open.
+    pub(crate) fn await_open(&self) {
+        super::until("somebody opens the line", || self.is_open());
+    }
+
+    /// Whether the hub has the line open.
+    pub(crate) fn is_open(&self) -> bool {
+        let mut fds = [PollFd::new(&self.0, PollFlags::IN)];
+        let now = Timespec { tv_sec: 0, tv_nsec: 0 };
+        poll(&mut fds, Some(&now)).is_ok() && !fds[0].revents().contains(PollFlags::HUP)
+    }
+
+    /// Sends all of `bytes`, in the pace of whoever reads them; what the other end says meanwhile is not heard.
+    pub(crate) fn send(&self, mut bytes: &[u8]) {
+        let give_up_at = Instant::now() + PATIENCE;
+        while !bytes.is_empty() {
+            let mut said = [0; 256];
+            while read(&self.0, &mut said).is_ok_and(|len| len > 0) {}
+            match write(&self.0, bytes) {
+                Ok(len) => bytes = &bytes[len..],
+                Err(Errno::AGAIN | Errno::INTR) => {
+                    let mut fds = [PollFd::new(&self.0, PollFlags::OUT)];
+                    let _ = poll(&mut fds, Some(&Timespec { tv_sec: 1, tv_nsec: 0 }));
+                }
+                Err(error) => panic!("the line is gone: {error}"),
+            }
+            assert!(Instant::now() < give_up_at, "nobody reads");
+        }
+    }
+}
