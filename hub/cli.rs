@@ -223,6 +223,6 @@ impl Simulate {
 
 /// The table of faults, for the end of the help.
 pub(crate) fn fault_table() -> String {
-    let rows = Faults::KEYS.iter().map(|(key, meaning)| format!("  {key:6} {meaning}"));
+    let rows = Faults::keys().map(|(key, meaning)| format!("  {key:13} {meaning}"));
     format!("Faults:\n{}", rows.collect::<Vec<_>>().join("\n"))
 }
