@@ -90,7 +90,9 @@ impl Wire {
             self.power_broke |= machine.power_cycle(now);
         }
         loop {
-            if let Some((_, mut carried)) = self.queue.pop_front_if(|(at, _)| *at <= now) {
+            if self.queue.front().is_some_and(|(at, _)| *at <= now)
+                && let Some((_, mut carried)) = self.queue.pop_front()
+            {
                 if !self.plugged && !std::mem::take(&mut carried.bytes).is_empty() {
                     carried.fault = carried.fault.or(carried.is_telegram().then_some(Fault::Unplug));
                 }
