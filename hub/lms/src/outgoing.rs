@@ -7,10 +7,45 @@ use crate::telegram::{Encoded, REPLY};
 use crate::variant::Baud;
 use crate::{MICROS, MILLIS, Nanos, line_time};
 
+/// What can be said: a telegram that has a reply, which takes its time.
+pub(crate) trait Say {
+    /// The telegram that says it to the sensor at `address`.
+    fn encode(&self, address: u8) -> Encoded;
+    /// Its command byte.
+    fn command(&self) -> u8;
+    /// How long the sensor may work between acknowledgement and reply.
+    fn work(&self) -> Nanos;
+    /// How long the first sign of an answer may take.
+    fn sign(&self) -> Nanos {
+        ACKNOWLEDGE_TIMEOUT
+    }
+}
+
+impl Say for Request {
+    fn encode(&self, address: u8) -> Encoded {
+        Request::encode(*self, address)
+    }
+
+    fn command(&self) -> u8 {
+        Request::command(*self)
+    }
+
+    fn work(&self) -> Nanos {
+        match self {
+            Request::Stream | Request::Stop | Request::Baud(_) => MODE_TIMEOUT,
+            _ => REPLY_TIMEOUT,
+        }
+    }
+
+    fn sign(&self) -> Nanos {
+        if *self == Request::Stop { STOP_TIMEOUT } else { ACKNOWLEDGE_TIMEOUT }
+    }
+}
+
 /// The open request.
 #[derive(Clone, Debug)]
-pub(crate) struct Outgoing {
-    pub(crate) request: Request,
+pub(crate) struct Outgoing<R = Request> {
+    pub(crate) request: R,
     encoded: Encoded,
     sent: usize,
     not_before: Nanos,
@@ -25,9 +60,9 @@ pub(crate) struct Outgoing {
     give_up_at: Nanos,
 }
 
-impl Outgoing {
+impl<R: Say> Outgoing<R> {
     /// `request` to the sensor at `address`, from `not_before` on, at most `tries` times.
-    pub(crate) fn new(request: Request, address: u8, not_before: Nanos, tries: u8) -> Self {
+    pub(crate) fn new(request: R, address: u8, not_before: Nanos, tries: u8) -> Self {
         let encoded = request.encode(address);
         Outgoing {
             request,
@@ -61,9 +96,8 @@ impl Outgoing {
             self.out_at = Some(now);
             // Behind the head of a scan that the request broke off, the acknowledgement is not seen: the reply is.
             // A sensor that is slower than it should be needs a longer wait, not more tries: each breaks off the last.
-            let base = if self.request == Request::Stop { STOP_TIMEOUT } else { ACKNOWLEDGE_TIMEOUT };
             let tried = Nanos::from(self.tries - self.tries_left - 1);
-            let wait = base + tried * ACKNOWLEDGE_TIMEOUT + self.patience;
+            let wait = self.request.sign() + tried * ACKNOWLEDGE_TIMEOUT + self.patience;
             self.give_up_at = now + wait + line_time(1 + LONGEST_REPLY, baud.rate());
         }
     }
@@ -74,11 +108,7 @@ impl Outgoing {
         if core::mem::replace(&mut self.acknowledged, true) {
             return;
         }
-        let work = match self.request {
-            Request::Stream | Request::Stop | Request::Baud(_) => MODE_TIMEOUT,
-            _ => REPLY_TIMEOUT,
-        };
-        self.give_up_at = now + work + line_time(LONGEST_REPLY, baud.rate());
+        self.give_up_at = now + self.request.work() + line_time(LONGEST_REPLY, baud.rate());
     }
 
     /// Begins again not before `at`; `false` if all tries are used up.
@@ -133,10 +163,10 @@ const ACKNOWLEDGE_TIMEOUT: Nanos = 150 * MILLIS;
 /// cheap: whoever overlooked the stop shows it by streaming on.
 const STOP_TIMEOUT: Nanos = 300 * MILLIS;
 /// Type, status and configuration were captured to take up to 158 ms.
-const REPLY_TIMEOUT: Nanos = 500 * MILLIS;
+pub(crate) const REPLY_TIMEOUT: Nanos = 500 * MILLIS;
 /// A change of mode takes up to 3 s (Telegram listing 7.3), but mostly a tenth of one. What is asked after this time, and
 /// asked again, comes through when it is over.
-const MODE_TIMEOUT: Nanos = 1_000 * MILLIS;
+pub(crate) const MODE_TIMEOUT: Nanos = 1_000 * MILLIS;
 /// Bytes of the status reply.
 const LONGEST_REPLY: usize = 160;
 /// After a NAK the sensor wants 30 ms of peace (Telegram listing 4.3).
