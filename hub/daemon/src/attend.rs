@@ -1,7 +1,7 @@
 //! The life of a port: streamed from while it is there, looked for while it is away, taken back when it returns under
 //! its name, whatever device that is then. Looking costs next to nothing; why it is away is said once, not at each look.
 
-use lms::{MILLIS, Nanos, Session};
+use lms::{Control, MILLIS, Nanos, Session};
 use schema::{Failure, Flags, Kind, State};
 
 use crate::clock;
@@ -36,8 +36,13 @@ impl LinkThread<'_> {
             }
             self.forget();
             self.show(None, State::Absent, &away.words);
-            if self.wait(None, clock::now() + away.pause()) == Woken::Stop {
-                return;
+            let look_at = clock::now() + away.pause();
+            loop {
+                match self.wait(None, look_at) {
+                    Woken::Stop => return,
+                    Woken::Order => self.orders.obey(None),
+                    Woken::Ready | Woken::Timeout => break,
+                }
             }
             match Port::attempt(&link.port, link.baud.rate()) {
                 Ok(port) => opened = Some(port),
@@ -50,6 +55,9 @@ impl LinkThread<'_> {
     fn stay(&mut self, port: &Port) -> std::io::Result<()> {
         self.topics.set_flags(if port.simulated() { Flags::SIMULATED } else { 0 });
         let mut session = Session::new(self.settings(false), clock::now());
+        if self.orders.is_paused() {
+            session.control(Control::Pause, clock::now());
+        }
         let end = self.stream(port, &mut session);
         self.account.close(&session);
         end
