@@ -296,7 +296,7 @@ impl Dialogue {
         self.sensor.address = None;
         let wanted = self.settings.baud;
         let mut others = Baud::ALL.into_iter().filter(|&baud| baud != wanted);
-        let turn = attempt % Baud::ALL.len();
+        let turn = if self.settings.fixed_rate { 0 } else { attempt % Baud::ALL.len() };
         let baud = if turn == 0 { wanted } else { others.nth(turn - 1).unwrap_or(wanted) };
         self.change_baud(baud);
         self.ask(Request::Status, now + SETTLE, 1);

@@ -3,6 +3,7 @@
 mod adoption;
 mod bench;
 mod control;
+mod fixed_rate;
 mod loss;
 mod rest;
 mod start;
