@@ -3,7 +3,7 @@
 
 use std::os::fd::AsFd;
 
-use lms::{MILLIS, Nanos, Session};
+use lms::{Control, MILLIS, Nanos, Session};
 use schema::{Failure, Flags, Kind, State};
 
 use crate::clock;
@@ -40,8 +40,13 @@ impl LinkThread<'_> {
             }
             self.forget();
             self.show(None, State::Absent, &away.words);
-            if self.wait(None, clock::now() + away.pause()) == Woken::Stop {
-                return;
+            let look_at = clock::now() + away.pause();
+            loop {
+                match self.wait(None, look_at) {
+                    Woken::Stop => return,
+                    Woken::Order => self.orders.obey(None),
+                    Woken::Ready | Woken::Timeout => break,
+                }
             }
             match self.reach(&away.words) {
                 None => return,
@@ -62,6 +67,7 @@ impl LinkThread<'_> {
         loop {
             match self.wait(Some(dial.as_fd()), clock::now() + STILL_AWAY) {
                 Woken::Stop => return None,
+                Woken::Order => self.orders.obey(None),
                 Woken::Ready => return Some(dial.finish()),
                 Woken::Timeout => self.show(None, State::Absent, words),
             }
@@ -72,6 +78,9 @@ impl LinkThread<'_> {
     fn stay(&mut self, port: &Port) -> std::io::Result<()> {
         self.topics.set_flags(if port.simulated() { Flags::SIMULATED } else { 0 });
         let mut session = Session::new(self.settings(false), clock::now());
+        if self.orders.is_paused() {
+            session.control(Control::Pause, clock::now());
+        }
         let end = self.stream(port, &mut session);
         self.account.close(&session);
         end

@@ -2,9 +2,10 @@
 //! memory; who listens is not its business.
 
 mod attend;
-mod bus_error;
+pub mod bus_error;
 mod clock;
 pub mod config;
+mod control;
 mod layer;
 mod link;
 mod origin;

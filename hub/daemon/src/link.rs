@@ -14,6 +14,7 @@ use schema::{Failure, Flags, State, Wake};
 
 use crate::clock;
 use crate::config::{Link, Source};
+use crate::control::Orders;
 use crate::port::Port;
 use crate::replay;
 use crate::scanner;
@@ -27,6 +28,8 @@ pub(crate) struct LinkThread<'a> {
     pub(crate) account: Account,
     /// Readable once the hub shall end.
     stop: &'a OwnedFd,
+    /// What users ask for.
+    pub(crate) orders: Orders,
     next_greeting: Nanos,
     next_status: Nanos,
     /// What `error` was made from.
@@ -42,6 +45,8 @@ pub(crate) struct LinkThread<'a> {
 pub(crate) enum Woken {
     /// The hub shall end.
     Stop,
+    /// A user wants something.
+    Order,
     /// There is something to do at the port.
     Ready,
     /// The time is up.
@@ -50,7 +55,7 @@ pub(crate) enum Woken {
 
 impl<'a> LinkThread<'a> {
     /// The thread's values; nothing happens yet.
-    pub(crate) fn new(link: &'a Link, topics: Topics, stop: &'a OwnedFd) -> Self {
+    pub(crate) fn new(link: &'a Link, topics: Topics, stop: &'a OwnedFd, orders: Orders) -> Self {
         let now = clock::now();
         let account = Account::new(&link.port.name(), now);
         LinkThread {
@@ -58,6 +63,7 @@ impl<'a> LinkThread<'a> {
             topics,
             account,
             stop,
+            orders,
             next_greeting: now,
             next_status: now,
             facts: None,
@@ -87,9 +93,13 @@ impl<'a> LinkThread<'a> {
     pub(crate) fn stream(&mut self, port: &Port, session: &mut Session) -> io::Result<()> {
         loop {
             let (watch, until) = self.drain(port, session)?;
-            let woken = self.wait(watch.then_some(port.as_fd()), until);
-            if woken == Woken::Stop {
-                return Ok(());
+            match self.wait(watch.then_some(port.as_fd()), until) {
+                Woken::Stop => return Ok(()),
+                Woken::Order => {
+                    self.orders.obey(Some(session));
+                    continue;
+                }
+                Woken::Ready | Woken::Timeout => {}
             }
             if !watch {
                 // The telegram's end is near: what can be done before it is not done after it.
@@ -209,20 +219,22 @@ impl<'a> LinkThread<'a> {
                 if self.account.is_streaming() { until } else { until.min(self.next_greeting.max(now)) };
             let span = clock::span(now, bound);
             let stop = PollFd::new(self.stop, PollFlags::IN);
+            let orders = PollFd::new(&self.orders, PollFlags::IN);
             let woken = match port {
                 Some(port) => {
-                    let mut fds = [stop, PollFd::from_borrowed_fd(port, PollFlags::IN)];
-                    poll(&mut fds, Some(&span)).map(|_| (is_ready(&fds[0]), is_ready(&fds[1])))
+                    let mut fds = [stop, orders, PollFd::from_borrowed_fd(port, PollFlags::IN)];
+                    poll(&mut fds, Some(&span)).map(|_| fds.each_ref().map(is_ready))
                 }
                 None => {
-                    let mut fds = [stop];
-                    poll(&mut fds, Some(&span)).map(|_| (is_ready(&fds[0]), false))
+                    let mut fds = [stop, orders];
+                    poll(&mut fds, Some(&span)).map(|_| [is_ready(&fds[0]), is_ready(&fds[1]), false])
                 }
             };
             self.account.wakeups += 1;
             match woken {
-                Ok((true, _)) => return Woken::Stop,
-                Ok((_, true)) => return Woken::Ready,
+                Ok([true, ..]) => return Woken::Stop,
+                Ok([_, true, _]) => return Woken::Order,
+                Ok([.., true]) => return Woken::Ready,
                 _ => {}
             }
             let now = clock::now();
@@ -253,7 +265,7 @@ impl<'a> LinkThread<'a> {
     fn trouble(&self, session: &Session) -> String {
         let unit = session.sensor().unit;
         match (session.trouble(), unit, self.link.unit) {
-            (Some(Trouble::NoAnswer), _, _) if self.settings(false).fixed_rate => format!(
+            (Some(Trouble::NoAnswer { .. }), _, _) if self.settings(false).fixed_rate => format!(
                 "no answer at {} baud, to which the serial server was set: power, cable, another rate?",
                 self.link.baud.rate()
             ),
