@@ -65,7 +65,7 @@ pub(crate) struct Received {
 
 /// What the session is asked for in all tests here.
 pub(crate) const WANTED: Settings =
-    Settings { variant: Variant::HALF, baud: Baud::B500000, listen_only: false };
+    Settings { variant: Variant::HALF, baud: Baud::B500000, listen_only: false, fixed_rate: false };
 
 /// A sensor in a room, at this rate.
 pub(crate) fn sensor(baud: Baud) -> Machine {
