@@ -9,9 +9,12 @@
 mod arrival;
 mod candidates;
 pub mod command;
+pub mod condition;
+pub mod configuration;
 pub mod crc;
 mod dialogue;
 pub mod eeprom;
+pub mod errors;
 pub mod exchange;
 pub mod framer;
 pub mod header;
@@ -21,10 +24,13 @@ pub mod operating;
 mod outgoing;
 pub mod parameters;
 mod phase;
+pub mod reflectivity;
 pub mod reply;
 mod sensor;
 pub mod session;
+pub mod status_report;
 pub mod telegram;
+pub mod value;
 pub mod variant;
 
 pub use inquiry::Inquiry;

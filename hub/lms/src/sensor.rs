@@ -100,7 +100,7 @@ impl Sensor {
                 self.kind_len = name.len().min(KIND_LEN);
                 self.kind[..self.kind_len].copy_from_slice(&name[..self.kind_len]);
             }
-            Reply::Mode { .. } | Reply::Refused => {}
+            _ => {}
         }
     }
 }

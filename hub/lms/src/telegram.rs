@@ -126,9 +126,14 @@ impl Writer {
         self
     }
 
+    /// LENGTH so far: command and what was appended.
+    pub fn length(&self) -> usize {
+        self.len - 4
+    }
+
     /// Writes length and checksum. A reply appends its status byte before.
     pub fn finish(mut self) -> Encoded {
-        let [low, high] = ((self.len - 4) as u16).to_le_bytes();
+        let [low, high] = (self.length() as u16).to_le_bytes();
         self.bytes[2] = low;
         self.bytes[3] = high;
         let sum = crc(&self.bytes[..self.len]);
