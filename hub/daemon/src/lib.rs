@@ -4,11 +4,14 @@
 mod bus_error;
 mod clock;
 pub mod config;
+mod converse;
+pub mod doctor;
 mod layer;
 mod link;
 mod origin;
 pub mod port;
 mod preflight;
+pub mod probe;
 mod replay;
 pub mod scanner;
 mod status;

@@ -66,7 +66,7 @@ fn short(what: String) -> Failure {
 }
 
 /// Bytes of the segments of one link: the payloads with their headers, and as much again for the rest.
-fn link_bytes() -> u64 {
+pub(crate) fn link_bytes() -> u64 {
     let payload = |topic| match topic {
         Topic::Telegram => Telegram::MAX,
         Topic::Scan => size_of::<Scan>(),
@@ -77,7 +77,7 @@ fn link_bytes() -> u64 {
 }
 
 /// Where POSIX shared memory lives on Linux.
-const SHARED_MEMORY: &str = "/dev/shm";
+pub(crate) const SHARED_MEMORY: &str = "/dev/shm";
 /// What the shared-memory library puts before each sample, rounded up.
 const CHUNK_HEADER: usize = 64;
 
