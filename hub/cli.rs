@@ -1,6 +1,7 @@
 //! The command line: which verbs there are and what they take. Syntax only; what a value means is checked by whoever
 //! uses it.
 
+mod control;
 mod doctor;
 mod probe;
 
@@ -13,6 +14,8 @@ use daemon::config::Sources;
 use schema::{DEFAULT_DOMAIN, Domain, Environment, Failure};
 use sim::fault::Faults;
 use sim::options::{self, SimulateOptions};
+
+pub(crate) use control::Control;
 
 /// Laser scanners on serial lines, for more than one program: a hub that publishes telegrams and scans into shared
 /// memory, and the programs that listen.
@@ -79,6 +82,8 @@ pub(crate) enum Verb {
     Echo(Echo),
     /// Rate, jitter and loss of topics
     Hz(Hz),
+    /// Stop a sensor, let it stream again, or begin anew with it
+    Control(Control),
 }
 
 #[derive(Args, Debug)]
@@ -234,6 +239,6 @@ impl Simulate {
 
 /// The table of faults, for the end of the help.
 pub(crate) fn fault_table() -> String {
-    let rows = Faults::KEYS.iter().map(|(key, meaning)| format!("  {key:6} {meaning}"));
+    let rows = Faults::keys().map(|(key, meaning)| format!("  {key:13} {meaning}"));
     format!("Faults:\n{}", rows.collect::<Vec<_>>().join("\n"))
 }

@@ -38,11 +38,12 @@ fn main() -> ExitCode {
         Err(error) => return refuse(&error),
     };
     start_log();
+    // What these two print on stdout is one line that says that they are up.
+    let quiet = matches!(cli.verb, Verb::Run(_) | Verb::Simulate(_));
+    daemon::bus_error::explain(cli.everywhere.json, quiet);
     match dispatch(&cli) {
         Ok(()) => ExitCode::SUCCESS,
         Err(failure) => {
-            // What these two print on stdout is one line that says that they are up.
-            let quiet = matches!(cli.verb, Verb::Run(_) | Verb::Simulate(_));
             report(&failure, cli.everywhere.json, quiet);
             ExitCode::from(failure.kind.exit_code())
         }
@@ -105,6 +106,7 @@ fn dispatch(cli: &Cli) -> Result<(), Failure> {
             };
             clients::hz(&options, &mut out, &mut io::stderr(), &*interrupt()?)
         }
+        Verb::Control(control) => clients::control(&control.options(everywhere)?, &mut out, &*interrupt()?),
     }
 }
 

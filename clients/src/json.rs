@@ -1,6 +1,6 @@
 //! The classes of `--json`: which keys, in which order. A contract with scripts and other languages: add, never change.
 
-use schema::{Counters, Failure, Header, Reasons, Scan, Status, Telegram};
+use schema::{Counters, Failure, Header, Reasons, Scan, Status, Telegram, Verb};
 use serde::Serialize;
 use serde::ser::{SerializeMap, Serializer};
 
@@ -177,6 +177,18 @@ pub(crate) fn summary<'a>(name: &'a TopicName, account: &Account) -> impl Serial
         seconds: account.seconds(),
         hz: account.hz(),
     }
+}
+
+/// Class `control`.
+pub(crate) fn control<'a>(sensor: &'a str, verb: Verb) -> impl Serialize + 'a {
+    #[derive(Serialize)]
+    struct Line<'a> {
+        class: &'static str,
+        sensor: &'a str,
+        verb: &'static str,
+        outcome: &'static str,
+    }
+    Line { class: "control", sensor, verb: verb.name(), outcome: "taken" }
 }
 
 /// Class `error`, as the line that a program writes when a verb failed; without its end.

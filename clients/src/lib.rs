@@ -4,6 +4,7 @@
 
 mod account;
 mod attach;
+mod control;
 pub mod duration;
 mod echo;
 mod follow;
@@ -21,6 +22,7 @@ mod text;
 mod window;
 
 pub use attach::{Attachment, attach};
+pub use control::{ControlOptions, control};
 pub use echo::{EchoOptions, Format, echo};
 pub use follow::Bounds;
 pub use follower::Received;

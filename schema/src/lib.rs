@@ -1,6 +1,7 @@
 //! The words everyone speaks: what the hub publishes, and the names under which it does. Knows nobody: no serial line,
 //! no configuration, no verb. Without feature `ipc` it is plain bytes and names, enough for a receiver on the LAN.
 
+mod control;
 mod domain;
 mod failure;
 mod header;
@@ -18,13 +19,14 @@ pub mod limits;
 #[cfg(feature = "ipc")]
 mod lock;
 
+pub use control::{Request, Response, Verb};
 pub use domain::{DEFAULT_DOMAIN, Domain, Environment};
 pub use failure::{Failure, Kind};
 pub use header::{Flags, Header, Quality, Reasons};
 pub use scan::{BEAMS, CONTENTS_UPPER, Code, Scan, TURN_NS};
 pub use status::{COUNTERS, Counter, Counters, State, Status};
 pub use telegram::Telegram;
-pub use topic::{Topic, WAKE, Wake, check_sensor, of_service};
+pub use topic::{CONTROL, CONTROL_REQUEST, CONTROL_RESPONSE, Topic, WAKE, Wake, check_sensor, of_service};
 
 #[cfg(feature = "ipc")]
 pub use lock::{HubLock, holder};

@@ -51,6 +51,13 @@ impl Topic {
     }
 }
 
+/// Name of the service that takes requests for the hub's links.
+pub const CONTROL: &str = "scanhub/v1/control";
+/// Name of the event that wakes the hub for a request.
+pub const CONTROL_REQUEST: &str = "scanhub/v1/control/request";
+/// Name of the event that wakes clients for a response.
+pub const CONTROL_RESPONSE: &str = "scanhub/v1/control/response";
+
 /// Name of the service that wakes the consumers of a sensor, beside its topics.
 pub const WAKE: &str = "wake";
 
@@ -112,7 +119,9 @@ mod tests {
         }
         assert_eq!(of_service(&Wake::service("rear")), Some(("rear", None)));
         assert_eq!(of_service("scanhub/v2/rear/scan"), None);
-        assert_eq!(of_service("scanhub/v1/control"), None);
+        for control in [CONTROL, CONTROL_REQUEST, CONTROL_RESPONSE] {
+            assert_eq!(of_service(control), None);
+        }
     }
 
     #[test]

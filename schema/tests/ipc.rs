@@ -3,9 +3,13 @@
 
 use std::path::PathBuf;
 use std::sync::atomic::{AtomicU32, Ordering};
+use std::time::Duration;
 
 use schema::ipc::{self, Payload, PortFactory};
-use schema::{Domain, Header, HubLock, Kind, Scan, Status, Topic, Wake, holder, limits};
+use schema::{
+    Domain, Failure, Header, HubLock, Kind, Request, Response, Scan, Status, Topic, Verb, Wake, holder,
+    limits,
+};
 
 /// A domain that goes with the test.
 struct Place {
@@ -205,4 +209,47 @@ fn a_hub_that_was_killed_while_making_a_topic_leaves_no_obstacle() {
     std::fs::write(&description, text).unwrap();
     let hub = ipc::hub_node(&place.domain).unwrap();
     Scan::create(&hub, "front").unwrap();
+}
+
+#[test]
+fn a_request_is_answered_and_both_are_woken() {
+    let place = Place::new();
+    let hub = ipc::hub_node(&place.domain).unwrap();
+    let server = ipc::ControlServer::create(&hub).unwrap();
+    let node = ipc::client_node(&place.domain).unwrap();
+    let client = ipc::ControlClient::open(&node).unwrap().expect("the hub made it");
+    assert!(!ipc::take_wakeups(&[client.responses()]).unwrap());
+    let pending = client.ask(&Request::new("front", Verb::Pause)).unwrap();
+    ipc::sleep(&[server.requests()], Duration::from_secs(20)).unwrap();
+    let asked = server.receive().unwrap().expect("was asked");
+    assert_eq!((asked.request().sensor(), asked.request().verb()), ("front", Some(Verb::Pause)));
+    assert!(server.receive().unwrap().is_none() && !ipc::take_wakeups(&[server.requests()]).unwrap());
+    assert!(pending.response().unwrap().is_none() && pending.is_open());
+    let refusal = Response(Err(Failure::new(Kind::Short, "busy", "wait")));
+    server.answer(asked, &refusal).unwrap();
+    assert!(ipc::take_wakeups(&[client.responses()]).unwrap());
+    assert_eq!(pending.response().unwrap(), Some(refusal));
+}
+
+#[test]
+fn clients_that_died_while_they_asked_are_no_obstacle() {
+    let place = Place::new();
+    let hub = ipc::hub_node(&place.domain).unwrap();
+    assert!(ipc::ControlClient::open(&hub).unwrap().is_none());
+    let server = ipc::ControlServer::create(&hub).unwrap();
+    for verb in [Verb::Pause, Verb::Resume].repeat(limits::CONTROL_CLIENTS) {
+        let node = ipc::client_node(&place.domain).unwrap();
+        let client = ipc::ControlClient::open(&node).unwrap().expect("the hub made it");
+        let pending = client.ask(&Request::new("front", verb)).unwrap();
+        if verb == Verb::Pause {
+            // Received and then given up.
+            let asked = server.receive().unwrap().expect("was asked");
+            drop(pending);
+            assert!(!asked.is_waited_for());
+            server.answer(asked, &Response(Ok(()))).unwrap();
+        } else {
+            drop((pending, client));
+            assert!(server.receive().unwrap().is_none());
+        }
+    }
 }

@@ -3,7 +3,9 @@
 
 use std::mem::{offset_of, size_of};
 
-use schema::{BEAMS, COUNTERS, Counter, Counters, Header, Scan, State, Status};
+use schema::{
+    BEAMS, COUNTERS, Counter, Counters, Failure, Header, Kind, Request, Response, Scan, State, Status, Verb,
+};
 
 /// Builds the expected bytes: `size` zeros with `fields` written over them.
 fn golden(size: usize, fields: &[(usize, &[u8])]) -> Vec<u8> {
@@ -147,6 +149,7 @@ fn status_bytes() {
     status.set_last_error("none");
     status.counters[Counter::BytesRead] = 3;
     status.counters[Counter::RejectedSuperseded] = 4;
+    status.counters[Counter::LineErrors] = 5;
     let expected = golden(
         592,
         &[
@@ -158,6 +161,7 @@ fn status_bytes() {
             (176, b"none"),
             (336, &[3]),
             (336 + 19 * 8, &[4]),
+            (336 + 20 * 8, &[5]),
         ],
     );
     assert_eq!(bytemuck::bytes_of(&status), expected);
@@ -170,8 +174,40 @@ fn counters_in_order() {
         names.join(" "),
         "bytes_read bytes_in_telegrams bytes_acknowledge bytes_discarded bytes_buffered telegrams suspect aborted \
          resyncs reconnects lost_in_restart wakeups loan_failed rejected_address rejected_length rejected_command \
-         rejected_count rejected_crc rejected_vetoed rejected_superseded"
+         rejected_count rejected_crc rejected_vetoed rejected_superseded line_errors"
     );
     let names: Vec<_> = State::ALL.iter().map(|state| state.name()).collect();
     assert_eq!(names.join(" "), "absent probing switching starting streaming silent paused");
+}
+
+#[test]
+fn request_layout() {
+    assert_eq!((size_of::<Request>(), align_of::<Request>()), (848, 2));
+    assert_eq!(offset_of!(Request, sensor_text), 0);
+    assert_eq!(offset_of!(Request, verb), 32);
+    assert_eq!(offset_of!(Request, count), 34);
+    assert_eq!(offset_of!(Request, unit_mm), 36);
+    assert_eq!(offset_of!(Request, reserved), 37);
+    assert_eq!(offset_of!(Request, range_array), 40);
+    assert_eq!(offset_of!(Request, pad), 842);
+    assert_eq!([Verb::Pause as u16, Verb::Resume as u16, Verb::Resync as u16], [1, 2, 3]);
+}
+
+#[test]
+fn request_bytes() {
+    let mut request = Request { count: 401, unit_mm: 10, ..Request::new("front", Verb::Resync) };
+    request.range_array[0] = 0x1234;
+    request.range_array[400] = 0x1FFF;
+    let expected = golden(
+        848,
+        &[(0, b"front"), (32, &[3, 0, 0x91, 0x01, 10]), (40, &[0x34, 0x12]), (840, &[0xFF, 0x1F])],
+    );
+    assert_eq!(bytemuck::bytes_of(&request), expected);
+}
+
+#[test]
+fn response_bytes() {
+    assert_eq!(Response(Ok(())).encode(), [0, 0, 0, 0]);
+    let refused = Response(Err(Failure::new(Kind::Short, "busy", "wait")));
+    assert_eq!(refused.encode(), b"\x4b\0\x09\0busy\nwait");
 }

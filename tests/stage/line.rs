@@ -39,11 +39,14 @@ impl Line {
 
     /// Waits until the hub has the line open.
     pub(crate) fn await_open(&self) {
-        super::until("somebody opens the line", || {
-            let mut fds = [PollFd::new(&self.0, PollFlags::IN)];
-            let now = Timespec { tv_sec: 0, tv_nsec: 0 };
-            poll(&mut fds, Some(&now)).is_ok() && !fds[0].revents().contains(PollFlags::HUP)
-        });
+        super::until("somebody opens the line", || self.is_open());
+    }
+
+    /// Whether the hub has the line open.
+    pub(crate) fn is_open(&self) -> bool {
+        let mut fds = [PollFd::new(&self.0, PollFlags::IN)];
+        let now = Timespec { tv_sec: 0, tv_nsec: 0 };
+        poll(&mut fds, Some(&now)).is_ok() && !fds[0].revents().contains(PollFlags::HUP)
     }
 
     /// Sends all of `bytes`, in the pace of whoever reads them; what the other end says meanwhile is not heard.

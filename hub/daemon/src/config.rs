@@ -2,6 +2,7 @@
 
 use std::path::{Path, PathBuf};
 
+use lms::family::Family;
 use lms::variant::{Baud, Unit, Variant};
 use schema::{Failure, Kind};
 
@@ -22,6 +23,8 @@ pub struct Link {
     pub name: String,
     /// Where its bytes come from.
     pub port: Source,
+    /// What the sensor is expected to be, if the user said it: nothing is asked for that it cannot do.
+    pub family: Option<Family>,
     /// Angle and resolution.
     pub variant: Variant,
     /// Unit that the sensor is expected to measure in, if the user said one; it is compared, never written.
@@ -210,6 +213,28 @@ mod tests {
     }
 
     #[test]
+    fn what_a_type_cannot_do_is_refused() {
+        let of = |set: &[&str]| Config::load(&sources(set, &[])).map(|config| config.links[0].clone());
+        let link = of(&["link.front.type=lms211"]).unwrap();
+        assert_eq!((link.family, link.variant), (Some(Family::Lms211), Variant::new(100, 50).unwrap()));
+        let fine = of(&["link.front.type=lms211", "link.front.resolution=0.25"]).unwrap();
+        assert_eq!(fine.variant.beams(), 401);
+        let wide = refusal(&["link.front.angle=180", "link.front.type=lms211"], &[]);
+        assert!(
+            wide.starts_with("--set link.front.angle=180: link front: an lms211 does not scan 180"),
+            "{wide}"
+        );
+        assert!(wide.contains("its window is 100 degrees wide\n  angle = 100"), "{wide}");
+        let fast = refusal(&["link.front.type=s14"], &[]);
+        assert!(
+            fast.contains("--set link.front.type=s14: link front: ") && fast.contains("90 degrees"),
+            "{fast}"
+        );
+        let unknown = refusal(&["link.front.type=lms100"], &[]);
+        assert!(unknown.contains("type = \"lms100\"\n  lms200, lms211, lms221, lms291 or s14"), "{unknown}");
+    }
+
+    #[test]
     fn a_file_error_has_line_and_column() {
         let path = std::env::temp_dir().join(format!("scanhub-config-{}.toml", std::process::id()));
         let load = |text: &str| {
@@ -224,6 +249,9 @@ mod tests {
         let error =
             load("[[link]]\nname = \"a\"\nport = \"x\"\n[[link]]\nname = \"a\"\n").unwrap_err().to_string();
         assert!(error.contains(":5:8: a second link a"), "{error}");
+        let text = "[[link]]\nname = \"a\"\nport = \"x\"\ntype = \"lms211\"\nangle = 180\n";
+        let error = load(text).unwrap_err().to_string();
+        assert!(error.contains(":5:9: link a: an lms211 does not scan 180 degrees"), "{error}");
         let error = load("[[link]]\nname = \"a\"\n").unwrap_err().to_string();
         assert!(error.contains("link a: no port"), "{error}");
         assert!(load("[[link]]\nname = \"a\"\nport = \"x\"\nangle = 100\n").is_ok());

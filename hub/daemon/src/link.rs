@@ -10,10 +10,11 @@ use lms::session::{Output, Received};
 use lms::variant::{Mode, Unit, Variant};
 use lms::{MILLIS, Nanos, Session, Settings, Trouble};
 use rustix::event::{PollFd, PollFlags, poll};
-use schema::{Failure, Flags, Kind, State, Wake};
+use schema::{Failure, Flags, State, Wake};
 
 use crate::clock;
 use crate::config::{Link, Source};
+use crate::control::Orders;
 use crate::port::Port;
 use crate::replay;
 use crate::scanner;
@@ -22,11 +23,13 @@ use crate::topics::Topics;
 
 /// A link with everything that belongs to its thread.
 pub(crate) struct LinkThread<'a> {
-    link: &'a Link,
-    topics: Topics,
-    account: Account,
+    pub(crate) link: &'a Link,
+    pub(crate) topics: Topics,
+    pub(crate) account: Account,
     /// Readable once the hub shall end.
     stop: &'a OwnedFd,
+    /// What users ask for.
+    pub(crate) orders: Orders,
     next_greeting: Nanos,
     next_status: Nanos,
     /// What `error` was made from.
@@ -42,6 +45,8 @@ pub(crate) struct LinkThread<'a> {
 pub(crate) enum Woken {
     /// The hub shall end.
     Stop,
+    /// A user wants something.
+    Order,
     /// There is something to do at the port.
     Ready,
     /// The time is up.
@@ -50,7 +55,7 @@ pub(crate) enum Woken {
 
 impl<'a> LinkThread<'a> {
     /// The thread's values; nothing happens yet.
-    pub(crate) fn new(link: &'a Link, topics: Topics, stop: &'a OwnedFd) -> Self {
+    pub(crate) fn new(link: &'a Link, topics: Topics, stop: &'a OwnedFd, orders: Orders) -> Self {
         let now = clock::now();
         let account = Account::new(&link.port.name(), now);
         LinkThread {
@@ -58,6 +63,7 @@ impl<'a> LinkThread<'a> {
             topics,
             account,
             stop,
+            orders,
             next_greeting: now,
             next_status: now,
             facts: None,
@@ -79,51 +85,21 @@ impl<'a> LinkThread<'a> {
                 }
                 Err(failure) => report(Err(failure)),
             },
-            source @ Source::Tty(_) => match Port::open(source, self.link.baud.rate()) {
-                Err(failure) if failure.kind != Kind::PortMissing => report(Err(failure)),
-                first => {
-                    report(Ok(()));
-                    self.keep_open(first);
-                }
-            },
-        }
-    }
-
-    /// Streams from the port, and takes it back whenever it was away.
-    fn keep_open(&mut self, mut opened: Result<Port, Failure>) {
-        loop {
-            let trouble = match opened {
-                Ok(port) => {
-                    self.topics.set_flags(if port.simulated() { Flags::SIMULATED } else { 0 });
-                    let mut session = Session::new(self.settings(false), clock::now());
-                    let end = self.stream(&port, &mut session);
-                    self.account.close(&session);
-                    match end {
-                        Ok(()) => return,
-                        Err(error) => {
-                            self.account.reconnects += 1;
-                            format!("{} went away: {error}", self.link.port.name())
-                        }
-                    }
-                }
-                Err(failure) => failure.message,
-            };
-            self.facts = None;
-            self.show(None, State::Absent, &trouble);
-            if self.wait(None, clock::now() + REOPEN) == Woken::Stop {
-                return;
-            }
-            opened = Port::open(&self.link.port, self.link.baud.rate());
+            Source::Tty(_) => self.attend(report),
         }
     }
 
     /// Drives `session` on `tty` until the hub shall end; an error says that the port is gone.
-    fn stream(&mut self, port: &Port, session: &mut Session) -> io::Result<()> {
+    pub(crate) fn stream(&mut self, port: &Port, session: &mut Session) -> io::Result<()> {
         loop {
             let (watch, until) = self.drain(port, session)?;
-            let woken = self.wait(watch.then_some(port), until);
-            if woken == Woken::Stop {
-                return Ok(());
+            match self.wait(watch.then_some(port), until) {
+                Woken::Stop => return Ok(()),
+                Woken::Order => {
+                    self.orders.obey(Some(session));
+                    continue;
+                }
+                Woken::Ready | Woken::Timeout => {}
             }
             if !watch {
                 // The telegram's end is near: what can be done before it is not done after it.
@@ -149,7 +125,10 @@ impl<'a> LinkThread<'a> {
                     port.write(byte)?;
                     session.transmitted(clock::now());
                 }
-                Output::Telegram(received) => {
+                Output::Telegram(mut received) => {
+                    let line_errors = port.line_errors();
+                    self.account.line_errors += line_errors;
+                    received.reasons |= if line_errors > 0 { suspect::LINE_ERROR } else { 0 };
                     self.publish(&received, None);
                     self.wake(Wake::Telegram);
                     published = true;
@@ -195,6 +174,11 @@ impl<'a> LinkThread<'a> {
         self.topics.scan(|scan| scanner::decode(&measured, mode, scan));
     }
 
+    /// The session is over: what is wrong is not what was.
+    pub(crate) fn forget(&mut self) {
+        self.facts = None;
+    }
+
     /// Wakes the consumers.
     pub(crate) fn wake(&self, why: Wake) {
         self.topics.wake(why);
@@ -235,20 +219,22 @@ impl<'a> LinkThread<'a> {
                 if self.account.is_streaming() { until } else { until.min(self.next_greeting.max(now)) };
             let span = clock::span(now, bound);
             let stop = PollFd::new(self.stop, PollFlags::IN);
+            let orders = PollFd::new(&self.orders, PollFlags::IN);
             let woken = match port {
                 Some(port) => {
-                    let mut fds = [stop, PollFd::new(port, PollFlags::IN)];
-                    poll(&mut fds, Some(&span)).map(|_| (is_ready(&fds[0]), is_ready(&fds[1])))
+                    let mut fds = [stop, orders, PollFd::new(port, PollFlags::IN)];
+                    poll(&mut fds, Some(&span)).map(|_| fds.each_ref().map(is_ready))
                 }
                 None => {
-                    let mut fds = [stop];
-                    poll(&mut fds, Some(&span)).map(|_| (is_ready(&fds[0]), false))
+                    let mut fds = [stop, orders];
+                    poll(&mut fds, Some(&span)).map(|_| [is_ready(&fds[0]), is_ready(&fds[1]), false])
                 }
             };
             self.account.wakeups += 1;
             match woken {
-                Ok((true, _)) => return Woken::Stop,
-                Ok((_, true)) => return Woken::Ready,
+                Ok([true, ..]) => return Woken::Stop,
+                Ok([_, true, _]) => return Woken::Order,
+                Ok([.., true]) => return Woken::Ready,
                 _ => {}
             }
             let now = clock::now();
@@ -270,7 +256,7 @@ impl<'a> LinkThread<'a> {
         }
     }
 
-    fn settings(&self, listen_only: bool) -> Settings {
+    pub(crate) fn settings(&self, listen_only: bool) -> Settings {
         Settings { variant: self.link.variant, baud: self.link.baud, listen_only }
     }
 
@@ -309,6 +295,7 @@ pub(crate) fn state_of(session: &Session) -> State {
         lms::State::Starting => State::Starting,
         lms::State::Streaming => State::Streaming,
         lms::State::Silent => State::Silent,
+        lms::State::Paused => State::Paused,
     }
 }
 
@@ -316,8 +303,6 @@ fn is_ready(fd: &PollFd<'_>) -> bool {
     !fd.revents().is_empty()
 }
 
-/// Between two attempts to open a port that is away.
-const REOPEN: Nanos = 500 * MILLIS;
 /// A status goes out at least so often.
 const STATUS_PERIOD: Nanos = 1_000 * MILLIS;
 /// A late joiner gets the last status after so long at the most.

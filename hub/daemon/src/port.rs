@@ -3,6 +3,7 @@
 
 mod candidates;
 mod holder;
+mod kernel;
 mod refusal;
 mod rights;
 mod tty;
@@ -67,6 +68,15 @@ impl Port {
     pub(crate) fn write(&self, byte: u8) -> io::Result<()> {
         match self {
             Port::Tty(tty) => tty.write(byte),
+        }
+    }
+}
+
+impl Port {
+    /// Errors that the driver counted on the line since this was last asked; 0 where it counts none, without asking it.
+    pub(crate) fn line_errors(&self) -> u64 {
+        match self {
+            Port::Tty(tty) => tty.line_errors(),
         }
     }
 }

@@ -91,7 +91,7 @@ pub(crate) fn play(link: &mut LinkThread<'_>, session: &mut Session, mut recorde
             last_stamp = Some(stamp);
         }
         // Also where nothing is waited for, the hub's end is looked for.
-        if link.wait(None, if paced { due } else { 0 }) == Woken::Stop {
+        if rest(link, if paced { due } else { 0 }) == Woken::Stop {
             return;
         }
         let now = clock::now();
@@ -106,7 +106,7 @@ pub(crate) fn play(link: &mut LinkThread<'_>, session: &mut Session, mut recorde
             link.wake(Wake::Telegram);
             if is_scan && paced && last_stamp.is_none() {
                 due += period(session);
-                if link.wait(None, due) == Woken::Stop {
+                if rest(link, due) == Woken::Stop {
                     return;
                 }
             }
@@ -116,8 +116,18 @@ pub(crate) fn play(link: &mut LinkThread<'_>, session: &mut Session, mut recorde
             break;
         }
     }
-    while link.wait(None, clock::now() + IDLE) != Woken::Stop {
+    while rest(link, clock::now() + IDLE) != Woken::Stop {
         link.show(Some(session), State::Silent, "the recording is at its end");
+    }
+}
+
+/// Waits until `until` or the hub's end.
+fn rest(link: &mut LinkThread<'_>, until: Nanos) -> Woken {
+    loop {
+        match link.wait(None, until) {
+            Woken::Order => link.orders.refuse(),
+            woken => return woken,
+        }
     }
 }
 

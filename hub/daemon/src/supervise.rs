@@ -6,15 +6,17 @@ use std::os::unix::net::UnixStream;
 use std::sync::mpsc;
 use std::thread;
 
+use lms::{MILLIS, Nanos};
 use rustix::event::{EventfdFlags, PollFd, PollFlags, Timespec, eventfd, poll};
 use schema::ipc::{self, Node};
 use schema::{Domain, Failure, HubLock, Kind};
 use signal_hook::consts::{SIGINT, SIGTERM};
 
 use crate::config::Config;
+use crate::control::Desk;
 use crate::link::LinkThread;
 use crate::topics::Topics;
-use crate::{bus_error, preflight};
+use crate::{clock, preflight};
 
 /// What is up.
 #[derive(Clone, Debug)]
@@ -34,19 +36,21 @@ pub fn run(config: &Config, domain: &Domain, on_ready: impl FnOnce(&Ready)) -> R
     let _lock = HubLock::acquire(domain.root())?;
     preflight::raise_descriptor_limit();
     preflight::check_memory(config.links.len())?;
-    bus_error::explain();
     let node = ipc::hub_node(domain)?;
     node.try_cleanup_dead_nodes();
     let ready =
         Ready { boot: random(), sensors: config.links.iter().map(|link| link.name.clone()).collect() };
+    let (mut desk, orders) = Desk::open(&node, config.links.iter().map(|link| link.name.as_str()))?;
     let stop = eventfd(0, EventfdFlags::CLOEXEC).map_err(|error| no_resource("an eventfd", &error))?;
     thread::scope(|scope| {
         let (report, reports) = mpsc::channel();
         let mut threads = Vec::new();
-        for (number, link) in config.links.iter().enumerate() {
+        for ((number, link), orders) in config.links.iter().enumerate().zip(orders) {
             let (node, stop, report) = (&node, &stop, report.clone());
             let body = move || match Topics::new(node, &link.name, number as u8, ready.boot) {
-                Ok(topics) => LinkThread::new(link, topics, stop).run(|outcome| drop(report.send(outcome))),
+                Ok(topics) => {
+                    LinkThread::new(link, topics, stop, orders).run(|outcome| drop(report.send(outcome)))
+                }
                 Err(failure) => drop(report.send(Err(failure))),
             };
             let thread = thread::Builder::new().name(link.name.clone()).spawn_scoped(scope, body);
@@ -66,7 +70,7 @@ pub fn run(config: &Config, domain: &Domain, on_ready: impl FnOnce(&Ready)) -> R
         if outcome.is_ok() {
             on_ready(&ready);
             let is_alive = || threads.iter().all(|thread| !thread.is_finished());
-            outcome = keep_up(&node, &signals, is_alive);
+            outcome = keep_up(&node, &signals, &mut desk, is_alive);
         }
         end_links(&stop);
         // Joined one by one, a thread that panicked is a failure of this function, not a panic of its own.
@@ -75,21 +79,32 @@ pub fn run(config: &Config, domain: &Domain, on_ready: impl FnOnce(&Ready)) -> R
     })
 }
 
-/// Looks after the links and after what dead consumers left, until a signal says to end.
-fn keep_up(node: &Node, signals: &UnixStream, is_alive: impl Fn() -> bool) -> Result<(), Failure> {
-    for look in 1_u64.. {
-        let mut fds = [PollFd::new(signals, PollFlags::IN)];
-        if poll(&mut fds, Some(&LOOK)).is_ok() && !fds[0].revents().is_empty() {
-            return Ok(());
+/// Looks after the links, what users ask of them and what dead consumers left, until a signal says to end.
+fn keep_up(
+    node: &Node,
+    signals: &UnixStream,
+    desk: &mut Desk,
+    is_alive: impl Fn() -> bool,
+) -> Result<(), Failure> {
+    let mut upkeep_at = clock::now() + UPKEEP;
+    loop {
+        let [requests, outcomes] = desk.descriptors().map(|fd| PollFd::from_borrowed_fd(fd, PollFlags::IN));
+        let mut fds = [PollFd::new(signals, PollFlags::IN), requests, outcomes];
+        let woken = poll(&mut fds, Some(&LOOK)).map(|_| fds.map(|fd| !fd.revents().is_empty()));
+        match woken {
+            Ok([true, ..]) => return Ok(()),
+            Ok([_, false, false]) | Err(_) => {}
+            Ok(_) => desk.serve(),
         }
         if !is_alive() {
             return Err(broken_thread());
         }
-        if look % UPKEEP == 0 {
+        let now = clock::now();
+        if now >= upkeep_at {
             node.try_cleanup_dead_nodes();
+            upkeep_at = now + UPKEEP;
         }
     }
-    Ok(())
 }
 
 /// A socket that becomes readable at SIGINT or SIGTERM.
@@ -127,5 +142,5 @@ fn no_resource(what: &str, error: &dyn std::fmt::Display) -> Failure {
 
 /// Between two looks whether the links are alive.
 const LOOK: Timespec = Timespec { tv_sec: 1, tv_nsec: 0 };
-/// Looks between two at what dead processes left: each reads the directory of all nodes, and nobody waits for it.
-const UPKEEP: u64 = 5;
+/// Between two looks at what dead processes left: each reads the directory of all nodes, and nobody waits for it.
+const UPKEEP: Nanos = 5_000 * MILLIS;

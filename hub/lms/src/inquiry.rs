@@ -8,6 +8,7 @@ use crate::command::Request;
 use crate::configuration::Configuration;
 use crate::errors::Errors;
 use crate::exchange::{Conversation, Exchange, Heard, Output};
+use crate::family::Family;
 use crate::framer::{Place, Tally};
 use crate::phase::{LISTEN, SETTLE, TRIES};
 use crate::reply::Reply;
@@ -198,10 +199,10 @@ impl Inquiry {
         }
     }
 
-    /// Only these types count hours and power-ons (Telegram listing 7-1, 35h).
+    /// What is of no known type would refuse them itself.
     fn has_counters(&self) -> bool {
-        let kind = self.report.kind().unwrap_or_default();
-        [b"LMS211", b"LMS221", b"LMS291"].iter().any(|known| kind.starts_with(*known))
+        let family = self.report.kind().and_then(Family::of_type);
+        family.is_none_or(|family| family.refuses(Request::Counters).is_none())
     }
 
     /// The status at the next rate.

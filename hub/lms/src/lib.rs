@@ -16,6 +16,7 @@ mod dialogue;
 pub mod eeprom;
 pub mod errors;
 pub mod exchange;
+pub mod family;
 pub mod framer;
 pub mod header;
 pub mod inquiry;
@@ -26,15 +27,17 @@ pub mod parameters;
 mod phase;
 pub mod reflectivity;
 pub mod reply;
+mod search;
 mod sensor;
 pub mod session;
+mod start;
 pub mod status_report;
 pub mod telegram;
 pub mod value;
 pub mod variant;
 
 pub use inquiry::Inquiry;
-pub use phase::{Reason, Settings};
+pub use phase::{Control, Reason, Settings};
 pub use sensor::{Sensor, State, Trouble};
 pub use session::Session;
 

@@ -8,7 +8,7 @@ use crate::arrival::{Arrivals, Rhythm};
 use crate::dialogue::Dialogue;
 use crate::framer::{Advance, Framer, Place, Tally, suspect};
 use crate::measured::MEASURED;
-use crate::phase::{Reason, Settings};
+use crate::phase::{Control, Reason, Settings};
 use crate::sensor::{Sensor, State, Trouble};
 use crate::telegram::Telegram;
 use crate::variant::{Baud, Mode};
@@ -110,6 +110,7 @@ impl Session {
         self.framer.commit(len);
         self.arrivals.note(now, len);
         self.last_byte = now;
+        self.dialogue.heard = true;
         if was_empty {
             self.begin_rhythm();
         }
@@ -120,6 +121,13 @@ impl Session {
         self.now = now;
         self.framer.release(now.saturating_sub(self.last_byte));
         self.dialogue.handle_timeout(now);
+    }
+
+    /// A user wants this from now on. Asking twice changes nothing, but a [`Control::Resync`] counts each time. A
+    /// recording cannot be controlled.
+    pub fn control(&mut self, control: Control, now: Nanos) {
+        self.now = now;
+        self.dialogue.control(control, now);
     }
 
     /// The byte of [`Output::Transmit`] was written at `now`.
@@ -197,7 +205,7 @@ impl Session {
         self.framer.buffered()
     }
 
-    /// How often measured data stayed out for a second.
+    /// How often everything began anew: measured data stayed out for a second, or a user asked for it.
     pub fn resyncs(&self) -> u64 {
         self.dialogue.resyncs
     }
@@ -226,7 +234,7 @@ impl Session {
         if self.framer.buffered() > 0 {
             self.begin_rhythm();
         }
-        self.dialogue.on_telegram(self.framer.view(place).telegram, self.now);
+        self.dialogue.on_telegram(self.framer.view(place).telegram, first.at, self.now);
         let framed = self.framer.view(place);
         Received {
             telegram: framed.telegram,

@@ -23,17 +23,19 @@ use crate::{Failure, Kind};
 pub fn sleep(listeners: &[&Listener], timeout: Duration) -> Result<(), Failure> {
     let mut fds: Vec<PollFd<'_>> = listeners
         .iter()
-        .map(|listener| {
-            // SAFETY: the descriptor is open as long as the listener lives, which is borrowed for the whole call.
-            let fd = unsafe { BorrowedFd::borrow_raw(listener.file_descriptor().native_handle()) };
-            PollFd::from_borrowed_fd(fd, PollFlags::IN)
-        })
+        .map(|listener| PollFd::from_borrowed_fd(descriptor(listener), PollFlags::IN))
         .collect();
     let timeout = Timespec { tv_sec: timeout.as_secs() as i64, tv_nsec: i64::from(timeout.subsec_nanos()) };
     match poll(&mut fds, Some(&timeout)) {
         Ok(_) | Err(Errno::INTR) => Ok(()),
         Err(error) => Err(broken(&error)),
     }
+}
+
+/// What is readable while wake-ups of `listener` are pending: for who waits for other things as well.
+pub fn descriptor(listener: &Listener) -> BorrowedFd<'_> {
+    // SAFETY: the descriptor is open as long as the listener lives, which is borrowed as long as the result.
+    unsafe { BorrowedFd::borrow_raw(listener.file_descriptor().native_handle()) }
 }
 
 /// Takes all wake-ups of `listeners` that are pending; returns whether there were any. What was sent before this call

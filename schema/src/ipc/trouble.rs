@@ -9,6 +9,7 @@ use std::time::{Duration, Instant};
 use iceoryx2::port::publisher::PublisherCreateError;
 use iceoryx2::service::builder::event::EventOpenOrCreateError as EventError;
 use iceoryx2::service::builder::publish_subscribe::PublishSubscribeOpenOrCreateError as TopicError;
+use iceoryx2::service::builder::request_response::RequestResponseOpenOrCreateError as ControlError;
 use iceoryx2::service::builder::{ServiceCreateError, ServiceOpenError};
 use iceoryx2::service::service_name::ServiceName;
 
@@ -73,6 +74,16 @@ impl From<EventError> for Trouble {
             EventError::EventOpenError(error) => ServiceOpenError::from(error).into(),
             EventError::EventCreateError(error) => ServiceCreateError::from(error).into(),
             EventError::SystemInFlux => Trouble::Absent,
+        }
+    }
+}
+
+impl From<ControlError> for Trouble {
+    fn from(error: ControlError) -> Trouble {
+        match error {
+            ControlError::RequestResponseOpenError(error) => ServiceOpenError::from(error).into(),
+            ControlError::RequestResponseCreateError(error) => ServiceCreateError::from(error).into(),
+            ControlError::SystemInFlux => Trouble::Absent,
         }
     }
 }

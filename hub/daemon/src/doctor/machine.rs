@@ -8,10 +8,11 @@ use std::path::{Path, PathBuf};
 use rustix::fs::{Access, access, statvfs};
 use rustix::process::{Resource, getrlimit, getuid};
 use schema::ipc::Nodes;
+use schema::ipc::memory::SHARED_MEMORY;
 use schema::{Domain, Failure};
 
 use super::finding::Finding;
-use crate::preflight::{SHARED_MEMORY, link_bytes};
+use crate::preflight::needed;
 
 /// What is known of the machine and the domain.
 #[derive(Clone, Debug)]
@@ -93,7 +94,7 @@ pub(crate) fn memory(facts: &Facts) -> Finding {
         let remedy = format!("mount a tmpfs there: mount -t tmpfs -o size=64M tmpfs {SHARED_MEMORY}");
         return Finding::failed(NAME, format!("{SHARED_MEMORY} cannot be looked at"), remedy);
     };
-    let needed = facts.links as u64 * link_bytes();
+    let needed = needed(facts.links);
     let has = format!("{SHARED_MEMORY} has {} kB, {} kB of them free", size / 1024, free / 1024);
     if facts.lives().is_some() {
         return Finding::ok(NAME, format!("{has}; the hub has what it needs"));

@@ -3,6 +3,7 @@
 
 use lms::condition::{Condition, Severity};
 use lms::errors::Fault;
+use lms::family::Family;
 use lms::inquiry::Report;
 use lms::variant::{Unit, Variant};
 use schema::{State, Status};
@@ -61,15 +62,29 @@ fn settings(report: &Report, link: Option<&Link>) -> Finding {
         status.unit().map_or("unknown unit".into(), |unit| format!("unit {} mm", unit.mm())),
         status.mode().0
     );
-    let expected = link.and_then(|link| link.unit);
-    match (expected, status.unit()) {
-        (Some(expected), Some(is)) if expected != is => Finding::warning(
-            NAME,
-            format!("{text}; the configuration says unit {} mm", expected.mm()),
-            format!("scanhub configure PORT unit={}, or correct the configuration", word(expected)),
-        ),
-        _ => Finding::ok(NAME, text),
+    let mut wrong = Vec::new();
+    let family = report.kind().and_then(Family::of_type);
+    if let Some((expected, is)) = link.and_then(|link| link.family).zip(family)
+        && expected != is
+    {
+        wrong.push((
+            format!("the configuration says type {}, it is a {}", expected.name(), is.name()),
+            "correct the type in the configuration, or plug in the other sensor".to_owned(),
+        ));
     }
+    if let Some((expected, is)) = link.and_then(|link| link.unit).zip(status.unit())
+        && expected != is
+    {
+        wrong.push((
+            format!("the configuration says unit {} mm", expected.mm()),
+            format!("scanhub configure PORT unit={}, or correct the configuration", word(expected)),
+        ));
+    }
+    if wrong.is_empty() {
+        return Finding::ok(NAME, text);
+    }
+    let (whats, remedies): (Vec<_>, Vec<_>) = wrong.into_iter().unzip();
+    Finding::warning(NAME, format!("{text}; {}", whats.join("; ")), remedies.join("; "))
 }
 
 /// Whether a former owner has changed the rate at which it comes up.

@@ -70,7 +70,7 @@ pub(super) fn found_in(root: &Path) -> Vec<Candidate> {
                 name: name.unwrap_or(&device).clone(),
                 driver: driver_of(&hardware),
                 product: product_of(&hardware),
-                latency_ms: word(&hardware.join("latency_timer")).and_then(|text| text.parse().ok()),
+                latency_ms: latency_of(&hardware),
                 device,
                 holder: None,
                 is_permitted: false,
@@ -79,6 +79,16 @@ pub(super) fn found_in(root: &Path) -> Vec<Candidate> {
         .collect();
     found.sort_by_key(|candidate| (candidate.product.is_none(), candidate.name.clone()));
     found
+}
+
+/// How long the adapter at `path` collects bytes, if it says so.
+pub(super) fn latency_ms(path: &Path) -> Option<u8> {
+    let device = path.canonicalize().ok()?;
+    latency_of(&Path::new("/sys/class/tty").join(device.file_name()?).join("device"))
+}
+
+fn latency_of(hardware: &Path) -> Option<u8> {
+    word(&hardware.join("latency_timer"))?.parse().ok()
 }
 
 /// The driver of `hardware`, or of what it is a part of: since Linux 6.5 the UARTs of a board hang below a bus that has

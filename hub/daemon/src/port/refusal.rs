@@ -118,14 +118,10 @@ fn missing(path: &Path, there: &[Candidate]) -> Failure {
 /// What is there instead of `name`, what is called alike first.
 fn instead(name: &str, there: &[Candidate]) -> String {
     let mut there: Vec<&Candidate> = there.iter().collect();
-    let likeness = |candidate: &Candidate| {
+    there.sort_by_key(|candidate| {
         let names = [&candidate.name, &candidate.device];
-        names
-            .map(|known| strsim::jaro_winkler(name, &known.to_string_lossy()))
-            .into_iter()
-            .fold(0.0, f64::max)
-    };
-    there.sort_by(|a, b| likeness(b).total_cmp(&likeness(a)));
+        names.map(|known| strsim::levenshtein(name, &known.to_string_lossy())).into_iter().min()
+    });
     match &there[..] {
         [] => "no serial line is plugged in".to_owned(),
         there => {
@@ -166,5 +162,76 @@ fn remedy_of_rate(wanted: u32) -> &'static str {
         "adapters with an FT232R, FT232H or FT4232H do it exactly; a UART clocked with 1.8432 MHz cannot: baud = 38400"
     } else {
         "say another rate: baud = 38400, 19200 or 9600"
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_the_kernel_says_and_what_it_means() {
+        let source = Source::Tty("/dev/null".into());
+        for (refusal, kind, says) in [
+            (Errno::NOTTY.into(), Kind::PortNotTty, "file:PATH for a recording"),
+            (Errno::IO.into(), Kind::PortMissing, "no line behind it"),
+            (Errno::NXIO.into(), Kind::PortMissing, "no line behind it"),
+            (Errno::MFILE.into(), Kind::Short, "ulimit -n"),
+            (Errno::LOOP.into(), Kind::PortNotTty, "dmesg"),
+            (Errno::PERM.into(), Kind::PortPermission, "/dev/null"),
+            (Errno::BUSY.into(), Kind::PortBusy, "stop it first"),
+            (
+                Refusal::Rate { wanted: 500_000, given: 115_200 },
+                Kind::PortRate,
+                "/dev/null: 500000 Bd is not possible here, the driver gives 115200 Bd\n  adapters with an FT232R",
+            ),
+            (Refusal::Rate { wanted: 9600, given: 0 }, Kind::PortRate, "say another rate"),
+        ] {
+            let failure = Refusal::explain(&refusal, &source);
+            assert_eq!(failure.kind, kind, "{failure}");
+            assert!(failure.to_string().contains(says) && !failure.hint.is_empty(), "{failure}");
+        }
+    }
+
+    #[test]
+    fn what_is_called_alike_stands_first() {
+        let candidate = |name: &str, device: &str| Candidate {
+            name: name.into(),
+            device: device.into(),
+            driver: Some("ftdi_sio".to_owned()),
+            product: None,
+            latency_ms: None,
+            holder: None,
+            is_permitted: true,
+        };
+        let there = [
+            candidate("/dev/serial/by-id/usb-FTDI-A-if00-port0", "/dev/ttyUSB1"),
+            candidate("/dev/serial/by-id/usb-Prolific-if00-port0", "/dev/ttyUSB0"),
+            candidate("/dev/ttyS0", "/dev/ttyS0"),
+        ];
+        let first = |name: &str| {
+            let hint = missing(Path::new(name), &there).hint;
+            hint.split([' ', ',']).nth(2).map(str::to_owned).unwrap_or_default()
+        };
+        assert_eq!(first("/dev/ttyUSB1"), "/dev/serial/by-id/usb-FTDI-A-if00-port0");
+        assert_eq!(first("/dev/serial/by-id/usb-Prolific-if00-port1"), there[1].name.display().to_string());
+        assert_eq!(first("/dev/ttyS1"), "/dev/ttyS0");
+        assert_eq!(missing(Path::new("/dev/x"), &[]).hint, "no serial line is plugged in");
+    }
+
+    #[test]
+    fn who_has_it_and_how_to_get_it_back() {
+        for (program, says) in [
+            ("ModemManager", "systemctl stop ModemManager"),
+            ("brltty", "apt remove brltty"),
+            ("agetty", "serial-getty"),
+            ("scanhub", "scanhub list --domains"),
+            ("minicom", "stop it first"),
+        ] {
+            let failure = busy(Path::new("/dev/x"), Some(Holder { pid: 7, program: program.to_owned() }));
+            assert!(failure.message.ends_with(&format!("in use by process 7 ({program})")), "{failure}");
+            assert!(failure.hint.contains(says), "{failure}");
+        }
+        assert!(busy(Path::new("/dev/x"), None).hint.contains("sudo fuser -v /dev/x"));
     }
 }

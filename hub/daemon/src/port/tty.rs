@@ -1,5 +1,6 @@
 //! A serial line: opened for us alone, raw, and at a rate that the driver was seen to take.
 
+use std::cell::Cell;
 use std::io::{self, ErrorKind};
 use std::os::fd::{AsFd, BorrowedFd, OwnedFd};
 use std::os::unix::fs::FileTypeExt;
@@ -12,13 +13,16 @@ use rustix::termios::{
     tcgetattr, tcsetattr,
 };
 
-use super::Refusal;
+use super::candidates::latency_ms;
+use super::{Refusal, kernel};
 
 /// An open serial line, exclusive and raw; reads and writes never block.
 pub(crate) struct Tty {
     line: OwnedFd,
     /// Whether another program plays the sensor.
     pub(crate) simulated: bool,
+    /// The driver's count of errors when it was last looked at; nothing if it has none.
+    errors: Cell<Option<u32>>,
 }
 
 impl Tty {
@@ -40,7 +44,11 @@ impl Tty {
         })?;
         ioctl_tiocexcl(&line)?;
         let simulated = path.canonicalize().is_ok_and(|real| real.starts_with("/dev/pts"));
-        let tty = Tty { line, simulated };
+        let tty = Tty { line, simulated, errors: Cell::new(None) };
+        // Not all drivers have this, and a sensor streams without it.
+        if let Err(error) = kernel::hand_over_at_once(&tty.line) {
+            tracing::debug!(%error, "{}: no low latency", path.display());
+        }
         termios.make_raw();
         termios.input_modes.remove(InputModes::IXOFF | InputModes::IXANY | InputModes::INPCK);
         // 8N1 without handshake (Telegram listing 4); the modem's lines mean nothing here.
@@ -49,9 +57,26 @@ impl Tty {
         termios.set_speed(baud)?;
         tcsetattr(&tty.line, OptionalActions::Now, &termios)?;
         match tty.rate()? {
-            given if is_near(given, baud) => Ok(tty),
-            given => Err(Refusal::Rate { wanted: baud, given }),
+            given if is_near(given, baud) => {}
+            given => return Err(Refusal::Rate { wanted: baud, given }),
         }
+        if let Some(ms) = latency_ms(path).filter(|&ms| ms > PROMPT_MS) {
+            tracing::warn!(
+                "{}: the adapter collects bytes for {ms} ms, so stamps are off by as much; a udev rule ends that: \
+                 ACTION==\"add\", SUBSYSTEM==\"usb-serial\", DRIVER==\"ftdi_sio\", ATTR{{latency_timer}}=\"1\"",
+                path.display()
+            );
+        }
+        tty.errors.set(kernel::line_errors(&tty.line).ok());
+        Ok(tty)
+    }
+
+    /// Errors that the driver counted since it was last asked, be it by a change of the rate.
+    pub(crate) fn line_errors(&self) -> u64 {
+        let Some(before) = self.errors.get() else { return 0 };
+        let now = kernel::line_errors(&self.line).unwrap_or(before);
+        self.errors.set(Some(now));
+        u64::from(now.wrapping_sub(before))
     }
 
     pub(crate) fn set_baud(&self, baud: u32) -> io::Result<()> {
@@ -59,6 +84,8 @@ impl Tty {
         termios.set_speed(baud)?;
         tcsetattr(&self.line, OptionalActions::Now, &termios)?;
         tcflush(&self.line, QueueSelector::IFlush)?;
+        // At a wrong rate every byte is an error.
+        self.line_errors();
         match self.rate()? {
             given if is_near(given, baud) => Ok(()),
             given => {
@@ -113,6 +140,9 @@ fn hung_up() -> io::Error {
 fn is_near(given: u32, wanted: u32) -> bool {
     u64::from(given.abs_diff(wanted)) * 100 <= u64::from(wanted) * 3
 }
+
+/// An adapter that collects bytes for longer blurs the stamps.
+const PROMPT_MS: u8 = 2;
 
 #[cfg(test)]
 mod tests {

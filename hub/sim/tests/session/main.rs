@@ -2,6 +2,7 @@
 
 mod adoption;
 mod bench;
+mod control;
 mod loss;
 mod rest;
 mod start;

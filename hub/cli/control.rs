@@ -1,0 +1,33 @@
+//! `scanhub control` on the command line.
+
+use clap::Args;
+use clap::builder::{PossibleValuesParser, TypedValueParser};
+use clients::ControlOptions;
+use schema::{Failure, Verb};
+
+use super::Everywhere;
+
+#[derive(Args, Debug)]
+pub(crate) struct Control {
+    /// The sensor
+    sensor: String,
+    /// pause: the sensor stops; resume: it streams again; resync: the conversation with it begins anew
+    #[arg(value_parser = verbs())]
+    verb: Verb,
+}
+
+impl Control {
+    pub(crate) fn options(&self, everywhere: &Everywhere) -> Result<ControlOptions, Failure> {
+        Ok(ControlOptions {
+            sensor: self.sensor.clone(),
+            verb: self.verb,
+            json: everywhere.json,
+            places: everywhere.places()?,
+        })
+    }
+}
+
+fn verbs() -> impl TypedValueParser<Value = Verb> {
+    PossibleValuesParser::new(Verb::ALL.map(Verb::name))
+        .try_map(|word| Verb::parse(&word).ok_or("not a request"))
+}

@@ -1,0 +1,226 @@
+//! Requests from outside on their way to the links: each is handed to its link's thread by a bounded queue and answered
+//! when the link has taken it. Never waits for a link; what a request does to a sensor is the session's business.
+
+use std::os::fd::{AsFd, BorrowedFd, OwnedFd};
+use std::sync::Arc;
+use std::sync::mpsc::{Receiver, Sender, SyncSender, TrySendError, channel, sync_channel};
+
+use lms::{Control, Session};
+use rustix::event::{EventfdFlags, eventfd};
+use rustix::io::Errno;
+use schema::ipc::{self, Asked, ControlServer, Node};
+use schema::{Failure, Kind, Response, Verb};
+
+use crate::clock;
+
+/// Where requests come in; stays in the supervising thread.
+pub(crate) struct Desk {
+    server: ControlServer,
+    links: Vec<Inbox>,
+    outcomes: Receiver<(u64, Result<(), Failure>)>,
+    bell: Arc<Bell>,
+    /// Requests that a link has not taken yet, by the numbers of their orders.
+    open: Vec<(u64, Asked)>,
+    next: u64,
+}
+
+/// The way to a link's thread.
+struct Inbox {
+    sensor: String,
+    queue: SyncSender<Order>,
+    bell: Arc<Bell>,
+}
+
+/// What a link is asked to do, in the link's thread.
+pub(crate) struct Orders {
+    sensor: String,
+    paused: bool,
+    queue: Receiver<Order>,
+    bell: Arc<Bell>,
+    outcomes: Sender<(u64, Result<(), Failure>)>,
+    desk: Arc<Bell>,
+}
+
+struct Order {
+    number: u64,
+    verb: Verb,
+}
+
+impl Desk {
+    /// Opens the control service, for a link of each of `sensors`; what comes for them arrives at the second value.
+    ///
+    /// [`Kind::Short`] if memory or descriptors are.
+    pub(crate) fn open<'a>(
+        node: &Node,
+        sensors: impl Iterator<Item = &'a str>,
+    ) -> Result<(Desk, Vec<Orders>), Failure> {
+        let server = ControlServer::create(node)?;
+        let bell = Arc::new(Bell::new()?);
+        let (told, outcomes) = channel();
+        let (mut links, mut ends) = (Vec::new(), Vec::new());
+        for sensor in sensors {
+            let (sender, queue) = sync_channel(QUEUE);
+            let own = Arc::new(Bell::new()?);
+            links.push(Inbox { sensor: sensor.to_owned(), queue: sender, bell: own.clone() });
+            ends.push(Orders {
+                sensor: sensor.to_owned(),
+                paused: false,
+                queue,
+                bell: own,
+                outcomes: told.clone(),
+                desk: bell.clone(),
+            });
+        }
+        Ok((Desk { server, links, outcomes, bell, open: Vec::new(), next: 0 }, ends))
+    }
+
+    /// What becomes readable when there is something to [`serve`](Self::serve).
+    pub(crate) fn descriptors(&self) -> [BorrowedFd<'_>; 2] {
+        [ipc::descriptor(self.server.requests()), self.bell.0.as_fd()]
+    }
+
+    /// Answers what the links have taken, and hands on what came in.
+    pub(crate) fn serve(&mut self) {
+        self.bell.hush();
+        while let Ok((number, outcome)) = self.outcomes.try_recv() {
+            if let Some(at) = self.open.iter().position(|(open, _)| *open == number) {
+                let (_, asked) = self.open.swap_remove(at);
+                self.answer(asked, outcome);
+            }
+        }
+        self.open.retain(|(_, asked)| asked.is_waited_for());
+        loop {
+            match self.server.receive() {
+                Ok(Some(asked)) => self.hand_on(asked),
+                Ok(None) => return,
+                Err(failure) => return tracing::warn!(%failure, "a request was not received"),
+            }
+        }
+    }
+
+    fn hand_on(&mut self, asked: Asked) {
+        match self.order(&asked) {
+            Ok(number) => self.open.push((number, asked)),
+            Err(refusal) => self.answer(asked, Err(refusal)),
+        }
+    }
+
+    /// Puts what `asked` wants into the link's queue; the number by which its outcome will be told.
+    fn order(&mut self, asked: &Asked) -> Result<u64, Failure> {
+        let (request, sensor) = (asked.request(), asked.request().sensor());
+        let link = self.links.iter().find(|link| link.sensor == sensor).ok_or_else(|| {
+            let sensors: Vec<_> = self.links.iter().map(|link| link.sensor.as_str()).collect();
+            let there_are = format!("there are {}", sensors.join(", "));
+            Failure::new(Kind::NoTopic, format!("the hub has no sensor {sensor}"), there_are)
+        })?;
+        let verb = request.verb().ok_or_else(|| {
+            let message = format!("request {} is not known to this hub", request.verb);
+            Failure::new(Kind::Failed, message, "client and hub are of different versions")
+        })?;
+        match link.queue.try_send(Order { number: self.next, verb }) {
+            Ok(()) => {}
+            Err(TrySendError::Full(_)) => {
+                let message = format!("{sensor} has {QUEUE} requests to do already");
+                return Err(Failure::new(Kind::Short, message, "try again in a moment"));
+            }
+            Err(TrySendError::Disconnected(_)) => {
+                return Err(Failure::new(Kind::Failed, format!("the link {sensor} has ended"), ""));
+            }
+        }
+        link.bell.ring();
+        self.next += 1;
+        Ok(self.next - 1)
+    }
+
+    fn answer(&self, asked: Asked, outcome: Result<(), Failure>) {
+        if let Err(failure) = self.server.answer(asked, &Response(outcome)) {
+            tracing::debug!(%failure, "a client was not answered");
+        }
+    }
+}
+
+impl Orders {
+    /// Does what users asked for, with `session` if the port is there.
+    pub(crate) fn obey(&mut self, mut session: Option<&mut Session>) {
+        while let Some(order) = self.take() {
+            let control = match order.verb {
+                Verb::Pause => Control::Pause,
+                Verb::Resume => Control::Resume,
+                Verb::Resync => Control::Resync,
+            };
+            let outcome = match &mut session {
+                None if control == Control::Resync => Err(self.refusal("the port is away")),
+                None => Ok(()),
+                Some(session) => {
+                    session.control(control, clock::now());
+                    Ok(())
+                }
+            };
+            if outcome.is_ok() {
+                self.paused = control == Control::Pause;
+            }
+            self.answer(&order, outcome);
+        }
+    }
+
+    /// Refuses what users ask of a recording.
+    pub(crate) fn refuse(&self) {
+        while let Some(order) = self.take() {
+            self.answer(&order, Err(self.refusal("a recording takes no requests")));
+        }
+    }
+
+    /// Whether a user wants nothing of the sensor for now: a pause outlasts an absence of the port.
+    pub(crate) fn is_paused(&self) -> bool {
+        self.paused
+    }
+
+    fn take(&self) -> Option<Order> {
+        self.bell.hush();
+        self.queue.try_recv().ok()
+    }
+
+    fn answer(&self, order: &Order, outcome: Result<(), Failure>) {
+        // A desk that is closed has no client that waits.
+        if self.outcomes.send((order.number, outcome)).is_ok() {
+            self.desk.ring();
+        }
+    }
+
+    fn refusal(&self, why: &str) -> Failure {
+        let hint = format!("`scanhub info {}` shows how it is", self.sensor);
+        Failure::new(Kind::Failed, format!("{}: {why}", self.sensor), hint)
+    }
+}
+
+impl AsFd for Orders {
+    /// Readable as long as an order waits.
+    fn as_fd(&self) -> BorrowedFd<'_> {
+        self.bell.0.as_fd()
+    }
+}
+
+/// An eventfd that stays readable until it is hushed.
+struct Bell(OwnedFd);
+
+impl Bell {
+    fn new() -> Result<Bell, Failure> {
+        let made = eventfd(0, EventfdFlags::CLOEXEC | EventfdFlags::NONBLOCK);
+        made.map(Bell).map_err(|error: Errno| {
+            Failure::new(Kind::Short, format!("an eventfd cannot be had: {error}"), "raise `ulimit -n`")
+        })
+    }
+
+    fn ring(&self) {
+        // Fails only if it rings already.
+        let _ = rustix::io::write(&self.0, &1_u64.to_ne_bytes());
+    }
+
+    fn hush(&self) {
+        // Fails only if it does not ring.
+        let _ = rustix::io::read(&self.0, &mut [0; 8]);
+    }
+}
+
+/// Requests that wait for a link; whoever asks faster is told to come back.
+const QUEUE: usize = 4;

@@ -1,0 +1,160 @@
+//! What may be asked of a running hub, and how it answers: the payloads of the control service. Refuses to know who
+//! carries a request out.
+
+use bytemuck::{Pod, Zeroable};
+#[cfg(feature = "ipc")]
+use iceoryx2::prelude::ZeroCopySend;
+
+use crate::{BEAMS, Failure, Kind, text};
+
+/// What is asked for.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[repr(u16)]
+pub enum Verb {
+    /// The sensor shall stop; its link stays.
+    Pause = 1,
+    /// The sensor shall stream again.
+    Resume = 2,
+    /// The conversation with the sensor shall begin anew.
+    Resync = 3,
+}
+
+impl Verb {
+    /// All verbs, in the order of all output.
+    pub const ALL: [Verb; 3] = [Verb::Pause, Verb::Resume, Verb::Resync];
+
+    /// The verb's name on the command line and in all output.
+    pub fn name(self) -> &'static str {
+        match self {
+            Verb::Pause => "pause",
+            Verb::Resume => "resume",
+            Verb::Resync => "resync",
+        }
+    }
+
+    /// The verb called `name`.
+    pub fn parse(name: &str) -> Option<Verb> {
+        Verb::ALL.into_iter().find(|verb| verb.name() == name)
+    }
+}
+
+/// A request, 848 bytes. What a verb has no use for is 0.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Pod, Zeroable)]
+#[cfg_attr(feature = "ipc", derive(ZeroCopySend), type_name("scanhub.Request.v1"))]
+#[repr(C)]
+pub struct Request {
+    /// See [`Request::sensor`].
+    pub sensor_text: [u8; 32],
+    /// See [`Request::verb`].
+    pub verb: u16,
+    /// Ranges used, at most [`BEAMS`].
+    pub count: u16,
+    /// Millimetres per unit of the ranges.
+    pub unit_mm: u8,
+    /// 0.
+    pub reserved: [u8; 3],
+    /// Ranges in device units; 0 beyond `count`.
+    pub range_array: [u16; BEAMS],
+    /// 0.
+    pub pad: [u8; 6],
+}
+
+impl Request {
+    /// Asks for `verb` at `sensor`, a name of at most 32 bytes.
+    pub fn new(sensor: &str, verb: Verb) -> Request {
+        let mut request = Request { verb: verb as u16, ..Zeroable::zeroed() };
+        text::write(&mut request.sensor_text, sensor);
+        request
+    }
+
+    /// The sensor that is meant.
+    pub fn sensor(&self) -> &str {
+        text::read(&self.sensor_text)
+    }
+
+    /// The verb; nothing if a newer client has one that this program does not know.
+    pub fn verb(&self) -> Option<Verb> {
+        Verb::ALL.into_iter().find(|verb| *verb as u16 == self.verb)
+    }
+}
+
+/// An answer: done, or why not. Its bytes are exit code and message length, two bytes each and the lower one first,
+/// then the message; a remedy is its second line.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Response(pub Result<(), Failure>);
+
+impl Response {
+    /// The longest response in bytes; a message beyond it is cut.
+    pub const MAX: usize = 1024;
+
+    /// The response as bytes.
+    pub fn encode(&self) -> Vec<u8> {
+        let (code, said) = match &self.0 {
+            Ok(()) => (0, String::new()),
+            Err(failure) => (failure.kind.exit_code(), format!("{}\n{}", failure.message, failure.hint)),
+        };
+        let mut message = vec![0; said.trim_end().len().min(Response::MAX - HEAD)];
+        text::write(&mut message, said.trim_end());
+        let head = [u16::from(code), message.len() as u16].map(u16::to_le_bytes);
+        [head.as_flattened(), &message].concat()
+    }
+
+    /// The response in `bytes`, if that is one. A code that no kind of failure has is [`Kind::Failed`].
+    pub fn decode(bytes: &[u8]) -> Option<Response> {
+        let (&[code_low, code_high, low, high], rest) = bytes.split_first_chunk()?;
+        let message = text::read(rest.get(..usize::from(u16::from_le_bytes([low, high])))?);
+        let code = u16::from_le_bytes([code_low, code_high]);
+        if code == 0 {
+            return Some(Response(Ok(())));
+        }
+        let kind = ANSWERS.into_iter().find(|kind| u16::from(kind.exit_code()) == code);
+        let (message, hint) = message.split_once('\n').unwrap_or((message, ""));
+        Some(Response(Err(Failure::new(kind.unwrap_or(Kind::Failed), message, hint))))
+    }
+}
+
+/// Exit code and message length.
+const HEAD: usize = 4;
+
+/// The failures that a hub answers with; each exit code stands for one of them.
+const ANSWERS: [Kind; 3] = [Kind::Failed, Kind::NoTopic, Kind::Short];
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn verbs_go_there_and_back() {
+        for verb in Verb::ALL {
+            assert_eq!(Verb::parse(verb.name()), Some(verb));
+            let request = Request::new("front", verb);
+            assert_eq!((request.sensor(), request.verb()), ("front", Some(verb)));
+        }
+        let unknown = Request { verb: 99, ..Request::new("front", Verb::Pause) };
+        assert_eq!((unknown.verb(), Verb::parse("stop")), (None, None));
+    }
+
+    #[test]
+    fn responses_go_there_and_back() {
+        let failure = |kind, hint: &str| Response(Err(Failure::new(kind, "front: no", hint)));
+        for response in [
+            Response(Ok(())),
+            failure(Kind::Failed, ""),
+            failure(Kind::Short, "later"),
+            failure(Kind::NoTopic, "a, b"),
+        ] {
+            assert_eq!(Response::decode(&response.encode()), Some(response));
+        }
+        let long = Response(Err(Failure::new(Kind::Failed, "é".repeat(2000), ""))).encode();
+        assert!(long.len() <= Response::MAX && Response::decode(&long).is_some());
+    }
+
+    #[test]
+    fn what_is_no_response() {
+        for bytes in [&[][..], &[0, 0, 1], &[1, 0, 2, 0, b'a']] {
+            assert_eq!(Response::decode(bytes), None);
+        }
+        let unknown = Response::decode(&[200, 1, 1, 0, b'a']).unwrap();
+        assert_eq!(unknown, Response(Err(Failure::new(Kind::Failed, "a", ""))));
+    }
+}

@@ -1,0 +1,191 @@
+//! The control service: a client's request, the hub's response, and the two events that wake the one for the other.
+//! Refuses to know what a request means.
+
+use iceoryx2::active_request::ActiveRequest;
+use iceoryx2::pending_response::PendingResponse;
+use iceoryx2::port::{client, server};
+use iceoryx2::prelude::{EventId, PortFactory as _};
+use iceoryx2::service::port_factory::request_response;
+
+use super::trouble::{Trouble, create, no_port, open};
+use super::{Listener, Node, Notifier, Service, WakeService, listener, name, take_wakeups};
+use crate::{Failure, Kind, Request, Response, limits, topic};
+
+/// The hub's end. Wakes its [`requests`](Self::requests) when somebody asked.
+pub struct ControlServer {
+    server: server::Server<Service, Request, (), [u8], ()>,
+    requests: Listener,
+    responses: Notifier,
+    control: ControlService,
+    _bells: [WakeService; 2],
+}
+
+/// A request that was received and not answered yet; one that is dropped stays without an answer.
+pub struct Asked(ActiveRequest<Service, Request, (), [u8], ()>);
+
+/// A client's end.
+pub struct ControlClient {
+    client: client::Client<Service, Request, (), [u8], ()>,
+    requests: Notifier,
+    responses: Listener,
+    _control: ControlService,
+    _bells: [WakeService; 2],
+}
+
+/// A request that was sent; who drops it gives it up.
+pub struct Pending(PendingResponse<Service, Request, (), [u8], ()>);
+
+type ControlService = request_response::PortFactory<Service, Request, (), [u8], ()>;
+
+impl ControlServer {
+    /// The hub's end of the service, made if it is not there.
+    ///
+    /// [`Kind::DomainHeld`] if another hub has it, [`Kind::Short`] if there is no memory for it.
+    pub fn create(node: &Node) -> Result<ControlServer, Failure> {
+        let service = name(topic::CONTROL)?;
+        let control = create(node, &service, || {
+            let builder = node.service_builder(&service).request_response::<Request, [u8]>();
+            builder
+                .max_servers(limits::PUBLISHERS)
+                .max_clients(limits::CONTROL_CLIENTS)
+                .max_nodes(limits::CONTROL_NODES)
+                .max_active_requests_per_client(1)
+                .max_loaned_requests(1)
+                .max_response_buffer_size(1)
+                .max_borrowed_responses_per_pending_response(1)
+                .open_or_create()
+                .map_err(Trouble::from)
+        })?;
+        let (asked, answered) = (bell(node, topic::CONTROL_REQUEST)?, bell(node, topic::CONTROL_RESPONSE)?);
+        let server = control
+            .server_builder()
+            .initial_max_slice_len(Response::MAX)
+            .create()
+            .map_err(|error| no_port(&service, &error))?;
+        let (requests, responses) = (listener(&asked)?, notifier(&answered)?);
+        Ok(ControlServer { server, requests, responses, control, _bells: [asked, answered] })
+    }
+
+    /// What is woken by requests.
+    pub fn requests(&self) -> &Listener {
+        &self.requests
+    }
+
+    /// The next request whose client still waits, or nothing. Takes the wake-ups that are pending.
+    ///
+    /// [`Kind::Short`] if the client cannot be connected.
+    pub fn receive(&self) -> Result<Option<Asked>, Failure> {
+        take_wakeups(&[&self.requests])?;
+        let received = self.server.receive();
+        received.map(|asked| asked.map(Asked)).map_err(|error| no_port(self.control.name(), &error))
+    }
+
+    /// Answers `asked`. A client that does not wait any more is no failure, one that cannot be told is.
+    pub fn answer(&self, asked: Asked, response: &Response) -> Result<(), Failure> {
+        if !asked.is_waited_for() {
+            return Ok(());
+        }
+        let bytes = response.encode();
+        let untold = |error: &dyn std::fmt::Debug| {
+            Failure::new(Kind::Short, format!("cannot answer a client: {error:?}"), "")
+        };
+        let loan = asked.0.loan_slice_uninit(bytes.len()).map_err(|error| untold(&error))?;
+        loan.write_from_slice(&bytes).send().map_err(|error| untold(&error))?;
+        drop(asked);
+        self.responses.notify().map(drop).map_err(|error| untold(&error))
+    }
+}
+
+impl Asked {
+    /// What was asked.
+    pub fn request(&self) -> &Request {
+        self.0.payload()
+    }
+
+    /// Whether the client is still there to be told.
+    pub fn is_waited_for(&self) -> bool {
+        self.0.is_connected()
+    }
+}
+
+impl ControlClient {
+    /// A client's end of the service, or nothing as long as no hub has made it.
+    ///
+    /// [`Kind::Short`] if too many clients ask at once, or descriptors are short.
+    pub fn open(node: &Node) -> Result<Option<ControlClient>, Failure> {
+        let event = |service: &str| {
+            let service = name(service)?;
+            open(node, &service, node.service_builder(&service).event().open())
+        };
+        let service = name(topic::CONTROL)?;
+        let builder = node.service_builder(&service).request_response::<Request, [u8]>();
+        let Some(control) = open(node, &service, builder.open())? else { return Ok(None) };
+        let Some(asked) = event(topic::CONTROL_REQUEST)? else { return Ok(None) };
+        let Some(answered) = event(topic::CONTROL_RESPONSE)? else { return Ok(None) };
+        let responses = listener(&answered)?;
+        let requests = notifier(&asked)?;
+        let client = control.client_builder().create().map_err(|error| no_port(&service, &error))?;
+        Ok(Some(ControlClient { client, requests, responses, _control: control, _bells: [asked, answered] }))
+    }
+
+    /// Sends `request` and wakes the hub.
+    ///
+    /// [`Kind::Short`] if it cannot be sent; [`Kind::NoHub`] if nobody took it.
+    pub fn ask(&self, request: &Request) -> Result<Pending, Failure> {
+        let unsent = |error: &dyn std::fmt::Debug| {
+            Failure::new(Kind::Short, format!("cannot ask the hub: {error:?}"), "try again later")
+        };
+        let pending = self.client.send_copy(*request).map_err(|error| unsent(&error))?;
+        if pending.number_of_server_connections() == 0 {
+            return Err(Failure::new(Kind::NoHub, "no hub takes requests", "start one with `scanhub run`"));
+        }
+        self.requests.notify().map_err(|error| unsent(&error))?;
+        Ok(Pending(pending))
+    }
+
+    /// What is woken by responses, also by those to others.
+    pub fn responses(&self) -> &Listener {
+        &self.responses
+    }
+}
+
+impl Pending {
+    /// The response, or nothing as long as there is none.
+    ///
+    /// [`Kind::Failed`] if it cannot be received or is none.
+    pub fn response(&self) -> Result<Option<Response>, Failure> {
+        let garbled = |error: &dyn std::fmt::Debug| {
+            Failure::new(Kind::Failed, format!("the hub's answer cannot be read: {error:?}"), "")
+        };
+        let Some(received) = self.0.receive().map_err(|error| garbled(&error))? else { return Ok(None) };
+        Response::decode(received.payload()).map(Some).ok_or_else(|| garbled(&received.payload()))
+    }
+
+    /// Whether the hub still has the request: it is alive and has not dropped it.
+    pub fn is_open(&self) -> bool {
+        self.0.is_connected()
+    }
+}
+
+/// An event of the service, made if it is not there.
+fn bell(node: &Node, service: &str) -> Result<WakeService, Failure> {
+    let service = name(service)?;
+    create(node, &service, || {
+        let builder = node.service_builder(&service).event();
+        builder
+            .max_notifiers(limits::CONTROL_CLIENTS)
+            .max_listeners(limits::CONTROL_CLIENTS)
+            .max_nodes(limits::CONTROL_NODES)
+            .event_id_max_value(EVENT)
+            .open_or_create()
+            .map_err(Trouble::from)
+    })
+}
+
+fn notifier(bell: &WakeService) -> Result<Notifier, Failure> {
+    let builder = bell.notifier_builder().default_event_id(EventId::new(EVENT));
+    builder.create().map_err(|error| no_port(bell.name(), &error))
+}
+
+/// The id of both events.
+const EVENT: usize = 1;
