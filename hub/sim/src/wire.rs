@@ -71,6 +71,15 @@ impl Wire {
         }
     }
 
+    /// From now on other things go wrong, drawn anew; what is under way stays as it is.
+    pub fn set_faults(&mut self, faults: &Faults, seed: u64) {
+        let fresh = Wire::new(faults, seed);
+        let lateness = fresh.lateness.behind(&self.lateness);
+        let (queue, header) = (std::mem::take(&mut self.queue), std::mem::take(&mut self.header));
+        let Wire { position, fault, power_broke, .. } = *self;
+        *self = Wire { lateness, position, fault, power_broke, queue, header, ..fresh };
+    }
+
     /// Whether the host's adapter is in its socket, as of the last poll.
     pub fn is_plugged(&self) -> bool {
         self.plugged
@@ -90,7 +99,9 @@ impl Wire {
             self.power_broke |= machine.power_cycle(now);
         }
         loop {
-            if let Some((_, mut carried)) = self.queue.pop_front_if(|(at, _)| *at <= now) {
+            if self.queue.front().is_some_and(|(at, _)| *at <= now)
+                && let Some((_, mut carried)) = self.queue.pop_front()
+            {
                 if !self.plugged && !std::mem::take(&mut carried.bytes).is_empty() {
                     carried.fault = carried.fault.or(carried.is_telegram().then_some(Fault::Unplug));
                 }
