@@ -2,6 +2,8 @@
 //! uses it.
 
 mod control;
+mod doctor;
+mod probe;
 mod telegram;
 
 use std::path::PathBuf;
@@ -9,6 +11,7 @@ use std::time::Duration;
 
 use clap::{Args, Parser, Subcommand};
 use clients::{Bounds, duration};
+use daemon::config::Sources;
 use schema::{DEFAULT_DOMAIN, Domain, Environment, Failure};
 use sim::fault::Faults;
 use sim::options::{self, SimulateOptions};
@@ -62,6 +65,10 @@ pub(crate) enum Verb {
     /// Sensors at the other end of ptys
     #[command(after_help = fault_table())]
     Simulate(Simulate),
+    /// What is at the other end of a port; without one, which ports there are
+    Probe(probe::Probe),
+    /// Every condition that a working set-up needs, and what to do where one is not met
+    Doctor(doctor::Doctor),
     /// Sensors and topics of the running hub
     List {
         /// Every live domain of this user instead
@@ -97,6 +104,15 @@ pub(crate) struct Run {
     /// One value, for example link.front.angle=100
     #[arg(long, value_name = "KEY=VALUE")]
     pub(crate) set: Vec<String>,
+}
+
+impl Run {
+    /// Where the configuration is to be read from.
+    pub(crate) fn sources(&self) -> Sources {
+        let mut files = if self.no_system_config { Vec::new() } else { Sources::system() };
+        files.extend(self.config.clone());
+        Sources { files, set: self.set.clone(), links: self.link.clone() }
+    }
 }
 
 #[derive(Args, Debug)]
