@@ -18,6 +18,7 @@ mod replay;
 pub mod scanner;
 mod status;
 mod supervise;
+pub mod telegram;
 mod topics;
 
 pub use config::Config;
