@@ -3,6 +3,7 @@
 
 mod control;
 mod leftover;
+pub mod memory;
 mod nodes;
 mod sleep;
 mod trouble;
@@ -21,6 +22,7 @@ use iceoryx2::prelude::{
 use iceoryx2::service::Service as _;
 use iceoryx2::service::port_factory::{event, publish_subscribe};
 
+use self::memory::{CLIENT_BYTES, check_room};
 use self::trouble::{Trouble, create, no_port, no_publisher, open};
 use crate::{Domain, Failure, Header, Kind, Scan, Status, Topic, Wake, access, limits, of_service};
 
@@ -87,6 +89,8 @@ pub trait Payload: IceoryxSend + Debug + 'static {
     fn publisher(topic: &TopicService<Self>) -> Result<Publisher<Self>, Failure>;
 
     /// A consumer's end of a topic.
+    ///
+    /// [`Kind::Short`] if memory, descriptors or places for consumers are.
     fn subscriber(topic: &TopicService<Self>) -> Result<Subscriber<Self>, Failure>;
 
     /// The oldest sample that waits, or nothing.
@@ -135,6 +139,7 @@ macro_rules! payload {
             }
 
             fn subscriber(topic: &TopicService<Self>) -> Result<Subscriber<Self>, Failure> {
+                check_room(CLIENT_BYTES)?;
                 topic.subscriber_builder().create().map_err(|error| no_port(topic.name(), &error))
             }
 
@@ -193,7 +198,10 @@ pub fn notify(notifier: &Notifier, why: Wake) -> Result<usize, Failure> {
 }
 
 /// A consumer's end of a wake service.
+///
+/// [`Kind::Short`] if memory, descriptors or places for consumers are.
 pub fn listener(wake: &WakeService) -> Result<Listener, Failure> {
+    check_room(CLIENT_BYTES)?;
     wake.listener_builder().create().map_err(|error| no_port(wake.name(), &error))
 }
 

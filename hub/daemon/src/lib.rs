@@ -2,15 +2,18 @@
 //! memory; who listens is not its business.
 
 mod attend;
-mod bus_error;
+pub mod bus_error;
 mod clock;
 pub mod config;
 mod control;
+mod converse;
+pub mod doctor;
 mod layer;
 mod link;
 mod origin;
 pub mod port;
 mod preflight;
+pub mod probe;
 mod replay;
 pub mod scanner;
 mod status;

@@ -3,10 +3,11 @@
 
 use std::fs::{self, OpenOptions};
 
-use rustix::fs::{FallocateFlags, fallocate, statvfs};
+use rustix::fs::{FallocateFlags, fallocate};
 use rustix::io::Errno;
 use rustix::process::{Resource, getrlimit, setrlimit};
-use schema::{Domain, Failure, Header, Kind, Scan, Status, Telegram, Topic, limits};
+use schema::ipc::memory::{SHARED_MEMORY, check_room, short};
+use schema::{Domain, Failure, Header, Scan, Status, Telegram, Topic, limits};
 
 /// Lets the process have as many descriptors as its hard limit allows: about four for each consumer of a topic.
 pub(crate) fn raise_descriptor_limit() {
@@ -17,23 +18,21 @@ pub(crate) fn raise_descriptor_limit() {
     }
 }
 
-/// Whether /dev/shm has room for `links` links.
+/// Whether /dev/shm has room for `links` links and the first consumers.
 ///
-/// [`Kind::Short`] with what is free and what is needed.
+/// [`Kind::Short`](schema::Kind) with what is free and what is needed.
 pub(crate) fn check_memory(links: usize) -> Result<(), Failure> {
-    let needed = links as u64 * link_bytes();
-    let Ok(stat) = statvfs(SHARED_MEMORY) else { return Ok(()) };
-    let free = stat.f_bavail * stat.f_frsize;
-    if free >= needed {
-        Ok(())
-    } else {
-        Err(short(format!("{} kB free, {} kB needed", free / 1024, needed / 1024)))
-    }
+    check_room(needed(links))
+}
+
+/// Bytes of shared memory for `links` links and the first consumers.
+pub(crate) fn needed(links: usize) -> u64 {
+    links as u64 * link_bytes() + REST
 }
 
 /// Allocates what the segments of `domain` have promised so far.
 ///
-/// [`Kind::Short`] if it cannot be had.
+/// [`Kind::Short`](schema::Kind) if it cannot be had.
 pub(crate) fn allocate(domain: &Domain) -> Result<(), Failure> {
     let prefix = domain.prefix();
     let entries = fs::read_dir(SHARED_MEMORY).into_iter().flatten().flatten();
@@ -47,7 +46,7 @@ pub(crate) fn allocate(domain: &Domain) -> Result<(), Failure> {
         match fallocate(&segment, FallocateFlags::empty(), 0, metadata.len()) {
             Err(Errno::NOSPC) => {
                 let name = entry.file_name().to_string_lossy().into_owned();
-                return Err(short(format!("{} kB for {name} cannot be had", metadata.len() / 1024)));
+                return Err(short(&format!("{} kB for {name} cannot be had", metadata.len() / 1024)));
             }
             Err(error) => tracing::debug!(%error, "a segment cannot be allocated"),
             Ok(()) => {}
@@ -56,16 +55,7 @@ pub(crate) fn allocate(domain: &Domain) -> Result<(), Failure> {
     Ok(())
 }
 
-fn short(what: String) -> Failure {
-    let place = SHARED_MEMORY;
-    Failure::new(
-        Kind::Short,
-        format!("shared memory is short: {place}: {what}"),
-        "free some, then start again",
-    )
-}
-
-/// Bytes of the segments of one link: the payloads with their headers, and as much again for the rest.
+/// Bytes of the segments of one link: the payloads with their headers, and who is at each service.
 fn link_bytes() -> u64 {
     let payload = |topic| match topic {
         Topic::Telegram => Telegram::MAX,
@@ -73,17 +63,22 @@ fn link_bytes() -> u64 {
         Topic::Status => size_of::<Status>(),
     };
     let chunk = |topic| limits::samples(topic) * (payload(topic) + size_of::<Header>() + CHUNK_HEADER);
-    2 * Topic::ALL.into_iter().map(chunk).sum::<usize>() as u64
+    let services = (Topic::ALL.len() + 1) as u64 * SERVICE;
+    Topic::ALL.into_iter().map(chunk).sum::<usize>() as u64 + services
 }
 
-/// Where POSIX shared memory lives on Linux.
-const SHARED_MEMORY: &str = "/dev/shm";
 /// What the shared-memory library puts before each sample, rounded up.
 const CHUNK_HEADER: usize = 64;
+/// The list of ports and processes of one service, rounded up.
+const SERVICE: u64 = 48 * 1024;
+/// The control service, what belongs to no link, and the first consumers.
+const REST: u64 = 512 * 1024;
 
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    use schema::Kind;
 
     #[test]
     fn more_links_than_memory_are_refused() {

@@ -16,7 +16,7 @@ use crate::config::Config;
 use crate::control::Desk;
 use crate::link::LinkThread;
 use crate::topics::Topics;
-use crate::{bus_error, clock, preflight};
+use crate::{clock, preflight};
 
 /// What is up.
 #[derive(Clone, Debug)]
@@ -36,7 +36,6 @@ pub fn run(config: &Config, domain: &Domain, on_ready: impl FnOnce(&Ready)) -> R
     let _lock = HubLock::acquire(domain.root())?;
     preflight::raise_descriptor_limit();
     preflight::check_memory(config.links.len())?;
-    bus_error::explain();
     let node = ipc::hub_node(domain)?;
     node.try_cleanup_dead_nodes();
     let ready =
