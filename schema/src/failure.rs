@@ -27,6 +27,8 @@ pub enum Kind {
     PortBusy,
     /// The path is not a serial line: exit 4.
     PortNotTty,
+    /// The port cannot do the rate: exit 4.
+    PortRate,
     /// A check failed (telegrams lost, a limit exceeded): exit 5.
     Check,
     /// Shared memory or descriptors are short, try later: exit 75.
@@ -51,6 +53,7 @@ impl Kind {
             Kind::PortPermission => "port_permission",
             Kind::PortBusy => "port_busy",
             Kind::PortNotTty => "port_not_tty",
+            Kind::PortRate => "port_rate",
             Kind::Check => "check",
             Kind::Short => "short",
             Kind::Configuration => "configuration",
@@ -64,7 +67,9 @@ impl Kind {
             Kind::Failed | Kind::DomainHeld => 1,
             Kind::Usage => 2,
             Kind::NoHub | Kind::NoTopic | Kind::Timeout => 3,
-            Kind::PortMissing | Kind::PortPermission | Kind::PortBusy | Kind::PortNotTty => 4,
+            Kind::PortMissing | Kind::PortPermission | Kind::PortBusy | Kind::PortNotTty | Kind::PortRate => {
+                4
+            }
             Kind::Check => 5,
             Kind::Short => 75,
             Kind::Configuration => 78,

@@ -3,6 +3,7 @@
 
 mod control;
 mod leftover;
+mod nodes;
 mod sleep;
 mod trouble;
 
@@ -27,6 +28,7 @@ use crate::shortage::check_client;
 use crate::{Domain, Failure, Header, Kind, Scan, Status, Topic, Wake, access, limits, of_service};
 
 pub use self::control::{Asked, ControlClient, ControlServer, Pending};
+pub use self::nodes::{Nodes, nodes};
 pub use self::sleep::{descriptor, sleep, take_wakeups};
 pub use iceoryx2::port::update_connections::UpdateConnections;
 pub use iceoryx2::port::{LoanError, ReceiveError, SendError};

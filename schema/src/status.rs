@@ -205,6 +205,7 @@ counters! {
     RejectedCrc "rejected_crc" "Candidates rejected: the CRC is wrong.",
     RejectedVetoed "rejected_vetoed" "Candidates rejected: a right telegram began inside them.",
     RejectedSuperseded "rejected_superseded" "Candidates rejected: another one was complete first.",
+    LineErrors "line_errors" "Framing, parity and overrun errors and breaks that the line's driver counted.",
 }
 
 #[cfg(test)]

@@ -149,6 +149,7 @@ fn status_bytes() {
     status.set_last_error("none");
     status.counters[Counter::BytesRead] = 3;
     status.counters[Counter::RejectedSuperseded] = 4;
+    status.counters[Counter::LineErrors] = 5;
     let expected = golden(
         592,
         &[
@@ -160,6 +161,7 @@ fn status_bytes() {
             (176, b"none"),
             (336, &[3]),
             (336 + 19 * 8, &[4]),
+            (336 + 20 * 8, &[5]),
         ],
     );
     assert_eq!(bytemuck::bytes_of(&status), expected);
@@ -172,7 +174,7 @@ fn counters_in_order() {
         names.join(" "),
         "bytes_read bytes_in_telegrams bytes_acknowledge bytes_discarded bytes_buffered telegrams suspect aborted \
          resyncs reconnects lost_in_restart wakeups loan_failed rejected_address rejected_length rejected_command \
-         rejected_count rejected_crc rejected_vetoed rejected_superseded"
+         rejected_count rejected_crc rejected_vetoed rejected_superseded line_errors"
     );
     let names: Vec<_> = State::ALL.iter().map(|state| state.name()).collect();
     assert_eq!(names.join(" "), "absent probing switching starting streaming silent paused");

@@ -88,6 +88,7 @@ pub fn session(data: &[u8]) {
         variant: Variant::ALL[usize::from(*variant) % Variant::ALL.len()],
         baud: Baud::ALL[usize::from(*baud) % Baud::ALL.len()],
         listen_only: false,
+        fixed_rate: false,
     };
     let mut now: Nanos = 1_000 * MILLIS;
     let mut session = Session::new(settings, now);

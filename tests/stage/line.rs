@@ -39,11 +39,14 @@ impl Line {
 
     /// Waits until the hub has the line open.
     pub(crate) fn await_open(&self) {
-        super::until("somebody opens the line", || {
-            let mut fds = [PollFd::new(&self.0, PollFlags::IN)];
-            let now = Timespec { tv_sec: 0, tv_nsec: 0 };
-            poll(&mut fds, Some(&now)).is_ok() && !fds[0].revents().contains(PollFlags::HUP)
-        });
+        super::until("somebody opens the line", || self.is_open());
+    }
+
+    /// Whether the hub has the line open.
+    pub(crate) fn is_open(&self) -> bool {
+        let mut fds = [PollFd::new(&self.0, PollFlags::IN)];
+        let now = Timespec { tv_sec: 0, tv_nsec: 0 };
+        poll(&mut fds, Some(&now)).is_ok() && !fds[0].revents().contains(PollFlags::HUP)
     }
 
     /// Sends all of `bytes`, in the pace of whoever reads them; what the other end says meanwhile is not heard.
@@ -63,4 +66,18 @@ impl Line {
             assert!(Instant::now() < give_up_at, "nobody reads");
         }
     }
+}
+
+/// The host's end of the line at `place`, raw, at `rate`; reads and writes do not block.
+pub(crate) fn open_line(place: &Path, rate: u32) -> std::fs::File {
+    let make = || -> Result<OwnedFd, Errno> {
+        let flags = OFlags::RDWR | OFlags::NOCTTY | OFlags::NONBLOCK | OFlags::CLOEXEC;
+        let line = open(place, flags, Mode::empty())?;
+        let mut termios = tcgetattr(&line)?;
+        termios.make_raw();
+        termios.set_speed(rate)?;
+        tcsetattr(&line, OptionalActions::Now, &termios)?;
+        Ok(line)
+    };
+    make().unwrap_or_else(|error| panic!("cannot open {}: {error}", place.display())).into()
 }

@@ -16,7 +16,7 @@ use std::time::{Duration, Instant};
 use schema::Domain;
 use serde_json::Value;
 
-pub(crate) use line::Line;
+pub(crate) use line::{Line, open_line};
 pub(crate) use program::{INT, KILL, Outcome, Program, TERM};
 pub(crate) use telegrams::{MEASURED, Sent, bytes_of, hash, is_class, number, scan, sequence};
 
@@ -66,9 +66,14 @@ impl Stage {
 
     /// The program with `arguments`, in this domain.
     pub(crate) fn command<S: AsRef<str>>(&self, arguments: &[S]) -> Command {
+        self.command_at(&self.directory, arguments)
+    }
+
+    /// As [`Stage::command`], with the domain in another directory.
+    pub(crate) fn command_at<S: AsRef<str>>(&self, root: &Path, arguments: &[S]) -> Command {
         let mut command = Command::new(env!("CARGO_BIN_EXE_scanhub"));
         command.args(arguments.iter().map(AsRef::as_ref));
-        command.args(["--domain", &self.domain, "--root"]).arg(&self.directory);
+        command.args(["--domain", &self.domain, "--root"]).arg(root);
         // Should the whole test be killed, its children end too.
         command.env("SCANHUB_END_WITH_PARENT", "1").env("SCANHUB_LOG", "info").env_remove("SCANHUB_CONFIG");
         command

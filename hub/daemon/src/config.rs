@@ -2,6 +2,7 @@
 
 use std::path::{Path, PathBuf};
 
+use lms::family::Family;
 use lms::variant::{Baud, Unit, Variant};
 use schema::{Failure, Kind};
 
@@ -22,6 +23,8 @@ pub struct Link {
     pub name: String,
     /// Where its bytes come from.
     pub port: Source,
+    /// What the sensor is expected to be, if the user said it: nothing is asked for that it cannot do.
+    pub family: Option<Family>,
     /// Angle and resolution.
     pub variant: Variant,
     /// Unit that the sensor is expected to measure in, if the user said one; it is compared, never written.
@@ -35,6 +38,13 @@ pub struct Link {
 pub enum Source {
     /// A serial line.
     Tty(PathBuf),
+    /// A line behind a serial server (`tcp:HOST:PORT`), which was set to the link's rate by hand.
+    Tcp {
+        /// Name or address, an IPv6 address without its brackets.
+        host: String,
+        /// Port in raw TCP mode.
+        port: u16,
+    },
     /// A recording (`file:PATH`), paced by its scan period or, with `?rate=max`, as fast as it can be read.
     File {
         /// The recording.
@@ -49,14 +59,26 @@ impl Source {
     pub fn name(&self) -> String {
         match self {
             Source::Tty(path) => path.display().to_string(),
+            Source::Tcp { host, port } if host.contains(':') => format!("tcp:[{host}]:{port}"),
+            Source::Tcp { host, port } => format!("tcp:{host}:{port}"),
             Source::File { path, paced: true } => format!("file:{}", path.display()),
             Source::File { path, paced: false } => format!("file:{}?rate=max", path.display()),
         }
     }
 
     pub(crate) fn parse(text: &str) -> Result<Source, &'static str> {
-        if text.starts_with("tcp:") {
-            return Err("serial servers (tcp:) are not supported");
+        if let Some(server) = text.strip_prefix("tcp:") {
+            let (host, port) = server.rsplit_once(':').ok_or("tcp: without a port: write tcp:HOST:PORT")?;
+            let port =
+                port.parse().ok().filter(|&port| port > 0).ok_or("tcp: the port is a number to 65535")?;
+            let bare = host.strip_prefix('[').and_then(|host| host.strip_suffix(']'));
+            return match bare.unwrap_or(host) {
+                "" => Err("tcp: without a host: write tcp:HOST:PORT"),
+                host if bare.is_none() && host.contains(':') => {
+                    Err("an IPv6 address stands in brackets: tcp:[ADDRESS]:PORT")
+                }
+                host => Ok(Source::Tcp { host: host.to_owned(), port }),
+            };
         }
         let Some(file) = text.strip_prefix("file:") else {
             return if text.is_empty() { Err("the port is empty") } else { Ok(Source::Tty(text.into())) };
@@ -193,6 +215,18 @@ mod tests {
     }
 
     #[test]
+    fn serial_servers() {
+        for (text, host, port) in [
+            ("tcp:box:4001", "box", 4001),
+            ("tcp:10.0.0.7:23", "10.0.0.7", 23),
+            ("tcp:[::1]:4001", "::1", 4001),
+        ] {
+            let source = Source::parse(text).unwrap();
+            assert_eq!((source.name().as_str(), &source), (text, &Source::Tcp { host: host.into(), port }));
+        }
+    }
+
+    #[test]
     fn refusals_name_place_value_and_remedy() {
         let unknown = refusal(&["link.front.prot=/dev/x"], &[]);
         assert!(unknown.contains("--set link.front.prot=/dev/x: unknown key `prot`"), "{unknown}");
@@ -206,7 +240,32 @@ mod tests {
         assert!(refusal(&[], &["front"]).contains("--link front: no = in it"));
         assert!(refusal(&[], &["Front=/dev/x"]).contains("sensor name \"Front\" is not possible"));
         assert!(refusal(&[], &["front=file:x?rate=2"]).contains("rate=max"));
-        assert!(refusal(&[], &["front=tcp:box:4001"]).contains("not supported"));
+        assert!(refusal(&[], &["front=tcp:box"]).contains("write tcp:HOST:PORT"));
+        assert!(refusal(&[], &["front=tcp::4001"]).contains("without a host"));
+        assert!(refusal(&[], &["front=tcp:box:0"]).contains("a number to 65535"));
+        assert!(refusal(&[], &["front=tcp:fe80::1:4001"]).contains("in brackets"));
+    }
+
+    #[test]
+    fn what_a_type_cannot_do_is_refused() {
+        let of = |set: &[&str]| Config::load(&sources(set, &[])).map(|config| config.links[0].clone());
+        let link = of(&["link.front.type=lms211"]).unwrap();
+        assert_eq!((link.family, link.variant), (Some(Family::Lms211), Variant::new(100, 50).unwrap()));
+        let fine = of(&["link.front.type=lms211", "link.front.resolution=0.25"]).unwrap();
+        assert_eq!(fine.variant.beams(), 401);
+        let wide = refusal(&["link.front.angle=180", "link.front.type=lms211"], &[]);
+        assert!(
+            wide.starts_with("--set link.front.angle=180: link front: an lms211 does not scan 180"),
+            "{wide}"
+        );
+        assert!(wide.contains("its window is 100 degrees wide\n  angle = 100"), "{wide}");
+        let fast = refusal(&["link.front.type=s14"], &[]);
+        assert!(
+            fast.contains("--set link.front.type=s14: link front: ") && fast.contains("90 degrees"),
+            "{fast}"
+        );
+        let unknown = refusal(&["link.front.type=lms100"], &[]);
+        assert!(unknown.contains("type = \"lms100\"\n  lms200, lms211, lms221, lms291 or s14"), "{unknown}");
     }
 
     #[test]
@@ -224,6 +283,9 @@ mod tests {
         let error =
             load("[[link]]\nname = \"a\"\nport = \"x\"\n[[link]]\nname = \"a\"\n").unwrap_err().to_string();
         assert!(error.contains(":5:8: a second link a"), "{error}");
+        let text = "[[link]]\nname = \"a\"\nport = \"x\"\ntype = \"lms211\"\nangle = 180\n";
+        let error = load(text).unwrap_err().to_string();
+        assert!(error.contains(":5:9: link a: an lms211 does not scan 180 degrees"), "{error}");
         let error = load("[[link]]\nname = \"a\"\n").unwrap_err().to_string();
         assert!(error.contains("link a: no port"), "{error}");
         assert!(load("[[link]]\nname = \"a\"\nport = \"x\"\nangle = 100\n").is_ok());

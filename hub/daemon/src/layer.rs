@@ -1,6 +1,7 @@
 //! One source of configuration laid over the others: every value is checked where it stands, so that an error names
 //! file, line and column, or the flag.
 
+use lms::family::Family;
 use lms::variant::{Baud, Unit, Variant};
 use schema::{Failure, Kind, check_sensor};
 use serde::Deserialize;
@@ -22,6 +23,8 @@ pub(crate) struct Layer {
 struct LinkLayer {
     name: Spanned<String>,
     port: Option<Spanned<String>>,
+    #[serde(rename = "type")]
+    family: Option<Spanned<String>>,
     angle: Option<Spanned<f64>>,
     resolution: Option<Spanned<f64>>,
     unit: Option<Spanned<String>>,
@@ -33,25 +36,53 @@ pub(crate) struct Draft {
     pub(crate) name: String,
     place: String,
     port: Option<Source>,
-    angle_deg: u16,
-    resolution_cdeg: u16,
+    family: Option<Said<Family>>,
+    angle_deg: Option<Said<u16>>,
+    resolution_cdeg: Option<Said<u16>>,
     unit: Option<Unit>,
     baud: Baud,
 }
 
+/// A value, and where it was said last.
+struct Said<T> {
+    value: T,
+    place: String,
+}
+
 impl Draft {
     pub(crate) fn finish(self) -> Result<Link, Failure> {
-        let Draft { name, place, port, angle_deg, resolution_cdeg, unit, baud } = self;
-        let refuse = |what: String, remedy: &str| {
+        let Draft { name, place, port, family, angle_deg, resolution_cdeg, unit, baud } = self;
+        let refuse = |place: &str, what: String, remedy: &str| {
             Failure::new(Kind::Configuration, format!("{place}: link {name}: {what}"), remedy)
         };
-        let port = port.ok_or_else(|| refuse("no port".into(), "add port = \"/dev/ttyUSB0\""))?;
+        let port = port.ok_or_else(|| refuse(&place, "no port".into(), "add port = \"/dev/ttyUSB0\""))?;
+        // The place of what clashes, or of what implies it.
+        let type_place = family.as_ref().map_or(&place, |said| &said.place);
+        let angle_place = angle_deg.as_ref().map_or(type_place, |said| &said.place);
+        let step_place = resolution_cdeg.as_ref().map_or(angle_place, |said| &said.place);
+        let family = family.as_ref().map(|said| said.value);
+        let factory = family.and_then(Family::factory_variant).unwrap_or(Variant::HALF);
+        let angle_deg = angle_deg.as_ref().map_or(factory.angle_deg, |said| said.value);
+        let resolution_cdeg = resolution_cdeg.as_ref().map_or(factory.resolution_cdeg, |said| said.value);
+        if family == Some(Family::Fast) {
+            // Its 181 values look like those of 180 degrees at 1.
+            let what = "the beams of version S14 look elsewhere: 90 degrees at 0.5, which no telegram tells";
+            return Err(refuse(
+                type_place,
+                what.into(),
+                "a hub can stream lms200, lms211, lms221 and lms291",
+            ));
+        }
         let variant = Variant::new(angle_deg, resolution_cdeg).ok_or_else(|| {
             let step = f64::from(resolution_cdeg) / 100.0;
             let remedy = "180 degrees at 0.5 or 1, 100 degrees at 0.25, 0.5 or 1";
-            refuse(format!("no sensor scans {angle_deg} degrees at {step}"), remedy)
+            refuse(step_place, format!("no sensor scans {angle_deg} degrees at {step}"), remedy)
         })?;
-        Ok(Link { name, port, variant, unit, baud })
+        if let Some((family, why)) = family.and_then(|f| Some((f, f.refuses_variant(variant)?))) {
+            let what = format!("an {} does not scan {angle_deg} degrees: {why}", family.name());
+            return Err(refuse(angle_place, what, "angle = 100"));
+        }
+        Ok(Link { name, port, family, variant, unit, baud })
     }
 }
 
@@ -87,8 +118,9 @@ pub(crate) fn merge(
                     name: name.clone(),
                     place: origin.place(span),
                     port: None,
-                    angle_deg: Variant::HALF.angle_deg,
-                    resolution_cdeg: Variant::HALF.resolution_cdeg,
+                    family: None,
+                    angle_deg: None,
+                    resolution_cdeg: None,
                     unit: None,
                     baud: Baud::B500000,
                 });
@@ -105,14 +137,27 @@ pub(crate) fn merge(
             let port_span = Some(port.span());
             let port = port.into_inner();
             draft.port = Some(Source::parse(&port).map_err(|what| {
-                origin.refuse(port_span, what, "name a tty, or file:PATH with ?rate=max if you like")
+                origin.refuse(
+                    port_span,
+                    what,
+                    "name a tty, tcp:HOST:PORT, or file:PATH with ?rate=max if you like",
+                )
             })?);
         }
-        if let Some(angle) = link.angle {
-            draft.angle_deg = whole(origin, &angle, 1.0, "angle", "100 or 180")?;
+        if let Some(family) = link.family {
+            let value = Family::of_name(family.get_ref()).ok_or_else(|| {
+                let what = format!("type = \"{}\"", family.get_ref());
+                origin.refuse(Some(family.span()), what, "lms200, lms211, lms221, lms291 or s14")
+            })?;
+            draft.family = Some(Said { value, place: origin.place(Some(family.span())) });
         }
-        if let Some(resolution) = link.resolution {
-            draft.resolution_cdeg = whole(origin, &resolution, 100.0, "resolution", "0.25, 0.5 or 1")?;
+        if let Some(angle) = link.angle {
+            let value = whole(origin, &angle, 1.0, "angle", "100 or 180")?;
+            draft.angle_deg = Some(Said { value, place: origin.place(Some(angle.span())) });
+        }
+        if let Some(step) = link.resolution {
+            let value = whole(origin, &step, 100.0, "resolution", "0.25, 0.5 or 1")?;
+            draft.resolution_cdeg = Some(Said { value, place: origin.place(Some(step.span())) });
         }
         if let Some(unit) = link.unit {
             draft.unit = Some(match unit.get_ref().as_str() {

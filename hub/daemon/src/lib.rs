@@ -1,15 +1,19 @@
 //! The hub: all the I/O there is. It owns the serial links, one thread each, and publishes what they say into shared
 //! memory; who listens is not its business.
 
+mod attend;
 pub mod bus_error;
 mod clock;
 pub mod config;
 mod control;
+mod converse;
+pub mod doctor;
 mod layer;
 mod link;
 mod origin;
-mod port;
+pub mod port;
 mod preflight;
+pub mod probe;
 mod replay;
 pub mod scanner;
 mod status;

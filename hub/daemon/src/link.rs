@@ -2,21 +2,20 @@
 //! come or a deadline passes, and does nothing twice per telegram.
 
 use std::io;
-use std::os::fd::OwnedFd;
-use std::path::Path;
+use std::os::fd::{AsFd, BorrowedFd, OwnedFd};
 
 use lms::framer::suspect;
 use lms::reply::Reply;
 use lms::session::{Output, Received};
 use lms::variant::{Mode, Unit, Variant};
-use lms::{Control, MILLIS, Nanos, Session, Settings, Trouble};
+use lms::{MILLIS, Nanos, Session, Settings, Trouble};
 use rustix::event::{PollFd, PollFlags, poll};
-use schema::{Failure, Flags, Kind, State, Wake};
+use schema::{Failure, Flags, State, Wake};
 
 use crate::clock;
 use crate::config::{Link, Source};
 use crate::control::Orders;
-use crate::port::Tty;
+use crate::port::Port;
 use crate::replay;
 use crate::scanner;
 use crate::status::Account;
@@ -24,9 +23,9 @@ use crate::topics::Topics;
 
 /// A link with everything that belongs to its thread.
 pub(crate) struct LinkThread<'a> {
-    link: &'a Link,
-    topics: Topics,
-    account: Account,
+    pub(crate) link: &'a Link,
+    pub(crate) topics: Topics,
+    pub(crate) account: Account,
     /// Readable once the hub shall end.
     stop: &'a OwnedFd,
     /// What users ask for.
@@ -86,57 +85,15 @@ impl<'a> LinkThread<'a> {
                 }
                 Err(failure) => report(Err(failure)),
             },
-            Source::Tty(path) => match Tty::open(path, self.link.baud.rate()) {
-                Err(failure) if failure.kind != Kind::PortMissing => report(Err(failure)),
-                first => {
-                    report(Ok(()));
-                    self.keep_open(path, first);
-                }
-            },
-        }
-    }
-
-    /// Streams from the port, and takes it back whenever it was away.
-    fn keep_open(&mut self, path: &Path, mut opened: Result<Tty, Failure>) {
-        loop {
-            let trouble = match opened {
-                Ok(tty) => {
-                    self.topics.set_flags(if tty.simulated { Flags::SIMULATED } else { 0 });
-                    let mut session = Session::new(self.settings(false), clock::now());
-                    if self.orders.is_paused() {
-                        session.control(Control::Pause, clock::now());
-                    }
-                    let end = self.stream(&tty, &mut session);
-                    self.account.close(&session);
-                    match end {
-                        Ok(()) => return,
-                        Err(error) => {
-                            self.account.reconnects += 1;
-                            format!("{} went away: {error}", path.display())
-                        }
-                    }
-                }
-                Err(failure) => failure.message,
-            };
-            self.facts = None;
-            self.show(None, State::Absent, &trouble);
-            let reopen_at = clock::now() + REOPEN;
-            loop {
-                match self.wait(None, reopen_at) {
-                    Woken::Stop => return,
-                    Woken::Order => self.orders.obey(None),
-                    Woken::Ready | Woken::Timeout => break,
-                }
-            }
-            opened = Tty::open(path, self.link.baud.rate());
+            Source::Tty(_) | Source::Tcp { .. } => self.attend(report),
         }
     }
 
     /// Drives `session` on `tty` until the hub shall end; an error says that the port is gone.
-    fn stream(&mut self, tty: &Tty, session: &mut Session) -> io::Result<()> {
+    pub(crate) fn stream(&mut self, port: &Port, session: &mut Session) -> io::Result<()> {
         loop {
-            let (watch, until) = self.drain(tty, session)?;
-            match self.wait(watch.then_some(tty), until) {
+            let (watch, until) = self.drain(port, session)?;
+            match self.wait(watch.then_some(port.as_fd()), until) {
                 Woken::Stop => return Ok(()),
                 Woken::Order => {
                     self.orders.obey(Some(session));
@@ -148,7 +105,7 @@ impl<'a> LinkThread<'a> {
                 // The telegram's end is near: what can be done before it is not done after it.
                 self.topics.prepare();
             }
-            let len = tty.read(session.spare())?;
+            let len = port.read(session.spare())?;
             let now = clock::now();
             session.commit(now, len);
             if len == 0 && now >= until {
@@ -158,17 +115,20 @@ impl<'a> LinkThread<'a> {
     }
 
     /// Does what the session wants, until it wants to wait: whether for bytes, and until when.
-    fn drain(&mut self, tty: &Tty, session: &mut Session) -> io::Result<(bool, Nanos)> {
+    fn drain(&mut self, port: &Port, session: &mut Session) -> io::Result<(bool, Nanos)> {
         let mut published = false;
         let (watch, until) = loop {
             match session.poll_output() {
-                Output::SetBaud(baud) => tty.set_baud(baud.rate())?,
+                Output::SetBaud(baud) => port.set_baud(baud.rate())?,
                 Output::Transmit { byte, not_before } => {
                     self.pause(not_before);
-                    tty.write(byte)?;
+                    port.write(byte)?;
                     session.transmitted(clock::now());
                 }
-                Output::Telegram(received) => {
+                Output::Telegram(mut received) => {
+                    let line_errors = port.line_errors();
+                    self.account.line_errors += line_errors;
+                    received.reasons |= if line_errors > 0 { suspect::LINE_ERROR } else { 0 };
                     self.publish(&received, None);
                     self.wake(Wake::Telegram);
                     published = true;
@@ -214,6 +174,11 @@ impl<'a> LinkThread<'a> {
         self.topics.scan(|scan| scanner::decode(&measured, mode, scan));
     }
 
+    /// The session is over: what is wrong is not what was.
+    pub(crate) fn forget(&mut self) {
+        self.facts = None;
+    }
+
     /// Wakes the consumers.
     pub(crate) fn wake(&self, why: Wake) {
         self.topics.wake(why);
@@ -246,7 +211,7 @@ impl<'a> LinkThread<'a> {
     }
 
     /// Sleeps until the port has bytes (or is gone), `until`, or the hub's end.
-    pub(crate) fn wait(&mut self, tty: Option<&Tty>, until: Nanos) -> Woken {
+    pub(crate) fn wait(&mut self, port: Option<BorrowedFd<'_>>, until: Nanos) -> Woken {
         loop {
             let now = clock::now();
             // Whoever attaches to a silent sensor is greeted in time all the same.
@@ -255,9 +220,9 @@ impl<'a> LinkThread<'a> {
             let span = clock::span(now, bound);
             let stop = PollFd::new(self.stop, PollFlags::IN);
             let orders = PollFd::new(&self.orders, PollFlags::IN);
-            let woken = match tty {
-                Some(tty) => {
-                    let mut fds = [stop, orders, PollFd::new(tty, PollFlags::IN)];
+            let woken = match port {
+                Some(port) => {
+                    let mut fds = [stop, orders, PollFd::from_borrowed_fd(port, PollFlags::IN)];
                     poll(&mut fds, Some(&span)).map(|_| fds.each_ref().map(is_ready))
                 }
                 None => {
@@ -291,14 +256,19 @@ impl<'a> LinkThread<'a> {
         }
     }
 
-    fn settings(&self, listen_only: bool) -> Settings {
-        Settings { variant: self.link.variant, baud: self.link.baud, listen_only }
+    pub(crate) fn settings(&self, listen_only: bool) -> Settings {
+        let fixed_rate = matches!(self.link.port, Source::Tcp { .. });
+        Settings { variant: self.link.variant, baud: self.link.baud, listen_only, fixed_rate }
     }
 
     /// What is wrong, in words; empty if nothing is.
     fn trouble(&self, session: &Session) -> String {
         let unit = session.sensor().unit;
         match (session.trouble(), unit, self.link.unit) {
+            (Some(Trouble::NoAnswer { .. }), _, _) if self.settings(false).fixed_rate => format!(
+                "no answer at {} baud, to which the serial server was set: power, cable, another rate?",
+                self.link.baud.rate()
+            ),
             (Some(trouble), _, _) => trouble.to_string(),
             (None, Some(is), Some(expected)) if is != expected => format!(
                 "the sensor measures in units of {} mm, the configuration says {} mm; the unit lives in its EEPROM, \
@@ -347,8 +317,6 @@ fn is_ready(fd: &PollFd<'_>) -> bool {
     !fd.revents().is_empty()
 }
 
-/// Between two attempts to open a port that is away.
-const REOPEN: Nanos = 500 * MILLIS;
 /// A status goes out at least so often.
 const STATUS_PERIOD: Nanos = 1_000 * MILLIS;
 /// A late joiner gets the last status after so long at the most.

@@ -19,6 +19,8 @@ pub(crate) struct Account {
     /// Telegrams that were suspect.
     pub(crate) suspect: u64,
     pub(crate) reconnects: u64,
+    /// Errors that the line's driver counted.
+    pub(crate) line_errors: u64,
 }
 
 impl Account {
@@ -33,6 +35,7 @@ impl Account {
             wakeups: 0,
             suspect: 0,
             reconnects: 0,
+            line_errors: 0,
         }
     }
 
@@ -63,6 +66,7 @@ impl Account {
         counters[Counter::Reconnects] = self.reconnects;
         counters[Counter::Wakeups] = self.wakeups;
         counters[Counter::LoanFailed] = loan_failed;
+        counters[Counter::LineErrors] = self.line_errors;
         self.status.counters = counters;
         let (since, scans) = *self.measured_at.get_or_insert((now, self.scans));
         if now > since {

@@ -43,19 +43,19 @@ impl Arrivals {
     /// it, took its time on the line.
     pub(crate) fn stamp(&self, offset: u64, baud: u32) -> Stamp {
         let oldest = self.next.saturating_sub(Arrivals::CAPACITY);
-        let mut stamp = Stamp { at: Nanos::MAX, estimated: true };
+        let (mut at, mut own, mut own_behind) = (Nanos::MAX, Nanos::MAX, ESTIMATED + 1);
         for n in (oldest..self.next).rev() {
             let read = self.reads[n % Arrivals::CAPACITY];
             if read.end <= offset {
                 break;
             }
-            let behind = (read.end - offset - 1) as usize;
-            let at = read.now.saturating_sub(line_time(behind, baud));
-            if at < stamp.at {
-                stamp = Stamp { at, estimated: behind > ESTIMATED };
-            }
+            own_behind = (read.end - offset - 1) as usize;
+            own = read.now.saturating_sub(line_time(own_behind, baud));
+            at = at.min(own);
         }
-        stamp
+        // A host that wakes up a little later for one read than for another is no estimate.
+        let moved = own - at > line_time(ESTIMATED, baud);
+        Stamp { at, estimated: own_behind > ESTIMATED || moved }
     }
 }
 
@@ -140,8 +140,12 @@ mod tests {
         // Two reads of what had been waiting: the line was not faster because of that.
         arrivals.note(11_010_000, 500);
         assert_eq!(arrivals.stamp(499, 500_000), Stamp { at: 11_010_000 - 500 * 20_000, estimated: true });
+        // Reads with a jitter of some microseconds are what they are.
+        arrivals.note(31_000_000, 16);
+        arrivals.note(31_300_000, 16);
+        assert_eq!(arrivals.stamp(1_015, 500_000), Stamp { at: 30_980_000, estimated: false });
         for _ in 0..200 {
-            arrivals.note(20_000_000, 1);
+            arrivals.note(40_000_000, 1);
         }
         // Older than what is remembered: the oldest remembered read.
         assert!(arrivals.stamp(0, 500_000).estimated);

@@ -93,7 +93,7 @@ impl Request {
     }
 
     /// The request that `telegram` says; `None` if it is a reply, unknown, one that writes the EEPROM, or its data are
-    /// not as they should be. 35h may carry a word of zeros, which is not kept.
+    /// not as they should be.
     pub fn decode(telegram: Telegram<'_>) -> Option<Request> {
         if telegram.is_reply() {
             return None;
@@ -108,7 +108,7 @@ impl Request {
             (VALUES, &[selection]) => Request::Values(selection),
             (STATUS, []) => Request::Status,
             (ERRORS, []) => Request::Errors,
-            (COUNTERS, [] | [0, 0]) => Request::Counters,
+            (COUNTERS, []) => Request::Counters,
             (MEANS, &[shots]) => Request::Means(shots),
             (RANGE, data) => Request::Range(Span::read(data)?),
             (TYPE, []) => Request::Type,
@@ -284,8 +284,6 @@ mod tests {
             assert_eq!(encoded.telegram().address(), 3);
             assert_eq!(Request::decode(encoded.telegram()), Some(request));
         }
-        let padded = Writer::new(0, COUNTERS).word(0).finish();
-        assert_eq!(Request::decode(padded.telegram()), Some(Request::Counters));
     }
 
     #[test]

@@ -1,14 +1,15 @@
-//! What to say to the sensor next: from a line of unknown rate to a stream, and back when the stream ends. Knows
-//! telegrams and deadlines, no bytes and no port. It never says anything that outlives a power cycle.
+//! The conversation with the sensor: what came and what did not, and what follows from it. How a sensor is found is
+//! in [`crate::search`], how it is brought to a stream in [`crate::start`]. Knows telegrams and deadlines, no bytes
+//! and no port. It never says anything that outlives a power cycle.
 
 use crate::Nanos;
-use crate::command::Request;
-use crate::header::Expect;
+use crate::command::{MODE, Request};
+use crate::header::{Expect, POWER_ON, StreamHeader, is_data};
 use crate::measured::Measured;
 use crate::outgoing::{FORGOTTEN, NAK_PAUSE, Outgoing};
 use crate::phase::{
-    BESIDE_VALUES, Control, LISTEN, PAUSE, Phase, QUESTIONS, Reason, SETTLE, SILENCE, STOPS, Settings, Step,
-    TRIES,
+    BESIDE_VALUES, Control, OVERLOOKED, PAUSE, Phase, Progress, QUESTIONS, Reason, SILENCE, STOPS, Settings,
+    Step, TRIES,
 };
 use crate::reply::Reply;
 use crate::sensor::{Sensor, State, Trouble};
@@ -18,34 +19,35 @@ use crate::variant::Baud;
 #[derive(Clone, Debug)]
 pub(crate) struct Dialogue {
     pub(crate) settings: Settings,
-    phase: Phase,
-    open: Option<Outgoing>,
+    pub(crate) phase: Phase,
+    pub(crate) open: Option<Outgoing>,
     change_baud: Option<Baud>,
     pub(crate) baud: Baud,
     pub(crate) sensor: Sensor,
     pub(crate) trouble: Option<Trouble>,
     pub(crate) resyncs: u64,
+    /// Bytes came since the last round of the search began.
+    pub(crate) heard: bool,
+    /// When the last telegram came.
+    pub(crate) quiet_since: Nanos,
 }
 
 impl Dialogue {
     pub(crate) fn new(settings: Settings, now: Nanos) -> Self {
-        let phase = if settings.listen_only {
-            Phase::Following
-        } else {
-            Phase::Listening { give_up_at: now, shown: State::Probing }
-        };
         let mut dialogue = Dialogue {
             settings,
-            phase,
+            phase: Phase::Following,
             open: None,
             change_baud: None,
             baud: settings.baud,
             sensor: Sensor::default(),
             trouble: None,
             resyncs: 0,
+            heard: false,
+            quiet_since: now,
         };
         if !settings.listen_only {
-            dialogue.listen(now, State::Probing);
+            dialogue.begin(now);
         }
         dialogue
     }
@@ -54,7 +56,7 @@ impl Dialogue {
         match self.phase {
             Phase::Listening { shown, .. } => shown,
             Phase::Probing { .. } => State::Probing,
-            Phase::Switching => State::Switching,
+            Phase::Starting { .. } if self.baud != self.settings.baud => State::Switching,
             Phase::Starting { .. } => State::Starting,
             Phase::Streaming { .. } | Phase::Following => State::Streaming,
             Phase::Paused { .. } => State::Paused,
@@ -100,7 +102,9 @@ impl Dialogue {
 
     pub(crate) fn handle_timeout(&mut self, now: Nanos) {
         match self.phase {
-            Phase::Listening { give_up_at, .. } if now >= give_up_at => return self.probe(now, 0),
+            Phase::Listening { give_up_at, attempt, .. } if now >= give_up_at => {
+                return self.probe(now, attempt);
+            }
             Phase::Streaming { silent_at, .. } if now >= silent_at => {
                 self.resyncs += 1;
                 self.trouble = Some(Trouble::Silence);
@@ -137,22 +141,30 @@ impl Dialogue {
         }
     }
 
-    /// While the rate is sought, a NAK proves nothing: the scan that the request broke off, or a stream at another
-    /// rate, has such bytes, and who believes them leaves the right rate. Then only time says no.
+    /// While the rate is sought or a stream is broken off, a NAK proves nothing: the rest of a scan, or a stream at
+    /// another rate, has such bytes, and who believes them asks in vain. Then only time says no.
     pub(crate) fn on_nak(&mut self, now: Nanos) {
-        if !matches!(self.phase, Phase::Probing { .. }) && self.open.as_ref().is_some_and(Outgoing::is_out) {
+        let credible = !matches!(self.phase, Phase::Probing { .. }) && !self.sensor.streams;
+        if credible && self.open.as_ref().is_some_and(Outgoing::is_out) {
             self.retry(now + NAK_PAUSE);
         }
     }
 
-    pub(crate) fn on_telegram(&mut self, telegram: Telegram<'_>, now: Nanos) {
+    /// A telegram came whose first byte arrived at `first`.
+    pub(crate) fn on_telegram(&mut self, telegram: Telegram<'_>, first: Nanos, now: Nanos) {
+        self.quiet_since = now;
         // What cannot be read is an answer all the same.
         let reply = Reply::decode(telegram);
-        if let Some(reply) = &reply {
-            self.sensor.learn(reply, telegram);
+        self.sensor.learn(reply.as_ref(), telegram);
+        if telegram.command() == POWER_ON {
+            return self.on_power_on(now);
         }
-        if let Some(Reply::Measured(measured)) = reply {
-            return self.on_measured(telegram, measured, now);
+        if is_data(telegram.command()) {
+            let measured = match reply {
+                Some(Reply::Measured(measured)) if measured.partial().is_none() => Some(measured),
+                _ => None,
+            };
+            return self.on_data(telegram, measured, first, now);
         }
         let expected = telegram.command() == crate::reply::REFUSED
             || self.open.as_ref().is_some_and(|open| open.reply() == telegram.command());
@@ -161,84 +173,66 @@ impl Dialogue {
         }
     }
 
-    fn on_measured(&mut self, telegram: Telegram<'_>, measured: Measured<'_>, now: Nanos) {
-        let silent_at = self.silent_at(now);
+    /// The sensor sends unasked; `measured` is a whole scan.
+    fn on_data(&mut self, telegram: Telegram<'_>, measured: Option<Measured<'_>>, first: Nanos, now: Nanos) {
+        let at_rate = self.baud == self.settings.baud;
+        let next_silence = self.silent_at(now);
         match self.phase {
-            Phase::Streaming { silent_at: ref mut at, .. } => *at = silent_at,
-            Phase::Following => {}
+            Phase::Streaming { header, silent_at: ref mut at, .. } => {
+                // One of another kind was judged before this stream was known.
+                if telegram.bytes().starts_with(&header) {
+                    *at = next_silence;
+                    self.question(now);
+                }
+            }
+            Phase::Following => return,
+            Phase::Paused { stops_left: 0 } => {}
             Phase::Paused { ref mut stops_left } => {
-                if self.open.is_none() && *stops_left > 0 {
+                if self.open.is_none() {
                     *stops_left -= 1;
                     self.ask(Request::Stop, now, TRIES);
                 }
             }
-            Phase::Listening { .. } | Phase::Probing { .. } if self.baud != self.settings.baud => {
-                self.sensor.streams = true;
-                self.switch(now);
+            Phase::Listening { shown: State::Starting, .. } if measured.is_some() => {
+                self.stream(telegram, measured, now);
             }
-            Phase::Listening { .. } | Phase::Probing { .. } if !self.is_wanted(measured) => {
-                self.sensor.streams = true;
-                self.start(Step::Stop, now);
+            Phase::Listening { .. } | Phase::Probing { .. } => {
+                if at_rate && measured.is_some_and(|measured| self.is_wanted(measured)) {
+                    self.stream(telegram, measured, now);
+                } else {
+                    self.sensor.streams = true;
+                    self.proceed(Progress::BEGIN, now);
+                }
             }
-            Phase::Listening { .. } | Phase::Probing { .. } => self.stream(telegram, now),
-            Phase::Starting { step: Step::Stream } if self.open.as_ref().is_none_or(Outgoing::is_out) => {
-                self.stream(telegram, now);
+            Phase::Starting { step: Step::Stream, .. } if measured.is_some() => {
+                if self.open.as_ref().is_none_or(Outgoing::is_out) {
+                    self.stream(telegram, measured, now);
+                }
             }
-            Phase::Switching | Phase::Starting { .. } => {}
+            Phase::Starting { .. } => {}
+        }
+        if self.open.as_ref().is_some_and(|open| open.out_at().is_some_and(|out| first > out + OVERLOOKED)) {
+            self.retry(now);
         }
     }
 
-    /// Whether a running stream has the beams asked for; a sensor that refused them is taken as it is.
-    fn is_wanted(&self, measured: Measured<'_>) -> bool {
-        let same = measured.count() == self.settings.variant.beams();
-        measured.partial().is_none() && (same || self.trouble == Some(Trouble::VariantRefused))
-    }
-
-    /// Time between two telegrams of the variant asked for.
-    fn period(&self) -> Nanos {
-        let Settings { variant, baud, .. } = self.settings;
-        variant.period(2 * variant.beams() + BESIDE_VALUES, baud.rate())
+    /// The sensor was without power, or was reset: whatever it was set to is gone, and it is there at this rate.
+    fn on_power_on(&mut self, now: Nanos) {
+        match self.phase {
+            Phase::Following | Phase::Paused { .. } => {}
+            phase => {
+                self.resyncs += u64::from(matches!(phase, Phase::Streaming { .. }));
+                self.enter(Step::Check, Progress::BEGIN, now);
+            }
+        }
     }
 
     fn on_reply(&mut self, request: Request, reply: Option<Reply<'_>>, now: Nanos) {
-        match (self.phase, request) {
-            (Phase::Probing { .. }, _) if self.baud == self.settings.baud => self.start(Step::Stop, now),
-            (Phase::Probing { .. }, _) => self.switch(now),
-            (Phase::Switching, Request::Stop) => {
-                self.sensor.streams = false;
-                self.switch(now);
-            }
-            (Phase::Switching, Request::Baud(baud)) if reply == Some(Reply::Mode { done: true }) => {
-                self.change_baud(baud);
-                self.start(Step::Stop, now + SETTLE);
-            }
-            (Phase::Starting { step }, _) => {
-                if step == Step::Variant && !matches!(reply, Some(Reply::Variant { done: true, .. })) {
-                    self.trouble = Some(Trouble::VariantRefused);
-                }
-                let failed = matches!(reply, Some(Reply::Refused | Reply::Mode { done: false }));
-                match step {
-                    Step::Stop | Step::Stream if failed => {
-                        self.trouble = Some(Trouble::Refused(request));
-                        self.probe(now + PAUSE, 0);
-                    }
-                    // The stream is there when its first telegram is; until then its request stays unrepeated.
-                    Step::Stream => self.await_stream(now),
-                    Step::Stop => {
-                        self.sensor.streams = false;
-                        self.start(Step::Variant, now);
-                    }
-                    Step::Variant => self.start(Step::Type, now),
-                    Step::Type => self.start(Step::Configuration, now),
-                    Step::Configuration => self.start(Step::Stream, now),
-                }
-            }
-            (Phase::Streaming { .. }, _) => self.question(now),
-            (Phase::Paused { .. }, _) => self.sensor.streams = false,
-            _ => {
-                self.trouble = Some(Trouble::Refused(request));
-                self.probe(now + PAUSE, 0);
-            }
+        match self.phase {
+            Phase::Probing { .. } => self.proceed(Progress::BEGIN, now),
+            Phase::Starting { step, progress } => self.on_step(step, progress, request, reply, now),
+            Phase::Paused { .. } => self.sensor.streams = false,
+            Phase::Streaming { .. } | Phase::Listening { .. } | Phase::Following => {}
         }
     }
 
@@ -246,118 +240,83 @@ impl Dialogue {
     fn retry(&mut self, at: Nanos) {
         let Some(open) = &mut self.open else { return };
         let request = open.request;
-        if open.again(at) {
+        // What it did then is asked, not repeated.
+        let heard = open.reply() == MODE_REPLY && open.is_acknowledged();
+        if !heard && open.again(at) {
             return;
         }
         self.open = None;
         match self.phase {
-            Phase::Probing { attempt } => {
-                if attempt % Baud::ALL.len() == Baud::ALL.len() - 1 {
-                    self.trouble = Some(Trouble::NoAnswer);
-                }
-                self.probe(at, attempt + 1);
-            }
-            // Some sensors do not have it, some do not answer these right after a reset: the stream matters more.
-            Phase::Starting { step: Step::Variant } => {
-                self.trouble = Some(Trouble::VariantRefused);
-                self.start(Step::Type, at);
-            }
-            Phase::Starting { step: Step::Type } => self.start(Step::Configuration, at),
-            Phase::Starting { step: Step::Configuration } => self.start(Step::Stream, at),
-            Phase::Streaming { .. } => self.question(at),
-            Phase::Paused { .. } => {}
-            _ => {
-                self.trouble = Some(Trouble::Unanswered(request));
-                self.probe(at, 0);
-            }
+            Phase::Probing { attempt } => self.search_on(attempt, at),
+            Phase::Starting { step, progress } => self.on_no_reply(step, progress, request, heard, at),
+            Phase::Streaming { .. } | Phase::Paused { .. } | Phase::Listening { .. } | Phase::Following => {}
         }
     }
 
-    /// As a new session does: at the wanted rate, without a word.
-    fn begin(&mut self, now: Nanos) {
-        self.trouble = None;
-        self.change_baud(self.settings.baud);
-        self.listen(now, State::Probing);
+    /// The sensor said no: everything begins again, but not at once.
+    pub(crate) fn refused(&mut self, request: Request, now: Nanos) {
+        self.trouble = Some(Trouble::Refused(request));
+        self.probe(now + PAUSE, 0);
     }
 
-    fn listen(&mut self, now: Nanos, shown: State) {
-        self.open = None;
-        self.phase = Phase::Listening { give_up_at: now + LISTEN.max(2 * self.period()), shown };
+    /// Whether a running stream has the beams asked for; a sensor that refused them is taken as it is.
+    fn is_wanted(&self, measured: Measured<'_>) -> bool {
+        measured.count() == self.settings.variant.beams() || self.trouble == Some(Trouble::VariantRefused)
+    }
+
+    /// Time between two telegrams of the variant asked for.
+    pub(crate) fn period(&self) -> Nanos {
+        let Settings { variant, baud, .. } = self.settings;
+        variant.period(2 * variant.beams() + BESIDE_VALUES, baud.rate())
     }
 
     /// Until when measured data may stay out: the paper's second, and on a slow line two telegrams' worth.
-    fn silent_at(&self, now: Nanos) -> Nanos {
+    pub(crate) fn silent_at(&self, now: Nanos) -> Nanos {
         now + SILENCE.max(5 * self.period() / 2)
     }
 
-    fn probe(&mut self, now: Nanos, attempt: usize) {
-        self.phase = Phase::Probing { attempt };
-        // Who answers next may be another sensor: address 0 is for all.
-        self.sensor.address = None;
-        let wanted = self.settings.baud;
-        let mut others = Baud::ALL.into_iter().filter(|&baud| baud != wanted);
-        let turn = attempt % Baud::ALL.len();
-        let baud = if turn == 0 { wanted } else { others.nth(turn - 1).unwrap_or(wanted) };
-        self.change_baud(baud);
-        self.ask(Request::Status, now + SETTLE, 1);
-    }
-
-    fn switch(&mut self, now: Nanos) {
-        self.phase = Phase::Switching;
-        let request = if self.sensor.streams { Request::Stop } else { Request::Baud(self.settings.baud) };
-        self.ask(request, now, TRIES);
-    }
-
-    /// Begins with `step`, or the first one after it that has something to say.
-    fn start(&mut self, step: Step, now: Nanos) {
-        let same_variant = self.sensor.variant == Some(self.settings.variant);
-        let (step, request) = match step {
-            Step::Stop if self.sensor.streams => (step, Request::Stop),
-            Step::Stop | Step::Variant if !same_variant => {
-                (Step::Variant, Request::Variant(self.settings.variant))
-            }
-            Step::Stop | Step::Variant | Step::Type => (Step::Type, Request::Type),
-            Step::Configuration => (step, Request::Configuration),
-            Step::Stream => (step, Request::Stream),
+    /// Measured data come, and are taken as they are.
+    fn stream(&mut self, telegram: Telegram<'_>, measured: Option<Measured<'_>>, now: Nanos) {
+        let Some(&header) = telegram.bytes().first_chunk::<{ size_of::<StreamHeader>() }>() else { return };
+        let as_asked = measured.is_some_and(|scan| scan.count() == self.settings.variant.beams());
+        self.trouble = (!as_asked).then_some(Trouble::VariantRefused);
+        self.sensor.streams = true;
+        self.phase = Phase::Streaming {
+            header,
+            silent_at: self.silent_at(now),
+            questions: QUESTIONS,
+            tries_left: TRIES,
         };
-        self.phase = Phase::Starting { step };
-        self.ask(request, now, TRIES);
+        // A reply that is under way may answer.
+        self.open.take_if(|open| !open.is_out());
+        self.question(now);
     }
 
-    /// The sensor said that it streams: the first telegram is due like one that went missing.
-    fn await_stream(&mut self, now: Nanos) {
-        self.phase = Phase::Listening { give_up_at: self.silent_at(now), shown: State::Starting };
-    }
-
-    fn stream(&mut self, telegram: Telegram<'_>, now: Nanos) {
-        if let Some(&header) = telegram.bytes().first_chunk() {
-            self.sensor.streams = true;
-            self.trouble = self.trouble.filter(|&trouble| trouble == Trouble::VariantRefused);
-            self.open = None;
-            self.phase = Phase::Streaming { header, silent_at: self.silent_at(now), questions: QUESTIONS };
-            self.question(now);
-        }
-    }
-
-    /// Asks an adopted sensor for what its stream does not tell. Each reply costs the scan that it interrupts.
+    /// Right after a scan: asks for what a stream does not tell. A reply costs the scan that it interrupts, so the next
+    /// question waits for the next scan.
     fn question(&mut self, now: Nanos) {
-        let Phase::Streaming { questions, .. } = &mut self.phase else { return };
+        let Phase::Streaming { questions, tries_left, .. } = &mut self.phase else { return };
+        if self.open.is_some() {
+            return;
+        }
         while let Some((&question, rest)) = questions.split_first() {
-            *questions = rest;
             let is_known = match question {
                 Request::Type => !self.sensor.kind().is_empty(),
                 _ => self.sensor.mode.is_some(),
             };
-            if !is_known {
-                return self.ask(question, now, TRIES);
+            if !is_known && *tries_left > 0 {
+                *tries_left -= 1;
+                return self.ask(question, now, 1);
             }
+            (*questions, *tries_left) = (rest, TRIES);
         }
-        if self.sensor.mode.is_none() {
-            self.trouble = Some(Trouble::ModeUnknown);
+        match self.sensor.mode {
+            None => self.trouble = Some(Trouble::ModeUnknown),
+            Some(_) => self.trouble = self.trouble.filter(|&trouble| trouble != Trouble::ModeUnknown),
         }
     }
 
-    fn ask(&mut self, request: Request, not_before: Nanos, tries: u8) {
+    pub(crate) fn ask(&mut self, request: Request, not_before: Nanos, tries: u8) {
         let address = self.sensor.address.map_or(0, |address| address & !REPLY);
         // What the sensor has half heard must be forgotten first.
         let is_cut = self.open.as_ref().is_some_and(Outgoing::is_partly_out);
@@ -365,10 +324,13 @@ impl Dialogue {
         self.open = Some(Outgoing::new(request, address, not_before, tries));
     }
 
-    fn change_baud(&mut self, baud: Baud) {
-        if self.baud != baud {
+    pub(crate) fn change_baud(&mut self, baud: Baud) {
+        if self.baud != baud && !self.settings.fixed_rate {
             self.baud = baud;
             self.change_baud = Some(baud);
         }
     }
 }
+
+/// Command byte of the reply to every change of mode or rate.
+const MODE_REPLY: u8 = MODE | REPLY;

@@ -1,6 +1,7 @@
 //! What may stand at the head of a telegram: the only test that a position in the stream must pass to be watched as
 //! a candidate. Looks at the first 5 or 7 bytes, never at the checksum.
 
+use crate::command;
 use crate::measured::MEASURED;
 use crate::telegram::{FRAME, MAX_LENGTH, REPLY, STX};
 use crate::variant::MAX_BEAMS;
@@ -55,7 +56,8 @@ pub type StreamHeader = [u8; 7];
 pub enum Expect {
     /// Any reply of at most [`MAX_LENGTH`]; a measured-value telegram must have the length that its count asks for.
     Anything,
-    /// A stream in a known mode, and the reply to the request that is open, or its refusal.
+    /// A stream in a known mode, and the reply to the request that is open, or its refusal. At any time what a sensor
+    /// says late, twice or after power-on, if it has the length that it always has.
     Stream {
         /// How each measured-value telegram begins.
         header: StreamHeader,
@@ -123,7 +125,10 @@ fn length_fits(length: usize, expect: &Expect) -> bool {
         Expect::Anything | Expect::Stream { reply: Some(_), .. } => {
             (MIN_LENGTH..=MAX_LENGTH).contains(&length)
         }
-        Expect::Stream { header, reply: None } => length == stream_length(header),
+        Expect::Stream { header, reply: None } => {
+            length == stream_length(header)
+                || BESIDE_A_STREAM.iter().any(|(_, lengths)| lengths.contains(&length))
+        }
     }
 }
 
@@ -140,6 +145,11 @@ fn command_fits(command: u8, length: usize, expect: &Expect) -> Result<Counted, 
         }
         Expect::Stream { reply: Some(reply), .. }
             if command == *reply || command == crate::reply::REFUSED =>
+        {
+            Ok(Counted::No)
+        }
+        Expect::Stream { .. }
+            if BESIDE_A_STREAM.iter().any(|(may, lengths)| *may == command && lengths.contains(&length)) =>
         {
             Ok(Counted::No)
         }
@@ -163,6 +173,27 @@ fn stream_length(header: &StreamHeader) -> usize {
     usize::from(u16::from_le_bytes([header[2], header[3]]))
 }
 
+/// Whether a sensor sends telegrams with this command byte unasked, scan after scan, in one of its operating modes.
+pub(crate) fn is_data(command: u8) -> bool {
+    STREAMED.contains(&command)
+}
+
+/// Command byte of what a sensor says when its power comes on.
+pub(crate) const POWER_ON: u8 = 0x90;
+/// All values, means, a sub-range, with field values, means of a sub-range, with reflectivity, ranges and
+/// reflectivity, Cartesian (Telegram listing, 20h).
+const STREAMED: [u8; 8] = [MEASURED, 0xB6, 0xB7, 0xBE, 0xBF, 0xC4, 0xF5, 0xF6];
+/// Replies to what a session asks, the refusal, and what is said at power-on, each with its LENGTH: names have 20 or 21
+/// characters, configurations 32 or 34 bytes. Without their length they would be found in scans.
+const BESIDE_A_STREAM: [(u8, core::ops::RangeInclusive<usize>); 7] = [
+    (POWER_ON, 20..=26),
+    (crate::reply::REFUSED, 2..=2),
+    (command::MODE | REPLY, 3..=3),
+    (command::STATUS | REPLY, 0x9A..=0x9A),
+    (command::TYPE | REPLY, 20..=26),
+    (command::VARIANT | REPLY, 7..=7),
+    (command::CONFIGURATION | REPLY, 33..=36),
+];
 /// Command and status.
 const MIN_LENGTH: usize = 2;
 /// Bytes of the longest header.
@@ -218,11 +249,26 @@ mod tests {
     }
 
     #[test]
-    fn in_a_stream_only_the_open_reply_may_come() {
+    fn in_a_stream_the_open_reply_may_come() {
         let open = Expect::Stream { header: HEADER, reply: Some(0xB1) };
         assert_eq!(judge(&[0x02, 0x80, 0x9A, 0, 0xB1], &open), Judgement::Candidate { len: 160 });
         assert_eq!(judge(&[0x02, 0x80, 2, 0, 0x92], &open), Judgement::Candidate { len: 8 });
-        assert_eq!(judge(&[0x02, 0x80, 0x17, 0, 0xBA], &open), Judgement::Refused(Reject::Command));
+        assert_eq!(judge(&[0x02, 0x80, 0x17, 0, 0xCA], &open), Judgement::Refused(Reject::Command));
         assert_eq!(judge(&[0x02, 0x80, 0x17, 0, 0xB0], &open), Judgement::Refused(Reject::Length));
+    }
+
+    #[test]
+    fn in_a_stream_a_late_reply_may_come_with_its_own_length() {
+        let stream = Expect::Stream { header: HEADER, reply: None };
+        for (command, length) in
+            [(0x90, 0x17), (0x92, 2), (0xA0, 3), (0xB1, 0x9A), (0xBA, 0x17), (0xBB, 7), (0xF4, 0x24)]
+        {
+            let mut header = [0x02, 0x80, length, 0, command];
+            assert_eq!(judge(&header, &stream), Judgement::Candidate { len: usize::from(length) + FRAME });
+            header[4] = 0xC0;
+            assert_eq!(judge(&header, &stream), Judgement::Refused(Reject::Command));
+            header[2] = 0x50;
+            assert_eq!(judge(&header, &stream), Judgement::Refused(Reject::Length));
+        }
     }
 }

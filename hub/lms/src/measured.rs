@@ -1,5 +1,6 @@
-//! The measured-value telegram B0h: a count word and one word a beam. What the words mean in millimetres depends on
-//! the measuring mode, which the telegram does not carry.
+//! Measured values as B0h, B6h, B7h and BFh carry them: a count word, one word a beam, and the two real-time indices
+//! where the sensor is set to send them. What the words mean in millimetres depends on the measuring mode, which no
+//! telegram of values carries.
 
 use crate::telegram::{Encoded, REPLY, Telegram, Writer};
 use crate::variant::{MAX_BEAMS, Unit};
@@ -7,7 +8,7 @@ use crate::variant::{MAX_BEAMS, Unit};
 /// Command byte of a measured-value telegram.
 pub const MEASURED: u8 = 0xB0;
 
-/// View of a measured-value telegram's data.
+/// View of measured values, from the count word on.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Measured<'a> {
     count_word: u16,
@@ -22,7 +23,12 @@ impl<'a> Measured<'a> {
         if telegram.command() != MEASURED || !telegram.is_reply() {
             return None;
         }
-        let [low, high, rest @ ..] = telegram.data() else { return None };
+        Measured::read(telegram.data())
+    }
+
+    /// The values that `data` are, from the count word on.
+    pub(crate) fn read(data: &'a [u8]) -> Option<Self> {
+        let [low, high, rest @ ..] = data else { return None };
         let count_word = u16::from_le_bytes([*low, *high]);
         Unit::of_code((count_word >> 14) as u8)?;
         let count = usize::from(count_word & COUNT);
@@ -36,6 +42,11 @@ impl<'a> Measured<'a> {
             _ => return None,
         };
         Some(Measured { count_word, values, indices })
+    }
+
+    pub(crate) fn write(&self, writer: Writer) -> Writer {
+        let writer = writer.word(self.count_word).slice(self.values);
+        self.indices.map_or(writer.clone(), |(scan, telegram)| writer.byte(scan).byte(telegram))
     }
 
     /// Number of beams: 1 to 401.
@@ -68,18 +79,38 @@ impl<'a> Measured<'a> {
 /// A measured-value telegram of a whole scan from the sensor at `address` (0 to 127): at most 401 `words` as they
 /// are, then `status`.
 pub fn encode(address: u8, unit: Unit, words: &[u16], status: u8) -> Encoded {
-    let count_word = words.len() as u16 | u16::from(unit.code()) << 14;
+    encode_with(address, Frame { unit, partial: None, indices: None }, words, status)
+}
+
+/// What a measured-value telegram says beside its values.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Frame {
+    /// Unit of the ranges.
+    pub unit: Unit,
+    /// Of a partial scan, its start in quarters of a degree (0 to 3).
+    pub partial: Option<u8>,
+    /// Scan index and telegram index.
+    pub indices: Option<(u8, u8)>,
+}
+
+/// As [`encode`], also for partial scans and with real-time indices.
+pub fn encode_with(address: u8, frame: Frame, words: &[u16], status: u8) -> Encoded {
+    let partial = frame.partial.map_or(0, |quarter| PARTIAL | u16::from(quarter & 3) << 11);
+    let count_word = words.len() as u16 | partial | u16::from(frame.unit.code()) << 14;
     let mut writer = Writer::new(address | REPLY, MEASURED).word(count_word);
     for &word in words {
         writer = writer.word(word);
+    }
+    if let Some((scan, telegram)) = frame.indices {
+        writer = writer.byte(scan).byte(telegram);
     }
     writer.byte(status).finish()
 }
 
 /// Bits of the count word that are the count.
-const COUNT: u16 = 0x03FF;
+pub(crate) const COUNT: u16 = 0x03FF;
 /// Bit of the count word that marks a partial scan.
-const PARTIAL: u16 = 1 << 13;
+pub(crate) const PARTIAL: u16 = 1 << 13;
 
 #[cfg(test)]
 mod tests {
@@ -95,6 +126,32 @@ mod tests {
         let measured = Measured::decode(encoded.telegram()).unwrap();
         assert_eq!((measured.count(), measured.unit(), measured.partial()), (361, Unit::Mm, None));
         assert!(measured.words().eq(words));
+    }
+
+    #[test]
+    fn partial_scans_with_indices_both_ways() {
+        let words: [u16; 180] = core::array::from_fn(|i| i as u16);
+        let frame = Frame { unit: Unit::Cm, partial: Some(2), indices: Some((255, 7)) };
+        let encoded = encode_with(1, frame, &words, 0x11);
+        assert_eq!((encoded.bytes().len(), encoded.telegram().length()), (372, 0x016C + 2));
+        assert_eq!(encoded.telegram().data()[..2], [180, 0b0011_0000]);
+        let measured = Measured::decode(encoded.telegram()).unwrap();
+        assert_eq!(
+            (measured.unit(), measured.partial(), measured.indices()),
+            (Unit::Cm, Some(2), Some((255, 7)))
+        );
+        assert!(measured.words().eq(words));
+    }
+
+    #[test]
+    fn lengths_of_the_listing() {
+        for (beams, length) in [(181, 0x016E), (361, 0x02D6), (101, 0xCE), (201, 0x0196), (401, 0x0326)] {
+            let encoded = encode(0, Unit::Mm, &[0; MAX_BEAMS][..beams], 0x10);
+            assert_eq!(encoded.telegram().length(), length);
+            let frame = Frame { unit: Unit::Mm, partial: None, indices: Some((0, 0)) };
+            let with_indices = encode_with(0, frame, &[0; MAX_BEAMS][..beams], 0x10);
+            assert_eq!(with_indices.telegram().length(), length + 2);
+        }
     }
 
     #[test]

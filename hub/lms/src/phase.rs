@@ -16,6 +16,8 @@ pub struct Settings {
     pub baud: Baud,
     /// Whether anybody hears us: a recording is only listened to.
     pub listen_only: bool,
+    /// Whether the port has the wanted rate and no other: a serial server on the network.
+    pub fixed_rate: bool,
 }
 
 /// Why a session waits until its deadline.
@@ -35,20 +37,50 @@ pub enum Reason {
 
 #[derive(Clone, Copy, Debug)]
 pub(crate) enum Phase {
-    /// Whoever streams at the wanted rate is adopted undisturbed; meanwhile the state is as `shown`.
-    Listening { give_up_at: Nanos, shown: State },
+    /// Without a word: whoever streams is heard. Meanwhile the state is as `shown`, afterwards comes `attempt`.
+    Listening { give_up_at: Nanos, shown: State, attempt: usize },
     /// A status request at one rate after the other.
     Probing { attempt: usize },
-    /// The rate was found and is changed to the wanted one.
-    Switching,
-    /// At the wanted rate: settings, then the stream.
-    Starting { step: Step },
-    /// Measured data come.
-    Streaming { header: StreamHeader, silent_at: Nanos, questions: &'static [Request] },
+    /// The sensor hears us: it is brought to rest, to the wanted rate, to its settings, to a stream.
+    Starting { step: Step, progress: Progress },
+    /// Measured data come; after each scan a question may be asked, the first one so many times more.
+    Streaming { header: StreamHeader, silent_at: Nanos, questions: &'static [Request], tries_left: u8 },
     /// Bytes come from a recording.
     Following,
     /// Nothing is wanted. A stream that goes on all the same is stopped so many times more.
     Paused { stops_left: u8 },
+}
+
+/// Steps of [`Phase::Starting`], each a request. Between two changes of mode or rate, whose replies look alike, there
+/// is always another one: so a reply that is late, or comes twice, is not taken for the next one's.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Step {
+    /// Ends a stream, or the installation mode.
+    Stop,
+    /// Asks the sensor what it does now, and whether it hears at this rate.
+    Check,
+    Baud,
+    Variant,
+    Type,
+    Configuration,
+    Stream,
+}
+
+/// How far a start is.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Progress {
+    /// Stops that may still be said.
+    pub(crate) stops_left: u8,
+    /// What follows once the sensor is at rest and at the wanted rate.
+    pub(crate) settings: &'static [Step],
+}
+
+impl Progress {
+    /// Nothing was done yet.
+    pub(crate) const BEGIN: Progress = Progress {
+        stops_left: STOPS + 1,
+        settings: &[Step::Variant, Step::Type, Step::Configuration, Step::Stream],
+    };
 }
 
 /// What a user may ask of a running session.
@@ -62,19 +94,9 @@ pub enum Control {
     Resync,
 }
 
-/// Steps of [`Phase::Starting`] in their order.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(crate) enum Step {
-    Stop,
-    Variant,
-    Type,
-    Configuration,
-    Stream,
-}
-
 /// Two scans of the slowest variant, and some; longer where the line is slower than the scans.
 pub(crate) const LISTEN: Nanos = 120 * MILLIS;
-/// Without measured data for so long, the session begins again (paper: resynchronise after one second).
+/// Without measured data for so long the session begins again (paper: resynchronise after one second).
 pub(crate) const SILENCE: Nanos = 1_000 * MILLIS;
 /// After a change of rate the sensor's and the adapter's UART need a moment.
 pub(crate) const SETTLE: Nanos = 20 * MILLIS;
@@ -82,7 +104,16 @@ pub(crate) const SETTLE: Nanos = 20 * MILLIS;
 pub(crate) const PAUSE: Nanos = 500 * MILLIS;
 /// A sensor may overlook a request while its mirror turns; three tries are what all drivers give it.
 pub(crate) const TRIES: u8 = 3;
-/// Stops that a pause says beside the first one: a sensor that went on after so many does not listen.
+/// Of requests without which there is no stream.
+pub(crate) const MORE_TRIES: u8 = 5;
+/// A whole scan that began so long after a request says that the request was overlooked: it breaks off what is sent.
+/// The time is for bytes that an adapter keeps.
+pub(crate) const OVERLOOKED: Nanos = 25 * MILLIS;
+/// At all rates nobody answered and no byte came: before the next round, by how many there were.
+pub(crate) const PAUSES: [Nanos; 4] = [0, 500 * MILLIS, 1_000 * MILLIS, 1_500 * MILLIS];
+/// In every other round a sensor has so much more time: one that is slow would never be found otherwise.
+pub(crate) const PATIENCE: Nanos = 250 * MILLIS;
+/// Stops beside the first one; what goes on after so many does not listen.
 pub(crate) const STOPS: u8 = 2;
 /// What a stream does not tell: how values are split, from the one reply or the other, and who sends them.
 pub(crate) const QUESTIONS: &[Request] = &[Request::Status, Request::Configuration, Request::Type];

@@ -1,25 +1,61 @@
-//! Replies: what a sensor says to a host's requests. Decoded by the session, encoded by the simulator. Every reply
-//! ends with a status byte, which is the telegram's affair ([`Telegram::status`]), not this file's.
+//! Replies: what a sensor says to a host's requests, and unasked in a stream. Every reply ends with a status byte, which
+//! is [`crate::condition::Condition`]'s affair, not this file's.
 
-use crate::command;
+use crate::command as request;
+use crate::configuration::factory;
+use crate::errors::Errors;
 use crate::measured::{MEASURED, Measured};
-use crate::telegram::{Encoded, REPLY, Telegram, Writer};
-use crate::variant::{Baud, Mode, Unit, Variant};
+use crate::parameters::Span;
+use crate::reflectivity::{RangeFields, Reflectivities, Reflectivity};
+use crate::telegram::{Encoded, MAX_LENGTH, REPLY, Telegram, Writer};
+use crate::variant::{Mode, Unit, Variant};
 
-/// A reply of the path from power-on to a stream.
+pub use crate::configuration::Configuration;
+pub use crate::status_report::{Health, StatusReport, status};
+
+/// A reply.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Reply<'a> {
+    /// 90h: what a sensor says when it is up, after power-on or a reset: type, number and firmware.
+    PowerOn(&'a [u8]),
+    /// 91h: the reset begins; 90h follows within 60 s.
+    Reset,
+    /// 92h: a well-formed command that this sensor cannot do, or not now.
+    Refused,
     /// A0h: the operating mode (or rate) was changed, or not.
     Mode {
         /// Whether it was.
         done: bool,
     },
+    /// B0h: a scan, asked for or streamed.
+    Measured(Measured<'a>),
     /// B1h.
     Status(StatusReport<'a>),
+    /// B2h: none, if everything is well.
+    Errors(Errors<'a>),
+    /// B5h.
+    Counters {
+        /// Hours of operation, in units of two.
+        hours_by_2: u16,
+        /// How often the power came on.
+        power_ons: u16,
+    },
+    /// B6h: mean values.
+    Means {
+        /// Of how many scans.
+        shots: u8,
+        /// The values.
+        values: Measured<'a>,
+    },
+    /// B7h: a sub-range.
+    Range {
+        /// Which.
+        span: Span,
+        /// The values.
+        values: Measured<'a>,
+    },
     /// BAh: type, number and firmware as ASCII, such as `LMS200;S18063;V02.19`.
     Type(&'a [u8]),
-    /// F4h.
-    Configuration(Configuration<'a>),
     /// BBh: the variant now in force, and whether it is the one asked for.
     Variant {
         /// Whether the switch was done.
@@ -29,97 +65,176 @@ pub enum Reply<'a> {
         /// See `angle_deg`.
         resolution_cdeg: u16,
     },
-    /// B0h: a scan, asked for or streamed.
-    Measured(Measured<'a>),
-    /// 92h: a well-formed command that this sensor cannot do, or not now.
-    Refused,
+    /// BEh: a sub-range with field values.
+    RangeFields(RangeFields<'a>),
+    /// BFh: mean values of a sub-range.
+    RangeMeans {
+        /// Of how many scans.
+        shots: u8,
+        /// Which.
+        span: Span,
+        /// The values.
+        values: Measured<'a>,
+    },
+    /// C4h: ranges, and reflectivities of a sub-range; LMS S14.
+    Reflectivity(Reflectivity<'a>),
+    /// E6h: to the change of the rate after power-on.
+    PowerOnSet {
+        /// What came of it; the present state is told by [`StatusReport::has_permanent_baud`].
+        outcome: u8,
+        /// The byte that was set.
+        set: u8,
+    },
+    /// F4h.
+    Configuration(Configuration<'a>),
+    /// F5h: ranges and reflectivities.
+    Reflectivities(Reflectivities<'a>),
+    /// F7h: to the change of the configuration.
+    ConfigurationWritten {
+        /// Whether it was changed.
+        done: bool,
+        /// What is in force now.
+        configuration: Configuration<'a>,
+    },
+    /// FBh: second part of the configuration, 84 bytes.
+    Configuration2(&'a [u8]),
+    /// FCh: to the change of the second part.
+    Configuration2Written {
+        /// Whether it was changed.
+        done: bool,
+        /// What is in force now.
+        parameters: &'a [u8],
+    },
+    /// C0h, C1h, C2h, C5h, C6h, CAh, E9h and F6h, whose layout is not known here: the data as they are.
+    Unread {
+        /// The command byte.
+        command: u8,
+        /// Without the status byte.
+        data: &'a [u8],
+    },
 }
 
 impl<'a> Reply<'a> {
-    /// What `telegram` says; `None` if it is no reply of this list or shorter than its kind needs.
+    /// What `telegram` says; `None` if it is no reply of this list or its data are not as its kind needs them.
     pub fn decode(telegram: Telegram<'a>) -> Option<Reply<'a>> {
-        if !telegram.is_reply() {
+        if !telegram.is_reply() || telegram.status().is_none() {
             return None;
         }
         let data = telegram.data();
-        match telegram.command() {
-            MODE => data.first().map(|&outcome| Reply::Mode { done: outcome == 0 }),
-            STATUS => data.try_into().ok().map(StatusReport).map(Reply::Status),
-            TYPE => Some(Reply::Type(data.trim_ascii())),
-            CONFIGURATION => {
-                (data.len() >= CONFIGURATION_MIN).then_some(Reply::Configuration(Configuration(data)))
+        Some(match (telegram.command(), data) {
+            (POWER_ON, name) => Reply::PowerOn(name.trim_ascii()),
+            (RESET, []) => Reply::Reset,
+            (REFUSED, _) => Reply::Refused,
+            (MODE, &[outcome, ..]) => Reply::Mode { done: outcome == 0 },
+            (MEASURED, data) => Reply::Measured(Measured::read(data)?),
+            (STATUS, data) => Reply::Status(StatusReport::new(data)?),
+            (ERRORS, data) => Reply::Errors(Errors::new(data)?),
+            (COUNTERS, &[a, b, c, d]) => Reply::Counters {
+                hours_by_2: u16::from_le_bytes([a, b]),
+                power_ons: u16::from_le_bytes([c, d]),
+            },
+            (MEANS, &[shots, ref rest @ ..]) => Reply::Means { shots, values: Measured::read(rest)? },
+            (RANGE, data) => {
+                let (span, rest) = data.split_at_checked(Span::LEN)?;
+                Reply::Range { span: Span::read(span)?, values: Measured::read(rest)? }
             }
-            VARIANT => {
-                let &[done, a, b, c, d] = data else { return None };
-                Some(Reply::Variant {
-                    done: done == 1,
-                    angle_deg: u16::from_le_bytes([a, b]),
-                    resolution_cdeg: u16::from_le_bytes([c, d]),
-                })
+            (TYPE, name) => Reply::Type(name.trim_ascii()),
+            (VARIANT, &[done, a, b, c, d]) => Reply::Variant {
+                done: done == 1,
+                angle_deg: u16::from_le_bytes([a, b]),
+                resolution_cdeg: u16::from_le_bytes([c, d]),
+            },
+            (RANGE_FIELDS, data) => Reply::RangeFields(RangeFields::new(data)?),
+            (RANGE_MEANS, &[shots, ref rest @ ..]) => {
+                let (span, rest) = rest.split_at_checked(Span::LEN)?;
+                Reply::RangeMeans { shots, span: Span::read(span)?, values: Measured::read(rest)? }
             }
-            MEASURED => Measured::decode(telegram).map(Reply::Measured),
-            REFUSED => Some(Reply::Refused),
-            _ => None,
+            (REFLECTIVITY, data) => Reply::Reflectivity(Reflectivity::new(data)?),
+            (POWER_ON_SET, &[outcome, set]) => Reply::PowerOnSet { outcome, set },
+            (CONFIGURATION, data) => Reply::Configuration(Configuration::new(data)?),
+            (REFLECTIVITIES, data) => Reply::Reflectivities(Reflectivities::new(data)?),
+            (CONFIGURATION_WRITTEN, &[outcome, ref rest @ ..]) => {
+                Reply::ConfigurationWritten { done: outcome == 1, configuration: Configuration::new(rest)? }
+            }
+            (CONFIGURATION_2, parameters) => Reply::Configuration2(parameters),
+            (CONFIGURATION_2_WRITTEN, &[outcome, ref parameters @ ..]) => {
+                Reply::Configuration2Written { done: outcome == 1, parameters }
+            }
+            (command, data) if UNREAD.contains(&command) => Reply::Unread { command, data },
+            _ => return None,
+        })
+    }
+
+    /// The telegram that says it, from the sensor at `address`, ending with `status`; `None` if it is longer than a
+    /// telegram may be. Names are filled up with spaces to the 21 characters that they have.
+    pub fn encode(&self, address: u8, status: u8) -> Option<Encoded> {
+        let writer = Writer::new(address | REPLY, self.command());
+        let writer = match *self {
+            Reply::PowerOn(name) | Reply::Type(name) => {
+                let spaces = &[b' '; NAME_LEN][..NAME_LEN.saturating_sub(name.len())];
+                fitting(writer, name)?.slice(spaces)
+            }
+            Reply::Reset | Reply::Refused => writer,
+            Reply::Mode { done } => writer.byte(u8::from(!done)),
+            Reply::Measured(values) => values.write(writer),
+            Reply::Status(report) => writer.slice(report.bytes()),
+            Reply::Errors(errors) => fitting(writer, errors.bytes())?,
+            Reply::Counters { hours_by_2, power_ons } => writer.word(hours_by_2).word(power_ons),
+            Reply::Means { shots, values } => values.write(writer.byte(shots)),
+            Reply::Range { span, values } => values.write(span.write(writer)),
+            Reply::Variant { done, angle_deg, resolution_cdeg } => {
+                writer.byte(u8::from(done)).word(angle_deg).word(resolution_cdeg)
+            }
+            Reply::RangeFields(fields) => fields.write(writer),
+            Reply::RangeMeans { shots, span, values } => values.write(span.write(writer.byte(shots))),
+            Reply::Reflectivity(view) => fitting(writer, view.bytes())?,
+            Reply::PowerOnSet { outcome, set } => writer.byte(outcome).byte(set),
+            Reply::Configuration(configuration) => fitting(writer, configuration.bytes())?,
+            Reply::Reflectivities(view) => fitting(writer, view.bytes())?,
+            Reply::ConfigurationWritten { done, configuration } => {
+                fitting(writer.byte(u8::from(done)), configuration.bytes())?
+            }
+            Reply::Configuration2(parameters) => fitting(writer, parameters)?,
+            Reply::Configuration2Written { done, parameters } => {
+                fitting(writer.byte(u8::from(done)), parameters)?
+            }
+            Reply::Unread { data, .. } => fitting(writer, data)?,
+        };
+        Some(writer.byte(status).finish())
+    }
+
+    /// The command byte.
+    pub fn command(&self) -> u8 {
+        match self {
+            Reply::PowerOn(_) => POWER_ON,
+            Reply::Reset => RESET,
+            Reply::Refused => REFUSED,
+            Reply::Mode { .. } => MODE,
+            Reply::Measured(_) => MEASURED,
+            Reply::Status(_) => STATUS,
+            Reply::Errors(_) => ERRORS,
+            Reply::Counters { .. } => COUNTERS,
+            Reply::Means { .. } => MEANS,
+            Reply::Range { .. } => RANGE,
+            Reply::Type(_) => TYPE,
+            Reply::Variant { .. } => VARIANT,
+            Reply::RangeFields(_) => RANGE_FIELDS,
+            Reply::RangeMeans { .. } => RANGE_MEANS,
+            Reply::Reflectivity(_) => REFLECTIVITY,
+            Reply::PowerOnSet { .. } => POWER_ON_SET,
+            Reply::Configuration(_) => CONFIGURATION,
+            Reply::Reflectivities(_) => REFLECTIVITIES,
+            Reply::ConfigurationWritten { .. } => CONFIGURATION_WRITTEN,
+            Reply::Configuration2(_) => CONFIGURATION_2,
+            Reply::Configuration2Written { .. } => CONFIGURATION_2_WRITTEN,
+            Reply::Unread { command, .. } => *command,
         }
     }
 }
 
-/// Data of a status reply: 152 bytes, of which the sensor's settings and its health are read here.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct StatusReport<'a>(&'a [u8; STATUS_LEN]);
-
-impl<'a> StatusReport<'a> {
-    /// Firmware as ASCII, such as `V02.19`.
-    pub fn software(&self) -> &'a [u8] {
-        self.0[..7].trim_ascii()
-    }
-
-    /// The operating mode, the byte after command 20h (24h: streaming, 25h: on request).
-    pub fn operating_mode(&self) -> u8 {
-        self.0[7]
-    }
-
-    /// Whether the sensor calls itself defective.
-    pub fn is_defective(&self) -> bool {
-        self.0[8] != 0
-    }
-
-    /// How values are split.
-    pub fn mode(&self) -> Mode {
-        Mode(self.0[101])
-    }
-
-    /// Angle and resolution in force; `None` if the sensor names a pair that no telegram can carry.
-    pub fn variant(&self) -> Option<Variant> {
-        let word = |at: usize| u16::from_le_bytes([self.0[at], self.0[at + 1]]);
-        Variant::new(word(106), word(108))
-    }
-
-    /// Unit of the ranges; `None` for an unknown code.
-    pub fn unit(&self) -> Option<Unit> {
-        Unit::of_code(self.0[121])
-    }
-}
-
-/// Data of a configuration reply: 34 bytes, 32 with older firmware.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct Configuration<'a>(&'a [u8]);
-
-impl<'a> Configuration<'a> {
-    /// The bytes as the sensor keeps them.
-    pub fn bytes(&self) -> &'a [u8] {
-        self.0
-    }
-
-    /// How values are split.
-    pub fn mode(&self) -> Mode {
-        Mode(self.0[5])
-    }
-
-    /// Unit of the ranges; `None` for an unknown code.
-    pub fn unit(&self) -> Option<Unit> {
-        Unit::of_code(self.0[6])
-    }
+/// `writer` with `bytes` and room for the status byte; `None` if there is no such room.
+fn fitting(writer: Writer, bytes: &[u8]) -> Option<Writer> {
+    (writer.length() + bytes.len() < MAX_LENGTH).then(|| writer.slice(bytes))
 }
 
 /// A0h: mode or rate changed (or not), from `address`, ending with `status`.
@@ -149,121 +264,34 @@ pub fn variant(address: u8, done: bool, variant: Variant, status: u8) -> Encoded
 
 /// F4h: 34 bytes of a sensor as it left the factory, with this measuring mode and unit.
 pub fn configuration(address: u8, mode: Mode, unit: Unit, status: u8) -> Encoded {
-    let mut data = [0; CONFIGURATION_LEN];
-    data[2] = 0x70;
-    data[5] = mode.0;
-    data[6] = unit.code();
-    data[9] = 2;
-    data[10] = 2;
-    data[32] = 2;
-    Writer::new(address | REPLY, CONFIGURATION).slice(&data).byte(status).finish()
+    Writer::new(address | REPLY, CONFIGURATION).slice(&factory(mode, unit)).byte(status).finish()
 }
 
-/// What a simulated sensor says of itself in a status reply.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct Health {
-    /// Firmware, 7 ASCII characters.
-    pub software: [u8; 7],
-    /// The byte after the last 20h.
-    pub operating_mode: u8,
-    /// How values are split.
-    pub mode: Mode,
-    /// Angle and resolution in force.
-    pub variant: Variant,
-    /// Unit of the ranges.
-    pub unit: Unit,
-    /// Rate of the line.
-    pub baud: Baud,
-}
-
-/// B1h: the settings of `health`, a motor at its nominal speed, everything else 0.
-pub fn status(address: u8, health: &Health, status: u8) -> Encoded {
-    let mut data = [0; STATUS_LEN];
-    data[..7].copy_from_slice(&health.software);
-    data[7] = health.operating_mode;
-    // Microseconds per 1/90 revolution: 148 is 13.32 ms a turn.
-    data[66..68].copy_from_slice(&148u16.to_le_bytes());
-    data[101] = health.mode.0;
-    data[106..108].copy_from_slice(&health.variant.angle_deg.to_le_bytes());
-    data[108..110].copy_from_slice(&health.variant.resolution_cdeg.to_le_bytes());
-    let divisor: u16 = match health.baud {
-        Baud::B500000 => 0x8001,
-        Baud::B38400 => 0x8019,
-        Baud::B19200 => 0x8033,
-        Baud::B9600 => 0x8067,
-    };
-    data[115..117].copy_from_slice(&divisor.to_le_bytes());
-    data[121] = health.unit.code();
-    data[122] = 1;
-    Writer::new(address | REPLY, STATUS).slice(&data).byte(status).finish()
-}
-
+/// Command byte of what a sensor says when it is up.
+pub const POWER_ON: u8 = 0x90;
+/// Command byte of the beginning of a reset.
+pub const RESET: u8 = 0x91;
 /// Command byte of the refusal.
 pub const REFUSED: u8 = 0x92;
 
-const MODE: u8 = command::MODE | REPLY;
-const STATUS: u8 = command::STATUS | REPLY;
-const TYPE: u8 = command::TYPE | REPLY;
-const VARIANT: u8 = command::VARIANT | REPLY;
-const CONFIGURATION: u8 = command::CONFIGURATION | REPLY;
-/// LENGTH 9Ah less command and status (Telegram listing 7-5).
-const STATUS_LEN: usize = 152;
-/// Data of F4h; a capture of V02.19 has 34, older firmware 32.
-const CONFIGURATION_LEN: usize = 34;
-const CONFIGURATION_MIN: usize = 32;
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    fn decoded(bytes: &[u8]) -> Reply<'_> {
-        Reply::decode(Telegram::check(bytes).unwrap()).unwrap()
-    }
-
-    #[test]
-    fn printed_and_captured_replies() {
-        assert_eq!(mode(0, true, 0x10).bytes(), [0x02, 0x80, 3, 0, 0xA0, 0, 0x10, 0x16, 0x0A]);
-        assert_eq!(mode(1, true, 0x10).bytes(), [0x02, 0x81, 3, 0, 0xA0, 0, 0x10, 0x36, 0x1A]);
-        assert_eq!(mode(0, true, 0x11).bytes(), [0x02, 0x80, 3, 0, 0xA0, 0, 0x11, 0x17, 0x0A]);
-        assert_eq!(refused(0, 0x10).bytes(), [0x02, 0x80, 2, 0, 0x92, 0x10, 0x7F, 0x33]);
-        let bb = variant(0, true, Variant::HALF, 0x10);
-        assert_eq!(bb.bytes(), [0x02, 0x80, 7, 0, 0xBB, 1, 0xB4, 0, 0x32, 0, 0x10, 0x03, 0x9D]);
-        assert_eq!(decoded(bb.bytes()), Reply::Variant { done: true, angle_deg: 180, resolution_cdeg: 50 });
-        let ba = kind(0, b"LMS200;S18063;V02.19 ", 0x10);
-        assert_eq!(ba.bytes()[26..], [0x10, 0x85, 0x6A]);
-        assert_eq!(decoded(ba.bytes()), Reply::Type(b"LMS200;S18063;V02.19"));
-        assert_eq!(decoded(mode(0, false, 0x10).bytes()), Reply::Mode { done: false });
-        assert_eq!(decoded(refused(0, 0x10).bytes()), Reply::Refused);
-    }
-
-    #[test]
-    fn a_captured_configuration() {
-        let mut bytes = [0; 42];
-        bytes[..17].copy_from_slice(&[2, 0x80, 0x24, 0, 0xF4, 0, 0, 0x70, 0, 0, 4, 1, 0, 0, 2, 2, 0]);
-        bytes[37..].copy_from_slice(&[2, 0, 0x10, 0x36, 0xFE]);
-        let Reply::Configuration(configuration) = decoded(&bytes) else { panic!("not a configuration") };
-        assert_eq!((configuration.mode(), configuration.unit()), (Mode(4), Some(Unit::Mm)));
-        assert_eq!(super::configuration(0, Mode(4), Unit::Mm, 0x10).bytes(), bytes);
-    }
-
-    #[test]
-    fn a_status_both_ways() {
-        let health = Health {
-            software: *b"V02.19 ",
-            operating_mode: 0x24,
-            mode: Mode(1),
-            variant: Variant::HALF,
-            unit: Unit::Cm,
-            baud: Baud::B500000,
-        };
-        let encoded = status(0, &health, 0x10);
-        assert_eq!(encoded.bytes().len(), 160);
-        let Reply::Status(report) = decoded(encoded.bytes()) else { panic!("not a status") };
-        assert_eq!(report.software(), b"V02.19");
-        assert_eq!((report.operating_mode(), report.is_defective()), (0x24, false));
-        assert_eq!(
-            (report.mode(), report.variant(), report.unit()),
-            (Mode(1), Some(Variant::HALF), Some(Unit::Cm))
-        );
-    }
-}
+const MODE: u8 = request::MODE | REPLY;
+const STATUS: u8 = request::STATUS | REPLY;
+const ERRORS: u8 = request::ERRORS | REPLY;
+const COUNTERS: u8 = request::COUNTERS | REPLY;
+const MEANS: u8 = request::MEANS | REPLY;
+const RANGE: u8 = request::RANGE | REPLY;
+const TYPE: u8 = request::TYPE | REPLY;
+const VARIANT: u8 = request::VARIANT | REPLY;
+const RANGE_FIELDS: u8 = request::RANGE_FIELDS | REPLY;
+const RANGE_MEANS: u8 = request::RANGE_MEANS | REPLY;
+const REFLECTIVITY: u8 = request::REFLECTIVITY | REPLY;
+const POWER_ON_SET: u8 = 0xE6;
+const CONFIGURATION: u8 = request::CONFIGURATION | REPLY;
+const REFLECTIVITIES: u8 = request::REFLECTIVITIES | REPLY;
+const CONFIGURATION_WRITTEN: u8 = 0xF7;
+const CONFIGURATION_2: u8 = request::CONFIGURATION_2 | REPLY;
+const CONFIGURATION_2_WRITTEN: u8 = 0xFC;
+/// Replies without a layout here.
+const UNREAD: [u8; 8] = [0xC0, 0xC1, 0xC2, 0xC5, 0xC6, 0xCA, 0xE9, 0xF6];
+/// Characters of type, number and firmware.
+const NAME_LEN: usize = 21;

@@ -1,6 +1,7 @@
 //! What a session knows of its sensor, in plain values: learned from its replies, forgotten never but overwritten.
 
 use crate::command::Request;
+use crate::header::POWER_ON;
 use crate::reply::Reply;
 use crate::telegram::Telegram;
 use crate::variant::{Mode, Unit, Variant};
@@ -27,8 +28,11 @@ pub enum State {
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Trouble {
     /// No rate got an answer.
-    NoAnswer,
-    /// A request was not answered three times.
+    NoAnswer {
+        /// For how long already, in steps that grow.
+        seconds: u32,
+    },
+    /// A request was not answered in all its tries.
     Unanswered(Request),
     /// The sensor said no.
     Refused(Request),
@@ -43,10 +47,11 @@ pub enum Trouble {
 impl fmt::Display for Trouble {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
-            Trouble::NoAnswer => {
-                f.write_str("no answer at 9600, 19200, 38400 or 500000 baud: power, cable, RS-422 jumper?")
-            }
-            Trouble::Unanswered(request) => write!(f, "no reply to {request:?} in three tries"),
+            Trouble::NoAnswer { seconds } => write!(
+                f,
+                "no answer at 9600, 19200, 38400 or 500000 baud for {seconds} s: power, cable, RS-422 jumper?"
+            ),
+            Trouble::Unanswered(request) => write!(f, "no reply to {request:?} in several tries"),
             Trouble::Refused(request) => write!(f, "the sensor refused {request:?}"),
             Trouble::VariantRefused => f.write_str("the sensor keeps its own angle and resolution"),
             Trouble::ModeUnknown => f.write_str("the sensor does not tell its measuring mode: no scans"),
@@ -78,8 +83,14 @@ impl Sensor {
         &self.kind[..self.kind_len]
     }
 
-    pub(crate) fn learn(&mut self, reply: &Reply<'_>, telegram: Telegram<'_>) {
+    /// Takes over what `telegram` tells, which is `reply`, if it can be read.
+    pub(crate) fn learn(&mut self, reply: Option<&Reply<'_>>, telegram: Telegram<'_>) {
         self.address = Some(telegram.address());
+        if telegram.command() == POWER_ON {
+            self.streams = false;
+            self.variant = None;
+        }
+        let Some(reply) = reply else { return };
         match reply {
             Reply::Status(report) => {
                 self.mode = Some(report.mode());
@@ -102,7 +113,7 @@ impl Sensor {
                 self.kind_len = name.len().min(KIND_LEN);
                 self.kind[..self.kind_len].copy_from_slice(&name[..self.kind_len]);
             }
-            Reply::Mode { .. } | Reply::Refused => {}
+            _ => {}
         }
     }
 }

@@ -110,6 +110,7 @@ impl Session {
         self.framer.commit(len);
         self.arrivals.note(now, len);
         self.last_byte = now;
+        self.dialogue.heard = true;
         if was_empty {
             self.begin_rhythm();
         }
@@ -233,7 +234,7 @@ impl Session {
         if self.framer.buffered() > 0 {
             self.begin_rhythm();
         }
-        self.dialogue.on_telegram(self.framer.view(place).telegram, self.now);
+        self.dialogue.on_telegram(self.framer.view(place).telegram, first.at, self.now);
         let framed = self.framer.view(place);
         Received {
             telegram: framed.telegram,

@@ -126,9 +126,14 @@ impl Writer {
         self
     }
 
+    /// LENGTH so far: command and what was appended.
+    pub fn length(&self) -> usize {
+        self.len - 4
+    }
+
     /// Writes length and checksum. A reply appends its status byte before.
     pub fn finish(mut self) -> Encoded {
-        let [low, high] = ((self.len - 4) as u16).to_le_bytes();
+        let [low, high] = (self.length() as u16).to_le_bytes();
         self.bytes[2] = low;
         self.bytes[3] = high;
         let sum = crc(&self.bytes[..self.len]);
@@ -141,6 +146,13 @@ impl Writer {
 pub struct Encoded(Writer);
 
 impl Encoded {
+    /// A copy of `telegram`.
+    pub fn of(telegram: Telegram<'_>) -> Encoded {
+        let mut bytes = [0; MAX_TELEGRAM];
+        bytes[..telegram.0.len()].copy_from_slice(telegram.0);
+        Encoded(Writer { bytes, len: telegram.0.len() })
+    }
+
     /// The telegram's bytes, STX to checksum.
     pub fn bytes(&self) -> &[u8] {
         &self.0.bytes[..self.0.len]

@@ -1,137 +1,209 @@
 //! What the sensor answers to a request, and what the request changes in it. Knows no times but how long the sensor
 //! thinks, and nothing of the line.
 //!
-//! It can what the path to a stream needs, and as much of the installation mode as changing unit and measuring mode
-//! needs. Every other well-formed request is refused with 92h, as the sensor does with what it cannot.
+//! It can what the path to a stream needs, every mode that sends measured values, and as much of the installation mode
+//! as changing the configuration and the permanent rate needs. Every other well-formed request is refused with 92h, as
+//! the sensor does with what it cannot.
 
 use lms::command::{EEPROM_WRITES, MODE, Request, VARIANT};
 use lms::reply::{self, Health};
 use lms::telegram::{Encoded, Telegram, Writer};
-use lms::variant::{Baud, Mode, Unit};
+use lms::variant::{Baud, MIRROR_TURN, Variant};
 use lms::{MILLIS, Nanos};
 
-use crate::machine::{Machine, Settings};
+use crate::machine::Machine;
+use crate::operating::Operating;
 
-/// A reply, how long after its ACK it begins at least, and the rate of the line after it where that changes.
+/// A reply, how long after its ACK it begins at least, and what comes after it.
 pub(crate) struct Answer {
-    pub(crate) reply: Encoded,
+    pub(crate) reply: Vec<u8>,
     pub(crate) delay_ns: Nanos,
-    pub(crate) baud: Option<Baud>,
+    pub(crate) after: After,
+}
+
+/// What a reply announces.
+#[derive(Clone, Copy, Debug)]
+pub(crate) enum After {
+    Nothing,
+    /// The line has another rate.
+    Baud(Baud),
+    /// The sensor starts anew.
+    Reset,
 }
 
 impl Machine {
-    /// Does what `request` asks, and answers.
-    pub(crate) fn answer(&mut self, request: Telegram<'_>) -> Answer {
-        let address = self.settings.address;
+    /// Does what `request` asks at `now`, and answers.
+    pub(crate) fn answer(&mut self, request: Telegram<'_>, now: Nanos) -> Answer {
         if EEPROM_WRITES.contains(&request.command()) {
-            self.eeprom_writes += 1;
-            return answer(self.write_eeprom(request), EEPROM_NS);
+            self.eeprom.writes += 1;
         }
+        if self.settings.habits.refuses.contains(&request.command()) {
+            return self.refusal();
+        }
+        let (address, status) = (self.settings.address, self.settings.status);
         match Request::decode(request) {
-            Some(Request::Status) => {
-                let health = Health {
-                    software: *FIRMWARE,
-                    operating_mode: self.operating_mode,
-                    mode: self.settings.mode,
-                    variant: self.settings.variant,
-                    unit: self.settings.unit,
-                    baud: self.baud(),
-                };
-                answer(reply::status(address, &health, STATUS), THINKING_NS)
-            }
+            Some(Request::Status) => answer(&self.status(), THINKING_NS),
             Some(Request::Type) => {
-                answer(reply::kind(address, self.settings.type_name.as_bytes(), STATUS), THINKING_NS)
+                answer(&reply::kind(address, self.settings.type_name.as_bytes(), status), THINKING_NS)
             }
-            Some(Request::Configuration) => answer(self.configuration(), THINKING_NS),
+            Some(Request::Configuration) => {
+                answer(&self.reply(CONFIGURATION, self.eeprom.configuration()), THINKING_NS)
+            }
             Some(Request::Variant(variant)) => {
-                let done = self.source.variant().is_none_or(|fixed| fixed == variant);
+                let done = self.source.variant().is_none_or(|fixed| fixed == variant) && self.can(variant);
                 if done {
-                    self.settings.variant = variant;
+                    self.variant = variant;
                 }
-                answer(reply::variant(address, done, self.settings.variant, STATUS), MODE_NS)
+                answer(&reply::variant(address, done, self.variant, status), MODE_NS)
             }
-            Some(Request::Stream) => self.change_mode(STREAM),
-            Some(Request::Stop) => self.change_mode(ON_REQUEST),
+            Some(Request::Stream) => self.change_mode(Operating::All),
+            Some(Request::Stop) => self.change_mode(Operating::OnRequest),
             Some(Request::Baud(baud)) => {
-                Answer { reply: reply::mode(address, true, STATUS), delay_ns: MODE_NS, baud: Some(baud) }
+                Answer { after: After::Baud(baud), ..answer(&reply::mode(address, true, status), MODE_NS) }
             }
-            _ => self.answer_other(request),
+            _ => self.answer_other(request, now),
         }
     }
 
-    fn answer_other(&mut self, request: Telegram<'_>) -> Answer {
-        let address = self.settings.address;
+    /// 90h: what it says when it has started.
+    pub(crate) fn banner(&self) -> Vec<u8> {
+        self.reply(BANNER, self.settings.type_name.as_bytes()).bytes().to_vec()
+    }
+
+    fn answer_other(&mut self, request: Telegram<'_>, now: Nanos) -> Answer {
+        let (address, status) = (self.settings.address, self.settings.status);
+        let is_installation = self.operating == Operating::Installation;
         match (request.command(), request.data()) {
+            (RESET, []) => {
+                self.settings.errors.clear();
+                let announced = Writer::new(self.reply_address(), RESET_REPLY).byte(status).finish();
+                Answer { after: After::Reset, ..answer(&announced, THINKING_NS) }
+            }
             // A variant that is none.
-            (VARIANT, [_, _, _, _]) => {
-                answer(reply::variant(address, false, self.settings.variant, STATUS), MODE_NS)
-            }
+            (VARIANT, [_, _, _, _]) => answer(&reply::variant(address, false, self.variant, status), MODE_NS),
             (ERRORS, []) => {
-                answer(Writer::new(self.reply_address(), ERRORS_REPLY).byte(STATUS).finish(), THINKING_NS)
+                let pairs: Vec<u8> =
+                    self.settings.errors.iter().flat_map(|&(kind, number)| [kind, number]).collect();
+                answer(&self.reply(ERRORS_REPLY, &pairs), THINKING_NS)
             }
-            (MODE, [INSTALLATION, password @ ..]) if password == PASSWORD => self.change_mode(INSTALLATION),
-            (MODE, [INSTALLATION, ..]) => answer(reply::mode(address, false, STATUS), MODE_NS),
-            _ => answer(reply::refused(address, STATUS), THINKING_NS),
+            (MODE, [0x00, password @ ..]) if password == PASSWORD => {
+                self.change_mode(Operating::Installation)
+            }
+            (MODE, [0x00, ..]) => answer(&reply::mode(address, false, status), MODE_NS),
+            (MODE, data) => match Operating::of_mode(data, self.variant) {
+                Some(operating) if self.source.can(&operating) => self.change_mode(operating),
+                _ => self.refusal(),
+            },
+            (WRITE_CONFIGURATION, data) if is_installation && !data.is_empty() => {
+                self.write_configuration(data)
+            }
+            (PERMANENT_BAUD, &[permanent @ (0 | 1)]) if is_installation => {
+                self.eeprom.permanent_baud = (permanent == 1).then(|| self.baud());
+                answer(&self.reply(PERMANENT_BAUD | 0x80, &[0, permanent]), SAME_NS)
+            }
+            _ => match Operating::of_single(request, self.variant) {
+                Some(operating) if self.source.can(&operating) => self.measure_once(&operating, now),
+                _ => self.refusal(),
+            },
         }
     }
 
-    fn change_mode(&mut self, mode: u8) -> Answer {
-        self.operating_mode = mode;
-        answer(reply::mode(self.settings.address, true, STATUS), MODE_NS)
+    fn measure_once(&mut self, operating: &Operating, now: Nanos) -> Answer {
+        let delay_ns = operating.turns(self.variant) * MIRROR_TURN;
+        let single =
+            self.source.variant().is_none().then(|| self.measure(operating, now + delay_ns)).flatten();
+        match single {
+            Some(reply) => Answer { reply, delay_ns, after: After::Nothing },
+            None => self.refusal(),
+        }
     }
 
-    /// 77h in installation mode sets measuring mode and unit, except in a recording, whose words are what they are.
-    /// Everything else that would write is refused.
-    fn write_eeprom(&mut self, request: Telegram<'_>) -> Encoded {
-        if request.command() != WRITE_CONFIGURATION || self.operating_mode != INSTALLATION {
-            return reply::refused(self.settings.address, STATUS);
-        }
-        let mode = request.data().get(5).map_or(self.settings.mode, |&mode| Mode(mode));
-        let unit = request.data().get(6).map_or(Some(self.settings.unit), |&code| Unit::of_code(code));
-        let same = mode == self.settings.mode && unit == Some(self.settings.unit);
-        let done = unit.is_some() && (same || self.source.variant().is_none());
-        if let (true, Some(unit)) = (done, unit) {
-            self.settings.mode = mode;
-            self.settings.unit = unit;
-        }
-        Writer::new(self.reply_address(), CONFIGURATION_WRITTEN)
-            .byte(u8::from(done))
-            .slice(self.configuration().telegram().data())
-            .byte(STATUS)
-            .finish()
+    fn change_mode(&mut self, operating: Operating) -> Answer {
+        self.operating = operating;
+        answer(&reply::mode(self.settings.address, true, self.settings.status), MODE_NS)
     }
 
-    fn configuration(&self) -> Encoded {
-        let Settings { address, mode, unit, .. } = self.settings;
-        reply::configuration(address, mode, unit, STATUS)
+    /// 77h in installation mode changes as many bytes of the configuration as it has, except that the words of a
+    /// recording are what they are.
+    fn write_configuration(&mut self, data: &[u8]) -> Answer {
+        let (unit, mode) = (self.eeprom.unit(), self.eeprom.mode());
+        let written = self.eeprom.rewritten(data).filter(|written| {
+            self.source.variant().is_none() || (written.unit() == unit && written.mode() == mode)
+        });
+        let done = written.is_some();
+        self.eeprom = written.unwrap_or_else(|| self.eeprom.clone());
+        let delay_ns = if self.eeprom.unit() == unit { SAME_NS } else { UNIT_NS };
+        let outcome = [&[u8::from(done)], self.eeprom.configuration()].concat();
+        answer(&self.reply(CONFIGURATION_WRITTEN, &outcome), delay_ns)
+    }
+
+    /// B1h: what a healthy sensor says, its settings, and what ails it.
+    fn status(&self) -> Encoded {
+        let health = Health {
+            software: *FIRMWARE,
+            operating_mode: self.operating.code(),
+            mode: self.eeprom.mode(),
+            variant: self.variant,
+            unit: self.eeprom.unit(),
+            baud: self.baud(),
+        };
+        let healthy = reply::status(self.settings.address, &health, self.settings.status);
+        let mut data = healthy.telegram().data().to_vec();
+        // Offsets in the data of B1h, which begin after the command byte (Telegram listing 7-5).
+        data[8] = u8::from(self.settings.errors.iter().any(|&(kind, _)| kind == FATAL));
+        let pollution = POLLUTION_CLEAN / 100 * self.settings.pollution_percent;
+        for (at, words, value) in [(18, 8, pollution), (42, 8, POLLUTION_CLEAN)] {
+            data[at..at + 2 * words].copy_from_slice(&value.to_le_bytes().repeat(words));
+        }
+        data[118] = u8::from(self.eeprom.permanent_baud.is_some());
+        data[119] = self.settings.address;
+        self.reply(healthy.telegram().command(), &data)
+    }
+
+    /// Whether a sensor of its type can: an LMS 211 sees 100 degrees (Telegram listing, 3Bh).
+    fn can(&self, variant: Variant) -> bool {
+        variant.angle_deg == 100 || !self.settings.type_name.starts_with("LMS211")
+    }
+
+    fn refusal(&self) -> Answer {
+        answer(&reply::refused(self.settings.address, self.settings.status), THINKING_NS)
+    }
+
+    fn reply(&self, command: u8, data: &[u8]) -> Encoded {
+        Writer::new(self.reply_address(), command).slice(data).byte(self.settings.status).finish()
     }
 }
 
-fn answer(reply: Encoded, delay_ns: Nanos) -> Answer {
-    Answer { reply, delay_ns, baud: None }
+fn answer(reply: &Encoded, delay_ns: Nanos) -> Answer {
+    Answer { reply: reply.bytes().to_vec(), delay_ns, after: After::Nothing }
 }
 
-/// Operating mode: all values, continuously (Telegram listing, 20h).
-pub(crate) const STREAM: u8 = 0x24;
-/// Operating mode: values on request.
-pub(crate) const ON_REQUEST: u8 = 0x25;
-/// Operating mode: installation, with a password.
-const INSTALLATION: u8 = 0x00;
 /// The password that every sensor leaves the factory with (Telegram listing 6-4).
 const PASSWORD: &[u8] = b"SICK_LMS";
-/// Command: errors, and its reply (without one in the list).
+/// Command: start anew, and the reply before that; then the banner.
+const RESET: u8 = 0x10;
+const RESET_REPLY: u8 = 0x91;
+const BANNER: u8 = 0x90;
+/// Command: errors, and its reply (without one in the list). A fatal one that is not over has type 4.
 const ERRORS: u8 = 0x32;
 const ERRORS_REPLY: u8 = 0xB2;
+const FATAL: u8 = 4;
+/// Reply: the configuration.
+const CONFIGURATION: u8 = 0xF4;
 /// Command: write the configuration, and its reply.
 const WRITE_CONFIGURATION: u8 = 0x77;
 const CONFIGURATION_WRITTEN: u8 = 0xF7;
-/// Status byte of a healthy LMS type 6 (Telegram listing 8).
-pub(crate) const STATUS: u8 = 0x10;
+/// Command: the rate at power-on.
+const PERMANENT_BAUD: u8 = 0x66;
 /// What the status reply calls the firmware.
 const FIRMWARE: &[u8; 7] = b"V02.30 ";
+/// What a clean window's sensors read; only the ratio to it matters.
+const POLLUTION_CLEAN: u16 = 1_000;
 /// Between ACK and reply where nothing changes; the listing allows 60 ms.
 const THINKING_NS: Nanos = MILLIS;
 /// Between ACK and A0h or BBh: captured exchanges took 66 ms and more, the listing allows 3 s.
 const MODE_NS: Nanos = 55 * MILLIS;
 /// Between ACK and F7h: a captured exchange took 130 ms.
-const EEPROM_NS: Nanos = 110 * MILLIS;
+const SAME_NS: Nanos = 110 * MILLIS;
+/// The same where the unit changes: SICK's quick manual allows 7 s.
+const UNIT_NS: Nanos = 1_000 * MILLIS;

@@ -1,26 +1,30 @@
 //! The sensor at the other end of the wire: a simulated SICK LMS 2xx on a pty, for tests, demonstrations and
 //! measurements without hardware.
 //!
-//! [`machine`] is the sensor itself, without I/O and clock; [`room`] is what it sees; [`fault`] and [`noise`] are what
-//! happens on the line; [`pty`] is the only file that knows real time and ports; [`simulate()`] is the verb. It uses the
+//! [`machine`] is the sensor itself, without I/O and clock; [`room`] is what it sees; [`wire`], [`fault`] and [`noise`] are
+//! what happens on the line; [`pty`] is the only file that knows real time and ports; [`simulate()`] is the verb. It uses the
 //! protocol crate's other direction and knows nothing of the hub.
 
 mod answer;
 mod ear;
+mod eeprom;
 pub mod fault;
 mod line;
 pub mod machine;
 pub mod noise;
+pub mod operating;
 pub mod options;
 mod people;
 mod place;
 pub mod pty;
 pub mod room;
+mod settings;
 mod shape;
 mod simulate;
 pub mod source;
 mod transmission;
 pub mod truth;
+pub mod wire;
 
 pub use ear::Arrival;
 pub use simulate::{Ready, simulate};

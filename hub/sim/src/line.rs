@@ -1,29 +1,47 @@
-//! The thread of one port: paces the sensor by its deadlines, and puts what happens on the way between it and the host:
-//! lost bytes, another rate at the host, nobody there, nobody reading. Keeps the truth of each telegram.
+//! The thread of one port: paces sensor and line by their deadlines, and adds what happens at the host's port: another
+//! rate, nobody there, nobody reading, unplugged. Keeps the truth of each telegram.
 
 use std::os::fd::BorrowedFd;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use lms::{MILLIS, Nanos};
 use schema::Failure;
 
 use crate::ear::Arrival;
-use crate::fault::{Fault, Loss};
-use crate::machine::{Chunk, Machine, Part};
+use crate::fault::Fault;
+use crate::machine::{Machine, Part};
 use crate::noise::Receiver;
-use crate::pty::{Pty, Wake, now_ns};
+use crate::place::Place;
+use crate::pty::{Pty, Wake, now_ns, wait};
 use crate::truth::{Record, Summary};
+use crate::wire::{Carried, Wire};
 
 /// A sensor on its line.
 pub(crate) struct Line<'a> {
     /// The port as the user named it.
     pub(crate) port: PathBuf,
-    pub(crate) pty: Pty,
+    /// What is there to be opened; nothing while the adapter is unplugged.
+    pub(crate) socket: Option<Socket>,
     pub(crate) machine: Machine,
-    pub(crate) loss: Loss,
+    pub(crate) wire: Wire,
     pub(crate) time: Time,
     /// Where the truth goes.
     pub(crate) tell: &'a (dyn Fn(&Record) -> Result<(), Failure> + Sync),
+}
+
+/// A pty and where it is found. Dropped, it is gone as an adapter is that was pulled out: first the name, then the
+/// terminal.
+pub(crate) struct Socket {
+    _place: Place,
+    pub(crate) pty: Pty,
+}
+
+impl Socket {
+    /// A new pty, with `port` leading to it.
+    pub(crate) fn new(port: &Path) -> Result<Socket, Failure> {
+        let pty = Pty::open()?;
+        Ok(Socket { _place: Place::new(port, pty.name())?, pty })
+    }
 }
 
 /// The machine's time: from 0 on, `speed` times as fast as the clock.
@@ -63,96 +81,113 @@ impl Line<'_> {
         // Before this time of the clock there was nothing to read.
         let mut quiet_ns = now_ns();
         loop {
-            let was_open = std::mem::replace(&mut way.is_open, self.pty.is_open());
-            if was_open && !way.is_open {
-                self.pty.clean_up_after_close();
-            }
             let read_ns = now_ns();
-            let count = self.pty.read(&mut buffer)?;
+            let count = self.look(&mut way, &mut buffer)?;
             let now_ns = now_ns();
             self.slip(now_ns);
-            while let Some(chunk) = self.machine.poll_transmit(self.time.of_machine(now_ns)) {
-                self.hand_over(chunk, &mut way)?;
+            let machine_ns = self.time.of_machine(now_ns);
+            while let Some(carried) = self.wire.poll_transmit(&mut self.machine, machine_ns) {
+                self.hand_over(carried, &mut way)?;
             }
-            if count > 0 && same_rate(self.pty.rate(), self.machine.baud().rate()) {
+            if count > 0 && same_rate(self.rate(), self.machine.baud().rate()) {
                 let arrival = Arrival {
                     not_before: self.time.of_machine(quiet_ns.saturating_sub(PTY_DELAY_NS)),
                     not_after: self.time.of_machine(now_ns),
                 };
                 for &byte in &buffer[..count] {
-                    self.machine.receive(byte, arrival);
+                    self.wire.receive(&mut self.machine, byte, arrival);
                 }
             }
             if count == 0 {
                 quiet_ns = read_ns;
             }
-            let due_ns = self.machine.poll_timeout().map_or(Nanos::MAX, |at| self.time.of_clock(at));
-            let look_ns = now_ns + LOOK_NS;
-            if self.pty.wait(stops, way.is_open, due_ns.min(look_ns)) == Wake::Stop {
+            if self.wire.is_plugged() != self.socket.is_some() {
+                self.socket = None;
+                way.is_open = false;
+                self.socket = self.wire.is_plugged().then(|| Socket::new(&self.port)).transpose()?;
+            }
+            let due = self.wire.poll_timeout(&self.machine, machine_ns);
+            let due_ns = due.map_or(Nanos::MAX, |at| self.time.of_clock(at));
+            let pty = self.socket.as_ref().map(|socket| &socket.pty);
+            let look_ns = if pty.is_some() { now_ns + LOOK_NS } else { Nanos::MAX };
+            let watched = pty.filter(|_| way.is_open);
+            if wait(stops, watched, due_ns.min(look_ns)) == Wake::Stop {
                 let eeprom_writes = self.machine.eeprom_writes();
                 return Ok(Summary { port: self.port, sent: way.sent, eeprom_writes });
             }
         }
     }
 
+    /// Whether a host is there, and what it has written.
+    fn look(&self, way: &mut Way, buffer: &mut [u8]) -> Result<usize, Failure> {
+        let Some(Socket { pty, .. }) = &self.socket else { return Ok(0) };
+        let was_open = std::mem::replace(&mut way.is_open, pty.is_open());
+        if was_open && !way.is_open {
+            pty.clean_up_after_close();
+        }
+        pty.read(buffer)
+    }
+
+    /// Rate of the host's port; 0 if it is unplugged.
+    fn rate(&self) -> u32 {
+        self.socket.as_ref().map_or(0, |socket| socket.pty.rate())
+    }
+
     /// A line never brings more at once than it carries: where this thread was kept from running for long, the
     /// sensor's time stood still too.
     fn slip(&mut self, now_ns: Nanos) {
-        let Some(due_ns) = self.machine.poll_timeout() else { return };
+        let machine_ns = self.time.of_machine(now_ns);
+        let Some(due_ns) = self.wire.poll_timeout(&self.machine, machine_ns) else { return };
         let latest_ns = self.time.of_clock(due_ns + MOST_LATE_NS);
         self.time.zero_ns += now_ns.saturating_sub(latest_ns);
     }
 
-    fn hand_over(&mut self, mut chunk: Chunk, way: &mut Way) -> Result<(), Failure> {
-        let mut fault = self.loss.apply(&mut chunk.bytes).then_some(Fault::Loss);
-        if way.is_open {
-            let rates = (chunk.baud.rate(), self.pty.rate());
-            if same_rate(rates.1, rates.0) {
-                way.garbled = None;
-            } else {
-                fault = fault.or(Some(Fault::Baud));
-                chunk.bytes = way.garble(rates, &chunk);
+    fn hand_over(&mut self, carried: Carried, way: &mut Way) -> Result<(), Failure> {
+        let is_telegram = carried.is_telegram();
+        let Carried { mut bytes, baud, idle_after, part, mut fault } = carried;
+        match self.socket.as_ref().filter(|_| way.is_open) {
+            Some(Socket { pty, .. }) => {
+                let rates = (baud.rate(), pty.rate());
+                if same_rate(rates.1, rates.0) {
+                    way.garbled = None;
+                } else {
+                    fault = fault.or(Some(Fault::Baud));
+                    bytes = way.garble(rates, &bytes, idle_after);
+                }
+                if !pty.write(&bytes)? {
+                    fault = fault.or(Some(Fault::Overrun));
+                }
             }
-            if !self.pty.write(&chunk.bytes)? {
-                fault = fault.or(Some(Fault::Overrun));
-            }
-        } else {
-            fault = fault.or(Some(Fault::Unread));
+            None => fault = fault.or(Some(Fault::Unread)),
         }
         // Before the hash, which takes longer than a host that waits for this byte.
         let sent_ns = now_ns();
-        way.fault = way.fault.or(fault);
-        match chunk.part {
-            Part::Telegram => {}
-            Part::Acknowledge => way.fault = None,
-            Part::End(sent) => {
-                let fault = if sent.aborted { Some(Fault::Aborted) } else { way.fault };
-                (self.tell)(&Record {
-                    port: self.port.clone(),
-                    index: way.sent,
-                    is_reply: sent.is_reply,
-                    length: sent.telegram.len(),
-                    sha256: Record::hash(&sent.telegram),
-                    sent_ns,
-                    fault,
-                })?;
-                way.sent += 1;
-                way.fault = None;
-            }
+        if is_telegram {
+            way.fault = way.fault.or(fault);
+        }
+        if let Some(Part::End(sent)) = part {
+            (self.tell)(&Record {
+                port: self.port.clone(),
+                index: way.sent,
+                is_reply: sent.is_reply,
+                length: sent.telegram.len(),
+                sha256: Record::hash(&sent.telegram),
+                sent_ns,
+                fault: way.fault.take(),
+            })?;
+            way.sent += 1;
         }
         Ok(())
     }
 }
 
 impl Way {
-    /// What a port at the second of `rates` makes of a chunk sent at the first.
-    fn garble(&mut self, rates: (u32, u32), chunk: &Chunk) -> Vec<u8> {
+    /// What a port at the second of `rates` makes of bytes sent at the first.
+    fn garble(&mut self, rates: (u32, u32), bytes: &[u8], idle_after: bool) -> Vec<u8> {
         if self.garbled.as_ref().is_none_or(|(known, _)| *known != rates) {
             self.garbled = Some((rates, Receiver::new(rates.0, rates.1)));
         }
-        self.garbled
-            .as_mut()
-            .map_or(Vec::new(), |(_, receiver)| receiver.receive(&chunk.bytes, chunk.idle_after))
+        self.garbled.as_mut().map_or(Vec::new(), |(_, receiver)| receiver.receive(bytes, idle_after))
     }
 }
 

@@ -1,6 +1,6 @@
 //! The sensor's side of the conversation, without a line and without a clock: host bytes and times go in, chunks of
-//! bytes with the time at which they are through come out. What it measures comes from [`Source`]; what is lost on
-//! the way is not its affair.
+//! bytes with the time at which they are through come out. What it measures comes from [`Source`], what it answers is
+//! said in `answer.rs`; what is lost on the way is not its affair.
 //!
 //! Drive it like this: call [`Machine::poll_transmit`] until it answers `None`, hear the host's bytes, and come back
 //! at [`Machine::poll_timeout`].
@@ -8,54 +8,17 @@
 use std::collections::VecDeque;
 
 use lms::telegram::{ACK, NAK, REPLY, Telegram};
-use lms::variant::{Baud, MIRROR_TURN, Mode, Unit, Variant};
+use lms::variant::{Baud, MIRROR_TURN, Variant};
 use lms::{MILLIS, Nanos};
 
-use crate::answer::Answer;
+use crate::answer::{After, Answer};
 use crate::ear::{Arrival, Ear};
+use crate::eeprom::Eeprom;
+use crate::operating::{Operating, Shot};
 use crate::source::Source;
-use crate::transmission::{ChunkSize, Transmission};
+use crate::transmission::Transmission;
 
-/// What the sensor is when the power comes on, and the hardware at the host's end of its line.
-#[derive(Clone, Debug)]
-pub struct Settings {
-    /// The sensor's own address, 0 to 127; it answers to this one and to 0.
-    pub address: u8,
-    /// What it says of itself to 3Ah: 21 ASCII characters by custom.
-    pub type_name: String,
-    /// Rate of the line at power-on.
-    pub baud: Baud,
-    /// Angle and resolution at power-on.
-    pub variant: Variant,
-    /// Unit of the ranges.
-    pub unit: Unit,
-    /// How the 16 bits of a value are split.
-    pub mode: Mode,
-    /// How many bytes come at once.
-    pub chunk: ChunkSize,
-    /// How many times faster the machine's time runs than the host's, which keeps the gaps of its requests by its own
-    /// clock.
-    pub speed: f64,
-    /// Seed of the delays before replies.
-    pub seed: u64,
-}
-
-impl Default for Settings {
-    /// An LMS 200 as it left the factory, except for mode 1: millimetres and reflector levels.
-    fn default() -> Self {
-        Settings {
-            address: 0,
-            type_name: "LMS200;301063;V02.30 ".into(),
-            baud: Baud::B9600,
-            variant: Variant::HALF,
-            unit: Unit::Mm,
-            mode: Mode(1),
-            chunk: ChunkSize::Uart,
-            speed: 1.0,
-            seed: 0,
-        }
-    }
-}
+pub use crate::settings::{Habits, Settings, Start};
 
 /// Bytes that the host's hardware hands over at once.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -88,7 +51,7 @@ pub struct Sent {
     pub is_reply: bool,
     /// The telegram as it should have been.
     pub telegram: Vec<u8>,
-    /// Whether a request broke it off.
+    /// Whether it was broken off, by a request or by the power.
     pub aborted: bool,
 }
 
@@ -96,15 +59,21 @@ pub struct Sent {
 pub struct Machine {
     pub(crate) settings: Settings,
     pub(crate) source: Source,
-    /// The byte after the last 20h.
-    pub(crate) operating_mode: u8,
-    pub(crate) eeprom_writes: u64,
+    /// What outlives a power cycle.
+    pub(crate) eeprom: Eeprom,
+    pub(crate) operating: Operating,
+    pub(crate) variant: Variant,
     baud: Baud,
     ear: Ear,
     random: fastrand::Rng,
+    habits: fastrand::Rng,
     queue: VecDeque<Transmission<Tag>>,
     /// When the next scan of the stream begins to leave; `None` while there is no stream.
     next_scan_ns: Option<Nanos>,
+    /// Before it has started it hears nothing.
+    started_ns: Nanos,
+    /// Telegrams of measured values since power-on, and those of them that were partial scans.
+    scans: u64,
 }
 
 /// What a transmission is.
@@ -112,24 +81,39 @@ pub struct Machine {
 enum Tag {
     Acknowledge,
     Scan,
-    /// A reply, and the rate of the line after it.
-    Reply(Option<Baud>),
+    /// A reply, whether the next request leaves it in its place, and what follows from it.
+    Reply {
+        late: bool,
+        after: After,
+    },
 }
 
 impl Machine {
-    /// A sensor that was powered on at time 0 and is through with its start-up.
+    /// The sensor that `settings` describe, at time 0.
     pub fn new(settings: Settings, source: Source) -> Self {
-        Machine {
+        let mut machine = Machine {
+            eeprom: Eeprom::new(&settings),
+            operating: Operating::OnRequest,
+            variant: settings.variant,
             baud: settings.baud,
             ear: Ear::new(settings.speed),
             random: fastrand::Rng::with_seed(settings.seed),
+            habits: fastrand::Rng::with_seed(!settings.seed),
             settings,
             source,
-            operating_mode: crate::answer::ON_REQUEST,
-            eeprom_writes: 0,
             queue: VecDeque::new(),
             next_scan_ns: None,
+            started_ns: 0,
+            scans: 0,
+        };
+        match machine.settings.start.clone() {
+            Start::In(operating) => {
+                machine.next_scan_ns = operating.streams().then_some(0);
+                machine.operating = operating;
+            }
+            Start::PowerOn => machine.boot(0),
         }
+        machine
     }
 
     /// Rate of the line at which it hears now.
@@ -137,27 +121,74 @@ impl Machine {
         self.baud
     }
 
+    /// What it does now.
+    pub fn operating(&self) -> &Operating {
+        &self.operating
+    }
+
     /// Requests heard that would write its EEPROM (40 42 46 66 77 7C), done or refused.
     pub fn eeprom_writes(&self) -> u64 {
-        self.eeprom_writes
+        self.eeprom.writes
+    }
+
+    /// From now on it behaves like this.
+    pub fn set_habits(&mut self, habits: Habits) {
+        self.settings.habits = habits;
+    }
+
+    /// The power goes and comes back: what is on the line ends with the byte in the transmitter, everything that the
+    /// EEPROM does not hold is forgotten, and after the time of a start-up the banner 90h comes, at the permanent rate
+    /// or at 9600. Returns whether a telegram was broken off.
+    pub fn power_cycle(&mut self, now: Nanos) -> bool {
+        self.queue.retain(|transmission| transmission.start_ns() <= now);
+        self.queue.truncate(1);
+        let mut broken = false;
+        if let Some(front) = self.queue.front_mut() {
+            front.break_off(now);
+            broken = front.is_broken();
+            if let Tag::Reply { after, .. } = &mut front.tag {
+                *after = After::Nothing;
+            }
+        }
+        self.boot(now);
+        broken
+    }
+
+    /// Breaks off what it is sending, as for a request that it then took for none; a stream goes on with a whole scan.
+    pub fn break_off(&mut self, now: Nanos) {
+        if self.queue.front().is_some_and(|front| front.start_ns() <= now) {
+            self.interrupt(now);
+        }
     }
 
     /// Hears a byte of the host. Call it after [`Machine::poll_transmit`] answered `None` for `arrival.not_after`.
     pub fn receive(&mut self, byte: u8, arrival: Arrival) {
+        if arrival.not_after < self.started_ns {
+            return;
+        }
         let Some(bytes) = self.ear.hear(byte, arrival, self.baud.rate()) else { return };
-        if bytes[1] != 0 && bytes[1] != self.settings.address {
+        let is_mine = bytes[1] == 0 || bytes[1] == self.settings.address;
+        if !is_mine || self.settings.habits.mute || self.chance(self.settings.habits.overlooks) {
             return;
         }
         let free_ns = self.interrupt(arrival.not_after);
-        let first_ns = free_ns + self.random.u64(2 * MILLIS..8 * MILLIS);
-        let Some(request) = Telegram::check(&bytes) else {
+        let late_ns = self.settings.habits.late_acknowledge_ns;
+        let first_ns = free_ns + late_ns + self.random.u64(2 * MILLIS..8 * MILLIS);
+        let request = Telegram::check(&bytes).filter(|_| !self.chance(self.settings.habits.naks));
+        let Some(request) = request else {
             self.send(vec![NAK], first_ns, Tag::Acknowledge);
             return;
         };
-        let Answer { reply, delay_ns, baud } = self.answer(request);
+        let Answer { reply, delay_ns, after } = self.answer(request, first_ns);
         let acknowledged_ns = self.send(vec![ACK], first_ns, Tag::Acknowledge);
-        let reply_ns = acknowledged_ns + delay_ns + self.random.u64(..3 * MILLIS);
-        self.send(reply.bytes().to_vec(), reply_ns, Tag::Reply(baud));
+        let late_ns = self.settings.habits.late_reply_ns;
+        let reply_ns = acknowledged_ns + delay_ns + late_ns + self.random.u64(..3 * MILLIS);
+        let late = late_ns > 0;
+        let end_ns = self.send(reply.clone(), reply_ns, Tag::Reply { late, after });
+        if self.chance(self.settings.habits.doubles) {
+            let again_ns = end_ns + self.habits.u64(..20 * MILLIS);
+            self.send(reply, again_ns, Tag::Reply { late, after: After::Nothing });
+        }
     }
 
     /// The next bytes that are through at `now`.
@@ -171,7 +202,7 @@ impl Machine {
         let bytes = bytes.to_vec();
         let part = match front.tag {
             Tag::Acknowledge => Part::Acknowledge,
-            Tag::Scan | Tag::Reply(_) => Part::Telegram,
+            Tag::Scan | Tag::Reply { .. } => Part::Telegram,
         };
         let part = if front.is_done() { self.finish_front(part) } else { part };
         Some(Chunk { bytes, baud, idle_after, part })
@@ -182,13 +213,25 @@ impl Machine {
         self.queue.front().map(Transmission::next_chunk_ns).or(self.next_scan_ns)
     }
 
+    /// A telegram of measured values of a sensor in `operating`, the scan of which ended at `at_ns`.
+    pub(crate) fn measure(&mut self, operating: &Operating, at_ns: Nanos) -> Option<Vec<u8>> {
+        let (variant, unit, mode) = (self.variant, self.eeprom.unit(), self.eeprom.mode());
+        let Settings { address, status, .. } = self.settings;
+        let index = self.eeprom.has_indices().then_some(self.scans as u8);
+        let turn = self.scans;
+        self.scans += 1;
+        let shot = |room| Shot { room, variant, unit, mode, at_ns, address, status, index, turn };
+        self.source.telegram(operating, shot)
+    }
+
     /// Puts the next scan of the stream on the line if it is due.
     fn start_scan(&mut self, now: Nanos) {
         let Some(start_ns) = self.next_scan_ns.filter(|&at| at <= now) else { return };
         // At the end of a recording there is none: the line stays open and silent.
         self.next_scan_ns = None;
-        let Some(telegram) = self.source.telegram(start_ns, &self.settings) else { return };
-        let period_ns = self.settings.variant.period(telegram.len(), self.baud.rate());
+        let operating = self.operating.clone();
+        let Some(telegram) = self.measure(&operating, start_ns) else { return };
+        let period_ns = operating.period(self.variant, telegram.len(), self.baud.rate());
         self.next_scan_ns = Some(start_ns + period_ns);
         self.send(telegram, start_ns, Tag::Scan);
     }
@@ -197,19 +240,23 @@ impl Machine {
     fn finish_front(&mut self, part: Part) -> Part {
         let Some(front) = self.queue.pop_front() else { return part };
         let (end_ns, aborted) = (front.end_ns(), front.is_broken());
-        if let Tag::Reply(Some(baud)) = front.tag {
-            self.baud = baud;
+        match front.tag {
+            Tag::Reply { after: After::Baud(baud), .. } => self.baud = baud,
+            Tag::Reply { after: After::Reset, .. } => self.boot(end_ns + RESET_NS),
+            _ => {}
         }
-        if self.queue.is_empty() && self.is_streaming() && !matches!(front.tag, Tag::Scan) {
+        if let Some(next) = self.queue.front_mut() {
+            next.start_no_earlier(end_ns);
+        } else if self.operating.streams() && (aborted || !matches!(front.tag, Tag::Scan)) {
             // The stream goes on with a whole scan, where the mirror begins one.
-            let scan_ns = self.settings.variant.turns() * MIRROR_TURN;
+            let scan_ns = self.operating.turns(self.variant) * MIRROR_TURN;
             self.next_scan_ns = Some(end_ns.next_multiple_of(scan_ns));
         }
         let (telegram, tag) = front.into_parts();
         match tag {
             Tag::Acknowledge => part,
-            Tag::Scan | Tag::Reply(_) => {
-                Part::End(Sent { is_reply: matches!(tag, Tag::Reply(_)), telegram, aborted })
+            Tag::Scan | Tag::Reply { .. } => {
+                Part::End(Sent { is_reply: matches!(tag, Tag::Reply { .. }), telegram, aborted })
             }
         }
     }
@@ -218,23 +265,39 @@ impl Machine {
     /// Returns when the line is free.
     fn interrupt(&mut self, now: Nanos) -> Nanos {
         self.next_scan_ns = None;
-        self.queue.retain(|transmission| transmission.start_ns() <= now);
-        self.queue.truncate(1);
-        let Some(front) = self.queue.front_mut() else { return now };
+        let mut is_first = true;
+        self.queue.retain(|transmission| {
+            let on_line = std::mem::take(&mut is_first) && transmission.start_ns() <= now;
+            on_line || matches!(transmission.tag, Tag::Reply { late: true, .. })
+        });
+        let Some(front) = self.queue.front_mut().filter(|front| front.start_ns() <= now) else { return now };
         front.break_off(now);
         front.end_ns().max(now)
     }
 
-    /// Queues `bytes` from `start_ns` on; returns when the last one is through.
+    /// Begins a start-up at `now`: the banner is what it says first.
+    fn boot(&mut self, now: Nanos) {
+        self.next_scan_ns = None;
+        self.operating = Operating::OnRequest;
+        self.variant = self.settings.variant;
+        self.baud = self.eeprom.power_on_baud();
+        self.scans = 0;
+        self.started_ns = now + self.settings.boot_ns;
+        self.ear = Ear::new(self.settings.speed);
+        self.send(self.banner(), self.started_ns, Tag::Reply { late: false, after: After::Nothing });
+    }
+
+    /// Queues `bytes` from `start_ns` on, before what starts later; returns when the last one is through.
     fn send(&mut self, bytes: Vec<u8>, start_ns: Nanos, tag: Tag) -> Nanos {
         let transmission = Transmission::new(bytes, start_ns, self.baud, self.settings.chunk, tag);
         let end_ns = transmission.end_ns();
-        self.queue.push_back(transmission);
+        let place = self.queue.partition_point(|other| other.start_ns() <= start_ns);
+        self.queue.insert(place, transmission);
         end_ns
     }
 
-    fn is_streaming(&self) -> bool {
-        self.operating_mode == crate::answer::STREAM
+    fn chance(&mut self, share: f64) -> bool {
+        share > 0.0 && self.habits.f64() < share
     }
 
     /// Address byte of what it sends.
@@ -242,3 +305,6 @@ impl Machine {
         self.settings.address | REPLY
     }
 }
+
+/// From 91h to the reset that it announces (Telegram listing, 10h).
+const RESET_NS: Nanos = 10 * MILLIS;

@@ -118,25 +118,21 @@ impl Pty {
         }
     }
 
-    /// Waits for bytes, for `deadline_ns` of the clock, or for one of the `stops`. A host's side that is closed is not
-    /// waited for: it would say so all the time.
-    pub(crate) fn wait(&self, stops: [BorrowedFd<'_>; 2], is_open: bool, deadline_ns: Nanos) -> Wake {
-        let left = deadline_ns.saturating_sub(now_ns());
-        let timeout = Timespec { tv_sec: (left / 1_000_000_000) as _, tv_nsec: (left % 1_000_000_000) as _ };
-        let mut fds = [
-            PollFd::from_borrowed_fd(stops[0], PollFlags::IN),
-            PollFd::from_borrowed_fd(stops[1], PollFlags::IN),
-            PollFd::from_borrowed_fd(self.master.as_fd(), PollFlags::IN),
-        ];
-        let watched = if is_open { 3 } else { 2 };
-        // An interrupted wait is a short one.
-        let _ = poll(&mut fds[..watched], Some(&timeout));
-        if fds[..2].iter().any(|fd| !fd.revents().is_empty()) { Wake::Stop } else { Wake::Line }
-    }
-
     fn open_slave(&self) -> io::Result<OwnedFd> {
         open(&self.name, OFlags::RDWR | OFlags::NOCTTY | OFlags::NONBLOCK | OFlags::CLOEXEC, Mode::empty())
     }
+}
+
+/// Waits for bytes at `pty`, for `deadline_ns` of the clock, or for one of the `stops`. A host's side that is closed must
+/// not be waited for: it would say so all the time.
+pub(crate) fn wait(stops: [BorrowedFd<'_>; 2], pty: Option<&Pty>, deadline_ns: Nanos) -> Wake {
+    let left = deadline_ns.saturating_sub(now_ns());
+    let timeout = Timespec { tv_sec: (left / 1_000_000_000) as _, tv_nsec: (left % 1_000_000_000) as _ };
+    let line = pty.map_or(stops[0], |pty| pty.master.as_fd());
+    let mut fds = [stops[0], stops[1], line].map(|fd| PollFd::from_borrowed_fd(fd, PollFlags::IN));
+    // An interrupted wait is a short one.
+    let _ = poll(&mut fds, Some(&timeout));
+    if fds[..2].iter().any(|fd| !fd.revents().is_empty()) { Wake::Stop } else { Wake::Line }
 }
 
 fn broken(what: &str, name: &Path, errno: Errno) -> Failure {

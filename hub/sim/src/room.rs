@@ -79,19 +79,41 @@ impl Room {
             World::Empty => vec![mode.max_value(); variant.beams()],
             World::Wall640 => vec![640; variant.beams()],
             World::Random => (0..variant.beams()).map(|_| random.u16(..) & !mode.forbidden()).collect(),
-            World::Room | World::Bare => self.measure(variant, unit, mode, end_ns, &mut random),
+            World::Room | World::Bare => {
+                let step_mdeg = 10 * i32::from(variant.resolution_cdeg);
+                let angles =
+                    (0..variant.beams() as i32).map(|beam| variant.first_angle_mdeg() + beam * step_mdeg);
+                self.measure(angles, variant.turns(), unit, mode, end_ns, &mut random)
+            }
         }
     }
 
+    /// The value words of the mirror turn that ended at `end_ns`, as a partial scan tells them: 181 beams on whole
+    /// degrees, or 180 that lie `quarter` quarters of a degree behind them.
+    pub(crate) fn partial(&self, quarter: u8, unit: Unit, mode: Mode, end_ns: Nanos) -> Vec<u16> {
+        let whole = Variant { angle_deg: 180, resolution_cdeg: 100 };
+        let beams = whole.beams() - usize::from(quarter > 0);
+        match self.world {
+            World::Room | World::Bare => {
+                let mut random =
+                    fastrand::Rng::with_seed(self.seed ^ end_ns.wrapping_mul(0x9E37_79B9_7F4A_7C15));
+                let angles = (0..beams as i32).map(|beam| 1_000 * beam + 250 * i32::from(quarter));
+                self.measure(angles, 1, unit, mode, end_ns, &mut random)
+            }
+            _ => self.scan(whole, unit, mode, end_ns)[..beams].to_vec(),
+        }
+    }
+
+    /// What the beams at `angles_mdeg` meet, every one after the other in the next of `turns` mirror turns.
     fn measure(
         &self,
-        variant: Variant,
+        angles_mdeg: impl Iterator<Item = i32>,
+        turns: u64,
         unit: Unit,
         mode: Mode,
         end_ns: Nanos,
         random: &mut fastrand::Rng,
     ) -> Vec<u16> {
-        let turns = variant.turns();
         let legs: Vec<Vec<Shape>> = (0..turns)
             .map(|turn| {
                 let time_s = end_ns.saturating_sub((turns - turn) * MIRROR_TURN) as f64 / 1e9;
@@ -99,11 +121,10 @@ impl Room {
             })
             .collect();
         let mut before_mm = None;
-        (0..variant.beams())
-            .map(|beam| {
-                let angle_mdeg = f64::from(variant.first_angle_mdeg())
-                    + beam as f64 * 10.0 * f64::from(variant.resolution_cdeg);
-                let (sin, cos) = (angle_mdeg / 1000.0).to_radians().sin_cos();
+        angles_mdeg
+            .enumerate()
+            .map(|(beam, angle_mdeg)| {
+                let (sin, cos) = (f64::from(angle_mdeg) / 1000.0).to_radians().sin_cos();
                 // The beams between whole degrees are measured in the turns after the first.
                 let (range_mm, surface) = self.nearest((cos, sin), &legs[beam % turns as usize]);
                 let edge = before_mm.replace(range_mm).is_some_and(|b: f64| (b - range_mm).abs() > EDGE_MM);

@@ -9,15 +9,14 @@ use recording::{Encoding, Frame, Recording};
 use rustix::event::{EventfdFlags, eventfd};
 use schema::{Failure, Kind};
 
-use crate::fault::Loss;
-use crate::line::{Line, Time};
+use crate::line::{Line, Socket, Time};
 use crate::machine::{Machine, Settings};
 use crate::options::SimulateOptions;
-use crate::place::Place;
-use crate::pty::{Pty, now_ns};
+use crate::pty::now_ns;
 use crate::room::Room;
 use crate::source::Source;
 use crate::truth::{Record, Summary, Truth};
+use crate::wire::Wire;
 
 /// A port that is there to be opened.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -44,7 +43,6 @@ pub fn simulate(
         tell(record);
         truth.as_ref().map_or(Ok(()), |truth| truth.write(&record.line()))
     };
-    let mut places = Vec::new();
     let mut ready = Vec::new();
     let mut lines = Vec::new();
     let time = Time { zero_ns: now_ns(), speed: options.speed };
@@ -52,11 +50,10 @@ pub fn simulate(
         let seed = options.seed.wrapping_add(number as u64);
         let (settings, source) = sensor(options, recording.as_ref(), seed)?;
         let machine = Machine::new(settings, source);
-        let pty = Pty::open()?;
-        places.push(Place::new(port, pty.name())?);
-        ready.push(Ready { port: port.clone(), pty: pty.name().to_owned() });
-        let loss = Loss::new(options.faults, seed);
-        lines.push(Line { port: port.clone(), pty, machine, loss, time, tell: &tell });
+        let socket = Socket::new(port)?;
+        ready.push(Ready { port: port.clone(), pty: socket.pty.name().to_owned() });
+        let wire = Wire::new(&options.faults, seed);
+        lines.push(Line { port: port.clone(), socket: Some(socket), machine, wire, time, tell: &tell });
     }
     on_ready(&ready);
     let summaries = run(lines, stop.as_fd())?;
@@ -110,6 +107,7 @@ fn sensor(
         variant,
         unit,
         mode,
+        habits: options.faults.habits(),
         chunk: options.chunk,
         speed: options.speed,
         seed,

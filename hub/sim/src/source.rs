@@ -1,12 +1,9 @@
 //! Where the sensor's scans come from: a room that is measured anew each time, or a recording that is told once from
 //! its beginning to its end. Knows neither requests nor the line.
 
-use lms::Nanos;
-use lms::measured;
 use lms::variant::Variant;
 
-use crate::answer::STATUS;
-use crate::machine::Settings;
+use crate::operating::{Operating, Shot};
 use crate::room::Room;
 
 /// A source of measured-value telegrams.
@@ -23,13 +20,15 @@ pub enum Source {
 }
 
 impl Source {
-    /// The telegram that begins to leave at `start_ns`, as the sensor is set at that time; `None` at the end.
-    pub(crate) fn telegram(&mut self, start_ns: Nanos, settings: &Settings) -> Option<Vec<u8>> {
+    /// The next telegram of a sensor in `operating`, of what `shot` makes of the room; `None` at the end of a
+    /// recording, and in a mode that sends nothing.
+    pub(crate) fn telegram<'a>(
+        &'a mut self,
+        operating: &Operating,
+        shot: impl FnOnce(&'a Room) -> Shot<'a>,
+    ) -> Option<Vec<u8>> {
         match self {
-            Source::Room(room) => {
-                let words = room.scan(settings.variant, settings.unit, settings.mode, start_ns);
-                Some(measured::encode(settings.address, settings.unit, &words, STATUS).bytes().to_vec())
-            }
+            Source::Room(room) => operating.telegram(&shot(room)),
             Source::Recorded { telegrams, .. } => telegrams.next(),
         }
     }
@@ -40,5 +39,10 @@ impl Source {
             Source::Room(_) => None,
             Source::Recorded { variant, .. } => Some(*variant),
         }
+    }
+
+    /// Whether a sensor that tells it can be in `operating`: a recording streams all values, and each once.
+    pub(crate) fn can(&self, operating: &Operating) -> bool {
+        matches!(self, Source::Room(_)) || *operating == Operating::All || !operating.streams()
     }
 }

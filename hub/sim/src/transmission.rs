@@ -59,6 +59,11 @@ impl<T> Transmission<T> {
         self.start_ns
     }
 
+    /// Begins at `at_ns` if it would have begun before; only as long as nothing of it was taken.
+    pub(crate) fn start_no_earlier(&mut self, at_ns: Nanos) {
+        self.start_ns = self.start_ns.max(at_ns);
+    }
+
     /// Rate of the line.
     pub(crate) fn baud(&self) -> Baud {
         self.baud

@@ -1,6 +1,9 @@
 //! The sensor in virtual time: what it answers, when its bytes are through, and what a request does to its stream.
 
 mod bench;
+mod habits;
+mod modes;
+mod power;
 
 use lms::command::{EEPROM_WRITES, Request};
 use lms::measured::Measured;
@@ -17,12 +20,12 @@ use sim::{Arrival, ChunkSize};
 use bench::Bench;
 
 /// The reply in `bytes`, which are an ACK and one telegram.
-fn reply(bytes: &[u8]) -> Reply<'_> {
+pub(crate) fn reply(bytes: &[u8]) -> Reply<'_> {
     assert_eq!(bytes[0], ACK);
     Reply::decode(Telegram::check(&bytes[1..]).expect("a whole telegram")).expect("a reply")
 }
 
-fn fast() -> Settings {
+pub(crate) fn fast() -> Settings {
     Settings { baud: Baud::B500000, ..Settings::default() }
 }
 
@@ -193,7 +196,7 @@ fn what_is_not_heard_and_what_is_refused() {
     assert_eq!(bench.ask(&wrong), [NAK]);
     let bytes = bench.ask(Request::Status.encode(5).bytes());
     assert_eq!(Telegram::check(&bytes[1..]).unwrap().address(), 0x85);
-    for impossible in [Writer::new(0, 0x20).byte(0x2A).finish(), Writer::new(0, 0x55).finish()] {
+    for impossible in [Writer::new(0, 0x20).byte(0x2C).finish(), Writer::new(0, 0x55).finish()] {
         assert_eq!(reply(&bench.ask(impossible.bytes())), Reply::Refused);
     }
     let no_variant = Writer::new(0, 0x3B).word(180).word(25).finish();
@@ -215,7 +218,11 @@ fn every_write_to_the_eeprom_is_counted_and_only_installation_mode_does_one() {
     let installation = Writer::new(0, 0x20).byte(0).slice(b"SICK_LMS").finish();
     assert_eq!(reply(&bench.ask(installation.bytes())), Reply::Mode { done: true });
     let centimetres = Writer::new(0, 0x77).slice(&[0, 0, 0x70, 0, 0, 4, 0]).finish();
-    let written = bench.ask(centimetres.bytes());
+    let before = bench.chunks.len();
+    bench.ask(centimetres.bytes());
+    // Another unit takes its time.
+    bench.run_until(bench.now + 1_000 * MILLIS);
+    let written = bench.bytes_from(before);
     assert_eq!((written[5], written[6], written.len()), (0xF7, 1, 44));
     let bytes = bench.ask(Request::Configuration.encode(0).bytes());
     let Reply::Configuration(configuration) = reply(&bytes) else { panic!("no configuration") };

@@ -167,7 +167,7 @@ fn a_replay_is_sent_once_in_order_and_then_the_line_is_silent() {
 fn lost_bytes_damage_exactly_the_telegrams_that_the_truth_names() {
     let folder = Folder::new("loss");
     let port = folder.path("front");
-    let faults = Faults { loss: 0.00135, burst: 1.89 };
+    let faults = Faults { loss: 0.00135, burst: 1.89, ..Faults::default() };
     let simulator = Simulator::start(SimulateOptions { faults, speed: 2.0, ..options(port.clone()) });
     let mut host = Host::open(&port, 500_000);
     host.ask(Request::Stream, 500_000);

@@ -34,7 +34,8 @@ fn delivered(faults: Faults, seed: u64, span: Nanos) -> (usize, usize) {
 #[test]
 fn the_losses_of_the_paper_cost_only_what_they_damage() {
     for seed in 1..=4 {
-        let (sent, intact) = delivered(Faults { loss: 0.00135, burst: 1.89 }, seed, 30_000 * MILLIS);
+        let (sent, intact) =
+            delivered(Faults { loss: 0.00135, burst: 1.89, ..Faults::default() }, seed, 30_000 * MILLIS);
         let share = 1.0 - intact as f64 / sent as f64;
         assert!(sent > 1100 && (0.33..0.47).contains(&share), "{share} of {sent} were damaged");
     }
@@ -43,7 +44,7 @@ fn the_losses_of_the_paper_cost_only_what_they_damage() {
 #[test]
 fn long_bursts_and_single_bytes_too() {
     for (loss, burst) in [(0.0005, 1.0), (0.002, 3.34), (0.02, 200.0), (0.1, 1000.0)] {
-        let (sent, intact) = delivered(Faults { loss, burst }, 9, 20_000 * MILLIS);
+        let (sent, intact) = delivered(Faults { loss, burst, ..Faults::default() }, 9, 20_000 * MILLIS);
         assert!(intact > 0 && intact < sent, "{loss} {burst}: {intact} of {sent}");
     }
 }

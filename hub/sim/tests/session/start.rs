@@ -50,7 +50,9 @@ fn a_sensor_with_another_variant_is_set_to_the_wanted_one() {
 fn nobody_there_is_said_and_the_search_goes_on() {
     let mut bench = Bench::new(sensor(Baud::B9600), 0);
     bench.to_sensor = Box::new(|_, _| None);
-    bench.until("said", 3_000 * MILLIS, |bench| bench.session.trouble() == Some(lms::Trouble::NoAnswer));
+    bench.until("said", 3_000 * MILLIS, |bench| {
+        matches!(bench.session.trouble(), Some(lms::Trouble::NoAnswer { .. }))
+    });
     bench.run(10_000 * MILLIS);
     assert_eq!(bench.states, [State::Probing]);
     // Power on.

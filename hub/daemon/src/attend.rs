@@ -1,0 +1,164 @@
+//! The life of a port: streamed from while it is there, looked for while it is away, taken back when it returns under
+//! its name, whatever device that is then. Looking costs next to nothing; why it is away is said once, not at each look.
+
+use std::os::fd::AsFd;
+
+use lms::{Control, MILLIS, Nanos, Session};
+use schema::{Failure, Flags, Kind, State};
+
+use crate::clock;
+use crate::config::Source;
+use crate::link::{LinkThread, Woken};
+use crate::port::{Port, Refusal};
+
+impl LinkThread<'_> {
+    /// Streams from the port, and takes it back whenever it was away. `report` is called once, as in
+    /// [`LinkThread::run`].
+    pub(crate) fn attend(&mut self, report: impl FnOnce(Result<(), Failure>)) {
+        let link = self.link;
+        let mut away = Away::default();
+        let mut opened = None;
+        if let Source::Tcp { .. } = link.port {
+            away = Away::for_lack_of_a_port(format!("{}: not connected yet", link.port.name()));
+        } else {
+            match Port::open(&link.port, link.baud.rate()) {
+                Ok(port) => opened = Some(port),
+                Err(failure) if failure.kind != Kind::PortMissing => return report(Err(failure)),
+                Err(failure) => away = Away::for_lack_of_a_port(said(failure)),
+            }
+        }
+        report(Ok(()));
+        loop {
+            if let Some(port) = opened.take() {
+                match self.stay(&port) {
+                    Ok(()) => return,
+                    Err(error) => {
+                        self.account.reconnects += 1;
+                        away = Away::for_lack_of_a_port(format!("{} went away: {error}", link.port.name()));
+                    }
+                }
+            }
+            self.forget();
+            self.show(None, State::Absent, &away.words);
+            let look_at = clock::now() + away.pause();
+            loop {
+                match self.wait(None, look_at) {
+                    Woken::Stop => return,
+                    Woken::Order => self.orders.obey(None),
+                    Woken::Ready | Woken::Timeout => break,
+                }
+            }
+            match self.reach(&away.words) {
+                None => return,
+                Some(Ok(port)) => opened = Some(port),
+                Some(Err(refusal)) => away.learn(refusal, &link.port, clock::now()),
+            }
+        }
+    }
+
+    /// Tries to open the port, however long that takes; nothing if the hub shall end meanwhile.
+    fn reach(&mut self, words: &str) -> Option<Result<Port, Refusal>> {
+        let link = self.link;
+        let dial = match Port::dial(&link.port) {
+            None => return Some(Port::attempt(&link.port, link.baud.rate())),
+            Some(Err(refusal)) => return Some(Err(refusal)),
+            Some(Ok(dial)) => dial,
+        };
+        loop {
+            match self.wait(Some(dial.as_fd()), clock::now() + STILL_AWAY) {
+                Woken::Stop => return None,
+                Woken::Order => self.orders.obey(None),
+                Woken::Ready => return Some(dial.finish()),
+                Woken::Timeout => self.show(None, State::Absent, words),
+            }
+        }
+    }
+
+    /// A session on `port`, until the hub shall end; an error says that the port is gone.
+    fn stay(&mut self, port: &Port) -> std::io::Result<()> {
+        self.topics.set_flags(if port.simulated() { Flags::SIMULATED } else { 0 });
+        let mut session = Session::new(self.settings(false), clock::now());
+        if self.orders.is_paused() {
+            session.control(Control::Pause, clock::now());
+        }
+        let end = self.stream(port, &mut session);
+        self.account.close(&session);
+        end
+    }
+}
+
+/// Why a port is away, for how many looks, and in which words.
+#[derive(Default)]
+struct Away {
+    refusal: Option<Refusal>,
+    words: String,
+    /// When the words were found.
+    since: Nanos,
+    /// Looks in a row that found something that cannot be opened.
+    refused: u32,
+}
+
+impl Away {
+    /// There is no port, which `words` say: that the next look finds none is no news.
+    fn for_lack_of_a_port(words: String) -> Away {
+        Away { refusal: Some(Refusal::Missing), words, ..Away::default() }
+    }
+
+    /// The port cannot be opened because of `refusal`.
+    fn learn(&mut self, refusal: Refusal, source: &Source, now: Nanos) {
+        let is_missing = refusal == Refusal::Missing;
+        self.refused = if is_missing { 0 } else { self.refused + 1 };
+        let is_news = self.refusal.as_ref() != Some(&refusal);
+        // Another process may hold it now than the one that was named.
+        if is_news || (!is_missing && now >= self.since + STALE) {
+            self.words = said(refusal.explain(source));
+            self.since = now;
+        }
+        self.refusal = Some(refusal);
+    }
+
+    /// How long to wait before the next look: what is not there is looked for by name only, what is there and cannot be
+    /// opened is left alone for longer each time. The first looks come soon, for udev gives a new device its group.
+    fn pause(&self) -> Nanos {
+        LOOK << self.refused.saturating_sub(1).min(LONGEST_PAUSE)
+    }
+}
+
+/// A failure as a line of a status and of a log.
+fn said(failure: Failure) -> String {
+    format!("{}; {}", failure.message, failure.hint)
+}
+
+/// Between two looks for a port that is away.
+const LOOK: Nanos = 100 * MILLIS;
+/// Times that the pause between two looks doubles.
+const LONGEST_PAUSE: u32 = 4;
+/// A status is due so often while a connection is being made.
+const STILL_AWAY: Nanos = 1_000 * MILLIS;
+/// After so long the circumstances of a refusal are looked for again.
+const STALE: Nanos = 10_000 * MILLIS;
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn why_it_is_away_is_looked_for_once_per_change() {
+        let source = Source::Tty("/dev/no-such-port".into());
+        let mut away = Away::for_lack_of_a_port("it went".to_owned());
+        away.learn(Refusal::Missing, &source, 1);
+        assert_eq!((away.words.as_str(), away.pause()), ("it went", LOOK));
+        away.learn(Refusal::Busy, &source, 2);
+        assert!(away.words.contains("in use by another process; stop it first"), "{}", away.words);
+        assert_eq!((away.since, away.pause()), (2, LOOK));
+        for look in 3..20 {
+            away.learn(Refusal::Busy, &source, look);
+        }
+        assert_eq!((away.since, away.pause()), (2, 16 * LOOK));
+        away.learn(Refusal::Busy, &source, 2 + STALE);
+        assert_eq!(away.since, 2 + STALE);
+        away.learn(Refusal::Missing, &source, 3 + STALE);
+        assert!(away.words.contains("no such port"), "{}", away.words);
+        assert_eq!(away.pause(), LOOK);
+    }
+}

@@ -1,0 +1,52 @@
+//! Who has a port open. It reads the descriptors of all processes, so it is asked once when something went wrong, not
+//! again and again.
+
+use std::fmt;
+use std::fs;
+use std::path::Path;
+
+/// A process that has a port open.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Holder {
+    /// Its process id.
+    pub pid: u32,
+    /// Its program's name, at most 15 bytes.
+    pub program: String,
+}
+
+impl fmt::Display for Holder {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "process {} ({})", self.pid, self.program)
+    }
+}
+
+/// The first other process that has `path` open, as far as this user may see.
+pub fn holder(path: &Path) -> Option<Holder> {
+    let device = path.canonicalize().ok()?;
+    holders(&[&device]).pop().flatten()
+}
+
+/// For each of the real `devices` the first other process that has it open, in one look at all processes.
+pub(super) fn holders(devices: &[&Path]) -> Vec<Option<Holder>> {
+    let mut found: Vec<Option<Holder>> = vec![None; devices.len()];
+    let processes = fs::read_dir("/proc").into_iter().flatten().flatten();
+    let pids = processes.filter_map(|entry| entry.file_name().to_str()?.parse::<u32>().ok());
+    for pid in pids.filter(|&pid| pid != std::process::id()) {
+        let open = fs::read_dir(format!("/proc/{pid}/fd")).into_iter().flatten().flatten();
+        for target in open.filter_map(|entry| fs::read_link(entry.path()).ok()) {
+            let at = devices.iter().position(|&device| device == target);
+            if let Some(found) = at.and_then(|at| found.get_mut(at)).filter(|found| found.is_none()) {
+                *found = Some(Holder { pid, program: name_of(pid) });
+            }
+        }
+    }
+    found
+}
+
+fn name_of(pid: u32) -> String {
+    let name = fs::read_to_string(format!("/proc/{pid}/comm")).unwrap_or_default();
+    match name.trim() {
+        "" => "no name".to_owned(),
+        name => name.to_owned(),
+    }
+}

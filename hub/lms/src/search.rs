@@ -1,0 +1,85 @@
+//! How a sensor is found whose rate nobody knows: first by listening, then by a question at one rate after the other,
+//! in rounds that become rarer while the line is dead. What it says then is for [`crate::dialogue`].
+
+use crate::command::Request;
+use crate::dialogue::Dialogue;
+use crate::phase::{LISTEN, PATIENCE, PAUSES, Phase, SETTLE};
+use crate::sensor::{State, Trouble};
+use crate::variant::Baud;
+use crate::{MILLIS, Nanos};
+
+impl Dialogue {
+    /// As a new session does: at the wanted rate, without a word.
+    pub(crate) fn begin(&mut self, now: Nanos) {
+        self.trouble = None;
+        self.change_baud(self.settings.baud);
+        self.listen(now, State::Probing);
+    }
+
+    /// Whoever streams at this rate is heard.
+    pub(crate) fn listen(&mut self, now: Nanos, shown: State) {
+        self.open = None;
+        let give_up_at = now + LISTEN.max(2 * self.period());
+        self.phase = Phase::Listening { give_up_at, shown, attempt: 0 };
+    }
+
+    /// Asks who is there at the rate that has its turn.
+    pub(crate) fn probe(&mut self, now: Nanos, attempt: usize) {
+        self.phase = Phase::Probing { attempt };
+        // Who answers next may be another sensor: address 0 is for all.
+        self.sensor.address = None;
+        let (round, turn) = (attempt / ORDER.len(), attempt % ORDER.len());
+        if turn == 0 {
+            self.heard = false;
+        }
+        let wanted = self.settings.baud;
+        let mut others = ORDER.into_iter().filter(|&baud| baud != wanted);
+        let baud = if turn == 0 { wanted } else { others.nth(turn - 1).unwrap_or(wanted) };
+        self.change_baud(baud);
+        self.ask(Request::Status, now + SETTLE, 1);
+        if let Some(open) = self.open.as_mut().filter(|_| round % 2 == 1) {
+            open.be_patient(PATIENCE);
+        }
+    }
+
+    /// Nobody answered `attempt`. A round without a single byte is followed by a pause at the rate at which a sensor
+    /// says that it has power, which takes it up to a minute (Telegram listing 7.1).
+    pub(crate) fn search_on(&mut self, attempt: usize, now: Nanos) {
+        let next = attempt + 1;
+        if !next.is_multiple_of(ORDER.len()) {
+            return self.probe(now, next);
+        }
+        self.trouble =
+            Some(Trouble::NoAnswer { seconds: coarse((now - self.quiet_since) / (1_000 * MILLIS)) });
+        let pause = PAUSES[(next / ORDER.len() - 1).min(PAUSES.len() - 1)];
+        if self.heard || pause == 0 {
+            return self.probe(now, next);
+        }
+        self.change_baud(POWER_ON_BAUD);
+        self.phase = Phase::Listening { give_up_at: now + pause, shown: State::Probing, attempt: next };
+    }
+}
+
+/// Seconds as they are told: rarely another number, so that nobody is told every second.
+fn coarse(seconds: u64) -> u32 {
+    let step = STEPS.into_iter().rev().find(|&step| u64::from(step) <= seconds).unwrap_or(0);
+    if step < HOUR { step } else { (seconds / u64::from(HOUR)) as u32 * HOUR }
+}
+
+/// The rates after the wanted one, likeliest first: power-on, what a hub leaves behind, what is left.
+const ORDER: [Baud; 4] = [Baud::B9600, Baud::B500000, Baud::B38400, Baud::B19200];
+/// Without another setting in its EEPROM a sensor begins at this rate.
+const POWER_ON_BAUD: Baud = Baud::B9600;
+const HOUR: u32 = 3_600;
+const STEPS: [u32; 9] = [1, 3, 10, 30, 60, 300, 600, 1_800, HOUR];
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_time_is_told_in_few_words() {
+        let told = [0, 1, 2, 9, 59, 60, 299, 3_599, 3_600, 7_199, 7_200, 360_000].map(coarse);
+        assert_eq!(told, [0, 1, 1, 3, 30, 60, 60, 1_800, 3_600, 3_600, 7_200, 360_000]);
+    }
+}

@@ -1,0 +1,194 @@
+//! Faults that happen at a time: when the next one is, how long it lasts, and what garbage it brings. Times are the
+//! sensor's, from 0 on.
+
+use lms::{MILLIS, Nanos};
+
+use super::{Fault, Faults, random};
+
+/// Points in time at which something happens.
+#[derive(Clone, Debug)]
+pub(crate) struct Schedule {
+    every_s: f64,
+    next_ns: Nanos,
+    random: fastrand::Rng,
+}
+
+impl Schedule {
+    /// First at `at_s`, then `every_s` after each other on average, in seconds. Where `at_s` is 0 the first time is
+    /// drawn like the others, or is [`ONCE_S`] if there are none; where `every_s` is 0 there are none.
+    pub(crate) fn new(at_s: f64, every_s: f64, random: fastrand::Rng) -> Schedule {
+        let mut schedule = Schedule { every_s, next_ns: 0, random };
+        schedule.next_ns = match (at_s > 0.0, every_s > 0.0) {
+            (true, _) => nanos(at_s),
+            (false, true) => schedule.interval_ns(),
+            (false, false) => nanos(ONCE_S),
+        };
+        schedule
+    }
+
+    /// When the sensor's power is cycled.
+    pub(crate) fn power_cycles(faults: &Faults, seed: u64) -> Schedule {
+        let Faults { power_at, power_every, .. } = *faults;
+        match power_at + power_every > 0.0 {
+            true => Schedule::new(power_at, power_every, random(seed, 7)),
+            false => Schedule::never(),
+        }
+    }
+
+    /// Never.
+    pub(crate) fn never() -> Schedule {
+        Schedule { every_s: 0.0, next_ns: Nanos::MAX, random: fastrand::Rng::with_seed(0) }
+    }
+
+    pub(crate) fn next_ns(&self) -> Nanos {
+        self.next_ns
+    }
+
+    /// When it happened, if that was not after `now`; the earliest time that was not asked for yet.
+    pub(crate) fn take(&mut self, now: Nanos) -> Option<Nanos> {
+        let at_ns = Some(self.next_ns).filter(|&at| at <= now)?;
+        let interval_ns = if self.every_s > 0.0 { self.interval_ns() } else { Nanos::MAX };
+        self.next_ns = at_ns.saturating_add(interval_ns);
+        Some(at_ns)
+    }
+
+    fn interval_ns(&mut self) -> Nanos {
+        nanos(self.every_s * (0.5 + self.random.f64())).max(MILLIS)
+    }
+}
+
+/// Spans of time in which something holds.
+#[derive(Clone, Debug)]
+pub(crate) struct Window {
+    begins: Schedule,
+    span_ns: Nanos,
+    /// End of the span that has begun last.
+    until_ns: Nanos,
+}
+
+impl Window {
+    /// Spans of `span_s` seconds that begin as [`Schedule::new`] says; none if `span_s` is 0.
+    pub(crate) fn new(span_s: f64, at_s: f64, every_s: f64, random: fastrand::Rng) -> Window {
+        let begins = if span_s > 0.0 { Schedule::new(at_s, every_s, random) } else { Schedule::never() };
+        Window { begins, span_ns: nanos(span_s), until_ns: 0 }
+    }
+
+    /// When nothing arrives.
+    pub(crate) fn silences(faults: &Faults, seed: u64) -> Window {
+        Window::new(faults.silence, faults.silence_at, faults.silence_every, random(seed, 8))
+    }
+
+    /// When the port is gone.
+    pub(crate) fn unplugs(faults: &Faults, seed: u64) -> Window {
+        Window::new(faults.unplug, faults.unplug_at, faults.unplug_every, random(seed, 9))
+    }
+
+    /// Whether it holds at `now`. Time must not go backwards.
+    pub(crate) fn holds(&mut self, now: Nanos) -> bool {
+        while let Some(begin_ns) = self.begins.take(now) {
+            self.until_ns = begin_ns + self.span_ns;
+        }
+        now < self.until_ns
+    }
+
+    /// When the span ends that holds at `now`; `now` if none does.
+    pub(crate) fn end_ns(&mut self, now: Nanos) -> Nanos {
+        if self.holds(now) { self.until_ns } else { now }
+    }
+
+    /// The next change after `now`.
+    pub(crate) fn next_ns(&self, now: Nanos) -> Nanos {
+        if now < self.until_ns { self.until_ns.min(self.begins.next_ns()) } else { self.begins.next_ns() }
+    }
+}
+
+/// Garbage that comes now and then, between telegrams or inside one.
+#[derive(Clone, Debug)]
+pub(crate) struct Extra {
+    pub(crate) fault: Fault,
+    schedule: Schedule,
+    len: usize,
+    inside: f64,
+    random: fastrand::Rng,
+    /// Whether the next one is to come inside a telegram, and how many bytes it lets pass there.
+    wants_inside: bool,
+    passes: usize,
+}
+
+impl Extra {
+    /// Floods of random bytes.
+    pub(crate) fn floods(faults: &Faults, seed: u64) -> Extra {
+        Extra::new(Fault::Flood, faults.flood, faults.flood_every, faults.inside, random(seed, 5))
+    }
+
+    /// Walls of start bytes.
+    pub(crate) fn walls(faults: &Faults, seed: u64) -> Extra {
+        Extra::new(Fault::Wall, faults.wall, faults.wall_every, faults.inside, random(seed, 6))
+    }
+
+    fn new(fault: Fault, len: f64, every_s: f64, inside: f64, mut random: fastrand::Rng) -> Extra {
+        let happens = len >= 1.0;
+        let schedule = if happens { Schedule::new(0.0, every_s, random.fork()) } else { Schedule::never() };
+        let wants_inside = random.f64() < inside;
+        Extra { fault, schedule, len: len as usize, inside, random, wants_inside, passes: 0 }
+    }
+
+    /// When it comes, if the line is between two telegrams or, as `inside` says, in one.
+    pub(crate) fn due_ns(&self, inside: bool) -> Nanos {
+        if inside == self.wants_inside { self.schedule.next_ns() } else { Nanos::MAX }
+    }
+
+    /// The garbage, if it is due before the byte that is through at `now`; `header` is how the stream's telegrams begin.
+    pub(crate) fn take(&mut self, now: Nanos, inside: bool, header: &[u8]) -> Option<Vec<u8>> {
+        if self.due_ns(inside) > now {
+            return None;
+        }
+        if inside && self.passes > 0 {
+            self.passes -= 1;
+            return None;
+        }
+        self.schedule.take(now)?;
+        self.wants_inside = self.random.f64() < self.inside;
+        self.passes = self.random.usize(..64);
+        if self.fault == Fault::Flood {
+            return Some((0..self.len).map(|_| self.random.u8(..)).collect());
+        }
+        let bricks: [&[u8]; 3] =
+            [&[0x02], &[0x02, 0x80], if header.is_empty() { &[0x02, 0x80] } else { header }];
+        let brick = bricks[self.random.usize(..3)];
+        Some(brick.iter().copied().cycle().take(self.len).collect())
+    }
+}
+
+fn nanos(seconds: f64) -> Nanos {
+    (seconds * 1e9) as Nanos
+}
+
+/// When something happens that happens once and whose time nobody said, in seconds: a session streams by then.
+const ONCE_S: f64 = 5.0;
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const S: Nanos = 1_000_000_000;
+
+    #[test]
+    fn spans_begin_and_end_when_they_were_said_to() {
+        let mut window = Window::new(1.5, 3.0, 0.0, random(1, 1));
+        assert_eq!((window.next_ns(0), window.holds(3 * S - 1)), (3 * S, false));
+        assert!(window.holds(3 * S) && window.holds(4 * S));
+        assert_eq!(window.next_ns(4 * S), 4 * S + S / 2);
+        assert!(!window.holds(4 * S + S / 2) && !window.holds(100 * S));
+        assert_eq!(window.next_ns(100 * S), Nanos::MAX);
+        assert!(!Window::new(0.0, 3.0, 1.0, random(1, 1)).holds(50 * S));
+        assert!(Window::new(1.0, 0.0, 0.0, random(1, 1)).holds(5 * S));
+    }
+
+    #[test]
+    fn repeated_ones_come_as_often_as_was_said() {
+        let mut schedule = Schedule::new(0.0, 2.0, random(1, 1));
+        let times = (0..200 * 100).filter(|i| schedule.take(i * S / 100).is_some()).count();
+        assert!((85..115).contains(&times), "{times}");
+    }
+}

@@ -1,0 +1,193 @@
+//! The faults as they are written, `loss=0.00135,burst=1.89`: one table says what there is, what it means and between
+//! which values; parsing, printing and the help follow it.
+
+use std::fmt;
+use std::str::FromStr;
+
+use lms::Nanos;
+use schema::{Failure, Kind};
+
+use crate::settings::Habits;
+
+/// A row of the table.
+struct Key {
+    name: &'static str,
+    meaning: &'static str,
+    least: f64,
+    most: f64,
+    default: f64,
+    field: fn(&mut Faults) -> &mut f64,
+}
+
+/// Makes of each row a field and a key of that name.
+macro_rules! faults {
+    ($($name:ident, $least:literal to $most:literal, $default:literal, $meaning:literal;)*) => {
+        /// How much goes wrong, and of what.
+        #[derive(Clone, Copy, Debug, PartialEq)]
+        pub struct Faults {
+            $(#[doc = $meaning] pub $name: f64,)*
+        }
+
+        impl Default for Faults {
+            /// None.
+            fn default() -> Self {
+                Faults { $($name: $default,)* }
+            }
+        }
+
+        const TABLE: &[Key] = &[$(Key {
+            name: stringify!($name),
+            meaning: $meaning,
+            least: $least,
+            most: $most,
+            default: $default,
+            field: |faults| &mut faults.$name,
+        },)*];
+    };
+}
+
+faults! {
+    loss, 0.0 to 0.5, 0.0, "share of the bytes from sensor to host that are lost";
+    burst, 1.0 to 1000.0, 1.0, "mean number of bytes lost in a row, geometric";
+    flip, 0.0 to 0.5, 0.0, "share of the bytes in which a run of flipped bits begins";
+    flip_bits, 1.0 to 64.0, 1.0, "mean number of neighbouring bits in a run, geometric";
+    insert, 0.0 to 0.5, 0.0, "share of the bytes before which random ones come";
+    insert_burst, 1.0 to 1000.0, 1.0, "mean number of random bytes in a row, geometric";
+    double, 0.0 to 0.5, 0.0, "share of the bytes that come twice";
+    repeat, 0.0 to 1.0, 0.0, "share of the telegrams that come twice; the copy has a truth of its own";
+    truncate, 0.0 to 1.0, 0.0, "share of the telegrams whose end is lost";
+    length, 0.0 to 1.0, 0.0, "share of the telegrams whose length field is changed";
+    abort, 0.0 to 1.0, 0.0, "share of the scans that the sensor breaks off of itself";
+    flood, 0.0 to 8000.0, 0.0, "bytes of a flood of garbage";
+    flood_every, 0.01 to 86400.0, 1.0, "mean seconds from one flood to the next";
+    wall, 0.0 to 8000.0, 0.0, "bytes of a wall of start bytes: 02, 02 80, or headers like the stream's";
+    wall_every, 0.01 to 86400.0, 1.0, "mean seconds from one wall to the next";
+    inside, 0.0 to 1.0, 0.5, "share of the floods and walls that come inside a telegram";
+    silence, 0.0 to 86400.0, 0.0, "seconds for which nothing arrives";
+    silence_at, 0.0 to 86400.0, 0.0, "when that begins first, in seconds; 0: 5, or within silence_every";
+    silence_every, 0.0 to 86400.0, 0.0, "mean seconds to the next; 0: once";
+    stall, 0.0 to 86400.0, 0.0, "seconds for which everything is held back, to come late";
+    stall_at, 0.0 to 86400.0, 0.0, "as silence_at";
+    stall_every, 0.0 to 86400.0, 0.0, "as silence_every";
+    delay, 0.0 to 10.0, 0.0, "greatest random lateness of each piece, in seconds";
+    unplug, 0.0 to 86400.0, 0.0, "seconds for which the port is gone";
+    unplug_at, 0.0 to 86400.0, 0.0, "as silence_at";
+    unplug_every, 0.0 to 86400.0, 0.0, "as silence_every";
+    power_at, 0.0 to 86400.0, 0.0, "when the sensor's power is cycled first, in seconds; 0: within power_every";
+    power_every, 0.0 to 86400.0, 0.0, "mean seconds to the next; 0: once";
+    overlook, 0.0 to 1.0, 0.0, "share of the requests that the sensor overlooks";
+    nak, 0.0 to 1.0, 0.0, "share of the requests that it answers with NAK";
+    twice, 0.0 to 1.0, 0.0, "share of the replies that it sends twice";
+    late, 0.0 to 60.0, 0.0, "seconds by which its replies are late";
+    late_ack, 0.0 to 60.0, 0.0, "seconds by which its ACK is late";
+    refuse, 0.0 to 255.0, 0.0, "command that it refuses, such as 0x3B";
+    mute, 0.0 to 1.0, 0.0, "1: it answers nothing";
+}
+
+impl Faults {
+    /// Every key with what it means, its range and its default.
+    pub fn keys() -> impl Iterator<Item = (&'static str, String)> {
+        TABLE.iter().map(|key| {
+            let Key { name, meaning, least, most, default, .. } = key;
+            (*name, format!("{meaning}, {least} to {most} [{default}]"))
+        })
+    }
+
+    /// Those that are the sensor's own.
+    pub fn habits(&self) -> Habits {
+        Habits {
+            overlooks: self.overlook,
+            naks: self.nak,
+            doubles: self.twice,
+            late_acknowledge_ns: (self.late_ack * 1e9) as Nanos,
+            late_reply_ns: (self.late * 1e9) as Nanos,
+            refuses: if self.refuse > 0.0 { vec![self.refuse as u8] } else { Vec::new() },
+            mute: self.mute > 0.0,
+        }
+    }
+}
+
+impl FromStr for Faults {
+    type Err = Failure;
+
+    fn from_str(text: &str) -> Result<Self, Failure> {
+        let mut faults = Faults::default();
+        for part in text.split(',').filter(|part| !part.is_empty()) {
+            let (name, value) =
+                part.split_once('=').ok_or_else(|| wrong(part, "is not KEY=VALUE", names()))?;
+            let key = TABLE.iter().find(|key| key.name == name);
+            let Key { least, most, field, .. } = key.ok_or_else(|| wrong(part, "names no fault", names()))?;
+            let number = match value.strip_prefix("0x") {
+                Some(digits) => u8::from_str_radix(digits, 16).ok().map(f64::from),
+                None => value.parse().ok(),
+            };
+            *field(&mut faults) =
+                number.filter(|number| (*least..=*most).contains(number)).ok_or_else(|| {
+                    wrong(part, "is out of range", format!("{name} is a number from {least} to {most}"))
+                })?;
+        }
+        Ok(faults)
+    }
+}
+
+impl fmt::Display for Faults {
+    /// What differs from no faults, as it is parsed; nothing if nothing does.
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let mut faults = *self;
+        let parts = TABLE.iter().filter_map(|key| {
+            let value = *(key.field)(&mut faults);
+            (value != key.default).then(|| format!("{}={value}", key.name))
+        });
+        f.write_str(&parts.collect::<Vec<_>>().join(","))
+    }
+}
+
+fn wrong(part: &str, what: &str, hint: String) -> Failure {
+    Failure::new(Kind::Configuration, format!("fault {part:?} {what}"), hint)
+}
+
+fn names() -> String {
+    format!("keys: {}", TABLE.iter().map(|key| key.name).collect::<Vec<_>>().join(", "))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn written_faults() {
+        let faults: Faults = "loss=0.00135,burst=1.89".parse().unwrap();
+        assert_eq!(faults, Faults { loss: 0.00135, burst: 1.89, ..Faults::default() });
+        assert_eq!(faults.to_string(), "loss=0.00135,burst=1.89");
+        assert_eq!(("".parse(), Faults::default().to_string()), (Ok(Faults::default()), String::new()));
+        for (text, says) in [
+            ("los=0.1", "loss, burst"),
+            ("loss", "loss, burst"),
+            ("loss=2", "from 0 to 0.5"),
+            ("loss=x", "from 0 to 0.5"),
+            ("burst=0.5", "from 1 to 1000"),
+            ("burst=nan", "from 1 to 1000"),
+            ("refuse=0x100", "from 0 to 255"),
+        ] {
+            let failure = text.parse::<Faults>().unwrap_err();
+            assert!(failure.hint.contains(says), "{text}: {failure}");
+            assert!(failure.message.contains(text), "{text}: {failure}");
+            assert_eq!(failure.kind.exit_code(), 78);
+        }
+    }
+
+    #[test]
+    fn every_key_is_written_and_read_and_is_off_unless_asked_for() {
+        for key in TABLE {
+            let mut faults = Faults::default();
+            assert_eq!(*(key.field)(&mut faults), key.default);
+            *(key.field)(&mut faults) = key.most;
+            let text = faults.to_string();
+            assert_eq!((text.parse(), text), (Ok(faults), format!("{}={}", key.name, key.most)));
+        }
+        let habits = "overlook=0.5,late=1.5,refuse=0x3B,mute=1".parse::<Faults>().unwrap().habits();
+        assert_eq!((habits.overlooks, habits.late_reply_ns), (0.5, 1_500_000_000));
+        assert_eq!((habits.refuses, habits.mute), (vec![0x3B], true));
+        assert_eq!(Faults::default().habits(), Habits::default());
+    }
+}

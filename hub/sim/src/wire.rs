@@ -1,0 +1,236 @@
+//! The line between sensor and port with everything that goes wrong on it, in a time that is an argument: the sensor's
+//! chunks go in, what arrives and why it differs comes out. One implementation for ptys and for tests in virtual time.
+//!
+//! Drive it like a [`Machine`]: [`Wire::poll_transmit`] until it answers `None`, hear the host's bytes, come back at
+//! [`Wire::poll_timeout`]. What the host's port does (another rate, nobody there) comes after it.
+
+use std::collections::VecDeque;
+
+use lms::Nanos;
+use lms::variant::Baud;
+
+use crate::ear::Arrival;
+use crate::fault::{Blemishes, Extra, Fate, Fault, Faults, Lateness, Noise, Schedule, Window};
+use crate::machine::{Chunk, Machine, Part, Sent};
+
+/// What arrives at once.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Carried {
+    /// The bytes, with what came between them; none if all of them were lost.
+    pub bytes: Vec<u8>,
+    /// The rate they were sent at.
+    pub baud: Baud,
+    /// Whether the line is idle after them.
+    pub idle_after: bool,
+    /// What was sent; `None` where nothing was.
+    pub part: Option<Part>,
+    /// The first cause why the telegram's bytes among them did not arrive as sent.
+    pub fault: Option<Fault>,
+}
+
+/// The line.
+#[derive(Clone, Debug)]
+pub struct Wire {
+    noise: Noise,
+    blemishes: Blemishes,
+    extras: [Extra; 2],
+    silence: Window,
+    lateness: Lateness,
+    unplug: Window,
+    power: Schedule,
+    /// Whether the adapter is in its socket.
+    plugged: bool,
+    /// Bytes of the telegram on the line that were sent, and why they did not arrive as they were.
+    position: usize,
+    fault: Option<Fault>,
+    /// Whether the power broke it off.
+    power_broke: bool,
+    /// How the last telegram of measured values began.
+    header: Vec<u8>,
+    /// What has not arrived yet, with the time at which it does.
+    queue: VecDeque<(Nanos, Carried)>,
+}
+
+impl Wire {
+    /// A line with `faults`, drawn with `seed`.
+    pub fn new(faults: &Faults, seed: u64) -> Wire {
+        Wire {
+            noise: Noise::new(faults, seed),
+            blemishes: Blemishes::new(faults, seed),
+            extras: [Extra::floods(faults, seed), Extra::walls(faults, seed)],
+            silence: Window::silences(faults, seed),
+            lateness: Lateness::new(faults, seed),
+            unplug: Window::unplugs(faults, seed),
+            power: Schedule::power_cycles(faults, seed),
+            plugged: true,
+            position: 0,
+            fault: None,
+            power_broke: false,
+            header: Vec::new(),
+            queue: VecDeque::new(),
+        }
+    }
+
+    /// From now on other things go wrong, drawn anew; what is under way stays as it is.
+    pub fn set_faults(&mut self, faults: &Faults, seed: u64) {
+        let fresh = Wire::new(faults, seed);
+        let lateness = fresh.lateness.behind(&self.lateness);
+        let (queue, header) = (std::mem::take(&mut self.queue), std::mem::take(&mut self.header));
+        let Wire { position, fault, power_broke, .. } = *self;
+        *self = Wire { lateness, position, fault, power_broke, queue, header, ..fresh };
+    }
+
+    /// Whether the host's adapter is in its socket, as of the last poll.
+    pub fn is_plugged(&self) -> bool {
+        self.plugged
+    }
+
+    /// A byte of the host, if it gets through. Call it after [`Wire::poll_transmit`] answered `None`.
+    pub fn receive(&mut self, machine: &mut Machine, byte: u8, arrival: Arrival) {
+        if self.plugged {
+            machine.receive(byte, arrival);
+        }
+    }
+
+    /// The next bytes that arrive at `now`.
+    pub fn poll_transmit(&mut self, machine: &mut Machine, now: Nanos) -> Option<Carried> {
+        self.plugged = !self.unplug.holds(now);
+        if self.power.take(now).is_some() {
+            self.power_broke |= machine.power_cycle(now);
+        }
+        loop {
+            if self.queue.front().is_some_and(|(at, _)| *at <= now)
+                && let Some((_, mut carried)) = self.queue.pop_front()
+            {
+                if !self.plugged && !std::mem::take(&mut carried.bytes).is_empty() {
+                    carried.fault = carried.fault.or(carried.is_telegram().then_some(Fault::Unplug));
+                }
+                return Some(carried);
+            }
+            match machine.poll_transmit(now) {
+                Some(chunk) => self.carry(machine, chunk, now),
+                None => {
+                    let bytes = Some(self.garbage(now, false)?.0);
+                    let bytes = bytes.filter(|_| !self.silence.holds(now)).unwrap_or_default();
+                    let baud = machine.baud();
+                    self.push(now, Carried { bytes, baud, idle_after: true, part: None, fault: None });
+                }
+            }
+        }
+    }
+
+    /// When there will be something to poll, seen from `now`.
+    pub fn poll_timeout(&self, machine: &Machine, now: Nanos) -> Option<Nanos> {
+        let extras = self.extras.iter().filter(|_| self.position == 0).map(|extra| extra.due_ns(false));
+        extras
+            .chain(machine.poll_timeout())
+            .chain(self.queue.front().map(|(at, _)| *at))
+            .chain([self.power.next_ns(), self.unplug.next_ns(now)])
+            .filter(|&at| at < Nanos::MAX)
+            .min()
+    }
+
+    /// Puts what becomes of a chunk that is through on its way to the host.
+    fn carry(&mut self, machine: &mut Machine, chunk: Chunk, now: Nanos) {
+        let Chunk { bytes, baud, idle_after, part } = chunk;
+        let is_silent = self.silence.holds(now);
+        let (arrived, mut fault) = match &part {
+            Part::Acknowledge => (self.carry_acknowledge(&bytes), None),
+            Part::Telegram => self.carry_telegram(&bytes, usize::MAX, is_silent, now),
+            Part::End(sent) => self.carry_telegram(&bytes, sent.telegram.len(), is_silent, now),
+        };
+        let arrived = if is_silent { Vec::new() } else { arrived };
+        let mut copy = None;
+        if let Part::End(sent) = &part {
+            let cause = if std::mem::take(&mut self.power_broke) { Fault::Power } else { Fault::Aborted };
+            fault = fault.or(sent.aborted.then_some(cause));
+            copy = self.end(sent, fault);
+        } else if machine.operating().streams() && self.blemishes.breaks_at(self.position) {
+            machine.break_off(now);
+        }
+        self.push(now, Carried { bytes: arrived, baud, idle_after, part: Some(part), fault });
+        if let Some(sent) = copy {
+            let bytes = sent.telegram.clone();
+            self.push(now, Carried { bytes, baud, idle_after, part: Some(Part::End(sent)), fault: None });
+        }
+    }
+
+    fn carry_acknowledge(&mut self, bytes: &[u8]) -> Vec<u8> {
+        let mut arrived = Vec::new();
+        for &byte in bytes {
+            let Fate { before, lost, flipped, doubled } = self.noise.next();
+            arrived.extend(before);
+            let copies = if lost { 0 } else { 1 + usize::from(doubled) };
+            arrived.extend(std::iter::repeat_n(byte ^ flipped, copies));
+        }
+        arrived
+    }
+
+    /// What becomes of bytes of a telegram that has `len` (if that is known yet), and the first cause.
+    fn carry_telegram(
+        &mut self,
+        bytes: &[u8],
+        len: usize,
+        is_silent: bool,
+        now: Nanos,
+    ) -> (Vec<u8>, Option<Fault>) {
+        let mut arrived = Vec::with_capacity(bytes.len());
+        let mut fault = None;
+        for &byte in bytes {
+            let position = self.position;
+            self.position += 1;
+            if position == 0 {
+                self.blemishes.begin();
+                self.fault = None;
+            }
+            fault = fault.or(is_silent.then_some(Fault::Silence));
+            if let Some((garbage, cause)) = self.garbage(now, position > 0) {
+                arrived.extend(garbage);
+                fault = fault.or((position > 0).then_some(cause));
+            }
+            let Fate { before, lost, flipped, doubled } = self.noise.next();
+            let (blemished, blemish) = self.blemishes.apply(position, byte);
+            fault = fault.or((position > 0 && !before.is_empty()).then_some(Fault::Insert));
+            arrived.extend(before);
+            fault = fault.or(blemish).or(lost.then_some(Fault::Loss));
+            let Some(byte) = blemished.filter(|_| !lost) else { continue };
+            fault = fault.or((flipped != 0).then_some(Fault::Flip));
+            // A copy of the first byte comes before a whole telegram, one of the last behind it.
+            let splits = doubled && position > 0 && position + 1 < len;
+            fault = fault.or(splits.then_some(Fault::Double));
+            arrived.extend(std::iter::repeat_n(byte ^ flipped, 1 + usize::from(doubled)));
+        }
+        self.fault = self.fault.or(fault);
+        (arrived, fault)
+    }
+
+    /// A telegram has left; returns its copy, if it comes twice.
+    fn end(&mut self, sent: &Sent, fault: Option<Fault>) -> Option<Sent> {
+        self.position = 0;
+        if !sent.is_reply {
+            self.header = sent.telegram[..HEADER.min(sent.telegram.len())].to_vec();
+        }
+        let is_whole = self.fault.or(fault).is_none();
+        (is_whole && self.blemishes.repeats()).then(|| sent.clone())
+    }
+
+    /// Garbage that is due, inside a telegram or between two, and its name.
+    fn garbage(&mut self, now: Nanos, inside: bool) -> Option<(Vec<u8>, Fault)> {
+        let header = &self.header;
+        self.extras.iter_mut().find_map(|extra| Some((extra.take(now, inside, header)?, extra.fault)))
+    }
+
+    fn push(&mut self, now: Nanos, carried: Carried) {
+        self.queue.push_back((self.lateness.release_ns(now), carried));
+    }
+}
+
+impl Carried {
+    /// Whether bytes of a telegram are among those that were sent.
+    pub fn is_telegram(&self) -> bool {
+        matches!(self.part, Some(Part::Telegram | Part::End(_)))
+    }
+}
+
+/// Bytes of a stream's header: STX to count word.
+const HEADER: usize = 7;

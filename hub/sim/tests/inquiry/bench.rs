@@ -1,0 +1,187 @@
+//! A conversation that comes to an end and a simulated sensor at the two ends of a line, with a clock that only this file
+//! moves.
+
+use std::collections::VecDeque;
+
+use lms::command::Request;
+use lms::exchange::{Conversation, Output};
+use lms::telegram::{Encoded, FRAME};
+use lms::variant::Baud;
+use lms::{MICROS, MILLIS, Nanos, line_time};
+use sim::Arrival;
+use sim::machine::{Chunk, Machine, Part, Settings};
+use sim::noise::Receiver;
+use sim::room::{Room, World};
+use sim::source::Source;
+
+/// What becomes of bytes on their way.
+pub(crate) type Wire = Box<dyn FnMut(Vec<u8>) -> Vec<u8>>;
+
+/// Both ends and the line.
+pub(crate) struct Bench<C> {
+    pub(crate) talk: C,
+    pub(crate) machine: Machine,
+    pub(crate) now: Nanos,
+    pub(crate) to_host: Wire,
+    pub(crate) to_sensor: Wire,
+    /// Telegrams that were said.
+    pub(crate) said: Vec<Vec<u8>>,
+    port: Baud,
+    inbox: VecDeque<u8>,
+    garbled: Option<((Baud, Baud), Receiver)>,
+    request: Vec<u8>,
+    last: Nanos,
+}
+
+/// A sensor in a room, at this rate.
+pub(crate) fn sensor(baud: Baud) -> Machine {
+    machine(Settings { baud, seed: 1, ..Settings::default() })
+}
+
+/// A sensor in a room.
+pub(crate) fn machine(settings: Settings) -> Machine {
+    Machine::new(settings, Source::Room(Room::new(World::Room, 1)))
+}
+
+/// Says `request` to `machine` as a host does that is gone; returns the time.
+pub(crate) fn say(machine: &mut Machine, request: &Encoded) -> Nanos {
+    let mut now = 10 * MILLIS;
+    for &byte in request.bytes() {
+        now += line_time(1, machine.baud().rate()) + 60 * MICROS;
+        machine.receive(byte, Arrival::at(now));
+    }
+    now += 2_000 * MILLIS;
+    while machine.poll_transmit(now).is_some() {}
+    now
+}
+
+/// Makes `machine` stream.
+pub(crate) fn make_stream(machine: &mut Machine) -> Nanos {
+    say(machine, &Request::Stream.encode(0))
+}
+
+impl<C: Conversation> Bench<C> {
+    /// The conversation begins at `now` of the machine's time, at a port with the rate `port`.
+    pub(crate) fn new(talk: C, port: Baud, machine: Machine, now: Nanos) -> Self {
+        Bench {
+            talk,
+            machine,
+            now,
+            to_host: Box::new(|bytes| bytes),
+            to_sensor: Box::new(|bytes| bytes),
+            said: Vec::new(),
+            port,
+            inbox: VecDeque::new(),
+            garbled: None,
+            request: Vec::new(),
+            last: now,
+        }
+    }
+
+    /// Runs until it is over, which must be within `span`; returns the time it took.
+    pub(crate) fn finish(&mut self, span: Nanos) -> Nanos {
+        let begun = self.now;
+        while let Some(until) = self.drain() {
+            assert!(self.now < begun + span, "not over within {} ms", span / MILLIS);
+            self.wait(until);
+            let spare = self.talk.spare();
+            let len = spare.len().min(self.inbox.len());
+            for (place, byte) in spare.iter_mut().zip(self.inbox.drain(..len)) {
+                *place = byte;
+            }
+            self.talk.commit(self.now, len);
+            if len == 0 && self.now >= until {
+                self.talk.handle_timeout(self.now);
+            }
+        }
+        self.now - begun
+    }
+
+    /// What the sensor sends in `span`, nobody asking: telegrams that end in it.
+    pub(crate) fn overhear(&mut self, span: Nanos) -> Vec<Vec<u8>> {
+        let mut sent = Vec::new();
+        let end = self.now + span;
+        while let Some(at) = self.machine.poll_timeout().filter(|&at| at <= end) {
+            while let Some(chunk) = self.machine.poll_transmit(at) {
+                if let Part::End(whole) = chunk.part {
+                    sent.push(whole.telegram);
+                }
+            }
+        }
+        self.now = end;
+        sent
+    }
+
+    fn drain(&mut self) -> Option<Nanos> {
+        loop {
+            match self.talk.poll_output() {
+                Output::SetBaud(baud) => {
+                    self.port = baud;
+                    self.inbox.clear();
+                }
+                Output::Transmit { byte, not_before } => self.transmit(byte, not_before),
+                Output::Wait { until } => return Some(until),
+                Output::Done => return None,
+            }
+        }
+    }
+
+    fn wait(&mut self, until: Nanos) {
+        while self.inbox.is_empty() {
+            match self.machine.poll_timeout() {
+                Some(at) if at <= until => self.advance(at),
+                _ => return self.advance(until.max(self.now) + WAKE),
+            }
+        }
+        self.advance(self.now + WAKE);
+    }
+
+    fn transmit(&mut self, byte: u8, not_before: Nanos) {
+        self.advance(not_before);
+        let byte_ns = line_time(1, self.port.rate());
+        if !self.request.is_empty() {
+            let gap = self.now - self.last - byte_ns;
+            assert!((55 * MICROS..=6 * MILLIS).contains(&gap), "{gap} ns between two bytes of a request");
+        }
+        self.last = self.now;
+        self.request.push(byte);
+        if let [_, _, low, high, ..] = self.request[..]
+            && self.request.len() == usize::from(u16::from_le_bytes([low, high])) + FRAME
+        {
+            self.said.push(std::mem::take(&mut self.request));
+        }
+        self.talk.transmitted(self.now);
+        self.advance(self.now + byte_ns);
+        for byte in (self.to_sensor)(vec![byte]) {
+            if self.machine.baud() == self.port {
+                self.machine.receive(byte, Arrival::at(self.now));
+            }
+        }
+    }
+
+    fn advance(&mut self, to: Nanos) {
+        while let Some(at) = self.machine.poll_timeout().filter(|&at| at <= to) {
+            self.now = self.now.max(at);
+            while let Some(chunk) = self.machine.poll_transmit(self.now) {
+                self.carry(chunk);
+            }
+        }
+        self.now = self.now.max(to);
+    }
+
+    fn carry(&mut self, chunk: Chunk) {
+        let mut bytes = (self.to_host)(chunk.bytes);
+        if chunk.baud != self.port {
+            let rates = (chunk.baud, self.port);
+            if self.garbled.as_ref().is_none_or(|(known, _)| *known != rates) {
+                self.garbled = Some((rates, Receiver::new(rates.0.rate(), rates.1.rate())));
+            }
+            let receiver = self.garbled.as_mut().map(|(_, receiver)| receiver);
+            bytes = receiver.map_or(Vec::new(), |receiver| receiver.receive(&bytes, chunk.idle_after));
+        }
+        self.inbox.extend(bytes);
+    }
+}
+
+/// From what it waits for to a running host.
+const WAKE: Nanos = 50 * MICROS;

@@ -1,0 +1,5 @@
+//! Asking a simulated sensor what it is, in virtual time: one file per situation.
+
+mod bench;
+mod finding;
+mod trouble;

@@ -1,0 +1,62 @@
+//! Bad habits of a sensor, each alone.
+
+use lms::MILLIS;
+use lms::command::Request;
+use lms::reply::Reply;
+use lms::telegram::{ACK, NAK};
+use sim::machine::{Habits, Settings};
+
+use crate::bench::Bench;
+use crate::{fast, reply};
+
+fn with(habits: Habits) -> Bench {
+    Bench::new(Settings { habits, ..fast() })
+}
+
+/// How many of 200 requests for the type get this as the first byte of the answer.
+fn answered(habits: Habits, first: Option<u8>) -> usize {
+    let mut bench = with(habits);
+    let request = Request::Type.encode(0);
+    (0..200).filter(|_| bench.ask(request.bytes()).first().copied() == first).count()
+}
+
+#[test]
+fn a_share_of_the_requests_is_overlooked_or_refused_by_nak() {
+    let overlooked = answered(Habits { overlooks: 0.3, ..Habits::default() }, None);
+    assert!((40..80).contains(&overlooked), "{overlooked}");
+    let refused = answered(Habits { naks: 0.3, ..Habits::default() }, Some(NAK));
+    assert!((40..80).contains(&refused), "{refused}");
+    assert_eq!(answered(Habits { mute: true, ..Habits::default() }, None), 200);
+}
+
+#[test]
+fn a_command_may_be_refused() {
+    let mut bench = with(Habits { refuses: vec![0x3A], ..Habits::default() });
+    assert_eq!(reply(&bench.ask(Request::Type.encode(0).bytes())), Reply::Refused);
+    assert!(matches!(reply(&bench.ask(Request::Status.encode(0).bytes())), Reply::Status(_)));
+    bench.machine.set_habits(Habits::default());
+    assert!(matches!(reply(&bench.ask(Request::Type.encode(0).bytes())), Reply::Type(_)));
+}
+
+#[test]
+fn replies_come_twice() {
+    let mut bench = with(Habits { doubles: 1.0, ..Habits::default() });
+    bench.ask(Request::Type.encode(0).bytes());
+    let sent = bench.sent();
+    assert_eq!((sent.len(), &sent[0].1.telegram), (2, &sent[1].1.telegram));
+}
+
+#[test]
+fn a_late_reply_comes_though_the_next_request_was_there_before_it() {
+    let mut bench = with(Habits { late_reply_ns: 800 * MILLIS, ..Habits::default() });
+    assert_eq!(bench.ask(Request::Type.encode(0).bytes()), [ACK]);
+    assert_eq!(bench.ask(Request::Stop.encode(0).bytes())[0], ACK);
+    bench.run_until(bench.now + 2_000 * MILLIS);
+    let commands: Vec<u8> = bench.sent().iter().map(|(_, sent)| sent.telegram[4]).collect();
+    assert_eq!(commands, [0xBA, 0xA0]);
+    let mut bench = with(Habits { late_acknowledge_ns: 300 * MILLIS, ..Habits::default() });
+    bench.say(Request::Type.encode(0).bytes(), 60_000);
+    let asked = bench.now;
+    bench.run_until(asked + 1_000 * MILLIS);
+    assert!(bench.chunks[0].0 >= asked + 300 * MILLIS && bench.chunks[0].1.bytes == [ACK]);
+}

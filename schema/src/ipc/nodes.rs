@@ -1,0 +1,36 @@
+//! Who has joined a domain, living and dead. Only counts: what a dead process left is cleaned up by the next hub.
+
+use iceoryx2::node::NodeState;
+use iceoryx2::prelude::CallbackProgression;
+
+use super::{Node, config};
+use crate::{Domain, Failure, access};
+
+/// Processes that joined a domain.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Nodes {
+    /// Those that live.
+    pub alive: usize,
+    /// Those that ended without leaving; what they had is still there.
+    pub dead: usize,
+}
+
+/// The processes in `domain`; none if there is no such domain.
+///
+/// [`Kind::Failed`](crate::Kind) with owner, mode and remedy if the directory is another user's.
+pub fn nodes(domain: &Domain) -> Result<Nodes, Failure> {
+    let mut nodes = Nodes::default();
+    if !domain.root().exists() {
+        return Ok(nodes);
+    }
+    let listed = Node::list(&config(domain)?, |state| {
+        match state {
+            NodeState::Alive(_) => nodes.alive += 1,
+            NodeState::Dead(_) => nodes.dead += 1,
+            NodeState::Inaccessible(_) | NodeState::Undefined(_) => {}
+        }
+        CallbackProgression::Continue
+    });
+    listed.map_err(|error| access::failure(domain.root(), format!("cannot list processes: {error:?}")))?;
+    Ok(nodes)
+}
