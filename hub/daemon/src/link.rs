@@ -286,6 +286,7 @@ impl<'a> LinkThread<'a> {
                 is.mm(),
                 expected.mm()
             ),
+            _ if self.unreached >= UNREACHED_LIMIT => self.unserved(),
             _ => {
                 let fault = session.sensor().notices().find(|notice| notice.is_fault());
                 fault.map_or_else(String::new, |notice| notice.to_string())
@@ -294,14 +295,22 @@ impl<'a> LinkThread<'a> {
     }
 
     fn watch_reach(&mut self) {
-        self.unreached = if self.topics.unreached() > 0 { self.unreached + 1 } else { 0 };
-        if self.unreached == UNREACHED_LIMIT {
-            tracing::warn!(
-                "{}: {} consumers are attached but get nothing: raise the limit of open descriptors (ulimit -n)",
-                self.link.name,
-                self.topics.unreached()
-            );
+        let before = self.unreached;
+        self.unreached = if self.topics.unreached() > 0 { before.saturating_add(1) } else { 0 };
+        if self.unreached == UNREACHED_LIMIT || before >= UNREACHED_LIMIT && self.unreached == 0 {
+            // Whoever is served shall read it in the status.
+            self.facts = None;
         }
+        if self.unreached == UNREACHED_LIMIT {
+            tracing::warn!("{}: {}", self.link.name, self.unserved());
+        }
+    }
+
+    fn unserved(&self) -> String {
+        let count = self.topics.unreached();
+        format!(
+            "{count} consumers are attached but get nothing: raise the limit of open descriptors (ulimit -n)"
+        )
     }
 }
 
