@@ -15,7 +15,7 @@ use std::time::{Duration, Instant};
 
 use serde_json::Value;
 
-pub(crate) use line::Line;
+pub(crate) use line::{Line, open_line};
 pub(crate) use program::{INT, KILL, Outcome, Program, TERM};
 pub(crate) use telegrams::{MEASURED, Sent, bytes_of, hash, is_class, number, scan, sequence};
 

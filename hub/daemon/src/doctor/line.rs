@@ -34,6 +34,10 @@ pub(crate) fn examine(
             tell(recording(path));
             return Ok(());
         }
+        Source::Tcp { .. } => {
+            tell(Finding::skipped("sensor", "is behind a serial server"));
+            return Ok(());
+        }
     };
     let candidate = candidate(path, there);
     tell(presence(&subject.source, path, candidate));

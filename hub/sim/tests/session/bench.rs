@@ -65,11 +65,16 @@ pub(crate) struct Received {
 
 /// What the session is asked for in all tests here.
 pub(crate) const WANTED: Settings =
-    Settings { variant: Variant::HALF, baud: Baud::B500000, listen_only: false };
+    Settings { variant: Variant::HALF, baud: Baud::B500000, listen_only: false, fixed_rate: false };
 
 /// A sensor in a room, at this rate.
 pub(crate) fn sensor(baud: Baud) -> Machine {
     let settings = machine::Settings { baud, seed: 1, ..machine::Settings::default() };
+    Machine::new(settings, Source::Room(Room::new(World::Room, 1)))
+}
+
+/// The sensor of `settings` in a room.
+pub(crate) fn sensor_with(settings: machine::Settings) -> Machine {
     Machine::new(settings, Source::Room(Room::new(World::Room, 1)))
 }
 
@@ -113,6 +118,12 @@ impl Bench {
             looks: 0,
             request: Vec::new(),
         }
+    }
+
+    /// A session with a past, none of whose requests is half said, gets this machine.
+    pub(crate) fn adopting(session: Session, machine: Machine, now: Nanos) -> Bench {
+        let (port, read) = (session.baud(), session.tally().read);
+        Bench { port, read, session, ..Bench::new(machine, now) }
     }
 
     /// Runs for `span`.
