@@ -1,6 +1,7 @@
 //! The command line: which verbs there are and what they take. Syntax only; what a value means is checked by whoever
 //! uses it.
 
+mod configure;
 mod control;
 mod doctor;
 mod probe;
@@ -67,6 +68,8 @@ pub(crate) enum Verb {
     Simulate(Simulate),
     /// What is at the other end of a port; without one, which ports there are
     Probe(probe::Probe),
+    /// Change what a sensor keeps for ever, after showing the difference and asking
+    Configure(configure::Configure),
     /// Every condition that a working set-up needs, and what to do where one is not met
     Doctor(doctor::Doctor),
     /// Sensors and topics of the running hub

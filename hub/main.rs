@@ -72,6 +72,7 @@ fn dispatch(cli: &Cli) -> Result<(), Failure> {
             Way::Encode(encode) => daemon::telegram::encode(&encode.options(everywhere.json), &mut out),
         },
         Verb::Probe(probe) => probe.run(everywhere.json, &*interrupt()?),
+        Verb::Configure(configure) => configure.run(everywhere.json, &*interrupt()?),
         Verb::Doctor(doctor) => doctor.run(everywhere, &*interrupt()?),
         Verb::List { domains: true } => {
             clients::list_domains(&Environment::of_process().bases(), everywhere.json, &mut out)

@@ -5,6 +5,7 @@ mod attend;
 pub mod bus_error;
 mod clock;
 pub mod config;
+pub mod configure;
 mod control;
 mod converse;
 pub mod doctor;

@@ -8,6 +8,7 @@
 
 mod arrival;
 mod candidates;
+pub mod change;
 pub mod command;
 pub mod condition;
 pub mod configuration;
