@@ -1,18 +1,24 @@
 //! The command line: which verbs there are and what they take. Syntax only; what a value means is checked by whoever
 //! uses it.
 
+mod configure;
 mod control;
+mod doctor;
+mod probe;
+mod telegram;
 
 use std::path::PathBuf;
 use std::time::Duration;
 
 use clap::{Args, Parser, Subcommand};
 use clients::{Bounds, duration};
+use daemon::config::Sources;
 use schema::{DEFAULT_DOMAIN, Domain, Environment, Failure};
 use sim::fault::Faults;
 use sim::options::{self, SimulateOptions};
 
 pub(crate) use control::Control;
+pub(crate) use telegram::{Telegram, Way};
 
 /// Laser scanners on serial lines, for more than one program: a hub that publishes telegrams and scans into shared
 /// memory, and the programs that listen.
@@ -60,6 +66,12 @@ pub(crate) enum Verb {
     /// Sensors at the other end of ptys
     #[command(after_help = fault_table())]
     Simulate(Simulate),
+    /// What is at the other end of a port; without one, which ports there are
+    Probe(probe::Probe),
+    /// Change what a sensor keeps for ever, after showing the difference and asking
+    Configure(configure::Configure),
+    /// Every condition that a working set-up needs, and what to do where one is not met
+    Doctor(doctor::Doctor),
     /// Sensors and topics of the running hub
     List {
         /// Every live domain of this user instead
@@ -75,6 +87,8 @@ pub(crate) enum Verb {
     Echo(Echo),
     /// Rate, jitter and loss of topics
     Hz(Hz),
+    /// Telegrams explained field by field, and written
+    Telegram(Telegram),
     /// Stop a sensor, let it stream again, or begin anew with it
     Control(Control),
 }
@@ -93,6 +107,15 @@ pub(crate) struct Run {
     /// One value, for example link.front.angle=100
     #[arg(long, value_name = "KEY=VALUE")]
     pub(crate) set: Vec<String>,
+}
+
+impl Run {
+    /// Where the configuration is to be read from.
+    pub(crate) fn sources(&self) -> Sources {
+        let mut files = if self.no_system_config { Vec::new() } else { Sources::system() };
+        files.extend(self.config.clone());
+        Sources { files, set: self.set.clone(), links: self.link.clone() }
+    }
 }
 
 #[derive(Args, Debug)]

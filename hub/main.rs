@@ -17,14 +17,13 @@ use clap::Parser;
 use clap::error::ErrorKind;
 use clients::{EchoOptions, Format, HzOptions, InfoOptions, ListOptions};
 use daemon::Config;
-use daemon::config::Sources;
 use rustix::process::Signal;
 use schema::{Environment, Failure, Kind};
 use serde::Serialize;
 use signal_hook::consts::{SIGINT, SIGTERM};
 use tracing::level_filters::LevelFilter;
 
-use cli::{Cli, Everywhere, Verb};
+use cli::{Cli, Everywhere, Verb, Way};
 use demo::DemoOptions;
 
 /// In the environment of a process that shall not outlive the one that started it.
@@ -68,6 +67,13 @@ fn dispatch(cli: &Cli) -> Result<(), Failure> {
             demo::demo(&options, &mut out, &*interrupt()?)
         }
         Verb::Simulate(simulate) => run_simulator(simulate, everywhere),
+        Verb::Telegram(telegram) => match &telegram.way {
+            Way::Decode(decode) => daemon::telegram::decode(&decode.options(everywhere.json), &mut out),
+            Way::Encode(encode) => daemon::telegram::encode(&encode.options(everywhere.json), &mut out),
+        },
+        Verb::Probe(probe) => probe.run(everywhere.json, &*interrupt()?),
+        Verb::Configure(configure) => configure.run(everywhere.json, &*interrupt()?),
+        Verb::Doctor(doctor) => doctor.run(everywhere, &*interrupt()?),
         Verb::List { domains: true } => {
             clients::list_domains(&Environment::of_process().bases(), everywhere.json, &mut out)
         }
@@ -110,9 +116,7 @@ fn dispatch(cli: &Cli) -> Result<(), Failure> {
 }
 
 fn run_hub(run: &cli::Run, everywhere: &Everywhere) -> Result<(), Failure> {
-    let mut files = if run.no_system_config { Vec::new() } else { Sources::system() };
-    files.extend(run.config.clone());
-    let config = Config::load(&Sources { files, set: run.set.clone(), links: run.link.clone() })?;
+    let config = Config::load(&run.sources())?;
     let domain = everywhere.hub_domain()?;
     daemon::run(&config, &domain, |ready| {
         let line = if everywhere.json {

@@ -67,3 +67,17 @@ impl Line {
         }
     }
 }
+
+/// The host's end of the line at `place`, raw, at `rate`; reads and writes do not block.
+pub(crate) fn open_line(place: &Path, rate: u32) -> std::fs::File {
+    let make = || -> Result<OwnedFd, Errno> {
+        let flags = OFlags::RDWR | OFlags::NOCTTY | OFlags::NONBLOCK | OFlags::CLOEXEC;
+        let line = open(place, flags, Mode::empty())?;
+        let mut termios = tcgetattr(&line)?;
+        termios.make_raw();
+        termios.set_speed(rate)?;
+        tcsetattr(&line, OptionalActions::Now, &termios)?;
+        Ok(line)
+    };
+    make().unwrap_or_else(|error| panic!("cannot open {}: {error}", place.display())).into()
+}

@@ -13,9 +13,10 @@ use std::sync::atomic::{AtomicU32, Ordering};
 use std::thread;
 use std::time::{Duration, Instant};
 
+use schema::Domain;
 use serde_json::Value;
 
-pub(crate) use line::Line;
+pub(crate) use line::{Line, open_line};
 pub(crate) use program::{INT, KILL, Outcome, Program, TERM};
 pub(crate) use telegrams::{MEASURED, Sent, bytes_of, hash, is_class, number, scan, sequence};
 
@@ -36,6 +37,11 @@ impl Stage {
         let directory = PathBuf::from(format!("/tmp/{domain}"));
         fs::create_dir_all(&directory).unwrap_or_else(|error| panic!("{}: {error}", directory.display()));
         Stage { directory, domain }
+    }
+
+    /// Where its hub is, for consumers in the test itself.
+    pub(crate) fn place(&self) -> Domain {
+        Domain::at(&self.domain, &self.directory).unwrap_or_else(|failure| panic!("{failure}"))
     }
 
     pub(crate) fn path(&self, name: &str) -> PathBuf {

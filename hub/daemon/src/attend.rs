@@ -1,6 +1,8 @@
 //! The life of a port: streamed from while it is there, looked for while it is away, taken back when it returns under
 //! its name, whatever device that is then. Looking costs next to nothing; why it is away is said once, not at each look.
 
+use std::os::fd::AsFd;
+
 use lms::{Control, MILLIS, Nanos, Session};
 use schema::{Failure, Flags, Kind, State};
 
@@ -15,14 +17,16 @@ impl LinkThread<'_> {
     pub(crate) fn attend(&mut self, report: impl FnOnce(Result<(), Failure>)) {
         let link = self.link;
         let mut away = Away::default();
-        let mut opened = match Port::open(&link.port, link.baud.rate()) {
-            Err(failure) if failure.kind != Kind::PortMissing => return report(Err(failure)),
-            Err(failure) => {
-                away = Away::for_lack_of_a_port(said(failure));
-                None
+        let mut opened = None;
+        if let Source::Tcp { .. } = link.port {
+            away = Away::for_lack_of_a_port(format!("{}: not connected yet", link.port.name()));
+        } else {
+            match Port::open(&link.port, link.baud.rate()) {
+                Ok(port) => opened = Some(port),
+                Err(failure) if failure.kind != Kind::PortMissing => return report(Err(failure)),
+                Err(failure) => away = Away::for_lack_of_a_port(said(failure)),
             }
-            Ok(port) => Some(port),
-        };
+        }
         report(Ok(()));
         loop {
             if let Some(port) = opened.take() {
@@ -44,9 +48,28 @@ impl LinkThread<'_> {
                     Woken::Ready | Woken::Timeout => break,
                 }
             }
-            match Port::attempt(&link.port, link.baud.rate()) {
-                Ok(port) => opened = Some(port),
-                Err(refusal) => away.learn(refusal, &link.port, clock::now()),
+            match self.reach(&away.words) {
+                None => return,
+                Some(Ok(port)) => opened = Some(port),
+                Some(Err(refusal)) => away.learn(refusal, &link.port, clock::now()),
+            }
+        }
+    }
+
+    /// Tries to open the port, however long that takes; nothing if the hub shall end meanwhile.
+    fn reach(&mut self, words: &str) -> Option<Result<Port, Refusal>> {
+        let link = self.link;
+        let dial = match Port::dial(&link.port) {
+            None => return Some(Port::attempt(&link.port, link.baud.rate())),
+            Some(Err(refusal)) => return Some(Err(refusal)),
+            Some(Ok(dial)) => dial,
+        };
+        loop {
+            match self.wait(Some(dial.as_fd()), clock::now() + STILL_AWAY) {
+                Woken::Stop => return None,
+                Woken::Order => self.orders.obey(None),
+                Woken::Ready => return Some(dial.finish()),
+                Woken::Timeout => self.show(None, State::Absent, words),
             }
         }
     }
@@ -110,6 +133,8 @@ fn said(failure: Failure) -> String {
 const LOOK: Nanos = 100 * MILLIS;
 /// Times that the pause between two looks doubles.
 const LONGEST_PAUSE: u32 = 4;
+/// A status is due so often while a connection is being made.
+const STILL_AWAY: Nanos = 1_000 * MILLIS;
 /// After so long the circumstances of a refusal are looked for again.
 const STALE: Nanos = 10_000 * MILLIS;
 

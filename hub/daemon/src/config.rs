@@ -38,6 +38,13 @@ pub struct Link {
 pub enum Source {
     /// A serial line.
     Tty(PathBuf),
+    /// A line behind a serial server (`tcp:HOST:PORT`), which was set to the link's rate by hand.
+    Tcp {
+        /// Name or address, an IPv6 address without its brackets.
+        host: String,
+        /// Port in raw TCP mode.
+        port: u16,
+    },
     /// A recording (`file:PATH`), paced by its scan period or, with `?rate=max`, as fast as it can be read.
     File {
         /// The recording.
@@ -52,14 +59,26 @@ impl Source {
     pub fn name(&self) -> String {
         match self {
             Source::Tty(path) => path.display().to_string(),
+            Source::Tcp { host, port } if host.contains(':') => format!("tcp:[{host}]:{port}"),
+            Source::Tcp { host, port } => format!("tcp:{host}:{port}"),
             Source::File { path, paced: true } => format!("file:{}", path.display()),
             Source::File { path, paced: false } => format!("file:{}?rate=max", path.display()),
         }
     }
 
     pub(crate) fn parse(text: &str) -> Result<Source, &'static str> {
-        if text.starts_with("tcp:") {
-            return Err("serial servers (tcp:) are not supported");
+        if let Some(server) = text.strip_prefix("tcp:") {
+            let (host, port) = server.rsplit_once(':').ok_or("tcp: without a port: write tcp:HOST:PORT")?;
+            let port =
+                port.parse().ok().filter(|&port| port > 0).ok_or("tcp: the port is a number to 65535")?;
+            let bare = host.strip_prefix('[').and_then(|host| host.strip_suffix(']'));
+            return match bare.unwrap_or(host) {
+                "" => Err("tcp: without a host: write tcp:HOST:PORT"),
+                host if bare.is_none() && host.contains(':') => {
+                    Err("an IPv6 address stands in brackets: tcp:[ADDRESS]:PORT")
+                }
+                host => Ok(Source::Tcp { host: host.to_owned(), port }),
+            };
         }
         let Some(file) = text.strip_prefix("file:") else {
             return if text.is_empty() { Err("the port is empty") } else { Ok(Source::Tty(text.into())) };
@@ -196,6 +215,18 @@ mod tests {
     }
 
     #[test]
+    fn serial_servers() {
+        for (text, host, port) in [
+            ("tcp:box:4001", "box", 4001),
+            ("tcp:10.0.0.7:23", "10.0.0.7", 23),
+            ("tcp:[::1]:4001", "::1", 4001),
+        ] {
+            let source = Source::parse(text).unwrap();
+            assert_eq!((source.name().as_str(), &source), (text, &Source::Tcp { host: host.into(), port }));
+        }
+    }
+
+    #[test]
     fn refusals_name_place_value_and_remedy() {
         let unknown = refusal(&["link.front.prot=/dev/x"], &[]);
         assert!(unknown.contains("--set link.front.prot=/dev/x: unknown key `prot`"), "{unknown}");
@@ -209,7 +240,10 @@ mod tests {
         assert!(refusal(&[], &["front"]).contains("--link front: no = in it"));
         assert!(refusal(&[], &["Front=/dev/x"]).contains("sensor name \"Front\" is not possible"));
         assert!(refusal(&[], &["front=file:x?rate=2"]).contains("rate=max"));
-        assert!(refusal(&[], &["front=tcp:box:4001"]).contains("not supported"));
+        assert!(refusal(&[], &["front=tcp:box"]).contains("write tcp:HOST:PORT"));
+        assert!(refusal(&[], &["front=tcp::4001"]).contains("without a host"));
+        assert!(refusal(&[], &["front=tcp:box:0"]).contains("a number to 65535"));
+        assert!(refusal(&[], &["front=tcp:fe80::1:4001"]).contains("in brackets"));
     }
 
     #[test]

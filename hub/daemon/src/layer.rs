@@ -137,7 +137,11 @@ pub(crate) fn merge(
             let port_span = Some(port.span());
             let port = port.into_inner();
             draft.port = Some(Source::parse(&port).map_err(|what| {
-                origin.refuse(port_span, what, "name a tty, or file:PATH with ?rate=max if you like")
+                origin.refuse(
+                    port_span,
+                    what,
+                    "name a tty, tcp:HOST:PORT, or file:PATH with ?rate=max if you like",
+                )
             })?);
         }
         if let Some(family) = link.family {

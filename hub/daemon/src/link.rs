@@ -2,7 +2,7 @@
 //! come or a deadline passes, and does nothing twice per telegram.
 
 use std::io;
-use std::os::fd::OwnedFd;
+use std::os::fd::{AsFd, BorrowedFd, OwnedFd};
 
 use lms::framer::suspect;
 use lms::reply::Reply;
@@ -88,7 +88,7 @@ impl<'a> LinkThread<'a> {
                 }
                 Err(failure) => report(Err(failure)),
             },
-            Source::Tty(_) => self.attend(report),
+            Source::Tty(_) | Source::Tcp { .. } => self.attend(report),
         }
     }
 
@@ -96,7 +96,7 @@ impl<'a> LinkThread<'a> {
     pub(crate) fn stream(&mut self, port: &Port, session: &mut Session) -> io::Result<()> {
         loop {
             let (watch, until) = self.drain(port, session)?;
-            match self.wait(watch.then_some(port), until) {
+            match self.wait(watch.then_some(port.as_fd()), until) {
                 Woken::Stop => return Ok(()),
                 Woken::Order => {
                     self.orders.obey(Some(session));
@@ -221,7 +221,7 @@ impl<'a> LinkThread<'a> {
     }
 
     /// Sleeps until the port has bytes (or is gone), `until`, or the hub's end.
-    pub(crate) fn wait(&mut self, port: Option<&Port>, until: Nanos) -> Woken {
+    pub(crate) fn wait(&mut self, port: Option<BorrowedFd<'_>>, until: Nanos) -> Woken {
         loop {
             let now = clock::now();
             // Whoever attaches to a silent sensor is greeted in time all the same.
@@ -232,7 +232,7 @@ impl<'a> LinkThread<'a> {
             let orders = PollFd::new(&self.orders, PollFlags::IN);
             let woken = match port {
                 Some(port) => {
-                    let mut fds = [stop, orders, PollFd::new(port, PollFlags::IN)];
+                    let mut fds = [stop, orders, PollFd::from_borrowed_fd(port, PollFlags::IN)];
                     poll(&mut fds, Some(&span)).map(|_| fds.each_ref().map(is_ready))
                 }
                 None => {
@@ -267,13 +267,18 @@ impl<'a> LinkThread<'a> {
     }
 
     pub(crate) fn settings(&self, listen_only: bool) -> Settings {
-        Settings { variant: self.link.variant, baud: self.link.baud, listen_only }
+        let fixed_rate = matches!(self.link.port, Source::Tcp { .. });
+        Settings { variant: self.link.variant, baud: self.link.baud, listen_only, fixed_rate }
     }
 
     /// What is wrong, in words; empty if nothing is.
     fn trouble(&self, session: &Session) -> String {
         let unit = session.sensor().unit;
         match (session.trouble(), unit, self.link.unit) {
+            (Some(Trouble::NoAnswer { .. }), _, _) if self.settings(false).fixed_rate => format!(
+                "no answer at {} baud, to which the serial server was set: power, cable, another rate?",
+                self.link.baud.rate()
+            ),
             (Some(trouble), _, _) => trouble.to_string(),
             (None, Some(is), Some(expected)) if is != expected => format!(
                 "the sensor measures in units of {} mm, the configuration says {} mm; the unit lives in its EEPROM, \
@@ -281,6 +286,7 @@ impl<'a> LinkThread<'a> {
                 is.mm(),
                 expected.mm()
             ),
+            _ if self.unreached >= UNREACHED_LIMIT => self.unserved(),
             _ => {
                 let fault = session.sensor().notices().find(|notice| notice.is_fault());
                 fault.map_or_else(String::new, |notice| notice.to_string())
@@ -289,14 +295,22 @@ impl<'a> LinkThread<'a> {
     }
 
     fn watch_reach(&mut self) {
-        self.unreached = if self.topics.unreached() > 0 { self.unreached + 1 } else { 0 };
-        if self.unreached == UNREACHED_LIMIT {
-            tracing::warn!(
-                "{}: {} consumers are attached but get nothing: raise the limit of open descriptors (ulimit -n)",
-                self.link.name,
-                self.topics.unreached()
-            );
+        let before = self.unreached;
+        self.unreached = if self.topics.unreached() > 0 { before.saturating_add(1) } else { 0 };
+        if self.unreached == UNREACHED_LIMIT || before >= UNREACHED_LIMIT && self.unreached == 0 {
+            // Whoever is served shall read it in the status.
+            self.facts = None;
         }
+        if self.unreached == UNREACHED_LIMIT {
+            tracing::warn!("{}: {}", self.link.name, self.unserved());
+        }
+    }
+
+    fn unserved(&self) -> String {
+        let count = self.topics.unreached();
+        format!(
+            "{count} consumers are attached but get nothing: raise the limit of open descriptors (ulimit -n)"
+        )
     }
 }
 

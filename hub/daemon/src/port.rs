@@ -1,11 +1,12 @@
-//! Where a link's bytes come from: a serial line. Above this file nobody knows how it is opened, and what may go wrong
-//! then.
+//! Where a link's bytes come from: a serial line, here or behind a serial server. Above this file nobody knows how it is
+//! opened, and what may go wrong then.
 
 mod candidates;
 mod holder;
 mod kernel;
 mod refusal;
 mod rights;
+mod tcp;
 mod tty;
 
 use std::io;
@@ -17,16 +18,20 @@ use crate::config::Source;
 pub use candidates::{Candidate, candidates};
 pub use holder::{Holder, holder};
 pub(crate) use refusal::Refusal;
+pub(crate) use tcp::Dial;
+use tcp::Tcp;
 use tty::Tty;
 
 /// An open line to a sensor; reads and writes never block.
 pub(crate) enum Port {
     /// A serial line, exclusive and raw.
     Tty(Tty),
+    /// A connection to a serial server.
+    Tcp(Tcp),
 }
 
 impl Port {
-    /// Opens `source` at `baud`.
+    /// Opens `source` at `baud`. A serial server is waited for, some seconds at most.
     ///
     /// A failure of one of the port kinds, with its remedy; of kind `short` without descriptors, of kind
     /// `configuration` if it is a recording.
@@ -38,6 +43,7 @@ impl Port {
     pub(crate) fn attempt(source: &Source, baud: u32) -> Result<Port, Refusal> {
         match source {
             Source::Tty(path) => Tty::open(path, baud).map(Port::Tty),
+            Source::Tcp { host, port } => Tcp::open(host, *port).map(Port::Tcp),
             Source::File { .. } => Err(Refusal::Recording),
         }
     }
@@ -46,14 +52,27 @@ impl Port {
     pub(crate) fn simulated(&self) -> bool {
         match self {
             Port::Tty(tty) => tty.simulated,
+            Port::Tcp(_) => false,
+        }
+    }
+
+    /// Begins to open `source` if that takes its time; nothing if [`Port::attempt`] is over at once.
+    pub(crate) fn dial(source: &Source) -> Option<Result<Dial, Refusal>> {
+        match source {
+            Source::Tcp { host, port } => Some(Dial::start(host, *port)),
+            _ => None,
         }
     }
 
     /// Changes the rate, and forgets what came in at the old one. An error of kind `Unsupported` says that the driver
-    /// made another rate of it.
+    /// made another rate of it, or that it cannot be changed from here.
     pub(crate) fn set_baud(&self, baud: u32) -> io::Result<()> {
         match self {
             Port::Tty(tty) => tty.set_baud(baud),
+            Port::Tcp(_) => {
+                let what = "the rate of a serial server is set there, by hand";
+                Err(io::Error::new(io::ErrorKind::Unsupported, what))
+            }
         }
     }
 
@@ -61,6 +80,7 @@ impl Port {
     pub(crate) fn read(&self, buffer: &mut [u8]) -> io::Result<usize> {
         match self {
             Port::Tty(tty) => tty.read(buffer),
+            Port::Tcp(tcp) => tcp.read(buffer),
         }
     }
 
@@ -68,6 +88,7 @@ impl Port {
     pub(crate) fn write(&self, byte: u8) -> io::Result<()> {
         match self {
             Port::Tty(tty) => tty.write(byte),
+            Port::Tcp(tcp) => tcp.write(byte),
         }
     }
 }
@@ -77,6 +98,7 @@ impl Port {
     pub(crate) fn line_errors(&self) -> u64 {
         match self {
             Port::Tty(tty) => tty.line_errors(),
+            Port::Tcp(_) => 0,
         }
     }
 }
@@ -85,6 +107,7 @@ impl AsFd for Port {
     fn as_fd(&self) -> BorrowedFd<'_> {
         match self {
             Port::Tty(tty) => tty.as_fd(),
+            Port::Tcp(tcp) => tcp.as_fd(),
         }
     }
 }

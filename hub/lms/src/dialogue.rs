@@ -330,7 +330,7 @@ impl Dialogue {
     }
 
     pub(crate) fn change_baud(&mut self, baud: Baud) {
-        if self.baud != baud {
+        if self.baud != baud && !self.settings.fixed_rate {
             self.baud = baud;
             self.change_baud = Some(baud);
         }

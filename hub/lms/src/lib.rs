@@ -8,6 +8,7 @@
 
 mod arrival;
 mod candidates;
+pub mod change;
 pub mod command;
 pub mod condition;
 pub mod configuration;
@@ -16,6 +17,7 @@ mod dialogue;
 pub mod eeprom;
 pub mod errors;
 pub mod exchange;
+pub mod explain;
 pub mod family;
 pub mod framer;
 pub mod header;

@@ -16,6 +16,8 @@ pub struct Settings {
     pub baud: Baud,
     /// Whether anybody hears us: a recording is only listened to.
     pub listen_only: bool,
+    /// Whether the port has the wanted rate and no other: a serial server on the network.
+    pub fixed_rate: bool,
 }
 
 /// Why a session waits until its deadline.

@@ -30,6 +30,14 @@ pub(crate) enum Refusal {
     Short(Errno),
     /// The driver made another rate of the one that was wanted.
     Rate { wanted: u32, given: u32 },
+    /// The serial server's name cannot be looked up.
+    NoHost(String),
+    /// The serial server is there, and takes no connection at this port.
+    Refused,
+    /// The serial server does not answer.
+    TimedOut,
+    /// The network does not reach it.
+    Network(String),
     /// It is no line at all.
     Recording,
     /// Whatever else the kernel says.
@@ -62,7 +70,16 @@ impl Refusal {
             Refusal::Dead => failure(Kind::PortMissing, &instead(&name, &candidates())),
             Refusal::Short(_) => failure(Kind::Short, "raise the limit of open descriptors (ulimit -n)"),
             Refusal::Rate { wanted, .. } => failure(Kind::PortRate, remedy_of_rate(*wanted)),
-            Refusal::Recording => failure(Kind::Configuration, "name a tty"),
+            Refusal::NoHost(_) => failure(Kind::PortMissing, "correct the name, or give the address instead"),
+            Refusal::Refused => failure(
+                Kind::PortMissing,
+                "nothing listens there, or it serves somebody else: the server's port must be in raw TCP mode",
+            ),
+            Refusal::TimedOut => failure(Kind::PortMissing, "is it switched on, and is the address right?"),
+            Refusal::Network(_) => {
+                failure(Kind::PortMissing, "is the network plugged in, and is there a way to it?")
+            }
+            Refusal::Recording => failure(Kind::Configuration, "name a tty, or tcp:HOST:PORT"),
             Refusal::Other(_) => {
                 failure(Kind::PortNotTty, "name a tty; the kernel's log (dmesg) may tell more")
             }
@@ -82,6 +99,10 @@ impl fmt::Display for Refusal {
             Refusal::Rate { wanted, given } => {
                 write!(f, "{wanted} Bd is not possible here, the driver gives {given} Bd")
             }
+            Refusal::NoHost(why) => write!(f, "no such host: {why}"),
+            Refusal::Refused => f.write_str("connection refused"),
+            Refusal::TimedOut => f.write_str("no answer"),
+            Refusal::Network(why) => write!(f, "cannot be reached: {why}"),
             Refusal::Recording => f.write_str("a recording, no line to a sensor"),
             Refusal::Other(errno) => write!(f, "cannot be used as a serial line: {errno}"),
         }

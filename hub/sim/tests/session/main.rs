@@ -4,6 +4,7 @@ mod adoption;
 mod bench;
 mod control;
 mod figures;
+mod fixed_rate;
 mod habits;
 mod installation;
 mod loss;

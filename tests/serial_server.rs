@@ -1,0 +1,133 @@
+//! A sensor behind a serial server: the server is played here, between a socket on the loopback and the simulator's
+//! pty.
+
+mod stage;
+
+use std::io::{Read, Write};
+use std::net::{TcpListener, TcpStream};
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::thread::{self, JoinHandle};
+use std::time::Duration;
+
+use serde_json::Value;
+use stage::{INT, Stage, TERM, is_class, number, open_line, sequence};
+
+/// One connection at a time, until it is dropped.
+struct Server {
+    address: String,
+    /// Ends the connection that there is.
+    hang_up: Arc<AtomicBool>,
+    end: Arc<AtomicBool>,
+    thread: Option<JoinHandle<()>>,
+}
+
+impl Server {
+    /// A server whose serial port is the line at `place`, set to `rate` by hand.
+    fn new(stage: &Stage, place: &str, rate: u32) -> Server {
+        let listener = TcpListener::bind("127.0.0.1:0").expect("a port of the loopback");
+        let address = listener.local_addr().expect("it has an address").to_string();
+        listener.set_nonblocking(true).expect("a socket");
+        let (hang_up, end) = (Arc::new(AtomicBool::new(false)), Arc::new(AtomicBool::new(false)));
+        let line = open_line(&stage.path(place), rate);
+        let body = {
+            let (hang_up, end) = (hang_up.clone(), end.clone());
+            move || {
+                while !end.load(Ordering::Relaxed) {
+                    match listener.accept() {
+                        Ok((socket, _)) => carry(&line, &socket, &|| {
+                            hang_up.swap(false, Ordering::Relaxed) || end.load(Ordering::Relaxed)
+                        }),
+                        Err(_) => thread::sleep(Duration::from_millis(5)),
+                    }
+                }
+            }
+        };
+        Server { address, hang_up, end, thread: Some(thread::spawn(body)) }
+    }
+
+    fn link(&self) -> String {
+        format!("--link=front=tcp:{}", self.address)
+    }
+}
+
+impl Drop for Server {
+    fn drop(&mut self) {
+        self.end.store(true, Ordering::Relaxed);
+        let _ = self.thread.take().map(JoinHandle::join);
+    }
+}
+
+/// Bytes to and fro until `is_over`, or until the other end closes the connection.
+fn carry(line: &std::fs::File, socket: &TcpStream, is_over: &dyn Fn() -> bool) {
+    let (mut line, mut socket) = (line, socket);
+    let mut buffer = [0; 4096];
+    socket.set_nonblocking(true).expect("a socket");
+    socket.set_nodelay(true).expect("a socket");
+    while !is_over() {
+        let from_host = socket.read(&mut buffer);
+        match from_host {
+            Ok(0) => return,
+            Ok(len) => line.write_all(&buffer[..len]).expect("the simulator lives"),
+            Err(_) => {}
+        }
+        match line.read(&mut buffer) {
+            Ok(len) if len > 0 => {
+                if socket.write_all(&buffer[..len]).is_err() {
+                    return;
+                }
+            }
+            _ if from_host.is_ok() => {}
+            _ => thread::sleep(Duration::from_micros(200)),
+        }
+    }
+}
+
+#[test]
+fn a_sensor_behind_a_serial_server() {
+    let stage = Stage::new();
+    let _simulator = stage.simulator(&["line"], &["--baud=38400", "--seed=5"]);
+    let server = Server::new(&stage, "line", 38_400);
+    let hub = stage.hub(&[&server.link(), "--set=link.front.baud=38400"]);
+    let mut consumer = stage.echo(&["front/telegram", "front/status"]);
+    consumer.await_lines(5, "a telegram", is_class("telegram"));
+    server.hang_up.store(true, Ordering::Relaxed);
+    let absent = consumer.await_line("absent", |line| line["state"] == "absent");
+    let error = absent["last_error"].as_str().unwrap_or_default();
+    assert!(error.contains(&server.address) && error.contains("closed by the serial server"), "{absent}");
+    consumer.await_line("streaming", |line| line["state"] == "streaming");
+    consumer.await_lines(5, "a telegram", is_class("telegram"));
+    let info = stage.info("front");
+    assert_eq!(number(&info["counters"], "reconnects"), 1, "{info}");
+    assert_eq!(info["port"], format!("tcp:{}", server.address));
+    let outcome = consumer.end(INT);
+    sequence(&outcome.of_class("telegram"), "seq");
+    assert_eq!(hub.end(TERM).code, Some(0));
+}
+
+#[test]
+fn a_serial_server_that_is_set_to_another_rate() {
+    let stage = Stage::new();
+    let _simulator = stage.simulator(&["line"], &["--baud=9600"]);
+    let server = Server::new(&stage, "line", 38_400);
+    let _hub = stage.hub(&[&server.link(), "--set=link.front.baud=38400"]);
+    let says = "no answer at 38400 baud, to which the serial server was set";
+    let said = |info: &Value| info["last_error"].as_str().is_some_and(|error| error.contains(says));
+    stage.await_info("front", said);
+}
+
+#[test]
+fn a_serial_server_that_is_not_there() {
+    let stage = Stage::new();
+    // The port was free a moment ago.
+    let address = TcpListener::bind("127.0.0.1:0").and_then(|socket| socket.local_addr()).expect("a port");
+    let hub =
+        stage.hub(&[&format!("--link=front=tcp:{address}"), "--link=named=tcp:no-such-host.invalid:4001"]);
+    for (sensor, says) in [("front", "connection refused; nothing listens there"), ("named", "no such host")]
+    {
+        let said = |info: &Value| info["last_error"].as_str().is_some_and(|error| error.contains(says));
+        let info = stage.await_info(sensor, said);
+        assert_eq!(info["state"], "absent", "{info}");
+    }
+    assert_eq!(hub.end(TERM).code, Some(0));
+}
