@@ -61,7 +61,7 @@ pub(crate) enum Verb {
     Demo(Demo),
     /// Sensors at the other end of ptys
     #[command(after_help = simulate::fault_table())]
-    Simulate(simulate::Simulate),
+    Simulate(Box<simulate::Simulate>),
     /// What is at the other end of a port; without one, which ports there are
     Probe(probe::Probe),
     /// Every condition that a working set-up needs, and what to do where one is not met
