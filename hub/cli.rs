@@ -1,10 +1,12 @@
 //! The command line: which verbs there are and what they take. Syntax only; what a value means is checked by whoever
 //! uses it.
 
+mod configure;
 mod control;
 mod doctor;
 mod probe;
 pub(crate) mod simulate;
+mod telegram;
 
 use std::path::PathBuf;
 use std::time::Duration;
@@ -15,6 +17,7 @@ use daemon::config::Sources;
 use schema::{DEFAULT_DOMAIN, Domain, Environment, Failure};
 
 pub(crate) use control::Control;
+pub(crate) use telegram::{Telegram, Way};
 
 /// Laser scanners on serial lines, for more than one program: a hub that publishes telegrams and scans into shared
 /// memory, and the programs that listen.
@@ -64,6 +67,8 @@ pub(crate) enum Verb {
     Simulate(Box<simulate::Simulate>),
     /// What is at the other end of a port; without one, which ports there are
     Probe(probe::Probe),
+    /// Change what a sensor keeps for ever, after showing the difference and asking
+    Configure(configure::Configure),
     /// Every condition that a working set-up needs, and what to do where one is not met
     Doctor(doctor::Doctor),
     /// Sensors and topics of the running hub
@@ -81,6 +86,8 @@ pub(crate) enum Verb {
     Echo(Echo),
     /// Rate, jitter and loss of topics
     Hz(Hz),
+    /// Telegrams explained field by field, and written
+    Telegram(Telegram),
     /// Stop a sensor, let it stream again, or begin anew with it
     Control(Control),
 }

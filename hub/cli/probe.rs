@@ -52,13 +52,17 @@ impl Progress {
             let _ = write!(stderr(), "\r\x1b[K{text} ..");
         }
     }
+
+    pub(crate) fn clear(&mut self) {
+        if self.is_terminal {
+            let _ = write!(stderr(), "\r\x1b[K");
+        }
+    }
 }
 
 impl Drop for Progress {
     fn drop(&mut self) {
-        if self.is_terminal {
-            let _ = write!(stderr(), "\r\x1b[K");
-        }
+        self.clear();
     }
 }
 

@@ -13,6 +13,7 @@ use crate::config::Source;
 use crate::converse::converse;
 use crate::port::{Candidate, Port, candidates};
 pub use description::Description;
+pub(crate) use description::{hex, measuring};
 
 /// The serial lines of this machine.
 ///
