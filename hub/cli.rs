@@ -2,12 +2,15 @@
 //! uses it.
 
 mod control;
+mod doctor;
+mod probe;
 
 use std::path::PathBuf;
 use std::time::Duration;
 
 use clap::{Args, Parser, Subcommand};
 use clients::{Bounds, duration};
+use daemon::config::Sources;
 use schema::{DEFAULT_DOMAIN, Domain, Environment, Failure};
 use sim::fault::Faults;
 use sim::options::{self, SimulateOptions};
@@ -60,6 +63,10 @@ pub(crate) enum Verb {
     /// Sensors at the other end of ptys
     #[command(after_help = fault_table())]
     Simulate(Simulate),
+    /// What is at the other end of a port; without one, which ports there are
+    Probe(probe::Probe),
+    /// Every condition that a working set-up needs, and what to do where one is not met
+    Doctor(doctor::Doctor),
     /// Sensors and topics of the running hub
     List {
         /// Every live domain of this user instead
@@ -93,6 +100,15 @@ pub(crate) struct Run {
     /// One value, for example link.front.angle=100
     #[arg(long, value_name = "KEY=VALUE")]
     pub(crate) set: Vec<String>,
+}
+
+impl Run {
+    /// Where the configuration is to be read from.
+    pub(crate) fn sources(&self) -> Sources {
+        let mut files = if self.no_system_config { Vec::new() } else { Sources::system() };
+        files.extend(self.config.clone());
+        Sources { files, set: self.set.clone(), links: self.link.clone() }
+    }
 }
 
 #[derive(Args, Debug)]

@@ -17,7 +17,6 @@ use clap::Parser;
 use clap::error::ErrorKind;
 use clients::{EchoOptions, Format, HzOptions, InfoOptions, ListOptions};
 use daemon::Config;
-use daemon::config::Sources;
 use rustix::process::Signal;
 use schema::{Environment, Failure, Kind};
 use serde::Serialize;
@@ -68,6 +67,8 @@ fn dispatch(cli: &Cli) -> Result<(), Failure> {
             demo::demo(&options, &mut out, &*interrupt()?)
         }
         Verb::Simulate(simulate) => run_simulator(simulate, everywhere),
+        Verb::Probe(probe) => probe.run(everywhere.json, &*interrupt()?),
+        Verb::Doctor(doctor) => doctor.run(everywhere, &*interrupt()?),
         Verb::List { domains: true } => {
             clients::list_domains(&Environment::of_process().bases(), everywhere.json, &mut out)
         }
@@ -110,9 +111,7 @@ fn dispatch(cli: &Cli) -> Result<(), Failure> {
 }
 
 fn run_hub(run: &cli::Run, everywhere: &Everywhere) -> Result<(), Failure> {
-    let mut files = if run.no_system_config { Vec::new() } else { Sources::system() };
-    files.extend(run.config.clone());
-    let config = Config::load(&Sources { files, set: run.set.clone(), links: run.link.clone() })?;
+    let config = Config::load(&run.sources())?;
     let domain = everywhere.hub_domain()?;
     daemon::run(&config, &domain, |ready| {
         let line = if everywhere.json {

@@ -22,7 +22,12 @@ pub(crate) fn raise_descriptor_limit() {
 ///
 /// [`Kind::Short`](schema::Kind) with what is free and what is needed.
 pub(crate) fn check_memory(links: usize) -> Result<(), Failure> {
-    check_room(links as u64 * link_bytes() + REST)
+    check_room(needed(links))
+}
+
+/// Bytes of shared memory for `links` links and the first consumers.
+pub(crate) fn needed(links: usize) -> u64 {
+    links as u64 * link_bytes() + REST
 }
 
 /// Allocates what the segments of `domain` have promised so far.

@@ -3,13 +3,13 @@
 //! and no port. It never says anything that outlives a power cycle.
 
 use crate::Nanos;
-use crate::command::Request;
+use crate::command::{MODE, Request};
 use crate::header::{Expect, POWER_ON, StreamHeader, is_data};
 use crate::measured::Measured;
 use crate::outgoing::{FORGOTTEN, NAK_PAUSE, Outgoing};
 use crate::phase::{
-    BESIDE_VALUES, Control, MORE_TRIES, OVERLOOKED, PAUSE, Phase, QUESTIONS, Reason, SILENCE, STOPS,
-    Settings, Step, TRIES,
+    BESIDE_VALUES, Control, OVERLOOKED, PAUSE, Phase, Progress, QUESTIONS, Reason, SILENCE, STOPS, Settings,
+    Step, TRIES,
 };
 use crate::reply::Reply;
 use crate::sensor::{Sensor, State, Trouble};
@@ -182,6 +182,7 @@ impl Dialogue {
                 // One of another kind was judged before this stream was known.
                 if telegram.bytes().starts_with(&header) {
                     *at = next_silence;
+                    self.question(now);
                 }
             }
             Phase::Following => return,
@@ -200,7 +201,7 @@ impl Dialogue {
                     self.stream(telegram, measured, now);
                 } else {
                     self.sensor.streams = true;
-                    self.proceed(STOPS, now);
+                    self.proceed(Progress::BEGIN, now);
                 }
             }
             Phase::Starting { step: Step::Stream, .. } if measured.is_some() => {
@@ -221,18 +222,17 @@ impl Dialogue {
             Phase::Following | Phase::Paused { .. } => {}
             phase => {
                 self.resyncs += u64::from(matches!(phase, Phase::Streaming { .. }));
-                self.enter(Step::Check, STOPS, now);
+                self.enter(Step::Check, Progress::BEGIN, now);
             }
         }
     }
 
     fn on_reply(&mut self, request: Request, reply: Option<Reply<'_>>, now: Nanos) {
         match self.phase {
-            Phase::Probing { .. } => self.proceed(STOPS, now),
-            Phase::Starting { step, stops_left } => self.on_step(step, stops_left, request, reply, now),
-            Phase::Streaming { .. } => self.question(now),
+            Phase::Probing { .. } => self.proceed(Progress::BEGIN, now),
+            Phase::Starting { step, progress } => self.on_step(step, progress, request, reply, now),
             Phase::Paused { .. } => self.sensor.streams = false,
-            Phase::Listening { .. } | Phase::Following => {}
+            Phase::Streaming { .. } | Phase::Listening { .. } | Phase::Following => {}
         }
     }
 
@@ -240,15 +240,16 @@ impl Dialogue {
     fn retry(&mut self, at: Nanos) {
         let Some(open) = &mut self.open else { return };
         let request = open.request;
-        if open.again(at) {
+        // What it did then is asked, not repeated.
+        let heard = open.reply() == MODE_REPLY && open.is_acknowledged();
+        if !heard && open.again(at) {
             return;
         }
         self.open = None;
         match self.phase {
             Phase::Probing { attempt } => self.search_on(attempt, at),
-            Phase::Starting { step, stops_left } => self.on_no_reply(step, stops_left, request, at),
-            Phase::Streaming { .. } => self.question(at),
-            Phase::Paused { .. } | Phase::Listening { .. } | Phase::Following => {}
+            Phase::Starting { step, progress } => self.on_no_reply(step, progress, request, heard, at),
+            Phase::Streaming { .. } | Phase::Paused { .. } | Phase::Listening { .. } | Phase::Following => {}
         }
     }
 
@@ -280,29 +281,38 @@ impl Dialogue {
         let as_asked = measured.is_some_and(|scan| scan.count() == self.settings.variant.beams());
         self.trouble = (!as_asked).then_some(Trouble::VariantRefused);
         self.sensor.streams = true;
-        self.phase = Phase::Streaming { header, silent_at: self.silent_at(now), questions: QUESTIONS };
-        // Whose reply is under way is not asked twice.
-        if !self.open.as_ref().is_some_and(|open| open.is_out() && QUESTIONS.contains(&open.request)) {
-            self.open = None;
-            self.question(now);
-        }
+        self.phase = Phase::Streaming {
+            header,
+            silent_at: self.silent_at(now),
+            questions: QUESTIONS,
+            tries_left: TRIES,
+        };
+        // A reply that is under way may answer.
+        self.open.take_if(|open| !open.is_out());
+        self.question(now);
     }
 
-    /// Asks an adopted sensor for what its stream does not tell. Each reply costs the scan that it interrupts.
+    /// Right after a scan: asks for what a stream does not tell. A reply costs the scan that it interrupts, so the next
+    /// question waits for the next scan.
     fn question(&mut self, now: Nanos) {
-        let Phase::Streaming { questions, .. } = &mut self.phase else { return };
+        let Phase::Streaming { questions, tries_left, .. } = &mut self.phase else { return };
+        if self.open.is_some() {
+            return;
+        }
         while let Some((&question, rest)) = questions.split_first() {
-            *questions = rest;
             let is_known = match question {
                 Request::Type => !self.sensor.kind().is_empty(),
                 _ => self.sensor.mode.is_some(),
             };
-            if !is_known {
-                return self.ask(question, now, TRIES);
+            if !is_known && *tries_left > 0 {
+                *tries_left -= 1;
+                return self.ask(question, now, 1);
             }
+            (*questions, *tries_left) = (rest, TRIES);
         }
-        if self.sensor.mode.is_none() {
-            self.trouble = Some(Trouble::ModeUnknown);
+        match self.sensor.mode {
+            None => self.trouble = Some(Trouble::ModeUnknown),
+            Some(_) => self.trouble = self.trouble.filter(|&trouble| trouble != Trouble::ModeUnknown),
         }
     }
 
@@ -322,4 +332,5 @@ impl Dialogue {
     }
 }
 
-const _: () = assert!(MORE_TRIES > TRIES);
+/// Command byte of the reply to every change of mode or rate.
+const MODE_REPLY: u8 = MODE | REPLY;

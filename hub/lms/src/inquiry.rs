@@ -5,10 +5,14 @@
 //! once more round: a sensor may overlook a request. A rate at which telegrams were heard is not left so easily.
 
 use crate::command::Request;
+use crate::configuration::Configuration;
+use crate::errors::Errors;
 use crate::exchange::{Conversation, Exchange, Heard, Output};
+use crate::family::Family;
 use crate::framer::{Place, Tally};
 use crate::phase::{LISTEN, SETTLE, TRIES};
-use crate::reply::{Configuration, Reply, StatusReport};
+use crate::reply::Reply;
+use crate::status_report::StatusReport;
 use crate::telegram::{Encoded, MAX_TELEGRAM, REPLY};
 use crate::variant::Baud;
 use crate::{Nanos, line_time};
@@ -59,6 +63,8 @@ pub struct Report {
     pub streams: bool,
     /// The last status byte that came.
     pub status_byte: Option<u8>,
+    /// Bytes that came in all.
+    pub bytes: u64,
     replies: [Option<Encoded>; QUESTIONS.len()],
 }
 
@@ -93,6 +99,14 @@ impl Report {
     pub fn configuration(&self) -> Option<Configuration<'_>> {
         match self.reply(Request::Configuration)? {
             Reply::Configuration(configuration) => Some(configuration),
+            _ => None,
+        }
+    }
+
+    /// What is wrong with it, and what was.
+    pub fn errors(&self) -> Option<Errors<'_>> {
+        match self.reply(Request::Errors)? {
+            Reply::Errors(errors) => Some(errors),
             _ => None,
         }
     }
@@ -176,12 +190,19 @@ impl Inquiry {
     fn ask_after(&mut self, request: Request) {
         let question = place_of(request).map_or(QUESTIONS.len(), |at| at + 1);
         match QUESTIONS.get(question) {
+            Some(Request::Counters) if !self.has_counters() => self.phase = Phase::Done,
             Some(&request) => {
                 self.phase = Phase::Asking { question };
                 self.exchange.ask(request, self.exchange.now, TRIES);
             }
             None => self.phase = Phase::Done,
         }
+    }
+
+    /// What is of no known type would refuse them itself.
+    fn has_counters(&self) -> bool {
+        let family = self.report.kind().and_then(Family::of_type);
+        family.is_none_or(|family| family.refuses(Request::Counters).is_none())
     }
 
     /// The status at the next rate.
@@ -240,6 +261,7 @@ impl Conversation for Inquiry {
 
     fn commit(&mut self, now: Nanos, len: usize) {
         self.exchange.commit(now, len);
+        self.report.bytes += len as u64;
     }
 
     fn handle_timeout(&mut self, now: Nanos) {
@@ -291,7 +313,8 @@ fn is_data(command: u8) -> bool {
 }
 
 /// What is asked, in this order; the first one finds the rate.
-const QUESTIONS: [Request; 3] = [Request::Status, Request::Type, Request::Configuration];
+const QUESTIONS: [Request; 5] =
+    [Request::Status, Request::Type, Request::Configuration, Request::Errors, Request::Counters];
 /// How often all rates are tried.
 const ROUNDS: usize = 2;
 /// More tries at a rate at which telegrams were heard.

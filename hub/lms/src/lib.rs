@@ -16,6 +16,7 @@ mod dialogue;
 pub mod eeprom;
 pub mod errors;
 pub mod exchange;
+pub mod explain;
 pub mod family;
 pub mod framer;
 pub mod header;

@@ -42,9 +42,9 @@ pub(crate) enum Phase {
     /// A status request at one rate after the other.
     Probing { attempt: usize },
     /// The sensor hears us: it is brought to rest, to the wanted rate, to its settings, to a stream.
-    Starting { step: Step, stops_left: u8 },
-    /// Measured data come.
-    Streaming { header: StreamHeader, silent_at: Nanos, questions: &'static [Request] },
+    Starting { step: Step, progress: Progress },
+    /// Measured data come; after each scan a question may be asked, the first one so many times more.
+    Streaming { header: StreamHeader, silent_at: Nanos, questions: &'static [Request], tries_left: u8 },
     /// Bytes come from a recording.
     Following,
     /// Nothing is wanted. A stream that goes on all the same is stopped so many times more.
@@ -64,6 +64,23 @@ pub(crate) enum Step {
     Type,
     Configuration,
     Stream,
+}
+
+/// How far a start is.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Progress {
+    /// Stops that may still be said.
+    pub(crate) stops_left: u8,
+    /// What follows once the sensor is at rest and at the wanted rate.
+    pub(crate) settings: &'static [Step],
+}
+
+impl Progress {
+    /// Nothing was done yet.
+    pub(crate) const BEGIN: Progress = Progress {
+        stops_left: STOPS + 1,
+        settings: &[Step::Variant, Step::Type, Step::Configuration, Step::Stream],
+    };
 }
 
 /// What a user may ask of a running session.
@@ -96,7 +113,7 @@ pub(crate) const OVERLOOKED: Nanos = 25 * MILLIS;
 pub(crate) const PAUSES: [Nanos; 4] = [0, 500 * MILLIS, 1_000 * MILLIS, 1_500 * MILLIS];
 /// In every other round a sensor has so much more time: one that is slow would never be found otherwise.
 pub(crate) const PATIENCE: Nanos = 250 * MILLIS;
-/// Stops beside the first one: what goes on after so many does not listen.
+/// Stops beside the first one; what goes on after so many does not listen.
 pub(crate) const STOPS: u8 = 2;
 /// What a stream does not tell: how values are split, from the one reply or the other, and who sends them.
 pub(crate) const QUESTIONS: &[Request] = &[Request::Status, Request::Configuration, Request::Type];

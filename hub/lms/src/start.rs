@@ -4,36 +4,46 @@
 use crate::Nanos;
 use crate::command::Request;
 use crate::dialogue::Dialogue;
-use crate::phase::{MORE_TRIES, Phase, SETTLE, STOPS, Step, TRIES};
+use crate::phase::{MORE_TRIES, Phase, Progress, SETTLE, Step, TRIES};
 use crate::reply::Reply;
 use crate::sensor::{State, Trouble};
 
 impl Dialogue {
     /// What the sensor does now is known: goes on from there.
-    pub(crate) fn proceed(&mut self, stops_left: u8, now: Nanos) {
-        let step = match stops_left.checked_sub(1) {
-            Some(left) if self.sensor.streams => return self.enter(Step::Stop, left, now),
-            _ if self.baud != self.settings.baud => Step::Baud,
-            _ => Step::Variant,
-        };
-        self.enter(step, stops_left, now);
+    pub(crate) fn proceed(&mut self, progress: Progress, now: Nanos) {
+        match progress.stops_left.checked_sub(1) {
+            Some(stops_left) if self.sensor.streams => {
+                self.enter(Step::Stop, Progress { stops_left, ..progress }, now);
+            }
+            _ if self.baud != self.settings.baud => self.enter(Step::Baud, progress, now),
+            _ => self.settle(progress, now),
+        }
+    }
+
+    /// The next of the settings that is not as it should be.
+    fn settle(&mut self, mut progress: Progress, now: Nanos) {
+        while let Some((&step, rest)) = progress.settings.split_first() {
+            progress.settings = rest;
+            if step != Step::Variant || self.sensor.variant != Some(self.settings.variant) {
+                return self.enter(step, progress, now);
+            }
+        }
+        // The stream was asked for, and what came of it is not known.
+        self.enter(Step::Stream, progress, now);
     }
 
     /// Says what belongs to `step`.
-    pub(crate) fn enter(&mut self, step: Step, stops_left: u8, now: Nanos) {
+    pub(crate) fn enter(&mut self, step: Step, progress: Progress, now: Nanos) {
         let (request, tries) = match step {
             Step::Stop => (Request::Stop, MORE_TRIES),
             Step::Check => (Request::Status, MORE_TRIES),
             Step::Baud => (Request::Baud(self.settings.baud), MORE_TRIES),
-            Step::Variant if self.sensor.variant == Some(self.settings.variant) => {
-                return self.enter(Step::Type, stops_left, now);
-            }
             Step::Variant => (Request::Variant(self.settings.variant), TRIES),
             Step::Type => (Request::Type, TRIES),
             Step::Configuration => (Request::Configuration, TRIES),
             Step::Stream => (Request::Stream, MORE_TRIES),
         };
-        self.phase = Phase::Starting { step, stops_left };
+        self.phase = Phase::Starting { step, progress };
         self.ask(request, now, tries);
     }
 
@@ -41,7 +51,7 @@ impl Dialogue {
     pub(crate) fn on_step(
         &mut self,
         step: Step,
-        stops_left: u8,
+        progress: Progress,
         request: Request,
         reply: Option<Reply<'_>>,
         now: Nanos,
@@ -51,20 +61,19 @@ impl Dialogue {
             Step::Stop | Step::Baud | Step::Stream if failed => self.refused(request, now),
             Step::Stop => {
                 self.sensor.streams = false;
-                self.enter(Step::Check, stops_left, now);
+                self.enter(Step::Check, progress, now);
             }
-            Step::Check => self.proceed(stops_left, now),
+            Step::Check => self.proceed(progress, now),
             Step::Baud => {
                 self.change_baud(self.settings.baud);
-                self.enter(Step::Check, stops_left, now + SETTLE);
+                self.enter(Step::Check, progress, now + SETTLE);
             }
             Step::Variant => {
                 let done = matches!(reply, Some(Reply::Variant { done: true, .. }));
                 self.trouble = (!done).then_some(Trouble::VariantRefused);
-                self.enter(Step::Type, stops_left, now);
+                self.settle(progress, now);
             }
-            Step::Type => self.enter(Step::Configuration, stops_left, now),
-            Step::Configuration => self.enter(Step::Stream, stops_left, now),
+            Step::Type | Step::Configuration => self.settle(progress, now),
             // The stream is there when its first telegram is, which is due like one that went missing.
             Step::Stream => {
                 self.phase =
@@ -73,15 +82,23 @@ impl Dialogue {
         }
     }
 
-    /// The sensor did not answer in all its tries.
-    pub(crate) fn on_no_reply(&mut self, step: Step, stops_left: u8, request: Request, at: Nanos) {
+    /// The sensor did not answer in all its tries, or `heard` the request and did not say what it did.
+    pub(crate) fn on_no_reply(
+        &mut self,
+        step: Step,
+        progress: Progress,
+        request: Request,
+        heard: bool,
+        at: Nanos,
+    ) {
         match step {
-            Step::Variant => {
-                self.trouble = Some(Trouble::VariantRefused);
-                self.enter(Step::Type, stops_left, at);
+            Step::Variant | Step::Type | Step::Configuration => {
+                if step == Step::Variant {
+                    self.trouble = Some(Trouble::VariantRefused);
+                }
+                self.enter(Step::Check, progress, at);
             }
-            Step::Type => self.enter(Step::Configuration, stops_left, at),
-            Step::Configuration => self.enter(Step::Stream, stops_left, at),
+            Step::Stop | Step::Stream if heard => self.enter(Step::Check, progress, at),
             Step::Stop | Step::Check | Step::Baud | Step::Stream => {
                 self.trouble = Some(Trouble::Unanswered(request));
                 self.probe(at, 0);
@@ -89,5 +106,3 @@ impl Dialogue {
         }
     }
 }
-
-const _: () = assert!(STOPS > 0, "a stream must be stopped once");

@@ -66,8 +66,7 @@ impl<'a> StatusReport<'a> {
 
     /// Rate of the line; `None` for an unknown divisor.
     pub fn baud(&self) -> Option<Baud> {
-        let divisor = self.word(115);
-        Baud::ALL.into_iter().find(|&baud| divisor_of(baud) == divisor)
+        baud_of_divisor(self.word(115))
     }
 
     /// Whether the rate after power-on is another than 9600: byte 119, 0 is the factory's.
@@ -142,6 +141,11 @@ fn divisor_of(baud: Baud) -> u16 {
         Baud::B19200 => 0x8033,
         Baud::B9600 => 0x8067,
     }
+}
+
+/// The rate that a word stands for.
+pub(crate) fn baud_of_divisor(divisor: u16) -> Option<Baud> {
+    Baud::ALL.into_iter().find(|&baud| divisor_of(baud) == divisor)
 }
 
 /// How the bytes of a value are read.

@@ -3,8 +3,10 @@
 
 use lms::command::Request;
 use lms::eeprom::Write;
+use lms::explain::{Headline, explain};
 use lms::reply::Reply;
 use lms::telegram::{Encoded, Telegram, Writer};
+use lms::variant::Mode;
 use proptest::prelude::*;
 
 fn telegram(address: u8, command: u8, data: &[u8]) -> Encoded {
@@ -31,6 +33,25 @@ fn data() -> impl Strategy<Value = Vec<u8>> {
     ]
 }
 
+/// Explains `telegram`; every byte of it must be in one field, in order.
+fn explained(telegram: Telegram<'_>, mode: Option<Mode>) -> String {
+    let mut text = Headline(telegram).to_string();
+    let mut at = 0;
+    explain(telegram, mode, &mut |field| {
+        assert_eq!(
+            (field.offset, field.bytes),
+            (at, &telegram.bytes()[at..at + field.bytes.len()]),
+            "{}",
+            field.name
+        );
+        assert!(!field.bytes.is_empty() && !field.name.is_empty());
+        at += field.bytes.len();
+        text += &field.words.map(|words| words.to_string()).unwrap_or_default();
+    });
+    assert_eq!(at, telegram.bytes().len());
+    text
+}
+
 proptest! {
     #![proptest_config(ProptestConfig { cases: 4000, failure_persistence: None, ..ProptestConfig::default() })]
 
@@ -39,6 +60,16 @@ proptest! {
         if let Some(telegram) = Telegram::check(&bytes) {
             let _ = (Request::decode(telegram), Reply::decode(telegram), Write::decode(telegram));
         }
+    }
+
+    #[test]
+    fn explanations(
+        address in any::<u8>(),
+        command in commands(),
+        data in data(),
+        mode in proptest::option::of(any::<u8>().prop_map(Mode)),
+    ) {
+        prop_assert!(!explained(telegram(address, command, &data).telegram(), mode).is_empty());
     }
 
     #[test]

@@ -71,6 +71,15 @@ impl Wire {
         }
     }
 
+    /// From now on other things go wrong, drawn anew; what is under way stays as it is.
+    pub fn set_faults(&mut self, faults: &Faults, seed: u64) {
+        let fresh = Wire::new(faults, seed);
+        let lateness = fresh.lateness.behind(&self.lateness);
+        let (queue, header) = (std::mem::take(&mut self.queue), std::mem::take(&mut self.header));
+        let Wire { position, fault, power_broke, .. } = *self;
+        *self = Wire { lateness, position, fault, power_broke, queue, header, ..fresh };
+    }
+
     /// Whether the host's adapter is in its socket, as of the last poll.
     pub fn is_plugged(&self) -> bool {
         self.plugged

@@ -27,6 +27,11 @@ impl Lateness {
         }
     }
 
+    /// The same, but behind what `other` holds back.
+    pub(crate) fn behind(self, other: &Lateness) -> Lateness {
+        Lateness { last_ns: other.last_ns, ..self }
+    }
+
     /// When a piece arrives that is through at `now`.
     pub(crate) fn release_ns(&mut self, now: Nanos) -> Nanos {
         let delay_ns = if self.delay_ns > 0 { self.random.u64(..=self.delay_ns) } else { 0 };

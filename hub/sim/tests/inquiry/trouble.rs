@@ -59,7 +59,7 @@ fn silence_is_told_in_bounded_time() {
     let report = bench.talk.report();
     assert_eq!((report.baud, report.answers(), report.streams), (None, false, false));
     println!("silence: {} ms", took / MILLIS);
-    assert!(took < 3_000 * MILLIS, "{took} ns");
+    assert!(took < 5_000 * MILLIS, "{took} ns");
 }
 
 #[test]

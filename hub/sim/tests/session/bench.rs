@@ -73,6 +73,11 @@ pub(crate) fn sensor(baud: Baud) -> Machine {
     Machine::new(settings, Source::Room(Room::new(World::Room, 1)))
 }
 
+/// The sensor of `settings` in a room.
+pub(crate) fn sensor_with(settings: machine::Settings) -> Machine {
+    Machine::new(settings, Source::Room(Room::new(World::Room, 1)))
+}
+
 /// Makes `machine` stream, as a host did that is gone; returns the time.
 pub(crate) fn make_stream(machine: &mut Machine) -> Nanos {
     let mut now = 10 * MILLIS;
@@ -113,6 +118,12 @@ impl Bench {
             looks: 0,
             request: Vec::new(),
         }
+    }
+
+    /// A session with a past, none of whose requests is half said, gets this machine.
+    pub(crate) fn adopting(session: Session, machine: Machine, now: Nanos) -> Bench {
+        let (port, read) = (session.baud(), session.tally().read);
+        Bench { port, read, session, ..Bench::new(machine, now) }
     }
 
     /// Runs for `span`.

@@ -3,8 +3,14 @@
 mod adoption;
 mod bench;
 mod control;
+mod figures;
 mod fixed_rate;
+mod habits;
+mod installation;
 mod loss;
+mod modes;
+mod power;
+mod property;
 mod rest;
 mod start;
 mod trouble;

@@ -1,0 +1,45 @@
+//! `scanhub doctor` on the command line: what it takes, and a line for each finding.
+
+use std::sync::atomic::AtomicBool;
+
+use clap::Args;
+use daemon::Config;
+use daemon::doctor::{Subjects, examine};
+use daemon::probe::source;
+use schema::Failure;
+
+use super::{Everywhere, Run};
+
+#[derive(Args, Debug)]
+pub(crate) struct Doctor {
+    /// A tty; without one those of the configuration, else all that there are
+    #[arg(value_name = "PORT")]
+    ports: Vec<String>,
+    #[command(flatten)]
+    run: Run,
+}
+
+impl Doctor {
+    pub(crate) fn run(&self, everywhere: &Everywhere, stop: &AtomicBool) -> Result<(), Failure> {
+        let sources = self.run.sources();
+        let is_said = !(sources.files.is_empty() && sources.links.is_empty() && sources.set.is_empty());
+        let subjects = Subjects {
+            ports: self.ports.iter().map(|port| source(port)).collect::<Result<_, _>>()?,
+            config: is_said.then(|| Config::load(&sources)),
+            domain: everywhere.hub_domain()?,
+            places: everywhere.places()?,
+        };
+        let mut port = None;
+        examine(&subjects, stop, &mut |finding| {
+            if everywhere.json {
+                return crate::say(&crate::line(finding));
+            }
+            if port != finding.port {
+                port.clone_from(&finding.port);
+                let link = finding.link.as_ref().map(|link| format!(" (link {link})"));
+                crate::say(&format!("\n{}{}", port.as_deref().unwrap_or_default(), link.unwrap_or_default()));
+            }
+            crate::say(&finding.to_string());
+        })
+    }
+}

@@ -1,0 +1,105 @@
+//! `scanhub probe` on the command line: what it takes, and what it says.
+
+use std::io::{IsTerminal, Write, stderr};
+use std::sync::atomic::AtomicBool;
+
+use clap::Args;
+use daemon::port::Candidate;
+use daemon::probe::{list, probe, source};
+use schema::Failure;
+use serde::Serialize;
+
+#[derive(Args, Debug)]
+pub(crate) struct Probe {
+    /// A tty; without one the ports of this machine are listed
+    #[arg(value_name = "PORT")]
+    port: Option<String>,
+}
+
+impl Probe {
+    pub(crate) fn run(&self, json: bool, stop: &AtomicBool) -> Result<(), Failure> {
+        let Some(port) = &self.port else {
+            for candidate in list()? {
+                crate::say(&if json { crate::line(&Line::of(&candidate)) } else { describe(&candidate) });
+            }
+            return Ok(());
+        };
+        let mut progress = Progress::new();
+        let found = probe(&source(port)?, stop, |rate| progress.show(&format!("looking at {rate} Bd")));
+        drop(progress);
+        let found = found?;
+        crate::say(&if json {
+            crate::line(&found)
+        } else {
+            format!("{port}\n{}", found.to_string().trim_end())
+        });
+        Ok(())
+    }
+}
+
+/// A line on the terminal that the next one overwrites; nothing if there is no terminal.
+pub(crate) struct Progress {
+    is_terminal: bool,
+}
+
+impl Progress {
+    pub(crate) fn new() -> Progress {
+        Progress { is_terminal: stderr().is_terminal() }
+    }
+
+    pub(crate) fn show(&mut self, text: &str) {
+        if self.is_terminal {
+            let _ = write!(stderr(), "\r\x1b[K{text} ..");
+        }
+    }
+}
+
+impl Drop for Progress {
+    fn drop(&mut self) {
+        if self.is_terminal {
+            let _ = write!(stderr(), "\r\x1b[K");
+        }
+    }
+}
+
+/// Class `candidate`.
+#[derive(Serialize)]
+struct Line<'a> {
+    class: &'static str,
+    port: String,
+    device: String,
+    driver: Option<&'a str>,
+    product: Option<&'a str>,
+    permitted: bool,
+    /// The process that has it open.
+    holder: Option<u32>,
+    program: Option<&'a str>,
+}
+
+impl<'a> Line<'a> {
+    fn of(candidate: &'a Candidate) -> Line<'a> {
+        Line {
+            class: "candidate",
+            port: candidate.name.display().to_string(),
+            device: candidate.device.display().to_string(),
+            driver: candidate.driver.as_deref(),
+            product: candidate.product.as_deref(),
+            permitted: candidate.is_permitted,
+            holder: candidate.holder.as_ref().map(|holder| holder.pid),
+            program: candidate.holder.as_ref().map(|holder| holder.program.as_str()),
+        }
+    }
+}
+
+fn describe(candidate: &Candidate) -> String {
+    let Candidate { name, device, driver, product, holder, is_permitted, .. } = candidate;
+    let state = match (holder, is_permitted) {
+        (Some(holder), _) => format!("in use by {holder}"),
+        (None, true) => "free".to_owned(),
+        (None, false) => format!("no permission: scanhub doctor {} tells why", name.display()),
+    };
+    let device = (name != device).then(|| device.display().to_string());
+    let facts: Vec<String> =
+        [device, product.clone(), driver.clone(), Some(state)].into_iter().flatten().collect();
+    format!("{}  {}", name.display(), facts.join(", "))
+}

@@ -1,0 +1,105 @@
+//! `scanhub doctor`: every condition that a working set-up needs, one after the other, with what was found and what to
+//! do. Changes nothing: no sensor, no file, no process.
+
+mod finding;
+mod hub;
+mod line;
+mod machine;
+mod sensor;
+
+use std::sync::atomic::AtomicBool;
+
+use schema::{Domain, Failure, Kind};
+
+use crate::config::{Config, Link, Source};
+use crate::port::{Candidate, candidates};
+pub use finding::{Finding, State};
+use hub::Hub;
+use machine::Facts;
+
+/// What to examine.
+#[derive(Clone, Debug)]
+pub struct Subjects {
+    /// Ports as the user named them; none: those of the configuration.
+    pub ports: Vec<Source>,
+    /// The configuration, or why there is none; nothing if nobody wrote one.
+    pub config: Option<Result<Config, Failure>>,
+    /// Where a hub would put its domain.
+    pub domain: Domain,
+    /// Where a client would look for it.
+    pub places: Vec<Domain>,
+}
+
+/// A port under examination, and what the configuration wants of it.
+pub(crate) struct Subject {
+    pub(crate) source: Source,
+    pub(crate) link: Option<Link>,
+}
+
+/// Examines everything, telling each finding as soon as it is there.
+///
+/// [`Kind::Check`] with the number of checks that failed, [`Kind::Interrupted`] if `stop` is set.
+pub fn examine(
+    subjects: &Subjects,
+    stop: &AtomicBool,
+    tell: &mut dyn FnMut(&Finding),
+) -> Result<(), Failure> {
+    let mut failed = 0;
+    let mut tell = |finding: Finding| {
+        failed += usize::from(finding.state == State::Failed);
+        tell(&finding);
+    };
+    let there = candidates();
+    let ports = choose(subjects, &there, &mut tell);
+    let home = subjects.places.iter().find(|place| matches!(schema::holder(place.root()), Ok(Some(_))));
+    let domain = home.unwrap_or(&subjects.domain);
+    let facts = Facts::gather(domain, ports.len().max(1));
+    tell(machine::memory(&facts));
+    tell(machine::domain(&facts));
+    tell(machine::leftovers(&facts));
+    tell(machine::descriptors(&facts));
+    let hub = Hub::find(domain);
+    for subject in &ports {
+        let (port, link) = (subject.source.name(), subject.link.as_ref().map(|link| link.name.as_str()));
+        line::examine(subject, &there, hub.as_ref(), stop, &mut |finding| tell(finding.at(&port, link)))?;
+    }
+    match failed {
+        0 => Ok(()),
+        1 => Err(Failure::new(Kind::Check, "1 check failed", "do what stands below it")),
+        _ => Err(Failure::new(Kind::Check, format!("{failed} checks failed"), "do what stands below each")),
+    }
+}
+
+/// The ports that the user named, else those of the configuration, else all that there are.
+fn choose(subjects: &Subjects, there: &[Candidate], tell: &mut impl FnMut(Finding)) -> Vec<Subject> {
+    const NAME: &str = "configuration";
+    let links = match &subjects.config {
+        Some(Ok(config)) => {
+            let names: Vec<&str> = config.links.iter().map(|link| link.name.as_str()).collect();
+            tell(Finding::ok(NAME, format!("links {}", names.join(", "))));
+            &config.links[..]
+        }
+        Some(Err(failure)) => {
+            tell(Finding::failed(NAME, failure.message.clone(), failure.hint.clone()));
+            &[]
+        }
+        None => &[],
+    };
+    let of_link = |source: &Source| links.iter().find(|link| link.port == *source).cloned();
+    if !subjects.ports.is_empty() {
+        let named = subjects.ports.iter();
+        return named.map(|source| Subject { source: source.clone(), link: of_link(source) }).collect();
+    }
+    if !links.is_empty() {
+        let ports = links.iter();
+        return ports.map(|link| Subject { source: link.port.clone(), link: Some(link.clone()) }).collect();
+    }
+    if there.is_empty() {
+        tell(Finding::failed(
+            "ports",
+            "no serial line on this machine",
+            "plug an adapter in, or name a port",
+        ));
+    }
+    there.iter().map(|port| Subject { source: Source::Tty(port.name.clone()), link: None }).collect()
+}

@@ -1,0 +1,193 @@
+//! One port from the outside in: is it there, may it be used, by whom is it, what can it do; and then who is at its other
+//! end.
+
+use std::os::unix::fs::FileTypeExt;
+use std::path::Path;
+use std::sync::atomic::AtomicBool;
+
+use lms::variant::Baud;
+use rustix::fs::{Mode, OFlags, open};
+use rustix::termios::isatty;
+use schema::{Failure, Kind};
+
+use super::Subject;
+use super::finding::Finding;
+use super::hub::Hub;
+use super::sensor;
+use crate::config::Source;
+use crate::port::{Candidate, Port, Refusal, holder};
+use crate::probe;
+
+/// Examines a port and its sensor.
+///
+/// [`Kind::Interrupted`] if `stop` is set; everything else is a finding.
+pub(crate) fn examine(
+    subject: &Subject,
+    there: &[Candidate],
+    hub: Option<&Hub>,
+    stop: &AtomicBool,
+    tell: &mut dyn FnMut(Finding),
+) -> Result<(), Failure> {
+    let path = match &subject.source {
+        Source::Tty(path) => path,
+        Source::File { path, .. } => {
+            tell(recording(path));
+            return Ok(());
+        }
+        Source::Tcp { .. } => {
+            tell(Finding::skipped("sensor", "is behind a serial server"));
+            return Ok(());
+        }
+    };
+    let candidate = candidate(path, there);
+    tell(presence(&subject.source, path, candidate));
+    if !path.exists() {
+        return Ok(());
+    }
+    if !is_tty(path) {
+        tell(refused(Refusal::NotTty.explain(&subject.source)));
+        return Ok(());
+    }
+    tell(latency(candidate));
+    if let Some(holder) = holder(path) {
+        // To open it would change its settings under who has it.
+        let by_hub = hub.filter(|hub| holder.pid == hub.pid);
+        match by_hub {
+            Some(hub) => {
+                tell(Finding::ok("holder", format!("the hub has it, {holder}")));
+                tell(sensor::as_the_hub_says(hub.link(&subject.source.name())));
+            }
+            None => {
+                tell(refused(Refusal::Busy.explain(&subject.source)));
+                tell(Finding::skipped("sensor", "its port is in use"));
+            }
+        }
+        return Ok(());
+    }
+    tell(Finding::ok("holder", "nobody has it open"));
+    let (port, first) = match probe::open(&subject.source) {
+        Ok(opened) => opened,
+        Err(failure) => {
+            tell(refused(failure));
+            return Ok(());
+        }
+    };
+    tell(Finding::ok("access", "can be opened, is a serial line"));
+    tell(rate(subject, &port, first));
+    let report = match probe::inquire(&port, first, stop, |_| {}) {
+        Ok(report) => report,
+        Err(failure) if failure.kind == Kind::Interrupted => return Err(failure),
+        Err(failure) => {
+            tell(Finding::failed("sensor", failure.message, failure.hint));
+            return Ok(());
+        }
+    };
+    if !report.answers() {
+        let failure = probe::silence(&subject.source, &report);
+        tell(Finding::failed("sensor", failure.message, failure.hint));
+        return Ok(());
+    }
+    for finding in sensor::examine(&report, subject.link.as_ref()) {
+        tell(finding);
+    }
+    Ok(())
+}
+
+fn recording(path: &Path) -> Finding {
+    if path.is_file() {
+        Finding::ok("port", "a recording")
+    } else {
+        Finding::failed("port", "no such file", "name an existing recording")
+    }
+}
+
+/// What the machine knows of the port.
+fn candidate<'a>(path: &Path, there: &'a [Candidate]) -> Option<&'a Candidate> {
+    let device = path.canonicalize().ok()?;
+    there.iter().find(|candidate| candidate.device == device)
+}
+
+/// Whether it is there, and under a name that stays.
+fn presence(source: &Source, path: &Path, candidate: Option<&Candidate>) -> Finding {
+    const NAME: &str = "port";
+    if !path.exists() {
+        return refused(Refusal::Missing.explain(source));
+    }
+    let Some(Candidate { name, device, .. }) = candidate else {
+        let device = path.canonicalize().unwrap_or_else(|_| path.to_owned());
+        return Finding::ok(NAME, format!("{}, no hardware behind it", device.display()));
+    };
+    let text = candidate.map(describe).unwrap_or_default();
+    if name != device && path == device {
+        let remedy = format!("name {}, which is the same wherever it is plugged in", name.display());
+        return Finding::warning(NAME, format!("{text}; the name may be another one's tomorrow"), remedy);
+    }
+    Finding::ok(NAME, text)
+}
+
+fn describe(candidate: &Candidate) -> String {
+    let Candidate { device, driver, product, .. } = candidate;
+    let mut text = device.display().to_string();
+    for word in [product, driver].into_iter().flatten() {
+        text = format!("{text}, {word}");
+    }
+    text
+}
+
+/// Whether it is a terminal, as far as this user can find out; looking changes nothing in it.
+fn is_tty(path: &Path) -> bool {
+    let is_char_device = path.metadata().is_ok_and(|metadata| metadata.file_type().is_char_device());
+    let flags = OFlags::RDWR | OFlags::NOCTTY | OFlags::NONBLOCK | OFlags::CLOEXEC;
+    // One that cannot be opened says why later.
+    is_char_device && open(path, flags, Mode::empty()).map_or(true, isatty)
+}
+
+/// Why it cannot be opened.
+fn refused(failure: Failure) -> Finding {
+    let name = match failure.kind {
+        Kind::PortBusy => "holder",
+        Kind::PortMissing => "port",
+        Kind::PortRate => "rate",
+        _ => "access",
+    };
+    Finding::failed(name, failure.message, failure.hint)
+}
+
+/// Whether the adapter collects bytes before it hands them over.
+fn latency(candidate: Option<&Candidate>) -> Finding {
+    const NAME: &str = "latency";
+    let Some((candidate, ms)) = candidate.and_then(|it| Some((it, it.latency_ms?))) else {
+        return Finding::skipped(NAME, "the driver has no timer to look at");
+    };
+    if ms <= 1 {
+        return Finding::ok(NAME, format!("the adapter hands over bytes after {ms} ms"));
+    }
+    let name = candidate.device.file_name().unwrap_or_default().to_string_lossy();
+    let remedy = format!(
+        "echo 1 | sudo tee /sys/class/tty/{name}/device/latency_timer; for good by udev: \
+         SUBSYSTEM==\"usb-serial\", DRIVER==\"ftdi_sio\", ATTR{{latency_timer}}=\"1\""
+    );
+    Finding::warning(NAME, format!("the adapter collects bytes for {ms} ms: scans are late by that"), remedy)
+}
+
+/// Whether it can have the rate to stream at.
+fn rate(subject: &Subject, port: &Port, first: Baud) -> Finding {
+    const NAME: &str = "rate";
+    let wanted = subject.link.as_ref().map_or(Baud::B500000, |link| link.baud);
+    let outcome = port.set_baud(wanted.rate());
+    // The inquiry begins at the rate at which it was opened.
+    let _ = port.set_baud(first.rate());
+    match outcome {
+        Ok(()) => Finding::ok(NAME, format!("{} Bd is possible", wanted.rate())),
+        Err(error) if subject.link.is_some() => Finding::failed(
+            NAME,
+            error.to_string(),
+            "set a rate that it can: link.NAME.baud = 38400; or take an adapter with an FT232R or newer",
+        ),
+        Err(error) => Finding::warning(
+            NAME,
+            error.to_string(),
+            "at 38400 Bd a sensor sends 5 scans a second instead of 37; an adapter with an FT232R or newer does it",
+        ),
+    }
+}

@@ -1,0 +1,155 @@
+//! The sensor at the other end: does it answer, is it set as the configuration wants it, is it well. Judges what it said;
+//! refuses to ask.
+
+use lms::condition::{Condition, Severity};
+use lms::errors::Fault;
+use lms::family::Family;
+use lms::inquiry::Report;
+use lms::variant::{Unit, Variant};
+use schema::{State, Status};
+
+use super::finding::Finding;
+use crate::config::Link;
+
+/// What follows from what the sensor said of itself.
+pub(crate) fn examine(report: &Report, link: Option<&Link>) -> Vec<Finding> {
+    vec![answer(report), settings(report, link), power_on(report), health(report)]
+}
+
+/// The port is the hub's: what it says of its link.
+pub(crate) fn as_the_hub_says(link: Option<(&str, &Status)>) -> Finding {
+    const NAME: &str = "sensor";
+    let Some((name, status)) = link else {
+        return Finding::skipped(NAME, "the hub has the port under another name: scanhub info");
+    };
+    let text = format!(
+        "link {name} of the hub: {}, {}",
+        status.state().map_or("unknown", State::name),
+        match status.sensor_type() {
+            "" => "type not known",
+            kind => kind,
+        }
+    );
+    match (status.state(), status.last_error()) {
+        (Some(State::Streaming | State::Paused), "") => {
+            Finding::ok(NAME, format!("{text}, {} Bd", status.baud))
+        }
+        (Some(State::Streaming | State::Paused), error) => {
+            Finding::warning(NAME, format!("{text}: {error}"), format!("scanhub info {name}"))
+        }
+        (_, error) => Finding::failed(NAME, format!("{text}: {error}"), format!("scanhub info {name}")),
+    }
+}
+
+/// Who it is.
+fn answer(report: &Report) -> Finding {
+    const NAME: &str = "sensor";
+    let kind = report.kind().map(|kind| String::from_utf8_lossy(kind).into_owned());
+    let rate = report.baud.map_or(0, |baud| baud.rate());
+    let text = format!("{} at {rate} Bd", kind.as_deref().unwrap_or("a sensor that does not tell its type"));
+    Finding::ok(NAME, text)
+}
+
+/// Whether unit and variant are those of the configuration.
+fn settings(report: &Report, link: Option<&Link>) -> Finding {
+    const NAME: &str = "settings";
+    let Some(status) = report.status() else {
+        return Finding::warning(NAME, "it does not tell its settings", "power it off and on again");
+    };
+    let text = format!(
+        "{}, {}, measuring mode {:02x}h",
+        status.variant().map_or("unknown view".into(), in_words),
+        status.unit().map_or("unknown unit".into(), |unit| format!("unit {} mm", unit.mm())),
+        status.mode().0
+    );
+    let mut wrong = Vec::new();
+    let family = report.kind().and_then(Family::of_type);
+    if let Some((expected, is)) = link.and_then(|link| link.family).zip(family)
+        && expected != is
+    {
+        wrong.push((
+            format!("the configuration says type {}, it is a {}", expected.name(), is.name()),
+            "correct the type in the configuration, or plug in the other sensor".to_owned(),
+        ));
+    }
+    if let Some((expected, is)) = link.and_then(|link| link.unit).zip(status.unit())
+        && expected != is
+    {
+        wrong.push((
+            format!("the configuration says unit {} mm", expected.mm()),
+            format!("scanhub configure PORT unit={}, or correct the configuration", word(expected)),
+        ));
+    }
+    if wrong.is_empty() {
+        return Finding::ok(NAME, text);
+    }
+    let (whats, remedies): (Vec<_>, Vec<_>) = wrong.into_iter().unzip();
+    Finding::warning(NAME, format!("{text}; {}", whats.join("; ")), remedies.join("; "))
+}
+
+/// Whether a former owner has changed the rate at which it comes up.
+fn power_on(report: &Report) -> Finding {
+    const NAME: &str = "power-on";
+    match report.status() {
+        Some(status) if status.has_permanent_baud() => Finding::warning(
+            NAME,
+            "it comes up at another rate than 9600 Bd, as somebody has set it",
+            "the hub finds it all the same, other programs may not: scanhub configure PORT power_on_baud=9600",
+        ),
+        Some(status) if status.operating_mode() == INSTALLATION => Finding::warning(
+            NAME,
+            "somebody left it in installation mode, in which its field outputs are blocked",
+            "scanhub run leaves it; or power it off and on again",
+        ),
+        _ => Finding::ok(NAME, "comes up at 9600 Bd"),
+    }
+}
+
+/// What it complains of: itself, its window, its errors.
+fn health(report: &Report) -> Finding {
+    const NAME: &str = "health";
+    let is_current = |fault: &Fault| !fault.is_past() && fault.severity() >= Some(Severity::Warning);
+    let faults: Vec<Fault> = report.errors().map(|errors| errors.iter().collect()).unwrap_or_default();
+    let mut complaints: Vec<String> =
+        faults.iter().filter(|fault| is_current(fault)).map(Fault::to_string).collect();
+    let status = report.status();
+    if status.is_some_and(|status| !status.is_laser_on()) {
+        complaints.insert(0, "its laser is off".to_owned());
+    }
+    let condition = report.status_byte.map(Condition);
+    if condition.is_some_and(Condition::is_polluted) {
+        complaints.insert(0, "its window is dirty".to_owned());
+    }
+    if status.is_some_and(|status| status.is_defective()) {
+        complaints.insert(0, "it calls itself defective".to_owned());
+        return Finding::failed(NAME, complaints.join("; "), "a repair: no setting changes that");
+    }
+    let past = match faults.iter().filter(|fault| fault.is_past()).count() {
+        0 => String::new(),
+        past => format!(", {past} in its memory: scanhub probe shows them"),
+    };
+    if complaints.is_empty() {
+        return Finding::ok(NAME, format!("no complaint{past}"));
+    }
+    Finding::warning(
+        NAME,
+        complaints.join("; "),
+        format!("clean its window, look at what is before it{past}"),
+    )
+}
+
+fn in_words(variant: Variant) -> String {
+    let Variant { angle_deg, resolution_cdeg } = variant;
+    format!("{angle_deg} degrees at {}", f64::from(resolution_cdeg) / 100.0)
+}
+
+fn word(unit: Unit) -> &'static str {
+    match unit {
+        Unit::Cm => "cm",
+        Unit::Mm => "mm",
+        Unit::Dm => "dm",
+    }
+}
+
+/// The operating mode in which the EEPROM can be written.
+const INSTALLATION: u8 = 0x00;

@@ -1,0 +1,176 @@
+//! What a sensor said of itself, for people and for programs: class `probe`. Words and keys; refuses to ask anything.
+
+use std::fmt;
+
+use lms::command::Request;
+use lms::condition::Condition;
+use lms::configuration::availability_words;
+use lms::inquiry::Report;
+use lms::reply::Reply;
+use lms::variant::Mode;
+use serde::Serialize;
+
+/// A sensor; what it did not tell is null.
+#[derive(Clone, Debug, Serialize)]
+pub struct Description {
+    class: &'static str,
+    port: String,
+    baud: Option<u32>,
+    #[serde(rename = "type")]
+    kind: Option<String>,
+    number: Option<String>,
+    firmware: Option<String>,
+    address: Option<u8>,
+    operating_mode: Option<u8>,
+    mode: Option<u8>,
+    unit_mm: Option<u8>,
+    angle_deg: Option<u16>,
+    step_deg: Option<f64>,
+    /// Whether it comes up at another rate than 9600.
+    permanent_rate: Option<bool>,
+    defective: Option<bool>,
+    condition: Option<String>,
+    polluted: Option<bool>,
+    laser_on: Option<bool>,
+    availability: Option<u8>,
+    errors: Option<Vec<Fault>>,
+    hours: Option<u32>,
+    power_ons: Option<u16>,
+    /// The first part of the configuration in hex, as `configure` can restore it.
+    configuration: Option<String>,
+}
+
+#[derive(Clone, Debug, Serialize)]
+struct Fault {
+    severity: Option<&'static str>,
+    number: u8,
+    past: bool,
+    meaning: Option<&'static str>,
+}
+
+impl Description {
+    /// Of the sensor at `port`, which said what is in `report`.
+    pub fn new(port: String, report: &Report) -> Description {
+        let kind = report.kind().map(|kind| String::from_utf8_lossy(kind).into_owned());
+        let mut words = kind.iter().flat_map(|kind| kind.split(';')).map(|word| word.trim().to_owned());
+        let (kind, number, firmware) = (words.next(), words.next(), words.next());
+        let status = report.status();
+        let variant = status.and_then(|status| status.variant());
+        let condition = report.status_byte.map(Condition);
+        let configuration = report.configuration();
+        let faults = |fault: lms::errors::Fault| Fault {
+            severity: fault.severity().map(|severity| severity.name()),
+            number: fault.number,
+            past: fault.is_past(),
+            meaning: fault.meaning(),
+        };
+        let (hours, power_ons) = match report.reply(Request::Counters) {
+            Some(Reply::Counters { hours_by_2, power_ons }) => {
+                (Some(2 * u32::from(hours_by_2)), Some(power_ons))
+            }
+            _ => (None, None),
+        };
+        Description {
+            class: "probe",
+            port,
+            baud: report.baud.map(|baud| baud.rate()),
+            kind,
+            number,
+            firmware: firmware
+                .or(status.map(|status| String::from_utf8_lossy(status.software()).into_owned())),
+            address: report.address,
+            operating_mode: status.map(|status| status.operating_mode()),
+            mode: status.map(|status| status.mode().0),
+            unit_mm: status.and_then(|status| status.unit()).map(|unit| unit.mm()),
+            angle_deg: variant.map(|variant| variant.angle_deg),
+            step_deg: variant.map(|variant| f64::from(variant.resolution_cdeg) / 100.0),
+            permanent_rate: status.map(|status| status.has_permanent_baud()),
+            defective: status.map(|status| status.is_defective()),
+            condition: condition.map(|condition| condition.to_string()),
+            polluted: condition.map(Condition::is_polluted),
+            laser_on: status.map(|status| status.is_laser_on()),
+            availability: configuration.map(|configuration| configuration.availability()),
+            errors: report.errors().map(|errors| errors.iter().map(faults).collect()),
+            hours,
+            power_ons,
+            configuration: configuration.map(|configuration| hex(configuration.bytes())),
+        }
+    }
+}
+
+impl fmt::Display for Description {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let mut row = |label: &str, value: Option<String>| match value {
+            Some(value) => writeln!(f, "  {label:<16}{value}"),
+            None => Ok(()),
+        };
+        let (kind, number) = (self.kind.as_deref(), self.number.as_deref());
+        row("type", kind.map(|kind| format!("{kind}, number {}", number.unwrap_or("not told"))))?;
+        row("firmware", self.firmware.clone())?;
+        row("rate", self.baud.map(|baud| format!("{baud} Bd")))?;
+        let power_on = |permanent| if permanent { "as it was set, not 9600 Bd" } else { "9600 Bd" };
+        row("after power-on", self.permanent_rate.map(|permanent| power_on(permanent).to_owned()))?;
+        row("address", self.address.map(|address| address.to_string()))?;
+        row("operating mode", self.operating_mode.map(|mode| format!("{mode:02x}h, {}", operating(mode))))?;
+        row("measuring mode", self.mode.map(|mode| format!("{mode:02x}h, {}", measuring(Mode(mode)))))?;
+        row("unit", self.unit_mm.map(|mm| format!("{mm} mm")))?;
+        let view = self.angle_deg.zip(self.step_deg);
+        row("view", view.map(|(angle, step)| format!("{angle} degrees in steps of {step}")))?;
+        row("availability", self.availability.map(|byte| availability_words(byte).to_owned()))?;
+        let told = if self.defective == Some(true) { "calls itself defective; " } else { "" };
+        row("condition", self.condition.as_ref().map(|condition| format!("{told}{condition}")))?;
+        row("laser", self.laser_on.map(|on| if on { "on" } else { "off" }.to_owned()))?;
+        row("hours", self.hours.map(|hours| hours.to_string()))?;
+        row("power-ons", self.power_ons.map(|count| count.to_string()))?;
+        let errors = self.errors.as_deref();
+        row("errors", errors.map(|errors| if errors.is_empty() { "none" } else { "" }.to_owned()))?;
+        for fault in errors.unwrap_or_default() {
+            let past = if fault.past { "past " } else { "" };
+            let (severity, meaning) =
+                (fault.severity.unwrap_or("unknown"), fault.meaning.unwrap_or_default());
+            row("", Some(format!("{past}{severity} {}: {meaning}", fault.number)))?;
+        }
+        row("configuration", self.configuration.clone())
+    }
+}
+
+/// What the sensor does, by the byte after command 20h (Telegram listing 7.3).
+fn operating(mode: u8) -> &'static str {
+    match mode {
+        0x00 => "installation: somebody left it there, its field outputs are blocked",
+        0x10 => "diagnosis",
+        0x20..=0x23 | 0x2C => "streams least values",
+        0x24 => "streams all values",
+        0x25 => "values on request",
+        0x26 => "streams mean values",
+        0x27 => "streams a sub-range",
+        0x28 => "streams mean values of a sub-range",
+        0x29 => "streams a sub-range with field values",
+        0x2A => "streams partial scans",
+        0x2B | 0x50 => "streams ranges and reflectivities",
+        0x2E => "streams records for navigation",
+        _ => "not known here",
+    }
+}
+
+/// How the values are split (Telegram listing, 77h block D).
+fn measuring(mode: Mode) -> String {
+    let upper = match (mode.0, mode.intensity_bits()) {
+        (0x00, _) => "fields A and B, dazzle",
+        (0x02, _) => "fields A, B and C",
+        (0x04, _) => "fields A and B",
+        (0x06, _) => "field A",
+        (0x0F, _) => "nothing beside it",
+        (0x3F, _) => return "energy instead of ranges".to_owned(),
+        (_, 3) => "8 levels of reflectors",
+        (_, 2) => "4 levels of reflectors",
+        (_, 1) => "reflector or not",
+        _ => return "reserved".to_owned(),
+    };
+    format!("{} bits of range, {upper}", mode.range_bits())
+}
+
+/// Bytes in lower hex, without spaces.
+fn hex(bytes: &[u8]) -> String {
+    bytes.iter().map(|byte| format!("{byte:02x}")).collect()
+}

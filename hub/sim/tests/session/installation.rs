@@ -1,0 +1,38 @@
+//! What somebody left behind in a sensor: the installation mode, in which it does not measure, and a rate in its
+//! EEPROM, which is none of ours to change.
+
+use lms::MILLIS;
+use lms::variant::Baud;
+use sim::machine::{Settings, Start};
+use sim::operating::Operating;
+
+use crate::bench::{Bench, sensor_with};
+
+#[test]
+fn the_installation_mode_is_left() {
+    for baud in Baud::ALL {
+        let settings = Settings { baud, start: Start::In(Operating::Installation), ..Settings::default() };
+        let mut bench = Bench::new(sensor_with(settings), 0);
+        bench.until("streaming", 3_000 * MILLIS, Bench::is_streaming);
+        bench.run(1_000 * MILLIS);
+        assert!(bench.is_streaming() && bench.machine.operating() == &Operating::All, "{bench}");
+        assert_eq!(bench.session.trouble(), None);
+    }
+}
+
+#[test]
+fn a_permanent_rate_is_found_worked_with_and_kept() {
+    for permanent in Baud::ALL {
+        let settings = Settings { baud: permanent, permanent_baud: Some(permanent), ..Settings::default() };
+        let mut bench = Bench::new(sensor_with(settings), 0);
+        bench.until("streaming", 3_000 * MILLIS, Bench::is_streaming);
+        bench.run(500 * MILLIS);
+        // It comes back at its own rate, and is found again.
+        let now = bench.now;
+        bench.machine.power_cycle(now);
+        bench.until("silent", 1_200 * MILLIS, |bench| !bench.is_streaming());
+        bench.until("streaming", 8_000 * MILLIS, Bench::is_streaming);
+        bench.run(500 * MILLIS);
+        assert!(bench.is_streaming() && bench.session.baud() == Baud::B500000, "{permanent:?}: {bench}");
+    }
+}

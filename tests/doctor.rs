@@ -1,0 +1,122 @@
+//! `scanhub doctor`, as somebody runs it: every condition has its line, what is wrong has its remedy, and nothing is
+//! changed by looking.
+
+mod stage;
+
+use serde_json::Value;
+use stage::{KILL, Outcome, Stage, TERM};
+
+/// Findings by the name of their check; those of a port after it.
+fn state<'a>(findings: &'a [Value], name: &str, port: Option<&str>) -> (&'a str, String) {
+    let found = findings.iter().find(|line| line["name"] == name && line["port"].as_str() == port);
+    let found = found.unwrap_or_else(|| panic!("no {name} of {port:?}: {findings:#?}"));
+    let text = |key: &str| found[key].as_str().unwrap_or_default();
+    let needs_remedy = matches!(text("state"), "warning" | "failed");
+    assert_eq!(text("remedy").is_empty(), !needs_remedy, "{found}");
+    (text("state"), format!("{} {}", text("finding"), text("remedy")))
+}
+
+/// Runs it; all its lines but a last error must be checks.
+fn doctor(stage: &Stage, arguments: &[&str], code: i32) -> (Vec<Value>, Outcome) {
+    let outcome = stage.run(&[&["doctor", "--json", "--no-system-config"], arguments].concat());
+    assert_eq!(outcome.code, Some(code), "{outcome}");
+    let findings = outcome.of_class("check");
+    let errors = outcome.of_class("error");
+    assert_eq!(findings.len() + errors.len(), outcome.lines().len());
+    assert_eq!(errors.len(), usize::from(code != 0), "{outcome}");
+    (findings, outcome)
+}
+
+#[test]
+fn a_set_up_that_works() {
+    let stage = Stage::new();
+    let simulator = stage.simulator(&["front"], &["--baud=38400"]);
+    let port = stage.word("front");
+    let (findings, _) = doctor(&stage, &[&port], 0);
+    for name in ["memory", "domain", "leftovers", "descriptors"] {
+        assert_eq!(state(&findings, name, None).0, "ok", "{findings:#?}");
+    }
+    for name in ["port", "holder", "access", "rate", "settings", "power-on", "health"] {
+        assert_eq!(state(&findings, name, Some(&port)).0, "ok", "{findings:#?}");
+    }
+    let (found, text) = state(&findings, "sensor", Some(&port));
+    assert!(found == "ok" && text.contains("LMS200") && text.contains("38400 Bd"), "{text}");
+    let outcome = stage.run(&["doctor", &port, "--no-system-config"]);
+    let text = String::from_utf8_lossy(&outcome.out);
+    assert!(text.contains("ok       sensor") && text.contains(&port), "{outcome}");
+    assert_eq!(simulator.end(TERM).code, Some(0));
+    assert_eq!(stage.simulated("front").1, 0);
+}
+
+#[test]
+fn what_is_wrong_is_told_with_its_remedy() {
+    let stage = Stage::new();
+    let _simulator = stage.simulator(&["front"], &[] as &[&str]);
+    let (front, absent) = (stage.word("front"), stage.word("absent"));
+    let links = [stage.link("front"), stage.link("absent"), "--link=null=/dev/null".into()];
+    let mut arguments: Vec<&str> = links.iter().map(String::as_str).collect();
+    arguments.extend(["--set", "link.front.unit=cm"]);
+    let (findings, outcome) = doctor(&stage, &arguments, 5);
+    assert!(state(&findings, "configuration", None).1.contains("front, absent, null"));
+    let (found, text) = state(&findings, "settings", Some(&front));
+    assert!(found == "warning" && text.contains("unit=cm"), "{text}");
+    let (found, text) = state(&findings, "port", Some(&absent));
+    assert!(found == "failed" && text.contains("no such port"), "{text}");
+    let (found, text) = state(&findings, "access", Some("/dev/null"));
+    assert!(found == "failed" && text.contains("not a serial line"), "{text}");
+    assert_eq!(outcome.of_class("error")[0]["kind"], "check");
+    assert_eq!(findings.iter().find(|line| line["port"] == front.as_str()).unwrap()["link"], "front");
+
+    let (findings, _) = doctor(&stage, &["--set", "link.front.angle=170"], 5);
+    let (found, text) = state(&findings, "configuration", None);
+    assert!(found == "failed" && text.contains("100 or 180"), "{text}");
+}
+
+#[test]
+fn a_port_without_a_sensor_is_asked_for_a_bounded_time() {
+    let stage = Stage::new();
+    // A sensor that hears nothing, because its line runs a hundred times slower than it says.
+    let _simulator = stage.simulator(&["front"], &["--speed=0.01"]);
+    let (findings, _) = doctor(&stage, &[&stage.word("front")], 5);
+    let (found, text) = state(&findings, "sensor", Some(&stage.word("front")));
+    assert!(found == "failed" && text.contains("no answer at 9600"), "{text}");
+}
+
+#[test]
+fn a_running_hub_is_asked_instead_and_a_dead_one_leaves_traces() {
+    let stage = Stage::new();
+    let _simulator = stage.simulator(&["front"], &["--baud=500000"]);
+    let hub = stage.hub(&[stage.link("front")]);
+    stage.await_info("front", |info| info["state"] == "streaming");
+    let before = stage.info("front");
+    let (port, link) = (stage.word("front"), stage.link("front"));
+    let (findings, _) = doctor(&stage, &[&link], 0);
+    let pid = format!("process {}", hub.pid());
+    assert!(state(&findings, "domain", None).1.contains(&pid));
+    assert!(state(&findings, "holder", Some(&port)).1.contains(&pid));
+    assert!(state(&findings, "sensor", Some(&port)).1.contains("streaming"));
+    let after = stage.info("front");
+    let account = |info: &Value| (info["counters"]["aborted"].clone(), info["counters"]["resyncs"].clone());
+    assert_eq!(account(&before), account(&after), "it was disturbed");
+
+    assert_eq!(hub.end(KILL).code, None);
+    let (findings, _) = doctor(&stage, &[&link], 0);
+    let (found, text) = state(&findings, "leftovers", None);
+    assert!(found == "warning" && text.contains("1 process died") && text.contains("scanhub run"), "{text}");
+    assert!(!stage.left_behind().is_empty(), "it deleted something");
+}
+
+#[test]
+fn what_another_program_has_is_not_touched() {
+    let stage = Stage::new();
+    let _simulator = stage.simulator(&["front"], &[] as &[&str]);
+    let holder = std::fs::File::options().read(true).write(true).open(stage.path("front")).unwrap();
+    let before = rustix::termios::tcgetattr(&holder).unwrap();
+    // This process has it open.
+    let (findings, _) = doctor(&stage, &[&stage.word("front")], 5);
+    let (found, text) = state(&findings, "holder", Some(&stage.word("front")));
+    assert!(found == "failed" && text.contains(&format!("process {}", std::process::id())), "{text}");
+    assert_eq!(state(&findings, "sensor", Some(&stage.word("front"))).0, "skipped");
+    let after = rustix::termios::tcgetattr(&holder).unwrap();
+    assert_eq!(before.output_speed(), after.output_speed());
+}
