@@ -56,10 +56,13 @@ pub fn source(text: &str) -> Result<Source, Failure> {
 /// Opens `source` at the greatest rate that it can have.
 pub(crate) fn open(source: &Source) -> Result<(Port, Baud), Failure> {
     let open = |baud: Baud| Port::open(source, baud.rate()).map(|port| (port, baud));
-    open(Baud::B500000).or_else(|failure| match failure.kind {
+    let (port, baud) = open(Baud::B500000).or_else(|failure| match failure.kind {
         Kind::PortRate => open(Baud::B38400),
         _ => Err(failure),
-    })
+    })?;
+    // What waits in its buffer may be older than the sensor's last power-on.
+    let _ = port.set_baud(baud.rate());
+    Ok((port, baud))
 }
 
 /// Asks the sensor at `port`, which is open at `first`.

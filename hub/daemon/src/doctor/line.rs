@@ -62,6 +62,17 @@ pub(crate) fn examine(
         return Ok(());
     }
     tell(Finding::ok("holder", "nobody has it open"));
+    if !subject.named {
+        // To open it alone would start some devices anew.
+        tell(if candidate.is_none_or(|candidate| candidate.is_permitted) {
+            Finding::ok("access", "may be opened")
+        } else {
+            refused(Refusal::Denied.explain(&subject.source))
+        });
+        let why = "not asked: nobody said that it is a sensor's port; scanhub doctor PORT asks";
+        tell(Finding::skipped("sensor", why));
+        return Ok(());
+    }
     let (port, first) = match probe::open(&subject.source) {
         Ok(opened) => opened,
         Err(failure) => {
