@@ -5,6 +5,7 @@ mod configure;
 mod control;
 mod doctor;
 mod probe;
+mod telegram;
 
 use std::path::PathBuf;
 use std::time::Duration;
@@ -17,6 +18,7 @@ use sim::fault::Faults;
 use sim::options::{self, SimulateOptions};
 
 pub(crate) use control::Control;
+pub(crate) use telegram::{Telegram, Way};
 
 /// Laser scanners on serial lines, for more than one program: a hub that publishes telegrams and scans into shared
 /// memory, and the programs that listen.
@@ -85,6 +87,8 @@ pub(crate) enum Verb {
     Echo(Echo),
     /// Rate, jitter and loss of topics
     Hz(Hz),
+    /// Telegrams explained field by field, and written
+    Telegram(Telegram),
     /// Stop a sensor, let it stream again, or begin anew with it
     Control(Control),
 }

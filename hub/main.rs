@@ -23,7 +23,7 @@ use serde::Serialize;
 use signal_hook::consts::{SIGINT, SIGTERM};
 use tracing::level_filters::LevelFilter;
 
-use cli::{Cli, Everywhere, Verb};
+use cli::{Cli, Everywhere, Verb, Way};
 use demo::DemoOptions;
 
 /// In the environment of a process that shall not outlive the one that started it.
@@ -67,6 +67,10 @@ fn dispatch(cli: &Cli) -> Result<(), Failure> {
             demo::demo(&options, &mut out, &*interrupt()?)
         }
         Verb::Simulate(simulate) => run_simulator(simulate, everywhere),
+        Verb::Telegram(telegram) => match &telegram.way {
+            Way::Decode(decode) => daemon::telegram::decode(&decode.options(everywhere.json), &mut out),
+            Way::Encode(encode) => daemon::telegram::encode(&encode.options(everywhere.json), &mut out),
+        },
         Verb::Probe(probe) => probe.run(everywhere.json, &*interrupt()?),
         Verb::Configure(configure) => configure.run(everywhere.json, &*interrupt()?),
         Verb::Doctor(doctor) => doctor.run(everywhere, &*interrupt()?),

@@ -19,6 +19,7 @@ mod replay;
 pub mod scanner;
 mod status;
 mod supervise;
+pub mod telegram;
 mod topics;
 
 pub use config::Config;

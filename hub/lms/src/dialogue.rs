@@ -4,14 +4,14 @@
 
 use crate::Nanos;
 use crate::command::{MODE, Request};
-use crate::header::{Expect, POWER_ON, StreamHeader, is_data};
+use crate::header::{Expect, StreamHeader, is_data};
 use crate::measured::Measured;
 use crate::outgoing::{FORGOTTEN, NAK_PAUSE, Outgoing};
 use crate::phase::{
     BESIDE_VALUES, Control, OVERLOOKED, PAUSE, Phase, Progress, QUESTIONS, Reason, SILENCE, STOPS, Settings,
     Step, TRIES,
 };
-use crate::reply::Reply;
+use crate::reply::{POWER_ON, Reply};
 use crate::sensor::{Sensor, State, Trouble};
 use crate::telegram::{REPLY, Telegram};
 use crate::variant::Baud;

@@ -23,6 +23,7 @@ pub mod framer;
 pub mod header;
 pub mod inquiry;
 pub mod measured;
+mod notice;
 pub mod operating;
 mod outgoing;
 pub mod parameters;
@@ -39,6 +40,7 @@ pub mod value;
 pub mod variant;
 
 pub use inquiry::Inquiry;
+pub use notice::Notice;
 pub use phase::{Control, Reason, Settings};
 pub use sensor::{Sensor, State, Trouble};
 pub use session::Session;

@@ -79,6 +79,9 @@ pub struct Session {
     now: Nanos,
     last_byte: Nanos,
     cut: bool,
+    /// What the next read has room for, and whether the last one left none: then more may be there already.
+    room: usize,
+    has_more: bool,
 }
 
 impl Session {
@@ -92,17 +95,22 @@ impl Session {
             now,
             last_byte: now,
             cut: false,
+            room: 0,
+            has_more: false,
         }
     }
 
     /// Room for the next read; never empty once the outputs are drained.
     pub fn spare(&mut self) -> &mut [u8] {
-        self.framer.spare()
+        let spare = self.framer.spare();
+        self.room = spare.len();
+        spare
     }
 
     /// A read returned at `now` and brought `len` bytes into [`Session::spare`].
     pub fn commit(&mut self, now: Nanos, len: usize) {
         self.now = now;
+        self.has_more = len > 0 && len == self.room;
         if len == 0 {
             return;
         }
@@ -162,6 +170,7 @@ impl Session {
         if self.framer.buffered() == 0 {
             self.rhythm.lose();
         } else if self.is_live()
+            && !self.has_more
             && let Some(until) = self.rhythm.rest(self.now)
         {
             return Output::Rest(until);
