@@ -11,7 +11,7 @@ use super::probe::Progress;
 
 #[derive(Args, Debug)]
 pub(crate) struct Configure {
-    /// A tty
+    /// A tty or tcp:HOST:PORT
     #[arg(value_name = "PORT")]
     port: String,
     /// unit=mm|cm, mode=NAME|0x01, availability=1|2|3, indices=on|off, sensitivity=standard|medium|low|high,

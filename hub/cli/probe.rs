@@ -11,7 +11,7 @@ use serde::Serialize;
 
 #[derive(Args, Debug)]
 pub(crate) struct Probe {
-    /// A tty; without one the ports of this machine are listed
+    /// A tty or tcp:HOST:PORT; without one the ports of this machine are listed
     #[arg(value_name = "PORT")]
     port: Option<String>,
 }
