@@ -49,8 +49,9 @@ impl Dialogue {
         if !next.is_multiple_of(ORDER.len()) {
             return self.probe(now, next);
         }
-        self.trouble =
-            Some(Trouble::NoAnswer { seconds: coarse((now - self.quiet_since) / (1_000 * MILLIS)) });
+        let baud = self.settings.fixed_rate.then_some(self.baud);
+        let seconds = coarse((now - self.quiet_since) / (1_000 * MILLIS));
+        self.trouble = Some(Trouble::NoAnswer { baud, seconds });
         let pause = PAUSES[(next / ORDER.len() - 1).min(PAUSES.len() - 1)];
         if self.heard || pause == 0 {
             return self.probe(now, next);

@@ -6,7 +6,7 @@ use crate::notice::Notice;
 use crate::reply::{POWER_ON, Reply};
 use crate::status_report::StatusReport;
 use crate::telegram::Telegram;
-use crate::variant::{Mode, Unit, Variant};
+use crate::variant::{Baud, Mode, Unit, Variant};
 use core::fmt;
 
 /// How far a session is.
@@ -31,6 +31,8 @@ pub enum State {
 pub enum Trouble {
     /// No rate got an answer.
     NoAnswer {
+        /// The only rate at which was asked; `None`: at all of them.
+        baud: Option<Baud>,
         /// For how long already, in steps that grow.
         seconds: u32,
     },
@@ -49,9 +51,14 @@ pub enum Trouble {
 impl fmt::Display for Trouble {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
-            Trouble::NoAnswer { seconds } => write!(
+            Trouble::NoAnswer { baud: None, seconds } => write!(
                 f,
                 "no answer at 9600, 19200, 38400 or 500000 baud for {seconds} s: power, cable, RS-422 jumper?"
+            ),
+            Trouble::NoAnswer { baud: Some(baud), seconds } => write!(
+                f,
+                "no answer at {} baud, the only rate of this port, for {seconds} s: power, cable, another rate?",
+                baud.rate()
             ),
             Trouble::Unanswered(request) => write!(f, "no reply to {request:?} in several tries"),
             Trouble::Refused(request) => write!(f, "the sensor refused {request:?}"),

@@ -41,10 +41,10 @@ fn in_the_middle_of_a_scan() {
 #[test]
 fn at_any_moment_of_the_conversation() {
     for baud in [Baud::B9600, Baud::B500000] {
-        for at in 0..40 {
-            for boot in [20, 700, 3_100] {
+        for at in 0..20 {
+            for boot in [20, 3_100] {
                 let mut bench = Bench::new(sensor_with(Settings { baud, ..booting(boot * MILLIS) }), 0);
-                bench.run(at * 31 * MILLIS);
+                bench.run(at * 63 * MILLIS);
                 let off = bench.now;
                 bench.machine.power_cycle(off);
                 bench.run(boot * MILLIS);
@@ -77,7 +77,10 @@ fn a_banner_that_is_heard_is_answered_at_once() {
     let mut bench = Bench::new(sensor_with(settings), 0);
     bench.run(59_990 * MILLIS);
     assert_eq!(bench.states, [State::Probing]);
-    assert!(matches!(bench.session.trouble(), Some(Trouble::NoAnswer { seconds: 30..=59 })), "{bench}");
+    assert!(
+        matches!(bench.session.trouble(), Some(Trouble::NoAnswer { seconds: 30..=59, baud: None })),
+        "{bench}"
+    );
     bench.until("streaming", LIMIT, Bench::is_streaming);
     assert_eq!(bench.session.trouble(), None);
 }
@@ -96,7 +99,7 @@ fn a_mute_line_is_asked_rarely_and_for_ever() {
     let seconds: Vec<u32> = told
         .iter()
         .filter_map(|trouble| match trouble {
-            Some(Trouble::NoAnswer { seconds }) => Some(*seconds),
+            Some(Trouble::NoAnswer { seconds, .. }) => Some(*seconds),
             _ => None,
         })
         .collect();
