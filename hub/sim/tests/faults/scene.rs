@@ -53,7 +53,7 @@ impl Scene {
         let baud = Baud::B500000;
         let boot_ns = 200 * MILLIS;
         let settings = Settings { baud, start, boot_ns, habits, seed, ..Settings::default() };
-        let world = World::ALL[seed as usize % World::ALL.len()].1;
+        let (_, world) = world(seed);
         let mut bench = Bench::new(Machine::new(settings, Source::Room(Room::new(world, seed))), 0);
         bench.wire = Wire::new(&self.faults, seed);
         bench.run(self.span_ms * MILLIS);
@@ -95,8 +95,15 @@ impl Scene {
     }
 
     fn name(&self, seed: u64) -> String {
-        format!("--fault {} --seed {seed}", self.faults)
+        let state = if self.faults.habits() == Habits::default() { "streaming" } else { "idle" };
+        let (world, faults) = (world(seed).0, self.faults);
+        format!("--baud 500000 --boot 200ms --state {state} --world {world} --seed {seed} --fault {faults}")
     }
+}
+
+/// What the sensor sees: each seed something else.
+fn world(seed: u64) -> (&'static str, World) {
+    World::ALL[seed as usize % World::ALL.len()]
 }
 
 /// A session that has to look for its sensor finds it within so long.
