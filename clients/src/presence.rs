@@ -51,6 +51,10 @@ impl Presence {
 
     /// What to tell who cannot wait for a hub.
     pub(crate) fn no_hub(&self) -> Failure {
+        // Who cannot look does not know.
+        if let Some(short) = self.denied.as_ref().filter(|denied| denied.kind == Kind::Short) {
+            return short.clone();
+        }
         let name = self.places.first().map(Domain::name).unwrap_or_default();
         let roots: Vec<_> = self.places.iter().map(|place| place.root().display().to_string()).collect();
         let hint = match &self.denied {

@@ -4,12 +4,12 @@
 use std::os::unix::fs::MetadataExt;
 use std::path::Path;
 
-use crate::{Failure, Kind};
+use crate::{Failure, Kind, shortage};
 
 /// A failure at the domain in `root`: as denied access with owner, mode and remedy if the directory is another
-/// user's, else `what` happened.
+/// user's, as a shortage if there is one, else `what` happened.
 pub(crate) fn failure(root: &Path, what: impl Into<String>) -> Failure {
-    match foreign(root) {
+    match foreign(root).or_else(|| shortage::found(root)) {
         Some(failure) => failure,
         None => Failure::new(Kind::Failed, what, "IOX2_LOG_LEVEL=debug shows what the shared memory says"),
     }

@@ -3,7 +3,6 @@
 
 mod control;
 mod leftover;
-pub mod memory;
 mod nodes;
 mod sleep;
 mod trouble;
@@ -15,6 +14,8 @@ use std::time::Duration;
 
 use iceoryx2::config::Config;
 use iceoryx2::port;
+use iceoryx2::port::listener::ListenerCreateError;
+use iceoryx2::port::subscriber::SubscriberCreateError;
 use iceoryx2::prelude::{
     AttributeSet, AttributeVerifier, CallbackProgression, EventId, FileName, IceoryxSend, LogLevel,
     NodeBuilder, SemanticString, ServiceName, SignalHandlingMode, set_log_level_from_env_or,
@@ -22,8 +23,8 @@ use iceoryx2::prelude::{
 use iceoryx2::service::Service as _;
 use iceoryx2::service::port_factory::{event, publish_subscribe};
 
-use self::memory::{CLIENT_BYTES, check_room};
-use self::trouble::{Trouble, create, no_port, no_publisher, open};
+use self::trouble::{Trouble, create, full, no_port, no_publisher, open};
+use crate::shortage::check_client;
 use crate::{Domain, Failure, Header, Kind, Scan, Status, Topic, Wake, access, limits, of_service};
 
 pub use self::control::{Asked, ControlClient, ControlServer, Pending};
@@ -139,8 +140,13 @@ macro_rules! payload {
             }
 
             fn subscriber(topic: &TopicService<Self>) -> Result<Subscriber<Self>, Failure> {
-                check_room(CLIENT_BYTES)?;
-                topic.subscriber_builder().create().map_err(|error| no_port(topic.name(), &error))
+                check_client()?;
+                topic.subscriber_builder().create().map_err(|error| match error {
+                    SubscriberCreateError::ExceedsMaxSupportedSubscribers => {
+                        full(topic.name(), limits::SUBSCRIBERS)
+                    }
+                    other => no_port(topic.name(), &other),
+                })
             }
 
             fn receive(subscriber: &Subscriber<Self>) -> Result<Option<Sample<Self>>, ReceiveError> {
@@ -201,8 +207,11 @@ pub fn notify(notifier: &Notifier, why: Wake) -> Result<usize, Failure> {
 ///
 /// [`Kind::Short`] if memory, descriptors or places for consumers are.
 pub fn listener(wake: &WakeService) -> Result<Listener, Failure> {
-    check_room(CLIENT_BYTES)?;
-    wake.listener_builder().create().map_err(|error| no_port(wake.name(), &error))
+    check_client()?;
+    wake.listener_builder().create().map_err(|error| match error {
+        ListenerCreateError::ExceedsMaxSupportedListeners => full(wake.name(), limits::LISTENERS),
+        other => no_port(wake.name(), &other),
+    })
 }
 
 /// The sensors that have topics in `domain`, sorted. Those of a dead hub stay as long as a consumer keeps them.

@@ -18,6 +18,8 @@ pub mod ipc;
 pub mod limits;
 #[cfg(feature = "ipc")]
 mod lock;
+#[cfg(feature = "ipc")]
+pub mod shortage;
 
 pub use control::{Request, Response, Verb};
 pub use domain::{DEFAULT_DOMAIN, Domain, Environment};

@@ -11,7 +11,7 @@ use nix::errno::Errno;
 use nix::fcntl::{FcntlArg, fcntl};
 use nix::libc::{self, flock};
 
-use crate::{Failure, Kind, access};
+use crate::{Failure, Kind, access, shortage};
 
 /// The lock of a hub on its domain; it ends with the value or with the process, however that ends.
 #[derive(Debug)]
@@ -105,7 +105,7 @@ fn held(root: &Path, pid: u32) -> Failure {
 }
 
 fn unusable(root: &Path, error: &io::Error) -> Failure {
-    access::foreign(root).unwrap_or_else(|| {
+    access::foreign(root).or_else(|| shortage::found(root)).unwrap_or_else(|| {
         Failure::new(Kind::Failed, format!("{}: {error}", root.display()), "choose another place with --root")
     })
 }

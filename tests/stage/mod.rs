@@ -13,6 +13,7 @@ use std::sync::atomic::{AtomicU32, Ordering};
 use std::thread;
 use std::time::{Duration, Instant};
 
+use schema::Domain;
 use serde_json::Value;
 
 pub(crate) use line::{Line, open_line};
@@ -36,6 +37,11 @@ impl Stage {
         let directory = PathBuf::from(format!("/tmp/{domain}"));
         fs::create_dir_all(&directory).unwrap_or_else(|error| panic!("{}: {error}", directory.display()));
         Stage { directory, domain }
+    }
+
+    /// Where its hub is, for consumers in the test itself.
+    pub(crate) fn place(&self) -> Domain {
+        Domain::at(&self.domain, &self.directory).unwrap_or_else(|failure| panic!("{failure}"))
     }
 
     pub(crate) fn path(&self, name: &str) -> PathBuf {

@@ -95,6 +95,17 @@ impl Program {
         (0..count).map(|_| self.await_line(what, &wanted)).collect()
     }
 
+    /// Waits for a line that begins with `text`; for children that do not speak JSON.
+    pub(crate) fn await_text(&mut self, text: &str) {
+        let give_up_at = Instant::now() + PATIENCE;
+        let mut line = Vec::new();
+        while !line.starts_with(text.as_bytes()) {
+            let begin = self.out.len();
+            self.receive(give_up_at).unwrap_or_else(|why| self.give_up(text, why));
+            line = self.out[begin..].to_vec();
+        }
+    }
+
     /// Waits until it has written more than `len` bytes in all.
     pub(crate) fn await_bytes(&mut self, len: usize) {
         let give_up_at = Instant::now() + PATIENCE;

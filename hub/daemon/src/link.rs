@@ -8,7 +8,7 @@ use lms::framer::suspect;
 use lms::reply::Reply;
 use lms::session::{Output, Received};
 use lms::variant::{Mode, Unit, Variant};
-use lms::{MILLIS, Nanos, Session, Settings, Trouble};
+use lms::{MILLIS, Nanos, Notice, Session, Settings, Trouble};
 use rustix::event::{PollFd, PollFlags, poll};
 use schema::{Failure, Flags, State, Wake};
 
@@ -33,12 +33,15 @@ pub(crate) struct LinkThread<'a> {
     next_greeting: Nanos,
     next_status: Nanos,
     /// What `error` was made from.
-    facts: Option<(State, Option<Trouble>, Option<Unit>)>,
+    facts: Option<Facts>,
     /// What is wrong, in words; empty if nothing is.
     error: String,
     /// Statuses in a row that said that consumers got nothing.
     unreached: u32,
 }
+
+/// What a link's error is made from.
+type Facts = (State, Option<Trouble>, Option<Unit>, Option<Notice>);
 
 /// Why a wait is over.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -137,10 +140,17 @@ impl<'a> LinkThread<'a> {
                 Output::Wait { until, .. } => break (true, until),
             }
         };
-        let facts = (state_of(session), session.trouble(), session.sensor().unit);
-        let (state, ..) = facts;
+        let sensor = session.sensor();
+        let facts = (state_of(session), session.trouble(), sensor.unit, sensor.notices().next());
+        let (state, .., notice) = facts;
         let changed = self.facts != Some(facts);
         if changed {
+            // What is good to know is no error.
+            if let Some(notice) = notice.filter(|notice| !notice.is_fault())
+                && self.facts.is_none_or(|(.., before)| before != Some(notice))
+            {
+                tracing::info!("{}: {notice}", self.link.name);
+            }
             self.facts = Some(facts);
             self.error = self.trouble(session);
         }
@@ -276,19 +286,31 @@ impl<'a> LinkThread<'a> {
                 is.mm(),
                 expected.mm()
             ),
-            _ => String::new(),
+            _ if self.unreached >= UNREACHED_LIMIT => self.unserved(),
+            _ => {
+                let fault = session.sensor().notices().find(|notice| notice.is_fault());
+                fault.map_or_else(String::new, |notice| notice.to_string())
+            }
         }
     }
 
     fn watch_reach(&mut self) {
-        self.unreached = if self.topics.unreached() > 0 { self.unreached + 1 } else { 0 };
-        if self.unreached == UNREACHED_LIMIT {
-            tracing::warn!(
-                "{}: {} consumers are attached but get nothing: raise the limit of open descriptors (ulimit -n)",
-                self.link.name,
-                self.topics.unreached()
-            );
+        let before = self.unreached;
+        self.unreached = if self.topics.unreached() > 0 { before.saturating_add(1) } else { 0 };
+        if self.unreached == UNREACHED_LIMIT || before >= UNREACHED_LIMIT && self.unreached == 0 {
+            // Whoever is served shall read it in the status.
+            self.facts = None;
         }
+        if self.unreached == UNREACHED_LIMIT {
+            tracing::warn!("{}: {}", self.link.name, self.unserved());
+        }
+    }
+
+    fn unserved(&self) -> String {
+        let count = self.topics.unreached();
+        format!(
+            "{count} consumers are attached but get nothing: raise the limit of open descriptors (ulimit -n)"
+        )
     }
 }
 

@@ -6,7 +6,7 @@ use std::fs::{self, OpenOptions};
 use rustix::fs::{FallocateFlags, fallocate};
 use rustix::io::Errno;
 use rustix::process::{Resource, getrlimit, setrlimit};
-use schema::ipc::memory::{SHARED_MEMORY, check_room, short};
+use schema::shortage::{self, SHARED_MEMORY};
 use schema::{Domain, Failure, Header, Scan, Status, Telegram, Topic, limits};
 
 /// Lets the process have as many descriptors as its hard limit allows: about four for each consumer of a topic.
@@ -22,12 +22,19 @@ pub(crate) fn raise_descriptor_limit() {
 ///
 /// [`Kind::Short`](schema::Kind) with what is free and what is needed.
 pub(crate) fn check_memory(links: usize) -> Result<(), Failure> {
-    check_room(needed(links))
+    shortage::check_memory(needed(links))
 }
 
 /// Bytes of shared memory for `links` links and the first consumers.
 pub(crate) fn needed(links: usize) -> u64 {
     links as u64 * link_bytes() + REST
+}
+
+/// Whether `links` links, and a first consumer of each, have descriptors enough.
+///
+/// [`Kind::Short`](schema::Kind) with the limit and what is needed.
+pub(crate) fn check_descriptors(links: usize) -> Result<(), Failure> {
+    shortage::check_descriptors(BASE_DESCRIPTORS + links as u64 * LINK_DESCRIPTORS)
 }
 
 /// Allocates what the segments of `domain` have promised so far.
@@ -46,7 +53,10 @@ pub(crate) fn allocate(domain: &Domain) -> Result<(), Failure> {
         match fallocate(&segment, FallocateFlags::empty(), 0, metadata.len()) {
             Err(Errno::NOSPC) => {
                 let name = entry.file_name().to_string_lossy().into_owned();
-                return Err(short(&format!("{} kB for {name} cannot be had", metadata.len() / 1024)));
+                return Err(shortage::memory(&format!(
+                    "{} kB for {name} cannot be had",
+                    metadata.len() / 1024
+                )));
             }
             Err(error) => tracing::debug!(%error, "a segment cannot be allocated"),
             Ok(()) => {}
@@ -67,6 +77,10 @@ fn link_bytes() -> u64 {
     Topic::ALL.into_iter().map(chunk).sum::<usize>() as u64 + services
 }
 
+/// Descriptors of what belongs to no link, beside those open from the start: 16 are left open, making them takes more.
+const BASE_DESCRIPTORS: u64 = 24;
+/// Descriptors of a link: its services, its port, and a first consumer.
+const LINK_DESCRIPTORS: u64 = 24;
 /// What the shared-memory library puts before each sample, rounded up.
 const CHUNK_HEADER: usize = 64;
 /// The list of ports and processes of one service, rounded up.

@@ -32,9 +32,10 @@ pub struct Ready {
 /// [`Kind::DomainHeld`] if another hub has the domain, [`Kind::Short`] if memory is, the port kinds if a port is there
 /// but cannot be used, [`Kind::Failed`] if shared memory refuses.
 pub fn run(config: &Config, domain: &Domain, on_ready: impl FnOnce(&Ready)) -> Result<(), Failure> {
+    preflight::raise_descriptor_limit();
     let signals = end_signals()?;
     let _lock = HubLock::acquire(domain.root())?;
-    preflight::raise_descriptor_limit();
+    preflight::check_descriptors(config.links.len())?;
     preflight::check_memory(config.links.len())?;
     let node = ipc::hub_node(domain)?;
     node.try_cleanup_dead_nodes();

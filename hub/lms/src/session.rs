@@ -81,6 +81,9 @@ pub struct Session {
     /// Of the last byte of the last telegram.
     last_stamp: Nanos,
     cut: bool,
+    /// What the next read has room for, and whether the last one left none: then more may be there already.
+    room: usize,
+    has_more: bool,
 }
 
 impl Session {
@@ -95,17 +98,22 @@ impl Session {
             last_byte: now,
             last_stamp: 0,
             cut: false,
+            room: 0,
+            has_more: false,
         }
     }
 
     /// Room for the next read; never empty once the outputs are drained.
     pub fn spare(&mut self) -> &mut [u8] {
-        self.framer.spare()
+        let spare = self.framer.spare();
+        self.room = spare.len();
+        spare
     }
 
     /// A read returned at `now` and brought `len` bytes into [`Session::spare`].
     pub fn commit(&mut self, now: Nanos, len: usize) {
         self.now = now;
+        self.has_more = len > 0 && len == self.room;
         // Neither a recording nor a network has the pace of a line.
         let has_pace = !(self.dialogue.settings.listen_only || self.dialogue.settings.fixed_rate);
         self.arrivals.note(now, len, has_pace.then_some(self.dialogue.baud.rate()));
@@ -167,6 +175,7 @@ impl Session {
         if self.framer.buffered() == 0 {
             self.rhythm.lose();
         } else if self.is_live()
+            && !self.has_more
             && let Some(until) = self.rhythm.rest(self.now)
         {
             return Output::Rest(until);

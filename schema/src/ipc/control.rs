@@ -5,10 +5,12 @@ use iceoryx2::active_request::ActiveRequest;
 use iceoryx2::pending_response::PendingResponse;
 use iceoryx2::port::{client, server};
 use iceoryx2::prelude::{EventId, PortFactory as _};
+use iceoryx2::service::port_factory::client::ClientCreateError;
 use iceoryx2::service::port_factory::request_response;
 
-use super::trouble::{Trouble, create, no_port, open};
+use super::trouble::{Trouble, create, full, no_port, open};
 use super::{Listener, Node, Notifier, Service, WakeService, listener, name, take_wakeups};
+use crate::shortage::{CONTROL_DESCRIPTORS, check_descriptors};
 use crate::{Failure, Kind, Request, Response, limits, topic};
 
 /// The hub's end. Wakes its [`requests`](Self::requests) when somebody asked.
@@ -113,6 +115,7 @@ impl ControlClient {
     ///
     /// [`Kind::Short`] if too many clients ask at once, or descriptors are short.
     pub fn open(node: &Node) -> Result<Option<ControlClient>, Failure> {
+        check_descriptors(CONTROL_DESCRIPTORS)?;
         let event = |service: &str| {
             let service = name(service)?;
             open(node, &service, node.service_builder(&service).event().open())
@@ -124,7 +127,10 @@ impl ControlClient {
         let Some(answered) = event(topic::CONTROL_RESPONSE)? else { return Ok(None) };
         let responses = listener(&answered)?;
         let requests = notifier(&asked)?;
-        let client = control.client_builder().create().map_err(|error| no_port(&service, &error))?;
+        let client = control.client_builder().create().map_err(|error| match error {
+            ClientCreateError::ExceedsMaxSupportedClients => full(&service, limits::CONTROL_CLIENTS),
+            other => no_port(&service, &other),
+        })?;
         Ok(Some(ControlClient { client, requests, responses, _control: control, _bells: [asked, answered] }))
     }
 

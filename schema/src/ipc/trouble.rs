@@ -14,7 +14,7 @@ use iceoryx2::service::builder::{ServiceCreateError, ServiceOpenError};
 use iceoryx2::service::service_name::ServiceName;
 
 use super::Node;
-use crate::{Failure, Kind, access};
+use crate::{Failure, Kind, access, shortage};
 
 /// What there is to do about an error.
 pub(super) enum Trouble {
@@ -137,10 +137,21 @@ pub(super) fn no_publisher(service: &ServiceName, error: PublisherCreateError) -
     }
 }
 
+/// Why there is no place for one more consumer or client at `service`, of which there can be `limit`.
+pub(super) fn full(service: &ServiceName, limit: usize) -> Failure {
+    Failure::new(
+        Kind::Short,
+        format!("{service} has {limit} consumers: there is no place for another one"),
+        "stop some of them; the places of those that crashed are free again within seconds",
+    )
+}
+
 /// Why there is no other port: as a rule descriptors or places are short.
 pub(super) fn no_port(service: &ServiceName, error: &dyn Debug) -> Failure {
-    let hint = "too many consumers, or `ulimit -n` is too small: about 4 descriptors for each";
-    Failure::new(Kind::Short, format!("no port at {service}: {error:?}"), hint)
+    shortage::found(Path::new(shortage::SHARED_MEMORY)).unwrap_or_else(|| {
+        let hint = "too many consumers, or `ulimit -n` is too small: about 4 descriptors for each";
+        Failure::new(Kind::Short, format!("no port at {service}: {error:?}"), hint)
+    })
 }
 
 fn failure(node: &Node, service: &ServiceName, trouble: Trouble) -> Failure {

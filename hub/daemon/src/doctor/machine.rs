@@ -8,7 +8,7 @@ use std::path::{Path, PathBuf};
 use rustix::fs::{Access, access, statvfs};
 use rustix::process::{Resource, getrlimit, getuid};
 use schema::ipc::Nodes;
-use schema::ipc::memory::SHARED_MEMORY;
+use schema::shortage::SHARED_MEMORY;
 use schema::{Domain, Failure};
 
 use super::finding::Finding;

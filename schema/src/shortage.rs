@@ -1,0 +1,105 @@
+//! What is short on this machine: shared memory, descriptors, room for a domain's files. The shared-memory library
+//! promises segments without allocating them, so that at a full /dev/shm the first touch ends the process by SIGBUS;
+//! of anything else that is short it says no more than "internal error". Refuses to know for what something is needed.
+
+use std::path::Path;
+
+use rustix::fs::statvfs;
+use rustix::process::{Resource, getrlimit};
+
+use crate::{Failure, Kind};
+
+/// Where POSIX shared memory lives on Linux.
+pub const SHARED_MEMORY: &str = "/dev/shm";
+
+/// What the segments of a consumer or of a client of the control service take, and some for others that come at the
+/// same time: each has a few pages.
+const CLIENT_BYTES: u64 = 64 * 1024;
+
+/// Descriptors that one more topic or event takes, with some to spare.
+const PORT_DESCRIPTORS: u64 = 8;
+
+/// Descriptors that a client of the control service takes.
+pub(crate) const CONTROL_DESCRIPTORS: u64 = 24;
+
+/// Refuses to go on where fewer than `needed` bytes of shared memory are free.
+///
+/// [`Kind::Short`] with what is free and what is needed.
+pub fn check_memory(needed: u64) -> Result<(), Failure> {
+    check_place(Path::new(SHARED_MEMORY), needed).map_err(|what| memory(&what))
+}
+
+/// Refuses to go on where fewer than `needed` more descriptors can be opened.
+///
+/// [`Kind::Short`] with the limit and what is needed.
+pub fn check_descriptors(needed: u64) -> Result<(), Failure> {
+    let limit = getrlimit(Resource::Nofile).current.unwrap_or(u64::MAX);
+    // To list them needs one too.
+    let open = match std::fs::read_dir("/proc/self/fd") {
+        Ok(entries) => entries.count() as u64 - 1,
+        Err(_) => limit,
+    };
+    if limit.saturating_sub(open) >= needed {
+        return Ok(());
+    }
+    Err(Failure::new(
+        Kind::Short,
+        format!("descriptors are short: {open} are open, {needed} more needed, the limit is {limit}"),
+        "raise the limit: `ulimit -n`, for a service LimitNOFILE",
+    ))
+}
+
+/// Shared memory is short, in the words of `what`.
+pub fn memory(what: &str) -> Failure {
+    Failure::new(
+        Kind::Short,
+        format!("shared memory is short: {SHARED_MEMORY}: {what}"),
+        format!("free some of {SHARED_MEMORY}, then start again"),
+    )
+}
+
+/// Refuses to make one more of a consumer's ports where there is no room for it: the library would make one that gets
+/// nothing, or end the process.
+pub(crate) fn check_client() -> Result<(), Failure> {
+    check_descriptors(PORT_DESCRIPTORS).and_then(|()| check_memory(CLIENT_BYTES))
+}
+
+/// What is so short that it may be why something failed in the domain at `root`.
+pub(crate) fn found(root: &Path) -> Option<Failure> {
+    let files = || {
+        let place = root.ancestors().find(|path| path.exists()).unwrap_or(root);
+        let hint = "free some of it, or choose another place with --root";
+        check_place(place, CLIENT_BYTES)
+            .map_err(|what| Failure::new(Kind::Short, format!("{}: {what}", root.display()), hint))
+    };
+    check_descriptors(2 * PORT_DESCRIPTORS)
+        .and_then(|()| check_memory(CLIENT_BYTES))
+        .and_then(|()| files())
+        .err()
+}
+
+/// What is free at `place` and what is needed, if that is more.
+fn check_place(place: &Path, needed: u64) -> Result<(), String> {
+    let Ok(stat) = statvfs(place) else { return Ok(()) };
+    let free = stat.f_bavail * stat.f_frsize;
+    if free >= needed {
+        return Ok(());
+    }
+    Err(format!("{} kB free, {} kB needed", free / 1024, needed.div_ceil(1024)))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_is_more_than_there_is_is_refused() {
+        assert_eq!((check_memory(0), check_descriptors(0)), (Ok(()), Ok(())));
+        let memory = check_memory(1 << 60).unwrap_err();
+        assert_eq!(memory.kind, Kind::Short);
+        assert!(memory.message.contains(&format!("{} kB needed", 1_u64 << 50)), "{memory}");
+        let descriptors = check_descriptors(1 << 60).unwrap_err();
+        assert_eq!(descriptors.kind, Kind::Short);
+        assert!(descriptors.message.contains(&format!("{} more needed", 1_u64 << 60)), "{descriptors}");
+    }
+}
