@@ -50,7 +50,8 @@ fn measure(options: &Options) -> Outcome<()> {
         let absent = statuses.await_line("status front absent", PATIENCE)?.number(3)?;
         noticed.push(absent.saturating_sub(pulled) as f64 / 1e6);
         let (before, begun) = (Work::of(hub.guard.pid(), |_| true)?, clock::now());
-        clock::rest(begun + 1_000 * MILLIS);
+        // Another phase of the hub's looks, too.
+        clock::rest(begun + (1_000 + 37 * (round as u64 % 20)) * MILLIS);
         let work = Work::of(hub.guard.pid(), |_| true)?.since(before);
         busy.push(100.0 * work.busy_ns as f64 / (clock::now() - begun) as f64);
         // What came before the plug was pulled.
