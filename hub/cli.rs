@@ -100,7 +100,7 @@ pub(crate) struct Run {
     /// Do not read /etc/scanhub
     #[arg(long)]
     pub(crate) no_system_config: bool,
-    /// A link with its defaults; PORT is a tty or file:PATH[?rate=max]
+    /// A link with its defaults; PORT is a tty, tcp:HOST:PORT or file:PATH[?rate=max]
     #[arg(long, value_name = "NAME=PORT")]
     pub(crate) link: Vec<String>,
     /// One value, for example link.front.angle=100

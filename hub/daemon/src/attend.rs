@@ -4,6 +4,7 @@
 use std::os::fd::AsFd;
 
 use lms::{Control, MILLIS, Nanos, Session};
+use rustix::event::PollFlags;
 use schema::{Failure, Flags, Kind, State};
 
 use crate::clock;
@@ -65,7 +66,7 @@ impl LinkThread<'_> {
             Some(Ok(dial)) => dial,
         };
         loop {
-            match self.wait(Some(dial.as_fd()), clock::now() + STILL_AWAY) {
+            match self.wait(Some((dial.as_fd(), PollFlags::IN)), clock::now() + STILL_AWAY) {
                 Woken::Stop => return None,
                 Woken::Order => self.orders.obey(None),
                 Woken::Ready => return Some(dial.finish()),

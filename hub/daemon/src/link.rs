@@ -96,7 +96,9 @@ impl<'a> LinkThread<'a> {
     pub(crate) fn stream(&mut self, port: &Port, session: &mut Session) -> io::Result<()> {
         loop {
             let (watch, until) = self.drain(port, session)?;
-            match self.wait(watch.then_some(port.as_fd()), until) {
+            // Also while bytes are left alone the port may go away.
+            let events = if watch { PollFlags::IN } else { PollFlags::empty() };
+            match self.wait(Some((port.as_fd(), events)), until) {
                 Woken::Stop => return Ok(()),
                 Woken::Order => {
                     self.orders.obey(Some(session));
@@ -220,19 +222,23 @@ impl<'a> LinkThread<'a> {
         }
     }
 
-    /// Sleeps until the port has bytes (or is gone), `until`, or the hub's end.
-    pub(crate) fn wait(&mut self, port: Option<BorrowedFd<'_>>, until: Nanos) -> Woken {
+    /// Sleeps until the port has one of these events or is gone, `until`, or the hub's end.
+    pub(crate) fn wait(&mut self, port: Option<(BorrowedFd<'_>, PollFlags)>, until: Nanos) -> Woken {
         loop {
             let now = clock::now();
             // Whoever attaches to a silent sensor is greeted in time all the same.
-            let bound =
+            let mut bound =
                 if self.account.is_streaming() { until } else { until.min(self.next_greeting.max(now)) };
+            if port.is_some_and(|(_, events)| events.is_empty()) {
+                // Some drivers wake nobody who waits for no bytes.
+                bound = bound.min(now + LONGEST_REST);
+            }
             let span = clock::span(now, bound);
             let stop = PollFd::new(self.stop, PollFlags::IN);
             let orders = PollFd::new(&self.orders, PollFlags::IN);
             let woken = match port {
-                Some(port) => {
-                    let mut fds = [stop, orders, PollFd::from_borrowed_fd(port, PollFlags::IN)];
+                Some((port, events)) => {
+                    let mut fds = [stop, orders, PollFd::from_borrowed_fd(port, events)];
                     poll(&mut fds, Some(&span)).map(|_| fds.each_ref().map(is_ready))
                 }
                 None => {
@@ -330,6 +336,8 @@ fn is_ready(fd: &PollFd<'_>) -> bool {
     !fd.revents().is_empty()
 }
 
+/// A port that is left alone is looked at so often whether it is still there; at the highest rate no rest is as long.
+const LONGEST_REST: Nanos = 40 * MILLIS;
 /// A status goes out at least so often.
 const STATUS_PERIOD: Nanos = 1_000 * MILLIS;
 /// A late joiner gets the last status after so long at the most.

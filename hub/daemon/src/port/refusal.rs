@@ -197,19 +197,19 @@ mod tests {
 
     #[test]
     fn what_the_kernel_says_and_what_it_means() {
-        let source = Source::Tty("/dev/null".into());
+        let source = Source::Tty("/dev/full".into());
         for (refusal, kind, says) in [
             (Errno::NOTTY.into(), Kind::PortNotTty, "file:PATH for a recording"),
             (Errno::IO.into(), Kind::PortMissing, "no line behind it"),
             (Errno::NXIO.into(), Kind::PortMissing, "no line behind it"),
             (Errno::MFILE.into(), Kind::Short, "ulimit -n"),
             (Errno::LOOP.into(), Kind::PortNotTty, "dmesg"),
-            (Errno::PERM.into(), Kind::PortPermission, "/dev/null"),
+            (Errno::PERM.into(), Kind::PortPermission, "/dev/full"),
             (Errno::BUSY.into(), Kind::PortBusy, "stop it first"),
             (
                 Refusal::Rate { wanted: 500_000, given: 115_200 },
                 Kind::PortRate,
-                "/dev/null: 500000 Bd is not possible here, the driver gives 115200 Bd\n  adapters with an FT232R",
+                "/dev/full: 500000 Bd is not possible here, the driver gives 115200 Bd\n  adapters with an FT232R",
             ),
             (Refusal::Rate { wanted: 9600, given: 0 }, Kind::PortRate, "say another rate"),
         ] {
