@@ -23,7 +23,7 @@ use serde::Serialize;
 use signal_hook::consts::{SIGINT, SIGTERM};
 use tracing::level_filters::LevelFilter;
 
-use cli::{Cli, Everywhere, Verb};
+use cli::{Cli, Everywhere, Verb, Way};
 use demo::DemoOptions;
 
 /// In the environment of a process that shall not outlive the one that started it.
@@ -67,7 +67,12 @@ fn dispatch(cli: &Cli) -> Result<(), Failure> {
             demo::demo(&options, &mut out, &*interrupt()?)
         }
         Verb::Simulate(simulate) => run_simulator(simulate, everywhere),
+        Verb::Telegram(telegram) => match &telegram.way {
+            Way::Decode(decode) => daemon::telegram::decode(&decode.options(everywhere.json), &mut out),
+            Way::Encode(encode) => daemon::telegram::encode(&encode.options(everywhere.json), &mut out),
+        },
         Verb::Probe(probe) => probe.run(everywhere.json, &*interrupt()?),
+        Verb::Configure(configure) => configure.run(everywhere.json, &*interrupt()?),
         Verb::Doctor(doctor) => doctor.run(everywhere, &*interrupt()?),
         Verb::List { domains: true } => {
             clients::list_domains(&Environment::of_process().bases(), everywhere.json, &mut out)
@@ -131,7 +136,7 @@ fn run_hub(run: &cli::Run, everywhere: &Everywhere) -> Result<(), Failure> {
     })
 }
 
-fn run_simulator(simulate: &cli::Simulate, everywhere: &Everywhere) -> Result<(), Failure> {
+fn run_simulator(simulate: &cli::simulate::Simulate, everywhere: &Everywhere) -> Result<(), Failure> {
     let options = simulate.options()?;
     let (stop, write) = UnixStream::pair().map_err(no_handler)?;
     for signal in [SIGINT, SIGTERM] {

@@ -75,8 +75,8 @@ fn what_is_wrong_is_told_with_its_remedy() {
 #[test]
 fn a_port_without_a_sensor_is_asked_for_a_bounded_time() {
     let stage = Stage::new();
-    // A sensor that hears nothing, because its line runs a hundred times slower than it says.
-    let _simulator = stage.simulator(&["front"], &["--speed=0.01"]);
+    // A sensor that answers nothing.
+    let _simulator = stage.simulator(&["front"], &["--fault=mute=1"]);
     let (findings, _) = doctor(&stage, &[&stage.word("front")], 5);
     let (found, text) = state(&findings, "sensor", Some(&stage.word("front")));
     assert!(found == "failed" && text.contains("no answer at 9600"), "{text}");

@@ -55,7 +55,7 @@ fn a_stream_goes_on() {
 #[test]
 fn nobody_there() {
     let stage = Stage::new();
-    let _simulator = stage.simulator(&["front"], &["--speed=0.01"]);
+    let _simulator = stage.simulator(&["front"], &["--fault=mute=1"]);
     let outcome = stage.run(&["probe", &stage.word("front"), "--json"]);
     let error = &outcome.of_class("error")[0];
     assert_eq!((outcome.code, &error["kind"]), (Some(3), &"timeout".into()), "{outcome}");
@@ -70,7 +70,7 @@ fn nobody_there() {
 #[test]
 fn an_interrupt_ends_it() {
     let stage = Stage::new();
-    let _simulator = stage.simulator(&["front"], &["--speed=0.01"]);
+    let _simulator = stage.simulator(&["front"], &["--fault=mute=1"]);
     let mut probe = stage.command(&["probe", &stage.word("front"), "--json"]);
     probe.env("SCANHUB_LOG", "off");
     let program = stage::Program::start(probe);

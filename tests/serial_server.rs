@@ -131,3 +131,24 @@ fn a_serial_server_that_is_not_there() {
     }
     assert_eq!(hub.end(TERM).code, Some(0));
 }
+
+#[test]
+fn probe_and_doctor_ask_there_too() {
+    let stage = Stage::new();
+    let _simulator = stage.simulator(&["sensor"], &["--baud=38400"]);
+    let server = Server::new(&stage, "sensor", 38_400);
+    let port = format!("tcp:{}", server.address);
+    let outcome = stage.run(&["probe", &port, "--json"]);
+    assert_eq!(outcome.code, Some(0), "{outcome}");
+    let found = &outcome.lines()[0];
+    // The server has the rate; the sensor tells which it is.
+    assert_eq!((number(found, "baud"), number(found, "operating_mode")), (38_400, 0x25), "{found}");
+    let outcome = stage.run(&["doctor", &port, "--no-system-config", "--json"]);
+    assert_eq!(outcome.code, Some(0), "{outcome}");
+    let findings = outcome.of_class("check");
+    let sensor = findings.iter().find(|line| line["name"] == "sensor").expect("it is asked");
+    assert!(sensor["finding"].as_str().is_some_and(|text| text.contains("38400 Bd")), "{sensor}");
+    drop(server);
+    let outcome = stage.run(&["probe", &port, "--json"]);
+    assert_eq!(outcome.code, Some(4), "{outcome}");
+}

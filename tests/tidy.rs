@@ -189,6 +189,28 @@ fn nobody_writes_the_eeprom() {
 }
 
 #[test]
+fn consent_is_given_by_persons() {
+    holds(sources::consent_is_given_by_persons, |tree| {
+        let planted = "//! Writes.\nlet consent = Consent::of_a_person(plan);\n";
+        let ask = tree.text("hub/daemon/src/configure/ask.rs");
+        let plan = tree.text("hub/lms/src/change/plan.rs");
+        vec![
+            tree.with("hub/daemon/src/link.rs", planted),
+            tree.with("hub/daemon/src/configure.rs", planted),
+            tree.with("hub/cli/configure.rs", planted),
+            tree.with(
+                "hub/daemon/src/configure/ask.rs",
+                &ask.replace("fn person", &format!("{planted}fn person")),
+            ),
+            tree.with(
+                "hub/lms/src/change/plan.rs",
+                &plan.replace("Consent(plan)", "Consent(plan); Consent(plan)\n Consent(plan)"),
+            ),
+        ]
+    });
+}
+
+#[test]
 fn files_are_short_and_say_what_they_are_for() {
     holds(sources::files_are_short_and_say_what_they_are_for, |tree| {
         vec![

@@ -11,7 +11,7 @@ use serde::Serialize;
 
 #[derive(Args, Debug)]
 pub(crate) struct Probe {
-    /// A tty; without one the ports of this machine are listed
+    /// A tty or tcp:HOST:PORT; without one the ports of this machine are listed
     #[arg(value_name = "PORT")]
     port: Option<String>,
 }
@@ -52,13 +52,17 @@ impl Progress {
             let _ = write!(stderr(), "\r\x1b[K{text} ..");
         }
     }
+
+    pub(crate) fn clear(&mut self) {
+        if self.is_terminal {
+            let _ = write!(stderr(), "\r\x1b[K");
+        }
+    }
 }
 
 impl Drop for Progress {
     fn drop(&mut self) {
-        if self.is_terminal {
-            let _ = write!(stderr(), "\r\x1b[K");
-        }
+        self.clear();
     }
 }
 

@@ -2,6 +2,8 @@
 //! with what it invents, `tests/fuzzed.rs` with the corpus and with seeded noise. They know invariants, no examples.
 
 use lms::command::Request;
+use lms::eeprom::Write;
+use lms::explain::explain;
 use lms::framer::{Found, Framer, SUFFIX_HOLD, Tally, VETO_HOLD};
 use lms::header::Expect;
 use lms::measured::Measured;
@@ -9,7 +11,7 @@ use lms::reply::Reply;
 use lms::session::{Output, Session};
 use lms::telegram::{MAX_LENGTH, Telegram, Writer};
 use lms::variant::{Baud, Variant};
-use lms::{MILLIS, Nanos, Settings};
+use lms::{Control, MILLIS, Nanos, Settings};
 
 /// A target by its name.
 pub type Target = (&'static str, fn(&[u8]));
@@ -74,11 +76,27 @@ pub fn replies(data: &[u8]) {
     if let Some(request) = Request::decode(telegram) {
         assert_eq!(request.encode(*address).bytes(), encoded.bytes(), "{request:?}");
     }
+    if let Some(write) = Write::decode(telegram) {
+        assert!(lms::command::EEPROM_WRITES.contains(command), "{write:?}");
+        let again = write.encode(*address).expect("what was read can be said");
+        assert_eq!(again.bytes(), encoded.bytes(), "{write:?}");
+    }
     if let Some(measured) = Measured::decode(telegram) {
         assert_eq!(measured.words().len(), measured.count());
         assert!((1..=401).contains(&measured.count()));
     }
-    let _ = Reply::decode(telegram);
+    if let (Some(reply), Some(status)) = (Reply::decode(telegram), telegram.status()) {
+        let again =
+            reply.encode(*address, status).map(|again| Reply::decode(again.telegram()) == Some(reply));
+        assert_ne!(again, Some(false), "{reply:?}");
+    }
+    // The fields are the whole telegram, one after the other.
+    let mut end = 0;
+    explain(telegram, None, &mut |field| {
+        assert_eq!(field.offset, end, "{}", field.name);
+        end += field.bytes.len();
+    });
+    assert_eq!(end, encoded.bytes().len());
 }
 
 /// Any order of events: bytes, time, bytes that leave or stay. Read as a program of two-byte instructions.
@@ -141,6 +159,10 @@ pub fn session(data: &[u8]) {
             2 if until != Nanos::MAX => {
                 now = now.max(until);
                 session.handle_timeout(now);
+            }
+            3 if what & 0x40 != 0 => {
+                const ORDERS: [Control; 3] = [Control::Pause, Control::Resume, Control::Resync];
+                session.control(ORDERS[usize::from(*much) % ORDERS.len()], now);
             }
             // A reply with a right checksum, its data from the program.
             _ => {

@@ -110,6 +110,25 @@ pub(crate) fn nobody_writes_the_eeprom(tree: &Tree) -> Vec<String> {
     breaches
 }
 
+/// Only where a person is asked is consent made, without which nothing that writes the EEPROM leaves for a port.
+pub(crate) fn consent_is_given_by_persons(tree: &Tree) -> Vec<String> {
+    const ASKS: &str = "hub/daemon/src/configure/ask.rs";
+    const TAKES: &str = "hub/lms/src/change";
+    let mut breaches = find(tree, &["of_a_person", "Consent("], |path| {
+        !is_test(path) && path != ASKS && !path.starts_with(TAKES)
+    });
+    let asks = find(tree, &["of_a_person"], |path| path == ASKS);
+    let makers = find(tree, &["Consent("], |path| path.starts_with(TAKES));
+    if asks.len() != 1 {
+        breaches.push(format!("{ASKS} gives consent in {} places", asks.len()));
+    }
+    // The type and its one constructor.
+    if makers.len() != 2 {
+        breaches.push(format!("{TAKES} makes consent in {} places", makers.len()));
+    }
+    breaches
+}
+
 /// A file longer than so is about more than one concept.
 const MOST_LINES: usize = 400;
 

@@ -34,6 +34,8 @@ pub struct Subjects {
 pub(crate) struct Subject {
     pub(crate) source: Source,
     pub(crate) link: Option<Link>,
+    /// Whether somebody said that a sensor is there; anything else may be, and is not spoken to.
+    pub(crate) named: bool,
 }
 
 /// Examines everything, telling each finding as soon as it is there.
@@ -88,11 +90,15 @@ fn choose(subjects: &Subjects, there: &[Candidate], tell: &mut impl FnMut(Findin
     let of_link = |source: &Source| links.iter().find(|link| link.port == *source).cloned();
     if !subjects.ports.is_empty() {
         let named = subjects.ports.iter();
-        return named.map(|source| Subject { source: source.clone(), link: of_link(source) }).collect();
+        return named
+            .map(|source| Subject { source: source.clone(), link: of_link(source), named: true })
+            .collect();
     }
     if !links.is_empty() {
         let ports = links.iter();
-        return ports.map(|link| Subject { source: link.port.clone(), link: Some(link.clone()) }).collect();
+        return ports
+            .map(|link| Subject { source: link.port.clone(), link: Some(link.clone()), named: true })
+            .collect();
     }
     if there.is_empty() {
         tell(Finding::failed(
@@ -101,5 +107,8 @@ fn choose(subjects: &Subjects, there: &[Candidate], tell: &mut impl FnMut(Findin
             "plug an adapter in, or name a port",
         ));
     }
-    there.iter().map(|port| Subject { source: Source::Tty(port.name.clone()), link: None }).collect()
+    there
+        .iter()
+        .map(|port| Subject { source: Source::Tty(port.name.clone()), link: None, named: false })
+        .collect()
 }

@@ -5,6 +5,7 @@ mod attend;
 pub mod bus_error;
 mod clock;
 pub mod config;
+pub mod configure;
 mod control;
 mod converse;
 pub mod doctor;
@@ -18,6 +19,7 @@ mod replay;
 pub mod scanner;
 mod status;
 mod supervise;
+pub mod telegram;
 mod topics;
 
 pub use config::Config;

@@ -8,7 +8,7 @@ use lms::framer::suspect;
 use lms::reply::Reply;
 use lms::session::{Output, Received};
 use lms::variant::{Mode, Unit, Variant};
-use lms::{MILLIS, Nanos, Session, Settings, Trouble};
+use lms::{MILLIS, Nanos, Notice, Session, Settings, Trouble};
 use rustix::event::{PollFd, PollFlags, poll};
 use schema::{Failure, Flags, State, Wake};
 
@@ -33,12 +33,15 @@ pub(crate) struct LinkThread<'a> {
     next_greeting: Nanos,
     next_status: Nanos,
     /// What `error` was made from.
-    facts: Option<(State, Option<Trouble>, Option<Unit>)>,
+    facts: Option<Facts>,
     /// What is wrong, in words; empty if nothing is.
     error: String,
     /// Statuses in a row that said that consumers got nothing.
     unreached: u32,
 }
+
+/// What a link's error is made from.
+type Facts = (State, Option<Trouble>, Option<Unit>, Option<Notice>);
 
 /// Why a wait is over.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -137,10 +140,17 @@ impl<'a> LinkThread<'a> {
                 Output::Wait { until, .. } => break (true, until),
             }
         };
-        let facts = (state_of(session), session.trouble(), session.sensor().unit);
-        let (state, ..) = facts;
+        let sensor = session.sensor();
+        let facts = (state_of(session), session.trouble(), sensor.unit, sensor.notices().next());
+        let (state, .., notice) = facts;
         let changed = self.facts != Some(facts);
         if changed {
+            // What is good to know is no error.
+            if let Some(notice) = notice.filter(|notice| !notice.is_fault())
+                && self.facts.is_none_or(|(.., before)| before != Some(notice))
+            {
+                tracing::info!("{}: {notice}", self.link.name);
+            }
             self.facts = Some(facts);
             self.error = self.trouble(session);
         }
@@ -277,7 +287,10 @@ impl<'a> LinkThread<'a> {
                 expected.mm()
             ),
             _ if self.unreached >= UNREACHED_LIMIT => self.unserved(),
-            _ => String::new(),
+            _ => {
+                let fault = session.sensor().notices().find(|notice| notice.is_fault());
+                fault.map_or_else(String::new, |notice| notice.to_string())
+            }
         }
     }
 

@@ -13,6 +13,7 @@ use crate::config::Source;
 use crate::converse::converse;
 use crate::port::{Candidate, Port, candidates};
 pub use description::Description;
+pub(crate) use description::{hex, measuring};
 
 /// The serial lines of this machine.
 ///
@@ -39,70 +40,85 @@ pub fn probe(source: &Source, stop: &AtomicBool, look: impl FnMut(u32)) -> Resul
     Ok(Description::new(source.name(), &report))
 }
 
-/// The port that `text` names: a tty.
+/// The port that `text` names: a tty, or `tcp:HOST:PORT`.
 ///
 /// [`Kind::Configuration`] if it can be none.
 pub fn source(text: &str) -> Result<Source, Failure> {
     Source::parse(text).map_err(|what| {
-        Failure::new(Kind::Configuration, format!("{text}: {what}"), "name a tty; scanhub probe lists them")
+        Failure::new(
+            Kind::Configuration,
+            format!("{text}: {what}"),
+            "name a tty (scanhub probe lists them), or tcp:HOST:PORT",
+        )
     })
 }
 
 /// Opens `source` at the greatest rate that it can have.
 pub(crate) fn open(source: &Source) -> Result<(Port, Baud), Failure> {
     let open = |baud: Baud| Port::open(source, baud.rate()).map(|port| (port, baud));
-    open(Baud::B500000).or_else(|failure| match failure.kind {
+    let (port, baud) = open(Baud::B500000).or_else(|failure| match failure.kind {
         Kind::PortRate => open(Baud::B38400),
         _ => Err(failure),
-    })
+    })?;
+    // What waits in its buffer may be older than the sensor's last power-on.
+    let _ = port.set_baud(baud.rate());
+    Ok((port, baud))
 }
 
-/// As [`inquire`], and [`Kind::Timeout`] if nobody answers.
+/// Asks the sensor at `port`, which is open at `first`.
+///
+/// [`Kind::Timeout`] if nobody answers; the rest as [`probe`].
 pub(crate) fn ask(
     port: &Port,
     first: Baud,
     source: &Source,
     stop: &AtomicBool,
-    look: impl FnMut(u32),
-) -> Result<Report, Failure> {
-    let report = inquire(port, first, stop, look)?;
-    if report.answers() { Ok(report) } else { Err(silence(source, &report)) }
-}
-
-/// Asks the sensor at `port`, which is open at `first`.
-pub(crate) fn inquire(
-    port: &Port,
-    first: Baud,
-    stop: &AtomicBool,
     mut look: impl FnMut(u32),
 ) -> Result<Report, Failure> {
-    let mut inquiry = Inquiry::new(first, clock::now());
+    let is_server = matches!(source, Source::Tcp { .. });
+    // Which rate a serial server has the sensor tells afterwards; the slowest one waits long enough for any.
+    let now = clock::now();
+    let mut inquiry = if is_server { Inquiry::at(Baud::B9600, now) } else { Inquiry::new(first, now) };
     let mut shown = None;
     converse(port, &mut inquiry, stop, |inquiry| {
-        if shown != Some(inquiry.baud()) {
+        if shown != Some(inquiry.baud()) && !is_server {
             shown = Some(inquiry.baud());
             look(inquiry.baud().rate());
         }
     })?;
-    Ok(inquiry.report().clone())
+    let mut report = inquiry.report().clone();
+    if is_server {
+        report.baud = report.status().and_then(|status| status.baud()).or(report.baud);
+    }
+    if report.answers() { Ok(report) } else { Err(silence(source, &report)) }
 }
 
 /// Why a sensor that did not answer may have been silent.
-pub(crate) fn silence(source: &Source, report: &Report) -> Failure {
+fn silence(source: &Source, report: &Report) -> Failure {
     let name = source.name();
-    let (what, remedy) = match (report.baud, report.bytes) {
+    let came = match report.bytes {
+        0 => "not a byte came".to_owned(),
+        bytes => format!("{bytes} bytes came, no telegram in them"),
+    };
+    let (what, remedy) = match (report.baud, source) {
+        (Some(_), Source::Tcp { .. }) => (
+            format!("{name}: a sensor streams and answers nothing"),
+            "it does not hear the serial server: look at the wire that goes to it",
+        ),
         (Some(baud), _) => (
             format!("{name}: a sensor streams at {} Bd and answers nothing", baud.rate()),
             "it does not hear this port: look at the wire that goes to it",
         ),
-        (None, 0) => (
-            format!("{name}: no answer at 9600, 19200, 38400 or 500000 Bd, and not a byte"),
+        (None, Source::Tcp { .. }) => (
+            format!("{name}: connected, but no answer; {came}"),
+            "set the serial server to the sensor's rate, 8 bits, no parity; power, cable?",
+        ),
+        (None, _) if report.bytes == 0 => (
+            format!("{name}: no answer at 9600, 19200, 38400 or 500000 Bd; {came}"),
             "power, cable, jumper 7-8 for RS-422? after power-on a sensor takes up to a minute",
         ),
-        (None, bytes) => (
-            format!(
-                "{name}: no answer at 9600, 19200, 38400 or 500000 Bd; {bytes} bytes came, no telegram in them"
-            ),
+        (None, _) => (
+            format!("{name}: no answer at 9600, 19200, 38400 or 500000 Bd; {came}"),
             "another device, RS-232 against RS-422, or a wire too few?",
         ),
     };

@@ -178,15 +178,13 @@ pub(crate) fn is_data(command: u8) -> bool {
     STREAMED.contains(&command)
 }
 
-/// Command byte of what a sensor says when its power comes on.
-pub(crate) const POWER_ON: u8 = 0x90;
 /// All values, means, a sub-range, with field values, means of a sub-range, with reflectivity, ranges and
 /// reflectivity, Cartesian (Telegram listing, 20h).
 const STREAMED: [u8; 8] = [MEASURED, 0xB6, 0xB7, 0xBE, 0xBF, 0xC4, 0xF5, 0xF6];
 /// Replies to what a session asks, the refusal, and what is said at power-on, each with its LENGTH: names have 20 or 21
 /// characters, configurations 32 or 34 bytes. Without their length they would be found in scans.
 const BESIDE_A_STREAM: [(u8, core::ops::RangeInclusive<usize>); 7] = [
-    (POWER_ON, 20..=26),
+    (crate::reply::POWER_ON, 20..=26),
     (crate::reply::REFUSED, 2..=2),
     (command::MODE | REPLY, 3..=3),
     (command::STATUS | REPLY, 0x9A..=0x9A),

@@ -8,6 +8,7 @@
 
 mod arrival;
 mod candidates;
+pub mod change;
 pub mod command;
 pub mod condition;
 pub mod configuration;
@@ -22,6 +23,7 @@ pub mod framer;
 pub mod header;
 pub mod inquiry;
 pub mod measured;
+mod notice;
 pub mod operating;
 mod outgoing;
 pub mod parameters;
@@ -38,6 +40,7 @@ pub mod value;
 pub mod variant;
 
 pub use inquiry::Inquiry;
+pub use notice::Notice;
 pub use phase::{Control, Reason, Settings};
 pub use sensor::{Sensor, State, Trouble};
 pub use session::Session;

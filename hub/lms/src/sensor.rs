@@ -1,8 +1,10 @@
 //! What a session knows of its sensor, in plain values: learned from its replies, forgotten never but overwritten.
 
 use crate::command::Request;
-use crate::header::POWER_ON;
-use crate::reply::Reply;
+use crate::condition::{Condition, Severity};
+use crate::notice::Notice;
+use crate::reply::{POWER_ON, Reply};
+use crate::status_report::StatusReport;
 use crate::telegram::Telegram;
 use crate::variant::{Mode, Unit, Variant};
 use core::fmt;
@@ -71,10 +73,25 @@ pub struct Sensor {
     pub unit: Option<Unit>,
     /// Angle and resolution.
     pub variant: Option<Variant>,
-    /// Whether it sends scans unasked.
+    /// Whether it does something unasked: sends scans, or is in a mode in which it does not measure.
     pub streams: bool,
+    /// The status byte of its telegrams. A worse one counts at once, a better one after some hundred telegrams: it may
+    /// change with each scan.
+    pub condition: Option<Condition>,
+    /// Whether it calls itself defective.
+    pub defective: Option<bool>,
+    /// Whether its EEPROM holds a rate for power-on that is not the factory's 9600.
+    pub permanent_baud: Option<bool>,
+    /// Laser power in percent of what it should be; real ones tell 156 to 161.
+    pub laser_power_percent: Option<u16>,
+    /// What the dirtiest channel of the window lets through, in percent of when it was clean (a warning comes below 75, an
+    /// error below 30).
+    pub window_percent: Option<u16>,
+    software: [u8; SOFTWARE_LEN],
     kind: [u8; KIND_LEN],
     kind_len: usize,
+    /// Telegrams in a row whose condition was better.
+    calm: u16,
 }
 
 impl Sensor {
@@ -83,21 +100,37 @@ impl Sensor {
         &self.kind[..self.kind_len]
     }
 
+    /// Firmware as ASCII, such as `V02.19`; empty if it was not asked yet.
+    pub fn software(&self) -> &[u8] {
+        self.software.trim_ascii()
+    }
+
+    /// What its owner should know, worst first.
+    pub fn notices(&self) -> impl Iterator<Item = Notice> {
+        let severity = self.condition.and_then(Condition::severity);
+        let dirty = self.condition.is_some_and(Condition::is_polluted);
+        [
+            (self.defective == Some(true), Notice::Defective),
+            (severity == Some(Severity::Fatal), Notice::Fatal),
+            (severity == Some(Severity::Error), Notice::Error),
+            (dirty || self.window_percent.is_some_and(|percent| percent < DIRTY), Notice::Dirty),
+            (self.permanent_baud == Some(true), Notice::PermanentBaud),
+        ]
+        .into_iter()
+        .filter_map(|(is_so, notice)| is_so.then_some(notice))
+    }
+
     /// Takes over what `telegram` tells, which is `reply`, if it can be read.
     pub(crate) fn learn(&mut self, reply: Option<&Reply<'_>>, telegram: Telegram<'_>) {
         self.address = Some(telegram.address());
+        self.feel(telegram.status().map(Condition));
         if telegram.command() == POWER_ON {
             self.streams = false;
             self.variant = None;
         }
         let Some(reply) = reply else { return };
         match reply {
-            Reply::Status(report) => {
-                self.mode = Some(report.mode());
-                self.unit = report.unit().or(self.unit);
-                self.variant = report.variant().or(self.variant);
-                self.streams = report.operating_mode() != ON_REQUEST;
-            }
+            Reply::Status(report) => self.read(report),
             Reply::Configuration(configuration) => {
                 self.mode = Some(configuration.mode());
                 self.unit = configuration.unit().or(self.unit);
@@ -105,7 +138,7 @@ impl Sensor {
             Reply::Variant { angle_deg, resolution_cdeg, .. } => {
                 self.variant = Variant::new(*angle_deg, *resolution_cdeg).or(self.variant);
             }
-            Reply::Measured(measured) => {
+            Reply::Measured(measured) if measured.partial().is_none() => {
                 self.unit = Some(measured.unit());
                 self.variant = Variant::of_beams(measured.count()).or(self.variant);
             }
@@ -116,8 +149,46 @@ impl Sensor {
             _ => {}
         }
     }
+
+    fn read(&mut self, report: &StatusReport<'_>) {
+        self.mode = Some(report.mode());
+        self.unit = report.unit().or(self.unit);
+        self.variant = report.variant().or(self.variant);
+        self.streams = report.operating_mode() != ON_REQUEST;
+        self.defective = Some(report.is_defective());
+        self.permanent_baud = Some(report.has_permanent_baud());
+        self.laser_power_percent = Some(report.laser_power_percent());
+        let channels = report.pollution().into_iter().zip(report.pollution_calibration()).take(CHANNELS);
+        let percent = |(is, was): (u16, u16)| (u32::from(is) * 100).checked_div(u32::from(was));
+        self.window_percent = channels.filter_map(percent).min().and_then(|percent| percent.try_into().ok());
+        self.software = *report.bytes().first_chunk().unwrap_or(&[0; SOFTWARE_LEN]);
+    }
+
+    fn feel(&mut self, condition: Option<Condition>) {
+        let is_better = badness(condition) < badness(self.condition);
+        self.calm = if is_better { self.calm + 1 } else { 0 };
+        if !is_better || self.calm > CALM {
+            self.condition = condition;
+            self.calm = 0;
+        }
+    }
 }
 
+/// An order of conditions by what is told of them.
+fn badness(condition: Option<Condition>) -> u8 {
+    let severity = condition.and_then(Condition::severity).unwrap_or(Severity::Ok);
+    let polluted = condition.is_some_and(Condition::is_polluted);
+    if severity >= Severity::Error { 2 * severity.code() + u8::from(polluted) } else { u8::from(polluted) }
+}
+
+/// Better telegrams in a row before a bad one is forgotten: some seconds of scans.
+const CALM: u16 = 200;
+/// A window that lets through less than so many percent is dirty (Telegram listing, errors 18 and 19).
+const DIRTY: u16 = 75;
+/// Channels of the pollution measurement that look through the window; the others are its reference.
+const CHANNELS: usize = 8;
+/// Bytes of the firmware's name.
+const SOFTWARE_LEN: usize = 7;
 /// A type reply has 20 or 21 characters.
 const KIND_LEN: usize = 24;
 /// Operating mode: values on request.

@@ -40,8 +40,9 @@ pub struct Wire {
     power: Schedule,
     /// Whether the adapter is in its socket.
     plugged: bool,
-    /// Bytes of the telegram on the line that were sent, and why they did not arrive as they were.
+    /// Bytes of the telegram on the line that were sent, the last of them, and why they did not arrive as they were.
     position: usize,
+    last: u8,
     fault: Option<Fault>,
     /// Whether the power broke it off.
     power_broke: bool,
@@ -64,6 +65,7 @@ impl Wire {
             power: Schedule::power_cycles(faults, seed),
             plugged: true,
             position: 0,
+            last: 0,
             fault: None,
             power_broke: false,
             header: Vec::new(),
@@ -76,8 +78,8 @@ impl Wire {
         let fresh = Wire::new(faults, seed);
         let lateness = fresh.lateness.behind(&self.lateness);
         let (queue, header) = (std::mem::take(&mut self.queue), std::mem::take(&mut self.header));
-        let Wire { position, fault, power_broke, .. } = *self;
-        *self = Wire { lateness, position, fault, power_broke, queue, header, ..fresh };
+        let Wire { position, last, fault, power_broke, .. } = *self;
+        *self = Wire { lateness, position, last, fault, power_broke, queue, header, ..fresh };
     }
 
     /// Whether the host's adapter is in its socket, as of the last poll.
@@ -110,6 +112,9 @@ impl Wire {
             match machine.poll_transmit(now) {
                 Some(chunk) => self.carry(machine, chunk, now),
                 None => {
+                    if self.position > 0 {
+                        return None;
+                    }
                     let bytes = Some(self.garbage(now, false)?.0);
                     let bytes = bytes.filter(|_| !self.silence.holds(now)).unwrap_or_default();
                     let baud = machine.baud();
@@ -182,16 +187,18 @@ impl Wire {
             if position == 0 {
                 self.blemishes.begin();
                 self.fault = None;
+                self.last = byte;
             }
             fault = fault.or(is_silent.then_some(Fault::Silence));
+            let between = (position > 0).then(|| (std::mem::replace(&mut self.last, byte), byte));
             if let Some((garbage, cause)) = self.garbage(now, position > 0) {
-                arrived.extend(garbage);
-                fault = fault.or((position > 0).then_some(cause));
+                arrived.extend(foreign(garbage, between));
+                fault = fault.or(between.map(|_| cause));
             }
             let Fate { before, lost, flipped, doubled } = self.noise.next();
             let (blemished, blemish) = self.blemishes.apply(position, byte);
             fault = fault.or((position > 0 && !before.is_empty()).then_some(Fault::Insert));
-            arrived.extend(before);
+            arrived.extend(foreign(before, between));
             fault = fault.or(blemish).or(lost.then_some(Fault::Loss));
             let Some(byte) = blemished.filter(|_| !lost) else { continue };
             fault = fault.or((flipped != 0).then_some(Fault::Flip));
@@ -216,6 +223,9 @@ impl Wire {
 
     /// Garbage that is due, inside a telegram or between two, and its name.
     fn garbage(&mut self, now: Nanos, inside: bool) -> Option<(Vec<u8>, Fault)> {
+        if self.extras.iter().all(|extra| extra.due_ns(inside) > now) {
+            return None;
+        }
         let header = &self.header;
         self.extras.iter_mut().find_map(|extra| Some((extra.take(now, inside, header)?, extra.fault)))
     }
@@ -230,6 +240,22 @@ impl Carried {
     pub fn is_telegram(&self) -> bool {
         matches!(self.part, Some(Part::Telegram | Part::End(_)))
     }
+}
+
+/// Foreign bytes that came `between` two of a telegram, none of which can stand for one of them: else the telegram
+/// would be whole, shifted by as many.
+fn foreign(mut bytes: Vec<u8>, between: Option<(u8, u8)>) -> Vec<u8> {
+    if let (Some((before, after)), [first, rest @ ..]) = (between, &mut bytes[..]) {
+        let last = rest.last_mut();
+        let is_alone = last.is_none();
+        if let Some(last) = last.filter(|last| **last == before) {
+            *last ^= 1;
+        }
+        while *first == after || (is_alone && *first == before) {
+            *first = first.wrapping_add(1);
+        }
+    }
+    bytes
 }
 
 /// Bytes of a stream's header: STX to count word.

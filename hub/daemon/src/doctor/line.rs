@@ -34,10 +34,7 @@ pub(crate) fn examine(
             tell(recording(path));
             return Ok(());
         }
-        Source::Tcp { .. } => {
-            tell(Finding::skipped("sensor", "is behind a serial server"));
-            return Ok(());
-        }
+        Source::Tcp { .. } => return server(subject, hub, stop, tell),
     };
     let candidate = candidate(path, there);
     tell(presence(&subject.source, path, candidate));
@@ -65,6 +62,17 @@ pub(crate) fn examine(
         return Ok(());
     }
     tell(Finding::ok("holder", "nobody has it open"));
+    if !subject.named {
+        // To open it alone would start some devices anew.
+        tell(if candidate.is_none_or(|candidate| candidate.is_permitted) {
+            Finding::ok("access", "may be opened")
+        } else {
+            refused(Refusal::Denied.explain(&subject.source))
+        });
+        let why = "not asked: nobody said that it is a sensor's port; scanhub doctor PORT asks";
+        tell(Finding::skipped("sensor", why));
+        return Ok(());
+    }
     let (port, first) = match probe::open(&subject.source) {
         Ok(opened) => opened,
         Err(failure) => {
@@ -74,21 +82,46 @@ pub(crate) fn examine(
     };
     tell(Finding::ok("access", "can be opened, is a serial line"));
     tell(rate(subject, &port, first));
-    let report = match probe::inquire(&port, first, stop, |_| {}) {
-        Ok(report) => report,
-        Err(failure) if failure.kind == Kind::Interrupted => return Err(failure),
-        Err(failure) => {
-            tell(Finding::failed("sensor", failure.message, failure.hint));
-            return Ok(());
-        }
-    };
-    if !report.answers() {
-        let failure = probe::silence(&subject.source, &report);
-        tell(Finding::failed("sensor", failure.message, failure.hint));
+    ask(subject, &port, first, stop, tell)
+}
+
+/// Examines a serial server and the sensor behind it.
+fn server(
+    subject: &Subject,
+    hub: Option<&Hub>,
+    stop: &AtomicBool,
+    tell: &mut dyn FnMut(Finding),
+) -> Result<(), Failure> {
+    // Most of them serve one at a time.
+    if let Some(link) = hub.and_then(|hub| hub.link(&subject.source.name())) {
+        tell(Finding::ok("holder", "it is a link of the hub"));
+        tell(sensor::as_the_hub_says(Some(link)));
         return Ok(());
     }
-    for finding in sensor::examine(&report, subject.link.as_ref()) {
-        tell(finding);
+    match probe::open(&subject.source) {
+        Ok((port, first)) => {
+            tell(Finding::ok("access", "connected; its rate was set there, by hand"));
+            ask(subject, &port, first, stop, tell)
+        }
+        Err(failure) => {
+            tell(refused(failure));
+            Ok(())
+        }
+    }
+}
+
+/// Examines the sensor at `port`, which is open at `first`.
+fn ask(
+    subject: &Subject,
+    port: &Port,
+    first: Baud,
+    stop: &AtomicBool,
+    tell: &mut dyn FnMut(Finding),
+) -> Result<(), Failure> {
+    match probe::ask(port, first, &subject.source, stop, |_| {}) {
+        Ok(report) => sensor::examine(&report, subject.link.as_ref()).into_iter().for_each(tell),
+        Err(failure) if failure.kind == Kind::Interrupted => return Err(failure),
+        Err(failure) => tell(Finding::failed("sensor", failure.message, failure.hint)),
     }
     Ok(())
 }

@@ -153,3 +153,124 @@ fn word(unit: Unit) -> &'static str {
 
 /// The operating mode in which the EEPROM can be written.
 const INSTALLATION: u8 = 0x00;
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::doctor::finding::State as Verdict;
+    use lms::exchange::{Conversation, Output};
+    use lms::status_report::Health;
+    use lms::telegram::{Telegram, Writer};
+    use lms::variant::{Baud, Mode};
+    use lms::{Inquiry, configuration};
+
+    /// What an inquiry makes of a sensor with this status report, status byte and errors.
+    fn report(status: [u8; 152], condition: u8, errors: &[u8]) -> Report {
+        let mut inquiry = Inquiry::new(Baud::B38400, 0);
+        let (mut now, mut request, mut reply) = (0, Vec::new(), Vec::new());
+        loop {
+            match inquiry.poll_output() {
+                Output::Done => return inquiry.report().clone(),
+                Output::SetBaud(baud) => panic!("{baud:?}"),
+                Output::Transmit { byte, not_before } => {
+                    now = not_before.max(now);
+                    request.push(byte);
+                    inquiry.transmitted(now);
+                    if let Some(asked) = Telegram::check(&request) {
+                        let data: Vec<u8> = match asked.command() {
+                            0x31 => status.to_vec(),
+                            0x32 => errors.to_vec(),
+                            0x3A => b"LMS200;301063;V02.30 ".to_vec(),
+                            _ => configuration::factory(Mode(1), Unit::Mm).to_vec(),
+                        };
+                        let told = Writer::new(0x80, asked.command() | 0x80).slice(&data).byte(condition);
+                        reply = told.finish().bytes().to_vec();
+                        request.clear();
+                    }
+                }
+                Output::Wait { until } => {
+                    now = until;
+                    let told = std::mem::take(&mut reply);
+                    inquiry.spare()[..told.len()].copy_from_slice(&told);
+                    inquiry.commit(now, told.len());
+                    if told.is_empty() {
+                        inquiry.handle_timeout(now);
+                    }
+                }
+            }
+        }
+    }
+
+    fn healthy() -> [u8; 152] {
+        let health = Health {
+            software: *b"V02.30 ",
+            operating_mode: 0x25,
+            mode: Mode(1),
+            variant: Variant::HALF,
+            unit: Unit::Mm,
+            baud: Baud::B38400,
+        };
+        health.report()
+    }
+
+    /// Verdict and words of a check on a sensor of which byte `at` of the status is `byte`.
+    fn verdict(name: &str, at: usize, byte: u8, condition: u8, errors: &[u8]) -> (Verdict, String) {
+        let mut status = healthy();
+        status[at] = byte;
+        let findings = examine(&report(status, condition, errors), None);
+        let found = findings.iter().find(|finding| finding.name == name).expect("it is checked");
+        (found.state, found.to_string())
+    }
+
+    #[test]
+    fn what_a_sensor_complains_of_is_told() {
+        let (state, text) = verdict("health", 8, 0, 0x10, &[]);
+        assert_eq!(state, Verdict::Ok, "{text}");
+        let (state, text) = verdict("health", 8, 0, 0x11, &[0x84, 22, 1, 49]);
+        assert!(state == Verdict::Ok && text.contains("1 in its memory"), "{text}");
+        let (state, text) = verdict("health", 8, 0, 0x92, &[2, 18]);
+        assert!(state == Verdict::Warning && text.contains("window is dirty; warning 18"), "{text}");
+        let (state, text) = verdict("health", 122, 0, 0x10, &[]);
+        assert!(state == Verdict::Warning && text.contains("laser is off"), "{text}");
+        let (state, text) = verdict("health", 8, 1, 0x14, &[4, 29]);
+        assert!(state == Verdict::Failed && text.contains("defective; fatal 29: motor"), "{text}");
+    }
+
+    #[test]
+    fn what_a_former_owner_left_is_told() {
+        assert_eq!(verdict("power-on", 118, 0, 0x10, &[]).0, Verdict::Ok);
+        let (state, text) = verdict("power-on", 118, 1, 0x10, &[]);
+        assert!(state == Verdict::Warning && text.contains("power_on_baud=9600"), "{text}");
+        let (state, text) = verdict("power-on", 7, 0x00, 0x10, &[]);
+        assert!(state == Verdict::Warning && text.contains("installation mode"), "{text}");
+    }
+
+    #[test]
+    fn what_the_configuration_says_otherwise_is_told() {
+        let link = Link {
+            name: "front".into(),
+            port: crate::config::Source::Tty("/dev/ttyUSB0".into()),
+            family: Some(Family::Lms291),
+            variant: Variant::HALF,
+            unit: Some(Unit::Cm),
+            baud: Baud::B500000,
+        };
+        let finding = settings(&report(healthy(), 0x10, &[]), Some(&link));
+        let text = finding.to_string();
+        assert_eq!(finding.state, Verdict::Warning, "{text}");
+        assert!(text.contains("type lms291, it is a lms200") && text.contains("unit=cm"), "{text}");
+        assert_eq!(settings(&report(healthy(), 0x10, &[]), None).state, Verdict::Ok);
+    }
+
+    #[test]
+    fn what_the_hub_says_is_passed_on() {
+        let mut status = Status { state: State::Streaming as u8, baud: 500_000, ..Status::default() };
+        assert_eq!(as_the_hub_says(Some(("front", &status))).state, Verdict::Ok);
+        status.set_last_error("the window is dirty");
+        let told = as_the_hub_says(Some(("front", &status)));
+        assert!(told.state == Verdict::Warning && told.finding.contains("window"), "{told}");
+        status.state = State::Silent as u8;
+        assert_eq!(as_the_hub_says(Some(("front", &status))).state, Verdict::Failed);
+        assert_eq!(as_the_hub_says(None).state, Verdict::Skipped);
+    }
+}

@@ -6,6 +6,7 @@ use lms::command::Request;
 use lms::condition::Condition;
 use lms::configuration::availability_words;
 use lms::inquiry::Report;
+use lms::operating;
 use lms::reply::Reply;
 use lms::variant::Mode;
 use serde::Serialize;
@@ -111,7 +112,10 @@ impl fmt::Display for Description {
         let power_on = |permanent| if permanent { "as it was set, not 9600 Bd" } else { "9600 Bd" };
         row("after power-on", self.permanent_rate.map(|permanent| power_on(permanent).to_owned()))?;
         row("address", self.address.map(|address| address.to_string()))?;
-        row("operating mode", self.operating_mode.map(|mode| format!("{mode:02x}h, {}", operating(mode))))?;
+        row(
+            "operating mode",
+            self.operating_mode.map(|mode| format!("{mode:02x}h, {}", operating::name(mode))),
+        )?;
         row("measuring mode", self.mode.map(|mode| format!("{mode:02x}h, {}", measuring(Mode(mode)))))?;
         row("unit", self.unit_mm.map(|mm| format!("{mm} mm")))?;
         let view = self.angle_deg.zip(self.step_deg);
@@ -134,27 +138,8 @@ impl fmt::Display for Description {
     }
 }
 
-/// What the sensor does, by the byte after command 20h (Telegram listing 7.3).
-fn operating(mode: u8) -> &'static str {
-    match mode {
-        0x00 => "installation: somebody left it there, its field outputs are blocked",
-        0x10 => "diagnosis",
-        0x20..=0x23 | 0x2C => "streams least values",
-        0x24 => "streams all values",
-        0x25 => "values on request",
-        0x26 => "streams mean values",
-        0x27 => "streams a sub-range",
-        0x28 => "streams mean values of a sub-range",
-        0x29 => "streams a sub-range with field values",
-        0x2A => "streams partial scans",
-        0x2B | 0x50 => "streams ranges and reflectivities",
-        0x2E => "streams records for navigation",
-        _ => "not known here",
-    }
-}
-
 /// How the values are split (Telegram listing, 77h block D).
-fn measuring(mode: Mode) -> String {
+pub(crate) fn measuring(mode: Mode) -> String {
     let upper = match (mode.0, mode.intensity_bits()) {
         (0x00, _) => "fields A and B, dazzle",
         (0x02, _) => "fields A, B and C",
@@ -171,6 +156,6 @@ fn measuring(mode: Mode) -> String {
 }
 
 /// Bytes in lower hex, without spaces.
-fn hex(bytes: &[u8]) -> String {
+pub(crate) fn hex(bytes: &[u8]) -> String {
     bytes.iter().map(|byte| format!("{byte:02x}")).collect()
 }

@@ -4,7 +4,8 @@ use lms::command::Request;
 use lms::telegram::{Encoded, Writer};
 use lms::variant::{Baud, Mode, Unit};
 use lms::{Inquiry, MILLIS};
-use sim::machine::Settings;
+use sim::machine::{Settings, Start};
+use sim::operating::Operating;
 
 use crate::bench::{Bench, machine, make_stream, say, sensor};
 
@@ -53,6 +54,55 @@ fn nothing_is_said_that_changes_anything() {
             assert!([0x31, 0x32, 0x35, 0x3A, 0x74].contains(&telegram[4]), "{telegram:02X?}");
         }
     }
+}
+
+#[test]
+fn found_in_every_operating_mode_and_left_in_it() {
+    for operating in [
+        Operating::All,
+        Operating::Partial,
+        Operating::Means(3),
+        Operating::Range(10, 90),
+        Operating::Fields(1, 50),
+        Operating::Reflectivity(vec![(1, 40), (60, 80)]),
+        Operating::Installation,
+    ] {
+        for baud in Baud::ALL {
+            let start = Start::In(operating.clone());
+            let settings = Settings { baud, start, seed: 4, ..Settings::default() };
+            let mut bench = Bench::new(Inquiry::new(Baud::B500000, 0), Baud::B500000, machine(settings), 0);
+            bench.finish(20_000 * MILLIS);
+            let report = bench.talk.report();
+            let mode = report.status().map(|status| status.operating_mode());
+            assert_eq!((report.baud, mode), (Some(baud), Some(operating.code())), "{operating:?}");
+            assert_eq!((report.kind().is_some(), report.errors().is_some()), (true, true), "{operating:?}");
+            assert_eq!(*bench.machine.operating(), operating);
+            let is_silent = operating == Operating::Installation;
+            assert_eq!(bench.overhear(3_000 * MILLIS).is_empty(), is_silent, "{operating:?} {baud:?}");
+        }
+    }
+}
+
+#[test]
+fn what_it_suffers_from_and_what_a_former_owner_left() {
+    let settings = Settings {
+        baud: Baud::B38400,
+        permanent_baud: Some(Baud::B38400),
+        type_name: "LMS291;S05123;V02.10 ".into(),
+        errors: vec![(0x84, 22), (2, 18)],
+        status: 0x92,
+        configuration_len: 32,
+        ..Settings::default()
+    };
+    let mut bench = Bench::new(Inquiry::new(Baud::B9600, 0), Baud::B9600, machine(settings), 0);
+    bench.finish(20_000 * MILLIS);
+    let report = bench.talk.report();
+    assert_eq!(report.status().map(|status| status.has_permanent_baud()), Some(true));
+    assert_eq!(report.configuration().map(|configuration| configuration.bytes().len()), Some(32));
+    assert_eq!(report.status_byte, Some(0x92));
+    let faults: Vec<_> = report.errors().expect("was asked").iter().map(|fault| fault.number).collect();
+    assert_eq!(faults, [22, 18]);
+    assert!(report.reply(Request::Counters).is_some(), "an LMS 291 counts its hours");
 }
 
 #[test]

@@ -1,5 +1,7 @@
 //! Asking a simulated sensor what it is, in virtual time: one file per situation.
 
+mod anything;
 mod bench;
+mod change;
 mod finding;
 mod trouble;

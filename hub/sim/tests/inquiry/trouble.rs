@@ -2,6 +2,7 @@
 
 use lms::variant::Baud;
 use lms::{Inquiry, MILLIS};
+use sim::machine::Habits;
 
 use crate::bench::{Bench, make_stream, sensor};
 
@@ -49,6 +50,28 @@ fn a_request_that_is_overlooked_is_said_again() {
         found += usize::from(bench.talk.report().baud == Some(baud));
     }
     assert!(found >= 38, "{found} of 40 found");
+}
+
+#[test]
+fn late_doubled_and_refused_replies() {
+    for (word, habits) in [
+        ("late", Habits { late_reply_ns: 250 * MILLIS, ..Habits::default() }),
+        ("late ACK", Habits { late_acknowledge_ns: 120 * MILLIS, ..Habits::default() }),
+        ("doubled", Habits { doubles: 1.0, ..Habits::default() }),
+        ("NAK", Habits { naks: 0.3, ..Habits::default() }),
+        ("refused", Habits { refuses: vec![0x3A, 0x32], ..Habits::default() }),
+    ] {
+        for baud in Baud::ALL {
+            let mut machine = sensor(baud);
+            machine.set_habits(habits.clone());
+            let mut bench = Bench::new(Inquiry::new(Baud::B500000, 0), Baud::B500000, machine, 0);
+            bench.finish(20_000 * MILLIS);
+            let report = bench.talk.report();
+            assert_eq!(report.baud, Some(baud), "{word}");
+            assert!(report.status().is_some() && report.configuration().is_some(), "{word}, {baud:?}");
+            assert_eq!(report.kind().is_some(), word != "refused", "{word}, {baud:?}");
+        }
+    }
 }
 
 #[test]

@@ -4,6 +4,7 @@ mod bench;
 mod habits;
 mod modes;
 mod power;
+mod wire;
 
 use lms::command::{EEPROM_WRITES, Request};
 use lms::measured::Measured;

@@ -8,10 +8,12 @@ use lms::session::{Output, Session};
 use lms::variant::{Baud, Variant};
 use lms::{MICROS, MILLIS, Nanos, Settings, State, line_time};
 use sim::Arrival;
-use sim::machine::{self, Chunk, Machine, Part};
+use sim::fault::{Fault, Faults};
+use sim::machine::{self, Machine, Part};
 use sim::noise::Receiver;
 use sim::room::{Room, World};
 use sim::source::Source;
+use sim::wire::{Carried, Wire};
 
 /// From sensor to host: what becomes of a chunk that is through at this time.
 pub(crate) type ToHost = Box<dyn FnMut(Nanos, Vec<u8>) -> Vec<u8>>;
@@ -22,6 +24,8 @@ pub(crate) type ToSensor = Box<dyn FnMut(usize, u8) -> Option<u8>>;
 pub(crate) struct Bench {
     pub(crate) session: Session,
     pub(crate) machine: Machine,
+    /// What goes wrong on the line by itself.
+    pub(crate) wire: Wire,
     pub(crate) now: Nanos,
     pub(crate) to_host: ToHost,
     pub(crate) to_sensor: ToSensor,
@@ -36,6 +40,9 @@ pub(crate) struct Bench {
     inbox: VecDeque<u8>,
     garbled: Option<((Baud, Baud), Receiver)>,
     damaged: bool,
+    fault: Option<Fault>,
+    /// Whether the session streamed since the telegram on the line began.
+    streamed: bool,
     read: u64,
     looks: u32,
     /// Bytes said of the request that is being said.
@@ -52,6 +59,12 @@ pub(crate) struct Sent {
     pub(crate) aborted: bool,
     /// Whether the line did something to it.
     pub(crate) damaged: bool,
+    /// What the wire did to it.
+    #[allow(dead_code, reason = "for the tests of faults")]
+    pub(crate) fault: Option<Fault>,
+    /// Whether the session streamed while it came, so that nothing but the line can have lost it.
+    #[allow(dead_code, reason = "for the tests of faults")]
+    pub(crate) streamed: bool,
 }
 
 /// A telegram as the session delivered it.
@@ -59,6 +72,9 @@ pub(crate) struct Sent {
 pub(crate) struct Received {
     pub(crate) at: Nanos,
     pub(crate) telegram: Vec<u8>,
+    /// Why it is suspect; 0 is clean.
+    #[allow(dead_code, reason = "for the tests of faults")]
+    pub(crate) reasons: u8,
     /// Reads since the one before it.
     pub(crate) looks: u32,
 }
@@ -103,6 +119,7 @@ impl Bench {
         Bench {
             session: Session::new(wanted, now),
             machine,
+            wire: Wire::new(&Faults::default(), 0),
             now,
             to_host: Box::new(|_, bytes| bytes),
             to_sensor: Box::new(|_, byte| Some(byte)),
@@ -114,6 +131,8 @@ impl Bench {
             inbox: VecDeque::new(),
             garbled: None,
             damaged: false,
+            fault: None,
+            streamed: true,
             read: 0,
             looks: 0,
             request: Vec::new(),
@@ -189,7 +208,8 @@ impl Bench {
                 Output::Telegram(received) => {
                     let telegram = received.telegram.bytes().to_vec();
                     let looks = std::mem::take(&mut self.looks);
-                    self.received.push(Received { at: self.now, telegram, looks });
+                    let reasons = received.reasons;
+                    self.received.push(Received { at: self.now, telegram, reasons, looks });
                 }
                 Output::Rest(until) => break (false, until),
                 Output::Wait { until, .. } => break (true, until),
@@ -199,6 +219,7 @@ impl Bench {
         let known = tally.in_telegrams + tally.acknowledge + tally.discarded + self.session.buffered() as u64;
         assert_eq!((tally.read, known), (self.read, self.read), "bytes vanished");
         assert_eq!(self.machine.eeprom_writes(), 0);
+        self.streamed &= self.is_streaming();
         if self.states.last() != Some(&self.session.state()) {
             self.states.push(self.session.state());
         }
@@ -208,7 +229,7 @@ impl Bench {
     /// Waits until `until`, or for bytes if they are watched for.
     fn wait(&mut self, watch: bool, until: Nanos) {
         while !watch || self.inbox.is_empty() {
-            match self.machine.poll_timeout() {
+            match self.wire.poll_timeout(&self.machine, self.now) {
                 Some(at) if at <= until => self.advance(at),
                 _ => break,
             }
@@ -238,41 +259,47 @@ impl Bench {
         if let Some(byte) = (self.to_sensor)(number, byte)
             && self.machine.baud() == self.port
         {
-            self.machine.receive(byte, Arrival::at(self.now));
+            self.wire.receive(&mut self.machine, byte, Arrival::at(self.now));
         }
     }
 
     /// Lets the time be `to`, unless it is later already.
     fn advance(&mut self, to: Nanos) {
-        while let Some(at) = self.machine.poll_timeout().filter(|&at| at <= to) {
+        while let Some(at) = self.wire.poll_timeout(&self.machine, self.now).filter(|&at| at <= to) {
             self.now = self.now.max(at);
-            while let Some(chunk) = self.machine.poll_transmit(self.now) {
-                self.carry(chunk);
+            while let Some(carried) = self.wire.poll_transmit(&mut self.machine, self.now) {
+                self.carry(carried);
             }
         }
         self.now = self.now.max(to);
     }
 
-    /// What the sensor sent is through.
-    fn carry(&mut self, chunk: Chunk) {
-        let sent = chunk.bytes.clone();
-        let mut bytes = (self.to_host)(self.now, chunk.bytes);
-        if chunk.baud != self.port {
-            let rates = (chunk.baud, self.port);
+    /// What the wire brings is there.
+    fn carry(&mut self, carried: Carried) {
+        if carried.is_telegram() {
+            self.fault = self.fault.or(carried.fault);
+        }
+        let Carried { bytes: brought, baud, idle_after, part, .. } = carried;
+        let mut bytes = (self.to_host)(self.now, brought.clone());
+        if baud != self.port {
+            let rates = (baud, self.port);
             if self.garbled.as_ref().is_none_or(|(known, _)| *known != rates) {
                 self.garbled = Some((rates, Receiver::new(rates.0.rate(), rates.1.rate())));
             }
             let receiver = self.garbled.as_mut().map(|(_, receiver)| receiver);
-            bytes = receiver.map_or(Vec::new(), |receiver| receiver.receive(&bytes, chunk.idle_after));
+            bytes = receiver.map_or(Vec::new(), |receiver| receiver.receive(&bytes, idle_after));
         }
-        self.damaged |= bytes != sent;
+        self.damaged |= bytes != brought;
         self.inbox.extend(bytes);
-        match chunk.part {
-            Part::Telegram => {}
-            Part::Acknowledge => self.damaged = false,
-            Part::End(machine::Sent { is_reply, telegram, aborted }) => {
-                let damaged = std::mem::take(&mut self.damaged);
-                self.sent.push(Sent { at: self.now, telegram, is_reply, aborted, damaged });
+        match part {
+            None | Some(Part::Telegram) => {}
+            Some(Part::Acknowledge) => self.damaged = false,
+            Some(Part::End(machine::Sent { is_reply, telegram, aborted })) => {
+                let fault = self.fault.take();
+                let damaged = std::mem::take(&mut self.damaged) || fault.is_some();
+                let streams = self.is_streaming();
+                let streamed = std::mem::replace(&mut self.streamed, streams);
+                self.sent.push(Sent { at: self.now, telegram, is_reply, aborted, damaged, fault, streamed });
             }
         }
     }

@@ -1,8 +1,8 @@
 //! What somebody left behind in a sensor: the installation mode, in which it does not measure, and a rate in its
 //! EEPROM, which is none of ours to change.
 
-use lms::MILLIS;
 use lms::variant::Baud;
+use lms::{MILLIS, Notice};
 use sim::machine::{Settings, Start};
 use sim::operating::Operating;
 
@@ -23,10 +23,16 @@ fn the_installation_mode_is_left() {
 #[test]
 fn a_permanent_rate_is_found_worked_with_and_kept() {
     for permanent in Baud::ALL {
-        let settings = Settings { baud: permanent, permanent_baud: Some(permanent), ..Settings::default() };
+        let permanent_baud = (permanent != Baud::B9600).then_some(permanent);
+        let settings = Settings { baud: permanent, permanent_baud, ..Settings::default() };
         let mut bench = Bench::new(sensor_with(settings), 0);
         bench.until("streaming", 3_000 * MILLIS, Bench::is_streaming);
         bench.run(500 * MILLIS);
+        // That is good to know, and no trouble.
+        let is_said = bench.session.sensor().notices().eq([Notice::PermanentBaud]);
+        assert_eq!(is_said, permanent != Baud::B9600, "{permanent:?}: {bench}");
+        assert_eq!(bench.session.sensor().permanent_baud, Some(is_said));
+        assert_eq!(bench.session.trouble(), None);
         // It comes back at its own rate, and is found again.
         let now = bench.now;
         bench.machine.power_cycle(now);

@@ -9,6 +9,7 @@ mod habits;
 mod installation;
 mod loss;
 mod modes;
+mod notices;
 mod power;
 mod property;
 mod rest;

@@ -1,0 +1,48 @@
+//! `scanhub configure` on the command line: what it takes, and what it says.
+
+use std::sync::atomic::AtomicBool;
+
+use clap::Args;
+use daemon::configure::{News, Order, configure};
+use daemon::probe::source;
+use schema::Failure;
+
+use super::probe::Progress;
+
+#[derive(Args, Debug)]
+pub(crate) struct Configure {
+    /// A tty or tcp:HOST:PORT
+    #[arg(value_name = "PORT")]
+    port: String,
+    /// unit=mm|cm, mode=NAME|0x01, availability=1|2|3, indices=on|off, sensitivity=standard|medium|low|high,
+    /// power_on_baud=9600|keep, configuration=HEX
+    #[arg(value_name = "KEY=VALUE")]
+    settings: Vec<String>,
+    /// Password of the installation mode
+    #[arg(long, default_value = "SICK_LMS", value_name = "WORD")]
+    password: String,
+}
+
+impl Configure {
+    pub(crate) fn run(&self, json: bool, stop: &AtomicBool) -> Result<(), Failure> {
+        let order = Order {
+            source: source(&self.port)?,
+            settings: self.settings.clone(),
+            password: self.password.clone(),
+        };
+        let mut progress = Progress::new();
+        configure(&order, stop, &mut |news| match news {
+            News::Looking(rate) => progress.show(&format!("looking at {rate} Bd")),
+            News::Doing(what) => progress.show(what),
+            News::Asking => progress.clear(),
+            News::Difference(difference) => {
+                progress.clear();
+                crate::say(&if json { crate::line(difference) } else { difference.to_string() });
+            }
+            News::Configured(configured) => {
+                progress.clear();
+                crate::say(&if json { crate::line(configured) } else { configured.to_string() });
+            }
+        })
+    }
+}

@@ -1,0 +1,67 @@
+//! `scanhub telegram` on the command line.
+
+use std::path::PathBuf;
+
+use clap::{Args, Subcommand};
+use daemon::telegram::{DecodeOptions, EncodeOptions};
+
+#[derive(Args, Debug)]
+pub(crate) struct Telegram {
+    #[command(subcommand)]
+    pub(crate) way: Way,
+}
+
+#[derive(Debug, Subcommand)]
+pub(crate) enum Way {
+    /// Bytes to words: the telegrams in a recording, a pipe, or text such as 02 00 01 00 31 15 12
+    Decode(Decode),
+    /// Words to bytes, which are printed and not sent
+    #[command(after_help = daemon::telegram::names())]
+    Encode(Encode),
+}
+
+#[derive(Args, Debug)]
+pub(crate) struct Decode {
+    /// File with the bytes, as they came down a line or as text; - or nothing is stdin
+    file: Option<PathBuf>,
+    /// Measuring mode of the values, for example 0x01 [default: what the telegrams tell]
+    #[arg(long, value_name = "BYTE")]
+    mode: Option<String>,
+    /// Every value of long lists
+    #[arg(long)]
+    all: bool,
+}
+
+impl Decode {
+    pub(crate) fn options(&self, json: bool) -> DecodeOptions {
+        DecodeOptions { file: self.file.clone(), mode: self.mode.clone(), all: self.all, json }
+    }
+}
+
+#[derive(Args, Debug)]
+pub(crate) struct Encode {
+    /// Name of the telegram and its values; see below
+    #[arg(required = true, value_name = "NAME")]
+    words: Vec<String>,
+    /// The sensor's own address, 0 to 127; 0 is all sensors
+    #[arg(long, default_value_t = 0, value_name = "N")]
+    address: u8,
+    /// Status byte of a reply [default: 0x10]
+    #[arg(long, value_name = "BYTE")]
+    status: Option<String>,
+    /// The bytes themselves instead of hexadecimal text
+    #[arg(long, conflicts_with = "json")]
+    raw: bool,
+}
+
+impl Encode {
+    pub(crate) fn options(&self, json: bool) -> EncodeOptions {
+        EncodeOptions {
+            words: self.words.clone(),
+            address: self.address,
+            status: self.status.clone(),
+            raw: self.raw,
+            json,
+        }
+    }
+}

@@ -1,0 +1,83 @@
+//! `scanhub telegram`: bytes of a line, or written down, to words for people; and names to bytes. Touches no port: what
+//! is encoded here is printed, not sent.
+
+mod arguments;
+mod encode;
+mod find;
+mod input;
+mod show;
+
+pub use encode::{EncodeOptions, encode, names};
+
+use std::fs::File;
+use std::io::{self, ErrorKind, Read, Write};
+use std::path::{Path, PathBuf};
+
+use lms::variant::Mode;
+use schema::{Failure, Kind};
+
+use find::Finder;
+use input::Input;
+use show::{Form, Show};
+
+/// What `telegram decode` is asked for.
+#[derive(Clone, Debug, Default)]
+pub struct DecodeOptions {
+    /// The file to read; `None` or `-` is stdin.
+    pub file: Option<PathBuf>,
+    /// The measuring mode, as `0x01` or `1`; without it the one that the telegrams tell is taken.
+    pub mode: Option<String>,
+    /// Every value instead of a summary.
+    pub all: bool,
+    /// One JSON object a line.
+    pub json: bool,
+}
+
+/// Explains all telegrams in a stream of bytes or in hexadecimal text, and accounts for the bytes between them.
+///
+/// [`Kind::Check`] if there is no telegram in it, [`Kind::Configuration`] if it cannot be read.
+pub fn decode(options: &DecodeOptions, out: &mut dyn Write) -> Result<(), Failure> {
+    let mode = options.mode.as_deref().map(arguments::byte).transpose()?.map(Mode);
+    let file = options.file.as_deref().filter(|path| *path != Path::new("-"));
+    let name = file.map_or("stdin".into(), |path| path.display().to_string());
+    let reader: Box<dyn Read> = match file {
+        Some(path) => Box::new(File::open(path).map_err(|error| unreadable(&name, &error))?),
+        None => Box::new(io::stdin()),
+    };
+    let mut input = Input::new(reader).map_err(|error| unreadable(&name, &error))?;
+    let form = match (options.json, options.all) {
+        (true, _) => Form::Json,
+        (false, all) => Form::Text { all },
+    };
+    let mut show = Show::new(out, form, mode);
+    let mut finder = Finder::default();
+    let mut ended = Ok(());
+    while ended.is_ok() {
+        match input.next().map_err(|error| unreadable(&name, &error))? {
+            Some(bytes) => ended = finder.feed(bytes, &mut |offset, item| show.item(offset, item)),
+            None => {
+                ended = finder.end(&mut |offset, item| show.item(offset, item)).and_then(|()| show.summary());
+                break;
+            }
+        }
+    }
+    match ended {
+        // Whoever read does not any more: normal use of a pipe.
+        Err(error) if error.kind() == ErrorKind::BrokenPipe => Ok(()),
+        Err(error) => Err(Failure::new(Kind::Failed, format!("cannot write: {error}"), "")),
+        Ok(()) if show.telegrams() == 0 => {
+            let message = format!("{name}: no telegram in {} bytes", show.bytes());
+            let hint = "the bytes of a line as they came, or as text: 02 00 01 00 31 15 12";
+            Err(Failure::new(Kind::Check, message, hint))
+        }
+        Ok(()) => Ok(()),
+    }
+}
+
+fn unreadable(name: &str, error: &io::Error) -> Failure {
+    let hint = match error.kind() {
+        ErrorKind::InvalidData => "write pairs of digits, as 02 80 03 00 or 0x02,0x80; text between quotes",
+        _ => "name a readable file, or - for stdin",
+    };
+    Failure::new(Kind::Configuration, format!("{name}: {error}"), hint)
+}

@@ -1,0 +1,327 @@
+//! Changes what a sensor keeps for ever. It goes into installation mode, writes, leaves it again, reads back what is in
+//! force now, and brings back the operating mode in which the sensor was. Whatever goes wrong on the way, it tries to
+//! leave the installation mode, and says in the end what it knows of the sensor's state.
+//!
+//! The only code that sends a request of [`crate::eeprom`], and it needs [`Consent`]. A write that was not acknowledged
+//! is not simply said again: first the configuration tells whether it was done.
+
+mod plan;
+
+use crate::Nanos;
+use crate::command::Request;
+use crate::eeprom::{PowerOn, Write};
+use crate::exchange::{Conversation, Exchange, Heard, Output};
+use crate::framer::Place;
+use crate::operating::{ON_REQUEST, Operating, PARTIAL, STREAM};
+use crate::outgoing::{MODE_TIMEOUT, Say};
+use crate::phase::TRIES;
+use crate::reply::Reply;
+use crate::telegram::Encoded;
+use crate::{MILLIS, command};
+pub use plan::{Consent, Kept, Plan};
+
+/// A change under way; it cannot be copied, as consent is to one.
+#[derive(Debug)]
+pub struct Change {
+    plan: Plan,
+    exchange: Exchange<Saying>,
+    step: Step,
+    /// How often more the configuration may be written.
+    writes_left: u8,
+    outcome: Outcome,
+}
+
+/// How far a change is, in its order.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Step {
+    /// Into installation mode.
+    Enter,
+    /// The configuration is written.
+    Write,
+    /// Nobody said whether it was: the configuration is read.
+    Check,
+    /// The rate after power-on is written.
+    PowerOn,
+    /// Out of installation mode.
+    Leave,
+    /// The configuration that is in force now.
+    ReadBack,
+    /// Whether another rate than 9600 comes after power-on.
+    ReadStatus,
+    /// Back to the stream that was found.
+    Restore,
+    /// Over.
+    Done,
+}
+
+/// What became of it.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Outcome {
+    /// The step that failed first, and how; `None` if all went well.
+    pub failed: Option<(Step, Failing)>,
+    /// Whether a write may have reached the sensor.
+    pub written: bool,
+    /// The configuration as it was read back.
+    pub configuration: Option<Kept>,
+    /// Whether a rate other than 9600 comes after power-on, if that was to change and could be read back.
+    pub permanent_baud: Option<bool>,
+    /// The operating mode in which the sensor is now; `None` if it may still be in installation mode.
+    pub operating_mode: Option<u8>,
+}
+
+/// How a step failed.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Failing {
+    /// No reply.
+    Unanswered,
+    /// The sensor said no; to [`Step::Enter`]: the password is wrong.
+    Refused,
+    /// What was read back is not what was to be written.
+    Differs,
+}
+
+#[derive(Clone, Debug)]
+enum Saying {
+    Ask(Request),
+    Keep(Kept),
+    PowerOn(PowerOn),
+}
+
+impl Saying {
+    /// What of it is written.
+    fn write(&self) -> Option<Write<'_>> {
+        match self {
+            Saying::Ask(_) => None,
+            Saying::Keep(kept) => Some(Write::Configuration(kept.bytes())),
+            Saying::PowerOn(power_on) => Some(Write::PowerOn(*power_on)),
+        }
+    }
+}
+
+impl Say for Saying {
+    fn encode(&self, address: u8) -> Encoded {
+        let request = match self {
+            Saying::Ask(request) => *request,
+            // Which configuration there is does no harm to ask; but none is longer than a write may be.
+            Saying::Keep(_) | Saying::PowerOn(_) => Request::Configuration,
+        };
+        let write = self.write().and_then(|write| write.encode(address));
+        write.unwrap_or_else(|| request.encode(address))
+    }
+
+    fn command(&self) -> u8 {
+        match self {
+            Saying::Ask(request) => request.command(),
+            Saying::Keep(kept) => Write::Configuration(kept.bytes()).command(),
+            Saying::PowerOn(power_on) => Write::PowerOn(*power_on).command(),
+        }
+    }
+
+    fn work(&self) -> Nanos {
+        match self {
+            Saying::Ask(request) if request.command() == command::MODE => MODE_TIMEOUT,
+            Saying::Ask(request) => request.work(),
+            Saying::Keep(_) | Saying::PowerOn(_) => WRITE_TIMEOUT,
+        }
+    }
+
+    /// A sensor that writes answers nothing else: what it acknowledged unheard is waited for as long.
+    fn sign(&self) -> Nanos {
+        match self {
+            Saying::Ask(request) => request.sign(),
+            Saying::Keep(_) | Saying::PowerOn(_) => WRITE_TIMEOUT,
+        }
+    }
+}
+
+impl Change {
+    /// Carries out the plan that somebody consented to, on a port that is open at its rate.
+    pub fn new(consent: Consent, now: Nanos) -> Self {
+        let plan = consent.into_plan();
+        let mut exchange = Exchange::new(plan.baud, now);
+        exchange.address = plan.address;
+        let mut change =
+            Change { plan, exchange, step: Step::Enter, writes_left: TRIES, outcome: Outcome::default() };
+        change.begin(Step::Enter);
+        change
+    }
+
+    /// How far it is.
+    pub fn step(&self) -> Step {
+        self.step
+    }
+
+    /// What became of it; all of it after [`Output::Done`].
+    pub fn outcome(&self) -> &Outcome {
+        &self.outcome
+    }
+
+    /// Begins with `step`, or the first one after it that has something to do.
+    fn begin(&mut self, step: Step) {
+        self.step = step;
+        let plan = self.plan;
+        let ask = |request| Some((Saying::Ask(request), TRIES));
+        // A wrong or lost request does nothing; it is for the next step to find out.
+        let once = |saying| Some((saying, 1));
+        let said = match step {
+            Step::Enter => ask(Request::Operate(Operating::Installation(plan.password))),
+            Step::Write if plan.old == plan.new => None,
+            Step::Write => once(Saying::Keep(plan.new)),
+            Step::Check | Step::ReadBack => ask(Request::Configuration),
+            Step::PowerOn => plan.power_on.map(Saying::PowerOn).and_then(once),
+            Step::Leave => ask(Request::Stop),
+            Step::ReadStatus if plan.power_on.is_none() => None,
+            Step::ReadStatus => ask(Request::Status),
+            Step::Restore => match plan.operating_mode {
+                STREAM => ask(Request::Stream),
+                PARTIAL => ask(Request::Operate(Operating::Partial)),
+                // What other modes need beside their byte nobody tells.
+                _ => None,
+            },
+            Step::Done => return,
+        };
+        match said {
+            Some((saying, tries)) => {
+                self.outcome.written |= saying.write().is_some();
+                self.exchange.ask(saying, self.exchange.now, tries);
+            }
+            None => self.begin(following(step)),
+        }
+    }
+
+    fn on_telegram(&mut self, place: Place) {
+        let telegram = self.exchange.view(place);
+        let reply = Reply::decode(telegram);
+        let kept = match &reply {
+            Some(Reply::Configuration(it) | Reply::ConfigurationWritten { configuration: it, .. }) => {
+                Kept::new(it.bytes())
+            }
+            _ => None,
+        };
+        let done = match &reply {
+            Some(Reply::Mode { done } | Reply::ConfigurationWritten { done, .. }) => *done,
+            // What its first byte says is told in no two ways alike: the status tells it afterwards.
+            Some(Reply::PowerOnSet { .. } | Reply::Status(_) | Reply::Configuration(_)) => true,
+            _ => false,
+        };
+        let permanent = match &reply {
+            Some(Reply::Status(status)) => Some(status.has_permanent_baud()),
+            _ => None,
+        };
+        let command = telegram.command();
+        if self.exchange.answered(command).is_none() {
+            return;
+        }
+        match self.step {
+            _ if !done => self.fail(Failing::Refused),
+            Step::Check if kept == Some(self.plan.new) => self.begin(Step::PowerOn),
+            Step::Check if self.writes_left > 0 => self.begin(Step::Write),
+            Step::Check => {
+                self.step = Step::Write;
+                self.fail(Failing::Unanswered);
+            }
+            Step::Leave => {
+                self.outcome.operating_mode = Some(ON_REQUEST);
+                self.begin(Step::ReadBack);
+            }
+            Step::ReadBack => {
+                self.outcome.configuration = kept;
+                if kept != Some(self.plan.new) {
+                    self.note(Failing::Differs);
+                }
+                self.begin(Step::ReadStatus);
+            }
+            Step::ReadStatus => {
+                self.outcome.permanent_baud = permanent;
+                let wanted = self.plan.power_on.map(|power_on| power_on == PowerOn::KeepBaud);
+                if wanted != permanent {
+                    self.note(Failing::Differs);
+                }
+                self.begin(Step::Restore);
+            }
+            Step::Restore => {
+                self.outcome.operating_mode = Some(self.plan.operating_mode);
+                self.begin(Step::Done);
+            }
+            step => self.begin(following(step)),
+        }
+    }
+
+    fn on_silence(&mut self) {
+        if self.exchange.again(self.exchange.now) {
+            return;
+        }
+        match self.step {
+            Step::Write => {
+                self.writes_left = self.writes_left.saturating_sub(1);
+                self.begin(Step::Check);
+            }
+            _ => self.fail(Failing::Unanswered),
+        }
+    }
+
+    fn fail(&mut self, failing: Failing) {
+        self.note(failing);
+        match self.step {
+            // Whether it heard that or not, it may be in installation mode.
+            Step::Enter | Step::Write | Step::Check | Step::PowerOn => self.begin(Step::Leave),
+            Step::Leave => self.begin(Step::ReadBack),
+            step => self.begin(following(step)),
+        }
+    }
+
+    /// The first failure is the cause of the others.
+    fn note(&mut self, failing: Failing) {
+        self.outcome.failed.get_or_insert((self.step, failing));
+    }
+}
+
+impl Conversation for Change {
+    fn spare(&mut self) -> &mut [u8] {
+        self.exchange.spare()
+    }
+
+    fn commit(&mut self, now: Nanos, len: usize) {
+        self.exchange.commit(now, len);
+    }
+
+    fn handle_timeout(&mut self, now: Nanos) {
+        if self.exchange.handle_timeout(now) {
+            self.on_silence();
+        }
+    }
+
+    fn transmitted(&mut self, now: Nanos) {
+        self.exchange.transmitted(now);
+    }
+
+    fn poll_output(&mut self) -> Output {
+        while let Some(heard) = self.exchange.advance() {
+            match heard {
+                Heard::Telegram(place) => self.on_telegram(place),
+                Heard::Nak => {
+                    if self.exchange.refused_checksum() == Some(false) {
+                        self.on_silence();
+                    }
+                }
+            }
+        }
+        if self.step == Step::Done { Output::Done } else { self.exchange.output(Nanos::MAX) }
+    }
+}
+
+/// The step after one that went as it should.
+fn following(step: Step) -> Step {
+    match step {
+        Step::Enter => Step::Write,
+        Step::Write | Step::Check => Step::PowerOn,
+        Step::PowerOn => Step::Leave,
+        Step::Leave => Step::ReadBack,
+        Step::ReadBack => Step::ReadStatus,
+        Step::ReadStatus => Step::Restore,
+        Step::Restore | Step::Done => Step::Done,
+    }
+}
+
+/// A change of unit was seen to take 7 s (QM), one driver waits 15 s.
+const WRITE_TIMEOUT: Nanos = 15_000 * MILLIS;
