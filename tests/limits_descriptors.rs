@@ -50,6 +50,10 @@ fn a_client_works_or_says_how_many_it_needs() {
         &["echo", "front/status", "-n", "1"],
         &["control", "front", "pause"],
     ];
+    for limit in [5, 6, 8, 10] {
+        // Nor does one wait for a hub that it cannot see.
+        is_short(&limited(&stage, limit, &["echo", "front/status"]).wait());
+    }
     for verb in verbs {
         for limit in [5, 6, 8, 10, 12, 14, 16, 18, 20, 22, 24, 26, 28, 30, 32, 40] {
             let outcome = limited(&stage, limit, verb).wait();

@@ -6,6 +6,7 @@ pub(crate) mod bare;
 pub(crate) mod child;
 pub(crate) mod clock;
 pub(crate) mod consumer;
+pub(crate) mod crowd;
 pub(crate) mod figures;
 pub(crate) mod host;
 pub(crate) mod line;
@@ -48,6 +49,11 @@ fn play(words: &[String]) -> Outcome<()> {
         ["consume", "scan", domain, sensor] => consumer::scans(domain, sensor),
         ["consume", "telegram", domain, sensor, count] => consumer::telegrams(domain, sensor, count.parse()?),
         ["consume", "status", domain, sensor] => consumer::statuses(domain, sensor),
+        ["crowd", domain, sensor, count, seconds] => {
+            crowd::follow(domain, sensor, count.parse()?, seconds.parse()?)
+        }
+        ["hold", domain, sensor, count] => crowd::hold(domain, sensor, count.parse()?),
+        ["stay", domain, sensor, count] => crowd::stay(domain, sensor, count.parse()?),
         ["bare", count, ref ports @ ..] => bare::chain(ports, count.parse()?),
         ["sleeper", number, count] => bare::sleeper(number, count.parse()?),
         ["host", port, rate] => host::start(port.as_ref(), rate.parse()?),

@@ -51,9 +51,8 @@ impl Presence {
 
     /// What to tell who cannot wait for a hub.
     pub(crate) fn no_hub(&self) -> Failure {
-        // Who cannot look does not know.
-        if let Some(short) = self.denied.as_ref().filter(|denied| denied.kind == Kind::Short) {
-            return short.clone();
+        if let Some(short) = self.short() {
+            return short;
         }
         let name = self.places.first().map(Domain::name).unwrap_or_default();
         let roots: Vec<_> = self.places.iter().map(|place| place.root().display().to_string()).collect();
@@ -62,6 +61,11 @@ impl Presence {
             None => format!("start one with `scanhub run`; looked at {}", roots.join(", ")),
         };
         Failure::new(Kind::NoHub, format!("no hub in domain {name}"), hint)
+    }
+
+    /// Why it is not known whether there is a hub: there was not even a descriptor to look with.
+    pub(crate) fn short(&self) -> Option<Failure> {
+        self.denied.clone().filter(|denied| denied.kind == Kind::Short)
     }
 
     fn live(&mut self) -> Option<(Domain, u32)> {

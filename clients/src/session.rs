@@ -33,10 +33,15 @@ impl Session {
     }
 
     /// Looks whether the hub is there, and joins its domain if it is a new place.
+    ///
+    /// [`Kind::Short`](schema::Kind) if memory or descriptors are; who has joined already goes on without a look.
     pub(crate) fn look(&mut self) -> Result<Change, Failure> {
         let change = self.presence.look();
         let Some(domain) = self.presence.domain() else {
-            return Ok(change);
+            return match self.presence.short() {
+                Some(short) if self.joined.is_none() => Err(short),
+                _ => Ok(change),
+            };
         };
         if self.joined.as_ref().is_none_or(|joined| joined.domain != *domain) {
             let node = ipc::client_node(domain)?;

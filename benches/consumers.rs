@@ -1,0 +1,177 @@
+//! What do many consumers cost, and what do bad ones cost the others? A hundred follow one sensor at once; a process
+//! that holds samples of a dozen queues is killed twenty times; one consumer is stopped for two seconds; the places of a topic are
+//! all taken. A consumer that stands by loses nothing of all that, and the hub is afterwards as it was before. It does
+//! not tell what a hundred processes cost the machine: threads of four processes stand for them.
+
+mod support;
+
+use std::fs;
+use std::process::ExitCode;
+use std::thread;
+use std::time::Duration;
+
+use rustix::process::{Pid, Signal, kill_process};
+use schema::{Counter, Status};
+use support::child::{Child, Line};
+use support::figures::{self, Figure, Target};
+use support::options::Options;
+use support::stage::{PATIENCE, Stage};
+use support::work::Work;
+use support::{Outcome, consumer};
+
+fn main() -> ExitCode {
+    support::main(measure)
+}
+
+fn measure(options: &Options) -> Outcome<()> {
+    let stage = Stage::new()?;
+    let _simulator = stage.simulate(&[SENSOR], 500_000)?;
+    let hub = stage.hub(&[SENSOR])?;
+    hub.await_line("ready", PATIENCE)?;
+    let mut figures = crowd(&stage, &hub, options.count(100), options.seconds(20))?;
+    figures.extend(kills(&stage, &hub)?);
+    figures.extend(stop(&stage)?);
+    figures.extend(places(&stage)?);
+    // Once somebody has left there is a place for who asks.
+    thread::sleep(CLEANED);
+    let failed = counter(&stage, Counter::LoanFailed)?;
+    figures.push(figure("samples without memory", "1", failed, Target::Most(0.0)));
+    figures::print("consumers", options.json, &figures);
+    Ok(())
+}
+
+/// `count` consumers for `seconds`.
+fn crowd(stage: &Stage, hub: &Child, count: usize, seconds: u64) -> Outcome<Vec<Figure>> {
+    let before = attaching(stage)?;
+    let each = count.div_ceil(PROCESSES).to_string();
+    let start = |_| stage.part(&["crowd", stage.domain.name(), SENSOR, &each, &seconds.to_string()]);
+    let crowd: Vec<Child> = (0..PROCESSES).map(start).collect::<Outcome<_>>()?;
+    for child in &crowd {
+        child.await_line("following", PATIENCE)?;
+    }
+    let (from, telegrams) = (Work::of(hub.guard.pid(), |_| true)?, counter(stage, Counter::Telegrams)?);
+    let mut lines = Vec::new();
+    for child in &crowd {
+        lines.extend(child.lines_until("end", PATIENCE + Duration::from_secs(seconds))?);
+    }
+    let work = Work::of(hub.guard.pid(), |_| true)?.since(from);
+    let telegrams = counter(stage, Counter::Telegrams)? - telegrams;
+    let sum = |i| lines.iter().map(|line: &Line| line.number(i)).sum::<Outcome<u64>>().map(|sum| sum as f64);
+    let [received, missed, published] = [sum(1)?, sum(2)?, sum(3)?];
+    drop(before);
+    Ok(vec![
+        figure("consumers together", "1", lines.len() as f64, Target::None),
+        figure("scans received by them", "1", received, Target::None),
+        figure("missed", "1", missed, Target::Most(0.0)),
+        figure("not accounted for", "1", (published - received - missed).abs(), Target::Most(0.0)),
+        figure(
+            "processor time of the hub per telegram",
+            "us",
+            work.busy_ns as f64 / 1e3 / telegrams,
+            Target::None,
+        ),
+    ])
+}
+
+/// A process that holds samples is killed, again and again.
+fn kills(stage: &Stage, hub: &Child) -> Outcome<Vec<Figure>> {
+    let witness = attaching(stage)?;
+    let open = || -> Outcome<usize> { Ok(fs::read_dir(format!("/proc/{}/fd", hub.guard.pid()))?.count()) };
+    let segments = || -> Outcome<usize> {
+        let entries = fs::read_dir("/dev/shm")?.flatten();
+        let prefix = stage.domain.prefix();
+        Ok(entries.filter(|entry| entry.file_name().to_string_lossy().starts_with(&prefix)).count())
+    };
+    thread::sleep(CLEANED);
+    let before = (open()?, segments()?, resident(hub)?);
+    let mut held = 0;
+    for _ in 0..KILLS {
+        let holder = stage.part(&["hold", stage.domain.name(), SENSOR, "12"])?;
+        held += holder.await_line("holding", PATIENCE)?.number(1)?;
+        holder.guard.kill()?;
+    }
+    thread::sleep(CLEANED);
+    let after = (open()?, segments()?, resident(hub)?);
+    let grown = |before: usize, after: usize| after as f64 - before as f64;
+    Ok(vec![
+        figure("samples held by who was killed", "1", held as f64, Target::None),
+        figure("missed by who stood by", "1", missed(&witness)?, Target::Most(0.0)),
+        figure("descriptors of the hub, more", "1", grown(before.0, after.0), Target::Most(0.0)),
+        figure("segments, more", "1", grown(before.1, after.1), Target::Most(0.0)),
+        figure("resident memory of the hub, more", "kB", grown(before.2, after.2), Target::Most(64.0)),
+    ])
+}
+
+/// A consumer is stopped for two seconds.
+fn stop(stage: &Stage) -> Outcome<Vec<Figure>> {
+    // Who stands by was there before, and tells what there was.
+    let (witness, stopped) = (attaching(stage)?, attaching(stage)?);
+    let pid = Pid::from_raw(stopped.guard.pid() as i32).ok_or("no process")?;
+    thread::sleep(Duration::from_secs(1));
+    kill_process(pid, Signal::STOP)?;
+    thread::sleep(Duration::from_secs(2));
+    kill_process(pid, Signal::CONT)?;
+    thread::sleep(Duration::from_secs(1));
+    let (stopped, witness) = (measured(&stopped), measured(&witness));
+    let read = |line: &Line| line.number(7);
+    let span = read(stopped.first().ok_or("nothing came")?)?..=read(stopped.last().ok_or("nothing came")?)?;
+    let mut published = 0.0;
+    for line in &witness {
+        published += f64::from(u8::from(span.contains(&read(line)?)));
+    }
+    let [lost, others] = [sum_of_missed(&stopped)?, sum_of_missed(&witness)?];
+    Ok(vec![
+        figure("missed by who was stopped", "1", lost, Target::None),
+        figure("of it not told", "1", (published - stopped.len() as f64 - lost).abs(), Target::Most(0.0)),
+        figure("missed by who was not", "1", others, Target::Most(0.0)),
+    ])
+}
+
+/// All places of a topic are taken, and one more is wanted.
+fn places(stage: &Stage) -> Outcome<Vec<Figure>> {
+    let crowd = stage.part(&["stay", stage.domain.name(), SENSOR, "210"])?;
+    let refused = crowd.await_line("refused", 6 * PATIENCE)?;
+    eprintln!("{}", refused.text);
+    Ok(vec![figure("consumers before one was refused", "1", refused.number(1)? as f64, Target::None)])
+}
+
+/// A consumer of telegrams that prints each, once the first has come.
+fn attaching(stage: &Stage) -> Outcome<Child> {
+    let consumer = stage.consumer("telegram", SENSOR, &["0"])?;
+    consumer.await_line("telegram", PATIENCE)?;
+    Ok(consumer)
+}
+
+fn measured(consumer: &Child) -> Vec<Line> {
+    consumer.lines_so_far().into_iter().filter(|line| line.text.starts_with("telegram")).collect()
+}
+
+fn missed(consumer: &Child) -> Outcome<f64> {
+    sum_of_missed(&measured(consumer))
+}
+
+fn sum_of_missed(lines: &[Line]) -> Outcome<f64> {
+    lines.iter().map(|line| line.number(4)).sum::<Outcome<u64>>().map(|sum| sum as f64)
+}
+
+fn counter(stage: &Stage, counter: Counter) -> Outcome<f64> {
+    let mut status = consumer::attach::<Status>(stage.domain.name(), SENSOR)?.timeout(PATIENCE);
+    Ok(status.next()?.ok_or("no status")?.counters[counter] as f64)
+}
+
+/// Resident memory in kB, less what is shared with others.
+fn resident(hub: &Child) -> Outcome<usize> {
+    let status = fs::read_to_string(format!("/proc/{}/status", hub.guard.pid()))?;
+    let line = status.lines().find_map(|line| line.strip_prefix("RssAnon:")).ok_or("no RssAnon")?;
+    Ok(line.split_whitespace().next().ok_or("no number")?.parse()?)
+}
+
+fn figure(name: &'static str, unit: &'static str, value: f64, target: Target) -> Figure {
+    Figure { name, unit, hub: vec![value], floor: Vec::new(), target }
+}
+
+const SENSOR: &str = "front";
+const PROCESSES: usize = 4;
+const KILLS: usize = 20;
+/// What dead processes left is cleaned up every 5 s.
+const CLEANED: Duration = Duration::from_secs(12);
