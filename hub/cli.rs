@@ -5,6 +5,7 @@ mod configure;
 mod control;
 mod doctor;
 mod probe;
+pub(crate) mod simulate;
 mod telegram;
 
 use std::path::PathBuf;
@@ -14,8 +15,6 @@ use clap::{Args, Parser, Subcommand};
 use clients::{Bounds, duration};
 use daemon::config::Sources;
 use schema::{DEFAULT_DOMAIN, Domain, Environment, Failure};
-use sim::fault::Faults;
-use sim::options::{self, SimulateOptions};
 
 pub(crate) use control::Control;
 pub(crate) use telegram::{Telegram, Way};
@@ -64,8 +63,8 @@ pub(crate) enum Verb {
     /// Two simulated sensors, the hub and a consumer for each, in one terminal
     Demo(Demo),
     /// Sensors at the other end of ptys
-    #[command(after_help = fault_table())]
-    Simulate(Simulate),
+    #[command(after_help = simulate::fault_table())]
+    Simulate(Box<simulate::Simulate>),
     /// What is at the other end of a port; without one, which ports there are
     Probe(probe::Probe),
     /// Change what a sensor keeps for ever, after showing the difference and asking
@@ -175,77 +174,4 @@ pub(crate) struct Hz {
     pub(crate) window: Duration,
     #[command(flatten)]
     pub(crate) limits: Limits,
-}
-
-#[derive(Args, Debug)]
-pub(crate) struct Simulate {
-    /// Where each sensor's pty shall appear, as a symlink
-    #[arg(long, required = true, value_name = "PATH")]
-    port: Vec<PathBuf>,
-    /// Rate at power-on: 9600, 19200, 38400 or 500000
-    #[arg(long, default_value = "9600", value_name = "RATE")]
-    baud: String,
-    /// What the sensors see: room, bare, empty, wall640 or random
-    #[arg(long, default_value = "room", value_name = "NAME", conflicts_with = "replay")]
-    world: String,
-    /// A recording to send instead: telegram stream or CARMEN log, plain or gzipped
-    #[arg(long, value_name = "FILE")]
-    replay: Option<PathBuf>,
-    /// Begin the recording anew at its end
-    #[arg(long = "loop")]
-    looped: bool,
-    /// How many times faster than the clock everything runs, the bit time too
-    #[arg(long, default_value_t = 1.0, value_name = "FACTOR")]
-    speed: f64,
-    /// Seed of worlds, delays and faults
-    #[arg(long, default_value_t = 0)]
-    seed: u64,
-    /// What goes wrong, for example loss=0.00135,burst=1.89; see below
-    #[arg(long, default_value = "", hide_default_value = true, value_name = "KEY=VALUE,..")]
-    fault: String,
-    /// File for a line of JSON per telegram: what was sent, with its hash
-    #[arg(long, value_name = "FILE")]
-    truth: Option<PathBuf>,
-    /// What the sensors call themselves: lms200, lms211, lms221 or lms291
-    #[arg(long = "type", default_value = "lms200", value_name = "TYPE")]
-    model: String,
-    /// Angle and resolution [default: the recording's, else 180/0.5]
-    #[arg(long, value_name = "DEGREES/STEP")]
-    variant: Option<String>,
-    /// Unit: mm, cm or dm [default: the recording's, else mm]
-    #[arg(long)]
-    unit: Option<String>,
-    /// Measuring mode [default: the recording's, else 0x01]
-    #[arg(long, value_name = "BYTE")]
-    mode: Option<String>,
-    /// In which pieces bytes arrive: uart (16 bytes) or usb (62)
-    #[arg(long, default_value = "uart", value_name = "KIND")]
-    chunk: String,
-}
-
-impl Simulate {
-    pub(crate) fn options(&self) -> Result<SimulateOptions, Failure> {
-        Ok(SimulateOptions {
-            ports: self.port.clone(),
-            baud: options::parse_baud(&self.baud)?,
-            world: self.world.parse()?,
-            replay: self.replay.clone(),
-            looped: self.looped,
-            speed: self.speed,
-            seed: self.seed,
-            faults: self.fault.parse()?,
-            truth: self.truth.clone(),
-            model: self.model.parse()?,
-            variant: self.variant.as_deref().map(options::parse_variant).transpose()?,
-            unit: self.unit.as_deref().map(options::parse_unit).transpose()?,
-            mode: self.mode.as_deref().map(options::parse_mode).transpose()?,
-            chunk: self.chunk.parse()?,
-        })
-    }
-}
-
-/// The table of faults, for the end of the help.
-pub(crate) fn fault_table() -> String {
-    let rows = Faults::keys().map(|(key, meaning)| format!("  {key:13} {meaning}"));
-    format!("Faults:\n{}", rows.collect::<Vec<_>>().join("\n"))
 }

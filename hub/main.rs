@@ -136,7 +136,7 @@ fn run_hub(run: &cli::Run, everywhere: &Everywhere) -> Result<(), Failure> {
     })
 }
 
-fn run_simulator(simulate: &cli::Simulate, everywhere: &Everywhere) -> Result<(), Failure> {
+fn run_simulator(simulate: &cli::simulate::Simulate, everywhere: &Everywhere) -> Result<(), Failure> {
     let options = simulate.options()?;
     let (stop, write) = UnixStream::pair().map_err(no_handler)?;
     for signal in [SIGINT, SIGTERM] {

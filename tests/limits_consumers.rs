@@ -102,7 +102,6 @@ fn a_stopped_consumer_knows_what_it_missed_and_nobody_else_misses_anything() {
     let (mut stopped, mut other) = (stage.echo(&["front/scan"]), stage.echo(&["front/scan"]));
     stopped.await_lines(10, "a scan", is_class("scan"));
     stopped.signal(Signal::STOP);
-    // What its pipe already holds is none of them.
     let first = number(&other.await_line("a scan", is_class("scan")), "topic_seq");
     other.await_line("many scans", |line| line["class"] == "scan" && number(line, "topic_seq") > first + 60);
     stopped.signal(Signal::CONT);

@@ -106,6 +106,9 @@ fn configuration_that_cannot_be() {
         (&["simulate", "--port=a", "--baud=115200"], &["115200", "9600"]),
         (&["simulate", "--port=a", "--variant=180/0.25"], &["180/0.25", "one of"]),
         (&["simulate", "--port=a", "--speed=0"], &["speed"]),
+        (&["simulate", "--port=a", "--state=asleep"], &["asleep", "installation"]),
+        (&["simulate", "--port=a", "--fault=silence=-1"], &["silence=-1", "from 0 to"]),
+        (&["simulate", "--port=a", "--type=lms211", "--variant=180/0.5"], &["180/0.5", "100 degrees"]),
         (&["simulate", "--port=a", "--replay=/no/such"], &["/no/such", "existing"]),
         (&["echo", "Front/scan"], &["Front"]),
     ] {

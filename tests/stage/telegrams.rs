@@ -14,6 +14,8 @@ pub(crate) struct Sent {
     pub(crate) is_reply: bool,
     pub(crate) hash: String,
     pub(crate) fault: Option<String>,
+    /// CLOCK_MONOTONIC after its last byte.
+    pub(crate) sent_ns: u64,
 }
 
 impl Sent {
@@ -23,6 +25,7 @@ impl Sent {
             is_reply: line["kind"] == "reply",
             hash: text("sha256").unwrap_or_else(|| panic!("no hash: {line}")),
             fault: text("fault"),
+            sent_ns: number(line, "sent_ns"),
         }
     }
 

@@ -160,9 +160,32 @@ impl Config {
             let message = format!("{} links: a sample names its sensor in one byte", links.len());
             return Err(Failure::new(Kind::Configuration, message, format!("{MAX_LINKS} links for one hub")));
         }
-        let links = links.into_iter().map(Draft::finish).collect::<Result<_, _>>()?;
+        let links = links.into_iter().map(Draft::finish).collect::<Result<Vec<_>, _>>()?;
+        check_ports(&links)?;
         Ok(Config { links })
     }
+}
+
+/// Refuses two links at one line, also where it goes by two names at this moment.
+fn check_ports(links: &[Link]) -> Result<(), Failure> {
+    let is_same = |a: &Source, b: &Source| match (a, b) {
+        (Source::File { .. }, _) => false,
+        (Source::Tty(a), Source::Tty(b)) => {
+            a == b || a.canonicalize().is_ok_and(|a| b.canonicalize().is_ok_and(|b| a == b))
+        }
+        _ => a == b,
+    };
+    for (at, link) in links.iter().enumerate() {
+        if let Some(other) = links[..at].iter().find(|other| is_same(&other.port, &link.port)) {
+            let names = match (other.port.name(), link.port.name()) {
+                (one, same) if one == same => one,
+                (one, another) => format!("{one} is {another}"),
+            };
+            let message = format!("links {} and {} have the same port: {names}", other.name, link.name);
+            return Err(Failure::new(Kind::Configuration, message, "name the port of each sensor"));
+        }
+    }
+    Ok(())
 }
 
 /// Links of one hub.
@@ -266,6 +289,21 @@ mod tests {
         );
         let unknown = refusal(&["link.front.type=lms100"], &[]);
         assert!(unknown.contains("type = \"lms100\"\n  lms200, lms211, lms221, lms291 or s14"), "{unknown}");
+    }
+
+    #[test]
+    fn one_port_is_for_one_link() {
+        let own = std::env::temp_dir().join(format!("scanhub-port-{}", std::process::id()));
+        std::os::unix::fs::symlink("/dev/null", &own).unwrap();
+        let twice = refusal(&[], &["a=/dev/x", "b=/dev/y", "c=/dev/x"]);
+        let named = refusal(&[], &["a=/dev/null", &format!("b={}", own.display())]);
+        let moved = refusal(&["link.b.port=/dev/x"], &["a=/dev/x", "b=/dev/y"]);
+        assert!(refusal(&[], &["a=tcp:h:1", "b=tcp:h:1"]).contains("have the same port: tcp:h:1"));
+        std::fs::remove_file(&own).unwrap();
+        assert!(twice.starts_with("links a and c have the same port: /dev/x\n"), "{twice}");
+        assert!(named.contains(&format!("same port: /dev/null is {}\n", own.display())), "{named}");
+        assert!(moved.starts_with("links a and b have the same port: /dev/x\n"), "{moved}");
+        assert!(Config::load(&sources(&[], &["a=file:x", "b=file:x", "c=tcp:h:1", "d=tcp:h:2"])).is_ok());
     }
 
     #[test]

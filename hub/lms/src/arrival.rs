@@ -2,6 +2,7 @@
 //! bytes it brought; this file turns that into a stamp for any byte, and learns how long a telegram takes, so that
 //! the host can sleep through it.
 
+use crate::variant::BYTES_PER_TURN;
 use crate::{MICROS, MILLIS, Nanos, line_time};
 
 /// Reads, newest last, by the number of the byte after their last one.
@@ -10,12 +11,29 @@ pub(crate) struct Arrivals {
     reads: [Read; Arrivals::CAPACITY],
     next: usize,
     total: u64,
+    last_look: Nanos,
+    /// What waited while the host did not look.
+    backlog: Option<Backlog>,
 }
 
 #[derive(Clone, Copy, Debug, Default)]
 struct Read {
     end: u64,
     now: Nanos,
+    backlog: Option<Backlog>,
+}
+
+/// Bytes that came while the host did not run: how old each is nobody knows, but the line's buffer keeps the oldest
+/// ones, so they came as fast as the line is from the last look on.
+#[derive(Clone, Copy, Debug)]
+struct Backlog {
+    /// Number of its first byte.
+    begin: u64,
+    /// The last look before it.
+    since: Nanos,
+    /// The last read that brought more than can have come since the one before it, and the bytes read after it.
+    hurried: Nanos,
+    read_since: usize,
 }
 
 /// A stamp, and whether more than the pace of a UART stands between it and the truth.
@@ -30,17 +48,44 @@ impl Arrivals {
     const CAPACITY: usize = 128;
 
     pub(crate) fn new() -> Self {
-        Arrivals { reads: [Read::default(); Arrivals::CAPACITY], next: 0, total: 0 }
+        let reads = [Read::default(); Arrivals::CAPACITY];
+        Arrivals { reads, next: 0, total: 0, last_look: 0, backlog: None }
     }
 
-    pub(crate) fn note(&mut self, now: Nanos, len: usize) {
-        self.total += len as u64;
-        self.reads[self.next % Arrivals::CAPACITY] = Read { end: self.total, now };
-        self.next += 1;
+    /// A read at `now` brought `len` bytes, of a line of `pace` bits per second if it was one.
+    pub(crate) fn note(&mut self, now: Nanos, len: usize, pace: Option<u32>) {
+        let since = core::mem::replace(&mut self.last_look, now);
+        if len > BYTES_PER_TURN && now.saturating_sub(since) > LATE {
+            self.backlog = pace.map(|_| Backlog { begin: self.total, since, hurried: now, read_since: 0 });
+        } else if let (Some(backlog), Some(baud)) = (&mut self.backlog, pace) {
+            backlog.read_since += len;
+            let calm = now.saturating_sub(backlog.hurried);
+            if line_time(backlog.read_since, baud) > calm + line_time(ESTIMATED, baud) {
+                (backlog.hurried, backlog.read_since) = (now, 0);
+            } else if calm > CALM {
+                self.catch_up();
+            }
+        }
+        if len > 0 {
+            self.total += len as u64;
+            let read = Read { end: self.total, now, backlog: self.backlog };
+            self.reads[self.next % Arrivals::CAPACITY] = read;
+            self.next += 1;
+        }
+    }
+
+    /// What was read since the last hurried read came when it was read.
+    fn catch_up(&mut self) {
+        if let Some(backlog) = self.backlog.take() {
+            for read in self.reads.iter_mut().filter(|read| read.now > backlog.hurried) {
+                read.backlog = None;
+            }
+        }
     }
 
     /// When byte number `offset` arrived at the latest: whatever came behind it, in the same read or in one right after
-    /// it, took its time on the line.
+    /// it, took its time on the line. Of a backlog it is the earliest time that is possible: whoever looks at the age of
+    /// what was measured shall not take it for new.
     pub(crate) fn stamp(&self, offset: u64, baud: u32) -> Stamp {
         let oldest = self.next.saturating_sub(Arrivals::CAPACITY);
         let (mut at, mut own, mut own_behind) = (Nanos::MAX, Nanos::MAX, ESTIMATED + 1);
@@ -52,6 +97,9 @@ impl Arrivals {
             own_behind = (read.end - offset - 1) as usize;
             own = read.now.saturating_sub(line_time(own_behind, baud));
             at = at.min(own);
+            if let Some(backlog) = read.backlog.filter(|backlog| backlog.begin <= offset) {
+                at = at.min(backlog.since + line_time((offset - backlog.begin) as usize + 1, baud));
+            }
         }
         // A host that wakes up a little later for one read than for another is no estimate.
         let moved = own - at > line_time(ESTIMATED, baud);
@@ -113,6 +161,11 @@ impl Rhythm {
 
 /// More bytes than so behind a stamped one in the same read make the stamp an estimate: an adapter's chunk of 62.
 const ESTIMATED: usize = 64;
+/// A host that did not look for so long, beyond any rest at the highest rate, was stopped or starved.
+const LATE: Nanos = 50 * MILLIS;
+/// A line that brings no more than it can for so long has no backlog any more: less than a telegram takes, more than the
+/// kernel needs to move what it kept from one buffer to the next.
+const CALM: Nanos = 12 * MILLIS;
 /// The host looks again so long before the expected end: a chunk or two of 16 bytes.
 const LEAD: Nanos = 600 * MICROS;
 /// A shorter rest is not worth a system call.
@@ -132,23 +185,50 @@ mod tests {
     #[test]
     fn a_stamp_knows_what_came_behind_it() {
         let mut arrivals = Arrivals::new();
-        arrivals.note(1_000_000, 16);
-        arrivals.note(11_000_000, 484);
+        arrivals.note(1_000_000, 16, Some(500_000));
+        arrivals.note(11_000_000, 484, Some(500_000));
         assert_eq!(arrivals.stamp(0, 500_000), Stamp { at: 1_000_000 - 15 * 20_000, estimated: false });
         assert_eq!(arrivals.stamp(499, 500_000), Stamp { at: 11_000_000, estimated: false });
         assert_eq!(arrivals.stamp(16, 500_000), Stamp { at: 11_000_000 - 483 * 20_000, estimated: true });
         // Two reads of what had been waiting: the line was not faster because of that.
-        arrivals.note(11_010_000, 500);
+        arrivals.note(11_010_000, 500, Some(500_000));
         assert_eq!(arrivals.stamp(499, 500_000), Stamp { at: 11_010_000 - 500 * 20_000, estimated: true });
         // Reads with a jitter of some microseconds are what they are.
-        arrivals.note(31_000_000, 16);
-        arrivals.note(31_300_000, 16);
+        arrivals.note(31_000_000, 16, Some(500_000));
+        arrivals.note(31_300_000, 16, Some(500_000));
         assert_eq!(arrivals.stamp(1_015, 500_000), Stamp { at: 30_980_000, estimated: false });
         for _ in 0..200 {
-            arrivals.note(40_000_000, 1);
+            arrivals.note(40_000_000, 1, Some(500_000));
         }
         // Older than what is remembered: the oldest remembered read.
         assert!(arrivals.stamp(0, 500_000).estimated);
+    }
+
+    #[test]
+    fn what_waited_while_the_host_did_not_run_is_not_new() {
+        let mut arrivals = Arrivals::new();
+        arrivals.note(1_000 * MILLIS, 16, Some(500_000));
+        // Two seconds later, as fast as they can be read; then as they come.
+        for read in 0..4 {
+            arrivals.note(3_000 * MILLIS + read * 100_000, 1_600, Some(500_000));
+        }
+        // The kernel moves the rest a little later; then comes what is new.
+        arrivals.note(3_002 * MILLIS, 50, Some(500_000));
+        arrivals.note(3_002 * MILLIS + 50_000, 1_550, Some(500_000));
+        arrivals.note(3_010 * MILLIS, 16, Some(500_000));
+        assert!(arrivals.stamp(8_031, 500_000).at < 1_200 * MILLIS, "not yet known to be new");
+        arrivals.note(3_015 * MILLIS, 16, Some(500_000));
+        for byte in [0, 731, 1_599, 1_600, 6_399, 6_400, 7_999] {
+            let at = 1_000 * MILLIS + (byte + 1) * 20_000;
+            assert_eq!(arrivals.stamp(16 + byte, 500_000), Stamp { at, estimated: true });
+        }
+        assert_eq!(arrivals.stamp(8_031, 500_000), Stamp { at: 3_010 * MILLIS, estimated: false });
+        // A line that was silent is looked at in time; a slow one that was slept through has kept its pace.
+        arrivals.note(5_000 * MILLIS, 62, Some(500_000));
+        assert_eq!(arrivals.stamp(8_109, 500_000), Stamp { at: 5_000 * MILLIS, estimated: false });
+        arrivals.note(5_762 * MILLIS, 730, Some(9600));
+        let stamp = arrivals.stamp(8_110 + 729, 9600);
+        assert!(stamp.at > 5_760 * MILLIS && !stamp.estimated, "{stamp:?}");
     }
 
     #[test]

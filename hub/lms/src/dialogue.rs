@@ -8,8 +8,8 @@ use crate::header::{Expect, StreamHeader, is_data};
 use crate::measured::Measured;
 use crate::outgoing::{FORGOTTEN, NAK_PAUSE, Outgoing};
 use crate::phase::{
-    BESIDE_VALUES, Control, OVERLOOKED, PAUSE, Phase, Progress, QUESTIONS, Reason, SILENCE, STOPS, Settings,
-    Step, TRIES,
+    BESIDE_VALUES, Control, OVERLOOKED, PAUSE, Phase, Progress, QUESTION_PAUSE, QUESTION_ROUNDS, QUESTIONS,
+    Reason, SILENCE, STOPS, Settings, Step, TRIES,
 };
 use crate::reply::{POWER_ON, Reply};
 use crate::sensor::{Sensor, State, Trouble};
@@ -281,12 +281,8 @@ impl Dialogue {
         let as_asked = measured.is_some_and(|scan| scan.count() == self.settings.variant.beams());
         self.trouble = (!as_asked).then_some(Trouble::VariantRefused);
         self.sensor.streams = true;
-        self.phase = Phase::Streaming {
-            header,
-            silent_at: self.silent_at(now),
-            questions: QUESTIONS,
-            tries_left: TRIES,
-        };
+        let silent_at = self.silent_at(now);
+        self.phase = Phase::Streaming { header, silent_at, questions: QUESTIONS, rounds: 0, ask_at: now };
         // A reply that is under way may answer.
         self.open.take_if(|open| !open.is_out());
         self.question(now);
@@ -295,24 +291,33 @@ impl Dialogue {
     /// Right after a scan: asks for what a stream does not tell. A reply costs the scan that it interrupts, so the next
     /// question waits for the next scan.
     fn question(&mut self, now: Nanos) {
-        let Phase::Streaming { questions, tries_left, .. } = &mut self.phase else { return };
-        if self.open.is_some() {
+        let Phase::Streaming { questions, rounds, ask_at, .. } = &mut self.phase else { return };
+        if self.open.is_some() || now < *ask_at {
             return;
         }
+        let sensor = &self.sensor;
+        let is_open = |question: Request| match question {
+            Request::Type => sensor.kind().is_empty(),
+            Request::Status => sensor.defective.is_none(),
+            _ => sensor.mode.is_none(),
+        };
         while let Some((&question, rest)) = questions.split_first() {
-            let is_known = match question {
-                Request::Type => !self.sensor.kind().is_empty(),
-                _ => self.sensor.mode.is_some(),
-            };
-            if !is_known && *tries_left > 0 {
-                *tries_left -= 1;
+            *questions = rest;
+            if is_open(question) {
                 return self.ask(question, now, 1);
             }
-            (*questions, *tries_left) = (rest, TRIES);
         }
-        match self.sensor.mode {
-            None => self.trouble = Some(Trouble::ModeUnknown),
-            Some(_) => self.trouble = self.trouble.filter(|&trouble| trouble != Trouble::ModeUnknown),
+        let mode_is_known = sensor.mode.is_some();
+        if QUESTIONS.iter().any(|&question| is_open(question)) && *rounds < QUESTION_ROUNDS - 1 {
+            *rounds += 1;
+            *questions = QUESTIONS;
+        } else if mode_is_known {
+            *ask_at = Nanos::MAX;
+            self.trouble = self.trouble.filter(|&trouble| trouble != Trouble::ModeUnknown);
+        } else {
+            *ask_at = now + QUESTION_PAUSE;
+            *questions = QUESTIONS;
+            self.trouble = Some(Trouble::ModeUnknown);
         }
     }
 

@@ -43,8 +43,14 @@ pub(crate) enum Phase {
     Probing { attempt: usize },
     /// The sensor hears us: it is brought to rest, to the wanted rate, to its settings, to a stream.
     Starting { step: Step, progress: Progress },
-    /// Measured data come; after each scan a question may be asked, the first one so many times more.
-    Streaming { header: StreamHeader, silent_at: Nanos, questions: &'static [Request], tries_left: u8 },
+    /// Measured data come. After a scan from `ask_at` on, the next question may be asked; all were asked `rounds` times.
+    Streaming {
+        header: StreamHeader,
+        silent_at: Nanos,
+        questions: &'static [Request],
+        rounds: u8,
+        ask_at: Nanos,
+    },
     /// Bytes come from a recording.
     Following,
     /// Nothing is wanted. A stream that goes on all the same is stopped so many times more.
@@ -115,7 +121,10 @@ pub(crate) const PAUSES: [Nanos; 4] = [0, 500 * MILLIS, 1_000 * MILLIS, 1_500 * 
 pub(crate) const PATIENCE: Nanos = 250 * MILLIS;
 /// Stops beside the first one; what goes on after so many does not listen.
 pub(crate) const STOPS: u8 = 2;
-/// What a stream does not tell: how values are split, from the one reply or the other, and who sends them.
+/// What a stream does not tell: how values are split, from the one reply or the other, and who sends them. After some
+/// rounds only the first is still wanted, rarely: without it there are no scans.
 pub(crate) const QUESTIONS: &[Request] = &[Request::Status, Request::Configuration, Request::Type];
+pub(crate) const QUESTION_ROUNDS: u8 = 5;
+pub(crate) const QUESTION_PAUSE: Nanos = 10_000 * MILLIS;
 /// STX to count word, status and checksum: bytes of a telegram beside its values.
 pub(crate) const BESIDE_VALUES: usize = 10;

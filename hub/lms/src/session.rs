@@ -78,6 +78,8 @@ pub struct Session {
     rhythm: Rhythm,
     now: Nanos,
     last_byte: Nanos,
+    /// Of the last byte of the last telegram.
+    last_stamp: Nanos,
     cut: bool,
     /// What the next read has room for, and whether the last one left none: then more may be there already.
     room: usize,
@@ -94,6 +96,7 @@ impl Session {
             rhythm: Rhythm::new(),
             now,
             last_byte: now,
+            last_stamp: 0,
             cut: false,
             room: 0,
             has_more: false,
@@ -111,12 +114,14 @@ impl Session {
     pub fn commit(&mut self, now: Nanos, len: usize) {
         self.now = now;
         self.has_more = len > 0 && len == self.room;
+        // Neither a recording nor a network has the pace of a line.
+        let has_pace = !(self.dialogue.settings.listen_only || self.dialogue.settings.fixed_rate);
+        self.arrivals.note(now, len, has_pace.then_some(self.dialogue.baud.rate()));
         if len == 0 {
             return;
         }
         let was_empty = self.framer.buffered() == 0;
         self.framer.commit(len);
-        self.arrivals.note(now, len);
         self.last_byte = now;
         self.dialogue.heard = true;
         if was_empty {
@@ -228,8 +233,12 @@ impl Session {
         let baud = self.dialogue.baud.rate();
         let telegram = self.framer.view(place).telegram;
         let (len, is_scan) = (telegram.bytes().len() as u64, telegram.command() == MEASURED);
-        let first = self.arrivals.stamp(place.offset, baud);
-        let last = self.arrivals.stamp(place.offset + len - 1, baud).at;
+        let mut first = self.arrivals.stamp(place.offset, baud);
+        // What is read later may tell that bytes were older than was thought; those before them were older still, but
+        // that has been said.
+        first.at = first.at.max(self.last_stamp);
+        let last = self.arrivals.stamp(place.offset + len - 1, baud).at.max(first.at);
+        self.last_stamp = last;
         self.cut |= is_scan && self.tally().telegrams == 1 && self.tally().discarded > 0;
         // Replies come when they are asked for, and a recording has the pace of whoever reads it.
         let has_rhythm = is_scan && self.is_live() && !first.estimated;

@@ -96,13 +96,19 @@ impl Dialogue {
                 if step == Step::Variant {
                     self.trouble = Some(Trouble::VariantRefused);
                 }
-                self.enter(Step::Check, progress, at);
+                self.doubt(progress, at);
             }
-            Step::Stop | Step::Stream if heard => self.enter(Step::Check, progress, at),
+            Step::Stop | Step::Stream if heard => self.doubt(progress, at),
             Step::Stop | Step::Check | Step::Baud | Step::Stream => {
                 self.trouble = Some(Trouble::Unanswered(request));
                 self.probe(at, 0);
             }
         }
+    }
+
+    /// The sensor may have gone: asks whether it is there, but not for long.
+    fn doubt(&mut self, progress: Progress, at: Nanos) {
+        self.phase = Phase::Starting { step: Step::Check, progress };
+        self.ask(Request::Status, at, TRIES);
     }
 }

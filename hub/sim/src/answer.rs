@@ -6,6 +6,7 @@
 //! the sensor does with what it cannot.
 
 use lms::command::{EEPROM_WRITES, MODE, Request, VARIANT};
+use lms::family::Family;
 use lms::reply::{self, Health};
 use lms::telegram::{Encoded, Telegram, Writer};
 use lms::variant::{Baud, MIRROR_TURN, Variant};
@@ -37,7 +38,9 @@ impl Machine {
         if EEPROM_WRITES.contains(&request.command()) {
             self.eeprom.writes += 1;
         }
-        if self.settings.habits.refuses.contains(&request.command()) {
+        let command = request.command();
+        let is_refused = self.settings.habits.refuses.contains(&command);
+        if is_refused || self.family().and_then(|family| family.refuses_command(command)).is_some() {
             return self.refusal();
         }
         let (address, status) = (self.settings.address, self.settings.status);
@@ -81,6 +84,7 @@ impl Machine {
             }
             // A variant that is none.
             (VARIANT, [_, _, _, _]) => answer(&reply::variant(address, false, self.variant, status), MODE_NS),
+            (COUNTERS, [] | [0, 0]) => answer(&self.reply(COUNTERS_REPLY, &COUNTED), THINKING_NS),
             (ERRORS, []) => {
                 let pairs: Vec<u8> =
                     self.settings.errors.iter().flat_map(|&(kind, number)| [kind, number]).collect();
@@ -139,8 +143,9 @@ impl Machine {
 
     /// B1h: what a healthy sensor says, its settings, and what ails it.
     fn status(&self) -> Encoded {
+        let firmware = self.settings.type_name.rsplit(';').next().unwrap_or_default().as_bytes();
         let health = Health {
-            software: *FIRMWARE,
+            software: std::array::from_fn(|at| firmware.get(at).copied().unwrap_or(b' ')),
             operating_mode: self.operating.code(),
             mode: self.eeprom.mode(),
             variant: self.variant,
@@ -152,7 +157,7 @@ impl Machine {
         // Offsets in the data of B1h, which begin after the command byte (Telegram listing 7-5).
         data[8] = u8::from(self.settings.errors.iter().any(|&(kind, _)| kind == FATAL));
         let pollution = POLLUTION_CLEAN / 100 * self.settings.pollution_percent;
-        for (at, words, value) in [(18, 8, pollution), (42, 8, POLLUTION_CLEAN)] {
+        for (at, words, value) in [(18, 12, pollution), (42, 12, POLLUTION_CLEAN)] {
             data[at..at + 2 * words].copy_from_slice(&value.to_le_bytes().repeat(words));
         }
         data[118] = u8::from(self.eeprom.permanent_baud.is_some());
@@ -160,9 +165,12 @@ impl Machine {
         self.reply(healthy.telegram().command(), &data)
     }
 
-    /// Whether a sensor of its type can: an LMS 211 sees 100 degrees (Telegram listing, 3Bh).
+    fn family(&self) -> Option<Family> {
+        Family::of_type(self.settings.type_name.as_bytes())
+    }
+
     fn can(&self, variant: Variant) -> bool {
-        variant.angle_deg == 100 || !self.settings.type_name.starts_with("LMS211")
+        self.family().and_then(|family| family.refuses_variant(variant)).is_none()
     }
 
     fn refusal(&self) -> Answer {
@@ -188,6 +196,10 @@ const BANNER: u8 = 0x90;
 const ERRORS: u8 = 0x32;
 const ERRORS_REPLY: u8 = 0xB2;
 const FATAL: u8 = 4;
+/// Command: hours (unit 2 h) and power-ons, and its reply; what a sensor has counted that is some years old.
+const COUNTERS: u8 = 0x35;
+const COUNTERS_REPLY: u8 = 0xB5;
+const COUNTED: [u8; 4] = [0x10, 0x27, 0x2C, 0x01];
 /// Reply: the configuration.
 const CONFIGURATION: u8 = 0xF4;
 /// Command: write the configuration, and its reply.
@@ -195,8 +207,6 @@ const WRITE_CONFIGURATION: u8 = 0x77;
 const CONFIGURATION_WRITTEN: u8 = 0xF7;
 /// Command: the rate at power-on.
 const PERMANENT_BAUD: u8 = 0x66;
-/// What the status reply calls the firmware.
-const FIRMWARE: &[u8; 7] = b"V02.30 ";
 /// What a clean window's sensors read; only the ratio to it matters.
 const POLLUTION_CLEAN: u16 = 1_000;
 /// Between ACK and reply where nothing changes; the listing allows 60 ms.

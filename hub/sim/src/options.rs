@@ -3,12 +3,16 @@
 
 use std::path::PathBuf;
 use std::str::FromStr;
+use std::time::Duration;
 
+use lms::family::Family;
 use lms::variant::{Baud, Mode, Unit, Variant};
 use schema::{Failure, Kind};
 
 use crate::fault::Faults;
+use crate::operating::Operating;
 use crate::room::World;
+use crate::settings::Start;
 use crate::transmission::ChunkSize;
 
 /// The options of the verb.
@@ -16,8 +20,26 @@ use crate::transmission::ChunkSize;
 pub struct SimulateOptions {
     /// One sensor each: where the symlink to its pty is to be.
     pub ports: Vec<PathBuf>,
-    /// Rate of the line at power-on.
-    pub baud: Baud,
+    /// Rate of the line; `None`: the permanent rate, else 9600.
+    pub baud: Option<Baud>,
+    /// Rate at power-on that a former owner has written into the sensor.
+    pub permanent_baud: Option<Baud>,
+    /// The sensors' own address, 0 to 127.
+    pub address: u8,
+    /// What a host that is gone left them doing.
+    pub state: Start,
+    /// From power-on to the banner.
+    pub boot: Duration,
+    /// The byte that ends each reply.
+    pub status: u8,
+    /// What 32h is answered with.
+    pub errors: Vec<(u8, u8)>,
+    /// Transparency of the front window in percent.
+    pub pollution: u16,
+    /// Whether measured values end with scan and telegram index.
+    pub indices: bool,
+    /// Whether the configuration has 32 bytes, as with older firmware.
+    pub short_configuration: bool,
     /// What the sensors see, unless they replay.
     pub world: World,
     /// A recording to send instead.
@@ -32,11 +54,11 @@ pub struct SimulateOptions {
     pub faults: Faults,
     /// File for the truth.
     pub truth: Option<PathBuf>,
-    /// What the sensor calls itself.
-    pub model: Model,
-    /// Angle and resolution; `None`: those of the recording, else 180/0.5.
+    /// What the sensor calls itself, which decides what it cannot do.
+    pub family: Family,
+    /// Angle and resolution; `None`: those of the recording, else the type's.
     pub variant: Option<Variant>,
-    /// Unit; `None`: that of the recording, else mm.
+    /// Unit; `None`: that of the recording, else the type's.
     pub unit: Option<Unit>,
     /// Measuring mode; `None`: that of the recording, else 0x01.
     pub mode: Option<Mode>,
@@ -49,7 +71,16 @@ impl Default for SimulateOptions {
     fn default() -> Self {
         SimulateOptions {
             ports: Vec::new(),
-            baud: Baud::B9600,
+            baud: None,
+            permanent_baud: None,
+            address: 0,
+            state: Start::In(Operating::OnRequest),
+            boot: Duration::from_secs(2),
+            status: 0x10,
+            errors: Vec::new(),
+            pollution: 100,
+            indices: false,
+            short_configuration: false,
             world: World::Room,
             replay: None,
             looped: false,
@@ -57,7 +88,7 @@ impl Default for SimulateOptions {
             seed: 0,
             faults: Faults::default(),
             truth: None,
-            model: Model::Lms200,
+            family: Family::Lms200,
             variant: None,
             unit: None,
             mode: None,
@@ -66,44 +97,55 @@ impl Default for SimulateOptions {
     }
 }
 
-/// The members of the family; they differ here in what they answer to 3Ah.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Model {
-    /// Indoors.
-    Lms200,
-    /// Outdoors, 100 degrees.
-    Lms211,
-    /// Outdoors.
-    Lms221,
-    /// Indoors, long range.
-    Lms291,
+/// Type, number and firmware as a sensor of `family` says them: 21 characters (Telegram listing, BAh).
+pub fn type_name(family: Family) -> String {
+    format!("{};301063;V02.30 ", family.name().to_uppercase())
 }
 
-impl Model {
-    /// Every model with its name on the command line.
-    pub const ALL: [(&str, Model); 4] = [
-        ("lms200", Model::Lms200),
-        ("lms211", Model::Lms211),
-        ("lms221", Model::Lms221),
-        ("lms291", Model::Lms291),
+/// `lms200` and the other types that can scan what a [`Variant`] says.
+pub fn parse_type(text: &str) -> Result<Family, Failure> {
+    let families = Family::ALL.into_iter().filter(|family| family.factory_variant().is_some());
+    one_of("type", text, &families.map(|family| (family.name(), family)).collect::<Vec<_>>())
+}
+
+/// What a host that is gone left the sensor doing: `idle`, `streaming`, another mode that streams, `installation`, or
+/// `starting` for a sensor that gets its power now.
+pub fn parse_state(text: &str) -> Result<Start, Failure> {
+    let known = [
+        ("idle", Start::In(Operating::OnRequest)),
+        ("streaming", Start::In(Operating::All)),
+        ("partial", Start::In(Operating::Partial)),
+        ("means", Start::In(Operating::Means(10))),
+        ("range", Start::In(Operating::Range(31, 91))),
+        ("mean-range", Start::In(Operating::MeanRange(10, 31, 91))),
+        ("fields", Start::In(Operating::Fields(1, 100))),
+        ("reflectivity", Start::In(Operating::Reflectivity(vec![(1, 101)]))),
+        ("installation", Start::In(Operating::Installation)),
+        ("starting", Start::PowerOn),
     ];
-
-    /// Type, number and firmware as the sensor says them: 21 characters (Telegram listing, BAh).
-    pub fn type_name(self) -> &'static str {
-        match self {
-            Model::Lms200 => "LMS200;301063;V02.30 ",
-            Model::Lms211 => "LMS211;301063;V02.30 ",
-            Model::Lms221 => "LMS221;301063;V02.30 ",
-            Model::Lms291 => "LMS291;301063;V02.30 ",
-        }
-    }
+    one_of("state", text, &known)
 }
 
-impl FromStr for Model {
-    type Err = Failure;
+/// An error as 32h tells it: type and number, `0x84:22`.
+pub fn parse_error(text: &str) -> Result<(u8, u8), Failure> {
+    let pair = text.split_once(':').and_then(|(kind, number)| Some((byte(kind)?, byte(number)?)));
+    pair.ok_or_else(|| {
+        let hint = "TYPE:NUMBER, such as 3:18, or 0x84:22 for a fatal one that is over";
+        Failure::new(Kind::Configuration, format!("error {text:?} is not understood"), hint)
+    })
+}
 
-    fn from_str(text: &str) -> Result<Self, Failure> {
-        one_of("type", text, &Model::ALL)
+/// A byte, `0x10` or `16`; `what` it is for.
+pub fn parse_byte(what: &str, text: &str) -> Result<u8, Failure> {
+    byte(text).ok_or_else(|| {
+        Failure::new(Kind::Configuration, format!("{what} {text:?} is no byte"), "0 to 255, or 0x00 to 0xFF")
+    })
+}
+
+fn byte(text: &str) -> Option<u8> {
+    match text.strip_prefix("0x").or(text.strip_prefix("0X")) {
+        Some(digits) => u8::from_str_radix(digits, 16).ok(),
+        None => text.parse().ok(),
     }
 }
 
@@ -136,19 +178,15 @@ pub fn parse_baud(text: &str) -> Result<Baud, Failure> {
 
 /// The measuring mode, `0x01` or `1`.
 pub fn parse_mode(text: &str) -> Result<Mode, Failure> {
-    let number = match text.strip_prefix("0x").or(text.strip_prefix("0X")) {
-        Some(digits) => u8::from_str_radix(digits, 16),
-        None => text.parse(),
-    };
-    number.ok().filter(|mode| MODES.contains(mode)).map(Mode).ok_or_else(|| {
+    byte(text).filter(|mode| MODES.contains(mode)).map(Mode).ok_or_else(|| {
         let hint = format!("one of: {}", MODES.map(|mode| format!("{mode:#04x}")).join(", "));
         Failure::new(Kind::Configuration, format!("mode {text:?} is none of a range"), hint)
     })
 }
 
-fn one_of<T: Copy>(what: &str, text: &str, known: &[(&str, T)]) -> Result<T, Failure> {
-    known.iter().find(|(name, _)| *name == text).map(|&(_, value)| value).ok_or_else(|| {
-        let names: Vec<&str> = known.iter().map(|&(name, _)| name).collect();
+fn one_of<T: Clone>(what: &str, text: &str, known: &[(&str, T)]) -> Result<T, Failure> {
+    known.iter().find(|(name, _)| *name == text).map(|(_, value)| value.clone()).ok_or_else(|| {
+        let names: Vec<&str> = known.iter().map(|(name, _)| *name).collect();
         Failure::new(
             Kind::Configuration,
             format!("{what} {text:?} is not known"),
@@ -180,8 +218,15 @@ mod tests {
         assert_eq!(parse_unit("cm").unwrap(), Unit::Cm);
         assert_eq!(parse_baud("500000").unwrap().rate(), 500_000);
         assert_eq!("usb".parse::<ChunkSize>().unwrap().bytes(), 62);
-        for (name, model) in Model::ALL {
-            assert!(model.type_name().starts_with(&name.to_uppercase()) && model.type_name().len() == 21);
+        for family in [Family::Lms200, Family::Lms211, Family::Lms221, Family::Lms291] {
+            let name = type_name(family);
+            assert_eq!((Family::of_type(name.as_bytes()), name.len()), (Some(family), 21));
+            assert_eq!(parse_type(family.name()).unwrap(), family);
+        }
+        assert_eq!(parse_state("partial").unwrap(), Start::In(Operating::Partial));
+        assert_eq!((parse_error("0x84:22").unwrap(), parse_byte("status", "0x11").unwrap()), ((132, 22), 17));
+        for failure in [parse_error("22").unwrap_err(), parse_byte("status", "256").unwrap_err()] {
+            assert!(failure.kind.exit_code() == 78 && !failure.hint.is_empty(), "{failure}");
         }
         for failure in [
             parse_variant("180/0.25").unwrap_err(),
@@ -189,7 +234,9 @@ mod tests {
             parse_mode("0x3F").unwrap_err(),
             parse_mode("x").unwrap_err(),
             parse_baud("115200").unwrap_err(),
-            "s300".parse::<Model>().unwrap_err(),
+            parse_type("s300").unwrap_err(),
+            parse_type("s14").unwrap_err(),
+            parse_state("asleep").unwrap_err(),
             "moon".parse::<World>().unwrap_err(),
         ] {
             assert!(failure.hint.starts_with("one of: ") && failure.kind.exit_code() == 78, "{failure}");

@@ -4,14 +4,16 @@
 use std::os::fd::{AsFd, BorrowedFd, OwnedFd};
 use std::path::PathBuf;
 
-use lms::variant::{Mode, Unit, Variant};
+use lms::Nanos;
+use lms::variant::{Baud, Mode, Variant};
 use recording::{Encoding, Frame, Recording};
 use rustix::event::{EventfdFlags, eventfd};
 use schema::{Failure, Kind};
 
 use crate::line::{Line, Socket, Time};
-use crate::machine::{Machine, Settings};
-use crate::options::SimulateOptions;
+use crate::machine::{Machine, Settings, Start};
+use crate::operating::Operating;
+use crate::options::{SimulateOptions, type_name};
 use crate::pty::now_ns;
 use crate::room::Room;
 use crate::source::Source;
@@ -98,20 +100,29 @@ fn sensor(
     seed: u64,
 ) -> Result<(Settings, Source), Failure> {
     let contents = recording.map(Recording::contents);
-    let variant = options.variant.or(contents.and_then(|c| c.variant)).unwrap_or(Variant::HALF);
-    let unit = options.unit.or(contents.and_then(|c| c.unit)).unwrap_or(Unit::Mm);
+    let factory = options.family.factory_variant().unwrap_or(Variant::HALF);
+    let variant = options.variant.or(contents.and_then(|c| c.variant)).unwrap_or(factory);
+    let unit = options.unit.or(contents.and_then(|c| c.unit)).unwrap_or(options.family.factory_unit());
     let mode = options.mode.or(contents.and_then(|c| c.mode)).unwrap_or(Mode(0x01));
     let settings = Settings {
-        type_name: options.model.type_name().into(),
-        baud: options.baud,
+        address: options.address,
+        type_name: type_name(options.family),
+        baud: options.baud.or(options.permanent_baud).unwrap_or(Baud::B9600),
+        permanent_baud: options.permanent_baud,
         variant,
         unit,
         mode,
+        availability: if options.indices { 2 } else { 0 },
+        configuration_len: if options.short_configuration { 32 } else { 34 },
+        start: options.state.clone(),
+        boot_ns: options.boot.as_nanos() as Nanos,
+        status: options.status,
+        errors: options.errors.clone(),
+        pollution_percent: options.pollution,
         habits: options.faults.habits(),
         chunk: options.chunk,
         speed: options.speed,
         seed,
-        ..Settings::default()
     };
     let source = match recording {
         None => Source::Room(Room::new(options.world, seed)),
@@ -165,6 +176,30 @@ fn check(options: &SimulateOptions) -> Result<(), Failure> {
     }
     if !(0.01..=100.0).contains(&options.speed) {
         return wrong(format!("speed {} is out of range", options.speed), "a number from 0.01 to 100");
+    }
+    if options.address > 127 {
+        return wrong(format!("address {} is out of range", options.address), "a number from 0 to 127");
+    }
+    if options.pollution > 100 {
+        return wrong(format!("pollution {} is out of range", options.pollution), "percent, 0 to 100");
+    }
+    if let (Some(variant), family) = (options.variant, options.family)
+        && let Some(reason) = family.refuses_variant(variant)
+    {
+        let Variant { angle_deg, resolution_cdeg } = variant;
+        let message =
+            format!("an {} cannot scan {angle_deg}/{}", family.name(), f64::from(resolution_cdeg) / 100.0);
+        return wrong(message, reason);
+    }
+    let tells_all = |start: &Start| match start {
+        Start::In(operating) => *operating == Operating::All || !operating.streams(),
+        Start::PowerOn => true,
+    };
+    if options.replay.is_some() && !tells_all(&options.state) {
+        return wrong(
+            "a recording is told in whole scans only".into(),
+            "leave --state away, or say idle, streaming, installation or starting",
+        );
     }
     if options.looped && options.replay.is_none() {
         return wrong("--loop without a recording".into(), "name one with --replay FILE");

@@ -26,6 +26,13 @@ pub fn holder(path: &Path) -> Option<Holder> {
     holders(&[&device]).pop().flatten()
 }
 
+/// Whether this process itself has `path` open.
+pub(super) fn is_own(path: &Path) -> bool {
+    let open = fs::read_dir("/proc/self/fd").into_iter().flatten().flatten();
+    let mut targets = open.filter_map(|entry| fs::read_link(entry.path()).ok());
+    path.canonicalize().is_ok_and(|device| targets.any(|target| target == device))
+}
+
 /// For each of the real `devices` the first other process that has it open, in one look at all processes.
 pub(super) fn holders(devices: &[&Path]) -> Vec<Option<Holder>> {
     let mut found: Vec<Option<Holder>> = vec![None; devices.len()];

@@ -9,7 +9,7 @@ use rustix::io::Errno;
 use schema::{Failure, Kind};
 
 use super::candidates::{Candidate, candidates};
-use super::holder::{Holder, holder};
+use super::holder::{Holder, holder, is_own};
 use super::rights::Rights;
 use crate::config::Source;
 
@@ -61,6 +61,11 @@ impl Refusal {
                 let (what, remedy) = Rights::of(path).explain(path);
                 Failure::new(Kind::PortPermission, what, remedy)
             }
+            Refusal::Busy if is_own(path) => Failure::new(
+                Kind::PortBusy,
+                format!("{name}: in use by another link of this hub"),
+                "name the port of each sensor",
+            ),
             Refusal::Busy => busy(path, holder(path)),
             Refusal::NotTty if path.is_dir() => {
                 let hint = format!("it is a directory; {}", instead(&name, &candidates()));

@@ -10,11 +10,14 @@ use std::path::PathBuf;
 use std::time::Duration;
 
 use lms::command::Request;
+use lms::family::Family;
 use lms::measured;
 use lms::reply::Reply;
 use lms::telegram::Telegram;
 use lms::variant::{Baud, Unit, Variant};
 use sim::fault::{Fault, Faults};
+use sim::machine::Start;
+use sim::operating::Operating;
 use sim::options::SimulateOptions;
 use sim::simulate;
 use sim::truth::Record;
@@ -26,7 +29,7 @@ use simulator::{Folder, Simulator};
 const PATIENCE: Duration = Duration::from_secs(20);
 
 fn options(port: PathBuf) -> SimulateOptions {
-    SimulateOptions { ports: vec![port], baud: Baud::B500000, seed: 5, ..SimulateOptions::default() }
+    SimulateOptions { ports: vec![port], baud: Some(Baud::B500000), seed: 5, ..SimulateOptions::default() }
 }
 
 fn is_data(record: &Record) -> bool {
@@ -39,7 +42,7 @@ fn from_9600_to_a_stream_at_500k_bit_for_bit_as_the_truth_says() {
     let (port, truth) = (folder.path("front"), folder.path("truth.jsonl"));
     std::os::unix::fs::symlink("/dev/pts/999999", &port).unwrap();
     let simulator = Simulator::start(SimulateOptions {
-        baud: Baud::B9600,
+        baud: Some(Baud::B9600),
         truth: Some(truth.clone()),
         ..options(port.clone())
     });
@@ -210,6 +213,16 @@ fn two_ports_and_what_is_refused() {
         (SimulateOptions { ports: vec!["a".into(), "a".into()], ..SimulateOptions::default() }, 78),
         (SimulateOptions { speed: 0.0, ..options(folder.path("x")) }, 78),
         (SimulateOptions { looped: true, ..options(folder.path("x")) }, 78),
+        (SimulateOptions { address: 128, ..options(folder.path("x")) }, 78),
+        (SimulateOptions { pollution: 101, ..options(folder.path("x")) }, 78),
+        (
+            SimulateOptions {
+                family: Family::Lms211,
+                variant: Some(Variant::HALF),
+                ..options(folder.path("x"))
+            },
+            78,
+        ),
         (SimulateOptions { replay: Some(file), ..options(folder.path("x")) }, 78),
         (SimulateOptions { replay: Some("/no/file".into()), ..options(folder.path("x")) }, 78),
         (SimulateOptions { truth: Some("/no/file".into()), ..options(folder.path("x")) }, 1),
@@ -218,5 +231,36 @@ fn two_ports_and_what_is_refused() {
         assert_eq!(failure.kind.exit_code(), code, "{failure}");
         assert!(!failure.hint.is_empty(), "{failure}");
         assert!(fs::symlink_metadata(folder.path("x")).is_err());
+    }
+}
+
+#[test]
+fn an_unplugged_port_is_gone_and_comes_back_under_its_name() {
+    let folder = Folder::new("unplug");
+    let port = folder.path("front");
+    let faults: Faults = "unplug=0.3,unplug_at=1,unplug_every=1".parse().unwrap();
+    let state = Start::In(Operating::All);
+    let simulator = Simulator::start(SimulateOptions { faults, state, ..options(port.clone()) });
+    let first = fs::read_link(&port).unwrap();
+    for _ in 0..2 {
+        let mut host = Host::open(&port, 500_000);
+        host.telegram(PATIENCE).expect("a scan");
+        // The hosts of a pty whose other side is gone read its end.
+        let mut buffer = [0; 4096];
+        until("it is unplugged", || rustix::io::read(&host.port, &mut buffer) == Ok(0));
+        assert!(rustix::termios::tcgetattr(&host.port).is_err(), "the port is there");
+        simulator.record_where(|record| record.fault == Some(Fault::Unplug));
+        until("it is back", || fs::symlink_metadata(&port).is_ok());
+    }
+    assert!(fs::read_link(&port).unwrap().starts_with("/dev/pts"), "{first:?}");
+    simulator.end();
+    assert!(fs::symlink_metadata(&port).is_err(), "the symlink is left");
+}
+
+fn until(what: &str, mut is_so: impl FnMut() -> bool) {
+    let end = std::time::Instant::now() + PATIENCE;
+    while !is_so() {
+        assert!(std::time::Instant::now() < end, "not: {what}");
+        std::thread::sleep(Duration::from_millis(1));
     }
 }

@@ -1,0 +1,120 @@
+//! `scanhub simulate` on the command line: what it takes.
+
+use std::path::PathBuf;
+use std::time::Duration;
+
+use clap::Args;
+use clients::duration;
+use schema::Failure;
+use sim::fault::Faults;
+use sim::options::{self, SimulateOptions};
+
+#[derive(Args, Debug)]
+pub(crate) struct Simulate {
+    /// Where each sensor's pty shall appear, as a symlink
+    #[arg(long, required = true, value_name = "PATH")]
+    port: Vec<PathBuf>,
+    /// Rate of the line: 9600, 19200, 38400 or 500000 [default: the permanent rate]
+    #[arg(long, value_name = "RATE")]
+    baud: Option<String>,
+    /// Rate at power-on that a former owner wrote into the sensor [default: 9600]
+    #[arg(long, value_name = "RATE")]
+    permanent_baud: Option<String>,
+    /// What a host that is gone left the sensors doing: idle, streaming, partial, means, range, mean-range, fields,
+    /// reflectivity, installation; or starting, if they get their power now
+    #[arg(long, default_value = "idle", value_name = "STATE")]
+    state: String,
+    /// From power-on to the banner
+    #[arg(long, default_value = "2s", value_name = "DURATION", value_parser = duration::parse)]
+    boot: Duration,
+    /// The sensors' own address, 0 to 127; they answer to 0 too
+    #[arg(long, default_value_t = 0, value_name = "NUMBER")]
+    address: u8,
+    /// What the sensors see: room, bare, empty, wall640 or random
+    #[arg(long, default_value = "room", value_name = "NAME", conflicts_with = "replay")]
+    world: String,
+    /// A recording to send instead: telegram stream or CARMEN log, plain or gzipped
+    #[arg(long, value_name = "FILE")]
+    replay: Option<PathBuf>,
+    /// Begin the recording anew at its end
+    #[arg(long = "loop")]
+    looped: bool,
+    /// How many times faster than the clock everything runs, the bit time too
+    #[arg(long, default_value_t = 1.0, value_name = "FACTOR")]
+    speed: f64,
+    /// Seed of worlds, delays and faults
+    #[arg(long, default_value_t = 0)]
+    seed: u64,
+    /// What goes wrong, for example loss=0.00135,burst=1.89; see below
+    #[arg(long, default_value = "", hide_default_value = true, value_name = "KEY=VALUE,..")]
+    fault: String,
+    /// File for a line of JSON per telegram: what was sent, with its hash
+    #[arg(long, value_name = "FILE")]
+    truth: Option<PathBuf>,
+    /// What the sensors call themselves, and what they cannot do: lms200, lms211, lms221 or lms291
+    #[arg(long = "type", default_value = "lms200", value_name = "TYPE")]
+    family: String,
+    /// Angle and resolution [default: the recording's, else 180/0.5, or 100/0.5 of an lms211]
+    #[arg(long, value_name = "DEGREES/STEP")]
+    variant: Option<String>,
+    /// Unit: mm, cm or dm [default: the recording's, else mm of an lms200, cm of others]
+    #[arg(long)]
+    unit: Option<String>,
+    /// Measuring mode [default: the recording's, else 0x01]
+    #[arg(long, value_name = "BYTE")]
+    mode: Option<String>,
+    /// Measured values end with scan and telegram index
+    #[arg(long)]
+    indices: bool,
+    /// The configuration has 32 bytes, as with older firmware
+    #[arg(long)]
+    short_configuration: bool,
+    /// The byte that ends each reply: 0x10 healthy, 0x11 news, 0x12 warning, 0x13 error
+    #[arg(long, default_value = "0x10", value_name = "BYTE")]
+    status: String,
+    /// An error that the sensors tell when asked, such as 3:18, or 0x84:22 for one that is over
+    #[arg(long, value_name = "TYPE:NUMBER")]
+    error: Vec<String>,
+    /// Transparency of the front window in percent: a warning below 75, an error below 30
+    #[arg(long, default_value_t = 100, value_name = "PERCENT")]
+    pollution: u16,
+    /// In which pieces bytes arrive: uart (16 bytes) or usb (62)
+    #[arg(long, default_value = "uart", value_name = "KIND")]
+    chunk: String,
+}
+
+impl Simulate {
+    pub(crate) fn options(&self) -> Result<SimulateOptions, Failure> {
+        Ok(SimulateOptions {
+            ports: self.port.clone(),
+            baud: self.baud.as_deref().map(options::parse_baud).transpose()?,
+            permanent_baud: self.permanent_baud.as_deref().map(options::parse_baud).transpose()?,
+            state: options::parse_state(&self.state)?,
+            boot: self.boot,
+            address: self.address,
+            world: self.world.parse()?,
+            replay: self.replay.clone(),
+            looped: self.looped,
+            speed: self.speed,
+            seed: self.seed,
+            faults: self.fault.parse()?,
+            truth: self.truth.clone(),
+            family: options::parse_type(&self.family)?,
+            variant: self.variant.as_deref().map(options::parse_variant).transpose()?,
+            unit: self.unit.as_deref().map(options::parse_unit).transpose()?,
+            mode: self.mode.as_deref().map(options::parse_mode).transpose()?,
+            indices: self.indices,
+            short_configuration: self.short_configuration,
+            status: options::parse_byte("status", &self.status)?,
+            errors: self.error.iter().map(|text| options::parse_error(text)).collect::<Result<_, _>>()?,
+            pollution: self.pollution,
+            chunk: self.chunk.parse()?,
+        })
+    }
+}
+
+/// The table of faults, for the end of the help.
+pub(crate) fn fault_table() -> String {
+    let rows = Faults::keys().map(|(key, meaning)| format!("  {key:13} {meaning}"));
+    format!("Faults:\n{}", rows.collect::<Vec<_>>().join("\n"))
+}

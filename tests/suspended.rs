@@ -1,0 +1,59 @@
+//! A hub that does not run for a while, as on a machine that is suspended: what its line's buffer had room for is
+//! delivered, what it had no room for is lost and counted, and then it goes on as if nothing had been.
+
+mod stage;
+
+use rustix::process::Signal;
+use rustix::time::{ClockId, clock_gettime};
+use stage::{INT, Stage, TERM, bytes_of, hash, is_class, number, until};
+
+#[test]
+fn a_hub_that_was_stopped() {
+    let stage = Stage::new();
+    let simulator = stage.simulator(&["front"], &["--seed=31", "--baud=500000"]);
+    let hub = stage.hub(&[stage.link("front")]);
+    let mut consumer = stage.echo(&["front/telegram", "front/status"]);
+    consumer.await_lines(20, "a telegram", is_class("telegram"));
+    let stopped = now();
+    hub.signal(Signal::STOP);
+    let lost = |stage: &Stage| stage.truth("front").iter().filter(|sent| sent.fault.is_some()).count();
+    let before = lost(&stage);
+    // The buffer is full, and more than a second passes.
+    until("telegrams are lost", || lost(&stage) > before + 50);
+    let continued = now();
+    hub.signal(Signal::CONT);
+    consumer.await_lines(60, "a telegram", is_class("telegram"));
+    let info = stage.await_info("front", |info| number(&info["counters"], "bytes_discarded") > 0);
+    assert_eq!((&info["state"], number(&info["counters"], "resyncs")), (&"streaming".into(), 0), "{info}");
+    assert_eq!(hub.end(TERM).code, Some(0));
+    assert_eq!(simulator.end(INT).code, Some(0));
+
+    let outcome = consumer.end(INT);
+    let lines = outcome.of_class("telegram");
+    let got: Vec<String> = lines.iter().map(|line| hash(&bytes_of(line))).collect();
+    let truth = stage.truth("front");
+    let at = |hash: &String| truth.iter().position(|sent| sent.hash == *hash).expect("it was sent");
+    let places: Vec<usize> = got.iter().map(at).collect();
+    let (Some(&first), Some(&last)) = (places.first(), places.last()) else { panic!("nothing came") };
+    assert!(places.is_sorted(), "out of order");
+    assert!(places.iter().all(|&place| truth[place].fault.is_none()), "made up");
+    // The burst may be too fast for a consumer, who knows then how many it missed.
+    let notices = outcome.of_class("notice");
+    let of_telegrams = notices.iter().filter(|line| line["kind"] == "missed" && line["topic"] == "telegram");
+    let missed: u64 = of_telegrams.map(|line| number(line, "missed")).sum();
+    let intact = truth[first..=last].iter().filter(|sent| sent.fault.is_none()).count();
+    assert_eq!(got.len() as u64 + missed, intact as u64, "lost");
+
+    let stamps: Vec<u64> = lines.iter().map(|line| number(line, "stamp_ns")).collect();
+    assert!(stamps.is_sorted(), "stamps run backwards: {stamps:?}");
+    // Nothing that waited looks newer than it is.
+    let sent = places.iter().map(|&place| truth[place].sent_ns);
+    let waited: Vec<_> = sent.zip(&stamps).filter(|(sent, _)| (stopped..continued).contains(sent)).collect();
+    assert!(waited.len() > 10 && waited.iter().all(|(sent, stamp)| *stamp < sent), "{waited:?}");
+}
+
+/// CLOCK_MONOTONIC, as in the truth and in stamps.
+fn now() -> u64 {
+    let now = clock_gettime(ClockId::Monotonic);
+    now.tv_sec as u64 * 1_000_000_000 + now.tv_nsec as u64
+}
