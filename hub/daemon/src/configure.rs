@@ -105,6 +105,7 @@ fn password(text: &str) -> Result<Password, Failure> {
 
 fn words(step: Step) -> &'static str {
     match step {
+        Step::Compare => "looking whether it is still the same",
         Step::Enter => "entering installation mode",
         Step::Write => "writing, which takes up to 15 s",
         Step::Check => "looking whether it was written",

@@ -1,4 +1,4 @@
-//! Changes what a sensor keeps for ever. It goes into installation mode, writes, leaves it again, reads back what is in
+//! Changes what a sensor keeps for ever. It looks whether the sensor still keeps what it did, goes into installation mode, writes, leaves it again, reads back what is in
 //! force now, and brings back the operating mode in which the sensor was. Whatever goes wrong on the way, it tries to
 //! leave the installation mode, and says in the end what it knows of the sensor's state.
 //!
@@ -34,6 +34,8 @@ pub struct Change {
 /// How far a change is, in its order.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Step {
+    /// Whether it is still the sensor that the plan was made for: a person takes time to answer.
+    Compare,
     /// Into installation mode.
     Enter,
     /// The configuration is written.
@@ -76,7 +78,7 @@ pub enum Failing {
     Unanswered,
     /// The sensor said no; to [`Step::Enter`]: the password is wrong.
     Refused,
-    /// What was read back is not what was to be written.
+    /// What was read back is not what was to be written; to [`Step::Compare`]: not what was there before.
     Differs,
 }
 
@@ -141,8 +143,8 @@ impl Change {
         let mut exchange = Exchange::new(plan.baud, now);
         exchange.address = plan.address;
         let mut change =
-            Change { plan, exchange, step: Step::Enter, writes_left: TRIES, outcome: Outcome::default() };
-        change.begin(Step::Enter);
+            Change { plan, exchange, step: Step::Compare, writes_left: TRIES, outcome: Outcome::default() };
+        change.begin(Step::Compare);
         change
     }
 
@@ -167,7 +169,7 @@ impl Change {
             Step::Enter => ask(Request::Operate(Operating::Installation(plan.password))),
             Step::Write if plan.old == plan.new => None,
             Step::Write => once(Saying::Keep(plan.new)),
-            Step::Check | Step::ReadBack => ask(Request::Configuration),
+            Step::Compare | Step::Check | Step::ReadBack => ask(Request::Configuration),
             Step::PowerOn => plan.power_on.map(Saying::PowerOn).and_then(once),
             Step::Leave => ask(Request::Stop),
             Step::ReadStatus if plan.power_on.is_none() => None,
@@ -214,6 +216,7 @@ impl Change {
         }
         match self.step {
             _ if !done => self.fail(Failing::Refused),
+            Step::Compare if kept != Some(self.plan.old) => self.fail(Failing::Differs),
             Step::Check if kept == Some(self.plan.new) => self.begin(Step::PowerOn),
             Step::Check if self.writes_left > 0 => self.begin(Step::Write),
             Step::Check => {
@@ -263,6 +266,11 @@ impl Change {
     fn fail(&mut self, failing: Failing) {
         self.note(failing);
         match self.step {
+            // Nothing was said that changes anything.
+            Step::Compare => {
+                self.outcome.operating_mode = Some(self.plan.operating_mode);
+                self.begin(Step::Done);
+            }
             // Whether it heard that or not, it may be in installation mode.
             Step::Enter | Step::Write | Step::Check | Step::PowerOn => self.begin(Step::Leave),
             Step::Leave => self.begin(Step::ReadBack),
@@ -313,6 +321,7 @@ impl Conversation for Change {
 /// The step after one that went as it should.
 fn following(step: Step) -> Step {
     match step {
+        Step::Compare => Step::Enter,
         Step::Enter => Step::Write,
         Step::Write | Step::Check => Step::PowerOn,
         Step::PowerOn => Step::Leave,

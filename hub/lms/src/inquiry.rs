@@ -4,18 +4,19 @@
 //! It listens first, because a stream at the port's rate tells itself. Then it asks for the status at each rate, and
 //! once more round: a sensor may overlook a request. A rate at which telegrams were heard is not left so easily.
 
+mod report;
+
 use crate::command::Request;
-use crate::configuration::Configuration;
-use crate::errors::Errors;
 use crate::exchange::{Conversation, Exchange, Heard, Output};
 use crate::family::Family;
 use crate::framer::{Place, Tally};
 use crate::phase::{LISTEN, SETTLE, TRIES};
 use crate::reply::Reply;
-use crate::status_report::StatusReport;
 use crate::telegram::{Encoded, MAX_TELEGRAM, REPLY};
 use crate::variant::Baud;
 use crate::{Nanos, line_time};
+pub use report::Report;
+use report::{QUESTIONS, place_of};
 
 /// The questions, and how far it is with them.
 #[derive(Clone, Debug)]
@@ -50,66 +51,6 @@ enum Phase {
         give_up_at: Nanos,
     },
     Done,
-}
-
-/// What a sensor said of itself, as it said it.
-#[derive(Clone, Debug, Default)]
-pub struct Report {
-    /// The rate at which it talks; `None` if nothing was heard at any.
-    pub baud: Option<Baud>,
-    /// Its own address, 0 to 127.
-    pub address: Option<u8>,
-    /// Whether telegrams came unasked.
-    pub streams: bool,
-    /// The last status byte that came.
-    pub status_byte: Option<u8>,
-    /// Bytes that came in all.
-    pub bytes: u64,
-    replies: [Option<Encoded>; QUESTIONS.len()],
-}
-
-impl Report {
-    /// Whether it answered at all. One that streams and does not answer does not hear us.
-    pub fn answers(&self) -> bool {
-        self.replies.iter().any(Option::is_some)
-    }
-
-    /// The reply to `request`, if that was asked and answered; a refusal is an answer.
-    pub fn reply(&self, request: Request) -> Option<Reply<'_>> {
-        Reply::decode(self.replies[place_of(request)?].as_ref()?.telegram())
-    }
-
-    /// Its status.
-    pub fn status(&self) -> Option<StatusReport<'_>> {
-        match self.reply(Request::Status)? {
-            Reply::Status(status) => Some(status),
-            _ => None,
-        }
-    }
-
-    /// Type, number and firmware, such as `LMS200;S18063;V02.19`; ASCII by custom.
-    pub fn kind(&self) -> Option<&[u8]> {
-        match self.reply(Request::Type)? {
-            Reply::Type(kind) => Some(kind),
-            _ => None,
-        }
-    }
-
-    /// The first part of its configuration.
-    pub fn configuration(&self) -> Option<Configuration<'_>> {
-        match self.reply(Request::Configuration)? {
-            Reply::Configuration(configuration) => Some(configuration),
-            _ => None,
-        }
-    }
-
-    /// What is wrong with it, and what was.
-    pub fn errors(&self) -> Option<Errors<'_>> {
-        match self.reply(Request::Errors)? {
-            Reply::Errors(errors) => Some(errors),
-            _ => None,
-        }
-    }
 }
 
 impl Inquiry {
@@ -164,9 +105,7 @@ impl Inquiry {
         let Some(request) = may_answer.then(|| self.exchange.answered(command)).flatten() else {
             return self.on_unasked(command);
         };
-        if let Some(at) = place_of(request) {
-            self.report.replies[at] = Some(reply);
-        }
+        self.report.keep(request, reply);
         self.report.baud = Some(self.exchange.baud);
         self.report.address = Some(address);
         self.report.status_byte = status;
@@ -301,10 +240,6 @@ impl Conversation for Inquiry {
     }
 }
 
-fn place_of(request: Request) -> Option<usize> {
-    QUESTIONS.iter().position(|&question| question == request)
-}
-
 /// Whether a sensor sends such telegrams unasked (Telegram listing, 20h): values, means, sub-ranges of either, with
 /// fields, with reflectivity, Cartesian.
 fn is_data(command: u8) -> bool {
@@ -312,9 +247,6 @@ fn is_data(command: u8) -> bool {
     DATA.contains(&command)
 }
 
-/// What is asked, in this order; the first one finds the rate.
-const QUESTIONS: [Request; 5] =
-    [Request::Status, Request::Type, Request::Configuration, Request::Errors, Request::Counters];
 /// How often all rates are tried.
 const ROUNDS: usize = 2;
 /// More tries at a rate at which telegrams were heard.

@@ -72,10 +72,16 @@ impl fmt::Display for Configured {
 fn failure(port: &str, plan: &Plan, outcome: &Outcome, step: Step, failing: Failing) -> Failure {
     let what = match (step, failing) {
         (Step::Enter, Failing::Refused) => "the sensor refuses the installation mode: wrong password?".into(),
+        (Step::Compare, Failing::Differs) => {
+            "it does not keep what it did when it was asked: is this another sensor?".into()
+        }
         (_, Failing::Differs) => "what was read back is not what was to be written".into(),
         (step, Failing::Refused) => format!("{}: the sensor refuses", words(step)),
         (step, Failing::Unanswered) => format!("{}: no answer", words(step)),
     };
+    if step == Step::Compare {
+        return Failure::new(Kind::Failed, format!("{port}: {what}"), "nothing was written");
+    }
     let kept = match outcome.configuration {
         _ if !outcome.written => "nothing was written".into(),
         None => format!("what it keeps now is not known; before it was {}", hex(plan.old.bytes())),

@@ -84,6 +84,19 @@ fn the_rate_after_power_on() {
 }
 
 #[test]
+fn another_sensor_than_the_one_that_was_asked_is_not_written() {
+    let (mut plan, _, _) = plan(sensor(Baud::B9600), 0);
+    other_values(&mut plan);
+    let other = machine(Settings { mode: Mode(3), seed: 9, ..Settings::default() });
+    let mut bench = change(plan, other, 0);
+    bench.finish(60_000 * MILLIS);
+    let outcome = bench.talk.outcome();
+    assert_eq!((outcome.failed, outcome.written), (Some((Step::Compare, Failing::Differs)), false));
+    assert!(bench.said.iter().all(|telegram| telegram[4] == 0x74), "{:02X?}", bench.said);
+    assert_eq!(bench.machine.eeprom_writes(), 0);
+}
+
+#[test]
 fn a_wrong_password_writes_nothing_and_leaves_the_stream() {
     let mut machine = sensor(Baud::B500000);
     let now = make_stream(&mut machine);
@@ -120,8 +133,8 @@ fn a_reply_that_was_lost_costs_no_second_write() {
     let mut heard = 0;
     bench.to_host = Box::new(move |bytes| {
         heard += bytes.len();
-        // ACK and A0h come first, 10 bytes; then ACK and F7h of 43.
-        if heard > 10 && heard <= 10 + 44 { Vec::new() } else { bytes }
+        // ACK and F4h of 42 bytes come first, then ACK and A0h of 9, then ACK and F7h of 43.
+        if heard > 53 && heard <= 53 + 44 { Vec::new() } else { bytes }
     });
     bench.finish(120_000 * MILLIS);
     assert_eq!((bench.talk.outcome().failed, bench.machine.eeprom_writes()), (None, 1));
@@ -136,7 +149,7 @@ fn a_sensor_that_falls_silent_may_be_in_installation_mode() {
     let mut heard = 0;
     bench.to_host = Box::new(move |bytes| {
         heard += bytes.len();
-        if heard > 10 { Vec::new() } else { bytes }
+        if heard > 53 { Vec::new() } else { bytes }
     });
     let took = bench.finish(180_000 * MILLIS);
     let outcome = bench.talk.outcome();
