@@ -193,7 +193,7 @@ counters! {
     Telegrams "telegrams" "Telegrams published.",
     Suspect "suspect" "Telegrams of quality suspect.",
     Aborted "aborted" "Scans that the sensor broke off to answer a request.",
-    Resyncs "resyncs" "Times that measured data stayed out for a second and the session began again.",
+    Resyncs "resyncs" "Times that everything began anew: data stayed out for a second, the power came on, or on request.",
     Reconnects "reconnects" "Times that the port was opened again.",
     LostInRestart "lost_in_restart" "1 if the first telegram after the start came behind a piece of one.",
     Wakeups "wakeups" "Times that the link's thread woke up.",
