@@ -52,9 +52,26 @@ impl Stage {
 
     /// Sensors at the other end of ptys, idle, at `rate`.
     pub(crate) fn simulate(&self, sensors: &[&str], rate: u32) -> Outcome<Child> {
-        let mut words =
-            vec!["simulate".into(), "--baud".into(), rate.to_string(), "--seed".into(), "1".into()];
-        words.extend(["--truth".into(), self.truth().display().to_string()]);
+        self.simulator(sensors, &self.truth(), &["--baud", &rate.to_string()])
+    }
+
+    /// A sensor in a simulator of its own, as `flags` say, with its truth in [`Stage::own_truth`].
+    pub(crate) fn simulate_one(&self, sensor: &str, flags: &[&str]) -> Outcome<Child> {
+        self.simulator(&[sensor], &self.own_truth(sensor), flags)
+    }
+
+    /// The file with the truth of a sensor that has a simulator of its own.
+    pub(crate) fn own_truth(&self, sensor: &str) -> PathBuf {
+        self.directory.join(format!("truth-{sensor}"))
+    }
+
+    fn simulator(&self, sensors: &[&str], truth: &Path, flags: &[&str]) -> Outcome<Child> {
+        let truth = truth.display().to_string();
+        let mut words: Vec<String> = ["simulate", "--seed", "1", "--truth", &truth]
+            .iter()
+            .chain(flags)
+            .map(|word| word.to_string())
+            .collect();
         words.extend(sensors.iter().flat_map(|sensor| ["--port".into(), self.port(sensor)]));
         let child = Child::start(PROGRAM, &words)?;
         child.await_line("ready", PATIENCE)?;

@@ -1,0 +1,128 @@
+//! How long does it take to have a stream, whatever mood the sensor is in? Each of the four rates, idle, streaming or left
+//! in installation mode; and a sensor whose power is cycled in the middle of a scan while another one streams. It does
+//! not tell how long a real sensor boots: that is up to a minute, and passes before its banner.
+
+mod support;
+
+use std::collections::HashSet;
+use std::process::ExitCode;
+
+use lms::reply::Reply;
+use serde_json::Value;
+use support::Outcome;
+use support::child::Line;
+use support::figures::{self, Figure, Target};
+use support::options::Options;
+use support::stage::{PATIENCE, Stage};
+use support::truth::{Truth, hash};
+
+fn main() -> ExitCode {
+    support::main(measure)
+}
+
+fn measure(options: &Options) -> Outcome<()> {
+    let mut figures = Vec::new();
+    for (rate, state, name) in STARTS {
+        let times = (0..options.pairs()).map(|_| start(rate, state)).collect::<Outcome<Vec<f64>>>()?;
+        let most = if (rate, state) == ("500000", "streaming") { 500.0 } else { 5_000.0 };
+        figures.push(Figure { name, unit: "ms", hub: times, floor: Vec::new(), target: Target::Most(most) });
+    }
+    figures.extend(power_cycles(options.pairs())?);
+    figures::print("moods", options.json, &figures);
+    Ok(())
+}
+
+/// Milliseconds from exec of the hub to the first scan in a consumer's hands.
+fn start(rate: &str, state: &str) -> Outcome<f64> {
+    let stage = Stage::new()?;
+    let _simulator = stage.simulate_one("front", &["--baud", rate, "--state", state])?;
+    let scans = stage.consumer("scan", "front", &[])?;
+    scans.await_line("attaching", PATIENCE)?;
+    let hub = stage.hub(&["front"])?;
+    Ok((scans.await_line("scan", PATIENCE)?.number(2)? - hub.started_ns) as f64 / 1e6)
+}
+
+/// Cycles the power of one of two sensors: from its banner to its first telegram, and what the other one lost.
+fn power_cycles(count: usize) -> Outcome<[Figure; 3]> {
+    let (mut back, mut lost, mut writes) = (Vec::new(), Vec::new(), Vec::new());
+    for _ in 0..count {
+        let stage = Stage::new()?;
+        let follow = |sensor| stage.consumer("telegram", sensor, &["0"]);
+        let (front, rear) = (follow("front")?, follow("rear")?);
+        for consumer in [&front, &rear] {
+            consumer.await_line("attaching", PATIENCE)?;
+        }
+        let hub = stage.hub(&["front", "rear"])?;
+        hub.await_line("ready", PATIENCE)?;
+        let healthy = stage.simulate_one("rear", &["--state", "streaming", "--baud", "500000"])?;
+        let cycled = ["--state", "streaming", "--baud", "500000", "--boot", "1s", "--fault", "power_at=2"];
+        let cycled = stage.simulate_one("front", &cycled)?;
+        let banner = await_banner(&stage)?;
+        let mut received = Vec::new();
+        while received.last().is_none_or(|line: &Line| line.number(2).is_ok_and(|at| at < banner)) {
+            received.push(front.await_line("telegram", PATIENCE)?);
+        }
+        let first = received[received.len() - 1].number(2)?;
+        back.push((first - banner) as f64 / 1e6);
+        // The other sensor's last telegrams are on their way.
+        drop(healthy);
+        rear.await_line("telegram", PATIENCE)?;
+        let truth = Truth::read(&stage.own_truth("rear"), "rear")?;
+        let last = truth.sent.last().map(|sent| sent.hash.clone()).unwrap_or_default();
+        let mut hashes = HashSet::new();
+        while !hashes.contains(&last) {
+            let line = rear.await_line("telegram", PATIENCE)?;
+            hashes.insert(line.words().get(6).copied().unwrap_or_default().to_owned());
+        }
+        // Two telegrams are read before the loop.
+        let missing = truth.sent.iter().filter(|sent| !hashes.contains(&sent.hash)).count();
+        lost.push(missing as f64);
+        drop((cycled, hub));
+        let eeprom = ["front", "rear"].map(|sensor| {
+            Truth::read(&stage.own_truth(sensor), sensor).ok().and_then(|truth| truth.eeprom_writes)
+        });
+        writes.push(eeprom.into_iter().flatten().sum::<u64>() as f64);
+    }
+    let figure =
+        |name, unit, hub, most| Figure { name, unit, hub, floor: Vec::new(), target: Target::Most(most) };
+    Ok([
+        figure("power cycle: banner to telegram", "ms", back, 5_000.0),
+        figure("power cycle: lost of the other", "1", lost, 0.0),
+        figure("EEPROM writes", "1", writes, 0.0),
+    ])
+}
+
+/// Waits until the sensor has said that its power came on; when its last byte was written.
+fn await_banner(stage: &Stage) -> Outcome<u64> {
+    let banner = Reply::PowerOn(b"LMS200;301063;V02.30").encode(0, 0x10).ok_or("no banner")?;
+    let banner = hash(banner.bytes());
+    let give_up_at = support::clock::now() + PATIENCE.as_nanos() as u64;
+    loop {
+        for line in std::fs::read_to_string(stage.own_truth("front"))?.lines() {
+            let Ok(value) = serde_json::from_str::<Value>(line) else { continue };
+            if value["sha256"] == banner.as_str() {
+                return Ok(value["sent_ns"].as_u64().unwrap_or_default());
+            }
+        }
+        if support::clock::now() > give_up_at {
+            return Err("the sensor's power did not come on".into());
+        }
+        support::clock::rest(support::clock::now() + 20_000_000);
+    }
+}
+
+/// Rate of the line, what the sensor was left doing, and the name of the figure.
+const STARTS: [(&str, &str, &str); 12] = [
+    ("500000", "idle", "500000 Bd, idle"),
+    ("500000", "streaming", "500000 Bd, streaming"),
+    ("500000", "installation", "500000 Bd, installation mode"),
+    ("38400", "idle", "38400 Bd, idle"),
+    ("38400", "streaming", "38400 Bd, streaming"),
+    ("38400", "installation", "38400 Bd, installation mode"),
+    ("19200", "idle", "19200 Bd, idle"),
+    ("19200", "streaming", "19200 Bd, streaming"),
+    ("19200", "installation", "19200 Bd, installation mode"),
+    ("9600", "idle", "9600 Bd, idle"),
+    ("9600", "streaming", "9600 Bd, streaming"),
+    ("9600", "installation", "9600 Bd, installation mode"),
+];
