@@ -66,7 +66,6 @@ fn power_cycles(count: usize) -> Outcome<[Figure; 3]> {
         back.push((first - banner) as f64 / 1e6);
         // The other sensor's last telegrams are on their way.
         drop(healthy);
-        rear.await_line("telegram", PATIENCE)?;
         let truth = Truth::read(&stage.own_truth("rear"), "rear")?;
         let last = truth.sent.last().map(|sent| sent.hash.clone()).unwrap_or_default();
         let mut hashes = HashSet::new();
@@ -74,7 +73,6 @@ fn power_cycles(count: usize) -> Outcome<[Figure; 3]> {
             let line = rear.await_line("telegram", PATIENCE)?;
             hashes.insert(line.words().get(6).copied().unwrap_or_default().to_owned());
         }
-        // Two telegrams are read before the loop.
         let missing = truth.sent.iter().filter(|sent| !hashes.contains(&sent.hash)).count();
         lost.push(missing as f64);
         drop((cycled, hub));
