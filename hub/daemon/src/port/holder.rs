@@ -26,10 +26,11 @@ pub fn holder(path: &Path) -> Option<Holder> {
     holders(&[&device]).pop().flatten()
 }
 
-/// Whether this process itself has `path` open.
+/// Whether this process itself has `path` open, other than from whoever started it.
 pub(super) fn is_own(path: &Path) -> bool {
     let open = fs::read_dir("/proc/self/fd").into_iter().flatten().flatten();
-    let mut targets = open.filter_map(|entry| fs::read_link(entry.path()).ok());
+    let given = |entry: &fs::DirEntry| ["0", "1", "2"].iter().any(|number| entry.file_name() == *number);
+    let mut targets = open.filter(|entry| !given(entry)).filter_map(|entry| fs::read_link(entry.path()).ok());
     path.canonicalize().is_ok_and(|device| targets.any(|target| target == device))
 }
 

@@ -61,12 +61,14 @@ impl Refusal {
                 let (what, remedy) = Rights::of(path).explain(path);
                 Failure::new(Kind::PortPermission, what, remedy)
             }
-            Refusal::Busy if is_own(path) => Failure::new(
-                Kind::PortBusy,
-                format!("{name}: in use by another link of this hub"),
-                "name the port of each sensor",
-            ),
-            Refusal::Busy => busy(path, holder(path)),
+            Refusal::Busy => match holder(path) {
+                None if is_own(path) => Failure::new(
+                    Kind::PortBusy,
+                    format!("{name}: in use by another link of this hub"),
+                    "name the port of each sensor",
+                ),
+                holder => busy(path, holder),
+            },
             Refusal::NotTty if path.is_dir() => {
                 let hint = format!("it is a directory; {}", instead(&name, &candidates()));
                 failure(Kind::PortNotTty, &hint)
