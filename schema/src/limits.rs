@@ -13,8 +13,8 @@ pub const NODES: usize = 260;
 pub const BORROWED: usize = 4;
 /// Samples that the publisher may have in work at a time.
 pub const LOANED: usize = 2;
-/// Consumers asleep at a wake service.
-pub const LISTENERS: usize = 200;
+/// Consumers asleep at a wake service: those of all topics of a sensor, and who looks at its status beside 200 of one.
+pub const LISTENERS: usize = 250;
 /// Notifiers of a wake service: the hub's link, and those of dead hubs that are not cleaned up yet.
 pub const NOTIFIERS: usize = 4;
 /// The greatest event id of a wake service.
