@@ -143,7 +143,7 @@ fn limits_are_those_of_the_contract() {
     assert_eq!((config.subscriber_max_buffer_size(), config.history_size()), (4, 1));
     let wake = ipc::create_wake(&hub, "front").unwrap();
     let config = wake.static_config();
-    assert_eq!((config.max_listeners(), config.max_nodes(), config.event_id_max_value()), (200, 260, 7));
+    assert_eq!((config.max_listeners(), config.max_nodes(), config.event_id_max_value()), (250, 260, 7));
     assert_eq!(limits::samples(Topic::Scan), 16 + 800 + 2);
 }
 
