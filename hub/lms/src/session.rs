@@ -92,7 +92,7 @@ impl Session {
         Session {
             framer: Framer::default(),
             dialogue: Dialogue::new(settings, now),
-            arrivals: Arrivals::new(),
+            arrivals: Arrivals::new(now),
             rhythm: Rhythm::new(),
             now,
             last_byte: now,
@@ -219,7 +219,8 @@ impl Session {
         self.framer.buffered()
     }
 
-    /// How often everything began anew: measured data stayed out for a second, or a user asked for it.
+    /// How often everything began anew: measured data stayed out for a second, the sensor said that it had just got its
+    /// power, or a user asked for it.
     pub fn resyncs(&self) -> u64 {
         self.dialogue.resyncs
     }
