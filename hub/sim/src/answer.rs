@@ -57,13 +57,14 @@ impl Machine {
                 if done {
                     self.variant = variant;
                 }
-                answer(&reply::variant(address, done, self.variant, status), MODE_NS)
+                answer(&reply::variant(address, done, self.variant, status), self.mode_ns())
             }
             Some(Request::Stream) => self.change_mode(Operating::All),
             Some(Request::Stop) => self.change_mode(Operating::OnRequest),
-            Some(Request::Baud(baud)) => {
-                Answer { after: After::Baud(baud), ..answer(&reply::mode(address, true, status), MODE_NS) }
-            }
+            Some(Request::Baud(baud)) => Answer {
+                after: After::Baud(baud),
+                ..answer(&reply::mode(address, true, status), self.mode_ns())
+            },
             _ => self.answer_other(request, now),
         }
     }
@@ -83,7 +84,9 @@ impl Machine {
                 Answer { after: After::Reset, ..answer(&announced, THINKING_NS) }
             }
             // A variant that is none.
-            (VARIANT, [_, _, _, _]) => answer(&reply::variant(address, false, self.variant, status), MODE_NS),
+            (VARIANT, [_, _, _, _]) => {
+                answer(&reply::variant(address, false, self.variant, status), self.mode_ns())
+            }
             (COUNTERS, [] | [0, 0]) => answer(&self.reply(COUNTERS_REPLY, &COUNTED), THINKING_NS),
             (ERRORS, []) => {
                 let pairs: Vec<u8> =
@@ -93,7 +96,7 @@ impl Machine {
             (MODE, [0x00, password @ ..]) if password == PASSWORD => {
                 self.change_mode(Operating::Installation)
             }
-            (MODE, [0x00, ..]) => answer(&reply::mode(address, false, status), MODE_NS),
+            (MODE, [0x00, ..]) => answer(&reply::mode(address, false, status), self.mode_ns()),
             (MODE, data) => match Operating::of_mode(data, self.variant) {
                 Some(operating) if self.source.can(&operating) => self.change_mode(operating),
                 _ => self.refusal(),
@@ -103,7 +106,7 @@ impl Machine {
             }
             (PERMANENT_BAUD, &[permanent @ (0 | 1)]) if is_installation => {
                 self.eeprom.permanent_baud = (permanent == 1).then(|| self.baud());
-                answer(&self.reply(PERMANENT_BAUD | 0x80, &[0, permanent]), SAME_NS)
+                answer(&self.reply(PERMANENT_BAUD | 0x80, &[0, permanent]), self.write_ns(false))
             }
             _ => match Operating::of_single(request, self.variant) {
                 Some(operating) if self.source.can(&operating) => self.measure_once(&operating, now),
@@ -124,7 +127,7 @@ impl Machine {
 
     fn change_mode(&mut self, operating: Operating) -> Answer {
         self.operating = operating;
-        answer(&reply::mode(self.settings.address, true, self.settings.status), MODE_NS)
+        answer(&reply::mode(self.settings.address, true, self.settings.status), self.mode_ns())
     }
 
     /// 77h in installation mode changes as many bytes of the configuration as it has, except that the words of a
@@ -136,7 +139,7 @@ impl Machine {
         });
         let done = written.is_some();
         self.eeprom = written.unwrap_or_else(|| self.eeprom.clone());
-        let delay_ns = if self.eeprom.unit() == unit { SAME_NS } else { UNIT_NS };
+        let delay_ns = self.write_ns(self.eeprom.unit() != unit);
         let outcome = [&[u8::from(done)], self.eeprom.configuration()].concat();
         answer(&self.reply(CONFIGURATION_WRITTEN, &outcome), delay_ns)
     }
@@ -163,6 +166,17 @@ impl Machine {
         data[118] = u8::from(self.eeprom.permanent_baud.is_some());
         data[119] = self.settings.address;
         self.reply(healthy.telegram().command(), &data)
+    }
+
+    /// Between ACK and A0h or BBh.
+    fn mode_ns(&self) -> Nanos {
+        MODE_NS + self.settings.habits.late_mode_ns
+    }
+
+    /// Between ACK and F7h or E6h.
+    fn write_ns(&self, is_other_unit: bool) -> Nanos {
+        let usual_ns = if is_other_unit { UNIT_NS } else { SAME_NS };
+        usual_ns + self.settings.habits.late_write_ns
     }
 
     fn family(&self) -> Option<Family> {
