@@ -108,6 +108,7 @@ impl Dialogue {
             Phase::Streaming { silent_at, .. } if now >= silent_at => {
                 self.resyncs += 1;
                 self.trouble = Some(Trouble::Silence);
+                self.sensor.forget();
                 return self.listen(now, State::Silent);
             }
             _ => {}

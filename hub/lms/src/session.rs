@@ -69,7 +69,8 @@ pub struct Received<'a> {
 /// A byte that may leave within so long is asked for at once; a later one is waited for as for anything else.
 const SOON: Nanos = 5 * MILLIS;
 
-/// One sensor's session.
+/// One sensor's session. A sensor that is exchanged within a second for one that streams already, with the same number
+/// of values and the same address, is taken for the same one.
 #[derive(Clone, Debug)]
 pub struct Session {
     framer: Framer,

@@ -76,7 +76,7 @@ fn any_reply_may_be_lost_or_damaged() {
 }
 
 #[test]
-fn a_second_of_silence_begins_again_without_a_word() {
+fn a_second_of_silence_begins_again_with_two_questions() {
     let mut bench = Bench::new(sensor(Baud::B500000), 0);
     bench.until("streaming", 3_000 * MILLIS, Bench::is_streaming);
     bench.run(300 * MILLIS);
@@ -88,7 +88,9 @@ fn a_second_of_silence_begins_again_without_a_word() {
     bench.until("streaming", 200 * MILLIS, Bench::is_streaming);
     bench.run(1_000 * MILLIS);
     assert!(bench.is_streaming(), "{bench}");
-    assert_eq!((bench.said.len(), bench.session.resyncs(), bench.session.trouble()), (said, 1, None));
+    assert_eq!((bench.session.resyncs(), bench.session.trouble()), (1, None));
+    // Who it is, and how its values are split: it might be another one.
+    assert_eq!(bench.said.len(), said + 2 * 7);
 }
 
 #[test]
