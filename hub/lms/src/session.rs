@@ -207,7 +207,7 @@ impl Session {
 
     /// Why it is not where it should be.
     pub fn trouble(&self) -> Option<Trouble> {
-        self.dialogue.trouble
+        self.dialogue.trouble()
     }
 
     /// What became of the bytes.
