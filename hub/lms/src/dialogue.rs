@@ -238,6 +238,8 @@ impl Dialogue {
     }
 
     fn on_reply(&mut self, request: Request, reply: Option<Reply<'_>>, now: Nanos) {
+        // Whoever does not tell what it does may be doing anything: it is stopped, but not for ever.
+        self.sensor.streams |= request == Request::Status && !matches!(reply, Some(Reply::Status(_)));
         match self.phase {
             Phase::Probing { .. } => self.proceed(Progress::BEGIN, now),
             Phase::Starting { step, progress } => self.on_step(step, progress, request, reply, now),
