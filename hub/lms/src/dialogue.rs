@@ -69,7 +69,9 @@ impl Dialogue {
 
     /// What is in the way, and else what stays so.
     pub(crate) fn trouble(&self) -> Option<Trouble> {
-        self.trouble.or(self.variant_refused.then_some(Trouble::VariantRefused))
+        let has_other_angles = self.sensor.has_other_angles().then_some(Trouble::AnglesUnknown);
+        let variant_refused = self.variant_refused.then_some(Trouble::VariantRefused);
+        self.trouble.or(has_other_angles).or(variant_refused)
     }
 
     /// The rate to set on the port now.

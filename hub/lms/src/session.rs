@@ -60,7 +60,8 @@ pub struct Received<'a> {
     pub last: Nanos,
     /// Whether `first` is an estimate from bytes that came in one read.
     pub estimated: bool,
-    /// How measured values are split; `None` while the sensor has not told it.
+    /// How measured values are split; `None` while the sensor has not told it, or if nobody knows at which angles they
+    /// were measured.
     pub mode: Option<Mode>,
     /// Why it is suspect, bits of [`suspect`]; 0 is clean.
     pub reasons: u8,
@@ -261,7 +262,7 @@ impl Session {
             first: first.at,
             last,
             estimated: first.estimated,
-            mode: self.dialogue.sensor.mode,
+            mode: self.dialogue.sensor.mode.filter(|_| !self.dialogue.sensor.has_other_angles()),
             reasons: framed.reasons | if slow { suspect::SLOW } else { 0 },
         }
     }
