@@ -117,6 +117,8 @@ pub(crate) const MORE_TRIES: u8 = 5;
 pub(crate) const OVERLOOKED: Nanos = 25 * MILLIS;
 /// At all rates nobody answered and no byte came: before the next round, by how many there were.
 pub(crate) const PAUSES: [Nanos; 4] = [0, 500 * MILLIS, 1_000 * MILLIS, 1_500 * MILLIS];
+/// A sensor that shall only stop is sought in so many rounds, a hasty and a patient one.
+pub(crate) const PAUSE_ROUNDS: usize = 2;
 /// In every other round a sensor has so much more time: one that is slow would never be found otherwise.
 pub(crate) const PATIENCE: Nanos = 250 * MILLIS;
 /// Stops beside the first one; what goes on after so many does not listen.

@@ -46,6 +46,8 @@ pub enum Trouble {
     VariantRefused,
     /// One second without measured data.
     Silence,
+    /// A pause is wanted, but bytes come, and no answer says that they will end.
+    NotStopped,
     /// The sensor calls itself a version S14, which scans 90 degrees with as many values as others 180.
     AnglesUnknown,
     /// The sensor does not tell its measuring mode, so nobody knows where a range ends in its 16 bits.
@@ -71,6 +73,7 @@ impl fmt::Display for Trouble {
             Trouble::AnglesUnknown => {
                 f.write_str("the sensor is a version S14, whose angles are not known here: no scans")
             }
+            Trouble::NotStopped => f.write_str("paused, but the sensor does not stop: cable to the sensor?"),
             Trouble::Silence => f.write_str("no measured data for one second"),
         }
     }
