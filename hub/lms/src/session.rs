@@ -4,15 +4,16 @@
 //! After every call that changes it, drain [`Session::poll_output`] until it answers [`Output::Wait`] or
 //! [`Output::Rest`].
 
+use crate::Nanos;
 use crate::arrival::{Arrivals, Rhythm};
 use crate::dialogue::Dialogue;
 use crate::framer::{Advance, Framer, Place, Tally, suspect};
 use crate::measured::MEASURED;
+use crate::outgoing::SOON;
 use crate::phase::{Control, Reason, Settings};
 use crate::sensor::{Sensor, State, Trouble};
 use crate::telegram::Telegram;
 use crate::variant::{Baud, Mode};
-use crate::{MILLIS, Nanos};
 
 /// What the session wants, in the order in which it wants it.
 #[derive(Debug)]
@@ -66,9 +67,6 @@ pub struct Received<'a> {
     /// Why it is suspect, bits of [`suspect`]; 0 is clean.
     pub reasons: u8,
 }
-
-/// A byte that may leave within so long is asked for at once; a later one is waited for as for anything else.
-const SOON: Nanos = 5 * MILLIS;
 
 /// One sensor's session. A sensor that is exchanged within a second for one that streams already, with the same number
 /// of values and the same address, is taken for the same one.
