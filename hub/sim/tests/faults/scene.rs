@@ -11,6 +11,7 @@ use sim::wire::Wire;
 
 use crate::alignment::align;
 use crate::bench::{Bench, Sent};
+use crate::effect::Effects;
 
 /// What goes wrong, and for how long.
 pub(crate) struct Scene {
@@ -31,10 +32,12 @@ pub(crate) struct Verdict {
     pub(crate) resyncs: u64,
     /// Longest time from the end of the faults to a stream.
     pub(crate) back_ms: u64,
+    pub(crate) effects: Effects,
 }
 
 impl Verdict {
     pub(crate) fn add(&mut self, other: Verdict) {
+        self.effects.add(&other.effects);
         self.intact += other.intact;
         self.faulty += other.faulty;
         self.wrong += other.wrong;
@@ -67,7 +70,8 @@ impl Scene {
         bench.to_host = Box::new(|_, _| Vec::new());
         bench.run(40 * MILLIS);
         let verdict = self.account(&bench, seed);
-        Verdict { resyncs: bench.session.resyncs(), back_ms: back / MILLIS, ..verdict }
+        let effects = Effects::of(&bench);
+        Verdict { effects, resyncs: bench.session.resyncs(), back_ms: back / MILLIS, ..verdict }
     }
 
     /// Holds what was delivered against what was sent.
