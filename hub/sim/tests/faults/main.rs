@@ -11,17 +11,23 @@ mod bench;
 mod effect;
 mod scene;
 
+use std::collections::HashMap;
+
+use sim::fault::Faults;
+
 use scene::{Scene, Verdict};
 
 /// Runs `faults` with seeds up to this one, and sums up.
 fn hold(faults: &str, span_ms: u64, seeds: u64) -> Verdict {
-    let scene = Scene { faults: faults.parse().expect("faults"), span_ms };
-    let mut all = Verdict::default();
-    for seed in 1..=seeds {
-        all.add(scene.run(seed));
-    }
+    let all = sum(&Scene::new(faults.parse().expect("faults"), span_ms), seeds);
     println!("{faults}: {all:?}");
     assert!(is_sound(&all, faults), "delivered and never sent: {faults}: {all:?}");
+    all
+}
+
+fn sum(scene: &Scene, seeds: u64) -> Verdict {
+    let mut all = Verdict::default();
+    (1..=seeds).for_each(|seed| all.add(scene.run(seed)));
     all
 }
 
@@ -39,16 +45,27 @@ macro_rules! scenes {
             }
         )*
 
-        /// Faults and milliseconds.
-        const SCENES: &[(&str, u64)] = &[$(($faults, $span_ms)),*];
+        /// Faults, milliseconds, and what shows that they were there.
+        const SCENES: &[(&str, u64, fn(&Verdict) -> bool)] = &[$(($faults, $span_ms, $least)),*];
     };
 }
 
 #[test]
 #[ignore = "takes minutes: each scene with five times as many seeds, for five times as long"]
 fn everything_for_longer() {
-    for (faults, span_ms) in SCENES {
+    for (faults, span_ms, _) in SCENES {
         hold(faults, 5 * span_ms, 5 * SEEDS);
+    }
+}
+
+#[test]
+fn no_scene_is_about_nothing() {
+    let mut healthy: HashMap<(bool, u64), Verdict> = HashMap::new();
+    for &(faults, span_ms, least) in SCENES.iter().filter(|(faults, ..)| !faults.is_empty()) {
+        let Scene { is_idle, .. } = Scene::new(faults.parse().expect("faults"), span_ms);
+        let inert = Scene { is_idle, ..Scene::new(Faults::default(), span_ms) };
+        let all = healthy.entry((is_idle, span_ms)).or_insert_with(|| sum(&inert, SEEDS));
+        assert!(!least(all), "without {faults} the same shows: {all:?}");
     }
 }
 
@@ -61,7 +78,7 @@ fn is_sound(all: &Verdict, faults: &str) -> bool {
     all.wrong <= most && (flips || all.unmarked == 0)
 }
 
-// What each does at least, so that no scene is about nothing.
+// What each does at least.
 scenes! {
     nothing: "", 300, |all| all.intact > 600;
     bytes_lost: "loss=0.00135,burst=1.89", 320, |all| all.faulty > 120;

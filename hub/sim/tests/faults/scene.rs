@@ -17,6 +17,8 @@ use crate::effect::Effects;
 pub(crate) struct Scene {
     pub(crate) faults: Faults,
     pub(crate) span_ms: u64,
+    /// Whether the sensor is idle first, else it streams.
+    pub(crate) is_idle: bool,
 }
 
 /// What came of it.
@@ -48,11 +50,14 @@ impl Verdict {
 }
 
 impl Scene {
+    /// Bad habits show while the sensor is asked: it is idle then.
+    pub(crate) fn new(faults: Faults, span_ms: u64) -> Scene {
+        Scene { faults, span_ms, is_idle: faults.habits() != Habits::default() }
+    }
+
     pub(crate) fn run(&self, seed: u64) -> Verdict {
-        // Bad habits show while it is asked: it is idle then.
         let habits = self.faults.habits();
-        let is_good = habits == Habits::default();
-        let start = Start::In(if is_good { Operating::All } else { Operating::OnRequest });
+        let start = Start::In(if self.is_idle { Operating::OnRequest } else { Operating::All });
         let baud = Baud::B500000;
         let boot_ns = 200 * MILLIS;
         let settings = Settings { baud, start, boot_ns, habits, seed, ..Settings::default() };
@@ -99,7 +104,7 @@ impl Scene {
     }
 
     fn name(&self, seed: u64) -> String {
-        let state = if self.faults.habits() == Habits::default() { "streaming" } else { "idle" };
+        let state = if self.is_idle { "idle" } else { "streaming" };
         let (world, faults) = (world(seed).0, self.faults);
         format!("--baud 500000 --boot 200ms --state {state} --world {world} --seed {seed} --fault {faults}")
     }
