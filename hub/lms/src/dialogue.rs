@@ -24,7 +24,10 @@ pub(crate) struct Dialogue {
     change_baud: Option<Baud>,
     pub(crate) baud: Baud,
     pub(crate) sensor: Sensor,
+    /// What is in the way now; [`Dialogue::trouble`] is what is shown.
     pub(crate) trouble: Option<Trouble>,
+    /// The sensor keeps another variant than the wanted one.
+    pub(crate) variant_refused: bool,
     pub(crate) resyncs: u64,
     /// Bytes came since the last round of the search began.
     pub(crate) heard: bool,
@@ -42,6 +45,7 @@ impl Dialogue {
             baud: settings.baud,
             sensor: Sensor::default(),
             trouble: None,
+            variant_refused: false,
             resyncs: 0,
             heard: false,
             quiet_since: now,
@@ -61,6 +65,11 @@ impl Dialogue {
             Phase::Streaming { .. } | Phase::Following => State::Streaming,
             Phase::Paused { .. } => State::Paused,
         }
+    }
+
+    /// What is in the way, and else what stays so.
+    pub(crate) fn trouble(&self) -> Option<Trouble> {
+        self.trouble.or(self.variant_refused.then_some(Trouble::VariantRefused))
     }
 
     /// The rate to set on the port now.
@@ -108,6 +117,7 @@ impl Dialogue {
             Phase::Streaming { silent_at, .. } if now >= silent_at => {
                 self.resyncs += 1;
                 self.trouble = Some(Trouble::Silence);
+                self.sensor.forget();
                 return self.listen(now, State::Silent);
             }
             _ => {}
@@ -228,6 +238,8 @@ impl Dialogue {
     }
 
     fn on_reply(&mut self, request: Request, reply: Option<Reply<'_>>, now: Nanos) {
+        // Whoever does not tell what it does may be doing anything: it is stopped, but not for ever.
+        self.sensor.streams |= request == Request::Status && !matches!(reply, Some(Reply::Status(_)));
         match self.phase {
             Phase::Probing { .. } => self.proceed(Progress::BEGIN, now),
             Phase::Starting { step, progress } => self.on_step(step, progress, request, reply, now),
@@ -261,7 +273,7 @@ impl Dialogue {
 
     /// Whether a running stream has the beams asked for; a sensor that refused them is taken as it is.
     fn is_wanted(&self, measured: Measured<'_>) -> bool {
-        measured.count() == self.settings.variant.beams() || self.trouble == Some(Trouble::VariantRefused)
+        measured.count() == self.settings.variant.beams() || self.variant_refused
     }
 
     /// Time between two telegrams of the variant asked for.
@@ -279,7 +291,8 @@ impl Dialogue {
     fn stream(&mut self, telegram: Telegram<'_>, measured: Option<Measured<'_>>, now: Nanos) {
         let Some(&header) = telegram.bytes().first_chunk::<{ size_of::<StreamHeader>() }>() else { return };
         let as_asked = measured.is_some_and(|scan| scan.count() == self.settings.variant.beams());
-        self.trouble = (!as_asked).then_some(Trouble::VariantRefused);
+        self.trouble = None;
+        self.variant_refused = !as_asked;
         self.sensor.streams = true;
         let silent_at = self.silent_at(now);
         self.phase = Phase::Streaming { header, silent_at, questions: QUESTIONS, rounds: 0, ask_at: now };

@@ -12,6 +12,8 @@ impl Dialogue {
     /// As a new session does: at the wanted rate, without a word.
     pub(crate) fn begin(&mut self, now: Nanos) {
         self.trouble = None;
+        self.variant_refused = false;
+        self.sensor.forget();
         self.change_baud(self.settings.baud);
         self.listen(now, State::Probing);
     }

@@ -1,4 +1,5 @@
-//! What a session knows of its sensor, in plain values: learned from its replies, forgotten never but overwritten.
+//! What a session knows of its sensor, in plain values: learned from its replies, and forgotten where it may be another
+//! sensor that speaks next.
 
 use crate::command::Request;
 use crate::condition::{Condition, Severity};
@@ -127,11 +128,20 @@ impl Sensor {
         .filter_map(|(is_so, notice)| is_so.then_some(notice))
     }
 
+    /// Who speaks next may be another sensor, or the same with another configuration: who it is and how its values are
+    /// split is not known any more. What each scan tells anew may stay.
+    pub(crate) fn forget(&mut self) {
+        self.mode = None;
+        self.kind_len = 0;
+        self.defective = None;
+    }
+
     /// Takes over what `telegram` tells, which is `reply`, if it can be read.
     pub(crate) fn learn(&mut self, reply: Option<&Reply<'_>>, telegram: Telegram<'_>) {
         self.address = Some(telegram.address());
         self.feel(telegram.status().map(Condition));
         if telegram.command() == POWER_ON {
+            self.forget();
             self.streams = false;
             self.variant = None;
         }

@@ -69,7 +69,8 @@ pub struct Received<'a> {
 /// A byte that may leave within so long is asked for at once; a later one is waited for as for anything else.
 const SOON: Nanos = 5 * MILLIS;
 
-/// One sensor's session.
+/// One sensor's session. A sensor that is exchanged within a second for one that streams already, with the same number
+/// of values and the same address, is taken for the same one.
 #[derive(Clone, Debug)]
 pub struct Session {
     framer: Framer,
@@ -92,7 +93,7 @@ impl Session {
         Session {
             framer: Framer::default(),
             dialogue: Dialogue::new(settings, now),
-            arrivals: Arrivals::new(),
+            arrivals: Arrivals::new(now),
             rhythm: Rhythm::new(),
             now,
             last_byte: now,
@@ -206,7 +207,7 @@ impl Session {
 
     /// Why it is not where it should be.
     pub fn trouble(&self) -> Option<Trouble> {
-        self.dialogue.trouble
+        self.dialogue.trouble()
     }
 
     /// What became of the bytes.
@@ -219,7 +220,8 @@ impl Session {
         self.framer.buffered()
     }
 
-    /// How often everything began anew: measured data stayed out for a second, or a user asked for it.
+    /// How often everything began anew: measured data stayed out for a second, the sensor said that it had just got its
+    /// power, or a user asked for it.
     pub fn resyncs(&self) -> u64 {
         self.dialogue.resyncs
     }

@@ -5,7 +5,7 @@ use std::collections::VecDeque;
 
 use lms::command::Request;
 use lms::session::{Output, Session};
-use lms::variant::{Baud, Variant};
+use lms::variant::{Baud, Mode, Variant};
 use lms::{MICROS, MILLIS, Nanos, Settings, State, line_time};
 use sim::Arrival;
 use sim::fault::{Fault, Faults};
@@ -78,6 +78,8 @@ pub(crate) struct Sent {
 pub(crate) struct Received {
     pub(crate) at: Nanos,
     pub(crate) telegram: Vec<u8>,
+    /// How its values are split, if that was known when it was delivered.
+    pub(crate) mode: Option<Mode>,
     /// Why it is suspect; 0 is clean.
     #[allow(dead_code, reason = "for the tests of faults")]
     pub(crate) reasons: u8,
@@ -217,8 +219,8 @@ impl Bench {
                 Output::Telegram(received) => {
                     let telegram = received.telegram.bytes().to_vec();
                     let looks = std::mem::take(&mut self.looks);
-                    let reasons = received.reasons;
-                    self.received.push(Received { at: self.now, telegram, reasons, looks });
+                    let lms::session::Received { mode, reasons, .. } = received;
+                    self.received.push(Received { at: self.now, telegram, mode, reasons, looks });
                 }
                 Output::Rest(until) => break (false, until),
                 Output::Wait { until, .. } => break (true, until),

@@ -102,8 +102,9 @@ fn what_streams_on_is_delivered_and_told_to_stop_some_times() {
     assert_eq!(bench.received_scans(paused), intact);
     bench.control(Control::Resume);
     bench.until("streaming", 100 * MILLIS, Bench::is_streaming);
-    bench.run(500 * MILLIS);
-    assert_eq!(bench.said.len(), said, "an adopted stream costs nothing");
+    bench.run(5_000 * MILLIS);
+    // It is asked who it is, as often as any other.
+    assert!(bench.is_streaming() && bench.said.len() <= said + 15 * 7, "{bench}");
 }
 
 #[test]
@@ -116,7 +117,7 @@ fn a_resync_begins_anew_and_is_counted() {
     assert_eq!((bench.session.state(), bench.session.resyncs()), (State::Probing, 1));
     bench.until("streaming", 60 * MILLIS, Bench::is_streaming);
     bench.run(1_000 * MILLIS);
-    assert_eq!(bench.said.len(), said, "an adopted stream costs nothing");
+    assert_eq!(bench.said.len(), said + 2 * 7, "an adopted stream costs two questions");
     let mut intact = bench.intact_scans(begun);
     intact.truncate(bench.received_scans(begun).len());
     assert_eq!(bench.received_scans(begun), intact, "{bench}");

@@ -101,3 +101,11 @@ fn a_stream_of_a_sensor_that_answers_nothing_is_taken() {
     bench.run(500 * MILLIS);
     assert_eq!((bench.session.trouble(), bench.session.resyncs()), (None, 0));
 }
+
+#[test]
+fn a_change_of_mode_takes_as_long_as_the_listing_allows() {
+    for late in [1_100, 1_500, 2_900] {
+        let habits = Habits { late_mode_ns: late * MILLIS, ..Habits::default() };
+        all_stream(habits, 0..1, 15_000);
+    }
+}

@@ -25,6 +25,19 @@ fn the_installation_mode_is_left() {
 }
 
 #[test]
+fn it_is_left_too_by_a_sensor_that_does_not_tell_it() {
+    for baud in Baud::ALL {
+        let habits = Habits { refuses: vec![0x31], ..Habits::default() };
+        let start = Start::In(Operating::Installation);
+        let mut bench = Bench::new(sensor_with(Settings { baud, start, habits, ..Settings::default() }), 0);
+        bench.until("stopped", 3_000 * MILLIS, |bench| bench.machine.operating() == &Operating::OnRequest);
+        bench.until("streaming", 3_000 * MILLIS, Bench::is_streaming);
+        bench.run(1_000 * MILLIS);
+        assert!(bench.is_streaming() && bench.session.trouble().is_none(), "{bench}");
+    }
+}
+
+#[test]
 fn a_permanent_rate_is_found_worked_with_and_kept() {
     for permanent in Baud::ALL {
         let permanent_baud = (permanent != Baud::B9600).then_some(permanent);
