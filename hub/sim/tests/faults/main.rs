@@ -110,6 +110,7 @@ scenes! {
     acknowledgements_late: "late_ack=0.1", 900, |all| all.effects.late_acknowledgements > 300;
     replies_late: "late=0.4", 2200, |all| all.effects.late_replies > 200;
     replies_twice: "twice=0.5", 650, |all| all.effects.doubled > 30;
+    modes_changed_slowly: "late_mode=2.9", 3600, |all| all.effects.late_replies >= 100 && all.back_ms < 1_000;
     a_command_refused: "refuse=0x3A", 800, |all| all.effects.refused >= 100;
     nobody_answers: "mute=1", 300, |all| all.effects.unheard >= 100 && all.back_ms > 100;
 }
