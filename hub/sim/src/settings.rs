@@ -102,6 +102,9 @@ pub struct Habits {
     pub late_mode_ns: Nanos,
     /// How much longer than usual a write to the EEPROM takes; SICK's quick manual allows 7 s.
     pub late_write_ns: Nanos,
+    /// Whether it refuses in installation mode to measure, with 92h: the monitoring mode is wanted first (Telegram listing
+    /// 6.3.2; its table 7-1 allows it).
+    pub strict: bool,
     /// Commands that it refuses with 92h.
     pub refuses: Vec<u8>,
     /// Whether it answers nothing at all. A stream goes on.

@@ -82,6 +82,7 @@ faults! {
     late_ack, 0.0 to 60.0, 0.0, "seconds by which its ACK is late";
     late_mode, 0.0 to 60.0, 0.0, "seconds more that a change of mode, rate or variant takes";
     late_write, 0.0 to 60.0, 0.0, "seconds more that a write to the EEPROM takes";
+    strict, 0.0 to 1.0, 0.0, "1: in installation mode it refuses to measure";
     refuse, 0.0 to 255.0, 0.0, "command that it refuses, such as 0x3B";
     mute, 0.0 to 1.0, 0.0, "1: it answers nothing";
 }
@@ -105,6 +106,7 @@ impl Faults {
             late_reply_ns: (self.late * 1e9) as Nanos,
             late_mode_ns: (self.late_mode * 1e9) as Nanos,
             late_write_ns: (self.late_write * 1e9) as Nanos,
+            strict: self.strict > 0.0,
             refuses: if self.refuse > 0.0 { vec![self.refuse as u8] } else { Vec::new() },
             mute: self.mute > 0.0,
         }

@@ -127,6 +127,18 @@ fn a_refused_write_leaves_what_was() {
 }
 
 #[test]
+fn another_unit_may_take_seven_seconds() {
+    let (mut plan, mut machine, now) = plan(sensor(Baud::B38400), 0);
+    other_values(&mut plan);
+    machine.set_habits(Habits { late_write_ns: 6_000 * MILLIS, ..Habits::default() });
+    let mut bench = change(plan, machine, now);
+    let took = bench.finish(60_000 * MILLIS);
+    assert!(took > 7_000 * MILLIS, "{took}");
+    assert_eq!((bench.talk.outcome().failed, bench.machine.eeprom_writes()), (None, 1));
+    assert_eq!(bench.talk.outcome().configuration, Some(plan.new));
+}
+
+#[test]
 fn a_reply_that_was_lost_costs_no_second_write() {
     let (mut plan, machine, now) = plan(sensor(Baud::B38400), 0);
     other_values(&mut plan);

@@ -3,6 +3,7 @@
 use lms::MILLIS;
 use lms::command::Request;
 use lms::eeprom::{PowerOn, Write};
+use lms::operating::Operating;
 use lms::parameters::Password;
 use lms::reply::Reply;
 use lms::telegram::{ACK, NAK};
@@ -95,5 +96,34 @@ fn writing_the_eeprom_takes_its_time() {
         assert_eq!(bench.sent().len(), before, "{write:?}");
         bench.run_until(bench.now + 600 * MILLIS);
         assert_eq!(bench.sent()[before].1.telegram[4], write.command() | 0x80);
+    }
+}
+
+#[test]
+fn a_strict_sensor_does_not_measure_in_installation_mode() {
+    for strict in [false, true] {
+        let mut bench = with(Habits { strict, ..Habits::default() });
+        bench.ask(Request::install(Password::FACTORY).encode(0).bytes());
+        let measuring = [
+            Request::Operate(Operating::Means(2)),
+            Request::Operate(Operating::Partial),
+            Request::Values(1),
+            Request::Means(2),
+            Request::Stream,
+        ];
+        for request in measuring {
+            bench.ask(Request::install(Password::FACTORY).encode(0).bytes());
+            let before = bench.sent().len();
+            bench.ask(request.encode(0).bytes());
+            let reply = bench.sent()[before..]
+                .iter()
+                .find(|(_, sent)| sent.is_reply)
+                .map(|(_, sent)| sent.telegram[4]);
+            assert_eq!(reply == Some(0x92), strict, "{request:?}");
+        }
+        bench.ask(Request::Stop.encode(0).bytes());
+        assert_eq!(*bench.machine.operating(), sim::operating::Operating::OnRequest);
+        let bytes = bench.ask(Request::Stream.encode(0).bytes());
+        assert_eq!(bytes[5], 0xA0);
     }
 }

@@ -11,12 +11,16 @@ use crate::bench::{Bench, sensor_with};
 #[test]
 fn the_installation_mode_is_left() {
     for baud in Baud::ALL {
-        let settings = Settings { baud, start: Start::In(Operating::Installation), ..Settings::default() };
-        let mut bench = Bench::new(sensor_with(settings), 0);
-        bench.until("streaming", 3_000 * MILLIS, Bench::is_streaming);
-        bench.run(1_000 * MILLIS);
-        assert!(bench.is_streaming() && bench.machine.operating() == &Operating::All, "{bench}");
-        assert_eq!(bench.session.trouble(), None);
+        for strict in [false, true] {
+            let habits = Habits { strict, ..Habits::default() };
+            let start = Start::In(Operating::Installation);
+            let settings = Settings { baud, start, habits, ..Settings::default() };
+            let mut bench = Bench::new(sensor_with(settings), 0);
+            bench.until("streaming", 3_000 * MILLIS, Bench::is_streaming);
+            bench.run(1_000 * MILLIS);
+            assert!(bench.is_streaming() && bench.machine.operating() == &Operating::All, "{bench}");
+            assert_eq!(bench.session.trouble(), None);
+        }
     }
 }
 
