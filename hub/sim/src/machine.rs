@@ -65,7 +65,7 @@ pub struct Machine {
     pub(crate) variant: Variant,
     baud: Baud,
     ear: Ear,
-    random: fastrand::Rng,
+    pub(crate) random: fastrand::Rng,
     habits: fastrand::Rng,
     queue: VecDeque<Transmission<Tag>>,
     /// When the next scan of the stream begins to leave; `None` while there is no stream.
@@ -182,7 +182,7 @@ impl Machine {
         let Answer { reply, delay_ns, after } = self.answer(request, first_ns);
         let acknowledged_ns = self.send(vec![ACK], first_ns, Tag::Acknowledge);
         let late_ns = self.settings.habits.late_reply_ns;
-        let reply_ns = acknowledged_ns + delay_ns + late_ns + self.random.u64(..3 * MILLIS);
+        let reply_ns = acknowledged_ns + delay_ns + late_ns;
         let late = late_ns > 0;
         let end_ns = self.send(reply.clone(), reply_ns, Tag::Reply { late, after });
         if self.chance(self.settings.habits.doubles) {
