@@ -72,8 +72,10 @@ pub struct Machine {
     next_scan_ns: Option<Nanos>,
     /// Before it has started it hears nothing.
     started_ns: Nanos,
-    /// Telegrams of measured values since power-on, and those of them that were partial scans.
+    /// Telegrams of measured values since power-on.
     scans: u64,
+    /// Partial scans since the operating mode was changed.
+    pub(crate) partials: u64,
 }
 
 /// What a transmission is.
@@ -105,6 +107,7 @@ impl Machine {
             next_scan_ns: None,
             started_ns: 0,
             scans: 0,
+            partials: 0,
         };
         match machine.settings.start.clone() {
             Start::In(operating) => {
@@ -218,8 +221,9 @@ impl Machine {
         let (variant, unit, mode) = (self.variant, self.eeprom.unit(), self.eeprom.mode());
         let Settings { address, status, .. } = self.settings;
         let index = self.eeprom.has_indices().then_some(self.scans as u8);
-        let turn = self.scans;
+        let turn = self.partials;
         self.scans += 1;
+        self.partials += u64::from(*operating == Operating::Partial);
         let shot = |room| Shot { room, variant, unit, mode, at_ns, address, status, index, turn };
         self.source.telegram(operating, shot)
     }
@@ -282,6 +286,7 @@ impl Machine {
         self.variant = self.settings.variant;
         self.baud = self.eeprom.power_on_baud();
         self.scans = 0;
+        self.partials = 0;
         self.started_ns = now + self.settings.boot_ns;
         self.ear = Ear::new(self.settings.speed);
         self.send(self.banner(), self.started_ns, Tag::Reply { late: false, after: After::Nothing });
