@@ -7,7 +7,7 @@ use std::os::fd::{AsFd, BorrowedFd, OwnedFd};
 use lms::framer::suspect;
 use lms::reply::Reply;
 use lms::session::{Output, Received};
-use lms::variant::{Mode, Unit, Variant};
+use lms::variant::{Baud, Mode, Unit, Variant};
 use lms::{MILLIS, Nanos, Notice, Session, Settings, Trouble};
 use rustix::event::{PollFd, PollFlags, poll};
 use schema::{Failure, Flags, State, Wake};
@@ -36,6 +36,8 @@ pub(crate) struct LinkThread<'a> {
     facts: Option<Facts>,
     /// What is wrong, in words; empty if nothing is.
     error: String,
+    /// Rates that the port cannot have, as was said.
+    refused: Vec<Baud>,
     /// Statuses in a row that said that consumers got nothing.
     unreached: u32,
 }
@@ -71,6 +73,7 @@ impl<'a> LinkThread<'a> {
             next_status: now,
             facts: None,
             error: String::new(),
+            refused: Vec::new(),
             unreached: 0,
         }
     }
@@ -124,7 +127,15 @@ impl<'a> LinkThread<'a> {
         let mut published = false;
         let (watch, until) = loop {
             match session.poll_output() {
-                Output::SetBaud(baud) => port.set_baud(baud.rate())?,
+                Output::SetBaud(baud) => {
+                    // The sensor is looked for at those that the port can have.
+                    if let Some(error) = port.try_baud(baud.rate())?
+                        && !self.refused.contains(&baud)
+                    {
+                        self.refused.push(baud);
+                        tracing::warn!("{}: {error}", self.link.name);
+                    }
+                }
                 Output::Transmit { byte, not_before } => {
                     self.pause(not_before);
                     port.write(byte)?;

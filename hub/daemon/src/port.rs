@@ -65,7 +65,7 @@ impl Port {
     }
 
     /// Changes the rate, and forgets what came in at the old one. An error of kind `Unsupported` says that the driver
-    /// made another rate of it, or that it cannot be changed from here.
+    /// refused it or made another rate of it, or that it cannot be changed from here.
     pub(crate) fn set_baud(&self, baud: u32) -> io::Result<()> {
         match self {
             Port::Tty(tty) => tty.set_baud(baud),
@@ -73,6 +73,14 @@ impl Port {
                 let what = "the rate of a serial server is set there, by hand";
                 Err(io::Error::new(io::ErrorKind::Unsupported, what))
             }
+        }
+    }
+
+    /// As [`Port::set_baud`], for who has other rates to try: what is said of one that cannot be had, if it cannot.
+    pub(crate) fn try_baud(&self, baud: u32) -> io::Result<Option<io::Error>> {
+        match self.set_baud(baud) {
+            Err(error) if error.kind() == io::ErrorKind::Unsupported => Ok(Some(error)),
+            other => other.map(|()| None),
         }
     }
 
@@ -120,6 +128,14 @@ mod tests {
     fn refused(text: &str) -> Failure {
         let source = Source::parse(text).unwrap();
         Port::open(&source, 500_000).err().expect("cannot be opened")
+    }
+
+    #[test]
+    fn a_rate_that_cannot_be_had_is_no_port_that_is_gone() {
+        let listener = std::net::TcpListener::bind("127.0.0.1:0").unwrap();
+        let source = Source::parse(&format!("tcp:{}", listener.local_addr().unwrap())).unwrap();
+        let port = Port::open(&source, 9600).unwrap();
+        assert!(port.try_baud(38_400).unwrap().is_some());
     }
 
     #[test]
