@@ -3,13 +3,19 @@
 
 mod stage;
 
+use std::ffi::OsStr;
+use std::fs::File;
 use std::io::{Read, Write};
 use std::net::{TcpListener, TcpStream};
+use std::os::unix::ffi::OsStrExt;
+use std::process::Stdio;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::thread::{self, JoinHandle};
 use std::time::Duration;
 
+use rustix::fs::{Mode, OFlags, open};
+use rustix::pty::{OpenptFlags, grantpt, openpt, ptsname, unlockpt};
 use serde_json::Value;
 use stage::{INT, Stage, TERM, is_class, number, open_line, sequence};
 
@@ -151,4 +157,41 @@ fn probe_and_doctor_ask_there_too() {
     drop(server);
     let outcome = stage.run(&["probe", &port, "--json"]);
     assert_eq!(outcome.code, Some(4), "{outcome}");
+}
+
+/// What a person sees who runs the program with `arguments` at a terminal and answers its question by yes; its exit code.
+fn confirmed(stage: &Stage, arguments: &[&str]) -> (String, Option<i32>) {
+    let keys = openpt(OpenptFlags::RDWR | OpenptFlags::NOCTTY | OpenptFlags::CLOEXEC).expect("a terminal");
+    grantpt(&keys).and_then(|()| unlockpt(&keys)).expect("a terminal");
+    let name = ptsname(&keys, Vec::new()).expect("it has a name");
+    let flags = OFlags::RDWR | OFlags::NOCTTY | OFlags::CLOEXEC;
+    let screen = open(OsStr::from_bytes(name.as_bytes()), flags, Mode::empty());
+    let mut command = stage.command(arguments);
+    let screens = [0; 3].map(|_| Stdio::from(screen.as_ref().expect("a terminal").try_clone().unwrap()));
+    let [stdin, stdout, stderr] = screens;
+    let mut process = command.stdin(stdin).stdout(stdout).stderr(stderr).spawn().expect("it starts");
+    drop((command, screen));
+    let (mut keys, mut seen, mut byte) = (File::from(keys), Vec::new(), [0]);
+    // A terminal that nobody has open any more ends by an error.
+    while keys.read(&mut byte).is_ok_and(|len| len > 0) {
+        seen.push(byte[0]);
+        if seen.ends_with(b"Type yes: ") {
+            keys.write_all(b"yes\n").expect("it listens");
+        }
+    }
+    (String::from_utf8_lossy(&seen).into_owned(), process.wait().expect("it ends").code())
+}
+
+#[test]
+fn a_sensor_there_can_be_configured() {
+    let stage = Stage::new();
+    let simulator = stage.simulator(&["front"], &["--baud=38400"]);
+    let server = Server::new(&stage, "front", 38_400);
+    let port = format!("tcp:{}", server.address);
+    let (seen, code) = confirmed(&stage, &["configure", &port, "unit=cm"]);
+    assert_eq!(code, Some(0), "{seen}");
+    assert_eq!(number(&stage.run(&["probe", &port, "--json"]).lines()[0], "unit_mm"), 10);
+    drop(server);
+    assert_eq!(simulator.end(TERM).code, Some(0));
+    assert_eq!(stage.simulated("front").1, 1);
 }

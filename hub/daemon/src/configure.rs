@@ -78,7 +78,7 @@ pub fn configure(order: &Order, stop: &AtomicBool, tell: &mut dyn FnMut(News<'_>
     tell(News::Asking);
     let consent = ask::person(plan, stop)?;
     // What a stream has sent meanwhile is not looked at.
-    port.set_baud(plan.baud.rate()).map_err(|error| outcome::untouched(&name, &error))?;
+    port.begin_anew(plan.baud.rate()).map_err(|error| outcome::untouched(&name, &error))?;
     let mut change = Change::new(consent, clock::now());
     let mut shown = None;
     // An interrupt would leave it half done; it takes seconds, and ends in any case.

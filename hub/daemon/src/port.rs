@@ -84,6 +84,14 @@ impl Port {
         }
     }
 
+    /// Forgets what came in, at `baud` from now on; where a serial server has the rate, at the one that it has.
+    pub(crate) fn begin_anew(&self, baud: u32) -> io::Result<()> {
+        match self {
+            Port::Tty(tty) => tty.set_baud(baud),
+            Port::Tcp(tcp) => tcp.forget(),
+        }
+    }
+
     /// Reads what there is: 0 bytes if nothing, an error if the line is gone.
     pub(crate) fn read(&self, buffer: &mut [u8]) -> io::Result<usize> {
         match self {

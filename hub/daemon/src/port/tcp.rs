@@ -37,6 +37,18 @@ impl Tcp {
         }
     }
 
+    /// Throws away what came in.
+    pub(crate) fn forget(&self) -> io::Result<()> {
+        let mut buffer = [0; 4096];
+        // Bounded, for somebody may send as fast as this reads.
+        for _ in 0..MOST_FORGOTTEN / buffer.len() {
+            if self.read(&mut buffer)? == 0 {
+                break;
+            }
+        }
+        Ok(())
+    }
+
     pub(crate) fn write(&self, byte: u8) -> io::Result<()> {
         match rustix::io::write(&self.stream, &[byte]) {
             Ok(_) | Err(Errno::AGAIN | Errno::INTR) => Ok(()),
@@ -119,5 +131,7 @@ fn connect(host: &str, port: u16) -> Result<Tcp, Refusal> {
 
 /// A serial server in the same house answers sooner.
 const CONNECT: Duration = Duration::from_secs(3);
+/// Bytes that are thrown away at the most: more than a minute of 500 kBd.
+const MOST_FORGOTTEN: usize = 1 << 24;
 /// For name and connection together.
 const PATIENCE: Duration = Duration::from_secs(6);
