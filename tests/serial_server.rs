@@ -12,7 +12,7 @@ use std::process::Stdio;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::thread::{self, JoinHandle};
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use rustix::fs::{Mode, OFlags, open};
 use rustix::pty::{OpenptFlags, grantpt, openpt, ptsname, unlockpt};
@@ -136,6 +136,26 @@ fn a_serial_server_that_is_not_there() {
         assert_eq!(info["state"], "absent", "{info}");
     }
     assert_eq!(hub.end(TERM).code, Some(0));
+}
+
+#[test]
+fn a_serial_server_that_serves_somebody_else_is_asked_seldom_and_told_of_once() {
+    let stage = Stage::new();
+    let listener = TcpListener::bind("127.0.0.1:0").expect("a port of the loopback");
+    let address = listener.local_addr().expect("it has an address");
+    let hub = stage.hub(&[format!("--link=front=tcp:{address}")]);
+    let came = [0; 6].map(|_| {
+        let _connection = listener.accept().expect("the hub comes again");
+        Instant::now()
+    });
+    let info = stage.await_info("front", |info| info["counters"]["reconnects"] == 6);
+    assert_eq!(info["state"], "absent", "{info}");
+    let outcome = hub.end(TERM);
+    let said = outcome.errors.lines().filter(|line| line.contains("closed by the serial server")).count();
+    assert_eq!(said, 1, "{outcome}");
+    assert!(outcome.errors.lines().count() < 8, "{outcome}");
+    // Never sooner than it wants to wait by then.
+    assert!(came[5] - came[4] >= Duration::from_millis(1_600), "{came:?}");
 }
 
 #[test]

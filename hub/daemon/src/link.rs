@@ -31,7 +31,9 @@ pub(crate) struct LinkThread<'a> {
     /// What users ask for.
     pub(crate) orders: Orders,
     next_greeting: Nanos,
-    next_status: Nanos,
+    pub(crate) next_status: Nanos,
+    /// Why the port went away the last time, if it did so without a byte.
+    pub(crate) doubt: String,
     /// What `error` was made from.
     facts: Option<Facts>,
     /// What is wrong, in words; empty if nothing is.
@@ -71,6 +73,7 @@ impl<'a> LinkThread<'a> {
             orders,
             next_greeting: now,
             next_status: now,
+            doubt: String::new(),
             facts: None,
             error: String::new(),
             refused: Vec::new(),
@@ -154,8 +157,9 @@ impl<'a> LinkThread<'a> {
             }
         };
         let sensor = session.sensor();
-        let facts = (state_of(session), session.trouble(), sensor.unit, sensor.notices().next());
-        let (state, .., notice) = facts;
+        let state = if self.is_doubtful(session) { State::Absent } else { state_of(session) };
+        let facts = (state, session.trouble(), sensor.unit, sensor.notices().next());
+        let (.., notice) = facts;
         let changed = self.facts != Some(facts);
         if changed {
             // What is good to know is no error.
@@ -288,8 +292,18 @@ impl<'a> LinkThread<'a> {
         Settings { variant: self.link.variant, baud: self.link.baud, listen_only, fixed_rate }
     }
 
+    /// Whether the port may go away again before it brings anything, as it did the last time: a serial server that
+    /// serves somebody else takes each connection and closes it. Then it is not said anew that it is there.
+    fn is_doubtful(&self, session: &Session) -> bool {
+        let is_silent = session.tally().read == 0 && session.trouble().is_none();
+        !self.doubt.is_empty() && is_silent && session.state() == lms::State::Probing
+    }
+
     /// What is wrong, in words; empty if nothing is.
     fn trouble(&self, session: &Session) -> String {
+        if self.is_doubtful(session) {
+            return self.doubt.clone();
+        }
         let unit = session.sensor().unit;
         match (session.trouble(), unit, self.link.unit) {
             (Some(Trouble::NoAnswer { .. }), _, _) if self.settings(false).fixed_rate => format!(
