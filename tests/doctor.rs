@@ -3,6 +3,8 @@
 
 mod stage;
 
+use rustix::fs::inotify::{self, CreateFlags, WatchFlags};
+use rustix::io::Errno;
 use serde_json::Value;
 use stage::{KILL, Outcome, Stage, TERM};
 
@@ -112,8 +114,14 @@ fn what_another_program_has_is_not_touched() {
     let _simulator = stage.simulator(&["front"], &[] as &[&str]);
     let holder = std::fs::File::options().read(true).write(true).open(stage.path("front")).unwrap();
     let before = rustix::termios::tcgetattr(&holder).unwrap();
+    let watch = inotify::init(CreateFlags::CLOEXEC | CreateFlags::NONBLOCK).unwrap();
+    let device = stage.path("front").canonicalize().unwrap();
+    inotify::add_watch(&watch, &device, WatchFlags::OPEN).unwrap();
     // This process has it open.
     let (findings, _) = doctor(&stage, &[&stage.word("front")], 5);
+    assert_eq!(rustix::io::read(&watch, &mut [0; 64]), Err(Errno::AGAIN), "it was opened");
+    drop(std::fs::File::open(&device).unwrap());
+    assert!(rustix::io::read(&watch, &mut [0; 64]).is_ok(), "nobody would have noticed");
     let (found, text) = state(&findings, "holder", Some(&stage.word("front")));
     assert!(found == "failed" && text.contains(&format!("process {}", std::process::id())), "{text}");
     assert_eq!(state(&findings, "sensor", Some(&stage.word("front"))).0, "skipped");

@@ -15,6 +15,7 @@ use std::os::fd::{AsFd, BorrowedFd};
 use schema::Failure;
 
 use crate::config::Source;
+pub(crate) use candidates::is_tty;
 pub use candidates::{Candidate, candidates};
 pub use holder::{Holder, holder};
 pub(crate) use refusal::Refusal;

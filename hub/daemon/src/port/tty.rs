@@ -3,7 +3,6 @@
 use std::cell::Cell;
 use std::io::{self, ErrorKind};
 use std::os::fd::{AsFd, BorrowedFd, OwnedFd};
-use std::os::unix::fs::FileTypeExt;
 use std::path::Path;
 
 use rustix::fs::{FlockOperation, Mode, OFlags, flock, open};
@@ -13,7 +12,7 @@ use rustix::termios::{
     tcflush, tcgetattr, tcsetattr,
 };
 
-use super::candidates::latency_ms;
+use super::candidates::{is_tty, latency_ms};
 use super::{Refusal, kernel};
 
 /// An open serial line, exclusive and raw; reads and writes never block.
@@ -29,9 +28,8 @@ impl Tty {
     /// Opens `path` at `baud`. What lies in the line's buffer stays there: it may be what a hub that crashed did not
     /// read.
     pub(crate) fn open(path: &Path, baud: u32) -> Result<Tty, Refusal> {
-        // Opening what is no terminal can do harm: a watchdog, a pipe that waits for its other end.
-        let kind = path.metadata().map_err(|error| Refusal::of_io(&error))?.file_type();
-        if !kind.is_char_device() {
+        path.metadata().map_err(|error| Refusal::of_io(&error))?;
+        if !is_tty(path) {
             return Err(Refusal::NotTty);
         }
         let flags = OFlags::RDWR | OFlags::NOCTTY | OFlags::NONBLOCK | OFlags::CLOEXEC;
