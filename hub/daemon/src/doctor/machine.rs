@@ -12,7 +12,7 @@ use schema::shortage::SHARED_MEMORY;
 use schema::{Domain, Failure};
 
 use super::finding::Finding;
-use crate::preflight::needed;
+use crate::preflight::{needed, needed_descriptors};
 
 /// What is known of the machine and the domain.
 #[derive(Clone, Debug)]
@@ -35,6 +35,8 @@ pub(crate) struct Facts {
     pub(crate) segments: (usize, u64),
     /// Hard limit of open descriptors; none: no limit.
     pub(crate) descriptors: Option<u64>,
+    /// How many this process has open, as would a hub that was started in its place.
+    pub(crate) open: u64,
 }
 
 /// A directory.
@@ -52,6 +54,8 @@ impl Facts {
     pub(crate) fn gather(domain: &Domain, links: usize) -> Facts {
         let root = domain.root();
         Facts {
+            // To list them needs one too.
+            open: fs::read_dir("/proc/self/fd").map_or(0, |entries| entries.count() as u64 - 1),
             links,
             memory: statvfs(SHARED_MEMORY)
                 .ok()
@@ -180,11 +184,11 @@ pub(crate) fn leftovers(facts: &Facts) -> Finding {
 pub(crate) fn descriptors(facts: &Facts) -> Finding {
     const NAME: &str = "descriptors";
     let Some(limit) = facts.descriptors else { return Finding::ok(NAME, "no limit") };
-    let own = DESCRIPTORS + facts.links as u64 * DESCRIPTORS_OF_LINK;
+    let own = facts.open + DESCRIPTORS_AT_START + needed_descriptors(facts.links);
     let remedy =
         "raise the hard limit: ulimit -Hn, LimitNOFILE= of a service, --ulimit nofile= of a container";
     let Some(rest) = limit.checked_sub(own) else {
-        let text = format!("{limit} at most, the hub alone needs {own}");
+        let text = format!("{limit} at most, the hub needs {own}");
         return Finding::failed(NAME, text, remedy);
     };
     let consumers = rest / DESCRIPTORS_OF_CONSUMER;
@@ -210,10 +214,8 @@ fn plural(count: u64, what: &str) -> String {
     }
 }
 
-/// Descriptors of a hub without links, rounded up: /proc/PID/fd of a running one.
-const DESCRIPTORS: u64 = 24;
-/// For each link: port, topics, wake service.
-const DESCRIPTORS_OF_LINK: u64 = 16;
+/// What a hub has open when it counts: three for the signals, and its lock.
+const DESCRIPTORS_AT_START: u64 = 4;
 /// For each consumer of a topic.
 const DESCRIPTORS_OF_CONSUMER: u64 = 4;
 /// A robot has hardly more.
@@ -240,6 +242,7 @@ mod tests {
             nodes: Ok(Nodes::default()),
             segments: (0, 0),
             descriptors: Some(4096),
+            open: 4,
         }
     }
 
@@ -293,9 +296,9 @@ mod tests {
 
     #[test]
     fn descriptors_are_counted_in_consumers() {
-        says(&descriptors(&facts()), State::Ok, &["4096", "1010 consumers"]);
+        says(&descriptors(&facts()), State::Ok, &["4096", "1004 consumers"]);
         says(&descriptors(&Facts { descriptors: None, ..facts() }), State::Ok, &["no limit"]);
-        says(&descriptors(&Facts { descriptors: Some(128), ..facts() }), State::Warning, &["18 consumers"]);
-        says(&descriptors(&Facts { descriptors: Some(32), ..facts() }), State::Failed, &["needs 56"]);
+        says(&descriptors(&Facts { descriptors: Some(128), ..facts() }), State::Warning, &["12 consumers"]);
+        says(&descriptors(&Facts { descriptors: Some(79), ..facts() }), State::Failed, &["needs 80"]);
     }
 }
