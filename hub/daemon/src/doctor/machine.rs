@@ -18,7 +18,7 @@ use crate::preflight::{needed, needed_descriptors};
 #[derive(Clone, Debug)]
 pub(crate) struct Facts {
     pub(crate) links: usize,
-    /// Size and free bytes of shared memory; none: it cannot be looked at.
+    /// Size (0 is no limit) and free bytes of shared memory; none: it cannot be looked at.
     pub(crate) memory: Option<(u64, u64)>,
     /// Root path of the domain.
     pub(crate) root: PathBuf,
@@ -98,6 +98,9 @@ pub(crate) fn memory(facts: &Facts) -> Finding {
         let remedy = format!("mount a tmpfs there: mount -t tmpfs -o size=64M tmpfs {SHARED_MEMORY}");
         return Finding::failed(NAME, format!("{SHARED_MEMORY} cannot be looked at"), remedy);
     };
+    if size == 0 {
+        return Finding::ok(NAME, format!("{SHARED_MEMORY} has no limit"));
+    }
     let needed = needed(facts.links);
     let has = format!("{SHARED_MEMORY} has {} kB, {} kB of them free", size / 1024, free / 1024);
     if facts.lives().is_some() {
@@ -262,6 +265,7 @@ mod tests {
         let small = Facts { memory: Some((1 << 20, 1 << 20)), ..facts() };
         says(&memory(&small), State::Failed, &["1024 kB", "remount", "--shm-size"]);
         says(&memory(&Facts { hub: Ok(Some(5)), ..full }), State::Ok, &["the hub has"]);
+        says(&memory(&Facts { memory: Some((0, 0)), ..facts() }), State::Ok, &["no limit"]);
         says(&memory(&Facts { memory: None, ..facts() }), State::Failed, &["mount -t tmpfs"]);
     }
 
