@@ -139,6 +139,28 @@ fn a_serial_server_that_is_not_there() {
 }
 
 #[test]
+fn nobody_has_to_wait_for_a_serial_server_that_does_not_answer() {
+    let stage = Stage::new();
+    // Nobody accepts, and there is no room for one more: the kernel drops who comes.
+    let listener = TcpListener::bind("127.0.0.1:0").expect("a port of the loopback");
+    rustix::net::listen(&listener, 0).expect("a socket");
+    let address = listener.local_addr().expect("it has an address");
+    let _waiting = TcpStream::connect(address).expect("room for one");
+    let port = format!("tcp:{address}");
+    for arguments in [["probe", &port, "--json"], ["doctor", &port, "--json"]] {
+        let program = stage.start(&arguments);
+        let descriptors = format!("/proc/{}/fd", program.pid());
+        let is_socket = |entry: std::fs::DirEntry| {
+            entry.path().read_link().is_ok_and(|target| target.to_string_lossy().starts_with("socket:"))
+        };
+        stage::until("it dials", || {
+            std::fs::read_dir(&descriptors).is_ok_and(|entries| entries.flatten().any(is_socket))
+        });
+        assert_eq!(program.end(INT).code, Some(130));
+    }
+}
+
+#[test]
 fn a_serial_server_that_serves_somebody_else_is_asked_seldom_and_told_of_once() {
     let stage = Stage::new();
     let listener = TcpListener::bind("127.0.0.1:0").expect("a port of the loopback");

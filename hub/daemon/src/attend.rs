@@ -2,6 +2,7 @@
 //! its name, whatever device that is then. Looking costs next to nothing; why it is away is said once, not at each look.
 
 use std::os::fd::AsFd;
+use std::sync::atomic::AtomicBool;
 
 use lms::{Control, MILLIS, Nanos, Session};
 use rustix::event::PollFlags;
@@ -22,7 +23,7 @@ impl LinkThread<'_> {
         if let Source::Tcp { .. } = link.port {
             away = Away::for_lack_of_a_port(format!("{}: not connected yet", link.port.name()));
         } else {
-            match Port::open(&link.port, link.baud.rate()) {
+            match Port::open(&link.port, link.baud.rate(), &AtomicBool::new(false)) {
                 Ok(port) => opened = Some(port),
                 Err(failure) if failure.kind != Kind::PortMissing => return report(Err(failure)),
                 Err(failure) => away = Away::for_lack_of_a_port(said(failure)),
@@ -63,7 +64,7 @@ impl LinkThread<'_> {
     fn reach(&mut self, words: &str) -> Option<Result<Port, Refusal>> {
         let link = self.link;
         let dial = match Port::dial(&link.port) {
-            None => return Some(Port::attempt(&link.port, link.baud.rate())),
+            None => return Some(Port::attempt(&link.port, link.baud.rate(), &AtomicBool::new(false))),
             Some(Err(refusal)) => return Some(Err(refusal)),
             Some(Ok(dial)) => dial,
         };

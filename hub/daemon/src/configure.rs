@@ -55,7 +55,7 @@ pub enum News<'a> {
 pub fn configure(order: &Order, stop: &AtomicBool, tell: &mut dyn FnMut(News<'_>)) -> Result<(), Failure> {
     let wanted = Wanted::parse(&order.settings)?;
     let password = password(&order.password)?;
-    let (port, first) = open(&order.source)?;
+    let (port, first) = open(&order.source, stop)?;
     let report = ask(&port, first, &order.source, stop, |rate| tell(News::Looking(rate)))?;
     let name = order.source.name();
     let Some(mut plan) = Plan::of(&report) else {

@@ -11,6 +11,7 @@ mod tty;
 
 use std::io;
 use std::os::fd::{AsFd, BorrowedFd};
+use std::sync::atomic::AtomicBool;
 
 use schema::Failure;
 
@@ -32,19 +33,19 @@ pub(crate) enum Port {
 }
 
 impl Port {
-    /// Opens `source` at `baud`. A serial server is waited for, some seconds at most.
+    /// Opens `source` at `baud`. A serial server is waited for, some seconds at most, or until `stop` is set.
     ///
     /// A failure of one of the port kinds, with its remedy; of kind `short` without descriptors, of kind
-    /// `configuration` if it is a recording.
-    pub(crate) fn open(source: &Source, baud: u32) -> Result<Port, Failure> {
-        Port::attempt(source, baud).map_err(|refusal| refusal.explain(source))
+    /// `configuration` if it is a recording, of kind `interrupted` if `stop` is set.
+    pub(crate) fn open(source: &Source, baud: u32, stop: &AtomicBool) -> Result<Port, Failure> {
+        Port::attempt(source, baud, stop).map_err(|refusal| refusal.explain(source))
     }
 
     /// As [`Port::open`], for who tries again and again: the reason alone, without looking for its circumstances.
-    pub(crate) fn attempt(source: &Source, baud: u32) -> Result<Port, Refusal> {
+    pub(crate) fn attempt(source: &Source, baud: u32, stop: &AtomicBool) -> Result<Port, Refusal> {
         match source {
             Source::Tty(path) => Tty::open(path, baud).map(Port::Tty),
-            Source::Tcp { host, port } => Tcp::open(host, *port).map(Port::Tcp),
+            Source::Tcp { host, port } => Tcp::open(host, *port, stop).map(Port::Tcp),
             Source::File { .. } => Err(Refusal::Recording),
         }
     }
@@ -134,16 +135,18 @@ mod tests {
     use super::*;
     use schema::Kind;
 
+    const NEVER: AtomicBool = AtomicBool::new(false);
+
     fn refused(text: &str) -> Failure {
         let source = Source::parse(text).unwrap();
-        Port::open(&source, 500_000).err().expect("cannot be opened")
+        Port::open(&source, 500_000, &NEVER).err().expect("cannot be opened")
     }
 
     #[test]
     fn a_rate_that_cannot_be_had_is_no_port_that_is_gone() {
         let listener = std::net::TcpListener::bind("127.0.0.1:0").unwrap();
         let source = Source::parse(&format!("tcp:{}", listener.local_addr().unwrap())).unwrap();
-        let port = Port::open(&source, 9600).unwrap();
+        let port = Port::open(&source, 9600, &NEVER).unwrap();
         assert!(port.try_baud(38_400).unwrap().is_some());
     }
 

@@ -70,7 +70,7 @@ pub(crate) fn examine(
         tell(Finding::skipped("sensor", why));
         return Ok(());
     }
-    let (port, first) = match probe::open(&subject.source) {
+    let (port, first) = match probe::open(&subject.source, stop) {
         Ok(opened) => opened,
         Err(failure) => {
             tell(refused(failure));
@@ -95,11 +95,12 @@ fn server(
         tell(sensor::as_the_hub_says(Some(link)));
         return Ok(());
     }
-    match probe::open(&subject.source) {
+    match probe::open(&subject.source, stop) {
         Ok((port, first)) => {
             tell(Finding::ok("access", "connected; its rate was set there, by hand"));
             ask(subject, &port, first, stop, tell)
         }
+        Err(failure) if failure.kind == Kind::Interrupted => Err(failure),
         Err(failure) => {
             tell(refused(failure));
             Ok(())
