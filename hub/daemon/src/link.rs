@@ -15,6 +15,7 @@ use schema::{Failure, Flags, State, Wake};
 use crate::clock;
 use crate::config::{Link, Source};
 use crate::control::Orders;
+use crate::line_errors::LineErrors;
 use crate::port::Port;
 use crate::replay;
 use crate::scanner;
@@ -40,6 +41,7 @@ pub(crate) struct LinkThread<'a> {
     error: String,
     /// Rates that the port cannot have, as was said.
     refused: Vec<Baud>,
+    line_errors: LineErrors,
     /// Statuses in a row that said that consumers got nothing.
     unreached: u32,
 }
@@ -77,6 +79,7 @@ impl<'a> LinkThread<'a> {
             facts: None,
             error: String::new(),
             refused: Vec::new(),
+            line_errors: LineErrors::default(),
             unreached: 0,
         }
     }
@@ -145,9 +148,10 @@ impl<'a> LinkThread<'a> {
                     session.transmitted(clock::now());
                 }
                 Output::Telegram(mut received) => {
-                    let line_errors = port.line_errors();
-                    self.account.line_errors += line_errors;
-                    received.reasons |= if line_errors > 0 { suspect::LINE_ERROR } else { 0 };
+                    let counted = port.line_errors();
+                    self.account.line_errors += counted;
+                    let is_hit = self.line_errors.note(counted);
+                    received.reasons |= if is_hit { suspect::LINE_ERROR } else { 0 };
                     self.publish(&received, None);
                     self.wake(Wake::Telegram);
                     published = true;
@@ -156,6 +160,9 @@ impl<'a> LinkThread<'a> {
                 Output::Wait { until, .. } => break (true, until),
             }
         };
+        if published {
+            self.line_errors.wait();
+        }
         let sensor = session.sensor();
         let state = if self.is_doubtful(session) { State::Absent } else { state_of(session) };
         let facts = (state, session.trouble(), sensor.unit, sensor.notices().next());
