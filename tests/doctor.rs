@@ -3,8 +3,10 @@
 
 mod stage;
 
+use rustix::fs::inotify::{self, CreateFlags, WatchFlags};
+use rustix::io::Errno;
 use serde_json::Value;
-use stage::{KILL, Outcome, Stage, TERM};
+use stage::{KILL, Outcome, Program, Stage, TERM};
 
 /// Findings by the name of their check; those of a port after it.
 fn state<'a>(findings: &'a [Value], name: &str, port: Option<&str>) -> (&'a str, String) {
@@ -112,11 +114,45 @@ fn what_another_program_has_is_not_touched() {
     let _simulator = stage.simulator(&["front"], &[] as &[&str]);
     let holder = std::fs::File::options().read(true).write(true).open(stage.path("front")).unwrap();
     let before = rustix::termios::tcgetattr(&holder).unwrap();
+    let watch = inotify::init(CreateFlags::CLOEXEC | CreateFlags::NONBLOCK).unwrap();
+    let device = stage.path("front").canonicalize().unwrap();
+    inotify::add_watch(&watch, &device, WatchFlags::OPEN).unwrap();
     // This process has it open.
     let (findings, _) = doctor(&stage, &[&stage.word("front")], 5);
+    assert_eq!(rustix::io::read(&watch, &mut [0; 64]), Err(Errno::AGAIN), "it was opened");
+    drop(std::fs::File::open(&device).unwrap());
+    assert!(rustix::io::read(&watch, &mut [0; 64]).is_ok(), "nobody would have noticed");
     let (found, text) = state(&findings, "holder", Some(&stage.word("front")));
     assert!(found == "failed" && text.contains(&format!("process {}", std::process::id())), "{text}");
     assert_eq!(state(&findings, "sensor", Some(&stage.word("front"))).0, "skipped");
     let after = rustix::termios::tcgetattr(&holder).unwrap();
     assert_eq!(before.output_speed(), after.output_speed());
+}
+
+#[test]
+fn a_hub_that_would_not_start_for_want_of_descriptors_is_no_good_set_up() {
+    let stage = Stage::new();
+    let link = stage.link("absent");
+    let limited = |limit: u64, arguments: &[&str]| {
+        let inner = stage.command(arguments);
+        let mut command = std::process::Command::new("sh");
+        command.args(["-c", "ulimit -n \"$0\" && exec \"$@\"", &limit.to_string()]);
+        command.arg(inner.get_program()).args(inner.get_args());
+        command.env_remove("SCANHUB_CONFIG").env("SCANHUB_END_WITH_PARENT", "1");
+        Program::start(command)
+    };
+    let doctor = |limit| {
+        let outcome = limited(limit, &["doctor", "--json", "--no-system-config", &link]).wait();
+        state(&outcome.of_class("check"), "descriptors", None).0.to_owned()
+    };
+    let run = ["run", "--json", &link];
+    let refused = limited(40, &run).wait();
+    assert_eq!(refused.code, Some(75), "{refused}");
+    let words = refused.errors.split_once("descriptors are short: ").expect("it says so").1.split(' ');
+    let numbers: Vec<u64> = words.filter_map(|word| word.parse().ok()).collect();
+    let enough = numbers[0] + numbers[1];
+    assert_eq!(limited(enough - 1, &run).wait().code, Some(75));
+    assert_eq!(doctor(enough - 1), "failed");
+    assert_eq!(limited(enough, &run).ready().end(TERM).code, Some(0));
+    assert_eq!(doctor(enough), "warning");
 }

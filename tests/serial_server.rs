@@ -3,13 +3,19 @@
 
 mod stage;
 
+use std::ffi::OsStr;
+use std::fs::File;
 use std::io::{Read, Write};
 use std::net::{TcpListener, TcpStream};
+use std::os::unix::ffi::OsStrExt;
+use std::process::Stdio;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::thread::{self, JoinHandle};
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
+use rustix::fs::{Mode, OFlags, open};
+use rustix::pty::{OpenptFlags, grantpt, openpt, ptsname, unlockpt};
 use serde_json::Value;
 use stage::{INT, Stage, TERM, is_class, number, open_line, sequence};
 
@@ -135,6 +141,48 @@ fn a_serial_server_that_is_not_there() {
 }
 
 #[test]
+fn nobody_has_to_wait_for_a_serial_server_that_does_not_answer() {
+    let stage = Stage::new();
+    // Nobody accepts, and there is no room for one more: the kernel drops who comes.
+    let listener = TcpListener::bind("127.0.0.1:0").expect("a port of the loopback");
+    rustix::net::listen(&listener, 0).expect("a socket");
+    let address = listener.local_addr().expect("it has an address");
+    let _waiting = TcpStream::connect(address).expect("room for one");
+    let port = format!("tcp:{address}");
+    for arguments in [["probe", &port, "--json"], ["doctor", &port, "--json"]] {
+        let program = stage.start(&arguments);
+        let descriptors = format!("/proc/{}/fd", program.pid());
+        let is_socket = |entry: std::fs::DirEntry| {
+            entry.path().read_link().is_ok_and(|target| target.to_string_lossy().starts_with("socket:"))
+        };
+        stage::until("it dials", || {
+            std::fs::read_dir(&descriptors).is_ok_and(|entries| entries.flatten().any(is_socket))
+        });
+        assert_eq!(program.end(INT).code, Some(130));
+    }
+}
+
+#[test]
+fn a_serial_server_that_serves_somebody_else_is_asked_seldom_and_told_of_once() {
+    let stage = Stage::new();
+    let listener = TcpListener::bind("127.0.0.1:0").expect("a port of the loopback");
+    let address = listener.local_addr().expect("it has an address");
+    let hub = stage.hub(&[format!("--link=front=tcp:{address}")]);
+    let came = [0; 6].map(|_| {
+        let _connection = listener.accept().expect("the hub comes again");
+        Instant::now()
+    });
+    let info = stage.await_info("front", |info| info["counters"]["reconnects"] == 6);
+    assert_eq!(info["state"], "absent", "{info}");
+    let outcome = hub.end(TERM);
+    let said = outcome.errors.lines().filter(|line| line.contains("closed by the serial server")).count();
+    assert_eq!(said, 1, "{outcome}");
+    assert!(outcome.errors.lines().count() < 8, "{outcome}");
+    // Never sooner than it wants to wait by then.
+    assert!(came[5] - came[4] >= Duration::from_millis(1_600), "{came:?}");
+}
+
+#[test]
 fn probe_and_doctor_ask_there_too() {
     let stage = Stage::new();
     let _simulator = stage.simulator(&["sensor"], &["--baud=38400"]);
@@ -153,4 +201,41 @@ fn probe_and_doctor_ask_there_too() {
     drop(server);
     let outcome = stage.run(&["probe", &port, "--json"]);
     assert_eq!(outcome.code, Some(4), "{outcome}");
+}
+
+/// What a person sees who runs the program with `arguments` at a terminal and answers its question by yes; its exit code.
+fn confirmed(stage: &Stage, arguments: &[&str]) -> (String, Option<i32>) {
+    let keys = openpt(OpenptFlags::RDWR | OpenptFlags::NOCTTY | OpenptFlags::CLOEXEC).expect("a terminal");
+    grantpt(&keys).and_then(|()| unlockpt(&keys)).expect("a terminal");
+    let name = ptsname(&keys, Vec::new()).expect("it has a name");
+    let flags = OFlags::RDWR | OFlags::NOCTTY | OFlags::CLOEXEC;
+    let screen = open(OsStr::from_bytes(name.as_bytes()), flags, Mode::empty());
+    let mut command = stage.command(arguments);
+    let screens = [0; 3].map(|_| Stdio::from(screen.as_ref().expect("a terminal").try_clone().unwrap()));
+    let [stdin, stdout, stderr] = screens;
+    let mut process = command.stdin(stdin).stdout(stdout).stderr(stderr).spawn().expect("it starts");
+    drop((command, screen));
+    let (mut keys, mut seen, mut byte) = (File::from(keys), Vec::new(), [0]);
+    // A terminal that nobody has open any more ends by an error.
+    while keys.read(&mut byte).is_ok_and(|len| len > 0) {
+        seen.push(byte[0]);
+        if seen.ends_with(b"Type yes: ") {
+            keys.write_all(b"yes\n").expect("it listens");
+        }
+    }
+    (String::from_utf8_lossy(&seen).into_owned(), process.wait().expect("it ends").code())
+}
+
+#[test]
+fn a_sensor_there_can_be_configured() {
+    let stage = Stage::new();
+    let simulator = stage.simulator(&["front"], &["--baud=38400"]);
+    let server = Server::new(&stage, "front", 38_400);
+    let port = format!("tcp:{}", server.address);
+    let (seen, code) = confirmed(&stage, &["configure", &port, "unit=cm"]);
+    assert_eq!(code, Some(0), "{seen}");
+    assert_eq!(number(&stage.run(&["probe", &port, "--json"]).lines()[0], "unit_mm"), 10);
+    drop(server);
+    assert_eq!(simulator.end(TERM).code, Some(0));
+    assert_eq!(stage.simulated("front").1, 1);
 }

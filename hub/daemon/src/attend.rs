@@ -2,6 +2,7 @@
 //! its name, whatever device that is then. Looking costs next to nothing; why it is away is said once, not at each look.
 
 use std::os::fd::AsFd;
+use std::sync::atomic::AtomicBool;
 
 use lms::{Control, MILLIS, Nanos, Session};
 use rustix::event::PollFlags;
@@ -22,31 +23,33 @@ impl LinkThread<'_> {
         if let Source::Tcp { .. } = link.port {
             away = Away::for_lack_of_a_port(format!("{}: not connected yet", link.port.name()));
         } else {
-            match Port::open(&link.port, link.baud.rate()) {
+            match Port::open(&link.port, link.baud.rate(), &AtomicBool::new(false)) {
                 Ok(port) => opened = Some(port),
                 Err(failure) if failure.kind != Kind::PortMissing => return report(Err(failure)),
                 Err(failure) => away = Away::for_lack_of_a_port(said(failure)),
             }
         }
         report(Ok(()));
+        // Times in a row that it was there and went without a byte.
+        let mut futile = 0;
         loop {
             if let Some(port) = opened.take() {
-                match self.stay(&port) {
-                    Ok(()) => return,
-                    Err(error) => {
-                        self.account.reconnects += 1;
-                        away = Away::for_lack_of_a_port(format!("{} went away: {error}", link.port.name()));
-                    }
-                }
+                let (heard, end) = self.stay(&port);
+                let Err(error) = end else { return };
+                self.account.reconnects += 1;
+                futile = if heard { 0 } else { futile + 1 };
+                let words = format!("{} went away: {error}", link.port.name());
+                self.doubt = if heard { String::new() } else { words.clone() };
+                away = Away { refused: futile, ..Away::for_lack_of_a_port(words) };
             }
             self.forget();
             self.show(None, State::Absent, &away.words);
             let look_at = clock::now() + away.pause();
-            loop {
-                match self.wait(None, look_at) {
+            while clock::now() < look_at {
+                match self.wait(None, look_at.min(self.next_status)) {
                     Woken::Stop => return,
                     Woken::Order => self.orders.obey(None),
-                    Woken::Ready | Woken::Timeout => break,
+                    Woken::Ready | Woken::Timeout => self.show(None, State::Absent, &away.words),
                 }
             }
             match self.reach(&away.words) {
@@ -61,7 +64,7 @@ impl LinkThread<'_> {
     fn reach(&mut self, words: &str) -> Option<Result<Port, Refusal>> {
         let link = self.link;
         let dial = match Port::dial(&link.port) {
-            None => return Some(Port::attempt(&link.port, link.baud.rate())),
+            None => return Some(Port::attempt(&link.port, link.baud.rate(), &AtomicBool::new(false))),
             Some(Err(refusal)) => return Some(Err(refusal)),
             Some(Ok(dial)) => dial,
         };
@@ -75,8 +78,8 @@ impl LinkThread<'_> {
         }
     }
 
-    /// A session on `port`, until the hub shall end; an error says that the port is gone.
-    fn stay(&mut self, port: &Port) -> std::io::Result<()> {
+    /// A session on `port`, until the hub shall end; an error says that the port is gone. Whether a byte came.
+    fn stay(&mut self, port: &Port) -> (bool, std::io::Result<()>) {
         self.topics.set_flags(if port.simulated() { Flags::SIMULATED } else { 0 });
         let mut session = Session::new(self.settings(false), clock::now());
         if self.orders.is_paused() {
@@ -84,7 +87,7 @@ impl LinkThread<'_> {
         }
         let end = self.stream(port, &mut session);
         self.account.close(&session);
-        end
+        (session.tally().read > 0, end)
     }
 }
 
@@ -95,7 +98,7 @@ struct Away {
     words: String,
     /// When the words were found.
     since: Nanos,
-    /// Looks in a row that found something that cannot be opened.
+    /// Looks in a row that found something that cannot be opened, or went again without a byte.
     refused: u32,
 }
 

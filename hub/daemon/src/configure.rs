@@ -55,7 +55,7 @@ pub enum News<'a> {
 pub fn configure(order: &Order, stop: &AtomicBool, tell: &mut dyn FnMut(News<'_>)) -> Result<(), Failure> {
     let wanted = Wanted::parse(&order.settings)?;
     let password = password(&order.password)?;
-    let (port, first) = open(&order.source)?;
+    let (port, first) = open(&order.source, stop)?;
     let report = ask(&port, first, &order.source, stop, |rate| tell(News::Looking(rate)))?;
     let name = order.source.name();
     let Some(mut plan) = Plan::of(&report) else {
@@ -78,7 +78,7 @@ pub fn configure(order: &Order, stop: &AtomicBool, tell: &mut dyn FnMut(News<'_>
     tell(News::Asking);
     let consent = ask::person(plan, stop)?;
     // What a stream has sent meanwhile is not looked at.
-    port.set_baud(plan.baud.rate()).map_err(|error| outcome::untouched(&name, &error))?;
+    port.begin_anew(plan.baud.rate()).map_err(|error| outcome::untouched(&name, &error))?;
     let mut change = Change::new(consent, clock::now());
     let mut shown = None;
     // An interrupt would leave it half done; it takes seconds, and ends in any case.

@@ -1,7 +1,6 @@
 //! Drives a conversation on an open port until it is over. What a link's thread does for ever and for consumers, this
 //! does once and for somebody who waits at a terminal.
 
-use std::io::ErrorKind;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
@@ -45,10 +44,11 @@ pub(crate) fn converse<C: Conversation>(
 fn drain<C: Conversation>(port: &Port, talk: &mut C) -> std::io::Result<Option<Nanos>> {
     loop {
         match talk.poll_output() {
-            Output::SetBaud(baud) => match port.set_baud(baud.rate()) {
-                Err(error) if error.kind() == ErrorKind::Unsupported => tracing::warn!("{error}"),
-                other => other?,
-            },
+            Output::SetBaud(baud) => {
+                if let Some(error) = port.try_baud(baud.rate())? {
+                    tracing::warn!("{error}");
+                }
+            }
             Output::Transmit { byte, not_before } => {
                 let now = clock::now();
                 if not_before > now {

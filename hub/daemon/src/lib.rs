@@ -10,6 +10,7 @@ mod control;
 mod converse;
 pub mod doctor;
 mod layer;
+mod line_errors;
 mod link;
 mod origin;
 pub mod port;

@@ -7,7 +7,7 @@ use std::os::fd::{AsFd, BorrowedFd, OwnedFd};
 use lms::framer::suspect;
 use lms::reply::Reply;
 use lms::session::{Output, Received};
-use lms::variant::{Mode, Unit, Variant};
+use lms::variant::{Baud, Mode, Unit, Variant};
 use lms::{MILLIS, Nanos, Notice, Session, Settings, Trouble};
 use rustix::event::{PollFd, PollFlags, poll};
 use schema::{Failure, Flags, State, Wake};
@@ -15,6 +15,7 @@ use schema::{Failure, Flags, State, Wake};
 use crate::clock;
 use crate::config::{Link, Source};
 use crate::control::Orders;
+use crate::line_errors::LineErrors;
 use crate::port::Port;
 use crate::replay;
 use crate::scanner;
@@ -31,11 +32,16 @@ pub(crate) struct LinkThread<'a> {
     /// What users ask for.
     pub(crate) orders: Orders,
     next_greeting: Nanos,
-    next_status: Nanos,
+    pub(crate) next_status: Nanos,
+    /// Why the port went away the last time, if it did so without a byte.
+    pub(crate) doubt: String,
     /// What `error` was made from.
     facts: Option<Facts>,
     /// What is wrong, in words; empty if nothing is.
     error: String,
+    /// Rates that the port cannot have, as was said.
+    refused: Vec<Baud>,
+    line_errors: LineErrors,
     /// Statuses in a row that said that consumers got nothing.
     unreached: u32,
 }
@@ -69,8 +75,11 @@ impl<'a> LinkThread<'a> {
             orders,
             next_greeting: now,
             next_status: now,
+            doubt: String::new(),
             facts: None,
             error: String::new(),
+            refused: Vec::new(),
+            line_errors: LineErrors::default(),
             unreached: 0,
         }
     }
@@ -124,16 +133,25 @@ impl<'a> LinkThread<'a> {
         let mut published = false;
         let (watch, until) = loop {
             match session.poll_output() {
-                Output::SetBaud(baud) => port.set_baud(baud.rate())?,
+                Output::SetBaud(baud) => {
+                    // The sensor is looked for at those that the port can have.
+                    if let Some(error) = port.try_baud(baud.rate())?
+                        && !self.refused.contains(&baud)
+                    {
+                        self.refused.push(baud);
+                        tracing::warn!("{}: {error}", self.link.name);
+                    }
+                }
                 Output::Transmit { byte, not_before } => {
                     self.pause(not_before);
                     port.write(byte)?;
                     session.transmitted(clock::now());
                 }
                 Output::Telegram(mut received) => {
-                    let line_errors = port.line_errors();
-                    self.account.line_errors += line_errors;
-                    received.reasons |= if line_errors > 0 { suspect::LINE_ERROR } else { 0 };
+                    let counted = port.line_errors();
+                    self.account.line_errors += counted;
+                    let is_hit = self.line_errors.note(counted);
+                    received.reasons |= if is_hit { suspect::LINE_ERROR } else { 0 };
                     self.publish(&received, None);
                     self.wake(Wake::Telegram);
                     published = true;
@@ -142,9 +160,13 @@ impl<'a> LinkThread<'a> {
                 Output::Wait { until, .. } => break (true, until),
             }
         };
+        if published {
+            self.line_errors.wait();
+        }
         let sensor = session.sensor();
-        let facts = (state_of(session), session.trouble(), sensor.unit, sensor.notices().next());
-        let (state, .., notice) = facts;
+        let state = if self.is_doubtful(session) { State::Absent } else { state_of(session) };
+        let facts = (state, session.trouble(), sensor.unit, sensor.notices().next());
+        let (.., notice) = facts;
         let changed = self.facts != Some(facts);
         if changed {
             // What is good to know is no error.
@@ -277,8 +299,18 @@ impl<'a> LinkThread<'a> {
         Settings { variant: self.link.variant, baud: self.link.baud, listen_only, fixed_rate }
     }
 
+    /// Whether the port may go away again before it brings anything, as it did the last time: a serial server that
+    /// serves somebody else takes each connection and closes it. Then it is not said anew that it is there.
+    fn is_doubtful(&self, session: &Session) -> bool {
+        let is_silent = session.tally().read == 0 && session.trouble().is_none();
+        !self.doubt.is_empty() && is_silent && session.state() == lms::State::Probing
+    }
+
     /// What is wrong, in words; empty if nothing is.
     fn trouble(&self, session: &Session) -> String {
+        if self.is_doubtful(session) {
+            return self.doubt.clone();
+        }
         let unit = session.sensor().unit;
         match (session.trouble(), unit, self.link.unit) {
             (Some(Trouble::NoAnswer { .. }), _, _) if self.settings(false).fixed_rate => format!(

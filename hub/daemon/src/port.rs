@@ -11,10 +11,12 @@ mod tty;
 
 use std::io;
 use std::os::fd::{AsFd, BorrowedFd};
+use std::sync::atomic::AtomicBool;
 
 use schema::Failure;
 
 use crate::config::Source;
+pub(crate) use candidates::is_tty;
 pub use candidates::{Candidate, candidates};
 pub use holder::{Holder, holder};
 pub(crate) use refusal::Refusal;
@@ -31,19 +33,19 @@ pub(crate) enum Port {
 }
 
 impl Port {
-    /// Opens `source` at `baud`. A serial server is waited for, some seconds at most.
+    /// Opens `source` at `baud`. A serial server is waited for, some seconds at most, or until `stop` is set.
     ///
     /// A failure of one of the port kinds, with its remedy; of kind `short` without descriptors, of kind
-    /// `configuration` if it is a recording.
-    pub(crate) fn open(source: &Source, baud: u32) -> Result<Port, Failure> {
-        Port::attempt(source, baud).map_err(|refusal| refusal.explain(source))
+    /// `configuration` if it is a recording, of kind `interrupted` if `stop` is set.
+    pub(crate) fn open(source: &Source, baud: u32, stop: &AtomicBool) -> Result<Port, Failure> {
+        Port::attempt(source, baud, stop).map_err(|refusal| refusal.explain(source))
     }
 
     /// As [`Port::open`], for who tries again and again: the reason alone, without looking for its circumstances.
-    pub(crate) fn attempt(source: &Source, baud: u32) -> Result<Port, Refusal> {
+    pub(crate) fn attempt(source: &Source, baud: u32, stop: &AtomicBool) -> Result<Port, Refusal> {
         match source {
             Source::Tty(path) => Tty::open(path, baud).map(Port::Tty),
-            Source::Tcp { host, port } => Tcp::open(host, *port).map(Port::Tcp),
+            Source::Tcp { host, port } => Tcp::open(host, *port, stop).map(Port::Tcp),
             Source::File { .. } => Err(Refusal::Recording),
         }
     }
@@ -65,7 +67,7 @@ impl Port {
     }
 
     /// Changes the rate, and forgets what came in at the old one. An error of kind `Unsupported` says that the driver
-    /// made another rate of it, or that it cannot be changed from here.
+    /// refused it or made another rate of it, or that it cannot be changed from here.
     pub(crate) fn set_baud(&self, baud: u32) -> io::Result<()> {
         match self {
             Port::Tty(tty) => tty.set_baud(baud),
@@ -73,6 +75,22 @@ impl Port {
                 let what = "the rate of a serial server is set there, by hand";
                 Err(io::Error::new(io::ErrorKind::Unsupported, what))
             }
+        }
+    }
+
+    /// As [`Port::set_baud`], for who has other rates to try: what is said of one that cannot be had, if it cannot.
+    pub(crate) fn try_baud(&self, baud: u32) -> io::Result<Option<io::Error>> {
+        match self.set_baud(baud) {
+            Err(error) if error.kind() == io::ErrorKind::Unsupported => Ok(Some(error)),
+            other => other.map(|()| None),
+        }
+    }
+
+    /// Forgets what came in, at `baud` from now on; where a serial server has the rate, at the one that it has.
+    pub(crate) fn begin_anew(&self, baud: u32) -> io::Result<()> {
+        match self {
+            Port::Tty(tty) => tty.set_baud(baud),
+            Port::Tcp(tcp) => tcp.forget(),
         }
     }
 
@@ -117,9 +135,19 @@ mod tests {
     use super::*;
     use schema::Kind;
 
+    const NEVER: AtomicBool = AtomicBool::new(false);
+
     fn refused(text: &str) -> Failure {
         let source = Source::parse(text).unwrap();
-        Port::open(&source, 500_000).err().expect("cannot be opened")
+        Port::open(&source, 500_000, &NEVER).err().expect("cannot be opened")
+    }
+
+    #[test]
+    fn a_rate_that_cannot_be_had_is_no_port_that_is_gone() {
+        let listener = std::net::TcpListener::bind("127.0.0.1:0").unwrap();
+        let source = Source::parse(&format!("tcp:{}", listener.local_addr().unwrap())).unwrap();
+        let port = Port::open(&source, 9600, &NEVER).unwrap();
+        assert!(port.try_baud(38_400).unwrap().is_some());
     }
 
     #[test]

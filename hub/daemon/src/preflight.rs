@@ -34,7 +34,12 @@ pub(crate) fn needed(links: usize) -> u64 {
 ///
 /// [`Kind::Short`](schema::Kind) with the limit and what is needed.
 pub(crate) fn check_descriptors(links: usize) -> Result<(), Failure> {
-    shortage::check_descriptors(BASE_DESCRIPTORS + links as u64 * LINK_DESCRIPTORS)
+    shortage::check_descriptors(needed_descriptors(links))
+}
+
+/// Descriptors for `links` links and a first consumer of each, beside those open from the start.
+pub(crate) fn needed_descriptors(links: usize) -> u64 {
+    BASE_DESCRIPTORS + links as u64 * LINK_DESCRIPTORS
 }
 
 /// Allocates what the segments of `domain` have promised so far.

@@ -35,7 +35,7 @@ pub fn list() -> Result<Vec<Candidate>, Failure> {
 /// The port kinds if the port cannot be used, [`Kind::Timeout`] if nobody answers, [`Kind::Interrupted`] if `stop` is
 /// set.
 pub fn probe(source: &Source, stop: &AtomicBool, look: impl FnMut(u32)) -> Result<Description, Failure> {
-    let (port, first) = open(source)?;
+    let (port, first) = open(source, stop)?;
     let report = ask(&port, first, source, stop, look)?;
     Ok(Description::new(source.name(), &report))
 }
@@ -53,9 +53,9 @@ pub fn source(text: &str) -> Result<Source, Failure> {
     })
 }
 
-/// Opens `source` at the greatest rate that it can have.
-pub(crate) fn open(source: &Source) -> Result<(Port, Baud), Failure> {
-    let open = |baud: Baud| Port::open(source, baud.rate()).map(|port| (port, baud));
+/// Opens `source` at the greatest rate that it can have, unless `stop` is set before it is open.
+pub(crate) fn open(source: &Source, stop: &AtomicBool) -> Result<(Port, Baud), Failure> {
+    let open = |baud: Baud| Port::open(source, baud.rate(), stop).map(|port| (port, baud));
     let (port, baud) = open(Baud::B500000).or_else(|failure| match failure.kind {
         Kind::PortRate => open(Baud::B38400),
         _ => Err(failure),

@@ -1,13 +1,10 @@
 //! One port from the outside in: is it there, may it be used, by whom is it, what can it do; and then who is at its other
 //! end.
 
-use std::os::unix::fs::FileTypeExt;
 use std::path::Path;
 use std::sync::atomic::AtomicBool;
 
 use lms::variant::Baud;
-use rustix::fs::{Mode, OFlags, open};
-use rustix::termios::isatty;
 use schema::{Failure, Kind};
 
 use super::Subject;
@@ -15,7 +12,7 @@ use super::finding::Finding;
 use super::hub::Hub;
 use super::sensor;
 use crate::config::Source;
-use crate::port::{Candidate, Port, Refusal, holder};
+use crate::port::{Candidate, Port, Refusal, holder, is_tty};
 use crate::probe;
 
 /// Examines a port and its sensor.
@@ -73,7 +70,7 @@ pub(crate) fn examine(
         tell(Finding::skipped("sensor", why));
         return Ok(());
     }
-    let (port, first) = match probe::open(&subject.source) {
+    let (port, first) = match probe::open(&subject.source, stop) {
         Ok(opened) => opened,
         Err(failure) => {
             tell(refused(failure));
@@ -98,11 +95,12 @@ fn server(
         tell(sensor::as_the_hub_says(Some(link)));
         return Ok(());
     }
-    match probe::open(&subject.source) {
+    match probe::open(&subject.source, stop) {
         Ok((port, first)) => {
             tell(Finding::ok("access", "connected; its rate was set there, by hand"));
             ask(subject, &port, first, stop, tell)
         }
+        Err(failure) if failure.kind == Kind::Interrupted => Err(failure),
         Err(failure) => {
             tell(refused(failure));
             Ok(())
@@ -165,14 +163,6 @@ fn describe(candidate: &Candidate) -> String {
         text = format!("{text}, {word}");
     }
     text
-}
-
-/// Whether it is a terminal, as far as this user can find out; looking changes nothing in it.
-fn is_tty(path: &Path) -> bool {
-    let is_char_device = path.metadata().is_ok_and(|metadata| metadata.file_type().is_char_device());
-    let flags = OFlags::RDWR | OFlags::NOCTTY | OFlags::NONBLOCK | OFlags::CLOEXEC;
-    // One that cannot be opened says why later.
-    is_char_device && open(path, flags, Mode::empty()).map_or(true, isatty)
 }
 
 /// Why it cannot be opened.

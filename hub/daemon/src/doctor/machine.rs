@@ -12,13 +12,13 @@ use schema::shortage::SHARED_MEMORY;
 use schema::{Domain, Failure};
 
 use super::finding::Finding;
-use crate::preflight::needed;
+use crate::preflight::{needed, needed_descriptors};
 
 /// What is known of the machine and the domain.
 #[derive(Clone, Debug)]
 pub(crate) struct Facts {
     pub(crate) links: usize,
-    /// Size and free bytes of shared memory; none: it cannot be looked at.
+    /// Size (0 is no limit) and free bytes of shared memory; none: it cannot be looked at.
     pub(crate) memory: Option<(u64, u64)>,
     /// Root path of the domain.
     pub(crate) root: PathBuf,
@@ -35,6 +35,8 @@ pub(crate) struct Facts {
     pub(crate) segments: (usize, u64),
     /// Hard limit of open descriptors; none: no limit.
     pub(crate) descriptors: Option<u64>,
+    /// How many this process has open, as would a hub that was started in its place.
+    pub(crate) open: u64,
 }
 
 /// A directory.
@@ -52,6 +54,8 @@ impl Facts {
     pub(crate) fn gather(domain: &Domain, links: usize) -> Facts {
         let root = domain.root();
         Facts {
+            // To list them needs one too.
+            open: fs::read_dir("/proc/self/fd").map_or(0, |entries| entries.count() as u64 - 1),
             links,
             memory: statvfs(SHARED_MEMORY)
                 .ok()
@@ -94,6 +98,9 @@ pub(crate) fn memory(facts: &Facts) -> Finding {
         let remedy = format!("mount a tmpfs there: mount -t tmpfs -o size=64M tmpfs {SHARED_MEMORY}");
         return Finding::failed(NAME, format!("{SHARED_MEMORY} cannot be looked at"), remedy);
     };
+    if size == 0 {
+        return Finding::ok(NAME, format!("{SHARED_MEMORY} has no limit"));
+    }
     let needed = needed(facts.links);
     let has = format!("{SHARED_MEMORY} has {} kB, {} kB of them free", size / 1024, free / 1024);
     if facts.lives().is_some() {
@@ -180,11 +187,11 @@ pub(crate) fn leftovers(facts: &Facts) -> Finding {
 pub(crate) fn descriptors(facts: &Facts) -> Finding {
     const NAME: &str = "descriptors";
     let Some(limit) = facts.descriptors else { return Finding::ok(NAME, "no limit") };
-    let own = DESCRIPTORS + facts.links as u64 * DESCRIPTORS_OF_LINK;
+    let own = facts.open + DESCRIPTORS_AT_START + needed_descriptors(facts.links);
     let remedy =
         "raise the hard limit: ulimit -Hn, LimitNOFILE= of a service, --ulimit nofile= of a container";
     let Some(rest) = limit.checked_sub(own) else {
-        let text = format!("{limit} at most, the hub alone needs {own}");
+        let text = format!("{limit} at most, the hub needs {own}");
         return Finding::failed(NAME, text, remedy);
     };
     let consumers = rest / DESCRIPTORS_OF_CONSUMER;
@@ -210,10 +217,8 @@ fn plural(count: u64, what: &str) -> String {
     }
 }
 
-/// Descriptors of a hub without links, rounded up: /proc/PID/fd of a running one.
-const DESCRIPTORS: u64 = 24;
-/// For each link: port, topics, wake service.
-const DESCRIPTORS_OF_LINK: u64 = 16;
+/// What a hub has open when it counts: three for the signals, and its lock.
+const DESCRIPTORS_AT_START: u64 = 4;
 /// For each consumer of a topic.
 const DESCRIPTORS_OF_CONSUMER: u64 = 4;
 /// A robot has hardly more.
@@ -240,6 +245,7 @@ mod tests {
             nodes: Ok(Nodes::default()),
             segments: (0, 0),
             descriptors: Some(4096),
+            open: 4,
         }
     }
 
@@ -259,6 +265,7 @@ mod tests {
         let small = Facts { memory: Some((1 << 20, 1 << 20)), ..facts() };
         says(&memory(&small), State::Failed, &["1024 kB", "remount", "--shm-size"]);
         says(&memory(&Facts { hub: Ok(Some(5)), ..full }), State::Ok, &["the hub has"]);
+        says(&memory(&Facts { memory: Some((0, 0)), ..facts() }), State::Ok, &["no limit"]);
         says(&memory(&Facts { memory: None, ..facts() }), State::Failed, &["mount -t tmpfs"]);
     }
 
@@ -293,9 +300,9 @@ mod tests {
 
     #[test]
     fn descriptors_are_counted_in_consumers() {
-        says(&descriptors(&facts()), State::Ok, &["4096", "1010 consumers"]);
+        says(&descriptors(&facts()), State::Ok, &["4096", "1004 consumers"]);
         says(&descriptors(&Facts { descriptors: None, ..facts() }), State::Ok, &["no limit"]);
-        says(&descriptors(&Facts { descriptors: Some(128), ..facts() }), State::Warning, &["18 consumers"]);
-        says(&descriptors(&Facts { descriptors: Some(32), ..facts() }), State::Failed, &["needs 56"]);
+        says(&descriptors(&Facts { descriptors: Some(128), ..facts() }), State::Warning, &["12 consumers"]);
+        says(&descriptors(&Facts { descriptors: Some(79), ..facts() }), State::Failed, &["needs 80"]);
     }
 }

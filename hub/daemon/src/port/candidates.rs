@@ -2,9 +2,11 @@
 
 use std::fmt;
 use std::fs;
+use std::ops::RangeInclusive;
+use std::os::unix::fs::{FileTypeExt, MetadataExt};
 use std::path::{Path, PathBuf};
 
-use rustix::fs::{Access, access};
+use rustix::fs::{Access, access, major, minor};
 
 use super::holder::{Holder, holders};
 
@@ -81,6 +83,22 @@ pub(super) fn found_in(root: &Path) -> Vec<Candidate> {
     found
 }
 
+/// Whether `path` is a terminal, by what the kernel says of its device; opening others can do harm: a watchdog, a pipe
+/// that waits for its other end.
+pub(crate) fn is_tty(path: &Path) -> bool {
+    let Ok(metadata) = path.metadata() else { return false };
+    if !metadata.file_type().is_char_device() {
+        return false;
+    }
+    let (major, minor) = (major(metadata.rdev()), minor(metadata.rdev()));
+    let known = Path::new("/sys/dev/char");
+    match fs::read_link(known.join(format!("{major}:{minor}/subsystem"))) {
+        Ok(subsystem) => subsystem.ends_with("tty"),
+        // Ptys are not listed; without sysfs nothing is, and the terminal has to say it itself.
+        Err(_) => UNIX98_PTYS.contains(&major) || !known.exists(),
+    }
+}
+
 /// How long the adapter at `path` collects bytes, if it says so.
 pub(super) fn latency_ms(path: &Path) -> Option<u8> {
     let device = path.canonicalize().ok()?;
@@ -125,9 +143,13 @@ fn entries(directory: &Path) -> Vec<PathBuf> {
     paths
 }
 
+/// Majors of the ends of ptys that are opened by name (Linux, devices.txt).
+const UNIX98_PTYS: RangeInclusive<u32> = 136..=143;
+
 #[cfg(test)]
 mod tests {
     use super::*;
+    use rustix::pty::{OpenptFlags, grantpt, openpt, ptsname};
     use std::os::unix::fs::symlink;
 
     /// A machine with a USB adapter, a UART on the board, one that is not there, and a terminal without hardware.
@@ -153,6 +175,19 @@ mod tests {
         for (name, kind) in [("ttyS0", "4\n"), ("ttyS1", "0\n")] {
             link("sys/pnp", &format!("sys/class/tty/{name}/device"));
             file(&format!("sys/class/tty/{name}/type"), kind);
+        }
+    }
+
+    #[test]
+    fn what_is_a_terminal_is_known_without_opening() {
+        let pty = openpt(OpenptFlags::RDWR | OpenptFlags::NOCTTY).unwrap();
+        grantpt(&pty).unwrap();
+        let name = ptsname(&pty, Vec::new()).unwrap();
+        // Locked still: whoever opened it would be refused.
+        assert!(is_tty(Path::new(name.to_str().unwrap())));
+        assert!(is_tty(Path::new("/dev/tty")));
+        for other in ["/dev/null", "/dev/zero", "/dev", "/etc/hostname", "/dev/no-such-port"] {
+            assert!(!is_tty(Path::new(other)), "{other}");
         }
     }
 

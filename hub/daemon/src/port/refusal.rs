@@ -26,7 +26,7 @@ pub(crate) enum Refusal {
     Busy,
     /// There is a name and nothing behind it.
     Dead,
-    /// This process has no descriptor left, or the kernel no memory.
+    /// This process has no descriptor or thread left, or the kernel no memory.
     Short(Errno),
     /// The driver made another rate of the one that was wanted.
     Rate { wanted: u32, given: u32 },
@@ -38,6 +38,8 @@ pub(crate) enum Refusal {
     TimedOut,
     /// The network does not reach it.
     Network(String),
+    /// Somebody wanted to stop.
+    Interrupted,
     /// It is no line at all.
     Recording,
     /// Whatever else the kernel says.
@@ -75,6 +77,7 @@ impl Refusal {
             }
             Refusal::NotTty => failure(Kind::PortNotTty, "name a tty, or file:PATH for a recording"),
             Refusal::Dead => failure(Kind::PortMissing, &instead(&name, &candidates())),
+            Refusal::Short(Errno::AGAIN) => failure(Kind::Short, "raise the limit of threads (ulimit -u)"),
             Refusal::Short(_) => failure(Kind::Short, "raise the limit of open descriptors (ulimit -n)"),
             Refusal::Rate { wanted, .. } => failure(Kind::PortRate, remedy_of_rate(*wanted)),
             Refusal::NoHost(_) => failure(Kind::PortMissing, "correct the name, or give the address instead"),
@@ -86,6 +89,7 @@ impl Refusal {
             Refusal::Network(_) => {
                 failure(Kind::PortMissing, "is the network plugged in, and is there a way to it?")
             }
+            Refusal::Interrupted => Failure::new(Kind::Interrupted, "interrupted", ""),
             Refusal::Recording => failure(Kind::Configuration, "name a tty, or tcp:HOST:PORT"),
             Refusal::Other(_) => {
                 failure(Kind::PortNotTty, "name a tty; the kernel's log (dmesg) may tell more")
@@ -110,6 +114,7 @@ impl fmt::Display for Refusal {
             Refusal::Refused => f.write_str("connection refused"),
             Refusal::TimedOut => f.write_str("no answer"),
             Refusal::Network(why) => write!(f, "cannot be reached: {why}"),
+            Refusal::Interrupted => f.write_str("interrupted"),
             Refusal::Recording => f.write_str("a recording, no line to a sensor"),
             Refusal::Other(errno) => write!(f, "cannot be used as a serial line: {errno}"),
         }
@@ -205,6 +210,7 @@ mod tests {
             (Errno::IO.into(), Kind::PortMissing, "no line behind it"),
             (Errno::NXIO.into(), Kind::PortMissing, "no line behind it"),
             (Errno::MFILE.into(), Kind::Short, "ulimit -n"),
+            (Refusal::Short(Errno::AGAIN), Kind::Short, "ulimit -u"),
             (Errno::LOOP.into(), Kind::PortNotTty, "dmesg"),
             (Errno::PERM.into(), Kind::PortPermission, "/dev/full"),
             (Errno::BUSY.into(), Kind::PortBusy, "stop it first"),

@@ -5,6 +5,7 @@
 use std::io::{self, ErrorKind, PipeReader, PipeWriter};
 use std::net::{SocketAddr, TcpStream, ToSocketAddrs};
 use std::os::fd::{AsFd, BorrowedFd};
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::mpsc::{Receiver, Sender, channel};
 use std::thread;
 use std::time::Duration;
@@ -23,10 +24,17 @@ pub(crate) struct Tcp {
 }
 
 impl Tcp {
-    /// Connects to `port` of `host`, and waits for the outcome.
-    pub(crate) fn open(host: &str, port: u16) -> Result<Tcp, Refusal> {
+    /// Connects to `port` of `host`, and waits for the outcome, or until `stop` is set.
+    pub(crate) fn open(host: &str, port: u16, stop: &AtomicBool) -> Result<Tcp, Refusal> {
         let dial = Dial::start(host, port)?;
-        dial.outcome.recv_timeout(PATIENCE).unwrap_or(Err(Refusal::TimedOut))
+        for _ in 0..LOOKS {
+            match dial.outcome.recv_timeout(LOOK) {
+                Ok(outcome) => return outcome,
+                Err(_) if stop.load(Ordering::Relaxed) => return Err(Refusal::Interrupted),
+                Err(_) => {}
+            }
+        }
+        Err(Refusal::TimedOut)
     }
 
     pub(crate) fn read(&self, buffer: &mut [u8]) -> io::Result<usize> {
@@ -35,6 +43,18 @@ impl Tcp {
             Err(Errno::AGAIN | Errno::INTR) => Ok(0),
             other => Ok(other?),
         }
+    }
+
+    /// Throws away what came in.
+    pub(crate) fn forget(&self) -> io::Result<()> {
+        let mut buffer = [0; 4096];
+        // Bounded, for somebody may send as fast as this reads.
+        for _ in 0..MOST_FORGOTTEN / buffer.len() {
+            if self.read(&mut buffer)? == 0 {
+                break;
+            }
+        }
+        Ok(())
     }
 
     pub(crate) fn write(&self, byte: u8) -> io::Result<()> {
@@ -78,7 +98,12 @@ impl Dial {
         let (send, outcome) = channel();
         let host = host.to_owned();
         let body = move || tell(connect(&host, port), &send, rope);
-        thread::Builder::new().name("dial".to_owned()).spawn(body).map_err(|error| Refusal::of_io(&error))?;
+        // A thread is refused by AGAIN.
+        let refuse = |error: io::Error| match Refusal::of_io(&error) {
+            Refusal::Other(Errno::AGAIN) => Refusal::Short(Errno::AGAIN),
+            refusal => refusal,
+        };
+        thread::Builder::new().name("dial".to_owned()).spawn(body).map_err(refuse)?;
         Ok(Dial { outcome, bell })
     }
 
@@ -103,7 +128,7 @@ fn tell(outcome: Result<Tcp, Refusal>, send: &Sender<Result<Tcp, Refusal>>, rope
 fn connect(host: &str, port: u16) -> Result<Tcp, Refusal> {
     let addresses: Vec<SocketAddr> = match (host, port).to_socket_addrs() {
         Ok(addresses) => addresses.collect(),
-        Err(error) => return Err(Refusal::NoHost(error.to_string())),
+        Err(error) => return Err(failed(&error, Refusal::NoHost)),
     };
     let mut last = Refusal::NoHost("it has no address".to_owned());
     for address in addresses {
@@ -111,13 +136,40 @@ fn connect(host: &str, port: u16) -> Result<Tcp, Refusal> {
             Ok(stream) => return Ok(Tcp::new(stream)?),
             Err(error) if error.kind() == ErrorKind::TimedOut => last = Refusal::TimedOut,
             Err(error) if error.kind() == ErrorKind::ConnectionRefused => last = Refusal::Refused,
-            Err(error) => last = Refusal::Network(error.to_string()),
+            Err(error) => last = failed(&error, Refusal::Network),
         }
     }
     Err(last)
 }
 
+/// What is short here is neither the network's fault nor the server's, which `otherwise` tells of.
+fn failed(error: &io::Error, otherwise: fn(String) -> Refusal) -> Refusal {
+    match Refusal::of_io(error) {
+        short @ Refusal::Short(_) => short,
+        _ => otherwise(error.to_string()),
+    }
+}
+
 /// A serial server in the same house answers sooner.
 const CONNECT: Duration = Duration::from_secs(3);
-/// For name and connection together.
-const PATIENCE: Duration = Duration::from_secs(6);
+/// Bytes that are thrown away at the most: more than a minute of 500 kBd.
+const MOST_FORGOTTEN: usize = 1 << 24;
+/// Between two looks whether somebody wants to stop.
+const LOOK: Duration = Duration::from_millis(100);
+/// Six seconds for name and connection together.
+const LOOKS: u32 = 60;
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_is_short_here_is_not_blamed_on_the_network() {
+        let of = |errno: Errno| failed(&errno.into(), Refusal::Network);
+        assert_eq!(of(Errno::MFILE), Refusal::Short(Errno::MFILE));
+        assert_eq!(of(Errno::NFILE), Refusal::Short(Errno::NFILE));
+        assert!(matches!(of(Errno::HOSTUNREACH), Refusal::Network(_)));
+        let unknown = io::Error::other("Name or service not known");
+        assert!(matches!(failed(&unknown, Refusal::NoHost), Refusal::NoHost(_)));
+    }
+}

@@ -3,17 +3,16 @@
 use std::cell::Cell;
 use std::io::{self, ErrorKind};
 use std::os::fd::{AsFd, BorrowedFd, OwnedFd};
-use std::os::unix::fs::FileTypeExt;
 use std::path::Path;
 
 use rustix::fs::{FlockOperation, Mode, OFlags, flock, open};
 use rustix::io::Errno;
 use rustix::termios::{
-    ControlModes, InputModes, OptionalActions, QueueSelector, ioctl_tiocexcl, ioctl_tiocnxcl, tcflush,
-    tcgetattr, tcsetattr,
+    ControlModes, InputModes, OptionalActions, QueueSelector, Termios, ioctl_tiocexcl, ioctl_tiocnxcl,
+    tcflush, tcgetattr, tcsetattr,
 };
 
-use super::candidates::latency_ms;
+use super::candidates::{is_tty, latency_ms};
 use super::{Refusal, kernel};
 
 /// An open serial line, exclusive and raw; reads and writes never block.
@@ -29,9 +28,8 @@ impl Tty {
     /// Opens `path` at `baud`. What lies in the line's buffer stays there: it may be what a hub that crashed did not
     /// read.
     pub(crate) fn open(path: &Path, baud: u32) -> Result<Tty, Refusal> {
-        // Opening what is no terminal can do harm: a watchdog, a pipe that waits for its other end.
-        let kind = path.metadata().map_err(|error| Refusal::of_io(&error))?.file_type();
-        if !kind.is_char_device() {
+        path.metadata().map_err(|error| Refusal::of_io(&error))?;
+        if !is_tty(path) {
             return Err(Refusal::NotTty);
         }
         let flags = OFlags::RDWR | OFlags::NOCTTY | OFlags::NONBLOCK | OFlags::CLOEXEC;
@@ -55,11 +53,7 @@ impl Tty {
         termios.control_modes.remove(ControlModes::CSTOPB | ControlModes::CRTSCTS);
         termios.control_modes.insert(ControlModes::CREAD | ControlModes::CLOCAL);
         termios.set_speed(baud)?;
-        tcsetattr(&tty.line, OptionalActions::Now, &termios)?;
-        match tty.rate()? {
-            given if is_near(given, baud) => {}
-            given => return Err(Refusal::Rate { wanted: baud, given }),
-        }
+        tty.apply(&termios)?;
         if let Some(ms) = latency_ms(path).filter(|&ms| ms > PROMPT_MS) {
             tracing::warn!(
                 "{}: the adapter collects bytes for {ms} ms, so stamps are off by as much; a udev rule ends that: \
@@ -82,17 +76,14 @@ impl Tty {
     pub(crate) fn set_baud(&self, baud: u32) -> io::Result<()> {
         let mut termios = tcgetattr(&self.line)?;
         termios.set_speed(baud)?;
-        tcsetattr(&self.line, OptionalActions::Now, &termios)?;
+        let applied = self.apply(&termios);
         tcflush(&self.line, QueueSelector::IFlush)?;
         // At a wrong rate every byte is an error.
         self.line_errors();
-        match self.rate()? {
-            given if is_near(given, baud) => Ok(()),
-            given => {
-                let refusal = Refusal::Rate { wanted: baud, given };
-                Err(io::Error::new(ErrorKind::Unsupported, refusal.to_string()))
-            }
-        }
+        applied.map_err(|refusal| match refusal {
+            Refusal::Rate { .. } => io::Error::new(ErrorKind::Unsupported, refusal.to_string()),
+            refusal => io::Error::other(refusal.to_string()),
+        })
     }
 
     pub(crate) fn read(&self, buffer: &mut [u8]) -> io::Result<usize> {
@@ -111,9 +102,11 @@ impl Tty {
         }
     }
 
-    /// The rate that the driver made of what it was told.
-    fn rate(&self) -> Result<u32, Errno> {
-        Ok(tcgetattr(&self.line)?.output_speed())
+    /// Tells the driver its settings, and looks which rate it made of the one that was wanted.
+    fn apply(&self, termios: &Termios) -> Result<(), Refusal> {
+        let told = tcsetattr(&self.line, OptionalActions::Now, termios);
+        let given = tcgetattr(&self.line)?.output_speed();
+        judge(told, given, termios.output_speed())
     }
 }
 
@@ -135,6 +128,14 @@ fn hung_up() -> io::Error {
     io::Error::new(ErrorKind::UnexpectedEof, "the line hung up")
 }
 
+/// What a driver that was `told` a rate and has `given` means: some take another, some refuse what they cannot have.
+fn judge(told: Result<(), Errno>, given: u32, wanted: u32) -> Result<(), Refusal> {
+    match told {
+        Ok(()) | Err(Errno::INVAL) if !is_near(given, wanted) => Err(Refusal::Rate { wanted, given }),
+        told => Ok(told?),
+    }
+}
+
 /// Whether a UART at `given` understands one at `wanted`: in the middle of the last bit it may be half a bit off, both
 /// ends together, so 3 % is the most of one of them.
 fn is_near(given: u32, wanted: u32) -> bool {
@@ -153,5 +154,16 @@ mod tests {
         assert!(is_near(500_000, 500_000) && is_near(485_000, 500_000) && is_near(515_000, 500_000));
         // What drivers make of 500 kBd that cannot do it.
         assert!(!is_near(460_800, 500_000) && !is_near(9600, 500_000) && !is_near(0, 500_000));
+    }
+
+    #[test]
+    fn a_rate_that_is_refused_is_not_had_and_a_line_that_is_gone_is_gone() {
+        let no_rate = |given| Err(Refusal::Rate { wanted: 500_000, given });
+        assert_eq!(judge(Ok(()), 500_000, 500_000), Ok(()));
+        assert_eq!(judge(Ok(()), 460_800, 500_000), no_rate(460_800));
+        assert_eq!(judge(Err(Errno::INVAL), 38_400, 500_000), no_rate(38_400));
+        // It has the rate, and cannot have something else.
+        assert_eq!(judge(Err(Errno::INVAL), 500_000, 500_000), Err(Refusal::Other(Errno::INVAL)));
+        assert_eq!(judge(Err(Errno::IO), 38_400, 500_000), Err(Refusal::Dead));
     }
 }
