@@ -156,6 +156,8 @@ impl<R: Say> Outgoing<R> {
 pub(crate) const FORGOTTEN: Nanos = 10 * MILLIS;
 /// Between the end of a byte and the next: more than 55 us, far less than 6 ms (Telegram listing 4.3).
 const GAP: Nanos = 120 * MICROS;
+/// A byte that may leave within so long is asked for at once; a later one is waited for as for anything else.
+pub(crate) const SOON: Nanos = 5 * MILLIS;
 /// ACK or NAK comes within 60 ms (Telegram listing 4.3), and a reply was captured to begin within 100 ms; the rest is
 /// for adapters.
 const ACKNOWLEDGE_TIMEOUT: Nanos = 150 * MILLIS;

@@ -3,6 +3,7 @@
 
 use crate::command::Request;
 use crate::condition::{Condition, Severity};
+use crate::family::Family;
 use crate::notice::Notice;
 use crate::reply::{POWER_ON, Reply};
 use crate::status_report::StatusReport;
@@ -45,6 +46,10 @@ pub enum Trouble {
     VariantRefused,
     /// One second without measured data.
     Silence,
+    /// A pause is wanted, but bytes come, and no answer says that they will end.
+    NotStopped,
+    /// The sensor calls itself a version S14, which scans 90 degrees with as many values as others 180.
+    AnglesUnknown,
     /// The sensor does not tell its measuring mode, so nobody knows where a range ends in its 16 bits.
     ModeUnknown,
 }
@@ -65,6 +70,10 @@ impl fmt::Display for Trouble {
             Trouble::Refused(request) => write!(f, "the sensor refused {request:?}"),
             Trouble::VariantRefused => f.write_str("the sensor keeps its own angle and resolution"),
             Trouble::ModeUnknown => f.write_str("the sensor does not tell its measuring mode: no scans"),
+            Trouble::AnglesUnknown => {
+                f.write_str("the sensor is a version S14, whose angles are not known here: no scans")
+            }
+            Trouble::NotStopped => f.write_str("paused, but the sensor does not stop: cable to the sensor?"),
             Trouble::Silence => f.write_str("no measured data for one second"),
         }
     }
@@ -106,6 +115,11 @@ impl Sensor {
     /// Type, number and firmware as ASCII, such as `LMS200;S18063;V02.19`; empty if it was not asked yet.
     pub fn kind(&self) -> &[u8] {
         &self.kind[..self.kind_len]
+    }
+
+    /// Whether its scans have none of the angles of [`Variant`], although they look so.
+    pub fn has_other_angles(&self) -> bool {
+        Family::of_type(self.kind()) == Some(Family::Fast)
     }
 
     /// Firmware as ASCII, such as `V02.19`; empty if it was not asked yet.

@@ -5,7 +5,7 @@ use lms::{MILLIS, State, Trouble};
 use sim::machine::{Habits, Settings, Start};
 use sim::operating::Operating;
 
-use crate::bench::{Bench, sensor_with};
+use crate::bench::{Bench, WANTED, sensor_with};
 
 /// Sensors with these habits, idle and streaming at each rate, stream as wanted within `limit` ms.
 fn all_stream(habits: Habits, seeds: std::ops::Range<u64>, limit: u64) {
@@ -80,6 +80,23 @@ fn what_is_refused_is_done_without_or_told() {
     bench.machine.set_habits(Habits::default());
     bench.until("streaming", 3_000 * MILLIS, Bench::is_streaming);
     assert_eq!(bench.session.trouble(), None);
+}
+
+#[test]
+fn a_version_s14_streams_but_nobody_knows_its_angles() {
+    for start in [Start::In(Operating::OnRequest), Start::In(Operating::All)] {
+        let type_name = "LMS291;S14063;X01.27 ".into();
+        let (variant, baud) = (Variant::ALL[0], Baud::B500000);
+        let settings = Settings { type_name, variant, baud, start, ..Settings::default() };
+        let wanted = lms::Settings { variant, ..WANTED };
+        let mut bench = Bench::wanting(wanted, sensor_with(settings), 0);
+        bench.until("streaming", 3_000 * MILLIS, Bench::is_streaming);
+        bench.run(1_000 * MILLIS);
+        assert!(bench.is_streaming() && bench.received_scans(0).len() > 60, "{bench}");
+        let mut scans = bench.received.iter().filter(|got| got.telegram[4] == lms::measured::MEASURED);
+        assert!(scans.all(|got| got.mode.is_none()), "{bench}");
+        assert_eq!(bench.session.trouble(), Some(Trouble::AnglesUnknown));
+    }
 }
 
 #[test]
