@@ -111,7 +111,7 @@ impl Machine {
             Some(Write::Configuration(data)) if is_installation => return self.write_configuration(data),
             Some(Write::PowerOn(set @ (PowerOn::Baud9600 | PowerOn::KeepBaud))) if is_installation => {
                 self.eeprom.permanent_baud = (set == PowerOn::KeepBaud).then(|| self.baud());
-                let done = self.reply(eeprom::POWER_ON | REPLY, &[0, set.byte()]);
+                let done = self.reply(eeprom::POWER_ON_RATE | REPLY, &[0, set.byte()]);
                 return answer(&done, self.write_ns(false));
             }
             _ => {}

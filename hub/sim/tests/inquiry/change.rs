@@ -14,7 +14,7 @@ use sim::operating::Operating;
 use crate::bench::{Bench, machine, make_stream, sensor};
 
 /// Asks the sensor what it is; returns the plan to change nothing, and when that was known.
-fn plan(machine: Machine, now: Nanos) -> (Plan, Machine, Nanos) {
+pub(crate) fn plan(machine: Machine, now: Nanos) -> (Plan, Machine, Nanos) {
     let mut bench = Bench::new(Inquiry::new(Baud::B500000, now), Baud::B500000, machine, now);
     bench.finish(20_000 * MILLIS);
     let plan = Plan::of(bench.talk.report()).expect("it told all of it");
@@ -22,17 +22,17 @@ fn plan(machine: Machine, now: Nanos) -> (Plan, Machine, Nanos) {
 }
 
 /// Unit mm, mode 4.
-fn other_values(plan: &mut Plan) {
+pub(crate) fn other_values(plan: &mut Plan) {
     plan.new.set(5, 4);
     plan.new.set(6, Unit::Cm.code());
 }
 
-fn change(plan: Plan, machine: Machine, now: Nanos) -> Bench<Change> {
+pub(crate) fn change(plan: Plan, machine: Machine, now: Nanos) -> Bench<Change> {
     Bench::new(Change::new(Consent::of_a_person(plan), now), plan.baud, machine, now)
 }
 
 /// What the sensor says of itself now.
-fn again(bench: Bench<Change>) -> (Plan, Machine, Nanos) {
+pub(crate) fn again(bench: Bench<Change>) -> (Plan, Machine, Nanos) {
     plan(bench.machine, bench.now)
 }
 
