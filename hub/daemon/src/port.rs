@@ -135,7 +135,7 @@ mod tests {
     use super::*;
     use schema::Kind;
 
-    const NEVER: AtomicBool = AtomicBool::new(false);
+    static NEVER: AtomicBool = AtomicBool::new(false);
 
     fn refused(text: &str) -> Failure {
         let source = Source::parse(text).unwrap();
