@@ -16,8 +16,8 @@ use std::sync::atomic::AtomicBool;
 use schema::Failure;
 
 use crate::config::Source;
-pub(crate) use candidates::is_tty;
 pub use candidates::{Candidate, candidates};
+pub(crate) use candidates::{PROMPT_MS, is_tty, latency_ms};
 pub use holder::{Holder, holder};
 pub(crate) use refusal::Refusal;
 pub(crate) use tcp::Dial;
@@ -135,7 +135,7 @@ mod tests {
     use super::*;
     use schema::Kind;
 
-    const NEVER: AtomicBool = AtomicBool::new(false);
+    static NEVER: AtomicBool = AtomicBool::new(false);
 
     fn refused(text: &str) -> Failure {
         let source = Source::parse(text).unwrap();
