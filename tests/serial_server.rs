@@ -127,8 +127,9 @@ fn a_serial_server_that_is_not_there() {
     let stage = Stage::new();
     // The port was free a moment ago.
     let address = TcpListener::bind("127.0.0.1:0").and_then(|socket| socket.local_addr()).expect("a port");
-    let hub =
-        stage.hub(&[&format!("--link=front=tcp:{address}"), "--link=named=tcp:no-such-host.invalid:4001"]);
+    // A label has 63 letters at the most: nobody is asked for this one.
+    let named = format!("--link=named=tcp:{}:4001", "x".repeat(64));
+    let hub = stage.hub(&[format!("--link=front=tcp:{address}"), named]);
     for (sensor, says) in [("front", "connection refused; nothing listens there"), ("named", "no such host")]
     {
         let said = |info: &Value| info["last_error"].as_str().is_some_and(|error| error.contains(says));
@@ -136,6 +137,25 @@ fn a_serial_server_that_is_not_there() {
         assert_eq!(info["state"], "absent", "{info}");
     }
     assert_eq!(hub.end(TERM).code, Some(0));
+}
+
+#[test]
+fn a_want_of_descriptors_is_not_the_servers_fault() {
+    let stage = Stage::new();
+    let free = TcpListener::bind("127.0.0.1:0").and_then(|socket| socket.local_addr()).expect("a port");
+    let port = format!("tcp:localhost:{}", free.port());
+    for limit in 5..16 {
+        let inner = stage.command(&["probe", &port]);
+        let mut command = std::process::Command::new("sh");
+        command.args(["-c", "ulimit -n \"$0\" && exec \"$@\"", &limit.to_string()]);
+        command.arg(inner.get_program()).args(inner.get_args()).env("SCANHUB_END_WITH_PARENT", "1");
+        let outcome = stage::Program::start(command).wait();
+        match outcome.code {
+            Some(75) => {}
+            Some(4) => assert!(outcome.errors.contains("connection refused"), "{limit}: {outcome}"),
+            _ => panic!("{limit}: {outcome}"),
+        }
+    }
 }
 
 #[test]
