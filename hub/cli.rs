@@ -68,6 +68,7 @@ pub(crate) enum Verb {
     /// What is at the other end of a port; without one, which ports there are
     Probe(probe::Probe),
     /// Change what a sensor keeps for ever, after showing the difference and asking
+    #[command(after_help = configure::CONSENT)]
     Configure(configure::Configure),
     /// Every condition that a working set-up needs, and what to do where one is not met
     Doctor(doctor::Doctor),

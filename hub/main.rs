@@ -4,6 +4,7 @@
 mod cli;
 mod demo;
 
+use std::ffi::c_int;
 use std::fs::File;
 use std::io::{self, Write};
 use std::os::fd::AsFd;
@@ -20,7 +21,7 @@ use daemon::Config;
 use rustix::process::Signal;
 use schema::{Environment, Failure, Kind};
 use serde::Serialize;
-use signal_hook::consts::{SIGINT, SIGTERM};
+use signal_hook::consts::{SIGHUP, SIGINT, SIGQUIT, SIGTERM};
 use tracing::level_filters::LevelFilter;
 
 use cli::{Cli, Everywhere, Verb, Way};
@@ -72,7 +73,9 @@ fn dispatch(cli: &Cli) -> Result<(), Failure> {
             Way::Encode(encode) => daemon::telegram::encode(&encode.options(everywhere.json), &mut out),
         },
         Verb::Probe(probe) => probe.run(everywhere.json, &*interrupt()?),
-        Verb::Configure(configure) => configure.run(everywhere.json, &*interrupt()?),
+        Verb::Configure(configure) => {
+            configure.run(everywhere.json, &*interrupt_by(&[SIGINT, SIGTERM, SIGHUP, SIGQUIT])?)
+        }
         Verb::Doctor(doctor) => doctor.run(everywhere, &*interrupt()?),
         Verb::List { domains: true } => {
             clients::list_domains(&Environment::of_process().bases(), everywhere.json, &mut out)
@@ -185,9 +188,15 @@ fn line(value: &impl Serialize) -> String {
 
 /// A flag that SIGINT and SIGTERM set; either one also ends a wait.
 fn interrupt() -> Result<Arc<AtomicBool>, Failure> {
+    interrupt_by(&[SIGINT, SIGTERM])
+}
+
+/// The same of these signals, none of which ends the process: a change of an EEPROM goes to its end, also when its
+/// terminal is closed.
+fn interrupt_by(signals: &[c_int]) -> Result<Arc<AtomicBool>, Failure> {
     let flag = Arc::new(AtomicBool::new(false));
-    for signal in [SIGINT, SIGTERM] {
-        signal_hook::flag::register(signal, flag.clone()).map_err(no_handler)?;
+    for signal in signals {
+        signal_hook::flag::register(*signal, flag.clone()).map_err(no_handler)?;
     }
     Ok(flag)
 }
@@ -204,9 +213,14 @@ fn say(line: &str) {
 fn report(failure: &Failure, json: bool, quiet: bool) {
     match (json, quiet) {
         (true, false) => say(&clients::error_line(failure)),
-        (true, true) => eprintln!("{}", clients::error_line(failure)),
-        (false, _) => eprintln!("scanhub: {failure}"),
+        (true, true) => complain(&clients::error_line(failure)),
+        (false, _) => complain(&format!("scanhub: {failure}")),
     }
+}
+
+/// Writes one line to stderr, which may be a terminal that is gone.
+fn complain(line: &str) {
+    let _ = io::stderr().lock().write_all(format!("{line}\n").as_bytes());
 }
 
 /// The command line cannot be understood, or asks for help only.

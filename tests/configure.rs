@@ -12,9 +12,10 @@ use std::process::{Child, Stdio};
 use std::thread;
 
 use rustix::fs::{Mode, OFlags};
+use rustix::process::{Pid, Signal, kill_process};
 use rustix::pty::{OpenptFlags, grantpt, openpt, ptsname, unlockpt};
 use serde_json::Value;
-use stage::{INT, Stage, TERM, number};
+use stage::{INT, Stage, TERM, number, until};
 
 /// The program with a person before it: what it asks is read, and answered on a terminal.
 struct Person {
@@ -32,21 +33,15 @@ struct Seen {
 
 impl Person {
     fn start(stage: &Stage, arguments: &[&str]) -> Person {
-        let keys = openpt(OpenptFlags::RDWR | OpenptFlags::NOCTTY | OpenptFlags::CLOEXEC).unwrap();
-        grantpt(&keys).unwrap();
-        unlockpt(&keys).unwrap();
-        let name = ptsname(&keys, Vec::new()).unwrap();
-        let flags = OFlags::RDWR | OFlags::NOCTTY | OFlags::CLOEXEC;
-        let screen: OwnedFd =
-            rustix::fs::open(OsStr::from_bytes(name.as_bytes()), flags, Mode::empty()).unwrap();
+        let (keys, screen) = terminal();
         let mut command = stage.command(&[&["configure"], arguments].concat());
-        command.stdin(Stdio::from(screen)).stdout(Stdio::piped()).stderr(Stdio::piped());
-        Person { process: command.spawn().unwrap(), keys: keys.into() }
+        command.stdin(Stdio::from(screen.try_clone().unwrap()));
+        command.stdout(Stdio::piped()).stderr(Stdio::from(screen));
+        Person { process: command.spawn().unwrap(), keys }
     }
 
     /// Reads until it asks, answers by `act`, and waits for its end.
     fn answer(mut self, act: impl FnOnce(&mut File, u32)) -> Seen {
-        let mut stderr = self.process.stderr.take().unwrap();
         let mut stdout = self.process.stdout.take().unwrap();
         let out = thread::spawn(move || {
             let mut text = String::new();
@@ -54,13 +49,16 @@ impl Person {
         });
         let mut errors = Vec::new();
         let mut byte = [0];
-        while !errors.ends_with(b"Type yes: ") && stderr.read(&mut byte).unwrap() > 0 {
+        // A terminal that nobody has open any more ends by an error.
+        while !errors.ends_with(b"Type yes: ") && self.keys.read(&mut byte).is_ok_and(|len| len > 0) {
             errors.push(byte[0]);
         }
         if errors.ends_with(b"Type yes: ") {
             act(&mut self.keys, self.process.id());
         }
-        stderr.read_to_end(&mut errors).unwrap();
+        while self.keys.read(&mut byte).is_ok_and(|len| len > 0) {
+            errors.push(byte[0]);
+        }
         let code = self.process.wait().unwrap().code();
         Seen { code, out: out.join().unwrap(), errors: String::from_utf8(errors).unwrap() }
     }
@@ -74,6 +72,21 @@ impl Seen {
     fn lines(&self) -> Vec<Value> {
         self.out.lines().map(|line| serde_json::from_str(line).unwrap_or_else(|_| panic!("{line}"))).collect()
     }
+}
+
+/// The person's side of a new terminal, and the program's.
+fn terminal() -> (File, OwnedFd) {
+    let keys = openpt(OpenptFlags::RDWR | OpenptFlags::NOCTTY | OpenptFlags::CLOEXEC).unwrap();
+    grantpt(&keys).unwrap();
+    unlockpt(&keys).unwrap();
+    let name = ptsname(&keys, Vec::new()).unwrap();
+    let flags = OFlags::RDWR | OFlags::NOCTTY | OFlags::CLOEXEC;
+    let screen: OwnedFd = rustix::fs::open(OsStr::from_bytes(name.as_bytes()), flags, Mode::empty()).unwrap();
+    (keys.into(), screen)
+}
+
+fn signal(pid: u32, signal: Signal) {
+    kill_process(Pid::from_raw(pid as i32).unwrap(), signal).unwrap();
 }
 
 fn probe(stage: &Stage, port: &str) -> Value {
@@ -99,6 +112,9 @@ fn a_person_says_yes_and_it_is_written_once() {
         "{configured}"
     );
     assert_eq!(configured["before"], before["configuration"]);
+    // Stdout is a pipe: who is asked sees it on the terminal.
+    let shown = seen.errors.split("Type yes").next().unwrap();
+    assert!(shown.contains("unit: 01h (1 mm) -> 00h (10 mm)"), "{}", seen.errors);
     let after = probe(&stage, "front");
     assert_eq!(configured["after"], after["configuration"]);
     assert_eq!((number(&after, "unit_mm"), number(&after, "mode")), (10, 4), "{after}");
@@ -131,8 +147,7 @@ fn everything_else_than_yes_writes_nothing() {
         assert!(seen.errors.contains("nothing was written"), "{}", seen.errors);
     }
     let seen = Person::start(&stage, &[&port, "unit=cm"]).answer(|_, pid| {
-        let pid = rustix::process::Pid::from_raw(pid as i32).unwrap();
-        rustix::process::kill_process(pid, INT).unwrap();
+        signal(pid, INT);
     });
     assert_eq!(seen.code, Some(130), "{}", seen.errors);
     // No terminal, no person: the difference is shown all the same.
@@ -140,6 +155,13 @@ fn everything_else_than_yes_writes_nothing() {
     assert_eq!(outcome.code, Some(2), "{outcome}");
     assert_eq!(outcome.of_class("difference").len(), 1, "{outcome}");
     assert_eq!(outcome.of_class("error")[0]["kind"], "usage", "{outcome}");
+    // Nor is one asked who cannot see the question.
+    let (_keys, screen) = terminal();
+    let mut unseen = stage.command(&["configure", &port, "unit=cm"]);
+    unseen.stdin(Stdio::from(screen)).stdout(Stdio::null()).stderr(Stdio::null());
+    let mut process = unseen.spawn().unwrap();
+    until("it does not ask", || process.try_wait().unwrap().is_some());
+    assert_eq!(process.wait().unwrap().code(), Some(2));
     assert_eq!(number(&probe(&stage, "front"), "unit_mm"), 1);
     assert_eq!(simulator.end(TERM).code, Some(0));
     assert_eq!(stage.simulated("front").1, 0);
@@ -190,8 +212,33 @@ fn a_stream_that_was_found_goes_on() {
     assert_eq!(seen.code, Some(0), "{}", seen.errors);
     assert!(seen.out.contains("now at: all values, continuously"), "{}", seen.out);
     let sent = stage.truth("front").len();
-    stage::until("it streams on", || stage.truth("front").len() > sent + 20);
+    until("it streams on", || stage.truth("front").len() > sent + 20);
     assert_eq!(number(&probe(&stage, "front"), "availability"), 1);
     assert_eq!(simulator.end(TERM).code, Some(0));
     assert_eq!(stage.simulated("front").1, 1);
+}
+
+#[test]
+fn what_was_begun_goes_to_its_end() {
+    let stage = Stage::new();
+    let simulator = stage.simulator(&["front"], &["--baud=38400"]);
+    let port = stage.word("front");
+    let signals = [(Signal::HUP, "unit=cm", 10), (Signal::QUIT, "unit=mm", 1), (TERM, "unit=cm", 10)];
+    for (sent, setting, unit_mm) in signals {
+        let seen = Person::start(&stage, &[&port, setting, "--json"]).answer(|keys, pid| {
+            let before = stage.truth("front").len();
+            keys.write_all(b"yes\n").unwrap();
+            until("it has begun", || stage.truth("front").len() > before);
+            if sent == Signal::HUP {
+                // The terminal is closed, too.
+                *keys = File::open("/dev/null").unwrap();
+            }
+            signal(pid, sent);
+        });
+        assert_eq!(seen.code, Some(0), "{sent:?}: {}", seen.errors);
+        assert_eq!(seen.lines().last().unwrap()["written"], true, "{sent:?}: {}", seen.out);
+        assert_eq!(number(&probe(&stage, "front"), "unit_mm"), unit_mm, "{sent:?}");
+    }
+    assert_eq!(simulator.end(TERM).code, Some(0));
+    assert_eq!(stage.simulated("front").1, 3);
 }

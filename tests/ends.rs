@@ -6,7 +6,6 @@ use std::fs::{self, File};
 use std::io::{BufRead, BufReader};
 use std::os::unix::fs::symlink;
 use std::process::Stdio;
-use std::time::{Duration, Instant};
 
 use rustix::pipe::{PipeFlags, pipe_with};
 use serde_json::Value;
@@ -28,10 +27,7 @@ fn a_hub_ends_by_both_signals_and_leaves_nothing() {
         let mut consumer = stage.echo(&["front/scan"]);
         consumer.await_lines(3, "a scan", is_class("scan"));
         assert!(!stage.left_behind().is_empty(), "looked at the wrong place");
-        let begun = Instant::now();
         assert_eq!(hub.end(signal).code, Some(0), "{signal:?}");
-        // Promised is a second; the machine may have other things to do.
-        assert!(begun.elapsed() < Duration::from_secs(3), "{signal:?}: {:?}", begun.elapsed());
         // Once the consumer has gone too.
         assert_eq!(consumer.end(INT).code, Some(0));
         until("shared memory is free", || stage.left_behind().is_empty());

@@ -73,12 +73,18 @@ fn a_hub_that_runs_out_of_them_serves_on_whom_it_serves() {
     let mut served = stage.echo(&["front/scan", "front/status"]);
     served.await_lines(20, "a scan", is_class("scan"));
     let others: Vec<_> = (0..16).map(|_| stage.start(&["echo", "--json", "front/scan"])).collect();
+    // Who is attached also ends by a signal as it should.
+    until("all are attached", || stage.subscribers("front/scan") == 17);
     let tells = |line: &serde_json::Value| {
         line["class"] == "status"
             && line["last_error"].as_str().is_some_and(|error| error.contains("attached but get nothing"))
     };
     served.await_line("that others get nothing", tells);
     served.await_lines(20, "a scan", is_class("scan"));
+    let asked = stage.run(&["control", "front", "resync", "--json"]);
+    let error = &asked.of_class("error")[0];
+    assert_eq!((asked.code, &error["kind"]), (Some(3), &"timeout".into()), "{asked}");
+    assert_eq!(error["message"], "the hub did not answer for front in 5 s");
     for other in others {
         assert_eq!(other.end(INT).code, Some(0));
     }
@@ -93,4 +99,5 @@ fn a_hub_that_runs_out_of_them_serves_on_whom_it_serves() {
     let outcome = hub.end(TERM);
     assert_eq!(outcome.code, Some(0), "{outcome}");
     assert!(outcome.errors.contains("attached but get nothing"), "{outcome}");
+    assert!(outcome.errors.contains("a request was not received: descriptors are short: "), "{outcome}");
 }

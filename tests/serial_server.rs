@@ -127,9 +127,10 @@ fn a_serial_server_that_is_not_there() {
     let stage = Stage::new();
     // The port was free a moment ago.
     let address = TcpListener::bind("127.0.0.1:0").and_then(|socket| socket.local_addr()).expect("a port");
-    // A label has 63 letters at the most: nobody is asked for this one.
-    let named = format!("--link=named=tcp:{}:4001", "x".repeat(64));
-    let hub = stage.hub(&[format!("--link=front=tcp:{address}"), named]);
+    // Too long for a name: nobody is asked for it.
+    let nowhere = "x".repeat(64);
+    let hub =
+        stage.hub(&[&format!("--link=front=tcp:{address}"), &format!("--link=named=tcp:{nowhere}:4001")]);
     for (sensor, says) in [("front", "connection refused; nothing listens there"), ("named", "no such host")]
     {
         let said = |info: &Value| info["last_error"].as_str().is_some_and(|error| error.contains(says));

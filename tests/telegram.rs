@@ -164,13 +164,22 @@ fn text_and_bytes_are_the_same() {
     assert!(text(&of_text.stdout).starts_with(expected), "{}", text(&of_text.stdout));
     let one = &lines(&telegram(&["encode", "power-on", "keep", "--address", "3", "--json"], &[]))[0];
     let keys: Vec<_> = one.as_object().expect("an object").keys().cloned().collect();
-    let mut expected = ["class", "length", "address", "command", "writes_eeprom", "words", "raw"];
+    let mut expected = ["class", "length", "from", "address", "command", "writes_eeprom", "words", "raw"];
     expected.sort_unstable();
     assert_eq!(keys, expected);
     assert_eq!(
-        (&one["address"], &one["command"], &one["writes_eeprom"]),
-        (&3.into(), &0x66.into(), &true.into())
+        (&one["from"], &one["address"], &one["command"], &one["writes_eeprom"]),
+        (&"host".into(), &3.into(), &0x66.into(), &true.into())
     );
+    // Said and understood, an address is the same.
+    let words = ["reply", "mode", "ok", "--address", "5"];
+    let said = &lines(&telegram(&[&["encode", "--json"], &words[..]].concat(), &[]))[0];
+    let bytes = telegram(&[&["encode", "--raw"], &words[..]].concat(), &[]).stdout;
+    let understood = &lines(&telegram(&["decode", "--json"], &bytes))[0];
+    assert_eq!((&said["from"], &said["address"]), (&"sensor".into(), &5.into()));
+    for key in ["from", "address", "command", "length", "words", "raw"] {
+        assert_eq!(said[key], understood[key], "{key}");
+    }
 }
 
 #[test]
@@ -218,6 +227,13 @@ fn refusals_have_a_remedy() {
         (&["encode", "install", "secret"], 78, "8, such as SICK_LMS"),
         (&["encode", "status", "--address", "200"], 78, "1 to 127"),
         (&["encode", "configuration2", "zz"], 78, "pairs of digits"),
+        (&["encode", "stop", "--status", "0x10"], 78, "only a reply has a status byte"),
+        (&["encode", "mode", "range-segments"], 78, "pairs of digits"),
+        (&["encode", "field-set"], 78, "pairs of digits"),
+        (&["encode", "field", ""], 78, "pairs of digits"),
+        (&["encode", "write-field"], 78, "pairs of digits"),
+        (&["encode", "write-password"], 78, "pairs of digits"),
+        (&["encode", "teach"], 78, "pairs of digits"),
         (&["encode"], 2, "NAME"),
         (&["decode", "/nowhere/at/all"], 78, "/nowhere/at/all: No such file"),
         (&["decode", "--mode", "x"], 78, "is no number"),

@@ -74,11 +74,17 @@ struct Counted {
 }
 
 fn count_scans(domain: &str, sensor: &str, all: &Barrier, seconds: u64) -> Outcome<Counted> {
-    let mut scans = attach::<Scan>(domain, sensor)?.timeout(LONG);
     let last =
         |scan: Option<clients::Received<Scan>>| Ok::<_, &str>(scan.ok_or("nothing came")?.header().topic_seq);
-    last(scans.next()?)?;
+    let attached = || -> Outcome<_> {
+        let mut scans = attach::<Scan>(domain, sensor)?.timeout(LONG);
+        last(scans.next()?)?;
+        Ok(scans)
+    };
+    let attached = attached();
+    // One that cannot come is not waited for by the others.
     all.wait();
+    let mut scans = attached?;
     // What queued up while the others came is none of the count.
     while scans.try_next()?.is_some() {}
     let first = last(scans.next()?)?;

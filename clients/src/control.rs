@@ -30,7 +30,8 @@ pub struct ControlOptions {
 ///
 /// [`Kind::NoHub`] within a second if there is none, or if it ends before it answers; [`Kind::NoTopic`] with the sensors
 /// that there are; [`Kind::Short`] if too much is asked at a time; [`Kind::Failed`] if the link cannot do it;
-/// [`Kind::Timeout`] if the link does not take it; [`Kind::Interrupted`] if `stop` is set.
+/// [`Kind::Timeout`] if the hub does not answer: it is short of something, or the link is busy;
+/// [`Kind::Interrupted`] if `stop` is set.
 pub fn control(options: &ControlOptions, out: &mut dyn Write, stop: &AtomicBool) -> Result<(), Failure> {
     let ControlOptions { sensor, verb, .. } = options;
     check_sensor(sensor)?;
@@ -77,8 +78,13 @@ fn ask(client: &ControlClient, domain: &Domain, request: &Request, stop: &Atomic
             return Err(Failure::new(Kind::Interrupted, "interrupted before the hub answered", ""));
         }
         if Instant::now() >= give_up_at {
-            let message = format!("{} did not take it within {} s", request.sensor(), PATIENCE.as_secs());
-            return Err(Failure::new(Kind::Timeout, message, "`scanhub info` shows why"));
+            let message =
+                format!("the hub did not answer for {} in {} s", request.sensor(), PATIENCE.as_secs());
+            let hint = format!(
+                "its log tells if it is short of something; `scanhub info {}` how it is",
+                request.sensor()
+            );
+            return Err(Failure::new(Kind::Timeout, message, hint));
         }
         ipc::sleep(&[client.responses()], LOOK_EVERY)?;
     }

@@ -1,5 +1,6 @@
 //! `scanhub configure` on the command line: what it takes, and what it says.
 
+use std::io::{IsTerminal, stderr, stdout};
 use std::sync::atomic::AtomicBool;
 
 use clap::Args;
@@ -23,6 +24,10 @@ pub(crate) struct Configure {
     password: String,
 }
 
+/// What the help says of who is asked.
+pub(crate) const CONSENT: &str = "A person has to confirm it: where stdin or stderr is no terminal, the difference is \
+                                  shown, nothing is written, and the exit code is 2";
+
 impl Configure {
     pub(crate) fn run(&self, json: bool, stop: &AtomicBool) -> Result<(), Failure> {
         let order = Order {
@@ -38,6 +43,10 @@ impl Configure {
             News::Difference(difference) => {
                 progress.clear();
                 crate::say(&if json { crate::line(difference) } else { difference.to_string() });
+                // Whoever is asked has to see it, wherever stdout leads.
+                if !stdout().is_terminal() && stderr().is_terminal() {
+                    crate::complain(&difference.to_string());
+                }
             }
             News::Configured(configured) => {
                 progress.clear();

@@ -2,9 +2,11 @@
 //! promises segments without allocating them, so that at a full /dev/shm the first touch ends the process by SIGBUS;
 //! of anything else that is short it says no more than "internal error". Refuses to know for what something is needed.
 
+use std::io;
 use std::path::Path;
 
-use rustix::fs::statvfs;
+use rustix::fs::{StatVfs, statvfs};
+use rustix::io::Errno;
 use rustix::process::{Resource, getrlimit};
 
 use crate::{Failure, Kind};
@@ -34,10 +36,10 @@ pub fn check_memory(needed: u64) -> Result<(), Failure> {
 /// [`Kind::Short`] with the limit and what is needed.
 pub fn check_descriptors(needed: u64) -> Result<(), Failure> {
     let limit = getrlimit(Resource::Nofile).current.unwrap_or(u64::MAX);
-    // To list them needs one too.
-    let open = match std::fs::read_dir("/proc/self/fd") {
+    let open = match std::fs::read_dir(OPEN) {
+        // To list them needs one too.
         Ok(entries) => entries.count() as u64 - 1,
-        Err(_) => limit,
+        Err(error) => without_list(&error, limit),
     };
     if limit.saturating_sub(open) >= needed {
         return Ok(());
@@ -78,15 +80,32 @@ pub(crate) fn found(root: &Path) -> Option<Failure> {
         .err()
 }
 
+/// How many descriptors are open, of at most `limit`, where `error` came instead of their list. None that would be in
+/// the way if only the list is not there: not every container has /proc.
+fn without_list(error: &io::Error, limit: u64) -> u64 {
+    match Errno::from_io_error(error) {
+        Some(Errno::MFILE | Errno::NFILE) => limit,
+        _ => 0,
+    }
+}
+
 /// What is free at `place` and what is needed, if that is more.
 fn check_place(place: &Path, needed: u64) -> Result<(), String> {
     let Ok(stat) = statvfs(place) else { return Ok(()) };
-    let free = stat.f_bavail * stat.f_frsize;
+    let free = free(&stat);
     if free >= needed {
         return Ok(());
     }
     Err(format!("{} kB free, {} kB needed", free / 1024, needed.div_ceil(1024)))
 }
+
+/// Bytes that are free in a file system; one that counts no blocks, as a tmpfs without a size, has no limit.
+fn free(stat: &StatVfs) -> u64 {
+    if stat.f_blocks == 0 { u64::MAX } else { stat.f_bavail * stat.f_frsize }
+}
+
+/// The list of the own open descriptors.
+const OPEN: &str = "/proc/self/fd";
 
 #[cfg(test)]
 mod tests {
@@ -101,5 +120,25 @@ mod tests {
         let descriptors = check_descriptors(1 << 60).unwrap_err();
         assert_eq!(descriptors.kind, Kind::Short);
         assert!(descriptors.message.contains(&format!("{} more needed", 1_u64 << 60)), "{descriptors}");
+    }
+
+    #[test]
+    fn a_file_system_without_a_size_is_not_full() {
+        let mut stat = statvfs(SHARED_MEMORY).unwrap();
+        (stat.f_frsize, stat.f_blocks, stat.f_bavail) = (4096, 100, 0);
+        assert_eq!(free(&stat), 0);
+        stat.f_bavail = 10;
+        assert_eq!(free(&stat), 40_960);
+        (stat.f_blocks, stat.f_bavail) = (0, 0);
+        assert_eq!(free(&stat), u64::MAX);
+    }
+
+    #[test]
+    fn a_machine_without_proc_is_not_short() {
+        for (error, open) in
+            [(Errno::MFILE, 1000), (Errno::NFILE, 1000), (Errno::NOENT, 0), (Errno::ACCESS, 0)]
+        {
+            assert_eq!(without_list(&error.into(), 1000), open, "{error}");
+        }
     }
 }

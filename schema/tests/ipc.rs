@@ -232,7 +232,7 @@ fn a_request_is_answered_and_both_are_woken() {
 }
 
 #[test]
-fn clients_that_died_while_they_asked_are_no_obstacle() {
+fn clients_that_went_while_they_asked_are_no_obstacle() {
     let place = Place::new();
     let hub = ipc::hub_node(&place.domain).unwrap();
     assert!(ipc::ControlClient::open(&hub).unwrap().is_none());

@@ -9,7 +9,7 @@ use lms::{Control, Session};
 use rustix::event::{EventfdFlags, eventfd};
 use rustix::io::Errno;
 use schema::ipc::{self, Asked, ControlServer, Node};
-use schema::{Failure, Kind, Response, Verb};
+use schema::{Failure, Kind, Response, Verb, shortage};
 
 use crate::clock;
 
@@ -89,12 +89,20 @@ impl Desk {
             }
         }
         self.open.retain(|(_, asked)| asked.is_waited_for());
+        let mut unheard = ipc::take_wakeups(&[self.server.requests()]).is_ok_and(|rang| rang);
         loop {
             match self.server.receive() {
-                Ok(Some(asked)) => self.hand_on(asked),
-                Ok(None) => return,
+                Ok(Some(asked)) => {
+                    unheard = false;
+                    self.hand_on(asked);
+                }
+                Ok(None) => break,
                 Err(failure) => return tracing::warn!(%failure, "a request was not received"),
             }
+        }
+        // The library leaves out a client that it has no descriptors for.
+        if unheard && let Err(failure) = shortage::check_descriptors(CLIENT_DESCRIPTORS) {
+            tracing::warn!("a request was not received: {}; {}", failure.message, failure.hint);
         }
     }
 
@@ -222,5 +230,7 @@ impl Bell {
     }
 }
 
+/// Descriptors of the connection to a client: both directions, and the memory of its requests.
+const CLIENT_DESCRIPTORS: u64 = 4;
 /// Requests that wait for a link; whoever asks faster is told to come back.
 const QUEUE: usize = 4;

@@ -91,12 +91,12 @@ fn keep_up(
     loop {
         let [requests, outcomes] = desk.descriptors().map(|fd| PollFd::from_borrowed_fd(fd, PollFlags::IN));
         let mut fds = [PollFd::new(signals, PollFlags::IN), requests, outcomes];
-        let woken = poll(&mut fds, Some(&LOOK)).map(|_| fds.map(|fd| !fd.revents().is_empty()));
-        match woken {
-            Ok([true, ..]) => return Ok(()),
-            Ok([_, false, false]) | Err(_) => {}
-            Ok(_) => desk.serve(),
+        let woken = poll(&mut fds, Some(&LOOK)).map(|_| !fds[0].revents().is_empty());
+        if woken == Ok(true) {
+            return Ok(());
         }
+        // Without a wake-up too: what is behind a request that could not be received has been announced already.
+        desk.serve();
         if !is_alive() {
             return Err(broken_thread());
         }

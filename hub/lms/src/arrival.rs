@@ -47,9 +47,10 @@ impl Arrivals {
     /// A telegram in pieces of 16 bytes, twice.
     const CAPACITY: usize = 128;
 
-    pub(crate) fn new() -> Self {
+    /// Nothing that arrives is older than `now`.
+    pub(crate) fn new(now: Nanos) -> Self {
         let reads = [Read::default(); Arrivals::CAPACITY];
-        Arrivals { reads, next: 0, total: 0, last_look: 0, backlog: None }
+        Arrivals { reads, next: 0, total: 0, last_look: now, backlog: None }
     }
 
     /// A read at `now` brought `len` bytes, of a line of `pace` bits per second if it was one.
@@ -184,7 +185,7 @@ mod tests {
 
     #[test]
     fn a_stamp_knows_what_came_behind_it() {
-        let mut arrivals = Arrivals::new();
+        let mut arrivals = Arrivals::new(0);
         arrivals.note(1_000_000, 16, Some(500_000));
         arrivals.note(11_000_000, 484, Some(500_000));
         assert_eq!(arrivals.stamp(0, 500_000), Stamp { at: 1_000_000 - 15 * 20_000, estimated: false });
@@ -206,7 +207,7 @@ mod tests {
 
     #[test]
     fn what_waited_while_the_host_did_not_run_is_not_new() {
-        let mut arrivals = Arrivals::new();
+        let mut arrivals = Arrivals::new(0);
         arrivals.note(1_000 * MILLIS, 16, Some(500_000));
         // Two seconds later, as fast as they can be read; then as they come.
         for read in 0..4 {
@@ -229,6 +230,14 @@ mod tests {
         arrivals.note(5_762 * MILLIS, 730, Some(9600));
         let stamp = arrivals.stamp(8_110 + 729, 9600);
         assert!(stamp.at > 5_760 * MILLIS && !stamp.estimated, "{stamp:?}");
+    }
+
+    #[test]
+    fn what_comes_with_the_first_look_is_no_older_than_the_session() {
+        let mut arrivals = Arrivals::new(9_000 * MILLIS);
+        arrivals.note(9_010 * MILLIS, 400, Some(500_000));
+        let at = 9_010 * MILLIS - 399 * 20_000;
+        assert_eq!(arrivals.stamp(0, 500_000), Stamp { at, estimated: true });
     }
 
     #[test]

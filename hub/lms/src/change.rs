@@ -1,6 +1,7 @@
-//! Changes what a sensor keeps for ever. It looks whether the sensor still keeps what it did, goes into installation mode, writes, leaves it again, reads back what is in
-//! force now, and brings back the operating mode in which the sensor was. Whatever goes wrong on the way, it tries to
-//! leave the installation mode, and says in the end what it knows of the sensor's state.
+//! Changes what a sensor keeps for ever. It looks whether the sensor still keeps what it did, goes into installation
+//! mode, writes, leaves it again, reads back what is in force now, and brings back the operating mode in which the
+//! sensor was. Whatever goes wrong on the way, it tries to leave the installation mode, and says in the end what it
+//! knows of the sensor's state.
 //!
 //! The only code that sends a request of [`crate::eeprom`], and it needs [`Consent`]. A write that was not acknowledged
 //! is not simply said again: first the configuration tells whether it was done.
@@ -14,7 +15,7 @@ use crate::exchange::{Conversation, Exchange, Heard, Output};
 use crate::framer::Place;
 use crate::operating::{ON_REQUEST, Operating, PARTIAL, STREAM};
 use crate::outgoing::{MODE_TIMEOUT, Say};
-use crate::phase::TRIES;
+use crate::phase::{MORE_TRIES, TRIES};
 use crate::reply::Reply;
 use crate::telegram::Encoded;
 use crate::{MILLIS, command};
@@ -28,6 +29,8 @@ pub struct Change {
     step: Step,
     /// How often more the configuration may be written.
     writes_left: u8,
+    /// The sensor sends nothing unasked. Before that the rest of a scan may look like a NAK.
+    is_quiet: bool,
     outcome: Outcome,
 }
 
@@ -74,7 +77,7 @@ pub struct Outcome {
 /// How a step failed.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Failing {
-    /// No reply.
+    /// No reply, or none that can be read.
     Unanswered,
     /// The sensor said no; to [`Step::Enter`]: the password is wrong.
     Refused,
@@ -142,8 +145,8 @@ impl Change {
         let plan = consent.into_plan();
         let mut exchange = Exchange::new(plan.baud, now);
         exchange.address = plan.address;
-        let mut change =
-            Change { plan, exchange, step: Step::Compare, writes_left: TRIES, outcome: Outcome::default() };
+        let (step, outcome) = (Step::Compare, Outcome::default());
+        let mut change = Change { plan, exchange, step, writes_left: TRIES, is_quiet: false, outcome };
         change.begin(Step::Compare);
         change
     }
@@ -171,9 +174,13 @@ impl Change {
             Step::Write => once(Saying::Keep(plan.new)),
             Step::Compare | Step::Check | Step::ReadBack => ask(Request::Configuration),
             Step::PowerOn => plan.power_on.map(Saying::PowerOn).and_then(once),
-            Step::Leave => ask(Request::Stop),
+            Step::Leave => Some((Saying::Ask(Request::Stop), MORE_TRIES)),
             Step::ReadStatus if plan.power_on.is_none() => None,
             Step::ReadStatus => ask(Request::Status),
+            // It may still be in installation mode.
+            Step::Restore if self.outcome.operating_mode.is_none() => {
+                Some((Saying::Ask(Request::Stop), MORE_TRIES))
+            }
             Step::Restore => match plan.operating_mode {
                 STREAM => ask(Request::Stream),
                 PARTIAL => ask(Request::Operate(Operating::Partial)),
@@ -201,11 +208,13 @@ impl Change {
             _ => None,
         };
         let done = match &reply {
-            Some(Reply::Mode { done } | Reply::ConfigurationWritten { done, .. }) => *done,
+            Some(Reply::Mode { done } | Reply::ConfigurationWritten { done, .. }) => Some(*done),
             // What its first byte says is told in no two ways alike: the status tells it afterwards.
-            Some(Reply::PowerOnSet { .. } | Reply::Status(_) | Reply::Configuration(_)) => true,
-            _ => false,
+            Some(Reply::PowerOnSet { .. } | Reply::Status(_) | Reply::Configuration(_)) => Some(true),
+            Some(Reply::Refused) => Some(false),
+            _ => None,
         };
+        let is_changed = matches!(reply, Some(Reply::Mode { done: true }));
         let permanent = match &reply {
             Some(Reply::Status(status)) => Some(status.has_permanent_baud()),
             _ => None,
@@ -214,8 +223,12 @@ impl Change {
         if self.exchange.answered(command).is_none() {
             return;
         }
+        self.is_quiet |= is_changed;
         match self.step {
-            _ if !done => self.fail(Failing::Refused),
+            _ if done == Some(false) => self.fail(Failing::Refused),
+            // An answer that cannot be read says no more than none.
+            Step::Write if done.is_none() => self.ask_what_is_kept(),
+            _ if done.is_none() => self.fail(Failing::Unanswered),
             Step::Compare if kept != Some(self.plan.old) => self.fail(Failing::Differs),
             Step::Check if kept == Some(self.plan.new) => self.begin(Step::PowerOn),
             Step::Check if self.writes_left > 0 => self.begin(Step::Write),
@@ -242,6 +255,10 @@ impl Change {
                 }
                 self.begin(Step::Restore);
             }
+            Step::Restore if self.outcome.operating_mode.is_none() => {
+                self.outcome.operating_mode = Some(ON_REQUEST);
+                self.begin(Step::Restore);
+            }
             Step::Restore => {
                 self.outcome.operating_mode = Some(self.plan.operating_mode);
                 self.begin(Step::Done);
@@ -255,12 +272,14 @@ impl Change {
             return;
         }
         match self.step {
-            Step::Write => {
-                self.writes_left = self.writes_left.saturating_sub(1);
-                self.begin(Step::Check);
-            }
+            Step::Write => self.ask_what_is_kept(),
             _ => self.fail(Failing::Unanswered),
         }
+    }
+
+    fn ask_what_is_kept(&mut self) {
+        self.writes_left = self.writes_left.saturating_sub(1);
+        self.begin(Step::Check);
     }
 
     fn fail(&mut self, failing: Failing) {
@@ -307,6 +326,8 @@ impl Conversation for Change {
         while let Some(heard) = self.exchange.advance() {
             match heard {
                 Heard::Telegram(place) => self.on_telegram(place),
+                // While it may be writing, only time says no: noise is not worth a second write.
+                Heard::Nak if !self.is_quiet || matches!(self.step, Step::Write | Step::PowerOn) => {}
                 Heard::Nak => {
                     if self.exchange.refused_checksum() == Some(false) {
                         self.on_silence();

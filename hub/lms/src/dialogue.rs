@@ -1,5 +1,5 @@
 //! The conversation with the sensor: what came and what did not, and what follows from it. How a sensor is found is
-//! in [`crate::search`], how it is brought to a stream in [`crate::start`]. Knows telegrams and deadlines, no bytes
+//! in [`crate::search`], how it is brought to a stream in [`crate::start`], and to rest in [`crate::pause`]. Knows telegrams and deadlines, no bytes
 //! and no port. It never says anything that outlives a power cycle.
 
 use crate::Nanos;
@@ -8,8 +8,8 @@ use crate::header::{Expect, StreamHeader, is_data};
 use crate::measured::Measured;
 use crate::outgoing::{FORGOTTEN, NAK_PAUSE, Outgoing};
 use crate::phase::{
-    BESIDE_VALUES, Control, OVERLOOKED, PAUSE, Phase, Progress, QUESTION_PAUSE, QUESTION_ROUNDS, QUESTIONS,
-    Reason, SILENCE, STOPS, Settings, Step, TRIES,
+    BESIDE_VALUES, OVERLOOKED, PAUSE, Phase, Progress, QUESTION_PAUSE, QUESTION_ROUNDS, QUESTIONS, Reason,
+    SILENCE, Settings, Step,
 };
 use crate::reply::{POWER_ON, Reply};
 use crate::sensor::{Sensor, State, Trouble};
@@ -24,7 +24,12 @@ pub(crate) struct Dialogue {
     change_baud: Option<Baud>,
     pub(crate) baud: Baud,
     pub(crate) sensor: Sensor,
+    /// What is in the way now; [`Dialogue::trouble`] is what is shown.
     pub(crate) trouble: Option<Trouble>,
+    /// A user wants nothing of the sensor.
+    pub(crate) is_paused: bool,
+    /// The sensor keeps another variant than the wanted one.
+    pub(crate) variant_refused: bool,
     pub(crate) resyncs: u64,
     /// Bytes came since the last round of the search began.
     pub(crate) heard: bool,
@@ -42,6 +47,8 @@ impl Dialogue {
             baud: settings.baud,
             sensor: Sensor::default(),
             trouble: None,
+            is_paused: false,
+            variant_refused: false,
             resyncs: 0,
             heard: false,
             quiet_since: now,
@@ -54,6 +61,7 @@ impl Dialogue {
 
     pub(crate) fn state(&self) -> State {
         match self.phase {
+            _ if self.is_paused => State::Paused,
             Phase::Listening { shown, .. } => shown,
             Phase::Probing { .. } => State::Probing,
             Phase::Starting { .. } if self.baud != self.settings.baud => State::Switching,
@@ -61,6 +69,16 @@ impl Dialogue {
             Phase::Streaming { .. } | Phase::Following => State::Streaming,
             Phase::Paused { .. } => State::Paused,
         }
+    }
+
+    /// What is in the way, and else what stays so. It is in nobody's way during a pause.
+    pub(crate) fn trouble(&self) -> Option<Trouble> {
+        if self.is_paused {
+            return self.trouble;
+        }
+        let has_other_angles = self.sensor.has_other_angles().then_some(Trouble::AnglesUnknown);
+        let variant_refused = self.variant_refused.then_some(Trouble::VariantRefused);
+        self.trouble.or(has_other_angles).or(variant_refused)
     }
 
     /// The rate to set on the port now.
@@ -108,29 +126,13 @@ impl Dialogue {
             Phase::Streaming { silent_at, .. } if now >= silent_at => {
                 self.resyncs += 1;
                 self.trouble = Some(Trouble::Silence);
+                self.sensor.forget();
                 return self.listen(now, State::Silent);
             }
             _ => {}
         }
         if self.open.as_ref().is_some_and(|open| now >= open.give_up_at()) {
             self.retry(now);
-        }
-    }
-
-    pub(crate) fn control(&mut self, control: Control, now: Nanos) {
-        match (control, self.phase) {
-            (_, Phase::Following) | (Control::Pause, Phase::Paused { .. }) => {}
-            (Control::Pause, _) => {
-                self.phase = Phase::Paused { stops_left: STOPS };
-                self.trouble = None;
-                self.ask(Request::Stop, now, TRIES);
-            }
-            (Control::Resume, Phase::Paused { .. }) => self.begin(now),
-            (Control::Resync, _) => {
-                self.resyncs += 1;
-                self.begin(now);
-            }
-            (Control::Resume, _) => {}
         }
     }
 
@@ -186,13 +188,12 @@ impl Dialogue {
                 }
             }
             Phase::Following => return,
-            Phase::Paused { stops_left: 0 } => {}
-            Phase::Paused { ref mut stops_left } => {
+            Phase::Paused { .. } => {
                 if self.open.is_none() {
-                    *stops_left -= 1;
-                    self.ask(Request::Stop, now, TRIES);
+                    self.stop_again(now);
                 }
             }
+            Phase::Listening { .. } | Phase::Probing { .. } if self.is_paused => self.stop(now),
             Phase::Listening { shown: State::Starting, .. } if measured.is_some() => {
                 self.stream(telegram, measured, now);
             }
@@ -219,7 +220,8 @@ impl Dialogue {
     /// The sensor was without power, or was reset: whatever it was set to is gone, and it is there at this rate.
     fn on_power_on(&mut self, now: Nanos) {
         match self.phase {
-            Phase::Following | Phase::Paused { .. } => {}
+            Phase::Following => {}
+            _ if self.is_paused => self.come_to_rest(),
             phase => {
                 self.resyncs += u64::from(matches!(phase, Phase::Streaming { .. }));
                 self.enter(Step::Check, Progress::BEGIN, now);
@@ -228,10 +230,13 @@ impl Dialogue {
     }
 
     fn on_reply(&mut self, request: Request, reply: Option<Reply<'_>>, now: Nanos) {
+        // Whoever does not tell what it does may be doing anything: it is stopped, but not for ever.
+        self.sensor.streams |= request == Request::Status && !matches!(reply, Some(Reply::Status(_)));
         match self.phase {
+            Phase::Probing { .. } if self.is_paused => self.stop(now),
             Phase::Probing { .. } => self.proceed(Progress::BEGIN, now),
             Phase::Starting { step, progress } => self.on_step(step, progress, request, reply, now),
-            Phase::Paused { .. } => self.sensor.streams = false,
+            Phase::Paused { .. } => self.on_stopped(reply, now),
             Phase::Streaming { .. } | Phase::Listening { .. } | Phase::Following => {}
         }
     }
@@ -249,7 +254,8 @@ impl Dialogue {
         match self.phase {
             Phase::Probing { attempt } => self.search_on(attempt, at),
             Phase::Starting { step, progress } => self.on_no_reply(step, progress, request, heard, at),
-            Phase::Streaming { .. } | Phase::Paused { .. } | Phase::Listening { .. } | Phase::Following => {}
+            Phase::Paused { .. } => self.stop_again(at),
+            Phase::Streaming { .. } | Phase::Listening { .. } | Phase::Following => {}
         }
     }
 
@@ -261,7 +267,7 @@ impl Dialogue {
 
     /// Whether a running stream has the beams asked for; a sensor that refused them is taken as it is.
     fn is_wanted(&self, measured: Measured<'_>) -> bool {
-        measured.count() == self.settings.variant.beams() || self.trouble == Some(Trouble::VariantRefused)
+        measured.count() == self.settings.variant.beams() || self.variant_refused
     }
 
     /// Time between two telegrams of the variant asked for.
@@ -279,7 +285,8 @@ impl Dialogue {
     fn stream(&mut self, telegram: Telegram<'_>, measured: Option<Measured<'_>>, now: Nanos) {
         let Some(&header) = telegram.bytes().first_chunk::<{ size_of::<StreamHeader>() }>() else { return };
         let as_asked = measured.is_some_and(|scan| scan.count() == self.settings.variant.beams());
-        self.trouble = (!as_asked).then_some(Trouble::VariantRefused);
+        self.trouble = None;
+        self.variant_refused = !as_asked;
         self.sensor.streams = true;
         let silent_at = self.silent_at(now);
         self.phase = Phase::Streaming { header, silent_at, questions: QUESTIONS, rounds: 0, ask_at: now };

@@ -45,7 +45,7 @@ impl<'a> Write<'a> {
             FIELD => Write::Field(data),
             PASSWORD => Write::Password(data),
             TEACH => Write::Teach(data),
-            POWER_ON => match data {
+            POWER_ON_RATE => match data {
                 &[byte] => Write::PowerOn(PowerOn::of_byte(byte)?),
                 _ => return None,
             },
@@ -62,7 +62,7 @@ impl<'a> Write<'a> {
             Write::Field(_) => FIELD,
             Write::Password(_) => PASSWORD,
             Write::Teach(_) => TEACH,
-            Write::PowerOn(_) => POWER_ON,
+            Write::PowerOn(_) => POWER_ON_RATE,
             Write::Configuration(_) => CONFIGURATION,
             Write::Configuration2(_) => CONFIGURATION_2,
         }
@@ -124,7 +124,7 @@ pub const PASSWORD: u8 = 0x42;
 /// Command: teach a field.
 pub const TEACH: u8 = 0x46;
 /// Command: rate after power-on.
-pub const POWER_ON: u8 = 0x66;
+pub const POWER_ON_RATE: u8 = 0x66;
 /// Command: write the first part of the configuration.
 pub const CONFIGURATION: u8 = 0x77;
 /// Command: write the second part of the configuration.
@@ -175,7 +175,7 @@ mod tests {
         assert!(Write::Configuration(&[0; 35]).encode(0).is_none());
         assert!(Write::Configuration2(&[]).encode(0).is_none());
         assert!(Write::Field(&[0; 808]).encode(0).is_none());
-        let three = Writer::new(0, POWER_ON).byte(3).finish();
+        let three = Writer::new(0, POWER_ON_RATE).byte(3).finish();
         assert_eq!(Write::decode(three.telegram()), None);
         let reply = Writer::new(0x80, CONFIGURATION).byte(0).byte(0x10).finish();
         assert_eq!(Write::decode(reply.telegram()), None);

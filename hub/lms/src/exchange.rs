@@ -1,12 +1,12 @@
 //! One request after the other, and what comes back: what [`crate::inquiry`] and [`crate::change`] have in common. Knows
 //! pace, tries and bytes; refuses to know what is asked, and why.
 
+use crate::Nanos;
 use crate::framer::{Advance, Framer, Place, Tally};
-use crate::outgoing::{NAK_PAUSE, Outgoing, Say};
+use crate::outgoing::{NAK_PAUSE, Outgoing, SOON, Say};
 use crate::reply::REFUSED;
 use crate::telegram::{REPLY, Telegram};
 use crate::variant::Baud;
-use crate::{MILLIS, Nanos};
 
 /// What a conversation wants, in the order in which it wants it.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -192,6 +192,3 @@ pub(crate) enum Heard {
     Telegram(Place),
     Nak,
 }
-
-/// A byte that may leave within so long is asked for at once; a later one is waited for as for anything else.
-const SOON: Nanos = 5 * MILLIS;

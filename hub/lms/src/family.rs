@@ -93,7 +93,10 @@ impl Family {
     pub fn refuses(self, request: Request) -> Option<&'static str> {
         match request {
             Request::Variant(variant) => self.refuses_variant(variant),
+            // What it does not answer once it does not send continuously.
             Request::Operate(Operating::Reflectivity(_)) => self.refuses_command(REFLECTIVITY),
+            Request::Operate(Operating::RangeFields(_)) => self.refuses_command(RANGE_FIELDS),
+            Request::Operate(Operating::Reflectivities(_)) => self.refuses_command(REFLECTIVITIES),
             _ => self.refuses_command(request.command()),
         }
     }
@@ -119,7 +122,7 @@ const FIELDS_WRITTEN: &[u8] = &[0x40, 0x46];
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::parameters::Span;
+    use crate::parameters::{Span, Spans};
 
     #[test]
     fn recognised_from_what_it_says() {
@@ -154,6 +157,11 @@ mod tests {
         assert!(Family::Lms291.refuses(Request::Operate(Operating::Reflectivity(span))).is_some());
         assert!(Family::Fast.refuses(Request::Operate(Operating::Reflectivity(span))).is_none());
         assert!(Family::Fast.refuses(Request::Variant(Variant::HALF)).is_some());
+        let spans = Spans::new(&[span]).unwrap();
+        for operating in [Operating::RangeFields(span), Operating::Reflectivities(spans)] {
+            assert!(Family::Fast.refuses(Request::Operate(operating)).is_some());
+            assert!(Family::Lms291.refuses(Request::Operate(operating)).is_none());
+        }
         for command in [0x3E, 0x40, 0x41, 0x45, 0x46, 0x75, 0x76] {
             assert!(Family::Fast.refuses_command(command).is_some(), "{command:02X}");
             assert!(Family::Lms200.refuses_command(command).is_none(), "{command:02X}");

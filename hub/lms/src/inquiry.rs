@@ -10,6 +10,7 @@ use crate::command::Request;
 use crate::exchange::{Conversation, Exchange, Heard, Output};
 use crate::family::Family;
 use crate::framer::{Place, Tally};
+use crate::header::is_data;
 use crate::phase::{LISTEN, SETTLE, TRIES};
 use crate::reply::Reply;
 use crate::telegram::{Encoded, MAX_TELEGRAM, REPLY};
@@ -238,13 +239,6 @@ impl Conversation for Inquiry {
             Phase::Done => Output::Done,
         }
     }
-}
-
-/// Whether a sensor sends such telegrams unasked (Telegram listing, 20h): values, means, sub-ranges of either, with
-/// fields, with reflectivity, Cartesian.
-fn is_data(command: u8) -> bool {
-    const DATA: [u8; 8] = [0xB0, 0xB6, 0xB7, 0xBE, 0xBF, 0xC4, 0xF5, 0xF6];
-    DATA.contains(&command)
 }
 
 /// How often all rates are tried.

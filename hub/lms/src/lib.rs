@@ -27,6 +27,7 @@ mod notice;
 pub mod operating;
 mod outgoing;
 pub mod parameters;
+mod pause;
 mod phase;
 pub mod reflectivity;
 pub mod reply;

@@ -44,9 +44,13 @@ impl<'a> Measured<'a> {
         Some(Measured { count_word, values, indices })
     }
 
-    pub(crate) fn write(&self, writer: Writer) -> Writer {
-        let writer = writer.word(self.count_word).slice(self.values);
-        self.indices.map_or(writer.clone(), |(scan, telegram)| writer.byte(scan).byte(telegram))
+    /// Appends them to a reply; `None` if they do not fit into it.
+    pub(crate) fn write(&self, writer: Writer) -> Option<Writer> {
+        let writer = writer.word(self.count_word).reply_slice(self.values)?;
+        match self.indices {
+            Some((scan, telegram)) => writer.reply_slice(&[scan, telegram]),
+            None => Some(writer),
+        }
     }
 
     /// Number of beams: 1 to 401.

@@ -53,12 +53,12 @@ impl Operating {
             (0x21, []) => Operating::SegmentMinimumOnObject,
             (0x22, []) => Operating::VerticalMinimum,
             (0x23, []) => Operating::VerticalMinimumOnObject,
-            (0x26, &[shots]) => Operating::Means(shots),
-            (0x27, span) => Operating::Range(Span::read(span)?),
-            (0x28, &[shots, ref span @ ..]) => Operating::RangeMeans(shots, Span::read(span)?),
-            (0x29, span) => Operating::RangeFields(Span::read(span)?),
+            (MEANS, &[shots]) => Operating::Means(shots),
+            (RANGE, span) => Operating::Range(Span::read(span)?),
+            (RANGE_MEANS, &[shots, ref span @ ..]) => Operating::RangeMeans(shots, Span::read(span)?),
+            (RANGE_FIELDS, span) => Operating::RangeFields(Span::read(span)?),
             (PARTIAL, []) => Operating::Partial,
-            (0x2B, spans) => Operating::Reflectivities(Spans::read_counted(spans)?),
+            (REFLECTIVITIES, spans) => Operating::Reflectivities(Spans::read_counted(spans)?),
             (0x2C, raw) => Operating::SegmentMinimumOfRange(Raw::new(raw)?),
             (0x2E, []) => Operating::Navigation,
             (0x30, _) => Operating::TestPassword(Password(parameters.try_into().ok()?)),
@@ -99,12 +99,12 @@ impl Operating {
             Operating::SegmentMinimumOnObject => 0x21,
             Operating::VerticalMinimum => 0x22,
             Operating::VerticalMinimumOnObject => 0x23,
-            Operating::Means(_) => 0x26,
-            Operating::Range(_) => 0x27,
-            Operating::RangeMeans(..) => 0x28,
-            Operating::RangeFields(_) => 0x29,
+            Operating::Means(_) => MEANS,
+            Operating::Range(_) => RANGE,
+            Operating::RangeMeans(..) => RANGE_MEANS,
+            Operating::RangeFields(_) => RANGE_FIELDS,
             Operating::Partial => PARTIAL,
-            Operating::Reflectivities(_) => 0x2B,
+            Operating::Reflectivities(_) => REFLECTIVITIES,
             Operating::SegmentMinimumOfRange(_) => 0x2C,
             Operating::Navigation => 0x2E,
             Operating::TestPassword(_) => 0x30,
@@ -124,12 +124,12 @@ pub fn name(mode: u8) -> &'static str {
         0x23 => "least vertical distance, on an object",
         STREAM => "all values, continuously",
         ON_REQUEST => "values on request",
-        0x26 => "mean values, continuously",
-        0x27 => "values of a sub-range, continuously",
-        0x28 => "mean values of a sub-range, continuously",
-        0x29 => "values of a sub-range with field values, continuously",
+        MEANS => "mean values, continuously",
+        RANGE => "values of a sub-range, continuously",
+        RANGE_MEANS => "mean values of a sub-range, continuously",
+        RANGE_FIELDS => "values of a sub-range with field values, continuously",
         PARTIAL => "partial scans, at once",
-        0x2B => "ranges and reflectivities of sub-ranges, continuously",
+        REFLECTIVITIES => "ranges and reflectivities of sub-ranges, continuously",
         0x2C => "least value of each segment in a sub-range, continuously",
         0x2E => "records for navigation",
         0x30 => "test of a password",
@@ -163,8 +163,18 @@ pub const INSTALLATION: u8 = 0x00;
 pub const STREAM: u8 = 0x24;
 /// Operating mode: values on request; so a sensor begins.
 pub const ON_REQUEST: u8 = 0x25;
+/// Operating mode: mean values.
+pub const MEANS: u8 = 0x26;
+/// Operating mode: a sub-range.
+pub const RANGE: u8 = 0x27;
+/// Operating mode: mean values of a sub-range.
+pub const RANGE_MEANS: u8 = 0x28;
+/// Operating mode: a sub-range with field values.
+pub const RANGE_FIELDS: u8 = 0x29;
 /// Operating mode: partial scans.
 pub const PARTIAL: u8 = 0x2A;
+/// Operating mode: ranges and reflectivities of sub-ranges.
+pub const REFLECTIVITIES: u8 = 0x2B;
 
 #[cfg(test)]
 mod tests {

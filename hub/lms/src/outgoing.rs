@@ -156,6 +156,8 @@ impl<R: Say> Outgoing<R> {
 pub(crate) const FORGOTTEN: Nanos = 10 * MILLIS;
 /// Between the end of a byte and the next: more than 55 us, far less than 6 ms (Telegram listing 4.3).
 const GAP: Nanos = 120 * MICROS;
+/// A byte that may leave within so long is asked for at once; a later one is waited for as for anything else.
+pub(crate) const SOON: Nanos = 5 * MILLIS;
 /// ACK or NAK comes within 60 ms (Telegram listing 4.3), and a reply was captured to begin within 100 ms; the rest is
 /// for adapters.
 const ACKNOWLEDGE_TIMEOUT: Nanos = 150 * MILLIS;
@@ -164,9 +166,9 @@ const ACKNOWLEDGE_TIMEOUT: Nanos = 150 * MILLIS;
 const STOP_TIMEOUT: Nanos = 300 * MILLIS;
 /// Type, status and configuration were captured to take up to 158 ms.
 pub(crate) const REPLY_TIMEOUT: Nanos = 500 * MILLIS;
-/// A change of mode takes up to 3 s (Telegram listing 7.3), but mostly a tenth of one. What is asked after this time, and
-/// asked again, comes through when it is over.
-pub(crate) const MODE_TIMEOUT: Nanos = 1_000 * MILLIS;
+/// A change of mode takes up to 3 s (Telegram listing 7.3), but mostly a tenth of one. Who asks what became of it before
+/// it is over finds the mode that was, and undoes the change.
+pub(crate) const MODE_TIMEOUT: Nanos = 3_200 * MILLIS;
 /// Bytes of the status reply.
 const LONGEST_REPLY: usize = 160;
 /// After a NAK the sensor wants 30 ms of peace (Telegram listing 4.3).

@@ -117,13 +117,15 @@ pub(crate) const MORE_TRIES: u8 = 5;
 pub(crate) const OVERLOOKED: Nanos = 25 * MILLIS;
 /// At all rates nobody answered and no byte came: before the next round, by how many there were.
 pub(crate) const PAUSES: [Nanos; 4] = [0, 500 * MILLIS, 1_000 * MILLIS, 1_500 * MILLIS];
+/// A sensor that shall only stop is sought in so many rounds, a hasty and a patient one.
+pub(crate) const PAUSE_ROUNDS: usize = 2;
 /// In every other round a sensor has so much more time: one that is slow would never be found otherwise.
 pub(crate) const PATIENCE: Nanos = 250 * MILLIS;
 /// Stops beside the first one; what goes on after so many does not listen.
 pub(crate) const STOPS: u8 = 2;
-/// What a stream does not tell: how values are split, from the one reply or the other, and who sends them. After some
-/// rounds only the first is still wanted, rarely: without it there are no scans.
-pub(crate) const QUESTIONS: &[Request] = &[Request::Status, Request::Configuration, Request::Type];
+/// What a stream does not tell: who sends it, which may say at which angles, and how values are split, from the one reply
+/// or the other. After some rounds only the latter is still wanted, rarely: without it there are no scans.
+pub(crate) const QUESTIONS: &[Request] = &[Request::Type, Request::Status, Request::Configuration];
 pub(crate) const QUESTION_ROUNDS: u8 = 5;
 pub(crate) const QUESTION_PAUSE: Nanos = 10_000 * MILLIS;
 /// STX to count word, status and checksum: bytes of a telegram beside its values.

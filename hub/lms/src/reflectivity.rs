@@ -140,8 +140,9 @@ impl<'a> RangeFields<'a> {
             .map(|row| core::array::from_fn(|i| u16::from_le_bytes([row[2 * i], row[2 * i + 1]])))
     }
 
-    pub(crate) fn write(&self, writer: Writer) -> Writer {
-        self.span.write(writer).word(self.count_word).slice(self.rest)
+    /// Appends them to a reply; `None` if they do not fit into it.
+    pub(crate) fn write(&self, writer: Writer) -> Option<Writer> {
+        self.span.write(writer).word(self.count_word).reply_slice(self.rest)
     }
 }
 

@@ -7,7 +7,7 @@ use crate::errors::Errors;
 use crate::measured::{MEASURED, Measured};
 use crate::parameters::Span;
 use crate::reflectivity::{RangeFields, Reflectivities, Reflectivity};
-use crate::telegram::{Encoded, MAX_LENGTH, REPLY, Telegram, Writer};
+use crate::telegram::{Encoded, REPLY, Telegram, Writer};
 use crate::variant::{Mode, Unit, Variant};
 
 pub use crate::configuration::Configuration;
@@ -172,33 +172,33 @@ impl<'a> Reply<'a> {
         let writer = match *self {
             Reply::PowerOn(name) | Reply::Type(name) => {
                 let spaces = &[b' '; NAME_LEN][..NAME_LEN.saturating_sub(name.len())];
-                fitting(writer, name)?.slice(spaces)
+                writer.reply_slice(name)?.slice(spaces)
             }
             Reply::Reset | Reply::Refused => writer,
             Reply::Mode { done } => writer.byte(u8::from(!done)),
-            Reply::Measured(values) => values.write(writer),
+            Reply::Measured(values) => values.write(writer)?,
             Reply::Status(report) => writer.slice(report.bytes()),
-            Reply::Errors(errors) => fitting(writer, errors.bytes())?,
+            Reply::Errors(errors) => writer.reply_slice(errors.bytes())?,
             Reply::Counters { hours_by_2, power_ons } => writer.word(hours_by_2).word(power_ons),
-            Reply::Means { shots, values } => values.write(writer.byte(shots)),
-            Reply::Range { span, values } => values.write(span.write(writer)),
+            Reply::Means { shots, values } => values.write(writer.byte(shots))?,
+            Reply::Range { span, values } => values.write(span.write(writer))?,
             Reply::Variant { done, angle_deg, resolution_cdeg } => {
                 writer.byte(u8::from(done)).word(angle_deg).word(resolution_cdeg)
             }
-            Reply::RangeFields(fields) => fields.write(writer),
-            Reply::RangeMeans { shots, span, values } => values.write(span.write(writer.byte(shots))),
-            Reply::Reflectivity(view) => fitting(writer, view.bytes())?,
+            Reply::RangeFields(fields) => fields.write(writer)?,
+            Reply::RangeMeans { shots, span, values } => values.write(span.write(writer.byte(shots)))?,
+            Reply::Reflectivity(view) => writer.reply_slice(view.bytes())?,
             Reply::PowerOnSet { outcome, set } => writer.byte(outcome).byte(set),
-            Reply::Configuration(configuration) => fitting(writer, configuration.bytes())?,
-            Reply::Reflectivities(view) => fitting(writer, view.bytes())?,
+            Reply::Configuration(configuration) => writer.reply_slice(configuration.bytes())?,
+            Reply::Reflectivities(view) => writer.reply_slice(view.bytes())?,
             Reply::ConfigurationWritten { done, configuration } => {
-                fitting(writer.byte(u8::from(done)), configuration.bytes())?
+                writer.byte(u8::from(done)).reply_slice(configuration.bytes())?
             }
-            Reply::Configuration2(parameters) => fitting(writer, parameters)?,
+            Reply::Configuration2(parameters) => writer.reply_slice(parameters)?,
             Reply::Configuration2Written { done, parameters } => {
-                fitting(writer.byte(u8::from(done)), parameters)?
+                writer.byte(u8::from(done)).reply_slice(parameters)?
             }
-            Reply::Unread { data, .. } => fitting(writer, data)?,
+            Reply::Unread { data, .. } => writer.reply_slice(data)?,
         };
         Some(writer.byte(status).finish())
     }
@@ -230,11 +230,6 @@ impl<'a> Reply<'a> {
             Reply::Unread { command, .. } => *command,
         }
     }
-}
-
-/// `writer` with `bytes` and room for the status byte; `None` if there is no such room.
-fn fitting(writer: Writer, bytes: &[u8]) -> Option<Writer> {
-    (writer.length() + bytes.len() < MAX_LENGTH).then(|| writer.slice(bytes))
 }
 
 /// A0h: mode or rate changed (or not), from `address`, ending with `status`.

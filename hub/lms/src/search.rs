@@ -3,7 +3,7 @@
 
 use crate::command::Request;
 use crate::dialogue::Dialogue;
-use crate::phase::{LISTEN, PATIENCE, PAUSES, Phase, SETTLE};
+use crate::phase::{LISTEN, PATIENCE, PAUSE_ROUNDS, PAUSES, Phase, SETTLE};
 use crate::sensor::{State, Trouble};
 use crate::variant::Baud;
 use crate::{MILLIS, Nanos};
@@ -11,7 +11,13 @@ use crate::{MILLIS, Nanos};
 impl Dialogue {
     /// As a new session does: at the wanted rate, without a word.
     pub(crate) fn begin(&mut self, now: Nanos) {
+        if core::mem::take(&mut self.is_paused) {
+            // Whoever is not asked does not answer.
+            self.quiet_since = now;
+        }
         self.trouble = None;
+        self.variant_refused = false;
+        self.sensor.forget();
         self.change_baud(self.settings.baud);
         self.listen(now, State::Probing);
     }
@@ -49,10 +55,16 @@ impl Dialogue {
         if !next.is_multiple_of(ORDER.len()) {
             return self.probe(now, next);
         }
+        let round = next / ORDER.len();
+        if self.is_paused && round == PAUSE_ROUNDS {
+            return self.nobody_to_stop();
+        }
         let baud = self.settings.fixed_rate.then_some(self.baud);
-        let seconds = coarse((now - self.quiet_since) / (1_000 * MILLIS));
-        self.trouble = Some(Trouble::NoAnswer { baud, seconds });
-        let pause = PAUSES[(next / ORDER.len() - 1).min(PAUSES.len() - 1)];
+        let seconds = coarse(now.saturating_sub(self.quiet_since) / (1_000 * MILLIS));
+        if !self.is_paused {
+            self.trouble = Some(Trouble::NoAnswer { baud, seconds });
+        }
+        let pause = PAUSES[(round - 1).min(PAUSES.len() - 1)];
         if self.heard || pause == 0 {
             return self.probe(now, next);
         }

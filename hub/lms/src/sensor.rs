@@ -1,7 +1,9 @@
-//! What a session knows of its sensor, in plain values: learned from its replies, forgotten never but overwritten.
+//! What a session knows of its sensor, in plain values: learned from its replies, and forgotten where it may be another
+//! sensor that speaks next.
 
 use crate::command::Request;
 use crate::condition::{Condition, Severity};
+use crate::family::Family;
 use crate::notice::Notice;
 use crate::reply::{POWER_ON, Reply};
 use crate::status_report::StatusReport;
@@ -44,6 +46,10 @@ pub enum Trouble {
     VariantRefused,
     /// One second without measured data.
     Silence,
+    /// A pause is wanted, but bytes come, and no answer says that they will end.
+    NotStopped,
+    /// The sensor calls itself a version S14, which scans 90 degrees with as many values as others 180.
+    AnglesUnknown,
     /// The sensor does not tell its measuring mode, so nobody knows where a range ends in its 16 bits.
     ModeUnknown,
 }
@@ -64,6 +70,10 @@ impl fmt::Display for Trouble {
             Trouble::Refused(request) => write!(f, "the sensor refused {request:?}"),
             Trouble::VariantRefused => f.write_str("the sensor keeps its own angle and resolution"),
             Trouble::ModeUnknown => f.write_str("the sensor does not tell its measuring mode: no scans"),
+            Trouble::AnglesUnknown => {
+                f.write_str("the sensor is a version S14, whose angles are not known here: no scans")
+            }
+            Trouble::NotStopped => f.write_str("paused, but the sensor does not stop: cable to the sensor?"),
             Trouble::Silence => f.write_str("no measured data for one second"),
         }
     }
@@ -107,6 +117,11 @@ impl Sensor {
         &self.kind[..self.kind_len]
     }
 
+    /// Whether its scans have none of the angles of [`Variant`], although they look so.
+    pub fn has_other_angles(&self) -> bool {
+        Family::of_type(self.kind()) == Some(Family::Fast)
+    }
+
     /// Firmware as ASCII, such as `V02.19`; empty if it was not asked yet.
     pub fn software(&self) -> &[u8] {
         self.software.trim_ascii()
@@ -127,11 +142,20 @@ impl Sensor {
         .filter_map(|(is_so, notice)| is_so.then_some(notice))
     }
 
+    /// Who speaks next may be another sensor, or the same with another configuration: who it is and how its values are
+    /// split is not known any more. What each scan tells anew may stay.
+    pub(crate) fn forget(&mut self) {
+        self.mode = None;
+        self.kind_len = 0;
+        self.defective = None;
+    }
+
     /// Takes over what `telegram` tells, which is `reply`, if it can be read.
     pub(crate) fn learn(&mut self, reply: Option<&Reply<'_>>, telegram: Telegram<'_>) {
         self.address = Some(telegram.address());
         self.feel(telegram.status().map(Condition));
         if telegram.command() == POWER_ON {
+            self.forget();
             self.streams = false;
             self.variant = None;
         }

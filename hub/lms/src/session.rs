@@ -4,15 +4,16 @@
 //! After every call that changes it, drain [`Session::poll_output`] until it answers [`Output::Wait`] or
 //! [`Output::Rest`].
 
+use crate::Nanos;
 use crate::arrival::{Arrivals, Rhythm};
 use crate::dialogue::Dialogue;
 use crate::framer::{Advance, Framer, Place, Tally, suspect};
 use crate::measured::MEASURED;
+use crate::outgoing::SOON;
 use crate::phase::{Control, Reason, Settings};
 use crate::sensor::{Sensor, State, Trouble};
 use crate::telegram::Telegram;
 use crate::variant::{Baud, Mode};
-use crate::{MILLIS, Nanos};
 
 /// What the session wants, in the order in which it wants it.
 #[derive(Debug)]
@@ -60,16 +61,15 @@ pub struct Received<'a> {
     pub last: Nanos,
     /// Whether `first` is an estimate from bytes that came in one read.
     pub estimated: bool,
-    /// How measured values are split; `None` while the sensor has not told it.
+    /// How measured values are split; `None` while the sensor has not told it, or if nobody knows at which angles they
+    /// were measured.
     pub mode: Option<Mode>,
     /// Why it is suspect, bits of [`suspect`]; 0 is clean.
     pub reasons: u8,
 }
 
-/// A byte that may leave within so long is asked for at once; a later one is waited for as for anything else.
-const SOON: Nanos = 5 * MILLIS;
-
-/// One sensor's session.
+/// One sensor's session. A sensor that is exchanged within a second for one that streams already, with the same number
+/// of values and the same address, is taken for the same one.
 #[derive(Clone, Debug)]
 pub struct Session {
     framer: Framer,
@@ -92,7 +92,7 @@ impl Session {
         Session {
             framer: Framer::default(),
             dialogue: Dialogue::new(settings, now),
-            arrivals: Arrivals::new(),
+            arrivals: Arrivals::new(now),
             rhythm: Rhythm::new(),
             now,
             last_byte: now,
@@ -206,7 +206,7 @@ impl Session {
 
     /// Why it is not where it should be.
     pub fn trouble(&self) -> Option<Trouble> {
-        self.dialogue.trouble
+        self.dialogue.trouble()
     }
 
     /// What became of the bytes.
@@ -219,7 +219,8 @@ impl Session {
         self.framer.buffered()
     }
 
-    /// How often everything began anew: measured data stayed out for a second, or a user asked for it.
+    /// How often everything began anew: measured data stayed out for a second, the sensor said that it had just got its
+    /// power, or a user asked for it.
     pub fn resyncs(&self) -> u64 {
         self.dialogue.resyncs
     }
@@ -259,7 +260,7 @@ impl Session {
             first: first.at,
             last,
             estimated: first.estimated,
-            mode: self.dialogue.sensor.mode,
+            mode: self.dialogue.sensor.mode.filter(|_| !self.dialogue.sensor.has_other_angles()),
             reasons: framed.reasons | if slow { suspect::SLOW } else { 0 },
         }
     }

@@ -69,8 +69,7 @@ impl Dialogue {
                 self.enter(Step::Check, progress, now + SETTLE);
             }
             Step::Variant => {
-                let done = matches!(reply, Some(Reply::Variant { done: true, .. }));
-                self.trouble = (!done).then_some(Trouble::VariantRefused);
+                self.variant_refused = !matches!(reply, Some(Reply::Variant { done: true, .. }));
                 self.settle(progress, now);
             }
             Step::Type | Step::Configuration => self.settle(progress, now),
@@ -93,9 +92,7 @@ impl Dialogue {
     ) {
         match step {
             Step::Variant | Step::Type | Step::Configuration => {
-                if step == Step::Variant {
-                    self.trouble = Some(Trouble::VariantRefused);
-                }
+                self.variant_refused |= step == Step::Variant;
                 self.doubt(progress, at);
             }
             Step::Stop | Step::Stream if heard => self.doubt(progress, at),

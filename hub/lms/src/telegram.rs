@@ -126,6 +126,11 @@ impl Writer {
         self
     }
 
+    /// Appends bytes as they are; `None` if they leave no room for the status byte that a reply ends with.
+    pub(crate) fn reply_slice(self, bytes: &[u8]) -> Option<Self> {
+        (self.length() + bytes.len() < MAX_LENGTH).then(|| self.slice(bytes))
+    }
+
     /// LENGTH so far: command and what was appended.
     pub fn length(&self) -> usize {
         self.len - 4

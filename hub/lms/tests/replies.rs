@@ -4,8 +4,9 @@
 use lms::condition::Condition;
 use lms::configuration::Configuration;
 use lms::errors::Errors;
-use lms::measured::{self, Frame};
+use lms::measured::{self, Frame, Measured};
 use lms::parameters::Span;
+use lms::reflectivity::RangeFields;
 use lms::reply::{self, Reply};
 use lms::telegram::{Encoded, Telegram, Writer};
 use lms::variant::{Mode, Unit, Variant};
@@ -150,4 +151,16 @@ fn what_does_not_fit_is_no_reply() {
     assert_eq!(Reply::decode(request.telegram()), None, "a host sends no reply");
     assert!(Reply::Configuration2(&[0; 900]).encode(0, 0x10).is_none());
     assert!(Reply::Type(&[b'x'; 900]).encode(0, 0x10).is_none());
+    // All that a telegram of values holds, and one byte more.
+    let frame = Frame { unit: Unit::Mm, partial: None, indices: Some((1, 2)) };
+    let longest = measured::encode_with(0, frame, &[7; 401], 0x10);
+    let values = Measured::decode(longest.telegram()).expect("is one");
+    let span = Span { first: 1, last: 401 };
+    assert!(Reply::Measured(values).encode(0, 0x10).is_some());
+    assert!(Reply::Means { shots: 2, values }.encode(0, 0x10).is_none());
+    assert!(Reply::Range { span, values }.encode(0, 0x10).is_none());
+    assert!(Reply::RangeMeans { shots: 2, span, values }.encode(0, 0x10).is_none());
+    let data = [&[1, 0, 101, 0, 101, 0][..], &[0; 8 * 101]].concat();
+    let fields = RangeFields::new(&data).expect("is one");
+    assert!(Reply::RangeFields(fields).encode(0, 0x10).is_none());
 }

@@ -5,10 +5,15 @@
 //! as changing the configuration and the permanent rate needs. Every other well-formed request is refused with 92h, as
 //! the sensor does with what it cannot.
 
-use lms::command::{EEPROM_WRITES, MODE, Request, VARIANT};
+use std::ops::Range;
+
+use lms::command::{self, EEPROM_WRITES, Request};
+use lms::eeprom::{self, PowerOn, Write};
 use lms::family::Family;
+use lms::operating::Operating as Asked;
+use lms::parameters::Password;
 use lms::reply::{self, Health};
-use lms::telegram::{Encoded, Telegram, Writer};
+use lms::telegram::{Encoded, REPLY, Telegram, Writer};
 use lms::variant::{Baud, MIRROR_TURN, Variant};
 use lms::{MILLIS, Nanos};
 
@@ -38,78 +43,92 @@ impl Machine {
         if EEPROM_WRITES.contains(&request.command()) {
             self.eeprom.writes += 1;
         }
-        let command = request.command();
-        let is_refused = self.settings.habits.refuses.contains(&command);
-        if is_refused || self.family().and_then(|family| family.refuses_command(command)).is_some() {
+        let asked = request.command();
+        let is_refused = self.settings.habits.refuses.contains(&asked);
+        if is_refused || self.family().and_then(|family| family.refuses_command(asked)).is_some() {
             return self.refusal();
         }
         let (address, status) = (self.settings.address, self.settings.status);
         match Request::decode(request) {
-            Some(Request::Status) => answer(&self.status(), THINKING_NS),
+            Some(Request::Status) => answer(&self.status(), self.thinking_ns()),
             Some(Request::Type) => {
-                answer(&reply::kind(address, self.settings.type_name.as_bytes(), status), THINKING_NS)
+                answer(&reply::kind(address, self.settings.type_name.as_bytes(), status), self.thinking_ns())
             }
             Some(Request::Configuration) => {
-                answer(&self.reply(CONFIGURATION, self.eeprom.configuration()), THINKING_NS)
+                let told = self.reply(command::CONFIGURATION | REPLY, self.eeprom.configuration());
+                answer(&told, self.thinking_ns())
+            }
+            Some(Request::Errors) => {
+                let pairs: Vec<u8> =
+                    self.settings.errors.iter().flat_map(|&(kind, number)| [kind, number]).collect();
+                answer(&self.reply(command::ERRORS | REPLY, &pairs), self.thinking_ns())
+            }
+            Some(Request::Counters) => self.counters(),
+            Some(Request::Reset) => {
+                self.settings.errors.clear();
+                let announced = self.reply(reply::RESET, &[]);
+                Answer { after: After::Reset, ..answer(&announced, self.thinking_ns()) }
             }
             Some(Request::Variant(variant)) => {
                 let done = self.source.variant().is_none_or(|fixed| fixed == variant) && self.can(variant);
                 if done {
                     self.variant = variant;
                 }
-                answer(&reply::variant(address, done, self.variant, status), MODE_NS)
+                answer(&reply::variant(address, done, self.variant, status), self.mode_ns())
             }
-            Some(Request::Stream) => self.change_mode(Operating::All),
-            Some(Request::Stop) => self.change_mode(Operating::OnRequest),
             Some(Request::Baud(baud)) => {
-                Answer { after: After::Baud(baud), ..answer(&reply::mode(address, true, status), MODE_NS) }
+                let changed = reply::mode(address, true, status);
+                Answer { after: After::Baud(baud), ..answer(&changed, self.mode_ns()) }
             }
-            _ => self.answer_other(request, now),
+            Some(Request::Operate(Asked::Installation(password))) => match password {
+                Password::FACTORY => self.change_mode(Operating::Installation),
+                _ => answer(&reply::mode(address, false, status), self.mode_ns()),
+            },
+            Some(asked) => match Operating::of_request(asked, self.variant) {
+                Some(operating) if self.source.can(&operating) && self.may(&operating) => {
+                    if asked.command() == command::MODE {
+                        self.change_mode(operating)
+                    } else {
+                        self.measure_once(&operating, now)
+                    }
+                }
+                _ => self.refusal(),
+            },
+            None => self.answer_other(request),
         }
     }
 
     /// 90h: what it says when it has started.
     pub(crate) fn banner(&self) -> Vec<u8> {
-        self.reply(BANNER, self.settings.type_name.as_bytes()).bytes().to_vec()
+        self.reply(reply::POWER_ON, self.settings.type_name.as_bytes()).bytes().to_vec()
     }
 
-    fn answer_other(&mut self, request: Telegram<'_>, now: Nanos) -> Answer {
+    /// What writes the EEPROM, and what is a request by its command only.
+    fn answer_other(&mut self, request: Telegram<'_>) -> Answer {
         let (address, status) = (self.settings.address, self.settings.status);
         let is_installation = self.operating == Operating::Installation;
-        match (request.command(), request.data()) {
-            (RESET, []) => {
-                self.settings.errors.clear();
-                let announced = Writer::new(self.reply_address(), RESET_REPLY).byte(status).finish();
-                Answer { after: After::Reset, ..answer(&announced, THINKING_NS) }
+        match Write::decode(request) {
+            Some(Write::Configuration(data)) if is_installation => return self.write_configuration(data),
+            Some(Write::PowerOn(set @ (PowerOn::Baud9600 | PowerOn::KeepBaud))) if is_installation => {
+                self.eeprom.permanent_baud = (set == PowerOn::KeepBaud).then(|| self.baud());
+                let done = self.reply(eeprom::POWER_ON_RATE | REPLY, &[0, set.byte()]);
+                return answer(&done, self.write_ns(false));
             }
-            // A variant that is none.
-            (VARIANT, [_, _, _, _]) => answer(&reply::variant(address, false, self.variant, status), MODE_NS),
-            (COUNTERS, [] | [0, 0]) => answer(&self.reply(COUNTERS_REPLY, &COUNTED), THINKING_NS),
-            (ERRORS, []) => {
-                let pairs: Vec<u8> =
-                    self.settings.errors.iter().flat_map(|&(kind, number)| [kind, number]).collect();
-                answer(&self.reply(ERRORS_REPLY, &pairs), THINKING_NS)
-            }
-            (MODE, [0x00, password @ ..]) if password == PASSWORD => {
-                self.change_mode(Operating::Installation)
-            }
-            (MODE, [0x00, ..]) => answer(&reply::mode(address, false, status), MODE_NS),
-            (MODE, data) => match Operating::of_mode(data, self.variant) {
-                Some(operating) if self.source.can(&operating) => self.change_mode(operating),
-                _ => self.refusal(),
-            },
-            (WRITE_CONFIGURATION, data) if is_installation && !data.is_empty() => {
-                self.write_configuration(data)
-            }
-            (PERMANENT_BAUD, &[permanent @ (0 | 1)]) if is_installation => {
-                self.eeprom.permanent_baud = (permanent == 1).then(|| self.baud());
-                answer(&self.reply(PERMANENT_BAUD | 0x80, &[0, permanent]), SAME_NS)
-            }
-            _ => match Operating::of_single(request, self.variant) {
-                Some(operating) if self.source.can(&operating) => self.measure_once(&operating, now),
-                _ => self.refusal(),
-            },
+            _ => {}
         }
+        match (request.command(), request.data()) {
+            // A variant that is none.
+            (command::VARIANT, [_, _, _, _]) => {
+                answer(&reply::variant(address, false, self.variant, status), self.mode_ns())
+            }
+            // The listing allows a word that means nothing.
+            (command::COUNTERS, [0, 0]) => self.counters(),
+            _ => self.refusal(),
+        }
+    }
+
+    fn counters(&mut self) -> Answer {
+        answer(&self.reply(command::COUNTERS | REPLY, &COUNTED), self.thinking_ns())
     }
 
     fn measure_once(&mut self, operating: &Operating, now: Nanos) -> Answer {
@@ -124,7 +143,8 @@ impl Machine {
 
     fn change_mode(&mut self, operating: Operating) -> Answer {
         self.operating = operating;
-        answer(&reply::mode(self.settings.address, true, self.settings.status), MODE_NS)
+        self.partials = 0;
+        answer(&reply::mode(self.settings.address, true, self.settings.status), self.mode_ns())
     }
 
     /// 77h in installation mode changes as many bytes of the configuration as it has, except that the words of a
@@ -136,9 +156,9 @@ impl Machine {
         });
         let done = written.is_some();
         self.eeprom = written.unwrap_or_else(|| self.eeprom.clone());
-        let delay_ns = if self.eeprom.unit() == unit { SAME_NS } else { UNIT_NS };
+        let delay_ns = self.write_ns(self.eeprom.unit() != unit);
         let outcome = [&[u8::from(done)], self.eeprom.configuration()].concat();
-        answer(&self.reply(CONFIGURATION_WRITTEN, &outcome), delay_ns)
+        answer(&self.reply(eeprom::CONFIGURATION | REPLY, &outcome), delay_ns)
     }
 
     /// B1h: what a healthy sensor says, its settings, and what ails it.
@@ -165,6 +185,27 @@ impl Machine {
         self.reply(healthy.telegram().command(), &data)
     }
 
+    /// Between ACK and reply where nothing changes.
+    fn thinking_ns(&mut self) -> Nanos {
+        self.random.u64(THINKING_NS)
+    }
+
+    /// Between ACK and A0h or BBh.
+    fn mode_ns(&mut self) -> Nanos {
+        self.random.u64(MODE_NS) + self.settings.habits.late_mode_ns
+    }
+
+    /// Between ACK and F7h or E6h.
+    fn write_ns(&self, is_other_unit: bool) -> Nanos {
+        let usual_ns = if is_other_unit { UNIT_NS } else { SAME_NS };
+        usual_ns + self.settings.habits.late_write_ns
+    }
+
+    fn may(&self, operating: &Operating) -> bool {
+        let is_measuring = operating.streams();
+        !(self.settings.habits.strict && is_measuring) || self.operating != Operating::Installation
+    }
+
     fn family(&self) -> Option<Family> {
         Family::of_type(self.settings.type_name.as_bytes())
     }
@@ -173,8 +214,8 @@ impl Machine {
         self.family().and_then(|family| family.refuses_variant(variant)).is_none()
     }
 
-    fn refusal(&self) -> Answer {
-        answer(&reply::refused(self.settings.address, self.settings.status), THINKING_NS)
+    fn refusal(&mut self) -> Answer {
+        answer(&reply::refused(self.settings.address, self.settings.status), self.thinking_ns())
     }
 
     fn reply(&self, command: u8, data: &[u8]) -> Encoded {
@@ -186,33 +227,17 @@ fn answer(reply: &Encoded, delay_ns: Nanos) -> Answer {
     Answer { reply: reply.bytes().to_vec(), delay_ns, after: After::Nothing }
 }
 
-/// The password that every sensor leaves the factory with (Telegram listing 6-4).
-const PASSWORD: &[u8] = b"SICK_LMS";
-/// Command: start anew, and the reply before that; then the banner.
-const RESET: u8 = 0x10;
-const RESET_REPLY: u8 = 0x91;
-const BANNER: u8 = 0x90;
-/// Command: errors, and its reply (without one in the list). A fatal one that is not over has type 4.
-const ERRORS: u8 = 0x32;
-const ERRORS_REPLY: u8 = 0xB2;
+/// Of an error that is not over.
 const FATAL: u8 = 4;
-/// Command: hours (unit 2 h) and power-ons, and its reply; what a sensor has counted that is some years old.
-const COUNTERS: u8 = 0x35;
-const COUNTERS_REPLY: u8 = 0xB5;
+/// What a sensor has counted that is some years old: hours (unit 2 h) and power-ons.
 const COUNTED: [u8; 4] = [0x10, 0x27, 0x2C, 0x01];
-/// Reply: the configuration.
-const CONFIGURATION: u8 = 0xF4;
-/// Command: write the configuration, and its reply.
-const WRITE_CONFIGURATION: u8 = 0x77;
-const CONFIGURATION_WRITTEN: u8 = 0xF7;
-/// Command: the rate at power-on.
-const PERMANENT_BAUD: u8 = 0x66;
 /// What a clean window's sensors read; only the ratio to it matters.
 const POLLUTION_CLEAN: u16 = 1_000;
-/// Between ACK and reply where nothing changes; the listing allows 60 ms.
-const THINKING_NS: Nanos = MILLIS;
-/// Between ACK and A0h or BBh: captured exchanges took 66 ms and more, the listing allows 3 s.
-const MODE_NS: Nanos = 55 * MILLIS;
+/// Between ACK and reply where nothing changes: captured exchanges took 70 to 158 ms at 38400, request and reply
+/// themselves 10 to 45 of them.
+const THINKING_NS: Range<Nanos> = 55 * MILLIS..145 * MILLIS;
+/// Between ACK and A0h or BBh: captured exchanges took 66 to 94 ms, the listing allows 3 s.
+const MODE_NS: Range<Nanos> = 55 * MILLIS..85 * MILLIS;
 /// Between ACK and F7h: a captured exchange took 130 ms.
 const SAME_NS: Nanos = 110 * MILLIS;
 /// The same where the unit changes: SICK's quick manual allows 7 s.

@@ -1,6 +1,7 @@
 //! What the sensor keeps without power: configuration and permanent rate, as bytes where the protocol has bytes, and
 //! how often somebody asked to write them. Automatic code never does; the count is how tests know.
 
+use lms::configuration::{OLD_LEN, REAL_TIME_INDICES, factory};
 use lms::variant::{Baud, Mode, Unit};
 
 use crate::settings::Settings;
@@ -19,16 +20,9 @@ pub(crate) struct Eeprom {
 impl Eeprom {
     /// As it left the factory, but for what `settings` name (Telegram listing, 77h).
     pub(crate) fn new(settings: &Settings) -> Eeprom {
-        let mut configuration = vec![0; settings.configuration_len.clamp(SHORT, LONG)];
-        configuration[PEAK] = 0x70;
+        let mut configuration = factory(settings.mode, settings.unit).to_vec();
         configuration[AVAILABILITY] = settings.availability;
-        configuration[MODE] = settings.mode.0;
-        configuration[UNIT] = settings.unit.code();
-        configuration[EVALUATIONS] = 2;
-        configuration[RESTART] = 2;
-        if let Some(dazzle) = configuration.get_mut(DAZZLE) {
-            *dazzle = 2;
-        }
+        configuration.truncate(settings.configuration_len.max(OLD_LEN));
         Eeprom { configuration, permanent_baud: settings.permanent_baud, writes: 0 }
     }
 
@@ -48,7 +42,7 @@ impl Eeprom {
 
     /// Whether measured values end with scan and telegram index.
     pub(crate) fn has_indices(&self) -> bool {
-        self.configuration[AVAILABILITY] & 2 != 0
+        self.configuration[AVAILABILITY] & REAL_TIME_INDICES != 0
     }
 
     pub(crate) fn power_on_baud(&self) -> Baud {
@@ -66,14 +60,8 @@ impl Eeprom {
     }
 }
 
-const PEAK: usize = 2;
 const AVAILABILITY: usize = 4;
 const MODE: usize = 5;
 const UNIT: usize = 6;
-const EVALUATIONS: usize = 9;
-const RESTART: usize = 10;
-const DAZZLE: usize = 32;
-const SHORT: usize = 32;
-const LONG: usize = 34;
 /// Measuring modes of the listing (77h block D), and the two that a sensor needs for reflectivity (reference 1.6).
 const MODES: [u8; 11] = [0x00, 0x01, 0x02, 0x03, 0x04, 0x05, 0x06, 0x0D, 0x0E, 0x0F, 0x3F];

@@ -65,15 +65,17 @@ pub struct Machine {
     pub(crate) variant: Variant,
     baud: Baud,
     ear: Ear,
-    random: fastrand::Rng,
+    pub(crate) random: fastrand::Rng,
     habits: fastrand::Rng,
     queue: VecDeque<Transmission<Tag>>,
     /// When the next scan of the stream begins to leave; `None` while there is no stream.
     next_scan_ns: Option<Nanos>,
     /// Before it has started it hears nothing.
     started_ns: Nanos,
-    /// Telegrams of measured values since power-on, and those of them that were partial scans.
+    /// Telegrams of measured values since power-on.
     scans: u64,
+    /// Partial scans since the operating mode was changed.
+    pub(crate) partials: u64,
 }
 
 /// What a transmission is.
@@ -105,6 +107,7 @@ impl Machine {
             next_scan_ns: None,
             started_ns: 0,
             scans: 0,
+            partials: 0,
         };
         match machine.settings.start.clone() {
             Start::In(operating) => {
@@ -182,7 +185,7 @@ impl Machine {
         let Answer { reply, delay_ns, after } = self.answer(request, first_ns);
         let acknowledged_ns = self.send(vec![ACK], first_ns, Tag::Acknowledge);
         let late_ns = self.settings.habits.late_reply_ns;
-        let reply_ns = acknowledged_ns + delay_ns + late_ns + self.random.u64(..3 * MILLIS);
+        let reply_ns = acknowledged_ns + delay_ns + late_ns;
         let late = late_ns > 0;
         let end_ns = self.send(reply.clone(), reply_ns, Tag::Reply { late, after });
         if self.chance(self.settings.habits.doubles) {
@@ -218,8 +221,9 @@ impl Machine {
         let (variant, unit, mode) = (self.variant, self.eeprom.unit(), self.eeprom.mode());
         let Settings { address, status, .. } = self.settings;
         let index = self.eeprom.has_indices().then_some(self.scans as u8);
-        let turn = self.scans;
+        let turn = self.partials;
         self.scans += 1;
+        self.partials += u64::from(*operating == Operating::Partial);
         let shot = |room| Shot { room, variant, unit, mode, at_ns, address, status, index, turn };
         self.source.telegram(operating, shot)
     }
@@ -282,6 +286,7 @@ impl Machine {
         self.variant = self.settings.variant;
         self.baud = self.eeprom.power_on_baud();
         self.scans = 0;
+        self.partials = 0;
         self.started_ns = now + self.settings.boot_ns;
         self.ear = Ear::new(self.settings.speed);
         self.send(self.banner(), self.started_ns, Tag::Reply { late: false, after: After::Nothing });

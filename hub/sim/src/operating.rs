@@ -1,7 +1,10 @@
 //! The operating modes: what a sensor sends unasked after a request 20h, or once after one of its own kind, and how
 //! such a telegram is laid out (Telegram listing, 20h, 30h to 3Fh and 75h). Knows nothing of the line.
 
-use lms::telegram::{REPLY, Telegram, Writer};
+use lms::command::Request;
+use lms::measured::{Frame, encode_with};
+use lms::operating::{self as mode, Operating as Asked};
+use lms::telegram::{REPLY, Writer};
 use lms::variant::{MIRROR_TURN, Mode, Unit, Variant};
 use lms::{Nanos, line_time};
 
@@ -49,15 +52,15 @@ impl Operating {
     /// The byte after 20h.
     pub fn code(&self) -> u8 {
         match self {
-            Operating::Installation => 0x00,
-            Operating::All => 0x24,
-            Operating::OnRequest => 0x25,
-            Operating::Means(_) => 0x26,
-            Operating::Range(..) => 0x27,
-            Operating::MeanRange(..) => 0x28,
-            Operating::Fields(..) => 0x29,
-            Operating::Partial => 0x2A,
-            Operating::Reflectivity(_) => 0x2B,
+            Operating::Installation => mode::INSTALLATION,
+            Operating::All => mode::STREAM,
+            Operating::OnRequest => mode::ON_REQUEST,
+            Operating::Means(_) => mode::MEANS,
+            Operating::Range(..) => mode::RANGE,
+            Operating::MeanRange(..) => mode::RANGE_MEANS,
+            Operating::Fields(..) => mode::RANGE_FIELDS,
+            Operating::Partial => mode::PARTIAL,
+            Operating::Reflectivity(_) => mode::REFLECTIVITIES,
         }
     }
 
@@ -66,38 +69,30 @@ impl Operating {
         !matches!(self, Operating::Installation | Operating::OnRequest)
     }
 
-    /// The mode that the data of a request 20h name, if a sensor set to `variant` can do it; not the installation,
+    /// What `request` asks for, once or from now on, if a sensor set to `variant` can do it; not the installation,
     /// which takes a password.
-    pub(crate) fn of_mode(data: &[u8], variant: Variant) -> Option<Operating> {
-        let (&code, data) = data.split_first()?;
-        let operating = match (code, data) {
-            (0x24, []) => Operating::All,
-            (0x25, []) => Operating::OnRequest,
-            (0x26, &[shots]) => Operating::Means(shots),
-            (0x27, &[a, b, c, d]) => Operating::Range(word(a, b), word(c, d)),
-            (0x28, &[shots, a, b, c, d]) => Operating::MeanRange(shots, word(a, b), word(c, d)),
-            (0x29, &[a, b, c, d]) => Operating::Fields(word(a, b), word(c, d)),
-            (0x2A, []) => Operating::Partial,
-            (0x2B, data) => Operating::Reflectivity(ranges(data)?),
+    pub(crate) fn of_request(request: Request, variant: Variant) -> Option<Operating> {
+        let operating = match request {
+            Request::Stream | Request::Values(1) => Operating::All,
+            Request::Stop => Operating::OnRequest,
+            Request::Operate(Asked::Partial) | Request::Values(8) => Operating::Partial,
+            Request::Operate(Asked::Means(shots)) | Request::Means(shots) => Operating::Means(shots),
+            Request::Operate(Asked::Range(span)) | Request::Range(span) => {
+                Operating::Range(span.first, span.last)
+            }
+            Request::Operate(Asked::RangeMeans(shots, span)) | Request::RangeMeans(shots, span) => {
+                Operating::MeanRange(shots, span.first, span.last)
+            }
+            Request::Operate(Asked::RangeFields(span)) | Request::RangeFields(span) => {
+                Operating::Fields(span.first, span.last)
+            }
+            Request::Operate(Asked::Reflectivities(spans)) | Request::Reflectivities(spans) => {
+                let ranges = spans.as_slice().iter().map(|span| (span.first, span.last));
+                Operating::Reflectivity(ranges.collect())
+            }
             _ => return None,
         };
         operating.fits(variant).then_some(operating)
-    }
-
-    /// What a request for one telegram asks for: 30h 36h 37h 3Eh 3Fh 75h.
-    pub(crate) fn of_single(request: Telegram<'_>, variant: Variant) -> Option<Operating> {
-        let data = request.data();
-        let code = match (request.command(), data) {
-            (0x30, [1]) => return Some(Operating::All),
-            (0x30, [8]) => return Some(Operating::Partial),
-            (0x36, _) => 0x26,
-            (0x37, _) => 0x27,
-            (0x3E, _) => 0x29,
-            (0x3F, _) => 0x28,
-            (0x75, _) => 0x2B,
-            _ => return None,
-        };
-        Operating::of_mode(&[&[code], data].concat(), variant)
     }
 
     fn fits(&self, variant: Variant) -> bool {
@@ -141,15 +136,12 @@ impl Operating {
         let begin = |command| Writer::new(shot.address | REPLY, command);
         let writer = match self {
             Operating::Installation | Operating::OnRequest => return None,
-            Operating::All => {
-                let words = shot.words();
-                append(begin(0xB0).word(whole(&words)), &words)
-            }
+            Operating::All => return Some(shot.scan(None, &shot.words())),
             Operating::Partial => {
                 let step = 4 / shot.variant.turns();
                 let quarter = (shot.turn % shot.variant.turns() * step) as u8;
                 let words = shot.room.partial(quarter, shot.unit, shot.mode, shot.at_ns);
-                append(begin(0xB0).word(whole(&words) | PARTIAL | u16::from(quarter) << 11), &words)
+                return Some(shot.scan(Some(quarter), &words));
             }
             Operating::Means(shots) => {
                 let words = shot.means(*shots);
@@ -180,8 +172,8 @@ impl Operating {
                 })
             }
         };
-        let writer = match shot.index {
-            Some(index) => writer.byte((shot.at_ns / MIRROR_TURN) as u8).byte(index),
+        let writer = match shot.indices() {
+            Some((scan, telegram)) => writer.byte(scan).byte(telegram),
             None => writer,
         };
         Some(writer.byte(shot.status).finish().bytes().to_vec())
@@ -189,6 +181,17 @@ impl Operating {
 }
 
 impl Shot<'_> {
+    /// B0h of `words`, which are a whole scan or the one that begins at a quarter of a degree.
+    fn scan(&self, partial: Option<u8>, words: &[u16]) -> Vec<u8> {
+        let frame = Frame { unit: self.unit, partial, indices: self.indices() };
+        encode_with(self.address, frame, words, self.status).bytes().to_vec()
+    }
+
+    /// Numbers of the mirror turn and of the telegram, where they are wanted.
+    fn indices(&self) -> Option<(u8, u8)> {
+        self.index.map(|index| ((self.at_ns / MIRROR_TURN) as u8, index))
+    }
+
     fn words(&self) -> Vec<u16> {
         self.room.scan(self.variant, self.unit, self.mode, self.at_ns)
     }
@@ -233,22 +236,5 @@ fn append(writer: Writer, words: &[u16]) -> Writer {
     words.iter().fold(writer, |writer, &word| writer.word(word))
 }
 
-/// Number of ranges (a word; 75h is seen with a byte too), then first and last beam of each.
-fn ranges(data: &[u8]) -> Option<Vec<(u16, u16)>> {
-    let (count, pairs) = match data.len() % 4 {
-        1 => (usize::from(data[0]), &data[1..]),
-        2 => (usize::from(word(data[0], data[1])), &data[2..]),
-        _ => return None,
-    };
-    let ranges = pairs.chunks_exact(4).map(|pair| (word(pair[0], pair[1]), word(pair[2], pair[3]))).collect();
-    ((1..=5).contains(&count) && pairs.len() == 4 * count).then_some(ranges)
-}
-
-fn word(low: u8, high: u8) -> u16 {
-    u16::from_le_bytes([low, high])
-}
-
-/// Bit of the count word that marks a partial scan.
-const PARTIAL: u16 = 1 << 13;
 /// Code of a value that could not be calculated: maximum - 2 (Telegram listing 10.8).
 const OVERFLOW: u16 = 2;

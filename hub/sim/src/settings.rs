@@ -97,6 +97,14 @@ pub struct Habits {
     pub late_acknowledge_ns: Nanos,
     /// How much later than usual its reply comes; such a reply comes even if the next request is there before it.
     pub late_reply_ns: Nanos,
+    /// How much longer than usual a change of mode, rate or variant takes: up to 3 s by the listing. A request that comes
+    /// before it is over is answered at once, and the reply to the change never comes.
+    pub late_mode_ns: Nanos,
+    /// How much longer than usual a write to the EEPROM takes; SICK's quick manual allows 7 s.
+    pub late_write_ns: Nanos,
+    /// Whether it refuses in installation mode to measure, with 92h: the monitoring mode is wanted first (Telegram listing
+    /// 6.3.2; its table 7-1 allows it).
+    pub strict: bool,
     /// Commands that it refuses with 92h.
     pub refuses: Vec<u8>,
     /// Whether it answers nothing at all. A stream goes on.

@@ -11,15 +11,15 @@ use schema::{Failure, Kind};
 
 /// Asks for consent to `plan`, whose differences were shown.
 ///
-/// [`Kind::Usage`] if stdin is no terminal, [`Kind::Interrupted`] if `stop` is set, [`Kind::Failed`] if the answer is
+/// [`Kind::Usage`] if stdin or stderr, which has the question, is no terminal, [`Kind::Interrupted`] if `stop` is set, [`Kind::Failed`] if the answer is
 /// not yes.
 pub(crate) fn person(plan: Plan, stop: &AtomicBool) -> Result<Consent, Failure> {
     let input = stdin();
-    if !input.is_terminal() {
+    if !input.is_terminal() || !stderr().is_terminal() {
         return Err(Failure::new(
             Kind::Usage,
             "nothing was written: a person has to confirm it",
-            "run the same at a terminal, with stdin not redirected",
+            "run the same at a terminal, with stdin and stderr not redirected",
         ));
     }
     // What was typed before the question is no answer to it.

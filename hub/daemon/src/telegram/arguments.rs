@@ -65,11 +65,12 @@ pub(super) fn password(text: &str) -> Result<Password, Failure> {
     })
 }
 
-/// Hexadecimal, as `telegram decode` reads it.
+/// Hexadecimal, as `telegram decode` reads it; at least one byte.
 pub(super) fn bytes(words: &[&str]) -> Result<Vec<u8>, Failure> {
-    let wrong =
-        |_| refuse(format!("{:?} are no bytes", words.join(" ")), "pairs of digits, as 02 80 or 0280");
-    super::input::parse(&words.join(" ")).map_err(wrong)
+    let parsed = super::input::parse(&words.join(" ")).ok().filter(|bytes| !bytes.is_empty());
+    parsed.ok_or_else(|| {
+        refuse(format!("{:?} are no bytes", words.join(" ")), "pairs of digits, as 02 80 or 0280")
+    })
 }
 
 /// The same, as parameters of a request.

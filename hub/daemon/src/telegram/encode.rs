@@ -13,7 +13,7 @@ use lms::measured;
 use lms::operating::Operating;
 use lms::parameters::Password;
 use lms::reply::{self, Health, Reply};
-use lms::telegram::Encoded;
+use lms::telegram::{Encoded, REPLY};
 use lms::variant::{Baud, MAX_BEAMS, Mode, Unit, Variant};
 use schema::{Failure, Kind};
 use serde::Serialize;
@@ -46,12 +46,16 @@ pub fn encode(options: &EncodeOptions, out: &mut dyn Write) -> Result<(), Failur
         return Err(refuse(format!("address {}", options.address), "0 for all sensors, or 1 to 127"));
     }
     let words: Vec<&str> = options.words.iter().map(String::as_str).collect();
-    let encoded = match words[..] {
-        ["reply", ref words @ ..] => {
-            let status = options.status.as_deref().map_or(Ok(Condition::OK.0), byte)?;
+    let encoded = match (&words[..], &options.status) {
+        (["reply", words @ ..], status) => {
+            let status = status.as_deref().map_or(Ok(Condition::OK.0), byte)?;
             answer(words, options.address, status)?
         }
-        _ => request(&words, options.address)?,
+        (_, Some(status)) => {
+            let message = format!("--status {status} with {:?}", words.join(" "));
+            return Err(refuse(message, "only a reply has a status byte"));
+        }
+        (_, None) => request(&words, options.address)?,
     };
     let hex: Vec<_> = encoded.bytes().iter().map(|byte| format!("{byte:02X}")).collect();
     let written = match (options.json, options.raw) {
@@ -60,7 +64,8 @@ pub fn encode(options: &EncodeOptions, out: &mut dyn Write) -> Result<(), Failur
             let line = Line {
                 class: "encoded",
                 length: encoded.bytes().len(),
-                address: telegram.address(),
+                from: if telegram.is_reply() { "sensor" } else { "host" },
+                address: telegram.address() & !REPLY,
                 command: telegram.command(),
                 writes_eeprom: eeprom::Write::decode(telegram).is_some(),
                 words: Headline(telegram).to_string(),
@@ -85,6 +90,7 @@ pub fn encode(options: &EncodeOptions, out: &mut dyn Write) -> Result<(), Failur
 struct Line {
     class: &'static str,
     length: usize,
+    from: &'static str,
     address: u8,
     command: u8,
     writes_eeprom: bool,

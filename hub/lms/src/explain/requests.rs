@@ -32,7 +32,7 @@ pub(super) fn fields(walk: &mut Walk<'_, '_>, telegram: Telegram<'_>) -> Option<
             walk.word_as("resolution", |step| said(move |f| write!(f, "{} degrees", Degrees(step)))).map(drop)
         }
         eeprom::CONFIGURATION => replies::configuration(walk),
-        eeprom::POWER_ON => walk.byte_as("rate after power-on", power_on).map(drop),
+        eeprom::POWER_ON_RATE => walk.byte_as("rate after power-on", power_on).map(drop),
         _ => walk.rest("parameters"),
     }
 }

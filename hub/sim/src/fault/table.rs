@@ -80,6 +80,9 @@ faults! {
     twice, 0.0 to 1.0, 0.0, "share of the replies that it sends twice";
     late, 0.0 to 60.0, 0.0, "seconds by which its replies are late";
     late_ack, 0.0 to 60.0, 0.0, "seconds by which its ACK is late";
+    late_mode, 0.0 to 60.0, 0.0, "seconds more that a change of mode, rate or variant takes";
+    late_write, 0.0 to 60.0, 0.0, "seconds more that a write to the EEPROM takes";
+    strict, 0.0 to 1.0, 0.0, "1: in installation mode it refuses to measure";
     refuse, 0.0 to 255.0, 0.0, "command that it refuses, such as 0x3B";
     mute, 0.0 to 1.0, 0.0, "1: it answers nothing";
 }
@@ -101,6 +104,9 @@ impl Faults {
             doubles: self.twice,
             late_acknowledge_ns: (self.late_ack * 1e9) as Nanos,
             late_reply_ns: (self.late * 1e9) as Nanos,
+            late_mode_ns: (self.late_mode * 1e9) as Nanos,
+            late_write_ns: (self.late_write * 1e9) as Nanos,
+            strict: self.strict > 0.0,
             refuses: if self.refuse > 0.0 { vec![self.refuse as u8] } else { Vec::new() },
             mute: self.mute > 0.0,
         }
@@ -188,6 +194,8 @@ mod tests {
         let habits = "overlook=0.5,late=1.5,refuse=0x3B,mute=1".parse::<Faults>().unwrap().habits();
         assert_eq!((habits.overlooks, habits.late_reply_ns), (0.5, 1_500_000_000));
         assert_eq!((habits.refuses, habits.mute), (vec![0x3B], true));
+        let habits = "late_mode=2.5,late_write=6".parse::<Faults>().unwrap().habits();
+        assert_eq!((habits.late_mode_ns, habits.late_write_ns), (2_500_000_000, 6_000_000_000));
         assert_eq!(Faults::default().habits(), Habits::default());
     }
 }

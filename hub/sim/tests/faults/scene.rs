@@ -11,11 +11,14 @@ use sim::wire::Wire;
 
 use crate::alignment::align;
 use crate::bench::{Bench, Sent};
+use crate::effect::Effects;
 
 /// What goes wrong, and for how long.
 pub(crate) struct Scene {
     pub(crate) faults: Faults,
     pub(crate) span_ms: u64,
+    /// Whether the sensor is idle first, else it streams.
+    pub(crate) is_idle: bool,
 }
 
 /// What came of it.
@@ -31,10 +34,12 @@ pub(crate) struct Verdict {
     pub(crate) resyncs: u64,
     /// Longest time from the end of the faults to a stream.
     pub(crate) back_ms: u64,
+    pub(crate) effects: Effects,
 }
 
 impl Verdict {
     pub(crate) fn add(&mut self, other: Verdict) {
+        self.effects.add(&other.effects);
         self.intact += other.intact;
         self.faulty += other.faulty;
         self.wrong += other.wrong;
@@ -45,11 +50,14 @@ impl Verdict {
 }
 
 impl Scene {
+    /// Bad habits show while the sensor is asked: it is idle then.
+    pub(crate) fn new(faults: Faults, span_ms: u64) -> Scene {
+        Scene { faults, span_ms, is_idle: faults.habits() != Habits::default() }
+    }
+
     pub(crate) fn run(&self, seed: u64) -> Verdict {
-        // Bad habits show while it is asked: it is idle then.
         let habits = self.faults.habits();
-        let is_good = habits == Habits::default();
-        let start = Start::In(if is_good { Operating::All } else { Operating::OnRequest });
+        let start = Start::In(if self.is_idle { Operating::OnRequest } else { Operating::All });
         let baud = Baud::B500000;
         let boot_ns = 200 * MILLIS;
         let settings = Settings { baud, start, boot_ns, habits, seed, ..Settings::default() };
@@ -67,7 +75,8 @@ impl Scene {
         bench.to_host = Box::new(|_, _| Vec::new());
         bench.run(40 * MILLIS);
         let verdict = self.account(&bench, seed);
-        Verdict { resyncs: bench.session.resyncs(), back_ms: back / MILLIS, ..verdict }
+        let effects = Effects::of(&bench);
+        Verdict { effects, resyncs: bench.session.resyncs(), back_ms: back / MILLIS, ..verdict }
     }
 
     /// Holds what was delivered against what was sent.
@@ -95,7 +104,7 @@ impl Scene {
     }
 
     fn name(&self, seed: u64) -> String {
-        let state = if self.faults.habits() == Habits::default() { "streaming" } else { "idle" };
+        let state = if self.is_idle { "idle" } else { "streaming" };
         let (world, faults) = (world(seed).0, self.faults);
         format!("--baud 500000 --boot 200ms --state {state} --world {world} --seed {seed} --fault {faults}")
     }

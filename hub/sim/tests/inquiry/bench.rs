@@ -9,21 +9,25 @@ use lms::telegram::{Encoded, FRAME};
 use lms::variant::Baud;
 use lms::{MICROS, MILLIS, Nanos, line_time};
 use sim::Arrival;
-use sim::machine::{Chunk, Machine, Part, Settings};
+use sim::fault::Faults;
+use sim::machine::{Machine, Part, Settings};
 use sim::noise::Receiver;
 use sim::room::{Room, World};
 use sim::source::Source;
+use sim::wire::{Carried, Wire};
 
 /// What becomes of bytes on their way.
-pub(crate) type Wire = Box<dyn FnMut(Vec<u8>) -> Vec<u8>>;
+pub(crate) type Way = Box<dyn FnMut(Vec<u8>) -> Vec<u8>>;
 
 /// Both ends and the line.
 pub(crate) struct Bench<C> {
     pub(crate) talk: C,
     pub(crate) machine: Machine,
     pub(crate) now: Nanos,
-    pub(crate) to_host: Wire,
-    pub(crate) to_sensor: Wire,
+    /// What goes wrong on the line by itself.
+    pub(crate) wire: Wire,
+    pub(crate) to_host: Way,
+    pub(crate) to_sensor: Way,
     /// Telegrams that were said.
     pub(crate) said: Vec<Vec<u8>>,
     port: Baud,
@@ -67,6 +71,7 @@ impl<C: Conversation> Bench<C> {
             talk,
             machine,
             now,
+            wire: Wire::new(&Faults::default(), 0),
             to_host: Box::new(|bytes| bytes),
             to_sensor: Box::new(|bytes| bytes),
             said: Vec::new(),
@@ -101,9 +106,10 @@ impl<C: Conversation> Bench<C> {
     pub(crate) fn overhear(&mut self, span: Nanos) -> Vec<Vec<u8>> {
         let mut sent = Vec::new();
         let end = self.now + span;
-        while let Some(at) = self.machine.poll_timeout().filter(|&at| at <= end) {
-            while let Some(chunk) = self.machine.poll_transmit(at) {
-                if let Part::End(whole) = chunk.part {
+        while let Some(at) = self.wire.poll_timeout(&self.machine, self.now).filter(|&at| at <= end) {
+            self.now = self.now.max(at);
+            while let Some(carried) = self.wire.poll_transmit(&mut self.machine, self.now) {
+                if let Some(Part::End(whole)) = carried.part {
                     sent.push(whole.telegram);
                 }
             }
@@ -128,7 +134,7 @@ impl<C: Conversation> Bench<C> {
 
     fn wait(&mut self, until: Nanos) {
         while self.inbox.is_empty() {
-            match self.machine.poll_timeout() {
+            match self.wire.poll_timeout(&self.machine, self.now) {
                 Some(at) if at <= until => self.advance(at),
                 _ => return self.advance(until.max(self.now) + WAKE),
             }
@@ -154,30 +160,31 @@ impl<C: Conversation> Bench<C> {
         self.advance(self.now + byte_ns);
         for byte in (self.to_sensor)(vec![byte]) {
             if self.machine.baud() == self.port {
-                self.machine.receive(byte, Arrival::at(self.now));
+                self.wire.receive(&mut self.machine, byte, Arrival::at(self.now));
             }
         }
     }
 
     fn advance(&mut self, to: Nanos) {
-        while let Some(at) = self.machine.poll_timeout().filter(|&at| at <= to) {
+        while let Some(at) = self.wire.poll_timeout(&self.machine, self.now).filter(|&at| at <= to) {
             self.now = self.now.max(at);
-            while let Some(chunk) = self.machine.poll_transmit(self.now) {
-                self.carry(chunk);
+            while let Some(carried) = self.wire.poll_transmit(&mut self.machine, self.now) {
+                self.carry(carried);
             }
         }
         self.now = self.now.max(to);
     }
 
-    fn carry(&mut self, chunk: Chunk) {
-        let mut bytes = (self.to_host)(chunk.bytes);
-        if chunk.baud != self.port {
-            let rates = (chunk.baud, self.port);
+    fn carry(&mut self, carried: Carried) {
+        let Carried { bytes, baud, idle_after, .. } = carried;
+        let mut bytes = (self.to_host)(bytes);
+        if baud != self.port {
+            let rates = (baud, self.port);
             if self.garbled.as_ref().is_none_or(|(known, _)| *known != rates) {
                 self.garbled = Some((rates, Receiver::new(rates.0.rate(), rates.1.rate())));
             }
             let receiver = self.garbled.as_mut().map(|(_, receiver)| receiver);
-            bytes = receiver.map_or(Vec::new(), |receiver| receiver.receive(&bytes, chunk.idle_after));
+            bytes = receiver.map_or(Vec::new(), |receiver| receiver.receive(&bytes, idle_after));
         }
         self.inbox.extend(bytes);
     }

@@ -5,14 +5,16 @@ use lms::change::{Change, Consent, Failing, Outcome, Plan, Step};
 use lms::configuration::Configuration;
 use lms::eeprom::PowerOn;
 use lms::parameters::Password;
+use lms::telegram::{NAK, Writer};
 use lms::variant::{Baud, Mode, Unit};
 use lms::{Inquiry, MILLIS, Nanos};
 use sim::machine::{Habits, Machine, Settings};
+use sim::operating::Operating;
 
 use crate::bench::{Bench, machine, make_stream, sensor};
 
 /// Asks the sensor what it is; returns the plan to change nothing, and when that was known.
-fn plan(machine: Machine, now: Nanos) -> (Plan, Machine, Nanos) {
+pub(crate) fn plan(machine: Machine, now: Nanos) -> (Plan, Machine, Nanos) {
     let mut bench = Bench::new(Inquiry::new(Baud::B500000, now), Baud::B500000, machine, now);
     bench.finish(20_000 * MILLIS);
     let plan = Plan::of(bench.talk.report()).expect("it told all of it");
@@ -20,17 +22,17 @@ fn plan(machine: Machine, now: Nanos) -> (Plan, Machine, Nanos) {
 }
 
 /// Unit mm, mode 4.
-fn other_values(plan: &mut Plan) {
+pub(crate) fn other_values(plan: &mut Plan) {
     plan.new.set(5, 4);
     plan.new.set(6, Unit::Cm.code());
 }
 
-fn change(plan: Plan, machine: Machine, now: Nanos) -> Bench<Change> {
+pub(crate) fn change(plan: Plan, machine: Machine, now: Nanos) -> Bench<Change> {
     Bench::new(Change::new(Consent::of_a_person(plan), now), plan.baud, machine, now)
 }
 
 /// What the sensor says of itself now.
-fn again(bench: Bench<Change>) -> (Plan, Machine, Nanos) {
+pub(crate) fn again(bench: Bench<Change>) -> (Plan, Machine, Nanos) {
     plan(bench.machine, bench.now)
 }
 
@@ -125,6 +127,18 @@ fn a_refused_write_leaves_what_was() {
 }
 
 #[test]
+fn another_unit_may_take_seven_seconds() {
+    let (mut plan, mut machine, now) = plan(sensor(Baud::B38400), 0);
+    other_values(&mut plan);
+    machine.set_habits(Habits { late_write_ns: 6_000 * MILLIS, ..Habits::default() });
+    let mut bench = change(plan, machine, now);
+    let took = bench.finish(60_000 * MILLIS);
+    assert!(took > 7_000 * MILLIS, "{took}");
+    assert_eq!((bench.talk.outcome().failed, bench.machine.eeprom_writes()), (None, 1));
+    assert_eq!(bench.talk.outcome().configuration, Some(plan.new));
+}
+
+#[test]
 fn a_reply_that_was_lost_costs_no_second_write() {
     let (mut plan, machine, now) = plan(sensor(Baud::B38400), 0);
     other_values(&mut plan);
@@ -193,4 +207,83 @@ fn bad_habits_and_lossy_lines_never_lie() {
     }
     println!("{done} of 60 done");
     assert!(done >= 45, "{done} of 60");
+}
+
+/// Loses the first `count` stops on their way.
+fn losing_stops(mut count: usize) -> Box<dyn FnMut(Vec<u8>) -> Vec<u8>> {
+    let mut last = [0; 6];
+    Box::new(move |bytes| {
+        for &byte in &bytes {
+            last.rotate_left(1);
+            last[5] = byte;
+        }
+        let is_lost = count > 0 && last == [0x02, 0x00, 0x02, 0x00, 0x20, 0x25];
+        count -= usize::from(is_lost);
+        if is_lost { Vec::new() } else { bytes }
+    })
+}
+
+#[test]
+fn the_installation_mode_is_left_although_stops_are_lost() {
+    for (lost, streaming) in [(4, false), (4, true), (7, false), (7, true)] {
+        let mut machine = sensor(Baud::B38400);
+        let now = if streaming { make_stream(&mut machine) } else { 0 };
+        let (mut plan, machine, now) = plan(machine, now);
+        other_values(&mut plan);
+        let mut bench = change(plan, machine, now);
+        bench.to_sensor = losing_stops(lost);
+        bench.finish(60_000 * MILLIS);
+        let outcome = *bench.talk.outcome();
+        let failed = (lost > 4).then_some((Step::Leave, Failing::Unanswered));
+        assert_eq!((outcome.failed, outcome.configuration), (failed, Some(plan.new)), "{lost} {streaming}");
+        let expected = if streaming { Operating::All } else { Operating::OnRequest };
+        assert_eq!(*bench.machine.operating(), expected, "{lost} {streaming}");
+        assert_eq!(outcome.operating_mode, Some(expected.code()));
+    }
+}
+
+#[test]
+fn a_stray_nak_is_not_believed_where_it_does_harm() {
+    // Before the first reply, and while the sensor writes: behind the ACK and F4h of 42 bytes, the ACK and A0h of 9.
+    for after in [0, 53] {
+        let (mut plan, mut machine, now) = plan(sensor(Baud::B38400), 0);
+        other_values(&mut plan);
+        machine.set_habits(Habits { late_write_ns: 5_000 * MILLIS, ..Habits::default() });
+        let mut bench = change(plan, machine, now);
+        let mut heard = 0;
+        bench.to_host = Box::new(move |mut bytes| {
+            heard += bytes.len();
+            if heard == after + 1 {
+                bytes.push(NAK);
+            }
+            bytes
+        });
+        bench.finish(60_000 * MILLIS);
+        assert_eq!((bench.talk.outcome().failed, bench.machine.eeprom_writes()), (None, 1), "{after}");
+        let commands: Vec<u8> = bench.said.iter().map(|telegram| telegram[4]).collect();
+        assert_eq!(commands, [0x74, 0x20, 0x77, 0x20, 0x74], "{after}: nothing was said twice");
+    }
+}
+
+#[test]
+fn a_reply_that_cannot_be_read_is_no_refusal() {
+    let (mut plan, machine, now) = plan(sensor(Baud::B38400), 0);
+    other_values(&mut plan);
+    let mut bench = change(plan, machine, now);
+    let (mut heard, short) =
+        (0, Writer::new(0x80, 0xF7).byte(1).slice(&plan.new.bytes()[..7]).byte(0x10).finish());
+    bench.to_host = Box::new(move |bytes| {
+        let before = heard;
+        heard += bytes.len();
+        // ACK and F4h of 42 bytes, ACK and A0h of 9, ACK; then F7h of 43.
+        match before {
+            54 => short.bytes().to_vec(),
+            55..97 => Vec::new(),
+            _ => bytes,
+        }
+    });
+    bench.finish(60_000 * MILLIS);
+    let outcome = *bench.talk.outcome();
+    assert_eq!((outcome.failed, outcome.configuration), (None, Some(plan.new)));
+    assert_eq!(bench.machine.eeprom_writes(), 1);
 }

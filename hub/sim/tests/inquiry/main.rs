@@ -3,5 +3,6 @@
 mod anything;
 mod bench;
 mod change;
+mod faults;
 mod finding;
 mod trouble;

@@ -2,8 +2,12 @@
 
 use lms::MILLIS;
 use lms::command::Request;
+use lms::eeprom::{PowerOn, Write};
+use lms::operating::Operating;
+use lms::parameters::Password;
 use lms::reply::Reply;
 use lms::telegram::{ACK, NAK};
+use lms::variant::{Baud, Variant};
 use sim::machine::{Habits, Settings};
 
 use crate::bench::Bench;
@@ -59,4 +63,67 @@ fn a_late_reply_comes_though_the_next_request_was_there_before_it() {
     let asked = bench.now;
     bench.run_until(asked + 1_000 * MILLIS);
     assert!(bench.chunks[0].0 >= asked + 300 * MILLIS && bench.chunks[0].1.bytes == [ACK]);
+}
+
+#[test]
+fn a_mode_is_changed_slowly_and_a_status_told_at_once() {
+    let mut bench = with(Habits { late_mode_ns: 2_000 * MILLIS, ..Habits::default() });
+    for request in [Request::Stop, Request::Variant(Variant::ALL[0]), Request::Baud(Baud::B500000)] {
+        assert_eq!(bench.ask(request.encode(0).bytes()), [ACK]);
+        let before = bench.sent().len();
+        bench.run_until(bench.now + 2_000 * MILLIS);
+        assert_eq!(bench.sent().len(), before + 1, "{request:?}");
+    }
+    // Whoever does not wait is answered, and never hears that the change was made.
+    assert_eq!(bench.ask(Request::Stop.encode(0).bytes()), [ACK]);
+    let before = bench.sent().len();
+    assert!(matches!(reply(&bench.ask(Request::Status.encode(0).bytes())), Reply::Status(_)));
+    bench.run_until(bench.now + 5_000 * MILLIS);
+    assert_eq!(bench.sent().len(), before + 1);
+}
+
+#[test]
+fn writing_the_eeprom_takes_its_time() {
+    let mut bench = with(Habits { late_write_ns: 6_000 * MILLIS, ..Habits::default() });
+    assert_eq!(
+        reply(&bench.ask(Request::install(Password::FACTORY).encode(0).bytes())),
+        Reply::Mode { done: true }
+    );
+    for write in [Write::Configuration(&[20, 0]), Write::PowerOn(PowerOn::Baud9600)] {
+        let before = bench.sent().len();
+        assert_eq!(bench.ask(write.encode(0).expect("short enough").bytes()), [ACK]);
+        bench.run_until(bench.now + 5_400 * MILLIS);
+        assert_eq!(bench.sent().len(), before, "{write:?}");
+        bench.run_until(bench.now + 600 * MILLIS);
+        assert_eq!(bench.sent()[before].1.telegram[4], write.command() | 0x80);
+    }
+}
+
+#[test]
+fn a_strict_sensor_does_not_measure_in_installation_mode() {
+    for strict in [false, true] {
+        let mut bench = with(Habits { strict, ..Habits::default() });
+        bench.ask(Request::install(Password::FACTORY).encode(0).bytes());
+        let measuring = [
+            Request::Operate(Operating::Means(2)),
+            Request::Operate(Operating::Partial),
+            Request::Values(1),
+            Request::Means(2),
+            Request::Stream,
+        ];
+        for request in measuring {
+            bench.ask(Request::install(Password::FACTORY).encode(0).bytes());
+            let before = bench.sent().len();
+            bench.ask(request.encode(0).bytes());
+            let reply = bench.sent()[before..]
+                .iter()
+                .find(|(_, sent)| sent.is_reply)
+                .map(|(_, sent)| sent.telegram[4]);
+            assert_eq!(reply == Some(0x92), strict, "{request:?}");
+        }
+        bench.ask(Request::Stop.encode(0).bytes());
+        assert_eq!(*bench.machine.operating(), sim::operating::Operating::OnRequest);
+        let bytes = bench.ask(Request::Stream.encode(0).bytes());
+        assert_eq!(bytes[5], 0xA0);
+    }
 }

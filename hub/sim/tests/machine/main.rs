@@ -69,7 +69,7 @@ fn a_start_up_at_9600_to_a_stream_at_500k() {
 #[test]
 fn the_times_of_an_answer() {
     for (request, least, most) in
-        [(Request::Status, 0, 60 * MILLIS), (Request::Stop, 50 * MILLIS, 120 * MILLIS)]
+        [(Request::Status, 55 * MILLIS, 160 * MILLIS), (Request::Stop, 55 * MILLIS, 100 * MILLIS)]
     {
         let mut bench = Bench::new(fast());
         bench.say(request.encode(0).bytes(), 60 * MICROS);

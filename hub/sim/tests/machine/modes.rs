@@ -61,6 +61,18 @@ fn partial_scans_take_turns() {
 }
 
 #[test]
+fn partial_scans_begin_with_the_first() {
+    let mut bench = Bench::new(fast());
+    bench.ask(Writer::new(0, 0x30).byte(1).finish().bytes());
+    bench.ask(Writer::new(0, 0x20).byte(0x2A).finish().bytes());
+    let sent = bench.sent();
+    let quarters = sent[2..4].iter().map(|(_, sent)| {
+        Measured::decode(Telegram::check(&sent.telegram).unwrap()).and_then(|measured| measured.partial())
+    });
+    assert_eq!(quarters.collect::<Vec<_>>(), [Some(0), Some(2)]);
+}
+
+#[test]
 fn indices_count_mirror_turns_and_telegrams() {
     let settings = Settings { availability: 2, baud: Baud::B38400, ..fast() };
     let telegrams = streamed(Operating::All, settings);
@@ -80,11 +92,11 @@ fn one_telegram_may_be_asked_for() {
     let mut bench = Bench::new(Settings { unit: Unit::Cm, ..fast() });
     for (request, command, len) in [
         (Writer::new(0, 0x30).byte(1), 0xB0, 732),
-        (Writer::new(0, 0x30).byte(8), 0xB0, 370),
+        (Writer::new(0, 0x30).byte(8), 0xB0, 372),
         (Writer::new(0, 0x36).byte(3), 0xB6, 733),
         (Writer::new(0, 0x37).word(1).word(361), 0xB7, 736),
-        (Writer::new(0, 0x75).byte(1).word(1).word(10), 0xF5, 56),
         (Writer::new(0, 0x75).word(1).word(1).word(10), 0xF5, 56),
+        (Writer::new(0, 0x75).byte(1).word(1).word(10), 0x92, 8),
         (Writer::new(0, 0x37).word(1).word(362), 0x92, 8),
         (Writer::new(0, 0x3E).word(1).word(101), 0x92, 8),
         (Writer::new(0, 0x75).word(1).word(1).word(361), 0x92, 8),

@@ -1,9 +1,11 @@
 //! A sensor that streams already when the session begins: left by a hub that was killed, or by another program.
 
-use lms::variant::Baud;
-use lms::{MICROS, MILLIS, Settings, State};
+use lms::variant::{Baud, Mode};
+use lms::{Control, MICROS, MILLIS, Settings, State};
+use sim::machine::{self, Start};
+use sim::operating::Operating;
 
-use crate::bench::{Bench, WANTED, make_stream, sensor};
+use crate::bench::{Bench, WANTED, make_stream, sensor, sensor_with};
 
 #[test]
 fn at_the_wanted_rate_it_is_taken_as_it_streams() {
@@ -57,5 +59,41 @@ fn on_a_slow_line_it_is_waited_for() {
         assert!(bench.said.iter().all(|(at, _)| *at >= first), "spoke before it listened: {bench}");
         bench.run(10_000 * MILLIS);
         assert_eq!(bench.states, [State::Probing, State::Streaming], "{bench}");
+    }
+}
+
+#[test]
+fn another_one_is_not_taken_for_the_first() {
+    for resync in [false, true] {
+        let mut bench = Bench::new(sensor(Baud::B500000), 0);
+        bench.until("streaming", 3_000 * MILLIS, Bench::is_streaming);
+        assert_eq!(bench.session.sensor().mode, Some(Mode(1)));
+        // It streams as the first one did, but what its values mean is something else.
+        let mut other = sensor_with(machine::Settings {
+            baud: Baud::B500000,
+            start: Start::In(Operating::All),
+            mode: Mode(4),
+            type_name: "LMS291;S05063;V02.30 ".into(),
+            ..machine::Settings::default()
+        });
+        let now = bench.now;
+        let back = now + if resync { 300 * MILLIS } else { 1_050 * MILLIS };
+        bench.to_host = Box::new(move |at, bytes| if at < back { Vec::new() } else { bytes });
+        bench.run(back - now);
+        while other.poll_timeout().is_some_and(|at| at < back) {
+            while other.poll_transmit(back).is_some() {}
+        }
+        bench.machine = other;
+        if resync {
+            bench.session.control(Control::Resync, bench.now);
+        }
+        let since = bench.now;
+        bench.states.clear();
+        bench.until("streaming", 3_000 * MILLIS, |bench| bench.received_scans(since).len() > 4);
+        let known = bench.session.sensor();
+        assert_eq!((known.mode, known.kind()), (Some(Mode(4)), &b"LMS291;S05063;V02.30"[..]), "{bench}");
+        let told = bench.received.iter().filter(|got| got.at > since);
+        assert!(told.filter_map(|got| got.mode).all(|mode| mode == Mode(4)), "{bench}");
+        assert!(!bench.states.contains(&State::Starting), "it was adopted: {bench}");
     }
 }

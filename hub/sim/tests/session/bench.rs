@@ -5,7 +5,7 @@ use std::collections::VecDeque;
 
 use lms::command::Request;
 use lms::session::{Output, Session};
-use lms::variant::{Baud, Variant};
+use lms::variant::{Baud, Mode, Variant};
 use lms::{MICROS, MILLIS, Nanos, Settings, State, line_time};
 use sim::Arrival;
 use sim::fault::{Fault, Faults};
@@ -31,6 +31,12 @@ pub(crate) struct Bench {
     pub(crate) to_sensor: ToSensor,
     /// Bytes that the session said, with the time.
     pub(crate) said: Vec<(Nanos, u8)>,
+    /// When the sensor got the last byte of a request.
+    pub(crate) asked: Vec<Nanos>,
+    /// Each ACK or NAK that came, with the time.
+    pub(crate) acknowledged: Vec<(Nanos, u8)>,
+    /// Bytes that came and that the sensor did not send, beside those inside telegrams.
+    pub(crate) foreign: usize,
     pub(crate) sent: Vec<Sent>,
     pub(crate) received: Vec<Received>,
     /// Every state that was seen, once in a row.
@@ -72,6 +78,8 @@ pub(crate) struct Sent {
 pub(crate) struct Received {
     pub(crate) at: Nanos,
     pub(crate) telegram: Vec<u8>,
+    /// How its values are split, if that was known when it was delivered.
+    pub(crate) mode: Option<Mode>,
     /// Why it is suspect; 0 is clean.
     #[allow(dead_code, reason = "for the tests of faults")]
     pub(crate) reasons: u8,
@@ -124,6 +132,9 @@ impl Bench {
             to_host: Box::new(|_, bytes| bytes),
             to_sensor: Box::new(|_, byte| Some(byte)),
             said: Vec::new(),
+            asked: Vec::new(),
+            acknowledged: Vec::new(),
+            foreign: 0,
             sent: Vec::new(),
             received: Vec::new(),
             states: Vec::new(),
@@ -208,8 +219,8 @@ impl Bench {
                 Output::Telegram(received) => {
                     let telegram = received.telegram.bytes().to_vec();
                     let looks = std::mem::take(&mut self.looks);
-                    let reasons = received.reasons;
-                    self.received.push(Received { at: self.now, telegram, reasons, looks });
+                    let lms::session::Received { mode, reasons, .. } = received;
+                    self.received.push(Received { at: self.now, telegram, mode, reasons, looks });
                 }
                 Output::Rest(until) => break (false, until),
                 Output::Wait { until, .. } => break (true, until),
@@ -247,10 +258,12 @@ impl Bench {
             assert!((55 * MICROS..=6 * MILLIS).contains(&gap), "{gap} ns between two bytes of a request");
         }
         self.request.push(byte);
+        let mut is_whole = false;
         if let [_, _, low, high, ..] = self.request[..]
             && self.request.len() == usize::from(u16::from_le_bytes([low, high])) + lms::telegram::FRAME
         {
             self.request.clear();
+            is_whole = true;
         }
         let number = self.said.len();
         self.said.push((self.now, byte));
@@ -260,6 +273,7 @@ impl Bench {
             && self.machine.baud() == self.port
         {
             self.wire.receive(&mut self.machine, byte, Arrival::at(self.now));
+            self.asked.extend(is_whole.then_some(self.now));
         }
     }
 
@@ -292,8 +306,12 @@ impl Bench {
         self.damaged |= bytes != brought;
         self.inbox.extend(bytes);
         match part {
-            None | Some(Part::Telegram) => {}
-            Some(Part::Acknowledge) => self.damaged = false,
+            None => self.foreign += brought.len(),
+            Some(Part::Telegram) => {}
+            Some(Part::Acknowledge) => {
+                self.damaged = false;
+                self.acknowledged.extend(brought.first().map(|&byte| (self.now, byte)));
+            }
             Some(Part::End(machine::Sent { is_reply, telegram, aborted })) => {
                 let fault = self.fault.take();
                 let damaged = std::mem::take(&mut self.damaged) || fault.is_some();

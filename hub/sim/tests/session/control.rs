@@ -1,7 +1,8 @@
 //! What a user may ask of a running session: pause, resume, resync.
 
 use lms::variant::Baud;
-use lms::{Control, MILLIS, Nanos, State};
+use lms::{Control, MILLIS, Nanos, State, Trouble};
+use sim::operating::Operating;
 
 use crate::bench::{Bench, make_stream, sensor};
 
@@ -44,22 +45,22 @@ fn a_pause_stops_the_stream_and_a_resume_starts_it() {
 
 #[test]
 fn a_pause_may_come_at_any_moment() {
-    for baud in [Baud::B9600, Baud::B500000] {
+    for baud in [Baud::B9600, Baud::B38400, Baud::B500000] {
         for streams in [false, true] {
-            for at in 0..16 {
+            for at in 0..60 {
                 let mut machine = sensor(baud);
                 let begun = if streams { make_stream(&mut machine) } else { 0 };
                 let mut bench = Bench::new(machine, begun);
-                bench.run(at * 67 * MILLIS);
+                bench.run(at * 23 * MILLIS);
                 bench.control(Control::Pause);
                 assert_eq!(bench.session.state(), State::Paused);
                 bench.run(5_000 * MILLIS);
                 let (quiet, said) = (bench.now, bench.said.len());
                 bench.run(2_000 * MILLIS);
                 assert_eq!((bench.session.state(), bench.said.len()), (State::Paused, said), "{bench}");
-                if bench.machine.baud() == bench.session.baud() {
-                    assert_eq!(sent_after(&bench, quiet), 0, "{at}: the sensor streams on: {bench}");
-                }
+                assert_eq!(sent_after(&bench, quiet), 0, "{at}: the sensor streams on: {bench}");
+                assert_eq!(bench.machine.operating(), &Operating::OnRequest, "{at}: {bench}");
+                assert_eq!(bench.session.trouble(), None, "{at}: {bench}");
                 bench.control(Control::Resume);
                 bench.until("streaming", 5_000 * MILLIS, Bench::is_streaming);
                 bench.run(200 * MILLIS);
@@ -79,6 +80,26 @@ fn an_absent_sensor_is_paused_in_peace() {
     assert!(said <= 8 * 8, "{said} bytes to nobody");
     bench.run(60_000 * MILLIS);
     assert_eq!((bench.session.state(), bench.said.len()), (State::Paused, said));
+    assert_eq!(bench.session.trouble(), None);
+    // A pause does not count as time in which it did not answer.
+    bench.control(Control::Resume);
+    bench.until("said", 3_000 * MILLIS, |bench| bench.session.trouble().is_some());
+    assert!(matches!(bench.session.trouble(), Some(Trouble::NoAnswer { seconds: 0..=3, .. })), "{bench}");
+}
+
+#[test]
+fn what_sends_at_another_rate_and_does_not_listen_is_no_pause() {
+    let mut machine = sensor(Baud::B38400);
+    let begun = make_stream(&mut machine);
+    let mut bench = Bench::new(machine, begun);
+    bench.to_sensor = Box::new(|_, _| None);
+    bench.run(300 * MILLIS);
+    bench.control(Control::Pause);
+    bench.run(20_000 * MILLIS);
+    let said = bench.said.len();
+    bench.run(60_000 * MILLIS);
+    assert_eq!((bench.session.state(), bench.said.len()), (State::Paused, said));
+    assert_eq!(bench.session.trouble(), Some(Trouble::NotStopped), "{bench}");
 }
 
 #[test]
@@ -96,14 +117,16 @@ fn what_streams_on_is_delivered_and_told_to_stop_some_times() {
     let said = bench.said.len();
     bench.run(10_000 * MILLIS);
     assert_eq!((bench.session.state(), bench.said.len()), (State::Paused, said), "{bench}");
+    assert_eq!(bench.session.trouble(), Some(Trouble::NotStopped), "{bench}");
     let mut intact = bench.intact_scans(paused);
     assert!(intact.len() > 1400);
     intact.truncate(bench.received_scans(paused).len());
     assert_eq!(bench.received_scans(paused), intact);
     bench.control(Control::Resume);
     bench.until("streaming", 100 * MILLIS, Bench::is_streaming);
-    bench.run(500 * MILLIS);
-    assert_eq!(bench.said.len(), said, "an adopted stream costs nothing");
+    bench.run(5_000 * MILLIS);
+    // It is asked who it is, as often as any other.
+    assert!(bench.is_streaming() && bench.said.len() <= said + 15 * 7, "{bench}");
 }
 
 #[test]
@@ -116,7 +139,7 @@ fn a_resync_begins_anew_and_is_counted() {
     assert_eq!((bench.session.state(), bench.session.resyncs()), (State::Probing, 1));
     bench.until("streaming", 60 * MILLIS, Bench::is_streaming);
     bench.run(1_000 * MILLIS);
-    assert_eq!(bench.said.len(), said, "an adopted stream costs nothing");
+    assert_eq!(bench.said.len(), said + 2 * 7, "an adopted stream costs two questions");
     let mut intact = bench.intact_scans(begun);
     intact.truncate(bench.received_scans(begun).len());
     assert_eq!(bench.received_scans(begun), intact, "{bench}");

@@ -5,7 +5,7 @@ use lms::{MILLIS, State, Trouble};
 use sim::machine::{Habits, Settings, Start};
 use sim::operating::Operating;
 
-use crate::bench::{Bench, sensor_with};
+use crate::bench::{Bench, WANTED, sensor_with};
 
 /// Sensors with these habits, idle and streaming at each rate, stream as wanted within `limit` ms.
 fn all_stream(habits: Habits, seeds: std::ops::Range<u64>, limit: u64) {
@@ -49,7 +49,8 @@ fn replies_come_twice() {
 
 #[test]
 fn acknowledgements_and_replies_are_late() {
-    for late in [100, 300] {
+    // As late as the listing allows, and later.
+    for late in [52, 100, 300] {
         let late_ns = late * MILLIS;
         all_stream(Habits { late_acknowledge_ns: late_ns, ..Habits::default() }, 0..1, 20_000);
         all_stream(Habits { late_reply_ns: late_ns, ..Habits::default() }, 0..1, 20_000);
@@ -82,6 +83,23 @@ fn what_is_refused_is_done_without_or_told() {
 }
 
 #[test]
+fn a_version_s14_streams_but_nobody_knows_its_angles() {
+    for start in [Start::In(Operating::OnRequest), Start::In(Operating::All)] {
+        let type_name = "LMS291;S14063;X01.27 ".into();
+        let (variant, baud) = (Variant::ALL[0], Baud::B500000);
+        let settings = Settings { type_name, variant, baud, start, ..Settings::default() };
+        let wanted = lms::Settings { variant, ..WANTED };
+        let mut bench = Bench::wanting(wanted, sensor_with(settings), 0);
+        bench.until("streaming", 3_000 * MILLIS, Bench::is_streaming);
+        bench.run(1_000 * MILLIS);
+        assert!(bench.is_streaming() && bench.received_scans(0).len() > 60, "{bench}");
+        let mut scans = bench.received.iter().filter(|got| got.telegram[4] == lms::measured::MEASURED);
+        assert!(scans.all(|got| got.mode.is_none()), "{bench}");
+        assert_eq!(bench.session.trouble(), Some(Trouble::AnglesUnknown));
+    }
+}
+
+#[test]
 fn a_stream_of_a_sensor_that_answers_nothing_is_taken() {
     let habits = Habits { mute: true, ..Habits::default() };
     let start = Start::In(Operating::All);
@@ -99,4 +117,12 @@ fn a_stream_of_a_sensor_that_answers_nothing_is_taken() {
     bench.until("mode known", 11_000 * MILLIS, |bench| bench.session.sensor().mode.is_some());
     bench.run(500 * MILLIS);
     assert_eq!((bench.session.trouble(), bench.session.resyncs()), (None, 0));
+}
+
+#[test]
+fn a_change_of_mode_takes_as_long_as_the_listing_allows() {
+    for late in [1_100, 1_500, 2_900] {
+        let habits = Habits { late_mode_ns: late * MILLIS, ..Habits::default() };
+        all_stream(habits, 0..1, 15_000);
+    }
 }

@@ -3,7 +3,7 @@
 
 use lms::variant::Baud;
 use lms::{MILLIS, Notice};
-use sim::machine::{Settings, Start};
+use sim::machine::{Habits, Settings, Start};
 use sim::operating::Operating;
 
 use crate::bench::{Bench, sensor_with};
@@ -11,12 +11,29 @@ use crate::bench::{Bench, sensor_with};
 #[test]
 fn the_installation_mode_is_left() {
     for baud in Baud::ALL {
-        let settings = Settings { baud, start: Start::In(Operating::Installation), ..Settings::default() };
-        let mut bench = Bench::new(sensor_with(settings), 0);
+        for strict in [false, true] {
+            let habits = Habits { strict, ..Habits::default() };
+            let start = Start::In(Operating::Installation);
+            let settings = Settings { baud, start, habits, ..Settings::default() };
+            let mut bench = Bench::new(sensor_with(settings), 0);
+            bench.until("streaming", 3_000 * MILLIS, Bench::is_streaming);
+            bench.run(1_000 * MILLIS);
+            assert!(bench.is_streaming() && bench.machine.operating() == &Operating::All, "{bench}");
+            assert_eq!(bench.session.trouble(), None);
+        }
+    }
+}
+
+#[test]
+fn it_is_left_too_by_a_sensor_that_does_not_tell_it() {
+    for baud in Baud::ALL {
+        let habits = Habits { refuses: vec![0x31], ..Habits::default() };
+        let start = Start::In(Operating::Installation);
+        let mut bench = Bench::new(sensor_with(Settings { baud, start, habits, ..Settings::default() }), 0);
+        bench.until("stopped", 3_000 * MILLIS, |bench| bench.machine.operating() == &Operating::OnRequest);
         bench.until("streaming", 3_000 * MILLIS, Bench::is_streaming);
         bench.run(1_000 * MILLIS);
-        assert!(bench.is_streaming() && bench.machine.operating() == &Operating::All, "{bench}");
-        assert_eq!(bench.session.trouble(), None);
+        assert!(bench.is_streaming() && bench.session.trouble().is_none(), "{bench}");
     }
 }
 

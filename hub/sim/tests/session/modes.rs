@@ -52,14 +52,15 @@ impl Bench {
 }
 
 #[test]
-fn whatever_streams_at_500k_is_the_wanted_stream_within_half_a_second() {
+fn whatever_streams_at_500k_is_the_wanted_stream_within_a_second() {
     for operating in modes() {
         for age in [1_000, 1_019] {
             for (address, availability) in [(0, 0), (5, 2)] {
                 let settings = Settings { baud: Baud::B500000, address, availability, ..Settings::default() };
                 let (machine, now) = streaming(settings, &operating, age * MILLIS);
                 let mut bench = Bench::new(machine, now);
-                let took = taken_over(&mut bench, 500 * MILLIS);
+                let limit = if operating == Operating::All { 500 } else { 1_000 };
+                let took = taken_over(&mut bench, limit * MILLIS);
                 let adopted = bench.states == [State::Probing, State::Streaming];
                 assert_eq!(adopted, operating == Operating::All, "{operating:?} in {took} ns: {bench}");
                 let scan = bench.received_scans(0).pop().map(|scan| (scan.len(), scan[1]));
@@ -70,13 +71,13 @@ fn whatever_streams_at_500k_is_the_wanted_stream_within_half_a_second() {
 }
 
 #[test]
-fn another_variant_is_switched_within_half_a_second() {
+fn another_variant_is_switched_within_a_second() {
     for variant in Variant::ALL {
         for operating in [Operating::All, Operating::Partial] {
             let settings = Settings { baud: Baud::B500000, variant, ..Settings::default() };
             let (machine, now) = streaming(settings, &operating, 1_005 * MILLIS);
             let mut bench = Bench::new(machine, now);
-            taken_over(&mut bench, 500 * MILLIS);
+            taken_over(&mut bench, 1_000 * MILLIS);
             assert_eq!(bench.session.sensor().variant, Some(Variant::HALF), "{variant:?}: {bench}");
         }
     }
@@ -104,7 +105,7 @@ fn a_slow_link_takes_over_what_streams_too() {
                 let (machine, now) =
                     streaming(Settings { baud, ..Settings::default() }, &operating, 1_003 * MILLIS);
                 let mut bench = Bench::wanting(lms::Settings { baud: wanted, ..WANTED }, machine, now);
-                taken_over(&mut bench, 5_000 * MILLIS);
+                taken_over(&mut bench, 6_000 * MILLIS);
                 assert_eq!(bench.session.baud(), wanted);
             }
         }
