@@ -38,6 +38,9 @@ fn a_set_up_that_works() {
     for name in ["memory", "domain", "leftovers", "descriptors"] {
         assert_eq!(state(&findings, name, None).0, "ok", "{findings:#?}");
     }
+    // Once it is open, for opening ends the adapter's collecting.
+    let place = |name: &str| findings.iter().position(|line| line["name"] == name);
+    assert!(place("latency") > place("access"), "{findings:#?}");
     for name in ["port", "holder", "access", "rate", "settings", "power-on", "health"] {
         assert_eq!(state(&findings, name, Some(&port)).0, "ok", "{findings:#?}");
     }

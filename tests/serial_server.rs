@@ -141,6 +141,25 @@ fn a_serial_server_that_is_not_there() {
 }
 
 #[test]
+fn a_want_of_descriptors_is_not_the_servers_fault() {
+    let stage = Stage::new();
+    let free = TcpListener::bind("127.0.0.1:0").and_then(|socket| socket.local_addr()).expect("a port");
+    let port = format!("tcp:localhost:{}", free.port());
+    for limit in 5..16 {
+        let inner = stage.command(&["probe", &port]);
+        let mut command = std::process::Command::new("sh");
+        command.args(["-c", "ulimit -n \"$0\" && exec \"$@\"", &limit.to_string()]);
+        command.arg(inner.get_program()).args(inner.get_args()).env("SCANHUB_END_WITH_PARENT", "1");
+        let outcome = stage::Program::start(command).wait();
+        match outcome.code {
+            Some(75) => {}
+            Some(4) => assert!(outcome.errors.contains("connection refused"), "{limit}: {outcome}"),
+            _ => panic!("{limit}: {outcome}"),
+        }
+    }
+}
+
+#[test]
 fn nobody_has_to_wait_for_a_serial_server_that_does_not_answer() {
     let stage = Stage::new();
     // Nobody accepts, and there is no room for one more: the kernel drops who comes.

@@ -1,5 +1,6 @@
 //! `scanhub doctor`: every condition that a working set-up needs, one after the other, with what was found and what to
-//! do. Changes nothing: no sensor, no file, no process.
+//! do. Changes no sensor, no file and no process. A port that somebody named, and nobody holds, it opens as the hub would:
+//! it stays raw at the rate of the last question, and its driver hands over bytes at once.
 
 mod finding;
 mod hub;

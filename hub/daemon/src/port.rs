@@ -16,8 +16,8 @@ use std::sync::atomic::AtomicBool;
 use schema::Failure;
 
 use crate::config::Source;
-pub(crate) use candidates::is_tty;
 pub use candidates::{Candidate, candidates};
+pub(crate) use candidates::{PROMPT_MS, is_tty, latency_ms};
 pub use holder::{Holder, holder};
 pub(crate) use refusal::Refusal;
 pub(crate) use tcp::Dial;

@@ -12,7 +12,7 @@ use super::finding::Finding;
 use super::hub::Hub;
 use super::sensor;
 use crate::config::Source;
-use crate::port::{Candidate, Port, Refusal, holder, is_tty};
+use crate::port::{Candidate, PROMPT_MS, Port, Refusal, holder, is_tty, latency_ms};
 use crate::probe;
 
 /// Examines a port and its sensor.
@@ -42,12 +42,12 @@ pub(crate) fn examine(
         tell(refused(Refusal::NotTty.explain(&subject.source)));
         return Ok(());
     }
-    tell(latency(candidate));
     if let Some(holder) = holder(path) {
         // To open it would change its settings under who has it.
         let by_hub = hub.filter(|hub| holder.pid == hub.pid);
         match by_hub {
             Some(hub) => {
+                tell(latency(path, latency_ms(path)));
                 tell(Finding::ok("holder", format!("the hub has it, {holder}")));
                 tell(sensor::as_the_hub_says(hub.link(&subject.source.name())));
             }
@@ -78,6 +78,8 @@ pub(crate) fn examine(
         }
     };
     tell(Finding::ok("access", "can be opened, is a serial line"));
+    // Opened, most adapters hand over at once.
+    tell(latency(path, latency_ms(path)));
     tell(rate(subject, &port, first));
     ask(subject, &port, first, stop, tell)
 }
@@ -176,16 +178,15 @@ fn refused(failure: Failure) -> Finding {
     Finding::failed(name, failure.message, failure.hint)
 }
 
-/// Whether the adapter collects bytes before it hands them over.
-fn latency(candidate: Option<&Candidate>) -> Finding {
+/// Whether the adapter of an open port collects bytes, for so many milliseconds, before it hands them over.
+fn latency(path: &Path, ms: Option<u8>) -> Finding {
     const NAME: &str = "latency";
-    let Some((candidate, ms)) = candidate.and_then(|it| Some((it, it.latency_ms?))) else {
-        return Finding::skipped(NAME, "the driver has no timer to look at");
-    };
-    if ms <= 1 {
+    let Some(ms) = ms else { return Finding::skipped(NAME, "the driver has no timer to look at") };
+    if ms <= PROMPT_MS {
         return Finding::ok(NAME, format!("the adapter hands over bytes after {ms} ms"));
     }
-    let name = candidate.device.file_name().unwrap_or_default().to_string_lossy();
+    let device = path.canonicalize().unwrap_or_else(|_| path.to_owned());
+    let name = device.file_name().unwrap_or_default().to_string_lossy();
     let remedy = format!(
         "echo 1 | sudo tee /sys/class/tty/{name}/device/latency_timer; for good by udev: \
          SUBSYSTEM==\"usb-serial\", DRIVER==\"ftdi_sio\", ATTR{{latency_timer}}=\"1\""
@@ -212,5 +213,21 @@ fn rate(subject: &Subject, port: &Port, first: Baud) -> Finding {
             error.to_string(),
             "at 38400 Bd a sensor sends 5 scans a second instead of 37; an adapter with an FT232R or newer does it",
         ),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::doctor::finding::State;
+
+    #[test]
+    fn what_the_hub_does_not_mind_is_no_finding() {
+        let of = |ms| latency(Path::new("/dev/ttyUSB0"), ms);
+        assert_eq!([of(None).state, of(Some(1)).state], [State::Skipped, State::Ok]);
+        assert_eq!(of(Some(PROMPT_MS)).state, State::Ok);
+        let slow = of(Some(16));
+        assert_eq!(slow.state, State::Warning);
+        assert!(slow.remedy.contains("/sys/class/tty/ttyUSB0/device/latency_timer"), "{slow}");
     }
 }

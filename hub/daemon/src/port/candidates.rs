@@ -21,8 +21,6 @@ pub struct Candidate {
     pub driver: Option<String>,
     /// What its adapter says it is: maker and product.
     pub product: Option<String>,
-    /// How long an FTDI adapter collects bytes before it hands them over, in milliseconds.
-    pub latency_ms: Option<u8>,
     /// Who has it open, as far as this user may see.
     pub holder: Option<Holder>,
     /// Whether this user may open it.
@@ -72,7 +70,6 @@ pub(super) fn found_in(root: &Path) -> Vec<Candidate> {
                 name: name.unwrap_or(&device).clone(),
                 driver: driver_of(&hardware),
                 product: product_of(&hardware),
-                latency_ms: latency_of(&hardware),
                 device,
                 holder: None,
                 is_permitted: false,
@@ -99,8 +96,8 @@ pub(crate) fn is_tty(path: &Path) -> bool {
     }
 }
 
-/// How long the adapter at `path` collects bytes, if it says so.
-pub(super) fn latency_ms(path: &Path) -> Option<u8> {
+/// How long the adapter at `path` collects bytes before it hands them over, in milliseconds, if it says so.
+pub(crate) fn latency_ms(path: &Path) -> Option<u8> {
     let device = path.canonicalize().ok()?;
     latency_of(&Path::new("/sys/class/tty").join(device.file_name()?).join("device"))
 }
@@ -143,6 +140,8 @@ fn entries(directory: &Path) -> Vec<PathBuf> {
     paths
 }
 
+/// An adapter that collects bytes for longer blurs the stamps.
+pub(crate) const PROMPT_MS: u8 = 2;
 /// Majors of the ends of ptys that are opened by name (Linux, devices.txt).
 const UNIX98_PTYS: RangeInclusive<u32> = 136..=143;
 
@@ -198,12 +197,13 @@ mod tests {
         let root = root.canonicalize().unwrap();
         machine(&root);
         let found = found_in(&root);
+        let latency = latency_of(&root.join("sys/class/tty/ttyUSB0/device"));
         fs::remove_dir_all(&root).unwrap();
         let [adapter, board] = &found[..] else { panic!("{found:?}") };
         assert_eq!(adapter.name, root.join("dev/serial/by-id/usb-FTDI_USB-RS422-if00-port0"));
         assert_eq!(adapter.device, root.join("dev/ttyUSB0"));
         assert_eq!(adapter.driver.as_deref(), Some("ftdi_sio"));
-        assert_eq!(adapter.latency_ms, Some(16));
+        assert_eq!(latency, Some(16));
         assert!(adapter.to_string().ends_with("port0 (FTDI USB-RS422 Cable)"), "{adapter}");
         assert_eq!((&board.name, &board.driver), (&root.join("dev/ttyS0"), &None));
         assert_eq!(board.to_string(), root.join("dev/ttyS0").display().to_string());

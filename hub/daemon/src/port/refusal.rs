@@ -234,7 +234,6 @@ mod tests {
             device: device.into(),
             driver: Some("ftdi_sio".to_owned()),
             product: None,
-            latency_ms: None,
             holder: None,
             is_permitted: true,
         };

@@ -15,6 +15,7 @@ use rustix::net::sockopt::{
     set_socket_keepalive, set_tcp_keepcnt, set_tcp_keepidle, set_tcp_keepintvl, set_tcp_nodelay,
     set_tcp_user_timeout,
 };
+use schema::shortage;
 
 use super::{Port, Refusal};
 
@@ -128,6 +129,8 @@ fn tell(outcome: Result<Tcp, Refusal>, send: &Sender<Result<Tcp, Refusal>>, rope
 fn connect(host: &str, port: u16) -> Result<Tcp, Refusal> {
     let addresses: Vec<SocketAddr> = match (host, port).to_socket_addrs() {
         Ok(addresses) => addresses.collect(),
+        // A look-up that lacks descriptors says that there is no such host.
+        Err(_) if shortage::check_descriptors(LOOK_UP).is_err() => return Err(Refusal::Short(Errno::MFILE)),
         Err(error) => return Err(failed(&error, Refusal::NoHost)),
     };
     let mut last = Refusal::NoHost("it has no address".to_owned());
@@ -150,6 +153,8 @@ fn failed(error: &io::Error, otherwise: fn(String) -> Refusal) -> Refusal {
     }
 }
 
+/// Descriptors that looking up a name takes at the most: a file, and a socket for each of its servers.
+const LOOK_UP: u64 = 4;
 /// A serial server in the same house answers sooner.
 const CONNECT: Duration = Duration::from_secs(3);
 /// Bytes that are thrown away at the most: more than a minute of 500 kBd.

@@ -12,7 +12,7 @@ use rustix::termios::{
     tcflush, tcgetattr, tcsetattr,
 };
 
-use super::candidates::{is_tty, latency_ms};
+use super::candidates::{PROMPT_MS, is_tty, latency_ms};
 use super::{Refusal, kernel};
 
 /// An open serial line, exclusive and raw; reads and writes never block.
@@ -141,9 +141,6 @@ fn judge(told: Result<(), Errno>, given: u32, wanted: u32) -> Result<(), Refusal
 fn is_near(given: u32, wanted: u32) -> bool {
     u64::from(given.abs_diff(wanted)) * 100 <= u64::from(wanted) * 3
 }
-
-/// An adapter that collects bytes for longer blurs the stamps.
-const PROMPT_MS: u8 = 2;
 
 #[cfg(test)]
 mod tests {
