@@ -130,9 +130,11 @@ impl Say for Saying {
         }
     }
 
-    /// A sensor that writes answers nothing else: what it acknowledged unheard is waited for as long.
+    /// A sensor that writes, or changes its mode, may have acknowledged unheard, behind a scan that it broke off: it is
+    /// waited for as long.
     fn sign(&self) -> Nanos {
         match self {
+            Saying::Ask(request) if request.command() == command::MODE => MODE_TIMEOUT,
             Saying::Ask(request) => request.sign(),
             Saying::Keep(_) | Saying::PowerOn(_) => WRITE_TIMEOUT,
         }

@@ -289,9 +289,10 @@ impl Dialogue {
         self.variant_refused = !as_asked;
         self.sensor.streams = true;
         let silent_at = self.silent_at(now);
-        self.phase = Phase::Streaming { header, silent_at, questions: QUESTIONS, rounds: 0, ask_at: now };
-        // A reply that is under way may answer.
-        self.open.take_if(|open| !open.is_out());
+        // A reply that is under way may answer; half a request must be forgotten before the next one.
+        let unsaid = self.open.take_if(|open| !open.is_out());
+        let ask_at = if unsaid.is_some_and(|open| open.is_partly_out()) { now + FORGOTTEN } else { now };
+        self.phase = Phase::Streaming { header, silent_at, questions: QUESTIONS, rounds: 0, ask_at };
         self.question(now);
     }
 
