@@ -195,7 +195,7 @@ impl<'a> LinkThread<'a> {
             Some(Reply::Measured(measured)) => Some(measured),
             _ => None,
         };
-        let mode = received.mode.or(fallback);
+        let mode = received.mode.or(fallback).filter(|mode| mode.has_ranges());
         let forbidden =
             measured.zip(mode).is_some_and(|(measured, mode)| scanner::is_forbidden(&measured, mode));
         let reasons = received.reasons | if forbidden { suspect::FORBIDDEN_BITS } else { 0 };

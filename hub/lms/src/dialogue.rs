@@ -77,8 +77,9 @@ impl Dialogue {
             return self.trouble;
         }
         let has_other_angles = self.sensor.has_other_angles().then_some(Trouble::AnglesUnknown);
+        let no_ranges = self.sensor.mode.filter(|mode| !mode.has_ranges()).map(Trouble::NoRanges);
         let variant_refused = self.variant_refused.then_some(Trouble::VariantRefused);
-        self.trouble.or(has_other_angles).or(variant_refused)
+        self.trouble.or(has_other_angles).or(no_ranges).or(variant_refused)
     }
 
     /// The rate to set on the port now.

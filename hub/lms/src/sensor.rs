@@ -50,6 +50,8 @@ pub enum Trouble {
     NotStopped,
     /// The sensor calls itself a version S14, which scans 90 degrees with as many values as others 180.
     AnglesUnknown,
+    /// The sensor is set to a measuring mode whose values are no ranges, or are split as nobody knows.
+    NoRanges(Mode),
     /// The sensor does not tell its measuring mode, so nobody knows where a range ends in its 16 bits.
     ModeUnknown,
 }
@@ -72,6 +74,9 @@ impl fmt::Display for Trouble {
             Trouble::ModeUnknown => f.write_str("the sensor does not tell its measuring mode: no scans"),
             Trouble::AnglesUnknown => {
                 f.write_str("the sensor is a version S14, whose angles are not known here: no scans")
+            }
+            Trouble::NoRanges(Mode(mode)) => {
+                write!(f, "the sensor measures in mode {mode:02x}h, which has no ranges: no scans")
             }
             Trouble::NotStopped => f.write_str("paused, but the sensor does not stop: cable to the sensor?"),
             Trouble::Silence => f.write_str("no measured data for one second"),
@@ -120,6 +125,11 @@ impl Sensor {
     /// Whether its scans have none of the angles of [`Variant`], although they look so.
     pub fn has_other_angles(&self) -> bool {
         Family::of_type(self.kind()) == Some(Family::Fast)
+    }
+
+    /// How its values are split, if they are ranges at angles that are known: else there are no scans.
+    pub(crate) fn mode_of_scans(&self) -> Option<Mode> {
+        self.mode.filter(|mode| mode.has_ranges() && !self.has_other_angles())
     }
 
     /// Firmware as ASCII, such as `V02.19`; empty if it was not asked yet.

@@ -260,7 +260,7 @@ impl Session {
             first: first.at,
             last,
             estimated: first.estimated,
-            mode: self.dialogue.sensor.mode.filter(|_| !self.dialogue.sensor.has_other_angles()),
+            mode: self.dialogue.sensor.mode_of_scans(),
             reasons: framed.reasons | if slow { suspect::SLOW } else { 0 },
         }
     }

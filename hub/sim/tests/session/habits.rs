@@ -1,6 +1,6 @@
 //! A sensor that overlooks requests, says NAK, answers late or twice, refuses: it streams all the same.
 
-use lms::variant::{Baud, Variant};
+use lms::variant::{Baud, Mode, Variant};
 use lms::{MILLIS, State, Trouble};
 use sim::machine::{Habits, Settings, Start};
 use sim::operating::Operating;
@@ -96,6 +96,20 @@ fn a_version_s14_streams_but_nobody_knows_its_angles() {
         let mut scans = bench.received.iter().filter(|got| got.telegram[4] == lms::measured::MEASURED);
         assert!(scans.all(|got| got.mode.is_none()), "{bench}");
         assert_eq!(bench.session.trouble(), Some(Trouble::AnglesUnknown));
+    }
+}
+
+#[test]
+fn a_mode_without_ranges_gives_no_scans() {
+    for start in [Start::In(Operating::OnRequest), Start::In(Operating::All)] {
+        let settings = Settings { mode: Mode(0x3F), baud: Baud::B500000, start, ..Settings::default() };
+        let mut bench = Bench::new(sensor_with(settings), 0);
+        bench.until("streaming", 3_000 * MILLIS, Bench::is_streaming);
+        bench.run(1_000 * MILLIS);
+        assert!(bench.is_streaming() && bench.received_scans(0).len() > 30, "{bench}");
+        let mut scans = bench.received.iter().filter(|got| got.telegram[4] == lms::measured::MEASURED);
+        assert!(scans.all(|got| got.mode.is_none()), "{bench}");
+        assert_eq!(bench.session.trouble(), Some(Trouble::NoRanges(Mode(0x3F))));
     }
 }
 
