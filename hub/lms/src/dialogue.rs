@@ -235,7 +235,12 @@ impl Dialogue {
         self.sensor.streams |= request == Request::Status && !matches!(reply, Some(Reply::Status(_)));
         match self.phase {
             Phase::Probing { .. } if self.is_paused => self.stop(now),
-            Phase::Probing { .. } => self.proceed(Progress::BEGIN, now),
+            Phase::Probing { .. } => {
+                // Somebody is there after all.
+                self.trouble
+                    .take_if(|trouble| matches!(trouble, Trouble::NoAnswer { .. } | Trouble::Silence));
+                self.proceed(Progress::BEGIN, now);
+            }
             Phase::Starting { step, progress } => self.on_step(step, progress, request, reply, now),
             Phase::Paused { .. } => self.on_stopped(reply, now),
             Phase::Streaming { .. } | Phase::Listening { .. } | Phase::Following => {}
