@@ -137,6 +137,32 @@ fn a_person_says_yes_and_it_is_written_once() {
 }
 
 #[test]
+fn the_way_back_brings_back_what_was_changed() {
+    let stage = Stage::new();
+    let _simulator = stage.simulator(&["front"], &["--baud=38400"]);
+    let port = stage.word("front");
+    let done = |settings: &[&str]| {
+        let seen = Person::start(&stage, &[&[&port[..]], settings].concat()).types("yes\n");
+        assert_eq!(seen.code, Some(0), "{}", seen.errors);
+        assert!(seen.errors.contains("EEPROM wears out after a few thousand writes."), "{}", seen.errors);
+        seen.out
+    };
+    let hex = probe(&stage, "front")["configuration"].as_str().unwrap().to_owned();
+    let out = done(&["power_on_baud=keep"]);
+    let change = "9600 Bd -> 38400 Bd: the present rate of the line becomes permanent";
+    assert!(out.contains(change), "{out}");
+    let back = format!("to go back: scanhub configure {port} power_on_baud=9600\n");
+    assert!(out.contains(&back), "{out}");
+    assert_eq!(probe(&stage, "front")["permanent_rate"], true);
+    // What was permanent before, the sensor does not tell.
+    let out = done(&["power_on_baud=9600"]);
+    assert!(out.contains("cannot be brought back") && !out.contains("to go back"), "{out}");
+    assert_eq!(probe(&stage, "front")["permanent_rate"], false);
+    let out = done(&["unit=cm", "power_on_baud=keep"]);
+    assert!(out.contains(&format!("{port} configuration={hex} power_on_baud=9600\n")), "{out}");
+}
+
+#[test]
 fn everything_else_than_yes_writes_nothing() {
     let stage = Stage::new();
     let simulator = stage.simulator(&["front"], &["--baud=38400"]);
@@ -145,6 +171,7 @@ fn everything_else_than_yes_writes_nothing() {
         let seen = Person::start(&stage, &[&port, "unit=cm"]).types(answer);
         assert_eq!(seen.code, Some(1), "{answer:?}: {}", seen.errors);
         assert!(seen.errors.contains("nothing was written"), "{}", seen.errors);
+        assert!(seen.errors.contains("\nscanhub: not confirmed"), "{answer:?}: {:?}", seen.errors);
     }
     let seen = Person::start(&stage, &[&port, "unit=cm"]).answer(|_, pid| {
         signal(pid, INT);
@@ -189,6 +216,7 @@ fn what_cannot_be_is_refused_before_anything_is_written() {
     for words in ["wrong password?", "nothing was written", "values on request"] {
         assert!(wrong.errors.contains(words), "{words}: {}", wrong.errors);
     }
+    assert!(wrong.errors.contains(" ..\r\nscanhub: "), "{:?}", wrong.errors);
     // A port that a hub has.
     let hub = stage.hub(&[stage.link("front")]);
     stage.await_info("front", |info| info["state"] == "streaming");

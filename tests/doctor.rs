@@ -78,6 +78,29 @@ fn what_is_wrong_is_told_with_its_remedy() {
 }
 
 #[test]
+fn a_sensor_that_is_not_well_is_no_good_set_up() {
+    let stage = Stage::new();
+    let dirty = stage.simulator(&["dirty"], &["--type=lms291", "--pollution=20"]);
+    let port = stage.word("dirty");
+    let (findings, _) = doctor(&stage, &[&port], 0);
+    let (found, text) = state(&findings, "health", Some(&port));
+    assert!(found == "warning" && text.contains("window is dirty, lets through 20 %"), "{text}");
+    drop(dirty);
+    let _broken = stage.simulator(&["broken"], &["--type=lms211", "--status=0x13", "--error=3:18"]);
+    let port = stage.word("broken");
+    let (findings, _) = doctor(&stage, &[&port], 5);
+    let (found, text) = state(&findings, "health", Some(&port));
+    assert!(found == "failed" && text.contains("error 18: dirt on the window"), "{text}");
+    let _former = stage.simulator(&["former"], &["--permanent-baud=38400", "--status=0x12", "--error=2:18"]);
+    let port = stage.word("former");
+    let (findings, _) = doctor(&stage, &[&port], 0);
+    assert_eq!(state(&findings, "health", Some(&port)).0, "warning");
+    let (found, text) = state(&findings, "power-on", Some(&port));
+    let remedy = format!("scanhub configure {port} power_on_baud=9600");
+    assert!(found == "warning" && text.contains(&remedy), "{text}");
+}
+
+#[test]
 fn a_port_without_a_sensor_is_asked_for_a_bounded_time() {
     let stage = Stage::new();
     // A sensor that answers nothing.

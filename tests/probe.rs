@@ -37,6 +37,19 @@ fn a_sensor_tells_of_itself_and_is_left_as_it_was() {
 }
 
 #[test]
+fn a_dirty_window_is_told_whatever_the_status_byte_says() {
+    let stage = Stage::new();
+    let _simulator = stage.simulator(&["front"], &["--type=lms291", "--pollution=20"]);
+    let port = stage.word("front");
+    let found = stage.run(&["probe", &port, "--json"]);
+    assert_eq!(found.lines()[0]["polluted"], true, "{found}");
+    let outcome = stage.run(&["probe", &port]);
+    let text = String::from_utf8_lossy(&outcome.out);
+    assert!(text.contains("ok, window polluted"), "{outcome}");
+    assert!(text.contains("lets through 20 % of what it did when clean: clean it"), "{outcome}");
+}
+
+#[test]
 fn a_stream_goes_on() {
     let stage = Stage::new();
     let simulator = stage.simulator(&["front"], &["--baud=500000"]);

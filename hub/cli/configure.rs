@@ -36,7 +36,7 @@ impl Configure {
             password: self.password.clone(),
         };
         let mut progress = Progress::new();
-        configure(&order, stop, &mut |news| match news {
+        let outcome = configure(&order, stop, &mut |news| match news {
             News::Looking(rate) => progress.show(&format!("looking at {rate} Bd")),
             News::Doing(what) => progress.show(what),
             News::Asking => progress.clear(),
@@ -52,6 +52,10 @@ impl Configure {
                 progress.clear();
                 crate::say(&if json { crate::line(configured) } else { configured.to_string() });
             }
-        })
+        });
+        if outcome.is_err() {
+            progress.leave();
+        }
+        outcome
     }
 }

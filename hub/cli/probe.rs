@@ -26,6 +26,9 @@ impl Probe {
         };
         let mut progress = Progress::new();
         let found = probe(&source(port)?, stop, |rate| progress.show(&format!("looking at {rate} Bd")));
+        if found.is_err() {
+            progress.leave();
+        }
         drop(progress);
         let found = found?;
         crate::say(&if json {
@@ -40,22 +43,32 @@ impl Probe {
 /// A line on the terminal that the next one overwrites; nothing if there is no terminal.
 pub(crate) struct Progress {
     is_terminal: bool,
+    /// Whether there is something on the line.
+    is_shown: bool,
 }
 
 impl Progress {
     pub(crate) fn new() -> Progress {
-        Progress { is_terminal: stderr().is_terminal() }
+        Progress { is_terminal: stderr().is_terminal(), is_shown: false }
     }
 
     pub(crate) fn show(&mut self, text: &str) {
         if self.is_terminal {
             let _ = write!(stderr(), "\r\x1b[K{text} ..");
+            self.is_shown = true;
         }
     }
 
     pub(crate) fn clear(&mut self) {
-        if self.is_terminal {
+        if std::mem::take(&mut self.is_shown) {
             let _ = write!(stderr(), "\r\x1b[K");
+        }
+    }
+
+    /// What was done last stays, on a line of its own: it failed, and why comes next.
+    pub(crate) fn leave(&mut self) {
+        if std::mem::take(&mut self.is_shown) {
+            let _ = writeln!(stderr());
         }
     }
 }

@@ -72,7 +72,8 @@ pub fn configure(order: &Order, stop: &AtomicBool, tell: &mut dyn FnMut(News<'_>
         tell(News::Configured(&Configured::nothing(&name, &plan)));
         return Ok(());
     }
-    for difference in difference::between(&name, &plan, family) {
+    let was_permanent = report.status().map(|status| status.has_permanent_baud());
+    for difference in difference::between(&name, &plan, family, was_permanent) {
         tell(News::Difference(&difference));
     }
     tell(News::Asking);
@@ -90,7 +91,7 @@ pub fn configure(order: &Order, stop: &AtomicBool, tell: &mut dyn FnMut(News<'_>
         }
     });
     ended.map_err(|failure| outcome::gone(&name, &change, &failure))?;
-    let configured = Configured::of(&name, &plan, change.outcome())?;
+    let configured = Configured::of(&name, &plan, was_permanent, change.outcome())?;
     tell(News::Configured(&configured));
     Ok(())
 }

@@ -1,4 +1,4 @@
-//! Requests that a sensor keeps for ever: they write its EEPROM, which stands some thousands of writes, and they are
+//! Requests that a sensor keeps for ever: they write its EEPROM, which wears out after a few thousand writes, and they are
 //! done in installation mode only (Telegram listing 7-1). Here they are made and read: for people, for the simulator.
 //! Nothing here sends one, and no code that talks to a sensor by itself may name this module.
 

@@ -6,7 +6,7 @@ use crate::condition::{Condition, Severity};
 use crate::family::Family;
 use crate::notice::Notice;
 use crate::reply::{POWER_ON, Reply};
-use crate::status_report::StatusReport;
+use crate::status_report::{DIRTY, StatusReport};
 use crate::telegram::Telegram;
 use crate::variant::{Baud, Mode, Unit, Variant};
 use core::fmt;
@@ -199,9 +199,7 @@ impl Sensor {
         self.defective = Some(report.is_defective());
         self.permanent_baud = Some(report.has_permanent_baud());
         self.laser_power_percent = Some(report.laser_power_percent());
-        let channels = report.pollution().into_iter().zip(report.pollution_calibration()).take(CHANNELS);
-        let percent = |(is, was): (u16, u16)| (u32::from(is) * 100).checked_div(u32::from(was));
-        self.window_percent = channels.filter_map(percent).min().and_then(|percent| percent.try_into().ok());
+        self.window_percent = report.window_percent();
         self.software = *report.bytes().first_chunk().unwrap_or(&[0; SOFTWARE_LEN]);
     }
 
@@ -224,10 +222,6 @@ fn badness(condition: Option<Condition>) -> u8 {
 
 /// Better telegrams in a row before a bad one is forgotten: some seconds of scans.
 const CALM: u16 = 200;
-/// A window that lets through less than so many percent is dirty (Telegram listing, errors 18 and 19).
-const DIRTY: u16 = 75;
-/// Channels of the pollution measurement that look through the window; the others are its reference.
-const CHANNELS: usize = 8;
 /// Bytes of the firmware's name.
 const SOFTWARE_LEN: usize = 7;
 /// A type reply has 20 or 21 characters.

@@ -44,6 +44,14 @@ impl<'a> StatusReport<'a> {
         core::array::from_fn(|i| self.word(42 + 2 * i))
     }
 
+    /// What the dirtiest channel of the window lets through, in percent of when it was clean; `None` if nobody measured
+    /// that.
+    pub fn window_percent(&self) -> Option<u16> {
+        let channels = self.pollution().into_iter().zip(self.pollution_calibration()).take(CHANNELS);
+        let percent = |(is, was): (u16, u16)| (u32::from(is) * 100).checked_div(u32::from(was));
+        channels.filter_map(percent).min().and_then(|percent| percent.try_into().ok())
+    }
+
     /// Microseconds per 1/90 turn of the mirror; 148 is 13.32 ms a turn.
     pub fn motor_us(&self) -> u16 {
         self.word(66)
@@ -231,6 +239,11 @@ pub const ITEMS: [Item; 50] = [
     item(148, 2, "M0, second", Kind::Number),
     item(150, 2, "calibration interval", Kind::Number),
 ];
+
+/// A window that lets through less than so many percent is dirty (Telegram listing, errors 18 and 19).
+pub(crate) const DIRTY: u16 = 75;
+/// Channels of the pollution measurement that look through the window; the others are its reference.
+const CHANNELS: usize = 8;
 
 /// LENGTH 9Ah less command and status (Telegram listing 7-5).
 pub const LEN: usize = 152;

@@ -24,7 +24,7 @@ pub(crate) fn person(plan: Plan, stop: &AtomicBool) -> Result<Consent, Failure> 
     }
     // What was typed before the question is no answer to it.
     let _ = tcflush(&input, QueueSelector::IFlush);
-    let question = "A sensor's EEPROM stands some thousands of writes. Write this into it? Type yes: ";
+    let question = "The EEPROM wears out after a few thousand writes. Write this into it? Type yes: ";
     let _ = stderr().write_all(question.as_bytes());
     loop {
         if stop.load(Ordering::Relaxed) {
@@ -39,6 +39,10 @@ pub(crate) fn person(plan: Plan, stop: &AtomicBool) -> Result<Consent, Failure> 
     }
     let mut answer = String::new();
     let read = input.read_line(&mut answer);
+    // An answer without an end, such as Ctrl-D, leaves the cursor behind the question.
+    if !answer.ends_with('\n') {
+        let _ = stderr().write_all(b"\n");
+    }
     if read.is_ok() && answer.trim() == "yes" {
         return Ok(Consent::of_a_person(plan));
     }

@@ -32,7 +32,14 @@ impl fmt::Display for Difference {
 }
 
 /// All that `plan` changes in the sensor at `port`.
-pub(crate) fn between(port: &str, plan: &Plan, family: Option<Family>) -> Vec<Difference> {
+///
+/// `was_permanent`: whether another rate than 9600 came after power-on so far, if it told.
+pub(crate) fn between(
+    port: &str,
+    plan: &Plan,
+    family: Option<Family>,
+    was_permanent: Option<bool>,
+) -> Vec<Difference> {
     let told = |item, offset, before, after| Difference {
         class: "difference",
         port: port.to_owned(),
@@ -48,13 +55,19 @@ pub(crate) fn between(port: &str, plan: &Plan, family: Option<Family>) -> Vec<Di
             told(item.name, Some(item.at), words(plan.old.bytes()), words(plan.new.bytes()))
         })
         .collect();
-    let rate = format!("{} Bd", plan.baud.rate());
     found.extend(plan.power_on.map(|power_on| {
-        let (before, after) = match power_on {
-            PowerOn::KeepBaud => ("as it is kept now".to_owned(), rate),
-            _ => ("another than 9600 Bd".to_owned(), "9600 Bd".to_owned()),
+        let before = match was_permanent {
+            Some(false) => "9600 Bd",
+            Some(true) => "not 9600 Bd, which rate the sensor does not tell",
+            None => "not told by the sensor",
         };
-        told("rate after power-on", None, before, after)
+        let after = match power_on {
+            PowerOn::KeepBaud => {
+                format!("{} Bd: the present rate of the line becomes permanent", plan.baud.rate())
+            }
+            _ => "9600 Bd".to_owned(),
+        };
+        told("rate after power-on", None, before.to_owned(), after)
     }));
     found
 }

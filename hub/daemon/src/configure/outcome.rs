@@ -24,6 +24,33 @@ pub struct Configured {
     /// The operating mode in which the sensor is now, and in which it was found.
     operating_mode: u8,
     found_mode: u8,
+    /// What brings back what was changed, for the words alone.
+    #[serde(skip)]
+    back: Back,
+}
+
+/// The way back: settings of `configure`.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+struct Back {
+    settings: Vec<String>,
+    /// The former rate after power-on was overwritten, and nobody knows it.
+    is_rate_lost: bool,
+}
+
+impl Back {
+    /// From what `plan` changes; `was_permanent` as for the differences.
+    fn of(plan: &Plan, was_permanent: Option<bool>) -> Back {
+        let mut back = Back::default();
+        if plan.new != plan.old {
+            back.settings.push(format!("configuration={}", hex(plan.old.bytes())));
+        }
+        match (plan.power_on, was_permanent) {
+            (None, _) => {}
+            (Some(_), Some(false)) => back.settings.push("power_on_baud=9600".to_owned()),
+            (Some(_), _) => back.is_rate_lost = true,
+        }
+        back
+    }
 }
 
 impl Configured {
@@ -37,11 +64,17 @@ impl Configured {
             after: hex(plan.old.bytes()),
             operating_mode: plan.operating_mode,
             found_mode: plan.operating_mode,
+            back: Back::default(),
         }
     }
 
-    /// [`Kind::Failed`] with the state of the sensor if something failed.
-    pub(crate) fn of(port: &str, plan: &Plan, outcome: &Outcome) -> Result<Configured, Failure> {
+    /// [`Kind::Failed`] with the state of the sensor if something failed. `was_permanent` as for the differences.
+    pub(crate) fn of(
+        port: &str,
+        plan: &Plan,
+        was_permanent: Option<bool>,
+        outcome: &Outcome,
+    ) -> Result<Configured, Failure> {
         if let Some((step, failing)) = outcome.failed {
             return Err(failure(port, plan, outcome, step, failing));
         }
@@ -49,6 +82,7 @@ impl Configured {
             written: true,
             after: hex(outcome.configuration.as_ref().map_or(&[], Kept::bytes)),
             operating_mode: outcome.operating_mode.unwrap_or_default(),
+            back: Back::of(plan, was_permanent),
             ..Configured::nothing(port, plan)
         })
     }
@@ -56,16 +90,24 @@ impl Configured {
 
 impl fmt::Display for Configured {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let Configured { port, before, .. } = self;
+        let Configured { port, back, .. } = self;
         if !self.written {
             return write!(f, "{port}: nothing to change, nothing was written");
         }
         let now = operating::name(self.operating_mode);
-        writeln!(f, "{port}: written, read back, and as it should be; now at: {now}")?;
+        write!(f, "{port}: written, read back, and as it should be; now at: {now}")?;
         if self.operating_mode != self.found_mode {
-            writeln!(f, "  it was found at: {}", operating::name(self.found_mode))?;
+            write!(f, "\n  it was found at: {}", operating::name(self.found_mode))?;
         }
-        write!(f, "  to go back: scanhub configure {port} configuration={before}")
+        if !back.settings.is_empty() {
+            write!(f, "\n  to go back: scanhub configure {port} {}", back.settings.join(" "))?;
+        }
+        if back.is_rate_lost {
+            f.write_str(
+                "\n  the former rate after power-on cannot be brought back: the sensor did not tell it",
+            )?;
+        }
+        Ok(())
     }
 }
 

@@ -66,7 +66,8 @@ pub(crate) fn examine(
         } else {
             refused(Refusal::Denied.explain(&subject.source))
         });
-        let why = "not asked: nobody said that it is a sensor's port; scanhub doctor PORT asks";
+        let name = subject.source.name();
+        let why = format!("not asked: nobody said that it is a sensor's port; scanhub doctor {name} asks");
         tell(Finding::skipped("sensor", why));
         return Ok(());
     }
@@ -119,7 +120,9 @@ fn ask(
     tell: &mut dyn FnMut(Finding),
 ) -> Result<(), Failure> {
     match probe::ask(port, first, &subject.source, stop, |_| {}) {
-        Ok(report) => sensor::examine(&report, subject.link.as_ref()).into_iter().for_each(tell),
+        Ok(report) => {
+            sensor::examine(&subject.source.name(), &report, subject.link.as_ref()).into_iter().for_each(tell)
+        }
         Err(failure) if failure.kind == Kind::Interrupted => return Err(failure),
         Err(failure) => tell(Finding::failed("sensor", failure.message, failure.hint)),
     }
@@ -201,14 +204,17 @@ fn rate(subject: &Subject, port: &Port, first: Baud) -> Finding {
     let outcome = port.set_baud(wanted.rate());
     // The inquiry begins at the rate at which it was opened.
     let _ = port.set_baud(first.rate());
-    match outcome {
-        Ok(()) => Finding::ok(NAME, format!("{} Bd is possible", wanted.rate())),
-        Err(error) if subject.link.is_some() => Finding::failed(
+    match (outcome, &subject.link) {
+        (Ok(()), _) => Finding::ok(NAME, format!("{} Bd is possible", wanted.rate())),
+        (Err(error), Some(link)) => Finding::failed(
             NAME,
             error.to_string(),
-            "set a rate that it can: link.NAME.baud = 38400; or take an adapter with an FT232R or newer",
+            format!(
+                "set a rate that it can: link.{}.baud = 38400; or take an adapter with an FT232R or newer",
+                link.name
+            ),
         ),
-        Err(error) => Finding::warning(
+        (Err(error), None) => Finding::warning(
             NAME,
             error.to_string(),
             "at 38400 Bd a sensor sends 5 scans a second instead of 37; an adapter with an FT232R or newer does it",

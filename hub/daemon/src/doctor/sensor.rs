@@ -11,9 +11,9 @@ use schema::{State, Status};
 use super::finding::Finding;
 use crate::config::Link;
 
-/// What follows from what the sensor said of itself.
-pub(crate) fn examine(report: &Report, link: Option<&Link>) -> Vec<Finding> {
-    vec![answer(report), settings(report, link), power_on(report), health(report)]
+/// What follows from what the sensor at `port` said of itself.
+pub(crate) fn examine(port: &str, report: &Report, link: Option<&Link>) -> Vec<Finding> {
+    vec![answer(report), settings(port, report, link), power_on(port, report), health(report)]
 }
 
 /// The port is the hub's: what it says of its link.
@@ -51,7 +51,7 @@ fn answer(report: &Report) -> Finding {
 }
 
 /// Whether unit and variant are those of the configuration.
-fn settings(report: &Report, link: Option<&Link>) -> Finding {
+fn settings(port: &str, report: &Report, link: Option<&Link>) -> Finding {
     const NAME: &str = "settings";
     let Some(status) = report.status() else {
         return Finding::warning(NAME, "it does not tell its settings", "power it off and on again");
@@ -77,7 +77,7 @@ fn settings(report: &Report, link: Option<&Link>) -> Finding {
     {
         wrong.push((
             format!("the configuration says unit {} mm", expected.mm()),
-            format!("scanhub configure PORT unit={}, or correct the configuration", word(expected)),
+            format!("scanhub configure {port} unit={}, or correct the configuration", word(expected)),
         ));
     }
     if wrong.is_empty() {
@@ -87,38 +87,48 @@ fn settings(report: &Report, link: Option<&Link>) -> Finding {
     Finding::warning(NAME, format!("{text}; {}", whats.join("; ")), remedies.join("; "))
 }
 
-/// Whether a former owner has changed the rate at which it comes up.
-fn power_on(report: &Report) -> Finding {
+/// Whether a former owner has changed the rate at which it comes up, or left it in installation mode.
+fn power_on(port: &str, report: &Report) -> Finding {
     const NAME: &str = "power-on";
-    match report.status() {
-        Some(status) if status.has_permanent_baud() => Finding::warning(
-            NAME,
-            "it comes up at another rate than 9600 Bd, as somebody has set it",
-            "the hub finds it all the same, other programs may not: scanhub configure PORT power_on_baud=9600",
-        ),
-        Some(status) if status.operating_mode() == INSTALLATION => Finding::warning(
-            NAME,
-            "somebody left it in installation mode, in which its field outputs are blocked",
-            "scanhub run leaves it; or power it off and on again",
-        ),
-        _ => Finding::ok(NAME, "comes up at 9600 Bd"),
+    let status = report.status();
+    let (mut whats, mut remedies) = (Vec::new(), Vec::new());
+    if status.is_some_and(|status| status.has_permanent_baud()) {
+        whats.push("it comes up at another rate than 9600 Bd, as somebody has set it");
+        remedies.push(format!(
+            "the hub finds it all the same, other programs may not: scanhub configure {port} power_on_baud=9600"
+        ));
     }
+    if status.is_some_and(|status| status.operating_mode() == INSTALLATION) {
+        whats.push("somebody left it in installation mode, in which its field outputs are blocked");
+        remedies.push("scanhub run leaves it by itself; or power it off and on again".to_owned());
+    }
+    if whats.is_empty() {
+        return Finding::ok(NAME, "comes up at 9600 Bd");
+    }
+    Finding::warning(NAME, whats.join("; "), remedies.join("; "))
 }
 
 /// What it complains of: itself, its window, its errors.
 fn health(report: &Report) -> Finding {
     const NAME: &str = "health";
-    let is_current = |fault: &Fault| !fault.is_past() && fault.severity() >= Some(Severity::Warning);
     let faults: Vec<Fault> = report.errors().map(|errors| errors.iter().collect()).unwrap_or_default();
-    let mut complaints: Vec<String> =
-        faults.iter().filter(|fault| is_current(fault)).map(Fault::to_string).collect();
+    let is_current = |fault: &&Fault| !fault.is_past() && fault.severity() >= Some(Severity::Warning);
+    let current: Vec<&Fault> = faults.iter().filter(is_current).collect();
+    let mut complaints: Vec<String> = current.iter().map(ToString::to_string).collect();
+    let mut worst = current.iter().filter_map(|fault| fault.severity()).max();
     let status = report.status();
     if status.is_some_and(|status| !status.is_laser_on()) {
         complaints.insert(0, "its laser is off".to_owned());
     }
-    let condition = report.status_byte.map(Condition);
-    if condition.is_some_and(Condition::is_polluted) {
-        complaints.insert(0, "its window is dirty".to_owned());
+    let told = report.status_byte.and_then(|byte| Condition(byte).severity());
+    if told >= Some(Severity::Warning) && told > worst {
+        complaints.insert(0, format!("its telegrams say {}", told.map_or("", Severity::name)));
+        worst = told;
+    }
+    if report.is_polluted() == Some(true) {
+        let percent = status.and_then(|status| status.window_percent());
+        let percent = percent.map_or(String::new(), |percent| format!(", lets through {percent} %"));
+        complaints.insert(0, format!("its window is dirty{percent}"));
     }
     if status.is_some_and(|status| status.is_defective()) {
         complaints.insert(0, "it calls itself defective".to_owned());
@@ -131,11 +141,12 @@ fn health(report: &Report) -> Finding {
     if complaints.is_empty() {
         return Finding::ok(NAME, format!("no complaint{past}"));
     }
-    Finding::warning(
-        NAME,
-        complaints.join("; "),
-        format!("clean its window, look at what is before it{past}"),
-    )
+    let look = "clean its window, look at what is before it";
+    if worst >= Some(Severity::Error) {
+        let remedy = format!("{look}, power it off and on again; if it stays, a repair{past}");
+        return Finding::failed(NAME, complaints.join("; "), remedy);
+    }
+    Finding::warning(NAME, complaints.join("; "), format!("{look}{past}"))
 }
 
 fn in_words(variant: Variant) -> String {
@@ -217,7 +228,7 @@ mod tests {
     fn verdict(name: &str, at: usize, byte: u8, condition: u8, errors: &[u8]) -> (Verdict, String) {
         let mut status = healthy();
         status[at] = byte;
-        let findings = examine(&report(status, condition, errors), None);
+        let findings = examine("/dev/ttyUSB0", &report(status, condition, errors), None);
         let found = findings.iter().find(|finding| finding.name == name).expect("it is checked");
         (found.state, found.to_string())
     }
@@ -230,6 +241,19 @@ mod tests {
         assert!(state == Verdict::Ok && text.contains("1 in its memory"), "{text}");
         let (state, text) = verdict("health", 8, 0, 0x92, &[2, 18]);
         assert!(state == Verdict::Warning && text.contains("window is dirty; warning 18"), "{text}");
+        let (state, text) = verdict("health", 8, 0, 0x13, &[3, 18]);
+        assert!(state == Verdict::Failed && text.contains("error 18"), "{text}");
+        let (state, text) = verdict("health", 8, 0, 0x13, &[0x83, 18]);
+        assert!(state == Verdict::Failed && text.contains("telegrams say error"), "{text}");
+        let (state, text) = verdict("health", 8, 0, 0x10, &[0x83, 18]);
+        assert!(state == Verdict::Ok && text.contains("1 in its memory"), "{text}");
+        // A clean channel gave 100, the first gives 20.
+        let mut dim = healthy();
+        dim[42] = 100;
+        dim[18] = 20;
+        let found = health(&report(dim, 0x10, &[]));
+        assert_eq!(found.state, Verdict::Warning, "{found}");
+        assert!(found.finding.contains("window is dirty, lets through 20 %"), "{found}");
         let (state, text) = verdict("health", 122, 0, 0x10, &[]);
         assert!(state == Verdict::Warning && text.contains("laser is off"), "{text}");
         let (state, text) = verdict("health", 8, 1, 0x14, &[4, 29]);
@@ -240,7 +264,10 @@ mod tests {
     fn what_a_former_owner_left_is_told() {
         assert_eq!(verdict("power-on", 118, 0, 0x10, &[]).0, Verdict::Ok);
         let (state, text) = verdict("power-on", 118, 1, 0x10, &[]);
-        assert!(state == Verdict::Warning && text.contains("power_on_baud=9600"), "{text}");
+        assert!(
+            state == Verdict::Warning && text.contains("configure /dev/ttyUSB0 power_on_baud=9600"),
+            "{text}"
+        );
         let (state, text) = verdict("power-on", 7, 0x00, 0x10, &[]);
         assert!(state == Verdict::Warning && text.contains("installation mode"), "{text}");
     }
@@ -255,11 +282,14 @@ mod tests {
             unit: Some(Unit::Cm),
             baud: Baud::B500000,
         };
-        let finding = settings(&report(healthy(), 0x10, &[]), Some(&link));
+        let finding = settings("/dev/ttyUSB0", &report(healthy(), 0x10, &[]), Some(&link));
         let text = finding.to_string();
         assert_eq!(finding.state, Verdict::Warning, "{text}");
-        assert!(text.contains("type lms291, it is a lms200") && text.contains("unit=cm"), "{text}");
-        assert_eq!(settings(&report(healthy(), 0x10, &[]), None).state, Verdict::Ok);
+        assert!(
+            text.contains("type lms291, it is a lms200") && text.contains("configure /dev/ttyUSB0 unit=cm"),
+            "{text}"
+        );
+        assert_eq!(settings("/dev/ttyUSB0", &report(healthy(), 0x10, &[]), None).state, Verdict::Ok);
     }
 
     #[test]

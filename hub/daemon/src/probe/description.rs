@@ -32,6 +32,9 @@ pub struct Description {
     defective: Option<bool>,
     condition: Option<String>,
     polluted: Option<bool>,
+    /// What the window lets through, for the words alone.
+    #[serde(skip)]
+    window_percent: Option<u16>,
     laser_on: Option<bool>,
     availability: Option<u8>,
     errors: Option<Vec<Fault>>,
@@ -88,7 +91,8 @@ impl Description {
             permanent_rate: status.map(|status| status.has_permanent_baud()),
             defective: status.map(|status| status.is_defective()),
             condition: condition.map(|condition| condition.to_string()),
-            polluted: condition.map(Condition::is_polluted),
+            polluted: report.is_polluted(),
+            window_percent: status.and_then(|status| status.window_percent()),
             laser_on: status.map(|status| status.is_laser_on()),
             availability: configuration.map(|configuration| configuration.availability()),
             errors: report.errors().map(|errors| errors.iter().map(faults).collect()),
@@ -122,7 +126,15 @@ impl fmt::Display for Description {
         row("view", view.map(|(angle, step)| format!("{angle} degrees in steps of {step}")))?;
         row("availability", self.availability.map(|byte| availability_words(byte).to_owned()))?;
         let told = if self.defective == Some(true) { "calls itself defective; " } else { "" };
-        row("condition", self.condition.as_ref().map(|condition| format!("{told}{condition}")))?;
+        let dirty = self.polluted == Some(true);
+        let condition = |condition: &String| {
+            let unsaid = if dirty && !condition.contains("polluted") { ", window polluted" } else { "" };
+            format!("{told}{condition}{unsaid}")
+        };
+        row("condition", self.condition.as_ref().map(condition))?;
+        let remedy = if dirty { ": clean it" } else { "" };
+        let window = |percent| format!("lets through {percent} % of what it did when clean{remedy}");
+        row("window", self.window_percent.map(window))?;
         row("laser", self.laser_on.map(|on| if on { "on" } else { "off" }.to_owned()))?;
         row("hours", self.hours.map(|hours| hours.to_string()))?;
         row("power-ons", self.power_ons.map(|count| count.to_string()))?;

@@ -1,10 +1,11 @@
 //! What a sensor said of itself, reply by reply as it came. Refuses to know how it was asked.
 
 use crate::command::Request;
+use crate::condition::Condition;
 use crate::configuration::Configuration;
 use crate::errors::Errors;
 use crate::reply::Reply;
-use crate::status_report::StatusReport;
+use crate::status_report::{DIRTY, StatusReport};
 use crate::telegram::Encoded;
 use crate::variant::Baud;
 
@@ -65,6 +66,14 @@ impl Report {
             Reply::Errors(errors) => Some(errors),
             _ => None,
         }
+    }
+
+    /// Whether its window is dirty, as its status byte says or its status measured; `None` if it told neither.
+    pub fn is_polluted(&self) -> Option<bool> {
+        let told = self.status_byte.map(|byte| Condition(byte).is_polluted());
+        let measured =
+            self.status().and_then(|status| status.window_percent()).map(|percent| percent < DIRTY);
+        told.max(measured)
     }
 
     /// Keeps the `reply` to one of the questions.
