@@ -50,6 +50,11 @@ impl Everywhere {
         Domain::of_hub(&self.domain, self.root.as_deref(), &Environment::of_process())
     }
 
+    /// The directories that may hold domains.
+    pub(crate) fn bases(&self) -> Vec<PathBuf> {
+        self.root.clone().map_or_else(|| Environment::of_process().bases(), |root| vec![root])
+    }
+
     /// The places in which a client looks for it.
     pub(crate) fn places(&self) -> Result<Vec<Domain>, Failure> {
         Domain::candidates(&self.domain, self.root.as_deref(), &Environment::of_process())

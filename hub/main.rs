@@ -19,7 +19,7 @@ use clap::error::ErrorKind;
 use clients::{EchoOptions, Format, HzOptions, InfoOptions, ListOptions};
 use daemon::Config;
 use rustix::process::Signal;
-use schema::{Environment, Failure, Kind};
+use schema::{Failure, Kind};
 use serde::Serialize;
 use signal_hook::consts::{SIGHUP, SIGINT, SIGQUIT, SIGTERM};
 use tracing::level_filters::LevelFilter;
@@ -77,9 +77,7 @@ fn dispatch(cli: &Cli) -> Result<(), Failure> {
             configure.run(everywhere.json, &*interrupt_by(&[SIGINT, SIGTERM, SIGHUP, SIGQUIT])?)
         }
         Verb::Doctor(doctor) => doctor.run(everywhere, &*interrupt()?),
-        Verb::List { domains: true } => {
-            clients::list_domains(&Environment::of_process().bases(), everywhere.json, &mut out)
-        }
+        Verb::List { domains: true } => clients::list_domains(&everywhere.bases(), everywhere.json, &mut out),
         Verb::List { domains: false } => {
             let options = ListOptions { json: everywhere.json, places: everywhere.places()? };
             clients::list(&options, &mut out, &*interrupt()?)

@@ -3,6 +3,8 @@
 
 mod stage;
 
+use std::path::Path;
+
 use rustix::fs::inotify::{self, CreateFlags, WatchFlags};
 use rustix::io::Errno;
 use serde_json::Value;
@@ -68,6 +70,12 @@ fn what_is_wrong_is_told_with_its_remedy() {
     let (found, text) = state(&findings, "port", Some(&absent));
     assert!(found == "failed" && text.contains("no such port"), "{text}");
     let (found, text) = state(&findings, "access", Some("/dev/null"));
+    assert!(!text.contains("file:"), "no recording is asked: {text}");
+    let of_null = findings.iter().filter(|line| line["port"] == "/dev/null");
+    assert!(
+        of_null.clone().count() > 0 && of_null.clone().all(|line| line["state"] != "ok"),
+        "{findings:#?}"
+    );
     assert!(found == "failed" && text.contains("not a serial line"), "{text}");
     assert_eq!(outcome.of_class("error")[0]["kind"], "check");
     assert_eq!(findings.iter().find(|line| line["port"] == front.as_str()).unwrap()["link"], "front");
@@ -132,6 +140,25 @@ fn a_running_hub_is_asked_instead_and_a_dead_one_leaves_traces() {
     let (found, text) = state(&findings, "leftovers", None);
     assert!(found == "warning" && text.contains("1 process died") && text.contains("scanhub run"), "{text}");
     assert!(!stage.left_behind().is_empty(), "it deleted something");
+}
+
+#[test]
+fn a_hub_is_listed_below_its_root_and_is_no_leftover_below_another() {
+    let stage = Stage::new();
+    let hub = stage.hub(&[stage.link("absent")]);
+    assert!(!stage.left_behind().is_empty(), "it has shared memory");
+    let domains =
+        |root: &Path| Program::start(stage.command_at(root, &["list", "--domains", "--json"])).wait();
+    let place = stage.place();
+    let here = domains(place.root().parent().unwrap()).of_class("domain");
+    assert!(here.len() == 1 && here[0]["pid"] == hub.pid(), "{here:?}");
+    let other = stage.path("other");
+    assert!(domains(&other).of_class("domain").is_empty());
+    let outcome =
+        Program::start(stage.command_at(&other, &["doctor", "--json", "--no-system-config"])).wait();
+    let findings = outcome.of_class("check");
+    let (found, text) = state(&findings, "leftovers", None);
+    assert_eq!((found, text.as_str()), ("ok", "none "), "{outcome}");
 }
 
 #[test]

@@ -75,6 +75,10 @@ fn nobody_there() {
     for (port, code, kind) in [("/dev/null", 4, "port_not_tty"), ("/no/such", 4, "port_missing")] {
         let outcome = stage.run(&["probe", port, "--json"]);
         assert_eq!((outcome.code, &outcome.of_class("error")[0]["kind"]), (Some(code), &kind.into()));
+        assert!(
+            !outcome.of_class("error")[0].to_string().contains("file:"),
+            "no recording is asked: {outcome}"
+        );
     }
     let outcome = stage.run(&["probe", "file:/etc/hostname", "--json"]);
     assert_eq!((outcome.code, &outcome.of_class("error")[0]["kind"]), (Some(78), &"configuration".into()));

@@ -193,7 +193,7 @@ fn ports_that_cannot_be_used() {
     let stage = Stage::new();
     let file = stage.file("file", "not a tty");
     refused(&stage, &["run", "--link=front=/dev/null"], 4, "port_not_tty", &["/dev/null", "name a tty"]);
-    refused(&stage, &["run", &format!("--link=front={file}")], 4, "port_not_tty", &[&file, "name a tty"]);
+    refused(&stage, &["run", &format!("--link=front={file}")], 4, "port_not_tty", &[&file, "or file:PATH"]);
     refused(&stage, &["simulate", "--port=/no/where/front"], 4, "port_missing", &["/no/where/front"]);
 
     let _simulator = stage.simulator(&["front"], &["--baud=500000"]);

@@ -50,7 +50,7 @@ pub fn list(options: &ListOptions, out: &mut dyn Write, stop: &AtomicBool) -> Re
     quiet(table(&mut output, &rows))
 }
 
-/// Writes every live domain below `bases` (see [`Environment::bases`](schema::Environment::bases)) to `out`.
+/// Writes every live domain below `bases` (`--root`, or [`Environment::bases`](schema::Environment::bases)) to `out`.
 pub fn list_domains(bases: &[PathBuf], json: bool, out: &mut dyn Write) -> Result<(), Failure> {
     #[derive(Serialize)]
     struct Line {

@@ -30,7 +30,7 @@ fn foreign_to(uid: u32, root: &Path) -> Option<Failure> {
     Some(Failure::new(
         Kind::Failed,
         format!("{} belongs to user {owner} with mode {mode:04o}, this is user {uid}", path.display()),
-        "shared memory is for one user: run as that user, choose another --root, or take `scanhub listen` or a pipe",
+        "shared memory is for one user: run as that user, choose another --root, or take a pipe from that user's `scanhub echo --json`",
     ))
 }
 
@@ -52,6 +52,7 @@ mod tests {
             let said =
                 format!("{} belongs to user {own} with mode 0700, this is user {}", base.display(), own + 1);
             assert_eq!(failure.message, said);
+            assert!(failure.hint.contains("a pipe from that user's `scanhub echo --json`"), "{failure}");
         }
         assert_eq!((mine, shared), (None, None));
     }

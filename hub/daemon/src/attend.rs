@@ -25,6 +25,11 @@ impl LinkThread<'_> {
         } else {
             match Port::open(&link.port, link.baud.rate(), &AtomicBool::new(false)) {
                 Ok(port) => opened = Some(port),
+                // Only a hub plays recordings.
+                Err(failure) if failure.kind == Kind::PortNotTty => {
+                    let hint = format!("{}, or file:PATH for a recording", failure.hint);
+                    return report(Err(Failure { hint, ..failure }));
+                }
                 Err(failure) if failure.kind != Kind::PortMissing => return report(Err(failure)),
                 Err(failure) => away = Away::for_lack_of_a_port(said(failure)),
             }

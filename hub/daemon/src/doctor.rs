@@ -6,6 +6,7 @@ mod finding;
 mod hub;
 mod line;
 mod machine;
+mod segments;
 mod sensor;
 
 use std::sync::atomic::AtomicBool;

@@ -34,12 +34,12 @@ pub(crate) fn examine(
         Source::Tcp { .. } => return server(subject, hub, stop, tell),
     };
     let candidate = candidate(path, there);
-    tell(presence(&subject.source, path, candidate));
-    if !path.exists() {
+    if path.exists() && !is_tty(path) {
+        tell(refused(Refusal::NotTty.explain(&subject.source)));
         return Ok(());
     }
-    if !is_tty(path) {
-        tell(refused(Refusal::NotTty.explain(&subject.source)));
+    tell(presence(&subject.source, path, candidate));
+    if !path.exists() {
         return Ok(());
     }
     if let Some(holder) = holder(path) {

@@ -12,6 +12,7 @@ use schema::shortage::SHARED_MEMORY;
 use schema::{Domain, Failure};
 
 use super::finding::Finding;
+use super::segments::abandoned;
 use crate::preflight::{needed, needed_descriptors};
 
 /// What is known of the machine and the domain.
@@ -22,8 +23,6 @@ pub(crate) struct Facts {
     pub(crate) memory: Option<(u64, u64)>,
     /// Root path of the domain.
     pub(crate) root: PathBuf,
-    /// How names of its shared memory begin.
-    pub(crate) prefix: String,
     /// This user's number.
     pub(crate) user: u32,
     /// The root path, or the nearest directory above that exists.
@@ -31,8 +30,8 @@ pub(crate) struct Facts {
     /// The hub's process, if one holds the domain.
     pub(crate) hub: Result<Option<u32>, Failure>,
     pub(crate) nodes: Result<Nodes, Failure>,
-    /// Number and bytes of the domain's files in shared memory.
-    pub(crate) segments: (usize, u64),
+    /// Files in shared memory that may be the domain's and that nobody holds, with their bytes.
+    pub(crate) segments: Vec<(PathBuf, u64)>,
     /// Hard limit of open descriptors; none: no limit.
     pub(crate) descriptors: Option<u64>,
     /// How many this process has open, as would a hub that was started in its place.
@@ -61,12 +60,11 @@ impl Facts {
                 .ok()
                 .map(|stat| (stat.f_blocks * stat.f_frsize, stat.f_bavail * stat.f_frsize)),
             root: root.to_owned(),
-            prefix: domain.prefix(),
             user: getuid().as_raw(),
             place: Place::nearest(root),
             hub: schema::holder(root),
             nodes: schema::ipc::nodes(domain),
-            segments: segments(&domain.prefix()),
+            segments: abandoned(&domain.prefix(), getuid().as_raw()),
             descriptors: getrlimit(Resource::Nofile).maximum,
         }
     }
@@ -157,7 +155,7 @@ pub(crate) fn leftovers(facts: &Facts) -> Finding {
         Ok(nodes) => nodes,
         Err(failure) => return Finding::failed(NAME, failure.message.clone(), failure.hint.clone()),
     };
-    let (files, bytes) = facts.segments;
+    let (files, bytes) = (facts.segments.len(), facts.segments.iter().map(|(_, bytes)| bytes).sum::<u64>());
     let left = format!("{} ({} kB) in {SHARED_MEMORY}", plural(files as u64, "file"), bytes / 1024);
     match (facts.lives(), nodes.dead, nodes.alive) {
         (Some(_), 0, _) => Finding::ok(NAME, "none"),
@@ -168,17 +166,18 @@ pub(crate) fn leftovers(facts: &Facts) -> Finding {
         (None, 0, alive) if alive > 0 => {
             Finding::ok(NAME, format!("none; {} waiting for a hub", plural(alive as u64, "consumer")))
         }
+        (None, 0, _) => {
+            let names: Vec<_> = facts.segments.iter().map(|(path, _)| path.display().to_string()).collect();
+            Finding::warning(
+                NAME,
+                format!("no process here holds {left}"),
+                format!("unless a container that shares {SHARED_MEMORY} does: rm {}", names.join(" ")),
+            )
+        }
         (None, dead, _) => Finding::warning(
             NAME,
-            match dead {
-                0 => format!("nobody is left who made {left}"),
-                dead => format!("{} died without a hub to tidy up; {left}", plural(dead as u64, "process")),
-            },
-            format!(
-                "the next `scanhub run` here tidies up; without one: rm -r {} {SHARED_MEMORY}/{}*",
-                facts.root.display(),
-                facts.prefix
-            ),
+            format!("{} died without a hub to tidy up; {left}", plural(dead as u64, "process")),
+            format!("the next `scanhub run` at {} tidies up at its start", facts.root.display()),
         ),
     }
 }
@@ -199,16 +198,6 @@ pub(crate) fn descriptors(facts: &Facts) -> Finding {
     if consumers >= ENOUGH_CONSUMERS { Finding::ok(NAME, text) } else { Finding::warning(NAME, text, remedy) }
 }
 
-/// Files in shared memory whose names begin with `prefix`, less those that the library always leaves.
-fn segments(prefix: &str) -> (usize, u64) {
-    let entries = fs::read_dir(SHARED_MEMORY).into_iter().flatten().flatten();
-    let lengths = entries
-        .filter(|entry| entry.file_name().to_string_lossy().starts_with(prefix))
-        .filter_map(|entry| Some(entry.metadata().ok()?.len()))
-        .filter(|&length| length > ALWAYS_LEFT);
-    lengths.fold((0, 0), |(files, bytes), length| (files + 1, bytes + length))
-}
-
 fn plural(count: u64, what: &str) -> String {
     match (count, what.strip_suffix("ss")) {
         (1, _) => format!("1 {what}"),
@@ -223,8 +212,6 @@ const DESCRIPTORS_AT_START: u64 = 4;
 const DESCRIPTORS_OF_CONSUMER: u64 = 4;
 /// A robot has hardly more.
 const ENOUGH_CONSUMERS: u64 = 50;
-/// One lock of the library's is never removed, and has 16 bytes.
-const ALWAYS_LEFT: u64 = 16;
 
 #[cfg(test)]
 mod tests {
@@ -238,12 +225,11 @@ mod tests {
             links: 2,
             memory: Some((64 << 20, 60 << 20)),
             root: "/run/user/7/scanhub/scanhub".into(),
-            prefix: "sh_scanhub_".into(),
             user: 7,
             place: Place { path: "/run/user/7".into(), owner: 7, mode: 0o700, writable: true },
             hub: Ok(None),
             nodes: Ok(Nodes::default()),
-            segments: (0, 0),
+            segments: Vec::new(),
             descriptors: Some(4096),
             open: 4,
         }
@@ -290,11 +276,18 @@ mod tests {
     #[test]
     fn what_dead_processes_left_is_told_and_waiting_consumers_are_not() {
         says(&leftovers(&facts()), State::Ok, &["none"]);
-        let nodes = |alive, dead| Facts { nodes: Ok(Nodes { alive, dead }), segments: (7, 2048), ..facts() };
+        let segments = vec![("/dev/shm/sh_a_1".into(), 1024), ("/dev/shm/sh_a_2".into(), 1024)];
+        let nodes =
+            |alive, dead| Facts { nodes: Ok(Nodes { alive, dead }), segments: segments.clone(), ..facts() };
         says(&leftovers(&nodes(3, 0)), State::Ok, &["3 consumers waiting"]);
-        let words = ["1 process died", "7 files (2 kB)", "scanhub run", "/dev/shm/sh_scanhub_*"];
+        let words = ["1 process died", "2 files (2 kB)", "`scanhub run` at /run/user/7/scanhub/scanhub"];
         says(&leftovers(&nodes(0, 1)), State::Warning, &words);
-        says(&leftovers(&nodes(0, 0)), State::Warning, &["nobody is left", "7 files"]);
+        assert!(!leftovers(&nodes(0, 1)).remedy.contains("rm "), "its files may be another hub's");
+        says(
+            &leftovers(&nodes(0, 0)),
+            State::Warning,
+            &["no process", "2 files", "rm /dev/shm/sh_a_1 /dev/shm/sh_a_2"],
+        );
         says(&leftovers(&Facts { hub: Ok(Some(5)), ..nodes(3, 2) }), State::Ok, &["2 processes", "tidying"]);
     }
 

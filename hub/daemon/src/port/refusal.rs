@@ -75,7 +75,7 @@ impl Refusal {
                 let hint = format!("it is a directory; {}", instead(&name, &candidates()));
                 failure(Kind::PortNotTty, &hint)
             }
-            Refusal::NotTty => failure(Kind::PortNotTty, "name a tty, or file:PATH for a recording"),
+            Refusal::NotTty => failure(Kind::PortNotTty, "name a tty, or tcp:HOST:PORT"),
             Refusal::Dead => failure(Kind::PortMissing, &instead(&name, &candidates())),
             Refusal::Short(Errno::AGAIN) => failure(Kind::Short, "raise the limit of threads (ulimit -u)"),
             Refusal::Short(_) => failure(Kind::Short, "raise the limit of open descriptors (ulimit -n)"),
@@ -206,7 +206,7 @@ mod tests {
     fn what_the_kernel_says_and_what_it_means() {
         let source = Source::Tty("/dev/full".into());
         for (refusal, kind, says) in [
-            (Errno::NOTTY.into(), Kind::PortNotTty, "file:PATH for a recording"),
+            (Errno::NOTTY.into(), Kind::PortNotTty, "name a tty, or tcp:HOST:PORT"),
             (Errno::IO.into(), Kind::PortMissing, "no line behind it"),
             (Errno::NXIO.into(), Kind::PortMissing, "no line behind it"),
             (Errno::MFILE.into(), Kind::Short, "ulimit -n"),
