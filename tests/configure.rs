@@ -165,7 +165,7 @@ fn the_way_back_brings_back_what_was_changed() {
 #[test]
 fn everything_else_than_yes_writes_nothing() {
     let stage = Stage::new();
-    let simulator = stage.simulator(&["front"], &["--baud=38400"]);
+    let simulator = stage.simulator(&["front"], &["--baud=500000"]);
     let port = stage.word("front");
     for answer in ["no\n", "y\n", "\n", "YES\n", "\x04"] {
         let seen = Person::start(&stage, &[&port, "unit=cm"]).types(answer);
@@ -249,7 +249,7 @@ fn a_stream_that_was_found_goes_on() {
 #[test]
 fn what_was_begun_goes_to_its_end() {
     let stage = Stage::new();
-    let simulator = stage.simulator(&["front"], &["--baud=38400"]);
+    let simulator = stage.simulator(&["front"], &["--baud=500000"]);
     let port = stage.word("front");
     let signals = [(Signal::HUP, "unit=cm", 10), (Signal::QUIT, "unit=mm", 1), (TERM, "unit=cm", 10)];
     for (sent, setting, unit_mm) in signals {
