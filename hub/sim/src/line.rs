@@ -10,7 +10,7 @@ use schema::Failure;
 use crate::ear::Arrival;
 use crate::fault::Fault;
 use crate::machine::{Machine, Part};
-use crate::noise::Receiver;
+use crate::noise::Mistuned;
 use crate::place::Place;
 use crate::pty::{Pty, Wake, now_ns, wait};
 use crate::truth::{Record, Summary};
@@ -68,8 +68,8 @@ struct Way {
     is_open: bool,
     /// Of the telegram on the line.
     fault: Option<Fault>,
-    /// The host's port at another rate: the rates, and what it makes of the line.
-    garbled: Option<((u32, u32), Receiver)>,
+    /// The host's port, where it runs at another rate.
+    mistuned: Mistuned,
     sent: u64,
 }
 
@@ -149,10 +149,10 @@ impl Line<'_> {
             Some(Socket { pty, .. }) => {
                 let rates = (baud.rate(), pty.rate());
                 if same_rate(rates.1, rates.0) {
-                    way.garbled = None;
+                    way.mistuned.tune();
                 } else {
                     fault = fault.or(Some(Fault::Baud));
-                    bytes = way.garble(rates, &bytes, idle_after);
+                    bytes = way.mistuned.receive(rates, &bytes, idle_after);
                 }
                 if !pty.write(&bytes)? {
                     fault = fault.or(Some(Fault::Overrun));
@@ -178,16 +178,6 @@ impl Line<'_> {
             way.sent += 1;
         }
         Ok(())
-    }
-}
-
-impl Way {
-    /// What a port at the second of `rates` makes of bytes sent at the first.
-    fn garble(&mut self, rates: (u32, u32), bytes: &[u8], idle_after: bool) -> Vec<u8> {
-        if self.garbled.as_ref().is_none_or(|(known, _)| *known != rates) {
-            self.garbled = Some((rates, Receiver::new(rates.0, rates.1)));
-        }
-        self.garbled.as_mut().map_or(Vec::new(), |(_, receiver)| receiver.receive(bytes, idle_after))
     }
 }
 

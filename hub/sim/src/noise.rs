@@ -15,6 +15,24 @@ pub struct Receiver {
     state: State,
 }
 
+/// A port that may run at another rate than the line, whose rate changes too: begins anew with each pair of rates.
+#[derive(Clone, Debug, Default)]
+pub struct Mistuned(Option<((u32, u32), Receiver)>);
+
+impl Mistuned {
+    /// As [`Receiver::receive`], for a port at the second of `rates` on a line at the first, in bits per second.
+    pub fn receive(&mut self, rates: (u32, u32), bytes: &[u8], idle_after: bool) -> Vec<u8> {
+        let known = self.0.take().filter(|(known, _)| *known == rates);
+        let (_, receiver) = self.0.insert(known.unwrap_or_else(|| (rates, Receiver::new(rates.0, rates.1))));
+        receiver.receive(bytes, idle_after)
+    }
+
+    /// Both ends have one rate: what was half read is forgotten.
+    pub fn tune(&mut self) {
+        self.0 = None;
+    }
+}
+
 #[derive(Clone, Copy, Debug)]
 enum State {
     /// Waits for a falling edge after bit number `after`, whose level was `level`.

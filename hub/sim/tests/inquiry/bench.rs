@@ -11,7 +11,7 @@ use lms::{MICROS, MILLIS, Nanos, line_time};
 use sim::Arrival;
 use sim::fault::Faults;
 use sim::machine::{Machine, Part, Settings};
-use sim::noise::Receiver;
+use sim::noise::Mistuned;
 use sim::room::{Room, World};
 use sim::source::Source;
 use sim::wire::{Carried, Wire};
@@ -32,7 +32,7 @@ pub(crate) struct Bench<C> {
     pub(crate) said: Vec<Vec<u8>>,
     port: Baud,
     inbox: VecDeque<u8>,
-    garbled: Option<((Baud, Baud), Receiver)>,
+    mistuned: Mistuned,
     request: Vec<u8>,
     last: Nanos,
 }
@@ -77,7 +77,7 @@ impl<C: Conversation> Bench<C> {
             said: Vec::new(),
             port,
             inbox: VecDeque::new(),
-            garbled: None,
+            mistuned: Mistuned::default(),
             request: Vec::new(),
             last: now,
         }
@@ -179,12 +179,7 @@ impl<C: Conversation> Bench<C> {
         let Carried { bytes, baud, idle_after, .. } = carried;
         let mut bytes = (self.to_host)(bytes);
         if baud != self.port {
-            let rates = (baud, self.port);
-            if self.garbled.as_ref().is_none_or(|(known, _)| *known != rates) {
-                self.garbled = Some((rates, Receiver::new(rates.0.rate(), rates.1.rate())));
-            }
-            let receiver = self.garbled.as_mut().map(|(_, receiver)| receiver);
-            bytes = receiver.map_or(Vec::new(), |receiver| receiver.receive(&bytes, idle_after));
+            bytes = self.mistuned.receive((baud.rate(), self.port.rate()), &bytes, idle_after);
         }
         self.inbox.extend(bytes);
     }

@@ -10,7 +10,7 @@ use lms::{MICROS, MILLIS, Nanos, Settings, State, line_time};
 use sim::Arrival;
 use sim::fault::{Fault, Faults};
 use sim::machine::{self, Machine, Part};
-use sim::noise::Receiver;
+use sim::noise::Mistuned;
 use sim::room::{Room, World};
 use sim::source::Source;
 use sim::wire::{Carried, Wire};
@@ -44,7 +44,7 @@ pub(crate) struct Bench {
     port: Baud,
     /// Bytes that came and were not read.
     inbox: VecDeque<u8>,
-    garbled: Option<((Baud, Baud), Receiver)>,
+    mistuned: Mistuned,
     damaged: bool,
     fault: Option<Fault>,
     /// Whether the session streamed since the telegram on the line began.
@@ -140,7 +140,7 @@ impl Bench {
             states: Vec::new(),
             port: wanted.baud,
             inbox: VecDeque::new(),
-            garbled: None,
+            mistuned: Mistuned::default(),
             damaged: false,
             fault: None,
             streamed: true,
@@ -296,12 +296,7 @@ impl Bench {
         let Carried { bytes: brought, baud, idle_after, part, .. } = carried;
         let mut bytes = (self.to_host)(self.now, brought.clone());
         if baud != self.port {
-            let rates = (baud, self.port);
-            if self.garbled.as_ref().is_none_or(|(known, _)| *known != rates) {
-                self.garbled = Some((rates, Receiver::new(rates.0.rate(), rates.1.rate())));
-            }
-            let receiver = self.garbled.as_mut().map(|(_, receiver)| receiver);
-            bytes = receiver.map_or(Vec::new(), |receiver| receiver.receive(&bytes, idle_after));
+            bytes = self.mistuned.receive((baud.rate(), self.port.rate()), &bytes, idle_after);
         }
         self.damaged |= bytes != brought;
         self.inbox.extend(bytes);
