@@ -3,19 +3,14 @@
 
 mod stage;
 
-use std::ffi::OsStr;
 use std::fs::File;
 use std::io::{Read, Write};
-use std::os::fd::OwnedFd;
-use std::os::unix::ffi::OsStrExt;
 use std::process::{Child, Stdio};
 use std::thread;
 
-use rustix::fs::{Mode, OFlags};
 use rustix::process::{Pid, Signal, kill_process};
-use rustix::pty::{OpenptFlags, grantpt, openpt, ptsname, unlockpt};
 use serde_json::Value;
-use stage::{INT, Stage, TERM, number, until};
+use stage::{INT, Stage, TERM, number, terminal, until};
 
 /// The program with a person before it: what it asks is read, and answered on a terminal.
 struct Person {
@@ -72,17 +67,6 @@ impl Seen {
     fn lines(&self) -> Vec<Value> {
         self.out.lines().map(|line| serde_json::from_str(line).unwrap_or_else(|_| panic!("{line}"))).collect()
     }
-}
-
-/// The person's side of a new terminal, and the program's.
-fn terminal() -> (File, OwnedFd) {
-    let keys = openpt(OpenptFlags::RDWR | OpenptFlags::NOCTTY | OpenptFlags::CLOEXEC).unwrap();
-    grantpt(&keys).unwrap();
-    unlockpt(&keys).unwrap();
-    let name = ptsname(&keys, Vec::new()).unwrap();
-    let flags = OFlags::RDWR | OFlags::NOCTTY | OFlags::CLOEXEC;
-    let screen: OwnedFd = rustix::fs::open(OsStr::from_bytes(name.as_bytes()), flags, Mode::empty()).unwrap();
-    (keys.into(), screen)
 }
 
 fn signal(pid: u32, signal: Signal) {

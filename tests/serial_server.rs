@@ -3,21 +3,16 @@
 
 mod stage;
 
-use std::ffi::OsStr;
-use std::fs::File;
 use std::io::{Read, Write};
 use std::net::{TcpListener, TcpStream};
-use std::os::unix::ffi::OsStrExt;
 use std::process::Stdio;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::thread::{self, JoinHandle};
 use std::time::{Duration, Instant};
 
-use rustix::fs::{Mode, OFlags, open};
-use rustix::pty::{OpenptFlags, grantpt, openpt, ptsname, unlockpt};
 use serde_json::Value;
-use stage::{INT, Stage, TERM, is_class, number, open_line, sequence};
+use stage::{INT, Stage, TERM, is_class, number, open_line, sequence, terminal};
 
 /// One connection at a time, until it is dropped.
 struct Server {
@@ -224,17 +219,13 @@ fn probe_and_doctor_ask_there_too() {
 
 /// What a person sees who runs the program with `arguments` at a terminal and answers its question by yes; its exit code.
 fn confirmed(stage: &Stage, arguments: &[&str]) -> (String, Option<i32>) {
-    let keys = openpt(OpenptFlags::RDWR | OpenptFlags::NOCTTY | OpenptFlags::CLOEXEC).expect("a terminal");
-    grantpt(&keys).and_then(|()| unlockpt(&keys)).expect("a terminal");
-    let name = ptsname(&keys, Vec::new()).expect("it has a name");
-    let flags = OFlags::RDWR | OFlags::NOCTTY | OFlags::CLOEXEC;
-    let screen = open(OsStr::from_bytes(name.as_bytes()), flags, Mode::empty());
+    let (mut keys, screen) = terminal();
     let mut command = stage.command(arguments);
-    let screens = [0; 3].map(|_| Stdio::from(screen.as_ref().expect("a terminal").try_clone().unwrap()));
+    let screens = [0; 3].map(|_| Stdio::from(screen.try_clone().unwrap()));
     let [stdin, stdout, stderr] = screens;
     let mut process = command.stdin(stdin).stdout(stdout).stderr(stderr).spawn().expect("it starts");
     drop((command, screen));
-    let (mut keys, mut seen, mut byte) = (File::from(keys), Vec::new(), [0]);
+    let (mut seen, mut byte) = (Vec::new(), [0]);
     // A terminal that nobody has open any more ends by an error.
     while keys.read(&mut byte).is_ok_and(|len| len > 0) {
         seen.push(byte[0]);

@@ -5,6 +5,7 @@
 mod line;
 mod program;
 mod telegrams;
+mod terminal;
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -19,6 +20,7 @@ use serde_json::Value;
 pub(crate) use line::{Line, open_line};
 pub(crate) use program::{INT, KILL, Outcome, Program, TERM};
 pub(crate) use telegrams::{MEASURED, Sent, bytes_of, hash, is_class, number, scan, sequence};
+pub(crate) use terminal::terminal;
 
 /// Far longer than anything takes on a busy machine.
 pub(crate) const PATIENCE: Duration = Duration::from_secs(20);
