@@ -30,6 +30,8 @@ impl View {
             for line in &lines {
                 picture += &format!("\x1b[2K{line}\n");
             }
+            // A line that wraps would be two, and the next picture would not find its place: it is cut.
+            picture = format!("\x1b[?7l{picture}\x1b[?7h");
             self.drawn = lines.len();
         } else if elapsed.as_secs() >= self.drawn as u64 {
             // Into a file or a pipe: once a second is enough.
@@ -73,7 +75,7 @@ fn sensor_lines(sensor: &Sensor) -> [String; 3] {
     };
     [
         format!(
-            "{:6} {:9} {:6} Bd  {:5.2} Hz   {} telegrams   {} lost   {nearest}",
+            "{:6} {:9} {:6} Bd  {:5.2} Hz   {} telegrams   {} lost",
             sensor.name,
             sensor.state,
             sensor.baud,
@@ -82,7 +84,7 @@ fn sensor_lines(sensor: &Sensor) -> [String; 3] {
             lost,
         ),
         format!("  left  {}  right", profile(sensor)),
-        format!("        {:<COLUMNS$}", "(the taller, the nearer)"),
+        format!("        {:<COLUMNS$}", format!("(the taller, the nearer)   {nearest}")),
     ]
 }
 
