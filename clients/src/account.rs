@@ -70,7 +70,11 @@ impl Account {
     fn deadline(&self) -> Duration {
         match self.topic {
             Topic::Status => Duration::from_secs(3),
-            Topic::Telegram | Topic::Scan => (self.period * 10).max(Duration::from_secs(1)),
+            // It comes when there is a new one.
+            Topic::Background => Duration::MAX,
+            Topic::Telegram | Topic::Scan | Topic::Marks | Topic::Zones | Topic::Foreground => {
+                (self.period * 10).max(Duration::from_secs(1))
+            }
         }
     }
 }

@@ -72,13 +72,7 @@ impl Sink for Echo<'_> {
             (Format::Raw, _) => self.out.raw(sample.bytes()),
             (Format::Csv, Sample::Scan(scan)) => self.csv(scan.header(), scan),
             (Format::Csv, _) => Ok(()),
-            (Format::Json, Sample::Telegram(found)) => {
-                self.out.json(&json::telegram(&name.sensor, found.header(), found))
-            }
-            (Format::Json, Sample::Scan(found)) => {
-                self.out.json(&json::scan(&name.sensor, found.header(), found))
-            }
-            (Format::Json, Sample::Status(found)) => self.out.json(&json::status(&name.sensor, found)),
+            (Format::Json, _) => self.json(&name.sensor, sample),
         }
     }
 
@@ -99,6 +93,19 @@ impl Sink for Echo<'_> {
 }
 
 impl Echo<'_> {
+    fn json(&mut self, sensor: &str, sample: &Sample) -> Result<(), End> {
+        let (out, header) = (&mut self.out, sample.header());
+        match sample {
+            Sample::Telegram(found) => out.json(&json::telegram(sensor, header, found)),
+            Sample::Scan(found) => out.json(&json::scan(sensor, header, found)),
+            Sample::Marks(found) => out.json(&json::marks(sensor, header, found)),
+            Sample::Zones(found) => out.json(&json::zones(sensor, header, found)),
+            Sample::Foreground(found) => out.json(&json::foreground(sensor, header, found)),
+            Sample::Background(found) => out.json(&json::background(sensor, found)),
+            Sample::Status(found) => out.json(&json::status(sensor, found)),
+        }
+    }
+
     /// A line of columns; the names of the columns first, and again if their number changes.
     fn csv(&mut self, header: &Header, scan: &Scan) -> Result<(), End> {
         if self.columns != Some(scan.beams()) {

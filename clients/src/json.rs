@@ -1,5 +1,7 @@
 //! The classes of `--json`: which keys, in which order. A contract with scripts and other languages: add, never change.
 
+mod processed;
+
 use schema::{Counters, Failure, Header, Reasons, Scan, Status, Telegram, Verb};
 use serde::Serialize;
 use serde::ser::{SerializeMap, Serializer};
@@ -8,6 +10,8 @@ use crate::account::Account;
 use crate::follow::Notice;
 use crate::names::TopicName;
 use crate::output::{End, Output};
+
+pub(crate) use processed::{background, foreground, marks, zones};
 
 /// What all samples of telegrams begin with.
 #[derive(Serialize)]
@@ -92,6 +96,15 @@ pub(crate) fn scan<'a>(sensor: &'a str, header: &Header, scan: &'a Scan) -> impl
     }
 }
 
+/// A pose, in a status.
+#[derive(Serialize)]
+struct Place {
+    x_m: f64,
+    y_m: f64,
+    yaw_rad: f64,
+    upside_down: bool,
+}
+
 /// Class `status`; what is not known is null.
 pub(crate) fn status<'a>(sensor: &'a str, status: &'a Status) -> impl Serialize + 'a {
     #[derive(Serialize)]
@@ -108,6 +121,7 @@ pub(crate) fn status<'a>(sensor: &'a str, status: &'a Status) -> impl Serialize 
         step_deg: Option<f64>,
         hz: f64,
         port: &'a str,
+        pose: Place,
         since_ns: u64,
         #[serde(serialize_with = "counters")]
         counters: &'a Counters,
@@ -125,6 +139,12 @@ pub(crate) fn status<'a>(sensor: &'a str, status: &'a Status) -> impl Serialize 
         step_deg: known(status.resolution_cdeg, 0).map(|step| f64::from(step) / 100.0),
         hz: f64::from(status.rate_mhz) / 1000.0,
         port: status.port(),
+        pose: Place {
+            x_m: status.pose.x_m,
+            y_m: status.pose.y_m,
+            yaw_rad: status.pose.yaw_rad,
+            upside_down: status.pose.upside_down != 0,
+        },
         since_ns: status.since_ns,
         counters: &status.counters,
         last_error: status.last_error(),

@@ -9,19 +9,39 @@ pub enum Topic {
     Telegram,
     /// Decoded measurements.
     Scan,
+    /// Reflector marks.
+    Marks,
+    /// What is near the robot.
+    Zones,
+    /// What stands before the background.
+    Foreground,
+    /// The background model.
+    Background,
     /// State, properties and counters of the link.
     Status,
 }
 
 impl Topic {
     /// All topics, in the order of all output.
-    pub const ALL: [Topic; 3] = [Topic::Telegram, Topic::Scan, Topic::Status];
+    pub const ALL: [Topic; 7] = [
+        Topic::Telegram,
+        Topic::Scan,
+        Topic::Marks,
+        Topic::Zones,
+        Topic::Foreground,
+        Topic::Background,
+        Topic::Status,
+    ];
 
     /// The topic's name, as in `front/scan`.
     pub fn name(self) -> &'static str {
         match self {
             Topic::Telegram => "telegram",
             Topic::Scan => "scan",
+            Topic::Marks => "marks",
+            Topic::Zones => "zones",
+            Topic::Foreground => "foreground",
+            Topic::Background => "background",
             Topic::Status => "status",
         }
     }
@@ -36,6 +56,10 @@ impl Topic {
         match self {
             Topic::Telegram => "u8[]",
             Topic::Scan => "scanhub.Scan.v1",
+            Topic::Marks => "scanhub.Marks.v1",
+            Topic::Zones => "scanhub.Zones.v1",
+            Topic::Foreground => "scanhub.Foreground.v1",
+            Topic::Background => "scanhub.Background.v1",
             Topic::Status => "scanhub.Status.v1",
         }
     }

@@ -1,0 +1,181 @@
+//! The classes of what the hub makes of a scan: marks, zones, foreground, background. A contract, as its parent.
+
+use schema::{Background, Foreground, Header, Mark, Marks, Segment, Zone, Zones};
+use serde::{Serialize, Serializer};
+
+use super::Stamp;
+
+/// Class `marks`.
+pub(crate) fn marks<'a>(sensor: &'a str, header: &Header, marks: &'a Marks) -> impl Serialize + 'a {
+    #[derive(Serialize)]
+    struct Line<'a> {
+        #[serde(flatten)]
+        stamp: Stamp<'a>,
+        available: bool,
+        overflow: bool,
+        #[serde(serialize_with = "mark_list")]
+        marks: &'a [Mark],
+    }
+    Line {
+        stamp: Stamp::new("marks", sensor, header),
+        available: marks.is_available(),
+        overflow: marks.is_overflow(),
+        marks: marks.marks(),
+    }
+}
+
+/// Class `zones`.
+pub(crate) fn zones<'a>(sensor: &'a str, header: &Header, zones: &'a Zones) -> impl Serialize + 'a {
+    #[derive(Serialize)]
+    struct Line<'a> {
+        #[serde(flatten)]
+        stamp: Stamp<'a>,
+        verdict: &'static str,
+        nearest_mm: Option<u32>,
+        nearest_beam: Option<u16>,
+        #[serde(serialize_with = "zone_list")]
+        zones: &'a [Zone],
+        invalid_beams: u16,
+        #[serde(skip_serializing_if = "std::ops::Not::not")]
+        provisional: bool,
+    }
+    let (nearest_beam, nearest_mm) = zones.nearest().unzip();
+    Line {
+        stamp: Stamp::new("zones", sensor, header),
+        verdict: zones.verdict().name(),
+        nearest_mm,
+        nearest_beam,
+        zones: zones.zones(),
+        invalid_beams: zones.invalid_beams,
+        provisional: zones.flags & Zones::PROVISIONAL != 0,
+    }
+}
+
+/// Class `foreground`.
+pub(crate) fn foreground<'a>(
+    sensor: &'a str,
+    header: &Header,
+    foreground: &'a Foreground,
+) -> impl Serialize + 'a {
+    #[derive(Serialize)]
+    struct Line<'a> {
+        #[serde(flatten)]
+        stamp: Stamp<'a>,
+        generation: u32,
+        unit_mm: u8,
+        #[serde(serialize_with = "beams")]
+        beams: &'a Foreground,
+        ranges: &'a [u16],
+        #[serde(serialize_with = "segment_list")]
+        segments: &'a Foreground,
+        left_out: u8,
+    }
+    Line {
+        stamp: Stamp::new("foreground", sensor, header),
+        generation: foreground.generation,
+        unit_mm: foreground.unit_mm,
+        beams: foreground,
+        ranges: foreground.ranges(),
+        segments: foreground,
+        left_out: foreground.left_out,
+    }
+}
+
+/// Class `background`.
+pub(crate) fn background<'a>(sensor: &'a str, model: &'a Background) -> impl Serialize + 'a {
+    #[derive(Serialize)]
+    struct Line<'a> {
+        class: &'static str,
+        sensor: &'a str,
+        generation: u32,
+        taught: u16,
+        unit_mm: u8,
+        frozen: bool,
+        #[serde(serialize_with = "known_ranges")]
+        ranges: &'a [u16],
+        #[serde(serialize_with = "far_beams")]
+        far: &'a [u16],
+    }
+    Line {
+        class: "background",
+        sensor,
+        generation: model.generation,
+        taught: model.taught,
+        unit_mm: model.unit_mm,
+        frozen: model.is_frozen(),
+        ranges: model.ranges(),
+        far: model.ranges(),
+    }
+}
+
+fn mark_list<S: Serializer>(marks: &[Mark], serializer: S) -> Result<S::Ok, S::Error> {
+    #[derive(Serialize)]
+    struct Item {
+        angle_deg: f64,
+        range_mm: f64,
+        peak: u8,
+        weight: u16,
+        first_beam: u16,
+        last_beam: u16,
+        edge: bool,
+    }
+    serializer.collect_seq(marks.iter().map(|mark| Item {
+        angle_deg: f64::from(mark.angle_mdeg) / 1000.0,
+        range_mm: f64::from(mark.range_dmm) / 10.0,
+        peak: mark.peak,
+        weight: mark.weight,
+        first_beam: mark.first_beam,
+        last_beam: mark.last_beam,
+        edge: mark.edge != 0,
+    }))
+}
+
+fn zone_list<S: Serializer>(zones: &[Zone], serializer: S) -> Result<S::Ok, S::Error> {
+    #[derive(Serialize)]
+    struct Item {
+        radius_mm: u16,
+        violated: bool,
+        beams: u16,
+    }
+    serializer.collect_seq(zones.iter().map(|zone| Item {
+        radius_mm: zone.radius_mm,
+        violated: zone.violated != 0,
+        beams: zone.beams,
+    }))
+}
+
+fn segment_list<S: Serializer>(foreground: &Foreground, serializer: S) -> Result<S::Ok, S::Error> {
+    #[derive(Serialize)]
+    struct Item {
+        first: u16,
+        last: u16,
+        nearest_mm: u32,
+        width_mm: u32,
+        x_mm: i32,
+        y_mm: i32,
+    }
+    let unit_mm = u32::from(foreground.unit_mm);
+    let item = |segment: &Segment| Item {
+        first: segment.first,
+        last: segment.last,
+        nearest_mm: u32::from(segment.nearest) * unit_mm,
+        width_mm: u32::from(segment.width) * unit_mm,
+        x_mm: segment.x_mm,
+        y_mm: segment.y_mm,
+    };
+    serializer.collect_seq(foreground.segments().iter().map(item))
+}
+
+fn beams<S: Serializer>(foreground: &Foreground, serializer: S) -> Result<S::Ok, S::Error> {
+    serializer.collect_seq(foreground.readings().map(|(beam, _)| beam))
+}
+
+fn known_ranges<S: Serializer>(ranges: &[u16], serializer: S) -> Result<S::Ok, S::Error> {
+    let is_known = |range: &u16| *range != Background::UNTAUGHT && *range != Background::FAR;
+    serializer.collect_seq(ranges.iter().map(|range| Some(*range).filter(is_known)))
+}
+
+fn far_beams<S: Serializer>(ranges: &[u16], serializer: S) -> Result<S::Ok, S::Error> {
+    let far = ranges.iter().enumerate().filter(|(_, range)| **range == Background::FAR);
+    serializer.collect_seq(far.map(|(beam, _)| beam))
+}

@@ -1,0 +1,55 @@
+//! The lines of what the hub makes of a scan. No contract, as its parent.
+
+use std::io::{self, Write};
+
+use schema::{Background, Foreground, Header, Marks, Zones};
+
+use super::numbers;
+
+pub(super) fn marks(line: &mut Vec<u8>, header: &Header, marks: &Marks) -> io::Result<()> {
+    numbers(line, header)?;
+    if !marks.is_available() {
+        return write!(line, " unavailable: the sensor's measuring mode has no reflector bits");
+    }
+    write!(line, " {} marks", marks.marks().len())?;
+    for mark in marks.marks() {
+        let (angle_deg, range_mm) = (f64::from(mark.angle_mdeg) / 1000.0, f64::from(mark.range_dmm) / 10.0);
+        write!(line, ", {range_mm:.1} mm at {angle_deg:.3} deg")?;
+    }
+    if marks.is_overflow() { write!(line, ", and more") } else { Ok(()) }
+}
+
+pub(super) fn zones(line: &mut Vec<u8>, header: &Header, zones: &Zones) -> io::Result<()> {
+    numbers(line, header)?;
+    write!(line, " {}", zones.verdict().name())?;
+    match zones.nearest() {
+        Some((beam, mm)) => write!(line, " nearest {mm} mm, beam {beam}")?,
+        None => write!(line, " nothing near")?,
+    }
+    for zone in zones.zones() {
+        let violated = if zone.violated != 0 { " violated" } else { "" };
+        write!(line, ", {} mm{violated} {}", zone.radius_mm, zone.beams)?;
+    }
+    if zones.invalid_beams > 0 { write!(line, ", {} invalid", zones.invalid_beams) } else { Ok(()) }
+}
+
+pub(super) fn foreground(line: &mut Vec<u8>, header: &Header, foreground: &Foreground) -> io::Result<()> {
+    numbers(line, header)?;
+    write!(line, " {} beams, {} segments", foreground.beams, foreground.segments)?;
+    let unit_mm = u32::from(foreground.unit_mm);
+    for segment in foreground.segments() {
+        let width_mm = u32::from(segment.width) * unit_mm;
+        write!(line, ", {width_mm} mm wide at ({}, {})", segment.x_mm, segment.y_mm)?;
+    }
+    Ok(())
+}
+
+pub(crate) fn background(line: &mut Vec<u8>, model: &Background) -> io::Result<()> {
+    let far = model.ranges().iter().filter(|&&range| range == Background::FAR).count();
+    let frozen = if model.is_frozen() { ", frozen" } else { "" };
+    let Background { generation, taught, count, unit_mm, .. } = model;
+    write!(
+        line,
+        "generation {generation}: {taught} of {count} beams known, {far} far, in {unit_mm} mm{frozen}"
+    )
+}
