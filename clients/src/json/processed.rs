@@ -1,6 +1,6 @@
-//! The classes of what the hub makes of a scan: marks, zones, foreground, background. A contract, as its parent.
+//! The classes of what the hub makes of a scan: marks, zones, foreground. A contract, as its parent.
 
-use schema::{Background, Foreground, Header, Mark, Marks, Segment, Zone, Zones};
+use schema::{Foreground, Header, Mark, Marks, Segment, Zone, Zones};
 use serde::{Serialize, Serializer};
 
 use super::Stamp;
@@ -81,33 +81,6 @@ pub(crate) fn foreground<'a>(
     }
 }
 
-/// Class `background`.
-pub(crate) fn background<'a>(sensor: &'a str, model: &'a Background) -> impl Serialize + 'a {
-    #[derive(Serialize)]
-    struct Line<'a> {
-        class: &'static str,
-        sensor: &'a str,
-        generation: u32,
-        taught: u16,
-        unit_mm: u8,
-        frozen: bool,
-        #[serde(serialize_with = "known_ranges")]
-        ranges: &'a [u16],
-        #[serde(serialize_with = "far_beams")]
-        far: &'a [u16],
-    }
-    Line {
-        class: "background",
-        sensor,
-        generation: model.generation,
-        taught: model.taught,
-        unit_mm: model.unit_mm,
-        frozen: model.is_frozen(),
-        ranges: model.ranges(),
-        far: model.ranges(),
-    }
-}
-
 fn mark_list<S: Serializer>(marks: &[Mark], serializer: S) -> Result<S::Ok, S::Error> {
     #[derive(Serialize)]
     struct Item {
@@ -168,14 +141,4 @@ fn segment_list<S: Serializer>(foreground: &Foreground, serializer: S) -> Result
 
 fn beams<S: Serializer>(foreground: &Foreground, serializer: S) -> Result<S::Ok, S::Error> {
     serializer.collect_seq(foreground.readings().map(|(beam, _)| beam))
-}
-
-fn known_ranges<S: Serializer>(ranges: &[u16], serializer: S) -> Result<S::Ok, S::Error> {
-    let is_known = |range: &u16| *range != Background::UNTAUGHT && *range != Background::FAR;
-    serializer.collect_seq(ranges.iter().map(|range| Some(*range).filter(is_known)))
-}
-
-fn far_beams<S: Serializer>(ranges: &[u16], serializer: S) -> Result<S::Ok, S::Error> {
-    let far = ranges.iter().enumerate().filter(|(_, range)| **range == Background::FAR);
-    serializer.collect_seq(far.map(|(beam, _)| beam))
 }
