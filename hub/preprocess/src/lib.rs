@@ -3,6 +3,8 @@
 
 #![forbid(unsafe_code)]
 
+pub mod marks;
 mod reading;
+pub mod zones;
 
 pub use reading::Reading;
