@@ -11,7 +11,9 @@ use crate::follow::Notice;
 use crate::names::TopicName;
 use crate::output::{End, Output};
 
-pub(crate) use processed::{background, foreground, marks, robot, zones};
+pub(crate) use processed::{foreground, marks, robot, zones};
+// A background model as a line is what a file of it is.
+pub(crate) use schema::as_json as background;
 
 /// What all samples of telegrams begin with.
 #[derive(Serialize)]

@@ -23,6 +23,8 @@ pub mod ipc;
 pub mod limits;
 #[cfg(feature = "ipc")]
 mod lock;
+#[cfg(feature = "json")]
+mod saved;
 #[cfg(feature = "ipc")]
 pub mod shortage;
 
@@ -44,3 +46,5 @@ pub use zones::{Verdict, ZONES, Zone, Zones};
 
 #[cfg(feature = "ipc")]
 pub use lock::{HubLock, holder};
+#[cfg(feature = "json")]
+pub use saved::{SavedModel, as_json};

@@ -1,6 +1,6 @@
-//! The classes of what the hub makes of a scan: marks, zones, foreground, background. A contract, as its parent.
+//! The classes of what the hub makes of a scan: marks, zones, foreground. A contract, as its parent.
 
-use schema::{Background, Foreground, Header, Mark, Marks, ROBOT, Segment, Verdict, Zone, Zones};
+use schema::{Foreground, Header, Mark, Marks, ROBOT, Segment, Verdict, Zone, Zones};
 use serde::{Serialize, Serializer};
 
 use super::Stamp;
@@ -38,9 +38,9 @@ pub(crate) fn zones<'a>(sensor: &'a str, heard: &'a Heard) -> impl Serialize + '
         #[serde(serialize_with = "zone_list")]
         zones: &'a [Zone],
         invalid_beams: u16,
-        #[serde(skip_serializing_if = "is_not")]
+        #[serde(skip_serializing_if = "std::ops::Not::not")]
         provisional: bool,
-        #[serde(skip_serializing_if = "is_not")]
+        #[serde(skip_serializing_if = "std::ops::Not::not")]
         stale: bool,
     }
     let zones = &heard.zones;
@@ -74,7 +74,7 @@ pub(crate) fn robot<'a>(robot: &'a Robot, heard: &Heard) -> impl Serialize + 'a 
         nearest_sensor: Option<&'a str>,
         #[serde(serialize_with = "verdict_list")]
         sensors: &'a Robot,
-        #[serde(skip_serializing_if = "is_not")]
+        #[serde(skip_serializing_if = "std::ops::Not::not")]
         stale: bool,
     }
     let (nearest_mm, nearest_sensor) = robot.nearest().unzip();
@@ -118,33 +118,6 @@ pub(crate) fn foreground<'a>(
         ranges: foreground.ranges(),
         segments: foreground,
         left_out: foreground.left_out,
-    }
-}
-
-/// Class `background`.
-pub(crate) fn background<'a>(sensor: &'a str, model: &'a Background) -> impl Serialize + 'a {
-    #[derive(Serialize)]
-    struct Line<'a> {
-        class: &'static str,
-        sensor: &'a str,
-        generation: u32,
-        taught: u16,
-        unit_mm: u8,
-        frozen: bool,
-        #[serde(serialize_with = "known_ranges")]
-        ranges: &'a [u16],
-        #[serde(serialize_with = "far_beams")]
-        far: &'a [u16],
-    }
-    Line {
-        class: "background",
-        sensor,
-        generation: model.generation,
-        taught: model.taught,
-        unit_mm: model.unit_mm,
-        frozen: model.is_frozen(),
-        ranges: model.ranges(),
-        far: model.ranges(),
     }
 }
 
@@ -218,19 +191,4 @@ fn segment_list<S: Serializer>(foreground: &Foreground, serializer: S) -> Result
 
 fn beams<S: Serializer>(foreground: &Foreground, serializer: S) -> Result<S::Ok, S::Error> {
     serializer.collect_seq(foreground.readings().map(|(beam, _)| beam))
-}
-
-fn known_ranges<S: Serializer>(ranges: &[u16], serializer: S) -> Result<S::Ok, S::Error> {
-    let is_known = |range: &u16| *range != Background::UNTAUGHT && *range != Background::FAR;
-    serializer.collect_seq(ranges.iter().map(|range| Some(*range).filter(is_known)))
-}
-
-#[allow(clippy::trivially_copy_pass_by_ref)] // serde's shape.
-fn is_not(value: &bool) -> bool {
-    !value
-}
-
-fn far_beams<S: Serializer>(ranges: &[u16], serializer: S) -> Result<S::Ok, S::Error> {
-    let far = ranges.iter().enumerate().filter(|(_, range)| **range == Background::FAR);
-    serializer.collect_seq(far.map(|(beam, _)| beam))
 }
