@@ -4,11 +4,13 @@
 
 mod account;
 mod attach;
+mod clock;
 mod control;
 pub mod duration;
 mod echo;
 mod follow;
 mod follower;
+mod freshness;
 mod hz;
 mod info;
 mod json;
@@ -16,10 +18,12 @@ mod list;
 mod names;
 mod output;
 mod presence;
+mod robot;
 mod sample;
 mod session;
 mod text;
 mod window;
+mod zones;
 
 pub use attach::{Attachment, attach};
 pub use control::{ControlOptions, control};
@@ -31,3 +35,5 @@ pub use info::{InfoOptions, info};
 pub use json::error as error_line;
 pub use list::{ListOptions, list, list_domains};
 pub use names::TopicName;
+pub use robot::{Robot, RobotFollower, robot};
+pub use zones::{Heard, ZonesFollower, zones};
