@@ -4,9 +4,11 @@
 
 mod account;
 mod attach;
+mod background;
 mod control;
 pub mod duration;
 mod echo;
+mod file;
 mod follow;
 mod follower;
 mod hz;
@@ -22,6 +24,7 @@ mod text;
 mod window;
 
 pub use attach::{Attachment, attach};
+pub use background::{BackgroundOptions, ModelOrder, background, saved_model};
 pub use control::{ControlOptions, control};
 pub use echo::{EchoOptions, Format, echo};
 pub use follow::Bounds;
