@@ -30,7 +30,7 @@ pub(crate) struct Simulate {
     /// The sensors' own address, 0 to 127; they answer to 0 too
     #[arg(long, default_value_t = 0, value_name = "NUMBER")]
     address: u8,
-    /// What the sensors see: room, bare, empty, wall640 or random
+    /// What the sensors see: room, bare, fig8, empty, wall640, random, or a TOML file
     #[arg(long, default_value = "room", value_name = "NAME", conflicts_with = "replay")]
     world: String,
     /// A recording to send instead: telegram stream or CARMEN log, plain or gzipped

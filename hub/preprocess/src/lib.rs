@@ -3,6 +3,8 @@
 
 #![forbid(unsafe_code)]
 
+pub mod background;
 mod reading;
+pub mod segments;
 
 pub use reading::Reading;
