@@ -6,7 +6,6 @@
 pub mod background;
 pub mod marks;
 mod reading;
-mod reading;
 pub mod segments;
 pub mod zones;
 
