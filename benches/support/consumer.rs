@@ -5,7 +5,7 @@ use std::io::Write;
 
 use clients::Attachment;
 use schema::ipc::Payload;
-use schema::{Domain, Environment, Header, Scan, Status};
+use schema::{Domain, Environment, Header, Scan, Status, Zones};
 
 use super::{Outcome, clock, truth};
 
@@ -49,6 +49,29 @@ pub(crate) fn telegrams(domain: &str, sensor: &str, count: usize) -> Outcome<()>
     kept.iter().try_for_each(|found| write(&mut out, sensor, found))?;
     writeln!(out, "end")?;
     Ok(())
+}
+
+/// Follows the scans or the zones of `sensor` until `count` came, then prints for each how old its telegram's last byte
+/// was when the sample was in hand: `aged SENSOR NS`.
+pub(crate) fn ages(topic: &str, domain: &str, sensor: &str, count: usize) -> Outcome<()> {
+    let ages = match topic {
+        "zones" => collect_ages::<Zones>(domain, sensor, count)?,
+        _ => collect_ages::<Scan>(domain, sensor, count)?,
+    };
+    ages.iter().for_each(|age| println!("aged {sensor} {age}"));
+    println!("end");
+    Ok(())
+}
+
+fn collect_ages<P: Payload>(domain: &str, sensor: &str, count: usize) -> Outcome<Vec<u64>> {
+    let mut samples = attach::<P>(domain, sensor)?;
+    let mut ages = Vec::with_capacity(count);
+    println!("attaching {sensor}");
+    while ages.len() < count {
+        let Some(sample) = samples.next()? else { continue };
+        ages.push(clock::now().saturating_sub(sample.header().stamp_last_ns));
+    }
+    Ok(ages)
 }
 
 /// Follows the status of `sensor` for ever; prints each: `status SENSOR STATE SINCE_NS BOOT`.

@@ -48,6 +48,7 @@ fn play(words: &[String]) -> Outcome<()> {
     match words[..] {
         ["consume", "scan", domain, sensor] => consumer::scans(domain, sensor),
         ["consume", "telegram", domain, sensor, count] => consumer::telegrams(domain, sensor, count.parse()?),
+        ["ages", topic, domain, sensor, count] => consumer::ages(topic, domain, sensor, count.parse()?),
         ["consume", "status", domain, sensor] => consumer::statuses(domain, sensor),
         ["crowd", domain, sensor, count, seconds] => {
             crowd::follow(domain, sensor, count.parse()?, seconds.parse()?)

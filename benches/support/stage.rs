@@ -80,10 +80,15 @@ impl Stage {
 
     /// The hub; its first line says that it is up.
     pub(crate) fn hub(&self, sensors: &[&str]) -> Outcome<Child> {
+        self.hub_of(PROGRAM, sensors)
+    }
+
+    /// The hub of another build of the program.
+    pub(crate) fn hub_of(&self, program: &str, sensors: &[&str]) -> Outcome<Child> {
         let mut words = vec!["run".into(), "--domain".into(), self.domain.name().into()];
         let link = |sensor: &&str| ["--link".into(), format!("{sensor}={}", self.port(sensor))];
         words.extend(sensors.iter().flat_map(link));
-        Child::start(PROGRAM, &words)
+        Child::start(program, &words)
     }
 
     /// This program as a consumer of `topic`, with more `words`.

@@ -7,7 +7,7 @@ use std::thread::sleep;
 use std::time::{Duration, Instant};
 
 use schema::ipc::{self, ControlClient, Node};
-use schema::{Domain, Failure, Kind, Request, Verb, check_sensor, holder};
+use schema::{Background, Domain, Failure, Kind, Request, Verb, check_sensor, holder};
 
 use crate::json;
 use crate::output::{Output, quiet};
@@ -35,15 +35,24 @@ pub struct ControlOptions {
 pub fn control(options: &ControlOptions, out: &mut dyn Write, stop: &AtomicBool) -> Result<(), Failure> {
     let ControlOptions { sensor, verb, .. } = options;
     check_sensor(sensor)?;
-    let domain = find(&options.places)?;
-    let node = ipc::client_node(&domain)?;
-    ask(&open(&node)?, &domain, &Request::new(sensor, *verb), stop)?;
+    request(&options.places, &Request::new(sensor, *verb), stop)?;
     let mut output = Output::new(out);
     quiet(if options.json {
         output.json(&json::control(sensor, *verb))
     } else {
         output.line(|line| write!(line, "{sensor}: {} taken", verb.name()))
     })
+}
+
+/// Asks the hub at the first live one of `places` for `request`, and answers what it answered. Failures as [`control`].
+pub(crate) fn request(
+    places: &[Domain],
+    request: &Request,
+    stop: &AtomicBool,
+) -> Result<Option<Background>, Failure> {
+    let domain = find(places)?;
+    let node = ipc::client_node(&domain)?;
+    ask(&open(&node)?, &domain, request, stop)
 }
 
 /// The control service; that of a hub that is just starting is waited for.
@@ -60,7 +69,12 @@ fn open(node: &Node) -> Result<ControlClient, Failure> {
     }
 }
 
-fn ask(client: &ControlClient, domain: &Domain, request: &Request, stop: &AtomicBool) -> Result<(), Failure> {
+fn ask(
+    client: &ControlClient,
+    domain: &Domain,
+    request: &Request,
+    stop: &AtomicBool,
+) -> Result<Option<Background>, Failure> {
     let pending = client.ask(request)?;
     let give_up_at = Instant::now() + PATIENCE;
     loop {

@@ -72,13 +72,7 @@ impl Sink for Echo<'_> {
             (Format::Raw, _) => self.out.raw(sample.bytes()),
             (Format::Csv, Sample::Scan(scan)) => self.csv(scan.header(), scan),
             (Format::Csv, _) => Ok(()),
-            (Format::Json, Sample::Telegram(found)) => {
-                self.out.json(&json::telegram(&name.sensor, found.header(), found))
-            }
-            (Format::Json, Sample::Scan(found)) => {
-                self.out.json(&json::scan(&name.sensor, found.header(), found))
-            }
-            (Format::Json, Sample::Status(found)) => self.out.json(&json::status(&name.sensor, found)),
+            (Format::Json, _) => self.json(&name.sensor, sample),
         }
     }
 
@@ -99,6 +93,20 @@ impl Sink for Echo<'_> {
 }
 
 impl Echo<'_> {
+    fn json(&mut self, sensor: &str, sample: &Sample) -> Result<(), End> {
+        let out = &mut self.out;
+        match sample {
+            Sample::Telegram(found) => out.json(&json::telegram(sensor, found.header(), found)),
+            Sample::Scan(found) => out.json(&json::scan(sensor, found.header(), found)),
+            Sample::Marks(found) => out.json(&json::marks(sensor, found.header(), found)),
+            Sample::Zones(heard) => out.json(&json::zones(sensor, heard)),
+            Sample::Foreground(found) => out.json(&json::foreground(sensor, found.header(), found)),
+            Sample::Background(found) => out.json(&json::background(sensor, found)),
+            Sample::Status(found) => out.json(&json::status(sensor, found)),
+            Sample::Robot(found) => out.json(&json::robot(&found.robot, &found.heard)),
+        }
+    }
+
     /// A line of columns; the names of the columns first, and again if their number changes.
     fn csv(&mut self, header: &Header, scan: &Scan) -> Result<(), End> {
         if self.columns != Some(scan.beams()) {
@@ -129,6 +137,7 @@ fn check(format: Format, names: &[TopicName]) -> Result<(), Failure> {
         (Format::Csv, [one]) if one.topic == Topic::Scan => Ok(()),
         (Format::Csv, _) => usage("--csv takes one topic, and that a scan"),
         (Format::Raw, [_, _, ..]) => usage("--raw takes one topic"),
+        (Format::Raw, [one]) if one.is_robot() => usage("--raw takes the topic of a sensor"),
         _ => Ok(()),
     }
 }

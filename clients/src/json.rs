@@ -1,6 +1,8 @@
 //! The classes of `--json`: which keys, in which order. A contract with scripts and other languages: add, never change.
 
-use schema::{Counters, Failure, Header, Reasons, Scan, Status, Telegram, Verb};
+mod processed;
+
+use schema::{Counters, Failure, Header, Quality, Reasons, Scan, Status, Telegram, Verb};
 use serde::Serialize;
 use serde::ser::{SerializeMap, Serializer};
 
@@ -9,17 +11,21 @@ use crate::follow::Notice;
 use crate::names::TopicName;
 use crate::output::{End, Output};
 
+pub(crate) use processed::{foreground, marks, robot, zones};
+// A background model as a line is what a file of it is.
+pub(crate) use schema::as_json as background;
+
 /// What all samples of telegrams begin with.
 #[derive(Serialize)]
 struct Stamp<'a> {
     class: &'static str,
     sensor: &'a str,
-    seq: u64,
-    topic_seq: u64,
-    stamp_ns: u64,
-    wall_ns: u64,
+    seq: Option<u64>,
+    topic_seq: Option<u64>,
+    stamp_ns: Option<u64>,
+    wall_ns: Option<u64>,
     #[serde(serialize_with = "id")]
-    boot: u64,
+    boot: Option<u64>,
     quality: &'static str,
     #[serde(skip_serializing_if = "Vec::is_empty")]
     reasons: Vec<&'static str>,
@@ -30,14 +36,21 @@ impl<'a> Stamp<'a> {
         Stamp {
             class,
             sensor,
-            seq: header.seq,
-            topic_seq: header.topic_seq,
-            stamp_ns: header.stamp_first_ns,
-            wall_ns: header.wall_ns,
-            boot: header.boot,
+            seq: Some(header.seq),
+            topic_seq: Some(header.topic_seq),
+            stamp_ns: Some(header.stamp_first_ns),
+            wall_ns: Some(header.wall_ns),
+            boot: Some(header.boot),
             quality: header.quality().name(),
             reasons: Reasons::names(header.reasons).collect(),
         }
+    }
+
+    /// Of a sensor that was never heard.
+    fn unheard(class: &'static str, sensor: &'a str) -> Stamp<'a> {
+        let (seq, topic_seq, stamp_ns, wall_ns, boot) = (None, None, None, None, None);
+        let quality = Quality::Clean.name();
+        Stamp { class, sensor, seq, topic_seq, stamp_ns, wall_ns, boot, quality, reasons: Vec::new() }
     }
 }
 
@@ -92,6 +105,15 @@ pub(crate) fn scan<'a>(sensor: &'a str, header: &Header, scan: &'a Scan) -> impl
     }
 }
 
+/// A pose, in a status.
+#[derive(Serialize)]
+struct Place {
+    x_m: f64,
+    y_m: f64,
+    yaw_rad: f64,
+    upside_down: bool,
+}
+
 /// Class `status`; what is not known is null.
 pub(crate) fn status<'a>(sensor: &'a str, status: &'a Status) -> impl Serialize + 'a {
     #[derive(Serialize)]
@@ -112,6 +134,7 @@ pub(crate) fn status<'a>(sensor: &'a str, status: &'a Status) -> impl Serialize 
         #[serde(serialize_with = "counters")]
         counters: &'a Counters,
         last_error: &'a str,
+        pose: Place,
     }
     Line {
         class: "status",
@@ -128,6 +151,12 @@ pub(crate) fn status<'a>(sensor: &'a str, status: &'a Status) -> impl Serialize 
         since_ns: status.since_ns,
         counters: &status.counters,
         last_error: status.last_error(),
+        pose: Place {
+            x_m: status.pose.x_m,
+            y_m: status.pose.y_m,
+            yaw_rad: status.pose.yaw_rad,
+            upside_down: status.pose.upside_down != 0,
+        },
     }
 }
 
@@ -209,8 +238,11 @@ fn known<T: PartialEq>(value: T, unknown: T) -> Option<T> {
     (value != unknown).then_some(value)
 }
 
-fn id<S: Serializer>(value: &u64, serializer: S) -> Result<S::Ok, S::Error> {
-    serializer.collect_str(&format_args!("{value:016x}"))
+fn id<S: Serializer>(value: &Option<u64>, serializer: S) -> Result<S::Ok, S::Error> {
+    match value {
+        Some(value) => serializer.collect_str(&format_args!("{value:016x}")),
+        None => serializer.serialize_none(),
+    }
 }
 
 fn hex<S: Serializer>(bytes: &[u8], serializer: S) -> Result<S::Ok, S::Error> {

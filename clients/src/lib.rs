@@ -4,11 +4,15 @@
 
 mod account;
 mod attach;
+mod background;
+mod clock;
 mod control;
 pub mod duration;
 mod echo;
+mod file;
 mod follow;
 mod follower;
+mod freshness;
 mod hz;
 mod info;
 mod json;
@@ -16,12 +20,15 @@ mod list;
 mod names;
 mod output;
 mod presence;
+mod robot;
 mod sample;
 mod session;
 mod text;
 mod window;
+mod zones;
 
 pub use attach::{Attachment, attach};
+pub use background::{BackgroundOptions, ModelOrder, background, saved_model};
 pub use control::{ControlOptions, control};
 pub use echo::{EchoOptions, Format, echo};
 pub use follow::Bounds;
@@ -31,3 +38,5 @@ pub use info::{InfoOptions, info};
 pub use json::error as error_line;
 pub use list::{ListOptions, list, list_domains};
 pub use names::TopicName;
+pub use robot::{Robot, RobotFollower, robot};
+pub use zones::{Heard, ZonesFollower, zones};

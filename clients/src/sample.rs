@@ -1,87 +1,154 @@
 //! A sample of any topic, and where such come from: for verbs that follow topics of several kinds.
 
+use std::time::Duration;
+
 use schema::ipc::Payload;
-use schema::{Failure, Header, Scan, Status, Topic};
+use schema::{Background, Failure, Foreground, Marks, Scan, Status, Topic};
 
 use crate::follower::{Follower, Received};
 use crate::names::TopicName;
+use crate::robot::{RobotHeard, RobotSource};
 use crate::session::Session;
+use crate::zones::{Heard, ZonesSource};
 
-/// A received sample of one of the topics.
-pub(crate) enum Sample {
-    Telegram(Received<[u8]>),
-    Scan(Received<Scan>),
-    Status(Received<Status>),
+/// Declares once what a name may stand for: the sample, and the source that it comes from.
+macro_rules! samples {
+    ($($kind:ident $sample:ty, $source:ty;)*) => {
+        /// A received sample of one of the topics, or of the fold over several.
+        pub(crate) enum Sample { $($kind($sample),)* }
+
+        impl Sample {
+            /// Nominal time between two scans, in us; 0 unknown.
+            pub(crate) fn period_us(&self) -> u32 {
+                match self { $(Sample::$kind(sample) => sample.period_us(),)* }
+            }
+
+            /// Samples that were sent before this one and not received.
+            pub(crate) fn missed(&self) -> u64 {
+                match self { $(Sample::$kind(sample) => sample.missed(),)* }
+            }
+
+            /// Nobody sent it: it is made of a silence.
+            pub(crate) fn is_stale(&self) -> bool {
+                match self { $(Sample::$kind(sample) => sample.is_stale(),)* }
+            }
+        }
+
+        /// Follows what one name stands for.
+        pub(crate) enum Source { $($kind($source),)* }
+
+        impl Source {
+            /// The topic has been there at least once.
+            pub(crate) fn attached(&self) -> bool {
+                match self { $(Source::$kind(source) => source.attached(),)* }
+            }
+
+            /// The next sample that waits, or nothing; failures as [`Follower::receive`].
+            pub(crate) fn receive(&mut self, session: &mut Session) -> Result<Option<Sample>, Failure> {
+                Ok(match self { $(Source::$kind(source) => source.receive(session)?.map(Sample::$kind),)* })
+            }
+        }
+    };
 }
 
-impl Sample {
-    /// Numbers, stamps and quality of the sample.
-    pub(crate) fn header(&self) -> &Header {
-        match self {
-            Sample::Telegram(sample) => sample.header(),
-            Sample::Scan(sample) => sample.header(),
-            Sample::Status(sample) => sample.header(),
-        }
-    }
-
-    /// Samples that were sent before this one and not received.
-    pub(crate) fn missed(&self) -> u64 {
-        match self {
-            Sample::Telegram(sample) => sample.missed,
-            Sample::Scan(sample) => sample.missed,
-            Sample::Status(sample) => sample.missed,
-        }
-    }
-
-    /// The payload as it lies in memory.
-    pub(crate) fn bytes(&self) -> &[u8] {
-        match self {
-            Sample::Telegram(sample) => sample,
-            Sample::Scan(sample) => bytemuck::bytes_of::<Scan>(sample),
-            Sample::Status(sample) => bytemuck::bytes_of::<Status>(sample),
-        }
-    }
-}
-
-/// Follows one topic of any kind.
-pub(crate) enum Source {
-    Telegram(Follower<[u8]>),
-    Scan(Follower<Scan>),
-    Status(Follower<Status>),
+samples! {
+    Telegram Received<[u8]>, Follower<[u8]>;
+    Scan Received<Scan>, Follower<Scan>;
+    Marks Received<Marks>, Follower<Marks>;
+    Zones Heard, ZonesSource;
+    Foreground Received<Foreground>, Follower<Foreground>;
+    Background Received<Background>, Follower<Background>;
+    Status Received<Status>, Follower<Status>;
+    Robot RobotHeard, RobotSource;
 }
 
 impl Source {
     /// Will follow `name`.
     pub(crate) fn new(name: &TopicName) -> Source {
+        let sensor = &name.sensor;
         match name.topic {
-            Topic::Telegram => Source::Telegram(Follower::new(&name.sensor)),
-            Topic::Scan => Source::Scan(Follower::new(&name.sensor)),
-            Topic::Status => Source::Status(Follower::new(&name.sensor)),
+            Topic::Telegram => Source::Telegram(Follower::new(sensor)),
+            Topic::Scan => Source::Scan(Follower::new(sensor)),
+            Topic::Marks => Source::Marks(Follower::new(sensor)),
+            Topic::Zones if name.is_robot() => Source::Robot(RobotSource::new(&[])),
+            Topic::Zones => Source::Zones(ZonesSource::new(sensor)),
+            Topic::Foreground => Source::Foreground(Follower::new(sensor)),
+            Topic::Background => Source::Background(Follower::new(sensor)),
+            Topic::Status => Source::Status(Follower::new(sensor)),
         }
     }
 
-    /// The topic has been there at least once.
-    pub(crate) fn attached(&self) -> bool {
+    /// After which time there may be something to receive although nothing was sent.
+    pub(crate) fn left(&self) -> Option<Duration> {
         match self {
-            Source::Telegram(follower) => follower.attached(),
-            Source::Scan(follower) => follower.attached(),
-            Source::Status(follower) => follower.attached(),
+            Source::Zones(source) => source.left(),
+            Source::Robot(source) => source.left(),
+            _ => None,
         }
     }
+}
 
-    /// The next sample that waits, or nothing; failures as [`Follower::receive`].
-    pub(crate) fn receive(&mut self, session: &mut Session) -> Result<Option<Sample>, Failure> {
-        fn next<P: Payload + ?Sized>(
-            follower: &mut Follower<P>,
-            session: &mut Session,
-            kind: impl FnOnce(Received<P>) -> Sample,
-        ) -> Result<Option<Sample>, Failure> {
-            Ok(follower.receive(session)?.map(kind))
-        }
+impl Sample {
+    /// The payload as it lies in memory; of the fold that of the sensor that was heard.
+    pub(crate) fn bytes(&self) -> &[u8] {
         match self {
-            Source::Telegram(follower) => next(follower, session, Sample::Telegram),
-            Source::Scan(follower) => next(follower, session, Sample::Scan),
-            Source::Status(follower) => next(follower, session, Sample::Status),
+            Sample::Telegram(sample) => sample,
+            Sample::Scan(sample) => bytemuck::bytes_of::<Scan>(sample),
+            Sample::Marks(sample) => bytemuck::bytes_of::<Marks>(sample),
+            Sample::Zones(sample) => bytemuck::bytes_of(&sample.zones),
+            Sample::Foreground(sample) => bytemuck::bytes_of::<Foreground>(sample),
+            Sample::Background(sample) => bytemuck::bytes_of::<Background>(sample),
+            Sample::Status(sample) => bytemuck::bytes_of::<Status>(sample),
+            Sample::Robot(sample) => bytemuck::bytes_of(&sample.heard.zones),
         }
+    }
+}
+
+/// What every sample can be asked.
+trait Told {
+    fn period_us(&self) -> u32;
+    fn missed(&self) -> u64;
+    fn is_stale(&self) -> bool;
+}
+
+impl<P: Payload + ?Sized> Told for Received<P> {
+    fn period_us(&self) -> u32 {
+        self.header().period_us
+    }
+
+    fn missed(&self) -> u64 {
+        self.missed
+    }
+
+    fn is_stale(&self) -> bool {
+        false
+    }
+}
+
+impl Told for Heard {
+    fn period_us(&self) -> u32 {
+        self.header.map_or(0, |header| header.period_us)
+    }
+
+    fn missed(&self) -> u64 {
+        self.missed
+    }
+
+    fn is_stale(&self) -> bool {
+        self.stale
+    }
+}
+
+impl Told for RobotHeard {
+    fn period_us(&self) -> u32 {
+        self.heard.period_us()
+    }
+
+    fn missed(&self) -> u64 {
+        self.heard.missed
+    }
+
+    fn is_stale(&self) -> bool {
+        self.heard.stale
     }
 }

@@ -1,5 +1,7 @@
 //! The same as the classes of `--json`, for people on a terminal: a line a sample, what matters first. No contract.
 
+mod processed;
+
 use std::fmt;
 use std::io::{self, Write};
 
@@ -9,6 +11,8 @@ use crate::account::Account;
 use crate::follow::Notice;
 use crate::names::TopicName;
 use crate::sample::Sample;
+
+pub(crate) use processed::background;
 
 /// Bytes as lower hex, without spaces.
 pub(crate) struct Hex<'a>(pub(crate) &'a [u8]);
@@ -25,7 +29,12 @@ pub(crate) fn sample(line: &mut Vec<u8>, name: &TopicName, sample: &Sample) -> i
     match sample {
         Sample::Telegram(bytes) => telegram(line, bytes.header(), bytes),
         Sample::Scan(found) => scan(line, found.header(), found),
+        Sample::Marks(found) => processed::marks(line, found.header(), found),
+        Sample::Zones(heard) => processed::zones(line, heard),
+        Sample::Foreground(found) => processed::foreground(line, found.header(), found),
+        Sample::Background(found) => background(line, found),
         Sample::Status(found) => status(line, found),
+        Sample::Robot(found) => processed::robot(line, &found.robot),
     }
 }
 

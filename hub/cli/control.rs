@@ -28,6 +28,6 @@ impl Control {
 }
 
 fn verbs() -> impl TypedValueParser<Value = Verb> {
-    PossibleValuesParser::new(Verb::ALL.map(Verb::name))
+    PossibleValuesParser::new(Verb::FLOW.map(Verb::name))
         .try_map(|word| Verb::parse(&word).ok_or("not a request"))
 }

@@ -5,7 +5,7 @@ use bytemuck::{Pod, Zeroable};
 #[cfg(feature = "ipc")]
 use iceoryx2::prelude::ZeroCopySend;
 
-use crate::{BEAMS, Failure, Kind, text};
+use crate::{BEAMS, Background, Failure, Kind, text};
 
 /// What is asked for.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -17,11 +17,28 @@ pub enum Verb {
     Resume = 2,
     /// The conversation with the sensor shall begin anew.
     Resync = 3,
+    /// The background model is wanted.
+    Show = 16,
+    /// The background model shall be learned anew.
+    Reset = 17,
+    /// The background model shall stay as it is.
+    Freeze = 18,
+    /// The background model shall be learned on.
+    Thaw = 19,
+    /// The ranges of the request shall be the background model.
+    Load = 20,
 }
 
 impl Verb {
-    /// All verbs, in the order of all output.
-    pub const ALL: [Verb; 3] = [Verb::Pause, Verb::Resume, Verb::Resync];
+    /// What may be asked of the flow of data, in the order of all output.
+    pub const FLOW: [Verb; 3] = [Verb::Pause, Verb::Resume, Verb::Resync];
+    /// What may be asked of the background model, in the order of all output.
+    pub const BACKGROUND: [Verb; 5] = [Verb::Show, Verb::Reset, Verb::Freeze, Verb::Thaw, Verb::Load];
+
+    /// All verbs.
+    pub fn all() -> impl Iterator<Item = Verb> {
+        Verb::FLOW.into_iter().chain(Verb::BACKGROUND)
+    }
 
     /// The verb's name on the command line and in all output.
     pub fn name(self) -> &'static str {
@@ -29,12 +46,17 @@ impl Verb {
             Verb::Pause => "pause",
             Verb::Resume => "resume",
             Verb::Resync => "resync",
+            Verb::Show => "show",
+            Verb::Reset => "reset",
+            Verb::Freeze => "freeze",
+            Verb::Thaw => "thaw",
+            Verb::Load => "load",
         }
     }
 
     /// The verb called `name`.
     pub fn parse(name: &str) -> Option<Verb> {
-        Verb::ALL.into_iter().find(|verb| verb.name() == name)
+        Verb::all().find(|verb| verb.name() == name)
     }
 }
 
@@ -67,6 +89,28 @@ impl Request {
         request
     }
 
+    /// Asks `sensor` to take the ranges of `model` as its background.
+    pub fn load(sensor: &str, model: &Background) -> Request {
+        let mut request = Request::new(sensor, Verb::Load);
+        request.count = model.count;
+        request.unit_mm = model.unit_mm;
+        request.range_array = model.range_array;
+        request
+    }
+
+    /// The model that it brings, for [`Verb::Load`]: generation and flags are 0.
+    pub fn model(&self) -> Background {
+        let mut model = Background {
+            count: self.count.min(BEAMS as u16),
+            unit_mm: self.unit_mm,
+            ..Background::default()
+        };
+        let used = usize::from(model.count);
+        model.range_array[..used].copy_from_slice(&self.range_array[..used]);
+        model.taught = model.ranges().iter().filter(|&&range| range != Background::UNTAUGHT).count() as u16;
+        model
+    }
+
     /// The sensor that is meant.
     pub fn sensor(&self) -> &str {
         text::read(&self.sensor_text)
@@ -74,14 +118,14 @@ impl Request {
 
     /// The verb; nothing if a newer client has one that this program does not know.
     pub fn verb(&self) -> Option<Verb> {
-        Verb::ALL.into_iter().find(|verb| *verb as u16 == self.verb)
+        Verb::all().find(|verb| *verb as u16 == self.verb)
     }
 }
 
-/// An answer: done, or why not. Its bytes are exit code and message length, two bytes each and the lower one first,
-/// then the message; a remedy is its second line.
+/// An answer: done, with the model that was asked for, or why not. Its bytes are exit code and message length, two bytes
+/// each and the lower one first, then the message, whose second line is a remedy, then the packed model.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub struct Response(pub Result<(), Failure>);
+pub struct Response(pub Result<Option<Background>, Failure>);
 
 impl Response {
     /// The longest response in bytes; a message beyond it is cut.
@@ -90,22 +134,27 @@ impl Response {
     /// The response as bytes.
     pub fn encode(&self) -> Vec<u8> {
         let (code, said) = match &self.0 {
-            Ok(()) => (0, String::new()),
+            Ok(_) => (0, String::new()),
             Err(failure) => (failure.kind.exit_code(), format!("{}\n{}", failure.message, failure.hint)),
         };
         let mut message = vec![0; said.trim_end().len().min(Response::MAX - HEAD)];
         text::write(&mut message, said.trim_end());
         let head = [u16::from(code), message.len() as u16].map(u16::to_le_bytes);
-        [head.as_flattened(), &message].concat()
+        let model = self.0.as_ref().ok().and_then(Option::as_ref).map_or(&[][..], Background::packed);
+        [head.as_flattened(), &message, model].concat()
     }
 
     /// The response in `bytes`, if that is one. A code that no kind of failure has is [`Kind::Failed`].
     pub fn decode(bytes: &[u8]) -> Option<Response> {
         let (&[code_low, code_high, low, high], rest) = bytes.split_first_chunk()?;
-        let message = text::read(rest.get(..usize::from(u16::from_le_bytes([low, high])))?);
-        let code = u16::from_le_bytes([code_low, code_high]);
+        let (message, model) = rest.split_at_checked(usize::from(u16::from_le_bytes([low, high])))?;
+        let (message, code) = (text::read(message), u16::from_le_bytes([code_low, code_high]));
         if code == 0 {
-            return Some(Response(Ok(())));
+            let model = (!model.is_empty()).then(|| Background::unpack(model));
+            return Some(Response(Ok(match model {
+                Some(model) => Some(model?),
+                None => None,
+            })));
         }
         let kind = ANSWERS.into_iter().find(|kind| u16::from(kind.exit_code()) == code);
         let (message, hint) = message.split_once('\n').unwrap_or((message, ""));
@@ -117,7 +166,9 @@ impl Response {
 const HEAD: usize = 4;
 
 /// The failures that a hub answers with; each exit code stands for one of them.
-const ANSWERS: [Kind; 3] = [Kind::Failed, Kind::NoTopic, Kind::Short];
+const ANSWERS: [Kind; 4] = [Kind::Failed, Kind::NoTopic, Kind::Short, Kind::Configuration];
+
+const _: () = assert!(HEAD + Background::MAX_PACKED <= Response::MAX);
 
 #[cfg(test)]
 mod tests {
@@ -125,7 +176,7 @@ mod tests {
 
     #[test]
     fn verbs_go_there_and_back() {
-        for verb in Verb::ALL {
+        for verb in Verb::all() {
             assert_eq!(Verb::parse(verb.name()), Some(verb));
             let request = Request::new("front", verb);
             assert_eq!((request.sensor(), request.verb()), ("front", Some(verb)));
@@ -138,7 +189,8 @@ mod tests {
     fn responses_go_there_and_back() {
         let failure = |kind, hint: &str| Response(Err(Failure::new(kind, "front: no", hint)));
         for response in [
-            Response(Ok(())),
+            Response(Ok(None)),
+            Response(Ok(Some(Background { count: 361, generation: 7, ..Background::default() }))),
             failure(Kind::Failed, ""),
             failure(Kind::Short, "later"),
             failure(Kind::NoTopic, "a, b"),
@@ -151,7 +203,7 @@ mod tests {
 
     #[test]
     fn what_is_no_response() {
-        for bytes in [&[][..], &[0, 0, 1], &[1, 0, 2, 0, b'a']] {
+        for bytes in [&[][..], &[0, 0, 1], &[1, 0, 2, 0, b'a'], &[0, 0, 0, 0, 1]] {
             assert_eq!(Response::decode(bytes), None);
         }
         let unknown = Response::decode(&[200, 1, 1, 0, b'a']).unwrap();

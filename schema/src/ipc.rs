@@ -25,7 +25,10 @@ use iceoryx2::service::port_factory::{event, publish_subscribe};
 
 use self::trouble::{Trouble, create, full, no_port, no_publisher, open};
 use crate::shortage::check_client;
-use crate::{Domain, Failure, Header, Kind, Scan, Status, Topic, Wake, access, limits, of_service};
+use crate::{
+    Background, Domain, Failure, Foreground, Header, Kind, Marks, Scan, Status, Topic, Wake, Zones, access,
+    limits, of_service,
+};
 
 pub use self::control::{Asked, ControlClient, ControlServer, Pending};
 pub use self::nodes::{Nodes, nodes};
@@ -72,7 +75,7 @@ pub fn client_node(domain: &Domain) -> Result<Node, Failure> {
     node(domain, false)
 }
 
-/// What a topic carries; implemented by `[u8]` (telegram), [`Scan`] and [`Status`].
+/// What a topic carries; implemented by `[u8]` (telegram) and the payloads of the other topics.
 pub trait Payload: IceoryxSend + Debug + 'static {
     /// The topic that carries it.
     const TOPIC: Topic;
@@ -84,7 +87,7 @@ pub trait Payload: IceoryxSend + Debug + 'static {
     fn open(node: &Node, sensor: &str) -> Result<Option<TopicService<Self>>, Failure>;
 
     /// The publisher of a topic. A sample is loaned, written in place, and sent with `send()`, which returns how many
-    /// consumers got it: `loan()` for scan and status, `loan_slice_uninit(n)` + `write_from_slice` for a telegram.
+    /// consumers got it: `loan_slice_uninit(n)` + `write_from_slice` for a telegram, `loan()` for all else.
     ///
     /// [`Kind::DomainHeld`] if the topic has a publisher already.
     fn publisher(topic: &TopicService<Self>) -> Result<Publisher<Self>, Failure>;
@@ -162,6 +165,10 @@ macro_rules! payload {
 
 payload!([u8], Topic::Telegram, |builder| builder.initial_max_slice_len(crate::Telegram::MAX));
 payload!(Scan, Topic::Scan, |builder| builder);
+payload!(Marks, Topic::Marks, |builder| builder);
+payload!(Zones, Topic::Zones, |builder| builder);
+payload!(Foreground, Topic::Foreground, |builder| builder);
+payload!(Background, Topic::Background, |builder| builder);
 payload!(Status, Topic::Status, |builder| builder);
 
 /// The wake service of `sensor`, made if it is not there: for the hub.

@@ -1,15 +1,20 @@
 //! The words everyone speaks: what the hub publishes, and the names under which it does. Knows nobody: no serial line,
 //! no configuration, no verb. Without feature `ipc` it is plain bytes and names, enough for a receiver on the LAN.
 
+mod background;
 mod control;
 mod domain;
 mod failure;
+mod foreground;
 mod header;
+mod marks;
+mod pose;
 mod scan;
 mod status;
 mod telegram;
 mod text;
 mod topic;
+mod zones;
 
 #[cfg(feature = "ipc")]
 mod access;
@@ -18,17 +23,28 @@ pub mod ipc;
 pub mod limits;
 #[cfg(feature = "ipc")]
 mod lock;
+#[cfg(feature = "json")]
+mod saved;
 #[cfg(feature = "ipc")]
 pub mod shortage;
 
+pub use background::Background;
 pub use control::{Request, Response, Verb};
 pub use domain::{DEFAULT_DOMAIN, Domain, Environment};
 pub use failure::{Failure, Kind};
+pub use foreground::{Foreground, SEGMENTS, Segment};
 pub use header::{Flags, Header, Quality, Reasons};
+pub use marks::{MARKS, Mark, Marks};
+pub use pose::Pose;
 pub use scan::{BEAMS, CONTENTS_UPPER, Code, Scan, TURN_NS};
 pub use status::{COUNTERS, Counter, Counters, State, Status};
 pub use telegram::Telegram;
-pub use topic::{CONTROL, CONTROL_REQUEST, CONTROL_RESPONSE, Topic, WAKE, Wake, check_sensor, of_service};
+pub use topic::{
+    CONTROL, CONTROL_REQUEST, CONTROL_RESPONSE, ROBOT, Topic, WAKE, Wake, check_sensor, of_service,
+};
+pub use zones::{Verdict, ZONES, Zone, Zones};
 
 #[cfg(feature = "ipc")]
 pub use lock::{HubLock, holder};
+#[cfg(feature = "json")]
+pub use saved::{SavedModel, as_json};

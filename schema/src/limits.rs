@@ -29,15 +29,15 @@ pub const CONTROL_NODES: usize = 32;
 pub const fn buffer(topic: Topic) -> usize {
     match topic {
         Topic::Telegram | Topic::Scan => 16,
-        Topic::Status => 4,
+        Topic::Marks | Topic::Zones | Topic::Foreground | Topic::Background | Topic::Status => 4,
     }
 }
 
 /// Samples that a consumer gets which comes later.
 pub const fn history(topic: Topic) -> usize {
     match topic {
-        Topic::Telegram | Topic::Scan => 0,
-        Topic::Status => 1,
+        Topic::Telegram | Topic::Scan | Topic::Marks | Topic::Foreground => 0,
+        Topic::Zones | Topic::Background | Topic::Status => 1,
     }
 }
 

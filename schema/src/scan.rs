@@ -91,7 +91,7 @@ impl Scan {
 
     /// Angle of beam `i` in 1/1000 degree.
     pub fn angle_mdeg(&self, i: usize) -> i32 {
-        self.first_angle_mdeg + i as i32 * i32::from(self.step_mdeg)
+        self.first_angle_mdeg.saturating_add(i as i32 * i32::from(self.step_mdeg))
     }
 
     /// Angle of beam `i` in degrees.
@@ -182,7 +182,7 @@ mod tests {
     fn intensities_only_where_the_mode_has_them() {
         let mut scan = scan(13, &[1, 2]);
         scan.upper_array[1] = 7;
-        assert_eq!(scan.upper(), []);
+        assert!(scan.upper().is_empty());
         scan.contents = CONTENTS_UPPER;
         assert_eq!((scan.upper(), scan.intensities()), (&[0, 7][..], &[][..]));
         scan.intensity_bits = 3;

@@ -7,13 +7,13 @@ use bytemuck::{Pod, Zeroable};
 #[cfg(feature = "ipc")]
 use iceoryx2::prelude::ZeroCopySend;
 
-use crate::text;
+use crate::{Pose, text};
 
 /// Room for counters in a [`Status`]; new ones append.
-pub const COUNTERS: usize = 32;
+pub const COUNTERS: usize = 28;
 
 /// The payload of topic `status`, 592 bytes: published each second and on every change.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Pod, Zeroable)]
+#[derive(Clone, Copy, Debug, PartialEq, Pod, Zeroable)]
 #[cfg_attr(feature = "ipc", derive(ZeroCopySend), type_name("scanhub.Status.v1"))]
 #[repr(C)]
 pub struct Status {
@@ -43,6 +43,8 @@ pub struct Status {
     pub last_error_text: [u8; 160],
     /// See [`Counter`].
     pub counters: Counters,
+    /// Where the sensor sits, as configured.
+    pub pose: Pose,
 }
 
 impl Default for Status {

@@ -9,19 +9,39 @@ pub enum Topic {
     Telegram,
     /// Decoded measurements.
     Scan,
+    /// Reflector marks.
+    Marks,
+    /// What is near the robot.
+    Zones,
+    /// What stands before the background.
+    Foreground,
+    /// The background model.
+    Background,
     /// State, properties and counters of the link.
     Status,
 }
 
 impl Topic {
     /// All topics, in the order of all output.
-    pub const ALL: [Topic; 3] = [Topic::Telegram, Topic::Scan, Topic::Status];
+    pub const ALL: [Topic; 7] = [
+        Topic::Telegram,
+        Topic::Scan,
+        Topic::Marks,
+        Topic::Zones,
+        Topic::Foreground,
+        Topic::Background,
+        Topic::Status,
+    ];
 
     /// The topic's name, as in `front/scan`.
     pub fn name(self) -> &'static str {
         match self {
             Topic::Telegram => "telegram",
             Topic::Scan => "scan",
+            Topic::Marks => "marks",
+            Topic::Zones => "zones",
+            Topic::Foreground => "foreground",
+            Topic::Background => "background",
             Topic::Status => "status",
         }
     }
@@ -36,6 +56,10 @@ impl Topic {
         match self {
             Topic::Telegram => "u8[]",
             Topic::Scan => "scanhub.Scan.v1",
+            Topic::Marks => "scanhub.Marks.v1",
+            Topic::Zones => "scanhub.Zones.v1",
+            Topic::Foreground => "scanhub.Foreground.v1",
+            Topic::Background => "scanhub.Background.v1",
             Topic::Status => "scanhub.Status.v1",
         }
     }
@@ -89,8 +113,15 @@ pub fn of_service(name: &str) -> Option<(&str, Option<Topic>)> {
     if topic == WAKE { Some((sensor, None)) } else { Some((sensor, Some(Topic::parse(topic)?))) }
 }
 
-/// Refuses a sensor's name that is not `[a-z0-9_-]`, 1 to 24 of them: [`Kind::Configuration`].
+/// Stands for all sensors of a hub where one is named, and so is no name of a sensor.
+pub const ROBOT: &str = "robot";
+
+/// Refuses a sensor's name that is not `[a-z0-9_-]`, 1 to 24 of them, or [`ROBOT`]: [`Kind::Configuration`].
 pub fn check_sensor(name: &str) -> Result<(), Failure> {
+    if name == ROBOT {
+        let what = format!("sensor name {ROBOT:?} is not possible: it stands for all sensors");
+        return Err(Failure::new(Kind::Configuration, what, "any other name, for example front"));
+    }
     let allowed = |c: char| c.is_ascii_lowercase() || c.is_ascii_digit() || c == '_' || c == '-';
     if (1..=24).contains(&name.len()) && name.chars().all(allowed) {
         return Ok(());
@@ -127,7 +158,7 @@ mod tests {
     #[test]
     fn names_of_sensors() {
         assert!(check_sensor("front_2-b").is_ok());
-        for bad in ["", "Front", "a/b", "a b", "ä", &"a".repeat(25)] {
+        for bad in ["", "Front", "a/b", "a b", "ä", ROBOT, &"a".repeat(25)] {
             assert_eq!(check_sensor(bad).map_err(|failure| failure.kind), Err(Kind::Configuration), "{bad}");
         }
     }

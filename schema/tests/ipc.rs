@@ -246,7 +246,7 @@ fn clients_that_went_while_they_asked_are_no_obstacle() {
             let asked = server.receive().unwrap().expect("was asked");
             drop(pending);
             assert!(!asked.is_waited_for());
-            server.answer(asked, &Response(Ok(()))).unwrap();
+            server.answer(asked, &Response(Ok(None))).unwrap();
         } else {
             drop((pending, client));
             assert!(server.receive().unwrap().is_none());

@@ -4,7 +4,8 @@
 use std::mem::{offset_of, size_of};
 
 use schema::{
-    BEAMS, COUNTERS, Counter, Counters, Failure, Header, Kind, Request, Response, Scan, State, Status, Verb,
+    BEAMS, Background, COUNTERS, Counter, Counters, Failure, Foreground, Header, Kind, Mark, Marks, Pose,
+    Request, Response, Scan, Segment, State, Status, Verb, Zone, Zones,
 };
 
 /// Builds the expected bytes: `size` zeros with `fields` written over them.
@@ -113,9 +114,134 @@ fn scan_bytes() {
 }
 
 #[test]
+fn marks_layout() {
+    assert_eq!((size_of::<Marks>(), align_of::<Marks>()), (1028, 4));
+    assert_eq!((offset_of!(Marks, count), offset_of!(Marks, flags)), (0, 1));
+    assert_eq!((offset_of!(Marks, reserved), offset_of!(Marks, mark_array)), (2, 4));
+    assert_eq!((size_of::<Mark>(), align_of::<Mark>()), (16, 4));
+    assert_eq!((offset_of!(Mark, angle_mdeg), offset_of!(Mark, range_dmm)), (0, 4));
+    assert_eq!((offset_of!(Mark, weight), offset_of!(Mark, peak), offset_of!(Mark, edge)), (8, 10, 11));
+    assert_eq!((offset_of!(Mark, first_beam), offset_of!(Mark, last_beam)), (12, 14));
+}
+
+#[test]
+fn marks_bytes() {
+    let mut marks = Marks { count: 64, flags: Marks::OVERFLOW | Marks::UNAVAILABLE, ..Marks::default() };
+    marks.mark_array[63] = Mark {
+        angle_mdeg: -2,
+        range_dmm: 0x0001_0203,
+        weight: 0x0405,
+        peak: 7,
+        edge: 1,
+        first_beam: 0x0106,
+        last_beam: 0x0108,
+    };
+    let mark = [0xFE, 0xFF, 0xFF, 0xFF, 3, 2, 1, 0, 5, 4, 7, 1, 6, 1, 8, 1];
+    assert_eq!(bytemuck::bytes_of(&marks), golden(1028, &[(0, &[64, 3]), (1012, &mark)]));
+}
+
+#[test]
+fn zones_layout() {
+    assert_eq!((size_of::<Zones>(), align_of::<Zones>()), (76, 4));
+    assert_eq!((offset_of!(Zones, verdict), offset_of!(Zones, count)), (0, 1));
+    assert_eq!((offset_of!(Zones, nearest_beam), offset_of!(Zones, nearest_mm)), (2, 4));
+    assert_eq!((offset_of!(Zones, invalid_beams), offset_of!(Zones, flags)), (8, 10));
+    assert_eq!((offset_of!(Zones, reserved), offset_of!(Zones, zone_array)), (11, 12));
+    assert_eq!((size_of::<Zone>(), align_of::<Zone>()), (8, 2));
+    assert_eq!((offset_of!(Zone, radius_mm), offset_of!(Zone, beams)), (0, 2));
+    assert_eq!((offset_of!(Zone, violated), offset_of!(Zone, reserved)), (4, 5));
+}
+
+#[test]
+fn zones_bytes() {
+    assert_eq!(bytemuck::bytes_of(&Zones::unknown()), golden(76, &[(0, &[3]), (2, &[0xFF; 6])]));
+    let mut zones = Zones {
+        verdict: 1,
+        count: 2,
+        nearest_beam: 0x0102,
+        nearest_mm: 0x0003_0405,
+        invalid_beams: 0x0106,
+        flags: Zones::PROVISIONAL,
+        ..Zones::unknown()
+    };
+    zones.zone_array[1] = Zone { radius_mm: 600, beams: 0x0107, violated: 1, reserved: [0; 3] };
+    let head = [1, 2, 2, 1, 5, 4, 3, 0, 6, 1, 1, 0];
+    let expected = golden(76, &[(0, &head), (20, &[0x58, 0x02, 7, 1, 1])]);
+    assert_eq!(bytemuck::bytes_of(&zones), expected);
+}
+
+#[test]
+fn foreground_layout() {
+    assert_eq!((size_of::<Foreground>(), align_of::<Foreground>()), (1892, 4));
+    assert_eq!((offset_of!(Foreground, generation), offset_of!(Foreground, count)), (0, 4));
+    assert_eq!((offset_of!(Foreground, beams), offset_of!(Foreground, unit_mm)), (6, 8));
+    assert_eq!((offset_of!(Foreground, left_out), offset_of!(Foreground, segments)), (9, 10));
+    assert_eq!((offset_of!(Foreground, bit_array), offset_of!(Foreground, pad)), (12, 63));
+    assert_eq!((offset_of!(Foreground, range_array), offset_of!(Foreground, pad2)), (64, 866));
+    assert_eq!(offset_of!(Foreground, segment_array), 868);
+    assert_eq!((size_of::<Segment>(), align_of::<Segment>()), (16, 4));
+    assert_eq!((offset_of!(Segment, first), offset_of!(Segment, last)), (0, 2));
+    assert_eq!((offset_of!(Segment, nearest), offset_of!(Segment, width)), (4, 6));
+    assert_eq!((offset_of!(Segment, x_mm), offset_of!(Segment, y_mm)), (8, 12));
+}
+
+#[test]
+fn foreground_bytes() {
+    let mut foreground = Foreground {
+        generation: 0x0001_0203,
+        count: 401,
+        beams: 1,
+        unit_mm: 10,
+        left_out: 255,
+        segments: 64,
+        ..Foreground::default()
+    };
+    foreground.bit_array[50] = 1;
+    foreground.range_array[0] = 0x1234;
+    foreground.segment_array[63] =
+        Segment { first: 400, last: 0x0105, nearest: 6, width: 7, x_mm: -2, y_mm: 8 };
+    let expected = golden(
+        1892,
+        &[
+            (0, &[3, 2, 1, 0, 0x91, 0x01, 1, 0, 10, 255, 64, 0]),
+            (62, &[1, 0, 0x34, 0x12]),
+            (1876, &[0x90, 0x01, 5, 1, 6, 0, 7, 0, 0xFE, 0xFF, 0xFF, 0xFF, 8]),
+        ],
+    );
+    assert_eq!(bytemuck::bytes_of(&foreground), expected);
+}
+
+#[test]
+fn background_layout() {
+    assert_eq!((size_of::<Background>(), align_of::<Background>()), (816, 4));
+    assert_eq!((offset_of!(Background, generation), offset_of!(Background, taught)), (0, 4));
+    assert_eq!((offset_of!(Background, count), offset_of!(Background, unit_mm)), (6, 8));
+    assert_eq!((offset_of!(Background, flags), offset_of!(Background, reserved)), (9, 10));
+    assert_eq!((offset_of!(Background, range_array), offset_of!(Background, pad)), (12, 814));
+}
+
+#[test]
+fn background_bytes() {
+    let mut background = Background {
+        generation: 0x0001_0203,
+        taught: 0x0104,
+        count: 401,
+        unit_mm: 10,
+        flags: Background::FROZEN,
+        ..Background::default()
+    };
+    background.range_array[0] = 0x1234;
+    background.range_array[400] = Background::FAR;
+    let expected =
+        golden(816, &[(0, &[3, 2, 1, 0, 4, 1, 0x91, 0x01, 10, 1, 0, 0, 0x34, 0x12]), (812, &[0xFF, 0xFF])]);
+    assert_eq!(bytemuck::bytes_of(&background), expected);
+    assert_eq!(background.packed(), &expected[..814]);
+}
+
+#[test]
 fn status_layout() {
     assert_eq!((size_of::<Status>(), align_of::<Status>()), (592, 8));
-    assert_eq!((size_of::<Counters>(), COUNTERS), (256, 32));
+    assert_eq!((size_of::<Counters>(), COUNTERS), (224, 28));
     assert_eq!(offset_of!(Status, state), 0);
     assert_eq!(offset_of!(Status, mode), 1);
     assert_eq!(offset_of!(Status, unit_mm), 2);
@@ -129,6 +255,10 @@ fn status_layout() {
     assert_eq!(offset_of!(Status, port_text), 48);
     assert_eq!(offset_of!(Status, last_error_text), 176);
     assert_eq!(offset_of!(Status, counters), 336);
+    assert_eq!(offset_of!(Status, pose), 560);
+    assert_eq!((size_of::<Pose>(), align_of::<Pose>()), (32, 8));
+    assert_eq!((offset_of!(Pose, x_m), offset_of!(Pose, y_m)), (0, 8));
+    assert_eq!((offset_of!(Pose, yaw_rad), offset_of!(Pose, upside_down)), (16, 24));
 }
 
 #[test]
@@ -150,6 +280,7 @@ fn status_bytes() {
     status.counters[Counter::BytesRead] = 3;
     status.counters[Counter::RejectedSuperseded] = 4;
     status.counters[Counter::LineErrors] = 5;
+    status.pose = Pose { x_m: 0.5, y_m: -0.5, yaw_rad: 2.0, upside_down: 1, reserved: [0; 7] };
     let expected = golden(
         592,
         &[
@@ -162,6 +293,10 @@ fn status_bytes() {
             (336, &[3]),
             (336 + 19 * 8, &[4]),
             (336 + 20 * 8, &[5]),
+            (560, &0.5f64.to_le_bytes()),
+            (568, &(-0.5f64).to_le_bytes()),
+            (576, &2.0f64.to_le_bytes()),
+            (584, &[1]),
         ],
     );
     assert_eq!(bytemuck::bytes_of(&status), expected);
@@ -207,7 +342,10 @@ fn request_bytes() {
 
 #[test]
 fn response_bytes() {
-    assert_eq!(Response(Ok(())).encode(), [0, 0, 0, 0]);
+    assert_eq!(Response(Ok(None)).encode(), [0, 0, 0, 0]);
+    let model = Background { count: 1, taught: 1, unit_mm: 1, ..Background::default() };
+    let shown = [0, 0, 0, 0, 0, 0, 0, 0, 1, 0, 1, 0, 1, 0, 0, 0, 0, 0];
+    assert_eq!(Response(Ok(Some(model))).encode(), shown);
     let refused = Response(Err(Failure::new(Kind::Short, "busy", "wait")));
     assert_eq!(refused.encode(), b"\x4b\0\x09\0busy\nwait");
 }

@@ -141,7 +141,7 @@ impl Desk {
     }
 
     fn answer(&self, asked: Asked, outcome: Result<(), Failure>) {
-        if let Err(failure) = self.server.answer(asked, &Response(outcome)) {
+        if let Err(failure) = self.server.answer(asked, &Response(outcome.map(|()| None))) {
             tracing::debug!(%failure, "a client was not answered");
         }
     }
@@ -155,6 +155,10 @@ impl Orders {
                 Verb::Pause => Control::Pause,
                 Verb::Resume => Control::Resume,
                 Verb::Resync => Control::Resync,
+                Verb::Show | Verb::Reset | Verb::Freeze | Verb::Thaw | Verb::Load => {
+                    self.answer(&order, Err(self.refusal("this hub keeps no background")));
+                    continue;
+                }
             };
             let outcome = match &mut session {
                 None if control == Control::Resync => Err(self.refusal("the port is away")),

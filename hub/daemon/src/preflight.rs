@@ -7,7 +7,9 @@ use rustix::fs::{FallocateFlags, fallocate};
 use rustix::io::Errno;
 use rustix::process::{Resource, getrlimit, setrlimit};
 use schema::shortage::{self, SHARED_MEMORY};
-use schema::{Domain, Failure, Header, Scan, Status, Telegram, Topic, limits};
+use schema::{
+    Background, Domain, Failure, Foreground, Header, Marks, Scan, Status, Telegram, Topic, Zones, limits,
+};
 
 /// Lets the process have as many descriptors as its hard limit allows: about four for each consumer of a topic.
 pub(crate) fn raise_descriptor_limit() {
@@ -75,6 +77,10 @@ fn link_bytes() -> u64 {
     let payload = |topic| match topic {
         Topic::Telegram => Telegram::MAX,
         Topic::Scan => size_of::<Scan>(),
+        Topic::Marks => size_of::<Marks>(),
+        Topic::Zones => size_of::<Zones>(),
+        Topic::Foreground => size_of::<Foreground>(),
+        Topic::Background => size_of::<Background>(),
         Topic::Status => size_of::<Status>(),
     };
     let chunk = |topic| limits::samples(topic) * (payload(topic) + size_of::<Header>() + CHUNK_HEADER);

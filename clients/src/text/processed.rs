@@ -1,0 +1,78 @@
+//! The lines of what the hub makes of a scan. No contract, as its parent.
+
+use std::io::{self, Write};
+
+use schema::{Background, Foreground, Header, Marks};
+
+use super::numbers;
+use crate::robot::Robot;
+use crate::zones::Heard;
+
+pub(super) fn marks(line: &mut Vec<u8>, header: &Header, marks: &Marks) -> io::Result<()> {
+    numbers(line, header)?;
+    if !marks.is_available() {
+        return write!(line, " unavailable: the sensor's measuring mode has no reflector bits");
+    }
+    write!(line, " {} marks", marks.marks().len())?;
+    for mark in marks.marks() {
+        let (angle_deg, range_mm) = (f64::from(mark.angle_mdeg) / 1000.0, f64::from(mark.range_dmm) / 10.0);
+        write!(line, ", {range_mm:.1} mm at {angle_deg:.3} deg")?;
+    }
+    if marks.is_overflow() { write!(line, ", and more") } else { Ok(()) }
+}
+
+pub(super) fn zones(line: &mut Vec<u8>, heard: &Heard) -> io::Result<()> {
+    let Heard { zones, header, .. } = heard;
+    match header {
+        Some(header) if heard.stale => {
+            let seconds = header.stamp_first_ns as f64 / 1e9;
+            return write!(line, "seq {} at {seconds:.6} unknown: heard nothing since", header.seq);
+        }
+        Some(header) => numbers(line, header)?,
+        None => return write!(line, "unknown: heard nothing yet"),
+    }
+    write!(line, " {}", zones.verdict().name())?;
+    match zones.nearest() {
+        Some((beam, mm)) => write!(line, " nearest {mm} mm, beam {beam}")?,
+        None => write!(line, " nothing near")?,
+    }
+    for zone in zones.zones() {
+        let violated = if zone.violated != 0 { " violated" } else { "" };
+        write!(line, ", {} mm{violated} {}", zone.radius_mm, zone.beams)?;
+    }
+    if zones.invalid_beams > 0 { write!(line, ", {} invalid", zones.invalid_beams) } else { Ok(()) }
+}
+
+/// The fold over all sensors.
+pub(super) fn robot(line: &mut Vec<u8>, robot: &Robot) -> io::Result<()> {
+    write!(line, "{}", robot.verdict().name())?;
+    match robot.nearest() {
+        Some((mm, sensor)) => write!(line, " nearest {mm} mm, {sensor}:")?,
+        None => write!(line, " nothing near:")?,
+    }
+    for (sensor, verdict) in robot.sensors() {
+        write!(line, " {sensor} {}", verdict.name())?;
+    }
+    Ok(())
+}
+
+pub(super) fn foreground(line: &mut Vec<u8>, header: &Header, foreground: &Foreground) -> io::Result<()> {
+    numbers(line, header)?;
+    write!(line, " {} beams, {} segments", foreground.beams, foreground.segments)?;
+    let unit_mm = u32::from(foreground.unit_mm);
+    for segment in foreground.segments() {
+        let width_mm = u32::from(segment.width) * unit_mm;
+        write!(line, ", {width_mm} mm wide at ({}, {})", segment.x_mm, segment.y_mm)?;
+    }
+    Ok(())
+}
+
+pub(crate) fn background(line: &mut Vec<u8>, model: &Background) -> io::Result<()> {
+    let far = model.ranges().iter().filter(|&&range| range == Background::FAR).count();
+    let frozen = if model.is_frozen() { ", frozen" } else { "" };
+    let Background { generation, taught, count, unit_mm, .. } = model;
+    write!(
+        line,
+        "generation {generation}: {taught} of {count} beams known, {far} far, in {unit_mm} mm{frozen}"
+    )
+}

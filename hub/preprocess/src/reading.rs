@@ -1,0 +1,49 @@
+//! What one beam tells a processor: a range in millimetres, that nothing is near, or nothing at all. Refuses to know
+//! what is made of it.
+
+use schema::{Code, Scan};
+
+/// The reading of one beam.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Reading {
+    /// Something at this range in mm.
+    Valid(u32),
+    /// Nothing within reach.
+    Far,
+    /// Nothing is known: dazzled, too weak a signal, a reading error.
+    Invalid,
+}
+
+impl Reading {
+    /// What beam `i` of `scan` tells. That nothing came back is the most frequent code in real rooms; whether it means
+    /// [`Reading::Far`] or [`Reading::Invalid`] is for each processor to say.
+    pub fn of(scan: &Scan, i: usize, no_return_is_far: bool) -> Reading {
+        match (scan.distance_mm(i), scan.code(i)) {
+            (Some(range_mm), _) => Reading::Valid(range_mm),
+            (None, Some(Code::BEYOND)) => Reading::Far,
+            (None, Some(Code::NO_RETURN)) if no_return_is_far => Reading::Far,
+            _ => Reading::Invalid,
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn codes_and_ranges() {
+        let mut scan = Scan { count: 11, unit_mm: 10, range_bits: 13, ..Scan::default() };
+        for code in 0..10 {
+            scan.range_array[usize::from(code)] = 0x1FFF - code;
+        }
+        let all = |far| (0..12).map(|i| Reading::of(&scan, i, far)).collect::<Vec<_>>();
+        let mut expected = vec![Reading::Invalid; 12];
+        expected[8] = Reading::Far;
+        expected[9] = Reading::Valid(81_820);
+        expected[10] = Reading::Valid(0);
+        assert_eq!(all(false), expected);
+        expected[0] = Reading::Far;
+        assert_eq!(all(true), expected, "and a beam that is not there tells nothing");
+    }
+}

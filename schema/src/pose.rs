@@ -1,0 +1,60 @@
+//! Where a sensor sits on the robot, and where its beams point. Refuses to know what they meet.
+
+use bytemuck::{Pod, Zeroable};
+#[cfg(feature = "ipc")]
+use iceoryx2::prelude::ZeroCopySend;
+
+/// A sensor's place in the robot's frame: x ahead, y left, the origin at the robot's centre. 32 bytes.
+///
+/// The default is a sensor at the centre that looks ahead.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Pod, Zeroable)]
+#[cfg_attr(feature = "ipc", derive(ZeroCopySend), type_name("scanhub.Pose.v1"))]
+#[repr(C)]
+pub struct Pose {
+    /// Metres ahead of the centre.
+    pub x_m: f64,
+    /// Metres to the left of the centre.
+    pub y_m: f64,
+    /// Where the sensor looks, in radians counter-clockwise from ahead.
+    pub yaw_rad: f64,
+    /// 1: mounted upside down, so that its first beam is the leftmost.
+    pub upside_down: u8,
+    /// 0.
+    pub reserved: [u8; 7],
+}
+
+impl Pose {
+    /// Direction of the beam at sensor angle `angle_mdeg` (1/1000 degree; 0 right, 90 ahead, as an upright sensor sees
+    /// it) in the robot's frame: a unit vector.
+    pub fn direction(&self, angle_mdeg: i32) -> (f64, f64) {
+        let ahead_deg = f64::from(angle_mdeg) / 1000.0 - 90.0;
+        let aside_deg = if self.upside_down == 0 { ahead_deg } else { -ahead_deg };
+        let (sin, cos) = (self.yaw_rad + aside_deg.to_radians()).sin_cos();
+        (cos, sin)
+    }
+
+    /// The point at `range_mm` on that beam in the robot's frame, in mm.
+    pub fn point_mm(&self, angle_mdeg: i32, range_mm: f64) -> (f64, f64) {
+        let (x, y) = self.direction(angle_mdeg);
+        (1000.0 * self.x_m + range_mm * x, 1000.0 * self.y_m + range_mm * y)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use std::f64::consts::FRAC_PI_2;
+
+    #[test]
+    fn beams_point_where_the_sensor_is_turned_and_mounted() {
+        let near = |(x, y): (f64, f64), (a, b): (f64, f64)| (x - a).abs() < 1e-9 && (y - b).abs() < 1e-9;
+        let ahead = Pose { x_m: 0.3, y_m: -0.1, ..Pose::default() };
+        assert!(near(ahead.point_mm(90_000, 500.0), (800.0, -100.0)));
+        assert!(near(ahead.point_mm(0, 500.0), (300.0, -600.0)), "the first beam looks right");
+        let rear = Pose { yaw_rad: 2.0 * FRAC_PI_2, ..Pose::default() };
+        assert!(near(rear.direction(0), (0.0, 1.0)), "behind, right is left");
+        let turned_over = Pose { yaw_rad: FRAC_PI_2, upside_down: 1, ..Pose::default() };
+        assert!(near(turned_over.direction(90_000), (0.0, 1.0)));
+        assert!(near(turned_over.direction(0), (-1.0, 0.0)), "upside down, the first beam looks left");
+    }
+}
