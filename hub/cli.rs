@@ -1,6 +1,7 @@
 //! The command line: which verbs there are and what they take. Syntax only; what a value means is checked by whoever
 //! uses it.
 
+mod background;
 mod configure;
 mod control;
 mod doctor;
@@ -16,6 +17,7 @@ use clients::{Bounds, duration};
 use daemon::config::Sources;
 use schema::{DEFAULT_DOMAIN, Domain, Environment, Failure};
 
+pub(crate) use background::Background;
 pub(crate) use control::Control;
 pub(crate) use telegram::{Telegram, Way};
 
@@ -96,6 +98,8 @@ pub(crate) enum Verb {
     Telegram(Telegram),
     /// Stop a sensor, let it stream again, or begin anew with it
     Control(Control),
+    /// The background model of a sensor: look at it, learn it anew, hold it, keep it in a file
+    Background(Background),
 }
 
 #[derive(Args, Debug)]

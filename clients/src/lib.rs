@@ -4,10 +4,12 @@
 
 mod account;
 mod attach;
+mod background;
 mod clock;
 mod control;
 pub mod duration;
 mod echo;
+mod file;
 mod follow;
 mod follower;
 mod freshness;
@@ -26,6 +28,7 @@ mod window;
 mod zones;
 
 pub use attach::{Attachment, attach};
+pub use background::{BackgroundOptions, ModelOrder, background, saved_model};
 pub use control::{ControlOptions, control};
 pub use echo::{EchoOptions, Format, echo};
 pub use follow::Bounds;
