@@ -67,7 +67,9 @@ impl Sink for Hz<'_> {
     }
 
     fn sample(&mut self, name: &TopicName, sample: &Sample) -> Result<(), End> {
-        if let Some((_, window)) = self.windows.iter_mut().find(|(known, _)| known == name) {
+        if !sample.is_stale()
+            && let Some((_, window)) = self.windows.iter_mut().find(|(known, _)| known == name)
+        {
             window.arrived(Instant::now(), sample.missed());
         }
         Ok(())

@@ -6,6 +6,7 @@ use std::time::{Duration, Instant};
 
 use schema::{Domain, Failure, Kind, Status, ipc};
 
+use crate::clock;
 use crate::follower::Follower;
 use crate::json;
 use crate::names::no_sensor;
@@ -31,7 +32,7 @@ pub struct InfoOptions {
 pub fn info(options: &InfoOptions, out: &mut dyn Write, stop: &AtomicBool) -> Result<(), Failure> {
     let domain = find(&options.places)?;
     let sensors = wanted(options.sensor.as_deref(), &domain)?;
-    let now_ns = monotonic_ns();
+    let now_ns = clock::now().monotonic_ns;
     let mut output = Output::new(out);
     for (sensor, status) in statuses(&domain, &sensors, stop)? {
         let Some(status) = status else {
@@ -130,8 +131,3 @@ fn counters(status: &Status) -> Vec<Vec<String>> {
 
 /// Of the labels: the longest counter's name and its indent.
 const WIDTH: usize = 21;
-
-fn monotonic_ns() -> u64 {
-    let now = rustix::time::clock_gettime(rustix::time::ClockId::Monotonic);
-    now.tv_sec as u64 * 1_000_000_000 + now.tv_nsec as u64
-}

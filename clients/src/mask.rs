@@ -128,8 +128,8 @@ impl Sink for Look<'_> {
     fn sample(&mut self, name: &TopicName, sample: &Sample) -> Result<(), End> {
         match sample {
             Sample::Status(status) => self.pose = Some(status.pose),
-            Sample::Zones(zones) if self.within_mm.is_none() => {
-                self.within_mm = zones.zones().first().map(|zone| f64::from(zone.radius_mm));
+            Sample::Zones(heard) if self.within_mm.is_none() => {
+                self.within_mm = heard.zones.zones().first().map(|zone| f64::from(zone.radius_mm));
             }
             // A telegram that may be broken is no evidence.
             Sample::Scan(scan) if scan.header().quality() == Quality::Clean => {

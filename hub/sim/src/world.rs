@@ -26,10 +26,19 @@ pub enum World {
 }
 
 /// The scenes that the program brings along: name and text.
-const SCENES: [(&str, &str); 3] = [
+const SCENES: [(&str, &str); 12] = [
     ("room", include_str!("../../../tests/worlds/room.toml")),
     ("bare", include_str!("../../../tests/worlds/bare.toml")),
     ("fig8", include_str!("../../../tests/worlds/fig8.toml")),
+    ("standing", include_str!("../../../tests/worlds/standing.toml")),
+    ("approach", include_str!("../../../tests/worlds/approach.toml")),
+    ("door", include_str!("../../../tests/worlds/door.toml")),
+    ("corridor", include_str!("../../../tests/worlds/corridor.toml")),
+    ("glass", include_str!("../../../tests/worlds/glass.toml")),
+    ("sun", include_str!("../../../tests/worlds/sun.toml")),
+    ("chair", include_str!("../../../tests/worlds/chair.toml")),
+    ("strips", include_str!("../../../tests/worlds/strips.toml")),
+    ("crowd", include_str!("../../../tests/worlds/crowd.toml")),
 ];
 
 impl World {
