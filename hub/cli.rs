@@ -8,6 +8,7 @@ mod doctor;
 mod probe;
 pub(crate) mod simulate;
 mod telegram;
+mod zones;
 
 use std::path::PathBuf;
 use std::time::Duration;
@@ -20,6 +21,7 @@ use schema::{DEFAULT_DOMAIN, Domain, Environment, Failure};
 pub(crate) use background::Background;
 pub(crate) use control::Control;
 pub(crate) use telegram::{Telegram, Way};
+pub(crate) use zones::Zones;
 
 /// Laser scanners on serial lines, for more than one program: a hub that publishes telegrams and scans into shared
 /// memory, and the programs that listen.
@@ -100,6 +102,8 @@ pub(crate) enum Verb {
     Control(Control),
     /// The background model of a sensor: look at it, learn it anew, hold it, keep it in a file
     Background(Background),
+    /// The zones around the robot: which part of its view the robot itself takes
+    Zones(Zones),
 }
 
 #[derive(Args, Debug)]
@@ -161,7 +165,7 @@ impl Limits {
 
 #[derive(Args, Debug)]
 pub(crate) struct Echo {
-    /// What to follow: front/scan, rear/telegram, front/status ..
+    /// What to follow: front/scan, rear/telegram, front/zones .. or robot/zones, all sensors' zones in one
     #[arg(required = true, value_name = "SENSOR/TOPIC")]
     pub(crate) topics: Vec<String>,
     /// Comma-separated values

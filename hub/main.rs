@@ -118,6 +118,7 @@ fn dispatch(cli: &Cli) -> Result<(), Failure> {
             let options = background.options(everywhere)?;
             clients::background(&options, &mut out, &*interrupt()?)
         }
+        Verb::Zones(zones) => zones.run(everywhere, &mut out, &*interrupt()?),
     }
 }
 
