@@ -113,8 +113,15 @@ pub fn of_service(name: &str) -> Option<(&str, Option<Topic>)> {
     if topic == WAKE { Some((sensor, None)) } else { Some((sensor, Some(Topic::parse(topic)?))) }
 }
 
-/// Refuses a sensor's name that is not `[a-z0-9_-]`, 1 to 24 of them: [`Kind::Configuration`].
+/// Stands for all sensors of a hub where one is named, and so is no name of a sensor.
+pub const ROBOT: &str = "robot";
+
+/// Refuses a sensor's name that is not `[a-z0-9_-]`, 1 to 24 of them, or [`ROBOT`]: [`Kind::Configuration`].
 pub fn check_sensor(name: &str) -> Result<(), Failure> {
+    if name == ROBOT {
+        let what = format!("sensor name {ROBOT:?} is not possible: it stands for all sensors");
+        return Err(Failure::new(Kind::Configuration, what, "any other name, for example front"));
+    }
     let allowed = |c: char| c.is_ascii_lowercase() || c.is_ascii_digit() || c == '_' || c == '-';
     if (1..=24).contains(&name.len()) && name.chars().all(allowed) {
         return Ok(());
@@ -151,7 +158,7 @@ mod tests {
     #[test]
     fn names_of_sensors() {
         assert!(check_sensor("front_2-b").is_ok());
-        for bad in ["", "Front", "a/b", "a b", "ä", &"a".repeat(25)] {
+        for bad in ["", "Front", "a/b", "a b", "ä", ROBOT, &"a".repeat(25)] {
             assert_eq!(check_sensor(bad).map_err(|failure| failure.kind), Err(Kind::Configuration), "{bad}");
         }
     }
