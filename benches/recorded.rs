@@ -141,7 +141,7 @@ impl Account {
             );
             let peak = marks.iter().map(|mark| mark.peak).max().unwrap_or_default();
             println!(
-                "  {:>5.1}% {:>8.2} ({:.2}, {:.2}) {:>10.0} ({:.1}, {:.0}) {peak:>5}",
+                "  {:>5.1}% {:>8.3} ({:.3}, {:.3}) {:>10.0} ({:.1}, {:.0}) {peak:>5}",
                 100.0 * per_scan(marks.len()),
                 angle.mean,
                 angle.deviation,

@@ -170,7 +170,7 @@ impl Limits {
 
 #[derive(Args, Debug)]
 pub(crate) struct Echo {
-    /// What to follow: front/scan, rear/telegram, front/status ..
+    /// What to follow: front/scan, rear/telegram, front/zones .. or robot/zones, all sensors' zones in one
     #[arg(required = true, value_name = "SENSOR/TOPIC")]
     pub(crate) topics: Vec<String>,
     /// Comma-separated values

@@ -146,10 +146,10 @@ impl<'a> Line<'a> {
         match (self.hz, self.jitter_ms, self.min_ms, self.max_ms) {
             (Some(hz), Some(jitter), Some(min), Some(max)) => write!(
                 line,
-                "{name:<16} {hz:8.2} Hz  jitter {jitter:7.2} ms  min {min:7.2} ms  max {max:8.2} ms  lost {}",
+                "{name:<16} {hz:8.2} Hz jitter {jitter:6.2} min {min:6.2} max {max:8.2} ms lost {}",
                 self.lost
             ),
-            _ => write!(line, "{name:<16}        - Hz  {} received", self.received),
+            _ => write!(line, "{name:<16}        - Hz {} received", self.received),
         }
     }
 }

@@ -114,6 +114,13 @@ struct Place {
     upside_down: bool,
 }
 
+/// Whether there are marks, in a status, and the command that changes it.
+#[derive(Serialize)]
+struct MarksOffer {
+    available: Option<bool>,
+    remedy: Option<String>,
+}
+
 /// Class `status`; what is not known is null.
 pub(crate) fn status<'a>(sensor: &'a str, status: &'a Status) -> impl Serialize + 'a {
     #[derive(Serialize)]
@@ -135,6 +142,7 @@ pub(crate) fn status<'a>(sensor: &'a str, status: &'a Status) -> impl Serialize 
         counters: &'a Counters,
         last_error: &'a str,
         pose: Place,
+        marks: MarksOffer,
     }
     Line {
         class: "status",
@@ -157,6 +165,7 @@ pub(crate) fn status<'a>(sensor: &'a str, status: &'a Status) -> impl Serialize 
             yaw_rad: status.pose.yaw_rad,
             upside_down: status.pose.upside_down != 0,
         },
+        marks: MarksOffer { available: status.has_reflector_bits(), remedy: status.reflector_remedy() },
     }
 }
 

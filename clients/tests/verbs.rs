@@ -6,7 +6,7 @@ use std::time::{Duration, Instant};
 
 use clients::{Bounds, HzOptions, InfoOptions, ListOptions, hz, info, list, list_domains};
 use fake::{FakeHub, Place, Verb};
-use schema::{Counter, Kind};
+use schema::{Counter, Kind, Pose};
 
 fn start_list(place: &Place, json: bool) -> Verb {
     let options = ListOptions { json, places: place.places() };
@@ -83,6 +83,9 @@ fn info_of_a_sensor() {
     for sensor in &mut hub.sensors {
         sensor.status(|status| {
             status.set_sensor_type("LMS200");
+            status.set_port("/dev/ttyUSB1");
+            status.mode = 0;
+            status.pose = Pose { x_m: 0.3, yaw_rad: std::f64::consts::PI, upside_down: 1, ..Pose::default() };
             status.counters[Counter::Telegrams] = 12;
         });
     }
@@ -96,6 +99,8 @@ fn info_of_a_sensor() {
     let (_, out, _) = verb.join();
     assert!(out.starts_with("front                  streaming for"), "{out}");
     assert!(out.contains("  telegrams            12\n"), "{out}");
+    assert!(out.contains("  pose                 x 0.3 m, y 0 m, yaw 180.0 deg, upside down\n"), "{out}");
+    assert!(out.contains("`scanhub configure /dev/ttyUSB1 mode=0x01`\n"), "{out}");
     let failure = start_info(&place, Some("left"), true).join().0.unwrap_err();
     assert_eq!((failure.kind, failure.hint.as_str()), (Kind::NoTopic, "there are front, rear"));
 }
