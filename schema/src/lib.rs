@@ -3,6 +3,7 @@
 
 mod background;
 mod control;
+pub mod datagram;
 mod domain;
 mod failure;
 mod foreground;
@@ -39,7 +40,9 @@ pub use pose::Pose;
 pub use scan::{BEAMS, CONTENTS_UPPER, Code, Scan, TURN_NS};
 pub use status::{COUNTERS, Counter, Counters, State, Status};
 pub use telegram::Telegram;
-pub use topic::{CONTROL, CONTROL_REQUEST, CONTROL_RESPONSE, Topic, WAKE, Wake, check_sensor, of_service};
+pub use topic::{
+    CONTROL, CONTROL_REQUEST, CONTROL_RESPONSE, ROBOT, Topic, WAKE, Wake, check_sensor, of_service,
+};
 pub use zones::{Verdict, ZONES, Zone, Zones};
 
 #[cfg(feature = "ipc")]

@@ -91,7 +91,7 @@ impl Scan {
 
     /// Angle of beam `i` in 1/1000 degree.
     pub fn angle_mdeg(&self, i: usize) -> i32 {
-        self.first_angle_mdeg + i as i32 * i32::from(self.step_mdeg)
+        self.first_angle_mdeg.saturating_add(i as i32 * i32::from(self.step_mdeg))
     }
 
     /// Angle of beam `i` in degrees.

@@ -4,7 +4,9 @@
 #![forbid(unsafe_code)]
 
 pub mod background;
+pub mod marks;
 mod reading;
 pub mod segments;
+pub mod zones;
 
 pub use reading::Reading;

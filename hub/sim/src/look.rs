@@ -26,7 +26,8 @@ pub enum Met {
     },
     /// A leg of somebody, standing or walking.
     Person,
-    /// A thing that was put down or moved after the world began, a door too: only now it is where the beam meets it.
+    /// A thing that was put down or moved after the world began, a door too, and is nearer than what the beam met before;
+    /// one that moved away from the sensor is [`Met::Static`] as what it uncovers is.
     Box {
         /// When it was put down or came to rest; the time of the scan itself while it moves.
         since_ns: Nanos,

@@ -4,13 +4,11 @@
 use lms::Nanos;
 use lms::variant::{Mode, Unit, Variant};
 
-use crate::layers::{self, Dice, Layers};
+use crate::layers::{self, Dice};
 use crate::look::{Look, Mark, Met};
-use crate::people::{Person, jittered};
-use crate::scene::{Scene, Sun, Surface, Thing};
-use crate::shape::{Pose, Shape};
 use crate::spot::{Echo, echo};
-use crate::view::{Face, Kind, View};
+use crate::stage::Stage;
+use crate::view::View;
 use crate::world::World;
 
 /// A world with its furniture in place, as one sensor in it sees it.
@@ -28,20 +26,6 @@ enum Sight {
     Value(u16),
     Random,
     Scene(Box<Stage>),
-}
-
-/// A scene as a seed makes it.
-#[derive(Clone, Debug)]
-struct Stage {
-    layers: Layers,
-    sensor: Pose,
-    bias_mm: f64,
-    /// What never changes, drawn once.
-    still: View,
-    still_reflectors: Vec<Shape>,
-    changing: Vec<Thing>,
-    people: Vec<Person>,
-    suns: Vec<Sun>,
 }
 
 impl Room {
@@ -103,7 +87,7 @@ impl Room {
             Sight::Value(value) => vec![*value; beams],
             Sight::Random => (0..beams).map(|_| random.u16(..) & !mode.forbidden()).collect(),
             Sight::Scene(stage) => {
-                return stage.measure(&angles_mdeg, turns, unit, mode, end_ns, &mut random);
+                return measure(stage, &angles_mdeg, turns, unit, mode, end_ns, &mut random);
             }
         };
         let truth = words.iter().map(|&word| truth(word, Met::Static { since_ns: 0 }, mode)).collect();
@@ -111,141 +95,47 @@ impl Room {
     }
 }
 
-impl Stage {
-    fn new(scene: &Scene, seed: u64, sensor: u64) -> Stage {
-        let mut random = fastrand::Rng::with_seed(seed);
-        let people = scene.people.iter().map(|plan| Person::new(plan, &mut random)).collect();
-        let mut things = scene.things.clone();
-        for thing in &mut things {
-            let place = (thing.pose.x_mm, thing.pose.y_mm);
-            (thing.pose.x_mm, thing.pose.y_mm) = jittered(place, thing.jitter_mm, &mut random);
-        }
-        let (still_things, changing): (Vec<_>, Vec<_>) = things.into_iter().partition(Thing::is_still);
-        let bias = fastrand::Rng::with_seed(!seed ^ sensor << 32).f64();
-        let mut stage = Stage {
-            layers: scene.layers,
-            sensor: scene.sensors[sensor as usize],
-            bias_mm: scene.layers.bias_mm * (2.0 * bias - 1.0),
-            still: View::empty(),
-            still_reflectors: Vec::new(),
-            changing,
-            people,
-            suns: scene.suns.clone(),
-        };
-        for thing in still_things {
-            for shape in stage.seen(&thing, thing.pose) {
-                if thing.surface == Surface::Reflector {
-                    stage.still_reflectors.push(shape);
-                }
-                stage.still.draw(Face { shape, surface: thing.surface, kind: Kind::Static });
-            }
-        }
-        stage
+/// What the beams at `angles_mdeg` tell of `stage`, every one after the other in the next of `turns` mirror turns.
+fn measure(
+    stage: &Stage,
+    angles_mdeg: &[i32],
+    turns: u64,
+    unit: Unit,
+    mode: Mode,
+    end_ns: Nanos,
+    random: &mut fastrand::Rng,
+) -> Look {
+    let times: Vec<Nanos> = (0..turns).map(|turn| stage.layers.turn_ns(turn, turns, end_ns)).collect();
+    let views: Vec<View> = times.iter().map(|&time_ns| stage.view(time_ns)).collect();
+    let mut look = Look { words: Vec::new(), truth: Vec::new() };
+    for (beam, &angle_mdeg) in angles_mdeg.iter().enumerate() {
+        // The beams between whole degrees are measured in the turns after the first.
+        let turn = beam % turns as usize;
+        let dice = Dice::throw(random);
+        let echo = echo(&views[turn], angle_mdeg, stage.layers.spot, &dice);
+        let time_s = times[turn] as f64 / 1e9;
+        let sun = stage.suns.iter().map(|sun| sun.share(angle_mdeg, time_s)).fold(0.0, f64::max);
+        let word = word(stage, &echo, sun, unit, mode, &dice);
+        look.words.push(word);
+        look.truth.push(truth(word, echo.met, mode));
     }
+    look
+}
 
-    /// The shapes of `thing` in the frame of the sensor, while it stands at `pose`.
-    fn seen(&self, thing: &Thing, pose: Pose) -> Vec<Shape> {
-        let place = |point| self.eye(pose.outward(point));
-        thing.shapes.iter().map(|shape| shape.placed(place)).collect()
-    }
-
-    /// A point of the world in the frame of the sensor: 0 degrees to its right, 90 ahead.
-    fn eye(&self, point: (f64, f64)) -> (f64, f64) {
-        let (ahead, left) = self.sensor.inward(point);
-        (-left, ahead)
-    }
-
-    /// The things that come, go or move, and the people, as they are at `time_ns`.
-    fn faces(&self, time_ns: Nanos) -> Vec<Face> {
-        let time_s = time_ns as f64 / 1e9;
-        let mut faces = Vec::new();
-        for thing in &self.changing {
-            let Some(spell) = thing.at(time_s) else { continue };
-            let kind = match nanos(spell.since_s) {
-                0 => Kind::Static,
-                since_ns => Kind::Box { since_ns },
-            };
-            let shapes = self.seen(thing, spell.pose);
-            faces.extend(shapes.into_iter().map(|shape| Face { shape, surface: thing.surface, kind }));
-        }
-        for legs in self.people.iter().filter_map(|person| person.legs(time_s)) {
-            let leg = |leg: Shape| Face {
-                shape: leg.placed(|point| self.eye(point)),
-                surface: Surface::Plain,
-                kind: Kind::Person,
-            };
-            faces.extend(legs.map(leg));
-        }
-        faces
-    }
-
-    fn view(&self, time_ns: Nanos) -> View {
-        let mut view = self.still.clone();
-        for face in self.faces(time_ns) {
-            view.draw(face);
-        }
-        for thing in &self.changing {
-            for spell in thing.left(time_ns as f64 / 1e9) {
-                for shape in self.seen(thing, spell.pose) {
-                    view.uncover(&shape, nanos(spell.since_s));
-                }
-            }
-        }
-        view
-    }
-
-    fn marks(&self, time_ns: Nanos) -> Vec<Mark> {
-        let view = self.view(time_ns);
-        let moving = self.faces(time_ns).into_iter().filter(|face| face.surface == Surface::Reflector);
-        let fronts = self.still_reflectors.iter().copied().chain(moving.map(|face| face.shape));
-        let marks = fronts.map(|shape| {
-            let (x, y) = shape.front();
-            Mark { angle_deg: y.atan2(x).to_degrees(), range_mm: x.hypot(y) }
-        });
-        marks.filter(|mark| view.reaches(mark.angle_deg, mark.range_mm)).collect()
-    }
-
-    fn measure(
-        &self,
-        angles_mdeg: &[i32],
-        turns: u64,
-        unit: Unit,
-        mode: Mode,
-        end_ns: Nanos,
-        random: &mut fastrand::Rng,
-    ) -> Look {
-        let times: Vec<Nanos> = (0..turns).map(|turn| self.layers.turn_ns(turn, turns, end_ns)).collect();
-        let views: Vec<View> = times.iter().map(|&time_ns| self.view(time_ns)).collect();
-        let mut look = Look { words: Vec::new(), truth: Vec::new() };
-        for (beam, &angle_mdeg) in angles_mdeg.iter().enumerate() {
-            // The beams between whole degrees are measured in the turns after the first.
-            let turn = beam % turns as usize;
-            let dice = Dice::throw(random);
-            let echo = echo(&views[turn], angle_mdeg, self.layers.spot, &dice);
-            let time_s = times[turn] as f64 / 1e9;
-            let sun = self.suns.iter().map(|sun| sun.share(angle_mdeg, time_s)).fold(0.0, f64::max);
-            let word = self.word(&echo, sun, unit, mode, &dice);
-            look.words.push(word);
-            look.truth.push(truth(word, echo.met, mode));
-        }
-        look
-    }
-
-    /// What a beam says that got `echo`, while the sun dazzles `sun` of its like.
-    fn word(&self, echo: &Echo, sun: f64, unit: Unit, mode: Mode, dice: &Dice) -> u16 {
-        let code = |code: u16| mode.max_value() - code;
-        if self.layers.dazzles(sun, dice) {
-            code(layers::DAZZLE)
-        } else if echo.range_mm.is_infinite() {
-            code(layers::NO_RETURN)
-        } else if self.layers.loses(echo.signal, echo.torn, dice) {
-            code(layers::TOO_WEAK)
-        } else if let Some(error) = self.layers.error(dice) {
-            code(error)
-        } else {
-            let range_mm = echo.range_mm + self.bias_mm + self.layers.deviation_mm(dice);
-            range_value(range_mm / f64::from(unit.mm()), mode) | level(echo, mode, dice) << mode.range_bits()
-        }
+/// What a beam says that got `echo`, while the sun dazzles `sun` of its like.
+fn word(stage: &Stage, echo: &Echo, sun: f64, unit: Unit, mode: Mode, dice: &Dice) -> u16 {
+    let code = |code: u16| mode.max_value() - code;
+    if stage.layers.dazzles(sun, dice) {
+        code(layers::DAZZLE)
+    } else if echo.range_mm.is_infinite() {
+        code(layers::NO_RETURN)
+    } else if stage.layers.loses(echo.signal, echo.torn, dice) {
+        code(layers::TOO_WEAK)
+    } else if let Some(error) = stage.layers.error(dice) {
+        code(error)
+    } else {
+        let range_mm = echo.range_mm + stage.bias_mm + stage.layers.deviation_mm(dice);
+        range_value(range_mm / f64::from(unit.mm()), mode) | level(echo, mode, dice) << mode.range_bits()
     }
 }
 
@@ -271,12 +161,8 @@ fn level(echo: &Echo, mode: Mode, dice: &Dice) -> u16 {
     (top * echo.bright + LEVEL_DEVIATION * dice.bright).round().clamp(0.0, most) as u16
 }
 
-fn nanos(time_s: f64) -> Nanos {
-    (time_s * 1e9).round() as Nanos
-}
-
-/// Standard deviation of a reflector level.
-const LEVEL_DEVIATION: f64 = 0.3;
+/// Standard deviation of a reflector level; a recording of a standing sensor shows none at all.
+const LEVEL_DEVIATION: f64 = 0.1;
 
 #[cfg(test)]
 mod tests {

@@ -30,6 +30,26 @@ struct Part<'a> {
     weight: f64,
 }
 
+impl Part<'_> {
+    fn is_reflector(&self) -> bool {
+        self.face.is_some_and(|face| face.surface == Surface::Reflector)
+    }
+
+    /// What it sends back beside the other parts of the spot.
+    fn echo(&self) -> f64 {
+        self.weight * if self.is_reflector() { OUTSHINES } else { 1.0 }
+    }
+
+    /// What the beam meets, if it meets this part alone. A thing that moved away is like any surface that was
+    /// uncovered: new to the beam, but not nearer than what it met before.
+    fn kind(&self) -> Kind {
+        match self.face.map_or(Kind::Static, |face| face.kind) {
+            Kind::Box { since_ns } if self.hit.since_ns >= since_ns => Kind::Static,
+            kind => kind,
+        }
+    }
+}
+
 /// The echo of the beam at `angle_mdeg`; without `wide` that of a line, else that of a spot.
 pub(crate) fn echo(view: &View, angle_mdeg: i32, wide: bool, dice: &Dice) -> Echo {
     let rays = view.around(angle_mdeg);
@@ -37,23 +57,25 @@ pub(crate) fn echo(view: &View, angle_mdeg: i32, wide: bool, dice: &Dice) -> Ech
     let total: f64 = parts.iter().map(|part| part.weight).sum();
     let nearest_mm = parts.iter().map(|part| part.hit.range_mm).fold(f64::INFINITY, f64::min);
     let is_near = |part: &&Part| part.hit.range_mm <= nearest_mm + CONTINUOUS_MM;
-    let near_weight: f64 = parts.iter().filter(is_near).map(|part| part.weight).sum();
+    let near_echo: f64 = parts.iter().filter(is_near).map(Part::echo).sum();
     let near = heaviest(parts.iter().filter(is_near));
     let far = heaviest(parts.iter().filter(|part| !is_near(part)));
-    let (face, range_mm) = told(near, far, near_weight / total, dice);
-    let lit = parts.iter().filter(|part| part.face.is_some_and(|face| face.surface == Surface::Reflector));
+    let all_echo: f64 = parts.iter().map(Part::echo).sum();
+    let (face, range_mm) = told(near, far, near_echo / all_echo, dice);
+    let lit = parts.iter().filter(|part| part.is_reflector());
+    let bright = lit.map(|part| part.weight).sum::<f64>() / total;
     Echo {
         range_mm,
         signal: face.map_or(0.0, |face| signal(face, range_mm, angle_mdeg)),
-        bright: lit.map(|part| part.weight).sum::<f64>() / total,
-        torn: far.is_some_and(|far| far.1 - nearest_mm > TORN_MM),
+        bright,
+        torn: bright == 0.0 && far.is_some_and(|far| far.1 - nearest_mm > TORN_MM),
         met: met(&parts),
     }
 }
 
 /// Face and range of the part with most of the light.
 fn heaviest<'a>(parts: impl Iterator<Item = &'a Part<'a>>) -> Option<(Option<&'a Face>, f64)> {
-    parts.max_by(|a, b| a.weight.total_cmp(&b.weight)).map(|part| (part.face, part.hit.range_mm))
+    parts.max_by(|a, b| a.echo().total_cmp(&b.echo())).map(|part| (part.face, part.hit.range_mm))
 }
 
 /// What a spot on a `near` and perhaps a `far` face tells, the nearer one having `share` of its light.
@@ -78,6 +100,9 @@ fn told<'a>(
 /// The faces that the spot covers, with the light that falls on each. The spot has a Gaussian profile; it ends where
 /// the light is down to 1/e^2.
 fn spread<'a>(view: &'a View, rays: &'a [Hit], dice: &Dice) -> Vec<Part<'a>> {
+    if rays.iter().all(|hit| hit.is_of(&rays[REACH])) {
+        return vec![part(view, &rays[REACH], 1.0)];
+    }
     let mut parts: Vec<Part> = Vec::with_capacity(2);
     let off = MIRROR_STEPS * dice.mirror;
     // From the middle outwards: of each face the ray nearest to the middle stands for it.
@@ -91,11 +116,7 @@ fn spread<'a>(view: &'a View, rays: &'a [Hit], dice: &Dice) -> Vec<Part<'a>> {
             continue;
         }
         let new = part(view, hit, (-2.0 * within * within).exp());
-        let same = |part: &&mut Part| match (part.face, new.face) {
-            (Some(a), Some(b)) => std::ptr::eq(a, b) && part.hit.since_ns == new.hit.since_ns,
-            (a, b) => a.is_none() && b.is_none(),
-        };
-        match parts.iter_mut().find(same) {
+        match parts.iter_mut().find(|part| part.hit.is_of(hit)) {
             Some(part) => part.weight += new.weight,
             None => parts.push(new),
         }
@@ -112,7 +133,7 @@ fn part<'a>(view: &'a View, hit: &Hit, weight: f64) -> Part<'a> {
 
 /// The truth of a spot of `parts`.
 fn met(parts: &[Part]) -> Met {
-    let kinds = || parts.iter().map(|part| part.face.map_or(Kind::Static, |face| face.kind));
+    let kinds = || parts.iter().map(Part::kind);
     let since_ns = parts.iter().map(|part| part.hit.since_ns).max().unwrap_or(0);
     let youngest = kinds().filter_map(|kind| match kind {
         Kind::Box { since_ns } => Some(since_ns),
@@ -156,6 +177,8 @@ const MIRROR_STEPS: f64 = 0.32;
 const CONTINUOUS_MM: f64 = 40.0;
 /// Surfaces further apart than this can cost the beam its signal.
 const TORN_MM: f64 = 300.0;
+/// How much brighter a reflector is than other surfaces: in recordings beams that only touch one tell its range.
+const OUTSHINES: f64 = 100.0;
 /// A surface with less than this share of the light is never told.
 const CLEAR: f64 = 0.17;
 /// Share of the undecided readings that lie between the surfaces: two pulses that the sensor takes for one.

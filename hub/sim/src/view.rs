@@ -38,6 +38,13 @@ pub(crate) struct Hit {
     pub(crate) since_ns: Nanos,
 }
 
+impl Hit {
+    /// Whether both end at the same face, and for as long.
+    pub(crate) fn is_of(&self, other: &Hit) -> bool {
+        self.face == other.face && self.since_ns == other.since_ns
+    }
+}
+
 /// All rays of a moment.
 #[derive(Clone, Debug, Default)]
 pub(crate) struct View {

@@ -1,6 +1,9 @@
 //! The worlds there are: some that a sensor's tests need, made of code, and scenes as data: those that the program
 //! brings along, and files. Knows where a world comes from, not what is in it.
 
+mod file;
+mod origin;
+
 use std::path::Path;
 use std::str::FromStr;
 use std::sync::Arc;
@@ -9,7 +12,6 @@ use schema::{Failure, Kind};
 
 use crate::layers::Layers;
 use crate::scene::Scene;
-use crate::scene_file;
 
 /// What a sensor can be put into.
 #[derive(Clone, Debug, PartialEq)]
@@ -26,16 +28,32 @@ pub enum World {
 }
 
 /// The scenes that the program brings along: name and text.
-const SCENES: [(&str, &str); 3] = [
+const SCENES: [(&str, &str); 12] = [
     ("room", include_str!("../../../tests/worlds/room.toml")),
     ("bare", include_str!("../../../tests/worlds/bare.toml")),
     ("fig8", include_str!("../../../tests/worlds/fig8.toml")),
+    ("standing", include_str!("../../../tests/worlds/standing.toml")),
+    ("approach", include_str!("../../../tests/worlds/approach.toml")),
+    ("door", include_str!("../../../tests/worlds/door.toml")),
+    ("corridor", include_str!("../../../tests/worlds/corridor.toml")),
+    ("glass", include_str!("../../../tests/worlds/glass.toml")),
+    ("sun", include_str!("../../../tests/worlds/sun.toml")),
+    ("chair", include_str!("../../../tests/worlds/chair.toml")),
+    ("strips", include_str!("../../../tests/worlds/strips.toml")),
+    ("crowd", include_str!("../../../tests/worlds/crowd.toml")),
 ];
 
 impl World {
     /// The names of all worlds that need no file.
     pub fn names() -> impl Iterator<Item = &'static str> {
         SCENES.iter().map(|(name, _)| *name).chain(["empty", "wall640", "random"])
+    }
+
+    /// The world that `text` describes in TOML; `name` is how failures call it.
+    ///
+    /// [`Kind::Configuration`] if it is none, with place, value and remedy.
+    pub fn of_toml(name: &str, text: &str) -> Result<World, Failure> {
+        file::parse(name, text).map(|scene| World::Scene(Arc::new(scene)))
     }
 
     /// How many sensors look at it.
@@ -70,14 +88,13 @@ impl FromStr for World {
     ///
     /// [`Kind::Configuration`] if it is neither, or if the file is wrong: then with the place and a remedy.
     fn from_str(text: &str) -> Result<World, Failure> {
-        let scene = |name: &str, text: &str| Ok(World::Scene(Arc::new(scene_file::parse(name, text)?)));
         match text {
             "empty" => Ok(World::Empty),
             "wall640" => Ok(World::Wall640),
             "random" => Ok(World::Random),
             _ => match SCENES.iter().find(|(name, _)| *name == text) {
-                Some((name, contents)) => scene(name, contents),
-                None => scene(text, &read(text)?),
+                Some((name, contents)) => World::of_toml(name, contents),
+                None => World::of_toml(text, &read(text)?),
             },
         }
     }

@@ -3,7 +3,7 @@
 
 use std::ops::Range;
 
-use schema::{Failure, Kind};
+use schema::Failure;
 use serde::Deserialize;
 use toml::Spanned;
 
@@ -11,6 +11,7 @@ use crate::layers::Layers;
 use crate::people::{Plan, Speed, Way};
 use crate::scene::{Move, Scene, Sun, Surface, Thing};
 use crate::shape::{Point, Pose, Shape};
+use crate::world::origin::Origin;
 
 /// The scene that `text` describes; `name` is how failures call it.
 ///
@@ -23,8 +24,16 @@ pub(crate) fn parse(name: &str, text: &str) -> Result<Scene, Failure> {
     Ok(Scene {
         sensors: if sensors.is_empty() { vec![MIDDLE] } else { sensors },
         layers: file.noise.layers(&origin)?,
-        things: file.thing.iter().map(|thing| thing.thing(&origin)).collect::<Result<_, _>>()?,
-        people: file.person.iter().map(|person| person.plan(&origin)).collect::<Result<_, _>>()?,
+        things: file
+            .thing
+            .iter()
+            .map(|thing| thing.get_ref().thing(thing.span(), &origin))
+            .collect::<Result<_, _>>()?,
+        people: file
+            .person
+            .iter()
+            .map(|person| person.get_ref().plan(person.span(), &origin))
+            .collect::<Result<_, _>>()?,
         suns: file.sun.iter().map(|sun| sun.sun(&origin)).collect::<Result<_, _>>()?,
     })
 }
@@ -40,9 +49,9 @@ struct SceneFile {
     #[serde(default)]
     noise: NoiseFile,
     #[serde(default)]
-    thing: Vec<ThingFile>,
+    thing: Vec<Spanned<ThingFile>>,
     #[serde(default)]
-    person: Vec<PersonFile>,
+    person: Vec<Spanned<PersonFile>>,
     #[serde(default)]
     sun: Vec<SunFile>,
 }
@@ -50,7 +59,7 @@ struct SceneFile {
 #[derive(Deserialize)]
 #[serde(deny_unknown_fields)]
 struct SensorFile {
-    pose: Spanned<Vec<f64>>,
+    pose: Spanned<Vec<Number>>,
 }
 
 #[derive(Default, Deserialize)]
@@ -69,12 +78,12 @@ struct NoiseFile {
 #[derive(Deserialize)]
 #[serde(deny_unknown_fields)]
 struct ThingFile {
-    line: Option<Spanned<Vec<Point>>>,
+    line: Option<Vec<(Number, Number)>>,
     #[serde(rename = "box")]
-    sides: Option<Spanned<Point>>,
-    legs: Option<Spanned<Point>>,
+    sides: Option<(Length, Length)>,
+    legs: Option<(Length, Length)>,
     radius_mm: Option<Spanned<f64>>,
-    pose: Option<Spanned<Vec<f64>>>,
+    pose: Option<Spanned<Vec<Number>>>,
     surface: Option<Spanned<String>>,
     from_s: Option<Spanned<f64>>,
     until_s: Option<Spanned<f64>>,
@@ -88,16 +97,16 @@ struct ThingFile {
 struct MoveFile {
     from_s: Spanned<f64>,
     until_s: Spanned<f64>,
-    by: Spanned<Vec<f64>>,
+    by: Spanned<Vec<Number>>,
 }
 
 #[derive(Deserialize)]
 #[serde(deny_unknown_fields)]
 struct PersonFile {
-    path: Option<Spanned<Vec<Vec<f64>>>>,
+    path: Option<Spanned<Vec<Vec<Number>>>>,
     speed_mm_s: Option<Spanned<SpeedFile>>,
-    centre: Option<Point>,
-    reach: Option<Spanned<Point>>,
+    centre: Option<(Number, Number)>,
+    reach: Option<(Length, Length)>,
     from_s: Option<Spanned<f64>>,
     until_s: Option<Spanned<f64>>,
     jitter_mm: Option<Spanned<f64>>,
@@ -114,7 +123,7 @@ enum SpeedFile {
 #[derive(Deserialize)]
 #[serde(deny_unknown_fields)]
 struct SunFile {
-    sector_deg: Spanned<Point>,
+    sector_deg: Spanned<(Number, Number)>,
     from_s: Option<Spanned<f64>>,
     until_s: Option<Spanned<f64>>,
     share: Option<Spanned<f64>>,
@@ -139,7 +148,7 @@ impl NoiseFile {
 }
 
 impl ThingFile {
-    fn thing(&self, origin: &Origin) -> Result<Thing, Failure> {
+    fn thing(&self, span: Range<usize>, origin: &Origin) -> Result<Thing, Failure> {
         let (from_s, until_s) = origin.interval(&self.from_s, &self.until_s)?;
         let mut moves: Vec<Move> = Vec::new();
         for file in &self.moves {
@@ -153,7 +162,7 @@ impl ThingFile {
             moves.push(Move { from_s: start_s, until_s: end_s, by: pose(origin, &file.by)? });
         }
         Ok(Thing {
-            shapes: self.shapes(origin)?,
+            shapes: self.shapes(span, origin)?,
             pose: self.pose.as_ref().map_or(Ok(Pose { turn_deg: 0.0, ..MIDDLE }), |at| pose(origin, at))?,
             surface: self.surface.as_ref().map_or(Ok(Surface::Plain), |name| surface(origin, name))?,
             from_s,
@@ -163,43 +172,36 @@ impl ThingFile {
         })
     }
 
-    fn shapes(&self, origin: &Origin) -> Result<Vec<Shape>, Failure> {
+    fn shapes(&self, span: Range<usize>, origin: &Origin) -> Result<Vec<Shape>, Failure> {
         const REMEDY: &str = "one of: line = [[x, y], ..], box = [width, depth], radius_mm = R for a post, \
                               legs = [width, depth] with the radius_mm of each";
-        let corners = |(width, depth): Point| {
-            let (x, y) = (width / 2.0, depth / 2.0);
-            [(-x, -y), (x, -y), (x, y), (-x, y), (-x, -y)]
+        let corners = |(width, depth): (Length, Length)| {
+            let (x, y) = (width.0 / 2.0, depth.0 / 2.0);
+            [(-x, -y), (x, -y), (x, y), (-x, y), (-x, -y)].map(|(x, y)| (Number(x), Number(y)))
         };
-        let walls = |points: &[Point]| {
-            points.windows(2).map(|pair| Shape::Wall { from: pair[0], to: pair[1] }).collect::<Vec<_>>()
+        let walls = |points: &[(Number, Number)]| {
+            let wall = |pair: &[(Number, Number)]| Shape::Wall { from: point(pair[0]), to: point(pair[1]) };
+            points.windows(2).map(wall).collect()
         };
         let radius = origin.number(&self.radius_mm, 0.0, 1.0..=10_000.0)?;
         match (&self.line, &self.sides, &self.legs, &self.radius_mm) {
-            (Some(line), None, None, None) if line.get_ref().len() >= 2 => Ok(walls(line.get_ref())),
-            (None, Some(sides), None, None) => Ok(walls(&corners(*sides.get_ref()))),
+            (Some(line), None, None, None) if line.len() >= 2 => Ok(walls(line)),
+            (None, Some(sides), None, None) => Ok(walls(&corners(*sides))),
             (None, None, Some(legs), Some(_)) => {
-                let feet = corners(*legs.get_ref());
-                Ok(feet[..4].iter().map(|&centre| Shape::Post { centre, radius }).collect())
+                let feet = corners(*legs);
+                Ok(feet[..4].iter().map(|&foot| Shape::Post { centre: point(foot), radius }).collect())
             }
             (None, None, None, Some(_)) => Ok(vec![Shape::Post { centre: (0.0, 0.0), radius }]),
-            (line, sides, legs, radius) => {
-                let span = line.as_ref().map(Spanned::span).or(sides.as_ref().map(Spanned::span));
-                let span = span.or(legs.as_ref().map(Spanned::span)).or(radius.as_ref().map(Spanned::span));
-                Err(origin.refuse(
-                    span.unwrap_or_default(),
-                    "a thing without a shape, or with too many",
-                    REMEDY,
-                ))
-            }
+            _ => Err(origin.refuse(span, "a thing without a shape, or with too many", REMEDY)),
         }
     }
 }
 
 impl PersonFile {
-    fn plan(&self, origin: &Origin) -> Result<Plan, Failure> {
+    fn plan(&self, span: Range<usize>, origin: &Origin) -> Result<Plan, Failure> {
         let (from_s, until_s) = origin.interval(&self.from_s, &self.until_s)?;
         Ok(Plan {
-            way: self.way(origin, until_s)?,
+            way: self.way(span, origin, until_s)?,
             from_s,
             until_s,
             jitter_mm: origin.number(&self.jitter_mm, 0.0, 0.0..=10_000.0)?,
@@ -207,29 +209,20 @@ impl PersonFile {
         })
     }
 
-    fn way(&self, origin: &Origin, until_s: f64) -> Result<Way, Failure> {
-        let (path, speed) = match (&self.path, self.centre, &self.reach, &self.speed_mm_s) {
+    fn way(&self, span: Range<usize>, origin: &Origin, until_s: f64) -> Result<Way, Failure> {
+        let (path, speed) = match (&self.path, self.centre, self.reach, &self.speed_mm_s) {
             (None, Some(centre), Some(reach), None) => {
-                if reach.get_ref().0 <= 0.0 || reach.get_ref().1 <= 0.0 {
-                    let what = format!("reach = {:?}", reach.get_ref());
-                    return Err(origin.refuse(reach.span(), what, "two lengths in millimetres, above 0"));
-                }
-                return Ok(Way::Roam { centre, reach: *reach.get_ref() });
+                return Ok(Way::Roam { centre: point(centre), reach: (reach.0.0, reach.1.0) });
             }
             (Some(path), None, None, speed) => (path, speed),
-            (path, _, reach, _) => {
-                let span = path.as_ref().map(Spanned::span).or(reach.as_ref().map(Spanned::span));
+            _ => {
                 let remedy = "path = [[x, y], ..], or centre = [x, y] with reach = [x, y] and no speed";
-                return Err(origin.refuse(
-                    span.unwrap_or_default(),
-                    "a person without a way, or with two",
-                    remedy,
-                ));
+                return Err(origin.refuse(span, "a person without a way, or with two", remedy));
             }
         };
-        let corner = |values: &Vec<f64>| match values[..] {
-            [x, y] => Some(((x, y), 0.0)),
-            [x, y, rest_s] if rest_s >= 0.0 => Some(((x, y), rest_s)),
+        let corner = |values: &Vec<Number>| match values[..] {
+            [x, y] => Some(((x.0, y.0), 0.0)),
+            [x, y, rest_s] if rest_s.0 >= 0.0 => Some(((x.0, y.0), rest_s.0)),
             _ => None,
         };
         let corners = path.get_ref().iter().map(corner).collect::<Option<Vec<_>>>();
@@ -263,7 +256,7 @@ impl PersonFile {
 
 impl SunFile {
     fn sun(&self, origin: &Origin) -> Result<Sun, Failure> {
-        let (from_deg, to_deg) = *self.sector_deg.get_ref();
+        let (from_deg, to_deg) = point(*self.sector_deg.get_ref());
         if from_deg > to_deg {
             let what = format!("sector_deg = [{from_deg}, {to_deg}]");
             return Err(origin.refuse(
@@ -278,12 +271,44 @@ impl SunFile {
     }
 }
 
-fn pose(origin: &Origin, values: &Spanned<Vec<f64>>) -> Result<Pose, Failure> {
+/// A coordinate in millimetres, an angle in degrees, a time in seconds.
+#[derive(Clone, Copy, Deserialize)]
+#[serde(try_from = "f64")]
+struct Number(f64);
+
+impl TryFrom<f64> for Number {
+    type Error = String;
+
+    fn try_from(value: f64) -> Result<Number, String> {
+        let known = value.abs() <= 1e6;
+        known.then_some(Number(value)).ok_or_else(|| format!("{value} is not between -1000000 and 1000000"))
+    }
+}
+
+/// A length in millimetres that is one.
+#[derive(Clone, Copy, Deserialize)]
+#[serde(try_from = "f64")]
+struct Length(f64);
+
+impl TryFrom<f64> for Length {
+    type Error = String;
+
+    fn try_from(value: f64) -> Result<Length, String> {
+        let known = (1.0..=1e6).contains(&value);
+        known.then_some(Length(value)).ok_or_else(|| format!("{value} is not between 1 and 1000000"))
+    }
+}
+
+fn point((x, y): (Number, Number)) -> Point {
+    (x.0, y.0)
+}
+
+fn pose(origin: &Origin, values: &Spanned<Vec<Number>>) -> Result<Pose, Failure> {
     match values.get_ref()[..] {
-        [x_mm, y_mm] => Ok(Pose { x_mm, y_mm, turn_deg: 0.0 }),
-        [x_mm, y_mm, turn_deg] => Ok(Pose { x_mm, y_mm, turn_deg }),
-        _ => {
-            let what = format!("{:?} is no pose", values.get_ref());
+        [x, y] => Ok(Pose { x_mm: x.0, y_mm: y.0, turn_deg: 0.0 }),
+        [x, y, turn] => Ok(Pose { x_mm: x.0, y_mm: y.0, turn_deg: turn.0 }),
+        ref other => {
+            let what = format!("{} numbers are no pose", other.len());
             Err(origin.refuse(values.span(), what, "[x, y] in millimetres, or [x, y, degrees]"))
         }
     }
@@ -298,70 +323,6 @@ fn surface(origin: &Origin, name: &Spanned<String>) -> Result<Surface, Failure> 
         other => {
             let what = format!("surface = \"{other}\"");
             Err(origin.refuse(name.span(), what, "plain, dark, reflector or glass"))
-        }
-    }
-}
-
-/// The file, so that a failure can say the place.
-struct Origin<'a> {
-    name: &'a str,
-    text: &'a str,
-}
-
-impl Origin<'_> {
-    /// A value within `allowed`, or `usual` where none is said.
-    fn number(
-        &self,
-        value: &Option<Spanned<f64>>,
-        usual: f64,
-        allowed: std::ops::RangeInclusive<f64>,
-    ) -> Result<f64, Failure> {
-        match value {
-            None => Ok(usual),
-            Some(value) if allowed.contains(value.get_ref()) => Ok(*value.get_ref()),
-            Some(value) => {
-                let remedy = format!("a number from {} to {}", allowed.start(), allowed.end());
-                Err(self.refuse(value.span(), format!("{} is out of range", value.get_ref()), remedy))
-            }
-        }
-    }
-
-    fn interval(
-        &self,
-        from: &Option<Spanned<f64>>,
-        until: &Option<Spanned<f64>>,
-    ) -> Result<(f64, f64), Failure> {
-        let from_s = self.number(from, 0.0, 0.0..=1e6)?;
-        let until_s = self.number(until, f64::INFINITY, 0.0..=1e6)?;
-        match until {
-            Some(until) if until_s <= from_s => {
-                let what = format!("until_s = {until_s}, and from_s = {from_s}");
-                Err(self.refuse(until.span(), what, "an end after the start"))
-            }
-            _ => Ok((from_s, until_s)),
-        }
-    }
-
-    fn refuse(&self, span: Range<usize>, what: impl std::fmt::Display, remedy: impl Into<String>) -> Failure {
-        let before = &self.text[..span.start.min(self.text.len())];
-        let line = before.matches('\n').count() + 1;
-        let column = before.chars().rev().take_while(|&c| c != '\n').count() + 1;
-        Failure::new(Kind::Configuration, format!("{}:{line}:{column}: {what}", self.name), remedy)
-    }
-
-    /// What the TOML parser found wrong; of an unknown key the nearest known one.
-    fn explain(&self, error: &toml::de::Error) -> Failure {
-        let (span, message) = (error.span().unwrap_or_default(), error.message());
-        let names: Vec<&str> = message.split('`').skip(1).step_by(2).collect();
-        match names[..] {
-            [unknown, ref known @ ..] if message.starts_with("unknown field") => {
-                let likeness = |name: &str| strsim::jaro_winkler(name, unknown);
-                let nearest = known.iter().max_by(|a, b| likeness(a).total_cmp(&likeness(b)));
-                let nearest = nearest.map_or(String::new(), |name| format!("did you mean `{name}`? "));
-                let remedy = format!("{nearest}Known here: {}", known.join(", "));
-                self.refuse(span, format!("unknown key `{unknown}`"), remedy)
-            }
-            _ => self.refuse(span, message, "docs/worlds.md has the keys and their forms"),
         }
     }
 }

@@ -1,0 +1,160 @@
+//! Is something near the robot: the paper's minimal distance check, with circles around the robot's centre. Refuses to
+//! know how beams meet circles, which the table tells in device units, so that a scan costs comparisons of integers.
+
+mod table;
+
+use schema::{BEAMS, Pose, Scan, Verdict, ZONES, Zone, Zones};
+use table::{Layout, Table};
+
+/// A part of the sensor's view in which something of the robot itself stands.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Sector {
+    /// First sensor angle in 1/1000 degree.
+    pub from_mdeg: i32,
+    /// Last sensor angle in 1/1000 degree; it belongs to the sector.
+    pub to_mdeg: i32,
+    /// Readings nearer than this are the robot's own body and are ignored.
+    pub range_mm: u16,
+}
+
+/// The most sectors of a sensor; those beyond are left out.
+pub const SECTORS: usize = 64;
+
+/// What a check is made from.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Settings<'a> {
+    /// Radii of the circles, the largest first, at most [`ZONES`]; those beyond are left out.
+    pub radii_mm: &'a [u16],
+    /// The robot's own body; where sectors overlap, the farthest range holds.
+    pub self_min: &'a [Sector],
+    /// Added to a circle along every beam that meets it.
+    pub margin_mm: u16,
+    /// A zone is violated by so many beams of a scan; 0 is 1.
+    pub min_beams: u16,
+    /// And by so many scans, one after the other; 0 is 1.
+    pub min_scans: u16,
+    /// The verdict is unknown if a greater share of the beams through the largest circle is invalid.
+    pub max_invalid: f64,
+    /// What stands before the circle, between a sensor outside and the circle's near side, is not inside.
+    pub exact: bool,
+    /// A beam of which nothing came back has met nothing; otherwise it is invalid.
+    pub no_return_is_far: bool,
+}
+
+impl Default for Settings<'static> {
+    /// 1 m and 0.6 m (paper III.B.1), one beam, one scan; a tenth of the beams may be invalid.
+    fn default() -> Self {
+        Settings {
+            radii_mm: &[1000, 600],
+            self_min: &[],
+            margin_mm: 0,
+            min_beams: 1,
+            min_scans: 1,
+            max_invalid: 0.10,
+            exact: true,
+            no_return_is_far: true,
+        }
+    }
+}
+
+/// Compares scans of one sensor with its circles.
+///
+/// Where the design leaves something open:
+/// - until `min_scans` scans were seen since the start, a silence or a change of the sensor's layout, no zone can be
+///   violated; the verdict is unknown then, because clear would be a guess;
+/// - an empty scan, no circle at all and a pose that is not finite tell nothing: unknown;
+/// - a sensor none of whose beams meets the largest circle sees nothing inside it, ever: clear;
+/// - the invalid are counted among the beams that can tell something: one that the robot's own body covers up to the
+///   largest circle's far side counts neither as invalid nor among all.
+pub struct Check {
+    min_beams: u16,
+    min_scans: u16,
+    table: Table,
+    /// Scans since the start, a silence or another layout.
+    seen: u16,
+    /// Scans one after the other in which enough beams met something, by circle.
+    streaks: [u16; ZONES],
+}
+
+impl Check {
+    /// A check for the sensor that sits at `pose`.
+    pub fn new(pose: Pose, settings: &Settings<'_>) -> Check {
+        Check {
+            min_beams: settings.min_beams.max(1),
+            min_scans: settings.min_scans.max(1),
+            table: Table::new(pose, settings),
+            seen: 0,
+            streaks: [0; ZONES],
+        }
+    }
+
+    /// Writes what `scan` tells into `out`, every byte of it. The first scan of a layout costs a table; no other does.
+    pub fn update(&mut self, scan: &Scan, out: &mut Zones) {
+        let layout = Layout::of(scan);
+        if *self.table.layout() != layout {
+            self.table.make(layout);
+            self.forget();
+        }
+        self.seen = self.seen.saturating_add(1);
+        let ranges = &scan.range_array;
+        let invalid = self.table.invalid(ranges);
+        let nearest = self.table.nearest(ranges);
+        let is_known =
+            self.seen >= self.min_scans && self.table.tells() && invalid <= self.table.most_invalid();
+        let mut beams = [0; ZONES];
+        for (zone, beams) in beams.iter_mut().enumerate().take(self.table.circles()) {
+            *beams = self.table.inside(zone, ranges);
+            let streak = &mut self.streaks[zone];
+            *streak = if *beams >= self.min_beams { streak.saturating_add(1) } else { 0 };
+        }
+        out.verdict = self.verdict(is_known) as u8;
+        out.count = self.table.circles() as u8;
+        (out.nearest_beam, out.nearest_mm) = nearest.unwrap_or((Zones::NO_BEAM, Zones::NO_DISTANCE));
+        out.invalid_beams = invalid;
+        self.write_circles(&beams, out);
+    }
+
+    /// Writes into `out` what to say when scans stay out: nothing is known but the circles. Scans have to follow each
+    /// other anew.
+    pub fn stale(&mut self, out: &mut Zones) {
+        self.forget();
+        *out = Zones { count: self.table.circles() as u8, ..Zones::unknown() };
+        self.write_circles(&[0; ZONES], out);
+    }
+
+    fn forget(&mut self) {
+        self.seen = 0;
+        self.streaks = [0; ZONES];
+    }
+
+    fn is_violated(&self, zone: usize) -> bool {
+        self.streaks[zone] >= self.min_scans
+    }
+
+    /// What is seen inside the smallest circle outweighs what is not known.
+    fn verdict(&self, is_known: bool) -> Verdict {
+        match self.table.circles().checked_sub(1) {
+            None => Verdict::Unknown,
+            Some(smallest) if self.is_violated(smallest) => Verdict::Stop,
+            _ if !is_known => Verdict::Unknown,
+            Some(smallest) if (0..smallest).any(|zone| self.is_violated(zone)) => Verdict::Slow,
+            _ => Verdict::Clear,
+        }
+    }
+
+    fn write_circles(&self, beams: &[u16; ZONES], out: &mut Zones) {
+        out.flags = if self.seen < self.min_scans { Zones::PROVISIONAL } else { 0 };
+        out.reserved = 0;
+        for (zone, circle) in out.zone_array.iter_mut().enumerate() {
+            *circle = Zone {
+                radius_mm: self.table.radius_mm(zone),
+                beams: beams[zone],
+                violated: u8::from(self.is_violated(zone)),
+                reserved: [0; 3],
+            };
+        }
+    }
+}
+
+/// Ranges as the table reads them: all of the array, so that loops have a length that the compiler knows.
+type Ranges = [u16; BEAMS];

@@ -1,0 +1,166 @@
+//! Marks against a slow version, straight from their definition and in floating point.
+
+mod scans;
+
+use fastrand::Rng;
+use preprocess::marks::{Finder, Settings};
+use schema::{CONTENTS_UPPER, MARKS, Mark, Marks, Scan};
+
+/// A beam that belongs to a mark: its index, range in mm and intensity.
+#[derive(Clone, Copy)]
+struct Hit {
+    beam: usize,
+    range_mm: f64,
+    intensity: u8,
+}
+
+/// All that qualify, then cut where beams lie too far apart or ranges jump.
+fn groups(scan: &Scan, settings: Settings) -> Vec<Vec<Hit>> {
+    let mut groups: Vec<Vec<Hit>> = Vec::new();
+    for beam in 0..usize::from(scan.count) {
+        let (value, intensity) = (scan.range_array[beam], scan.upper_array[beam]);
+        let is_code = i32::from(value) >= (1 << scan.range_bits) - 9;
+        if is_code || intensity < settings.i_min.max(1) {
+            continue;
+        }
+        let hit = Hit { beam, range_mm: f64::from(value) * f64::from(scan.unit_mm), intensity };
+        let joins = groups.last().and_then(|group| group.last()).is_some_and(|last| {
+            let step_mm = (hit.range_mm - last.range_mm).abs();
+            beam - last.beam - 1 <= usize::from(settings.max_gap)
+                && step_mm <= f64::from(settings.max_range_step_mm)
+        });
+        if !joins {
+            groups.push(Vec::new());
+        }
+        groups.last_mut().expect("one is open").push(hit);
+    }
+    groups
+}
+
+fn assert_mark(scan: &Scan, group: &[Hit], mark: &Mark) {
+    let sum = |of: &dyn Fn(&Hit) -> f64| group.iter().map(|hit| f64::from(hit.intensity) * of(hit)).sum();
+    let weight: f64 = sum(&|_| 1.0);
+    let angle: f64 =
+        sum(&|hit| f64::from(scan.first_angle_mdeg) + hit.beam as f64 * f64::from(scan.step_mdeg));
+    let range: f64 = sum(&|hit| hit.range_mm);
+    // The nearest thousandth of a degree and tenth of a millimetre; halves go up.
+    let nearest = |exact: f64, said: f64| (-0.5 - 1e-6..0.5 + 1e-6).contains(&(exact - said));
+    assert!(nearest(angle / weight, f64::from(mark.angle_mdeg)), "{} {mark:?}", angle / weight);
+    assert!(nearest(10.0 * range / weight, f64::from(mark.range_dmm)), "{} {mark:?}", range / weight);
+    assert_eq!(f64::from(mark.weight), weight);
+    assert_eq!(Some(mark.peak), group.iter().map(|hit| hit.intensity).max());
+    let (first, last) = (group[0].beam, group[group.len() - 1].beam);
+    assert_eq!((usize::from(mark.first_beam), usize::from(mark.last_beam)), (first, last));
+    assert_eq!(mark.edge == 1, first == 0 || last == usize::from(scan.count) - 1);
+}
+
+/// A wall with steps in it, reflectors here and there.
+fn fill(random: &mut Rng, scan: &mut Scan) {
+    let max = (1 << scan.range_bits) - 1;
+    let seldom = [2, 10, 40][random.usize(..3)];
+    let mut wall = random.u16(..max - 1000);
+    let mut lit = 0;
+    for i in 0..usize::from(scan.count) {
+        if random.u8(..20) == 0 {
+            wall = random.u16(..max - 1000);
+        }
+        if lit == 0 && random.u8(..seldom) == 0 {
+            lit = random.u8(1..8);
+        }
+        scan.range_array[i] = match random.u8(..15) {
+            0 => scans::code(random, scan),
+            _ => (wall + random.u16(..150 / u16::from(scan.unit_mm))).min(max - 9),
+        };
+        scan.upper_array[i] = if lit > 0 { random.u8(..1 << scan.intensity_bits) } else { 0 };
+        lit = lit.saturating_sub(1);
+    }
+}
+
+#[test]
+fn marks_are_those_of_the_definition() {
+    let mut random = Rng::with_seed(1);
+    let (mut marks, mut edges, mut overflows) = (0, 0, 0);
+    for _ in 0..2000 {
+        let settings = Settings {
+            i_min: random.u8(..4),
+            max_range_step_mm: [0, 50, 100, 1000][random.usize(..4)],
+            max_gap: [0, 0, 1, 5][random.usize(..4)],
+        };
+        let unit_mm = [1, 10][random.usize(..2)];
+        let mut scan = scans::layout(&mut random, unit_mm);
+        fill(&mut random, &mut scan);
+        let mut out: Marks = *bytemuck::from_bytes(&[0xA5; size_of::<Marks>()]);
+        Finder::new(settings).update(&scan, &mut out);
+        let groups = groups(&scan, settings);
+        assert_eq!(usize::from(out.count), groups.len().min(MARKS), "{settings:?}");
+        assert_eq!((out.is_overflow(), out.is_available()), (groups.len() > MARKS, true));
+        for (group, mark) in groups.iter().zip(out.marks()) {
+            assert_mark(&scan, group, mark);
+        }
+        assert!(out.mark_array[usize::from(out.count)..].iter().all(|mark| *mark == Mark::default()));
+        marks += groups.len();
+        edges += out.marks().iter().filter(|mark| mark.edge == 1).count();
+        overflows += usize::from(out.is_overflow());
+    }
+    println!("{marks} marks, {edges} at an edge, {overflows} scans with too many");
+    assert!(marks > 10_000 && edges > 100 && overflows > 10, "{marks} {edges} {overflows}");
+}
+
+/// Eleven beams at 1 m, a degree apart.
+fn lit(intensities: &[(usize, u8)]) -> Scan {
+    let mut scan = Scan {
+        count: 11,
+        unit_mm: 1,
+        range_bits: 13,
+        first_angle_mdeg: -1000,
+        step_mdeg: 1000,
+        intensity_bits: 3,
+        contents: CONTENTS_UPPER,
+        ..Scan::default()
+    };
+    scan.range_array[..11].fill(1000);
+    for &(i, intensity) in intensities {
+        scan.upper_array[i] = intensity;
+    }
+    scan
+}
+
+fn find(scan: &Scan, settings: Settings) -> Marks {
+    let mut out = Marks::default();
+    Finder::new(settings).update(scan, &mut out);
+    out
+}
+
+#[test]
+fn halves_are_rounded_up() {
+    let mut scan = lit(&[(4, 1), (5, 1)]);
+    scan.range_array[4] = 1001;
+    scan.step_mdeg = 1;
+    let mark = find(&scan, Settings::default()).mark_array[0];
+    assert_eq!((mark.angle_mdeg, mark.range_dmm), (-1000 + 5, 10_005));
+    // 8/3 and 7/3 degrees after the first.
+    let angle = |beams| find(&lit(beams), Settings::default()).mark_array[0].angle_mdeg;
+    assert_eq!((angle(&[(2, 1), (3, 2)]), angle(&[(2, 2), (3, 1)])), (1667, 1333));
+}
+
+#[test]
+fn a_gap_is_counted_anew_after_every_beam_that_joins() {
+    let scan = lit(&[(2, 3), (4, 1), (6, 3), (9, 1)]);
+    let count = |max_gap| find(&scan, Settings { max_gap, ..Settings::default() }).count;
+    assert_eq!((count(0), count(1), count(2)), (4, 2, 1));
+    let mark = find(&scan, Settings { max_gap: 1, ..Settings::default() }).mark_array[0];
+    assert_eq!((mark.first_beam, mark.last_beam, mark.edge, mark.weight), (2, 6, 0, 7));
+}
+
+#[test]
+fn without_reflector_bits_nothing_is_known() {
+    let mut scan = lit(&[(4, 1)]);
+    scan.intensity_bits = 0;
+    let out = find(&scan, Settings::default());
+    assert_eq!((out.count, out.is_available()), (0, false));
+    scan.intensity_bits = 3;
+    scan.contents = 0;
+    assert!(!find(&scan, Settings::default()).is_available());
+    let nothing = find(&lit(&[]), Settings::default());
+    assert_eq!((nothing.count, nothing.is_available()), (0, true), "nothing there is something known");
+}
