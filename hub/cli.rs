@@ -1,12 +1,15 @@
 //! The command line: which verbs there are and what they take. Syntax only; what a value means is checked by whoever
 //! uses it.
 
+mod background;
 mod configure;
 mod control;
 mod doctor;
+mod leds;
 mod probe;
 pub(crate) mod simulate;
 mod telegram;
+mod zones;
 
 use std::path::PathBuf;
 use std::time::Duration;
@@ -16,8 +19,11 @@ use clients::{Bounds, duration};
 use daemon::config::Sources;
 use schema::{DEFAULT_DOMAIN, Domain, Environment, Failure};
 
+pub(crate) use background::Background;
 pub(crate) use control::Control;
+pub(crate) use leds::Leds;
 pub(crate) use telegram::{Telegram, Way};
+pub(crate) use zones::Zones;
 
 /// Laser scanners on serial lines, for more than one program: a hub that publishes telegrams and scans into shared
 /// memory, and the programs that listen.
@@ -96,6 +102,13 @@ pub(crate) enum Verb {
     Telegram(Telegram),
     /// Stop a sensor, let it stream again, or begin anew with it
     Control(Control),
+    /// The background model of a sensor: look at it, learn it anew, hold it, keep it in a file
+    Background(Background),
+    /// The zones around the robot: which part of its view the robot itself takes
+    Zones(Zones),
+    /// The zone verdict and the marks as lights: in the terminal, and on diodes of this machine
+    #[command(after_help = leds::MEANING)]
+    Leds(Leds),
 }
 
 #[derive(Args, Debug)]
@@ -157,7 +170,7 @@ impl Limits {
 
 #[derive(Args, Debug)]
 pub(crate) struct Echo {
-    /// What to follow: front/scan, rear/telegram, front/status ..
+    /// What to follow: front/scan, rear/telegram, front/zones .. or robot/zones, all sensors' zones in one
     #[arg(required = true, value_name = "SENSOR/TOPIC")]
     pub(crate) topics: Vec<String>,
     /// Comma-separated values

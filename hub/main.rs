@@ -113,6 +113,15 @@ fn dispatch(cli: &Cli) -> Result<(), Failure> {
             clients::hz(&options, &mut out, &mut io::stderr(), &*interrupt()?)
         }
         Verb::Control(control) => clients::control(&control.options(everywhere)?, &mut out, &*interrupt()?),
+        Verb::Background(background) => {
+            // A model is read before Ctrl-C is a flag, which would not end a person's typing.
+            let options = background.options(everywhere)?;
+            clients::background(&options, &mut out, &*interrupt()?)
+        }
+        Verb::Zones(zones) => zones.run(everywhere, &mut out, &*interrupt()?),
+        Verb::Leds(leds) => {
+            clients::leds(&leds.options(everywhere)?, &mut out, &mut io::stderr(), &*interrupt()?)
+        }
     }
 }
 

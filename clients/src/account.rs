@@ -2,7 +2,7 @@
 
 use std::time::{Duration, Instant};
 
-use schema::{Header, Topic};
+use schema::Topic;
 
 /// The account of one topic in one run.
 #[derive(Clone, Debug)]
@@ -32,13 +32,13 @@ impl Account {
         }
     }
 
-    /// A sample came, `missed` before it did not.
-    pub(crate) fn count(&mut self, now: Instant, missed: u64, header: &Header) {
+    /// A sample came, `missed` before it did not; scans are `period_us` apart.
+    pub(crate) fn count(&mut self, now: Instant, missed: u64, period_us: u32) {
         self.received += 1;
         self.lost += missed;
         self.first.get_or_insert(now);
         self.last = Some(now);
-        self.period = Duration::from_micros(header.period_us.into());
+        self.period = Duration::from_micros(period_us.into());
         self.stale_said = false;
     }
 
@@ -89,7 +89,7 @@ mod tests {
         let start = Instant::now();
         assert!(!account.stale(start + Duration::from_secs(9)));
         for i in 0..5 {
-            account.count(start + Duration::from_millis(500 * i), i, &Header::default());
+            account.count(start + Duration::from_millis(500 * i), i, 0);
         }
         assert_eq!(
             (account.received, account.lost, account.seconds(), account.hz()),

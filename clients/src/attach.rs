@@ -9,13 +9,18 @@ use schema::{DEFAULT_DOMAIN, Domain, Environment, Failure, check_sensor};
 use crate::follower::{Follower, Received};
 use crate::session::Session;
 
-/// Follows the topic of `sensor` that carries `P` (`[u8]`: telegram, `Scan`, `Status`), in the domain that
-/// SCANHUB_DOMAIN names. There need not be a hub yet.
+/// Follows the topic of `sensor` that carries `P` (`[u8]`: telegram, `Scan`, `Marks` ..), in the domain that
+/// SCANHUB_DOMAIN names. There need not be a hub yet. Who acts on zones follows them by [`zones`](crate::zones).
 ///
 /// [`Kind::Configuration`](schema::Kind) if a name is not possible.
 pub fn attach<P: Payload + ?Sized>(sensor: &str) -> Result<Attachment<P>, Failure> {
+    Attachment::in_domain(places()?, sensor)
+}
+
+/// Where the domain that SCANHUB_DOMAIN names may be.
+pub(crate) fn places() -> Result<Vec<Domain>, Failure> {
     let name = std::env::var("SCANHUB_DOMAIN").unwrap_or_else(|_| DEFAULT_DOMAIN.to_owned());
-    Attachment::in_domain(Domain::candidates(&name, None, &Environment::of_process())?, sensor)
+    Domain::candidates(&name, None, &Environment::of_process())
 }
 
 /// A topic that is being followed.

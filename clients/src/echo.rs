@@ -94,15 +94,16 @@ impl Sink for Echo<'_> {
 
 impl Echo<'_> {
     fn json(&mut self, sensor: &str, sample: &Sample) -> Result<(), End> {
-        let (out, header) = (&mut self.out, sample.header());
+        let out = &mut self.out;
         match sample {
-            Sample::Telegram(found) => out.json(&json::telegram(sensor, header, found)),
-            Sample::Scan(found) => out.json(&json::scan(sensor, header, found)),
-            Sample::Marks(found) => out.json(&json::marks(sensor, header, found)),
-            Sample::Zones(found) => out.json(&json::zones(sensor, header, found)),
-            Sample::Foreground(found) => out.json(&json::foreground(sensor, header, found)),
+            Sample::Telegram(found) => out.json(&json::telegram(sensor, found.header(), found)),
+            Sample::Scan(found) => out.json(&json::scan(sensor, found.header(), found)),
+            Sample::Marks(found) => out.json(&json::marks(sensor, found.header(), found)),
+            Sample::Zones(heard) => out.json(&json::zones(sensor, heard)),
+            Sample::Foreground(found) => out.json(&json::foreground(sensor, found.header(), found)),
             Sample::Background(found) => out.json(&json::background(sensor, found)),
             Sample::Status(found) => out.json(&json::status(sensor, found)),
+            Sample::Robot(found) => out.json(&json::robot(&found.robot, &found.heard)),
         }
     }
 
@@ -136,6 +137,7 @@ fn check(format: Format, names: &[TopicName]) -> Result<(), Failure> {
         (Format::Csv, [one]) if one.topic == Topic::Scan => Ok(()),
         (Format::Csv, _) => usage("--csv takes one topic, and that a scan"),
         (Format::Raw, [_, _, ..]) => usage("--raw takes one topic"),
+        (Format::Raw, [one]) if one.is_robot() => usage("--raw takes the topic of a sensor"),
         _ => Ok(()),
     }
 }

@@ -48,7 +48,7 @@ pub(crate) enum Notice {
 pub(crate) trait Sink {
     /// A topic will be followed.
     fn begin(&mut self, _name: &TopicName) {}
-    /// A sample came.
+    /// A sample came, or one was made of a silence: that counts as none.
     fn sample(&mut self, name: &TopicName, sample: &Sample) -> Result<(), End>;
     /// Something went wrong, or right again, in the streams of `names`; none as long as it is not known what is followed.
     fn notice(&mut self, names: &[&TopicName], notice: Notice) -> Result<(), End>;
@@ -176,8 +176,12 @@ impl<'a> Run<'a> {
                     let Some(sample) = track.source.receive(&mut self.session)? else { break };
                     more |= turn + 1 == TURN;
                     let now = Instant::now();
+                    if sample.is_stale() {
+                        sink.sample(&track.name, &sample)?;
+                        continue;
+                    }
                     let missed = sample.missed();
-                    track.account.count(now, missed, sample.header());
+                    track.account.count(now, missed, sample.period_us());
                     if missed > 0 {
                         sink.notice(&[&track.name], Notice::Missed(missed))?;
                     }
@@ -236,7 +240,8 @@ impl<'a> Run<'a> {
             return Ok(());
         }
         let sensors = self.sensors()?;
-        if self.tracks.is_empty() && sensors.is_empty() {
+        let wants_all = self.tracks.iter().all(|track| track.name.is_robot());
+        if wants_all && sensors.is_empty() {
             return Err(Failure::new(
                 Kind::NoTopic,
                 "the hub has no sensors",
@@ -245,7 +250,8 @@ impl<'a> Run<'a> {
             .into());
         }
         for track in &self.tracks {
-            if !track.source.attached() && !sensors.contains(&track.name.sensor) {
+            let is_there = track.name.is_robot() || sensors.contains(&track.name.sensor);
+            if !track.source.attached() && !is_there {
                 return Err(no_sensor(&track.name.sensor, &sensors).into());
             }
         }
@@ -265,7 +271,9 @@ impl<'a> Run<'a> {
     fn wake_at(&self) -> Option<Instant> {
         let end = self.bounds.run_for.and_then(|limit| self.started.checked_add(limit));
         let silence = self.bounds.timeout.and_then(|limit| self.last_sample.checked_add(limit));
-        [end, silence].into_iter().flatten().min()
+        let left = self.tracks.iter().filter_map(|track| track.source.left()).min();
+        let unheard = left.and_then(|left| Instant::now().checked_add(left));
+        [end, silence, unheard].into_iter().flatten().min()
     }
 
     fn stopped(&self) -> Result<(), End> {

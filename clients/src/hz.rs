@@ -67,7 +67,9 @@ impl Sink for Hz<'_> {
     }
 
     fn sample(&mut self, name: &TopicName, sample: &Sample) -> Result<(), End> {
-        if let Some((_, window)) = self.windows.iter_mut().find(|(known, _)| known == name) {
+        if !sample.is_stale()
+            && let Some((_, window)) = self.windows.iter_mut().find(|(known, _)| known == name)
+        {
             window.arrived(Instant::now(), sample.missed());
         }
         Ok(())
@@ -144,10 +146,10 @@ impl<'a> Line<'a> {
         match (self.hz, self.jitter_ms, self.min_ms, self.max_ms) {
             (Some(hz), Some(jitter), Some(min), Some(max)) => write!(
                 line,
-                "{name:<16} {hz:8.2} Hz  jitter {jitter:7.2} ms  min {min:7.2} ms  max {max:8.2} ms  lost {}",
+                "{name:<16} {hz:8.2} Hz jitter {jitter:6.2} min {min:6.2} max {max:8.2} ms lost {}",
                 self.lost
             ),
-            _ => write!(line, "{name:<16}        - Hz  {} received", self.received),
+            _ => write!(line, "{name:<16}        - Hz {} received", self.received),
         }
     }
 }

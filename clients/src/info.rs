@@ -4,8 +4,9 @@ use std::io::Write;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
-use schema::{Domain, Failure, Kind, Status, ipc};
+use schema::{Domain, Failure, Kind, Pose, Status, ipc};
 
+use crate::clock;
 use crate::follower::Follower;
 use crate::json;
 use crate::names::no_sensor;
@@ -31,7 +32,7 @@ pub struct InfoOptions {
 pub fn info(options: &InfoOptions, out: &mut dyn Write, stop: &AtomicBool) -> Result<(), Failure> {
     let domain = find(&options.places)?;
     let sensors = wanted(options.sensor.as_deref(), &domain)?;
-    let now_ns = monotonic_ns();
+    let now_ns = clock::now().monotonic_ns;
     let mut output = Output::new(out);
     for (sensor, status) in statuses(&domain, &sensors, stop)? {
         let Some(status) = status else {
@@ -113,11 +114,28 @@ fn properties(sensor: &str, status: &Status, now_ns: u64) -> Vec<Vec<String>> {
             known(format!("{} deg in steps of {step_deg}", status.angle_deg), status.angle_deg != 0),
         ),
         row("  rate", format!("{:.2} Hz", f64::from(status.rate_mhz) / 1000.0)),
+        row("  pose", pose(&status.pose)),
+        row("  marks", marks(status)),
     ];
     if !status.last_error().is_empty() {
         rows.push(row("  last error", status.last_error().into()));
     }
     rows
+}
+
+fn pose(pose: &Pose) -> String {
+    let Pose { x_m, y_m, yaw_rad, upside_down, .. } = pose;
+    let mounted = if *upside_down == 0 { "" } else { ", upside down" };
+    format!("x {x_m} m, y {y_m} m, yaw {:.1} deg{mounted}", yaw_rad.to_degrees())
+}
+
+fn marks(status: &Status) -> String {
+    match (status.has_reflector_bits(), status.reflector_remedy()) {
+        (None, _) => "unknown".into(),
+        (Some(true), _) => "available".into(),
+        (Some(false), None) => "unavailable: the recording has no reflector bits".into(),
+        (Some(false), Some(remedy)) => format!("unavailable: no reflector bits; `{remedy}`"),
+    }
 }
 
 fn counters(status: &Status) -> Vec<Vec<String>> {
@@ -130,8 +148,3 @@ fn counters(status: &Status) -> Vec<Vec<String>> {
 
 /// Of the labels: the longest counter's name and its indent.
 const WIDTH: usize = 21;
-
-fn monotonic_ns() -> u64 {
-    let now = rustix::time::clock_gettime(rustix::time::ClockId::Monotonic);
-    now.tv_sec as u64 * 1_000_000_000 + now.tv_nsec as u64
-}

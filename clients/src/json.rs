@@ -2,7 +2,7 @@
 
 mod processed;
 
-use schema::{Counters, Failure, Header, Reasons, Scan, Status, Telegram, Verb};
+use schema::{Counters, Failure, Header, Quality, Reasons, Scan, Status, Telegram, Verb};
 use serde::Serialize;
 use serde::ser::{SerializeMap, Serializer};
 
@@ -11,19 +11,21 @@ use crate::follow::Notice;
 use crate::names::TopicName;
 use crate::output::{End, Output};
 
-pub(crate) use processed::{background, foreground, marks, zones};
+pub(crate) use processed::{foreground, marks, robot, zones};
+// A background model as a line is what a file of it is.
+pub(crate) use schema::as_json as background;
 
 /// What all samples of telegrams begin with.
 #[derive(Serialize)]
 struct Stamp<'a> {
     class: &'static str,
     sensor: &'a str,
-    seq: u64,
-    topic_seq: u64,
-    stamp_ns: u64,
-    wall_ns: u64,
+    seq: Option<u64>,
+    topic_seq: Option<u64>,
+    stamp_ns: Option<u64>,
+    wall_ns: Option<u64>,
     #[serde(serialize_with = "id")]
-    boot: u64,
+    boot: Option<u64>,
     quality: &'static str,
     #[serde(skip_serializing_if = "Vec::is_empty")]
     reasons: Vec<&'static str>,
@@ -34,14 +36,21 @@ impl<'a> Stamp<'a> {
         Stamp {
             class,
             sensor,
-            seq: header.seq,
-            topic_seq: header.topic_seq,
-            stamp_ns: header.stamp_first_ns,
-            wall_ns: header.wall_ns,
-            boot: header.boot,
+            seq: Some(header.seq),
+            topic_seq: Some(header.topic_seq),
+            stamp_ns: Some(header.stamp_first_ns),
+            wall_ns: Some(header.wall_ns),
+            boot: Some(header.boot),
             quality: header.quality().name(),
             reasons: Reasons::names(header.reasons).collect(),
         }
+    }
+
+    /// Of a sensor that was never heard.
+    fn unheard(class: &'static str, sensor: &'a str) -> Stamp<'a> {
+        let (seq, topic_seq, stamp_ns, wall_ns, boot) = (None, None, None, None, None);
+        let quality = Quality::Clean.name();
+        Stamp { class, sensor, seq, topic_seq, stamp_ns, wall_ns, boot, quality, reasons: Vec::new() }
     }
 }
 
@@ -105,6 +114,13 @@ struct Place {
     upside_down: bool,
 }
 
+/// Whether there are marks, in a status, and the command that changes it.
+#[derive(Serialize)]
+struct MarksOffer {
+    available: Option<bool>,
+    remedy: Option<String>,
+}
+
 /// Class `status`; what is not known is null.
 pub(crate) fn status<'a>(sensor: &'a str, status: &'a Status) -> impl Serialize + 'a {
     #[derive(Serialize)]
@@ -121,11 +137,12 @@ pub(crate) fn status<'a>(sensor: &'a str, status: &'a Status) -> impl Serialize 
         step_deg: Option<f64>,
         hz: f64,
         port: &'a str,
-        pose: Place,
         since_ns: u64,
         #[serde(serialize_with = "counters")]
         counters: &'a Counters,
         last_error: &'a str,
+        pose: Place,
+        marks: MarksOffer,
     }
     Line {
         class: "status",
@@ -139,15 +156,16 @@ pub(crate) fn status<'a>(sensor: &'a str, status: &'a Status) -> impl Serialize 
         step_deg: known(status.resolution_cdeg, 0).map(|step| f64::from(step) / 100.0),
         hz: f64::from(status.rate_mhz) / 1000.0,
         port: status.port(),
+        since_ns: status.since_ns,
+        counters: &status.counters,
+        last_error: status.last_error(),
         pose: Place {
             x_m: status.pose.x_m,
             y_m: status.pose.y_m,
             yaw_rad: status.pose.yaw_rad,
             upside_down: status.pose.upside_down != 0,
         },
-        since_ns: status.since_ns,
-        counters: &status.counters,
-        last_error: status.last_error(),
+        marks: MarksOffer { available: status.has_reflector_bits(), remedy: status.reflector_remedy() },
     }
 }
 
@@ -229,8 +247,11 @@ fn known<T: PartialEq>(value: T, unknown: T) -> Option<T> {
     (value != unknown).then_some(value)
 }
 
-fn id<S: Serializer>(value: &u64, serializer: S) -> Result<S::Ok, S::Error> {
-    serializer.collect_str(&format_args!("{value:016x}"))
+fn id<S: Serializer>(value: &Option<u64>, serializer: S) -> Result<S::Ok, S::Error> {
+    match value {
+        Some(value) => serializer.collect_str(&format_args!("{value:016x}")),
+        None => serializer.serialize_none(),
+    }
 }
 
 fn hex<S: Serializer>(bytes: &[u8], serializer: S) -> Result<S::Ok, S::Error> {

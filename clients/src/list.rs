@@ -5,8 +5,8 @@ use std::path::PathBuf;
 use std::sync::atomic::AtomicBool;
 
 use schema::ipc::{self, Node, Payload, PortFactory};
-use schema::{Domain, Failure, Scan, Status, Topic, holder};
-use serde::Serialize;
+use schema::{Background, Domain, Failure, Foreground, Marks, Scan, Status, Topic, Zones, holder};
+use serde::{Serialize, Serializer};
 
 use crate::info::statuses;
 use crate::output::{Output, quiet, table};
@@ -32,12 +32,14 @@ pub fn list(options: &ListOptions, out: &mut dyn Write, stop: &AtomicBool) -> Re
     for sensor in &sensors {
         lines.extend(line::<[u8]>(&node, sensor)?);
         lines.extend(line::<Scan>(&node, sensor)?);
+        lines.extend(line::<Marks>(&node, sensor)?);
+        lines.extend(line::<Zones>(&node, sensor)?);
+        lines.extend(line::<Foreground>(&node, sensor)?);
+        lines.extend(line::<Background>(&node, sensor)?);
         lines.extend(line::<Status>(&node, sensor)?);
     }
     for (sensor, status) in statuses(&domain, &sensors, stop)? {
-        for line in
-            lines.iter_mut().filter(|line| line.sensor == sensor && line.topic != Topic::Status.name())
-        {
+        for line in lines.iter_mut().filter(|line| line.sensor == sensor && comes_with_scans(line.topic)) {
             line.hz = status.as_ref().map(|status| f64::from(status.rate_mhz) / 1000.0);
         }
     }
@@ -84,12 +86,14 @@ pub fn list_domains(bases: &[PathBuf], json: bool, out: &mut dyn Write) -> Resul
     quiet(table(&mut output, &rows))
 }
 
-/// Class `topic`; the rate is the hub's own measurement, null where it does not say one.
+/// Class `topic`; the rate is the hub's own measurement of the scans, null where it does not say one and for topics that
+/// come at their own time. Marks and foreground are sent while somebody listens.
 #[derive(Serialize)]
 struct Line {
     class: &'static str,
     sensor: String,
-    topic: &'static str,
+    #[serde(serialize_with = "name")]
+    topic: Topic,
     payload: &'static str,
     revision: u32,
     hz: Option<f64>,
@@ -99,7 +103,7 @@ struct Line {
 impl Line {
     fn row(&self) -> Vec<String> {
         vec![
-            format!("{}/{}", self.sensor, self.topic),
+            format!("{}/{}", self.sensor, self.topic.name()),
             self.hz.map_or_else(|| "-".into(), |hz| format!("{hz:.2}")),
             self.subscribers.to_string(),
             self.payload.to_owned(),
@@ -113,10 +117,22 @@ fn line<P: Payload + ?Sized>(node: &Node, sensor: &str) -> Result<Option<Line>, 
     Ok(P::open(node, sensor)?.map(|service| Line {
         class: "topic",
         sensor: sensor.to_owned(),
-        topic: topic.name(),
+        topic,
         payload: topic.payload(),
         revision: ipc::payload_revision(service.attributes()),
         hz: None,
         subscribers: service.dynamic_config().number_of_subscribers(),
     }))
+}
+
+/// Not each second or when there is something new, but scan by scan.
+fn comes_with_scans(topic: Topic) -> bool {
+    match topic {
+        Topic::Telegram | Topic::Scan | Topic::Marks | Topic::Zones | Topic::Foreground => true,
+        Topic::Background | Topic::Status => false,
+    }
+}
+
+fn name<S: Serializer>(topic: &Topic, serializer: S) -> Result<S::Ok, S::Error> {
+    serializer.serialize_str(topic.name())
 }

@@ -2,7 +2,7 @@
 
 use std::fmt;
 
-use schema::{Failure, Kind, Topic, check_sensor};
+use schema::{Failure, Kind, ROBOT, Topic, check_sensor};
 
 /// One topic of one sensor.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -14,7 +14,7 @@ pub struct TopicName {
 }
 
 impl TopicName {
-    /// The topic that `text` names, as in `front/scan`.
+    /// The topic that `text` names, as in `front/scan`; `robot/zones` is the fold over all sensors.
     ///
     /// [`Kind::NoTopic`] with the topics that there are, [`Kind::Configuration`] if the sensor's name is not possible.
     pub fn parse(text: &str) -> Result<TopicName, Failure> {
@@ -29,8 +29,20 @@ impl TopicName {
         };
         let (sensor, topic) = text.split_once('/').ok_or_else(|| unknown(text))?;
         let topic = Topic::parse(topic).ok_or_else(|| unknown(sensor))?;
-        check_sensor(sensor)?;
-        Ok(TopicName { sensor: sensor.to_owned(), topic })
+        let name = TopicName { sensor: sensor.to_owned(), topic };
+        if sensor == ROBOT && topic != Topic::Zones {
+            let hint = format!("{ROBOT} stands for all sensors, and only their zones add up: {ROBOT}/zones");
+            return Err(Failure::new(Kind::NoTopic, format!("no topic {text:?}"), hint));
+        }
+        if !name.is_robot() {
+            check_sensor(sensor)?;
+        }
+        Ok(name)
+    }
+
+    /// Not one sensor's topic but the fold over all of them.
+    pub(crate) fn is_robot(&self) -> bool {
+        self.sensor == ROBOT && self.topic == Topic::Zones
     }
 }
 
@@ -65,6 +77,11 @@ mod tests {
             assert_eq!(failure.kind, Kind::NoTopic, "{bad}");
             assert!(failure.hint.contains("/telegram"), "{failure}");
         }
+        assert!(TopicName::parse("robot/zones").unwrap().is_robot());
+        assert!(!TopicName::parse("front/zones").unwrap().is_robot());
+        let failure = TopicName::parse("robot/scan").unwrap_err();
+        assert_eq!(failure.kind, Kind::NoTopic);
+        assert!(failure.hint.contains("robot/zones"), "{failure}");
         assert_eq!(TopicName::parse("Front/scan").unwrap_err().kind, Kind::Configuration);
     }
 }

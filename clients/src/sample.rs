@@ -1,81 +1,154 @@
 //! A sample of any topic, and where such come from: for verbs that follow topics of several kinds.
 
+use std::time::Duration;
+
 use schema::ipc::Payload;
-use schema::{Background, Failure, Foreground, Header, Marks, Scan, Status, Topic, Zones};
+use schema::{Background, Failure, Foreground, Marks, Scan, Status, Topic};
 
 use crate::follower::{Follower, Received};
 use crate::names::TopicName;
+use crate::robot::{RobotHeard, RobotSource};
 use crate::session::Session;
+use crate::zones::{Heard, ZonesSource};
 
-/// Declares once which topics there are and what they carry.
+/// Declares once what a name may stand for: the sample, and the source that it comes from.
 macro_rules! samples {
-    ($($topic:ident $payload:ty,)*) => {
-        /// A received sample of one of the topics.
-        pub(crate) enum Sample { $($topic(Received<$payload>),)* }
+    ($($kind:ident $sample:ty, $source:ty;)*) => {
+        /// A received sample of one of the topics, or of the fold over several.
+        pub(crate) enum Sample { $($kind($sample),)* }
 
         impl Sample {
-            /// Numbers, stamps and quality of the sample.
-            pub(crate) fn header(&self) -> &Header {
-                match self { $(Sample::$topic(sample) => sample.header(),)* }
+            /// Nominal time between two scans, in us; 0 unknown.
+            pub(crate) fn period_us(&self) -> u32 {
+                match self { $(Sample::$kind(sample) => sample.period_us(),)* }
             }
 
             /// Samples that were sent before this one and not received.
             pub(crate) fn missed(&self) -> u64 {
-                match self { $(Sample::$topic(sample) => sample.missed,)* }
+                match self { $(Sample::$kind(sample) => sample.missed(),)* }
+            }
+
+            /// Nobody sent it: it is made of a silence.
+            pub(crate) fn is_stale(&self) -> bool {
+                match self { $(Sample::$kind(sample) => sample.is_stale(),)* }
             }
         }
 
-        /// Follows one topic of any kind.
-        pub(crate) enum Source { $($topic(Follower<$payload>),)* }
+        /// Follows what one name stands for.
+        pub(crate) enum Source { $($kind($source),)* }
 
         impl Source {
-            /// Will follow `name`.
-            pub(crate) fn new(name: &TopicName) -> Source {
-                match name.topic { $(Topic::$topic => Source::$topic(Follower::new(&name.sensor)),)* }
-            }
-
             /// The topic has been there at least once.
             pub(crate) fn attached(&self) -> bool {
-                match self { $(Source::$topic(follower) => follower.attached(),)* }
+                match self { $(Source::$kind(source) => source.attached(),)* }
             }
 
             /// The next sample that waits, or nothing; failures as [`Follower::receive`].
             pub(crate) fn receive(&mut self, session: &mut Session) -> Result<Option<Sample>, Failure> {
-                match self { $(Source::$topic(follower) => next(follower, session, Sample::$topic),)* }
+                Ok(match self { $(Source::$kind(source) => source.receive(session)?.map(Sample::$kind),)* })
             }
         }
     };
 }
 
 samples! {
-    Telegram [u8],
-    Scan Scan,
-    Marks Marks,
-    Zones Zones,
-    Foreground Foreground,
-    Background Background,
-    Status Status,
+    Telegram Received<[u8]>, Follower<[u8]>;
+    Scan Received<Scan>, Follower<Scan>;
+    Marks Received<Marks>, Follower<Marks>;
+    Zones Heard, ZonesSource;
+    Foreground Received<Foreground>, Follower<Foreground>;
+    Background Received<Background>, Follower<Background>;
+    Status Received<Status>, Follower<Status>;
+    Robot RobotHeard, RobotSource;
+}
+
+impl Source {
+    /// Will follow `name`.
+    pub(crate) fn new(name: &TopicName) -> Source {
+        let sensor = &name.sensor;
+        match name.topic {
+            Topic::Telegram => Source::Telegram(Follower::new(sensor)),
+            Topic::Scan => Source::Scan(Follower::new(sensor)),
+            Topic::Marks => Source::Marks(Follower::new(sensor)),
+            Topic::Zones if name.is_robot() => Source::Robot(RobotSource::new(&[])),
+            Topic::Zones => Source::Zones(ZonesSource::new(sensor)),
+            Topic::Foreground => Source::Foreground(Follower::new(sensor)),
+            Topic::Background => Source::Background(Follower::new(sensor)),
+            Topic::Status => Source::Status(Follower::new(sensor)),
+        }
+    }
+
+    /// After which time there may be something to receive although nothing was sent.
+    pub(crate) fn left(&self) -> Option<Duration> {
+        match self {
+            Source::Zones(source) => source.left(),
+            Source::Robot(source) => source.left(),
+            _ => None,
+        }
+    }
 }
 
 impl Sample {
-    /// The payload as it lies in memory.
+    /// The payload as it lies in memory; of the fold that of the sensor that was heard.
     pub(crate) fn bytes(&self) -> &[u8] {
         match self {
             Sample::Telegram(sample) => sample,
             Sample::Scan(sample) => bytemuck::bytes_of::<Scan>(sample),
             Sample::Marks(sample) => bytemuck::bytes_of::<Marks>(sample),
-            Sample::Zones(sample) => bytemuck::bytes_of::<Zones>(sample),
+            Sample::Zones(sample) => bytemuck::bytes_of(&sample.zones),
             Sample::Foreground(sample) => bytemuck::bytes_of::<Foreground>(sample),
             Sample::Background(sample) => bytemuck::bytes_of::<Background>(sample),
             Sample::Status(sample) => bytemuck::bytes_of::<Status>(sample),
+            Sample::Robot(sample) => bytemuck::bytes_of(&sample.heard.zones),
         }
     }
 }
 
-fn next<P: Payload + ?Sized>(
-    follower: &mut Follower<P>,
-    session: &mut Session,
-    kind: impl FnOnce(Received<P>) -> Sample,
-) -> Result<Option<Sample>, Failure> {
-    Ok(follower.receive(session)?.map(kind))
+/// What every sample can be asked.
+trait Told {
+    fn period_us(&self) -> u32;
+    fn missed(&self) -> u64;
+    fn is_stale(&self) -> bool;
+}
+
+impl<P: Payload + ?Sized> Told for Received<P> {
+    fn period_us(&self) -> u32 {
+        self.header().period_us
+    }
+
+    fn missed(&self) -> u64 {
+        self.missed
+    }
+
+    fn is_stale(&self) -> bool {
+        false
+    }
+}
+
+impl Told for Heard {
+    fn period_us(&self) -> u32 {
+        self.header.map_or(0, |header| header.period_us)
+    }
+
+    fn missed(&self) -> u64 {
+        self.missed
+    }
+
+    fn is_stale(&self) -> bool {
+        self.stale
+    }
+}
+
+impl Told for RobotHeard {
+    fn period_us(&self) -> u32 {
+        self.heard.period_us()
+    }
+
+    fn missed(&self) -> u64 {
+        self.heard.missed
+    }
+
+    fn is_stale(&self) -> bool {
+        self.heard.stale
+    }
 }

@@ -87,7 +87,11 @@ impl Session {
     /// Sleeps until something was sent, at the latest until `until`, and 100 ms at most; returns at once if something
     /// may have been sent since the caller looked. Hold no sample meanwhile.
     pub(crate) fn wait(&mut self, until: Option<Instant>) -> Result<(), Failure> {
-        let left = until.map_or(LONGEST_WAIT, |until| until.saturating_duration_since(Instant::now()));
+        self.wait_for(until.map(|until| until.saturating_duration_since(Instant::now())))
+    }
+
+    /// As [`wait`](Self::wait), for a time instead of until one.
+    pub(crate) fn wait_for(&mut self, left: Option<Duration>) -> Result<(), Failure> {
         let listeners: Vec<&Listener> = match &self.joined {
             Some(joined) => joined.listeners.iter().map(|(_, listener)| listener).collect(),
             None => Vec::new(),
@@ -97,6 +101,6 @@ impl Session {
             return Ok(());
         }
         self.taken = false;
-        ipc::sleep(&listeners, left.min(LONGEST_WAIT))
+        ipc::sleep(&listeners, left.map_or(LONGEST_WAIT, |left| left.min(LONGEST_WAIT)))
     }
 }

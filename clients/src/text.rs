@@ -30,10 +30,11 @@ pub(crate) fn sample(line: &mut Vec<u8>, name: &TopicName, sample: &Sample) -> i
         Sample::Telegram(bytes) => telegram(line, bytes.header(), bytes),
         Sample::Scan(found) => scan(line, found.header(), found),
         Sample::Marks(found) => processed::marks(line, found.header(), found),
-        Sample::Zones(found) => processed::zones(line, found.header(), found),
+        Sample::Zones(heard) => processed::zones(line, heard),
         Sample::Foreground(found) => processed::foreground(line, found.header(), found),
         Sample::Background(found) => background(line, found),
         Sample::Status(found) => status(line, found),
+        Sample::Robot(found) => processed::robot(line, &found.robot),
     }
 }
 

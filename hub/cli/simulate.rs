@@ -30,8 +30,9 @@ pub(crate) struct Simulate {
     /// The sensors' own address, 0 to 127; they answer to 0 too
     #[arg(long, default_value_t = 0, value_name = "NUMBER")]
     address: u8,
-    /// What the sensors see: room, bare, empty, wall640 or random
-    #[arg(long, default_value = "room", value_name = "NAME", conflicts_with = "replay")]
+    /// What the sensors see: room, bare, fig8, standing, approach, door, corridor, glass, sun, chair, strips, crowd,
+    /// empty, wall640 or random; or a TOML file, see docs/worlds.md
+    #[arg(long, default_value = "room", value_name = "NAME|FILE", conflicts_with = "replay")]
     world: String,
     /// A recording to send instead: telegram stream or CARMEN log, plain or gzipped
     #[arg(long, value_name = "FILE")]
@@ -117,4 +118,20 @@ impl Simulate {
 pub(crate) fn fault_table() -> String {
     let rows = Faults::keys().map(|(key, meaning)| format!("  {key:13} {meaning}"));
     format!("Faults:\n{}", rows.collect::<Vec<_>>().join("\n"))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_help_names_every_world() {
+        let command = Simulate::augment_args(clap::Command::new("simulate"));
+        let world = command.get_arguments().find(|argument| argument.get_id() == "world").expect("an option");
+        let help = world.get_help().expect("a help").to_string();
+        let words: Vec<&str> = help.split([' ', ',', ';']).collect();
+        for name in sim::world::World::names() {
+            assert!(words.contains(&name), "{name} is not in: {help}");
+        }
+    }
 }

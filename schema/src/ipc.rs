@@ -35,9 +35,9 @@ pub use self::nodes::{Nodes, nodes};
 pub use self::sleep::{descriptor, sleep, take_wakeups};
 pub use iceoryx2::port::update_connections::UpdateConnections;
 pub use iceoryx2::port::{LoanError, ReceiveError, SendError};
-pub use iceoryx2::prelude::PortFactory;
 /// Shared memory between processes; ports of it stay in their thread, nodes and services may move.
 pub use iceoryx2::prelude::ipc::Service;
+pub use iceoryx2::prelude::{PortFactory, ZeroCopySend};
 
 /// The membership of a process in a domain.
 pub type Node = iceoryx2::node::Node<Service>;

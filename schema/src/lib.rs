@@ -3,6 +3,7 @@
 
 mod background;
 mod control;
+pub mod datagram;
 mod domain;
 mod failure;
 mod foreground;
@@ -23,6 +24,8 @@ pub mod ipc;
 pub mod limits;
 #[cfg(feature = "ipc")]
 mod lock;
+#[cfg(feature = "json")]
+mod saved;
 #[cfg(feature = "ipc")]
 pub mod shortage;
 
@@ -37,8 +40,12 @@ pub use pose::Pose;
 pub use scan::{BEAMS, CONTENTS_UPPER, Code, Scan, TURN_NS};
 pub use status::{COUNTERS, Counter, Counters, State, Status};
 pub use telegram::Telegram;
-pub use topic::{CONTROL, CONTROL_REQUEST, CONTROL_RESPONSE, Topic, WAKE, Wake, check_sensor, of_service};
+pub use topic::{
+    CONTROL, CONTROL_REQUEST, CONTROL_RESPONSE, ROBOT, Topic, WAKE, Wake, check_sensor, of_service,
+};
 pub use zones::{Verdict, ZONES, Zone, Zones};
 
 #[cfg(feature = "ipc")]
 pub use lock::{HubLock, holder};
+#[cfg(feature = "json")]
+pub use saved::{SavedModel, as_json};

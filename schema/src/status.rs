@@ -62,6 +62,19 @@ impl Status {
         State::ALL.get(usize::from(self.state)).copied()
     }
 
+    /// Whether the measuring mode has reflector bits, without which there are no marks (Telegram listing, 77h block D);
+    /// nothing as long as the mode is not known.
+    pub fn has_reflector_bits(&self) -> Option<bool> {
+        (self.mode != Status::MODE_UNKNOWN).then_some(matches!(self.mode, 0x01 | 0x03 | 0x05))
+    }
+
+    /// The command that gives the sensor reflector bits, if it has none and is no recording: they live in its EEPROM,
+    /// which only a person changes.
+    pub fn reflector_remedy(&self) -> Option<String> {
+        let is_wanted = self.has_reflector_bits() == Some(false) && !self.port().starts_with("file:");
+        is_wanted.then(|| format!("scanhub configure {} mode=0x01", self.port()))
+    }
+
     /// What the sensor calls itself; empty if unknown.
     pub fn sensor_type(&self) -> &str {
         text::read(&self.type_text)
@@ -220,6 +233,23 @@ mod tests {
             assert_eq!(*state as usize, number);
         }
         assert_eq!(Status { state: 7, ..Status::default() }.state(), None);
+    }
+
+    #[test]
+    fn a_mode_without_reflector_bits_has_a_remedy() {
+        let mut status = Status { mode: 0, ..Status::default() };
+        status.set_port("/dev/ttyUSB0");
+        let remedy = "scanhub configure /dev/ttyUSB0 mode=0x01";
+        assert_eq!(
+            (status.has_reflector_bits(), status.reflector_remedy()),
+            (Some(false), Some(remedy.into()))
+        );
+        status.mode = 1;
+        assert_eq!((status.has_reflector_bits(), status.reflector_remedy()), (Some(true), None));
+        status.set_port("file:/tmp/walk.log");
+        status.mode = 0;
+        assert_eq!((status.has_reflector_bits(), status.reflector_remedy()), (Some(false), None));
+        assert_eq!(Status::default().has_reflector_bits(), None);
     }
 
     #[test]

@@ -42,6 +42,6 @@ mod tests {
         let telegram = Telegram(&[0x02, 0x80, 0x03, 0x00, 0xA0, 0x00, 0x10, 0x16, 0x0A]);
         assert_eq!((telegram.address(), telegram.length(), telegram.command()), (0x80, 3, 0xA0));
         assert_eq!(telegram.data(), [0x00, 0x10]);
-        assert_eq!(Telegram(&[0x02]).data(), []);
+        assert!(Telegram(&[0x02]).data().is_empty());
     }
 }

@@ -51,6 +51,16 @@ impl Topic {
         Topic::ALL.into_iter().find(|topic| topic.name() == name)
     }
 
+    /// The topic's number on a network: from 1.
+    pub fn number(self) -> u8 {
+        self as u8 + 1
+    }
+
+    /// The topic with this number.
+    pub fn of_number(number: u8) -> Option<Topic> {
+        Topic::ALL.into_iter().find(|topic| topic.number() == number)
+    }
+
     /// The payload's type, the same in all languages.
     pub fn payload(self) -> &'static str {
         match self {
@@ -113,8 +123,15 @@ pub fn of_service(name: &str) -> Option<(&str, Option<Topic>)> {
     if topic == WAKE { Some((sensor, None)) } else { Some((sensor, Some(Topic::parse(topic)?))) }
 }
 
-/// Refuses a sensor's name that is not `[a-z0-9_-]`, 1 to 24 of them: [`Kind::Configuration`].
+/// Stands for all sensors of a hub where one is named, and so is no name of a sensor.
+pub const ROBOT: &str = "robot";
+
+/// Refuses a sensor's name that is not `[a-z0-9_-]`, 1 to 24 of them, or [`ROBOT`]: [`Kind::Configuration`].
 pub fn check_sensor(name: &str) -> Result<(), Failure> {
+    if name == ROBOT {
+        let what = format!("sensor name {ROBOT:?} is not possible: it stands for all sensors");
+        return Err(Failure::new(Kind::Configuration, what, "any other name, for example front"));
+    }
     let allowed = |c: char| c.is_ascii_lowercase() || c.is_ascii_digit() || c == '_' || c == '-';
     if (1..=24).contains(&name.len()) && name.chars().all(allowed) {
         return Ok(());
@@ -140,6 +157,7 @@ mod tests {
         for topic in Topic::ALL {
             assert_eq!(of_service(&topic.service("rear")), Some(("rear", Some(topic))));
             assert_eq!(Topic::parse(topic.name()), Some(topic));
+            assert_eq!(Topic::of_number(topic.number()), Some(topic));
         }
         assert_eq!(of_service(&Wake::service("rear")), Some(("rear", None)));
         assert_eq!(of_service("scanhub/v2/rear/scan"), None);
@@ -151,7 +169,7 @@ mod tests {
     #[test]
     fn names_of_sensors() {
         assert!(check_sensor("front_2-b").is_ok());
-        for bad in ["", "Front", "a/b", "a b", "ä", &"a".repeat(25)] {
+        for bad in ["", "Front", "a/b", "a b", "ä", ROBOT, &"a".repeat(25)] {
             assert_eq!(check_sensor(bad).map_err(|failure| failure.kind), Err(Kind::Configuration), "{bad}");
         }
     }

@@ -1,9 +1,11 @@
-//! The classes of what the hub makes of a scan: marks, zones, foreground, background. A contract, as its parent.
+//! The classes of what the hub makes of a scan: marks, zones, foreground. A contract, as its parent.
 
-use schema::{Background, Foreground, Header, Mark, Marks, Segment, Zone, Zones};
+use schema::{Foreground, Header, Mark, Marks, ROBOT, Segment, Verdict, Zone, Zones};
 use serde::{Serialize, Serializer};
 
 use super::Stamp;
+use crate::robot::Robot;
+use crate::zones::Heard;
 
 /// Class `marks`.
 pub(crate) fn marks<'a>(sensor: &'a str, header: &Header, marks: &'a Marks) -> impl Serialize + 'a {
@@ -24,8 +26,8 @@ pub(crate) fn marks<'a>(sensor: &'a str, header: &Header, marks: &'a Marks) -> i
     }
 }
 
-/// Class `zones`.
-pub(crate) fn zones<'a>(sensor: &'a str, header: &Header, zones: &'a Zones) -> impl Serialize + 'a {
+/// Class `zones`; what was heard of no sample has no number in the topic, and of no telegram none at all.
+pub(crate) fn zones<'a>(sensor: &'a str, heard: &'a Heard) -> impl Serialize + 'a {
     #[derive(Serialize)]
     struct Line<'a> {
         #[serde(flatten)]
@@ -38,16 +40,54 @@ pub(crate) fn zones<'a>(sensor: &'a str, header: &Header, zones: &'a Zones) -> i
         invalid_beams: u16,
         #[serde(skip_serializing_if = "std::ops::Not::not")]
         provisional: bool,
+        #[serde(skip_serializing_if = "std::ops::Not::not")]
+        stale: bool,
     }
+    let zones = &heard.zones;
     let (nearest_beam, nearest_mm) = zones.nearest().unzip();
+    let stamp = match &heard.header {
+        Some(header) => Stamp::new("zones", sensor, header),
+        None => Stamp::unheard("zones", sensor),
+    };
     Line {
-        stamp: Stamp::new("zones", sensor, header),
+        stamp: Stamp { topic_seq: stamp.topic_seq.filter(|_| !heard.stale), ..stamp },
         verdict: zones.verdict().name(),
         nearest_mm,
         nearest_beam,
         zones: zones.zones(),
         invalid_beams: zones.invalid_beams,
         provisional: zones.flags & Zones::PROVISIONAL != 0,
+        stale: heard.stale,
+    }
+}
+
+/// Class `zones` of the robot: the fold over its sensors after `heard`, the last sample of one of them.
+pub(crate) fn robot<'a>(robot: &'a Robot, heard: &Heard) -> impl Serialize + 'a {
+    #[derive(Serialize)]
+    struct Line<'a> {
+        class: &'static str,
+        sensor: &'static str,
+        stamp_ns: Option<u64>,
+        wall_ns: Option<u64>,
+        verdict: &'static str,
+        nearest_mm: Option<u32>,
+        nearest_sensor: Option<&'a str>,
+        #[serde(serialize_with = "verdict_list")]
+        sensors: &'a Robot,
+        #[serde(skip_serializing_if = "std::ops::Not::not")]
+        stale: bool,
+    }
+    let (nearest_mm, nearest_sensor) = robot.nearest().unzip();
+    Line {
+        class: "zones",
+        sensor: ROBOT,
+        stamp_ns: heard.header.map(|header| header.stamp_first_ns),
+        wall_ns: heard.header.map(|header| header.wall_ns),
+        verdict: robot.verdict().name(),
+        nearest_mm,
+        nearest_sensor,
+        sensors: robot,
+        stale: heard.stale,
     }
 }
 
@@ -78,33 +118,6 @@ pub(crate) fn foreground<'a>(
         ranges: foreground.ranges(),
         segments: foreground,
         left_out: foreground.left_out,
-    }
-}
-
-/// Class `background`.
-pub(crate) fn background<'a>(sensor: &'a str, model: &'a Background) -> impl Serialize + 'a {
-    #[derive(Serialize)]
-    struct Line<'a> {
-        class: &'static str,
-        sensor: &'a str,
-        generation: u32,
-        taught: u16,
-        unit_mm: u8,
-        frozen: bool,
-        #[serde(serialize_with = "known_ranges")]
-        ranges: &'a [u16],
-        #[serde(serialize_with = "far_beams")]
-        far: &'a [u16],
-    }
-    Line {
-        class: "background",
-        sensor,
-        generation: model.generation,
-        taught: model.taught,
-        unit_mm: model.unit_mm,
-        frozen: model.is_frozen(),
-        ranges: model.ranges(),
-        far: model.ranges(),
     }
 }
 
@@ -144,6 +157,16 @@ fn zone_list<S: Serializer>(zones: &[Zone], serializer: S) -> Result<S::Ok, S::E
     }))
 }
 
+fn verdict_list<S: Serializer>(robot: &Robot, serializer: S) -> Result<S::Ok, S::Error> {
+    #[derive(Serialize)]
+    struct Item<'a> {
+        sensor: &'a str,
+        verdict: &'static str,
+    }
+    let item = |(sensor, verdict): (_, Verdict)| Item { sensor, verdict: verdict.name() };
+    serializer.collect_seq(robot.sensors().map(item))
+}
+
 fn segment_list<S: Serializer>(foreground: &Foreground, serializer: S) -> Result<S::Ok, S::Error> {
     #[derive(Serialize)]
     struct Item {
@@ -168,14 +191,4 @@ fn segment_list<S: Serializer>(foreground: &Foreground, serializer: S) -> Result
 
 fn beams<S: Serializer>(foreground: &Foreground, serializer: S) -> Result<S::Ok, S::Error> {
     serializer.collect_seq(foreground.readings().map(|(beam, _)| beam))
-}
-
-fn known_ranges<S: Serializer>(ranges: &[u16], serializer: S) -> Result<S::Ok, S::Error> {
-    let is_known = |range: &u16| *range != Background::UNTAUGHT && *range != Background::FAR;
-    serializer.collect_seq(ranges.iter().map(|range| Some(*range).filter(is_known)))
-}
-
-fn far_beams<S: Serializer>(ranges: &[u16], serializer: S) -> Result<S::Ok, S::Error> {
-    let far = ranges.iter().enumerate().filter(|(_, range)| **range == Background::FAR);
-    serializer.collect_seq(far.map(|(beam, _)| beam))
 }

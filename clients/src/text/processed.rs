@@ -2,9 +2,11 @@
 
 use std::io::{self, Write};
 
-use schema::{Background, Foreground, Header, Marks, Zones};
+use schema::{Background, Foreground, Header, Marks};
 
 use super::numbers;
+use crate::robot::Robot;
+use crate::zones::Heard;
 
 pub(super) fn marks(line: &mut Vec<u8>, header: &Header, marks: &Marks) -> io::Result<()> {
     numbers(line, header)?;
@@ -19,8 +21,16 @@ pub(super) fn marks(line: &mut Vec<u8>, header: &Header, marks: &Marks) -> io::R
     if marks.is_overflow() { write!(line, ", and more") } else { Ok(()) }
 }
 
-pub(super) fn zones(line: &mut Vec<u8>, header: &Header, zones: &Zones) -> io::Result<()> {
-    numbers(line, header)?;
+pub(super) fn zones(line: &mut Vec<u8>, heard: &Heard) -> io::Result<()> {
+    let Heard { zones, header, .. } = heard;
+    match header {
+        Some(header) if heard.stale => {
+            let seconds = header.stamp_first_ns as f64 / 1e9;
+            return write!(line, "seq {} at {seconds:.6} unknown: heard nothing since", header.seq);
+        }
+        Some(header) => numbers(line, header)?,
+        None => return write!(line, "unknown: heard nothing yet"),
+    }
     write!(line, " {}", zones.verdict().name())?;
     match zones.nearest() {
         Some((beam, mm)) => write!(line, " nearest {mm} mm, beam {beam}")?,
@@ -31,6 +41,19 @@ pub(super) fn zones(line: &mut Vec<u8>, header: &Header, zones: &Zones) -> io::R
         write!(line, ", {} mm{violated} {}", zone.radius_mm, zone.beams)?;
     }
     if zones.invalid_beams > 0 { write!(line, ", {} invalid", zones.invalid_beams) } else { Ok(()) }
+}
+
+/// The fold over all sensors.
+pub(super) fn robot(line: &mut Vec<u8>, robot: &Robot) -> io::Result<()> {
+    write!(line, "{}", robot.verdict().name())?;
+    match robot.nearest() {
+        Some((mm, sensor)) => write!(line, " nearest {mm} mm, {sensor}:")?,
+        None => write!(line, " nothing near:")?,
+    }
+    for (sensor, verdict) in robot.sensors() {
+        write!(line, " {sensor} {}", verdict.name())?;
+    }
+    Ok(())
 }
 
 pub(super) fn foreground(line: &mut Vec<u8>, header: &Header, foreground: &Foreground) -> io::Result<()> {

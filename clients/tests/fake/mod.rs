@@ -9,8 +9,12 @@ use std::sync::{Arc, Mutex};
 use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
+use rustix::time::{ClockId, clock_gettime};
 use schema::ipc::{self, Node, Notifier, Payload, PortFactory, Publisher, TopicService, UpdateConnections};
-use schema::{Domain, Failure, Header, HubLock, Scan, State, Status, Wake};
+use schema::{
+    Background, Domain, Failure, Foreground, Header, HubLock, Marks, Scan, State, Status, Verdict, Wake,
+    Zones,
+};
 
 /// A domain that goes with the test.
 pub(crate) struct Place {
@@ -66,10 +70,16 @@ impl<P: Payload + ?Sized> Port<P> {
 pub(crate) struct FakeSensor {
     pub(crate) telegram: Port<[u8]>,
     pub(crate) scan: Port<Scan>,
+    pub(crate) marks: Port<Marks>,
+    pub(crate) zones: Port<Zones>,
+    pub(crate) foreground: Port<Foreground>,
+    pub(crate) background: Port<Background>,
     pub(crate) status: Port<Status>,
     pub(crate) notifier: Notifier,
     pub(crate) boot: u64,
     pub(crate) seq: u64,
+    /// Of the scans, in us.
+    pub(crate) period_us: u32,
 }
 
 impl FakeSensor {
@@ -81,7 +91,7 @@ impl FakeSensor {
             stamp_last_ns: 1_010_000_000 + self.seq,
             wall_ns: 1_700_000_000_000_000_000 + self.seq,
             boot: self.boot,
-            period_us: 26_640,
+            period_us: self.period_us,
             hub_pid: std::process::id(),
             ..Header::default()
         }
@@ -98,6 +108,26 @@ impl FakeSensor {
         scan.range_array[..ranges.len()].copy_from_slice(ranges);
         sample.send().unwrap();
         self.scan.topic_seq += 1;
+        self.seq += 1;
+        ipc::notify(&self.notifier, Wake::Telegram).unwrap();
+    }
+
+    /// Publishes zones of `verdict` with something at `nearest_mm`, measured just now, and wakes the consumers.
+    pub(crate) fn zones(&mut self, verdict: Verdict, nearest_mm: u32) {
+        let now = clock_gettime(ClockId::Monotonic);
+        let now_ns = now.tv_sec as u64 * 1_000_000_000 + now.tv_nsec as u64;
+        self.zones_of(verdict, nearest_mm, now_ns);
+    }
+
+    /// As [`zones`](Self::zones), measured at `stamp_ns`.
+    pub(crate) fn zones_of(&mut self, verdict: Verdict, nearest_mm: u32, stamp_ns: u64) {
+        let header = self.header(self.zones.topic_seq);
+        let mut sample = self.zones.publisher.loan().unwrap();
+        *sample.user_header_mut() = Header { stamp_first_ns: stamp_ns, stamp_last_ns: stamp_ns, ..header };
+        *sample.payload_mut() =
+            Zones { verdict: verdict as u8, nearest_beam: 180, nearest_mm, ..Zones::unknown() };
+        sample.send().unwrap();
+        self.zones.topic_seq += 1;
         self.seq += 1;
         ipc::notify(&self.notifier, Wake::Telegram).unwrap();
     }
@@ -141,10 +171,15 @@ impl FakeHub {
         let sensor = |name: &&str| FakeSensor {
             telegram: Port::new(&node, name),
             scan: Port::new(&node, name),
+            marks: Port::new(&node, name),
+            zones: Port::new(&node, name),
+            foreground: Port::new(&node, name),
+            background: Port::new(&node, name),
             status: Port::new(&node, name),
             notifier: ipc::notifier(&ipc::create_wake(&node, name).unwrap()).unwrap(),
             boot,
             seq: 0,
+            period_us: 26_640,
         };
         FakeHub { sensors: sensors.iter().map(sensor).collect(), _node: node, _lock: lock }
     }

@@ -10,6 +10,7 @@ use schema::{Failure, Flags, Kind, State};
 
 use crate::clock;
 use crate::config::Source;
+use crate::control::Flow;
 use crate::link::{LinkThread, Woken};
 use crate::port::{Port, Refusal};
 
@@ -53,7 +54,7 @@ impl LinkThread<'_> {
             while clock::now() < look_at {
                 match self.wait(None, look_at.min(self.next_status)) {
                     Woken::Stop => return,
-                    Woken::Order => self.orders.obey(None),
+                    Woken::Order => self.obey(Flow::Away),
                     Woken::Ready | Woken::Timeout => self.show(None, State::Absent, &away.words),
                 }
             }
@@ -76,7 +77,7 @@ impl LinkThread<'_> {
         loop {
             match self.wait(Some((dial.as_fd(), PollFlags::IN)), clock::now() + STILL_AWAY) {
                 Woken::Stop => return None,
-                Woken::Order => self.orders.obey(None),
+                Woken::Order => self.obey(Flow::Away),
                 Woken::Ready => return Some(dial.finish()),
                 Woken::Timeout => self.show(None, State::Absent, words),
             }

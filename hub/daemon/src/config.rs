@@ -1,13 +1,18 @@
 //! What the hub is told: links with their ports and what to ask of their sensors. Several sources, the last one wins.
 
+mod processing;
+
 use std::path::{Path, PathBuf};
 
 use lms::family::Family;
 use lms::variant::{Baud, Unit, Variant};
 use schema::{Failure, Kind};
 
-use crate::layer::{Draft, merge, parse, quoted, setting};
+use crate::layer::{Drafts, parse, quoted, setting};
 use crate::origin::Origin;
+
+pub(crate) use processing::START;
+pub use processing::{Background, Processing, Zones};
 
 /// The effective configuration.
 #[derive(Clone, Debug, PartialEq)]
@@ -31,6 +36,8 @@ pub struct Link {
     pub unit: Option<Unit>,
     /// Rate to stream at.
     pub baud: Baud,
+    /// What is made of its scans.
+    pub processing: Processing,
 }
 
 /// What stands behind a link.
@@ -128,11 +135,11 @@ impl Config {
     ///
     /// [`schema::Kind::Configuration`] with place, value and remedy.
     pub fn load(sources: &Sources) -> Result<Config, Failure> {
-        let mut links: Vec<Draft> = Vec::new();
+        let mut drafts = Drafts::default();
         for path in &sources.files {
             let origin = Origin::read(path)?;
-            let Origin::File { text, .. } = &origin else { continue };
-            merge(&mut links, parse(&origin, text)?, &origin, true)?;
+            let layer = parse(&origin, origin.text())?;
+            drafts.merge(layer, origin, true)?;
         }
         for flag in &sources.links {
             let origin = Origin::Flag(format!("--link {flag}"));
@@ -140,27 +147,25 @@ impl Config {
                 origin.refuse(None, "no = in it", "write --link NAME=PORT, for example front=/dev/ttyUSB0")
             })?;
             let text = format!("[[link]]\nname = {}\nport = {}", quoted(name), quoted(port));
-            merge(&mut links, parse(&origin, &text)?, &origin, true)?;
+            drafts.merge(parse(&origin, &text)?, origin, true)?;
         }
-        if links.is_empty() {
-            merge(&mut links, parse(&Origin::Default, DEFAULT)?, &Origin::Default, true)?;
+        if drafts.len() == 0 {
+            drafts.merge(parse(&Origin::Default, DEFAULT)?, Origin::Default, true)?;
         }
         for flag in &sources.set {
             let origin = Origin::Flag(format!("--set {flag}"));
             let text = setting(flag).ok_or_else(|| {
-                origin.refuse(
-                    None,
-                    "not a setting",
-                    "write --set link.NAME.KEY=VALUE, as link.front.angle=100",
-                )
+                let remedy = "write --set link.NAME.KEY=VALUE, as link.front.angle=100, or for all links --set \
+                              zones.radii=[1.2,0.7]";
+                origin.refuse(None, "not a setting", remedy)
             })?;
-            merge(&mut links, parse(&origin, &text)?, &origin, false)?;
+            drafts.merge(parse(&origin, &text)?, origin, false)?;
         }
-        if links.len() > MAX_LINKS {
-            let message = format!("{} links: a sample names its sensor in one byte", links.len());
+        if drafts.len() > MAX_LINKS {
+            let message = format!("{} links: a sample names its sensor in one byte", drafts.len());
             return Err(Failure::new(Kind::Configuration, message, format!("{MAX_LINKS} links for one hub")));
         }
-        let links = links.into_iter().map(Draft::finish).collect::<Result<Vec<_>, _>>()?;
+        let links = drafts.finish()?;
         check_ports(&links)?;
         Ok(Config { links })
     }

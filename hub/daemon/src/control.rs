@@ -1,23 +1,24 @@
 //! Requests from outside on their way to the links: each is handed to its link's thread by a bounded queue and answered
 //! when the link has taken it. Never waits for a link; what a request does to a sensor is the session's business.
 
+mod orders;
+
 use std::os::fd::{AsFd, BorrowedFd, OwnedFd};
 use std::sync::Arc;
-use std::sync::mpsc::{Receiver, Sender, SyncSender, TrySendError, channel, sync_channel};
+use std::sync::mpsc::{Receiver, SyncSender, TrySendError, channel, sync_channel};
 
-use lms::{Control, Session};
 use rustix::event::{EventfdFlags, eventfd};
 use rustix::io::Errno;
 use schema::ipc::{self, Asked, ControlServer, Node};
-use schema::{Failure, Kind, Response, Verb, shortage};
+use schema::{Background, Failure, Kind, Response, Verb, shortage};
 
-use crate::clock;
+pub(crate) use orders::{Flow, Orders};
 
 /// Where requests come in; stays in the supervising thread.
 pub(crate) struct Desk {
     server: ControlServer,
     links: Vec<Inbox>,
-    outcomes: Receiver<(u64, Result<(), Failure>)>,
+    outcomes: Receiver<(u64, Outcome)>,
     bell: Arc<Bell>,
     /// Requests that a link has not taken yet, by the numbers of their orders.
     open: Vec<(u64, Asked)>,
@@ -31,19 +32,14 @@ struct Inbox {
     bell: Arc<Bell>,
 }
 
-/// What a link is asked to do, in the link's thread.
-pub(crate) struct Orders {
-    sensor: String,
-    paused: bool,
-    queue: Receiver<Order>,
-    bell: Arc<Bell>,
-    outcomes: Sender<(u64, Result<(), Failure>)>,
-    desk: Arc<Bell>,
-}
+/// What came of an order: done, with the model that was asked for, or why not.
+type Outcome = Result<Option<Box<Background>>, Failure>;
 
 struct Order {
     number: u64,
     verb: Verb,
+    /// What a request to load brings.
+    model: Box<Background>,
 }
 
 impl Desk {
@@ -125,7 +121,7 @@ impl Desk {
             let message = format!("request {} is not known to this hub", request.verb);
             Failure::new(Kind::Failed, message, "client and hub are of different versions")
         })?;
-        match link.queue.try_send(Order { number: self.next, verb }) {
+        match link.queue.try_send(Order { number: self.next, verb, model: Box::new(request.model()) }) {
             Ok(()) => {}
             Err(TrySendError::Full(_)) => {
                 let message = format!("{sensor} has {QUEUE} requests to do already");
@@ -140,75 +136,11 @@ impl Desk {
         Ok(self.next - 1)
     }
 
-    fn answer(&self, asked: Asked, outcome: Result<(), Failure>) {
-        if let Err(failure) = self.server.answer(asked, &Response(outcome.map(|()| None))) {
+    fn answer(&self, asked: Asked, outcome: Outcome) {
+        let response = Response(outcome.map(|model| model.map(|model| *model)));
+        if let Err(failure) = self.server.answer(asked, &response) {
             tracing::debug!(%failure, "a client was not answered");
         }
-    }
-}
-
-impl Orders {
-    /// Does what users asked for, with `session` if the port is there.
-    pub(crate) fn obey(&mut self, mut session: Option<&mut Session>) {
-        while let Some(order) = self.take() {
-            let control = match order.verb {
-                Verb::Pause => Control::Pause,
-                Verb::Resume => Control::Resume,
-                Verb::Resync => Control::Resync,
-                Verb::Show | Verb::Reset | Verb::Freeze | Verb::Thaw | Verb::Load => {
-                    self.answer(&order, Err(self.refusal("this hub keeps no background")));
-                    continue;
-                }
-            };
-            let outcome = match &mut session {
-                None if control == Control::Resync => Err(self.refusal("the port is away")),
-                None => Ok(()),
-                Some(session) => {
-                    session.control(control, clock::now());
-                    Ok(())
-                }
-            };
-            if outcome.is_ok() {
-                self.paused = control == Control::Pause;
-            }
-            self.answer(&order, outcome);
-        }
-    }
-
-    /// Refuses what users ask of a recording.
-    pub(crate) fn refuse(&self) {
-        while let Some(order) = self.take() {
-            self.answer(&order, Err(self.refusal("a recording takes no requests")));
-        }
-    }
-
-    /// Whether a user wants nothing of the sensor for now: a pause outlasts an absence of the port.
-    pub(crate) fn is_paused(&self) -> bool {
-        self.paused
-    }
-
-    fn take(&self) -> Option<Order> {
-        self.bell.hush();
-        self.queue.try_recv().ok()
-    }
-
-    fn answer(&self, order: &Order, outcome: Result<(), Failure>) {
-        // A desk that is closed has no client that waits.
-        if self.outcomes.send((order.number, outcome)).is_ok() {
-            self.desk.ring();
-        }
-    }
-
-    fn refusal(&self, why: &str) -> Failure {
-        let hint = format!("`scanhub info {}` shows how it is", self.sensor);
-        Failure::new(Kind::Failed, format!("{}: {why}", self.sensor), hint)
-    }
-}
-
-impl AsFd for Orders {
-    /// Readable as long as an order waits.
-    fn as_fd(&self) -> BorrowedFd<'_> {
-        self.bell.0.as_fd()
     }
 }
 

@@ -1,14 +1,19 @@
 //! One source of configuration laid over the others: every value is checked where it stands, so that an error names
 //! file, line and column, or the flag.
 
+mod processing;
+
+use std::rc::Rc;
+
 use lms::family::Family;
 use lms::variant::{Baud, Unit, Variant};
 use schema::{Failure, Kind, check_sensor};
 use serde::Deserialize;
 use toml::Spanned;
 
-use crate::config::{Link, Source};
+use crate::config::{Link, Processing, Source};
 use crate::origin::Origin;
+use processing::{BackgroundLayer, MarksLayer, PoseLayer, Sections, ZonesLayer};
 
 /// What one source says. Knows the keys; what is not here is an unknown key.
 #[derive(Deserialize)]
@@ -16,6 +21,9 @@ use crate::origin::Origin;
 pub(crate) struct Layer {
     #[serde(default)]
     link: Vec<LinkLayer>,
+    zones: Option<ZonesLayer>,
+    marks: Option<MarksLayer>,
+    background: Option<BackgroundLayer>,
 }
 
 #[derive(Deserialize)]
@@ -29,11 +37,23 @@ struct LinkLayer {
     resolution: Option<Spanned<f64>>,
     unit: Option<Spanned<String>>,
     baud: Option<Spanned<u32>>,
+    pose: Option<PoseLayer>,
+    zones: Option<ZonesLayer>,
+    marks: Option<MarksLayer>,
+    background: Option<BackgroundLayer>,
+}
+
+/// All links while sources are merged.
+#[derive(Default)]
+pub(crate) struct Drafts {
+    links: Vec<Draft>,
+    /// What was said for all links, in the order of the sources.
+    general: Vec<(Rc<Origin>, Sections)>,
 }
 
 /// A link while sources are merged.
-pub(crate) struct Draft {
-    pub(crate) name: String,
+struct Draft {
+    name: String,
     place: String,
     port: Option<Source>,
     family: Option<Said<Family>>,
@@ -41,6 +61,8 @@ pub(crate) struct Draft {
     resolution_cdeg: Option<Said<u16>>,
     unit: Option<Unit>,
     baud: Baud,
+    /// What was said for this link, in the order of the sources.
+    own: Vec<(Rc<Origin>, Sections)>,
 }
 
 /// A value, and where it was said last.
@@ -49,9 +71,31 @@ struct Said<T> {
     place: String,
 }
 
+impl Drafts {
+    pub(crate) fn len(&self) -> usize {
+        self.links.len()
+    }
+
+    /// Lays `layer` over the others; only where `may_add` may it bring links that were not there.
+    pub(crate) fn merge(&mut self, layer: Layer, origin: Origin, may_add: bool) -> Result<(), Failure> {
+        let Layer { link, zones, marks, background } = layer;
+        let origin = Rc::new(origin);
+        merge(&mut self.links, link, &origin, may_add)?;
+        self.general.push((origin, Sections { pose: None, zones, marks, background }));
+        Ok(())
+    }
+
+    /// The links as they are when all has been said.
+    pub(crate) fn finish(self) -> Result<Vec<Link>, Failure> {
+        let Drafts { links, general } = self;
+        links.into_iter().map(|draft| draft.finish(&general)).collect()
+    }
+}
+
 impl Draft {
-    pub(crate) fn finish(self) -> Result<Link, Failure> {
-        let Draft { name, place, port, family, angle_deg, resolution_cdeg, unit, baud } = self;
+    /// What was said for the link wins over what was said for all, wherever either stands.
+    fn finish(self, general: &[(Rc<Origin>, Sections)]) -> Result<Link, Failure> {
+        let Draft { name, place, port, family, angle_deg, resolution_cdeg, unit, baud, own } = self;
         let refuse = |place: &str, what: String, remedy: &str| {
             Failure::new(Kind::Configuration, format!("{place}: link {name}: {what}"), remedy)
         };
@@ -82,7 +126,12 @@ impl Draft {
             let what = format!("an {} does not scan {angle_deg} degrees: {why}", family.name());
             return Err(refuse(angle_place, what, "angle = 100"));
         }
-        Ok(Link { name, port, family, variant, unit, baud })
+        let mut processing = Processing::default();
+        for (origin, sections) in general.iter().chain(&own) {
+            sections.clone().lay(origin, &mut processing)?;
+        }
+        processing.background.read(&name, variant, unit)?;
+        Ok(Link { name, port, family, variant, unit, baud, processing })
     }
 }
 
@@ -91,15 +140,14 @@ pub(crate) fn parse(origin: &Origin, text: &str) -> Result<Layer, Failure> {
     toml::from_str(text).map_err(|error| origin.explain(&error))
 }
 
-/// Lays `layer` over `links`; only where `may_add` may it bring links that were not there.
-pub(crate) fn merge(
+fn merge(
     links: &mut Vec<Draft>,
-    layer: Layer,
-    origin: &Origin,
+    layers: Vec<LinkLayer>,
+    origin: &Rc<Origin>,
     may_add: bool,
 ) -> Result<(), Failure> {
     let mut seen: Vec<String> = Vec::new();
-    for link in layer.link {
+    for link in layers {
         let (span, name) = (Some(link.name.span()), link.name.into_inner());
         check_sensor(&name).map_err(|failure| origin.refuse(span.clone(), failure.message, failure.hint))?;
         if seen.contains(&name) {
@@ -123,6 +171,7 @@ pub(crate) fn merge(
                     resolution_cdeg: None,
                     unit: None,
                     baud: Baud::B500000,
+                    own: Vec::new(),
                 });
                 links.len() - 1
             }
@@ -175,6 +224,8 @@ pub(crate) fn merge(
                 origin.refuse(Some(baud.span()), what, "500000, 38400, 19200 or 9600")
             })?;
         }
+        let LinkLayer { pose, zones, marks, background, .. } = link;
+        draft.own.push((origin.clone(), Sections { pose, zones, marks, background }));
     }
     Ok(())
 }
@@ -193,24 +244,24 @@ fn whole(
     found.ok_or_else(|| origin.refuse(Some(value.span()), format!("{key} = {}", value.get_ref()), allowed))
 }
 
-/// `link.NAME.KEY=VALUE` as TOML; a value that is none is taken as text.
+/// `link.NAME.KEY=VALUE`, or a key of all links as `zones.margin=0.05`, as TOML; a value that is none is taken as text.
 pub(crate) fn setting(flag: &str) -> Option<String> {
     let (path, value) = flag.split_once('=')?;
-    let mut words = path.split('.');
-    let (Some("link"), Some(name), Some(key), None) =
-        (words.next(), words.next(), words.next(), words.next())
-    else {
-        return None;
+    let (table, key) = path.split_once('.')?;
+    let (head, key) = match (table, key.split_once('.')) {
+        ("link", Some((name, key))) => (format!("[[link]]\nname = {}\n", quoted(name)), key),
+        ("link", None) => return None,
+        _ => (String::new(), path),
     };
     let is_key = |c: char| c.is_ascii_alphanumeric() || c == '_' || c == '-';
-    if key.is_empty() || key == "name" || !key.chars().all(is_key) {
+    if key == "name" || key.split('.').any(|word| word.is_empty() || !word.chars().all(is_key)) {
         return None;
     }
     let value = match toml::from_str::<toml::Table>(&format!("v = {value}")) {
         Ok(table) if table.len() == 1 => value.to_owned(),
         _ => quoted(value),
     };
-    Some(format!("[[link]]\nname = {}\n{key} = {value}", quoted(name)))
+    Some(format!("{head}{key} = {value}"))
 }
 
 /// As a TOML string.

@@ -4,6 +4,7 @@
 mod attend;
 pub mod bus_error;
 mod clock;
+mod complaint;
 pub mod config;
 pub mod configure;
 mod control;
@@ -13,6 +14,7 @@ mod layer;
 mod line_errors;
 mod link;
 mod origin;
+mod pipeline;
 pub mod port;
 mod preflight;
 pub mod probe;

@@ -10,12 +10,13 @@ use lms::session::{Output, Received};
 use lms::variant::{Baud, Mode, Unit, Variant};
 use lms::{MILLIS, Nanos, Notice, Session, Settings, Trouble};
 use rustix::event::{PollFd, PollFlags, poll};
-use schema::{Failure, Flags, State, Wake};
+use schema::{Failure, Flags, Scan, State, Wake};
 
 use crate::clock;
 use crate::config::{Link, Source};
-use crate::control::Orders;
+use crate::control::{Flow, Orders};
 use crate::line_errors::LineErrors;
+use crate::pipeline::Pipeline;
 use crate::port::Port;
 use crate::replay;
 use crate::scanner;
@@ -31,19 +32,23 @@ pub(crate) struct LinkThread<'a> {
     stop: &'a OwnedFd,
     /// What users ask for.
     pub(crate) orders: Orders,
+    /// What is made of the scans.
+    pub(crate) pipeline: Pipeline,
+    /// When the last verdict of the zones is too old to stand.
+    stale_at: Nanos,
     next_greeting: Nanos,
     pub(crate) next_status: Nanos,
     /// Why the port went away the last time, if it did so without a byte.
     pub(crate) doubt: String,
     /// What `error` was made from.
-    facts: Option<Facts>,
+    pub(crate) facts: Option<Facts>,
     /// What is wrong, in words; empty if nothing is.
     error: String,
     /// Rates that the port cannot have, as was said.
     refused: Vec<Baud>,
     line_errors: LineErrors,
     /// Statuses in a row that said that consumers got nothing.
-    unreached: u32,
+    pub(crate) unreached: u32,
 }
 
 /// What a link's error is made from.
@@ -66,13 +71,16 @@ impl<'a> LinkThread<'a> {
     /// The thread's values; nothing happens yet.
     pub(crate) fn new(link: &'a Link, topics: Topics, stop: &'a OwnedFd, orders: Orders) -> Self {
         let now = clock::now();
-        let account = Account::new(&link.port.name(), now);
+        let account = Account::new(&link.port.name(), link.processing.pose, now);
         LinkThread {
             link,
             topics,
             account,
             stop,
             orders,
+            pipeline: Pipeline::new(&link.processing),
+            // Nothing is known yet, and that is said at once.
+            stale_at: now,
             next_greeting: now,
             next_status: now,
             doubt: String::new(),
@@ -110,14 +118,14 @@ impl<'a> LinkThread<'a> {
             match self.wait(Some((port.as_fd(), events)), until) {
                 Woken::Stop => return Ok(()),
                 Woken::Order => {
-                    self.orders.obey(Some(session));
+                    self.obey(Flow::Session(session));
                     continue;
                 }
                 Woken::Ready | Woken::Timeout => {}
             }
             if !watch {
                 // The telegram's end is near: what can be done before it is not done after it.
-                self.topics.prepare();
+                self.topics.prepare(&self.pipeline);
             }
             let len = port.read(session.spare())?;
             let now = clock::now();
@@ -152,7 +160,7 @@ impl<'a> LinkThread<'a> {
                     self.account.line_errors += counted;
                     let is_hit = self.line_errors.note(counted);
                     received.reasons |= if is_hit { suspect::LINE_ERROR } else { 0 };
-                    self.publish(&received, None);
+                    self.publish(&received, None, 0);
                     self.wake(Wake::Telegram);
                     published = true;
                 }
@@ -188,9 +196,9 @@ impl<'a> LinkThread<'a> {
         Ok((watch, until.min(bound)))
     }
 
-    /// Publishes a telegram and, if it is measured data that can be read, its scan. `fallback` is the mode of a sensor
-    /// that cannot be asked.
-    pub(crate) fn publish(&mut self, received: &Received<'_>, fallback: Option<Mode>) {
+    /// Publishes a telegram and, if it is measured data that can be read, its scan and what is made of it. `fallback` is
+    /// the mode of a sensor that cannot be asked, `gap_us` the time between its scans if that is greater than nominal.
+    pub(crate) fn publish(&mut self, received: &Received<'_>, fallback: Option<Mode>, gap_us: u32) {
         let measured = match Reply::decode(received.telegram) {
             Some(Reply::Measured(measured)) => Some(measured),
             _ => None,
@@ -201,11 +209,16 @@ impl<'a> LinkThread<'a> {
         let reasons = received.reasons | if forbidden { suspect::FORBIDDEN_BITS } else { 0 };
         self.account.suspect += u64::from(reasons != 0);
         let variant = measured.and_then(|measured| Variant::of_beams(measured.count()));
-        self.topics.telegram(received, reasons, scanner::period_us(variant, self.link.baud.rate()));
+        let period_us = scanner::period_us(variant, self.link.baud.rate()).max(gap_us);
+        self.topics.telegram(received, reasons, period_us);
         // Better no range than a wrong one.
         let (Some(measured), Some(mode)) = (measured, mode) else { return };
         self.account.scans += 1;
-        self.topics.scan(|scan| scanner::decode(&measured, mode, scan));
+        let fill = |scan: &mut Scan| scanner::decode(&measured, mode, scan);
+        if let Some(mismatch) = self.topics.scan(fill, &mut self.pipeline) {
+            tracing::warn!("{}: the background begins anew: {mismatch}", self.link.name);
+        }
+        self.stale_at = received.last.saturating_add(limit(period_us));
     }
 
     /// The session is over: what is wrong is not what was.
@@ -231,7 +244,7 @@ impl<'a> LinkThread<'a> {
         }
         if changed || now >= self.next_status {
             self.next_status = now + STATUS_PERIOD;
-            let status = self.account.status(session, self.topics.loan_failed, now);
+            let status = self.account.status(session, self.topics.loan_failed(), now);
             self.topics.status(status, now);
             if changed || state != State::Streaming {
                 self.topics.wake(Wake::Status);
@@ -248,9 +261,15 @@ impl<'a> LinkThread<'a> {
     pub(crate) fn wait(&mut self, port: Option<(BorrowedFd<'_>, PollFlags)>, until: Nanos) -> Woken {
         loop {
             let now = clock::now();
+            if now >= self.stale_at {
+                self.stale_at = Nanos::MAX;
+                self.topics.stale(&mut self.pipeline, now);
+                self.topics.wake(Wake::Status);
+            }
             // Whoever attaches to a silent sensor is greeted in time all the same.
             let mut bound =
                 if self.account.is_streaming() { until } else { until.min(self.next_greeting.max(now)) };
+            bound = bound.min(self.stale_at);
             if port.is_some_and(|(_, events)| events.is_empty()) {
                 // Some drivers wake nobody who waits for no bytes.
                 bound = bound.min(now + LONGEST_REST);
@@ -298,58 +317,6 @@ impl<'a> LinkThread<'a> {
         let fixed_rate = matches!(self.link.port, Source::Tcp { .. });
         Settings { variant: self.link.variant, baud: self.link.baud, listen_only, fixed_rate }
     }
-
-    /// Whether the port may go away again before it brings anything, as it did the last time: a serial server that
-    /// serves somebody else takes each connection and closes it. Then it is not said anew that it is there.
-    fn is_doubtful(&self, session: &Session) -> bool {
-        let is_silent = session.tally().read == 0 && session.trouble().is_none();
-        !self.doubt.is_empty() && is_silent && session.state() == lms::State::Probing
-    }
-
-    /// What is wrong, in words; empty if nothing is.
-    fn trouble(&self, session: &Session) -> String {
-        if self.is_doubtful(session) {
-            return self.doubt.clone();
-        }
-        let unit = session.sensor().unit;
-        match (session.trouble(), unit, self.link.unit) {
-            (Some(Trouble::NoAnswer { .. }), _, _) if self.settings(false).fixed_rate => format!(
-                "no answer at {} baud, to which the serial server was set: power, cable, another rate?",
-                self.link.baud.rate()
-            ),
-            (Some(trouble), _, _) => trouble.to_string(),
-            (None, Some(is), Some(expected)) if is != expected => format!(
-                "the sensor measures in units of {} mm, the configuration says {} mm; the unit lives in its EEPROM, \
-                 which the hub never writes",
-                is.mm(),
-                expected.mm()
-            ),
-            _ if self.unreached >= UNREACHED_LIMIT => self.unserved(),
-            _ => {
-                let fault = session.sensor().notices().find(|notice| notice.is_fault());
-                fault.map_or_else(String::new, |notice| notice.to_string())
-            }
-        }
-    }
-
-    fn watch_reach(&mut self) {
-        let before = self.unreached;
-        self.unreached = if self.topics.unreached() > 0 { before.saturating_add(1) } else { 0 };
-        if self.unreached == UNREACHED_LIMIT || before >= UNREACHED_LIMIT && self.unreached == 0 {
-            // Whoever is served shall read it in the status.
-            self.facts = None;
-        }
-        if self.unreached == UNREACHED_LIMIT {
-            tracing::warn!("{}: {}", self.link.name, self.unserved());
-        }
-    }
-
-    fn unserved(&self) -> String {
-        let count = self.topics.unreached();
-        format!(
-            "{count} consumers are attached but get nothing: raise the limit of open descriptors (ulimit -n)"
-        )
-    }
 }
 
 /// The word for how far `session` is.
@@ -364,6 +331,11 @@ pub(crate) fn state_of(session: &Session) -> State {
     }
 }
 
+/// For how long after a scan the verdict on it stands, if scans come every `period_us`.
+fn limit(period_us: u32) -> Nanos {
+    if period_us == 0 { NO_PERIOD } else { 2000 * Nanos::from(period_us) + GRACE }
+}
+
 fn is_ready(fd: &PollFd<'_>) -> bool {
     !fd.revents().is_empty()
 }
@@ -374,5 +346,7 @@ const LONGEST_REST: Nanos = 40 * MILLIS;
 const STATUS_PERIOD: Nanos = 1_000 * MILLIS;
 /// A late joiner gets the last status after so long at the most.
 const GREETING_PERIOD: Nanos = 100 * MILLIS;
-/// Statuses after which unreached consumers are more than ones that are just attaching.
-const UNREACHED_LIMIT: u32 = 3;
+/// A verdict stands for two scan periods and so much longer.
+const GRACE: Nanos = 20 * MILLIS;
+/// The same for scans of no variant, which have no nominal period: two of 361 beams at 38400 baud and the grace.
+const NO_PERIOD: Nanos = 480 * MILLIS;

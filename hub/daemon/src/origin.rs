@@ -28,6 +28,14 @@ impl Origin {
         Ok(Origin::File { path: path.to_owned(), text })
     }
 
+    /// What stands in it; a flag's text is made by who reads it.
+    pub(crate) fn text(&self) -> &str {
+        match self {
+            Origin::File { text, .. } => text,
+            Origin::Flag(_) | Origin::Default => "",
+        }
+    }
+
     /// The place of `span` in this source: `FILE:LINE:COLUMN`, or the flag.
     pub(crate) fn place(&self, span: Option<Range<usize>>) -> String {
         match (self, span) {
@@ -53,19 +61,22 @@ impl Origin {
         Failure::new(Kind::Configuration, format!("{}: {what}", self.place(span)), remedy)
     }
 
-    /// What the TOML parser found wrong; of an unknown key the nearest known one.
+    /// What the TOML parser found wrong; of an unknown key or word the nearest known one.
     pub(crate) fn explain(&self, error: &toml::de::Error) -> Failure {
         let message = error.message();
         let names: Vec<&str> = message.split('`').skip(1).step_by(2).collect();
-        if let (true, [unknown, known @ ..]) = (message.starts_with("unknown field"), &names[..]) {
+        let unknown =
+            [("unknown field", "unknown key", "Known"), ("unknown variant", "not possible:", "Possible")];
+        let said = unknown.into_iter().find(|(said, ..)| message.starts_with(said));
+        if let (Some((_, what, those)), [unknown, known @ ..]) = (said, &names[..]) {
             let nearest = known
                 .iter()
                 .max_by(|a, b| strsim::jaro_winkler(a, unknown).total_cmp(&strsim::jaro_winkler(b, unknown)));
             let remedy = nearest.map_or(String::new(), |nearest| {
-                format!("did you mean `{nearest}`? Known here: {}", known.join(", "))
+                format!("did you mean `{nearest}`? {those} here: {}", known.join(", "))
             });
-            return self.refuse(error.span(), format!("unknown key `{unknown}`"), remedy);
+            return self.refuse(error.span(), format!("{what} `{unknown}`"), remedy);
         }
-        self.refuse(error.span(), message, "see the configuration in README")
+        self.refuse(error.span(), message, "see docs/configuration.md")
     }
 }

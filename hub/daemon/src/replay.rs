@@ -13,6 +13,7 @@ use schema::{Failure, State, Wake};
 
 use crate::clock;
 use crate::config::Link;
+use crate::control::Flow;
 use crate::link::{LinkThread, Woken};
 use crate::scanner;
 
@@ -84,10 +85,14 @@ impl Recorded {
 pub(crate) fn play(link: &mut LinkThread<'_>, session: &mut Session, mut recorded: Recorded, paced: bool) {
     let mut due = clock::now();
     let mut last_stamp = None;
+    // Between the scans of the recording, as far as it is kept.
+    let mut gap_ns = 0;
     loop {
         let (len, stamp) = recorded.read(session.spare());
         if let Some(stamp) = stamp {
-            due += stamp.saturating_sub(last_stamp.unwrap_or(stamp)).min(LONGEST_GAP);
+            let gap = stamp.saturating_sub(last_stamp.unwrap_or(stamp)).min(LONGEST_GAP);
+            due += gap;
+            gap_ns = if paced { gap } else { 0 };
             last_stamp = Some(stamp);
         }
         // Also where nothing is waited for, the hub's end is looked for.
@@ -102,7 +107,7 @@ pub(crate) fn play(link: &mut LinkThread<'_>, session: &mut Session, mut recorde
         }
         while let Output::Telegram(received) = session.poll_output() {
             let is_scan = received.telegram.command() == MEASURED;
-            link.publish(&received, Some(recorded.mode));
+            link.publish(&received, Some(recorded.mode), (gap_ns / 1000) as u32);
             link.wake(Wake::Telegram);
             if is_scan && paced && last_stamp.is_none() {
                 due += period(session);
@@ -125,7 +130,7 @@ pub(crate) fn play(link: &mut LinkThread<'_>, session: &mut Session, mut recorde
 fn rest(link: &mut LinkThread<'_>, until: Nanos) -> Woken {
     loop {
         match link.wait(None, until) {
-            Woken::Order => link.orders.refuse(),
+            Woken::Order => link.obey(Flow::Recording),
             woken => return woken,
         }
     }

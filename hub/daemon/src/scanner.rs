@@ -80,6 +80,14 @@ mod tests {
     }
 
     #[test]
+    fn a_status_knows_the_modes_with_reflector_bits() {
+        for mode in 0..schema::Status::MODE_UNKNOWN {
+            let status = schema::Status { mode, ..schema::Status::default() };
+            assert_eq!(status.has_reflector_bits(), Some(Mode(mode).intensity_bits() > 0), "{mode}");
+        }
+    }
+
+    #[test]
     fn periods() {
         assert_eq!(period_us(Some(Variant::HALF), 500_000), 26_640);
         assert_eq!(period_us(None, 500_000), 0);

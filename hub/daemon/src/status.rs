@@ -3,7 +3,7 @@
 use lms::header::Reject;
 use lms::variant::Variant;
 use lms::{Nanos, Session};
-use schema::{Counter, Counters, State, Status};
+use schema::{Counter, Counters, Pose, State, Status};
 
 /// The link's account, across all sessions on its port.
 pub(crate) struct Account {
@@ -24,8 +24,8 @@ pub(crate) struct Account {
 }
 
 impl Account {
-    pub(crate) fn new(port: &str, now: Nanos) -> Self {
-        let mut status = Status { since_ns: now, ..Status::default() };
+    pub(crate) fn new(port: &str, pose: Pose, now: Nanos) -> Self {
+        let mut status = Status { since_ns: now, pose, ..Status::default() };
         status.set_port(port);
         Account {
             status,

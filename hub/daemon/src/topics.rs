@@ -1,58 +1,37 @@
 //! The topics of one link: numbers every sample, fills it in place, sends it, wakes the consumers. A sample for which
 //! there is no memory is counted and its number used up, so that consumers see the gap; nothing ever waits for one.
 
+mod outlet;
+
 use lms::session::Received;
-use schema::ipc::{
-    self, BytesMut, Node, Notifier, Payload, PortFactory, Publisher, SampleMut, TopicService,
-    UpdateConnections, WakeService,
-};
-use schema::{Failure, Flags, Header, Quality, Scan, Status, Wake};
+use preprocess::background::Mismatch;
+use schema::ipc::{self, BytesMut, Node, Notifier, WakeService};
+use schema::{Background, Failure, Flags, Foreground, Header, Marks, Quality, Scan, Status, Wake, Zones};
 
 use crate::clock;
+use crate::pipeline::{Outputs, Pipeline};
+use outlet::Outlet;
 
 /// The publishing end of one sensor; stays in its link's thread.
 pub(crate) struct Topics {
     telegram: Outlet<[u8]>,
     scan: Outlet<Scan>,
+    zones: Outlet<Zones>,
+    marks: Outlet<Marks>,
+    foreground: Outlet<Foreground>,
+    background: Outlet<Background>,
+    status: Outlet<Status>,
     /// Loaned while there was time, for the telegram that is coming.
     next_telegram: Option<BytesMut>,
-    next_scan: Option<SampleMut<Scan>>,
     /// Length of the last telegram.
     last_len: usize,
-    status: Outlet<Status>,
+    /// Where a scan is decoded for which there is no memory: what is made of it is published all the same.
+    spare_scan: Box<Scan>,
     notifier: Notifier,
     _wake: WakeService,
     /// What the next sample's header begins with.
     header: Header,
     next_seq: u64,
-    /// Samples without memory.
-    pub(crate) loan_failed: u64,
-}
-
-struct Outlet<P: Payload + ?Sized> {
-    publisher: Publisher<P>,
-    service: TopicService<P>,
-    next: u64,
-    reached: usize,
-}
-
-impl<P: Payload + ?Sized> Outlet<P> {
-    fn new(node: &Node, sensor: &str) -> Result<Self, Failure> {
-        let service = P::create(node, sensor)?;
-        Ok(Outlet { publisher: P::publisher(&service)?, service, next: 0, reached: 0 })
-    }
-
-    fn take_number(&mut self) -> u64 {
-        let number = self.next;
-        self.next += 1;
-        number
-    }
-
-    /// Consumers that are attached and did not get the last sample.
-    fn missed_out(&self) -> usize {
-        let attached = self.service.dynamic_config().number_of_subscribers();
-        if self.next > 0 { attached.saturating_sub(self.reached) } else { 0 }
-    }
 }
 
 impl Topics {
@@ -63,15 +42,18 @@ impl Topics {
         Ok(Topics {
             telegram: Outlet::new(node, sensor)?,
             scan: Outlet::new(node, sensor)?,
-            next_telegram: None,
-            next_scan: None,
-            last_len: 0,
+            zones: Outlet::new(node, sensor)?,
+            marks: Outlet::new(node, sensor)?,
+            foreground: Outlet::new(node, sensor)?,
+            background: Outlet::new(node, sensor)?,
             status: Outlet::new(node, sensor)?,
+            next_telegram: None,
+            last_len: 0,
+            spare_scan: Box::default(),
             notifier: ipc::notifier(&wake)?,
             _wake: wake,
             header,
             next_seq: 0,
-            loan_failed: 0,
         })
     }
 
@@ -80,17 +62,24 @@ impl Topics {
         self.header.flags = flags;
     }
 
-    /// Takes loans for a telegram as long as the last one and for its scan, which will be there in a moment.
-    pub(crate) fn prepare(&mut self) {
+    /// Takes loans for a telegram as long as the last one and for what `pipeline` makes of its scan, which will be there
+    /// in a moment.
+    pub(crate) fn prepare(&mut self, pipeline: &Pipeline) {
         if self.next_telegram.is_none() {
             self.next_telegram = self.telegram.publisher.loan_slice_uninit(self.last_len).ok();
         }
-        if self.next_scan.is_none() {
-            self.next_scan = self.scan.publisher.loan().ok();
+        self.telegram.connect();
+        self.scan.prepare();
+        self.zones.prepare();
+        if self.marks.is_followed() {
+            self.marks.prepare();
         }
-        // Who came is connected now, not while the telegram waits; and what sending looks at is near the processor.
-        connect(&self.telegram.publisher);
-        connect(&self.scan.publisher);
+        if pipeline.keeps_background() && self.foreground.is_followed() {
+            self.foreground.prepare();
+        }
+        if pipeline.shows_every_scan() {
+            self.background.prepare();
+        }
     }
 
     /// Publishes the telegram and takes its number and stamps for all that follows from it.
@@ -113,54 +102,81 @@ impl Topics {
         let prepared = self.next_telegram.take().filter(|loan| loan.payload().len() == bytes.len());
         let Some(loan) = prepared.or_else(|| self.telegram.publisher.loan_slice_uninit(bytes.len()).ok())
         else {
-            self.loan_failed += 1;
+            self.telegram.failed += 1;
             return;
         };
         let mut sample = loan.write_from_slice(bytes);
         *sample.user_header_mut() = header;
-        match sample.send() {
-            Ok(reached) => self.telegram.reached = reached,
-            Err(_) => self.loan_failed += 1,
-        }
+        self.telegram.note(sample.send());
     }
 
-    /// Publishes a scan of the last telegram, which `fill` writes in place.
-    pub(crate) fn scan(&mut self, fill: impl FnOnce(&mut Scan)) {
-        let topic_seq = self.scan.take_number();
-        let Some(mut sample) = self.next_scan.take().or_else(|| self.scan.publisher.loan().ok()) else {
-            self.loan_failed += 1;
-            return;
+    /// Publishes a scan of the last telegram, which `fill` writes in place, and what `pipeline` makes of it there. Marks
+    /// and foreground that nobody wants are not made; their numbers are used up. A background that does not fit the scan
+    /// begins anew; then it is told why.
+    pub(crate) fn scan(&mut self, fill: impl FnOnce(&mut Scan), pipeline: &mut Pipeline) -> Option<Mismatch> {
+        let with_marks = self.marks.is_followed();
+        let with_foreground = pipeline.keeps_background() && self.foreground.is_followed();
+        let mut scan = self.scan.loan();
+        let mut zones = self.zones.loan();
+        let mut marks = if with_marks { self.marks.loan() } else { None };
+        let mut foreground = if with_foreground { self.foreground.loan() } else { None };
+        let decoded = match &mut scan {
+            Some(loan) => loan.payload_mut(),
+            None => &mut *self.spare_scan,
         };
-        fill(sample.payload_mut());
-        *sample.user_header_mut() = Header { topic_seq, ..self.header };
-        match sample.send() {
-            Ok(reached) => self.scan.reached = reached,
-            Err(_) => self.loan_failed += 1,
+        fill(decoded);
+        let mismatch = pipeline.update(
+            decoded,
+            Outputs {
+                zones: zones.as_mut().map(|loan| loan.payload_mut()),
+                marks: marks.as_mut().map(|loan| loan.payload_mut()),
+                foreground: foreground.as_mut().map(|loan| loan.payload_mut()),
+            },
+        );
+        let header = self.header;
+        self.scan.send(scan, &header);
+        self.zones.send(zones, &header);
+        match with_marks {
+            true => self.marks.send(marks, &header),
+            false => self.marks.skip(),
         }
+        match with_foreground {
+            true => self.foreground.send(foreground, &header),
+            false if pipeline.keeps_background() => self.foreground.skip(),
+            false => {}
+        }
+        if pipeline.shows_every_scan() || pipeline.is_news() {
+            self.show(pipeline, &header);
+        }
+        mismatch
+    }
+
+    /// Publishes that nothing is known of the zones as of `now`, for scans stay out.
+    pub(crate) fn stale(&mut self, pipeline: &mut Pipeline, now: u64) {
+        let mut loan = self.zones.loan();
+        match &mut loan {
+            Some(loan) => pipeline.stale(loan.payload_mut()),
+            None => pipeline.stale(&mut Zones::default()),
+        }
+        self.zones.send(loan, &self.header_of(now));
+    }
+
+    /// Publishes the background as of `now`, if it is one that was not published; whether it was.
+    pub(crate) fn background(&mut self, pipeline: &mut Pipeline, now: u64) -> bool {
+        let is_news = pipeline.is_news();
+        if is_news {
+            self.show(pipeline, &self.header_of(now));
+        }
+        is_news
     }
 
     /// Publishes the status as of `now`.
     pub(crate) fn status(&mut self, status: &Status, now: u64) {
-        let topic_seq = self.status.take_number();
-        let header = Header {
-            topic_seq,
-            stamp_first_ns: now,
-            stamp_last_ns: now,
-            wall_ns: clock::wall(now),
-            quality: Quality::Clean as u8,
-            reasons: 0,
-            ..self.header
-        };
-        let Ok(mut sample) = self.status.publisher.loan() else {
-            self.loan_failed += 1;
-            return;
-        };
-        *sample.payload_mut() = *status;
-        *sample.user_header_mut() = header;
-        match sample.send() {
-            Ok(reached) => self.status.reached = reached,
-            Err(_) => self.loan_failed += 1,
+        let mut loan = self.status.loan();
+        if let Some(loan) = &mut loan {
+            *loan.payload_mut() = *status;
         }
+        self.status.send(loan, &self.header_of(now));
     }
 
     /// Wakes whoever sleeps; once per telegram, after its last sample.
@@ -170,20 +186,47 @@ impl Topics {
         }
     }
 
-    /// Gives late joiners what they would else get with the next status.
+    /// Gives late joiners what they would else get with the next sample.
     pub(crate) fn greet(&self) {
-        connect(&self.status.publisher);
+        self.status.connect();
+        self.zones.connect();
+        self.background.connect();
+    }
+
+    /// Samples without memory.
+    pub(crate) fn loan_failed(&self) -> u64 {
+        let of_scans = self.scan.failed + self.zones.failed + self.marks.failed;
+        let of_models = self.foreground.failed + self.background.failed;
+        self.telegram.failed + of_scans + of_models + self.status.failed
     }
 
     /// Consumers that got nothing although they are attached: their descriptors or ours ran out, and sending says Ok
-    /// all the same.
+    /// all the same. Of the background nothing is known: it is not sent when somebody comes.
     pub(crate) fn unreached(&self) -> usize {
-        self.telegram.missed_out().max(self.scan.missed_out()).max(self.status.missed_out())
+        let of_telegrams =
+            self.telegram.missed_out().max(self.scan.missed_out()).max(self.zones.missed_out());
+        let of_wanted = self.marks.missed_out().max(self.foreground.missed_out());
+        of_telegrams.max(of_wanted).max(self.status.missed_out())
     }
-}
 
-fn connect(publisher: &impl UpdateConnections) {
-    if let Err(error) = publisher.update_connections() {
-        tracing::debug!(?error, "a consumer could not be connected");
+    fn show(&mut self, pipeline: &mut Pipeline, header: &Header) {
+        let mut loan = self.background.loan();
+        match &mut loan {
+            Some(loan) => pipeline.show(loan.payload_mut()),
+            None => pipeline.show(&mut Background::default()),
+        }
+        self.background.send(loan, header);
+    }
+
+    /// The header of what is said at `now` without a telegram: its number is the last one's.
+    fn header_of(&self, now: u64) -> Header {
+        Header {
+            stamp_first_ns: now,
+            stamp_last_ns: now,
+            wall_ns: clock::wall(now),
+            quality: Quality::Clean as u8,
+            reasons: 0,
+            ..self.header
+        }
     }
 }

@@ -3,8 +3,10 @@
 
 #![forbid(unsafe_code)]
 
+pub mod background;
 pub mod marks;
 mod reading;
+pub mod segments;
 pub mod zones;
 
 pub use reading::Reading;

@@ -11,9 +11,9 @@ use schema::{Failure, Kind};
 
 use crate::fault::Faults;
 use crate::operating::Operating;
-use crate::room::World;
 use crate::settings::Start;
 use crate::transmission::ChunkSize;
+use crate::world::World;
 
 /// The options of the verb.
 #[derive(Clone, Debug)]
@@ -81,7 +81,7 @@ impl Default for SimulateOptions {
             pollution: 100,
             indices: false,
             short_configuration: false,
-            world: World::Room,
+            world: "room".parse().expect("a scene that the program brings along"),
             replay: None,
             looped: false,
             speed: 1.0,
@@ -195,14 +195,6 @@ fn one_of<T: Clone>(what: &str, text: &str, known: &[(&str, T)]) -> Result<T, Fa
     })
 }
 
-impl FromStr for World {
-    type Err = Failure;
-
-    fn from_str(text: &str) -> Result<Self, Failure> {
-        one_of("world", text, &World::ALL)
-    }
-}
-
 /// Measuring modes whose values hold a range (Telegram listing, 77h block D).
 const MODES: [u8; 8] = [0x00, 0x01, 0x02, 0x03, 0x04, 0x05, 0x06, 0x0F];
 
@@ -237,7 +229,6 @@ mod tests {
             parse_type("s300").unwrap_err(),
             parse_type("s14").unwrap_err(),
             parse_state("asleep").unwrap_err(),
-            "moon".parse::<World>().unwrap_err(),
         ] {
             assert!(failure.hint.starts_with("one of: ") && failure.kind.exit_code() == 78, "{failure}");
         }

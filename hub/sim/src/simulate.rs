@@ -50,7 +50,7 @@ pub fn simulate(
     let time = Time { zero_ns: now_ns(), speed: options.speed };
     for (number, port) in options.ports.iter().enumerate() {
         let seed = options.seed.wrapping_add(number as u64);
-        let (settings, source) = sensor(options, recording.as_ref(), seed)?;
+        let (settings, source) = sensor(options, recording.as_ref(), number)?;
         let machine = Machine::new(settings, source);
         let socket = Socket::new(port)?;
         ready.push(Ready { port: port.clone(), pty: socket.pty.name().to_owned() });
@@ -97,8 +97,9 @@ fn run(lines: Vec<Line<'_>>, stop: BorrowedFd<'_>) -> Result<Vec<Summary>, Failu
 fn sensor(
     options: &SimulateOptions,
     recording: Option<&Recording>,
-    seed: u64,
+    number: usize,
 ) -> Result<(Settings, Source), Failure> {
+    let seed = options.seed.wrapping_add(number as u64);
     let contents = recording.map(Recording::contents);
     let factory = options.family.factory_variant().unwrap_or(Variant::HALF);
     let variant = options.variant.or(contents.and_then(|c| c.variant)).unwrap_or(factory);
@@ -125,7 +126,7 @@ fn sensor(
         seed,
     };
     let source = match recording {
-        None => Source::Room(Room::new(options.world, seed)),
+        None => Source::Room(Room::of_port(&options.world, options.seed, number as u64)),
         Some(recording) => {
             let telegrams = scans(recording, Encoding { unit, mode }, options.looped)?;
             Source::Recorded { variant, telegrams }

@@ -281,6 +281,7 @@ mod tests {
             variant: Variant::HALF,
             unit: Some(Unit::Cm),
             baud: Baud::B500000,
+            processing: Default::default(),
         };
         let finding = settings("/dev/ttyUSB0", &report(healthy(), 0x10, &[]), Some(&link));
         let text = finding.to_string();

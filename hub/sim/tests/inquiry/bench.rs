@@ -12,7 +12,7 @@ use sim::Arrival;
 use sim::fault::Faults;
 use sim::machine::{Machine, Part, Settings};
 use sim::noise::Mistuned;
-use sim::room::{Room, World};
+use sim::room::Room;
 use sim::source::Source;
 use sim::wire::{Carried, Wire};
 
@@ -44,7 +44,7 @@ pub(crate) fn sensor(baud: Baud) -> Machine {
 
 /// A sensor in a room.
 pub(crate) fn machine(settings: Settings) -> Machine {
-    Machine::new(settings, Source::Room(Room::new(World::Room, 1)))
+    Machine::new(settings, Source::Room(Room::new(&"room".parse().unwrap(), 1)))
 }
 
 /// Says `request` to `machine` as a host does that is gone; returns the time.

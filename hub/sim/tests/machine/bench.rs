@@ -3,7 +3,7 @@
 use lms::{MICROS, MILLIS, Nanos, line_time};
 use sim::Arrival;
 use sim::machine::{Chunk, Machine, Part, Sent, Settings};
-use sim::room::{Room, World};
+use sim::room::Room;
 use sim::source::Source;
 
 /// A machine with a clock of its own and everything that it has sent.
@@ -15,7 +15,7 @@ pub(crate) struct Bench {
 
 impl Bench {
     pub(crate) fn new(settings: Settings) -> Bench {
-        Bench::with(settings, Source::Room(Room::new(World::Room, 1)))
+        Bench::with(settings, Source::Room(Room::new(&"room".parse().unwrap(), 1)))
     }
 
     pub(crate) fn with(settings: Settings, source: Source) -> Bench {

@@ -14,8 +14,9 @@ use lms::variant::{Baud, MIRROR_TURN, Mode, Unit, Variant};
 use lms::{MICROS, MILLIS, Nanos, line_time};
 use proptest::prelude::*;
 use sim::machine::{Machine, Part, Settings};
-use sim::room::{Room, World};
+use sim::room::Room;
 use sim::source::Source;
+use sim::world::World;
 use sim::{Arrival, ChunkSize};
 
 use bench::Bench;
@@ -255,7 +256,7 @@ proptest! {
     #[test]
     fn everything_sent_is_intact(
         seed in any::<u64>(),
-        world in 0..World::ALL.len(),
+        world in 0..World::names().count(),
         variant in 0..Variant::ALL.len(),
         baud in 0..Baud::ALL.len(),
         usb in any::<bool>(),
@@ -268,7 +269,8 @@ proptest! {
             seed,
             ..Settings::default()
         };
-        let mut machine = Machine::new(settings, Source::Room(Room::new(World::ALL[world].1, seed)));
+        let world: World = World::names().nth(world).unwrap().parse().unwrap();
+        let mut machine = Machine::new(settings, Source::Room(Room::new(&world, seed)));
         let mut now = 0;
         for &byte in Request::Stream.encode(0).bytes() {
             now += line_time(1, machine.baud().rate()) + 60 * MICROS;

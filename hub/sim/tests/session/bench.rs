@@ -11,7 +11,7 @@ use sim::Arrival;
 use sim::fault::{Fault, Faults};
 use sim::machine::{self, Machine, Part};
 use sim::noise::Mistuned;
-use sim::room::{Room, World};
+use sim::room::Room;
 use sim::source::Source;
 use sim::wire::{Carried, Wire};
 
@@ -94,12 +94,12 @@ pub(crate) const WANTED: Settings =
 /// A sensor in a room, at this rate.
 pub(crate) fn sensor(baud: Baud) -> Machine {
     let settings = machine::Settings { baud, seed: 1, ..machine::Settings::default() };
-    Machine::new(settings, Source::Room(Room::new(World::Room, 1)))
+    Machine::new(settings, Source::Room(Room::new(&"room".parse().unwrap(), 1)))
 }
 
 /// The sensor of `settings` in a room.
 pub(crate) fn sensor_with(settings: machine::Settings) -> Machine {
-    Machine::new(settings, Source::Room(Room::new(World::Room, 1)))
+    Machine::new(settings, Source::Room(Room::new(&"room".parse().unwrap(), 1)))
 }
 
 /// Makes `machine` stream, as a host did that is gone; returns the time.

@@ -5,7 +5,7 @@ use lms::variant::{Baud, Variant};
 use lms::{MICROS, MILLIS};
 use sim::ChunkSize;
 use sim::machine::{Machine, Settings};
-use sim::room::{Room, World};
+use sim::room::Room;
 use sim::source::Source;
 
 use crate::bench::{Bench, Received, Sent};
@@ -21,7 +21,7 @@ fn a_telegram_is_there_soon_after_its_last_byte() {
     for chunk in [ChunkSize::Uart, ChunkSize::Usb] {
         for variant in [Variant::HALF, Variant::ALL[0]] {
             let settings = Settings { baud: Baud::B500000, variant, chunk, ..Settings::default() };
-            let machine = Machine::new(settings, Source::Room(Room::new(World::Room, 5)));
+            let machine = Machine::new(settings, Source::Room(Room::new(&"room".parse().unwrap(), 5)));
             let mut bench = Bench::new(machine, 0);
             bench.until("streaming", 3_000 * MILLIS, Bench::is_streaming);
             bench.run(20_000 * MILLIS);

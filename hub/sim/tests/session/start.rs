@@ -37,7 +37,7 @@ fn a_sensor_with_another_variant_is_set_to_the_wanted_one() {
         baud: Baud::B38400,
         ..sim::machine::Settings::default()
     };
-    let room = sim::room::Room::new(sim::room::World::Random, 3);
+    let room = sim::room::Room::new(&sim::world::World::Random, 3);
     let machine = sim::machine::Machine::new(settings, sim::source::Source::Room(room));
     let mut bench = Bench::new(machine, 0);
     bench.until("streaming", 3_000 * MILLIS, Bench::is_streaming);

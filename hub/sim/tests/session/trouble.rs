@@ -3,7 +3,7 @@
 use lms::variant::{Baud, Unit, Variant};
 use lms::{MILLIS, State, Trouble};
 use sim::machine::{Habits, Machine, Settings};
-use sim::room::{Room, World};
+use sim::room::Room;
 use sim::source::Source;
 
 use crate::bench::{Bench, make_stream, sensor};
@@ -27,7 +27,8 @@ fn what_was_refused_is_not_forgotten_in_a_silence() {
     let variant = Variant::ALL[0];
     let habits = Habits { refuses: vec![0x3B], ..Habits::default() };
     let settings = Settings { variant, habits, ..Settings::default() };
-    let mut bench = Bench::new(Machine::new(settings, Source::Room(Room::new(World::Room, 1))), 0);
+    let mut bench =
+        Bench::new(Machine::new(settings, Source::Room(Room::new(&"room".parse().unwrap(), 1))), 0);
     bench.until("streaming", 3_000 * MILLIS, Bench::is_streaming);
     bench.run(500 * MILLIS);
     let cut = bench.now;
@@ -149,7 +150,8 @@ fn a_sensor_whose_power_was_cycled() {
 fn a_variant_that_gets_no_answer_is_done_without() {
     let settings =
         Settings { variant: Variant { angle_deg: 180, resolution_cdeg: 100 }, ..Settings::default() };
-    let mut bench = Bench::new(Machine::new(settings, Source::Room(Room::new(World::Room, 1))), 0);
+    let mut bench =
+        Bench::new(Machine::new(settings, Source::Room(Room::new(&"room".parse().unwrap(), 1))), 0);
     // Every request to switch arrives damaged, and is answered with NAK.
     let mut heard = Vec::new();
     bench.to_sensor = Box::new(move |_, byte| {
@@ -167,7 +169,7 @@ fn a_variant_that_gets_no_answer_is_done_without() {
 fn a_sensor_that_was_swapped_may_have_another_address() {
     let at = |address| {
         let settings = Settings { address, ..Settings::default() };
-        Machine::new(settings, Source::Room(Room::new(World::Room, 1)))
+        Machine::new(settings, Source::Room(Room::new(&"room".parse().unwrap(), 1)))
     };
     let mut bench = Bench::new(at(1), 0);
     bench.until("streaming", 3_000 * MILLIS, Bench::is_streaming);

@@ -1,0 +1,281 @@
+//! Which readings of a sensor are the robot's own body: what stands within a circle around the robot's centre for as
+//! long as one looks. Scans in, sectors out; refuses to know where scans come from and how sectors are written down.
+//!
+//! The time is looked at in slices. What is met in all of them at about the same range is body; what is met in some
+//! only came and went, and is left out.
+
+use schema::{Pose, Scan};
+
+/// Slices of the time.
+pub(crate) const SLICES: usize = 10;
+/// The most sectors that a hub takes.
+pub(crate) const SECTORS: usize = 64;
+/// So much farther than the body was met a reading still counts as the body: five standard deviations of 7 mm, which is
+/// the most that recordings of standing sensors show, and the 15 mm by which two devices differ.
+pub(crate) const MARGIN_MM: u32 = 50;
+
+/// A share of a slice's scans that a beam has to meet something in, so that one wrong reading is nothing.
+const SHARE: f64 = 0.05;
+/// A fifth of the slices may differ from the others: somebody may pass before or behind the body.
+const PASSING: usize = 5;
+/// How much the nearest readings of a body differ from slice to slice: noise and a robot that trembles. What is alive
+/// moves more.
+const STEADY_MM: u32 = 100;
+/// Beams beside a body that meet its edge and what is behind it by turns.
+const EDGE_BEAMS: usize = 2;
+/// Neighbouring beams whose ranges differ by less make one sector: what it hides more than needed is no wider than that.
+const ALIKE_MM: u32 = 50;
+/// Beams between two that moved, and belong together all the same.
+const GAP_BEAMS: usize = 3;
+
+/// What was seen so far.
+pub(crate) struct Body {
+    pose: Pose,
+    within_mm: f64,
+    /// Of the first scan; all others are to be alike.
+    shape: Option<Shape>,
+    scans: [u32; SLICES],
+    beams: Vec<Beam>,
+}
+
+/// Count, first angle, step and unit of a scan.
+type Shape = (u16, i32, u16, u8);
+
+struct Beam {
+    /// In the robot's frame.
+    direction: (f64, f64),
+    angle_mdeg: i32,
+    slices: [Slice; SLICES],
+}
+
+/// What a beam met within the circle.
+#[derive(Clone, Copy, Default)]
+struct Slice {
+    met: u32,
+    nearest_mm: u32,
+    farthest_mm: u32,
+}
+
+/// The body, and what was no body.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub(crate) struct Mask {
+    /// Readings nearer than `range_mm` are the body; in order, at most [`SECTORS`].
+    pub(crate) sectors: Vec<Sector>,
+    /// What moved, or came, or went: at `range_mm` where it was nearest.
+    pub(crate) moving: Vec<Sector>,
+    /// Beams of the scan.
+    pub(crate) of_beams: usize,
+}
+
+/// Neighbouring beams.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) struct Sector {
+    /// Angle of the first beam in 1/1000 degree.
+    pub(crate) from_mdeg: i32,
+    /// Angle of the last one.
+    pub(crate) to_mdeg: i32,
+    /// How many there are.
+    pub(crate) beams: usize,
+    /// In mm.
+    pub(crate) range_mm: u32,
+}
+
+impl Body {
+    /// Nothing seen yet by a sensor at `pose`; what is nearer than `within_mm` to the robot's centre may be body.
+    pub(crate) fn new(pose: Pose, within_mm: f64) -> Body {
+        Body { pose, within_mm, shape: None, scans: [0; SLICES], beams: Vec::new() }
+    }
+
+    /// Looks at `scan`, which was made in slice `slice`; false if it is shaped otherwise than those before.
+    pub(crate) fn look(&mut self, slice: usize, scan: &Scan) -> bool {
+        let shape = (scan.count, scan.first_angle_mdeg, scan.step_mdeg, scan.unit_mm);
+        if *self.shape.get_or_insert(shape) != shape {
+            return false;
+        }
+        if self.beams.is_empty() {
+            self.beams = (0..scan.beams()).map(|i| self.beam(scan.angle_mdeg(i))).collect();
+        }
+        let slice = slice.min(SLICES - 1);
+        self.scans[slice] += 1;
+        let (x_mm, y_mm) = (1000.0 * self.pose.x_m, 1000.0 * self.pose.y_m);
+        for (i, beam) in self.beams.iter_mut().enumerate() {
+            let Some(range_mm) = scan.distance_mm(i) else { continue };
+            let (x, y) = beam.direction;
+            let range = f64::from(range_mm);
+            if (x_mm + range * x).hypot(y_mm + range * y) < self.within_mm {
+                let met = &mut beam.slices[slice];
+                met.nearest_mm = if met.met == 0 { range_mm } else { met.nearest_mm.min(range_mm) };
+                met.farthest_mm = met.farthest_mm.max(range_mm);
+                met.met += 1;
+            }
+        }
+        true
+    }
+
+    /// Scans looked at.
+    pub(crate) fn scans(&self) -> u32 {
+        self.scans.iter().sum()
+    }
+
+    /// Slices of which there was a scan.
+    pub(crate) fn seen_slices(&self) -> usize {
+        self.scans.iter().filter(|&&scans| scans > 0).count()
+    }
+
+    /// What is to be concluded from all that was seen.
+    pub(crate) fn mask(&self) -> Mask {
+        let met: Vec<Met> = self.beams.iter().map(|beam| Met::of(beam, &self.scans)).collect();
+        let slices = self.seen_slices();
+        let is_body: Vec<bool> = met.iter().map(|met| met.is_body(slices)).collect();
+        let ranges_mm: Vec<u32> = (0..met.len()).map(|i| range_mm(&met, &is_body, i, slices)).collect();
+        let moving_mm: Vec<u32> = met.iter().zip(&ranges_mm).map(|(met, range)| met.beyond(*range)).collect();
+        Mask {
+            sectors: self.sectors(join(runs(&ranges_mm, 0, ALIKE_MM)), |run| run.most_mm),
+            moving: self.sectors(runs(&moving_mm, GAP_BEAMS, u32::MAX), |run| run.least_mm),
+            of_beams: self.beams.len(),
+        }
+    }
+
+    fn beam(&self, angle_mdeg: i32) -> Beam {
+        Beam { direction: self.pose.direction(angle_mdeg), angle_mdeg, slices: Default::default() }
+    }
+
+    fn sectors(&self, runs: Vec<Run>, range_mm: impl Fn(&Run) -> u32) -> Vec<Sector> {
+        let sector = |run: &Run| Sector {
+            from_mdeg: self.beams[run.first].angle_mdeg,
+            to_mdeg: self.beams[run.last].angle_mdeg,
+            beams: run.beams(),
+            range_mm: range_mm(run),
+        };
+        runs.iter().map(sector).collect()
+    }
+}
+
+/// What one beam met in the slices in which it met something often enough; both from the least on.
+struct Met {
+    nearest_mm: Vec<u32>,
+    farthest_mm: Vec<u32>,
+}
+
+impl Met {
+    fn of(beam: &Beam, scans: &[u32; SLICES]) -> Met {
+        let enough = |scans: u32| ((f64::from(scans) * SHARE).ceil() as u32).max(1);
+        let met: Vec<&Slice> = beam
+            .slices
+            .iter()
+            .zip(scans)
+            .filter_map(|(slice, scans)| (slice.met >= enough(*scans)).then_some(slice))
+            .collect();
+        let sorted = |range_mm: fn(&Slice) -> u32| {
+            let mut ranges: Vec<u32> = met.iter().map(|slice| range_mm(slice)).collect();
+            ranges.sort_unstable();
+            ranges
+        };
+        Met { nearest_mm: sorted(|slice| slice.nearest_mm), farthest_mm: sorted(|slice| slice.farthest_mm) }
+    }
+
+    fn slices(&self) -> usize {
+        self.nearest_mm.len()
+    }
+
+    /// Something is met in all of `slices`, and stays where it is.
+    fn is_body(&self, slices: usize) -> bool {
+        if self.slices() < slices {
+            return false;
+        }
+        let passing = slices / PASSING;
+        let (near, far) = (self.nearest_mm.get(passing), self.nearest_mm.iter().nth_back(passing));
+        near.zip(far).is_some_and(|(near, far)| far.saturating_sub(*near) <= STEADY_MM)
+    }
+
+    /// Up to where it reaches, but for what passes behind its edge.
+    fn reach_mm(&self, slices: usize) -> u32 {
+        let farthest = &self.farthest_mm;
+        farthest.iter().nth_back(slices / PASSING).or(farthest.first()).copied().unwrap_or_default()
+    }
+
+    /// The nearest that was met at `range_mm` or farther; 0 if nothing was.
+    fn beyond(&self, range_mm: u32) -> u32 {
+        self.nearest_mm.iter().copied().find(|&nearest| nearest >= range_mm).unwrap_or_default()
+    }
+}
+
+/// Readings of `beam` nearer than this are the body; 0 if none are. The beams just beside a body count as far as it
+/// does: spots are wider than beams, and robots tremble.
+fn range_mm(met: &[Met], is_body: &[bool], beam: usize, slices: usize) -> u32 {
+    let reach = |i: usize| met[i].reach_mm(slices) + MARGIN_MM;
+    if is_body[beam] {
+        return reach(beam);
+    }
+    let bodies = |distance: usize| {
+        let (first, last) = (beam.saturating_sub(distance), (beam + distance).min(met.len() - 1));
+        (first..=last).filter(|&i| is_body[i])
+    };
+    let beside = bodies(1).map(reach).max().unwrap_or_default();
+    let is_edge = bodies(EDGE_BEAMS).next().is_some() && 2 * met[beam].slices() >= slices;
+    if is_edge { beside.max(reach(beam)) } else { beside }
+}
+
+/// Neighbouring beams, and between which values theirs are.
+#[derive(Clone, Copy)]
+struct Run {
+    first: usize,
+    last: usize,
+    least_mm: u32,
+    most_mm: u32,
+}
+
+impl Run {
+    fn beams(&self) -> usize {
+        self.last - self.first + 1
+    }
+
+    fn and(self, other: Run) -> Run {
+        Run {
+            first: self.first.min(other.first),
+            last: self.last.max(other.last),
+            least_mm: self.least_mm.min(other.least_mm),
+            most_mm: self.most_mm.max(other.most_mm),
+        }
+    }
+
+    /// What it hides.
+    fn area(&self) -> u64 {
+        self.beams() as u64 * u64::from(self.most_mm)
+    }
+}
+
+/// Beams whose value is not 0 as runs, in which at most `gap` beams without one lie between two, and no two values
+/// differ by more than `alike_mm`.
+fn runs(values_mm: &[u32], gap: usize, alike_mm: u32) -> Vec<Run> {
+    let mut runs: Vec<Run> = Vec::new();
+    for (beam, &value) in values_mm.iter().enumerate().filter(|(_, value)| **value > 0) {
+        let one = Run { first: beam, last: beam, least_mm: value, most_mm: value };
+        match runs.last_mut() {
+            Some(run)
+                if beam - run.last <= gap + 1 && run.and(one).most_mm - run.and(one).least_mm <= alike_mm =>
+            {
+                *run = run.and(one);
+            }
+            _ => runs.push(one),
+        }
+    }
+    runs
+}
+
+/// Joins neighbours until a hub takes them, first those that hide the least more by it.
+fn join(mut runs: Vec<Run>) -> Vec<Run> {
+    while runs.len() > SECTORS {
+        let more = |at: &usize| {
+            let (one, next) = (runs[*at], runs[at + 1]);
+            one.and(next).area() - one.area() - next.area()
+        };
+        let Some(at) = (0..runs.len() - 1).min_by_key(more) else { break };
+        let next = runs.remove(at + 1);
+        runs[at] = runs[at].and(next);
+    }
+    runs
+}
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,159 @@
+//! Bodies and people in front of a sensor that sees a wall at five metres, by ranges that are written here.
+
+use super::*;
+
+const COUNT: usize = 361;
+const WALL_MM: u16 = 5000;
+const SCANS: usize = 40;
+
+/// What a sensor at the robot's centre makes of scans whose beams are `range_mm(beam, slice, scan of the slice)`.
+fn mask(range_mm: impl Fn(usize, usize, usize) -> Option<u16>) -> Mask {
+    learn(Pose::default(), 1000.0, range_mm)
+}
+
+fn learn(pose: Pose, within_mm: f64, range_mm: impl Fn(usize, usize, usize) -> Option<u16>) -> Mask {
+    let mut body = Body::new(pose, within_mm);
+    let mut scan =
+        Scan { count: COUNT as u16, unit_mm: 1, range_bits: 13, step_mdeg: 500, ..Scan::default() };
+    for slice in 0..SLICES {
+        for number in 0..SCANS {
+            for beam in 0..COUNT {
+                let code = scan.max();
+                scan.range_array[beam] = range_mm(beam, slice, number).unwrap_or(code);
+            }
+            assert!(body.look(slice, &scan));
+        }
+    }
+    assert_eq!((body.scans(), body.seen_slices()), ((SLICES * SCANS) as u32, SLICES));
+    body.mask()
+}
+
+fn sector(first: usize, last: usize, range_mm: u32) -> Sector {
+    let angle = |beam: usize| beam as i32 * 500;
+    Sector { from_mdeg: angle(first), to_mdeg: angle(last), beams: last - first + 1, range_mm }
+}
+
+/// Noise of a few mm, the same in every run.
+fn noise(beam: usize, slice: usize, scan: usize) -> u16 {
+    ((beam * 31 + slice * 17 + scan * 7) % 11) as u16
+}
+
+#[test]
+fn a_post_is_body_with_a_beam_beside_it_on_either_side() {
+    let post = |beam, slice, scan| match beam {
+        60..=67 => Some(400 + noise(beam, slice, scan)),
+        _ => Some(WALL_MM),
+    };
+    // As far as it was met, and the margin.
+    assert_eq!(mask(post), Mask { sectors: vec![sector(59, 68, 460)], moving: vec![], of_beams: COUNT });
+}
+
+#[test]
+fn nothing_there_is_an_empty_list() {
+    let nothing = Mask { of_beams: COUNT, ..Mask::default() };
+    assert_eq!(mask(|_, _, _| Some(WALL_MM)), nothing);
+    assert_eq!(mask(|_, _, _| None), nothing);
+    assert_eq!(Body::new(Pose::default(), 1000.0).mask(), Mask::default(), "not a scan");
+}
+
+#[test]
+fn what_comes_and_goes_is_left_out_and_named() {
+    // Somebody walks past in six slices, ten beams further in each, while a post stands there.
+    let found = mask(|beam, slice, scan| match beam {
+        60..=67 => Some(400 + noise(beam, slice, scan)),
+        _ if (2..8).contains(&slice) && (100 + 10 * slice..115 + 10 * slice).contains(&beam) => Some(700),
+        _ => Some(WALL_MM),
+    });
+    assert_eq!((found.sectors, found.moving), (vec![sector(59, 68, 460)], vec![sector(120, 184, 700)]));
+}
+
+#[test]
+fn who_walks_up_and_down_all_the_time_is_no_body() {
+    let found = mask(|beam, slice, _| match beam {
+        100..=130 => Some(400 + 50 * slice as u16),
+        _ => Some(WALL_MM),
+    });
+    assert_eq!((found.sectors, found.moving), (vec![], vec![sector(100, 130, 400)]));
+}
+
+#[test]
+fn who_passes_before_a_body_neither_widens_nor_hides_it() {
+    let found = mask(|beam, slice, _| match beam {
+        90..=150 if slice == 4 => Some(250),
+        100..=110 => Some(500),
+        _ => Some(WALL_MM),
+    });
+    assert_eq!(found.sectors, [sector(99, 111, 550)]);
+    assert_eq!(found.moving, [sector(90, 98, 250), sector(112, 150, 250)]);
+}
+
+#[test]
+fn an_edge_that_is_met_by_turns_counts_as_far_as_it_was_met() {
+    // Beam 68 meets body, wall and what lies between by turns; beam 70 is too far from the body for that.
+    let found = mask(|beam, slice, scan| match beam {
+        60..=67 => Some(400),
+        68 | 70 if scan % 8 == 0 && slice < 6 => Some(450 + 50 * (scan as u16 / 4)),
+        _ => Some(WALL_MM),
+    });
+    assert_eq!(found.sectors, [sector(59, 67, 450), sector(68, 68, 900)]);
+    assert_eq!(found.moving, [sector(70, 70, 450)]);
+}
+
+#[test]
+fn a_cable_is_body_although_it_is_met_seldom_and_never_at_one_range() {
+    // It is met in six of forty scans, and each time somewhere else.
+    let found = mask(|beam, slice, scan| match beam {
+        200..=202 if scan % 7 == slice % 7 => Some(300 + ((slice * 97 + scan * 41) % 400) as u16),
+        _ => Some(WALL_MM),
+    });
+    assert_eq!((found.sectors.len(), found.moving.len()), (1, 0), "{found:?}");
+    assert_eq!((found.sectors[0].from_mdeg, found.sectors[0].to_mdeg), (99_500, 101_500));
+}
+
+#[test]
+fn single_wrong_readings_are_nothing() {
+    let wrong = |one: usize| {
+        mask(move |beam, slice, scan| match beam {
+            7 if slice == 2 && (scan == 3 || scan == one) => Some(100),
+            _ => Some(WALL_MM),
+        })
+    };
+    assert_eq!(wrong(3), Mask { of_beams: COUNT, ..Mask::default() });
+    // Twice in a slice is something; not a body.
+    assert_eq!(wrong(30), Mask { moving: vec![sector(7, 7, 100)], of_beams: COUNT, ..Mask::default() });
+}
+
+#[test]
+fn the_circle_is_around_the_robot_wherever_the_sensor_sits() {
+    // 0.8 m ahead of the centre and looking back: what is 1.7 m off is 0.9 m behind the centre.
+    let pose = Pose { x_m: 0.8, yaw_rad: std::f64::consts::PI, ..Pose::default() };
+    let wall = |range_mm: u16| move |beam, _, _| if beam == 180 { Some(range_mm) } else { None };
+    assert_eq!(learn(pose, 1000.0, wall(1700)).sectors, [sector(179, 181, 1750)]);
+    assert_eq!(learn(pose, 1000.0, wall(1801)).sectors, []);
+    assert_eq!(learn(pose, 1000.0, wall(1800)).sectors, [], "on the circle is outside");
+}
+
+#[test]
+fn a_slope_becomes_steps_and_a_fence_no_more_than_a_hub_takes() {
+    let slope = mask(|beam, _, _| if beam < 100 { Some(200 + 5 * beam as u16) } else { Some(WALL_MM) });
+    assert_eq!(slope.sectors.len(), 10);
+    for pair in slope.sectors.windows(2) {
+        assert!(pair[0].to_mdeg < pair[1].from_mdeg && pair[1].range_mm - pair[0].range_mm <= 2 * ALIKE_MM);
+    }
+    let fence = mask(|beam, _, _| if beam % 4 == 0 { Some(300 + beam as u16) } else { Some(WALL_MM) });
+    assert_eq!(fence.sectors.len(), SECTORS);
+    let hidden = |beam: usize| {
+        let angle = beam as i32 * 500;
+        let of = |sector: &&Sector| (sector.from_mdeg..=sector.to_mdeg).contains(&angle);
+        fence.sectors.iter().find(of).map_or(0, |sector| sector.range_mm)
+    };
+    assert!((0..COUNT).step_by(4).all(|beam| hidden(beam) > 300 + beam as u32), "every post is still hidden");
+}
+
+#[test]
+fn a_sensor_that_is_set_otherwise_meanwhile_is_noticed() {
+    let mut body = Body::new(Pose::default(), 1000.0);
+    let scan = Scan { count: 181, unit_mm: 1, range_bits: 13, step_mdeg: 1000, ..Scan::default() };
+    assert!(body.look(0, &scan) && !body.look(0, &Scan { unit_mm: 10, ..scan }));
+    assert!(!body.look(0, &Scan { count: 180, ..scan }) && body.look(SLICES, &scan));
+}

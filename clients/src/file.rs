@@ -1,0 +1,74 @@
+//! Files that are whole or not there: read with a bound, written beside their place and then put there. Refuses to know
+//! what is in them.
+
+use std::ffi::OsString;
+use std::fs::{self, File};
+use std::io::{self, Read, Write};
+use std::path::{Path, PathBuf};
+
+use schema::{Failure, Kind};
+
+/// All of the file at `path`, at most `longest` bytes.
+///
+/// [`Kind::Configuration`] if it cannot be read or is longer: another one was meant.
+pub(crate) fn read(path: &Path, longest: u64) -> Result<Vec<u8>, Failure> {
+    let place = path.display().to_string();
+    let mut file = File::open(path).map_err(|error| unreadable(&place, &error))?;
+    read_all(&mut file, &place, longest)
+}
+
+/// All of `input`, which is at `place`; failures as [`read`].
+pub(crate) fn read_all(input: &mut dyn Read, place: &str, longest: u64) -> Result<Vec<u8>, Failure> {
+    let mut content = Vec::new();
+    input.take(longest + 1).read_to_end(&mut content).map_err(|error| unreadable(place, &error))?;
+    if content.len() as u64 > longest {
+        let message = format!("{place} is longer than {longest} bytes, so it is something else");
+        return Err(Failure::new(Kind::Configuration, message, "look whether it is the right file"));
+    }
+    Ok(content)
+}
+
+/// Puts a file of `content` at `path`. Whoever reads meanwhile, and whatever happens, finds the old one or the new one
+/// whole. What is there and no file, a device or a pipe, is written to.
+///
+/// [`Kind::Failed`] if it cannot be written; nothing is left then.
+pub(crate) fn replace(path: &Path, content: &[u8]) -> Result<(), Failure> {
+    // A link stays, and what it points to is replaced.
+    let path = fs::canonicalize(path).unwrap_or_else(|_| path.to_owned());
+    let written = match fs::metadata(&path) {
+        Ok(found) if !found.is_file() => {
+            File::options().write(true).open(&path).and_then(|mut file| file.write_all(content))
+        }
+        _ => beside(&path).and_then(|beside| exchange(&path, &beside, content)),
+    };
+    written.map_err(|error| {
+        let hint = "the directory has to be there, writable, and with room";
+        Failure::new(Kind::Failed, format!("cannot write {}: {error}", path.display()), hint)
+    })
+}
+
+fn exchange(path: &Path, beside: &Path, content: &[u8]) -> io::Result<()> {
+    let write = || {
+        let mut file = File::create(beside)?;
+        file.write_all(content)?;
+        file.sync_all()?;
+        fs::rename(beside, path)
+    };
+    write().inspect_err(|_| {
+        let _ = fs::remove_file(beside);
+    })
+}
+
+/// A name in the same directory that no other process takes.
+fn beside(path: &Path) -> io::Result<PathBuf> {
+    let name = path.file_name().ok_or(io::ErrorKind::IsADirectory)?;
+    let mut hidden = OsString::from(".");
+    hidden.push(name);
+    hidden.push(format!(".{}", std::process::id()));
+    Ok(path.with_file_name(hidden))
+}
+
+fn unreadable(place: &str, error: &io::Error) -> Failure {
+    let hint = "it has to be there, and readable for this user";
+    Failure::new(Kind::Configuration, format!("cannot read {place}: {error}"), hint)
+}

@@ -1,0 +1,142 @@
+//! What the hub makes of the scans of a link, and by which numbers: the effective values of sections pose, zones, marks
+//! and background. Refuses to know where they were written.
+
+use std::path::PathBuf;
+
+use lms::variant::{Unit, Variant};
+use preprocess::background::Settings as Learning;
+use preprocess::{marks, zones};
+use schema::{Failure, Kind, Pose, SavedModel};
+
+/// What is made of the scans of one link.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Processing {
+    /// Where the sensor sits.
+    pub pose: Pose,
+    /// What is near the robot.
+    pub zones: Zones,
+    /// How reflector marks are found.
+    pub marks: marks::Settings,
+    /// How the background is learned.
+    pub background: Background,
+}
+
+/// Section `[zones]`.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Zones {
+    /// Radii around the robot's centre in mm, the largest first, 1 to 8.
+    pub radii_mm: Vec<u16>,
+    /// The robot's own body in the sensor's view.
+    pub self_min: Vec<zones::Sector>,
+    /// Added to every radius, in mm.
+    pub margin_mm: u16,
+    /// Beams that violate a circle, at least.
+    pub min_beams: u16,
+    /// Scans in a row that violate it, at least.
+    pub min_scans: u16,
+    /// Share of the beams through the largest circle that may be without a reading.
+    pub max_invalid: f64,
+    /// What lies before the near side of a circle that the sensor stands outside of is not in it.
+    pub exact: bool,
+    /// That nothing came back means that nothing is near.
+    pub no_return_is_far: bool,
+}
+
+impl Zones {
+    /// The same, as the processor takes it.
+    pub fn settings(&self) -> zones::Settings<'_> {
+        zones::Settings {
+            radii_mm: &self.radii_mm,
+            self_min: &self.self_min,
+            margin_mm: self.margin_mm,
+            min_beams: self.min_beams,
+            min_scans: self.min_scans,
+            max_invalid: self.max_invalid,
+            exact: self.exact,
+            no_return_is_far: self.no_return_is_far,
+        }
+    }
+}
+
+impl Default for Zones {
+    fn default() -> Self {
+        let zones::Settings {
+            radii_mm,
+            self_min,
+            margin_mm,
+            min_beams,
+            min_scans,
+            max_invalid,
+            exact,
+            no_return_is_far,
+        } = zones::Settings::default();
+        let (radii_mm, self_min) = (radii_mm.to_vec(), self_min.to_vec());
+        Zones { radii_mm, self_min, margin_mm, min_beams, min_scans, max_invalid, exact, no_return_is_far }
+    }
+}
+
+/// Section `[background]`.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Background {
+    /// A background is kept; else there are no samples of foreground and background.
+    pub is_kept: bool,
+    /// How it is learned.
+    pub learning: Learning,
+    /// The file that it begins with.
+    pub file: Option<PathBuf>,
+    /// What stands in the file.
+    pub model: Option<Box<schema::Background>>,
+    /// The model is published with every scan, not only when a new generation begins.
+    pub every_scan: bool,
+}
+
+impl Background {
+    /// Reads the file that the background of `sensor` begins with, if there is one, and compares it with what is
+    /// configured for that sensor.
+    ///
+    /// [`Kind::Configuration`] with file and reason.
+    pub(crate) fn read(&mut self, sensor: &str, variant: Variant, unit: Option<Unit>) -> Result<(), Failure> {
+        let Some(file) = self.file.as_ref().filter(|_| self.is_kept) else { return Ok(()) };
+        let place = file.display().to_string();
+        let refuse = |what: String, hint: &str| {
+            let message = format!("link {sensor}: background.start = {place}: {what}");
+            Err(Failure::new(Kind::Configuration, message, hint))
+        };
+        let text = match std::fs::read(file) {
+            Ok(text) => text,
+            Err(error) => return refuse(error.to_string(), START),
+        };
+        let SavedModel { sensor: of, model } = SavedModel::parse(&text, &place)?;
+        if of != sensor {
+            let hint = "name the file of each sensor by background.start of its link";
+            return refuse(format!("the model is that of sensor {of}"), hint);
+        }
+        let (beams, unit_mm) = (variant.beams(), unit.map_or(model.unit_mm, |unit| unit.mm()));
+        if usize::from(model.count) != beams || model.unit_mm != unit_mm {
+            let what = format!(
+                "the model has {} beams in units of {} mm, the link is configured for {beams} beams in units of \
+                 {unit_mm} mm",
+                model.count, model.unit_mm
+            );
+            return refuse(what, "begin with \"empty\", and save a model of the sensor as it is now");
+        }
+        self.model = Some(Box::new(model));
+        Ok(())
+    }
+}
+
+impl Default for Background {
+    fn default() -> Self {
+        Background {
+            is_kept: true,
+            learning: Learning::default(),
+            file: None,
+            model: None,
+            every_scan: false,
+        }
+    }
+}
+
+/// What a background may begin with.
+pub(crate) const START: &str =
+    "\"empty\", \"first-scan\", or a file that `scanhub background SENSOR save` has written";

@@ -1,0 +1,100 @@
+//! What users want of one link, in the link's thread: each request is taken, done and answered. What pausing does to a
+//! sensor is the session's business, what a reset does to a background the pipeline's.
+
+use std::os::fd::{AsFd, BorrowedFd};
+use std::sync::Arc;
+use std::sync::mpsc::{Receiver, Sender};
+
+use lms::{Control, Session};
+use schema::{Failure, Kind, Verb, Wake};
+
+use super::{Bell, Order, Outcome};
+use crate::clock;
+use crate::link::LinkThread;
+
+/// The link's end of the way from the desk.
+pub(crate) struct Orders {
+    pub(super) sensor: String,
+    pub(super) paused: bool,
+    pub(super) queue: Receiver<Order>,
+    pub(super) bell: Arc<Bell>,
+    pub(super) outcomes: Sender<(u64, Outcome)>,
+    pub(super) desk: Arc<Bell>,
+}
+
+/// Who can be told to pause, to resume, to begin anew.
+pub(crate) enum Flow<'a> {
+    /// A session with a sensor.
+    Session(&'a mut Session),
+    /// Nobody, for now.
+    Away,
+    /// Nobody, ever.
+    Recording,
+}
+
+impl LinkThread<'_> {
+    /// Does what users asked for.
+    pub(crate) fn obey(&mut self, mut flow: Flow<'_>) {
+        while let Some(order) = self.orders.take() {
+            let control = match order.verb {
+                Verb::Pause => Some(Control::Pause),
+                Verb::Resume => Some(Control::Resume),
+                Verb::Resync => Some(Control::Resync),
+                Verb::Show | Verb::Reset | Verb::Freeze | Verb::Thaw | Verb::Load => None,
+            };
+            let outcome = match control {
+                Some(control) => self.orders.control(control, &mut flow).map(|()| None),
+                None => self.pipeline.obey(&self.link.name, order.verb, &order.model),
+            };
+            let now = clock::now();
+            if self.topics.background(&mut self.pipeline, now) {
+                self.topics.wake(Wake::Status);
+            }
+            self.orders.answer(order.number, outcome);
+        }
+    }
+}
+
+impl Orders {
+    /// Whether a user wants nothing of the sensor for now: a pause outlasts an absence of the port.
+    pub(crate) fn is_paused(&self) -> bool {
+        self.paused
+    }
+
+    fn control(&mut self, control: Control, flow: &mut Flow<'_>) -> Result<(), Failure> {
+        match flow {
+            Flow::Recording => {
+                return Err(self.refusal("a recording plays on, only its background can be asked for"));
+            }
+            Flow::Away if control == Control::Resync => return Err(self.refusal("the port is away")),
+            Flow::Away => {}
+            Flow::Session(session) => session.control(control, clock::now()),
+        }
+        self.paused = control == Control::Pause;
+        Ok(())
+    }
+
+    fn take(&self) -> Option<Order> {
+        self.bell.hush();
+        self.queue.try_recv().ok()
+    }
+
+    fn answer(&self, number: u64, outcome: Outcome) {
+        // A desk that is closed has no client that waits.
+        if self.outcomes.send((number, outcome)).is_ok() {
+            self.desk.ring();
+        }
+    }
+
+    fn refusal(&self, why: &str) -> Failure {
+        let hint = format!("`scanhub info {}` shows how it is", self.sensor);
+        Failure::new(Kind::Failed, format!("{}: {why}", self.sensor), hint)
+    }
+}
+
+impl AsFd for Orders {
+    /// Readable as long as an order waits.
+    fn as_fd(&self) -> BorrowedFd<'_> {
+        self.bell.0.as_fd()
+    }
+}

@@ -1,0 +1,172 @@
+//! What the hub makes of each scan of a link: marks, zones, foreground. One after the other on the scan where it was
+//! decoded, each into the payload that is given. Refuses to know topics, and who listens.
+
+use preprocess::background::{Mismatch, Model};
+use preprocess::marks::Finder;
+use preprocess::segments::Cutter;
+use preprocess::zones::Check;
+use schema::{Background, Failure, Foreground, Kind, Marks, Scan, Verb, Zones};
+
+use crate::config::Processing;
+
+/// The processors of one link. Suspect scans take the same way as clean ones: an obstacle counts also where it is only
+/// suspected, and a background needs hundreds of scans in agreement, which the one bad one among them does not spoil.
+pub(crate) struct Pipeline {
+    zones: Check,
+    marks: Finder,
+    background: Option<Kept>,
+    /// Where a payload is written that nobody wants, or for which there is no memory.
+    spare: Spare,
+}
+
+/// A background, and what is known of it outside.
+struct Kept {
+    model: Box<Model>,
+    cutter: Cutter,
+    every_scan: bool,
+    /// The generation that was published last.
+    published: Option<u32>,
+    /// Beams and unit of the model, as far as something was learned or loaded.
+    shape: Option<(u16, u8)>,
+}
+
+#[derive(Default)]
+struct Spare {
+    zones: Zones,
+    foreground: Box<Foreground>,
+}
+
+/// Where to write what a scan tells; nothing where nobody wants it or there is no memory.
+#[derive(Default)]
+pub(crate) struct Outputs<'a> {
+    pub(crate) zones: Option<&'a mut Zones>,
+    pub(crate) marks: Option<&'a mut Marks>,
+    pub(crate) foreground: Option<&'a mut Foreground>,
+}
+
+impl Pipeline {
+    /// The processors as configured, with the model to begin with.
+    pub(crate) fn new(processing: &Processing) -> Pipeline {
+        let Processing { pose, zones, marks, background } = processing;
+        let background = background.is_kept.then(|| {
+            let mut kept = Kept {
+                model: Box::new(Model::new(background.learning)),
+                cutter: Cutter::new(*pose),
+                every_scan: background.every_scan,
+                published: None,
+                shape: None,
+            };
+            if let Some(model) = &background.model {
+                // Before the first scan every model is taken.
+                let _ = kept.load(model);
+            }
+            kept
+        });
+        Pipeline {
+            zones: Check::new(*pose, &zones.settings()),
+            marks: Finder::new(*marks),
+            background,
+            spare: Spare::default(),
+        }
+    }
+
+    /// Reads `scan`. What has a memory learns from it, whoever wants to know. A model that does not fit the scan begins
+    /// anew; then it is told why.
+    pub(crate) fn update(&mut self, scan: &Scan, out: Outputs<'_>) -> Option<Mismatch> {
+        self.zones.update(scan, out.zones.unwrap_or(&mut self.spare.zones));
+        if let Some(marks) = out.marks {
+            self.marks.update(scan, marks);
+        }
+        self.background.as_mut()?.update(scan, out.foreground, &mut self.spare.foreground)
+    }
+
+    /// What to say of the zones when scans stay out.
+    pub(crate) fn stale(&mut self, out: &mut Zones) {
+        self.zones.stale(out);
+    }
+
+    /// Whether there are foreground and background at all.
+    pub(crate) fn keeps_background(&self) -> bool {
+        self.background.is_some()
+    }
+
+    /// Whether the model is published with every scan.
+    pub(crate) fn shows_every_scan(&self) -> bool {
+        self.background.as_ref().is_some_and(|kept| kept.every_scan)
+    }
+
+    /// Whether the model has a generation that was not published.
+    pub(crate) fn is_news(&self) -> bool {
+        self.background.as_ref().is_some_and(|kept| kept.published != Some(kept.model.generation()))
+    }
+
+    /// Writes the model, which is to be published, into `out`, if one is kept.
+    pub(crate) fn show(&mut self, out: &mut Background) {
+        if let Some(kept) = &mut self.background {
+            kept.model.show(out);
+            kept.published = Some(out.generation);
+        }
+    }
+
+    /// Does what a user asks of the background of `sensor`; the model, for [`Verb::Show`]. `model` is that of a request
+    /// to load.
+    ///
+    /// [`Kind::Configuration`] if none is kept, or if `model` is another sensor's.
+    pub(crate) fn obey(
+        &mut self,
+        sensor: &str,
+        verb: Verb,
+        model: &Background,
+    ) -> Result<Option<Box<Background>>, Failure> {
+        let Some(kept) = &mut self.background else {
+            let message = format!("{sensor}: background.method is \"off\", no background is kept");
+            let hint = format!("run the hub with --set link.{sensor}.background.method=multi, or paper");
+            return Err(Failure::new(Kind::Configuration, message, hint));
+        };
+        match verb {
+            Verb::Show => {
+                let mut shown = Box::<Background>::default();
+                kept.model.show(&mut shown);
+                return Ok(Some(shown));
+            }
+            Verb::Reset => kept.model.reset(),
+            Verb::Freeze => kept.model.freeze(),
+            Verb::Thaw => kept.model.thaw(),
+            Verb::Load => kept.load(model).map_err(|mismatch| {
+                let hint =
+                    "a model fits scans of its own resolution and unit: save one of this sensor as it is now";
+                Failure::new(Kind::Configuration, format!("{sensor}: {mismatch}"), hint)
+            })?,
+            // The session's business.
+            Verb::Pause | Verb::Resume | Verb::Resync => {}
+        }
+        Ok(None)
+    }
+}
+
+impl Kept {
+    fn load(&mut self, model: &Background) -> Result<(), Mismatch> {
+        self.model.load(model)?;
+        self.shape = Some((model.count, model.unit_mm));
+        Ok(())
+    }
+
+    fn update(
+        &mut self,
+        scan: &Scan,
+        out: Option<&mut Foreground>,
+        spare: &mut Foreground,
+    ) -> Option<Mismatch> {
+        let before = self.model.generation();
+        match out {
+            Some(out) => {
+                self.model.update(scan, out);
+                self.cutter.update(scan, out);
+            }
+            None => self.model.update(scan, spare),
+        }
+        let sensor = (scan.beams() as u16, scan.unit_mm);
+        let model = self.shape.replace(sensor).filter(|shape| *shape != sensor)?;
+        (self.model.generation() != before).then_some(Mismatch { model, sensor })
+    }
+}

@@ -1,0 +1,121 @@
+//! How a background is learned, and what that means for scans of one shape. Refuses to know where the settings come
+//! from.
+
+use schema::Scan;
+
+/// How a background is learned.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Settings {
+    /// By which method.
+    pub method: Method,
+    /// Readings at most so far apart, in mm, are of one surface. None: 30, in cm mode 60.
+    pub threshold_mm: Option<u16>,
+    /// The same for a reading and its candidate (`paper`). None: 30, in cm mode 60.
+    pub candidate_mm: Option<u16>,
+    /// Scans until a surface is background. None: 375 at half degrees, 750 at 1, 188 at a quarter, which are 10 s at
+    /// the full rate; `multi` takes half of it.
+    pub scans: Option<u32>,
+    /// What a candidate is compared with (`paper`).
+    pub candidate: Candidate,
+    /// What is known at the start.
+    pub start: Start,
+    /// A beam from which nothing came back has a far background, instead of telling nothing.
+    pub no_return_is_far: bool,
+}
+
+/// The ways to learn a background.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum Method {
+    /// One background a beam, replaced by what was read often enough in a row.
+    Paper,
+    /// Several surfaces a beam, and neighbours that must agree before something is in the foreground.
+    #[default]
+    Multi,
+}
+
+/// What the readings of a run are compared with.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum Candidate {
+    /// The first one: somebody who walks straight at the sensor never becomes background.
+    #[default]
+    First,
+    /// The one before: drifts along with whatever moves slowly.
+    Latest,
+}
+
+/// What is known at the start and after each reset.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum Start {
+    /// Nothing.
+    #[default]
+    Empty,
+    /// What the first scan shows, as soon as it is over; beams without a reading in it begin empty.
+    FirstScan,
+}
+
+/// The settings in the units of the scans.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Limits {
+    /// In device units; so low that no range is near [`schema::Background::FAR`].
+    pub(super) threshold: u16,
+    /// In device units.
+    pub(super) candidate: u16,
+    /// At least 1.
+    pub(super) scans: u32,
+    pub(super) latest: bool,
+    /// Angle between two beams in 1/1000 degree.
+    pub(super) step_mdeg: u16,
+    /// Millimetres per device unit, at least 1.
+    pub(super) unit_mm: u16,
+}
+
+/// Default of both thresholds: six standard deviations of a range (the paper names no value).
+const THRESHOLD_MM: u16 = 30;
+/// In cm mode: quantisation comes on top.
+const THRESHOLD_CM_MODE_MM: u16 = 60;
+/// Mirror turns in 10 s (75 Hz): as many scans at 1 degree, half of them at half degrees.
+const TURNS: u32 = 750;
+/// No two ranges are farther apart; [`schema::Background::FAR`] is, from all of them.
+const FARTHEST: u16 = 0x7FFF;
+
+impl Limits {
+    pub(super) fn of(settings: &Settings, scan: &Scan) -> Limits {
+        let unit_mm = u16::from(scan.unit_mm.max(1));
+        let default_mm = if unit_mm >= 10 { THRESHOLD_CM_MODE_MM } else { THRESHOLD_MM };
+        let units = |mm: Option<u16>| (mm.unwrap_or(default_mm) / unit_mm).min(FARTHEST);
+        let ten_seconds = (TURNS * u32::from(scan.step_mdeg)).div_ceil(1000);
+        let scans = match settings.method {
+            Method::Paper => ten_seconds,
+            Method::Multi => ten_seconds / 2,
+        };
+        Limits {
+            threshold: units(settings.threshold_mm),
+            candidate: units(settings.candidate_mm),
+            scans: settings.scans.unwrap_or(scans).max(1),
+            latest: settings.candidate == Candidate::Latest,
+            step_mdeg: scan.step_mdeg,
+            unit_mm,
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn defaults_go_by_unit_and_resolution() {
+        let limits = |settings, unit_mm, step_mdeg| {
+            let limits = Limits::of(&settings, &Scan { unit_mm, step_mdeg, ..Scan::default() });
+            (limits.threshold, limits.candidate, limits.scans)
+        };
+        let paper = Settings { method: Method::Paper, ..Settings::default() };
+        assert_eq!(limits(paper, 1, 500), (30, 30, 375));
+        assert_eq!(limits(paper, 10, 1000), (6, 6, 750));
+        assert_eq!(limits(paper, 1, 250), (30, 30, 188));
+        assert_eq!(limits(Settings::default(), 1, 500).2, 187);
+        let own = Settings { threshold_mm: Some(45), candidate_mm: Some(u16::MAX), scans: Some(0), ..paper };
+        assert_eq!(limits(own, 10, 500), (4, 6553, 1));
+        assert_eq!(limits(own, 0, 0), (45, FARTHEST, 1));
+    }
+}

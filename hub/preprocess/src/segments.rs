@@ -1,0 +1,148 @@
+//! Which foreground beams belong together, and where what they see is. Refuses to know why a beam is in the
+//! foreground, and what a segment is.
+
+use schema::{BEAMS, Foreground, Pose, Scan, Segment};
+
+/// Cuts the foreground of one sensor into segments.
+///
+/// Points are computed in 64-bit floating point and rounded to mm: its four basic operations and the square root are
+/// the same on every machine.
+pub struct Cutter {
+    pose: Pose,
+    /// First angle and step of the scans that the tables below are for.
+    angles: Option<(i32, u16)>,
+    /// Where each beam points in the robot's frame: a unit vector.
+    directions: [(f64, f64); BEAMS],
+    /// 2 (1 - cos step): what the law of cosines says of two neighbouring beams.
+    spread: f64,
+    /// How far apart two neighbouring points of one surface are at most, per mm of range.
+    slope: f64,
+}
+
+/// A surface that is seen at a flatter angle than this falls apart into its points.
+const FLATTEST_DEG: f64 = 10.0;
+/// Noise of two ranges, on top, in mm.
+const NOISE_MM: f64 = 15.0;
+
+impl Cutter {
+    /// For a sensor that sits at `pose`.
+    pub fn new(pose: Pose) -> Cutter {
+        Cutter { pose, angles: None, directions: [(0.0, 0.0); BEAMS], spread: 0.0, slope: 0.0 }
+    }
+
+    /// Fills in the segments of `foreground`, which was made from `scan`, and writes every byte of them.
+    ///
+    /// Two foreground beams belong together if they are neighbours and their points lie as near to each other as those
+    /// of a surface seen at 10 degrees: r sin(step) / sin(10 degrees - step) + 15 mm, r being the first one's range.
+    pub fn update(&mut self, scan: &Scan, foreground: &mut Foreground) {
+        self.point(scan);
+        let unit_mm = f64::from(scan.unit_mm);
+        let (mut segments, mut left_out) = (0, 0_u8);
+        let mut put = |open: &Open, pose: &Pose| match foreground.segment_array.get_mut(segments) {
+            Some(segment) => {
+                *segment = open.close(pose, unit_mm);
+                segments += 1;
+            }
+            None => left_out = left_out.saturating_add(1),
+        };
+        let mut open: Option<Open> = None;
+        let mut ranges = foreground.range_array.iter();
+        for (byte, &bits) in foreground.bit_array.iter().enumerate() {
+            let mut rest = bits;
+            while rest != 0 {
+                let beam = 8 * byte + rest.trailing_zeros() as usize;
+                rest &= rest - 1;
+                let (Some(&range), Some(&(x, y))) = (ranges.next(), self.directions.get(beam)) else { break };
+                let range_mm = f64::from(range) * unit_mm;
+                let point = (range_mm * x, range_mm * y);
+                match &mut open {
+                    Some(open) if open.last + 1 == beam && self.joins(open.last_mm, range_mm) => {
+                        open.add(beam, range, range_mm, point);
+                    }
+                    _ => {
+                        if let Some(done) = open.replace(Open::new(beam, range, range_mm, point)) {
+                            put(&done, &self.pose);
+                        }
+                    }
+                }
+            }
+        }
+        if let Some(done) = open {
+            put(&done, &self.pose);
+        }
+        foreground.segments = segments as u16;
+        foreground.left_out = left_out;
+        foreground.segment_array[segments..].fill(Segment::default());
+    }
+
+    /// A point at `next_mm` on the next beam belongs to one at `range_mm`.
+    fn joins(&self, range_mm: f64, next_mm: f64) -> bool {
+        let most = range_mm * self.slope + NOISE_MM;
+        (range_mm - next_mm) * (range_mm - next_mm) + range_mm * next_mm * self.spread <= most * most
+    }
+
+    /// Makes the tables for scans with the angles of `scan`.
+    fn point(&mut self, scan: &Scan) {
+        let angles = Some((scan.first_angle_mdeg, scan.step_mdeg));
+        if self.angles == angles {
+            return;
+        }
+        self.angles = angles;
+        for (i, direction) in self.directions.iter_mut().enumerate() {
+            let angle_mdeg = i64::from(scan.first_angle_mdeg) + i as i64 * i64::from(scan.step_mdeg);
+            *direction = self.pose.direction((angle_mdeg % 360_000) as i32);
+        }
+        let step = (f64::from(scan.step_mdeg) / 1000.0).to_radians();
+        self.spread = 2.0 * (1.0 - step.cos());
+        // Steps of 10 degrees and more are no scanner's; nothing but the noise joins them.
+        let flattest = FLATTEST_DEG.to_radians();
+        self.slope = if step < flattest { step.sin() / (flattest - step).sin() } else { 0.0 };
+    }
+}
+
+/// A segment that may go on.
+struct Open {
+    first: usize,
+    last: usize,
+    nearest: u16,
+    last_mm: f64,
+    /// As seen from the sensor, in the directions of the robot's frame.
+    first_point: (f64, f64),
+    last_point: (f64, f64),
+    sum: (f64, f64),
+}
+
+impl Open {
+    fn new(beam: usize, range: u16, range_mm: f64, point: (f64, f64)) -> Open {
+        Open {
+            first: beam,
+            last: beam,
+            nearest: range,
+            last_mm: range_mm,
+            first_point: point,
+            last_point: point,
+            sum: point,
+        }
+    }
+
+    fn add(&mut self, beam: usize, range: u16, range_mm: f64, point: (f64, f64)) {
+        self.last = beam;
+        self.nearest = self.nearest.min(range);
+        self.last_mm = range_mm;
+        self.last_point = point;
+        self.sum = (self.sum.0 + point.0, self.sum.1 + point.1);
+    }
+
+    fn close(&self, pose: &Pose, unit_mm: f64) -> Segment {
+        let (dx, dy) = (self.last_point.0 - self.first_point.0, self.last_point.1 - self.first_point.1);
+        let beams = (self.last - self.first + 1) as f64;
+        Segment {
+            first: self.first as u16,
+            last: self.last as u16,
+            nearest: self.nearest,
+            width: ((dx * dx + dy * dy).sqrt() / unit_mm).round() as u16,
+            x_mm: (1000.0 * pose.x_m + self.sum.0 / beams).round() as i32,
+            y_mm: (1000.0 * pose.y_m + self.sum.1 / beams).round() as i32,
+        }
+    }
+}

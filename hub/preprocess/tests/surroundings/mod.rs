@@ -1,0 +1,99 @@
+//! Scans of made-up surroundings for the tests: beams with one to three surfaces between which they flip, something
+//! that comes and goes, codes, zeroes, noise with outliers. As unkind as a room can be, and more; not a simulation.
+
+use schema::{BEAMS, Scan};
+
+/// Angles, unit and bits of a scan.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(crate) struct Shape {
+    pub(crate) count: u16,
+    pub(crate) first_angle_mdeg: i32,
+    pub(crate) step_mdeg: u16,
+    pub(crate) unit_mm: u8,
+    pub(crate) range_bits: u8,
+}
+
+impl Shape {
+    /// One of those that the sensors have.
+    pub(crate) fn any(random: &mut fastrand::Rng) -> Shape {
+        let (count, first_angle_mdeg, step_mdeg) =
+            [(181, 0, 1000), (361, 0, 500), (101, 40_000, 1000), (201, 40_000, 500), (401, 40_000, 250)]
+                [random.usize(..5)];
+        let (unit_mm, range_bits) = (*random.choice(&[1, 10]).unwrap(), random.u8(13..=15));
+        Shape { count, first_angle_mdeg, step_mdeg, unit_mm, range_bits }
+    }
+}
+
+/// Surroundings that are looked at scan by scan.
+pub(crate) struct Surroundings {
+    pub(crate) shape: Shape,
+    random: fastrand::Rng,
+    /// Ranges in mm of the surfaces of each beam.
+    beams: Vec<Vec<f64>>,
+    /// Something before them: its first beam, its beams, its range in mm.
+    body: (f64, usize, f64),
+}
+
+impl Surroundings {
+    pub(crate) fn new(shape: Shape, seed: u64) -> Surroundings {
+        let mut random = fastrand::Rng::with_seed(seed);
+        let mut wall_mm = 3_000.0;
+        let beams = (0..shape.count)
+            .map(|_| {
+                wall_mm += 80.0 * (random.f64() - 0.5);
+                let surfaces = if random.u8(..4) == 0 { random.usize(2..=3) } else { 1 };
+                (0..surfaces).map(|n| wall_mm + 170.0 * n as f64 * random.f64()).collect()
+            })
+            .collect();
+        Surroundings { shape, random, beams, body: (0.0, 6, 1_500.0) }
+    }
+
+    /// The next scan.
+    pub(crate) fn next(&mut self) -> Scan {
+        let Surroundings { shape, random, beams, body } = self;
+        let mut scan = Scan {
+            count: shape.count,
+            unit_mm: shape.unit_mm,
+            range_bits: shape.range_bits,
+            first_angle_mdeg: shape.first_angle_mdeg,
+            step_mdeg: shape.step_mdeg,
+            ..Scan::default()
+        };
+        body.0 = (body.0 + random.f64() - 0.3).rem_euclid(BEAMS as f64);
+        body.2 = (body.2 + 30.0 * (random.f64() - 0.5)).clamp(100.0, 3_200.0);
+        if random.u16(..200) == 0 {
+            body.1 = random.usize(..9);
+        }
+        for (i, surfaces) in beams.iter_mut().enumerate() {
+            if random.u16(..4_000) == 0 {
+                surfaces[0] = 500.0 + 4_000.0 * random.f64();
+            }
+            let before = (body.0 as usize..body.0 as usize + body.1).contains(&i);
+            let range_mm = if before { body.2 } else { *random.choice(surfaces.iter()).unwrap() };
+            let noise_mm = (0..4).map(|_| random.f64() - 0.5).sum::<f64>() * 14.0;
+            let max = ((1_u32 << shape.range_bits) - 1) as u16;
+            scan.range_array[i] = match random.u16(..1_000) {
+                0..10 => max - random.u16(..9),
+                10..16 => 0,
+                16..40 => (range_mm / f64::from(shape.unit_mm)) as u16 + random.u16(..90),
+                // Such beams look through a window.
+                _ if i % 40 < 3 => max - 8 * u16::from(i % 3 == 0),
+                _ => ((range_mm + noise_mm) / f64::from(shape.unit_mm)).max(0.0) as u16,
+            };
+        }
+        scan
+    }
+}
+
+/// What a scan says of a beam: its range in mm, that nothing is near (infinite), or nothing.
+pub(crate) fn reading_mm(scan: &Scan, i: usize, no_return_is_far: bool) -> Option<f64> {
+    let max = 2_f64.powi(i32::from(scan.range_bits)) - 1.0;
+    let value = f64::from(scan.range_array[i]);
+    if value == max - 8.0 || value == max && no_return_is_far {
+        Some(f64::INFINITY)
+    } else if value > max - 8.0 {
+        None
+    } else {
+        Some(value * f64::from(scan.unit_mm))
+    }
+}

@@ -1,0 +1,255 @@
+//! What one beam makes of the rays that its spot covers: an echo from one surface, or from two of which it tells one,
+//! the other or something between. Knows neither units nor words.
+
+use crate::layers::Dice;
+use crate::look::Met;
+use crate::scene::Surface;
+use crate::shape::Shape;
+use crate::view::{Face, Hit, Kind, RAY_STEP, REACH, View};
+
+/// What comes back.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(crate) struct Echo {
+    /// How far away; infinite if nothing comes back.
+    pub(crate) range_mm: f64,
+    /// How much, beside a white surface at 1 m on which the beam falls squarely.
+    pub(crate) signal: f64,
+    /// Share of the light that fell on reflectors.
+    pub(crate) bright: f64,
+    /// Whether the spot met two surfaces far apart.
+    pub(crate) torn: bool,
+    /// What is true.
+    pub(crate) met: Met,
+}
+
+/// What the spot has of one face.
+#[derive(Clone, Copy)]
+struct Part<'a> {
+    face: Option<&'a Face>,
+    hit: Hit,
+    weight: f64,
+}
+
+impl Part<'_> {
+    fn is_reflector(&self) -> bool {
+        self.face.is_some_and(|face| face.surface == Surface::Reflector)
+    }
+
+    /// What it sends back beside the other parts of the spot.
+    fn echo(&self) -> f64 {
+        self.weight * if self.is_reflector() { OUTSHINES } else { 1.0 }
+    }
+
+    /// What the beam meets, if it meets this part alone. A thing that moved away is like any surface that was
+    /// uncovered: new to the beam, but not nearer than what it met before.
+    fn kind(&self) -> Kind {
+        match self.face.map_or(Kind::Static, |face| face.kind) {
+            Kind::Box { since_ns } if self.hit.since_ns >= since_ns => Kind::Static,
+            kind => kind,
+        }
+    }
+}
+
+/// The echo of the beam at `angle_mdeg`; without `wide` that of a line, else that of a spot.
+pub(crate) fn echo(view: &View, angle_mdeg: i32, wide: bool, dice: &Dice) -> Echo {
+    let rays = view.around(angle_mdeg);
+    let parts = if wide { spread(view, rays, dice) } else { vec![part(view, &rays[REACH], 1.0)] };
+    let total: f64 = parts.iter().map(|part| part.weight).sum();
+    let nearest_mm = parts.iter().map(|part| part.hit.range_mm).fold(f64::INFINITY, f64::min);
+    let is_near = |part: &&Part| part.hit.range_mm <= nearest_mm + CONTINUOUS_MM;
+    let near_echo: f64 = parts.iter().filter(is_near).map(Part::echo).sum();
+    let near = heaviest(parts.iter().filter(is_near));
+    let far = heaviest(parts.iter().filter(|part| !is_near(part)));
+    let all_echo: f64 = parts.iter().map(Part::echo).sum();
+    let (face, range_mm) = told(near, far, near_echo / all_echo, dice);
+    let lit = parts.iter().filter(|part| part.is_reflector());
+    let bright = lit.map(|part| part.weight).sum::<f64>() / total;
+    Echo {
+        range_mm,
+        signal: face.map_or(0.0, |face| signal(face, range_mm, angle_mdeg)),
+        bright,
+        torn: bright == 0.0 && far.is_some_and(|far| far.1 - nearest_mm > TORN_MM),
+        met: met(&parts),
+    }
+}
+
+/// Face and range of the part with most of the light.
+fn heaviest<'a>(parts: impl Iterator<Item = &'a Part<'a>>) -> Option<(Option<&'a Face>, f64)> {
+    parts.max_by(|a, b| a.echo().total_cmp(&b.echo())).map(|part| (part.face, part.hit.range_mm))
+}
+
+/// What a spot on a `near` and perhaps a `far` face tells, the nearer one having `share` of its light.
+fn told<'a>(
+    near: Option<(Option<&'a Face>, f64)>,
+    far: Option<(Option<&'a Face>, f64)>,
+    share: f64,
+    dice: &Dice,
+) -> (Option<&'a Face>, f64) {
+    let near = near.unwrap_or((None, f64::INFINITY));
+    let Some(far) = far else { return near };
+    let leans = (share - 0.5) / (1.0 - 2.0 * CLEAR) + 0.5;
+    let tells = if dice.surface < leans { near } else { far };
+    let undecided = (0.0..1.0).contains(&leans) && far.1.is_finite();
+    if undecided && dice.between < MIXED {
+        (tells.0, near.1 + (far.1 - near.1) * dice.between / MIXED)
+    } else {
+        tells
+    }
+}
+
+/// The faces that the spot covers, with the light that falls on each. The spot has a Gaussian profile; it ends where
+/// the light is down to 1/e^2.
+fn spread<'a>(view: &'a View, rays: &'a [Hit], dice: &Dice) -> Vec<Part<'a>> {
+    if rays.iter().all(|hit| hit.is_of(&rays[REACH])) {
+        return vec![part(view, &rays[REACH], 1.0)];
+    }
+    let mut parts: Vec<Part> = Vec::with_capacity(2);
+    let off = MIRROR_STEPS * dice.mirror;
+    // From the middle outwards: of each face the ray nearest to the middle stands for it.
+    for number in 0..rays.len() {
+        let aside = number.div_ceil(2);
+        let ray = if number % 2 == 0 { REACH + aside } else { REACH - aside };
+        let hit = &rays[ray];
+        let angle = (ray as f64 - REACH as f64 - off) * RAY_STEP;
+        let within = angle.abs() / (SPOT_MM / hit.range_mm + SPOT_PER_MM) * 2.0;
+        if within > 1.0 {
+            continue;
+        }
+        let new = part(view, hit, (-2.0 * within * within).exp());
+        match parts.iter_mut().find(|part| part.hit.is_of(hit)) {
+            Some(part) => part.weight += new.weight,
+            None => parts.push(new),
+        }
+    }
+    if parts.is_empty() {
+        parts.push(part(view, &rays[REACH], 1.0));
+    }
+    parts
+}
+
+fn part<'a>(view: &'a View, hit: &Hit, weight: f64) -> Part<'a> {
+    Part { face: view.face(hit), hit: *hit, weight }
+}
+
+/// The truth of a spot of `parts`.
+fn met(parts: &[Part]) -> Met {
+    let kinds = || parts.iter().map(Part::kind);
+    let since_ns = parts.iter().map(|part| part.hit.since_ns).max().unwrap_or(0);
+    let youngest = kinds().filter_map(|kind| match kind {
+        Kind::Box { since_ns } => Some(since_ns),
+        _ => None,
+    });
+    let is_box = |kind| matches!(kind, Kind::Box { .. });
+    if kinds().all(|kind| kind == Kind::Static) {
+        Met::Static { since_ns }
+    } else if kinds().all(|kind| kind == Kind::Person) {
+        Met::Person
+    } else if kinds().all(is_box) {
+        Met::Box { since_ns: youngest.max().unwrap_or(0) }
+    } else {
+        Met::Grazed
+    }
+}
+
+/// What a face sends back from `range_mm`.
+fn signal(face: &Face, range_mm: f64, angle_mdeg: i32) -> f64 {
+    let white = match face.surface {
+        Surface::Plain => 0.5,
+        Surface::Dark => 0.02,
+        // A mirror of glass, a reflector: always enough.
+        Surface::Reflector | Surface::Glass => return f64::INFINITY,
+    };
+    let (sin, cos) = (f64::from(angle_mdeg) / 1000.0).to_radians().sin_cos();
+    let square = match face.shape {
+        Shape::Wall { .. } => face.shape.squareness((cos, sin)),
+        // The spot on a post has always a part that it falls on squarely.
+        Shape::Post { .. } => 1.0,
+    };
+    white * square / (range_mm / 1000.0).powi(2)
+}
+
+/// Diameter of the spot at the window, and what it grows with each millimetre of range.
+const SPOT_MM: f64 = 10.0;
+const SPOT_PER_MM: f64 = 0.0045;
+/// How unsteady the mirror is, in rays: 0.02 degrees. So the share of a surface at an edge is another one each turn.
+const MIRROR_STEPS: f64 = 0.32;
+/// Surfaces nearer to each other than this are one to the sensor, such as the two sides of a corner.
+const CONTINUOUS_MM: f64 = 40.0;
+/// Surfaces further apart than this can cost the beam its signal.
+const TORN_MM: f64 = 300.0;
+/// How much brighter a reflector is than other surfaces: in recordings beams that only touch one tell its range.
+const OUTSHINES: f64 = 100.0;
+/// A surface with less than this share of the light is never told.
+const CLEAR: f64 = 0.17;
+/// Share of the undecided readings that lie between the surfaces: two pulses that the sensor takes for one.
+const MIXED: f64 = 0.3;
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const DICE: Dice = Dice::CENTRE;
+
+    fn view(faces: &[(Shape, Surface, Kind)]) -> View {
+        let mut view = View::empty();
+        for &(shape, surface, kind) in faces {
+            view.draw(Face { shape, surface, kind });
+        }
+        view
+    }
+
+    fn wall(from_x: f64, to_x: f64, y: f64) -> Shape {
+        Shape::Wall { from: (from_x, y), to: (to_x, y) }
+    }
+
+    #[test]
+    fn a_single_surface_is_told_as_it_is_however_oblique() {
+        let view = view(&[(wall(-9_000.0, 9_000.0, 500.0), Surface::Plain, Kind::Static)]);
+        for angle_deg in 10..170 {
+            let sin = f64::from(angle_deg).to_radians().sin();
+            let echo = echo(&view, 1_000 * angle_deg, true, &DICE);
+            assert!((echo.range_mm - 500.0 / sin).abs() < 1e-6 && !echo.torn, "{angle_deg}: {echo:?}");
+        }
+    }
+
+    #[test]
+    fn an_edge_tells_one_the_other_or_between_and_is_grazed_if_somebody_makes_it() {
+        let edge = [
+            (wall(-2_000.0, 1.0, 3_000.0), Surface::Plain, Kind::Person),
+            (wall(-2_000.0, 2_000.0, 4_000.0), Surface::Plain, Kind::Static),
+        ];
+        let view = view(&edge);
+        let told = |surface, between| {
+            let dice = Dice { surface, between, ..DICE };
+            let echo = echo(&view, 90_000, true, &dice);
+            assert!(echo.torn && echo.met == Met::Grazed, "{echo:?}");
+            echo.range_mm.round()
+        };
+        assert_eq!((told(0.1, 0.9), told(0.9, 0.9), told(0.1, MIXED / 2.0)), (3_000.0, 4_000.0, 3_500.0));
+        assert_eq!(echo(&view, 90_000, false, &DICE).range_mm.round(), 3_000.0);
+        assert_eq!(echo(&view, 92_000, true, &DICE).met, Met::Person);
+        assert_eq!(echo(&view, 88_000, true, &DICE).met, Met::Static { since_ns: 0 });
+    }
+
+    #[test]
+    fn a_strip_brightens_with_the_light_that_falls_on_it() {
+        let view = view(&[
+            (wall(-25.0, 25.0, 4_000.0), Surface::Reflector, Kind::Static),
+            (wall(-900.0, 900.0, 4_010.0), Surface::Plain, Kind::Static),
+        ]);
+        let bright = |angle_mdeg| echo(&view, angle_mdeg, true, &DICE).bright;
+        assert!(
+            bright(90_000) > 0.95 && bright(90_500) > 0.0 && bright(90_500) < 0.5 && bright(91_000) == 0.0
+        );
+    }
+
+    #[test]
+    fn dark_and_oblique_send_little_back() {
+        let signal = |surface, angle_mdeg| {
+            echo(&view(&[(wall(-9e3, 9e3, 2e3), surface, Kind::Static)]), angle_mdeg, true, &DICE).signal
+        };
+        assert!((signal(Surface::Plain, 90_000) - 0.125).abs() < 1e-9);
+        assert!(signal(Surface::Dark, 90_000) < 0.1 * signal(Surface::Plain, 90_000));
+        assert!(signal(Surface::Plain, 20_000) < 0.1 * signal(Surface::Plain, 90_000));
+    }
+}

@@ -1,0 +1,128 @@
+//! A scene as a seed makes it, from the place of one sensor: what lies around it at a given time. Knows neither units nor
+//! words.
+
+use lms::Nanos;
+
+use crate::layers::Layers;
+use crate::look::Mark;
+use crate::people::{Person, jittered};
+use crate::scene::{Scene, Sun, Surface, Thing};
+use crate::shape::{Pose, Shape};
+use crate::view::{Face, Kind, View};
+
+/// A scene as a seed makes it.
+#[derive(Clone, Debug)]
+pub(crate) struct Stage {
+    pub(crate) layers: Layers,
+    sensor: Pose,
+    /// By how much all ranges of this sensor are off.
+    pub(crate) bias_mm: f64,
+    /// What never changes, drawn once.
+    still: View,
+    still_reflectors: Vec<Shape>,
+    changing: Vec<Thing>,
+    people: Vec<Person>,
+    pub(crate) suns: Vec<Sun>,
+}
+
+impl Stage {
+    /// `scene` as `seed` makes it, seen by its sensor number `sensor`.
+    pub(crate) fn new(scene: &Scene, seed: u64, sensor: u64) -> Stage {
+        let mut random = fastrand::Rng::with_seed(seed);
+        let people = scene.people.iter().map(|plan| Person::new(plan, &mut random)).collect();
+        let mut things = scene.things.clone();
+        for thing in &mut things {
+            let place = (thing.pose.x_mm, thing.pose.y_mm);
+            (thing.pose.x_mm, thing.pose.y_mm) = jittered(place, thing.jitter_mm, &mut random);
+        }
+        let (still_things, changing): (Vec<_>, Vec<_>) = things.into_iter().partition(Thing::is_still);
+        let bias = fastrand::Rng::with_seed(!seed ^ sensor << 32).f64();
+        let mut stage = Stage {
+            layers: scene.layers,
+            sensor: scene.sensors[sensor as usize],
+            bias_mm: scene.layers.bias_mm * (2.0 * bias - 1.0),
+            still: View::empty(),
+            still_reflectors: Vec::new(),
+            changing,
+            people,
+            suns: scene.suns.clone(),
+        };
+        for thing in still_things {
+            for shape in stage.seen(&thing, thing.pose) {
+                if thing.surface == Surface::Reflector {
+                    stage.still_reflectors.push(shape);
+                }
+                stage.still.draw(Face { shape, surface: thing.surface, kind: Kind::Static });
+            }
+        }
+        stage
+    }
+
+    /// The shapes of `thing` in the frame of the sensor, while it stands at `pose`.
+    fn seen(&self, thing: &Thing, pose: Pose) -> Vec<Shape> {
+        let place = |point| self.eye(pose.outward(point));
+        thing.shapes.iter().map(|shape| shape.placed(place)).collect()
+    }
+
+    /// A point of the world in the frame of the sensor: 0 degrees to its right, 90 ahead.
+    fn eye(&self, point: (f64, f64)) -> (f64, f64) {
+        let (ahead, left) = self.sensor.inward(point);
+        (-left, ahead)
+    }
+
+    /// The things that come, go or move, and the people, as they are at `time_ns`.
+    fn faces(&self, time_ns: Nanos) -> Vec<Face> {
+        let time_s = time_ns as f64 / 1e9;
+        let mut faces = Vec::new();
+        for thing in &self.changing {
+            let Some(spell) = thing.at(time_s) else { continue };
+            let kind = match nanos(spell.since_s) {
+                0 => Kind::Static,
+                since_ns => Kind::Box { since_ns },
+            };
+            let shapes = self.seen(thing, spell.pose);
+            faces.extend(shapes.into_iter().map(|shape| Face { shape, surface: thing.surface, kind }));
+        }
+        for legs in self.people.iter().filter_map(|person| person.legs(time_s)) {
+            let leg = |leg: Shape| Face {
+                shape: leg.placed(|point| self.eye(point)),
+                surface: Surface::Plain,
+                kind: Kind::Person,
+            };
+            faces.extend(legs.map(leg));
+        }
+        faces
+    }
+
+    /// What lies in each direction at `time_ns`.
+    pub(crate) fn view(&self, time_ns: Nanos) -> View {
+        let mut view = self.still.clone();
+        for face in self.faces(time_ns) {
+            view.draw(face);
+        }
+        for thing in &self.changing {
+            for spell in thing.left(time_ns as f64 / 1e9) {
+                for shape in self.seen(thing, spell.pose) {
+                    view.uncover(&shape, nanos(spell.since_s));
+                }
+            }
+        }
+        view
+    }
+
+    /// The middle of each reflector that can be seen at `time_ns`.
+    pub(crate) fn marks(&self, time_ns: Nanos) -> Vec<Mark> {
+        let view = self.view(time_ns);
+        let moving = self.faces(time_ns).into_iter().filter(|face| face.surface == Surface::Reflector);
+        let fronts = self.still_reflectors.iter().copied().chain(moving.map(|face| face.shape));
+        let marks = fronts.map(|shape| {
+            let (x, y) = shape.front();
+            Mark { angle_deg: y.atan2(x).to_degrees(), range_mm: x.hypot(y) }
+        });
+        marks.filter(|mark| view.reaches(mark.angle_deg, mark.range_mm)).collect()
+    }
+}
+
+fn nanos(time_s: f64) -> Nanos {
+    (time_s * 1e9).round() as Nanos
+}

@@ -1,0 +1,109 @@
+//! The worlds there are: some that a sensor's tests need, made of code, and scenes as data: those that the program
+//! brings along, and files. Knows where a world comes from, not what is in it.
+
+mod file;
+mod origin;
+
+use std::path::Path;
+use std::str::FromStr;
+use std::sync::Arc;
+
+use schema::{Failure, Kind};
+
+use crate::layers::Layers;
+use crate::scene::Scene;
+
+/// What a sensor can be put into.
+#[derive(Clone, Debug, PartialEq)]
+pub enum World {
+    /// Nothing within reach.
+    Empty,
+    /// A wall bent around the sensor so that every value is 640: its bytes are `80 02` throughout, so each beam but
+    /// the last ends in what a header begins with.
+    Wall640,
+    /// Words without meaning: every bit that the mode may set, at random.
+    Random,
+    /// Walls, things and people.
+    Scene(Arc<Scene>),
+}
+
+/// The scenes that the program brings along: name and text.
+const SCENES: [(&str, &str); 12] = [
+    ("room", include_str!("../../../tests/worlds/room.toml")),
+    ("bare", include_str!("../../../tests/worlds/bare.toml")),
+    ("fig8", include_str!("../../../tests/worlds/fig8.toml")),
+    ("standing", include_str!("../../../tests/worlds/standing.toml")),
+    ("approach", include_str!("../../../tests/worlds/approach.toml")),
+    ("door", include_str!("../../../tests/worlds/door.toml")),
+    ("corridor", include_str!("../../../tests/worlds/corridor.toml")),
+    ("glass", include_str!("../../../tests/worlds/glass.toml")),
+    ("sun", include_str!("../../../tests/worlds/sun.toml")),
+    ("chair", include_str!("../../../tests/worlds/chair.toml")),
+    ("strips", include_str!("../../../tests/worlds/strips.toml")),
+    ("crowd", include_str!("../../../tests/worlds/crowd.toml")),
+];
+
+impl World {
+    /// The names of all worlds that need no file.
+    pub fn names() -> impl Iterator<Item = &'static str> {
+        SCENES.iter().map(|(name, _)| *name).chain(["empty", "wall640", "random"])
+    }
+
+    /// The world that `text` describes in TOML; `name` is how failures call it.
+    ///
+    /// [`Kind::Configuration`] if it is none, with place, value and remedy.
+    pub fn of_toml(name: &str, text: &str) -> Result<World, Failure> {
+        file::parse(name, text).map(|scene| World::Scene(Arc::new(scene)))
+    }
+
+    /// How many sensors look at it.
+    pub fn sensors(&self) -> usize {
+        match self {
+            World::Scene(scene) => scene.sensors.len(),
+            _ => 1,
+        }
+    }
+
+    /// Its layers of noise, if it has any.
+    pub fn layers(&self) -> Option<Layers> {
+        match self {
+            World::Scene(scene) => Some(scene.layers),
+            _ => None,
+        }
+    }
+
+    /// The same world with other layers of noise; one without layers stays as it is.
+    pub fn with_layers(self, layers: Layers) -> World {
+        match self {
+            World::Scene(scene) => World::Scene(Arc::new(Scene { layers, ..Arc::unwrap_or_clone(scene) })),
+            other => other,
+        }
+    }
+}
+
+impl FromStr for World {
+    type Err = Failure;
+
+    /// The world of this name, else of this file.
+    ///
+    /// [`Kind::Configuration`] if it is neither, or if the file is wrong: then with the place and a remedy.
+    fn from_str(text: &str) -> Result<World, Failure> {
+        match text {
+            "empty" => Ok(World::Empty),
+            "wall640" => Ok(World::Wall640),
+            "random" => Ok(World::Random),
+            _ => match SCENES.iter().find(|(name, _)| *name == text) {
+                Some((name, contents)) => World::of_toml(name, contents),
+                None => World::of_toml(text, &read(text)?),
+            },
+        }
+    }
+}
+
+fn read(path: &str) -> Result<String, Failure> {
+    std::fs::read_to_string(Path::new(path)).map_err(|error| {
+        let names: Vec<_> = World::names().collect();
+        let message = format!("world {path:?} is not known, and as a file: {error}");
+        Failure::new(Kind::Configuration, message, format!("a TOML file, or one of: {}", names.join(", ")))
+    })
+}
