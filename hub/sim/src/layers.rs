@@ -13,8 +13,8 @@ pub struct Layers {
     pub sigma_mm: f64,
     /// Share of the readings whose deviation is [`TAIL_MM`] instead.
     pub tail: f64,
-    /// Whether a beam is as wide as a real one and tells something between two surfaces if it meets both; else it is a
-    /// line without width.
+    /// Whether a beam is as wide as a real one: where it meets two surfaces it tells one, the other or something between,
+    /// or too weak a signal if they are far apart. Else it is a line without width.
     pub spot: bool,
     /// Share of the beams that tell a code although they could tell a range.
     pub errors: f64,
@@ -145,7 +145,7 @@ impl Dice {
 }
 
 /// Standard normal, by the sum of twelve.
-pub(crate) fn gaussian(random: &mut fastrand::Rng) -> f64 {
+fn gaussian(random: &mut fastrand::Rng) -> f64 {
     (0..12).map(|_| random.f64()).sum::<f64>() - 6.0
 }
 
