@@ -5,6 +5,7 @@ mod background;
 mod configure;
 mod control;
 mod doctor;
+mod leds;
 mod probe;
 pub(crate) mod simulate;
 mod telegram;
@@ -20,6 +21,7 @@ use schema::{DEFAULT_DOMAIN, Domain, Environment, Failure};
 
 pub(crate) use background::Background;
 pub(crate) use control::Control;
+pub(crate) use leds::Leds;
 pub(crate) use telegram::{Telegram, Way};
 pub(crate) use zones::Zones;
 
@@ -104,6 +106,9 @@ pub(crate) enum Verb {
     Background(Background),
     /// The zones around the robot: which part of its view the robot itself takes
     Zones(Zones),
+    /// The zone verdict and the marks as lights: in the terminal, and on diodes of this machine
+    #[command(after_help = leds::MEANING)]
+    Leds(Leds),
 }
 
 #[derive(Args, Debug)]

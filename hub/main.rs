@@ -119,6 +119,9 @@ fn dispatch(cli: &Cli) -> Result<(), Failure> {
             clients::background(&options, &mut out, &*interrupt()?)
         }
         Verb::Zones(zones) => zones.run(everywhere, &mut out, &*interrupt()?),
+        Verb::Leds(leds) => {
+            clients::leds(&leds.options(everywhere)?, &mut out, &mut io::stderr(), &*interrupt()?)
+        }
     }
 }
 

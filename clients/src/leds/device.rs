@@ -1,0 +1,241 @@
+//! A light of the machine that Linux offers as a directory of files (Documentation/leds/leds-class.rst): switched on and
+//! off where it changed, taken up again when it comes back. Refuses to know what it stands for; time is an argument.
+
+use std::fs::{self, File};
+use std::io::{self, Write};
+use std::os::unix::fs::MetadataExt;
+use std::path::{Path, PathBuf};
+use std::time::{Duration, Instant};
+
+use schema::{Failure, Kind};
+
+/// How often a light that cannot be switched is tried again.
+const AGAIN: Duration = Duration::from_secs(1);
+
+/// One light.
+pub(crate) struct Device {
+    directory: PathBuf,
+    /// What it shows; nothing if that is not known.
+    lit: Option<bool>,
+    /// It could not be switched: when to try again.
+    again_at: Option<Instant>,
+}
+
+/// What became of a light.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub(crate) enum News {
+    /// It cannot be switched any more.
+    Failed(Failure),
+    /// It can be switched again.
+    Back,
+}
+
+impl Device {
+    /// The light `name` below `root`, switched off. Taken from whatever made it blink, because who names it wants it to
+    /// show something else; from what is the second value.
+    ///
+    /// [`Kind::Configuration`] with the lights that there are if it is not one of them, [`Kind::Failed`] with whose it
+    /// is if it may not be switched.
+    pub(crate) fn open(root: &Path, name: &str) -> Result<(Device, Option<String>), Failure> {
+        let directory = root.join(name);
+        let is_name = !name.is_empty() && !name.contains('/') && name != "." && name != "..";
+        if !is_name || !directory.join(BRIGHTNESS).is_file() {
+            let message = format!("{} has no light {name:?}", root.display());
+            return Err(Failure::new(Kind::Configuration, message, there_are(root)));
+        }
+        let mut device = Device { directory, lit: None, again_at: None };
+        let trigger = device.trigger();
+        device.take().map_err(|error| device.failure(&error))?;
+        Ok((device, trigger))
+    }
+
+    /// Switches it if it does not show `on` already; something to tell only if that went otherwise than before.
+    pub(crate) fn show(&mut self, on: bool, now: Instant) -> Option<News> {
+        if self.lit == Some(on) || self.again_at.is_some_and(|at| now < at) {
+            return None;
+        }
+        // What was away may have come back as it is after power-on.
+        let taken = if self.again_at.is_some() { self.take() } else { Ok(()) };
+        match taken.and_then(|()| self.switch(on)) {
+            Ok(()) => self.again_at.take().map(|_| News::Back),
+            Err(error) => {
+                self.lit = None;
+                let is_new = self.again_at.replace(now + AGAIN).is_none();
+                is_new.then(|| News::Failed(self.failure(&error)))
+            }
+        }
+    }
+
+    /// Ends a trigger, which would go on beside what is written, and switches the light off.
+    fn take(&mut self) -> io::Result<()> {
+        if self.trigger().is_some() {
+            // Not everybody who may switch a light may do this; switching it off ends a trigger, too.
+            let _ = write(&self.directory.join(TRIGGER), b"none\n");
+        }
+        self.switch(false)
+    }
+
+    fn switch(&mut self, on: bool) -> io::Result<()> {
+        let brightness = if on { self.brightest()? } else { 0 };
+        write(&self.directory.join(BRIGHTNESS), format!("{brightness}\n").as_bytes())?;
+        self.lit = Some(on);
+        Ok(())
+    }
+
+    fn brightest(&self) -> io::Result<u32> {
+        let text = fs::read_to_string(self.directory.join("max_brightness"))?;
+        text.trim().parse().map_err(|_| io::Error::other(format!("its max_brightness is {:?}", text.trim())))
+    }
+
+    /// What makes it blink by itself: the word in brackets, unless that is `none`.
+    fn trigger(&self) -> Option<String> {
+        let text = fs::read_to_string(self.directory.join(TRIGGER)).ok()?;
+        let (_, rest) = text.split_once('[')?;
+        let (active, _) = rest.split_once(']')?;
+        (active != "none").then(|| active.to_owned())
+    }
+
+    fn failure(&self, error: &io::Error) -> Failure {
+        let path = self.directory.join(BRIGHTNESS);
+        let message = format!("{} cannot be written: {error}", path.display());
+        let hint = match (error.kind(), fs::metadata(&path)) {
+            (io::ErrorKind::PermissionDenied, Ok(found)) => {
+                let (mode, uid, gid) = (found.mode() & 0o777, found.uid(), found.gid());
+                format!(
+                    "it is of user {uid} and group {gid} with mode {mode:04o}; a udev rule opens it: \
+                     SUBSYSTEM==\"leds\", ACTION==\"add\", RUN+=\"/bin/chgrp GROUP /sys%p/brightness\", \
+                     RUN+=\"/bin/chmod 0664 /sys%p/brightness\", with a GROUP that this user is in"
+                )
+            }
+            (io::ErrorKind::NotFound, _) => "it went away; it is tried again every second".to_owned(),
+            _ => "it is tried again every second".to_owned(),
+        };
+        Failure::new(Kind::Failed, message, hint)
+    }
+}
+
+/// Writes to a file that is there; one that went away is not made anew.
+fn write(path: &Path, content: &[u8]) -> io::Result<()> {
+    File::options().write(true).truncate(true).open(path)?.write_all(content)
+}
+
+fn there_are(root: &Path) -> String {
+    let entries = fs::read_dir(root).into_iter().flatten().flatten();
+    let mut names: Vec<_> = entries.map(|entry| entry.file_name().to_string_lossy().into_owned()).collect();
+    names.sort();
+    match &names[..] {
+        [] => "there are none: --led-root names another directory".to_owned(),
+        names => format!("there are {}", names.join(", ")),
+    }
+}
+
+const BRIGHTNESS: &str = "brightness";
+const TRIGGER: &str = "trigger";
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use std::sync::atomic::{AtomicU32, Ordering};
+
+    /// A directory that stands in for the kernel's.
+    struct Root(PathBuf);
+
+    impl Root {
+        fn new() -> Root {
+            static NEXT: AtomicU32 = AtomicU32::new(0);
+            let name = format!("shl{}-{}", std::process::id(), NEXT.fetch_add(1, Ordering::Relaxed));
+            let root = Root(std::env::temp_dir().join(name));
+            fs::create_dir(&root.0).unwrap();
+            root
+        }
+
+        fn plug(&self, name: &str, trigger: &str) {
+            fs::create_dir(self.0.join(name)).unwrap();
+            for (file, content) in [(BRIGHTNESS, "77\n"), ("max_brightness", "255\n"), (TRIGGER, trigger)] {
+                fs::write(self.0.join(name).join(file), content).unwrap();
+            }
+        }
+
+        fn unplug(&self, name: &str) {
+            fs::remove_dir_all(self.0.join(name)).unwrap();
+        }
+
+        fn brightness(&self, name: &str) -> String {
+            fs::read_to_string(self.0.join(name).join(BRIGHTNESS)).unwrap()
+        }
+    }
+
+    impl Drop for Root {
+        fn drop(&mut self) {
+            let _ = fs::remove_dir_all(&self.0);
+        }
+    }
+
+    #[test]
+    fn a_light_is_written_where_it_changes() {
+        let (root, now) = (Root::new(), Instant::now());
+        root.plug("red", "[none] timer\n");
+        let (mut red, trigger) = Device::open(&root.0, "red").unwrap();
+        assert_eq!((trigger, root.brightness("red").as_str()), (None, "0\n"));
+        assert_eq!((red.show(true, now), root.brightness("red").as_str()), (None, "255\n"));
+        // Somebody else's doing is not undone, so nothing was written.
+        fs::write(root.0.join("red").join(BRIGHTNESS), "3\n").unwrap();
+        assert_eq!((red.show(true, now), root.brightness("red").as_str()), (None, "3\n"));
+        assert_eq!((red.show(false, now), root.brightness("red").as_str()), (None, "0\n"));
+    }
+
+    #[test]
+    fn a_light_that_blinks_by_itself_is_taken_from_what_makes_it() {
+        let root = Root::new();
+        root.plug("red", "none timer [heartbeat]\n");
+        let (_, trigger) = Device::open(&root.0, "red").unwrap();
+        assert_eq!(trigger.as_deref(), Some("heartbeat"));
+        assert_eq!(fs::read_to_string(root.0.join("red").join(TRIGGER)).unwrap(), "none\n");
+    }
+
+    #[test]
+    fn what_is_no_light_is_refused_with_those_that_are() {
+        let root = Root::new();
+        for (plugged, hint) in [("", "there are none"), ("red", "there are red")] {
+            if !plugged.is_empty() {
+                root.plug(plugged, "");
+            }
+            for name in ["blue", "", "..", "red/../red"] {
+                let failure = Device::open(&root.0, name).err().unwrap();
+                assert_eq!(failure.kind, Kind::Configuration, "{name}");
+                assert!(failure.message.contains(&format!("no light {name:?}")), "{failure}");
+                assert!(failure.hint.starts_with(hint), "{failure}");
+            }
+        }
+    }
+
+    #[test]
+    fn one_that_is_unplugged_is_told_once_and_taken_up_when_it_is_back() {
+        let (root, start) = (Root::new(), Instant::now());
+        root.plug("red", "[none]\n");
+        let (mut red, _) = Device::open(&root.0, "red").unwrap();
+        root.unplug("red");
+        let Some(News::Failed(failure)) = red.show(true, start) else { panic!("nothing told") };
+        assert!(failure.message.contains("red/brightness cannot be written"), "{failure}");
+        assert_eq!(red.show(true, start + AGAIN), None, "it was told");
+        root.plug("red", "[timer]\n");
+        assert_eq!(
+            (red.show(true, start + AGAIN), root.brightness("red").as_str()),
+            (None, "77\n"),
+            "too early"
+        );
+        assert_eq!(red.show(true, start + 2 * AGAIN), Some(News::Back));
+        assert_eq!(root.brightness("red"), "255\n");
+        assert_eq!(fs::read_to_string(root.0.join("red").join(TRIGGER)).unwrap(), "none\n");
+    }
+
+    #[test]
+    fn what_the_kernel_says_is_no_number_is_told() {
+        let root = Root::new();
+        root.plug("red", "[none]\n");
+        let (mut red, _) = Device::open(&root.0, "red").unwrap();
+        fs::write(root.0.join("red").join("max_brightness"), "bright\n").unwrap();
+        let Some(News::Failed(failure)) = red.show(true, Instant::now()) else { panic!("nothing told") };
+        assert!(failure.message.contains("its max_brightness is \"bright\""), "{failure}");
+    }
+}

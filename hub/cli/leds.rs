@@ -1,0 +1,48 @@
+//! `scanhub leds` on the command line.
+
+use std::io::{IsTerminal, stdout};
+use std::path::PathBuf;
+
+use clap::Args;
+use clients::{LedsLook, LedsOptions};
+use schema::Failure;
+
+use super::{Everywhere, Limits};
+
+#[derive(Args, Debug)]
+pub(crate) struct Leds {
+    /// The sensor, or robot for the verdict over all of them
+    sensor: String,
+    /// Light-emitting diodes of this machine that show the lights as well: green=NAME, yellow=NAME, red=NAME, mark=NAME,
+    /// with commas between them; the red one is lit when nothing is known, and after the end
+    #[arg(long = "led", value_name = "LIGHT=NAME", value_delimiter = ',')]
+    leds: Vec<String>,
+    /// Where they are
+    #[arg(long, default_value = "/sys/class/leds", value_name = "DIR")]
+    led_root: PathBuf,
+    #[command(flatten)]
+    limits: Limits,
+}
+
+impl Leds {
+    pub(crate) fn options(&self, everywhere: &Everywhere) -> Result<LedsOptions, Failure> {
+        // https://no-color.org: set to anything but nothing.
+        let colours = std::env::var_os("NO_COLOR").is_none_or(|value| value.is_empty());
+        Ok(LedsOptions {
+            sensor: self.sensor.clone(),
+            leds: self.leds.clone(),
+            led_root: self.led_root.clone(),
+            look: match (everywhere.json, stdout().is_terminal()) {
+                (true, _) => LedsLook::Json,
+                (false, true) => LedsLook::Terminal { colours },
+                (false, false) => LedsLook::Lines,
+            },
+            bounds: self.limits.bounds(),
+            places: everywhere.places()?,
+        })
+    }
+}
+
+/// What the help says of how it reads.
+pub(crate) const MEANING: &str =
+    "green: clear, yellow: slow, red: stop or unknown, mark: at least one reflector mark";
