@@ -16,6 +16,11 @@ pub(crate) fn now() -> Moment {
     Moment { monotonic_ns: read(ClockId::Monotonic), boottime_ns: read(ClockId::Boottime) }
 }
 
+/// The wall clock, ns since 1970.
+pub(crate) fn wall_ns() -> u64 {
+    read(ClockId::Realtime)
+}
+
 fn read(clock: ClockId) -> u64 {
     let Timespec { tv_sec, tv_nsec } = clock_gettime(clock);
     tv_sec as u64 * 1_000_000_000 + tv_nsec as u64
