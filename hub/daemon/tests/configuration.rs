@@ -97,7 +97,10 @@ fn what_cannot_be_is_refused_with_place_value_and_remedy() {
         ("link.front.pose.x=nan", "x = NaN\n  metres"),
         ("link.front.pose.y=300", "y = 300\n  metres from the robot's centre, at most 100"),
         ("link.front.pose.yaw=90", "yaw = 90\n  radians, counter-clockwise: 90 degrees are 1.5708"),
-        ("link.front.pose.yam=1", "unknown key `yam`\n  did you mean `yaw`? Known here: x, y, yaw, upside_down"),
+        (
+            "link.front.pose.yam=1",
+            "unknown key `yam`\n  did you mean `yaw`? Known here: x, y, yaw, upside_down",
+        ),
         ("link.front.pose.upside_down=1", "expected a boolean"),
         ("link.front.pose.x=left", "invalid type"),
         ("link.front.zones.radi=[1]", "unknown key `radi`\n  did you mean `radii`?"),
