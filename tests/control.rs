@@ -118,7 +118,7 @@ fn what_is_not_there_or_takes_no_requests_is_refused() {
     let _hub = stage.hub(&["--link", &format!("front=file:{file}")]);
     for (sensor, code, kind, message) in [
         ("side", 3, "no_topic", "the hub has no sensor side"),
-        ("front", 1, "failed", "front: a recording takes no requests"),
+        ("front", 1, "failed", "front: a recording plays on, only its background can be asked for"),
         ("Front", 78, "configuration", "sensor name \"Front\" is not possible"),
     ] {
         let outcome = control(&stage, sensor, "pause");

@@ -94,7 +94,7 @@ fn a_hub_starts_or_says_what_it_needs() {
             needed.unwrap_or_else(|| panic!("{outcome}")) * 1024
         };
         let needed = short(16 << 10);
-        assert!(needed <= 4 << 20, "{needed} bytes for one link");
+        assert!(needed <= 8 << 20, "{needed} bytes for one link");
         for bytes in (15..22)
             .map(|shift| 1 << shift)
             .filter(|bytes| *bytes < needed)
@@ -102,7 +102,7 @@ fn a_hub_starts_or_says_what_it_needs() {
         {
             assert_eq!(short(bytes), needed);
         }
-        for bytes in [needed.next_multiple_of(4096), 4 << 20, 8 << 20] {
+        for bytes in [needed.next_multiple_of(4096), 8 << 20, 16 << 20] {
             mount(bytes);
             let hub = stage.hub(&[stage.link("front")]);
             assert_eq!(stage.info("front")["state"], "absent");

@@ -102,6 +102,7 @@ fn configuration_that_cannot_be() {
         (&["run", "--config", &broken], &["toml.toml:1:"]),
         (&["run", "--config", &missing], &["no.toml"]),
         (&["simulate", "--port=a", "--fault=los=1"], &["los=1", "loss, burst"]),
+        (&["simulate", "--port=a", "--world=moon"], &["\"moon\"", "fig8"]),
         (&["simulate", "--port=a", "--baud=115200"], &["115200", "9600"]),
         (&["simulate", "--port=a", "--variant=180/0.25"], &["180/0.25", "one of"]),
         (&["simulate", "--port=a", "--speed=0"], &["speed"]),

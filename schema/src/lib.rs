@@ -3,6 +3,7 @@
 
 mod background;
 mod control;
+pub mod datagram;
 mod domain;
 mod failure;
 mod foreground;

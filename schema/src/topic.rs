@@ -51,6 +51,16 @@ impl Topic {
         Topic::ALL.into_iter().find(|topic| topic.name() == name)
     }
 
+    /// The topic's number on a network: from 1.
+    pub fn number(self) -> u8 {
+        self as u8 + 1
+    }
+
+    /// The topic with this number.
+    pub fn of_number(number: u8) -> Option<Topic> {
+        Topic::ALL.into_iter().find(|topic| topic.number() == number)
+    }
+
     /// The payload's type, the same in all languages.
     pub fn payload(self) -> &'static str {
         match self {
@@ -147,6 +157,7 @@ mod tests {
         for topic in Topic::ALL {
             assert_eq!(of_service(&topic.service("rear")), Some(("rear", Some(topic))));
             assert_eq!(Topic::parse(topic.name()), Some(topic));
+            assert_eq!(Topic::of_number(topic.number()), Some(topic));
         }
         assert_eq!(of_service(&Wake::service("rear")), Some(("rear", None)));
         assert_eq!(of_service("scanhub/v2/rear/scan"), None);

@@ -90,8 +90,8 @@ fn link_bytes() -> u64 {
 
 /// Descriptors of what belongs to no link, beside those open from the start: 16 are left open, making them takes more.
 const BASE_DESCRIPTORS: u64 = 24;
-/// Descriptors of a link: its services, its port, and a first consumer.
-const LINK_DESCRIPTORS: u64 = 24;
+/// Descriptors of a link: four for each of its eight services, its port, and a first consumer.
+const LINK_DESCRIPTORS: u64 = 38;
 /// What the shared-memory library puts before each sample, rounded up.
 const CHUNK_HEADER: usize = 64;
 /// The list of ports and processes of one service, rounded up.

@@ -1,0 +1,276 @@
+//! The LAN form of a sample: one datagram, readable without a library, checked before anything of it is believed. Refuses
+//! to know sockets, who sent it and what is missing between two of them. Needs neither shared memory nor a heap.
+
+mod announce;
+mod payload;
+
+use crc::{CRC_32_ISCSI, Crc, Table};
+
+pub use announce::{Announce, Announced};
+pub use payload::Packed;
+
+use crate::Topic;
+
+/// Bytes before the payload.
+pub const HEAD: usize = 48;
+/// Bytes of a MAC behind the payload, if [`LanFlags::AUTHENTICATED`] is set.
+pub const MAC: usize = 16;
+/// The longest datagram that is never fragmented where tunnels leave an MTU of 1400.
+pub const MTU_SAFE: usize = 1372;
+/// The longest datagram on an Ethernet.
+pub const MTU_ETHERNET: usize = 1472;
+/// Port of all groups.
+pub const PORT: u16 = 22_200;
+/// The first three bytes of all groups, of which [`group`] is the last.
+pub const GROUPS: [u8; 3] = [239, 255, 76];
+
+/// The bits of [`Head::flags`].
+pub struct LanFlags;
+
+impl LanFlags {
+    /// A MAC follows the payload.
+    pub const AUTHENTICATED: u8 = 1;
+    /// The sensor is simulated.
+    pub const SIMULATED: u8 = 2;
+    /// The sensor is a recording.
+    pub const REPLAYED: u8 = 4;
+    /// The stamp is an estimate.
+    pub const STAMP_ESTIMATED: u8 = 8;
+    /// The telegram is suspect.
+    pub const SUSPECT: u8 = 16;
+}
+
+/// What stands before the payload.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Head {
+    /// [`Announce::NUMBER`], or a topic's [`Topic::number`].
+    pub topic: u8,
+    /// Bits of [`LanFlags`].
+    pub flags: u8,
+    /// The gateway, a random number.
+    pub hub: u64,
+    /// The gateway's life: seconds since 1970 at its start, or one more than the last one.
+    pub epoch: u32,
+    /// Number of the datagram among those of this sensor and topic, from 0, wrapping.
+    pub sequence: u32,
+    /// The wall clock of the telegram's first byte, ns since 1970; of announce and status that of sending.
+    pub stamp_ns: u64,
+    /// Position of the sensor's link in the hub's configuration.
+    pub sensor: u8,
+    /// Revision of the payload: a greater one only appends.
+    pub revision: u16,
+    /// The lower half of the sample's `seq`: joins what came from one telegram.
+    pub counter: u32,
+}
+
+/// A datagram whose header, lengths and checksum are right.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Datagram<'a> {
+    /// What stands before the payload.
+    pub head: Head,
+    /// The payload; what it says is checked by [`Packed::unpack`].
+    pub payload: &'a [u8],
+    /// The MAC, if there is one. Nothing here can tell whether it is right.
+    pub mac: Option<&'a [u8; MAC]>,
+}
+
+/// Why bytes are no datagram, in the order of the checks: the first that fails names the reason.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Refusal {
+    /// Fewer bytes than a header.
+    Short,
+    /// It does not begin with `SHUB`.
+    Magic,
+    /// Another version.
+    Version,
+    /// The header is shorter than this version's, or longer than the datagram.
+    Header,
+    /// The lengths do not add up to the datagram's.
+    Length,
+    /// The checksum is wrong.
+    Crc,
+}
+
+impl Head {
+    /// Writes the header before a payload of `len` bytes that stands in `buffer` from [`HEAD`] on, and the checksum;
+    /// answers the whole datagram. `None` if the buffer ends before the payload or the payload has no length of two
+    /// bytes. There is no MAC behind it.
+    pub fn seal<'a>(&self, buffer: &'a mut [u8], len: usize) -> Option<&'a [u8]> {
+        let datagram = buffer.get_mut(..HEAD + len)?;
+        let (head, _) = datagram.split_first_chunk_mut::<HEAD>()?;
+        head[..4].copy_from_slice(MAGIC);
+        head[4..8].copy_from_slice(&[VERSION, HEAD as u8, self.topic, self.flags]);
+        head[8..16].copy_from_slice(&self.hub.to_le_bytes());
+        head[16..20].copy_from_slice(&self.epoch.to_le_bytes());
+        head[20..24].copy_from_slice(&self.sequence.to_le_bytes());
+        head[24..32].copy_from_slice(&self.stamp_ns.to_le_bytes());
+        head[32..36].copy_from_slice(&[self.sensor, 0, 0, 0]);
+        head[36..38].copy_from_slice(&u16::try_from(len).ok()?.to_le_bytes());
+        head[38..40].copy_from_slice(&self.revision.to_le_bytes());
+        head[40..44].copy_from_slice(&self.counter.to_le_bytes());
+        head[CRC_AT..].fill(0);
+        let crc = CRC.checksum(datagram);
+        datagram[CRC_AT..HEAD].copy_from_slice(&crc.to_le_bytes());
+        Some(datagram)
+    }
+}
+
+impl<'a> Datagram<'a> {
+    /// Checks `bytes`, a whole datagram as it was received.
+    pub fn read(bytes: &'a [u8]) -> Result<Datagram<'a>, Refusal> {
+        let (head, _) = bytes.split_first_chunk::<HEAD>().ok_or(Refusal::Short)?;
+        if &head[..4] != MAGIC {
+            return Err(Refusal::Magic);
+        }
+        if head[4] != VERSION {
+            return Err(Refusal::Version);
+        }
+        let begin = usize::from(head[5]);
+        if begin < HEAD || begin > bytes.len() {
+            return Err(Refusal::Header);
+        }
+        let two = |at: usize| u16::from_le_bytes([head[at], head[at + 1]]);
+        let four = |at: usize| u32::from_le_bytes(std::array::from_fn(|i| head[at + i]));
+        let eight = |at: usize| u64::from_le_bytes(std::array::from_fn(|i| head[at + i]));
+        let flags = head[7];
+        let (payload, mac) = bytes[begin..].split_at_checked(usize::from(two(36))).ok_or(Refusal::Length)?;
+        let mac = match (flags & LanFlags::AUTHENTICATED != 0, mac) {
+            (false, []) => None,
+            (true, mac) => Some(mac.try_into().map_err(|_| Refusal::Length)?),
+            _ => return Err(Refusal::Length),
+        };
+        let mut digest = CRC.digest();
+        digest.update(&bytes[..CRC_AT]);
+        digest.update(&[0; HEAD - CRC_AT]);
+        digest.update(&bytes[HEAD..]);
+        if digest.finalize() != four(CRC_AT) {
+            return Err(Refusal::Crc);
+        }
+        let head = Head {
+            topic: head[6],
+            flags,
+            hub: eight(8),
+            epoch: four(16),
+            sequence: four(20),
+            stamp_ns: eight(24),
+            sensor: head[32],
+            revision: two(38),
+            counter: four(40),
+        };
+        Ok(Datagram { head, payload, mac })
+    }
+}
+
+impl Refusal {
+    /// All reasons, in the order of the checks.
+    pub const ALL: [Refusal; 6] =
+        [Refusal::Short, Refusal::Magic, Refusal::Version, Refusal::Header, Refusal::Length, Refusal::Crc];
+
+    /// The reason's name in all output.
+    pub fn name(self) -> &'static str {
+        match self {
+            Refusal::Short => "short",
+            Refusal::Magic => "magic",
+            Refusal::Version => "version",
+            Refusal::Header => "header",
+            Refusal::Length => "length",
+            Refusal::Crc => "crc",
+        }
+    }
+}
+
+/// The last byte of the group that `topic` goes to: a group for each class of traffic, because switches filter by
+/// group and not by port. That of announcements is [`Announce::GROUP`].
+pub fn group(topic: Topic) -> u8 {
+    match topic {
+        Topic::Status => Announce::GROUP,
+        Topic::Zones | Topic::Marks | Topic::Foreground => 81,
+        Topic::Scan | Topic::Background => 82,
+        Topic::Telegram => 83,
+    }
+}
+
+const MAGIC: &[u8; 4] = b"SHUB";
+const VERSION: u8 = 1;
+/// Where the checksum stands; it is taken over the datagram with these four bytes as 0.
+const CRC_AT: usize = 44;
+const CRC: Crc<u32, Table<16>> = Crc::<u32, Table<16>>::new(&CRC_32_ISCSI);
+
+// Payloads go out as they lie in memory.
+const _: () = assert!(cfg!(target_endian = "little"));
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn sealed(head: Head, payload: &[u8]) -> Vec<u8> {
+        let mut buffer = [0xAA; MTU_ETHERNET];
+        buffer[HEAD..HEAD + payload.len()].copy_from_slice(payload);
+        head.seal(&mut buffer, payload.len()).unwrap().to_vec()
+    }
+
+    #[test]
+    fn the_checksum_is_that_of_the_catalogue() {
+        assert_eq!(CRC.checksum(b"123456789"), 0xE306_9283);
+    }
+
+    #[test]
+    fn datagrams_go_there_and_back() {
+        let head = Head {
+            topic: Topic::Scan.number(),
+            flags: LanFlags::SUSPECT,
+            hub: 1,
+            epoch: 2,
+            sequence: 3,
+            stamp_ns: 4,
+            sensor: 5,
+            revision: 6,
+            counter: 7,
+        };
+        let bytes = sealed(head, b"payload");
+        assert_eq!(Datagram::read(&bytes), Ok(Datagram { head, payload: b"payload", mac: None }));
+        assert_eq!(head.seal(&mut [0; HEAD], 1), None);
+        assert_eq!(head.seal(&mut vec![0; 70_000], 65_536), None);
+    }
+
+    #[test]
+    fn the_first_failing_check_names_the_reason() {
+        let good = sealed(Head::default(), b"1234");
+        let with = |at: usize, byte: u8| {
+            let mut bytes = good.clone();
+            bytes[at] = byte;
+            Datagram::read(&bytes).unwrap_err()
+        };
+        assert_eq!(Datagram::read(&good[..47]), Err(Refusal::Short));
+        assert_eq!(with(0, b'X'), Refusal::Magic);
+        assert_eq!(with(4, 2), Refusal::Version);
+        assert_eq!((with(5, 47), with(5, 53)), (Refusal::Header, Refusal::Header));
+        assert_eq!(
+            (with(36, 3), with(36, 5), with(7, 1)),
+            (Refusal::Length, Refusal::Length, Refusal::Length)
+        );
+        assert_eq!((with(44, 0), with(51, 0)), (Refusal::Crc, Refusal::Crc));
+        assert_eq!(Datagram::read(&[&good[..], &[0]].concat()), Err(Refusal::Length), "nothing may follow");
+    }
+
+    #[test]
+    fn every_flipped_bit_is_seen() {
+        let good = sealed(Head { hub: 9, ..Head::default() }, &[0x55; 100]);
+        for bit in 0..8 * good.len() {
+            let mut bytes = good.clone();
+            bytes[bit / 8] ^= 1 << (bit % 8);
+            assert!(Datagram::read(&bytes).is_err(), "bit {bit}");
+        }
+    }
+
+    #[test]
+    fn a_longer_header_of_a_later_version_is_skipped() {
+        let mut bytes = sealed(Head::default(), b"1234");
+        bytes.splice(HEAD..HEAD, [1, 2, 3, 4]);
+        bytes[5] = 52;
+        bytes[CRC_AT..HEAD].fill(0);
+        let crc = CRC.checksum(&bytes).to_le_bytes();
+        bytes[CRC_AT..HEAD].copy_from_slice(&crc);
+        assert_eq!(Datagram::read(&bytes).unwrap().payload, b"1234");
+    }
+}

@@ -1,0 +1,138 @@
+//! What a gateway says of a sensor once a second: who it is, what goes out where, and the next number of each topic, from
+//! which a listener knows what it lost before the first and after the last datagram.
+
+use crate::{Topic, check_sensor, text};
+
+/// The payload of an announcement, made by a gateway or read from a datagram.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Announce {
+    /// The hub's life.
+    pub boot: u64,
+    name: [u8; NAME],
+    kind: [u8; KIND],
+    topics: [Announced; MOST],
+    count: usize,
+}
+
+/// One topic in an announcement.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Announced {
+    /// Number of the topic, see [`Topic::of_number`].
+    pub topic: u8,
+    /// The last byte of its group.
+    pub group: u8,
+    /// Its port.
+    pub port: u16,
+    /// Number that its next datagram will have.
+    pub next: u32,
+}
+
+impl Announce {
+    /// Topic number of announcements themselves.
+    pub const NUMBER: u8 = 0;
+    /// The last byte of their group.
+    pub const GROUP: u8 = 80;
+
+    /// For `sensor`, a sensor of type `kind`, without topics.
+    pub fn new(boot: u64, sensor: &str, kind: &str) -> Announce {
+        let mut announce = Announce {
+            boot,
+            name: [0; NAME],
+            kind: [0; KIND],
+            topics: [Announced::default(); MOST],
+            count: 0,
+        };
+        text::write(&mut announce.name, sensor);
+        text::write(&mut announce.kind, kind);
+        announce
+    }
+
+    /// Adds a topic; beyond 16 there is no room and it is left away.
+    pub fn add(&mut self, topic: Announced) {
+        if let Some(place) = self.topics.get_mut(self.count) {
+            *place = topic;
+            self.count += 1;
+        }
+    }
+
+    /// The sensor's name.
+    pub fn sensor(&self) -> &str {
+        text::read(&self.name)
+    }
+
+    /// The sensor's type; empty if unknown.
+    pub fn kind(&self) -> &str {
+        text::read(&self.kind)
+    }
+
+    /// The topics that go out.
+    pub fn topics(&self) -> &[Announced] {
+        &self.topics[..self.count]
+    }
+
+    /// Writes the payload to the beginning of `room`; answers its length, or `None` if there is too little room.
+    pub fn pack(&self, room: &mut [u8]) -> Option<usize> {
+        let room = room.get_mut(..TOPICS + EACH * self.count)?;
+        room[..8].copy_from_slice(&self.boot.to_le_bytes());
+        room[8..40].copy_from_slice(&self.name);
+        room[40..64].copy_from_slice(&self.kind);
+        room[64..TOPICS].copy_from_slice(&[self.count as u8, 0, 0, 0]);
+        for (bytes, topic) in room[TOPICS..].chunks_exact_mut(EACH).zip(self.topics()) {
+            bytes[..2].copy_from_slice(&[topic.topic, topic.group]);
+            bytes[2..4].copy_from_slice(&topic.port.to_le_bytes());
+            bytes[4..].copy_from_slice(&topic.next.to_le_bytes());
+        }
+        Some(room.len())
+    }
+
+    /// The announcement in `payload`; `None` if it is shorter than its own count says, or if its sensor has no possible
+    /// name. Topics beyond the 16th are left away.
+    pub fn unpack(payload: &[u8]) -> Option<Announce> {
+        let (head, rest) = payload.split_first_chunk::<TOPICS>()?;
+        let rest = rest.get(..EACH * usize::from(head[64]))?;
+        let (boot, _) = head.split_first_chunk()?;
+        let mut announce =
+            Announce::new(u64::from_le_bytes(*boot), text::read(&head[8..40]), text::read(&head[40..64]));
+        check_sensor(announce.sensor()).ok()?;
+        for bytes in rest.chunks_exact(EACH) {
+            announce.add(Announced {
+                topic: bytes[0],
+                group: bytes[1],
+                port: u16::from_le_bytes([bytes[2], bytes[3]]),
+                next: u32::from_le_bytes([bytes[4], bytes[5], bytes[6], bytes[7]]),
+            });
+        }
+        Some(announce)
+    }
+}
+
+const NAME: usize = 32;
+const KIND: usize = 24;
+/// Where the topics begin.
+const TOPICS: usize = 68;
+/// Bytes of a topic.
+const EACH: usize = 8;
+/// More topics than there are.
+const MOST: usize = 16;
+
+const _: () = assert!(Topic::ALL.len() < MOST);
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn announcements_go_there_and_back() {
+        let mut announce = Announce::new(0x1122, "front", "LMS200;301063;V02.30");
+        for topic in [Topic::Scan, Topic::Status] {
+            announce.add(Announced { topic: topic.number(), group: 81, port: 22_200, next: 5 });
+        }
+        let mut room = [0; 100];
+        assert_eq!(announce.pack(&mut room), Some(84));
+        assert_eq!(Announce::unpack(&room), Some(announce));
+        assert_eq!((announce.sensor(), announce.topics().len()), ("front", 2));
+        assert_eq!((Announce::unpack(&room[..83]), announce.pack(&mut [0; 83])), (None, None));
+        room[8] = b'/';
+        assert_eq!(Announce::unpack(&room), None, "no sensor has such a name");
+    }
+}
