@@ -99,8 +99,10 @@ fn a_silence_is_said_once_and_late_joiners_know_at_once() {
     zones.await_line("the hub's word", is_unknown);
     let unknown = last_word(&stage);
     // Five statuses later nothing was added to it.
-    let mut statuses = stage.echo(&["front/status"]);
-    statuses.await_lines(5, "a status", is_class("status"));
+    let mut statuses = stage.echo(&["front/status", "front/scan", "front/background"]);
+    let statuses = statuses.await_lines(5, "a status", is_class("status"));
+    // Who comes meanwhile gets no scan, which is nobody's fault.
+    assert!(statuses.iter().all(|status| status["last_error"] == ""), "{statuses:?}");
     assert_eq!(stage.run(&["control", "front", "resume"]).code, Some(0));
     let next = zones.await_line("what comes after it", |line| {
         line["class"] == "zones" && number(line, "topic_seq") > number(&unknown, "topic_seq")
