@@ -39,6 +39,17 @@ impl LinkThread<'_> {
         }
     }
 
+    /// Says once that the measuring mode has no marks, which is no error, and what changes it.
+    pub(crate) fn tell_mode(&mut self) {
+        let status = self.account.last();
+        if std::mem::replace(&mut self.told_mode, status.mode) != status.mode
+            && let Some(remedy) = status.reflector_remedy()
+        {
+            let name = &self.link.name;
+            tracing::info!("{name}: marks are unavailable; after the hub's end `{remedy}` changes that");
+        }
+    }
+
     /// Notices consumers that stay without samples.
     pub(crate) fn watch_reach(&mut self) {
         let before = self.unreached;

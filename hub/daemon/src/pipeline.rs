@@ -95,9 +95,10 @@ impl Pipeline {
         self.background.as_ref().is_some_and(|kept| kept.every_scan)
     }
 
-    /// Whether the model has a generation that was not published.
+    /// Whether there is a model, of a generation that was not published.
     pub(crate) fn is_news(&self) -> bool {
-        self.background.as_ref().is_some_and(|kept| kept.published != Some(kept.model.generation()))
+        let is_news = |kept: &Kept| kept.shape.is_some() && kept.published != Some(kept.model.generation());
+        self.background.as_ref().is_some_and(is_news)
     }
 
     /// Writes the model, which is to be published, into `out`, if one is kept.

@@ -35,6 +35,7 @@ pub enum Class {
 ///
 /// A scan of another shape than the one before (number of beams, unit, angles) resets it. A reading of 0 is one like
 /// any other, but as a background it cannot be told from one that is not known.
+#[derive(Clone)]
 pub struct Model {
     settings: Settings,
     limits: Limits,
@@ -52,6 +53,7 @@ pub struct Model {
 
 /// What is learned, by method.
 #[expect(clippy::large_enum_variant, reason = "there is one per sensor, and no heap")]
+#[derive(Clone)]
 enum Learner {
     Paper(Paper),
     Multi(Multi),

@@ -6,6 +6,7 @@ use super::{Class, INVALID};
 use schema::{BEAMS, Background};
 
 /// State of the method with several surfaces.
+#[derive(Clone)]
 pub(super) struct Multi {
     slots: [[Slot; SLOTS]; BEAMS],
 }
