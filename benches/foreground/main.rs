@@ -80,7 +80,12 @@ fn main() -> ExitCode {
         }
         println!("{} {}", scene.world, if scene.mixed { "mixed" } else { "" });
         for (score, name) in scores.iter().zip(METHODS) {
-            println!("  {name:<20} {:.4} {:.4} {:.3}", score.recall(), score.precision(), score.wrong_per_scan());
+            println!(
+                "  {name:<20} {:.4} {:.4} {:.3}",
+                score.recall(),
+                score.precision(),
+                score.wrong_per_scan()
+            );
         }
     }
     ExitCode::SUCCESS
