@@ -1,13 +1,17 @@
 //! The LAN form of a sample: one datagram, readable without a library, checked before anything of it is believed. Refuses
 //! to know sockets, who sent it and what is missing between two of them. Needs neither shared memory nor a heap.
 
+mod account;
 mod announce;
+mod numbers;
 mod payload;
 
 use crc::{CRC_32_ISCSI, Crc, Table};
 
+pub use account::{Account, LIVES, ROWS};
 pub use announce::{Announce, Announced};
-pub use payload::Packed;
+pub use numbers::{Fresh, Row, WINDOW};
+pub use payload::{Packed, telegram};
 
 use crate::Topic;
 
@@ -74,7 +78,8 @@ pub struct Datagram<'a> {
     pub mac: Option<&'a [u8; MAC]>,
 }
 
-/// Why bytes are no datagram, in the order of the checks: the first that fails names the reason.
+/// Why a datagram is refused, in the order of the checks: the first that fails names the reason. [`Datagram::read`] knows
+/// those up to the checksum; the others are an [`Account`]'s.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Refusal {
     /// Fewer bytes than a header.
@@ -89,6 +94,20 @@ pub enum Refusal {
     Length,
     /// The checksum is wrong.
     Crc,
+    /// A key is given and there is no MAC. No receiver here has keys yet.
+    Unauthenticated,
+    /// A key is given and the MAC is not of it.
+    Mac,
+    /// A later epoch of the same hub was seen.
+    Epoch,
+    /// Older than the window, so that nobody knows whether it came before.
+    Stale,
+    /// More hubs or topics than there is memory for.
+    Capacity,
+    /// A topic that is not known here.
+    Skipped,
+    /// The payload is shorter than its own counts say, contradicts itself or has no revision.
+    Payload,
 }
 
 impl Head {
@@ -163,8 +182,21 @@ impl<'a> Datagram<'a> {
 
 impl Refusal {
     /// All reasons, in the order of the checks.
-    pub const ALL: [Refusal; 6] =
-        [Refusal::Short, Refusal::Magic, Refusal::Version, Refusal::Header, Refusal::Length, Refusal::Crc];
+    pub const ALL: [Refusal; 13] = [
+        Refusal::Short,
+        Refusal::Magic,
+        Refusal::Version,
+        Refusal::Header,
+        Refusal::Length,
+        Refusal::Crc,
+        Refusal::Unauthenticated,
+        Refusal::Mac,
+        Refusal::Epoch,
+        Refusal::Stale,
+        Refusal::Capacity,
+        Refusal::Skipped,
+        Refusal::Payload,
+    ];
 
     /// The reason's name in all output.
     pub fn name(self) -> &'static str {
@@ -175,6 +207,13 @@ impl Refusal {
             Refusal::Header => "header",
             Refusal::Length => "length",
             Refusal::Crc => "crc",
+            Refusal::Unauthenticated => "unauthenticated",
+            Refusal::Mac => "mac",
+            Refusal::Epoch => "epoch",
+            Refusal::Stale => "stale",
+            Refusal::Capacity => "capacity",
+            Refusal::Skipped => "skipped",
+            Refusal::Payload => "payload",
         }
     }
 }
