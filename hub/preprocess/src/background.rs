@@ -4,6 +4,7 @@
 
 mod multi;
 mod paper;
+mod runs;
 mod settings;
 
 use std::fmt;
@@ -94,7 +95,7 @@ impl Model {
         }
         if learn && self.fresh {
             if self.settings.start == Start::FirstScan {
-                self.learner.adopt(readings, &self.limits);
+                self.learner.adopt(readings);
             }
             self.fresh = false;
         }
@@ -163,7 +164,7 @@ impl Model {
         }
         self.shape = shape;
         self.reset();
-        self.learner.adopt(ranges, &self.limits);
+        self.learner.adopt(ranges);
         self.fresh = false;
         Ok(())
     }
@@ -193,12 +194,12 @@ impl Learner {
     }
 
     /// Takes `ranges` for the background, but those that tell nothing.
-    fn adopt(&mut self, ranges: &[u16], limits: &Limits) {
+    fn adopt(&mut self, ranges: &[u16]) {
         for (i, &range) in ranges.iter().enumerate() {
             if range != INVALID && range != Background::UNTAUGHT {
                 match self {
                     Learner::Paper(paper) => paper.adopt(i, range),
-                    Learner::Multi(multi) => multi.adopt(i, range, limits),
+                    Learner::Multi(multi) => multi.adopt(i, range),
                 }
             }
         }
