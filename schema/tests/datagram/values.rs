@@ -8,7 +8,10 @@ use schema::{
 };
 
 /// Name of the file, header, and what writes the payload.
-pub(crate) const ALL: [(&str, Head, fn(&mut [u8]) -> Option<usize>); 10] = [
+pub(crate) type Golden = (&'static str, Head, fn(&mut [u8]) -> Option<usize>);
+
+/// Those that a gateway of this version sends.
+pub(crate) const ALL: [Golden; 10] = [
     ("announce", Head { sequence: 7, counter: 0, ..head(None) }, announce),
     ("telegram", Head { sequence: u32::MAX, ..head(Some(Topic::Telegram)) }, telegram),
     ("scan", Head { flags: LanFlags::SUSPECT, ..head(Some(Topic::Scan)) }, |room| {
