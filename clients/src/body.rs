@@ -9,10 +9,15 @@ use schema::{Pose, Scan};
 /// Slices of the time.
 pub(crate) const SLICES: usize = 10;
 /// The most sectors that a hub takes.
-pub(crate) const SECTORS: usize = 64;
-/// So much farther than the body was met a reading still counts as the body: five standard deviations of 7 mm, which is
-/// the most that recordings of standing sensors show, and the 15 mm by which two devices differ.
-pub(crate) const MARGIN_MM: u32 = 50;
+const SECTORS: usize = 64;
+/// So much farther than it was met a reading beside the body still counts as the body: five standard deviations of 7 mm,
+/// which is the most that recordings of standing sensors show, and the 15 mm by which two devices differ.
+const MARGIN_MM: u32 = 50;
+/// The same where the body hides all that is behind it: nothing is missed there by looking less far, and one reading in
+/// two hundred is off by 60 mm and more.
+const BEHIND_MM: u32 = 150;
+/// A beam that meets the body in so large a share of the scans sees nothing behind it.
+const FULL: f64 = 0.9;
 
 /// A share of a slice's scans that a beam has to meet something in, so that one wrong reading is nothing.
 const SHARE: f64 = 0.05;
@@ -21,7 +26,7 @@ const PASSING: usize = 5;
 /// How much the nearest readings of a body differ from slice to slice: noise and a robot that trembles. What is alive
 /// moves more.
 const STEADY_MM: u32 = 100;
-/// Beams beside a body that meet its edge and what is behind it by turns.
+/// Beams beside a body that meet its edge, what is behind it, and what lies between by turns.
 const EDGE_BEAMS: usize = 2;
 /// Neighbouring beams whose ranges differ by less make one sector: what it hides more than needed is no wider than that.
 const ALIKE_MM: u32 = 50;
@@ -45,6 +50,8 @@ struct Beam {
     /// In the robot's frame.
     direction: (f64, f64),
     angle_mdeg: i32,
+    /// Where it leaves the circle.
+    circle_mm: u32,
     slices: [Slice; SLICES],
 }
 
@@ -137,7 +144,13 @@ impl Body {
     }
 
     fn beam(&self, angle_mdeg: i32) -> Beam {
-        Beam { direction: self.pose.direction(angle_mdeg), angle_mdeg, slices: Default::default() }
+        let direction = self.pose.direction(angle_mdeg);
+        let (x_mm, y_mm) = (1000.0 * self.pose.x_m, 1000.0 * self.pose.y_m);
+        // The greater root of |sensor + range * direction| = circle; none is not a number, and so becomes 0.
+        let along = x_mm * direction.0 + y_mm * direction.1;
+        let across = self.within_mm.powi(2) - (x_mm.powi(2) + y_mm.powi(2) - along.powi(2));
+        let circle_mm = (across.sqrt() - along).ceil() as u32;
+        Beam { direction, angle_mdeg, circle_mm, slices: Default::default() }
     }
 
     fn sectors(&self, runs: Vec<Run>, range_mm: impl Fn(&Run) -> u32) -> Vec<Sector> {
@@ -153,6 +166,9 @@ impl Body {
 
 /// What one beam met in the slices in which it met something often enough; both from the least on.
 struct Met {
+    /// It sees nothing behind that.
+    is_full: bool,
+    circle_mm: u32,
     nearest_mm: Vec<u32>,
     farthest_mm: Vec<u32>,
 }
@@ -171,7 +187,13 @@ impl Met {
             ranges.sort_unstable();
             ranges
         };
-        Met { nearest_mm: sorted(|slice| slice.nearest_mm), farthest_mm: sorted(|slice| slice.farthest_mm) }
+        let all: u32 = scans.iter().sum();
+        Met {
+            is_full: f64::from(met.iter().map(|slice| slice.met).sum::<u32>()) >= FULL * f64::from(all),
+            circle_mm: beam.circle_mm,
+            nearest_mm: sorted(|slice| slice.nearest_mm),
+            farthest_mm: sorted(|slice| slice.farthest_mm),
+        }
     }
 
     fn slices(&self) -> usize {
@@ -188,10 +210,18 @@ impl Met {
         near.zip(far).is_some_and(|(near, far)| far.saturating_sub(*near) <= STEADY_MM)
     }
 
-    /// Up to where it reaches, but for what passes behind its edge.
+    /// Readings nearer than this are what was met. What passed behind its edge is left out; an edge that tells something
+    /// between itself and what is behind may tell anything up to there.
     fn reach_mm(&self, slices: usize) -> u32 {
-        let farthest = &self.farthest_mm;
-        farthest.iter().nth_back(slices / PASSING).or(farthest.first()).copied().unwrap_or_default()
+        let (nearest, farthest) = (&self.nearest_mm, &self.farthest_mm);
+        let reach =
+            farthest.iter().nth_back(slices / PASSING).or(farthest.first()).copied().unwrap_or_default();
+        let is_mixed = nearest.first().is_some_and(|nearest| reach - nearest > STEADY_MM);
+        match (self.is_full, is_mixed) {
+            (true, _) => reach + BEHIND_MM,
+            (false, true) => self.circle_mm.max(reach + MARGIN_MM),
+            (false, false) => reach + MARGIN_MM,
+        }
     }
 
     /// The nearest that was met at `range_mm` or farther; 0 if nothing was.
@@ -203,7 +233,7 @@ impl Met {
 /// Readings of `beam` nearer than this are the body; 0 if none are. The beams just beside a body count as far as it
 /// does: spots are wider than beams, and robots tremble.
 fn range_mm(met: &[Met], is_body: &[bool], beam: usize, slices: usize) -> u32 {
-    let reach = |i: usize| met[i].reach_mm(slices) + MARGIN_MM;
+    let reach = |i: usize| met[i].reach_mm(slices);
     if is_body[beam] {
         return reach(beam);
     }

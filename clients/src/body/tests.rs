@@ -44,8 +44,8 @@ fn a_post_is_body_with_a_beam_beside_it_on_either_side() {
         60..=67 => Some(400 + noise(beam, slice, scan)),
         _ => Some(WALL_MM),
     };
-    // As far as it was met, and the margin.
-    assert_eq!(mask(post), Mask { sectors: vec![sector(59, 68, 460)], moving: vec![], of_beams: COUNT });
+    // As far as it was met, and a good deal of what it hides.
+    assert_eq!(mask(post), Mask { sectors: vec![sector(59, 68, 560)], moving: vec![], of_beams: COUNT });
 }
 
 #[test]
@@ -64,7 +64,7 @@ fn what_comes_and_goes_is_left_out_and_named() {
         _ if (2..8).contains(&slice) && (100 + 10 * slice..115 + 10 * slice).contains(&beam) => Some(700),
         _ => Some(WALL_MM),
     });
-    assert_eq!((found.sectors, found.moving), (vec![sector(59, 68, 460)], vec![sector(120, 184, 700)]));
+    assert_eq!((found.sectors, found.moving), (vec![sector(59, 68, 560)], vec![sector(120, 184, 700)]));
 }
 
 #[test]
@@ -83,19 +83,19 @@ fn who_passes_before_a_body_neither_widens_nor_hides_it() {
         100..=110 => Some(500),
         _ => Some(WALL_MM),
     });
-    assert_eq!(found.sectors, [sector(99, 111, 550)]);
+    assert_eq!(found.sectors, [sector(99, 111, 650)]);
     assert_eq!(found.moving, [sector(90, 98, 250), sector(112, 150, 250)]);
 }
 
 #[test]
-fn an_edge_that_is_met_by_turns_counts_as_far_as_it_was_met() {
+fn an_edge_that_is_met_by_turns_hides_what_lies_between() {
     // Beam 68 meets body, wall and what lies between by turns; beam 70 is too far from the body for that.
     let found = mask(|beam, slice, scan| match beam {
         60..=67 => Some(400),
         68 | 70 if scan % 8 == 0 && slice < 6 => Some(450 + 50 * (scan as u16 / 4)),
         _ => Some(WALL_MM),
     });
-    assert_eq!(found.sectors, [sector(59, 67, 450), sector(68, 68, 900)]);
+    assert_eq!(found.sectors, [sector(59, 67, 550), sector(68, 68, 1000)]);
     assert_eq!(found.moving, [sector(70, 70, 450)]);
 }
 
@@ -128,7 +128,7 @@ fn the_circle_is_around_the_robot_wherever_the_sensor_sits() {
     // 0.8 m ahead of the centre and looking back: what is 1.7 m off is 0.9 m behind the centre.
     let pose = Pose { x_m: 0.8, yaw_rad: std::f64::consts::PI, ..Pose::default() };
     let wall = |range_mm: u16| move |beam, _, _| if beam == 180 { Some(range_mm) } else { None };
-    assert_eq!(learn(pose, 1000.0, wall(1700)).sectors, [sector(179, 181, 1750)]);
+    assert_eq!(learn(pose, 1000.0, wall(1700)).sectors, [sector(179, 181, 1850)]);
     assert_eq!(learn(pose, 1000.0, wall(1801)).sectors, []);
     assert_eq!(learn(pose, 1000.0, wall(1800)).sectors, [], "on the circle is outside");
 }

@@ -1,5 +1,6 @@
 //! Scans of made-up surroundings for the tests: beams with one to three surfaces between which they flip, something
 //! that comes and goes, codes, zeroes, noise with outliers. As unkind as a room can be, and more; not a simulation.
+#![allow(dead_code)] // each test takes what it needs
 
 use preprocess::background::Class;
 use schema::{BEAMS, Background, Foreground, Scan};
