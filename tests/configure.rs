@@ -121,6 +121,40 @@ fn a_person_says_yes_and_it_is_written_once() {
 }
 
 #[test]
+fn marks_become_available_by_the_command_that_is_named() {
+    let stage = Stage::new();
+    let _simulator = stage.simulator(&["front"], &["--baud=38400", "--mode=0x00"]);
+    let port = stage.word("front");
+    let marks = |hub: stage::Program| {
+        let told = stage.await_info("front", |info| !info["marks"]["available"].is_null())["marks"].clone();
+        let outcome = stage.run(&["echo", "--json", "front/marks", "-n", "3"]);
+        let lines = outcome.of_class("marks");
+        assert!(lines.iter().all(|line| line["available"] == told["available"]), "{outcome}");
+        let doctor = stage.run(&["doctor", &port, "--json", "--no-system-config"]).of_class("check");
+        let found = doctor.iter().find(|line| line["name"] == "marks").expect("it is checked").clone();
+        let ended = hub.end(TERM);
+        assert_eq!(ended.code, Some(0), "{ended}");
+        (told, found, ended.errors)
+    };
+    let (told, found, log) = marks(stage.hub(&[stage.link("front")]));
+    let command = format!("scanhub configure {port} mode=0x01");
+    assert_eq!(told, serde_json::json!({ "available": false, "remedy": command }));
+    assert_eq!(
+        (&found["state"], &found["remedy"]),
+        (&"warning".into(), &format!("after the hub's end: {command}").into())
+    );
+    assert!(log.contains(&command), "{log}");
+
+    let words: Vec<&str> = command.split(' ').skip(2).collect();
+    let seen = Person::start(&stage, &words).types("yes\n");
+    assert_eq!(seen.code, Some(0), "{}", seen.errors);
+    let (told, found, log) = marks(stage.hub(&[stage.link("front")]));
+    assert_eq!(told, serde_json::json!({ "available": true, "remedy": null }));
+    assert_eq!(found["state"], "ok");
+    assert!(!log.contains("scanhub configure"), "{log}");
+}
+
+#[test]
 fn the_way_back_brings_back_what_was_changed() {
     let stage = Stage::new();
     let _simulator = stage.simulator(&["front"], &["--baud=38400"]);

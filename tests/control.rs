@@ -42,6 +42,9 @@ fn a_paused_sensor_stops_and_a_resumed_one_goes_on_without_a_gap() {
         consumers[2].await_lines(10, "a scan of the other sensor", is_class("scan"));
         before == sent
     });
+    // The second of two statuses is one of the pause.
+    let statuses = stage.run(&["echo", "front/status", "-n", "2", "--timeout", "5s"]);
+    assert_eq!(statuses.code, Some(0), "{statuses}");
     let paused = stage.info("front");
     consumers[2].await_lines(40, "a scan of the other sensor", is_class("scan"));
     let later = stage.info("front");

@@ -6,6 +6,7 @@ mod stage;
 use lms::framer::{Found, Framer};
 use lms::measured::Measured;
 use lms::telegram::Telegram;
+use schema::Topic;
 use serde_json::Value;
 use stage::{INT, MEASURED, Stage, TERM, bytes_of, hash, is_class, number, sequence};
 
@@ -86,14 +87,8 @@ fn the_bytes_themselves_and_what_all_verbs_say_agree() {
     let hz = summary["hz"].as_f64().unwrap_or_default();
     let listed = stage.run(&["list", "--json"]).of_class("topic");
     let topics: Vec<_> = listed.iter().map(|line| (&line["topic"], &line["payload"])).collect();
-    let expected = [("telegram", "u8[]"), ("scan", "scanhub.Scan.v1"), ("status", "scanhub.Status.v1")];
-    assert!(
-        topics
-            .iter()
-            .zip(expected)
-            .all(|(is, expected)| (is.0, is.1) == (&expected.0.into(), &expected.1.into())),
-        "{topics:?}"
-    );
+    let expected = Topic::ALL.map(|topic| (topic.name().into(), topic.payload().into()));
+    assert_eq!(topics, expected.each_ref().map(|(name, payload): &(Value, Value)| (name, payload)));
     assert_eq!(number(&listed[0], "subscribers"), 1, "{listed:?}");
     let info = stage.await_info("front", |info| info["hz"].as_f64().is_some_and(|hz| hz > 0.0));
     // Two looks at the same stream; neither is exact on a busy machine.

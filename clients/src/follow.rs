@@ -48,7 +48,7 @@ pub(crate) enum Notice {
 pub(crate) trait Sink {
     /// A topic will be followed.
     fn begin(&mut self, _name: &TopicName) {}
-    /// A sample came, or one was made of a silence: that counts as none.
+    /// A sample came, or one that stands for a silence and does not count.
     fn sample(&mut self, name: &TopicName, sample: &Sample) -> Result<(), End>;
     /// Something went wrong, or right again, in the streams of `names`; none as long as it is not known what is followed.
     fn notice(&mut self, names: &[&TopicName], notice: Notice) -> Result<(), End>;
@@ -176,7 +176,7 @@ impl<'a> Run<'a> {
                     let Some(sample) = track.source.receive(&mut self.session)? else { break };
                     more |= turn + 1 == TURN;
                     let now = Instant::now();
-                    if sample.is_stale() {
+                    if sample.is_silence() {
                         sink.sample(&track.name, &sample)?;
                         continue;
                     }

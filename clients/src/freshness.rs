@@ -34,9 +34,10 @@ impl Freshness {
         Freshness { until: later(now, FIRST_WORD_NS), said: false }
     }
 
-    /// A sample with `header` and `verdict` came in at `now`. Its age counts as well as the silence after it: what
-    /// waited for long is no news, and a stamp in the future keeps nothing fresh.
-    pub(crate) fn heard(&mut self, header: &Header, verdict: Verdict, now: Moment) {
+    /// A sample with `header` and `verdict` came in at `now`; whether it may be believed. Its age counts as well as the
+    /// silence after it: what waited for long is no news, and a stamp in the future keeps nothing fresh. An `unknown` stands
+    /// however old it is.
+    pub(crate) fn heard(&mut self, header: &Header, verdict: Verdict, now: Moment) -> bool {
         let limit_ns = match header.period_us {
             0 => NO_PERIOD_NS,
             period_us => 2000 * u64::from(period_us) + HUB_LIMIT_NS + AFTER_HUB_NS,
@@ -44,7 +45,10 @@ impl Freshness {
         let silent_at = later(now, limit_ns);
         let aged_at_ns = header.stamp_last_ns.saturating_add(limit_ns);
         self.until = Moment { monotonic_ns: silent_at.monotonic_ns.min(aged_at_ns), ..silent_at };
-        self.said = verdict == Verdict::Unknown;
+        let is_unknown = verdict == Verdict::Unknown;
+        let fresh = now.monotonic_ns < self.until.monotonic_ns;
+        self.said = is_unknown || !fresh;
+        is_unknown || fresh
     }
 
     /// Whether a verdict became too old just now; said once per silence.
@@ -108,19 +112,20 @@ mod tests {
         assert_eq!(freshness.left(at(50)), Some(Duration::from_secs(1)));
         assert!(!freshness.silence(at(1049)) && freshness.silence(at(1050)) && !freshness.silence(at(9000)));
         // The hub's own word of the silence.
-        freshness.heard(&header(2000, PERIOD_US), Verdict::Unknown, at(2000));
+        assert!(freshness.heard(&header(2000, PERIOD_US), Verdict::Unknown, at(2000)));
         assert_eq!((freshness.silence(at(9000)), freshness.left(at(2000))), (false, None));
+        assert!(freshness.heard(&header(2000, PERIOD_US), Verdict::Unknown, at(60_000)), "to a late joiner");
     }
 
     #[test]
     fn what_waited_is_no_news() {
         let mut freshness = Freshness::new(at(0));
-        freshness.heard(&header(100, PERIOD_US), Verdict::Clear, at(180));
+        assert!(freshness.heard(&header(100, PERIOD_US), Verdict::Clear, at(180)));
         assert!(!freshness.silence(at(193)) && freshness.silence(at(194)));
-        freshness.heard(&header(100, PERIOD_US), Verdict::Clear, at(500));
-        assert!(freshness.silence(at(500)), "too old when it came");
-        freshness.heard(&header(99_999, PERIOD_US), Verdict::Clear, at(600));
-        assert!(freshness.silence(at(694)), "a stamp in the future");
+        assert!(!freshness.heard(&header(100, PERIOD_US), Verdict::Clear, at(500)), "too old when it came");
+        assert!(!freshness.silence(at(9000)), "which says enough");
+        assert!(freshness.heard(&header(99_999, PERIOD_US), Verdict::Clear, at(600)));
+        assert!(!freshness.silence(at(693)) && freshness.silence(at(694)), "a stamp in the future");
     }
 
     #[test]
@@ -139,7 +144,6 @@ mod tests {
         assert!(!freshness.silence(at(599)) && freshness.silence(at(600)));
         let end = Header { stamp_last_ns: u64::MAX, period_us: u32::MAX, ..Header::default() };
         let last = Moment { monotonic_ns: u64::MAX, boottime_ns: u64::MAX };
-        freshness.heard(&end, Verdict::Clear, last);
-        assert!(freshness.silence(last));
+        assert!(!freshness.heard(&end, Verdict::Clear, last));
     }
 }

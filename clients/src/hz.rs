@@ -67,7 +67,7 @@ impl Sink for Hz<'_> {
     }
 
     fn sample(&mut self, name: &TopicName, sample: &Sample) -> Result<(), End> {
-        if !sample.is_stale()
+        if !sample.is_silence()
             && let Some((_, window)) = self.windows.iter_mut().find(|(known, _)| known == name)
         {
             window.arrived(Instant::now(), sample.missed());

@@ -46,7 +46,7 @@ impl<'a> Stamp<'a> {
         }
     }
 
-    /// Of a sensor that was never heard.
+    /// Of no telegram.
     fn unheard(class: &'static str, sensor: &'a str) -> Stamp<'a> {
         let (seq, topic_seq, stamp_ns, wall_ns, boot) = (None, None, None, None, None);
         let quality = Quality::Clean.name();

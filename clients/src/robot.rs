@@ -70,8 +70,9 @@ impl RobotFollower {
         Ok(RobotFollower { session: Session::new(places), source: RobotSource::new(sensors) })
     }
 
-    /// Waits until any of the sensors is heard, or any is heard no more; what is known then. A sensor becomes unknown as
-    /// with [`ZonesFollower::next`](crate::ZonesFollower::next), and fails likewise.
+    /// Waits until any of the sensors is heard, or any is heard no more; what is known then. The first time it waits for
+    /// a word of each. A sensor becomes unknown as with [`ZonesFollower::next`](crate::ZonesFollower::next), and this
+    /// fails likewise.
     #[allow(clippy::should_implement_trait)] // There is no end that an iterator would have.
     pub fn next(&mut self) -> Result<&Robot, Failure> {
         while !self.hear()? {
@@ -103,6 +104,8 @@ pub(crate) struct RobotSource {
     parts: Vec<ZonesSource>,
     /// Whose turn it is: no sensor shall wait for another one's samples.
     turn: usize,
+    /// Each sensor has spoken once: the fold is of all of them.
+    begun: bool,
     /// As long as there are no sensors.
     nobody: Freshness,
     /// The sensors are those of the hub.
@@ -127,6 +130,7 @@ impl RobotSource {
             robot: Robot::default(),
             parts: Vec::new(),
             turn: 0,
+            begun: false,
             nobody: Freshness::new(clock::now()),
             all: sensors.is_empty(),
             call_at: None,
@@ -140,7 +144,7 @@ impl RobotSource {
         !self.parts.is_empty() && self.parts.iter().all(ZonesSource::attached)
     }
 
-    /// The next sample of any sensor, or a silence; failures as [`ZonesSource::receive`].
+    /// The next sample of any sensor, or a silence, once each has spoken; failures as [`ZonesSource::receive`].
     pub(crate) fn receive(&mut self, session: &mut Session) -> Result<Option<RobotHeard>, Failure> {
         let heard = self.hear(session)?;
         Ok(heard.map(|heard| RobotHeard { robot: self.robot.clone(), heard }))
@@ -169,13 +173,16 @@ impl RobotSource {
             self.turn = (turn + 1) % self.parts.len();
             if let Some(heard) = self.parts[turn].receive(session)? {
                 self.robot.parts[turn].1 = heard.zones;
-                return Ok(Some(heard));
+                self.begun = self.begun || self.parts.iter().all(ZonesSource::has_spoken);
+                if self.begun {
+                    return Ok(Some(heard));
+                }
             }
         }
         // Last, because it takes longer than all the rest.
         self.call_the_roll(session)?;
         let silence = self.parts.is_empty() && self.nobody.silence(clock::now());
-        Ok(silence.then_some(Heard { zones: Zones::unknown(), header: None, missed: 0, stale: true }))
+        Ok(silence.then(Heard::nothing))
     }
 
     /// Adds the sensors that the hub has and that are not followed yet. One that is, stays: that it is missing is to be

@@ -28,9 +28,9 @@ macro_rules! samples {
                 match self { $(Sample::$kind(sample) => sample.missed(),)* }
             }
 
-            /// Nobody sent it: it is made of a silence.
-            pub(crate) fn is_stale(&self) -> bool {
-                match self { $(Sample::$kind(sample) => sample.is_stale(),)* }
+            /// Nobody sent it: it stands for a silence.
+            pub(crate) fn is_silence(&self) -> bool {
+                match self { $(Sample::$kind(sample) => sample.is_silence(),)* }
             }
         }
 
@@ -108,7 +108,7 @@ impl Sample {
 trait Told {
     fn period_us(&self) -> u32;
     fn missed(&self) -> u64;
-    fn is_stale(&self) -> bool;
+    fn is_silence(&self) -> bool;
 }
 
 impl<P: Payload + ?Sized> Told for Received<P> {
@@ -120,7 +120,7 @@ impl<P: Payload + ?Sized> Told for Received<P> {
         self.missed
     }
 
-    fn is_stale(&self) -> bool {
+    fn is_silence(&self) -> bool {
         false
     }
 }
@@ -134,8 +134,8 @@ impl Told for Heard {
         self.missed
     }
 
-    fn is_stale(&self) -> bool {
-        self.stale
+    fn is_silence(&self) -> bool {
+        self.header.is_none()
     }
 }
 
@@ -148,7 +148,7 @@ impl Told for RobotHeard {
         self.heard.missed
     }
 
-    fn is_stale(&self) -> bool {
-        self.heard.stale
+    fn is_silence(&self) -> bool {
+        self.heard.is_silence()
     }
 }

@@ -21,14 +21,21 @@ pub fn zones(sensor: &str) -> Result<ZonesFollower, Failure> {
 /// What was heard of a sensor's zones, or that nothing was.
 #[derive(Clone, Copy, Debug)]
 pub struct Heard {
-    /// The zones; [`Zones::unknown`] in a silence.
+    /// The zones of the sample, [`Zones::unknown`] if it was too old when it came, and in a silence.
     pub zones: Zones,
-    /// Of the sample. In a silence that of the last one, with this moment as its stamps; nothing if there never was one.
+    /// Of the sample; nothing in a silence.
     pub header: Option<Header>,
     /// Samples that were sent since the one heard before and are not handed out.
     pub missed: u64,
-    /// Nothing that is new enough was heard: no sample of the hub's says this.
+    /// The zones are unknown because nothing was heard that is new enough, not because the hub says so.
     pub stale: bool,
+}
+
+impl Heard {
+    /// A silence.
+    pub(crate) fn nothing() -> Heard {
+        Heard { zones: Zones::unknown(), header: None, missed: 0, stale: true }
+    }
 }
 
 /// The zones of a sensor that is being followed.
@@ -77,13 +84,17 @@ impl ZonesFollower {
 pub(crate) struct ZonesSource {
     follower: Follower<Zones>,
     freshness: Freshness,
-    last: Option<Header>,
+    spoken: bool,
 }
 
 impl ZonesSource {
     /// Will follow the zones of `sensor`.
     pub(crate) fn new(sensor: &str) -> ZonesSource {
-        ZonesSource { follower: Follower::new(sensor), freshness: Freshness::new(clock::now()), last: None }
+        ZonesSource {
+            follower: Follower::new(sensor),
+            freshness: Freshness::new(clock::now()),
+            spoken: false,
+        }
     }
 
     /// The topic has been there at least once.
@@ -91,35 +102,34 @@ impl ZonesSource {
         self.follower.attached()
     }
 
-    /// The next sample that waits; if there is none and the last one became too old, that; else nothing. Failures as
+    /// There was a sample, or the silence of one that does not come.
+    pub(crate) fn has_spoken(&self) -> bool {
+        self.spoken
+    }
+
+    /// The next sample that waits; if there is none and the last one became too old just now, that. Failures as
     /// [`Follower::receive`].
     pub(crate) fn receive(&mut self, session: &mut Session) -> Result<Option<Heard>, Failure> {
         let sample = self.follower.receive(session)?;
         let now = clock::now();
-        if let Some(sample) = sample {
-            let header = *sample.header();
-            self.freshness.heard(&header, sample.verdict(), now);
-            self.last = Some(header);
-            let missed = sample.missed;
-            return Ok(Some(Heard { zones: *sample, header: Some(header), missed, stale: false }));
-        }
-        if !self.freshness.silence(now) {
-            return Ok(None);
-        }
-        let header = self.last.map(|last| Header {
-            stamp_first_ns: now.monotonic_ns,
-            stamp_last_ns: now.monotonic_ns,
-            wall_ns: clock::wall_ns(),
-            ..last
-        });
-        Ok(Some(Heard { zones: Zones::unknown(), header, missed: 0, stale: true }))
+        let heard = match sample {
+            Some(sample) => {
+                let header = *sample.header();
+                let fresh = self.freshness.heard(&header, sample.verdict(), now);
+                let zones = if fresh { *sample } else { Zones::unknown() };
+                Some(Heard { zones, header: Some(header), missed: sample.missed, stale: !fresh })
+            }
+            None => self.freshness.silence(now).then(Heard::nothing),
+        };
+        self.spoken |= heard.is_some();
+        Ok(heard)
     }
 
     /// The last of all that waits: what stands now. What it supersedes counts as missed.
     fn newest(&mut self, session: &mut Session) -> Result<Option<Heard>, Failure> {
         let mut newest: Option<Heard> = None;
         while let Some(mut heard) = self.receive(session)? {
-            heard.missed += newest.map_or(0, |passed| passed.missed + u64::from(!passed.stale));
+            heard.missed += newest.map_or(0, |passed| passed.missed + u64::from(passed.header.is_some()));
             newest = Some(heard);
         }
         Ok(newest)

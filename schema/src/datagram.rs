@@ -1,13 +1,19 @@
 //! The LAN form of a sample: one datagram, readable without a library, checked before anything of it is believed. Refuses
 //! to know sockets, who sent it and what is missing between two of them. Needs neither shared memory nor a heap.
 
+mod account;
 mod announce;
+mod numbers;
 mod payload;
+mod refusal;
 
 use crc::{CRC_32_ISCSI, Crc, Table};
 
+pub use account::{Account, LIVES, ROWS};
 pub use announce::{Announce, Announced};
-pub use payload::Packed;
+pub use numbers::{Fresh, Row, WINDOW};
+pub use payload::{Packed, telegram};
+pub use refusal::Refusal;
 
 use crate::Topic;
 
@@ -72,23 +78,6 @@ pub struct Datagram<'a> {
     pub payload: &'a [u8],
     /// The MAC, if there is one. Nothing here can tell whether it is right.
     pub mac: Option<&'a [u8; MAC]>,
-}
-
-/// Why bytes are no datagram, in the order of the checks: the first that fails names the reason.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Refusal {
-    /// Fewer bytes than a header.
-    Short,
-    /// It does not begin with `SHUB`.
-    Magic,
-    /// Another version.
-    Version,
-    /// The header is shorter than this version's, or longer than the datagram.
-    Header,
-    /// The lengths do not add up to the datagram's.
-    Length,
-    /// The checksum is wrong.
-    Crc,
 }
 
 impl Head {
@@ -158,24 +147,6 @@ impl<'a> Datagram<'a> {
             counter: four(40),
         };
         Ok(Datagram { head, payload, mac })
-    }
-}
-
-impl Refusal {
-    /// All reasons, in the order of the checks.
-    pub const ALL: [Refusal; 6] =
-        [Refusal::Short, Refusal::Magic, Refusal::Version, Refusal::Header, Refusal::Length, Refusal::Crc];
-
-    /// The reason's name in all output.
-    pub fn name(self) -> &'static str {
-        match self {
-            Refusal::Short => "short",
-            Refusal::Magic => "magic",
-            Refusal::Version => "version",
-            Refusal::Header => "header",
-            Refusal::Length => "length",
-            Refusal::Crc => "crc",
-        }
     }
 }
 

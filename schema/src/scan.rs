@@ -49,42 +49,50 @@ impl Default for Scan {
 
 impl Scan {
     /// The ranges that are used, in device units, codes included.
+    #[inline]
     pub fn ranges(&self) -> &[u16] {
         &self.range_array[..self.beams()]
     }
 
     /// The upper bits of the beams, as many as ranges, or none if the mode does not send them.
+    #[inline]
     pub fn upper(&self) -> &[u8] {
         if self.contents & CONTENTS_UPPER == 0 { &[] } else { &self.upper_array[..self.beams()] }
     }
 
     /// The intensities of the beams, or none if the mode has no reflector bits.
+    #[inline]
     pub fn intensities(&self) -> &[u8] {
         if self.intensity_bits == 0 { &[] } else { self.upper() }
     }
 
     /// Beams used: `count`, never more than [`BEAMS`].
+    #[inline]
     pub fn beams(&self) -> usize {
         usize::from(self.count).min(BEAMS)
     }
 
     /// The largest value that the range's bits hold; codes are counted down from it.
+    #[inline]
     pub fn max(&self) -> u16 {
         ((1_u32 << u32::from(self.range_bits).min(16)) - 1) as u16
     }
 
     /// The range of beam `i` in device units, if it is a valid reading.
+    #[inline]
     pub fn range(&self, i: usize) -> Option<u16> {
         let value = *self.ranges().get(i)?;
         if self.classify(value).is_none() { Some(value) } else { None }
     }
 
     /// Why beam `i` has no valid reading; nothing if it has one or is not there.
+    #[inline]
     pub fn code(&self, i: usize) -> Option<Code> {
         self.classify(*self.ranges().get(i)?)
     }
 
     /// The range of beam `i` in mm, if it is a valid reading.
+    #[inline]
     pub fn distance_mm(&self, i: usize) -> Option<u32> {
         Some(u32::from(self.range(i)?) * u32::from(self.unit_mm))
     }
@@ -108,6 +116,7 @@ impl Scan {
         later_turns * TURN_NS + later_beams * u64::from(self.step_mdeg) * TURN_NS / 360_000
     }
 
+    #[inline]
     fn classify(&self, value: u16) -> Option<Code> {
         match self.max().checked_sub(value) {
             Some(code) if code > Code::BEYOND.0 => None,

@@ -26,7 +26,7 @@ pub(crate) fn marks<'a>(sensor: &'a str, header: &Header, marks: &'a Marks) -> i
     }
 }
 
-/// Class `zones`; what was heard of no sample has no number in the topic, and of no telegram none at all.
+/// Class `zones`; a silence has neither numbers nor stamps.
 pub(crate) fn zones<'a>(sensor: &'a str, heard: &'a Heard) -> impl Serialize + 'a {
     #[derive(Serialize)]
     struct Line<'a> {
@@ -50,7 +50,7 @@ pub(crate) fn zones<'a>(sensor: &'a str, heard: &'a Heard) -> impl Serialize + '
         None => Stamp::unheard("zones", sensor),
     };
     Line {
-        stamp: Stamp { topic_seq: stamp.topic_seq.filter(|_| !heard.stale), ..stamp },
+        stamp,
         verdict: zones.verdict().name(),
         nearest_mm,
         nearest_beam,

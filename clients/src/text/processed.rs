@@ -23,13 +23,12 @@ pub(super) fn marks(line: &mut Vec<u8>, header: &Header, marks: &Marks) -> io::R
 
 pub(super) fn zones(line: &mut Vec<u8>, heard: &Heard) -> io::Result<()> {
     let Heard { zones, header, .. } = heard;
-    match header {
-        Some(header) if heard.stale => {
-            let seconds = header.stamp_first_ns as f64 / 1e9;
-            return write!(line, "seq {} at {seconds:.6} unknown: heard nothing since", header.seq);
-        }
-        Some(header) => numbers(line, header)?,
-        None => return write!(line, "unknown: heard nothing yet"),
+    let Some(header) = header else {
+        return write!(line, "unknown: nothing new is heard");
+    };
+    numbers(line, header)?;
+    if heard.stale {
+        return write!(line, " unknown: too old");
     }
     write!(line, " {}", zones.verdict().name())?;
     match zones.nearest() {

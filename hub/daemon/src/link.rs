@@ -10,7 +10,7 @@ use lms::session::{Output, Received};
 use lms::variant::{Baud, Mode, Unit, Variant};
 use lms::{MILLIS, Nanos, Notice, Session, Settings, Trouble};
 use rustix::event::{PollFd, PollFlags, poll};
-use schema::{Failure, Flags, Scan, State, Wake};
+use schema::{Failure, Flags, Scan, State, Status, Wake};
 
 use crate::clock;
 use crate::config::{Link, Source};
@@ -49,6 +49,8 @@ pub(crate) struct LinkThread<'a> {
     line_errors: LineErrors,
     /// Statuses in a row that said that consumers got nothing.
     pub(crate) unreached: u32,
+    /// The measuring mode of which was said whether it has marks.
+    pub(crate) told_mode: u8,
 }
 
 /// What a link's error is made from.
@@ -89,12 +91,15 @@ impl<'a> LinkThread<'a> {
             refused: Vec::new(),
             line_errors: LineErrors::default(),
             unreached: 0,
+            told_mode: Status::MODE_UNKNOWN,
         }
     }
 
     /// Runs until the hub shall end. `report` is called once, when it is clear whether the link can work: an absent
     /// port can, one that is busy, forbidden or no tty cannot.
     pub(crate) fn run(mut self, report: impl FnOnce(Result<(), Failure>)) {
+        // The model to begin with, before anything is learned.
+        self.topics.background(&mut self.pipeline, clock::now());
         match &self.link.port {
             Source::File { path, paced } => match replay::Recorded::open(path, self.link) {
                 Ok(recorded) => {
@@ -192,7 +197,7 @@ impl<'a> LinkThread<'a> {
             self.error = error;
         }
         // While telegrams come there is no need for wake-ups of the status' own.
-        let bound = if published || state == State::Streaming { Nanos::MAX } else { self.next_status };
+        let bound = if state == State::Streaming { Nanos::MAX } else { self.next_status };
         Ok((watch, until.min(bound)))
     }
 
@@ -250,6 +255,7 @@ impl<'a> LinkThread<'a> {
                 self.topics.wake(Wake::Status);
             }
             self.watch_reach();
+            self.tell_mode();
         }
         if now >= self.next_greeting {
             self.next_greeting = now + GREETING_PERIOD;

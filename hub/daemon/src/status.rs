@@ -78,6 +78,11 @@ impl Account {
         &self.status
     }
 
+    /// The status as it was last.
+    pub(crate) fn last(&self) -> &Status {
+        &self.status
+    }
+
     /// Whether telegrams come.
     pub(crate) fn is_streaming(&self) -> bool {
         self.status.state == State::Streaming as u8

@@ -4,6 +4,7 @@
 
 mod multi;
 mod paper;
+mod runs;
 mod settings;
 
 use std::fmt;
@@ -35,6 +36,7 @@ pub enum Class {
 ///
 /// A scan of another shape than the one before (number of beams, unit, angles) resets it. A reading of 0 is one like
 /// any other, but as a background it cannot be told from one that is not known.
+#[derive(Clone)]
 pub struct Model {
     settings: Settings,
     limits: Limits,
@@ -52,6 +54,7 @@ pub struct Model {
 
 /// What is learned, by method.
 #[expect(clippy::large_enum_variant, reason = "there is one per sensor, and no heap")]
+#[derive(Clone)]
 enum Learner {
     Paper(Paper),
     Multi(Multi),
@@ -92,7 +95,7 @@ impl Model {
         }
         if learn && self.fresh {
             if self.settings.start == Start::FirstScan {
-                self.learner.adopt(readings, &self.limits);
+                self.learner.adopt(readings);
             }
             self.fresh = false;
         }
@@ -161,7 +164,7 @@ impl Model {
         }
         self.shape = shape;
         self.reset();
-        self.learner.adopt(ranges, &self.limits);
+        self.learner.adopt(ranges);
         self.fresh = false;
         Ok(())
     }
@@ -191,12 +194,12 @@ impl Learner {
     }
 
     /// Takes `ranges` for the background, but those that tell nothing.
-    fn adopt(&mut self, ranges: &[u16], limits: &Limits) {
+    fn adopt(&mut self, ranges: &[u16]) {
         for (i, &range) in ranges.iter().enumerate() {
             if range != INVALID && range != Background::UNTAUGHT {
                 match self {
                     Learner::Paper(paper) => paper.adopt(i, range),
-                    Learner::Multi(multi) => multi.adopt(i, range, limits),
+                    Learner::Multi(multi) => multi.adopt(i, range),
                 }
             }
         }

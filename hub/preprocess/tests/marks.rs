@@ -89,7 +89,7 @@ fn marks_are_those_of_the_definition() {
         let unit_mm = [1, 10][random.usize(..2)];
         let mut scan = scans::layout(&mut random, unit_mm);
         fill(&mut random, &mut scan);
-        let mut out: Marks = *bytemuck::from_bytes(&[0xA5; size_of::<Marks>()]);
+        let mut out: Marks = bytemuck::pod_read_unaligned(&[0xA5; size_of::<Marks>()]);
         Finder::new(settings).update(&scan, &mut out);
         let groups = groups(&scan, settings);
         assert_eq!(usize::from(out.count), groups.len().min(MARKS), "{settings:?}");

@@ -278,7 +278,7 @@ fn on_a_circle_is_outside_wherever_it_is_seen_from() {
 
 /// As a loan comes.
 fn dirty() -> Zones {
-    *bytemuck::from_bytes(&[0xA5; size_of::<Zones>()])
+    bytemuck::pod_read_unaligned(&[0xA5; size_of::<Zones>()])
 }
 
 const CASES: u32 = 600;

@@ -3,9 +3,10 @@
 
 use bytemuck::{Pod, bytes_of, bytes_of_mut, cast_slice, cast_slice_mut};
 
+use super::{Announce, Datagram, Refusal};
 use crate::{
-    BEAMS, Background, CONTENTS_UPPER, Foreground, MARKS, Marks, SEGMENTS, Scan, Segment, Status, ZONES,
-    Zones,
+    BEAMS, Background, CONTENTS_UPPER, Foreground, MARKS, Marks, SEGMENTS, Scan, Segment, Status, Telegram,
+    Topic, ZONES, Zones,
 };
 
 /// A payload that can go over a network.
@@ -17,6 +18,31 @@ pub trait Packed {
     /// shorter than its own counts say or contradicts itself: then the value is of no use.
     #[must_use]
     fn unpack(&mut self, payload: &[u8]) -> bool;
+}
+
+/// The telegram that a payload begins with: STX, two bytes with the length of what lies between them and the CRC.
+pub fn telegram(payload: &[u8]) -> Option<Telegram<'_>> {
+    let [STX, _, low, high, ..] = payload else { return None };
+    let len = usize::from(u16::from_le_bytes([*low, *high])) + AROUND_DATA;
+    payload.get(..len).filter(|bytes| bytes.len() <= Telegram::MAX).map(Telegram)
+}
+
+impl Datagram<'_> {
+    /// Checks what stands after the header: its topic is known, and the payload is one of that topic.
+    pub fn check_payload(&self) -> Result<(), Refusal> {
+        let is_sound = match Topic::of_number(self.head.topic) {
+            None if self.head.topic == Announce::NUMBER => Announce::unpack(self.payload).is_some(),
+            None => return Err(Refusal::Skipped),
+            Some(Topic::Telegram) => telegram(self.payload).is_some(),
+            Some(Topic::Scan) => Scan::default().unpack(self.payload),
+            Some(Topic::Marks) => Marks::default().unpack(self.payload),
+            Some(Topic::Zones) => Zones::unknown().unpack(self.payload),
+            Some(Topic::Foreground) => Foreground::default().unpack(self.payload),
+            Some(Topic::Background) => Background::default().unpack(self.payload),
+            Some(Topic::Status) => Status::default().unpack(self.payload),
+        };
+        if is_sound && self.head.revision > 0 { Ok(()) } else { Err(Refusal::Payload) }
+    }
 }
 
 impl Packed for Scan {
@@ -159,6 +185,9 @@ fn write(room: &mut [u8], parts: &[&[u8]]) -> Option<usize> {
     Some(end)
 }
 
+const STX: u8 = 0x02;
+/// STX, address, length and CRC (Telegram listing 4).
+const AROUND_DATA: usize = 6;
 const SCAN_HEAD: usize = 12;
 const SCAN_CONTENTS: usize = 11;
 const MARKS_HEAD: usize = 4;

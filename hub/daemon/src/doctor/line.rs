@@ -49,7 +49,7 @@ pub(crate) fn examine(
             Some(hub) => {
                 tell(latency(path, latency_ms(path)));
                 tell(Finding::ok("holder", format!("the hub has it, {holder}")));
-                tell(sensor::as_the_hub_says(hub.link(&subject.source.name())));
+                sensor::as_the_hub_says(hub.link(&subject.source.name())).into_iter().for_each(tell);
             }
             None => {
                 tell(refused(Refusal::Busy.explain(&subject.source)));
@@ -95,7 +95,7 @@ fn server(
     // Most of them serve one at a time.
     if let Some(link) = hub.and_then(|hub| hub.link(&subject.source.name())) {
         tell(Finding::ok("holder", "it is a link of the hub"));
-        tell(sensor::as_the_hub_says(Some(link)));
+        sensor::as_the_hub_says(Some(link)).into_iter().for_each(tell);
         return Ok(());
     }
     match probe::open(&subject.source, stop) {

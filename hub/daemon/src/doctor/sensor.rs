@@ -13,15 +13,43 @@ use crate::config::Link;
 
 /// What follows from what the sensor at `port` said of itself.
 pub(crate) fn examine(port: &str, report: &Report, link: Option<&Link>) -> Vec<Finding> {
-    vec![answer(report), settings(port, report, link), power_on(port, report), health(report)]
+    let mut told =
+        Status { mode: report.status().map_or(Status::MODE_UNKNOWN, |it| it.mode().0), ..Status::default() };
+    told.set_port(port);
+    let mut findings =
+        vec![answer(report), settings(port, report, link), power_on(port, report), health(report)];
+    findings.extend(marks(&told, ""));
+    findings
 }
 
 /// The port is the hub's: what it says of its link.
-pub(crate) fn as_the_hub_says(link: Option<(&str, &Status)>) -> Finding {
-    const NAME: &str = "sensor";
-    let Some((name, status)) = link else {
-        return Finding::skipped(NAME, "the hub has the port under another name: scanhub info");
+pub(crate) fn as_the_hub_says(link: Option<(&str, &Status)>) -> Vec<Finding> {
+    match link {
+        None => vec![Finding::skipped("sensor", "the hub has the port under another name: scanhub info")],
+        Some((name, status)) => {
+            let marks = marks(status, "after the hub's end: ");
+            std::iter::once(link_of_the_hub(name, status)).chain(marks).collect()
+        }
+    }
+}
+
+/// Whether marks can be found; nothing as long as the mode is not known. Who needs none may leave it so.
+fn marks(status: &Status, when: &str) -> Option<Finding> {
+    const NAME: &str = "marks";
+    let Some(remedy) = status.reflector_remedy() else {
+        return status
+            .has_reflector_bits()?
+            .then(|| Finding::ok(NAME, "the measuring mode has reflector bits"));
     };
+    let what = format!(
+        "the measuring mode, {:02x}h, has no reflector bits: topic marks is unavailable",
+        status.mode
+    );
+    Some(Finding::warning(NAME, what, format!("{when}{remedy}")))
+}
+
+fn link_of_the_hub(name: &str, status: &Status) -> Finding {
+    const NAME: &str = "sensor";
     let text = format!(
         "link {name} of the hub: {}, {}",
         status.state().map_or("unknown", State::name),
@@ -213,10 +241,14 @@ mod tests {
     }
 
     fn healthy() -> [u8; 152] {
+        with_mode(1)
+    }
+
+    fn with_mode(mode: u8) -> [u8; 152] {
         let health = Health {
             software: *b"V02.30 ",
             operating_mode: 0x25,
-            mode: Mode(1),
+            mode: Mode(mode),
             variant: Variant::HALF,
             unit: Unit::Mm,
             baud: Baud::B38400,
@@ -273,6 +305,18 @@ mod tests {
     }
 
     #[test]
+    fn a_mode_without_marks_is_told() {
+        let found = |mode: u8| {
+            examine("/dev/ttyUSB0", &report(with_mode(mode), 0x10, &[]), None).pop().expect("it is checked")
+        };
+        assert_eq!((found(1).name, found(1).state), ("marks", Verdict::Ok));
+        assert_eq!(
+            (found(0).state, found(0).remedy.as_str()),
+            (Verdict::Warning, "scanhub configure /dev/ttyUSB0 mode=0x01")
+        );
+    }
+
+    #[test]
     fn what_the_configuration_says_otherwise_is_told() {
         let link = Link {
             name: "front".into(),
@@ -296,12 +340,18 @@ mod tests {
     #[test]
     fn what_the_hub_says_is_passed_on() {
         let mut status = Status { state: State::Streaming as u8, baud: 500_000, ..Status::default() };
-        assert_eq!(as_the_hub_says(Some(("front", &status))).state, Verdict::Ok);
+        let told = |status: &Status| as_the_hub_says(Some(("front", status)));
+        assert_eq!(told(&status).iter().map(|finding| finding.state).collect::<Vec<_>>(), [Verdict::Ok]);
+        status.mode = 0;
+        status.set_port("/dev/ttyUSB0");
+        let [_, marks] = &told(&status)[..] else { panic!("of marks nothing") };
+        assert_eq!(marks.state, Verdict::Warning);
+        assert_eq!(marks.remedy, "after the hub's end: scanhub configure /dev/ttyUSB0 mode=0x01");
         status.set_last_error("the window is dirty");
-        let told = as_the_hub_says(Some(("front", &status)));
-        assert!(told.state == Verdict::Warning && told.finding.contains("window"), "{told}");
+        let dirty = &told(&status)[0];
+        assert!(dirty.state == Verdict::Warning && dirty.finding.contains("window"), "{dirty}");
         status.state = State::Silent as u8;
-        assert_eq!(as_the_hub_says(Some(("front", &status))).state, Verdict::Failed);
-        assert_eq!(as_the_hub_says(None).state, Verdict::Skipped);
+        assert_eq!(told(&status)[0].state, Verdict::Failed);
+        assert_eq!(as_the_hub_says(None)[0].state, Verdict::Skipped);
     }
 }

@@ -6,6 +6,7 @@ use super::{Class, INVALID};
 use schema::{BEAMS, Background};
 
 /// State of the paper's method.
+#[derive(Clone)]
 pub(super) struct Paper {
     /// Ranges in device units, [`Background::UNTAUGHT`] or [`Background::FAR`].
     background: [u16; BEAMS],

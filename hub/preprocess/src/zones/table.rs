@@ -1,7 +1,9 @@
-//! Which values of each beam lie where: inside a circle, before the robot's own body, in no range at all. Made once
-//! for a layout of beams, in floating point; read with every scan, in device units. Refuses to know verdicts.
+//! Where the beams of a sensor meet circles around the robot's centre. Made once for a layout of beams, in floating point
+//! and millimetres; read with every scan, in device units. Refuses to know verdicts.
 
-use super::{Ranges, SECTORS, Sector, Settings};
+use super::nearest::Nearest;
+use super::spans::{Ranges, Spans};
+use super::{SECTORS, Sector, Settings};
 use schema::{BEAMS, Code, Pose, Scan, ZONES};
 
 /// What of a scan the table depends on.
@@ -25,25 +27,10 @@ impl Layout {
         let Layout { count, unit_mm, range_bits, first_angle_mdeg, step_mdeg } = self;
         Scan { count, unit_mm, range_bits, first_angle_mdeg, step_mdeg, ..Scan::default() }
     }
-}
 
-/// The values `from..from + len` of each beam, in device units. Nothing for beams that there are not.
-#[derive(Clone, Copy)]
-struct Spans {
-    from: [u16; BEAMS],
-    len: [u16; BEAMS],
-}
-
-impl Spans {
-    const NONE: Spans = Spans { from: [0; BEAMS], len: [0; BEAMS] };
-
-    fn set(&mut self, i: usize, from: u64, below: u64) {
-        self.from[i] = from as u16;
-        self.len[i] = below.saturating_sub(from) as u16;
-    }
-
-    fn has(&self, i: usize, value: u16) -> bool {
-        value.wrapping_sub(self.from[i]) < self.len[i]
+    /// Millimetres per device unit; no sensor has a unit of 0.
+    fn unit_mm(self) -> u64 {
+        u64::from(self.unit_mm.max(1))
     }
 }
 
@@ -61,8 +48,7 @@ pub(super) struct Table {
     layout: Layout,
     /// Valid readings inside each circle, beyond the robot's own body.
     inside: [Spans; ZONES],
-    /// Valid readings beyond the robot's own body.
-    beyond_self: Spans,
+    nearest: Nearest,
     /// 1 for beams that can tell something of the largest circle.
     telling: [u16; BEAMS],
     most_invalid: u16,
@@ -70,8 +56,6 @@ pub(super) struct Table {
     codes_from: u16,
     /// The largest value, code 0.
     max: u16,
-    /// Twice the way along each beam to the point that is nearest to the centre, backwards, in device units.
-    twice_q: [f64; BEAMS],
 }
 
 impl Table {
@@ -94,12 +78,11 @@ impl Table {
             max_invalid: settings.max_invalid,
             layout: Layout::default(),
             inside: [Spans::NONE; ZONES],
-            beyond_self: Spans::NONE,
+            nearest: Nearest::NONE,
             telling: [0; BEAMS],
             most_invalid: 0,
             codes_from: 0,
             max: 0,
-            twice_q: [0.0; BEAMS],
         };
         table.make(Layout::default());
         table
@@ -116,41 +99,44 @@ impl Table {
     }
 
     /// What the table was made for.
-    pub(super) fn layout(&self) -> &Layout {
-        &self.layout
+    pub(super) fn layout(&self) -> Layout {
+        self.layout
     }
 
     /// Makes the table anew.
     pub(super) fn make(&mut self, layout: Layout) {
         let scan = layout.scan();
-        // A unit of 0 is none that a sensor has.
-        let unit_mm = u64::from(layout.unit_mm.max(1));
         self.layout = layout;
         self.max = scan.max();
         self.codes_from = self.max.saturating_sub(Code::BEYOND.0);
-        (self.inside, self.beyond_self) = ([Spans::NONE; ZONES], Spans::NONE);
-        (self.telling, self.twice_q) = ([0; BEAMS], [0.0; BEAMS]);
-        let (sx, sy) = (1000.0 * self.pose.x_m, 1000.0 * self.pose.y_m);
+        self.inside = [Spans::NONE; ZONES];
+        self.nearest = Nearest::NONE;
+        self.telling = [0; BEAMS];
         for i in 0..scan.beams() {
-            let angle_mdeg = scan.angle_mdeg(i);
-            let (ux, uy) = self.pose.direction(angle_mdeg);
-            let q = sx * ux + sy * uy;
-            let self_min_mm = self.self_min_mm(angle_mdeg);
-            let own = self_min_mm.div_ceil(unit_mm);
-            let below = u64::from(self.codes_from);
-            self.beyond_self.set(i, own, below);
-            self.twice_q[i] = 2.0 * q / unit_mm as f64;
-            for zone in 0..self.circles {
-                let (lo_mm, hi_mm) = self.chord_mm(q, sx * sx + sy * sy, f64::from(self.radii_mm[zone]));
-                let from = if self.exact && lo_mm > 0 { lo_mm / unit_mm + 1 } else { 0 };
-                self.inside[zone].set(i, from.max(own), hi_mm.div_ceil(unit_mm).min(below));
-                if zone == 0 {
-                    self.telling[i] = u16::from(hi_mm > self_min_mm);
-                }
-            }
+            self.make_beam(i, scan.angle_mdeg(i));
         }
+        self.nearest.finish();
         let telling: u16 = self.telling.iter().sum();
         self.most_invalid = floor(self.max_invalid * f64::from(telling)) as u16;
+    }
+
+    fn make_beam(&mut self, i: usize, angle_mdeg: i32) {
+        let unit_mm = self.layout.unit_mm();
+        let ((sx, sy), (ux, uy)) = (self.sensor_mm(), self.pose.direction(angle_mdeg));
+        let (q, square) = (sx * ux + sy * uy, sx * sx + sy * sy);
+        let self_min_mm = self.self_min_mm(angle_mdeg);
+        let own = self_min_mm.div_ceil(unit_mm);
+        self.nearest.seen.set(i, own, self.codes_from);
+        self.nearest.twice_q[i] = 2.0 * q / unit_mm as f64;
+        for zone in 0..self.circles {
+            let (lo_mm, hi_mm) = self.chord_mm(q, square, f64::from(self.radii_mm[zone]));
+            let from = if self.exact && lo_mm > 0 { lo_mm / unit_mm + 1 } else { 0 };
+            let below = hi_mm.div_ceil(unit_mm).min(u64::from(self.codes_from));
+            self.inside[zone].set(i, from.max(own), below as u16);
+            if zone == 0 {
+                self.telling[i] = u16::from(hi_mm > self_min_mm);
+            }
+        }
     }
 
     /// A scan of this layout tells anything at all.
@@ -159,18 +145,17 @@ impl Table {
         self.layout.count > 0 && (x_m + y_m + yaw_rad).is_finite()
     }
 
-    /// Beams through the largest circle that may be invalid.
+    /// Beams that met something inside circle `zone`.
+    pub(super) fn inside(&self, zone: usize, ranges: &Ranges) -> u16 {
+        self.inside[zone].count(ranges)
+    }
+
+    /// Of so many invalid beams or fewer the verdict does not become unknown.
     pub(super) fn most_invalid(&self) -> u16 {
         self.most_invalid
     }
 
-    /// Beams that met something inside circle `zone`.
-    pub(super) fn inside(&self, zone: usize, ranges: &Ranges) -> u16 {
-        let spans = &self.inside[zone];
-        (0..BEAMS).map(|i| u16::from(spans.has(i, ranges[i]))).sum()
-    }
-
-    /// Beams without a reading among those that could tell something of the largest circle.
+    /// Beams without a reading among those that can tell something of the largest circle.
     pub(super) fn invalid(&self, ranges: &Ranges) -> u16 {
         let has_beyond = self.max >= Code::BEYOND.0;
         let is_invalid = |value: u16| {
@@ -181,28 +166,19 @@ impl Table {
         (0..BEAMS).map(|i| u16::from(is_invalid(ranges[i])) & self.telling[i]).sum()
     }
 
-    /// The beam whose point is nearest to the robot's centre, the first of several, and the distance in mm, rounded
+    /// The beam whose point is nearest to the robot's centre, the first of several, and its distance in mm, rounded
     /// down.
     pub(super) fn nearest(&self, ranges: &Ranges) -> Option<(u16, u32)> {
-        // The distance squared is r^2 + 2qr and what is the same for all beams.
-        let key = |i: usize| {
-            let value = f64::from(ranges[i]);
-            let key = value * (value + self.twice_q[i]);
-            if self.beyond_self.has(i, ranges[i]) { key } else { f64::INFINITY }
-        };
-        let mut nearest = (f64::INFINITY, 0);
-        for start in (0..BEAMS).step_by(BLOCK) {
-            let block = start..(start + BLOCK).min(BEAMS);
-            let least = block.clone().map(key).fold(f64::INFINITY, |a, b| if b < a { b } else { a });
-            if least < nearest.0 {
-                nearest = (least, block.clone().find(|&i| key(i) == least).unwrap_or(start));
-            }
-        }
-        let (key, beam) = nearest;
-        let unit_mm = f64::from(self.layout.unit_mm.max(1));
-        let (sx, sy) = (1000.0 * self.pose.x_m, 1000.0 * self.pose.y_m);
-        let square = key * unit_mm * unit_mm + (sx * sx + sy * sy);
-        key.is_finite().then_some((beam as u16, floor(square.max(0.0).sqrt()) as u32))
+        let (beam, square) = self.nearest.find(ranges)?;
+        let unit_mm = self.layout.unit_mm() as f64;
+        let (sx, sy) = self.sensor_mm();
+        let distance_mm = (square * unit_mm * unit_mm + sx * sx + sy * sy).max(0.0).sqrt();
+        Some((beam as u16, floor(distance_mm) as u32))
+    }
+
+    /// The sensor's place in the robot's frame.
+    fn sensor_mm(&self) -> (f64, f64) {
+        (1000.0 * self.pose.x_m, 1000.0 * self.pose.y_m)
     }
 
     /// Where the robot's own body ends along a beam.
@@ -211,10 +187,10 @@ impl Table {
         self.sectors.iter().filter(here).map(|sector| u64::from(sector.range_mm)).max().unwrap_or(0)
     }
 
-    /// The ranges in mm between which a beam is inside a circle: with the sensor at s and the beam's direction u, `q`
-    /// is s.u, `square` is |s|^2 (the line through a circle; paper III.B.1). 0 and 0 if it never is.
-    fn chord_mm(&self, q: f64, square: f64, radius: f64) -> (u64, u64) {
-        let outside = square - radius * radius;
+    /// The ranges in mm between which a beam is inside a circle, 0 and 0 if it never is: `q` is s.u and `square` |s|^2,
+    /// with s the sensor's place and u the beam's direction (a line through a circle; paper III.B.1).
+    fn chord_mm(&self, q: f64, square: f64, radius_mm: f64) -> (u64, u64) {
+        let outside = square - radius_mm * radius_mm;
         let disc = q * q - outside;
         let (lo, hi) = if outside < 0.0 {
             (0.0, -q + disc.sqrt())
@@ -224,7 +200,7 @@ impl Table {
             return (0, 0);
         };
         let margin = f64::from(self.margin_mm);
-        // Below 0 is 0.
+        // What is below 0 becomes 0.
         (floor(lo - margin) as u64, ceil(hi + margin) as u64)
     }
 }
@@ -232,9 +208,6 @@ impl Table {
 /// Values within so many mm of a whole number are that number: rounding is never towards clear, but what stands
 /// exactly on a circle is outside, whatever sine and cosine lose.
 const WHOLE_MM: f64 = 1e-6;
-
-/// Beams that are compared before it is asked which of them is nearest.
-const BLOCK: usize = 16;
 
 fn floor(value: f64) -> f64 {
     if (value - value.round()).abs() <= WHOLE_MM { value.round() } else { value.floor() }

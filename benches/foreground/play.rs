@@ -1,0 +1,83 @@
+//! Scenes of the simulated world as a method gets to see them: scans, and beside each beam what it should say of it.
+//! Refuses to know any method.
+
+use lms::variant::{Mode, Unit, Variant};
+use schema::Scan;
+use sim::look::Met;
+use sim::room::Room;
+use sim::world::World;
+
+/// A scene of the table.
+#[derive(Clone, Copy)]
+pub(crate) struct Scene {
+    /// Its world.
+    pub(crate) world: &'static str,
+    pub(crate) unit: Unit,
+    pub(crate) scans: u64,
+    /// Whether beams are as wide as real ones, so that at edges they tell one surface, the other or one between.
+    pub(crate) mixed: bool,
+}
+
+/// What a method should say of a beam.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Due {
+    /// In the foreground: a person.
+    Foreground,
+    /// Not in the foreground: what always stood there, what stood behind a thing that has been taken away, and a thing
+    /// that was put down or moved more than [`OLD_S`] ago.
+    Other,
+    /// A thing that has been put down, moved or opened lately: rightly foreground until it is learned, and each method
+    /// takes its own time.
+    New,
+    /// Grazed by a leg, or without a reading.
+    Neither,
+}
+
+/// A thing older than this is background: twice the time that the paper's method takes at most.
+const OLD_S: f64 = 20.0;
+
+/// One scan and what is due.
+pub(crate) struct Frame {
+    pub(crate) end_ns: u64,
+    pub(crate) scan: Scan,
+    pub(crate) due: Vec<Due>,
+    pub(crate) met: Vec<Met>,
+}
+
+/// The scans of `scene` as `seed` makes it.
+pub(crate) fn play(scene: &Scene, seed: u64) -> Vec<Frame> {
+    let world: World = scene.world.parse().expect("a world that the program brings along");
+    let mut layers = world.layers().expect("a world with noise");
+    layers.spot &= scene.mixed;
+    let room = Room::new(&world.with_layers(layers), seed);
+    (1..=scene.scans).map(|number| frame(&room, scene.unit, number)).collect()
+}
+
+fn frame(room: &Room, unit: Unit, number: u64) -> Frame {
+    let (variant, mode) = (Variant::HALF, Mode(1));
+    let end_ns = number * variant.turns() * lms::variant::MIRROR_TURN;
+    let look = room.look(variant, unit, mode, end_ns);
+    let mut scan = Scan {
+        count: look.words.len() as u16,
+        unit_mm: unit.mm(),
+        range_bits: mode.range_bits(),
+        first_angle_mdeg: variant.first_angle_mdeg(),
+        step_mdeg: 10 * variant.resolution_cdeg,
+        ..Scan::default()
+    };
+    for (range, word) in scan.range_array.iter_mut().zip(&look.words) {
+        *range = word & mode.max_value();
+    }
+    let due = (0..look.truth.len()).map(|i| due(&scan, i, look.truth[i], end_ns)).collect();
+    Frame { end_ns, scan, due, met: look.truth }
+}
+
+fn due(scan: &Scan, i: usize, met: Met, end_ns: u64) -> Due {
+    match met {
+        _ if scan.range(i).is_none() => Due::Neither,
+        Met::Person => Due::Foreground,
+        Met::Box { since_ns } if end_ns.saturating_sub(since_ns) as f64 <= OLD_S * 1e9 => Due::New,
+        Met::Static { .. } | Met::Box { .. } => Due::Other,
+        Met::Grazed | Met::Invalid => Due::Neither,
+    }
+}

@@ -1,0 +1,289 @@
+//! The receiver's account against a slow model that keeps every number, under whatever a network and strangers do.
+
+use std::collections::{BTreeMap, BTreeSet};
+
+use fastrand::Rng;
+use schema::datagram::{
+    Account, Announce, Announced, Fresh, HEAD, Head, LIVES, Packed, ROWS, Refusal, WINDOW,
+};
+use schema::{Background, Marks, Topic, Zones};
+
+/// Hub, epoch, sensor, topic.
+type Key = (u64, u32, u8, u8);
+
+/// What a datagram is, known without looking at its bytes: numbers do not wrap.
+#[derive(Clone)]
+struct Sent {
+    key: Key,
+    number: u64,
+    /// Of an announcement: the next numbers.
+    next: Vec<(u8, u64)>,
+    bytes: Vec<u8>,
+}
+
+impl Sent {
+    fn new(key: Key, number: u64, next: Vec<(u8, u64)>) -> Sent {
+        let (hub, epoch, sensor, topic) = key;
+        let mut buffer = [0; 200];
+        let room = &mut buffer[HEAD..];
+        let len = match Topic::of_number(topic) {
+            None => {
+                let mut announce = Announce::new(1, "front", "");
+                for &(topic, next) in &next {
+                    announce.add(Announced { topic, group: 81, port: 22_200, next: next as u32 });
+                }
+                announce.pack(room)
+            }
+            Some(Topic::Marks) => Marks::default().pack(room),
+            Some(Topic::Background) => Background::default().pack(room),
+            Some(_) => Zones::unknown().pack(room),
+        };
+        let head =
+            Head { topic, hub, epoch, sequence: number as u32, sensor, revision: 1, ..Head::default() };
+        let bytes = head.seal(&mut buffer, len.unwrap()).unwrap().to_vec();
+        Sent { key, number, next, bytes }
+    }
+}
+
+/// All numbers that came.
+#[derive(Default)]
+struct Numbers {
+    came: BTreeSet<u64>,
+    expected: BTreeSet<u64>,
+    duplicate: u64,
+    reordered: u64,
+}
+
+#[derive(Default)]
+struct Model {
+    rows: BTreeMap<Key, Numbers>,
+    lives: BTreeSet<(u64, u32)>,
+    refused: BTreeMap<&'static str, u64>,
+}
+
+impl Model {
+    fn receive(&mut self, sent: &Sent) -> Result<Fresh, Refusal> {
+        let result = self.take(sent);
+        if let Err(refusal) = result {
+            *self.refused.entry(refusal.name()).or_default() += 1;
+        }
+        result
+    }
+
+    fn take(&mut self, sent: &Sent) -> Result<Fresh, Refusal> {
+        let (hub, epoch, sensor, _) = sent.key;
+        if self.lives.iter().any(|&(known, later)| known == hub && later > epoch) {
+            return Err(Refusal::Epoch);
+        }
+        let highest = self.rows.get(&sent.key).and_then(|row| row.came.last().copied());
+        if highest.is_some_and(|highest| highest >= sent.number + WINDOW as u64) {
+            return Err(Refusal::Stale);
+        }
+        let has_row = self.rows.contains_key(&sent.key);
+        if !has_row
+            && (self.rows.len() == ROWS || !self.lives.contains(&(hub, epoch)) && self.lives.len() == LIVES)
+        {
+            return Err(Refusal::Capacity);
+        }
+        self.lives.insert((hub, epoch));
+        let row = self.rows.entry(sent.key).or_default();
+        let fresh = match highest {
+            _ if row.came.contains(&sent.number) => Fresh::Duplicate,
+            Some(highest) if highest > sent.number => Fresh::Late,
+            _ => Fresh::New,
+        };
+        row.duplicate += u64::from(fresh == Fresh::Duplicate);
+        row.reordered += u64::from(fresh == Fresh::Late);
+        row.came.insert(sent.number);
+        row.expect(sent.number, sent.number + 1);
+        for &(topic, next) in &sent.next {
+            let key = (hub, epoch, sensor, topic);
+            if self.rows.contains_key(&key) || self.rows.len() < ROWS {
+                self.rows.entry(key).or_default().expect(next, next);
+            }
+        }
+        Ok(fresh)
+    }
+
+    /// Received, lost, duplicate, reordered.
+    fn figures(&self) -> BTreeMap<Key, [u64; 4]> {
+        let all = self.rows.iter().map(|(&key, row)| {
+            let received = row.came.len() as u64;
+            (key, [received, row.sent() - received, row.duplicate, row.reordered])
+        });
+        all.filter(|(_, figures)| figures[0] + figures[1] > 0).collect()
+    }
+}
+
+impl Numbers {
+    /// `first` to `next` were sent, if `first` is one; nothing is known of what is before the first announcement.
+    fn expect(&mut self, first: u64, next: u64) {
+        let known_first = self.expected.first().copied().unwrap_or(first);
+        // An announcement alone moves no beginning.
+        let first = if first == next { known_first } else { first.min(known_first) };
+        self.expected.extend([first, next.max(first)]);
+    }
+
+    fn sent(&self) -> u64 {
+        self.expected.last().unwrap() - self.expected.first().unwrap()
+    }
+}
+
+fn figures(account: &Account) -> BTreeMap<Key, [u64; 4]> {
+    let rows = account.rows();
+    rows.map(|row| {
+        let key = (row.hub, row.epoch, row.sensor, row.topic);
+        (key, [row.received, row.lost(), row.duplicate, row.reordered])
+    })
+    .collect()
+}
+
+/// Gateways that send, restart and announce, and a network between.
+struct World {
+    random: Rng,
+    now: u64,
+    /// By hub and sensor: the epoch and the next number of each topic, announce first.
+    gateways: Vec<(u64, u32, u8, Vec<u64>)>,
+    /// By time of arrival.
+    underway: BTreeMap<(u64, u64), Sent>,
+    count: u64,
+    /// One datagram of a stranger to so many of the gateways.
+    strangers: u8,
+}
+
+impl World {
+    fn new(seed: u64) -> World {
+        let mut random = Rng::with_seed(seed);
+        let start = |random: &mut Rng| {
+            // Some begin close to the end of 32 bits.
+            let near = (1 << 32) - random.u64(..2_000);
+            [0, near, 1 << 31][random.usize(..3)]
+        };
+        let mut gateways = Vec::new();
+        for hub in 0..random.u64(1..4) {
+            for sensor in 0..random.u8(1..4) {
+                gateways.push((hub, 1, sensor, (0..4).map(|_| (1 << 33) + start(&mut random)).collect()));
+            }
+        }
+        let strangers = [60, 5][random.usize(..2)];
+        World { random, now: 0, gateways, underway: BTreeMap::new(), count: 0, strangers }
+    }
+
+    /// One datagram goes out, and all that arrive meanwhile come back.
+    fn step(&mut self) -> Vec<Sent> {
+        self.now += 1;
+        let at = self.random.usize(..self.gateways.len());
+        let life = self.random.u32(..12_000);
+        let (hub, epoch, sensor, next) = &mut self.gateways[at];
+        if life == 0 {
+            *epoch += self.random.u32(1..3);
+            next.fill(0);
+        }
+        let topic = self.random.usize(..4);
+        let key = (*hub, *epoch, *sensor, TOPICS[topic]);
+        let announced: Vec<(u8, u64)> = TOPICS.into_iter().zip(next.iter().copied()).skip(1).collect();
+        let sent = Sent::new(key, next[topic], if topic == 0 { announced } else { Vec::new() });
+        next[topic] += 1;
+        if self.random.u8(..20) > 0 {
+            self.carry(sent.clone());
+        }
+        if self.random.u8(..20) == 0 {
+            self.carry(sent);
+        }
+        // A stranger.
+        if self.random.u8(..self.strangers) == 0 {
+            let key = (self.random.u64(100..170), self.random.u32(1..3), self.random.u8(..), 4);
+            self.carry(Sent::new(key, 1 << 33, Vec::new()));
+        }
+        let later = self.underway.split_off(&(self.now, 0));
+        std::mem::replace(&mut self.underway, later).into_values().collect()
+    }
+
+    fn carry(&mut self, sent: Sent) {
+        let delay = match self.random.u8(..100) {
+            0 => self.random.u64(..20_000),
+            1..10 => self.random.u64(..100),
+            _ => 0,
+        };
+        self.count += 1;
+        self.underway.insert((self.now + delay, self.count), sent);
+    }
+}
+
+#[test]
+fn it_says_what_a_model_says_that_keeps_everything() {
+    let (mut refused, mut full) = (BTreeMap::new(), 0);
+    for seed in 0..10 {
+        let mut world = World::new(seed);
+        let (mut account, mut model) = (Account::new(&Topic::ALL), Model::default());
+        for step in 0..16_000 {
+            for sent in world.step() {
+                let fresh = account.receive(&sent.bytes).map(|(_, fresh)| fresh);
+                assert_eq!(
+                    fresh,
+                    model.receive(&sent),
+                    "seed {seed}, step {step}, {:?}",
+                    (sent.key, sent.number)
+                );
+            }
+            if step % 1_000 == 0 {
+                assert_eq!(figures(&account), model.figures(), "seed {seed}, step {step}");
+            }
+        }
+        full += u32::from(model.rows.len() == ROWS);
+        assert_eq!(figures(&account), model.figures(), "seed {seed}");
+        for refusal in Refusal::ALL {
+            let count = model.refused.get(refusal.name()).copied().unwrap_or_default();
+            assert_eq!(account.refused(refusal), count, "seed {seed}, {}", refusal.name());
+            *refused.entry(refusal.name()).or_insert(0) += count;
+        }
+    }
+    // The network did what it was made for.
+    assert!(full > 0);
+    for refusal in [Refusal::Epoch, Refusal::Stale, Refusal::Capacity] {
+        assert!(refused[refusal.name()] > 0, "nothing was ever {}", refusal.name());
+    }
+}
+
+/// With an announcement before and one behind, what is lost is what a relay dropped, whichever that was.
+#[test]
+fn it_is_the_log_of_a_relay() {
+    const SENT: u64 = 5_000;
+    let topic = Topic::Zones.number();
+    for seed in 0..50 {
+        let mut random = Rng::with_seed(seed);
+        let first = (1 << 33) - random.u64(..2 * SENT);
+        let announce =
+            |number: u64, next| Sent::new((1, 1, 0, Announce::NUMBER), number, vec![(topic, next)]);
+        let (mut dropped, mut doubled) = (0, 0);
+        let mut arrivals = Vec::new();
+        for number in first..first + SENT {
+            let sent = Sent::new((1, 1, 0, topic), number, Vec::new());
+            let late = if random.u8(..20) == 0 { random.u64(..1_000) } else { 0 };
+            match random.u8(..100) {
+                0..5 => dropped += 1,
+                5..7 => {
+                    doubled += 1;
+                    arrivals.extend([(number + late, sent.clone()), (number + random.u64(..20), sent)]);
+                }
+                _ => arrivals.push((number + late, sent)),
+            }
+        }
+        arrivals.sort_by_key(|&(at, _)| at);
+        let mut account = Account::new(&Topic::ALL);
+        let (mut highest, mut below, mut came) = (0, 0, BTreeSet::new());
+        account.receive(&announce(0, first).bytes).unwrap();
+        for (_, sent) in &arrivals {
+            account.receive(&sent.bytes).unwrap();
+            below += u64::from(came.insert(sent.number) && sent.number < highest);
+            highest = highest.max(sent.number);
+        }
+        account.receive(&announce(1, first + SENT).bytes).unwrap();
+        let expected = [SENT - dropped, dropped, doubled, below];
+        assert_eq!(figures(&account)[&(1, 1, 0, topic)], expected, "seed {seed}");
+        assert!(dropped > 100 && doubled > 30 && below > 100);
+    }
+}
+
+/// Announce, marks, zones, background.
+const TOPICS: [u8; 4] = [Announce::NUMBER, 3, 4, 6];

@@ -1,0 +1,198 @@
+//! What the golden datagrams say, as values.
+
+use bytemuck::Zeroable;
+use schema::datagram::{Announce, Announced, Head, LanFlags, Packed};
+use schema::{
+    Background, CONTENTS_UPPER, COUNTERS, Counter, Counters, Foreground, Mark, Marks, Pose, Scan, Segment,
+    State, Status, Topic, Verdict, Zone, Zones,
+};
+
+/// Name of the file, header, and what writes the payload.
+pub(crate) type Golden = (&'static str, Head, fn(&mut [u8]) -> Option<usize>);
+
+/// Those that a gateway of this version sends.
+pub(crate) const ALL: [Golden; 10] = [
+    ("announce", Head { sequence: 7, counter: 0, ..head(None) }, announce),
+    ("telegram", Head { sequence: u32::MAX, ..head(Some(Topic::Telegram)) }, telegram),
+    ("scan", Head { flags: LanFlags::SUSPECT, ..head(Some(Topic::Scan)) }, |room| {
+        scan(361, 0, 500, 0).pack(room)
+    }),
+    (
+        "scan_intensities",
+        Head { flags: LanFlags::SIMULATED, sequence: 2, ..head(Some(Topic::Scan)) },
+        |room| scan(401, 40_000, 250, 3).pack(room),
+    ),
+    ("marks", head(Some(Topic::Marks)), |room| marks().pack(room)),
+    ("zones", ZONES, |room| zones().pack(room)),
+    ("zones_unknown", Head { sequence: 5001, ..ZONES }, |room| {
+        Zones { invalid_beams: 361, flags: Zones::PROVISIONAL, ..Zones::unknown() }.pack(room)
+    }),
+    ("foreground", head(Some(Topic::Foreground)), |room| foreground().pack(room)),
+    ("background", Head { flags: LanFlags::REPLAYED, ..head(Some(Topic::Background)) }, |room| {
+        background().pack(room)
+    }),
+    (
+        "status",
+        Head { flags: LanFlags::STAMP_ESTIMATED, counter: u32::MAX, ..head(Some(Topic::Status)) },
+        |room| status().pack(room),
+    ),
+];
+
+/// The header of `zones`.
+pub(crate) const ZONES: Head = Head { sequence: 5000, ..head(Some(Topic::Zones)) };
+
+const fn head(topic: Option<Topic>) -> Head {
+    Head {
+        topic: match topic {
+            Some(topic) => topic as u8 + 1,
+            None => Announce::NUMBER,
+        },
+        flags: 0,
+        hub: 0x1122_3344_5566_7788,
+        epoch: 1_700_000_000,
+        sequence: 1,
+        stamp_ns: 1_700_000_123_456_789_012,
+        sensor: 1,
+        revision: 1,
+        counter: 4660,
+    }
+}
+
+const KIND: &str = "LMS200;301063;V02.30";
+
+fn announce(room: &mut [u8]) -> Option<usize> {
+    let mut announce = Announce::new(0x99AA_BBCC_DDEE_FF00, "front", KIND);
+    for (topic, next) in [(Topic::Scan, u32::MAX - 1), (Topic::Zones, 5001), (Topic::Status, 3)] {
+        let group = schema::datagram::group(topic);
+        announce.add(Announced { topic: topic.number(), group, port: 22_200, next });
+    }
+    announce.pack(room)
+}
+
+fn telegram(room: &mut [u8]) -> Option<usize> {
+    let telegram = [0x02, 0x80, 0x03, 0x00, 0xA0, 0x00, 0x10, 0x16, 0x0A];
+    room[..telegram.len()].copy_from_slice(&telegram);
+    Some(telegram.len())
+}
+
+/// Every 60th beam has a code. All upper bits are 0 where there are no intensities.
+fn scan(count: u16, first_angle_mdeg: i32, step_mdeg: u16, intensity_bits: u8) -> Scan {
+    let mut scan = Scan {
+        count,
+        unit_mm: 1,
+        range_bits: 13,
+        first_angle_mdeg,
+        step_mdeg,
+        intensity_bits,
+        contents: CONTENTS_UPPER,
+        ..Scan::default()
+    };
+    for i in 0..count {
+        let range = if i % 60 == 0 { 0x1FFF - i / 60 } else { 1000 + 37 * i % 7000 };
+        scan.range_array[usize::from(i)] = range;
+        scan.upper_array[usize::from(i)] = if intensity_bits > 0 { (i % 8) as u8 } else { 0 };
+    }
+    scan
+}
+
+fn marks() -> Marks {
+    let mut marks = Marks { count: 2, flags: Marks::OVERFLOW, ..Marks::default() };
+    marks.mark_array[0] = Mark {
+        angle_mdeg: -250,
+        range_dmm: 12_345,
+        weight: 11,
+        peak: 5,
+        edge: 1,
+        first_beam: 0,
+        last_beam: 2,
+    };
+    marks.mark_array[1] = Mark {
+        angle_mdeg: 90_000,
+        range_dmm: 79_999,
+        weight: 7,
+        peak: 7,
+        edge: 0,
+        first_beam: 180,
+        last_beam: 180,
+    };
+    marks
+}
+
+fn zones() -> Zones {
+    let mut zones = Zones {
+        verdict: Verdict::Slow as u8,
+        count: 2,
+        nearest_beam: 180,
+        nearest_mm: 733,
+        invalid_beams: 4,
+        ..Zones::unknown()
+    };
+    zones.zone_array[0] = Zone { radius_mm: 1000, beams: 17, violated: 1, reserved: [0; 3] };
+    zones.zone_array[1] = Zone { radius_mm: 600, ..Zone::default() };
+    zones
+}
+
+/// 64 segments of three beams, of which 55 fit.
+fn foreground() -> Foreground {
+    let mut foreground =
+        Foreground { generation: 9, count: 361, unit_mm: 1, segments: 64, ..Foreground::default() };
+    for s in 0..64_u16 {
+        for beam in [5 * s, 5 * s + 1, 5 * s + 2] {
+            foreground.bit_array[usize::from(beam) / 8] |= 1 << (beam % 8);
+            foreground.range_array[usize::from(foreground.beams)] = 2000 + beam;
+            foreground.beams += 1;
+        }
+        foreground.segment_array[usize::from(s)] = Segment {
+            first: 5 * s,
+            last: 5 * s + 2,
+            nearest: 2000 + 5 * s,
+            width: 30 + s,
+            x_mm: i32::from(s) - 1000,
+            y_mm: 1000 - 100 * i32::from(s),
+        };
+    }
+    foreground
+}
+
+fn background() -> Background {
+    let mut model = Background {
+        generation: 9,
+        taught: 162,
+        count: 181,
+        unit_mm: 10,
+        flags: Background::FROZEN,
+        ..Background::default()
+    };
+    for i in 0..181_u16 {
+        model.range_array[usize::from(i)] = match i % 10 {
+            0 => Background::UNTAUGHT,
+            1 => Background::FAR,
+            _ => 3000 + i,
+        };
+    }
+    model
+}
+
+fn status() -> Status {
+    let mut counters = [0; COUNTERS];
+    for (i, counter) in counters[..Counter::ALL.len()].iter_mut().enumerate() {
+        *counter = 1_000_000_000_000_000 + i as u64;
+    }
+    let mut status = Status {
+        state: State::Streaming as u8,
+        mode: 1,
+        unit_mm: 1,
+        baud: 500_000,
+        since_ns: 123_456_789_012_345,
+        rate_mhz: 37_538,
+        angle_deg: 180,
+        resolution_cdeg: 50,
+        counters: Counters(counters),
+        pose: Pose { x_m: 0.25, y_m: -0.125, yaw_rad: 1.5, upside_down: 1, ..Pose::zeroed() },
+        ..Status::default()
+    };
+    status.set_sensor_type(KIND);
+    status.set_port("/dev/ttyUSB0");
+    status.set_last_error("größer");
+    status
+}

@@ -1,0 +1,94 @@
+//! The robot's verdict over two sensors, to those who follow it: a sensor that dies makes it unknown, a hub that dies
+//! too, and whoever comes back is heard again.
+
+mod stage;
+
+use clients::RobotFollower;
+use schema::Verdict;
+use serde_json::Value;
+use stage::{INT, KILL, Program, Stage, TERM, until};
+
+/// So near that nothing in the simulated room is inside.
+const CLEAR: &str = "--set=zones.radii=[0.02,0.01]";
+
+fn hub(stage: &Stage) -> Program {
+    stage.hub(&[&stage.link("front"), &stage.link("rear"), CLEAR])
+}
+
+fn sensor(stage: &Stage, name: &str) -> Program {
+    let port = format!("--port={}", stage.word(name));
+    stage.start(&["simulate", "--json", "--baud=500000", &port]).ready()
+}
+
+/// The verdicts of robot, front and rear in a line of `echo robot/zones`.
+fn verdicts(line: &Value) -> [&str; 3] {
+    let of = |value: &Value, name: &str| {
+        let sensors = value["sensors"].as_array()?;
+        let is_it = |sensor: &&Value| sensor["sensor"] == name;
+        sensors.iter().find(is_it).and_then(|sensor| ALL.into_iter().find(|it| sensor["verdict"] == *it))
+    };
+    const ALL: [&str; 4] = ["clear", "slow", "stop", "unknown"];
+    let robot = ALL.into_iter().find(|it| line["verdict"] == *it).unwrap_or("none");
+    [robot, of(line, "front").unwrap_or("none"), of(line, "rear").unwrap_or("none")]
+}
+
+#[test]
+fn a_sensor_that_dies_makes_the_robot_unknown_and_so_does_the_hub() {
+    let stage = Stage::new();
+    let (_front, rear) = (sensor(&stage, "front"), sensor(&stage, "rear"));
+    let first = hub(&stage);
+    let mut echo = stage.start(&["echo", "--json", "robot/zones"]);
+    let are = |wanted: [&'static str; 3]| move |line: &Value| verdicts(line) == wanted;
+    let line = echo.await_line("all is clear", are(["clear", "clear", "clear"]));
+    assert_eq!((&line["class"], &line["sensor"]), (&"zones".into(), &"robot".into()), "{line}");
+    assert!(line.get("stale").is_none() && line["nearest_mm"].is_u64(), "{line}");
+
+    rear.signal(KILL);
+    let line = echo.await_line("the rear is gone", are(["unknown", "clear", "unknown"]));
+    assert!(line.get("stale").is_none(), "the hub says it itself: {line}");
+    echo.await_line("the front goes on", are(["unknown", "clear", "unknown"]));
+
+    first.signal(KILL);
+    let line = echo.await_line("the hub is gone", are(["unknown", "unknown", "unknown"]));
+    assert_eq!((&line["stale"], &line["nearest_mm"]), (&true.into(), &Value::Null), "{line}");
+    drop((first, rear));
+
+    let _rear = sensor(&stage, "rear");
+    let _second = hub(&stage);
+    echo.await_line("all is clear again", are(["clear", "clear", "clear"]));
+    let outcome = echo.end(INT);
+    assert_eq!(outcome.code, Some(0), "{outcome}");
+    let summaries = outcome.of_class("summary");
+    assert!(matches!(&summaries[..], [one] if one["sensor"] == "robot"), "{outcome}");
+}
+
+#[test]
+fn a_program_that_follows_the_robot() {
+    let stage = Stage::new();
+    let mut robot =
+        RobotFollower::in_domain(vec![stage.place()], &["front", "rear"]).expect("possible names");
+    let first = robot.next().expect("no hub is no failure");
+    assert_eq!((first.verdict(), first.worst()), (Verdict::Unknown, Some("front")));
+    let _front = sensor(&stage, "front");
+    let hub = hub(&stage);
+    until("the front is heard", || {
+        let verdicts: Vec<_> = robot.next().expect("a hub").sensors().map(|(_, verdict)| verdict).collect();
+        verdicts == [Verdict::Clear, Verdict::Unknown]
+    });
+    let _rear = sensor(&stage, "rear");
+    until("the rear is heard", || robot.next().expect("a hub").verdict() == Verdict::Clear);
+    assert_eq!(hub.end(TERM).code, Some(0));
+    until("nobody is heard", || {
+        robot.now().expect("no hub is no failure").sensors().all(|(_, verdict)| verdict == Verdict::Unknown)
+    });
+}
+
+#[test]
+fn what_the_robot_is_not() {
+    let stage = Stage::new();
+    let scan = stage.run(&["echo", "--json", "robot/scan"]);
+    assert_eq!((scan.code, &scan.of_class("error")[0]["kind"]), (Some(3), &"no_topic".into()), "{scan}");
+    let link = stage.run(&["run", "--json", "--no-system-config", "--link=robot=/dev/ttyS0"]);
+    assert_eq!(link.code, Some(78), "{link}");
+    assert!(link.errors.contains("robot"), "{link}");
+}
