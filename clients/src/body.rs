@@ -10,6 +10,8 @@ use schema::{Pose, Scan};
 pub(crate) const SLICES: usize = 10;
 /// The most sectors that a hub takes.
 const SECTORS: usize = 64;
+/// The greatest range of a sector that a hub takes.
+const FARTHEST_MM: u32 = 65_000;
 /// So much farther than it was met a reading still counts as the body: five standard deviations of 7 mm, which is the most
 /// that recordings of standing sensors show, and the 15 mm by which two devices differ.
 const MARGIN_MM: u32 = 50;
@@ -139,7 +141,7 @@ impl Body {
         let slices = self.seen_slices();
         let is_body: Vec<bool> = met.iter().map(|met| met.is_body(slices)).collect();
         let edge = self.shape.map_or(1, |(_, _, step_mdeg, _)| EDGE_MDEG / step_mdeg.clamp(1, EDGE_MDEG));
-        let range = |beam: usize| range_mm(&met, &is_body, beam, edge.into(), slices);
+        let range = |beam: usize| range_mm(&met, &is_body, beam, edge.into(), slices).min(FARTHEST_MM);
         let ranges_mm: Vec<u32> = (0..met.len()).map(range).collect();
         let moving_mm: Vec<u32> = met.iter().zip(&ranges_mm).map(|(met, range)| met.beyond(*range)).collect();
         Mask {
@@ -173,7 +175,7 @@ impl Body {
 
 /// What one beam met in the slices in which it met something often enough; both from the least on.
 struct Met {
-    /// It sees nothing behind that.
+    /// It sees nothing behind what it met.
     is_full: bool,
     circle_mm: u32,
     nearest_mm: Vec<u32>,

@@ -138,6 +138,8 @@ fn the_circle_is_around_the_robot_wherever_the_sensor_sits() {
     assert_eq!(learn(pose, 1000.0, wall(1700)).sectors, [sector(179, 181, 1850)]);
     assert_eq!(learn(pose, 1000.0, wall(1801)).sectors, []);
     assert_eq!(learn(pose, 1000.0, wall(1800)).sectors, [], "on the circle is outside");
+    // As large a circle as there is: no range is beyond what a hub takes.
+    assert_eq!(learn(Pose::default(), 65_000.0, wall(1800)).sectors, [sector(179, 181, FARTHEST_MM)]);
 }
 
 #[test]
