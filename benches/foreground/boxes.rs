@@ -4,8 +4,8 @@
 use schema::Scan;
 use sim::look::Met;
 
+use crate::method::Method;
 use crate::play::Frame;
-use crate::rivals::Method;
 
 /// Scans until a surface is background: the default at half degrees.
 const N: usize = 375;
