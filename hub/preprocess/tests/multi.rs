@@ -10,16 +10,21 @@ use surroundings::{Shape, Surroundings, any_model, foreground, ranges_mm, readin
 /// A surface as a beam remembers it.
 #[derive(Clone, Copy, Debug)]
 struct Surface {
-    /// In device units, in whole sixteenths of them.
+    /// In device units.
     at: f64,
     /// In scans.
     weight: f64,
-    is_background: bool,
+}
+
+impl Surface {
+    fn is_background(&self, scans: f64) -> bool {
+        self.weight >= scans * 5.0 / 8.0
+    }
 }
 
 /// What is far, in device units.
 const FAR: f64 = 1e9;
-const NOTHING: Surface = Surface { at: -FAR, weight: 0.0, is_background: false };
+const NOTHING: Surface = Surface { at: -FAR, weight: 0.0 };
 
 struct Slow {
     settings: Settings,
@@ -29,16 +34,18 @@ struct Slow {
     told: Vec<(usize, f64)>,
     frozen: bool,
     fresh: bool,
+    /// Scans that are set, for the last scan.
+    scans: f64,
 }
 
 impl Slow {
     fn new(settings: Settings, count: u16) -> Slow {
         let beams = vec![[NOTHING; 3]; usize::from(count)];
-        Slow { settings, beams, seen: vec![], told: vec![], frozen: false, fresh: true }
+        Slow { settings, beams, seen: vec![], told: vec![], frozen: false, fresh: true, scans: 0.0 }
     }
 
     fn reset(&mut self, count: u16) {
-        *self = Slow { frozen: self.frozen, ..Slow::new(self.settings, count) };
+        *self = Slow { frozen: self.frozen, scans: self.scans, ..Slow::new(self.settings, count) };
     }
 
     fn load(&mut self, model: &Background) {
@@ -50,12 +57,12 @@ impl Slow {
 
     fn adopt(&mut self, i: usize, at: f64) {
         if at != 0.0 {
-            self.beams[i] = [Surface { at, weight: f64::INFINITY, is_background: true }, NOTHING, NOTHING];
+            self.beams[i] = [Surface { at, weight: f64::INFINITY }, NOTHING, NOTHING];
         }
     }
 
-    fn nearest(&self, i: usize) -> Option<f64> {
-        let known = self.beams[i].iter().filter(|surface| surface.is_background);
+    fn nearest(&self, i: usize, scans: f64) -> Option<f64> {
+        let known = self.beams[i].iter().filter(|surface| surface.is_background(scans));
         known.map(|surface| surface.at).min_by(f64::total_cmp)
     }
 
@@ -66,6 +73,7 @@ impl Slow {
         let threshold = (threshold / unit_mm).floor();
         let scans = (750.0 * f64::from(scan.step_mdeg) / 1000.0).ceil();
         let scans = self.settings.scans.map_or(scans, f64::from);
+        self.scans = scans;
         let readings: Vec<Option<f64>> = (0..self.beams.len())
             .map(|i| Some((reading_mm(scan, i, self.settings.no_return_is_far)? / unit_mm).min(FAR)))
             .collect();
@@ -88,18 +96,19 @@ impl Slow {
     fn class(&self, i: usize, reading: Option<f64>, threshold: f64, scans: f64) -> Class {
         let Some(reading) = reading else { return Class::Invalid };
         let meets = |surface: &&Surface| (surface.at - reading).abs() <= threshold;
-        if let Some(nearest) = self.nearest(i) {
+        if let Some(nearest) = self.nearest(i, scans) {
             return match reading {
-                _ if self.beams[i].iter().filter(meets).any(|surface| surface.is_background) => {
+                _ if self.beams[i].iter().filter(meets).any(|surface| surface.is_background(scans)) => {
                     Class::Background
                 }
                 _ if reading < nearest => Class::Foreground,
                 _ => Class::Behind,
             };
         }
-        let right = (1..=4).find_map(|aside| self.nearest(i.checked_sub(aside)?));
-        let left =
-            (1..=4).filter(|aside| i + aside < self.beams.len()).find_map(|aside| self.nearest(i + aside));
+        let right = (1..=4).find_map(|aside| self.nearest(i.checked_sub(aside)?, scans));
+        let left = (1..=4)
+            .filter(|aside| i + aside < self.beams.len())
+            .find_map(|aside| self.nearest(i + aside, scans));
         let met = self.beams[i].iter().filter(meets).any(|surface| surface.weight >= scans / 4.0);
         match (right, left) {
             (Some(right), Some(left)) if reading < right.min(left) - threshold && !met => Class::Foreground,
@@ -144,18 +153,18 @@ fn learn(surfaces: &mut [Surface; 3], reading: f64, threshold: f64, scans: f64) 
     for (number, surface) in surfaces.iter_mut().enumerate() {
         if Some(number) == met {
             surface.weight = (surface.weight + 1.0).min(scans);
-            surface.is_background |= surface.weight >= scans * 5.0 / 8.0;
-            let sixteenths = surface.at * 16.0;
-            surface.at = (sixteenths + reading - (sixteenths / 16.0).floor()) / 16.0;
+            surface.at += ((reading - surface.at) / 16.0).trunc();
         } else {
             let leak = if reading > surface.at { 0.5 } else { 0.125 };
             surface.weight = (surface.weight - leak).max(0.0);
-            surface.is_background &= surface.weight >= scans / 4.0;
+            if surface.weight == 0.0 {
+                *surface = NOTHING;
+            }
         }
     }
     let least = (0..3).min_by(|&a, &b| surfaces[a].weight.total_cmp(&surfaces[b].weight)).expect("three");
     if met.is_none() && surfaces[least].weight < scans / 4.0 {
-        surfaces[least] = Surface { at: reading, weight: 1.0, is_background: scans <= 1.0 };
+        surfaces[least] = Surface { at: reading, weight: 1.0 };
     }
 }
 
@@ -212,11 +221,15 @@ fn identical_beam_by_beam() {
         }
         let mut shown = Background::default();
         model.show(&mut shown);
-        let known = slow.beams.iter().filter(|beam| beam.iter().any(|surface| surface.is_background)).count();
+        let known = slow
+            .beams
+            .iter()
+            .filter(|beam| beam.iter().any(|surface| surface.is_background(slow.scans)))
+            .count();
         assert_eq!(usize::from(shown.taught), known);
         for (i, &range) in shown.ranges().iter().enumerate().filter(|(_, range)| **range != 0) {
             let at = if range == Background::FAR { FAR } else { f64::from(range) };
-            let shows = |surface: &Surface| surface.is_background && (surface.at - at).abs() <= 0.5;
+            let shows = |surface: &Surface| surface.is_background(slow.scans) && surface.at == at;
             assert!(slow.beams[i].iter().any(shows), "beam {i}: {range}, {:?}", slow.beams[i]);
         }
     }
