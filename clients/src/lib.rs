@@ -16,7 +16,6 @@ mod follower;
 mod freshness;
 mod hz;
 mod info;
-mod interface;
 mod json;
 mod leds;
 mod list;

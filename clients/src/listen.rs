@@ -2,6 +2,7 @@
 //! who sends it, and to answer.
 
 mod ear;
+mod interface;
 mod names;
 mod remote;
 mod report;

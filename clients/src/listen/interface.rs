@@ -1,4 +1,4 @@
-//! The network interfaces of this machine, for who sends to groups or hears them. Refuses to know sockets.
+//! The network interfaces of this machine, for who joins groups on them. Refuses to know sockets.
 
 use std::net::Ipv4Addr;
 
@@ -8,27 +8,27 @@ use schema::{Failure, Kind};
 
 /// One interface, as it is at this moment.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub(crate) struct Interface {
+pub(super) struct Interface {
     /// Its name.
-    pub(crate) name: String,
+    pub(super) name: String,
     /// Its number: another one if it was taken away and made again under the same name.
-    pub(crate) index: u32,
+    pub(super) index: u32,
     /// It is switched on.
-    pub(crate) up: bool,
+    pub(super) up: bool,
     /// There is a link: its cable is plugged in.
-    pub(crate) running: bool,
+    pub(super) running: bool,
     /// It can carry groups, or is the loopback, which can all the same.
-    pub(crate) multicast: bool,
+    pub(super) multicast: bool,
     /// It leads back to this machine.
-    pub(crate) loopback: bool,
+    pub(super) loopback: bool,
     /// Its first IPv4 address.
-    pub(crate) address: Option<Ipv4Addr>,
+    pub(super) address: Option<Ipv4Addr>,
 }
 
 /// All interfaces, in the kernel's order.
 ///
 /// [`Kind::Failed`] if the system does not tell.
-pub(crate) fn interfaces() -> Result<Vec<Interface>, Failure> {
+pub(super) fn interfaces() -> Result<Vec<Interface>, Failure> {
     let addresses = getifaddrs().map_err(|error| {
         Failure::new(Kind::Failed, format!("cannot list network interfaces: {error}"), "")
     })?;
@@ -46,7 +46,7 @@ pub(crate) fn interfaces() -> Result<Vec<Interface>, Failure> {
 /// The interface called `name`.
 ///
 /// [`Kind::Configuration`] with those that there are.
-pub(crate) fn named(name: &str) -> Result<Interface, Failure> {
+pub(super) fn named(name: &str) -> Result<Interface, Failure> {
     let mut all = interfaces()?;
     if let Some(at) = all.iter().position(|interface| interface.name == name) {
         return Ok(all.swap_remove(at));
