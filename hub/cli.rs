@@ -6,6 +6,7 @@ mod configure;
 mod control;
 mod doctor;
 mod leds;
+mod listen;
 mod probe;
 pub(crate) mod simulate;
 mod telegram;
@@ -22,6 +23,7 @@ use schema::{DEFAULT_DOMAIN, Domain, Environment, Failure};
 pub(crate) use background::Background;
 pub(crate) use control::Control;
 pub(crate) use leds::Leds;
+pub(crate) use listen::Listen;
 pub(crate) use telegram::{Telegram, Way};
 pub(crate) use zones::Zones;
 
@@ -109,6 +111,8 @@ pub(crate) enum Verb {
     /// The zone verdict and the marks as lights: in the terminal, and on diodes of this machine
     #[command(after_help = leds::MEANING)]
     Leds(Leds),
+    /// What the gateways of other machines send over the network, and what of it was lost
+    Listen(Listen),
 }
 
 #[derive(Args, Debug)]

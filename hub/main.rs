@@ -122,6 +122,9 @@ fn dispatch(cli: &Cli) -> Result<(), Failure> {
         Verb::Leds(leds) => {
             clients::leds(&leds.options(everywhere)?, &mut out, &mut io::stderr(), &*interrupt()?)
         }
+        Verb::Listen(listen) => {
+            clients::listen(&listen.options(everywhere)?, &mut out, &mut io::stderr(), &*interrupt()?)
+        }
     }
 }
 

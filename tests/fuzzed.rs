@@ -83,6 +83,11 @@ fn configuration() {
 }
 
 #[test]
+fn processors() {
+    run("processors");
+}
+
+#[test]
 fn lan() {
     run("lan");
 }

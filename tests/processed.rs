@@ -99,8 +99,10 @@ fn a_silence_is_said_once_and_late_joiners_know_at_once() {
     zones.await_line("the hub's word", is_unknown);
     let unknown = last_word(&stage);
     // Five statuses later nothing was added to it.
-    let mut statuses = stage.echo(&["front/status"]);
-    statuses.await_lines(5, "a status", is_class("status"));
+    let mut statuses = stage.echo(&["front/status", "front/scan", "front/background"]);
+    let statuses = statuses.await_lines(5, "a status", is_class("status"));
+    // Who comes meanwhile gets no scan, which is nobody's fault.
+    assert!(statuses.iter().all(|status| status["last_error"] == ""), "{statuses:?}");
     assert_eq!(stage.run(&["control", "front", "resume"]).code, Some(0));
     let next = zones.await_line("what comes after it", |line| {
         line["class"] == "zones" && number(line, "topic_seq") > number(&unknown, "topic_seq")
@@ -238,6 +240,25 @@ fn a_recording_is_processed_too_and_its_background_can_be_asked_for() {
     // A recording says nothing of reflectors: it is one of mode 00h.
     let marks = stage.run(&["echo", "--json", "front/marks", "-n", "1"]);
     assert_eq!(marks.of_class("marks")[0]["available"], false, "{marks}");
+}
+
+#[test]
+fn the_scans_of_a_slow_recording_follow_each_other() {
+    let stage = Stage::new();
+    let ranges = vec!["2.0"; 181].join(" ");
+    // Five a second: the sensor alone would be silent after a fifteenth of one.
+    let line = |at_s: f64| format!("FLASER 181 {ranges} 0 0 0 0 0 0 {at_s} host {at_s}\n");
+    let log: String = (0..25).map(|scan| line(10.0 + 0.2 * f64::from(scan))).collect();
+    let _hub = stage.hub(&["--link", &format!("front=file:{}", stage.file("log", log))]);
+    let mut zones = stage.echo(&["front/zones"]);
+    let known = |line: &Value| line["class"] == "zones" && line["verdict"] == "clear";
+    let first = zones.await_line("a verdict", known);
+    let rest = zones.await_lines(8, "a verdict", is_class("zones"));
+    assert!(rest.iter().all(known), "{rest:?}");
+    assert_eq!(number(&rest[7], "topic_seq"), number(&first, "topic_seq") + 8);
+    // At its end it is silent like any sensor.
+    zones.await_line("the hub's word", is_unknown);
+    assert_eq!(last_word(&stage)["stale"], Value::Null);
 }
 
 #[test]

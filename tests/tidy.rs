@@ -53,6 +53,37 @@ fn lms_stands_alone() {
 }
 
 #[test]
+fn preprocess_only_computes() {
+    holds(crates::preprocess_only_computes, |tree| {
+        let planted = |code: &str| tree.with("hub/preprocess/src/planted.rs", &format!("//! So.\n{code}\n"));
+        let lib = tree.text("hub/preprocess/src/lib.rs");
+        vec![
+            tree.with_line("hub/preprocess/Cargo.toml", "[dependencies]", "scanhub-lms.workspace = true"),
+            tree.with_line("hub/preprocess/Cargo.toml", "[dependencies]", "iceoryx2.workspace = true"),
+            tree.with("hub/preprocess/src/lib.rs", &lib.replace("#![forbid(unsafe_code)]", "")),
+            planted("use std::time::Instant;"),
+            planted("use std::{array, thread};"),
+            planted("let ends = ranges.iter().collect::<Vec<_>>();"),
+            planted("let ranges = vec![0; 401];"),
+            planted("let name = format!(\"{i}\");"),
+            planted("use schema::ipc::Payload;"),
+        ]
+    });
+}
+
+#[test]
+fn no_processor_uses_another() {
+    holds(crates::no_processor_uses_another, |tree| {
+        let planted = |path: &str, code: &str| tree.with(path, &format!("//! So.\n{code}\n"));
+        vec![
+            planted("hub/preprocess/src/zones.rs", "use crate::marks::Finder;"),
+            planted("hub/preprocess/src/zones/table.rs", "use crate::{background, Reading};"),
+            planted("hub/preprocess/src/segments.rs", "let class = super::background::Class::Unknown;"),
+        ]
+    });
+}
+
+#[test]
 fn clients_know_only_schema() {
     holds(crates::clients_know_only_schema, |tree| {
         vec![tree.with_line("clients/Cargo.toml", "[dependencies]", "scanhub-lms.workspace = true")]

@@ -1,16 +1,16 @@
 //! Whether the robot may go, said when it changes: `cargo run --example stop`.
 
 use clients::robot;
-use schema::{Failure, Verdict};
+use schema::Failure;
 
 fn main() -> Result<(), Failure> {
     let mut robot = robot(&[])?;
-    let mut last = Verdict::Unknown;
+    let mut last = None;
     loop {
         let now = robot.next()?;
-        if now.verdict() != last {
-            last = now.verdict();
-            println!("{}, {}", last.name(), now.worst().unwrap_or("no sensor"));
+        if last != Some(now.verdict()) {
+            last = Some(now.verdict());
+            println!("{}, {}", now.verdict().name(), now.worst().unwrap_or("no sensor"));
         }
     }
 }

@@ -8,7 +8,7 @@ use schema::{Background, Foreground, Marks, Scan, Status, Topic, Zones};
 ///
 /// A piece begins with a byte and its length in two more. Odd: a header in short and a payload, to which a checksum is
 /// made; even: a datagram as it is.
-pub fn lan(data: &[u8]) {
+pub(crate) fn lan(data: &[u8]) {
     let mut account = Box::new(Account::new(&Topic::ALL));
     let mut rest = data;
     let (mut given, mut accepted) = (0, 0);

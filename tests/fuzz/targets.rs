@@ -2,8 +2,8 @@
 //! with what it invents, `tests/fuzzed.rs` with the corpus and with seeded noise. They know invariants, no examples.
 
 mod lan;
+mod processors;
 
-pub use lan::lan;
 use lms::command::Request;
 use lms::eeprom::Write;
 use lms::explain::explain;
@@ -20,11 +20,12 @@ use lms::{Control, MILLIS, Nanos, Settings};
 pub type Target = (&'static str, fn(&[u8]));
 
 /// All of them; the names are those of the corpus' folders.
-pub const TARGETS: [Target; 5] = [
+pub const TARGETS: [Target; 6] = [
     ("framer", framer),
     ("replies", replies),
     ("session", session),
     ("configuration", configuration),
+    ("processors", processors),
     ("lan", lan),
 ];
 
@@ -223,4 +224,14 @@ pub fn configuration(data: &[u8]) {
         }
     }
     let _ = std::fs::remove_file(&path);
+}
+
+/// Any scans, whoever sends such, with any settings, through all processors.
+pub fn processors(data: &[u8]) {
+    processors::processors(data);
+}
+
+/// Any datagrams, one after the other, through all checks and the receiver's account.
+pub fn lan(data: &[u8]) {
+    lan::lan(data);
 }

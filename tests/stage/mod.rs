@@ -3,7 +3,9 @@
 #![allow(dead_code, unused_imports)] // Every test file takes what it needs.
 
 mod line;
+mod network;
 mod program;
+mod sender;
 mod telegrams;
 mod terminal;
 
@@ -18,7 +20,9 @@ use schema::Domain;
 use serde_json::Value;
 
 pub(crate) use line::{Line, open_line};
+pub(crate) use network::in_a_network;
 pub(crate) use program::{INT, KILL, Outcome, Program, TERM};
+pub(crate) use sender::{Sender, wall_ns};
 pub(crate) use telegrams::{MEASURED, Sent, bytes_of, hash, is_class, number, scan, sequence};
 pub(crate) use terminal::terminal;
 

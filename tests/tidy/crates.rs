@@ -22,22 +22,78 @@ pub(crate) fn schema_knows_nobody(tree: &Tree) -> Vec<String> {
     ours(&tree.members()["scanhub-schema"], &ALL).into_iter().collect()
 }
 
+/// Names of all crates that a manifest names for what is built, tests left out.
+fn built_with(manifest: &toml::Table) -> impl Iterator<Item = &String> {
+    let sections = ["dependencies", "build-dependencies"].into_iter();
+    let tables = sections.filter_map(|section| manifest.get(section).and_then(toml::Value::as_table));
+    tables.flat_map(toml::Table::keys)
+}
+
 pub(crate) fn lms_stands_alone(tree: &Tree) -> Vec<String> {
     let manifest = &tree.members()["scanhub-lms"];
     let mut breaches: Vec<String> = ours(manifest, &ALL).into_iter().collect();
-    for section in ["dependencies", "build-dependencies"] {
-        let names =
-            manifest.get(section).and_then(toml::Value::as_table).into_iter().flat_map(toml::Table::keys);
-        breaches.extend(names.cloned());
-    }
-    let lib = tree.text("hub/lms/src/lib.rs");
-    for attribute in ["#![no_std]", "#![forbid(unsafe_code)]"] {
-        if !lib.lines().any(|line| line == attribute) {
-            breaches.push(format!("hub/lms/src/lib.rs lacks {attribute}"));
-        }
-    }
+    breaches.extend(built_with(manifest).cloned());
+    breaches.extend(lacks(tree, "hub/lms/src/lib.rs", &["#![no_std]", "#![forbid(unsafe_code)]"]));
     breaches
         .extend(find(tree, &["std::", "extern crate", "alloc::"], |path| path.starts_with("hub/lms/src/")));
+    breaches
+}
+
+fn lacks(tree: &Tree, path: &str, attributes: &[&str]) -> Vec<String> {
+    let has = |attribute: &str| tree.text(path).lines().any(|line| line == attribute);
+    let missing = attributes.iter().filter(|attribute| !has(attribute));
+    missing.map(|attribute| format!("{path} lacks {attribute}")).collect()
+}
+
+/// From payloads to payloads: no telegram, no shared memory, nothing of the system, no heap.
+pub(crate) fn preprocess_only_computes(tree: &Tree) -> Vec<String> {
+    const HEAP: [&str; 12] = [
+        "Vec<",
+        "Vec::",
+        "vec!",
+        "Box<",
+        "Box::",
+        "String",
+        "format!",
+        "to_owned()",
+        "to_string()",
+        "to_vec()",
+        "collect()",
+        "collect::",
+    ];
+    // Rc, Arc, maps, clocks, threads, files: all else that std has stands under another name.
+    const HARMLESS: [&str; 5] = ["std::array", "std::error", "std::fmt", "std::mem", "std::ops"];
+    let ours = |path: &str| path.starts_with("hub/preprocess/src/");
+    let manifest = &tree.members()["scanhub-preprocess"];
+    let mut breaches: Vec<String> =
+        built_with(manifest).filter(|name| *name != "scanhub-schema").cloned().collect();
+    breaches.extend(lacks(tree, "hub/preprocess/src/lib.rs", &["#![forbid(unsafe_code)]"]));
+    breaches.extend(find(tree, &HEAP, ours));
+    breaches.extend(find(tree, &["extern crate", "ipc"], ours));
+    let mut of_std = find(tree, &["std::"], ours);
+    of_std.retain(|place| {
+        place.matches("std::").count() > HARMLESS.iter().map(|name| place.matches(name).count()).sum()
+    });
+    breaches.extend(of_std);
+    breaches
+}
+
+/// What a processor does must not depend on which others run.
+pub(crate) fn no_processor_uses_another(tree: &Tree) -> Vec<String> {
+    const BELOW: &str = "hub/preprocess/src/";
+    const PROCESSORS: [&str; 4] = ["zones", "marks", "background", "segments"];
+    let mut breaches = Vec::new();
+    for own in PROCESSORS {
+        let is_own = |path: &str| {
+            let below = path.strip_prefix(BELOW).and_then(|path| path.strip_prefix(own));
+            below.is_some_and(|rest| rest.starts_with(['.', '/']))
+        };
+        breaches.extend(find(tree, &["crate::", "super::"], is_own).into_iter().filter(|place| {
+            let (_, code) = place.split_once(": ").unwrap_or_default();
+            let mut words = code.split(|c: char| !c.is_alphanumeric() && c != '_');
+            words.any(|word| word != own && PROCESSORS.contains(&word))
+        }));
+    }
     breaches
 }
 

@@ -53,7 +53,7 @@ impl LinkThread<'_> {
     /// Notices consumers that stay without samples.
     pub(crate) fn watch_reach(&mut self) {
         let before = self.unreached;
-        self.unreached = if self.topics.unreached() > 0 { before.saturating_add(1) } else { 0 };
+        self.unreached = if self.unreached_now() > 0 { before.saturating_add(1) } else { 0 };
         if self.unreached == UNREACHED_LIMIT || before >= UNREACHED_LIMIT && self.unreached == 0 {
             // Whoever is served shall read it in the status.
             self.facts = None;
@@ -63,8 +63,12 @@ impl LinkThread<'_> {
         }
     }
 
+    fn unreached_now(&self) -> usize {
+        self.topics.unreached(self.account.is_streaming())
+    }
+
     fn unserved(&self) -> String {
-        let count = self.topics.unreached();
+        let count = self.unreached_now();
         format!(
             "{count} consumers are attached but get nothing: raise the limit of open descriptors (ulimit -n)"
         )

@@ -171,3 +171,91 @@ impl Kept {
         (self.model.generation() != before).then_some(Mismatch { model, sensor })
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use schema::Verdict;
+
+    fn processing(change: impl FnOnce(&mut Processing)) -> Processing {
+        let mut processing = Processing::default();
+        processing.background.learning.scans = Some(4);
+        change(&mut processing);
+        processing
+    }
+
+    /// A wall at `range` all around.
+    fn wall(count: u16, unit_mm: u8, range: u16) -> Scan {
+        let mut scan = Scan { count, unit_mm, range_bits: 13, step_mdeg: 500, ..Scan::default() };
+        scan.range_array[..usize::from(count)].fill(range);
+        scan
+    }
+
+    fn shown(pipeline: &mut Pipeline) -> Background {
+        let mut model = Background::default();
+        pipeline.show(&mut model);
+        model
+    }
+
+    #[test]
+    fn it_learns_and_warns_whoever_wants_to_know() {
+        let mut pipeline = Pipeline::new(&processing(|_| {}));
+        let mut zones = Zones::default();
+        for _ in 0..20 {
+            assert_eq!(pipeline.update(&wall(361, 1, 3000), Outputs::default()), None);
+        }
+        let mut foreground = Foreground::default();
+        let near = wall(361, 1, 500);
+        let out = Outputs { zones: Some(&mut zones), marks: None, foreground: Some(&mut foreground) };
+        assert_eq!(pipeline.update(&near, out), None);
+        assert_eq!((zones.verdict(), foreground.beams), (Verdict::Stop, 361));
+        assert_eq!(foreground.segments().len(), 1, "segments are those of this scan");
+        let mut stale = Zones::default();
+        pipeline.stale(&mut stale);
+        assert_eq!((stale.verdict(), stale.count), (Verdict::Unknown, 2));
+    }
+
+    #[test]
+    fn a_generation_is_news_until_it_is_shown() {
+        let mut pipeline = Pipeline::new(&processing(|_| {}));
+        assert!(!pipeline.is_news(), "nothing is known yet");
+        pipeline.update(&wall(361, 1, 3000), Outputs::default());
+        assert!(pipeline.is_news());
+        assert_eq!((shown(&mut pipeline).generation, pipeline.is_news()), (0, false));
+        for (verb, is_news) in [(Verb::Freeze, false), (Verb::Thaw, false), (Verb::Reset, true)] {
+            assert_eq!(pipeline.obey("a", verb, &Background::default()), Ok(None));
+            assert_eq!(pipeline.is_news(), is_news, "{verb:?}");
+        }
+        assert_eq!(shown(&mut pipeline).generation, 1);
+        let asked =
+            pipeline.obey("a", Verb::Show, &Background::default()).expect("is kept").expect("a model");
+        assert_eq!((asked.generation, asked.count), (1, 361));
+    }
+
+    #[test]
+    fn a_model_that_does_not_fit_is_refused_or_begins_anew() {
+        let mut model = Background { count: 181, unit_mm: 10, ..Background::default() };
+        model.range_array[..181].fill(300);
+        let mut pipeline =
+            Pipeline::new(&processing(|processing| processing.background.model = Some(Box::new(model))));
+        let (first, is_news) = (shown(&mut pipeline), pipeline.is_news());
+        assert_eq!((first.generation, first.taught, first.ranges()[180], is_news), (1, 181, 300, false));
+        let mismatch = pipeline.update(&wall(361, 10, 300), Outputs::default()).expect("another resolution");
+        assert_eq!((mismatch.model, mismatch.sensor), ((181, 10), (361, 10)));
+        assert!(pipeline.is_news());
+        let refusal = pipeline.obey("a", Verb::Load, &model).expect_err("another resolution");
+        assert_eq!(refusal.kind, Kind::Configuration);
+        let words = "a: the model has 181 beams in units of 10 mm, the sensor's scans have 361 beams in units of 10 mm";
+        assert_eq!(refusal.message, words);
+        assert!(pipeline.update(&wall(361, 1, 3000), Outputs::default()).is_some(), "another unit");
+    }
+
+    #[test]
+    fn who_keeps_none_refuses_with_the_key() {
+        let mut pipeline = Pipeline::new(&processing(|processing| processing.background.is_kept = false));
+        pipeline.update(&wall(361, 1, 3000), Outputs::default());
+        assert!(!pipeline.keeps_background() && !pipeline.is_news() && !pipeline.shows_every_scan());
+        let refusal = pipeline.obey("side", Verb::Show, &Background::default()).expect_err("none is kept");
+        assert!(refusal.hint.contains("link.side.background.method=multi"), "{refusal}");
+    }
+}

@@ -201,8 +201,12 @@ impl Topics {
     }
 
     /// Consumers that got nothing although they are attached: their descriptors or ours ran out, and sending says Ok
-    /// all the same. Of the background nothing is known: it is not sent when somebody comes.
-    pub(crate) fn unreached(&self) -> usize {
+    /// all the same. Of a topic nothing is known while nothing is sent: of those of telegrams unless they come
+    /// (`streaming`), of the background ever.
+    pub(crate) fn unreached(&self, streaming: bool) -> usize {
+        if !streaming {
+            return self.status.missed_out();
+        }
         let of_telegrams =
             self.telegram.missed_out().max(self.scan.missed_out()).max(self.zones.missed_out());
         let of_wanted = self.marks.missed_out().max(self.foreground.missed_out());

@@ -1,16 +1,17 @@
 //! The hub's memory is fixed once a sensor streams, however many scans come. Its link takes nothing from the heap for a
 //! scan and what is made of it but what the shared-memory library takes for each loan of a sample: one small piece, given
 //! back when it is sent. For marks and foreground that nobody follows there is no loan.
-#![allow(unsafe_code)]
 
-use std::alloc::{GlobalAlloc, Layout, System};
+mod counting;
+
 use std::fs;
 use std::os::fd::OwnedFd;
-use std::sync::atomic::{AtomicI32, AtomicI64, AtomicU64, Ordering::Relaxed};
+use std::sync::atomic::Ordering::Relaxed;
 use std::sync::mpsc::channel;
 use std::thread;
 use std::time::{Duration, Instant};
 
+use counting::{HELD, TAKEN, WATCHED};
 use daemon::Config;
 use daemon::config::Sources;
 use lms::command::Request;
@@ -20,53 +21,8 @@ use lms::variant::{Baud, Mode, Unit, Variant};
 use rustix::fs::{OFlags, fcntl_setfl};
 use rustix::process::{Signal, getpid, kill_process};
 use rustix::pty::{OpenptFlags, grantpt, openpt, ptsname, unlockpt};
-use rustix::thread::gettid;
 use schema::ipc::{self, Payload, Subscriber};
 use schema::{Domain, Foreground, Marks, Scan};
-
-/// Counts what one thread asks for.
-struct Counting;
-
-static WATCHED: AtomicI32 = AtomicI32::new(0);
-/// Pieces taken.
-static TAKEN: AtomicU64 = AtomicU64::new(0);
-/// Bytes taken and not given back.
-static HELD: AtomicI64 = AtomicI64::new(0);
-
-fn note(taken: u64, bytes: i64) {
-    let watched = WATCHED.load(Relaxed);
-    if watched != 0 && gettid().as_raw_nonzero().get() == watched {
-        TAKEN.fetch_add(taken, Relaxed);
-        HELD.fetch_add(bytes, Relaxed);
-    }
-}
-
-// SAFETY: every call goes to the system's allocator as it came; counting asks for no memory.
-unsafe impl GlobalAlloc for Counting {
-    // SAFETY: the caller keeps the promises of the trait, which are those of the system's allocator.
-    unsafe fn alloc(&self, layout: Layout) -> *mut u8 {
-        note(1, layout.size() as i64);
-        // SAFETY: as above.
-        unsafe { System.alloc(layout) }
-    }
-
-    // SAFETY: as above.
-    unsafe fn dealloc(&self, memory: *mut u8, layout: Layout) {
-        note(0, -(layout.size() as i64));
-        // SAFETY: as above.
-        unsafe { System.dealloc(memory, layout) }
-    }
-
-    // SAFETY: as above.
-    unsafe fn realloc(&self, memory: *mut u8, layout: Layout, size: usize) -> *mut u8 {
-        note(1, size as i64 - layout.size() as i64);
-        // SAFETY: as above.
-        unsafe { System.realloc(memory, layout, size) }
-    }
-}
-
-#[global_allocator]
-static ALLOCATOR: Counting = Counting;
 
 /// A sensor of few words at the other end of a pty: it streams when it is told to, and answers two questions.
 struct Sensor {

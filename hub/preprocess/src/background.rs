@@ -4,6 +4,7 @@
 
 mod multi;
 mod paper;
+mod runs;
 mod settings;
 
 use std::fmt;
@@ -94,7 +95,7 @@ impl Model {
         }
         if learn && self.fresh {
             if self.settings.start == Start::FirstScan {
-                self.learner.adopt(readings, &self.limits);
+                self.learner.adopt(readings);
             }
             self.fresh = false;
         }
@@ -118,7 +119,7 @@ impl Model {
         };
         let count = usize::from(self.shape.0);
         for (i, range) in out.range_array[..count].iter_mut().enumerate() {
-            *range = self.learner.background(i);
+            *range = self.learner.background(i, &self.limits);
         }
         out.taught = out.ranges().iter().filter(|&&range| range != Background::UNTAUGHT).count() as u16;
     }
@@ -163,7 +164,7 @@ impl Model {
         }
         self.shape = shape;
         self.reset();
-        self.learner.adopt(ranges, &self.limits);
+        self.learner.adopt(ranges);
         self.fresh = false;
         Ok(())
     }
@@ -193,22 +194,22 @@ impl Learner {
     }
 
     /// Takes `ranges` for the background, but those that tell nothing.
-    fn adopt(&mut self, ranges: &[u16], limits: &Limits) {
+    fn adopt(&mut self, ranges: &[u16]) {
         for (i, &range) in ranges.iter().enumerate() {
             if range != INVALID && range != Background::UNTAUGHT {
                 match self {
                     Learner::Paper(paper) => paper.adopt(i, range),
-                    Learner::Multi(multi) => multi.adopt(i, range, limits),
+                    Learner::Multi(multi) => multi.adopt(i, range),
                 }
             }
         }
     }
 
     /// The background of beam `i` in device units, [`Background::UNTAUGHT`] or [`Background::FAR`].
-    fn background(&self, i: usize) -> u16 {
+    fn background(&self, i: usize, limits: &Limits) -> u16 {
         match self {
             Learner::Paper(paper) => paper.background(i),
-            Learner::Multi(multi) => multi.background(i),
+            Learner::Multi(multi) => multi.background(i, limits),
         }
     }
 }
@@ -242,6 +243,9 @@ fn write(scan: &Scan, classes: &[Class; BEAMS], out: &mut Foreground) {
     out.bit_array.fill(0);
     let mut beams = 0;
     for (byte, (classes, values)) in classes[..count].chunks(8).zip(scan.ranges().chunks(8)).enumerate() {
+        if !classes.iter().fold(false, |any, &class| any | (class == Class::Foreground)) {
+            continue;
+        }
         for (bit, (&class, &value)) in classes.iter().zip(values).enumerate() {
             if class == Class::Foreground {
                 out.bit_array[byte] |= 1 << bit;

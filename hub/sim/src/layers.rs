@@ -11,10 +11,12 @@ pub struct Layers {
     pub bias_mm: f64,
     /// Standard deviation of a range, in millimetres.
     pub sigma_mm: f64,
-    /// Share of the readings whose deviation is [`TAIL_MM`] instead.
+    /// Share of the readings at edges whose standard deviation is [`TAIL_MM`] instead. In a recording of a sensor that
+    /// stood still 316 of 348 beams were never off by 30 mm, and 22 more often than in one scan of a hundred: the tail
+    /// belongs to a few beams.
     pub tail: f64,
-    /// Whether a beam is as wide as a real one and tells something between two surfaces if it meets both; else it is a
-    /// line without width.
+    /// Whether a beam is as wide as a real one: where it meets two surfaces it tells one, the other or something between,
+    /// or too weak a signal if they are far apart. Else it is a line without width.
     pub spot: bool,
     /// Share of the beams that tell a code although they could tell a range.
     pub errors: f64,
@@ -47,7 +49,7 @@ impl Default for Layers {
         Layers {
             bias_mm: 15.0,
             sigma_mm: 5.0,
-            tail: 0.004,
+            tail: 0.1,
             spot: true,
             errors: 0.005,
             weak: true,
@@ -97,9 +99,9 @@ impl Dice {
 }
 
 impl Layers {
-    /// What a reading deviates from the truth, in millimetres, the device's bias left aside.
-    pub(crate) fn deviation_mm(&self, dice: &Dice) -> f64 {
-        dice.deviation * if dice.tail < self.tail { TAIL_MM } else { self.sigma_mm }
+    /// What a reading deviates from the truth, in millimetres, the device's bias left aside; more at an `edge`.
+    pub(crate) fn deviation_mm(&self, edge: bool, dice: &Dice) -> f64 {
+        dice.deviation * if edge && dice.tail < self.tail { TAIL_MM } else { self.sigma_mm }
     }
 
     /// The code that a beam tells although it could tell a range, counted from the greatest value.
@@ -145,7 +147,7 @@ impl Dice {
 }
 
 /// Standard normal, by the sum of twelve.
-pub(crate) fn gaussian(random: &mut fastrand::Rng) -> f64 {
+fn gaussian(random: &mut fastrand::Rng) -> f64 {
     (0..12).map(|_| random.f64()).sum::<f64>() - 6.0
 }
 

@@ -134,7 +134,7 @@ fn word(stage: &Stage, echo: &Echo, sun: f64, unit: Unit, mode: Mode, dice: &Dic
     } else if let Some(error) = stage.layers.error(dice) {
         code(error)
     } else {
-        let range_mm = echo.range_mm + stage.bias_mm + stage.layers.deviation_mm(dice);
+        let range_mm = echo.range_mm + stage.bias_mm + stage.layers.deviation_mm(echo.edge, dice);
         range_value(range_mm / f64::from(unit.mm()), mode) | level(echo, mode, dice) << mode.range_bits()
     }
 }

@@ -16,7 +16,9 @@ pub(crate) struct Echo {
     pub(crate) signal: f64,
     /// Share of the light that fell on reflectors.
     pub(crate) bright: f64,
-    /// Whether the spot met two surfaces far apart.
+    /// Whether a beam as wide as a real one meets two surfaces, one behind the other, and no reflector.
+    pub(crate) edge: bool,
+    /// Whether this spot met two surfaces far apart, and no reflector.
     pub(crate) torn: bool,
     /// What is true.
     pub(crate) met: Met,
@@ -53,7 +55,9 @@ impl Part<'_> {
 /// The echo of the beam at `angle_mdeg`; without `wide` that of a line, else that of a spot.
 pub(crate) fn echo(view: &View, angle_mdeg: i32, wide: bool, dice: &Dice) -> Echo {
     let rays = view.around(angle_mdeg);
-    let parts = if wide { spread(view, rays, dice) } else { vec![part(view, &rays[REACH], 1.0)] };
+    let spread = spread(view, rays, dice);
+    let middle = [part(view, &rays[REACH], 1.0)];
+    let parts: &[Part] = if wide { &spread } else { &middle };
     let total: f64 = parts.iter().map(|part| part.weight).sum();
     let nearest_mm = parts.iter().map(|part| part.hit.range_mm).fold(f64::INFINITY, f64::min);
     let is_near = |part: &&Part| part.hit.range_mm <= nearest_mm + CONTINUOUS_MM;
@@ -64,12 +68,16 @@ pub(crate) fn echo(view: &View, angle_mdeg: i32, wide: bool, dice: &Dice) -> Ech
     let (face, range_mm) = told(near, far, near_echo / all_echo, dice);
     let lit = parts.iter().filter(|part| part.is_reflector());
     let bright = lit.map(|part| part.weight).sum::<f64>() / total;
+    // What a reflector sends back is strong and clear.
+    let dull = bright == 0.0;
     Echo {
         range_mm,
         signal: face.map_or(0.0, |face| signal(face, range_mm, angle_mdeg)),
         bright,
-        torn: bright == 0.0 && far.is_some_and(|far| far.1 - nearest_mm > TORN_MM),
-        met: met(&parts),
+        edge: dull
+            && spread.iter().any(|part| (part.hit.range_mm - spread[0].hit.range_mm).abs() > CONTINUOUS_MM),
+        torn: dull && far.is_some_and(|far| far.1 - nearest_mm > TORN_MM),
+        met: met(parts),
     }
 }
 

@@ -1,6 +1,10 @@
-//! A background with several surfaces a beam: at edges a beam flips between two of them and both are learned; and what
-//! is nearer counts only where neighbouring beams agree.
+//! A background with several surfaces a beam: at edges a beam flips between two of them, and both are learned. Refuses
+//! to know how many beams something has to cover until it is believed: that is for the runs.
+//!
+//! All beams take the same steps, whatever they meet, so that a processor does several of them at once. The constants
+//! were found on seeds 0 to 9 of the simulated scenes, by `benches/foreground`.
 
+use super::runs::Runs;
 use super::settings::Limits;
 use super::{Class, INVALID};
 use schema::{BEAMS, Background};
@@ -8,154 +12,182 @@ use schema::{BEAMS, Background};
 /// State of the method with several surfaces.
 #[derive(Clone)]
 pub(super) struct Multi {
-    slots: [[Slot; SLOTS]; BEAMS],
+    slots: [Slots; SLOTS],
+    runs: Runs,
 }
 
-/// A surface that a beam meets, now and then.
+/// A surface of each beam, if it has one.
 #[derive(Clone, Copy)]
-struct Slot {
-    /// Its range in 1/16 device units; [`EMPTY`] if there is none.
-    range: u32,
-    /// How well it is known: 8 for each scan in which it was met, less what leaked.
-    weight: u32,
-    is_background: bool,
+struct Slots {
+    /// In device units.
+    range: [u16; BEAMS],
+    /// How well it is known: grows with each scan in which it was met, and leaks in others. 0: there is none.
+    weight: [u16; BEAMS],
+}
+
+/// What the steps are about, in units of ranges and of weights.
+#[derive(Clone, Copy)]
+struct Bounds {
+    threshold: u16,
+    full: u16,
+    known: u16,
+    replaced: u16,
 }
 
 impl Multi {
     pub(super) fn new() -> Multi {
-        Multi { slots: [[Slot::NONE; SLOTS]; BEAMS] }
+        Multi { slots: [Slots { range: [0; BEAMS], weight: [0; BEAMS] }; SLOTS], runs: Runs::new() }
     }
 
     /// Compares all beams with the state before this scan, then learns from them.
     pub(super) fn update(&mut self, readings: &[u16], limits: &Limits, learn: bool, classes: &mut [Class]) {
-        self.compare(readings, limits, classes);
-        keep_runs(readings, limits, classes);
-        if learn {
-            let threshold = FINE * u32::from(limits.threshold);
-            let full = MET * limits.scans.min(MOST_SCANS);
-            for (slots, &reading) in self.slots.iter_mut().zip(readings) {
-                if reading != INVALID {
-                    learn_beam(slots, FINE * u32::from(reading), threshold, full);
-                }
+        let bounds = Bounds::of(limits);
+        let mut nearest = [INVALID; BEAMS];
+        self.compare(readings, bounds, classes, &mut nearest);
+        let nearest = &nearest[..readings.len()];
+        for i in (0..readings.len()).filter(|&i| nearest[i] == INVALID) {
+            if readings[i] != INVALID && self.is_before_its_neighbours(i, readings[i], nearest, bounds) {
+                classes[i] = Class::Foreground;
             }
+        }
+        self.runs.keep(readings, limits, classes);
+        if learn {
+            self.learn(readings, bounds);
         }
     }
 
-    /// A beam is in the foreground if it meets none of its own backgrounds and is nearer than those of its neighbours,
-    /// too: at an edge it may meet theirs.
-    fn compare(&self, readings: &[u16], limits: &Limits, classes: &mut [Class]) {
-        let threshold = FINE * u32::from(limits.threshold);
-        let mut nearest = [u32::MAX; BEAMS + 2];
-        for (nearest, slots) in nearest[1..=readings.len()].iter_mut().zip(&self.slots) {
-            for slot in slots.iter().filter(|slot| slot.is_background) {
-                *nearest = slot.range.min(*nearest);
+    /// What each beam is beside its own background, and the nearest one of these; [`INVALID`] if there is none.
+    fn compare(&self, readings: &[u16], bounds: Bounds, classes: &mut [Class], nearest: &mut [u16; BEAMS]) {
+        for (i, ((&reading, class), nearest)) in readings.iter().zip(classes).zip(nearest).enumerate() {
+            let (mut ends, mut known, mut range) = (false, false, Background::FAR);
+            for slots in &self.slots {
+                let is_known = slots.weight[i] >= bounds.known;
+                known |= is_known;
+                ends |= is_known & (slots.range[i].abs_diff(reading) <= bounds.threshold);
+                range = if is_known & (slots.range[i] < range) { slots.range[i] } else { range };
             }
+            *nearest = if known { range } else { INVALID };
+            let aside = if reading < range { Class::Foreground } else { Class::Behind };
+            let with_background = if ends { Class::Background } else { aside };
+            let valid = if known { with_background } else { Class::Unknown };
+            *class = if reading == INVALID { Class::Invalid } else { valid };
         }
-        for (i, (&reading, class)) in readings.iter().zip(classes).enumerate() {
-            let range = FINE * u32::from(reading);
-            let around = nearest[i].min(nearest[i + 1]).min(nearest[i + 2]);
-            *class = if reading == INVALID {
-                Class::Invalid
-            } else if nearest[i + 1] == u32::MAX {
-                Class::Unknown
-            } else if self.slots[i].iter().any(|slot| slot.is_background && slot.meets(range, threshold)) {
-                Class::Background
-            } else if range + threshold < around {
-                Class::Foreground
-            } else if range > nearest[i + 1] {
-                Class::Behind
-            } else {
-                Class::Background
-            };
+    }
+
+    /// Beam `i`, whose own background is not known, is nearer than what its neighbours to both sides end on, and meets
+    /// nothing that it has met for a while.
+    fn is_before_its_neighbours(&self, i: usize, reading: u16, nearest: &[u16], bounds: Bounds) -> bool {
+        let known = |range: &&u16| **range != INVALID;
+        let right = nearest[i.saturating_sub(ASIDE)..i].iter().rev().find(known);
+        let left = nearest[i + 1..(i + 1 + ASIDE).min(nearest.len())].iter().find(known);
+        let (Some(&right), Some(&left)) = (right, left) else { return false };
+        let met = |slots: &Slots| {
+            slots.weight[i] >= bounds.replaced && slots.range[i].abs_diff(reading) <= bounds.threshold
+        };
+        reading < right.min(left).saturating_sub(bounds.threshold) && !self.slots.iter().any(met)
+    }
+
+    /// The surface nearest to a reading, within the threshold, was met; the others leak, those through which the beam
+    /// went more than those that may be hidden. What is none of them takes the place of the least known one, unless all
+    /// are known too well.
+    fn learn(&mut self, readings: &[u16], bounds: Bounds) {
+        for (i, &reading) in readings.iter().enumerate() {
+            let range = self.slots.each_ref().map(|slots| slots.range[i]);
+            let weight = self.slots.each_ref().map(|slots| slots.weight[i]);
+            let (new_range, new_weight) = learned(range, weight, reading, bounds);
+            let valid = reading != INVALID;
+            for (k, slots) in self.slots.iter_mut().enumerate() {
+                slots.range[i] = if valid { new_range[k] } else { range[k] };
+                slots.weight[i] = if valid { new_weight[k] } else { weight[k] };
+            }
         }
     }
 
     /// Takes `range` for the only background of beam `i`, as well known as can be.
-    pub(super) fn adopt(&mut self, i: usize, range: u16, limits: &Limits) {
-        let weight = MET * limits.scans.min(MOST_SCANS);
-        let known = Slot { range: FINE * u32::from(range), weight, is_background: true };
-        self.slots[i] = [Slot::NONE; SLOTS];
-        self.slots[i][0] = known;
+    pub(super) fn adopt(&mut self, i: usize, range: u16) {
+        self.slots.iter_mut().for_each(|slots| slots.weight[i] = 0);
+        self.slots[0].range[i] = range;
+        self.slots[0].weight[i] = u16::MAX;
     }
 
     /// The best known background of beam `i`, of equals the nearer one.
-    pub(super) fn background(&self, i: usize) -> u16 {
-        let known = self.slots[i].iter().filter(|slot| slot.is_background);
-        let best = known.max_by_key(|slot| (slot.weight, u32::MAX - slot.range));
-        best.map_or(Background::UNTAUGHT, |slot| ((slot.range + FINE / 2) / FINE) as u16)
+    pub(super) fn background(&self, i: usize, limits: &Limits) -> u16 {
+        let known = |slots: &&Slots| slots.weight[i] >= Bounds::of(limits).known;
+        let best = self.slots.iter().filter(known).max_by_key(|s| (s.weight[i], u16::MAX - s.range[i]));
+        best.map_or(Background::UNTAUGHT, |slots| slots.range[i])
     }
 }
 
-impl Slot {
-    const NONE: Slot = Slot { range: EMPTY, weight: 0, is_background: false };
+/// The surfaces of one beam after `reading`.
+#[inline]
+fn learned(
+    range: [u16; SLOTS],
+    weight: [u16; SLOTS],
+    reading: u16,
+    bounds: Bounds,
+) -> ([u16; SLOTS], [u16; SLOTS]) {
+    const NOT_MET: u16 = u16::MAX;
+    let mut apart = [NOT_MET; SLOTS];
+    let mut least_apart = NOT_MET;
+    for k in 0..SLOTS {
+        let away = range[k].abs_diff(reading);
+        apart[k] = if (weight[k] > 0) & (away <= bounds.threshold) { away } else { NOT_MET };
+        least_apart = least_apart.min(apart[k]);
+    }
+    let (mut new_range, mut new_weight) = (range, weight);
+    let mut open = least_apart != NOT_MET;
+    let mut least = u16::MAX;
+    for k in 0..SLOTS {
+        let met = open & (apart[k] == least_apart);
+        open &= !met;
+        let step = (reading.wrapping_sub(range[k]) as i16) / DRAWN;
+        new_range[k] = if met { range[k].wrapping_add_signed(step) } else { range[k] };
+        let before = weight[k].min(bounds.full);
+        let leak = if reading > range[k] { PASSED } else { HIDDEN };
+        let more = before.saturating_add(MET).min(bounds.full);
+        new_weight[k] = if met { more } else { before.saturating_sub(leak) };
+        least = least.min(new_weight[k]);
+    }
+    let mut homeless = (least_apart == NOT_MET) & (least < bounds.replaced);
+    for k in 0..SLOTS {
+        let replaced = homeless & (new_weight[k] == least);
+        homeless &= !replaced;
+        new_range[k] = if replaced { reading } else { new_range[k] };
+        new_weight[k] = if replaced { MET } else { new_weight[k] };
+    }
+    (new_range, new_weight)
+}
 
-    fn meets(&self, range: u32, threshold: u32) -> bool {
-        self.range.abs_diff(range) <= threshold
+impl Bounds {
+    fn of(limits: &Limits) -> Bounds {
+        let scans = limits.scans;
+        Bounds {
+            threshold: limits.threshold,
+            full: MET * scans,
+            known: KNOWN * scans,
+            replaced: REPLACED * scans,
+        }
     }
 }
 
-/// One beam's surfaces after it has met something at `range`.
-fn learn_beam(slots: &mut [Slot; SLOTS], range: u32, threshold: u32, full: u32) {
-    let mut met = None;
-    let mut nearest = threshold;
-    for (number, slot) in slots.iter().enumerate() {
-        let apart = slot.range.abs_diff(range);
-        if apart <= threshold && (met.is_none() || apart < nearest) {
-            (met, nearest) = (Some(number), apart);
-        }
-    }
-    for (number, slot) in slots.iter_mut().enumerate() {
-        if Some(number) == met {
-            slot.weight = (slot.weight + MET).min(full);
-            slot.is_background |= slot.weight >= full;
-            slot.range = slot.range + range / DRAWN - slot.range / DRAWN;
-        } else {
-            slot.weight = slot.weight.saturating_sub(LEAK);
-            slot.is_background &= slot.weight >= full / 4;
-        }
-    }
-    if met.is_none() {
-        let weakest = if slots[1].weight < slots[0].weight { 1 } else { 0 };
-        let weakest = if slots[2].weight < slots[weakest].weight { 2 } else { weakest };
-        if slots[weakest].weight < full / 4 {
-            slots[weakest] = Slot { range, weight: MET, is_background: MET >= full };
-        }
-    }
-}
-
-/// Leaves only those runs of foreground beams that are long enough for their range.
-fn keep_runs(readings: &[u16], limits: &Limits, classes: &mut [Class]) {
-    let mut begin = 0;
-    while begin < classes.len() {
-        if classes[begin] != Class::Foreground {
-            begin += 1;
-            continue;
-        }
-        let length = classes[begin..].iter().take_while(|&&class| class == Class::Foreground).count();
-        let end = begin + length;
-        let nearest = readings[begin..end].iter().min().map_or(0, |&nearest| u64::from(nearest));
-        let beam_um = nearest * u64::from(limits.unit_mm) * u64::from(limits.step_mdeg) * 1000 / 57_296;
-        let enough = OBJECT_UM.checked_div(beam_um).map_or(3, |beams| beams.clamp(1, 3) as usize);
-        if length < enough {
-            classes[begin..end].fill(Class::Unknown);
-        }
-        begin = end;
-    }
-}
-
-/// Surfaces a beam remembers.
+/// Surfaces a beam remembers: two at an edge, and one that may take the place of either.
 const SLOTS: usize = 3;
-/// Steps of a slot's range in a device unit.
-const FINE: u32 = 16;
-/// Range of an empty slot: nothing is near it.
-const EMPTY: u32 = 1 << 30;
-/// Weight of a scan in which the surface was met.
-const MET: u32 = 8;
-/// Weight lost in a scan in which something else was met.
-const LEAK: u32 = 3;
-/// A slot's range moves by this part of its distance to the reading.
-const DRAWN: u32 = 16;
-/// Keeps weights in their integers.
-const MOST_SCANS: u32 = u32::MAX / 16;
-/// Width of the narrowest thing that is looked for: a leg.
-const OBJECT_UM: u64 = 120_000;
+/// A surface's range moves by this part of its distance to the reading, in whole units: too slowly to follow somebody
+/// who walks.
+const DRAWN: i16 = 16;
+
+/// Weight of a scan in which the surface was met; it is fully known after as many scans as are set.
+const MET: u16 = 8;
+/// Weight lost in a scan that saw what is behind the surface: what was taken away is no background any more after 3/4
+/// of the scans that are set, and what is met in more than a third of the scans becomes one in the end.
+const PASSED: u16 = 4;
+/// Weight lost in a scan that saw something before the surface, which may still be there. Not 0: else all slots could
+/// be taken by what is hidden for ever.
+const HIDDEN: u16 = 1;
+/// Weight per scan that is set, from which on a surface is background: 5/8 of the full weight, so that readings may be
+/// missing.
+const KNOWN: u16 = 5;
+/// Weight per scan that is set, below which a surface can be replaced.
+const REPLACED: u16 = 2;
+/// Beams to either side among which one has to be known, to stand in for a beam that is not.
+const ASIDE: usize = 8;

@@ -3,6 +3,7 @@
 use std::collections::BTreeSet;
 
 use lms::variant::{Mode, Unit, Variant};
+use proptest::prelude::*;
 use schema::Failure;
 use sim::look::Met;
 use sim::room::Room;
@@ -156,5 +157,31 @@ fn the_page_shows_a_world_with_every_key() {
     }
     for name in World::names() {
         assert!(page.contains(&format!("`{name}`")), "{name} is not on the page");
+    }
+}
+
+proptest! {
+    /// Whatever a file has become, it is refused with a place or it runs.
+    #[test]
+    fn a_damaged_file_is_refused_or_runs(
+        file in 0..12usize,
+        at in any::<prop::sample::Index>(),
+        cut in 0..12usize,
+        patch in "[-0-9.,=a-z_\\[\\]\"é# \n]{0,8}",
+    ) {
+        let names = ["fig8", "door", "crowd", "sun", "approach", "room", "standing", "corridor", "glass", "chair", "strips", "bare"];
+        let mut characters: Vec<char> = text(names[file]).chars().collect();
+        let from = at.index(characters.len());
+        let until = (from + cut).min(characters.len());
+        characters.splice(from..until, patch.chars());
+        match World::of_toml("w.toml", &characters.into_iter().collect::<String>()) {
+            Ok(world) => {
+                for port in 0..world.sensors() as u64 {
+                    let look = look(&Room::of_port(&world, 1, port), 16_000_000_000);
+                    prop_assert_eq!(look.words.len(), 361);
+                }
+            }
+            Err(failure) => prop_assert!(failure.message.starts_with("w.toml:"), "{}", failure),
+        }
     }
 }

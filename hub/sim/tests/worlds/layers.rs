@@ -81,12 +81,29 @@ fn bias_is_one_for_a_device_and_another_for_the_next() {
 }
 
 #[test]
-fn the_tail_is_heavy_but_thin() {
-    let deviations = deviations_mm(&words(Layers { tail: 0.01, ..NONE }, 1, 300));
-    // 62 % of a normal distribution lie beyond half its deviation, here 30 mm of 60.
-    let far = share(&deviations, |d| d.abs() > 30.0);
-    assert!((0.005..0.0075).contains(&far), "{far}");
-    assert!(share(&deviations, |d| d == 0.0) > 0.98);
+fn the_tail_is_heavy_and_belongs_to_edges() {
+    let exact = &words(NONE, 1, 1)[0];
+    let scans = words(Layers { tail: 0.5, ..NONE }, 1, 400);
+    let ranges = (0..361).filter(|&beam| exact[beam] < 8183);
+    let (mut at_edges, mut readings) = (0, Vec::new());
+    for beam in ranges {
+        let off = |words: &Vec<u16>| f64::from(words[beam]) - f64::from(exact[beam]);
+        let off: Vec<f64> = scans.iter().map(off).collect();
+        if off.iter().all(|&mm| mm == 0.0) {
+            continue;
+        }
+        let around = beam.saturating_sub(1)..(beam + 2).min(361);
+        assert!(
+            around.clone().any(|other| exact[other].abs_diff(exact[beam]) > 40),
+            "beam {beam} is at no edge"
+        );
+        at_edges += 1;
+        readings.extend(off);
+    }
+    assert!((4..30).contains(&at_edges), "{at_edges} beams");
+    // Half of a normal distribution of 60 mm, of which 62 % lie beyond 30 mm.
+    let far = share(&readings, |mm| mm.abs() > 30.0);
+    assert!((0.2..0.33).contains(&far), "{far}");
 }
 
 #[test]

@@ -1,0 +1,52 @@
+//! The system's allocator with a count of what one thread takes from it: for tests that promise that nothing is taken.
+#![allow(unsafe_code)]
+
+use std::alloc::{GlobalAlloc, Layout, System};
+use std::sync::atomic::{AtomicI32, AtomicI64, AtomicU64, Ordering::Relaxed};
+
+use rustix::thread::gettid;
+
+/// Counts what one thread asks for.
+struct Counting;
+
+/// The thread whose requests are counted; 0: nobody's.
+pub(crate) static WATCHED: AtomicI32 = AtomicI32::new(0);
+/// Pieces taken.
+pub(crate) static TAKEN: AtomicU64 = AtomicU64::new(0);
+/// Bytes taken and not given back.
+pub(crate) static HELD: AtomicI64 = AtomicI64::new(0);
+
+fn note(taken: u64, bytes: i64) {
+    let watched = WATCHED.load(Relaxed);
+    if watched != 0 && gettid().as_raw_nonzero().get() == watched {
+        TAKEN.fetch_add(taken, Relaxed);
+        HELD.fetch_add(bytes, Relaxed);
+    }
+}
+
+// SAFETY: every call goes to the system's allocator as it came; counting asks for no memory.
+unsafe impl GlobalAlloc for Counting {
+    // SAFETY: the caller keeps the promises of the trait, which are those of the system's allocator.
+    unsafe fn alloc(&self, layout: Layout) -> *mut u8 {
+        note(1, layout.size() as i64);
+        // SAFETY: as above.
+        unsafe { System.alloc(layout) }
+    }
+
+    // SAFETY: as above.
+    unsafe fn dealloc(&self, memory: *mut u8, layout: Layout) {
+        note(0, -(layout.size() as i64));
+        // SAFETY: as above.
+        unsafe { System.dealloc(memory, layout) }
+    }
+
+    // SAFETY: as above.
+    unsafe fn realloc(&self, memory: *mut u8, layout: Layout, size: usize) -> *mut u8 {
+        note(1, size as i64 - layout.size() as i64);
+        // SAFETY: as above.
+        unsafe { System.realloc(memory, layout, size) }
+    }
+}
+
+#[global_allocator]
+static ALLOCATOR: Counting = Counting;

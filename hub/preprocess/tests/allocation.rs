@@ -1,0 +1,59 @@
+//! No processor takes anything from the heap: not for a scan, not for the first one of another layout.
+
+#[path = "../../daemon/tests/counting/mod.rs"]
+mod counting;
+mod surroundings;
+
+use std::hint::black_box;
+use std::sync::atomic::Ordering::Relaxed;
+
+use counting::{TAKEN, WATCHED};
+use preprocess::background::{self, Method, Model};
+use preprocess::segments::Cutter;
+use preprocess::{marks, zones};
+use rustix::thread::gettid;
+use schema::{Background, CONTENTS_UPPER, Foreground, Marks, Pose, Scan, Zones};
+use surroundings::{Shape, Surroundings};
+
+#[test]
+fn a_scan_takes_nothing_from_the_heap() {
+    let mut random = fastrand::Rng::with_seed(1);
+    let mut scans: Vec<Scan> = Vec::new();
+    for seed in 0..20 {
+        let mut surroundings = Surroundings::new(Shape::any(&mut random), seed);
+        scans.extend((0..50).map(|_| surroundings.next()));
+    }
+    for scan in &mut scans {
+        scan.intensity_bits = 3;
+        scan.contents = CONTENTS_UPPER;
+        scan.upper_array.iter_mut().for_each(|intensity| *intensity = random.u8(..8));
+    }
+    let pose = Pose { x_m: 0.3, yaw_rad: 1.0, ..Pose::default() };
+    let mut check = zones::Check::new(pose, &zones::Settings::default());
+    let mut finder = marks::Finder::new(marks::Settings::default());
+    let mut models = [Method::Paper, Method::Multi]
+        .map(|method| Model::new(background::Settings { method, scans: Some(10), ..Default::default() }));
+    let mut cutter = Cutter::new(pose);
+    let (mut zones, mut marks) = (Zones::default(), Marks::default());
+    let (mut foreground, mut background) = (Foreground::default(), Background::default());
+    let mut segments = 0;
+
+    WATCHED.store(gettid().as_raw_nonzero().get(), Relaxed);
+    drop(black_box(Box::new(0)));
+    let before = TAKEN.load(Relaxed);
+    for scan in &scans {
+        check.update(scan, &mut zones);
+        finder.update(scan, &mut marks);
+        for model in &mut models {
+            model.update(scan, &mut foreground);
+            cutter.update(scan, &mut foreground);
+            model.show(&mut background);
+            segments += foreground.segments().len();
+        }
+    }
+    check.stale(&mut zones);
+    let taken = TAKEN.load(Relaxed) - before;
+    WATCHED.store(0, Relaxed);
+    assert_eq!((before, taken), (1, 0), "one piece was taken before, to see that it is counted");
+    assert!(marks.count > 0 && segments > 0, "there was something to do");
+}
