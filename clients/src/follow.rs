@@ -4,7 +4,7 @@
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
-use schema::{Domain, Failure, Kind, Topic, ipc};
+use schema::{Domain, Failure, Kind, Topic, ipc, is_remote};
 
 use crate::account::Account;
 use crate::names::{TopicName, no_sensor};
@@ -241,7 +241,7 @@ impl<'a> Run<'a> {
         }
         let sensors = self.sensors()?;
         let wants_all = self.tracks.iter().all(|track| track.name.is_robot());
-        if wants_all && sensors.is_empty() {
+        if wants_all && sensors.iter().all(|sensor| is_remote(sensor)) {
             return Err(Failure::new(
                 Kind::NoTopic,
                 "the hub has no sensors",
@@ -250,9 +250,11 @@ impl<'a> Run<'a> {
             .into());
         }
         for track in &self.tracks {
-            let is_there = track.name.is_robot() || sensors.contains(&track.name.sensor);
+            // One of another machine comes with its announcement.
+            let sensor = &track.name.sensor;
+            let is_there = track.name.is_robot() || is_remote(sensor) || sensors.contains(sensor);
             if !track.source.attached() && !is_there {
-                return Err(no_sensor(&track.name.sensor, &sensors).into());
+                return Err(no_sensor(sensor, &sensors).into());
             }
         }
         Ok(())
