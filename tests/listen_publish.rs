@@ -4,8 +4,8 @@
 mod stage;
 
 use schema::{Scan, State, Status, Topic, Verdict, Zones};
-use serde_json::json;
-use stage::{INT, KILL, Program, Sender, Stage, TERM, in_a_network, is_class, number, until};
+use serde_json::{Value, json};
+use stage::{INT, KILL, Program, Sender, Stage, TERM, in_a_network, number, until};
 
 const HUB: u64 = 0x5f3a_12bc_00d1_e2f3;
 const FRONT: &str = "robot1.front";
@@ -20,7 +20,14 @@ fn published(stage: &Stage, sender: &mut Sender) -> Program {
     sender.announce(&[Topic::Zones, Topic::Scan, Topic::Status, Topic::Telegram]);
     let line = program.await_line("a sensor", |line| line["kind"] == "published");
     assert_eq!(line["sensor"], FRONT);
+    // Whoever lists sensors waits for one.
+    sender.send(Topic::Status, &Status { state: State::Starting as u8, ..Status::default() });
     program
+}
+
+/// Zones that somebody sent, not those of a silence.
+fn is_zones(line: &Value) -> bool {
+    line["class"] == "zones" && line["stale"] != true
 }
 
 fn zones(verdict: Verdict) -> Zones {
@@ -46,7 +53,7 @@ fn a_remote_sensor_is_as_a_local_one() {
         sender.send(Topic::Scan, &scan);
         sender.send(Topic::Zones, &zones(Verdict::Slow));
         sender.send(Topic::Status, &status);
-        let line = echo.await_line("zones", is_class("zones"));
+        let line = echo.await_line("zones", is_zones);
         assert_eq!((&line["sensor"], &line["verdict"]), (&json!(FRONT), &json!("slow")));
         assert_eq!((&line["seq"], &line["boot"]), (&json!(40), &json!("000000000000b007")));
         assert_eq!(line["wall_ns"], sender.stamp_ns);
@@ -62,11 +69,10 @@ fn a_remote_sensor_is_as_a_local_one() {
         sender.throw(Topic::Zones, &late);
         sender.throw(Topic::Zones, &late);
         sender.send(Topic::Zones, &zones(Verdict::Slow));
-        echo.await_lines(2, "zones", |line| line["class"] == "zones" && line["stale"] != true);
+        echo.await_lines(2, "zones", is_zones);
         hz.await_line("a second", |line| line["class"] == "hz" && line["received"] == 3);
         let outcome = echo.end(INT);
-        let zones: Vec<_> =
-            outcome.of_class("zones").into_iter().filter(|line| line["stale"] != true).collect();
+        let zones: Vec<_> = outcome.lines().into_iter().filter(is_zones).collect();
         let numbers: Vec<_> = zones.iter().map(|line| number(line, "topic_seq")).collect();
         assert_eq!(numbers, [0, 4, 5], "{outcome}");
         assert_eq!(outcome.of_class("scan")[0]["ranges"], json!([11, 12]));
@@ -105,7 +111,7 @@ fn consumers_outlive_the_listener_and_see_what_they_missed() {
         let first = published(&stage, &mut sender);
         let mut echo = stage.echo(&["robot1.front/zones"]);
         sender.send(Topic::Zones, &zones(Verdict::Clear));
-        echo.await_line("zones", is_class("zones"));
+        echo.await_line("zones", is_zones);
         assert_eq!(first.end(KILL).code, None);
         echo.await_line("the news", |line| line["kind"] == "hub_gone");
         for _ in 0..4 {
@@ -164,7 +170,8 @@ fn a_hub_and_two_remote_ones_live_in_one_domain() {
         let mut other = Sender::new(0xab, 7, 0, "front");
         let listener = published(&stage, &mut one);
         let hub = stage.hub(&[stage.link("front")]);
-        other.announce(&[Topic::Zones]);
+        other.announce(&[Topic::Zones, Topic::Status]);
+        other.send(Topic::Status, &Status::default());
         let second = publisher_refused(&stage);
         assert!(second.contains(&format!("pid {}", listener.pid())), "{second}");
         let mut echo = stage.echo(&["front/scan", "robot1.front/zones", "00000000000000ab.front/zones"]);
@@ -177,8 +184,14 @@ fn a_hub_and_two_remote_ones_live_in_one_domain() {
         let outcome = stage.run(&["echo", "--json", "robot/zones", "-n", "3"]);
         let lines = outcome.of_class("zones");
         assert!(lines.iter().all(|line| line["sensors"].as_array().map(Vec::len) == Some(1)), "{outcome}");
-        let pinned = stage.run(&["control", "robot1.front", "pause", "--json"]);
-        assert_eq!(pinned.code, Some(78), "nobody commands another machine's sensor: {pinned}");
+        let absent = stage.run(&["echo", "--json", "robot2.front/zones", "-n", "1"]);
+        assert_eq!(
+            (absent.code, &absent.of_class("error")[0]["kind"]),
+            (Some(3), &json!("no_topic")),
+            "{absent}"
+        );
+        let refused = stage.run(&["control", "robot1.front", "pause", "--json"]);
+        assert_eq!(refused.code, Some(78), "nobody commands another machine's sensor: {refused}");
         assert_eq!(hub.end(TERM).code, Some(0));
         one.send(Topic::Zones, &zones(Verdict::Clear));
         echo.await_line("the remote sensor goes on", |line| line["verdict"] == "clear");

@@ -103,6 +103,9 @@ struct Run<'a> {
     received: u64,
 }
 
+/// Sensors of other machines that are there have been announced after so long: it is done once a second.
+const ANNOUNCED: Duration = Duration::from_secs(3);
+
 /// Samples taken from one topic before the next one has its turn.
 const TURN: usize = 32;
 
@@ -250,9 +253,11 @@ impl<'a> Run<'a> {
             .into());
         }
         for track in &self.tracks {
-            // One of another machine comes with its announcement.
             let sensor = &track.name.sensor;
-            let is_there = track.name.is_robot() || is_remote(sensor) || sensors.contains(sensor);
+            // Another machine may be switched on later.
+            let may_come =
+                is_remote(sensor) && (!self.bounds.bounded() || self.started.elapsed() < ANNOUNCED);
+            let is_there = track.name.is_robot() || may_come || sensors.contains(sensor);
             if !track.source.attached() && !is_there {
                 return Err(no_sensor(sensor, &sensors).into());
             }
