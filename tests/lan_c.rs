@@ -1,5 +1,7 @@
 //! The C header against the golden datagrams and against `schema`; skips, saying so, where there is no C compiler.
 
+#[path = "lan/damaged.rs"]
+mod damaged;
 #[path = "lan/readers.rs"]
 mod readers;
 #[path = "../schema/tests/datagram/says.rs"]

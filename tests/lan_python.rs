@@ -1,6 +1,8 @@
 //! The Python module against the golden datagrams and against `schema`; skips, saying so, where there is no python3. Its
 //! numpy part skips by itself.
 
+#[path = "lan/damaged.rs"]
+mod damaged;
 #[path = "lan/readers.rs"]
 mod readers;
 #[path = "../schema/tests/datagram/says.rs"]

@@ -4,12 +4,11 @@
 use std::io::{BufRead, BufReader, Write};
 use std::process::{Child, ChildStdin, ChildStdout, Command, Stdio};
 
-use fastrand::Rng;
-use schema::datagram::{Announce, Datagram, HEAD, Head, MTU_ETHERNET, Packed};
-use schema::{Counter, Scan, Topic};
+use schema::datagram::{Datagram, Packed};
+use schema::{Counter, Scan};
 use serde_json::{Map, Value, json};
 
-use super::{says, vectors};
+use super::{damaged, vectors};
 
 /// A program that answers a datagram in hex with a line of JSON.
 pub(crate) struct Reader {
@@ -47,76 +46,15 @@ pub(crate) fn golden(reader: &mut Reader) {
     for vector in vectors::vectors() {
         let says = vector.says.as_object().expect("an object");
         let by_itself = !["after", "after_hubs", "with_key"].iter().any(|key| says.contains_key(*key));
-        let expected = if by_itself { vector.says.clone() } else { expected(&vector.bytes) };
+        let expected = if by_itself { vector.says.clone() } else { damaged::expected(&vector.bytes) };
         same(&vector.file, &vector.bytes, reader.read(None, &vector.bytes), &expected);
     }
 }
 
 /// Whatever a payload says, they agree on whether it is sound and on what it says.
-pub(crate) fn damaged(reader: &mut Reader, rounds: u32) {
-    let mut random = Rng::with_seed(6);
-    let golden: Vec<Vec<u8>> = vectors::vectors().into_iter().map(|vector| vector.bytes).collect();
-    let (mut sound, mut unsound) = (0, 0);
-    for _ in 0..rounds {
-        let bytes = &golden[random.usize(..golden.len())];
-        let Ok(datagram) = Datagram::read(bytes) else { continue };
-        let damaged = damage(&mut random, &datagram);
-        let expected = expected(&damaged);
-        if expected["refusal"].is_null() {
-            sound += 1
-        } else {
-            unsound += 1
-        }
-        same("a damaged one", &damaged, reader.read(None, &damaged), &expected);
-    }
-    assert!(sound > rounds / 10 && unsound > rounds / 10, "{sound} of {rounds} sound, {unsound} not");
-}
-
-/// A few bytes of header and payload are others, or the payload ends earlier or later. Text and what is no number stay:
-/// languages differ in how they show those.
-fn damage(random: &mut Rng, datagram: &Datagram<'_>) -> Vec<u8> {
-    let mut payload = datagram.payload.to_vec();
-    let spared = match Topic::of_number(datagram.head.topic) {
-        Some(Topic::Status) => vec![24..336, 560..592],
-        None => vec![8..64],
-        Some(_) => Vec::new(),
-    };
-    for _ in 0..random.usize(..4) {
-        // The beginning has the counts.
-        let end = if random.bool() { payload.len() } else { payload.len().min(20) };
-        let at = random.usize(..end.max(1));
-        if at < payload.len() && !spared.iter().any(|range| range.contains(&at)) {
-            payload[at] = match random.u8(..4) {
-                0 => random.u8(..),
-                1 => random.u8(..4),
-                2 => payload[at].wrapping_add(1),
-                _ => payload[at].wrapping_sub(1),
-            };
-        }
-    }
-    match random.u8(..8) {
-        0 => payload.truncate(random.usize(..=payload.len())),
-        1 => payload.extend(std::iter::repeat_with(|| random.u8(..)).take(20)),
-        _ => {}
-    }
-    let mut head = Head { flags: datagram.head.flags & !1, sequence: random.u32(..), ..datagram.head };
-    if random.u8(..20) == 0 {
-        head.revision = random.u16(..3);
-    }
-    if random.u8(..20) == 0 && head.topic != Topic::Status.number() && head.topic != Announce::NUMBER {
-        head.topic = [1, 2, 3, 4, 5, 6, 8, 255][random.usize(..8)];
-    }
-    let mut buffer = [0; MTU_ETHERNET];
-    buffer[HEAD..HEAD + payload.len()].copy_from_slice(&payload);
-    head.seal(&mut buffer, payload.len()).expect("it fits").to_vec()
-}
-
-/// What `schema` says of a datagram, in the words of the list.
-fn expected(bytes: &[u8]) -> Value {
-    let sound = Datagram::read(bytes).and_then(|datagram| datagram.check_payload().map(|()| datagram));
-    match sound {
-        Ok(datagram) => json!({ "head": says::head(&datagram), "payload": says::payload(&datagram) }),
-        Err(refusal) => json!({ "refusal": refusal.name() }),
+pub(crate) fn damaged(reader: &mut Reader, count: u32) {
+    for (datagram, expected) in damaged::datagrams(count) {
+        same("a damaged one", &datagram, reader.read(None, &datagram), &expected);
     }
 }
 

@@ -190,4 +190,4 @@ const KNOWN: u16 = 5;
 /// Weight per scan that is set, below which a surface can be replaced.
 const REPLACED: u16 = 2;
 /// Beams to either side among which one has to be known, to stand in for a beam that is not.
-const ASIDE: usize = 4;
+const ASIDE: usize = 8;
