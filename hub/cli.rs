@@ -5,6 +5,7 @@ mod background;
 mod configure;
 mod control;
 mod doctor;
+mod gateway;
 mod leds;
 mod probe;
 pub(crate) mod simulate;
@@ -21,6 +22,7 @@ use schema::{DEFAULT_DOMAIN, Domain, Environment, Failure};
 
 pub(crate) use background::Background;
 pub(crate) use control::Control;
+pub(crate) use gateway::Gateway;
 pub(crate) use leds::Leds;
 pub(crate) use telegram::{Telegram, Way};
 pub(crate) use zones::Zones;
@@ -109,6 +111,9 @@ pub(crate) enum Verb {
     /// The zone verdict and the marks as lights: in the terminal, and on diodes of this machine
     #[command(after_help = leds::MEANING)]
     Leds(Leds),
+    /// What the hub publishes, as UDP datagrams on a network: one message each, to multicast groups and to hosts
+    #[command(after_help = gateway::GROUPS)]
+    Gateway(Gateway),
 }
 
 #[derive(Args, Debug)]

@@ -3,6 +3,7 @@
 #![allow(dead_code, unused_imports)] // Every test file takes what it needs.
 
 mod line;
+mod network;
 mod program;
 mod telegrams;
 mod terminal;
@@ -18,6 +19,7 @@ use schema::Domain;
 use serde_json::Value;
 
 pub(crate) use line::{Line, open_line};
+pub(crate) use network::{Receiver, in_a_network, ip, read};
 pub(crate) use program::{INT, KILL, Outcome, Program, TERM};
 pub(crate) use telegrams::{MEASURED, Sent, bytes_of, hash, is_class, number, scan, sequence};
 pub(crate) use terminal::terminal;
