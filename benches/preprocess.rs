@@ -1,79 +1,117 @@
-//! What the processors of the hub cost for one scan of 361 beams. Targets: zones, marks and background together 1 us
-//! with the method `paper`, 3 us with `multi`; 5 us with segments.
+//! What the processors of the hub cost for one scan of 361 beams, with somebody who walks through the room of the
+//! paper's Fig. 8. Targets: zones, marks and background together 1 us with the method `paper`, 3 us with `multi`; 5 us
+//! with segments.
 
 #![allow(missing_docs)] // criterion's macros make public functions
 
-use std::f64::consts::PI;
 use std::hint::black_box;
 
 use criterion::{Criterion, criterion_group, criterion_main};
-use fastrand::Rng;
+use daemon::scanner;
+use lms::measured::{self, Measured};
+use lms::variant::{MIRROR_TURN, Mode, Unit, Variant};
+use preprocess::background::{self, Method, Model};
+use preprocess::segments::Cutter;
 use preprocess::{marks, zones};
-use schema::{CONTENTS_UPPER, Marks, Pose, Scan, Zones};
+use schema::{Foreground, Marks, Pose, Scan, Zones};
+use sim::room::Room;
 
-/// Scans of a rectangular room with noise, a few codes and `reflectors` strips of four beams, so that no two are alike.
-fn scans(reflectors: usize) -> Vec<Scan> {
-    let mut random = Rng::with_seed(1);
-    let mut scan = || {
-        let mut scan = Scan {
-            count: 361,
-            unit_mm: 1,
-            range_bits: 13,
-            step_mdeg: 500,
-            intensity_bits: 3,
-            contents: CONTENTS_UPPER,
-            ..Scan::default()
-        };
-        for i in 0..361 {
-            let (sin, cos) = (i as f64 / 360.0 * PI).sin_cos();
-            let wall_mm = (3_150.0 / cos.abs()).min(5_500.0 / sin.abs());
-            let is_code = random.u8(..200) == 0;
-            scan.range_array[i] = if is_code { 0x1FFB } else { wall_mm as u16 + random.u16(..20) };
-            let is_lit = (1..=reflectors).any(|n| (0..4).contains(&(i as i32 - (n * 28) as i32)));
-            scan.upper_array[i] = if is_lit { random.u8(1..8) } else { 0 };
-        }
+const POSE: Pose = Pose { x_m: 0.3, y_m: -0.1, yaw_rad: 0.2, upside_down: 0, reserved: [0; 7] };
+/// Somebody walks through the room, and its background has been learned.
+const FIRST: u64 = 800;
+/// Scans that take turns.
+const COUNT: u64 = 64;
+
+/// Scans of a world from the first one.
+fn scans(world: &str, count: u64) -> Vec<Scan> {
+    let room = Room::new(&world.parse().expect("a world that the program brings along"), 1);
+    let scan = |number| {
+        let end_ns = number * Variant::HALF.turns() * MIRROR_TURN;
+        let words = room.scan(Variant::HALF, Unit::Mm, Mode(1), end_ns);
+        let telegram = measured::encode(0, Unit::Mm, &words, 0x10);
+        let mut scan = Scan::default();
+        scanner::decode(&Measured::decode(telegram.telegram()).expect("a scan"), Mode(1), &mut scan);
         scan
     };
-    std::iter::repeat_with(&mut scan).take(64).collect()
+    (1..=count).map(scan).collect()
+}
+
+/// A model that has learned from what came before, and the scans that come then.
+fn model(method: Method, scans: &[Scan]) -> (Model, &[Scan]) {
+    let mut model = Model::new(background::Settings { method, ..background::Settings::default() });
+    let (past, present) = scans.split_at(FIRST as usize);
+    past.iter().for_each(|scan| model.update(scan, &mut Foreground::default()));
+    (model, present)
+}
+
+/// Times `update` over `scans` in turn.
+fn bench(c: &mut Criterion, name: &str, scans: &[Scan], mut update: impl FnMut(&Scan)) {
+    let mut next = scans.iter().cycle();
+    c.bench_function(name, |b| b.iter(|| update(black_box(next.next().expect("a cycle")))));
 }
 
 fn check(c: &mut Criterion) {
-    let scans = scans(0);
-    let off_centre = Pose { x_m: 0.3, y_m: -0.1, yaw_rad: 0.2, ..Pose::default() };
+    let scans = scans("fig8", COUNT);
     let eight = [2000, 1800, 1600, 1400, 1200, 1000, 800, 600];
     let cases: [(&str, Pose, &[u16]); 3] = [
         ("zones, 2 circles, at the centre", Pose::default(), &[1000, 600]),
-        ("zones, 2 circles, off the centre", off_centre, &[1000, 600]),
-        ("zones, 8 circles, off the centre", off_centre, &eight),
+        ("zones, 2 circles, off the centre", POSE, &[1000, 600]),
+        ("zones, 8 circles, off the centre", POSE, &eight),
     ];
     for (name, pose, radii_mm) in cases {
-        let settings = zones::Settings { radii_mm, ..zones::Settings::default() };
-        let mut check = zones::Check::new(pose, &settings);
+        let mut check = zones::Check::new(pose, &zones::Settings { radii_mm, ..zones::Settings::default() });
         let mut out = Zones::default();
-        let mut next = scans.iter().cycle();
-        c.bench_function(name, |b| {
-            b.iter(|| {
-                check.update(black_box(next.next().expect("a cycle")), &mut out);
-                black_box(&mut out);
-            });
-        });
+        bench(c, name, &scans, |scan| check.update(scan, black_box(&mut out)));
     }
 }
 
 fn find(c: &mut Criterion) {
-    for (name, reflectors) in [("marks, none", 0), ("marks, 12 of 4 beams", 12)] {
-        let scans = scans(reflectors);
+    for (name, world) in [("marks, none", "fig8"), ("marks, 12", "strips")] {
         let mut finder = marks::Finder::new(marks::Settings::default());
         let mut out = Marks::default();
-        let mut next = scans.iter().cycle();
-        c.bench_function(name, |b| {
-            b.iter(|| {
-                finder.update(black_box(next.next().expect("a cycle")), &mut out);
-                black_box(&mut out);
-            });
+        bench(c, name, &scans(world, COUNT), |scan| finder.update(scan, black_box(&mut out)));
+    }
+}
+
+fn learn(c: &mut Criterion) {
+    let scans = scans("fig8", FIRST + COUNT);
+    for (name, method) in [("background, paper", Method::Paper), ("background, multi", Method::Multi)] {
+        let (mut model, scans) = model(method, &scans);
+        let mut out = Foreground::default();
+        bench(c, name, scans, |scan| model.update(scan, black_box(&mut out)));
+    }
+    let (mut model, scans) = model(Method::Multi, &scans);
+    let mut cutter = Cutter::new(POSE);
+    // What stands before the background is found once, and cut again and again.
+    let mut foreground = Foreground::default();
+    model.update(&scans[0], &mut foreground);
+    bench(c, "segments", &scans[..1], |scan| cutter.update(scan, black_box(&mut foreground)));
+}
+
+fn all(c: &mut Criterion) {
+    let scans = scans("fig8", FIRST + COUNT);
+    let cases = [
+        ("zones, marks, background paper", Method::Paper, false),
+        ("zones, marks, background multi", Method::Multi, false),
+        ("zones, marks, background multi, segments", Method::Multi, true),
+    ];
+    for (name, method, with_segments) in cases {
+        let mut check = zones::Check::new(POSE, &zones::Settings::default());
+        let mut finder = marks::Finder::new(marks::Settings::default());
+        let (mut model, scans) = model(method, &scans);
+        let mut cutter = Cutter::new(POSE);
+        let (mut zones, mut marks) = (Zones::default(), Marks::default());
+        let mut foreground = Foreground::default();
+        bench(c, name, scans, |scan| {
+            check.update(scan, black_box(&mut zones));
+            finder.update(scan, black_box(&mut marks));
+            model.update(scan, black_box(&mut foreground));
+            if with_segments {
+                cutter.update(scan, black_box(&mut foreground));
+            }
         });
     }
 }
 
-criterion_group!(benches, check, find);
+criterion_group!(benches, check, find, learn, all);
 criterion_main!(benches);

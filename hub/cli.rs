@@ -7,6 +7,7 @@ mod control;
 mod doctor;
 mod gateway;
 mod leds;
+mod listen;
 mod probe;
 pub(crate) mod simulate;
 mod telegram;
@@ -24,6 +25,7 @@ pub(crate) use background::Background;
 pub(crate) use control::Control;
 pub(crate) use gateway::Gateway;
 pub(crate) use leds::Leds;
+pub(crate) use listen::Listen;
 pub(crate) use telegram::{Telegram, Way};
 pub(crate) use zones::Zones;
 
@@ -114,6 +116,8 @@ pub(crate) enum Verb {
     /// What the hub publishes, as UDP datagrams on a network: one message each, to multicast groups and to hosts
     #[command(after_help = gateway::GROUPS)]
     Gateway(Gateway),
+    /// What the gateways of other machines send over the network, and what of it was lost
+    Listen(Listen),
 }
 
 #[derive(Args, Debug)]

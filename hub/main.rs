@@ -126,6 +126,9 @@ fn dispatch(cli: &Cli) -> Result<(), Failure> {
             let (tell, stop) = (interrupt_by(&[SIGUSR1])?, interrupt()?);
             clients::gateway(&gateway.options(everywhere)?, &mut out, &mut io::stderr(), &tell, &stop)
         }
+        Verb::Listen(listen) => {
+            clients::listen(&listen.options(everywhere)?, &mut out, &mut io::stderr(), &*interrupt()?)
+        }
     }
 }
 

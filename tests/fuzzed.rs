@@ -82,6 +82,11 @@ fn configuration() {
     run("configuration");
 }
 
+#[test]
+fn processors() {
+    run("processors");
+}
+
 /// Inputs beside those of the corpus, for each target.
 const ROUNDS: u32 = 4_000;
 /// Bytes of the longest one.

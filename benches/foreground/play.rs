@@ -7,16 +7,19 @@ use sim::look::Met;
 use sim::room::Room;
 use sim::world::World;
 
-/// A scene of the table.
+/// A scene of the table, 2000 scans of it, 53 s.
 #[derive(Clone, Copy)]
 pub(crate) struct Scene {
+    /// What the table calls it.
+    pub(crate) name: &'static str,
     /// Its world.
     pub(crate) world: &'static str,
     pub(crate) unit: Unit,
-    pub(crate) scans: u64,
     /// Whether beams are as wide as real ones, so that at edges they tell one surface, the other or one between.
     pub(crate) mixed: bool,
 }
+
+const SCANS: u64 = 2_000;
 
 /// What a method should say of a beam.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -38,7 +41,6 @@ const OLD_S: f64 = 20.0;
 
 /// One scan and what is due.
 pub(crate) struct Frame {
-    pub(crate) end_ns: u64,
     pub(crate) scan: Scan,
     pub(crate) due: Vec<Due>,
     pub(crate) met: Vec<Met>,
@@ -50,7 +52,7 @@ pub(crate) fn play(scene: &Scene, seed: u64) -> Vec<Frame> {
     let mut layers = world.layers().expect("a world with noise");
     layers.spot &= scene.mixed;
     let room = Room::new(&world.with_layers(layers), seed);
-    (1..=scene.scans).map(|number| frame(&room, scene.unit, number)).collect()
+    (1..=SCANS).map(|number| frame(&room, scene.unit, number)).collect()
 }
 
 fn frame(room: &Room, unit: Unit, number: u64) -> Frame {
@@ -69,7 +71,7 @@ fn frame(room: &Room, unit: Unit, number: u64) -> Frame {
         *range = word & mode.max_value();
     }
     let due = (0..look.truth.len()).map(|i| due(&scan, i, look.truth[i], end_ns)).collect();
-    Frame { end_ns, scan, due, met: look.truth }
+    Frame { scan, due, met: look.truth }
 }
 
 fn due(scan: &Scan, i: usize, met: Met, end_ns: u64) -> Due {

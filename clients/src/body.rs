@@ -10,13 +10,15 @@ use schema::{Pose, Scan};
 pub(crate) const SLICES: usize = 10;
 /// The most sectors that a hub takes.
 const SECTORS: usize = 64;
-/// So much farther than it was met a reading beside the body still counts as the body: five standard deviations of 7 mm,
-/// which is the most that recordings of standing sensors show, and the 15 mm by which two devices differ.
+/// The greatest range of a sector that a hub takes.
+const FARTHEST_MM: u32 = 65_000;
+/// So much farther than it was met a reading still counts as the body: five standard deviations of 7 mm, which is the most
+/// that recordings of standing sensors show, and the 15 mm by which two devices differ.
 const MARGIN_MM: u32 = 50;
-/// The same where the body hides all that is behind it: nothing is missed there by looking less far, and one reading in
-/// two hundred is off by 60 mm and more.
-const BEHIND_MM: u32 = 150;
-/// A beam that meets the body in so large a share of the scans sees nothing behind it.
+/// The same where the body hides all that is behind it, so that nothing is missed by looking less far: four standard
+/// deviations of the 60 mm by which a reading in a hundred is off, which would be a stop every few seconds.
+const BEHIND_MM: u32 = 250;
+/// A beam of whose readings so large a share are of the body sees nothing behind it.
 const FULL: f64 = 0.9;
 
 /// A share of a slice's scans that a beam has to meet something in, so that one wrong reading is nothing.
@@ -26,8 +28,9 @@ const PASSING: usize = 5;
 /// How much the nearest readings of a body differ from slice to slice: noise and a robot that trembles. What is alive
 /// moves more.
 const STEADY_MM: u32 = 100;
-/// Beams beside a body that meet its edge, what is behind it, and what lies between by turns.
-const EDGE_BEAMS: usize = 2;
+/// So near to an edge, in 1/1000 degree, a beam may tell something between the body and what is behind: half a spot of
+/// 12 mm at 0.4 m.
+const EDGE_MDEG: u16 = 1000;
 /// Neighbouring beams whose ranges differ by less make one sector: what it hides more than needed is no wider than that.
 const ALIKE_MM: u32 = 50;
 /// Beams between two that moved, and belong together all the same.
@@ -50,8 +53,10 @@ struct Beam {
     /// In the robot's frame.
     direction: (f64, f64),
     angle_mdeg: i32,
-    /// Where it leaves the circle.
+    /// Where it leaves the circle, and the margin; 0 if it never is inside.
     circle_mm: u32,
+    /// Scans in which it met anything at all.
+    valid: u32,
     slices: [Slice; SLICES],
 }
 
@@ -107,6 +112,7 @@ impl Body {
         let (x_mm, y_mm) = (1000.0 * self.pose.x_m, 1000.0 * self.pose.y_m);
         for (i, beam) in self.beams.iter_mut().enumerate() {
             let Some(range_mm) = scan.distance_mm(i) else { continue };
+            beam.valid += 1;
             let (x, y) = beam.direction;
             let range = f64::from(range_mm);
             if (x_mm + range * x).hypot(y_mm + range * y) < self.within_mm {
@@ -134,7 +140,9 @@ impl Body {
         let met: Vec<Met> = self.beams.iter().map(|beam| Met::of(beam, &self.scans)).collect();
         let slices = self.seen_slices();
         let is_body: Vec<bool> = met.iter().map(|met| met.is_body(slices)).collect();
-        let ranges_mm: Vec<u32> = (0..met.len()).map(|i| range_mm(&met, &is_body, i, slices)).collect();
+        let edge = self.shape.map_or(1, |(_, _, step_mdeg, _)| EDGE_MDEG / step_mdeg.clamp(1, EDGE_MDEG));
+        let range = |beam: usize| range_mm(&met, &is_body, beam, edge.into(), slices).min(FARTHEST_MM);
+        let ranges_mm: Vec<u32> = (0..met.len()).map(range).collect();
         let moving_mm: Vec<u32> = met.iter().zip(&ranges_mm).map(|(met, range)| met.beyond(*range)).collect();
         Mask {
             sectors: self.sectors(join(runs(&ranges_mm, 0, ALIKE_MM)), |run| run.most_mm),
@@ -149,8 +157,9 @@ impl Body {
         // The greater root of |sensor + range * direction| = circle; none is not a number, and so becomes 0.
         let along = x_mm * direction.0 + y_mm * direction.1;
         let across = self.within_mm.powi(2) - (x_mm.powi(2) + y_mm.powi(2) - along.powi(2));
-        let circle_mm = (across.sqrt() - along).ceil() as u32;
-        Beam { direction, angle_mdeg, circle_mm, slices: Default::default() }
+        let leaves = (across.sqrt() - along).ceil() as u32;
+        let circle_mm = if leaves > 0 { leaves + MARGIN_MM } else { 0 };
+        Beam { direction, angle_mdeg, circle_mm, valid: 0, slices: Default::default() }
     }
 
     fn sectors(&self, runs: Vec<Run>, range_mm: impl Fn(&Run) -> u32) -> Vec<Sector> {
@@ -166,7 +175,7 @@ impl Body {
 
 /// What one beam met in the slices in which it met something often enough; both from the least on.
 struct Met {
-    /// It sees nothing behind that.
+    /// It sees nothing behind what it met.
     is_full: bool,
     circle_mm: u32,
     nearest_mm: Vec<u32>,
@@ -187,9 +196,9 @@ impl Met {
             ranges.sort_unstable();
             ranges
         };
-        let all: u32 = scans.iter().sum();
         Met {
-            is_full: f64::from(met.iter().map(|slice| slice.met).sum::<u32>()) >= FULL * f64::from(all),
+            is_full: f64::from(met.iter().map(|slice| slice.met).sum::<u32>())
+                >= FULL * f64::from(beam.valid),
             circle_mm: beam.circle_mm,
             nearest_mm: sorted(|slice| slice.nearest_mm),
             farthest_mm: sorted(|slice| slice.farthest_mm),
@@ -210,18 +219,10 @@ impl Met {
         near.zip(far).is_some_and(|(near, far)| far.saturating_sub(*near) <= STEADY_MM)
     }
 
-    /// Readings nearer than this are what was met. What passed behind its edge is left out; an edge that tells something
-    /// between itself and what is behind may tell anything up to there.
+    /// Readings nearer than this are the body that is met, but for what passes behind its edge.
     fn reach_mm(&self, slices: usize) -> u32 {
-        let (nearest, farthest) = (&self.nearest_mm, &self.farthest_mm);
-        let reach =
-            farthest.iter().nth_back(slices / PASSING).or(farthest.first()).copied().unwrap_or_default();
-        let is_mixed = nearest.first().is_some_and(|nearest| reach - nearest > STEADY_MM);
-        match (self.is_full, is_mixed) {
-            (true, _) => reach + BEHIND_MM,
-            (false, true) => self.circle_mm.max(reach + MARGIN_MM),
-            (false, false) => reach + MARGIN_MM,
-        }
+        let reach = self.farthest_mm.iter().nth_back(slices / PASSING).copied().unwrap_or_default();
+        reach + if self.is_full { BEHIND_MM } else { MARGIN_MM }
     }
 
     /// The nearest that was met at `range_mm` or farther; 0 if nothing was.
@@ -230,20 +231,21 @@ impl Met {
     }
 }
 
-/// Readings of `beam` nearer than this are the body; 0 if none are. The beams just beside a body count as far as it
-/// does: spots are wider than beams, and robots tremble.
-fn range_mm(met: &[Met], is_body: &[bool], beam: usize, slices: usize) -> u32 {
-    let reach = |i: usize| met[i].reach_mm(slices);
-    if is_body[beam] {
-        return reach(beam);
-    }
-    let bodies = |distance: usize| {
+/// Readings of `beam` nearer than this are the body; 0 if none are. At an edge of the body, `edge` beams to either side, all
+/// that is within the circle may be: spots are wider than beams, robots tremble, and what is told lies anywhere between
+/// the body and what is behind. What is lost by that is a strip that no leg fits into.
+fn range_mm(met: &[Met], is_body: &[bool], beam: usize, edge: usize, slices: usize) -> u32 {
+    let near = |distance: usize| {
         let (first, last) = (beam.saturating_sub(distance), (beam + distance).min(met.len() - 1));
-        (first..=last).filter(|&i| is_body[i])
+        &is_body[first..=last]
     };
-    let beside = bodies(1).map(reach).max().unwrap_or_default();
-    let is_edge = bodies(EDGE_BEAMS).next().is_some() && 2 * met[beam].slices() >= slices;
-    if is_edge { beside.max(reach(beam)) } else { beside }
+    match &met[beam] {
+        edge_of_it if is_body[beam] && near(edge).contains(&false) => edge_of_it.circle_mm,
+        within if is_body[beam] => within.reach_mm(slices),
+        beside if near(1).contains(&true) => beside.circle_mm,
+        beside if near(edge).contains(&true) && beside.slices() > slices / PASSING => beside.circle_mm,
+        _ => 0,
+    }
 }
 
 /// Neighbouring beams, and between which values theirs are.

@@ -7,6 +7,7 @@ mod outlet;
 mod report;
 mod selection;
 mod sensor;
+mod uplink;
 
 use std::io::Write;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -16,7 +17,6 @@ use schema::{Domain, Failure, check_sensor, ipc};
 
 use crate::clock;
 use crate::follow::Notice;
-use crate::interface::Interface;
 use crate::names::no_sensor;
 use crate::output::{End, quiet};
 use crate::presence::GRACE;
@@ -26,6 +26,7 @@ use life::Life;
 use report::Report;
 use selection::Selection;
 use sensor::Sensor;
+use uplink::Uplink;
 
 /// What `gateway` is asked for.
 #[derive(Clone, Debug)]
@@ -101,7 +102,7 @@ const ROLL: Duration = Duration::from_secs(5);
 impl<'a> Gateway<'a> {
     fn open(options: &'a GatewayOptions) -> Result<Gateway<'a>, Failure> {
         let selection = Selection::parse(&options.topics, options.bare)?;
-        let interface = Interface::choose(options.interface.as_deref())?;
+        let interface = Uplink::choose(options.interface.as_deref())?;
         let domain = options.places.first().map(Domain::name).unwrap_or_default();
         let now_s = clock::wall_ns() / 1_000_000_000;
         let life = Life::begin(&life::directory()?, domain, interface.name(), now_s)?;

@@ -40,7 +40,7 @@ impl<'a> Stamp<'a> {
             topic_seq: Some(header.topic_seq),
             stamp_ns: Some(header.stamp_first_ns),
             wall_ns: Some(header.wall_ns),
-            boot: Some(header.boot),
+            boot: known(header.boot, 0),
             quality: header.quality().name(),
             reasons: Reasons::names(header.reasons).collect(),
         }

@@ -190,6 +190,8 @@ impl Board<'_> {
     /// The stop light stays, because nobody watches any more.
     fn leave(&mut self) -> Result<(), End> {
         self.show(Lamps::UNKNOWN, false)?;
+        // Also if it was lost before it was shown.
+        self.switch(Instant::now())?;
         match self.look {
             LedsLook::Terminal { .. } => self.out.raw(b"\n"),
             LedsLook::Json | LedsLook::Lines => Ok(()),

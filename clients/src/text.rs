@@ -12,7 +12,7 @@ use crate::follow::Notice;
 use crate::names::TopicName;
 use crate::sample::Sample;
 
-pub(crate) use processed::background;
+pub(crate) use processed::{background, foreground, marks, zones};
 
 /// Bytes as lower hex, without spaces.
 pub(crate) struct Hex<'a>(pub(crate) &'a [u8]);
@@ -84,7 +84,8 @@ fn numbers(line: &mut Vec<u8>, header: &Header) -> io::Result<()> {
     Ok(())
 }
 
-fn telegram(line: &mut Vec<u8>, header: &Header, bytes: &[u8]) -> io::Result<()> {
+/// What follows the name of a sample of topic `telegram`.
+pub(crate) fn telegram(line: &mut Vec<u8>, header: &Header, bytes: &[u8]) -> io::Result<()> {
     const SHOWN: usize = 16;
     numbers(line, header)?;
     let telegram = Telegram(bytes);
@@ -99,7 +100,8 @@ fn telegram(line: &mut Vec<u8>, header: &Header, bytes: &[u8]) -> io::Result<()>
     if bytes.len() > SHOWN { write!(line, "...") } else { Ok(()) }
 }
 
-fn scan(line: &mut Vec<u8>, header: &Header, scan: &Scan) -> io::Result<()> {
+/// What follows the name of a sample of topic `scan`.
+pub(crate) fn scan(line: &mut Vec<u8>, header: &Header, scan: &Scan) -> io::Result<()> {
     numbers(line, header)?;
     let beams = scan.beams();
     let last = scan.angle_deg(beams.saturating_sub(1));
@@ -112,7 +114,8 @@ fn scan(line: &mut Vec<u8>, header: &Header, scan: &Scan) -> io::Result<()> {
     }
 }
 
-fn status(line: &mut Vec<u8>, status: &Status) -> io::Result<()> {
+/// What follows the name of a sample of topic `status`.
+pub(crate) fn status(line: &mut Vec<u8>, status: &Status) -> io::Result<()> {
     let state = status.state().map_or("unknown", |state| state.name());
     write!(
         line,

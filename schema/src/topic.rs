@@ -101,7 +101,8 @@ pub const WAKE: &str = "wake";
 pub enum Wake {
     /// All samples of a telegram are sent.
     Telegram = 1,
-    /// The status changed.
+    /// The status changed, or something else was said without a telegram: that nothing is known of the zones, a new
+    /// background.
     Status = 2,
     /// The hub is up; sent by itself when the notifier is created.
     HubUp = 3,

@@ -1,6 +1,8 @@
 //! What has to hold whatever comes: one function for each place where the world's bytes enter. The fuzzer calls them
 //! with what it invents, `tests/fuzzed.rs` with the corpus and with seeded noise. They know invariants, no examples.
 
+mod processors;
+
 use lms::command::Request;
 use lms::eeprom::Write;
 use lms::explain::explain;
@@ -17,8 +19,13 @@ use lms::{Control, MILLIS, Nanos, Settings};
 pub type Target = (&'static str, fn(&[u8]));
 
 /// All of them; the names are those of the corpus' folders.
-pub const TARGETS: [Target; 4] =
-    [("framer", framer), ("replies", replies), ("session", session), ("configuration", configuration)];
+pub const TARGETS: [Target; 5] = [
+    ("framer", framer),
+    ("replies", replies),
+    ("session", session),
+    ("configuration", configuration),
+    ("processors", processors),
+];
 
 /// Any bytes in any pieces: what is delivered stood there and has a right checksum, in order, and no byte vanishes.
 ///
@@ -215,4 +222,9 @@ pub fn configuration(data: &[u8]) {
         }
     }
     let _ = std::fs::remove_file(&path);
+}
+
+/// Any scans, whoever sends such, with any settings, through all processors.
+pub fn processors(data: &[u8]) {
+    processors::processors(data);
 }

@@ -43,7 +43,8 @@ fn unhex(text: &str) -> Vec<u8> {
     digits.chunks(2).map(|pair| (pair[0] << 4 | pair[1]) as u8).collect()
 }
 
-fn list() -> Value {
+/// The whole list: `vectors`, and `key`, as hex digits, of those that have one.
+pub(crate) fn list() -> Value {
     let text = fs::read_to_string(directory().join("vectors.json")).expect("the list");
     serde_json::from_str(&text).expect("JSON")
 }

@@ -6,12 +6,12 @@ use schema::{Failure, Kind, Telegram, Topic};
 
 use super::life::Life;
 use super::outlet::Outlet;
-use crate::interface::Interface;
+use super::uplink::Uplink;
 
 /// What goes out, and the account of it.
 pub(super) struct Lan {
     pub(super) life: Life,
-    pub(super) interface: Interface,
+    pub(super) interface: Uplink,
     /// The groups; what is sent to them is what the rows count.
     pub(super) groups: Outlet,
     /// Hosts that get copies.
@@ -74,7 +74,7 @@ impl Lan {
     /// [`Kind::Configuration`] if `longest` is not possible or a host is none; [`Kind::Failed`] without sockets.
     pub(super) fn open(
         life: Life,
-        interface: Interface,
+        interface: Uplink,
         to: &[String],
         form: Form,
         ttl: u8,

@@ -8,7 +8,7 @@ use super::numbers;
 use crate::robot::Robot;
 use crate::zones::Heard;
 
-pub(super) fn marks(line: &mut Vec<u8>, header: &Header, marks: &Marks) -> io::Result<()> {
+pub(crate) fn marks(line: &mut Vec<u8>, header: &Header, marks: &Marks) -> io::Result<()> {
     numbers(line, header)?;
     if !marks.is_available() {
         return write!(line, " unavailable: the sensor's measuring mode has no reflector bits");
@@ -21,7 +21,7 @@ pub(super) fn marks(line: &mut Vec<u8>, header: &Header, marks: &Marks) -> io::R
     if marks.is_overflow() { write!(line, ", and more") } else { Ok(()) }
 }
 
-pub(super) fn zones(line: &mut Vec<u8>, heard: &Heard) -> io::Result<()> {
+pub(crate) fn zones(line: &mut Vec<u8>, heard: &Heard) -> io::Result<()> {
     let Heard { zones, header, .. } = heard;
     let Some(header) = header else {
         return write!(line, "unknown: nothing new is heard");
@@ -55,7 +55,7 @@ pub(super) fn robot(line: &mut Vec<u8>, robot: &Robot) -> io::Result<()> {
     Ok(())
 }
 
-pub(super) fn foreground(line: &mut Vec<u8>, header: &Header, foreground: &Foreground) -> io::Result<()> {
+pub(crate) fn foreground(line: &mut Vec<u8>, header: &Header, foreground: &Foreground) -> io::Result<()> {
     numbers(line, header)?;
     write!(line, " {} beams, {} segments", foreground.beams, foreground.segments)?;
     let unit_mm = u32::from(foreground.unit_mm);

@@ -119,7 +119,7 @@ impl Model {
         };
         let count = usize::from(self.shape.0);
         for (i, range) in out.range_array[..count].iter_mut().enumerate() {
-            *range = self.learner.background(i);
+            *range = self.learner.background(i, &self.limits);
         }
         out.taught = out.ranges().iter().filter(|&&range| range != Background::UNTAUGHT).count() as u16;
     }
@@ -206,10 +206,10 @@ impl Learner {
     }
 
     /// The background of beam `i` in device units, [`Background::UNTAUGHT`] or [`Background::FAR`].
-    fn background(&self, i: usize) -> u16 {
+    fn background(&self, i: usize, limits: &Limits) -> u16 {
         match self {
             Learner::Paper(paper) => paper.background(i),
-            Learner::Multi(multi) => multi.background(i),
+            Learner::Multi(multi) => multi.background(i, limits),
         }
     }
 }
@@ -243,6 +243,9 @@ fn write(scan: &Scan, classes: &[Class; BEAMS], out: &mut Foreground) {
     out.bit_array.fill(0);
     let mut beams = 0;
     for (byte, (classes, values)) in classes[..count].chunks(8).zip(scan.ranges().chunks(8)).enumerate() {
+        if !classes.iter().fold(false, |any, &class| any | (class == Class::Foreground)) {
+            continue;
+        }
         for (bit, (&class, &value)) in classes.iter().zip(values).enumerate() {
             if class == Class::Foreground {
                 out.bit_array[byte] |= 1 << bit;

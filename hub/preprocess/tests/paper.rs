@@ -5,7 +5,7 @@ mod surroundings;
 
 use preprocess::background::{Candidate, Class, Method, Model, Settings, Start};
 use schema::{Background, Foreground, Scan};
-use surroundings::{Shape, Surroundings, reading_mm};
+use surroundings::{Shape, Surroundings, any_model, foreground, ranges_mm, reading_mm};
 
 /// One beam as the paper has it.
 #[derive(Clone, Default)]
@@ -93,23 +93,6 @@ impl Slow {
     }
 }
 
-/// The foreground that belongs to `classes`, but for its segments and generation, which are as in `like`.
-fn foreground(scan: &Scan, classes: &[Class], like: &Foreground) -> Foreground {
-    let mut expected = *like;
-    expected.count = scan.count;
-    expected.unit_mm = scan.unit_mm;
-    (expected.pad, expected.pad2) = ([0], [0, 0]);
-    expected.bit_array.fill(0);
-    expected.range_array.fill(0);
-    let beams: Vec<usize> = (0..classes.len()).filter(|&i| classes[i] == Class::Foreground).collect();
-    for (place, &i) in beams.iter().enumerate() {
-        expected.bit_array[i / 8] |= 1 << (i % 8);
-        expected.range_array[place] = scan.range_array[i];
-    }
-    expected.beams = beams.len() as u16;
-    expected
-}
-
 fn any_settings(random: &mut fastrand::Rng) -> Settings {
     let mut maybe = |from, to| if random.bool() { Some(random.u16(from..to)) } else { None };
     let (threshold_mm, candidate_mm, scans) = (maybe(5, 120), maybe(5, 120), maybe(1, 60));
@@ -124,32 +107,11 @@ fn any_settings(random: &mut fastrand::Rng) -> Settings {
     }
 }
 
-/// A model as somebody might have saved it: what is behind by `far` of 8, unknown by another, and ranges.
-fn any_model(random: &mut fastrand::Rng, shape: Shape) -> Background {
-    let mut model = Background { count: shape.count, unit_mm: shape.unit_mm, ..Background::default() };
-    for range in &mut model.range_array[..usize::from(shape.count)] {
-        *range = match random.u8(..8) {
-            0 => Background::UNTAUGHT,
-            1 => Background::FAR,
-            _ => random.u16(100..4_000),
-        };
-    }
-    model
-}
-
-fn ranges_mm(model: &Background) -> Vec<f64> {
-    let mm = |&range: &u16| match range {
-        Background::FAR => f64::INFINITY,
-        range => f64::from(range) * f64::from(model.unit_mm),
-    };
-    model.ranges().iter().map(mm).collect()
-}
-
 #[test]
 fn identical_beam_by_beam() {
     let mut seen = [0_u64; 5];
     let mut adopted = 0_u64;
-    for seed in 0..24 {
+    for seed in 0..16 {
         let mut random = fastrand::Rng::with_seed(seed);
         let settings = any_settings(&mut random);
         let mut surroundings = Surroundings::new(Shape::any(&mut random), seed);
@@ -207,5 +169,5 @@ fn identical_beam_by_beam() {
         assert_eq!(usize::from(shown.taught), shown.ranges().iter().filter(|&&r| r != 0).count());
         adopted += u64::from(shown.taught);
     }
-    assert!(seen.iter().all(|&n| n > 10_000) && adopted > 3_000, "{seen:?}, {adopted}: nothing was tried");
+    assert!(seen.iter().all(|&n| n > 10_000) && adopted > 2_000, "{seen:?}, {adopted}: nothing was tried");
 }

@@ -295,7 +295,7 @@ mod tests {
     fn descriptors_are_counted_in_consumers() {
         says(&descriptors(&facts()), State::Ok, &["4096", "997 consumers"]);
         says(&descriptors(&Facts { descriptors: None, ..facts() }), State::Ok, &["no limit"]);
-        says(&descriptors(&Facts { descriptors: Some(128), ..facts() }), State::Warning, &["12 consumers"]);
-        says(&descriptors(&Facts { descriptors: Some(79), ..facts() }), State::Failed, &["needs 80"]);
+        says(&descriptors(&Facts { descriptors: Some(128), ..facts() }), State::Warning, &["5 consumers"]);
+        says(&descriptors(&Facts { descriptors: Some(107), ..facts() }), State::Failed, &["needs 108"]);
     }
 }

@@ -1,7 +1,8 @@
 //! A background with several surfaces a beam: at edges a beam flips between two of them, and both are learned. Refuses
 //! to know how many beams something has to cover until it is believed: that is for the runs.
 //!
-//! The constants were found on seeds 0 to 9 of the simulated scenes, by `benches/foreground`.
+//! All beams take the same steps, whatever they meet, so that a processor does several of them at once. The constants
+//! were found on seeds 0 to 9 of the simulated scenes, by `benches/foreground`.
 
 use super::runs::Runs;
 use super::settings::Limits;
@@ -11,155 +12,182 @@ use schema::{BEAMS, Background};
 /// State of the method with several surfaces.
 #[derive(Clone)]
 pub(super) struct Multi {
-    beams: [Beam; BEAMS],
+    slots: [Slots; SLOTS],
     runs: Runs,
 }
 
-/// The surfaces that a beam meets, now and then, in no order.
+/// A surface of each beam, if it has one.
 #[derive(Clone, Copy)]
-struct Beam {
-    slots: [Slot; SLOTS],
-    /// Range of the nearest background; [`NONE`] if there is none.
-    nearest: u32,
+struct Slots {
+    /// In device units.
+    range: [u16; BEAMS],
+    /// How well it is known: grows with each scan in which it was met, and leaks in others. 0: there is none.
+    weight: [u16; BEAMS],
 }
 
-/// One of these surfaces.
+/// What the steps are about, in units of ranges and of weights.
 #[derive(Clone, Copy)]
-struct Slot {
-    /// In 1/16 device units; [`NONE`] if the slot is empty.
-    range: u32,
-    /// How well it is known: grows with each scan in which it was met, and leaks in others.
-    weight: u32,
-    is_background: bool,
+struct Bounds {
+    threshold: u16,
+    full: u16,
+    known: u16,
+    replaced: u16,
 }
 
 impl Multi {
     pub(super) fn new() -> Multi {
-        Multi { beams: [Beam { slots: [Slot::EMPTY; SLOTS], nearest: NONE }; BEAMS], runs: Runs::new() }
+        Multi { slots: [Slots { range: [0; BEAMS], weight: [0; BEAMS] }; SLOTS], runs: Runs::new() }
     }
 
     /// Compares all beams with the state before this scan, then learns from them.
     pub(super) fn update(&mut self, readings: &[u16], limits: &Limits, learn: bool, classes: &mut [Class]) {
-        let threshold = FINE * u32::from(limits.threshold);
-        let full = MET * limits.scans.min(MOST_SCANS);
-        for (i, (&reading, class)) in readings.iter().zip(classes.iter_mut()).enumerate() {
-            let range = FINE * u32::from(reading);
-            *class = match &self.beams[i] {
-                _ if reading == INVALID => Class::Invalid,
-                beam if beam.nearest == NONE => self.beside(i, readings.len(), range, threshold, full),
-                beam if beam.slots.iter().any(|slot| slot.is_background && slot.meets(range, threshold)) => {
-                    Class::Background
-                }
-                beam if range < beam.nearest => Class::Foreground,
-                _ => Class::Behind,
-            };
+        let bounds = Bounds::of(limits);
+        let mut nearest = [INVALID; BEAMS];
+        self.compare(readings, bounds, classes, &mut nearest);
+        let nearest = &nearest[..readings.len()];
+        for i in (0..readings.len()).filter(|&i| nearest[i] == INVALID) {
+            if readings[i] != INVALID && self.is_before_its_neighbours(i, readings[i], nearest, bounds) {
+                classes[i] = Class::Foreground;
+            }
         }
         self.runs.keep(readings, limits, classes);
         if learn {
-            for (beam, &reading) in self.beams.iter_mut().zip(readings) {
-                if reading != INVALID {
-                    beam.learn(FINE * u32::from(reading), threshold, full);
-                }
-            }
+            self.learn(readings, bounds);
         }
     }
 
-    /// What beam `i` of `count` is, whose own background is not known: foreground if it is nearer than what its
-    /// neighbours to both sides end on, and meets nothing that it has met for a while.
-    fn beside(&self, i: usize, count: usize, range: u32, threshold: u32, full: u32) -> Class {
-        let known = |beam: &&Beam| beam.nearest != NONE;
-        let right = self.beams[i.saturating_sub(ASIDE)..i].iter().rev().find(known);
-        let left = self.beams[i + 1..(i + 1 + ASIDE).min(count)].iter().find(known);
-        let (Some(right), Some(left)) = (right, left) else { return Class::Unknown };
-        let met = |slot: &Slot| slot.weight >= full / FORGOTTEN && slot.meets(range, threshold);
-        if range + threshold < right.nearest.min(left.nearest) && !self.beams[i].slots.iter().any(met) {
-            Class::Foreground
-        } else {
-            Class::Unknown
+    /// What each beam is beside its own background, and the nearest one of these; [`INVALID`] if there is none.
+    fn compare(&self, readings: &[u16], bounds: Bounds, classes: &mut [Class], nearest: &mut [u16; BEAMS]) {
+        for (i, ((&reading, class), nearest)) in readings.iter().zip(classes).zip(nearest).enumerate() {
+            let (mut ends, mut known, mut range) = (false, false, Background::FAR);
+            for slots in &self.slots {
+                let is_known = slots.weight[i] >= bounds.known;
+                known |= is_known;
+                ends |= is_known & (slots.range[i].abs_diff(reading) <= bounds.threshold);
+                range = if is_known & (slots.range[i] < range) { slots.range[i] } else { range };
+            }
+            *nearest = if known { range } else { INVALID };
+            let aside = if reading < range { Class::Foreground } else { Class::Behind };
+            let with_background = if ends { Class::Background } else { aside };
+            let valid = if known { with_background } else { Class::Unknown };
+            *class = if reading == INVALID { Class::Invalid } else { valid };
+        }
+    }
+
+    /// Beam `i`, whose own background is not known, is nearer than what its neighbours to both sides end on, and meets
+    /// nothing that it has met for a while.
+    fn is_before_its_neighbours(&self, i: usize, reading: u16, nearest: &[u16], bounds: Bounds) -> bool {
+        let known = |range: &&u16| **range != INVALID;
+        let right = nearest[i.saturating_sub(ASIDE)..i].iter().rev().find(known);
+        let left = nearest[i + 1..(i + 1 + ASIDE).min(nearest.len())].iter().find(known);
+        let (Some(&right), Some(&left)) = (right, left) else { return false };
+        let met = |slots: &Slots| {
+            slots.weight[i] >= bounds.replaced && slots.range[i].abs_diff(reading) <= bounds.threshold
+        };
+        reading < right.min(left).saturating_sub(bounds.threshold) && !self.slots.iter().any(met)
+    }
+
+    /// The surface nearest to a reading, within the threshold, was met; the others leak, those through which the beam
+    /// went more than those that may be hidden. What is none of them takes the place of the least known one, unless all
+    /// are known too well.
+    fn learn(&mut self, readings: &[u16], bounds: Bounds) {
+        for (i, &reading) in readings.iter().enumerate() {
+            let range = self.slots.each_ref().map(|slots| slots.range[i]);
+            let weight = self.slots.each_ref().map(|slots| slots.weight[i]);
+            let (new_range, new_weight) = learned(range, weight, reading, bounds);
+            let valid = reading != INVALID;
+            for (k, slots) in self.slots.iter_mut().enumerate() {
+                slots.range[i] = if valid { new_range[k] } else { range[k] };
+                slots.weight[i] = if valid { new_weight[k] } else { weight[k] };
+            }
         }
     }
 
     /// Takes `range` for the only background of beam `i`, as well known as can be.
     pub(super) fn adopt(&mut self, i: usize, range: u16) {
-        let known = Slot { range: FINE * u32::from(range), weight: u32::MAX, is_background: true };
-        self.beams[i] = Beam { slots: [Slot::EMPTY; SLOTS], nearest: known.range };
-        self.beams[i].slots[0] = known;
+        self.slots.iter_mut().for_each(|slots| slots.weight[i] = 0);
+        self.slots[0].range[i] = range;
+        self.slots[0].weight[i] = u16::MAX;
     }
 
     /// The best known background of beam `i`, of equals the nearer one.
-    pub(super) fn background(&self, i: usize) -> u16 {
-        let known = self.beams[i].slots.iter().filter(|slot| slot.is_background);
-        let best = known.max_by_key(|slot| (slot.weight, NONE - slot.range));
-        best.map_or(Background::UNTAUGHT, |slot| ((slot.range + FINE / 2) / FINE) as u16)
+    pub(super) fn background(&self, i: usize, limits: &Limits) -> u16 {
+        let known = |slots: &&Slots| slots.weight[i] >= Bounds::of(limits).known;
+        let best = self.slots.iter().filter(known).max_by_key(|s| (s.weight[i], u16::MAX - s.range[i]));
+        best.map_or(Background::UNTAUGHT, |slots| slots.range[i])
     }
 }
 
-impl Beam {
-    /// After something was met at `range`: the nearest surface within `threshold` is it, the others leak, those
-    /// through which the beam went more than those that may be hidden. What is none of them takes the place of the
-    /// least known one, unless all are known too well.
-    fn learn(&mut self, range: u32, threshold: u32, full: u32) {
-        let mut met = None;
-        let mut nearest = threshold;
-        for (number, slot) in self.slots.iter().enumerate() {
-            let apart = slot.range.abs_diff(range);
-            if apart < nearest || apart == nearest && met.is_none() {
-                (met, nearest) = (Some(number), apart);
-            }
-        }
-        for (number, slot) in self.slots.iter_mut().enumerate() {
-            let weight = slot.weight.min(full);
-            if met == Some(number) {
-                slot.weight = (weight + MET).min(full);
-                slot.is_background |= slot.weight >= full / 8 * KNOWN_EIGHTHS;
-                slot.range = slot.range + range / DRAWN - slot.range / DRAWN;
-            } else {
-                slot.weight = weight.saturating_sub(if range > slot.range { PASSED } else { HIDDEN });
-                slot.is_background &= slot.weight >= full / FORGOTTEN;
-            }
-        }
-        if met.is_none()
-            && let Some(least) = self.slots.iter_mut().min_by_key(|slot| slot.weight)
-            && least.weight < full / FORGOTTEN
-        {
-            *least = Slot { range, weight: MET, is_background: MET >= full };
-        }
-        let ranges = self.slots.iter().map(|slot| if slot.is_background { slot.range } else { NONE });
-        self.nearest = ranges.fold(NONE, u32::min);
+/// The surfaces of one beam after `reading`.
+#[inline]
+fn learned(
+    range: [u16; SLOTS],
+    weight: [u16; SLOTS],
+    reading: u16,
+    bounds: Bounds,
+) -> ([u16; SLOTS], [u16; SLOTS]) {
+    const NOT_MET: u16 = u16::MAX;
+    let mut apart = [NOT_MET; SLOTS];
+    let mut least_apart = NOT_MET;
+    for k in 0..SLOTS {
+        let away = range[k].abs_diff(reading);
+        apart[k] = if (weight[k] > 0) & (away <= bounds.threshold) { away } else { NOT_MET };
+        least_apart = least_apart.min(apart[k]);
     }
+    let (mut new_range, mut new_weight) = (range, weight);
+    let mut open = least_apart != NOT_MET;
+    let mut least = u16::MAX;
+    for k in 0..SLOTS {
+        let met = open & (apart[k] == least_apart);
+        open &= !met;
+        let step = (reading.wrapping_sub(range[k]) as i16) / DRAWN;
+        new_range[k] = if met { range[k].wrapping_add_signed(step) } else { range[k] };
+        let before = weight[k].min(bounds.full);
+        let leak = if reading > range[k] { PASSED } else { HIDDEN };
+        let more = before.saturating_add(MET).min(bounds.full);
+        new_weight[k] = if met { more } else { before.saturating_sub(leak) };
+        least = least.min(new_weight[k]);
+    }
+    let mut homeless = (least_apart == NOT_MET) & (least < bounds.replaced);
+    for k in 0..SLOTS {
+        let replaced = homeless & (new_weight[k] == least);
+        homeless &= !replaced;
+        new_range[k] = if replaced { reading } else { new_range[k] };
+        new_weight[k] = if replaced { MET } else { new_weight[k] };
+    }
+    (new_range, new_weight)
 }
 
-impl Slot {
-    const EMPTY: Slot = Slot { range: NONE, weight: 0, is_background: false };
-
-    fn meets(&self, range: u32, threshold: u32) -> bool {
-        self.range.abs_diff(range) <= threshold
+impl Bounds {
+    fn of(limits: &Limits) -> Bounds {
+        let scans = limits.scans;
+        Bounds {
+            threshold: limits.threshold,
+            full: MET * scans,
+            known: KNOWN * scans,
+            replaced: REPLACED * scans,
+        }
     }
 }
 
 /// Surfaces a beam remembers: two at an edge, and one that may take the place of either.
 const SLOTS: usize = 3;
-/// Steps of a slot's range in a device unit.
-const FINE: u32 = 16;
-/// A range that nothing is near, not even what is beyond the sensor's.
-const NONE: u32 = 1 << 30;
-/// A slot's range moves by this part of its distance to the reading: too slowly to follow somebody who walks.
-const DRAWN: u32 = 16;
+/// A surface's range moves by this part of its distance to the reading, in whole units: too slowly to follow somebody
+/// who walks.
+const DRAWN: i16 = 16;
 
 /// Weight of a scan in which the surface was met; it is fully known after as many scans as are set.
-const MET: u32 = 8;
-/// Weight lost in a scan that saw what is behind the surface: what was taken away is forgotten after 1.5 times the
-/// scans that are set, and what is met in a third of the scans is learned in the end.
-const PASSED: u32 = 4;
+const MET: u16 = 8;
+/// Weight lost in a scan that saw what is behind the surface: what was taken away is no background any more after 3/4
+/// of the scans that are set, and what is met in more than a third of the scans becomes one in the end.
+const PASSED: u16 = 4;
 /// Weight lost in a scan that saw something before the surface, which may still be there. Not 0: else all slots could
 /// be taken by what is hidden for ever.
-const HIDDEN: u32 = 1;
-/// A surface is background from 5/8 of the full weight on: sooner than a run of the paper's method, whose readings
-/// must all be the same; so readings may be missing.
-const KNOWN_EIGHTHS: u32 = 5;
-/// Below a quarter of the full weight it is forgotten.
-const FORGOTTEN: u32 = 4;
+const HIDDEN: u16 = 1;
+/// Weight per scan that is set, from which on a surface is background: 5/8 of the full weight, so that readings may be
+/// missing.
+const KNOWN: u16 = 5;
+/// Weight per scan that is set, below which a surface can be replaced.
+const REPLACED: u16 = 2;
 /// Beams to either side among which one has to be known, to stand in for a beam that is not.
-const ASIDE: usize = 4;
-/// Keeps weights in their integers: 26 months.
-const MOST_SCANS: u32 = u32::MAX / 16;
+const ASIDE: usize = 8;

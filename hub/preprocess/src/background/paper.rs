@@ -1,5 +1,7 @@
 //! The paper's background, value for value: one range a beam, replaced by what was read so many times in a row. A beam
 //! that flips between two surfaces never learns either.
+//!
+//! All beams take the same steps, whatever they meet, so that a processor does several of them at once.
 
 use super::settings::Limits;
 use super::{Class, INVALID};
@@ -13,7 +15,7 @@ pub(super) struct Paper {
     /// What may become the background, where `run` is not 0.
     candidate: [u16; BEAMS],
     /// Readings in a row that were the candidate's.
-    run: [u32; BEAMS],
+    run: [u16; BEAMS],
 }
 
 impl Paper {
@@ -24,41 +26,35 @@ impl Paper {
     /// Compares and learns (paper III.B.3). Readings without a range neither count nor end a run; farther ones count,
     /// but are never foreground; the scan that completes a run is compared with the old background.
     pub(super) fn update(&mut self, readings: &[u16], limits: &Limits, learn: bool, classes: &mut [Class]) {
-        let state = self.background.iter_mut().zip(&mut self.candidate).zip(&mut self.run);
-        for ((&reading, class), ((background, candidate), run)) in readings.iter().zip(classes).zip(state) {
-            if reading == INVALID {
-                *class = Class::Invalid;
-                continue;
-            }
-            let known = *background != Background::UNTAUGHT;
-            if known && reading.abs_diff(*background) <= limits.threshold {
-                *class = Class::Background;
-                if learn {
-                    *run = 0;
-                }
-                continue;
-            }
-            *class = match known {
-                false => Class::Unknown,
-                true if reading < *background => Class::Foreground,
-                true => Class::Behind,
-            };
-            if !learn {
-                continue;
-            }
-            if *run > 0 && reading.abs_diff(*candidate) <= limits.candidate {
-                *run += 1;
-                if limits.latest {
-                    *candidate = reading;
-                }
-            } else {
-                *candidate = reading;
-                *run = 1;
-            }
-            if *run >= limits.scans {
-                *background = reading;
-                *run = 0;
-            }
+        for ((&reading, &background), class) in readings.iter().zip(&self.background).zip(classes) {
+            let aside = if reading < background { Class::Foreground } else { Class::Behind };
+            let ends = reading.abs_diff(background) <= limits.threshold;
+            let known = if ends { Class::Background } else { aside };
+            let valid = if background == Background::UNTAUGHT { Class::Unknown } else { known };
+            *class = if reading == INVALID { Class::Invalid } else { valid };
+        }
+        if learn {
+            self.learn(readings, limits);
+        }
+    }
+
+    fn learn(&mut self, readings: &[u16], limits: &Limits) {
+        let beams = readings.len();
+        let background = &mut self.background[..beams];
+        let candidate = &mut self.candidate[..beams];
+        let run = &mut self.run[..beams];
+        for (i, &reading) in readings.iter().enumerate() {
+            let valid = reading != INVALID;
+            let known = background[i] != Background::UNTAUGHT;
+            let ends = known & (reading.abs_diff(background[i]) <= limits.threshold);
+            let goes_on = (run[i] > 0) & (reading.abs_diff(candidate[i]) <= limits.candidate);
+            let longer = if goes_on { run[i] + 1 } else { 1 };
+            let adopted = valid & !ends & (longer >= limits.scans);
+            let anew = valid & !ends & (!goes_on | limits.latest);
+            let new_run = if ends | adopted { 0 } else { longer };
+            background[i] = if adopted { reading } else { background[i] };
+            candidate[i] = if anew { reading } else { candidate[i] };
+            run[i] = if valid { new_run } else { run[i] };
         }
     }
 

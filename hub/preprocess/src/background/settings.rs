@@ -13,7 +13,8 @@ pub struct Settings {
     /// The same for a reading and its candidate (`paper`). None: 30, in cm mode 60.
     pub candidate_mm: Option<u16>,
     /// Scans until a surface is background. None: 375 at half degrees, 750 at 1, 188 at a quarter, which are 10 s at
-    /// the full rate; `multi` knows a surface well enough after 5/8 of it.
+    /// the full rate; `multi` knows a surface well enough after
+    /// 5/8 of it. At most 8191, more is taken for that: 3.6 minutes at half degrees.
     pub scans: Option<u32>,
     /// What a candidate is compared with (`paper`).
     pub candidate: Candidate,
@@ -60,8 +61,8 @@ pub(super) struct Limits {
     pub(super) threshold: u16,
     /// In device units.
     pub(super) candidate: u16,
-    /// At least 1.
-    pub(super) scans: u32,
+    /// 1 to [`MOST_SCANS`].
+    pub(super) scans: u16,
     pub(super) latest: bool,
     /// Angle between two beams in 1/1000 degree.
     pub(super) step_mdeg: u16,
@@ -75,6 +76,8 @@ const THRESHOLD_MM: u16 = 30;
 const THRESHOLD_CM_MODE_MM: u16 = 60;
 /// Mirror turns in 10 s (75 Hz): as many scans at 1 degree, half of them at half degrees.
 const TURNS: u32 = 750;
+/// What the weights of `multi` have room for: eight a scan in 16 bits.
+const MOST_SCANS: u32 = 8191;
 /// No two ranges are farther apart; [`schema::Background::FAR`] is, from all of them.
 const FARTHEST: u16 = 0x7FFF;
 
@@ -87,7 +90,7 @@ impl Limits {
         Limits {
             threshold: units(settings.threshold_mm),
             candidate: units(settings.candidate_mm),
-            scans: settings.scans.unwrap_or(ten_seconds).max(1),
+            scans: settings.scans.unwrap_or(ten_seconds).clamp(1, MOST_SCANS) as u16,
             latest: settings.candidate == Candidate::Latest,
             step_mdeg: scan.step_mdeg,
             unit_mm,
@@ -112,5 +115,6 @@ mod tests {
         let own = Settings { threshold_mm: Some(45), candidate_mm: Some(u16::MAX), scans: Some(0), ..paper };
         assert_eq!(limits(own, 10, 500), (4, 6553, 1));
         assert_eq!(limits(own, 0, 0), (45, FARTHEST, 1));
+        assert_eq!(limits(Settings { scans: Some(u32::MAX), ..paper }, 1, 500).2, 8191);
     }
 }

@@ -2,7 +2,8 @@
 //! that comes and goes, codes, zeroes, noise with outliers. As unkind as a room can be, and more; not a simulation.
 #![allow(dead_code)] // each test takes what it needs
 
-use schema::{BEAMS, Scan};
+use preprocess::background::Class;
+use schema::{BEAMS, Background, Foreground, Scan};
 
 /// Angles, unit and bits of a scan.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -97,4 +98,43 @@ pub(crate) fn reading_mm(scan: &Scan, i: usize, no_return_is_far: bool) -> Optio
     } else {
         Some(value * f64::from(scan.unit_mm))
     }
+}
+
+/// A model as somebody might have saved it.
+pub(crate) fn any_model(random: &mut fastrand::Rng, shape: Shape) -> Background {
+    let mut model = Background { count: shape.count, unit_mm: shape.unit_mm, ..Background::default() };
+    for range in &mut model.range_array[..usize::from(shape.count)] {
+        *range = match random.u8(..8) {
+            0 => Background::UNTAUGHT,
+            1 => Background::FAR,
+            _ => random.u16(100..4_000),
+        };
+    }
+    model
+}
+
+/// The ranges of `model` in mm: 0 where it knows none, infinite where they are far.
+pub(crate) fn ranges_mm(model: &Background) -> Vec<f64> {
+    let mm = |&range: &u16| match range {
+        Background::FAR => f64::INFINITY,
+        range => f64::from(range) * f64::from(model.unit_mm),
+    };
+    model.ranges().iter().map(mm).collect()
+}
+
+/// The foreground that belongs to `classes`, but for its segments and generation, which are as in `like`.
+pub(crate) fn foreground(scan: &Scan, classes: &[Class], like: &Foreground) -> Foreground {
+    let mut expected = *like;
+    expected.count = scan.count;
+    expected.unit_mm = scan.unit_mm;
+    (expected.pad, expected.pad2) = ([0], [0, 0]);
+    expected.bit_array.fill(0);
+    expected.range_array.fill(0);
+    let beams: Vec<usize> = (0..classes.len()).filter(|&i| classes[i] == Class::Foreground).collect();
+    for (place, &i) in beams.iter().enumerate() {
+        expected.bit_array[i / 8] |= 1 << (i % 8);
+        expected.range_array[place] = scan.range_array[i];
+    }
+    expected.beams = beams.len() as u16;
+    expected
 }

@@ -1,0 +1,48 @@
+//! How many bytes a second go over a network: all scans, or the foreground alone.
+
+use preprocess::background::{Model, Settings};
+use preprocess::segments::Cutter;
+use schema::{Foreground, Pose};
+
+use crate::play::Frame;
+
+/// Bytes of payloads over some runs, without headers.
+#[derive(Clone, Copy, Debug, Default)]
+pub(crate) struct Bytes {
+    scans: u64,
+    scan: u64,
+    foreground: u64,
+    /// The foreground of scans in which nobody was.
+    empty: (u64, u64),
+}
+
+impl Bytes {
+    /// Adds a run of `frames`, compared by the method of `settings`.
+    pub(crate) fn add(&mut self, settings: Settings, frames: &[Frame]) {
+        let mut model = Model::new(settings);
+        let mut cutter = Cutter::new(Pose::default());
+        let mut out = Foreground::default();
+        for frame in frames {
+            model.update(&frame.scan, &mut out);
+            cutter.update(&frame.scan, &mut out);
+            let beams = frame.scan.beams();
+            let foreground = 12 + beams.div_ceil(8) + 2 * out.ranges().len() + 16 * out.segments().len();
+            self.scans += 1;
+            self.scan += 12 + 2 * beams as u64;
+            self.foreground += foreground as u64;
+            if out.beams == 0 {
+                self.empty = (self.empty.0 + 1, self.empty.1 + foreground as u64);
+            }
+        }
+    }
+
+    /// Bytes per second at 37.5 Hz: scans, foreground, foreground of scans in which it is empty.
+    pub(crate) fn per_second(&self) -> [f64; 3] {
+        let per_second = |bytes: u64, scans: u64| bytes as f64 / scans as f64 * 1e3 / 26.64;
+        [
+            per_second(self.scan, self.scans),
+            per_second(self.foreground, self.scans),
+            per_second(self.empty.1, self.empty.0),
+        ]
+    }
+}

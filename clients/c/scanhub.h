@@ -1,0 +1,530 @@
+/*
+ * The datagrams of `scanhub gateway` for programs in C: checks one, and tells what it says. Refuses to know sockets and
+ * what is missing between two datagrams. C99, one header, no heap; docs/datagram.md has the bytes.
+ *
+ *     struct scanhub_datagram datagram;
+ *     struct scanhub_scan scan;
+ *     if (scanhub_read(bytes, len, &datagram) == SCANHUB_OK && scanhub_read_scan(&datagram, &scan) == SCANHUB_OK)
+ *         for (unsigned i = 0; i < scan.count; i++)
+ *             use(scanhub_scan_mm(&scan, i));
+ *
+ * What is read points into the datagram and lives as long as its bytes do. They are hostile input: nothing that a function
+ * here answers with SCANHUB_OK leads outside of them, as long as an index is below the count that came with it.
+ */
+#ifndef SCANHUB_H
+#define SCANHUB_H
+
+#include <stddef.h>
+#include <stdint.h>
+#include <string.h>
+
+#ifdef __cplusplus
+extern "C" {
+#endif
+
+/* The groups are 239.255.76.80 to .83, all on this port: .80 announce and status, .81 zones, marks and foreground, .82 scan
+ * and background, .83 telegram. */
+#define SCANHUB_PORT 22200
+/* The longest datagram that a gateway ever sends. */
+#define SCANHUB_MAX 1472
+
+enum scanhub_topic {
+    SCANHUB_ANNOUNCE = 0,
+    SCANHUB_TELEGRAM = 1,
+    SCANHUB_SCAN = 2,
+    SCANHUB_MARKS = 3,
+    SCANHUB_ZONES = 4,
+    SCANHUB_FOREGROUND = 5,
+    SCANHUB_BACKGROUND = 6,
+    SCANHUB_STATUS = 7
+};
+
+/* Bits of `flags`. */
+enum scanhub_flag {
+    SCANHUB_AUTHENTICATED = 1,
+    SCANHUB_SIMULATED = 2,
+    SCANHUB_REPLAYED = 4,
+    SCANHUB_STAMP_ESTIMATED = 8,
+    SCANHUB_SUSPECT = 16
+};
+
+/* Why something is refused, in the order of the checks. */
+enum scanhub_result {
+    SCANHUB_OK = 0,
+    SCANHUB_BAD_SHORT,   /* fewer bytes than a header */
+    SCANHUB_BAD_MAGIC,   /* it does not begin with SHUB */
+    SCANHUB_BAD_VERSION, /* another version */
+    SCANHUB_BAD_HEADER,  /* the header is too short, or longer than the datagram */
+    SCANHUB_BAD_LENGTH,  /* the lengths do not add up to the datagram's */
+    SCANHUB_BAD_CRC,     /* the checksum is wrong */
+    SCANHUB_SKIPPED,     /* another topic than the one asked for */
+    SCANHUB_BAD_PAYLOAD  /* shorter than its own counts say, in contradiction to itself, or without revision */
+};
+
+/* A datagram whose header, lengths and checksum are right. Whether a MAC is, this header cannot tell. */
+struct scanhub_datagram {
+    uint8_t topic;
+    uint8_t flags;
+    uint64_t hub;       /* the gateway, a random number */
+    uint32_t epoch;     /* its life: a greater one ends the one before */
+    uint32_t sequence;  /* number among those of this sensor and topic, wrapping: a gap is what was lost */
+    uint64_t stamp_ns;  /* wall clock of the telegram's first byte, ns since 1970; of announce and status that of sending */
+    uint8_t sensor;     /* its position in the hub's configuration */
+    uint16_t revision;  /* of the payload: a greater one only appends */
+    uint32_t counter;   /* the same in all datagrams that came from one telegram */
+    const uint8_t *payload;
+    uint16_t payload_len;
+    const uint8_t *mac; /* 16 bytes, or NULL */
+};
+
+static inline uint16_t scanhub_u16(const uint8_t *at) { return (uint16_t)(at[0] | at[1] << 8); }
+static inline uint32_t scanhub_u32(const uint8_t *at) { return scanhub_u16(at) | (uint32_t)scanhub_u16(at + 2) << 16; }
+static inline uint64_t scanhub_u64(const uint8_t *at) { return scanhub_u32(at) | (uint64_t)scanhub_u32(at + 4) << 32; }
+static inline int32_t scanhub_i32(const uint8_t *at)
+{
+    uint32_t bits = scanhub_u32(at);
+    int32_t value;
+    memcpy(&value, &bits, sizeof value);
+    return value;
+}
+static inline double scanhub_f64(const uint8_t *at)
+{
+    uint64_t bits = scanhub_u64(at);
+    double value;
+    memcpy(&value, &bits, sizeof value);
+    return value;
+}
+
+/* Goes on with a CRC-32C (polynomial 1EDC6F41h, reflected) over `len` bytes; begins with FFFFFFFFh, the result is the
+ * complement. Half a byte at a time: a table of 64 bytes instead of one of 1024. */
+static inline uint32_t scanhub_crc(uint32_t crc, const uint8_t *bytes, size_t len)
+{
+    static const uint32_t nibble[16] = {
+        0x00000000u, 0x105EC76Fu, 0x20BD8EDEu, 0x30E349B1u, 0x417B1DBCu, 0x5125DAD3u, 0x61C69362u, 0x7198540Du,
+        0x82F63B78u, 0x92A8FC17u, 0xA24BB5A6u, 0xB21572C9u, 0xC38D26C4u, 0xD3D3E1ABu, 0xE330A81Au, 0xF36E6F75u};
+    while (len--) {
+        crc ^= *bytes++;
+        crc = crc >> 4 ^ nibble[crc & 15];
+        crc = crc >> 4 ^ nibble[crc & 15];
+    }
+    return crc;
+}
+
+/* Checks `len` bytes, a whole datagram as it was received. */
+static inline enum scanhub_result scanhub_read(const void *bytes, size_t len, struct scanhub_datagram *out)
+{
+    static const uint8_t no_crc[4] = {0, 0, 0, 0};
+    const uint8_t *at = (const uint8_t *)bytes;
+    size_t header, payload, mac;
+    uint32_t crc;
+    if (len < 48)
+        return SCANHUB_BAD_SHORT;
+    if (memcmp(at, "SHUB", 4) != 0)
+        return SCANHUB_BAD_MAGIC;
+    if (at[4] != 1)
+        return SCANHUB_BAD_VERSION;
+    header = at[5];
+    if (header < 48 || header > len)
+        return SCANHUB_BAD_HEADER;
+    payload = scanhub_u16(at + 36);
+    mac = at[7] & SCANHUB_AUTHENTICATED ? 16 : 0;
+    if (header + payload + mac != len)
+        return SCANHUB_BAD_LENGTH;
+    crc = scanhub_crc(0xFFFFFFFFu, at, 44);
+    crc = scanhub_crc(crc, no_crc, 4);
+    crc = scanhub_crc(crc, at + 48, len - 48);
+    if (~crc != scanhub_u32(at + 44))
+        return SCANHUB_BAD_CRC;
+    out->topic = at[6];
+    out->flags = at[7];
+    out->hub = scanhub_u64(at + 8);
+    out->epoch = scanhub_u32(at + 16);
+    out->sequence = scanhub_u32(at + 20);
+    out->stamp_ns = scanhub_u64(at + 24);
+    out->sensor = at[32];
+    out->revision = scanhub_u16(at + 38);
+    out->counter = scanhub_u32(at + 40);
+    out->payload = at + header;
+    out->payload_len = (uint16_t)payload;
+    out->mac = mac ? at + header + payload : NULL;
+    return SCANHUB_OK;
+}
+
+/* The topic is the one asked for, and the payload has a revision and at least `least` bytes. */
+static inline enum scanhub_result scanhub_expect(const struct scanhub_datagram *datagram, uint8_t topic, size_t least)
+{
+    if (datagram->topic != topic)
+        return SCANHUB_SKIPPED;
+    return datagram->revision == 0 || datagram->payload_len < least ? SCANHUB_BAD_PAYLOAD : SCANHUB_OK;
+}
+
+/* Copies text that may fill its field; `out` has a byte more than the field. */
+static inline void scanhub_text(char *out, const uint8_t *field, size_t len)
+{
+    memcpy(out, field, len);
+    out[len] = 0;
+}
+
+/* Who a sensor is and what goes out of it: once a second. */
+struct scanhub_announce {
+    uint64_t boot;       /* the hub's life */
+    char sensor[33];     /* its name: 1 to 24 of a-z, 0-9, _ and - */
+    char type[25];       /* what it calls itself, UTF-8; empty if unknown */
+    uint8_t count;       /* topics */
+    const uint8_t *topics;
+};
+struct scanhub_announced {
+    uint8_t topic;
+    uint8_t group; /* last byte of the group's address */
+    uint16_t port;
+    uint32_t next; /* number that its next datagram will have */
+};
+static inline enum scanhub_result scanhub_read_announce(const struct scanhub_datagram *datagram,
+                                                        struct scanhub_announce *out)
+{
+    const uint8_t *at = datagram->payload;
+    enum scanhub_result result = scanhub_expect(datagram, SCANHUB_ANNOUNCE, 68);
+    size_t i, len;
+    if (result != SCANHUB_OK)
+        return result;
+    if (datagram->payload_len < 68 + 8 * (size_t)at[64])
+        return SCANHUB_BAD_PAYLOAD;
+    out->boot = scanhub_u64(at);
+    scanhub_text(out->sensor, at + 8, 32);
+    scanhub_text(out->type, at + 40, 24);
+    out->count = at[64];
+    out->topics = at + 68;
+    len = strlen(out->sensor);
+    if (len < 1 || len > 24 || strcmp(out->sensor, "robot") == 0)
+        return SCANHUB_BAD_PAYLOAD;
+    for (i = 0; i < len; i++) {
+        char c = out->sensor[i];
+        if (!((c >= 'a' && c <= 'z') || (c >= '0' && c <= '9') || c == '_' || c == '-'))
+            return SCANHUB_BAD_PAYLOAD;
+    }
+    return SCANHUB_OK;
+}
+/* One of them, i below `count`. */
+static inline struct scanhub_announced scanhub_announced(const struct scanhub_announce *announce, unsigned i)
+{
+    const uint8_t *at = announce->topics + 8 * (size_t)i;
+    struct scanhub_announced out;
+    out.topic = at[0];
+    out.group = at[1];
+    out.port = scanhub_u16(at + 2);
+    out.next = scanhub_u32(at + 4);
+    return out;
+}
+
+/* A telegram of the sensor, STX to CRC, as it came. */
+struct scanhub_telegram {
+    const uint8_t *bytes;
+    uint16_t len;
+};
+static inline enum scanhub_result scanhub_read_telegram(const struct scanhub_datagram *datagram,
+                                                        struct scanhub_telegram *out)
+{
+    const uint8_t *at = datagram->payload;
+    enum scanhub_result result = scanhub_expect(datagram, SCANHUB_TELEGRAM, 4);
+    size_t len;
+    if (result != SCANHUB_OK)
+        return result;
+    len = scanhub_u16(at + 2) + (size_t)6;
+    if (at[0] != 0x02 || len > 814 || len > datagram->payload_len)
+        return SCANHUB_BAD_PAYLOAD;
+    out->bytes = at;
+    out->len = (uint16_t)len;
+    return SCANHUB_OK;
+}
+
+/* A scan: at most 401 beams, counter-clockwise seen from above, 0 right, 90 degrees ahead. */
+struct scanhub_scan {
+    uint16_t count;
+    uint8_t unit_mm;          /* millimetres per device unit: 1 or 10 */
+    uint8_t range_bits;       /* 13, 14 or 15 */
+    int32_t first_angle_mdeg; /* 1/1000 degree */
+    uint16_t step_mdeg;
+    uint8_t intensity_bits;   /* 0: the upper bits are field bits */
+    const uint8_t *ranges;    /* count x u16, see below */
+    const uint8_t *upper;     /* count bytes, or NULL: the bits above the range are all 0 */
+};
+static inline enum scanhub_result scanhub_read_scan(const struct scanhub_datagram *datagram, struct scanhub_scan *out)
+{
+    const uint8_t *at = datagram->payload;
+    enum scanhub_result result = scanhub_expect(datagram, SCANHUB_SCAN, 12);
+    size_t count;
+    if (result != SCANHUB_OK)
+        return result;
+    count = scanhub_u16(at);
+    if (count > 401 || datagram->payload_len < 12 + (at[11] & 1 ? 3 : 2) * count || at[3] > 16)
+        return SCANHUB_BAD_PAYLOAD;
+    out->count = (uint16_t)count;
+    out->unit_mm = at[2];
+    out->range_bits = at[3];
+    out->first_angle_mdeg = scanhub_i32(at + 4);
+    out->step_mdeg = scanhub_u16(at + 8);
+    out->intensity_bits = at[10];
+    out->ranges = at + 12;
+    out->upper = at[11] & 1 ? at + 12 + 2 * count : NULL;
+    return SCANHUB_OK;
+}
+/* The range of beam i in device units as it was sent, i below `count`: the nine greatest values are codes. */
+static inline uint16_t scanhub_scan_range(const struct scanhub_scan *scan, unsigned i)
+{
+    return scanhub_u16(scan->ranges + 2 * (size_t)i);
+}
+/* The range of beam i in mm, or -1 if it has no valid reading. */
+static inline int32_t scanhub_scan_mm(const struct scanhub_scan *scan, unsigned i)
+{
+    int32_t greatest = (int32_t)((1ul << scan->range_bits) - 1), range = scanhub_scan_range(scan, i);
+    return range > greatest - 9 ? -1 : range * scan->unit_mm;
+}
+
+/* Reflector marks of a scan: at most 64. */
+struct scanhub_marks {
+    uint8_t count;
+    uint8_t overflow;    /* 1: there were more */
+    uint8_t unavailable; /* 1: the sensor's mode has no reflector bits, nothing is known of marks */
+    const uint8_t *marks;
+};
+struct scanhub_mark {
+    int32_t angle_mdeg;
+    uint32_t range_dmm; /* 1/10 mm */
+    uint16_t weight;    /* sum of the intensities */
+    uint8_t peak;       /* the greatest of them */
+    uint8_t edge;       /* 1: a part of it may lie outside of the scan */
+    uint16_t first_beam, last_beam;
+};
+static inline enum scanhub_result scanhub_read_marks(const struct scanhub_datagram *datagram,
+                                                     struct scanhub_marks *out)
+{
+    const uint8_t *at = datagram->payload;
+    enum scanhub_result result = scanhub_expect(datagram, SCANHUB_MARKS, 4);
+    if (result != SCANHUB_OK)
+        return result;
+    if (at[0] > 64 || datagram->payload_len < 4 + 16 * (size_t)at[0])
+        return SCANHUB_BAD_PAYLOAD;
+    out->count = at[0];
+    out->overflow = at[1] & 1;
+    out->unavailable = at[1] >> 1 & 1;
+    out->marks = at + 4;
+    return SCANHUB_OK;
+}
+/* One of them, i below `count`. */
+static inline struct scanhub_mark scanhub_mark(const struct scanhub_marks *marks, unsigned i)
+{
+    const uint8_t *at = marks->marks + 16 * (size_t)i;
+    struct scanhub_mark out;
+    out.angle_mdeg = scanhub_i32(at);
+    out.range_dmm = scanhub_u32(at + 4);
+    out.weight = scanhub_u16(at + 8);
+    out.peak = at[10];
+    out.edge = at[11];
+    out.first_beam = scanhub_u16(at + 12);
+    out.last_beam = scanhub_u16(at + 14);
+    return out;
+}
+
+/* What is near the robot: at most 8 circles around its centre, the largest first. */
+enum scanhub_verdict { SCANHUB_CLEAR = 0, SCANHUB_SLOW = 1, SCANHUB_STOP = 2, SCANHUB_UNKNOWN = 3 };
+struct scanhub_zones {
+    uint8_t verdict;       /* what is greater than SCANHUB_UNKNOWN is unknown, too */
+    uint8_t count;
+    uint16_t nearest_beam; /* FFFFh: no beam has a valid reading */
+    uint32_t nearest_mm;   /* from the robot's centre */
+    uint16_t invalid_beams;
+    uint8_t provisional;   /* 1: too few scans were seen for a violation */
+    const uint8_t *zones;
+};
+struct scanhub_zone {
+    uint16_t radius_mm;
+    uint16_t beams;   /* that met something inside, in this scan */
+    uint8_t violated;
+};
+static inline enum scanhub_result scanhub_read_zones(const struct scanhub_datagram *datagram,
+                                                     struct scanhub_zones *out)
+{
+    const uint8_t *at = datagram->payload;
+    enum scanhub_result result = scanhub_expect(datagram, SCANHUB_ZONES, 12);
+    if (result != SCANHUB_OK)
+        return result;
+    if (at[1] > 8 || datagram->payload_len < 12 + 8 * (size_t)at[1])
+        return SCANHUB_BAD_PAYLOAD;
+    out->verdict = at[0];
+    out->count = at[1];
+    out->nearest_beam = scanhub_u16(at + 2);
+    out->nearest_mm = scanhub_u32(at + 4);
+    out->invalid_beams = scanhub_u16(at + 8);
+    out->provisional = at[10] & 1;
+    out->zones = at + 12;
+    return SCANHUB_OK;
+}
+/* One of them, i below `count`. */
+static inline struct scanhub_zone scanhub_zone(const struct scanhub_zones *zones, unsigned i)
+{
+    const uint8_t *at = zones->zones + 8 * (size_t)i;
+    struct scanhub_zone out;
+    out.radius_mm = scanhub_u16(at);
+    out.beams = scanhub_u16(at + 2);
+    out.violated = at[4];
+    return out;
+}
+
+/* What stands before the background, in one scan. */
+struct scanhub_foreground {
+    uint32_t generation;     /* of the background model */
+    uint16_t count;          /* beams of the scan, at most 401 */
+    uint16_t beams;          /* beams in the foreground */
+    uint8_t unit_mm;
+    uint8_t left_out;        /* segments for which there was no room; 255: or more */
+    uint16_t segment_count;
+    const uint8_t *bits;     /* beam i is bit i % 8 of byte i / 8 */
+    const uint8_t *ranges;   /* of the foreground beams, in their order, beams x u16 */
+    const uint8_t *segments;
+};
+struct scanhub_segment {
+    uint16_t first, last;    /* beams */
+    uint16_t nearest, width; /* device units */
+    int32_t x_mm, y_mm;      /* its middle, ahead and to the left of the robot's centre */
+};
+/* Beam i of the scan is in the foreground, i below `count`. */
+static inline int scanhub_is_foreground(const struct scanhub_foreground *foreground, unsigned i)
+{
+    return foreground->bits[i / 8] >> (i % 8) & 1;
+}
+/* The range of foreground beam n in device units, n below `beams`. */
+static inline uint16_t scanhub_foreground_range(const struct scanhub_foreground *foreground, unsigned n)
+{
+    return scanhub_u16(foreground->ranges + 2 * (size_t)n);
+}
+/* One segment, i below `segment_count`. */
+static inline struct scanhub_segment scanhub_segment(const struct scanhub_foreground *foreground, unsigned i)
+{
+    const uint8_t *at = foreground->segments + 16 * (size_t)i;
+    struct scanhub_segment out;
+    out.first = scanhub_u16(at);
+    out.last = scanhub_u16(at + 2);
+    out.nearest = scanhub_u16(at + 4);
+    out.width = scanhub_u16(at + 6);
+    out.x_mm = scanhub_i32(at + 8);
+    out.y_mm = scanhub_i32(at + 12);
+    return out;
+}
+static inline enum scanhub_result scanhub_read_foreground(const struct scanhub_datagram *datagram,
+                                                          struct scanhub_foreground *out)
+{
+    const uint8_t *at = datagram->payload;
+    enum scanhub_result result = scanhub_expect(datagram, SCANHUB_FOREGROUND, 12);
+    size_t count, beams, segments, set;
+    unsigned i, members = 0;
+    if (result != SCANHUB_OK)
+        return result;
+    count = scanhub_u16(at + 4);
+    beams = scanhub_u16(at + 6);
+    segments = scanhub_u16(at + 10);
+    set = (count + 7) / 8;
+    if (count > 401 || beams > count || segments > 64 || datagram->payload_len < 12 + set + 2 * beams + 16 * segments)
+        return SCANHUB_BAD_PAYLOAD;
+    out->generation = scanhub_u32(at);
+    out->count = (uint16_t)count;
+    out->beams = (uint16_t)beams;
+    out->unit_mm = at[8];
+    out->left_out = at[9];
+    out->segment_count = (uint16_t)segments;
+    out->bits = at + 12;
+    out->ranges = at + 12 + set;
+    out->segments = at + 12 + set + 2 * beams;
+    /* As many beams as ranges, and none beyond the scan. */
+    for (i = 0; i < 8 * set; i++) {
+        if (scanhub_is_foreground(out, i)) {
+            members++;
+            if (i >= count)
+                return SCANHUB_BAD_PAYLOAD;
+        }
+    }
+    for (i = 0; i < segments; i++) {
+        struct scanhub_segment segment = scanhub_segment(out, i);
+        if (segment.first > segment.last || segment.last >= count)
+            return SCANHUB_BAD_PAYLOAD;
+    }
+    return members == beams ? SCANHUB_OK : SCANHUB_BAD_PAYLOAD;
+}
+
+/* The background model: where each beam ends when nobody is there. */
+struct scanhub_background {
+    uint32_t generation;
+    uint16_t taught;       /* beams whose background is known */
+    uint16_t count;        /* at most 401 */
+    uint8_t unit_mm;
+    uint8_t frozen;        /* 1: nothing is learned */
+    const uint8_t *ranges; /* count x u16 */
+};
+static inline enum scanhub_result scanhub_read_background(const struct scanhub_datagram *datagram,
+                                                          struct scanhub_background *out)
+{
+    const uint8_t *at = datagram->payload;
+    enum scanhub_result result = scanhub_expect(datagram, SCANHUB_BACKGROUND, 12);
+    if (result != SCANHUB_OK)
+        return result;
+    out->generation = scanhub_u32(at);
+    out->taught = scanhub_u16(at + 4);
+    out->count = scanhub_u16(at + 6);
+    out->unit_mm = at[8];
+    out->frozen = at[9] & 1;
+    out->ranges = at + 12;
+    return out->count > 401 || datagram->payload_len < 12 + 2 * (size_t)out->count ? SCANHUB_BAD_PAYLOAD : SCANHUB_OK;
+}
+/* The range of beam i in device units, i below `count`: 0 not learned, FFFFh beyond what the sensor measures. */
+static inline uint16_t scanhub_background_range(const struct scanhub_background *background, unsigned i)
+{
+    return scanhub_u16(background->ranges + 2 * (size_t)i);
+}
+
+/* How a link and its sensor are: each second and on every change. */
+struct scanhub_status {
+    uint8_t state;            /* 0 absent, 1 probing, 2 switching, 3 starting, 4 streaming, 5 silent, 6 paused */
+    uint8_t mode;             /* measuring mode; FFh unknown */
+    uint8_t unit_mm;          /* 0 unknown */
+    uint32_t baud;            /* 0 unknown */
+    uint64_t since_ns;        /* CLOCK_MONOTONIC of the hub's machine when the state began */
+    uint32_t rate_mhz;        /* scans per second in 1/1000 */
+    uint16_t angle_deg;       /* 0 unknown */
+    uint16_t resolution_cdeg; /* 1/100 degree; 0 unknown */
+    char type[25], port[129], last_error[161]; /* UTF-8 */
+    uint64_t counters[28];    /* in the order of docs/topics.md */
+    double x_m, y_m;          /* where the sensor sits: ahead and to the left of the robot's centre */
+    double yaw_rad;           /* where it looks, counter-clockwise from ahead */
+    uint8_t upside_down;
+};
+static inline enum scanhub_result scanhub_read_status(const struct scanhub_datagram *datagram,
+                                                      struct scanhub_status *out)
+{
+    const uint8_t *at = datagram->payload;
+    enum scanhub_result result = scanhub_expect(datagram, SCANHUB_STATUS, 592);
+    unsigned i;
+    if (result != SCANHUB_OK)
+        return result;
+    out->state = at[0];
+    out->mode = at[1];
+    out->unit_mm = at[2];
+    out->baud = scanhub_u32(at + 4);
+    out->since_ns = scanhub_u64(at + 8);
+    out->rate_mhz = scanhub_u32(at + 16);
+    out->angle_deg = scanhub_u16(at + 20);
+    out->resolution_cdeg = scanhub_u16(at + 22);
+    scanhub_text(out->type, at + 24, 24);
+    scanhub_text(out->port, at + 48, 128);
+    scanhub_text(out->last_error, at + 176, 160);
+    for (i = 0; i < 28; i++)
+        out->counters[i] = scanhub_u64(at + 336 + 8 * (size_t)i);
+    out->x_m = scanhub_f64(at + 560);
+    out->y_m = scanhub_f64(at + 568);
+    out->yaw_rad = scanhub_f64(at + 576);
+    out->upside_down = at[584];
+    return SCANHUB_OK;
+}
+
+#ifdef __cplusplus
+}
+#endif
+#endif

@@ -1,0 +1,255 @@
+//! `scanhub listen`: what gateways send over the network, checked, with an account of what did not come. Refuses to know
+//! who sends it, and to answer.
+
+mod ear;
+mod names;
+mod remote;
+mod report;
+mod roll;
+
+use std::io::Write;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::{Duration, Instant};
+
+use schema::datagram::{Account, Announce, Datagram, Fresh, group};
+use schema::{Failure, Kind, Topic};
+
+use self::ear::{Ear, LONGEST};
+use self::names::Names;
+use self::remote::Remote;
+use self::report::Report;
+use self::roll::Roll;
+use crate::clock;
+use crate::follow::Bounds;
+use crate::output::{End, Output, quiet};
+
+/// What `listen` is asked for.
+#[derive(Clone, Debug)]
+pub struct ListenOptions {
+    /// The network interface to hear on; none: all that have a link.
+    pub interface: Option<String>,
+    /// Names of topics, without sensors; none: all.
+    pub topics: Vec<String>,
+    /// `NAME=HUB`: what to call a gateway, instead of its 16 hex digits.
+    pub names: Vec<String>,
+    /// Only the account, no samples.
+    pub stats: bool,
+    /// Objects instead of text.
+    pub json: bool,
+    /// `out` is a terminal: the account is shown each second.
+    pub terminal: bool,
+    /// When it ends by itself.
+    pub bounds: Bounds,
+}
+
+/// Writes the samples that come to `out`, and at the end the account; what is no sample goes to `notes` (stderr) if `out`
+/// is not JSON. Ends when the bounds are reached, `stop` is set, or nobody reads any more.
+///
+/// [`Kind::NoTopic`] with what there is, [`Kind::Configuration`] if there is no such interface or a name is not possible,
+/// [`Kind::Failed`] if the port cannot be had, [`Kind::Timeout`], [`Kind::Interrupted`] if bounded and `stop` came first.
+pub fn listen(
+    options: &ListenOptions,
+    out: &mut dyn Write,
+    notes: &mut dyn Write,
+    stop: &AtomicBool,
+) -> Result<(), Failure> {
+    let wanted = topics(&options.topics)?;
+    let names = Names::parse(&options.names)?;
+    let groups = groups(&wanted);
+    let now = Instant::now();
+    let ear = Ear::open(options.interface.as_deref(), &groups, now)?;
+    // Of topics whose group is not joined announcements would tell as lost what nobody wanted.
+    let heard: Vec<_> = Topic::ALL.into_iter().filter(|&topic| groups.contains(&group(topic))).collect();
+    let mut listener = Listener {
+        options,
+        wanted,
+        ear,
+        account: Box::new(Account::new(&heard)),
+        roll: Roll::default(),
+        report: Report::new(options.json, Output::new(out), Output::new(notes), names),
+        started: now,
+        last_sample: now,
+        draw_at: now,
+        received: 0,
+    };
+    quiet(listener.listen(stop))
+}
+
+struct Listener<'a> {
+    options: &'a ListenOptions,
+    wanted: Vec<Topic>,
+    ear: Ear,
+    account: Box<Account>,
+    roll: Roll,
+    report: Report<'a>,
+    started: Instant,
+    last_sample: Instant,
+    draw_at: Instant,
+    received: u64,
+}
+
+/// Datagrams that are taken before anything else has its turn, so that no flood keeps it from ending.
+const TURN: usize = 64;
+
+/// The longest sleep: so often interfaces and reasons to stop are looked at.
+const LONGEST_WAIT: Duration = Duration::from_millis(100);
+
+/// Between two accounts on a terminal.
+const DRAW_EVERY: Duration = Duration::from_secs(1);
+
+impl Listener<'_> {
+    fn listen(&mut self, stop: &AtomicBool) -> Result<(), End> {
+        self.report.ready(&self.ear.interfaces())?;
+        let end = self.run(stop);
+        if !matches!(end, Err(End::ReaderGone)) {
+            self.report.account(&self.account, &self.roll)?;
+        }
+        end
+    }
+
+    fn run(&mut self, stop: &AtomicBool) -> Result<(), End> {
+        let mut buffer = vec![0; LONGEST];
+        loop {
+            let more = self.take(&mut buffer)?;
+            let (now, bounds) = (Instant::now(), &self.options.bounds);
+            if bounds.count.is_some_and(|count| self.received >= count) {
+                return Ok(());
+            }
+            if stop.load(Ordering::Relaxed) {
+                return self.stopped();
+            }
+            if bounds.run_for.is_some_and(|limit| now - self.started >= limit) {
+                return self.time_is_over();
+            }
+            if let Some(limit) = bounds.timeout.filter(|&limit| now - self.last_sample >= limit) {
+                return Err(nothing_came(limit).into());
+            }
+            self.look(now)?;
+            if !more {
+                self.ear.wait(self.left(now));
+            }
+        }
+    }
+
+    /// Takes what waits, up to a turn; whether there may be more.
+    fn take(&mut self, buffer: &mut [u8]) -> Result<bool, End> {
+        for _ in 0..TURN {
+            let Some(bytes) = self.ear.receive(buffer)? else { return Ok(false) };
+            if let Ok((datagram, fresh)) = self.account.receive(bytes)
+                && fresh != Fresh::Duplicate
+            {
+                self.heard(datagram, fresh == Fresh::Late)?;
+            }
+            if self.options.bounds.count.is_some_and(|count| self.received >= count) {
+                return Ok(true);
+            }
+        }
+        Ok(true)
+    }
+
+    /// A datagram that was not there before.
+    fn heard(&mut self, datagram: Datagram<'_>, late: bool) -> Result<(), End> {
+        let (now, wall_ns) = (clock::now(), clock::wall_ns());
+        let head = datagram.head;
+        let Some(topic) = Topic::of_number(head.topic) else {
+            return self.announced(&datagram, wall_ns);
+        };
+        let life = self.roll.life(&head);
+        let age_ns = life.age_ns(head.stamp_ns, wall_ns);
+        let sensor = life.sensor(head.sensor);
+        let missed = if late { 0 } else { sensor.advance(head.topic, head.sequence) };
+        let boot = sensor.announced.map_or(0, |announced| announced.boot);
+        if !self.wanted.contains(&topic) {
+            return Ok(());
+        }
+        self.received += 1;
+        self.last_sample = Instant::now();
+        if self.options.stats {
+            return Ok(());
+        }
+        let sensor = &self.roll.name(head.hub, head.epoch, head.sensor);
+        if missed > 0 {
+            self.report.missed(&head, sensor, topic, missed)?;
+        }
+        let arrival_ns = now.monotonic_ns;
+        self.report.sample(&Remote { topic, sensor, datagram, boot, arrival_ns, age_ns, late })
+    }
+
+    fn announced(&mut self, datagram: &Datagram<'_>, wall_ns: u64) -> Result<(), End> {
+        let head = datagram.head;
+        let Some(announce) = Announce::unpack(datagram.payload) else { return Ok(()) };
+        match self.roll.life(&head).announce(head.sensor, &announce, head.stamp_ns, wall_ns) {
+            Some(behind_ns) => self.report.clocks_differ(&head, behind_ns),
+            None => Ok(()),
+        }
+    }
+
+    /// What is due now and then.
+    fn look(&mut self, now: Instant) -> Result<(), End> {
+        self.ear.look(now)?;
+        if let Some(what) = self.ear.news_of_trouble() {
+            self.report.trouble(what)?;
+        }
+        if self.options.stats && self.options.terminal && !self.options.json && now >= self.draw_at {
+            self.draw_at = now + DRAW_EVERY;
+            self.report.draw(&self.account, &self.roll)?;
+        }
+        Ok(())
+    }
+
+    fn left(&self, now: Instant) -> Duration {
+        let bounds = &self.options.bounds;
+        let end = bounds.run_for.and_then(|limit| self.started.checked_add(limit));
+        let silence = bounds.timeout.and_then(|limit| self.last_sample.checked_add(limit));
+        let first = [end, silence].into_iter().flatten().min();
+        first.map_or(LONGEST_WAIT, |at| at.saturating_duration_since(now).min(LONGEST_WAIT))
+    }
+
+    fn stopped(&self) -> Result<(), End> {
+        if self.options.bounds.bounded() {
+            return Err(Failure::new(Kind::Interrupted, "interrupted before it was through", "").into());
+        }
+        Ok(())
+    }
+
+    fn time_is_over(&self) -> Result<(), End> {
+        match self.options.bounds.count {
+            Some(count) => {
+                let what = format!("{} of {count} samples came in time", self.received);
+                Err(Failure::new(Kind::Timeout, what, NOTHING_CAME).into())
+            }
+            None => Ok(()),
+        }
+    }
+}
+
+fn nothing_came(limit: Duration) -> Failure {
+    Failure::new(Kind::Timeout, format!("nothing came for {limit:?}"), NOTHING_CAME)
+}
+
+const NOTHING_CAME: &str = "is `scanhub gateway` running in the same network? `scanhub listen --stats` counts what is \
+                            refused, --interface names another interface";
+
+/// The topics called so; all if none is.
+fn topics(names: &[String]) -> Result<Vec<Topic>, Failure> {
+    if names.is_empty() {
+        return Ok(Topic::ALL.to_vec());
+    }
+    let known: Vec<_> = Topic::ALL.iter().map(|topic| topic.name()).collect();
+    let parse = |name: &String| {
+        Topic::parse(name).ok_or_else(|| {
+            let hint = format!("there are {}; they are those of all sensors", known.join(", "));
+            Failure::new(Kind::NoTopic, format!("no topic {name:?}"), hint)
+        })
+    };
+    names.iter().map(parse).collect()
+}
+
+/// The groups of `topics`, and that of announcements, without which nobody has a name.
+fn groups(topics: &[Topic]) -> Vec<u8> {
+    let mut groups = vec![Announce::GROUP];
+    groups.extend(topics.iter().map(|&topic| group(topic)));
+    groups.sort_unstable();
+    groups.dedup();
+    groups
+}

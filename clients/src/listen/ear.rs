@@ -1,0 +1,165 @@
+//! The socket that hears the groups, on every interface that has a link, also on one that comes later or comes back.
+//! It sends nothing. Refuses to know what a datagram says.
+
+use std::io::{self, ErrorKind};
+use std::net::{Ipv4Addr, SocketAddrV4, UdpSocket};
+use std::time::{Duration, Instant};
+
+use rustix::event::{PollFd, PollFlags, Timespec, poll};
+use schema::datagram::{GROUPS, PORT};
+use schema::{Failure, Kind};
+use socket2::{Domain, InterfaceIndexOrAddress, Protocol, Socket, Type};
+
+use crate::interface::{Interface, interfaces, named};
+
+/// Hears groups.
+pub(super) struct Ear {
+    socket: UdpSocket,
+    groups: Vec<Ipv4Addr>,
+    /// The one interface to hear on; none: all that can.
+    only: Option<String>,
+    joined: Vec<Joined>,
+    look_at: Instant,
+    /// Why the groups could not be joined somewhere, and whether that was asked for.
+    trouble: Option<(String, bool)>,
+}
+
+/// An interface on which the groups were joined.
+struct Joined {
+    name: String,
+    index: u32,
+    /// It had a link when it was last looked at.
+    running: bool,
+}
+
+/// Between two looks at the interfaces.
+const LOOK_EVERY: Duration = Duration::from_millis(500);
+
+/// Room for what waits while this process does not run; the system gives less where its own limit is lower.
+const BUFFER: usize = 4 << 20;
+
+/// The longest datagram that there can be.
+pub(super) const LONGEST: usize = 65_536;
+
+impl Ear {
+    /// Binds the port and joins the `groups` (last bytes) on the interface `only`, or wherever there is a link. If there
+    /// is none yet, it is waited for.
+    ///
+    /// [`Kind::Configuration`] if there is no such interface, [`Kind::Failed`] if the port cannot be had.
+    pub(super) fn open(only: Option<&str>, groups: &[u8], now: Instant) -> Result<Ear, Failure> {
+        if let Some(name) = only {
+            let interface = named(name)?;
+            if !interface.multicast {
+                let hint = "choose another --interface, or have the gateway send copies: `gateway --to`";
+                return Err(Failure::new(Kind::Configuration, format!("{name} carries no multicast"), hint));
+            }
+        }
+        let socket = bind().map_err(|error| {
+            let hint = "it is in use by a program that does not share it: `ss -lunp` names it";
+            Failure::new(Kind::Failed, format!("cannot hear on UDP port {PORT}: {error}"), hint)
+        })?;
+        let [a, b, c] = GROUPS;
+        let mut ear = Ear {
+            socket,
+            groups: groups.iter().map(|&last| Ipv4Addr::new(a, b, c, last)).collect(),
+            only: only.map(str::to_owned),
+            joined: Vec::new(),
+            look_at: now,
+            trouble: None,
+        };
+        ear.look(now)?;
+        Ok(ear)
+    }
+
+    /// Joins the groups where a link came or came back, if the last look is long enough ago. A switch that filters by
+    /// group has forgotten us when a cable was pulled, and an interface that was made anew never knew us.
+    ///
+    /// [`Kind::Failed`] if the system does not tell its interfaces.
+    pub(super) fn look(&mut self, now: Instant) -> Result<(), Failure> {
+        if now < self.look_at {
+            return Ok(());
+        }
+        self.look_at = now + LOOK_EVERY;
+        let all = interfaces()?;
+        self.joined.retain(|joined| all.iter().any(|interface| interface.index == joined.index));
+        for interface in &all {
+            if !self.wants(interface) {
+                continue;
+            }
+            match self.joined.iter_mut().find(|joined| joined.index == interface.index) {
+                Some(joined) if joined.running || !interface.running => joined.running = interface.running,
+                _ if interface.running => self.join(interface),
+                _ => {}
+            }
+        }
+        Ok(())
+    }
+
+    /// The names of the interfaces on which it hears.
+    pub(super) fn interfaces(&self) -> Vec<&str> {
+        self.joined.iter().map(|joined| joined.name.as_str()).collect()
+    }
+
+    /// Why the groups could not be joined somewhere, if that is not what was answered before.
+    pub(super) fn news_of_trouble(&mut self) -> Option<&str> {
+        let (what, told) = self.trouble.as_mut()?;
+        (!std::mem::replace(told, true)).then_some(what)
+    }
+
+    /// The next datagram that waits, whole, or nothing; `buffer` has [`LONGEST`] bytes.
+    ///
+    /// [`Kind::Failed`] if the socket is of no use any more.
+    pub(super) fn receive<'a>(&self, buffer: &'a mut [u8]) -> Result<Option<&'a [u8]>, Failure> {
+        match self.socket.recv(buffer) {
+            Ok(len) => Ok(Some(&buffer[..len])),
+            Err(error) if matches!(error.kind(), ErrorKind::WouldBlock | ErrorKind::Interrupted) => Ok(None),
+            Err(error) => Err(Failure::new(Kind::Failed, format!("cannot receive: {error}"), "")),
+        }
+    }
+
+    /// Sleeps until a datagram waits, a signal comes or `left` is over.
+    pub(super) fn wait(&self, left: Duration) {
+        let left = Timespec { tv_sec: left.as_secs() as i64, tv_nsec: i64::from(left.subsec_nanos()) };
+        // What would go wrong here, receiving tells.
+        let _ = poll(&mut [PollFd::new(&self.socket, PollFlags::IN)], Some(&left));
+    }
+
+    fn wants(&self, interface: &Interface) -> bool {
+        match &self.only {
+            Some(name) => interface.name == *name,
+            // Those of containers and bridges have none, and there are more of them than a socket can join.
+            None => interface.multicast && interface.address.is_some(),
+        }
+    }
+
+    fn join(&mut self, interface: &Interface) {
+        let index = InterfaceIndexOrAddress::Index(interface.index);
+        let socket = socket2::SockRef::from(&self.socket);
+        for group in &self.groups {
+            // Leaving first: joining again what was joined before tells the network nothing.
+            let _ = socket.leave_multicast_v4_n(group, &index);
+            if let Err(error) = socket.join_multicast_v4_n(group, &index) {
+                let what = format!("cannot join {group} on {}: {error}", interface.name);
+                if self.trouble.as_ref().is_none_or(|(said, _)| *said != what) {
+                    self.trouble = Some((what, false));
+                }
+                return;
+            }
+        }
+        self.joined.retain(|joined| joined.index != interface.index);
+        self.joined.push(Joined { name: interface.name.clone(), index: interface.index, running: true });
+    }
+}
+
+/// Not bound to a group: copies that are sent to this machine alone are heard as well. What other programs have joined is
+/// not.
+fn bind() -> io::Result<UdpSocket> {
+    let socket = Socket::new(Domain::IPV4, Type::DGRAM, Some(Protocol::UDP))?;
+    socket.set_reuse_address(true)?;
+    socket.set_multicast_all_v4(false)?;
+    // Less is no reason to fail: what does not fit is lost, and counted.
+    let _ = socket.set_recv_buffer_size(BUFFER);
+    socket.set_nonblocking(true)?;
+    socket.bind(&SocketAddrV4::new(Ipv4Addr::UNSPECIFIED, PORT).into())?;
+    Ok(socket.into())
+}

@@ -1,0 +1,242 @@
+//! What `listen` says beside samples: that it hears, what went wrong, and the account of everything that came and did
+//! not.
+
+use std::io::Write;
+
+use schema::Topic;
+use schema::datagram::{Account, Announce, Head, Refusal, Row};
+use serde::Serialize;
+use serde::ser::{SerializeMap, Serializer};
+
+use super::names::Names;
+use super::remote::{Remote, id};
+use super::roll::Roll;
+use crate::output::{End, Output, table};
+
+/// Where it is said, and how.
+pub(super) struct Report<'a> {
+    pub(super) json: bool,
+    pub(super) out: Output<'a>,
+    pub(super) notes: Output<'a>,
+    /// What gateways are called for people.
+    pub(super) names: Names,
+    /// Lines of the account that stand on the terminal.
+    drawn: usize,
+}
+
+impl<'a> Report<'a> {
+    pub(super) fn new(json: bool, out: Output<'a>, notes: Output<'a>, names: Names) -> Report<'a> {
+        Report { json, out, notes, names, drawn: 0 }
+    }
+
+    /// The groups are joined on `interfaces`.
+    pub(super) fn ready(&mut self, interfaces: &[&str]) -> Result<(), End> {
+        #[derive(Serialize)]
+        struct Line<'a> {
+            class: &'static str,
+            port: u16,
+            interfaces: &'a [&'a str],
+        }
+        if self.json {
+            return self.out.json(&Line { class: "ready", port: schema::datagram::PORT, interfaces });
+        }
+        self.notes.line(|line| match interfaces {
+            [] => write!(line, "no network interface has a link, waiting for one"),
+            some => write!(line, "listening on {}", some.join(", ")),
+        })
+    }
+
+    /// A sample.
+    pub(super) fn sample(&mut self, remote: &Remote<'_>) -> Result<(), End> {
+        if self.json {
+            return remote.json(&mut self.out);
+        }
+        let hub = self.names.of(remote.datagram.head.hub);
+        self.out.line(|line| remote.text(&hub, line))
+    }
+
+    /// Samples of `topic` of `sensor` were sent before the one with `head` and did not come, or not yet.
+    pub(super) fn missed(&mut self, head: &Head, sensor: &str, topic: Topic, missed: u32) -> Result<(), End> {
+        if self.json {
+            let (sensor, topic) = (Some(sensor), Some(topic.name()));
+            return self.notice(Notice { sensor, topic, missed, ..Notice::of("missed", head) });
+        }
+        let hub = self.names.of(head.hub);
+        self.notes.line(|line| write!(line, "{hub}.{sensor}/{}: missed {missed}", topic.name()))
+    }
+
+    /// The clock of the machine that sent `head` is so much behind this one's.
+    pub(super) fn clocks_differ(&mut self, head: &Head, behind_ns: i64) -> Result<(), End> {
+        let behind_ms = behind_ns as f64 / 1e6;
+        if self.json {
+            let behind_ms = Some(behind_ms);
+            return self.notice(Notice { behind_ms, ..Notice::of("clocks_differ", head) });
+        }
+        let hub = self.names.of(head.hub);
+        let (ms, which) = (behind_ms.abs(), if behind_ms < 0.0 { "ahead of" } else { "behind" });
+        self.notes.line(|line| {
+            write!(line, "{hub}: its clock is {ms:.0} ms {which} this machine's, so that ages are not told")
+        })
+    }
+
+    /// Something is wrong here.
+    pub(super) fn trouble(&mut self, what: &str) -> Result<(), End> {
+        if self.json {
+            let notice = Notice::of("trouble", &Head::default());
+            return self.notice(Notice { hub: None, epoch: None, message: Some(what), ..notice });
+        }
+        self.notes.line(|line| write!(line, "{what}"))
+    }
+
+    /// The account as it stands, over the one that stands on the terminal.
+    pub(super) fn draw(&mut self, account: &Account, roll: &Roll) -> Result<(), End> {
+        if self.drawn > 0 {
+            self.out.raw(format!("\x1b[{}A\x1b[J", self.drawn).as_bytes())?;
+        }
+        self.drawn = account.rows().count() + 2;
+        self.text_account(account, roll)
+    }
+
+    /// The account, for the last time.
+    pub(super) fn account(&mut self, account: &Account, roll: &Roll) -> Result<(), End> {
+        if !self.json {
+            return if self.drawn > 0 { self.draw(account, roll) } else { self.text_account(account, roll) };
+        }
+        for row in account.rows() {
+            let sensor = roll.name(row.hub, row.epoch, row.sensor);
+            self.out.json(&Lan::new(row, &sensor))?;
+        }
+        self.out.json(&Refused { class: "lan_refused", reasons: account })
+    }
+
+    fn text_account(&mut self, account: &Account, roll: &Roll) -> Result<(), End> {
+        let titles = ["HUB", "EPOCH", "TOPIC", "RECEIVED", "LOST", "DUPLICATE", "REORDERED"];
+        let mut rows = vec![titles.map(String::from).to_vec()];
+        rows.extend(account.rows().map(|row| {
+            vec![
+                self.names.of(row.hub),
+                row.epoch.to_string(),
+                format!("{}/{}", roll.name(row.hub, row.epoch, row.sensor), topic(row)),
+                row.received.to_string(),
+                row.lost().to_string(),
+                row.duplicate.to_string(),
+                row.reordered.to_string(),
+            ]
+        }));
+        table(&mut self.out, &rows)?;
+        self.out.line(|line| {
+            write!(line, "refused:")?;
+            for (reason, count) in refused(account).filter(|(_, count)| *count > 0) {
+                write!(line, " {} {count}", reason.name())?;
+            }
+            let any = refused(account).any(|(_, count)| count > 0);
+            if any { Ok(()) } else { write!(line, " none") }
+        })
+    }
+
+    fn notice(&mut self, notice: Notice<'_>) -> Result<(), End> {
+        self.out.json(&notice)
+    }
+}
+
+/// Class `notice`.
+#[derive(Serialize)]
+struct Notice<'a> {
+    class: &'static str,
+    kind: &'static str,
+    sensor: Option<&'a str>,
+    topic: Option<&'static str>,
+    missed: u32,
+    #[serde(serialize_with = "known_id")]
+    hub: Option<u64>,
+    epoch: Option<u32>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    behind_ms: Option<f64>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    message: Option<&'a str>,
+}
+
+impl Notice<'_> {
+    fn of(kind: &'static str, head: &Head) -> Self {
+        Notice {
+            class: "notice",
+            kind,
+            sensor: None,
+            topic: None,
+            missed: 0,
+            hub: Some(head.hub),
+            epoch: Some(head.epoch),
+            behind_ms: None,
+            message: None,
+        }
+    }
+}
+
+/// Class `lan`.
+#[derive(Serialize)]
+struct Lan<'a> {
+    class: &'static str,
+    #[serde(serialize_with = "id")]
+    hub: u64,
+    epoch: u32,
+    sensor: &'a str,
+    topic: &'static str,
+    received: u64,
+    lost: u64,
+    duplicate: u64,
+    reordered: u64,
+    authenticated: bool,
+}
+
+impl<'a> Lan<'a> {
+    fn new(row: &Row, sensor: &'a str) -> Lan<'a> {
+        Lan {
+            class: "lan",
+            hub: row.hub,
+            epoch: row.epoch,
+            sensor,
+            topic: topic(row),
+            received: row.received,
+            lost: row.lost(),
+            duplicate: row.duplicate,
+            reordered: row.reordered,
+            authenticated: false,
+        }
+    }
+}
+
+/// Class `lan_refused`.
+#[derive(Serialize)]
+struct Refused<'a> {
+    class: &'static str,
+    #[serde(flatten, serialize_with = "reasons")]
+    reasons: &'a Account,
+}
+
+fn reasons<S: Serializer>(account: &&Account, serializer: S) -> Result<S::Ok, S::Error> {
+    let mut map = serializer.serialize_map(None)?;
+    for (reason, count) in refused(account) {
+        map.serialize_entry(reason.name(), &count)?;
+    }
+    map.end()
+}
+
+fn known_id<S: Serializer>(hub: &Option<u64>, serializer: S) -> Result<S::Ok, S::Error> {
+    match hub {
+        Some(hub) => id(hub, serializer),
+        None => serializer.serialize_none(),
+    }
+}
+
+fn refused(account: &Account) -> impl Iterator<Item = (Refusal, u64)> {
+    Refusal::ALL.into_iter().map(|refusal| (refusal, account.refused(refusal)))
+}
+
+/// The topic's name; an account has no other ones.
+fn topic(row: &Row) -> &'static str {
+    match Topic::of_number(row.topic) {
+        Some(topic) => topic.name(),
+        None if row.topic == Announce::NUMBER => "announce",
+        None => "unknown",
+    }
+}

@@ -1,0 +1,488 @@
+-- Shows the datagrams of `scanhub gateway` in Wireshark and tshark: every field by its name, checksums checked, and gaps,
+-- duplicates and datagrams out of order flagged per hub, epoch, sensor and topic. docs/datagram.md has the bytes.
+--
+--   tshark -X lua_script:scanhub.lua -f 'udp port 22200' -Y scanhub.lost
+--
+-- or copy it to where Help, About, Folders shows the personal Lua plugins.
+
+local PORT = 22200
+local WINDOW = 1024
+
+local scanhub = Proto("scanhub", "scanhub LAN")
+scanhub.prefs.crc = Pref.bool("Check checksums", true, "Bytes by bytes in Lua: off for long captures")
+
+local TOPICS = {
+    [0] = "announce", "telegram", "scan", "marks", "zones", "foreground", "background", "status"
+}
+local VERDICTS = { [0] = "clear", "slow", "stop", "unknown" }
+local STATES = { [0] = "absent", "probing", "switching", "starting", "streaming", "silent", "paused" }
+local COUNTERS = {
+    "bytes_read", "bytes_in_telegrams", "bytes_acknowledge", "bytes_discarded", "bytes_buffered", "telegrams",
+    "suspect", "aborted", "resyncs", "reconnects", "lost_in_restart", "wakeups", "loan_failed", "rejected_address",
+    "rejected_length", "rejected_command", "rejected_count", "rejected_crc", "rejected_vetoed",
+    "rejected_superseded", "line_errors",
+}
+
+-- Fields -----------------------------------------------------------------------------------------------------------
+
+local f = {}
+
+-- Declares field `scanhub.NAME`; `kind` is a constructor of ProtoField.
+local function field(name, kind, label, ...)
+    f[name] = ProtoField[kind]("scanhub." .. name, label, ...)
+end
+
+field("magic", "string", "Magic")
+field("version", "uint8", "Version")
+field("header_length", "uint8", "Header length")
+field("topic", "uint8", "Topic", base.DEC, TOPICS)
+field("flags", "uint8", "Flags", base.HEX)
+field("flags.authenticated", "uint8", "Authenticated", base.DEC, nil, 1)
+field("flags.simulated", "uint8", "Simulated", base.DEC, nil, 2)
+field("flags.replayed", "uint8", "Replayed", base.DEC, nil, 4)
+field("flags.stamp_estimated", "uint8", "Stamp estimated", base.DEC, nil, 8)
+field("flags.suspect", "uint8", "Suspect", base.DEC, nil, 16)
+field("hub", "uint64", "Hub", base.HEX)
+field("epoch", "uint32", "Epoch")
+field("sequence", "uint32", "Sequence")
+field("stamp_ns", "uint64", "Stamp, ns since 1970")
+field("stamp", "absolute_time", "Stamp", base.UTC)
+field("sensor", "uint8", "Sensor")
+field("sensor_name", "string", "Sensor's name")
+field("payload_length", "uint16", "Payload length")
+field("revision", "uint16", "Payload revision")
+field("counter", "uint32", "Scan counter")
+field("crc", "uint32", "CRC-32C", base.HEX)
+field("crc_status", "string", "Checksum")
+field("later", "bytes", "Of a later version")
+field("mac", "bytes", "MAC")
+field("refused", "string", "Refused")
+field("lost", "uint32", "Lost before this one")
+field("duplicate", "uint32", "Duplicate: this many places below the highest")
+field("reordered", "uint32", "Out of order: this many places below the highest")
+field("stale", "uint32", "Stale: this many places below the highest")
+field("retired", "uint32", "Of a retired epoch; the latest is")
+
+field("announce.boot", "uint64", "Hub's life", base.HEX)
+field("announce.sensor", "string", "Sensor's name")
+field("announce.type", "string", "Sensor's type")
+field("announce.topic", "uint8", "Topic", base.DEC, TOPICS)
+field("announce.group", "uint8", "Group 239.255.76")
+field("announce.port", "uint16", "Port")
+field("announce.next", "uint32", "Next sequence")
+
+field("telegram", "bytes", "Telegram")
+
+field("scan.count", "uint16", "Beams")
+field("scan.unit_mm", "uint8", "Millimetres per unit")
+field("scan.range_bits", "uint8", "Bits of a range")
+field("scan.first_angle_mdeg", "int32", "First angle, 1/1000 degree")
+field("scan.step_mdeg", "uint16", "Step, 1/1000 degree")
+field("scan.intensity_bits", "uint8", "Bits of intensity")
+field("scan.contents", "uint8", "Contents", base.HEX)
+field("scan.range", "uint16", "Range, device units")
+field("scan.upper", "uint8", "Upper bits")
+
+field("marks.count", "uint8", "Marks")
+field("marks.overflow", "uint8", "Overflow", base.DEC, nil, 1)
+field("marks.unavailable", "uint8", "Unavailable", base.DEC, nil, 2)
+field("marks.angle_mdeg", "int32", "Angle, 1/1000 degree")
+field("marks.range_dmm", "uint32", "Range, 1/10 mm")
+field("marks.weight", "uint16", "Weight")
+field("marks.peak", "uint8", "Peak")
+field("marks.edge", "uint8", "Edge")
+field("marks.first_beam", "uint16", "First beam")
+field("marks.last_beam", "uint16", "Last beam")
+
+field("zones.verdict", "uint8", "Verdict", base.DEC, VERDICTS)
+field("zones.count", "uint8", "Zones")
+field("zones.nearest_beam", "uint16", "Nearest beam")
+field("zones.nearest_mm", "uint32", "Nearest, mm")
+field("zones.invalid_beams", "uint16", "Invalid beams")
+field("zones.provisional", "uint8", "Provisional", base.DEC, nil, 1)
+field("zones.radius_mm", "uint16", "Radius, mm")
+field("zones.beams", "uint16", "Beams inside")
+field("zones.violated", "uint8", "Violated")
+
+field("foreground.generation", "uint32", "Generation")
+field("foreground.count", "uint16", "Beams of the scan")
+field("foreground.beams", "uint16", "Beams in the foreground")
+field("foreground.unit_mm", "uint8", "Millimetres per unit")
+field("foreground.left_out", "uint8", "Segments left out")
+field("foreground.segments", "uint16", "Segments")
+field("foreground.set", "bytes", "Beams, a bit each")
+field("foreground.beam", "uint16", "Beam")
+field("foreground.range", "uint16", "Range, device units")
+field("foreground.first", "uint16", "First beam")
+field("foreground.last", "uint16", "Last beam")
+field("foreground.nearest", "uint16", "Nearest, device units")
+field("foreground.width", "uint16", "Width, device units")
+field("foreground.x_mm", "int32", "x, mm")
+field("foreground.y_mm", "int32", "y, mm")
+
+field("background.generation", "uint32", "Generation")
+field("background.taught", "uint16", "Beams taught")
+field("background.count", "uint16", "Beams")
+field("background.unit_mm", "uint8", "Millimetres per unit")
+field("background.frozen", "uint8", "Frozen", base.DEC, nil, 1)
+field("background.range", "uint16", "Range, device units")
+
+field("status.state", "uint8", "State", base.DEC, STATES)
+field("status.mode", "uint8", "Measuring mode", base.HEX)
+field("status.unit_mm", "uint8", "Millimetres per unit")
+field("status.baud", "uint32", "Baud rate")
+field("status.since_ns", "uint64", "Since, ns of the hub's monotonic clock")
+field("status.rate_mhz", "uint32", "Scans per second, 1/1000")
+field("status.angle_deg", "uint16", "Field of view, degrees")
+field("status.resolution_cdeg", "uint16", "Step, 1/100 degree")
+field("status.type", "string", "Type")
+field("status.port", "string", "Port")
+field("status.last_error", "string", "Last error")
+field("status.x_m", "double", "x, m")
+field("status.y_m", "double", "y, m")
+field("status.yaw_rad", "double", "Yaw, rad")
+field("status.upside_down", "uint8", "Upside down")
+for _, name in ipairs(COUNTERS) do
+    field("status." .. name, "uint64", name)
+end
+
+scanhub.fields = {}
+for _, declared in pairs(f) do
+    table.insert(scanhub.fields, declared)
+end
+
+local expert_lost = ProtoExpert.new("scanhub.expert.lost", "datagrams are missing", expert.group.SEQUENCE,
+    expert.severity.WARN)
+local expert_order = ProtoExpert.new("scanhub.expert.order", "not the next one", expert.group.SEQUENCE,
+    expert.severity.NOTE)
+local expert_refused = ProtoExpert.new("scanhub.expert.refused", "a receiver refuses it", expert.group.MALFORMED,
+    expert.severity.ERROR)
+scanhub.experts = { expert_lost, expert_order, expert_refused }
+
+-- Checksum ---------------------------------------------------------------------------------------------------------
+
+-- Lua 5.2 brings bit32, Lua 5.4 has operators that 5.2 cannot parse.
+local bits = bit32 or bit or load([[return {
+    bxor = function(a, b) return a ~ b end, band = function(a, b) return a & b end,
+    rshift = function(a, n) return a >> n end, bnot = function(a) return ~a & 0xFFFFFFFF end }]])()
+
+local CRC = {}
+for byte = 0, 255 do
+    local crc = byte
+    for _ = 1, 8 do
+        local odd = crc % 2 == 1
+        crc = bits.rshift(crc, 1)
+        if odd then crc = bits.bxor(crc, 0x82F63B78) end
+    end
+    CRC[byte] = crc
+end
+
+-- CRC-32C of the datagram with its own four bytes as 0.
+local function crc_of(tvb)
+    local bytes = tvb:bytes()
+    local crc = 0xFFFFFFFF
+    for i = 0, bytes:len() - 1 do
+        local byte = (i < 44 or i > 47) and bytes:get_index(i) or 0
+        crc = bits.bxor(bits.rshift(crc, 8), CRC[bits.band(bits.bxor(crc, byte), 0xFF)])
+    end
+    return bits.bnot(crc) % 0x100000000
+end
+
+-- Sequence ---------------------------------------------------------------------------------------------------------
+
+local streams, epochs, names, findings
+
+function scanhub.init()
+    -- By hub, epoch, sensor and topic: the highest number and those seen in the window below it.
+    streams = {}
+    -- By hub: the latest epoch.
+    epochs = {}
+    -- By hub and sensor: its name.
+    names = {}
+    -- By number of the frame, from the first pass: what to flag.
+    findings = {}
+end
+
+-- What a datagram is beside those before it: the field to show and its value, or nothing.
+local function judge(hub, epoch, sensor, topic, sequence)
+    if epochs[hub] and epoch < epochs[hub] then
+        return { "retired", epochs[hub] }
+    end
+    epochs[hub] = epoch
+    local key = table.concat({ hub, epoch, sensor, topic }, "/")
+    local stream = streams[key]
+    if not stream then
+        streams[key] = { highest = sequence, seen = { [sequence] = true } }
+        return nil
+    end
+    local ahead = (sequence - stream.highest) % 0x100000000
+    if ahead > 0 and ahead < 0x80000000 then
+        -- What leaves the window is forgotten, at most the whole window.
+        for behind = 0, math.min(ahead, WINDOW) - 1 do
+            stream.seen[(stream.highest - WINDOW + 1 + behind) % 0x100000000] = nil
+        end
+        stream.highest = sequence
+        stream.seen[sequence] = true
+        if ahead > 1 then
+            return { "lost", ahead - 1 }
+        end
+        return nil
+    end
+    local below = (stream.highest - sequence) % 0x100000000
+    if below >= WINDOW then
+        return { "stale", below }
+    end
+    if stream.seen[sequence] then
+        return { "duplicate", below }
+    end
+    stream.seen[sequence] = true
+    return { "reordered", below }
+end
+
+-- Payloads ---------------------------------------------------------------------------------------------------------
+-- Each adds its fields to the tree and answers a few words for the Info column; `nil` if the payload is shorter than its
+-- own counts say.
+
+local unpack_payload = {}
+
+-- Adds fields that stand one behind the other: pairs of a name and a length.
+local function add_fields(tree, payload, at, ...)
+    local list = { ... }
+    for i = 1, #list, 2 do
+        tree:add_le(f[list[i]], payload(at, list[i + 1]))
+        at = at + list[i + 1]
+    end
+end
+
+unpack_payload[0] = function(payload, tree, hub, sensor)
+    local len = payload:len()
+    if len < 68 or len < 68 + 8 * payload(64, 1):uint() then return nil end
+    local name = payload(8, 32):stringz()
+    names[hub .. "/" .. sensor] = name
+    tree:add_le(f["announce.boot"], payload(0, 8))
+    tree:add(f["announce.sensor"], payload(8, 32), name)
+    tree:add(f["announce.type"], payload(40, 24), payload(40, 24):stringz())
+    for i = 0, payload(64, 1):uint() - 1 do
+        local at = 68 + 8 * i
+        local topic = payload(at, 1):uint()
+        local item = tree:add(payload(at, 8), "Topic " .. (TOPICS[topic] or topic))
+        add_fields(item, payload, at, "announce.topic", 1, "announce.group", 1, "announce.port", 2, "announce.next", 4)
+    end
+    return payload(64, 1):uint() .. " topics"
+end
+
+unpack_payload[1] = function(payload, tree)
+    if payload:len() < 4 or payload(0, 1):uint() ~= 2 then return nil end
+    local len = payload(2, 2):le_uint() + 6
+    if len > payload:len() or len > 814 then return nil end
+    tree:add(f["telegram"], payload(0, len))
+    return len .. " bytes"
+end
+
+unpack_payload[2] = function(payload, tree)
+    local len = payload:len()
+    if len < 12 then return nil end
+    local count, contents = payload(0, 2):le_uint(), payload(11, 1):uint()
+    local has_upper = contents % 2 == 1
+    if count > 401 or payload(3, 1):uint() > 16 or len < 12 + (has_upper and 3 or 2) * count then return nil end
+    add_fields(tree, payload, 0, "scan.count", 2, "scan.unit_mm", 1, "scan.range_bits", 1, "scan.first_angle_mdeg", 4,
+        "scan.step_mdeg", 2, "scan.intensity_bits", 1, "scan.contents", 1)
+    if count > 0 then
+        local ranges = tree:add(payload(12, 2 * count), "Ranges")
+        for i = 0, count - 1 do
+            ranges:add_le(f["scan.range"], payload(12 + 2 * i, 2)):prepend_text("Beam " .. i .. ": ")
+        end
+        if has_upper then
+            local upper = tree:add(payload(12 + 2 * count, count), "Upper bits")
+            for i = 0, count - 1 do
+                upper:add(f["scan.upper"], payload(12 + 2 * count + i, 1)):prepend_text("Beam " .. i .. ": ")
+            end
+        end
+    end
+    return count .. " beams"
+end
+
+unpack_payload[3] = function(payload, tree)
+    local len = payload:len()
+    if len < 4 then return nil end
+    local count = payload(0, 1):uint()
+    if count > 64 or len < 4 + 16 * count then return nil end
+    tree:add(f["marks.count"], payload(0, 1))
+    tree:add(f["marks.overflow"], payload(1, 1))
+    tree:add(f["marks.unavailable"], payload(1, 1))
+    for i = 0, count - 1 do
+        local item = tree:add(payload(4 + 16 * i, 16), "Mark " .. i)
+        add_fields(item, payload, 4 + 16 * i, "marks.angle_mdeg", 4, "marks.range_dmm", 4, "marks.weight", 2,
+            "marks.peak", 1, "marks.edge", 1, "marks.first_beam", 2, "marks.last_beam", 2)
+    end
+    return count .. " marks"
+end
+
+unpack_payload[4] = function(payload, tree)
+    local len = payload:len()
+    if len < 12 then return nil end
+    local count = payload(1, 1):uint()
+    if count > 8 or len < 12 + 8 * count then return nil end
+    add_fields(tree, payload, 0, "zones.verdict", 1, "zones.count", 1, "zones.nearest_beam", 2, "zones.nearest_mm", 4,
+        "zones.invalid_beams", 2, "zones.provisional", 1)
+    for i = 0, count - 1 do
+        local item = tree:add(payload(12 + 8 * i, 8), "Zone " .. i)
+        add_fields(item, payload, 12 + 8 * i, "zones.radius_mm", 2, "zones.beams", 2, "zones.violated", 1)
+    end
+    return VERDICTS[payload(0, 1):uint()] or "unknown"
+end
+
+unpack_payload[5] = function(payload, tree)
+    local len = payload:len()
+    if len < 12 then return nil end
+    local count, beams, segments = payload(4, 2):le_uint(), payload(6, 2):le_uint(), payload(10, 2):le_uint()
+    local set = math.floor((count + 7) / 8)
+    if count > 401 or beams > count or segments > 64 or len < 12 + set + 2 * beams + 16 * segments then return nil end
+    local members = {}
+    for i = 0, 8 * set - 1 do
+        if bits.band(bits.rshift(payload(12 + math.floor(i / 8), 1):uint(), i % 8), 1) == 1 then
+            if i >= count then return nil end
+            table.insert(members, i)
+        end
+    end
+    if #members ~= beams then return nil end
+    local begin = 12 + set + 2 * beams
+    for at = begin, begin + 16 * segments - 1, 16 do
+        local first, last = payload(at, 2):le_uint(), payload(at + 2, 2):le_uint()
+        if first > last or last >= count then return nil end
+    end
+    add_fields(tree, payload, 0, "foreground.generation", 4, "foreground.count", 2, "foreground.beams", 2,
+        "foreground.unit_mm", 1, "foreground.left_out", 1, "foreground.segments", 2)
+    if set > 0 then tree:add(f["foreground.set"], payload(12, set)) end
+    for n, beam in ipairs(members) do
+        local range = payload(12 + set + 2 * (n - 1), 2)
+        local item = tree:add(range, "Beam " .. beam)
+        item:add(f["foreground.beam"], payload(12 + math.floor(beam / 8), 1), beam)
+        item:add_le(f["foreground.range"], range)
+    end
+    for i = 0, segments - 1 do
+        local item = tree:add(payload(begin + 16 * i, 16), "Segment " .. i)
+        add_fields(item, payload, begin + 16 * i, "foreground.first", 2, "foreground.last", 2, "foreground.nearest", 2,
+            "foreground.width", 2, "foreground.x_mm", 4, "foreground.y_mm", 4)
+    end
+    return beams .. " of " .. count .. " beams, " .. segments .. " segments"
+end
+
+unpack_payload[6] = function(payload, tree)
+    local len = payload:len()
+    if len < 12 then return nil end
+    local count = payload(6, 2):le_uint()
+    if count > 401 or len < 12 + 2 * count then return nil end
+    add_fields(tree, payload, 0, "background.generation", 4, "background.taught", 2, "background.count", 2,
+        "background.unit_mm", 1, "background.frozen", 1)
+    for i = 0, count - 1 do
+        tree:add_le(f["background.range"], payload(12 + 2 * i, 2)):prepend_text("Beam " .. i .. ": ")
+    end
+    return payload(4, 2):le_uint() .. " of " .. count .. " beams taught"
+end
+
+unpack_payload[7] = function(payload, tree)
+    if payload:len() < 592 then return nil end
+    add_fields(tree, payload, 0, "status.state", 1, "status.mode", 1, "status.unit_mm", 1)
+    add_fields(tree, payload, 4, "status.baud", 4, "status.since_ns", 8, "status.rate_mhz", 4, "status.angle_deg", 2,
+        "status.resolution_cdeg", 2)
+    for _, text in ipairs({ { "type", 24, 24 }, { "port", 48, 128 }, { "last_error", 176, 160 } }) do
+        local range = payload(text[2], text[3])
+        tree:add(f["status." .. text[1]], range, range:stringz(ENC_UTF_8))
+    end
+    for i, name in ipairs(COUNTERS) do
+        tree:add_le(f["status." .. name], payload(328 + 8 * i, 8))
+    end
+    add_fields(tree, payload, 560, "status.x_m", 8, "status.y_m", 8, "status.yaw_rad", 8, "status.upside_down", 1)
+    return STATES[payload(0, 1):uint()] or "unknown"
+end
+
+-- Datagram ---------------------------------------------------------------------------------------------------------
+
+local FLAGS = { "authenticated", "simulated", "replayed", "stamp_estimated", "suspect" }
+
+-- Why bytes are no datagram, in the order of the checks; nothing if they are one.
+local function refusal(tvb)
+    local len = tvb:len()
+    if len < 48 then return "short" end
+    if tvb(0, 4):string() ~= "SHUB" then return "magic" end
+    if tvb(4, 1):uint() ~= 1 then return "version" end
+    local header = tvb(5, 1):uint()
+    if header < 48 or header > len then return "header" end
+    local mac = tvb(7, 1):uint() % 2 * 16
+    if header + tvb(36, 2):le_uint() + mac ~= len then return "length" end
+    if scanhub.prefs.crc and crc_of(tvb) ~= tvb(44, 4):le_uint() then return "crc" end
+    return nil
+end
+
+local function add_header(tvb, tree)
+    tree:add(f["magic"], tvb(0, 4))
+    add_fields(tree, tvb, 4, "version", 1, "header_length", 1, "topic", 1)
+    local flags = tree:add(f["flags"], tvb(7, 1))
+    for _, name in ipairs(FLAGS) do
+        flags:add(f["flags." .. name], tvb(7, 1))
+    end
+    add_fields(tree, tvb, 8, "hub", 8, "epoch", 4, "sequence", 4, "stamp_ns", 8)
+    local stamp_ns = tvb(24, 8):le_uint64()
+    local stamp = NSTime.new((stamp_ns / 1000000000):tonumber(), (stamp_ns % 1000000000):tonumber())
+    tree:add(f["stamp"], tvb(24, 8), stamp):set_generated()
+    tree:add(f["sensor"], tvb(32, 1))
+    add_fields(tree, tvb, 36, "payload_length", 2, "revision", 2, "counter", 4)
+end
+
+local function add_refusal(tree, pinfo, reason)
+    tree:add(f["refused"], reason):set_generated()
+    tree:add_proto_expert_info(expert_refused, "refused: " .. reason)
+    pinfo.cols.info = "refused: " .. reason
+end
+
+function scanhub.dissector(tvb, pinfo, root)
+    pinfo.cols.protocol = "SCANHUB"
+    local tree = root:add(scanhub, tvb())
+    if tvb:len() < tvb:reported_len() then
+        pinfo.cols.info = "cut by the capture"
+        return
+    end
+    local reason = refusal(tvb)
+    if tvb:len() >= 48 then
+        add_header(tvb, tree)
+        tree:add_le(f["crc"], tvb(44, 4))
+    end
+    if reason then
+        if reason == "crc" then tree:add(f["crc_status"], "bad"):set_generated() end
+        return add_refusal(tree, pinfo, reason)
+    end
+    tree:add(f["crc_status"], scanhub.prefs.crc and "good" or "unchecked"):set_generated()
+
+    local header, length = tvb(5, 1):uint(), tvb(36, 2):le_uint()
+    local topic, sensor = tvb(6, 1):uint(), tvb(32, 1):uint()
+    local hub, epoch, sequence = tostring(tvb(8, 8):le_uint64()), tvb(16, 4):le_uint(), tvb(20, 4):le_uint()
+    if header > 48 then tree:add(f["later"], tvb(48, header - 48)) end
+    if tvb:len() > header + length then tree:add(f["mac"], tvb(header + length)) end
+
+    local unpack = unpack_payload[topic]
+    local words
+    if unpack and length > 0 and tvb(38, 2):le_uint() > 0 then
+        local payload = tvb(header, length)
+        words = unpack(payload:tvb(), tree:add(payload, "Payload: " .. TOPICS[topic]), hub, sensor)
+    end
+    if not words then
+        return add_refusal(tree, pinfo, unpack and "payload" or "skipped")
+    end
+    if not pinfo.visited then
+        findings[pinfo.number] = judge(hub, epoch, sensor, topic, sequence)
+    end
+    local name = names[hub .. "/" .. sensor]
+    if name then tree:add(f["sensor_name"], name):set_generated() end
+    local info = string.format("%s/%s #%d, %s", name or sensor, TOPICS[topic], sequence, words)
+    local finding = findings[pinfo.number]
+    if finding then
+        local flag = string.format("%s %d", finding[1], finding[2])
+        tree:add(f[finding[1]], finding[2]):set_generated()
+        tree:add_proto_expert_info(finding[1] == "lost" and expert_lost or expert_order, flag)
+        info = info .. " [" .. flag .. "]"
+    end
+    pinfo.cols.info = info
+end
+
+DissectorTable.get("udp.port"):add(PORT, scanhub)

@@ -1,0 +1,41 @@
+//! `scanhub listen` on the command line.
+
+use std::io::{IsTerminal, stdout};
+
+use clap::Args;
+use clients::ListenOptions;
+use schema::Failure;
+
+use super::{Everywhere, Limits};
+
+#[derive(Args, Debug)]
+pub(crate) struct Listen {
+    /// Network interface to listen on; without it all that have a link
+    #[arg(long, value_name = "IF")]
+    interface: Option<String>,
+    /// Topic of all sensors to listen to, for example zones; all topics if none is named
+    #[arg(long = "topic", value_name = "TOPIC")]
+    topics: Vec<String>,
+    /// What to call a hub instead of its 16 hex digits, for example robot1=5f3a12bc00d1e2f3
+    #[arg(long = "name", value_name = "NAME=HUB")]
+    names: Vec<String>,
+    /// Only the account: what was received, lost, doubled, out of order, refused
+    #[arg(long)]
+    stats: bool,
+    #[command(flatten)]
+    limits: Limits,
+}
+
+impl Listen {
+    pub(crate) fn options(&self, everywhere: &Everywhere) -> Result<ListenOptions, Failure> {
+        Ok(ListenOptions {
+            interface: self.interface.clone(),
+            topics: self.topics.clone(),
+            names: self.names.clone(),
+            stats: self.stats,
+            json: everywhere.json,
+            terminal: stdout().is_terminal(),
+            bounds: self.limits.bounds(),
+        })
+    }
+}

@@ -1,0 +1,167 @@
+//! What a model is made for, what is done to it by command, and what it does with scans that no sensor sends.
+
+use preprocess::background::{Class, Method, Mismatch, Model, Settings, Start};
+use preprocess::segments::Cutter;
+use schema::{Background, Foreground, Pose, Scan};
+
+const METHODS: [Method; 2] = [Method::Paper, Method::Multi];
+
+fn scan(count: u16, unit_mm: u8, range: u16) -> Scan {
+    let mut scan = Scan { count, unit_mm, range_bits: 13, step_mdeg: 500, ..Scan::default() };
+    scan.range_array[..usize::from(count)].fill(range);
+    scan
+}
+
+fn model(method: Method) -> Model {
+    Model::new(Settings { method, scans: Some(8), ..Settings::default() })
+}
+
+fn shown(model: &Model) -> Background {
+    let mut background = bytemuck::pod_read_unaligned(&[0xA5; size_of::<Background>()]);
+    model.show(&mut background);
+    background
+}
+
+/// Shows `scan` to `model` so many times; the last foreground.
+fn look(model: &mut Model, scan: &Scan, times: usize) -> Foreground {
+    let mut out = Foreground::default();
+    (0..times).for_each(|_| model.update(scan, &mut out));
+    out
+}
+
+#[test]
+fn learned_compared_frozen_thawed_and_reset() {
+    for method in METHODS {
+        let mut model = model(method);
+        assert_eq!((model.classes(), shown(&model)), (&[][..], Background::default()));
+        look(&mut model, &scan(361, 1, 3_000), 8);
+        let known = shown(&model);
+        assert_eq!((known.count, known.taught, known.generation, known.unit_mm), (361, 361, 0, 1));
+        assert!(known.ranges().iter().all(|&range| range == 3_000) && known.range_array[361] == 0);
+
+        model.freeze();
+        let out = look(&mut model, &scan(361, 1, 2_000), 100);
+        assert_eq!((out.beams, out.ranges()[360], out.range_array[361]), (361, 2_000, 0));
+        assert_eq!(shown(&model), Background { flags: Background::FROZEN, ..known });
+        look(&mut model, &scan(361, 1, 4_000), 1);
+        assert!(model.is_frozen() && model.classes().iter().all(|&class| class == Class::Behind));
+        model.thaw();
+        look(&mut model, &scan(361, 1, 2_000), 8);
+        assert_eq!(look(&mut model, &scan(361, 1, 2_000), 1).beams, 0);
+
+        model.reset();
+        assert_eq!((model.generation(), shown(&model).taught, shown(&model).count), (1, 0, 361));
+        assert_eq!(look(&mut model, &scan(361, 1, 1_000), 1).generation, 1);
+        assert!(model.classes().iter().all(|&class| class == Class::Unknown));
+    }
+}
+
+#[test]
+fn another_shape_begins_anew() {
+    for method in METHODS {
+        let mut model = model(method);
+        look(&mut model, &scan(361, 1, 3_000), 20);
+        let mut generation = 0;
+        let finer = Scan { step_mdeg: 250, ..scan(361, 1, 3_000) };
+        let turned = Scan { first_angle_mdeg: 40_000, ..finer };
+        for other in [scan(181, 1, 3_000), scan(181, 10, 300), scan(361, 1, 3_000), finer, turned] {
+            generation += 1;
+            assert_eq!(look(&mut model, &other, 1).generation, generation);
+            assert_eq!((shown(&model).taught, shown(&model).count), (0, other.count));
+            look(&mut model, &other, 20);
+            assert_eq!((model.generation(), shown(&model).taught), (generation, other.count));
+        }
+    }
+}
+
+#[test]
+fn a_saved_model_is_taken_if_it_fits() {
+    for method in METHODS {
+        let mut saved = Background { count: 361, unit_mm: 1, generation: 77, ..Background::default() };
+        saved.range_array[..361].fill(3_000);
+        saved.range_array[..3].copy_from_slice(&[0, Background::FAR, 2_500]);
+
+        // Before the first scan.
+        let mut early = model(method);
+        early.load(&saved).unwrap();
+        assert_eq!(shown(&early), Background { generation: 1, taught: 360, ..saved });
+        let out = look(&mut early, &scan(361, 1, 1_000), 1);
+        assert_eq!((out.generation, out.beams), (1, 360));
+
+        // It does not fit the first scan: what it says is forgotten.
+        let mut wrong = model(method);
+        wrong.load(&saved).unwrap();
+        assert_eq!(look(&mut wrong, &scan(181, 1, 1_000), 1).generation, 2);
+        assert_eq!((shown(&wrong).taught, shown(&wrong).count), (0, 181));
+
+        // Later it is refused, and the model stays what it was.
+        let before = shown(&wrong);
+        let refusal = wrong.load(&saved).unwrap_err();
+        assert_eq!(refusal, Mismatch { model: (361, 1), sensor: (181, 1) });
+        let cm = Background { unit_mm: 10, count: 181, ..saved };
+        assert_eq!(
+            wrong.load(&cm).unwrap_err().to_string(),
+            "the model has 181 beams in units of 10 mm, the sensor's scans have 181 beams in units of 1 mm"
+        );
+        assert_eq!(shown(&wrong), before);
+        wrong.load(&Background { count: 181, ..saved }).unwrap();
+        assert_eq!((wrong.generation(), shown(&wrong).taught), (3, 180));
+    }
+}
+
+#[test]
+fn the_first_scan_may_be_the_background() {
+    for method in METHODS {
+        let mut model = Model::new(Settings { method, start: Start::FirstScan, ..Settings::default() });
+        look(&mut model, &scan(361, 1, 3_000), 1);
+        assert!(
+            model.classes().iter().all(|&class| class == Class::Unknown),
+            "compared before it is learned"
+        );
+        assert_eq!(shown(&model).taught, 361);
+        assert_eq!(look(&mut model, &scan(361, 1, 2_000), 1).beams, 361);
+        model.reset();
+        look(&mut model, &scan(361, 1, 2_000), 1);
+        assert_eq!(look(&mut model, &scan(361, 1, 2_000), 1).beams, 0, "after a reset as well");
+        assert!(shown(&model).ranges().iter().all(|&range| range == 2_000));
+    }
+}
+
+#[test]
+fn no_scan_makes_it_panic() {
+    let mut random = fastrand::Rng::with_seed(1);
+    for method in METHODS {
+        for round in 0..60 {
+            let mut any = || if random.bool() { Some(random.u16(..)) } else { None };
+            let (threshold_mm, candidate_mm, scans) = (any(), any(), any());
+            let settings = Settings {
+                method,
+                threshold_mm,
+                candidate_mm,
+                scans: scans.map(|n| if round % 3 == 0 { u32::MAX } else { u32::from(n % 5) }),
+                start: if random.bool() { Start::Empty } else { Start::FirstScan },
+                no_return_is_far: random.bool(),
+                ..Settings::default()
+            };
+            let mut model = Model::new(settings);
+            let mut cutter = Cutter::new(Pose { x_m: f64::NAN, y_m: f64::MAX, ..Pose::default() });
+            let mut bytes = [0_u8; size_of::<Scan>()];
+            for _ in 0..40 {
+                // A sensor keeps the shape of its scans for a while, however odd it is.
+                let from = if random.u8(..8) == 0 { 0 } else { 12 };
+                random.fill(&mut bytes[from..]);
+                let scan: Scan = bytemuck::pod_read_unaligned(&bytes);
+                let mut out: Foreground = bytemuck::pod_read_unaligned(&[0xFF; size_of::<Foreground>()]);
+                model.update(&scan, &mut out);
+                assert_eq!(model.classes().len(), scan.beams());
+                assert_eq!(out.readings().count(), usize::from(out.beams));
+                cutter.update(&scan, &mut out);
+                let mut foreign: Foreground = bytemuck::pod_read_unaligned(&[0xFF; size_of::<Foreground>()]);
+                cutter.update(&scan, &mut foreign);
+                let saved = bytemuck::pod_read_unaligned(&bytes[..size_of::<Background>()]);
+                let _ = model.load(&saved);
+                shown(&model);
+            }
+        }
+    }
+}

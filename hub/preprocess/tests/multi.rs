@@ -1,0 +1,237 @@
+//! The background with several surfaces a beam against a slow version of its rules, in floating point, without tables
+//! and memory of its own but lists. Identical beam by beam, with commands in between.
+
+mod surroundings;
+
+use preprocess::background::{Class, Method, Model, Settings, Start};
+use schema::{Background, Foreground, Scan};
+use surroundings::{Shape, Surroundings, any_model, foreground, ranges_mm, reading_mm};
+
+/// A surface as a beam remembers it.
+#[derive(Clone, Copy, Debug)]
+struct Surface {
+    /// In device units.
+    at: f64,
+    /// In scans.
+    weight: f64,
+}
+
+impl Surface {
+    fn is_background(&self, scans: f64) -> bool {
+        self.weight >= scans * 5.0 / 8.0
+    }
+}
+
+/// What is far, in device units.
+const FAR: f64 = 1e9;
+const NOTHING: Surface = Surface { at: -FAR, weight: 0.0 };
+
+struct Slow {
+    settings: Settings,
+    beams: Vec<[Surface; 3]>,
+    /// Foreground beams of the last scan with their readings: those that were seen, those that were told.
+    seen: Vec<(usize, f64)>,
+    told: Vec<(usize, f64)>,
+    frozen: bool,
+    fresh: bool,
+    /// Scans that are set, for the last scan.
+    scans: f64,
+}
+
+impl Slow {
+    fn new(settings: Settings, count: u16) -> Slow {
+        let beams = vec![[NOTHING; 3]; usize::from(count)];
+        Slow { settings, beams, seen: vec![], told: vec![], frozen: false, fresh: true, scans: 0.0 }
+    }
+
+    fn reset(&mut self, count: u16) {
+        *self = Slow { frozen: self.frozen, scans: self.scans, ..Slow::new(self.settings, count) };
+    }
+
+    fn load(&mut self, model: &Background) {
+        self.reset(model.count);
+        let far = |mm: f64| if mm.is_infinite() { FAR } else { mm / f64::from(model.unit_mm) };
+        ranges_mm(model).into_iter().enumerate().for_each(|(i, mm)| self.adopt(i, far(mm)));
+        self.fresh = false;
+    }
+
+    fn adopt(&mut self, i: usize, at: f64) {
+        if at != 0.0 {
+            self.beams[i] = [Surface { at, weight: f64::INFINITY }, NOTHING, NOTHING];
+        }
+    }
+
+    fn nearest(&self, i: usize, scans: f64) -> Option<f64> {
+        let known = self.beams[i].iter().filter(|surface| surface.is_background(scans));
+        known.map(|surface| surface.at).min_by(f64::total_cmp)
+    }
+
+    fn update(&mut self, scan: &Scan) -> Vec<Class> {
+        let unit_mm = f64::from(scan.unit_mm);
+        let threshold =
+            self.settings.threshold_mm.map_or(if scan.unit_mm == 10 { 60.0 } else { 30.0 }, f64::from);
+        let threshold = (threshold / unit_mm).floor();
+        let scans = (750.0 * f64::from(scan.step_mdeg) / 1000.0).ceil();
+        let scans = self.settings.scans.map_or(scans, f64::from);
+        self.scans = scans;
+        let readings: Vec<Option<f64>> = (0..self.beams.len())
+            .map(|i| Some((reading_mm(scan, i, self.settings.no_return_is_far)? / unit_mm).min(FAR)))
+            .collect();
+        let mut classes: Vec<Class> =
+            (0..readings.len()).map(|i| self.class(i, readings[i], threshold, scans)).collect();
+        self.believe(&mut classes, &readings, unit_mm, f64::from(scan.step_mdeg));
+        if !self.frozen {
+            for (i, reading) in readings.iter().enumerate() {
+                let Some(reading) = *reading else { continue };
+                learn(&mut self.beams[i], reading, threshold, scans);
+                if self.fresh && self.settings.start == Start::FirstScan {
+                    self.adopt(i, reading);
+                }
+            }
+            self.fresh = false;
+        }
+        classes
+    }
+
+    fn class(&self, i: usize, reading: Option<f64>, threshold: f64, scans: f64) -> Class {
+        let Some(reading) = reading else { return Class::Invalid };
+        let meets = |surface: &&Surface| (surface.at - reading).abs() <= threshold;
+        if let Some(nearest) = self.nearest(i, scans) {
+            return match reading {
+                _ if self.beams[i].iter().filter(meets).any(|surface| surface.is_background(scans)) => {
+                    Class::Background
+                }
+                _ if reading < nearest => Class::Foreground,
+                _ => Class::Behind,
+            };
+        }
+        let right = (1..=4).find_map(|aside| self.nearest(i.checked_sub(aside)?, scans));
+        let left = (1..=4)
+            .filter(|aside| i + aside < self.beams.len())
+            .find_map(|aside| self.nearest(i + aside, scans));
+        let met = self.beams[i].iter().filter(meets).any(|surface| surface.weight >= scans / 4.0);
+        match (right, left) {
+            (Some(right), Some(left)) if reading < right.min(left) - threshold && !met => Class::Foreground,
+            _ => Class::Unknown,
+        }
+    }
+
+    /// Strikes out what is not believed.
+    fn believe(&mut self, classes: &mut [Class], readings: &[Option<f64>], unit_mm: f64, step_mdeg: f64) {
+        let seen: Vec<(usize, f64)> = (0..classes.len())
+            .filter(|&i| classes[i] == Class::Foreground)
+            .map(|i| (i, readings[i].expect("only readings are in the foreground")))
+            .collect();
+        let mut told = Vec::new();
+        // Two belong to one run if there is nothing but codes between them.
+        let codes = |from: usize, to: usize| (from + 1..to).all(|i| readings[i].is_none());
+        for run in seen.chunk_by(|a, b| codes(a.0, b.0)) {
+            let (first, last) = (run[0].0, run[run.len() - 1].0);
+            let nearest = run.iter().map(|beam| beam.1).fold(FAR, f64::min);
+            let there = |before: &[(usize, f64)]| {
+                before.iter().any(|&(i, range)| {
+                    i + 1 >= first && i <= last + 1 && (range - nearest).abs() * unit_mm <= 200.0
+                })
+            };
+            let beam_mm = nearest * unit_mm * step_mdeg / 57_296.0;
+            let leg = (135.0 / beam_mm).floor().clamp(1.0, 3.0);
+            let is_believed =
+                run.len() >= 3 || there(&self.told) || run.len() as f64 >= leg && there(&self.seen);
+            match is_believed {
+                true => told.extend_from_slice(run),
+                false => run.iter().for_each(|&(i, _)| classes[i] = Class::Unknown),
+            }
+        }
+        (self.seen, self.told) = (seen, told);
+    }
+}
+
+fn learn(surfaces: &mut [Surface; 3], reading: f64, threshold: f64, scans: f64) {
+    surfaces.iter_mut().for_each(|surface| surface.weight = surface.weight.min(scans));
+    let apart = |number: &usize| (surfaces[*number].at - reading).abs();
+    let met = (0..3).filter(|number| apart(number) <= threshold).min_by(|a, b| apart(a).total_cmp(&apart(b)));
+    for (number, surface) in surfaces.iter_mut().enumerate() {
+        if Some(number) == met {
+            surface.weight = (surface.weight + 1.0).min(scans);
+            surface.at += ((reading - surface.at) / 16.0).trunc();
+        } else {
+            let leak = if reading > surface.at { 0.5 } else { 0.125 };
+            surface.weight = (surface.weight - leak).max(0.0);
+            if surface.weight == 0.0 {
+                *surface = NOTHING;
+            }
+        }
+    }
+    let least = (0..3).min_by(|&a, &b| surfaces[a].weight.total_cmp(&surfaces[b].weight)).expect("three");
+    if met.is_none() && surfaces[least].weight < scans / 4.0 {
+        surfaces[least] = Surface { at: reading, weight: 1.0 };
+    }
+}
+
+#[test]
+fn identical_beam_by_beam() {
+    let mut seen = [0_u64; 5];
+    for seed in 0..12 {
+        let mut random = fastrand::Rng::with_seed(seed);
+        let settings = Settings {
+            method: Method::Multi,
+            threshold_mm: if random.bool() { Some(random.u16(5..120)) } else { None },
+            scans: if random.u8(..4) > 0 { Some(random.u32(1..90)) } else { None },
+            start: if random.bool() { Start::Empty } else { Start::FirstScan },
+            no_return_is_far: random.bool(),
+            ..Settings::default()
+        };
+        let mut surroundings = Surroundings::new(Shape::any(&mut random), seed);
+        let mut model = Model::new(settings);
+        let mut slow = Slow::new(settings, surroundings.shape.count);
+        let mut generation = 0;
+        for number in 0..2_000 {
+            match random.u16(..1_500) {
+                0 => {
+                    model.reset();
+                    slow.reset(surroundings.shape.count);
+                    generation += 1;
+                }
+                1 => {
+                    let saved = any_model(&mut random, surroundings.shape);
+                    model.load(&saved).unwrap();
+                    slow.load(&saved);
+                    generation += 1;
+                }
+                2 => {
+                    model.freeze();
+                    slow.frozen = true;
+                }
+                3..7 => {
+                    model.thaw();
+                    slow.frozen = false;
+                }
+                _ => {}
+            }
+            let scan = surroundings.next();
+            let dirty: Foreground = bytemuck::pod_read_unaligned(&[random.u8(..); size_of::<Foreground>()]);
+            let mut out = dirty;
+            model.update(&scan, &mut out);
+            let classes = slow.update(&scan);
+            assert_eq!(model.classes(), classes, "seed {seed}, scan {number}, {settings:?}");
+            let mut expected = foreground(&scan, &classes, &dirty);
+            expected.generation = generation;
+            assert_eq!(out, expected, "seed {seed}, scan {number}");
+            classes.iter().for_each(|&class| seen[class as usize] += 1);
+        }
+        let mut shown = Background::default();
+        model.show(&mut shown);
+        let known = slow
+            .beams
+            .iter()
+            .filter(|beam| beam.iter().any(|surface| surface.is_background(slow.scans)))
+            .count();
+        assert_eq!(usize::from(shown.taught), known);
+        for (i, &range) in shown.ranges().iter().enumerate().filter(|(_, range)| **range != 0) {
+            let at = if range == Background::FAR { FAR } else { f64::from(range) };
+            let shows = |surface: &Surface| surface.is_background(slow.scans) && surface.at == at;
+            assert!(slow.beams[i].iter().any(shows), "beam {i}: {range}, {:?}", slow.beams[i]);
+        }
+    }
+    assert!(seen.iter().all(|&n| n > 10_000), "{seen:?}: nothing was tried");
+}

@@ -1,0 +1,109 @@
+//! Segments against a slow version of them: every point by sine and cosine, every distance from two points.
+
+use preprocess::segments::Cutter;
+use schema::{BEAMS, Foreground, Pose, SEGMENTS, Scan, Segment};
+
+/// A foreground with the beams `ranges`, in the order of the beams.
+fn foreground(ranges: &[(usize, u16)]) -> Foreground {
+    let mut foreground: Foreground = bytemuck::pod_read_unaligned(&[0xA5; size_of::<Foreground>()]);
+    foreground.bit_array.fill(0);
+    foreground.range_array.fill(0);
+    for (place, &(beam, range)) in ranges.iter().enumerate() {
+        foreground.bit_array[beam / 8] |= 1 << (beam % 8);
+        foreground.range_array[place] = range;
+    }
+    foreground.beams = ranges.len() as u16;
+    foreground
+}
+
+/// Where beam `i` of `scan` ends in the robot's frame, in mm.
+fn point(scan: &Scan, pose: &Pose, i: usize, range: u16) -> (f64, f64) {
+    let turned = (f64::from(scan.first_angle_mdeg) + i as f64 * f64::from(scan.step_mdeg)) / 1000.0 - 90.0;
+    let turned = if pose.upside_down == 1 { -turned } else { turned };
+    let angle = pose.yaw_rad + turned.to_radians();
+    let range_mm = f64::from(range) * f64::from(scan.unit_mm);
+    (1000.0 * pose.x_m + range_mm * angle.cos(), 1000.0 * pose.y_m + range_mm * angle.sin())
+}
+
+fn apart(a: (f64, f64), b: (f64, f64)) -> f64 {
+    (a.0 - b.0).hypot(a.1 - b.1)
+}
+
+#[test]
+fn segments_are_those_of_the_formula() {
+    let mut random = fastrand::Rng::with_seed(3);
+    let mut most = 0;
+    for round in 0..3_000 {
+        let step_mdeg = [250, 500, 1000][random.usize(..3)];
+        let unit_mm = [1, 10][random.usize(..2)];
+        let scan = Scan {
+            count: 361,
+            unit_mm,
+            step_mdeg,
+            first_angle_mdeg: random.i32(..90_000),
+            ..Scan::default()
+        };
+        let pose = Pose {
+            x_m: random.f64() - 0.5,
+            y_m: random.f64() - 0.5,
+            yaw_rad: 7.0 * random.f64(),
+            upside_down: random.u8(..2),
+            reserved: [0; 7],
+        };
+        let (mut range_mm, share) = (2_000.0, 0.3 + 0.7 * random.f64());
+        let mut ranges = Vec::new();
+        for i in 0..BEAMS {
+            // Mostly a surface with noise, at times a step that may or may not divide it.
+            let step_mm = if random.u8(..8) == 0 { 600.0 } else { 30.0 };
+            range_mm = (range_mm + step_mm * (random.f64() - 0.5)).clamp(50.0, 8_000.0);
+            if random.f64() < share {
+                ranges.push((i, (range_mm / f64::from(unit_mm)) as u16));
+            }
+        }
+        let step = (f64::from(step_mdeg) / 1000.0).to_radians();
+        let together = |a: &(usize, u16), b: &(usize, u16)| {
+            let range_mm = f64::from(a.1) * f64::from(unit_mm);
+            let limit_mm = range_mm * step.sin() / (10_f64.to_radians() - step).sin() + 15.0;
+            a.0 + 1 == b.0 && apart(point(&scan, &pose, a.0, a.1), point(&scan, &pose, b.0, b.1)) <= limit_mm
+        };
+        let expected: Vec<_> = ranges.chunk_by(together).collect();
+        most = most.max(expected.len());
+
+        let mut out = foreground(&ranges);
+        Cutter::new(pose).update(&scan, &mut out);
+        assert_eq!(usize::from(out.segments), expected.len().min(SEGMENTS), "round {round}");
+        assert_eq!(usize::from(out.left_out), expected.len().saturating_sub(SEGMENTS));
+        assert!(out.segment_array[out.segments().len()..].iter().all(|rest| *rest == Segment::default()));
+        for (segment, beams) in out.segments().iter().zip(expected) {
+            let ((first, a), (last, b)) = (beams[0], beams[beams.len() - 1]);
+            assert_eq!((usize::from(segment.first), usize::from(segment.last)), (first, last));
+            assert_eq!(Some(segment.nearest), beams.iter().map(|beam| beam.1).min());
+            let points = || beams.iter().map(|&(i, range)| point(&scan, &pose, i, range));
+            let mean = |part: fn((f64, f64)) -> f64| points().map(part).sum::<f64>() / beams.len() as f64;
+            let width =
+                apart(point(&scan, &pose, first, a), point(&scan, &pose, last, b)) / f64::from(unit_mm);
+            for (told, exact) in [
+                (f64::from(segment.width), width),
+                (f64::from(segment.x_mm), mean(|point| point.0)),
+                (f64::from(segment.y_mm), mean(|point| point.1)),
+            ] {
+                assert!((told - exact).abs() < 0.5 + 1e-6, "round {round}: {told}, {exact}");
+            }
+        }
+    }
+    assert!(most > SEGMENTS, "{most} segments at most: none was left out");
+}
+
+#[test]
+fn other_angles_are_pointed_anew() {
+    let mut cutter = Cutter::new(Pose::default());
+    let mut x_mm = |first_angle_mdeg, step_mdeg| {
+        let scan = Scan { count: 361, unit_mm: 1, first_angle_mdeg, step_mdeg, ..Scan::default() };
+        let mut out = foreground(&[(180, 1_000)]);
+        cutter.update(&scan, &mut out);
+        (out.segments()[0].x_mm, out.segments()[0].y_mm)
+    };
+    assert_eq!(x_mm(0, 500), (1_000, 0));
+    assert_eq!(x_mm(0, 1000), (0, 1_000));
+    assert_eq!(x_mm(-90_000, 1000), (1_000, 0));
+}

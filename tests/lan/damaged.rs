@@ -1,0 +1,74 @@
+//! Datagrams with damage inside and a right checksum, and what `schema` says of them.
+
+use fastrand::Rng;
+use schema::Topic;
+use schema::datagram::{Announce, Datagram, HEAD, Head, MTU_ETHERNET};
+use serde_json::{Value, json};
+
+use super::{says, vectors};
+
+/// So many of them, always the same, made from the golden ones.
+pub(crate) fn datagrams(count: u32) -> Vec<(Vec<u8>, Value)> {
+    let mut random = Rng::with_seed(6);
+    let mut golden: Vec<Vec<u8>> = vectors::vectors().into_iter().map(|vector| vector.bytes).collect();
+    golden.retain(|bytes| Datagram::read(bytes).is_ok());
+    let datagrams: Vec<(Vec<u8>, Value)> = (0..count)
+        .map(|_| {
+            let golden = Datagram::read(&golden[random.usize(..golden.len())]).expect("a datagram");
+            let damaged = damage(&mut random, &golden);
+            let expected = expected(&damaged);
+            (damaged, expected)
+        })
+        .collect();
+    let sound = datagrams.iter().filter(|(_, expected)| expected["refusal"].is_null()).count() as u32;
+    assert!((count / 10..count * 9 / 10).contains(&sound), "{sound} of {count} are sound");
+    datagrams
+}
+
+/// What `schema` says of a datagram, in the words of the list.
+pub(crate) fn expected(bytes: &[u8]) -> Value {
+    let sound = Datagram::read(bytes).and_then(|datagram| datagram.check_payload().map(|()| datagram));
+    match sound {
+        Ok(datagram) => json!({ "head": says::head(&datagram), "payload": says::payload(&datagram) }),
+        Err(refusal) => json!({ "refusal": refusal.name() }),
+    }
+}
+
+/// A few bytes of header and payload are others, or the payload ends earlier or later. Text and what is no number stay:
+/// languages differ in how they show those.
+fn damage(random: &mut Rng, datagram: &Datagram<'_>) -> Vec<u8> {
+    let mut payload = datagram.payload.to_vec();
+    let is_spared = |at: usize| match Topic::of_number(datagram.head.topic) {
+        Some(Topic::Status) => (24..336).contains(&at) || at >= 560,
+        None => (8..64).contains(&at),
+        Some(_) => false,
+    };
+    for _ in 0..random.usize(..4) {
+        // The beginning has the counts.
+        let end = if random.bool() { payload.len() } else { payload.len().min(20) };
+        let at = random.usize(..end.max(1));
+        if at < payload.len() && !is_spared(at) {
+            payload[at] = match random.u8(..4) {
+                0 => random.u8(..),
+                1 => random.u8(..4),
+                2 => payload[at].wrapping_add(1),
+                _ => payload[at].wrapping_sub(1),
+            };
+        }
+    }
+    match random.u8(..8) {
+        0 => payload.truncate(random.usize(..=payload.len())),
+        1 => payload.extend(std::iter::repeat_with(|| random.u8(..)).take(20)),
+        _ => {}
+    }
+    let mut head = Head { flags: datagram.head.flags & !1, sequence: random.u32(..), ..datagram.head };
+    if random.u8(..20) == 0 {
+        head.revision = random.u16(..3);
+    }
+    if random.u8(..20) == 0 && head.topic != Topic::Status.number() && head.topic != Announce::NUMBER {
+        head.topic = [1, 2, 3, 4, 5, 6, 8, 255][random.usize(..8)];
+    }
+    let mut buffer = [0; MTU_ETHERNET];
+    buffer[HEAD..HEAD + payload.len()].copy_from_slice(&payload);
+    head.seal(&mut buffer, payload.len()).expect("it fits").to_vec()
+}

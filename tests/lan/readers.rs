@@ -1,0 +1,78 @@
+//! Readers in other languages against the one in `schema`: over the golden datagrams, and over damaged ones whose checksum
+//! is right.
+
+use std::io::{BufRead, BufReader, Write};
+use std::process::{Child, ChildStdin, ChildStdout, Command, Stdio};
+
+use schema::datagram::{Datagram, Packed};
+use schema::{Counter, Scan};
+use serde_json::{Map, Value, json};
+
+use super::{damaged, vectors};
+
+/// A program that answers a datagram in hex with a line of JSON.
+pub(crate) struct Reader {
+    child: Child,
+    input: ChildStdin,
+    output: BufReader<ChildStdout>,
+}
+
+impl Reader {
+    pub(crate) fn start(command: &mut Command) -> Reader {
+        let mut child = command.stdin(Stdio::piped()).stdout(Stdio::piped()).spawn().expect("a program");
+        let (input, output) = (child.stdin.take().expect("a pipe"), child.stdout.take().expect("a pipe"));
+        Reader { child, input, output: BufReader::new(output) }
+    }
+
+    /// What it says of a datagram; `key` as hex digits.
+    pub(crate) fn read(&mut self, key: Option<&str>, datagram: &[u8]) -> Value {
+        let digits: String = datagram.iter().map(|byte| format!("{byte:02x}")).collect();
+        let line = key.map_or(digits.clone(), |key| format!("{key}:{digits}"));
+        writeln!(self.input, "{line}").expect("it reads");
+        let mut answer = String::new();
+        self.output.read_line(&mut answer).expect("it answers");
+        serde_json::from_str(&answer).unwrap_or_else(|error| panic!("{error} in {answer:?} to {line}"))
+    }
+
+    /// It ends by itself, and well.
+    pub(crate) fn end(mut self) {
+        drop(self.input);
+        assert!(self.child.wait().expect("it ends").success());
+    }
+}
+
+/// Every golden datagram is what the list says. What depends on those before it, or on a key, is sound by itself.
+pub(crate) fn golden(reader: &mut Reader) {
+    for vector in vectors::vectors() {
+        let says = vector.says.as_object().expect("an object");
+        let by_itself = !["after", "after_hubs", "with_key"].iter().any(|key| says.contains_key(*key));
+        let expected = if by_itself { vector.says.clone() } else { damaged::expected(&vector.bytes) };
+        same(&vector.file, &vector.bytes, reader.read(None, &vector.bytes), &expected);
+    }
+}
+
+/// Whatever a payload says, they agree on whether it is sound and on what it says.
+pub(crate) fn damaged(reader: &mut Reader, count: u32) {
+    for (datagram, expected) in damaged::datagrams(count) {
+        same("a damaged one", &datagram, reader.read(None, &datagram), &expected);
+    }
+}
+
+fn same(name: &str, bytes: &[u8], mut said: Value, expected: &Value) {
+    if let Some(ranges_mm) = said["payload"].as_object_mut().and_then(|payload| payload.remove("mm")) {
+        let mut scan = Scan::default();
+        assert!(scan.unpack(Datagram::read(bytes).expect("it was read").payload));
+        let expected: Vec<i64> =
+            (0..scan.beams()).map(|i| scan.distance_mm(i).map_or(-1, i64::from)).collect();
+        assert_eq!(ranges_mm, json!(expected), "{name}: {bytes:02x?}");
+    }
+    // A language without names for them.
+    if let Some(counters) = said["payload"]["counters"].as_array() {
+        let names = Counter::ALL.iter().map(|counter| counter.name().to_owned());
+        let named: Map<String, Value> = names.zip(counters.iter().cloned()).collect();
+        said["payload"]["counters"] = named.into();
+    }
+    for key in ["head", "payload", "refusal"] {
+        assert_eq!(said[key], expected[key], "{key} of {name}: {bytes:02x?}");
+    }
+}

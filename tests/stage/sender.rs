@@ -1,0 +1,109 @@
+//! What a gateway sends, said by a test: datagrams of one sensor with their numbers, on the loopback.
+
+use std::net::{Ipv4Addr, UdpSocket};
+
+use rustix::net::sockopt::set_ip_multicast_if;
+use schema::Topic;
+use schema::datagram::{
+    Announce, Announced, GROUPS, HEAD, Head, LanFlags, MTU_ETHERNET, PORT, Packed, group,
+};
+
+/// One sensor of one gateway.
+pub(crate) struct Sender {
+    socket: UdpSocket,
+    pub(crate) hub: u64,
+    pub(crate) epoch: u32,
+    pub(crate) sensor: u8,
+    pub(crate) name: String,
+    pub(crate) boot: u64,
+    /// By topic's number: that of the next datagram.
+    pub(crate) next: [u32; 9],
+    /// Of the telegram that is sent.
+    pub(crate) counter: u32,
+    /// Of what is sent, ns since 1970.
+    pub(crate) stamp_ns: u64,
+}
+
+impl Sender {
+    pub(crate) fn new(hub: u64, epoch: u32, sensor: u8, name: &str) -> Sender {
+        let socket = UdpSocket::bind("127.0.0.1:0").expect("a port");
+        set_ip_multicast_if(&socket, &Ipv4Addr::LOCALHOST).expect("the loopback has an address");
+        let (boot, next, counter, stamp_ns) = (0xb007, [0; 9], 0, wall_ns());
+        Sender { socket, hub, epoch, sensor, name: name.to_owned(), boot, next, counter, stamp_ns }
+    }
+
+    /// The next datagram of `topic`.
+    pub(crate) fn make(&mut self, topic: Topic, payload: &impl Packed) -> Vec<u8> {
+        let mut buffer = [0; MTU_ETHERNET];
+        let len = payload.pack(&mut buffer[HEAD..]).expect("it fits");
+        self.seal(topic.number(), &mut buffer, len)
+    }
+
+    /// The next telegram.
+    pub(crate) fn telegram(&mut self, bytes: &[u8]) -> Vec<u8> {
+        let mut buffer = [0; MTU_ETHERNET];
+        buffer[HEAD..HEAD + bytes.len()].copy_from_slice(bytes);
+        self.seal(Topic::Telegram.number(), &mut buffer, bytes.len())
+    }
+
+    /// Sends the next datagram of `topic`.
+    pub(crate) fn send(&mut self, topic: Topic, payload: &impl Packed) {
+        let datagram = self.make(topic, payload);
+        self.throw(topic, &datagram);
+    }
+
+    /// Sends these bytes to the group of `topic`.
+    pub(crate) fn throw(&self, topic: Topic, bytes: &[u8]) {
+        self.to(group(topic), bytes);
+    }
+
+    /// Announces `topics` with their next numbers.
+    pub(crate) fn announce(&mut self, topics: &[Topic]) {
+        let mut announce = Announce::new(self.boot, &self.name, "LMS200;301063;V02.30");
+        for &topic in topics {
+            let next = self.next[usize::from(topic.number())];
+            announce.add(Announced { topic: topic.number(), group: group(topic), port: PORT, next });
+        }
+        let mut buffer = [0; MTU_ETHERNET];
+        let len = announce.pack(&mut buffer[HEAD..]).expect("it fits");
+        let stamp_ns = std::mem::replace(&mut self.stamp_ns, wall_ns());
+        let datagram = self.seal(Announce::NUMBER, &mut buffer, len);
+        self.stamp_ns = stamp_ns;
+        self.to(Announce::GROUP, &datagram);
+    }
+
+    /// Sends an empty payload of the topic with this number.
+    pub(crate) fn empty(&mut self, number: u8) {
+        let datagram = self.seal(number, &mut [0; HEAD], 0);
+        self.to(Announce::GROUP, &datagram);
+    }
+
+    fn to(&self, group: u8, bytes: &[u8]) {
+        let [a, b, c] = GROUPS;
+        let sent = self.socket.send_to(bytes, (Ipv4Addr::new(a, b, c, group), PORT));
+        assert_eq!(sent.expect("the loopback takes it"), bytes.len());
+    }
+
+    fn seal(&mut self, topic: u8, buffer: &mut [u8], len: usize) -> Vec<u8> {
+        let next = &mut self.next[usize::from(topic)];
+        let head = Head {
+            topic,
+            flags: LanFlags::SIMULATED,
+            hub: self.hub,
+            epoch: self.epoch,
+            sequence: *next,
+            stamp_ns: self.stamp_ns,
+            sensor: self.sensor,
+            revision: 1,
+            counter: self.counter,
+        };
+        *next = next.wrapping_add(1);
+        head.seal(buffer, len).expect("it fits").to_vec()
+    }
+}
+
+/// The wall clock, ns since 1970.
+pub(crate) fn wall_ns() -> u64 {
+    let now = std::time::SystemTime::now().duration_since(std::time::UNIX_EPOCH);
+    now.expect("after 1970").as_nanos() as u64
+}
