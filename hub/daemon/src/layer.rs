@@ -1,6 +1,7 @@
 //! One source of configuration laid over the others: every value is checked where it stands, so that an error names
 //! file, line and column, or the flag.
 
+mod gateway;
 mod processing;
 
 use std::rc::Rc;
@@ -13,6 +14,7 @@ use toml::Spanned;
 
 use crate::config::{Link, Processing, Source};
 use crate::origin::Origin;
+use gateway::GatewayLayer;
 use processing::{BackgroundLayer, MarksLayer, PoseLayer, Sections, ZonesLayer};
 
 /// What one source says. Knows the keys; what is not here is an unknown key.
@@ -24,6 +26,8 @@ pub(crate) struct Layer {
     zones: Option<ZonesLayer>,
     marks: Option<MarksLayer>,
     background: Option<BackgroundLayer>,
+    /// The hub's own configuration may be that of its gateway, too.
+    pub(crate) gateway: Option<GatewayLayer>,
 }
 
 #[derive(Deserialize)]
@@ -78,7 +82,7 @@ impl Drafts {
 
     /// Lays `layer` over the others; only where `may_add` may it bring links that were not there.
     pub(crate) fn merge(&mut self, layer: Layer, origin: Origin, may_add: bool) -> Result<(), Failure> {
-        let Layer { link, zones, marks, background } = layer;
+        let Layer { link, zones, marks, background, gateway: _ } = layer;
         let origin = Rc::new(origin);
         merge(&mut self.links, link, &origin, may_add)?;
         self.general.push((origin, Sections { pose: None, zones, marks, background }));
