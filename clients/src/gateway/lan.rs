@@ -196,14 +196,12 @@ impl Lan {
 
     /// `SENSOR/TOPIC` of which something did not fit into a datagram; each is told once.
     pub(super) fn misfit(&mut self) -> Option<String> {
-        for Rows { name, rows } in &mut self.sensors {
-            for (number, row) in rows.iter_mut().enumerate().filter(|(_, row)| row.fit == Fit::NotAll) {
-                row.fit = Fit::Told;
-                let topic = Topic::of_number(number as u8).map_or("announce", Topic::name);
-                return Some(format!("{name}/{topic}"));
-            }
-        }
-        None
+        self.sensors.iter_mut().find_map(|Rows { name, rows }| {
+            let (number, row) = rows.iter_mut().enumerate().find(|(_, row)| row.fit == Fit::NotAll)?;
+            row.fit = Fit::Told;
+            let topic = Topic::of_number(number as u8).map_or("announce", Topic::name);
+            Some(format!("{name}/{topic}"))
+        })
     }
 
     fn row(&mut self, number: u8, topic: u8) -> Option<&mut Row> {
