@@ -140,6 +140,44 @@ fn igmp() -> String {
     std::fs::read_to_string("/proc/net/igmp").expect("the kernel has multicast")
 }
 
+/// How many of our groups were joined on `interface`.
+fn joined(interface: &str) -> usize {
+    let text = igmp();
+    let mut lines = text.lines().skip_while(|line| line.split_whitespace().nth(1) != Some(interface)).skip(1);
+    let groups = lines.by_ref().take_while(|line| line.starts_with("\t\t"));
+    groups.filter(|line| line.contains("4CFFEF")).count()
+}
+
+/// Runs `ip` with these words.
+fn ip(words: &str) -> bool {
+    std::process::Command::new("ip").args(words.split(' ')).status().is_ok_and(|status| status.success())
+}
+
+#[test]
+fn groups_are_joined_where_a_link_comes_or_comes_back() {
+    in_a_network("groups_are_joined_where_a_link_comes_or_comes_back", || {
+        let make = || ip("link add scan0 type veth peer name far0") && ip("addr add 10.9.0.1/24 dev scan0");
+        if !make() {
+            eprintln!("skipped: the kernel makes no pair of interfaces");
+            return;
+        }
+        let stage = Stage::new();
+        for words in [&["--interface=scan0"][..], &[]] {
+            let program = listener(&stage, words);
+            assert_eq!(joined("scan0"), 0, "it is down");
+            assert!(ip("link set scan0 up") && ip("link set far0 up"));
+            until("the groups are joined", || joined("scan0") == 4);
+            assert!(ip("link set far0 down") && ip("link set far0 up"));
+            assert!(ip("link del scan0") && make() && ip("link set scan0 up") && ip("link set far0 up"));
+            until("the groups are joined again", || joined("scan0") == 4);
+            assert_eq!(joined("lo"), if words.is_empty() { 4 } else { 0 });
+            let outcome = program.end(INT);
+            assert_eq!((outcome.code, outcome.of_class("notice").len()), (Some(0), 0), "{outcome}");
+            assert!(ip("link set scan0 down"));
+        }
+    });
+}
+
 #[test]
 fn the_account_is_exact() {
     in_a_network("the_account_is_exact", || {

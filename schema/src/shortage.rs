@@ -2,6 +2,8 @@
 //! promises segments without allocating them, so that at a full /dev/shm the first touch ends the process by SIGBUS;
 //! of anything else that is short it says no more than "internal error". Refuses to know for what something is needed.
 
+mod segments;
+
 use std::io;
 use std::path::Path;
 
@@ -10,6 +12,8 @@ use rustix::io::Errno;
 use rustix::process::{Resource, getrlimit};
 
 use crate::{Failure, Kind};
+
+pub use segments::{allocate, sensor_bytes};
 
 /// Where POSIX shared memory lives on Linux.
 pub const SHARED_MEMORY: &str = "/dev/shm";
