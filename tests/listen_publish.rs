@@ -169,7 +169,17 @@ fn a_hub_and_two_remote_ones_live_in_one_domain() {
         let mut one = Sender::new(HUB, 7, 0, "front");
         let mut other = Sender::new(0xab, 7, 0, "front");
         let listener = published(&stage, &mut one);
+        // Somebody who follows the hub's sensor waits for the hub, whoever else is in the domain.
+        let mut early = stage.start(&["echo", "--json", "front/scan"]);
+        let absent = stage.run(&["echo", "--json", "front/scan", "-n", "1"]);
+        assert_eq!(
+            (absent.code, &absent.of_class("error")[0]["kind"]),
+            (Some(3), &json!("no_topic")),
+            "{absent}"
+        );
         let hub = stage.hub(&[stage.link("front")]);
+        early.await_line("a scan", |line| line["class"] == "scan");
+        assert_eq!(early.end(INT).code, Some(0));
         other.announce(&[Topic::Zones, Topic::Status]);
         other.send(Topic::Status, &Status::default());
         let second = publisher_refused(&stage);
