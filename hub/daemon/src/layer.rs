@@ -3,6 +3,7 @@
 
 mod gateway;
 mod processing;
+mod sight;
 
 use std::rc::Rc;
 
@@ -16,6 +17,7 @@ use crate::config::{Link, Processing, Source};
 use crate::origin::Origin;
 use gateway::GatewayLayer;
 use processing::{BackgroundLayer, MarksLayer, PoseLayer, Sections, ZonesLayer};
+use sight::Sight;
 
 /// What one source says. Knows the keys; what is not here is an unknown key.
 #[derive(Deserialize)]
@@ -131,9 +133,11 @@ impl Draft {
             return Err(refuse(angle_place, what, "angle = 100"));
         }
         let mut processing = Processing::default();
-        for (origin, sections) in general.iter().chain(&own) {
+        let said: Vec<_> = general.iter().chain(&own).collect();
+        for (origin, sections) in &said {
             sections.clone().lay(origin, &mut processing)?;
         }
+        Sight { name: &name, place: &place, variant, unit, said }.check(&processing)?;
         processing.background.read(&name, variant, unit)?;
         Ok(Link { name, port, family, variant, unit, baud, processing })
     }

@@ -1,7 +1,7 @@
 //! The keys of sections pose, zones, marks and background, and which values they may have. Metres, radians and degrees
 //! become what the processors count in. Each value is checked where it stands; it refuses to know which source wins.
 
-use std::ops::RangeInclusive;
+use std::ops::{Range, RangeInclusive};
 
 use preprocess::background::{Candidate, Method, Start};
 use preprocess::zones::{SECTORS, Sector};
@@ -135,6 +135,22 @@ impl Sections {
         }
         Ok(())
     }
+
+    /// Where the sensor's place is said, if it is.
+    pub(super) fn pose(&self) -> Option<Range<usize>> {
+        let PoseLayer { x, y, yaw, .. } = self.pose.as_ref()?;
+        [x, y, yaw].into_iter().flatten().map(Spanned::span).next()
+    }
+
+    /// Where the robot's own body is said, if it is.
+    pub(super) fn self_min(&self) -> Option<Range<usize>> {
+        self.zones.as_ref()?.self_min.as_ref().map(Spanned::span)
+    }
+
+    /// Where it is said how many beams violate a circle, if it is.
+    pub(super) fn min_beams(&self) -> Option<Range<usize>> {
+        self.zones.as_ref()?.min_beams.as_ref().map(Spanned::span)
+    }
 }
 
 impl ZonesLayer {
@@ -172,7 +188,7 @@ impl BackgroundLayer {
         put(&mut learning.candidate_mm, self.candidate_mm, |value| {
             whole(origin, "candidate_mm", value, 1..=10_000).map(Some)
         })?;
-        put(&mut learning.scans, self.scans, |value| whole(origin, "scans", value, 1..=1_000_000).map(Some))?;
+        put(&mut learning.scans, self.scans, |value| whole(origin, "scans", value, 1..=8_191).map(Some))?;
         if let Some(candidate) = self.candidate {
             learning.candidate = match candidate {
                 CandidateLayer::First => Candidate::First,
@@ -187,7 +203,7 @@ impl BackgroundLayer {
                 file => (Start::Empty, Some(file.into())),
             };
         }
-        learning.no_return_is_far = self.no_return_is_far.unwrap_or(learning.no_return_is_far);
+        learning.no_return_is_far = self.no_return_is_far.or(learning.no_return_is_far);
         if let Some(publish) = self.publish {
             background.every_scan = matches!(publish, PublishLayer::EveryScan);
         }
