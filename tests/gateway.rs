@@ -220,7 +220,11 @@ fn hubs_and_gateways_are_replaced() {
         receiver.await_more(10, of_topic(Topic::Scan));
         hub.end(KILL);
         // Who listens there learns that nothing is known any more.
-        receiver.await_more(1, is_unknown);
+        until("the last word", || {
+            let heard = receiver.heard();
+            let last = heard.iter().map(|bytes| read(bytes)).rfind(of_topic(Topic::Zones));
+            last.is_some_and(|last| is_unknown(&last))
+        });
         let _hub = stage.hub(&links);
         first.await_line("the next hub", |line| line["kind"] == "hub_back");
         receiver.await_more(10, of_topic(Topic::Scan));
