@@ -5,6 +5,7 @@ mod background;
 mod configure;
 mod control;
 mod doctor;
+mod gateway;
 mod leds;
 mod listen;
 mod probe;
@@ -22,6 +23,7 @@ use schema::{DEFAULT_DOMAIN, Domain, Environment, Failure};
 
 pub(crate) use background::Background;
 pub(crate) use control::Control;
+pub(crate) use gateway::Gateway;
 pub(crate) use leds::Leds;
 pub(crate) use listen::Listen;
 pub(crate) use telegram::{Telegram, Way};
@@ -111,6 +113,9 @@ pub(crate) enum Verb {
     /// The zone verdict and the marks as lights: in the terminal, and on diodes of this machine
     #[command(after_help = leds::MEANING)]
     Leds(Leds),
+    /// What the hub publishes, as UDP datagrams on a network: one message each, to multicast groups and to hosts
+    #[command(after_help = gateway::GROUPS)]
+    Gateway(Gateway),
     /// What the gateways of other machines send over the network, and what of it was lost
     Listen(Listen),
 }

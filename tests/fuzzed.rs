@@ -87,6 +87,11 @@ fn processors() {
     run("processors");
 }
 
+#[test]
+fn lan() {
+    run("lan");
+}
+
 /// Inputs beside those of the corpus, for each target.
 const ROUNDS: u32 = 4_000;
 /// Bytes of the longest one.

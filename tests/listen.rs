@@ -3,10 +3,12 @@
 
 mod stage;
 
+use std::io::Read;
+
 use schema::datagram::{HEAD, Refusal, WINDOW};
 use schema::{Background, Foreground, Mark, Marks, Scan, State, Status, Topic, Verdict, Zones};
 use serde_json::{Value, json};
-use stage::{INT, Outcome, Program, Sender, Stage, in_a_network, is_class, until, wall_ns};
+use stage::{INT, Outcome, Program, Sender, Stage, in_a_network, is_class, terminal, until, wall_ns};
 
 const HUB: u64 = 0x5f3a_12bc_00d1_e2f3;
 
@@ -138,6 +140,71 @@ fn people_read_lines_too() {
 /// The groups that this network namespace has joined, as the kernel lists them.
 fn igmp() -> String {
     std::fs::read_to_string("/proc/net/igmp").expect("the kernel has multicast")
+}
+
+/// How many of our groups were joined on `interface`.
+fn joined(interface: &str) -> usize {
+    let text = igmp();
+    let mut lines = text.lines().skip_while(|line| line.split_whitespace().nth(1) != Some(interface)).skip(1);
+    let groups = lines.by_ref().take_while(|line| line.starts_with("\t\t"));
+    groups.filter(|line| line.contains("4CFFEF")).count()
+}
+
+/// Runs `ip` with these words.
+fn ip(words: &str) -> bool {
+    std::process::Command::new("ip").args(words.split(' ')).status().is_ok_and(|status| status.success())
+}
+
+#[test]
+fn on_a_terminal_the_account_is_drawn_over_itself() {
+    in_a_network("on_a_terminal_the_account_is_drawn_over_itself", || {
+        let stage = Stage::new();
+        let (mut keys, screen) = terminal();
+        let mut command = stage.command(&["listen", "--stats", "--interface=lo"]);
+        command.stdout(screen).stderr(std::process::Stdio::null());
+        let mut process = command.spawn().expect("starts");
+        drop(command);
+        until("the groups are joined", || joined("lo") == 4);
+        Sender::new(HUB, 7, 0, "front").send(Topic::Zones, &zones(Verdict::Clear));
+        let mut text = String::new();
+        let mut read = |wanted: &str| {
+            let mut bytes = [0; 4096];
+            while !text.contains(wanted) {
+                let len =
+                    keys.read(&mut bytes).unwrap_or_else(|error| panic!("no {wanted:?}: {error}: {text}"));
+                text.push_str(&String::from_utf8_lossy(&bytes[..len]));
+            }
+        };
+        read("#0/zones");
+        read("\x1b[3A\x1b[J");
+        rustix::process::kill_process(rustix::process::Pid::from_child(&process), INT).expect("it lives");
+        assert!(process.wait().expect("it ends").success());
+    });
+}
+
+#[test]
+fn groups_are_joined_where_a_link_comes_or_comes_back() {
+    in_a_network("groups_are_joined_where_a_link_comes_or_comes_back", || {
+        let make = || ip("link add scan0 type veth peer name far0") && ip("addr add 10.9.0.1/24 dev scan0");
+        if !make() {
+            eprintln!("skipped: the kernel makes no pair of interfaces");
+            return;
+        }
+        let stage = Stage::new();
+        for words in [&["--interface=scan0"][..], &[]] {
+            let program = listener(&stage, words);
+            assert_eq!(joined("scan0"), 0, "it is down");
+            assert!(ip("link set scan0 up") && ip("link set far0 up"));
+            until("the groups are joined", || joined("scan0") == 4);
+            assert!(ip("link set far0 down") && ip("link set far0 up"));
+            assert!(ip("link del scan0") && make() && ip("link set scan0 up") && ip("link set far0 up"));
+            until("the groups are joined again", || joined("scan0") == 4);
+            assert_eq!(joined("lo"), if words.is_empty() { 4 } else { 0 });
+            let outcome = program.end(INT);
+            assert_eq!((outcome.code, outcome.of_class("notice").len()), (Some(0), 0), "{outcome}");
+            assert!(ip("link set scan0 down"));
+        }
+    });
 }
 
 #[test]

@@ -4,8 +4,8 @@
 use schema::Scan;
 use sim::look::Met;
 
+use crate::method::Method;
 use crate::play::Frame;
-use crate::rivals::Method;
 
 /// Scans until a surface is background: the default at half degrees.
 const N: usize = 375;
@@ -53,12 +53,16 @@ impl Boxes {
         let taken = first(is_bare);
         let stood = &frames[taken - 1];
         for (gone, at) in self.gone.iter_mut().zip([taken + N, taken + 2 * N]) {
-            let beams =
-                (0..stood.met.len()).filter(|&i| is_bare(&frames[at].met[i]) && is_still(&stood.met[i]));
-            let mut scan = frames[at].scan;
-            beams.clone().for_each(|i| scan.range_array[i] = stood.scan.range_array[i]);
+            let now = &frames[at];
+            // At its edges a beam may have told what stood behind it.
+            let inside = |i: &usize| now.met[i - 1..=i + 1].iter().all(is_bare);
+            let beams: Vec<usize> = (1..stood.met.len() - 1).filter(inside).collect();
+            let mut scan = now.scan;
+            let span = beams[0]..=beams[beams.len() - 1];
+            scan.range_array[span.clone()].copy_from_slice(&stood.scan.range_array[span]);
             let told = self::told(&mut *make(), &frames[..at], &scan);
-            beams.for_each(|i| gone.count(!told[i]));
+            let met_box = beams.into_iter().filter(|&i| is_still(&stood.met[i]));
+            met_box.for_each(|i| gone.count(!told[i]));
         }
     }
 

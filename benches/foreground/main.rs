@@ -9,6 +9,7 @@
 
 mod boxes;
 mod bytes;
+mod method;
 mod play;
 mod rivals;
 mod score;
@@ -22,8 +23,9 @@ use serde_json::json;
 
 use boxes::Boxes;
 use bytes::Bytes;
+use method::{Hub, Method};
 use play::{Scene, play};
-use rivals::{Hub, Method, Mixtures, TeachIn};
+use rivals::{Mixtures, TeachIn};
 use score::Score;
 
 const SCENES: [Scene; 10] = [

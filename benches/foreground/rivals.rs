@@ -1,37 +1,9 @@
 //! What the hub's methods are measured beside: a teach-in that never adapts, and the mixture of Gaussians that computer
 //! vision takes for the background of pictures, a mixture per beam. Plain versions in floating point and millimetres.
 
-use schema::{Foreground, Scan};
+use schema::Scan;
 
-use preprocess::background::{Class, Model, Settings};
-
-/// Something that tells the foreground of each scan.
-pub(crate) trait Method {
-    /// The beams of `scan` in the foreground.
-    fn update(&mut self, scan: &Scan, foreground: &mut [bool]);
-}
-
-/// A method of the hub.
-#[derive(Clone)]
-pub(crate) struct Hub {
-    pub(crate) model: Model,
-    pub(crate) out: Foreground,
-}
-
-impl Hub {
-    pub(crate) fn new(settings: Settings) -> Hub {
-        Hub { model: Model::new(settings), out: Foreground::default() }
-    }
-}
-
-impl Method for Hub {
-    fn update(&mut self, scan: &Scan, foreground: &mut [bool]) {
-        self.model.update(scan, &mut self.out);
-        for (is_foreground, class) in foreground.iter_mut().zip(self.model.classes()) {
-            *is_foreground = *class == Class::Foreground;
-        }
-    }
-}
+use crate::method::Method;
 
 /// The background is the median of what each beam told in the first [`TEACH_SCANS`] scans, for ever; nearer by more
 /// than 30 mm (60 in cm mode) is foreground.

@@ -331,10 +331,12 @@ def _items(kind, form: str, payload: bytes, begin: int, count: int) -> tuple:
 def _announce(payload: bytes) -> Announce:
     boot, sensor, kind, count = struct.unpack_from("<Q32s24sB3x", payload)
     topics = _items(Announced, "<BBHI", payload, 68, count)
-    name = _text(sensor)
-    possible = "abcdefghijklmnopqrstuvwxyz0123456789_-"
-    _limit(1 <= len(name) <= 24 and name != "robot" and all(c in possible for c in name))
-    return Announce(boot, name, _text(kind), topics)
+    name = sensor.split(b"\0", 1)[0]
+    _limit(1 <= len(name) <= 24 and name != b"robot" and all(c in _OF_NAMES for c in name))
+    return Announce(boot, name.decode(), _text(kind), topics)
+
+
+_OF_NAMES = b"abcdefghijklmnopqrstuvwxyz0123456789_-"
 
 
 def _telegram(payload: bytes) -> Telegram:

@@ -4,7 +4,7 @@
 use std::time::{Duration, Instant};
 
 use schema::ipc::Payload;
-use schema::{DEFAULT_DOMAIN, Domain, Environment, Failure, check_sensor};
+use schema::{DEFAULT_DOMAIN, Domain, Environment, Failure, check_followed};
 
 use crate::follower::{Follower, Received};
 use crate::session::Session;
@@ -35,7 +35,7 @@ impl<P: Payload + ?Sized> Attachment<P> {
     ///
     /// [`Kind::Configuration`](schema::Kind) if the sensor's name is not possible.
     pub fn in_domain(places: Vec<Domain>, sensor: &str) -> Result<Self, Failure> {
-        check_sensor(sensor)?;
+        check_followed(sensor)?;
         Ok(Attachment { session: Session::new(places), follower: Follower::new(sensor), timeout: None })
     }
 

@@ -4,7 +4,7 @@
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
-use schema::{Domain, Failure, Kind, Topic, ipc};
+use schema::{Domain, Failure, Kind, ROBOT, Topic, ipc, is_remote};
 
 use crate::account::Account;
 use crate::names::{TopicName, no_sensor};
@@ -102,6 +102,9 @@ struct Run<'a> {
     waiting_said: bool,
     received: u64,
 }
+
+/// Sensors of other machines that are there have been announced after so long: it is done once a second.
+const ANNOUNCED: Duration = Duration::from_secs(3);
 
 /// Samples taken from one topic before the next one has its turn.
 const TURN: usize = 32;
@@ -241,7 +244,7 @@ impl<'a> Run<'a> {
         }
         let sensors = self.sensors()?;
         let wants_all = self.tracks.iter().all(|track| track.name.is_robot());
-        if wants_all && sensors.is_empty() {
+        if wants_all && !self.may_come(ROBOT) && sensors.iter().all(|sensor| is_remote(sensor)) {
             return Err(Failure::new(
                 Kind::NoTopic,
                 "the hub has no sensors",
@@ -250,12 +253,22 @@ impl<'a> Run<'a> {
             .into());
         }
         for track in &self.tracks {
-            let is_there = track.name.is_robot() || sensors.contains(&track.name.sensor);
+            let sensor = &track.name.sensor;
+            let is_there = track.name.is_robot() || sensors.contains(sensor) || self.may_come(sensor);
             if !track.source.attached() && !is_there {
-                return Err(no_sensor(&track.name.sensor, &sensors).into());
+                return Err(no_sensor(sensor, &sensors).into());
             }
         }
         Ok(())
+    }
+
+    /// Who is not there may come: another machine that is switched on later, or the hub, where only a listener is yet.
+    fn may_come(&self, sensor: &str) -> bool {
+        let unbounded = !self.bounds.bounded();
+        match is_remote(sensor) {
+            true => unbounded || self.started.elapsed() < ANNOUNCED,
+            false => unbounded && !self.session.hub_lives(),
+        }
     }
 
     fn sensors(&self) -> Result<Vec<String>, Failure> {

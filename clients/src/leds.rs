@@ -10,7 +10,7 @@ use std::path::{Path, PathBuf};
 use std::sync::atomic::AtomicBool;
 use std::time::Instant;
 
-use schema::{Domain, Failure, Kind, ROBOT, Topic, check_sensor};
+use schema::{Domain, Failure, Kind, ROBOT, Topic, check_followed};
 use serde::Serialize;
 
 use crate::account::Account;
@@ -68,7 +68,7 @@ pub fn leds(
     let LedsOptions { sensor, leds, .. } = options;
     let topics = if sensor == ROBOT { &[Topic::Zones][..] } else { &[Topic::Zones, Topic::Marks] };
     if sensor != ROBOT {
-        check_sensor(sensor)?;
+        check_followed(sensor)?;
     }
     let names: Vec<_> = topics.iter().map(|&topic| TopicName { sensor: sensor.clone(), topic }).collect();
     let wanted = leds.iter().map(|led| wanted(sensor, led)).collect::<Result<Vec<_>, _>>()?;

@@ -5,7 +5,7 @@ use std::path::PathBuf;
 use std::sync::atomic::AtomicBool;
 
 use schema::ipc::{self, Node, Payload, PortFactory};
-use schema::{Background, Domain, Failure, Foreground, Marks, Scan, Status, Topic, Zones, holder};
+use schema::{Background, Domain, Failure, Foreground, Marks, Scan, Status, Topic, Zones, publisher};
 use serde::{Serialize, Serializer};
 
 use crate::info::statuses;
@@ -68,7 +68,7 @@ pub fn list_domains(bases: &[PathBuf], json: bool, out: &mut dyn Write) -> Resul
                 continue;
             };
             // Another user's domain is not one of this user's.
-            if let Ok(Some(pid)) = holder(domain.root()) {
+            if let Ok(Some(pid)) = publisher(domain.root()) {
                 let root = domain.root().to_owned();
                 lines.push(Line { class: "domain", domain: domain.name().to_owned(), root, pid });
             }

@@ -2,8 +2,8 @@
 //! who sends it, and to answer.
 
 mod ear;
-mod interface;
 mod names;
+mod publish;
 mod remote;
 mod report;
 mod roll;
@@ -13,10 +13,11 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
 use schema::datagram::{Account, Announce, Datagram, Fresh, group};
-use schema::{Failure, Kind, Topic};
+use schema::{Domain, Failure, Kind, Topic};
 
 use self::ear::{Ear, LONGEST};
 use self::names::Names;
+use self::publish::Publication;
 use self::remote::Remote;
 use self::report::Report;
 use self::roll::Roll;
@@ -35,6 +36,8 @@ pub struct ListenOptions {
     pub names: Vec<String>,
     /// Only the account, no samples.
     pub stats: bool,
+    /// Instead of writing samples, publish them in this domain, as `HUB.SENSOR`.
+    pub publish: Option<Domain>,
     /// Objects instead of text.
     pub json: bool,
     /// `out` is a terminal: the account is shown each second.
@@ -46,8 +49,12 @@ pub struct ListenOptions {
 /// Writes the samples that come to `out`, and at the end the account; what is no sample goes to `notes` (stderr) if `out`
 /// is not JSON. Ends when the bounds are reached, `stop` is set, or nobody reads any more.
 ///
+/// With a domain to publish in no samples are written: what comes is to be followed there, without a copy for each
+/// consumer. Then it takes the place of a listener in the domain, of which there is one.
+///
 /// [`Kind::NoTopic`] with what there is, [`Kind::Configuration`] if there is no such interface or a name is not possible,
-/// [`Kind::Failed`] if the port cannot be had, [`Kind::Timeout`], [`Kind::Interrupted`] if bounded and `stop` came first.
+/// [`Kind::DomainHeld`] if another listener publishes in the domain, [`Kind::Short`] if memory for that is, [`Kind::Failed`]
+/// if the port cannot be had, [`Kind::Timeout`], [`Kind::Interrupted`] if bounded and `stop` came first.
 pub fn listen(
     options: &ListenOptions,
     out: &mut dyn Write,
@@ -58,6 +65,7 @@ pub fn listen(
     let names = Names::parse(&options.names)?;
     let groups = groups(&wanted);
     let now = Instant::now();
+    let publication = options.publish.as_ref().map(|domain| Publication::open(domain, now)).transpose()?;
     let ear = Ear::open(options.interface.as_deref(), &groups, now)?;
     // Of topics whose group is not joined announcements would tell as lost what nobody wanted.
     let heard: Vec<_> = Topic::ALL.into_iter().filter(|&topic| groups.contains(&group(topic))).collect();
@@ -65,6 +73,8 @@ pub fn listen(
         options,
         wanted,
         ear,
+        publication,
+        told: Vec::new(),
         account: Box::new(Account::new(&heard)),
         roll: Roll::default(),
         report: Report::new(options.json, Output::new(out), Output::new(notes), names),
@@ -80,6 +90,9 @@ struct Listener<'a> {
     options: &'a ListenOptions,
     wanted: Vec<Topic>,
     ear: Ear,
+    publication: Option<Publication>,
+    /// What was told that is wrong here.
+    told: Vec<String>,
     account: Box<Account>,
     roll: Roll,
     report: Report<'a>,
@@ -95,15 +108,19 @@ const TURN: usize = 64;
 /// The longest sleep: so often interfaces and reasons to stop are looked at.
 const LONGEST_WAIT: Duration = Duration::from_millis(100);
 
+/// The most things that are told to be wrong: it may be the network that makes them.
+const TOLD: usize = 16;
+
 /// Between two accounts on a terminal.
 const DRAW_EVERY: Duration = Duration::from_secs(1);
 
 impl Listener<'_> {
     fn listen(&mut self, stop: &AtomicBool) -> Result<(), End> {
-        self.report.ready(&self.ear.interfaces())?;
+        self.report.ready(&self.ear.interfaces(), self.options.publish.as_ref())?;
         let end = self.run(stop);
         if !matches!(end, Err(End::ReaderGone)) {
             self.report.account(&self.account, &self.roll)?;
+            self.publication.iter().try_for_each(|publication| self.report.publication(publication))?;
         }
         end
     }
@@ -112,6 +129,9 @@ impl Listener<'_> {
         let mut buffer = vec![0; LONGEST];
         loop {
             let more = self.take(&mut buffer)?;
+            if let Some(publication) = &mut self.publication {
+                publication.wake();
+            }
             let (now, bounds) = (Instant::now(), &self.options.bounds);
             if bounds.count.is_some_and(|count| self.received >= count) {
                 return Ok(());
@@ -165,6 +185,11 @@ impl Listener<'_> {
         }
         self.received += 1;
         self.last_sample = Instant::now();
+        let remote = Remote { topic, datagram, boot, arrival_ns: now.monotonic_ns, age_ns, late };
+        if let Some(publication) = &mut self.publication {
+            publication.sample(&remote, self.last_sample);
+            return Ok(());
+        }
         if self.options.stats {
             return Ok(());
         }
@@ -172,24 +197,41 @@ impl Listener<'_> {
         if missed > 0 {
             self.report.missed(&head, sensor, topic, missed)?;
         }
-        let arrival_ns = now.monotonic_ns;
-        self.report.sample(&Remote { topic, sensor, datagram, boot, arrival_ns, age_ns, late })
+        self.report.sample(sensor, &remote)
     }
 
     fn announced(&mut self, datagram: &Datagram<'_>, wall_ns: u64) -> Result<(), End> {
         let head = datagram.head;
         let Some(announce) = Announce::unpack(datagram.payload) else { return Ok(()) };
-        match self.roll.life(&head).announce(head.sensor, &announce, head.stamp_ns, wall_ns) {
-            Some(behind_ns) => self.report.clocks_differ(&head, behind_ns),
-            None => Ok(()),
+        let life = self.roll.life(&head);
+        if let Some(behind_ns) = life.announce(head.sensor, &announce, head.stamp_ns, wall_ns) {
+            self.report.clocks_differ(&head, behind_ns)?;
         }
+        let Some(publication) = &mut self.publication else { return Ok(()) };
+        match publication.announced(&head, &self.report.names.of(head.hub), &announce) {
+            Ok(Some(name)) => self.report.published(&head, &name),
+            Ok(None) => Ok(()),
+            Err(failure) => self.trouble(&failure.to_string()),
+        }
+    }
+
+    /// Tells what is wrong here, once; of ever new things only the first ones.
+    fn trouble(&mut self, what: &str) -> Result<(), End> {
+        if self.told.len() == TOLD || self.told.iter().any(|told| told == what) {
+            return Ok(());
+        }
+        self.told.push(what.to_owned());
+        self.report.trouble(what)
     }
 
     /// What is due now and then.
     fn look(&mut self, now: Instant) -> Result<(), End> {
         self.ear.look(now)?;
-        if let Some(what) = self.ear.news_of_trouble() {
-            self.report.trouble(what)?;
+        if let Some(what) = self.ear.take_trouble() {
+            self.trouble(&what)?;
+        }
+        if let Some(publication) = &mut self.publication {
+            publication.look(now);
         }
         if self.options.stats && self.options.terminal && !self.options.json && now >= self.draw_at {
             self.draw_at = now + DRAW_EVERY;

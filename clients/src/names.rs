@@ -2,7 +2,7 @@
 
 use std::fmt;
 
-use schema::{Failure, Kind, ROBOT, Topic, check_sensor};
+use schema::{Failure, Kind, ROBOT, Topic, check_followed};
 
 /// One topic of one sensor.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -35,7 +35,7 @@ impl TopicName {
             return Err(Failure::new(Kind::NoTopic, format!("no topic {text:?}"), hint));
         }
         if !name.is_robot() {
-            check_sensor(sensor)?;
+            check_followed(sensor)?;
         }
         Ok(name)
     }

@@ -1,8 +1,8 @@
-//! Is there a hub, and where? Asks the locks of the places that a domain may be at; refuses to open anything there.
+//! Is there a hub, or a listener that stands for hubs of other machines, and where? Asks the locks of the places that a domain may be at; refuses to open anything there.
 
 use std::time::{Duration, Instant};
 
-use schema::{Domain, Failure, Kind, holder};
+use schema::{Domain, Failure, Kind, publisher};
 
 /// How often the locks are looked at.
 const LOOK_EVERY: Duration = Duration::from_millis(100);
@@ -70,7 +70,7 @@ impl Presence {
 
     fn live(&mut self) -> Option<(Domain, u32)> {
         for place in &self.places {
-            match holder(place.root()) {
+            match publisher(place.root()) {
                 // 0: it has the lock and not yet written who it is.
                 Ok(None | Some(0)) => {}
                 Ok(Some(pid)) => return Some((place.clone(), pid)),

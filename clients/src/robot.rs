@@ -2,7 +2,7 @@
 
 use std::time::{Duration, Instant};
 
-use schema::{Domain, Failure, Verdict, Zones, check_sensor, ipc};
+use schema::{Domain, Failure, Verdict, Zones, check_followed, ipc, is_remote};
 
 use crate::attach::places;
 use crate::clock;
@@ -11,7 +11,7 @@ use crate::presence::GRACE;
 use crate::session::Session;
 use crate::zones::{Heard, ZonesSource};
 
-/// Follows the zones of `sensors` (none: all sensors of the hub) in the domain that SCANHUB_DOMAIN names. There need
+/// Follows the zones of `sensors` (none: all sensors of the hub on this machine) in the domain that SCANHUB_DOMAIN names. There need
 /// not be a hub yet.
 ///
 /// [`Kind::Configuration`](schema::Kind) if a name is not possible.
@@ -66,7 +66,7 @@ impl RobotFollower {
     ///
     /// [`Kind::Configuration`](schema::Kind) if a sensor's name is not possible.
     pub fn in_domain(places: Vec<Domain>, sensors: &[&str]) -> Result<RobotFollower, Failure> {
-        sensors.iter().try_for_each(|sensor| check_sensor(sensor))?;
+        sensors.iter().try_for_each(|sensor| check_followed(sensor))?;
         Ok(RobotFollower { session: Session::new(places), source: RobotSource::new(sensors) })
     }
 
@@ -197,7 +197,8 @@ impl RobotSource {
             return Ok(());
         }
         self.call_at = Some(now + CALL_EVERY);
-        for sensor in ipc::sensors(domain)? {
+        // The zones of another robot's sensors are around its own centre.
+        for sensor in ipc::sensors(domain)?.into_iter().filter(|sensor| !is_remote(sensor)) {
             if self.robot.sensors().all(|(known, _)| known != sensor) {
                 self.follow(&sensor);
             }

@@ -3,7 +3,7 @@
 
 use std::time::Duration;
 
-use schema::{Domain, Failure, Header, Zones, check_sensor};
+use schema::{Domain, Failure, Header, Zones, check_followed};
 
 use crate::attach::places;
 use crate::clock;
@@ -49,7 +49,7 @@ impl ZonesFollower {
     ///
     /// [`Kind::Configuration`](schema::Kind) if the sensor's name is not possible.
     pub fn in_domain(places: Vec<Domain>, sensor: &str) -> Result<ZonesFollower, Failure> {
-        check_sensor(sensor)?;
+        check_followed(sensor)?;
         Ok(ZonesFollower { session: Session::new(places), source: ZonesSource::new(sensor) })
     }
 

@@ -258,6 +258,7 @@ unpack_payload[0] = function(payload, tree, hub, sensor)
     local len = payload:len()
     if len < 68 or len < 68 + 8 * payload(64, 1):uint() then return nil end
     local name = payload(8, 32):stringz()
+    if not name:match("^[a-z0-9_-]+$") or #name > 24 or name == "robot" then return nil end
     names[hub .. "/" .. sensor] = name
     tree:add_le(f["announce.boot"], payload(0, 8))
     tree:add(f["announce.sensor"], payload(8, 32), name)

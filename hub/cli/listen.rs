@@ -22,6 +22,10 @@ pub(crate) struct Listen {
     /// Only the account: what was received, lost, doubled, out of order, refused
     #[arg(long)]
     stats: bool,
+    /// Publish what comes in the domain of this machine as HUB.SENSOR, instead of writing it, so that all programs here
+    /// follow remote sensors as they follow those of a hub
+    #[arg(long)]
+    publish: bool,
     #[command(flatten)]
     limits: Limits,
 }
@@ -33,6 +37,7 @@ impl Listen {
             topics: self.topics.clone(),
             names: self.names.clone(),
             stats: self.stats,
+            publish: if self.publish { Some(everywhere.hub_domain()?) } else { None },
             json: everywhere.json,
             terminal: stdout().is_terminal(),
             bounds: self.limits.bounds(),

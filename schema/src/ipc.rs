@@ -24,6 +24,7 @@ use iceoryx2::service::Service as _;
 use iceoryx2::service::port_factory::{event, publish_subscribe};
 
 use self::trouble::{Trouble, create, full, no_port, no_publisher, open};
+use crate::lock::MakingLock;
 use crate::shortage::check_client;
 use crate::{
     Background, Domain, Failure, Foreground, Header, Kind, Marks, Scan, Status, Topic, Wake, Zones, access,
@@ -60,8 +61,8 @@ pub type Notifier = port::notifier::Notifier<Service>;
 /// Sleeps until it is woken.
 pub type Listener = port::listener::Listener<Service>;
 
-/// The hub's node in `domain`, for who holds its [`HubLock`](crate::HubLock). Cleans up what dead hubs and consumers
-/// left.
+/// The node of a hub or listener in `domain`, for who holds its [`HubLock`](crate::HubLock) or
+/// [`ListenLock`](crate::ListenLock). Cleans up what dead ones and consumers left.
 ///
 /// [`Kind::Failed`] with owner, mode and remedy if the directory is another user's.
 pub fn hub_node(domain: &Domain) -> Result<Node, Failure> {
@@ -251,6 +252,7 @@ fn node(domain: &Domain, cleanup: bool) -> Result<Node, Failure> {
     config.global.node.cleanup_dead_nodes_on_destruction = false;
     config.global.service.cleanup_dead_nodes_on_open = false;
     if cleanup {
+        let _making = MakingLock::wait(domain.root())?;
         leftover::sweep(std::path::Path::new(&config.global.service_dir().to_string()));
     } else {
         config.global.creation_timeout = Duration::from_millis(100);

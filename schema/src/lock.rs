@@ -1,5 +1,6 @@
-//! One hub per domain: a lock on `<root>/hub.lock` that dies with its process. Consumers ask who holds it and never
-//! hold it themselves. Refuses to know what the hub does.
+//! Who publishes in a domain: one hub at most, and one listener that brings topics of other machines. Each holds a lock
+//! that dies with its process. Consumers ask who holds them and never hold one themselves. Refuses to know what is
+//! published.
 
 use std::fs::{DirBuilder, File, OpenOptions};
 use std::io::{self, ErrorKind};
@@ -16,7 +17,7 @@ use crate::{Failure, Kind, access, shortage};
 /// The lock of a hub on its domain; it ends with the value or with the process, however that ends.
 #[derive(Debug)]
 pub struct HubLock {
-    file: File,
+    _held: Held,
 }
 
 impl HubLock {
@@ -25,33 +26,81 @@ impl HubLock {
     /// [`Kind::DomainHeld`] if another hub has it (the message names its pid), [`Kind::Failed`] if the directory is
     /// another user's or cannot be made.
     pub fn acquire(root: &Path) -> Result<HubLock, Failure> {
-        DirBuilder::new().recursive(true).mode(0o700).create(root).map_err(|error| unusable(root, &error))?;
-        if let Some(failure) = access::foreign(root) {
-            return Err(failure);
+        Ok(HubLock { _held: Held::acquire(root, HUB, "hub")? })
+    }
+}
+
+/// The lock of who publishes in a domain what other machines send. It stands beside a hub's and ends as that does.
+#[derive(Debug)]
+pub struct ListenLock {
+    _held: Held,
+}
+
+impl ListenLock {
+    /// As [`HubLock::acquire`].
+    pub fn acquire(root: &Path) -> Result<ListenLock, Failure> {
+        Ok(ListenLock { _held: Held::acquire(root, LISTENER, "listener")? })
+    }
+}
+
+/// Held while services are made in a domain or what is left of unfinished ones is swept away, by hub and listener in
+/// turn.
+pub(crate) struct MakingLock {
+    _held: Held,
+}
+
+impl MakingLock {
+    /// Waits for it; nobody holds it for longer than a service takes to be made.
+    pub(crate) fn wait(root: &Path) -> Result<MakingLock, Failure> {
+        let file = Held::open(root, MAKING)?;
+        loop {
+            match fcntl(file.as_raw_fd(), FcntlArg::F_OFD_SETLKW(&whole_file(libc::F_WRLCK))) {
+                Ok(_) => return Ok(MakingLock { _held: Held { file } }),
+                Err(Errno::EINTR) => {}
+                Err(error) => return Err(unusable(root, &error.into())),
+            }
         }
-        let path = root.join(NAME);
-        let file = OpenOptions::new()
-            .read(true)
-            .write(true)
-            .create(true)
-            .truncate(false)
-            .mode(0o600)
-            .open(&path)
-            .map_err(|error| unusable(root, &error))?;
+    }
+}
+
+/// A lock on a file.
+#[derive(Debug)]
+struct Held {
+    file: File,
+}
+
+impl Held {
+    fn acquire(root: &Path, name: &str, who: &str) -> Result<Held, Failure> {
+        let file = Held::open(root, name)?;
         match fcntl(file.as_raw_fd(), FcntlArg::F_OFD_SETLK(&whole_file(libc::F_WRLCK))) {
             Ok(_) => {}
-            Err(Errno::EAGAIN | Errno::EACCES) => return Err(held(root, pid_in(&file))),
+            Err(Errno::EAGAIN | Errno::EACCES) => return Err(held(root, who, pid_in(&file))),
             Err(error) => return Err(unusable(root, &error.into())),
         }
         let pid = format!("{}\n", std::process::id());
         file.set_len(0)
             .and_then(|()| file.write_all_at(pid.as_bytes(), 0))
             .map_err(|error| unusable(root, &error))?;
-        Ok(HubLock { file })
+        Ok(Held { file })
+    }
+
+    fn open(root: &Path, name: &str) -> Result<File, Failure> {
+        DirBuilder::new().recursive(true).mode(0o700).create(root).map_err(|error| unusable(root, &error))?;
+        if let Some(failure) = access::foreign(root) {
+            return Err(failure);
+        }
+        OpenOptions::new()
+            .read(true)
+            .write(true)
+            .create(true)
+            .truncate(false)
+            .mode(0o600)
+            .open(root.join(name))
+            .map_err(|error| unusable(root, &error))
     }
 }
 
-impl Drop for HubLock {
+impl Drop for Held {
     /// Closing is not enough: a process that is just being started has a copy of the descriptor for a moment.
     fn drop(&mut self) {
         let _ = fcntl(self.file.as_raw_fd(), FcntlArg::F_OFD_SETLK(&whole_file(libc::F_UNLCK)));
@@ -63,7 +112,19 @@ impl Drop for HubLock {
 ///
 /// [`Kind::Failed`] if the directory is another user's.
 pub fn holder(root: &Path) -> Result<Option<u32>, Failure> {
-    let file = match File::open(root.join(NAME)) {
+    holder_of(root, HUB)
+}
+
+/// The process that publishes in `root`: the hub, or else a listener; failures and 0 as with [`holder`].
+pub fn publisher(root: &Path) -> Result<Option<u32>, Failure> {
+    match holder_of(root, HUB)? {
+        None => holder_of(root, LISTENER),
+        hub => Ok(hub),
+    }
+}
+
+fn holder_of(root: &Path, name: &str) -> Result<Option<u32>, Failure> {
+    let file = match File::open(root.join(name)) {
         Ok(file) => file,
         Err(error) if matches!(error.kind(), ErrorKind::NotFound | ErrorKind::NotADirectory) => {
             return Ok(None);
@@ -76,7 +137,9 @@ pub fn holder(root: &Path) -> Result<Option<u32>, Failure> {
     if lock.l_type == libc::F_UNLCK as libc::c_short { Ok(None) } else { Ok(Some(pid_in(&file))) }
 }
 
-const NAME: &str = "hub.lock";
+const HUB: &str = "hub.lock";
+const LISTENER: &str = "listen.lock";
+const MAKING: &str = "making.lock";
 
 /// A lock of the whole file, however long; `l_pid` has to be 0 for open file descriptions.
 fn whole_file(kind: libc::c_int) -> flock {
@@ -96,10 +159,10 @@ fn pid_in(file: &File) -> u32 {
     str::from_utf8(&bytes[..length]).ok().and_then(|text| text.trim_end().parse().ok()).unwrap_or_default()
 }
 
-fn held(root: &Path, pid: u32) -> Failure {
+fn held(root: &Path, who: &str, pid: u32) -> Failure {
     Failure::new(
         Kind::DomainHeld,
-        format!("another hub holds {}: pid {pid}", root.display()),
+        format!("another {who} holds {}: pid {pid}", root.display()),
         "stop it, or choose another --domain",
     )
 }

@@ -2,14 +2,18 @@
 //! promises segments without allocating them, so that at a full /dev/shm the first touch ends the process by SIGBUS;
 //! of anything else that is short it says no more than "internal error". Refuses to know for what something is needed.
 
+mod segments;
+
 use std::io;
 use std::path::Path;
 
 use rustix::fs::{StatVfs, statvfs};
 use rustix::io::Errno;
-use rustix::process::{Resource, getrlimit};
+use rustix::process::{Resource, getrlimit, setrlimit};
 
 use crate::{Failure, Kind};
+
+pub use segments::{allocate, sensor_bytes};
 
 /// Where POSIX shared memory lives on Linux.
 pub const SHARED_MEMORY: &str = "/dev/shm";
@@ -49,6 +53,16 @@ pub fn check_descriptors(needed: u64) -> Result<(), Failure> {
         format!("descriptors are short: {open} are open, {needed} more needed, the limit is {limit}"),
         "raise the limit: `ulimit -n`, for a service LimitNOFILE",
     ))
+}
+
+/// Lets the process have as many descriptors as its hard limit allows: who publishes needs about four for each consumer
+/// of a topic.
+///
+/// The system's error if it does not let it.
+pub fn raise_descriptor_limit() -> io::Result<()> {
+    let mut limit = getrlimit(Resource::Nofile);
+    limit.current = limit.maximum;
+    Ok(setrlimit(Resource::Nofile, limit)?)
 }
 
 /// Shared memory is short, in the words of `what`.

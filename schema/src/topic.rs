@@ -144,6 +144,20 @@ pub fn check_sensor(name: &str) -> Result<(), Failure> {
     ))
 }
 
+/// Refuses what no consumer can follow: neither a sensor's name nor that of a remote one, `HUB.SENSOR`, of which each
+/// half is as a sensor's name: [`Kind::Configuration`].
+pub fn check_followed(name: &str) -> Result<(), Failure> {
+    match name.split_once('.') {
+        Some((hub, sensor)) => check_sensor(hub).and_then(|()| check_sensor(sensor)),
+        None => check_sensor(name),
+    }
+}
+
+/// The sensor is another machine's; a listener brings its topics here.
+pub fn is_remote(sensor: &str) -> bool {
+    sensor.contains('.')
+}
+
 fn service(sensor: &str, topic: &str) -> String {
     format!("scanhub/v1/{sensor}/{topic}")
 }
@@ -172,6 +186,10 @@ mod tests {
         assert!(check_sensor("front_2-b").is_ok());
         for bad in ["", "Front", "a/b", "a b", "ä", ROBOT, &"a".repeat(25)] {
             assert_eq!(check_sensor(bad).map_err(|failure| failure.kind), Err(Kind::Configuration), "{bad}");
+            assert!(check_followed(bad).is_err() && check_followed(&format!("hub.{bad}")).is_err(), "{bad}");
         }
+        assert!(check_sensor("hub.front").is_err() && check_followed("00ab.front").is_ok());
+        assert!(check_followed("front").is_ok() && check_followed("a.b.c").is_err());
+        assert!(is_remote("hub.front") && !is_remote("front"));
     }
 }

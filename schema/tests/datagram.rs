@@ -135,6 +135,42 @@ fn every_reason_has_its_datagram() {
     }
 }
 
+/// What the page shows is so: header fields without a hole, sizes, an example, reasons and their order.
+#[test]
+fn the_page_shows_these_bytes() {
+    let top = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).parent().unwrap();
+    let page = std::fs::read_to_string(top.join("docs/datagram.md")).unwrap();
+    let section = |name: &str| {
+        let (_, rest) = page.split_once(&format!("\n## {name}\n")).unwrap_or_else(|| panic!("no {name}"));
+        rest.split("\n## ").next().unwrap_or_default()
+    };
+    let rows = |name: &str| -> Vec<Vec<&str>> {
+        let rows = section(name).lines().filter(|line| line.starts_with("| "));
+        rows.map(|row| row.split('|').map(str::trim).skip(1).collect()).collect()
+    };
+    let mut end = 0;
+    for row in rows("Header").iter().skip(1) {
+        assert_eq!(row[0].parse(), Ok(end), "{row:?}");
+        end += row[1].parse::<usize>().unwrap();
+    }
+    assert_eq!(end, HEAD);
+    let is_file = |row: &&Vec<&str>| row[0].ends_with(".hex`");
+    let sizes = rows("Payloads");
+    let sizes = sizes.iter().filter(is_file).map(|row| (row[0].trim_matches('`'), row[1].parse().unwrap()));
+    let vectors = vectors();
+    let sound = vectors.iter().filter(|vector| vector.says["refusal"].is_null());
+    assert!(sizes.eq(sound.map(|vector| (vector.file.as_str(), vector.bytes.len()))));
+    let example =
+        vector("zones").chunks(16).enumerate().fold(String::from("\n"), |lines, (number, bytes)| {
+            let digits: String = bytes.iter().map(|byte| format!("{byte:02x}")).collect();
+            format!("{lines}{:2}  {digits}\n", 16 * number)
+        });
+    assert_eq!(section("Payloads").split("```").nth(1), Some(example.as_str()));
+    let reasons = rows("What a receiver refuses");
+    let reasons = reasons.iter().skip(1).map(|row| row[0].trim_matches('`'));
+    assert!(reasons.eq(Refusal::ALL.map(Refusal::name)));
+}
+
 fn sealed(head: Head, payload: &[u8]) -> Vec<u8> {
     let mut buffer = [0; MTU_SAFE];
     buffer[HEAD..HEAD + payload.len()].copy_from_slice(payload);

@@ -7,8 +7,8 @@ use std::time::Duration;
 
 use schema::ipc::{self, Payload, PortFactory};
 use schema::{
-    Domain, Failure, Header, HubLock, Kind, Request, Response, Scan, Status, Topic, Verb, Wake, holder,
-    limits,
+    Domain, Failure, Header, HubLock, Kind, ListenLock, Request, Response, Scan, Status, Topic, Verb, Wake,
+    holder, limits, publisher,
 };
 
 /// A domain that goes with the test.
@@ -192,7 +192,12 @@ fn one_hub_holds_a_domain() {
     assert!(second.message.contains(&format!("pid {}", std::process::id())), "{second}");
     drop(lock);
     assert_eq!(holder(root), Ok(None));
+    let listener = ListenLock::acquire(root).unwrap();
+    assert_eq!((holder(root), publisher(root)), (Ok(None), Ok(Some(std::process::id()))));
+    assert!(ListenLock::acquire(root).unwrap_err().message.starts_with("another listener holds "));
     let _again = HubLock::acquire(root).unwrap();
+    drop(listener);
+    assert_eq!(publisher(root), Ok(Some(std::process::id())));
 }
 
 #[test]

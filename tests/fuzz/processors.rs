@@ -44,7 +44,7 @@ pub(super) fn processors(data: &[u8]) {
         scans: is(5).then(|| u32::from(bytes.u8())),
         candidate: if is(6) { Candidate::First } else { Candidate::Latest },
         start: if is(7) { Start::FirstScan } else { Start::Empty },
-        no_return_is_far: is(1),
+        no_return_is_far: Some(is(1)),
     });
     let mut cutter = Cutter::new(pose);
     let (mut zones, mut marks) = (Zones::unknown(), Marks::default());

@@ -1,6 +1,7 @@
 //! What has to hold whatever comes: one function for each place where the world's bytes enter. The fuzzer calls them
 //! with what it invents, `tests/fuzzed.rs` with the corpus and with seeded noise. They know invariants, no examples.
 
+mod lan;
 mod processors;
 
 use lms::command::Request;
@@ -19,12 +20,13 @@ use lms::{Control, MILLIS, Nanos, Settings};
 pub type Target = (&'static str, fn(&[u8]));
 
 /// All of them; the names are those of the corpus' folders.
-pub const TARGETS: [Target; 5] = [
+pub const TARGETS: [Target; 6] = [
     ("framer", framer),
     ("replies", replies),
     ("session", session),
     ("configuration", configuration),
     ("processors", processors),
+    ("lan", lan),
 ];
 
 /// Any bytes in any pieces: what is delivered stood there and has a right checksum, in order, and no byte vanishes.
@@ -227,4 +229,9 @@ pub fn configuration(data: &[u8]) {
 /// Any scans, whoever sends such, with any settings, through all processors.
 pub fn processors(data: &[u8]) {
     processors::processors(data);
+}
+
+/// Any datagrams, one after the other, through all checks and the receiver's account.
+pub fn lan(data: &[u8]) {
+    lan::lan(data);
 }

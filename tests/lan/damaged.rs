@@ -40,7 +40,7 @@ fn damage(random: &mut Rng, datagram: &Datagram<'_>) -> Vec<u8> {
     let mut payload = datagram.payload.to_vec();
     let is_spared = |at: usize| match Topic::of_number(datagram.head.topic) {
         Some(Topic::Status) => (24..336).contains(&at) || at >= 560,
-        None => (8..64).contains(&at),
+        None => (40..64).contains(&at),
         Some(_) => false,
     };
     for _ in 0..random.usize(..4) {

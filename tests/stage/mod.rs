@@ -5,6 +5,7 @@
 mod line;
 mod network;
 mod program;
+mod receiver;
 mod sender;
 mod telegrams;
 mod terminal;
@@ -22,6 +23,7 @@ use serde_json::Value;
 pub(crate) use line::{Line, open_line};
 pub(crate) use network::in_a_network;
 pub(crate) use program::{INT, KILL, Outcome, Program, TERM};
+pub(crate) use receiver::{Receiver, ip, read};
 pub(crate) use sender::{Sender, wall_ns};
 pub(crate) use telegrams::{MEASURED, Sent, bytes_of, hash, is_class, number, scan, sequence};
 pub(crate) use terminal::terminal;

@@ -10,7 +10,7 @@ use schema::datagram::{GROUPS, PORT};
 use schema::{Failure, Kind};
 use socket2::{Domain, InterfaceIndexOrAddress, Protocol, Socket, Type};
 
-use super::interface::{Interface, interfaces, named};
+use crate::interface::{Interface, interfaces, named};
 
 /// Hears groups.
 pub(super) struct Ear {
@@ -20,8 +20,8 @@ pub(super) struct Ear {
     only: Option<String>,
     joined: Vec<Joined>,
     look_at: Instant,
-    /// Why the groups could not be joined somewhere, and whether that was asked for.
-    trouble: Option<(String, bool)>,
+    /// Why the groups could not be joined somewhere.
+    trouble: Option<String>,
 }
 
 /// An interface on which the groups were joined.
@@ -100,10 +100,9 @@ impl Ear {
         self.joined.iter().map(|joined| joined.name.as_str()).collect()
     }
 
-    /// Why the groups could not be joined somewhere, if that is not what was answered before.
-    pub(super) fn news_of_trouble(&mut self) -> Option<&str> {
-        let (what, told) = self.trouble.as_mut()?;
-        (!std::mem::replace(told, true)).then_some(what)
+    /// Why the groups could not be joined somewhere, when that was tried last.
+    pub(super) fn take_trouble(&mut self) -> Option<String> {
+        self.trouble.take()
     }
 
     /// The next datagram that waits, whole, or nothing; `buffer` has [`LONGEST`] bytes.
@@ -139,10 +138,7 @@ impl Ear {
             // Leaving first: joining again what was joined before tells the network nothing.
             let _ = socket.leave_multicast_v4_n(group, &index);
             if let Err(error) = socket.join_multicast_v4_n(group, &index) {
-                let what = format!("cannot join {group} on {}: {error}", interface.name);
-                if self.trouble.as_ref().is_none_or(|(said, _)| *said != what) {
-                    self.trouble = Some((what, false));
-                }
+                self.trouble = Some(format!("cannot join {group} on {}: {error}", interface.name));
                 return;
             }
         }

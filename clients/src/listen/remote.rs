@@ -14,8 +14,6 @@ use crate::{json, text};
 pub(super) struct Remote<'a> {
     /// Of which topic.
     pub(super) topic: Topic,
-    /// Its sensor's name, see [`Roll::name`](super::roll::Roll::name).
-    pub(super) sensor: &'a str,
     /// What came.
     pub(super) datagram: Datagram<'a>,
     /// Life of its hub, 0 unknown.
@@ -56,9 +54,9 @@ impl Remote<'_> {
         payload.unpack(self.datagram.payload).then_some(payload)
     }
 
-    /// A line of JSON.
-    pub(super) fn json(&self, out: &mut Output<'_>) -> Result<(), End> {
-        let (sensor, header) = (self.sensor, &self.header());
+    /// A line of JSON; `sensor` is called so by [`Roll::name`](super::roll::Roll::name).
+    pub(super) fn json(&self, sensor: &str, out: &mut Output<'_>) -> Result<(), End> {
+        let header = &self.header();
         let payload = self.datagram.payload;
         match self.topic {
             Topic::Telegram => {
@@ -78,9 +76,9 @@ impl Remote<'_> {
         .unwrap_or(Ok(()))
     }
 
-    /// A line for people; `hub` is what the gateway is called.
-    pub(super) fn text(&self, hub: &str, line: &mut Vec<u8>) -> io::Result<()> {
-        write!(line, "{hub}.{}/{} ", self.sensor, self.topic.name())?;
+    /// A line for people; `hub` is what the gateway is called, `sensor` as above.
+    pub(super) fn text(&self, hub: &str, sensor: &str, line: &mut Vec<u8>) -> io::Result<()> {
+        write!(line, "{hub}.{sensor}/{} ", self.topic.name())?;
         let header = &self.header();
         match self.topic {
             Topic::Telegram => telegram(self.datagram.payload).map(|it| text::telegram(line, header, it.0)),

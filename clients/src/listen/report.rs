@@ -1,17 +1,21 @@
 //! What `listen` says beside samples: that it hears, what went wrong, and the account of everything that came and did
 //! not.
 
+mod classes;
+
 use std::io::Write;
 
-use schema::Topic;
 use schema::datagram::{Account, Announce, Head, Refusal, Row};
+use schema::{Domain, Topic};
 use serde::Serialize;
 use serde::ser::{SerializeMap, Serializer};
 
 use super::names::Names;
+use super::publish::Publication;
 use super::remote::{Remote, id};
 use super::roll::Roll;
 use crate::output::{End, Output, table};
+use classes::{Notice, Published, Ready};
 
 /// Where it is said, and how.
 pub(super) struct Report<'a> {
@@ -29,16 +33,10 @@ impl<'a> Report<'a> {
         Report { json, out, notes, names, drawn: 0 }
     }
 
-    /// The groups are joined on `interfaces`.
-    pub(super) fn ready(&mut self, interfaces: &[&str]) -> Result<(), End> {
-        #[derive(Serialize)]
-        struct Line<'a> {
-            class: &'static str,
-            port: u16,
-            interfaces: &'a [&'a str],
-        }
+    /// The groups are joined on `interfaces`; what comes will be published in `domain`, if there is one.
+    pub(super) fn ready(&mut self, interfaces: &[&str], domain: Option<&Domain>) -> Result<(), End> {
         if self.json {
-            return self.out.json(&Line { class: "ready", port: schema::datagram::PORT, interfaces });
+            return self.out.json(&Ready::new(interfaces, domain));
         }
         self.notes.line(|line| match interfaces {
             [] => write!(line, "no network interface has a link, waiting for one"),
@@ -46,20 +44,20 @@ impl<'a> Report<'a> {
         })
     }
 
-    /// A sample.
-    pub(super) fn sample(&mut self, remote: &Remote<'_>) -> Result<(), End> {
+    /// A sample of the sensor that is called so.
+    pub(super) fn sample(&mut self, sensor: &str, remote: &Remote<'_>) -> Result<(), End> {
         if self.json {
-            return remote.json(&mut self.out);
+            return remote.json(sensor, &mut self.out);
         }
         let hub = self.names.of(remote.datagram.head.hub);
-        self.out.line(|line| remote.text(&hub, line))
+        self.out.line(|line| remote.text(&hub, sensor, line))
     }
 
     /// Samples of `topic` of `sensor` were sent before the one with `head` and did not come, or not yet.
     pub(super) fn missed(&mut self, head: &Head, sensor: &str, topic: Topic, missed: u32) -> Result<(), End> {
         if self.json {
             let (sensor, topic) = (Some(sensor), Some(topic.name()));
-            return self.notice(Notice { sensor, topic, missed, ..Notice::of("missed", head) });
+            return self.out.json(&Notice { sensor, topic, missed, ..Notice::of("missed", head) });
         }
         let hub = self.names.of(head.hub);
         self.notes.line(|line| write!(line, "{hub}.{sensor}/{}: missed {missed}", topic.name()))
@@ -70,7 +68,7 @@ impl<'a> Report<'a> {
         let behind_ms = behind_ns as f64 / 1e6;
         if self.json {
             let behind_ms = Some(behind_ms);
-            return self.notice(Notice { behind_ms, ..Notice::of("clocks_differ", head) });
+            return self.out.json(&Notice { behind_ms, ..Notice::of("clocks_differ", head) });
         }
         let hub = self.names.of(head.hub);
         let (ms, which) = (behind_ms.abs(), if behind_ms < 0.0 { "ahead of" } else { "behind" });
@@ -79,11 +77,25 @@ impl<'a> Report<'a> {
         })
     }
 
+    /// A remote sensor is published as `name`.
+    pub(super) fn published(&mut self, head: &Head, name: &str) -> Result<(), End> {
+        if self.json {
+            return self.out.json(&Notice { sensor: Some(name), ..Notice::of("published", head) });
+        }
+        self.notes.line(|line| write!(line, "publishing {name}"))
+    }
+
+    /// What became of all that came, in shared memory.
+    pub(super) fn publication(&mut self, publication: &Publication) -> Result<(), End> {
+        let line = Published::new(publication);
+        if self.json { self.out.json(&line) } else { self.out.line(|out| line.text(out)) }
+    }
+
     /// Something is wrong here.
     pub(super) fn trouble(&mut self, what: &str) -> Result<(), End> {
         if self.json {
             let notice = Notice::of("trouble", &Head::default());
-            return self.notice(Notice { hub: None, epoch: None, message: Some(what), ..notice });
+            return self.out.json(&Notice { hub: None, epoch: None, message: Some(what), ..notice });
         }
         self.notes.line(|line| write!(line, "{what}"))
     }
@@ -132,43 +144,6 @@ impl<'a> Report<'a> {
             let any = refused(account).any(|(_, count)| count > 0);
             if any { Ok(()) } else { write!(line, " none") }
         })
-    }
-
-    fn notice(&mut self, notice: Notice<'_>) -> Result<(), End> {
-        self.out.json(&notice)
-    }
-}
-
-/// Class `notice`.
-#[derive(Serialize)]
-struct Notice<'a> {
-    class: &'static str,
-    kind: &'static str,
-    sensor: Option<&'a str>,
-    topic: Option<&'static str>,
-    missed: u32,
-    #[serde(serialize_with = "known_id")]
-    hub: Option<u64>,
-    epoch: Option<u32>,
-    #[serde(skip_serializing_if = "Option::is_none")]
-    behind_ms: Option<f64>,
-    #[serde(skip_serializing_if = "Option::is_none")]
-    message: Option<&'a str>,
-}
-
-impl Notice<'_> {
-    fn of(kind: &'static str, head: &Head) -> Self {
-        Notice {
-            class: "notice",
-            kind,
-            sensor: None,
-            topic: None,
-            missed: 0,
-            hub: Some(head.hub),
-            epoch: Some(head.epoch),
-            behind_ms: None,
-            message: None,
-        }
     }
 }
 
@@ -219,13 +194,6 @@ fn reasons<S: Serializer>(account: &&Account, serializer: S) -> Result<S::Ok, S:
         map.serialize_entry(reason.name(), &count)?;
     }
     map.end()
-}
-
-fn known_id<S: Serializer>(hub: &Option<u64>, serializer: S) -> Result<S::Ok, S::Error> {
-    match hub {
-        Some(hub) => id(hub, serializer),
-        None => serializer.serialize_none(),
-    }
 }
 
 fn refused(account: &Account) -> impl Iterator<Item = (Refusal, u64)> {

@@ -9,7 +9,7 @@ use std::thread;
 use lms::{MILLIS, Nanos};
 use rustix::event::{EventfdFlags, PollFd, PollFlags, Timespec, eventfd, poll};
 use schema::ipc::{self, Node};
-use schema::{Domain, Failure, HubLock, Kind};
+use schema::{Domain, Failure, HubLock, Kind, shortage};
 use signal_hook::consts::{SIGINT, SIGTERM};
 
 use crate::config::Config;
@@ -66,7 +66,7 @@ pub fn run(config: &Config, domain: &Domain, on_ready: impl FnOnce(&Ready)) -> R
         drop(report);
         let mut outcome = reports.iter().take(config.links.len()).find(Result::is_err).unwrap_or(Ok(()));
         if outcome.is_ok() {
-            outcome = preflight::allocate(domain);
+            outcome = shortage::allocate(domain);
         }
         if outcome.is_ok() {
             on_ready(&ready);

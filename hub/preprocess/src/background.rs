@@ -85,7 +85,7 @@ impl Model {
     pub fn update(&mut self, scan: &Scan, out: &mut Foreground) {
         self.fit(scan);
         let mut readings = [INVALID; BEAMS];
-        measure(scan, self.settings.no_return_is_far, &mut readings);
+        measure(scan, self.limits.no_return_is_far, &mut readings);
         let count = scan.beams();
         let (readings, classes) = (&readings[..count], &mut self.classes[..count]);
         let learn = !self.frozen;

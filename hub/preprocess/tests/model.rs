@@ -140,7 +140,7 @@ fn no_scan_makes_it_panic() {
                 candidate_mm,
                 scans: scans.map(|n| if round % 3 == 0 { u32::MAX } else { u32::from(n % 5) }),
                 start: if random.bool() { Start::Empty } else { Start::FirstScan },
-                no_return_is_far: random.bool(),
+                no_return_is_far: Some(random.bool()),
                 ..Settings::default()
             };
             let mut model = Model::new(settings);

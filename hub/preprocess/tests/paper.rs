@@ -5,7 +5,7 @@ mod surroundings;
 
 use preprocess::background::{Candidate, Class, Method, Model, Settings, Start};
 use schema::{Background, Foreground, Scan};
-use surroundings::{Shape, Surroundings, any_model, foreground, ranges_mm, reading_mm};
+use surroundings::{Shape, Surroundings, any_choice, any_model, foreground, ranges_mm, reading_mm};
 
 /// One beam as the paper has it.
 #[derive(Clone, Default)]
@@ -44,6 +44,7 @@ impl Slow {
     }
 
     fn update(&mut self, scan: &Scan) -> Vec<Class> {
+        let far = self.settings.no_return_is_far.unwrap_or(false);
         let default_mm = if scan.unit_mm == 10 { 60 } else { 30 };
         let threshold_mm = f64::from(self.settings.threshold_mm.unwrap_or(default_mm));
         let candidate_mm = f64::from(self.settings.candidate_mm.unwrap_or(default_mm));
@@ -54,7 +55,7 @@ impl Slow {
             .iter_mut()
             .enumerate()
             .map(|(i, beam)| {
-                let Some(mm) = reading_mm(scan, i, self.settings.no_return_is_far) else {
+                let Some(mm) = reading_mm(scan, i, far) else {
                     return Class::Invalid;
                 };
                 let before = beam.clone();
@@ -103,7 +104,7 @@ fn any_settings(random: &mut fastrand::Rng) -> Settings {
         scans: scans.map(u32::from),
         candidate: if random.bool() { Candidate::First } else { Candidate::Latest },
         start: if random.bool() { Start::Empty } else { Start::FirstScan },
-        no_return_is_far: random.bool(),
+        no_return_is_far: any_choice(random),
     }
 }
 

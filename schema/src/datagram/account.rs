@@ -10,7 +10,7 @@ pub const LIVES: usize = 64;
 /// The most sensors and topics of all lives; those of what is more are refused.
 pub const ROWS: usize = 1024;
 
-/// What was received, by hub, epoch, sensor and topic. 180 kB, wherever its owner puts it.
+/// What was received, by hub, epoch, sensor and topic. 200 kB, wherever its owner puts it.
 ///
 /// A topic's account begins with its first datagram, or with the first announcement that came before that: what was sent
 /// before neither is not ours. An announcement that is overtaken by the first datagram therefore says nothing about what

@@ -93,7 +93,9 @@ impl Announce {
         let (boot, _) = head.split_first_chunk()?;
         let mut announce =
             Announce::new(u64::from_le_bytes(*boot), text::read(&head[8..40]), text::read(&head[40..64]));
-        check_sensor(announce.sensor()).ok()?;
+        // What is no text ends what is read of a field, but not the name.
+        let name_len = head[8..40].iter().position(|&byte| byte == 0)?;
+        check_sensor(announce.sensor()).ok().filter(|()| announce.sensor().len() == name_len)?;
         for bytes in rest.chunks_exact(EACH) {
             announce.add(Announced {
                 topic: bytes[0],
@@ -134,5 +136,7 @@ mod tests {
         assert_eq!((Announce::unpack(&room[..83]), announce.pack(&mut [0; 83])), (None, None));
         room[8] = b'/';
         assert_eq!(Announce::unpack(&room), None, "no sensor has such a name");
+        room[8..14].copy_from_slice(b"fron\xFF\0");
+        assert_eq!(Announce::unpack(&room), None, "nor such");
     }
 }

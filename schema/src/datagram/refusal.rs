@@ -2,7 +2,7 @@
 
 /// Why a datagram is refused, in the order of the checks: the first that fails names the reason. [`super::Datagram::read`] knows
 /// those up to the checksum; the others are an [`super::Account`]'s.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub enum Refusal {
     /// Fewer bytes than a header.
     Short,

@@ -5,8 +5,8 @@ use std::fs;
 use std::os::unix::fs::PermissionsExt;
 use std::path::Path;
 
-/// Removes unfinished descriptions below `directory`. Only for who holds the domain's lock: nobody else makes services,
-/// and one that is unfinished nobody has opened. Finished ones are read-only.
+/// Removes unfinished descriptions below `directory`. Only for who holds the [`MakingLock`](crate::lock::MakingLock): then
+/// nobody makes services, and one that is unfinished nobody has opened. Finished ones are read-only.
 pub(super) fn sweep(directory: &Path) {
     for entry in fs::read_dir(directory).into_iter().flatten().flatten() {
         let finished = entry.metadata().is_ok_and(|metadata| metadata.permissions().mode() & 0o200 == 0);

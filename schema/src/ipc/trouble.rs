@@ -14,6 +14,7 @@ use iceoryx2::service::builder::{ServiceCreateError, ServiceOpenError};
 use iceoryx2::service::service_name::ServiceName;
 
 use super::Node;
+use crate::lock::MakingLock;
 use crate::{Failure, Kind, access, shortage};
 
 /// What there is to do about an error.
@@ -95,8 +96,12 @@ pub(super) fn create<T>(
     make: impl Fn() -> Result<T, Trouble>,
 ) -> Result<T, Failure> {
     let give_up_at = Instant::now() + Duration::from_secs(2);
+    let root = node.config().global.root_path().to_string();
     loop {
-        match make() {
+        let making = MakingLock::wait(Path::new(&root))?;
+        let made = make();
+        drop(making);
+        match made {
             Ok(made) => return Ok(made),
             Err(Trouble::Absent) if Instant::now() < give_up_at => sleep(Duration::from_millis(10)),
             Err(trouble) => return Err(failure(node, service, trouble)),

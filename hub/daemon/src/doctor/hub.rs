@@ -3,7 +3,7 @@
 use std::time::Duration;
 
 use schema::ipc::{self, Payload};
-use schema::{Domain, Failure, Status};
+use schema::{Domain, Failure, Status, is_remote};
 
 /// A running hub.
 pub(crate) struct Hub {
@@ -30,7 +30,8 @@ impl Hub {
 fn statuses(domain: &Domain) -> Result<Vec<(String, Status)>, Failure> {
     let node = ipc::client_node(domain)?;
     let mut found = Vec::new();
-    for sensor in ipc::sensors(domain)? {
+    // The ports of others are on other machines.
+    for sensor in ipc::sensors(domain)?.into_iter().filter(|sensor| !is_remote(sensor)) {
         let Some(topic) = Status::open(&node, &sensor)? else { continue };
         let subscriber = Status::subscriber(&topic)?;
         for _ in 0..LOOKS {

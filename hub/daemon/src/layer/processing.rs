@@ -188,7 +188,7 @@ impl BackgroundLayer {
         put(&mut learning.candidate_mm, self.candidate_mm, |value| {
             whole(origin, "candidate_mm", value, 1..=10_000).map(Some)
         })?;
-        put(&mut learning.scans, self.scans, |value| whole(origin, "scans", value, 1..=1_000_000).map(Some))?;
+        put(&mut learning.scans, self.scans, |value| whole(origin, "scans", value, 1..=8_191).map(Some))?;
         if let Some(candidate) = self.candidate {
             learning.candidate = match candidate {
                 CandidateLayer::First => Candidate::First,
@@ -203,7 +203,7 @@ impl BackgroundLayer {
                 file => (Start::Empty, Some(file.into())),
             };
         }
-        learning.no_return_is_far = self.no_return_is_far.unwrap_or(learning.no_return_is_far);
+        learning.no_return_is_far = self.no_return_is_far.or(learning.no_return_is_far);
         if let Some(publish) = self.publish {
             background.every_scan = matches!(publish, PublishLayer::EveryScan);
         }

@@ -20,8 +20,9 @@ pub struct Settings {
     pub candidate: Candidate,
     /// What is known at the start.
     pub start: Start,
-    /// A beam from which nothing came back has a far background, instead of telling nothing.
-    pub no_return_is_far: bool,
+    /// A beam from which nothing came back has a far background, instead of telling nothing. None: yes with `multi`,
+    /// which so finds people before glass and at no cost elsewhere; no with `paper`, whose runs each such beam ends.
+    pub no_return_is_far: Option<bool>,
 }
 
 /// The ways to learn a background.
@@ -64,6 +65,7 @@ pub(super) struct Limits {
     /// 1 to [`MOST_SCANS`].
     pub(super) scans: u16,
     pub(super) latest: bool,
+    pub(super) no_return_is_far: bool,
     /// Angle between two beams in 1/1000 degree.
     pub(super) step_mdeg: u16,
     /// Millimetres per device unit, at least 1.
@@ -92,6 +94,7 @@ impl Limits {
             candidate: units(settings.candidate_mm),
             scans: settings.scans.unwrap_or(ten_seconds).clamp(1, MOST_SCANS) as u16,
             latest: settings.candidate == Candidate::Latest,
+            no_return_is_far: settings.no_return_is_far.unwrap_or(settings.method == Method::Multi),
             step_mdeg: scan.step_mdeg,
             unit_mm,
         }

@@ -138,3 +138,8 @@ pub(crate) fn foreground(scan: &Scan, classes: &[Class], like: &Foreground) -> F
     expected.beams = beams.len() as u16;
     expected
 }
+
+/// Yes, no, or whatever is the default.
+pub(crate) fn any_choice(random: &mut fastrand::Rng) -> Option<bool> {
+    [None, Some(false), Some(true)][random.usize(..3)]
+}

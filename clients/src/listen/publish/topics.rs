@@ -1,0 +1,298 @@
+//! The topics of one remote sensor in shared memory. Numbers its samples so that consumers see what the network lost:
+//! they go on over lives of the gateway, and begin again with each life of the hub, as a hub's own do.
+
+use std::time::{Duration, Instant};
+
+use schema::datagram::{Head, Packed, telegram};
+use schema::ipc::{
+    self, Node, Notifier, Payload, Publisher, TopicService, UpdateConnections, WakeService, ZeroCopySend,
+};
+use schema::{Background, Failure, Foreground, Header, Marks, Scan, State, Status, Topic, Wake, Zones};
+
+use super::super::remote::Remote;
+use crate::clock;
+
+/// One sensor of another machine.
+pub(super) struct RemoteTopics {
+    /// Its name here, `HUB.SENSOR`.
+    pub(super) name: String,
+    /// Gateway, its life, and the sensor's number in it, as last announced.
+    source: Option<(u64, u32, u8)>,
+    boot: u64,
+    telegram: Option<Outlet<[u8]>>,
+    scan: Option<Outlet<Scan>>,
+    marks: Option<Outlet<Marks>>,
+    zones: Option<Outlet<Zones>>,
+    foreground: Option<Outlet<Foreground>>,
+    background: Option<Outlet<Background>>,
+    status: Option<Outlet<Status>>,
+    /// The last status, and the header it came with.
+    last: Option<(Status, Header)>,
+    heard_at: Option<Instant>,
+    /// Why consumers are to be woken.
+    news: Option<Wake>,
+    notifier: Notifier,
+    _wake: WakeService,
+}
+
+/// So long nothing comes before the sensor counts as silent: three announcements.
+const SILENT_AFTER: Duration = Duration::from_secs(3);
+
+impl RemoteTopics {
+    /// The sensor `name`, without topics.
+    pub(super) fn new(node: &Node, name: &str) -> Result<RemoteTopics, Failure> {
+        let wake = ipc::create_wake(node, name)?;
+        Ok(RemoteTopics {
+            name: name.to_owned(),
+            source: None,
+            boot: 0,
+            telegram: None,
+            scan: None,
+            marks: None,
+            zones: None,
+            foreground: None,
+            background: None,
+            status: None,
+            last: None,
+            heard_at: None,
+            news: None,
+            notifier: ipc::notifier(&wake)?,
+            _wake: wake,
+        })
+    }
+
+    /// It has this topic.
+    pub(super) fn has(&self, topic: Topic) -> bool {
+        match topic {
+            Topic::Telegram => self.telegram.is_some(),
+            Topic::Scan => self.scan.is_some(),
+            Topic::Marks => self.marks.is_some(),
+            Topic::Zones => self.zones.is_some(),
+            Topic::Foreground => self.foreground.is_some(),
+            Topic::Background => self.background.is_some(),
+            Topic::Status => self.status.is_some(),
+        }
+    }
+
+    /// Makes `topic`, which it does not have.
+    pub(super) fn add(&mut self, node: &Node, topic: Topic) -> Result<(), Failure> {
+        let name = &self.name;
+        match topic {
+            Topic::Telegram => self.telegram = Some(Outlet::new(node, name)?),
+            Topic::Scan => self.scan = Some(Outlet::new(node, name)?),
+            Topic::Marks => self.marks = Some(Outlet::new(node, name)?),
+            Topic::Zones => self.zones = Some(Outlet::new(node, name)?),
+            Topic::Foreground => self.foreground = Some(Outlet::new(node, name)?),
+            Topic::Background => self.background = Some(Outlet::new(node, name)?),
+            Topic::Status => self.status = Some(Outlet::new(node, name)?),
+        }
+        Ok(())
+    }
+
+    /// It was announced with `head`, in the hub's life `boot`.
+    pub(super) fn announced(&mut self, head: &Head, boot: u64) {
+        self.source = Some((head.hub, head.epoch, head.sensor));
+        if self.boot != 0 && self.boot != boot {
+            self.begin_again();
+        }
+        self.boot = boot;
+    }
+
+    /// Whether it was announced.
+    pub(super) fn is_announced(&self) -> bool {
+        self.source.is_some()
+    }
+
+    /// It is the sensor that sent `head`.
+    pub(super) fn is(&self, head: &Head) -> bool {
+        self.source == Some((head.hub, head.epoch, head.sensor))
+    }
+
+    /// Publishes `remote`; `false` if it has no such topic. A payload cannot fail to be read: the account has checked it.
+    pub(super) fn publish(&mut self, remote: &Remote<'_>, now: Instant) -> bool {
+        self.heard_at = Some(now);
+        let header = &remote.header();
+        let sent = match remote.topic {
+            Topic::Telegram => self.telegram.as_mut().map(|outlet| outlet.send_telegram(remote, header)),
+            Topic::Scan => self.scan.as_mut().map(|outlet| outlet.unpack(remote, header)),
+            Topic::Marks => self.marks.as_mut().map(|outlet| outlet.unpack(remote, header)),
+            Topic::Zones => self.zones.as_mut().map(|outlet| outlet.unpack(remote, header)),
+            Topic::Foreground => self.foreground.as_mut().map(|outlet| outlet.unpack(remote, header)),
+            Topic::Background => self.background.as_mut().map(|outlet| outlet.unpack(remote, header)),
+            Topic::Status => {
+                let Some(status) = remote.payload::<Status>() else { return true };
+                let number = self.status.as_mut().map(|outlet| outlet.number(&remote.datagram.head));
+                number.map(|number| self.tell(status, header, number))
+            }
+        };
+        if sent.is_some() {
+            let why = if remote.topic == Topic::Status { Wake::Status } else { Wake::Telegram };
+            self.news = match self.news {
+                Some(Wake::Telegram) => Some(Wake::Telegram),
+                _ => Some(why),
+            };
+        }
+        sent.is_some()
+    }
+
+    /// Wakes the consumers, if something was published since the last call.
+    pub(super) fn wake(&mut self) {
+        if let Some(why) = self.news.take() {
+            // Those that cannot be woken look by themselves ten times a second.
+            let _ = ipc::notify(&self.notifier, why);
+        }
+    }
+
+    /// Says that the sensor is silent, once per silence, and gives late joiners what they would else get with the next
+    /// sample.
+    pub(super) fn look(&mut self, now: Instant) {
+        if self.heard_at.is_some_and(|at| now - at >= SILENT_AFTER) {
+            self.heard_at = None;
+            self.silent();
+            self.wake();
+        }
+        connect(&self.status);
+        connect(&self.zones);
+        connect(&self.background);
+    }
+
+    /// Samples for which there was no memory.
+    pub(super) fn loan_failed(&self) -> u64 {
+        fn of<P: Payload + ?Sized>(outlet: &Option<Outlet<P>>) -> u64 {
+            outlet.as_ref().map_or(0, |outlet| outlet.failed)
+        }
+        let of_scans = of(&self.scan) + of(&self.marks) + of(&self.zones) + of(&self.foreground);
+        of(&self.telegram) + of_scans + of(&self.background) + of(&self.status)
+    }
+
+    /// Publishes a status as it came, but for the beginning of its state: that is on a clock of another machine. Here the
+    /// state began when it was first heard of.
+    fn tell(&mut self, mut status: Status, header: &Header, topic_seq: u64) {
+        let same = self.last.filter(|(last, _)| last.state == status.state);
+        status.since_ns = same.map_or(header.stamp_first_ns, |(last, _)| last.since_ns);
+        self.last = Some((status, *header));
+        if let Some(outlet) = &mut self.status {
+            outlet.send(header, topic_seq, |sample| *sample = status);
+        }
+    }
+
+    /// Nothing comes any more: what was last said would stand for ever.
+    fn silent(&mut self) {
+        let Some((mut status, mut header)) = self.last else { return };
+        status.state = State::Silent as u8;
+        status.rate_mhz = 0;
+        status.set_last_error("nothing comes over the network");
+        (header.stamp_first_ns, header.wall_ns) = (clock::now().monotonic_ns, clock::wall_ns());
+        header.stamp_last_ns = header.stamp_first_ns;
+        if let Some(number) = self.status.as_mut().map(Outlet::own_number) {
+            self.tell(status, &header, number);
+            self.news = Some(Wake::Status);
+        }
+    }
+
+    /// The hub began to count anew.
+    fn begin_again(&mut self) {
+        fn again<P: Payload + ?Sized>(outlet: &mut Option<Outlet<P>>) {
+            if let Some(outlet) = outlet {
+                outlet.next = Some(0);
+            }
+        }
+        again(&mut self.telegram);
+        again(&mut self.scan);
+        again(&mut self.marks);
+        again(&mut self.zones);
+        again(&mut self.foreground);
+        again(&mut self.background);
+        again(&mut self.status);
+    }
+}
+
+/// The publishing end of one topic.
+struct Outlet<P: Payload + ?Sized> {
+    publisher: Publisher<P>,
+    /// The number of the next sample if none is left out before it. The first one has that of the network, so that
+    /// consumers that outlive a listener see what was lost meanwhile.
+    next: Option<u64>,
+    /// Life of the gateway, and number there, of the last one that came from the network.
+    last: (u32, u32),
+    failed: u64,
+    _service: TopicService<P>,
+}
+
+impl<P: Payload + ?Sized> Outlet<P> {
+    fn new(node: &Node, sensor: &str) -> Result<Self, Failure> {
+        let service = P::create(node, sensor)?;
+        Ok(Outlet {
+            publisher: P::publisher(&service)?,
+            next: None,
+            last: (0, 0),
+            failed: 0,
+            _service: service,
+        })
+    }
+
+    /// The number of the sample with `head`. All numbers between the last one and it are left out, be they lost or not
+    /// published; of a new life of the gateway all before it.
+    fn number(&mut self, head: &Head) -> u64 {
+        let (epoch, last) = self.last;
+        let left_out = if head.epoch == epoch {
+            head.sequence.wrapping_sub(last).wrapping_sub(1)
+        } else {
+            head.sequence
+        };
+        let number = self.next.map_or(head.sequence.into(), |next| next + u64::from(left_out));
+        self.last = (head.epoch, head.sequence);
+        self.next = Some(number + 1);
+        number
+    }
+
+    /// The number of a sample that did not come from the network.
+    fn own_number(&mut self) -> u64 {
+        let number = self.next.unwrap_or_default();
+        self.next = Some(number + 1);
+        number
+    }
+}
+
+impl Outlet<[u8]> {
+    fn send_telegram(&mut self, remote: &Remote<'_>, header: &Header) {
+        let topic_seq = self.number(&remote.datagram.head);
+        let Some(telegram) = telegram(remote.datagram.payload) else { return };
+        let Ok(loan) = self.publisher.loan_slice_uninit(telegram.0.len()) else {
+            self.failed += 1;
+            return;
+        };
+        let mut sample = loan.write_from_slice(telegram.0);
+        *sample.user_header_mut() = Header { topic_seq, ..*header };
+        self.failed += u64::from(sample.send().is_err());
+    }
+}
+
+impl<P: Payload + ZeroCopySend + Default> Outlet<P> {
+    /// Publishes a sample that `fill` writes in place.
+    fn send(&mut self, header: &Header, topic_seq: u64, fill: impl FnOnce(&mut P)) {
+        let Ok(mut sample) = self.publisher.loan() else {
+            self.failed += 1;
+            return;
+        };
+        *sample.user_header_mut() = Header { topic_seq, ..*header };
+        fill(sample.payload_mut());
+        self.failed += u64::from(sample.send().is_err());
+    }
+}
+
+impl<P: Payload + ZeroCopySend + Default + Packed> Outlet<P> {
+    fn unpack(&mut self, remote: &Remote<'_>, header: &Header) {
+        let topic_seq = self.number(&remote.datagram.head);
+        self.send(header, topic_seq, |sample| {
+            let _ = sample.unpack(remote.datagram.payload);
+        });
+    }
+}
+
+fn connect<P: Payload + ?Sized>(outlet: &Option<Outlet<P>>) {
+    if let Some(outlet) = outlet {
+        // One that cannot be connected now is tried again.
+        let _ = outlet.publisher.update_connections();
+    }
+}

@@ -1,0 +1,56 @@
+//! The memory of who publishes: how much of it the topics of a sensor take, and that it is really there. A sparse segment
+//! that finds /dev/shm full would end the process later.
+
+use std::fs::{self, OpenOptions};
+
+use rustix::fs::{FallocateFlags, fallocate};
+use rustix::io::Errno;
+
+use super::{SHARED_MEMORY, memory};
+use crate::{
+    Background, Domain, Failure, Foreground, Header, Marks, Scan, Status, Telegram, Topic, Zones, limits,
+};
+
+/// Allocates what the segments of `domain` have promised so far.
+///
+/// [`Kind::Short`](crate::Kind) if it cannot be had.
+pub fn allocate(domain: &Domain) -> Result<(), Failure> {
+    let prefix = domain.prefix();
+    let entries = fs::read_dir(SHARED_MEMORY).into_iter().flatten().flatten();
+    for entry in entries.filter(|entry| entry.file_name().to_string_lossy().starts_with(&prefix)) {
+        // What is another process's, or gone again, is not ours to allocate.
+        let Ok(segment) = OpenOptions::new().write(true).open(entry.path()) else { continue };
+        let Ok(metadata) = segment.metadata() else { continue };
+        if metadata.len() == 0 {
+            continue;
+        }
+        // For any other reason it may be had later all the same.
+        if fallocate(&segment, FallocateFlags::empty(), 0, metadata.len()) == Err(Errno::NOSPC) {
+            let name = entry.file_name().to_string_lossy().into_owned();
+            return Err(memory(&format!("{} kB for {name} cannot be had", metadata.len() / 1024)));
+        }
+    }
+    Ok(())
+}
+
+/// Bytes of the segments of one sensor's `topics`: the payloads with their headers, and who is at each service.
+pub fn sensor_bytes(topics: &[Topic]) -> u64 {
+    let payload = |topic| match topic {
+        Topic::Telegram => Telegram::MAX,
+        Topic::Scan => size_of::<Scan>(),
+        Topic::Marks => size_of::<Marks>(),
+        Topic::Zones => size_of::<Zones>(),
+        Topic::Foreground => size_of::<Foreground>(),
+        Topic::Background => size_of::<Background>(),
+        Topic::Status => size_of::<Status>(),
+    };
+    let chunk =
+        |&topic: &Topic| limits::samples(topic) * (payload(topic) + size_of::<Header>() + CHUNK_HEADER);
+    let services = (topics.len() + 1) as u64 * SERVICE;
+    topics.iter().map(chunk).sum::<usize>() as u64 + services
+}
+
+/// What the shared-memory library puts before each sample, rounded up.
+const CHUNK_HEADER: usize = 64;
+/// The list of ports and processes of one service, rounded up.
+const SERVICE: u64 = 48 * 1024;

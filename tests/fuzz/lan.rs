@@ -1,0 +1,117 @@
+//! What has to hold whatever a network carries: datagrams are refused, or they say what can be said again.
+
+use schema::datagram::{Account, Announce, Datagram, Fresh, HEAD, Head, MTU_ETHERNET, Packed, ROWS, Refusal};
+use schema::{Background, Foreground, Marks, Scan, Status, Topic, Zones};
+
+/// Any datagrams, one after the other: each is counted once, what is refused changes nothing, and what is not, can be
+/// said again.
+///
+/// A piece begins with a byte and its length in two more. Odd: a header in short and a payload, to which a checksum is
+/// made; even: a datagram as it is.
+pub(crate) fn lan(data: &[u8]) {
+    let mut account = Box::new(Account::new(&Topic::ALL));
+    let mut rest = data;
+    let (mut given, mut accepted) = (0, 0);
+    while let [mode, low, high, after @ ..] = rest {
+        let len = usize::from(u16::from_le_bytes([*low, *high])).min(after.len());
+        let (piece, after) = after.split_at(len);
+        rest = after;
+        let mut buffer = [0; MTU_ETHERNET];
+        let bytes = if mode & 1 == 0 { Some(piece) } else { sealed(piece, &mut buffer) };
+        let Some(bytes) = bytes else { continue };
+        let before = figures(&account);
+        let result = account.receive(bytes);
+        given += 1;
+        match result {
+            Ok((datagram, fresh)) => {
+                accepted += 1;
+                assert_eq!(Datagram::read(bytes), Ok(datagram));
+                assert_eq!(datagram.check_payload(), Ok(()));
+                can_be_said_again(&datagram);
+                is_seen_if_damaged(bytes, data);
+                assert_ne!(
+                    account.receive(bytes).map(|(_, again)| again),
+                    Ok(Fresh::New),
+                    "{fresh:?} and new again"
+                );
+                given += 1;
+                accepted += 1;
+            }
+            Err(refusal) => {
+                assert_eq!(figures(&account), before, "{refusal:?}");
+                let read = Datagram::read(bytes).map(|_| ());
+                assert!(read == Err(refusal) || read.is_ok() && refusal > Refusal::Crc, "{refusal:?}");
+            }
+        }
+    }
+    let refused: u64 = Refusal::ALL.iter().map(|&refusal| account.refused(refusal)).sum();
+    let counted: u64 = account.rows().map(|row| row.received + row.duplicate).sum();
+    assert_eq!((given, accepted), (counted + refused, counted));
+    assert!(account.rows().count() <= ROWS);
+}
+
+/// Received, lost, duplicate and reordered of each row.
+fn figures(account: &Account) -> Vec<[u64; 4]> {
+    account.rows().map(|row| [row.received, row.lost(), row.duplicate, row.reordered]).collect()
+}
+
+/// A datagram of few hubs, epochs and sensors, so that they meet.
+fn sealed<'a>(piece: &[u8], buffer: &'a mut [u8]) -> Option<&'a [u8]> {
+    let (short, payload) = piece.split_first_chunk::<10>()?;
+    let head = Head {
+        topic: short[0],
+        flags: short[1] & !1,
+        hub: u64::from(short[2]),
+        epoch: u32::from(short[3] & 3),
+        sequence: u32::from_le_bytes([short[4], short[5], short[6], short[7]]),
+        sensor: short[8],
+        revision: u16::from(short[9] & 3),
+        ..Head::default()
+    };
+    buffer.get_mut(HEAD..HEAD + payload.len())?.copy_from_slice(payload);
+    head.seal(buffer, payload.len())
+}
+
+/// What a payload says, packed again, says the same.
+fn can_be_said_again(datagram: &Datagram<'_>) {
+    fn again<T: Packed>(mut value: T, payload: &[u8]) {
+        let (mut first, mut second) = ([0; 2_000], [0; 2_000]);
+        assert!(value.unpack(payload));
+        let len = value.pack(&mut first).expect("room");
+        assert!(value.unpack(&first[..len]));
+        assert_eq!(value.pack(&mut second), Some(len));
+        // As bytes, because a number may be none, which is not even itself.
+        assert_eq!(first, second);
+    }
+    let payload = datagram.payload;
+    match Topic::of_number(datagram.head.topic) {
+        None => {
+            let announce = Announce::unpack(payload).expect("an announcement");
+            let mut room = [0; 2_000];
+            let len = announce.pack(&mut room).expect("room");
+            assert_eq!(Announce::unpack(&room[..len]), Some(announce));
+        }
+        Some(Topic::Telegram) => {
+            let telegram = schema::datagram::telegram(payload).expect("a telegram").0;
+            assert_eq!(schema::datagram::telegram(telegram).map(|again| again.0), Some(telegram));
+        }
+        Some(Topic::Scan) => again(Scan::default(), payload),
+        Some(Topic::Marks) => again(Marks::default(), payload),
+        Some(Topic::Zones) => again(Zones::unknown(), payload),
+        Some(Topic::Foreground) => again(Foreground::default(), payload),
+        Some(Topic::Background) => again(Background::default(), payload),
+        Some(Topic::Status) => again(Status::default(), payload),
+    }
+}
+
+/// The checksum sees one to three changed bits, wherever they are (its Hamming distance at these lengths is 4).
+fn is_seen_if_damaged(bytes: &[u8], places: &[u8]) {
+    let mut damaged = bytes.to_vec();
+    let mut at = 0;
+    for (number, place) in places.iter().rev().take(3).enumerate() {
+        at = (at * 256 + usize::from(*place)) % (8 * bytes.len());
+        damaged[at / 8] ^= 1 << (at % 8);
+        let is_changed = damaged != bytes;
+        assert!(!is_changed || Datagram::read(&damaged).is_err(), "{number}: bit {at} of {bytes:02x?}");
+    }
+}

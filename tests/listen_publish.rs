@@ -1,0 +1,237 @@
+//! `scanhub listen --publish`: remote sensors as local ones, for every verb that follows, through loss, restarts and
+//! kills.
+
+mod stage;
+
+use schema::{Scan, State, Status, Topic, Verdict, Zones};
+use serde_json::{Value, json};
+use stage::{INT, KILL, Program, Sender, Stage, TERM, in_a_network, number, until};
+
+const HUB: u64 = 0x5f3a_12bc_00d1_e2f3;
+const FRONT: &str = "robot1.front";
+
+fn publisher(stage: &Stage) -> Program {
+    stage.start(&["listen", "--json", "--publish", "--name=robot1=5f3a12bc00d1e2f3"]).ready()
+}
+
+/// A listener that publishes what a sender has announced.
+fn published(stage: &Stage, sender: &mut Sender) -> Program {
+    let mut program = publisher(stage);
+    sender.announce(&[Topic::Zones, Topic::Scan, Topic::Status, Topic::Telegram]);
+    let line = program.await_line("a sensor", |line| line["kind"] == "published");
+    assert_eq!(line["sensor"], FRONT);
+    // Whoever lists sensors waits for one.
+    sender.send(Topic::Status, &Status { state: State::Starting as u8, ..Status::default() });
+    program
+}
+
+/// Zones that somebody sent, not those of a silence.
+fn is_zones(line: &Value) -> bool {
+    line["class"] == "zones" && line["stale"] != true
+}
+
+fn zones(verdict: Verdict) -> Zones {
+    Zones { verdict: verdict as u8, ..Zones::unknown() }
+}
+
+#[test]
+fn a_remote_sensor_is_as_a_local_one() {
+    in_a_network("a_remote_sensor_is_as_a_local_one", || {
+        let stage = Stage::new();
+        let mut sender = Sender::new(HUB, 7, 3, "front");
+        let program = published(&stage, &mut sender);
+        let mut echo = stage.echo(&["robot1.front/zones", "robot1.front/scan", "robot1.front/telegram"]);
+        let mut hz = stage.start(&["hz", "--json", "robot1.front/zones"]);
+        until("hz is attached", || stage.subscribers("robot1.front/zones") == 2);
+        let mut scan = Scan { count: 2, unit_mm: 10, range_bits: 13, ..Scan::default() };
+        scan.range_array[..2].copy_from_slice(&[11, 12]);
+        let mut status = Status { state: State::Streaming as u8, since_ns: 5, ..Status::default() };
+        status.set_port("/dev/ttyUSB7");
+        sender.counter = 40;
+        let telegram = sender.telegram(&[0x02, 0x80, 0x03, 0x00, 0xA0, 0x00, 0x10, 0x16, 0x0A]);
+        sender.throw(Topic::Telegram, &telegram);
+        sender.send(Topic::Scan, &scan);
+        sender.send(Topic::Zones, &zones(Verdict::Slow));
+        sender.send(Topic::Status, &status);
+        let line = echo.await_line("zones", is_zones);
+        assert_eq!((&line["sensor"], &line["verdict"]), (&json!(FRONT), &json!("slow")));
+        assert_eq!((&line["seq"], &line["boot"]), (&json!(40), &json!("000000000000b007")));
+        assert_eq!(line["wall_ns"], sender.stamp_ns);
+        let since_start_ns = std::fs::read_to_string("/proc/uptime").expect("Linux");
+        let uptime_s: f64 =
+            since_start_ns.split(' ').next().and_then(|text| text.parse().ok()).expect("seconds");
+        let age_s = uptime_s - number(&line, "stamp_ns") as f64 / 1e9;
+        assert!((-1.0..60.0).contains(&age_s), "the stamp is not of the arrival: {age_s} s");
+        // Two lost, one late, one doubled.
+        let (late, lost) = (sender.make(Topic::Zones, &zones(Verdict::Stop)), 2);
+        sender.next[usize::from(Topic::Zones.number())] += lost;
+        sender.send(Topic::Zones, &zones(Verdict::Clear));
+        sender.throw(Topic::Zones, &late);
+        sender.throw(Topic::Zones, &late);
+        sender.send(Topic::Zones, &zones(Verdict::Slow));
+        echo.await_lines(2, "zones", is_zones);
+        hz.await_line("a second", |line| line["class"] == "hz" && line["received"] == 3);
+        let outcome = echo.end(INT);
+        let zones: Vec<_> = outcome.lines().into_iter().filter(is_zones).collect();
+        let numbers: Vec<_> = zones.iter().map(|line| number(line, "topic_seq")).collect();
+        assert_eq!(numbers, [0, 4, 5], "{outcome}");
+        assert_eq!(outcome.of_class("scan")[0]["ranges"], json!([11, 12]));
+        assert_eq!(outcome.of_class("telegram")[0]["data"], "02800300a00010160a");
+        let summary = outcome.of_class("summary");
+        let of_zones = summary.iter().find(|line| line["topic"] == "zones").expect("a summary");
+        assert_eq!((&of_zones["received"], &of_zones["lost"]), (&json!(3), &json!(3)));
+        assert_eq!(hz.end(INT).of_class("summary")[0]["lost"], 3);
+
+        let info = stage.await_info(FRONT, |info| info["state"] == "streaming");
+        assert_eq!(info["port"], "/dev/ttyUSB7");
+        assert!(number(&info, "since_ns") > 5, "the beginning is on another machine's clock: {info}");
+        let listed = stage.run(&["list", "--json"]).of_class("topic");
+        let topics: Vec<_> = listed.iter().map(|line| &line["topic"]).collect();
+        assert_eq!(topics, ["telegram", "scan", "zones", "status"], "those that were announced");
+        let domains = stage.command(&["list", "--domains", "--json"]).output().expect("runs");
+        assert!(String::from_utf8_lossy(&domains.stdout).contains(&program.pid().to_string()));
+        stage.await_info(FRONT, |info| info["state"] == "silent" && info["last_error"] != "");
+
+        let outcome = program.end(TERM);
+        assert_eq!(outcome.code, Some(0), "{outcome}");
+        let line = &outcome.of_class("lan_published")[0];
+        assert_eq!(
+            (&line["sensors"], &line["late"], &line["loan_failed"]),
+            (&json!([FRONT]), &json!(1), &json!(0))
+        );
+        assert_eq!(stage.run(&["info", FRONT, "--json"]).code, Some(3), "nobody publishes");
+    });
+}
+
+#[test]
+fn consumers_outlive_the_listener_and_see_what_they_missed() {
+    in_a_network("consumers_outlive_the_listener_and_see_what_they_missed", || {
+        let stage = Stage::new();
+        let mut sender = Sender::new(HUB, 7, 0, "front");
+        let first = published(&stage, &mut sender);
+        let mut echo = stage.echo(&["robot1.front/zones"]);
+        sender.send(Topic::Zones, &zones(Verdict::Clear));
+        echo.await_line("zones", is_zones);
+        assert_eq!(first.end(KILL).code, None);
+        echo.await_line("the news", |line| line["kind"] == "hub_gone");
+        for _ in 0..4 {
+            sender.send(Topic::Zones, &zones(Verdict::Slow));
+        }
+        let second = published(&stage, &mut sender);
+        echo.await_line("the news", |line| line["kind"] == "hub_back");
+        sender.send(Topic::Zones, &zones(Verdict::Stop));
+        echo.await_line("zones", |line| line["verdict"] == "stop");
+        let outcome = echo.end(INT);
+        assert_eq!(outcome.of_class("summary")[0]["lost"], 4, "{outcome}");
+        assert_eq!(second.end(TERM).code, Some(0));
+        assert!(stage.left_behind().is_empty(), "{:?}", stage.left_behind());
+    });
+}
+
+#[test]
+fn gateways_and_hubs_that_start_again_are_followed() {
+    in_a_network("gateways_and_hubs_that_start_again_are_followed", || {
+        let stage = Stage::new();
+        let mut sender = Sender::new(HUB, 7, 0, "front");
+        let program = published(&stage, &mut sender);
+        let mut echo = stage.echo(&["robot1.front/zones"]);
+        for _ in 0..3 {
+            sender.send(Topic::Zones, &zones(Verdict::Clear));
+        }
+        // The gateway starts again: two come before it says who its sensor is.
+        let mut again = Sender::new(HUB, 8, 1, "front");
+        again.send(Topic::Zones, &zones(Verdict::Slow));
+        again.send(Topic::Zones, &zones(Verdict::Slow));
+        again.announce(&[Topic::Zones]);
+        again.send(Topic::Zones, &zones(Verdict::Stop));
+        let line = echo.await_line("the gateway's next life", |line| line["verdict"] == "stop");
+        assert_eq!(line["topic_seq"], 5);
+        // The hub starts again: its gateway goes on counting, its consumers see new numbers.
+        again.boot = 0xb008;
+        again.announce(&[Topic::Zones]);
+        again.next[usize::from(Topic::Zones.number())] += 1;
+        again.send(Topic::Zones, &zones(Verdict::Clear));
+        let line = echo.await_line("the hub's next life", |line| line["boot"] == "000000000000b008");
+        assert_eq!(line["topic_seq"], 1);
+        let outcome = echo.end(INT);
+        assert_eq!(outcome.of_class("summary")[0]["lost"], 3, "{outcome}");
+        let outcome = program.end(INT);
+        assert_eq!(outcome.of_class("lan_published")[0]["unnamed"], 2, "{outcome}");
+        assert_eq!(outcome.of_class("notice").iter().filter(|line| line["kind"] == "published").count(), 1);
+    });
+}
+
+#[test]
+fn a_hub_and_two_remote_ones_live_in_one_domain() {
+    in_a_network("a_hub_and_two_remote_ones_live_in_one_domain", || {
+        let stage = Stage::new();
+        let _simulator = stage.simulator(&["front"], &["--seed=61", "--baud=500000"]);
+        let mut one = Sender::new(HUB, 7, 0, "front");
+        let mut other = Sender::new(0xab, 7, 0, "front");
+        let listener = published(&stage, &mut one);
+        // Somebody who follows the hub's sensor waits for the hub, whoever else is in the domain.
+        let mut early = stage.start(&["echo", "--json", "front/scan"]);
+        let absent = stage.run(&["echo", "--json", "front/scan", "-n", "1"]);
+        assert_eq!(
+            (absent.code, &absent.of_class("error")[0]["kind"]),
+            (Some(3), &json!("no_topic")),
+            "{absent}"
+        );
+        let hub = stage.hub(&[stage.link("front")]);
+        early.await_line("a scan", |line| line["class"] == "scan");
+        assert_eq!(early.end(INT).code, Some(0));
+        other.announce(&[Topic::Zones, Topic::Status]);
+        other.send(Topic::Status, &Status::default());
+        let second = publisher_refused(&stage);
+        assert!(second.contains(&format!("pid {}", listener.pid())), "{second}");
+        let mut echo = stage.echo(&["front/scan", "robot1.front/zones", "00000000000000ab.front/zones"]);
+        one.send(Topic::Zones, &zones(Verdict::Stop));
+        other.send(Topic::Zones, &zones(Verdict::Slow));
+        for sensor in ["front", FRONT, "00000000000000ab.front"] {
+            echo.await_line(sensor, |line| line["sensor"] == sensor && line["class"] != "notice");
+        }
+        // The robot's own sensors: those of other robots stand elsewhere.
+        let outcome = stage.run(&["echo", "--json", "robot/zones", "-n", "3"]);
+        let lines = outcome.of_class("zones");
+        assert!(lines.iter().all(|line| line["sensors"].as_array().map(Vec::len) == Some(1)), "{outcome}");
+        let absent = stage.run(&["echo", "--json", "robot2.front/zones", "-n", "1"]);
+        assert_eq!(
+            (absent.code, &absent.of_class("error")[0]["kind"]),
+            (Some(3), &json!("no_topic")),
+            "{absent}"
+        );
+        let refused = stage.run(&["control", "robot1.front", "pause", "--json"]);
+        assert_eq!(refused.code, Some(78), "nobody commands another machine's sensor: {refused}");
+        assert_eq!(hub.end(TERM).code, Some(0));
+        one.send(Topic::Zones, &zones(Verdict::Clear));
+        echo.await_line("the remote sensor goes on", |line| line["verdict"] == "clear");
+        drop(echo);
+        assert_eq!(listener.end(TERM).code, Some(0));
+        assert!(stage.left_behind().is_empty(), "{:?}", stage.left_behind());
+    });
+}
+
+fn publisher_refused(stage: &Stage) -> String {
+    let outcome = stage.run(&["listen", "--json", "--publish"]);
+    assert_eq!((outcome.code, &outcome.lines()[0]["kind"]), (Some(1), &json!("domain_held")), "{outcome}");
+    outcome.lines()[0]["message"].as_str().unwrap_or_default().to_owned()
+}
+
+#[test]
+fn there_is_room_for_sixteen_sensors() {
+    in_a_network("there_is_room_for_sixteen_sensors", || {
+        let stage = Stage::new();
+        let mut program = publisher(&stage);
+        for number in 0..17 {
+            let mut sender = Sender::new(0xab, 7, number, &format!("s{number}"));
+            sender.announce(&[Topic::Zones]);
+            sender.send(Topic::Zones, &zones(Verdict::Clear));
+        }
+        let line = program.await_line("one too many", |line| line["kind"] == "trouble");
+        assert!(line["message"].as_str().is_some_and(|text| text.contains("16")), "{line}");
+        let listed = stage.run(&["list", "--json"]).of_class("topic");
+        assert_eq!(listed.len(), 16);
+        let outcome = program.end(INT);
+        assert_eq!(outcome.of_class("lan_published")[0]["capacity"], 1, "{outcome}");
+    });
+}
