@@ -199,7 +199,8 @@ impl<'a> Gateway<'a> {
                 }
             }
         }
-        if !was_checked && now - came >= GRACE {
+        // Where a listener is alone the hub may come yet.
+        if !was_checked && now - came >= GRACE && self.session.hub_lives() {
             let missing = self.selection.named().into_iter().find(|name| !there.iter().any(|it| it == name));
             if let Some(name) = missing {
                 return Err(no_sensor(name, &there));
