@@ -2,6 +2,7 @@
 //! file, line and column, or the flag.
 
 mod processing;
+mod sight;
 
 use std::rc::Rc;
 
@@ -14,6 +15,7 @@ use toml::Spanned;
 use crate::config::{Link, Processing, Source};
 use crate::origin::Origin;
 use processing::{BackgroundLayer, MarksLayer, PoseLayer, Sections, ZonesLayer};
+use sight::Sight;
 
 /// What one source says. Knows the keys; what is not here is an unknown key.
 #[derive(Deserialize)]
@@ -127,9 +129,11 @@ impl Draft {
             return Err(refuse(angle_place, what, "angle = 100"));
         }
         let mut processing = Processing::default();
-        for (origin, sections) in general.iter().chain(&own) {
+        let said: Vec<_> = general.iter().chain(&own).collect();
+        for (origin, sections) in &said {
             sections.clone().lay(origin, &mut processing)?;
         }
+        Sight { name: &name, place: &place, variant, unit, said }.check(&processing)?;
         processing.background.read(&name, variant, unit)?;
         Ok(Link { name, port, family, variant, unit, baud, processing })
     }

@@ -51,6 +51,8 @@ pub(crate) struct LinkThread<'a> {
     pub(crate) unreached: u32,
     /// The measuring mode of which was said whether it has marks.
     pub(crate) told_mode: u8,
+    /// The sensor, as it turned out to be, sees too little of its circles.
+    is_blind: bool,
 }
 
 /// What a link's error is made from.
@@ -92,6 +94,7 @@ impl<'a> LinkThread<'a> {
             line_errors: LineErrors::default(),
             unreached: 0,
             told_mode: Status::MODE_UNKNOWN,
+            is_blind: false,
         }
     }
 
@@ -222,6 +225,10 @@ impl<'a> LinkThread<'a> {
         let fill = |scan: &mut Scan| scanner::decode(&measured, mode, scan);
         if let Some(mismatch) = self.topics.scan(fill, &mut self.pipeline) {
             tracing::warn!("{}: the background begins anew: {mismatch}", self.link.name);
+        }
+        let is_blind = self.pipeline.is_blind();
+        if std::mem::replace(&mut self.is_blind, is_blind) != is_blind && is_blind {
+            tracing::warn!("{}: zones unknown: too few beams meet the largest circle", self.link.name);
         }
         self.stale_at = received.last.saturating_add(limit(period_us));
     }

@@ -80,6 +80,11 @@ impl Pipeline {
         self.background.as_mut()?.update(scan, out.foreground, &mut self.spare.foreground)
     }
 
+    /// Whether the sensor sees too little of the largest circle to find anything inside.
+    pub(crate) fn is_blind(&self) -> bool {
+        self.zones.is_blind()
+    }
+
     /// What to say of the zones when scans stay out.
     pub(crate) fn stale(&mut self, out: &mut Zones) {
         self.zones.stale(out);
