@@ -22,7 +22,7 @@ use serde_json::Value;
 
 pub(crate) use line::{Line, open_line};
 pub(crate) use network::in_a_network;
-pub(crate) use program::{INT, KILL, Outcome, Program, TERM};
+pub(crate) use program::{INT, KILL, Outcome, Program, TERM, USR1};
 pub(crate) use receiver::{Receiver, ip, read};
 pub(crate) use sender::{Sender, wall_ns};
 pub(crate) use telegrams::{MEASURED, Sent, bytes_of, hash, is_class, number, scan, sequence};
@@ -100,6 +100,20 @@ impl Stage {
     /// A hub with these flags that is up.
     pub(crate) fn hub<S: AsRef<str>>(&self, flags: &[S]) -> Program {
         self.start(&with(&["run", "--json"], flags)).ready()
+    }
+
+    /// A gateway with these flags that has begun; its number is kept in this directory.
+    pub(crate) fn gateway<S: AsRef<str>>(&self, flags: &[S]) -> Program {
+        let mut gateway = self.gateway_at(flags);
+        gateway.await_line("its begin", is_class("gateway"));
+        gateway
+    }
+
+    /// As [`Stage::gateway`], however it begins.
+    pub(crate) fn gateway_at<S: AsRef<str>>(&self, flags: &[S]) -> Program {
+        let mut command = self.command(&with(&["gateway", "--json", "--no-system-config"], flags));
+        command.env("XDG_STATE_HOME", self.path("state")).env_remove("STATE_DIRECTORY");
+        Program::start(command)
     }
 
     /// A simulator with a port of each of these names that is up; its truth is in the file `truth`.

@@ -1,6 +1,7 @@
 //! One source of configuration laid over the others: every value is checked where it stands, so that an error names
 //! file, line and column, or the flag.
 
+mod gateway;
 mod processing;
 mod sight;
 
@@ -14,6 +15,7 @@ use toml::Spanned;
 
 use crate::config::{Link, Processing, Source};
 use crate::origin::Origin;
+use gateway::GatewayLayer;
 use processing::{BackgroundLayer, MarksLayer, PoseLayer, Sections, ZonesLayer};
 use sight::Sight;
 
@@ -26,6 +28,8 @@ pub(crate) struct Layer {
     zones: Option<ZonesLayer>,
     marks: Option<MarksLayer>,
     background: Option<BackgroundLayer>,
+    /// The hub's own configuration may be that of its gateway, too.
+    pub(crate) gateway: Option<GatewayLayer>,
 }
 
 #[derive(Deserialize)]
@@ -80,7 +84,7 @@ impl Drafts {
 
     /// Lays `layer` over the others; only where `may_add` may it bring links that were not there.
     pub(crate) fn merge(&mut self, layer: Layer, origin: Origin, may_add: bool) -> Result<(), Failure> {
-        let Layer { link, zones, marks, background } = layer;
+        let Layer { link, zones, marks, background, gateway: _ } = layer;
         let origin = Rc::new(origin);
         merge(&mut self.links, link, &origin, may_add)?;
         self.general.push((origin, Sections { pose: None, zones, marks, background }));

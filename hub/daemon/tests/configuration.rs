@@ -5,7 +5,7 @@ use std::fs;
 use std::path::PathBuf;
 
 use daemon::Config;
-use daemon::config::{Processing, Sources};
+use daemon::config::{Gateway, Processing, Sources};
 use preprocess::background::{Candidate, Method, Start};
 use preprocess::zones::Sector;
 use schema::{Background, Kind, as_json};
@@ -218,4 +218,44 @@ fn a_background_begins_with_a_model_of_its_own_sensor() {
     let cut = Scratch::new("cut.json", &text[..900]);
     let refusal = load(&[], &[&format!("link.front.background.start={}", cut.0.display())]).unwrap_err();
     assert!(refusal.contains("cut.json is no background model: it is cut short"), "{refusal}");
+}
+
+#[test]
+fn the_gateway_has_a_section_that_needs_no_links() {
+    let first =
+        Scratch::new("gateway-1.toml", "[gateway]\ninterface = \"eth0\"\nttl = 2\ntopics = [\"a/scan\"]\n");
+    let second = Scratch::new("gateway-2.toml", "[gateway]\nbackground_every = \"10s\"\ntopics = []\n");
+    let gateway = |files: &[&Scratch], set: &[&str]| {
+        let sources = Sources {
+            files: files.iter().map(|file| file.0.clone()).collect(),
+            set: set.iter().map(|flag| (*flag).to_owned()).collect(),
+            links: Vec::new(),
+        };
+        Gateway::load(&sources).map_err(|failure| failure.to_string())
+    };
+    let place = format!("{}:2:20", second.0.display());
+    assert_eq!(
+        gateway(&[&first, &second], &["gateway.ttl=3", "gateway.bare=true"]).unwrap(),
+        Gateway {
+            interface: Some("eth0".into()),
+            topics: Some(Vec::new()),
+            to: None,
+            bare: Some(true),
+            ttl: Some(3),
+            background_every: Some(("10s".into(), place)),
+            mtu: None,
+        }
+    );
+    assert_eq!(gateway(&[], &[]).unwrap(), Gateway::default());
+    // A hub takes the same files.
+    assert_eq!(load(&[&first], &[]).unwrap().links.len(), 2);
+    for (set, said) in [
+        ("gateway.ttl=256", "ttl = 256\n  0 to 255"),
+        ("gateway.mtu=861", "mtu = 861\n  862 to 1472"),
+        ("gateway.mtu=-1", "mtu = -1"),
+        ("gateway.tll=1", "did you mean `ttl`?"),
+    ] {
+        let error = gateway(&[], &[set]).unwrap_err();
+        assert!(error.starts_with(&format!("--set {set}: ")) && error.contains(said), "{error}");
+    }
 }
