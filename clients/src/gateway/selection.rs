@@ -85,7 +85,8 @@ impl Entry {
                     return Err(refuse(text, "is a fold", "*/zones sends the zones of each sensor"));
                 }
                 if is_remote(&name.sensor) {
-                    return Err(refuse(text, "came over a network", "its own gateway sends it"));
+                    let hint = "a gateway sends what the hub of its own machine publishes";
+                    return Err(refuse(text, "is another machine's", hint));
                 }
                 (Some(name.sensor), name.topic)
             }

@@ -216,7 +216,7 @@ fn zones_are_those_of_the_formula_and_of_geometry() {
         let mut check = case.check();
         let mut out = dirty();
         // Another unit is another layout, and all begins anew.
-        for unit_mm in [1, 10] {
+        for unit_mm in [1, 10, 100] {
             let mut scan = scans::layout(&mut random, unit_mm);
             let mut streaks = vec![0; case.radii.len()];
             for seen in 1..=SCANS {
