@@ -1,7 +1,6 @@
 //! Who listens on a network, and knows nothing of who sends.
 
 use std::net::{Ipv4Addr, UdpSocket};
-use std::process::Command;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex};
 use std::thread::{self, JoinHandle};
@@ -11,12 +10,6 @@ use rustix::net::sockopt::set_socket_recv_buffer_size_force;
 use schema::datagram::{Datagram, GROUPS, PORT};
 
 use super::until;
-
-/// `ip` with these arguments.
-pub(crate) fn ip(arguments: &str) {
-    let done = Command::new("ip").args(arguments.split(' ')).status();
-    assert!(done.is_ok_and(|status| status.success()), "ip {arguments}");
-}
 
 /// Takes all datagrams that come to a port, from the four groups and from elsewhere.
 pub(crate) struct Receiver {
