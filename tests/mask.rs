@@ -83,6 +83,21 @@ fn nothing_there_is_an_empty_mask_that_a_hub_takes_too() {
 }
 
 #[test]
+fn a_body_beyond_the_circle_that_violates_it_is_no_reason_to_do_without_a_mask() {
+    let stage = Stage::new();
+    let _simulator = simulator(&stage, &world(&stage, "[[thing]]\nradius_mm = 40\npose = [0, 1200]\n"));
+    let _hub = stage.hub(&[&stage.link("front"), "--set=zones.margin=0.5"]);
+    await_verdict(&stage, "slow");
+    let outcome = stage.run(&["zones", "front", "mask", "--for", "3s"]);
+    assert_eq!(outcome.code, Some(0), "{outcome}");
+    assert!(outcome.errors.contains("the largest circle is violated") && outcome.errors.contains("--within"));
+    assert!(!outcome.errors.contains("no mask is needed"), "{outcome}");
+    let outcome = stage.run(&["zones", "front", "mask", "--for", "3s", "--within", "1.5"]);
+    assert_eq!((outcome.code, outcome.errors.as_str()), (Some(0), ""), "{outcome}");
+    assert!(!outcome.out.ends_with(b"self_min = []\n"), "{outcome}");
+}
+
+#[test]
 fn too_little_to_learn_from_is_refused() {
     let stage = Stage::new();
     let mask = |more: &[&str]| stage.run(&[&["zones", "front", "mask", "--json"], more].concat());

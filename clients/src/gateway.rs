@@ -203,7 +203,8 @@ impl<'a> Gateway<'a> {
                 }
             }
         }
-        if !self.is_checked && now - came >= GRACE {
+        // Where a listener is alone the hub may come yet.
+        if !self.is_checked && now - came >= GRACE && self.session.hub_lives() {
             let missing = self.selection.named().into_iter().find(|name| !there.iter().any(|it| it == name));
             if let Some(name) = missing {
                 return Err(no_sensor(name, &there));

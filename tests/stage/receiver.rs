@@ -33,14 +33,7 @@ impl Receiver {
 
     /// At another port.
     pub(crate) fn at(interface: Ipv4Addr, port: u16) -> Receiver {
-        let socket = UdpSocket::bind((Ipv4Addr::UNSPECIFIED, port)).expect("the port is free");
-        for last in 80..84 {
-            let group = Ipv4Addr::new(GROUPS[0], GROUPS[1], GROUPS[2], last);
-            socket.join_multicast_v4(&group, &interface).expect("the group can be joined");
-        }
-        // A test that is not scheduled for a second shall miss nothing; where that is not allowed it may.
-        let _ = set_socket_recv_buffer_size_force(&socket, 8 << 20);
-        socket.set_read_timeout(Some(Duration::from_millis(50))).expect("waits that long");
+        let socket = Receiver::socket(interface, port);
         let (heard, stop) = (Arc::new(Mutex::new(Vec::new())), Arc::new(AtomicBool::new(false)));
         let (to, flag) = (heard.clone(), stop.clone());
         let thread = thread::spawn(move || {
@@ -55,6 +48,19 @@ impl Receiver {
             }
         });
         Receiver { heard, stop, thread: Some(thread) }
+    }
+
+    /// Hears the four groups on this interface, at this port; waits 50 ms for a datagram.
+    pub(crate) fn socket(interface: Ipv4Addr, port: u16) -> UdpSocket {
+        let socket = UdpSocket::bind((Ipv4Addr::UNSPECIFIED, port)).expect("the port is free");
+        for last in 80..84 {
+            let group = Ipv4Addr::new(GROUPS[0], GROUPS[1], GROUPS[2], last);
+            socket.join_multicast_v4(&group, &interface).expect("the group can be joined");
+        }
+        // A test that is not scheduled for a second shall miss nothing; where that is not allowed it may.
+        let _ = set_socket_recv_buffer_size_force(&socket, 8 << 20);
+        socket.set_read_timeout(Some(Duration::from_millis(50))).expect("waits that long");
+        socket
     }
 
     /// All that came so far, in its order.
