@@ -5,6 +5,7 @@ mod background;
 mod configure;
 mod control;
 mod doctor;
+mod gateway;
 mod leds;
 mod listen;
 mod probe;
@@ -22,6 +23,7 @@ use schema::{DEFAULT_DOMAIN, Domain, Environment, Failure};
 
 pub(crate) use background::Background;
 pub(crate) use control::Control;
+pub(crate) use gateway::Gateway;
 pub(crate) use leds::Leds;
 pub(crate) use listen::Listen;
 pub(crate) use telegram::{Telegram, Way};
@@ -111,32 +113,48 @@ pub(crate) enum Verb {
     /// The zone verdict and the marks as lights: in the terminal, and on diodes of this machine
     #[command(after_help = leds::MEANING)]
     Leds(Leds),
+    /// What the hub publishes, as UDP datagrams on a network: one message each, to multicast groups and to hosts
+    #[command(after_help = gateway::GROUPS)]
+    Gateway(Gateway),
     /// What the gateways of other machines send over the network, and what of it was lost
     Listen(Listen),
 }
 
 #[derive(Args, Debug)]
 pub(crate) struct Run {
-    /// TOML file, read after those in /etc/scanhub
-    #[arg(long, env = "SCANHUB_CONFIG", value_name = "FILE")]
-    pub(crate) config: Option<PathBuf>,
-    /// Do not read /etc/scanhub
-    #[arg(long)]
-    pub(crate) no_system_config: bool,
+    #[command(flatten)]
+    pub(crate) configured: Configured,
     /// A link with its defaults; PORT is a tty, tcp:HOST:PORT or file:PATH[?rate=max]
     #[arg(long, value_name = "NAME=PORT")]
     pub(crate) link: Vec<String>,
-    /// One value, for example link.front.angle=100
-    #[arg(long, value_name = "KEY=VALUE")]
-    pub(crate) set: Vec<String>,
 }
 
 impl Run {
     /// Where the configuration is to be read from.
     pub(crate) fn sources(&self) -> Sources {
+        Sources { links: self.link.clone(), ..self.configured.sources() }
+    }
+}
+
+/// Where a configuration is said, apart from links.
+#[derive(Args, Debug)]
+pub(crate) struct Configured {
+    /// TOML file, read after those in /etc/scanhub
+    #[arg(long, env = "SCANHUB_CONFIG", value_name = "FILE")]
+    config: Option<PathBuf>,
+    /// Do not read /etc/scanhub
+    #[arg(long)]
+    no_system_config: bool,
+    /// One value, for example link.front.angle=100
+    #[arg(long, value_name = "KEY=VALUE")]
+    set: Vec<String>,
+}
+
+impl Configured {
+    pub(crate) fn sources(&self) -> Sources {
         let mut files = if self.no_system_config { Vec::new() } else { Sources::system() };
         files.extend(self.config.clone());
-        Sources { files, set: self.set.clone(), links: self.link.clone() }
+        Sources { files, set: self.set.clone(), links: Vec::new() }
     }
 }
 

@@ -21,7 +21,7 @@ use daemon::Config;
 use rustix::process::Signal;
 use schema::{Failure, Kind};
 use serde::Serialize;
-use signal_hook::consts::{SIGHUP, SIGINT, SIGQUIT, SIGTERM};
+use signal_hook::consts::{SIGHUP, SIGINT, SIGQUIT, SIGTERM, SIGUSR1};
 use tracing::level_filters::LevelFilter;
 
 use cli::{Cli, Everywhere, Verb, Way};
@@ -122,6 +122,10 @@ fn dispatch(cli: &Cli) -> Result<(), Failure> {
         Verb::Leds(leds) => {
             clients::leds(&leds.options(everywhere)?, &mut out, &mut io::stderr(), &*interrupt()?)
         }
+        Verb::Gateway(gateway) => {
+            let (tell, stop) = (interrupt_by(&[SIGUSR1])?, interrupt()?);
+            clients::gateway(&gateway.options(everywhere)?, &mut out, &mut io::stderr(), &tell, &stop)
+        }
         Verb::Listen(listen) => {
             clients::listen(&listen.options(everywhere)?, &mut out, &mut io::stderr(), &*interrupt()?)
         }
@@ -201,7 +205,7 @@ fn interrupt() -> Result<Arc<AtomicBool>, Failure> {
     interrupt_by(&[SIGINT, SIGTERM])
 }
 
-/// The same of these signals, none of which ends the process: a change of an EEPROM goes to its end, also when its
+/// The same of these signals, none of which ends the process then: a change of an EEPROM goes to its end, also when its
 /// terminal is closed.
 fn interrupt_by(signals: &[c_int]) -> Result<Arc<AtomicBool>, Failure> {
     let flag = Arc::new(AtomicBool::new(false));

@@ -2,7 +2,6 @@
 //! who sends it, and to answer.
 
 mod ear;
-mod interface;
 mod names;
 mod publish;
 mod remote;

@@ -2,8 +2,9 @@
 
 use std::time::Duration;
 
+use schema::datagram::Packed;
 use schema::ipc::Payload;
-use schema::{Background, Failure, Foreground, Marks, Scan, Status, Topic};
+use schema::{Background, Failure, Foreground, Header, Marks, Scan, Status, Topic};
 
 use crate::follower::{Follower, Received};
 use crate::names::TopicName;
@@ -18,19 +19,14 @@ macro_rules! samples {
         pub(crate) enum Sample { $($kind($sample),)* }
 
         impl Sample {
-            /// Nominal time between two scans, in us; 0 unknown.
-            pub(crate) fn period_us(&self) -> u32 {
-                match self { $(Sample::$kind(sample) => sample.period_us(),)* }
+            /// Numbers, stamps and quality; nothing if nobody sent it: then it stands for a silence.
+            pub(crate) fn header(&self) -> Option<&Header> {
+                match self { $(Sample::$kind(sample) => Told::header(sample),)* }
             }
 
             /// Samples that were sent before this one and not received.
             pub(crate) fn missed(&self) -> u64 {
                 match self { $(Sample::$kind(sample) => sample.missed(),)* }
-            }
-
-            /// Nobody sent it: it stands for a silence.
-            pub(crate) fn is_silence(&self) -> bool {
-                match self { $(Sample::$kind(sample) => sample.is_silence(),)* }
             }
         }
 
@@ -89,6 +85,16 @@ impl Source {
 }
 
 impl Sample {
+    /// Nominal time between two scans, in us; 0 unknown.
+    pub(crate) fn period_us(&self) -> u32 {
+        self.header().map_or(0, |header| header.period_us)
+    }
+
+    /// Nobody sent it: it stands for a silence.
+    pub(crate) fn is_silence(&self) -> bool {
+        self.header().is_none()
+    }
+
     /// The payload as it lies in memory; of the fold that of the sensor that was heard.
     pub(crate) fn bytes(&self) -> &[u8] {
         match self {
@@ -104,51 +110,58 @@ impl Sample {
     }
 }
 
+impl Sample {
+    /// Writes the payload as it goes over a network to the beginning of `room`; answers its length, or `None` if there is
+    /// too little room.
+    pub(crate) fn pack(&self, room: &mut [u8]) -> Option<usize> {
+        match self {
+            Sample::Telegram(sample) => {
+                room.get_mut(..sample.len())?.copy_from_slice(sample);
+                Some(sample.len())
+            }
+            Sample::Scan(sample) => sample.pack(room),
+            Sample::Marks(sample) => sample.pack(room),
+            Sample::Zones(sample) => sample.zones.pack(room),
+            Sample::Foreground(sample) => sample.pack(room),
+            Sample::Background(sample) => sample.pack(room),
+            Sample::Status(sample) => sample.pack(room),
+            Sample::Robot(sample) => sample.heard.zones.pack(room),
+        }
+    }
+}
+
 /// What every sample can be asked.
 trait Told {
-    fn period_us(&self) -> u32;
+    fn header(&self) -> Option<&Header>;
     fn missed(&self) -> u64;
-    fn is_silence(&self) -> bool;
 }
 
 impl<P: Payload + ?Sized> Told for Received<P> {
-    fn period_us(&self) -> u32 {
-        self.header().period_us
+    fn header(&self) -> Option<&Header> {
+        Some(self.header())
     }
 
     fn missed(&self) -> u64 {
         self.missed
-    }
-
-    fn is_silence(&self) -> bool {
-        false
     }
 }
 
 impl Told for Heard {
-    fn period_us(&self) -> u32 {
-        self.header.map_or(0, |header| header.period_us)
+    fn header(&self) -> Option<&Header> {
+        self.header.as_ref()
     }
 
     fn missed(&self) -> u64 {
         self.missed
     }
-
-    fn is_silence(&self) -> bool {
-        self.header.is_none()
-    }
 }
 
 impl Told for RobotHeard {
-    fn period_us(&self) -> u32 {
-        self.heard.period_us()
+    fn header(&self) -> Option<&Header> {
+        self.heard.header.as_ref()
     }
 
     fn missed(&self) -> u64 {
         self.heard.missed
-    }
-
-    fn is_silence(&self) -> bool {
-        self.heard.is_silence()
     }
 }

@@ -3,8 +3,11 @@
 #![allow(dead_code, unused_imports)] // Every test file takes what it needs.
 
 mod line;
+mod machine;
 mod network;
 mod program;
+mod receiver;
+mod relay;
 mod sender;
 mod telegrams;
 mod terminal;
@@ -20,8 +23,11 @@ use schema::Domain;
 use serde_json::Value;
 
 pub(crate) use line::{Line, open_line};
+pub(crate) use machine::{Machine, command_in};
 pub(crate) use network::in_a_network;
-pub(crate) use program::{INT, KILL, Outcome, Program, TERM};
+pub(crate) use program::{INT, KILL, Outcome, Program, TERM, USR1};
+pub(crate) use receiver::{Receiver, ip, read};
+pub(crate) use relay::Relay;
 pub(crate) use sender::{Sender, wall_ns};
 pub(crate) use telegrams::{MEASURED, Sent, bytes_of, hash, is_class, number, scan, sequence};
 pub(crate) use terminal::terminal;
@@ -33,6 +39,8 @@ pub(crate) const PATIENCE: Duration = Duration::from_secs(20);
 pub(crate) struct Stage {
     directory: PathBuf,
     domain: String,
+    /// Where its programs run, if not where the test does.
+    network: Option<PathBuf>,
 }
 
 impl Stage {
@@ -42,7 +50,14 @@ impl Stage {
         // Not TMPDIR: root and prefix of a domain have to be short.
         let directory = PathBuf::from(format!("/tmp/{domain}"));
         fs::create_dir_all(&directory).unwrap_or_else(|error| panic!("{}: {error}", directory.display()));
-        Stage { directory, domain }
+        Stage { directory, domain, network: None }
+    }
+
+    /// One whose programs run on another machine.
+    pub(crate) fn on(machine: &Machine) -> Stage {
+        let mut stage = Stage::new();
+        stage.network = Some(machine.network());
+        stage
     }
 
     /// Where its hub is, for consumers in the test itself.
@@ -77,7 +92,11 @@ impl Stage {
 
     /// As [`Stage::command`], with the domain in another directory.
     pub(crate) fn command_at<S: AsRef<str>>(&self, root: &Path, arguments: &[S]) -> Command {
-        let mut command = Command::new(env!("CARGO_BIN_EXE_scanhub"));
+        let program = env!("CARGO_BIN_EXE_scanhub");
+        let mut command = match &self.network {
+            Some(network) => command_in(network, program),
+            None => Command::new(program),
+        };
         command.args(arguments.iter().map(AsRef::as_ref));
         command.args(["--domain", &self.domain, "--root"]).arg(root);
         // Should the whole test be killed, its children end too.
@@ -98,6 +117,20 @@ impl Stage {
     /// A hub with these flags that is up.
     pub(crate) fn hub<S: AsRef<str>>(&self, flags: &[S]) -> Program {
         self.start(&with(&["run", "--json"], flags)).ready()
+    }
+
+    /// A gateway with these flags that has begun; its number is kept in this directory.
+    pub(crate) fn gateway<S: AsRef<str>>(&self, flags: &[S]) -> Program {
+        let mut gateway = self.gateway_at(flags);
+        gateway.await_line("its begin", is_class("gateway"));
+        gateway
+    }
+
+    /// As [`Stage::gateway`], however it begins.
+    pub(crate) fn gateway_at<S: AsRef<str>>(&self, flags: &[S]) -> Program {
+        let mut command = self.command(&with(&["gateway", "--json", "--no-system-config"], flags));
+        command.env("XDG_STATE_HOME", self.path("state")).env_remove("STATE_DIRECTORY");
+        Program::start(command)
     }
 
     /// A simulator with a port of each of these names that is up; its truth is in the file `truth`.

@@ -10,7 +10,7 @@ use schema::datagram::{GROUPS, PORT};
 use schema::{Failure, Kind};
 use socket2::{Domain, InterfaceIndexOrAddress, Protocol, Socket, Type};
 
-use super::interface::{Interface, interfaces, named};
+use crate::interface::{Interface, interfaces, named};
 
 /// Hears groups.
 pub(super) struct Ear {

@@ -4,12 +4,11 @@
 mod outlet;
 
 use lms::session::Received;
-use preprocess::background::Mismatch;
 use schema::ipc::{self, BytesMut, Node, Notifier, WakeService};
 use schema::{Background, Failure, Flags, Foreground, Header, Marks, Quality, Scan, Status, Wake, Zones};
 
 use crate::clock;
-use crate::pipeline::{Outputs, Pipeline};
+use crate::pipeline::{Anew, Outputs, Pipeline};
 use outlet::Outlet;
 
 /// The publishing end of one sensor; stays in its link's thread.
@@ -113,7 +112,7 @@ impl Topics {
     /// Publishes a scan of the last telegram, which `fill` writes in place, and what `pipeline` makes of it there. Marks
     /// and foreground that nobody wants are not made; their numbers are used up. A background that does not fit the scan
     /// begins anew; then it is told why.
-    pub(crate) fn scan(&mut self, fill: impl FnOnce(&mut Scan), pipeline: &mut Pipeline) -> Option<Mismatch> {
+    pub(crate) fn scan(&mut self, fill: impl FnOnce(&mut Scan), pipeline: &mut Pipeline) -> Option<Anew> {
         let with_marks = self.marks.is_followed();
         let with_foreground = pipeline.keeps_background() && self.foreground.is_followed();
         let mut scan = self.scan.loan();
@@ -125,7 +124,7 @@ impl Topics {
             None => &mut *self.spare_scan,
         };
         fill(decoded);
-        let mismatch = pipeline.update(
+        let anew = pipeline.update(
             decoded,
             Outputs {
                 zones: zones.as_mut().map(|loan| loan.payload_mut()),
@@ -148,7 +147,7 @@ impl Topics {
         if pipeline.shows_every_scan() || pipeline.is_news() {
             self.show(pipeline, &header);
         }
-        mismatch
+        anew
     }
 
     /// Publishes that nothing is known of the zones as of `now`, for scans stay out.
@@ -158,14 +157,14 @@ impl Topics {
             Some(loan) => pipeline.stale(loan.payload_mut()),
             None => pipeline.stale(&mut Zones::default()),
         }
-        self.zones.send(loan, &self.header_of(now));
+        self.zones.send(loan, &of_moment(&self.header, now));
     }
 
     /// Publishes the background as of `now`, if it is one that was not published; whether it was.
     pub(crate) fn background(&mut self, pipeline: &mut Pipeline, now: u64) -> bool {
         let is_news = pipeline.is_news();
         if is_news {
-            self.show(pipeline, &self.header_of(now));
+            self.show(pipeline, &of_moment(&self.header, now));
         }
         is_news
     }
@@ -176,7 +175,7 @@ impl Topics {
         if let Some(loan) = &mut loan {
             *loan.payload_mut() = *status;
         }
-        self.status.send(loan, &self.header_of(now));
+        self.status.send(loan, &of_moment(&self.header, now));
     }
 
     /// Wakes whoever sleeps; once per telegram, after its last sample.
@@ -221,16 +220,34 @@ impl Topics {
         }
         self.background.send(loan, header);
     }
+}
 
-    /// The header of what is said at `now` without a telegram: its number is the last one's.
-    fn header_of(&self, now: u64) -> Header {
-        Header {
-            stamp_first_ns: now,
-            stamp_last_ns: now,
-            wall_ns: clock::wall(now),
-            quality: Quality::Clean as u8,
-            reasons: 0,
-            ..self.header
-        }
+/// The header of what is said at `now` without a telegram: its number is that of `last`, the last one's.
+fn of_moment(last: &Header, now: u64) -> Header {
+    Header {
+        stamp_first_ns: now,
+        stamp_last_ns: now,
+        wall_ns: clock::wall(now),
+        quality: Quality::Clean as u8,
+        reasons: 0,
+        flags: last.flags & !Flags::STAMP_ESTIMATED,
+        ..*last
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_is_said_without_a_telegram_has_nothing_of_its_doubts() {
+        let flags = Flags::SIMULATED | Flags::STAMP_ESTIMATED;
+        let last = Header { seq: 7, period_us: 26_640, quality: 1, reasons: 4, flags, ..Header::default() };
+        let header = of_moment(&last, 5);
+        assert_eq!((header.quality, header.reasons, header.flags), (0, 0, Flags::SIMULATED));
+        assert_eq!(
+            (header.seq, header.period_us, header.stamp_first_ns, header.stamp_last_ns),
+            (7, 26_640, 5, 5)
+        );
     }
 }

@@ -1,4 +1,4 @@
-//! The network interfaces of this machine, for who joins groups on them. Refuses to know sockets.
+//! The network interfaces of this machine, for who joins groups on them or sends to them. Refuses to know sockets.
 
 use std::net::Ipv4Addr;
 
@@ -8,27 +8,27 @@ use schema::{Failure, Kind};
 
 /// One interface, as it is at this moment.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub(super) struct Interface {
+pub(crate) struct Interface {
     /// Its name.
-    pub(super) name: String,
+    pub(crate) name: String,
     /// Its number: another one if it was taken away and made again under the same name.
-    pub(super) index: u32,
+    pub(crate) index: u32,
     /// It is switched on.
-    pub(super) up: bool,
+    pub(crate) up: bool,
     /// There is a link: its cable is plugged in.
-    pub(super) running: bool,
+    pub(crate) running: bool,
     /// It can carry groups, or is the loopback, which can all the same.
-    pub(super) multicast: bool,
+    pub(crate) multicast: bool,
     /// It leads back to this machine.
-    pub(super) loopback: bool,
+    pub(crate) loopback: bool,
     /// Its first IPv4 address.
-    pub(super) address: Option<Ipv4Addr>,
+    pub(crate) address: Option<Ipv4Addr>,
 }
 
 /// All interfaces, in the kernel's order.
 ///
 /// [`Kind::Failed`] if the system does not tell.
-pub(super) fn interfaces() -> Result<Vec<Interface>, Failure> {
+pub(crate) fn interfaces() -> Result<Vec<Interface>, Failure> {
     let addresses = getifaddrs().map_err(|error| {
         Failure::new(Kind::Failed, format!("cannot list network interfaces: {error}"), "")
     })?;
@@ -46,7 +46,7 @@ pub(super) fn interfaces() -> Result<Vec<Interface>, Failure> {
 /// The interface called `name`.
 ///
 /// [`Kind::Configuration`] with those that there are.
-pub(super) fn named(name: &str) -> Result<Interface, Failure> {
+pub(crate) fn named(name: &str) -> Result<Interface, Failure> {
     let mut all = interfaces()?;
     if let Some(at) = all.iter().position(|interface| interface.name == name) {
         return Ok(all.swap_remove(at));

@@ -1,0 +1,243 @@
+//! `scanhub gateway`: what the hub publishes, as datagrams on a network, one message each and nothing sent twice. An
+//! ordinary client of the hub that outlives it, its links and its own network. Takes nothing from the network.
+
+mod lan;
+mod life;
+mod outlet;
+mod report;
+mod selection;
+mod sensor;
+mod uplink;
+
+use std::io::Write;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::{Duration, Instant};
+
+use schema::{Domain, Failure, Kind, check_sensor, ipc};
+
+use crate::clock;
+use crate::follow::Notice;
+use crate::names::no_sensor;
+use crate::output::{End, quiet};
+use crate::presence::GRACE;
+use crate::session::Session;
+use lan::{Form, Lan};
+use life::Life;
+use report::Report;
+use selection::Selection;
+use sensor::Sensor;
+use uplink::Uplink;
+
+/// What `gateway` is asked for.
+#[derive(Clone, Debug)]
+pub struct GatewayOptions {
+    /// The network interface of the groups; without one the only one that can be meant.
+    pub interface: Option<String>,
+    /// `SENSOR/TOPIC` or `*/TOPIC`, with `:every=N` if it is to be thinned; none: all but telegrams, of all sensors.
+    pub topics: Vec<String>,
+    /// `HOST:PORT` of those that get copies.
+    pub to: Vec<String>,
+    /// Telegrams and nothing else, without a header.
+    pub bare: bool,
+    /// How many routers pass on what goes to the groups.
+    pub ttl: u8,
+    /// The background goes out so often, besides when it is a new one.
+    pub background_every: Option<Duration>,
+    /// The longest datagram, in bytes.
+    pub longest: usize,
+    /// How it tells of itself.
+    pub look: GatewayLook,
+    /// Where the domain may be, see [`Domain::candidates`].
+    pub places: Vec<Domain>,
+}
+
+/// How a gateway tells of itself.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum GatewayLook {
+    /// Lines at the begin, at the end and when asked.
+    Lines,
+    /// Objects, once a second.
+    Json,
+    /// One line that is drawn over itself.
+    Terminal,
+}
+
+/// Sends until `stop` is set, whatever becomes of the hub and of the network. The account goes to `out` at the end and
+/// whenever `tell` is set; what is no account to `notes` (stderr) if `out` is not JSON.
+///
+/// [`Kind::Configuration`] if there is no such interface or not just one, a destination is no host, or a
+/// value is not possible; [`Kind::NoTopic`] if there is no such topic, or the first hub that is met has no
+/// such sensor; [`Kind::Short`] if descriptors or memory are.
+pub fn gateway(
+    options: &GatewayOptions,
+    out: &mut dyn Write,
+    notes: &mut dyn Write,
+    tell: &AtomicBool,
+    stop: &AtomicBool,
+) -> Result<(), Failure> {
+    let mut gateway = Gateway::open(options)?;
+    let mut report = Report::new(options.look, out, notes);
+    quiet(gateway.run(&mut report, tell, stop))
+}
+
+struct Gateway<'a> {
+    options: &'a GatewayOptions,
+    selection: Selection,
+    session: Session,
+    sensors: Vec<Sensor>,
+    lan: Lan,
+    started: Instant,
+    /// When the hub came, and how often its sensors were looked for.
+    hub: Option<(Instant, usize)>,
+    /// The sensors that are named were found in a hub.
+    is_checked: bool,
+    waiting_said: bool,
+    tick_at: Instant,
+}
+
+/// Between two announcements, and between two lines of the account.
+const TICK: Duration = Duration::from_secs(1);
+/// When the sensors of a hub that came are looked for: it makes their topics one after the other. Not more often, because
+/// nothing is sent meanwhile.
+const ROLLS: [Duration; 4] =
+    [Duration::ZERO, Duration::from_millis(200), Duration::from_secs(1), Duration::from_secs(5)];
+
+impl<'a> Gateway<'a> {
+    fn open(options: &'a GatewayOptions) -> Result<Gateway<'a>, Failure> {
+        let selection = Selection::parse(&options.topics, options.bare)?;
+        if options.bare && options.background_every.is_some() {
+            let what = "no background goes out where only telegrams do";
+            return Err(Failure::new(Kind::Configuration, what, "leave bare or background_every away"));
+        }
+        let interface = Uplink::choose(options.interface.as_deref())?;
+        let domain = options.places.first().map(Domain::name).unwrap_or_default();
+        let now_s = clock::wall_ns() / 1_000_000_000;
+        let life = Life::begin(&life::directory()?, domain, interface.name(), now_s)?;
+        let form = if options.bare { Form::Bare } else { Form::Sealed };
+        let lan = Lan::open(life, interface, &options.to, form, options.ttl, options.longest)?;
+        let sensor = |name: &&str| Sensor::new(name, &selection, !options.bare);
+        Ok(Gateway {
+            options,
+            sensors: selection.named().iter().map(sensor).collect(),
+            selection,
+            session: Session::new(options.places.clone()),
+            lan,
+            started: Instant::now(),
+            hub: None,
+            waiting_said: false,
+            is_checked: false,
+            tick_at: Instant::now(),
+        })
+    }
+
+    fn run(&mut self, report: &mut Report<'_>, tell: &AtomicBool, stop: &AtomicBool) -> Result<(), End> {
+        report.begin(&self.lan, self.options.bare)?;
+        if !self.lan.interface.is_up() {
+            report.interface(&self.lan)?;
+        }
+        let end = self.go_on(report, tell, stop);
+        // However it ends: how many were sent is the last word.
+        self.announce();
+        end.and_then(|()| report.account(&self.lan))
+    }
+
+    fn go_on(&mut self, report: &mut Report<'_>, tell: &AtomicBool, stop: &AtomicBool) -> Result<(), End> {
+        while !stop.load(Ordering::Relaxed) {
+            if self.lan.look() {
+                report.interface(&self.lan)?;
+            }
+            // What is there comes before the question whether the hub still is: that takes longer than sending.
+            let mut more = false;
+            for sensor in &mut self.sensors {
+                more |= sensor.forward(&mut self.session, &mut self.lan)?;
+            }
+            self.look(report)?;
+            self.tick(report)?;
+            if tell.swap(false, Ordering::Relaxed) {
+                report.account(&self.lan)?;
+            }
+            if !more {
+                let left = self.sensors.iter().filter_map(Sensor::left).min();
+                let tick = self.tick_at.saturating_duration_since(Instant::now());
+                self.session.wait_for(Some(left.map_or(tick, |left| left.min(tick))))?;
+            }
+        }
+        Ok(())
+    }
+
+    /// News of the hub, and the sensors of one that came.
+    fn look(&mut self, report: &mut Report<'_>) -> Result<(), End> {
+        let change = self.session.look()?;
+        let now = Instant::now();
+        if change.gone {
+            report.hub(Notice::HubGone)?;
+        }
+        if change.back {
+            if self.hub.is_some() || self.waiting_said {
+                report.hub(Notice::HubBack)?;
+            }
+            self.hub = Some((now, 0));
+        }
+        if self.hub.is_none() && !self.waiting_said && now - self.started >= GRACE {
+            self.waiting_said = true;
+            report.hub(Notice::HubGone)?;
+        }
+        self.call_the_roll(now)?;
+        Ok(())
+    }
+
+    /// Follows the sensors of the hub if all are wanted; those that are named have to be there in the first hub.
+    fn call_the_roll(&mut self, now: Instant) -> Result<(), Failure> {
+        let (Some((came, rolls)), Some(domain)) = (self.hub, self.session.domain()) else { return Ok(()) };
+        if ROLLS.get(rolls).is_none_or(|after| now - came < *after) {
+            return Ok(());
+        }
+        self.hub = Some((came, rolls + 1));
+        let there = ipc::sensors(domain)?;
+        if self.selection.wants_all() {
+            for name in &there {
+                // One that came from another machine has another name.
+                let is_known = self.sensors.iter().any(|sensor| sensor.name == *name);
+                if !is_known && check_sensor(name).is_ok() {
+                    self.sensors.push(Sensor::new(name, &self.selection, !self.options.bare));
+                }
+            }
+        }
+        // Where a listener is alone the hub may come yet.
+        if !self.is_checked && now - came >= GRACE && self.session.hub_lives() {
+            let missing = self.selection.named().into_iter().find(|name| !there.iter().any(|it| it == name));
+            if let Some(name) = missing {
+                return Err(no_sensor(name, &there));
+            }
+            self.is_checked = true;
+        }
+        Ok(())
+    }
+
+    /// Once a second: announcements, backgrounds, and what became of destinations.
+    fn tick(&mut self, report: &mut Report<'_>) -> Result<(), End> {
+        let now = Instant::now();
+        if now < self.tick_at {
+            return Ok(());
+        }
+        self.tick_at = now + TICK;
+        if let Some(every) = self.options.background_every {
+            self.sensors.iter_mut().for_each(|sensor| sensor.repeat(every, now, &mut self.lan));
+        }
+        self.announce();
+        let Lan { groups, copies, .. } = &mut self.lan;
+        for outlet in std::iter::once(groups).chain(copies) {
+            if let Some(news) = outlet.news() {
+                report.destination(&outlet.name, &news)?;
+            }
+        }
+        if let Some(what) = self.lan.misfit() {
+            report.misfit(&what, self.lan.longest())?;
+        }
+        report.periodic(&self.lan, self.session.domain().is_some())
+    }
+
+    fn announce(&mut self) {
+        self.sensors.iter().for_each(|sensor| sensor.announce(&mut self.lan));
+    }
+}

@@ -1,0 +1,222 @@
+//! The datagrams: each is numbered, sealed and handed to every destination, in a buffer that is always the same. Refuses
+//! to know where samples come from.
+
+use schema::datagram::{Announce, HEAD, Head, MTU_ETHERNET, MTU_LEAST, PORT, group};
+use schema::{Failure, Kind, Topic};
+
+use super::life::Life;
+use super::outlet::Outlet;
+use super::uplink::Uplink;
+
+/// What goes out, and the account of it.
+pub(super) struct Lan {
+    pub(super) life: Life,
+    pub(super) interface: Uplink,
+    /// The groups; what is sent to them is what the rows count.
+    pub(super) groups: Outlet,
+    /// Hosts that get copies.
+    pub(super) copies: Vec<Outlet>,
+    sensors: Vec<Rows>,
+    form: Form,
+    longest: usize,
+    buffer: [u8; MTU_ETHERNET],
+}
+
+/// How a payload becomes a datagram.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum Form {
+    /// Behind a header.
+    Sealed,
+    /// By itself, to a port of its sensor.
+    Bare,
+}
+
+/// The account of one sensor.
+#[derive(Default)]
+pub(super) struct Rows {
+    /// Who had this number last.
+    pub(super) name: String,
+    rows: [Row; KINDS],
+}
+
+/// The account of one sensor and topic.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub(super) struct Row {
+    /// Datagrams that the groups were sent.
+    pub(super) sent: u64,
+    /// Datagrams that have a number and were not sent to the groups.
+    pub(super) failed: u64,
+    /// Bytes in what was sent.
+    pub(super) bytes: u64,
+    /// Samples that the hub sent and the gateway did not receive; they have no number.
+    pub(super) missed: u64,
+    fit: Fit,
+}
+
+/// Whether all samples of a topic fit into datagrams.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+enum Fit {
+    #[default]
+    All,
+    NotAll,
+    /// And that is told.
+    Told,
+}
+
+impl Row {
+    /// The number of the next datagram.
+    pub(super) fn next(&self) -> u32 {
+        (self.sent + self.failed) as u32
+    }
+}
+
+impl Rows {
+    /// All topics of which anything was sent or ought to have been, announcements as nothing.
+    pub(super) fn used(&self) -> impl Iterator<Item = (Option<Topic>, &Row)> {
+        let numbered = self.rows.iter().enumerate().filter(|(_, row)| **row != Row::default());
+        numbered.map(|(number, row)| (Topic::of_number(number as u8), row))
+    }
+}
+
+impl Lan {
+    /// Datagrams of at most `longest` bytes, as `life`, to the groups on `interface`, which routers pass on `ttl` times,
+    /// and to the hosts in `to`.
+    ///
+    /// [`Kind::Configuration`] if `longest` is not possible or a host is none; [`Kind::Failed`] without sockets.
+    pub(super) fn open(
+        life: Life,
+        interface: Uplink,
+        to: &[String],
+        form: Form,
+        ttl: u8,
+        longest: usize,
+    ) -> Result<Lan, Failure> {
+        if !(MTU_LEAST..=MTU_ETHERNET).contains(&longest) {
+            let what = format!("datagrams of {longest} bytes are not possible");
+            let hint =
+                format!("from {MTU_LEAST} to {MTU_ETHERNET}, which is the most that an Ethernet carries");
+            return Err(Failure::new(Kind::Configuration, what, hint));
+        }
+        let (port, more) = match form {
+            Form::Sealed => (PORT, 0),
+            Form::Bare => (BARE_PORT, u16::from(u8::MAX)),
+        };
+        let groups = Outlet::groups(interface.name(), port, ttl)?;
+        let copies = to.iter().map(|text| Outlet::host(text, more)).collect::<Result<_, _>>()?;
+        let (sensors, buffer) = (Vec::new(), [0; MTU_ETHERNET]);
+        let mut lan = Lan { life, interface, groups, copies, sensors, form, longest, buffer };
+        lan.use_interface();
+        let room = lan.interface.index().and_then(|index| lan.groups.room(index));
+        lan.longest = longest.min(room.unwrap_or(longest)).max(HEAD);
+        Ok(lan)
+    }
+
+    /// The longest datagram that goes out.
+    pub(super) fn longest(&self) -> usize {
+        self.longest
+    }
+
+    /// Goes on where the interface is now; whether its state is another one than before.
+    pub(super) fn look(&mut self) -> bool {
+        let changed = self.interface.look();
+        if changed {
+            self.use_interface();
+        }
+        changed
+    }
+
+    /// Sensor number `number` is called `name`.
+    pub(super) fn claim(&mut self, number: u8, name: &str) {
+        let at = usize::from(number);
+        if self.sensors.len() <= at {
+            self.sensors.resize_with(at + 1, Rows::default);
+        }
+        if self.sensors[at].name != name {
+            name.clone_into(&mut self.sensors[at].name);
+        }
+    }
+
+    /// Whether `name` was the last to claim `number`: a hub that is started anew may number its sensors otherwise.
+    pub(super) fn is_claimed(&self, number: u8, name: &str) -> bool {
+        self.sensors.get(usize::from(number)).is_some_and(|rows| rows.name == name)
+    }
+
+    /// The number of the next datagram of this sensor and topic.
+    pub(super) fn next(&self, number: u8, topic: Topic) -> u32 {
+        let rows = self.sensors.get(usize::from(number));
+        rows.map_or(0, |rows| rows.rows[usize::from(topic.number())].next())
+    }
+
+    /// The hub sent so many samples that did not come here.
+    pub(super) fn miss(&mut self, number: u8, topic: Topic, missed: u64) {
+        if let Some(row) = self.row(number, topic.number()) {
+            row.missed += missed;
+        }
+    }
+
+    /// The account, by the sensors' numbers.
+    pub(super) fn sensors(&self) -> impl Iterator<Item = &Rows> {
+        self.sensors.iter()
+    }
+
+    /// Sends what `pack` writes, under the next number of this sensor and topic; `head` lacks hub, epoch and sequence. A
+    /// failure uses the number up.
+    pub(super) fn send(&mut self, head: Head, pack: impl FnOnce(&mut [u8]) -> Option<usize>) {
+        let (hub, epoch) = (self.life.hub, self.life.epoch);
+        let Some(row) = self.row(head.sensor, head.topic) else { return };
+        let head = Head { hub, epoch, sequence: row.next(), ..head };
+        let payload = pack(&mut self.buffer[HEAD..self.longest]);
+        let (datagram, above) = match (self.form, payload) {
+            (_, None) => (None, 0),
+            (Form::Sealed, Some(len)) => (head.seal(&mut self.buffer, len), 0),
+            (Form::Bare, Some(len)) => (self.buffer.get(HEAD..HEAD + len), head.sensor),
+        };
+        let group = Topic::of_number(head.topic).map_or(Announce::GROUP, group);
+        let mut taken = None;
+        if let Some(datagram) = datagram {
+            let is_sent = self.groups.send(datagram, group, above);
+            taken = is_sent.then_some(datagram.len());
+            for copy in &mut self.copies {
+                copy.send(datagram, group, above);
+            }
+        }
+        if let Some(row) = self.row(head.sensor, head.topic) {
+            match taken {
+                Some(len) => {
+                    row.sent += 1;
+                    row.bytes += len as u64;
+                }
+                None => row.failed += 1,
+            }
+            if payload.is_none() && row.fit == Fit::All {
+                row.fit = Fit::NotAll;
+            }
+        }
+    }
+
+    /// `SENSOR/TOPIC` of which something did not fit into a datagram; each is told once.
+    pub(super) fn misfit(&mut self) -> Option<String> {
+        self.sensors.iter_mut().find_map(|Rows { name, rows }| {
+            let (number, row) = rows.iter_mut().enumerate().find(|(_, row)| row.fit == Fit::NotAll)?;
+            row.fit = Fit::Told;
+            let topic = Topic::of_number(number as u8).map_or("announce", Topic::name);
+            Some(format!("{name}/{topic}"))
+        })
+    }
+
+    fn row(&mut self, number: u8, topic: u8) -> Option<&mut Row> {
+        self.sensors.get_mut(usize::from(number))?.rows.get_mut(usize::from(topic))
+    }
+
+    fn use_interface(&mut self) {
+        self.groups.is_cut = !self.interface.is_up();
+        if let Some(index) = self.interface.index() {
+            self.groups.use_interface(index);
+        }
+    }
+}
+
+/// Announcements, and the topics by their numbers.
+const KINDS: usize = 1 + Topic::ALL.len();
+/// The port of sensor 0 where nothing but telegrams goes out; the next sensor has the next one.
+const BARE_PORT: u16 = PORT + 1;

@@ -1,0 +1,167 @@
+//! Who a gateway is: a random number that it keeps from one start to the next, and the number of this life, greater than
+//! those before. Two gateways at once are two, also those of one hub. Refuses to know what is sent under them.
+
+use std::fs::{DirBuilder, File};
+use std::hash::{BuildHasher, RandomState};
+use std::io;
+use std::os::unix::fs::{DirBuilderExt, FileExt};
+use std::path::{Path, PathBuf};
+
+use schema::{Failure, Kind};
+
+/// One life of a gateway. Nobody else has its number as long as this value is there.
+#[derive(Debug)]
+pub(super) struct Life {
+    /// The gateway.
+    pub(super) hub: u64,
+    /// Seconds since 1970 at its start, or one more than the last epoch of it.
+    pub(super) epoch: u32,
+    /// Locked.
+    _file: File,
+}
+
+impl Life {
+    /// Begins a life of the gateway of `domain` on `interface`, or of another one if there is one already: kept in a file
+    /// in `directory`, which is made if it is not there. `now_s` is seconds since 1970.
+    ///
+    /// [`Kind::Configuration`] if the file cannot be written: then listeners could not tell this life from the last one.
+    pub(super) fn begin(
+        directory: &Path,
+        domain: &str,
+        interface: &str,
+        now_s: u64,
+    ) -> Result<Life, Failure> {
+        let unusable = |path: &Path, error: &io::Error| {
+            let what = format!("cannot keep the gateway's number in {}: {error}", path.display());
+            Failure::new(Kind::Configuration, what, "let XDG_STATE_HOME name a directory that can be written")
+        };
+        DirBuilder::new()
+            .recursive(true)
+            .mode(0o700)
+            .create(directory)
+            .map_err(|error| unusable(directory, &error))?;
+        for number in 1..=MOST {
+            let path = directory.join(format!("gateway-{domain}-{interface}-{number}"));
+            let file = File::options().read(true).write(true).create(true).truncate(false).open(&path);
+            let file = file.map_err(|error| unusable(&path, &error))?;
+            match file.try_lock() {
+                Ok(()) => return Life::of(file, now_s).map_err(|error| unusable(&path, &error)),
+                Err(std::fs::TryLockError::WouldBlock) => {}
+                Err(std::fs::TryLockError::Error(error)) => return Err(unusable(&path, &error)),
+            }
+        }
+        let what = format!("{MOST} gateways of domain {domain} are on {interface} already");
+        Err(Failure::new(Kind::Configuration, what, "stop some of them"))
+    }
+
+    fn of(file: File, now_s: u64) -> io::Result<Life> {
+        let now = u32::try_from(now_s).unwrap_or(u32::MAX);
+        // What is no such line, or has no next epoch, is as good as nothing: another gateway.
+        let last = read(&file).and_then(|(hub, epoch)| Some((hub, epoch.checked_add(1)?)));
+        let (hub, epoch) = last
+            .map_or_else(|| (RandomState::new().hash_one(now_s), now), |(hub, next)| (hub, next.max(now)));
+        let line = format!("{hub:016x} {epoch:010}\n");
+        file.write_all_at(line.as_bytes(), 0)?;
+        file.set_len(LINE as u64)?;
+        file.sync_data()?;
+        Ok(Life { hub, epoch, _file: file })
+    }
+}
+
+/// Where such files are: what systemd made for the service, else what the user's environment says.
+///
+/// [`Kind::Configuration`] if it says nothing.
+pub(super) fn directory() -> Result<PathBuf, Failure> {
+    let path = |name: &str| {
+        let value = std::env::var(name).ok()?;
+        // systemd lists several with colons between them.
+        let first = PathBuf::from(value.split(':').next()?);
+        first.is_absolute().then_some(first)
+    };
+    let user = || path("XDG_STATE_HOME").or_else(|| Some(path("HOME")?.join(".local/state")));
+    path("STATE_DIRECTORY").or_else(|| Some(user()?.join("scanhub"))).ok_or_else(|| {
+        let what = "no place for the gateway's number: neither XDG_STATE_HOME nor HOME is set";
+        Failure::new(Kind::Configuration, what, "let XDG_STATE_HOME name a directory that can be written")
+    })
+}
+
+fn read(file: &File) -> Option<(u64, u32)> {
+    let mut bytes = [0; LINE];
+    file.read_exact_at(&mut bytes, 0).ok()?;
+    let (hub, epoch) = str::from_utf8(&bytes).ok()?.trim_end().split_once(' ')?;
+    Some((u64::from_str_radix(hub, 16).ok()?, epoch.parse().ok()?))
+}
+
+/// 16 hex digits, a space, 10 digits, a line feed.
+const LINE: usize = 28;
+/// Gateways of one domain on one interface: more are started by mistake.
+const MOST: u32 = 16;
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    struct Place(PathBuf);
+
+    impl Place {
+        fn new(name: &str) -> Place {
+            Place(std::env::temp_dir().join(format!("scanhub-life-{}-{name}", std::process::id())))
+        }
+
+        fn begin(&self, interface: &str, now_s: u64) -> Life {
+            Life::begin(&self.0, "d", interface, now_s).unwrap()
+        }
+    }
+
+    impl Drop for Place {
+        fn drop(&mut self) {
+            let _ = std::fs::remove_dir_all(&self.0);
+        }
+    }
+
+    #[test]
+    fn each_life_has_a_greater_epoch() {
+        let place = Place::new("epoch");
+        let (hub, epoch) = {
+            let life = place.begin("eth0", 1000);
+            (life.hub, life.epoch)
+        };
+        assert_eq!(epoch, 1000);
+        for (now_s, epoch) in [(1000, 1001), (5, 1002), (2000, 2000), (0, 2001)] {
+            let life = place.begin("eth0", now_s);
+            assert_eq!((life.hub, life.epoch), (hub, epoch));
+        }
+    }
+
+    #[test]
+    fn two_at_once_are_two() {
+        let place = Place::new("two");
+        let first = place.begin("eth0", 1);
+        let (second, elsewhere) = (place.begin("eth0", 1), place.begin("wlan0", 1));
+        assert!(first.hub != second.hub && first.hub != elsewhere.hub && second.hub != elsewhere.hub);
+        let (first_hub, second_hub) = (first.hub, second.hub);
+        drop((first, second));
+        let (first, second) = (place.begin("eth0", 1), place.begin("eth0", 1));
+        assert_eq!((first.hub, second.hub), (first_hub, second_hub));
+    }
+
+    #[test]
+    fn what_is_no_number_is_replaced() {
+        let place = Place::new("torn");
+        let hub = place.begin("eth0", 7).hub;
+        let path = place.0.join("gateway-d-eth0-1");
+        for torn in ["", "0123", "0123456789abcdef 4294967295\n", &"x".repeat(60)] {
+            std::fs::write(&path, torn).unwrap();
+            let life = place.begin("eth0", 8);
+            assert!(life.hub != hub && life.epoch == 8, "{torn}");
+            assert_eq!(std::fs::metadata(&path).unwrap().len(), LINE as u64);
+        }
+    }
+
+    #[test]
+    fn a_place_that_cannot_be_written_is_refused() {
+        let refused = Life::begin(Path::new("/dev/null/x"), "d", "eth0", 1).unwrap_err();
+        assert_eq!(refused.kind, Kind::Configuration);
+        assert!(refused.message.contains("/dev/null/x"), "{refused}");
+    }
+}

@@ -1,0 +1,234 @@
+//! What a gateway tells of itself: lines of JSON, or text and one line that is drawn over itself. Refuses to know why.
+
+use std::io::{self, Write};
+
+use schema::Topic;
+use serde::Serialize;
+
+use super::GatewayLook;
+use super::lan::Lan;
+use super::outlet::{News, Outlet};
+use crate::follow::Notice;
+use crate::output::{End, Output};
+use crate::{json, text};
+
+/// Where it is told.
+pub(super) struct Report<'a> {
+    look: GatewayLook,
+    out: Output<'a>,
+    notes: Output<'a>,
+    /// Datagrams to the groups, as of the last status line.
+    sent: u64,
+}
+
+impl<'a> Report<'a> {
+    /// Accounts to `out`, and what is no account to `notes` if `out` is not JSON.
+    pub(super) fn new(look: GatewayLook, out: &'a mut dyn Write, notes: &'a mut dyn Write) -> Report<'a> {
+        Report { look, out: Output::new(out), notes: Output::new(notes), sent: 0 }
+    }
+
+    /// Who it is and where it sends.
+    pub(super) fn begin(&mut self, lan: &Lan, bare: bool) -> Result<(), End> {
+        let to: Vec<_> = lan.copies.iter().map(|copy| copy.name.as_str()).collect();
+        if self.look == GatewayLook::Json {
+            return self.out.json(&Begin {
+                class: "gateway",
+                hub: id(lan),
+                epoch: lan.life.epoch,
+                interface: lan.interface.name(),
+                to,
+                bare,
+                longest: lan.longest(),
+            });
+        }
+        self.out.line(|line| {
+            write!(line, "gateway {} epoch {} on {}", id(lan), lan.life.epoch, lan.interface.name())?;
+            to.iter().try_for_each(|to| write!(line, ", copies to {to}"))?;
+            write!(line, ", datagrams of {} bytes at most", lan.longest())
+        })
+    }
+
+    /// News of the hub.
+    pub(super) fn hub(&mut self, notice: Notice) -> Result<(), End> {
+        if self.look == GatewayLook::Json {
+            return json::notices(&mut self.out, &[], notice);
+        }
+        self.wipe()?;
+        self.notes.line(|line| text::notice(line, &[], notice))
+    }
+
+    /// The state of the interface became another one.
+    pub(super) fn interface(&mut self, lan: &Lan) -> Result<(), End> {
+        let name = lan.interface.name();
+        match lan.interface.is_up() {
+            true => self.link(name, "up", None),
+            false => self.link(name, "down", Some("no carrier, no IPv4 address, or not there")),
+        }
+    }
+
+    /// What became of a destination.
+    pub(super) fn destination(&mut self, outlet: &str, news: &News) -> Result<(), End> {
+        match news {
+            News::Failing(why) => self.link(outlet, "failing", Some(why)),
+            News::Well => self.link(outlet, "well", None),
+        }
+    }
+
+    /// Samples of `topic` are longer than the longest datagram.
+    pub(super) fn misfit(&mut self, topic: &str, longest: usize) -> Result<(), End> {
+        let message =
+            format!("does not fit into {longest} bytes: --mtu, or the interface's own, is too small");
+        self.link(topic, "failing", Some(&message))
+    }
+
+    /// The periodic word: an object for each sensor and topic and each destination, or one line on a terminal.
+    pub(super) fn periodic(&mut self, lan: &Lan, hub_lives: bool) -> Result<(), End> {
+        match self.look {
+            GatewayLook::Json => self.account(lan),
+            GatewayLook::Lines => Ok(()),
+            GatewayLook::Terminal => self.draw(lan, hub_lives),
+        }
+    }
+
+    /// The whole account.
+    pub(super) fn account(&mut self, lan: &Lan) -> Result<(), End> {
+        self.wipe()?;
+        for sensor in lan.sensors() {
+            for (topic, row) in sensor.used() {
+                let name = topic.map_or("announce", Topic::name);
+                if self.look == GatewayLook::Json {
+                    self.out.json(&Line {
+                        class: "lan",
+                        hub: id(lan),
+                        epoch: lan.life.epoch,
+                        sensor: &sensor.name,
+                        topic: name,
+                        sent: row.sent,
+                        send_failed: row.failed,
+                        bytes: row.bytes,
+                        missed: row.missed,
+                    })?;
+                } else {
+                    self.out.line(|line| {
+                        write!(line, "{}/{name}: {} sent, ", sensor.name, row.sent)?;
+                        write!(line, "{} failed, {} bytes", row.failed, row.bytes)?;
+                        if row.missed > 0 { write!(line, ", {} missed", row.missed) } else { Ok(()) }
+                    })?;
+                }
+            }
+        }
+        std::iter::once(&lan.groups).chain(&lan.copies).try_for_each(|outlet| self.outlet(lan, outlet))
+    }
+
+    fn outlet(&mut self, lan: &Lan, outlet: &Outlet) -> Result<(), End> {
+        let Outlet { name, sent, failed, reported, .. } = outlet;
+        if self.look == GatewayLook::Json {
+            return self.out.json(&To {
+                class: "lan_to",
+                hub: id(lan),
+                epoch: lan.life.epoch,
+                to: name,
+                sent: *sent,
+                send_failed: *failed,
+                reported: *reported,
+            });
+        }
+        self.out.line(|line| write!(line, "to {name}: {sent} sent, {failed} failed, {reported} reported"))
+    }
+
+    fn link(&mut self, to: &str, state: &'static str, message: Option<&str>) -> Result<(), End> {
+        if self.look == GatewayLook::Json {
+            return self.out.json(&Link { class: "lan_link", to, state, message });
+        }
+        self.wipe()?;
+        self.notes.line(|line| match message {
+            Some(message) => write!(line, "{to}: {state}: {message}"),
+            None => write!(line, "{to}: {state}"),
+        })
+    }
+
+    fn draw(&mut self, lan: &Lan, hub_lives: bool) -> Result<(), End> {
+        // A line that wraps would not be drawn over: it is cut.
+        let mut line = [WIPE, b"\x1b[?7l"].concat();
+        status(&mut line, lan, hub_lives, self.sent)?;
+        line.extend(b"\x1b[?7h");
+        self.sent = lan.groups.sent;
+        self.out.raw(&line)
+    }
+
+    fn wipe(&mut self) -> Result<(), End> {
+        match self.look {
+            GatewayLook::Terminal => self.out.raw(WIPE),
+            GatewayLook::Json | GatewayLook::Lines => Ok(()),
+        }
+    }
+}
+
+fn status(line: &mut Vec<u8>, lan: &Lan, hub_lives: bool, sent_before: u64) -> io::Result<()> {
+    let groups = &lan.groups;
+    let state = if lan.interface.is_up() { "" } else { " down" };
+    let hub = if hub_lives { "" } else { "no hub, " };
+    write!(line, "{hub}{}{state}: {}/s, {} sent", groups.name, groups.sent - sent_before, groups.sent)?;
+    if groups.failed > 0 {
+        write!(line, ", {} failed", groups.failed)?;
+    }
+    for copy in &lan.copies {
+        write!(line, "; {}: {} sent, {} failed", copy.name, copy.sent, copy.failed)?;
+    }
+    let missed: u64 = lan.sensors().flat_map(|sensor| sensor.used()).map(|(_, row)| row.missed).sum();
+    if missed > 0 { write!(line, "; {missed} missed") } else { Ok(()) }
+}
+
+fn id(lan: &Lan) -> String {
+    format!("{:016x}", lan.life.hub)
+}
+
+/// Class `gateway`.
+#[derive(Serialize)]
+struct Begin<'a> {
+    class: &'static str,
+    hub: String,
+    epoch: u32,
+    interface: &'a str,
+    to: Vec<&'a str>,
+    bare: bool,
+    longest: usize,
+}
+
+/// Class `lan`.
+#[derive(Serialize)]
+struct Line<'a> {
+    class: &'static str,
+    hub: String,
+    epoch: u32,
+    sensor: &'a str,
+    topic: &'static str,
+    sent: u64,
+    send_failed: u64,
+    bytes: u64,
+    missed: u64,
+}
+
+/// Class `lan_to`.
+#[derive(Serialize)]
+struct To<'a> {
+    class: &'static str,
+    hub: String,
+    epoch: u32,
+    to: &'a str,
+    sent: u64,
+    send_failed: u64,
+    reported: u64,
+}
+
+/// Class `lan_link`.
+#[derive(Serialize)]
+struct Link<'a> {
+    class: &'static str,
+    to: &'a str,
+    state: &'static str,
+    message: Option<&'a str>,
+}
+
+/// To the line's begin, and nothing on it (ECMA-48).
+const WIPE: &[u8] = b"\r\x1b[K";
