@@ -145,6 +145,13 @@ impl Stage {
         self.start(&words).ready()
     }
 
+    /// Kills the simulator of one port, and takes away the name that it leaves: a hub that goes on would soon find
+    /// another test's terminal by it.
+    pub(crate) fn kill_simulator(&self, simulator: Program, port: &str) {
+        assert_eq!(simulator.end(KILL).code, None);
+        fs::remove_file(self.path(port)).unwrap_or_else(|error| panic!("{port}: {error}"));
+    }
+
     /// `echo --json` of these topics, attached to all of them.
     pub(crate) fn echo(&self, topics: &[&str]) -> Program {
         let before: Vec<_> = topics.iter().map(|topic| self.subscribers(topic)).collect();
