@@ -122,26 +122,39 @@ pub(crate) enum Verb {
 
 #[derive(Args, Debug)]
 pub(crate) struct Run {
-    /// TOML file, read after those in /etc/scanhub
-    #[arg(long, env = "SCANHUB_CONFIG", value_name = "FILE")]
-    pub(crate) config: Option<PathBuf>,
-    /// Do not read /etc/scanhub
-    #[arg(long)]
-    pub(crate) no_system_config: bool,
+    #[command(flatten)]
+    pub(crate) configured: Configured,
     /// A link with its defaults; PORT is a tty, tcp:HOST:PORT or file:PATH[?rate=max]
     #[arg(long, value_name = "NAME=PORT")]
     pub(crate) link: Vec<String>,
-    /// One value, for example link.front.angle=100
-    #[arg(long, value_name = "KEY=VALUE")]
-    pub(crate) set: Vec<String>,
 }
 
 impl Run {
     /// Where the configuration is to be read from.
     pub(crate) fn sources(&self) -> Sources {
+        Sources { links: self.link.clone(), ..self.configured.sources() }
+    }
+}
+
+/// Where a configuration is said, apart from links.
+#[derive(Args, Debug)]
+pub(crate) struct Configured {
+    /// TOML file, read after those in /etc/scanhub
+    #[arg(long, env = "SCANHUB_CONFIG", value_name = "FILE")]
+    config: Option<PathBuf>,
+    /// Do not read /etc/scanhub
+    #[arg(long)]
+    no_system_config: bool,
+    /// One value, for example link.front.angle=100
+    #[arg(long, value_name = "KEY=VALUE")]
+    set: Vec<String>,
+}
+
+impl Configured {
+    pub(crate) fn sources(&self) -> Sources {
         let mut files = if self.no_system_config { Vec::new() } else { Sources::system() };
         files.extend(self.config.clone());
-        Sources { files, set: self.set.clone(), links: self.link.clone() }
+        Sources { files, set: self.set.clone(), links: Vec::new() }
     }
 }
 

@@ -7,6 +7,7 @@ use std::io::Read;
 use std::path::PathBuf;
 use std::process::Stdio;
 
+use rustix::process::Signal;
 use serde_json::Value;
 use stage::{INT, KILL, Program, Stage, TERM, terminal, until};
 
@@ -116,6 +117,28 @@ fn the_lights_follow_the_verdict_and_stop_is_lit_when_nobody_says_anything() {
 }
 
 #[test]
+fn a_mark_that_nobody_sees_any_more_is_dark() {
+    let stage = Stage::new();
+    let diodes = Diodes::new(&stage);
+    let [root, led] = diodes.flags();
+    let sensor = simulator(&stage, &world(&stage, "open", STRIP));
+    let hub = stage.hub(&[stage.link("front")]);
+    let leds = stage.start(&["leds", "front", "--json", &root, &led]);
+    diodes.await_lit("gn mk");
+    // The last marks wait together with the hub's word that there are no scans.
+    leds.signal(Signal::STOP);
+    assert_eq!(stage.run(&["echo", "front/marks", "-n", "5"]).code, Some(0));
+    assert_eq!(sensor.end(TERM).code, Some(0));
+    stage.echo(&["front/zones"]).await_line("unknown", |line| line["verdict"] == "unknown");
+    leds.signal(Signal::CONT);
+    diodes.await_lit("rd");
+    let outcome = leds.end(INT);
+    let last = outcome.of_class("leds").pop().expect("a line");
+    assert_eq!((outcome.code, &last["mark"], &last["marks"]), (Some(0), &false.into(), &Value::Null));
+    assert_eq!(hub.end(TERM).code, Some(0));
+}
+
+#[test]
 fn a_post_before_the_robot_is_red_and_one_in_the_outer_circle_yellow() {
     let stage = Stage::new();
     let diodes = Diodes::new(&stage);
@@ -190,6 +213,7 @@ fn what_is_no_light_is_refused() {
         ("front", "blue=rd", "--led blue=rd cannot be shown"),
         ("front", "red", "--led red cannot be shown"),
         ("robot", "mark=mk", "--led mark=mk cannot be shown"),
+        ("front", "yellow=rd,red=rd", "--led red=rd cannot be shown"),
     ] {
         let outcome = stage.run(&["leds", sensor, "--json", &root, "--led", led]);
         let error = &outcome.of_class("error")[0];

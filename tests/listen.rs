@@ -3,10 +3,12 @@
 
 mod stage;
 
+use std::io::Read;
+
 use schema::datagram::{HEAD, Refusal, WINDOW};
 use schema::{Background, Foreground, Mark, Marks, Scan, State, Status, Topic, Verdict, Zones};
 use serde_json::{Value, json};
-use stage::{INT, Outcome, Program, Sender, Stage, in_a_network, is_class, until, wall_ns};
+use stage::{INT, Outcome, Program, Sender, Stage, in_a_network, is_class, terminal, until, wall_ns};
 
 const HUB: u64 = 0x5f3a_12bc_00d1_e2f3;
 
@@ -151,6 +153,33 @@ fn joined(interface: &str) -> usize {
 /// Runs `ip` with these words.
 fn ip(words: &str) -> bool {
     std::process::Command::new("ip").args(words.split(' ')).status().is_ok_and(|status| status.success())
+}
+
+#[test]
+fn on_a_terminal_the_account_is_drawn_over_itself() {
+    in_a_network("on_a_terminal_the_account_is_drawn_over_itself", || {
+        let stage = Stage::new();
+        let (mut keys, screen) = terminal();
+        let mut command = stage.command(&["listen", "--stats", "--interface=lo"]);
+        command.stdout(screen).stderr(std::process::Stdio::null());
+        let mut process = command.spawn().expect("starts");
+        drop(command);
+        until("the groups are joined", || joined("lo") == 4);
+        Sender::new(HUB, 7, 0, "front").send(Topic::Zones, &zones(Verdict::Clear));
+        let mut text = String::new();
+        let mut read = |wanted: &str| {
+            let mut bytes = [0; 4096];
+            while !text.contains(wanted) {
+                let len =
+                    keys.read(&mut bytes).unwrap_or_else(|error| panic!("no {wanted:?}: {error}: {text}"));
+                text.push_str(&String::from_utf8_lossy(&bytes[..len]));
+            }
+        };
+        read("#0/zones");
+        read("\x1b[3A\x1b[J");
+        rustix::process::kill_process(rustix::process::Pid::from_child(&process), INT).expect("it lives");
+        assert!(process.wait().expect("it ends").success());
+    });
 }
 
 #[test]

@@ -169,7 +169,17 @@ fn a_hub_and_two_remote_ones_live_in_one_domain() {
         let mut one = Sender::new(HUB, 7, 0, "front");
         let mut other = Sender::new(0xab, 7, 0, "front");
         let listener = published(&stage, &mut one);
+        // Somebody who follows the hub's sensor waits for the hub, whoever else is in the domain.
+        let mut early = stage.start(&["echo", "--json", "front/scan"]);
+        let absent = stage.run(&["echo", "--json", "front/scan", "-n", "1"]);
+        assert_eq!(
+            (absent.code, &absent.of_class("error")[0]["kind"]),
+            (Some(3), &json!("no_topic")),
+            "{absent}"
+        );
         let hub = stage.hub(&[stage.link("front")]);
+        early.await_line("a scan", |line| line["class"] == "scan");
+        assert_eq!(early.end(INT).code, Some(0));
         other.announce(&[Topic::Zones, Topic::Status]);
         other.send(Topic::Status, &Status::default());
         let second = publisher_refused(&stage);
@@ -198,6 +208,42 @@ fn a_hub_and_two_remote_ones_live_in_one_domain() {
         drop(echo);
         assert_eq!(listener.end(TERM).code, Some(0));
         assert!(stage.left_behind().is_empty(), "{:?}", stage.left_behind());
+    });
+}
+
+#[test]
+fn what_a_gateway_sends_comes_back_once() {
+    in_a_network("what_a_gateway_sends_comes_back_once", || {
+        let stage = Stage::new();
+        let _simulator = stage.simulator(&["front"], &["--seed=62", "--baud=500000"]);
+        let mut listener = stage.start(&["listen", "--json", "--publish", "--interface=lo"]).ready();
+        // The gateway waits for the hub, though the domain lives already; and what the listener brings is not its to send.
+        let mut command = stage.command(&["gateway", "--json", "--interface=lo", "--topic=front/scan"]);
+        command.env("XDG_STATE_HOME", stage.path("state")).env_remove("STATE_DIRECTORY");
+        let mut gateway = Program::start(command);
+        let id = gateway.await_line("its begin", |line| line["class"] == "gateway")["hub"].clone();
+        let hub = stage.hub(&[stage.link("front")]);
+        let line = listener.await_line("a sensor", |line| line["kind"] == "published");
+        let remote = format!("{}.front", id.as_str().unwrap_or_default());
+        assert_eq!(line["sensor"], remote.as_str());
+        let mut echo = stage.echo(&["front/scan", &format!("{remote}/scan")]);
+        echo.await_lines(40, "scans", |line| line["sensor"] == remote.as_str());
+        let outcome = echo.end(INT);
+        let scans = outcome.of_class("scan");
+        let (here, there): (Vec<_>, Vec<_>) = scans.iter().partition(|line| line["sensor"] == "front");
+        for line in &there[1..] {
+            let same = here.iter().find(|it| it["seq"] == line["seq"]);
+            let Some(same) = same else { continue };
+            assert_eq!((&same["ranges"], &same["codes"]), (&line["ranges"], &line["codes"]));
+            assert_eq!((&same["boot"], &same["wall_ns"]), (&line["boot"], &line["wall_ns"]));
+            assert!(number(same, "stamp_ns") < number(line, "stamp_ns"), "it came later");
+        }
+        assert!(there.iter().filter(|line| here.iter().any(|it| it["seq"] == line["seq"])).count() > 30);
+        assert_eq!((gateway.end(TERM).code, hub.end(TERM).code), (Some(0), Some(0)));
+        let outcome = listener.end(TERM);
+        let hubs: Vec<_> = outcome.of_class("lan").into_iter().map(|line| line["hub"].clone()).collect();
+        assert!(hubs.iter().all(|hub| *hub == id), "{outcome}");
+        assert_eq!(outcome.of_class("lan_published")[0]["sensors"], json!([remote]));
     });
 }
 

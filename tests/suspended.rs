@@ -12,7 +12,7 @@ fn a_hub_that_was_stopped() {
     let stage = Stage::new();
     let simulator = stage.simulator(&["front"], &["--seed=31", "--baud=500000"]);
     let hub = stage.hub(&[stage.link("front")]);
-    let mut consumer = stage.echo(&["front/telegram", "front/status"]);
+    let mut consumer = stage.echo(&["front/telegram", "front/scan", "front/zones", "front/status"]);
     consumer.await_lines(20, "a telegram", is_class("telegram"));
     let stopped = now();
     hub.signal(Signal::STOP);
@@ -50,6 +50,18 @@ fn a_hub_that_was_stopped() {
     let sent = places.iter().map(|&place| truth[place].sent_ns);
     let waited: Vec<_> = sent.zip(&stamps).filter(|(sent, _)| (stopped..continued).contains(sent)).collect();
     assert!(waited.len() > 10 && waited.iter().all(|(sent, stamp)| *stamp < sent), "{waited:?}");
+
+    // Each scan has a verdict; what the zones' numbers are ahead of the scans' by was said because scans stayed out. That
+    // is not said again between those that waited.
+    let scans = outcome.of_class("scan");
+    let ahead = outcome.of_class("zones").into_iter().filter_map(|line| {
+        let scan = scans.iter().find(|scan| scan["seq"] == line["seq"])?;
+        let is_verdict = line["verdict"] != "unknown";
+        is_verdict.then(|| number(&line, "topic_seq") - number(scan, "topic_seq"))
+    });
+    let ahead: Vec<u64> = ahead.collect();
+    let (Some(first), Some(last)) = (ahead.first(), ahead.last()) else { panic!("no verdict came") };
+    assert!(last - first < waited.len() as u64 / 2, "{ahead:?} with {} that waited", waited.len());
 }
 
 /// CLOCK_MONOTONIC, as in the truth and in stamps.

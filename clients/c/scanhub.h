@@ -240,7 +240,7 @@ static inline enum scanhub_result scanhub_read_telegram(const struct scanhub_dat
 /* A scan: at most 401 beams, counter-clockwise seen from above, 0 right, 90 degrees ahead. */
 struct scanhub_scan {
     uint16_t count;
-    uint8_t unit_mm;          /* millimetres per device unit: 1 or 10 */
+    uint8_t unit_mm;          /* millimetres per device unit: 1, 10 or 100 */
     uint8_t range_bits;       /* 13, 14 or 15 */
     int32_t first_angle_mdeg; /* 1/1000 degree */
     uint16_t step_mdeg;

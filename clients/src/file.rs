@@ -2,8 +2,9 @@
 //! what is in them.
 
 use std::ffi::OsString;
-use std::fs::{self, File};
+use std::fs::{self, File, Metadata};
 use std::io::{self, Read, Write};
+use std::os::unix::fs::{MetadataExt, fchown};
 use std::path::{Path, PathBuf};
 
 use schema::{Failure, Kind};
@@ -29,17 +30,18 @@ pub(crate) fn read_all(input: &mut dyn Read, place: &str, longest: u64) -> Resul
 }
 
 /// Puts a file of `content` at `path`. Whoever reads meanwhile, and whatever happens, finds the old one or the new one
-/// whole. What is there and no file, a device or a pipe, is written to.
+/// whole; who may read it stays as it was. What is there and no file, a device or a pipe, is written to.
 ///
 /// [`Kind::Failed`] if it cannot be written; nothing is left then.
 pub(crate) fn replace(path: &Path, content: &[u8]) -> Result<(), Failure> {
     // A link stays, and what it points to is replaced.
     let path = fs::canonicalize(path).unwrap_or_else(|_| path.to_owned());
-    let written = match fs::metadata(&path) {
-        Ok(found) if !found.is_file() => {
+    let old = fs::metadata(&path).ok();
+    let written = match &old {
+        Some(old) if !old.is_file() => {
             File::options().write(true).open(&path).and_then(|mut file| file.write_all(content))
         }
-        _ => beside(&path).and_then(|beside| exchange(&path, &beside, content)),
+        old => beside(&path).and_then(|beside| exchange(&path, &beside, old.as_ref(), content)),
     };
     written.map_err(|error| {
         let hint = "the directory has to be there, writable, and with room";
@@ -47,9 +49,14 @@ pub(crate) fn replace(path: &Path, content: &[u8]) -> Result<(), Failure> {
     })
 }
 
-fn exchange(path: &Path, beside: &Path, content: &[u8]) -> io::Result<()> {
+fn exchange(path: &Path, beside: &Path, old: Option<&Metadata>, content: &[u8]) -> io::Result<()> {
     let write = || {
         let mut file = File::create(beside)?;
+        if let Some(old) = old {
+            // Not everybody may give a file away. Before its permissions, of which this clears some.
+            let _ = fchown(&file, Some(old.uid()), Some(old.gid()));
+            file.set_permissions(old.permissions())?;
+        }
         file.write_all(content)?;
         file.sync_all()?;
         fs::rename(beside, path)

@@ -4,7 +4,7 @@
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
-use schema::{Domain, Failure, Kind, Topic, ipc, is_remote};
+use schema::{Domain, Failure, Kind, ROBOT, Topic, ipc, is_remote};
 
 use crate::account::Account;
 use crate::names::{TopicName, no_sensor};
@@ -244,7 +244,7 @@ impl<'a> Run<'a> {
         }
         let sensors = self.sensors()?;
         let wants_all = self.tracks.iter().all(|track| track.name.is_robot());
-        if wants_all && sensors.iter().all(|sensor| is_remote(sensor)) {
+        if wants_all && !self.may_come(ROBOT) && sensors.iter().all(|sensor| is_remote(sensor)) {
             return Err(Failure::new(
                 Kind::NoTopic,
                 "the hub has no sensors",
@@ -254,15 +254,21 @@ impl<'a> Run<'a> {
         }
         for track in &self.tracks {
             let sensor = &track.name.sensor;
-            // Another machine may be switched on later.
-            let may_come =
-                is_remote(sensor) && (!self.bounds.bounded() || self.started.elapsed() < ANNOUNCED);
-            let is_there = track.name.is_robot() || may_come || sensors.contains(sensor);
+            let is_there = track.name.is_robot() || sensors.contains(sensor) || self.may_come(sensor);
             if !track.source.attached() && !is_there {
                 return Err(no_sensor(sensor, &sensors).into());
             }
         }
         Ok(())
+    }
+
+    /// Who is not there may come: another machine that is switched on later, or the hub, where only a listener is yet.
+    fn may_come(&self, sensor: &str) -> bool {
+        let unbounded = !self.bounds.bounded();
+        match is_remote(sensor) {
+            true => unbounded || self.started.elapsed() < ANNOUNCED,
+            false => unbounded && !self.session.hub_lives(),
+        }
     }
 
     fn sensors(&self) -> Result<Vec<String>, Failure> {

@@ -1,5 +1,5 @@
-//! Until when what was heard of a sensor's zones may be believed. Time is an argument; refuses to know where zones
-//! come from and what becomes of them.
+//! Until when what was heard of a sensor, its zones above all, may be believed. Time is an argument; refuses to know
+//! where that comes from and what becomes of it.
 
 use std::time::Duration;
 

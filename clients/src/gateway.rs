@@ -13,7 +13,7 @@ use std::io::Write;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
-use schema::{Domain, Failure, check_sensor, ipc};
+use schema::{Domain, Failure, Kind, check_sensor, ipc};
 
 use crate::clock;
 use crate::follow::Notice;
@@ -65,9 +65,9 @@ pub enum GatewayLook {
 /// Sends until `stop` is set, whatever becomes of the hub and of the network. The account goes to `out` at the end and
 /// whenever `tell` is set; what is no account to `notes` (stderr) if `out` is not JSON.
 ///
-/// [`Kind::Configuration`](schema::Kind) if there is no such interface or not just one, a destination is no host, or a
-/// value is not possible; [`Kind::NoTopic`](schema::Kind) if there is no such topic, or the first hub that is met has no
-/// such sensor; [`Kind::Short`](schema::Kind) if descriptors or memory are.
+/// [`Kind::Configuration`] if there is no such interface or not just one, a destination is no host, or a
+/// value is not possible; [`Kind::NoTopic`] if there is no such topic, or the first hub that is met has no
+/// such sensor; [`Kind::Short`] if descriptors or memory are.
 pub fn gateway(
     options: &GatewayOptions,
     out: &mut dyn Write,
@@ -87,21 +87,29 @@ struct Gateway<'a> {
     sensors: Vec<Sensor>,
     lan: Lan,
     started: Instant,
-    /// When the hub came, and whether its sensors were compared with those that are named.
-    hub: Option<(Instant, bool)>,
+    /// When the hub came, and how often its sensors were looked for.
+    hub: Option<(Instant, usize)>,
+    is_there: bool,
+    /// The sensors that are named were found in a hub.
+    is_checked: bool,
     waiting_said: bool,
-    roll_at: Option<Instant>,
     tick_at: Instant,
 }
 
 /// Between two announcements, and between two lines of the account.
 const TICK: Duration = Duration::from_secs(1);
-/// How long the sensors of a hub that came are looked for: it makes their topics one after the other.
-const ROLL: Duration = Duration::from_secs(5);
+/// When the sensors of a hub that came are looked for: it makes their topics one after the other. Not more often, because
+/// nothing is sent meanwhile.
+const ROLLS: [Duration; 4] =
+    [Duration::ZERO, Duration::from_millis(200), Duration::from_secs(1), Duration::from_secs(5)];
 
 impl<'a> Gateway<'a> {
     fn open(options: &'a GatewayOptions) -> Result<Gateway<'a>, Failure> {
         let selection = Selection::parse(&options.topics, options.bare)?;
+        if options.bare && options.background_every.is_some() {
+            let what = "no background goes out where only telegrams do";
+            return Err(Failure::new(Kind::Configuration, what, "leave bare or background_every away"));
+        }
         let interface = Uplink::choose(options.interface.as_deref())?;
         let domain = options.places.first().map(Domain::name).unwrap_or_default();
         let now_s = clock::wall_ns() / 1_000_000_000;
@@ -118,7 +126,8 @@ impl<'a> Gateway<'a> {
             started: Instant::now(),
             hub: None,
             waiting_said: false,
-            roll_at: None,
+            is_there: false,
+            is_checked: false,
             tick_at: Instant::now(),
         })
     }
@@ -162,33 +171,33 @@ impl<'a> Gateway<'a> {
     fn look(&mut self, report: &mut Report<'_>) -> Result<(), End> {
         let change = self.session.look()?;
         let now = Instant::now();
-        if change.gone {
+        if change.gone && self.is_there {
+            self.is_there = false;
             report.hub(Notice::HubGone)?;
         }
-        if change.back {
+        // Somebody else may bring the sensors of other machines, which are not sent on.
+        if change.back && self.session.hub_lives() {
             if self.hub.is_some() || self.waiting_said {
                 report.hub(Notice::HubBack)?;
             }
-            let was_checked = self.hub.is_some_and(|(_, was_checked)| was_checked);
-            self.hub = Some((now, was_checked));
-            self.roll_at = Some(now);
+            self.is_there = true;
+            self.hub = Some((now, 0));
         }
         if self.hub.is_none() && !self.waiting_said && now - self.started >= GRACE {
             self.waiting_said = true;
             report.hub(Notice::HubGone)?;
         }
-        self.call_the_roll(now)?;
-        Ok(())
+        Ok(self.call_the_roll(now)?)
     }
 
     /// Follows the sensors of the hub if all are wanted; those that are named have to be there in the first hub.
     fn call_the_roll(&mut self, now: Instant) -> Result<(), Failure> {
-        let (Some((came, was_checked)), Some(domain)) = (self.hub, self.session.domain()) else {
-            return Ok(());
-        };
-        if self.roll_at.is_none_or(|roll_at| now < roll_at) {
+        let domain = self.session.domain().filter(|_| self.is_there);
+        let (Some((came, rolls)), Some(domain)) = (self.hub, domain) else { return Ok(()) };
+        if ROLLS.get(rolls).is_none_or(|after| now - came < *after) {
             return Ok(());
         }
+        self.hub = Some((came, rolls + 1));
         let there = ipc::sensors(domain)?;
         if self.selection.wants_all() {
             for name in &there {
@@ -199,14 +208,13 @@ impl<'a> Gateway<'a> {
                 }
             }
         }
-        if !was_checked && now - came >= GRACE {
+        if !self.is_checked && now - came >= GRACE {
             let missing = self.selection.named().into_iter().find(|name| !there.iter().any(|it| it == name));
             if let Some(name) = missing {
                 return Err(no_sensor(name, &there));
             }
-            self.hub = Some((came, true));
+            self.is_checked = true;
         }
-        self.roll_at = (now - came < ROLL).then(|| now + GRACE / 2);
         Ok(())
     }
 
@@ -227,7 +235,10 @@ impl<'a> Gateway<'a> {
                 report.destination(&outlet.name, &news)?;
             }
         }
-        report.periodic(&self.lan, self.session.domain().is_some())
+        if let Some(what) = self.lan.misfit() {
+            report.misfit(&what, self.lan.longest())?;
+        }
+        report.periodic(&self.lan, self.is_there)
     }
 
     fn announce(&mut self) {

@@ -2,7 +2,7 @@
 
 mod processed;
 
-use schema::{Counters, Failure, Header, Quality, Reasons, Scan, Status, Telegram, Verb};
+use schema::{Counters, Failure, Header, Reasons, Scan, Status, Telegram, Verb};
 use serde::Serialize;
 use serde::ser::{SerializeMap, Serializer};
 
@@ -26,7 +26,7 @@ struct Stamp<'a> {
     wall_ns: Option<u64>,
     #[serde(serialize_with = "id")]
     boot: Option<u64>,
-    quality: &'static str,
+    quality: Option<&'static str>,
     #[serde(skip_serializing_if = "Vec::is_empty")]
     reasons: Vec<&'static str>,
 }
@@ -41,15 +41,14 @@ impl<'a> Stamp<'a> {
             stamp_ns: Some(header.stamp_first_ns),
             wall_ns: Some(header.wall_ns),
             boot: known(header.boot, 0),
-            quality: header.quality().name(),
+            quality: Some(header.quality().name()),
             reasons: Reasons::names(header.reasons).collect(),
         }
     }
 
     /// Of no telegram.
     fn unheard(class: &'static str, sensor: &'a str) -> Stamp<'a> {
-        let (seq, topic_seq, stamp_ns, wall_ns, boot) = (None, None, None, None, None);
-        let quality = Quality::Clean.name();
+        let (seq, topic_seq, stamp_ns, wall_ns, boot, quality) = (None, None, None, None, None, None);
         Stamp { class, sensor, seq, topic_seq, stamp_ns, wall_ns, boot, quality, reasons: Vec::new() }
     }
 }

@@ -10,12 +10,13 @@ use std::path::{Path, PathBuf};
 use std::sync::atomic::AtomicBool;
 use std::time::Instant;
 
-use schema::{Domain, Failure, Kind, ROBOT, Topic, check_followed};
+use schema::{Domain, Failure, Kind, ROBOT, Topic, Verdict, check_followed};
 use serde::Serialize;
 
 use crate::account::Account;
 use crate::clock;
 use crate::follow::{Bounds, Notice, Sink, follow};
+use crate::freshness::Freshness;
 use crate::names::TopicName;
 use crate::output::{End, Output, quiet};
 use crate::sample::Sample;
@@ -28,7 +29,7 @@ use lamps::{Lamps, Light};
 pub struct LedsOptions {
     /// The sensor, or `robot` for the verdict over all of them.
     pub sensor: String,
-    /// `LIGHT=NAME`: the light-emitting diode that shows a light; one light may have several.
+    /// `LIGHT=NAME`: the light-emitting diode that shows a light; one light may have several, not one diode several lights.
     pub leds: Vec<String>,
     /// Where they are: `/sys/class/leds`.
     pub led_root: PathBuf,
@@ -71,12 +72,12 @@ pub fn leds(
         check_followed(sensor)?;
     }
     let names: Vec<_> = topics.iter().map(|&topic| TopicName { sensor: sensor.clone(), topic }).collect();
-    let wanted = leds.iter().map(|led| wanted(sensor, led)).collect::<Result<Vec<_>, _>>()?;
+    let wanted = wanted(sensor, leds)?;
     let mut board = Board {
         sensor,
         look: options.look,
         lamps: Lamps::UNKNOWN,
-        seq: None,
+        marks: Freshness::new(clock::now()),
         devices: Vec::new(),
         out: Output::new(out),
         notes: Output::new(notes),
@@ -86,16 +87,28 @@ pub fn leds(
     quiet(end.and(board.leave()))
 }
 
-/// Light and name in `led`.
-fn wanted<'a>(sensor: &str, led: &'a str) -> Result<(Light, &'a str), Failure> {
-    let refuse =
-        |hint: &str| Err(Failure::new(Kind::Configuration, format!("--led {led} cannot be shown"), hint));
-    let Some((light, name)) = led.split_once('=') else { return refuse(LED_FORM) };
-    let Some(light) = Light::ALL.into_iter().find(|it| it.name() == light) else { return refuse(LED_FORM) };
-    if light == Light::Mark && sensor == ROBOT {
-        return refuse("marks are one sensor's: name the sensor");
+/// Light and name in each of `leds`. A name stands once: a diode that showed two lights would not tell which.
+fn wanted<'a>(sensor: &str, leds: &'a [String]) -> Result<Vec<(Light, &'a str)>, Failure> {
+    let mut wanted: Vec<(Light, &str)> = Vec::new();
+    for led in leds {
+        let refuse =
+            |hint: &str| Err(Failure::new(Kind::Configuration, format!("--led {led} cannot be shown"), hint));
+        let Some((light, name)) = led.split_once('=') else { return refuse(LED_FORM) };
+        let Some(light) = Light::ALL.into_iter().find(|it| it.name() == light) else {
+            return refuse(LED_FORM);
+        };
+        if light == Light::Mark && sensor == ROBOT {
+            return refuse("marks are one sensor's: name the sensor");
+        }
+        if let Some((other, _)) = wanted.iter().find(|(_, taken)| *taken == name) {
+            return refuse(&format!(
+                "{name} shows {} already: each light has diodes of its own",
+                other.name()
+            ));
+        }
+        wanted.push((light, name));
     }
-    Ok((light, name))
+    Ok(wanted)
 }
 
 const LED_FORM: &str = "green=NAME, yellow=NAME, red=NAME or mark=NAME, with a NAME from /sys/class/leds";
@@ -105,8 +118,8 @@ struct Board<'a> {
     sensor: &'a str,
     look: LedsLook,
     lamps: Lamps,
-    /// Of the telegram that the last zones are of.
-    seq: Option<u64>,
+    /// Until when the marks may be believed, whatever became of the zones.
+    marks: Freshness,
     devices: Vec<(Light, String, Device)>,
     out: Output<'a>,
     notes: Output<'a>,
@@ -203,20 +216,16 @@ impl Sink for Board<'_> {
     fn sample(&mut self, _: &TopicName, sample: &Sample) -> Result<(), End> {
         let mut lamps = self.lamps.clone();
         match sample {
-            Sample::Zones(heard) => {
-                lamps.verdict = heard.zones.verdict();
-                let seq = heard.header.map(|header| header.seq);
-                // A second word on the same telegram is that no other came after it.
-                if heard.stale || seq == self.seq {
-                    lamps.marks = None;
-                }
-                self.seq = seq;
-            }
+            Sample::Zones(heard) => lamps.verdict = heard.zones.verdict(),
             Sample::Robot(heard) => {
                 lamps.verdict = heard.robot.verdict();
                 lamps.worst = heard.robot.worst().map(str::to_owned);
             }
-            Sample::Marks(marks) => lamps.marks = marks.is_available().then(|| marks.marks().len()),
+            Sample::Marks(marks) => {
+                // A number of marks ages as a verdict does of which something is known.
+                let fresh = self.marks.heard(marks.header(), Verdict::Clear, clock::now());
+                lamps.marks = (fresh && marks.is_available()).then(|| marks.marks().len());
+            }
             _ => {}
         }
         self.show(lamps, false)
@@ -238,8 +247,11 @@ impl Sink for Board<'_> {
         }
     }
 
-    /// Diodes that failed are tried again.
+    /// Marks that became too old go out, and diodes that failed are tried again.
     fn tick(&mut self, now: Instant) -> Result<(), End> {
+        if self.marks.silence(clock::now()) {
+            self.show(Lamps { marks: None, ..self.lamps.clone() }, false)?;
+        }
         self.switch(now)
     }
 

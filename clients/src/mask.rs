@@ -61,6 +61,8 @@ pub fn mask(
         since: Instant::now(),
         pose: None,
         within_mm: within_m.map(|metres| 1000.0 * metres),
+        verdicts: 0,
+        violated: 0,
         body: None,
         notes: Output::new(notes),
         progress,
@@ -69,7 +71,8 @@ pub fn mask(
     quiet(follow(&names, &options.places, &bounds, stop, &mut look))?;
     let (body, within_mm) = look.seen(sensor)?;
     let (scans, mask) = (body.scans(), body.mask());
-    let found = Found { sensor, run_for: *run_for, within_mm, scans, mask };
+    let is_violated = look.is_violated();
+    let found = Found { sensor, run_for: *run_for, within_mm, scans, mask, is_violated };
     let Look { mut notes, progress, .. } = look;
     progress(None);
     quiet(found.doubts().iter().try_for_each(|doubt| notes.line(|line| write!(line, "{doubt}"))))?;
@@ -87,6 +90,10 @@ struct Look<'a> {
     since: Instant,
     pose: Option<Pose>,
     within_mm: Option<f64>,
+    /// Samples of zones with circles.
+    verdicts: u32,
+    /// Those of them in which the largest circle is violated.
+    violated: u32,
     body: Option<Body>,
     notes: Output<'a>,
     progress: &'a mut dyn FnMut(Option<&str>),
@@ -118,6 +125,11 @@ impl Look<'_> {
         }
     }
 
+    /// The largest circle is violated all the while.
+    fn is_violated(&self) -> bool {
+        self.verdicts > 0 && f64::from(self.violated) >= ALL_THE_WHILE * f64::from(self.verdicts)
+    }
+
     fn slice(&self) -> usize {
         let share = self.since.elapsed().as_secs_f64() / self.run_for.as_secs_f64();
         ((share * SLICES as f64) as usize).min(SLICES - 1)
@@ -128,8 +140,11 @@ impl Sink for Look<'_> {
     fn sample(&mut self, name: &TopicName, sample: &Sample) -> Result<(), End> {
         match sample {
             Sample::Status(status) => self.pose = Some(status.pose),
-            Sample::Zones(heard) if self.within_mm.is_none() => {
-                self.within_mm = heard.zones.zones().first().map(|zone| f64::from(zone.radius_mm));
+            Sample::Zones(heard) => {
+                let Some(largest) = heard.zones.zones().first() else { return Ok(()) };
+                self.within_mm.get_or_insert(f64::from(largest.radius_mm));
+                self.verdicts += 1;
+                self.violated += u32::from(largest.violated != 0);
             }
             // A telegram that may be broken is no evidence.
             Sample::Scan(scan) if scan.header().quality() == Quality::Clean => {
@@ -178,6 +193,8 @@ struct Found<'a> {
     within_mm: f64,
     scans: u32,
     mask: Mask,
+    /// The hub finds something in the largest circle all the while.
+    is_violated: bool,
 }
 
 impl Found<'_> {
@@ -186,9 +203,14 @@ impl Found<'_> {
         let within = metres(self.within_mm as u32);
         let mut doubts = Vec::new();
         if self.mask.sectors.is_empty() {
-            doubts.push(format!(
-                "nothing of the robot is seen within {within} m of its centre: no mask is needed"
-            ));
+            let so = if self.is_violated {
+                // The hub adds zones.margin to its circles, and keeps it to itself.
+                "but the largest circle is violated all the while. If by the robot, look farther: --within RADIUS, \
+                 at least the circle's and zones.margin"
+            } else {
+                "no mask is needed"
+            };
+            doubts.push(format!("nothing of the robot is seen within {within} m of its centre: {so}"));
         }
         for Sector { from_mdeg, to_mdeg, range_mm, .. } in &self.mask.moving {
             let (from, to) = (degrees(*from_mdeg), degrees(*to_mdeg));
@@ -284,6 +306,8 @@ fn degrees(mdeg: i32) -> String {
 
 /// Fewer tell little of noise: five in each slice.
 const LEAST_SCANS: u32 = 50;
+/// Of the zones' samples, so that one scan without a reading changes nothing.
+const ALL_THE_WHILE: f64 = 0.9;
 /// As large as a circle of the zones may be.
 const FARTHEST_M: f64 = 65.0;
 /// A robot hides at most the third part of its sensor's view; more will be the room around it.

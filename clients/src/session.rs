@@ -4,7 +4,7 @@
 use std::time::{Duration, Instant};
 
 use schema::ipc::{self, Listener, Node, Payload, Subscriber};
-use schema::{Domain, Failure};
+use schema::{Domain, Failure, holder};
 
 use crate::presence::{Change, Presence};
 
@@ -54,6 +54,11 @@ impl Session {
     /// Where the hub lives, if there is one.
     pub(crate) fn domain(&self) -> Option<&Domain> {
         self.presence.domain()
+    }
+
+    /// There is a hub, and not only a listener that stands for those of other machines.
+    pub(crate) fn hub_lives(&self) -> bool {
+        self.domain().is_some_and(|domain| matches!(holder(domain.root()), Ok(Some(_))))
     }
 
     /// What to tell who cannot wait for a hub.

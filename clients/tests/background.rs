@@ -3,6 +3,7 @@
 mod fake;
 
 use std::fs;
+use std::os::unix::fs::{MetadataExt, PermissionsExt, chown};
 use std::path::PathBuf;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -182,6 +183,13 @@ fn nothing_is_saved_by_halves() {
     save(link.clone()).0.unwrap();
     assert!(fs::symlink_metadata(&link).unwrap().is_symlink());
     assert!(saved_model(&file, "front", false, &mut &b""[..]).is_ok());
+    // Who may read it stays as it was.
+    let _ = chown(&file, Some(12_345), Some(12_345));
+    fs::set_permissions(&file, fs::Permissions::from_mode(0o640)).unwrap();
+    let rights = || fs::metadata(&file).map(|found| (found.mode(), found.uid(), found.gid())).unwrap();
+    let before = rights();
+    save(file.clone()).0.unwrap();
+    assert_eq!(rights(), before);
     save("/dev/null".into()).0.unwrap();
     assert!(!fs::metadata("/dev/null").unwrap().is_file());
     let left: Vec<_> = fs::read_dir(&place.base).unwrap().map(|entry| entry.unwrap().file_name()).collect();

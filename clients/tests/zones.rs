@@ -120,7 +120,7 @@ fn echo_says_the_silence_too() {
     assert!(lines[0].starts_with(r#"{"class":"zones","sensor":"front","seq":0,"topic_seq":0,"stamp_ns":"#));
     let told = r#""quality":"clean","verdict":"stop","nearest_mm":420,"nearest_beam":180,"zones":[],"invalid_beams":0}"#;
     assert!(lines[0].ends_with(told), "{out}");
-    let silence = r#"{"class":"zones","sensor":"front","seq":null,"topic_seq":null,"stamp_ns":null,"wall_ns":null,"boot":null,"quality":"clean","verdict":"unknown","nearest_mm":null,"nearest_beam":null,"zones":[],"invalid_beams":0,"stale":true}"#;
+    let silence = r#"{"class":"zones","sensor":"front","seq":null,"topic_seq":null,"stamp_ns":null,"wall_ns":null,"boot":null,"quality":null,"verdict":"unknown","nearest_mm":null,"nearest_beam":null,"zones":[],"invalid_beams":0,"stale":true}"#;
     assert_eq!(lines[1], silence);
     assert!(
         lines[2].contains(r#""class":"summary""#) && lines[2].contains(r#""received":1,"lost":0"#),

@@ -5,15 +5,17 @@ use std::time::Duration;
 
 use clap::Args;
 use clients::{GatewayLook, GatewayOptions, duration};
-use schema::Failure;
+use daemon::config;
 use schema::datagram::MTU_SAFE;
+use schema::{Failure, Kind};
 
-use super::Everywhere;
+use super::{Configured, Everywhere};
 
+/// Each flag is also a key of section `gateway` of the configuration, and wins over it.
 #[derive(Args, Debug)]
 pub(crate) struct Gateway {
     /// Network interface of the groups; need not be named if only one is up and has multicast
-    #[arg(long, env = "SCANHUB_INTERFACE", value_name = "NAME")]
+    #[arg(long, value_name = "NAME")]
     interface: Option<String>,
     /// What goes out, front/scan or */scan for all sensors; :every=4 behind it keeps the samples of every fourth telegram.
     /// May be given several times; without it all topics but telegrams, of all sensors
@@ -25,27 +27,38 @@ pub(crate) struct Gateway {
     /// The telegrams and nothing else, without a header, each sensor's to a port of its own
     #[arg(long, conflicts_with = "background_every")]
     bare: bool,
-    /// How many routers may pass on what goes to the groups, and one more
-    #[arg(long, default_value_t = 1, value_name = "N")]
-    ttl: u8,
+    /// How many networks what goes to the groups may cross, the first one included [default: 1]
+    #[arg(long, value_name = "N")]
+    ttl: Option<u8>,
     /// The background goes out so often, and not only when it is a new one, for example 10s
     #[arg(long, value_name = "DURATION", value_parser = duration::parse)]
     background_every: Option<Duration>,
-    /// The longest datagram in bytes; 1472 where no tunnel is on the way
-    #[arg(long, default_value_t = MTU_SAFE, value_name = "BYTES")]
-    mtu: usize,
+    /// The longest datagram in bytes, up to 1472 where no tunnel is on the way [default: 1372]
+    #[arg(long, value_name = "BYTES")]
+    mtu: Option<usize>,
+    #[command(flatten)]
+    configured: Configured,
 }
 
 impl Gateway {
     pub(crate) fn options(&self, everywhere: &Everywhere) -> Result<GatewayOptions, Failure> {
+        let said = config::Gateway::load(&self.configured.sources())?;
+        let every = said.background_every.map(|(text, place)| {
+            let refuse = |what| Failure::new(Kind::Configuration, format!("{place}: {what}"), "");
+            duration::parse(&text).map_err(refuse)
+        });
+        let or = |flags: &[String], said: Option<Vec<String>>| match flags {
+            [] => said.unwrap_or_default(),
+            flags => flags.to_vec(),
+        };
         Ok(GatewayOptions {
-            interface: self.interface.clone(),
-            topics: self.topics.clone(),
-            to: self.to.clone(),
-            bare: self.bare,
-            ttl: self.ttl,
-            background_every: self.background_every,
-            longest: self.mtu,
+            interface: self.interface.clone().or(said.interface),
+            topics: or(&self.topics, said.topics),
+            to: or(&self.to, said.to),
+            bare: self.bare || said.bare.unwrap_or_default(),
+            ttl: self.ttl.or(said.ttl).unwrap_or(1),
+            background_every: self.background_every.or(every.transpose()?),
+            longest: self.mtu.or(said.mtu).unwrap_or(MTU_SAFE),
             look: match (everywhere.json, stdout().is_terminal()) {
                 (true, _) => GatewayLook::Json,
                 (false, true) => GatewayLook::Terminal,

@@ -18,7 +18,7 @@ pub struct Background {
     pub taught: u16,
     /// Beams of the model, at most [`BEAMS`]; 0 before the first scan.
     pub count: u16,
-    /// Millimetres per device unit: 1 or 10.
+    /// Millimetres per device unit: 1, 10 or 100.
     pub unit_mm: u8,
     /// [`Background::FROZEN`] or 0.
     pub flags: u8,

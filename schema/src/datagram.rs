@@ -15,7 +15,7 @@ pub use numbers::{Fresh, Row, WINDOW};
 pub use payload::{Packed, telegram};
 pub use refusal::Refusal;
 
-use crate::Topic;
+use crate::{Telegram, Topic};
 
 /// Bytes before the payload.
 pub const HEAD: usize = 48;
@@ -23,6 +23,8 @@ pub const HEAD: usize = 48;
 pub const MAC: usize = 16;
 /// The longest datagram that is never fragmented where tunnels leave an MTU of 1400.
 pub const MTU_SAFE: usize = 1372;
+/// The longest telegram with its header: a gateway that sends shorter datagrams could not send it.
+pub const MTU_LEAST: usize = HEAD + Telegram::MAX;
 /// The longest datagram on an Ethernet.
 pub const MTU_ETHERNET: usize = 1472;
 /// Port of all groups.

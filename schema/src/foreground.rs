@@ -22,7 +22,7 @@ pub struct Foreground {
     pub count: u16,
     /// Beams in the foreground.
     pub beams: u16,
-    /// Millimetres per device unit: 1 or 10.
+    /// Millimetres per device unit: 1, 10 or 100.
     pub unit_mm: u8,
     /// Segments that did not fit; 255: or more.
     pub left_out: u8,

@@ -100,8 +100,8 @@ impl File {
                 self.first_angle_deg, self.step_deg
             ));
         }
-        if ![1, 10].contains(&unit_mm) {
-            return Err(format!("unit_mm is {unit_mm}, and a unit is 1 or 10 mm"));
+        if ![1, 10, 100].contains(&unit_mm) {
+            return Err(format!("unit_mm is {unit_mm}, and a unit is 1, 10 or 100 mm"));
         }
         if self.ranges.len() != usize::from(count) {
             return Err(format!("{} ranges of {count} beams", self.ranges.len()));
@@ -177,9 +177,9 @@ mod tests {
 
     #[test]
     fn models_go_there_and_back() {
-        for count in [101, 181, 201, 361, 401] {
+        for (count, unit_mm) in [(101, 1), (181, 10), (201, 100), (361, 1), (401, 10)] {
             for flags in [0, Background::FROZEN] {
-                let model = Background { flags, ..model(count) };
+                let model = Background { flags, unit_mm, ..model(count) };
                 let saved = SavedModel { sensor: "front".into(), model };
                 assert_eq!(SavedModel::parse(text(&model).as_bytes(), "m"), Ok(saved), "{count}");
             }
@@ -220,7 +220,7 @@ mod tests {
                 "361 beams begin at 0 degrees in steps of 0.5, not at 0 in steps",
             ),
             ("\"step_deg\":1.0", "\"step_deg\":null", "invalid type: null, expected f64"),
-            ("\"unit_mm\":10", "\"unit_mm\":2", "unit_mm is 2, and a unit is 1 or 10 mm"),
+            ("\"unit_mm\":10", "\"unit_mm\":2", "unit_mm is 2, and a unit is 1, 10 or 100 mm"),
             ("[400,", "[", "180 ranges of 181 beams"),
             ("[400", "[0", "the range of beam 0 is 0, and 1 to 32758 are possible"),
             ("32758", "65535", "the range of beam 3 is 65535"),

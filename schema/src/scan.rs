@@ -21,7 +21,7 @@ pub const TURN_NS: u64 = 13_320_000;
 pub struct Scan {
     /// Beams used, at most [`BEAMS`].
     pub count: u16,
-    /// Millimetres per device unit: 1 or 10.
+    /// Millimetres per device unit: 1, 10 or 100.
     pub unit_mm: u8,
     /// Bits of a range: 13, 14 or 15. The largest values are codes.
     pub range_bits: u8,

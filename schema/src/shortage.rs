@@ -9,7 +9,7 @@ use std::path::Path;
 
 use rustix::fs::{StatVfs, statvfs};
 use rustix::io::Errno;
-use rustix::process::{Resource, getrlimit};
+use rustix::process::{Resource, getrlimit, setrlimit};
 
 use crate::{Failure, Kind};
 
@@ -53,6 +53,16 @@ pub fn check_descriptors(needed: u64) -> Result<(), Failure> {
         format!("descriptors are short: {open} are open, {needed} more needed, the limit is {limit}"),
         "raise the limit: `ulimit -n`, for a service LimitNOFILE",
     ))
+}
+
+/// Lets the process have as many descriptors as its hard limit allows: who publishes needs about four for each consumer
+/// of a topic.
+///
+/// The system's error if it does not let it.
+pub fn raise_descriptor_limit() -> io::Result<()> {
+    let mut limit = getrlimit(Resource::Nofile);
+    limit.current = limit.maximum;
+    Ok(setrlimit(Resource::Nofile, limit)?)
 }
 
 /// Shared memory is short, in the words of `what`.

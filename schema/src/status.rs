@@ -21,7 +21,7 @@ pub struct Status {
     pub state: u8,
     /// The sensor's measuring-mode byte; FFh unknown.
     pub mode: u8,
-    /// Millimetres per device unit: 1 or 10; 0 unknown.
+    /// Millimetres per device unit: 1, 10 or 100; 0 unknown.
     pub unit_mm: u8,
     /// 0.
     pub reserved: u8,

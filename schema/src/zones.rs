@@ -20,7 +20,7 @@ pub struct Zones {
     pub nearest_beam: u16,
     /// That point's distance from the centre in mm, rounded down; [`Zones::NO_DISTANCE`] if there is none.
     pub nearest_mm: u32,
-    /// Beams through the largest circle without a valid reading.
+    /// Beams that see into the largest circle, without a valid reading.
     pub invalid_beams: u16,
     /// [`Zones::PROVISIONAL`] or 0.
     pub flags: u8,

@@ -26,7 +26,7 @@ use serde_json::Value;
 pub(crate) use line::{Line, open_line};
 pub(crate) use machine::{Machine, command_in, ip};
 pub(crate) use network::in_a_network;
-pub(crate) use program::{INT, KILL, Outcome, Program, TERM};
+pub(crate) use program::{INT, KILL, Outcome, Program, TERM, USR1};
 pub(crate) use receiver::{Receiver, read};
 pub(crate) use relay::Relay;
 pub(crate) use robot::Robot;
@@ -121,12 +121,33 @@ impl Stage {
         self.start(&with(&["run", "--json"], flags)).ready()
     }
 
+    /// A gateway with these flags that has begun; its number is kept in this directory.
+    pub(crate) fn gateway<S: AsRef<str>>(&self, flags: &[S]) -> Program {
+        let mut gateway = self.gateway_at(flags);
+        gateway.await_line("its begin", is_class("gateway"));
+        gateway
+    }
+
+    /// As [`Stage::gateway`], however it begins.
+    pub(crate) fn gateway_at<S: AsRef<str>>(&self, flags: &[S]) -> Program {
+        let mut command = self.command(&with(&["gateway", "--json", "--no-system-config"], flags));
+        command.env("XDG_STATE_HOME", self.path("state")).env_remove("STATE_DIRECTORY");
+        Program::start(command)
+    }
+
     /// A simulator with a port of each of these names that is up; its truth is in the file `truth`.
     pub(crate) fn simulator<S: AsRef<str>>(&self, ports: &[&str], flags: &[S]) -> Program {
         let ports: Vec<_> = ports.iter().map(|port| format!("--port={}", self.word(port))).collect();
         let truth = format!("--truth={}", self.word("truth"));
         let words = with(&["simulate", "--json", &truth], &with(&ports, flags));
         self.start(&words).ready()
+    }
+
+    /// Kills the simulator of one port, and takes away the name that it leaves: a hub that goes on would soon find
+    /// another test's terminal by it.
+    pub(crate) fn kill_simulator(&self, simulator: Program, port: &str) {
+        assert_eq!(simulator.end(KILL).code, None);
+        fs::remove_file(self.path(port)).unwrap_or_else(|error| panic!("{port}: {error}"));
     }
 
     /// `echo --json` of these topics, attached to all of them.

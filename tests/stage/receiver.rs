@@ -31,12 +31,17 @@ impl Receiver {
         let (to, flag) = (heard.clone(), stop.clone());
         let thread = thread::spawn(move || {
             let mut bytes = [0; 65_536];
-            // What waits when it is told to stop is taken, too.
+            let mut is_over = false;
             loop {
                 match socket.recv(&mut bytes) {
                     Ok(len) => to.lock().expect("not poisoned").push(bytes[..len].to_vec()),
-                    Err(_) if flag.load(Ordering::Relaxed) => return,
+                    Err(_) if is_over => return,
                     Err(_) => {}
+                }
+                // What waits when it is told to stop is taken, what comes later is not waited for.
+                if !is_over && flag.load(Ordering::Relaxed) {
+                    is_over = true;
+                    socket.set_nonblocking(true).expect("need not wait");
                 }
             }
         });

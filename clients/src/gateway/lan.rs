@@ -1,8 +1,8 @@
 //! The datagrams: each is numbered, sealed and handed to every destination, in a buffer that is always the same. Refuses
 //! to know where samples come from.
 
-use schema::datagram::{Announce, HEAD, Head, MTU_ETHERNET, PORT, group};
-use schema::{Failure, Kind, Telegram, Topic};
+use schema::datagram::{Announce, HEAD, Head, MTU_ETHERNET, MTU_LEAST, PORT, group};
+use schema::{Failure, Kind, Topic};
 
 use super::life::Life;
 use super::outlet::Outlet;
@@ -50,6 +50,17 @@ pub(super) struct Row {
     pub(super) bytes: u64,
     /// Samples that the hub sent and the gateway did not receive; they have no number.
     pub(super) missed: u64,
+    fit: Fit,
+}
+
+/// Whether all samples of a topic fit into datagrams.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+enum Fit {
+    #[default]
+    All,
+    NotAll,
+    /// And that is told.
+    Told,
 }
 
 impl Row {
@@ -80,10 +91,10 @@ impl Lan {
         ttl: u8,
         longest: usize,
     ) -> Result<Lan, Failure> {
-        if !(SHORTEST..=MTU_ETHERNET).contains(&longest) {
+        if !(MTU_LEAST..=MTU_ETHERNET).contains(&longest) {
             let what = format!("datagrams of {longest} bytes are not possible");
             let hint =
-                format!("from {SHORTEST} to {MTU_ETHERNET}, which is the most that an Ethernet carries");
+                format!("from {MTU_LEAST} to {MTU_ETHERNET}, which is the most that an Ethernet carries");
             return Err(Failure::new(Kind::Configuration, what, hint));
         }
         let (port, more) = match form {
@@ -177,7 +188,20 @@ impl Lan {
                 }
                 None => row.failed += 1,
             }
+            if payload.is_none() && row.fit == Fit::All {
+                row.fit = Fit::NotAll;
+            }
         }
+    }
+
+    /// `SENSOR/TOPIC` of which something did not fit into a datagram; each is told once.
+    pub(super) fn misfit(&mut self) -> Option<String> {
+        self.sensors.iter_mut().find_map(|Rows { name, rows }| {
+            let (number, row) = rows.iter_mut().enumerate().find(|(_, row)| row.fit == Fit::NotAll)?;
+            row.fit = Fit::Told;
+            let topic = Topic::of_number(number as u8).map_or("announce", Topic::name);
+            Some(format!("{name}/{topic}"))
+        })
     }
 
     fn row(&mut self, number: u8, topic: u8) -> Option<&mut Row> {
@@ -196,5 +220,3 @@ impl Lan {
 const KINDS: usize = 1 + Topic::ALL.len();
 /// The port of sensor 0 where nothing but telegrams goes out; the next sensor has the next one.
 const BARE_PORT: u16 = PORT + 1;
-/// A telegram with a header fits into the shortest datagram that can be asked for.
-const SHORTEST: usize = HEAD + Telegram::MAX;

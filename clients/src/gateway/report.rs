@@ -74,6 +74,13 @@ impl<'a> Report<'a> {
         }
     }
 
+    /// Samples of `topic` are longer than the longest datagram.
+    pub(super) fn misfit(&mut self, topic: &str, longest: usize) -> Result<(), End> {
+        let message =
+            format!("does not fit into {longest} bytes: --mtu, or the interface's own, is too small");
+        self.link(topic, "failing", Some(&message))
+    }
+
     /// The periodic word: an object for each sensor and topic and each destination, or one line on a terminal.
     pub(super) fn periodic(&mut self, lan: &Lan, hub_lives: bool) -> Result<(), End> {
         match self.look {

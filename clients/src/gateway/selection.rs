@@ -2,7 +2,7 @@
 
 use std::num::NonZeroU64;
 
-use schema::{Failure, Kind, Topic};
+use schema::{Failure, Kind, Topic, is_remote};
 
 use crate::names::TopicName;
 
@@ -84,6 +84,10 @@ impl Entry {
                 if name.is_robot() {
                     return Err(refuse(text, "is a fold", "*/zones sends the zones of each sensor"));
                 }
+                if is_remote(&name.sensor) {
+                    let hint = "a gateway sends what the hub of its own machine publishes";
+                    return Err(refuse(text, "is another machine's", hint));
+                }
                 (Some(name.sensor), name.topic)
             }
         };
@@ -152,6 +156,7 @@ mod tests {
         for bad in [
             "Front/scan",
             "robot/zones",
+            "robot1.front/zones",
             "front/scan:every=0",
             "front/scan:every=",
             "front/scan:4",

@@ -7,7 +7,7 @@ use std::time::{Duration, Instant};
 
 use schema::datagram::{Announce, Head};
 use schema::ipc::{self, Node};
-use schema::shortage::{allocate, check_memory, sensor_bytes};
+use schema::shortage::{allocate, check_descriptors, check_memory, raise_descriptor_limit, sensor_bytes};
 use schema::{Domain, Failure, Kind, ListenLock, Topic};
 
 use super::remote::Remote;
@@ -41,6 +41,9 @@ pub(super) struct LeftOut {
 /// The most sensors: each takes up to 6 MB of shared memory, and whoever can send to the network can announce some.
 pub(super) const SENSORS: usize = 16;
 
+/// Descriptors of a service, and of its first consumer.
+const SERVICE_DESCRIPTORS: u64 = 8;
+
 /// So often late joiners get the last status, zones and background.
 const GREET_EVERY: Duration = Duration::from_millis(100);
 
@@ -53,6 +56,8 @@ impl Publication {
     /// [`Kind::DomainHeld`] if another listener has it, [`Kind::Short`] if there is no memory
     /// for even one sensor, [`Kind::Failed`] if shared memory refuses.
     pub(super) fn open(domain: &Domain, now: Instant) -> Result<Publication, Failure> {
+        // With fewer, fewer consumers can attach.
+        let _ = raise_descriptor_limit();
         let lock = ListenLock::acquire(domain.root())?;
         check_memory(sensor_bytes(&Topic::ALL))?;
         let node = ipc::hub_node(domain)?;
@@ -94,6 +99,7 @@ impl Publication {
             topics.filter(|&topic| at.is_none_or(|at| !self.sensors[at].has(topic))).collect();
         if at.is_none() || !missing.is_empty() {
             check_memory(sensor_bytes(&missing))?;
+            check_descriptors((missing.len() as u64 + 1) * SERVICE_DESCRIPTORS)?;
         }
         let at = match at {
             Some(at) => at,

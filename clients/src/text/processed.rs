@@ -2,7 +2,7 @@
 
 use std::io::{self, Write};
 
-use schema::{Background, Foreground, Header, Marks};
+use schema::{Background, Foreground, Header, Marks, Verdict};
 
 use super::numbers;
 use crate::robot::Robot;
@@ -33,7 +33,7 @@ pub(crate) fn zones(line: &mut Vec<u8>, heard: &Heard) -> io::Result<()> {
     write!(line, " {}", zones.verdict().name())?;
     match zones.nearest() {
         Some((beam, mm)) => write!(line, " nearest {mm} mm, beam {beam}")?,
-        None => write!(line, " nothing near")?,
+        None => write!(line, " {}", without_nearest(zones.verdict()))?,
     }
     for zone in zones.zones() {
         let violated = if zone.violated != 0 { " violated" } else { "" };
@@ -47,12 +47,17 @@ pub(super) fn robot(line: &mut Vec<u8>, robot: &Robot) -> io::Result<()> {
     write!(line, "{}", robot.verdict().name())?;
     match robot.nearest() {
         Some((mm, sensor)) => write!(line, " nearest {mm} mm, {sensor}:")?,
-        None => write!(line, " nothing near:")?,
+        None => write!(line, " {}:", without_nearest(robot.verdict()))?,
     }
     for (sensor, verdict) in robot.sensors() {
         write!(line, " {sensor} {}", verdict.name())?;
     }
     Ok(())
+}
+
+/// In place of what is nearest, where no beam met anything.
+fn without_nearest(verdict: Verdict) -> &'static str {
+    if verdict == Verdict::Unknown { "nearest not known" } else { "nothing near" }
 }
 
 pub(crate) fn foreground(line: &mut Vec<u8>, header: &Header, foreground: &Foreground) -> io::Result<()> {
@@ -74,4 +79,26 @@ pub(crate) fn background(line: &mut Vec<u8>, model: &Background) -> io::Result<(
         line,
         "generation {generation}: {taught} of {count} beams known, {far} far, in {unit_mm} mm{frozen}"
     )
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use schema::Zones;
+
+    #[test]
+    fn what_is_not_known_is_not_called_far() {
+        let text = |verdict: Verdict| {
+            let zones = Zones { verdict: verdict as u8, ..Zones::unknown() };
+            let mut line = Vec::new();
+            let header = Some(Header::default());
+            super::zones(&mut line, &Heard { zones, header, missed: 0, stale: false }).unwrap();
+            String::from_utf8(line).unwrap()
+        };
+        assert!(text(Verdict::Clear).ends_with(" clear nothing near"));
+        assert!(text(Verdict::Unknown).ends_with(" unknown nearest not known"));
+        let mut line = Vec::new();
+        robot(&mut line, &Robot::default()).unwrap();
+        assert_eq!(line, b"unknown nearest not known:");
+    }
 }

@@ -1,18 +1,22 @@
 //! What the hub is told: links with their ports and what to ask of their sensors. Several sources, the last one wins.
 
+mod gateway;
 mod processing;
+mod sources;
 
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 
 use lms::family::Family;
 use lms::variant::{Baud, Unit, Variant};
 use schema::{Failure, Kind};
 
-use crate::layer::{Drafts, parse, quoted, setting};
+use crate::layer::{Drafts, parse};
 use crate::origin::Origin;
 
+pub use gateway::Gateway;
 pub(crate) use processing::START;
 pub use processing::{Background, Processing, Zones};
+pub use sources::Sources;
 
 /// The effective configuration.
 #[derive(Clone, Debug, PartialEq)]
@@ -103,63 +107,22 @@ impl Source {
     }
 }
 
-/// Where to look for values, besides the defaults.
-#[derive(Clone, Debug, Default)]
-pub struct Sources {
-    /// Files in their order; each must be there.
-    pub files: Vec<PathBuf>,
-    /// `--set KEY=VALUE`, as given.
-    pub set: Vec<String>,
-    /// `--link NAME=PORT`, as given.
-    pub links: Vec<String>,
-}
-
-impl Sources {
-    /// The system's files as far as they are there: `/etc/scanhub/scanhub.toml`, then `/etc/scanhub/conf.d/*.toml`
-    /// in the order of their names.
-    pub fn system() -> Vec<PathBuf> {
-        let base = Path::new("/etc/scanhub");
-        let mut files: Vec<_> =
-            [base.join("scanhub.toml")].into_iter().filter(|file| file.exists()).collect();
-        let entries = std::fs::read_dir(base.join("conf.d")).into_iter().flatten().flatten();
-        let mut more: Vec<_> = entries.map(|entry| entry.path()).collect();
-        more.retain(|path| path.extension().is_some_and(|extension| extension == "toml"));
-        more.sort();
-        files.extend(more);
-        files
-    }
-}
-
 impl Config {
     /// Reads all sources. Without any link in them there are two, `front` and `rear`, at the first two USB adapters.
     ///
     /// [`schema::Kind::Configuration`] with place, value and remedy.
     pub fn load(sources: &Sources) -> Result<Config, Failure> {
         let mut drafts = Drafts::default();
-        for path in &sources.files {
-            let origin = Origin::read(path)?;
-            let layer = parse(&origin, origin.text())?;
+        for layer in sources.files().chain(sources.links()) {
+            let (origin, layer) = layer?;
             drafts.merge(layer, origin, true)?;
-        }
-        for flag in &sources.links {
-            let origin = Origin::Flag(format!("--link {flag}"));
-            let (name, port) = flag.split_once('=').ok_or_else(|| {
-                origin.refuse(None, "no = in it", "write --link NAME=PORT, for example front=/dev/ttyUSB0")
-            })?;
-            let text = format!("[[link]]\nname = {}\nport = {}", quoted(name), quoted(port));
-            drafts.merge(parse(&origin, &text)?, origin, true)?;
         }
         if drafts.len() == 0 {
             drafts.merge(parse(&Origin::Default, DEFAULT)?, Origin::Default, true)?;
         }
-        for flag in &sources.set {
-            let origin = Origin::Flag(format!("--set {flag}"));
-            let text = setting(flag).ok_or_else(|| {
-                let remedy = "write --set link.NAME.KEY=VALUE, as link.front.angle=100, or for all links --set \
-                              zones.radii=[1.2,0.7]";
-                origin.refuse(None, "not a setting", remedy)
-            })?;
-            drafts.merge(parse(&origin, &text)?, origin, false)?;
+        for layer in sources.settings() {
+            let (origin, layer) = layer?;
+            drafts.merge(layer, origin, false)?;
         }
         if drafts.len() > MAX_LINKS {
             let message = format!("{} links: a sample names its sensor in one byte", drafts.len());

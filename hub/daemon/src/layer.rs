@@ -1,7 +1,9 @@
 //! One source of configuration laid over the others: every value is checked where it stands, so that an error names
 //! file, line and column, or the flag.
 
+mod gateway;
 mod processing;
+mod sight;
 
 use std::rc::Rc;
 
@@ -13,7 +15,9 @@ use toml::Spanned;
 
 use crate::config::{Link, Processing, Source};
 use crate::origin::Origin;
+use gateway::GatewayLayer;
 use processing::{BackgroundLayer, MarksLayer, PoseLayer, Sections, ZonesLayer};
+use sight::Sight;
 
 /// What one source says. Knows the keys; what is not here is an unknown key.
 #[derive(Deserialize)]
@@ -24,6 +28,8 @@ pub(crate) struct Layer {
     zones: Option<ZonesLayer>,
     marks: Option<MarksLayer>,
     background: Option<BackgroundLayer>,
+    /// The hub's own configuration may be that of its gateway, too.
+    pub(crate) gateway: Option<GatewayLayer>,
 }
 
 #[derive(Deserialize)]
@@ -78,7 +84,7 @@ impl Drafts {
 
     /// Lays `layer` over the others; only where `may_add` may it bring links that were not there.
     pub(crate) fn merge(&mut self, layer: Layer, origin: Origin, may_add: bool) -> Result<(), Failure> {
-        let Layer { link, zones, marks, background } = layer;
+        let Layer { link, zones, marks, background, gateway: _ } = layer;
         let origin = Rc::new(origin);
         merge(&mut self.links, link, &origin, may_add)?;
         self.general.push((origin, Sections { pose: None, zones, marks, background }));
@@ -127,9 +133,11 @@ impl Draft {
             return Err(refuse(angle_place, what, "angle = 100"));
         }
         let mut processing = Processing::default();
-        for (origin, sections) in general.iter().chain(&own) {
+        let said: Vec<_> = general.iter().chain(&own).collect();
+        for (origin, sections) in &said {
             sections.clone().lay(origin, &mut processing)?;
         }
+        Sight { name: &name, place: &place, variant, unit, said }.check(&processing)?;
         processing.background.read(&name, variant, unit)?;
         Ok(Link { name, port, family, variant, unit, baud, processing })
     }

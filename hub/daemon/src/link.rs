@@ -51,6 +51,8 @@ pub(crate) struct LinkThread<'a> {
     pub(crate) unreached: u32,
     /// The measuring mode of which was said whether it has marks.
     pub(crate) told_mode: u8,
+    /// The sensor, as it turned out to be, sees too little of its circles.
+    is_blind: bool,
 }
 
 /// What a link's error is made from.
@@ -81,8 +83,7 @@ impl<'a> LinkThread<'a> {
             stop,
             orders,
             pipeline: Pipeline::new(&link.processing),
-            // Nothing is known yet, and that is said at once.
-            stale_at: now,
+            stale_at: Nanos::MAX,
             next_greeting: now,
             next_status: now,
             doubt: String::new(),
@@ -92,19 +93,25 @@ impl<'a> LinkThread<'a> {
             line_errors: LineErrors::default(),
             unreached: 0,
             told_mode: Status::MODE_UNKNOWN,
+            is_blind: false,
         }
     }
 
     /// Runs until the hub shall end. `report` is called once, when it is clear whether the link can work: an absent
     /// port can, one that is busy, forbidden or no tty cannot.
     pub(crate) fn run(mut self, report: impl FnOnce(Result<(), Failure>)) {
-        // The model to begin with, before anything is learned.
-        self.topics.background(&mut self.pipeline, clock::now());
+        if let Source::File { .. } = self.link.port {
+            self.topics.set_flags(Flags::REPLAYED);
+        }
+        // Nothing is known yet but the model to begin with: that is said before anything can come.
+        self.show(None, State::Absent, "");
+        let now = clock::now();
+        self.topics.stale(&mut self.pipeline, now);
+        self.topics.background(&mut self.pipeline, now);
         match &self.link.port {
             Source::File { path, paced } => match replay::Recorded::open(path, self.link) {
                 Ok(recorded) => {
                     report(Ok(()));
-                    self.topics.set_flags(Flags::REPLAYED);
                     let mut session = Session::new(self.settings(true), clock::now());
                     replay::play(&mut self, &mut session, recorded, *paced);
                 }
@@ -202,7 +209,8 @@ impl<'a> LinkThread<'a> {
     }
 
     /// Publishes a telegram and, if it is measured data that can be read, its scan and what is made of it. `fallback` is
-    /// the mode of a sensor that cannot be asked, `gap_us` the time between its scans if that is greater than nominal.
+    /// the mode of a sensor that cannot be asked, `gap_us` the time to the next scan if that is known to be longer than
+    /// nominal.
     pub(crate) fn publish(&mut self, received: &Received<'_>, fallback: Option<Mode>, gap_us: u32) {
         let measured = match Reply::decode(received.telegram) {
             Some(Reply::Measured(measured)) => Some(measured),
@@ -220,10 +228,15 @@ impl<'a> LinkThread<'a> {
         let (Some(measured), Some(mode)) = (measured, mode) else { return };
         self.account.scans += 1;
         let fill = |scan: &mut Scan| scanner::decode(&measured, mode, scan);
-        if let Some(mismatch) = self.topics.scan(fill, &mut self.pipeline) {
-            tracing::warn!("{}: the background begins anew: {mismatch}", self.link.name);
+        if let Some(anew) = self.topics.scan(fill, &mut self.pipeline) {
+            tracing::warn!("{}: the background begins anew: {anew}", self.link.name);
         }
-        self.stale_at = received.last.saturating_add(limit(period_us));
+        let is_blind = self.pipeline.is_blind();
+        if std::mem::replace(&mut self.is_blind, is_blind) != is_blind && is_blind {
+            tracing::warn!("{}: zones unknown: too few beams meet the largest circle", self.link.name);
+        }
+        // Telegrams that had to wait for the hub are late, but scans do not stay out.
+        self.stale_at = clock::now().saturating_add(limit(period_us));
     }
 
     /// The session is over: what is wrong is not what was.
@@ -267,7 +280,8 @@ impl<'a> LinkThread<'a> {
     pub(crate) fn wait(&mut self, port: Option<(BorrowedFd<'_>, PollFlags)>, until: Nanos) -> Woken {
         loop {
             let now = clock::now();
-            if now >= self.stale_at {
+            // What was due before comes first: it may be a scan.
+            if now >= self.stale_at && self.stale_at < until {
                 self.stale_at = Nanos::MAX;
                 self.topics.stale(&mut self.pipeline, now);
                 self.topics.wake(Wake::Status);

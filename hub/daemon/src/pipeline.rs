@@ -1,6 +1,8 @@
 //! What the hub makes of each scan of a link: marks, zones, foreground. One after the other on the scan where it was
 //! decoded, each into the payload that is given. Refuses to know topics, and who listens.
 
+use std::fmt;
+
 use preprocess::background::{Mismatch, Model};
 use preprocess::marks::Finder;
 use preprocess::segments::Cutter;
@@ -34,6 +36,24 @@ struct Kept {
 struct Spare {
     zones: Zones,
     foreground: Box<Foreground>,
+}
+
+/// Why a background began anew with a scan.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Anew {
+    /// The model was one of other beams or another unit.
+    Shape(Mismatch),
+    /// Its beams look elsewhere.
+    Angles,
+}
+
+impl fmt::Display for Anew {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Anew::Shape(mismatch) => mismatch.fmt(f),
+            Anew::Angles => f.write_str("the sensor's beams have other angles than before"),
+        }
+    }
 }
 
 /// Where to write what a scan tells; nothing where nobody wants it or there is no memory.
@@ -72,12 +92,17 @@ impl Pipeline {
 
     /// Reads `scan`. What has a memory learns from it, whoever wants to know. A model that does not fit the scan begins
     /// anew; then it is told why.
-    pub(crate) fn update(&mut self, scan: &Scan, out: Outputs<'_>) -> Option<Mismatch> {
+    pub(crate) fn update(&mut self, scan: &Scan, out: Outputs<'_>) -> Option<Anew> {
         self.zones.update(scan, out.zones.unwrap_or(&mut self.spare.zones));
         if let Some(marks) = out.marks {
             self.marks.update(scan, marks);
         }
         self.background.as_mut()?.update(scan, out.foreground, &mut self.spare.foreground)
+    }
+
+    /// Whether the sensor sees too little of the largest circle to find anything inside.
+    pub(crate) fn is_blind(&self) -> bool {
+        self.zones.is_blind()
     }
 
     /// What to say of the zones when scans stay out.
@@ -152,12 +177,7 @@ impl Kept {
         Ok(())
     }
 
-    fn update(
-        &mut self,
-        scan: &Scan,
-        out: Option<&mut Foreground>,
-        spare: &mut Foreground,
-    ) -> Option<Mismatch> {
+    fn update(&mut self, scan: &Scan, out: Option<&mut Foreground>, spare: &mut Foreground) -> Option<Anew> {
         let before = self.model.generation();
         match out {
             Some(out) => {
@@ -167,8 +187,9 @@ impl Kept {
             None => self.model.update(scan, spare),
         }
         let sensor = (scan.beams() as u16, scan.unit_mm);
-        let model = self.shape.replace(sensor).filter(|shape| *shape != sensor)?;
-        (self.model.generation() != before).then_some(Mismatch { model, sensor })
+        let model = self.shape.replace(sensor).filter(|shape| *shape != sensor);
+        let anew = model.map_or(Anew::Angles, |model| Anew::Shape(Mismatch { model, sensor }));
+        (self.model.generation() != before).then_some(anew)
     }
 }
 
@@ -240,14 +261,18 @@ mod tests {
             Pipeline::new(&processing(|processing| processing.background.model = Some(Box::new(model))));
         let (first, is_news) = (shown(&mut pipeline), pipeline.is_news());
         assert_eq!((first.generation, first.taught, first.ranges()[180], is_news), (1, 181, 300, false));
-        let mismatch = pipeline.update(&wall(361, 10, 300), Outputs::default()).expect("another resolution");
-        assert_eq!((mismatch.model, mismatch.sensor), ((181, 10), (361, 10)));
+        let anew = pipeline.update(&wall(361, 10, 300), Outputs::default());
+        assert_eq!(anew, Some(Anew::Shape(Mismatch { model: (181, 10), sensor: (361, 10) })));
         assert!(pipeline.is_news());
         let refusal = pipeline.obey("a", Verb::Load, &model).expect_err("another resolution");
         assert_eq!(refusal.kind, Kind::Configuration);
         let words = "a: the model has 181 beams in units of 10 mm, the sensor's scans have 361 beams in units of 10 mm";
         assert_eq!(refusal.message, words);
         assert!(pipeline.update(&wall(361, 1, 3000), Outputs::default()).is_some(), "another unit");
+        let turned = Scan { first_angle_mdeg: 40_000, ..wall(361, 1, 3000) };
+        shown(&mut pipeline);
+        assert_eq!(pipeline.update(&turned, Outputs::default()), Some(Anew::Angles));
+        assert_eq!((pipeline.is_news(), pipeline.update(&turned, Outputs::default())), (true, None));
     }
 
     #[test]

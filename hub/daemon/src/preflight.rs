@@ -1,15 +1,12 @@
 //! What must be there before the hub takes its first sensor: descriptors for all consumers, and memory for every
 //! segment of its own. A sparse segment that finds /dev/shm full would kill the hub later.
 
-use rustix::process::{Resource, getrlimit, setrlimit};
 use schema::shortage::{self, sensor_bytes};
 use schema::{Failure, Topic};
 
-/// Lets the process have as many descriptors as its hard limit allows: about four for each consumer of a topic.
+/// Lets the process have as many descriptors as its hard limit allows.
 pub(crate) fn raise_descriptor_limit() {
-    let mut limit = getrlimit(Resource::Nofile);
-    limit.current = limit.maximum;
-    if let Err(error) = setrlimit(Resource::Nofile, limit) {
+    if let Err(error) = shortage::raise_descriptor_limit() {
         tracing::warn!(%error, "cannot raise the limit of open descriptors: fewer consumers can attach");
     }
 }

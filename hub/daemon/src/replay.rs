@@ -2,6 +2,7 @@
 //! else of the scans, or as fast as they can be read. Nobody hears what the hub would say, so nothing is asked.
 
 use std::io::{self, Read};
+use std::iter::Peekable;
 use std::path::Path;
 
 use lms::measured::MEASURED;
@@ -29,10 +30,17 @@ enum Bytes {
     Stream(Box<dyn Read + Send>),
     /// Telegram by telegram, with stamps where the recording has them.
     Frames {
-        frames: Box<dyn Iterator<Item = Frame> + Send>,
+        frames: Peekable<Box<dyn Iterator<Item = Frame> + Send>>,
         /// Of the telegram that was begun.
         rest: Vec<u8>,
     },
+}
+
+/// When a telegram came, as the recording has it.
+struct Stamp {
+    wall_ns: u64,
+    /// When the one after it came.
+    next_ns: Option<u64>,
 }
 
 impl Recorded {
@@ -45,14 +53,17 @@ impl Recorded {
         let encoding = Encoding { unit: link.unit.unwrap_or(Unit::Mm), mode };
         let bytes = match recording.contents().form {
             Form::Telegrams => Bytes::Stream(recording.bytes()?),
-            Form::Carmen => Bytes::Frames { frames: recording.telegrams(encoding)?, rest: Vec::new() },
+            Form::Carmen => {
+                let frames: Box<dyn Iterator<Item = Frame> + Send> = recording.telegrams(encoding)?;
+                Bytes::Frames { frames: frames.peekable(), rest: Vec::new() }
+            }
         };
         Ok(Recorded { bytes, mode })
     }
 
     /// Writes the next bytes into `room`: how many, none at the end, and the stamp of a telegram that begins with them,
     /// if it has one.
-    fn read(&mut self, room: &mut [u8]) -> (usize, Option<u64>) {
+    fn read(&mut self, room: &mut [u8]) -> (usize, Option<Stamp>) {
         match &mut self.bytes {
             Bytes::Stream(stream) => loop {
                 let piece = room.len().min(PIECE);
@@ -70,7 +81,9 @@ impl Recorded {
                 if rest.is_empty()
                     && let Some(frame) = frames.next()
                 {
-                    (*rest, stamp) = (frame.telegram, frame.wall_ns);
+                    let next_ns = frames.peek().and_then(|next| next.wall_ns);
+                    stamp = frame.wall_ns.map(|wall_ns| Stamp { wall_ns, next_ns });
+                    *rest = frame.telegram;
                 }
                 let len = rest.len().min(room.len());
                 room[..len].copy_from_slice(&rest[..len]);
@@ -84,16 +97,15 @@ impl Recorded {
 /// Plays `recorded` through `session` into the topics of `link`, then stays silent until the hub ends.
 pub(crate) fn play(link: &mut LinkThread<'_>, session: &mut Session, mut recorded: Recorded, paced: bool) {
     let mut due = clock::now();
-    let mut last_stamp = None;
-    // Between the scans of the recording, as far as it is kept.
+    let mut last_ns = None;
+    // From this scan to the next, as far as it is kept: so long nothing newer can be known.
     let mut gap_ns = 0;
     loop {
         let (len, stamp) = recorded.read(session.spare());
-        if let Some(stamp) = stamp {
-            let gap = stamp.saturating_sub(last_stamp.unwrap_or(stamp)).min(LONGEST_GAP);
-            due += gap;
-            gap_ns = if paced { gap } else { 0 };
-            last_stamp = Some(stamp);
+        if let Some(Stamp { wall_ns, next_ns }) = stamp {
+            due += gap(last_ns.unwrap_or(wall_ns), wall_ns);
+            gap_ns = next_ns.filter(|_| paced).map_or(0, |next_ns| gap(wall_ns, next_ns));
+            last_ns = Some(wall_ns);
         }
         // Also where nothing is waited for, the hub's end is looked for.
         if rest(link, if paced { due } else { 0 }) == Woken::Stop {
@@ -109,7 +121,7 @@ pub(crate) fn play(link: &mut LinkThread<'_>, session: &mut Session, mut recorde
             let is_scan = received.telegram.command() == MEASURED;
             link.publish(&received, Some(recorded.mode), (gap_ns / 1000) as u32);
             link.wake(Wake::Telegram);
-            if is_scan && paced && last_stamp.is_none() {
+            if is_scan && paced && last_ns.is_none() {
                 due += period(session);
                 if rest(link, due) == Woken::Stop {
                     return;
@@ -134,6 +146,11 @@ fn rest(link: &mut LinkThread<'_>, until: Nanos) -> Woken {
             woken => return woken,
         }
     }
+}
+
+/// How long the listeners wait.
+fn gap(from_ns: u64, to_ns: u64) -> Nanos {
+    to_ns.saturating_sub(from_ns).min(LONGEST_GAP)
 }
 
 fn period(session: &Session) -> Nanos {

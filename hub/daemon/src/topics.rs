@@ -4,13 +4,12 @@
 mod outlet;
 
 use lms::session::Received;
-use preprocess::background::Mismatch;
 use schema::ipc::{self, BytesMut, Node, Notifier, WakeService};
 use schema::{Background, Failure, Flags, Foreground, Header, Marks, Quality, Scan, Status, Wake, Zones};
 
 use crate::clock;
-use crate::pipeline::{Outputs, Pipeline};
-use outlet::Outlet;
+use crate::pipeline::{Anew, Outputs, Pipeline};
+use outlet::{Loan, Outlet};
 
 /// The publishing end of one sensor; stays in its link's thread.
 pub(crate) struct Topics {
@@ -25,7 +24,8 @@ pub(crate) struct Topics {
     next_telegram: Option<BytesMut>,
     /// Length of the last telegram.
     last_len: usize,
-    /// Where a scan is decoded for which there is no memory: what is made of it is published all the same.
+    /// Where a scan is decoded that nobody wants, or for which there is no memory: what is made of it is published all the
+    /// same.
     spare_scan: Box<Scan>,
     notifier: Notifier,
     _wake: WakeService,
@@ -65,16 +65,14 @@ impl Topics {
     /// Takes loans for a telegram as long as the last one and for what `pipeline` makes of its scan, which will be there
     /// in a moment.
     pub(crate) fn prepare(&mut self, pipeline: &Pipeline) {
-        if self.next_telegram.is_none() {
+        if self.next_telegram.is_none() && self.telegram.is_wanted() {
             self.next_telegram = self.telegram.publisher.loan_slice_uninit(self.last_len).ok();
         }
         self.telegram.connect();
         self.scan.prepare();
         self.zones.prepare();
-        if self.marks.is_followed() {
-            self.marks.prepare();
-        }
-        if pipeline.keeps_background() && self.foreground.is_followed() {
+        self.marks.prepare();
+        if pipeline.keeps_background() {
             self.foreground.prepare();
         }
         if pipeline.shows_every_scan() {
@@ -97,8 +95,11 @@ impl Topics {
         self.header.flags &= !Flags::STAMP_ESTIMATED;
         self.header.flags |= if received.estimated { Flags::STAMP_ESTIMATED } else { 0 };
         let bytes = received.telegram.bytes();
-        let header = Header { topic_seq: self.telegram.take_number(), ..self.header };
         self.last_len = bytes.len();
+        if !self.telegram.is_wanted() {
+            return self.telegram.skip();
+        }
+        let header = Header { topic_seq: self.telegram.take_number(), ..self.header };
         let prepared = self.next_telegram.take().filter(|loan| loan.payload().len() == bytes.len());
         let Some(loan) = prepared.or_else(|| self.telegram.publisher.loan_slice_uninit(bytes.len()).ok())
         else {
@@ -111,61 +112,46 @@ impl Topics {
     }
 
     /// Publishes a scan of the last telegram, which `fill` writes in place, and what `pipeline` makes of it there. Marks
-    /// and foreground that nobody wants are not made; their numbers are used up. A background that does not fit the scan
-    /// begins anew; then it is told why.
-    pub(crate) fn scan(&mut self, fill: impl FnOnce(&mut Scan), pipeline: &mut Pipeline) -> Option<Mismatch> {
-        let with_marks = self.marks.is_followed();
-        let with_foreground = pipeline.keeps_background() && self.foreground.is_followed();
-        let mut scan = self.scan.loan();
-        let mut zones = self.zones.loan();
-        let mut marks = if with_marks { self.marks.loan() } else { None };
-        let mut foreground = if with_foreground { self.foreground.loan() } else { None };
-        let decoded = match &mut scan {
-            Some(loan) => loan.payload_mut(),
-            None => &mut *self.spare_scan,
-        };
+    /// and foreground that nobody wants are not made. A background that does not fit the scan begins anew; then it is
+    /// told why.
+    pub(crate) fn scan(&mut self, fill: impl FnOnce(&mut Scan), pipeline: &mut Pipeline) -> Option<Anew> {
+        let (mut scan, mut zones, mut marks) = (self.scan.loan(), self.zones.loan(), self.marks.loan());
+        let mut foreground = pipeline.keeps_background().then(|| self.foreground.loan());
+        let decoded = scan.payload_mut().unwrap_or(&mut self.spare_scan);
         fill(decoded);
-        let mismatch = pipeline.update(
+        let anew = pipeline.update(
             decoded,
             Outputs {
-                zones: zones.as_mut().map(|loan| loan.payload_mut()),
-                marks: marks.as_mut().map(|loan| loan.payload_mut()),
-                foreground: foreground.as_mut().map(|loan| loan.payload_mut()),
+                zones: zones.payload_mut(),
+                marks: marks.payload_mut(),
+                foreground: foreground.as_mut().and_then(Loan::payload_mut),
             },
         );
         let header = self.header;
         self.scan.send(scan, &header);
         self.zones.send(zones, &header);
-        match with_marks {
-            true => self.marks.send(marks, &header),
-            false => self.marks.skip(),
-        }
-        match with_foreground {
-            true => self.foreground.send(foreground, &header),
-            false if pipeline.keeps_background() => self.foreground.skip(),
-            false => {}
+        self.marks.send(marks, &header);
+        if let Some(foreground) = foreground {
+            self.foreground.send(foreground, &header);
         }
         if pipeline.shows_every_scan() || pipeline.is_news() {
             self.show(pipeline, &header);
         }
-        mismatch
+        anew
     }
 
     /// Publishes that nothing is known of the zones as of `now`, for scans stay out.
     pub(crate) fn stale(&mut self, pipeline: &mut Pipeline, now: u64) {
         let mut loan = self.zones.loan();
-        match &mut loan {
-            Some(loan) => pipeline.stale(loan.payload_mut()),
-            None => pipeline.stale(&mut Zones::default()),
-        }
-        self.zones.send(loan, &self.header_of(now));
+        pipeline.stale(loan.payload_mut().unwrap_or(&mut Zones::default()));
+        self.zones.send(loan, &of_moment(&self.header, now));
     }
 
     /// Publishes the background as of `now`, if it is one that was not published; whether it was.
     pub(crate) fn background(&mut self, pipeline: &mut Pipeline, now: u64) -> bool {
         let is_news = pipeline.is_news();
         if is_news {
-            self.show(pipeline, &self.header_of(now));
+            self.show(pipeline, &of_moment(&self.header, now));
         }
         is_news
     }
@@ -173,10 +159,10 @@ impl Topics {
     /// Publishes the status as of `now`.
     pub(crate) fn status(&mut self, status: &Status, now: u64) {
         let mut loan = self.status.loan();
-        if let Some(loan) = &mut loan {
-            *loan.payload_mut() = *status;
+        if let Some(payload) = loan.payload_mut() {
+            *payload = *status;
         }
-        self.status.send(loan, &self.header_of(now));
+        self.status.send(loan, &of_moment(&self.header, now));
     }
 
     /// Wakes whoever sleeps; once per telegram, after its last sample.
@@ -215,22 +201,37 @@ impl Topics {
 
     fn show(&mut self, pipeline: &mut Pipeline, header: &Header) {
         let mut loan = self.background.loan();
-        match &mut loan {
-            Some(loan) => pipeline.show(loan.payload_mut()),
-            None => pipeline.show(&mut Background::default()),
-        }
+        pipeline.show(loan.payload_mut().unwrap_or(&mut Background::default()));
         self.background.send(loan, header);
     }
+}
 
-    /// The header of what is said at `now` without a telegram: its number is the last one's.
-    fn header_of(&self, now: u64) -> Header {
-        Header {
-            stamp_first_ns: now,
-            stamp_last_ns: now,
-            wall_ns: clock::wall(now),
-            quality: Quality::Clean as u8,
-            reasons: 0,
-            ..self.header
-        }
+/// The header of what is said at `now` without a telegram: its number is that of `last`, the last one's.
+fn of_moment(last: &Header, now: u64) -> Header {
+    Header {
+        stamp_first_ns: now,
+        stamp_last_ns: now,
+        wall_ns: clock::wall(now),
+        quality: Quality::Clean as u8,
+        reasons: 0,
+        flags: last.flags & !Flags::STAMP_ESTIMATED,
+        ..*last
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_is_said_without_a_telegram_has_nothing_of_its_doubts() {
+        let flags = Flags::SIMULATED | Flags::STAMP_ESTIMATED;
+        let last = Header { seq: 7, period_us: 26_640, quality: 1, reasons: 4, flags, ..Header::default() };
+        let header = of_moment(&last, 5);
+        assert_eq!((header.quality, header.reasons, header.flags), (0, 0, Flags::SIMULATED));
+        assert_eq!(
+            (header.seq, header.period_us, header.stamp_first_ns, header.stamp_last_ns),
+            (7, 26_640, 5, 5)
+        );
     }
 }

@@ -5,7 +5,7 @@ use std::fs;
 use std::path::PathBuf;
 
 use daemon::Config;
-use daemon::config::{Processing, Sources};
+use daemon::config::{Gateway, Processing, Sources};
 use preprocess::background::{Candidate, Method, Start};
 use preprocess::zones::Sector;
 use schema::{Background, Kind, as_json};
@@ -149,6 +149,52 @@ fn what_cannot_be_is_refused_with_place_value_and_remedy() {
 }
 
 #[test]
+fn a_circle_that_the_sensor_cannot_see_is_refused() {
+    let set = |settings: &[&str]| load(&[], settings).map(drop);
+    let refused = |settings: &[&str], words: &str| {
+        let refusal = set(settings).expect_err("must be refused");
+        assert!(refusal.contains(words), "{settings:?}: {refusal}");
+    };
+    assert_eq!(set(&["link.front.zones.min_beams=361"]), Ok(()));
+    refused(
+        &["zones.min_beams=362"],
+        "--set zones.min_beams=362: link front: min_beams = 362, and a scan has 361 beams\n  a few beams",
+    );
+    refused(
+        &["zones.min_beams=300", "link.rear.resolution=1"],
+        "link rear: min_beams = 300, and a scan has 181",
+    );
+    // Two metres ahead it looks away; turned about, it sees the circle. 30 degrees of it: 61 beams.
+    let away = "link.front.pose.x=2";
+    refused(
+        &[away, "link.front.pose.y=0"],
+        "--set link.front.pose.y=0: link front: no beam meets the circle of 1 m\n  correct the sensor's pose, or give it \
+         a circle that it sees: link.front.zones.radii",
+    );
+    assert_eq!(set(&[away, "link.front.zones.radii=[2.5,1]"]), Ok(()));
+    let back = [away, "link.front.pose.yaw=3.1416", "link.front.zones.min_beams=100"];
+    assert_eq!(set(&back), Ok(()));
+    refused(
+        &[&back[..], &["zones.radii=[0.5]"]].concat(),
+        "min_beams = 100, and 57 can see the circle of 0.5 m\n  fewer",
+    );
+    // The farthest reading in mm is 32 m.
+    let far = ["link.front.pose.x=40", "link.front.pose.yaw=3.1416"];
+    assert_eq!(set(&far), Ok(()));
+    refused(&[&far[..], &["link.front.unit=mm"]].concat(), "no beam meets the circle of 1 m");
+    let body = |range: &str| format!("link.rear.zones.self_min=[{{from=0,to=180,range={range}}}]");
+    assert_eq!(set(&[&body("0.99")]), Ok(()));
+    refused(
+        &[&body("1.0")],
+        "link rear: self_min covers every beam up to the circle of 1 m\n  shorten self_min",
+    );
+    let file =
+        Scratch::new("away.toml", "[[link]]\nname = \"a\"\nport = \"x\"\n[link.pose]\nyaw = 0.1\nx = 2\n");
+    let refusal = load(&[&file], &[]).unwrap_err();
+    assert!(refusal.contains("away.toml:6:5: link a: no beam meets the circle of 1 m"), "{refusal}");
+}
+
+#[test]
 fn a_background_begins_with_a_model_of_its_own_sensor() {
     let mut model = Background { count: 361, unit_mm: 1, taught: 1, ..Background::default() };
     model.range_array[7] = 1234;
@@ -172,4 +218,44 @@ fn a_background_begins_with_a_model_of_its_own_sensor() {
     let cut = Scratch::new("cut.json", &text[..900]);
     let refusal = load(&[], &[&format!("link.front.background.start={}", cut.0.display())]).unwrap_err();
     assert!(refusal.contains("cut.json is no background model: it is cut short"), "{refusal}");
+}
+
+#[test]
+fn the_gateway_has_a_section_that_needs_no_links() {
+    let first =
+        Scratch::new("gateway-1.toml", "[gateway]\ninterface = \"eth0\"\nttl = 2\ntopics = [\"a/scan\"]\n");
+    let second = Scratch::new("gateway-2.toml", "[gateway]\nbackground_every = \"10s\"\ntopics = []\n");
+    let gateway = |files: &[&Scratch], set: &[&str]| {
+        let sources = Sources {
+            files: files.iter().map(|file| file.0.clone()).collect(),
+            set: set.iter().map(|flag| (*flag).to_owned()).collect(),
+            links: Vec::new(),
+        };
+        Gateway::load(&sources).map_err(|failure| failure.to_string())
+    };
+    let place = format!("{}:2:20", second.0.display());
+    assert_eq!(
+        gateway(&[&first, &second], &["gateway.ttl=3", "gateway.bare=true"]).unwrap(),
+        Gateway {
+            interface: Some("eth0".into()),
+            topics: Some(Vec::new()),
+            to: None,
+            bare: Some(true),
+            ttl: Some(3),
+            background_every: Some(("10s".into(), place)),
+            mtu: None,
+        }
+    );
+    assert_eq!(gateway(&[], &[]).unwrap(), Gateway::default());
+    // A hub takes the same files.
+    assert_eq!(load(&[&first], &[]).unwrap().links.len(), 2);
+    for (set, said) in [
+        ("gateway.ttl=256", "ttl = 256\n  0 to 255"),
+        ("gateway.mtu=861", "mtu = 861\n  862 to 1472"),
+        ("gateway.mtu=-1", "mtu = -1"),
+        ("gateway.tll=1", "did you mean `ttl`?"),
+    ] {
+        let error = gateway(&[], &[set]).unwrap_err();
+        assert!(error.starts_with(&format!("--set {set}: ")) && error.contains(said), "{error}");
+    }
 }

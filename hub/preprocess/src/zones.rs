@@ -64,10 +64,10 @@ impl Default for Settings<'static> {
 /// Where the design leaves something open:
 /// - until `min_scans` scans were seen since the start, a silence or a change of the sensor's layout, no zone can be
 ///   violated; the verdict is unknown then, because clear would be a guess;
-/// - an empty scan, no circle at all and a pose that is not finite tell nothing: unknown;
-/// - a sensor none of whose beams meets the largest circle sees nothing inside it, ever: clear;
-/// - the invalid are counted among the beams that can tell something: one that the robot's own body covers up to the
-///   largest circle's far side counts neither as invalid nor among all.
+/// - a beam can tell something if there is a reading of it, in the scan's units and below its codes, that lies inside
+///   the largest circle and not in the robot's own body; all others count neither as invalid nor among all;
+/// - where fewer beams can tell something than a violation takes, nothing would ever be violated: unknown. So it is with
+///   an empty scan, no circle at all, a pose that is not finite, and a sensor that looks past the largest circle.
 pub struct Check {
     min_beams: u16,
     min_scans: u16,
@@ -102,7 +102,7 @@ impl Check {
         let invalid = self.table.invalid(ranges);
         let nearest = self.table.nearest(ranges);
         let is_known =
-            self.seen >= self.min_scans && self.table.tells() && invalid <= self.table.most_invalid();
+            self.seen >= self.min_scans && !self.is_blind() && invalid <= self.table.most_invalid();
         let mut beams = [0; ZONES];
         for (zone, beams) in beams.iter_mut().enumerate().take(self.table.circles()) {
             *beams = self.table.inside(zone, ranges);
@@ -122,6 +122,16 @@ impl Check {
         self.forget();
         *out = Zones { count: self.table.circles() as u8, ..Zones::unknown() };
         self.write_circles(&[0; ZONES], out);
+    }
+
+    /// Beams of the last scan's layout that can tell something of the largest circle; none before the first scan.
+    pub fn telling(&self) -> u16 {
+        self.table.telling()
+    }
+
+    /// Fewer beams can tell something than a violation takes: the verdict is always unknown.
+    pub fn is_blind(&self) -> bool {
+        self.telling() < self.min_beams
     }
 
     fn forget(&mut self) {
@@ -273,5 +283,33 @@ mod tests {
             let mut check = Check::new(Pose { x_m, yaw_rad, ..Pose::default() }, &settings);
             assert_eq!(told(&mut check, &scan(&[])).verdict(), Verdict::Unknown);
         }
+    }
+
+    #[test]
+    fn a_circle_that_cannot_be_violated_is_never_clear() {
+        let settings = Settings::default();
+        let of = |pose: Pose, settings: &Settings<'_>, scan: &Scan| {
+            let mut check = Check::new(pose, settings);
+            (told(&mut check, scan).verdict(), check.telling(), check.is_blind())
+        };
+        let whole = Pose::default();
+        let most = Settings { min_beams: 100, ..settings };
+        assert_eq!(of(whole, &most, &scan(&[])), (Verdict::Clear, 100, false));
+        let more = Settings { min_beams: 101, ..settings };
+        assert_eq!(of(whole, &more, &scan(&[(7, 0)])), (Verdict::Unknown, 100, true));
+        let body = [Sector { from_mdeg: 0, to_mdeg: 18_000, range_mm: 1000 }];
+        let masked = Settings { self_min: &body, ..most };
+        assert_eq!(of(whole, &masked, &scan(&[])), (Verdict::Unknown, 89, true));
+        let all = [Sector { to_mdeg: 180_000, ..body[0] }];
+        assert_eq!(of(whole, &Settings { self_min: &all, ..settings }, &scan(&[])).0, Verdict::Unknown);
+        // 2 m ahead of the centre it looks away from the circle; turned about, into it.
+        let away = Pose { x_m: 2.0, ..Pose::default() };
+        assert_eq!(of(away, &settings, &scan(&[])), (Verdict::Unknown, 0, true));
+        let back = Pose { yaw_rad: std::f64::consts::PI, ..away };
+        assert_eq!(of(back, &settings, &scan(&[])).0, Verdict::Clear);
+        // So far away that 13 bits of mm do not reach it; those of cm do.
+        let far = Pose { x_m: 9.2, ..back };
+        assert_eq!(of(far, &settings, &scan(&[])), (Verdict::Unknown, 0, true));
+        assert_eq!(of(far, &settings, &Scan { unit_mm: 10, ..scan(&[]) }).0, Verdict::Clear);
     }
 }

@@ -86,7 +86,7 @@ fn marks_are_those_of_the_definition() {
             max_range_step_mm: [0, 50, 100, 1000][random.usize(..4)],
             max_gap: [0, 0, 1, 5][random.usize(..4)],
         };
-        let unit_mm = [1, 10][random.usize(..2)];
+        let unit_mm = [1, 10, 100][random.usize(..3)];
         let mut scan = scans::layout(&mut random, unit_mm);
         fill(&mut random, &mut scan);
         let mut out: Marks = bytemuck::pod_read_unaligned(&[0xA5; size_of::<Marks>()]);

@@ -5,7 +5,9 @@ mod surroundings;
 
 use preprocess::background::{Class, Method, Model, Settings, Start};
 use schema::{Background, Foreground, Scan};
-use surroundings::{Shape, Surroundings, any_choice, any_model, foreground, ranges_mm, reading_mm};
+use surroundings::{
+    Shape, Surroundings, any_choice, any_model, apart_at_most_mm, foreground, ranges_mm, reading_mm,
+};
 
 /// A surface as a beam remembers it.
 #[derive(Clone, Copy, Debug)]
@@ -69,9 +71,7 @@ impl Slow {
     fn update(&mut self, scan: &Scan) -> Vec<Class> {
         let unit_mm = f64::from(scan.unit_mm);
         let far = self.settings.no_return_is_far.unwrap_or(true);
-        let threshold =
-            self.settings.threshold_mm.map_or(if scan.unit_mm == 10 { 60.0 } else { 30.0 }, f64::from);
-        let threshold = (threshold / unit_mm).floor();
+        let threshold = (apart_at_most_mm(self.settings.threshold_mm, scan) / unit_mm).floor();
         let scans = (750.0 * f64::from(scan.step_mdeg) / 1000.0).ceil();
         let scans = self.settings.scans.map_or(scans, f64::from);
         self.scans = scans;

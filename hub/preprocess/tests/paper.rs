@@ -5,7 +5,9 @@ mod surroundings;
 
 use preprocess::background::{Candidate, Class, Method, Model, Settings, Start};
 use schema::{Background, Foreground, Scan};
-use surroundings::{Shape, Surroundings, any_choice, any_model, foreground, ranges_mm, reading_mm};
+use surroundings::{
+    Shape, Surroundings, any_choice, any_model, apart_at_most_mm, foreground, ranges_mm, reading_mm,
+};
 
 /// One beam as the paper has it.
 #[derive(Clone, Default)]
@@ -45,9 +47,8 @@ impl Slow {
 
     fn update(&mut self, scan: &Scan) -> Vec<Class> {
         let far = self.settings.no_return_is_far.unwrap_or(false);
-        let default_mm = if scan.unit_mm == 10 { 60 } else { 30 };
-        let threshold_mm = f64::from(self.settings.threshold_mm.unwrap_or(default_mm));
-        let candidate_mm = f64::from(self.settings.candidate_mm.unwrap_or(default_mm));
+        let threshold_mm = apart_at_most_mm(self.settings.threshold_mm, scan);
+        let candidate_mm = apart_at_most_mm(self.settings.candidate_mm, scan);
         let ten_seconds = (10.0 * 75.0 * f64::from(scan.step_mdeg) / 1000.0).ceil();
         let scans = self.settings.scans.map_or(ten_seconds, f64::from);
         let classes = self

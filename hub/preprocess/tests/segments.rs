@@ -35,7 +35,7 @@ fn segments_are_those_of_the_formula() {
     let mut most = 0;
     for round in 0..3_000 {
         let step_mdeg = [250, 500, 1000][random.usize(..3)];
-        let unit_mm = [1, 10][random.usize(..2)];
+        let unit_mm = [1, 10, 100][random.usize(..3)];
         let scan = Scan {
             count: 361,
             unit_mm,

@@ -78,6 +78,15 @@ impl Case {
         range >= own && range < hi && (!self.settings.exact || lo == 0.0 || range > lo)
     }
 
+    /// There is a reading of the scan's kind that would be inside the largest circle: the shortest one beyond the robot's
+    /// own body and the circle's near side, if any.
+    fn tells(&self, scan: &Scan, u: [f64; 2], own: f64) -> bool {
+        let (unit, radius) = (f64::from(scan.unit_mm), f64::from(self.radii[0]));
+        let shortest = (own.max(self.chord(u, radius).0) / unit).floor();
+        let values = [shortest, shortest + 1.0].into_iter().filter(|value| *value < f64::from(max(scan) - 8));
+        values.into_iter().any(|value| self.violates(u, own, value * unit, radius))
+    }
+
     /// How far the part of a beam that counts as met by this reading stays from the centre: the point itself, so much
     /// to and fro as the margin allows, and what comes behind it if that counts.
     fn distance(&self, u: [f64; 2], range: f64) -> f64 {
@@ -90,7 +99,7 @@ impl Case {
 
     /// Readings, many of them about the circles and the robot's own body.
     fn fill(&self, random: &mut Rng, scan: &mut Scan) {
-        let max = (1 << scan.range_bits) - 1;
+        let max = max(scan);
         let crowded = random.bool();
         let broken = [0, 0, 20, 100][random.usize(..4)];
         for i in 0..usize::from(scan.count) {
@@ -109,6 +118,11 @@ impl Case {
     }
 }
 
+/// The greatest value of a range.
+fn max(scan: &Scan) -> u16 {
+    (1 << scan.range_bits) - 1
+}
+
 /// What a beam tells, from its word: a range in mm, that nothing is near, or nothing.
 enum Told {
     Range(f64),
@@ -117,7 +131,7 @@ enum Told {
 }
 
 fn told(scan: &Scan, i: usize, no_return_is_far: bool) -> Told {
-    match (1 << scan.range_bits) - 1 - i32::from(scan.range_array[i]) {
+    match max(scan) - scan.range_array[i] {
         8 => Told::Far,
         0 if no_return_is_far => Told::Far,
         0..8 => Told::Nothing,
@@ -134,7 +148,7 @@ fn compare(case: &Case, scan: &Scan, out: &Zones) -> Tally {
     let mut nearest: Option<(f64, usize)> = None;
     for i in 0..usize::from(scan.count) {
         let (u, own) = case.beam(scan, i);
-        let tells = case.chord(u, f64::from(case.radii[0])).1 > own;
+        let tells = case.tells(scan, u, own);
         telling += u16::from(tells);
         let range = match told(scan, i, case.settings.no_return_is_far) {
             Told::Range(range) => range,
@@ -165,7 +179,8 @@ fn compare(case: &Case, scan: &Scan, out: &Zones) -> Tally {
         tally.close += u32::from(surely != perhaps);
     }
     assert_eq!(out.invalid_beams, invalid);
-    tally.unknown = f64::from(invalid) > case.settings.max_invalid * f64::from(telling) + 1e-9;
+    tally.blind = telling < case.settings.min_beams;
+    tally.unknown = tally.blind || f64::from(invalid) > case.settings.max_invalid * f64::from(telling) + 1e-9;
     match (nearest, out.nearest()) {
         (None, None) => {}
         (Some((distance, i)), Some((beam, said))) => {
@@ -187,19 +202,21 @@ struct Tally {
     sure: u32,
     close: u32,
     unknown: bool,
+    /// A violation takes more beams than can tell something.
+    blind: bool,
 }
 
 #[test]
 fn zones_are_those_of_the_formula_and_of_geometry() {
     let mut random = Rng::with_seed(1);
     let mut verdicts = [0; 4];
-    let (mut sure, mut close) = (0, 0);
+    let (mut sure, mut close, mut blind) = (0, 0, 0);
     for _ in 0..CASES {
         let case = Case::new(&mut random);
         let mut check = case.check();
         let mut out = dirty();
         // Another unit is another layout, and all begins anew.
-        for unit_mm in [1, 10] {
+        for unit_mm in [1, 10, 100] {
             let mut scan = scans::layout(&mut random, unit_mm);
             let mut streaks = vec![0; case.radii.len()];
             for seen in 1..=SCANS {
@@ -207,6 +224,7 @@ fn zones_are_those_of_the_formula_and_of_geometry() {
                 check.update(&scan, &mut out);
                 let tally = compare(&case, &scan, &out);
                 (sure, close) = (sure + tally.sure, close + tally.close);
+                blind += u32::from(tally.blind);
                 for (streak, zone) in streaks.iter_mut().zip(out.zones()) {
                     *streak = if zone.beams >= case.settings.min_beams { *streak + 1 } else { 0 };
                     assert_eq!(zone.violated == 1, *streak >= case.settings.min_scans);
@@ -226,9 +244,11 @@ fn zones_are_those_of_the_formula_and_of_geometry() {
             }
         }
     }
-    println!("clear, slow, stop, unknown: {verdicts:?}; circles {sure} sure, {close} within 1 mm");
+    println!(
+        "clear, slow, stop, unknown: {verdicts:?}; circles {sure} sure, {close} within 1 mm; blind {blind}"
+    );
     assert!(verdicts.iter().all(|&verdicts| verdicts > CASES / 10), "{verdicts:?}");
-    assert!(close > 1000 && sure > 10_000, "{close} {sure}");
+    assert!(close > 1000 && sure > 10_000 && blind > 100, "{close} {sure} {blind}");
 }
 
 #[test]

@@ -48,7 +48,8 @@ pub struct SimulateOptions {
     pub looped: bool,
     /// How many times faster than the clock the sensor's time runs, the bit time too; 0.01 to 100.
     pub speed: f64,
-    /// Seed of worlds, delays and faults; each port adds its number.
+    /// Seed of worlds, delays and faults. For its delays and faults each port adds its number, for worlds see
+    /// [`Room::of_port`](crate::room::Room::of_port).
     pub seed: u64,
     /// What goes wrong on the line.
     pub faults: Faults,

@@ -34,7 +34,7 @@ pub(crate) enum Way {
 pub(crate) enum Speed {
     /// Millimetres per second, drawn by the seed between two bounds.
     Between(f64, f64),
-    /// So that the end of the path is reached when the person has to be gone.
+    /// So that the end of the path is reached when the person has to be gone, which is after all rests.
     InTime,
 }
 
@@ -85,14 +85,17 @@ impl Person {
                 let length: f64 = corners.windows(2).map(|pair| distance(pair[0].0, pair[1].0)).sum();
                 let speed = match *speed {
                     Speed::Between(slowest, fastest) => slowest + (fastest - slowest) * random.f64(),
-                    Speed::InTime => length / (until_s - from_s - rest_s).max(0.1),
+                    Speed::InTime => length / (until_s - from_s - rest_s),
                 };
-                Course::Path(course(&corners, from_s, until_s, speed))
+                Course::Path(course(&corners, from_s, speed))
             }
         };
-        let until_s = match &course {
-            Course::Path(knots) => knots.last().map_or(until_s, |knot| knot.0),
-            Course::Roam { .. } => until_s,
+        // Who has to be in time is; who has a speed is gone at the end of the way.
+        let until_s = match (&plan.way, &course) {
+            (Way::Path { speed: Speed::Between(..), .. }, Course::Path(knots)) => {
+                knots.last().map_or(until_s, |knot| knot.0)
+            }
+            _ => until_s,
         };
         Person { from_s, until_s, leg_mm, phase, course }
     }
@@ -128,7 +131,7 @@ impl Course {
             Course::Path(knots) => {
                 let next = knots.partition_point(|knot| knot.0 <= time_s).clamp(1, knots.len() - 1);
                 let ((t0, a, s0), (t1, b, s1)) = (knots[next - 1], knots[next]);
-                let share = if t1 > t0 && t1.is_finite() { (time_s - t0) / (t1 - t0) } else { 0.0 };
+                let share = if t1 > t0 { ((time_s - t0) / (t1 - t0)).min(1.0) } else { 1.0 };
                 // Whoever rests looks where the way goes on, and at its end where it came from.
                 let mut legs = knots[next - 1..].windows(2).chain(knots.windows(2).rev());
                 let ahead = legs.find(|pair| pair[0].1 != pair[1].1);
@@ -144,9 +147,8 @@ impl Course {
     }
 }
 
-/// When somebody who starts at `from_s` is at which corner, before and after the rest there; one corner alone is held
-/// until `until_s`.
-fn course(corners: &[(Point, f64)], from_s: f64, until_s: f64, speed: f64) -> Vec<(f64, Point, f64)> {
+/// When somebody who starts at `from_s` is at which corner, before and after the rest there.
+fn course(corners: &[(Point, f64)], from_s: f64, speed: f64) -> Vec<(f64, Point, f64)> {
     let (mut time_s, mut walked) = (from_s, 0.0);
     let mut before = corners[0].0;
     let mut knots = Vec::new();
@@ -158,9 +160,6 @@ fn course(corners: &[(Point, f64)], from_s: f64, until_s: f64, speed: f64) -> Ve
         time_s += rest_s;
         knots.push((time_s, point, walked));
         before = point;
-    }
-    if let ([_], [_, last]) = (corners, &mut knots[..]) {
-        last.0 = until_s;
     }
     knots
 }
@@ -250,6 +249,11 @@ mod tests {
         let corners = vec![((0.0, 0.0), 1.0), ((0.0, 2000.0), 0.0)];
         let walks = person(Way::Path { corners, speed: Speed::InTime }, 2.0, 7.0);
         assert!(distance(body(&walks, 5.0), (0.0, 1000.0)) < 1.0);
-        assert!(walks.legs(6.99).is_some() && walks.legs(7.01).is_none());
+        assert!(walks.legs(6.99).is_some() && walks.legs(7.0).is_none());
+        // No way at all is in time as well.
+        let corners = vec![((5.0, 7.0), 1.0), ((5.0, 7.0), 0.0)];
+        let waits = person(Way::Path { corners, speed: Speed::InTime }, 2.0, 7.0);
+        assert_eq!((waits.legs(2.0), waits.legs(7.0)), (waits.legs(6.99), None));
+        assert_eq!(body(&waits, 6.99), (5.0, 7.0));
     }
 }

@@ -35,7 +35,7 @@ pub(crate) struct Thing {
     pub(crate) surface: Surface,
     pub(crate) from_s: f64,
     pub(crate) until_s: f64,
-    /// In the order of time; each is over before the next begins.
+    /// In the order of time, while the thing is there; each is over before the next begins.
     pub(crate) moves: Vec<Move>,
     /// The most by which the seed moves it.
     pub(crate) jitter_mm: f64,
@@ -85,10 +85,9 @@ impl Thing {
 
     /// Where it stood before `time_s` and does not stand any more.
     pub(crate) fn left(&self, time_s: f64) -> Vec<Spell> {
-        let end_s = self.until_s.min(time_s);
         let mut left = Vec::new();
         let mut pose = self.pose;
-        for way in self.moves.iter().filter(|way| way.from_s <= end_s && self.from_s <= end_s) {
+        for way in self.moves.iter().filter(|way| way.from_s <= time_s) {
             left.push(Spell { pose, since_s: way.until_s.min(time_s) });
             pose = moved(pose, way, time_s);
         }

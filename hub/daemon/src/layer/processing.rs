@@ -1,7 +1,7 @@
 //! The keys of sections pose, zones, marks and background, and which values they may have. Metres, radians and degrees
 //! become what the processors count in. Each value is checked where it stands; it refuses to know which source wins.
 
-use std::ops::RangeInclusive;
+use std::ops::{Range, RangeInclusive};
 
 use preprocess::background::{Candidate, Method, Start};
 use preprocess::zones::{SECTORS, Sector};
@@ -134,6 +134,22 @@ impl Sections {
             layer.lay(origin, &mut processing.background)?;
         }
         Ok(())
+    }
+
+    /// Where the sensor's place is said, if it is.
+    pub(super) fn pose(&self) -> Option<Range<usize>> {
+        let PoseLayer { x, y, yaw, .. } = self.pose.as_ref()?;
+        [x, y, yaw].into_iter().flatten().map(Spanned::span).next()
+    }
+
+    /// Where the robot's own body is said, if it is.
+    pub(super) fn self_min(&self) -> Option<Range<usize>> {
+        self.zones.as_ref()?.self_min.as_ref().map(Spanned::span)
+    }
+
+    /// Where it is said how many beams violate a circle, if it is.
+    pub(super) fn min_beams(&self) -> Option<Range<usize>> {
+        self.zones.as_ref()?.min_beams.as_ref().map(Spanned::span)
     }
 }
 

@@ -1,10 +1,14 @@
 //! The publishing end of one topic: numbers its samples, has a loan ready before it is needed, knows whether anybody is
 //! there. Refuses to know what is in a sample.
+//!
+//! What a topic does not keep for late joiners is not sent while nobody is attached; its number is used up. Sending looks
+//! at the places of all consumers that there may be, and no processor has them at hand after a pause.
 
 use schema::ipc::{
     Node, Payload, PortFactory, Publisher, SampleMut, SendError, TopicService, UpdateConnections,
     ZeroCopySend,
 };
+use schema::limits::history;
 use schema::{Failure, Header};
 
 /// One topic of one sensor.
@@ -49,9 +53,9 @@ impl<P: Payload + ?Sized> Outlet<P> {
         }
     }
 
-    /// Whether anybody is attached.
-    pub(super) fn is_followed(&self) -> bool {
-        self.subscribers() > 0
+    /// Whether a sample is made at all: somebody is attached, or whoever comes will want it.
+    pub(super) fn is_wanted(&self) -> bool {
+        history(P::TOPIC) > 0 || self.subscribers() > 0
     }
 
     /// Consumers that are attached and did not get the last sample.
@@ -74,26 +78,51 @@ impl<P: Payload + ?Sized> Outlet<P> {
 impl<P: Payload + ZeroCopySend + Default> Outlet<P> {
     /// Takes a loan for the sample that will be there in a moment, and connects who came.
     pub(super) fn prepare(&mut self) {
-        if self.prepared.is_none() {
+        if self.prepared.is_none() && self.is_wanted() {
             self.prepared = self.publisher.loan().ok();
         }
         // Now, not while the telegram waits; and what sending looks at is near the processor.
         self.connect();
     }
 
-    /// A sample to write; nothing if there is no memory for it.
-    pub(super) fn loan(&mut self) -> Option<SampleMut<P>> {
-        self.prepared.take().or_else(|| self.publisher.loan().ok())
+    /// The next sample.
+    pub(super) fn loan(&mut self) -> Loan<P> {
+        if !self.is_wanted() {
+            return Loan::Unwanted;
+        }
+        self.prepared.take().or_else(|| self.publisher.loan().ok()).map_or(Loan::Lacking, Loan::Taken)
     }
 
-    /// Sends what [`loan`](Self::loan) gave, under its number.
-    pub(super) fn send(&mut self, loan: Option<SampleMut<P>>, header: &Header) {
+    /// Ends the sample that [`loan`](Self::loan) began, under its number.
+    pub(super) fn send(&mut self, loan: Loan<P>, header: &Header) {
         let topic_seq = self.take_number();
-        let Some(mut sample) = loan else {
-            self.failed += 1;
-            return;
-        };
-        *sample.user_header_mut() = Header { topic_seq, ..*header };
-        self.note(sample.send());
+        match loan {
+            Loan::Taken(mut sample) => {
+                *sample.user_header_mut() = Header { topic_seq, ..*header };
+                self.note(sample.send());
+            }
+            Loan::Lacking => self.failed += 1,
+            Loan::Unwanted => self.reached = 0,
+        }
+    }
+}
+
+/// A sample in the making.
+pub(super) enum Loan<P: Payload> {
+    /// It is written in place.
+    Taken(SampleMut<P>),
+    /// There is no memory for it.
+    Lacking,
+    /// Nobody would get it.
+    Unwanted,
+}
+
+impl<P: Payload + ZeroCopySend> Loan<P> {
+    /// Where to write it, if anywhere.
+    pub(super) fn payload_mut(&mut self) -> Option<&mut P> {
+        match self {
+            Loan::Taken(sample) => Some(sample.payload_mut()),
+            Loan::Lacking | Loan::Unwanted => None,
+        }
     }
 }

@@ -8,9 +8,10 @@ use schema::Scan;
 pub struct Settings {
     /// By which method.
     pub method: Method,
-    /// Readings at most so far apart, in mm, are of one surface. None: 30, in cm mode 60.
+    /// Readings at most so far apart, in mm, are of one surface; one unit of the sensor's at least. None: 30, in cm mode
+    /// 60, in dm mode 100.
     pub threshold_mm: Option<u16>,
-    /// The same for a reading and its candidate (`paper`). None: 30, in cm mode 60.
+    /// The same for a reading and its candidate (`paper`).
     pub candidate_mm: Option<u16>,
     /// Scans until a surface is background. None: 375 at half degrees, 750 at 1, 188 at a quarter, which are 10 s at
     /// the full rate; `multi` knows a surface well enough after
@@ -76,6 +77,8 @@ pub(super) struct Limits {
 const THRESHOLD_MM: u16 = 30;
 /// In cm mode: quantisation comes on top.
 const THRESHOLD_CM_MODE_MM: u16 = 60;
+/// In dm mode: what lies 30 mm apart is read as at most one unit apart.
+const THRESHOLD_DM_MODE_MM: u16 = 100;
 /// Mirror turns in 10 s (75 Hz): as many scans at 1 degree, half of them at half degrees.
 const TURNS: u32 = 750;
 /// What the weights of `multi` have room for: eight a scan in 16 bits.
@@ -86,8 +89,13 @@ const FARTHEST: u16 = 0x7FFF;
 impl Limits {
     pub(super) fn of(settings: &Settings, scan: &Scan) -> Limits {
         let unit_mm = u16::from(scan.unit_mm.max(1));
-        let default_mm = if unit_mm >= 10 { THRESHOLD_CM_MODE_MM } else { THRESHOLD_MM };
-        let units = |mm: Option<u16>| (mm.unwrap_or(default_mm) / unit_mm).min(FARTHEST);
+        let default_mm = match unit_mm {
+            ..10 => THRESHOLD_MM,
+            10..100 => THRESHOLD_CM_MODE_MM,
+            100.. => THRESHOLD_DM_MODE_MM,
+        };
+        // With less than a unit a reading between two of them would be of no surface.
+        let units = |mm: Option<u16>| (mm.unwrap_or(default_mm) / unit_mm).clamp(1, FARTHEST);
         let ten_seconds = (TURNS * u32::from(scan.step_mdeg)).div_ceil(1000);
         Limits {
             threshold: units(settings.threshold_mm),
@@ -115,9 +123,11 @@ mod tests {
         assert_eq!(limits(paper, 1, 500), (30, 30, 375));
         assert_eq!(limits(paper, 10, 1000), (6, 6, 750));
         assert_eq!(limits(paper, 1, 250), (30, 30, 188));
+        assert_eq!(limits(paper, 100, 500), (1, 1, 375));
         let own = Settings { threshold_mm: Some(45), candidate_mm: Some(u16::MAX), scans: Some(0), ..paper };
         assert_eq!(limits(own, 10, 500), (4, 6553, 1));
         assert_eq!(limits(own, 0, 0), (45, FARTHEST, 1));
+        assert_eq!(limits(own, 100, 500), (1, 655, 1), "less than a unit is one");
         assert_eq!(limits(Settings { scans: Some(u32::MAX), ..paper }, 1, 500).2, 8191);
     }
 }

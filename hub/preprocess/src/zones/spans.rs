@@ -29,6 +29,11 @@ impl Spans {
         value.wrapping_sub(self.from[i]) < self.len[i]
     }
 
+    /// There is a value of beam `i` that counts.
+    pub(super) fn has_any(&self, i: usize) -> bool {
+        self.len[i] > 0
+    }
+
     /// Beams whose value counts.
     pub(super) fn count(&self, ranges: &Ranges) -> u16 {
         (0..BEAMS).map(|i| u16::from(self.has(i, ranges[i]))).sum()

@@ -49,8 +49,10 @@ pub(super) struct Table {
     /// Valid readings inside each circle, beyond the robot's own body.
     inside: [Spans; ZONES],
     nearest: Nearest,
-    /// 1 for beams that can tell something of the largest circle.
-    telling: [u16; BEAMS],
+    /// 1 for beams of which a reading may lie inside the largest circle.
+    tells: [u16; BEAMS],
+    /// How many these are.
+    telling: u16,
     most_invalid: u16,
     /// The first value that is a code.
     codes_from: u16,
@@ -79,7 +81,8 @@ impl Table {
             layout: Layout::default(),
             inside: [Spans::NONE; ZONES],
             nearest: Nearest::NONE,
-            telling: [0; BEAMS],
+            tells: [0; BEAMS],
+            telling: 0,
             most_invalid: 0,
             codes_from: 0,
             max: 0,
@@ -111,21 +114,20 @@ impl Table {
         self.codes_from = self.max.saturating_sub(Code::BEYOND.0);
         self.inside = [Spans::NONE; ZONES];
         self.nearest = Nearest::NONE;
-        self.telling = [0; BEAMS];
+        self.tells = [0; BEAMS];
         for i in 0..scan.beams() {
             self.make_beam(i, scan.angle_mdeg(i));
         }
         self.nearest.finish();
-        let telling: u16 = self.telling.iter().sum();
-        self.most_invalid = floor(self.max_invalid * f64::from(telling)) as u16;
+        self.telling = self.tells.iter().sum();
+        self.most_invalid = floor(self.max_invalid * f64::from(self.telling)) as u16;
     }
 
     fn make_beam(&mut self, i: usize, angle_mdeg: i32) {
         let unit_mm = self.layout.unit_mm();
         let ((sx, sy), (ux, uy)) = (self.sensor_mm(), self.pose.direction(angle_mdeg));
         let (q, square) = (sx * ux + sy * uy, sx * sx + sy * sy);
-        let self_min_mm = self.self_min_mm(angle_mdeg);
-        let own = self_min_mm.div_ceil(unit_mm);
+        let own = self.self_min_mm(angle_mdeg).div_ceil(unit_mm);
         self.nearest.seen.set(i, own, self.codes_from);
         self.nearest.twice_q[i] = 2.0 * q / unit_mm as f64;
         for zone in 0..self.circles {
@@ -134,15 +136,14 @@ impl Table {
             let below = hi_mm.div_ceil(unit_mm).min(u64::from(self.codes_from));
             self.inside[zone].set(i, from.max(own), below as u16);
             if zone == 0 {
-                self.telling[i] = u16::from(hi_mm > self_min_mm);
+                self.tells[i] = u16::from(self.inside[zone].has_any(i));
             }
         }
     }
 
-    /// A scan of this layout tells anything at all.
-    pub(super) fn tells(&self) -> bool {
-        let Pose { x_m, y_m, yaw_rad, .. } = self.pose;
-        self.layout.count > 0 && (x_m + y_m + yaw_rad).is_finite()
+    /// Beams that can tell something of the largest circle.
+    pub(super) fn telling(&self) -> u16 {
+        self.telling
     }
 
     /// Beams that met something inside circle `zone`.
@@ -163,7 +164,7 @@ impl Table {
             let is_no_return = self.no_return_is_far & (value == self.max);
             (value >= self.codes_from) & !is_beyond & !is_no_return
         };
-        (0..BEAMS).map(|i| u16::from(is_invalid(ranges[i])) & self.telling[i]).sum()
+        (0..BEAMS).map(|i| u16::from(is_invalid(ranges[i])) & self.tells[i]).sum()
     }
 
     /// The beam whose point is nearest to the robot's centre, the first of several, and its distance in mm, rounded

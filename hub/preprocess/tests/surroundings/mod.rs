@@ -21,7 +21,7 @@ impl Shape {
         let (count, first_angle_mdeg, step_mdeg) =
             [(181, 0, 1000), (361, 0, 500), (101, 40_000, 1000), (201, 40_000, 500), (401, 40_000, 250)]
                 [random.usize(..5)];
-        let (unit_mm, range_bits) = (*random.choice(&[1, 10]).unwrap(), random.u8(13..=15));
+        let (unit_mm, range_bits) = (*random.choice(&[1, 10, 100]).unwrap(), random.u8(13..=15));
         Shape { count, first_angle_mdeg, step_mdeg, unit_mm, range_bits }
     }
 }
@@ -137,6 +137,16 @@ pub(crate) fn foreground(scan: &Scan, classes: &[Class], like: &Foreground) -> F
     }
     expected.beams = beams.len() as u16;
     expected
+}
+
+/// How far apart readings of one surface may be: as it is set, else by the unit, and never less than the unit.
+pub(crate) fn apart_at_most_mm(set_mm: Option<u16>, scan: &Scan) -> f64 {
+    let default_mm = match scan.unit_mm {
+        1 => 30,
+        10 => 60,
+        _ => 100,
+    };
+    f64::from(set_mm.unwrap_or(default_mm)).max(f64::from(scan.unit_mm))
 }
 
 /// Yes, no, or whatever is the default.

@@ -153,11 +153,15 @@ impl ThingFile {
         let mut moves: Vec<Move> = Vec::new();
         for file in &self.moves {
             let (start_s, end_s) = (*file.from_s.get_ref(), *file.until_s.get_ref());
-            let earliest_s = moves.last().map_or(0.0, |way| way.until_s);
+            let earliest_s = moves.last().map_or(from_s, |way| way.until_s);
             if !(earliest_s <= start_s && start_s <= end_s) {
                 let what = format!("a move from {start_s} s until {end_s} s, after {earliest_s} s");
-                let remedy = "moves one after the other, each with from_s <= until_s";
+                let remedy = "moves one after the other once it is put down, each with from_s <= until_s";
                 return Err(origin.refuse(file.from_s.span(), what, remedy));
+            }
+            if end_s > until_s {
+                let what = format!("a move until {end_s} s of what is taken away at {until_s} s");
+                return Err(origin.refuse(file.until_s.span(), what, "moves while it is there"));
             }
             moves.push(Move { from_s: start_s, until_s: end_s, by: pose(origin, &file.by)? });
         }
@@ -201,7 +205,7 @@ impl PersonFile {
     fn plan(&self, span: Range<usize>, origin: &Origin) -> Result<Plan, Failure> {
         let (from_s, until_s) = origin.interval(&self.from_s, &self.until_s)?;
         Ok(Plan {
-            way: self.way(span, origin, until_s)?,
+            way: self.way(span, origin, from_s, until_s)?,
             from_s,
             until_s,
             jitter_mm: origin.number(&self.jitter_mm, 0.0, 0.0..=10_000.0)?,
@@ -209,7 +213,7 @@ impl PersonFile {
         })
     }
 
-    fn way(&self, span: Range<usize>, origin: &Origin, until_s: f64) -> Result<Way, Failure> {
+    fn way(&self, span: Range<usize>, origin: &Origin, from_s: f64, until_s: f64) -> Result<Way, Failure> {
         let (path, speed) = match (&self.path, self.centre, self.reach, &self.speed_mm_s) {
             (None, Some(centre), Some(reach), None) => {
                 return Ok(Way::Roam { centre: point(centre), reach: (reach.0.0, reach.1.0) });
@@ -230,6 +234,11 @@ impl PersonFile {
             let remedy = "path = [[x, y], [x, y, seconds of rest], ..] in millimetres";
             return Err(origin.refuse(path.span(), "a path that is none", remedy));
         };
+        let rest_s: f64 = corners.iter().map(|corner| corner.1).sum();
+        if corners.len() > 1 && rest_s >= until_s - from_s {
+            let what = format!("{rest_s} s of rest from {from_s} s until {until_s} s");
+            return Err(origin.refuse(path.span(), what, "rests that leave time to walk"));
+        }
         let speed = match (speed, corners.len()) {
             (None, 1) => Speed::InTime,
             (None, _) if until_s.is_finite() => Speed::InTime,

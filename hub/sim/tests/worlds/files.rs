@@ -118,9 +118,24 @@ fn what_is_no_world_is_refused_by_name_place_and_remedy() {
             "w.toml:3:21: a move",
             "from_s <= until_s",
         ),
+        (
+            "[[thing]]\nradius_mm = 10\nfrom_s = 3\nmoves = [{ from_s = 2, until_s = 4, by = [1, 1] }]",
+            "w.toml:4:21: a move from 2 s until 4 s, after 3 s",
+            "once it is put down",
+        ),
+        (
+            "[[thing]]\nradius_mm = 10\nuntil_s = 3\nmoves = [{ from_s = 2, until_s = 4, by = [1, 1] }]",
+            "w.toml:4:34: a move until 4 s of what is taken away at 3 s",
+            "while it is there",
+        ),
         ("\n[[person]]\nfrom_s = 3", "w.toml:2:1: a person without a way", "path = "),
         ("[[person]]\npath = []\nuntil_s = 3", "w.toml:2:8: a path that is none", "[x, y, seconds of rest]"),
         ("[[person]]\npath = [[0, 0], [1, 1]]", "w.toml:2:8: nothing says when", "speed_mm_s or until_s"),
+        (
+            "[[person]]\npath = [[0, 0, 2], [1, 1, 3]]\nfrom_s = 1\nuntil_s = 6",
+            "w.toml:2:8: 5 s of rest from 1 s until 6 s",
+            "time to walk",
+        ),
         (
             "[[person]]\npath = [[0, 0], [1, 1]]\nspeed_mm_s = [9, 1]",
             "w.toml:3:14: speed",

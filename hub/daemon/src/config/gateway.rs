@@ -1,0 +1,40 @@
+//! Section `gateway` over all sources. Refuses to know what a gateway is: who makes one reads what only it understands.
+
+use schema::Failure;
+
+use super::Sources;
+
+/// What is said of the gateway; what is not said is nothing.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub struct Gateway {
+    /// Name of the network interface.
+    pub interface: Option<String>,
+    /// `SENSOR/TOPIC` or `*/TOPIC`, possibly with `:every=N`.
+    pub topics: Option<Vec<String>>,
+    /// `HOST:PORT` of those that get copies.
+    pub to: Option<Vec<String>>,
+    /// Telegrams and nothing else, without a header.
+    pub bare: Option<bool>,
+    /// How many routers pass a datagram on.
+    pub ttl: Option<u8>,
+    /// A duration, and where it is said.
+    pub background_every: Option<(String, String)>,
+    /// The longest datagram in bytes.
+    pub mtu: Option<usize>,
+}
+
+impl Gateway {
+    /// Reads the section in all sources, the last one wins. Links need not be there.
+    ///
+    /// [`schema::Kind::Configuration`] with place, value and remedy.
+    pub fn load(sources: &Sources) -> Result<Gateway, Failure> {
+        let mut gateway = Gateway::default();
+        for layer in sources.files().chain(sources.settings()) {
+            let (origin, layer) = layer?;
+            if let Some(section) = layer.gateway {
+                section.lay(&origin, &mut gateway)?;
+            }
+        }
+        Ok(gateway)
+    }
+}
