@@ -1,9 +1,9 @@
 //! From shared memory to an application behind the loopback, beside an eventfd and a datagram of the same length.
 
 use std::sync::Arc;
-use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::thread::{self, JoinHandle};
-use std::time::{Duration, Instant, SystemTime};
+use std::time::{Duration, SystemTime};
 
 use rustix::event::{EventfdFlags, eventfd};
 use schema::Topic;
@@ -11,7 +11,7 @@ use schema::datagram::{Datagram, HEAD, Packed};
 
 use crate::source::{self, SENSOR, Source};
 use crate::support::figures::{Figure, Target, percentile};
-use crate::support::stage::{PATIENCE, Stage};
+use crate::support::stage::Stage;
 use crate::support::{Outcome, clock};
 use crate::wire;
 
@@ -25,7 +25,7 @@ const STAMP: std::ops::Range<usize> = 24..32;
 
 /// p50 and p99 of runs that take turns.
 pub(crate) fn figures(pairs: usize) -> Outcome<Vec<Figure>> {
-    let (mut hub, mut floor) = (Vec::new(), Vec::new());
+    let (mut hub, mut floor): (Vec<Run>, Vec<Run>) = Default::default();
     for pair in 0..pairs {
         if pair % 2 == 0 {
             hub.push(through_gateway()?);
@@ -36,13 +36,16 @@ pub(crate) fn figures(pairs: usize) -> Outcome<Vec<Figure>> {
         }
     }
     let figure = |name, part| {
-        let at = |runs: &[Vec<f64>]| runs.iter().filter_map(|run| percentile(run, part)).collect();
+        let at = |runs: &[Run]| runs.iter().filter_map(|(ages, _)| percentile(ages, part)).collect();
         Figure { name, unit: "us", hub: at(&hub), floor: at(&floor), target: Target::Ratio(1.5) }
     };
-    Ok(vec![figure("hop: p50", 0.5), figure("hop: p99", 0.99)])
+    let absent = |runs: &[Run]| runs.iter().map(|(_, absent)| *absent).collect();
+    let (hub, floor) = (absent(&hub), absent(&floor));
+    let absent = Figure { name: "hop: did not come", unit: "1", hub, floor, target: Target::None };
+    Ok(vec![figure("hop: p50", 0.5), figure("hop: p99", 0.99), absent])
 }
 
-fn through_gateway() -> Outcome<Vec<f64>> {
+fn through_gateway() -> Outcome<Run> {
     let stage = Stage::new()?;
     let mut source = Source::open(&stage.domain)?;
     let gateway = wire::gateway(&stage, "lo", &[format!("--topic={SENSOR}/scan")])?;
@@ -52,19 +55,20 @@ fn through_gateway() -> Outcome<Vec<f64>> {
         clock::rest(clock::now() + PERIOD_NS);
         source.publish(wall_ns())?;
     }
-    let application = application(|bytes| {
+    let application = Application::start(|bytes| {
         let datagram = Datagram::read(bytes).ok()?;
         (datagram.head.topic == Topic::Scan.number()).then_some(datagram.head.stamp_ns)
     })?;
     paced(|| source.publish(wall_ns()))?;
     drop(gateway.end()?);
-    ages(application)
+    application.end()
 }
 
-fn bare() -> Outcome<Vec<f64>> {
+fn bare() -> Outcome<Run> {
     let (wake, mouth) = (eventfd(0, EventfdFlags::CLOEXEC)?, wire::mouth()?);
     let mut datagram = vec![0; HEAD + source::scan().pack(&mut [0; 2048]).unwrap_or_default()];
-    let application = application(|bytes| Some(u64::from_le_bytes(bytes.get(STAMP)?.try_into().ok()?)))?;
+    let application =
+        Application::start(|bytes| Some(u64::from_le_bytes(bytes.get(STAMP)?.try_into().ok()?)))?;
     let stamps: Arc<[AtomicU64]> = (0..SETTLING + COUNT).map(|_| AtomicU64::new(0)).collect();
     let (reading, theirs) = (wake.try_clone()?, stamps.clone());
     let sender = thread::spawn(move || -> std::io::Result<()> {
@@ -87,34 +91,48 @@ fn bare() -> Outcome<Vec<f64>> {
         Ok(())
     })?;
     sender.join().map_err(|_| "the sender panicked")??;
-    ages(application)
+    application.end()
 }
 
-/// A thread that collects the ages, in ns, of datagrams in which `stamp` finds when they were made.
-fn application(stamp: impl Fn(&[u8]) -> Option<u64> + Send + 'static) -> Outcome<JoinHandle<Vec<u64>>> {
-    let ear = wire::ear()?;
-    Ok(thread::spawn(move || {
-        let mut ages = Vec::with_capacity(SETTLING + COUNT);
-        let mut bytes = [0; 2048];
-        let mut heard_at = Instant::now();
-        while ages.len() < SETTLING + COUNT && heard_at.elapsed() < PATIENCE {
-            if let Ok(len) = ear.recv(&mut bytes) {
-                ages.extend(stamp(&bytes[..len]).map(|stamp_ns| wall_ns().saturating_sub(stamp_ns)));
-                heard_at = Instant::now();
+/// Ages in us, sorted, and how many did not come.
+type Run = (Vec<f64>, f64);
+
+/// A thread that collects the ages of datagrams.
+struct Application {
+    /// No more will be sent.
+    is_over: Arc<AtomicBool>,
+    thread: JoinHandle<Vec<u64>>,
+}
+
+impl Application {
+    /// `stamp` finds in a datagram when it was made, in ns.
+    fn start(stamp: impl Fn(&[u8]) -> Option<u64> + Send + 'static) -> Outcome<Application> {
+        let (ear, is_over) = (wire::ear()?, Arc::new(AtomicBool::new(false)));
+        let flag = is_over.clone();
+        let thread = thread::spawn(move || {
+            let (mut ages, mut bytes) = (Vec::with_capacity(SETTLING + COUNT), [0; 2048]);
+            loop {
+                match ear.recv(&mut bytes) {
+                    Ok(len) => {
+                        ages.extend(stamp(&bytes[..len]).map(|stamp_ns| wall_ns().saturating_sub(stamp_ns)));
+                    }
+                    Err(_) if flag.load(Ordering::Relaxed) => return ages,
+                    Err(_) => {}
+                }
             }
-        }
-        ages
-    }))
-}
-
-fn ages(application: JoinHandle<Vec<u64>>) -> Outcome<Vec<f64>> {
-    let ages = application.join().map_err(|_| "the application panicked")?;
-    if ages.len() < SETTLING + COUNT {
-        return Err(format!("{} of {} came", ages.len(), SETTLING + COUNT).into());
+        });
+        Ok(Application { is_over, thread })
     }
-    let mut ages: Vec<_> = ages[SETTLING..].iter().map(|&age| age as f64 / 1e3).collect();
-    ages.sort_by(f64::total_cmp);
-    Ok(ages)
+
+    /// What came; a hub does not wait for who is kept from running.
+    fn end(self) -> Outcome<Run> {
+        self.is_over.store(true, Ordering::Relaxed);
+        let ages = self.thread.join().map_err(|_| "the application panicked")?;
+        let absent = (SETTLING + COUNT).saturating_sub(ages.len()) as f64;
+        let mut ages: Vec<_> = ages.iter().skip(SETTLING).map(|&age| age as f64 / 1e3).collect();
+        ages.sort_by(f64::total_cmp);
+        Ok((ages, absent))
+    }
 }
 
 fn paced(mut tell: impl FnMut() -> Outcome<()>) -> Outcome<()> {

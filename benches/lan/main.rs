@@ -37,12 +37,12 @@ fn main() -> ExitCode {
 }
 
 fn measure(options: &Options) -> Outcome<()> {
-    let mut figures = sizes::figures();
-    figures.extend(hop::figures(options.pairs())?);
-    figures.extend(load::figures(options.pairs())?);
-    figures.extend(damage::figures(options.count(1_000_000) as u64)?);
-    figures.extend(healthy(options.seconds(60))?);
-    figures::print("lan", options.json, &figures);
+    let tell = |figures: Vec<Figure>| figures::print("lan", options.json, &figures);
+    tell(sizes::figures());
+    tell(hop::figures(options.pairs())?);
+    tell(load::figures(options.pairs())?);
+    tell(damage::figures(options.count(1_000_000) as u64)?);
+    tell(healthy(options.seconds(60))?);
     Ok(())
 }
 
