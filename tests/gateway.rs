@@ -220,7 +220,11 @@ fn hubs_and_gateways_are_replaced() {
         receiver.await_more(10, of_topic(Topic::Scan));
         hub.end(KILL);
         // Who listens there learns that nothing is known any more.
-        receiver.await_more(1, is_unknown);
+        until("the last word", || {
+            let heard = receiver.heard();
+            let last = heard.iter().map(|bytes| read(bytes)).rfind(of_topic(Topic::Zones));
+            last.is_some_and(|last| is_unknown(&last))
+        });
         let _hub = stage.hub(&links);
         first.await_line("the next hub", |line| line["kind"] == "hub_back");
         receiver.await_more(10, of_topic(Topic::Scan));
@@ -244,4 +248,31 @@ fn hubs_and_gateways_are_replaced() {
 fn announced(bytes: &[u8]) -> Option<Announce> {
     let datagram = read(bytes);
     (datagram.head.topic == Announce::NUMBER).then(|| Announce::unpack(datagram.payload)).flatten()
+}
+
+#[test]
+fn what_does_not_fit_is_told_and_counted() {
+    in_a_network("what_does_not_fit_is_told_and_counted", || {
+        let stage = Stage::new();
+        let receiver = Receiver::new(LO);
+        let _simulator = stage.simulator(&["front"], &STREAM);
+        let _hub = stage.hub(&[stage.link("front")]);
+        // The room's scans have intensities: 1143 bytes.
+        let mut gateway =
+            stage.gateway(&["--interface=lo", "--mtu=1000", "--topic=*/scan", "--topic=*/telegram"]);
+        let told = gateway.await_line("what does not fit", is_class("lan_link"));
+        assert_eq!((&told["to"], &told["state"]), (&"front/scan".into(), &"failing".into()));
+        receiver.await_more(20, of_topic(Topic::Telegram));
+        let outcome = gateway.end(TERM);
+        assert_eq!((outcome.code, outcome.of_class("lan_link").len()), (Some(0), 1), "{outcome}");
+        let heard = receiver.finish();
+        assert!(heard.iter().all(|bytes| bytes.len() <= 1000 && !of_topic(Topic::Scan)(&read(bytes))));
+        let lines = account(&outcome);
+        let scans = lines.iter().find(|line| line["topic"] == "scan").expect("its account");
+        assert!(number(scans, "sent") == 0 && number(scans, "send_failed") >= 20, "{scans}");
+        // Listeners know from the announcement that these are missing.
+        let last = heard.iter().rev().find_map(|bytes| announced(bytes)).expect("an announcement");
+        let next = last.topics().iter().find(|it| it.topic == Topic::Scan.number()).map(|it| it.next);
+        assert_eq!(next.map(u64::from), Some(number(scans, "send_failed")));
+    });
 }

@@ -29,9 +29,12 @@ fn await_state(gateway: &mut Program, state: &str) -> Value {
 
 /// Waits until the account of the scans says more of `key` than now.
 fn await_growth(gateway: &mut Program, key: &str) {
-    let of_scans = |line: &Value| line["class"] == "lan" && line["topic"] == "scan";
-    let now = number(&gateway.await_line("the account", of_scans), key);
-    gateway.await_line(key, |line| of_scans(line) && number(line, key) > now + 3);
+    let mut asked = || {
+        gateway.signal(USR1);
+        number(&gateway.await_line("the account", |it| it["class"] == "lan" && it["topic"] == "scan"), key)
+    };
+    let now = asked();
+    until(key, || asked() > now + 3);
 }
 
 /// All numbers were used once: what was not sent has failed.
@@ -45,7 +48,6 @@ fn is_gap_free(heard: &[Vec<u8>], outcome: &Outcome) {
         let line = lines.iter().rfind(|line| line["topic"] == topic).expect("its account");
         let numbered = number(line, "sent") + number(line, "send_failed");
         assert_eq!(row.received + row.lost(), numbered, "{line}");
-        assert!(row.received >= number(line, "sent"), "{line}");
     }
 }
 

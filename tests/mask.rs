@@ -10,6 +10,9 @@ fn world(stage: &Stage, thing: &str) -> String {
     format!("--world={}", stage.file("world.toml", format!("{room}\n{thing}")))
 }
 
+/// What is told beside a mask that a person should look at; on a busy machine also that scans were missed.
+const DOUBTS: [&str; 3] = ["nothing of the robot", "something moved", "are hidden"];
+
 const POST: &str = "[[thing]]\nradius_mm = 20\npose = [0, 400]\n";
 
 fn simulator(stage: &Stage, world: &str) -> Program {
@@ -28,7 +31,8 @@ fn a_robot_that_knows_its_own_post_goes_on() {
     let hub = stage.hub(&[stage.link("front")]);
     await_verdict(&stage, "stop");
     let outcome = stage.run(&["zones", "front", "mask", "--for", "3s"]);
-    assert_eq!((outcome.code, outcome.errors.as_str()), (Some(0), ""), "{outcome}");
+    assert_eq!(outcome.code, Some(0), "{outcome}");
+    assert!(!DOUBTS.iter().any(|doubt| outcome.errors.contains(doubt)), "{outcome}");
     assert_eq!(hub.end(TERM).code, Some(0));
 
     let text = String::from_utf8(outcome.out.clone()).unwrap();
@@ -51,7 +55,8 @@ fn a_robot_that_knows_its_own_post_goes_on() {
         lines.iter().filter(|line| line["verdict"] == "stop" || line["verdict"] == "slow").collect();
     assert!(seen.is_empty(), "{seen:#?}");
     // A mask that is in force does not hinder the next one: scans are as the sensor sends them.
-    let again = stage.run(&["zones", "front", "mask", "--for", "2s", "--json"]);
+    let again = stage.run(&["zones", "front", "mask", "--for", "4s", "--json"]);
+    assert_eq!(again.code, Some(0), "{again}");
     let mask = &again.of_class("mask")[0];
     assert_eq!(
         (&mask["sensor"], &mask["within_m"], &mask["of_beams"]),
@@ -69,7 +74,8 @@ fn nothing_there_is_an_empty_mask_that_a_hub_takes_too() {
     await_verdict(&stage, "clear");
     let outcome = stage.run(&["zones", "front", "mask", "--for", "3s"]);
     assert_eq!(outcome.code, Some(0), "{outcome}");
-    assert!(outcome.errors.starts_with("nothing of the robot is seen within 1.0 m"), "{outcome}");
+    let doubt = "nothing of the robot is seen within 1.0 m of its centre: no mask is needed";
+    assert!(outcome.errors.contains(doubt), "{outcome}");
     assert!(outcome.out.ends_with(b"self_min = []\n"), "{outcome}");
     assert_eq!(hub.end(TERM).code, Some(0));
     let file = stage.file("mask.toml", &outcome.out);
@@ -77,7 +83,7 @@ fn nothing_there_is_an_empty_mask_that_a_hub_takes_too() {
     await_verdict(&stage, "clear");
 
     // The walls are no body, but in a circle that is as large as the room they are: that is told.
-    let outcome = stage.run(&["zones", "front", "mask", "--for", "2s", "--within", "6"]);
+    let outcome = stage.run(&["zones", "front", "mask", "--for", "4s", "--within", "6"]);
     assert_eq!(outcome.code, Some(0), "{outcome}");
     assert!(outcome.errors.contains("the hub will be blind there"), "{outcome}");
 }
@@ -93,7 +99,8 @@ fn a_body_beyond_the_circle_that_violates_it_is_no_reason_to_do_without_a_mask()
     assert!(outcome.errors.contains("the largest circle is violated") && outcome.errors.contains("--within"));
     assert!(!outcome.errors.contains("no mask is needed"), "{outcome}");
     let outcome = stage.run(&["zones", "front", "mask", "--for", "3s", "--within", "1.5"]);
-    assert_eq!((outcome.code, outcome.errors.as_str()), (Some(0), ""), "{outcome}");
+    assert_eq!(outcome.code, Some(0), "{outcome}");
+    assert!(!DOUBTS.iter().any(|doubt| outcome.errors.contains(doubt)), "{outcome}");
     assert!(!outcome.out.ends_with(b"self_min = []\n"), "{outcome}");
 }
 

@@ -9,43 +9,18 @@ use schema::Topic;
 use schema::datagram::Announce;
 use serde_json::Value;
 use stage::{
-    INT, Machine, Outcome, Program, Relay, Stage, TERM, in_a_network, is_class, number, read, until,
+    INT, Machine, Outcome, Program, Relay, Robot, Stage, TERM, in_a_network, is_class, number, read, until,
 };
 
-const STREAM: [&str; 2] = ["--seed=61", "--baud=500000"];
 /// Passed on while the network is rough: some seconds.
 const MANY: usize = 2000;
 
 /// A sensor's number and a topic's.
 type Stream = (u8, u8);
 
-/// A machine with two sensors, its hub and its gateway.
-struct Robot {
-    machine: Machine,
-    stage: Stage,
-    _simulator: Program,
-    hub: Program,
-}
-
-impl Robot {
-    fn new() -> Robot {
-        let machine = Machine::new(1);
-        let stage = Stage::on(&machine);
-        let simulator = stage.simulator(&["front", "rear"], &STREAM);
-        let hub = stage.hub(&[stage.link("front"), stage.link("rear")]);
-        Robot { machine, stage, _simulator: simulator, hub }
-    }
-
-    /// Sends all there is.
-    fn gateway(&self) -> Program {
-        let topics = Topic::ALL.map(|topic| format!("--topic=*/{}", topic.name()));
-        let mut command = self.stage.command(&["gateway", "--json"]);
-        command.args(topics).env("XDG_STATE_HOME", self.stage.path("state")).env_remove("STATE_DIRECTORY");
-        let mut gateway = Program::start(command);
-        let begin = gateway.await_line("its begin", is_class("gateway"));
-        assert_eq!(begin["interface"], "eth0", "the only one that can be meant");
-        gateway
-    }
+/// Sends all that two sensors have.
+fn gateway(robot: &Robot) -> Program {
+    robot.gateway(&Topic::ALL.map(|topic| format!("--topic=*/{}", topic.name())))
 }
 
 fn listener(stage: &Stage, words: &[&str]) -> Program {
@@ -131,12 +106,12 @@ fn truth(log: &[Vec<u8>]) -> BTreeMap<Stream, [u64; 4]> {
 fn every_listener_knows_exactly_what_it_missed() {
     in_a_network("every_listener_knows_exactly_what_it_missed", || {
         let (second, third) = (Machine::new(2), Machine::new(3));
-        let robot = Robot::new();
+        let robot = Robot::new(&["front", "rear"]);
         let relay = Relay::new(&robot.machine, 7);
         assert_eq!(relay.connect(&second), 0);
         let stage = Stage::on(&second);
         let early = listener(&stage, &["--stats"]);
-        let gateway = robot.gateway();
+        let gateway = gateway(&robot);
         until("all topics of both sensors", || truth(&relay.log()).len() == 2 * (Topic::ALL.len() + 1));
         relay.set_rough(true);
         until("half of what is rough", || relay.log().len() > MANY / 2);
@@ -182,10 +157,10 @@ fn last_of_class(outcome: &Outcome, class: &str) -> Vec<Value> {
 fn a_sensor_of_another_machine_is_followed_as_one_here() {
     in_a_network("a_sensor_of_another_machine_is_followed_as_one_here", || {
         let second = Machine::new(2);
-        let robot = Robot::new();
+        let mut robot = Robot::new(&["front", "rear"]);
         let relay = Relay::new(&robot.machine, 7);
         relay.connect(&second);
-        let gateway = robot.gateway();
+        let gateway = gateway(&robot);
         let stage = Stage::on(&second);
         let listener = listener(&stage, &["--publish"]);
         until("the first announcement", || !names(&relay.log()).is_empty());
@@ -205,7 +180,7 @@ fn a_sensor_of_another_machine_is_followed_as_one_here() {
         assert_eq!(rate["lost"], 0, "{rate}");
         // Both ends go; who follows is told.
         drop(there.end(INT));
-        assert_eq!(robot.hub.end(TERM).code, Some(0));
+        assert_eq!(robot.take_hub().end(TERM).code, Some(0));
         here.await_line("nothing is known any more", |line| line["verdict"] == "unknown");
         assert_eq!(gateway.end(TERM).code, Some(0));
         assert_eq!(listener.end(TERM).code, Some(0));

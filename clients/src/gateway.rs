@@ -89,6 +89,7 @@ struct Gateway<'a> {
     started: Instant,
     /// When the hub came, and how often its sensors were looked for.
     hub: Option<(Instant, usize)>,
+    is_there: bool,
     /// The sensors that are named were found in a hub.
     is_checked: bool,
     waiting_said: bool,
@@ -125,6 +126,7 @@ impl<'a> Gateway<'a> {
             started: Instant::now(),
             hub: None,
             waiting_said: false,
+            is_there: false,
             is_checked: false,
             tick_at: Instant::now(),
         })
@@ -169,26 +171,29 @@ impl<'a> Gateway<'a> {
     fn look(&mut self, report: &mut Report<'_>) -> Result<(), End> {
         let change = self.session.look()?;
         let now = Instant::now();
-        if change.gone {
+        if change.gone && self.is_there {
+            self.is_there = false;
             report.hub(Notice::HubGone)?;
         }
-        if change.back {
+        // Somebody else may bring the sensors of other machines, which are not sent on.
+        if change.back && self.session.hub_lives() {
             if self.hub.is_some() || self.waiting_said {
                 report.hub(Notice::HubBack)?;
             }
+            self.is_there = true;
             self.hub = Some((now, 0));
         }
         if self.hub.is_none() && !self.waiting_said && now - self.started >= GRACE {
             self.waiting_said = true;
             report.hub(Notice::HubGone)?;
         }
-        self.call_the_roll(now)?;
-        Ok(())
+        Ok(self.call_the_roll(now)?)
     }
 
     /// Follows the sensors of the hub if all are wanted; those that are named have to be there in the first hub.
     fn call_the_roll(&mut self, now: Instant) -> Result<(), Failure> {
-        let (Some((came, rolls)), Some(domain)) = (self.hub, self.session.domain()) else { return Ok(()) };
+        let domain = self.session.domain().filter(|_| self.is_there);
+        let (Some((came, rolls)), Some(domain)) = (self.hub, domain) else { return Ok(()) };
         if ROLLS.get(rolls).is_none_or(|after| now - came < *after) {
             return Ok(());
         }
@@ -203,8 +208,7 @@ impl<'a> Gateway<'a> {
                 }
             }
         }
-        // Where a listener is alone the hub may come yet.
-        if !self.is_checked && now - came >= GRACE && self.session.hub_lives() {
+        if !self.is_checked && now - came >= GRACE {
             let missing = self.selection.named().into_iter().find(|name| !there.iter().any(|it| it == name));
             if let Some(name) = missing {
                 return Err(no_sensor(name, &there));
@@ -234,7 +238,7 @@ impl<'a> Gateway<'a> {
         if let Some(what) = self.lan.misfit() {
             report.misfit(&what, self.lan.longest())?;
         }
-        report.periodic(&self.lan, self.session.domain().is_some())
+        report.periodic(&self.lan, self.is_there)
     }
 
     fn announce(&mut self) {

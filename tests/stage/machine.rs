@@ -3,10 +3,10 @@
 use std::ffi::OsStr;
 use std::io::Read;
 use std::net::Ipv4Addr;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
-
-use super::ip;
+use std::thread;
+use std::time::{Duration, Instant};
 
 /// A machine that is there as long as this value. Its end of the cable is `eth0`.
 pub(crate) struct Machine {
@@ -31,6 +31,7 @@ impl Machine {
         ip(&format!("link set {end} up"));
         machine.run(&format!("ip address add {}/24 dev eth0", machine.there()));
         machine.run("ip link set eth0 up");
+        machine.await_link();
         machine
     }
 
@@ -54,6 +55,17 @@ impl Machine {
         format!("/proc/{}/ns/net", self.holder.id()).into()
     }
 
+    /// Waits until the machine knows that its cable is plugged in: the kernel says so up to a second later.
+    fn await_link(&self) {
+        let give_up_at = Instant::now() + Duration::from_secs(20);
+        let mut show = command_in(&self.network(), "ip");
+        show.args(["link", "show", "eth0"]);
+        while !show.output().is_ok_and(|it| String::from_utf8_lossy(&it.stdout).contains("state UP")) {
+            assert!(Instant::now() < give_up_at, "no link");
+            thread::sleep(Duration::from_millis(20));
+        }
+    }
+
     /// Runs a command there.
     pub(crate) fn run(&self, command: &str) {
         assert!(self.try_run(command), "{command}");
@@ -67,8 +79,14 @@ impl Machine {
     }
 }
 
+/// `ip` with these arguments.
+pub(crate) fn ip(arguments: &str) {
+    let done = Command::new("ip").args(arguments.split(' ')).status();
+    assert!(done.is_ok_and(|status| status.success()), "ip {arguments}");
+}
+
 /// `program`, to be started in this network.
-pub(crate) fn command_in(network: &std::path::Path, program: impl AsRef<OsStr>) -> Command {
+pub(crate) fn command_in(network: &Path, program: impl AsRef<OsStr>) -> Command {
     let mut command = Command::new("nsenter");
     command.arg(format!("--net={}", network.display())).arg(program);
     command

@@ -8,6 +8,7 @@ mod network;
 mod program;
 mod receiver;
 mod relay;
+mod robot;
 mod sender;
 mod telegrams;
 mod terminal;
@@ -23,11 +24,12 @@ use schema::Domain;
 use serde_json::Value;
 
 pub(crate) use line::{Line, open_line};
-pub(crate) use machine::{Machine, command_in};
+pub(crate) use machine::{Machine, command_in, ip};
 pub(crate) use network::in_a_network;
 pub(crate) use program::{INT, KILL, Outcome, Program, TERM, USR1};
-pub(crate) use receiver::{Receiver, ip, read};
+pub(crate) use receiver::{Receiver, read};
 pub(crate) use relay::Relay;
+pub(crate) use robot::Robot;
 pub(crate) use sender::{Sender, wall_ns};
 pub(crate) use telegrams::{MEASURED, Sent, bytes_of, hash, is_class, number, scan, sequence};
 pub(crate) use terminal::terminal;
@@ -139,6 +141,13 @@ impl Stage {
         let truth = format!("--truth={}", self.word("truth"));
         let words = with(&["simulate", "--json", &truth], &with(&ports, flags));
         self.start(&words).ready()
+    }
+
+    /// Kills the simulator of one port, and takes away the name that it leaves: a hub that goes on would soon find
+    /// another test's terminal by it.
+    pub(crate) fn kill_simulator(&self, simulator: Program, port: &str) {
+        assert_eq!(simulator.end(KILL).code, None);
+        fs::remove_file(self.path(port)).unwrap_or_else(|error| panic!("{port}: {error}"));
     }
 
     /// `echo --json` of these topics, attached to all of them.

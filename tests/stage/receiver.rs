@@ -1,7 +1,6 @@
 //! Who listens on a network, and knows nothing of who sends.
 
 use std::net::{Ipv4Addr, UdpSocket};
-use std::process::Command;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex};
 use std::thread::{self, JoinHandle};
@@ -11,12 +10,6 @@ use rustix::net::sockopt::set_socket_recv_buffer_size_force;
 use schema::datagram::{Datagram, GROUPS, PORT};
 
 use super::until;
-
-/// `ip` with these arguments.
-pub(crate) fn ip(arguments: &str) {
-    let done = Command::new("ip").args(arguments.split(' ')).status();
-    assert!(done.is_ok_and(|status| status.success()), "ip {arguments}");
-}
 
 /// Takes all datagrams that come to a port, from the four groups and from elsewhere.
 pub(crate) struct Receiver {
@@ -38,12 +31,17 @@ impl Receiver {
         let (to, flag) = (heard.clone(), stop.clone());
         let thread = thread::spawn(move || {
             let mut bytes = [0; 65_536];
-            // What waits when it is told to stop is taken, too.
+            let mut is_over = false;
             loop {
                 match socket.recv(&mut bytes) {
                     Ok(len) => to.lock().expect("not poisoned").push(bytes[..len].to_vec()),
-                    Err(_) if flag.load(Ordering::Relaxed) => return,
+                    Err(_) if is_over => return,
                     Err(_) => {}
+                }
+                // What waits when it is told to stop is taken, what comes later is not waited for.
+                if !is_over && flag.load(Ordering::Relaxed) {
+                    is_over = true;
+                    socket.set_nonblocking(true).expect("need not wait");
                 }
             }
         });

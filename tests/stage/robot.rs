@@ -1,0 +1,47 @@
+//! A machine that carries sensors, with its hub and what its gateway sends.
+
+use super::{Machine, Program, Stage, is_class};
+
+const STREAM: [&str; 2] = ["--seed=61", "--baud=500000"];
+
+/// Machine number 1, on which a hub streams.
+pub(crate) struct Robot {
+    pub(crate) machine: Machine,
+    pub(crate) stage: Stage,
+    pub(crate) hub: Option<Program>,
+    links: Vec<String>,
+    _simulator: Program,
+}
+
+impl Robot {
+    /// With these sensors.
+    pub(crate) fn new(sensors: &[&str]) -> Robot {
+        let machine = Machine::new(1);
+        let stage = Stage::on(&machine);
+        let simulator = stage.simulator(sensors, &STREAM);
+        let links = sensors.iter().map(|sensor| stage.link(sensor)).collect();
+        let mut robot = Robot { machine, stage, hub: None, links, _simulator: simulator };
+        robot.start();
+        robot
+    }
+
+    /// Starts its hub.
+    pub(crate) fn start(&mut self) {
+        self.hub = Some(self.stage.hub(&self.links));
+    }
+
+    /// Its hub, to be ended.
+    pub(crate) fn take_hub(&mut self) -> Program {
+        self.hub.take().expect("it was started")
+    }
+
+    /// A gateway that has begun, on the only interface that can be meant.
+    pub(crate) fn gateway<S: AsRef<std::ffi::OsStr>>(&self, flags: &[S]) -> Program {
+        let mut command = self.stage.command(&["gateway", "--json"]);
+        command.args(flags).env("XDG_STATE_HOME", self.stage.path("state")).env_remove("STATE_DIRECTORY");
+        let mut gateway = Program::start(command);
+        let begin = gateway.await_line("its begin", is_class("gateway"));
+        assert_eq!(begin["interface"], "eth0");
+        gateway
+    }
+}
