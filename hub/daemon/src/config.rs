@@ -7,7 +7,7 @@ mod sources;
 use std::path::PathBuf;
 
 use lms::family::Family;
-use lms::variant::{Baud, Unit, Variant};
+use lms::variant::{Baud, Mode, Unit, Variant};
 use schema::{Failure, Kind};
 
 use crate::layer::{Drafts, parse};
@@ -38,6 +38,8 @@ pub struct Link {
     pub variant: Variant,
     /// Unit that the sensor is expected to measure in, if the user said one; it is compared, never written.
     pub unit: Option<Unit>,
+    /// Measuring mode of a recording that does not tell it; a sensor is asked.
+    pub mode: Option<Mode>,
     /// Rate to stream at.
     pub baud: Baud,
     /// What is made of its scans.
@@ -235,6 +237,21 @@ mod tests {
         assert!(refusal(&[], &["front=tcp::4001"]).contains("without a host"));
         assert!(refusal(&[], &["front=tcp:box:0"]).contains("a number to 65535"));
         assert!(refusal(&[], &["front=tcp:fe80::1:4001"]).contains("in brackets"));
+    }
+
+    #[test]
+    fn only_a_recording_is_told_its_mode() {
+        let config = Config::load(&sources(&["link.a.mode=0x01"], &["a=file:x"])).unwrap();
+        assert_eq!(config.links[0].mode, Some(Mode(1)));
+        let live = refusal(&["link.front.mode=0x01"], &["front=/dev/x"]);
+        assert!(
+            live.contains("--set link.front.mode=0x01: link front: the mode of /dev/x is asked"),
+            "{live}"
+        );
+        for mode in ["0x07", "-1", "257"] {
+            let odd = refusal(&[&format!("link.a.mode={mode}")], &["a=file:x"]);
+            assert!(odd.contains("mode = ") && odd.contains("0x00 to 0x06"), "{odd}");
+        }
     }
 
     #[test]
