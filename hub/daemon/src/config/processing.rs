@@ -86,7 +86,7 @@ pub struct Background {
     pub file: Option<PathBuf>,
     /// What stands in the file.
     pub model: Option<Box<schema::Background>>,
-    /// The model is published with every scan, not only when a new generation begins.
+    /// The model is published with every scan, not only with a new generation and whenever it has learned for a while.
     pub every_scan: bool,
 }
 
