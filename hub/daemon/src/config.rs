@@ -229,6 +229,8 @@ mod tests {
         assert!(
             refusal(&["link.front.resolution=0.25"], &[]).contains("no sensor scans 180 degrees at 0.25")
         );
+        let pose = refusal(&["link.front.pose=3"], &[]);
+        assert!(pose.contains("integer `3`, expected where the sensor sits, as { x = 0.3, "), "{pose}");
         assert!(refusal(&["baud=3"], &[]).contains("not a setting"));
         assert!(refusal(&[], &["front"]).contains("--link front: no = in it"));
         assert!(refusal(&[], &["Front=/dev/x"]).contains("sensor name \"Front\" is not possible"));
@@ -273,7 +275,7 @@ mod tests {
             "{fast}"
         );
         let unknown = refusal(&["link.front.type=lms100"], &[]);
-        assert!(unknown.contains("type = \"lms100\"\n  lms200, lms211, lms221, lms291 or s14"), "{unknown}");
+        assert!(unknown.contains("type = \"lms100\"\n  lms200, lms211, lms221 or lms291"), "{unknown}");
     }
 
     #[test]
@@ -305,7 +307,10 @@ mod tests {
         assert!(error.contains(":4:8: baud = 115200"), "{error}");
         let error =
             load("[[link]]\nname = \"a\"\nport = \"x\"\n[[link]]\nname = \"a\"\n").unwrap_err().to_string();
-        assert!(error.contains(":5:8: a second link a"), "{error}");
+        assert!(
+            error.contains(":5:8: a second link a") && error.contains("beside those of the first"),
+            "{error}"
+        );
         let text = "[[link]]\nname = \"a\"\nport = \"x\"\ntype = \"lms211\"\nangle = 180\n";
         let error = load(text).unwrap_err().to_string();
         assert!(error.contains(":5:9: link a: an lms211 does not scan 180 degrees"), "{error}");

@@ -172,7 +172,7 @@ fn merge(
             return Err(origin.refuse(
                 span,
                 format!("a second link {name}"),
-                "give each link a name of its own",
+                "give each link a name of its own, or put its keys beside those of the first one",
             ));
         }
         seen.push(name.clone());
@@ -215,7 +215,7 @@ fn merge(
         if let Some(family) = link.family {
             let value = Family::of_name(family.get_ref()).ok_or_else(|| {
                 let what = format!("type = \"{}\"", family.get_ref());
-                origin.refuse(Some(family.span()), what, "lms200, lms211, lms221, lms291 or s14")
+                origin.refuse(Some(family.span()), what, "lms200, lms211, lms221 or lms291")
             })?;
             draft.family = Some(Said { value, place: origin.place(Some(family.span())) });
         }

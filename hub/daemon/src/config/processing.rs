@@ -106,7 +106,10 @@ impl Background {
             Ok(text) => text,
             Err(error) => return refuse(error.to_string(), START),
         };
-        let SavedModel { sensor: of, model } = SavedModel::parse(&text, &place)?;
+        let SavedModel { sensor: of, model } = SavedModel::parse(&text, &place).map_err(|failure| {
+            let message = format!("link {sensor}: background.start: {}", failure.message);
+            Failure::new(failure.kind, message, failure.hint)
+        })?;
         if of != sensor {
             let hint = "name the file of each sensor by background.start of its link";
             return refuse(format!("the model is that of sensor {of}"), hint);
