@@ -104,7 +104,6 @@ impl<'a> LinkThread<'a> {
             self.topics.set_flags(Flags::REPLAYED);
         }
         // Nothing is known yet but the model to begin with: that is said before anything can come.
-        self.show(None, State::Absent, "");
         let now = clock::now();
         self.topics.stale(&mut self.pipeline, now);
         self.topics.background(&mut self.pipeline, now);

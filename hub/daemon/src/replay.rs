@@ -100,6 +100,7 @@ pub(crate) fn play(link: &mut LinkThread<'_>, session: &mut Session, mut recorde
     let mut last_ns = None;
     // From this scan to the next, as far as it is kept: so long nothing newer can be known.
     let mut gap_ns = 0;
+    link.show(Some(session), State::Streaming, "");
     loop {
         let (len, stamp) = recorded.read(session.spare());
         if let Some(Stamp { wall_ns, next_ns }) = stamp {

@@ -1,0 +1,144 @@
+//! The network namespace that the bench runs in, its sockets on the loopback, and programs that speak JSON.
+
+use std::net::{Ipv4Addr, UdpSocket};
+use std::process::{Command, ExitCode, Stdio};
+use std::sync::mpsc::{Receiver, channel};
+use std::thread;
+use std::time::Duration;
+use std::{env, fs};
+
+use rustix::net::sockopt::{set_ip_multicast_if, set_socket_recv_buffer_size_force};
+use rustix::process::{Pid, Signal, kill_process};
+use schema::Topic;
+use schema::datagram::{GROUPS, PORT, group};
+use serde_json::Value;
+
+use crate::support::child::Guard;
+use crate::support::stage::{PATIENCE, Stage};
+use crate::support::{Outcome, clock};
+
+pub(crate) const PROGRAM: &str = env!("CARGO_BIN_EXE_scanhub");
+const INSIDE: &str = "SCANHUB_BENCH_NETWORK";
+
+/// Whether this is the process that runs in a namespace of its own.
+pub(crate) fn inside() -> bool {
+    env::var_os(INSIDE).is_some()
+}
+
+/// Runs this program again in a network namespace, in which only the loopback is; without an error code if the system
+/// does not allow that.
+pub(crate) fn enter() -> Outcome<ExitCode> {
+    let mut unshare = Command::new("unshare");
+    unshare.arg("--net");
+    if !rustix::process::getuid().is_root() {
+        unshare.arg("--map-root-user");
+    }
+    let state = env::temp_dir().join(format!("scanhub-lan-{}", std::process::id()));
+    unshare.args(["sh", "-c", "ip link set lo up && exec \"$@\"", "sh"]).arg(env::current_exe()?);
+    unshare.args(env::args().skip(1)).env(INSIDE, "1").env("XDG_STATE_HOME", &state);
+    let status = unshare.env_remove("STATE_DIRECTORY").status()?;
+    let _ = fs::remove_dir_all(state);
+    Ok(if status.success() { ExitCode::SUCCESS } else { ExitCode::FAILURE })
+}
+
+/// Hears the groups on the loopback.
+pub(crate) fn ear() -> Outcome<UdpSocket> {
+    let socket = UdpSocket::bind((Ipv4Addr::UNSPECIFIED, PORT))?;
+    for last in 80..84 {
+        socket
+            .join_multicast_v4(&Ipv4Addr::new(GROUPS[0], GROUPS[1], GROUPS[2], last), &Ipv4Addr::LOCALHOST)?;
+    }
+    let _ = set_socket_recv_buffer_size_force(&socket, 8 << 20);
+    socket.set_read_timeout(Some(Duration::from_millis(200)))?;
+    Ok(socket)
+}
+
+/// Sends to the groups on the loopback.
+pub(crate) fn mouth() -> Outcome<UdpSocket> {
+    let socket = UdpSocket::bind((Ipv4Addr::UNSPECIFIED, 0))?;
+    set_ip_multicast_if(&socket, &Ipv4Addr::LOCALHOST)?;
+    Ok(socket)
+}
+
+/// Where the datagrams of `topic` go.
+pub(crate) fn address(topic: Topic) -> (Ipv4Addr, u16) {
+    (Ipv4Addr::new(GROUPS[0], GROUPS[1], GROUPS[2], group(topic)), PORT)
+}
+
+/// Flags of a gateway that sends everything.
+pub(crate) fn all_topics() -> Vec<String> {
+    Topic::ALL.iter().map(|topic| format!("--topic=*/{}", topic.name())).collect()
+}
+
+/// The gateway of `stage`.
+pub(crate) fn gateway(stage: &Stage, interface: &str, flags: &[String]) -> Outcome<Program> {
+    let mut command = Command::new(PROGRAM);
+    command
+        .args(["gateway", "--json", "--interface", interface, "--domain", stage.domain.name()])
+        .args(flags);
+    Program::start(command, "gateway")
+}
+
+/// A program that speaks JSON.
+pub(crate) struct Program {
+    guard: Guard,
+    lines: Receiver<(u64, Value)>,
+}
+
+impl Program {
+    /// Starts it and waits for its first line, which is of this class.
+    pub(crate) fn start(mut command: Command, class: &str) -> Outcome<Program> {
+        command.env("SCANHUB_END_WITH_PARENT", "1").env("SCANHUB_LOG", "error");
+        let mut process = command.stdin(Stdio::null()).stdout(Stdio::piped()).spawn()?;
+        let stdout = process.stdout.take().ok_or("no pipe")?;
+        let (send, lines) = channel();
+        thread::spawn(move || {
+            use std::io::BufRead;
+            for text in std::io::BufReader::new(stdout).lines().map_while(Result::ok) {
+                let line = serde_json::from_str(&text).unwrap_or(Value::Null);
+                if send.send((clock::now(), line)).is_err() {
+                    return;
+                }
+            }
+        });
+        let program = Program { guard: Guard::new(process), lines };
+        program.await_class(class)?;
+        Ok(program)
+    }
+
+    pub(crate) fn pid(&self) -> u32 {
+        self.guard.pid()
+    }
+
+    /// The next line of this class; others are dropped.
+    pub(crate) fn await_class(&self, class: &str) -> Outcome<Value> {
+        loop {
+            let (_, line) = self.lines.recv_timeout(PATIENCE).map_err(|_| format!("no {class} came"))?;
+            if line["class"] == class {
+                return Ok(line);
+            }
+        }
+    }
+
+    /// Ends it; the lines that were not yet taken, each with when it came.
+    pub(crate) fn end(self) -> Outcome<Vec<(u64, Value)>> {
+        let pid = Pid::from_raw(self.pid() as i32).ok_or("no process")?;
+        kill_process(pid, Signal::TERM)?;
+        let mut lines = Vec::new();
+        while let Ok(line) = self.lines.recv_timeout(PATIENCE) {
+            lines.push(line);
+        }
+        self.guard.wait()?;
+        Ok(lines)
+    }
+}
+
+/// Whether a line is of the account of this sensor and topic.
+pub(crate) fn is_of(line: &Value, sensor: &str, topic: &str) -> bool {
+    line["class"] == "lan" && line["sensor"] == sensor && line["topic"] == topic
+}
+
+/// A number in a line; 0 if it is not there.
+pub(crate) fn number(line: &Value, key: &str) -> u64 {
+    line[key].as_u64().unwrap_or_default()
+}
