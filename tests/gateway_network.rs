@@ -4,8 +4,11 @@
 mod stage;
 
 use std::net::Ipv4Addr;
-use std::process::Command;
+use std::process::{Command, Stdio};
 
+use rustix::event::{PollFd, PollFlags, Timespec, poll};
+use rustix::pipe::fcntl_setpipe_size;
+use rustix::process::{Pid, kill_process};
 use schema::Topic;
 use schema::datagram::{Account, Announce};
 use serde_json::Value;
@@ -117,6 +120,43 @@ fn what_a_full_queue_drops_is_counted() {
         await_growth(&mut gateway, "sent");
         let outcome = gateway.end(TERM);
         is_gap_free(&receiver.finish(), &outcome);
+    });
+}
+
+#[test]
+fn a_reader_that_does_not_read_delays_nothing() {
+    in_a_network("a_reader_that_does_not_read_delays_nothing", || {
+        let stage = Stage::new();
+        let receiver = Receiver::new(Ipv4Addr::LOCALHOST);
+        let _simulator = stage.simulator(&["front"], &STREAM);
+        let _hub = stage.hub(&[stage.link("front")]);
+        // The pipe stays open, and is soon full.
+        let (_reader, writer) = std::io::pipe().expect("a pipe");
+        fcntl_setpipe_size(&writer, 8192).expect("a small one");
+        let mut command = stage.command(&["gateway", "--json", "--no-system-config", "--interface=lo"]);
+        command.env("XDG_STATE_HOME", stage.path("state")).env_remove("STATE_DIRECTORY");
+        command.stdout(writer.try_clone().expect("another end")).stdin(Stdio::null());
+        let mut gateway = command.spawn().expect("a gateway");
+        let signal = |signal| kill_process(Pid::from_child(&gateway), signal).expect("it lives");
+        let is_scan = |datagram: &schema::datagram::Datagram<'_>| datagram.head.topic == Topic::Scan.number();
+        receiver.await_more(3, is_scan);
+        let now = Timespec { tv_sec: 0, tv_nsec: 0 };
+        until("a full pipe", || {
+            signal(USR1);
+            poll(&mut [PollFd::new(&writer, PollFlags::OUT)], Some(&now)) == Ok(0)
+        });
+        // Some seconds of accounts that nobody can be told.
+        let is_announce = |datagram: &schema::datagram::Datagram<'_>| datagram.head.topic == Announce::NUMBER;
+        receiver.await_more(3, is_announce);
+        signal(USR1);
+        receiver.await_more(30, is_scan);
+        signal(TERM);
+        let mut status = None;
+        until("its end", || {
+            status = gateway.try_wait().expect("a child");
+            status.is_some()
+        });
+        assert_eq!(status.and_then(|status| status.code()), Some(0));
     });
 }
 
