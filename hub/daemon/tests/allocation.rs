@@ -19,6 +19,7 @@ use lms::reply::{self, Health};
 use lms::telegram::ACK;
 use lms::variant::{Baud, Mode, Unit, Variant};
 use rustix::fs::{OFlags, fcntl_setfl};
+use rustix::io::Errno;
 use rustix::process::{Signal, getpid, kill_process};
 use rustix::pty::{OpenptFlags, grantpt, openpt, ptsname, unlockpt};
 use schema::ipc::{self, Payload, Subscriber};
@@ -46,9 +47,17 @@ impl Sensor {
         (Sensor { line, heard: Vec::new(), scans: 0 }, name)
     }
 
-    fn say(&self, bytes: &[u8]) {
-        let written = rustix::io::write(&self.line, bytes);
-        assert_eq!(written, Ok(bytes.len()), "the hub does not read");
+    /// Writes all of it, however long a busy machine keeps the hub from reading.
+    fn say(&self, mut bytes: &[u8]) {
+        let give_up_at = Instant::now() + Duration::from_secs(30);
+        while !bytes.is_empty() {
+            match rustix::io::write(&self.line, bytes) {
+                Ok(len) => bytes = &bytes[len..],
+                Err(Errno::AGAIN) => thread::sleep(Duration::from_millis(1)),
+                Err(errno) => panic!("the line is gone: {errno}"),
+            }
+            assert!(Instant::now() < give_up_at, "the hub does not read");
+        }
     }
 
     fn send_scan(&mut self) {
