@@ -3,6 +3,7 @@
 
 mod stage;
 
+use schema::datagram::Announce;
 use schema::{Scan, State, Status, Topic, Verdict, Zones};
 use serde_json::{Value, json};
 use stage::{INT, KILL, Program, Sender, Stage, TERM, in_a_network, number, until};
@@ -244,6 +245,82 @@ fn what_a_gateway_sends_comes_back_once() {
         let hubs: Vec<_> = outcome.of_class("lan").into_iter().map(|line| line["hub"].clone()).collect();
         assert!(hubs.iter().all(|hub| *hub == id), "{outcome}");
         assert_eq!(outcome.of_class("lan_published")[0]["sensors"], json!([remote]));
+    });
+}
+
+#[test]
+fn a_number_that_another_sensor_has_is_its_own() {
+    in_a_network("a_number_that_another_sensor_has_is_its_own", || {
+        let stage = Stage::new();
+        let mut sender = Sender::new(HUB, 7, 0, "front");
+        let mut program = published(&stage, &mut sender);
+        let mut echo = stage.echo(&["robot1.front/zones"]);
+        sender.send(Topic::Zones, &zones(Verdict::Clear));
+        echo.await_line("zones", is_zones);
+        (sender.name, sender.boot) = ("rear".to_owned(), 0xb008);
+        // Named twice, as a stranger may.
+        let late = sender.announcement(&[Topic::Zones]);
+        sender.announce(&[Topic::Zones, Topic::Zones]);
+        let line = program.await_line("a sensor", |line| line["kind"] == "published");
+        assert_eq!(line["sensor"], "robot1.rear");
+        echo.await_line("nothing is known any more", |line| line["verdict"] == "unknown");
+        stage.await_info(FRONT, |info| info["state"] == "silent");
+        let mut rear = stage.echo(&["robot1.rear/zones"]);
+        sender.send(Topic::Zones, &zones(Verdict::Stop));
+        rear.await_line("its own", |line| line["verdict"] == "stop");
+        // The first one comes back with another number, of which it knows nothing. What is late says nothing.
+        let mut front = Sender::new(HUB, 7, 1, "front");
+        front.boot = 0xb008;
+        front.next[usize::from(Topic::Zones.number())] = 40;
+        front.announce(&[Topic::Zones]);
+        sender.to(Announce::GROUP, &late);
+        front.send(Topic::Zones, &zones(Verdict::Slow));
+        let line = echo.await_line("it again", |line| line["verdict"] == "slow");
+        assert_eq!(line["topic_seq"], 0, "a new life of the hub");
+        let outcome = echo.end(INT);
+        assert!(outcome.of_class("zones").iter().all(|line| line["verdict"] != "stop"), "{outcome}");
+        assert_eq!((rear.end(INT).code, program.end(INT).code), (Some(0), Some(0)));
+    });
+}
+
+#[test]
+fn a_hub_that_numbers_its_sensors_otherwise_keeps_them_apart() {
+    in_a_network("a_hub_that_numbers_its_sensors_otherwise_keeps_them_apart", || {
+        let stage = Stage::new();
+        let _simulator = stage.simulator(&["front", "rear"], &["--seed=63", "--baud=500000"]);
+        let mut listener = stage.start(&["listen", "--json", "--publish", "--interface=lo"]).ready();
+        let mut command = stage.command(&["gateway", "--json", "--interface=lo"]);
+        command.env("XDG_STATE_HOME", stage.path("state")).env_remove("STATE_DIRECTORY");
+        let mut gateway = Program::start(command);
+        let id = gateway.await_line("its begin", |line| line["class"] == "gateway")["hub"].clone();
+        let remote = |name: &str| format!("{}.{name}", id.as_str().unwrap_or_default());
+        let (front, rear) = (remote("front"), remote("rear"));
+        let hub = stage.hub(&[stage.link("front"), stage.link("rear")]);
+        listener.await_line("a sensor", |line| line["kind"] == "published");
+        listener.await_line("the other", |line| line["kind"] == "published");
+        let topics = [&front, &rear].map(|name| ["status", "scan"].map(|topic| format!("{name}/{topic}")));
+        let topics: Vec<_> = topics.iter().flatten().map(String::as_str).collect();
+        let mut echo = stage.echo(&topics);
+        let is_scan =
+            |line: &Value, name: &String| line["class"] == "scan" && line["sensor"] == name.as_str();
+        let first = echo.await_line("a life", |line| is_scan(line, &front))["boot"].clone();
+        assert_eq!(hub.end(TERM).code, Some(0));
+        let hub = stage.hub(&[stage.link("rear"), stage.link("front")]);
+        let is_next = |line: &Value, name| is_scan(line, name) && line["boot"] != first;
+        let next = echo.await_line("the next life", |line| is_next(line, &front))["boot"].clone();
+        echo.await_line("the next life of the other", |line| is_next(line, &rear));
+        assert_eq!(hub.end(TERM).code, Some(0));
+        // The one that has the other's number now takes it at once.
+        let _hub = stage.hub(&[stage.link("front")]);
+        echo.await_line("one is left", |line| is_next(line, &front) && line["boot"] != next);
+        stage.await_info(&rear, |info| info["state"] == "silent");
+        for line in echo.end(INT).of_class("status") {
+            let (sensor, port) =
+                (line["sensor"].as_str().unwrap_or_default(), line["port"].as_str().unwrap_or_default());
+            let name = sensor.rsplit('.').next().unwrap_or_default();
+            assert!(port.ends_with(name), "{line}");
+        }
+        assert_eq!((gateway.end(TERM).code, listener.end(TERM).code), (Some(0), Some(0)));
     });
 }
 

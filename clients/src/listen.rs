@@ -173,7 +173,8 @@ impl Listener<'_> {
         let (now, wall_ns) = (clock::now(), clock::wall_ns());
         let head = datagram.head;
         let Some(topic) = Topic::of_number(head.topic) else {
-            return self.announced(&datagram, wall_ns);
+            // What it says was said again, and better, by a newer one.
+            return if late { Ok(()) } else { self.announced(&datagram, wall_ns) };
         };
         let life = self.roll.life(&head);
         let age_ns = life.age_ns(head.stamp_ns, wall_ns);
@@ -226,7 +227,7 @@ impl Listener<'_> {
 
     /// What is due now and then.
     fn look(&mut self, now: Instant) -> Result<(), End> {
-        self.ear.look(now)?;
+        self.ear.look(now);
         if let Some(what) = self.ear.take_trouble() {
             self.trouble(&what)?;
         }

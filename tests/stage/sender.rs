@@ -59,6 +59,12 @@ impl Sender {
 
     /// Announces `topics` with their next numbers.
     pub(crate) fn announce(&mut self, topics: &[Topic]) {
+        let datagram = self.announcement(topics);
+        self.to(Announce::GROUP, &datagram);
+    }
+
+    /// The announcement of `topics` with their next numbers.
+    pub(crate) fn announcement(&mut self, topics: &[Topic]) -> Vec<u8> {
         let mut announce = Announce::new(self.boot, &self.name, "LMS200;301063;V02.30");
         for &topic in topics {
             let next = self.next[usize::from(topic.number())];
@@ -69,7 +75,7 @@ impl Sender {
         let stamp_ns = std::mem::replace(&mut self.stamp_ns, wall_ns());
         let datagram = self.seal(Announce::NUMBER, &mut buffer, len);
         self.stamp_ns = stamp_ns;
-        self.to(Announce::GROUP, &datagram);
+        datagram
     }
 
     /// Sends an empty payload of the topic with this number.
@@ -78,7 +84,8 @@ impl Sender {
         self.to(Announce::GROUP, &datagram);
     }
 
-    fn to(&self, group: u8, bytes: &[u8]) {
+    /// Sends these bytes to the group that ends in `group`.
+    pub(crate) fn to(&self, group: u8, bytes: &[u8]) {
         let [a, b, c] = GROUPS;
         let sent = self.socket.send_to(bytes, (Ipv4Addr::new(a, b, c, group), PORT));
         assert_eq!(sent.expect("the loopback takes it"), bytes.len());

@@ -110,7 +110,7 @@ impl Sensor {
     }
 
     fn take(&mut self, at: usize, sample: &Sample, lan: &mut Lan) {
-        let Sensor { name, tracks, heard, kind, model, .. } = self;
+        let Sensor { name, tracks, heard, kind, .. } = self;
         let track = &mut tracks[at];
         let Some(header) = sample.header().copied() else {
             // A silence has no header of its own: it is one of the last sample's sensor, if that still is this one.
@@ -128,12 +128,21 @@ impl Sensor {
         let is_new = heard.is_none_or(|heard| (heard.boot, heard.sensor) != (header.boot, header.sensor));
         if is_new {
             lan.claim(header.sensor, name);
+        } else if !lan.is_claimed(header.sensor, name) {
+            // What is left of a hub's life that is over: the number is another sensor's.
+            return;
         }
         *heard = Some(header);
         track.last = Some(header);
         if let Sample::Status(status) = sample {
             status.sensor_type().clone_into(kind);
         }
+        // Before its first sample: listeners would take that for one of whoever had the number before.
+        if is_new {
+            self.announce(lan);
+        }
+        let Sensor { tracks, model, .. } = self;
+        let track = &mut tracks[at];
         let Some(every) = track.every else { return };
         lan.miss(header.sensor, track.topic, sample.missed());
         let mut stamp_ns = header.wall_ns;
@@ -159,10 +168,6 @@ impl Sensor {
         }
         if is_due {
             lan.send(head(track.topic, &header, stamp_ns), |room| sample.pack(room));
-        }
-        // Listeners learn at once who it is, not a second later.
-        if is_new {
-            self.announce(lan);
         }
     }
 }

@@ -74,7 +74,8 @@ impl Publication {
     }
 
     /// `announce` came from the gateway that is called `hub`: makes what is not there yet of its sensor. The name of the
-    /// sensor here, if it is new.
+    /// sensor here, when all of it is there for the first time. Whoever had its number before has it no more, even if
+    /// there is no room for this one: no sensor's samples are ever another's.
     ///
     /// [`Kind::Short`] if memory, descriptors or places are; the sensors that are there go on.
     pub(super) fn announced(
@@ -84,7 +85,9 @@ impl Publication {
         announce: &Announce,
     ) -> Result<Option<String>, Failure> {
         let name = format!("{hub}.{}", announce.sensor());
-        let topics = announce.topics().iter().filter_map(|topic| Topic::of_number(topic.topic));
+        for sensor in self.sensors.iter_mut().filter(|sensor| sensor.is(head) && sensor.name != name) {
+            sensor.replaced();
+        }
         let at = self.sensors.iter().position(|sensor| sensor.name == name);
         if at.is_none() && self.sensors.len() == SENSORS {
             let what =
@@ -95,8 +98,11 @@ impl Publication {
                 "let another listener with another --domain have them",
             ));
         }
-        let missing: Vec<_> =
-            topics.filter(|&topic| at.is_none_or(|at| !self.sensors[at].has(topic))).collect();
+        let is_missing = |topic: &Topic| {
+            let is_announced = announce.topics().iter().any(|announced| announced.topic == topic.number());
+            is_announced && at.is_none_or(|at| !self.sensors[at].has(*topic))
+        };
+        let missing: Vec<_> = Topic::ALL.into_iter().filter(is_missing).collect();
         if at.is_none() || !missing.is_empty() {
             check_memory(sensor_bytes(&missing))?;
             check_descriptors((missing.len() as u64 + 1) * SERVICE_DESCRIPTORS)?;
@@ -109,15 +115,15 @@ impl Publication {
             }
         };
         let sensor = &mut self.sensors[at];
-        let is_new = !sensor.is_announced();
-        sensor.announced(head, announce.boot);
+        sensor.announced(head, announce);
         for &topic in &missing {
             sensor.add(&self.node, topic)?;
         }
         if !missing.is_empty() {
             allocate(&self.domain)?;
         }
-        Ok(is_new.then_some(name))
+        let is_told = std::mem::replace(&mut self.sensors[at].is_told, true);
+        Ok((!is_told).then_some(name))
     }
 
     /// Publishes `remote`, if it can be.

@@ -99,7 +99,7 @@ impl Row {
         self.seen[word] |= bit;
         self.received += 1;
         self.lowest = self.lowest.min(number);
-        self.next = self.next.max(number + 1);
+        self.next = self.next.max(number.saturating_add(1));
         if is_late {
             self.reordered += 1;
             return Fresh::Late;
@@ -115,7 +115,7 @@ impl Row {
     /// The number without wrapping: the nearest to what is known.
     fn number(&self, sequence: u32) -> i64 {
         let known = if self.received > 0 { self.highest } else { self.next };
-        known + i64::from(sequence.wrapping_sub(known as u32) as i32)
+        known.saturating_add(i64::from(sequence.wrapping_sub(known as u32) as i32))
     }
 
     fn has(&self, number: i64) -> bool {

@@ -3,7 +3,7 @@
 
 use std::time::{Duration, Instant};
 
-use schema::datagram::{Head, Packed, telegram};
+use schema::datagram::{Announce, Head, Packed, telegram};
 use schema::ipc::{
     self, Node, Notifier, Payload, Publisher, TopicService, UpdateConnections, WakeService, ZeroCopySend,
 };
@@ -19,6 +19,8 @@ pub(super) struct RemoteTopics {
     /// Gateway, its life, and the sensor's number in it, as last announced.
     source: Option<(u64, u32, u8)>,
     boot: u64,
+    /// It has all that was announced, and that was told.
+    pub(super) is_told: bool,
     telegram: Option<Outlet<[u8]>>,
     scan: Option<Outlet<Scan>>,
     marks: Option<Outlet<Marks>>,
@@ -28,6 +30,8 @@ pub(super) struct RemoteTopics {
     status: Option<Outlet<Status>>,
     /// The last status, and the header it came with.
     last: Option<(Status, Header)>,
+    /// The header of the last zones.
+    zoned: Option<Header>,
     heard_at: Option<Instant>,
     /// Why consumers are to be woken.
     news: Option<Wake>,
@@ -46,6 +50,7 @@ impl RemoteTopics {
             name: name.to_owned(),
             source: None,
             boot: 0,
+            is_told: false,
             telegram: None,
             scan: None,
             marks: None,
@@ -54,6 +59,7 @@ impl RemoteTopics {
             background: None,
             status: None,
             last: None,
+            zoned: None,
             heard_at: None,
             news: None,
             notifier: ipc::notifier(&wake)?,
@@ -89,18 +95,27 @@ impl RemoteTopics {
         Ok(())
     }
 
-    /// It was announced with `head`, in the hub's life `boot`.
-    pub(super) fn announced(&mut self, head: &Head, boot: u64) {
+    /// `announce` came with `head`: it is this one.
+    pub(super) fn announced(&mut self, head: &Head, announce: &Announce) {
         self.source = Some((head.hub, head.epoch, head.sensor));
-        if self.boot != 0 && self.boot != boot {
+        if self.boot != 0 && self.boot != announce.boot {
             self.begin_again();
         }
-        self.boot = boot;
+        self.boot = announce.boot;
     }
 
-    /// Whether it was announced.
-    pub(super) fn is_announced(&self) -> bool {
-        self.source.is_some()
+    /// Another sensor is announced with the number that this one had: nothing comes of it any more, which is said at once.
+    pub(super) fn replaced(&mut self) {
+        self.source = None;
+        self.heard_at = None;
+        if let (Some(mut header), Some(outlet)) = (self.zoned.take(), &mut self.zones) {
+            stamp(&mut header);
+            let number = outlet.own_number();
+            outlet.send(&header, number, |sample| *sample = Zones::unknown());
+            self.news = Some(Wake::Telegram);
+        }
+        self.silent();
+        self.wake();
     }
 
     /// It is the sensor that sent `head`.
@@ -116,7 +131,10 @@ impl RemoteTopics {
             Topic::Telegram => self.telegram.as_mut().map(|outlet| outlet.send_telegram(remote, header)),
             Topic::Scan => self.scan.as_mut().map(|outlet| outlet.unpack(remote, header)),
             Topic::Marks => self.marks.as_mut().map(|outlet| outlet.unpack(remote, header)),
-            Topic::Zones => self.zones.as_mut().map(|outlet| outlet.unpack(remote, header)),
+            Topic::Zones => {
+                self.zoned = Some(*header);
+                self.zones.as_mut().map(|outlet| outlet.unpack(remote, header))
+            }
             Topic::Foreground => self.foreground.as_mut().map(|outlet| outlet.unpack(remote, header)),
             Topic::Background => self.background.as_mut().map(|outlet| outlet.unpack(remote, header)),
             Topic::Status => {
@@ -182,11 +200,10 @@ impl RemoteTopics {
         status.state = State::Silent as u8;
         status.rate_mhz = 0;
         status.set_last_error("nothing comes over the network");
-        (header.stamp_first_ns, header.wall_ns) = (clock::now().monotonic_ns, clock::wall_ns());
-        header.stamp_last_ns = header.stamp_first_ns;
+        stamp(&mut header);
         if let Some(number) = self.status.as_mut().map(Outlet::own_number) {
             self.tell(status, &header, number);
-            self.news = Some(Wake::Status);
+            self.news = self.news.or(Some(Wake::Status));
         }
     }
 
@@ -213,8 +230,8 @@ struct Outlet<P: Payload + ?Sized> {
     /// The number of the next sample if none is left out before it. The first one has that of the network, so that
     /// consumers that outlive a listener see what was lost meanwhile.
     next: Option<u64>,
-    /// Life of the gateway, and number there, of the last one that came from the network.
-    last: (u32, u32),
+    /// Life of the gateway, sensor's number there, and its own number, of the last one that came from the network.
+    last: (u32, u8, u32),
     failed: u64,
     _service: TopicService<P>,
 }
@@ -225,23 +242,24 @@ impl<P: Payload + ?Sized> Outlet<P> {
         Ok(Outlet {
             publisher: P::publisher(&service)?,
             next: None,
-            last: (0, 0),
+            last: (0, 0, 0),
             failed: 0,
             _service: service,
         })
     }
 
     /// The number of the sample with `head`. All numbers between the last one and it are left out, be they lost or not
-    /// published; of a new life of the gateway all before it.
+    /// published; of a new life of the gateway all before it. Where the sensor has another number than before, those
+    /// before it may have been another one's: none counts.
     fn number(&mut self, head: &Head) -> u64 {
-        let (epoch, last) = self.last;
-        let left_out = if head.epoch == epoch {
-            head.sequence.wrapping_sub(last).wrapping_sub(1)
-        } else {
-            head.sequence
+        let (epoch, sensor, last) = self.last;
+        let left_out = match (head.epoch == epoch, head.sensor == sensor) {
+            (true, true) => head.sequence.wrapping_sub(last).wrapping_sub(1),
+            (true, false) => 0,
+            (false, _) => head.sequence,
         };
         let number = self.next.map_or(head.sequence.into(), |next| next + u64::from(left_out));
-        self.last = (head.epoch, head.sequence);
+        self.last = (head.epoch, head.sensor, head.sequence);
         self.next = Some(number + 1);
         number
     }
@@ -288,6 +306,12 @@ impl<P: Payload + ZeroCopySend + Default + Packed> Outlet<P> {
             let _ = sample.unpack(remote.datagram.payload);
         });
     }
+}
+
+/// What is said now, although nothing came.
+fn stamp(header: &mut Header) {
+    (header.stamp_first_ns, header.wall_ns) = (clock::now().monotonic_ns, clock::wall_ns());
+    header.stamp_last_ns = header.stamp_first_ns;
 }
 
 fn connect<P: Payload + ?Sized>(outlet: &Option<Outlet<P>>) {
