@@ -127,6 +127,9 @@ fn a_running_hub_is_asked_instead_and_a_dead_one_leaves_traces() {
     let before = stage.info("front");
     let (port, link) = (stage.word("front"), stage.link("front"));
     let (findings, _) = doctor(&stage, &[&link], 0);
+    // A link of the hub stands for its port.
+    let (named, _) = doctor(&stage, &["front"], 0);
+    assert_eq!(state(&named, "sensor", Some(&stage.word("front"))).0, "ok", "{named:#?}");
     let pid = format!("process {}", hub.pid());
     assert!(state(&findings, "domain", None).1.contains(&pid));
     assert!(state(&findings, "holder", Some(&port)).1.contains(&pid));

@@ -1,5 +1,5 @@
-//! What happens to networks and programs: the gateway outlives it, counts what it could not send, and sends again. How
-//! long that took is printed.
+//! What happens to networks and programs, as heard at the other end of the cable: the gateway outlives it, what it could
+//! not send is counted, and it sends again. How long that took is printed.
 
 mod stage;
 

@@ -221,6 +221,12 @@ fn what_is_no_light_is_refused() {
         assert!(error["message"].as_str().is_some_and(|message| message.contains(what)), "{outcome}");
         assert!(error["hint"].as_str().is_some_and(|hint| !hint.is_empty()), "{outcome}");
     }
+    let misspelt = stage.run(&["leds", "front", "--json", "--led=gren=rd"]);
+    let hint = misspelt.of_class("error")[0]["hint"].clone();
+    assert!(
+        hint.as_str().is_some_and(|hint| hint.starts_with("no light \"gren\": green=NAME")),
+        "{misspelt}"
+    );
     // One that was taken before another was refused shows the stop light.
     assert_eq!(fs::read_to_string(diodes.0.join("rd/brightness")).unwrap(), "255\n");
     // As with all that follow: bounded needs a hub, and a hub knows its sensors.

@@ -5,7 +5,8 @@ mod stage;
 
 use std::process::Command;
 
-use stage::{INT, Outcome, Program, Stage, TERM, is_class, number, sequence, until};
+use rustix::process::{Pid, Resource, Rlimit, getrlimit, prlimit};
+use stage::{INT, Outcome, Program, Stage, TERM, in_a_network, is_class, number, sequence, until};
 
 /// Starts the program with at most so many descriptors.
 fn limited<S: AsRef<str>>(stage: &Stage, limit: u64, arguments: &[S]) -> Program {
@@ -100,4 +101,22 @@ fn a_hub_that_runs_out_of_them_serves_on_whom_it_serves() {
     assert_eq!(outcome.code, Some(0), "{outcome}");
     assert!(outcome.errors.contains("attached but get nothing"), "{outcome}");
     assert!(outcome.errors.contains("a request was not received: descriptors are short: "), "{outcome}");
+}
+
+#[test]
+fn a_listener_that_runs_out_of_them_listens_on() {
+    in_a_network("a_listener_that_runs_out_of_them_listens_on", || {
+        let stage = Stage::new();
+        let mut listener = stage.start(&["listen", "--json", "--interface=lo"]).ready();
+        let pid = Pid::from_raw(listener.pid() as i32);
+        let maximum = getrlimit(Resource::Nofile).maximum;
+        let none = Rlimit { current: Some(0), maximum };
+        let usual = prlimit(pid, Resource::Nofile, none).expect("it may have fewer");
+        let told = listener.await_line("what is wrong", |line| line["kind"] == "trouble");
+        assert!(told["message"].to_string().contains("cannot list network interfaces"), "{told}");
+        prlimit(pid, Resource::Nofile, usual).expect("as before");
+        let outcome = listener.end(TERM);
+        assert_eq!(outcome.code, Some(0), "{outcome}");
+        assert_eq!(outcome.of_class("notice").len(), 1, "{outcome}");
+    });
 }

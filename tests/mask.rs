@@ -25,6 +25,13 @@ fn await_verdict(stage: &Stage, verdict: &str) {
 }
 
 #[test]
+fn no_time_at_all_is_refused() {
+    let outcome = Stage::new().run(&["zones", "front", "mask", "--for=0s", "--json"]);
+    assert_eq!(outcome.code, Some(78), "{outcome}");
+    assert_eq!(outcome.of_class("error")[0]["message"], "--for 0s sees nothing");
+}
+
+#[test]
 fn a_robot_that_knows_its_own_post_goes_on() {
     let stage = Stage::new();
     let _simulator = simulator(&stage, &world(&stage, POST));

@@ -65,6 +65,37 @@ fn check(outcome: &Outcome, whole: &[Vec<u8>]) {
 }
 
 #[test]
+fn a_recording_without_its_mode_has_marks_where_the_mode_is_set() {
+    let stage = Stage::new();
+    let bytes = (0..4).flat_map(stage::scan).collect::<Vec<u8>>();
+    let link = format!("--link=a=file:{}", stage.file("recording", &bytes));
+    let hub = stage.hub(&[&link]);
+    at_the_end(&stage);
+    let info = stage.run(&["info", "a"]).to_string();
+    assert!(info.contains("does not tell its measuring mode; set link.a.mode"), "{info}");
+    assert_eq!(stage.info("a")["marks"]["available"], Value::Null);
+    assert_eq!(hub.end(INT).code, Some(0));
+    let hub = stage.hub(&[&link, "--set=link.a.mode=0x01"]);
+    at_the_end(&stage);
+    let info = stage.info("a");
+    assert_eq!((&info["marks"]["available"], &info["mode"]), (&Value::Bool(true), &Value::from(1)), "{info}");
+    assert_eq!(hub.end(INT).code, Some(0));
+}
+
+#[test]
+fn the_reflectors_of_a_recording_are_marks() {
+    let Some(data) = data() else { return };
+    let recording = data.join("captures/reflector_levels_cm_18s.bin");
+    let stage = Stage::new();
+    let link = format!("--link=a=file:{}", recording.display());
+    let hub = stage.hub(&[&link, "--set=link.a.mode=0x01"]);
+    let outcome = stage.run(&["echo", "--json", "a/marks", "-n", "20"]);
+    let found = |line: &Value| line["marks"].as_array().map_or(0, Vec::len);
+    assert!(outcome.of_class("marks").iter().any(|line| found(line) == 5), "{outcome}");
+    assert_eq!(hub.end(INT).code, Some(0));
+}
+
+#[test]
 fn as_fast_as_it_can_be_read() {
     let stage = Stage::new();
     // No more than a consumer's buffer holds: nobody waits for it.

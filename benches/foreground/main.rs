@@ -14,8 +14,10 @@ mod play;
 mod rivals;
 mod score;
 
+use std::fmt;
+use std::io::{Write, stdout};
 use std::ops::Range;
-use std::process::ExitCode;
+use std::process::{ExitCode, exit};
 
 use lms::variant::Unit;
 use preprocess::background::{Method as Kind, Settings, Start};
@@ -84,10 +86,10 @@ fn measure(options: &Options) {
     let mut boxes = [Boxes::default(); METHODS.len()];
     let mut bytes = [Bytes::default(); METHODS.len()];
     if !options.json {
-        println!(
+        say(format_args!(
             "seeds {}..{}{:>34} {:>9} {:>11}",
             options.seeds.start, options.seeds.end, "recall", "precision", "wrong/scan"
-        );
+        ));
     }
     for (number, scene) in SCENES.iter().enumerate() {
         let mut scores = [Score::default(); METHODS.len()];
@@ -111,7 +113,7 @@ fn measure(options: &Options) {
 
 fn print_scores(scene: &Scene, scores: &[Score], json: bool) {
     if !json {
-        println!("{}", scene.name);
+        say(format_args!("{}", scene.name));
     }
     for (name, score) in METHODS.iter().zip(scores) {
         let (recall, precision, wrong) = (score.recall(), score.precision(), score.wrong_per_scan());
@@ -123,17 +125,17 @@ fn print_scores(scene: &Scene, scores: &[Score], json: bool) {
                 "class": "foreground_bench", "scene": scene.name, "world": scene.world, "mixed": scene.mixed,
                 "method": name, "recall": recall, "precision": precision, "wrong_per_scan": wrong, "met": is_met,
             });
-            println!("{line}");
+            say(format_args!("{line}"));
         } else {
             let verdict = is_met.map_or("", |met| if met { "met" } else { "missed" });
-            println!("  {name:<34} {recall:>8.4} {precision:>9.4} {wrong:>11.3}  {verdict}");
+            say(format_args!("  {name:<34} {recall:>8.4} {precision:>9.4} {wrong:>11.3}  {verdict}"));
         }
     }
 }
 
 fn print_boxes(boxes: &[Boxes], json: bool) {
     if !json {
-        println!("of a box, %{:>33} {:>17} {:>12}", "new after N", "left of it: N", "2N");
+        say(format_args!("of a box, %{:>33} {:>17} {:>12}", "new after N", "left of it: N", "2N"));
     }
     for (name, boxes) in METHODS.iter().zip(boxes) {
         let [new, gone, long_gone] = boxes.percents();
@@ -142,19 +144,19 @@ fn print_boxes(boxes: &[Boxes], json: bool) {
                 "class": "foreground_bench_box", "method": name, "scans": 375, "foreground_after_n_percent": new,
                 "background_after_n_percent": gone, "background_after_2n_percent": long_gone,
             });
-            println!("{line}");
+            say(format_args!("{line}"));
         } else {
-            println!("  {name:<34} {new:>8.2} {gone:>17.2} {long_gone:>12.2}");
+            say(format_args!("  {name:<34} {new:>8.2} {gone:>17.2} {long_gone:>12.2}"));
         }
     }
 }
 
 fn print_bytes(bytes: &[Bytes], json: bool) {
     if !json {
-        println!(
+        say(format_args!(
             "bytes a second in Fig. 8{:>18} {:>11} {:>7} {:>12}",
             "scans", "foreground", "ratio", "when empty"
-        );
+        ));
     }
     for (name, bytes) in METHODS.iter().zip(bytes).filter(|(name, _)| settings(name).is_some()) {
         let [scans, foreground, empty] = bytes.per_second();
@@ -164,10 +166,17 @@ fn print_bytes(bytes: &[Bytes], json: bool) {
                 "class": "foreground_bench_bytes", "method": name, "scan_bytes_per_s": scans,
                 "foreground_bytes_per_s": foreground, "empty_bytes_per_s": empty, "ratio": ratio,
             });
-            println!("{line}");
+            say(format_args!("{line}"));
         } else {
-            println!("  {name:<32} {scans:>8.0} {foreground:>11.0} {ratio:>7.2} {empty:>12.0}");
+            say(format_args!("  {name:<32} {scans:>8.0} {foreground:>11.0} {ratio:>7.2} {empty:>12.0}"));
         }
+    }
+}
+
+/// A line on stdout; who reads no further wants no more.
+fn say(line: fmt::Arguments<'_>) {
+    if writeln!(stdout(), "{line}").is_err() {
+        exit(0);
     }
 }
 

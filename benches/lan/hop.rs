@@ -1,15 +1,19 @@
 //! From shared memory to an application behind the loopback, beside an eventfd and a datagram of the same length.
 
+use std::io::Read;
+use std::process::{Command, Stdio};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::thread::{self, JoinHandle};
 use std::time::{Duration, SystemTime};
 
 use rustix::event::{EventfdFlags, eventfd};
+use rustix::process::{Signal, set_parent_process_death_signal};
 use schema::Topic;
 use schema::datagram::{Datagram, HEAD, Packed};
 
 use crate::source::{self, SENSOR, Source};
+use crate::support::child::Guard;
 use crate::support::figures::{Figure, Target, percentile};
 use crate::support::stage::Stage;
 use crate::support::{Outcome, clock};
@@ -20,8 +24,10 @@ const COUNT: usize = 800;
 const SETTLING: usize = 80;
 /// Two sensors at 37.5 Hz take 13 ms a telegram; here it is somewhat faster, so that runs are short.
 const PERIOD_NS: u64 = 7_000_000;
-/// Where in the header the stamp is.
-const STAMP: std::ops::Range<usize> = 24..32;
+/// Where in the header the number is.
+const NUMBER: std::ops::Range<usize> = 20..24;
+/// The words that make this program the sender of a bare run.
+pub(crate) const PART: [&str; 2] = ["part", "sender"];
 
 /// p50 and p99 of runs that take turns.
 pub(crate) fn figures(pairs: usize) -> Outcome<Vec<Figure>> {
@@ -65,33 +71,45 @@ fn through_gateway() -> Outcome<Run> {
 }
 
 fn bare() -> Outcome<Run> {
-    let (wake, mouth) = (eventfd(0, EventfdFlags::CLOEXEC)?, wire::mouth()?);
-    let mut datagram = vec![0; HEAD + source::scan().pack(&mut [0; 2048]).unwrap_or_default()];
-    let application =
-        Application::start(|bytes| Some(u64::from_le_bytes(bytes.get(STAMP)?.try_into().ok()?)))?;
+    let wake = eventfd(0, EventfdFlags::CLOEXEC)?;
     let stamps: Arc<[AtomicU64]> = (0..SETTLING + COUNT).map(|_| AtomicU64::new(0)).collect();
-    let (reading, theirs) = (wake.try_clone()?, stamps.clone());
-    let sender = thread::spawn(move || -> std::io::Result<()> {
-        let mut left = theirs.iter();
-        while left.len() > 0 {
-            let mut told = [0; 8];
-            rustix::io::read(&reading, &mut told)?;
-            // Who was late finds several.
-            for stamp in left.by_ref().take(u64::from_ne_bytes(told) as usize) {
-                datagram[STAMP].copy_from_slice(&stamp.load(Ordering::Acquire).to_le_bytes());
-                mouth.send_to(&datagram, wire::address(Topic::Scan))?;
-            }
-        }
-        Ok(())
-    });
+    let theirs = stamps.clone();
+    let application = Application::start(move |bytes| {
+        let number = u32::from_le_bytes(bytes.get(NUMBER)?.try_into().ok()?);
+        Some(theirs.get(number as usize)?.load(Ordering::Acquire))
+    })?;
+    let mut command = Command::new(std::env::current_exe()?);
+    let mut sender = command.args(PART).stdin(wake.try_clone()?).stdout(Stdio::piped()).spawn()?;
+    let stdout = sender.stdout.take();
+    let sender = Guard::new(sender);
+    stdout.ok_or("no pipe")?.read_exact(&mut [0; 1])?;
     let mut next = stamps.iter();
     paced(|| {
         next.next().ok_or("one too many")?.store(wall_ns(), Ordering::Release);
         rustix::io::write(&wake, &1u64.to_ne_bytes())?;
         Ok(())
     })?;
-    sender.join().map_err(|_| "the sender panicked")??;
+    sender.wait()?;
     application.end()
+}
+
+/// The process that a bare run wakes: sends a datagram with the next number each time that the eventfd, its stdin, tells.
+pub(crate) fn sender() -> Outcome<()> {
+    set_parent_process_death_signal(Some(Signal::TERM))?;
+    let mouth = wire::mouth()?;
+    let mut datagram = vec![0; HEAD + source::scan().pack(&mut [0; 2048]).unwrap_or_default()];
+    println!("ready");
+    let mut numbers = 0..(SETTLING + COUNT) as u32;
+    while !numbers.is_empty() {
+        let mut told = [0; 8];
+        rustix::io::read(rustix::stdio::stdin(), &mut told)?;
+        // Who was late finds several.
+        for number in numbers.by_ref().take(u64::from_ne_bytes(told) as usize) {
+            datagram[NUMBER].copy_from_slice(&number.to_le_bytes());
+            mouth.send_to(&datagram, wire::address(Topic::Scan))?;
+        }
+    }
+    Ok(())
 }
 
 /// Ages in us, sorted, and how many did not come.

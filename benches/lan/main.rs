@@ -27,13 +27,16 @@ use support::stage::{PATIENCE, SENSORS, Stage};
 use wire::{Program, is_of, number};
 
 fn main() -> ExitCode {
-    match wire::inside() {
-        true => support::main(measure),
-        false => wire::enter().unwrap_or_else(|error| {
-            eprintln!("{error}");
-            ExitCode::FAILURE
-        }),
-    }
+    let is_sender = std::env::args().skip(1).eq(hop::PART);
+    let outcome = match (wire::inside(), is_sender) {
+        (true, true) => hop::sender().map(|()| ExitCode::SUCCESS),
+        (true, false) => return support::main(measure),
+        (false, _) => wire::enter(),
+    };
+    outcome.unwrap_or_else(|error| {
+        eprintln!("{error}");
+        ExitCode::FAILURE
+    })
 }
 
 fn measure(options: &Options) -> Outcome<()> {

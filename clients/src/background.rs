@@ -55,7 +55,7 @@ pub fn background(
     check_sensor(sensor)?;
     let ask = |verb| request(places, &Request::new(sensor, verb), stop);
     let mut output = Output::new(out);
-    let mut taken = |verb: Verb| {
+    let taken = |output: &mut Output<'_>, verb: Verb| {
         quiet(if *json {
             output.json(&json::control(sensor, verb))
         } else {
@@ -63,12 +63,22 @@ pub fn background(
         })
     };
     match order {
-        ModelOrder::Reset => ask(Verb::Reset).and_then(|_| taken(Verb::Reset)),
-        ModelOrder::Freeze => ask(Verb::Freeze).and_then(|_| taken(Verb::Freeze)),
-        ModelOrder::Thaw => ask(Verb::Thaw).and_then(|_| taken(Verb::Thaw)),
+        ModelOrder::Reset => {
+            ask(Verb::Reset)?;
+            let is_frozen = !json && shown(sensor, ask(Verb::Show)?)?.is_frozen();
+            taken(&mut output, Verb::Reset)?;
+            if is_frozen {
+                let hint =
+                    format!("it is frozen: nothing is learned until `scanhub background {sensor} thaw`");
+                quiet(output.line(|line| write!(line, "{hint}")))?;
+            }
+            Ok(())
+        }
+        ModelOrder::Freeze => ask(Verb::Freeze).and_then(|_| taken(&mut output, Verb::Freeze)),
+        ModelOrder::Thaw => ask(Verb::Thaw).and_then(|_| taken(&mut output, Verb::Thaw)),
         ModelOrder::Load(model) => {
             request(places, &Request::load(sensor, model), stop)?;
-            taken(Verb::Load)
+            taken(&mut output, Verb::Load)
         }
         ModelOrder::Show => {
             let model = shown(sensor, ask(Verb::Show)?)?;
@@ -106,6 +116,16 @@ fn save(
     if model.count == 0 {
         let hint = format!("a scan has to come first: `scanhub info {sensor}` shows how it is");
         return Err(Failure::new(Kind::Failed, format!("{sensor} has no background model yet"), hint));
+    }
+    if model.taught == 0 {
+        let hint = format!(
+            "learning takes some seconds: `scanhub background {sensor} show`; frozen it learns nothing"
+        );
+        return Err(Failure::new(
+            Kind::Failed,
+            format!("the background of {sensor} knows no beam yet"),
+            hint,
+        ));
     }
     let object = as_json(sensor, model);
     if file == Path::new(STANDARD) {

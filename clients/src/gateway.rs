@@ -7,9 +7,11 @@ mod outlet;
 mod report;
 mod selection;
 mod sensor;
+mod spare;
 mod uplink;
 
 use std::io::Write;
+use std::os::fd::AsFd;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
@@ -26,6 +28,7 @@ use life::Life;
 use report::Report;
 use selection::Selection;
 use sensor::Sensor;
+use spare::Spare;
 use uplink::Uplink;
 
 /// What `gateway` is asked for.
@@ -63,20 +66,22 @@ pub enum GatewayLook {
 }
 
 /// Sends until `stop` is set, whatever becomes of the hub and of the network. The account goes to `out` at the end and
-/// whenever `tell` is set; what is no account to `notes` (stderr) if `out` is not JSON.
+/// whenever `tell` is set; what is no account to `notes` (stderr) if `out` is not JSON. Lines for which there is no room
+/// are left out: whoever does not read delays nothing but the end, and that by a second.
 ///
 /// [`Kind::Configuration`] if there is no such interface or not just one, a destination is no host, or a
 /// value is not possible; [`Kind::NoTopic`] if there is no such topic, or the first hub that is met has no
 /// such sensor; [`Kind::Short`] if descriptors or memory are.
 pub fn gateway(
     options: &GatewayOptions,
-    out: &mut dyn Write,
-    notes: &mut dyn Write,
+    out: &mut (impl Write + AsFd),
+    notes: &mut (impl Write + AsFd),
     tell: &AtomicBool,
     stop: &AtomicBool,
 ) -> Result<(), Failure> {
     let mut gateway = Gateway::open(options)?;
-    let mut report = Report::new(options.look, out, notes);
+    let (mut out, mut notes) = (Spare::new(out, stop), Spare::new(notes, stop));
+    let mut report = Report::new(options.look, &mut out, &mut notes);
     quiet(gateway.run(&mut report, tell, stop))
 }
 

@@ -115,7 +115,7 @@ fn properties(sensor: &str, status: &Status, now_ns: u64) -> Vec<Vec<String>> {
         ),
         row("  rate", format!("{:.2} Hz", f64::from(status.rate_mhz) / 1000.0)),
         row("  pose", pose(&status.pose)),
-        row("  marks", marks(status)),
+        row("  marks", marks(sensor, status)),
     ];
     if !status.last_error().is_empty() {
         rows.push(row("  last error", status.last_error().into()));
@@ -129,8 +129,11 @@ fn pose(pose: &Pose) -> String {
     format!("x {x_m} m, y {y_m} m, yaw {:.1} deg{mounted}", yaw_rad.to_degrees())
 }
 
-fn marks(status: &Status) -> String {
+fn marks(sensor: &str, status: &Status) -> String {
     match (status.has_reflector_bits(), status.reflector_remedy()) {
+        (None, _) if status.is_replayed() => {
+            format!("unavailable: the recording does not tell its measuring mode; set link.{sensor}.mode")
+        }
         (None, _) => "unknown".into(),
         (Some(true), _) => "available".into(),
         (Some(false), None) => "unavailable: the recording has no reflector bits".into(),

@@ -95,7 +95,7 @@ fn wanted<'a>(sensor: &str, leds: &'a [String]) -> Result<Vec<(Light, &'a str)>,
             |hint: &str| Err(Failure::new(Kind::Configuration, format!("--led {led} cannot be shown"), hint));
         let Some((light, name)) = led.split_once('=') else { return refuse(LED_FORM) };
         let Some(light) = Light::ALL.into_iter().find(|it| it.name() == light) else {
-            return refuse(LED_FORM);
+            return refuse(&format!("no light {light:?}: {LED_FORM}"));
         };
         if light == Light::Mark && sensor == ROBOT {
             return refuse("marks are one sensor's: name the sensor");

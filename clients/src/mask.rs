@@ -53,6 +53,10 @@ pub fn mask(
         let message = format!("--within {within_m} is no radius");
         return Err(Failure::new(Kind::Configuration, message, "metres from the robot's centre, at most 65"));
     }
+    if run_for.is_zero() {
+        let message = "--for 0s sees nothing";
+        return Err(Failure::new(Kind::Configuration, message, "--for 10s, which is what it is without it"));
+    }
     let topics = [Topic::Status, Topic::Zones, Topic::Scan];
     let names: Vec<_> = topics.into_iter().map(|topic| TopicName { sensor: sensor.clone(), topic }).collect();
     let bounds = Bounds { run_for: Some(*run_for), ..Bounds::default() };

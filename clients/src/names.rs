@@ -18,17 +18,12 @@ impl TopicName {
     ///
     /// [`Kind::NoTopic`] with the topics that there are, [`Kind::Configuration`] if the sensor's name is not possible.
     pub fn parse(text: &str) -> Result<TopicName, Failure> {
-        let unknown = |sensor: &str| {
-            let topics: Vec<_> =
-                Topic::ALL.iter().map(|topic| format!("{sensor}/{}", topic.name())).collect();
-            Failure::new(
-                Kind::NoTopic,
-                format!("no topic {text:?}"),
-                format!("there are {}", topics.join(", ")),
-            )
+        let unknown = |how: String| {
+            Failure::new(Kind::NoTopic, format!("no topic {text:?}"), format!("{how}{}", topics()))
         };
-        let (sensor, topic) = text.split_once('/').ok_or_else(|| unknown(text))?;
-        let topic = Topic::parse(topic).ok_or_else(|| unknown(sensor))?;
+        let (sensor, word) =
+            text.split_once('/').ok_or_else(|| unknown("write SENSOR/TOPIC, as front/zones; ".into()))?;
+        let topic = Topic::parse(word).ok_or_else(|| unknown(nearest(sensor, word)))?;
         let name = TopicName { sensor: sensor.to_owned(), topic };
         if sensor == ROBOT && topic != Topic::Zones {
             let hint = format!("{ROBOT} stands for all sensors, and only their zones add up: {ROBOT}/zones");
@@ -51,6 +46,22 @@ impl fmt::Display for TopicName {
         write!(f, "{}/{}", self.sensor, self.topic.name())
     }
 }
+
+/// All topics of a sensor.
+fn topics() -> String {
+    format!("topics are {}", Topic::ALL.map(Topic::name).join(", "))
+}
+
+/// The topic that `word` may have been meant for, if one is near.
+fn nearest(sensor: &str, word: &str) -> String {
+    let near = |topic: &Topic| strsim::jaro_winkler(topic.name(), word);
+    let nearest = Topic::ALL.into_iter().max_by(|a, b| near(a).total_cmp(&near(b)));
+    let nearest = nearest.filter(|topic| near(topic) > NEAR);
+    nearest.map_or(String::new(), |topic| format!("did you mean {sensor}/{}? ", topic.name()))
+}
+
+/// From here on a word may be meant for another: 1 is the same, 0 has nothing of it.
+const NEAR: f64 = 0.8;
 
 /// The hub has no `sensor`, but `sensors`.
 pub(crate) fn no_sensor(sensor: &str, sensors: &[String]) -> Failure {
@@ -75,8 +86,12 @@ mod tests {
         for bad in ["front", "front/scam", "front/scan/x", ""] {
             let failure = TopicName::parse(bad).unwrap_err();
             assert_eq!(failure.kind, Kind::NoTopic, "{bad}");
-            assert!(failure.hint.contains("/telegram"), "{failure}");
+            assert!(failure.hint.contains("topics are telegram, scan, "), "{failure}");
         }
+        let hint = |text: &str| TopicName::parse(text).unwrap_err().hint;
+        assert!(hint("zones").starts_with("write SENSOR/TOPIC, as front/zones; topics are "));
+        assert!(hint("front/backgroud").starts_with("did you mean front/background? topics are "));
+        assert!(hint("front/x").starts_with("topics are "));
         assert!(TopicName::parse("robot/zones").unwrap().is_robot());
         assert!(!TopicName::parse("front/zones").unwrap().is_robot());
         let failure = TopicName::parse("robot/scan").unwrap_err();

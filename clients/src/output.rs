@@ -52,22 +52,44 @@ impl<'a> Output<'a> {
 
     /// A line of JSON.
     pub(crate) fn json(&mut self, value: &impl Serialize) -> Result<(), End> {
-        self.line(|line| serde_json::to_writer(line, value).map_err(io::Error::from))
+        self.line.clear();
+        serde_json::to_writer(&mut self.line, value).map_err(io::Error::from)?;
+        self.end()
     }
 
-    /// A line that `build` makes, without its end.
+    /// A line of text that `build` makes, without its end. What would move a terminal's cursor or change its colours is
+    /// shown as `?`: ports, types and errors may come from another machine.
     pub(crate) fn line(&mut self, build: impl FnOnce(&mut Vec<u8>) -> io::Result<()>) -> Result<(), End> {
         self.line.clear();
         build(&mut self.line)?;
-        self.line.push(b'\n');
-        self.out.write_all(&self.line)?;
-        Ok(self.out.flush()?)
+        disarm(&mut self.line);
+        self.end()
     }
 
     /// Bytes as they are.
     pub(crate) fn raw(&mut self, bytes: &[u8]) -> Result<(), End> {
         self.out.write_all(bytes)?;
         Ok(self.out.flush()?)
+    }
+
+    fn end(&mut self) -> Result<(), End> {
+        self.line.push(b'\n');
+        self.out.write_all(&self.line)?;
+        Ok(self.out.flush()?)
+    }
+}
+
+/// Puts `?` in place of each byte of the control characters of UTF-8 `text`: C0, DEL and C1 (ECMA-48).
+fn disarm(text: &mut [u8]) {
+    let mut before = 0;
+    for at in 0..text.len() {
+        let byte = text[at];
+        if byte < 0x20 || byte == 0x7f {
+            text[at] = b'?';
+        } else if before == 0xc2 && byte < 0xa0 {
+            text[at - 1..=at].fill(b'?');
+        }
+        before = byte;
     }
 }
 
@@ -94,4 +116,29 @@ pub(crate) fn table(output: &mut Output<'_>, rows: &[Vec<String>]) -> Result<(),
         })?;
     }
     Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn line(text: &str) -> String {
+        let mut out = Vec::new();
+        Output::new(&mut out).line(|line| write!(line, "{text}")).unwrap();
+        String::from_utf8(out).unwrap()
+    }
+
+    #[test]
+    fn text_does_not_command_a_terminal() {
+        assert_eq!(line("\x1b[2J a\rb\nc\td \x7f"), "?[2J a?b?c?d ?\n");
+        assert_eq!(line("\u{80}x\u{9b}31m\u{9f}"), "??x??31m??\n");
+        assert_eq!(line("/dev/ttyUSB0 \u{a0}20 °C ● Größe"), "/dev/ttyUSB0 \u{a0}20 °C ● Größe\n");
+    }
+
+    #[test]
+    fn json_says_what_is_there() {
+        let mut out = Vec::new();
+        Output::new(&mut out).json(&"\x1b[2J\n").unwrap();
+        assert_eq!(out, b"\"\\u001b[2J\\n\"\n");
+    }
 }

@@ -59,8 +59,9 @@ impl Drop for Keeper {
 fn obey(model: &mut Background, verb: Verb, wanted: &Background) -> Result<Option<Background>, Failure> {
     match verb {
         Verb::Reset => {
-            let Background { generation, count, unit_mm, .. } = *model;
-            *model = Background { generation: generation + 1, count, unit_mm, ..Background::default() };
+            let Background { generation, count, unit_mm, flags, .. } = *model;
+            *model =
+                Background { generation: generation + 1, count, unit_mm, flags, ..Background::default() };
         }
         Verb::Freeze => model.flags = Background::FROZEN,
         Verb::Thaw => model.flags = 0,
@@ -194,6 +195,26 @@ fn nothing_is_saved_by_halves() {
     assert!(!fs::metadata("/dev/null").unwrap().is_file());
     let left: Vec<_> = fs::read_dir(&place.base).unwrap().map(|entry| entry.unwrap().file_name()).collect();
     assert!(left.iter().all(|name| !name.to_string_lossy().starts_with('.')), "{left:?}");
+}
+
+#[test]
+fn a_model_that_knows_nothing_takes_no_others_place() {
+    let place = Place::new();
+    let _keeper = Keeper::new(&place.domain, model());
+    let file = place.base.join("model.json");
+    let say = |order| ask(&place, "front", order, false);
+    say(ModelOrder::Save(file.clone())).0.unwrap();
+    say(ModelOrder::Freeze).0.unwrap();
+    let (_, out) = say(ModelOrder::Reset);
+    let hint = "it is frozen: nothing is learned until `scanhub background front thaw`";
+    assert_eq!(out, format!("front: reset taken\n{hint}\n"));
+    for to in [file.clone(), "-".into()] {
+        let (end, out) = say(ModelOrder::Save(to));
+        let failure = end.unwrap_err();
+        assert_eq!(failure.message, "the background of front knows no beam yet");
+        assert_eq!((failure.kind, out.as_str()), (Kind::Failed, ""));
+    }
+    assert_eq!(saved_model(&file, "front", false, &mut &b""[..]).unwrap().taught, 3);
 }
 
 #[test]

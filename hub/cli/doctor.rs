@@ -12,7 +12,7 @@ use super::{Everywhere, Run};
 
 #[derive(Args, Debug)]
 pub(crate) struct Doctor {
-    /// A tty or tcp:HOST:PORT; without one those of the configuration, else all that there are
+    /// A tty or tcp:HOST:PORT, or the name of a link of the running hub; without one those of the configuration, else all that there are
     #[arg(value_name = "PORT")]
     ports: Vec<String>,
     #[command(flatten)]

@@ -124,6 +124,9 @@ impl File {
         if self.taught != taught {
             return Err(format!("taught is {}, and {taught} beams are", self.taught));
         }
+        if taught == 0 {
+            return Err("it knows no beam".to_owned());
+        }
         (model.taught, model.flags) = (taught as u16, if self.frozen { Background::FROZEN } else { 0 });
         Ok(model)
     }
@@ -191,6 +194,14 @@ mod tests {
         assert!(text(&model(101)).starts_with(&[begin, then].concat()));
         assert!(text(&model(101)).ends_with(r#"null],"far":[2]}"#));
         assert!(text(&Background::default()).contains(r#""first_angle_deg":null,"#), "before the first scan");
+    }
+
+    #[test]
+    fn a_model_that_knows_nothing_is_none() {
+        let empty = Background { count: 361, unit_mm: 1, ..Background::default() };
+        let failure = SavedModel::parse(text(&empty).as_bytes(), "m").unwrap_err();
+        let expected = "m is no background model: it knows no beam";
+        assert_eq!((failure.kind, failure.message.as_str()), (Kind::Configuration, expected));
     }
 
     #[test]

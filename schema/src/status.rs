@@ -71,8 +71,13 @@ impl Status {
     /// The command that gives the sensor reflector bits, if it has none and is no recording: they live in its EEPROM,
     /// which only a person changes.
     pub fn reflector_remedy(&self) -> Option<String> {
-        let is_wanted = self.has_reflector_bits() == Some(false) && !self.port().starts_with("file:");
+        let is_wanted = self.has_reflector_bits() == Some(false) && !self.is_replayed();
         is_wanted.then(|| format!("scanhub configure {} mode=0x01", self.port()))
+    }
+
+    /// Whether the sensor is a recording, of which nothing can be asked.
+    pub fn is_replayed(&self) -> bool {
+        self.port().starts_with("file:")
     }
 
     /// What the sensor calls itself; empty if unknown.

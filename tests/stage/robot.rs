@@ -36,10 +36,8 @@ impl Robot {
     }
 
     /// A gateway that has begun, on the only interface that can be meant.
-    pub(crate) fn gateway<S: AsRef<std::ffi::OsStr>>(&self, flags: &[S]) -> Program {
-        let mut command = self.stage.command(&["gateway", "--json"]);
-        command.args(flags).env("XDG_STATE_HOME", self.stage.path("state")).env_remove("STATE_DIRECTORY");
-        let mut gateway = Program::start(command);
+    pub(crate) fn gateway<S: AsRef<str>>(&self, flags: &[S]) -> Program {
+        let mut gateway = self.stage.gateway_at(flags);
         let begin = gateway.await_line("its begin", is_class("gateway"));
         assert_eq!(begin["interface"], "eth0");
         gateway

@@ -82,7 +82,7 @@ impl Lan {
     /// Datagrams of at most `longest` bytes, as `life`, to the groups on `interface`, which routers pass on `ttl` times,
     /// and to the hosts in `to`.
     ///
-    /// [`Kind::Configuration`] if `longest` is not possible or a host is none; [`Kind::Failed`] without sockets.
+    /// [`Kind::Configuration`] if `longest` is not possible, a host is none or is named twice; [`Kind::Failed`] without sockets.
     pub(super) fn open(
         life: Life,
         interface: Uplink,
@@ -102,7 +102,16 @@ impl Lan {
             Form::Bare => (BARE_PORT, u16::from(u8::MAX)),
         };
         let groups = Outlet::groups(interface.name(), port, ttl)?;
-        let copies = to.iter().map(|text| Outlet::host(text, more)).collect::<Result<_, _>>()?;
+        let mut copies: Vec<Outlet> = Vec::new();
+        for text in to {
+            let copy = Outlet::host(text, more)?;
+            if let Some(other) = copies.iter().find(|other| other.is_as(&copy)) {
+                let what = format!("cannot send to {text}: it is named twice");
+                let hint = format!("{} gets a copy already; name each host and port once", other.name);
+                return Err(Failure::new(Kind::Configuration, what, hint));
+            }
+            copies.push(copy);
+        }
         let (sensors, buffer) = (Vec::new(), [0; MTU_ETHERNET]);
         let mut lan = Lan { life, interface, groups, copies, sensors, form, longest, buffer };
         lan.use_interface();

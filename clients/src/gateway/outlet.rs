@@ -33,7 +33,7 @@ pub(super) struct Outlet {
     trouble: Option<u32>,
 }
 
-#[derive(Clone, Copy, Debug)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum To {
     /// All groups.
     Groups {
@@ -88,6 +88,11 @@ impl Outlet {
             return Err(refuse(format!("cannot send to {text}: the port is not possible"), &hint));
         }
         Outlet::new(text, To::Host(address))
+    }
+
+    /// What is sent to `other` gets to the same place.
+    pub(super) fn is_as(&self, other: &Outlet) -> bool {
+        self.to == other.to
     }
 
     /// Lets the groups be those on interface number `index`.

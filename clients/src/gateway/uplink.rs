@@ -2,6 +2,7 @@
 //! takes datagrams for an interface whose cable is out, and says nothing. Refuses to know what is sent.
 
 use std::os::fd::OwnedFd;
+use std::time::{Duration, Instant};
 
 use rustix::io::Errno;
 use rustix::net::netlink::SocketAddrNetlink;
@@ -17,7 +18,12 @@ pub(super) struct Uplink {
     events: OwnedFd,
     index: Option<u32>,
     is_up: bool,
+    /// When the kernel is asked again that could not tell.
+    again_at: Option<Instant>,
 }
+
+/// Between two questions to a kernel that cannot tell, because descriptors or memory are short.
+const AGAIN: Duration = Duration::from_millis(500);
 
 impl Uplink {
     /// The interface called `name`; without a name the only one that is up, not the loopback, and has multicast and an
@@ -33,7 +39,8 @@ impl Uplink {
             Some(name) => named(name)?,
             None => only(interfaces()?)?,
         };
-        let mut uplink = Uplink { name: found.name.clone(), events, index: None, is_up: false };
+        let mut uplink =
+            Uplink { name: found.name.clone(), events, index: None, is_up: false, again_at: None };
         uplink.learn(Some(&found));
         Ok(uplink)
     }
@@ -54,9 +61,10 @@ impl Uplink {
     }
 
     /// Takes note of what changed since the last call; whether that was the number or the state of this interface. One
-    /// system call as long as nothing did.
+    /// system call as long as nothing did. If the kernel cannot tell what there is now, all stays as it is and it is asked
+    /// again.
     pub(super) fn look(&mut self) -> bool {
-        let mut any = false;
+        let mut any = self.again_at.is_some_and(|at| Instant::now() >= at);
         // More than can wait are an error that stands for them.
         while let Ok(_) | Err(Errno::NOBUFS) = recv(&self.events, &mut [0; 64], RecvFlags::DONTWAIT) {
             any = true;
@@ -65,8 +73,11 @@ impl Uplink {
             return false;
         }
         let before = (self.index, self.is_up);
-        // Who is not told the interfaces takes it for gone, and hears of the next event.
-        let all = interfaces().unwrap_or_default();
+        let Ok(all) = interfaces() else {
+            self.again_at = Some(Instant::now() + AGAIN);
+            return false;
+        };
+        self.again_at = None;
         self.learn(all.iter().find(|one| one.name == self.name));
         before != (self.index, self.is_up)
     }

@@ -37,6 +37,14 @@ impl Device {
     /// [`Kind::Configuration`] with the lights that there are if it is not one of them, [`Kind::Failed`] with whose it
     /// is if it may not be switched.
     pub(crate) fn open(root: &Path, name: &str) -> Result<(Device, Option<String>), Failure> {
+        if !root.is_dir() {
+            let message = format!("{} is no directory", root.display());
+            return Err(Failure::new(
+                Kind::Configuration,
+                message,
+                "--led-root names the one with the lights",
+            ));
+        }
         let directory = root.join(name);
         let is_name = !name.is_empty() && !name.contains('/') && name != "." && name != "..";
         if !is_name || !directory.join(BRIGHTNESS).is_file() {
@@ -200,6 +208,8 @@ mod tests {
             if !plugged.is_empty() {
                 root.plug(plugged, "");
             }
+            let nowhere = Device::open(&root.0.join("nowhere"), "red").err().unwrap();
+            assert!(nowhere.message.ends_with("/nowhere is no directory"), "{nowhere}");
             for name in ["blue", "", "..", "red/../red"] {
                 let failure = Device::open(&root.0, name).err().unwrap();
                 assert_eq!(failure.kind, Kind::Configuration, "{name}");

@@ -20,7 +20,7 @@ pub(super) struct Ear {
     only: Option<String>,
     joined: Vec<Joined>,
     look_at: Instant,
-    /// Why the groups could not be joined somewhere.
+    /// Why the groups could not be joined somewhere, or the interfaces not be had.
     trouble: Option<String>,
 }
 
@@ -67,20 +67,25 @@ impl Ear {
             look_at: now,
             trouble: None,
         };
-        ear.look(now)?;
+        ear.look(now);
         Ok(ear)
     }
 
     /// Joins the groups where a link came or came back, if the last look is long enough ago. A switch that filters by
-    /// group has forgotten us when a cable was pulled, and an interface that was made anew never knew us.
-    ///
-    /// [`Kind::Failed`] if the system does not tell its interfaces.
-    pub(super) fn look(&mut self, now: Instant) -> Result<(), Failure> {
+    /// group has forgotten us when a cable was pulled, and an interface that was made anew never knew us. If the system does
+    /// not tell its interfaces, all stays as it is until the next look.
+    pub(super) fn look(&mut self, now: Instant) {
         if now < self.look_at {
-            return Ok(());
+            return;
         }
         self.look_at = now + LOOK_EVERY;
-        let all = interfaces()?;
+        let all = match interfaces() {
+            Ok(all) => all,
+            Err(failure) => {
+                self.trouble = Some(failure.to_string());
+                return;
+            }
+        };
         self.joined.retain(|joined| all.iter().any(|interface| interface.index == joined.index));
         for interface in &all {
             if !self.wants(interface) {
@@ -92,7 +97,6 @@ impl Ear {
                 _ => {}
             }
         }
-        Ok(())
     }
 
     /// The names of the interfaces on which it hears.
@@ -100,7 +104,7 @@ impl Ear {
         self.joined.iter().map(|joined| joined.name.as_str()).collect()
     }
 
-    /// Why the groups could not be joined somewhere, when that was tried last.
+    /// Why the groups could not be joined somewhere, or the interfaces not be had, when that was tried last.
     pub(super) fn take_trouble(&mut self) -> Option<String> {
         self.trouble.take()
     }

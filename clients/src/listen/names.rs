@@ -18,7 +18,10 @@ impl Names {
                 Failure::new(Kind::Configuration, format!("--name {text}: {what}"), hint)
             };
             let (name, hub) = text.split_once('=').ok_or_else(|| wrong("no hub is named"))?;
-            check_sensor(name)?;
+            check_sensor(name).map_err(|failure| {
+                let what = format!("--name {text}: {name:?} cannot be a hub's name here");
+                Failure::new(failure.kind, what, format!("{HUB_NAMES}, for example robot1"))
+            })?;
             let is_hex = hub.len() == 16 && hub.bytes().all(|byte| byte.is_ascii_hexdigit());
             let hub = u64::from_str_radix(hub, 16).ok().filter(|_| is_hex);
             let hub = hub.ok_or_else(|| wrong("a hub is 16 hex digits"))?;
@@ -37,6 +40,9 @@ impl Names {
     }
 }
 
+/// What a hub may be called: its sensors are `HUB.SENSOR`, and each half has the same form; `robot` stands for all.
+const HUB_NAMES: &str = "1 to 24 of a-z, 0-9, _ and -, but not robot";
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -46,6 +52,8 @@ mod tests {
         let parse = |texts: &[&str]| Names::parse(&texts.iter().map(|&text| text.into()).collect::<Vec<_>>());
         let names = parse(&["robot1=00000000000000ab"]).unwrap();
         assert_eq!((names.of(0xab), names.of(1)), ("robot1".into(), "0000000000000001".into()));
+        let failure = parse(&["Robot=00000000000000ab"]).map(drop).unwrap_err();
+        assert!(failure.message.contains("hub's name") && failure.hint.contains("robot1"), "{failure}");
         for bad in [
             &["robot1"][..],
             &["Robot=00000000000000ab"],

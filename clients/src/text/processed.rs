@@ -2,7 +2,7 @@
 
 use std::io::{self, Write};
 
-use schema::{Background, Foreground, Header, Marks, Verdict};
+use schema::{Background, Flags, Foreground, Header, Marks, Verdict};
 
 use super::numbers;
 use crate::robot::Robot;
@@ -11,9 +11,19 @@ use crate::zones::Heard;
 pub(crate) fn marks(line: &mut Vec<u8>, header: &Header, marks: &Marks) -> io::Result<()> {
     numbers(line, header)?;
     if !marks.is_available() {
-        return write!(line, " unavailable: the sensor's measuring mode has no reflector bits");
+        // A sample does not tell whether the mode of a recording is known; `info` does.
+        return if header.flags & Flags::REPLAYED != 0 {
+            write!(
+                line,
+                " unavailable: the recording has no reflector bits, or does not tell its measuring mode: "
+            )?;
+            write!(line, "then set link.NAME.mode")
+        } else {
+            write!(line, " unavailable: the sensor's measuring mode has no reflector bits")
+        };
     }
-    write!(line, " {} marks", marks.marks().len())?;
+    let count = marks.marks().len();
+    write!(line, " {count} {}", if count == 1 { "mark" } else { "marks" })?;
     for mark in marks.marks() {
         let (angle_deg, range_mm) = (f64::from(mark.angle_mdeg) / 1000.0, f64::from(mark.range_dmm) / 10.0);
         write!(line, ", {range_mm:.1} mm at {angle_deg:.3} deg")?;

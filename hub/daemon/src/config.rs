@@ -7,7 +7,7 @@ mod sources;
 use std::path::PathBuf;
 
 use lms::family::Family;
-use lms::variant::{Baud, Unit, Variant};
+use lms::variant::{Baud, Mode, Unit, Variant};
 use schema::{Failure, Kind};
 
 use crate::layer::{Drafts, parse};
@@ -38,6 +38,8 @@ pub struct Link {
     pub variant: Variant,
     /// Unit that the sensor is expected to measure in, if the user said one; it is compared, never written.
     pub unit: Option<Unit>,
+    /// Measuring mode of a recording that does not tell it; a sensor is asked.
+    pub mode: Option<Mode>,
     /// Rate to stream at.
     pub baud: Baud,
     /// What is made of its scans.
@@ -227,6 +229,8 @@ mod tests {
         assert!(
             refusal(&["link.front.resolution=0.25"], &[]).contains("no sensor scans 180 degrees at 0.25")
         );
+        let pose = refusal(&["link.front.pose=3"], &[]);
+        assert!(pose.contains("integer `3`, expected where the sensor sits, as { x = 0.3, "), "{pose}");
         assert!(refusal(&["baud=3"], &[]).contains("not a setting"));
         assert!(refusal(&[], &["front"]).contains("--link front: no = in it"));
         assert!(refusal(&[], &["Front=/dev/x"]).contains("sensor name \"Front\" is not possible"));
@@ -235,6 +239,21 @@ mod tests {
         assert!(refusal(&[], &["front=tcp::4001"]).contains("without a host"));
         assert!(refusal(&[], &["front=tcp:box:0"]).contains("a number to 65535"));
         assert!(refusal(&[], &["front=tcp:fe80::1:4001"]).contains("in brackets"));
+    }
+
+    #[test]
+    fn only_a_recording_is_told_its_mode() {
+        let config = Config::load(&sources(&["link.a.mode=0x01"], &["a=file:x"])).unwrap();
+        assert_eq!(config.links[0].mode, Some(Mode(1)));
+        let live = refusal(&["link.front.mode=0x01"], &["front=/dev/x"]);
+        assert!(
+            live.contains("--set link.front.mode=0x01: link front: the mode of /dev/x is asked"),
+            "{live}"
+        );
+        for mode in ["0x07", "-1", "257"] {
+            let odd = refusal(&[&format!("link.a.mode={mode}")], &["a=file:x"]);
+            assert!(odd.contains("mode = ") && odd.contains("0x00 to 0x06"), "{odd}");
+        }
     }
 
     #[test]
@@ -256,7 +275,7 @@ mod tests {
             "{fast}"
         );
         let unknown = refusal(&["link.front.type=lms100"], &[]);
-        assert!(unknown.contains("type = \"lms100\"\n  lms200, lms211, lms221, lms291 or s14"), "{unknown}");
+        assert!(unknown.contains("type = \"lms100\"\n  lms200, lms211, lms221 or lms291"), "{unknown}");
     }
 
     #[test]
@@ -288,7 +307,10 @@ mod tests {
         assert!(error.contains(":4:8: baud = 115200"), "{error}");
         let error =
             load("[[link]]\nname = \"a\"\nport = \"x\"\n[[link]]\nname = \"a\"\n").unwrap_err().to_string();
-        assert!(error.contains(":5:8: a second link a"), "{error}");
+        assert!(
+            error.contains(":5:8: a second link a") && error.contains("beside those of the first"),
+            "{error}"
+        );
         let text = "[[link]]\nname = \"a\"\nport = \"x\"\ntype = \"lms211\"\nangle = 180\n";
         let error = load(text).unwrap_err().to_string();
         assert!(error.contains(":5:9: link a: an lms211 does not scan 180 degrees"), "{error}");

@@ -22,7 +22,7 @@ use machine::Facts;
 /// What to examine.
 #[derive(Clone, Debug)]
 pub struct Subjects {
-    /// Ports as the user named them; none: those of the configuration.
+    /// Ports as the user named them, or by the name of a link of the running hub; none: those of the configuration.
     pub ports: Vec<Source>,
     /// The configuration, or why there is none; nothing if nobody wrote one.
     pub config: Option<Result<Config, Failure>>,
@@ -54,15 +54,15 @@ pub fn examine(
         tell(&finding);
     };
     let there = candidates();
-    let ports = choose(subjects, &there, &mut tell);
     let home = subjects.places.iter().find(|place| matches!(schema::holder(place.root()), Ok(Some(_))));
     let domain = home.unwrap_or(&subjects.domain);
+    let hub = Hub::find(domain);
+    let ports = choose(subjects, &there, hub.as_ref(), &mut tell);
     let facts = Facts::gather(domain, ports.len().max(1));
     tell(machine::memory(&facts));
     tell(machine::domain(&facts));
     tell(machine::leftovers(&facts));
     tell(machine::descriptors(&facts));
-    let hub = Hub::find(domain);
     for subject in &ports {
         let (port, link) = (subject.source.name(), subject.link.as_ref().map(|link| link.name.as_str()));
         line::examine(subject, &there, hub.as_ref(), stop, &mut |finding| tell(finding.at(&port, link)))?;
@@ -75,7 +75,12 @@ pub fn examine(
 }
 
 /// The ports that the user named, else those of the configuration, else all that there are.
-fn choose(subjects: &Subjects, there: &[Candidate], tell: &mut impl FnMut(Finding)) -> Vec<Subject> {
+fn choose(
+    subjects: &Subjects,
+    there: &[Candidate],
+    hub: Option<&Hub>,
+    tell: &mut impl FnMut(Finding),
+) -> Vec<Subject> {
     const NAME: &str = "configuration";
     let links = match &subjects.config {
         Some(Ok(config)) => {
@@ -93,7 +98,8 @@ fn choose(subjects: &Subjects, there: &[Candidate], tell: &mut impl FnMut(Findin
     if !subjects.ports.is_empty() {
         let named = subjects.ports.iter();
         return named
-            .map(|source| Subject { source: source.clone(), link: of_link(source), named: true })
+            .map(|source| hub.and_then(|hub| hub.port_of(source)).unwrap_or_else(|| source.clone()))
+            .map(|source| Subject { link: of_link(&source), source, named: true })
             .collect();
     }
     if !links.is_empty() {

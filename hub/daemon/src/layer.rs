@@ -8,7 +8,7 @@ mod sight;
 use std::rc::Rc;
 
 use lms::family::Family;
-use lms::variant::{Baud, Unit, Variant};
+use lms::variant::{Baud, Mode, Unit, Variant};
 use schema::{Failure, Kind, check_sensor};
 use serde::Deserialize;
 use toml::Spanned;
@@ -42,6 +42,7 @@ struct LinkLayer {
     angle: Option<Spanned<f64>>,
     resolution: Option<Spanned<f64>>,
     unit: Option<Spanned<String>>,
+    mode: Option<Spanned<i64>>,
     baud: Option<Spanned<u32>>,
     pose: Option<PoseLayer>,
     zones: Option<ZonesLayer>,
@@ -66,6 +67,7 @@ struct Draft {
     angle_deg: Option<Said<u16>>,
     resolution_cdeg: Option<Said<u16>>,
     unit: Option<Unit>,
+    mode: Option<Said<Mode>>,
     baud: Baud,
     /// What was said for this link, in the order of the sources.
     own: Vec<(Rc<Origin>, Sections)>,
@@ -101,11 +103,19 @@ impl Drafts {
 impl Draft {
     /// What was said for the link wins over what was said for all, wherever either stands.
     fn finish(self, general: &[(Rc<Origin>, Sections)]) -> Result<Link, Failure> {
-        let Draft { name, place, port, family, angle_deg, resolution_cdeg, unit, baud, own } = self;
+        let Draft { name, place, port, family, angle_deg, resolution_cdeg, unit, mode, baud, own } = self;
         let refuse = |place: &str, what: String, remedy: &str| {
             Failure::new(Kind::Configuration, format!("{place}: link {name}: {what}"), remedy)
         };
         let port = port.ok_or_else(|| refuse(&place, "no port".into(), "add port = \"/dev/ttyUSB0\""))?;
+        if let Some(mode) = mode.as_ref().filter(|_| !matches!(port, Source::File { .. })) {
+            let what = format!("the mode of {} is asked of the sensor", port.name());
+            return Err(refuse(
+                &mode.place,
+                what,
+                "mode is a key for recordings, port = \"file:PATH\"; leave it out",
+            ));
+        }
         // The place of what clashes, or of what implies it.
         let type_place = family.as_ref().map_or(&place, |said| &said.place);
         let angle_place = angle_deg.as_ref().map_or(type_place, |said| &said.place);
@@ -139,7 +149,7 @@ impl Draft {
         }
         Sight { name: &name, place: &place, variant, unit, said }.check(&processing)?;
         processing.background.read(&name, variant, unit)?;
-        Ok(Link { name, port, family, variant, unit, baud, processing })
+        Ok(Link { name, port, family, variant, unit, mode: mode.map(|said| said.value), baud, processing })
     }
 }
 
@@ -162,7 +172,7 @@ fn merge(
             return Err(origin.refuse(
                 span,
                 format!("a second link {name}"),
-                "give each link a name of its own",
+                "give each link a name of its own, or put its keys beside those of the first one",
             ));
         }
         seen.push(name.clone());
@@ -178,6 +188,7 @@ fn merge(
                     angle_deg: None,
                     resolution_cdeg: None,
                     unit: None,
+                    mode: None,
                     baud: Baud::B500000,
                     own: Vec::new(),
                 });
@@ -204,7 +215,7 @@ fn merge(
         if let Some(family) = link.family {
             let value = Family::of_name(family.get_ref()).ok_or_else(|| {
                 let what = format!("type = \"{}\"", family.get_ref());
-                origin.refuse(Some(family.span()), what, "lms200, lms211, lms221, lms291 or s14")
+                origin.refuse(Some(family.span()), what, "lms200, lms211, lms221 or lms291")
             })?;
             draft.family = Some(Said { value, place: origin.place(Some(family.span())) });
         }
@@ -225,6 +236,14 @@ fn merge(
                     return Err(origin.refuse(Some(unit.span()), what, "\"mm\" or \"cm\""));
                 }
             });
+        }
+        if let Some(mode) = link.mode {
+            let known = u8::try_from(*mode.get_ref()).ok().map(Mode).filter(|mode| mode.has_ranges());
+            let value = known.ok_or_else(|| {
+                let what = format!("mode = {}", mode.get_ref());
+                origin.refuse(Some(mode.span()), what, MODES)
+            })?;
+            draft.mode = Some(Said { value, place: origin.place(Some(mode.span())) });
         }
         if let Some(baud) = link.baud {
             draft.baud = Baud::of_rate(*baud.get_ref()).ok_or_else(|| {
@@ -284,3 +303,6 @@ pub(crate) fn quoted(text: &str) -> String {
         .collect();
     format!("\"{escaped}\"")
 }
+
+/// The modes whose values are ranges (Telegram listing, 77h block D).
+const MODES: &str = "0x00 to 0x06, or 0x0F: 0x01 has 3 reflector bits, 0x03 has 2, 0x05 has 1";

@@ -75,7 +75,7 @@ impl<'a> LinkThread<'a> {
     /// The thread's values; nothing happens yet.
     pub(crate) fn new(link: &'a Link, topics: Topics, stop: &'a OwnedFd, orders: Orders) -> Self {
         let now = clock::now();
-        let account = Account::new(&link.port.name(), link.processing.pose, now);
+        let account = Account::new(link, now);
         LinkThread {
             link,
             topics,

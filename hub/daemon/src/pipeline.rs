@@ -28,6 +28,8 @@ struct Kept {
     every_scan: bool,
     /// The generation that was published last.
     published: Option<u32>,
+    /// Scans that it has learned from since.
+    learned: u32,
     /// Beams and unit of the model, as far as something was learned or loaded.
     shape: Option<(u16, u8)>,
 }
@@ -74,6 +76,7 @@ impl Pipeline {
                 cutter: Cutter::new(*pose),
                 every_scan: background.every_scan,
                 published: None,
+                learned: 0,
                 shape: None,
             };
             if let Some(model) = &background.model {
@@ -120,10 +123,14 @@ impl Pipeline {
         self.background.as_ref().is_some_and(|kept| kept.every_scan)
     }
 
-    /// Whether there is a model, of a generation that was not published.
+    /// Whether there is a model, of a generation that was not published, or that has had the time since to learn what
+    /// stands there.
     pub(crate) fn is_news(&self) -> bool {
-        let is_news = |kept: &Kept| kept.shape.is_some() && kept.published != Some(kept.model.generation());
-        self.background.as_ref().is_some_and(is_news)
+        let is_new = |kept: &Kept| kept.published != Some(kept.model.generation());
+        let has_learned = |kept: &Kept| kept.learned >= u32::from(kept.model.scans());
+        self.background
+            .as_ref()
+            .is_some_and(|kept| kept.shape.is_some() && (is_new(kept) || has_learned(kept)))
     }
 
     /// Writes the model, which is to be published, into `out`, if one is kept.
@@ -131,6 +138,7 @@ impl Pipeline {
         if let Some(kept) = &mut self.background {
             kept.model.show(out);
             kept.published = Some(out.generation);
+            kept.learned = 0;
         }
     }
 
@@ -186,6 +194,7 @@ impl Kept {
             }
             None => self.model.update(scan, spare),
         }
+        self.learned = self.learned.saturating_add(u32::from(!self.model.is_frozen()));
         let sensor = (scan.beams() as u16, scan.unit_mm);
         let model = self.shape.replace(sensor).filter(|shape| *shape != sensor);
         let anew = model.map_or(Anew::Angles, |model| Anew::Shape(Mismatch { model, sensor }));
@@ -251,6 +260,25 @@ mod tests {
         let asked =
             pipeline.obey("a", Verb::Show, &Background::default()).expect("is kept").expect("a model");
         assert_eq!((asked.generation, asked.count), (1, 361));
+    }
+
+    #[test]
+    fn what_was_learned_meanwhile_is_news() {
+        let mut pipeline = Pipeline::new(&processing(|_| {}));
+        pipeline.update(&wall(361, 1, 3000), Outputs::default());
+        assert_eq!(shown(&mut pipeline).taught, 0);
+        for _ in 0..3 {
+            pipeline.update(&wall(361, 1, 3000), Outputs::default());
+            assert!(!pipeline.is_news());
+        }
+        pipeline.update(&wall(361, 1, 3000), Outputs::default());
+        assert!(pipeline.is_news());
+        assert_eq!((shown(&mut pipeline).taught, pipeline.is_news()), (361, false));
+        pipeline.obey("a", Verb::Freeze, &Background::default()).expect("is kept");
+        for _ in 0..9 {
+            pipeline.update(&wall(361, 1, 3000), Outputs::default());
+        }
+        assert!(!pipeline.is_news(), "a frozen model stays as it is");
     }
 
     #[test]

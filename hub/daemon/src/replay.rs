@@ -21,7 +21,7 @@ use crate::scanner;
 /// A recording as a line's bytes.
 pub(crate) struct Recorded {
     bytes: Bytes,
-    /// How its values are split; one that does not say so is read as ranges of 13 bits.
+    /// How its values are split; one of which nobody says so is read as ranges of 13 bits.
     mode: Mode,
 }
 
@@ -49,7 +49,7 @@ impl Recorded {
     /// [`schema::Kind::Configuration`] if it cannot be read. A file without a telegram is a line that only brings noise.
     pub(crate) fn open(path: &Path, link: &Link) -> Result<Recorded, Failure> {
         let recording = Recording::open(path)?;
-        let mode = recording.contents().mode.unwrap_or(Mode(0));
+        let mode = recording.contents().mode.or(link.mode).unwrap_or(Mode(0));
         let encoding = Encoding { unit: link.unit.unwrap_or(Unit::Mm), mode };
         let bytes = match recording.contents().form {
             Form::Telegrams => Bytes::Stream(recording.bytes()?),

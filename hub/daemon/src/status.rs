@@ -1,13 +1,17 @@
 //! What a link tells of itself: the words of a session and the hub's own counts as the payload of topic `status`.
 
 use lms::header::Reject;
-use lms::variant::Variant;
+use lms::variant::{Mode, Variant};
 use lms::{Nanos, Session};
-use schema::{Counter, Counters, Pose, State, Status};
+use schema::{Counter, Counters, State, Status};
+
+use crate::config::Link;
 
 /// The link's account, across all sessions on its port.
 pub(crate) struct Account {
     status: Status,
+    /// The measuring mode while no reply has told it, as configured.
+    mode: Option<Mode>,
     /// Counters of the sessions that ended.
     past: Counters,
     /// Counters as they were when the rate was last computed.
@@ -24,11 +28,12 @@ pub(crate) struct Account {
 }
 
 impl Account {
-    pub(crate) fn new(port: &str, pose: Pose, now: Nanos) -> Self {
-        let mut status = Status { since_ns: now, pose, ..Status::default() };
-        status.set_port(port);
+    pub(crate) fn new(link: &Link, now: Nanos) -> Self {
+        let mut status = Status { since_ns: now, pose: link.processing.pose, ..Status::default() };
+        status.set_port(&link.port.name());
         Account {
             status,
+            mode: link.mode,
             past: Counters::default(),
             measured_at: None,
             scans: 0,
@@ -99,7 +104,7 @@ impl Account {
         let sensor = session.sensor();
         let known_rate = matches!(self.status.state(), Some(State::Streaming | State::Starting));
         self.status.baud = if known_rate { session.baud().rate() } else { 0 };
-        self.status.mode = sensor.mode.map_or(Status::MODE_UNKNOWN, |mode| mode.0);
+        self.status.mode = sensor.mode.or(self.mode).map_or(Status::MODE_UNKNOWN, |mode| mode.0);
         self.status.unit_mm = sensor.unit.map_or(0, |unit| unit.mm());
         let Variant { angle_deg, resolution_cdeg } =
             sensor.variant.unwrap_or(Variant { angle_deg: 0, resolution_cdeg: 0 });

@@ -217,6 +217,7 @@ fn a_background_begins_with_a_model_of_its_own_sensor() {
     assert!(refusal.contains("361 beams in units of 10 mm"), "{refusal}");
     let cut = Scratch::new("cut.json", &text[..900]);
     let refusal = load(&[], &[&format!("link.front.background.start={}", cut.0.display())]).unwrap_err();
+    assert!(refusal.starts_with("link front: background.start: "), "{refusal}");
     assert!(refusal.contains("cut.json is no background model: it is cut short"), "{refusal}");
 }
 

@@ -129,6 +129,11 @@ impl Model {
         self.generation
     }
 
+    /// In so many scans something has to be met until it is background, as set or as follows from the last scan.
+    pub fn scans(&self) -> u16 {
+        self.limits.scans
+    }
+
     /// Nothing is learned until it is thawed.
     pub fn is_frozen(&self) -> bool {
         self.frozen

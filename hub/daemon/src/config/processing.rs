@@ -86,7 +86,7 @@ pub struct Background {
     pub file: Option<PathBuf>,
     /// What stands in the file.
     pub model: Option<Box<schema::Background>>,
-    /// The model is published with every scan, not only when a new generation begins.
+    /// The model is published with every scan, not only with a new generation and whenever it has learned for a while.
     pub every_scan: bool,
 }
 
@@ -106,7 +106,10 @@ impl Background {
             Ok(text) => text,
             Err(error) => return refuse(error.to_string(), START),
         };
-        let SavedModel { sensor: of, model } = SavedModel::parse(&text, &place)?;
+        let SavedModel { sensor: of, model } = SavedModel::parse(&text, &place).map_err(|failure| {
+            let message = format!("link {sensor}: background.start: {}", failure.message);
+            Failure::new(failure.kind, message, failure.hint)
+        })?;
         if of != sensor {
             let hint = "name the file of each sensor by background.start of its link";
             return refuse(format!("the model is that of sensor {of}"), hint);

@@ -5,6 +5,8 @@ use std::time::Duration;
 use schema::ipc::{self, Payload};
 use schema::{Domain, Failure, Status, is_remote};
 
+use crate::config::Source;
+
 /// A running hub.
 pub(crate) struct Hub {
     pub(crate) pid: u32,
@@ -17,6 +19,14 @@ impl Hub {
     pub(crate) fn find(domain: &Domain) -> Option<Hub> {
         let pid = schema::holder(domain.root()).ok().flatten()?;
         Some(Hub { pid, statuses: statuses(domain).unwrap_or_default() })
+    }
+
+    /// The port of the link that `source` names instead of a port: no such file is here.
+    pub(crate) fn port_of(&self, source: &Source) -> Option<Source> {
+        let Source::Tty(path) = source else { return None };
+        let name = path.to_str().filter(|_| !path.exists())?;
+        let (_, status) = self.statuses.iter().find(|(sensor, _)| sensor == name)?;
+        Source::parse(status.port()).ok()
     }
 
     /// Name and status of the link whose port is configured as `port`.

@@ -324,6 +324,7 @@ mod tests {
             family: Some(Family::Lms291),
             variant: Variant::HALF,
             unit: Some(Unit::Cm),
+            mode: None,
             baud: Baud::B500000,
             processing: Default::default(),
         };

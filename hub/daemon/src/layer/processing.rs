@@ -14,7 +14,7 @@ use crate::origin::Origin;
 
 /// Section `pose` of a link.
 #[derive(Clone, Deserialize)]
-#[serde(deny_unknown_fields)]
+#[serde(deny_unknown_fields, expecting = "where the sensor sits, as { x = 0.3, y = 0.0, yaw = 1.5708 }")]
 pub(super) struct PoseLayer {
     x: Option<Spanned<f64>>,
     y: Option<Spanned<f64>>,
@@ -24,7 +24,7 @@ pub(super) struct PoseLayer {
 
 /// Section `zones`.
 #[derive(Clone, Deserialize)]
-#[serde(deny_unknown_fields)]
+#[serde(deny_unknown_fields, expecting = "keys of zones, as { radii = [1.0, 0.6] }")]
 pub(super) struct ZonesLayer {
     radii: Option<Spanned<Vec<f64>>>,
     self_min: Option<Spanned<Vec<Spanned<SectorLayer>>>>,
@@ -37,7 +37,7 @@ pub(super) struct ZonesLayer {
 }
 
 #[derive(Clone, Deserialize)]
-#[serde(deny_unknown_fields)]
+#[serde(deny_unknown_fields, expecting = "a sector, as { from = 12.5, to = 30.0, range = 0.42 }")]
 struct SectorLayer {
     from: f64,
     to: f64,
@@ -46,7 +46,7 @@ struct SectorLayer {
 
 /// Section `marks`.
 #[derive(Clone, Deserialize)]
-#[serde(deny_unknown_fields)]
+#[serde(deny_unknown_fields, expecting = "keys of marks, as { i_min = 1 }")]
 pub(super) struct MarksLayer {
     i_min: Option<Spanned<i64>>,
     max_range_step: Option<Spanned<f64>>,
@@ -55,7 +55,7 @@ pub(super) struct MarksLayer {
 
 /// Section `background`.
 #[derive(Clone, Deserialize)]
-#[serde(deny_unknown_fields)]
+#[serde(deny_unknown_fields, expecting = "keys of background, as { method = \"multi\" }")]
 pub(super) struct BackgroundLayer {
     method: Option<MethodLayer>,
     threshold_mm: Option<Spanned<i64>>,
