@@ -4,6 +4,7 @@ mod stage;
 
 use schema::datagram::{HEAD, Head, MTU_ETHERNET, Packed, Refusal};
 use schema::{Foreground, Marks, Scan, Status, Topic, Verdict, Zones};
+use serde_json::Value;
 use stage::{INT, Program, Sender, Stage, in_a_network, number};
 
 const DAMAGED: u64 = 100_000;
@@ -129,6 +130,8 @@ fn sealed_nonsense_neither_ends_it_nor_fills_memory() {
         assert!(resident_kb(&program).saturating_sub(kb) < 2048, "{kb} kB and more");
         let outcome = program.end(INT);
         assert_eq!(outcome.code, Some(0), "{outcome}");
+        let told = |it: &&Value| it["message"].as_str().is_some_and(|told| told.contains("start it anew"));
+        assert_eq!(outcome.of_class("notice").iter().filter(told).count(), 1, "{outcome}");
         let lines = outcome.of_class("lan");
         assert!(lines.len() <= 1024, "{} lines", lines.len());
         let own = lines.iter().find(|it| it["hub"] == "000000000000abcd" && it["topic"] == "zones");
@@ -148,7 +151,7 @@ fn words_that_make_no_sense_have_a_remedy() {
         (&["--topic=scam"], 3, "no_topic", "zones"),
         (&["--topic=front/zones"], 3, "no_topic", "zones"),
         (&["--name=robot"], 78, "configuration", "NAME=HUB"),
-        (&["--name=robot=0000000000000001"], 78, "configuration", "any other name"),
+        (&["--name=robot=0000000000000001"], 78, "configuration", "but not robot, for example"),
         (&["--nonsense"], 2, "usage", "--help"),
     ] {
         let outcome = stage.run(&[&["listen", "--json"], words].concat());

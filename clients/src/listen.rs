@@ -12,7 +12,7 @@ use std::io::Write;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
-use schema::datagram::{Account, Announce, Datagram, Fresh, group};
+use schema::datagram::{Account, Announce, Datagram, Fresh, Refusal, group};
 use schema::{Domain, Failure, Kind, Topic};
 
 use self::ear::{Ear, LONGEST};
@@ -111,6 +111,10 @@ const LONGEST_WAIT: Duration = Duration::from_millis(100);
 /// The most things that are told to be wrong: it may be the network that makes them.
 const TOLD: usize = 16;
 
+/// What to do about [`Refusal::Capacity`].
+const FULL: &str = "datagrams are refused: more gateways and starts of gateways were heard than one listener keeps apart \
+                    (64): start it anew";
+
 /// Between two accounts on a terminal.
 const DRAW_EVERY: Duration = Duration::from_secs(1);
 
@@ -156,10 +160,11 @@ impl Listener<'_> {
     fn take(&mut self, buffer: &mut [u8]) -> Result<bool, End> {
         for _ in 0..TURN {
             let Some(bytes) = self.ear.receive(buffer)? else { return Ok(false) };
-            if let Ok((datagram, fresh)) = self.account.receive(bytes)
-                && fresh != Fresh::Duplicate
-            {
-                self.heard(datagram, fresh == Fresh::Late)?;
+            match self.account.receive(bytes) {
+                Ok((_, Fresh::Duplicate)) => {}
+                Ok((datagram, fresh)) => self.heard(datagram, fresh == Fresh::Late)?,
+                Err(Refusal::Capacity) => self.trouble(FULL)?,
+                Err(_) => {}
             }
             if self.options.bounds.count.is_some_and(|count| self.received >= count) {
                 return Ok(true);
