@@ -84,7 +84,7 @@ pub fn mask(
     quiet(if options.json {
         output.json(&found.object())
     } else {
-        output.line(|line| write!(line, "{}", found.toml().trim_end()))
+        found.toml().lines().try_for_each(|text| output.line(|line| write!(line, "{text}")))
     })
 }
 

@@ -79,12 +79,16 @@ impl<'a> Output<'a> {
     }
 }
 
-/// Puts `?` in place of each byte of the control characters of UTF-8 `text`: C0, DEL and C1 (ECMA-48).
+/// Puts `?` in place of each byte of the control characters of UTF-8 `text`: C0, DEL and C1 (ECMA-48); a blank for a new
+/// line.
 fn disarm(text: &mut [u8]) {
     let mut before = 0;
     for at in 0..text.len() {
         let byte = text[at];
-        if byte < 0x20 || byte == 0x7f {
+        if byte == b'\n' {
+            // A message and its remedy are told in one line.
+            text[at] = b' ';
+        } else if byte < 0x20 || byte == 0x7f {
             text[at] = b'?';
         } else if before == 0xc2 && byte < 0xa0 {
             text[at - 1..=at].fill(b'?');
@@ -130,7 +134,7 @@ mod tests {
 
     #[test]
     fn text_does_not_command_a_terminal() {
-        assert_eq!(line("\x1b[2J a\rb\nc\td \x7f"), "?[2J a?b?c?d ?\n");
+        assert_eq!(line("\x1b[2J a\rb\nc\td \x7f"), "?[2J a?b c?d ?\n");
         assert_eq!(line("\u{80}x\u{9b}31m\u{9f}"), "??x??31m??\n");
         assert_eq!(line("/dev/ttyUSB0 \u{a0}20 °C ● Größe"), "/dev/ttyUSB0 \u{a0}20 °C ● Größe\n");
     }
