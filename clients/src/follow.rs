@@ -99,6 +99,8 @@ struct Run<'a> {
     started: Instant,
     last_sample: Instant,
     hub_seen: Option<Instant>,
+    /// Since when there is a hub, and not only a listener, as far as it was looked at.
+    hub_lives_since: Option<Instant>,
     waiting_said: bool,
     received: u64,
 }
@@ -120,6 +122,7 @@ impl<'a> Run<'a> {
             started: now,
             last_sample: now,
             hub_seen: None,
+            hub_lives_since: None,
             waiting_said: false,
             received: 0,
         }
@@ -242,6 +245,9 @@ impl<'a> Run<'a> {
         if self.session.domain().is_none() {
             return Ok(());
         }
+        // A hub that came to a listener has to make its topics first.
+        let lives = self.session.hub_lives();
+        self.hub_lives_since = if lives { self.hub_lives_since.or(Some(Instant::now())) } else { None };
         let sensors = self.sensors()?;
         let wants_all = self.tracks.iter().all(|track| track.name.is_robot());
         if wants_all && !self.may_come(ROBOT) && sensors.iter().all(|sensor| is_remote(sensor)) {
@@ -267,7 +273,7 @@ impl<'a> Run<'a> {
         let unbounded = !self.bounds.bounded();
         match is_remote(sensor) {
             true => unbounded || self.started.elapsed() < ANNOUNCED,
-            false => unbounded && !self.session.hub_lives(),
+            false => unbounded && self.hub_lives_since.is_none_or(|since| since.elapsed() < GRACE),
         }
     }
 
