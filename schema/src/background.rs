@@ -6,6 +6,7 @@ use bytemuck::{Pod, Zeroable};
 use iceoryx2::prelude::ZeroCopySend;
 
 use crate::BEAMS;
+use crate::datagram::Packed;
 
 /// The payload of topic `background`, 816 bytes: when a new generation begins, and with every scan if so configured.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Pod, Zeroable)]
@@ -44,7 +45,7 @@ impl Background {
     /// Flag: nothing is learned until it is thawed.
     pub const FROZEN: u8 = 1;
     /// Bytes of a packed model before its ranges.
-    const HEAD: usize = 12;
+    pub(crate) const HEAD: usize = 12;
     /// Bytes of the longest packed model.
     pub const MAX_PACKED: usize = Self::HEAD + 2 * BEAMS;
 
@@ -79,8 +80,7 @@ impl Background {
     /// The model in `bytes`, if they are as many as its count says.
     pub fn unpack(bytes: &[u8]) -> Option<Background> {
         let mut background = Background::default();
-        bytemuck::bytes_of_mut(&mut background).get_mut(..bytes.len())?.copy_from_slice(bytes);
-        (background.packed().len() == bytes.len() && usize::from(background.count) <= BEAMS)
+        (Packed::unpack(&mut background, bytes) && background.packed().len() == bytes.len())
             .then_some(background)
     }
 }

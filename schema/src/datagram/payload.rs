@@ -104,7 +104,7 @@ impl Packed for Background {
 
     fn unpack(&mut self, payload: &[u8]) -> bool {
         let count = payload.get(6..8).map(|count| usize::from(u16::from_le_bytes([count[0], count[1]])));
-        take(self, payload, count.map(|count| (count, BEAMS, BACKGROUND_HEAD, 2)))
+        take(self, payload, count.map(|count| (count, BEAMS, Background::HEAD, 2)))
     }
 }
 
@@ -192,7 +192,6 @@ const SCAN_HEAD: usize = 12;
 const SCAN_CONTENTS: usize = 11;
 const MARKS_HEAD: usize = 4;
 const ZONES_HEAD: usize = 12;
-const BACKGROUND_HEAD: usize = 12;
 const FOREGROUND_HEAD: usize = 12;
 const FOREGROUND_LEFT_OUT: usize = 9;
 const FOREGROUND_SEGMENTS: usize = 10;
