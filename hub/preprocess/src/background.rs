@@ -219,8 +219,8 @@ impl Learner {
     }
 }
 
-/// The readings of `scan` in device units, [`Background::FAR`] or [`INVALID`]. What [`crate::Reading`] says, for all
-/// beams at once.
+/// The readings of `scan` in device units, [`Background::FAR`] or [`INVALID`]. The values
+/// themselves are compared: they are many.
 fn measure(scan: &Scan, no_return_is_far: bool, readings: &mut [u16; BEAMS]) {
     let max = scan.max();
     let no_return = if no_return_is_far { Background::FAR } else { INVALID };
@@ -288,7 +288,7 @@ impl std::error::Error for Mismatch {}
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::Reading;
+    use crate::reading::Reading;
 
     #[test]
     fn readings_are_those_of_every_processor() {

@@ -5,8 +5,7 @@
 
 pub mod background;
 pub mod marks;
+#[cfg(test)]
 mod reading;
 pub mod segments;
 pub mod zones;
-
-pub use reading::Reading;

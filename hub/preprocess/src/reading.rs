@@ -1,11 +1,10 @@
-//! What one beam tells a processor: a range in millimetres, that nothing is near, or nothing at all. Refuses to know
-//! what is made of it.
+//! What one beam tells, written as the design says it: what tests hold the background's own reading of whole scans against.
 
 use schema::{Code, Scan};
 
 /// The reading of one beam.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Reading {
+pub(crate) enum Reading {
     /// Something at this range in mm.
     Valid(u32),
     /// Nothing within reach.
@@ -17,7 +16,7 @@ pub enum Reading {
 impl Reading {
     /// What beam `i` of `scan` tells. That nothing came back is the most frequent code in real rooms; whether it means
     /// [`Reading::Far`] or [`Reading::Invalid`] is for each processor to say.
-    pub fn of(scan: &Scan, i: usize, no_return_is_far: bool) -> Reading {
+    pub(crate) fn of(scan: &Scan, i: usize, no_return_is_far: bool) -> Reading {
         match (scan.distance_mm(i), scan.code(i)) {
             (Some(range_mm), _) => Reading::Valid(range_mm),
             (None, Some(Code::BEYOND)) => Reading::Far,
