@@ -2,7 +2,9 @@
 //! that comes and goes, codes, zeroes, noise with outliers. As unkind as a room can be, and more; not a simulation.
 #![allow(dead_code)] // each test takes what it needs
 
-use preprocess::background::Class;
+use std::fmt;
+
+use preprocess::background::{Class, Model};
 use schema::{BEAMS, Background, Foreground, Scan};
 
 /// Angles, unit and bits of a scan.
@@ -122,8 +124,27 @@ pub(crate) fn ranges_mm(model: &Background) -> Vec<f64> {
     model.ranges().iter().map(mm).collect()
 }
 
+/// Lets `model` look at `scan` and compares all that it says with `classes` and `generation`, in a payload that is full of
+/// `dirt` before. `place` is named where it differs.
+pub(crate) fn check_scan(
+    model: &mut Model,
+    scan: &Scan,
+    classes: &[Class],
+    generation: u32,
+    dirt: u8,
+    place: &fmt::Arguments<'_>,
+) {
+    let dirty: Foreground = bytemuck::pod_read_unaligned(&[dirt; size_of::<Foreground>()]);
+    let mut out = dirty;
+    model.update(scan, &mut out);
+    assert_eq!(model.classes(), classes, "{place}");
+    let mut expected = foreground(scan, classes, &dirty);
+    expected.generation = generation;
+    assert_eq!(out, expected, "{place}");
+}
+
 /// The foreground that belongs to `classes`, but for its segments and generation, which are as in `like`.
-pub(crate) fn foreground(scan: &Scan, classes: &[Class], like: &Foreground) -> Foreground {
+fn foreground(scan: &Scan, classes: &[Class], like: &Foreground) -> Foreground {
     let mut expected = *like;
     expected.count = scan.count;
     expected.unit_mm = scan.unit_mm;
