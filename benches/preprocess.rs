@@ -4,12 +4,13 @@
 
 #![allow(missing_docs)] // criterion's macros make public functions
 
+#[path = "support/seen.rs"]
+mod seen;
+
 use std::hint::black_box;
 
 use criterion::{Criterion, criterion_group, criterion_main};
-use daemon::scanner;
-use lms::measured::{self, Measured};
-use lms::variant::{MIRROR_TURN, Mode, Unit, Variant};
+use lms::variant::{MIRROR_TURN, Unit, Variant};
 use preprocess::background::{self, Method, Model};
 use preprocess::segments::Cutter;
 use preprocess::{marks, zones};
@@ -27,11 +28,7 @@ fn scans(world: &str, count: u64) -> Vec<Scan> {
     let room = Room::new(&world.parse().expect("a world that the program brings along"), 1);
     let scan = |number| {
         let end_ns = number * Variant::HALF.turns() * MIRROR_TURN;
-        let words = room.scan(Variant::HALF, Unit::Mm, Mode(1), end_ns);
-        let telegram = measured::encode(0, Unit::Mm, &words, 0x10);
-        let mut scan = Scan::default();
-        scanner::decode(&Measured::decode(telegram.telegram()).expect("a scan"), Mode(1), &mut scan);
-        scan
+        seen::scan(&room.scan(Variant::HALF, Unit::Mm, seen::MODE, end_ns), Unit::Mm)
     };
     (1..=count).map(scan).collect()
 }

@@ -9,6 +9,8 @@ mod method;
 mod play;
 #[path = "../benches/foreground/score.rs"]
 mod score;
+#[path = "../benches/support/seen.rs"]
+mod seen;
 
 use boxes::Boxes;
 use lms::variant::Unit;

@@ -3,12 +3,14 @@
 //! only says what they would show.
 
 mod picture;
+#[path = "../support/seen.rs"]
+mod seen;
 
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 
 use lms::Nanos;
-use lms::variant::{MIRROR_TURN, Mode, Unit, Variant};
+use lms::variant::{MIRROR_TURN, Unit, Variant};
 use preprocess::background::{Method, Model, Settings};
 use preprocess::segments::Cutter;
 use schema::{Background, Foreground, Pose, Scan};
@@ -144,19 +146,7 @@ impl Run {
 
 /// What the hub publishes of the scan that ended at `end_ns`.
 fn scan(room: &Room, end_ns: Nanos) -> Scan {
-    let (variant, unit, mode) = (Variant::HALF, Unit::Mm, Mode(1));
-    let mut scan = Scan {
-        count: variant.beams() as u16,
-        unit_mm: unit.mm(),
-        range_bits: mode.range_bits(),
-        first_angle_mdeg: variant.first_angle_mdeg(),
-        step_mdeg: 10 * variant.resolution_cdeg,
-        ..Scan::default()
-    };
-    for (range, word) in scan.range_array.iter_mut().zip(room.scan(variant, unit, mode, end_ns)) {
-        *range = word & mode.max_value();
-    }
-    scan
+    seen::scan(&room.scan(Variant::HALF, Unit::Mm, seen::MODE, end_ns), Unit::Mm)
 }
 
 /// Whether a model's range is one.

@@ -13,6 +13,8 @@ mod method;
 mod play;
 mod rivals;
 mod score;
+#[path = "../support/seen.rs"]
+mod seen;
 
 use std::fmt;
 use std::io::{Write, stdout};

@@ -1,11 +1,13 @@
 //! Scenes of the simulated world as a method gets to see them: scans, and beside each beam what it should say of it.
 //! Refuses to know any method.
 
-use lms::variant::{Mode, Unit, Variant};
+use lms::variant::{Unit, Variant};
 use schema::Scan;
 use sim::look::Met;
 use sim::room::Room;
 use sim::world::World;
+
+use crate::seen;
 
 /// A scene of the table, 2000 scans of it, 53 s.
 #[derive(Clone, Copy)]
@@ -56,20 +58,9 @@ pub(crate) fn play(scene: &Scene, seed: u64) -> Vec<Frame> {
 }
 
 fn frame(room: &Room, unit: Unit, number: u64) -> Frame {
-    let (variant, mode) = (Variant::HALF, Mode(1));
-    let end_ns = number * variant.turns() * lms::variant::MIRROR_TURN;
-    let look = room.look(variant, unit, mode, end_ns);
-    let mut scan = Scan {
-        count: look.words.len() as u16,
-        unit_mm: unit.mm(),
-        range_bits: mode.range_bits(),
-        first_angle_mdeg: variant.first_angle_mdeg(),
-        step_mdeg: 10 * variant.resolution_cdeg,
-        ..Scan::default()
-    };
-    for (range, word) in scan.range_array.iter_mut().zip(&look.words) {
-        *range = word & mode.max_value();
-    }
+    let end_ns = number * Variant::HALF.turns() * lms::variant::MIRROR_TURN;
+    let look = room.look(Variant::HALF, unit, seen::MODE, end_ns);
+    let scan = seen::scan(&look.words, unit);
     let due = (0..look.truth.len()).map(|i| due(&scan, i, look.truth[i], end_ns)).collect();
     Frame { scan, due, met: look.truth }
 }
