@@ -1,6 +1,6 @@
 //! A hub without sensors: publishes one scan again and again, when it is told to.
 
-use schema::ipc::{self, Node, Notifier, Payload, Publisher, TopicService, WakeService};
+use schema::ipc::{self, Node, Payload, Publisher, TopicService, Waker};
 use schema::{Domain, Header, HubLock, Scan, Wake};
 
 use crate::support::Outcome;
@@ -11,10 +11,9 @@ pub(crate) const SENSOR: &str = "front";
 /// The publishing end of the scans of one sensor.
 pub(crate) struct Source {
     publisher: Publisher<Scan>,
-    notifier: Notifier,
+    waker: Waker,
     next: u64,
     _service: TopicService<Scan>,
-    _wake: WakeService,
     _node: Node,
     _lock: HubLock,
 }
@@ -23,14 +22,13 @@ impl Source {
     pub(crate) fn open(domain: &Domain) -> Outcome<Source> {
         let lock = HubLock::acquire(domain.root())?;
         let node = ipc::hub_node(domain)?;
-        let wake = ipc::create_wake(&node, SENSOR)?;
+        let waker = Waker::new(&node, SENSOR)?;
         let service = Scan::create(&node, SENSOR)?;
         Ok(Source {
             publisher: Scan::publisher(&service)?,
-            notifier: ipc::notifier(&wake)?,
+            waker,
             next: 0,
             _service: service,
-            _wake: wake,
             _node: node,
             _lock: lock,
         })
@@ -44,7 +42,7 @@ impl Source {
         *sample.user_header_mut() = header;
         *sample.payload_mut() = scan();
         sample.send().map_err(|error| format!("not sent: {error:?}"))?;
-        ipc::notify(&self.notifier, Wake::Telegram)?;
+        self.waker.wake(Wake::Telegram)?;
         Ok(())
     }
 }

@@ -8,6 +8,7 @@ use schema::{DEFAULT_DOMAIN, Domain, Environment, Failure, check_followed};
 
 use crate::follower::{Follower, Received};
 use crate::session::Session;
+use crate::wait::Wait;
 
 /// Follows the topic of `sensor` that carries `P` (`[u8]`: telegram, `Scan`, `Marks` ..), in the domain that
 /// SCANHUB_DOMAIN names. There need not be a hub yet. Who acts on zones follows them by [`zones`](crate::zones).
@@ -43,6 +44,11 @@ impl<P: Payload + ?Sized> Attachment<P> {
     pub fn timeout(mut self, timeout: Duration) -> Self {
         self.timeout = Some(timeout);
         self
+    }
+
+    /// Waits by `wait`, to be said before the first sample is asked for; without it by [`Wait::Doorbell`].
+    pub fn wait_by(self, wait: Wait) -> Self {
+        Attachment { session: self.session.by(wait), ..self }
     }
 
     /// Waits for the next sample; `None` only after the timeout. Drop the sample before the next call.

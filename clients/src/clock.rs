@@ -16,6 +16,11 @@ pub(crate) fn now() -> Moment {
     Moment { monotonic_ns: read(ClockId::Monotonic), boottime_ns: read(ClockId::Boottime) }
 }
 
+/// CLOCK_MONOTONIC alone, in ns.
+pub(crate) fn now_ns() -> u64 {
+    read(ClockId::Monotonic)
+}
+
 /// The wall clock, ns since 1970.
 pub(crate) fn wall_ns() -> u64 {
     read(ClockId::Realtime)

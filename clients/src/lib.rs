@@ -30,6 +30,7 @@ mod robot;
 mod sample;
 mod session;
 mod text;
+mod wait;
 mod window;
 mod zones;
 
@@ -49,4 +50,5 @@ pub use listen::{ListenOptions, listen};
 pub use mask::{MaskOptions, mask};
 pub use names::TopicName;
 pub use robot::{Robot, RobotFollower, robot};
+pub use wait::Wait;
 pub use zones::{Heard, ZonesFollower, zones};

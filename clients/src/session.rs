@@ -1,12 +1,13 @@
-//! A process's stay in a domain, over several lives of its hub: membership, the listeners that wake it, and the news
-//! that a hub went or came. Refuses to know what is followed.
+//! A process's stay in a domain, over several lives of its hub: membership, what wakes it, and the news that a hub went or
+//! came. Refuses to know what is followed.
 
 use std::time::{Duration, Instant};
 
-use schema::ipc::{self, Listener, Node, Payload, Subscriber};
+use schema::ipc::{self, Node, Payload, Subscriber};
 use schema::{Domain, Failure, holder};
 
 use crate::presence::{Change, Presence};
+use crate::wait::{Wait, Wakeups};
 
 /// The longest wait: so often the hub is looked for, and the caller's reasons to stop are seen.
 const LONGEST_WAIT: Duration = Duration::from_millis(100);
@@ -16,20 +17,24 @@ pub(crate) struct Session {
     presence: Presence,
     joined: Option<Joined>,
     number: u32,
-    /// Wake-ups were taken since the last sleep, and samples looked for since.
-    taken: bool,
+    wait: Wait,
 }
 
 struct Joined {
     domain: Domain,
+    wakeups: Wakeups,
     node: Node,
-    listeners: Vec<(String, Listener)>,
 }
 
 impl Session {
     /// Will join the first live one of `places`, as soon as one is.
     pub(crate) fn new(places: Vec<Domain>) -> Session {
-        Session { presence: Presence::new(places), joined: None, number: 0, taken: false }
+        Session { presence: Presence::new(places), joined: None, number: 0, wait: Wait::default() }
+    }
+
+    /// Will be woken by `wait`; to be said before anything is followed.
+    pub(crate) fn by(self, wait: Wait) -> Session {
+        Session { wait, ..self }
     }
 
     /// Looks whether the hub is there, and joins its domain if it is a new place.
@@ -45,7 +50,7 @@ impl Session {
         };
         if self.joined.as_ref().is_none_or(|joined| joined.domain != *domain) {
             let node = ipc::client_node(domain)?;
-            self.joined = Some(Joined { domain: domain.clone(), node, listeners: Vec::new() });
+            self.joined = Some(Joined { domain: domain.clone(), wakeups: Wakeups::by(self.wait), node });
             self.number += 1;
         }
         Ok(change)
@@ -71,7 +76,7 @@ impl Session {
         self.number
     }
 
-    /// A subscriber of `sensor`, or nothing as long as its hub or topic is not there. The listener comes first, so that
+    /// A subscriber of `sensor`, or nothing as long as its hub or topic is not there. What wakes it comes first, so that
     /// nothing is sent unheard between the two.
     pub(crate) fn subscribe<P: Payload + ?Sized>(
         &mut self,
@@ -80,11 +85,8 @@ impl Session {
         let (Some(_), Some(joined)) = (self.presence.domain(), &mut self.joined) else {
             return Ok(None);
         };
-        if !joined.listeners.iter().any(|(name, _)| name == sensor) {
-            let Some(wake) = ipc::open_wake(&joined.node, sensor)? else {
-                return Ok(None);
-            };
-            joined.listeners.push((sensor.to_owned(), ipc::listener(&wake)?));
+        if !joined.wakeups.add(&joined.node, sensor)? {
+            return Ok(None);
         }
         P::open(&joined.node, sensor)?.map(|topic| P::subscriber(&topic)).transpose()
     }
@@ -97,15 +99,13 @@ impl Session {
 
     /// As [`wait`](Self::wait), for a time instead of until one.
     pub(crate) fn wait_for(&mut self, left: Option<Duration>) -> Result<(), Failure> {
-        let listeners: Vec<&Listener> = match &self.joined {
-            Some(joined) => joined.listeners.iter().map(|(_, listener)| listener).collect(),
-            None => Vec::new(),
-        };
-        if !self.taken && ipc::take_wakeups(&listeners)? {
-            self.taken = true;
-            return Ok(());
+        let left = left.map_or(LONGEST_WAIT, |left| left.min(LONGEST_WAIT));
+        match &mut self.joined {
+            Some(joined) => joined.wakeups.wait(&joined.node, left),
+            None => {
+                std::thread::sleep(left);
+                Ok(())
+            }
         }
-        self.taken = false;
-        ipc::sleep(&listeners, left.map_or(LONGEST_WAIT, |left| left.min(LONGEST_WAIT)))
     }
 }

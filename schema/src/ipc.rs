@@ -1,11 +1,13 @@
 //! From a topic to its service in shared memory, with all limits. The only file that names the builders of iceoryx2:
 //! everybody else gets ports. Refuses to know when something is sent and who reads it.
 
+mod bell;
 mod control;
 mod leftover;
 mod nodes;
 mod sleep;
 mod trouble;
+mod wake;
 
 use std::fmt::Debug;
 use std::mem::MaybeUninit;
@@ -14,11 +16,10 @@ use std::time::Duration;
 
 use iceoryx2::config::Config;
 use iceoryx2::port;
-use iceoryx2::port::listener::ListenerCreateError;
 use iceoryx2::port::subscriber::SubscriberCreateError;
 use iceoryx2::prelude::{
-    AttributeSet, AttributeVerifier, CallbackProgression, EventId, FileName, IceoryxSend, LogLevel,
-    NodeBuilder, SemanticString, ServiceName, SignalHandlingMode, set_log_level_from_env_or,
+    AttributeSet, AttributeVerifier, CallbackProgression, FileName, IceoryxSend, LogLevel, NodeBuilder,
+    SemanticString, ServiceName, SignalHandlingMode, set_log_level_from_env_or,
 };
 use iceoryx2::service::Service as _;
 use iceoryx2::service::port_factory::{event, publish_subscribe};
@@ -27,13 +28,15 @@ use self::trouble::{Trouble, create, full, no_port, no_publisher, open};
 use crate::lock::MakingLock;
 use crate::shortage::check_client;
 use crate::{
-    Background, Domain, Failure, Foreground, Header, Kind, Marks, Scan, Status, Topic, Wake, Zones, access,
-    limits, of_service,
+    Background, Domain, Failure, Foreground, Header, Kind, Marks, Scan, Status, Topic, Zones, access, limits,
+    of_service,
 };
 
+pub use self::bell::{Bell, Unsupported, sleep_at_bells};
 pub use self::control::{Asked, ControlClient, ControlServer, Pending};
 pub use self::nodes::{Nodes, nodes};
 pub use self::sleep::{descriptor, sleep, take_wakeups};
+pub use self::wake::{Waker, listener, open_wake};
 pub use iceoryx2::port::update_connections::UpdateConnections;
 pub use iceoryx2::port::{LoanError, ReceiveError, SendError};
 /// Shared memory between processes; ports of it stay in their thread, nodes and services may move.
@@ -171,56 +174,6 @@ payload!(Zones, Topic::Zones, |builder| builder);
 payload!(Foreground, Topic::Foreground, |builder| builder);
 payload!(Background, Topic::Background, |builder| builder);
 payload!(Status, Topic::Status, |builder| builder);
-
-/// The wake service of `sensor`, made if it is not there: for the hub.
-pub fn create_wake(node: &Node, sensor: &str) -> Result<WakeService, Failure> {
-    let service = name(&Wake::service(sensor))?;
-    create(node, &service, || {
-        let builder = node.service_builder(&service).event();
-        builder
-            .max_notifiers(limits::NOTIFIERS)
-            .max_listeners(limits::LISTENERS)
-            .max_nodes(limits::NODES)
-            .event_id_max_value(limits::EVENT_ID)
-            .notifier_created_event(EventId::new(Wake::HubUp as usize))
-            .notifier_dropped_event(EventId::new(Wake::HubDown as usize))
-            .notifier_dead_event(EventId::new(Wake::HubDown as usize))
-            .open_or_create()
-            .map_err(Trouble::from)
-    })
-}
-
-/// The wake service of `sensor`, or nothing as long as no hub has made it: for consumers.
-pub fn open_wake(node: &Node, sensor: &str) -> Result<Option<WakeService>, Failure> {
-    let service = name(&Wake::service(sensor))?;
-    open(node, &service, node.service_builder(&service).event().open())
-}
-
-/// The hub's end of a wake service; consumers wake at once by [`Wake::HubUp`].
-pub fn notifier(wake: &WakeService) -> Result<Notifier, Failure> {
-    wake.notifier_builder()
-        .default_event_id(EventId::new(Wake::Telegram as usize))
-        .create()
-        .map_err(|error| no_port(wake.name(), &error))
-}
-
-/// Wakes all consumers for `why`; returns how many were told.
-pub fn notify(notifier: &Notifier, why: Wake) -> Result<usize, Failure> {
-    notifier
-        .notify_with_custom_event_id(EventId::new(why as usize))
-        .map_err(|error| Failure::new(Kind::Failed, format!("cannot wake consumers: {error:?}"), ""))
-}
-
-/// A consumer's end of a wake service.
-///
-/// [`Kind::Short`] if memory, descriptors or places for consumers are.
-pub fn listener(wake: &WakeService) -> Result<Listener, Failure> {
-    check_client()?;
-    wake.listener_builder().create().map_err(|error| match error {
-        ListenerCreateError::ExceedsMaxSupportedListeners => full(wake.name(), limits::LISTENERS),
-        other => no_port(wake.name(), &other),
-    })
-}
 
 /// The sensors that have topics in `domain`, sorted. Those of a dead hub stay as long as a consumer keeps them.
 pub fn sensors(domain: &Domain) -> Result<Vec<String>, Failure> {

@@ -3,9 +3,11 @@
 
 use std::path::PathBuf;
 use std::sync::atomic::{AtomicU32, Ordering};
+use std::thread;
 use std::time::Duration;
 
-use schema::ipc::{self, Payload, PortFactory};
+use rustix::time::{ClockId, clock_gettime};
+use schema::ipc::{self, Bell, Payload, PortFactory, Waker, sleep_at_bells};
 use schema::{
     Domain, Failure, Header, HubLock, Kind, ListenLock, Request, Response, Scan, Status, Topic, Verb, Wake,
     holder, limits, publisher,
@@ -141,8 +143,8 @@ fn limits_are_those_of_the_contract() {
     let status = Status::create(&hub, "front").unwrap();
     let config = status.static_config();
     assert_eq!((config.subscriber_max_buffer_size(), config.history_size()), (4, 1));
-    let wake = ipc::create_wake(&hub, "front").unwrap();
-    let config = wake.static_config();
+    let waker = Waker::new(&hub, "front").unwrap();
+    let config = waker.service().static_config();
     assert_eq!((config.max_listeners(), config.max_nodes(), config.event_id_max_value()), (250, 260, 7));
     assert_eq!(limits::samples(Topic::Scan), 16 + 800 + 2);
 }
@@ -151,7 +153,7 @@ fn limits_are_those_of_the_contract() {
 fn consumers_wake_for_every_reason() {
     let place = Place::new();
     let hub = ipc::hub_node(&place.domain).unwrap();
-    let wake = ipc::create_wake(&hub, "front").unwrap();
+    let waker = Waker::new(&hub, "front").unwrap();
     let client = ipc::client_node(&place.domain).unwrap();
     let seen = ipc::open_wake(&client, "front").unwrap().expect("the hub made it");
     let listener = ipc::listener(&seen).unwrap();
@@ -160,12 +162,85 @@ fn consumers_wake_for_every_reason() {
         listener.try_wait(|event| ids.push(event.id.as_value())).unwrap();
         ids
     };
-    let notifier = ipc::notifier(&wake).unwrap();
-    assert_eq!(heard(), [Wake::HubUp as usize]);
-    assert_eq!(ipc::notify(&notifier, Wake::Telegram).unwrap(), 1);
+    assert_eq!(heard(), [0usize; 0], "who comes later was not woken");
+    waker.wake(Wake::Telegram).unwrap();
     assert_eq!(heard(), [Wake::Telegram as usize]);
-    drop(notifier);
+    drop(waker);
     assert_eq!(heard(), [Wake::HubDown as usize]);
+    let _again = Waker::new(&hub, "front").unwrap();
+    assert_eq!(heard(), [Wake::HubUp as usize]);
+}
+
+/// CLOCK_MONOTONIC in so many seconds.
+fn in_seconds(seconds: i64) -> u64 {
+    let now = clock_gettime(ClockId::Monotonic);
+    (now.tv_sec + seconds) as u64 * 1_000_000_000 + now.tv_nsec as u64
+}
+
+#[test]
+fn one_ring_wakes_all_who_sleep_at_a_bell() {
+    let place = Place::new();
+    let hub = ipc::hub_node(&place.domain).unwrap();
+    let client = ipc::client_node(&place.domain).unwrap();
+    assert!(Bell::open(&client, "front").unwrap().is_none());
+    let (front, rear) = (Waker::new(&hub, "front").unwrap(), Waker::new(&hub, "rear").unwrap());
+    let bell = |sensor| Bell::open(&client, sensor).unwrap().expect("the hub hung it");
+    let (heard, end) = (bell("front").rung(), in_seconds(20));
+    let sleepers: Vec<_> = (0..8)
+        .map(|number| {
+            let (front, rear) = (bell("front"), bell("rear"));
+            thread::spawn(move || {
+                let both = [(&front, front.rung()), (&rear, heard)];
+                let bells = if number % 2 == 0 { &both[..] } else { &both[1..] };
+                while rear.rung() == heard && in_seconds(0) < end {
+                    sleep_at_bells(bells, end).expect("this system can wait for two words");
+                }
+                rear.rung()
+            })
+        })
+        .collect();
+    // Of a sensor that only half of them follow; they go on sleeping.
+    front.wake(Wake::Telegram).unwrap();
+    rear.wake(Wake::Telegram).unwrap();
+    assert!(sleepers.into_iter().all(|sleeper| sleeper.join().unwrap() == heard + 1));
+    assert!(in_seconds(0) < end, "somebody slept to the end");
+    assert_eq!((bell("front").rung(), bell("rear").is_closed()), (heard + 1, false));
+    let last = bell("rear");
+    drop(rear);
+    assert!(last.is_closed() && Bell::open(&client, "rear").unwrap().is_none());
+}
+
+#[test]
+fn the_bell_of_a_killed_hub_is_rung_by_the_next_one() {
+    let place = Place::new();
+    let hub = ipc::hub_node(&place.domain).unwrap();
+    let killed = Waker::new(&hub, "front").unwrap();
+    let bell = Bell::open(&hub, "front").unwrap().expect("the hub hung it");
+    // A process that is killed closes nothing.
+    std::mem::forget(killed);
+    let next = Waker::new(&hub, "front").unwrap();
+    let heard = bell.rung();
+    next.wake(Wake::Telegram).unwrap();
+    assert_eq!((bell.rung(), bell.is_closed()), (heard + 1, false));
+    let end = in_seconds(20);
+    sleep_at_bells(&[(&bell, heard)], end).unwrap();
+    assert!(in_seconds(10) < end, "what was rung before is no reason to sleep");
+}
+
+#[test]
+fn a_bell_that_nobody_can_have_is_told() {
+    let place = Place::new();
+    let hub = ipc::hub_node(&place.domain).unwrap();
+    let path = PathBuf::from("/dev/shm").join(format!("{}front.bell", place.domain.prefix()));
+    std::os::unix::fs::symlink("/dev/null", &path).unwrap();
+    let failure = Waker::new(&hub, "front").err().expect("a link is not followed");
+    assert_eq!(failure.kind, Kind::Failed);
+    assert!(failure.message.starts_with(path.to_str().unwrap()) && !failure.hint.is_empty(), "{failure}");
+    assert!(Bell::open(&hub, "front").is_err());
+    std::fs::remove_file(&path).unwrap();
+    std::fs::write(&path, "").unwrap();
+    assert!(Bell::open(&hub, "front").unwrap().is_none(), "it is not made yet");
+    assert!(Waker::new(&hub, "front").is_ok());
 }
 
 #[test]

@@ -10,7 +10,7 @@ use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
 use rustix::time::{ClockId, clock_gettime};
-use schema::ipc::{self, Node, Notifier, Payload, PortFactory, Publisher, TopicService, UpdateConnections};
+use schema::ipc::{self, Node, Payload, PortFactory, Publisher, TopicService, UpdateConnections, Waker};
 use schema::{
     Background, Domain, Failure, Foreground, Header, HubLock, Marks, Scan, State, Status, Verdict, Wake,
     Zones,
@@ -75,7 +75,7 @@ pub(crate) struct FakeSensor {
     pub(crate) foreground: Port<Foreground>,
     pub(crate) background: Port<Background>,
     pub(crate) status: Port<Status>,
-    pub(crate) notifier: Notifier,
+    pub(crate) waker: Waker,
     pub(crate) boot: u64,
     pub(crate) seq: u64,
     /// Of the scans, in us.
@@ -109,7 +109,7 @@ impl FakeSensor {
         sample.send().unwrap();
         self.scan.topic_seq += 1;
         self.seq += 1;
-        ipc::notify(&self.notifier, Wake::Telegram).unwrap();
+        self.waker.wake(Wake::Telegram).unwrap();
     }
 
     /// Publishes zones of `verdict` with something at `nearest_mm`, measured just now, and wakes the consumers.
@@ -129,7 +129,7 @@ impl FakeSensor {
         sample.send().unwrap();
         self.zones.topic_seq += 1;
         self.seq += 1;
-        ipc::notify(&self.notifier, Wake::Telegram).unwrap();
+        self.waker.wake(Wake::Telegram).unwrap();
     }
 
     /// Publishes a telegram and wakes the consumers.
@@ -140,7 +140,7 @@ impl FakeSensor {
         sample.write_from_slice(bytes).send().unwrap();
         self.telegram.topic_seq += 1;
         self.seq += 1;
-        ipc::notify(&self.notifier, Wake::Telegram).unwrap();
+        self.waker.wake(Wake::Telegram).unwrap();
     }
 
     /// Publishes a status and wakes the consumers.
@@ -153,7 +153,7 @@ impl FakeSensor {
         change(status);
         sample.send().unwrap();
         self.status.topic_seq += 1;
-        ipc::notify(&self.notifier, Wake::Status).unwrap();
+        self.waker.wake(Wake::Status).unwrap();
     }
 }
 
@@ -176,7 +176,7 @@ impl FakeHub {
             foreground: Port::new(&node, name),
             background: Port::new(&node, name),
             status: Port::new(&node, name),
-            notifier: ipc::notifier(&ipc::create_wake(&node, name).unwrap()).unwrap(),
+            waker: Waker::new(&node, name).unwrap(),
             boot,
             seq: 0,
             period_us: 26_640,

@@ -4,7 +4,7 @@
 mod outlet;
 
 use lms::session::Received;
-use schema::ipc::{self, BytesMut, Node, Notifier, WakeService};
+use schema::ipc::{BytesMut, Node, Waker};
 use schema::{Background, Failure, Flags, Foreground, Header, Marks, Quality, Scan, Status, Wake, Zones};
 
 use crate::clock;
@@ -27,8 +27,7 @@ pub(crate) struct Topics {
     /// Where a scan is decoded that nobody wants, or for which there is no memory: what is made of it is published all the
     /// same.
     spare_scan: Box<Scan>,
-    notifier: Notifier,
-    _wake: WakeService,
+    waker: Waker,
     /// What the next sample's header begins with.
     header: Header,
     next_seq: u64,
@@ -37,7 +36,7 @@ pub(crate) struct Topics {
 impl Topics {
     /// Makes the topics of `sensor`, number `number` in the configuration, for the hub's life `boot`.
     pub(crate) fn new(node: &Node, sensor: &str, number: u8, boot: u64) -> Result<Self, Failure> {
-        let wake = ipc::create_wake(node, sensor)?;
+        let waker = Waker::new(node, sensor)?;
         let header = Header { sensor: number, boot, hub_pid: std::process::id(), ..Header::default() };
         Ok(Topics {
             telegram: Outlet::new(node, sensor)?,
@@ -50,8 +49,7 @@ impl Topics {
             next_telegram: None,
             last_len: 0,
             spare_scan: Box::default(),
-            notifier: ipc::notifier(&wake)?,
-            _wake: wake,
+            waker,
             header,
             next_seq: 0,
         })
@@ -167,7 +165,7 @@ impl Topics {
 
     /// Wakes whoever sleeps; once per telegram, after its last sample.
     pub(crate) fn wake(&self, why: Wake) {
-        if let Err(failure) = ipc::notify(&self.notifier, why) {
+        if let Err(failure) = self.waker.wake(why) {
             tracing::debug!(%failure, "some consumers were not woken");
         }
     }

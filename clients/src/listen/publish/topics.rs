@@ -4,9 +4,7 @@
 use std::time::{Duration, Instant};
 
 use schema::datagram::{Announce, Head, Packed, telegram};
-use schema::ipc::{
-    self, Node, Notifier, Payload, Publisher, TopicService, UpdateConnections, WakeService, ZeroCopySend,
-};
+use schema::ipc::{Node, Payload, Publisher, TopicService, UpdateConnections, Waker, ZeroCopySend};
 use schema::{Background, Failure, Foreground, Header, Marks, Scan, State, Status, Topic, Wake, Zones};
 
 use super::super::remote::Remote;
@@ -35,8 +33,7 @@ pub(super) struct RemoteTopics {
     heard_at: Option<Instant>,
     /// Why consumers are to be woken.
     news: Option<Wake>,
-    notifier: Notifier,
-    _wake: WakeService,
+    waker: Waker,
 }
 
 /// So long nothing comes before the sensor counts as silent: three announcements.
@@ -45,7 +42,6 @@ const SILENT_AFTER: Duration = Duration::from_secs(3);
 impl RemoteTopics {
     /// The sensor `name`, without topics.
     pub(super) fn new(node: &Node, name: &str) -> Result<RemoteTopics, Failure> {
-        let wake = ipc::create_wake(node, name)?;
         Ok(RemoteTopics {
             name: name.to_owned(),
             source: None,
@@ -62,8 +58,7 @@ impl RemoteTopics {
             zoned: None,
             heard_at: None,
             news: None,
-            notifier: ipc::notifier(&wake)?,
-            _wake: wake,
+            waker: Waker::new(node, name)?,
         })
     }
 
@@ -157,7 +152,7 @@ impl RemoteTopics {
     pub(super) fn wake(&mut self) {
         if let Some(why) = self.news.take() {
             // Those that cannot be woken look by themselves ten times a second.
-            let _ = ipc::notify(&self.notifier, why);
+            let _ = self.waker.wake(why);
         }
     }
 

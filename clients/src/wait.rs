@@ -1,0 +1,170 @@
+//! How a consumer waits for the samples of its sensors. Refuses to know which topics they are, and whether there is a hub.
+
+use std::time::Duration;
+
+use schema::Failure;
+use schema::ipc::{self, Bell, Listener, Node, Unsupported};
+
+use crate::clock;
+
+/// What a consumer sleeps at, or whether at all.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum Wait {
+    /// A word in the hub's memory, at which one call wakes all. Where the system cannot wait for the words of several
+    /// sensors at once, the event.
+    #[default]
+    Doorbell,
+    /// The event that other languages listen to: one message of the hub to each consumer.
+    Event,
+    /// Not asleep: looks at the words all the time, and takes a whole processor for the shortest latency there is.
+    Spin,
+}
+
+/// What wakes a consumer, for each of its sensors.
+pub(crate) struct Wakeups {
+    wait: Wait,
+    sensors: Vec<Sensor>,
+    /// Wake-ups by event were taken since the last sleep, and samples looked for since.
+    taken: bool,
+}
+
+struct Sensor {
+    name: String,
+    bell: Option<Bell>,
+    /// How often the bell had been rung when its samples were last looked for.
+    rung: u32,
+    listener: Option<Listener>,
+}
+
+impl Wakeups {
+    /// None yet.
+    pub(crate) fn by(wait: Wait) -> Wakeups {
+        Wakeups { wait, sensors: Vec::new(), taken: false }
+    }
+
+    /// Those of the sensor `name` too; whether they are there already.
+    ///
+    /// [`Kind::Short`](schema::Kind) if memory, descriptors or places for consumers are.
+    pub(crate) fn add(&mut self, node: &Node, name: &str) -> Result<bool, Failure> {
+        if self.sensors.iter().any(|sensor| sensor.name == name) {
+            return Ok(true);
+        }
+        let mut sensor = Sensor { name: name.to_owned(), bell: None, rung: 0, listener: None };
+        let is_there = match self.wait {
+            Wait::Event => sensor.listen(node)?,
+            Wait::Doorbell | Wait::Spin => sensor.go_to_bell(node)?,
+        };
+        if is_there {
+            self.sensors.push(sensor);
+        }
+        Ok(is_there)
+    }
+
+    /// Sleeps until one of them wakes, a signal comes or `left` is over; returns at once if one has since the caller looked
+    /// for samples.
+    ///
+    /// [`Kind::Short`](schema::Kind) if the system cannot wait.
+    pub(crate) fn wait(&mut self, node: &Node, left: Duration) -> Result<(), Failure> {
+        if self.wait == Wait::Event {
+            return self.wait_for_event(left);
+        }
+        for sensor in &mut self.sensors {
+            // Who has come this far goes on without a bell, a little later each time, until there is one.
+            let _ = sensor.go_to_bell(node);
+        }
+        if self.heard() {
+            return Ok(());
+        }
+        let bells: Vec<_> = self.sensors.iter().filter_map(Sensor::bell).collect();
+        let until_ns = clock::now_ns().saturating_add(left.as_nanos() as u64);
+        let slept = match self.wait {
+            _ if bells.is_empty() => {
+                std::thread::sleep(left.min(WITHOUT_BELL));
+                Ok(())
+            }
+            Wait::Spin => {
+                spin(&bells, until_ns);
+                Ok(())
+            }
+            _ => ipc::sleep_at_bells(&bells, until_ns),
+        };
+        match slept {
+            Ok(()) => {
+                self.heard();
+                Ok(())
+            }
+            Err(Unsupported) => self.turn_to_events(node),
+        }
+    }
+
+    /// Whether a bell was rung since this was last asked; what was sent before can be received now.
+    fn heard(&mut self) -> bool {
+        let mut any = false;
+        for sensor in &mut self.sensors {
+            let rung = sensor.bell.as_ref().map_or(sensor.rung, Bell::rung);
+            any |= std::mem::replace(&mut sensor.rung, rung) != rung;
+        }
+        any
+    }
+
+    fn wait_for_event(&mut self, left: Duration) -> Result<(), Failure> {
+        let listeners: Vec<&Listener> =
+            self.sensors.iter().filter_map(|sensor| sensor.listener.as_ref()).collect();
+        if !self.taken && ipc::take_wakeups(&listeners)? {
+            self.taken = true;
+            return Ok(());
+        }
+        self.taken = false;
+        ipc::sleep(&listeners, left)
+    }
+
+    /// From now on. Returns without a wait: what came before the listeners has to be looked for.
+    fn turn_to_events(&mut self, node: &Node) -> Result<(), Failure> {
+        self.wait = Wait::Event;
+        for sensor in &mut self.sensors {
+            sensor.bell = None;
+            sensor.listen(node)?;
+        }
+        Ok(())
+    }
+}
+
+impl Sensor {
+    /// Whether it listens to the event, if possible.
+    fn listen(&mut self, node: &Node) -> Result<bool, Failure> {
+        let Some(service) = ipc::open_wake(node, &self.name)? else { return Ok(false) };
+        self.listener = Some(ipc::listener(&service)?);
+        Ok(true)
+    }
+
+    /// Whether it has a bell that may be rung. That of a hub that ended is given up.
+    fn go_to_bell(&mut self, node: &Node) -> Result<bool, Failure> {
+        if self.bell.as_ref().is_none_or(Bell::is_closed) {
+            self.bell = Bell::open(node, &self.name)?.filter(|bell| !bell.is_closed());
+            // Another bell, another count: samples may have been sent at it before.
+            self.rung = self.bell.as_ref().map_or(self.rung, |bell| bell.rung().wrapping_sub(1));
+        }
+        Ok(self.bell.is_some())
+    }
+
+    fn bell(&self) -> Option<(&Bell, u32)> {
+        self.bell.as_ref().map(|bell| (bell, self.rung))
+    }
+}
+
+fn spin(bells: &[(&Bell, u32)], until_ns: u64) {
+    while clock::now_ns() < until_ns {
+        for _ in 0..LOOKS {
+            if bells.iter().any(|(bell, rung)| bell.rung() != *rung) {
+                return;
+            }
+            std::hint::spin_loop();
+        }
+    }
+}
+
+/// Looks at the words between two at the clock.
+const LOOKS: u32 = 100;
+
+/// The longest sleep while a hub is gone and its successor has hung no bell.
+const WITHOUT_BELL: Duration = Duration::from_millis(20);

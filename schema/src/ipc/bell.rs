@@ -1,0 +1,195 @@
+//! A word in shared memory at which all consumers of a sensor sleep: one call of the hub wakes them all, however many
+//! they are, where an event is one message to each. Refuses to know what was sent, and who sleeps.
+//!
+//! The page lies in /dev/shm under the domain's prefix. Consumers map it read-only. A hub that is killed leaves it, and the
+//! next one goes on with it, so that who sleeps meanwhile is woken; a hub that ends closes it for good.
+#![allow(unsafe_code)]
+
+use std::fs::{File, OpenOptions};
+use std::io;
+use std::num::NonZeroU32;
+use std::os::unix::fs::{MetadataExt, OpenOptionsExt};
+use std::path::{Path, PathBuf};
+use std::sync::atomic::{AtomicU32, Ordering, fence};
+
+use memmap2::{MmapOptions, MmapRaw};
+use rustix::fs::{FallocateFlags, OFlags, fallocate};
+use rustix::io::Errno;
+use rustix::thread::futex::{self, WaitFlags, WaitPtr, WaitvFlags};
+use rustix::time::{ClockId, Timespec};
+
+use super::Node;
+use crate::shortage::{SHARED_MEMORY, memory};
+use crate::{Failure, Kind};
+
+/// The hub's end; dropped it closes the bell and wakes all once more.
+#[derive(Debug)]
+pub(super) struct Ringer {
+    page: Page,
+    path: PathBuf,
+}
+
+impl Ringer {
+    /// The bell of `sensor`: that of a killed hub, which its consumers still have, else a new one.
+    ///
+    /// [`Kind::Short`] if there is no memory for it, [`Kind::Failed`] if the place is taken by another user.
+    pub(super) fn hang(node: &Node, sensor: &str) -> Result<Ringer, Failure> {
+        Ringer::at(path(node, sensor)).map_err(|(path, error)| match error {
+            error if error.raw_os_error() == Some(Errno::NOSPC.raw_os_error()) => {
+                memory(&format!("{} kB for {} cannot be had", PAGE / 1024, path.display()))
+            }
+            error => Failure::new(
+                Kind::Failed,
+                format!("{}: {error}", path.display()),
+                "remove it, or choose another --domain",
+            ),
+        })
+    }
+
+    /// Wakes all who sleep.
+    pub(super) fn ring(&self) {
+        let rung = &self.page.words().rung;
+        rung.fetch_add(1, Ordering::Release);
+        // Nobody there is no error, and there is no other one for a word that is mapped.
+        let _ = futex::wake(rung, futex::Flags::empty(), i32::MAX as u32);
+    }
+
+    fn at(path: PathBuf) -> Result<Ringer, (PathBuf, io::Error)> {
+        match Ringer::open(&path) {
+            Ok(page) => Ok(Ringer { page, path }),
+            Err(error) => Err((path, error)),
+        }
+    }
+
+    fn open(path: &Path) -> io::Result<Page> {
+        loop {
+            let mut options = OpenOptions::new();
+            let file = own(options.read(true).write(true).create(true).truncate(false), path)?;
+            fallocate(&file, FallocateFlags::empty(), 0, PAGE as u64)?;
+            let page = Page(MmapOptions::new().len(PAGE).map_raw(&file)?);
+            if page.words().closed.load(Ordering::Relaxed) == 0 {
+                return Ok(page);
+            }
+            // Whose hub was killed while it ended: nobody may wait at it any more.
+            std::fs::remove_file(path)?;
+        }
+    }
+}
+
+impl Drop for Ringer {
+    fn drop(&mut self) {
+        let _ = std::fs::remove_file(&self.path);
+        self.page.words().closed.store(1, Ordering::Relaxed);
+        self.ring();
+    }
+}
+
+/// A consumer's end, read-only.
+#[derive(Debug)]
+pub struct Bell(Page);
+
+impl Bell {
+    /// The bell of `sensor`, or nothing as long as no hub has hung it.
+    ///
+    /// [`Kind::Short`] if memory or descriptors are, [`Kind::Failed`] if it is another user's.
+    pub fn open(node: &Node, sensor: &str) -> Result<Option<Bell>, Failure> {
+        let path = path(node, sensor);
+        let mapped = own(OpenOptions::new().read(true), &path).and_then(|file| {
+            let is_made = file.metadata()?.len() >= PAGE as u64;
+            let mapped = is_made.then(|| MmapOptions::new().len(PAGE).map_raw_read_only(&file));
+            Ok(mapped.transpose()?.map(|mapped| Bell(Page(mapped))))
+        });
+        match mapped {
+            Ok(bell) => Ok(bell),
+            Err(error) if error.kind() == io::ErrorKind::NotFound => Ok(None),
+            Err(error) => {
+                let short = [Errno::MFILE, Errno::NFILE, Errno::NOMEM].map(|errno| errno.raw_os_error());
+                let is_short = error.raw_os_error().is_some_and(|errno| short.contains(&errno));
+                let kind = if is_short { Kind::Short } else { Kind::Failed };
+                let hint = if is_short { "`ulimit -n` may be too small" } else { "is it another user's?" };
+                Err(Failure::new(kind, format!("{}: {error}", path.display()), hint))
+            }
+        }
+    }
+
+    /// How often it was rung, modulo 2^32. What was sent before that can be received after this.
+    pub fn rung(&self) -> u32 {
+        // Only a relaxed load may touch memory that is mapped read-only.
+        let rung = self.0.words().rung.load(Ordering::Relaxed);
+        fence(Ordering::Acquire);
+        rung
+    }
+
+    /// Its hub has ended: nobody rings it any more.
+    pub fn is_closed(&self) -> bool {
+        self.0.words().closed.load(Ordering::Relaxed) != 0
+    }
+}
+
+/// Why there is no sleeping at bells: the system cannot wait for several words at once (Linux before 5.16, some
+/// containers).
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Unsupported;
+
+/// Sleeps until one of `bells` was rung more often than the number beside it says, a signal comes, or CLOCK_MONOTONIC is
+/// at `until_ns`.
+pub fn sleep_at_bells(bells: &[(&Bell, u32)], until_ns: u64) -> Result<(), Unsupported> {
+    let until =
+        Timespec { tv_sec: (until_ns / 1_000_000_000) as i64, tv_nsec: (until_ns % 1_000_000_000) as i64 };
+    let woken = match bells {
+        [(bell, rung)] => {
+            let word = &bell.0.words().rung;
+            futex::wait_bitset(word, futex::Flags::empty(), *rung, Some(&until), NonZeroU32::MAX)
+        }
+        _ => {
+            let wait = |(bell, rung): &(&Bell, u32)| {
+                let mut wait = futex::Wait::new();
+                wait.val = u64::from(*rung);
+                wait.uaddr = WaitPtr::new(bell.0.words().rung.as_ptr().cast());
+                wait.flags = WaitFlags::SIZE_U32;
+                wait
+            };
+            let all: Vec<_> = bells.iter().map(wait).collect();
+            futex::waitv(&all, WaitvFlags::empty(), Some(&until), ClockId::Monotonic).map(|_| ())
+        }
+    };
+    match woken {
+        Ok(()) | Err(Errno::AGAIN | Errno::TIMEDOUT | Errno::INTR) => Ok(()),
+        Err(_) => Err(Unsupported),
+    }
+}
+
+/// What lies in the page, each on a cache line of its own.
+#[repr(C)]
+struct Words {
+    rung: AtomicU32,
+    _apart: [u32; 15],
+    closed: AtomicU32,
+}
+
+/// The page, as long as it is mapped here.
+#[derive(Debug)]
+struct Page(MmapRaw);
+
+impl Page {
+    fn words(&self) -> &Words {
+        // SAFETY: the page is mapped as long as it is borrowed, starts at its own border, is longer than the words, and
+        // any bytes are words. Nobody shortens the file: it is this user's alone.
+        unsafe { &*self.0.as_ptr().cast() }
+    }
+}
+
+const PAGE: usize = 4096;
+
+fn path(node: &Node, sensor: &str) -> PathBuf {
+    Path::new(SHARED_MEMORY).join(format!("{}{sensor}.bell", node.config().global.prefix))
+}
+
+/// The file at `path`, if it is this user's: anybody may put a file there.
+fn own(options: &mut OpenOptions, path: &Path) -> io::Result<File> {
+    let file = options.mode(0o600).custom_flags(OFlags::NOFOLLOW.bits() as i32).open(path)?;
+    if file.metadata()?.uid() != rustix::process::geteuid().as_raw() {
+        return Err(io::Error::new(io::ErrorKind::PermissionDenied, "it is another user's"));
+    }
+    Ok(file)
+}

@@ -1,0 +1,86 @@
+//! What wakes the consumers of one sensor: a bell for those that share this code, an event for all other languages. Hides
+//! from the hub which of the two is listened to.
+
+use iceoryx2::port::listener::ListenerCreateError;
+use iceoryx2::prelude::EventId;
+
+use super::bell::Ringer;
+use super::trouble::{Trouble, create, full, no_port, open};
+use super::{Listener, Node, Notifier, PortFactory, WakeService, name};
+use crate::shortage::check_client;
+use crate::{Failure, Kind, Wake, limits};
+
+/// The hub's end. Made, it wakes consumers by [`Wake::HubUp`]; dropped, by [`Wake::HubDown`].
+pub struct Waker {
+    ringer: Ringer,
+    notifier: Notifier,
+    service: WakeService,
+}
+
+impl Waker {
+    /// That of `sensor`, to be made before its topics: who finds those sleeps at it.
+    ///
+    /// [`Kind::Short`] if memory is, [`Kind::Failed`] if the service is of another layout.
+    pub fn new(node: &Node, sensor: &str) -> Result<Waker, Failure> {
+        let ringer = Ringer::hang(node, sensor)?;
+        let service = create_service(node, sensor)?;
+        let notifier = service
+            .notifier_builder()
+            .default_event_id(EventId::new(Wake::Telegram as usize))
+            .create()
+            .map_err(|error| no_port(service.name(), &error))?;
+        Ok(Waker { ringer, notifier, service })
+    }
+
+    /// Wakes all consumers for `why`: those at the bell with one call, then those that listen to the event.
+    ///
+    /// [`Kind::Failed`] if some of the latter were not told.
+    pub fn wake(&self, why: Wake) -> Result<(), Failure> {
+        self.ringer.ring();
+        if self.service.dynamic_config().number_of_listeners() == 0 {
+            return Ok(());
+        }
+        let told = self.notifier.notify_with_custom_event_id(EventId::new(why as usize));
+        told.map(|_| ())
+            .map_err(|error| Failure::new(Kind::Failed, format!("cannot wake consumers: {error:?}"), ""))
+    }
+
+    /// The event service.
+    pub fn service(&self) -> &WakeService {
+        &self.service
+    }
+}
+
+fn create_service(node: &Node, sensor: &str) -> Result<WakeService, Failure> {
+    let service = name(&Wake::service(sensor))?;
+    create(node, &service, || {
+        let builder = node.service_builder(&service).event();
+        builder
+            .max_notifiers(limits::NOTIFIERS)
+            .max_listeners(limits::LISTENERS)
+            .max_nodes(limits::NODES)
+            .event_id_max_value(limits::EVENT_ID)
+            .notifier_created_event(EventId::new(Wake::HubUp as usize))
+            .notifier_dropped_event(EventId::new(Wake::HubDown as usize))
+            .notifier_dead_event(EventId::new(Wake::HubDown as usize))
+            .open_or_create()
+            .map_err(Trouble::from)
+    })
+}
+
+/// The event service of `sensor`, or nothing as long as no hub has made it: for consumers.
+pub fn open_wake(node: &Node, sensor: &str) -> Result<Option<WakeService>, Failure> {
+    let service = name(&Wake::service(sensor))?;
+    open(node, &service, node.service_builder(&service).event().open())
+}
+
+/// A consumer's end of the event.
+///
+/// [`Kind::Short`] if memory, descriptors or places for consumers are.
+pub fn listener(wake: &WakeService) -> Result<Listener, Failure> {
+    check_client()?;
+    wake.listener_builder().create().map_err(|error| match error {
+        ListenerCreateError::ExceedsMaxSupportedListeners => full(wake.name(), limits::LISTENERS),
+        other => no_port(wake.name(), &other),
+    })
+}
