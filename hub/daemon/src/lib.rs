@@ -20,6 +20,7 @@ mod preflight;
 pub mod probe;
 mod replay;
 pub mod scanner;
+mod service;
 mod status;
 mod supervise;
 pub mod telegram;
