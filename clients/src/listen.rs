@@ -112,8 +112,8 @@ const LONGEST_WAIT: Duration = Duration::from_millis(100);
 const TOLD: usize = 16;
 
 /// What to do about [`Refusal::Capacity`].
-const FULL: &str = "datagrams are refused: more gateways and starts of gateways were heard than one listener keeps apart \
-                    (64): start it anew";
+const FULL: &str = "datagrams are refused: more gateways (64), or more of their sensors and topics (1024), were heard than \
+                    one listener keeps apart: start it anew";
 
 /// Between two accounts on a terminal.
 const DRAW_EVERY: Duration = Duration::from_secs(1);
@@ -181,7 +181,7 @@ impl Listener<'_> {
             // What it says was said again, and better, by a newer one.
             return if late { Ok(()) } else { self.announced(&datagram, wall_ns) };
         };
-        let life = self.roll.life(&head);
+        let life = self.roll.life(&head, &self.account);
         let age_ns = life.age_ns(head.stamp_ns, wall_ns);
         let sensor = life.sensor(head.sensor);
         let missed = if late { 0 } else { sensor.advance(head.topic, head.sequence) };
@@ -209,7 +209,7 @@ impl Listener<'_> {
     fn announced(&mut self, datagram: &Datagram<'_>, wall_ns: u64) -> Result<(), End> {
         let head = datagram.head;
         let Some(announce) = Announce::unpack(datagram.payload) else { return Ok(()) };
-        let life = self.roll.life(&head);
+        let life = self.roll.life(&head, &self.account);
         if let Some(behind_ns) = life.announce(head.sensor, &announce, head.stamp_ns, wall_ns) {
             self.report.clocks_differ(&head, behind_ns)?;
         }

@@ -1,21 +1,16 @@
 //! The network interface that datagrams leave by: which one is meant, and whether anything gets out there. The kernel
 //! takes datagrams for an interface whose cable is out, and says nothing. Refuses to know what is sent.
 
-use std::os::fd::OwnedFd;
 use std::time::{Duration, Instant};
 
-use rustix::io::Errno;
-use rustix::net::netlink::SocketAddrNetlink;
-use rustix::net::{AddressFamily, RecvFlags, SocketFlags, SocketType, bind, recv, socket_with};
 use schema::{Failure, Kind};
 
-use crate::interface::{Interface, interfaces, named};
+use crate::interface::{Changes, Interface, interfaces, named};
 
 /// A network interface and its state.
 pub(super) struct Uplink {
     name: String,
-    /// The kernel tells here that interfaces or addresses changed.
-    events: OwnedFd,
+    changes: Changes,
     index: Option<u32>,
     is_up: bool,
     /// When the kernel is asked again that could not tell.
@@ -31,16 +26,14 @@ impl Uplink {
     ///
     /// [`Kind::Configuration`] with those that there are if it is not there, or not just one.
     pub(super) fn choose(name: Option<&str>) -> Result<Uplink, Failure> {
-        // First the events: what changes after the look is one.
-        let events = events().map_err(|error| {
-            Failure::new(Kind::Failed, format!("cannot watch network interfaces: {error}"), "")
-        })?;
+        // First the watch: what changes after the look is heard.
+        let changes = Changes::watch()?;
         let found = match name {
             Some(name) => named(name)?,
             None => only(interfaces()?)?,
         };
         let mut uplink =
-            Uplink { name: found.name.clone(), events, index: None, is_up: false, again_at: None };
+            Uplink { name: found.name.clone(), changes, index: None, is_up: false, again_at: None };
         uplink.learn(Some(&found));
         Ok(uplink)
     }
@@ -64,12 +57,8 @@ impl Uplink {
     /// system call as long as nothing did. If the kernel cannot tell what there is now, all stays as it is and it is asked
     /// again.
     pub(super) fn look(&mut self) -> bool {
-        let mut any = self.again_at.is_some_and(|at| Instant::now() >= at);
-        // More than can wait are an error that stands for them.
-        while let Ok(_) | Err(Errno::NOBUFS) = recv(&self.events, &mut [0; 64], RecvFlags::DONTWAIT) {
-            any = true;
-        }
-        if !any {
+        let is_again = self.again_at.is_some_and(|at| Instant::now() >= at);
+        if !self.changes.take(|_| {}) && !is_again {
             return false;
         }
         let before = (self.index, self.is_up);
@@ -108,17 +97,6 @@ fn only(mut all: Vec<Interface>) -> Result<Interface, Failure> {
             Err(Failure::new(Kind::Configuration, what, format!("name one by --interface: {hint}")))
         }
     }
-}
-
-/// The kernel's word on links and addresses, without waiting for it (rtnetlink(7)).
-fn events() -> rustix::io::Result<OwnedFd> {
-    const LINK: u32 = 1;
-    const IPV4_ADDRESS: u32 = 0x10;
-    let flags = SocketFlags::CLOEXEC | SocketFlags::NONBLOCK;
-    // No protocol: NETLINK_ROUTE is 0.
-    let socket = socket_with(AddressFamily::NETLINK, SocketType::RAW, flags, None)?;
-    bind(&socket, &SocketAddrNetlink::new(0, LINK | IPV4_ADDRESS))?;
-    Ok(socket)
 }
 
 #[cfg(test)]

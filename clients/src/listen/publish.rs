@@ -1,6 +1,8 @@
 //! Sensors of other machines in the domain of this one, so that a consumer follows them as it follows those of a hub.
 //! Refuses to know the network: what it gets was checked and is new.
 
+mod arrivals;
+mod outlet;
 mod topics;
 
 use std::time::{Duration, Instant};
