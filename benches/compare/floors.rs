@@ -1,0 +1,212 @@
+//! The floors: a process tells another one that there is something, and nothing more. By a word in shared memory at which
+//! the other sleeps or looks, which is one addition and one system call, or by an eventfd. Every mechanism does one of
+//! these at least; what it takes beyond is its own.
+
+use std::io::{IoSlice, IoSliceMut};
+use std::mem::MaybeUninit;
+use std::os::fd::{AsFd, OwnedFd};
+use std::os::unix::net::{UnixListener, UnixStream};
+
+use rustix::event::{EventfdFlags, eventfd};
+use rustix::net::{
+    RecvAncillaryBuffer, RecvAncillaryMessage, RecvFlags, SendAncillaryBuffer, SendAncillaryMessage,
+    SendFlags, recvmsg, sendmsg,
+};
+use schema::ipc::{self, Bell, Node, Waker};
+use schema::{Domain, Environment, HubLock, Wake};
+
+use super::message::Label;
+use super::receiver::Inlet;
+use super::schedule::PHASES;
+use super::sender::{Outlet, Task};
+use super::streams::door;
+use super::topic::SENSOR;
+use super::way::Way;
+use crate::support::{Outcome, clock};
+
+/// The word's writer.
+pub(crate) struct Word {
+    waker: Waker,
+    _node: Node,
+    _lock: HubLock,
+}
+
+impl Word {
+    pub(crate) fn new(task: &Task) -> Outcome<Word> {
+        let domain = Domain::of_hub(task.domain, None, &Environment::of_process())?;
+        let lock = HubLock::acquire(domain.root())?;
+        let node = ipc::hub_node(&domain)?;
+        Ok(Word { waker: Waker::new(&node, SENSOR)?, _node: node, _lock: lock })
+    }
+}
+
+impl Outlet for Word {
+    fn open(&mut self) -> Outcome<()> {
+        Ok(())
+    }
+
+    fn send(&mut self, _: Label) -> Outcome<u64> {
+        let at = clock::now();
+        self.waker.wake(Wake::Telegram)?;
+        Ok(at)
+    }
+}
+
+/// The word's reader.
+pub(crate) struct WordInlet {
+    bell: Bell,
+    rung: u32,
+    spins: bool,
+    counted: Counted,
+    _node: Node,
+}
+
+impl WordInlet {
+    pub(crate) fn new(task: &Task) -> Outcome<WordInlet> {
+        let node = ipc::client_node(&Domain::of_hub(task.domain, None, &Environment::of_process())?)?;
+        let bell = Bell::open(&node, SENSOR)?.ok_or("no bell")?;
+        let rung = bell.rung();
+        Ok(WordInlet {
+            bell,
+            rung,
+            spins: task.way == Way::SpinFloor,
+            counted: Counted::new(task),
+            _node: node,
+        })
+    }
+}
+
+impl Inlet for WordInlet {
+    fn next(&mut self) -> Outcome<Label> {
+        while !self.counted.is_waiting() {
+            let rung = self.bell.rung();
+            if rung != self.rung {
+                self.counted.add(u64::from(rung.wrapping_sub(self.rung)));
+                self.rung = rung;
+            } else if self.spins {
+                std::hint::spin_loop();
+            } else {
+                let until = clock::now() + LONG_NS;
+                ipc::sleep_at_bells(&[(&self.bell, rung)], until).map_err(|error| format!("{error:?}"))?;
+            }
+        }
+        Ok(self.counted.take())
+    }
+}
+
+/// The writing end of an eventfd.
+pub(crate) struct Counter {
+    eventfd: OwnedFd,
+    listener: UnixListener,
+    path: String,
+}
+
+impl Counter {
+    pub(crate) fn new(task: &Task) -> Outcome<Counter> {
+        let path = door(task.place);
+        let eventfd = eventfd(0, EventfdFlags::CLOEXEC)?;
+        Ok(Counter { eventfd, listener: UnixListener::bind(&path)?, path })
+    }
+}
+
+impl Outlet for Counter {
+    fn open(&mut self) -> Outcome<()> {
+        let (stream, _) = self.listener.accept()?;
+        let mut space = [MaybeUninit::uninit(); rustix::cmsg_space!(ScmRights(1))];
+        let mut control = SendAncillaryBuffer::new(&mut space);
+        let fds = [self.eventfd.as_fd()];
+        control.push(SendAncillaryMessage::ScmRights(&fds));
+        sendmsg(&stream, &[IoSlice::new(&[0])], &mut control, SendFlags::empty())?;
+        Ok(())
+    }
+
+    fn send(&mut self, _: Label) -> Outcome<u64> {
+        let at = clock::now();
+        rustix::io::write(&self.eventfd, &1u64.to_ne_bytes())?;
+        Ok(at)
+    }
+}
+
+impl Drop for Counter {
+    fn drop(&mut self) {
+        let _ = std::fs::remove_file(&self.path);
+    }
+}
+
+/// Its reading end.
+pub(crate) struct CounterInlet {
+    stream: UnixStream,
+    eventfd: Option<OwnedFd>,
+    counted: Counted,
+}
+
+impl CounterInlet {
+    pub(crate) fn new(task: &Task) -> Outcome<CounterInlet> {
+        let stream = UnixStream::connect(door(task.place))?;
+        Ok(CounterInlet { stream, eventfd: None, counted: Counted::new(task) })
+    }
+}
+
+impl Inlet for CounterInlet {
+    fn next(&mut self) -> Outcome<Label> {
+        if self.eventfd.is_none() {
+            self.eventfd = Some(handed(&self.stream)?);
+        }
+        while let (false, Some(eventfd)) = (self.counted.is_waiting(), &self.eventfd) {
+            let mut told = [0; 8];
+            rustix::io::read(eventfd, &mut told)?;
+            self.counted.add(u64::from_ne_bytes(told));
+        }
+        Ok(self.counted.take())
+    }
+}
+
+/// The descriptor that comes through `stream`.
+fn handed(stream: &UnixStream) -> Outcome<OwnedFd> {
+    let mut space = [MaybeUninit::uninit(); rustix::cmsg_space!(ScmRights(1))];
+    let mut control = RecvAncillaryBuffer::new(&mut space);
+    recvmsg(stream, &mut [IoSliceMut::new(&mut [0])], &mut control, RecvFlags::CMSG_CLOEXEC)?;
+    let handed = control.drain().find_map(|message| match message {
+        RecvAncillaryMessage::ScmRights(mut fds) => fds.next(),
+        _ => None,
+    });
+    Ok(handed.ok_or("no eventfd came")?)
+}
+
+/// Which message it is that was told of: nothing but a count comes.
+struct Counted {
+    way: Way,
+    told: u64,
+    taken: u64,
+    phase: usize,
+}
+
+impl Counted {
+    fn new(task: &Task) -> Counted {
+        Counted { way: task.way, told: 0, taken: 0, phase: 0 }
+    }
+
+    fn add(&mut self, told: u64) {
+        self.told += told;
+    }
+
+    fn is_waiting(&self) -> bool {
+        self.taken < self.told
+    }
+
+    fn take(&mut self) -> Label {
+        let number = self.taken;
+        self.taken += 1;
+        let label =
+            Label { phase: self.phase, number, is_end: number == PHASES[self.phase].count(self.way) as u64 };
+        if label.is_end {
+            self.phase += 1;
+            self.told -= self.taken;
+            self.taken = 0;
+        }
+        label
+    }
+}
+
+/// Longer than anything takes.
+const LONG_NS: u64 = 10_000_000_000;

@@ -1,0 +1,140 @@
+//! What does a message from one process to N others cost by this hub's topics, and what by the mechanisms that a user
+//! would take instead? UDP multicast, Unix sockets, TCP and pipes beside topics with each of their waits, and under all of
+//! them the bare wake-ups. One run after the other, in turning order, so that what the machine does meets them all.
+//! It does not tell what a network or another machine adds.
+
+mod datagrams;
+mod floors;
+mod message;
+mod receiver;
+mod run;
+mod schedule;
+mod sender;
+mod streams;
+#[path = "../support/mod.rs"]
+mod support;
+mod table;
+mod targets;
+mod topic;
+mod way;
+
+use std::io::IsTerminal;
+use std::process::ExitCode;
+use std::thread::available_parallelism;
+
+use rustix::process::{Signal, set_parent_process_death_signal};
+
+use run::{Case, Measured};
+use sender::Task;
+use support::options::Options;
+use support::stage::Stage;
+use support::{Outcome, PART};
+use way::Way;
+
+/// One result of each pair, in the order in which they were taken.
+pub(crate) struct Cell {
+    pub(crate) case: Case,
+    /// Position in the schedule.
+    pub(crate) phase: usize,
+    pub(crate) runs: Vec<Measured>,
+}
+
+fn main() -> ExitCode {
+    let words: Vec<String> = std::env::args().skip(1).collect();
+    let outcome = match words.first().map(String::as_str) {
+        Some(PART) => play(&words[1..]),
+        _ => measure(words),
+    };
+    match outcome {
+        Ok(()) => ExitCode::SUCCESS,
+        Err(error) => {
+            eprintln!("{error}");
+            ExitCode::FAILURE
+        }
+    }
+}
+
+/// A process of a run.
+fn play(words: &[String]) -> Outcome<()> {
+    set_parent_process_death_signal(Some(Signal::TERM))?;
+    let words: Vec<&str> = words.iter().map(String::as_str).collect();
+    let [part, way, payload, receivers, domain, place, ref rest @ ..] = words[..] else {
+        return Err(format!("no part {words:?}").into());
+    };
+    let way = Way::named(way)?;
+    let task = Task { way, payload: payload.parse()?, receivers: receivers.parse()?, domain, place };
+    match (part, rest) {
+        ("send", []) => sender::play(&task),
+        ("receive", [number, address]) => receiver::play(&task, number.parse()?, address),
+        _ => Err(format!("no part {words:?}").into()),
+    }
+}
+
+fn measure(mut words: Vec<String>) -> Outcome<()> {
+    let all = words.len();
+    words.retain(|word| word != "--quick");
+    let quick = words.len() < all;
+    let options = Options::parse(&words)?;
+    let pairs = if quick { options.pairs().min(2) } else { options.pairs() };
+    let (payloads, receivers): (&[usize], &[usize]) =
+        if quick { (&[TELEGRAM, MEBIBYTE], &[1, 16]) } else { (&PAYLOADS, &RECEIVERS) };
+    Stage::sweep()?;
+    let stage = Stage::new()?;
+    let processors = available_parallelism()?.get();
+    let mut cells = Vec::new();
+    for (number, payload) in payloads.iter().enumerate() {
+        for receivers in receivers {
+            tell(&format!("{payload} bytes to {receivers}, length {} of {}", number + 1, payloads.len()));
+            cells.extend(compare(&stage, *payload, *receivers, processors, pairs)?);
+        }
+    }
+    drop(stage);
+    table::print(&options, processors, pairs, &cells);
+    targets::print(&options, &cells);
+    match &options.draw {
+        Some(directory) => Ok(table::draw(directory, &cells)?),
+        None => Ok(()),
+    }
+}
+
+/// All mechanisms with the same messages and the same number of receivers, `pairs` times, each time another one first.
+fn compare(
+    stage: &Stage,
+    payload: usize,
+    receivers: usize,
+    processors: usize,
+    pairs: usize,
+) -> Outcome<Vec<Cell>> {
+    let ways = Way::ALL.into_iter().filter(|way| way.runs(receivers, payload, processors));
+    let mut cases: Vec<_> = ways.map(|way| Case { way, payload, receivers }).collect();
+    let mut cells: Vec<Cell> = Vec::new();
+    for case in &cases {
+        let phases = 1..schedule::PHASES.len();
+        let phases = phases.filter(|phase| schedule::PHASES[*phase].count(case.way) > 0);
+        cells.extend(phases.map(|phase| Cell { case: *case, phase, runs: Vec::new() }));
+    }
+    for _ in 0..pairs {
+        for case in &cases {
+            let measured = case.measure(stage).map_err(|error| format!("{case:?}: {error}"))?;
+            for (phase, measured) in measured {
+                let cell = cells.iter_mut().find(|cell| cell.case == *case && cell.phase == phase);
+                cell.ok_or("no such phase")?.runs.push(measured);
+            }
+        }
+        cases.rotate_left(1);
+    }
+    Ok(cells)
+}
+
+/// Says how far it is to who watches.
+fn tell(progress: &str) {
+    if std::io::stderr().is_terminal() {
+        eprintln!("{progress}");
+    }
+}
+
+/// A telegram of 361 values.
+const TELEGRAM: usize = 732;
+const MEBIBYTE: usize = 1 << 20;
+const PAYLOADS: [usize; 4] = [TELEGRAM, size_of::<schema::Scan>(), 1 << 16, MEBIBYTE];
+const RECEIVERS: [usize; 4] = [1, 4, 16, 64];

@@ -1,0 +1,136 @@
+//! One mechanism with one number of receivers and one length of messages: starts the processes, leads them through all
+//! phases, and makes figures of what they say. Refuses to know what the figures are compared with.
+
+use std::os::unix::net::UnixDatagram;
+
+use super::schedule::PHASES;
+use super::sender::control;
+use super::way::Way;
+use crate::support::Outcome;
+use crate::support::child::{Child, Line};
+use crate::support::figures::percentile;
+use crate::support::stage::{PATIENCE, Stage};
+
+/// A mechanism among so many processes.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) struct Case {
+    pub(crate) way: Way,
+    /// Bytes of a message.
+    pub(crate) payload: usize,
+    pub(crate) receivers: usize,
+}
+
+/// What one phase of it took.
+#[derive(Clone, Debug)]
+pub(crate) struct Measured {
+    /// From just before the send until it is in hand, of all receivers: p50, p99, p99.9, in us.
+    pub(crate) latency: [Option<f64>; 3],
+    /// The same of the last receiver of each message that all of them got.
+    pub(crate) last: [Option<f64>; 3],
+    /// Processor time of the sender for a message, in us.
+    pub(crate) sender_us: f64,
+    /// Processor time of a receiver for a message, in us; nothing if none came.
+    pub(crate) receiver_us: Option<f64>,
+    /// Messages that a receiver got, a second.
+    pub(crate) rate_hz: f64,
+    /// Messages that were not received, in %.
+    pub(crate) missed_percent: f64,
+    /// The rate was kept.
+    pub(crate) kept: bool,
+}
+
+impl Case {
+    /// Runs it; one result for each phase that it has, with the phase's position.
+    pub(crate) fn measure(&self, stage: &Stage) -> Outcome<Vec<(usize, Measured)>> {
+        let place = stage.port("compare");
+        let [payload, receivers] = [self.payload, self.receivers].map(|number| number.to_string());
+        let words = [self.way.name(), &payload, &receivers, stage.domain.name(), &place];
+        let sender = stage.part(&[&["send"], &words[..]].concat())?;
+        let ready = sender.await_line("ready", PATIENCE)?;
+        let address = ready.words().get(1).ok_or("no address")?.to_string();
+        let start = |number: usize| {
+            stage.part(&[&["receive"], &words[..], &[&number.to_string(), &address]].concat())
+        };
+        let receivers = (0..self.receivers).map(start).collect::<Outcome<Vec<_>>>()?;
+        for receiver in &receivers {
+            receiver.await_line("ready", PATIENCE)?;
+        }
+        let tell = UnixDatagram::unbound()?;
+        tell.connect(control(&place))?;
+        tell.send(GO)?;
+        sender.await_line("open", PATIENCE)?;
+        let mut measured = Vec::new();
+        for (number, phase) in PHASES.iter().enumerate() {
+            tell.send(GO)?;
+            let sent = Account::of(&sender, "sent")?;
+            let took =
+                receivers.iter().map(|child| Account::of(child, "took")).collect::<Outcome<Vec<_>>>()?;
+            if number > 0 && phase.count(self.way) > 0 {
+                let mut figures = figures(&sent, &took)?;
+                figures.kept = phase.period_ns == 0 || sent.numbers.len() == phase.count(self.way);
+                measured.push((number, figures));
+            }
+        }
+        tell.send(GO)?;
+        for child in receivers.iter().chain([&sender]) {
+            child.await_line("end", PATIENCE)?;
+        }
+        receivers.into_iter().chain([sender]).try_for_each(|child| child.guard.wait())?;
+        Ok(measured)
+    }
+}
+
+/// What a process says of a phase.
+struct Account {
+    busy_ns: u64,
+    /// Times of the sender; number and time of a receiver in turn.
+    numbers: Vec<u64>,
+}
+
+impl Account {
+    fn of(child: &Child, word: &str) -> Outcome<Account> {
+        let Line { text, .. } = child.await_line(word, PATIENCE)?;
+        let mut numbers = text.split_whitespace().skip(1).map(str::parse);
+        let busy_ns = numbers.next().ok_or("no account")??;
+        Ok(Account { busy_ns, numbers: numbers.collect::<Result<_, _>>()? })
+    }
+}
+
+fn figures(sent: &Account, took: &[Account]) -> Outcome<Measured> {
+    let mut all = Vec::new();
+    let mut last = vec![(0usize, 0u64); sent.numbers.len()];
+    let mut end_ns = 0;
+    for account in took {
+        for message in account.numbers.chunks_exact(2) {
+            let number = message[0] as usize;
+            let sent_ns = *sent.numbers.get(number).ok_or_else(|| format!("nobody sent {number}"))?;
+            let latency = message[1].saturating_sub(sent_ns);
+            all.push(latency);
+            last[number] = (last[number].0 + 1, last[number].1.max(latency));
+            end_ns = end_ns.max(message[1]);
+        }
+    }
+    let received = all.len();
+    let of_all = last.iter().filter(|(receivers, _)| *receivers == took.len());
+    let begin_ns = *sent.numbers.first().ok_or("nothing was sent")?;
+    let expected = sent.numbers.len() * took.len();
+    let busy_ns: u64 = took.iter().map(|account| account.busy_ns).sum();
+    Ok(Measured {
+        last: percentiles(of_all.map(|(_, latency)| *latency).collect()),
+        latency: percentiles(all),
+        sender_us: sent.busy_ns as f64 / 1e3 / sent.numbers.len() as f64,
+        receiver_us: (received > 0).then(|| busy_ns as f64 / 1e3 / received as f64),
+        rate_hz: received as f64 / took.len() as f64 / (end_ns.saturating_sub(begin_ns).max(1) as f64 / 1e9),
+        missed_percent: 100.0 * (expected - received) as f64 / expected as f64,
+        kept: true,
+    })
+}
+
+/// p50, p99 and p99.9 of times in ns, in us.
+fn percentiles(times: Vec<u64>) -> [Option<f64>; 3] {
+    let mut sorted: Vec<f64> = times.iter().map(|time| *time as f64 / 1e3).collect();
+    sorted.sort_by(f64::total_cmp);
+    [0.5, 0.99, 0.999].map(|part| percentile(&sorted, part))
+}
+
+const GO: &[u8] = b"go";

@@ -1,0 +1,225 @@
+//! Topics: a service with the settings of the hub's own, for messages of any length, and the hub's own topic of scans for
+//! comparison. Published as the hub does: loaned, written in place, sent, then all are woken once.
+
+use clients::Attachment;
+use iceoryx2::prelude::ServiceName;
+use schema::ipc::{self, Bell, Listener, Node, Payload, Publisher, Subscriber, TopicService, Waker};
+use schema::{Domain, Environment, Header, HubLock, Scan, Topic, Wake, limits};
+
+use super::message::{Label, SHORT, contents};
+use super::receiver::Inlet;
+use super::sender::{Outlet, Task};
+use super::way::Way;
+use crate::support::{Outcome, clock, consumer};
+
+/// The membership of a process that publishes.
+struct Hub {
+    waker: Waker,
+    node: Node,
+    _lock: HubLock,
+}
+
+impl Hub {
+    fn new(task: &Task) -> Outcome<Hub> {
+        let domain = Domain::of_hub(task.domain, None, &Environment::of_process())?;
+        let lock = HubLock::acquire(domain.root())?;
+        let node = ipc::hub_node(&domain)?;
+        Ok(Hub { waker: Waker::new(&node, SENSOR)?, node, _lock: lock })
+    }
+}
+
+/// The publisher of a topic of bytes.
+pub(crate) struct Bytes {
+    publisher: Publisher<[u8]>,
+    _service: TopicService<[u8]>,
+    contents: Vec<u8>,
+    hub: Hub,
+}
+
+impl Bytes {
+    pub(crate) fn new(task: &Task) -> Outcome<Bytes> {
+        let hub = Hub::new(task)?;
+        let service = hub
+            .node
+            .service_builder(&ServiceName::new(SERVICE)?)
+            .publish_subscribe::<[u8]>()
+            .user_header::<Header>()
+            .max_publishers(limits::PUBLISHERS)
+            .max_subscribers(limits::SUBSCRIBERS)
+            .max_nodes(limits::NODES)
+            .subscriber_max_buffer_size(limits::buffer(Topic::Scan))
+            .subscriber_max_borrowed_samples(limits::BORROWED)
+            .history_size(limits::history(Topic::Scan))
+            .enable_safe_overflow(true)
+            .create()?;
+        let publisher = service
+            .publisher_builder()
+            .max_loaned_samples(limits::LOANED)
+            .override_sample_preallocation(|_| limits::samples(Topic::Scan))
+            .initial_max_slice_len(task.payload)
+            .create()?;
+        Ok(Bytes { publisher, _service: service, contents: contents(task.payload), hub })
+    }
+
+    fn publish(&self, label: Label, len: usize) -> Outcome<u64> {
+        let loan = self.publisher.loan_slice_uninit(len).map_err(|error| format!("no loan: {error:?}"))?;
+        let mut sample = loan.write_from_slice(&self.contents[..len]);
+        label.write(sample.payload_mut());
+        let at = clock::now();
+        sample.send().map_err(|error| format!("not sent: {error:?}"))?;
+        self.hub.waker.wake(Wake::Telegram)?;
+        Ok(at)
+    }
+}
+
+impl Outlet for Bytes {
+    fn open(&mut self) -> Outcome<()> {
+        Ok(())
+    }
+
+    fn send(&mut self, label: Label) -> Outcome<u64> {
+        self.publish(label, self.contents.len())
+    }
+
+    fn end(&mut self, label: Label) -> Outcome<()> {
+        self.publish(label, SHORT).map(|_| ())
+    }
+}
+
+/// A subscriber of it.
+pub(crate) struct BytesInlet {
+    subscriber: Subscriber<[u8]>,
+    wait: Wait,
+    _node: Node,
+}
+
+/// What it waits at, as the attach library does.
+enum Wait {
+    /// How often the bell was rung when samples were last looked for; whether it sleeps.
+    Bell(Bell, u32, bool),
+    /// Whether wake-ups were taken since it slept.
+    Event(Box<Listener>, bool),
+}
+
+impl BytesInlet {
+    pub(crate) fn new(task: &Task) -> Outcome<BytesInlet> {
+        let node = ipc::client_node(&Domain::of_hub(task.domain, None, &Environment::of_process())?)?;
+        let wait = if task.way == Way::Event {
+            let event = ipc::open_wake(&node, SENSOR)?.ok_or("no event")?;
+            Wait::Event(Box::new(ipc::listener(&event)?), false)
+        } else {
+            let bell = Bell::open(&node, SENSOR)?.ok_or("no bell")?;
+            let rung = bell.rung();
+            Wait::Bell(bell, rung, task.way == Way::Doorbell)
+        };
+        let service = node
+            .service_builder(&ServiceName::new(SERVICE)?)
+            .publish_subscribe::<[u8]>()
+            .user_header::<Header>()
+            .open()?;
+        Ok(BytesInlet { subscriber: service.subscriber_builder().create()?, wait, _node: node })
+    }
+}
+
+impl Inlet for BytesInlet {
+    fn next(&mut self) -> Outcome<Label> {
+        loop {
+            if let Some(sample) = self.subscriber.receive()? {
+                return Label::read(&sample);
+            }
+            self.wait.wait()?;
+        }
+    }
+}
+
+impl Wait {
+    /// Sleeps or looks until there may be something; returns at once if there may be since samples were looked for.
+    fn wait(&mut self) -> Outcome<()> {
+        match self {
+            Wait::Bell(bell, rung, sleeps) => {
+                if bell.rung() == *rung && *sleeps {
+                    let until = clock::now() + LONG_NS;
+                    ipc::sleep_at_bells(&[(bell, *rung)], until).map_err(|error| format!("{error:?}"))?;
+                }
+                while bell.rung() == *rung && !*sleeps {
+                    std::hint::spin_loop();
+                }
+                *rung = bell.rung();
+                Ok(())
+            }
+            Wait::Event(listener, taken) => {
+                *taken = !*taken && ipc::take_wakeups(&[listener])?;
+                if !*taken {
+                    ipc::sleep(&[listener], LONG)?;
+                }
+                Ok(())
+            }
+        }
+    }
+}
+
+/// The publisher of the hub's topic of scans.
+pub(crate) struct Scans {
+    publisher: Publisher<Scan>,
+    _service: TopicService<Scan>,
+    next: u64,
+    hub: Hub,
+}
+
+impl Scans {
+    pub(crate) fn new(task: &Task) -> Outcome<Scans> {
+        let hub = Hub::new(task)?;
+        let service = Scan::create(&hub.node, SENSOR)?;
+        Ok(Scans { publisher: Scan::publisher(&service)?, _service: service, next: 0, hub })
+    }
+}
+
+impl Outlet for Scans {
+    fn open(&mut self) -> Outcome<()> {
+        Ok(())
+    }
+
+    fn send(&mut self, label: Label) -> Outcome<u64> {
+        let mut sample = self.publisher.loan().map_err(|error| format!("no loan: {error:?}"))?;
+        let kind = label.phase as u64 * 2 + u64::from(label.is_end);
+        let header =
+            Header { seq: label.number, topic_seq: self.next, boot: 1, wall_ns: kind, ..Header::default() };
+        self.next += 1;
+        *sample.user_header_mut() = header;
+        sample.payload_mut().range_array.fill(label.number as u16);
+        let at = clock::now();
+        sample.send().map_err(|error| format!("not sent: {error:?}"))?;
+        self.hub.waker.wake(Wake::Telegram)?;
+        Ok(at)
+    }
+}
+
+/// The attach library at it.
+pub(crate) struct ScansInlet(Attachment<Scan>);
+
+impl ScansInlet {
+    pub(crate) fn new(task: &Task) -> Outcome<ScansInlet> {
+        let mut scans = consumer::attach::<Scan>(task.domain, SENSOR)?;
+        // Joins the domain; nothing is sent yet.
+        scans.try_next()?;
+        Ok(ScansInlet(scans))
+    }
+}
+
+impl Inlet for ScansInlet {
+    fn next(&mut self) -> Outcome<Label> {
+        let scan = self.0.next()?.ok_or("no scan")?;
+        let Header { seq: number, wall_ns: kind, .. } = *scan.header();
+        let ends = [scan.range_array.first(), scan.range_array.last()];
+        if ends != [Some(&(number as u16)); 2] {
+            return Err(format!("scan {number} is torn").into());
+        }
+        Ok(Label { phase: kind as usize / 2, number, is_end: kind % 2 == 1 })
+    }
+}
+
+/// The sensor whose consumers are woken.
+pub(crate) const SENSOR: &str = "front";
+const SERVICE: &str = "compare";
+const LONG: std::time::Duration = std::time::Duration::from_secs(10);
+const LONG_NS: u64 = 10_000_000_000;
