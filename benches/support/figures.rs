@@ -1,5 +1,10 @@
-//! Figures with their spread: a series per run, beside that of the floor, and the ratio run by run. Printed as a table
-//! for people or as a line of JSON each. Says whether a target was met; refuses to fail because of it.
+//! Figures with their spread: a series per run, beside that of the floor, and the ratio run by run; or cells of tables.
+//! Printed as a table for people or as a line of JSON each. Says whether a target was met; refuses to fail because of it.
+//!
+//! The lines, from which the tables of benches/README.md are made (`SPREAD` is `{median, least, most}` or null; further
+//! keys may stand in any of them):
+//! `{class: "measurement", bench, name, unit, runs, hub: SPREAD, floor: SPREAD, ratio: SPREAD, target, met}`
+//! `{class: "cell", bench, table, row, column, value: SPREAD, unit}`
 
 use serde_json::{Value, json};
 
@@ -12,6 +17,17 @@ pub(crate) struct Figure {
     /// One value per run of the floor; empty if the figure has none.
     pub(crate) floor: Vec<f64>,
     pub(crate) target: Target,
+}
+
+/// A place in a table of several mechanisms or conditions. Tables, rows and columns stand in order of appearance.
+#[derive(Clone, Debug)]
+pub(crate) struct Cell {
+    pub(crate) table: String,
+    pub(crate) row: String,
+    pub(crate) column: String,
+    pub(crate) unit: &'static str,
+    /// One value per run; none where nothing could be measured.
+    pub(crate) values: Vec<f64>,
 }
 
 /// What a figure should be.
@@ -90,6 +106,47 @@ pub(crate) fn print(bench: &str, json: bool, figures: &[Figure]) {
             println!("{name:34} {hub:>30} {floor:>30} {ratio:>22}  {verdict}");
         }
     }
+}
+
+/// Prints the tables of `bench`.
+pub(crate) fn print_cells(bench: &str, json: bool, cells: &[Cell]) {
+    if json {
+        for Cell { table, row, column, unit, values } in cells {
+            let value = Spread::of(values).map(|spread| spread.json());
+            let line = json!({
+                "class": "cell", "bench": bench, "table": table, "row": row, "column": column, "value": value, "unit": unit,
+            });
+            println!("{line}");
+        }
+        return;
+    }
+    for table in appearing(cells.iter().map(|cell| &cell.table)) {
+        let cells: Vec<&Cell> = cells.iter().filter(|cell| cell.table == *table).collect();
+        let columns = appearing(cells.iter().map(|cell| &cell.column));
+        println!("{bench}: {table}");
+        let heads = columns.iter().map(|column| format!(" {column:>26}"));
+        println!("{:28}{}", "", heads.collect::<String>());
+        for row in appearing(cells.iter().map(|cell| &cell.row)) {
+            let text = |column: &&String| {
+                let cell = cells.iter().find(|cell| cell.row == *row && cell.column == **column);
+                let spread = cell.and_then(|cell| Some((Spread::of(&cell.values)?, cell.unit)));
+                let text = spread.map_or("-".into(), |(spread, unit)| format!("{} {unit}", spread.text()));
+                format!(" {text:>26}")
+            };
+            println!("{row:28}{}", columns.iter().map(text).collect::<String>());
+        }
+    }
+}
+
+/// Each name once, in order of appearance.
+fn appearing<'a>(names: impl Iterator<Item = &'a String>) -> Vec<&'a String> {
+    let mut found = Vec::new();
+    for name in names {
+        if !found.contains(&name) {
+            found.push(name);
+        }
+    }
+    found
 }
 
 /// The value below which `part` of the `sorted` values lie: nearest rank, the middle of two for the median.

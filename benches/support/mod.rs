@@ -3,6 +3,7 @@
 #![allow(dead_code)] // Every bench takes what it needs.
 
 pub(crate) mod bare;
+pub(crate) mod chart;
 pub(crate) mod child;
 pub(crate) mod clock;
 pub(crate) mod consumer;

@@ -1,12 +1,16 @@
-//! The few things that can be asked of a bench: `--json`, `--pairs N`, `--seconds N`, `--count N`.
+//! The few things that can be asked of a bench: `--json`, `--draw DIR`, `--pairs N`, `--seconds N`, `--count N`.
+
+use std::path::PathBuf;
 
 use super::Outcome;
 
 /// What was asked for; what was not is the bench's own.
-#[derive(Clone, Copy, Debug, Default)]
+#[derive(Clone, Debug, Default)]
 pub(crate) struct Options {
     /// One line of JSON per measurement instead of the table.
     pub(crate) json: bool,
+    /// Where charts go, as SVG; without it none is drawn. A bench that has no charts has no use for it.
+    pub(crate) draw: Option<PathBuf>,
     pairs: Option<usize>,
     seconds: Option<u64>,
     count: Option<usize>,
@@ -17,15 +21,20 @@ impl Options {
         let mut options = Options::default();
         let mut words = words.iter();
         while let Some(word) = words.next() {
-            let mut value = || words.next().ok_or_else(|| format!("{word} needs a number"));
+            let mut value = || words.next().ok_or_else(|| format!("{word} needs a value"));
             match word.as_str() {
                 "--json" => options.json = true,
+                "--draw" => options.draw = Some(value()?.into()),
                 "--pairs" => options.pairs = Some(value()?.parse()?),
                 "--seconds" => options.seconds = Some(value()?.parse()?),
                 "--count" => options.count = Some(value()?.parse()?),
                 // Cargo says so to every bench.
                 "--bench" => {}
-                _ => return Err(format!("{word}? --json, --pairs N, --seconds N, --count N").into()),
+                _ => {
+                    return Err(
+                        format!("{word}? --json, --draw DIR, --pairs N, --seconds N, --count N").into()
+                    );
+                }
             }
         }
         Ok(options)
