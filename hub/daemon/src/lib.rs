@@ -10,6 +10,7 @@ pub mod configure;
 mod control;
 mod converse;
 pub mod doctor;
+mod in_memory;
 mod layer;
 mod line_errors;
 mod link;
@@ -27,4 +28,5 @@ pub mod telegram;
 mod topics;
 
 pub use config::Config;
+pub use in_memory::{DrivenLink, in_memory};
 pub use supervise::{Ready, run};
