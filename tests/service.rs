@@ -14,26 +14,26 @@ const KILLS: usize = 6;
 fn what_is_sent_while_a_killed_hub_is_replaced_waits_in_the_line() {
     let stage = Stage::new();
     let simulator = stage.simulator(&["front"], &["--seed=5", "--baud=500000"]);
-    let mut manager = Supervisor::new(&stage);
+    let mut supervisor = Supervisor::new(&stage);
     let flags = [stage.link("front")];
-    let mut hub = manager.start(&stage, &flags, None).ready();
-    manager.hear("FDNAME=front");
-    manager.hear("READY=1");
+    let mut hub = supervisor.start(&stage, &flags, None).ready();
+    supervisor.hear("FDNAME=front");
+    supervisor.hear("READY=1");
     let mut telegrams = stage.echo(&["front/telegram"]);
     for _ in 0..KILLS {
         telegrams.await_lines(20, "a measured telegram", |line| line["command"] == MEASURED);
         assert_eq!(hub.end(KILL).code, None);
-        hub = manager.start(&stage, &flags, None).ready();
-        manager.hear("READY=1");
+        hub = supervisor.start(&stage, &flags, None).ready();
+        supervisor.hear("READY=1");
     }
     telegrams.await_lines(20, "a measured telegram", |line| line["command"] == MEASURED);
     // Nobody but the one who keeps it has the line, and it is still locked.
     assert_eq!(hub.end(KILL).code, None);
     assert_eq!(stage.run(&["run", &flags[0]]).code, Some(4), "a hub of nobody's finds it busy");
-    hub = manager.start(&stage, &flags, None).ready();
+    hub = supervisor.start(&stage, &flags, None).ready();
     telegrams.await_lines(20, "a measured telegram", |line| line["command"] == MEASURED);
     assert_eq!(hub.end(TERM).code, Some(0));
-    manager.hear("STOPPING=1");
+    supervisor.hear("STOPPING=1");
     let got = telegrams.end(INT);
     assert_eq!(simulator.end(TERM).code, Some(0));
 
@@ -66,23 +66,23 @@ fn what_is_sent_while_a_killed_hub_is_replaced_waits_in_the_line() {
 fn a_port_that_went_is_given_back_and_another_link_s_is_not_taken() {
     let stage = Stage::new();
     let simulator = stage.simulator(&["front"], &["--seed=6", "--baud=500000"]);
-    let mut manager = Supervisor::new(&stage);
-    let hub = manager.start(&stage, &[stage.link("front")], None).ready();
-    manager.hear("FDNAME=front");
-    manager.hear("READY=1");
+    let mut supervisor = Supervisor::new(&stage);
+    let hub = supervisor.start(&stage, &[stage.link("front")], None).ready();
+    supervisor.hear("FDNAME=front");
+    supervisor.hear("READY=1");
     assert_eq!(hub.end(KILL).code, None);
     // The next one has a link of another name: what was kept is nobody's.
     let side = format!("--link=side={}", stage.word("side"));
-    let hub = manager.start(&stage, &[side], None).ready();
-    manager.hear("FDSTOREREMOVE=1");
-    manager.hear("STATUS=sensors: side");
+    let hub = supervisor.start(&stage, &[side], None).ready();
+    supervisor.hear("FDSTOREREMOVE=1");
+    supervisor.hear("STATUS=sensors: side");
     assert_eq!(hub.end(TERM).code, Some(0));
     // It was closed: whoever comes finds it free.
-    let hub = manager.start(&stage, &[stage.link("front")], None).ready();
-    manager.hear("FDNAME=front");
+    let hub = supervisor.start(&stage, &[stage.link("front")], None).ready();
+    supervisor.hear("FDNAME=front");
     stage.await_info("front", |info| info["state"] == "streaming");
     stage.kill_simulator(simulator, "front");
-    manager.hear("FDSTOREREMOVE=1");
+    supervisor.hear("FDSTOREREMOVE=1");
     let info = stage.await_info("front", |info| info["state"] == "absent");
     assert_eq!(number(&info["counters"], "reconnects"), 1);
     assert_eq!(hub.end(TERM).code, Some(0));
@@ -91,12 +91,12 @@ fn a_port_that_went_is_given_back_and_another_link_s_is_not_taken() {
 #[test]
 fn the_watchdog_is_fed_while_links_work() {
     let stage = Stage::new();
-    let mut manager = Supervisor::new(&stage);
+    let mut supervisor = Supervisor::new(&stage);
     // A port that is not there is no link that hangs.
-    let hub = manager.start(&stage, &[stage.link("front")], Some(Duration::from_secs(2))).ready();
+    let hub = supervisor.start(&stage, &[stage.link("front")], Some(Duration::from_secs(2))).ready();
     for _ in 0..3 {
-        manager.hear("WATCHDOG=1");
+        supervisor.hear("WATCHDOG=1");
     }
     assert_eq!(hub.end(TERM).code, Some(0));
-    manager.hear("STOPPING=1");
+    supervisor.hear("STOPPING=1");
 }

@@ -2,6 +2,8 @@
 //! there, made by the same functions as those of a line. So many sensors can be driven faster than they turn. Refuses to know
 //! where the bytes are from; nobody hears what a session would say to a sensor.
 
+use std::sync::atomic::AtomicBool;
+
 use lms::session::Output;
 use lms::{Nanos, Session};
 use rustix::event::{EventfdFlags, eventfd};
@@ -10,8 +12,9 @@ use schema::{Domain, Failure, Flags, HubLock, State, Wake, ipc, shortage};
 use crate::clock;
 use crate::config::Config;
 use crate::control::Desk;
-use crate::link::LinkThread;
+use crate::link::{LinkThread, Surroundings};
 use crate::preflight;
+use crate::service::Service;
 use crate::topics::Topics;
 
 /// A link that is driven by whoever has it. It streams from the start, as a recording does: its scans are read in the
@@ -43,11 +46,13 @@ pub fn in_memory<T>(
         let message = format!("an eventfd cannot be had: {error}");
         Failure::new(schema::Kind::Short, message, "raise `ulimit -n`")
     })?;
+    let (service, worked) = (Service::default(), AtomicBool::new(false));
+    let around = Surroundings { stop: &stop, service: &service, worked: &worked };
     let mut links = Vec::with_capacity(config.links.len());
     for ((number, link), orders) in config.links.iter().enumerate().zip(orders) {
         let mut topics = Topics::new(&node, &link.name, number as u8, 0)?;
         topics.set_flags(Flags::REPLAYED);
-        let link = LinkThread::new(link, topics, &stop, orders);
+        let link = LinkThread::new(link, topics, around, orders);
         let session = Session::new(link.settings(true), clock::now());
         links.push(DrivenLink { link, session });
     }

@@ -10,7 +10,8 @@ use lms::Nanos;
 use rustix::io::{FdFlags, fcntl_setfd};
 use sd_notify::NotifyState;
 
-/// The service manager; without one nothing of this does anything.
+/// The service manager; without one, as by default, nothing of this does anything.
+#[derive(Default)]
 pub(crate) struct Service {
     /// What the one before this hub gave it to keep, by name.
     kept: Mutex<Vec<(String, OwnedFd)>>,
