@@ -4,6 +4,7 @@
 mod errand;
 mod lan;
 mod life;
+mod machine;
 mod outlet;
 mod report;
 mod roll;
@@ -14,6 +15,7 @@ mod uplink;
 
 use std::io::Write;
 use std::os::fd::AsFd;
+use std::path::Path;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
@@ -116,7 +118,8 @@ impl<'a> Gateway<'a> {
         let interface = Uplink::choose(options.interface.as_deref())?;
         let domain = options.places.first().map(Domain::name).unwrap_or_default();
         let now_s = clock::wall_ns() / 1_000_000_000;
-        let life = Life::begin(&life::directory()?, domain, interface.name(), now_s)?;
+        let machine = machine::machine(Path::new(machine::ID));
+        let life = Life::begin(&life::directory()?, domain, interface.name(), now_s, machine)?;
         let form = if options.bare { Form::Bare } else { Form::Sealed };
         let lan = Lan::open(life, interface, &options.to, form, options.ttl, options.longest)?;
         let sensor = |name: &&str| Sensor::new(name, &selection, !options.bare);

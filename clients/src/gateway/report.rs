@@ -39,7 +39,11 @@ impl<'a> Report<'a> {
                 to,
                 bare,
                 longest: lan.longest(),
+                renumbered: lan.life.is_renumbered,
             });
+        }
+        if lan.life.is_renumbered {
+            self.notes.line(|line| write!(line, "{}: {RENUMBERED}", id(lan)))?;
         }
         self.out.line(|line| {
             write!(line, "gateway {} epoch {} on {}", id(lan), lan.life.epoch, lan.interface.name())?;
@@ -193,6 +197,7 @@ struct Begin<'a> {
     to: Vec<&'a str>,
     bare: bool,
     longest: usize,
+    renumbered: bool,
 }
 
 /// Class `lan`.
@@ -230,5 +235,7 @@ struct Link<'a> {
     message: Option<&'a str>,
 }
 
+/// Why a gateway has another number than is kept.
+const RENUMBERED: &str = "a new number, because the one that is kept here was drawn on another machine";
 /// To the line's begin, and nothing on it (ECMA-48).
 const WIPE: &[u8] = b"\r\x1b[K";
