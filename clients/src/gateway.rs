@@ -2,6 +2,7 @@
 //! ordinary client of the hub that outlives it, its links and its own network. Takes nothing from the network.
 
 mod errand;
+mod host;
 mod lan;
 mod life;
 mod machine;
@@ -43,7 +44,7 @@ pub struct GatewayOptions {
     pub interface: Option<String>,
     /// `SENSOR/TOPIC` or `*/TOPIC`, with `:every=N` if it is to be thinned; none: all but telegrams, of all sensors.
     pub topics: Vec<String>,
-    /// `HOST:PORT` of those that get copies.
+    /// `HOST:PORT` of those that get copies; a name is asked for again while it runs, as its address may change.
     pub to: Vec<String>,
     /// Telegrams and nothing else, without a header.
     pub bare: bool,
@@ -231,6 +232,9 @@ impl<'a> Gateway<'a> {
         self.announce();
         let Lan { groups, copies, .. } = &mut self.lan;
         for outlet in std::iter::once(groups).chain(copies) {
+            if let Some(address) = outlet.follow_name(now) {
+                report.moved(&outlet.name, address)?;
+            }
             if let Some(news) = outlet.news() {
                 report.destination(&outlet.name, &news)?;
             }

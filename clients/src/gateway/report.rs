@@ -1,6 +1,7 @@
 //! What a gateway tells of itself: lines of JSON, or text and one line that is drawn over itself. Refuses to know why.
 
 use std::io::{self, Write};
+use std::net::SocketAddr;
 
 use schema::Topic;
 use serde::Serialize;
@@ -76,6 +77,11 @@ impl<'a> Report<'a> {
             News::Failing(why) => self.link(outlet, "failing", Some(why)),
             News::Well => self.link(outlet, "well", None),
         }
+    }
+
+    /// The name of a destination has another address now, which is sent to.
+    pub(super) fn moved(&mut self, outlet: &str, address: SocketAddr) -> Result<(), End> {
+        self.link(outlet, "moved", Some(&format!("its address is {address} now")))
     }
 
     /// Samples of `topic` are longer than the longest datagram.
