@@ -355,3 +355,25 @@ fn each_refusal_has_its_reason() {
         assert!(places.iter().all(Option::is_some) && places.is_sorted(), "{line}");
     });
 }
+
+#[test]
+fn two_gateways_with_one_number_are_told_once() {
+    in_a_network("two_gateways_with_one_number_are_told_once", || {
+        let stage = Stage::new();
+        let mut program = listener(&stage, &["--topic=zones", "--stats"]);
+        // Of the later life first: all of the earlier one are refused.
+        let mut gateways = [9, 7].map(|epoch| Sender::new(HUB, epoch, 0, "front"));
+        for _ in 0..80 {
+            gateways.iter_mut().for_each(|gateway| gateway.send(Topic::Zones, &zones(Verdict::Clear)));
+            // As far apart as they send: what comes in one moment is no second gateway.
+            std::thread::sleep(std::time::Duration::from_millis(50));
+        }
+        let line = program.await_line("the remedy", |line| line["kind"] == "trouble");
+        let message = line["message"].as_str().unwrap_or_default();
+        assert!(message.contains(&format!("{HUB:016x}")) && message.contains("gateway-*"), "{line}");
+        let outcome = program.end(INT);
+        assert_eq!(outcome.of_class("notice").len(), 1, "{outcome}");
+        assert_eq!(account(&outcome, 9, "zones"), [80, 0, 0, 0]);
+        assert_eq!(refused(&outcome)["epoch"], 80);
+    });
+}

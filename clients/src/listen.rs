@@ -7,6 +7,7 @@ mod publish;
 mod remote;
 mod report;
 mod roll;
+mod twins;
 
 use std::io::Write;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -21,6 +22,7 @@ use self::publish::Publication;
 use self::remote::Remote;
 use self::report::Report;
 use self::roll::Roll;
+use self::twins::Twins;
 use crate::clock;
 use crate::follow::Bounds;
 use crate::output::{End, Output, quiet};
@@ -77,6 +79,7 @@ pub fn listen(
         told: Vec::new(),
         account: Box::new(Account::new(&heard)),
         roll: Roll::default(),
+        twins: Twins::default(),
         report: Report::new(options.json, Output::new(out), Output::new(notes), names),
         started: now,
         last_sample: now,
@@ -95,6 +98,7 @@ struct Listener<'a> {
     told: Vec<String>,
     account: Box<Account>,
     roll: Roll,
+    twins: Twins,
     report: Report<'a>,
     started: Instant,
     last_sample: Instant,
@@ -162,8 +166,12 @@ impl Listener<'_> {
             let Some(bytes) = self.ear.receive(buffer)? else { return Ok(false) };
             match self.account.receive(bytes) {
                 Ok((_, Fresh::Duplicate)) => {}
-                Ok((datagram, fresh)) => self.heard(datagram, fresh == Fresh::Late)?,
+                Ok((datagram, fresh)) => {
+                    self.twins.taken(datagram.head.hub);
+                    self.heard(datagram, fresh == Fresh::Late)?;
+                }
                 Err(Refusal::Capacity) => self.trouble(FULL)?,
+                Err(Refusal::Epoch) => self.of_another_life(bytes)?,
                 Err(_) => {}
             }
             if self.options.bounds.count.is_some_and(|count| self.received >= count) {
@@ -219,6 +227,16 @@ impl Listener<'_> {
             Ok(None) => Ok(()),
             Err(failure) => self.trouble(&failure.to_string()),
         }
+    }
+
+    /// `bytes` were refused as of a life of their gateway that is over.
+    fn of_another_life(&mut self, bytes: &[u8]) -> Result<(), End> {
+        let Ok(Datagram { head, .. }) = Datagram::read(bytes) else { return Ok(()) };
+        if !self.twins.refused(head.hub, Instant::now()) {
+            return Ok(());
+        }
+        let what = twins::remedy(&self.report.names.of(head.hub));
+        self.trouble(&what)
     }
 
     /// Tells what is wrong here, once; of ever new things only the first ones.

@@ -18,6 +18,8 @@ pub(super) struct RemoteTopics {
     /// Gateway, its life, and the sensor's number in it, as last announced.
     source: Option<(u64, u32, u8)>,
     boot: u64,
+    /// Bit n: topic number n was announced last.
+    announced: u8,
     /// It has all that was announced, and that was told.
     pub(super) is_told: bool,
     telegram: Option<Outlet<[u8]>>,
@@ -47,6 +49,7 @@ impl RemoteTopics {
             name: name.to_owned(),
             source: None,
             boot: 0,
+            announced: 0,
             is_told: false,
             telegram: None,
             scan: None,
@@ -98,6 +101,8 @@ impl RemoteTopics {
             self.begin_again();
         }
         self.boot = announce.boot;
+        let numbers = announce.topics().iter().map(|announced| announced.topic).filter(|number| *number < 8);
+        self.announced = numbers.fold(0, |bits, number| bits | 1 << number);
     }
 
     /// Another sensor is announced with the number that this one had: nothing comes of it any more, which is said at once.
@@ -112,6 +117,11 @@ impl RemoteTopics {
         }
         self.silent();
         self.wake();
+    }
+
+    /// Its gateway sends this topic.
+    pub(super) fn is_announced(&self, topic: Topic) -> bool {
+        self.announced >> topic.number() & 1 == 1
     }
 
     /// It is the sensor that sent `head`.

@@ -82,6 +82,7 @@ pub(super) struct Published<'a> {
     unannounced: u64,
     late: u64,
     capacity: u64,
+    shortage: u64,
     loan_failed: u64,
 }
 
@@ -95,18 +96,17 @@ impl<'a> Published<'a> {
             unannounced: left_out.unannounced,
             late: left_out.late,
             capacity: left_out.capacity,
+            shortage: left_out.shortage,
             loan_failed: publication.loan_failed(),
         }
     }
 
     /// The same for people.
     pub(super) fn text(&self, line: &mut Vec<u8>) -> io::Result<()> {
-        let Published { unnamed, unannounced, late, capacity, loan_failed, .. } = self;
+        let Published { unnamed, unannounced, late, capacity, shortage, loan_failed, .. } = self;
         write!(line, "published: {}; left out: {unnamed} unnamed, ", self.sensors.join(", "))?;
-        write!(
-            line,
-            "{unannounced} unannounced, {late} late, {capacity} beyond capacity, {loan_failed} without memory"
-        )
+        write!(line, "{unannounced} unannounced, {late} late, {capacity} beyond capacity, ")?;
+        write!(line, "{shortage} for want of room, {loan_failed} without memory")
     }
 }
 
