@@ -18,7 +18,7 @@ use super::message::{Draft, Label, SHORT};
 use super::receiver::Inlet;
 use super::sender::{Outlet, Task};
 use super::way::Way;
-use crate::support::{Outcome, clock};
+use crate::support::Outcome;
 
 /// The sending sockets: one for each receiver, or one for the group.
 pub(crate) struct Datagrams {
@@ -62,13 +62,13 @@ impl Outlet for Datagrams {
         Ok(())
     }
 
-    fn send(&mut self, label: Label) -> Outcome<u64> {
-        let message = self.draft.write(label);
-        let at = clock::now();
-        for socket in &self.sockets {
-            send(socket, message, self.part)?;
-        }
-        Ok(at)
+    fn write(&mut self, label: Label) -> Outcome<()> {
+        self.draft.write(label);
+        Ok(())
+    }
+
+    fn send(&mut self) -> Outcome<()> {
+        self.sockets.iter().try_for_each(|socket| send(socket, self.draft.bytes(), self.part))
     }
 
     fn end(&mut self, label: Label) -> Outcome<()> {
@@ -77,6 +77,14 @@ impl Outlet for Datagrams {
             rustix::io::write(socket, message)?;
         }
         Ok(())
+    }
+}
+
+impl Drop for Datagrams {
+    fn drop(&mut self) {
+        for path in &self.paths {
+            let _ = std::fs::remove_file(path);
+        }
     }
 }
 
@@ -182,14 +190,6 @@ fn part(task: &Task) -> usize {
 
 fn mailbox(place: &str, number: usize) -> String {
     format!("{place}-mailbox-{number}")
-}
-
-impl Drop for Datagrams {
-    fn drop(&mut self) {
-        for path in &self.paths {
-            let _ = std::fs::remove_file(path);
-        }
-    }
 }
 
 /// What a part begins with: the message's number, and its own.

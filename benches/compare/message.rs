@@ -54,16 +54,15 @@ impl Draft {
         Draft { contents: contents(len), bytes: contents(len) }
     }
 
-    /// Bytes of a message.
-    pub(crate) fn len(&self) -> usize {
-        self.bytes.len()
+    /// What was written.
+    pub(crate) fn bytes(&self) -> &[u8] {
+        &self.bytes
     }
 
     /// Writes a whole message.
-    pub(crate) fn write(&mut self, label: Label) -> &[u8] {
+    pub(crate) fn write(&mut self, label: Label) {
         self.bytes.copy_from_slice(&self.contents);
         label.write(&mut self.bytes);
-        &self.bytes
     }
 
     /// Writes one that is no longer than it must be.

@@ -27,16 +27,18 @@ pub(crate) struct Measured {
     pub(crate) latency: [Option<f64>; 3],
     /// The same of the last receiver of each message that all of them got.
     pub(crate) last: [Option<f64>; 3],
-    /// Processor time of the sender for a message, in us.
+    /// Processor time of the sender for a message, with its writing and the wait until it is due, in us.
     pub(crate) sender_us: f64,
+    /// What of it is sending alone, in us; only looked at where messages are paced.
+    pub(crate) sending_us: Option<f64>,
     /// Processor time of a receiver for a message, in us; nothing if none came.
     pub(crate) receiver_us: Option<f64>,
     /// Messages that a receiver got, a second.
     pub(crate) rate_hz: f64,
     /// Messages that were not received, in %.
     pub(crate) missed_percent: f64,
-    /// The rate was kept.
-    pub(crate) kept: bool,
+    /// Messages that were sent, in % of those that the rate asks for; nothing if there is no rate.
+    pub(crate) kept_percent: Option<f64>,
 }
 
 impl Case {
@@ -62,12 +64,17 @@ impl Case {
         let mut measured = Vec::new();
         for (number, phase) in PHASES.iter().enumerate() {
             tell.send(GO)?;
-            let sent = Account::of(&sender, "sent")?;
+            let mut sent = Account::of(&sender, "sent")?;
+            let sending_ns = sent.numbers.remove(0);
             let took =
                 receivers.iter().map(|child| Account::of(child, "took")).collect::<Outcome<Vec<_>>>()?;
             if number > 0 && phase.count(self.way) > 0 {
                 let mut figures = figures(&sent, &took)?;
-                figures.kept = phase.period_ns == 0 || sent.numbers.len() == phase.count(self.way);
+                if phase.period_ns > 0 {
+                    let count = sent.numbers.len() as f64;
+                    figures.sending_us = Some(sending_ns as f64 / 1e3 / count);
+                    figures.kept_percent = Some(100.0 * count / phase.count(self.way) as f64);
+                }
                 measured.push((number, figures));
             }
         }
@@ -83,7 +90,7 @@ impl Case {
 /// What a process says of a phase.
 struct Account {
     busy_ns: u64,
-    /// Times of the sender; number and time of a receiver in turn.
+    /// Time spent in sending and times of the sender; number and time of a receiver in turn.
     numbers: Vec<u64>,
 }
 
@@ -122,7 +129,8 @@ fn figures(sent: &Account, took: &[Account]) -> Outcome<Measured> {
         receiver_us: (received > 0).then(|| busy_ns as f64 / 1e3 / received as f64),
         rate_hz: received as f64 / took.len() as f64 / (end_ns.saturating_sub(begin_ns).max(1) as f64 / 1e9),
         missed_percent: 100.0 * (expected - received) as f64 / expected as f64,
-        kept: true,
+        sending_us: None,
+        kept_percent: None,
     })
 }
 

@@ -30,7 +30,7 @@ impl Phase {
 /// In this order. The first one is for memory and caches and is not told.
 pub(crate) const PHASES: [Phase; 4] = [
     Phase { name: "warm-up", period_ns: 1_000_000, count: 20, most_ns: 40_000_000 },
-    Phase { name: "37.5 Hz", period_ns: 26_666_667, count: 20, most_ns: 600_000_000 },
+    Phase { name: "37.5 Hz", period_ns: 26_666_667, count: 28, most_ns: 900_000_000 },
     Phase { name: "1 kHz", period_ns: 1_000_000, count: 400, most_ns: 500_000_000 },
     Phase { name: "flat out", period_ns: 0, count: 2000, most_ns: 300_000_000 },
 ];

@@ -36,16 +36,21 @@ pub(crate) trait Outlet {
     /// Connects to all receivers, which are there now.
     fn open(&mut self) -> Outcome<()>;
 
-    /// Writes a message and sends it to all; returns CLOCK_MONOTONIC of the moment between the two.
-    fn send(&mut self, label: Label) -> Outcome<u64>;
+    /// Writes a message where it will be sent from; one that carries nothing has nothing to write.
+    fn write(&mut self, label: Label) -> Outcome<()>;
+
+    /// Sends what was written to all receivers.
+    fn send(&mut self) -> Outcome<()>;
 
     /// Tells all that a phase is over.
     fn end(&mut self, label: Label) -> Outcome<()> {
-        self.send(label).map(|_| ())
+        self.write(label)?;
+        self.send()
     }
 }
 
-/// Sends until it is told to end. Prints `ready ADDRESS`, `open`, and for each phase `sent BUSY_NS SENT_NS..`.
+/// Sends until it is told to end. Prints `ready ADDRESS`, `open`, and for each phase `sent
+/// BUSY_NS SENDING_NS SENT_NS..`, the second without the writing of messages and the waits; 0 where that was not looked at.
 pub(crate) fn play(task: &Task) -> Outcome<()> {
     let told = UnixDatagram::bind(control(task.place))?;
     let mut outlet = outlet(task)?;
@@ -58,6 +63,7 @@ pub(crate) fn play(task: &Task) -> Outcome<()> {
         let before = busy_ns();
         let sent = send(outlet.as_mut(), phase, number, task.way)?;
         println!("sent {} {}", busy_ns() - before, text(&sent));
+        let sent = &sent[1..];
         let end = Label { phase: number, number: sent.len() as u64, is_end: true };
         outlet.end(end)?;
         if task.way.loses() {
@@ -98,20 +104,26 @@ fn outlet(task: &Task) -> Outcome<Box<dyn Outlet>> {
     })
 }
 
-/// A phase; when each message was sent.
-fn send(outlet: &mut dyn Outlet, phase: &Phase, number: usize, way: Way) -> Outcome<Vec<u64>> {
+/// A phase: processor time of sending alone, then when each message was sent.
+fn send(outlet: &mut dyn Outlet, phase: &Phase, position: usize, way: Way) -> Outcome<Vec<u64>> {
     let count = phase.count(way);
-    let mut sent = Vec::with_capacity(count);
+    let mut sent = Vec::with_capacity(1 + count);
+    sent.push(0);
     let begin = clock::now();
-    while sent.len() < count {
-        let due = begin + (sent.len() as u64 + 1) * phase.period_ns;
+    while sent.len() <= count {
+        let number = sent.len() as u64 - 1;
+        let due = begin + (number + 1) * phase.period_ns;
         if phase.period_ns > 0 && clock::now() < due {
             clock::rest(due);
         } else if clock::now() - begin > phase.most_ns(way) {
             break;
         }
-        let label = Label { phase: number, number: sent.len() as u64, is_end: false };
-        sent.push(outlet.send(label)?);
+        outlet.write(Label { phase: position, number, is_end: false })?;
+        // Looking at it costs a system call, which would slow down who sends all the time.
+        let before = (phase.period_ns > 0).then(busy_ns);
+        sent.push(clock::now());
+        outlet.send()?;
+        sent[0] += before.map_or(0, |before| busy_ns() - before);
     }
     Ok(sent)
 }

@@ -15,7 +15,7 @@ use super::message::{Draft, Label};
 use super::receiver::Inlet;
 use super::sender::{Outlet, Task};
 use super::way::Way;
-use crate::support::{Outcome, clock};
+use crate::support::Outcome;
 
 /// The sending ends.
 pub(crate) struct Streams {
@@ -72,7 +72,7 @@ impl Outlet for Streams {
                 Door::Pipes(paths) => {
                     let end = OpenOptions::new().write(true).open(&paths[number])?;
                     // As large as a message or, where users may not have that much, as it was.
-                    let _ = fcntl_setpipe_size(&end, self.draft.len().max(PIPE));
+                    let _ = fcntl_setpipe_size(&end, self.draft.bytes().len().max(PIPE));
                     end
                 }
             };
@@ -81,13 +81,16 @@ impl Outlet for Streams {
         Ok(())
     }
 
-    fn send(&mut self, label: Label) -> Outcome<u64> {
-        let message = self.draft.write(label);
-        let at = clock::now();
+    fn write(&mut self, label: Label) -> Outcome<()> {
+        self.draft.write(label);
+        Ok(())
+    }
+
+    fn send(&mut self) -> Outcome<()> {
         for end in &mut self.ends {
-            end.write_all(message)?;
+            end.write_all(self.draft.bytes())?;
         }
-        Ok(at)
+        Ok(())
     }
 }
 

@@ -3,6 +3,8 @@
 
 use std::path::Path;
 
+use serde_json::json;
+
 use super::Cell;
 use super::run::{Case, Measured};
 use super::schedule::PHASES;
@@ -12,15 +14,19 @@ use crate::support::chart::{Chart, Point, Scale, Series};
 use crate::support::figures::{self, percentile};
 use crate::support::options::Options;
 
-/// Prints them all.
+/// Prints them all, after the machine: with `--json` a line `{class: "machine", bench, machine, processors, runs}`.
 pub(crate) fn print(options: &Options, processors: usize, pairs: usize, cells: &[Cell]) {
-    if !options.json {
+    if options.json {
+        let line = json!({
+            "class": "machine", "bench": "compare", "machine": machine(), "processors": processors, "runs": pairs,
+        });
+        println!("{line}");
+    } else {
         println!("{}, {processors} processors, {pairs} runs each: median [least .. most]", machine());
         println!(
             "With more receivers than processors the last one waits for the others' processor time, by every mechanism. \
              Datagrams of UDP hold 65507 bytes and those of Unix sockets 65536 here: longer messages are sent in parts. \
-             Flat out, streams, pipes and Unix datagrams wait for their receivers, multicast and topics lose. \
-             <N: the rate was not kept in N runs."
+             Flat out, streams, pipes and Unix datagrams wait for their receivers, multicast and topics lose."
         );
     }
     figures::print_cells("compare", options.json, &cells.iter().flat_map(columns).collect::<Vec<_>>());
@@ -38,24 +44,25 @@ fn columns(cell: &Cell) -> Vec<figures::Cell> {
         ("last, p99", "us", |run| run.last[1]),
         ("last, p99.9", "us", |run| run.last[2]),
     ];
-    const COST: [(&str, &str, Of); 4] = [
+    const COST: [(&str, &str, Of); 6] = [
         ("sender, a message", "us", |run| Some(run.sender_us)),
+        ("of it sending", "us", |run| run.sending_us),
         ("receiver, a message", "us", |run| run.receiver_us),
         ("received, a second", "1/s", |run| Some(run.rate_hz)),
         ("missed", "%", |run| Some(run.missed_percent)),
+        ("sent, of the rate", "%", |run| run.kept_percent),
     ];
     let Case { way, payload, receivers } = cell.case;
-    let slow = cell.runs.iter().filter(|run| !run.kept).count();
-    let row = if slow > 0 { format!("{} <{slow}", way.name()) } else { way.name().into() };
     let figure = |what: &str, (column, unit, of): (&str, &'static str, Of)| figures::Cell {
         table: format!("{payload} B to {receivers}, {}: {what}", PHASES[cell.phase].name),
-        row: row.clone(),
+        row: way.name().into(),
         column: column.into(),
         unit,
         values: values(cell, of),
     };
     let latency = LATENCY.into_iter().map(|column| figure("latency", column));
-    latency.chain(COST.into_iter().map(|column| figure("cost", column))).collect()
+    let all = latency.chain(COST.into_iter().map(|column| figure("cost", column)));
+    all.filter(|figure| !figure.values.is_empty()).collect()
 }
 
 /// One value of each run that has it.

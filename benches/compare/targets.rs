@@ -13,7 +13,7 @@ use crate::support::options::Options;
 /// Prints each, and where it is missed.
 pub(crate) fn print(options: &Options, cells: &[Cell]) {
     let mut verdicts = Vec::new();
-    for cell in cells.iter().filter(|cell| PHASES[cell.phase].period_ns > 0) {
+    for cell in cells.iter().filter(|cell| is_paced(cell)) {
         verdicts.extend(of_waits(cell, cells));
         verdicts.extend(of_spinning(cell));
         verdicts.extend(of_attaching(cell, cells));
@@ -92,56 +92,49 @@ fn of_attaching(cell: &Cell, cells: &[Cell]) -> Option<Verdict> {
 }
 
 /// What the hub is for: many receivers of long messages.
-fn of_many(cell: &Cell, cells: &[Cell]) -> Option<Verdict> {
+fn of_many(cell: &Cell, cells: &[Cell]) -> Vec<Verdict> {
     let least = match cell.case.way {
         Way::Doorbell => 50.0,
         Way::Event => 20.0,
-        _ => return None,
+        _ => return Vec::new(),
     };
     if cell.case.receivers != 16 || cell.case.payload != super::MEBIBYTE {
-        return None;
+        return Vec::new();
     }
-    let sockets = [Way::UnixDatagram, Way::UnixStream].into_iter().filter_map(|way| beside(cell, cells, way));
-    let cheapest = cheapest(sockets, |run| Some(run.sender_us))?;
-    ratio(
-        cheapest,
-        cell,
-        "sender's processor time",
-        |run| Some(run.sender_us),
-        |ratio| ratio >= least,
-        &format!(">= {least}"),
-    )
+    let verdict = |(quantity, of): (&str, Of)| {
+        let sockets = [Way::UnixDatagram, Way::UnixStream].into_iter();
+        let cheapest = cheapest(sockets.filter_map(|way| beside(cell, cells, way)), of)?;
+        ratio(cheapest, cell, quantity, of, |ratio| ratio >= least, &format!(">= {least}"))
+    };
+    SENDER.into_iter().filter_map(verdict).collect()
 }
 
-/// Sender and last receiver beside the cheapest socket: a verdict for each cell where they are above it, and one for all.
+/// Sender and last receiver beside the cheapest socket: a verdict for all cells together, then one for each where they are
+/// above it.
 fn of_sockets(cells: &[Cell]) -> Vec<Verdict> {
-    const QUANTITIES: [(&str, Of); 2] =
-        [("sender's processor time", |run| Some(run.sender_us)), ("last receiver's p50", |run| run.last[0])];
+    const LAST: (&str, Of) = ("last receiver's p50", |run| run.last[0]);
     let mut verdicts = Vec::new();
     for way in [Way::Doorbell, Way::Event] {
-        let ours = cells.iter().filter(|cell| cell.case.way == way && PHASES[cell.phase].period_ns > 0);
-        let (mut compared, mut above) = (0, Vec::new());
-        for cell in ours {
-            for (quantity, of) in QUANTITIES {
-                let rivals = cells.iter().filter(|rival| rival.case.way.is_rival() && is_beside(rival, cell));
-                let Some(rival) = cheapest(rivals, of) else { continue };
-                compared += 1;
-                if is_above(cell, rival, of) {
-                    let target = "not above the cheapest socket beyond the spread";
-                    above.extend(ratio(cell, rival, quantity, of, |_| false, target));
-                }
-            }
+        for (quantity, of) in SENDER.into_iter().chain([LAST]) {
+            let ours = cells.iter().filter(|cell| cell.case.way == way && is_paced(cell));
+            let beside: Vec<_> = ours
+                .filter_map(|cell| {
+                    let rivals = cells.iter().filter(|rival| rival.case.way.is_rival());
+                    Some((cell, cheapest(rivals.filter(|rival| is_beside(rival, cell)), of)?))
+                })
+                .collect();
+            let above: Vec<_> = beside.iter().filter(|(cell, rival)| is_above(cell, rival, of)).collect();
+            let target = "not above the cheapest socket beyond the spread";
+            verdicts.push(Verdict {
+                what: format!("{}, {quantity}", way.name()),
+                target: target.into(),
+                value: format!("above it in {} of {} cells", above.len(), beside.len()),
+                is_met: above.is_empty(),
+            });
+            verdicts.extend(
+                above.iter().filter_map(|(cell, rival)| ratio(cell, rival, quantity, of, |_| false, target)),
+            );
         }
-        verdicts.push(Verdict {
-            what: format!(
-                "{}: sender's processor time and last receiver's p50 beside the cheapest socket",
-                way.name()
-            ),
-            target: "none above it beyond the spread".into(),
-            value: format!("{} of {compared} above", above.len()),
-            is_met: above.is_empty(),
-        });
-        verdicts.append(&mut above);
     }
     verdicts
 }
@@ -193,6 +186,10 @@ fn is_beside(one: &Cell, other: &Cell) -> bool {
     place(one) == place(other)
 }
 
+fn is_paced(cell: &Cell) -> bool {
+    PHASES[cell.phase].period_ns > 0
+}
+
 fn median(cell: &Cell, of: Of) -> Option<f64> {
     let mut values = values(cell, of);
     values.sort_by(f64::total_cmp);
@@ -204,5 +201,8 @@ fn name(cell: &Cell) -> String {
     format!("{}, {} B to {}, {}", case.way.name(), case.payload, case.receivers, PHASES[cell.phase].name)
 }
 
+/// With all that a message costs its sender, and without the writing of it and the wait until it is due.
+const SENDER: [(&str, Of); 2] =
+    [("sender's processor time", |run| Some(run.sender_us)), ("sending alone", |run| run.sending_us)];
 /// The hub's own messages are not longer.
 const SHORT: usize = size_of::<schema::Scan>();

@@ -3,7 +3,9 @@
 
 use clients::Attachment;
 use iceoryx2::prelude::ServiceName;
-use schema::ipc::{self, Bell, Listener, Node, Payload, Publisher, Subscriber, TopicService, Waker};
+use schema::ipc::{
+    self, Bell, Listener, Node, Payload, Publisher, SampleMut, Subscriber, TopicService, Waker,
+};
 use schema::{Domain, Environment, Header, HubLock, Scan, Topic, Wake, limits};
 
 use super::message::{Label, SHORT, contents};
@@ -26,10 +28,18 @@ impl Hub {
         let node = ipc::hub_node(&domain)?;
         Ok(Hub { waker: Waker::new(&node, SENSOR)?, node, _lock: lock })
     }
+
+    /// Sends what was written, and wakes all.
+    fn send<P: Payload + ?Sized>(&self, written: Option<SampleMut<P>>) -> Outcome<()> {
+        let sample = written.ok_or("nothing was written")?;
+        sample.send().map_err(|error| format!("not sent: {error:?}"))?;
+        Ok(self.waker.wake(Wake::Telegram)?)
+    }
 }
 
 /// The publisher of a topic of bytes.
 pub(crate) struct Bytes {
+    written: Option<SampleMut<[u8]>>,
     publisher: Publisher<[u8]>,
     _service: TopicService<[u8]>,
     contents: Vec<u8>,
@@ -58,17 +68,15 @@ impl Bytes {
             .override_sample_preallocation(|_| limits::samples(Topic::Scan))
             .initial_max_slice_len(task.payload)
             .create()?;
-        Ok(Bytes { publisher, _service: service, contents: contents(task.payload), hub })
+        Ok(Bytes { written: None, publisher, _service: service, contents: contents(task.payload), hub })
     }
 
-    fn publish(&self, label: Label, len: usize) -> Outcome<u64> {
+    /// Writes a message of this length into a loan.
+    fn loan(&mut self, label: Label, len: usize) -> Outcome<()> {
         let loan = self.publisher.loan_slice_uninit(len).map_err(|error| format!("no loan: {error:?}"))?;
-        let mut sample = loan.write_from_slice(&self.contents[..len]);
+        let sample = self.written.insert(loan.write_from_slice(&self.contents[..len]));
         label.write(sample.payload_mut());
-        let at = clock::now();
-        sample.send().map_err(|error| format!("not sent: {error:?}"))?;
-        self.hub.waker.wake(Wake::Telegram)?;
-        Ok(at)
+        Ok(())
     }
 }
 
@@ -77,12 +85,17 @@ impl Outlet for Bytes {
         Ok(())
     }
 
-    fn send(&mut self, label: Label) -> Outcome<u64> {
-        self.publish(label, self.contents.len())
+    fn write(&mut self, label: Label) -> Outcome<()> {
+        self.loan(label, self.contents.len())
+    }
+
+    fn send(&mut self) -> Outcome<()> {
+        self.hub.send(self.written.take())
     }
 
     fn end(&mut self, label: Label) -> Outcome<()> {
-        self.publish(label, SHORT).map(|_| ())
+        self.loan(label, SHORT)?;
+        self.send()
     }
 }
 
@@ -160,6 +173,7 @@ impl Wait {
 
 /// The publisher of the hub's topic of scans.
 pub(crate) struct Scans {
+    written: Option<SampleMut<Scan>>,
     publisher: Publisher<Scan>,
     _service: TopicService<Scan>,
     next: u64,
@@ -170,7 +184,7 @@ impl Scans {
     pub(crate) fn new(task: &Task) -> Outcome<Scans> {
         let hub = Hub::new(task)?;
         let service = Scan::create(&hub.node, SENSOR)?;
-        Ok(Scans { publisher: Scan::publisher(&service)?, _service: service, next: 0, hub })
+        Ok(Scans { written: None, publisher: Scan::publisher(&service)?, _service: service, next: 0, hub })
     }
 }
 
@@ -179,18 +193,19 @@ impl Outlet for Scans {
         Ok(())
     }
 
-    fn send(&mut self, label: Label) -> Outcome<u64> {
-        let mut sample = self.publisher.loan().map_err(|error| format!("no loan: {error:?}"))?;
+    fn write(&mut self, label: Label) -> Outcome<()> {
+        let loan = self.publisher.loan().map_err(|error| format!("no loan: {error:?}"))?;
+        let sample = self.written.insert(loan);
         let kind = label.phase as u64 * 2 + u64::from(label.is_end);
-        let header =
+        *sample.user_header_mut() =
             Header { seq: label.number, topic_seq: self.next, boot: 1, wall_ns: kind, ..Header::default() };
-        self.next += 1;
-        *sample.user_header_mut() = header;
         sample.payload_mut().range_array.fill(label.number as u16);
-        let at = clock::now();
-        sample.send().map_err(|error| format!("not sent: {error:?}"))?;
-        self.hub.waker.wake(Wake::Telegram)?;
-        Ok(at)
+        self.next += 1;
+        Ok(())
+    }
+
+    fn send(&mut self) -> Outcome<()> {
+        self.hub.send(self.written.take())
     }
 }
 

@@ -64,7 +64,9 @@ pub(crate) fn unsafe_code_is_rare_and_explained(tree: &Tree) -> Vec<String> {
 
 /// Services are built in one module; the payloads elsewhere in schema derive one trait.
 pub(crate) fn shared_memory_is_built_in_one_module(tree: &Tree) -> Vec<String> {
-    let mut places = find(tree, &["iceoryx2::"], |path| !path.starts_with("schema/src/ipc"));
+    // Messages longer than any payload are compared with sockets by a service that no topic has.
+    let may_build = |path: &str| path.starts_with("schema/src/ipc") || path == "benches/compare/topic.rs";
+    let mut places = find(tree, &["iceoryx2::"], |path| !may_build(path));
     let derives =
         |place: &String| place.starts_with("schema/src/") && place.ends_with("prelude::ZeroCopySend;");
     places.retain(|place| !derives(place));
