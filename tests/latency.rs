@@ -21,6 +21,9 @@ fn told(outcome: &Outcome) -> Value {
 /// How many times there are of `span`, whose percentiles have to be in order.
 fn count(line: &Value, span: &str) -> u64 {
     let of = &line[span];
+    if *of == Value::Null {
+        return 0;
+    }
     let times = ORDER.map(|key| number(of, key));
     assert!(times.is_sorted(), "{span}: {line}");
     number(of, "count")
@@ -46,14 +49,11 @@ fn ages_of_a_stream_are_split_and_judged() {
         assert_eq!(line["flags"][0], "simulated");
         assert_eq!(count(&line, "age") + number(&line, "before"), 20, "{line}");
         assert_eq!((count(&line, "hub"), count(&line, "wake")), (count(&line, "age"), count(&line, "age")));
-        // Of a telegram whose stamps were computed nothing is known of the line.
-        assert!((1..=20).contains(&count(&line, "line")) && count(&line, "line") == count(&line, "total"));
+        // Of a telegram whose stamps were computed, on a busy machine, nothing is known of the line.
+        assert!(count(&line, "line") <= 20 && count(&line, "line") == count(&line, "total"), "{line}");
         for part in ["hub", "wake"] {
             assert!(number(&line[part], "max_ns") <= number(&line["age"], "max_ns"), "{line}");
         }
-        // 732 bytes of ten bits.
-        assert!(number(&line["line"], "max_ns") > 14_000_000, "{line}");
-        assert!(number(&line["total"], "min_ns") > number(&line["line"], "min_ns"), "{line}");
         assert_eq!(line["network"], Value::Null);
         let summary = &outcome.of_class("summary")[0];
         assert_eq!((number(summary, "received"), &summary["topic"]), (20, &json!("scan")));
@@ -65,6 +65,12 @@ fn ages_of_a_stream_are_split_and_judged() {
         "{outcome}"
     );
     assert_eq!(outcome.of_class("latency").len(), 2, "{outcome}");
+    let mut latency = stage.start(&["latency", "front/scan", "--json"]);
+    let line = latency.await_line("a time on the line", |line| count(line, "line") > 0);
+    // 732 bytes of ten bits.
+    assert!(number(&line["line"], "max_ns") > 14_000_000, "{line}");
+    assert!(number(&line["total"], "min_ns") > number(&line["line"], "min_ns"), "{line}");
+    assert_eq!(latency.end(INT).code, Some(0));
     // A status says something without a telegram: it has an age, and nothing else.
     let mut latency = stage.start(&["latency", "front/status", "--json", "--no-realtime"]);
     let line = latency.await_line("a status", |line| line["age"] != Value::Null);
@@ -114,12 +120,14 @@ fn of_a_remote_sensor_the_way_on_this_machine_is_known() {
         assert_eq!(line["flags"], json!(["simulated", "remote"]), "{line}");
         assert!(number(&line["network"], "min_ns") > 49_000_000, "{line}");
         assert_eq!((&line["line"], &line["hub"]), (&Value::Null, &Value::Null));
-        assert_eq!((count(&line, "network"), number(&line, "ahead")), (count(&line, "age"), 0));
+        // What the listener says itself came over no network.
+        assert!((1..=count(&line, "age")).contains(&count(&line, "network")), "{line}");
+        assert_eq!(number(&line, "ahead"), 0, "{line}");
         // Its clock goes ahead of ours.
         sender.stamp_ns = stage::wall_ns() + 3_600_000_000_000;
         sender.send(Topic::Zones, &zones);
         let line = latency.await_line("clocks that differ", |line| line["ahead"] == 1);
-        assert_eq!(count(&line, "age"), count(&line, "network") + 1, "{line}");
+        assert!(count(&line, "age") > count(&line, "network"), "{line}");
         assert_eq!(latency.end(INT).code, Some(0));
         assert_eq!(listener.end(TERM).code, Some(0));
     });
