@@ -77,12 +77,14 @@ impl<'a> Report<'a> {
         })
     }
 
-    /// A remote sensor is published as `name`.
-    pub(super) fn published(&mut self, head: &Head, name: &str) -> Result<(), End> {
+    /// A remote sensor is published as `name`; `here`: it is this machine's own.
+    pub(super) fn published(&mut self, head: &Head, name: &str, here: bool) -> Result<(), End> {
         if self.json {
-            return self.out.json(&Notice { sensor: Some(name), ..Notice::of("published", head) });
+            return self.out.json(&Notice { sensor: Some(name), here, ..Notice::of("published", head) });
         }
-        self.notes.line(|line| write!(line, "publishing {name}"))
+        let which =
+            if here { ", whose gateway is on this machine: --hub HUB hears others alone" } else { "" };
+        self.notes.line(|line| write!(line, "publishing {name}{which}"))
     }
 
     /// What became of all that came, in shared memory.
