@@ -32,8 +32,8 @@ fn a_hub_that_is_named_is_heard_in_a_crowd() {
         let senders = [HUB, 0xab].map(|hub| {
             let mut sender = Sender::new(hub, 7, 0, "front");
             sender.announce(&[Topic::Zones]);
-            sender.send(Topic::Zones, &zones(Verdict::Clear));
             sender.throw(Topic::Zones, b"short");
+            sender.send(Topic::Zones, &zones(Verdict::Clear));
             sender
         });
         program.await_lines(2, "zones", is_class("zones"));

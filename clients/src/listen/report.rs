@@ -117,7 +117,7 @@ impl<'a> Report<'a> {
             return if self.drawn > 0 { self.draw(account, roll) } else { self.text_account(account, roll) };
         }
         for row in account.rows() {
-            let sensor = roll.name(row.hub, row.epoch, row.sensor);
+            let sensor = roll.row_name(row.hub, row.epoch, row.sensor);
             self.out.json(&Lan::new(row, &sensor))?;
         }
         self.out.json(&Sums::new(account.given_up()))?;
@@ -131,7 +131,7 @@ impl<'a> Report<'a> {
             vec![
                 self.names.of(row.hub),
                 row.epoch.to_string(),
-                format!("{}/{}", roll.name(row.hub, row.epoch, row.sensor), topic(row)),
+                format!("{}/{}", roll.row_name(row.hub, row.epoch, row.sensor), topic(row)),
                 row.received.to_string(),
                 row.lost().to_string(),
                 row.duplicate.to_string(),
