@@ -210,7 +210,7 @@ impl Listener<'_> {
         if self.options.stats {
             return Ok(());
         }
-        let sensor = &self.roll.name(head.hub, head.epoch, head.sensor);
+        let sensor = &self.roll.written(&head, &self.account);
         if missed > 0 {
             self.report.missed(&head, sensor, topic, missed)?;
         }
@@ -221,7 +221,11 @@ impl Listener<'_> {
         let head = datagram.head;
         let Some(announce) = Announce::unpack(datagram.payload) else { return Ok(()) };
         let life = self.roll.life(&head, &self.account);
-        if let Some(behind_ns) = life.announce(head.sensor, &announce, head.stamp_ns, wall_ns) {
+        let behind_ns = life.announce(head.sensor, &announce, head.stamp_ns, wall_ns);
+        if life.sensor(head.sensor).take_numbered() {
+            self.report.named(&head, announce.sensor())?;
+        }
+        if let Some(behind_ns) = behind_ns {
             self.report.clocks_differ(&head, behind_ns)?;
         }
         let Some(publication) = &mut self.publication else { return Ok(()) };

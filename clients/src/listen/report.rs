@@ -63,6 +63,17 @@ impl<'a> Report<'a> {
         self.notes.line(|line| write!(line, "{hub}.{sensor}/{}: missed {missed}", topic.name()))
     }
 
+    /// The sensor that sent `head` is called so; what was written of it before has its number.
+    pub(super) fn named(&mut self, head: &Head, sensor: &str) -> Result<(), End> {
+        let number = head.sensor;
+        if self.json {
+            let (sensor, number) = (Some(sensor), Some(number));
+            return self.out.json(&Notice { sensor, number, ..Notice::of("named", head) });
+        }
+        let hub = self.names.of(head.hub);
+        self.notes.line(|line| write!(line, "{hub}.#{number} is {hub}.{sensor}"))
+    }
+
     /// The clock of the machine that sent `head` is so much behind this one's.
     pub(super) fn clocks_differ(&mut self, head: &Head, behind_ns: i64) -> Result<(), End> {
         let behind_ms = behind_ns as f64 / 1e6;

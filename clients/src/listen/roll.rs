@@ -25,6 +25,8 @@ pub(super) struct Sensor {
     pub(super) announced: Option<Announce>,
     /// It was announced under another name before: the hub began anew with its sensors in another order.
     is_renamed: bool,
+    /// Something was written of it under its number.
+    is_numbered: bool,
     /// By topic's number: the greatest number that is known to have been sent.
     last: [Option<u32>; TOPICS],
 }
@@ -46,6 +48,13 @@ impl Roll {
     pub(super) fn name(&self, hub: u64, epoch: u32, sensor: u8) -> String {
         let announced = self.sensor(hub, epoch, sensor).and_then(|sensor| sensor.announced.as_ref());
         announced.map_or_else(|| format!("#{sensor}"), |announced| announced.sensor().to_owned())
+    }
+
+    /// What the sensor that sent `head` is called, to be written now.
+    pub(super) fn written(&mut self, head: &Head, account: &Account) -> String {
+        let sensor = self.life(head, account).sensor(head.sensor);
+        sensor.is_numbered |= sensor.announced.is_none();
+        self.name(head.hub, head.epoch, head.sensor)
     }
 
     /// Of whom a row of the account is: as [`name`](Self::name), but `#` and the number also where it had several names,
@@ -103,6 +112,11 @@ impl Life {
 }
 
 impl Sensor {
+    /// Whether it was written of under its number; told once.
+    pub(super) fn take_numbered(&mut self) -> bool {
+        std::mem::take(&mut self.is_numbered)
+    }
+
     /// A number of a topic came that is greater than all before; how many between did not.
     pub(super) fn advance(&mut self, topic: u8, sequence: u32) -> u32 {
         let Some(last) = self.last.get_mut(usize::from(topic)) else { return 0 };

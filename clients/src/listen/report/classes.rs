@@ -28,6 +28,8 @@ pub(super) struct Notice<'a> {
     pub(super) message: Option<&'a str>,
     #[serde(skip_serializing_if = "std::ops::Not::not")]
     pub(super) here: bool,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub(super) number: Option<u8>,
 }
 
 impl Notice<'_> {
@@ -44,6 +46,7 @@ impl Notice<'_> {
             behind_ms: None,
             message: None,
             here: false,
+            number: None,
         }
     }
 }
