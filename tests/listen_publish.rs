@@ -226,7 +226,7 @@ fn what_a_gateway_sends_comes_back_once() {
         let hub = stage.hub(&[stage.link("front")]);
         let line = listener.await_line("a sensor", |line| line["kind"] == "published");
         let remote = format!("{}.front", id.as_str().unwrap_or_default());
-        assert_eq!(line["sensor"], remote.as_str());
+        assert_eq!((&line["sensor"], &line["here"]), (&json!(remote), &json!(true)));
         let mut echo = stage.echo(&["front/scan", &format!("{remote}/scan")]);
         echo.await_lines(40, "scans", |line| line["sensor"] == remote.as_str());
         let outcome = echo.end(INT);
