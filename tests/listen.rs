@@ -56,6 +56,8 @@ fn every_topic_is_a_line() {
             (&json!("#2"), &Value::Null, &Value::Null)
         );
         sender.announce(&Topic::ALL);
+        let named = program.await_line("its name", |line| line["kind"] == "named");
+        assert_eq!((&named["number"], &named["sensor"]), (&json!(2), &json!("front")));
         sender.counter = 77;
         sender.stamp_ns = wall_ns() - 5_000_000;
         let mut marks = Marks { count: 1, ..Marks::default() };

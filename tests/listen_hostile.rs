@@ -154,6 +154,7 @@ fn words_that_make_no_sense_have_a_remedy() {
         (&["--topic=front/zones"], 3, "no_topic", "zones"),
         (&["--name=robot"], 78, "configuration", "NAME=HUB"),
         (&["--name=robot=0000000000000001"], 78, "configuration", "but not robot, for example"),
+        (&["--hub=robot1"], 78, "configuration", "--name robot1="),
         (&["--nonsense"], 2, "usage", "--help"),
     ] {
         let outcome = stage.run(&[&["listen", "--json"], words].concat());

@@ -227,7 +227,7 @@ fn what_a_gateway_sends_comes_back_once() {
         let hub = stage.hub(&[stage.link("front")]);
         let line = listener.await_line("a sensor", |line| line["kind"] == "published");
         let remote = format!("{}.front", id.as_str().unwrap_or_default());
-        assert_eq!(line["sensor"], remote.as_str());
+        assert_eq!((&line["sensor"], &line["here"]), (&json!(remote), &json!(true)));
         let mut echo = stage.echo(&["front/scan", &format!("{remote}/scan")]);
         echo.await_lines(40, "scans", |line| line["sensor"] == remote.as_str());
         let outcome = echo.end(INT);
@@ -280,7 +280,12 @@ fn a_number_that_another_sensor_has_is_its_own() {
         assert_eq!(line["topic_seq"], 0, "a new life of the hub");
         let outcome = echo.end(INT);
         assert!(outcome.of_class("zones").iter().all(|line| line["verdict"] != "stop"), "{outcome}");
-        assert_eq!((rear.end(INT).code, program.end(INT).code), (Some(0), Some(0)));
+        let (rear, program) = (rear.end(INT), program.end(INT));
+        assert_eq!((rear.code, program.code), (Some(0), Some(0)));
+        let rows = program.of_class("lan");
+        let names: Vec<_> =
+            rows.iter().filter(|line| line["topic"] == "zones").map(|line| &line["sensor"]).collect();
+        assert_eq!(names, ["#0", "front"], "the first one was sent by both");
     });
 }
 

@@ -2,7 +2,7 @@
 
 mod changes;
 
-use std::net::Ipv4Addr;
+use std::net::{IpAddr, Ipv4Addr};
 
 use nix::ifaddrs::{InterfaceAddress, getifaddrs};
 use nix::net::if_::{InterfaceFlags, if_nametoindex};
@@ -63,6 +63,15 @@ pub(crate) fn named(name: &str) -> Result<Interface, Failure> {
     ))
 }
 
+/// Whether a sender with `address` is on this machine; not if the system does not tell its addresses.
+pub(crate) fn is_of_this_machine(address: IpAddr) -> bool {
+    let is_it = |entry: &InterfaceAddress| ipv4(entry).is_some_and(|own| own == address);
+    // What goes to a group by the loopback of a machine without another address has none; from outside none such comes in.
+    address.is_loopback()
+        || address.is_unspecified()
+        || getifaddrs().is_ok_and(|mut all| all.any(|entry| is_it(&entry)))
+}
+
 /// Nothing if it was taken away meanwhile.
 fn interface(entry: InterfaceAddress, address: Option<Ipv4Addr>) -> Option<Interface> {
     let index = if_nametoindex(entry.interface_name.as_str()).ok()?;
@@ -91,6 +100,13 @@ mod tests {
     fn the_loopback_is_known_and_others_are_named() {
         let lo = named("lo").unwrap();
         assert!(lo.loopback && lo.multicast && lo.index > 0, "{lo:?}");
+        let own = interfaces().unwrap().into_iter().filter_map(|interface| interface.address);
+        assert!(
+            own.chain([Ipv4Addr::new(127, 0, 0, 9), Ipv4Addr::UNSPECIFIED])
+                .all(|own| is_of_this_machine(own.into()))
+        );
+        // For documentation: nobody has it (RFC 5737).
+        assert!(!is_of_this_machine(Ipv4Addr::new(192, 0, 2, 1).into()));
         let failure = named("no-such").unwrap_err();
         assert_eq!(failure.kind, Kind::Configuration);
         assert!(failure.message.contains("no-such") && failure.hint.contains("lo"), "{failure}");

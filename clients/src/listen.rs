@@ -10,6 +10,7 @@ mod roll;
 mod twins;
 
 use std::io::Write;
+use std::net::IpAddr;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
@@ -17,7 +18,7 @@ use schema::datagram::{Account, Announce, Datagram, Fresh, Refusal, group};
 use schema::{Domain, Failure, Kind, Topic};
 
 use self::ear::{Ear, LONGEST};
-use self::names::Names;
+use self::names::{Hubs, Names};
 use self::publish::Publication;
 use self::remote::Remote;
 use self::report::Report;
@@ -25,6 +26,7 @@ use self::roll::Roll;
 use self::twins::Twins;
 use crate::clock;
 use crate::follow::Bounds;
+use crate::interface::is_of_this_machine;
 use crate::output::{End, Output, quiet};
 
 /// What `listen` is asked for.
@@ -36,6 +38,9 @@ pub struct ListenOptions {
     pub topics: Vec<String>,
     /// `NAME=HUB`: what to call a gateway, instead of its 16 hex digits.
     pub names: Vec<String>,
+    /// The gateways to hear, by 16 hex digits or by one of `names`; none: all. What others send is passed over, before the
+    /// account.
+    pub hubs: Vec<String>,
     /// Only the account, no samples.
     pub stats: bool,
     /// Instead of writing samples, publish them in this domain, as `HUB.SENSOR`.
@@ -54,7 +59,7 @@ pub struct ListenOptions {
 /// With a domain to publish in no samples are written: what comes is to be followed there, without a copy for each
 /// consumer. Then it takes the place of a listener in the domain, of which there is one.
 ///
-/// [`Kind::NoTopic`] with what there is, [`Kind::Configuration`] if there is no such interface or a name is not possible,
+/// [`Kind::NoTopic`] with what there is, [`Kind::Configuration`] if there is no such interface or a name or hub is not possible,
 /// [`Kind::DomainHeld`] if another listener publishes in the domain, [`Kind::Short`] if memory for that is, [`Kind::Failed`]
 /// if the port cannot be had, [`Kind::Timeout`], [`Kind::Interrupted`] if bounded and `stop` came first.
 pub fn listen(
@@ -65,6 +70,7 @@ pub fn listen(
 ) -> Result<(), Failure> {
     let wanted = topics(&options.topics)?;
     let names = Names::parse(&options.names)?;
+    let hubs = Hubs::parse(&options.hubs, &names)?;
     let groups = groups(&wanted);
     let now = Instant::now();
     let publication = options.publish.as_ref().map(|domain| Publication::open(domain, now)).transpose()?;
@@ -74,6 +80,7 @@ pub fn listen(
     let mut listener = Listener {
         options,
         wanted,
+        hubs,
         ear,
         publication,
         told: Vec::new(),
@@ -92,6 +99,7 @@ pub fn listen(
 struct Listener<'a> {
     options: &'a ListenOptions,
     wanted: Vec<Topic>,
+    hubs: Hubs,
     ear: Ear,
     publication: Option<Publication>,
     /// What was told that is wrong here.
@@ -163,12 +171,15 @@ impl Listener<'_> {
     /// Takes what waits, up to a turn; whether there may be more.
     fn take(&mut self, buffer: &mut [u8]) -> Result<bool, End> {
         for _ in 0..TURN {
-            let Some(bytes) = self.ear.receive(buffer)? else { return Ok(false) };
+            let Some((bytes, from)) = self.ear.receive(buffer)? else { return Ok(false) };
+            if !self.hubs.want(bytes) {
+                continue;
+            }
             match self.account.receive(bytes) {
                 Ok((_, Fresh::Duplicate)) => {}
                 Ok((datagram, fresh)) => {
                     self.twins.taken(datagram.head.hub);
-                    self.heard(datagram, fresh == Fresh::Late)?;
+                    self.heard(datagram, fresh == Fresh::Late, from)?;
                 }
                 Err(Refusal::Capacity) => self.trouble(FULL)?,
                 Err(Refusal::Epoch) => self.of_another_life(bytes)?,
@@ -181,13 +192,13 @@ impl Listener<'_> {
         Ok(true)
     }
 
-    /// A datagram that was not there before.
-    fn heard(&mut self, datagram: Datagram<'_>, late: bool) -> Result<(), End> {
+    /// A datagram that was not there before, and its sender's address.
+    fn heard(&mut self, datagram: Datagram<'_>, late: bool, from: IpAddr) -> Result<(), End> {
         let (now, wall_ns) = (clock::now(), clock::wall_ns());
         let head = datagram.head;
         let Some(topic) = Topic::of_number(head.topic) else {
             // What it says was said again, and better, by a newer one.
-            return if late { Ok(()) } else { self.announced(&datagram, wall_ns) };
+            return if late { Ok(()) } else { self.announced(&datagram, wall_ns, from) };
         };
         let life = self.roll.life(&head, &self.account);
         let age_ns = life.age_ns(head.stamp_ns, wall_ns);
@@ -207,23 +218,27 @@ impl Listener<'_> {
         if self.options.stats {
             return Ok(());
         }
-        let sensor = &self.roll.name(head.hub, head.epoch, head.sensor);
+        let sensor = &self.roll.written(&head, &self.account);
         if missed > 0 {
             self.report.missed(&head, sensor, topic, missed)?;
         }
         self.report.sample(sensor, &remote)
     }
 
-    fn announced(&mut self, datagram: &Datagram<'_>, wall_ns: u64) -> Result<(), End> {
+    fn announced(&mut self, datagram: &Datagram<'_>, wall_ns: u64, from: IpAddr) -> Result<(), End> {
         let head = datagram.head;
         let Some(announce) = Announce::unpack(datagram.payload) else { return Ok(()) };
         let life = self.roll.life(&head, &self.account);
-        if let Some(behind_ns) = life.announce(head.sensor, &announce, head.stamp_ns, wall_ns) {
+        let behind_ns = life.announce(head.sensor, &announce, head.stamp_ns, wall_ns);
+        if life.sensor(head.sensor).take_numbered() {
+            self.report.named(&head, announce.sensor())?;
+        }
+        if let Some(behind_ns) = behind_ns {
             self.report.clocks_differ(&head, behind_ns)?;
         }
         let Some(publication) = &mut self.publication else { return Ok(()) };
         match publication.announced(&head, &self.report.names.of(head.hub), &announce) {
-            Ok(Some(name)) => self.report.published(&head, &name),
+            Ok(Some(name)) => self.report.published(&head, &name, is_of_this_machine(from)),
             Ok(None) => Ok(()),
             Err(failure) => self.trouble(&failure.to_string()),
         }

@@ -54,7 +54,8 @@ impl ZonesFollower {
     }
 
     /// Waits for news: the newest sample, or the one `unknown` of a silence. That comes two scan periods and 40 ms
-    /// after the last sample, a second after the start if there was none, and with a hub as without one.
+    /// after the last sample (of another machine not before half a second), a second after the start if there was none, and
+    /// with a hub as without one.
     ///
     /// Failures as [`Attachment::next`](crate::Attachment::next): nothing is known then either.
     #[allow(clippy::should_implement_trait)] // There is no end that an iterator would have.

@@ -19,6 +19,9 @@ pub(crate) struct Listen {
     /// What to call a hub instead of its 16 hex digits, for example robot1=5f3a12bc00d1e2f3
     #[arg(long = "name", value_name = "NAME=HUB")]
     names: Vec<String>,
+    /// Hub to hear, by its 16 hex digits or by the name that --name gives it; all if none is named
+    #[arg(long = "hub", value_name = "HUB")]
+    hubs: Vec<String>,
     /// Only the account: what was received, lost, doubled, out of order, refused
     #[arg(long)]
     stats: bool,
@@ -36,6 +39,7 @@ impl Listen {
             interface: self.interface.clone(),
             topics: self.topics.clone(),
             names: self.names.clone(),
+            hubs: self.hubs.clone(),
             stats: self.stats,
             publish: if self.publish { Some(everywhere.hub_domain()?) } else { None },
             json: everywhere.json,

@@ -2,7 +2,7 @@
 //! It sends nothing. Refuses to know what a datagram says.
 
 use std::io::{self, ErrorKind};
-use std::net::{Ipv4Addr, SocketAddrV4, UdpSocket};
+use std::net::{IpAddr, Ipv4Addr, SocketAddrV4, UdpSocket};
 use std::time::{Duration, Instant};
 
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
@@ -124,12 +124,12 @@ impl Ear {
         self.trouble.take()
     }
 
-    /// The next datagram that waits, whole, or nothing; `buffer` has [`LONGEST`] bytes.
+    /// The next datagram that waits, whole, and its sender's address, or nothing; `buffer` has [`LONGEST`] bytes.
     ///
     /// [`Kind::Failed`] if the socket is of no use any more.
-    pub(super) fn receive<'a>(&self, buffer: &'a mut [u8]) -> Result<Option<&'a [u8]>, Failure> {
-        match self.socket.recv(buffer) {
-            Ok(len) => Ok(Some(&buffer[..len])),
+    pub(super) fn receive<'a>(&self, buffer: &'a mut [u8]) -> Result<Option<(&'a [u8], IpAddr)>, Failure> {
+        match self.socket.recv_from(buffer) {
+            Ok((len, from)) => Ok(Some((&buffer[..len], from.ip()))),
             Err(error) if matches!(error.kind(), ErrorKind::WouldBlock | ErrorKind::Interrupted) => Ok(None),
             Err(error) => Err(Failure::new(Kind::Failed, format!("cannot receive: {error}"), "")),
         }

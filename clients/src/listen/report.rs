@@ -63,6 +63,17 @@ impl<'a> Report<'a> {
         self.notes.line(|line| write!(line, "{hub}.{sensor}/{}: missed {missed}", topic.name()))
     }
 
+    /// The sensor that sent `head` is called so; what was written of it before has its number.
+    pub(super) fn named(&mut self, head: &Head, sensor: &str) -> Result<(), End> {
+        let number = head.sensor;
+        if self.json {
+            let (sensor, number) = (Some(sensor), Some(number));
+            return self.out.json(&Notice { sensor, number, ..Notice::of("named", head) });
+        }
+        let hub = self.names.of(head.hub);
+        self.notes.line(|line| write!(line, "{hub}.#{number} is {hub}.{sensor}"))
+    }
+
     /// The clock of the machine that sent `head` is so much behind this one's.
     pub(super) fn clocks_differ(&mut self, head: &Head, behind_ns: i64) -> Result<(), End> {
         let behind_ms = behind_ns as f64 / 1e6;
@@ -77,12 +88,14 @@ impl<'a> Report<'a> {
         })
     }
 
-    /// A remote sensor is published as `name`.
-    pub(super) fn published(&mut self, head: &Head, name: &str) -> Result<(), End> {
+    /// A remote sensor is published as `name`; `here`: it is this machine's own.
+    pub(super) fn published(&mut self, head: &Head, name: &str, here: bool) -> Result<(), End> {
         if self.json {
-            return self.out.json(&Notice { sensor: Some(name), ..Notice::of("published", head) });
+            return self.out.json(&Notice { sensor: Some(name), here, ..Notice::of("published", head) });
         }
-        self.notes.line(|line| write!(line, "publishing {name}"))
+        let which =
+            if here { ", whose gateway is on this machine: --hub HUB hears others alone" } else { "" };
+        self.notes.line(|line| write!(line, "publishing {name}{which}"))
     }
 
     /// What became of all that came, in shared memory.
@@ -115,7 +128,7 @@ impl<'a> Report<'a> {
             return if self.drawn > 0 { self.draw(account, roll) } else { self.text_account(account, roll) };
         }
         for row in account.rows() {
-            let sensor = roll.name(row.hub, row.epoch, row.sensor);
+            let sensor = roll.row_name(row.hub, row.epoch, row.sensor);
             self.out.json(&Lan::new(row, &sensor))?;
         }
         self.out.json(&Sums::new(account.given_up()))?;
@@ -129,7 +142,7 @@ impl<'a> Report<'a> {
             vec![
                 self.names.of(row.hub),
                 row.epoch.to_string(),
-                format!("{}/{}", roll.name(row.hub, row.epoch, row.sensor), topic(row)),
+                format!("{}/{}", roll.row_name(row.hub, row.epoch, row.sensor), topic(row)),
                 row.received.to_string(),
                 row.lost().to_string(),
                 row.duplicate.to_string(),

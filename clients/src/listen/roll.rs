@@ -23,6 +23,10 @@ pub(super) struct Life {
 pub(super) struct Sensor {
     /// What its announcement says of it, as soon as there was one.
     pub(super) announced: Option<Announce>,
+    /// It was announced under another name before: the hub began anew with its sensors in another order.
+    is_renamed: bool,
+    /// Something was written of it under its number.
+    is_numbered: bool,
     /// By topic's number: the greatest number that is known to have been sent.
     last: [Option<u32>; TOPICS],
 }
@@ -42,11 +46,28 @@ impl Roll {
 
     /// What the sensor is called: its name, or `#` and its number as long as nobody announced it.
     pub(super) fn name(&self, hub: u64, epoch: u32, sensor: u8) -> String {
-        let found = self.lives.get(&(hub, epoch)).and_then(|life| life.sensors.get(&sensor));
-        match found.and_then(|sensor| sensor.announced.as_ref()) {
-            Some(announced) => announced.sensor().to_owned(),
-            None => format!("#{sensor}"),
+        let announced = self.sensor(hub, epoch, sensor).and_then(|sensor| sensor.announced.as_ref());
+        announced.map_or_else(|| format!("#{sensor}"), |announced| announced.sensor().to_owned())
+    }
+
+    /// What the sensor that sent `head` is called, to be written now.
+    pub(super) fn written(&mut self, head: &Head, account: &Account) -> String {
+        let sensor = self.life(head, account).sensor(head.sensor);
+        sensor.is_numbered |= sensor.announced.is_none();
+        self.name(head.hub, head.epoch, head.sensor)
+    }
+
+    /// Of whom a row of the account is: as [`name`](Self::name), but `#` and the number also where it had several names,
+    /// for the row counts what was sent under each of them.
+    pub(super) fn row_name(&self, hub: u64, epoch: u32, sensor: u8) -> String {
+        match self.sensor(hub, epoch, sensor) {
+            Some(known) if known.is_renamed => format!("#{sensor}"),
+            _ => self.name(hub, epoch, sensor),
         }
+    }
+
+    fn sensor(&self, hub: u64, epoch: u32, sensor: u8) -> Option<&Sensor> {
+        self.lives.get(&(hub, epoch))?.sensors.get(&sensor)
     }
 }
 
@@ -80,7 +101,8 @@ impl Life {
                 last.get_or_insert(topic.next.wrapping_sub(1));
             }
         }
-        known.announced = Some(*announce);
+        let before = known.announced.replace(*announce);
+        known.is_renamed |= before.is_some_and(|before| before.sensor() != announce.sensor());
         self.delays.add(wall_ns.wrapping_sub(stamp_ns) as i64);
         let difference_ns = self.delays.difference_ns()?;
         let is_news = difference_ns.unsigned_abs() > CLOCKS_AGREE_NS && !self.delays.told;
@@ -90,6 +112,11 @@ impl Life {
 }
 
 impl Sensor {
+    /// Whether it was written of under its number; told once.
+    pub(super) fn take_numbered(&mut self) -> bool {
+        std::mem::take(&mut self.is_numbered)
+    }
+
     /// A number of a topic came that is greater than all before; how many between did not.
     pub(super) fn advance(&mut self, topic: u8, sequence: u32) -> u32 {
         let Some(last) = self.last.get_mut(usize::from(topic)) else { return 0 };
@@ -146,6 +173,21 @@ mod tests {
         assert_eq!(roll.name(5, 9, 1), "#1");
         roll.life(&head, &account).announce(1, &Announce::new(3, "rear", ""), MS, MS);
         assert_eq!((roll.name(5, 9, 1).as_str(), roll.name(5, 8, 1).as_str()), ("rear", "#1"));
+        assert_eq!(roll.row_name(5, 9, 1), "rear");
+    }
+
+    #[test]
+    fn a_row_of_two_sensors_has_the_name_of_neither() {
+        let (mut roll, account) = (Roll::default(), Box::new(Account::new(&Topic::ALL)));
+        let head = Head { hub: 5, epoch: 9, ..Head::default() };
+        let mut announce = |boot, name| {
+            roll.life(&head, &account).announce(0, &Announce::new(boot, name, ""), MS, MS);
+            (roll.name(5, 9, 0), roll.row_name(5, 9, 0))
+        };
+        assert_eq!(announce(3, "front"), ("front".into(), "front".into()));
+        assert_eq!(announce(4, "front"), ("front".into(), "front".into()), "the hub's next life");
+        assert_eq!(announce(5, "rear"), ("rear".into(), "#0".into()));
+        assert_eq!(announce(6, "front"), ("front".into(), "#0".into()));
     }
 
     #[test]

@@ -26,6 +26,10 @@ pub(super) struct Notice<'a> {
     pub(super) behind_ms: Option<f64>,
     #[serde(skip_serializing_if = "Option::is_none")]
     pub(super) message: Option<&'a str>,
+    #[serde(skip_serializing_if = "std::ops::Not::not")]
+    pub(super) here: bool,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub(super) number: Option<u8>,
 }
 
 impl Notice<'_> {
@@ -41,6 +45,8 @@ impl Notice<'_> {
             epoch: Some(head.epoch),
             behind_ms: None,
             message: None,
+            here: false,
+            number: None,
         }
     }
 }
