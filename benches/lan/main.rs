@@ -1,6 +1,6 @@
 //! What does the network add? Age of a scan at an application behind a gateway, beside a datagram behind an eventfd; the
 //! gateway's processor time, beside a thread that sends the same datagrams; how many it can send; what a healthy cable
-//! carries to a listener; what a million damaged datagrams do to one; and how long scans are. All of it in network
+//! carries to a listener, and one that is pulled for a while; what a million damaged datagrams do to one; and how long scans are. All of it in network
 //! namespaces of its own. It does not tell what a real switch does.
 
 mod damage;
@@ -9,6 +9,7 @@ mod load;
 #[path = "../../tests/stage/machine.rs"]
 #[allow(dead_code)] // Tests use more of it.
 mod machine;
+mod pulled;
 mod sizes;
 mod source;
 #[path = "../support/mod.rs"]
@@ -24,7 +25,7 @@ use support::Outcome;
 use support::figures::{self, Figure, Target};
 use support::options::Options;
 use support::stage::{PATIENCE, SENSORS, Stage};
-use wire::{Program, is_of, number};
+use wire::{Program, is_of, number, sum};
 
 fn main() -> ExitCode {
     let is_sender = std::env::args().skip(1).eq(hop::PART);
@@ -46,6 +47,7 @@ fn measure(options: &Options) -> Outcome<()> {
     tell(load::figures(options.pairs())?);
     tell(damage::figures(options.count(1_000_000) as u64)?);
     tell(healthy(options.seconds(60))?);
+    tell(pulled::figures()?);
     Ok(())
 }
 
@@ -72,10 +74,7 @@ fn healthy(seconds: u64) -> Outcome<Vec<Figure>> {
         let count = number(last, "sent") - number(first, "sent");
         rates.push(count as f64 / ((to_ns - from_ns) as f64 / 1e9));
     }
-    let count = |key: &str| {
-        let lines = heard.iter().filter(|(_, line)| line["class"] == "lan");
-        lines.map(|(_, line)| number(line, key)).sum::<u64>() as f64
-    };
+    let count = |key: &str| sum(&heard, key);
     let figure = |name, hub, target| Figure { name, unit: "1", hub, floor: Vec::new(), target };
     Ok(vec![
         Figure { unit: "Hz", ..figure("cable: scans of each sensor", rates, Target::None) },

@@ -120,6 +120,16 @@ impl Program {
         }
     }
 
+    /// When the first line of this class after `since_ns` came; those before it are dropped.
+    pub(crate) fn await_after(&self, since_ns: u64, class: &str) -> Outcome<u64> {
+        loop {
+            let (at_ns, line) = self.lines.recv_timeout(PATIENCE).map_err(|_| format!("no {class} came"))?;
+            if at_ns > since_ns && line["class"] == class {
+                return Ok(at_ns);
+            }
+        }
+    }
+
     /// Ends it; the lines that were not yet taken, each with when it came.
     pub(crate) fn end(self) -> Outcome<Vec<(u64, Value)>> {
         let pid = Pid::from_raw(self.pid() as i32).ok_or("no process")?;
@@ -136,6 +146,12 @@ impl Program {
 /// Whether a line is of the account of this sensor and topic.
 pub(crate) fn is_of(line: &Value, sensor: &str, topic: &str) -> bool {
     line["class"] == "lan" && line["sensor"] == sensor && line["topic"] == topic
+}
+
+/// What the rows of an account have under `key`, in all.
+pub(crate) fn sum(lines: &[(u64, Value)], key: &str) -> f64 {
+    let rows = lines.iter().filter(|(_, line)| line["class"] == "lan");
+    rows.map(|(_, line)| number(line, key)).sum::<u64>() as f64
 }
 
 /// A number in a line; 0 if it is not there.

@@ -156,9 +156,9 @@ impl<'a> Gateway<'a> {
                 report.interface(&self.lan)?;
             }
             // What is there comes before the question whether the hub still is: that takes longer than sending.
-            let mut more = false;
+            let (mut more, mut attached) = (false, false);
             for sensor in &mut self.sensors {
-                more |= sensor.forward(&mut self.session, &mut self.lan)?;
+                more |= sensor.forward(&mut self.session, &mut self.lan, &mut attached)?;
             }
             let now = Instant::now();
             self.look(report, now)?;

@@ -21,7 +21,8 @@ pub(crate) struct Gateway {
     /// May be given several times; without it all topics but telegrams, of all sensors
     #[arg(long = "topic", value_name = "SENSOR/TOPIC[:every=N]")]
     topics: Vec<String>,
-    /// A host that gets copies, besides the groups; may be given several times
+    /// A host that gets copies, besides the groups, or [IPV6]:PORT; a name is asked for again while it runs. May be given
+    /// several times
     #[arg(long, value_name = "HOST:PORT")]
     to: Vec<String>,
     /// The telegrams and nothing else, without a header, each sensor's to a port of its own

@@ -20,7 +20,8 @@ pub(super) struct Host {
     resolve: Resolve,
 }
 
-type Resolve = fn(&str) -> io::Result<Vec<SocketAddr>>;
+/// What knows the addresses of a name.
+pub(super) type Resolve = fn(&str) -> io::Result<Vec<SocketAddr>>;
 
 /// Between two questions for a name: machines are given other addresses.
 const EVERY: Duration = Duration::from_secs(60);
@@ -35,7 +36,8 @@ impl Host {
         Host::by(|text| Ok(text.to_socket_addrs()?.collect()), text, more, Instant::now())
     }
 
-    fn by(resolve: Resolve, text: &str, more: u16, now: Instant) -> Result<Host, Failure> {
+    /// The same, as `resolve` knows it.
+    pub(super) fn by(resolve: Resolve, text: &str, more: u16, now: Instant) -> Result<Host, Failure> {
         let refuse = |what: String, hint: &str| Failure::new(Kind::Configuration, what, hint);
         let found = resolve(text).map_err(|error| {
             let hint = "write HOST:PORT with a name that is known here, or an address, as in 10.0.0.7:22200";

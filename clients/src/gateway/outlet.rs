@@ -233,7 +233,43 @@ const CALM: u32 = 2;
 
 #[cfg(test)]
 mod tests {
+    use std::sync::atomic::{AtomicBool, AtomicU16, Ordering};
+    use std::time::Duration;
+
     use super::*;
+
+    #[test]
+    fn a_host_whose_name_moves_is_followed() {
+        static PORT: AtomicU16 = AtomicU16::new(0);
+        static HAS_MOVED: AtomicBool = AtomicBool::new(false);
+        fn resolve(_: &str) -> io::Result<Vec<SocketAddr>> {
+            let there = if HAS_MOVED.load(Ordering::SeqCst) { Ipv6Addr::LOCALHOST.into() } else { HERE };
+            Ok(vec![SocketAddr::new(there, PORT.load(Ordering::SeqCst))])
+        }
+        const HERE: IpAddr = IpAddr::V4(Ipv4Addr::LOCALHOST);
+        let there = match UdpSocket::bind("[::1]:0") {
+            Ok(there) => there,
+            Err(error) => return eprintln!("skipped: no IPv6 here: {error}"),
+        };
+        PORT.store(there.local_addr().unwrap().port(), Ordering::SeqCst);
+        let begin = Instant::now();
+        let host = Host::by(resolve, "robot:7", 0, begin).unwrap();
+        let mut outlet = Outlet::new("robot:7", To::Host(host)).unwrap();
+        let later = begin + Duration::from_secs(60);
+        assert_eq!(outlet.follow_name(begin), None);
+        HAS_MOVED.store(true, Ordering::SeqCst);
+        let moved = loop {
+            assert!(begin.elapsed() < Duration::from_secs(30));
+            match outlet.follow_name(later) {
+                Some(address) => break address,
+                None => std::thread::yield_now(),
+            }
+        };
+        assert_eq!(moved, there.local_addr().unwrap());
+        assert!(outlet.send(b"there", 0, 0));
+        let mut bytes = [0; 9];
+        assert_eq!(there.recv(&mut bytes).unwrap(), 5);
+    }
 
     #[test]
     fn a_host_where_nobody_listens_is_told_once() {

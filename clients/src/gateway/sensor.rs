@@ -59,15 +59,28 @@ impl Sensor {
         Sensor { name: name.to_owned(), tracks, heard: None, kind: String::new(), model: None, is_announced }
     }
 
-    /// Sends what waits; whether more may. Failures as [`Source::receive`].
-    pub(super) fn forward(&mut self, session: &mut Session, lan: &mut Lan) -> Result<bool, Failure> {
+    /// Sends what waits; whether more may. If nothing `attached` to a topic yet in this round it may, and says so: that takes
+    /// a thousand times as long as sending, so that what waits of others has its turn before the next one. Failures as
+    /// [`Source::receive`].
+    pub(super) fn forward(
+        &mut self,
+        session: &mut Session,
+        lan: &mut Lan,
+        attached: &mut bool,
+    ) -> Result<bool, Failure> {
         let mut more = false;
         for at in 0..self.tracks.len() {
+            let is_new = !self.tracks[at].source.attached();
+            if is_new && *attached {
+                more = true;
+                continue;
+            }
             for turn in 0..TURN {
                 let Some(sample) = self.tracks[at].source.receive(session)? else { break };
                 more |= turn + 1 == TURN;
                 self.take(at, &sample, lan);
             }
+            *attached |= is_new && self.tracks[at].source.attached();
         }
         Ok(more)
     }
