@@ -314,7 +314,7 @@ fn colour(number: usize) -> &'static str {
 }
 
 /// Of middling lightness, and told apart by most eyes.
-const COLOURS: [&str; 6] = ["#3b8fd4", "#d9822b", "#2f9e77", "#cc5a8b", "#8f7ad6", "#9a8a2c"];
+const COLOURS: [&str; 7] = ["#3b8fd4", "#d9822b", "#2f9e77", "#cc5a8b", "#8f7ad6", "#9a8a2c", "#b5473c"];
 /// The page and the field of the values on it, in pixels.
 const WIDTH: f64 = 720.0;
 const LEFT: f64 = 86.0;
