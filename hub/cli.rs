@@ -6,6 +6,7 @@ mod configure;
 mod control;
 mod doctor;
 mod gateway;
+mod latency;
 mod leds;
 mod listen;
 mod probe;
@@ -24,6 +25,7 @@ use schema::{DEFAULT_DOMAIN, Domain, Environment, Failure};
 pub(crate) use background::Background;
 pub(crate) use control::Control;
 pub(crate) use gateway::Gateway;
+pub(crate) use latency::Latency;
 pub(crate) use leds::Leds;
 pub(crate) use listen::Listen;
 pub(crate) use telegram::{Telegram, Way};
@@ -102,6 +104,9 @@ pub(crate) enum Verb {
     Echo(Echo),
     /// Rate, jitter and loss of topics
     Hz(Hz),
+    /// How old samples are on arrival, and where they spent that time: percentiles
+    #[command(after_help = latency::SPANS)]
+    Latency(Latency),
     /// Telegrams explained field by field, and written
     Telegram(Telegram),
     /// Stop a sensor, let it stream again, or begin anew with it

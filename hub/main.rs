@@ -112,6 +112,9 @@ fn dispatch(cli: &Cli) -> Result<(), Failure> {
             };
             clients::hz(&options, &mut out, &mut io::stderr(), &*interrupt()?)
         }
+        Verb::Latency(latency) => {
+            clients::latency(&latency.options(everywhere)?, &mut out, &mut io::stderr(), &*interrupt()?)
+        }
         Verb::Control(control) => clients::control(&control.options(everywhere)?, &mut out, &*interrupt()?),
         Verb::Background(background) => {
             // A model is read before Ctrl-C is a flag, which would not end a person's typing.

@@ -3,7 +3,7 @@
 
 mod stage;
 
-use std::net::Ipv4Addr;
+use std::net::{Ipv4Addr, UdpSocket};
 
 use schema::datagram::{Account, Announce, Datagram, Packed};
 use schema::{Scan, Topic, Verdict, Zones};
@@ -203,6 +203,32 @@ fn copies_are_the_same_and_a_dead_host_disturbs_nobody() {
         assert!(number(&dead, "send_failed") > 0 && number(&dead, "reported") > 0, "{dead}");
         assert_eq!((number(&copy, "sent"), number(&copy, "send_failed")), (heard.len() as u64, 0));
         assert_eq!(number(&to("lo"), "send_failed"), 0);
+    });
+}
+
+#[test]
+fn copies_go_over_ipv6_too() {
+    in_a_network("copies_go_over_ipv6_too", || {
+        let Ok(copies) = UdpSocket::bind("[::1]:30000") else {
+            eprintln!("skipped: no IPv6 here");
+            return;
+        };
+        let stage = Stage::new();
+        let receiver = Receiver::new(LO);
+        let _simulator = stage.simulator(&["front"], &STREAM);
+        let _hub = stage.hub(&[stage.link("front")]);
+        let gateway = stage.gateway(&["--interface=lo", "--topic=front/zones", "--to=[::1]:30000"]);
+        receiver.await_more(10, of_topic(Topic::Zones));
+        let outcome = gateway.end(TERM);
+        let heard = receiver.finish();
+        agrees(&heard, &outcome);
+        copies.set_nonblocking(true).expect("a socket");
+        let mut bytes = [0; 2048];
+        for datagram in &heard {
+            let len = copies.recv(&mut bytes).expect("as many as in the groups");
+            assert!(bytes[..len] == datagram[..], "the same");
+        }
+        assert!(copies.recv(&mut bytes).is_err(), "and no more");
     });
 }
 

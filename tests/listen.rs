@@ -8,7 +8,7 @@ use std::io::Read;
 use schema::datagram::{HEAD, Refusal, WINDOW};
 use schema::{Background, Foreground, Mark, Marks, Scan, State, Status, Topic, Verdict, Zones};
 use serde_json::{Value, json};
-use stage::{INT, Outcome, Program, Sender, Stage, in_a_network, is_class, terminal, until, wall_ns};
+use stage::{INT, Outcome, Program, Sender, Stage, in_a_network, is_class, number, terminal, until, wall_ns};
 
 const HUB: u64 = 0x5f3a_12bc_00d1_e2f3;
 
@@ -280,6 +280,33 @@ fn a_gateway_that_starts_again_and_a_second_hub_are_told_apart() {
 }
 
 #[test]
+fn a_gateway_that_starts_ever_again_stays_heard_and_accounted_for() {
+    in_a_network("a_gateway_that_starts_ever_again_stays_heard_and_accounted_for", || {
+        const LIVES: u64 = 90;
+        let stage = Stage::new();
+        let mut program = listener(&stage, &["--topic=zones"]);
+        for epoch in 1..=LIVES {
+            let mut sender = Sender::new(HUB, epoch as u32, 0, "front");
+            sender.announce(&[Topic::Zones]);
+            sender.send(Topic::Zones, &zones(Verdict::Clear));
+            sender.next[usize::from(Topic::Zones.number())] += 2;
+            sender.send(Topic::Zones, &zones(Verdict::Stop));
+            program.await_line("a life", |line| line["epoch"] == epoch && line["verdict"] == "stop");
+        }
+        let outcome = program.end(INT);
+        let lines = outcome.of_class("lan");
+        assert_eq!(lines.len(), 2 * 64, "{outcome}");
+        let given_up = &outcome.of_class("lan_given_up")[0];
+        assert_eq!(given_up["lives"], LIVES - 64, "{outcome}");
+        let sum = |key| number(given_up, key) + lines.iter().map(|line| number(line, key)).sum::<u64>();
+        // An announcement, and of four zones the first and the last.
+        assert_eq!((sum("received"), sum("lost")), (3 * LIVES, 2 * LIVES), "{outcome}");
+        assert_eq!(refused(&outcome)["capacity"], 0, "{outcome}");
+        assert!(outcome.of_class("notice").iter().all(|line| line["kind"] == "missed"), "{outcome}");
+    });
+}
+
+#[test]
 fn each_refusal_has_its_reason() {
     in_a_network("each_refusal_has_its_reason", || {
         let stage = Stage::new();
@@ -326,5 +353,27 @@ fn each_refusal_has_its_reason() {
         let line = line.lines().last().unwrap_or_default();
         let places: Vec<_> = keys.iter().map(|key| line.find(&format!("\"{key}\""))).collect();
         assert!(places.iter().all(Option::is_some) && places.is_sorted(), "{line}");
+    });
+}
+
+#[test]
+fn two_gateways_with_one_number_are_told_once() {
+    in_a_network("two_gateways_with_one_number_are_told_once", || {
+        let stage = Stage::new();
+        let mut program = listener(&stage, &["--topic=zones", "--stats"]);
+        // Of the later life first: all of the earlier one are refused.
+        let mut gateways = [9, 7].map(|epoch| Sender::new(HUB, epoch, 0, "front"));
+        for _ in 0..80 {
+            gateways.iter_mut().for_each(|gateway| gateway.send(Topic::Zones, &zones(Verdict::Clear)));
+            // As far apart as they send: what comes in one moment is no second gateway.
+            std::thread::sleep(std::time::Duration::from_millis(50));
+        }
+        let line = program.await_line("the remedy", |line| line["kind"] == "trouble");
+        let message = line["message"].as_str().unwrap_or_default();
+        assert!(message.contains(&format!("{HUB:016x}")) && message.contains("gateway-*"), "{line}");
+        let outcome = program.end(INT);
+        assert_eq!(outcome.of_class("notice").len(), 1, "{outcome}");
+        assert_eq!(account(&outcome, 9, "zones"), [80, 0, 0, 0]);
+        assert_eq!(refused(&outcome)["epoch"], 80);
     });
 }

@@ -3,8 +3,9 @@
 
 mod stage;
 
+use rustix::process::{Pid, Resource, Rlimit, getrlimit, prlimit};
 use schema::datagram::Announce;
-use schema::{Scan, State, Status, Topic, Verdict, Zones};
+use schema::{Marks, Scan, State, Status, Topic, Verdict, Zones};
 use serde_json::{Value, json};
 use stage::{INT, KILL, Program, Sender, Stage, TERM, in_a_network, number, until};
 
@@ -328,6 +329,37 @@ fn publisher_refused(stage: &Stage) -> String {
     let outcome = stage.run(&["listen", "--json", "--publish"]);
     assert_eq!((outcome.code, &outcome.lines()[0]["kind"]), (Some(1), &json!("domain_held")), "{outcome}");
     outcome.lines()[0]["message"].as_str().unwrap_or_default().to_owned()
+}
+
+#[test]
+fn what_has_no_room_is_counted_as_such() {
+    in_a_network("what_has_no_room_is_counted_as_such", || {
+        let stage = Stage::new();
+        let mut front = Sender::new(HUB, 7, 3, "front");
+        let mut program = publisher(&stage);
+        front.announce(&[Topic::Zones]);
+        program.await_line("a sensor", |line| line["kind"] == "published");
+        let mut echo = stage.echo(&["robot1.front/zones"]);
+        let pid = program.pid();
+        let used = std::fs::read_dir(format!("/proc/{pid}/fd")).expect("it runs").count() as u64;
+        let few = Rlimit { current: Some(used + 4), maximum: getrlimit(Resource::Nofile).maximum };
+        prlimit(Pid::from_raw(pid as i32), Resource::Nofile, few).expect("it may have fewer");
+        front.announce(&[Topic::Zones, Topic::Scan]);
+        let line = program.await_line("a shortage", |line| line["kind"] == "trouble");
+        assert!(line["message"].to_string().contains("descriptors"), "{line}");
+        front.send(Topic::Scan, &Scan::default());
+        front.send(Topic::Marks, &Marks::default());
+        let mut rear = Sender::new(HUB, 7, 4, "rear");
+        rear.announce(&[Topic::Zones]);
+        rear.send(Topic::Zones, &zones(Verdict::Clear));
+        // What there is room for goes on.
+        front.send(Topic::Zones, &zones(Verdict::Slow));
+        echo.await_line("zones", |line| is_zones(line) && line["verdict"] == "slow");
+        let outcome = program.end(INT);
+        let line = &outcome.of_class("lan_published")[0];
+        assert_eq!((&line["sensors"], &line["shortage"]), (&json!([FRONT]), &json!(2)), "{outcome}");
+        assert_eq!((&line["unannounced"], &line["unnamed"]), (&json!(1), &json!(0)), "{outcome}");
+    });
 }
 
 #[test]

@@ -1,7 +1,7 @@
 //! A hub without sensors: publishes one scan again and again, when it is told to.
 
 use schema::ipc::{self, Node, Payload, Publisher, TopicService, Waker};
-use schema::{Domain, Header, HubLock, Scan, Wake};
+use schema::{Domain, Header, HubLock, Scan, Status, Wake};
 
 use crate::support::Outcome;
 
@@ -14,6 +14,8 @@ pub(crate) struct Source {
     waker: Waker,
     next: u64,
     _service: TopicService<Scan>,
+    /// Every hub has it; where it was not there, a gateway would ask for it again and again.
+    _status: TopicService<Status>,
     _node: Node,
     _lock: HubLock,
 }
@@ -29,6 +31,7 @@ impl Source {
             waker,
             next: 0,
             _service: service,
+            _status: Status::create(&node, SENSOR)?,
             _node: node,
             _lock: lock,
         })

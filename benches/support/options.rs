@@ -1,4 +1,5 @@
-//! The few things that can be asked of a bench: `--json`, `--draw DIR`, `--pairs N`, `--seconds N`, `--count N`.
+//! The few things that can be asked of a bench: `--json`, `--quick`, `--draw DIR`, `--pairs N`, `--seconds N`,
+//! `--count N`.
 
 use std::path::PathBuf;
 
@@ -9,6 +10,8 @@ use super::Outcome;
 pub(crate) struct Options {
     /// One line of JSON per measurement instead of the table.
     pub(crate) json: bool,
+    /// Less of it, in a few minutes, where a bench is long.
+    pub(crate) quick: bool,
     /// Where charts go, as SVG; without it none is drawn. A bench that has no charts has no use for it.
     pub(crate) draw: Option<PathBuf>,
     pairs: Option<usize>,
@@ -24,6 +27,7 @@ impl Options {
             let mut value = || words.next().ok_or_else(|| format!("{word} needs a value"));
             match word.as_str() {
                 "--json" => options.json = true,
+                "--quick" => options.quick = true,
                 "--draw" => options.draw = Some(value()?.into()),
                 "--pairs" => options.pairs = Some(value()?.parse()?),
                 "--seconds" => options.seconds = Some(value()?.parse()?),
@@ -31,9 +35,10 @@ impl Options {
                 // Cargo says so to every bench.
                 "--bench" => {}
                 _ => {
-                    return Err(
-                        format!("{word}? --json, --draw DIR, --pairs N, --seconds N, --count N").into()
-                    );
+                    return Err(format!(
+                        "{word}? --json, --quick, --draw DIR, --pairs N, --seconds N, --count N"
+                    )
+                    .into());
                 }
             }
         }
@@ -42,7 +47,12 @@ impl Options {
 
     /// Pairs of a run of the hub and one of the floor.
     pub(crate) fn pairs(&self) -> usize {
-        self.pairs.unwrap_or(5).clamp(1, 100)
+        self.pairs_or(5)
+    }
+
+    /// The same, where five are not what a bench does by itself.
+    pub(crate) fn pairs_or(&self, default: usize) -> usize {
+        self.pairs.unwrap_or(default).clamp(1, 100)
     }
 
     /// Length of a run, if the bench is one of time.

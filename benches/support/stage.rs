@@ -55,6 +55,11 @@ impl Stage {
         self.simulator(sensors, &self.truth(), &["--baud", &rate.to_string()])
     }
 
+    /// Sensors that stream at 500 kBd to whoever opens their ptys, in a simulator of their own that writes no truth.
+    pub(crate) fn simulate_streaming(&self, sensors: &[&str]) -> Outcome<Child> {
+        self.simulator(sensors, Path::new("/dev/null"), &["--baud", "500000", "--state", "streaming"])
+    }
+
     /// A sensor in a simulator of its own, as `flags` say, with its truth in [`Stage::own_truth`].
     pub(crate) fn simulate_one(&self, sensor: &str, flags: &[&str]) -> Outcome<Child> {
         self.simulator(&[sensor], &self.own_truth(sensor), flags)

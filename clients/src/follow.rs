@@ -12,6 +12,7 @@ use crate::output::End;
 use crate::presence::GRACE;
 use crate::sample::{Sample, Source};
 use crate::session::Session;
+use crate::wait::Wait;
 
 /// When a verb that follows ends by itself.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
@@ -48,6 +49,10 @@ pub(crate) enum Notice {
 pub(crate) trait Sink {
     /// A topic will be followed.
     fn begin(&mut self, _name: &TopicName) {}
+    /// The topic is there, and what is sent from now on will be received.
+    fn attached(&mut self, _name: &TopicName) {}
+    /// A sample was received just now; who it is from and what was missed before it comes next.
+    fn arrived(&mut self) {}
     /// A sample came, or one that stands for a silence and does not count.
     fn sample(&mut self, name: &TopicName, sample: &Sample) -> Result<(), End>;
     /// Something went wrong, or right again, in the streams of `names`; none as long as it is not known what is followed.
@@ -68,7 +73,24 @@ pub(crate) fn follow(
     stop: &AtomicBool,
     sink: &mut dyn Sink,
 ) -> Result<(), End> {
-    let mut run = Run::new(names, places, bounds);
+    carry(Run::new(names, places, bounds), names, stop, sink)
+}
+
+/// As [`follow`], woken by `wait`, and for the shortest latency: what is there is taken before it is asked whether the hub
+/// still is, which takes longer than receiving.
+pub(crate) fn follow_closely(
+    wait: Wait,
+    names: &[TopicName],
+    places: &[Domain],
+    bounds: &Bounds,
+    stop: &AtomicBool,
+    sink: &mut dyn Sink,
+) -> Result<(), End> {
+    let run = Run::new(names, places, bounds);
+    carry(Run { session: run.session.by(wait), closely: true, ..run }, names, stop, sink)
+}
+
+fn carry(mut run: Run<'_>, names: &[TopicName], stop: &AtomicBool, sink: &mut dyn Sink) -> Result<(), End> {
     names.iter().for_each(|name| sink.begin(name));
     let end = run.run(stop, sink);
     if !matches!(end, Err(End::ReaderGone)) {
@@ -95,6 +117,8 @@ struct Run<'a> {
     session: Session,
     tracks: Vec<Track>,
     all: bool,
+    /// Samples come before news of the hub.
+    closely: bool,
     bounds: &'a Bounds,
     started: Instant,
     last_sample: Instant,
@@ -118,6 +142,7 @@ impl<'a> Run<'a> {
             session: Session::new(places.to_vec()),
             tracks: names.iter().cloned().map(Track::new).collect(),
             all: names.is_empty(),
+            closely: false,
             bounds,
             started: now,
             last_sample: now,
@@ -129,10 +154,16 @@ impl<'a> Run<'a> {
     }
 
     fn run(&mut self, stop: &AtomicBool, sink: &mut dyn Sink) -> Result<(), End> {
+        self.look(sink)?;
         loop {
-            self.look(sink)?;
+            if !self.closely {
+                self.look(sink)?;
+            }
             if self.take(stop, sink)? {
                 return Ok(());
+            }
+            if self.closely {
+                self.look(sink)?;
             }
             let now = Instant::now();
             sink.tick(now)?;
@@ -179,7 +210,15 @@ impl<'a> Run<'a> {
             more = false;
             for track in &mut self.tracks {
                 for turn in 0..TURN {
-                    let Some(sample) = track.source.receive(&mut self.session)? else { break };
+                    let was_attached = track.source.attached();
+                    let received = track.source.receive(&mut self.session)?;
+                    if received.is_some() {
+                        sink.arrived();
+                    }
+                    if !was_attached && track.source.attached() {
+                        sink.attached(&track.name);
+                    }
+                    let Some(sample) = received else { break };
                     more |= turn + 1 == TURN;
                     let now = Instant::now();
                     if sample.is_silence() {

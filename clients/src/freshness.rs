@@ -3,7 +3,7 @@
 
 use std::time::Duration;
 
-use schema::{Header, Verdict};
+use schema::{Flags, Header, Verdict};
 
 use crate::clock::Moment;
 
@@ -21,7 +21,8 @@ const HUB_LIMIT_NS: u64 = 20_000_000;
 /// So much longer a client waits: where the hub lives its own word comes first, and one silence has one `unknown`.
 const AFTER_HUB_NS: u64 = 20_000_000;
 
-/// The limit for a sample that tells no period: enough for two periods of half degrees at 38400 baud, 0.4 s.
+/// The limit for a sample that tells no period, enough for two periods of half degrees at 38400 baud, 0.4 s; and the least
+/// one for a sample of another machine, because networks hold back what they carry, wireless ones for a tenth of a second.
 const NO_PERIOD_NS: u64 = 500_000_000;
 
 /// How long the first word may take: a hub that lives hands its last sample to newcomers ten times a second, one that
@@ -42,6 +43,8 @@ impl Freshness {
             0 => NO_PERIOD_NS,
             period_us => 2000 * u64::from(period_us) + HUB_LIMIT_NS + AFTER_HUB_NS,
         };
+        let is_remote = header.flags & Flags::REMOTE != 0;
+        let limit_ns = if is_remote { limit_ns.max(NO_PERIOD_NS) } else { limit_ns };
         let silent_at = later(now, limit_ns);
         let aged_at_ns = header.stamp_last_ns.saturating_add(limit_ns);
         self.until = Moment { monotonic_ns: silent_at.monotonic_ns.min(aged_at_ns), ..silent_at };
@@ -135,6 +138,16 @@ mod tests {
         let resumed = Moment { boottime_ns: 3_600_000 * MS, ..at(110) };
         assert_eq!(freshness.left(resumed), Some(Duration::ZERO));
         assert!(freshness.silence(resumed));
+    }
+
+    #[test]
+    fn a_network_has_half_a_second_at_least() {
+        let mut freshness = Freshness::new(at(0));
+        for (period_us, limit_ms) in [(0, 500), (PERIOD_US, 500), (230_000, 500), (1_000_000, 2040)] {
+            let remote = Header { flags: Flags::REMOTE, ..header(100, period_us) };
+            freshness.heard(&remote, Verdict::Clear, at(100));
+            assert_eq!(freshness.left(at(100)), Some(Duration::from_millis(limit_ms)), "{period_us}");
+        }
     }
 
     #[test]

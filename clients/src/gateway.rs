@@ -1,10 +1,14 @@
 //! `scanhub gateway`: what the hub publishes, as datagrams on a network, one message each and nothing sent twice. An
 //! ordinary client of the hub that outlives it, its links and its own network. Takes nothing from the network.
 
+mod errand;
+mod host;
 mod lan;
 mod life;
+mod machine;
 mod outlet;
 mod report;
+mod roll;
 mod selection;
 mod sensor;
 mod spare;
@@ -12,10 +16,11 @@ mod uplink;
 
 use std::io::Write;
 use std::os::fd::AsFd;
+use std::path::Path;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
-use schema::{Domain, Failure, Kind, check_sensor, ipc};
+use schema::{Domain, Failure, Kind, check_sensor};
 
 use crate::clock;
 use crate::follow::Notice;
@@ -26,6 +31,7 @@ use crate::session::Session;
 use lan::{Form, Lan};
 use life::Life;
 use report::Report;
+use roll::Roll;
 use selection::Selection;
 use sensor::Sensor;
 use spare::Spare;
@@ -38,7 +44,7 @@ pub struct GatewayOptions {
     pub interface: Option<String>,
     /// `SENSOR/TOPIC` or `*/TOPIC`, with `:every=N` if it is to be thinned; none: all but telegrams, of all sensors.
     pub topics: Vec<String>,
-    /// `HOST:PORT` of those that get copies.
+    /// `HOST:PORT` of those that get copies; a name is asked for again while it runs, as its address may change.
     pub to: Vec<String>,
     /// Telegrams and nothing else, without a header.
     pub bare: bool,
@@ -92,8 +98,7 @@ struct Gateway<'a> {
     sensors: Vec<Sensor>,
     lan: Lan,
     started: Instant,
-    /// When the hub came, and how often its sensors were looked for.
-    hub: Option<(Instant, usize)>,
+    roll: Roll,
     is_there: bool,
     /// The sensors that are named were found in a hub.
     is_checked: bool,
@@ -103,10 +108,6 @@ struct Gateway<'a> {
 
 /// Between two announcements, and between two lines of the account.
 const TICK: Duration = Duration::from_secs(1);
-/// When the sensors of a hub that came are looked for: it makes their topics one after the other. Not more often, because
-/// nothing is sent meanwhile.
-const ROLLS: [Duration; 4] =
-    [Duration::ZERO, Duration::from_millis(200), Duration::from_secs(1), Duration::from_secs(5)];
 
 impl<'a> Gateway<'a> {
     fn open(options: &'a GatewayOptions) -> Result<Gateway<'a>, Failure> {
@@ -118,7 +119,8 @@ impl<'a> Gateway<'a> {
         let interface = Uplink::choose(options.interface.as_deref())?;
         let domain = options.places.first().map(Domain::name).unwrap_or_default();
         let now_s = clock::wall_ns() / 1_000_000_000;
-        let life = Life::begin(&life::directory()?, domain, interface.name(), now_s)?;
+        let machine = machine::machine(Path::new(machine::ID));
+        let life = Life::begin(&life::directory()?, domain, interface.name(), now_s, machine)?;
         let form = if options.bare { Form::Bare } else { Form::Sealed };
         let lan = Lan::open(life, interface, &options.to, form, options.ttl, options.longest)?;
         let sensor = |name: &&str| Sensor::new(name, &selection, !options.bare);
@@ -129,7 +131,7 @@ impl<'a> Gateway<'a> {
             session: Session::new(options.places.clone()),
             lan,
             started: Instant::now(),
-            hub: None,
+            roll: Roll::default(),
             waiting_said: false,
             is_there: false,
             is_checked: false,
@@ -158,37 +160,37 @@ impl<'a> Gateway<'a> {
             for sensor in &mut self.sensors {
                 more |= sensor.forward(&mut self.session, &mut self.lan)?;
             }
-            self.look(report)?;
-            self.tick(report)?;
+            let now = Instant::now();
+            self.look(report, now)?;
+            self.tick(report, now)?;
             if tell.swap(false, Ordering::Relaxed) {
                 report.account(&self.lan)?;
             }
             if !more {
-                let left = self.sensors.iter().filter_map(Sensor::left).min();
-                let tick = self.tick_at.saturating_duration_since(Instant::now());
-                self.session.wait_for(Some(left.map_or(tick, |left| left.min(tick))))?;
+                let tick = self.tick_at.saturating_duration_since(now);
+                let left = self.sensors.iter().filter_map(Sensor::left).chain(self.roll.left());
+                self.session.wait_for(Some(left.fold(tick, Duration::min)))?;
             }
         }
         Ok(())
     }
 
     /// News of the hub, and the sensors of one that came.
-    fn look(&mut self, report: &mut Report<'_>) -> Result<(), End> {
+    fn look(&mut self, report: &mut Report<'_>, now: Instant) -> Result<(), End> {
         let change = self.session.look()?;
-        let now = Instant::now();
         if change.gone && self.is_there {
             self.is_there = false;
             report.hub(Notice::HubGone)?;
         }
         // Somebody else may bring the sensors of other machines, which are not sent on.
         if change.back && self.session.hub_lives() {
-            if self.hub.is_some() || self.waiting_said {
+            if self.roll.has_begun() || self.waiting_said {
                 report.hub(Notice::HubBack)?;
             }
             self.is_there = true;
-            self.hub = Some((now, 0));
+            self.roll.begin(now);
         }
-        if self.hub.is_none() && !self.waiting_said && now - self.started >= GRACE {
+        if !self.roll.has_begun() && !self.waiting_said && now - self.started >= GRACE {
             self.waiting_said = true;
             report.hub(Notice::HubGone)?;
         }
@@ -197,15 +199,10 @@ impl<'a> Gateway<'a> {
 
     /// Follows the sensors of the hub if all are wanted; those that are named have to be there in the first hub.
     fn call_the_roll(&mut self, now: Instant) -> Result<(), Failure> {
-        let domain = self.session.domain().filter(|_| self.is_there);
-        let (Some((came, rolls)), Some(domain)) = (self.hub, domain) else { return Ok(()) };
-        if ROLLS.get(rolls).is_none_or(|after| now - came < *after) {
-            return Ok(());
-        }
-        self.hub = Some((came, rolls + 1));
-        let there = ipc::sensors(domain)?;
+        let Some(domain) = self.session.domain().filter(|_| self.is_there) else { return Ok(()) };
+        let Some(called) = self.roll.call(domain, now)? else { return Ok(()) };
         if self.selection.wants_all() {
-            for name in &there {
+            for name in &called.sensors {
                 // One that came from another machine has another name.
                 let is_known = self.sensors.iter().any(|sensor| sensor.name == *name);
                 if !is_known && check_sensor(name).is_ok() {
@@ -213,10 +210,10 @@ impl<'a> Gateway<'a> {
                 }
             }
         }
-        if !self.is_checked && now - came >= GRACE {
-            let missing = self.selection.named().into_iter().find(|name| !there.iter().any(|it| it == name));
-            if let Some(name) = missing {
-                return Err(no_sensor(name, &there));
+        if !self.is_checked && called.age >= GRACE {
+            let is_there = |name: &&str| called.sensors.iter().any(|it| it == name);
+            if let Some(name) = self.selection.named().into_iter().find(|name| !is_there(name)) {
+                return Err(no_sensor(name, &called.sensors));
             }
             self.is_checked = true;
         }
@@ -224,8 +221,7 @@ impl<'a> Gateway<'a> {
     }
 
     /// Once a second: announcements, backgrounds, and what became of destinations.
-    fn tick(&mut self, report: &mut Report<'_>) -> Result<(), End> {
-        let now = Instant::now();
+    fn tick(&mut self, report: &mut Report<'_>, now: Instant) -> Result<(), End> {
         if now < self.tick_at {
             return Ok(());
         }
@@ -236,6 +232,9 @@ impl<'a> Gateway<'a> {
         self.announce();
         let Lan { groups, copies, .. } = &mut self.lan;
         for outlet in std::iter::once(groups).chain(copies) {
+            if let Some(address) = outlet.follow_name(now) {
+                report.moved(&outlet.name, address)?;
+            }
             if let Some(news) = outlet.news() {
                 report.destination(&outlet.name, &news)?;
             }

@@ -1,10 +1,14 @@
 //! The network interfaces of this machine, for who joins groups on them or sends to them. Refuses to know sockets.
 
+mod changes;
+
 use std::net::Ipv4Addr;
 
 use nix::ifaddrs::{InterfaceAddress, getifaddrs};
 use nix::net::if_::{InterfaceFlags, if_nametoindex};
 use schema::{Failure, Kind};
+
+pub(crate) use changes::Changes;
 
 /// One interface, as it is at this moment.
 #[derive(Clone, Debug, PartialEq, Eq)]

@@ -7,6 +7,7 @@ mod publish;
 mod remote;
 mod report;
 mod roll;
+mod twins;
 
 use std::io::Write;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -21,6 +22,7 @@ use self::publish::Publication;
 use self::remote::Remote;
 use self::report::Report;
 use self::roll::Roll;
+use self::twins::Twins;
 use crate::clock;
 use crate::follow::Bounds;
 use crate::output::{End, Output, quiet};
@@ -77,6 +79,7 @@ pub fn listen(
         told: Vec::new(),
         account: Box::new(Account::new(&heard)),
         roll: Roll::default(),
+        twins: Twins::default(),
         report: Report::new(options.json, Output::new(out), Output::new(notes), names),
         started: now,
         last_sample: now,
@@ -95,6 +98,7 @@ struct Listener<'a> {
     told: Vec<String>,
     account: Box<Account>,
     roll: Roll,
+    twins: Twins,
     report: Report<'a>,
     started: Instant,
     last_sample: Instant,
@@ -112,8 +116,8 @@ const LONGEST_WAIT: Duration = Duration::from_millis(100);
 const TOLD: usize = 16;
 
 /// What to do about [`Refusal::Capacity`].
-const FULL: &str = "datagrams are refused: more gateways and starts of gateways were heard than one listener keeps apart \
-                    (64): start it anew";
+const FULL: &str = "datagrams are refused: more gateways (64), or more of their sensors and topics (1024), were heard than \
+                    one listener keeps apart: start it anew";
 
 /// Between two accounts on a terminal.
 const DRAW_EVERY: Duration = Duration::from_secs(1);
@@ -162,8 +166,12 @@ impl Listener<'_> {
             let Some(bytes) = self.ear.receive(buffer)? else { return Ok(false) };
             match self.account.receive(bytes) {
                 Ok((_, Fresh::Duplicate)) => {}
-                Ok((datagram, fresh)) => self.heard(datagram, fresh == Fresh::Late)?,
+                Ok((datagram, fresh)) => {
+                    self.twins.taken(datagram.head.hub);
+                    self.heard(datagram, fresh == Fresh::Late)?;
+                }
                 Err(Refusal::Capacity) => self.trouble(FULL)?,
+                Err(Refusal::Epoch) => self.of_another_life(bytes)?,
                 Err(_) => {}
             }
             if self.options.bounds.count.is_some_and(|count| self.received >= count) {
@@ -181,7 +189,7 @@ impl Listener<'_> {
             // What it says was said again, and better, by a newer one.
             return if late { Ok(()) } else { self.announced(&datagram, wall_ns) };
         };
-        let life = self.roll.life(&head);
+        let life = self.roll.life(&head, &self.account);
         let age_ns = life.age_ns(head.stamp_ns, wall_ns);
         let sensor = life.sensor(head.sensor);
         let missed = if late { 0 } else { sensor.advance(head.topic, head.sequence) };
@@ -209,7 +217,7 @@ impl Listener<'_> {
     fn announced(&mut self, datagram: &Datagram<'_>, wall_ns: u64) -> Result<(), End> {
         let head = datagram.head;
         let Some(announce) = Announce::unpack(datagram.payload) else { return Ok(()) };
-        let life = self.roll.life(&head);
+        let life = self.roll.life(&head, &self.account);
         if let Some(behind_ns) = life.announce(head.sensor, &announce, head.stamp_ns, wall_ns) {
             self.report.clocks_differ(&head, behind_ns)?;
         }
@@ -219,6 +227,16 @@ impl Listener<'_> {
             Ok(None) => Ok(()),
             Err(failure) => self.trouble(&failure.to_string()),
         }
+    }
+
+    /// `bytes` were refused as of a life of their gateway that is over.
+    fn of_another_life(&mut self, bytes: &[u8]) -> Result<(), End> {
+        let Ok(Datagram { head, .. }) = Datagram::read(bytes) else { return Ok(()) };
+        if !self.twins.refused(head.hub, Instant::now()) {
+            return Ok(());
+        }
+        let what = twins::remedy(&self.report.names.of(head.hub));
+        self.trouble(&what)
     }
 
     /// Tells what is wrong here, once; of ever new things only the first ones.

@@ -168,3 +168,120 @@ const LOOKS: u32 = 100;
 
 /// The longest sleep while a hub is gone and its successor has hung no bell.
 const WITHOUT_BELL: Duration = Duration::from_millis(20);
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use schema::ipc::Waker;
+    use schema::{Domain, Wake};
+    use std::path::PathBuf;
+    use std::sync::mpsc;
+    use std::thread;
+    use std::time::Instant;
+
+    /// A domain that goes with the test.
+    struct Place(PathBuf, Domain);
+
+    impl Place {
+        fn new(name: &str) -> Place {
+            let name = format!("w{}-{name}", std::process::id());
+            let base = PathBuf::from(format!("/tmp/sh{name}"));
+            Place(base.clone(), Domain::at(&name, &base).unwrap())
+        }
+    }
+
+    impl Drop for Place {
+        fn drop(&mut self) {
+            let _ = std::fs::remove_dir_all(&self.0);
+            for entry in std::fs::read_dir("/dev/shm").into_iter().flatten().flatten() {
+                if entry.file_name().to_string_lossy().starts_with(&self.1.prefix()) {
+                    let _ = std::fs::remove_file(entry.path());
+                }
+            }
+        }
+    }
+
+    /// Far longer than any wait here may last.
+    const LONG: Duration = Duration::from_secs(20);
+
+    /// Waits that are over before this time were woken.
+    fn woken(started: Instant) -> bool {
+        started.elapsed() < LONG
+    }
+
+    /// A hub's end in a thread of its own, where its ports have to stay; wakes each time it is told.
+    fn hub(domain: &Domain, sensor: &'static str) -> mpsc::Sender<()> {
+        let (tell, told) = mpsc::channel();
+        let (say, said) = mpsc::channel();
+        let node = ipc::hub_node(domain).unwrap();
+        thread::spawn(move || {
+            let waker = Waker::new(&node, sensor).unwrap();
+            say.send(()).unwrap();
+            while let Ok(()) = told.recv() {
+                waker.wake(Wake::Telegram).unwrap();
+            }
+        });
+        said.recv().unwrap();
+        tell
+    }
+
+    #[test]
+    fn each_way_wakes_for_every_sensor() {
+        for (wait, name) in [(Wait::Doorbell, "bell"), (Wait::Event, "event"), (Wait::Spin, "spin")] {
+            let place = Place::new(name);
+            let mut wakeups = Wakeups::by(wait);
+            let hubs = ["front", "rear"].map(|sensor| hub(&place.1, sensor));
+            let node = ipc::client_node(&place.1).unwrap();
+            assert!(!wakeups.add(&node, "left").unwrap(), "there is no such sensor");
+            for (at, sensor) in ["front", "rear"].into_iter().enumerate() {
+                assert!(wakeups.add(&node, sensor).unwrap());
+                for hub in &hubs[..=at] {
+                    // What came before it was listened to may be told once more.
+                    wakeups.wait(&node, Duration::ZERO).unwrap();
+                    wakeups.wait(&node, Duration::ZERO).unwrap();
+                    let started = Instant::now();
+                    hub.send(()).unwrap();
+                    wakeups.wait(&node, LONG).unwrap();
+                    assert!(woken(started), "{wait:?}");
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn the_bell_of_a_hub_that_ended_is_exchanged() {
+        let place = Place::new("ended");
+        let hub = ipc::hub_node(&place.1).unwrap();
+        let node = ipc::client_node(&place.1).unwrap();
+        let mut wakeups = Wakeups::by(Wait::Doorbell);
+        let first = Waker::new(&hub, "front").unwrap();
+        assert!(wakeups.add(&node, "front").unwrap());
+        wakeups.wait(&node, Duration::ZERO).unwrap();
+        let started = Instant::now();
+        drop(first);
+        wakeups.wait(&node, LONG).unwrap();
+        assert!(wakeups.sensors[0].bell.is_none(), "nobody rings it any more");
+        wakeups.wait(&node, Duration::ZERO).unwrap();
+        let second = Waker::new(&hub, "front").unwrap();
+        wakeups.wait(&node, LONG).unwrap();
+        second.wake(Wake::Telegram).unwrap();
+        wakeups.wait(&node, LONG).unwrap();
+        assert!(woken(started));
+        assert!(wakeups.sensors[0].bell.as_ref().is_some_and(|bell| !bell.is_closed()));
+    }
+
+    #[test]
+    fn where_words_cannot_be_waited_for_the_event_wakes() {
+        let place = Place::new("turn");
+        let hub = ipc::hub_node(&place.1).unwrap();
+        let node = ipc::client_node(&place.1).unwrap();
+        let waker = Waker::new(&hub, "front").unwrap();
+        let mut wakeups = Wakeups::by(Wait::Doorbell);
+        assert!(wakeups.add(&node, "front").unwrap());
+        wakeups.turn_to_events(&node).unwrap();
+        let started = Instant::now();
+        waker.wake(Wake::Telegram).unwrap();
+        wakeups.wait(&node, LONG).unwrap();
+        assert!(woken(started) && wakeups.wait == Wait::Event);
+    }
+}

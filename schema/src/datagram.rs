@@ -3,14 +3,16 @@
 
 mod account;
 mod announce;
+mod lives;
 mod numbers;
 mod payload;
 mod refusal;
 
 use crc::{CRC_32_ISCSI, Crc, Table};
 
-pub use account::{Account, LIVES, ROWS};
+pub use account::{Account, GivenUp, ROWS};
 pub use announce::{Announce, Announced};
+pub use lives::LIVES;
 pub use numbers::{Fresh, Row, WINDOW};
 pub use payload::{Packed, telegram};
 pub use refusal::Refusal;

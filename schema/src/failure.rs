@@ -3,6 +3,8 @@
 
 use std::fmt;
 
+use crate::Printable;
+
 /// The kinds of failure; each has a name for `--json` and an exit code.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[non_exhaustive]
@@ -98,9 +100,9 @@ impl Failure {
 
 impl fmt::Display for Failure {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.write_str(&self.message)?;
+        write!(f, "{}", Printable(&self.message))?;
         if !self.hint.is_empty() {
-            write!(f, "\n  {}", self.hint)?;
+            write!(f, "\n  {}", Printable(&self.hint))?;
         }
         Ok(())
     }

@@ -35,16 +35,37 @@ pub struct Header {
     pub hub_pid: u32,
     /// Why the telegram is suspect: bits of [`Reasons`]; 0 if it is clean.
     pub reasons: u8,
-    /// 0.
-    pub reserved: [u8; 3],
+    /// From the telegram's last byte until the sample was sent, in units of 256 ns, rounded up; little-endian. FFFFFFh is
+    /// that or more, 0 not told: of what was said without a telegram, and of other machines. See
+    /// [`hub_time_ns`](Self::hub_time_ns).
+    pub hub_time: [u8; 3],
 }
 
 impl Header {
+    /// Time from the telegram's last byte until the sample was sent, in ns, at most 256 too much; nothing if it is not
+    /// told, or was more than four seconds.
+    pub fn hub_time_ns(&self) -> Option<u64> {
+        let [low, middle, high] = self.hub_time;
+        let units = u32::from_le_bytes([low, middle, high, 0]);
+        (1..HUB_TIME_MORE).contains(&units).then(|| u64::from(units) * HUB_TIME_UNIT_NS)
+    }
+
+    /// Takes `now_ns` of CLOCK_MONOTONIC for the moment at which the sample is sent; the telegram's stamps are there already.
+    pub fn set_sent_at(&mut self, now_ns: u64) {
+        let units = now_ns.saturating_sub(self.stamp_last_ns).div_ceil(HUB_TIME_UNIT_NS);
+        let units = units.clamp(1, HUB_TIME_MORE.into()) as u32;
+        let [low, middle, high, _] = units.to_le_bytes();
+        self.hub_time = [low, middle, high];
+    }
+
     /// The quality as a word; unknown values are suspect.
     pub fn quality(&self) -> Quality {
         if self.quality == Quality::Clean as u8 { Quality::Clean } else { Quality::Suspect }
     }
 }
+
+const HUB_TIME_UNIT_NS: u64 = 256;
+const HUB_TIME_MORE: u32 = 0xFF_FFFF;
 
 /// What the hub thinks of a telegram whose CRC was right.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -106,4 +127,28 @@ impl Flags {
     pub const STAMP_ESTIMATED: u16 = 8;
     /// The sample came from another machine.
     pub const REMOTE: u16 = 32;
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn hub_time() {
+        let mut header = Header { stamp_last_ns: 1_000_000, ..Header::default() };
+        assert_eq!(header.hub_time_ns(), None);
+        for (now_ns, told) in [
+            (1_000_000, Some(256)),
+            (1_000_256, Some(256)),
+            (1_000_257, Some(512)),
+            (1_072_000, Some(282 * 256)),
+            (1_000_000 + 0xFF_FFFE * 256, Some(0xFF_FFFE * 256)),
+            (1_000_001 + 0xFF_FFFE * 256, None),
+            (u64::MAX, None),
+            (5, Some(256)),
+        ] {
+            header.set_sent_at(now_ns);
+            assert_eq!(header.hub_time_ns(), told, "{now_ns}");
+        }
+    }
 }

@@ -32,7 +32,7 @@ fn header_layout() {
     assert_eq!(offset_of!(Header, period_us), 52);
     assert_eq!(offset_of!(Header, hub_pid), 56);
     assert_eq!(offset_of!(Header, reasons), 60);
-    assert_eq!(offset_of!(Header, reserved), 61);
+    assert_eq!(offset_of!(Header, hub_time), 61);
 }
 
 #[test]
@@ -50,7 +50,7 @@ fn header_bytes() {
         period_us: 26_640,
         hub_pid: 7,
         reasons: 0x12,
-        reserved: [0; 3],
+        hub_time: [0xB2, 0x02, 0xFF],
     };
     let expected = golden(
         64,
@@ -64,7 +64,7 @@ fn header_bytes() {
             (48, &[5, 1, 0x02, 0x01]),
             (52, &[0x10, 0x68, 0, 0]),
             (56, &[7]),
-            (60, &[0x12]),
+            (60, &[0x12, 0xB2, 0x02, 0xFF]),
         ],
     );
     assert_eq!(bytemuck::bytes_of(&header), expected);

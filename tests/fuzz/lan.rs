@@ -1,6 +1,8 @@
 //! What has to hold whatever a network carries: datagrams are refused, or they say what can be said again.
 
-use schema::datagram::{Account, Announce, Datagram, Fresh, HEAD, Head, MTU_ETHERNET, Packed, ROWS, Refusal};
+use schema::datagram::{
+    Account, Announce, Datagram, Fresh, GivenUp, HEAD, Head, MTU_ETHERNET, Packed, ROWS, Refusal,
+};
 use schema::{Background, Foreground, Marks, Scan, Status, Topic, Zones};
 
 /// Any datagrams, one after the other: each is counted once, what is refused changes nothing, and what is not, can be
@@ -45,14 +47,17 @@ pub(crate) fn lan(data: &[u8]) {
         }
     }
     let refused: u64 = Refusal::ALL.iter().map(|&refusal| account.refused(refusal)).sum();
-    let counted: u64 = account.rows().map(|row| row.received + row.duplicate).sum();
+    let given_up = account.given_up();
+    let in_rows: u64 = account.rows().map(|row| row.received + row.duplicate).sum();
+    let counted = in_rows + given_up.received + given_up.duplicate;
     assert_eq!((given, accepted), (counted + refused, counted));
     assert!(account.rows().count() <= ROWS);
 }
 
-/// Received, lost, duplicate and reordered of each row.
-fn figures(account: &Account) -> Vec<[u64; 4]> {
-    account.rows().map(|row| [row.received, row.lost(), row.duplicate, row.reordered]).collect()
+/// Received, lost, duplicate and reordered of each row, and what was given up.
+fn figures(account: &Account) -> (Vec<[u64; 4]>, GivenUp) {
+    let rows = account.rows().map(|row| [row.received, row.lost(), row.duplicate, row.reordered]);
+    (rows.collect(), account.given_up())
 }
 
 /// A datagram of few hubs, epochs and sensors, so that they meet.

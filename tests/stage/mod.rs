@@ -10,6 +10,7 @@ mod receiver;
 mod relay;
 mod robot;
 mod sender;
+mod supervisor;
 mod telegrams;
 mod terminal;
 
@@ -31,6 +32,7 @@ pub(crate) use receiver::{Receiver, read};
 pub(crate) use relay::Relay;
 pub(crate) use robot::Robot;
 pub(crate) use sender::{Sender, wall_ns};
+pub(crate) use supervisor::Supervisor;
 pub(crate) use telegrams::{MEASURED, Sent, bytes_of, hash, is_class, number, scan, sequence};
 pub(crate) use terminal::terminal;
 

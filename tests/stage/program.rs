@@ -40,10 +40,15 @@ pub(crate) struct Outcome {
 }
 
 impl Program {
-    pub(crate) fn start(mut command: Command) -> Program {
+    pub(crate) fn start(command: Command) -> Program {
+        Program::start_with(command, Stdio::null())
+    }
+
+    /// As [`Program::start`], with this as its stdin.
+    pub(crate) fn start_with(mut command: Command, stdin: impl Into<Stdio>) -> Program {
         let words: Vec<_> = command.get_args().map(|word| word.to_string_lossy()).collect();
         let name = words.join(" ");
-        command.stdin(Stdio::null()).stdout(Stdio::piped()).stderr(Stdio::piped());
+        command.stdin(stdin).stdout(Stdio::piped()).stderr(Stdio::piped());
         let mut process = command.spawn().unwrap_or_else(|error| panic!("cannot start {name}: {error}"));
         let (send, pieces) = channel();
         let stdout = process.stdout.take();

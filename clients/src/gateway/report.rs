@@ -1,6 +1,7 @@
 //! What a gateway tells of itself: lines of JSON, or text and one line that is drawn over itself. Refuses to know why.
 
 use std::io::{self, Write};
+use std::net::SocketAddr;
 
 use schema::Topic;
 use serde::Serialize;
@@ -39,7 +40,11 @@ impl<'a> Report<'a> {
                 to,
                 bare,
                 longest: lan.longest(),
+                renumbered: lan.life.is_renumbered,
             });
+        }
+        if lan.life.is_renumbered {
+            self.notes.line(|line| write!(line, "{}: {RENUMBERED}", id(lan)))?;
         }
         self.out.line(|line| {
             write!(line, "gateway {} epoch {} on {}", id(lan), lan.life.epoch, lan.interface.name())?;
@@ -72,6 +77,11 @@ impl<'a> Report<'a> {
             News::Failing(why) => self.link(outlet, "failing", Some(why)),
             News::Well => self.link(outlet, "well", None),
         }
+    }
+
+    /// The name of a destination has another address now, which is sent to.
+    pub(super) fn moved(&mut self, outlet: &str, address: SocketAddr) -> Result<(), End> {
+        self.link(outlet, "moved", Some(&format!("its address is {address} now")))
     }
 
     /// Samples of `topic` are longer than the longest datagram.
@@ -193,6 +203,7 @@ struct Begin<'a> {
     to: Vec<&'a str>,
     bare: bool,
     longest: usize,
+    renumbered: bool,
 }
 
 /// Class `lan`.
@@ -230,5 +241,7 @@ struct Link<'a> {
     message: Option<&'a str>,
 }
 
+/// Why a gateway has another number than is kept.
+const RENUMBERED: &str = "a new number, because the one that is kept here was drawn on another machine";
 /// To the line's begin, and nothing on it (ECMA-48).
 const WIPE: &[u8] = b"\r\x1b[K";

@@ -1,25 +1,34 @@
 //! The network interface that datagrams leave by: which one is meant, and whether anything gets out there. The kernel
 //! takes datagrams for an interface whose cable is out, and says nothing. Refuses to know what is sent.
 
-use std::os::fd::OwnedFd;
-use std::time::{Duration, Instant};
+use std::fmt::Display;
+use std::io::{PipeReader, PipeWriter, pipe};
+use std::sync::Arc;
+use std::sync::atomic::{AtomicU64, Ordering};
+use std::thread;
+use std::time::Duration;
 
+use rustix::event::{PollFd, PollFlags, Timespec, poll};
 use rustix::io::Errno;
-use rustix::net::netlink::SocketAddrNetlink;
-use rustix::net::{AddressFamily, RecvFlags, SocketFlags, SocketType, bind, recv, socket_with};
 use schema::{Failure, Kind};
 
-use crate::interface::{Interface, interfaces, named};
+use crate::interface::{Changes, Interface, interfaces, named};
 
-/// A network interface and its state.
+/// A network interface and its state, which a thread of its own watches: who sends has nothing to ask the kernel.
 pub(super) struct Uplink {
     name: String,
-    /// The kernel tells here that interfaces or addresses changed.
-    events: OwnedFd,
+    state: State,
+    /// What the watch saw last.
+    seen: Arc<AtomicU64>,
+    /// Closed, it ends the watch.
+    _end: PipeWriter,
+}
+
+/// What of an interface matters to who sends.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+struct State {
     index: Option<u32>,
     is_up: bool,
-    /// When the kernel is asked again that could not tell.
-    again_at: Option<Instant>,
 }
 
 /// Between two questions to a kernel that cannot tell, because descriptors or memory are short.
@@ -31,18 +40,24 @@ impl Uplink {
     ///
     /// [`Kind::Configuration`] with those that there are if it is not there, or not just one.
     pub(super) fn choose(name: Option<&str>) -> Result<Uplink, Failure> {
-        // First the events: what changes after the look is one.
-        let events = events().map_err(|error| {
-            Failure::new(Kind::Failed, format!("cannot watch network interfaces: {error}"), "")
-        })?;
+        let unwatched = |why: &dyn Display| {
+            Failure::new(Kind::Failed, format!("cannot watch network interfaces: {why}"), "")
+        };
+        // First the watch: what changes after the look is heard.
+        let changes = Changes::watch()?;
         let found = match name {
             Some(name) => named(name)?,
             None => only(interfaces()?)?,
         };
-        let mut uplink =
-            Uplink { name: found.name.clone(), events, index: None, is_up: false, again_at: None };
-        uplink.learn(Some(&found));
-        Ok(uplink)
+        let state = State::of(Some(&found));
+        let seen = Arc::new(AtomicU64::new(state.word()));
+        let (ending, end) = pipe().map_err(|error| unwatched(&error))?;
+        let (name, theirs) = (found.name.clone(), seen.clone());
+        thread::Builder::new()
+            .name("interfaces".into())
+            .spawn(move || watch(&name, changes, &ending, &theirs))
+            .map_err(|error| unwatched(&error))?;
+        Ok(Uplink { name: found.name, state, seen, _end: end })
     }
 
     /// Its name.
@@ -52,39 +67,64 @@ impl Uplink {
 
     /// Its number; it has another one each time that it is made, and none while it is not there.
     pub(super) fn index(&self) -> Option<u32> {
-        self.index
+        self.state.index
     }
 
     /// It is up, has a carrier and an IPv4 address.
     pub(super) fn is_up(&self) -> bool {
-        self.is_up
+        self.state.is_up
     }
 
-    /// Takes note of what changed since the last call; whether that was the number or the state of this interface. One
-    /// system call as long as nothing did. If the kernel cannot tell what there is now, all stays as it is and it is asked
-    /// again.
+    /// Takes note of what changed since the last call; whether that was the number or the state of this interface.
     pub(super) fn look(&mut self) -> bool {
-        let mut any = self.again_at.is_some_and(|at| Instant::now() >= at);
-        // More than can wait are an error that stands for them.
-        while let Ok(_) | Err(Errno::NOBUFS) = recv(&self.events, &mut [0; 64], RecvFlags::DONTWAIT) {
-            any = true;
+        let state = State::in_word(self.seen.load(Ordering::Relaxed));
+        std::mem::replace(&mut self.state, state) != state
+    }
+}
+
+impl State {
+    fn of(found: Option<&Interface>) -> State {
+        State {
+            index: found.map(|found| found.index),
+            is_up: found.is_some_and(|found| found.up && found.running && found.address.is_some()),
         }
-        if !any {
-            return false;
-        }
-        let before = (self.index, self.is_up);
-        let Ok(all) = interfaces() else {
-            self.again_at = Some(Instant::now() + AGAIN);
-            return false;
-        };
-        self.again_at = None;
-        self.learn(all.iter().find(|one| one.name == self.name));
-        before != (self.index, self.is_up)
     }
 
-    fn learn(&mut self, found: Option<&Interface>) {
-        self.index = found.map(|found| found.index);
-        self.is_up = found.is_some_and(|found| found.up && found.running && found.address.is_some());
+    /// In one word, so that it is seen whole: no interface has number 0.
+    fn word(self) -> u64 {
+        u64::from(self.index.unwrap_or(0)) | u64::from(self.is_up) << 32
+    }
+
+    fn in_word(word: u64) -> State {
+        State { index: Some(word as u32).filter(|index| *index != 0), is_up: word >> 32 != 0 }
+    }
+}
+
+/// Keeps what is `seen` of the interface called `name` as it is, until `end` is closed. If the kernel cannot tell what
+/// there is now, all stays as it was and it is asked again.
+fn watch(name: &str, mut changes: Changes, end: &PipeReader, seen: &AtomicU64) {
+    let mut again = None;
+    loop {
+        let mut fds = [PollFd::new(&changes, PollFlags::IN), PollFd::new(end, PollFlags::IN)];
+        let polled = poll(&mut fds, again.as_ref());
+        if !fds[1].revents().is_empty() {
+            return;
+        }
+        if polled.is_err_and(|error| error != Errno::INTR) {
+            thread::sleep(AGAIN);
+        }
+        changes.take(|_| {});
+        match interfaces() {
+            Ok(all) => {
+                let state = State::of(all.iter().find(|one| one.name == name));
+                seen.store(state.word(), Ordering::Relaxed);
+                again = None;
+            }
+            Err(_) => {
+                let nanos = i64::from(AGAIN.subsec_nanos());
+                again = Some(Timespec { tv_sec: AGAIN.as_secs() as i64, tv_nsec: nanos });
+            }
+        }
     }
 }
 
@@ -108,17 +148,6 @@ fn only(mut all: Vec<Interface>) -> Result<Interface, Failure> {
             Err(Failure::new(Kind::Configuration, what, format!("name one by --interface: {hint}")))
         }
     }
-}
-
-/// The kernel's word on links and addresses, without waiting for it (rtnetlink(7)).
-fn events() -> rustix::io::Result<OwnedFd> {
-    const LINK: u32 = 1;
-    const IPV4_ADDRESS: u32 = 0x10;
-    let flags = SocketFlags::CLOEXEC | SocketFlags::NONBLOCK;
-    // No protocol: NETLINK_ROUTE is 0.
-    let socket = socket_with(AddressFamily::NETLINK, SocketType::RAW, flags, None)?;
-    bind(&socket, &SocketAddrNetlink::new(0, LINK | IPV4_ADDRESS))?;
-    Ok(socket)
 }
 
 #[cfg(test)]
@@ -146,13 +175,23 @@ mod tests {
     }
 
     #[test]
+    fn a_state_is_one_word() {
+        for state in [(None, false), (Some(1), false), (Some(u32::MAX), true)] {
+            let state = State { index: state.0, is_up: state.1 };
+            assert_eq!(State::in_word(state.word()), state);
+        }
+        let state = State { index: Some(1), is_up: true };
+        let seen = Arc::new(AtomicU64::new(state.word()));
+        let mut uplink = Uplink { name: "lo".into(), state, seen, _end: pipe().unwrap().1 };
+        assert!(!uplink.look() && uplink.is_up());
+        uplink.seen.store(0, Ordering::Relaxed);
+        assert!(uplink.look() && !uplink.is_up() && uplink.index().is_none() && !uplink.look());
+    }
+
+    #[test]
     fn what_gets_nothing_out_is_not_up() {
         let plugged = interface("eth0", Some(Ipv4Addr::LOCALHOST));
-        let mut uplink = Uplink::choose(Some("lo")).unwrap();
-        let mut is_up = |found: Option<&Interface>| {
-            uplink.learn(found);
-            uplink.is_up()
-        };
+        let is_up = |found: Option<&Interface>| State::of(found).is_up;
         assert!(is_up(Some(&plugged)) && !is_up(None));
         assert!(!is_up(Some(&Interface { running: false, ..plugged.clone() })));
         assert!(!is_up(Some(&Interface { up: false, ..plugged.clone() })));

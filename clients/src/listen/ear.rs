@@ -10,7 +10,7 @@ use schema::datagram::{GROUPS, PORT};
 use schema::{Failure, Kind};
 use socket2::{Domain, InterfaceIndexOrAddress, Protocol, Socket, Type};
 
-use crate::interface::{Interface, interfaces, named};
+use crate::interface::{Changes, Interface, interfaces, named};
 
 /// Hears groups.
 pub(super) struct Ear {
@@ -19,6 +19,9 @@ pub(super) struct Ear {
     /// The one interface to hear on; none: all that can.
     only: Option<String>,
     joined: Vec<Joined>,
+    changes: Changes,
+    /// The kernel has said that something changed.
+    is_changed: bool,
     look_at: Instant,
     /// Why the groups could not be joined somewhere, or the interfaces not be had.
     trouble: Option<String>,
@@ -28,11 +31,11 @@ pub(super) struct Ear {
 struct Joined {
     name: String,
     index: u32,
-    /// It had a link when it was last looked at.
+    /// It had a link when it was last looked at, and was not away since.
     running: bool,
 }
 
-/// Between two looks at the interfaces.
+/// Between two looks at the interfaces, if the kernel says nothing: what could not be done is tried again.
 const LOOK_EVERY: Duration = Duration::from_millis(500);
 
 /// Room for what waits while this process does not run; the system gives less where its own limit is lower.
@@ -54,6 +57,8 @@ impl Ear {
                 return Err(Failure::new(Kind::Configuration, format!("{name} carries no multicast"), hint));
             }
         }
+        // First the watch: what changes after the look is heard.
+        let changes = Changes::watch()?;
         let socket = bind().map_err(|error| {
             let hint = "it is in use by a program that does not share it: `ss -lunp` names it";
             Failure::new(Kind::Failed, format!("cannot hear on UDP port {PORT}: {error}"), hint)
@@ -64,6 +69,8 @@ impl Ear {
             groups: groups.iter().map(|&last| Ipv4Addr::new(a, b, c, last)).collect(),
             only: only.map(str::to_owned),
             joined: Vec::new(),
+            changes,
+            is_changed: false,
             look_at: now,
             trouble: None,
         };
@@ -71,14 +78,22 @@ impl Ear {
         Ok(ear)
     }
 
-    /// Joins the groups where a link came or came back, if the last look is long enough ago. A switch that filters by
-    /// group has forgotten us when a cable was pulled, and an interface that was made anew never knew us. If the system does
-    /// not tell its interfaces, all stays as it is until the next look.
+    /// Joins the groups where a link came or came back, if the kernel has said that something changed, or the last look is
+    /// long enough ago. A switch that filters by group has forgotten us when a cable was pulled, and an interface that was
+    /// made anew never knew us. If the system does not tell its interfaces, all stays as it is until the next look.
     pub(super) fn look(&mut self, now: Instant) {
-        if now < self.look_at {
+        if !self.is_changed && now < self.look_at {
             return;
         }
+        self.is_changed = false;
         self.look_at = now + LOOK_EVERY;
+        let joined = &mut self.joined;
+        self.changes.take(|away| {
+            joined
+                .iter_mut()
+                .filter(|joined| away.includes(joined.index))
+                .for_each(|joined| joined.running = false);
+        });
         let all = match interfaces() {
             Ok(all) => all,
             Err(failure) => {
@@ -120,11 +135,13 @@ impl Ear {
         }
     }
 
-    /// Sleeps until a datagram waits, a signal comes or `left` is over.
-    pub(super) fn wait(&self, left: Duration) {
+    /// Sleeps until a datagram waits, an interface changes, a signal comes or `left` is over.
+    pub(super) fn wait(&mut self, left: Duration) {
         let left = Timespec { tv_sec: left.as_secs() as i64, tv_nsec: i64::from(left.subsec_nanos()) };
         // What would go wrong here, receiving tells.
-        let _ = poll(&mut [PollFd::new(&self.socket, PollFlags::IN)], Some(&left));
+        let mut both = [PollFd::new(&self.socket, PollFlags::IN), PollFd::new(&self.changes, PollFlags::IN)];
+        let _ = poll(&mut both, Some(&left));
+        self.is_changed = !both[1].revents().is_empty();
     }
 
     fn wants(&self, interface: &Interface) -> bool {

@@ -1,6 +1,8 @@
 //! Sensors of other machines in the domain of this one, so that a consumer follows them as it follows those of a hub.
 //! Refuses to know the network: what it gets was checked and is new.
 
+mod arrivals;
+mod outlet;
 mod topics;
 
 use std::time::{Duration, Instant};
@@ -36,6 +38,8 @@ pub(super) struct LeftOut {
     pub(super) late: u64,
     /// Of more than [`SENSORS`] sensors.
     pub(super) capacity: u64,
+    /// Announced, but there was no memory or no descriptor for their topic.
+    pub(super) shortage: u64,
 }
 
 /// The most sensors: each takes up to 6 MB of shared memory, and whoever can send to the network can announce some.
@@ -98,6 +102,10 @@ impl Publication {
                 "let another listener with another --domain have them",
             ));
         }
+        if let Some(at) = at {
+            // What it has goes on, even if there is no room for more.
+            self.sensors[at].announced(head, announce);
+        }
         let is_missing = |topic: &Topic| {
             let is_announced = announce.topics().iter().any(|announced| announced.topic == topic.number());
             is_announced && at.is_none_or(|at| !self.sensors[at].has(*topic))
@@ -110,12 +118,13 @@ impl Publication {
         let at = match at {
             Some(at) => at,
             None => {
-                self.sensors.push(RemoteTopics::new(&self.node, &name)?);
+                let mut sensor = RemoteTopics::new(&self.node, &name)?;
+                sensor.announced(head, announce);
+                self.sensors.push(sensor);
                 self.sensors.len() - 1
             }
         };
         let sensor = &mut self.sensors[at];
-        sensor.announced(head, announce);
         for &topic in &missing {
             sensor.add(&self.node, topic)?;
         }
@@ -133,11 +142,15 @@ impl Publication {
         if remote.late {
             left_out.late += 1;
         } else if let Some(sensor) = self.sensors.iter_mut().find(|sensor| sensor.is(head)) {
-            if !sensor.publish(remote, now) {
-                left_out.unannounced += 1;
+            match sensor.publish(remote, now) {
+                true => {}
+                false if sensor.is_announced(remote.topic) => left_out.shortage += 1,
+                false => left_out.unannounced += 1,
             }
         } else if remote.boot != 0 && self.sensors.len() == SENSORS {
             left_out.capacity += 1;
+        } else if remote.boot != 0 {
+            left_out.shortage += 1;
         } else {
             left_out.unnamed += 1;
         }

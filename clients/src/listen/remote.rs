@@ -27,8 +27,8 @@ pub(super) struct Remote<'a> {
 }
 
 impl Remote<'_> {
-    /// The header that the sample has here: stamps are those of its arrival, the sensor's is in `wall_ns`; its period is
-    /// not known, for a gateway may send every so many samples only.
+    /// The header that the sample has here: stamps are those of its arrival, the sensor's is in `wall_ns`. It says no
+    /// period, for a gateway may send every so many samples only.
     pub(super) fn header(&self) -> Header {
         let head: &Head = &self.datagram.head;
         let quality = if head.flags & LanFlags::SUSPECT != 0 { Quality::Suspect } else { Quality::Clean };

@@ -15,7 +15,7 @@ use super::publish::Publication;
 use super::remote::{Remote, id};
 use super::roll::Roll;
 use crate::output::{End, Output, table};
-use classes::{Notice, Published, Ready};
+use classes::{Notice, Published, Ready, Sums};
 
 /// Where it is said, and how.
 pub(super) struct Report<'a> {
@@ -105,7 +105,7 @@ impl<'a> Report<'a> {
         if self.drawn > 0 {
             self.out.raw(format!("\x1b[{}A\x1b[J", self.drawn).as_bytes())?;
         }
-        self.drawn = account.rows().count() + 2;
+        self.drawn = account.rows().count() + 2 + usize::from(account.given_up().lives > 0);
         self.text_account(account, roll)
     }
 
@@ -118,6 +118,7 @@ impl<'a> Report<'a> {
             let sensor = roll.name(row.hub, row.epoch, row.sensor);
             self.out.json(&Lan::new(row, &sensor))?;
         }
+        self.out.json(&Sums::new(account.given_up()))?;
         self.out.json(&Refused { class: "lan_refused", reasons: account })
     }
 
@@ -136,6 +137,10 @@ impl<'a> Report<'a> {
             ]
         }));
         table(&mut self.out, &rows)?;
+        let given_up = account.given_up();
+        if given_up.lives > 0 {
+            self.out.line(|line| Sums::new(given_up).text(line))?;
+        }
         self.out.line(|line| {
             write!(line, "refused:")?;
             for (reason, count) in refused(account).filter(|(_, count)| *count > 0) {

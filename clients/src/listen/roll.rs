@@ -3,9 +3,9 @@
 
 use std::collections::HashMap;
 
-use schema::datagram::{Announce, Head};
+use schema::datagram::{Account, Announce, Head};
 
-/// All lives of gateways that were heard.
+/// All lives of gateways that were heard, as long as the account keeps them apart.
 #[derive(Default)]
 pub(super) struct Roll {
     lives: HashMap<(u64, u32), Life>,
@@ -31,9 +31,13 @@ pub(super) struct Sensor {
 const TOPICS: usize = 8;
 
 impl Roll {
-    /// The life that sent `head`.
-    pub(super) fn life(&mut self, head: &Head) -> &mut Life {
-        self.lives.entry((head.hub, head.epoch)).or_default()
+    /// The life that sent `head`, which `account` has taken.
+    pub(super) fn life(&mut self, head: &Head, account: &Account) -> &mut Life {
+        let life = (head.hub, head.epoch);
+        if !self.lives.contains_key(&life) {
+            self.lives.retain(|&(hub, epoch), _| account.knows(hub, epoch));
+        }
+        self.lives.entry(life).or_default()
     }
 
     /// What the sensor is called: its name, or `#` and its number as long as nobody announced it.
@@ -129,19 +133,33 @@ impl Delays {
 mod tests {
     use super::*;
 
-    use schema::Topic;
-    use schema::datagram::Announced;
+    use schema::datagram::{Announced, HEAD, LIVES, Packed};
+    use schema::{Topic, Zones};
 
     const MS: u64 = 1_000_000;
 
     #[test]
     fn names_come_with_announcements() {
-        let mut roll = Roll::default();
+        let (mut roll, account) = (Roll::default(), Box::new(Account::new(&Topic::ALL)));
         let head = Head { hub: 5, epoch: 9, sensor: 1, ..Head::default() };
-        roll.life(&head).sensor(1);
+        roll.life(&head, &account).sensor(1);
         assert_eq!(roll.name(5, 9, 1), "#1");
-        roll.life(&head).announce(1, &Announce::new(3, "rear", ""), MS, MS);
+        roll.life(&head, &account).announce(1, &Announce::new(3, "rear", ""), MS, MS);
         assert_eq!((roll.name(5, 9, 1).as_str(), roll.name(5, 8, 1).as_str()), ("rear", "#1"));
+    }
+
+    #[test]
+    fn who_is_given_up_is_forgotten() {
+        let (mut roll, mut account) = (Roll::default(), Box::new(Account::new(&Topic::ALL)));
+        for epoch in 1..300 {
+            let head = Head { topic: 4, revision: 1, hub: 5, epoch, ..Head::default() };
+            let mut buffer = [0; 100];
+            let len = Zones::unknown().pack(&mut buffer[HEAD..]).unwrap();
+            account.receive(head.seal(&mut buffer, len).unwrap()).unwrap();
+            roll.life(&head, &account).announce(0, &Announce::new(3, "rear", ""), MS, MS);
+        }
+        assert_eq!((roll.lives.len(), account.given_up().lives), (LIVES, 299 - LIVES as u64));
+        assert_eq!((roll.name(5, 299, 0).as_str(), roll.name(5, 1, 0).as_str()), ("rear", "#0"));
     }
 
     #[test]

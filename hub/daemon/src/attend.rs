@@ -24,7 +24,7 @@ impl LinkThread<'_> {
         if let Source::Tcp { .. } = link.port {
             away = Away::for_lack_of_a_port(format!("{}: not connected yet", link.port.name()));
         } else {
-            match Port::open(&link.port, link.baud.rate(), &AtomicBool::new(false)) {
+            match self.take_over() {
                 Ok(port) => opened = Some(port),
                 // Only a hub plays recordings.
                 Err(failure) if failure.kind == Kind::PortNotTty => {
@@ -40,8 +40,12 @@ impl LinkThread<'_> {
         let mut futile = 0;
         loop {
             if let Some(port) = opened.take() {
+                if let Port::Tty(_) = port {
+                    self.around.service.keep(&link.name, &port);
+                }
                 let (heard, end) = self.stay(&port);
                 let Err(error) = end else { return };
+                self.around.service.forget(&link.name);
                 self.account.reconnects += 1;
                 futile = if heard { 0 } else { futile + 1 };
                 let words = format!("{} went away: {error}", link.port.name());
@@ -64,6 +68,17 @@ impl LinkThread<'_> {
                 Some(Err(refusal)) => away.learn(refusal, &link.port, clock::now()),
             }
         }
+    }
+
+    /// The port at the hub's start: the one that a killed hub had, if it was kept, with what lies in it.
+    fn take_over(&self) -> Result<Port, Failure> {
+        let link = self.link;
+        let kept = self.around.service.take(&link.name);
+        if let Some(port) = kept.and_then(|line| Port::adopt(line, &link.port, link.baud.rate())) {
+            tracing::info!("{}: goes on with {}, which was kept", link.name, link.port.name());
+            return Ok(port);
+        }
+        Port::open(&link.port, link.baud.rate(), &AtomicBool::new(false))
     }
 
     /// Tries to open the port, however long that takes; nothing if the hub shall end meanwhile.

@@ -9,10 +9,9 @@ pub(crate) fn now() -> Nanos {
     nanos(clock_gettime(ClockId::Monotonic))
 }
 
-/// Nanoseconds since 1970 of the moment that CLOCK_MONOTONIC called `stamp`.
-pub(crate) fn wall(stamp: Nanos) -> u64 {
-    let (wall, monotonic) = (nanos(clock_gettime(ClockId::Realtime)), now());
-    wall.saturating_sub(monotonic.saturating_sub(stamp))
+/// Nanoseconds since 1970 of the moment that CLOCK_MONOTONIC called `stamp`; `now` was read just now.
+pub(crate) fn wall(stamp: Nanos, now: Nanos) -> u64 {
+    nanos(clock_gettime(ClockId::Realtime)).saturating_sub(now.saturating_sub(stamp))
 }
 
 /// The time from `now` to `until` as poll wants it; nothing if `until` is past, at least a nanosecond otherwise.

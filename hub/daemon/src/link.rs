@@ -3,6 +3,7 @@
 
 use std::io;
 use std::os::fd::{AsFd, BorrowedFd, OwnedFd};
+use std::sync::atomic::{AtomicBool, Ordering};
 
 use lms::framer::suspect;
 use lms::reply::Reply;
@@ -20,6 +21,7 @@ use crate::pipeline::Pipeline;
 use crate::port::Port;
 use crate::replay;
 use crate::scanner;
+use crate::service::Service;
 use crate::status::Account;
 use crate::topics::Topics;
 
@@ -28,8 +30,7 @@ pub(crate) struct LinkThread<'a> {
     pub(crate) link: &'a Link,
     pub(crate) topics: Topics,
     pub(crate) account: Account,
-    /// Readable once the hub shall end.
-    stop: &'a OwnedFd,
+    pub(crate) around: Surroundings<'a>,
     /// What users ask for.
     pub(crate) orders: Orders,
     /// What is made of the scans.
@@ -55,6 +56,17 @@ pub(crate) struct LinkThread<'a> {
     is_blind: bool,
 }
 
+/// What a link has around it.
+#[derive(Clone, Copy)]
+pub(crate) struct Surroundings<'a> {
+    /// Readable once the hub shall end.
+    pub(crate) stop: &'a OwnedFd,
+    /// Keeps the port when the hub is killed.
+    pub(crate) service: &'a Service,
+    /// Set whenever the link finished something.
+    pub(crate) worked: &'a AtomicBool,
+}
+
 /// What a link's error is made from.
 type Facts = (State, Option<Trouble>, Option<Unit>, Option<Notice>);
 
@@ -73,14 +85,14 @@ pub(crate) enum Woken {
 
 impl<'a> LinkThread<'a> {
     /// The thread's values; nothing happens yet.
-    pub(crate) fn new(link: &'a Link, topics: Topics, stop: &'a OwnedFd, orders: Orders) -> Self {
+    pub(crate) fn new(link: &'a Link, topics: Topics, around: Surroundings<'a>, orders: Orders) -> Self {
         let now = clock::now();
         let account = Account::new(link, now);
         LinkThread {
             link,
             topics,
             account,
-            stop,
+            around,
             orders,
             pipeline: Pipeline::new(&link.processing),
             stale_at: Nanos::MAX,
@@ -137,6 +149,13 @@ impl<'a> LinkThread<'a> {
             if !watch {
                 // The telegram's end is near: what can be done before it is not done after it.
                 self.topics.prepare(&self.pipeline);
+            }
+            if watch
+                && session.may_leave()
+                && let Some(waiting) = port.waiting()
+                && session.leave(clock::now(), waiting)
+            {
+                continue;
             }
             let len = port.read(session.spare())?;
             let now = clock::now();
@@ -294,7 +313,7 @@ impl<'a> LinkThread<'a> {
                 bound = bound.min(now + LONGEST_REST);
             }
             let span = clock::span(now, bound);
-            let stop = PollFd::new(self.stop, PollFlags::IN);
+            let stop = PollFd::new(self.around.stop, PollFlags::IN);
             let orders = PollFd::new(&self.orders, PollFlags::IN);
             let woken = match port {
                 Some((port, events)) => {
@@ -307,6 +326,7 @@ impl<'a> LinkThread<'a> {
                 }
             };
             self.account.wakeups += 1;
+            self.around.worked.store(true, Ordering::Relaxed);
             match woken {
                 Ok([true, ..]) => return Woken::Stop,
                 Ok([_, true, _]) => return Woken::Order,

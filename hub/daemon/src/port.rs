@@ -10,7 +10,7 @@ mod tcp;
 mod tty;
 
 use std::io;
-use std::os::fd::{AsFd, BorrowedFd};
+use std::os::fd::{AsFd, BorrowedFd, OwnedFd};
 use std::sync::atomic::AtomicBool;
 
 use schema::Failure;
@@ -47,6 +47,15 @@ impl Port {
             Source::Tty(path) => Tty::open(path, baud).map(Port::Tty),
             Source::Tcp { host, port } => Tcp::open(host, *port, stop).map(Port::Tcp),
             Source::File { .. } => Err(Refusal::Recording),
+        }
+    }
+
+    /// Goes on with `line`, which a hub before this one had opened, if it still is what `source` names.
+    pub(crate) fn adopt(line: OwnedFd, source: &Source, baud: u32) -> Option<Port> {
+        match source {
+            Source::Tty(path) => Tty::adopt(line, path, baud).ok().map(Port::Tty),
+            // What stands in a connection that nobody reads is old, and the other end may have given up.
+            Source::Tcp { .. } | Source::File { .. } => None,
         }
     }
 
@@ -91,6 +100,14 @@ impl Port {
         match self {
             Port::Tty(tty) => tty.set_baud(baud),
             Port::Tcp(tcp) => tcp.forget(),
+        }
+    }
+
+    /// How many bytes there are to read; nothing where that is not worth a question.
+    pub(crate) fn waiting(&self) -> Option<usize> {
+        match self {
+            Port::Tty(tty) => tty.waiting(),
+            Port::Tcp(_) => None,
         }
     }
 

@@ -3,6 +3,7 @@
 
 use std::os::fd::OwnedFd;
 use std::os::unix::net::UnixStream;
+use std::sync::atomic::AtomicBool;
 use std::sync::mpsc;
 use std::thread;
 
@@ -14,7 +15,8 @@ use signal_hook::consts::{SIGINT, SIGTERM};
 
 use crate::config::Config;
 use crate::control::Desk;
-use crate::link::LinkThread;
+use crate::link::{LinkThread, Surroundings};
+use crate::service::{Service, Watchdog};
 use crate::topics::Topics;
 use crate::{clock, preflight};
 
@@ -32,6 +34,7 @@ pub struct Ready {
 /// [`Kind::DomainHeld`] if another hub has the domain, [`Kind::Short`] if memory is, the port kinds if a port is there
 /// but cannot be used, [`Kind::Failed`] if shared memory refuses.
 pub fn run(config: &Config, domain: &Domain, on_ready: impl FnOnce(&Ready)) -> Result<(), Failure> {
+    let service = Service::of_process();
     preflight::raise_descriptor_limit();
     let signals = end_signals()?;
     let _lock = HubLock::acquire(domain.root())?;
@@ -43,14 +46,16 @@ pub fn run(config: &Config, domain: &Domain, on_ready: impl FnOnce(&Ready)) -> R
         Ready { boot: random(), sensors: config.links.iter().map(|link| link.name.clone()).collect() };
     let (mut desk, orders) = Desk::open(&node, config.links.iter().map(|link| link.name.as_str()))?;
     let stop = eventfd(0, EventfdFlags::CLOEXEC).map_err(|error| no_resource("an eventfd", &error))?;
+    let worked: Vec<_> = config.links.iter().map(|_| AtomicBool::new(true)).collect();
     thread::scope(|scope| {
         let (report, reports) = mpsc::channel();
         let mut threads = Vec::new();
         for ((number, link), orders) in config.links.iter().enumerate().zip(orders) {
-            let (node, stop, report) = (&node, &stop, report.clone());
+            let (node, report) = (&node, report.clone());
+            let around = Surroundings { stop: &stop, service: &service, worked: &worked[number] };
             let body = move || match Topics::new(node, &link.name, number as u8, ready.boot) {
                 Ok(topics) => {
-                    LinkThread::new(link, topics, stop, orders).run(|outcome| drop(report.send(outcome)))
+                    LinkThread::new(link, topics, around, orders).run(|outcome| drop(report.send(outcome)))
                 }
                 Err(failure) => drop(report.send(Err(failure))),
             };
@@ -58,7 +63,7 @@ pub fn run(config: &Config, domain: &Domain, on_ready: impl FnOnce(&Ready)) -> R
             match thread {
                 Ok(thread) => threads.push(thread),
                 Err(error) => {
-                    end_links(stop);
+                    end_links(&stop);
                     return Err(no_resource("a thread", &error));
                 }
             }
@@ -70,9 +75,12 @@ pub fn run(config: &Config, domain: &Domain, on_ready: impl FnOnce(&Ready)) -> R
         }
         if outcome.is_ok() {
             on_ready(&ready);
+            service.ready(&ready.sensors);
             let is_alive = || threads.iter().all(|thread| !thread.is_finished());
-            outcome = keep_up(&node, &signals, &mut desk, is_alive);
+            let watchdog = Watchdog::new(&service, &worked, clock::now());
+            outcome = keep_up(&node, &signals, &mut desk, watchdog, is_alive);
         }
+        service.stopping();
         end_links(&stop);
         // Joined one by one, a thread that panicked is a failure of this function, not a panic of its own.
         let ended = threads.into_iter().map(|thread| thread.join()).collect::<Result<Vec<()>, _>>();
@@ -85,6 +93,7 @@ fn keep_up(
     node: &Node,
     signals: &UnixStream,
     desk: &mut Desk,
+    mut watchdog: Option<Watchdog<'_>>,
     is_alive: impl Fn() -> bool,
 ) -> Result<(), Failure> {
     let mut upkeep_at = clock::now() + UPKEEP;
@@ -101,6 +110,7 @@ fn keep_up(
             return Err(broken_thread());
         }
         let now = clock::now();
+        watchdog.iter_mut().for_each(|watchdog| watchdog.look(now));
         if now >= upkeep_at {
             node.try_cleanup_dead_nodes();
             upkeep_at = now + UPKEEP;

@@ -81,11 +81,13 @@ impl Topics {
     /// Publishes the telegram and takes its number and stamps for all that follows from it.
     /// `reasons` are why it is suspect.
     pub(crate) fn telegram(&mut self, received: &Received<'_>, reasons: u8, period_us: u32) {
+        let now = clock::now();
         self.header.seq = self.next_seq;
         self.next_seq += 1;
         self.header.stamp_first_ns = received.first;
         self.header.stamp_last_ns = received.last;
-        self.header.wall_ns = clock::wall(received.first);
+        self.header.wall_ns = clock::wall(received.first, now);
+        self.header.set_sent_at(now);
         self.header.period_us = period_us;
         let quality = if reasons == 0 { Quality::Clean } else { Quality::Suspect };
         self.header.quality = quality as u8;
@@ -125,6 +127,7 @@ impl Topics {
                 foreground: foreground.as_mut().and_then(Loan::payload_mut),
             },
         );
+        self.header.set_sent_at(clock::now());
         let header = self.header;
         self.scan.send(scan, &header);
         self.zones.send(zones, &header);
@@ -209,10 +212,11 @@ fn of_moment(last: &Header, now: u64) -> Header {
     Header {
         stamp_first_ns: now,
         stamp_last_ns: now,
-        wall_ns: clock::wall(now),
+        wall_ns: clock::wall(now, clock::now()),
         quality: Quality::Clean as u8,
         reasons: 0,
         flags: last.flags & !Flags::STAMP_ESTIMATED,
+        hub_time: [0; 3],
         ..*last
     }
 }
@@ -224,9 +228,18 @@ mod tests {
     #[test]
     fn what_is_said_without_a_telegram_has_nothing_of_its_doubts() {
         let flags = Flags::SIMULATED | Flags::STAMP_ESTIMATED;
-        let last = Header { seq: 7, period_us: 26_640, quality: 1, reasons: 4, flags, ..Header::default() };
+        let last = Header {
+            seq: 7,
+            period_us: 26_640,
+            quality: 1,
+            reasons: 4,
+            flags,
+            hub_time: [9; 3],
+            ..Header::default()
+        };
         let header = of_moment(&last, 5);
         assert_eq!((header.quality, header.reasons, header.flags), (0, 0, Flags::SIMULATED));
+        assert_eq!(header.hub_time_ns(), None);
         assert_eq!(
             (header.seq, header.period_us, header.stamp_first_ns, header.stamp_last_ns),
             (7, 26_640, 5, 5)

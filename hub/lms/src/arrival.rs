@@ -75,6 +75,14 @@ impl Arrivals {
         }
     }
 
+    /// At `now` there were `len` bytes that will come with the next read.
+    pub(crate) fn sense(&mut self, now: Nanos, len: usize) {
+        self.last_look = now;
+        let read = Read { end: self.total + len as u64, now, backlog: self.backlog };
+        self.reads[self.next % Arrivals::CAPACITY] = read;
+        self.next += 1;
+    }
+
     /// What was read since the last hurried read came when it was read.
     fn catch_up(&mut self) {
         if let Some(backlog) = self.backlog.take() {
@@ -128,6 +136,11 @@ impl Rhythm {
     /// The first byte of a telegram arrived.
     pub(crate) fn begin(&mut self, first: Nanos) {
         self.first = Some(first);
+    }
+
+    /// Whether it is known how long a telegram takes.
+    pub(crate) fn is_known(&self) -> bool {
+        self.duration.is_some()
     }
 
     /// Until when nothing can be complete; answered once per telegram.
@@ -238,6 +251,18 @@ mod tests {
         arrivals.note(9_010 * MILLIS, 400, Some(500_000));
         let at = 9_010 * MILLIS - 399 * 20_000;
         assert_eq!(arrivals.stamp(0, 500_000), Stamp { at, estimated: true });
+    }
+
+    #[test]
+    fn what_was_seen_before_it_was_read_is_as_old_as_that() {
+        let mut arrivals = Arrivals::new(0);
+        arrivals.sense(1_000_000, 16);
+        arrivals.note(18_000_000, 700, Some(500_000));
+        arrivals.note(18_400_000, 32, Some(500_000));
+        assert_eq!(arrivals.stamp(0, 500_000), Stamp { at: 700_000, estimated: false });
+        assert_eq!(arrivals.stamp(731, 500_000), Stamp { at: 18_400_000, estimated: false });
+        arrivals.note(30_000_000, 1, Some(500_000));
+        assert_eq!(arrivals.stamp(732, 500_000), Stamp { at: 30_000_000, estimated: false });
     }
 
     #[test]

@@ -84,6 +84,8 @@ pub struct Session {
     /// What the next read has room for, and whether the last one left none: then more may be there already.
     room: usize,
     has_more: bool,
+    /// Until when bytes that are there are not read.
+    left_until: Option<Nanos>,
 }
 
 impl Session {
@@ -100,6 +102,7 @@ impl Session {
             cut: false,
             room: 0,
             has_more: false,
+            left_until: None,
         }
     }
 
@@ -110,13 +113,30 @@ impl Session {
         spare
     }
 
+    /// Whether it is worth a look how many bytes the line has, to [`leave`](Self::leave) them there.
+    pub fn may_leave(&self) -> bool {
+        let begins = self.framer.buffered() == 0 && !self.has_more && self.left_until.is_none();
+        begins && self.rhythm.is_known() && self.has_pace() && self.is_live()
+    }
+
+    /// The line has `waiting` bytes at `now` that were not read. Whether they may stay there until the telegram that they
+    /// begin is nearly complete: what a host has not read, one that is killed does not lose.
+    pub fn leave(&mut self, now: Nanos, waiting: usize) -> bool {
+        self.now = now;
+        if waiting > 0 && self.may_leave() {
+            self.arrivals.sense(now, waiting);
+            self.begin_rhythm();
+            self.left_until = self.rhythm.rest(now);
+        }
+        self.left_until.is_some()
+    }
+
     /// A read returned at `now` and brought `len` bytes into [`Session::spare`].
     pub fn commit(&mut self, now: Nanos, len: usize) {
         self.now = now;
         self.has_more = len > 0 && len == self.room;
-        // Neither a recording nor a network has the pace of a line.
-        let has_pace = !(self.dialogue.settings.listen_only || self.dialogue.settings.fixed_rate);
-        self.arrivals.note(now, len, has_pace.then_some(self.dialogue.baud.rate()));
+        self.left_until = None;
+        self.arrivals.note(now, len, self.has_pace().then_some(self.dialogue.baud.rate()));
         if len == 0 {
             return;
         }
@@ -171,6 +191,9 @@ impl Session {
         let next_byte = self.dialogue.outgoing().and_then(|outgoing| outgoing.byte());
         if let Some((byte, not_before)) = next_byte.filter(|&(_, at)| at <= self.now + SOON) {
             return Output::Transmit { byte, not_before };
+        }
+        if let Some(until) = self.left_until {
+            return Output::Rest(until);
         }
         if self.framer.buffered() == 0 {
             self.rhythm.lose();
@@ -268,6 +291,11 @@ impl Session {
     /// Whether a sensor streams, not a recording.
     fn is_live(&self) -> bool {
         self.state() == State::Streaming && !self.dialogue.settings.listen_only
+    }
+
+    /// Neither a recording nor a network has the pace of a line.
+    fn has_pace(&self) -> bool {
+        !(self.dialogue.settings.listen_only || self.dialogue.settings.fixed_rate)
     }
 
     fn begin_rhythm(&mut self) {

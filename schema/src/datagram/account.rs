@@ -1,13 +1,12 @@
 //! The receiver's account: what came, what did not, and why something was refused, exactly and in bounded memory, whoever
 //! sends. Refuses to know sockets, time and keys; it has no heap.
 
+use super::lives::{Life, Lives};
 use super::numbers::{Fresh, Key, Row};
 use super::{Announce, Datagram, Refusal};
 use crate::Topic;
 
-/// The most lives of gateways that are told apart; those of what is more are refused.
-pub const LIVES: usize = 64;
-/// The most sensors and topics of all lives; those of what is more are refused.
+/// The most sensors and topics of all lives that are told apart.
 pub const ROWS: usize = 1024;
 
 /// What was received, by hub, epoch, sensor and topic. 200 kB, wherever its owner puts it.
@@ -16,17 +15,34 @@ pub const ROWS: usize = 1024;
 /// before neither is not ours. An announcement that is overtaken by the first datagram therefore says nothing about what
 /// was before it, and what comes late from before the beginning moves the beginning there.
 ///
-/// Nothing is ever forgotten to make room: a retired life keeps its rows, so that what was lost in it can be told.
+/// A greater epoch of a gateway retires the one before, whose rows stay. Where there is no room, the life that has been
+/// retired longest is given up, and its rows are added to [`given_up`](Account::given_up): so rows and that together
+/// always are everything that was taken. A life that goes on is never given up; what has no room beside those is refused.
 pub struct Account {
     /// Bit n: topic number n is listened to.
     followed: u8,
-    lives: [(u64, u32); LIVES],
-    life_count: usize,
+    lives: Lives,
     rows: [Row; ROWS],
-    /// Positions in `rows`, sorted by key.
+    /// Positions in `rows`: of those in use, sorted by key, then of the others.
     order: [u16; ROWS],
     row_count: usize,
+    given_up: GivenUp,
     refused: [u64; Refusal::ALL.len()],
+}
+
+/// The sums of the rows that an account has given up.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct GivenUp {
+    /// Lives of gateways.
+    pub lives: u64,
+    /// Distinct numbers that came.
+    pub received: u64,
+    /// Numbers that did not come, and now never will: their epoch is over.
+    pub lost: u64,
+    /// Numbers that came again.
+    pub duplicate: u64,
+    /// Numbers among `received` that came after a higher one.
+    pub reordered: u64,
 }
 
 impl Account {
@@ -35,11 +51,11 @@ impl Account {
     pub fn new(topics: &[Topic]) -> Account {
         Account {
             followed: topics.iter().fold(0, |bits, topic| bits | 1 << topic.number()),
-            lives: [(0, 0); LIVES],
-            life_count: 0,
+            lives: Lives::new(),
             rows: [Row::EMPTY; ROWS],
-            order: [0; ROWS],
+            order: core::array::from_fn(|at| at as u16),
             row_count: 0,
+            given_up: GivenUp::default(),
             refused: [0; Refusal::ALL.len()],
         }
     }
@@ -59,6 +75,16 @@ impl Account {
         self.refused[refusal as usize]
     }
 
+    /// What was given up to make room.
+    pub fn given_up(&self) -> GivenUp {
+        self.given_up
+    }
+
+    /// Something of this life of `hub` was taken, and it was not given up.
+    pub fn knows(&self, hub: u64, epoch: u32) -> bool {
+        self.lives.contains((hub, epoch))
+    }
+
     /// What is known of every sensor and topic of which anything was sent, by hub, epoch, sensor and topic.
     pub fn rows(&self) -> impl Iterator<Item = &Row> {
         self.order[..self.row_count]
@@ -70,21 +96,19 @@ impl Account {
     fn take(&mut self, datagram: &Datagram<'_>) -> Result<Fresh, Refusal> {
         let head = datagram.head;
         let life = (head.hub, head.epoch);
-        let lives = &self.lives[..self.life_count];
-        if lives.iter().any(|&(hub, epoch)| hub == head.hub && epoch > head.epoch) {
+        if self.lives.is_over(life) {
             return Err(Refusal::Epoch);
         }
-        let is_known = lives.contains(&life);
+        let is_known = self.lives.contains(life);
+        let is_full = self.row_count == ROWS || !is_known && self.lives.is_full();
         let key = (head.hub, head.epoch, head.sensor, head.topic);
         match self.find(key) {
-            Ok(at) if self.rows[at].is_stale(head.sequence) => return Err(Refusal::Stale),
-            Err(_) if self.row_count == ROWS => return Err(Refusal::Capacity),
-            _ if !is_known && self.life_count == LIVES => return Err(Refusal::Capacity),
+            Some(at) if self.rows[at].is_stale(head.sequence) => return Err(Refusal::Stale),
+            None if is_full && !self.lives.can_give_up(life) => return Err(Refusal::Capacity),
             _ => datagram.check_payload()?,
         }
-        if !is_known {
-            self.lives[self.life_count] = life;
-            self.life_count += 1;
+        if !is_known && let Some(given_up) = self.lives.take(life) {
+            self.clear(given_up);
         }
         let fresh = self.row(key, head.sequence).map_or(Fresh::New, |row| row.take(head.sequence));
         if head.topic == Announce::NUMBER
@@ -95,7 +119,7 @@ impl Account {
         Ok(fresh)
     }
 
-    /// What is more than fits is not noted: it begins with its first datagram, if that fits.
+    /// What has no room is not noted: it begins with its first datagram, if there is room then.
     fn note(&mut self, (hub, epoch, sensor, _): Key, announce: &Announce) {
         let followed = self.followed;
         let is_followed = |number: u8| number < 8 && followed >> number & 1 == 1;
@@ -109,25 +133,50 @@ impl Account {
     /// The row of `key`, a new one that begins with `first` if there is none; nothing if there is no room.
     fn row(&mut self, key: Key, first: u32) -> Option<&mut Row> {
         let at = match self.find(key) {
-            Ok(at) => at,
-            Err(_) if self.row_count == ROWS => return None,
-            Err(position) => {
-                let at = self.row_count;
-                self.order.copy_within(position..at, position + 1);
-                self.order[position] = at as u16;
-                self.rows[at] = Row::new(key, first);
+            Some(at) => at,
+            None => {
+                // Each life has a row at least.
+                if self.row_count == ROWS {
+                    let given_up = self.lives.give_up()?;
+                    self.clear(given_up);
+                }
+                let position = self.below(|other| other < key);
+                self.order[position..=self.row_count].rotate_right(1);
                 self.row_count += 1;
+                let at = usize::from(self.order[position]);
+                self.rows[at] = Row::new(key, first);
                 at
             }
         };
         Some(&mut self.rows[at])
     }
 
-    /// Where in `rows` it stands, else where in `order` it would.
-    fn find(&self, key: Key) -> Result<usize, usize> {
+    /// Adds the rows of `life` to what was given up.
+    fn clear(&mut self, life: Life) {
+        let first = self.below(|(hub, epoch, ..)| (hub, epoch) < life);
+        let end = self.below(|(hub, epoch, ..)| (hub, epoch) <= life);
+        let sum = &mut self.given_up;
+        sum.lives += 1;
+        for row in self.order[first..end].iter().map(|&at| &self.rows[usize::from(at)]) {
+            sum.received += row.received;
+            sum.lost += row.lost();
+            sum.duplicate += row.duplicate;
+            sum.reordered += row.reordered;
+        }
+        self.order[first..self.row_count].rotate_left(end - first);
+        self.row_count -= end - first;
+    }
+
+    /// How many keys are before the first one that is not `before`.
+    fn below(&self, before: impl Fn(Key) -> bool) -> usize {
+        self.order[..self.row_count].partition_point(|&at| before(self.rows[usize::from(at)].key()))
+    }
+
+    /// Where in `rows` it stands.
+    fn find(&self, key: Key) -> Option<usize> {
         let order = &self.order[..self.row_count];
-        let position = order.binary_search_by_key(&key, |&at| self.rows[usize::from(at)].key())?;
-        Ok(usize::from(order[position]))
+        let found = order.binary_search_by_key(&key, |&at| self.rows[usize::from(at)].key());
+        found.ok().map(|position| usize::from(order[position]))
     }
 }
 
@@ -207,8 +256,7 @@ mod tests {
             assert_eq!(fresh(&mut account, &zones(head(hub, 1, 0))), Ok(Fresh::New));
         }
         assert_eq!(fresh(&mut account, &zones(head(64, 1, 0))), Err(Refusal::Capacity));
-        assert_eq!(fresh(&mut account, &zones(head(1, 2, 0))), Err(Refusal::Capacity));
-        assert_eq!(fresh(&mut account, &zones(head(1, 1, 1))), Ok(Fresh::New), "its epoch is not retired");
+        assert_eq!(fresh(&mut account, &zones(head(1, 1, 1))), Ok(Fresh::New), "all go on");
         for sensor in 1..=240 {
             for hub in 0..4 {
                 let bytes = zones(Head { sensor, ..head(hub, 1, 0) });
@@ -217,7 +265,44 @@ mod tests {
         }
         let more = zones(Head { sensor: 241, ..head(1, 1, 0) });
         assert_eq!(fresh(&mut account, &more), Err(Refusal::Capacity));
-        assert_eq!((account.rows().count(), account.refused(Refusal::Capacity)), (ROWS, 3));
+        assert_eq!((account.rows().count(), account.refused(Refusal::Capacity)), (ROWS, 2));
+        assert_eq!(account.given_up(), GivenUp::default());
+    }
+
+    #[test]
+    fn what_is_retired_makes_room_and_stays_in_the_sum() {
+        let mut account = Account::new(&Topic::ALL);
+        for hub in 0..64 {
+            assert_eq!(fresh(&mut account, &zones(head(hub, 1, 0))), Ok(Fresh::New));
+        }
+        assert_eq!(fresh(&mut account, &zones(head(5, 1, 3))), Ok(Fresh::New));
+        // A gateway that starts again is heard, though all places are taken.
+        assert_eq!(fresh(&mut account, &zones(head(5, 2, 0))), Ok(Fresh::New));
+        let mut given_up = GivenUp { lives: 1, received: 2, lost: 2, ..GivenUp::default() };
+        assert_eq!((account.given_up(), account.rows().count()), (given_up, 64));
+        assert_eq!(
+            fresh(&mut account, &zones(head(5, 1, 4))),
+            Err(Refusal::Epoch),
+            "given up is not forgotten"
+        );
+        assert!(account.knows(5, 2) && !account.knows(5, 1));
+        // A damaged one gives up nothing.
+        let mut buffer = [0; 60];
+        let damaged = head(5, 3, 0).seal(&mut buffer, 3).unwrap();
+        assert_eq!(fresh(&mut account, damaged), Err(Refusal::Payload));
+        assert!(account.knows(5, 2) && !account.knows(5, 3));
+        // As many sensors as there is room for, in a life that is retired then: one row more, and it goes.
+        for sensor in 1..=240 {
+            for hub in 0..4 {
+                let bytes = zones(Head { sensor, ..head(hub, 1, 0) });
+                assert_eq!(fresh(&mut account, &bytes), Ok(Fresh::New));
+            }
+        }
+        assert_eq!(fresh(&mut account, &zones(head(2, 9, 0))), Ok(Fresh::New));
+        given_up = GivenUp { lives: 2, received: 2 + 241, ..given_up };
+        assert_eq!((account.given_up(), account.rows().count()), (given_up, ROWS - 240));
+        let counted: u64 = account.rows().map(|row| row.received).sum();
+        assert_eq!(counted + given_up.received, 64 + 2 + 4 * 240 + 1);
     }
 
     #[test]

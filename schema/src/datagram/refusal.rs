@@ -24,7 +24,7 @@ pub enum Refusal {
     Epoch,
     /// Older than the window, so that nobody knows whether it came before.
     Stale,
-    /// More hubs or topics than there is memory for.
+    /// More hubs that go on, or more topics of theirs, than there is memory for.
     Capacity,
     /// A topic that is not known here.
     Skipped,

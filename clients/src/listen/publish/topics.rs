@@ -1,13 +1,14 @@
-//! The topics of one remote sensor in shared memory. Numbers its samples so that consumers see what the network lost:
-//! they go on over lives of the gateway, and begin again with each life of the hub, as a hub's own do.
+//! The topics of one remote sensor in shared memory: which there are, and what is said of it when nothing comes. Refuses to
+//! know how a sample gets there.
 
 use std::time::{Duration, Instant};
 
-use schema::datagram::{Announce, Head, Packed, telegram};
-use schema::ipc::{Node, Payload, Publisher, TopicService, UpdateConnections, Waker, ZeroCopySend};
+use schema::datagram::{Announce, Head};
+use schema::ipc::{Node, Payload, Waker};
 use schema::{Background, Failure, Foreground, Header, Marks, Scan, State, Status, Topic, Wake, Zones};
 
 use super::super::remote::Remote;
+use super::outlet::Outlet;
 use crate::clock;
 
 /// One sensor of another machine.
@@ -17,6 +18,8 @@ pub(super) struct RemoteTopics {
     /// Gateway, its life, and the sensor's number in it, as last announced.
     source: Option<(u64, u32, u8)>,
     boot: u64,
+    /// Bit n: topic number n was announced last.
+    announced: u8,
     /// It has all that was announced, and that was told.
     pub(super) is_told: bool,
     telegram: Option<Outlet<[u8]>>,
@@ -46,6 +49,7 @@ impl RemoteTopics {
             name: name.to_owned(),
             source: None,
             boot: 0,
+            announced: 0,
             is_told: false,
             telegram: None,
             scan: None,
@@ -97,6 +101,8 @@ impl RemoteTopics {
             self.begin_again();
         }
         self.boot = announce.boot;
+        let numbers = announce.topics().iter().map(|announced| announced.topic).filter(|number| *number < 8);
+        self.announced = numbers.fold(0, |bits, number| bits | 1 << number);
     }
 
     /// Another sensor is announced with the number that this one had: nothing comes of it any more, which is said at once.
@@ -105,12 +111,17 @@ impl RemoteTopics {
         self.heard_at = None;
         if let (Some(mut header), Some(outlet)) = (self.zoned.take(), &mut self.zones) {
             stamp(&mut header);
-            let number = outlet.own_number();
-            outlet.send(&header, number, |sample| *sample = Zones::unknown());
+            header.topic_seq = outlet.own_number();
+            outlet.send(&header, |sample| *sample = Zones::unknown());
             self.news = Some(Wake::Telegram);
         }
         self.silent();
         self.wake();
+    }
+
+    /// Its gateway sends this topic.
+    pub(super) fn is_announced(&self, topic: Topic) -> bool {
+        self.announced >> topic.number() & 1 == 1
     }
 
     /// It is the sensor that sent `head`.
@@ -121,21 +132,20 @@ impl RemoteTopics {
     /// Publishes `remote`; `false` if it has no such topic. A payload cannot fail to be read: the account has checked it.
     pub(super) fn publish(&mut self, remote: &Remote<'_>, now: Instant) -> bool {
         self.heard_at = Some(now);
-        let header = &remote.header();
         let sent = match remote.topic {
-            Topic::Telegram => self.telegram.as_mut().map(|outlet| outlet.send_telegram(remote, header)),
-            Topic::Scan => self.scan.as_mut().map(|outlet| outlet.unpack(remote, header)),
-            Topic::Marks => self.marks.as_mut().map(|outlet| outlet.unpack(remote, header)),
+            Topic::Telegram => self.telegram.as_mut().map(|outlet| outlet.send_telegram(remote)),
+            Topic::Scan => self.scan.as_mut().map(|outlet| outlet.unpack(remote)),
+            Topic::Marks => self.marks.as_mut().map(|outlet| outlet.unpack(remote)),
             Topic::Zones => {
-                self.zoned = Some(*header);
-                self.zones.as_mut().map(|outlet| outlet.unpack(remote, header))
+                self.zoned = Some(remote.header());
+                self.zones.as_mut().map(|outlet| outlet.unpack(remote))
             }
-            Topic::Foreground => self.foreground.as_mut().map(|outlet| outlet.unpack(remote, header)),
-            Topic::Background => self.background.as_mut().map(|outlet| outlet.unpack(remote, header)),
+            Topic::Foreground => self.foreground.as_mut().map(|outlet| outlet.unpack(remote)),
+            Topic::Background => self.background.as_mut().map(|outlet| outlet.unpack(remote)),
             Topic::Status => {
                 let Some(status) = remote.payload::<Status>() else { return true };
-                let number = self.status.as_mut().map(|outlet| outlet.number(&remote.datagram.head));
-                number.map(|number| self.tell(status, header, number))
+                let header = self.status.as_mut().map(|outlet| outlet.header(remote));
+                header.map(|header| self.tell(status, &header))
             }
         };
         if sent.is_some() {
@@ -180,12 +190,12 @@ impl RemoteTopics {
 
     /// Publishes a status as it came, but for the beginning of its state: that is on a clock of another machine. Here the
     /// state began when it was first heard of.
-    fn tell(&mut self, mut status: Status, header: &Header, topic_seq: u64) {
+    fn tell(&mut self, mut status: Status, header: &Header) {
         let same = self.last.filter(|(last, _)| last.state == status.state);
         status.since_ns = same.map_or(header.stamp_first_ns, |(last, _)| last.since_ns);
         self.last = Some((status, *header));
         if let Some(outlet) = &mut self.status {
-            outlet.send(header, topic_seq, |sample| *sample = status);
+            outlet.send(header, |sample| *sample = status);
         }
     }
 
@@ -197,7 +207,8 @@ impl RemoteTopics {
         status.set_last_error("nothing comes over the network");
         stamp(&mut header);
         if let Some(number) = self.status.as_mut().map(Outlet::own_number) {
-            self.tell(status, &header, number);
+            header.topic_seq = number;
+            self.tell(status, &header);
             self.news = self.news.or(Some(Wake::Status));
         }
     }
@@ -206,7 +217,7 @@ impl RemoteTopics {
     fn begin_again(&mut self) {
         fn again<P: Payload + ?Sized>(outlet: &mut Option<Outlet<P>>) {
             if let Some(outlet) = outlet {
-                outlet.next = Some(0);
+                outlet.begin_again();
             }
         }
         again(&mut self.telegram);
@@ -219,90 +230,6 @@ impl RemoteTopics {
     }
 }
 
-/// The publishing end of one topic.
-struct Outlet<P: Payload + ?Sized> {
-    publisher: Publisher<P>,
-    /// The number of the next sample if none is left out before it. The first one has that of the network, so that
-    /// consumers that outlive a listener see what was lost meanwhile.
-    next: Option<u64>,
-    /// Life of the gateway, sensor's number there, and its own number, of the last one that came from the network.
-    last: (u32, u8, u32),
-    failed: u64,
-    _service: TopicService<P>,
-}
-
-impl<P: Payload + ?Sized> Outlet<P> {
-    fn new(node: &Node, sensor: &str) -> Result<Self, Failure> {
-        let service = P::create(node, sensor)?;
-        Ok(Outlet {
-            publisher: P::publisher(&service)?,
-            next: None,
-            last: (0, 0, 0),
-            failed: 0,
-            _service: service,
-        })
-    }
-
-    /// The number of the sample with `head`. All numbers between the last one and it are left out, be they lost or not
-    /// published; of a new life of the gateway all before it. Where the sensor has another number than before, those
-    /// before it may have been another one's: none counts.
-    fn number(&mut self, head: &Head) -> u64 {
-        let (epoch, sensor, last) = self.last;
-        let left_out = match (head.epoch == epoch, head.sensor == sensor) {
-            (true, true) => head.sequence.wrapping_sub(last).wrapping_sub(1),
-            (true, false) => 0,
-            (false, _) => head.sequence,
-        };
-        let number = self.next.map_or(head.sequence.into(), |next| next + u64::from(left_out));
-        self.last = (head.epoch, head.sensor, head.sequence);
-        self.next = Some(number + 1);
-        number
-    }
-
-    /// The number of a sample that did not come from the network.
-    fn own_number(&mut self) -> u64 {
-        let number = self.next.unwrap_or_default();
-        self.next = Some(number + 1);
-        number
-    }
-}
-
-impl Outlet<[u8]> {
-    fn send_telegram(&mut self, remote: &Remote<'_>, header: &Header) {
-        let topic_seq = self.number(&remote.datagram.head);
-        let Some(telegram) = telegram(remote.datagram.payload) else { return };
-        let Ok(loan) = self.publisher.loan_slice_uninit(telegram.0.len()) else {
-            self.failed += 1;
-            return;
-        };
-        let mut sample = loan.write_from_slice(telegram.0);
-        *sample.user_header_mut() = Header { topic_seq, ..*header };
-        self.failed += u64::from(sample.send().is_err());
-    }
-}
-
-impl<P: Payload + ZeroCopySend + Default> Outlet<P> {
-    /// Publishes a sample that `fill` writes in place.
-    fn send(&mut self, header: &Header, topic_seq: u64, fill: impl FnOnce(&mut P)) {
-        let Ok(mut sample) = self.publisher.loan() else {
-            self.failed += 1;
-            return;
-        };
-        *sample.user_header_mut() = Header { topic_seq, ..*header };
-        fill(sample.payload_mut());
-        self.failed += u64::from(sample.send().is_err());
-    }
-}
-
-impl<P: Payload + ZeroCopySend + Default + Packed> Outlet<P> {
-    fn unpack(&mut self, remote: &Remote<'_>, header: &Header) {
-        let topic_seq = self.number(&remote.datagram.head);
-        self.send(header, topic_seq, |sample| {
-            let _ = sample.unpack(remote.datagram.payload);
-        });
-    }
-}
-
 /// What is said now, although nothing came.
 fn stamp(header: &mut Header) {
     (header.stamp_first_ns, header.wall_ns) = (clock::now().monotonic_ns, clock::wall_ns());
@@ -311,7 +238,6 @@ fn stamp(header: &mut Header) {
 
 fn connect<P: Payload + ?Sized>(outlet: &Option<Outlet<P>>) {
     if let Some(outlet) = outlet {
-        // One that cannot be connected now is tried again.
-        let _ = outlet.publisher.update_connections();
+        outlet.connect();
     }
 }

@@ -1,10 +1,11 @@
-//! The classes of `--json` that are no samples and not the account: notices, and what becomes of samples in shared memory.
+//! The classes of `--json` that are no samples and no row of the account: notices, sums of what was given up, and what
+//! becomes of samples in shared memory.
 
 use std::io::{self, Write};
 use std::path::Path;
 
 use schema::Domain;
-use schema::datagram::{Head, PORT};
+use schema::datagram::{GivenUp, Head, PORT};
 use serde::{Serialize, Serializer};
 
 use super::super::publish::Publication;
@@ -81,6 +82,7 @@ pub(super) struct Published<'a> {
     unannounced: u64,
     late: u64,
     capacity: u64,
+    shortage: u64,
     loan_failed: u64,
 }
 
@@ -94,18 +96,42 @@ impl<'a> Published<'a> {
             unannounced: left_out.unannounced,
             late: left_out.late,
             capacity: left_out.capacity,
+            shortage: left_out.shortage,
             loan_failed: publication.loan_failed(),
         }
     }
 
     /// The same for people.
     pub(super) fn text(&self, line: &mut Vec<u8>) -> io::Result<()> {
-        let Published { unnamed, unannounced, late, capacity, loan_failed, .. } = self;
+        let Published { unnamed, unannounced, late, capacity, shortage, loan_failed, .. } = self;
         write!(line, "published: {}; left out: {unnamed} unnamed, ", self.sensors.join(", "))?;
-        write!(
-            line,
-            "{unannounced} unannounced, {late} late, {capacity} beyond capacity, {loan_failed} without memory"
-        )
+        write!(line, "{unannounced} unannounced, {late} late, {capacity} beyond capacity, ")?;
+        write!(line, "{shortage} for want of room, {loan_failed} without memory")
+    }
+}
+
+/// Class `lan_given_up`.
+#[derive(Serialize)]
+pub(super) struct Sums {
+    class: &'static str,
+    lives: u64,
+    received: u64,
+    lost: u64,
+    duplicate: u64,
+    reordered: u64,
+}
+
+impl Sums {
+    pub(super) fn new(given_up: GivenUp) -> Sums {
+        let GivenUp { lives, received, lost, duplicate, reordered } = given_up;
+        Sums { class: "lan_given_up", lives, received, lost, duplicate, reordered }
+    }
+
+    /// The same for people.
+    pub(super) fn text(&self, line: &mut Vec<u8>) -> io::Result<()> {
+        let Sums { lives, received, lost, duplicate, reordered, .. } = self;
+        write!(line, "of {lives} former starts of gateways together: received {received}, lost {lost}, ")?;
+        write!(line, "duplicate {duplicate}, reordered {reordered}")
     }
 }
 

@@ -2,6 +2,7 @@
 
 use std::fmt;
 
+use schema::Printable;
 use serde::Serialize;
 
 /// How a check ended.
@@ -90,9 +91,9 @@ impl fmt::Display for Finding {
             State::Failed => "FAILED",
             State::Skipped => "skipped",
         };
-        write!(f, "{state:<8} {:<13} {}", self.name, self.finding)?;
+        write!(f, "{state:<8} {:<13} {}", self.name, Printable(&self.finding))?;
         if !self.remedy.is_empty() {
-            write!(f, "\n{:23}{}", "", self.remedy)?;
+            write!(f, "\n{:23}{}", "", Printable(&self.remedy))?;
         }
         Ok(())
     }

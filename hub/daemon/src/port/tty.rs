@@ -3,9 +3,10 @@
 use std::cell::Cell;
 use std::io::{self, ErrorKind};
 use std::os::fd::{AsFd, BorrowedFd, OwnedFd};
+use std::os::unix::fs::MetadataExt;
 use std::path::Path;
 
-use rustix::fs::{FlockOperation, Mode, OFlags, flock, open};
+use rustix::fs::{FlockOperation, Mode, OFlags, flock, fstat, open};
 use rustix::io::Errno;
 use rustix::termios::{
     ControlModes, InputModes, OptionalActions, QueueSelector, Termios, ioctl_tiocexcl, ioctl_tiocnxcl,
@@ -33,7 +34,21 @@ impl Tty {
             return Err(Refusal::NotTty);
         }
         let flags = OFlags::RDWR | OFlags::NOCTTY | OFlags::NONBLOCK | OFlags::CLOEXEC;
-        let line = open(path, flags, Mode::empty())?;
+        Tty::begin(open(path, flags, Mode::empty())?, path, baud)
+    }
+
+    /// As [`Tty::open`], of a `line` that is open already.
+    ///
+    /// [`Refusal::Missing`] if `path` names another line by now.
+    pub(crate) fn adopt(line: OwnedFd, path: &Path, baud: u32) -> Result<Tty, Refusal> {
+        let now = path.metadata().map_err(|error| Refusal::of_io(&error))?;
+        if fstat(&line)?.st_rdev != now.rdev() || !is_tty(path) {
+            return Err(Refusal::Missing);
+        }
+        Tty::begin(line, path, baud)
+    }
+
+    fn begin(line: OwnedFd, path: &Path, baud: u32) -> Result<Tty, Refusal> {
         let mut termios = tcgetattr(&line)?;
         // Before the exclusive mode: who does not get the lock must not end that of its owner.
         flock(&line, FlockOperation::NonBlockingLockExclusive).map_err(|error| match error {
@@ -84,6 +99,11 @@ impl Tty {
             Refusal::Rate { .. } => io::Error::new(ErrorKind::Unsupported, refusal.to_string()),
             refusal => io::Error::other(refusal.to_string()),
         })
+    }
+
+    /// How many bytes there are to read, if the driver tells.
+    pub(crate) fn waiting(&self) -> Option<usize> {
+        rustix::io::ioctl_fionread(&self.line).ok().map(|waiting| waiting as usize)
     }
 
     pub(crate) fn read(&self, buffer: &mut [u8]) -> io::Result<usize> {

@@ -194,7 +194,13 @@ impl Bench {
     fn step(&mut self, limit: Nanos) {
         let (watch, until) = self.drain();
         self.wait(watch, until.min(limit));
+        if !watch && self.now < until {
+            return;
+        }
         self.looks += 1;
+        if watch && self.session.may_leave() && self.session.leave(self.now, self.inbox.len()) {
+            return;
+        }
         let spare = self.session.spare();
         let len = spare.len().min(self.inbox.len());
         for (place, byte) in spare.iter_mut().zip(self.inbox.drain(..len)) {

@@ -69,6 +69,10 @@ impl Chaos {
             spare[..len].copy_from_slice(&bytes[..len]);
             bytes = &bytes[len..];
             self.now += self.random.u64(..line_time(len, 9_600));
+            if self.random.bool() {
+                self.session.leave(self.now, len);
+                self.drain(false);
+            }
             self.read += len as u64;
             self.session.commit(self.now, len);
             self.drain(false);

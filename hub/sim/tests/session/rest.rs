@@ -44,3 +44,20 @@ fn a_telegram_is_there_soon_after_its_last_byte() {
 
 /// Telegrams that are read as they come, before the first rest.
 const LESSONS: usize = 6;
+
+#[test]
+fn what_a_killed_host_would_lose_is_not_read_before_it_is_nearly_complete() {
+    let settings = Settings { baud: Baud::B500000, ..Settings::default() };
+    let machine = Machine::new(settings, Source::Room(Room::new(&"room".parse().unwrap(), 5)));
+    let mut bench = Bench::new(machine, 0);
+    bench.until("streaming", 3_000 * MILLIS, Bench::is_streaming);
+    bench.run(500 * MILLIS);
+    let looks = 2_000;
+    let mut exposed = 0;
+    for _ in 0..looks {
+        bench.run(MILLIS - MILLIS / 7);
+        exposed += u32::from(bench.session.buffered() > 0);
+    }
+    // 0.6 ms and a chunk of every 26.64.
+    assert!(exposed * 100 < looks * 6, "{exposed} of {looks}");
+}

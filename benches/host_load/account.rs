@@ -1,0 +1,196 @@
+//! What a machine and its processes have used of the processors, as the kernel counts it. Two counts of the same thing:
+//! `/proc/stat` charges whole ticks to whoever runs when one falls; the scheduler adds up nanoseconds for each thread.
+//! Refuses to know which processes are whose.
+
+use std::collections::BTreeMap;
+use std::fs::{read_dir, read_to_string};
+use std::path::Path;
+
+use crate::support::{Outcome, clock};
+
+/// All counts at one time.
+pub(crate) struct Snapshot {
+    at_ns: u64,
+    ticks: Ticks,
+    processes: BTreeMap<u32, Usage>,
+}
+
+/// Part of one processor that was used, user and system apart; 1 is the whole of it.
+#[derive(Clone, Copy, Debug, Default)]
+pub(crate) struct Share {
+    pub(crate) user: f64,
+    pub(crate) system: f64,
+}
+
+impl Share {
+    pub(crate) fn total(self) -> f64 {
+        self.user + self.system
+    }
+
+    /// With `other`.
+    pub(crate) fn plus(self, other: Share) -> Share {
+        Share { user: self.user + other.user, system: self.system + other.system }
+    }
+
+    /// What is left without `other`.
+    pub(crate) fn less(self, other: Share) -> Share {
+        Share { user: self.user - other.user, system: self.system - other.system }
+    }
+}
+
+/// What was used between two snapshots.
+pub(crate) struct Span<'a> {
+    before: &'a Snapshot,
+    after: &'a Snapshot,
+}
+
+impl Snapshot {
+    /// What has been used up to now.
+    pub(crate) fn take() -> Outcome<Snapshot> {
+        let ticks = Ticks::read()?;
+        let at_ns = clock::now();
+        let mut processes = BTreeMap::new();
+        for entry in read_dir("/proc")? {
+            let entry = entry?;
+            if let Ok(pid) = entry.file_name().to_string_lossy().parse() {
+                // Who ends just now is none.
+                processes.extend(Usage::of(&entry.path()).map(|usage| (pid, usage)));
+            }
+        }
+        Ok(Snapshot { at_ns, ticks, processes })
+    }
+
+    /// When it was taken, in ns of CLOCK_MONOTONIC.
+    pub(crate) fn at_ns(&self) -> u64 {
+        self.at_ns
+    }
+}
+
+impl<'a> Span<'a> {
+    pub(crate) fn new(before: &'a Snapshot, after: &'a Snapshot) -> Span<'a> {
+        Span { before, after }
+    }
+
+    /// The whole machine by `/proc/stat`; interrupts are of the system.
+    pub(crate) fn machine(&self) -> Share {
+        let (before, after) = (self.before.ticks, self.after.ticks);
+        let part = |ticks: u64| ticks as f64 / USER_HZ * 1e9 / self.ns();
+        Share { user: part(after.user - before.user), system: part(after.system - before.system) }
+    }
+
+    /// What the machine below took away of a processor.
+    pub(crate) fn stolen(&self) -> f64 {
+        (self.after.ticks.stolen - self.before.ticks.stolen) as f64 / USER_HZ * 1e9 / self.ns()
+    }
+
+    /// These processes by the scheduler; an error if one is not there any more.
+    pub(crate) fn of(&self, pids: &[u32]) -> Outcome<Share> {
+        let mut sum = Usage::default();
+        for pid in pids {
+            let after = self.after.processes.get(pid).ok_or_else(|| format!("process {pid} has ended"))?;
+            sum.add(after.since(self.before.processes.get(pid)));
+        }
+        Ok(sum.share(self.ns()))
+    }
+
+    /// The kernel's own threads by the scheduler: among them those that hand over the bytes of ttys.
+    pub(crate) fn kernel(&self) -> f64 {
+        self.sum(|usage| usage.is_kernel)
+    }
+
+    /// Everybody who was there at the end, by the scheduler.
+    pub(crate) fn everybody(&self) -> f64 {
+        self.sum(|_| true)
+    }
+
+    fn sum(&self, wanted: impl Fn(&Usage) -> bool) -> f64 {
+        let wanted = self.after.processes.iter().filter(|(_, usage)| wanted(usage));
+        let busy: u64 = wanted.map(|(pid, usage)| usage.since(self.before.processes.get(pid)).busy_ns).sum();
+        busy as f64 / self.ns()
+    }
+
+    fn ns(&self) -> f64 {
+        (self.after.at_ns - self.before.at_ns).max(1) as f64
+    }
+}
+
+/// Processors of the machine.
+pub(crate) fn processors() -> Outcome<usize> {
+    let stat = read_to_string("/proc/stat")?;
+    Ok(stat.lines().filter(|line| line.starts_with("cpu") && !line.starts_with("cpu ")).count().max(1))
+}
+
+/// `/proc/stat` of all processors, in units of 1 / [`USER_HZ`] s.
+#[derive(Clone, Copy)]
+struct Ticks {
+    user: u64,
+    system: u64,
+    stolen: u64,
+}
+
+impl Ticks {
+    fn read() -> Outcome<Ticks> {
+        let stat = read_to_string("/proc/stat")?;
+        let first =
+            stat.lines().next().and_then(|line| line.strip_prefix("cpu ")).ok_or("no cpu in /proc/stat")?;
+        let ticks: Vec<u64> = first.split_whitespace().map(str::parse).collect::<Result<_, _>>()?;
+        let [user, nice, system, _idle, _iowait, irq, softirq, stolen, ..] = ticks[..] else {
+            return Err("/proc/stat is too short".into());
+        };
+        Ok(Ticks { user: user + nice, system: system + irq + softirq, stolen })
+    }
+}
+
+/// One process since its start.
+#[derive(Clone, Copy, Debug, Default)]
+struct Usage {
+    /// Time on a processor, exact.
+    busy_ns: u64,
+    /// How it is divided, by ticks.
+    user: u64,
+    system: u64,
+    is_kernel: bool,
+}
+
+impl Usage {
+    /// The process whose directory this is; `None` if it has ended.
+    fn of(process: &Path) -> Option<Usage> {
+        let stat = read_to_string(process.join("stat")).ok()?;
+        // The name may hold blanks and brackets; the field after it is the third.
+        let fields: Vec<&str> = stat.rsplit_once(')')?.1.split_whitespace().collect();
+        let field = |number: usize| fields.get(number - 3)?.parse::<u64>().ok();
+        let mut usage =
+            Usage { user: field(14)?, system: field(15)?, is_kernel: field(4)? == KTHREADD, busy_ns: 0 };
+        for task in read_dir(process.join("task")).ok()?.flatten() {
+            let schedstat = read_to_string(task.path().join("schedstat")).unwrap_or_default();
+            usage.busy_ns += schedstat.split_whitespace().next().map_or(Some(0), |ns| ns.parse().ok())?;
+        }
+        Some(usage)
+    }
+
+    fn since(&self, before: Option<&Usage>) -> Usage {
+        let before = before.copied().unwrap_or_default();
+        Usage {
+            busy_ns: self.busy_ns.saturating_sub(before.busy_ns),
+            user: self.user.saturating_sub(before.user),
+            system: self.system.saturating_sub(before.system),
+            is_kernel: self.is_kernel,
+        }
+    }
+
+    fn add(&mut self, other: Usage) {
+        self.busy_ns += other.busy_ns;
+        self.user += other.user;
+        self.system += other.system;
+    }
+
+    fn share(&self, ns: f64) -> Share {
+        let (busy, ticks) = (self.busy_ns as f64 / ns, (self.user + self.system).max(1) as f64);
+        Share { user: busy * self.user as f64 / ticks, system: busy * self.system as f64 / ticks }
+    }
+}
+
+/// Ticks a second in what the kernel tells programs, whatever its own are.
+const USER_HZ: f64 = 100.0;
+/// Parent of all threads of the kernel.
+const KTHREADD: u64 = 2;

@@ -1,0 +1,101 @@
+//! What do consumers of two sensors cost their machine (the paper's Fig. 7), if
+//! a. each reads the raw bytes, one by one, from two lines of its own, and does everything itself,
+//! b. does the same, but reads what is there in one go,
+//! c. gets bare telegrams by multicast, as from the paper's unit, and does the rest itself,
+//! d. takes the scans of the hub,
+//! e. takes the zones and the foreground of the hub?
+//!
+//! Consumers are processes, and all of them get 37.5 scans a second of each sensor; a table says whether they did. What
+//! stands for hardware (simulators; in c the unit) is left out: its own time is taken from the machine's.
+//!
+//! Two accounts of each run. `/proc/stat` is that of the paper: the whole machine, interrupts with the system, and
+//! whatever else runs on it. Where the kernel counts by ticks it charges one to whoever runs when it falls, 4 ms
+//! or 10 ms apart, and who sleeps is woken for less than 0.1 ms: no single figure of it is exact below some tenths of a percent, and
+//! "/proc/stat, of what the scheduler counted" says how far it was from the truth. The account of the processes is the
+//! scheduler's, which counts nanoseconds; only its division in user and system is by ticks. Ratios are of that one. It
+//! has no part of what the kernel's own threads do for a pty, which is most where most ptys are: a table has them.
+//!
+//! It does not tell what a real UART costs: a pty has no interrupts.
+mod account;
+mod consumer;
+#[path = "../../hub/lms/tests/line/mod.rs"]
+#[allow(dead_code)] // Of the comparison of parsers only what a parser is.
+mod line;
+mod load;
+#[path = "../framing/rivals.rs"]
+#[allow(dead_code)] // The plainest one.
+mod rivals;
+mod setup;
+#[path = "../support/mod.rs"]
+mod support;
+mod tables;
+mod unit;
+mod work;
+
+use std::io::IsTerminal;
+use std::process::ExitCode;
+use std::time::Duration;
+
+use rustix::process::{Signal, set_parent_process_death_signal};
+use setup::{SetUp, WORD};
+use support::options::Options;
+use support::{Outcome, PART};
+use tables::{Run, Tables};
+
+fn main() -> ExitCode {
+    let words: Vec<String> = std::env::args().skip(1).collect();
+    let words: Vec<&str> = words.iter().map(String::as_str).collect();
+    let [PART, WORD, part @ ..] = &words[..] else { return support::main(measure) };
+    match play(part) {
+        Ok(()) => ExitCode::SUCCESS,
+        Err(error) => {
+            eprintln!("{error}");
+            ExitCode::FAILURE
+        }
+    }
+}
+
+fn play(words: &[&str]) -> Outcome<()> {
+    set_parent_process_death_signal(Some(Signal::TERM))?;
+    match *words {
+        ["bytes", most, front, rear] => consumer::bytes([front, rear], most.parse()?),
+        ["datagrams", port] => consumer::datagrams(port.parse()?),
+        ["scans", domain] => consumer::scans(domain),
+        ["results", domain] => consumer::results(domain),
+        ["unit", port] => unit::send(port.parse()?),
+        _ => Err(format!("no part {words:?}").into()),
+    }
+}
+
+fn measure(options: &Options) -> Outcome<()> {
+    let counts: &[usize] = if options.quick { &[1, 4] } else { &[1, 2, 4, 8, 16] };
+    let seconds = options.seconds(if options.quick { 5 } else { 60 });
+    let pairs = options.pairs_or(match seconds {
+        _ if options.quick => 2,
+        ..30 => 5,
+        _ => 1,
+    });
+    let span = Duration::from_secs(seconds);
+    let mut runs = Vec::new();
+    for pair in 0..pairs {
+        // What the unit takes whom nobody hears.
+        let deaf = SetUp::Datagrams.start(0)?.watch(span)?.outside;
+        for (turn, &count) in counts.iter().enumerate() {
+            let mut set_ups = SetUp::ALL;
+            set_ups.rotate_left((pair + turn) % SetUp::ALL.len());
+            for set_up in set_ups {
+                if std::io::stderr().is_terminal() {
+                    eprintln!("{} of {pairs}: {count} consumers, {}", pair + 1, set_up.name());
+                }
+                let load = set_up.start(count)?.watch(span)?;
+                runs.push(Run {
+                    set_up,
+                    count,
+                    host: load.of_host((set_up == SetUp::Datagrams).then_some(deaf)),
+                    load,
+                });
+            }
+        }
+    }
+    Tables::of(&runs, counts)?.print(options)
+}

@@ -1,0 +1,49 @@
+//! Work that may take its time, done beside the sending, which waits for nothing but samples. Refuses to know what is
+//! done.
+
+use std::sync::mpsc::{Receiver, channel};
+use std::thread;
+
+/// Work in a thread of its own. Dropped, nobody waits for its result any more.
+#[derive(Debug)]
+pub(super) struct Errand<T>(Receiver<T>);
+
+impl<T: Send + 'static> Errand<T> {
+    /// Begins it; nothing if there is no thread to be had: then it is to be tried again.
+    pub(super) fn begin(work: impl FnOnce() -> T + Send + 'static) -> Option<Errand<T>> {
+        let (done, result) = channel();
+        let thread = thread::Builder::new().name("errand".into()).spawn(move || {
+            let _ = done.send(work());
+        });
+        thread.ok().map(|_| Errand(result))
+    }
+
+    /// Its result, once, as soon as there is one.
+    pub(super) fn result(&self) -> Option<T> {
+        self.0.try_recv().ok()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::time::{Duration, Instant};
+
+    use super::*;
+
+    #[test]
+    fn nobody_waits_for_it() {
+        let (go, hold) = channel();
+        let errand = Errand::begin(move || hold.recv()).unwrap();
+        assert_eq!(errand.result(), None);
+        go.send(7).unwrap();
+        let give_up_at = Instant::now() + Duration::from_secs(30);
+        let result = loop {
+            match errand.result() {
+                Some(result) => break result,
+                None => assert!(Instant::now() < give_up_at),
+            }
+            thread::yield_now();
+        };
+        assert_eq!((result, errand.result()), (Ok(7), None));
+    }
+}

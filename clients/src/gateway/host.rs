@@ -1,0 +1,181 @@
+//! A host that gets copies, by the name that the user wrote: which address that has now. Asked again beside the sending,
+//! as an answer may take half a minute. Refuses to know sockets.
+
+use std::io;
+use std::net::{IpAddr, SocketAddr, ToSocketAddrs};
+use std::time::{Duration, Instant};
+
+use schema::{Failure, Kind};
+
+use super::errand::Errand;
+
+/// A host and port.
+#[derive(Debug)]
+pub(super) struct Host {
+    text: String,
+    address: SocketAddr,
+    /// When its name was last asked for; never, if it is an address.
+    asked_at: Option<Instant>,
+    errand: Option<Errand<Option<SocketAddr>>>,
+    resolve: Resolve,
+}
+
+type Resolve = fn(&str) -> io::Result<Vec<SocketAddr>>;
+
+/// Between two questions for a name: machines are given other addresses.
+const EVERY: Duration = Duration::from_secs(60);
+/// The same while nothing gets there.
+const EVERY_IN_TROUBLE: Duration = Duration::from_secs(5);
+
+impl Host {
+    /// The host and port in `text`, and up to `more` ports above it. Waits for the answer.
+    ///
+    /// [`Kind::Configuration`] if `text` names none, or a group.
+    pub(super) fn parse(text: &str, more: u16) -> Result<Host, Failure> {
+        Host::by(|text| Ok(text.to_socket_addrs()?.collect()), text, more, Instant::now())
+    }
+
+    fn by(resolve: Resolve, text: &str, more: u16, now: Instant) -> Result<Host, Failure> {
+        let refuse = |what: String, hint: &str| Failure::new(Kind::Configuration, what, hint);
+        let found = resolve(text).map_err(|error| {
+            let hint = "write HOST:PORT with a name that is known here, or an address, as in 10.0.0.7:22200";
+            refuse(format!("cannot send to {text}: {error}"), hint)
+        })?;
+        let ports = 1..=u16::MAX - more;
+        if found.iter().any(|address| !ports.contains(&address.port())) {
+            let hint = format!("a port from {} to {}", ports.start(), ports.end());
+            return Err(refuse(format!("cannot send to {text}: the port is not possible"), &hint));
+        }
+        let address = choose(&found, None).ok_or_else(|| {
+            let hint = "the groups get everything anyway; name single hosts besides";
+            refuse(format!("cannot send to {text}: it is no host"), hint)
+        })?;
+        let is_name = text.parse::<SocketAddr>().is_err();
+        let asked_at = is_name.then_some(now);
+        Ok(Host { text: text.to_owned(), address, asked_at, errand: None, resolve })
+    }
+
+    /// Where it is.
+    pub(super) fn address(&self) -> SocketAddr {
+        self.address
+    }
+
+    /// Goes on at `address`.
+    pub(super) fn move_to(&mut self, address: SocketAddr) {
+        self.address = address;
+    }
+
+    /// Another address that it has now, if that was answered since the last call. Its name is asked for once a minute, and
+    /// more often if it is `in_trouble`; one question at a time.
+    pub(super) fn look(&mut self, in_trouble: bool, now: Instant) -> Option<SocketAddr> {
+        if let Some(errand) = &self.errand {
+            let found = errand.result()?;
+            self.errand = None;
+            return found.filter(|address| *address != self.address);
+        }
+        let every = if in_trouble { EVERY_IN_TROUBLE } else { EVERY };
+        if self.asked_at.is_some_and(|at| now - at >= every) {
+            let (resolve, text, address) = (self.resolve, self.text.clone(), self.address);
+            let question = move || resolve(&text).ok().and_then(|found| choose(&found, Some(address)));
+            self.errand = Errand::begin(question);
+            self.asked_at = Some(now);
+        }
+        None
+    }
+}
+
+/// The address that datagrams go to: the present one as long as it is among them, else the first one of IPv4, which all
+/// listeners hear, else the first one.
+fn choose(found: &[SocketAddr], present: Option<SocketAddr>) -> Option<SocketAddr> {
+    let hosts: Vec<_> = found.iter().copied().map(plain).filter(|address| is_host(address.ip())).collect();
+    let first = hosts.iter().find(|address| address.is_ipv4()).or(hosts.first()).copied();
+    present.filter(|present| hosts.contains(present)).or(first)
+}
+
+/// An IPv4 address that is written as one of IPv6 is one of IPv4.
+fn plain(address: SocketAddr) -> SocketAddr {
+    match address.ip().to_canonical() {
+        IpAddr::V4(ip) => SocketAddr::from((ip, address.port())),
+        IpAddr::V6(_) => address,
+    }
+}
+
+fn is_host(ip: IpAddr) -> bool {
+    let is_broadcast = matches!(ip, IpAddr::V4(ip) if ip.is_broadcast());
+    !(ip.is_multicast() || ip.is_unspecified() || is_broadcast)
+}
+
+#[cfg(test)]
+mod tests {
+    use std::sync::atomic::{AtomicU32, Ordering};
+
+    use super::*;
+
+    #[test]
+    fn hosts_that_are_none() {
+        for bad in [
+            "",
+            "nowhere",
+            "10.0.0.1",
+            "10.0.0.1:99999",
+            "239.255.76.80:22200",
+            "0.0.0.0:1",
+            "255.255.255.255:1",
+            "[::]:22200",
+            "[ff02::1]:22200",
+            "[::ffff:239.255.76.80]:22200",
+            "::1:22200:",
+        ] {
+            let refused = Host::parse(bad, 0).map(drop).unwrap_err();
+            assert_eq!(refused.kind, Kind::Configuration, "{refused}");
+            assert!(refused.message.contains(bad) && !refused.hint.is_empty(), "{refused}");
+        }
+        assert!(Host::parse("127.0.0.1:0", 0).is_err());
+        assert!(Host::parse("127.0.0.1:65535", 255).is_err() && Host::parse("127.0.0.1:65535", 0).is_ok());
+    }
+
+    #[test]
+    fn addresses_of_both_kinds() {
+        let of = |text: &str| Host::parse(text, 0).unwrap().address().to_string();
+        assert_eq!((of("127.0.0.1:7"), of("[::1]:7")), ("127.0.0.1:7".into(), "[::1]:7".into()));
+        assert_eq!(of("[::ffff:10.0.0.7]:7"), "10.0.0.7:7");
+        let (four, six) = (SocketAddr::from(([10, 0, 0, 7], 7)), "[fe80::1]:7".parse().unwrap());
+        assert_eq!((choose(&[six, four], None), choose(&[six], None)), (Some(four), Some(six)));
+        assert_eq!(choose(&[four, six], Some(six)), Some(six), "as long as it is there");
+        assert_eq!(choose(&[], Some(six)), None);
+    }
+
+    #[test]
+    fn a_name_is_asked_for_again() {
+        static ASKED: AtomicU32 = AtomicU32::new(0);
+        // Every second answer is another one.
+        fn resolve(_: &str) -> io::Result<Vec<SocketAddr>> {
+            let number = ASKED.fetch_add(1, Ordering::SeqCst);
+            Ok(vec![SocketAddr::from(([10, 0, 0, number as u8 / 2], 7))])
+        }
+        fn answer(host: &mut Host, now: Instant) -> Option<SocketAddr> {
+            let give_up_at = Instant::now() + Duration::from_secs(30);
+            while host.errand.is_some() {
+                if let Some(address) = host.look(false, now) {
+                    return Some(address);
+                }
+                assert!(Instant::now() < give_up_at);
+                std::thread::yield_now();
+            }
+            None
+        }
+        let begin = Instant::now();
+        let at = |s: u64| begin + Duration::from_secs(s);
+        let mut host = Host::by(resolve, "robot:7", 0, begin).unwrap();
+        assert!((0..60).all(|s| host.look(false, at(s)).is_none()));
+        assert_eq!(ASKED.load(Ordering::SeqCst), 1);
+        assert_eq!((host.look(false, at(60)), answer(&mut host, at(61))), (None, None), "the same");
+        assert!(host.look(true, at(64)).is_none() && host.errand.is_none(), "not so soon");
+        assert_eq!(host.look(true, at(65)), None);
+        let moved = answer(&mut host, at(66)).unwrap();
+        assert_eq!((moved.to_string().as_str(), ASKED.load(Ordering::SeqCst)), ("10.0.0.1:7", 3));
+        // An address is no name.
+        let mut fixed = Host::by(resolve, "10.0.0.9:7", 0, begin).unwrap();
+        assert!(fixed.look(true, at(1000)).is_none() && fixed.errand.is_none());
+    }
+}

@@ -1,0 +1,70 @@
+//! Which sensors the hub has, asked beside the sending: the answer takes milliseconds where a datagram takes
+//! microseconds. Refuses to know which of them are wanted.
+
+use std::time::{Duration, Instant};
+
+use schema::{Domain, Failure, ipc};
+
+use super::errand::Errand;
+
+/// The calls of the sensors of a hub that came.
+#[derive(Default)]
+pub(super) struct Roll {
+    /// When the hub came, and how often its sensors were called.
+    hub: Option<(Instant, usize)>,
+    /// The call that is under way, and how long after the hub it began.
+    call: Option<(Errand<Answer>, Duration)>,
+}
+
+type Answer = Result<Vec<String>, Failure>;
+
+/// What was answered.
+pub(super) struct Called {
+    /// The sensors that have topics, sorted.
+    pub(super) sensors: Vec<String>,
+    /// So long after the hub came it was asked.
+    pub(super) age: Duration,
+}
+
+/// When the sensors of a hub that came are called: it makes their topics one after the other.
+const CALLS: [Duration; 4] =
+    [Duration::ZERO, Duration::from_millis(200), Duration::from_secs(1), Duration::from_secs(5)];
+/// So often an answer is looked for.
+const LOOK_EVERY: Duration = Duration::from_millis(5);
+
+impl Roll {
+    /// A hub came; answers about the one before are of no use.
+    pub(super) fn begin(&mut self, now: Instant) {
+        *self = Roll { hub: Some((now, 0)), call: None };
+    }
+
+    /// There was a hub.
+    pub(super) fn has_begun(&self) -> bool {
+        self.hub.is_some()
+    }
+
+    /// Calls the sensors of the hub in `domain` if it is time; what they answered, if that came since the last time.
+    ///
+    /// [`Kind::Failed`](schema::Kind) if the domain cannot be read.
+    pub(super) fn call(&mut self, domain: &Domain, now: Instant) -> Result<Option<Called>, Failure> {
+        if let Some((errand, age)) = &self.call {
+            let Some(sensors) = errand.result() else { return Ok(None) };
+            let called = Called { sensors: sensors?, age: *age };
+            self.call = None;
+            return Ok(Some(called));
+        }
+        let Some((came, calls)) = &mut self.hub else { return Ok(None) };
+        let age = now - *came;
+        if CALLS.get(*calls).is_some_and(|after| age >= *after) {
+            let domain = domain.clone();
+            self.call = Errand::begin(move || ipc::sensors(&domain)).map(|errand| (errand, age));
+            *calls += usize::from(self.call.is_some());
+        }
+        Ok(None)
+    }
+
+    /// After which time there may be an answer.
+    pub(super) fn left(&self) -> Option<Duration> {
+        self.call.as_ref().map(|_| LOOK_EVERY)
+    }
+}

@@ -1,0 +1,103 @@
+//! Two gateways that send under one number, as those of two machines made from one disk image do: the datagrams of the
+//! one that began first are refused, for as long as both send. Told apart from a gateway that was started anew, of whose
+//! life before something comes late. Time is an argument; refuses to know why a datagram is refused.
+
+use std::time::{Duration, Instant};
+
+use schema::datagram::LIVES;
+
+/// The gateways of which something was refused as of a life that is over.
+#[derive(Default)]
+pub(super) struct Twins(Vec<Twin>);
+
+struct Twin {
+    hub: u64,
+    since: Instant,
+    /// Refused datagrams behind one that was taken.
+    turns: u32,
+    /// Its last datagram was taken.
+    is_taken: bool,
+    is_told: bool,
+}
+
+/// So many turns, over so long, are no remains of a life that is over.
+const TURNS: u32 = 8;
+const SPAN: Duration = Duration::from_secs(3);
+/// Turns are counted anew after so long: each start of a gateway may give some.
+const WINDOW: Duration = Duration::from_secs(30);
+
+impl Twins {
+    /// A datagram of `hub` was taken.
+    pub(super) fn taken(&mut self, hub: u64) {
+        if let Some(twin) = self.of(hub) {
+            twin.is_taken = true;
+        }
+    }
+
+    /// A datagram of `hub` was refused as of a life that is over; whether it is known now that there are two of it, which
+    /// is said once.
+    pub(super) fn refused(&mut self, hub: u64, now: Instant) -> bool {
+        let Some(twin) = self.of(hub) else {
+            // Of no more hubs anything is taken.
+            if self.0.len() < LIVES {
+                self.0.push(Twin { hub, since: now, turns: 0, is_taken: false, is_told: false });
+            }
+            return false;
+        };
+        if now - twin.since >= WINDOW {
+            (twin.since, twin.turns) = (now, 0);
+        }
+        twin.turns += u32::from(std::mem::take(&mut twin.is_taken));
+        let is_new = twin.turns >= TURNS && now - twin.since >= SPAN && !twin.is_told;
+        twin.is_told |= is_new;
+        is_new
+    }
+
+    fn of(&mut self, hub: u64) -> Option<&mut Twin> {
+        self.0.iter_mut().find(|twin| twin.hub == hub)
+    }
+}
+
+/// What to do about the gateway that is called `hub`.
+pub(super) fn remedy(hub: &str) -> String {
+    format!(
+        "two gateways send as {hub}, and what one of them sends is refused: was one machine made from a copy of the \
+         other's disk? Remove the files gateway-* in the state directory of one of them \
+         (~/.local/state/scanhub, or what XDG_STATE_HOME or its service says) and start its gateway again"
+    )
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Each datagram of hub 7 that is taken is followed by one that is refused, `every` so long, `count` times; when that
+    /// was told.
+    fn told(twins: &mut Twins, begin: Instant, every: Duration, count: u32) -> Vec<u32> {
+        let turn = |n: &u32| {
+            twins.taken(7);
+            twins.taken(8);
+            twins.refused(7, begin + every * *n)
+        };
+        (0..count).filter(turn).collect()
+    }
+
+    #[test]
+    fn two_gateways_are_told_once() {
+        let (mut twins, begin) = (Twins::default(), Instant::now());
+        assert_eq!(told(&mut twins, begin, Duration::from_millis(100), 1000), [30]);
+        let mut seldom = Twins::default();
+        assert_eq!(told(&mut seldom, begin, Duration::from_secs(1), 1000), [8]);
+    }
+
+    #[test]
+    fn what_comes_late_of_a_life_that_is_over_is_not_another_gateway() {
+        let (mut twins, begin) = (Twins::default(), Instant::now());
+        assert!(told(&mut twins, begin, Duration::from_millis(1), 1000).is_empty(), "a start anew");
+        let later = begin + Duration::from_secs(3600);
+        assert!(told(&mut twins, later, Duration::from_millis(1), 1000).is_empty(), "and another one");
+        // One that was sent back in time, and is alone.
+        let mut alone = Twins::default();
+        assert!((0..1000).all(|n| !alone.refused(7, begin + Duration::from_millis(100) * n)));
+    }
+}

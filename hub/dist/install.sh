@@ -1,0 +1,79 @@
+#!/bin/sh
+# Puts the hub in place as a service of this machine, or takes it away again.
+#
+#   hub/dist/install.sh [--program FILE]     install; the program is target/release/scanhub if no other is named
+#   hub/dist/install.sh --remove             take away all that this script puts in place; configuration stays
+#
+# DESTDIR=DIR puts everything below DIR and starts nothing, for those who make packages.
+set -eu
+
+here=$(cd "$(dirname "$0")" && pwd)
+program=$here/../../target/release/scanhub
+action=install
+while [ $# -gt 0 ]; do
+    case $1 in
+    --program) program=${2:?--program needs a file}; shift ;;
+    --remove) action=remove ;;
+    -h | --help) sed -n '2,7s/^# \{0,1\}//p' "$0"; exit 0 ;;
+    *) echo "install.sh: $1? --program FILE, --remove" >&2; exit 2 ;;
+    esac
+    shift
+done
+root=${DESTDIR:-}
+if [ -z "$root" ] && [ "$(id -u)" != 0 ]; then
+    echo "install.sh: it takes root to install a service: sudo $0" >&2
+    exit 1
+fi
+
+# What goes where, with which mode.
+files="
+$program usr/local/bin/scanhub 755
+$here/scanhub.service etc/systemd/system/scanhub.service 644
+$here/scanhub-gateway.service etc/systemd/system/scanhub-gateway.service 644
+$here/60-scanhub.rules etc/udev/rules.d/60-scanhub.rules 644
+$here/scanhub.sysusers etc/sysusers.d/scanhub.conf 644
+$here/scanhub.tmpfiles etc/tmpfiles.d/scanhub.conf 644
+"
+
+each() { # calls $1 with source, destination and mode of each file
+    echo "$files" | while read -r source destination mode; do
+        [ -z "$source" ] || "$1" "$source" "$root/$destination" "$mode"
+    done
+}
+put() {
+    mkdir -p "$(dirname "$2")"
+    # Under another name first: a program that runs cannot be written to.
+    cp "$1" "$2.new"
+    chmod "$3" "$2.new"
+    mv "$2.new" "$2"
+    echo "$2"
+}
+take() {
+    [ ! -e "$2" ] || { rm "$2"; echo "removed $2"; }
+}
+has() { command -v "$1" > /dev/null 2>&1; }
+# Only a machine that runs systemd has services to tell.
+runs() { [ -z "$root" ] && [ -d /run/systemd/system ]; }
+udev() { if runs && has udevadm; then udevadm control --reload && udevadm trigger --subsystem-match=tty --subsystem-match=usb-serial; fi; }
+
+if [ "$action" = remove ]; then
+    if runs; then systemctl disable --now scanhub-gateway scanhub 2> /dev/null || true; fi
+    each take
+    if runs; then systemctl daemon-reload; fi
+    udev
+    echo "what is left: the user scanhub, /etc/scanhub, /var/lib/scanhub"
+    exit 0
+fi
+
+if [ ! -f "$program" ]; then
+    echo "install.sh: there is no $program: cargo build --release, or --program FILE" >&2
+    exit 1
+fi
+each put
+if runs; then
+    systemd-sysusers scanhub.conf
+    systemd-tmpfiles --create scanhub.conf
+    udev
+    systemctl daemon-reload
+fi
+echo "next: /etc/scanhub/scanhub.toml (scanhub config default), then: systemctl enable --now scanhub"

@@ -1,0 +1,85 @@
+//! A service manager as far as a hub speaks with one: it hears what the hub says, keeps the line that it is given, and
+//! hands it to the next hub as descriptor 3. For hubs with one link.
+
+use std::io::IoSliceMut;
+use std::mem::MaybeUninit;
+use std::os::fd::OwnedFd;
+use std::os::unix::net::UnixDatagram;
+use std::process::{Command, Stdio};
+use std::time::Duration;
+
+use rustix::net::{RecvAncillaryBuffer, RecvAncillaryMessage, RecvFlags, recvmsg};
+
+use super::{PATIENCE, Program, Stage, with};
+
+/// Bound to a socket of its own.
+pub(crate) struct Supervisor {
+    socket: UnixDatagram,
+    path: String,
+    /// What it keeps, with the name that it was given under.
+    kept: Option<(String, OwnedFd)>,
+    /// All that was said to it, a line each.
+    pub(crate) heard: Vec<String>,
+}
+
+impl Supervisor {
+    pub(crate) fn new(stage: &Stage) -> Supervisor {
+        let path = stage.word("notify");
+        let socket = UnixDatagram::bind(&path).unwrap_or_else(|error| panic!("{path}: {error}"));
+        Supervisor { socket, path, kept: None, heard: Vec::new() }
+    }
+
+    /// Starts a hub with `flags` as its service and with what it keeps; it is not waited for.
+    pub(crate) fn start(&self, stage: &Stage, flags: &[String], watchdog: Option<Duration>) -> Program {
+        let hub = stage.command(&with(&["run", "--json"], flags));
+        // The process id of a program that is not started yet only a shell can tell.
+        let mut command = Command::new("/bin/sh");
+        command.args([
+            "-c",
+            "export LISTEN_PID=$$ WATCHDOG_PID=$$; exec 3<&0 0</dev/null; exec \"$@\"",
+            "sh",
+        ]);
+        command.arg(hub.get_program()).args(hub.get_args());
+        command.envs(hub.get_envs().filter_map(|(key, value)| Some((key, value?))));
+        command.env("NOTIFY_SOCKET", &self.path);
+        if let Some(every) = watchdog {
+            command.env("WATCHDOG_USEC", every.as_micros().to_string());
+        }
+        let Some((name, line)) = &self.kept else { return Program::start(command) };
+        command.env("LISTEN_FDS", "1").env("LISTEN_FDNAMES", name);
+        let line = line.try_clone().unwrap_or_else(|error| panic!("no descriptor: {error}"));
+        Program::start_with(command, Stdio::from(line))
+    }
+
+    /// Hears until the hub says `wanted`.
+    pub(crate) fn hear(&mut self, wanted: &str) {
+        self.socket.set_read_timeout(Some(PATIENCE)).expect("a socket");
+        loop {
+            let begin = self.heard.len();
+            self.receive(wanted);
+            if self.heard[begin..].iter().any(|line| line == wanted) {
+                return;
+            }
+        }
+    }
+
+    fn receive(&mut self, wanted: &str) {
+        let mut text = [0; 1024];
+        let mut space = [MaybeUninit::uninit(); rustix::cmsg_space!(ScmRights(1))];
+        let mut control = RecvAncillaryBuffer::new(&mut space);
+        let parts = &mut [IoSliceMut::new(&mut text)];
+        let message = recvmsg(&self.socket, parts, &mut control, RecvFlags::CMSG_CLOEXEC)
+            .unwrap_or_else(|error| panic!("waited in vain for {wanted}: {error}; heard {:?}", self.heard));
+        let lines = String::from_utf8_lossy(&text[..message.bytes]).into_owned();
+        let name = lines.lines().find_map(|line| line.strip_prefix("FDNAME=")).unwrap_or_default();
+        for passed in control.drain() {
+            if let RecvAncillaryMessage::ScmRights(lines) = passed {
+                self.kept = lines.last().map(|line| (name.to_owned(), line));
+            }
+        }
+        if lines.lines().any(|line| line == "FDSTOREREMOVE=1") {
+            self.kept = self.kept.take().filter(|(kept, _)| kept != name);
+        }
+        self.heard.extend(lines.lines().map(str::to_owned));
+    }
+}
