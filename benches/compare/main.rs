@@ -18,6 +18,7 @@ mod targets;
 mod topic;
 mod way;
 
+use std::fmt;
 use std::io::IsTerminal;
 use std::process::ExitCode;
 use std::thread::available_parallelism;
@@ -37,6 +38,26 @@ pub(crate) struct Cell {
     /// Position in the schedule.
     pub(crate) phase: usize,
     pub(crate) runs: Vec<Measured>,
+}
+
+impl Cell {
+    /// Messages come at a rate.
+    fn is_paced(&self) -> bool {
+        schedule::PHASES[self.phase].period_ns > 0
+    }
+
+    /// The same messages, receivers and rate.
+    fn is_beside(&self, other: &Cell) -> bool {
+        let place = |cell: &Cell| (cell.case.payload, cell.case.receivers, cell.phase);
+        place(self) == place(other)
+    }
+}
+
+impl fmt::Display for Cell {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let Case { way, payload, receivers } = self.case;
+        write!(f, "{}, {payload} B to {receivers}, {}", way.name(), schedule::PHASES[self.phase].name)
+    }
 }
 
 fn main() -> ExitCode {

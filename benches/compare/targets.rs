@@ -3,41 +3,76 @@
 
 use serde_json::json;
 
-use super::Cell;
-use super::schedule::PHASES;
 use super::table::{Of, values};
 use super::way::Way;
-use crate::support::figures::percentile;
+use super::{Cell, MEBIBYTE};
+use crate::support::figures::{Spread, percentile};
 use crate::support::options::Options;
 
-/// Prints each, and where it is missed.
+/// Prints each, and where it is missed. With `--json` as lines of class `measurement`, whose floor is what topics are
+/// compared with, and of class `above`, for each cell where a socket is cheaper.
 pub(crate) fn print(options: &Options, cells: &[Cell]) {
     let mut verdicts = Vec::new();
-    for cell in cells.iter().filter(|cell| is_paced(cell)) {
+    for cell in cells.iter().filter(|cell| cell.is_paced()) {
         verdicts.extend(of_waits(cell, cells));
-        verdicts.extend(of_spinning(cell));
+        verdicts.extend(of_spinning(cell, cells));
         verdicts.extend(of_attaching(cell, cells));
         verdicts.extend(of_many(cell, cells));
     }
     verdicts.extend(of_sockets(cells));
-    for Verdict { what, target, value, is_met } in verdicts {
-        if options.json {
-            println!(
-                "{}",
-                json!({ "class": "target", "bench": "compare", "what": what, "target": target, "value": value, "met": is_met })
-            );
-        } else {
-            let met = if is_met { "met" } else { "MISSED" };
-            println!("{what}: {value}; {target}: {met}");
-        }
-    }
+    verdicts.iter().for_each(|verdict| verdict.print(options.json));
 }
 
 struct Verdict {
-    what: String,
+    class: &'static str,
+    name: String,
+    unit: &'static str,
+    /// One value per run.
+    ours: Vec<f64>,
+    /// One value per run of what it is compared with; empty if it is not.
+    other: Vec<f64>,
     target: String,
-    value: String,
     is_met: bool,
+}
+
+impl Verdict {
+    /// `cell` beside `other`, of which it should take `most` times as much at most.
+    fn beside(cell: &Cell, other: &Cell, (quantity, of): (&str, Of), most: f64) -> Option<Verdict> {
+        let mut verdict = Verdict {
+            class: "measurement",
+            name: format!("{cell}, {quantity} beside {}", other.case.way.name()),
+            unit: "us",
+            ours: values(cell, of),
+            other: values(other, of),
+            target: format!("ratio <= {most}"),
+            is_met: false,
+        };
+        verdict.is_met = middle(verdict.ratios())? <= most;
+        Some(verdict)
+    }
+
+    /// Run by run, for those met one another within the same minute.
+    fn ratios(&self) -> Vec<f64> {
+        self.ours.iter().zip(&self.other).map(|(ours, other)| ours / other).collect()
+    }
+
+    fn print(&self, as_json: bool) {
+        let Verdict { class, name, unit, ours, other, target, is_met } = self;
+        let spreads = [ours, other, &self.ratios()].map(|values| Spread::of(values));
+        if as_json {
+            let [ours, other, ratio] = spreads.map(|spread| spread.map(|spread| spread.json()));
+            let line = json!({
+                "class": class, "bench": "compare", "name": name, "unit": unit, "runs": self.ours.len(),
+                "hub": ours, "floor": other, "ratio": ratio, "target": target, "met": is_met,
+            });
+            println!("{line}");
+        } else {
+            let [ours, other, ratio] =
+                spreads.map(|spread| spread.map_or("-".into(), |spread| spread.text()));
+            let met = if *is_met { "met" } else { "MISSED" };
+            println!("{name}, {unit}: {ours}; {other}; ratio {ratio}; {target}: {met}");
+        }
+    }
 }
 
 /// A wait of topics beside the bare futex, with messages as short as the hub's.
@@ -50,61 +85,47 @@ fn of_waits(cell: &Cell, cells: &[Cell]) -> Option<Verdict> {
     if cell.case.receivers > 1 || cell.case.payload > SHORT {
         return None;
     }
-    ratio(
-        cell,
-        beside(cell, cells, Way::FutexFloor)?,
-        "p50",
-        |run| run.latency[0],
-        |ratio| ratio <= most,
-        &format!("<= {most}"),
-    )
+    Verdict::beside(cell, beside(cell, cells, Way::FutexFloor)?, ("p50", |run| run.latency[0]), most)
 }
 
-fn of_spinning(cell: &Cell) -> Option<Verdict> {
+/// Spinning, where two processors have nothing else to do.
+fn of_spinning(cell: &Cell, cells: &[Cell]) -> Option<Verdict> {
+    const MOST_US: f64 = 1.0;
     if cell.case.way != Way::Spin || cell.case.payload > SHORT {
         return None;
     }
-    let value = median(cell, |run| run.latency[0])?;
-    Some(Verdict {
-        what: format!("{}, p50", name(cell)),
-        target: "<= 1 us where processors are free".into(),
-        value: format!("{value:.2} us"),
-        is_met: value <= 1.0,
-    })
+    let verdict =
+        Verdict::beside(cell, beside(cell, cells, Way::SpinFloor)?, ("p50", |run| run.latency[0]), MOST_US)?;
+    let is_met = middle(verdict.ours.clone())? <= MOST_US;
+    Some(Verdict { target: format!("<= {MOST_US} us where processors are free"), is_met, ..verdict })
 }
 
 /// The attach library beside the path that is used for all lengths here.
 fn of_attaching(cell: &Cell, cells: &[Cell]) -> Option<Verdict> {
+    const COST: (&str, Of) = ("receiver's processor time", |run| run.receiver_us);
     if cell.case.way != Way::Attachment {
         return None;
     }
     let path = beside(cell, cells, Way::Doorbell)?;
-    let is_same =
-        !is_above(cell, path, |run| run.receiver_us) && !is_above(path, cell, |run| run.receiver_us);
-    ratio(
-        cell,
-        path,
-        "receiver's processor time",
-        |run| run.receiver_us,
-        |_| is_same,
-        "the same within the spread",
-    )
+    let is_met = !is_above(cell, path, COST.1) && !is_above(path, cell, COST.1);
+    let verdict = Verdict::beside(cell, path, COST, 1.0)?;
+    Some(Verdict { target: "the same within the spread".into(), is_met, ..verdict })
 }
 
 /// What the hub is for: many receivers of long messages.
 fn of_many(cell: &Cell, cells: &[Cell]) -> Vec<Verdict> {
-    let least = match cell.case.way {
+    let times = match cell.case.way {
         Way::Doorbell => 50.0,
         Way::Event => 20.0,
         _ => return Vec::new(),
     };
-    if cell.case.receivers != 16 || cell.case.payload != super::MEBIBYTE {
+    if cell.case.receivers != 16 || cell.case.payload != MEBIBYTE {
         return Vec::new();
     }
     let verdict = |(quantity, of): (&str, Of)| {
         let sockets = [Way::UnixDatagram, Way::UnixStream].into_iter();
         let cheapest = cheapest(sockets.filter_map(|way| beside(cell, cells, way)), of)?;
-        ratio(cheapest, cell, quantity, of, |ratio| ratio >= least, &format!(">= {least}"))
+        Verdict::beside(cell, cheapest, (quantity, of), 1.0 / times)
     };
     SENDER.into_iter().filter_map(verdict).collect()
 }
@@ -116,53 +137,30 @@ fn of_sockets(cells: &[Cell]) -> Vec<Verdict> {
     let mut verdicts = Vec::new();
     for way in [Way::Doorbell, Way::Event] {
         for (quantity, of) in SENDER.into_iter().chain([LAST]) {
-            let ours = cells.iter().filter(|cell| cell.case.way == way && is_paced(cell));
-            let beside: Vec<_> = ours
+            let ours = cells.iter().filter(|cell| cell.case.way == way && cell.is_paced());
+            let compared: Vec<_> = ours
                 .filter_map(|cell| {
                     let rivals = cells.iter().filter(|rival| rival.case.way.is_rival());
-                    Some((cell, cheapest(rivals.filter(|rival| is_beside(rival, cell)), of)?))
+                    Some((cell, cheapest(rivals.filter(|rival| rival.is_beside(cell)), of)?))
                 })
                 .collect();
-            let above: Vec<_> = beside.iter().filter(|(cell, rival)| is_above(cell, rival, of)).collect();
-            let target = "not above the cheapest socket beyond the spread";
+            let above: Vec<_> = compared.iter().filter(|(cell, rival)| is_above(cell, rival, of)).collect();
             verdicts.push(Verdict {
-                what: format!("{}, {quantity}", way.name()),
-                target: target.into(),
-                value: format!("above it in {} of {} cells", above.len(), beside.len()),
+                class: "measurement",
+                name: format!("{}, {quantity}: cells above the cheapest socket", way.name()),
+                unit: "1",
+                ours: vec![above.len() as f64],
+                other: Vec::new(),
+                target: format!("0 of {} beyond the spread", compared.len()),
                 is_met: above.is_empty(),
             });
-            verdicts.extend(
-                above.iter().filter_map(|(cell, rival)| ratio(cell, rival, quantity, of, |_| false, target)),
-            );
+            verdicts.extend(above.iter().filter_map(|(cell, rival)| {
+                let verdict = Verdict::beside(cell, rival, (quantity, of), 1.0)?;
+                Some(Verdict { class: "above", is_met: false, ..verdict })
+            }));
         }
     }
     verdicts
-}
-
-/// The ratio run by run, which met one another within the same minute.
-fn ratio(
-    cell: &Cell,
-    other: &Cell,
-    quantity: &str,
-    of: Of,
-    is_met: impl Fn(f64) -> bool,
-    target: &str,
-) -> Option<Verdict> {
-    let mut ratios: Vec<f64> =
-        values(cell, of).iter().zip(values(other, of)).map(|(value, other)| value / other).collect();
-    ratios.sort_by(f64::total_cmp);
-    let ratio = percentile(&ratios, 0.5)?;
-    let (value, beside) = (median(cell, of)?, median(other, of)?);
-    Some(Verdict {
-        what: format!("{}, {quantity} beside {}", name(cell), other.case.way.name()),
-        target: target.into(),
-        value: format!(
-            "{value:.2} and {beside:.2} us, ratio {ratio:.2} [{:.2} .. {:.2}]",
-            ratios[0],
-            ratios[ratios.len() - 1]
-        ),
-        is_met: is_met(ratio),
-    })
 }
 
 /// Every run of `cell` took more than every run of `other`.
@@ -173,32 +171,17 @@ fn is_above(cell: &Cell, other: &Cell, of: Of) -> bool {
 }
 
 fn cheapest<'a>(cells: impl Iterator<Item = &'a Cell>, of: Of) -> Option<&'a Cell> {
-    let known = cells.filter_map(|cell| Some((median(cell, of)?, cell)));
+    let known = cells.filter_map(|cell| Some((middle(values(cell, of))?, cell)));
     known.min_by(|(one, _), (other, _)| one.total_cmp(other)).map(|(_, cell)| cell)
 }
 
 fn beside<'a>(cell: &Cell, cells: &'a [Cell], way: Way) -> Option<&'a Cell> {
-    cells.iter().find(|other| other.case.way == way && is_beside(other, cell))
+    cells.iter().find(|other| other.case.way == way && other.is_beside(cell))
 }
 
-fn is_beside(one: &Cell, other: &Cell) -> bool {
-    let place = |cell: &Cell| (cell.case.payload, cell.case.receivers, cell.phase);
-    place(one) == place(other)
-}
-
-fn is_paced(cell: &Cell) -> bool {
-    PHASES[cell.phase].period_ns > 0
-}
-
-fn median(cell: &Cell, of: Of) -> Option<f64> {
-    let mut values = values(cell, of);
+fn middle(mut values: Vec<f64>) -> Option<f64> {
     values.sort_by(f64::total_cmp);
     percentile(&values, 0.5)
-}
-
-fn name(cell: &Cell) -> String {
-    let case = cell.case;
-    format!("{}, {} B to {}, {}", case.way.name(), case.payload, case.receivers, PHASES[cell.phase].name)
 }
 
 /// With all that a message costs its sender, and without the writing of it and the wait until it is due.

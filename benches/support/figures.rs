@@ -44,16 +44,18 @@ pub(crate) enum Target {
 }
 
 /// The middle, the least and the greatest of a series.
-struct Spread(f64, f64, f64);
+pub(crate) struct Spread(f64, f64, f64);
 
 impl Spread {
-    fn of(values: &[f64]) -> Option<Spread> {
+    /// That of `values`, in any order; nothing if there are none.
+    pub(crate) fn of(values: &[f64]) -> Option<Spread> {
         let mut sorted = values.to_vec();
         sorted.sort_by(f64::total_cmp);
         Some(Spread(percentile(&sorted, 0.5)?, *sorted.first()?, *sorted.last()?))
     }
 
-    fn text(&self) -> String {
+    /// As it stands in tables.
+    pub(crate) fn text(&self) -> String {
         let Spread(middle, least, most) = self;
         if least == most {
             return short(*middle);
@@ -61,7 +63,8 @@ impl Spread {
         format!("{} [{} .. {}]", short(*middle), short(*least), short(*most))
     }
 
-    fn json(&self) -> Value {
+    /// As it stands in lines.
+    pub(crate) fn json(&self) -> Value {
         json!({ "median": self.0, "least": self.1, "most": self.2 })
     }
 }
