@@ -133,13 +133,15 @@ fn measure(options: &Options) {
         let is_it = |cell: &&Cell| cell.table == table && cell.row == row && cell.column == METHODS[0];
         cells.iter().find(is_it).map_or(Vec::new(), |cell| cell.values.clone())
     };
-    let figures = TARGETS.map(|(name, row, table, target)| Figure {
-        name,
-        unit: "1",
-        hub: value(table, row),
-        floor: Vec::new(),
-        target,
-    });
+    let figure = |name, hub, target| Figure { name, unit: "1", hub, floor: Vec::new(), target };
+    let mut figures =
+        Vec::from(TARGETS.map(|(name, row, table, target)| figure(name, value(table, row), target)));
+    let [scans, foreground, _] = bytes[0].per_second();
+    figures.push(figure(
+        "bytes of scans for one of foreground",
+        vec![scans / foreground],
+        Target::Least(10.0),
+    ));
     if !options.json {
         println!("seeds {}..{}", options.seeds.start, options.seeds.end);
     }

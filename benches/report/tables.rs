@@ -74,7 +74,8 @@ fn measurements(figures: &[&Value]) -> String {
     let columns: Vec<&str> = ["hub", "floor", "ratio", "target"].into_iter().filter(is_wanted).collect();
     let mut rows = vec![["", "runs"].iter().chain(&columns).map(|head| head.to_string()).collect::<Vec<_>>()];
     for figure in figures {
-        let mut row = vec![named(&figure["name"], &figure["unit"]), figure["runs"].to_string()];
+        let mut row =
+            vec![named(text_of(&figure["name"]), Some(&figure["unit"])), figure["runs"].to_string()];
         row.extend(columns.iter().map(|&column| match column {
             "target" => target(figure),
             _ => spread(&figure[column]),
@@ -92,30 +93,36 @@ fn target(figure: &Value) -> String {
     }
 }
 
-/// Rows and columns in order of appearance. A unit that a whole column shares stands at its head.
-fn matrix(name: &str, cells: &[&Value]) -> String {
-    let (rows, columns) = (appearing(cells, "row"), appearing(cells, "column"));
-    let shared = |column: &str| {
-        let mut units = cells.iter().filter(|cell| cell["column"] == column).map(|cell| &cell["unit"]);
-        units.next().filter(|first| units.all(|unit| unit == *first))
-    };
+/// Rows and columns in order of appearance. A unit that all share stands in the title, one of a column at its head.
+fn matrix(title: &str, cells: &[&Value]) -> String {
+    let of_all = shared_unit(cells.iter());
+    let of_column: Vec<(&str, Option<&Value>)> = appearing(cells, "column")
+        .into_iter()
+        .map(|column| (column, shared_unit(cells.iter().filter(|cell| cell["column"] == column))))
+        .collect();
     let mut lines = vec![vec![String::new()]];
-    lines[0].extend(columns.iter().map(|&column| match shared(column) {
-        Some(unit) => named(&column.into(), unit),
-        None => column.to_owned(),
-    }));
-    for row in rows {
+    lines[0].extend(of_column.iter().map(|&(column, unit)| named(column, unit.filter(|_| of_all.is_none()))));
+    for row in appearing(cells, "row") {
         let mut line = vec![row.to_owned()];
-        for column in &columns {
+        for (column, unit) in &of_column {
             let cell = cells.iter().find(|cell| cell["row"] == row && cell["column"] == **column);
-            line.push(cell.map_or(String::new(), |cell| match spread(&cell["value"]) {
-                value if value.is_empty() || shared(column).is_some() => value,
-                value => named(&format!("{value} ").trim_end().into(), &cell["unit"]),
+            line.push(cell.map_or(String::new(), |cell| {
+                match (spread(&cell["value"]), text_of(&cell["unit"])) {
+                    (value, own) if unit.is_none() && !value.is_empty() && own != "1" => {
+                        format!("{value} {own}")
+                    }
+                    (value, _) => value,
+                }
             }));
         }
         lines.push(line);
     }
-    format!("**{name}**\n\n{}", table(&lines))
+    format!("**{}**\n\n{}", named(title, of_all), table(&lines))
+}
+
+fn shared_unit<'a>(mut cells: impl Iterator<Item = &'a &'a Value>) -> Option<&'a Value> {
+    let first = &cells.next()?["unit"];
+    cells.all(|cell| cell["unit"] == *first).then_some(first)
 }
 
 /// The first row is the head.
@@ -142,10 +149,10 @@ fn appearing<'a>(lines: &[&'a Value], key: &str) -> Vec<&'a str> {
     found
 }
 
-fn named(name: &Value, unit: &Value) -> String {
-    match (text_of(name), text_of(unit)) {
-        (name, "" | "1") => name.to_owned(),
-        (name, unit) => format!("{name}, {unit}"),
+fn named(name: &str, unit: Option<&Value>) -> String {
+    match unit.map_or("", text_of) {
+        "" | "1" => name.to_owned(),
+        unit => format!("{name}, {unit}"),
     }
 }
 

@@ -199,6 +199,8 @@ impl Chart {
             }
         }
         let (width, mut tops) = ((step * 0.7).min(60.0), vec![0.0; self.groups.len()]);
+        // In front of all bars: the one above would hide half of it.
+        let mut spreads = String::new();
         for (number, series) in self.series.iter().enumerate() {
             for point in &series.points {
                 let group = point.x as usize;
@@ -213,10 +215,11 @@ impl Chart {
                     escaped(&series.name),
                     self::number(point.y)
                 );
-                spread(svg, middle(group), y_axis, *top + point.least, *top + point.most, "#808080");
+                spread(&mut spreads, middle(group), y_axis, *top + point.least, *top + point.most, "#808080");
                 *top += point.y;
             }
         }
+        svg.push_str(&spreads);
     }
 }
 
@@ -314,7 +317,8 @@ fn colour(number: usize) -> &'static str {
 }
 
 /// Of middling lightness, and told apart by most eyes.
-const COLOURS: [&str; 6] = ["#3b8fd4", "#d9822b", "#2f9e77", "#cc5a8b", "#8f7ad6", "#9a8a2c"];
+const COLOURS: [&str; 8] =
+    ["#3b8fd4", "#d9822b", "#2f9e77", "#cc5a8b", "#8f7ad6", "#9a8a2c", "#b5533c", "#6b8299"];
 /// The page and the field of the values on it, in pixels.
 const WIDTH: f64 = 720.0;
 const LEFT: f64 = 86.0;
