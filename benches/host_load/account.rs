@@ -15,7 +15,7 @@ pub(crate) struct Snapshot {
     processes: BTreeMap<u32, Usage>,
 }
 
-/// Part of one processor that was used, user and system apart; 1 is the whole of it.
+/// How much of one processor was used, in percent, user and system apart.
 #[derive(Clone, Copy, Debug, Default)]
 pub(crate) struct Share {
     pub(crate) user: f64,
@@ -74,13 +74,17 @@ impl<'a> Span<'a> {
     /// The whole machine by `/proc/stat`; interrupts are of the system.
     pub(crate) fn machine(&self) -> Share {
         let (before, after) = (self.before.ticks, self.after.ticks);
-        let part = |ticks: u64| ticks as f64 / USER_HZ * 1e9 / self.ns();
-        Share { user: part(after.user - before.user), system: part(after.system - before.system) }
+        let part = |ticks: u64| self.percent(ticks as f64 / USER_HZ * 1e9);
+        Share {
+            user: part(after.user.saturating_sub(before.user)),
+            system: part(after.system.saturating_sub(before.system)),
+        }
     }
 
-    /// What the machine below took away of a processor.
+    /// What the machine below took away, in percent of one processor.
     pub(crate) fn stolen(&self) -> f64 {
-        (self.after.ticks.stolen - self.before.ticks.stolen) as f64 / USER_HZ * 1e9 / self.ns()
+        let stolen = self.after.ticks.stolen.saturating_sub(self.before.ticks.stolen);
+        self.percent(stolen as f64 / USER_HZ * 1e9)
     }
 
     /// These processes by the scheduler; an error if one is not there any more.
@@ -90,15 +94,16 @@ impl<'a> Span<'a> {
             let after = self.after.processes.get(pid).ok_or_else(|| format!("process {pid} has ended"))?;
             sum.add(after.since(self.before.processes.get(pid)));
         }
-        Ok(sum.share(self.ns()))
+        Ok(sum.share(self.percent(sum.busy_ns as f64)))
     }
 
-    /// The kernel's own threads by the scheduler: among them those that hand over the bytes of ttys.
+    /// The kernel's own threads by the scheduler, in percent of one processor: among them are those that hand over the
+    /// bytes of ttys.
     pub(crate) fn kernel(&self) -> f64 {
         self.sum(|usage| usage.is_kernel)
     }
 
-    /// Everybody who was there at the end, by the scheduler.
+    /// Everybody who was there at the end, likewise.
     pub(crate) fn everybody(&self) -> f64 {
         self.sum(|_| true)
     }
@@ -106,11 +111,11 @@ impl<'a> Span<'a> {
     fn sum(&self, wanted: impl Fn(&Usage) -> bool) -> f64 {
         let wanted = self.after.processes.iter().filter(|(_, usage)| wanted(usage));
         let busy: u64 = wanted.map(|(pid, usage)| usage.since(self.before.processes.get(pid)).busy_ns).sum();
-        busy as f64 / self.ns()
+        self.percent(busy as f64)
     }
 
-    fn ns(&self) -> f64 {
-        (self.after.at_ns - self.before.at_ns).max(1) as f64
+    fn percent(&self, ns: f64) -> f64 {
+        100.0 * ns / (self.after.at_ns - self.before.at_ns).max(1) as f64
     }
 }
 
@@ -184,9 +189,11 @@ impl Usage {
         self.system += other.system;
     }
 
-    fn share(&self, ns: f64) -> Share {
-        let (busy, ticks) = (self.busy_ns as f64 / ns, (self.user + self.system).max(1) as f64);
-        Share { user: busy * self.user as f64 / ticks, system: busy * self.system as f64 / ticks }
+    /// `busy` divided.
+    fn share(&self, busy: f64) -> Share {
+        // Half a tick of each more: no time is lost where none fell.
+        let system = busy * (self.system as f64 + 0.5) / ((self.user + self.system) as f64 + 1.0);
+        Share { user: busy - system, system }
     }
 }
 

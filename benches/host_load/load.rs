@@ -5,7 +5,7 @@ use crate::setup::Cast;
 use crate::support::Outcome;
 use crate::support::child::Child;
 
-/// Parts of one processor.
+/// In percent of one processor.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Load {
     /// `/proc/stat`, all of it.
@@ -28,7 +28,7 @@ pub(crate) struct Load {
     pub(crate) hz: f64,
 }
 
-/// The host's load by two accounts; parts of one processor.
+/// The host's load by two accounts, in percent of one processor.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Host {
     /// By `/proc/stat`, less who is no part of the host.

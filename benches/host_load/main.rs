@@ -8,14 +8,16 @@
 //! Consumers are processes, and all of them get 37.5 scans a second of each sensor; a table says whether they did. What
 //! stands for hardware (simulators; in c the unit) is left out: its own time is taken from the machine's.
 //!
-//! Two accounts of each run. `/proc/stat` is that of the paper: the whole machine, interrupts with the system, and
-//! whatever else runs on it. Where the kernel counts by ticks it charges one to whoever runs when it falls, 4 ms
-//! or 10 ms apart, and who sleeps is woken for less than 0.1 ms: no single figure of it is exact below some tenths of a percent, and
-//! "/proc/stat, of what the scheduler counted" says how far it was from the truth. The account of the processes is the
-//! scheduler's, which counts nanoseconds; only its division in user and system is by ticks. Ratios are of that one. It
-//! has no part of what the kernel's own threads do for a pty, which is most where most ptys are: a table has them.
+//! Two accounts of each run. `/proc/stat` is the paper's: the whole machine, interrupts with the system, and whatever
+//! else runs there. Where the kernel counts by ticks (CONFIG_TICK_CPU_ACCOUNTING) it charges one of 1 to 10 ms to
+//! whoever runs when it falls, and most of those here run for less than 0.1 ms at once. How far that is off is measured,
+//! in the table "/proc/stat, of what the scheduler counted": exact would be 100 %, and it is more if others
+//! ended meanwhile, who are then missing in the scheduler's count. The account of the processes is the scheduler's, in nanoseconds
+//! (schedstat); only its division in user and system is by ticks, of a process's whole life. Targets are of that one. It
+//! has no part of what threads of the kernel do for a pty, which is more where more ptys are: a table has these.
 //!
 //! It does not tell what a real UART costs: a pty has no interrupts.
+
 mod account;
 mod consumer;
 #[path = "../../hub/lms/tests/line/mod.rs"]

@@ -23,6 +23,14 @@ pub(crate) struct Tables<'a> {
     processors: usize,
 }
 
+/// What is in one table.
+struct Table {
+    name: &'static str,
+    unit: &'static str,
+    rows: &'static [SetUp],
+    value: Value,
+}
+
 /// What a table shows of a run.
 type Value = fn(&Run) -> f64;
 /// What a colour shows of a bar.
@@ -49,8 +57,8 @@ impl<'a> Tables<'a> {
 
     fn cells(&self) -> Vec<Cell> {
         let mut cells = Vec::new();
-        for (table, unit, value) in TABLES {
-            self.table(table.into(), unit, value, &mut cells);
+        for Table { name, unit, rows, value } in TABLES {
+            self.table(name.into(), unit, rows, value, &mut cells);
         }
         // Of all processors together, as the paper has it.
         let all = self.processors;
@@ -59,15 +67,15 @@ impl<'a> Tables<'a> {
         for (part, value) in parts {
             let table = format!("{part}, /proc/stat, of all {all} processors");
             let from = cells.len();
-            self.table(table, "%", value, &mut cells);
+            self.table(table, "%", &SetUp::ALL, value, &mut cells);
             let values = cells[from..].iter_mut().flat_map(|cell| &mut cell.values);
-            values.for_each(|value| *value *= 100.0 / all as f64);
+            values.for_each(|value| *value /= all as f64);
         }
         cells
     }
 
-    fn table(&self, table: String, unit: &'static str, value: Value, cells: &mut Vec<Cell>) {
-        for set_up in SetUp::ALL {
+    fn table(&self, table: String, unit: &'static str, rows: &[SetUp], value: Value, cells: &mut Vec<Cell>) {
+        for &set_up in rows {
             for &count in self.counts {
                 let (row, column) = (set_up.name().into(), consumers(count));
                 let values = self.series(set_up, count, value);
@@ -83,10 +91,10 @@ impl<'a> Tables<'a> {
             Figure { name, unit: "%", hub, floor, target }
         };
         vec![
-            of("system, processes", |run| 100.0 * run.host.processes.system, Target::Ratio(0.166)),
-            of("user, processes", |run| 100.0 * run.host.processes.user, Target::Ratio(0.333)),
-            of("system, /proc/stat", |run| 100.0 * run.host.machine.system, Target::None),
-            of("user, /proc/stat", |run| 100.0 * run.host.machine.user, Target::None),
+            of("system, processes", |run| run.host.processes.system, Target::Ratio(0.166)),
+            of("user, processes", |run| run.host.processes.user, Target::Ratio(0.333)),
+            of("system, /proc/stat", |run| run.host.machine.system, Target::None),
+            of("user, /proc/stat", |run| run.host.machine.user, Target::None),
         ]
     }
 
@@ -98,7 +106,7 @@ impl<'a> Tables<'a> {
             for (set_up, letter) in SetUp::ALL.into_iter().zip(["a", "b", "c", "d", "e"]) {
                 for ((_, part), series) in parts.iter().zip(&mut series) {
                     let mut values: Vec<f64> =
-                        self.chosen(set_up, count).map(|run| 100.0 * part(share(run))).collect();
+                        self.chosen(set_up, count).map(|run| part(share(run))).collect();
                     values.sort_by(f64::total_cmp);
                     if let (Some(y), [least, ..], [.., most]) =
                         (percentile(&values, 0.5), &values[..], &values[..])
@@ -129,21 +137,33 @@ fn consumers(count: usize) -> String {
     if count == 1 { "1 consumer".into() } else { format!("{count} consumers") }
 }
 
+const fn load(name: &'static str, rows: &'static [SetUp], value: Value) -> Table {
+    Table { name, unit: "%", rows, value }
+}
+
 const BENCH: &str = "host_load";
 /// Consumers in the paper's set-up, to which its figures belong.
 const FOUR: usize = 4;
-/// Tables, in % of one processor where they are of load.
-const TABLES: [(&str, &str, Value); 10] = [
-    ("system, processes of the host", "%", |run| 100.0 * run.host.processes.system),
-    ("user, processes of the host", "%", |run| 100.0 * run.host.processes.user),
-    ("of it the hub, system and user", "%", |run| 100.0 * run.load.hub.total()),
-    ("system, /proc/stat", "%", |run| 100.0 * run.host.machine.system),
-    ("user, /proc/stat", "%", |run| 100.0 * run.host.machine.user),
-    ("threads of the kernel", "%", |run| 100.0 * run.load.kernel),
-    ("left out: simulators or unit", "%", |run| 100.0 * run.load.outside.total()),
-    ("scans a second of each sensor, the least", "Hz", |run| run.load.hz),
-    ("/proc/stat, of what the scheduler counted", "%", |run| {
+/// Set-ups with a hub.
+const WITH_HUB: [SetUp; 2] = [SetUp::Scans, SetUp::Results];
+/// Load is in percent of one processor.
+const TABLES: [Table; 11] = [
+    load("system, processes of the host", &SetUp::ALL, |run| run.host.processes.system),
+    load("user, processes of the host", &SetUp::ALL, |run| run.host.processes.user),
+    load("system, of it the hub", &WITH_HUB, |run| run.load.hub.system),
+    load("user, of it the hub", &WITH_HUB, |run| run.load.hub.user),
+    load("system, /proc/stat", &SetUp::ALL, |run| run.host.machine.system),
+    load("user, /proc/stat", &SetUp::ALL, |run| run.host.machine.user),
+    load("threads of the kernel", &SetUp::ALL, |run| run.load.kernel),
+    load("left out: simulators or unit", &SetUp::ALL, |run| run.load.outside.total()),
+    Table {
+        name: "scans a second of each sensor, the least",
+        unit: "Hz",
+        rows: &SetUp::ALL,
+        value: |run| run.load.hz,
+    },
+    load("/proc/stat, of what the scheduler counted", &SetUp::ALL, |run| {
         100.0 * run.load.machine.total() / run.load.everybody
     }),
-    ("stolen by the machine below", "%", |run| 100.0 * run.load.stolen),
+    load("stolen by the machine below", &SetUp::ALL, |run| run.load.stolen),
 ];
