@@ -7,6 +7,8 @@ mod crates;
 mod sources;
 #[path = "tidy/tree.rs"]
 mod tree;
+#[path = "tidy/written.rs"]
+mod written;
 
 use tree::{Tree, Wall};
 
@@ -269,6 +271,24 @@ fn nothing_promises_safety() {
         vec![
             tree.with("clients/src/planted.rs", "//! A protective field.\n"),
             tree.with("CHANGELOG.md", "- A safety function for robots.\n"),
+        ]
+    });
+}
+
+#[test]
+fn tables_are_of_the_last_runs() {
+    let planted =
+        "{\"class\":\"measurement\",\"bench\":\"planted\",\"name\":\"nobody measured\",\"runs\":1}\n";
+    holds(written::tables_are_of_the_last_runs, |tree| {
+        let page = tree.text("benches/README.md");
+        vec![
+            tree.with("benches/last/planted.jsonl", planted),
+            tree.with("benches/last/planted.jsonl", "no line\n"),
+            tree.with(
+                "benches/README.md",
+                &page.replace("<!-- Until here. -->", "0 by hand\n<!-- Until here. -->"),
+            ),
+            tree.with("benches/README.md", &page.replace("<!-- Until here. -->", "")),
         ]
     });
 }

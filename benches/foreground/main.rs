@@ -9,6 +9,9 @@
 
 mod boxes;
 mod bytes;
+#[path = "../support/figures.rs"]
+#[allow(dead_code)] // Benches of time use more of it.
+mod figures;
 mod method;
 mod play;
 mod rivals;
@@ -16,17 +19,15 @@ mod score;
 #[path = "../support/seen.rs"]
 mod seen;
 
-use std::fmt;
-use std::io::{Write, stdout};
 use std::ops::Range;
-use std::process::{ExitCode, exit};
+use std::process::ExitCode;
 
 use lms::variant::Unit;
 use preprocess::background::{Method as Kind, Settings, Start};
-use serde_json::json;
 
 use boxes::Boxes;
 use bytes::Bytes;
+use figures::{Cell, Figure, Target};
 use method::{Hub, Method};
 use play::{Scene, play};
 use rivals::{Mixtures, TeachIn};
@@ -45,12 +46,24 @@ const SCENES: [Scene; 10] = [
     Scene { name: "a crowd", world: "crowd", unit: Unit::Mm, mixed: true },
 ];
 
-/// Recall, precision and wrong beams per scan that `multi` should reach; what is not named has no target.
-const TARGETS: [(&str, [f64; 3]); 3] = [
-    ("Fig. 8", [0.99, 0.95, 0.2]),
-    ("corridor, in cm", [0.95, 0.0, 0.4]),
-    ("somebody walks at the sensor", [0.95, 0.0, 0.4]),
+/// What `multi` should reach, by row and table.
+const TARGETS: [(&str, &str, &str, Target); 9] = [
+    ("recall in Fig. 8", "Fig. 8", RECALL, Target::Least(0.99)),
+    ("precision in Fig. 8", "Fig. 8", PRECISION, Target::Least(0.95)),
+    ("wrong beams a scan in Fig. 8", "Fig. 8", WRONG, Target::Most(0.2)),
+    ("recall in a corridor", "corridor, in cm", RECALL, Target::Least(0.95)),
+    ("wrong beams a scan in a corridor", "corridor, in cm", WRONG, Target::Most(0.4)),
+    ("recall at the sensor", "somebody walks at the sensor", RECALL, Target::Least(0.95)),
+    ("wrong beams a scan at the sensor", "somebody walks at the sensor", WRONG, Target::Most(0.4)),
+    ("percent of a box new after N", NEW, BOX, Target::Most(0.0)),
+    ("percent of a box left after 2N", LEFT, BOX, Target::Most(0.0)),
 ];
+const BOX: &str = "of a box in Fig. 8";
+const NEW: &str = "put down: new after N scans";
+const LEFT: &str = "taken away: left after 2N";
+const RECALL: &str = "recall";
+const PRECISION: &str = "precision";
+const WRONG: &str = "wrong beams a scan";
 
 const METHODS: [&str; 5] = ["multi", "paper", "paper, first scan", "teach-in", "mixtures (MOG2)"];
 
@@ -87,12 +100,7 @@ fn main() -> ExitCode {
 fn measure(options: &Options) {
     let mut boxes = [Boxes::default(); METHODS.len()];
     let mut bytes = [Bytes::default(); METHODS.len()];
-    if !options.json {
-        say(format_args!(
-            "seeds {}..{}{:>34} {:>9} {:>11}",
-            options.seeds.start, options.seeds.end, "recall", "precision", "wrong/scan"
-        ));
-    }
+    let mut cells = Vec::new();
     for (number, scene) in SCENES.iter().enumerate() {
         let mut scores = [Score::default(); METHODS.len()];
         for seed in options.seeds.clone() {
@@ -107,79 +115,47 @@ fn measure(options: &Options) {
                 }
             }
         }
-        print_scores(scene, &scores, options.json);
+        cells.extend(METHODS.iter().zip(&scores).flat_map(|(name, score)| scored(scene, name, score)));
     }
-    print_boxes(&boxes, options.json);
-    print_bytes(&bytes, options.json);
+    // A table for each of the three, though they are counted scene by scene.
+    cells.sort_by_key(|cell| [RECALL, PRECISION, WRONG].iter().position(|table| cell.table == *table));
+    for (name, boxes) in METHODS.iter().zip(&boxes) {
+        let rows = [NEW, "taken away: left after N", LEFT];
+        let values = rows.into_iter().zip(boxes.percents());
+        cells.extend(values.map(|(row, percent)| cell(BOX, row, name, "%", percent)));
+    }
+    for (name, bytes) in METHODS.iter().zip(&bytes).filter(|(name, _)| settings(name).is_some()) {
+        let rows = ["scans", "foreground", "foreground when empty"];
+        let values = rows.into_iter().zip(bytes.per_second());
+        cells.extend(values.map(|(row, bytes)| cell("payloads in Fig. 8", row, name, "B/s", bytes)));
+    }
+    let value = |table: &str, row: &str| {
+        let is_it = |cell: &&Cell| cell.table == table && cell.row == row && cell.column == METHODS[0];
+        cells.iter().find(is_it).map_or(Vec::new(), |cell| cell.values.clone())
+    };
+    let figures = TARGETS.map(|(name, row, table, target)| Figure {
+        name,
+        unit: "1",
+        hub: value(table, row),
+        floor: Vec::new(),
+        target,
+    });
+    if !options.json {
+        println!("seeds {}..{}", options.seeds.start, options.seeds.end);
+    }
+    figures::print("foreground", options.json, &figures);
+    figures::print_cells("foreground", options.json, &cells);
 }
 
-fn print_scores(scene: &Scene, scores: &[Score], json: bool) {
-    if !json {
-        say(format_args!("{}", scene.name));
-    }
-    for (name, score) in METHODS.iter().zip(scores) {
-        let (recall, precision, wrong) = (score.recall(), score.precision(), score.wrong_per_scan());
-        let target = TARGETS.iter().find(|target| *name == "multi" && target.0 == scene.name);
-        let is_met =
-            target.map(|(_, least)| recall >= least[0] && precision >= least[1] && wrong <= least[2]);
-        if json {
-            let line = json!({
-                "class": "foreground_bench", "scene": scene.name, "world": scene.world, "mixed": scene.mixed,
-                "method": name, "recall": recall, "precision": precision, "wrong_per_scan": wrong, "met": is_met,
-            });
-            say(format_args!("{line}"));
-        } else {
-            let verdict = is_met.map_or("", |met| if met { "met" } else { "missed" });
-            say(format_args!("  {name:<34} {recall:>8.4} {precision:>9.4} {wrong:>11.3}  {verdict}"));
-        }
-    }
+fn scored(scene: &Scene, method: &str, score: &Score) -> [Cell; 3] {
+    [(RECALL, score.recall()), (PRECISION, score.precision()), (WRONG, score.wrong_per_scan())]
+        .map(|(table, value)| cell(table, scene.name, method, "1", value))
 }
 
-fn print_boxes(boxes: &[Boxes], json: bool) {
-    if !json {
-        say(format_args!("of a box, %{:>33} {:>17} {:>12}", "new after N", "left of it: N", "2N"));
-    }
-    for (name, boxes) in METHODS.iter().zip(boxes) {
-        let [new, gone, long_gone] = boxes.percents();
-        if json {
-            let line = json!({
-                "class": "foreground_bench_box", "method": name, "scans": 375, "foreground_after_n_percent": new,
-                "background_after_n_percent": gone, "background_after_2n_percent": long_gone,
-            });
-            say(format_args!("{line}"));
-        } else {
-            say(format_args!("  {name:<34} {new:>8.2} {gone:>17.2} {long_gone:>12.2}"));
-        }
-    }
-}
-
-fn print_bytes(bytes: &[Bytes], json: bool) {
-    if !json {
-        say(format_args!(
-            "bytes a second in Fig. 8{:>18} {:>11} {:>7} {:>12}",
-            "scans", "foreground", "ratio", "when empty"
-        ));
-    }
-    for (name, bytes) in METHODS.iter().zip(bytes).filter(|(name, _)| settings(name).is_some()) {
-        let [scans, foreground, empty] = bytes.per_second();
-        let ratio = scans / foreground;
-        if json {
-            let line = json!({
-                "class": "foreground_bench_bytes", "method": name, "scan_bytes_per_s": scans,
-                "foreground_bytes_per_s": foreground, "empty_bytes_per_s": empty, "ratio": ratio,
-            });
-            say(format_args!("{line}"));
-        } else {
-            say(format_args!("  {name:<32} {scans:>8.0} {foreground:>11.0} {ratio:>7.2} {empty:>12.0}"));
-        }
-    }
-}
-
-/// A line on stdout; who reads no further wants no more.
-fn say(line: fmt::Arguments<'_>) {
-    if writeln!(stdout(), "{line}").is_err() {
-        exit(0);
-    }
+fn cell(table: &str, row: &str, method: &str, unit: &'static str, value: f64) -> Cell {
+    // Without anybody to tell, or nothing told, a share is no number.
+    let values = if value.is_finite() { vec![value] } else { Vec::new() };
+    Cell { table: table.into(), row: row.into(), column: method.into(), unit, values }
 }
 
 struct Options {

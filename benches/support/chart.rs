@@ -183,7 +183,8 @@ impl Chart {
                 let _ = writeln!(
                     svg,
                     "<circle cx=\"{x:.1}\" cy=\"{y:.1}\" r=\"3.5\" fill=\"{colour}\"><title>{named}: {}, {}</title></circle>",
-                    point.x, point.y
+                    self::number(point.x),
+                    self::number(point.y)
                 );
             }
         }
@@ -210,7 +211,7 @@ impl Chart {
                     low - high,
                     colour(number),
                     escaped(&series.name),
-                    point.y
+                    self::number(point.y)
                 );
                 spread(svg, middle(group), y_axis, *top + point.least, *top + point.most, "#808080");
                 *top += point.y;

@@ -37,6 +37,8 @@ pub(crate) enum Target {
     None,
     /// The hub's median at most so.
     Most(f64),
+    /// The hub's median at least so.
+    Least(f64),
     /// The median of the ratios at most so.
     Ratio(f64),
 }
@@ -53,6 +55,9 @@ impl Spread {
 
     fn text(&self) -> String {
         let Spread(middle, least, most) = self;
+        if least == most {
+            return short(*middle);
+        }
         format!("{} [{} .. {}]", short(*middle), short(*least), short(*most))
     }
 
@@ -76,6 +81,7 @@ impl Figure {
         match self.target {
             Target::None => None,
             Target::Most(most) => Some((format!("<= {most}"), Spread::of(&self.hub)?.0 <= most)),
+            Target::Least(least) => Some((format!(">= {least}"), Spread::of(&self.hub)?.0 >= least)),
             Target::Ratio(most) => Some((format!("ratio <= {most}"), Spread::of(&self.ratios())?.0 <= most)),
         }
     }
@@ -130,7 +136,10 @@ pub(crate) fn print_cells(bench: &str, json: bool, cells: &[Cell]) {
             let text = |column: &&String| {
                 let cell = cells.iter().find(|cell| cell.row == *row && cell.column == **column);
                 let spread = cell.and_then(|cell| Some((Spread::of(&cell.values)?, cell.unit)));
-                let text = spread.map_or("-".into(), |(spread, unit)| format!("{} {unit}", spread.text()));
+                let text = spread.map_or("-".into(), |(spread, unit)| match unit {
+                    "1" => spread.text(),
+                    _ => format!("{} {unit}", spread.text()),
+                });
                 format!(" {text:>26}")
             };
             println!("{row:28}{}", columns.iter().map(text).collect::<String>());
@@ -161,8 +170,9 @@ pub(crate) fn percentile(sorted: &[f64], part: f64) -> Option<f64> {
 
 fn short(value: f64) -> String {
     match value.abs() {
-        size if size >= 100.0 => format!("{value:.0}"),
+        size if size >= 100.0 || value == value.trunc() => format!("{value:.0}"),
         size if size >= 10.0 => format!("{value:.1}"),
-        _ => format!("{value:.2}"),
+        size if size >= 1.0 => format!("{value:.2}"),
+        _ => format!("{value:.3}"),
     }
 }
