@@ -11,6 +11,7 @@ pub(crate) mod crowd;
 pub(crate) mod figures;
 pub(crate) mod host;
 pub(crate) mod line;
+pub(crate) mod memory;
 pub(crate) mod options;
 pub(crate) mod stage;
 pub(crate) mod truth;

@@ -40,6 +40,11 @@ impl Stage {
         Ok(())
     }
 
+    /// A file that parts may agree upon.
+    pub(crate) fn file(&self, name: &str) -> PathBuf {
+        self.directory.join(name)
+    }
+
     /// The file with the truth.
     pub(crate) fn truth(&self) -> PathBuf {
         self.directory.join("truth")

@@ -1,0 +1,185 @@
+//! What a scan costs the hub's thread from loan to wake-up, with 0 to 200 consumers: awake, asleep at the bell, asleep at the
+//! event. And what a datagram costs: packing and sealing, reading and checking. Publishing is told as processor time of the
+//! thread that publishes, with some 0.3 us for looking at that clock; what consumers do meanwhile is not in it.
+
+#![allow(missing_docs)] // criterion's macros make public functions
+
+#[path = "lan/source.rs"]
+mod source;
+#[path = "support/mod.rs"]
+mod support;
+
+use std::hint::black_box;
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
+use std::thread;
+use std::time::{Duration, Instant};
+
+use criterion::{BenchmarkId, Criterion, criterion_group, criterion_main};
+use rustix::time::{ClockId, clock_gettime};
+use schema::datagram::{Datagram, HEAD, Head, MTU_ETHERNET, Packed};
+use schema::ipc::{self, Bell, Node, Payload};
+use schema::{Foreground, Marks, Scan, Topic, Zones};
+use source::{SENSOR, Source};
+use support::stage::{PATIENCE, Stage};
+use support::{Outcome, clock};
+
+/// What consumers do until there is something.
+#[derive(Clone, Copy, PartialEq)]
+enum Rest {
+    Awake,
+    Bell,
+    Event,
+}
+
+fn publish(c: &mut Criterion) {
+    Stage::sweep().expect("the temporary directory can be read");
+    let mut group = c.benchmark_group("publish a scan");
+    group.sample_size(10).warm_up_time(Duration::from_millis(500)).measurement_time(Duration::from_secs(2));
+    for (name, rest) in
+        [("awake", Rest::Awake), ("asleep at the bell", Rest::Bell), ("asleep at the event", Rest::Event)]
+    {
+        for count in CONSUMERS.into_iter().filter(|count| *count > 0 || rest == Rest::Awake) {
+            let stage = Stage::new().expect("a domain");
+            let mut source = Source::open(&stage.domain).expect("a publisher");
+            let node = ipc::client_node(&stage.domain).expect("a node");
+            let crowd = Crowd::default();
+            thread::scope(|scope| {
+                let _end = End(&crowd);
+                if rest != Rest::Awake {
+                    for _ in 0..count {
+                        scope.spawn(|| {
+                            follow(&node, rest, &crowd).unwrap_or_else(|error| eprintln!("{error}"))
+                        });
+                    }
+                    wait_until(|| crowd.ready.load(Ordering::Acquire) == count);
+                }
+                let awake: Vec<_> = (0..if rest == Rest::Awake { count } else { 0 })
+                    .map(|_| subscriber(&node).expect("a place"))
+                    .collect();
+                let mut sent = 0;
+                group.bench_function(BenchmarkId::new(name, count), |b| {
+                    b.iter_custom(|times| {
+                        let mut busy = Duration::ZERO;
+                        for _ in 0..times {
+                            let before = processor_time();
+                            source.publish(0).expect("is sent");
+                            busy += processor_time() - before;
+                            sent += 1;
+                            for subscriber in &awake {
+                                assert!(matches!(Scan::receive(subscriber), Ok(Some(_))), "a scan for each");
+                            }
+                            if rest != Rest::Awake {
+                                wait_until(|| crowd.received.load(Ordering::Acquire) >= sent * count);
+                                // Scans do not come one upon the other: the last one, too, is asleep again.
+                                thread::sleep(PAUSE);
+                            }
+                        }
+                        busy
+                    });
+                });
+            });
+        }
+    }
+    group.finish();
+}
+
+/// What the threads of consumers have come to.
+#[derive(Default)]
+struct Crowd {
+    ready: AtomicU64,
+    received: AtomicU64,
+    is_over: AtomicBool,
+}
+
+/// Lets the consumers go, however the bench ends: they look at least so often.
+struct End<'a>(&'a Crowd);
+
+impl Drop for End<'_> {
+    fn drop(&mut self) {
+        self.0.is_over.store(true, Ordering::Release);
+    }
+}
+
+fn follow(node: &Node, rest: Rest, crowd: &Crowd) -> Outcome<()> {
+    let subscriber = subscriber(node)?;
+    let bell = Bell::open(node, SENSOR)?.ok_or("no bell")?;
+    let listener = match rest {
+        Rest::Event => Some(ipc::listener(&ipc::open_wake(node, SENSOR)?.ok_or("no event")?)?),
+        Rest::Awake | Rest::Bell => None,
+    };
+    crowd.ready.fetch_add(1, Ordering::Release);
+    while !crowd.is_over.load(Ordering::Acquire) {
+        let rung = bell.rung();
+        if let Some(listener) = &listener {
+            ipc::take_wakeups(&[listener])?;
+        }
+        while Scan::receive(&subscriber).map_err(|error| format!("{error:?}"))?.is_some() {
+            crowd.received.fetch_add(1, Ordering::Release);
+        }
+        match &listener {
+            Some(listener) => ipc::sleep(&[listener], LOOK)?,
+            None => ipc::sleep_at_bells(&[(&bell, rung)], clock::now() + LOOK.as_nanos() as u64)
+                .map_err(|_| "no bells on this system")?,
+        }
+    }
+    Ok(())
+}
+
+fn subscriber(node: &Node) -> Outcome<ipc::Subscriber<Scan>> {
+    let service = Scan::open(node, SENSOR)?.ok_or("no topic")?;
+    Ok(Scan::subscriber(&service)?)
+}
+
+fn wait_until(is_so: impl Fn() -> bool) {
+    let give_up_at = Instant::now() + 6 * PATIENCE;
+    while !is_so() {
+        assert!(Instant::now() < give_up_at, "the consumers do not come on");
+        thread::sleep(Duration::from_micros(100));
+    }
+}
+
+fn processor_time() -> Duration {
+    let used = clock_gettime(ClockId::ThreadCPUTime);
+    Duration::new(used.tv_sec as u64, used.tv_nsec as u32)
+}
+
+fn datagram(c: &mut Criterion) {
+    let mut group = c.benchmark_group("datagram");
+    payload(&mut group, Topic::Scan, source::scan());
+    payload(&mut group, Topic::Zones, Zones::unknown());
+    payload(&mut group, Topic::Marks, Marks::default());
+    payload(&mut group, Topic::Foreground, Foreground::default());
+    group.finish();
+}
+
+type Group<'a> = criterion::BenchmarkGroup<'a, criterion::measurement::WallTime>;
+
+fn payload<P: Packed + Default>(group: &mut Group<'_>, topic: Topic, sent: P) {
+    let head = Head { topic: topic.number(), revision: 1, ..Head::default() };
+    let mut buffer = [0; MTU_ETHERNET];
+    group.bench_function(format!("{}, pack and seal", topic.name()), |b| {
+        b.iter(|| {
+            let len = black_box(&sent).pack(&mut buffer[HEAD..]).expect("fits");
+            black_box(head.seal(&mut buffer, len).expect("fits"));
+        });
+    });
+    let len = sent.pack(&mut buffer[HEAD..]).expect("fits");
+    let sealed = head.seal(&mut buffer, len).expect("fits").to_vec();
+    let mut received = P::default();
+    group.bench_function(format!("{}, read, check and unpack", topic.name()), |b| {
+        b.iter(|| {
+            let datagram = Datagram::read(black_box(&sealed)).expect("is whole");
+            assert!(received.unpack(datagram.payload));
+            black_box(&mut received);
+        });
+    });
+}
+
+const CONSUMERS: [u64; 6] = [0, 1, 4, 16, 64, 200];
+/// Between two scans, so that all sleep: a sensor's are 26 times as far apart.
+const PAUSE: Duration = Duration::from_millis(1);
+/// So often consumers look whether the bench is over.
+const LOOK: Duration = Duration::from_millis(500);
+
+criterion_group!(benches, publish, datagram);
+criterion_main!(benches);
