@@ -50,6 +50,8 @@ pub(crate) struct Follower<P: Payload + ?Sized> {
     boot: Option<u64>,
     expected: Option<u64>,
     unconnected_since: Option<Instant>,
+    /// In this moment there was nothing.
+    nothing_at: Option<(u32, Instant)>,
 }
 
 /// How often a topic that is not there is asked for.
@@ -68,6 +70,7 @@ impl<P: Payload + ?Sized> Follower<P> {
             boot: None,
             expected: None,
             unconnected_since: None,
+            nothing_at: None,
         }
     }
 
@@ -87,9 +90,14 @@ impl<P: Payload + ?Sized> Follower<P> {
         let Some((_, subscriber)) = &self.port else {
             return Ok(None);
         };
+        let moment = session.moment(&self.sensor);
+        if moment.is_some() && moment == self.nothing_at {
+            return Ok(None);
+        }
         match P::receive(subscriber) {
             Ok(sample) => {
                 self.unconnected_since = None;
+                self.nothing_at = moment.filter(|_| sample.is_none());
                 Ok(sample.map(|sample| self.account(sample)))
             }
             Err(ReceiveError::ExceedsMaxBorrows) => Err(Failure::new(
@@ -122,6 +130,7 @@ impl<P: Payload + ?Sized> Follower<P> {
         };
         self.port = Some((session.number(), subscriber));
         self.expected = None;
+        self.nothing_at = None;
         Ok(true)
     }
 

@@ -44,6 +44,11 @@ impl Presence {
         change
     }
 
+    /// When it was looked for last.
+    pub(crate) fn looked_at(&self) -> Option<Instant> {
+        self.looked_at
+    }
+
     /// Where the hub lives, if there is one.
     pub(crate) fn domain(&self) -> Option<&Domain> {
         self.hub.as_ref().map(|(domain, _)| domain)

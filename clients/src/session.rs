@@ -91,6 +91,13 @@ impl Session {
         P::open(&joined.node, sensor)?.map(|topic| P::subscriber(&topic)).transpose()
     }
 
+    /// A moment in the life of `sensor`'s topics: as long as it is the same, nothing new was sent. Nothing where that is not
+    /// known. What late joiners get comes without a word, so a moment ends with the next look for the hub, too.
+    pub(crate) fn moment(&self, sensor: &str) -> Option<(u32, Instant)> {
+        let rung = self.joined.as_ref()?.wakeups.rung(sensor)?;
+        Some((rung, self.presence.looked_at()?))
+    }
+
     /// Sleeps until something was sent, at the latest until `until`, and 100 ms at most; returns at once if something
     /// may have been sent since the caller looked. Hold no sample meanwhile.
     pub(crate) fn wait(&mut self, until: Option<Instant>) -> Result<(), Failure> {

@@ -97,6 +97,12 @@ impl Wakeups {
         }
     }
 
+    /// How often the bell of the sensor `name` was rung by now; nothing where that does not tell whether something was sent.
+    pub(crate) fn rung(&self, name: &str) -> Option<u32> {
+        let sensor = self.sensors.iter().find(|sensor| sensor.name == name)?;
+        sensor.bell.as_ref().filter(|bell| !bell.is_closed()).map(Bell::rung)
+    }
+
     /// Whether a bell was rung since this was last asked; what was sent before can be received now.
     fn heard(&mut self) -> bool {
         let mut any = false;
