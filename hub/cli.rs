@@ -2,6 +2,7 @@
 //! uses it.
 
 mod background;
+mod config;
 mod configure;
 mod control;
 mod doctor;
@@ -23,6 +24,7 @@ use daemon::config::Sources;
 use schema::{DEFAULT_DOMAIN, Domain, Environment, Failure};
 
 pub(crate) use background::Background;
+pub(crate) use config::Config;
 pub(crate) use control::Control;
 pub(crate) use gateway::Gateway;
 pub(crate) use latency::Latency;
@@ -87,6 +89,8 @@ pub(crate) enum Verb {
     /// Change what a sensor keeps for ever, after showing the difference and asking
     #[command(after_help = configure::CONSENT)]
     Configure(configure::Configure),
+    /// The configuration: one to begin with, whether one is right, what is in effect and where it is said
+    Config(Config),
     /// Every condition that a working set-up needs, and what to do where one is not met
     Doctor(doctor::Doctor),
     /// Sensors and topics of the running hub

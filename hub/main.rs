@@ -76,6 +76,7 @@ fn dispatch(cli: &Cli) -> Result<(), Failure> {
         Verb::Configure(configure) => {
             configure.run(everywhere.json, &*interrupt_by(&[SIGINT, SIGTERM, SIGHUP, SIGQUIT])?)
         }
+        Verb::Config(config) => config.run(everywhere),
         Verb::Doctor(doctor) => doctor.run(everywhere, &*interrupt()?),
         Verb::List { domains: true } => clients::list_domains(&everywhere.bases(), everywhere.json, &mut out),
         Verb::List { domains: false } => {

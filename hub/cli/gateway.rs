@@ -6,7 +6,6 @@ use std::time::Duration;
 use clap::Args;
 use clients::{GatewayLook, GatewayOptions, duration};
 use daemon::config;
-use schema::datagram::MTU_SAFE;
 use schema::{Failure, Kind};
 
 use super::{Configured, Everywhere};
@@ -44,10 +43,7 @@ pub(crate) struct Gateway {
 impl Gateway {
     pub(crate) fn options(&self, everywhere: &Everywhere) -> Result<GatewayOptions, Failure> {
         let said = config::Gateway::load(&self.configured.sources())?;
-        let every = said.background_every.map(|(text, place)| {
-            let refuse = |what| Failure::new(Kind::Configuration, format!("{place}: {what}"), "");
-            duration::parse(&text).map_err(refuse)
-        });
+        let every = background_every(&said)?;
         let or = |flags: &[String], said: Option<Vec<String>>| match flags {
             [] => said.unwrap_or_default(),
             flags => flags.to_vec(),
@@ -57,9 +53,9 @@ impl Gateway {
             topics: or(&self.topics, said.topics),
             to: or(&self.to, said.to),
             bare: self.bare || said.bare.unwrap_or_default(),
-            ttl: self.ttl.or(said.ttl).unwrap_or(1),
-            background_every: self.background_every.or(every.transpose()?),
-            longest: self.mtu.or(said.mtu).unwrap_or(MTU_SAFE),
+            ttl: self.ttl.or(said.ttl).unwrap_or(config::Gateway::TTL),
+            background_every: self.background_every.or(every),
+            longest: self.mtu.or(said.mtu).unwrap_or(config::Gateway::MTU),
             look: match (everywhere.json, stdout().is_terminal()) {
                 (true, _) => GatewayLook::Json,
                 (false, true) => GatewayLook::Terminal,
@@ -68,6 +64,16 @@ impl Gateway {
             places: everywhere.places()?,
         })
     }
+}
+
+/// How often the configuration wants a background to go out.
+pub(super) fn background_every(said: &config::Gateway) -> Result<Option<Duration>, Failure> {
+    let every = said.background_every.as_ref().map(|(text, place)| {
+        let refuse =
+            |what| Failure::new(Kind::Configuration, format!("{place}: {what}"), "write 10s, 250ms, 5m");
+        duration::parse(text).map_err(refuse)
+    });
+    every.transpose()
 }
 
 /// What the help says of where it sends.

@@ -1,6 +1,8 @@
 //! What the hub is told: links with their ports and what to ask of their sensors. Several sources, the last one wins.
 
+mod effective;
 mod gateway;
+mod places;
 mod processing;
 mod sources;
 
@@ -13,6 +15,7 @@ use schema::{Failure, Kind};
 use crate::layer::{Drafts, parse};
 use crate::origin::Origin;
 
+pub use effective::{Value, values};
 pub use gateway::Gateway;
 pub(crate) use processing::START;
 pub use processing::{Background, Processing, Zones};
@@ -120,7 +123,7 @@ impl Config {
             drafts.merge(layer, origin, true)?;
         }
         if drafts.len() == 0 {
-            drafts.merge(parse(&Origin::Default, DEFAULT)?, Origin::Default, true)?;
+            drafts.merge(parse(&Origin::Default)?, Origin::Default, true)?;
         }
         for layer in sources.settings() {
             let (origin, layer) = layer?;
@@ -161,8 +164,11 @@ fn check_ports(links: &[Link]) -> Result<(), Failure> {
 /// Links of one hub.
 const MAX_LINKS: usize = 256;
 
-/// What a hub without any link in its configuration does.
-const DEFAULT: &str = r#"
+/// What a hub without any configuration does, written out to begin one with.
+pub const DEFAULT: &str = include_str!("config/default.toml");
+
+/// The links of a hub for which none are said.
+pub(crate) const LINKS: &str = r#"
 [[link]]
 name = "front"
 port = "/dev/ttyUSB0"

@@ -153,9 +153,9 @@ impl Draft {
     }
 }
 
-/// The TOML `text` as a layer.
-pub(crate) fn parse(origin: &Origin, text: &str) -> Result<Layer, Failure> {
-    toml::from_str(text).map_err(|error| origin.explain(&error))
+/// What `origin` says.
+pub(crate) fn parse(origin: &Origin) -> Result<Layer, Failure> {
+    toml::from_str(origin.text()).map_err(|error| origin.explain(&error))
 }
 
 fn merge(

@@ -5,14 +5,16 @@ use std::path::{Path, PathBuf};
 
 use schema::{Failure, Kind};
 
+use crate::config::LINKS;
+
 /// One source of values with its text.
 #[derive(Clone, Debug)]
 pub(crate) enum Origin {
     /// A TOML file.
     File { path: PathBuf, text: String },
-    /// A flag of the command line, as given.
-    Flag(String),
-    /// The program's own defaults.
+    /// A flag of the command line, as given, and as TOML.
+    Flag { flag: String, text: String },
+    /// The program's own links.
     Default,
 }
 
@@ -28,11 +30,11 @@ impl Origin {
         Ok(Origin::File { path: path.to_owned(), text })
     }
 
-    /// What stands in it; a flag's text is made by who reads it.
+    /// What stands in it, as TOML.
     pub(crate) fn text(&self) -> &str {
         match self {
-            Origin::File { text, .. } => text,
-            Origin::Flag(_) | Origin::Default => "",
+            Origin::File { text, .. } | Origin::Flag { text, .. } => text,
+            Origin::Default => LINKS,
         }
     }
 
@@ -46,7 +48,7 @@ impl Origin {
                 format!("{}:{line}:{column}", path.display())
             }
             (Origin::File { path, .. }, None) => path.display().to_string(),
-            (Origin::Flag(flag), _) => flag.clone(),
+            (Origin::Flag { flag, .. }, _) => flag.clone(),
             (Origin::Default, _) => "default configuration".to_owned(),
         }
     }

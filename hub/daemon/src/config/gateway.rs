@@ -1,6 +1,7 @@
 //! Section `gateway` over all sources. Refuses to know what a gateway is: who makes one reads what only it understands.
 
 use schema::Failure;
+use schema::datagram::MTU_SAFE;
 
 use super::Sources;
 
@@ -24,6 +25,11 @@ pub struct Gateway {
 }
 
 impl Gateway {
+    /// Networks that a datagram crosses if nobody says how many.
+    pub const TTL: u8 = 1;
+    /// The longest datagram in bytes if nobody says it.
+    pub const MTU: usize = MTU_SAFE;
+
     /// Reads the section in all sources, the last one wins. Links need not be there.
     ///
     /// [`schema::Kind::Configuration`] with place, value and remedy.

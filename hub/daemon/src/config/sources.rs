@@ -40,7 +40,7 @@ impl Sources {
     pub(super) fn files(&self) -> impl Iterator<Item = Said> {
         self.files.iter().map(|path| {
             let origin = Origin::read(path)?;
-            let layer = parse(&origin, origin.text())?;
+            let layer = parse(&origin)?;
             Ok((origin, layer))
         })
     }
@@ -48,27 +48,36 @@ impl Sources {
     /// The links of the command line.
     pub(super) fn links(&self) -> impl Iterator<Item = Said> {
         self.links.iter().map(|flag| {
-            let origin = Origin::Flag(format!("--link {flag}"));
-            let (name, port) = flag.split_once('=').ok_or_else(|| {
-                origin.refuse(None, "no = in it", "write --link NAME=PORT, for example front=/dev/ttyUSB0")
-            })?;
-            let text = format!("[[link]]\nname = {}\nport = {}", quoted(name), quoted(port));
-            let layer = parse(&origin, &text)?;
-            Ok((origin, layer))
+            let text = flag
+                .split_once('=')
+                .map(|(name, port)| format!("[[link]]\nname = {}\nport = {}", quoted(name), quoted(port)));
+            let remedy = "write --link NAME=PORT, for example front=/dev/ttyUSB0";
+            of_flag(format!("--link {flag}"), text, "no = in it", remedy)
         })
     }
 
     /// The single values of the command line.
     pub(super) fn settings(&self) -> impl Iterator<Item = Said> {
         self.set.iter().map(|flag| {
-            let origin = Origin::Flag(format!("--set {flag}"));
-            let text = setting(flag).ok_or_else(|| {
             let remedy = "write --set link.NAME.KEY=VALUE, as link.front.angle=100, or for all links --set \
                           zones.radii=[1.2,0.7]";
-            origin.refuse(None, "not a setting", remedy)
-        })?;
-            let layer = parse(&origin, &text)?;
-            Ok((origin, layer))
+            of_flag(format!("--set {flag}"), setting(flag), "not a setting", remedy)
         })
     }
+
+    /// All of them, in the order in which they win.
+    pub(super) fn all(&self) -> impl Iterator<Item = Said> {
+        self.files().chain(self.links()).chain(self.settings())
+    }
+}
+
+/// A flag that says `text`; refused if it says nothing.
+fn of_flag(flag: String, text: Option<String>, what: &str, remedy: &str) -> Said {
+    let is_none = text.is_none();
+    let origin = Origin::Flag { flag, text: text.unwrap_or_default() };
+    if is_none {
+        return Err(origin.refuse(None, what, remedy));
+    }
+    let layer = parse(&origin)?;
+    Ok((origin, layer))
 }
