@@ -7,11 +7,15 @@ use schema::{Domain, Failure, Kind, publisher};
 /// How often the locks are looked at.
 const LOOK_EVERY: Duration = Duration::from_millis(100);
 
+/// How often the locks are looked at although the hub is heard.
+const MAKE_SURE_EVERY: Duration = Duration::from_secs(1);
+
 /// The hub of a domain, as far as its lock tells.
 pub(crate) struct Presence {
     places: Vec<Domain>,
     hub: Option<(Domain, u32)>,
     looked_at: Option<Instant>,
+    heard_at: Option<Instant>,
     denied: Option<Failure>,
 }
 
@@ -27,12 +31,19 @@ pub(crate) struct Change {
 impl Presence {
     /// Watches for a hub at `places`; the first live one is taken.
     pub(crate) fn new(places: Vec<Domain>) -> Presence {
-        Presence { places, hub: None, looked_at: None, denied: None }
+        Presence { places, hub: None, looked_at: None, heard_at: None, denied: None }
     }
 
-    /// Looks again, if the last look is long enough ago.
+    /// A sign of life of the hub.
+    pub(crate) fn heard(&mut self) {
+        self.heard_at = Some(Instant::now());
+    }
+
+    /// Looks again, if the last look is long enough ago and nothing was heard of the hub since.
     pub(crate) fn look(&mut self) -> Change {
-        if self.looked_at.is_some_and(|at| at.elapsed() < LOOK_EVERY) {
+        let is_within = |at: Option<Instant>, limit| at.is_some_and(|at| at.elapsed() < limit);
+        let is_heard = is_within(self.heard_at, LOOK_EVERY) && is_within(self.looked_at, MAKE_SURE_EVERY);
+        if is_heard || is_within(self.looked_at, LOOK_EVERY) {
             return Change::default();
         }
         self.looked_at = Some(Instant::now());

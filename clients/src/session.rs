@@ -41,6 +41,9 @@ impl Session {
     ///
     /// [`Kind::Short`](schema::Kind) if memory or descriptors are; who has joined already goes on without a look.
     pub(crate) fn look(&mut self) -> Result<Change, Failure> {
+        if self.joined.as_mut().is_some_and(|joined| joined.wakeups.take_rang()) {
+            self.presence.heard();
+        }
         let change = self.presence.look();
         let Some(domain) = self.presence.domain() else {
             return match self.presence.short() {

@@ -24,6 +24,8 @@ pub enum Wait {
 pub(crate) struct Wakeups {
     wait: Wait,
     sensors: Vec<Sensor>,
+    /// A bell was rung since that was last asked.
+    rang: bool,
     /// Wake-ups by event were taken since the last sleep, and samples looked for since.
     taken: bool,
 }
@@ -39,7 +41,7 @@ struct Sensor {
 impl Wakeups {
     /// None yet.
     pub(crate) fn by(wait: Wait) -> Wakeups {
-        Wakeups { wait, sensors: Vec::new(), taken: false }
+        Wakeups { wait, sensors: Vec::new(), rang: false, taken: false }
     }
 
     /// Those of the sensor `name` too; whether they are there already.
@@ -97,19 +99,25 @@ impl Wakeups {
         }
     }
 
+    /// Whether a bell was rung since this was last asked: who rings, lives.
+    pub(crate) fn take_rang(&mut self) -> bool {
+        std::mem::take(&mut self.rang)
+    }
+
     /// How often the bell of the sensor `name` was rung by now; nothing where that does not tell whether something was sent.
     pub(crate) fn rung(&self, name: &str) -> Option<u32> {
         let sensor = self.sensors.iter().find(|sensor| sensor.name == name)?;
         sensor.bell.as_ref().filter(|bell| !bell.is_closed()).map(Bell::rung)
     }
 
-    /// Whether a bell was rung since this was last asked; what was sent before can be received now.
+    /// Whether a bell was rung since samples were last looked for; what was sent before can be received now.
     fn heard(&mut self) -> bool {
         let mut any = false;
         for sensor in &mut self.sensors {
             let rung = sensor.bell.as_ref().map_or(sensor.rung, Bell::rung);
             any |= std::mem::replace(&mut sensor.rung, rung) != rung;
         }
+        self.rang |= any;
         any
     }
 
