@@ -22,12 +22,13 @@ pub(crate) fn two_links(options: &Options) -> Outcome<()> {
     let hub = stage.hub(&SENSORS)?;
     hub.await_line("ready", PATIENCE)?;
     let alone = segments(&stage.domain)?;
+    // They stay until they are ended: the first ones, too, while the last come.
+    let (seconds, long) = (options.seconds(8), 3600);
     let crowds: Vec<_> = SENSORS
         .iter()
-        .map(|sensor| crowd::start(&stage, sensor, 100, options.seconds(8), "doorbell"))
+        .map(|sensor| crowd::start(&stage, sensor, 100, long, "doorbell"))
         .collect::<Outcome<_>>()?;
-    // None of them has left before the end.
-    thread::sleep(Duration::from_millis(900 * options.seconds(8)));
+    thread::sleep(Duration::from_secs(seconds));
     let resident = Resident::of(hub.guard.pid())?;
     let full = segments(&stage.domain)?;
     drop(crowds);
