@@ -137,9 +137,9 @@ fn dispatch(cli: &Cli) -> Result<(), Failure> {
 }
 
 fn run_hub(run: &cli::Run, everywhere: &Everywhere) -> Result<(), Failure> {
-    let config = Config::load(&run.sources())?;
+    let read = || Config::load(&run.sources());
     let domain = everywhere.hub_domain()?;
-    daemon::run(&config, &domain, |ready| {
+    daemon::run(&read, &domain, |ready| {
         let line = if everywhere.json {
             line(&HubReady {
                 class: "ready",

@@ -27,7 +27,7 @@ use serde_json::Value;
 pub(crate) use line::{Line, open_line};
 pub(crate) use machine::{Machine, command_in, ip};
 pub(crate) use network::in_a_network;
-pub(crate) use program::{INT, KILL, Outcome, Program, TERM, USR1};
+pub(crate) use program::{HUP, INT, KILL, Outcome, Program, TERM, USR1};
 pub(crate) use receiver::{Receiver, read};
 pub(crate) use relay::Relay;
 pub(crate) use robot::Robot;

@@ -15,6 +15,7 @@ use super::PATIENCE;
 pub(crate) const INT: Signal = Signal::INT;
 pub(crate) const TERM: Signal = Signal::TERM;
 pub(crate) const KILL: Signal = Signal::KILL;
+pub(crate) const HUP: Signal = Signal::HUP;
 pub(crate) const USR1: Signal = Signal::USR1;
 
 /// A running child.

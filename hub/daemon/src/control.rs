@@ -4,14 +4,15 @@
 mod orders;
 
 use std::os::fd::{AsFd, BorrowedFd, OwnedFd};
-use std::sync::Arc;
 use std::sync::mpsc::{Receiver, SyncSender, TrySendError, channel, sync_channel};
+use std::sync::{Arc, Mutex, PoisonError};
 
 use rustix::event::{EventfdFlags, eventfd};
 use rustix::io::Errno;
 use schema::ipc::{self, Asked, ControlServer, Node};
 use schema::{Background, Failure, Kind, Response, Verb, shortage};
 
+use crate::config::Processing;
 pub(crate) use orders::{Flow, Orders};
 
 /// Where requests come in; stays in the supervising thread.
@@ -29,8 +30,12 @@ pub(crate) struct Desk {
 struct Inbox {
     sensor: String,
     queue: SyncSender<Order>,
+    changed: Changed,
     bell: Arc<Bell>,
 }
+
+/// What a link shall make of its scans from now on, until it has taken it.
+type Changed = Arc<Mutex<Option<Box<Processing>>>>;
 
 /// What came of an order: done, with the model that was asked for, or why not.
 type Outcome = Result<Option<Box<Background>>, Failure>;
@@ -56,12 +61,18 @@ impl Desk {
         let (mut links, mut ends) = (Vec::new(), Vec::new());
         for sensor in sensors {
             let (sender, queue) = sync_channel(QUEUE);
-            let own = Arc::new(Bell::new()?);
-            links.push(Inbox { sensor: sensor.to_owned(), queue: sender, bell: own.clone() });
+            let (own, changed) = (Arc::new(Bell::new()?), Changed::default());
+            links.push(Inbox {
+                sensor: sensor.to_owned(),
+                queue: sender,
+                changed: changed.clone(),
+                bell: own.clone(),
+            });
             ends.push(Orders {
                 sensor: sensor.to_owned(),
                 paused: false,
                 queue,
+                changed,
                 bell: own,
                 outcomes: told.clone(),
                 desk: bell.clone(),
@@ -73,6 +84,15 @@ impl Desk {
     /// What becomes readable when there is something to [`serve`](Self::serve).
     pub(crate) fn descriptors(&self) -> [BorrowedFd<'_>; 2] {
         [ipc::descriptor(self.server.requests()), self.bell.0.as_fd()]
+    }
+
+    /// Lets the link of `sensor` make of its scans what `processing` says, as soon as it looks; the last word holds.
+    pub(crate) fn change(&self, sensor: &str, processing: &Processing) {
+        if let Some(link) = self.links.iter().find(|link| link.sensor == sensor) {
+            let mut changed = link.changed.lock().unwrap_or_else(PoisonError::into_inner);
+            *changed = Some(Box::new(processing.clone()));
+            link.bell.ring();
+        }
     }
 
     /// Answers what the links have taken, and hands on what came in.

@@ -35,8 +35,8 @@ pub(crate) struct LinkThread<'a> {
     pub(crate) orders: Orders,
     /// What is made of the scans.
     pub(crate) pipeline: Pipeline,
-    /// When the last verdict of the zones is too old to stand.
-    stale_at: Nanos,
+    /// When the last verdict of the zones is too old to stand; `Nanos::MAX` if none stands.
+    pub(crate) stale_at: Nanos,
     next_greeting: Nanos,
     pub(crate) next_status: Nanos,
     /// Why the port went away the last time, if it did so without a byte.

@@ -17,6 +17,8 @@ pub(crate) struct Pipeline {
     zones: Check,
     marks: Finder,
     background: Option<Kept>,
+    /// By which they are made.
+    processing: Processing,
     /// Where a payload is written that nobody wants, or for which there is no memory.
     spare: Spare,
 }
@@ -70,26 +72,33 @@ impl Pipeline {
     /// The processors as configured, with the model to begin with.
     pub(crate) fn new(processing: &Processing) -> Pipeline {
         let Processing { pose, zones, marks, background } = processing;
-        let background = background.is_kept.then(|| {
-            let mut kept = Kept {
-                model: Box::new(Model::new(background.learning)),
-                cutter: Cutter::new(*pose),
-                every_scan: background.every_scan,
-                published: None,
-                learned: 0,
-                shape: None,
-            };
-            if let Some(model) = &background.model {
-                // Before the first scan every model is taken.
-                let _ = kept.load(model);
-            }
-            kept
-        });
         Pipeline {
             zones: Check::new(*pose, &zones.settings()),
             marks: Finder::new(*marks),
-            background,
+            background: background.is_kept.then(|| Kept::new(processing)),
+            processing: processing.clone(),
             spare: Spare::default(),
+        }
+    }
+
+    /// Goes on as `processing` says, what it says of a begin aside. A check of other circles knows nothing until it has
+    /// seen its scans; a background stays, as far as it is known.
+    pub(crate) fn change(&mut self, processing: &Processing) {
+        let before = std::mem::replace(&mut self.processing, processing.clone());
+        let Processing { pose, zones, marks, background } = &self.processing;
+        if (pose, zones) != (&before.pose, &before.zones) {
+            self.zones = Check::new(*pose, &zones.settings());
+        }
+        self.marks = Finder::new(*marks);
+        match &mut self.background {
+            Some(kept) if background.is_kept => {
+                kept.cutter = Cutter::new(*pose);
+                kept.every_scan = background.every_scan;
+                if background.learning != before.background.learning {
+                    kept.model.change(background.learning);
+                }
+            }
+            kept => *kept = background.is_kept.then(|| Kept::new(processing)),
         }
     }
 
@@ -179,6 +188,23 @@ impl Pipeline {
 }
 
 impl Kept {
+    fn new(processing: &Processing) -> Kept {
+        let background = &processing.background;
+        let mut kept = Kept {
+            model: Box::new(Model::new(background.learning)),
+            cutter: Cutter::new(processing.pose),
+            every_scan: background.every_scan,
+            published: None,
+            learned: 0,
+            shape: None,
+        };
+        if let Some(model) = &background.model {
+            // Before the first scan every model is taken.
+            let _ = kept.load(model);
+        }
+        kept
+    }
+
     fn load(&mut self, model: &Background) -> Result<(), Mismatch> {
         self.model.load(model)?;
         self.shape = Some((model.count, model.unit_mm));
@@ -301,6 +327,36 @@ mod tests {
         shown(&mut pipeline);
         assert_eq!(pipeline.update(&turned, Outputs::default()), Some(Anew::Angles));
         assert_eq!((pipeline.is_news(), pipeline.update(&turned, Outputs::default())), (true, None));
+    }
+
+    #[test]
+    fn other_settings_keep_what_is_known() {
+        let mut pipeline = Pipeline::new(&processing(|_| {}));
+        for _ in 0..20 {
+            pipeline.update(&wall(361, 1, 3000), Outputs::default());
+        }
+        let told = |pipeline: &mut Pipeline, range| {
+            let (mut zones, mut foreground) = (Zones::default(), Foreground::default());
+            let out = Outputs { zones: Some(&mut zones), marks: None, foreground: Some(&mut foreground) };
+            assert_eq!(pipeline.update(&wall(361, 1, range), out), None);
+            (zones.verdict(), foreground.beams)
+        };
+        let known = shown(&mut pipeline);
+        assert_eq!((told(&mut pipeline, 2000), known.taught), ((Verdict::Clear, 361), 361));
+        pipeline.change(&processing(|processing| processing.zones.radii_mm = vec![2500]));
+        assert!(!pipeline.is_news(), "the background is not concerned");
+        assert_eq!(told(&mut pipeline, 2000), (Verdict::Stop, 361));
+        pipeline.change(&processing(|processing| {
+            processing.background.learning.method = preprocess::background::Method::Paper;
+            processing.background.learning.threshold_mm = Some(1500);
+        }));
+        let changed = shown(&mut pipeline);
+        assert_eq!((changed.generation, changed.ranges()), (known.generation + 1, known.ranges()));
+        assert_eq!(told(&mut pipeline, 2000), (Verdict::Clear, 0), "the threshold is another one");
+        pipeline.change(&processing(|processing| processing.background.is_kept = false));
+        assert!(!pipeline.keeps_background());
+        pipeline.change(&processing(|_| {}));
+        assert_eq!((pipeline.keeps_background(), shown(&mut pipeline).taught), (true, 0));
     }
 
     #[test]

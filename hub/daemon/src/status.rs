@@ -3,7 +3,7 @@
 use lms::header::Reject;
 use lms::variant::{Mode, Variant};
 use lms::{Nanos, Session};
-use schema::{Counter, Counters, State, Status};
+use schema::{Counter, Counters, Pose, State, Status};
 
 use crate::config::Link;
 
@@ -81,6 +81,11 @@ impl Account {
             self.measured_at = Some((now, self.scans));
         }
         &self.status
+    }
+
+    /// The sensor sits elsewhere, or so it is said now.
+    pub(crate) fn set_pose(&mut self, pose: Pose) {
+        self.status.pose = pose;
     }
 
     /// The status as it was last.

@@ -2,7 +2,6 @@
 //! domain's upkeep; bytes and topics are the links' business.
 
 use std::os::fd::OwnedFd;
-use std::os::unix::net::UnixStream;
 use std::sync::atomic::AtomicBool;
 use std::sync::mpsc;
 use std::thread;
@@ -11,12 +10,13 @@ use lms::{MILLIS, Nanos};
 use rustix::event::{EventfdFlags, PollFd, PollFlags, Timespec, eventfd, poll};
 use schema::ipc::{self, Node};
 use schema::{Domain, Failure, HubLock, Kind, shortage};
-use signal_hook::consts::{SIGINT, SIGTERM};
 
 use crate::config::Config;
 use crate::control::Desk;
 use crate::link::{LinkThread, Surroundings};
+use crate::reload::Reload;
 use crate::service::{Service, Watchdog};
+use crate::signals::{Signals, Wanted};
 use crate::topics::Topics;
 use crate::{clock, preflight};
 
@@ -29,14 +29,20 @@ pub struct Ready {
     pub sensors: Vec<String>,
 }
 
-/// Runs the hub in `domain` until SIGINT or SIGTERM; `on_ready` is called once, when all topics exist.
+/// Runs the hub in `domain` until SIGINT or SIGTERM; `on_ready` is called once, when all topics exist. `read` tells the
+/// configuration: at the start, and at each SIGHUP, which changes what can be changed while links stream.
 ///
-/// [`Kind::DomainHeld`] if another hub has the domain, [`Kind::Short`] if memory is, the port kinds if a port is there
+/// What `read` fails with at the start, [`Kind::DomainHeld`] if another hub has the domain, [`Kind::Short`] if memory is, the port kinds if a port is there
 /// but cannot be used, [`Kind::Failed`] if shared memory refuses.
-pub fn run(config: &Config, domain: &Domain, on_ready: impl FnOnce(&Ready)) -> Result<(), Failure> {
+pub fn run(
+    read: &dyn Fn() -> Result<Config, Failure>,
+    domain: &Domain,
+    on_ready: impl FnOnce(&Ready),
+) -> Result<(), Failure> {
     let service = Service::of_process();
+    let config = &read()?;
     preflight::raise_descriptor_limit();
-    let signals = end_signals()?;
+    let signals = Signals::of_process()?;
     let _lock = HubLock::acquire(domain.root())?;
     preflight::check_descriptors(config.links.len())?;
     preflight::check_memory(config.links.len())?;
@@ -78,7 +84,8 @@ pub fn run(config: &Config, domain: &Domain, on_ready: impl FnOnce(&Ready)) -> R
             service.ready(&ready.sensors);
             let is_alive = || threads.iter().all(|thread| !thread.is_finished());
             let watchdog = Watchdog::new(&service, &worked, clock::now());
-            outcome = keep_up(&node, &signals, &mut desk, watchdog, is_alive);
+            let reload = Reload::new(config, read, &service);
+            outcome = keep_up(&node, &signals, reload, &mut desk, watchdog, is_alive);
         }
         service.stopping();
         end_links(&stop);
@@ -91,18 +98,22 @@ pub fn run(config: &Config, domain: &Domain, on_ready: impl FnOnce(&Ready)) -> R
 /// Looks after the links, what users ask of them and what dead consumers left, until a signal says to end.
 fn keep_up(
     node: &Node,
-    signals: &UnixStream,
+    signals: &Signals,
+    mut reload: Reload<'_>,
     desk: &mut Desk,
     mut watchdog: Option<Watchdog<'_>>,
     is_alive: impl Fn() -> bool,
 ) -> Result<(), Failure> {
     let mut upkeep_at = clock::now() + UPKEEP;
     loop {
-        let [requests, outcomes] = desk.descriptors().map(|fd| PollFd::from_borrowed_fd(fd, PollFlags::IN));
-        let mut fds = [PollFd::new(signals, PollFlags::IN), requests, outcomes];
-        let woken = poll(&mut fds, Some(&LOOK)).map(|_| !fds[0].revents().is_empty());
-        if woken == Ok(true) {
-            return Ok(());
+        let ([end, hangup], [requests, outcomes]) = (signals.descriptors(), desk.descriptors());
+        let mut fds = [end, hangup, requests, outcomes].map(|fd| PollFd::from_borrowed_fd(fd, PollFlags::IN));
+        // A signal ends the wait, and is there to be taken.
+        let _ = poll(&mut fds, Some(&LOOK));
+        match signals.take() {
+            Some(Wanted::End) => return Ok(()),
+            Some(Wanted::Reload) => reload.reload(desk),
+            None => {}
         }
         // Without a wake-up too: what is behind a request that could not be received has been announced already.
         desk.serve();
@@ -116,17 +127,6 @@ fn keep_up(
             upkeep_at = now + UPKEEP;
         }
     }
-}
-
-/// A socket that becomes readable at SIGINT or SIGTERM.
-fn end_signals() -> Result<UnixStream, Failure> {
-    let register = || {
-        let (read, write) = UnixStream::pair()?;
-        signal_hook::low_level::pipe::register(SIGINT, write.try_clone()?)?;
-        signal_hook::low_level::pipe::register(SIGTERM, write)?;
-        Ok(read)
-    };
-    register().map_err(|error: std::io::Error| no_resource("a signal handler", &error))
 }
 
 fn end_links(stop: &OwnedFd) {

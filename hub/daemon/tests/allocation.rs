@@ -156,11 +156,10 @@ fn windows(letter: char, follow_all: bool, set: &[&str]) -> [(u64, u64, i64); 4]
         set: set.iter().map(|flag| (*flag).to_owned()).collect(),
         ..Sources::default()
     };
-    let config = Config::load(&sources).expect("a configuration");
     let (send, ready) = channel();
     let hub = thread::spawn({
         let domain = domain.clone();
-        move || daemon::run(&config, &domain, |_| send.send(()).unwrap_or_default())
+        move || daemon::run(&|| Config::load(&sources), &domain, |_| send.send(()).unwrap_or_default())
     });
     ready.recv_timeout(Duration::from_secs(20)).expect("the hub is up");
     let node = ipc::client_node(domain).expect("a node");

@@ -174,6 +174,23 @@ impl Model {
         Ok(())
     }
 
+    /// Learns by `settings` from the next scan on. What is background stays background, as well known as can be; what was
+    /// about to be learned is forgotten, and the generation is the next one, as after [`load`](Self::load).
+    pub fn change(&mut self, settings: Settings) {
+        let mut ranges = [Background::UNTAUGHT; BEAMS];
+        let ranges = &mut ranges[..usize::from(self.shape.0)];
+        for (i, range) in ranges.iter_mut().enumerate() {
+            *range = self.learner.background(i, &self.limits);
+        }
+        let was_fresh = self.fresh;
+        self.settings = settings;
+        self.reset();
+        self.learner.adopt(ranges);
+        self.fresh = was_fresh;
+        // The next scan tells what the settings mean in its units.
+        self.angles = None;
+    }
+
     /// Makes the model one for scans such as `scan`.
     fn fit(&mut self, scan: &Scan) {
         let shape = (scan.beams() as u16, scan.unit_mm);

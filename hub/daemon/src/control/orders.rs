@@ -2,14 +2,15 @@
 //! sensor is the session's business, what a reset does to a background the pipeline's.
 
 use std::os::fd::{AsFd, BorrowedFd};
-use std::sync::Arc;
 use std::sync::mpsc::{Receiver, Sender};
+use std::sync::{Arc, PoisonError};
 
-use lms::{Control, Session};
+use lms::{Control, Nanos, Session};
 use schema::{Failure, Kind, Verb, Wake};
 
-use super::{Bell, Order, Outcome};
+use super::{Bell, Changed, Order, Outcome};
 use crate::clock;
+use crate::config::Processing;
 use crate::link::LinkThread;
 
 /// The link's end of the way from the desk.
@@ -17,6 +18,7 @@ pub(crate) struct Orders {
     pub(super) sensor: String,
     pub(super) paused: bool,
     pub(super) queue: Receiver<Order>,
+    pub(super) changed: Changed,
     pub(super) bell: Arc<Bell>,
     pub(super) outcomes: Sender<(u64, Outcome)>,
     pub(super) desk: Arc<Bell>,
@@ -33,8 +35,11 @@ pub(crate) enum Flow<'a> {
 }
 
 impl LinkThread<'_> {
-    /// Does what users asked for.
+    /// Does what users asked for, and takes over what was changed for it.
     pub(crate) fn obey(&mut self, mut flow: Flow<'_>) {
+        if let Some(processing) = self.orders.changed() {
+            self.change(&processing);
+        }
         while let Some(order) = self.orders.take() {
             let control = match order.verb {
                 Verb::Pause => Some(Control::Pause),
@@ -52,6 +57,19 @@ impl LinkThread<'_> {
             }
             self.orders.answer(order.number, outcome);
         }
+    }
+
+    /// From the next scan on. Where none come, the topics say at once how it is now.
+    fn change(&mut self, processing: &Processing) {
+        self.pipeline.change(processing);
+        self.account.set_pose(processing.pose);
+        let now = clock::now();
+        if self.stale_at == Nanos::MAX {
+            self.topics.stale(&mut self.pipeline, now);
+        }
+        self.topics.background(&mut self.pipeline, now);
+        self.topics.wake(Wake::Status);
+        self.next_status = now;
     }
 }
 
@@ -72,6 +90,11 @@ impl Orders {
         }
         self.paused = control == Control::Pause;
         Ok(())
+    }
+
+    fn changed(&self) -> Option<Box<Processing>> {
+        self.bell.hush();
+        self.changed.lock().unwrap_or_else(PoisonError::into_inner).take()
     }
 
     fn take(&self) -> Option<Order> {

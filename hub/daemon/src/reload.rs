@@ -1,0 +1,204 @@
+//! The configuration read anew while the hub runs: what is made of scans changes with the next scan, and nothing of the
+//! stream is lost for it; what belongs to a line waits for the next start, which is said. One that cannot be changes nothing.
+
+use schema::Failure;
+
+use crate::clock;
+use crate::config::{Background, Config, Link, Processing};
+use crate::control::Desk;
+use crate::service::Service;
+
+/// How the configuration is read.
+pub(crate) type Read<'a> = &'a dyn Fn() -> Result<Config, Failure>;
+
+/// What the hub works with, and where it looks whether that is still so.
+pub(crate) struct Reload<'a> {
+    running: Config,
+    read: Read<'a>,
+    service: &'a Service,
+}
+
+/// What another configuration means to a hub that runs.
+#[derive(Debug, Default, PartialEq)]
+struct Differences {
+    /// What its links make of their scans from now on, and which sections of it are others.
+    now: Vec<(String, Processing, Vec<&'static str>)>,
+    /// What has to wait for the next start, by the link's name.
+    later: Vec<(String, Vec<&'static str>)>,
+}
+
+impl<'a> Reload<'a> {
+    /// For a hub that runs with `running`.
+    pub(crate) fn new(running: &Config, read: Read<'a>, service: &'a Service) -> Reload<'a> {
+        Reload { running: running.clone(), read, service }
+    }
+
+    /// Reads the configuration, tells the links by `desk` what concerns them, and the log what came of it.
+    pub(crate) fn reload(&mut self, desk: &Desk) {
+        self.service.reloading(clock::now());
+        let refused = match (self.read)() {
+            Ok(read) => {
+                self.take(read, desk);
+                None
+            }
+            Err(failure) => {
+                tracing::error!(
+                    "the configuration is refused, the old one stays: {}; {}",
+                    failure.message,
+                    failure.hint
+                );
+                Some(failure.message)
+            }
+        };
+        let sensors: Vec<_> = self.running.links.iter().map(|link| link.name.clone()).collect();
+        self.service.reloaded(&sensors, refused.as_deref());
+    }
+
+    fn take(&mut self, read: Config, desk: &Desk) {
+        let Differences { now, later } = Differences::between(&self.running, &read);
+        if now.is_empty() && later.is_empty() {
+            tracing::info!("the configuration is as it was");
+        }
+        for (name, processing, sections) in now {
+            tracing::info!("{name}: {} as configured now", sections.join(", "));
+            desk.change(&name, &processing);
+            if let Some(link) = self.running.links.iter_mut().find(|link| link.name == name) {
+                link.processing = processing;
+            }
+        }
+        for (name, what) in later {
+            tracing::warn!("{name}: {}: takes effect at the next start", what.join(", "));
+        }
+    }
+}
+
+impl Differences {
+    fn between(running: &Config, read: &Config) -> Differences {
+        let mut differences = Differences::default();
+        let named = |config: &'_ Config, name: &str| config.links.iter().position(|link| link.name == name);
+        for old in &running.links {
+            match named(read, &old.name) {
+                Some(at) => differences.of_link(old, &read.links[at]),
+                None => differences.later.push((old.name.clone(), vec!["link removed"])),
+            }
+        }
+        let added = read.links.iter().filter(|link| named(running, &link.name).is_none());
+        differences.later.extend(added.map(|link| (link.name.clone(), vec!["link added"])));
+        differences
+    }
+
+    fn of_link(&mut self, old: &Link, new: &Link) {
+        let taken = taken(&old.processing, &new.processing);
+        let (before, after) = (&old.processing, &taken);
+        let sections = of_others([
+            ("pose", before.pose != after.pose),
+            ("zones", before.zones != after.zones),
+            ("marks", before.marks != after.marks),
+            ("background", before.background != after.background),
+        ]);
+        let begin = |link: &Link| {
+            let background = &link.processing.background;
+            (background.learning.start, background.file.clone())
+        };
+        let is_begun = before.background.is_kept && new.processing.background.is_kept;
+        let waiting = of_others([
+            ("port", old.port != new.port),
+            ("type", old.family != new.family),
+            ("angle", old.variant.angle_deg != new.variant.angle_deg),
+            ("resolution", old.variant.resolution_cdeg != new.variant.resolution_cdeg),
+            ("unit", old.unit != new.unit),
+            ("mode", old.mode != new.mode),
+            ("baud", old.baud != new.baud),
+            ("background.start", is_begun && begin(old) != begin(new)),
+        ]);
+        if !sections.is_empty() {
+            self.now.push((old.name.clone(), taken, sections));
+        }
+        if !waiting.is_empty() {
+            self.later.push((old.name.clone(), waiting));
+        }
+    }
+}
+
+/// What a link that works by `old` takes over of `new`: all but what its background began with.
+fn taken(old: &Processing, new: &Processing) -> Processing {
+    let mut taken = new.clone();
+    if old.background.is_kept {
+        let Background { learning, file, model, .. } = &old.background;
+        taken.background.learning.start = learning.start;
+        (taken.background.file, taken.background.model) = (file.clone(), model.clone());
+    }
+    taken
+}
+
+/// The names of what is another one.
+fn of_others<const N: usize>(compared: [(&'static str, bool); N]) -> Vec<&'static str> {
+    compared.into_iter().filter(|(_, is_other)| *is_other).map(|(name, _)| name).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::config::Sources;
+    use preprocess::background::Start;
+
+    fn config(links: &[&str], set: &[&str]) -> Config {
+        let owned = |flags: &[&str]| flags.iter().map(|flag| (*flag).to_owned()).collect();
+        let sources = Sources { files: Vec::new(), links: owned(links), set: owned(set) };
+        Config::load(&sources).expect("a configuration")
+    }
+
+    #[test]
+    fn what_is_made_of_scans_changes_now_and_lines_at_the_next_start() {
+        let old = config(&["a=/dev/x", "b=/dev/y", "c=/dev/z"], &[]);
+        let same = Differences::between(&old, &old);
+        assert_eq!(same, Differences::default());
+        let new = config(
+            &["d=/dev/w", "b=/dev/other", "a=/dev/x"],
+            &[
+                "zones.radii=[2.0]",
+                "link.a.pose.x=0.3",
+                "link.b.marks.i_min=2",
+                "link.b.angle=100",
+                "link.b.resolution=0.25",
+                "link.b.unit=cm",
+                "link.b.baud=38400",
+                "link.b.type=lms200",
+            ],
+        );
+        let Differences { now, later } = Differences::between(&old, &new);
+        let now: Vec<_> = now
+            .iter()
+            .map(|(name, to, sections)| (name.as_str(), &to.zones.radii_mm[..], &sections[..]))
+            .collect();
+        assert_eq!(now, [("a", &[2000][..], &["pose", "zones"][..]), ("b", &[2000], &["zones", "marks"])]);
+        let later: Vec<_> = later.iter().map(|(name, what)| (name.as_str(), what.join(" "))).collect();
+        assert_eq!(
+            later,
+            [
+                ("b", "port type angle resolution unit baud".to_owned()),
+                ("c", "link removed".to_owned()),
+                ("d", "link added".to_owned()),
+            ]
+        );
+    }
+
+    #[test]
+    fn a_background_that_has_begun_began_as_it_did() {
+        let of = |set: &[&str]| config(&["a=/dev/x"], set);
+        let begun = of(&["background.start=first-scan"]);
+        let other = of(&["background.threshold_mm=50"]);
+        let Differences { now, later } = Differences::between(&begun, &other);
+        let [(_, taken, sections)] = &now[..] else { panic!("{now:?}") };
+        let learning = taken.background.learning;
+        assert_eq!((learning.start, learning.threshold_mm), (Start::FirstScan, Some(50)));
+        assert_eq!(
+            (sections.join(" "), later),
+            ("background".to_owned(), vec![("a".to_owned(), vec!["background.start"])])
+        );
+        // One that has not begun begins as it is said now.
+        let off = of(&["background.method=off", "background.start=first-scan"]);
+        let Differences { now, later } = Differences::between(&off, &of(&[]));
+        assert_eq!((now[0].1.background.learning.start, later), (Start::Empty, Vec::new()));
+    }
+}
