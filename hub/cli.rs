@@ -13,6 +13,7 @@ mod listen;
 mod probe;
 pub(crate) mod simulate;
 mod telegram;
+pub(crate) mod watch;
 mod zones;
 
 use std::path::PathBuf;
@@ -31,6 +32,7 @@ pub(crate) use latency::Latency;
 pub(crate) use leds::Leds;
 pub(crate) use listen::Listen;
 pub(crate) use telegram::{Telegram, Way};
+pub(crate) use watch::Watch;
 pub(crate) use zones::Zones;
 
 /// Laser scanners on serial lines, for more than one program: a hub that publishes telegrams and scans into shared
@@ -111,6 +113,9 @@ pub(crate) enum Verb {
     /// How old samples are on arrival, and where they spent that time: percentiles
     #[command(after_help = latency::SPANS)]
     Latency(Latency),
+    /// The live picture in the terminal: what the sensors see, marks, zones and the verdict
+    #[command(after_help = watch::EXAMPLE)]
+    Watch(Watch),
     /// Telegrams explained field by field, and written
     Telegram(Telegram),
     /// Stop a sensor, let it stream again, or begin anew with it

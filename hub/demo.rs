@@ -1,24 +1,27 @@
 //! The whole thing in one terminal: two simulated sensors, the hub and one consumer per sensor, each a process as in
-//! real life. This process only starts them, reads what they print, and compares what was sent with what arrived.
+//! real life. This process only starts them, reads what they print, compares what was sent with what arrived, and shows
+//! the picture that `watch` makes of it.
 
 mod account;
 mod process;
+mod stage;
 mod view;
 
-use std::fs::{File, OpenOptions};
-use std::io::{self, IsTerminal, Write};
-use std::os::unix::fs::OpenOptionsExt;
-use std::path::PathBuf;
+use std::io::Write;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::mpsc::{self, RecvTimeoutError};
+use std::thread;
 use std::time::{Duration, Instant};
 
-use rustix::fs::{CWD, FileType, Mode, OFlags, mknodat};
-use schema::{Domain, Environment, Failure, Kind};
+use clients::{Bounds, WatchOptions};
+use schema::{Failure, Kind};
 use serde_json::Value;
 
+use crate::cli::watch::{can_show_pictures, colours};
 use account::Account;
-use process::{Child, Line};
+use process::Line;
+use stage::Stage;
+use view::View;
 
 /// What the demonstration is asked for.
 #[derive(Clone, Debug)]
@@ -33,12 +36,81 @@ pub(crate) struct DemoOptions {
     pub(crate) json: bool,
 }
 
-/// Runs until `run_for` is over or `stop` is set, then prints a summary per sensor.
+/// Runs until `run_for` is over, the picture is closed or `stop` is set, then prints a summary per sensor.
 ///
 /// [`Kind::Check`] if a telegram that a sensor sent did not arrive, [`Kind::Interrupted`] if a bounded run was stopped,
 /// [`Kind::Timeout`] if a sensor does not stream within ten seconds, [`Kind::Failed`] if a process ends early.
 pub(crate) fn demo(options: &DemoOptions, out: &mut dyn Write, stop: &AtomicBool) -> Result<(), Failure> {
-    let stage = Stage::new()?;
+    let shows = !options.headless && !options.json;
+    let has_picture = shows && can_show_pictures();
+    let stage = Stage::new(has_picture)?;
+    let played = if has_picture {
+        play_with_picture(options, &stage, out, stop)
+    } else {
+        let mut view = View::new(stage.domain.name());
+        let mut show = |account: &Account, elapsed: Duration| {
+            if shows {
+                view.draw(out, account, elapsed);
+            }
+        };
+        play(options, &stage, &mut show, &|| stop.load(Ordering::Relaxed))
+    };
+    stage.tell_errors();
+    let (account, stopped) = played?;
+    let lost = account.summary(out, options.json);
+    if lost > 0 {
+        return Err(Failure::new(Kind::Check, format!("{lost} telegrams were sent and not received"), ""));
+    }
+    if stopped && options.run_for.is_some() {
+        return Err(Failure::new(Kind::Interrupted, "interrupted before the time was over", ""));
+    }
+    Ok(())
+}
+
+/// As [`play`], while the terminal shows the picture; whoever closes it ends the demonstration.
+fn play_with_picture(
+    options: &DemoOptions,
+    stage: &Stage,
+    out: &mut dyn Write,
+    stop: &AtomicBool,
+) -> Result<(Account, bool), Failure> {
+    let picture = WatchOptions {
+        sensors: SENSORS.map(String::from).to_vec(),
+        colours: colours(),
+        bounds: Bounds::default(),
+        places: vec![stage.domain.clone()],
+    };
+    let (closed, over) = (AtomicBool::new(false), AtomicBool::new(false));
+    thread::scope(|scope| {
+        let play = scope.spawn(|| {
+            let _over = Raise(&over);
+            let is_stopped = || stop.load(Ordering::Relaxed) || closed.load(Ordering::Relaxed);
+            play(options, stage, &mut |_, _| {}, &is_stopped)
+        });
+        let closing = Raise(&closed);
+        let shown = clients::watch(&picture, out, &over);
+        drop(closing);
+        let played = play.join().unwrap_or_else(|panic| std::panic::resume_unwind(panic));
+        shown.and(played)
+    })
+}
+
+/// Sets a flag when dropped, in a panic too: the other thread ends then.
+struct Raise<'a>(&'a AtomicBool);
+
+impl Drop for Raise<'_> {
+    fn drop(&mut self) {
+        self.0.store(true, Ordering::Relaxed);
+    }
+}
+
+/// Starts everybody and keeps account until the time is over or `is_stopped`, which is the second answer.
+fn play(
+    options: &DemoOptions,
+    stage: &Stage,
+    show: &mut dyn FnMut(&Account, Duration),
+    is_stopped: &dyn Fn() -> bool,
+) -> Result<(Account, bool), Failure> {
     let (lines, received) = mpsc::channel();
     let hub = stage.start_hub(lines.clone())?;
     let consumers = stage.start_consumers(&lines)?;
@@ -48,8 +120,6 @@ pub(crate) fn demo(options: &DemoOptions, out: &mut dyn Write, stop: &AtomicBool
     let mut ready = 0;
     let mut first_sample: Option<Instant> = None;
     let begun = Instant::now();
-    let mut view = view::View::new(stage.domain.name(), hub.pid(), io::stdout().is_terminal());
-    let show = !options.headless && !options.json;
     let mut next_look = begun;
     let mut cut = None;
     loop {
@@ -75,9 +145,7 @@ pub(crate) fn demo(options: &DemoOptions, out: &mut dyn Write, stop: &AtomicBool
             next_look = now + REFRESH;
             account.read_truth();
             account.look_at_hub(hub.pid());
-            if show {
-                view.draw(out, &account, begun.elapsed());
-            }
+            show(&account, begun.elapsed());
         }
         if first_sample.is_none() && begun.elapsed() > START_LIMIT {
             return Err(Failure::new(
@@ -87,7 +155,7 @@ pub(crate) fn demo(options: &DemoOptions, out: &mut dyn Write, stop: &AtomicBool
             ));
         }
         let over = options.run_for.zip(first_sample).is_some_and(|(limit, first)| first.elapsed() >= limit);
-        if cut.is_none() && (over || stop.load(Ordering::Relaxed)) {
+        if cut.is_none() && (over || is_stopped()) {
             // What is on its way now arrives before anybody is stopped.
             cut = Some((now + GRACE, account.cut()));
         }
@@ -99,100 +167,7 @@ pub(crate) fn demo(options: &DemoOptions, out: &mut dyn Write, stop: &AtomicBool
     drop(hub);
     drop(simulator);
     account.read_truth();
-    if show {
-        view.end(out);
-    }
-    let lost = account.summary(out, options.json);
-    if lost > 0 {
-        return Err(Failure::new(Kind::Check, format!("{lost} telegrams were sent and not received"), ""));
-    }
-    if stop.load(Ordering::Relaxed) && options.run_for.is_some() {
-        return Err(Failure::new(Kind::Interrupted, "interrupted before the time was over", ""));
-    }
-    Ok(())
-}
-
-/// Where it all takes place: a domain and a directory of its own, gone afterwards.
-struct Stage {
-    domain: Domain,
-    directory: PathBuf,
-}
-
-impl Stage {
-    fn new() -> Result<Self, Failure> {
-        let name = format!("demo-{}", std::process::id());
-        let domain = Domain::of_hub(&name, None, &Environment::of_process())?;
-        let directory = std::env::temp_dir().join(format!("scanhub-{name}"));
-        std::fs::create_dir_all(&directory).map_err(|error| {
-            let message = format!("cannot make {}: {error}", directory.display());
-            Failure::new(Kind::Failed, message, "set TMPDIR to a directory that this user may write")
-        })?;
-        Ok(Stage { domain, directory })
-    }
-
-    fn truth(&self) -> PathBuf {
-        self.directory.join("truth")
-    }
-
-    /// The reading end of what the simulator will tell: a pipe, because a demonstration may run for days.
-    fn open_truth(&self) -> Result<File, Failure> {
-        let open = || -> io::Result<File> {
-            mknodat(CWD, self.truth(), FileType::Fifo, Mode::RUSR | Mode::WUSR, 0)?;
-            OpenOptions::new().read(true).custom_flags(OFlags::NONBLOCK.bits() as i32).open(self.truth())
-        };
-        open().map_err(|error| {
-            Failure::new(Kind::Failed, format!("cannot make a pipe {}: {error}", self.truth().display()), "")
-        })
-    }
-
-    fn port(&self, sensor: &str) -> String {
-        self.directory.join(sensor).display().to_string()
-    }
-
-    fn start_hub(&self, lines: mpsc::Sender<Line>) -> Result<Child, Failure> {
-        let links: Vec<_> = SENSORS.iter().flat_map(|sensor| ["--link".into(), self.link(sensor)]).collect();
-        let hub = Child::start(
-            &[&["run".into(), "--json".into(), "--no-system-config".into()], &links[..]].concat(),
-            self.domain.name(),
-            None,
-        )?;
-        hub.await_ready(HUB, lines)
-    }
-
-    fn link(&self, sensor: &str) -> String {
-        format!("{sensor}={}", self.port(sensor))
-    }
-
-    fn start_consumers(&self, lines: &mpsc::Sender<Line>) -> Result<Vec<Child>, Failure> {
-        let start = |(of, sensor): (usize, &&str)| {
-            let topics = ["telegram", "scan", "status"].map(|topic| format!("{sensor}/{topic}"));
-            let arguments = [&["echo".into(), "--json".into()], &topics[..]].concat();
-            Child::start(&arguments, self.domain.name(), Some((of, lines.clone())))
-        };
-        SENSORS.iter().enumerate().map(start).collect()
-    }
-
-    fn start_simulator(&self, seed: u64, lines: mpsc::Sender<Line>) -> Result<Child, Failure> {
-        let ports: Vec<_> = SENSORS.iter().flat_map(|sensor| ["--port".into(), self.port(sensor)]).collect();
-        let truth = self.truth().display().to_string();
-        let rest = ["--truth".into(), truth, "--seed".into(), seed.to_string(), "--json".into()];
-        let arguments = [&["simulate".into()], &ports[..], &rest[..]].concat();
-        Child::start(&arguments, self.domain.name(), None)?.await_ready(SIMULATOR, lines)
-    }
-}
-
-impl Drop for Stage {
-    fn drop(&mut self) {
-        // All of it is ours alone: the domain's name has our process id.
-        let _ = std::fs::remove_dir_all(&self.directory);
-        let _ = std::fs::remove_dir_all(self.domain.root());
-        let entries = std::fs::read_dir("/dev/shm").into_iter().flatten().flatten();
-        for entry in
-            entries.filter(|entry| entry.file_name().to_string_lossy().starts_with(&self.domain.prefix()))
-        {
-            let _ = std::fs::remove_file(entry.path());
-        }
-    }
+    Ok((account, is_stopped()))
 }
 
 fn ended(of: usize) -> Failure {

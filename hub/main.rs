@@ -116,6 +116,11 @@ fn dispatch(cli: &Cli) -> Result<(), Failure> {
         Verb::Latency(latency) => {
             clients::latency(&latency.options(everywhere)?, &mut out, &mut io::stderr(), &*interrupt()?)
         }
+        Verb::Watch(watch) => {
+            // The terminal is given back, whoever ends it.
+            let stop = interrupt_by(&[SIGINT, SIGTERM, SIGHUP, SIGQUIT])?;
+            clients::watch(&watch.options(everywhere)?, &mut out, &stop)
+        }
         Verb::Control(control) => clients::control(&control.options(everywhere)?, &mut out, &*interrupt()?),
         Verb::Background(background) => {
             // A model is read before Ctrl-C is a flag, which would not end a person's typing.

@@ -61,6 +61,10 @@ pub(crate) trait Sink {
     fn tick(&mut self, _now: Instant) -> Result<(), End> {
         Ok(())
     }
+    /// When [`tick`](Self::tick) has something to do before that.
+    fn wake_at(&self) -> Option<Instant> {
+        None
+    }
     /// The run is over, for good or ill; nothing comes any more.
     fn summary(&mut self, name: &TopicName, account: &Account) -> Result<(), End>;
 }
@@ -74,6 +78,19 @@ pub(crate) fn follow(
     sink: &mut dyn Sink,
 ) -> Result<(), End> {
     carry(Run::new(names, places, bounds), names, stop, sink)
+}
+
+/// As [`follow`], with `topics` of each sensor of the hub for no `names`.
+#[cfg(feature = "tui")]
+pub(crate) fn follow_topics(
+    names: &[TopicName],
+    topics: &'static [Topic],
+    places: &[Domain],
+    bounds: &Bounds,
+    stop: &AtomicBool,
+    sink: &mut dyn Sink,
+) -> Result<(), End> {
+    carry(Run { topics, ..Run::new(names, places, bounds) }, names, stop, sink)
 }
 
 /// As [`follow`], woken by `wait`, and for the shortest latency: what is there is taken before it is asked whether the hub
@@ -117,6 +134,8 @@ struct Run<'a> {
     session: Session,
     tracks: Vec<Track>,
     all: bool,
+    /// Of each sensor, if all are followed.
+    topics: &'static [Topic],
     /// Samples come before news of the hub.
     closely: bool,
     bounds: &'a Bounds,
@@ -142,6 +161,7 @@ impl<'a> Run<'a> {
             session: Session::new(places.to_vec()),
             tracks: names.iter().cloned().map(Track::new).collect(),
             all: names.is_empty(),
+            topics: &Topic::ALL,
             closely: false,
             bounds,
             started: now,
@@ -174,7 +194,7 @@ impl<'a> Run<'a> {
             if self.bounds.run_for.is_some_and(|limit| now - self.started >= limit) {
                 return self.time_is_over();
             }
-            self.session.wait(self.wake_at())?;
+            self.session.wait(self.wake_at().into_iter().chain(sink.wake_at()).min())?;
         }
     }
 
@@ -193,7 +213,7 @@ impl<'a> Run<'a> {
         if self.all && self.tracks.is_empty() && self.hub_seen.is_some_and(|seen| seen.elapsed() >= GRACE / 2)
         {
             for sensor in self.sensors()? {
-                for topic in Topic::ALL {
+                for &topic in self.topics {
                     let track = Track::new(TopicName { sensor: sensor.clone(), topic });
                     sink.begin(&track.name);
                     self.tracks.push(track);

@@ -32,6 +32,8 @@ mod sample;
 mod session;
 mod text;
 mod wait;
+#[cfg(feature = "tui")]
+mod watch;
 mod window;
 mod zones;
 
@@ -53,4 +55,6 @@ pub use mask::{MaskOptions, mask};
 pub use names::TopicName;
 pub use robot::{Robot, RobotFollower, robot};
 pub use wait::Wait;
+#[cfg(feature = "tui")]
+pub use watch::{WatchOptions, watch};
 pub use zones::{Heard, ZonesFollower, zones};

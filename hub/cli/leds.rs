@@ -7,6 +7,7 @@ use clap::Args;
 use clients::{LedsLook, LedsOptions};
 use schema::Failure;
 
+use super::watch::colours;
 use super::{Everywhere, Limits};
 
 #[derive(Args, Debug)]
@@ -26,15 +27,13 @@ pub(crate) struct Leds {
 
 impl Leds {
     pub(crate) fn options(&self, everywhere: &Everywhere) -> Result<LedsOptions, Failure> {
-        // https://no-color.org: set to anything but nothing.
-        let colours = std::env::var_os("NO_COLOR").is_none_or(|value| value.is_empty());
         Ok(LedsOptions {
             sensor: self.sensor.clone(),
             leds: self.leds.clone(),
             led_root: self.led_root.clone(),
             look: match (everywhere.json, stdout().is_terminal()) {
                 (true, _) => LedsLook::Json,
-                (false, true) => LedsLook::Terminal { colours },
+                (false, true) => LedsLook::Terminal { colours: colours() },
                 (false, false) => LedsLook::Lines,
             },
             bounds: self.limits.bounds(),

@@ -31,7 +31,7 @@ pub(crate) struct Simulate {
     #[arg(long, default_value_t = 0, value_name = "NUMBER")]
     address: u8,
     /// What the sensors see: room, bare, fig8, standing, approach, door, corridor, glass, sun, chair, strips, crowd,
-    /// empty, wall640 or random; or a TOML file, see docs/worlds.md
+    /// demo, empty, wall640 or random; or a TOML file, see docs/worlds.md
     #[arg(long, default_value = "room", value_name = "NAME|FILE", conflicts_with = "replay")]
     world: String,
     /// A recording to send instead: telegram stream or CARMEN log, plain or gzipped

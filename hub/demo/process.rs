@@ -26,11 +26,13 @@ pub(crate) struct Child {
 }
 
 impl Child {
-    /// Starts this program with `arguments` in `domain`; its lines go to `listener` with its number.
+    /// Starts this program with `arguments` in `domain`; its lines go to `listener` with its number, what it says of
+    /// errors to `errors`.
     pub(crate) fn start(
         arguments: &[String],
         domain: &str,
         listener: Option<(usize, Sender<Line>)>,
+        errors: Stdio,
     ) -> Result<Child, Failure> {
         let failed = |error: std::io::Error| {
             Failure::new(Kind::Failed, format!("cannot start scanhub {}: {error}", arguments.join(" ")), "")
@@ -45,6 +47,7 @@ impl Child {
             .process_group(0)
             .stdin(Stdio::null())
             .stdout(Stdio::piped())
+            .stderr(errors)
             .spawn()
             .map_err(failed)?;
         if let Some((of, lines)) = listener

@@ -1,59 +1,39 @@
-//! The live picture: a block of lines that is drawn over itself.
+//! What goes on, as lines for files and pipes; a terminal has the picture of `watch`.
 
 use std::io::Write;
 use std::time::Duration;
 
 use super::account::{Account, Sensor};
 
-/// What was drawn last.
+/// What was said last.
 pub(crate) struct View {
     domain: String,
-    hub_pid: u32,
-    /// Whether the block can be drawn over; else every picture is one line.
-    terminal: bool,
-    drawn: usize,
+    /// Seconds for which there are lines.
+    seconds: u64,
 }
 
 impl View {
-    pub(crate) fn new(domain: &str, hub_pid: u32, terminal: bool) -> Self {
-        View { domain: domain.to_owned(), hub_pid, terminal, drawn: 0 }
+    /// Of the demonstration in `domain`.
+    pub(crate) fn new(domain: &str) -> Self {
+        View { domain: domain.to_owned(), seconds: 0 }
     }
 
-    /// Draws the account as it is after `elapsed`.
+    /// Says once a second how the account is after `elapsed`.
     pub(crate) fn draw(&mut self, out: &mut dyn Write, account: &Account, elapsed: Duration) {
-        let lines = self.lines(account, elapsed);
-        let mut picture = String::new();
-        if self.terminal {
-            if self.drawn > 0 {
-                picture += &format!("\x1b[{}A", self.drawn);
-            }
-            for line in &lines {
-                picture += &format!("\x1b[2K{line}\n");
-            }
-            // A line that wraps would be two, and the next picture would not find its place: it is cut.
-            picture = format!("\x1b[?7l{picture}\x1b[?7h");
-            self.drawn = lines.len();
-        } else if elapsed.as_secs() >= self.drawn as u64 {
-            // Into a file or a pipe: once a second is enough.
-            self.drawn = elapsed.as_secs() as usize + 1;
-            picture = lines.join("\n") + "\n";
+        if elapsed.as_secs() >= self.seconds {
+            self.seconds = elapsed.as_secs() + 1;
+            let text = self.lines(account, elapsed).join("\n") + "\n\n";
+            let _ = out.write_all(text.as_bytes()).and_then(|()| out.flush());
         }
-        let _ = out.write_all(picture.as_bytes()).and_then(|()| out.flush());
-    }
-
-    /// Leaves the last picture where it is.
-    pub(crate) fn end(&mut self, out: &mut dyn Write) {
-        let _ = out.write_all(b"\n").and_then(|()| out.flush());
     }
 
     fn lines(&self, account: &Account, elapsed: Duration) -> Vec<String> {
         let seconds = elapsed.as_secs();
         let mut lines = vec![
             format!(
-                "scanhub demo  {:02}:{:02}   hub {} uses {:.1} % of a processor   Ctrl-C ends it",
+                "scanhub demo  {:02}:{:02}   the hub uses {:.1} % of a processor   Ctrl-C ends it",
                 seconds / 60,
                 seconds % 60,
-                self.hub_pid,
                 account.hub_cpu_percent
             ),
             format!("look from another terminal:  scanhub echo front/scan --domain {}", self.domain),

@@ -28,7 +28,7 @@ pub enum World {
 }
 
 /// The scenes that the program brings along: name and text.
-const SCENES: [(&str, &str); 12] = [
+const SCENES: [(&str, &str); 13] = [
     ("room", include_str!("../../../tests/worlds/room.toml")),
     ("bare", include_str!("../../../tests/worlds/bare.toml")),
     ("fig8", include_str!("../../../tests/worlds/fig8.toml")),
@@ -41,6 +41,7 @@ const SCENES: [(&str, &str); 12] = [
     ("chair", include_str!("../../../tests/worlds/chair.toml")),
     ("strips", include_str!("../../../tests/worlds/strips.toml")),
     ("crowd", include_str!("../../../tests/worlds/crowd.toml")),
+    ("demo", include_str!("../../../tests/worlds/demo.toml")),
 ];
 
 impl World {

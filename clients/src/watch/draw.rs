@@ -1,0 +1,194 @@
+//! A scene as a screen: the verdict in words, the picture, a line for each sensor, and the keys. Pure: the same scene and
+//! view give the same cells. Refuses to know what is on the screen already.
+
+use ratatui::Frame;
+use ratatui::layout::Rect;
+use ratatui::style::{Modifier, Style};
+use ratatui::text::{Line, Span};
+use ratatui::widgets::{Block, Clear, Paragraph};
+
+use schema::Counter;
+
+use super::map::{DOTS, colour, map};
+use super::scene::{Scene, Sensor, verdict};
+use super::view::View;
+
+/// Draws `scene` as `view` says.
+pub(crate) fn draw(frame: &mut Frame<'_>, scene: &Scene, view: &View) {
+    let places = Places::of(frame.area(), scene);
+    frame.render_widget(heading(scene, view), places.heading);
+    frame.render_widget(over(scene), right(places.heading, over(scene).width()));
+    frame.render_widget(map(scene, view, (places.map.width, places.map.height)), places.map);
+    frame.render_widget(Line::raw(measure(view.dot_m)), last_row(places.map));
+    for (row, (number, sensor)) in places.sensors.rows().zip(listed(scene, view, places.sensors.height)) {
+        frame.render_widget(line(number, sensor, view, row.width), row);
+    }
+    let keys = if scene.news.is_empty() { Line::raw(KEYS) } else { Line::raw(scene.news.clone()) };
+    frame.render_widget(keys.patch_style(Modifier::DIM), places.keys);
+    if view.help {
+        help(frame, places.map);
+    }
+}
+
+/// How many dots the picture has, across and up, on a screen of `area`.
+pub(crate) fn dots(area: Rect, scene: &Scene) -> (f64, f64) {
+    let map = Places::of(area, scene).map;
+    (f64::from(map.width.max(1)) * DOTS.0, f64::from(map.height.max(1)) * DOTS.1)
+}
+
+/// Where things are on the screen.
+struct Places {
+    heading: Rect,
+    map: Rect,
+    sensors: Rect,
+    keys: Rect,
+}
+
+impl Places {
+    fn of(area: Rect, scene: &Scene) -> Places {
+        let row = |from: u16, rows: u16| {
+            let y = area.y + from.min(area.height);
+            Rect { y, height: rows.min(area.bottom() - y), ..area }
+        };
+        // The picture comes first: on a low screen not all sensors have a line.
+        let wanted = u16::try_from(scene.sensors.len()).unwrap_or(u16::MAX);
+        let sensors = wanted.min(area.height / 4);
+        let map = area.height.saturating_sub(2 + sensors);
+        Places {
+            heading: row(0, 1),
+            map: row(1, map),
+            sensors: row(1 + map, sensors),
+            keys: row(1 + map + sensors, 1),
+        }
+    }
+}
+
+/// The verdict, and what is nearest; in words, because colours say nothing to everybody.
+fn heading(scene: &Scene, view: &View) -> Line<'static> {
+    let shown = view.shown(scene);
+    let (verdict, whose, nearest) = verdict(shown.iter().map(|(_, sensor)| *sensor));
+    let mut style = Style::new().add_modifier(Modifier::BOLD | Modifier::REVERSED);
+    if view.colours {
+        style = style.fg(colour(verdict));
+    }
+    let mut spans = vec![Span::styled(format!(" {} ", verdict.name().to_uppercase()), style)];
+    if view.paused {
+        spans.push(Span::styled(" HELD ", Modifier::REVERSED));
+    }
+    if let Some(whose) = whose {
+        spans.push(Span::raw(format!(" {whose}")));
+    }
+    if let Some(mm) = nearest {
+        spans.push(Span::raw(format!(", nearest {:.2} m", f64::from(mm) / 1000.0)));
+    }
+    Line::from(spans)
+}
+
+/// How the hub is.
+fn over(scene: &Scene) -> Line<'static> {
+    match (scene.hub_lives, scene.hub_pid, scene.hub_percent) {
+        (false, ..) => Line::styled(" no hub: waiting for it", Modifier::BOLD),
+        (true, 0, _) => Line::raw(" hub"),
+        (true, pid, None) => Line::raw(format!(" hub {pid}")),
+        (true, pid, Some(percent)) => Line::raw(format!(" hub {pid} {percent:.1} %")),
+    }
+}
+
+/// The sensors that have a line in `rows`: all, or those from the chosen one on.
+fn listed<'a>(scene: &'a Scene, view: &View, rows: u16) -> impl Iterator<Item = (usize, &'a Sensor)> {
+    let hidden = scene.sensors.len().saturating_sub(usize::from(rows));
+    let first = view.only.unwrap_or(0).min(hidden);
+    scene.sensors.iter().enumerate().skip(first)
+}
+
+/// A sensor in a line, the most needed first, because a narrow screen cuts it.
+fn line(number: usize, sensor: &Sensor, view: &View, width: u16) -> Line<'static> {
+    let dash = |text: Option<String>| text.unwrap_or_else(|| "-".to_owned());
+    let hz = dash(sensor.meter.hz().map(|hz| format!("{hz:.1}")));
+    let age = dash(sensor.meter.age_ms().map(|(mean, _)| format!("{mean:.2}")));
+    let greatest = dash(sensor.meter.age_ms().map(|(_, greatest)| format!("{greatest:.2}")));
+    let mut text = format!("{} {:<8} {:<9}", number + 1, sensor.name, sensor.state());
+    let error = sensor.status.map(|status| status.last_error().to_owned()).unwrap_or_default();
+    if sensor.scan.is_none() && !error.is_empty() {
+        text += &format!(" {error}");
+    } else {
+        text += &format!(" {hz:>5} Hz {age:>5} ms  lost {}", sensor.lost);
+        if sensor.is_frozen() {
+            text += "  frozen";
+        }
+        text += &format!("  suspect {}", sensor.count(Counter::Suspect));
+        if width >= WIDE {
+            let taught = sensor.background.map_or(0, |model| model.taught);
+            let marks = sensor.marks.map(|marks| marks.marks().len().to_string());
+            let objects = sensor.foreground.map(|foreground| foreground.segments().len().to_string());
+            text += &format!("  max {greatest} ms  marks {}  objects {}", dash(marks), dash(objects));
+            text += &format!("  background {taught}");
+        }
+    }
+    let is_shown = view.only.is_none_or(|only| only == number);
+    let style = if is_shown { Style::new() } else { Style::new().add_modifier(Modifier::DIM) };
+    Line::styled(text, style)
+}
+
+/// A length of the picture that is easily compared: `|----| 1 m`.
+fn measure(dot_m: f64) -> String {
+    let cell_m = dot_m * DOTS.0;
+    let length = LENGTHS_M.into_iter().rev().find(|length| length / cell_m <= MEASURE_CELLS);
+    let length = length.unwrap_or(LENGTHS_M[0]);
+    let cells = (length / cell_m).round().clamp(2.0, 4.0 * MEASURE_CELLS) as usize;
+    format!("|{}| {length} m", "-".repeat(cells - 2))
+}
+
+fn help(frame: &mut Frame<'_>, area: Rect) {
+    let lines: Vec<Line<'_>> = HELP.lines().map(Line::raw).collect();
+    let width = lines.iter().map(Line::width).max().unwrap_or_default() as u16 + 2;
+    let (width, height) = (width.min(area.width), (lines.len() as u16 + 2).min(area.height));
+    let (x, y) = (area.x + (area.width - width) / 2, area.y + (area.height - height) / 2);
+    let place = Rect { x, y, width, height };
+    frame.render_widget(Clear, place);
+    frame.render_widget(Paragraph::new(lines).block(Block::bordered().title(" scanhub watch ")), place);
+}
+
+fn right(row: Rect, width: usize) -> Rect {
+    let width = row.width.min(width as u16);
+    Rect { x: row.right() - width, width, ..row }
+}
+
+fn last_row(area: Rect) -> Rect {
+    let height = area.height.min(1);
+    Rect { y: area.bottom() - height, height, ..area }
+}
+
+const KEYS: &str = "q quit  ? help  +- zoom  tab sensor  fbmz layers  space hold";
+
+/// What keys do, and what signs mean; narrow enough for 60 columns, low enough for 16 rows.
+const HELP: &str = "\
++ -  arrows hjkl  c   zoom, pan, all of it
+tab  0 1 2 ..         next sensor, all, one of them
+f b m z               foreground, background, marks, zones
+space                 hold the picture
+R  F                  background: learn anew; hold, go on
+? q Esc Ctrl-C        this help, the end
+
+dots  what a beam met, small grey ones the background
+o     what stands before it (coloured: without the o)
+*     reflector mark   ^ 1 2 robot, sensors; ahead is up
+0.60! circle around the robot, in m, with something inside";
+
+/// Columns from which a sensor's line says more.
+const WIDE: u16 = 100;
+const LENGTHS_M: [f64; 9] = [0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 50.0];
+/// The longest measure.
+const MEASURE_CELLS: f64 = 12.0;
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn measures_are_round_and_short() {
+        assert_eq!(measure(0.05), "|--------| 1 m");
+        assert_eq!(measure(0.001), "|".to_owned() + &"-".repeat(48).as_str()[..46] + "| 0.1 m");
+        assert_eq!(measure(1.0), "|--------| 20 m");
+    }
+}

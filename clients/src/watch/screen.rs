@@ -1,0 +1,122 @@
+//! The terminal as a sheet: taken over at the start, and given back as it was however it ends. A frame is one write.
+//! Refuses to know what is drawn.
+
+use std::cell::Cell;
+use std::io::{self, ErrorKind, Write};
+use std::panic::{PanicHookInfo, set_hook, take_hook};
+use std::rc::Rc;
+use std::sync::Arc;
+use std::time::Duration;
+
+use ratatui::backend::CrosstermBackend;
+use ratatui::crossterm::cursor::{Hide, Show};
+use ratatui::crossterm::event::{self, Event, KeyEvent, KeyEventKind};
+use ratatui::crossterm::terminal::{
+    EnterAlternateScreen, LeaveAlternateScreen, disable_raw_mode, enable_raw_mode,
+};
+use ratatui::crossterm::{execute, queue};
+use ratatui::{Frame, Terminal};
+
+use crate::output::End;
+
+/// The terminal, as long as it is ours.
+pub(crate) struct Screen<'a> {
+    terminal: Terminal<CrosstermBackend<Sheet<'a>>>,
+    written: Rc<Cell<usize>>,
+    hook: Arc<Hook>,
+}
+
+type Hook = dyn Fn(&PanicHookInfo<'_>) + Sync + Send;
+
+/// What a terminal tells besides keys.
+pub(crate) enum News {
+    /// A key was pressed.
+    Key(KeyEvent),
+    /// It has another size.
+    Resized,
+}
+
+impl<'a> Screen<'a> {
+    /// Takes over the terminal that `out` writes to.
+    pub(crate) fn new(out: &'a mut dyn Write) -> Result<Screen<'a>, End> {
+        let written = Rc::new(Cell::new(0));
+        let mut sheet = Sheet { out, buffer: Vec::new(), written: written.clone() };
+        enable_raw_mode()?;
+        let taken = execute!(sheet, EnterAlternateScreen, Hide)
+            .and_then(|()| Terminal::new(CrosstermBackend::new(sheet)));
+        let terminal = taken.inspect_err(|_| {
+            let _ = disable_raw_mode();
+        })?;
+        let hook: Arc<Hook> = Arc::from(take_hook());
+        let before = hook.clone();
+        // What a panic says would go with the sheet.
+        set_hook(Box::new(move |info| {
+            let _ = execute!(io::stdout(), Show, LeaveAlternateScreen);
+            let _ = disable_raw_mode();
+            before(info);
+        }));
+        Ok(Screen { terminal, written, hook })
+    }
+
+    /// Draws a frame; how many bytes that took.
+    pub(crate) fn draw(&mut self, picture: impl FnOnce(&mut Frame<'_>)) -> Result<usize, End> {
+        self.written.set(0);
+        self.terminal.draw(picture).map_err(gone)?;
+        Ok(self.written.get())
+    }
+
+    /// What was typed, or else happened to the terminal, since the last call; never waits.
+    pub(crate) fn news(&mut self) -> Result<Option<News>, End> {
+        while event::poll(Duration::ZERO).map_err(gone)? {
+            match event::read().map_err(gone)? {
+                Event::Key(key) if key.kind != KeyEventKind::Release => return Ok(Some(News::Key(key))),
+                Event::Resize(..) => return Ok(Some(News::Resized)),
+                _ => {}
+            }
+        }
+        Ok(None)
+    }
+}
+
+impl Drop for Screen<'_> {
+    fn drop(&mut self) {
+        let backend = self.terminal.backend_mut();
+        let _ = queue!(backend, LeaveAlternateScreen, Show).and_then(|()| io::Write::flush(backend));
+        let _ = disable_raw_mode();
+        // While a panic unwinds hooks stay as they are, and it has shown the cursor already.
+        if !std::thread::panicking() {
+            let hook = self.hook.clone();
+            set_hook(Box::new(move |info| hook(info)));
+        }
+    }
+}
+
+/// A terminal that was closed is nobody who reads.
+fn gone(error: io::Error) -> End {
+    const EIO: i32 = 5;
+    if error.raw_os_error() == Some(EIO) || error.kind() == ErrorKind::UnexpectedEof {
+        return End::ReaderGone;
+    }
+    End::from(error)
+}
+
+/// Collects what makes a frame.
+struct Sheet<'a> {
+    out: &'a mut dyn Write,
+    buffer: Vec<u8>,
+    written: Rc<Cell<usize>>,
+}
+
+impl Write for Sheet<'_> {
+    fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
+        self.buffer.extend_from_slice(bytes);
+        Ok(bytes.len())
+    }
+
+    fn flush(&mut self) -> io::Result<()> {
+        self.written.set(self.written.get() + self.buffer.len());
+        let result = self.out.write_all(&self.buffer).and_then(|()| self.out.flush());
+        self.buffer.clear();
+        result
+    }
+}

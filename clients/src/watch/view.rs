@@ -1,0 +1,237 @@
+//! What of a scene is shown, and how large; and what keys make of that. Refuses to know a terminal but for its keys.
+
+use ratatui::crossterm::event::{KeyCode, KeyEvent, KeyModifiers};
+
+use super::scene::{Scene, Sensor};
+
+/// What is shown.
+#[derive(Clone, Debug)]
+pub(crate) struct View {
+    /// One sensor by its number from 0, or the robot with all of its own.
+    pub(crate) only: Option<usize>,
+    /// What is in the middle of the picture, in metres in the robot's frame.
+    pub(crate) centre_m: (f64, f64),
+    /// Metres between two dots.
+    pub(crate) dot_m: f64,
+    /// Place and size follow what is seen.
+    pub(crate) fits: bool,
+    pub(crate) foreground: bool,
+    pub(crate) background: bool,
+    pub(crate) marks: bool,
+    pub(crate) zones: bool,
+    /// The picture stands still.
+    pub(crate) paused: bool,
+    pub(crate) help: bool,
+    /// Colours may be used.
+    pub(crate) colours: bool,
+}
+
+/// What a key asks for beyond the picture.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Wish {
+    /// To end.
+    Quit,
+    /// To end, as by a signal.
+    Interrupt,
+    /// To learn the background anew.
+    Reset,
+    /// To hold the background, or to let it be learned on.
+    Freeze,
+}
+
+impl View {
+    /// All layers of the whole robot.
+    pub(crate) fn new(colours: bool) -> View {
+        View {
+            only: None,
+            centre_m: (0.0, 0.0),
+            dot_m: FIRST_DOT_M,
+            fits: true,
+            foreground: true,
+            background: true,
+            marks: true,
+            zones: true,
+            paused: false,
+            help: false,
+            colours,
+        }
+    }
+
+    /// The sensors that are shown, with their numbers from 0.
+    pub(crate) fn shown<'a>(&self, scene: &'a Scene) -> Vec<(usize, &'a Sensor)> {
+        match self.only.and_then(|n| Some((n, scene.sensors.get(n)?))) {
+            Some(one) => vec![one],
+            None => scene.robot().collect(),
+        }
+    }
+
+    /// Takes a key, with `scene` on the screen; what is left to be done for it.
+    pub(crate) fn key(&mut self, key: KeyEvent, scene: &Scene) -> Option<Wish> {
+        if key.modifiers.contains(KeyModifiers::CONTROL) {
+            return (key.code == KeyCode::Char('c')).then_some(Wish::Interrupt);
+        }
+        match key.code {
+            KeyCode::Esc if self.help => self.help = false,
+            KeyCode::Char('q') | KeyCode::Esc => return Some(Wish::Quit),
+            KeyCode::Char('R') => return Some(Wish::Reset),
+            KeyCode::Char('F') => return Some(Wish::Freeze),
+            KeyCode::Char('?') => self.help = !self.help,
+            KeyCode::Char(' ') => self.paused = !self.paused,
+            KeyCode::Char('+' | '=') => self.zoom(1.0 / ZOOM),
+            KeyCode::Char('-') => self.zoom(ZOOM),
+            KeyCode::Char('c') => self.fits = true,
+            KeyCode::Left | KeyCode::Char('h') => self.pan(0.0, 1.0),
+            KeyCode::Right | KeyCode::Char('l') => self.pan(0.0, -1.0),
+            KeyCode::Up | KeyCode::Char('k') => self.pan(1.0, 0.0),
+            KeyCode::Down | KeyCode::Char('j') => self.pan(-1.0, 0.0),
+            KeyCode::Tab => self.choose(self.only.map_or(0, |n| n + 1), scene),
+            KeyCode::Char(digit @ '0'..='9') => {
+                let number = digit as usize - '0' as usize;
+                self.choose(number.checked_sub(1).unwrap_or(usize::MAX), scene);
+            }
+            KeyCode::Char('f') => self.foreground = !self.foreground,
+            KeyCode::Char('b') => self.background = !self.background,
+            KeyCode::Char('m') => self.marks = !self.marks,
+            KeyCode::Char('z') => self.zones = !self.zones,
+            _ => {}
+        }
+        None
+    }
+
+    /// Brings what is seen into a picture of `dots`, unless a person chose its place; keeps what is about right, because a
+    /// picture that breathes cannot be read.
+    pub(crate) fn fit(&mut self, scene: &Scene, dots: (f64, f64)) {
+        let shown = self.shown(scene);
+        let seen: Vec<_> = shown.iter().flat_map(|(_, sensor)| sensor.points()).collect();
+        if !self.fits || seen.is_empty() {
+            return;
+        }
+        let reach = shown.iter().flat_map(|(_, sensor)| sensor.zones.zones().iter());
+        let reach = reach.map(|zone| f64::from(zone.radius_mm) / 1000.0).fold(LEAST_M, f64::max);
+        let ahead = span(seen.iter().map(|point| point.0).collect(), reach);
+        let aside = span(seen.iter().map(|point| point.1).collect(), reach);
+        let needed = ((aside.1 - aside.0) / dots.0).max((ahead.1 - ahead.0) / dots.1) * MARGIN;
+        let fits = |middle: f64, span: (f64, f64), dots: f64| {
+            let half = self.dot_m * dots / 2.0;
+            middle - half <= span.0 && span.1 <= middle + half
+        };
+        let is_in = fits(self.centre_m.0, ahead, dots.1) && fits(self.centre_m.1, aside, dots.0);
+        if !is_in || needed < TOO_SMALL * self.dot_m {
+            self.dot_m = needed;
+            self.centre_m = ((ahead.0 + ahead.1) / 2.0, (aside.0 + aside.1) / 2.0);
+        }
+    }
+
+    fn zoom(&mut self, factor: f64) {
+        self.fits = false;
+        self.dot_m = (self.dot_m * factor).clamp(FINEST_DOT_M, COARSEST_DOT_M);
+    }
+
+    /// By steps ahead and to the left.
+    fn pan(&mut self, ahead: f64, left: f64) {
+        self.fits = false;
+        let step = STEP_DOTS * self.dot_m;
+        let moved = |at: f64, steps: f64| (at + steps * step).clamp(-FARTHEST_M, FARTHEST_M);
+        self.centre_m = (moved(self.centre_m.0, ahead), moved(self.centre_m.1, left));
+    }
+
+    /// Sensor number `n` alone, or all where there is none.
+    fn choose(&mut self, n: usize, scene: &Scene) {
+        self.only = (n < scene.sensors.len()).then_some(n);
+    }
+}
+
+/// From the least to the greatest of `values`, few outliers left out, and at least `reach` around the centre.
+fn span(mut values: Vec<f64>, reach: f64) -> (f64, f64) {
+    values.sort_by(f64::total_cmp);
+    let out = values.len() / OUTLIERS;
+    (values[out].min(-reach), values[values.len() - 1 - out].max(reach))
+}
+
+/// Of one step of zoom and pan.
+const ZOOM: f64 = 1.25;
+const STEP_DOTS: f64 = 8.0;
+/// Before anything is seen: eight metres in a picture of eighty columns.
+const FIRST_DOT_M: f64 = 0.05;
+const FINEST_DOT_M: f64 = 0.001;
+const COARSEST_DOT_M: f64 = 1.0;
+/// Farther than a sensor sees (82 m) from where it may sit (100 m).
+const FARTHEST_M: f64 = 200.0;
+/// At least so much around the robot.
+const LEAST_M: f64 = 0.5;
+const MARGIN: f64 = 1.1;
+/// A picture that would be enough at this share of its size is drawn anew.
+const TOO_SMALL: f64 = 0.6;
+/// One of so many points, at either end, is not worth a smaller picture.
+const OUTLIERS: usize = 50;
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use schema::{Header, Scan};
+
+    fn press(view: &mut View, scene: &Scene, keys: &str) -> Option<Wish> {
+        keys.chars().map(|key| view.key(KeyCode::Char(key).into(), scene)).last().flatten()
+    }
+
+    fn two() -> Scene {
+        let mut scene = Scene::default();
+        for name in ["front", "rear"] {
+            let mut scan =
+                Scan { count: 181, unit_mm: 1, range_bits: 13, step_mdeg: 1000, ..Scan::default() };
+            scan.range_array[..181].fill(4000);
+            scene.sensor(name).take_scan(&Header::default(), &scan, 0);
+        }
+        scene
+    }
+
+    #[test]
+    fn keys_choose_sensors_and_layers() {
+        let (mut view, scene) = (View::new(false), two());
+        assert_eq!(view.shown(&scene).len(), 2);
+        for only in [Some(0), Some(1), None] {
+            view.key(KeyCode::Tab.into(), &scene);
+            assert_eq!(view.only, only);
+        }
+        press(&mut view, &scene, "2fbmz ?");
+        assert_eq!((view.only, view.shown(&scene)[0].1.name.as_str()), (Some(1), "rear"));
+        assert!(!(view.foreground || view.background || view.marks || view.zones));
+        assert!(view.paused && view.help);
+        press(&mut view, &scene, "9");
+        assert_eq!(view.only, None, "there is no ninth");
+    }
+
+    #[test]
+    fn escape_closes_the_help_first() {
+        let (mut view, scene) = (View::new(false), two());
+        press(&mut view, &scene, "?");
+        assert_eq!(view.key(KeyCode::Esc.into(), &scene), None);
+        assert_eq!(view.key(KeyCode::Esc.into(), &scene), Some(Wish::Quit));
+        assert_eq!(press(&mut view, &scene, "q"), Some(Wish::Quit));
+        assert_eq!(press(&mut view, &scene, "R"), Some(Wish::Reset));
+        assert_eq!(press(&mut view, &scene, "F"), Some(Wish::Freeze));
+        let control_c = KeyEvent::new(KeyCode::Char('c'), KeyModifiers::CONTROL);
+        assert_eq!(view.key(control_c, &scene), Some(Wish::Interrupt));
+        assert!(view.fits, "and c with it does not mean the picture");
+    }
+
+    #[test]
+    fn the_picture_fits_until_a_person_chooses_and_again_when_asked() {
+        let (mut view, scene) = (View::new(false), two());
+        let dots = (120.0, 68.0);
+        view.fit(&scene, dots);
+        let fitted = view.clone();
+        // Half a circle of four metres ahead, and half a metre behind.
+        assert!((fitted.centre_m.0 - 1.75).abs() < 0.1 && fitted.centre_m.1.abs() < 0.01, "{fitted:?}");
+        assert!((8.0..10.0).contains(&(fitted.dot_m * dots.0)), "{fitted:?}");
+        press(&mut view, &scene, "+l");
+        assert!(view.dot_m < fitted.dot_m && view.centre_m.1 < 0.0, "right is negative");
+        let chosen = view.centre_m;
+        view.fit(&scene, dots);
+        assert_eq!(view.centre_m, chosen);
+        press(&mut view, &scene, "kkkkkkkkkkkkkkkkkkkk");
+        press(&mut view, &scene, "c");
+        view.fit(&scene, dots);
+        assert_eq!((view.centre_m, view.dot_m), (fitted.centre_m, fitted.dot_m));
+    }
+}

@@ -1,0 +1,63 @@
+//! The processor time that the hub takes, as the kernel counts it. Refuses to know what the hub does with it.
+
+use std::collections::VecDeque;
+use std::time::{Duration, Instant};
+
+/// The work of one process over the last seconds.
+#[derive(Debug, Default)]
+pub(crate) struct Work {
+    pid: u32,
+    /// When it was looked at, and how much it had used by then, in ns.
+    looks: VecDeque<(Instant, u64)>,
+}
+
+impl Work {
+    /// Looks at process `pid`, at most once a second; in percent of one processor over the last five, if that is known.
+    pub(crate) fn look(&mut self, pid: u32, now: Instant) -> Option<f64> {
+        if self.pid != pid {
+            *self = Work { pid, looks: VecDeque::new() };
+        }
+        if self.looks.back().is_none_or(|(at, _)| now - *at >= EVERY) {
+            self.looks.push_back((now, used_ns(pid)?));
+            while self.looks.len() > LOOKS {
+                self.looks.pop_front();
+            }
+        }
+        let ((first, before), (last, after)) = (self.looks.front()?, self.looks.back()?);
+        let span = last.duration_since(*first);
+        (!span.is_zero()).then(|| 100.0 * after.saturating_sub(*before) as f64 / span.as_nanos() as f64)
+    }
+}
+
+/// Processor time of all threads of `pid`, user and system; nothing if that may not be seen.
+fn used_ns(pid: u32) -> Option<u64> {
+    let tasks = std::fs::read_dir(format!("/proc/{pid}/task")).ok()?.flatten();
+    let used = tasks.filter_map(|task| {
+        let text = std::fs::read_to_string(task.path().join("schedstat")).ok()?;
+        text.split_whitespace().next()?.parse::<u64>().ok()
+    });
+    used.reduce(|sum, ns| sum + ns)
+}
+
+const EVERY: Duration = Duration::from_secs(1);
+const LOOKS: usize = 6;
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_process_that_works_is_seen_working_and_one_that_is_not_there_is_not() {
+        let mut work = Work::default();
+        let (me, begin) = (std::process::id(), Instant::now());
+        assert_eq!(work.look(me, begin), None, "one look is no span");
+        let before = used_ns(me).unwrap();
+        let mut sum = 0_u64;
+        // The kernel counts when it switches: until it has.
+        while used_ns(me).unwrap() == before && begin.elapsed() < Duration::from_secs(20) {
+            sum = std::hint::black_box(sum + 1);
+        }
+        assert!(work.look(me, begin + EVERY).unwrap() > 0.0);
+        assert_eq!(work.look(u32::MAX, begin), None);
+    }
+}

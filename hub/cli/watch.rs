@@ -1,0 +1,53 @@
+//! `scanhub watch` on the command line.
+
+use std::io::{IsTerminal, stdout};
+
+use clap::Args;
+use clients::WatchOptions;
+use schema::{Failure, Kind};
+
+use super::{Everywhere, Limits};
+
+#[derive(Args, Debug)]
+pub(crate) struct Watch {
+    /// The sensors; all of the hub if none is named
+    #[arg(value_name = "SENSOR")]
+    sensors: Vec<String>,
+    #[command(flatten)]
+    limits: Limits,
+}
+
+impl Watch {
+    pub(crate) fn options(&self, everywhere: &Everywhere) -> Result<WatchOptions, Failure> {
+        if everywhere.json || !can_show_pictures() {
+            let sensor = self.sensors.first().map_or("robot/zones".to_owned(), |name| format!("{name}/scan"));
+            let hint = format!("lines for files and programs: scanhub echo {sensor}, with --json as objects");
+            return Err(Failure::new(Kind::Usage, "the picture needs a terminal", hint));
+        }
+        Ok(WatchOptions {
+            sensors: self.sensors.clone(),
+            colours: colours(),
+            bounds: self.limits.bounds(),
+            places: everywhere.places()?,
+        })
+    }
+}
+
+/// Stdout is a terminal that can place signs.
+pub(crate) fn can_show_pictures() -> bool {
+    stdout().is_terminal() && std::env::var_os("TERM").is_none_or(|term| term != "dumb")
+}
+
+/// Nobody said that there shall be none (<https://no-color.org>: by anything but nothing).
+pub(crate) fn colours() -> bool {
+    std::env::var_os("NO_COLOR").is_none_or(|value| value.is_empty())
+}
+
+/// What the help says beside the flags.
+pub(crate) const EXAMPLE: &str = "\
+Keys: q ends it, ? explains the rest. NO_COLOR=1 shows signs instead of colours.
+
+Examples:
+  scanhub watch             the robot with all its sensors
+  scanhub watch front       one sensor
+  ssh -t robot scanhub watch";

@@ -1,0 +1,123 @@
+//! Where a demonstration takes place, and who takes part: a hub, consumers and simulated sensors, in a domain and a
+//! directory that are gone afterwards. Refuses to know what they say.
+
+use std::fs::{File, OpenOptions};
+use std::io::{self, Write};
+use std::os::unix::fs::OpenOptionsExt;
+use std::path::PathBuf;
+use std::process::Stdio;
+use std::sync::mpsc;
+
+use rustix::fs::{CWD, FileType, Mode, OFlags, mknodat};
+use schema::{Domain, Environment, Failure, Kind};
+
+use super::process::{Child, Line};
+use super::{HUB, SENSORS, SIMULATOR};
+
+/// A domain and a directory of its own.
+pub(super) struct Stage {
+    pub(super) domain: Domain,
+    directory: PathBuf,
+    /// There is a picture on the terminal, into which nobody may write.
+    quiet: bool,
+}
+
+impl Stage {
+    /// `quiet`: what the processes have to say of errors is kept until [`tell_errors`](Self::tell_errors).
+    pub(super) fn new(quiet: bool) -> Result<Stage, Failure> {
+        let name = format!("demo-{}", std::process::id());
+        let domain = Domain::of_hub(&name, None, &Environment::of_process())?;
+        let directory = std::env::temp_dir().join(format!("scanhub-{name}"));
+        std::fs::create_dir_all(&directory).map_err(|error| {
+            let message = format!("cannot make {}: {error}", directory.display());
+            Failure::new(Kind::Failed, message, "set TMPDIR to a directory that this user may write")
+        })?;
+        Ok(Stage { domain, directory, quiet })
+    }
+
+    /// Says on stderr what was kept.
+    pub(super) fn tell_errors(&self) {
+        let kept = std::fs::read(self.log()).unwrap_or_default();
+        let _ = io::stderr().lock().write_all(&kept);
+    }
+
+    fn log(&self) -> PathBuf {
+        self.directory.join("log")
+    }
+
+    /// Where a process says what goes wrong.
+    fn errors(&self) -> Stdio {
+        let log = OpenOptions::new().append(true).create(true).open(self.log());
+        log.ok().filter(|_| self.quiet).map_or_else(Stdio::inherit, Stdio::from)
+    }
+
+    fn truth(&self) -> PathBuf {
+        self.directory.join("truth")
+    }
+
+    /// The reading end of what the simulator will tell: a pipe, because a demonstration may run for days.
+    pub(super) fn open_truth(&self) -> Result<File, Failure> {
+        let open = || -> io::Result<File> {
+            mknodat(CWD, self.truth(), FileType::Fifo, Mode::RUSR | Mode::WUSR, 0)?;
+            OpenOptions::new().read(true).custom_flags(OFlags::NONBLOCK.bits() as i32).open(self.truth())
+        };
+        open().map_err(|error| {
+            Failure::new(Kind::Failed, format!("cannot make a pipe {}: {error}", self.truth().display()), "")
+        })
+    }
+
+    fn port(&self, sensor: &str) -> String {
+        self.directory.join(sensor).display().to_string()
+    }
+
+    pub(super) fn start_hub(&self, lines: mpsc::Sender<Line>) -> Result<Child, Failure> {
+        let links: Vec<_> = SENSORS.iter().flat_map(|sensor| ["--link".into(), self.link(sensor)]).collect();
+        let poses = POSES.map(|pose| format!("--set=link.{pose}"));
+        let hub = Child::start(
+            &[&["run".into(), "--json".into(), "--no-system-config".into()], &links[..], &poses[..]].concat(),
+            self.domain.name(),
+            None,
+            self.errors(),
+        )?;
+        hub.await_ready(HUB, lines)
+    }
+
+    fn link(&self, sensor: &str) -> String {
+        format!("{sensor}={}", self.port(sensor))
+    }
+
+    pub(super) fn start_consumers(&self, lines: &mpsc::Sender<Line>) -> Result<Vec<Child>, Failure> {
+        let start = |(of, sensor): (usize, &&str)| {
+            let topics = ["telegram", "scan", "status"].map(|topic| format!("{sensor}/{topic}"));
+            let arguments = [&["echo".into(), "--json".into()], &topics[..]].concat();
+            Child::start(&arguments, self.domain.name(), Some((of, lines.clone())), self.errors())
+        };
+        SENSORS.iter().enumerate().map(start).collect()
+    }
+
+    pub(super) fn start_simulator(&self, seed: u64, lines: mpsc::Sender<Line>) -> Result<Child, Failure> {
+        let ports: Vec<_> = SENSORS.iter().flat_map(|sensor| ["--port".into(), self.port(sensor)]).collect();
+        let truth = self.truth().display().to_string();
+        let rest = ["--truth".into(), truth, "--seed".into(), seed.to_string(), "--json".into()];
+        let world = ["--world".into(), "demo".into()];
+        let arguments = [&["simulate".into()], &world[..], &ports[..], &rest[..]].concat();
+        Child::start(&arguments, self.domain.name(), None, self.errors())?.await_ready(SIMULATOR, lines)
+    }
+}
+
+impl Drop for Stage {
+    fn drop(&mut self) {
+        // All of it is ours alone: the domain's name has our process id.
+        let _ = std::fs::remove_dir_all(&self.directory);
+        let _ = std::fs::remove_dir_all(self.domain.root());
+        let entries = std::fs::read_dir("/dev/shm").into_iter().flatten().flatten();
+        for entry in
+            entries.filter(|entry| entry.file_name().to_string_lossy().starts_with(&self.domain.prefix()))
+        {
+            let _ = std::fs::remove_file(entry.path());
+        }
+    }
+}
+
+/// Where the sensors sit, as the world has them (`tests/worlds/demo.toml`).
+const POSES: [&str; 3] = ["front.pose.x=0.3", "rear.pose.x=-0.3", "rear.pose.yaw=3.14159"];
