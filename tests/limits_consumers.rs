@@ -78,7 +78,7 @@ fn more_consumers_than_there_are_places_are_refused_with_the_limit() {
     let node = ipc::client_node(&stage.place()).expect("joins");
     let topic = Scan::open(&node, "front").expect("works").expect("is there");
     let subscribers: Vec<_> =
-        (0..limits::SUBSCRIBERS).map(|_| Scan::subscriber(&topic).expect("a place")).collect();
+        (0..limits::subscribers(Scan::TOPIC)).map(|_| Scan::subscriber(&topic).expect("a place")).collect();
     assert_eq!(stage.subscribers("front/scan"), 200);
     let outcome = stage.run(&["echo", "front/scan", "--json"]);
     let error = &outcome.of_class("error")[0];

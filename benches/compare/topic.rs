@@ -55,7 +55,7 @@ impl Bytes {
             .publish_subscribe::<[u8]>()
             .user_header::<Header>()
             .max_publishers(limits::PUBLISHERS)
-            .max_subscribers(limits::SUBSCRIBERS)
+            .max_subscribers(limits::subscribers(Topic::Scan))
             .max_nodes(limits::NODES)
             .subscriber_max_buffer_size(limits::buffer(Topic::Scan))
             .subscriber_max_borrowed_samples(limits::BORROWED)

@@ -121,7 +121,7 @@ macro_rules! payload {
                     builder
                         .user_header::<Header>()
                         .max_publishers(limits::PUBLISHERS)
-                        .max_subscribers(limits::SUBSCRIBERS)
+                        .max_subscribers(limits::subscribers($topic))
                         .max_nodes(limits::NODES)
                         .subscriber_max_buffer_size(limits::buffer($topic))
                         .subscriber_max_borrowed_samples(limits::BORROWED)
@@ -150,7 +150,7 @@ macro_rules! payload {
                 check_client()?;
                 topic.subscriber_builder().create().map_err(|error| match error {
                     SubscriberCreateError::ExceedsMaxSupportedSubscribers => {
-                        full(topic.name(), limits::SUBSCRIBERS)
+                        full(topic.name(), limits::subscribers($topic))
                     }
                     other => no_port(topic.name(), &other),
                 })

@@ -5,8 +5,6 @@ use crate::Topic;
 
 /// Publishers of a topic: the hub's link.
 pub const PUBLISHERS: usize = 1;
-/// Consumers of a topic.
-pub const SUBSCRIBERS: usize = 200;
 /// Processes that have a service open.
 pub const NODES: usize = 260;
 /// Samples that a consumer may hold at a time.
@@ -24,6 +22,16 @@ pub const EVENT_ID: usize = 7;
 pub const CONTROL_CLIENTS: usize = 16;
 /// Processes that have the control service open, dead ones that are not cleaned up yet among them.
 pub const CONTROL_NODES: usize = 32;
+
+/// Consumers of `topic`. For each sample the shared-memory library looks at all places that there are, three times, and they
+/// are far apart: where few programs follow, many places cost more than the sample.
+pub const fn subscribers(topic: Topic) -> usize {
+    match topic {
+        Topic::Scan | Topic::Zones => 200,
+        Topic::Status => 64,
+        Topic::Telegram | Topic::Marks | Topic::Foreground | Topic::Background => 32,
+    }
+}
 
 /// Samples that wait for a consumer of `topic`; with one more the oldest is dropped.
 pub const fn buffer(topic: Topic) -> usize {
@@ -43,5 +51,5 @@ pub const fn history(topic: Topic) -> usize {
 
 /// Samples to reserve memory for. All queues hold the same latest samples, so that their number does not count.
 pub const fn samples(topic: Topic) -> usize {
-    buffer(topic) + SUBSCRIBERS * BORROWED + history(topic) + LOANED
+    buffer(topic) + subscribers(topic) * BORROWED + history(topic) + LOANED
 }

@@ -147,6 +147,7 @@ fn limits_are_those_of_the_contract() {
     let config = waker.service().static_config();
     assert_eq!((config.max_listeners(), config.max_nodes(), config.event_id_max_value()), (250, 260, 7));
     assert_eq!(limits::samples(Topic::Scan), 16 + 800 + 2);
+    assert_eq!(Topic::ALL.map(limits::subscribers), [32, 200, 32, 200, 32, 32, 64]);
 }
 
 #[test]
