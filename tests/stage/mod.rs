@@ -34,7 +34,7 @@ pub(crate) use robot::Robot;
 pub(crate) use sender::{Sender, wall_ns};
 pub(crate) use supervisor::Supervisor;
 pub(crate) use telegrams::{MEASURED, Sent, bytes_of, hash, is_class, number, scan, sequence};
-pub(crate) use terminal::terminal;
+pub(crate) use terminal::{Sitting, terminal};
 
 /// Far longer than anything takes on a busy machine.
 pub(crate) const PATIENCE: Duration = Duration::from_secs(20);

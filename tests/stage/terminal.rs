@@ -1,12 +1,21 @@
-//! A terminal at which a person sits: a pty of which the test has the person's side.
+//! A terminal at which a person sits: a pty of which the test has the person's side, and what stands on its screen.
 
 use std::ffi::OsStr;
 use std::fs::File;
-use std::os::fd::OwnedFd;
+use std::io::{Read, Write};
+use std::os::fd::{AsFd, OwnedFd};
 use std::os::unix::ffi::OsStrExt;
+use std::process::{Child, Command, Stdio};
+use std::sync::{Arc, Mutex};
+use std::thread;
+use std::time::{Duration, Instant};
 
 use rustix::fs::{Mode, OFlags};
+use rustix::process::{Pid, Signal, kill_process};
 use rustix::pty::{OpenptFlags, grantpt, openpt, ptsname, unlockpt};
+use rustix::termios::{Termios, Winsize, tcgetattr, tcsetwinsize};
+
+use super::PATIENCE;
 
 /// The person's side of a new terminal, and the program's.
 pub(crate) fn terminal() -> (File, OwnedFd) {
@@ -17,4 +26,167 @@ pub(crate) fn terminal() -> (File, OwnedFd) {
     let flags = OFlags::RDWR | OFlags::NOCTTY | OFlags::CLOEXEC;
     let screen: OwnedFd = rustix::fs::open(OsStr::from_bytes(name.as_bytes()), flags, Mode::empty()).unwrap();
     (keys.into(), screen)
+}
+
+/// A program with a terminal of its own, at which the test sits.
+pub(crate) struct Sitting {
+    process: Child,
+    keys: File,
+    screen: OwnedFd,
+    before: Termios,
+    seen: Arc<Mutex<Vec<u8>>>,
+    size: (u16, u16),
+}
+
+impl Sitting {
+    /// Starts `command` on a terminal of `size`, columns and rows, which is the one of its session.
+    pub(crate) fn start(command: &Command, size: (u16, u16)) -> Sitting {
+        let (keys, screen) = terminal();
+        resize(&screen, size);
+        let before = tcgetattr(&screen).unwrap();
+        let program = || Stdio::from(screen.try_clone().unwrap());
+        let mut setsid = Command::new("setsid");
+        setsid.arg("--ctty").arg(command.get_program()).args(command.get_args());
+        for (key, value) in command.get_envs() {
+            match value {
+                Some(value) => setsid.env(key, value),
+                None => setsid.env_remove(key),
+            };
+        }
+        setsid.env("TERM", "xterm").stdin(program()).stdout(program()).stderr(program());
+        let process = setsid.spawn().unwrap();
+        drop(setsid);
+        let seen = Arc::new(Mutex::new(Vec::new()));
+        let (mut from, to) = (keys.try_clone().unwrap(), seen.clone());
+        thread::spawn(move || {
+            let mut piece = [0; 4096];
+            // A terminal that nobody has open any more ends by an error.
+            while let Ok(len @ 1..) = from.read(&mut piece) {
+                to.lock().unwrap().extend_from_slice(&piece[..len]);
+            }
+        });
+        Sitting { process, keys, screen, before, seen, size }
+    }
+
+    /// Its process id.
+    pub(crate) fn pid(&self) -> u32 {
+        self.process.id()
+    }
+
+    /// All that was written on it.
+    pub(crate) fn text(&self) -> String {
+        String::from_utf8_lossy(&self.seen.lock().unwrap()).into_owned()
+    }
+
+    /// The rows of its screen.
+    pub(crate) fn rows(&self) -> Vec<String> {
+        shown(&self.text(), self.size.0.into(), self.size.1.into())
+    }
+
+    /// Waits until a row has `words`.
+    pub(crate) fn await_words(&self, words: &str) {
+        self.await_rows(words, |rows| rows.iter().any(|row| row.contains(words)));
+    }
+
+    /// Waits until the rows are as `wanted`.
+    pub(crate) fn await_rows(&self, what: &str, wanted: impl Fn(&[String]) -> bool) {
+        let give_up_at = Instant::now() + PATIENCE;
+        while !wanted(&self.rows()) {
+            assert!(Instant::now() < give_up_at, "no {what}:\n{}", self.rows().join("\n"));
+            thread::sleep(Duration::from_millis(10));
+        }
+    }
+
+    /// Types.
+    pub(crate) fn press(&mut self, keys: &str) {
+        self.keys.write_all(keys.as_bytes()).unwrap();
+    }
+
+    /// Makes the terminal so large.
+    pub(crate) fn resize(&mut self, size: (u16, u16)) {
+        self.size = size;
+        resize(&self.screen, size);
+    }
+
+    /// Sends a signal.
+    pub(crate) fn signal(&self, signal: Signal) {
+        kill_process(Pid::from_child(&self.process), signal).unwrap();
+    }
+
+    /// Waits for the end: the exit code, what stands below the picture, and whether the terminal is as it was.
+    pub(crate) fn end(mut self) -> (Option<i32>, String, bool) {
+        let give_up_at = Instant::now() + PATIENCE;
+        let status = loop {
+            if let Some(status) = self.process.try_wait().unwrap() {
+                break status;
+            }
+            assert!(Instant::now() < give_up_at, "it does not end:\n{}", self.rows().join("\n"));
+            thread::sleep(Duration::from_millis(10));
+        };
+        let after = tcgetattr(&self.screen).unwrap();
+        let is_as_before = (after.input_modes, after.output_modes, after.local_modes)
+            == (self.before.input_modes, self.before.output_modes, self.before.local_modes);
+        // All of it is here once the last of it is.
+        let mark = "\u{1}end";
+        File::from(self.screen.try_clone().unwrap()).write_all(mark.as_bytes()).unwrap();
+        while !self.text().ends_with(mark) {
+            assert!(Instant::now() < give_up_at, "the terminal keeps what was written");
+            thread::sleep(Duration::from_millis(10));
+        }
+        let text = self.text();
+        let (picture, below) = text.rsplit_once("\x1b[?1049l").unwrap_or(("", &text));
+        let is_shown = below.contains("\x1b[?25h") && !below.contains("\x1b[?25l");
+        let is_whole = picture.contains("\x1b[?1049h") && is_shown && is_as_before;
+        (status.code(), below.replace("\x1b[?25h", "").replace(mark, ""), is_whole)
+    }
+}
+
+impl Drop for Sitting {
+    fn drop(&mut self) {
+        let _ = self.process.kill();
+        let _ = self.process.wait();
+    }
+}
+
+fn resize(terminal: impl AsFd, (columns, rows): (u16, u16)) {
+    tcsetwinsize(terminal, Winsize { ws_col: columns, ws_row: rows, ws_xpixel: 0, ws_ypixel: 0 }).unwrap();
+}
+
+/// What stands on a screen on which `text` was written: its rows. Knows what programs use that place each sign: cursor
+/// positions (CSI H), clearing (CSI J) and the alternate screen; colours say nothing here.
+fn shown(text: &str, columns: usize, rows: usize) -> Vec<String> {
+    let mut screen = vec![vec![' '; columns]; rows];
+    let (mut row, mut column) = (0, 0);
+    let mut signs = text.chars();
+    while let Some(sign) = signs.next() {
+        match sign {
+            '\x1b' if signs.clone().next() == Some('[') => {
+                signs.next();
+                let arguments: String =
+                    signs.clone().take_while(|sign| !sign.is_ascii_alphabetic()).collect();
+                match signs.nth(arguments.chars().count()) {
+                    Some('H') => {
+                        let mut numbers =
+                            arguments.split(';').map(|number| number.parse().unwrap_or(1_usize));
+                        row = numbers.next().unwrap_or(1).saturating_sub(1);
+                        column = numbers.next().unwrap_or(1).saturating_sub(1);
+                    }
+                    Some('J') => screen.iter_mut().for_each(|row| row.fill(' ')),
+                    Some('h' | 'l') if arguments == "?1049" => {
+                        screen.iter_mut().for_each(|row| row.fill(' '));
+                    }
+                    _ => {}
+                }
+            }
+            '\r' => column = 0,
+            '\n' => row += 1,
+            sign => {
+                if let Some(cell) = screen.get_mut(row).and_then(|row| row.get_mut(column)) {
+                    *cell = sign;
+                }
+                column += 1;
+            }
+        }
+    }
+    screen.into_iter().map(|row| row.into_iter().collect::<String>().trim_end().to_owned()).collect()
 }
