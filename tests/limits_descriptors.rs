@@ -33,7 +33,7 @@ fn a_hub_starts_or_says_how_many_it_needs() {
     for limit in [6, 8, 12, 16, 24, 32, 40, 48] {
         is_short(&limited(&stage, limit, &run).wait());
     }
-    for limit in [72, 80, 128] {
+    for limit in [74, 80, 128] {
         let hub = limited(&stage, limit, &run).ready();
         assert_eq!(stage.info("front")["state"], "absent", "{limit}");
         assert_eq!(hub.end(TERM).code, Some(0), "{limit}");
@@ -70,7 +70,7 @@ fn a_client_works_or_says_how_many_it_needs() {
 fn a_hub_that_runs_out_of_them_serves_on_whom_it_serves() {
     let stage = Stage::new();
     let _simulator = stage.simulator(&["front"], &["--seed=51", "--baud=500000"]);
-    let hub = limited(&stage, 72, &["run", "--json", &stage.link("front")]).ready();
+    let hub = limited(&stage, 74, &["run", "--json", &stage.link("front")]).ready();
     let mut served = stage.echo(&["front/scan", "front/status"]);
     served.await_lines(20, "a scan", is_class("scan"));
     let others: Vec<_> = (0..16).map(|_| stage.start(&["echo", "--json", "front/scan"])).collect();
