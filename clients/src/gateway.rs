@@ -181,6 +181,7 @@ impl<'a> Gateway<'a> {
         let change = self.session.look()?;
         if change.gone && self.is_there {
             self.is_there = false;
+            self.roll.end();
             report.hub(Notice::HubGone)?;
         }
         // Somebody else may bring the sensors of other machines, which are not sent on.
