@@ -77,7 +77,8 @@ pub enum GatewayLook {
 ///
 /// [`Kind::Configuration`] if there is no such interface or not just one, a destination is no host, or a
 /// value is not possible; [`Kind::NoTopic`] if there is no such topic, or the first hub that is met has no
-/// such sensor; [`Kind::Short`] if descriptors or memory are.
+/// such sensor; [`Kind::Short`] if descriptors or memory are; [`Kind::Interrupted`] if `stop` is set before it is known
+/// where the hosts are.
 pub fn gateway(
     options: &GatewayOptions,
     out: &mut (impl Write + AsFd),
@@ -85,7 +86,7 @@ pub fn gateway(
     tell: &AtomicBool,
     stop: &AtomicBool,
 ) -> Result<(), Failure> {
-    let mut gateway = Gateway::open(options)?;
+    let mut gateway = Gateway::open(options, stop)?;
     let (mut out, mut notes) = (Spare::new(out, stop), Spare::new(notes, stop));
     let mut report = Report::new(options.look, &mut out, &mut notes);
     quiet(gateway.run(&mut report, tell, stop))
@@ -110,7 +111,7 @@ struct Gateway<'a> {
 const TICK: Duration = Duration::from_secs(1);
 
 impl<'a> Gateway<'a> {
-    fn open(options: &'a GatewayOptions) -> Result<Gateway<'a>, Failure> {
+    fn open(options: &'a GatewayOptions, stop: &AtomicBool) -> Result<Gateway<'a>, Failure> {
         let selection = Selection::parse(&options.topics, options.bare)?;
         if options.bare && options.background_every.is_some() {
             let what = "no background goes out where only telegrams do";
@@ -122,7 +123,7 @@ impl<'a> Gateway<'a> {
         let machine = machine::machine(Path::new(machine::ID));
         let life = Life::begin(&life::directory()?, domain, interface.name(), now_s, machine)?;
         let form = if options.bare { Form::Bare } else { Form::Sealed };
-        let lan = Lan::open(life, interface, &options.to, form, options.ttl, options.longest)?;
+        let lan = Lan::open(life, interface, &options.to, form, options.ttl, options.longest, stop)?;
         let sensor = |name: &&str| Sensor::new(name, &selection, !options.bare);
         Ok(Gateway {
             options,
@@ -180,6 +181,7 @@ impl<'a> Gateway<'a> {
         let change = self.session.look()?;
         if change.gone && self.is_there {
             self.is_there = false;
+            self.roll.end();
             report.hub(Notice::HubGone)?;
         }
         // Somebody else may bring the sensors of other machines, which are not sent on.

@@ -228,9 +228,8 @@ impl Listener<'_> {
     fn announced(&mut self, datagram: &Datagram<'_>, wall_ns: u64, from: IpAddr) -> Result<(), End> {
         let head = datagram.head;
         let Some(announce) = Announce::unpack(datagram.payload) else { return Ok(()) };
-        let life = self.roll.life(&head, &self.account);
-        let behind_ns = life.announce(head.sensor, &announce, head.stamp_ns, wall_ns);
-        if life.sensor(head.sensor).take_numbered() {
+        let behind_ns = self.roll.announce(&head, &self.account, &announce, wall_ns);
+        if self.roll.life(&head, &self.account).sensor(head.sensor).take_numbered() {
             self.report.named(&head, announce.sensor())?;
         }
         if let Some(behind_ns) = behind_ns {

@@ -25,14 +25,25 @@ impl Machine {
         let read = holder.stdout.as_mut().map(|out| out.read_exact(&mut said));
         assert!(matches!(read, Some(Ok(()))), "no namespace");
         let machine = Machine { holder, number };
-        let (end, pid) = (machine.end(), machine.holder.id());
-        ip(&format!("link add {end} type veth peer name eth0 netns {pid}"));
-        ip(&format!("address add {}/24 dev {end}", machine.here()));
-        ip(&format!("link set {end} up"));
-        machine.run(&format!("ip address add {}/24 dev eth0", machine.there()));
-        machine.run("ip link set eth0 up");
-        machine.await_link();
+        machine.plug();
         machine
+    }
+
+    /// Makes the cable, which is not there.
+    fn plug(&self) {
+        let (end, pid) = (self.end(), self.holder.id());
+        ip(&format!("link add {end} type veth peer name eth0 netns {pid}"));
+        ip(&format!("address add {}/24 dev {end}", self.here()));
+        ip(&format!("link set {end} up"));
+        self.run(&format!("ip address add {}/24 dev eth0", self.there()));
+        self.run("ip link set eth0 up");
+        self.await_link();
+    }
+
+    /// Takes both ends of the cable away, interfaces and all, and makes them anew.
+    pub(crate) fn make_cable_anew(&self) {
+        ip(&format!("link delete {}", self.end()));
+        self.plug();
     }
 
     /// The name of the test's end of the cable.

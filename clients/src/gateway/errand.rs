@@ -1,12 +1,17 @@
 //! Work that may take its time, done beside the sending, which waits for nothing but samples. Refuses to know what is
 //! done.
 
-use std::sync::mpsc::{Receiver, channel};
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::mpsc::{Receiver, RecvTimeoutError, channel};
 use std::thread;
+use std::time::Duration;
 
 /// Work in a thread of its own. Dropped, nobody waits for its result any more.
 #[derive(Debug)]
 pub(super) struct Errand<T>(Receiver<T>);
+
+/// So often it is seen that nobody wants to wait any more.
+const LOOK_EVERY: Duration = Duration::from_millis(50);
 
 impl<T: Send + 'static> Errand<T> {
     /// Begins it; nothing if there is no thread to be had: then it is to be tried again.
@@ -22,11 +27,22 @@ impl<T: Send + 'static> Errand<T> {
     pub(super) fn result(&self) -> Option<T> {
         self.0.try_recv().ok()
     }
+
+    /// Its result, waited for; nothing if `stop` is set before there is one.
+    pub(super) fn wait(&self, stop: &AtomicBool) -> Option<T> {
+        while !stop.load(Ordering::Relaxed) {
+            match self.0.recv_timeout(LOOK_EVERY) {
+                Err(RecvTimeoutError::Timeout) => {}
+                result => return result.ok(),
+            }
+        }
+        None
+    }
 }
 
 #[cfg(test)]
 mod tests {
-    use std::time::{Duration, Instant};
+    use std::time::Instant;
 
     use super::*;
 
@@ -45,5 +61,14 @@ mod tests {
             thread::yield_now();
         };
         assert_eq!((result, errand.result()), (Ok(7), None));
+    }
+
+    #[test]
+    fn who_waits_for_it_can_be_stopped() {
+        let (go, hold) = channel();
+        let errand = Errand::begin(move || hold.recv()).unwrap();
+        assert_eq!(errand.wait(&AtomicBool::new(true)), None);
+        go.send(7).unwrap();
+        assert_eq!(errand.wait(&AtomicBool::new(false)), Some(Ok(7)));
     }
 }

@@ -3,6 +3,7 @@
 
 use std::io;
 use std::net::{IpAddr, SocketAddr, ToSocketAddrs};
+use std::sync::atomic::AtomicBool;
 use std::time::{Duration, Instant};
 
 use schema::{Failure, Kind};
@@ -31,15 +32,29 @@ const EVERY_IN_TROUBLE: Duration = Duration::from_secs(5);
 impl Host {
     /// The host and port in `text`, and up to `more` ports above it. Waits for the answer.
     ///
-    /// [`Kind::Configuration`] if `text` names none, or a group.
-    pub(super) fn parse(text: &str, more: u16) -> Result<Host, Failure> {
-        Host::by(|text| Ok(text.to_socket_addrs()?.collect()), text, more, Instant::now())
+    /// [`Kind::Configuration`] if `text` names none, or a group; [`Kind::Interrupted`] if `stop` is set before the answer.
+    pub(super) fn parse(text: &str, more: u16, stop: &AtomicBool) -> Result<Host, Failure> {
+        Host::by(resolve, text, more, stop, Instant::now())
     }
 
     /// The same, as `resolve` knows it.
-    pub(super) fn by(resolve: Resolve, text: &str, more: u16, now: Instant) -> Result<Host, Failure> {
+    pub(super) fn by(
+        resolve: Resolve,
+        text: &str,
+        more: u16,
+        stop: &AtomicBool,
+        now: Instant,
+    ) -> Result<Host, Failure> {
         let refuse = |what: String, hint: &str| Failure::new(Kind::Configuration, what, hint);
-        let found = resolve(text).map_err(|error| {
+        let name = text.to_owned();
+        let found = match Errand::begin(move || resolve(&name)) {
+            Some(errand) => errand.wait(stop).ok_or_else(|| {
+                let what = format!("interrupted before it was known where {text} is");
+                Failure::new(Kind::Interrupted, what, "")
+            })?,
+            None => resolve(text),
+        };
+        let found = found.map_err(|error| {
             let hint = "write HOST:PORT with a name that is known here, or an address, as in 10.0.0.7:22200";
             refuse(format!("cannot send to {text}: {error}"), hint)
         })?;
@@ -52,6 +67,10 @@ impl Host {
             let hint = "the groups get everything anyway; name single hosts besides";
             refuse(format!("cannot send to {text}: it is no host"), hint)
         })?;
+        if matches!(address, SocketAddr::V6(six) if six.ip().is_unicast_link_local() && six.scope_id() == 0) {
+            let hint = "name the interface behind the address, as in [fe80::7%eth0]:22200";
+            return Err(refuse(format!("cannot send to {text}: each interface has such addresses"), hint));
+        }
         let is_name = text.parse::<SocketAddr>().is_err();
         let asked_at = is_name.then_some(now);
         Ok(Host { text: text.to_owned(), address, asked_at, errand: None, resolve })
@@ -86,6 +105,14 @@ impl Host {
     }
 }
 
+/// What the system knows of `HOST:PORT`. It knows an address with the name of an interface, but not within brackets.
+fn resolve(text: &str) -> io::Result<Vec<SocketAddr>> {
+    let bracketed = text.strip_prefix('[').and_then(|text| text.rsplit_once("]:"));
+    let scoped = bracketed.filter(|(host, _)| host.contains('%'));
+    let plain = scoped.map(|(host, port)| format!("{host}:{port}"));
+    Ok(plain.as_deref().unwrap_or(text).to_socket_addrs()?.collect())
+}
+
 /// The address that datagrams go to: the present one as long as it is among them, else the first one of IPv4, which all
 /// listeners hear, else the first one.
 fn choose(found: &[SocketAddr], present: Option<SocketAddr>) -> Option<SocketAddr> {
@@ -113,6 +140,30 @@ mod tests {
 
     use super::*;
 
+    static GO_ON: AtomicBool = AtomicBool::new(false);
+
+    #[test]
+    fn who_does_not_want_to_wait_for_a_name_is_let_go() {
+        fn never(_: &str) -> io::Result<Vec<SocketAddr>> {
+            loop {
+                std::thread::park();
+            }
+        }
+        let refused = Host::by(never, "robot:7", 0, &AtomicBool::new(true), Instant::now()).unwrap_err();
+        assert!(refused.kind == Kind::Interrupted && refused.message.contains("robot:7"), "{refused}");
+    }
+
+    #[test]
+    fn an_address_of_one_link_has_its_interface() {
+        let of = |text: &str| Host::parse(text, 0, &GO_ON).map(|host| host.address().to_string());
+        let refused = of("[fe80::1]:7").unwrap_err();
+        assert!(refused.kind == Kind::Configuration && refused.hint.contains("%eth0"), "{refused}");
+        assert_eq!(of("[fe80::1%3]:7"), Ok("[fe80::1%3]:7".into()));
+        let lo = crate::interface::named("lo").unwrap().index;
+        assert_eq!(of("[fe80::1%lo]:7"), Ok(format!("[fe80::1%{lo}]:7")));
+        assert!(of("[fe80::1%no-such]:7").is_err() && of("[fe80::1%lo]:").is_err());
+    }
+
     #[test]
     fn hosts_that_are_none() {
         for bad in [
@@ -128,17 +179,18 @@ mod tests {
             "[::ffff:239.255.76.80]:22200",
             "::1:22200:",
         ] {
-            let refused = Host::parse(bad, 0).map(drop).unwrap_err();
+            let refused = Host::parse(bad, 0, &GO_ON).map(drop).unwrap_err();
             assert_eq!(refused.kind, Kind::Configuration, "{refused}");
             assert!(refused.message.contains(bad) && !refused.hint.is_empty(), "{refused}");
         }
-        assert!(Host::parse("127.0.0.1:0", 0).is_err());
-        assert!(Host::parse("127.0.0.1:65535", 255).is_err() && Host::parse("127.0.0.1:65535", 0).is_ok());
+        assert!(Host::parse("127.0.0.1:0", 0, &GO_ON).is_err());
+        let last = |more| Host::parse("127.0.0.1:65535", more, &GO_ON);
+        assert!(last(255).is_err() && last(0).is_ok());
     }
 
     #[test]
     fn addresses_of_both_kinds() {
-        let of = |text: &str| Host::parse(text, 0).unwrap().address().to_string();
+        let of = |text: &str| Host::parse(text, 0, &GO_ON).unwrap().address().to_string();
         assert_eq!((of("127.0.0.1:7"), of("[::1]:7")), ("127.0.0.1:7".into(), "[::1]:7".into()));
         assert_eq!(of("[::ffff:10.0.0.7]:7"), "10.0.0.7:7");
         let (four, six) = (SocketAddr::from(([10, 0, 0, 7], 7)), "[fe80::1]:7".parse().unwrap());
@@ -168,7 +220,7 @@ mod tests {
         }
         let begin = Instant::now();
         let at = |s: u64| begin + Duration::from_secs(s);
-        let mut host = Host::by(resolve, "robot:7", 0, begin).unwrap();
+        let mut host = Host::by(resolve, "robot:7", 0, &GO_ON, begin).unwrap();
         assert!((0..60).all(|s| host.look(false, at(s)).is_none()));
         assert_eq!(ASKED.load(Ordering::SeqCst), 1);
         assert_eq!((host.look(false, at(60)), answer(&mut host, at(61))), (None, None), "the same");
@@ -177,7 +229,7 @@ mod tests {
         let moved = answer(&mut host, at(66)).unwrap();
         assert_eq!((moved.to_string().as_str(), ASKED.load(Ordering::SeqCst)), ("10.0.0.1:7", 3));
         // An address is no name.
-        let mut fixed = Host::by(resolve, "10.0.0.9:7", 0, begin).unwrap();
+        let mut fixed = Host::by(resolve, "10.0.0.9:7", 0, &GO_ON, begin).unwrap();
         assert!(fixed.look(true, at(1000)).is_none() && fixed.errand.is_none());
     }
 }

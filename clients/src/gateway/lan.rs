@@ -1,6 +1,8 @@
 //! The datagrams: each is numbered, sealed and handed to every destination, in a buffer that is always the same. Refuses
 //! to know where samples come from.
 
+use std::sync::atomic::AtomicBool;
+
 use schema::datagram::{Announce, HEAD, Head, MTU_ETHERNET, MTU_LEAST, PORT, group};
 use schema::{Failure, Kind, Topic};
 
@@ -82,7 +84,8 @@ impl Lan {
     /// Datagrams of at most `longest` bytes, as `life`, to the groups on `interface`, which routers pass on `ttl` times,
     /// and to the hosts in `to`.
     ///
-    /// [`Kind::Configuration`] if `longest` is not possible, a host is none or is named twice; [`Kind::Failed`] without sockets.
+    /// [`Kind::Configuration`] if `longest` is not possible, a host is none or is named twice; [`Kind::Failed`] without sockets;
+    /// [`Kind::Interrupted`] if `stop` is set before it is known where the hosts are.
     pub(super) fn open(
         life: Life,
         interface: Uplink,
@@ -90,6 +93,7 @@ impl Lan {
         form: Form,
         ttl: u8,
         longest: usize,
+        stop: &AtomicBool,
     ) -> Result<Lan, Failure> {
         if !(MTU_LEAST..=MTU_ETHERNET).contains(&longest) {
             let what = format!("datagrams of {longest} bytes are not possible");
@@ -104,7 +108,7 @@ impl Lan {
         let groups = Outlet::groups(interface.name(), port, ttl)?;
         let mut copies: Vec<Outlet> = Vec::new();
         for text in to {
-            let copy = Outlet::host(text, more)?;
+            let copy = Outlet::host(text, more, stop)?;
             if let Some(other) = copies.iter().find(|other| other.is_as(&copy)) {
                 let what = format!("cannot send to {text}: it is named twice");
                 let hint = format!("{} gets a copy already; name each host and port once", other.name);

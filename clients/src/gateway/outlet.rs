@@ -4,6 +4,7 @@
 use std::io::{self, ErrorKind, IoSliceMut};
 use std::net::{IpAddr, Ipv4Addr, Ipv6Addr, SocketAddr, UdpSocket};
 use std::os::fd::AsRawFd;
+use std::sync::atomic::AtomicBool;
 use std::time::Instant;
 
 use nix::sys::socket::{
@@ -68,8 +69,8 @@ impl Outlet {
     }
 
     /// A host and port, and up to `more` ports above it. Failures as [`Host::parse`], and [`Kind::Failed`] as above.
-    pub(super) fn host(text: &str, more: u16) -> Result<Outlet, Failure> {
-        Outlet::new(text, To::Host(Host::parse(text, more)?))
+    pub(super) fn host(text: &str, more: u16, stop: &AtomicBool) -> Result<Outlet, Failure> {
+        Outlet::new(text, To::Host(Host::parse(text, more, stop)?))
     }
 
     /// What is sent to `other` gets to the same place.
@@ -233,7 +234,7 @@ const CALM: u32 = 2;
 
 #[cfg(test)]
 mod tests {
-    use std::sync::atomic::{AtomicBool, AtomicU16, Ordering};
+    use std::sync::atomic::{AtomicU16, Ordering};
     use std::time::Duration;
 
     use super::*;
@@ -253,7 +254,7 @@ mod tests {
         };
         PORT.store(there.local_addr().unwrap().port(), Ordering::SeqCst);
         let begin = Instant::now();
-        let host = Host::by(resolve, "robot:7", 0, begin).unwrap();
+        let host = Host::by(resolve, "robot:7", 0, &AtomicBool::new(false), begin).unwrap();
         let mut outlet = Outlet::new("robot:7", To::Host(host)).unwrap();
         let later = begin + Duration::from_secs(60);
         assert_eq!(outlet.follow_name(begin), None);
@@ -282,7 +283,7 @@ mod tests {
 
     fn nobody_listens(receiver: UdpSocket) {
         let text = receiver.local_addr().unwrap().to_string();
-        let mut outlet = Outlet::host(&text, 0).unwrap();
+        let mut outlet = Outlet::host(&text, 0, &AtomicBool::new(false)).unwrap();
         assert!(outlet.send(b"one", 0, 0) && outlet.news().is_none());
         drop(receiver);
         for _ in 0..4 {

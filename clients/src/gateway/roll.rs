@@ -38,6 +38,11 @@ impl Roll {
         *self = Roll { hub: Some((now, 0)), call: None };
     }
 
+    /// The hub is gone: nobody waits for what it has.
+    pub(super) fn end(&mut self) {
+        self.call = None;
+    }
+
     /// There was a hub.
     pub(super) fn has_begun(&self) -> bool {
         self.hub.is_some()
@@ -66,5 +71,21 @@ impl Roll {
     /// After which time there may be an answer.
     pub(super) fn left(&self) -> Option<Duration> {
         self.call.as_ref().map(|_| LOOK_EVERY)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn nobody_looks_for_an_answer_about_a_hub_that_is_gone() {
+        let mut roll = Roll::default();
+        roll.begin(Instant::now());
+        assert_eq!(roll.left(), None);
+        roll.call = Errand::begin(|| Ok(Vec::new())).map(|errand| (errand, Duration::ZERO));
+        assert_eq!(roll.left(), Some(LOOK_EVERY));
+        roll.end();
+        assert!(roll.left().is_none() && roll.has_begun());
     }
 }

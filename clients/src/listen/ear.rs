@@ -8,7 +8,7 @@ use std::time::{Duration, Instant};
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
 use schema::datagram::{GROUPS, PORT};
 use schema::{Failure, Kind};
-use socket2::{Domain, InterfaceIndexOrAddress, Protocol, Socket, Type};
+use socket2::{Domain, InterfaceIndexOrAddress, Protocol, SockRef, Socket, Type};
 
 use crate::interface::{Changes, Interface, interfaces, named};
 
@@ -101,7 +101,14 @@ impl Ear {
                 return;
             }
         };
-        self.joined.retain(|joined| all.iter().any(|interface| interface.index == joined.index));
+        let (socket, groups) = (&self.socket, &self.groups);
+        self.joined.retain(|joined| {
+            let is_there = all.iter().any(|interface| interface.index == joined.index);
+            if !is_there {
+                leave(socket, groups, joined.index);
+            }
+            is_there
+        });
         for interface in &all {
             if !self.wants(interface) {
                 continue;
@@ -154,17 +161,26 @@ impl Ear {
 
     fn join(&mut self, interface: &Interface) {
         let index = InterfaceIndexOrAddress::Index(interface.index);
-        let socket = socket2::SockRef::from(&self.socket);
+        let socket = SockRef::from(&self.socket);
+        // First: joining again what was joined before tells the network nothing.
+        leave(&self.socket, &self.groups, interface.index);
         for group in &self.groups {
-            // Leaving first: joining again what was joined before tells the network nothing.
-            let _ = socket.leave_multicast_v4_n(group, &index);
             if let Err(error) = socket.join_multicast_v4_n(group, &index) {
                 self.trouble = Some(format!("cannot join {group} on {}: {error}", interface.name));
+                leave(&self.socket, &self.groups, interface.index);
                 return;
             }
         }
         self.joined.retain(|joined| joined.index != interface.index);
         self.joined.push(Joined { name: interface.name.clone(), index: interface.index, running: true });
+    }
+}
+
+/// Leaves what was joined of `groups` on interface number `index`. Of one that is gone, too: a socket keeps what it joined
+/// there, and can have 20 of them (`net.ipv4.igmp_max_memberships`).
+fn leave(socket: &UdpSocket, groups: &[Ipv4Addr], index: u32) {
+    for group in groups {
+        let _ = SockRef::from(socket).leave_multicast_v4_n(group, &InterfaceIndexOrAddress::Index(index));
     }
 }
 

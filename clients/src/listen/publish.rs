@@ -124,12 +124,13 @@ impl Publication {
                 self.sensors.len() - 1
             }
         };
-        let sensor = &mut self.sensors[at];
-        for &topic in &missing {
-            sensor.add(&self.node, topic)?;
-        }
         if !missing.is_empty() {
-            allocate(&self.domain)?;
+            let sensor = &mut self.sensors[at];
+            let made = missing.iter().try_for_each(|&topic| sensor.add(&self.node, topic));
+            made.and_then(|()| allocate(&self.domain)).inspect_err(|_| {
+                // To write into what has no memory behind it would end the process.
+                missing.iter().for_each(|&topic| sensor.remove(topic));
+            })?;
         }
         let is_told = std::mem::replace(&mut self.sensors[at].is_told, true);
         Ok((!is_told).then_some(name))

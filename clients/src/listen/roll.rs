@@ -1,7 +1,7 @@
 //! Who is heard: the lives of gateways, what their sensors are called, how their clocks stand against ours. Learned from
 //! what an account has accepted, which also bounds it. Refuses to know what a sample says.
 
-use std::collections::HashMap;
+use std::collections::{HashMap, HashSet};
 
 use schema::datagram::{Account, Announce, Head};
 
@@ -9,6 +9,8 @@ use schema::datagram::{Account, Announce, Head};
 #[derive(Default)]
 pub(super) struct Roll {
     lives: HashMap<(u64, u32), Life>,
+    /// The gateways of which it was told that their clocks differ; an account takes no more of them than it has lives.
+    told: HashSet<u64>,
 }
 
 /// One life of one gateway.
@@ -42,6 +44,20 @@ impl Roll {
             self.lives.retain(|&(hub, epoch), _| account.knows(hub, epoch));
         }
         self.lives.entry(life).or_default()
+    }
+
+    /// An announcement that came with `head`, which `account` has taken, at `wall_ns`. If it tells that the clocks differ, how
+    /// much ours is ahead of theirs, in ns; said once of each gateway, however often that is started anew.
+    pub(super) fn announce(
+        &mut self,
+        head: &Head,
+        account: &Account,
+        announce: &Announce,
+        wall_ns: u64,
+    ) -> Option<i64> {
+        let difference_ns =
+            self.life(head, account).announce(head.sensor, announce, head.stamp_ns, wall_ns)?;
+        self.told.insert(head.hub).then_some(difference_ns)
     }
 
     /// What the sensor is called: its name, or `#` and its number as long as nobody announced it.
@@ -87,14 +103,8 @@ impl Life {
     }
 
     /// An announcement of `sensor` came at `wall_ns`. If it tells that the clocks differ, how much ours is ahead of
-    /// theirs, in ns; said once.
-    pub(super) fn announce(
-        &mut self,
-        sensor: u8,
-        announce: &Announce,
-        stamp_ns: u64,
-        wall_ns: u64,
-    ) -> Option<i64> {
+    /// theirs, in ns.
+    fn announce(&mut self, sensor: u8, announce: &Announce, stamp_ns: u64, wall_ns: u64) -> Option<i64> {
         let known = self.sensor(sensor);
         for topic in announce.topics() {
             if let Some(last) = known.last.get_mut(usize::from(topic.topic)) {
@@ -104,10 +114,7 @@ impl Life {
         let before = known.announced.replace(*announce);
         known.is_renamed |= before.is_some_and(|before| before.sensor() != announce.sensor());
         self.delays.add(wall_ns.wrapping_sub(stamp_ns) as i64);
-        let difference_ns = self.delays.difference_ns()?;
-        let is_news = difference_ns.unsigned_abs() > CLOCKS_AGREE_NS && !self.delays.told;
-        self.delays.told |= is_news;
-        is_news.then_some(difference_ns)
+        self.delays.difference_ns().filter(|difference_ns| difference_ns.unsigned_abs() > CLOCKS_AGREE_NS)
     }
 }
 
@@ -133,8 +140,6 @@ impl Sensor {
 struct Delays {
     last_ns: [i64; DELAYS],
     count: usize,
-    /// That the clocks differ was told.
-    told: bool,
 }
 
 /// Announcements that count for the difference of clocks: of two sensors those of the last five seconds.
@@ -223,13 +228,22 @@ mod tests {
 
     #[test]
     fn clocks_that_differ_give_no_age_and_are_told_once() {
-        let (mut life, announce) = (Life::default(), Announce::new(1, "front", ""));
-        assert_eq!(life.age_ns(MS, 2 * MS), None, "not known yet");
-        assert_eq!(life.announce(0, &announce, 100 * MS, 101 * MS), None);
-        assert_eq!((life.age_ns(200 * MS, 230 * MS), life.age_ns(200 * MS, 199 * MS)), (Some(30 * MS), None));
-        assert_eq!(life.announce(0, &announce, 100 * MS, 900 * MS), None, "one that waited");
-        assert_eq!(life.announce(0, &announce, 3000 * MS, 1000 * MS), Some(-2000 * MS as i64));
-        assert_eq!(life.announce(0, &announce, 4000 * MS, 2000 * MS), None);
-        assert_eq!(life.age_ns(5000 * MS, 3030 * MS), None);
+        let (mut roll, account) = (Roll::default(), Box::new(Account::new(&Topic::ALL)));
+        let head = |epoch, stamp_ms| Head { hub: 5, epoch, stamp_ns: stamp_ms * MS, ..Head::default() };
+        let age_ns = |roll: &mut Roll, stamp_ms, wall_ms| {
+            roll.life(&head(1, 0), &account).age_ns(stamp_ms * MS, wall_ms * MS)
+        };
+        let announce = |roll: &mut Roll, epoch, stamp_ms, wall_ms| {
+            let announce = Announce::new(1, "front", "");
+            roll.announce(&head(epoch, stamp_ms), &account, &announce, wall_ms * MS)
+        };
+        assert_eq!(age_ns(&mut roll, 1, 2), None, "not known yet");
+        assert_eq!(announce(&mut roll, 1, 100, 101), None);
+        assert_eq!((age_ns(&mut roll, 200, 230), age_ns(&mut roll, 200, 199)), (Some(30 * MS), None));
+        assert_eq!(announce(&mut roll, 1, 100, 900), None, "one that waited");
+        assert_eq!(announce(&mut roll, 1, 3000, 1000), Some(-2000 * MS as i64));
+        assert_eq!(announce(&mut roll, 1, 4000, 2000), None);
+        assert_eq!(age_ns(&mut roll, 5000, 3030), None);
+        assert!((2..1000).all(|epoch| announce(&mut roll, epoch, 3000, 1000).is_none()), "the same gateway");
     }
 }

@@ -1,11 +1,11 @@
-//! How often samples of a topic come over the network. A gateway may send every so many only, which its datagrams do not
-//! say. Time is an argument; refuses to know what comes.
+//! How often samples of a topic are sent over the network. A gateway may send every so many only, which its datagrams do
+//! not say; what was lost on the way they do say. Time is an argument; refuses to know what comes.
 
 /// The last few arrivals of one topic.
 #[derive(Default)]
 pub(super) struct Arrivals {
     last_ns: Option<u64>,
-    /// Between two arrivals, of the last ones.
+    /// Between two that were sent, of the last arrivals.
     distances_ns: [u64; KEPT],
     count: usize,
 }
@@ -17,11 +17,12 @@ const KEPT: usize = 5;
 const LONGEST_NS: u64 = 2_500_000_000;
 
 impl Arrivals {
-    /// A sample came at `now_ns`, by a clock that goes on. The time between two of the last ones, in us: their median, the
-    /// shorter one of two. 0 as long as it is not known.
-    pub(super) fn period_us(&mut self, now_ns: u64) -> u32 {
+    /// A sample came at `now_ns`, by a clock that goes on, `steps` numbers behind the last one; 0 if nobody knows how many.
+    /// The time between two that were sent, in us: the median of the last ones, the shorter one of two. 0 as long as it is
+    /// not known. What is lost makes it no longer: else a bad link would keep a verdict for longer than a good one.
+    pub(super) fn period_us(&mut self, now_ns: u64, steps: u64) -> u32 {
         let before_ns = self.last_ns.replace(now_ns);
-        let distance_ns = before_ns.and_then(|before_ns| now_ns.checked_sub(before_ns));
+        let distance_ns = before_ns.and_then(|before_ns| now_ns.checked_sub(before_ns)?.checked_div(steps));
         if let Some(distance_ns) = distance_ns.filter(|distance_ns| *distance_ns <= LONGEST_NS) {
             self.distances_ns[self.count % KEPT] = distance_ns;
             self.count += 1;
@@ -46,7 +47,7 @@ mod tests {
 
     fn periods_ms(arrivals_ms: &[u64]) -> Vec<u32> {
         let mut arrivals = Arrivals::default();
-        arrivals_ms.iter().map(|at_ms| arrivals.period_us(at_ms * MS) / 1000).collect()
+        arrivals_ms.iter().map(|at_ms| arrivals.period_us(at_ms * MS, 1) / 1000).collect()
     }
 
     #[test]
@@ -62,6 +63,16 @@ mod tests {
     }
 
     #[test]
+    fn what_is_lost_makes_it_no_longer() {
+        let mut arrivals = Arrivals::default();
+        let mut came = |at_ms: u64, steps| arrivals.period_us(at_ms * MS, steps) / 1000;
+        assert_eq!([came(0, 1), came(20, 1), came(2_020, 100), came(4_020, 100)], [0, 20, 20, 20]);
+        assert_eq!(came(64_020, 3_000), 20, "out of sight for a minute");
+        // Another life of the gateway: how many of its numbers are of the time between is not known.
+        assert_eq!([came(65_020, 0), came(65_040, 1), came(65_060, 1)], [20, 20, 20]);
+    }
+
+    #[test]
     fn a_silence_is_no_period() {
         assert_eq!(periods_ms(&[0, 90_000, 90_020, 190_000, 190_020]), [0, 0, 20, 20, 20]);
         assert_eq!(periods_ms(&[0, 2_500, 5_001, 7_501]), [0, 2_500, 2_500, 2_500]);
@@ -70,7 +81,8 @@ mod tests {
 
     /// How often the verdict of a stream becomes unknown whose samples come every `period_ms` for a minute, and how long
     /// after its end it does so for good.
-    fn followed(period_ms: u64, jitter_ms: u64) -> (u32, u64) {
+    /// Of `sent` one comes.
+    fn followed(period_ms: u64, jitter_ms: u64, sent: u64) -> (u32, u64) {
         let (mut arrivals, mut freshness) = (Arrivals::default(), Freshness::new(at(0)));
         let mut silences = 0;
         let mut next_ms = 0;
@@ -78,7 +90,7 @@ mod tests {
         for ms in 0..75_000 {
             let now = at(ms);
             if ms == next_ms && ms < 60_000 {
-                let period_us = arrivals.period_us(now.monotonic_ns);
+                let period_us = arrivals.period_us(now.monotonic_ns, sent);
                 let header = Header {
                     stamp_last_ns: now.monotonic_ns,
                     period_us,
@@ -107,7 +119,7 @@ mod tests {
     #[test]
     fn a_verdict_is_as_fresh_as_its_stream_is_fast() {
         for (period_ms, jitter_ms) in [(27, 0), (27, 20), (230, 0), (400, 60), (1_000, 100), (2_000, 200)] {
-            let (silences, ended_ms) = followed(period_ms, jitter_ms);
+            let (silences, ended_ms) = followed(period_ms, jitter_ms, 1);
             let limit_ms = 2 * (period_ms + jitter_ms) + 41;
             // Of a slow one it is not known before the second sample how slow it is.
             let before_known = u32::from(period_ms > 500);
@@ -117,6 +129,12 @@ mod tests {
                 "a sample each {period_ms} ms: {ended_ms} ms"
             );
         }
-        assert!(followed(3_000, 0).0 > 15, "too slow to be followed");
+        assert!(followed(3_000, 0, 1).0 > 15, "too slow to be followed");
+    }
+
+    #[test]
+    fn a_bad_link_keeps_no_verdict_for_longer() {
+        // Each 30 ms one is sent, and one in two seconds comes: the verdict is known for a quarter of the time.
+        assert_eq!(followed(2_010, 0, 67), (29, 500));
     }
 }

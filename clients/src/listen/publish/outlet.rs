@@ -37,10 +37,12 @@ impl<P: Payload + ?Sized> Outlet<P> {
         })
     }
 
-    /// The header of `remote` here, with its number, and the time that is between two as they come.
+    /// The header of `remote` here, with its number, and the time that is between two as they are sent.
     pub(super) fn header(&mut self, remote: &Remote<'_>) -> Header {
-        let topic_seq = self.number(&remote.datagram.head);
-        let period_us = self.arrivals.period_us(remote.arrival_ns);
+        let head = &remote.datagram.head;
+        let steps = self.steps(head).unwrap_or_default();
+        let topic_seq = self.number(head);
+        let period_us = self.arrivals.period_us(remote.arrival_ns, steps.into());
         Header { topic_seq, period_us, ..remote.header() }
     }
 
@@ -66,16 +68,21 @@ impl<P: Payload + ?Sized> Outlet<P> {
     /// published; of a new life of the gateway all before it. Where the sensor has another number than before, those
     /// before it may have been another one's: none counts.
     fn number(&mut self, head: &Head) -> u64 {
-        let (epoch, sensor, last) = self.last;
-        let left_out = match (head.epoch == epoch, head.sensor == sensor) {
-            (true, true) => head.sequence.wrapping_sub(last).wrapping_sub(1),
-            (true, false) => 0,
-            (false, _) => head.sequence,
+        let left_out = match self.steps(head) {
+            Some(steps) => steps.wrapping_sub(1),
+            None if head.epoch == self.last.0 => 0,
+            None => head.sequence,
         };
         let number = self.next.map_or(head.sequence.into(), |next| next + u64::from(left_out));
         self.last = (head.epoch, head.sensor, head.sequence);
         self.next = Some(number + 1);
         number
+    }
+
+    /// How many numbers the sample with `head` is behind the last one, if both are of one count.
+    fn steps(&self, head: &Head) -> Option<u32> {
+        let (epoch, sensor, last) = self.last;
+        (head.epoch == epoch && head.sensor == sensor).then(|| head.sequence.wrapping_sub(last))
     }
 }
 

@@ -94,6 +94,19 @@ impl RemoteTopics {
         Ok(())
     }
 
+    /// Takes `topic` away.
+    pub(super) fn remove(&mut self, topic: Topic) {
+        match topic {
+            Topic::Telegram => self.telegram = None,
+            Topic::Scan => self.scan = None,
+            Topic::Marks => self.marks = None,
+            Topic::Zones => self.zones = None,
+            Topic::Foreground => self.foreground = None,
+            Topic::Background => self.background = None,
+            Topic::Status => self.status = None,
+        }
+    }
+
     /// `announce` came with `head`: it is this one.
     pub(super) fn announced(&mut self, head: &Head, announce: &Announce) {
         self.source = Some((head.hub, head.epoch, head.sensor));
