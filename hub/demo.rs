@@ -159,7 +159,8 @@ fn play(
             // What is on its way now arrives before anybody is stopped.
             cut = Some((now + GRACE, account.cut()));
         }
-        if cut.is_some_and(|(end, ())| now >= end) {
+        let is_patient = |(end, ())| now < end || (now < end + LATE && !account.all_arrived());
+        if cut.is_some_and(|cut| !is_patient(cut)) {
             break;
         }
     }
@@ -189,5 +190,7 @@ const REFRESH: Duration = Duration::from_millis(250);
 const PATIENCE: Duration = Duration::from_millis(50);
 /// Processes start and a rate is found in far less.
 const START_LIMIT: Duration = Duration::from_secs(10);
-/// From the last byte of a telegram to its line of JSON, on a busy machine.
+/// From the last byte of a telegram to its line of JSON.
 const GRACE: Duration = Duration::from_millis(300);
+/// So much longer on a machine that has more to do than it can; what is not here then is lost.
+const LATE: Duration = Duration::from_secs(3);

@@ -91,7 +91,7 @@ struct Watcher<'a> {
 
 impl Watcher<'_> {
     fn tell(&mut self, news: String, now: Instant) {
-        self.scene.news = news;
+        self.view.news = news;
         self.news_until = Some(now + READING_TIME);
         self.changed = true;
     }
@@ -158,7 +158,10 @@ impl Sink for Watcher<'_> {
 
     fn sample(&mut self, name: &TopicName, sample: &Sample) -> Result<(), End> {
         if let Some(header) = sample.header() {
-            (self.scene.hub_lives, self.scene.hub_pid) = (true, header.hub_pid);
+            self.scene.hub_lives = true;
+            if !is_remote(&name.sensor) {
+                self.scene.hub_pid = header.hub_pid;
+            }
         }
         let sensor = self.scene.sensor(&name.sensor);
         match sample {
@@ -197,11 +200,11 @@ impl Sink for Watcher<'_> {
         }
         if self.news_until.is_some_and(|until| now >= until) {
             self.news_until = None;
-            self.scene.news.clear();
+            self.view.news.clear();
             self.changed = true;
         }
         self.changed |= self.scene.age(clock::now_ns());
-        if self.scene.hub_pid != 0 && !self.scene.sensors.iter().all(|sensor| is_remote(&sensor.name)) {
+        if self.scene.hub_pid != 0 {
             let percent = self.work.look(self.scene.hub_pid, now);
             self.changed |= percent != self.scene.hub_percent;
             self.scene.hub_percent = percent;

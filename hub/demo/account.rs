@@ -102,6 +102,11 @@ impl Account {
         self.sensors.iter().all(|sensor| !sensor.ranges.is_empty())
     }
 
+    /// Whether nothing is missing that was sent, as far as the simulator has told.
+    pub(crate) fn all_arrived(&self) -> bool {
+        self.sensors.iter().all(|sensor| sensor.lost() == 0)
+    }
+
     /// Reads what the simulator wrote since the last time.
     pub(crate) fn read_truth(&mut self) {
         // Ends with an error where there is nothing more to read now; what was read before it is kept.

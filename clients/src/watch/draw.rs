@@ -23,7 +23,7 @@ pub(crate) fn draw(frame: &mut Frame<'_>, scene: &Scene, view: &View) {
     for (row, (number, sensor)) in places.sensors.rows().zip(listed(scene, view, places.sensors.height)) {
         frame.render_widget(line(number, sensor, view, row.width), row);
     }
-    let keys = if scene.news.is_empty() { Line::raw(KEYS) } else { Line::raw(scene.news.clone()) };
+    let keys = if view.news.is_empty() { Line::raw(KEYS) } else { Line::raw(view.news.clone()) };
     frame.render_widget(keys.patch_style(Modifier::DIM), places.keys);
     if view.help {
         help(frame, places.map);

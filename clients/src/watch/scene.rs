@@ -14,12 +14,10 @@ pub(crate) struct Scene {
     pub(crate) sensors: Vec<Sensor>,
     /// A hub lives.
     pub(crate) hub_lives: bool,
-    /// Its process; 0 unknown.
+    /// Its process; 0 unknown, or on another machine.
     pub(crate) hub_pid: u32,
     /// What it uses, in percent of one processor.
     pub(crate) hub_percent: Option<f64>,
-    /// The last news, in words; empty if there are none.
-    pub(crate) news: String,
 }
 
 /// What is known of one sensor.

@@ -6,6 +6,7 @@ use std::io::{self, ErrorKind, Write};
 use std::panic::{PanicHookInfo, set_hook, take_hook};
 use std::rc::Rc;
 use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
 use ratatui::backend::CrosstermBackend;
@@ -24,6 +25,8 @@ pub(crate) struct Screen<'a> {
     terminal: Terminal<CrosstermBackend<Sheet<'a>>>,
     written: Rc<Cell<usize>>,
     hook: Arc<Hook>,
+    /// A panic has given the terminal back already.
+    given_back: Arc<AtomicBool>,
 }
 
 type Hook = dyn Fn(&PanicHookInfo<'_>) + Sync + Send;
@@ -48,14 +51,17 @@ impl<'a> Screen<'a> {
             let _ = disable_raw_mode();
         })?;
         let hook: Arc<Hook> = Arc::from(take_hook());
-        let before = hook.clone();
+        let given_back = Arc::new(AtomicBool::new(false));
+        let (before, giving) = (hook.clone(), given_back.clone());
         // What a panic says would go with the sheet.
         set_hook(Box::new(move |info| {
-            let _ = execute!(io::stdout(), Show, LeaveAlternateScreen);
-            let _ = disable_raw_mode();
+            if !giving.swap(true, Ordering::Relaxed) {
+                let _ = execute!(io::stdout(), LeaveAlternateScreen, Show);
+                let _ = disable_raw_mode();
+            }
             before(info);
         }));
-        Ok(Screen { terminal, written, hook })
+        Ok(Screen { terminal, written, hook, given_back })
     }
 
     /// Draws a frame; how many bytes that took.
@@ -80,10 +86,12 @@ impl<'a> Screen<'a> {
 
 impl Drop for Screen<'_> {
     fn drop(&mut self) {
-        let backend = self.terminal.backend_mut();
-        let _ = queue!(backend, LeaveAlternateScreen, Show).and_then(|()| io::Write::flush(backend));
-        let _ = disable_raw_mode();
-        // While a panic unwinds hooks stay as they are, and it has shown the cursor already.
+        if !self.given_back.swap(true, Ordering::Relaxed) {
+            let backend = self.terminal.backend_mut();
+            let _ = queue!(backend, LeaveAlternateScreen, Show).and_then(|()| io::Write::flush(backend));
+            let _ = disable_raw_mode();
+        }
+        // Hooks cannot be changed while a panic unwinds.
         if !std::thread::panicking() {
             let hook = self.hook.clone();
             set_hook(Box::new(move |info| hook(info)));

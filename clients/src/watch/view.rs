@@ -24,6 +24,8 @@ pub(crate) struct View {
     pub(crate) help: bool,
     /// Colours may be used.
     pub(crate) colours: bool,
+    /// What became of a request, in words; empty if there is nothing new.
+    pub(crate) news: String,
 }
 
 /// What a key asks for beyond the picture.
@@ -54,6 +56,7 @@ impl View {
             paused: false,
             help: false,
             colours,
+            news: String::new(),
         }
     }
 
