@@ -167,7 +167,7 @@ impl Run {
 }
 
 /// Where a configuration is said, apart from links.
-#[derive(Args, Debug)]
+#[derive(Args, Debug, Default)]
 pub(crate) struct Configured {
     /// TOML file, read after those in /etc/scanhub
     #[arg(long, env = "SCANHUB_CONFIG", value_name = "FILE")]

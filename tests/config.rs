@@ -42,7 +42,9 @@ fn a_check_refuses_what_a_hub_refuses() {
     let stage = Stage::new();
     let file = stage.file("scanhub.toml", "[[link]]\nname = \"a\"\nprot = \"/dev/x\"\n");
     let gateway = stage.file("gateway.toml", "[gateway]\nbackground_every = \"10\"\n");
+    let topics = stage.file("topics.toml", "[gateway]\ntopics = [\"*/scna\"]\n");
     for (arguments, place) in [
+        (vec![topics.as_str()], "section gateway: ".to_owned()),
         (vec![file.as_str()], format!("{file}:3:1: unknown key `prot`")),
         (vec![gateway.as_str()], format!("{gateway}:2:20: ")),
         (vec!["--config", file.as_str()], format!("{file}:3:1: unknown key `prot`")),
