@@ -6,7 +6,9 @@ mod config;
 mod configure;
 mod control;
 mod doctor;
+mod examples;
 mod gateway;
+mod generated;
 mod latency;
 mod leds;
 mod listen;
@@ -19,7 +21,7 @@ mod zones;
 use std::path::PathBuf;
 use std::time::Duration;
 
-use clap::{Args, Parser, Subcommand};
+use clap::{Args, Command, CommandFactory, FromArgMatches, Parser, Subcommand};
 use clients::{Bounds, duration};
 use daemon::config::Sources;
 use schema::{DEFAULT_DOMAIN, Domain, Environment, Failure};
@@ -28,6 +30,7 @@ pub(crate) use background::Background;
 pub(crate) use config::Config;
 pub(crate) use control::Control;
 pub(crate) use gateway::Gateway;
+pub(crate) use generated::{Completions, Man};
 pub(crate) use latency::Latency;
 pub(crate) use leds::Leds;
 pub(crate) use listen::Listen;
@@ -44,6 +47,20 @@ pub(crate) struct Cli {
     pub(crate) verb: Verb,
     #[command(flatten)]
     pub(crate) everywhere: Everywhere,
+}
+
+/// The whole definition.
+pub(crate) fn command() -> Command {
+    examples::with_examples(Cli::command())
+}
+
+impl Cli {
+    /// The command line of this process.
+    pub(crate) fn of_process() -> Result<Cli, clap::Error> {
+        let mut command = command();
+        let matches = command.try_get_matches_from_mut(std::env::args_os())?;
+        Cli::from_arg_matches(&matches).map_err(|error| error.format(&mut command))
+    }
 }
 
 /// What every verb takes.
@@ -132,6 +149,10 @@ pub(crate) enum Verb {
     Gateway(Gateway),
     /// What the gateways of other machines send over the network, and what of it was lost
     Listen(Listen),
+    /// The completion of this command line for a shell
+    Completions(Completions),
+    /// Manual pages
+    Man(Man),
 }
 
 #[derive(Args, Debug)]
@@ -151,7 +172,7 @@ impl Run {
 }
 
 /// Where a configuration is said, apart from links.
-#[derive(Args, Debug)]
+#[derive(Args, Debug, Default)]
 pub(crate) struct Configured {
     /// TOML file, read after those in /etc/scanhub
     #[arg(long, env = "SCANHUB_CONFIG", value_name = "FILE")]

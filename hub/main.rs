@@ -14,7 +14,6 @@ use std::process::ExitCode;
 use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
 
-use clap::Parser;
 use clap::error::ErrorKind;
 use clients::{EchoOptions, Format, HzOptions, InfoOptions, ListOptions};
 use daemon::Config;
@@ -34,7 +33,7 @@ fn main() -> ExitCode {
     if std::env::var_os(END_WITH_PARENT).is_some() {
         let _ = rustix::process::set_parent_process_death_signal(Some(Signal::TERM));
     }
-    let cli = match Cli::try_parse() {
+    let cli = match Cli::of_process() {
         Ok(cli) => cli,
         Err(error) => return refuse(&error),
     };
@@ -76,6 +75,11 @@ fn dispatch(cli: &Cli) -> Result<(), Failure> {
         Verb::Configure(configure) => {
             configure.run(everywhere.json, &*interrupt_by(&[SIGINT, SIGTERM, SIGHUP, SIGQUIT])?)
         }
+        Verb::Completions(completions) => {
+            completions.run();
+            Ok(())
+        }
+        Verb::Man(man) => man.run(),
         Verb::Config(config) => config.run(everywhere),
         Verb::Doctor(doctor) => doctor.run(everywhere, &*interrupt()?),
         Verb::List { domains: true } => clients::list_domains(&everywhere.bases(), everywhere.json, &mut out),
@@ -252,7 +256,8 @@ fn refuse(error: &clap::Error) -> ExitCode {
     if !wants_text && std::env::args_os().any(|word| word == "--json") {
         let text = error.to_string();
         let message = text.lines().next().unwrap_or_default().trim_start_matches("error: ");
-        report(&Failure::new(Kind::Usage, message, "scanhub --help"), true, false);
+        let tip = text.lines().find_map(|line| line.trim_start().strip_prefix("tip: "));
+        report(&Failure::new(Kind::Usage, message, tip.unwrap_or("scanhub --help")), true, false);
     } else {
         let _ = error.print();
     }

@@ -1,10 +1,15 @@
 //! A configuration that changes while the hub runs: zones, marks, background and pose with the next scan, without a gap in
-//! the stream; lines at the next start; and one that cannot be changes nothing.
+//! the stream; lines at the next start; and one that cannot be changes nothing. A hangup of its terminal still ends a hub.
 
 mod stage;
 
+use std::process::Command;
+
 use serde_json::Value;
-use stage::{HUP, INT, Stage, Supervisor, TERM, is_class, number, sequence};
+use stage::{
+    HUP, INT, MEASURED, Program, Stage, Supervisor, TERM, bytes_of, hash, is_class, number, sequence,
+    terminal,
+};
 
 const STREAM: [&str; 2] = ["--seed=71", "--baud=500000"];
 
@@ -57,20 +62,32 @@ fn circles_change_in_a_stream_without_a_gap() {
     let (telegrams, zones) = (telegrams.end(INT), zones.end(INT));
     for (outcome, class) in [(&telegrams, "telegram"), (&zones, "zones")] {
         let mut lines = outcome.of_class(class);
-        lines.retain(|line| line["stale"] != true);
-        sequence(&lines, "seq");
+        // A silence has no numbers.
+        lines.retain(|line| line["topic_seq"].is_u64());
         sequence(&lines, "topic_seq");
         assert_eq!(outcome.of_class("summary")[0]["lost"], 0, "{class}");
     }
-    // Not one verdict of those in between was unknown.
-    let unknown = zones.of_class("zones").iter().filter(|line| line["verdict"] == "unknown").count();
-    assert_eq!(unknown, 0);
+    // The first verdict of other circles is one.
+    let mut verdicts = zones.of_class("zones");
+    verdicts.retain(|line| line["topic_seq"].is_u64());
+    let firsts: Vec<_> = verdicts.windows(2).filter(|pair| radii(&pair[0]) != radii(&pair[1])).collect();
+    assert_eq!(firsts.len(), 4);
+    assert!(firsts.iter().all(|pair| pair[1]["verdict"] != "unknown"), "{firsts:?}");
     let ended = hub.end(TERM);
     assert_eq!(ended.code, Some(0));
     assert!(ended.errors.contains("front: pose, zones as configured now"), "{ended}");
     assert!(ended.errors.contains("front: zones, marks, background as configured now"), "{ended}");
     assert_eq!(simulator.end(TERM).code, Some(0));
     assert_eq!(stage.simulated("front").1, 0, "EEPROM");
+    // What was sent from the first to the last that was received, was received.
+    let received = telegrams.of_class("telegram");
+    let received: Vec<_> = received.iter().filter(|line| line["command"] == MEASURED).collect();
+    let received: Vec<String> = received.iter().map(|line| hash(&bytes_of(line))).collect();
+    let truth: Vec<_> = stage.truth("front").into_iter().filter(|sent| sent.is_intact_scan()).collect();
+    let first = truth.iter().position(|sent| sent.hash == received[0]).expect("it was sent");
+    let sent: Vec<String> =
+        truth[first..].iter().map(|sent| sent.hash.clone()).take(received.len()).collect();
+    assert_eq!(received, sent);
 }
 
 #[test]
@@ -108,5 +125,35 @@ fn what_cannot_be_changed_is_said_and_what_cannot_be_changes_nothing() {
         "side: link added: takes effect at the next start".to_owned(),
     ] {
         assert!(ended.errors.contains(&words), "{words}: {ended}");
+    }
+}
+
+#[test]
+fn a_hub_ends_with_its_terminal_unless_nohup_says_otherwise() {
+    if Command::new("setsid").arg("--version").output().is_err() {
+        return eprintln!("skipped: no setsid");
+    }
+    for (nohup, survives) in [(&[][..], false), (&["nohup"], true)] {
+        let stage = Stage::new();
+        let (keys, screen) = terminal();
+        let hub = stage.command(&["run", "--json", "--no-system-config", &configure(&stage, "")]);
+        // Leader of a session that has this terminal.
+        let mut command = Command::new("setsid");
+        command.arg("--ctty").args(nohup).arg(hub.get_program()).args(hub.get_args());
+        command.envs(hub.get_envs().filter_map(|(key, value)| Some((key, value?))));
+        let hub = Program::start_with(command, screen);
+        let hub = hub.ready();
+        drop(keys);
+        if survives {
+            // It is asked to read its configuration instead, and does.
+            configure(&stage, "pose = { x = 0.5 }\n");
+            hub.signal(HUP);
+            stage.await_info("front", |info| info["pose"]["x_m"] == 0.5);
+            let ended = hub.end(TERM);
+            assert_eq!(ended.code, Some(0));
+        } else {
+            let ended = hub.wait();
+            assert_eq!(ended.code, Some(0), "{ended}");
+        }
     }
 }

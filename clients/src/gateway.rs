@@ -60,6 +60,24 @@ pub struct GatewayOptions {
     pub places: Vec<Domain>,
 }
 
+impl GatewayOptions {
+    /// What can be known without a network and without a hub: whether the topics are some, and go with the rest.
+    ///
+    /// [`Kind::NoTopic`] with the topics that there are, else [`Kind::Configuration`].
+    pub fn check(&self) -> Result<(), Failure> {
+        self.selection().map(drop)
+    }
+
+    fn selection(&self) -> Result<Selection, Failure> {
+        let selection = Selection::parse(&self.topics, self.bare)?;
+        if self.bare && self.background_every.is_some() {
+            let what = "no background goes out where only telegrams do";
+            return Err(Failure::new(Kind::Configuration, what, "leave bare or background_every away"));
+        }
+        Ok(selection)
+    }
+}
+
 /// How a gateway tells of itself.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum GatewayLook {
@@ -112,11 +130,7 @@ const TICK: Duration = Duration::from_secs(1);
 
 impl<'a> Gateway<'a> {
     fn open(options: &'a GatewayOptions, stop: &AtomicBool) -> Result<Gateway<'a>, Failure> {
-        let selection = Selection::parse(&options.topics, options.bare)?;
-        if options.bare && options.background_every.is_some() {
-            let what = "no background goes out where only telegrams do";
-            return Err(Failure::new(Kind::Configuration, what, "leave bare or background_every away"));
-        }
+        let selection = options.selection()?;
         let interface = Uplink::choose(options.interface.as_deref())?;
         let domain = options.places.first().map(Domain::name).unwrap_or_default();
         let now_s = clock::wall_ns() / 1_000_000_000;

@@ -3,11 +3,11 @@
 use std::path::PathBuf;
 
 use clap::{Args, Subcommand};
-use daemon::config::{self, DEFAULT, Link, Value, values};
+use daemon::config::{DEFAULT, Link, Value, values};
 use schema::Failure;
 use serde::Serialize;
 
-use super::{Everywhere, Run, gateway};
+use super::{Everywhere, Gateway, Run};
 use crate::{line, say};
 
 #[derive(Args, Debug)]
@@ -44,7 +44,7 @@ impl Config {
                     sources.files = vec![file.clone()];
                 }
                 let links = daemon::Config::load(&sources)?.links;
-                gateway::background_every(&config::Gateway::load(&sources)?)?;
+                Gateway::check(&sources, everywhere)?;
                 if everywhere.json { checked_line(&links) } else { checked(&links) }
             }
             Order::Show { run } => {

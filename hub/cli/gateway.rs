@@ -5,13 +5,13 @@ use std::time::Duration;
 
 use clap::Args;
 use clients::{GatewayLook, GatewayOptions, duration};
-use daemon::config;
+use daemon::config::{self, Sources};
 use schema::{Failure, Kind};
 
 use super::{Configured, Everywhere};
 
 /// Each flag is also a key of section `gateway` of the configuration, and wins over it.
-#[derive(Args, Debug)]
+#[derive(Args, Debug, Default)]
 pub(crate) struct Gateway {
     /// Network interface of the groups; need not be named if only one is up and has multicast
     #[arg(long, value_name = "NAME")]
@@ -42,7 +42,19 @@ pub(crate) struct Gateway {
 
 impl Gateway {
     pub(crate) fn options(&self, everywhere: &Everywhere) -> Result<GatewayOptions, Failure> {
-        let said = config::Gateway::load(&self.configured.sources())?;
+        self.over(config::Gateway::load(&self.configured.sources())?, everywhere)
+    }
+
+    /// Whether the section in `sources` is one that a gateway takes.
+    pub(super) fn check(sources: &Sources, everywhere: &Everywhere) -> Result<(), Failure> {
+        let checked = Gateway::default().over(config::Gateway::load(sources)?, everywhere)?.check();
+        checked.map_err(|failure| {
+            Failure::new(Kind::Configuration, format!("section gateway: {}", failure.message), failure.hint)
+        })
+    }
+
+    /// These flags over what is `said` in the section.
+    fn over(&self, said: config::Gateway, everywhere: &Everywhere) -> Result<GatewayOptions, Failure> {
         let every = background_every(&said)?;
         let or = |flags: &[String], said: Option<Vec<String>>| match flags {
             [] => said.unwrap_or_default(),
@@ -67,7 +79,7 @@ impl Gateway {
 }
 
 /// How often the configuration wants a background to go out.
-pub(super) fn background_every(said: &config::Gateway) -> Result<Option<Duration>, Failure> {
+fn background_every(said: &config::Gateway) -> Result<Option<Duration>, Failure> {
     let every = said.background_every.as_ref().map(|(text, place)| {
         let refuse =
             |what| Failure::new(Kind::Configuration, format!("{place}: {what}"), "write 10s, 250ms, 5m");

@@ -51,6 +51,35 @@ put() {
 take() {
     [ ! -e "$2" ] || { rm "$2"; echo "removed $2"; }
 }
+# What the program itself says of its command line; one for another processor cannot say it here.
+man=usr/local/share/man/man1
+completions="
+bash usr/local/share/bash-completion/completions/scanhub
+zsh usr/local/share/zsh/site-functions/_scanhub
+fish usr/local/share/fish/vendor_completions.d/scanhub.fish
+"
+put_generated() {
+    made=$(mktemp -d)
+    trap 'rm -r "$made"' EXIT
+    if ! "$program" man "$made/man" 2> /dev/null; then
+        echo "install.sh: $program does not run here: no manual pages, no completions" >&2
+        return
+    fi
+    for page in "$made"/man/*.1; do
+        put "$page" "$root/$man/$(basename "$page")" 644
+    done
+    echo "$completions" | while read -r shell destination; do
+        [ -z "$shell" ] || { "$program" completions "$shell" > "$made/$shell" && put "$made/$shell" "$root/$destination" 644; }
+    done
+}
+take_generated() {
+    for page in "$root/$man"/scanhub.1 "$root/$man"/scanhub-*.1; do
+        take "" "$page"
+    done
+    echo "$completions" | while read -r shell destination; do
+        [ -z "$shell" ] || take "" "$root/$destination"
+    done
+}
 has() { command -v "$1" > /dev/null 2>&1; }
 # Only a machine that runs systemd has services to tell.
 runs() { [ -z "$root" ] && [ -d /run/systemd/system ]; }
@@ -59,6 +88,7 @@ udev() { if runs && has udevadm; then udevadm control --reload && udevadm trigge
 if [ "$action" = remove ]; then
     if runs; then systemctl disable --now scanhub-gateway scanhub 2> /dev/null || true; fi
     each take
+    take_generated
     if runs; then systemctl daemon-reload; fi
     udev
     echo "what is left: the user scanhub, /etc/scanhub, /var/lib/scanhub"
@@ -70,6 +100,7 @@ if [ ! -f "$program" ]; then
     exit 1
 fi
 each put
+put_generated
 if runs; then
     systemd-sysusers scanhub.conf
     systemd-tmpfiles --create scanhub.conf

@@ -1,0 +1,101 @@
+//! An example for each verb, as its help and its manual page show it. A test reads every one of them as a command line.
+
+use clap::Command;
+
+/// `command` with an example below the help of each verb.
+pub(super) fn with_examples(command: Command) -> Command {
+    EXAMPLES
+        .iter()
+        .fold(command, |command, (verb, lines)| command.mut_subcommand(verb, |verb| below(verb, lines)))
+}
+
+fn below(verb: Command, lines: &[&str]) -> Command {
+    let title = if lines.len() == 1 { "Example" } else { "Examples" };
+    let examples = format!("{title}:\n  {}", lines.join("\n  "));
+    let text = match verb.get_after_help() {
+        Some(more) => format!("{examples}\n\n{more}"),
+        None => examples,
+    };
+    verb.after_help(text)
+}
+
+const EXAMPLES: &[(&str, &[&str])] = &[
+    (
+        "run",
+        &[
+            "scanhub run --link front=/dev/ttyUSB0",
+            "scanhub run --link front=/dev/ttyUSB0 --set zones.radii=[1.2,0.7]",
+            "scanhub run --config robot.toml",
+        ],
+    ),
+    ("demo", &["scanhub demo", "scanhub demo --headless --for 10s"]),
+    (
+        "simulate",
+        &[
+            "scanhub simulate --port /tmp/front --world room",
+            "scanhub simulate --port /tmp/front --fault loss=0.00135,burst=1.89",
+        ],
+    ),
+    ("probe", &["scanhub probe", "scanhub probe /dev/ttyUSB0"]),
+    ("configure", &["scanhub configure /dev/ttyUSB0 unit=mm"]),
+    (
+        "config",
+        &[
+            "scanhub config default > scanhub.toml",
+            "scanhub config check scanhub.toml",
+            "scanhub config show",
+        ],
+    ),
+    ("doctor", &["scanhub doctor", "scanhub doctor /dev/ttyUSB0"]),
+    ("list", &["scanhub list"]),
+    ("info", &["scanhub info front"]),
+    (
+        "echo",
+        &[
+            "scanhub echo front/scan",
+            "scanhub echo front/zones --json -n 10",
+            "scanhub echo front/scan --csv > scans.csv",
+        ],
+    ),
+    ("hz", &["scanhub hz front/scan --for 10s"]),
+    ("latency", &["scanhub latency front/scan --for 10s --max-p99 1ms"]),
+    (
+        "telegram",
+        &[
+            "scanhub telegram decode recording.bin",
+            "scanhub telegram encode status | scanhub telegram decode",
+        ],
+    ),
+    ("control", &["scanhub control front pause"]),
+    ("background", &["scanhub background front save front.json"]),
+    ("zones", &["scanhub zones front mask --for 10s"]),
+    ("leds", &["scanhub leds front", "scanhub leds robot --led green=led0"]),
+    ("gateway", &["scanhub gateway --interface eth0 --topic */zones --topic front/scan:every=4"]),
+    ("listen", &["scanhub listen --interface eth0 --stats"]),
+    ("completions", &["scanhub completions bash > ~/.local/share/bash-completion/completions/scanhub"]),
+    ("man", &["scanhub man | man -l -", "scanhub man ~/.local/share/man/man1"]),
+];
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn every_verb_has_an_example_that_can_be_read() {
+        let command = crate::cli::command();
+        let verbs: Vec<_> = command.get_subcommands().map(|verb| verb.get_name().to_owned()).collect();
+        assert_eq!(verbs.len(), EXAMPLES.len(), "{verbs:?}");
+        for verb in &verbs {
+            let example = EXAMPLES.iter().find(|(name, _)| name == verb);
+            let (_, lines) = example.unwrap_or_else(|| panic!("{verb} has no example"));
+            for line in *lines {
+                // What the shell would do with it is not the program's.
+                let words = line.split(['|', '>']).next().unwrap_or_default().split_whitespace();
+                let read = crate::cli::command().try_get_matches_from(words);
+                let read = read.unwrap_or_else(|error| panic!("{line}: {error}"));
+                assert_eq!(read.subcommand_name(), Some(verb.as_str()), "{line}");
+            }
+        }
+        command.debug_assert();
+    }
+}

@@ -1,0 +1,71 @@
+//! What follows from the definition of the command line: completions for shells, and manual pages. Refuses to know any verb.
+
+use std::io;
+use std::path::{Path, PathBuf};
+
+use clap::{Args, ValueEnum};
+use clap_complete::shells;
+use schema::{Failure, Kind};
+
+use super::command;
+use crate::say;
+
+#[derive(Args, Debug)]
+pub(crate) struct Completions {
+    /// For which shell
+    shell: Shell,
+}
+
+#[derive(Clone, Copy, Debug, ValueEnum)]
+enum Shell {
+    Bash,
+    Zsh,
+    Fish,
+}
+
+impl Completions {
+    pub(crate) fn run(&self) {
+        let mut text = Vec::new();
+        let command = &mut command();
+        match self.shell {
+            Shell::Bash => clap_complete::generate(shells::Bash, command, NAME, &mut text),
+            Shell::Zsh => clap_complete::generate(shells::Zsh, command, NAME, &mut text),
+            Shell::Fish => clap_complete::generate(shells::Fish, command, NAME, &mut text),
+        }
+        say(String::from_utf8_lossy(&text).trim_end());
+    }
+}
+
+#[derive(Args, Debug)]
+pub(crate) struct Man {
+    /// Directory for a page of each verb, scanhub-run.1 ..; without it the page of the program, on stdout
+    #[arg(value_name = "DIR")]
+    directory: Option<PathBuf>,
+}
+
+impl Man {
+    /// [`Kind::Failed`] if the directory cannot be written to.
+    pub(crate) fn run(&self) -> Result<(), Failure> {
+        match &self.directory {
+            Some(directory) => write_pages(directory),
+            None => {
+                let mut page = Vec::new();
+                let rendered = clap_mangen::Man::new(command()).render(&mut page);
+                rendered.map_err(|error| Failure::new(Kind::Failed, format!("no page: {error}"), ""))?;
+                say(String::from_utf8_lossy(&page).trim_end());
+                Ok(())
+            }
+        }
+    }
+}
+
+fn write_pages(directory: &Path) -> Result<(), Failure> {
+    let written =
+        std::fs::create_dir_all(directory).and_then(|()| clap_mangen::generate_to(command(), directory));
+    written.map_err(|error: io::Error| {
+        let message = format!("{}: {error}", directory.display());
+        Failure::new(Kind::Failed, message, "name a directory that can be written to")
+    })
+}
+
+const NAME: &str = env!("CARGO_PKG_NAME");
