@@ -1,11 +1,13 @@
 //! Topics in shared memory, each test in a domain of its own.
 #![cfg(feature = "ipc")]
 
+use std::os::unix::fs::MetadataExt;
 use std::path::PathBuf;
 use std::sync::atomic::{AtomicU32, Ordering};
 use std::thread;
 use std::time::Duration;
 
+use rustix::fs::{FileType, Mode};
 use rustix::time::{ClockId, clock_gettime};
 use schema::ipc::{self, Bell, Payload, PortFactory, Waker, sleep_at_bells};
 use schema::{
@@ -212,6 +214,24 @@ fn one_ring_wakes_all_who_sleep_at_a_bell() {
 }
 
 #[test]
+fn hubs_of_one_name_below_two_roots_have_bells_of_their_own() {
+    let place = Place::new();
+    let other = Domain::at(place.domain.name(), &place.base.join("other")).unwrap();
+    let [here, there] = [&place.domain, &other].map(|domain| ipc::hub_node(domain).unwrap());
+    let mine = Waker::new(&here, "front").unwrap();
+    let bell = Bell::open(&here, "front").unwrap().expect("the hub hung it");
+    let rung = bell.rung();
+    assert!(Bell::open(&there, "front").unwrap().is_none(), "nobody hung one there");
+    let theirs = Waker::new(&there, "front").unwrap();
+    theirs.wake(Wake::Telegram).unwrap();
+    drop(theirs);
+    assert!(bell.rung() == rung && !bell.is_closed(), "another hub's end is none of ours");
+    mine.wake(Wake::Telegram).unwrap();
+    assert_ne!(bell.rung(), rung);
+    assert!(Bell::open(&here, "front").unwrap().is_some());
+}
+
+#[test]
 fn the_bell_of_a_killed_hub_is_rung_by_the_next_one() {
     let place = Place::new();
     let hub = ipc::hub_node(&place.domain).unwrap();
@@ -232,7 +252,13 @@ fn the_bell_of_a_killed_hub_is_rung_by_the_next_one() {
 fn a_bell_that_nobody_can_have_is_told() {
     let place = Place::new();
     let hub = ipc::hub_node(&place.domain).unwrap();
-    let path = PathBuf::from("/dev/shm").join(format!("{}front.bell", place.domain.prefix()));
+    let root = place.domain.root().metadata().unwrap();
+    let name = format!("{}front.{:x}-{:x}.bell", place.domain.prefix(), root.dev(), root.ino());
+    let path = PathBuf::from("/dev/shm").join(name);
+    rustix::fs::mknodat(rustix::fs::CWD, &path, FileType::Fifo, Mode::RUSR | Mode::WUSR, 0).unwrap();
+    assert!(Waker::new(&hub, "front").is_err());
+    assert!(Bell::open(&hub, "front").unwrap().is_none(), "nobody waits for who writes");
+    std::fs::remove_file(&path).unwrap();
     std::os::unix::fs::symlink("/dev/null", &path).unwrap();
     let failure = Waker::new(&hub, "front").err().expect("a link is not followed");
     assert_eq!(failure.kind, Kind::Failed);

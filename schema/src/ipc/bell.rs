@@ -1,17 +1,21 @@
 //! A word in shared memory at which all consumers of a sensor sleep: one call of the hub wakes them all, however many
 //! they are, where an event is one message to each. Refuses to know what was sent, and who sleeps.
 //!
-//! The page lies in /dev/shm under the domain's prefix. Consumers map it read-only. A hub that is killed leaves it, and the
+//! The page lies in /dev/shm under the domain's prefix, and under what tells the domain's root from all others: hubs of one
+//! name may live below several. Consumers map it read-only. A hub that is killed leaves it, and the
 //! next one goes on with it, so that who sleeps meanwhile is woken; a hub that ends closes it for good.
 #![allow(unsafe_code)]
 
+use std::ffi::OsStr;
 use std::fs::{File, OpenOptions};
 use std::io;
 use std::num::NonZeroU32;
+use std::os::unix::ffi::OsStrExt;
 use std::os::unix::fs::{MetadataExt, OpenOptionsExt};
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicU32, Ordering, fence};
 
+use iceoryx2::prelude::SemanticString;
 use memmap2::{MmapOptions, MmapRaw};
 use rustix::fs::{FallocateFlags, OFlags, fallocate};
 use rustix::io::Errno;
@@ -34,7 +38,9 @@ impl Ringer {
     ///
     /// [`Kind::Short`] if there is no memory for it, [`Kind::Failed`] if the place is taken by another user.
     pub(super) fn hang(node: &Node, sensor: &str) -> Result<Ringer, Failure> {
-        Ringer::at(path(node, sensor)).map_err(|(path, error)| match error {
+        let path = path(node, sensor)
+            .map_err(|error| Failure::new(Kind::Failed, error.to_string(), "choose another --root"))?;
+        Ringer::at(path).map_err(|(path, error)| match error {
             error if error.raw_os_error() == Some(Errno::NOSPC.raw_os_error()) => {
                 memory(&format!("{} kB for {} cannot be had", PAGE / 1024, path.display()))
             }
@@ -78,9 +84,10 @@ impl Ringer {
 
 impl Drop for Ringer {
     fn drop(&mut self) {
-        let _ = std::fs::remove_file(&self.path);
+        // In this order: a hub that is killed in between leaves no page that looks alive and that nobody can find.
         self.page.words().closed.store(1, Ordering::Relaxed);
         self.ring();
+        let _ = std::fs::remove_file(&self.path);
     }
 }
 
@@ -93,7 +100,8 @@ impl Bell {
     ///
     /// [`Kind::Short`] if memory or descriptors are, [`Kind::Failed`] if it is another user's.
     pub fn open(node: &Node, sensor: &str) -> Result<Option<Bell>, Failure> {
-        let path = path(node, sensor);
+        // Without a root there is no hub.
+        let Ok(path) = path(node, sensor) else { return Ok(None) };
         let mapped = own(OpenOptions::new().read(true), &path).and_then(|file| {
             let is_made = file.metadata()?.len() >= PAGE as u64;
             let mapped = is_made.then(|| MmapOptions::new().len(PAGE).map_raw_read_only(&file));
@@ -181,13 +189,18 @@ impl Page {
 
 const PAGE: usize = 4096;
 
-fn path(node: &Node, sensor: &str) -> PathBuf {
-    Path::new(SHARED_MEMORY).join(format!("{}{sensor}.bell", node.config().global.prefix))
+/// Device and inode tell a root that may be written in several ways.
+fn path(node: &Node, sensor: &str) -> io::Result<PathBuf> {
+    let global = &node.config().global;
+    let root = Path::new(OsStr::from_bytes(global.root_path().as_bytes())).metadata()?;
+    let name = format!("{}{sensor}.{:x}-{:x}.bell", global.prefix, root.dev(), root.ino());
+    Ok(Path::new(SHARED_MEMORY).join(name))
 }
 
-/// The file at `path`, if it is this user's: anybody may put a file there.
+/// The file at `path`, if it is this user's: anybody may put a file there, or a pipe at which opening it waits.
 fn own(options: &mut OpenOptions, path: &Path) -> io::Result<File> {
-    let file = options.mode(0o600).custom_flags(OFlags::NOFOLLOW.bits() as i32).open(path)?;
+    let flags = OFlags::NOFOLLOW | OFlags::NONBLOCK;
+    let file = options.mode(0o600).custom_flags(flags.bits() as i32).open(path)?;
     if file.metadata()?.uid() != rustix::process::geteuid().as_raw() {
         return Err(io::Error::new(io::ErrorKind::PermissionDenied, "it is another user's"));
     }
