@@ -16,6 +16,7 @@ use signal_hook::consts::{SIGINT, SIGTERM};
 use crate::config::Config;
 use crate::control::Desk;
 use crate::link::{LinkThread, Surroundings};
+use crate::port::Port;
 use crate::service::{Service, Watchdog};
 use crate::topics::Topics;
 use crate::{clock, preflight};
@@ -44,6 +45,11 @@ pub fn run(config: &Config, domain: &Domain, on_ready: impl FnOnce(&Ready)) -> R
     node.try_cleanup_dead_nodes();
     let ready =
         Ready { boot: random(), sensors: config.links.iter().map(|link| link.name.clone()).collect() };
+    // By the port, not by the name: a line that somebody keeps cannot be opened by anybody.
+    service.assign(|line| {
+        let owner = config.links.iter().find(|link| Port::is_at(line, &link.port));
+        owner.map(|link| link.name.clone())
+    });
     let (mut desk, orders) = Desk::open(&node, config.links.iter().map(|link| link.name.as_str()))?;
     let stop = eventfd(0, EventfdFlags::CLOEXEC).map_err(|error| no_resource("an eventfd", &error))?;
     let worked: Vec<_> = config.links.iter().map(|_| AtomicBool::new(true)).collect();
