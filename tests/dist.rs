@@ -68,6 +68,21 @@ fn what_is_installed_is_taken_away_again() {
 }
 
 #[test]
+fn an_adapter_that_is_plugged_in_after_the_start_is_not_denied() {
+    let unit = fs::read_to_string(dist().join("scanhub.service")).expect("is there");
+    let is_said = |line: &str| unit.lines().any(|it| it == line);
+    // systemd.resource-control(5): a group that no driver has registered at the start is left out of the list.
+    for (group, driver) in [("ttyUSB", "usbserial"), ("ttyACM", "cdc_acm")] {
+        assert!(is_said(&format!("DeviceAllow=char-{group} rw")), "{group}");
+        for key in ["Wants=", "After="] {
+            let mut named = unit.lines().filter_map(|line| line.strip_prefix(key));
+            let loads = format!("modprobe@{driver}.service");
+            assert!(named.any(|units| units.split(' ').any(|it| it == loads)), "{key}{loads}");
+        }
+    }
+}
+
+#[test]
 fn units_leave_little_open() {
     for unit in ["scanhub.service", "scanhub-gateway.service"] {
         let path = dist().join(unit);

@@ -89,6 +89,31 @@ fn a_port_that_went_is_given_back_and_another_link_s_is_not_taken() {
 }
 
 #[test]
+fn a_link_that_got_another_name_goes_on_with_its_port() {
+    let stage = Stage::new();
+    let simulator = stage.simulator(&["front"], &["--seed=7", "--baud=500000"]);
+    let mut supervisor = Supervisor::new(&stage);
+    let hub = supervisor.start(&stage, &[stage.link("front")], None).ready();
+    supervisor.hear("FDNAME=front");
+    supervisor.hear("READY=1");
+    assert_eq!(hub.end(KILL).code, None);
+    // Whoever keeps it has it locked: it cannot be opened, only taken over.
+    let side = format!("--link=side={}", stage.word("front"));
+    let hub = supervisor.start(&stage, &[side], None).ready();
+    supervisor.hear("FDSTOREREMOVE=1");
+    supervisor.hear("FDNAME=side");
+    supervisor.hear("READY=1");
+    assert_eq!(hub.end(KILL).code, None);
+    // The name has another port now: what was kept under it is not kept beside the new one.
+    let side = format!("--link=side={}", stage.word("nowhere"));
+    let hub = supervisor.start(&stage, &[side], None).ready();
+    supervisor.hear("FDSTOREREMOVE=1");
+    supervisor.hear("STATUS=sensors: side");
+    assert_eq!(hub.end(TERM).code, Some(0));
+    assert_eq!(simulator.end(TERM).code, Some(0));
+}
+
+#[test]
 fn the_watchdog_is_fed_while_links_work() {
     let stage = Stage::new();
     let mut supervisor = Supervisor::new(&stage);

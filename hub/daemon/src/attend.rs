@@ -72,9 +72,16 @@ impl LinkThread<'_> {
 
     /// The port at the hub's start: the one that a killed hub had, if it was kept, with what lies in it.
     fn take_over(&self) -> Result<Port, Failure> {
-        let link = self.link;
-        let kept = self.around.service.take(&link.name);
-        if let Some(port) = kept.and_then(|line| Port::adopt(line, &link.port, link.baud.rate())) {
+        let (link, service) = (self.link, self.around.service);
+        let mut adopted = None;
+        while let Some(line) = service.take(&link.name) {
+            match Port::adopt(line, &link.port, link.baud.rate()).filter(|_| adopted.is_none()) {
+                Some(port) => adopted = Some(port),
+                // One that hung up: whoever keeps it would have it handed over again.
+                None => service.forget(&link.name),
+            }
+        }
+        if let Some(port) = adopted {
             tracing::info!("{}: goes on with {}, which was kept", link.name, link.port.name());
             return Ok(port);
         }

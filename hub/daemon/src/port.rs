@@ -59,6 +59,11 @@ impl Port {
         }
     }
 
+    /// Whether `source` names the `line`, which is open.
+    pub(crate) fn is_at(line: &OwnedFd, source: &Source) -> bool {
+        matches!(source, Source::Tty(path) if Tty::is_at(line, path))
+    }
+
     /// Whether another program plays the sensor.
     pub(crate) fn simulated(&self) -> bool {
         match self {

@@ -34,6 +34,19 @@ impl Service {
         Service { kept: Mutex::new(named.filter_map(own).collect()), watchdog }
     }
 
+    /// Puts what was kept under the name of the link that it is of now, whoever had it before; what is of none is not kept
+    /// any longer. To be called before anything is kept anew: names are forgotten with all that is kept under them.
+    pub(crate) fn assign(&self, owner: impl Fn(&OwnedFd) -> Option<String>) {
+        let mut kept = self.kept.lock().unwrap_or_else(PoisonError::into_inner);
+        for (name, line) in std::mem::take(&mut *kept) {
+            let owner = owner(&line);
+            if owner.as_ref() != Some(&name) {
+                self.forget(&name);
+            }
+            kept.extend(owner.map(|owner| (owner, line)));
+        }
+    }
+
     /// What was kept under `name`, once.
     pub(crate) fn take(&self, name: &str) -> Option<OwnedFd> {
         let mut kept = self.kept.lock().unwrap_or_else(PoisonError::into_inner);
@@ -52,10 +65,8 @@ impl Service {
         told(sd_notify::notify(&[NotifyState::FdStoreRemove, NotifyState::FdName(name)]));
     }
 
-    /// The hub is up with `sensors`; what is kept for others is not kept any longer.
+    /// The hub is up with `sensors`.
     pub(crate) fn ready(&self, sensors: &[String]) {
-        let mut kept = self.kept.lock().unwrap_or_else(PoisonError::into_inner);
-        kept.drain(..).for_each(|(name, _)| self.forget(&name));
         let status = format!("sensors: {}", sensors.join(", "));
         told(sd_notify::notify(&[NotifyState::Ready, NotifyState::Status(&status)]));
     }
@@ -147,8 +158,24 @@ mod tests {
         let kept = vec![("front".to_owned(), line()), ("rear".to_owned(), line())];
         let service = Service { kept: Mutex::new(kept), watchdog: None };
         assert!(service.take("rear").is_some() && service.take("rear").is_none());
-        assert!(service.take("side").is_none());
-        service.ready(&["front".to_owned()]);
-        assert!(service.take("front").is_none(), "nobody wanted it");
+        assert!(service.take("side").is_none() && service.take("front").is_some());
+    }
+
+    #[test]
+    fn what_was_kept_is_of_whose_port_it_is_now() {
+        let line = |path| OwnedFd::from(std::fs::File::open(path).unwrap());
+        let kept = [("front", "/dev/null"), ("rear", "/dev/zero"), ("side", "/dev/full")];
+        let kept = kept.map(|(name, path)| (name.to_owned(), line(path)));
+        let service = Service { kept: Mutex::new(kept.into()), watchdog: None };
+        let device = |line: &OwnedFd| rustix::fs::fstat(line).unwrap().st_rdev;
+        let [null, zero] = ["/dev/null", "/dev/zero"].map(|path| device(&line(path)));
+        // Two links have each other's port, the third one's is nobody's.
+        service.assign(|line| match device(line) {
+            it if it == null => Some("rear".to_owned()),
+            it if it == zero => Some("front".to_owned()),
+            _ => None,
+        });
+        let taken = ["front", "rear", "side"].map(|name| service.take(name).map(|line| device(&line)));
+        assert_eq!(taken, [Some(zero), Some(null), None]);
     }
 }

@@ -14,6 +14,7 @@ use schema::{Domain, Failure, HubLock, Kind, shortage};
 use crate::config::Config;
 use crate::control::Desk;
 use crate::link::{LinkThread, Surroundings};
+use crate::port::Port;
 use crate::reload::Reload;
 use crate::service::{Service, Watchdog};
 use crate::signals::{Signals, Wanted};
@@ -50,6 +51,11 @@ pub fn run(
     node.try_cleanup_dead_nodes();
     let ready =
         Ready { boot: random(), sensors: config.links.iter().map(|link| link.name.clone()).collect() };
+    // By the port, not by the name: a line that somebody keeps cannot be opened by anybody.
+    service.assign(|line| {
+        let owner = config.links.iter().find(|link| Port::is_at(line, &link.port));
+        owner.map(|link| link.name.clone())
+    });
     let (mut desk, orders) = Desk::open(&node, config.links.iter().map(|link| link.name.as_str()))?;
     let stop = eventfd(0, EventfdFlags::CLOEXEC).map_err(|error| no_resource("an eventfd", &error))?;
     let worked: Vec<_> = config.links.iter().map(|_| AtomicBool::new(true)).collect();

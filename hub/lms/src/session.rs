@@ -13,7 +13,7 @@ use crate::outgoing::SOON;
 use crate::phase::{Control, Reason, Settings};
 use crate::sensor::{Sensor, State, Trouble};
 use crate::telegram::Telegram;
-use crate::variant::{Baud, Mode};
+use crate::variant::{BYTES_PER_TURN, Baud, Mode};
 
 /// What the session wants, in the order in which it wants it.
 #[derive(Debug)]
@@ -116,14 +116,17 @@ impl Session {
     /// Whether it is worth a look how many bytes the line has, to [`leave`](Self::leave) them there.
     pub fn may_leave(&self) -> bool {
         let begins = self.framer.buffered() == 0 && !self.has_more && self.left_until.is_none();
-        begins && self.rhythm.is_known() && self.has_pace() && self.is_live()
+        // An answer takes less time than a scan.
+        let is_silent = self.dialogue.open.is_none();
+        begins && is_silent && self.rhythm.is_known() && self.has_pace() && self.is_live()
     }
 
     /// The line has `waiting` bytes at `now` that were not read. Whether they may stay there until the telegram that they
     /// begin is nearly complete: what a host has not read, one that is killed does not lose.
     pub fn leave(&mut self, now: Nanos, waiting: usize) -> bool {
         self.now = now;
-        if waiting > 0 && self.may_leave() {
+        // More than a turn's bytes came while the host did not look: the read has to find out since when.
+        if (1..=BYTES_PER_TURN).contains(&waiting) && self.may_leave() {
             self.arrivals.sense(now, waiting);
             self.begin_rhythm();
             self.left_until = self.rhythm.rest(now);
@@ -160,6 +163,7 @@ impl Session {
     /// recording cannot be controlled.
     pub fn control(&mut self, control: Control, now: Nanos) {
         self.now = now;
+        self.left_until = None;
         self.dialogue.control(control, now);
     }
 
@@ -198,6 +202,7 @@ impl Session {
         if self.framer.buffered() == 0 {
             self.rhythm.lose();
         } else if self.is_live()
+            && self.dialogue.open.is_none()
             && !self.has_more
             && let Some(until) = self.rhythm.rest(self.now)
         {

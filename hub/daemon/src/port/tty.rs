@@ -41,11 +41,13 @@ impl Tty {
     ///
     /// [`Refusal::Missing`] if `path` names another line by now.
     pub(crate) fn adopt(line: OwnedFd, path: &Path, baud: u32) -> Result<Tty, Refusal> {
-        let now = path.metadata().map_err(|error| Refusal::of_io(&error))?;
-        if fstat(&line)?.st_rdev != now.rdev() || !is_tty(path) {
-            return Err(Refusal::Missing);
-        }
-        Tty::begin(line, path, baud)
+        if Tty::is_at(&line, path) { Tty::begin(line, path, baud) } else { Err(Refusal::Missing) }
+    }
+
+    /// Whether `path` names the `line`, which is open.
+    pub(crate) fn is_at(line: &OwnedFd, path: &Path) -> bool {
+        let open = fstat(line).map(|stat| stat.st_rdev);
+        path.metadata().is_ok_and(|now| open == Ok(now.rdev())) && is_tty(path)
     }
 
     fn begin(line: OwnedFd, path: &Path, baud: u32) -> Result<Tty, Refusal> {

@@ -83,6 +83,9 @@ pub(crate) struct Received {
     /// Why it is suspect; 0 is clean.
     #[allow(dead_code, reason = "for the tests of faults")]
     pub(crate) reasons: u8,
+    /// When its first byte came, as the session says.
+    #[allow(dead_code, reason = "for the tests of stamps")]
+    pub(crate) first: Nanos,
     /// Reads since the one before it.
     pub(crate) looks: u32,
 }
@@ -190,6 +193,12 @@ impl Bench {
         self.received.iter().filter(is_scan).map(|got| &got.telegram[..]).collect()
     }
 
+    /// The host does not run for `span`.
+    #[allow(dead_code, reason = "for the tests of stamps")]
+    pub(crate) fn stop(&mut self, span: Nanos) {
+        self.advance(self.now + span);
+    }
+
     /// One round of the host: everything that the session wants, then a wait, then a read.
     fn step(&mut self, limit: Nanos) {
         let (watch, until) = self.drain();
@@ -225,8 +234,8 @@ impl Bench {
                 Output::Telegram(received) => {
                     let telegram = received.telegram.bytes().to_vec();
                     let looks = std::mem::take(&mut self.looks);
-                    let lms::session::Received { mode, reasons, .. } = received;
-                    self.received.push(Received { at: self.now, telegram, mode, reasons, looks });
+                    let lms::session::Received { mode, reasons, first, .. } = received;
+                    self.received.push(Received { at: self.now, telegram, mode, reasons, first, looks });
                 }
                 Output::Rest(until) => break (false, until),
                 Output::Wait { until, .. } => break (true, until),

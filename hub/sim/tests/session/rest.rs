@@ -8,7 +8,7 @@ use sim::machine::{Machine, Settings};
 use sim::room::Room;
 use sim::source::Source;
 
-use crate::bench::{Bench, Received, Sent};
+use crate::bench::{Bench, Received, Sent, make_stream, sensor};
 
 /// Whether the end of a telegram could be the beginning of the next one: such a telegram is held until the line is
 /// idle (framing, rule 4).
@@ -60,4 +60,49 @@ fn what_a_killed_host_would_lose_is_not_read_before_it_is_nearly_complete() {
     }
     // 0.6 ms and a chunk of every 26.64.
     assert!(exposed * 100 < looks * 6, "{exposed} of {looks}");
+}
+
+#[test]
+fn what_waited_while_a_host_between_two_telegrams_was_stopped_is_no_newer_than_it_is() {
+    let settings = Settings { baud: Baud::B500000, ..Settings::default() };
+    let machine = Machine::new(settings, Source::Room(Room::new(&"room".parse().unwrap(), 5)));
+    let mut bench = Bench::new(machine, 0);
+    bench.until("streaming", 3_000 * MILLIS, Bench::is_streaming);
+    for _ in 0..20 {
+        bench.run(100 * MILLIS);
+        while !bench.session.may_leave() {
+            bench.run(MILLIS);
+        }
+        let stopped = bench.now;
+        // As much as a tty has room for.
+        bench.stop(140 * MILLIS);
+        let continued = bench.now;
+        bench.run(5 * MILLIS);
+        let waited: Vec<_> = bench.received.iter().filter(|got| got.at >= stopped).collect();
+        assert!(waited.len() >= 4, "{} telegrams", waited.len());
+        for got in waited.into_iter().filter(|got| got.at < continued + 2 * MILLIS) {
+            let sent =
+                bench.sent.iter().rev().find(|sent| sent.telegram == got.telegram).expect("it was sent");
+            assert!((stopped..sent.at).contains(&got.first), "{} was sent by {}", got.first, sent.at);
+        }
+    }
+}
+
+#[test]
+fn what_is_asked_of_a_running_stream_is_heard_as_soon_as_it_is_answered() {
+    let mut machine = sensor(Baud::B500000);
+    let now = make_stream(&mut machine);
+    let mut bench = Bench::new(machine, now);
+    // The first questions are overlooked: how long a telegram takes is known by the time of the others.
+    bench.to_sensor = Box::new(|number, byte| (number >= 60).then_some(byte));
+    bench.until("streaming", 3_000 * MILLIS, Bench::is_streaming);
+    bench.run(3_000 * MILLIS);
+    let replies: Vec<_> = bench.sent.iter().filter(|sent| sent.is_reply && sent.at > now).collect();
+    assert!(!replies.is_empty());
+    for reply in replies {
+        let mut same =
+            bench.received.iter().filter(|got| got.telegram == reply.telegram && got.at >= reply.at);
+        let heard = same.next().expect("it was delivered").at;
+        assert!(heard < reply.at + 2 * MILLIS, "{} us late", (heard - reply.at) / MICROS);
+    }
 }
