@@ -1,11 +1,16 @@
 //! A hub that does not run for a while, as on a machine that is suspended: what its line's buffer had room for is
-//! delivered, what it had no room for is lost and counted, and then it goes on as if nothing had been.
+//! delivered, what it had no room for is lost and counted, and then it goes on as if nothing had been. And a listener: what
+//! waited for it is not new.
 
 mod stage;
 
+use std::thread;
+use std::time::Duration;
+
 use rustix::process::Signal;
 use rustix::time::{ClockId, clock_gettime};
-use stage::{INT, Stage, TERM, bytes_of, hash, is_class, number, until};
+use schema::{Topic, Verdict, Zones};
+use stage::{INT, Sender, Stage, TERM, bytes_of, hash, in_a_network, is_class, number, until};
 
 #[test]
 fn a_hub_that_was_stopped() {
@@ -68,4 +73,24 @@ fn a_hub_that_was_stopped() {
 fn now() -> u64 {
     let now = clock_gettime(ClockId::Monotonic);
     now.tv_sec as u64 * 1_000_000_000 + now.tv_nsec as u64
+}
+
+#[test]
+fn what_waited_for_a_listener_that_was_stopped_is_not_new() {
+    in_a_network("what_waited_for_a_listener_that_was_stopped_is_not_new", || {
+        let stage = Stage::new();
+        let mut listener = stage.start(&["listen", "--json"]).ready();
+        let mut sender = Sender::new(0x5f3a_12bc_00d1_e2f3, 7, 2, "front");
+        listener.signal(Signal::STOP);
+        let before = now();
+        sender.send(Topic::Zones, &Zones { verdict: Verdict::Clear as u8, ..Zones::unknown() });
+        let after = now();
+        thread::sleep(Duration::from_millis(600));
+        listener.signal(Signal::CONT);
+        let line = listener.await_line("zones", is_class("zones"));
+        // The kernel tells of another clock.
+        let possible = before - 1_000_000..after + 100_000_000;
+        assert!(possible.contains(&number(&line, "stamp_ns")), "{line} is not of {possible:?}");
+        assert_eq!(listener.end(INT).code, Some(0));
+    });
 }

@@ -9,7 +9,7 @@ use schema::{Domain, Failure, Kind, ROBOT, Topic, ipc, is_remote};
 use crate::account::Account;
 use crate::names::{TopicName, no_sensor};
 use crate::output::End;
-use crate::presence::GRACE;
+use crate::presence::{GRACE, Who};
 use crate::sample::{Sample, Source};
 use crate::session::Session;
 use crate::wait::Wait;
@@ -151,6 +151,11 @@ struct Run<'a> {
 /// Sensors of other machines that are there have been announced after so long: it is done once a second.
 const ANNOUNCED: Duration = Duration::from_secs(3);
 
+/// Who brings what is called so.
+fn of(name: &TopicName) -> Who {
+    if is_remote(&name.sensor) { Who::Listener } else { Who::Hub }
+}
+
 /// Samples taken from one topic before the next one has its turn.
 const TURN: usize = 32;
 
@@ -201,12 +206,12 @@ impl<'a> Run<'a> {
     /// News of the hub, and the topics of one that was waited for.
     fn look(&mut self, sink: &mut dyn Sink) -> Result<(), End> {
         let change = self.session.look()?;
-        if change.gone {
-            self.notice(sink, Notice::HubGone)?;
+        if let Some(who) = change.gone {
+            self.tell(sink, Notice::HubGone, |name| who == of(name))?;
         }
-        if change.back {
+        if let Some(who) = change.back {
             if self.hub_seen.is_some() || self.waiting_said {
-                self.notice(sink, Notice::HubBack)?;
+                self.tell(sink, Notice::HubBack, |name| who == of(name))?;
             }
             self.hub_seen = Some(Instant::now());
         }
@@ -342,8 +347,19 @@ impl<'a> Run<'a> {
 
     /// News of the hub concern every stream.
     fn notice(&self, sink: &mut dyn Sink, notice: Notice) -> Result<(), End> {
-        let names: Vec<_> = self.tracks.iter().map(|track| &track.name).collect();
-        sink.notice(&names, notice)
+        self.tell(sink, notice, |_| true)
+    }
+
+    /// As [`notice`](Self::notice), to those streams alone that it concerns.
+    fn tell(
+        &self,
+        sink: &mut dyn Sink,
+        notice: Notice,
+        concerns: impl Fn(&TopicName) -> bool,
+    ) -> Result<(), End> {
+        let names: Vec<_> =
+            self.tracks.iter().map(|track| &track.name).filter(|name| concerns(name)).collect();
+        if names.is_empty() { Ok(()) } else { sink.notice(&names, notice) }
     }
 
     fn wake_at(&self) -> Option<Instant> {

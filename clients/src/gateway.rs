@@ -193,13 +193,13 @@ impl<'a> Gateway<'a> {
     /// News of the hub, and the sensors of one that came.
     fn look(&mut self, report: &mut Report<'_>, now: Instant) -> Result<(), End> {
         let change = self.session.look()?;
-        if change.gone && self.is_there {
+        if change.gone.is_some() && self.is_there {
             self.is_there = false;
             self.roll.end();
             report.hub(Notice::HubGone)?;
         }
         // Somebody else may bring the sensors of other machines, which are not sent on.
-        if change.back && self.session.hub_lives() {
+        if change.back.is_some() && self.session.hub_lives() {
             if self.roll.has_begun() || self.waiting_said {
                 report.hub(Notice::HubBack)?;
             }

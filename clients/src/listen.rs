@@ -17,14 +17,13 @@ use std::time::{Duration, Instant};
 use schema::datagram::{Account, Announce, Datagram, Fresh, Refusal, group};
 use schema::{Domain, Failure, Kind, Topic};
 
-use self::ear::{Ear, LONGEST};
+use self::ear::{Caught, Ear, LONGEST};
 use self::names::{Hubs, Names};
 use self::publish::Publication;
 use self::remote::Remote;
 use self::report::Report;
 use self::roll::Roll;
 use self::twins::Twins;
-use crate::clock;
 use crate::follow::Bounds;
 use crate::interface::is_of_this_machine;
 use crate::output::{End, Output, quiet};
@@ -171,7 +170,8 @@ impl Listener<'_> {
     /// Takes what waits, up to a turn; whether there may be more.
     fn take(&mut self, buffer: &mut [u8]) -> Result<bool, End> {
         for _ in 0..TURN {
-            let Some((bytes, from)) = self.ear.receive(buffer)? else { return Ok(false) };
+            let Some(caught) = self.ear.receive(buffer)? else { return Ok(false) };
+            let bytes = caught.bytes;
             if !self.hubs.want(bytes) {
                 continue;
             }
@@ -179,7 +179,7 @@ impl Listener<'_> {
                 Ok((_, Fresh::Duplicate)) => {}
                 Ok((datagram, fresh)) => {
                     self.twins.taken(datagram.head.hub);
-                    self.heard(datagram, fresh == Fresh::Late, from)?;
+                    self.heard(datagram, fresh == Fresh::Late, &caught)?;
                 }
                 Err(Refusal::Capacity) => self.trouble(FULL)?,
                 Err(Refusal::Epoch) => self.of_another_life(bytes)?,
@@ -192,9 +192,9 @@ impl Listener<'_> {
         Ok(true)
     }
 
-    /// A datagram that was not there before, and its sender's address.
-    fn heard(&mut self, datagram: Datagram<'_>, late: bool, from: IpAddr) -> Result<(), End> {
-        let (now, wall_ns) = (clock::now(), clock::wall_ns());
+    /// A datagram that was not there before, as it was `caught`.
+    fn heard(&mut self, datagram: Datagram<'_>, late: bool, caught: &Caught<'_>) -> Result<(), End> {
+        let &Caught { from, arrival_ns, wall_ns, .. } = caught;
         let head = datagram.head;
         let Some(topic) = Topic::of_number(head.topic) else {
             // What it says was said again, and better, by a newer one.
@@ -210,7 +210,7 @@ impl Listener<'_> {
         }
         self.received += 1;
         self.last_sample = Instant::now();
-        let remote = Remote { topic, datagram, boot, arrival_ns: now.monotonic_ns, age_ns, late };
+        let remote = Remote { topic, datagram, boot, arrival_ns, age_ns, late };
         if let Some(publication) = &mut self.publication {
             publication.sample(&remote, self.last_sample);
             return Ok(());

@@ -2,7 +2,7 @@
 
 use std::time::{Duration, Instant};
 
-use schema::{Domain, Failure, Kind, publisher};
+use schema::{Domain, Failure, Kind, holder, publisher};
 
 /// How often the locks are looked at.
 const LOOK_EVERY: Duration = Duration::from_millis(100);
@@ -13,19 +13,48 @@ const MAKE_SURE_EVERY: Duration = Duration::from_secs(1);
 /// The hub of a domain, as far as its lock tells.
 pub(crate) struct Presence {
     places: Vec<Domain>,
-    hub: Option<(Domain, u32)>,
+    hub: Option<Holder>,
     looked_at: Option<Instant>,
     heard_at: Option<Instant>,
     denied: Option<Failure>,
 }
 
-/// What became different since the last look. Both: the hub was replaced in between.
+/// Who publishes in a domain. Where both are there the hub counts.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Who {
+    /// A hub.
+    Hub,
+    /// A listener that brings the sensors of other machines.
+    Listener,
+}
+
+#[derive(Clone, Debug, PartialEq, Eq)]
+struct Holder {
+    domain: Domain,
+    pid: u32,
+    who: Who,
+}
+
+/// What became different since the last look. Both: one was replaced in between.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub(crate) struct Change {
-    /// The hub that was there is not there any more.
-    pub(crate) gone: bool,
-    /// A hub is there that was not there before.
-    pub(crate) back: bool,
+    /// Who was there is not there any more.
+    pub(crate) gone: Option<Who>,
+    /// Somebody is there who was not there before.
+    pub(crate) back: Option<Who>,
+}
+
+impl Change {
+    /// A listener that stays behind a hub has not come with that hub's end, and has not gone when a hub stands before it.
+    fn between(before: Option<&Holder>, now: Option<&Holder>) -> Change {
+        let who = |holder: Option<&Holder>| holder.map(|holder| holder.who);
+        let is_beside = before.zip(now).is_some_and(|(a, b)| a.domain == b.domain && a.who != b.who);
+        let counts = |who: &Who| !is_beside || *who == Who::Hub;
+        match before == now {
+            true => Change::default(),
+            false => Change { gone: who(before).filter(counts), back: who(now).filter(counts) },
+        }
+    }
 }
 
 impl Presence {
@@ -49,8 +78,7 @@ impl Presence {
         self.looked_at = Some(Instant::now());
         self.denied = None;
         let now = self.live();
-        let change =
-            Change { gone: self.hub.is_some() && self.hub != now, back: now.is_some() && self.hub != now };
+        let change = Change::between(self.hub.as_ref(), now.as_ref());
         self.hub = now;
         change
     }
@@ -62,7 +90,7 @@ impl Presence {
 
     /// Where the hub lives, if there is one.
     pub(crate) fn domain(&self) -> Option<&Domain> {
-        self.hub.as_ref().map(|(domain, _)| domain)
+        self.hub.as_ref().map(|holder| &holder.domain)
     }
 
     /// What to tell who cannot wait for a hub.
@@ -84,12 +112,16 @@ impl Presence {
         self.denied.clone().filter(|denied| denied.kind == Kind::Short)
     }
 
-    fn live(&mut self) -> Option<(Domain, u32)> {
+    fn live(&mut self) -> Option<Holder> {
         for place in &self.places {
-            match publisher(place.root()) {
+            let asked = holder(place.root()).and_then(|hub| match hub {
+                None => Ok((publisher(place.root())?, Who::Listener)),
+                hub => Ok((hub, Who::Hub)),
+            });
+            match asked {
                 // 0: it has the lock and not yet written who it is.
-                Ok(None | Some(0)) => {}
-                Ok(Some(pid)) => return Some((place.clone(), pid)),
+                Ok((None | Some(0), _)) => {}
+                Ok((Some(pid), who)) => return Some(Holder { domain: place.clone(), pid, who }),
                 Err(failure) => self.denied = Some(failure),
             }
         }
@@ -117,3 +149,25 @@ pub(crate) fn find(places: &[Domain]) -> Result<Domain, Failure> {
 
 /// How long what has to be there may take to appear while a hub is starting: a verb without a hub ends within a second.
 pub(crate) const GRACE: Duration = Duration::from_millis(500);
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_listener_does_not_come_because_a_hub_goes() {
+        let domain = Domain::at("presence", std::path::Path::new("/tmp/presence")).unwrap();
+        let holder = |pid, who| Some(Holder { domain: domain.clone(), pid, who });
+        let (hub, other, listener) = (holder(1, Who::Hub), holder(2, Who::Hub), holder(3, Who::Listener));
+        let change = |before: &Option<Holder>, now: &Option<Holder>| {
+            let Change { gone, back } = Change::between(before.as_ref(), now.as_ref());
+            (gone, back)
+        };
+        assert_eq!(change(&None, &hub), (None, Some(Who::Hub)));
+        assert_eq!(change(&hub, &hub), (None, None));
+        assert_eq!(change(&hub, &other), (Some(Who::Hub), Some(Who::Hub)));
+        assert_eq!(change(&hub, &listener), (Some(Who::Hub), None));
+        assert_eq!(change(&listener, &hub), (None, Some(Who::Hub)));
+        assert_eq!(change(&listener, &None), (Some(Who::Listener), None));
+    }
+}

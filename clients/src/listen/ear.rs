@@ -1,15 +1,22 @@
 //! The socket that hears the groups, on every interface that has a link, also on one that comes later or comes back.
 //! It sends nothing. Refuses to know what a datagram says.
 
-use std::io::{self, ErrorKind};
+use std::io::{self, IoSliceMut};
 use std::net::{IpAddr, Ipv4Addr, SocketAddrV4, UdpSocket};
+use std::os::fd::AsRawFd;
 use std::time::{Duration, Instant};
 
+use nix::cmsg_space;
+use nix::errno::Errno;
+use nix::sys::socket::sockopt::ReceiveTimestampns;
+use nix::sys::socket::{ControlMessageOwned, MsgFlags, SockaddrIn, recvmsg, setsockopt};
+use nix::sys::time::TimeSpec;
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
 use schema::datagram::{GROUPS, PORT};
 use schema::{Failure, Kind};
 use socket2::{Domain, InterfaceIndexOrAddress, Protocol, SockRef, Socket, Type};
 
+use crate::clock;
 use crate::interface::{Changes, Interface, interfaces, named};
 
 /// Hears groups.
@@ -25,6 +32,21 @@ pub(super) struct Ear {
     look_at: Instant,
     /// Why the groups could not be joined somewhere, or the interfaces not be had.
     trouble: Option<String>,
+    /// Room for the kernel's word of when a datagram came.
+    stamp: Vec<u8>,
+    /// CLOCK_MONOTONIC when nothing waited, in ns.
+    empty_ns: u64,
+}
+
+/// A datagram as it came.
+pub(super) struct Caught<'a> {
+    /// All of it.
+    pub(super) bytes: &'a [u8],
+    /// Its sender's address.
+    pub(super) from: IpAddr,
+    /// When it came, in ns of CLOCK_MONOTONIC and since 1970, however late it is read.
+    pub(super) arrival_ns: u64,
+    pub(super) wall_ns: u64,
 }
 
 /// An interface on which the groups were joined.
@@ -73,6 +95,8 @@ impl Ear {
             is_changed: false,
             look_at: now,
             trouble: None,
+            stamp: cmsg_space!(TimeSpec),
+            empty_ns: clock::now_ns(),
         };
         ear.look(now);
         Ok(ear)
@@ -131,15 +155,36 @@ impl Ear {
         self.trouble.take()
     }
 
-    /// The next datagram that waits, whole, and its sender's address, or nothing; `buffer` has [`LONGEST`] bytes.
+    /// The next datagram that waits, or nothing; `buffer` has [`LONGEST`] bytes.
     ///
     /// [`Kind::Failed`] if the socket is of no use any more.
-    pub(super) fn receive<'a>(&self, buffer: &'a mut [u8]) -> Result<Option<(&'a [u8], IpAddr)>, Failure> {
-        match self.socket.recv_from(buffer) {
-            Ok((len, from)) => Ok(Some((&buffer[..len], from.ip()))),
-            Err(error) if matches!(error.kind(), ErrorKind::WouldBlock | ErrorKind::Interrupted) => Ok(None),
-            Err(error) => Err(Failure::new(Kind::Failed, format!("cannot receive: {error}"), "")),
-        }
+    pub(super) fn receive<'a>(&mut self, buffer: &'a mut [u8]) -> Result<Option<Caught<'a>>, Failure> {
+        let (fd, stamp) = (self.socket.as_raw_fd(), &mut self.stamp);
+        let mut room = [IoSliceMut::new(&mut *buffer)];
+        let received = recvmsg::<SockaddrIn>(fd, &mut room, Some(stamp), MsgFlags::empty());
+        let (len, from, came_ns) = match received {
+            Ok(message) => {
+                let came_ns = message.cmsgs().find_map(|said| match said {
+                    ControlMessageOwned::ScmTimestampns(at) => Some(wall_ns(at)),
+                    _ => None,
+                });
+                (message.bytes, message.address.map_or(0, |address| address.ip()), came_ns)
+            }
+            Err(Errno::EAGAIN) => {
+                self.empty_ns = clock::now_ns();
+                return Ok(None);
+            }
+            Err(Errno::EINTR) => return Ok(None),
+            Err(error) => return Err(Failure::new(Kind::Failed, format!("cannot receive: {error}"), "")),
+        };
+        let (now_ns, wall_ns) = (clock::now_ns(), clock::wall_ns());
+        let waited_ns = waited_ns(came_ns, wall_ns, now_ns.saturating_sub(self.empty_ns));
+        Ok(Some(Caught {
+            bytes: &buffer[..len],
+            from: Ipv4Addr::from(from).into(),
+            arrival_ns: now_ns - waited_ns,
+            wall_ns: wall_ns.saturating_sub(waited_ns),
+        }))
     }
 
     /// Sleeps until a datagram waits, an interface changes, a signal comes or `left` is over.
@@ -184,6 +229,17 @@ fn leave(socket: &UdpSocket, groups: &[Ipv4Addr], index: u32) {
     }
 }
 
+/// How long a datagram waited that came at `came_ns`, by a wall clock that says `wall_ns` now and may have been set meanwhile:
+/// never longer than it is since nothing waited, `at_most_ns`.
+fn waited_ns(came_ns: Option<u64>, wall_ns: u64, at_most_ns: u64) -> u64 {
+    came_ns.map_or(0, |came_ns| wall_ns.saturating_sub(came_ns)).min(at_most_ns)
+}
+
+/// A time since 1970, in ns.
+fn wall_ns(at: TimeSpec) -> u64 {
+    u64::try_from(Duration::from(at).as_nanos()).unwrap_or_default()
+}
+
 /// Not bound to a group: copies that are sent to this machine alone are heard as well. What other programs have joined is
 /// not.
 fn bind() -> io::Result<UdpSocket> {
@@ -193,6 +249,21 @@ fn bind() -> io::Result<UdpSocket> {
     // Less is no reason to fail: what does not fit is lost, and counted.
     let _ = socket.set_recv_buffer_size(BUFFER);
     socket.set_nonblocking(true)?;
+    // What waited while this process did not run shall not be taken for new.
+    setsockopt(socket.as_raw_fd(), ReceiveTimestampns, &true)?;
     socket.bind(&SocketAddrV4::new(Ipv4Addr::UNSPECIFIED, PORT).into())?;
     Ok(socket.into())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_waited_came_earlier_and_a_clock_that_is_set_says_nothing_else() {
+        assert_eq!(waited_ns(Some(700), 1_000, 5_000), 300);
+        assert_eq!(waited_ns(Some(700), 900_000, 5_000), 5_000, "set forward");
+        assert_eq!(waited_ns(Some(700), 100, 5_000), 0, "set back");
+        assert_eq!(waited_ns(None, 1_000, 5_000), 0);
+    }
 }
