@@ -42,6 +42,9 @@ impl Session {
     /// [`Kind::Short`](schema::Kind) if memory or descriptors are; who has joined already goes on without a look.
     pub(crate) fn look(&mut self) -> Result<Change, Failure> {
         let change = self.presence.look();
+        if let Some(joined) = self.joined.as_mut().filter(|_| change.gone || change.back) {
+            joined.wakeups.renew();
+        }
         let Some(domain) = self.presence.domain() else {
             return match self.presence.short() {
                 Some(short) if self.joined.is_none() => Err(short),
