@@ -45,6 +45,9 @@ impl Session {
             self.presence.heard();
         }
         let change = self.presence.look();
+        if let Some(joined) = self.joined.as_mut().filter(|_| change.gone || change.back) {
+            joined.wakeups.renew();
+        }
         let Some(domain) = self.presence.domain() else {
             return match self.presence.short() {
                 Some(short) if self.joined.is_none() => Err(short),

@@ -62,13 +62,18 @@ impl Wakeups {
         Ok(is_there)
     }
 
+    /// The hub went or came: what its consumers sleep at may be another bell now, or soon.
+    pub(crate) fn renew(&mut self) {
+        self.sensors.iter_mut().for_each(|sensor| sensor.bell = None);
+    }
+
     /// Sleeps until one of them wakes, a signal comes or `left` is over; returns at once if one has since the caller looked
     /// for samples.
     ///
     /// [`Kind::Short`](schema::Kind) if the system cannot wait.
     pub(crate) fn wait(&mut self, node: &Node, left: Duration) -> Result<(), Failure> {
         if self.wait == Wait::Event {
-            return self.wait_for_event(left);
+            return self.wait_for_event(node, left);
         }
         for sensor in &mut self.sensors {
             // Who has come this far goes on without a bell, a little later each time, until there is one.
@@ -121,7 +126,15 @@ impl Wakeups {
         any
     }
 
-    fn wait_for_event(&mut self, left: Duration) -> Result<(), Failure> {
+    fn wait_for_event(&mut self, node: &Node, left: Duration) -> Result<(), Failure> {
+        let mut is_new = false;
+        for sensor in self.sensors.iter_mut().filter(|sensor| sensor.listener.is_none()) {
+            // Its hub was still making it, or there was no room.
+            is_new |= sensor.listen(node).unwrap_or(false);
+        }
+        if is_new {
+            return Ok(());
+        }
         let listeners: Vec<&Listener> =
             self.sensors.iter().filter_map(|sensor| sensor.listener.as_ref()).collect();
         if !self.taken && ipc::take_wakeups(&listeners)? {
@@ -282,6 +295,48 @@ mod tests {
         wakeups.wait(&node, LONG).unwrap();
         assert!(woken(started));
         assert!(wakeups.sensors[0].bell.as_ref().is_some_and(|bell| !bell.is_closed()));
+    }
+
+    #[test]
+    fn a_bell_that_somebody_removed_while_there_was_no_hub_is_exchanged() {
+        let place = Place::new("removed");
+        let hub = ipc::hub_node(&place.1).unwrap();
+        let node = ipc::client_node(&place.1).unwrap();
+        let mut wakeups = Wakeups::by(Wait::Doorbell);
+        // A hub that is killed closes nothing.
+        std::mem::forget(Waker::new(&hub, "front").unwrap());
+        assert!(wakeups.add(&node, "front").unwrap());
+        for entry in std::fs::read_dir("/dev/shm").unwrap().flatten() {
+            let name = entry.file_name().to_string_lossy().into_owned();
+            if name.starts_with(&place.1.prefix()) && name.ends_with(".bell") {
+                std::fs::remove_file(entry.path()).unwrap();
+            }
+        }
+        let next = Waker::new(&hub, "front").unwrap();
+        wakeups.renew();
+        wakeups.wait(&node, Duration::ZERO).unwrap();
+        let before = wakeups.rung("front").expect("it has a bell");
+        next.wake(Wake::Telegram).unwrap();
+        assert_eq!(wakeups.rung("front"), Some(before + 1));
+    }
+
+    #[test]
+    fn an_event_that_is_made_later_is_listened_to() {
+        let place = Place::new("later");
+        let hub = ipc::hub_node(&place.1).unwrap();
+        let node = ipc::client_node(&place.1).unwrap();
+        let mut wakeups = Wakeups::by(Wait::Doorbell);
+        let first = Waker::new(&hub, "front").unwrap();
+        assert!(wakeups.add(&node, "front").unwrap());
+        drop(first);
+        wakeups.turn_to_events(&node).unwrap();
+        assert!(wakeups.sensors[0].listener.is_none());
+        let waker = Waker::new(&hub, "front").unwrap();
+        wakeups.wait(&node, LONG).unwrap();
+        let started = Instant::now();
+        waker.wake(Wake::Telegram).unwrap();
+        wakeups.wait(&node, LONG).unwrap();
+        assert!(woken(started) && wakeups.sensors[0].listener.is_some());
     }
 
     #[test]
