@@ -151,7 +151,7 @@ fn of_sockets(cells: &[Cell]) -> Vec<Verdict> {
                 unit: "1",
                 ours: vec![above.len() as f64],
                 other: Vec::new(),
-                target: format!("0 of {} beyond the spread", compared.len()),
+                target: format!("none of {} above beyond the spread", compared.len()),
                 is_met: above.is_empty(),
             });
             verdicts.extend(above.iter().filter_map(|(cell, rival)| {

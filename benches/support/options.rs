@@ -24,15 +24,18 @@ impl Options {
         let mut options = Options::default();
         let mut words = words.iter();
         while let Some(word) = words.next() {
-            let mut value = || words.next().ok_or_else(|| format!("{word} needs a value"));
+            let mut value = || {
+                // Cargo says --bench to every bench.
+                let value = words.next().filter(|value| *value != "--bench");
+                value.ok_or_else(|| format!("{word} needs a value"))
+            };
             match word.as_str() {
                 "--json" => options.json = true,
                 "--quick" => options.quick = true,
                 "--draw" => options.draw = Some(value()?.into()),
-                "--pairs" => options.pairs = Some(value()?.parse()?),
-                "--seconds" => options.seconds = Some(value()?.parse()?),
-                "--count" => options.count = Some(value()?.parse()?),
-                // Cargo says so to every bench.
+                "--pairs" => options.pairs = Some(number(word, value()?)?),
+                "--seconds" => options.seconds = Some(number(word, value()?)?),
+                "--count" => options.count = Some(number(word, value()?)?),
                 "--bench" => {}
                 _ => {
                     return Err(format!(
@@ -64,4 +67,11 @@ impl Options {
     pub(crate) fn count(&self, default: usize) -> usize {
         self.count.unwrap_or(default).clamp(1, 1_000_000)
     }
+}
+
+/// `value` as a number, at least one.
+fn number<T: TryFrom<u64>>(flag: &str, value: &str) -> Outcome<T> {
+    let number =
+        value.parse::<u64>().ok().filter(|&number| number > 0).and_then(|number| number.try_into().ok());
+    Ok(number.ok_or_else(|| format!("{flag} {value}? a number of at least 1"))?)
 }

@@ -72,6 +72,8 @@ impl Presence {
     pub(crate) fn look(&mut self) -> Change {
         let is_within = |at: Option<Instant>, limit| at.is_some_and(|at| at.elapsed() < limit);
         let is_heard = is_within(self.heard_at, LOOK_EVERY) && is_within(self.looked_at, MAKE_SURE_EVERY);
+        // One that is heard and was not there has come.
+        let is_heard = is_heard && self.hub.is_some();
         if is_heard || is_within(self.looked_at, LOOK_EVERY) {
             return Change::default();
         }

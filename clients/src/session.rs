@@ -45,7 +45,7 @@ impl Session {
             self.presence.heard();
         }
         let change = self.presence.look();
-        if let Some(joined) = self.joined.as_mut().filter(|_| change.gone || change.back) {
+        if let Some(joined) = self.joined.as_mut().filter(|_| change != Change::default()) {
             joined.wakeups.renew();
         }
         let Some(domain) = self.presence.domain() else {

@@ -140,3 +140,21 @@ fn a_client_that_comes_between_two_hubs() {
     let _hub = Hub::start(&place, 2);
     until("a scan", || scans.next().unwrap().is_some_and(|scan| scan.header().boot == 2 && !scan.restarted));
 }
+
+#[test]
+fn another_listener_counts_from_elsewhere() {
+    let place = Place::new();
+    let mut hub = FakeHub::new(&place.domain, &["front"], 1);
+    let mut scans = Attachment::<Scan>::in_domain(place.places(), "front").unwrap();
+    assert!(scans.try_next().unwrap().is_none());
+    hub.front().flags = schema::Flags::REMOTE;
+    let mut missed = |hub: &mut FakeHub, pid: u32, topic_seq: u64| {
+        (hub.front().pid, hub.front().scan.topic_seq) = (pid, topic_seq);
+        hub.front().scan(&[1000; 181]);
+        scans.next().unwrap().expect("without a timeout").missed
+    };
+    assert_eq!(missed(&mut hub, 11, 40), 0, "the first one");
+    assert_eq!(missed(&mut hub, 11, 44), 3);
+    assert_eq!(missed(&mut hub, 12, 900), 0, "of another process, which has other numbers");
+    assert_eq!(missed(&mut hub, 12, 902), 1);
+}

@@ -77,6 +77,9 @@ pub(crate) struct FakeSensor {
     pub(crate) status: Port<Status>,
     pub(crate) waker: Waker,
     pub(crate) boot: u64,
+    /// Of the headers' flags and process.
+    pub(crate) flags: u16,
+    pub(crate) pid: u32,
     pub(crate) seq: u64,
     /// Of the scans, in us.
     pub(crate) period_us: u32,
@@ -92,7 +95,8 @@ impl FakeSensor {
             wall_ns: 1_700_000_000_000_000_000 + self.seq,
             boot: self.boot,
             period_us: self.period_us,
-            hub_pid: std::process::id(),
+            hub_pid: self.pid,
+            flags: self.flags,
             ..Header::default()
         }
     }
@@ -178,6 +182,8 @@ impl FakeHub {
             status: Port::new(&node, name),
             waker: Waker::new(&node, name).unwrap(),
             boot,
+            flags: 0,
+            pid: std::process::id(),
             seq: 0,
             period_us: 26_640,
         };

@@ -12,8 +12,7 @@ use super::arrivals::Arrivals;
 /// One topic.
 pub(super) struct Outlet<P: Payload + ?Sized> {
     publisher: Publisher<P>,
-    /// The number of the next sample if none is left out before it. The first one has that of the network, so that
-    /// consumers that outlive a listener see what was lost meanwhile.
+    /// The number of the next sample if none is left out before it. The first one has that of the network.
     next: Option<u64>,
     /// Life of the gateway, sensor's number there, and its own number, of the last one that came from the network.
     last: (u32, u8, u32),
