@@ -46,7 +46,9 @@ impl<'a> Screen<'a> {
     /// Takes over the terminal that `out` writes to.
     pub(crate) fn new(out: &'a mut dyn Write) -> Result<Screen<'a>, End> {
         let written = Rc::new(Cell::new(0));
-        let mut sheet = Sheet { out, buffer: Vec::new(), written: written.clone() };
+        let given_back = Arc::new(AtomicBool::new(false));
+        let mut sheet =
+            Sheet { out, buffer: Vec::new(), written: written.clone(), given_back: given_back.clone() };
         enable_raw_mode().map_err(|error| {
             let message = format!("the terminal cannot be taken over: {error}");
             Failure::new(Kind::Failed, message, "keys come from stdin or /dev/tty; `ssh -t` gives one")
@@ -57,7 +59,6 @@ impl<'a> Screen<'a> {
             let _ = disable_raw_mode();
         })?;
         let hook: Arc<Hook> = Arc::from(take_hook());
-        let given_back = Arc::new(AtomicBool::new(false));
         let (before, giving) = (hook.clone(), given_back.clone());
         // What a panic says would go with the sheet.
         set_hook(Box::new(move |info| {
@@ -130,6 +131,8 @@ struct Sheet<'a> {
     out: &'a mut dyn Write,
     buffer: Vec<u8>,
     written: Rc<Cell<usize>>,
+    /// What comes now is a farewell, which may well fail.
+    given_back: Arc<AtomicBool>,
 }
 
 impl Write for Sheet<'_> {
@@ -142,6 +145,6 @@ impl Write for Sheet<'_> {
         self.written.set(self.written.get() + self.buffer.len());
         let result = self.out.write_all(&self.buffer).and_then(|()| self.out.flush());
         self.buffer.clear();
-        result
+        if self.given_back.load(Ordering::Relaxed) { Ok(()) } else { result }
     }
 }
