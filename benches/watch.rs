@@ -99,7 +99,7 @@ fn look(stage: &Stage, size: (u16, u16), span: Duration) -> Outcome<Seen> {
     let end = || -> Outcome<Stdio> { Ok(Stdio::from(screen.try_clone()?)) };
     // A session of its own, whose terminal that is.
     let mut command = Command::new("setsid");
-    command.args(["--ctty", env!("CARGO_BIN_EXE_scanhub"), "watch", "--domain", stage.domain.name()]);
+    command.args(["-c", env!("CARGO_BIN_EXE_scanhub"), "watch", "--domain", stage.domain.name()]);
     command.env("TERM", "xterm").env("SCANHUB_END_WITH_PARENT", "1");
     let watch = Guard::new(command.stdin(end()?).stdout(end()?).stderr(end()?).spawn()?);
     drop((command, screen));

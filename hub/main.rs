@@ -64,7 +64,9 @@ fn dispatch(cli: &Cli) -> Result<(), Failure> {
                 seed: demo.seed,
                 json: everywhere.json,
             };
-            demo::demo(&options, &mut out, &*interrupt()?)
+            // Without a picture it may be meant to outlive its terminal.
+            let stop = if demo.headless { interrupt() } else { interrupt_by(&ENDS) };
+            demo::demo(&options, &mut out, &*stop?)
         }
         Verb::Simulate(simulate) => run_simulator(simulate, everywhere),
         Verb::Telegram(telegram) => match &telegram.way {
@@ -72,9 +74,7 @@ fn dispatch(cli: &Cli) -> Result<(), Failure> {
             Way::Encode(encode) => daemon::telegram::encode(&encode.options(everywhere.json), &mut out),
         },
         Verb::Probe(probe) => probe.run(everywhere.json, &*interrupt()?),
-        Verb::Configure(configure) => {
-            configure.run(everywhere.json, &*interrupt_by(&[SIGINT, SIGTERM, SIGHUP, SIGQUIT])?)
-        }
+        Verb::Configure(configure) => configure.run(everywhere.json, &*interrupt_by(&ENDS)?),
         Verb::Completions(completions) => {
             completions.run();
             Ok(())
@@ -122,7 +122,7 @@ fn dispatch(cli: &Cli) -> Result<(), Failure> {
         }
         Verb::Watch(watch) => {
             // The terminal is given back, whoever ends it.
-            let stop = interrupt_by(&[SIGINT, SIGTERM, SIGHUP, SIGQUIT])?;
+            let stop = interrupt_by(&ENDS)?;
             clients::watch(&watch.options(everywhere)?, &mut out, &stop)
         }
         Verb::Control(control) => clients::control(&control.options(everywhere)?, &mut out, &*interrupt()?),
@@ -212,6 +212,9 @@ struct ReadyPort<'a> {
 fn line(value: &impl Serialize) -> String {
     serde_json::to_string(value).unwrap_or_default()
 }
+
+/// Whatever asks a process to end.
+const ENDS: [c_int; 4] = [SIGINT, SIGTERM, SIGHUP, SIGQUIT];
 
 /// A flag that SIGINT and SIGTERM set; either one also ends a wait.
 fn interrupt() -> Result<Arc<AtomicBool>, Failure> {

@@ -46,7 +46,7 @@ impl Sitting {
         let before = tcgetattr(&screen).unwrap();
         let program = || Stdio::from(screen.try_clone().unwrap());
         let mut setsid = Command::new("setsid");
-        setsid.arg("--ctty").arg(command.get_program()).args(command.get_args());
+        setsid.arg("-c").arg(command.get_program()).args(command.get_args());
         for (key, value) in command.get_envs() {
             match value {
                 Some(value) => setsid.env(key, value),

@@ -18,6 +18,9 @@ use ratatui::crossterm::terminal::{
 use ratatui::crossterm::{execute, queue};
 use ratatui::{Frame, Terminal};
 
+use rustix::event::{PollFd, PollFlags, Timespec, poll};
+use schema::{Failure, Kind};
+
 use crate::output::End;
 
 /// The terminal, as long as it is ours.
@@ -43,15 +46,19 @@ impl<'a> Screen<'a> {
     /// Takes over the terminal that `out` writes to.
     pub(crate) fn new(out: &'a mut dyn Write) -> Result<Screen<'a>, End> {
         let written = Rc::new(Cell::new(0));
-        let mut sheet = Sheet { out, buffer: Vec::new(), written: written.clone() };
-        enable_raw_mode()?;
+        let given_back = Arc::new(AtomicBool::new(false));
+        let mut sheet =
+            Sheet { out, buffer: Vec::new(), written: written.clone(), given_back: given_back.clone() };
+        enable_raw_mode().map_err(|error| {
+            let message = format!("the terminal cannot be taken over: {error}");
+            Failure::new(Kind::Failed, message, "keys come from stdin or /dev/tty; `ssh -t` gives one")
+        })?;
         let taken = execute!(sheet, EnterAlternateScreen, Hide)
             .and_then(|()| Terminal::new(CrosstermBackend::new(sheet)));
         let terminal = taken.inspect_err(|_| {
             let _ = disable_raw_mode();
         })?;
         let hook: Arc<Hook> = Arc::from(take_hook());
-        let given_back = Arc::new(AtomicBool::new(false));
         let (before, giving) = (hook.clone(), given_back.clone());
         // What a panic says would go with the sheet.
         set_hook(Box::new(move |info| {
@@ -73,6 +80,9 @@ impl<'a> Screen<'a> {
 
     /// What was typed, or else happened to the terminal, since the last call; never waits.
     pub(crate) fn news(&mut self) -> Result<Option<News>, End> {
+        if hung_up() {
+            return Err(End::ReaderGone);
+        }
         while event::poll(Duration::ZERO).map_err(gone)? {
             match event::read().map_err(gone)? {
                 Event::Key(key) if key.kind != KeyEventKind::Release => return Ok(Some(News::Key(key))),
@@ -99,6 +109,14 @@ impl Drop for Screen<'_> {
     }
 }
 
+/// Whether the terminal was closed: whoever draws nothing would not notice, and not everybody is sent a signal.
+fn hung_up() -> bool {
+    let stdout = io::stdout();
+    let mut ends = [PollFd::new(&stdout, PollFlags::empty())];
+    let is_polled = poll(&mut ends, Some(&Timespec::default())).is_ok();
+    is_polled && ends[0].revents().intersects(PollFlags::HUP | PollFlags::ERR)
+}
+
 /// A terminal that was closed is nobody who reads.
 fn gone(error: io::Error) -> End {
     const EIO: i32 = 5;
@@ -113,6 +131,8 @@ struct Sheet<'a> {
     out: &'a mut dyn Write,
     buffer: Vec<u8>,
     written: Rc<Cell<usize>>,
+    /// What comes now is a farewell, which may well fail.
+    given_back: Arc<AtomicBool>,
 }
 
 impl Write for Sheet<'_> {
@@ -125,6 +145,6 @@ impl Write for Sheet<'_> {
         self.written.set(self.written.get() + self.buffer.len());
         let result = self.out.write_all(&self.buffer).and_then(|()| self.out.flush());
         self.buffer.clear();
-        result
+        if self.given_back.load(Ordering::Relaxed) { Ok(()) } else { result }
     }
 }
