@@ -131,7 +131,7 @@ pub(crate) enum Verb {
     #[command(after_help = latency::SPANS)]
     Latency(Latency),
     /// The live picture in the terminal: what the sensors see, marks, zones and the verdict
-    #[command(after_help = watch::EXAMPLE)]
+    #[command(after_help = watch::KEYS)]
     Watch(Watch),
     /// Telegrams explained field by field, and written
     Telegram(Telegram),

@@ -48,8 +48,6 @@ pub(crate) struct Follower<P: Payload + ?Sized> {
     port: Option<(u32, Subscriber<P>)>,
     asked_at: Option<Instant>,
     boot: Option<u64>,
-    /// Process of the hub, or of the listener that brought the last sample.
-    pid: u32,
     expected: Option<u64>,
     unconnected_since: Option<Instant>,
     /// In this moment there was nothing.
@@ -70,7 +68,6 @@ impl<P: Payload + ?Sized> Follower<P> {
             port: None,
             asked_at: None,
             boot: None,
-            pid: 0,
             expected: None,
             unconnected_since: None,
             nothing_at: None,
@@ -141,14 +138,11 @@ impl<P: Payload + ?Sized> Follower<P> {
     fn account(&mut self, sample: Sample<P>) -> Received<P> {
         let header = sample.user_header();
         let restarted = self.boot.is_some_and(|boot| boot != header.boot);
-        if restarted && self.expected.is_some() {
+        // A network's numbers go on, whatever becomes of the hub at its other end.
+        let is_remote = header.flags & Flags::REMOTE != 0;
+        if restarted && !is_remote && self.expected.is_some() {
             self.expected = Some(0);
         }
-        // Another listener counts from elsewhere, and does not know what came while none was there.
-        if header.flags & Flags::REMOTE != 0 && header.hub_pid != self.pid {
-            self.expected = None;
-        }
-        self.pid = header.hub_pid;
         let missed = self.expected.map_or(0, |expected| header.topic_seq.saturating_sub(expected));
         self.boot = Some(header.boot);
         self.expected = Some(header.topic_seq + 1);

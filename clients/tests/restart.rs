@@ -142,19 +142,20 @@ fn a_client_that_comes_between_two_hubs() {
 }
 
 #[test]
-fn another_listener_counts_from_elsewhere() {
+fn the_numbers_of_a_network_go_on_over_lives_of_a_hub() {
     let place = Place::new();
     let mut hub = FakeHub::new(&place.domain, &["front"], 1);
     let mut scans = Attachment::<Scan>::in_domain(place.places(), "front").unwrap();
     assert!(scans.try_next().unwrap().is_none());
     hub.front().flags = schema::Flags::REMOTE;
-    let mut missed = |hub: &mut FakeHub, pid: u32, topic_seq: u64| {
-        (hub.front().pid, hub.front().scan.topic_seq) = (pid, topic_seq);
+    let mut missed = |hub: &mut FakeHub, boot: u64, topic_seq: u64| {
+        (hub.front().boot, hub.front().scan.topic_seq) = (boot, topic_seq);
         hub.front().scan(&[1000; 181]);
-        scans.next().unwrap().expect("without a timeout").missed
+        let scan = scans.next().unwrap().expect("without a timeout");
+        (scan.missed, scan.restarted)
     };
-    assert_eq!(missed(&mut hub, 11, 40), 0, "the first one");
-    assert_eq!(missed(&mut hub, 11, 44), 3);
-    assert_eq!(missed(&mut hub, 12, 900), 0, "of another process, which has other numbers");
-    assert_eq!(missed(&mut hub, 12, 902), 1);
+    assert_eq!(missed(&mut hub, 11, 40), (0, false), "the first one");
+    assert_eq!(missed(&mut hub, 11, 44), (3, false));
+    assert_eq!(missed(&mut hub, 12, 45), (0, true));
+    assert_eq!(missed(&mut hub, 12, 47), (1, false));
 }

@@ -66,6 +66,7 @@ const EXAMPLES: &[(&str, &[&str])] = &[
             "scanhub telegram encode status | scanhub telegram decode",
         ],
     ),
+    ("watch", &["scanhub watch", "scanhub watch front"]),
     ("control", &["scanhub control front pause"]),
     ("background", &["scanhub background front save front.json"]),
     ("zones", &["scanhub zones front mask --for 10s"]),

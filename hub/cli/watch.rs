@@ -44,10 +44,5 @@ pub(crate) fn colours() -> bool {
 }
 
 /// What the help says beside the flags.
-pub(crate) const EXAMPLE: &str = "\
-Keys: q ends it, ? explains the rest. NO_COLOR=1 shows signs instead of colours.
-
-Examples:
-  scanhub watch             the robot with all its sensors
-  scanhub watch front       one sensor
-  ssh -t robot scanhub watch";
+pub(crate) const KEYS: &str = "\
+Keys: q ends it, ? explains the rest. NO_COLOR=1 shows signs instead of colours. From elsewhere: ssh -t robot scanhub watch.";

@@ -77,9 +77,8 @@ pub(crate) struct FakeSensor {
     pub(crate) status: Port<Status>,
     pub(crate) waker: Waker,
     pub(crate) boot: u64,
-    /// Of the headers' flags and process.
+    /// Of the headers.
     pub(crate) flags: u16,
-    pub(crate) pid: u32,
     pub(crate) seq: u64,
     /// Of the scans, in us.
     pub(crate) period_us: u32,
@@ -95,7 +94,7 @@ impl FakeSensor {
             wall_ns: 1_700_000_000_000_000_000 + self.seq,
             boot: self.boot,
             period_us: self.period_us,
-            hub_pid: self.pid,
+            hub_pid: std::process::id(),
             flags: self.flags,
             ..Header::default()
         }
@@ -183,7 +182,6 @@ impl FakeHub {
             waker: Waker::new(&node, name).unwrap(),
             boot,
             flags: 0,
-            pid: std::process::id(),
             seq: 0,
             period_us: 26_640,
         };

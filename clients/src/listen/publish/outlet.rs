@@ -12,7 +12,8 @@ use super::arrivals::Arrivals;
 /// One topic.
 pub(super) struct Outlet<P: Payload + ?Sized> {
     publisher: Publisher<P>,
-    /// The number of the next sample if none is left out before it. The first one has that of the network.
+    /// The number of the next sample if none is left out before it. The first one has that of the network, so that
+    /// consumers that outlive a listener see what was lost meanwhile.
     next: Option<u64>,
     /// Life of the gateway, sensor's number there, and its own number, of the last one that came from the network.
     last: (u32, u8, u32),
@@ -50,11 +51,6 @@ impl<P: Payload + ?Sized> Outlet<P> {
         let number = self.next.unwrap_or_default();
         self.next = Some(number + 1);
         number
-    }
-
-    /// The hub began to count anew.
-    pub(super) fn begin_again(&mut self) {
-        self.next = Some(0);
     }
 
     /// Connects who came since, and gives them what the topic keeps for late joiners.

@@ -17,7 +17,6 @@ pub(super) struct RemoteTopics {
     pub(super) name: String,
     /// Gateway, its life, and the sensor's number in it, as last announced.
     source: Option<(u64, u32, u8)>,
-    boot: u64,
     /// Bit n: topic number n was announced last.
     announced: u8,
     /// It has all that was announced, and that was told.
@@ -48,7 +47,6 @@ impl RemoteTopics {
         Ok(RemoteTopics {
             name: name.to_owned(),
             source: None,
-            boot: 0,
             announced: 0,
             is_told: false,
             telegram: None,
@@ -110,10 +108,6 @@ impl RemoteTopics {
     /// `announce` came with `head`: it is this one.
     pub(super) fn announced(&mut self, head: &Head, announce: &Announce) {
         self.source = Some((head.hub, head.epoch, head.sensor));
-        if self.boot != 0 && self.boot != announce.boot {
-            self.begin_again();
-        }
-        self.boot = announce.boot;
         let numbers = announce.topics().iter().map(|announced| announced.topic).filter(|number| *number < 8);
         self.announced = numbers.fold(0, |bits, number| bits | 1 << number);
     }
@@ -224,22 +218,6 @@ impl RemoteTopics {
             self.tell(status, &header);
             self.news = self.news.or(Some(Wake::Status));
         }
-    }
-
-    /// The hub began to count anew.
-    fn begin_again(&mut self) {
-        fn again<P: Payload + ?Sized>(outlet: &mut Option<Outlet<P>>) {
-            if let Some(outlet) = outlet {
-                outlet.begin_again();
-            }
-        }
-        again(&mut self.telegram);
-        again(&mut self.scan);
-        again(&mut self.marks);
-        again(&mut self.zones);
-        again(&mut self.foreground);
-        again(&mut self.background);
-        again(&mut self.status);
     }
 }
 

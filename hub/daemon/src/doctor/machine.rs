@@ -206,8 +206,8 @@ fn plural(count: u64, what: &str) -> String {
     }
 }
 
-/// What a hub has open when it counts: three for the signals, and its lock.
-const DESCRIPTORS_AT_START: u64 = 4;
+/// What a hub has open when it counts: five for the signals, and its lock.
+const DESCRIPTORS_AT_START: u64 = 6;
 /// For each consumer of a topic.
 const DESCRIPTORS_OF_CONSUMER: u64 = 4;
 /// A robot has hardly more.
