@@ -21,6 +21,8 @@ pub(super) struct Lan {
     sensors: Vec<Rows>,
     form: Form,
     longest: usize,
+    /// What did not fit into a datagram.
+    pub(super) unfit: u64,
     buffer: [u8; MTU_ETHERNET],
 }
 
@@ -117,7 +119,7 @@ impl Lan {
             copies.push(copy);
         }
         let (sensors, buffer) = (Vec::new(), [0; MTU_ETHERNET]);
-        let mut lan = Lan { life, interface, groups, copies, sensors, form, longest, buffer };
+        let mut lan = Lan { life, interface, groups, copies, sensors, form, longest, unfit: 0, buffer };
         lan.use_interface();
         let room = lan.interface.index().and_then(|index| lan.groups.room(index));
         lan.longest = longest.min(room.unwrap_or(longest)).max(HEAD);
@@ -205,6 +207,7 @@ impl Lan {
                 row.fit = Fit::NotAll;
             }
         }
+        self.unfit += u64::from(payload.is_none());
     }
 
     /// `SENSOR/TOPIC` of which something did not fit into a datagram; each is told once.

@@ -127,6 +127,10 @@ impl<'a> Report<'a> {
                 }
             }
         }
+        if lan.unfit > 0 && self.look != GatewayLook::Json {
+            let longest = lan.longest();
+            self.out.line(|line| write!(line, "too long for {longest} bytes: {}, see --mtu", lan.unfit))?;
+        }
         std::iter::once(&lan.groups).chain(&lan.copies).try_for_each(|outlet| self.outlet(lan, outlet))
     }
 
@@ -186,7 +190,10 @@ fn status(line: &mut Vec<u8>, lan: &Lan, hub_lives: bool, sent_before: u64) -> i
         write!(line, "; {}: {} sent, {} failed", copy.name, copy.sent, copy.failed)?;
     }
     let missed: u64 = lan.sensors().flat_map(|sensor| sensor.used()).map(|(_, row)| row.missed).sum();
-    if missed > 0 { write!(line, "; {missed} missed") } else { Ok(()) }
+    if missed > 0 {
+        write!(line, "; {missed} missed")?;
+    }
+    if lan.unfit > 0 { write!(line, "; {} too long", lan.unfit) } else { Ok(()) }
 }
 
 fn id(lan: &Lan) -> String {
