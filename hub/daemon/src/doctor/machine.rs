@@ -293,9 +293,9 @@ mod tests {
 
     #[test]
     fn descriptors_are_counted_in_consumers() {
-        says(&descriptors(&facts()), State::Ok, &["4096", "997 consumers"]);
+        says(&descriptors(&facts()), State::Ok, &["4096", "996 consumers"]);
         says(&descriptors(&Facts { descriptors: None, ..facts() }), State::Ok, &["no limit"]);
-        says(&descriptors(&Facts { descriptors: Some(128), ..facts() }), State::Warning, &["5 consumers"]);
-        says(&descriptors(&Facts { descriptors: Some(107), ..facts() }), State::Failed, &["needs 108"]);
+        says(&descriptors(&Facts { descriptors: Some(128), ..facts() }), State::Warning, &["4 consumers"]);
+        says(&descriptors(&Facts { descriptors: Some(107), ..facts() }), State::Failed, &["needs 110"]);
     }
 }
