@@ -15,6 +15,8 @@ pub(crate) struct Presence {
     places: Vec<Domain>,
     hub: Option<Holder>,
     looked_at: Option<Instant>,
+    /// When the locks were asked last.
+    asked_at: Option<Instant>,
     heard_at: Option<Instant>,
     denied: Option<Failure>,
 }
@@ -60,7 +62,7 @@ impl Change {
 impl Presence {
     /// Watches for a hub at `places`; the first live one is taken.
     pub(crate) fn new(places: Vec<Domain>) -> Presence {
-        Presence { places, hub: None, looked_at: None, heard_at: None, denied: None }
+        Presence { places, hub: None, looked_at: None, asked_at: None, heard_at: None, denied: None }
     }
 
     /// A sign of life of the hub.
@@ -68,20 +70,24 @@ impl Presence {
         self.heard_at = Some(Instant::now());
     }
 
-    /// Looks again, if the last look is long enough ago and nothing was heard of the hub since.
+    /// Looks again, if the last look is long enough ago. A hub that is heard is seldom asked for.
     pub(crate) fn look(&mut self) -> Change {
-        let is_within = |at: Option<Instant>, limit| at.is_some_and(|at| at.elapsed() < limit);
-        let is_heard = is_within(self.heard_at, LOOK_EVERY) && is_within(self.looked_at, MAKE_SURE_EVERY);
-        // One that is heard and was not there has come.
-        let is_heard = is_heard && self.hub.is_some();
-        if is_heard || is_within(self.looked_at, LOOK_EVERY) {
+        let now = Instant::now();
+        let is_within = |at: Option<Instant>, limit| at.is_some_and(|at| now - at < limit);
+        if is_within(self.looked_at, LOOK_EVERY) {
             return Change::default();
         }
-        self.looked_at = Some(Instant::now());
+        self.looked_at = Some(now);
+        let is_heard = is_within(self.heard_at, LOOK_EVERY) && is_within(self.asked_at, MAKE_SURE_EVERY);
+        // One that is heard and was not there has come.
+        if is_heard && self.hub.is_some() {
+            return Change::default();
+        }
+        self.asked_at = Some(now);
         self.denied = None;
-        let now = self.live();
-        let change = Change::between(self.hub.as_ref(), now.as_ref());
-        self.hub = now;
+        let found = self.live();
+        let change = Change::between(self.hub.as_ref(), found.as_ref());
+        self.hub = found;
         change
     }
 
@@ -155,6 +161,20 @@ pub(crate) const GRACE: Duration = Duration::from_millis(500);
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn a_hub_that_is_heard_is_not_asked_for_and_time_goes_on() {
+        let domain = Domain::at("presence", std::path::Path::new("/tmp/presence")).unwrap();
+        let mut presence = Presence::new(vec![domain.clone()]);
+        presence.hub = Some(Holder { domain, pid: 1, who: Who::Hub });
+        let long_ago = Instant::now().checked_sub(2 * LOOK_EVERY);
+        (presence.looked_at, presence.asked_at) = (long_ago, long_ago);
+        presence.heard();
+        assert_eq!(presence.look(), Change::default(), "nobody holds that place");
+        assert!(presence.looked_at() > long_ago && presence.asked_at == long_ago);
+        (presence.looked_at, presence.heard_at) = (long_ago, long_ago);
+        assert_eq!(presence.look(), Change { gone: Some(Who::Hub), back: None });
+    }
 
     #[test]
     fn a_listener_does_not_come_because_a_hub_goes() {
