@@ -6,6 +6,8 @@ mod control;
 pub mod datagram;
 mod domain;
 mod failure;
+#[cfg(feature = "mcap")]
+pub mod file;
 mod foreground;
 mod header;
 mod marks;

@@ -1,0 +1,124 @@
+//! The form of a recording: samples as messages of an MCAP file, a channel for each sensor's topic. A message is the
+//! header of shared memory and, behind it, the payload as it goes over a network (docs/recording.md). Refuses to know
+//! where samples come from, when a chunk is full, and what a disk does.
+
+use std::collections::BTreeMap;
+use std::io::{self, BufWriter, Write};
+
+use bytemuck::bytes_of;
+use mcap::records::{MessageHeader, Metadata};
+use mcap::write::NoSeek;
+use mcap::{McapError, WriteOptions};
+
+use crate::{Header, Topic};
+
+/// Encoding of the messages, and of the text that describes them.
+pub const ENCODING: &str = "scanhub";
+/// Name of the metadata record that a recording begins with: who recorded what, where.
+pub const METADATA: &str = "scanhub";
+
+/// Writes a recording into `W`. Whatever was written up to [`close_chunk`](Self::close_chunk) can be read even if nothing
+/// follows; until then it lies in memory.
+pub struct Writer<W: Write> {
+    mcap: mcap::Writer<NoSeek<BufWriter<W>>>,
+    channels: BTreeMap<(String, Topic), u16>,
+    message: Vec<u8>,
+}
+
+/// What a file needs to be told of a channel that is none of the hub's topics.
+#[derive(Clone, Copy, Debug)]
+pub struct Foreign<'a> {
+    /// Name of the channel.
+    pub topic: &'a str,
+    /// Encoding of its messages, such as `cdr`.
+    pub encoding: &'a str,
+    /// Name of their type, its description, and in what language that is written, such as `ros2msg`.
+    pub schema: (&'a str, &'a str, &'a str),
+}
+
+impl<W: Write> Writer<W> {
+    /// Begins a recording of `profile` (empty, or `ros2`), of which `facts` are told.
+    pub fn begin(out: W, profile: &str, facts: BTreeMap<String, String>) -> io::Result<Self> {
+        // A chunk is written when it is closed: a process that is killed leaves whole chunks and nothing else.
+        let options = WriteOptions::new()
+            .compression(PACKING)
+            .profile(profile)
+            .library("scanhub")
+            .chunk_size(None)
+            .disable_seeking(true);
+        let mut mcap = options.create(NoSeek::new(BufWriter::new(out))).map_err(io_error)?;
+        mcap.write_metadata(&Metadata { name: METADATA.to_owned(), metadata: facts }).map_err(io_error)?;
+        mcap.flush().map_err(io_error)?;
+        Ok(Writer { mcap, channels: BTreeMap::new(), message: Vec::with_capacity(4096) })
+    }
+
+    /// Writes a sample of `sensor`'s `topic`; `payload` is packed as for a network
+    /// ([`Packed`](crate::datagram::Packed)).
+    pub fn sample(&mut self, sensor: &str, topic: Topic, header: &Header, payload: &[u8]) -> io::Result<()> {
+        let key = (sensor.to_owned(), topic);
+        let channel = match self.channels.get(&key) {
+            Some(&channel) => channel,
+            None => {
+                let name = format!("{sensor}/{}", topic.name());
+                let schema = (schema(topic), LAYOUT, ENCODING);
+                let channel = self.channel(&Foreign { topic: &name, encoding: ENCODING, schema })?;
+                self.channels.insert(key, channel);
+                channel
+            }
+        };
+        let mut message = std::mem::take(&mut self.message);
+        message.clear();
+        message.extend_from_slice(bytes_of(header));
+        message.extend_from_slice(payload);
+        let written = self.message(channel, header.topic_seq as u32, header.wall_ns, &message);
+        self.message = message;
+        written
+    }
+
+    /// Makes a channel, or finds the one made before.
+    pub fn channel(&mut self, foreign: &Foreign<'_>) -> io::Result<u16> {
+        let (name, text, language) = foreign.schema;
+        let schema = self.mcap.add_schema(name, language, text.as_bytes()).map_err(io_error)?;
+        self.mcap.add_channel(schema, foreign.topic, foreign.encoding, &BTreeMap::new()).map_err(io_error)
+    }
+
+    /// Writes a message of `time_ns` since 1970 into a channel.
+    pub fn message(&mut self, channel_id: u16, sequence: u32, time_ns: u64, data: &[u8]) -> io::Result<()> {
+        let header = MessageHeader { channel_id, sequence, log_time: time_ns, publish_time: time_ns };
+        self.mcap.write_to_known_channel(&header, data).map_err(io_error)
+    }
+
+    /// Hands all that was written to `W`.
+    pub fn close_chunk(&mut self) -> io::Result<()> {
+        self.mcap.flush().map_err(io_error)
+    }
+
+    /// Writes the index, without which a reader must read the whole file, and gives `W` back.
+    pub fn finish(mut self) -> io::Result<W> {
+        self.mcap.finish().map_err(io_error)?;
+        self.mcap.into_inner().into_inner().into_inner().map_err(io::IntoInnerError::into_error)
+    }
+}
+
+/// Name of the type of `topic`'s messages.
+pub fn schema(topic: Topic) -> &'static str {
+    match topic {
+        Topic::Telegram => "scanhub.Telegram.v1",
+        other => other.payload(),
+    }
+}
+
+fn io_error(error: McapError) -> io::Error {
+    match error {
+        McapError::Io(error) => error,
+        other => io::Error::other(other),
+    }
+}
+
+/// What stands in a file about the messages, for whoever has nothing but the file.
+const LAYOUT: &str = include_str!("file/layout.txt");
+
+#[cfg(feature = "lz4")]
+const PACKING: Option<mcap::Compression> = Some(mcap::Compression::Lz4);
+#[cfg(not(feature = "lz4"))]
+const PACKING: Option<mcap::Compression> = None;
