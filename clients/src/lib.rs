@@ -27,9 +27,12 @@ mod mask;
 mod names;
 mod output;
 mod presence;
+#[cfg(feature = "record")]
+mod record;
 mod robot;
 mod sample;
 mod session;
+mod spare;
 mod text;
 mod wait;
 #[cfg(feature = "tui")]
@@ -53,6 +56,8 @@ pub use list::{ListOptions, list, list_domains};
 pub use listen::{ListenOptions, listen};
 pub use mask::{MaskOptions, mask};
 pub use names::TopicName;
+#[cfg(feature = "record")]
+pub use record::{RecordLook, RecordOptions, Split, record};
 pub use robot::{Robot, RobotFollower, robot};
 pub use wait::Wait;
 #[cfg(feature = "tui")]
