@@ -27,6 +27,7 @@ mod mask;
 mod names;
 mod output;
 mod presence;
+mod readiness;
 #[cfg(feature = "record")]
 mod record;
 mod robot;
@@ -40,7 +41,7 @@ mod watch;
 mod window;
 mod zones;
 
-pub use attach::{Attachment, attach};
+pub use attach::{Attachment, attach, places};
 pub use background::{BackgroundOptions, ModelOrder, background, saved_model};
 pub use control::{ControlOptions, control};
 pub use echo::{EchoOptions, Format, echo};

@@ -34,9 +34,12 @@ pub(crate) struct Simulate {
     /// demo, empty, wall640 or random; or a TOML file, see docs/worlds.md
     #[arg(long, default_value = "room", value_name = "NAME|FILE", conflicts_with = "replay")]
     world: String,
-    /// A recording to send instead: telegram stream or CARMEN log, plain or gzipped
+    /// A recording to send instead: MCAP file, telegram stream or CARMEN log, plain or gzipped
     #[arg(long, value_name = "FILE")]
     replay: Option<PathBuf>,
+    /// Which sensor of the recording, if it has several: one for all ports, or one for each in their order
+    #[arg(long, value_name = "NAME")]
+    sensor: Vec<String>,
     /// Begin the recording anew at its end
     #[arg(long = "loop")]
     looped: bool,
@@ -95,6 +98,7 @@ impl Simulate {
             address: self.address,
             world: self.world.parse()?,
             replay: self.replay.clone(),
+            sensors: self.sensor.clone(),
             looped: self.looped,
             speed: self.speed,
             seed: self.seed,

@@ -107,6 +107,12 @@ impl<W: Write> Writer<W> {
     }
 }
 
+/// Header and payload of a message of a recording; `None` if it is shorter than a header.
+pub fn parts(message: &[u8]) -> Option<(Header, &[u8])> {
+    let (header, payload) = message.split_at_checked(size_of::<Header>())?;
+    Some((bytemuck::pod_read_unaligned(header), payload))
+}
+
 /// Name of the type of `topic`'s messages.
 pub fn schema(topic: Topic) -> &'static str {
     match topic {

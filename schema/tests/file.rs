@@ -5,7 +5,7 @@
 use std::collections::BTreeMap;
 
 use schema::datagram::Packed;
-use schema::file::Writer;
+use schema::file::{Writer, parts};
 use schema::{Flags, Header, Topic, Zones};
 
 fn header(seq: u64, topic_seq: u64) -> Header {
@@ -56,6 +56,8 @@ fn others_read_it() {
     assert_eq!(said, [("rear/telegram", 40), ("rear/zones", 7), ("rear/telegram", 43)]);
     assert_eq!(messages[0].data[..64], *bytemuck::bytes_of(&header(40, 40)));
     assert_eq!(messages[0].data[64..], TELEGRAM);
+    assert_eq!(parts(&messages[0].data), Some((header(40, 40), &TELEGRAM[..])));
+    assert_eq!(parts(&messages[0].data[..63]), None);
     let schema = messages[1].channel.schema.as_ref().unwrap();
     assert_eq!((schema.name.as_str(), schema.encoding.as_str()), ("scanhub.Zones.v1", "scanhub"));
 }

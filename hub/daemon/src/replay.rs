@@ -48,12 +48,16 @@ impl Recorded {
     ///
     /// [`schema::Kind::Configuration`] if it cannot be read. A file without a telegram is a line that only brings noise.
     pub(crate) fn open(path: &Path, link: &Link) -> Result<Recorded, Failure> {
-        let recording = Recording::open(path)?;
+        let mut recording = Recording::open(path)?;
+        // Of several sensors the one whose name the link has.
+        if recording.contents().sensors.len() > 1 {
+            recording = recording.of(&link.name)?;
+        }
         let mode = recording.contents().mode.or(link.mode).unwrap_or(Mode(0));
         let encoding = Encoding { unit: link.unit.unwrap_or(Unit::Mm), mode };
         let bytes = match recording.contents().form {
             Form::Telegrams => Bytes::Stream(recording.bytes()?),
-            Form::Carmen => {
+            Form::Carmen | Form::Mcap => {
                 let frames: Box<dyn Iterator<Item = Frame> + Send> = recording.telegrams(encoding)?;
                 Bytes::Frames { frames: frames.peekable(), rest: Vec::new() }
             }

@@ -64,8 +64,12 @@ impl Sweep {
     /// The telegram that a sensor with address 0 would have sent.
     pub(crate) fn frame(&self, unit: Unit, mode: Mode) -> Frame {
         let telegram = measured::encode(0, unit, &self.words(unit, mode), STATUS).bytes().to_vec();
-        let wall_ns = self.time_s.filter(|time_s| *time_s > 0.0).map(|time_s| (time_s * 1e9) as u64);
-        Frame { telegram, wall_ns }
+        Frame { telegram, wall_ns: self.wall_ns(), header: None }
+    }
+
+    /// Its time in ns.
+    pub(crate) fn wall_ns(&self) -> Option<u64> {
+        self.time_s.filter(|time_s| *time_s > 0.0).map(|time_s| (time_s * 1e9) as u64)
     }
 }
 

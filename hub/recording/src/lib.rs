@@ -1,14 +1,23 @@
-//! Reads what was recorded: streams of telegrams as they came down a line, and CARMEN logs, each plain or gzipped.
+//! Reads what was recorded: MCAP files of the hub (feature `mcap`), streams of telegrams as they came down a line, and
+//! CARMEN logs, each plain or gzipped.
 //!
-//! Both come out as whole telegrams, so that the simulator can send them and a hub can read them. Which sensor it was
+//! All come out as whole telegrams, so that the simulator can send them and a hub can read them. Which sensor it was
 //! and what its words mean is told as far as the file says it ([`Contents`]); nothing here keeps time or opens a port.
 
 mod carmen;
+mod contents;
+mod damage;
+#[cfg(feature = "mcap")]
+mod mcap;
 mod open;
 mod stream;
 
 pub use carmen::BEYOND;
-pub use open::{Contents, Encoding, Form, Recording};
+pub use contents::{Contents, Form};
+pub use damage::Damage;
+pub use open::{Encoding, Recording};
+
+use lms::measured::MEASURED;
 
 /// One telegram of a recording.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -17,4 +26,13 @@ pub struct Frame {
     pub telegram: Vec<u8>,
     /// When it was measured, in nanoseconds since 1970, where the recording says so.
     pub wall_ns: Option<u64>,
+    /// What the hub knew of it when it was recorded: numbers, stamps, quality. Streams and logs have none.
+    pub header: Option<schema::Header>,
+}
+
+impl Frame {
+    /// Whether it is a telegram of measured values (B0h), which is what a sensor streams.
+    pub fn is_scan(&self) -> bool {
+        self.telegram.get(4) == Some(&MEASURED)
+    }
 }

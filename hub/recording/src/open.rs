@@ -6,41 +6,12 @@ use std::io::{self, BufRead, BufReader, Read};
 use std::path::{Path, PathBuf};
 
 use flate2::bufread::MultiGzDecoder;
-use lms::measured::{MEASURED, Measured};
-use lms::reply::Reply;
-use lms::telegram::Telegram;
-use lms::variant::{Mode, Unit, Variant};
+use lms::variant::{Mode, Unit};
 use schema::{Failure, Kind};
 
-use crate::Frame;
 use crate::carmen;
 use crate::stream::Telegrams;
-
-/// What kind of recording it is.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Form {
-    /// Bytes as they came down a line.
-    Telegrams,
-    /// A CARMEN log.
-    Carmen,
-}
-
-/// What a recording holds, and what it says of the sensor.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct Contents {
-    /// Its form.
-    pub form: Form,
-    /// Number of whole telegrams; of a log, of scans.
-    pub telegrams: u64,
-    /// How many of them are measured values (B0h).
-    pub scans: u64,
-    /// Variant of the first scan.
-    pub variant: Option<Variant>,
-    /// Unit of the first scan; a log has none, its metres become what is asked for.
-    pub unit: Option<Unit>,
-    /// Measuring mode, where a configuration reply (F4h) tells it.
-    pub mode: Option<Mode>,
-}
+use crate::{Contents, Form, Frame};
 
 /// How a log's metres become value words; a telegram stream is what it is.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -56,10 +27,17 @@ pub struct Encoding {
 pub struct Recording {
     path: PathBuf,
     contents: Contents,
+    /// Of an MCAP file.
+    #[cfg(feature = "mcap")]
+    survey: std::sync::Arc<crate::mcap::Survey>,
+    /// The sensor that was chosen.
+    sensor: Option<String>,
 }
 
 impl Recording {
     /// Opens and reads through the file at `path`.
+    ///
+    /// [`Kind::Configuration`] if it is no recording. One that is damaged is opened: see [`Contents::damage`].
     pub fn open(path: impl Into<PathBuf>) -> Result<Recording, Failure> {
         let path = path.into();
         let mut reader = reader(&path)?;
@@ -68,14 +46,55 @@ impl Recording {
             return Err(refused(&path, "is empty"));
         }
         if head.starts_with(MCAP) {
-            return Err(refused(&path, "is an MCAP file, which is not among the forms read here"));
+            return Recording::open_mcap(path, reader);
         }
         let form = if carmen::is_log(head) { Form::Carmen } else { Form::Telegrams };
         let contents = match form {
             Form::Carmen => survey_log(&path, reader)?,
-            Form::Telegrams => survey_stream(&path, reader)?,
+            _ => survey_stream(&path, reader)?,
         };
-        Ok(Recording { path, contents })
+        Ok(Recording {
+            path,
+            contents,
+            #[cfg(feature = "mcap")]
+            survey: Default::default(),
+            sensor: None,
+        })
+    }
+
+    #[cfg(feature = "mcap")]
+    fn open_mcap(path: PathBuf, reader: impl BufRead) -> Result<Recording, Failure> {
+        let survey = crate::mcap::Survey::of(reader).map_err(|error| unreadable(&path, &error))?;
+        let contents = survey.contents();
+        Ok(Recording { path, contents, survey: survey.into(), sensor: None })
+    }
+
+    #[cfg(not(feature = "mcap"))]
+    fn open_mcap(path: PathBuf, _: impl BufRead) -> Result<Recording, Failure> {
+        let message = format!("recording {} is an MCAP file, which this build does not read", path.display());
+        Err(Failure::new(Kind::Configuration, message, "build it with the feature mcap of scanhub-recording"))
+    }
+
+    /// The part of it that is `sensor`'s.
+    ///
+    /// [`Kind::Configuration`] if it has no such sensor; says which it has.
+    pub fn of(&self, sensor: &str) -> Result<Recording, Failure> {
+        let place = self.path.display();
+        if self.contents.sensors.is_empty() {
+            let message = format!("recording {place} does not name its sensor, so {sensor} cannot be chosen");
+            return Err(Failure::new(Kind::Configuration, message, "leave the sensor away"));
+        }
+        if !self.contents.sensors.iter().any(|name| name == sensor) {
+            let message = format!("recording {place} has no sensor {sensor:?}");
+            return Err(Failure::new(Kind::Configuration, message, self.choice()));
+        }
+        let mut chosen = self.clone();
+        #[cfg(feature = "mcap")]
+        {
+            chosen.contents = self.survey.contents_of(sensor);
+        }
+        chosen.sensor = Some(sensor.to_owned());
+        Ok(chosen)
     }
 
     /// Where it is.
@@ -83,7 +102,7 @@ impl Recording {
         &self.path
     }
 
-    /// What is in it.
+    /// What is in it; after [`of`](Self::of), of that sensor.
     pub fn contents(&self) -> &Contents {
         &self.contents
     }
@@ -95,6 +114,8 @@ impl Recording {
 
     /// Its telegrams in order, replies too; a log's scans as `encoding` says. Should the file become unreadable in the
     /// meantime, they end there.
+    ///
+    /// [`Kind::Configuration`] if it has several sensors and none was chosen by [`of`](Self::of).
     pub fn telegrams(&self, encoding: Encoding) -> Result<Box<dyn Iterator<Item = Frame> + Send>, Failure> {
         let mut reader = reader(&self.path)?;
         Ok(match self.contents.form {
@@ -108,23 +129,45 @@ impl Recording {
             Form::Telegrams => {
                 let mut telegrams = Telegrams::new(reader);
                 Box::new(std::iter::from_fn(move || {
-                    Some(Frame { telegram: telegrams.next().ok()??, wall_ns: None })
+                    Some(Frame { telegram: telegrams.next().ok()??, wall_ns: None, header: None })
                 }))
             }
+            Form::Mcap => self.telegrams_of_sensor(reader)?,
         })
     }
-}
 
-impl Frame {
-    /// Whether it is a telegram of measured values (B0h), which is what a sensor streams.
-    pub fn is_scan(&self) -> bool {
-        self.telegram.get(4) == Some(&MEASURED)
+    #[cfg(feature = "mcap")]
+    fn telegrams_of_sensor(
+        &self,
+        reader: Box<dyn BufRead + Send>,
+    ) -> Result<Box<dyn Iterator<Item = Frame> + Send>, Failure> {
+        let sensor = match (&self.sensor, &self.contents.sensors[..]) {
+            (Some(sensor), _) | (None, [sensor]) => sensor.clone(),
+            (None, []) => return Ok(Box::new(std::iter::empty())),
+            (None, _) => {
+                let message = format!("recording {} has several sensors", self.path.display());
+                return Err(Failure::new(Kind::Configuration, message, self.choice()));
+            }
+        };
+        Ok(Box::new(crate::mcap::Frames::new(reader, self.survey.clone(), sensor)))
+    }
+
+    #[cfg(not(feature = "mcap"))]
+    fn telegrams_of_sensor(
+        &self,
+        _: Box<dyn BufRead + Send>,
+    ) -> Result<Box<dyn Iterator<Item = Frame> + Send>, Failure> {
+        // None could be opened.
+        Ok(Box::new(std::iter::empty()))
+    }
+
+    fn choice(&self) -> String {
+        format!("choose one: {}", self.contents.sensors.join(", "))
     }
 }
 
 fn survey_log(path: &Path, mut reader: impl BufRead) -> Result<Contents, Failure> {
-    let mut contents =
-        Contents { form: Form::Carmen, telegrams: 0, scans: 0, variant: None, unit: None, mode: None };
+    let mut contents = Contents::new(Form::Carmen);
     let mut line = 0;
     loop {
         let sweep = carmen::next(&mut reader, &mut line).map_err(|wrong| {
@@ -132,27 +175,15 @@ fn survey_log(path: &Path, mut reader: impl BufRead) -> Result<Contents, Failure
             Failure::new(Kind::Configuration, message, "a scan is: FLASER 361 RANGE... in metres")
         })?;
         let Some(sweep) = sweep else { return Ok(contents) };
-        contents.telegrams += 1;
-        contents.scans += 1;
-        contents.variant = contents.variant.or(sweep.variant());
+        contents.note_scan(sweep.variant(), sweep.wall_ns());
     }
 }
 
 fn survey_stream(path: &Path, reader: impl Read) -> Result<Contents, Failure> {
-    let mut contents =
-        Contents { form: Form::Telegrams, telegrams: 0, scans: 0, variant: None, unit: None, mode: None };
+    let mut contents = Contents::new(Form::Telegrams);
     let mut telegrams = Telegrams::new(reader);
     while let Some(bytes) = telegrams.next().map_err(|error| unreadable(path, &error))? {
-        contents.telegrams += 1;
-        let Some(telegram) = Telegram::check(&bytes) else { continue };
-        if let Some(Reply::Configuration(configuration)) = Reply::decode(telegram) {
-            contents.mode = contents.mode.or(Some(configuration.mode()));
-        }
-        if let Some(measured) = Measured::decode(telegram) {
-            contents.scans += 1;
-            contents.variant = contents.variant.or(Variant::of_beams(measured.count()));
-            contents.unit = contents.unit.or(Some(measured.unit()));
-        }
+        contents.note(&bytes, None);
     }
     Ok(contents)
 }
@@ -177,6 +208,7 @@ fn unreadable(path: &Path, error: &io::Error) -> Failure {
         io::ErrorKind::NotFound => "give the path of an existing recording",
         io::ErrorKind::PermissionDenied => "the file must be readable by this user",
         io::ErrorKind::UnexpectedEof => "the gzip file is cut: `zcat FILE > WHOLE` saves what is there",
+        io::ErrorKind::Unsupported => "`mcap compress --compression none IN -o OUT` (of mcap.dev) unpacks it",
         _ => FORMS,
     };
     Failure::new(Kind::Configuration, format!("cannot read recording {}: {error}", path.display()), hint)
@@ -186,7 +218,7 @@ fn refused(path: &Path, what: &str) -> Failure {
     Failure::new(Kind::Configuration, format!("recording {} {what}", path.display()), FORMS)
 }
 
-const FORMS: &str = "a recording is a stream of telegrams or a CARMEN log, plain or gzipped";
+const FORMS: &str = "a recording is an MCAP file, a stream of telegrams or a CARMEN log, plain or gzipped";
 /// First bytes of a gzip file.
 const GZIP: &[u8] = &[0x1F, 0x8B];
 /// First bytes of an MCAP file.

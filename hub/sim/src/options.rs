@@ -44,6 +44,8 @@ pub struct SimulateOptions {
     pub world: World,
     /// A recording to send instead.
     pub replay: Option<PathBuf>,
+    /// Which of the recording's sensors each port is; one for all, none if the recording has but one.
+    pub sensors: Vec<String>,
     /// Whether the recording begins anew at its end.
     pub looped: bool,
     /// How many times faster than the clock the sensor's time runs, the bit time too; 0.01 to 100.
@@ -84,6 +86,7 @@ impl Default for SimulateOptions {
             short_configuration: false,
             world: "room".parse().expect("a scene that the program brings along"),
             replay: None,
+            sensors: Vec::new(),
             looped: false,
             speed: 1.0,
             seed: 0,

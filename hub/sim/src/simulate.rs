@@ -50,7 +50,8 @@ pub fn simulate(
     let time = Time { zero_ns: now_ns(), speed: options.speed };
     for (number, port) in options.ports.iter().enumerate() {
         let seed = options.seed.wrapping_add(number as u64);
-        let (settings, source) = sensor(options, recording.as_ref(), number)?;
+        let chosen = chosen(options, recording.as_ref(), number)?;
+        let (settings, source) = sensor(options, chosen.as_ref(), number)?;
         let machine = Machine::new(settings, source);
         let socket = Socket::new(port)?;
         ready.push(Ready { port: port.clone(), pty: socket.pty.name().to_owned() });
@@ -91,6 +92,18 @@ fn run(lines: Vec<Line<'_>>, stop: BorrowedFd<'_>) -> Result<Vec<Summary>, Failu
         };
         threads.into_iter().map(join).collect()
     })
+}
+
+/// The recording that the port with this number plays: of several sensors the one that was named for it.
+fn chosen(
+    options: &SimulateOptions,
+    recording: Option<&Recording>,
+    number: usize,
+) -> Result<Option<Recording>, Failure> {
+    let sensor = options.sensors.get(number).or(options.sensors.last());
+    let chosen =
+        recording.map(|recording| sensor.map_or(Ok(recording.clone()), |sensor| recording.of(sensor)));
+    chosen.transpose()
 }
 
 /// A sensor as the flags, else the recording, else the factory have it, and what it sends.
@@ -145,7 +158,7 @@ fn scans(
         return Err(Failure::new(
             Kind::Configuration,
             format!("recording {} holds no scan", recording.path().display()),
-            "replay a stream with measured-value telegrams (B0h), or a CARMEN log with FLASER lines",
+            "replay one with measured-value telegrams (B0h), or a CARMEN log with FLASER lines",
         ));
     }
     let recording = recording.clone();
@@ -201,6 +214,13 @@ fn check(options: &SimulateOptions) -> Result<(), Failure> {
             "a recording is told in whole scans only".into(),
             "leave --state away, or say idle, streaming, installation or starting",
         );
+    }
+    if !options.sensors.is_empty() && options.replay.is_none() {
+        return wrong("--sensor without a recording".into(), "name one with --replay FILE");
+    }
+    if options.sensors.len() > 1 && options.sensors.len() != options.ports.len() {
+        let message = format!("{} sensors for {} ports", options.sensors.len(), options.ports.len());
+        return wrong(message, "name one --sensor for all ports, or one for each");
     }
     if options.looped && options.replay.is_none() {
         return wrong("--loop without a recording".into(), "name one with --replay FILE");

@@ -1,0 +1,88 @@
+//! What a recording holds, and what it says of the sensor. Refuses to know how it is read.
+
+use lms::measured::Measured;
+use lms::reply::Reply;
+use lms::telegram::Telegram;
+use lms::variant::{Mode, Unit, Variant};
+
+use crate::Damage;
+
+/// What kind of recording it is.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Form {
+    /// Bytes as they came down a line.
+    Telegrams,
+    /// A CARMEN log.
+    Carmen,
+    /// An MCAP file of `scanhub record`.
+    Mcap,
+}
+
+/// What a recording holds, and what it says of the sensor.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Contents {
+    /// Its form.
+    pub form: Form,
+    /// Names of the sensors in it, in the order in which they come; a stream and a log name none.
+    pub sensors: Vec<String>,
+    /// Number of whole telegrams; of a log, of scans.
+    pub telegrams: u64,
+    /// How many of them are measured values (B0h).
+    pub scans: u64,
+    /// Wall clock of the first and of the last telegram, ns since 1970, where there are stamps.
+    pub span: Option<(u64, u64)>,
+    /// Variant of the first scan.
+    pub variant: Option<Variant>,
+    /// Unit of the first scan; a log has none, its metres become what is asked for.
+    pub unit: Option<Unit>,
+    /// Measuring mode, where a configuration reply (F4h) or a status tells it.
+    pub mode: Option<Mode>,
+    /// What is missing of the file. Telegrams that follow are those that are there.
+    pub damage: Damage,
+}
+
+impl Contents {
+    /// Nothing yet.
+    pub(crate) fn new(form: Form) -> Contents {
+        Contents {
+            form,
+            sensors: Vec::new(),
+            telegrams: 0,
+            scans: 0,
+            span: None,
+            variant: None,
+            unit: None,
+            mode: None,
+            damage: Damage::default(),
+        }
+    }
+
+    /// Counts a telegram, and believes what it says of the sensor.
+    pub(crate) fn note(&mut self, telegram: &[u8], wall_ns: Option<u64>) {
+        self.telegrams += 1;
+        self.note_time(wall_ns);
+        let Some(telegram) = Telegram::check(telegram) else { return };
+        if let Some(Reply::Configuration(configuration)) = Reply::decode(telegram) {
+            self.mode = self.mode.or(Some(configuration.mode()));
+        }
+        if let Some(measured) = Measured::decode(telegram) {
+            self.scans += 1;
+            self.variant = self.variant.or(Variant::of_beams(measured.count()));
+            self.unit = self.unit.or(Some(measured.unit()));
+        }
+    }
+
+    /// Counts a scan of a log.
+    pub(crate) fn note_scan(&mut self, variant: Option<Variant>, wall_ns: Option<u64>) {
+        self.telegrams += 1;
+        self.scans += 1;
+        self.note_time(wall_ns);
+        self.variant = self.variant.or(variant);
+    }
+
+    fn note_time(&mut self, wall_ns: Option<u64>) {
+        if let Some(wall_ns) = wall_ns {
+            self.span = Some((self.span.map_or(wall_ns, |(first, _)| first), wall_ns));
+        }
+    }
+}

@@ -1,0 +1,59 @@
+//! What is missing of a recording, counted and in words. Refuses to know how that was found out.
+
+use std::fmt;
+
+/// What is missing; nothing of it if the file is whole.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Damage {
+    /// Telegrams whose numbers are missing between others: the file lost them, or the recorder did.
+    pub telegrams: u64,
+    /// Bytes that are in nothing that could be read.
+    pub bytes: u64,
+    /// Packed chunks of which nothing could be read.
+    pub chunks: u64,
+    /// Telegrams that are there, but what the hub knew of them is not: their stamps are estimated.
+    pub estimated: u64,
+    /// The file ends without its index, as after a kill.
+    pub is_cut: bool,
+}
+
+impl Damage {
+    /// Whether nothing is missing.
+    pub fn is_none(&self) -> bool {
+        *self == Damage::default()
+    }
+}
+
+/// In one line, `nothing` if nothing is missing.
+impl fmt::Display for Damage {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let counted = |count: u64, one: &str, more: &str| match count {
+            0 => None,
+            1 => Some(format!("1 {one}")),
+            count => Some(format!("{count} {more}")),
+        };
+        let parts = [
+            counted(self.telegrams, "telegram", "telegrams"),
+            counted(self.bytes, "byte that is in nothing", "bytes that are in nothing"),
+            counted(self.chunks, "packed chunk", "packed chunks"),
+            counted(self.estimated, "stamp, which is estimated", "stamps, which are estimated"),
+            self.is_cut.then(|| "the end of the file, with its index".to_owned()),
+        ];
+        let parts: Vec<_> = parts.into_iter().flatten().collect();
+        f.write_str(if parts.is_empty() { "nothing" } else { "" })?;
+        f.write_str(&parts.join(", "))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_is_missing_in_words() {
+        assert_eq!(Damage::default().to_string(), "nothing");
+        let damage = Damage { telegrams: 2, estimated: 1, is_cut: true, ..Damage::default() };
+        let words = "2 telegrams, 1 stamp, which is estimated, the end of the file, with its index";
+        assert_eq!(damage.to_string(), words);
+    }
+}

@@ -1,0 +1,86 @@
+//! Recordings of the hub: each sensor's telegrams come out as they went in, with what the hub knew of them.
+#![cfg(feature = "mcap")]
+
+mod written;
+
+use std::fs;
+use std::path::PathBuf;
+
+use lms::variant::{Mode, Unit, Variant};
+use recording::{Encoding, Form, Recording};
+use written::{Known, SENSORS};
+
+const MM: Encoding = Encoding { unit: Unit::Mm, mode: Mode(1) };
+
+/// A file of this test run that is gone with it.
+struct File(PathBuf);
+
+impl File {
+    fn new(name: &str, bytes: &[u8]) -> File {
+        let path = std::env::temp_dir().join(format!("scanhub-mcap-{}-{name}", std::process::id()));
+        fs::write(&path, bytes).unwrap();
+        File(path)
+    }
+}
+
+impl Drop for File {
+    fn drop(&mut self) {
+        let _ = fs::remove_file(&self.0);
+    }
+}
+
+/// The telegrams of `sensor` as `recording` gives them.
+fn read(recording: &Recording, sensor: &'static str) -> Vec<Known> {
+    let frames = recording.of(sensor).unwrap().telegrams(MM).unwrap();
+    frames
+        .map(|frame| {
+            let header = frame.header.unwrap();
+            assert_eq!(frame.wall_ns, Some(header.wall_ns));
+            Known { sensor, header, telegram: frame.telegram }
+        })
+        .collect()
+}
+
+#[test]
+fn each_sensor_has_its_telegrams() {
+    let written = written::recording(20, 1);
+    let file = File::new("whole", &written.bytes);
+    let recording = Recording::open(&file.0).unwrap();
+    let contents = recording.contents();
+    assert_eq!((contents.form, contents.telegrams, contents.scans), (Form::Mcap, 40, 36));
+    assert_eq!(contents.sensors, SENSORS);
+    let [first, .., last] = &written.telegrams[..] else { panic!("no telegrams") };
+    assert_eq!(contents.span, Some((first.header.wall_ns, last.header.wall_ns)));
+    assert!(contents.damage.is_none(), "{}", contents.damage);
+    for sensor in SENSORS {
+        let of_sensor: Vec<_> = written.telegrams.iter().filter(|known| known.sensor == sensor).collect();
+        assert!(read(&recording, sensor).iter().eq(of_sensor));
+        let part = recording.of(sensor).unwrap();
+        assert_eq!((part.contents().telegrams, part.contents().sensors.len()), (20, 1));
+        let told = (part.contents().variant, part.contents().unit, part.contents().mode);
+        let full = Variant::of_beams(181);
+        assert_eq!(told, (full, Some(Unit::Mm), Some(Mode(4))));
+    }
+}
+
+#[test]
+fn a_sensor_has_to_be_chosen_of_several() {
+    let file = File::new("choice", &written::recording(4, 2).bytes);
+    let recording = Recording::open(&file.0).unwrap();
+    for failure in [recording.telegrams(MM).err().unwrap(), recording.of("left").unwrap_err()] {
+        assert_eq!(failure.kind.exit_code(), 78);
+        assert_eq!(failure.hint, "choose one: front, rear");
+    }
+}
+
+/// A recorder that was killed leaves whole chunks.
+#[test]
+fn what_was_written_before_a_kill_is_there() {
+    let written = written::recording(20, 3);
+    let file = File::new("killed", &written.bytes[..written.bytes.len() / 2]);
+    let recording = Recording::open(&file.0).unwrap();
+    assert!(recording.contents().damage.is_cut);
+    let rear = read(&recording, "rear");
+    assert!(rear.len() >= 8, "{}", rear.len());
+    assert!(rear.iter().eq(written.telegrams.iter().filter(|known| known.sensor == "rear").take(rear.len())));
+}

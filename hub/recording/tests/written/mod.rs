@@ -1,0 +1,107 @@
+//! A recording of two sensors as the hub writes it, with what is in it.
+
+use std::collections::BTreeMap;
+
+use fastrand::Rng;
+use lms::measured;
+use lms::reply;
+use lms::variant::{Mode, Unit};
+use schema::datagram::Packed;
+use schema::file::{Foreign, Writer};
+use schema::{Background, Flags, Foreground, Header, Marks, Scan, Status, Topic, Zones};
+
+/// A telegram that was written.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub(crate) struct Known {
+    pub(crate) sensor: &'static str,
+    pub(crate) header: Header,
+    pub(crate) telegram: Vec<u8>,
+}
+
+/// The file, and its telegrams in order.
+pub(crate) struct Written {
+    pub(crate) bytes: Vec<u8>,
+    pub(crate) telegrams: Vec<Known>,
+}
+
+/// `rounds` telegrams of each sensor with all that the hub makes of them, a chunk for each four, a channel of somebody
+/// else's.
+pub(crate) fn recording(rounds: u64, seed: u64) -> Written {
+    let mut random = Rng::with_seed(seed);
+    let facts = BTreeMap::from([("domain".to_owned(), "test".to_owned())]);
+    let mut writer = Writer::begin(Vec::new(), "", facts).unwrap();
+    let cloud =
+        Foreign { topic: "/imu", encoding: "cdr", schema: ("sensor_msgs/msg/Imu", "float64 x", "ros2msg") };
+    let imu = writer.channel(&cloud).unwrap();
+    let mut telegrams = Vec::new();
+    for round in 0..rounds {
+        for (number, sensor) in SENSORS.into_iter().enumerate() {
+            let telegram = match round {
+                0 => reply::configuration(0, Mode(4), Unit::Mm, 0x10).bytes().to_vec(),
+                // A reply again and again: bit for bit the same.
+                round if round % 16 == 7 => reply::mode(0, true, 0x10).bytes().to_vec(),
+                _ => scan(&mut random),
+            };
+            let header = header(round, number as u8, &mut random);
+            writer.sample(sensor, Topic::Telegram, &header, &telegram).unwrap();
+            for (topic, payload) in results(&telegram, &mut random) {
+                writer.sample(sensor, topic, &header, &payload).unwrap();
+            }
+            telegrams.push(Known { sensor, header, telegram });
+        }
+        writer.message(imu, round as u32, WALL + round * PERIOD, &random.u64(..).to_le_bytes()).unwrap();
+        if round % 4 == 3 {
+            writer.close_chunk().unwrap();
+        }
+    }
+    Written { bytes: writer.finish().unwrap(), telegrams }
+}
+
+fn header(round: u64, sensor: u8, random: &mut Rng) -> Header {
+    let first_ns = 5_000_000_000 + round * PERIOD + u64::from(sensor) * 3_000_000;
+    let mut header = Header {
+        seq: 40 + round,
+        topic_seq: 40 + round,
+        stamp_first_ns: first_ns,
+        stamp_last_ns: first_ns + 14_640_000,
+        wall_ns: WALL + first_ns,
+        boot: 0x1122_3344_5566_7788,
+        sensor,
+        flags: Flags::SIMULATED,
+        period_us: (PERIOD / 1000) as u32,
+        hub_pid: 4711,
+        ..Header::default()
+    };
+    header.set_sent_at(first_ns + 14_640_000 + random.u64(50_000..3_000_000));
+    header
+}
+
+fn scan(random: &mut Rng) -> Vec<u8> {
+    let words: Vec<u16> = (0..181).map(|_| random.u16(..0x1FFF)).collect();
+    measured::encode(0, Unit::Mm, &words, 0x10).bytes().to_vec()
+}
+
+/// What the hub makes of a telegram, as far as its size matters.
+fn results(telegram: &[u8], random: &mut Rng) -> Vec<(Topic, Vec<u8>)> {
+    let packed = |payload: &dyn Fn(&mut [u8]) -> Option<usize>| {
+        let mut room = [0; 4096];
+        let len = payload(&mut room).unwrap();
+        room[..len].to_vec()
+    };
+    let status = Status { mode: 4, unit_mm: 1, baud: 500_000, since_ns: random.u64(..), ..Status::default() };
+    let mut scan = packed(&|room| Scan::default().pack(room));
+    // The ranges are there once more, as they came.
+    scan.extend_from_slice(&telegram[5..telegram.len() - 3]);
+    vec![
+        (Topic::Scan, scan),
+        (Topic::Marks, packed(&|room| Marks::default().pack(room))),
+        (Topic::Zones, packed(&|room| Zones::unknown().pack(room))),
+        (Topic::Foreground, packed(&|room| Foreground::default().pack(room))),
+        (Topic::Background, packed(&|room| Background::default().pack(room))),
+        (Topic::Status, packed(&|room| status.pack(room))),
+    ]
+}
+
+pub(crate) const SENSORS: [&str; 2] = ["front", "rear"];
+const WALL: u64 = 1_700_000_000_000_000_000;
+const PERIOD: u64 = 26_640_000;
