@@ -67,6 +67,14 @@ const EXAMPLES: &[(&str, &[&str])] = &[
         ],
     ),
     ("watch", &["scanhub watch", "scanhub watch front"]),
+    (
+        "record",
+        &[
+            "scanhub record",
+            "scanhub record -o walk.mcap --ros2 --for 10m",
+            "scanhub record --all --split 512MiB --keep 20",
+        ],
+    ),
     ("control", &["scanhub control front pause"]),
     ("background", &["scanhub background front save front.json"]),
     ("zones", &["scanhub zones front mask --for 10s"]),
