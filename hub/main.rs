@@ -150,7 +150,8 @@ fn dispatch(cli: &Cli) -> Result<(), Failure> {
             clients::gateway(&gateway.options(everywhere)?, &mut out, &mut io::stderr(), &tell, &stop)
         }
         Verb::Listen(listen) => {
-            clients::listen(&listen.options(everywhere)?, &mut out, &mut io::stderr(), &*interrupt()?)
+            let (tell, stop) = (interrupt_by(&[SIGUSR1])?, interrupt()?);
+            clients::listen(&listen.options(everywhere)?, &mut out, &mut io::stderr(), &tell, &stop)
         }
     }
 }
