@@ -13,6 +13,7 @@ mod latency;
 mod leds;
 mod listen;
 mod probe;
+pub(crate) mod replay;
 pub(crate) mod simulate;
 mod telegram;
 pub(crate) mod watch;
@@ -34,6 +35,7 @@ pub(crate) use generated::{Completions, Man};
 pub(crate) use latency::Latency;
 pub(crate) use leds::Leds;
 pub(crate) use listen::Listen;
+pub(crate) use replay::Replay;
 pub(crate) use telegram::{Telegram, Way};
 pub(crate) use watch::Watch;
 pub(crate) use zones::Zones;
@@ -98,6 +100,9 @@ impl Everywhere {
 pub(crate) enum Verb {
     /// The hub, in the foreground, until SIGINT or SIGTERM
     Run(Run),
+    /// A hub whose sensors are a recording, with the keys of a player
+    #[command(after_help = replay::KEYS)]
+    Replay(Replay),
     /// Two simulated sensors, the hub and a consumer for each, in one terminal
     Demo(Demo),
     /// Sensors at the other end of ptys
