@@ -13,6 +13,7 @@ mod latency;
 mod leds;
 mod listen;
 mod probe;
+pub(crate) mod record;
 pub(crate) mod replay;
 pub(crate) mod simulate;
 mod telegram;
@@ -35,6 +36,7 @@ pub(crate) use generated::{Completions, Man};
 pub(crate) use latency::Latency;
 pub(crate) use leds::Leds;
 pub(crate) use listen::Listen;
+pub(crate) use record::Record;
 pub(crate) use replay::Replay;
 pub(crate) use telegram::{Telegram, Way};
 pub(crate) use watch::Watch;
@@ -138,6 +140,9 @@ pub(crate) enum Verb {
     /// The live picture in the terminal: what the sensors see, marks, zones and the verdict
     #[command(after_help = watch::KEYS)]
     Watch(Watch),
+    /// What the hub publishes, in MCAP files
+    #[command(after_help = record::READING)]
+    Record(Record),
     /// Telegrams explained field by field, and written
     Telegram(Telegram),
     /// Stop a sensor, let it stream again, or begin anew with it

@@ -127,6 +127,16 @@ fn dispatch(cli: &Cli) -> Result<(), Failure> {
             let stop = interrupt_by(&ENDS)?;
             clients::watch(&watch.options(everywhere)?, &mut out, &stop)
         }
+        Verb::Record(record) => {
+            let options = record.options(everywhere)?;
+            // Whatever ends it, the file is finished. A file that may not grow is an error of its write, and no end.
+            let (stop, _) = (interrupt_by(&ENDS)?, interrupt_by(&[SIGXFSZ])?);
+            let mut stderr = io::stderr();
+            match options.is_to_stdout() {
+                true => clients::record(&options, &mut io::stderr(), &mut stderr, &stop),
+                false => clients::record(&options, &mut out, &mut stderr, &stop),
+            }
+        }
         Verb::Control(control) => clients::control(&control.options(everywhere)?, &mut out, &*interrupt()?),
         Verb::Background(background) => {
             // A model is read before Ctrl-C is a flag, which would not end a person's typing.
@@ -217,6 +227,8 @@ fn line(value: &impl Serialize) -> String {
     serde_json::to_string(value).unwrap_or_default()
 }
 
+/// A file would become longer than is allowed; signal-hook has no name for it.
+const SIGXFSZ: c_int = Signal::XFSZ.as_raw();
 /// Whatever asks a process to end.
 const ENDS: [c_int; 4] = [SIGINT, SIGTERM, SIGHUP, SIGQUIT];
 

@@ -93,6 +93,18 @@ fn clients_know_only_schema() {
 }
 
 #[test]
+fn the_library_for_c_knows_clients() {
+    holds(crates::the_library_for_c_knows_clients, |tree| {
+        vec![
+            tree.with_line("clients/c/Cargo.toml", "[dependencies]", "scanhub-lms.workspace = true"),
+            tree.with_line("clients/c/Cargo.toml", "[dependencies]", "iceoryx2.workspace = true"),
+            tree.with_line("clients/Cargo.toml", "[dependencies]", "scanhub-c.workspace = true"),
+            tree.with_line("Cargo.toml", "[dependencies]", "scanhub-c.workspace = true"),
+        ]
+    });
+}
+
+#[test]
 fn the_daemon_knows_neither_clients_nor_sim() {
     holds(crates::the_daemon_knows_neither_clients_nor_sim, |tree| {
         vec![
@@ -175,6 +187,8 @@ fn unsafe_code_is_rare_and_explained() {
         vec![
             tree.with(listed, "//! A handler.\nunsafe { call() };\n"),
             tree.with(listed, &format!("//! Many.\n{}", explained.repeat(11))),
+            tree.with("hub/daemon/tests/planted.rs", &format!("//! A test.\n{explained}")),
+            tree.with("hub/daemon/tests/counting/mod.rs", "//! An allocator.\nunsafe { call() };\n"),
             tree.with("hub/daemon/src/link.rs", &format!("//! A link.\n{explained}")),
             tree.with("hub/daemon/src/link.rs", "//! A link.\n#![allow(unsafe_code)]\n"),
         ]

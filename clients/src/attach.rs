@@ -1,6 +1,7 @@
 //! The attach library: one topic of one sensor, in place, for as long as you like. Waits for a hub that is not there
 //! yet and goes on after one that was killed. Hides what it is woken by.
 
+use std::os::fd::BorrowedFd;
 use std::time::{Duration, Instant};
 
 use schema::ipc::Payload;
@@ -15,13 +16,21 @@ use crate::wait::Wait;
 ///
 /// [`Kind::Configuration`](schema::Kind) if a name is not possible.
 pub fn attach<P: Payload + ?Sized>(sensor: &str) -> Result<Attachment<P>, Failure> {
-    Attachment::in_domain(places()?, sensor)
+    Attachment::in_domain(places(None)?, sensor)
 }
 
-/// Where the domain that SCANHUB_DOMAIN names may be.
-pub(crate) fn places() -> Result<Vec<Domain>, Failure> {
-    let name = std::env::var("SCANHUB_DOMAIN").unwrap_or_else(|_| DEFAULT_DOMAIN.to_owned());
-    Domain::candidates(&name, None, &Environment::of_process())
+/// Where `domain` may be, or if none is named that which SCANHUB_DOMAIN names.
+///
+/// [`Kind::Configuration`](schema::Kind) if the name is not possible.
+pub fn places(domain: Option<&str>) -> Result<Vec<Domain>, Failure> {
+    let environment = Environment::of_process();
+    match domain {
+        Some(domain) => Domain::candidates(domain, None, &environment),
+        None => {
+            let domain = std::env::var("SCANHUB_DOMAIN").unwrap_or_else(|_| DEFAULT_DOMAIN.to_owned());
+            Domain::candidates(&domain, None, &environment)
+        }
+    }
 }
 
 /// A topic that is being followed.
@@ -72,6 +81,35 @@ impl<P: Payload + ?Sized> Attachment<P> {
 
     /// The next sample if one waits; never waits itself. Failures as [`next`](Self::next).
     pub fn try_next(&mut self) -> Result<Option<Received<P>>, Failure> {
+        loop {
+            if let Some(received) = self.look()? {
+                return Ok(Some(received));
+            }
+            if !self.session.settle(None)? {
+                return Ok(None);
+            }
+        }
+    }
+
+    /// Sleeps until there may be a sample; for `longest` at most, and a tenth of a second at most, so that whoever wants to
+    /// stop can. Hold no sample meanwhile.
+    ///
+    /// [`Kind::Short`](schema::Kind) if the system cannot wait.
+    pub fn wait(&mut self, longest: Duration) -> Result<(), Failure> {
+        self.session.wait_for(Some(longest))
+    }
+
+    /// What is readable while there may be a sample, for who waits for other things as well: to be polled, never read. It
+    /// is the same for as long as the attachment lives, whatever becomes of the hub. [`try_next`](Self::try_next) makes it
+    /// unreadable by answering `None`; until then poll does not sleep. It also gets readable when there is nothing: each
+    /// second, ten times a second while there is no hub, and when other topics of the sensor have something.
+    ///
+    /// [`Kind::Configuration`](schema::Kind) without [`Wait::Event`], [`Kind::Short`](schema::Kind) if descriptors are.
+    pub fn descriptor(&mut self) -> Result<BorrowedFd<'_>, Failure> {
+        self.session.descriptor()
+    }
+
+    fn look(&mut self) -> Result<Option<Received<P>>, Failure> {
         // What is there comes before the question whether the hub still is: that takes longer than receiving.
         if self.follower.attached()
             && let Some(received) = self.follower.receive(&mut self.session)?

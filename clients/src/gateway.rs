@@ -11,7 +11,6 @@ mod report;
 mod roll;
 mod selection;
 mod sensor;
-mod spare;
 mod uplink;
 
 use std::io::Write;
@@ -28,13 +27,13 @@ use crate::names::no_sensor;
 use crate::output::{End, quiet};
 use crate::presence::GRACE;
 use crate::session::Session;
+use crate::spare::Spare;
 use lan::{Form, Lan};
 use life::Life;
 use report::Report;
 use roll::Roll;
 use selection::Selection;
 use sensor::Sensor;
-use spare::Spare;
 use uplink::Uplink;
 
 /// What `gateway` is asked for.

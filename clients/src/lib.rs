@@ -27,9 +27,13 @@ mod mask;
 mod names;
 mod output;
 mod presence;
+mod readiness;
+#[cfg(feature = "record")]
+mod record;
 mod robot;
 mod sample;
 mod session;
+mod spare;
 mod text;
 mod wait;
 #[cfg(feature = "tui")]
@@ -37,7 +41,7 @@ mod watch;
 mod window;
 mod zones;
 
-pub use attach::{Attachment, attach};
+pub use attach::{Attachment, attach, places};
 pub use background::{BackgroundOptions, ModelOrder, background, saved_model};
 pub use control::{ControlOptions, control};
 pub use echo::{EchoOptions, Format, echo};
@@ -53,6 +57,8 @@ pub use list::{ListOptions, list, list_domains};
 pub use listen::{ListenOptions, listen};
 pub use mask::{MaskOptions, mask};
 pub use names::TopicName;
+#[cfg(feature = "record")]
+pub use record::{RecordLook, RecordOptions, Split, record};
 pub use robot::{Robot, RobotFollower, robot};
 pub use wait::Wait;
 #[cfg(feature = "tui")]

@@ -16,7 +16,7 @@ use crate::zones::{Heard, ZonesSource};
 ///
 /// [`Kind::Configuration`](schema::Kind) if a name is not possible.
 pub fn robot(sensors: &[&str]) -> Result<RobotFollower, Failure> {
-    RobotFollower::in_domain(places()?, sensors)
+    RobotFollower::in_domain(places(None)?, sensors)
 }
 
 /// What is known of the robot's surroundings: one sensor's zones each.

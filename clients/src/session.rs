@@ -1,16 +1,21 @@
 //! A process's stay in a domain, over several lives of its hub: membership, what wakes it, and the news that a hub went or
 //! came. Refuses to know what is followed.
 
+use std::os::fd::{AsFd, BorrowedFd};
 use std::time::{Duration, Instant};
 
 use schema::ipc::{self, Node, Payload, Subscriber};
-use schema::{Domain, Failure, holder};
+use schema::{Domain, Failure, Kind, holder};
 
 use crate::presence::{Change, Presence};
+use crate::readiness::Readiness;
 use crate::wait::{Wait, Wakeups};
 
 /// The longest wait: so often the hub is looked for, and the caller's reasons to stop are seen.
 const LONGEST_WAIT: Duration = Duration::from_millis(100);
+
+/// How often whoever waits at the descriptor looks for a hub that lives: an event tells of the next one.
+const MAKE_SURE_EVERY: Duration = Duration::from_secs(1);
 
 /// Membership in the first live one of several domains.
 pub(crate) struct Session {
@@ -18,6 +23,9 @@ pub(crate) struct Session {
     joined: Option<Joined>,
     number: u32,
     wait: Wait,
+    /// For who waits at a descriptor of his own.
+    readiness: Option<Readiness>,
+    subscribed_at: Option<Instant>,
 }
 
 struct Joined {
@@ -29,7 +37,14 @@ struct Joined {
 impl Session {
     /// Will join the first live one of `places`, as soon as one is.
     pub(crate) fn new(places: Vec<Domain>) -> Session {
-        Session { presence: Presence::new(places), joined: None, number: 0, wait: Wait::default() }
+        Session {
+            presence: Presence::new(places),
+            joined: None,
+            number: 0,
+            wait: Wait::default(),
+            readiness: None,
+            subscribed_at: None,
+        }
     }
 
     /// Will be woken by `wait`; to be said before anything is followed.
@@ -94,7 +109,12 @@ impl Session {
         if !joined.wakeups.add(&joined.node, sensor)? {
             return Ok(None);
         }
-        P::open(&joined.node, sensor)?.map(|topic| P::subscriber(&topic)).transpose()
+        if let Some(readiness) = &self.readiness {
+            joined.wakeups.descriptors().try_for_each(|event| readiness.add(event))?;
+        }
+        let subscriber = P::open(&joined.node, sensor)?.map(|topic| P::subscriber(&topic)).transpose()?;
+        self.subscribed_at = subscriber.as_ref().map(|_| Instant::now());
+        Ok(subscriber)
     }
 
     /// A moment in the life of `sensor`'s topics: as long as it is the same, nothing new was sent. Nothing where that is not
@@ -102,6 +122,40 @@ impl Session {
     pub(crate) fn moment(&self, sensor: &str) -> Option<(u32, Instant)> {
         let rung = self.joined.as_ref()?.wakeups.rung(sensor)?;
         Some((rung, self.presence.looked_at()?))
+    }
+
+    /// Readable while there may be something to receive or to see to, the same over all lives of the hub; from the first
+    /// call on it takes [`settle`](Self::settle) to make it unreadable.
+    ///
+    /// [`Kind::Configuration`] if it is not waited by event, [`Kind::Short`] if descriptors are short.
+    pub(crate) fn descriptor(&mut self) -> Result<BorrowedFd<'_>, Failure> {
+        if self.wait != Wait::Event {
+            let hint = "say that it waits by event: a bell has no descriptor";
+            return Err(Failure::new(Kind::Configuration, "no descriptor to wait at", hint));
+        }
+        let readiness: &Readiness = match &mut self.readiness {
+            Some(readiness) => readiness,
+            none => {
+                let readiness = Readiness::new()?;
+                if let Some(joined) = &self.joined {
+                    joined.wakeups.descriptors().try_for_each(|event| readiness.add(event))?;
+                }
+                none.insert(readiness)
+            }
+        };
+        Ok(readiness.as_fd())
+    }
+
+    /// Nothing waits, and nothing will have to be looked for before `left`: the descriptor, if it is used, is not readable
+    /// before. Whether something was sent meanwhile: then look again first.
+    pub(crate) fn settle(&mut self, left: Option<Duration>) -> Result<bool, Failure> {
+        let Some(readiness) = &self.readiness else { return Ok(false) };
+        // What a late joiner is handed comes without an event.
+        let is_settled = self.subscribed_at.is_some_and(|at| at.elapsed() >= MAKE_SURE_EVERY);
+        let pace =
+            if is_settled && self.presence.domain().is_some() { MAKE_SURE_EVERY } else { LONGEST_WAIT };
+        readiness.again_in(left.map_or(pace, |left| left.min(pace)))?;
+        self.joined.as_mut().map_or(Ok(false), |joined| joined.wakeups.take())
     }
 
     /// Sleeps until something was sent, at the latest until `until`, and 100 ms at most; returns at once if something

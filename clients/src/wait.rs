@@ -1,5 +1,6 @@
 //! How a consumer waits for the samples of its sensors. Refuses to know which topics they are, and whether there is a hub.
 
+use std::os::fd::BorrowedFd;
 use std::time::Duration;
 
 use schema::Failure;
@@ -143,6 +144,22 @@ impl Wakeups {
         }
         self.taken = false;
         ipc::sleep(&listeners, left)
+    }
+
+    /// What is readable while events are pending, of each sensor that is listened to.
+    pub(crate) fn descriptors(&self) -> impl Iterator<Item = BorrowedFd<'_>> {
+        self.sensors.iter().filter_map(|sensor| sensor.listener.as_ref()).map(ipc::descriptor)
+    }
+
+    /// Takes the events that are pending; whether there were any. What was sent before has to be looked for.
+    ///
+    /// [`Kind::Short`](schema::Kind) if an event does not work.
+    pub(crate) fn take(&mut self) -> Result<bool, Failure> {
+        let mut any = false;
+        for listener in self.sensors.iter().filter_map(|sensor| sensor.listener.as_ref()) {
+            any |= ipc::take_wakeups(&[listener])?;
+        }
+        Ok(any)
     }
 
     /// From now on. Returns without a wait: what came before the listeners has to be looked for.

@@ -1,6 +1,7 @@
 //! The zones of one sensor, by value and never staler than they look: a verdict that is too old becomes `unknown` here,
 //! whether the sensor, the hub or the machine stood still. So nobody who acts on it has to think of silence.
 
+use std::os::fd::BorrowedFd;
 use std::time::Duration;
 
 use schema::{Domain, Failure, Header, Zones, check_followed};
@@ -10,12 +11,13 @@ use crate::clock;
 use crate::follower::Follower;
 use crate::freshness::Freshness;
 use crate::session::Session;
+use crate::wait::Wait;
 
 /// Follows the zones of `sensor` in the domain that SCANHUB_DOMAIN names. There need not be a hub yet.
 ///
 /// [`Kind::Configuration`](schema::Kind) if a name is not possible.
 pub fn zones(sensor: &str) -> Result<ZonesFollower, Failure> {
-    ZonesFollower::in_domain(places()?, sensor)
+    ZonesFollower::in_domain(places(None)?, sensor)
 }
 
 /// What was heard of a sensor's zones, or that nothing was.
@@ -29,12 +31,15 @@ pub struct Heard {
     pub missed: u64,
     /// The zones are unknown because nothing was heard that is new enough, not because the hub says so.
     pub stale: bool,
+    /// What the hub said, however old it was when it came: for who keeps it, and does not act on it.
+    #[cfg_attr(not(feature = "record"), allow(dead_code))]
+    pub(crate) said: Zones,
 }
 
 impl Heard {
     /// A silence.
     pub(crate) fn nothing() -> Heard {
-        Heard { zones: Zones::unknown(), header: None, missed: 0, stale: true }
+        Heard { zones: Zones::unknown(), header: None, missed: 0, stale: true, said: Zones::unknown() }
     }
 }
 
@@ -53,6 +58,11 @@ impl ZonesFollower {
         Ok(ZonesFollower { session: Session::new(places), source: ZonesSource::new(sensor) })
     }
 
+    /// As [`Attachment::wait_by`](crate::Attachment::wait_by).
+    pub fn wait_by(self, wait: Wait) -> ZonesFollower {
+        ZonesFollower { session: self.session.by(wait), ..self }
+    }
+
     /// Waits for news: the newest sample, or the one `unknown` of a silence. That comes two scan periods and 40 ms
     /// after the last sample (of another machine not before half a second), a second after the start if there was none, and
     /// with a hub as without one.
@@ -64,12 +74,40 @@ impl ZonesFollower {
             if let Some(heard) = self.try_next()? {
                 return Ok(heard);
             }
-            self.session.wait_for(self.source.left())?;
+            self.wait(Duration::MAX)?;
         }
+    }
+
+    /// As [`Attachment::wait`](crate::Attachment::wait); it is also over when the verdict becomes too old.
+    pub fn wait(&mut self, longest: Duration) -> Result<(), Failure> {
+        self.session.wait_for(Some(self.source.left().map_or(longest, |left| left.min(longest))))
+    }
+
+    /// As [`Attachment::descriptor`](crate::Attachment::descriptor), with [`try_next`](Self::try_next) of the zones; it gets
+    /// readable also when the verdict becomes too old.
+    pub fn descriptor(&mut self) -> Result<BorrowedFd<'_>, Failure> {
+        self.session.descriptor()
+    }
+
+    /// A hub lives in the domain, as of the last call of [`next`](Self::next) or [`try_next`](Self::try_next) that found
+    /// no news.
+    pub fn hub_lives(&self) -> bool {
+        self.session.domain().is_some()
     }
 
     /// The news, if there are any since the last call; never waits. Failures as [`next`](Self::next).
     pub fn try_next(&mut self) -> Result<Option<Heard>, Failure> {
+        loop {
+            if let Some(heard) = self.look()? {
+                return Ok(Some(heard));
+            }
+            if !self.session.settle(self.source.left())? {
+                return Ok(None);
+            }
+        }
+    }
+
+    fn look(&mut self) -> Result<Option<Heard>, Failure> {
         // What is there comes before the question whether the hub still is: that takes longer than receiving.
         if self.source.attached()
             && let Some(heard) = self.source.newest(&mut self.session)?
@@ -118,7 +156,13 @@ impl ZonesSource {
                 let header = *sample.header();
                 let fresh = self.freshness.heard(&header, sample.verdict(), now);
                 let zones = if fresh { *sample } else { Zones::unknown() };
-                Some(Heard { zones, header: Some(header), missed: sample.missed, stale: !fresh })
+                Some(Heard {
+                    zones,
+                    header: Some(header),
+                    missed: sample.missed,
+                    stale: !fresh,
+                    said: *sample,
+                })
             }
             None => self.freshness.silence(now).then(Heard::nothing),
         };

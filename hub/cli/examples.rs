@@ -54,7 +54,7 @@ const EXAMPLES: &[(&str, &[&str])] = &[
             "scanhub config show",
         ],
     ),
-    ("doctor", &["scanhub doctor", "scanhub doctor /dev/ttyUSB0"]),
+    ("doctor", &["scanhub doctor", "scanhub doctor /dev/ttyUSB0", "scanhub doctor --clean"]),
     ("list", &["scanhub list"]),
     ("info", &["scanhub info front"]),
     (
@@ -75,6 +75,14 @@ const EXAMPLES: &[(&str, &[&str])] = &[
         ],
     ),
     ("watch", &["scanhub watch", "scanhub watch front"]),
+    (
+        "record",
+        &[
+            "scanhub record",
+            "scanhub record -o walk.mcap --ros2 --for 10m",
+            "scanhub record --all --split 512MiB --keep 20",
+        ],
+    ),
     ("control", &["scanhub control front pause"]),
     ("background", &["scanhub background front save front.json"]),
     ("zones", &["scanhub zones front mask --for 10s"]),

@@ -113,6 +113,14 @@ impl Program {
         }
     }
 
+    /// Its next line; for children that do not speak JSON.
+    pub(crate) fn next_text(&mut self) -> String {
+        let begin = self.out.len();
+        let give_up_at = Instant::now() + PATIENCE;
+        self.receive(give_up_at).unwrap_or_else(|why| self.give_up("a line", why));
+        String::from_utf8_lossy(&self.out[begin..]).trim_end().to_owned()
+    }
+
     /// Waits until it has written more than `len` bytes in all.
     pub(crate) fn await_bytes(&mut self, len: usize) {
         let give_up_at = Instant::now() + PATIENCE;

@@ -103,6 +103,21 @@ pub(crate) fn clients_know_only_schema(tree: &Tree) -> Vec<String> {
     names.into_iter().collect()
 }
 
+/// The library for C is a face of the attach library: it knows nothing else, and nothing is built with it.
+pub(crate) fn the_library_for_c_knows_clients(tree: &Tree) -> Vec<String> {
+    const OWN: &str = "scanhub-c";
+    let members = tree.members();
+    let known = ["scanhub-clients", "scanhub-schema"];
+    let mut breaches: Vec<String> =
+        built_with(&members[OWN]).filter(|name| !known.contains(&name.as_str())).cloned().collect();
+    let top = ("scanhub".to_owned(), tree.manifest("Cargo.toml"));
+    let all = members.into_iter().chain([top]);
+    breaches.extend(all.filter_map(|(name, manifest)| {
+        built_with(&manifest).any(|known| known == OWN).then(|| format!("{name} is built with it"))
+    }));
+    breaches
+}
+
 pub(crate) fn the_daemon_knows_neither_clients_nor_sim(tree: &Tree) -> Vec<String> {
     let members = tree.members();
     let mut reached = BTreeSet::new();

@@ -22,18 +22,25 @@ pub(crate) fn clocks_are_read_in_few_places(tree: &Tree) -> Vec<String> {
 }
 
 /// Files that may hold unsafe code, each for something that no safe crate offers.
-const UNSAFE: [&str; 5] = [
+const UNSAFE: [&str; 8] = [
     // A page that hub and consumers map.
     "schema/src/ipc/bell.rs",
     // The descriptors that wake consumers.
     "schema/src/ipc/sleep.rs",
+    // The kernel's word whether nobody has a file.
+    "schema/src/ipc/unheld.rs",
     // A handler for SIGBUS.
     "hub/daemon/src/bus_error.rs",
     // What the kernel knows of a UART.
     "hub/daemon/src/port/kernel.rs",
+    // Addresses that programs in C bring.
+    "clients/c/src/boundary.rs",
+    // Names of functions as the linker of such programs looks for them; no block.
+    "clients/c/src/export.rs",
     // An allocator that counts.
     "hub/daemon/tests/counting/mod.rs",
 ];
+/// In what is shipped: tests and benches are listed and explained like all, and not counted.
 const MOST_UNSAFE_BLOCKS: usize = 10;
 
 pub(crate) fn unsafe_code_is_rare_and_explained(tree: &Tree) -> Vec<String> {
@@ -49,7 +56,7 @@ pub(crate) fn unsafe_code_is_rare_and_explained(tree: &Tree) -> Vec<String> {
             {
                 continue;
             }
-            blocks += 1;
+            blocks += usize::from(!is_test(path));
             let before = &lines[number.saturating_sub(6)..number];
             if !UNSAFE.contains(&path) || !before.iter().any(|line| line.contains("// SAFETY:")) {
                 breaches.push(format!("{path}:{number}: {}", line.trim()));

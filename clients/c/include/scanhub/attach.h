@@ -1,0 +1,347 @@
+/*
+ * The topics of a hub on this machine for programs in C and C++: its samples in shared memory, read where the hub wrote
+ * them. C99, or C++11; link with -lscanhub. docs/c.md is the page about it, docs/topics.md has the bytes.
+ *
+ *     struct scanhub_attachment *scans;
+ *     struct scanhub_sample sample;
+ *     if (scanhub_open(&scans, NULL, "front", SCANHUB_TOPIC_SCAN, SCANHUB_WAIT_DOORBELL) < 0)
+ *         fprintf(stderr, "%s\n", scanhub_error());
+ *     while (scanhub_wait(scans, -1) == 1 && scanhub_take(scans, &sample) == 1) {
+ *         const struct scanhub_scan_v1 *scan = sample.payload;
+ *         use(scan);
+ *         scanhub_release(&sample);
+ *     }
+ *     scanhub_close(scans);
+ *
+ * There need not be a hub: it is waited for, and so is the next one when it is killed or ends. What is too slow misses
+ * samples, and is told how many; it never slows the hub.
+ *
+ * A handle belongs to the thread that opened it; other threads open handles of their own. All functions may be called with
+ * a handle that was closed, or with NULL: they refuse it. A child after fork() opens its own.
+ *
+ * Functions answer 0 or more; a negative number is one of SCANHUB_REFUSED_.., and scanhub_error() says what and what to do.
+ * Signals are never an error.
+ */
+#ifndef SCANHUB_ATTACH_H
+#define SCANHUB_ATTACH_H
+
+#include <stddef.h>
+#include <stdint.h>
+
+#ifdef __cplusplus
+extern "C" {
+#endif
+
+/* Why a call was refused. */
+#define SCANHUB_REFUSED_ARGUMENT (-1)      /* NULL, an unknown handle or number, a fifth sample */
+#define SCANHUB_REFUSED_CONFIGURATION (-2) /* a name that is not possible, a descriptor without SCANHUB_WAIT_EVENT */
+#define SCANHUB_REFUSED_SHORT (-3)         /* shared memory, descriptors or places for consumers are short: try later */
+#define SCANHUB_REFUSED_FAILED (-4)        /* another user's domain, another version's topic, and what has no name */
+#define SCANHUB_REFUSED_BUG (-5)           /* in this library; close the handle */
+
+/* What the hub publishes for each sensor, and what a payload is. */
+#define SCANHUB_TOPIC_TELEGRAM 1   /* length bytes, STX to CRC */
+#define SCANHUB_TOPIC_SCAN 2       /* struct scanhub_scan_v1 */
+#define SCANHUB_TOPIC_MARKS 3      /* struct scanhub_marks_v1 */
+#define SCANHUB_TOPIC_ZONES 4      /* struct scanhub_zones_v1 */
+#define SCANHUB_TOPIC_FOREGROUND 5 /* struct scanhub_foreground_v1 */
+#define SCANHUB_TOPIC_BACKGROUND 6 /* struct scanhub_background_v1 */
+#define SCANHUB_TOPIC_STATUS 7     /* struct scanhub_status_v1 */
+
+/* How scanhub_wait waits. */
+#define SCANHUB_WAIT_DOORBELL 0 /* at a word in the hub's memory, at which one call wakes all: what to take if in doubt */
+#define SCANHUB_WAIT_EVENT 1    /* at a descriptor, which poll and epoll can wait at too: scanhub_fd */
+#define SCANHUB_WAIT_SPIN 2     /* not asleep: takes a whole processor for the shortest latency there is */
+
+/* A topic that is followed. */
+struct scanhub_attachment;
+
+/* Of every sample, 64 bytes. Stamps are nanoseconds of CLOCK_MONOTONIC. */
+struct scanhub_header_v1 {
+    uint64_t seq;            /* number of the telegram, per sensor and hub life; the same in all that was made of it */
+    uint64_t topic_seq;      /* number of the sample in its topic */
+    uint64_t stamp_first_ns; /* of the telegram's first byte */
+    uint64_t stamp_last_ns;  /* of its last byte */
+    uint64_t wall_ns;        /* wall clock of the first byte, ns since 1970 */
+    uint64_t boot;           /* random per start of the hub */
+    uint8_t sensor;          /* position of the link in the hub's configuration */
+    uint8_t quality;         /* 0 clean, 1 suspect */
+    uint16_t flags;          /* 2 simulated, 4 replayed, 8 stamp estimated, 32 of another machine */
+    uint32_t period_us;      /* nominal time between two scans, 0 unknown */
+    uint32_t hub_pid;
+    uint8_t reasons;         /* to suspect it: 1 line error, 2 neighbour, 4 slow, 8 forbidden bits, 16 header inside */
+    uint8_t hub_time[3];     /* from the last byte until it was sent, in 256 ns, the low byte first */
+};
+
+struct scanhub_scan_v1 {
+    uint16_t count;           /* beams used, at most 401 */
+    uint8_t unit_mm;          /* millimetres per unit: 1, 10 or 100 */
+    uint8_t range_bits;       /* 13, 14 or 15; the nine greatest values are codes: see scanhub_distance_mm */
+    int32_t first_angle_mdeg; /* of beam 0: counter-clockwise seen from above, 0 right, 90000 ahead */
+    uint16_t step_mdeg;
+    uint8_t intensity_bits;   /* in the upper bits; 0: they are field bits */
+    uint8_t contents;         /* 1: the upper bits are there */
+    uint16_t range_array[401];
+    uint8_t upper_array[401];
+    uint8_t pad[1];
+};
+
+struct scanhub_mark_v1 {
+    int32_t angle_mdeg;
+    uint32_t range_dmm; /* 1/10 mm */
+    uint16_t weight;    /* sum of intensities */
+    uint8_t peak;       /* greatest intensity */
+    uint8_t edge;       /* 1: touches the first or last beam */
+    uint16_t first_beam;
+    uint16_t last_beam;
+};
+
+struct scanhub_marks_v1 {
+    uint8_t count; /* at most 64 */
+    uint8_t flags; /* 1 there were more, 2 unavailable: the measuring mode has no reflector bits */
+    uint16_t reserved;
+    struct scanhub_mark_v1 mark_array[64];
+};
+
+struct scanhub_zone_v1 {
+    uint16_t radius_mm;
+    uint16_t beams;   /* that met something inside */
+    uint8_t violated; /* 1: enough of them, in enough scans */
+    uint8_t reserved[3];
+};
+
+/* Verdicts. */
+#define SCANHUB_VERDICT_CLEAR 0
+#define SCANHUB_VERDICT_SLOW 1
+#define SCANHUB_VERDICT_STOP 2
+#define SCANHUB_VERDICT_UNKNOWN 3 /* to be taken as stop, and so is every other number */
+
+struct scanhub_zones_v1 {
+    uint8_t verdict;
+    uint8_t count;         /* circles, at most 8 */
+    uint16_t nearest_beam; /* 65535: none */
+    uint32_t nearest_mm;   /* from the robot's centre */
+    uint16_t invalid_beams;
+    uint8_t flags;         /* 1: fewer scans were seen than a violation takes */
+    uint8_t reserved;
+    struct scanhub_zone_v1 zone_array[8]; /* the largest first */
+};
+
+struct scanhub_segment_v1 {
+    uint16_t first; /* beam */
+    uint16_t last;
+    uint16_t nearest; /* device units */
+    uint16_t width;
+    int32_t x_mm; /* mean of its points in the robot's frame */
+    int32_t y_mm;
+};
+
+struct scanhub_foreground_v1 {
+    uint32_t generation; /* of the background that the scan was compared with */
+    uint16_t count;      /* beams of the scan */
+    uint16_t beams;      /* of them in the foreground */
+    uint8_t unit_mm;
+    uint8_t left_out;    /* segments that did not fit */
+    uint16_t segments;   /* at most 64 */
+    uint8_t bit_array[51]; /* beam i is bit i % 8 of byte i / 8 */
+    uint8_t pad[1];
+    uint16_t range_array[401]; /* of the beams in the foreground, in their order */
+    uint8_t pad2[2];
+    struct scanhub_segment_v1 segment_array[64];
+};
+
+struct scanhub_background_v1 {
+    uint32_t generation;
+    uint16_t taught; /* beams whose background is known */
+    uint16_t count;  /* beams of the model, 0 before the first scan */
+    uint8_t unit_mm;
+    uint8_t flags;   /* 1 frozen */
+    uint8_t reserved[2];
+    uint16_t range_array[401]; /* 0 not known, 65535 beyond what the sensor measures */
+    uint8_t pad[2];
+};
+
+/* Where the counters of a status stand. */
+enum scanhub_counter {
+    SCANHUB_COUNTER_BYTES_READ,
+    SCANHUB_COUNTER_BYTES_IN_TELEGRAMS,
+    SCANHUB_COUNTER_BYTES_ACKNOWLEDGE,
+    SCANHUB_COUNTER_BYTES_DISCARDED,
+    SCANHUB_COUNTER_BYTES_BUFFERED,
+    SCANHUB_COUNTER_TELEGRAMS,
+    SCANHUB_COUNTER_SUSPECT,
+    SCANHUB_COUNTER_ABORTED,
+    SCANHUB_COUNTER_RESYNCS,
+    SCANHUB_COUNTER_RECONNECTS,
+    SCANHUB_COUNTER_LOST_IN_RESTART,
+    SCANHUB_COUNTER_WAKEUPS,
+    SCANHUB_COUNTER_LOAN_FAILED,
+    SCANHUB_COUNTER_REJECTED_ADDRESS,
+    SCANHUB_COUNTER_REJECTED_LENGTH,
+    SCANHUB_COUNTER_REJECTED_COMMAND,
+    SCANHUB_COUNTER_REJECTED_COUNT,
+    SCANHUB_COUNTER_REJECTED_CRC,
+    SCANHUB_COUNTER_REJECTED_VETOED,
+    SCANHUB_COUNTER_REJECTED_SUPERSEDED,
+    SCANHUB_COUNTER_LINE_ERRORS
+};
+
+struct scanhub_pose_v1 {
+    double x_m; /* ahead of the robot's centre */
+    double y_m; /* to the left of it */
+    double yaw_rad;
+    uint8_t upside_down;
+    uint8_t reserved[7];
+};
+
+/* States. */
+#define SCANHUB_STATE_ABSENT 0
+#define SCANHUB_STATE_PROBING 1
+#define SCANHUB_STATE_SWITCHING 2
+#define SCANHUB_STATE_STARTING 3
+#define SCANHUB_STATE_STREAMING 4
+#define SCANHUB_STATE_SILENT 5
+#define SCANHUB_STATE_PAUSED 6
+
+/* Texts are UTF-8 and end with 0 only where they do not fill their array: print them by "%.128s". */
+struct scanhub_status_v1 {
+    uint8_t state;
+    uint8_t mode;    /* measuring mode, 255 unknown */
+    uint8_t unit_mm; /* 0 unknown */
+    uint8_t reserved;
+    uint32_t baud;     /* 0 unknown */
+    uint64_t since_ns; /* stamp of the state's beginning */
+    uint32_t rate_mhz; /* scans per second in 1/1000 */
+    uint16_t angle_deg;
+    uint16_t resolution_cdeg;
+    char type_text[24];
+    char port_text[128];
+    char last_error_text[160];
+    uint64_t counters[28]; /* by enum scanhub_counter */
+    struct scanhub_pose_v1 pose;
+};
+
+/* A sample that is lent: scanhub_take fills it, scanhub_release empties it. */
+struct scanhub_sample {
+    const struct scanhub_header_v1 *header; /* NULL: nobody sent it, see stale */
+    const void *payload;                    /* where the hub wrote it, for reading */
+    size_t length;                          /* its bytes */
+    uint64_t missed;                        /* samples that were sent before it and not received */
+    int restarted;                          /* 1: the hub was started anew, seq and topic_seq begin again */
+    int stale;                              /* 1: zones that are unknown because nothing new enough was heard */
+    struct scanhub_attachment *of;                     /* the library's */
+    uint64_t number;                        /* the library's */
+};
+
+/*
+ * Begins to follow a topic of `sensor` ("front", "robot1.front") in `domain` (NULL: the one that SCANHUB_DOMAIN names). It
+ * does not wait for a hub. Answers 0; *handle is NULL after a refusal.
+ */
+int scanhub_open(struct scanhub_attachment **handle, const char *domain, const char *sensor, int topic, int wait);
+
+/*
+ * A descriptor that is readable while there may be a sample, for poll, select and epoll: never read, written or closed. It
+ * stays the same until scanhub_close, also over restarts of the hub. It is readable until scanhub_take has answered 0: take
+ * all, then poll. That it is readable does not promise a sample: it also is once a second, ten times a second while there is
+ * no hub, and when other topics of the sensor have something. Only with SCANHUB_WAIT_EVENT.
+ */
+int scanhub_fd(struct scanhub_attachment *handle);
+
+/*
+ * Sleeps until there is a sample to take: 1; or until `timeout_ms` are over: 0. Negative: waits for ever. A signal whose
+ * handler returns does not end it: wait for as long as your program may take to see the handler's flag.
+ */
+int scanhub_wait(struct scanhub_attachment *handle, int timeout_ms);
+
+/*
+ * Lends the next sample: 1; or there is none: 0, and *sample is empty. Never waits. Four samples can be lent at a time; what
+ * a sample points to lives until it is released.
+ *
+ * Of zones it is the last one that stands, as a copy: once it is too old to be believed, because sensor, hub or machine stood
+ * still, there is one more, without header, whose verdict is unknown (`stale`). Nobody who acts on zones needs a clock.
+ */
+int scanhub_take(struct scanhub_attachment *handle, struct scanhub_sample *sample);
+
+/* Gives a sample back and empties it: 0, also if it is empty. */
+int scanhub_release(struct scanhub_sample *sample);
+
+/* Ends it all, lent samples too: 0, also for NULL. */
+int scanhub_close(struct scanhub_attachment *handle);
+
+/* 1 if a hub lives in the domain, 0 if not, as of the last call that found no sample. */
+int scanhub_hub_lives(struct scanhub_attachment *handle);
+
+/* What the last refused call of this thread said: a line, and often a second one with the remedy. Valid until the next. */
+const char *scanhub_error(void);
+
+/* The version of the library, "0.1.0". */
+const char *scanhub_version(void);
+
+/* Millimetres that beam i measured; -1 if it has no valid reading, or is not there. */
+static inline int32_t scanhub_distance_mm(const struct scanhub_scan_v1 *scan, unsigned i)
+{
+    if (i >= scan->count || i >= 401 || scan->range_bits > 16)
+        return -1;
+    const int32_t range = scan->range_array[i];
+    return range + 8 < (INT32_C(1) << scan->range_bits) - 1 ? range * scan->unit_mm : -1;
+}
+
+/* Where beam i looks, in 1/1000 degree: counter-clockwise seen from above, 0 right, 90000 ahead. */
+static inline int32_t scanhub_angle_mdeg(const struct scanhub_scan_v1 *scan, unsigned i)
+{
+    return scan->first_angle_mdeg + (int32_t)i * scan->step_mdeg;
+}
+
+/* When beam i was measured, in ns of CLOCK_MONOTONIC: before the telegram was sent, the last beam in the last turn. */
+static inline uint64_t scanhub_beam_time_ns(const struct scanhub_header_v1 *header, const struct scanhub_scan_v1 *scan,
+                                            unsigned i)
+{
+    const uint64_t turn_ns = 13320000;
+    const uint64_t step = scan->step_mdeg == 0 ? 1 : scan->step_mdeg;
+    const uint64_t turns = step >= 1000 ? 1 : 1000 / step;
+    const uint64_t beams = scan->count < 401 ? scan->count : 401;
+    const uint64_t later_beams = (uint64_t)i + 1 < beams ? beams - 1 - i : 0;
+    const uint64_t age_ns = (turns - 1 - i % turns) * turn_ns + later_beams * scan->step_mdeg * turn_ns / 360000;
+    return header->stamp_first_ns > age_ns ? header->stamp_first_ns - age_ns : 0;
+}
+
+/* A compiler with another layout than the hub's stops here. */
+#if defined(__cplusplus)
+#define SCANHUB_MUST(name, what) static_assert(what, #name)
+#elif defined(__STDC_VERSION__) && __STDC_VERSION__ >= 201112L
+#define SCANHUB_MUST(name, what) _Static_assert(what, #name)
+#else
+#define SCANHUB_MUST(name, what) typedef char scanhub_must_##name[(what) ? 1 : -1]
+#endif
+#define SCANHUB_SIZE(type, size) SCANHUB_MUST(type, sizeof(struct type) == (size))
+#define SCANHUB_AT(type, field, at) SCANHUB_MUST(type##_##field, offsetof(struct type, field) == (at))
+SCANHUB_SIZE(scanhub_header_v1, 64);
+SCANHUB_AT(scanhub_header_v1, sensor, 48);
+SCANHUB_AT(scanhub_header_v1, hub_time, 61);
+SCANHUB_SIZE(scanhub_scan_v1, 1216);
+SCANHUB_AT(scanhub_scan_v1, range_array, 12);
+SCANHUB_AT(scanhub_scan_v1, upper_array, 814);
+SCANHUB_SIZE(scanhub_mark_v1, 16);
+SCANHUB_SIZE(scanhub_marks_v1, 1028);
+SCANHUB_AT(scanhub_marks_v1, mark_array, 4);
+SCANHUB_SIZE(scanhub_zone_v1, 8);
+SCANHUB_SIZE(scanhub_zones_v1, 76);
+SCANHUB_AT(scanhub_zones_v1, zone_array, 12);
+SCANHUB_SIZE(scanhub_segment_v1, 16);
+SCANHUB_SIZE(scanhub_foreground_v1, 1892);
+SCANHUB_AT(scanhub_foreground_v1, range_array, 64);
+SCANHUB_AT(scanhub_foreground_v1, segment_array, 868);
+SCANHUB_SIZE(scanhub_background_v1, 816);
+SCANHUB_AT(scanhub_background_v1, range_array, 12);
+SCANHUB_SIZE(scanhub_status_v1, 592);
+SCANHUB_AT(scanhub_status_v1, counters, 336);
+SCANHUB_AT(scanhub_status_v1, pose, 560);
+#undef SCANHUB_AT
+#undef SCANHUB_SIZE
+#undef SCANHUB_MUST
+
+#ifdef __cplusplus
+}
+#endif
+
+#endif

@@ -1,0 +1,109 @@
+/*
+ * The same for C++11 and later: what scanhub_open opens and scanhub_take lends is given back at the end of its scope, and a
+ * refusal is an exception. <scanhub/attach.h> has the words.
+ *
+ *     scanhub::Attachment scans("front", SCANHUB_TOPIC_SCAN);
+ *     while (scanhub::Sample sample = scans.next())
+ *         use(sample.as<scanhub_scan_v1>());
+ */
+#ifndef SCANHUB_ATTACH_HPP
+#define SCANHUB_ATTACH_HPP
+
+#include <scanhub/attach.h>
+
+#include <stdexcept>
+#include <utility>
+
+namespace scanhub {
+
+/* A call that was refused: what() says why and what to do. */
+class Refused : public std::runtime_error {
+public:
+    explicit Refused(int number) : std::runtime_error(scanhub_error()), number_(number) {}
+    /* One of SCANHUB_REFUSED_.. . */
+    int number() const { return number_; }
+
+private:
+    int number_;
+};
+
+inline int check(int answer)
+{
+    if (answer < 0)
+        throw Refused(answer);
+    return answer;
+}
+
+/* A sample, or none; given back when it goes out of scope. */
+class Sample {
+public:
+    Sample() : sample_() {}
+    Sample(Sample &&other) noexcept : sample_(other.sample_) { other.sample_ = scanhub_sample(); }
+    Sample &operator=(Sample &&other) noexcept
+    {
+        std::swap(sample_, other.sample_);
+        return *this;
+    }
+    Sample(const Sample &) = delete;
+    Sample &operator=(const Sample &) = delete;
+    ~Sample() { scanhub_release(&sample_); }
+
+    explicit operator bool() const { return sample_.payload != nullptr; }
+    /* Its fields: header, length, missed, restarted, stale. */
+    const scanhub_sample *operator->() const { return &sample_; }
+    /* The payload, of the type that belongs to the topic. */
+    template <typename Payload> const Payload &as() const
+    {
+        if (sample_.payload == nullptr || sample_.length != sizeof(Payload))
+            throw std::logic_error("the sample is none, or of another topic");
+        return *static_cast<const Payload *>(sample_.payload);
+    }
+
+private:
+    friend class Attachment;
+    scanhub_sample sample_;
+};
+
+/* A topic that is followed, in the thread that made it. */
+class Attachment {
+public:
+    explicit Attachment(const char *sensor, int topic, int wait = SCANHUB_WAIT_DOORBELL, const char *domain = nullptr)
+        : handle_(nullptr)
+    {
+        check(scanhub_open(&handle_, domain, sensor, topic, wait));
+    }
+    Attachment(Attachment &&other) noexcept : handle_(other.handle_) { other.handle_ = nullptr; }
+    Attachment &operator=(Attachment &&other) noexcept
+    {
+        std::swap(handle_, other.handle_);
+        return *this;
+    }
+    Attachment(const Attachment &) = delete;
+    Attachment &operator=(const Attachment &) = delete;
+    /* Samples that are still lent end with it. */
+    ~Attachment() { scanhub_close(handle_); }
+
+    /* The next sample if there is one; never waits. */
+    Sample take()
+    {
+        Sample sample;
+        check(scanhub_take(handle_, &sample.sample_));
+        return sample;
+    }
+    /* Waits for the next sample; none if `timeout_ms` are over (negative: never). */
+    Sample next(int timeout_ms = -1)
+    {
+        return check(scanhub_wait(handle_, timeout_ms)) == 1 ? take() : Sample();
+    }
+    /* As scanhub_fd. */
+    int fd() { return check(scanhub_fd(handle_)); }
+    /* As scanhub_hub_lives. */
+    bool hub_lives() { return check(scanhub_hub_lives(handle_)) == 1; }
+
+private:
+    scanhub_attachment *handle_;
+};
+
+} // namespace scanhub
+
+#endif

@@ -1,0 +1,79 @@
+#!/bin/sh
+# Puts the library for C and C++ in place, or takes it away again. Build it first: cargo build --release -p scanhub-c
+#
+#   clients/c/install.sh [--prefix DIR] [--library DIR]   install below /usr/local, or DIR; the library is taken from
+#                                                         target/release if no other place is named
+#   clients/c/install.sh [--prefix DIR] --remove          take away all that this script puts in place
+#
+# DESTDIR=DIR puts everything below DIR, for those who make packages.
+set -eu
+
+here=$(cd "$(dirname "$0")" && pwd)
+prefix=/usr/local
+library=$here/../../target/release
+action=install
+while [ $# -gt 0 ]; do
+    case $1 in
+    --prefix) prefix=${2:?--prefix needs a directory}; shift ;;
+    --library) library=${2:?--library needs a directory}; shift ;;
+    --remove) action=remove ;;
+    -h | --help) sed -n '2,9s/^# \{0,1\}//p' "$0"; exit 0 ;;
+    *) echo "install.sh: $1? --prefix DIR, --library DIR, --remove" >&2; exit 2 ;;
+    esac
+    shift
+done
+case $prefix in
+/*) ;;
+*) echo "install.sh: --prefix $prefix: say it from the root, as in /usr/local" >&2; exit 2 ;;
+esac
+root=${DESTDIR:-}$prefix
+version=$(sed -n 's/^version = "\(.*\)"/\1/p' "$here/../../Cargo.toml" | head -n 1)
+
+put() { # source, destination, mode
+    mkdir -p "$(dirname "$root/$2")"
+    # Under another name first: a program may have the old one open.
+    cp "$1" "$root/$2.new"
+    chmod "$3" "$root/$2.new"
+    mv "$root/$2.new" "$root/$2"
+    echo "$root/$2"
+}
+link() { # target, name
+    ln -sf "$1" "$root/$2"
+    echo "$root/$2"
+}
+refresh() { # where programs are told of libraries
+    if [ -z "${DESTDIR:-}" ] && [ "$(id -u)" = 0 ] && command -v ldconfig > /dev/null; then
+        ldconfig
+    fi
+}
+
+if [ "$action" = remove ]; then
+    for file in lib/libscanhub.so lib/libscanhub.so.0 lib/libscanhub.so."$version" lib/libscanhub.a \
+        lib/pkgconfig/scanhub.pc include/scanhub/attach.h include/scanhub/attach.hpp; do
+        if [ -e "$root/$file" ] || [ -L "$root/$file" ]; then
+            rm "$root/$file"
+            echo "removed $root/$file"
+        fi
+    done
+    rmdir "$root/include/scanhub" 2> /dev/null || true
+    refresh
+    exit 0
+fi
+
+if [ ! -f "$library/libscanhub.so" ]; then
+    echo "install.sh: there is no $library/libscanhub.so; cargo build --release -p scanhub-c" >&2
+    exit 1
+fi
+put "$library/libscanhub.so" lib/libscanhub.so."$version" 755
+link libscanhub.so."$version" lib/libscanhub.so.0
+link libscanhub.so.0 lib/libscanhub.so
+if [ -f "$library/libscanhub.a" ]; then
+    put "$library/libscanhub.a" lib/libscanhub.a 644
+fi
+put "$here/include/scanhub/attach.h" include/scanhub/attach.h 644
+put "$here/include/scanhub/attach.hpp" include/scanhub/attach.hpp 644
+made=$(mktemp)
+trap 'rm "$made"' EXIT
+sed -e "s|@PREFIX@|$prefix|" -e "s|@VERSION@|$version|" "$here/scanhub.pc.in" > "$made"
+put "$made" lib/pkgconfig/scanhub.pc 644
+refresh

@@ -1,0 +1,121 @@
+//! The functions of the header, one call each. What they answer is checked there and kept here: no panic gets out, and
+//! every refusal leaves its words behind.
+#![allow(unsafe_code)] // Names as they are written, for the linker; no block is unsafe here.
+
+use std::ffi::{CStr, c_char, c_int};
+use std::panic::{AssertUnwindSafe, catch_unwind};
+use std::time::Duration;
+
+use clients::{Wait, places};
+use schema::Topic;
+
+use crate::boundary::{Lent, place, sample, text};
+use crate::handle::Handle;
+use crate::refusal::{self, Refusal};
+use crate::table::{self, Opaque};
+
+/// Begins to follow a topic; answers 0.
+#[unsafe(no_mangle)]
+pub extern "C" fn scanhub_open(
+    handle: *mut *mut Opaque,
+    domain: *const c_char,
+    sensor: *const c_char,
+    topic: c_int,
+    wait: c_int,
+) -> c_int {
+    answer(|| {
+        let handle = place(handle)?;
+        handle.write(std::ptr::null_mut());
+        let sensor = text(sensor)?.ok_or(Refusal::Argument("no sensor is named", "for example \"front\""))?;
+        let topic = u8::try_from(topic).ok().and_then(Topic::of_number);
+        let topic = topic.ok_or(Refusal::Argument("there is no such topic", "one of SCANHUB_TOPIC_.."))?;
+        let wait = match wait {
+            0 => Wait::Doorbell,
+            1 => Wait::Event,
+            2 => Wait::Spin,
+            _ => {
+                return Err(Refusal::Argument("there is no such way to wait", "one of SCANHUB_WAIT_.."));
+            }
+        };
+        let opened = Handle::open(places(text(domain)?)?, sensor, topic, wait)?;
+        handle.write(table::insert(opened)?);
+        Ok(0)
+    })
+}
+
+/// The descriptor to poll; answers it.
+#[unsafe(no_mangle)]
+pub extern "C" fn scanhub_fd(handle: *mut Opaque) -> c_int {
+    answer(|| table::with(handle, Handle::descriptor))
+}
+
+/// Waits for a sample; answers 1 if there is one, 0 if the time is over.
+#[unsafe(no_mangle)]
+pub extern "C" fn scanhub_wait(handle: *mut Opaque, timeout_ms: c_int) -> c_int {
+    let timeout = u64::try_from(timeout_ms).ok().map(Duration::from_millis);
+    answer(|| table::with(handle, |handle| handle.wait(timeout)).map(c_int::from))
+}
+
+/// Lends the next sample; answers 1 if there was one, else 0.
+#[unsafe(no_mangle)]
+pub extern "C" fn scanhub_take(handle: *mut Opaque, taken: *mut Lent) -> c_int {
+    answer(|| {
+        let taken = place(taken)?;
+        taken.write(Lent::none());
+        match table::with(handle, Handle::take)? {
+            Some(lent) => {
+                taken.write(Lent { of: handle, ..lent });
+                Ok(1)
+            }
+            None => Ok(0),
+        }
+    })
+}
+
+/// Takes a sample back; answers 0.
+#[unsafe(no_mangle)]
+pub extern "C" fn scanhub_release(taken: *mut Lent) -> c_int {
+    answer(|| {
+        let taken = sample(taken)?;
+        let Lent { of, number, .. } = std::mem::replace(taken, Lent::none());
+        // Released before, or never filled.
+        if of.is_null() {
+            return Ok(0);
+        }
+        table::with(of, |handle| handle.give_back(number)).map(|()| 0)
+    })
+}
+
+/// Ends it all, samples that are still lent too; answers 0.
+#[unsafe(no_mangle)]
+pub extern "C" fn scanhub_close(handle: *mut Opaque) -> c_int {
+    answer(|| if handle.is_null() { Ok(0) } else { table::remove(handle).map(|()| 0) })
+}
+
+/// Whether a hub lives there; answers 1 or 0.
+#[unsafe(no_mangle)]
+pub extern "C" fn scanhub_hub_lives(handle: *mut Opaque) -> c_int {
+    answer(|| table::with(handle, |handle| Ok(handle.hub_lives().into())))
+}
+
+/// What the last call of this thread that was refused said.
+#[unsafe(no_mangle)]
+pub extern "C" fn scanhub_error() -> *const c_char {
+    refusal::last()
+}
+
+/// The version of this library.
+#[unsafe(no_mangle)]
+pub extern "C" fn scanhub_version() -> *const c_char {
+    VERSION.as_ptr()
+}
+
+const VERSION: &CStr = match CStr::from_bytes_with_nul(concat!(env!("CARGO_PKG_VERSION"), "\0").as_bytes()) {
+    Ok(version) => version,
+    Err(_) => panic!("a version is no text"),
+};
+
+fn answer(call: impl FnOnce() -> Result<c_int, Refusal>) -> c_int {
+    let answered = catch_unwind(AssertUnwindSafe(call)).unwrap_or(Err(Refusal::Bug));
+    answered.unwrap_or_else(|refusal| refusal.keep())
+}

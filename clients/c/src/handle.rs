@@ -1,0 +1,176 @@
+//! An attachment as C sees it: of any topic, with a sample that a wait found and nobody took yet, and those that are lent.
+
+use std::ffi::c_int;
+use std::os::fd::AsRawFd;
+use std::ptr;
+use std::time::{Duration, Instant};
+
+use clients::{Attachment, Heard, Received, Wait, ZonesFollower};
+use schema::{Background, Domain, Failure, Foreground, Header, Marks, Scan, Status, Topic, limits};
+
+use crate::boundary::Lent;
+use crate::refusal::Refusal;
+
+/// An open attachment.
+pub(crate) struct Handle {
+    // Before the source: they are given back to it.
+    lent: [Option<(u64, Held)>; LENT],
+    found: Option<Held>,
+    next: u64,
+    source: Source,
+}
+
+/// Samples that may be lent at a time, as many as the hub has in store for each consumer.
+const LENT: usize = limits::BORROWED;
+
+/// Declares the topics once, of which all but zones are followed alike.
+macro_rules! topics {
+    ($($topic:ident $payload:ty;)*) => {
+        enum Source { Zones(ZonesFollower), $($topic(Attachment<$payload>),)* }
+
+        enum Held { Zones(Heard), $($topic(Received<$payload>),)* }
+
+        impl Source {
+            fn open(places: Vec<Domain>, sensor: &str, topic: Topic, wait: Wait) -> Result<Source, Failure> {
+                Ok(match topic {
+                    Topic::Zones => Source::Zones(ZonesFollower::in_domain(places, sensor)?.wait_by(wait)),
+                    $(Topic::$topic => Source::$topic(Attachment::in_domain(places, sensor)?.wait_by(wait)),)*
+                })
+            }
+
+            fn try_next(&mut self) -> Result<Option<Held>, Failure> {
+                Ok(match self {
+                    Source::Zones(zones) => zones.try_next()?.map(Held::Zones),
+                    $(Source::$topic(attachment) => attachment.try_next()?.map(Held::$topic),)*
+                })
+            }
+
+            fn wait(&mut self, longest: Duration) -> Result<(), Failure> {
+                match self {
+                    Source::Zones(zones) => zones.wait(longest),
+                    $(Source::$topic(attachment) => attachment.wait(longest),)*
+                }
+            }
+
+            fn descriptor(&mut self) -> Result<c_int, Failure> {
+                Ok(match self {
+                    Source::Zones(zones) => zones.descriptor()?,
+                    $(Source::$topic(attachment) => attachment.descriptor()?,)*
+                }.as_raw_fd())
+            }
+
+            fn hub_lives(&self) -> bool {
+                match self {
+                    Source::Zones(zones) => zones.hub_lives(),
+                    $(Source::$topic(attachment) => attachment.hub_lives(),)*
+                }
+            }
+        }
+
+        impl Held {
+            fn lend(&self) -> Lent {
+                match self {
+                    Held::Zones(heard) => Lent {
+                        missed: heard.missed,
+                        stale: heard.stale.into(),
+                        ..Lent::new(heard.header.as_ref(), &heard.zones)
+                    },
+                    $(Held::$topic(received) => Lent {
+                        missed: received.missed,
+                        restarted: received.restarted.into(),
+                        ..Lent::new(Some(received.header()), &**received)
+                    },)*
+                }
+            }
+        }
+    };
+}
+
+topics! {
+    Telegram [u8];
+    Scan Scan;
+    Marks Marks;
+    Foreground Foreground;
+    Background Background;
+    Status Status;
+}
+
+impl Handle {
+    /// Will follow `topic` of `sensor` in the first live one of `places`.
+    pub(crate) fn open(
+        places: Vec<Domain>,
+        sensor: &str,
+        topic: Topic,
+        wait: Wait,
+    ) -> Result<Handle, Refusal> {
+        let source = Source::open(places, sensor, topic, wait)?;
+        Ok(Handle { lent: Default::default(), found: None, next: 1, source })
+    }
+
+    /// Waits until there is a sample to take, or `timeout` is over (none: never); whether there is.
+    pub(crate) fn wait(&mut self, timeout: Option<Duration>) -> Result<bool, Refusal> {
+        let until = timeout.and_then(|timeout| Instant::now().checked_add(timeout));
+        loop {
+            if self.found.is_none() {
+                self.found = self.source.try_next()?;
+            }
+            if self.found.is_some() {
+                return Ok(true);
+            }
+            let left = until.map_or(Duration::MAX, |until| until.saturating_duration_since(Instant::now()));
+            if left.is_zero() {
+                return Ok(false);
+            }
+            self.source.wait(left)?;
+        }
+    }
+
+    /// The next sample, lent until it is given back; nothing if none waits.
+    pub(crate) fn take(&mut self) -> Result<Option<Lent>, Refusal> {
+        let place = self.lent.iter_mut().find(|place| place.is_none());
+        let Some(place) = place else {
+            return Err(Refusal::Argument("four samples are lent already", "scanhub_release one of them"));
+        };
+        let held = match self.found.take() {
+            Some(held) => held,
+            None => match self.source.try_next()? {
+                Some(held) => held,
+                None => return Ok(None),
+            },
+        };
+        let number = self.next;
+        self.next += 1;
+        let (number, held) = place.insert((number, held));
+        Ok(Some(Lent { number: *number, ..held.lend() }))
+    }
+
+    /// Takes the sample back that was lent under `number`.
+    pub(crate) fn give_back(&mut self, number: u64) -> Result<(), Refusal> {
+        let is_it =
+            |place: &&mut Option<(u64, Held)>| place.as_ref().is_some_and(|(lent, _)| *lent == number);
+        let place = self.lent.iter_mut().find(is_it);
+        *place.ok_or(Refusal::Argument("this sample is not lent", "release each sample once"))? = None;
+        Ok(())
+    }
+
+    /// As [`Attachment::descriptor`].
+    pub(crate) fn descriptor(&mut self) -> Result<c_int, Refusal> {
+        Ok(self.source.descriptor()?)
+    }
+
+    /// As [`Attachment::hub_lives`].
+    pub(crate) fn hub_lives(&self) -> bool {
+        self.source.hub_lives()
+    }
+}
+
+impl Lent {
+    fn new<P: ?Sized>(header: Option<&Header>, payload: &P) -> Lent {
+        Lent {
+            header: header.map_or(ptr::null(), ptr::from_ref),
+            payload: ptr::from_ref(payload).cast(),
+            length: size_of_val(payload),
+            ..Lent::none()
+        }
+    }
+}

@@ -1,0 +1,16 @@
+//! The attach library for programs in C and C++: `include/scanhub/attach.h` is its contract, this is what stands behind it.
+//! A handle is a number, not an address: one that was closed, or is another thread's, is found out and not followed.
+//! Refuses to know how samples come: that is `clients`.
+
+mod boundary;
+mod export;
+mod handle;
+mod refusal;
+mod table;
+
+pub use boundary::Lent;
+pub use export::{
+    scanhub_close, scanhub_error, scanhub_fd, scanhub_hub_lives, scanhub_open, scanhub_release, scanhub_take,
+    scanhub_version, scanhub_wait,
+};
+pub use table::Opaque;

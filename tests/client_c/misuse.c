@@ -1,0 +1,159 @@
+/* Everything that a program may do wrong, and what the library answers: misuse SENSOR, where a hub lives. */
+#include <scanhub/attach.h>
+
+#include <pthread.h>
+#include <signal.h>
+#include <stdint.h>
+#include <stdio.h>
+#include <stdlib.h>
+#include <string.h>
+#include <sys/time.h>
+
+#define MUST(what)                                                                                   \
+    do {                                                                                             \
+        if (!(what)) {                                                                               \
+            fprintf(stderr, "%s:%d: %s: %s\n", __FILE__, __LINE__, #what, scanhub_error());          \
+            exit(EXIT_FAILURE);                                                                      \
+        }                                                                                            \
+    } while (0)
+#define SAYS(text) MUST(strstr(scanhub_error(), text) != NULL)
+
+static struct scanhub_attachment *open_scans(const char *sensor, int wait)
+{
+    struct scanhub_attachment *handle;
+    MUST(scanhub_open(&handle, NULL, sensor, SCANHUB_TOPIC_SCAN, wait) == 0);
+    return handle;
+}
+
+static void names(const char *sensor)
+{
+    struct scanhub_attachment *handle;
+    MUST(strcmp(scanhub_error(), "") == 0);
+    MUST(scanhub_open(NULL, NULL, sensor, SCANHUB_TOPIC_SCAN, 0) == SCANHUB_REFUSED_ARGUMENT);
+    SAYS("NULL");
+    MUST(scanhub_open(&handle, NULL, NULL, SCANHUB_TOPIC_SCAN, 0) == SCANHUB_REFUSED_ARGUMENT);
+    MUST(handle == NULL);
+    SAYS("no sensor");
+    for (int topic = -1; topic <= 8; topic += 9) {
+        MUST(scanhub_open(&handle, NULL, sensor, topic, 0) == SCANHUB_REFUSED_ARGUMENT);
+        SAYS("SCANHUB_TOPIC_");
+    }
+    MUST(scanhub_open(&handle, NULL, sensor, SCANHUB_TOPIC_SCAN, 3) == SCANHUB_REFUSED_ARGUMENT);
+    MUST(scanhub_open(&handle, NULL, "\xff", SCANHUB_TOPIC_SCAN, 0) == SCANHUB_REFUSED_ARGUMENT);
+    MUST(scanhub_open(&handle, NULL, "Front", SCANHUB_TOPIC_SCAN, 0) == SCANHUB_REFUSED_CONFIGURATION);
+    SAYS("\"Front\" is not possible\n  1 to 24 of a-z");
+    MUST(scanhub_open(&handle, "no/domain", sensor, SCANHUB_TOPIC_SCAN, 0) == SCANHUB_REFUSED_CONFIGURATION);
+    MUST(handle == NULL);
+}
+
+static void refused_as_a_handle(struct scanhub_attachment *handle)
+{
+    struct scanhub_sample sample;
+    MUST(scanhub_fd(handle) == SCANHUB_REFUSED_ARGUMENT);
+    SAYS("no such handle");
+    MUST(scanhub_wait(handle, 0) == SCANHUB_REFUSED_ARGUMENT);
+    MUST(scanhub_take(handle, &sample) == SCANHUB_REFUSED_ARGUMENT);
+    MUST(sample.header == NULL && sample.payload == NULL && scanhub_release(&sample) == 0);
+    MUST(scanhub_hub_lives(handle) == SCANHUB_REFUSED_ARGUMENT);
+}
+
+static void handles(const char *sensor)
+{
+    struct scanhub_attachment *handle = open_scans(sensor, SCANHUB_WAIT_DOORBELL);
+    int on_the_stack;
+    refused_as_a_handle(NULL);
+    refused_as_a_handle((struct scanhub_attachment *)&on_the_stack);
+    MUST(scanhub_close((struct scanhub_attachment *)&on_the_stack) == SCANHUB_REFUSED_ARGUMENT);
+    MUST(scanhub_close(NULL) == 0);
+    MUST(scanhub_fd(handle) == SCANHUB_REFUSED_CONFIGURATION);
+    SAYS("by event");
+    MUST(scanhub_take(handle, NULL) == SCANHUB_REFUSED_ARGUMENT);
+    MUST(scanhub_take(handle, (struct scanhub_sample *)((char *)&handle + 1)) == SCANHUB_REFUSED_ARGUMENT);
+    SAYS("aligned");
+    MUST(scanhub_close(handle) == 0);
+    refused_as_a_handle(handle);
+    MUST(scanhub_close(handle) == SCANHUB_REFUSED_ARGUMENT);
+}
+
+static void *elsewhere(void *handle)
+{
+    MUST(strcmp(scanhub_error(), "") == 0);
+    refused_as_a_handle(handle);
+    SAYS("by the thread that opened it");
+    return NULL;
+}
+
+static void threads(const char *sensor)
+{
+    struct scanhub_attachment *handle = open_scans(sensor, SCANHUB_WAIT_DOORBELL);
+    pthread_t thread;
+    MUST(pthread_create(&thread, NULL, elsewhere, handle) == 0 && pthread_join(thread, NULL) == 0);
+    MUST(scanhub_close(handle) == 0);
+}
+
+static void samples(const char *sensor)
+{
+    struct scanhub_attachment *handle = open_scans(sensor, SCANHUB_WAIT_DOORBELL);
+    struct scanhub_sample lent[4], fifth, copy;
+    for (int i = 0; i < 4; i++) {
+        MUST(scanhub_wait(handle, 20000) == 1);
+        MUST(scanhub_take(handle, &lent[i]) == 1 && lent[i].length == sizeof(struct scanhub_scan_v1));
+        MUST(i == 0 || lent[i].header->topic_seq == lent[i - 1].header->topic_seq + 1 + lent[i].missed);
+    }
+    MUST(scanhub_hub_lives(handle) == 1);
+    MUST(scanhub_take(handle, &fifth) == SCANHUB_REFUSED_ARGUMENT);
+    SAYS("four samples");
+    copy = lent[1];
+    MUST(scanhub_release(&lent[1]) == 0 && lent[1].payload == NULL);
+    MUST(scanhub_release(&lent[1]) == 0);
+    MUST(scanhub_release(&copy) == SCANHUB_REFUSED_ARGUMENT);
+    SAYS("not lent");
+    MUST(scanhub_release(NULL) == SCANHUB_REFUSED_ARGUMENT);
+    MUST(scanhub_wait(handle, 20000) == 1 && scanhub_wait(handle, 20000) == 1);
+    MUST(scanhub_take(handle, &fifth) == 1);
+    copy = fifth;
+    MUST(scanhub_close(handle) == 0);
+    MUST(scanhub_release(&copy) == SCANHUB_REFUSED_ARGUMENT);
+}
+
+static volatile sig_atomic_t alarms;
+
+static void on_alarm(int signal)
+{
+    (void)signal;
+    alarms++;
+}
+
+static void signals(void)
+{
+    const int ways[] = {SCANHUB_WAIT_DOORBELL, SCANHUB_WAIT_EVENT, SCANHUB_WAIT_SPIN};
+    const struct itimerval often = {{0, 5000}, {0, 5000}}, never = {{0, 0}, {0, 0}};
+    struct sigaction action;
+    memset(&action, 0, sizeof action);
+    action.sa_handler = on_alarm;
+    MUST(sigaction(SIGALRM, &action, NULL) == 0 && setitimer(ITIMER_REAL, &often, NULL) == 0);
+    for (int i = 0; i < 3; i++) {
+        struct scanhub_attachment *handle = open_scans("nobody", ways[i]);
+        const sig_atomic_t before = alarms;
+        MUST(scanhub_wait(handle, 200) == 0);
+        MUST(alarms > before);
+        MUST(scanhub_close(handle) == 0);
+    }
+    MUST(setitimer(ITIMER_REAL, &never, NULL) == 0);
+}
+
+int main(int argc, char **argv)
+{
+    const char *sensor = argc > 1 ? argv[1] : "front";
+    names(sensor);
+    handles(sensor);
+    threads(sensor);
+    samples(sensor);
+    signals();
+    /* Left open, with a sample: the end of the process is an end, too. */
+    struct scanhub_attachment *left = open_scans(sensor, SCANHUB_WAIT_EVENT);
+    struct scanhub_sample sample;
+    MUST(scanhub_wait(left, 20000) == 1 && scanhub_take(left, &sample) == 1);
+    puts("all refused");
+    return EXIT_SUCCESS;
+}
