@@ -2,6 +2,7 @@
 //! it ends. Everything is waited for by what it says, with a deadline far beyond what it takes.
 #![allow(dead_code, unused_imports)] // Every test file takes what it needs.
 
+mod findings;
 mod line;
 mod machine;
 mod network;
@@ -25,6 +26,7 @@ use std::time::{Duration, Instant};
 use schema::Domain;
 use serde_json::Value;
 
+pub(crate) use findings::Findings;
 pub(crate) use line::{Line, open_line};
 pub(crate) use machine::{Machine, command_in, ip};
 pub(crate) use network::in_a_network;
