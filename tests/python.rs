@@ -8,12 +8,15 @@ use std::path::Path;
 use std::process::Command;
 
 use serde_json::{Value, json};
-use stage::{INT, KILL, Outcome, Program, Stage, TERM, is_class, number, python, script};
+use stage::{INT, KILL, Outcome, Program, Stage, TERM, is_class, number, python};
 
 /// A script of the package's tests, if there is a Python for it.
 fn check(name: &str) -> Option<Command> {
-    let python = python(&["iceoryx2", "numpy"])?;
-    Some(script(&python, &format!("clients/python/tests/{name}.py")))
+    let mut command = python("iceoryx2, numpy")?;
+    let package = Path::new(env!("CARGO_MANIFEST_DIR")).join("clients/python");
+    command.arg(package.join("tests").join(name).with_extension("py"));
+    command.env("PYTHONPATH", package).env_remove("SCANHUB_DOMAIN");
+    Some(command)
 }
 
 /// The same with the stage's domain and root as its first arguments.
@@ -125,6 +128,20 @@ fn differing<'a>(line: &'a Value, sample: &Value) -> Vec<&'a String> {
     keys.filter(|key| *key != "marks" || line["class"] == "marks")
         .filter(|key| line[*key] != sample[*key])
         .collect()
+}
+
+#[test]
+fn one_subscription_follows_several_sensors() {
+    let stage = Stage::new();
+    let Some(mut command) = check_on(&stage, "follow") else { return };
+    command.args(["front/scan", "rear/scan", "rear/status"]);
+    let _simulator = stage.simulator(&["front", "rear"], &["--seed=63", "--baud=500000"]);
+    let _hub = stage.hub(&[stage.link("front"), stage.link("rear")]);
+    let mut follower = Program::start(command);
+    for (sensor, topic, count) in [("front", "scan", 40), ("rear", "scan", 40), ("rear", "status", 2)] {
+        follower.await_lines(count, sensor, |line| line["sensor"] == sensor && line["class"] == topic);
+    }
+    ended_by_interrupt(follower);
 }
 
 #[test]
