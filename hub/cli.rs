@@ -13,6 +13,8 @@ mod latency;
 mod leds;
 mod listen;
 mod probe;
+pub(crate) mod record;
+pub(crate) mod replay;
 pub(crate) mod simulate;
 mod telegram;
 pub(crate) mod watch;
@@ -34,6 +36,8 @@ pub(crate) use generated::{Completions, Man};
 pub(crate) use latency::Latency;
 pub(crate) use leds::Leds;
 pub(crate) use listen::Listen;
+pub(crate) use record::Record;
+pub(crate) use replay::Replay;
 pub(crate) use telegram::{Telegram, Way};
 pub(crate) use watch::Watch;
 pub(crate) use zones::Zones;
@@ -98,6 +102,9 @@ impl Everywhere {
 pub(crate) enum Verb {
     /// The hub, in the foreground, until SIGINT or SIGTERM
     Run(Run),
+    /// A hub whose sensors are a recording, with the keys of a player
+    #[command(after_help = replay::KEYS)]
+    Replay(Replay),
     /// Two simulated sensors, the hub and a consumer for each, in one terminal
     Demo(Demo),
     /// Sensors at the other end of ptys
@@ -133,6 +140,9 @@ pub(crate) enum Verb {
     /// The live picture in the terminal: what the sensors see, marks, zones and the verdict
     #[command(after_help = watch::KEYS)]
     Watch(Watch),
+    /// What the hub publishes, in MCAP files
+    #[command(after_help = record::READING)]
+    Record(Record),
     /// Telegrams explained field by field, and written
     Telegram(Telegram),
     /// Stop a sensor, let it stream again, or begin anew with it

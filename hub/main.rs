@@ -3,6 +3,7 @@
 
 mod cli;
 mod demo;
+mod replay;
 
 use std::ffi::c_int;
 use std::fs::File;
@@ -18,7 +19,7 @@ use clap::error::ErrorKind;
 use clients::{EchoOptions, Format, HzOptions, InfoOptions, ListOptions};
 use daemon::Config;
 use rustix::process::Signal;
-use schema::{Failure, Kind};
+use schema::{Domain, Failure, Kind};
 use serde::Serialize;
 use signal_hook::consts::{SIGHUP, SIGINT, SIGQUIT, SIGTERM, SIGUSR1};
 use tracing::level_filters::LevelFilter;
@@ -38,8 +39,12 @@ fn main() -> ExitCode {
         Err(error) => return refuse(&error),
     };
     start_log();
-    // What these two print on stdout is one line that says that they are up.
-    let quiet = matches!(cli.verb, Verb::Run(_) | Verb::Simulate(_));
+    // What these print on stdout says that they are up, and how it ended; a recording is no text.
+    let quiet = match &cli.verb {
+        Verb::Run(_) | Verb::Replay(_) | Verb::Simulate(_) => true,
+        Verb::Record(record) => record.is_to_stdout(),
+        _ => false,
+    };
     daemon::bus_error::explain(cli.everywhere.json, quiet);
     match dispatch(&cli) {
         Ok(()) => ExitCode::SUCCESS,
@@ -57,6 +62,7 @@ fn dispatch(cli: &Cli) -> Result<(), Failure> {
     let mut out = stdout.map_err(|error| Failure::new(Kind::Failed, format!("no stdout: {error}"), ""))?;
     match &cli.verb {
         Verb::Run(run) => run_hub(run, everywhere),
+        Verb::Replay(replay) => replay::replay(replay, everywhere),
         Verb::Demo(demo) => {
             let options = DemoOptions {
                 headless: demo.headless,
@@ -125,6 +131,16 @@ fn dispatch(cli: &Cli) -> Result<(), Failure> {
             let stop = interrupt_by(&ENDS)?;
             clients::watch(&watch.options(everywhere)?, &mut out, &stop)
         }
+        Verb::Record(record) => {
+            let options = record.options(everywhere)?;
+            // Whatever ends it, the file is finished. A file that may not grow is an error of its write, and no end.
+            let (stop, _) = (interrupt_by(&ENDS)?, interrupt_by(&[SIGXFSZ])?);
+            let mut stderr = io::stderr();
+            match record.is_to_stdout() {
+                true => clients::record(&options, &mut io::stderr(), &mut stderr, &stop),
+                false => clients::record(&options, &mut out, &mut stderr, &stop),
+            }
+        }
         Verb::Control(control) => clients::control(&control.options(everywhere)?, &mut out, &*interrupt()?),
         Verb::Background(background) => {
             // A model is read before Ctrl-C is a flag, which would not end a person's typing.
@@ -149,22 +165,24 @@ fn dispatch(cli: &Cli) -> Result<(), Failure> {
 fn run_hub(run: &cli::Run, everywhere: &Everywhere) -> Result<(), Failure> {
     let read = || Config::load(&run.sources());
     let domain = everywhere.hub_domain()?;
-    daemon::run(&read, &domain, |ready| {
-        let line = if everywhere.json {
-            line(&HubReady {
-                class: "ready",
-                domain: domain.name(),
-                root: domain.root(),
-                pid: std::process::id(),
-                boot: format!("{:016x}", ready.boot),
-                sensors: &ready.sensors,
-            })
-        } else {
-            let place = domain.root().display();
-            format!("ready {} in {place}, sensors: {}", domain.name(), ready.sensors.join(", "))
-        };
-        say(&line);
-    })
+    daemon::run(&read, &domain, |ready| say_ready(ready, &domain, everywhere.json))
+}
+
+/// Says that a hub is up.
+fn say_ready(ready: &daemon::Ready, domain: &Domain, json: bool) {
+    say(&if json {
+        line(&HubReady {
+            class: "ready",
+            domain: domain.name(),
+            root: domain.root(),
+            pid: std::process::id(),
+            boot: format!("{:016x}", ready.boot),
+            sensors: &ready.sensors,
+        })
+    } else {
+        let place = domain.root().display();
+        format!("ready {} in {place}, sensors: {}", domain.name(), ready.sensors.join(", "))
+    });
 }
 
 fn run_simulator(simulate: &cli::simulate::Simulate, everywhere: &Everywhere) -> Result<(), Failure> {
@@ -214,6 +232,8 @@ fn line(value: &impl Serialize) -> String {
     serde_json::to_string(value).unwrap_or_default()
 }
 
+/// A file would become longer than is allowed; signal-hook has no name for it.
+const SIGXFSZ: c_int = Signal::XFSZ.as_raw();
 /// Whatever asks a process to end.
 const ENDS: [c_int; 4] = [SIGINT, SIGTERM, SIGHUP, SIGQUIT];
 
@@ -272,7 +292,7 @@ fn refuse(error: &clap::Error) -> ExitCode {
 fn start_log() {
     let level = std::env::var("SCANHUB_LOG").ok().and_then(|level| level.parse().ok());
     tracing_subscriber::fmt()
-        .with_writer(io::stderr)
+        .with_writer(|| replay::line::Log)
         .with_max_level(level.unwrap_or(LevelFilter::INFO))
         .with_target(false)
         .init();

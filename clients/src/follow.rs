@@ -1,15 +1,18 @@
 //! The loop of every verb that follows topics: receive, account, say what is wrong, end when the bounds say so.
 //! Refuses to know what becomes of a sample.
 
+mod roll;
+
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
-use schema::{Domain, Failure, Kind, ROBOT, Topic, ipc, is_remote};
+use schema::{Domain, Failure, Kind, Topic, is_remote};
 
 use crate::account::Account;
-use crate::names::{TopicName, no_sensor};
+use crate::names::TopicName;
 use crate::output::End;
 use crate::presence::{GRACE, Who};
+use crate::roll::Roll;
 use crate::sample::{Sample, Source};
 use crate::session::Session;
 use crate::wait::Wait;
@@ -77,20 +80,21 @@ pub(crate) fn follow(
     stop: &AtomicBool,
     sink: &mut dyn Sink,
 ) -> Result<(), End> {
-    carry(Run::new(names, places, bounds), names, stop, sink)
+    let topics: &[Topic] = if names.is_empty() { &Topic::ALL } else { &[] };
+    carry(Run::new(names, topics, places, bounds), names, stop, sink)
 }
 
-/// As [`follow`], with `topics` of each sensor of the hub for no `names`.
-#[cfg(feature = "tui")]
+/// As [`follow`], and beside `names` these `topics` of each sensor that a hub has when it comes.
+#[cfg(any(feature = "record", feature = "tui"))]
 pub(crate) fn follow_topics(
     names: &[TopicName],
-    topics: &'static [Topic],
+    topics: &[Topic],
     places: &[Domain],
     bounds: &Bounds,
     stop: &AtomicBool,
     sink: &mut dyn Sink,
 ) -> Result<(), End> {
-    carry(Run { topics, ..Run::new(names, places, bounds) }, names, stop, sink)
+    carry(Run::new(names, topics, places, bounds), names, stop, sink)
 }
 
 /// As [`follow`], woken by `wait`, and for the shortest latency: what is there is taken before it is asked whether the hub
@@ -103,7 +107,7 @@ pub(crate) fn follow_closely(
     stop: &AtomicBool,
     sink: &mut dyn Sink,
 ) -> Result<(), End> {
-    let run = Run::new(names, places, bounds);
+    let run = Run::new(names, &[], places, bounds);
     carry(Run { session: run.session.by(wait), closely: true, ..run }, names, stop, sink)
 }
 
@@ -133,9 +137,9 @@ impl Track {
 struct Run<'a> {
     session: Session,
     tracks: Vec<Track>,
-    all: bool,
-    /// Of each sensor, if all are followed.
-    topics: &'static [Topic],
+    /// What is followed of each sensor that a hub has.
+    topics: &'a [Topic],
+    roll: Roll,
     /// Samples come before news of the hub.
     closely: bool,
     bounds: &'a Bounds,
@@ -148,9 +152,6 @@ struct Run<'a> {
     received: u64,
 }
 
-/// Sensors of other machines that are there have been announced after so long: it is done once a second.
-const ANNOUNCED: Duration = Duration::from_secs(3);
-
 /// Who brings what is called so.
 fn of(name: &TopicName) -> Who {
     if is_remote(&name.sensor) { Who::Listener } else { Who::Hub }
@@ -160,13 +161,13 @@ fn of(name: &TopicName) -> Who {
 const TURN: usize = 32;
 
 impl<'a> Run<'a> {
-    fn new(names: &[TopicName], places: &[Domain], bounds: &'a Bounds) -> Run<'a> {
+    fn new(names: &[TopicName], topics: &'a [Topic], places: &[Domain], bounds: &'a Bounds) -> Run<'a> {
         let now = Instant::now();
         Run {
             session: Session::new(places.to_vec()),
             tracks: names.iter().cloned().map(Track::new).collect(),
-            all: names.is_empty(),
-            topics: &Topic::ALL,
+            topics,
+            roll: Roll::default(),
             closely: false,
             bounds,
             started: now,
@@ -207,6 +208,7 @@ impl<'a> Run<'a> {
     fn look(&mut self, sink: &mut dyn Sink) -> Result<(), End> {
         let change = self.session.look()?;
         if let Some(who) = change.gone {
+            self.roll.end();
             self.tell(sink, Notice::HubGone, |name| who == of(name))?;
         }
         if let Some(who) = change.back {
@@ -214,18 +216,9 @@ impl<'a> Run<'a> {
                 self.tell(sink, Notice::HubBack, |name| who == of(name))?;
             }
             self.hub_seen = Some(Instant::now());
+            self.roll.begin(Instant::now());
         }
-        if self.all && self.tracks.is_empty() && self.hub_seen.is_some_and(|seen| seen.elapsed() >= GRACE / 2)
-        {
-            for sensor in self.sensors()? {
-                for &topic in self.topics {
-                    let track = Track::new(TopicName { sensor: sensor.clone(), topic });
-                    sink.begin(&track.name);
-                    self.tracks.push(track);
-                }
-            }
-        }
-        Ok(())
+        self.call_the_roll(sink)
     }
 
     /// Receives what waits; true if that was all that was asked for.
@@ -233,7 +226,13 @@ impl<'a> Run<'a> {
         let mut more = true;
         while more && !stop.load(Ordering::Relaxed) {
             more = false;
+            let mut attached = false;
             for track in &mut self.tracks {
+                // That takes a thousand times as long as receiving: what waits of others comes before the next one.
+                if attached && !track.source.attached() {
+                    more = true;
+                    continue;
+                }
                 for turn in 0..TURN {
                     let was_attached = track.source.attached();
                     let received = track.source.receive(&mut self.session)?;
@@ -241,6 +240,7 @@ impl<'a> Run<'a> {
                         sink.arrived();
                     }
                     if !was_attached && track.source.attached() {
+                        attached = true;
                         sink.attached(&track.name);
                     }
                     let Some(sample) = received else { break };
@@ -301,50 +301,6 @@ impl<'a> Run<'a> {
         Ok(())
     }
 
-    /// A hub that is up has all its topics: a sensor that is not among them is no sensor of it.
-    fn check_sensors(&mut self) -> Result<(), End> {
-        if !self.tracks.is_empty() && self.tracks.iter().all(|track| track.source.attached()) {
-            return Ok(());
-        }
-        if self.session.domain().is_none() {
-            return Ok(());
-        }
-        // A hub that came to a listener has to make its topics first.
-        let lives = self.session.hub_lives();
-        self.hub_lives_since = if lives { self.hub_lives_since.or(Some(Instant::now())) } else { None };
-        let sensors = self.sensors()?;
-        let wants_all = self.tracks.iter().all(|track| track.name.is_robot());
-        if wants_all && !self.may_come(ROBOT) && sensors.iter().all(|sensor| is_remote(sensor)) {
-            return Err(Failure::new(
-                Kind::NoTopic,
-                "the hub has no sensors",
-                "scanhub run --link NAME=PORT",
-            )
-            .into());
-        }
-        for track in &self.tracks {
-            let sensor = &track.name.sensor;
-            let is_there = track.name.is_robot() || sensors.contains(sensor) || self.may_come(sensor);
-            if !track.source.attached() && !is_there {
-                return Err(no_sensor(sensor, &sensors).into());
-            }
-        }
-        Ok(())
-    }
-
-    /// Who is not there may come: another machine that is switched on later, or the hub, where only a listener is yet.
-    fn may_come(&self, sensor: &str) -> bool {
-        let unbounded = !self.bounds.bounded();
-        match is_remote(sensor) {
-            true => unbounded || self.started.elapsed() < ANNOUNCED,
-            false => unbounded && self.hub_lives_since.is_none_or(|since| since.elapsed() < GRACE),
-        }
-    }
-
-    fn sensors(&self) -> Result<Vec<String>, Failure> {
-        self.session.domain().map(ipc::sensors).transpose().map(Option::unwrap_or_default)
-    }
-
     /// News of the hub concern every stream.
     fn notice(&self, sink: &mut dyn Sink, notice: Notice) -> Result<(), End> {
         self.tell(sink, notice, |_| true)
@@ -359,13 +315,14 @@ impl<'a> Run<'a> {
     ) -> Result<(), End> {
         let names: Vec<_> =
             self.tracks.iter().map(|track| &track.name).filter(|name| concerns(name)).collect();
-        if names.is_empty() { Ok(()) } else { sink.notice(&names, notice) }
+        if names.is_empty() && !self.tracks.is_empty() { Ok(()) } else { sink.notice(&names, notice) }
     }
 
     fn wake_at(&self) -> Option<Instant> {
         let end = self.bounds.run_for.and_then(|limit| self.started.checked_add(limit));
         let silence = self.bounds.timeout.and_then(|limit| self.last_sample.checked_add(limit));
         let left = self.tracks.iter().filter_map(|track| track.source.left()).min();
+        let left = left.into_iter().chain(self.roll.left()).min();
         let unheard = left.and_then(|left| Instant::now().checked_add(left));
         [end, silence, unheard].into_iter().flatten().min()
     }

@@ -10,6 +10,7 @@ mod clock;
 mod control;
 pub mod duration;
 mod echo;
+mod errand;
 mod file;
 mod follow;
 mod follower;
@@ -28,9 +29,13 @@ mod names;
 mod output;
 mod presence;
 mod readiness;
+#[cfg(feature = "record")]
+mod record;
 mod robot;
+mod roll;
 mod sample;
 mod session;
+mod spare;
 mod text;
 mod wait;
 #[cfg(feature = "tui")]
@@ -54,6 +59,8 @@ pub use list::{ListOptions, list, list_domains};
 pub use listen::{ListenOptions, listen};
 pub use mask::{MaskOptions, mask};
 pub use names::TopicName;
+#[cfg(feature = "record")]
+pub use record::{RecordLook, RecordOptions, Split, record};
 pub use robot::{Robot, RobotFollower, robot};
 pub use wait::Wait;
 #[cfg(feature = "tui")]

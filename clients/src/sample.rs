@@ -130,6 +130,17 @@ impl Sample {
     }
 }
 
+#[cfg(feature = "record")]
+impl Sample {
+    /// As [`pack`](Self::pack), zones as the hub said them: however old they were on arrival here.
+    pub(crate) fn pack_said(&self, room: &mut [u8]) -> Option<usize> {
+        match self {
+            Sample::Zones(sample) => sample.said.pack(room),
+            other => other.pack(room),
+        }
+    }
+}
+
 /// What every sample can be asked.
 trait Told {
     fn header(&self) -> Option<&Header>;

@@ -65,7 +65,8 @@ pub fn watch(options: &WatchOptions, out: &mut dyn Write, stop: &AtomicBool) -> 
             draw_at: Instant::now(),
             news_until: None,
         };
-        follow_topics(&names, &TOPICS, &options.places, &options.bounds, stop, &mut watcher)
+        let topics: &[Topic] = if names.is_empty() { &TOPICS } else { &[] };
+        follow_topics(&names, topics, &options.places, &options.bounds, stop, &mut watcher)
     });
     quiet(end)
 }

@@ -31,12 +31,15 @@ pub struct Heard {
     pub missed: u64,
     /// The zones are unknown because nothing was heard that is new enough, not because the hub says so.
     pub stale: bool,
+    /// What the hub said, however old it was when it came: for who keeps it, and does not act on it.
+    #[cfg_attr(not(feature = "record"), allow(dead_code))]
+    pub(crate) said: Zones,
 }
 
 impl Heard {
     /// A silence.
     pub(crate) fn nothing() -> Heard {
-        Heard { zones: Zones::unknown(), header: None, missed: 0, stale: true }
+        Heard { zones: Zones::unknown(), header: None, missed: 0, stale: true, said: Zones::unknown() }
     }
 }
 
@@ -153,7 +156,13 @@ impl ZonesSource {
                 let header = *sample.header();
                 let fresh = self.freshness.heard(&header, sample.verdict(), now);
                 let zones = if fresh { *sample } else { Zones::unknown() };
-                Some(Heard { zones, header: Some(header), missed: sample.missed, stale: !fresh })
+                Some(Heard {
+                    zones,
+                    header: Some(header),
+                    missed: sample.missed,
+                    stale: !fresh,
+                    said: *sample,
+                })
             }
             None => self.freshness.silence(now).then(Heard::nothing),
         };

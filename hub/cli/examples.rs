@@ -28,6 +28,14 @@ const EXAMPLES: &[(&str, &[&str])] = &[
             "scanhub run --config robot.toml",
         ],
     ),
+    (
+        "replay",
+        &[
+            "scanhub replay walk.mcap",
+            "scanhub replay walk.mcap --rate max --set zones.radii=[1.2,0.7]",
+            "scanhub replay walk.mcap --start 1m --end 90s --loop --paused",
+        ],
+    ),
     ("demo", &["scanhub demo", "scanhub demo --headless --for 10s"]),
     (
         "simulate",
@@ -46,7 +54,7 @@ const EXAMPLES: &[(&str, &[&str])] = &[
             "scanhub config show",
         ],
     ),
-    ("doctor", &["scanhub doctor", "scanhub doctor /dev/ttyUSB0"]),
+    ("doctor", &["scanhub doctor", "scanhub doctor /dev/ttyUSB0", "scanhub doctor --clean"]),
     ("list", &["scanhub list"]),
     ("info", &["scanhub info front"]),
     (
@@ -67,6 +75,14 @@ const EXAMPLES: &[(&str, &[&str])] = &[
         ],
     ),
     ("watch", &["scanhub watch", "scanhub watch front"]),
+    (
+        "record",
+        &[
+            "scanhub record",
+            "scanhub record -o walk.mcap --ros2 --for 10m",
+            "scanhub record --all --split 512MiB --keep 20",
+        ],
+    ),
     ("control", &["scanhub control front pause"]),
     ("background", &["scanhub background front save front.json"]),
     ("zones", &["scanhub zones front mask --for 10s"]),

@@ -21,7 +21,8 @@ pub const METADATA: &str = "scanhub";
 /// follows; until then it lies in memory.
 pub struct Writer<W: Write> {
     mcap: mcap::Writer<NoSeek<BufWriter<W>>>,
-    channels: BTreeMap<(String, Topic), u16>,
+    /// Few enough to be looked through.
+    channels: Vec<(String, Topic, u16)>,
     message: Vec<u8>,
 }
 
@@ -46,23 +47,24 @@ impl<W: Write> Writer<W> {
             .library("scanhub")
             .chunk_size(None)
             .disable_seeking(true);
-        let mut mcap = options.create(NoSeek::new(BufWriter::new(out))).map_err(io_error)?;
-        mcap.write_metadata(&Metadata { name: METADATA.to_owned(), metadata: facts }).map_err(io_error)?;
-        mcap.flush().map_err(io_error)?;
-        Ok(Writer { mcap, channels: BTreeMap::new(), message: Vec::with_capacity(4096) })
+        let mcap = options.create(NoSeek::new(BufWriter::new(out))).map_err(io_error)?;
+        let mut writer = Writer { mcap, channels: Vec::new(), message: Vec::with_capacity(4096) };
+        writer.note(METADATA, facts)?;
+        writer.close_chunk()?;
+        Ok(writer)
     }
 
     /// Writes a sample of `sensor`'s `topic`; `payload` is packed as for a network
     /// ([`Packed`](crate::datagram::Packed)).
     pub fn sample(&mut self, sensor: &str, topic: Topic, header: &Header, payload: &[u8]) -> io::Result<()> {
-        let key = (sensor.to_owned(), topic);
-        let channel = match self.channels.get(&key) {
-            Some(&channel) => channel,
+        let known = self.channels.iter().find(|(of, its, _)| *its == topic && of == sensor);
+        let channel = match known {
+            Some(&(_, _, channel)) => channel,
             None => {
                 let name = format!("{sensor}/{}", topic.name());
                 let schema = (schema(topic), LAYOUT, ENCODING);
                 let channel = self.channel(&Foreign { topic: &name, encoding: ENCODING, schema })?;
-                self.channels.insert(key, channel);
+                self.channels.push((sensor.to_owned(), topic, channel));
                 channel
             }
         };
@@ -86,6 +88,11 @@ impl<W: Write> Writer<W> {
     pub fn message(&mut self, channel_id: u16, sequence: u32, time_ns: u64, data: &[u8]) -> io::Result<()> {
         let header = MessageHeader { channel_id, sequence, log_time: time_ns, publish_time: time_ns };
         self.mcap.write_to_known_channel(&header, data).map_err(io_error)
+    }
+
+    /// Writes a metadata record called `name`, behind a chunk that this closes.
+    pub fn note(&mut self, name: &str, facts: BTreeMap<String, String>) -> io::Result<()> {
+        self.mcap.write_metadata(&Metadata { name: name.to_owned(), metadata: facts }).map_err(io_error)
     }
 
     /// Hands all that was written to `W`.

@@ -2,11 +2,14 @@
 //! it ends. Everything is waited for by what it says, with a deadline far beyond what it takes.
 #![allow(dead_code, unused_imports)] // Every test file takes what it needs.
 
+mod findings;
 mod line;
 mod machine;
 mod network;
 mod program;
+mod python;
 mod receiver;
+mod recording;
 mod relay;
 mod robot;
 mod sender;
@@ -25,11 +28,14 @@ use std::time::{Duration, Instant};
 use schema::Domain;
 use serde_json::Value;
 
+pub(crate) use findings::Findings;
 pub(crate) use line::{Line, open_line};
 pub(crate) use machine::{Machine, command_in, ip};
 pub(crate) use network::in_a_network;
 pub(crate) use program::{HUP, INT, KILL, Outcome, Program, TERM, USR1};
+pub(crate) use python::python;
 pub(crate) use receiver::{Receiver, read};
+pub(crate) use recording::{Kept, Recording, unbroken};
 pub(crate) use relay::Relay;
 pub(crate) use robot::Robot;
 pub(crate) use sender::{Sender, wall_ns};

@@ -127,5 +127,5 @@ pub(super) fn id<S: Serializer>(id: &u64, serializer: S) -> Result<S::Ok, S::Err
 }
 
 fn heard(zones: Zones, header: &Header) -> Heard {
-    Heard { zones, header: Some(*header), missed: 0, stale: false }
+    Heard { zones, header: Some(*header), missed: 0, stale: false, said: zones }
 }

@@ -102,7 +102,7 @@ mod tests {
             let zones = Zones { verdict: verdict as u8, ..Zones::unknown() };
             let mut line = Vec::new();
             let header = Some(Header::default());
-            super::zones(&mut line, &Heard { zones, header, missed: 0, stale: false }).unwrap();
+            super::zones(&mut line, &Heard { zones, header, missed: 0, stale: false, said: zones }).unwrap();
             String::from_utf8(line).unwrap()
         };
         assert!(text(Verdict::Clear).ends_with(" clear nothing near"));

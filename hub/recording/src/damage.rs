@@ -15,6 +15,8 @@ pub struct Damage {
     pub estimated: u64,
     /// The file ends without its index, as after a kill.
     pub is_cut: bool,
+    /// What the file says of itself is wrong somewhere: a checksum, a length, an order.
+    pub is_harmed: bool,
 }
 
 impl Damage {
@@ -40,8 +42,11 @@ impl fmt::Display for Damage {
             self.is_cut.then(|| "the end of the file, with its index".to_owned()),
         ];
         let parts: Vec<_> = parts.into_iter().flatten().collect();
-        f.write_str(if parts.is_empty() { "nothing" } else { "" })?;
-        f.write_str(&parts.join(", "))
+        match (&parts[..], self.is_harmed) {
+            ([], true) => f.write_str("no telegram, but a checksum is wrong"),
+            ([], false) => f.write_str("nothing"),
+            _ => f.write_str(&parts.join(", ")),
+        }
     }
 }
 
@@ -55,5 +60,7 @@ mod tests {
         let damage = Damage { telegrams: 2, estimated: 1, is_cut: true, ..Damage::default() };
         let words = "2 telegrams, 1 stamp, which is estimated, the end of the file, with its index";
         assert_eq!(damage.to_string(), words);
+        let damage = Damage { is_harmed: true, ..Damage::default() };
+        assert_eq!(damage.to_string(), "no telegram, but a checksum is wrong");
     }
 }

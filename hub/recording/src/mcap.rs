@@ -2,143 +2,164 @@
 //! into the file, and what other programs have put there.
 
 mod channels;
+mod chunk;
+mod exact;
+mod knowledge;
+mod reader;
 mod records;
+mod salvage;
+mod seen;
+mod source;
+mod window;
 
 use std::collections::BTreeMap;
-use std::io::Read;
+use std::io::{self, Read};
 use std::sync::Arc;
 
 use lms::variant::Mode;
-use mcap::records::{MessageHeader, Record as Parsed};
-use mcap::{McapError, parse_record};
 use schema::datagram::Packed;
-use schema::{Header, Status, Topic, file};
+use schema::{Header, Status, Topic};
 
-use crate::{Contents, Form, Frame};
-use channels::Channels;
-use records::{Record, Records};
+use crate::{Contents, Damage, Form, Frame};
+use knowledge::Knowledge;
+use reader::{Item, Reader, Sighting};
+use records::Record;
+use source::Source;
 
-/// What is known of a file that was read through once.
+/// What is known of a file that was read through.
 #[derive(Debug)]
 pub(crate) struct Survey {
     whole: Contents,
-    sensors: Vec<(String, Contents)>,
-    channels: Channels,
-    /// Last life of the hub and number of a telegram, by sensor.
-    last: BTreeMap<String, (u64, u64)>,
+    sensors: BTreeMap<String, Contents>,
+    knowledge: Knowledge,
+    is_sound: bool,
+    numbers: BTreeMap<String, Numbers>,
+}
+
+/// The last telegram of a sensor whose number is known.
+#[derive(Clone, Copy, Debug, Default)]
+struct Numbers {
+    last: Option<Header>,
+    /// Telegrams after it whose numbers are not.
+    estimated: u64,
 }
 
 impl Default for Survey {
     fn default() -> Self {
         Survey {
             whole: Contents::new(Form::Mcap),
-            sensors: Vec::new(),
-            channels: Channels::default(),
-            last: BTreeMap::new(),
+            sensors: BTreeMap::new(),
+            knowledge: Knowledge::default(),
+            is_sound: true,
+            numbers: BTreeMap::new(),
         }
     }
 }
 
 impl Survey {
-    /// Reads `input` through.
-    pub(crate) fn of(input: impl Read) -> std::io::Result<Survey> {
+    /// Reads the file that `open` opens through: once if it is sound.
+    pub(crate) fn of<R: Read>(open: impl Fn() -> io::Result<R>) -> io::Result<Survey> {
+        let failed = match Survey::read(Reader::sound(open()?)) {
+            Err(error) if window::is_end(&error) => error,
+            other => return other,
+        };
+        let knowledge = Knowledge::of(Source::of(open()?, false))?;
+        let mut survey = Survey::read(Reader::harmed(open()?, knowledge))?;
+        survey.is_sound = false;
+        let is_cut = failed.kind() == io::ErrorKind::UnexpectedEof && survey.whole.damage.is_cut;
+        survey.tell(|damage| damage.is_harmed = !is_cut);
+        Ok(survey)
+    }
+
+    fn read<R: Read>(mut reader: Reader<R>) -> io::Result<Survey> {
         let mut survey = Survey::default();
-        let mut records = Records::new(input);
-        loop {
-            match records.next() {
-                Ok(Some(record)) => survey.note(&record),
-                Ok(None) => return Ok(survey),
-                Err(McapError::UnsupportedCompression(name)) => {
-                    let message = format!("its chunks are packed by {name}");
-                    return Err(std::io::Error::new(std::io::ErrorKind::Unsupported, message));
-                }
-                Err(_) => {
-                    survey.whole.damage.is_cut = true;
-                    survey.sensors.iter_mut().for_each(|(_, contents)| contents.damage.is_cut = true);
-                    return Ok(survey);
-                }
+        while let Some(item) = reader.next()? {
+            match item {
+                Item::Telegram(sighting) => survey.note(&sighting),
+                Item::Record(record) => survey.note_record(&reader.knowledge, &record),
             }
         }
+        for sensor in reader.knowledge.channels.sensors() {
+            survey.sensors.entry(sensor).or_insert(Contents::new(Form::Mcap));
+        }
+        survey.whole.sensors = reader.knowledge.channels.sensors();
+        if let Some(account) = reader.account() {
+            survey.tell(|damage| {
+                (damage.bytes, damage.chunks) = (account.passed, account.chunks);
+                damage.is_cut = !account.has_end;
+            });
+        }
+        survey.knowledge = reader.knowledge;
+        Ok(survey)
     }
 
     /// What is in the file.
     pub(crate) fn contents(&self) -> Contents {
-        Contents {
-            sensors: self.sensors.iter().map(|(name, _)| name.clone()).collect(),
-            ..self.whole.clone()
-        }
+        self.whole.clone()
     }
 
     /// What is in it of `sensor`.
     pub(crate) fn contents_of(&self, sensor: &str) -> Contents {
-        let found = self.sensors.iter().find(|(name, _)| name == sensor);
-        let (name, contents) = found.cloned().unwrap_or((sensor.to_owned(), Contents::new(Form::Mcap)));
-        Contents { sensors: vec![name], ..contents }
+        let contents = self.sensors.get(sensor).cloned().unwrap_or(Contents::new(Form::Mcap));
+        Contents { sensors: vec![sensor.to_owned()], ..contents }
     }
 
-    fn note(&mut self, record: &Record) {
-        match parse_record(record.opcode, &record.body) {
-            Ok(Parsed::Channel(channel)) => {
-                self.channels.note(&channel);
-                if let Some(place) = self.channels.place(channel.id).cloned() {
-                    self.of_sensor(&place.sensor);
-                }
+    /// All that is in the file, as `input` has it.
+    pub(crate) fn reader<R: Read>(&self, input: R) -> Reader<R> {
+        if self.is_sound { Reader::sound(input) } else { Reader::harmed(input, self.knowledge.clone()) }
+    }
+
+    /// Says of the whole file and of each sensor what `tell` says.
+    fn tell(&mut self, tell: impl Fn(&mut Damage)) {
+        tell(&mut self.whole.damage);
+        self.sensors.values_mut().for_each(|contents| tell(&mut contents.damage));
+    }
+
+    fn note(&mut self, sighting: &Sighting) {
+        let numbers = self.numbers.entry(sighting.sensor.clone()).or_default();
+        let mut missing = 0;
+        if sighting.is_estimated {
+            numbers.estimated += 1;
+        } else {
+            let header = sighting.header;
+            if let Some(last) = numbers.last.filter(|last| last.boot == header.boot) {
+                missing =
+                    header.topic_seq.saturating_sub(last.topic_seq.saturating_add(1 + numbers.estimated));
             }
-            Ok(Parsed::Message { header, data }) => self.note_message(&header, &data),
-            _ => {}
+            *numbers = Numbers { last: Some(header), estimated: 0 };
+        }
+        for contents in [&mut self.whole, of_sensor(&mut self.sensors, &sighting.sensor)] {
+            contents.note(&sighting.telegram, Some(sighting.header.wall_ns));
+            contents.damage.telegrams += missing;
+            contents.damage.estimated += u64::from(sighting.is_estimated);
         }
     }
 
-    fn note_message(&mut self, message: &MessageHeader, data: &[u8]) {
-        let Some(place) = self.channels.place(message.channel_id).cloned() else { return };
-        let Some((header, payload)) = file::parts(data) else { return };
-        match place.topic {
-            Topic::Telegram => self.note_telegram(&place.sensor, &header, payload),
-            Topic::Status => {
-                let mut status = Status::default();
-                if status.unpack(payload) && status.mode != Status::MODE_UNKNOWN {
-                    let mode = Mode(status.mode);
-                    self.whole.mode = self.whole.mode.or(Some(mode));
-                    let contents = self.of_sensor(&place.sensor);
-                    contents.mode = contents.mode.or(Some(mode));
-                }
+    /// The measuring mode stands in a status too.
+    fn note_record(&mut self, knowledge: &Knowledge, record: &Record) {
+        let Some((place, _, payload)) = knowledge.message(record) else { return };
+        let mut status = Status::default();
+        if place.topic == Topic::Status && status.unpack(payload) && status.mode != Status::MODE_UNKNOWN {
+            for contents in [&mut self.whole, of_sensor(&mut self.sensors, &place.sensor)] {
+                contents.mode = contents.mode.or(Some(Mode(status.mode)));
             }
-            _ => {}
         }
     }
+}
 
-    fn note_telegram(&mut self, sensor: &str, header: &Header, telegram: &[u8]) {
-        let missing = match self.last.insert(sensor.to_owned(), (header.boot, header.topic_seq)) {
-            Some((boot, last)) if boot == header.boot => header.topic_seq.saturating_sub(last + 1),
-            _ => 0,
-        };
-        self.whole.damage.telegrams += missing;
-        self.whole.note(telegram, Some(header.wall_ns));
-        let contents = self.of_sensor(sensor);
-        contents.damage.telegrams += missing;
-        contents.note(telegram, Some(header.wall_ns));
-    }
-
-    fn of_sensor(&mut self, sensor: &str) -> &mut Contents {
-        let found = self.sensors.iter().position(|(name, _)| name == sensor);
-        let number = found.unwrap_or_else(|| {
-            self.sensors.push((sensor.to_owned(), Contents::new(Form::Mcap)));
-            self.sensors.len() - 1
-        });
-        &mut self.sensors[number].1
-    }
+fn of_sensor<'a>(sensors: &'a mut BTreeMap<String, Contents>, sensor: &str) -> &'a mut Contents {
+    sensors.entry(sensor.to_owned()).or_insert(Contents::new(Form::Mcap))
 }
 
 /// The telegrams of one sensor, in the order of the file.
 pub(crate) struct Frames<R> {
-    records: Records<R>,
-    survey: Arc<Survey>,
+    reader: Reader<R>,
     sensor: String,
 }
 
 impl<R: Read> Frames<R> {
-    pub(crate) fn new(input: R, survey: Arc<Survey>, sensor: String) -> Self {
-        Frames { records: Records::new(input), survey, sensor }
+    pub(crate) fn new(input: R, survey: &Arc<Survey>, sensor: String) -> Self {
+        Frames { reader: survey.reader(input), sensor }
     }
 }
 
@@ -147,21 +168,11 @@ impl<R: Read> Iterator for Frames<R> {
 
     fn next(&mut self) -> Option<Frame> {
         loop {
-            let record = self.records.next().ok()??;
-            let Ok(Parsed::Message { header: message, data }) = parse_record(record.opcode, &record.body)
-            else {
-                continue;
-            };
-            let place = self.survey.channels.place(message.channel_id);
-            if !place.is_some_and(|place| place.topic == Topic::Telegram && place.sensor == self.sensor) {
-                continue;
+            if let Item::Telegram(Sighting { sensor, header, telegram, .. }) = self.reader.next().ok()??
+                && sensor == self.sensor
+            {
+                return Some(Frame { telegram, wall_ns: Some(header.wall_ns), header: Some(header) });
             }
-            let Some((header, telegram)) = file::parts(&data) else { continue };
-            return Some(Frame {
-                telegram: telegram.to_vec(),
-                wall_ns: Some(header.wall_ns),
-                header: Some(header),
-            });
         }
     }
 }

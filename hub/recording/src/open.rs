@@ -46,7 +46,7 @@ impl Recording {
             return Err(refused(&path, "is empty"));
         }
         if head.starts_with(MCAP) {
-            return Recording::open_mcap(path, reader);
+            return Recording::open_mcap(path);
         }
         let form = if carmen::is_log(head) { Form::Carmen } else { Form::Telegrams };
         let contents = match form {
@@ -63,14 +63,14 @@ impl Recording {
     }
 
     #[cfg(feature = "mcap")]
-    fn open_mcap(path: PathBuf, reader: impl BufRead) -> Result<Recording, Failure> {
-        let survey = crate::mcap::Survey::of(reader).map_err(|error| unreadable(&path, &error))?;
+    fn open_mcap(path: PathBuf) -> Result<Recording, Failure> {
+        let survey = crate::mcap::Survey::of(|| open(&path)).map_err(|error| unreadable(&path, &error))?;
         let contents = survey.contents();
         Ok(Recording { path, contents, survey: survey.into(), sensor: None })
     }
 
     #[cfg(not(feature = "mcap"))]
-    fn open_mcap(path: PathBuf, _: impl BufRead) -> Result<Recording, Failure> {
+    fn open_mcap(path: PathBuf) -> Result<Recording, Failure> {
         let message = format!("recording {} is an MCAP file, which this build does not read", path.display());
         Err(Failure::new(Kind::Configuration, message, "build it with the feature mcap of scanhub-recording"))
     }
@@ -149,7 +149,7 @@ impl Recording {
                 return Err(Failure::new(Kind::Configuration, message, self.choice()));
             }
         };
-        Ok(Box::new(crate::mcap::Frames::new(reader, self.survey.clone(), sensor)))
+        Ok(Box::new(crate::mcap::Frames::new(reader, &self.survey, sensor)))
     }
 
     #[cfg(not(feature = "mcap"))]
@@ -189,18 +189,19 @@ fn survey_stream(path: &Path, reader: impl Read) -> Result<Contents, Failure> {
 }
 
 fn reader(path: &Path) -> Result<Box<dyn BufRead + Send>, Failure> {
-    let open = || -> io::Result<Box<dyn BufRead + Send>> {
-        // A pipe or a device has no end, and would be waited for.
-        if !std::fs::metadata(path)?.is_file() {
-            return Err(io::Error::new(io::ErrorKind::InvalidInput, "it is no regular file"));
-        }
-        let mut file = BufReader::with_capacity(BUFFER, File::open(path)?);
-        if file.fill_buf()?.starts_with(GZIP) {
-            return Ok(Box::new(BufReader::with_capacity(BUFFER, MultiGzDecoder::new(file))));
-        }
-        Ok(Box::new(file))
-    };
-    open().map_err(|error| unreadable(path, &error))
+    open(path).map_err(|error| unreadable(path, &error))
+}
+
+fn open(path: &Path) -> io::Result<Box<dyn BufRead + Send>> {
+    // A pipe or a device has no end, and would be waited for.
+    if !std::fs::metadata(path)?.is_file() {
+        return Err(io::Error::new(io::ErrorKind::InvalidInput, "it is no regular file"));
+    }
+    let mut file = BufReader::with_capacity(BUFFER, File::open(path)?);
+    if file.fill_buf()?.starts_with(GZIP) {
+        return Ok(Box::new(BufReader::with_capacity(BUFFER, MultiGzDecoder::new(file))));
+    }
+    Ok(Box::new(file))
 }
 
 fn unreadable(path: &Path, error: &io::Error) -> Failure {

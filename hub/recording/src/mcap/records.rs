@@ -1,10 +1,15 @@
-//! The records of an MCAP file that is sound, one after the other, chunks opened and their checksums looked at.
-//! Refuses to know what is in them.
+//! The records of an MCAP file that is sound, one after the other, also those in chunks. Refuses to know what is in
+//! them.
 
+use std::collections::VecDeque;
 use std::io::{self, Read};
 
 use mcap::McapError;
+use mcap::records::op;
 use mcap::sans_io::{LinearReadEvent, LinearReader, LinearReaderOptions};
+
+use super::chunk;
+use super::exact::LONGEST;
 
 /// A record: what kind ([`mcap::records::op`]), and its bytes.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -17,43 +22,61 @@ pub(crate) struct Record {
 pub(crate) struct Records<R> {
     input: R,
     reader: LinearReader,
+    /// Of the chunk that is being read.
+    of_chunk: VecDeque<Record>,
 }
 
 impl<R: Read> Records<R> {
     pub(crate) fn new(input: R) -> Self {
+        // Chunks are opened here: the library panics at one whose records are longer than itself.
         let options = LinearReaderOptions::default()
-            .with_validate_chunk_crcs(true)
+            .with_emit_chunks(true)
+            .with_validate_data_section_crc(true)
             .with_validate_summary_section_crc(true)
             .with_check_finishes_after_end_magic(true)
-            .with_record_length_limit(LONGEST_RECORD);
-        Records { input, reader: LinearReader::new_with_options(options) }
+            .with_record_length_limit(LONGEST as usize);
+        let reader = LinearReader::new_with_options(options);
+        Records { input, reader, of_chunk: VecDeque::new() }
     }
 
     /// The next record; an error where the file is not sound, or cannot be read.
     pub(crate) fn next(&mut self) -> Result<Option<Record>, McapError> {
-        while let Some(event) = self.reader.next_event() {
-            match event? {
-                LinearReadEvent::ReadRequest(wanted) => {
-                    // What a length says is not believed before that many bytes are there.
-                    let room = self.reader.insert(wanted.min(PIECE));
-                    let len = loop {
-                        match self.input.read(room) {
-                            Err(error) if error.kind() == io::ErrorKind::Interrupted => {}
-                            other => break other?,
-                        }
-                    };
-                    self.reader.notify_read(len);
+        loop {
+            if let Some(record) = self.of_chunk.pop_front() {
+                return Ok(Some(record));
+            }
+            match read(&mut self.reader, &mut self.input)? {
+                Some(record) if record.opcode == op::CHUNK => {
+                    self.of_chunk = chunk::open(&record.body)?.into()
                 }
-                LinearReadEvent::Record { opcode, data } => {
-                    return Ok(Some(Record { opcode, body: data.to_vec() }));
-                }
+                other => return Ok(other),
             }
         }
-        Ok(None)
     }
 }
 
-/// Longer ones are not held in memory.
-const LONGEST_RECORD: usize = 256 << 20;
+/// What `reader` finds next in `input`.
+pub(crate) fn read(reader: &mut LinearReader, input: &mut impl Read) -> Result<Option<Record>, McapError> {
+    while let Some(event) = reader.next_event() {
+        match event? {
+            LinearReadEvent::ReadRequest(wanted) => {
+                // What a length says is not believed before that many bytes are there.
+                let room = reader.insert(wanted.min(PIECE));
+                let len = loop {
+                    match input.read(room) {
+                        Err(error) if error.kind() == io::ErrorKind::Interrupted => {}
+                        other => break other?,
+                    }
+                };
+                reader.notify_read(len);
+            }
+            LinearReadEvent::Record { opcode, data } => {
+                return Ok(Some(Record { opcode, body: data.to_vec() }));
+            }
+        }
+    }
+    Ok(None)
+}
+
 /// Bytes read at a time.
 const PIECE: usize = 64 * 1024;

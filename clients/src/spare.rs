@@ -8,7 +8,7 @@ use std::time::{Duration, Instant};
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
 
 /// Writes each piece at once or not at all.
-pub(super) struct Spare<'a, W> {
+pub(crate) struct Spare<'a, W> {
     to: &'a mut W,
     /// There is nothing left to send: then who reads is waited for, for a while.
     stop: &'a AtomicBool,
@@ -20,7 +20,7 @@ const PATIENCE: Duration = Duration::from_secs(1);
 
 impl<'a, W: Write + AsFd> Spare<'a, W> {
     /// Pieces to `to`; not waited for before `stop` is set.
-    pub(super) fn new(to: &'a mut W, stop: &'a AtomicBool) -> Spare<'a, W> {
+    pub(crate) fn new(to: &'a mut W, stop: &'a AtomicBool) -> Spare<'a, W> {
         Spare { to, stop, left: PATIENCE }
     }
 

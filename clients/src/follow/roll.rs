@@ -1,0 +1,76 @@
+//! Which sensors there are: those of a hub that came are followed where all are wanted, and who follows one that is not
+//! there is told. Refuses to receive.
+
+use std::time::{Duration, Instant};
+
+use schema::{Failure, Kind, ROBOT, ipc, is_remote};
+
+use super::{Run, Sink, Track};
+use crate::names::{TopicName, no_sensor};
+use crate::output::End;
+use crate::presence::GRACE;
+
+/// Sensors of other machines that are there have been announced after so long: it is done once a second.
+const ANNOUNCED: Duration = Duration::from_secs(3);
+
+impl Run<'_> {
+    /// Follows the sensors of the hub that are not followed yet, if all are wanted.
+    pub(super) fn call_the_roll(&mut self, sink: &mut dyn Sink) -> Result<(), End> {
+        let Some(domain) = self.session.domain().filter(|_| !self.topics.is_empty()) else { return Ok(()) };
+        let Some(called) = self.roll.call(domain, Instant::now())? else { return Ok(()) };
+        for sensor in called.sensors {
+            for &topic in self.topics {
+                let name = TopicName { sensor: sensor.clone(), topic };
+                if self.tracks.iter().all(|track| track.name != name) {
+                    sink.begin(&name);
+                    self.tracks.push(Track::new(name));
+                }
+            }
+        }
+        Ok(())
+    }
+
+    /// A hub that is up has all its topics: a sensor that is not among them is no sensor of it.
+    pub(super) fn check_sensors(&mut self) -> Result<(), End> {
+        if !self.tracks.is_empty() && self.tracks.iter().all(|track| track.source.attached()) {
+            return Ok(());
+        }
+        if self.session.domain().is_none() {
+            return Ok(());
+        }
+        // A hub that came to a listener has to make its topics first.
+        let lives = self.session.hub_lives();
+        self.hub_lives_since = if lives { self.hub_lives_since.or(Some(Instant::now())) } else { None };
+        let sensors = self.sensors()?;
+        let wants_all = self.tracks.iter().all(|track| track.name.is_robot());
+        if wants_all && !self.may_come(ROBOT) && sensors.iter().all(|sensor| is_remote(sensor)) {
+            return Err(Failure::new(
+                Kind::NoTopic,
+                "the hub has no sensors",
+                "scanhub run --link NAME=PORT",
+            )
+            .into());
+        }
+        for track in &self.tracks {
+            let sensor = &track.name.sensor;
+            let is_there = track.name.is_robot() || sensors.contains(sensor) || self.may_come(sensor);
+            if !track.source.attached() && !is_there {
+                return Err(no_sensor(sensor, &sensors).into());
+            }
+        }
+        Ok(())
+    }
+
+    /// Who is not there may come: another machine that is switched on later, or the hub, where only a listener is yet.
+    fn may_come(&self, sensor: &str) -> bool {
+        let unbounded = !self.bounds.bounded();
+        match is_remote(sensor) {
+            true => unbounded || self.started.elapsed() < ANNOUNCED,
+            false => unbounded && self.hub_lives_since.is_none_or(|since| since.elapsed() < GRACE),
+        }
+    }
+
+    fn sensors(&self) -> Result<Vec<String>, Failure> {
+        self.session.domain().map(ipc::sensors).transpose().map(Option::unwrap_or_default)
+    }
+}

@@ -1,0 +1,284 @@
+//! The thread that writes: takes what waits ten times a second, makes a chunk of it and has it written. A disk that is
+//! full, slow or gone is told and tried again; meanwhile what comes waits in the queue. Refuses to know who receives.
+
+use std::collections::BTreeMap;
+use std::fs::File;
+use std::io::{self, ErrorKind};
+use std::path::PathBuf;
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::time::{Duration, Instant};
+
+use schema::Topic;
+
+use super::Kept;
+use super::files::{Files, Split};
+use super::part::{Part, Place};
+use super::queue::{Batch, EVERY, Entry, Queue, Track};
+
+/// What the writing thread says to the other one.
+#[derive(Default)]
+pub(super) struct Told(Mutex<Account>);
+
+/// How far it came.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub(super) struct Account {
+    /// Bytes in all files.
+    pub(super) bytes: u64,
+    /// Samples in all files.
+    pub(super) samples: u64,
+    /// What happened since it was looked at last.
+    pub(super) news: Vec<News>,
+}
+
+/// What is worth a word.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub(super) enum News {
+    /// It goes on in this file.
+    File(PathBuf),
+    /// What comes cannot be written, and why.
+    Trouble(PathBuf, String),
+    /// It can be written again, after this time.
+    Well(PathBuf, Duration),
+    /// Nobody reads what is written any more.
+    ReaderGone,
+}
+
+impl Told {
+    /// How far it came; news are told once.
+    pub(super) fn look(&self) -> Account {
+        let mut account = self.account();
+        let news = std::mem::take(&mut account.news);
+        Account { news, ..account.clone() }
+    }
+
+    fn account(&self) -> MutexGuard<'_, Account> {
+        self.0.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+/// The writing of one run.
+pub(super) struct Disk {
+    queue: Arc<Queue>,
+    told: Arc<Told>,
+    files: Option<Files>,
+    split: Option<Split>,
+    facts: BTreeMap<String, String>,
+    profile: &'static str,
+    part: Part,
+    tracks: Vec<Track>,
+    /// The last one of each track of that topic.
+    statuses: Vec<Option<Kept>>,
+    /// What is being written; kept until it is.
+    batch: Batch,
+    /// Bytes and samples of the files before.
+    bytes: u64,
+    trouble: Option<Trouble>,
+    look_at: Instant,
+}
+
+/// Something cannot be written.
+struct Trouble {
+    since: Instant,
+    retry_at: Instant,
+    is_too_large: bool,
+}
+
+impl Disk {
+    /// Begins the first file, so that it is known at once if there is none to be had: with `files` where these say, else
+    /// into `stream`.
+    pub(super) fn begin(
+        queue: Arc<Queue>,
+        files: Result<Files, File>,
+        split: Option<Split>,
+        profile: &'static str,
+        facts: BTreeMap<String, String>,
+    ) -> io::Result<Disk> {
+        let (files, place) = match files {
+            Ok(mut files) => {
+                let (path, file) = files.first()?;
+                (Some(files), Place::File(file, path))
+            }
+            Err(stream) => (None, Place::Stream(stream)),
+        };
+        let mut part = Part::begin(place, profile, numbered(&facts, files.as_ref()))?;
+        part.write()?;
+        let told = Told::default();
+        told.account().bytes = part.written;
+        Ok(Disk {
+            queue,
+            told: Arc::new(told),
+            files,
+            split,
+            facts,
+            profile,
+            part,
+            tracks: Vec::new(),
+            statuses: Vec::new(),
+            batch: Batch::new(),
+            bytes: 0,
+            trouble: None,
+            look_at: Instant::now() + LOOK_EVERY,
+        })
+    }
+
+    /// Where it says how far it came.
+    pub(super) fn told(&self) -> Arc<Told> {
+        self.told.clone()
+    }
+
+    /// The name of the file that is being written.
+    pub(super) fn path(&self) -> PathBuf {
+        self.part.path().map_or_else(|| "stdout".into(), PathBuf::from)
+    }
+
+    /// Writes until nothing more comes and all of it is written. The error says why the end is missing.
+    pub(super) fn run(mut self) -> io::Result<()> {
+        let mut due = Instant::now();
+        loop {
+            due = (due + EVERY).max(Instant::now());
+            let is_over = self.queue.wait(due);
+            let now = Instant::now();
+            if self.trouble.as_ref().is_some_and(|trouble| !is_over && now < trouble.retry_at) {
+                continue;
+            }
+            match self.step(now, is_over) {
+                Ok(()) => {
+                    self.recovered();
+                    if is_over {
+                        return Ok(());
+                    }
+                }
+                Err(error) if error.kind() == ErrorKind::BrokenPipe => {
+                    self.told.account().news.push(News::ReaderGone);
+                    return Ok(());
+                }
+                Err(error) if is_over && self.trouble.is_some() => return Err(error),
+                Err(error) => self.troubled(&error, now),
+            }
+        }
+    }
+
+    /// Brings to the disk what could not be written before, and then what came since.
+    fn step(&mut self, now: Instant, is_over: bool) -> io::Result<()> {
+        if self.trouble.is_some() && self.is_lost() {
+            self.renew()?;
+        }
+        self.write()?;
+        if self.part.is_finished() {
+            if is_over && self.queue.is_empty() {
+                return Ok(());
+            }
+            self.renew()?;
+        }
+        self.queue.take(&mut self.batch);
+        self.meet();
+        self.part.add(&self.tracks, &self.batch)?;
+        self.write()?;
+        if now >= self.look_at {
+            self.look_at = now + LOOK_EVERY;
+            self.part.look()?;
+        }
+        let is_full = match self.split {
+            Some(Split::Bytes(most)) => self.part.written >= most,
+            Some(Split::Time(most)) => now - self.part.begun >= most,
+            None => false,
+        };
+        if is_over || is_full {
+            self.part.finish()?;
+            self.write()?;
+            self.part.sync()?;
+        }
+        if is_full && !is_over {
+            self.renew()?;
+            self.write()?;
+        }
+        Ok(())
+    }
+
+    /// Writes what was made; then the batch is on the disk.
+    fn write(&mut self) -> io::Result<()> {
+        self.part.write()?;
+        self.remember();
+        let mut account = self.told.account();
+        account.bytes = self.bytes + self.part.written;
+        account.samples += self.batch.count();
+        self.batch.clear();
+        Ok(())
+    }
+
+    /// The file that is there takes nothing any more, whatever becomes of the disk.
+    fn is_lost(&self) -> bool {
+        let is_too_large = self.trouble.as_ref().is_some_and(|trouble| trouble.is_too_large);
+        self.files.is_some() && (self.part.look().is_err() || (is_too_large && self.part.written > 0))
+    }
+
+    /// Goes on in the next file, with the batch that is not written yet.
+    fn renew(&mut self) -> io::Result<()> {
+        let Some(files) = &mut self.files else { return Ok(()) };
+        let (path, file) = files.next()?;
+        let facts = numbered(&self.facts, Some(files));
+        let mut part = Part::begin(Place::File(file, path.clone()), self.profile, facts)?;
+        part.repeat(&self.tracks, &self.statuses)?;
+        part.add(&self.tracks, &self.batch)?;
+        files.prune();
+        self.bytes += self.part.written;
+        self.part = part;
+        self.told.account().news.push(News::File(path));
+        Ok(())
+    }
+
+    /// Keeps the tracks of the batch.
+    fn meet(&mut self) {
+        for entry in &self.batch.entries {
+            if let Entry::Track(track) = entry {
+                self.tracks.push(track.clone());
+                self.statuses.push(None);
+            }
+        }
+    }
+
+    /// Keeps the last statuses of the batch, for the next file.
+    fn remember(&mut self) {
+        for (track, header, payload) in self.batch.samples() {
+            if self.tracks[track].name.topic == Topic::Status {
+                let (kept, old) = self.statuses[track].get_or_insert_default();
+                *kept = *header;
+                old.clear();
+                old.extend_from_slice(payload);
+            }
+        }
+    }
+
+    fn troubled(&mut self, error: &io::Error, now: Instant) {
+        let is_too_large = error.kind() == ErrorKind::FileTooLarge;
+        if self.trouble.is_none() {
+            self.told.account().news.push(News::Trouble(self.path(), error.to_string()));
+        }
+        // What another file may help is tried at once.
+        let is_first = self.trouble.is_none();
+        let since = self.trouble.as_ref().map_or(now, |trouble| trouble.since);
+        self.trouble = Some(Trouble { since, retry_at: now, is_too_large });
+        let at_once = is_first && self.is_lost();
+        if let Some(trouble) = self.trouble.as_mut().filter(|_| !at_once) {
+            trouble.retry_at = now + RETRY_EVERY;
+        }
+    }
+
+    fn recovered(&mut self) {
+        if let Some(trouble) = self.trouble.take() {
+            self.told.account().news.push(News::Well(self.path(), trouble.since.elapsed()));
+        }
+    }
+}
+
+/// What is told of a run, with the number of the file among those of the run.
+fn numbered(facts: &BTreeMap<String, String>, files: Option<&Files>) -> BTreeMap<String, String> {
+    let mut facts = facts.clone();
+    facts.insert("part".to_owned(), files.map_or(1, Files::number).to_string());
+    facts
+}
+
+/// So often a disk that takes nothing is tried.
+const RETRY_EVERY: Duration = Duration::from_secs(1);
+/// So often it is seen that a file was taken away.
+const LOOK_EVERY: Duration = Duration::from_secs(1);

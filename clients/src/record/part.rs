@@ -1,0 +1,208 @@
+//! One file of a recording. It is made in memory, chunk by chunk, and then written: a disk that refuses a chunk gets it
+//! again, and what stands there is always a whole number of them. Refuses to know why and when.
+
+use std::collections::BTreeMap;
+use std::fs::{self, File};
+use std::io::{self, ErrorKind, Write};
+use std::os::unix::fs::{FileExt, MetadataExt};
+use std::path::{Path, PathBuf};
+use std::sync::{Arc, Mutex, PoisonError};
+use std::time::Instant;
+
+use schema::datagram::Packed;
+use schema::file::Writer;
+use schema::{Header, Scan};
+
+use super::queue::{Batch, Entry, Gap, Track};
+use super::{Kept, ros2};
+
+/// A file that is being written.
+pub(super) struct Part {
+    writer: Option<Writer<Made>>,
+    made: Made,
+    place: Place,
+    /// Bytes that are in the file.
+    pub(super) written: u64,
+    pub(super) begun: Instant,
+    /// What was said last of which life of a sensor's hub.
+    lives: Vec<u64>,
+    /// Channels of ROS 2, by track.
+    channels: Vec<Option<u16>>,
+    scan: Scan,
+    message: Vec<u8>,
+}
+
+/// Where the bytes go.
+pub(super) enum Place {
+    /// A file and its name.
+    File(File, PathBuf),
+    /// Something that only takes bytes one after the other.
+    Stream(File),
+}
+
+/// What was made and is not written yet.
+#[derive(Clone, Default)]
+struct Made(Arc<Mutex<Vec<u8>>>);
+
+impl Write for Made {
+    fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
+        self.0.lock().unwrap_or_else(PoisonError::into_inner).extend_from_slice(bytes);
+        Ok(bytes.len())
+    }
+
+    fn flush(&mut self) -> io::Result<()> {
+        Ok(())
+    }
+}
+
+impl Part {
+    /// A new one at `place`, of which `facts` are told; nothing is written yet.
+    pub(super) fn begin(place: Place, profile: &str, facts: BTreeMap<String, String>) -> io::Result<Part> {
+        let made = Made::default();
+        let writer = Some(Writer::begin(made.clone(), profile, facts)?);
+        Ok(Part {
+            writer,
+            made,
+            place,
+            written: 0,
+            begun: Instant::now(),
+            lives: Vec::new(),
+            channels: Vec::new(),
+            scan: Scan::default(),
+            message: Vec::new(),
+        })
+    }
+
+    /// The statuses that stand, by track, so that it can be played without what came before.
+    pub(super) fn repeat(&mut self, tracks: &[Track], statuses: &[Option<Kept>]) -> io::Result<()> {
+        for (at, kept) in statuses.iter().enumerate() {
+            if let Some((header, payload)) = kept {
+                self.sample(tracks, at, header, payload)?;
+            }
+        }
+        Ok(())
+    }
+
+    /// Makes a chunk of `batch`, whose tracks are among `tracks`.
+    pub(super) fn add(&mut self, tracks: &[Track], batch: &Batch) -> io::Result<()> {
+        let mut bytes = &batch.bytes[..];
+        for entry in &batch.entries {
+            match entry {
+                Entry::Track(_) => {}
+                Entry::Sample { track, header, len } => {
+                    let (payload, rest) = bytes.split_at(*len);
+                    bytes = rest;
+                    self.sample(tracks, *track, header, payload)?;
+                }
+                Entry::Gap(gap) => self.gap(gap)?,
+            }
+        }
+        self.writer()?.close_chunk()
+    }
+
+    /// Makes the index, behind which nothing comes.
+    pub(super) fn finish(&mut self) -> io::Result<()> {
+        match self.writer.take() {
+            Some(writer) => writer.finish().map(drop),
+            None => Ok(()),
+        }
+    }
+
+    /// Its end is made.
+    pub(super) fn is_finished(&self) -> bool {
+        self.writer.is_none()
+    }
+
+    /// Writes what was made. After an error the file ends with the last chunk that is whole, and what was not written is
+    /// still there to be.
+    pub(super) fn write(&mut self) -> io::Result<()> {
+        let mut made = self.made.0.lock().unwrap_or_else(PoisonError::into_inner);
+        match &mut self.place {
+            Place::Stream(stream) => stream.write_all(&made)?,
+            Place::File(file, _) => file.write_all_at(&made, self.written).inspect_err(|_| {
+                let _ = file.set_len(self.written);
+            })?,
+        }
+        self.written += made.len() as u64;
+        made.clear();
+        Ok(())
+    }
+
+    /// Asks the disk to have all of it.
+    pub(super) fn sync(&self) -> io::Result<()> {
+        match &self.place {
+            Place::Stream(_) => Ok(()),
+            Place::File(file, _) => match file.sync_data() {
+                // Not every device keeps things.
+                Err(error) if error.kind() == ErrorKind::InvalidInput => Ok(()),
+                synced => synced,
+            },
+        }
+    }
+
+    /// Its name, if it has one.
+    pub(super) fn path(&self) -> Option<&Path> {
+        match &self.place {
+            Place::File(_, path) => Some(path),
+            Place::Stream(_) => None,
+        }
+    }
+
+    /// [`ErrorKind::NotFound`] if the file is not to be found under its name any more.
+    pub(super) fn look(&self) -> io::Result<()> {
+        let Place::File(file, path) = &self.place else { return Ok(()) };
+        let (here, there) = (file.metadata()?, fs::metadata(path)?);
+        if (here.dev(), here.ino()) == (there.dev(), there.ino()) {
+            return Ok(());
+        }
+        Err(io::Error::new(ErrorKind::NotFound, "another file has its name"))
+    }
+
+    fn writer(&mut self) -> io::Result<&mut Writer<Made>> {
+        self.writer.as_mut().ok_or_else(|| io::Error::other("nothing comes behind the index"))
+    }
+
+    fn sample(&mut self, tracks: &[Track], at: usize, header: &Header, payload: &[u8]) -> io::Result<()> {
+        let Some(track) = tracks.get(at) else { return Ok(()) };
+        let name = &track.name;
+        if !self.lives.contains(&header.boot) {
+            self.lives.push(header.boot);
+            let facts = [
+                ("boot", format!("{:016x}", header.boot)),
+                ("hub_pid", header.hub_pid.to_string()),
+                ("wall_ns", header.wall_ns.to_string()),
+            ];
+            self.writer()?.note(LIFE, facts.map(|(key, value)| (key.to_owned(), value)).into())?;
+        }
+        if track.native {
+            self.writer()?.sample(&name.sensor, name.topic, header, payload)?;
+        }
+        if track.ros2 && self.scan.unpack(payload) {
+            self.channels.resize(tracks.len(), None);
+            let channel = match self.channels[at] {
+                Some(channel) => channel,
+                None => self.writer()?.channel(&ros2::channel(&ros2::topic(&name.sensor)))?,
+            };
+            self.channels[at] = Some(channel);
+            let mut message = std::mem::take(&mut self.message);
+            message.clear();
+            ros2::write(&mut message, &name.sensor, header, &self.scan);
+            let written = self.writer()?.message(channel, header.topic_seq as u32, header.wall_ns, &message);
+            self.message = message;
+            written?;
+        }
+        Ok(())
+    }
+
+    fn gap(&mut self, gap: &Gap) -> io::Result<()> {
+        let span = [("from_ns", gap.from_ns), ("to_ns", gap.to_ns)];
+        let facts = span.map(|(key, value)| (key.to_owned(), value.to_string()));
+        let left_out = gap.left_out.iter().map(|(name, count)| (name.to_string(), count.to_string()));
+        self.writer()?.note(GAP, facts.into_iter().chain(left_out).collect())
+    }
+}
+
+/// Name of the metadata record of a life of the hub, before its first sample.
+const LIFE: &str = "scanhub.life";
+/// Name of the metadata record of samples that were left out.
+const GAP: &str = "scanhub.gap";

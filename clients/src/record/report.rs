@@ -1,0 +1,292 @@
+//! What a recorder tells of itself: lines of JSON, or text and one line that is drawn over itself. Refuses to know why.
+
+use std::io::{self, Write};
+use std::path::{Path, PathBuf};
+use std::time::{Duration, Instant};
+
+use serde::Serialize;
+
+use super::RecordLook;
+use super::disk::{Account as Written, News};
+use super::queue::Gap;
+use crate::account::Account;
+use crate::follow::Notice;
+use crate::names::TopicName;
+use crate::output::{End, Output};
+use crate::{json, text};
+
+/// Where it is told.
+pub(super) struct Report<'a> {
+    look: RecordLook,
+    out: Output<'a>,
+    notes: Output<'a>,
+    begun: Instant,
+    next: Instant,
+    files: Vec<PathBuf>,
+    /// Bytes at the last word.
+    bytes: u64,
+    /// Samples that were sent and not received.
+    lost: u64,
+    is_in_trouble: bool,
+}
+
+/// Between two words about the progress.
+const EVERY: Duration = Duration::from_secs(1);
+
+impl<'a> Report<'a> {
+    /// Accounts to `out`, and what is no account to `notes` if `out` is not JSON.
+    pub(super) fn new(look: RecordLook, out: &'a mut dyn Write, notes: &'a mut dyn Write) -> Report<'a> {
+        let now = Instant::now();
+        Report {
+            look,
+            out: Output::new(out),
+            notes: Output::new(notes),
+            begun: now,
+            next: now + EVERY,
+            files: Vec::new(),
+            bytes: 0,
+            lost: 0,
+            is_in_trouble: false,
+        }
+    }
+
+    /// Where it goes.
+    pub(super) fn begin(&mut self, path: &Path) -> Result<(), End> {
+        self.files.push(path.to_owned());
+        if self.look == RecordLook::Json {
+            return self.recording(&Written::default(), 0);
+        }
+        self.out.line(|line| write!(line, "records into {}", path.display()))
+    }
+
+    /// News of the hub, and of what was not received.
+    pub(super) fn hub(&mut self, names: &[&TopicName], notice: Notice) -> Result<(), End> {
+        if let Notice::Missed(missed) = notice {
+            self.lost += missed;
+        }
+        if self.look == RecordLook::Json {
+            return json::notices(&mut self.out, names, notice);
+        }
+        self.note(|line| text::notice(line, names, notice))
+    }
+
+    /// News of the disk.
+    pub(super) fn disk(&mut self, news: &News) -> Result<(), End> {
+        self.is_in_trouble = match news {
+            News::Trouble(..) => true,
+            News::Well(..) => false,
+            News::File(_) | News::ReaderGone => self.is_in_trouble,
+        };
+        if let News::File(path) = news {
+            self.files.push(path.clone());
+        }
+        if self.look == RecordLook::Json {
+            let (kind, path, message, seconds) = match news {
+                News::File(path) => ("file", path, None, None),
+                News::Trouble(path, message) => ("disk_trouble", path, Some(message.as_str()), None),
+                News::Well(path, after) => ("disk_well", path, None, Some(after.as_secs_f64())),
+                News::ReaderGone => return Ok(()),
+            };
+            let file = path.display().to_string();
+            return self.out.json(&Disk { class: "notice", kind, file, message, seconds });
+        }
+        self.note(|line| match news {
+            News::File(path) => write!(line, "goes on in {}", path.display()),
+            News::Trouble(path, message) => {
+                let path = path.display();
+                write!(line, "cannot write {path}: {message}; what comes is held, and it is tried again")
+            }
+            News::Well(path, after) => {
+                write!(line, "{} is written again, after {:.1} s", path.display(), after.as_secs_f64())
+            }
+            News::ReaderGone => Ok(()),
+        })
+    }
+
+    /// From here on samples are left out.
+    pub(super) fn gap_begins(&mut self) -> Result<(), End> {
+        if self.look == RecordLook::Json {
+            let (left_out, seconds) = (0, 0.0);
+            return self.out.json(&Left { class: "notice", kind: "gap_begins", left_out, seconds });
+        }
+        self.note(|line| write!(line, "no more can be held: samples are left out of the recording"))
+    }
+
+    /// Nothing more is left out.
+    pub(super) fn gap_ends(&mut self, gap: &Gap) -> Result<(), End> {
+        let left_out = gap.left_out.iter().map(|(_, count)| count).sum();
+        let seconds = gap.to_ns.saturating_sub(gap.from_ns) as f64 / 1e9;
+        if self.look == RecordLook::Json {
+            return self.out.json(&Left { class: "notice", kind: "gap_ends", left_out, seconds });
+        }
+        self.note(|line| {
+            write!(line, "records again: {left_out} samples of {seconds:.1} s are not in the recording (")?;
+            for (at, (name, count)) in gap.left_out.iter().enumerate() {
+                write!(line, "{}{name} {count}", if at == 0 { "" } else { ", " })?;
+            }
+            write!(line, ")")
+        })
+    }
+
+    /// How far it is, once a second, to who looks or reads objects.
+    pub(super) fn progress(&mut self, written: &Written, left_out: u64) -> Result<(), End> {
+        if Instant::now() < self.next {
+            return Ok(());
+        }
+        self.next = Instant::now() + EVERY;
+        match self.look {
+            RecordLook::Lines => Ok(()),
+            RecordLook::Json => self.recording(written, left_out),
+            RecordLook::Terminal => {
+                // A line that wraps would not be drawn over: it is cut.
+                let mut line = [WIPE, b"\x1b[?7l"].concat();
+                self.status(&mut line, written, left_out)?;
+                line.extend(b"\x1b[?7h");
+                self.bytes = written.bytes;
+                self.out.raw(&line)
+            }
+        }
+    }
+
+    /// What was received of a topic.
+    pub(super) fn topic(&mut self, name: &TopicName, account: &Account) -> Result<(), End> {
+        if self.look == RecordLook::Json {
+            return self.out.json(&json::summary(name, account));
+        }
+        self.wipe()?;
+        self.out.line(|line| text::summary(line, name, account))
+    }
+
+    /// All of it is written.
+    pub(super) fn end(&mut self, written: &Written, left_out: u64) -> Result<(), End> {
+        let Written { bytes, samples, .. } = *written;
+        if self.look == RecordLook::Json {
+            return self.out.json(&Recorded {
+                class: "recorded",
+                files: self.files.iter().map(|file| file.display().to_string()).collect(),
+                bytes,
+                samples,
+                lost: self.lost,
+                left_out,
+                seconds: self.begun.elapsed().as_secs_f64(),
+            });
+        }
+        self.wipe()?;
+        let files = &self.files;
+        self.out.line(|line| {
+            match &files[..] {
+                [file] => write!(line, "{}", file.display())?,
+                [first, .., last] => {
+                    write!(line, "{} to {}", first.display(), last.display())?;
+                }
+                [] => {}
+            }
+            write!(line, ": {samples} samples, {}", size(bytes))?;
+            if left_out > 0 { write!(line, ", {left_out} left out") } else { Ok(()) }
+        })
+    }
+
+    fn recording(&mut self, written: &Written, left_out: u64) -> Result<(), End> {
+        self.out.json(&Progress {
+            class: "recording",
+            file: self.files.last().map(|file| file.display().to_string()),
+            bytes: written.bytes,
+            samples: written.samples,
+            lost: self.lost,
+            left_out,
+            seconds: self.begun.elapsed().as_secs_f64(),
+        })
+    }
+
+    fn status(&self, line: &mut Vec<u8>, written: &Written, left_out: u64) -> io::Result<()> {
+        let seconds = self.begun.elapsed().as_secs();
+        let rate = written.bytes.saturating_sub(self.bytes) / EVERY.as_secs();
+        let trouble = if self.is_in_trouble { "disk trouble, " } else { "" };
+        write!(line, "{trouble}{}:{:02}:{:02}", seconds / 3600, seconds / 60 % 60, seconds % 60)?;
+        write!(line, "  {}  {}/s  {} samples", size(written.bytes), size(rate), written.samples)?;
+        write!(line, "  {} lost", self.lost + left_out)
+    }
+
+    /// A line that is no account.
+    fn note(&mut self, build: impl FnOnce(&mut Vec<u8>) -> io::Result<()>) -> Result<(), End> {
+        self.wipe()?;
+        self.notes.line(build)
+    }
+
+    fn wipe(&mut self) -> Result<(), End> {
+        match self.look {
+            RecordLook::Terminal => self.out.raw(WIPE),
+            RecordLook::Json | RecordLook::Lines => Ok(()),
+        }
+    }
+}
+
+/// `bytes` for people.
+fn size(bytes: u64) -> String {
+    let units = [("GiB", 30), ("MiB", 20), ("KiB", 10)];
+    match units.into_iter().find(|(_, bits)| bytes >> bits > 0) {
+        Some((unit, bits)) => format!("{:.1} {unit}", bytes as f64 / (1_u64 << bits) as f64),
+        None => format!("{bytes} B"),
+    }
+}
+
+/// Class `recording`: how far it is.
+#[derive(Serialize)]
+struct Progress {
+    class: &'static str,
+    file: Option<String>,
+    bytes: u64,
+    samples: u64,
+    lost: u64,
+    left_out: u64,
+    seconds: f64,
+}
+
+/// Class `recorded`: the last line.
+#[derive(Serialize)]
+struct Recorded {
+    class: &'static str,
+    files: Vec<String>,
+    bytes: u64,
+    samples: u64,
+    lost: u64,
+    left_out: u64,
+    seconds: f64,
+}
+
+/// Class `notice`, of the disk.
+#[derive(Serialize)]
+struct Disk<'a> {
+    class: &'static str,
+    kind: &'static str,
+    file: String,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    message: Option<&'a str>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    seconds: Option<f64>,
+}
+
+/// Class `notice`, of samples left out.
+#[derive(Serialize)]
+struct Left {
+    class: &'static str,
+    kind: &'static str,
+    left_out: u64,
+    seconds: f64,
+}
+
+/// To the line's begin, and nothing on it (ECMA-48).
+const WIPE: &[u8] = b"\r\x1b[K";
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn sizes() {
+        assert_eq!(
+            [0, 1023, 1024, 5 << 19, 3 << 30].map(size),
+            ["0 B", "1023 B", "1.0 KiB", "2.5 MiB", "3.0 GiB"]
+        );
+    }
+}

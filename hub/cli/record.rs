@@ -1,0 +1,70 @@
+//! `scanhub record` on the command line.
+
+use std::io::{IsTerminal, stderr, stdout};
+use std::path::{Path, PathBuf};
+
+use clap::Args;
+use clients::{RecordLook, RecordOptions, Split};
+use schema::Failure;
+
+use super::{Everywhere, Limits};
+
+#[derive(Args, Debug)]
+pub(crate) struct Record {
+    /// What to record: front/telegram, or */scan for all sensors; without it telegram, marks, zones, foreground and status
+    /// of all sensors
+    #[arg(value_name = "SENSOR/TOPIC")]
+    topics: Vec<String>,
+    /// Every topic of all sensors
+    #[arg(long, conflicts_with = "topics")]
+    all: bool,
+    /// Scans as sensor_msgs/msg/LaserScan, too, which ROS 2 and Foxglove read
+    #[arg(long)]
+    ros2: bool,
+    /// The recording; - for stdout [default: scanhub-DATE-TIME.mcap]
+    #[arg(short, long, value_name = "FILE")]
+    output: Option<PathBuf>,
+    /// Overwrite what is there
+    #[arg(short, long)]
+    force: bool,
+    /// Go on in another file after so much or so long: 512MiB, 1h; they are called FILE-0001.mcap ..
+    #[arg(long, value_name = "SIZE|DURATION", value_parser = Split::parse)]
+    split: Option<Split>,
+    /// Remove the oldest of these files when there are more
+    #[arg(long, value_name = "COUNT", requires = "split", value_parser = clap::value_parser!(u32).range(1..))]
+    keep: Option<u32>,
+    #[command(flatten)]
+    limits: Limits,
+}
+
+impl Record {
+    /// Stdout takes the recording, and nothing else.
+    pub(crate) fn is_to_stdout(&self) -> bool {
+        self.output.as_deref() == Some(Path::new(RecordOptions::STDOUT))
+    }
+
+    pub(crate) fn options(&self, everywhere: &Everywhere) -> Result<RecordOptions, Failure> {
+        let is_terminal = if self.is_to_stdout() { stderr().is_terminal() } else { stdout().is_terminal() };
+        Ok(RecordOptions {
+            topics: self.topics.clone(),
+            everything: self.all,
+            ros2: self.ros2,
+            file: self.output.clone(),
+            force: self.force,
+            split: self.split,
+            keep: self.keep.map(|keep| keep as usize),
+            look: match (everywhere.json, is_terminal) {
+                (true, _) => RecordLook::Json,
+                (false, true) => RecordLook::Terminal,
+                (false, false) => RecordLook::Lines,
+            },
+            bounds: self.limits.bounds(),
+            places: everywhere.places()?,
+        })
+    }
+}
+
+/// What the help says beside the flags.
+pub(crate) const READING: &str = "\
+The files are MCAP: any reader of that reads them, `scanhub replay FILE` plays them. Ctrl-C finishes the file. On a full
+disk it waits and goes on; what is missing then is said, and is a gap in the file's numbers.";

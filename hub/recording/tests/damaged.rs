@@ -1,0 +1,218 @@
+//! A recording that is cut, flipped, blanked, shortened or doubled anywhere gives every telegram whose bytes are all
+//! there, once, in order and bit for bit, and nothing that was never in it.
+#![cfg(feature = "mcap")]
+
+mod written;
+
+use std::collections::BTreeMap;
+use std::fs;
+use std::path::PathBuf;
+use std::time::{Duration, Instant};
+
+use fastrand::Rng;
+use lms::variant::{Mode, Unit};
+use recording::{Encoding, Frame, Recording};
+use schema::Flags;
+use written::Written;
+
+const MM: Encoding = Encoding { unit: Unit::Mm, mode: Mode(1) };
+
+/// What became of a file: for each byte of the new one, where it was in the old one.
+struct Mutation {
+    name: String,
+    bytes: Vec<u8>,
+    /// `None`: it is another byte now.
+    origin: Vec<Option<usize>>,
+    /// Where what is there twice begins.
+    doubled: Option<usize>,
+}
+
+impl Mutation {
+    fn of(bytes: &[u8], random: &mut Rng) -> Mutation {
+        let len = bytes.len();
+        let mut mutated = Mutation {
+            name: String::new(),
+            bytes: bytes.to_vec(),
+            origin: (0..len).map(Some).collect(),
+            doubled: None,
+        };
+        let from = random.usize(..len);
+        let some = from..(from + random.usize(1..20_000)).min(len);
+        match random.u8(..5) {
+            0 => {
+                mutated.name = format!("cut at {from}");
+                mutated.bytes.truncate(from);
+                mutated.origin.truncate(from);
+            }
+            1 => {
+                let places: Vec<_> = (0..random.usize(1..=16)).map(|_| random.usize(..len)).collect();
+                mutated.name = format!("flips at {places:?}");
+                for place in places {
+                    mutated.bytes[place] ^= 1 << random.u8(..8);
+                    mutated.origin[place] = None;
+                }
+            }
+            2 => {
+                let pages = from / 4096 * 4096..(from / 4096 * 4096 + 4096 * random.usize(1..4)).min(len);
+                mutated.name = format!("zeroes in {pages:?}");
+                for place in pages {
+                    mutated.origin[place] = mutated.origin[place].filter(|_| mutated.bytes[place] == 0);
+                    mutated.bytes[place] = 0;
+                }
+            }
+            3 => {
+                mutated.name = format!("without {some:?}");
+                mutated.bytes.drain(some.clone());
+                mutated.origin.drain(some);
+            }
+            _ => {
+                mutated.name = format!("{some:?} twice");
+                mutated.doubled = Some(some.start);
+                let (again, of_it) = (bytes[some.clone()].to_vec(), mutated.origin[some.clone()].to_vec());
+                mutated.bytes.splice(some.end..some.end, again);
+                mutated.origin.splice(some.end..some.end, of_it);
+            }
+        }
+        mutated
+    }
+
+    /// Where each of the `len` bytes of the old file is in the new one: it may be there twice.
+    fn places(&self, len: usize) -> Vec<[Option<usize>; 2]> {
+        let mut places = vec![[None; 2]; len];
+        for (at, old) in self.origin.iter().enumerate() {
+            if let Some(old) = old {
+                let [first, second] = &mut places[*old];
+                *(if first.is_none() { first } else { second }) = Some(at);
+            }
+        }
+        places
+    }
+
+    /// Whether the old bytes from `begin` to `end` are at one of `places`, side by side.
+    fn has(&self, places: [Option<usize>; 2], begin: usize, end: usize) -> bool {
+        let is_there =
+            |at: usize| (begin..end).enumerate().all(|(i, old)| self.origin.get(at + i) == Some(&Some(old)));
+        places.into_iter().flatten().any(is_there)
+    }
+}
+
+/// Where each telegram of `written` begins in its bytes.
+fn positions(written: &Written) -> Vec<usize> {
+    let mut from = 0;
+    let mut positions = Vec::new();
+    for known in &written.telegrams {
+        let message: Vec<u8> = [schema_bytes(known), known.telegram.clone()].concat();
+        let found = written.bytes[from..].windows(message.len()).position(|bytes| bytes == message);
+        from += found.expect("a telegram that is in the file") + HEADER;
+        positions.push(from);
+    }
+    positions
+}
+
+fn schema_bytes(known: &written::Known) -> Vec<u8> {
+    // As the writer has it: numbers, stamps, and the rest.
+    let header = known.header;
+    let mut bytes = Vec::new();
+    for word in [
+        header.seq,
+        header.topic_seq,
+        header.stamp_first_ns,
+        header.stamp_last_ns,
+        header.wall_ns,
+        header.boot,
+    ] {
+        bytes.extend(word.to_le_bytes());
+    }
+    bytes.extend([header.sensor, header.quality]);
+    bytes.extend(header.flags.to_le_bytes());
+    bytes.extend(header.period_us.to_le_bytes());
+    bytes.extend(header.hub_pid.to_le_bytes());
+    bytes.push(header.reasons);
+    bytes.extend(header.hub_time);
+    bytes
+}
+
+/// All telegrams that a recording gives, by sensor; none if it is no recording any more.
+fn read(path: &PathBuf) -> Option<(Recording, BTreeMap<String, Vec<Frame>>)> {
+    let recording = Recording::open(path).ok()?;
+    let of = |sensor: &String| {
+        let part = recording.of(sensor).unwrap();
+        let frames: Vec<_> = part.telegrams(MM).unwrap().collect();
+        assert_eq!(frames.len() as u64, part.contents().telegrams);
+        (sensor.clone(), frames)
+    };
+    let by_sensor = recording.contents().sensors.iter().map(of).collect();
+    Some((recording, by_sensor))
+}
+
+#[test]
+fn every_intact_telegram_is_found() {
+    let written = written::recording(100, 7);
+    let positions = positions(&written);
+    let path = std::env::temp_dir().join(format!("scanhub-damaged-{}", std::process::id()));
+    let (mut intact, mut estimated, mut unreadable) = (0, 0, 0);
+    let started = Instant::now();
+    for seed in 0..MUTATIONS {
+        let mutation = Mutation::of(&written.bytes, &mut Rng::with_seed(seed));
+        let name = format!("seed {seed}, {}", mutation.name);
+        fs::write(&path, &mutation.bytes).unwrap();
+        let Some((recording, by_sensor)) = read(&path) else {
+            // Its first bytes are gone, so it is taken for a stream, or it is empty.
+            assert!(mutation.bytes.get(..8) != Some(&written.bytes[..8]), "{name}");
+            unreadable += 1;
+            continue;
+        };
+        if recording.contents().form != recording::Form::Mcap {
+            unreadable += 1;
+            continue;
+        }
+        let mut left = by_sensor;
+        for (known, at) in written.telegrams.iter().zip(&positions) {
+            // Cut from all but three bytes of its header, a second one cannot be told from another that is alike.
+            if mutation.doubled.is_some_and(|begin| (at - 3..=*at).contains(&begin)) {
+                let is_guess = |frame: &Frame| frame.header.unwrap().flags & Flags::STAMP_ESTIMATED != 0;
+                left.values_mut().for_each(|frames| {
+                    frames.retain(|frame| frame.telegram != known.telegram || !is_guess(frame));
+                });
+            }
+        }
+        let places = mutation.places(written.bytes.len());
+        for (known, &at) in written.telegrams.iter().zip(&positions) {
+            if !mutation.has(places[at], at, at + known.telegram.len()) {
+                continue;
+            }
+            intact += 1;
+            let message = at - MESSAGE - HEADER;
+            let is_message_whole = mutation.has(places[message], message, at + known.telegram.len());
+            // In the order of the file: what stands before it in its list was there before.
+            let taken = left.iter_mut().find_map(|(sensor, frames)| {
+                let place = frames.iter().position(|frame| frame.telegram == known.telegram)?;
+                (place == 0 || sensor == known.sensor).then(|| (sensor.clone(), place, frames.remove(place)))
+            });
+            let Some((sensor, place, frame)) = taken else {
+                panic!("{name}: the telegram at {at} is missing")
+            };
+            assert_eq!(place, 0, "{name}: the telegram at {at} is not in order");
+            if is_message_whole {
+                assert_eq!((&sensor[..], frame.header), (known.sensor, Some(known.header)), "{name}, {at}");
+            } else {
+                estimated += u64::from(frame.header.unwrap().flags & Flags::STAMP_ESTIMATED != 0);
+            }
+        }
+        for (sensor, frames) in left {
+            assert_eq!(frames, [], "{name}: {sensor} has what it should not");
+        }
+    }
+    let _ = fs::remove_file(&path);
+    println!(
+        "{intact} intact telegrams, {estimated} of them with a harmed header; {unreadable} no recording"
+    );
+    println!("{:.1} ms a file", started.elapsed().as_secs_f64() * 1000.0 / MUTATIONS as f64);
+    assert!(intact > MUTATIONS * 100 && unreadable < MUTATIONS / 20);
+    assert!(started.elapsed() < Duration::from_secs(600));
+}
+
+const MUTATIONS: u64 = 1_000;
+/// Opcode, length, channel, sequence and times.
+const MESSAGE: usize = 1 + 8 + 2 + 4 + 8 + 8;
+const HEADER: usize = 64;
