@@ -34,7 +34,7 @@ pub(crate) use network::in_a_network;
 pub(crate) use program::{HUP, INT, KILL, Outcome, Program, TERM, USR1};
 pub(crate) use python::{python, script};
 pub(crate) use receiver::{Receiver, read};
-pub(crate) use recording::{Kept, Recording, python, unbroken};
+pub(crate) use recording::{Kept, Recording, unbroken};
 pub(crate) use relay::Relay;
 pub(crate) use robot::Robot;
 pub(crate) use sender::{Sender, wall_ns};
