@@ -5,7 +5,8 @@ mod channels;
 mod chunk;
 mod exact;
 mod knowledge;
-mod reader;
+mod originals;
+pub(crate) mod reader;
 mod records;
 mod salvage;
 mod seen;
@@ -21,9 +22,10 @@ use schema::datagram::Packed;
 use schema::{Header, Status, Topic};
 
 use crate::{Contents, Damage, Form, Frame};
-use knowledge::Knowledge;
+pub(crate) use knowledge::{Knowledge, message};
+pub(crate) use originals::Originals;
 use reader::{Item, Reader, Sighting};
-use records::Record;
+pub(crate) use records::Record;
 use source::Source;
 
 /// What is known of a file that was read through.
@@ -107,6 +109,11 @@ impl Survey {
     /// All that is in the file, as `input` has it.
     pub(crate) fn reader<R: Read>(&self, input: R) -> Reader<R> {
         if self.is_sound { Reader::sound(input) } else { Reader::harmed(input, self.knowledge.clone()) }
+    }
+
+    /// What the file says beside its telegrams.
+    pub(crate) fn knowledge(&self) -> &Knowledge {
+        &self.knowledge
     }
 
     /// Says of the whole file and of each sensor what `tell` says.
