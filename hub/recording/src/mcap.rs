@@ -81,10 +81,14 @@ impl Survey {
                 Item::Record(record) => survey.note_record(&reader.knowledge, &record),
             }
         }
-        for sensor in reader.knowledge.channels.sensors() {
-            survey.sensors.entry(sensor).or_insert(Contents::new(Form::Mcap));
-        }
         survey.whole.sensors = reader.knowledge.channels.sensors();
+        for sensor in &survey.whole.sensors {
+            of_sensor(&mut survey.sensors, sensor);
+        }
+        // Those whose names are lost.
+        let others = survey.sensors.keys().filter(|name| !survey.whole.sensors.contains(name));
+        let others: Vec<_> = others.cloned().collect();
+        survey.whole.sensors.extend(others);
         if let Some(account) = reader.account() {
             survey.tell(|damage| {
                 (damage.bytes, damage.chunks) = (account.passed, account.chunks);
