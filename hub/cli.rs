@@ -155,6 +155,7 @@ pub(crate) enum Verb {
     #[command(after_help = gateway::GROUPS)]
     Gateway(Gateway),
     /// What the gateways of other machines send over the network, and what of it was lost
+    #[command(after_help = listen::SIGNALS)]
     Listen(Listen),
     /// A recording in another form, or a damaged one made whole
     #[command(after_help = convert::REPAIR)]

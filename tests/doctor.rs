@@ -32,6 +32,13 @@ fn doctor(stage: &Stage, arguments: &[&str], code: i32) -> (Vec<Value>, Outcome)
 }
 
 #[test]
+fn the_page_has_a_line_for_each_check() {
+    let page = include_str!("../docs/doctor.md");
+    let lines = page.lines().filter_map(|line| line.strip_prefix("| `")?.split('`').next());
+    assert_eq!(lines.collect::<Vec<_>>(), daemon::doctor::CHECKS);
+}
+
+#[test]
 fn a_set_up_that_works() {
     let stage = Stage::new();
     let simulator = stage.simulator(&["front"], &["--baud=38400"]);

@@ -4,7 +4,8 @@ use std::sync::atomic::AtomicBool;
 
 use clap::Args;
 use daemon::Config;
-use daemon::doctor::{Subjects, examine};
+use daemon::config::Gateway;
+use daemon::doctor::{Subjects, System, examine};
 use daemon::probe::source;
 use schema::Failure;
 
@@ -15,6 +16,9 @@ pub(crate) struct Doctor {
     /// A tty or tcp:HOST:PORT, or the name of a link of the running hub; without one those of the configuration, else all that there are
     #[arg(value_name = "PORT")]
     ports: Vec<String>,
+    /// First take away what dead processes left in this domain; nothing while a hub lives there
+    #[arg(long)]
+    clean: bool,
     #[command(flatten)]
     run: Run,
 }
@@ -23,11 +27,16 @@ impl Doctor {
     pub(crate) fn run(&self, everywhere: &Everywhere, stop: &AtomicBool) -> Result<(), Failure> {
         let sources = self.run.sources();
         let is_said = !(sources.files.is_empty() && sources.links.is_empty() && sources.set.is_empty());
+        let gateway = Gateway::load(&sources);
         let subjects = Subjects {
             ports: self.ports.iter().map(|port| source(port)).collect::<Result<_, _>>()?,
-            config: is_said.then(|| Config::load(&sources)),
+            config: is_said
+                .then(|| Config::load(&sources).and_then(|config| gateway.clone().map(|_| config))),
+            gateway: gateway.clone().unwrap_or_default(),
             domain: everywhere.hub_domain()?,
             places: everywhere.places()?,
+            system: System::this(),
+            clean: self.clean,
         };
         let mut port = None;
         examine(&subjects, stop, &mut |finding| {

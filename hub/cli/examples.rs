@@ -47,7 +47,7 @@ const EXAMPLES: &[(&str, &[&str])] = &[
             "scanhub config show",
         ],
     ),
-    ("doctor", &["scanhub doctor", "scanhub doctor /dev/ttyUSB0"]),
+    ("doctor", &["scanhub doctor", "scanhub doctor /dev/ttyUSB0", "scanhub doctor --clean"]),
     ("list", &["scanhub list"]),
     ("info", &["scanhub info front"]),
     (

@@ -2,11 +2,13 @@
 //! everybody else gets ports. Refuses to know when something is sent and who reads it.
 
 mod bell;
+mod clean;
 mod control;
 mod leftover;
 mod nodes;
 mod sleep;
 mod trouble;
+mod unheld;
 mod wake;
 
 use std::fmt::Debug;
@@ -33,15 +35,20 @@ use crate::{
 };
 
 pub use self::bell::{Bell, Unsupported, sleep_at_bells};
+pub use self::clean::{Cleaned, clean};
 pub use self::control::{Asked, ControlClient, ControlServer, Pending};
 pub use self::nodes::{Nodes, nodes};
 pub use self::sleep::{descriptor, sleep, take_wakeups};
+pub use self::unheld::is_unheld;
 pub use self::wake::{Waker, listener, open_wake};
 pub use iceoryx2::port::update_connections::UpdateConnections;
 pub use iceoryx2::port::{LoanError, ReceiveError, SendError};
 /// Shared memory between processes; ports of it stay in their thread, nodes and services may move.
 pub use iceoryx2::prelude::ipc::Service;
 pub use iceoryx2::prelude::{PortFactory, ZeroCopySend};
+
+/// The version of the shared-memory library: one of another version is not spoken with.
+pub const LIBRARY: &str = "iceoryx2 0.10.0";
 
 /// The membership of a process in a domain.
 pub type Node = iceoryx2::node::Node<Service>;

@@ -5,7 +5,7 @@
 use std::fs::{DirBuilder, File, OpenOptions};
 use std::io::{self, ErrorKind};
 use std::os::fd::AsRawFd;
-use std::os::unix::fs::{DirBuilderExt, FileExt, OpenOptionsExt};
+use std::os::unix::fs::{DirBuilderExt, FileExt, MetadataExt, OpenOptionsExt};
 use std::path::Path;
 
 use nix::errno::Errno;
@@ -71,12 +71,16 @@ struct Held {
 
 impl Held {
     fn acquire(root: &Path, name: &str, who: &str) -> Result<Held, Failure> {
-        let file = Held::open(root, name)?;
-        match fcntl(file.as_raw_fd(), FcntlArg::F_OFD_SETLK(&whole_file(libc::F_WRLCK))) {
-            Ok(_) => {}
-            Err(Errno::EAGAIN | Errno::EACCES) => return Err(held(root, who, pid_in(&file))),
-            Err(error) => return Err(unusable(root, &error.into())),
-        }
+        let file = loop {
+            let file = Held::open(root, name)?;
+            match fcntl(file.as_raw_fd(), FcntlArg::F_OFD_SETLK(&whole_file(libc::F_WRLCK))) {
+                // Whoever held it until now may have taken the domain away, and the next one would lock another file.
+                Ok(_) if file.metadata().is_ok_and(|metadata| metadata.nlink() == 0) => {}
+                Ok(_) => break file,
+                Err(Errno::EAGAIN | Errno::EACCES) => return Err(held(root, who, pid_in(&file))),
+                Err(error) => return Err(unusable(root, &error.into())),
+            }
+        };
         let pid = format!("{}\n", std::process::id());
         file.set_len(0)
             .and_then(|()| file.write_all_at(pid.as_bytes(), 0))

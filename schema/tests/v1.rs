@@ -1,5 +1,5 @@
 //! Golden size, offsets and bytes of every payload of version 1. Do not change these tests: another layout is another
-//! version.
+//! version. The bytes stand in `tests/vectors/v1` too, for other languages.
 
 use std::mem::{offset_of, size_of};
 
@@ -15,6 +15,14 @@ fn golden(size: usize, fields: &[(usize, &[u8])]) -> Vec<u8> {
         bytes[offset..offset + field.len()].copy_from_slice(field);
     }
     bytes
+}
+
+/// The bytes that other languages read.
+fn shared(file: &str) -> Vec<u8> {
+    let path = concat!(env!("CARGO_MANIFEST_DIR"), "/../tests/vectors/v1/").to_owned() + file;
+    let text = std::fs::read_to_string(&path).unwrap_or_else(|error| panic!("{path}: {error}"));
+    let digits: Vec<u32> = text.chars().filter_map(|c| c.to_digit(16)).collect();
+    digits.chunks(2).map(|pair| (pair[0] << 4 | pair[1]) as u8).collect()
 }
 
 #[test]
@@ -68,6 +76,7 @@ fn header_bytes() {
         ],
     );
     assert_eq!(bytemuck::bytes_of(&header), expected);
+    assert_eq!(shared("header.hex"), expected);
 }
 
 #[test]
@@ -111,6 +120,7 @@ fn scan_bytes() {
         ],
     );
     assert_eq!(bytemuck::bytes_of(&scan), expected);
+    assert_eq!(shared("scan.hex"), expected);
 }
 
 #[test]
@@ -138,6 +148,7 @@ fn marks_bytes() {
     };
     let mark = [0xFE, 0xFF, 0xFF, 0xFF, 3, 2, 1, 0, 5, 4, 7, 1, 6, 1, 8, 1];
     assert_eq!(bytemuck::bytes_of(&marks), golden(1028, &[(0, &[64, 3]), (1012, &mark)]));
+    assert_eq!(bytemuck::bytes_of(&marks), shared("marks.hex"));
 }
 
 #[test]
@@ -168,6 +179,7 @@ fn zones_bytes() {
     let head = [1, 2, 2, 1, 5, 4, 3, 0, 6, 1, 1, 0];
     let expected = golden(76, &[(0, &head), (20, &[0x58, 0x02, 7, 1, 1])]);
     assert_eq!(bytemuck::bytes_of(&zones), expected);
+    assert_eq!(shared("zones.hex"), expected);
 }
 
 #[test]
@@ -209,6 +221,7 @@ fn foreground_bytes() {
         ],
     );
     assert_eq!(bytemuck::bytes_of(&foreground), expected);
+    assert_eq!(shared("foreground.hex"), expected);
 }
 
 #[test]
@@ -235,6 +248,7 @@ fn background_bytes() {
     let expected =
         golden(816, &[(0, &[3, 2, 1, 0, 4, 1, 0x91, 0x01, 10, 1, 0, 0, 0x34, 0x12]), (812, &[0xFF, 0xFF])]);
     assert_eq!(bytemuck::bytes_of(&background), expected);
+    assert_eq!(shared("background.hex"), expected);
     assert_eq!(background.packed(), &expected[..814]);
 }
 
@@ -300,6 +314,7 @@ fn status_bytes() {
         ],
     );
     assert_eq!(bytemuck::bytes_of(&status), expected);
+    assert_eq!(shared("status.hex"), expected);
 }
 
 #[test]
@@ -338,6 +353,7 @@ fn request_bytes() {
         &[(0, b"front"), (32, &[3, 0, 0x91, 0x01, 10]), (40, &[0x34, 0x12]), (840, &[0xFF, 0x1F])],
     );
     assert_eq!(bytemuck::bytes_of(&request), expected);
+    assert_eq!(shared("request.hex"), expected);
 }
 
 #[test]

@@ -1,23 +1,34 @@
 //! `scanhub doctor`: every condition that a working set-up needs, one after the other, with what was found and what to
-//! do. Changes no sensor, no file and no process. A port that somebody named, and nobody holds, it opens as the hub would:
-//! it stays raw at the rate of the last question, and its driver hands over bytes at once.
+//! do. Changes no sensor, no file and no process, unless it is told to take away what dead ones left. A port that somebody
+//! named, and nobody holds, it opens as the hub would: it stays raw at the rate of the last question, and its driver hands
+//! over bytes at once.
 
+mod counts;
 mod finding;
 mod hub;
+mod installed;
+mod leftovers;
+mod limits;
 mod line;
+mod logout;
 mod machine;
+mod multicast;
+mod program;
 mod segments;
 mod sensor;
+mod system;
+mod version;
 
 use std::sync::atomic::AtomicBool;
 
 use schema::{Domain, Failure, Kind};
 
-use crate::config::{Config, Link, Source};
+use crate::config::{Config, Gateway, Link, Source};
 use crate::port::{Candidate, candidates};
-pub use finding::{Finding, State};
+pub use finding::{CHECKS, Finding, State};
 use hub::Hub;
 use machine::Facts;
+pub use system::System;
 
 /// What to examine.
 #[derive(Clone, Debug)]
@@ -26,10 +37,16 @@ pub struct Subjects {
     pub ports: Vec<Source>,
     /// The configuration, or why there is none; nothing if nobody wrote one.
     pub config: Option<Result<Config, Failure>>,
+    /// What the configuration says of a gateway.
+    pub gateway: Gateway,
     /// Where a hub would put its domain.
     pub domain: Domain,
     /// Where a client would look for it.
     pub places: Vec<Domain>,
+    /// The machine's files.
+    pub system: System,
+    /// Whether what dead processes left in the domain is to be taken away first.
+    pub clean: bool,
 }
 
 /// A port under examination, and what the configuration wants of it.
@@ -58,11 +75,24 @@ pub fn examine(
     let domain = home.unwrap_or(&subjects.domain);
     let hub = Hub::find(domain);
     let ports = choose(subjects, &there, hub.as_ref(), &mut tell);
-    let facts = Facts::gather(domain, ports.len().max(1));
+    let (system, pid) = (&subjects.system, hub.as_ref().map(|hub| hub.pid));
+    if subjects.clean {
+        let elsewhere = subjects.places.iter().filter(|place| place.root() != domain.root());
+        let places: Vec<&Domain> = std::iter::once(domain).chain(elsewhere).collect();
+        tell(leftovers::clean(&places, system.user()));
+    }
+    tell(version::version(system, pid));
+    tell(installed::service(system, pid));
+    tell(installed::rules(system, &there));
+    let facts = Facts::gather(domain, &subjects.places, ports.len().max(1));
     tell(machine::memory(&facts));
     tell(machine::domain(&facts));
-    tell(machine::leftovers(&facts));
-    tell(machine::descriptors(&facts));
+    tell(machine::hubs(&facts));
+    tell(leftovers::leftovers(&facts));
+    tell(limits::descriptors(&facts));
+    tell(limits::file_size(&facts));
+    tell(logout::logout(system, pid.and_then(program::user_of).unwrap_or(system.user())));
+    tell(multicast::multicast(system, subjects.gateway.interface.as_deref()));
     for subject in &ports {
         let (port, link) = (subject.source.name(), subject.link.as_ref().map(|link| link.name.as_str()));
         line::examine(subject, &there, hub.as_ref(), stop, &mut |finding| tell(finding.at(&port, link)))?;

@@ -16,10 +16,15 @@ use std::sync::atomic::AtomicBool;
 use schema::Failure;
 
 use crate::config::Source;
+#[cfg(test)]
+pub(crate) use candidates::found_in;
 pub use candidates::{Candidate, candidates};
 pub(crate) use candidates::{PROMPT_MS, is_tty, latency_ms};
+pub(crate) use holder::all_holders;
 pub use holder::{Holder, holder};
+pub(crate) use kernel::Counts;
 pub(crate) use refusal::Refusal;
+pub(crate) use rights::Rights;
 pub(crate) use tcp::Dial;
 use tcp::Tcp;
 use tty::Tty;
@@ -139,6 +144,22 @@ impl Port {
         match self {
             Port::Tty(tty) => tty.line_errors(),
             Port::Tcp(_) => 0,
+        }
+    }
+
+    /// What the driver counted on the line since it was loaded, if it counts.
+    pub(crate) fn counts(&self) -> Option<Counts> {
+        match self {
+            Port::Tty(tty) => tty.counts(),
+            Port::Tcp(_) => None,
+        }
+    }
+
+    /// The rate that the driver says it has; nothing where it is set elsewhere.
+    pub(crate) fn baud(&self) -> Option<u32> {
+        match self {
+            Port::Tty(tty) => tty.baud(),
+            Port::Tcp(_) => None,
         }
     }
 }

@@ -5,6 +5,35 @@ use std::fmt;
 use schema::Printable;
 use serde::Serialize;
 
+/// The names of all checks, in the order in which they are made; docs/doctor.md has a line for each.
+pub const CHECKS: &[&str] = &[
+    "configuration",
+    "ports",
+    "clean",
+    "version",
+    "service",
+    "udev",
+    "memory",
+    "domain",
+    "hubs",
+    "leftovers",
+    "descriptors",
+    "file-size",
+    "logout",
+    "multicast",
+    "port",
+    "holder",
+    "access",
+    "latency",
+    "rate",
+    "sensor",
+    "settings",
+    "power-on",
+    "health",
+    "marks",
+    "line-errors",
+];
+
 /// How a check ended.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "lowercase")]
@@ -77,6 +106,7 @@ impl Finding {
         finding: impl Into<String>,
         remedy: impl Into<String>,
     ) -> Finding {
+        debug_assert!(CHECKS.contains(&name), "{name} is in no list");
         let (finding, remedy) = (finding.into(), remedy.into());
         Finding { class: "check", name, state, finding, remedy, port: None, link: None }
     }

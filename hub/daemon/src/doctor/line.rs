@@ -8,11 +8,12 @@ use lms::variant::Baud;
 use schema::{Failure, Kind};
 
 use super::Subject;
+use super::counts::{as_the_hub_counts, line_errors};
 use super::finding::Finding;
 use super::hub::Hub;
 use super::sensor;
 use crate::config::Source;
-use crate::port::{Candidate, PROMPT_MS, Port, Refusal, holder, is_tty, latency_ms};
+use crate::port::{Candidate, Holder, PROMPT_MS, Port, Refusal, Rights, all_holders, is_tty, latency_ms};
 use crate::probe;
 
 /// Examines a port and its sensor.
@@ -42,14 +43,19 @@ pub(crate) fn examine(
     if !path.exists() {
         return Ok(());
     }
-    if let Some(holder) = holder(path) {
+    let holders = all_holders(path);
+    if !holders.is_empty() {
         // To open it would change its settings under who has it.
-        let by_hub = hub.filter(|hub| holder.pid == hub.pid);
-        match by_hub {
+        match hub.filter(|hub| holders.iter().any(|holder| holder.pid == hub.pid)) {
             Some(hub) => {
+                let link = hub.link(&subject.source.name());
                 tell(latency(path, latency_ms(path)));
-                tell(Finding::ok("holder", format!("the hub has it, {holder}")));
-                sensor::as_the_hub_says(hub.link(&subject.source.name())).into_iter().for_each(tell);
+                tell(held(&holders, hub.pid));
+                tell(link.map_or_else(
+                    || Finding::skipped("line-errors", "the hub has the port under another name"),
+                    |(_, status)| as_the_hub_counts(status),
+                ));
+                sensor::as_the_hub_says(link).into_iter().for_each(tell);
             }
             None => {
                 tell(refused(Refusal::Busy.explain(&subject.source)));
@@ -78,11 +84,15 @@ pub(crate) fn examine(
             return Ok(());
         }
     };
-    tell(Finding::ok("access", "can be opened, is a serial line"));
+    tell(Finding::ok("access", format!("can be opened, is a serial line{}", whose(path))));
     // Opened, most adapters hand over at once.
     tell(latency(path, latency_ms(path)));
     tell(rate(subject, &port, first));
-    ask(subject, &port, first, stop, tell)
+    let answered = ask(subject, &port, first, stop, tell)?;
+    // Where nobody answered, what came may have come at another rate.
+    let now = if answered { port.line_errors() } else { 0 };
+    tell(line_errors(port.counts(), now));
+    Ok(())
 }
 
 /// Examines a serial server and the sensor behind it.
@@ -101,7 +111,7 @@ fn server(
     match probe::open(&subject.source, stop) {
         Ok((port, first)) => {
             tell(Finding::ok("access", "connected; its rate was set there, by hand"));
-            ask(subject, &port, first, stop, tell)
+            ask(subject, &port, first, stop, tell).map(drop)
         }
         Err(failure) if failure.kind == Kind::Interrupted => Err(failure),
         Err(failure) => {
@@ -111,22 +121,47 @@ fn server(
     }
 }
 
-/// Examines the sensor at `port`, which is open at `first`.
+/// Examines the sensor at `port`, which is open at `first`; whether one answered.
 fn ask(
     subject: &Subject,
     port: &Port,
     first: Baud,
     stop: &AtomicBool,
     tell: &mut dyn FnMut(Finding),
-) -> Result<(), Failure> {
+) -> Result<bool, Failure> {
     match probe::ask(port, first, &subject.source, stop, |_| {}) {
         Ok(report) => {
-            sensor::examine(&subject.source.name(), &report, subject.link.as_ref()).into_iter().for_each(tell)
+            let findings = sensor::examine(&subject.source.name(), &report, subject.link.as_ref());
+            findings.into_iter().for_each(tell);
+            Ok(true)
         }
-        Err(failure) if failure.kind == Kind::Interrupted => return Err(failure),
-        Err(failure) => tell(Finding::failed("sensor", failure.message, failure.hint)),
+        Err(failure) if failure.kind == Kind::Interrupted => Err(failure),
+        Err(failure) => {
+            tell(Finding::failed("sensor", failure.message, failure.hint));
+            Ok(false)
+        }
     }
-    Ok(())
+}
+
+/// The hub has it; whoever has it too takes bytes away from it. The service manager keeps it for the next hub.
+fn held(holders: &[Holder], hub: u32) -> Finding {
+    const NAME: &str = "holder";
+    let words: Vec<String> = holders.iter().map(ToString::to_string).collect();
+    let other = holders.iter().find(|holder| holder.pid != hub && holder.pid != SERVICE_MANAGER);
+    match other {
+        None => Finding::ok(NAME, format!("the hub has it, {}", words.join(", "))),
+        Some(other) => Finding::warning(
+            NAME,
+            format!("the hub is not alone: {}", words.join(", ")),
+            format!("end {other}: what it reads the hub does not get"),
+        ),
+    }
+}
+
+/// Group and mode of the port, in words.
+fn whose(path: &Path) -> String {
+    let rights = Rights::of(path);
+    rights.port.map_or(String::new(), |port| format!("; group {}, mode {:03o}", rights.group, port.mode))
 }
 
 fn recording(path: &Path) -> Finding {
@@ -202,10 +237,15 @@ fn rate(subject: &Subject, port: &Port, first: Baud) -> Finding {
     const NAME: &str = "rate";
     let wanted = subject.link.as_ref().map_or(Baud::B500000, |link| link.baud);
     let outcome = port.set_baud(wanted.rate());
+    let given = port.baud().filter(|&given| given != wanted.rate());
     // The inquiry begins at the rate at which it was opened.
     let _ = port.set_baud(first.rate());
     match (outcome, &subject.link) {
-        (Ok(()), _) => Finding::ok(NAME, format!("{} Bd is possible", wanted.rate())),
+        (Ok(()), _) => {
+            let near =
+                given.map_or(String::new(), |given| format!(": the driver gives {given} Bd, near enough"));
+            Finding::ok(NAME, format!("{} Bd is possible{near}", wanted.rate()))
+        }
         (Err(error), Some(link)) => Finding::failed(
             NAME,
             error.to_string(),
@@ -222,6 +262,9 @@ fn rate(subject: &Subject, port: &Port, first: Baud) -> Finding {
     }
 }
 
+/// The first process of all: it has lines open only for a service.
+const SERVICE_MANAGER: u32 = 1;
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -235,5 +278,15 @@ mod tests {
         let slow = of(Some(16));
         assert_eq!(slow.state, State::Warning);
         assert!(slow.remedy.contains("/sys/class/tty/ttyUSB0/device/latency_timer"), "{slow}");
+    }
+
+    #[test]
+    fn who_reads_beside_the_hub_is_told() {
+        let holder = |pid, program: &str| Holder { pid, program: program.to_owned() };
+        let (manager, hub, cat) = (holder(1, "systemd"), holder(7, "scanhub"), holder(9, "cat"));
+        assert_eq!(held(std::slice::from_ref(&hub), 7).state, State::Ok);
+        assert_eq!(held(&[manager, hub.clone()], 7).state, State::Ok);
+        let two = held(&[hub, cat], 7);
+        assert!(two.state == State::Warning && two.remedy.contains("process 9 (cat)"), "{two}");
     }
 }

@@ -1,5 +1,5 @@
-//! What a hub needs of the machine, whatever its sensors are: shared memory, a domain, descriptors. Each check judges
-//! facts that were gathered before, so that every verdict can be tested.
+//! What a hub needs of the machine, whatever its sensors are: shared memory, a domain of its own. Each check judges facts
+//! that were gathered before, so that every verdict can be tested.
 
 use std::fs;
 use std::os::unix::fs::MetadataExt;
@@ -12,15 +12,17 @@ use schema::shortage::SHARED_MEMORY;
 use schema::{Domain, Failure};
 
 use super::finding::Finding;
-use super::segments::abandoned;
-use crate::preflight::{needed, needed_descriptors};
+use super::segments::{self, Segment};
+use crate::preflight::needed;
 
 /// What is known of the machine and the domain.
 #[derive(Clone, Debug)]
 pub(crate) struct Facts {
     pub(crate) links: usize,
-    /// Size (0 is no limit) and free bytes of shared memory; none: it cannot be looked at.
-    pub(crate) memory: Option<(u64, u64)>,
+    /// None: it cannot be looked at.
+    pub(crate) memory: Option<Memory>,
+    /// The domain's name.
+    pub(crate) name: String,
     /// Root path of the domain.
     pub(crate) root: PathBuf,
     /// This user's number.
@@ -29,13 +31,29 @@ pub(crate) struct Facts {
     pub(crate) place: Place,
     /// The hub's process, if one holds the domain.
     pub(crate) hub: Result<Option<u32>, Failure>,
+    /// Hubs of the same name at other places.
+    pub(crate) others: Vec<(PathBuf, u32)>,
+    /// Processes at the domain's place, and the dead ones at others where no hub is.
     pub(crate) nodes: Result<Nodes, Failure>,
-    /// Files in shared memory that may be the domain's and that nobody holds, with their bytes.
-    pub(crate) segments: Vec<(PathBuf, u64)>,
+    /// Files in shared memory that may be the domain's and that nobody holds.
+    pub(crate) segments: Vec<Segment>,
     /// Hard limit of open descriptors; none: no limit.
     pub(crate) descriptors: Option<u64>,
     /// How many this process has open, as would a hub that was started in its place.
     pub(crate) open: u64,
+    /// Limit of a file's bytes; none: no limit.
+    pub(crate) file_size: Option<u64>,
+}
+
+/// Shared memory.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Memory {
+    /// Bytes; 0 is no limit.
+    pub(crate) size: u64,
+    pub(crate) free: u64,
+    /// How many files it has room for; none: no limit.
+    pub(crate) free_files: Option<u64>,
+    pub(crate) is_read_only: bool,
 }
 
 /// A directory.
@@ -45,32 +63,60 @@ pub(crate) struct Place {
     pub(crate) owner: u32,
     /// Permission bits.
     pub(crate) mode: u32,
+    /// Something can be made in it.
     pub(crate) writable: bool,
 }
 
 impl Facts {
     /// Looks at everything; changes nothing.
-    pub(crate) fn gather(domain: &Domain, links: usize) -> Facts {
+    pub(crate) fn gather(domain: &Domain, places: &[Domain], links: usize) -> Facts {
         let root = domain.root();
+        let elsewhere = || places.iter().filter(|place| place.root() != root);
+        let held = |place: &Domain| schema::holder(place.root()).ok().flatten();
+        let mut nodes = schema::ipc::nodes(domain);
+        if let Ok(nodes) = &mut nodes {
+            let free = elsewhere().filter(|place| held(place).is_none());
+            nodes.dead += free.filter_map(|place| Some(schema::ipc::nodes(place).ok()?.dead)).sum::<usize>();
+        }
+        // Whoever lives there may be opening files: they are left in peace.
+        let is_empty = nodes.as_ref().is_ok_and(|nodes| nodes.alive == 0) && held(domain).is_none();
         Facts {
             // To list them needs one too.
             open: fs::read_dir("/proc/self/fd").map_or(0, |entries| entries.count() as u64 - 1),
             links,
-            memory: statvfs(SHARED_MEMORY)
-                .ok()
-                .map(|stat| (stat.f_blocks * stat.f_frsize, stat.f_bavail * stat.f_frsize)),
+            memory: Memory::of_machine(),
+            name: domain.name().to_owned(),
             root: root.to_owned(),
             user: getuid().as_raw(),
             place: Place::nearest(root),
             hub: schema::holder(root),
-            nodes: schema::ipc::nodes(domain),
-            segments: abandoned(&domain.prefix(), getuid().as_raw()),
+            others: elsewhere().filter_map(|place| Some((place.root().to_owned(), held(place)?))).collect(),
+            nodes,
+            segments: if is_empty {
+                segments::abandoned(&domain.prefix(), getuid().as_raw())
+            } else {
+                Vec::new()
+            },
             descriptors: getrlimit(Resource::Nofile).maximum,
+            file_size: getrlimit(Resource::Fsize).current,
         }
     }
 
-    fn lives(&self) -> Option<u32> {
+    /// The hub that lives at the domain's place.
+    pub(crate) fn lives(&self) -> Option<u32> {
         self.hub.as_ref().ok().copied().flatten()
+    }
+}
+
+impl Memory {
+    fn of_machine() -> Option<Memory> {
+        let stat = statvfs(SHARED_MEMORY).ok()?;
+        Some(Memory {
+            size: stat.f_blocks * stat.f_frsize,
+            free: stat.f_bavail * stat.f_frsize,
+            free_files: (stat.f_files > 0).then_some(stat.f_ffree),
+            is_read_only: access(SHARED_MEMORY, Access::WRITE_OK).is_err(),
+        })
     }
 }
 
@@ -82,7 +128,7 @@ impl Place {
                 path: path.to_owned(),
                 owner: metadata.uid(),
                 mode: metadata.mode() & 0o7777,
-                writable: access(path, Access::WRITE_OK | Access::EXEC_OK).is_ok(),
+                writable: metadata.is_dir() && access(path, Access::WRITE_OK | Access::EXEC_OK).is_ok(),
             },
             None => Place { path: root.to_owned(), owner: 0, mode: 0, writable: false },
         }
@@ -92,10 +138,19 @@ impl Place {
 /// Whether shared memory has room for the links.
 pub(crate) fn memory(facts: &Facts) -> Finding {
     const NAME: &str = "memory";
-    let Some((size, free)) = facts.memory else {
+    let Some(Memory { size, free, free_files, is_read_only }) = facts.memory else {
         let remedy = format!("mount a tmpfs there: mount -t tmpfs -o size=64M tmpfs {SHARED_MEMORY}");
         return Finding::failed(NAME, format!("{SHARED_MEMORY} cannot be looked at"), remedy);
     };
+    if is_read_only {
+        let text = format!("{SHARED_MEMORY} cannot be written to");
+        return Finding::failed(NAME, text, format!("sudo mount -o remount,rw,mode=1777 {SHARED_MEMORY}"));
+    }
+    let files = facts.links as u64 * FILES_OF_LINK + FILES;
+    if let Some(free_files) = free_files.filter(|&free| free < files && facts.lives().is_none()) {
+        let text = format!("{SHARED_MEMORY} has room for {free_files} files, {files} needed");
+        return Finding::failed(NAME, text, format!("sudo mount -o remount,nr_inodes=10k {SHARED_MEMORY}"));
+    }
     if size == 0 {
         return Finding::ok(NAME, format!("{SHARED_MEMORY} has no limit"));
     }
@@ -130,7 +185,7 @@ pub(crate) fn domain(facts: &Facts) -> Finding {
         return if place.writable {
             Finding::ok(NAME, format!("{root}: not there yet, can be made"))
         } else {
-            let text = format!("{root} cannot be made: no right to write in {at}");
+            let text = format!("{root} cannot be made: nothing can be made in {at}");
             Finding::failed(NAME, text, "name another place with --root")
         };
     }
@@ -141,6 +196,10 @@ pub(crate) fn domain(facts: &Facts) -> Finding {
             "run as that user, or choose another --root or --domain",
         );
     }
+    if !place.writable {
+        let text = format!("{at}: nothing can be made there, mode {:04o}", place.mode);
+        return Finding::failed(NAME, text, format!("chmod 700 {at}, or name another place with --root"));
+    }
     if place.mode & 0o022 != 0 {
         let text = format!("{at}: others may write there, mode {:04o}", place.mode);
         return Finding::warning(NAME, text, format!("chmod 700 {at}"));
@@ -148,57 +207,26 @@ pub(crate) fn domain(facts: &Facts) -> Finding {
     Finding::ok(NAME, format!("{root}: free, yours, mode {:04o}", place.mode))
 }
 
-/// Whether something is left of processes that ended without tidying up.
-pub(crate) fn leftovers(facts: &Facts) -> Finding {
-    const NAME: &str = "leftovers";
-    let nodes = match &facts.nodes {
-        Ok(nodes) => nodes,
-        Err(failure) => return Finding::failed(NAME, failure.message.clone(), failure.hint.clone()),
-    };
-    let (files, bytes) = (facts.segments.len(), facts.segments.iter().map(|(_, bytes)| bytes).sum::<u64>());
-    let left = format!("{} ({} kB) in {SHARED_MEMORY}", plural(files as u64, "file"), bytes / 1024);
-    match (facts.lives(), nodes.dead, nodes.alive) {
-        (Some(_), 0, _) => Finding::ok(NAME, "none"),
-        (Some(_), dead, _) => {
-            Finding::ok(NAME, format!("{} died; the hub is tidying up", plural(dead as u64, "process")))
-        }
-        (None, 0, 0) if files == 0 => Finding::ok(NAME, "none"),
-        (None, 0, alive) if alive > 0 => {
-            Finding::ok(NAME, format!("none; {} waiting for a hub", plural(alive as u64, "consumer")))
-        }
-        (None, 0, _) => {
-            let names: Vec<_> = facts.segments.iter().map(|(path, _)| path.display().to_string()).collect();
-            Finding::warning(
-                NAME,
-                format!("no process here holds {left}"),
-                format!("unless a container that shares {SHARED_MEMORY} does: rm {}", names.join(" ")),
-            )
-        }
-        (None, dead, _) => Finding::warning(
-            NAME,
-            format!("{} died without a hub to tidy up; {left}", plural(dead as u64, "process")),
-            format!("the next `scanhub run` at {} tidies up at its start", facts.root.display()),
-        ),
+/// Whether there is one hub of this name for everybody who names no place.
+pub(crate) fn hubs(facts: &Facts) -> Finding {
+    const NAME: &str = "hubs";
+    let others: Vec<String> =
+        facts.others.iter().map(|(root, pid)| format!("{} (process {pid})", root.display())).collect();
+    if others.is_empty() {
+        return Finding::ok(NAME, format!("no other hub of domain {}", facts.name));
     }
+    Finding::warning(
+        NAME,
+        format!(
+            "domain {} has another hub at {}; clients take the first that lives",
+            facts.name,
+            others.join(", ")
+        ),
+        "end one of them, or give it a --domain of its own",
+    )
 }
 
-/// Whether the process may open enough.
-pub(crate) fn descriptors(facts: &Facts) -> Finding {
-    const NAME: &str = "descriptors";
-    let Some(limit) = facts.descriptors else { return Finding::ok(NAME, "no limit") };
-    let own = facts.open + DESCRIPTORS_AT_START + needed_descriptors(facts.links);
-    let remedy =
-        "raise the hard limit: ulimit -Hn, LimitNOFILE= of a service, --ulimit nofile= of a container";
-    let Some(rest) = limit.checked_sub(own) else {
-        let text = format!("{limit} at most, the hub needs {own}");
-        return Finding::failed(NAME, text, remedy);
-    };
-    let consumers = rest / DESCRIPTORS_OF_CONSUMER;
-    let text = format!("{limit} at most: enough for about {consumers} consumers of a topic");
-    if consumers >= ENOUGH_CONSUMERS { Finding::ok(NAME, text) } else { Finding::warning(NAME, text, remedy) }
-}
-
-fn plural(count: u64, what: &str) -> String {
+pub(crate) fn plural(count: u64, what: &str) -> String {
     match (count, what.strip_suffix("ss")) {
         (1, _) => format!("1 {what}"),
         (_, Some(_)) => format!("{count} {what}es"),
@@ -206,36 +234,38 @@ fn plural(count: u64, what: &str) -> String {
     }
 }
 
-/// What a hub has open when it counts: five for the signals, and its lock.
-const DESCRIPTORS_AT_START: u64 = 6;
-/// For each consumer of a topic.
-const DESCRIPTORS_OF_CONSUMER: u64 = 4;
-/// A robot has hardly more.
-const ENOUGH_CONSUMERS: u64 = 50;
+/// Files in shared memory of each link, and of what belongs to no link, with some for the first consumers.
+const FILES_OF_LINK: u64 = 24;
+const FILES: u64 = 8;
 
 #[cfg(test)]
-mod tests {
+pub(super) mod tests {
     use schema::Kind;
 
     use super::*;
     use crate::doctor::finding::State;
 
-    fn facts() -> Facts {
+    const ROOMY: Memory = Memory { size: 64 << 20, free: 60 << 20, free_files: None, is_read_only: false };
+
+    pub(crate) fn facts() -> Facts {
         Facts {
             links: 2,
-            memory: Some((64 << 20, 60 << 20)),
+            memory: Some(ROOMY),
+            name: "scanhub".into(),
             root: "/run/user/7/scanhub/scanhub".into(),
             user: 7,
             place: Place { path: "/run/user/7".into(), owner: 7, mode: 0o700, writable: true },
             hub: Ok(None),
+            others: Vec::new(),
             nodes: Ok(Nodes::default()),
             segments: Vec::new(),
             descriptors: Some(4096),
             open: 4,
+            file_size: None,
         }
     }
 
-    fn says(finding: &Finding, state: State, words: &[&str]) {
+    pub(crate) fn says(finding: &Finding, state: State, words: &[&str]) {
         assert_eq!(finding.state, state, "{finding}");
         let text = finding.to_string();
         assert!(words.iter().all(|word| text.contains(word)), "{text} lacks one of {words:?}");
@@ -246,56 +276,45 @@ mod tests {
     #[test]
     fn memory_is_judged_by_what_the_links_need() {
         says(&memory(&facts()), State::Ok, &["61440 kB of them free", "2 links"]);
-        let full = Facts { memory: Some((64 << 20, 1 << 10)), ..facts() };
+        let with = |memory: Memory| Facts { memory: Some(memory), ..facts() };
+        let full = with(Memory { free: 1 << 10, ..ROOMY });
         says(&memory(&full), State::Failed, &["1 kB of them free", "free some"]);
-        let small = Facts { memory: Some((1 << 20, 1 << 20)), ..facts() };
+        let small = with(Memory { size: 1 << 20, free: 1 << 20, ..ROOMY });
         says(&memory(&small), State::Failed, &["1024 kB", "remount", "--shm-size"]);
         says(&memory(&Facts { hub: Ok(Some(5)), ..full }), State::Ok, &["the hub has"]);
-        says(&memory(&Facts { memory: Some((0, 0)), ..facts() }), State::Ok, &["no limit"]);
+        says(&memory(&with(Memory { size: 0, free: 0, ..ROOMY })), State::Ok, &["no limit"]);
         says(&memory(&Facts { memory: None, ..facts() }), State::Failed, &["mount -t tmpfs"]);
+        let crowded = with(Memory { free_files: Some(9), ..ROOMY });
+        says(&memory(&crowded), State::Failed, &["room for 9 files", "nr_inodes"]);
+        says(&memory(&with(Memory { free_files: Some(900), ..ROOMY })), State::Ok, &["free"]);
+        let closed = with(Memory { is_read_only: true, ..ROOMY });
+        says(&memory(&closed), State::Failed, &["cannot be written", "remount,rw"]);
     }
 
     #[test]
     fn a_domain_is_free_held_foreign_or_impossible() {
         let root: PathBuf = facts().root;
         let there = |owner, mode| Facts {
-            place: Place { path: root.clone(), owner, mode, writable: true },
+            place: Place { path: root.clone(), owner, mode, writable: mode & 0o200 != 0 },
             ..facts()
         };
         says(&domain(&facts()), State::Ok, &["not there yet"]);
         says(&domain(&there(7, 0o700)), State::Ok, &["free", "0700"]);
         says(&domain(&there(7, 0o777)), State::Warning, &["0777", "chmod 700"]);
+        says(&domain(&there(7, 0o500)), State::Failed, &["0500", "chmod 700"]);
         says(&domain(&there(8, 0o700)), State::Failed, &["user 8", "user 7", "--root"]);
         says(&domain(&Facts { hub: Ok(Some(41)), ..facts() }), State::Ok, &["process 41"]);
         let closed = Place { path: "/run".into(), owner: 0, mode: 0o755, writable: false };
         says(&domain(&Facts { place: closed, ..facts() }), State::Failed, &["/run", "--root"]);
         let denied = Failure::new(Kind::Failed, "not yours", "ask");
         says(&domain(&Facts { hub: Err(denied), ..facts() }), State::Failed, &["not yours", "ask"]);
+        assert!(!Place::nearest(Path::new("/dev/null/scanhub")).writable, "no directory");
     }
 
     #[test]
-    fn what_dead_processes_left_is_told_and_waiting_consumers_are_not() {
-        says(&leftovers(&facts()), State::Ok, &["none"]);
-        let segments = vec![("/dev/shm/sh_a_1".into(), 1024), ("/dev/shm/sh_a_2".into(), 1024)];
-        let nodes =
-            |alive, dead| Facts { nodes: Ok(Nodes { alive, dead }), segments: segments.clone(), ..facts() };
-        says(&leftovers(&nodes(3, 0)), State::Ok, &["3 consumers waiting"]);
-        let words = ["1 process died", "2 files (2 kB)", "`scanhub run` at /run/user/7/scanhub/scanhub"];
-        says(&leftovers(&nodes(0, 1)), State::Warning, &words);
-        assert!(!leftovers(&nodes(0, 1)).remedy.contains("rm "), "its files may be another hub's");
-        says(
-            &leftovers(&nodes(0, 0)),
-            State::Warning,
-            &["no process", "2 files", "rm /dev/shm/sh_a_1 /dev/shm/sh_a_2"],
-        );
-        says(&leftovers(&Facts { hub: Ok(Some(5)), ..nodes(3, 2) }), State::Ok, &["2 processes", "tidying"]);
-    }
-
-    #[test]
-    fn descriptors_are_counted_in_consumers() {
-        says(&descriptors(&facts()), State::Ok, &["4096", "996 consumers"]);
-        says(&descriptors(&Facts { descriptors: None, ..facts() }), State::Ok, &["no limit"]);
-        says(&descriptors(&Facts { descriptors: Some(128), ..facts() }), State::Warning, &["4 consumers"]);
-        says(&descriptors(&Facts { descriptors: Some(107), ..facts() }), State::Failed, &["needs 110"]);
+    fn two_hubs_of_one_name_are_one_too_many() {
+        says(&hubs(&facts()), State::Ok, &["scanhub"]);
+        let two = Facts { others: vec![("/tmp/scanhub-7/scanhub".into(), 9)], ..facts() };
+        says(&hubs(&two), State::Warning, &["/tmp/scanhub-7/scanhub (process 9)", "--domain"]);
     }
 }

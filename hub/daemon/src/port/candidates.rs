@@ -42,15 +42,15 @@ pub fn candidates() -> Vec<Candidate> {
     let mut found = found_in(Path::new("/"));
     let devices: Vec<&Path> = found.iter().map(|candidate| candidate.device.as_path()).collect();
     let holders = holders(&devices);
-    for (candidate, holder) in found.iter_mut().zip(holders) {
-        candidate.holder = holder;
+    for (candidate, holders) in found.iter_mut().zip(holders) {
+        candidate.holder = holders.into_iter().next();
         candidate.is_permitted = access(&candidate.device, Access::READ_OK | Access::WRITE_OK).is_ok();
     }
     found
 }
 
 /// What `sys` and `dev` below `root` tell.
-pub(super) fn found_in(root: &Path) -> Vec<Candidate> {
+pub(crate) fn found_in(root: &Path) -> Vec<Candidate> {
     let stable: Vec<(PathBuf, PathBuf)> = ["by-id", "by-path"]
         .iter()
         .flat_map(|kind| entries(&root.join("dev/serial").join(kind)))

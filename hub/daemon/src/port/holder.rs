@@ -22,8 +22,13 @@ impl fmt::Display for Holder {
 
 /// The first other process that has `path` open, as far as this user may see.
 pub fn holder(path: &Path) -> Option<Holder> {
-    let device = path.canonicalize().ok()?;
-    holders(&[&device]).pop().flatten()
+    all_holders(path).into_iter().next()
+}
+
+/// All other processes that have `path` open, as far as this user may see.
+pub(crate) fn all_holders(path: &Path) -> Vec<Holder> {
+    let device = path.canonicalize().ok();
+    device.and_then(|device| holders(&[&device]).pop()).unwrap_or_default()
 }
 
 /// Whether this process itself has `path` open, other than from whoever started it.
@@ -34,17 +39,19 @@ pub(super) fn is_own(path: &Path) -> bool {
     path.canonicalize().is_ok_and(|device| targets.any(|target| target == device))
 }
 
-/// For each of the real `devices` the first other process that has it open, in one look at all processes.
-pub(super) fn holders(devices: &[&Path]) -> Vec<Option<Holder>> {
-    let mut found: Vec<Option<Holder>> = vec![None; devices.len()];
+/// For each of the real `devices` the other processes that have it open, in one look at all processes.
+pub(super) fn holders(devices: &[&Path]) -> Vec<Vec<Holder>> {
+    let mut found: Vec<Vec<Holder>> = vec![Vec::new(); devices.len()];
     let processes = fs::read_dir("/proc").into_iter().flatten().flatten();
     let pids = processes.filter_map(|entry| entry.file_name().to_str()?.parse::<u32>().ok());
     for pid in pids.filter(|&pid| pid != std::process::id()) {
         let open = fs::read_dir(format!("/proc/{pid}/fd")).into_iter().flatten().flatten();
         for target in open.filter_map(|entry| fs::read_link(entry.path()).ok()) {
             let at = devices.iter().position(|&device| device == target);
-            if let Some(found) = at.and_then(|at| found.get_mut(at)).filter(|found| found.is_none()) {
-                *found = Some(Holder { pid, program: name_of(pid) });
+            let known = at.and_then(|at| found.get_mut(at));
+            // Once each, however often it has it open.
+            if let Some(known) = known.filter(|known| known.last().is_none_or(|last| last.pid != pid)) {
+                known.push(Holder { pid, program: name_of(pid) });
             }
         }
     }

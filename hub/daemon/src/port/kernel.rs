@@ -8,12 +8,40 @@ use std::os::fd::{AsFd, BorrowedFd};
 use rustix::io::Errno;
 use rustix::ioctl::{Opcode, Updater, ioctl};
 
-/// Errors of the line since the driver was loaded: framing, overrun and parity errors, breaks, and bytes for which the
-/// kernel's buffer had no room. Wraps.
-pub(super) fn line_errors(line: impl AsFd) -> Result<u32, Errno> {
-    let mut counts = [0; WORDS];
-    call::<TIOCGICOUNT>(line.as_fd(), &mut counts)?;
-    Ok(sum_of_errors(&counts))
+/// What happened on a line since its driver was loaded. All wrap.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub(crate) struct Counts {
+    /// Bytes received.
+    pub(crate) received: u32,
+    /// Bytes without a stop bit.
+    pub(crate) framing: u32,
+    /// Bytes that the UART lost.
+    pub(crate) overrun: u32,
+    pub(crate) parity: u32,
+    pub(crate) breaks: u32,
+    /// Bytes for which the kernel's buffer had no room.
+    pub(crate) buffer: u32,
+}
+
+impl Counts {
+    /// Asks the driver of `line`.
+    pub(super) fn of(line: impl AsFd) -> Result<Counts, Errno> {
+        let mut words = [0; WORDS];
+        call::<TIOCGICOUNT>(line.as_fd(), &mut words)?;
+        Ok(Counts::in_words(&words))
+    }
+
+    /// All errors in one number.
+    pub(crate) fn errors(self) -> u32 {
+        let Counts { received: _, framing, overrun, parity, breaks, buffer } = self;
+        [framing, overrun, parity, breaks, buffer].into_iter().fold(0, u32::wrapping_add)
+    }
+
+    /// A `serial_icounter_struct`: cts dsr rng dcd rx tx frame overrun parity brk buf_overrun.
+    fn in_words(words: &[u32; WORDS]) -> Counts {
+        let [_, _, _, _, received, _, framing, overrun, parity, breaks, buffer, ..] = *words;
+        Counts { received, framing, overrun, parity, breaks, buffer }
+    }
 }
 
 /// Has the driver hand over bytes as they come; an FTDI adapter then does so each millisecond instead of each 16. Takes
@@ -24,11 +52,6 @@ pub(super) fn hand_over_at_once(line: impl AsFd) -> Result<(), Errno> {
     let flags = serial[FLAGS];
     serial[FLAGS] = prompt(flags);
     if serial[FLAGS] == flags { Ok(()) } else { call::<TIOCSSERIAL>(line.as_fd(), &mut serial) }
-}
-
-/// The error counts of a `serial_icounter_struct` in one number.
-fn sum_of_errors(counts: &[u32; WORDS]) -> u32 {
-    counts[ERRORS].iter().fold(0, |sum, count| sum.wrapping_add(*count))
 }
 
 /// The `flags` of a `serial_struct` as they shall be.
@@ -44,8 +67,6 @@ fn call<const OPCODE: Opcode>(line: BorrowedFd<'_>, words: &mut [u32; WORDS]) ->
 
 /// Words of a `serial_icounter_struct`; a `serial_struct` is shorter.
 const WORDS: usize = 20;
-/// Where frame, overrun, parity, brk and buf_overrun stand in it.
-const ERRORS: std::ops::RangeInclusive<usize> = 6..=10;
 /// Where the flags stand in a `serial_struct`.
 const FLAGS: usize = 4;
 /// Bits of the flags (linux/tty_flags.h).
@@ -62,12 +83,12 @@ mod tests {
 
     #[test]
     fn errors_are_what_the_line_did_wrong() {
-        // cts dsr rng dcd rx tx, then frame overrun parity brk buf_overrun, then what is reserved.
-        let mut counts = [0; WORDS];
-        counts[..11].copy_from_slice(&[9, 9, 9, 9, 1_000_000, 500, 1, 20, 300, 4000, 50_000]);
-        assert_eq!(sum_of_errors(&counts), 54_321);
-        counts[6] = u32::MAX;
-        assert_eq!(sum_of_errors(&counts), 54_319);
+        let mut words = [0; WORDS];
+        words[..11].copy_from_slice(&[9, 9, 9, 9, 1_000_000, 500, 1, 20, 300, 4000, 50_000]);
+        let counts = Counts::in_words(&words);
+        assert_eq!((counts.received, counts.errors()), (1_000_000, 54_321));
+        assert_eq!((counts.overrun, counts.buffer), (20, 50_000));
+        assert_eq!(Counts { framing: u32::MAX, ..counts }.errors(), 54_319);
     }
 
     #[test]
@@ -80,7 +101,7 @@ mod tests {
     #[test]
     fn a_line_that_has_none() {
         let (_, slave) = std::io::pipe().unwrap();
-        assert_eq!(line_errors(&slave), Err(Errno::NOTTY));
+        assert_eq!(Counts::of(&slave), Err(Errno::NOTTY));
         assert_eq!(hand_over_at_once(&slave), Err(Errno::NOTTY));
     }
 }

@@ -180,6 +180,9 @@ fn busy(path: &Path, holder: Option<Holder>) -> Failure {
                 "agetty" | "getty" => {
                     "a login waits there: stop it first (sudo systemctl stop serial-getty@...)"
                 }
+                "systemd" => {
+                    "the service manager keeps it for a service that is to go on with it: sudo systemctl stop scanhub"
+                }
                 "gpsd" => "stop it first (sudo systemctl stop gpsd.socket gpsd)",
                 "scanhub" => "stop it first, or listen to it: scanhub list --domains",
                 _ => "stop it first",
@@ -259,6 +262,7 @@ mod tests {
             ("brltty", "apt remove brltty"),
             ("agetty", "serial-getty"),
             ("scanhub", "scanhub list --domains"),
+            ("systemd", "systemctl stop scanhub"),
             ("minicom", "stop it first"),
         ] {
             let failure = busy(Path::new("/dev/x"), Some(Holder { pid: 7, program: program.to_owned() }));

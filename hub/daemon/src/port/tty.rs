@@ -13,8 +13,9 @@ use rustix::termios::{
     tcflush, tcgetattr, tcsetattr,
 };
 
+use super::Refusal;
 use super::candidates::{PROMPT_MS, is_tty, latency_ms};
-use super::{Refusal, kernel};
+use super::kernel::{self, Counts};
 
 /// An open serial line, exclusive and raw; reads and writes never block.
 pub(crate) struct Tty {
@@ -78,14 +79,24 @@ impl Tty {
                 path.display()
             );
         }
-        tty.errors.set(kernel::line_errors(&tty.line).ok());
+        tty.errors.set(tty.counts().map(|counts| counts.errors()));
         Ok(tty)
+    }
+
+    /// What the driver counted since it was loaded, if it counts.
+    pub(crate) fn counts(&self) -> Option<Counts> {
+        Counts::of(&self.line).ok()
+    }
+
+    /// The rate that the driver says it has.
+    pub(crate) fn baud(&self) -> Option<u32> {
+        tcgetattr(&self.line).ok().map(|termios| termios.output_speed())
     }
 
     /// Errors that the driver counted since it was last asked, be it by a change of the rate.
     pub(crate) fn line_errors(&self) -> u64 {
         let Some(before) = self.errors.get() else { return 0 };
-        let now = kernel::line_errors(&self.line).unwrap_or(before);
+        let now = self.counts().map_or(before, |counts| counts.errors());
         self.errors.set(Some(now));
         u64::from(now.wrapping_sub(before))
     }

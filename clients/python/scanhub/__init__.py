@@ -1,0 +1,90 @@
+"""What a scanhub publishes, for programs in Python: samples in shared memory, without a copy.
+
+    import scanhub
+
+    for scan in scanhub.subscribe("front/scan"):
+        print(scan.seq, scan.ranges.min(), scan.ranges_m[180])
+
+`scan.ranges` is a numpy view of the hub's memory that cannot be written. A hub that is not there is waited for, one
+that restarts too. docs/python.md has the rest.
+"""
+
+from __future__ import annotations
+
+import os
+from typing import Callable
+
+from . import memory
+from .control import background, control
+from .errors import Denied, Failure, Held, Impossible, Mismatch, NoHub, NoTopic, Refused, Short, Silent
+from .model import Background, Shown
+from .names import TopicName, candidates, parse
+from .presence import find
+from .processed import Foreground, Mark, Marks, Segment, Zone, Zones
+from .sample import Sample
+from .scan import Scan, Telegram
+from .status import Pose, Status
+from .subscription import Subscription
+
+__version__ = "0.1.0"
+
+__all__ = [
+    "Background",
+    "Denied",
+    "Failure",
+    "Foreground",
+    "Held",
+    "Impossible",
+    "Mark",
+    "Marks",
+    "Mismatch",
+    "NoHub",
+    "NoTopic",
+    "Pose",
+    "Refused",
+    "Sample",
+    "Scan",
+    "Segment",
+    "Short",
+    "Shown",
+    "Silent",
+    "Status",
+    "Subscription",
+    "Telegram",
+    "TopicName",
+    "Zone",
+    "Zones",
+    "background",
+    "control",
+    "sensors",
+    "subscribe",
+    "topics",
+]
+
+
+def subscribe(
+    *topics: str,
+    domain: str | None = None,
+    root: str | os.PathLike[str] | None = None,
+    timeout: float | None = None,
+    on_notice: Callable[[str], object] | None = None,
+) -> Subscription:
+    """Follows `topics`, each `SENSOR/TOPIC` as in `front/scan`, in the domain (None: what SCANHUB_DOMAIN says, else
+    `scanhub`) below the directory `root` (None: wherever a hub may have put it).
+
+    Iterate over what is returned, for ever. With `timeout`, a silence of so many seconds raises NoHub or Silent.
+    `on_notice` is called with `hub_gone` and `hub_back`. NoTopic or Impossible at once if a name is.
+    """
+    if not topics:
+        raise NoTopic("no topic is named", "write SENSOR/TOPIC, as front/scan")
+    return Subscription([parse(topic) for topic in topics], candidates(domain, root), timeout, on_notice)
+
+
+def topics(*, domain: str | None = None, root: str | os.PathLike[str] | None = None) -> list[TopicName]:
+    """The topics of the running hub, sorted; NoHub after half a second."""
+    return memory.topics(find(candidates(domain, root)))
+
+
+def sensors(*, domain: str | None = None, root: str | os.PathLike[str] | None = None) -> list[str]:
+    """The sensors of the running hub, sorted; NoHub after half a second."""
+    return sorted({topic.sensor for topic in topics(domain=domain, root=root)})

@@ -1,0 +1,172 @@
+"""The structs of docs/topics.md, version 1, field by field, as they lie in shared memory. Refuses to know what they
+mean."""
+
+from __future__ import annotations
+
+import ctypes
+from ctypes import c_double, c_int32, c_uint8, c_uint16, c_uint32, c_uint64
+
+BEAMS = 401
+"""The most beams of a scan."""
+
+REVISION = 1
+"""Of all payloads: a greater one of the hub only appends."""
+
+
+class _Struct(ctypes.LittleEndianStructure):
+    @classmethod
+    def type_name(cls) -> str:
+        """The name that both sides of a service compare."""
+        return f"scanhub.{cls.__name__}.v1"
+
+
+class Header(_Struct):
+    _fields_ = [
+        ("seq", c_uint64),
+        ("topic_seq", c_uint64),
+        ("stamp_first_ns", c_uint64),
+        ("stamp_last_ns", c_uint64),
+        ("wall_ns", c_uint64),
+        ("boot", c_uint64),
+        ("sensor", c_uint8),
+        ("quality", c_uint8),
+        ("flags", c_uint16),
+        ("period_us", c_uint32),
+        ("hub_pid", c_uint32),
+        ("reasons", c_uint8),
+        ("hub_time", c_uint8 * 3),
+    ]
+
+
+class Scan(_Struct):
+    _fields_ = [
+        ("count", c_uint16),
+        ("unit_mm", c_uint8),
+        ("range_bits", c_uint8),
+        ("first_angle_mdeg", c_int32),
+        ("step_mdeg", c_uint16),
+        ("intensity_bits", c_uint8),
+        ("contents", c_uint8),
+        ("range_array", c_uint16 * BEAMS),
+        ("upper_array", c_uint8 * BEAMS),
+        ("pad", c_uint8),
+    ]
+
+
+class Mark(_Struct):
+    _fields_ = [
+        ("angle_mdeg", c_int32),
+        ("range_dmm", c_uint32),
+        ("weight", c_uint16),
+        ("peak", c_uint8),
+        ("edge", c_uint8),
+        ("first_beam", c_uint16),
+        ("last_beam", c_uint16),
+    ]
+
+
+class Marks(_Struct):
+    _fields_ = [("count", c_uint8), ("flags", c_uint8), ("reserved", c_uint16), ("mark_array", Mark * 64)]
+
+
+class Zone(_Struct):
+    _fields_ = [("radius_mm", c_uint16), ("beams", c_uint16), ("violated", c_uint8), ("reserved", c_uint8 * 3)]
+
+
+class Zones(_Struct):
+    _fields_ = [
+        ("verdict", c_uint8),
+        ("count", c_uint8),
+        ("nearest_beam", c_uint16),
+        ("nearest_mm", c_uint32),
+        ("invalid_beams", c_uint16),
+        ("flags", c_uint8),
+        ("reserved", c_uint8),
+        ("zone_array", Zone * 8),
+    ]
+
+
+class Segment(_Struct):
+    _fields_ = [
+        ("first", c_uint16),
+        ("last", c_uint16),
+        ("nearest", c_uint16),
+        ("width", c_uint16),
+        ("x_mm", c_int32),
+        ("y_mm", c_int32),
+    ]
+
+
+class Foreground(_Struct):
+    _fields_ = [
+        ("generation", c_uint32),
+        ("count", c_uint16),
+        ("beams", c_uint16),
+        ("unit_mm", c_uint8),
+        ("left_out", c_uint8),
+        ("segments", c_uint16),
+        ("bit_array", c_uint8 * 51),
+        ("pad", c_uint8),
+        ("range_array", c_uint16 * BEAMS),
+        ("pad2", c_uint8 * 2),
+        ("segment_array", Segment * 64),
+    ]
+
+
+class Background(_Struct):
+    _fields_ = [
+        ("generation", c_uint32),
+        ("taught", c_uint16),
+        ("count", c_uint16),
+        ("unit_mm", c_uint8),
+        ("flags", c_uint8),
+        ("reserved", c_uint8 * 2),
+        ("range_array", c_uint16 * BEAMS),
+        ("pad", c_uint8 * 2),
+    ]
+
+
+class Pose(_Struct):
+    _fields_ = [
+        ("x_m", c_double),
+        ("y_m", c_double),
+        ("yaw_rad", c_double),
+        ("upside_down", c_uint8),
+        ("reserved", c_uint8 * 7),
+    ]
+
+
+class Status(_Struct):
+    _fields_ = [
+        ("state", c_uint8),
+        ("mode", c_uint8),
+        ("unit_mm", c_uint8),
+        ("reserved", c_uint8),
+        ("baud", c_uint32),
+        ("since_ns", c_uint64),
+        ("rate_mhz", c_uint32),
+        ("angle_deg", c_uint16),
+        ("resolution_cdeg", c_uint16),
+        ("type_text", c_uint8 * 24),
+        ("port_text", c_uint8 * 128),
+        ("last_error_text", c_uint8 * 160),
+        ("counters", c_uint64 * 28),
+        ("pose", Pose),
+    ]
+
+
+class Request(_Struct):
+    _fields_ = [
+        ("sensor_text", c_uint8 * 32),
+        ("verb", c_uint16),
+        ("count", c_uint16),
+        ("unit_mm", c_uint8),
+        ("reserved", c_uint8 * 3),
+        ("range_array", c_uint16 * BEAMS),
+        ("pad", c_uint8 * 6),
+    ]
+
+
+def text(field: ctypes.Array[c_uint8]) -> str:
+    """A text that is filled up with 0; a character that was cut at its end is left out."""
+    return bytes(field).split(b"\0", 1)[0].decode(errors="ignore")

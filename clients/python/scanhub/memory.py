@@ -1,0 +1,171 @@
+"""From a topic to its service in shared memory. Who follows topics gets ports and never sees iceoryx2. Refuses to know
+why somebody waits, and what a sample says."""
+
+from __future__ import annotations
+
+import ctypes
+import time
+from typing import Any
+
+import iceoryx2 as iox2
+
+from . import layout, trouble
+from .errors import Held, Short
+from .names import Domain, TopicName, of_service
+from .sample import Sample
+
+
+class Membership:
+    """The stay of this process in a domain; Failure if it cannot join.
+
+    The configuration is made here, never read from a file: the library would search the working directory for one.
+    Signals stay Python's.
+    """
+
+    def __init__(self, domain: Domain) -> None:
+        self.domain = domain
+        iox2.set_log_level_from_env_or(iox2.LogLevel.Error)
+        builder = iox2.NodeBuilder.new().config(_config(domain))
+        try:
+            builder = builder.signal_handling_mode(iox2.SignalHandlingMode.Disabled)
+            self._node = builder.create(iox2.ServiceType.Ipc)
+        except iox2.NodeCreationFailure as error:
+            raise trouble.broken(domain, f"cannot join {domain.name}: {error}") from None
+
+    def service(self, name: str) -> Any:
+        """The builder of a service."""
+        return self._node.service_builder(iox2.ServiceName.new(name))
+
+    def listen(self, event: str) -> Any | None:
+        """The end of an event at which one sleeps, or nothing as long as no hub has made it; Failure, Short."""
+        factory = self.open(event, self.service(event).event(), "an event")
+        return factory and self.port(event, factory.listener_builder())
+
+    def subscribe(self, name: TopicName, kind: type[Sample]) -> Port | None:
+        """A consumer's end of a topic, or nothing as long as no hub has made it; Mismatch, Short, Failure."""
+        builder = self.service(name.service).publish_subscribe(_payload(kind)).user_header(layout.Header)
+        factory = self.open(name.service, builder, trouble.types(kind.struct))
+        return factory and Port(name, kind, self.port(name.service, factory.subscriber_builder()))
+
+    def open(self, name: str, builder: Any, ours: str) -> Any | None:
+        """Opens a service of types `ours`; one that is not there, or just being made or removed, is nothing."""
+        try:
+            return builder.open()
+        except Exception as error:  # Each pattern has its own type of error, which share no other parent.
+            trouble.check_absent(self.domain, name, ours, str(error))
+            return None
+
+    def port(self, name: str, builder: Any) -> Any:
+        """Makes a port; Short if memory, descriptors or places are."""
+        trouble.check_room()
+        try:
+            return builder.create()
+        except Exception as error:
+            raise trouble.no_port(name, str(error)) from None
+
+
+class Received:
+    """A sample in shared memory. Its place is not written anew as long as this, or what was made of it, is in use."""
+
+    def __init__(self, sample: Any, size: int | None) -> None:
+        self._sample = sample
+        self._size = size
+        self.header = layout.Header.from_address(sample.user_header_ptr)
+
+    def data(self) -> Any:
+        """The payload as an array of bytes; made when it is asked for, because whoever waits for a sample has haste."""
+        size = self._size or self._sample.payload().len()
+        data: Any = (ctypes.c_uint8 * size).from_address(self._sample.payload_ptr)
+        data.sample = self._sample
+        return data
+
+
+class Port:
+    """A consumer's end of a topic."""
+
+    def __init__(self, name: TopicName, kind: type[Sample], subscriber: Any) -> None:
+        self._name = name
+        self._size = None if kind.topic == "telegram" else ctypes.sizeof(kind.struct)
+        self._subscriber = subscriber
+        self._unconnected_since: float | None = None
+
+    def receive(self) -> Received | None:
+        """The oldest sample that waits, or nothing; Held if too many are kept, Short if there is no connection."""
+        try:
+            sample = self._subscriber.receive()
+        except iox2.ReceiveError as error:
+            self._refused(str(error))
+            return None
+        self._unconnected_since = None
+        return None if sample is None else Received(sample, self._size)
+
+    def _refused(self, what: str) -> None:
+        if what == "ExceedsMaxBorrows":
+            remedy = "let go of them and of their views, or keep `sample.copy()`"
+            raise Held(f"four samples of {self._name} are kept, and no more are possible", remedy)
+        # Seen while a killed hub's memory is being removed; what stays so is a shortage.
+        now = time.monotonic()
+        self._unconnected_since = self._unconnected_since or now
+        if now - self._unconnected_since > _UNCONNECTED_LIMIT:
+            raise Short(f"cannot connect to {self._name}: {what}", "`ulimit -n` or /dev/shm may be too small")
+
+
+class Wakeups:
+    """What wakes the consumers of several sensors: the hub notifies once per telegram, after its last sample."""
+
+    def __init__(self) -> None:
+        builder = iox2.WaitSetBuilder.new().signal_handling_mode(iox2.SignalHandlingMode.Disabled)
+        self._set = builder.create(iox2.ServiceType.Ipc)
+        self._listeners: list[Any] = []
+        self._guards: list[Any] = []
+
+    def add(self, listener: Any) -> None:
+        """Is woken by this one, too."""
+        self._guards.append(self._set.attach_notification(listener))
+        self._listeners.append(listener)
+
+    def wait(self, seconds: float) -> None:
+        """Sleeps until one of them is notified, a signal comes, or the time is over; returns at once if one was since
+        the caller looked. Other threads run meanwhile."""
+        try:
+            # What was notified stays so until it is taken, and that after receiving, which has more haste.
+            if any([listener.try_wait() for listener in self._listeners]):
+                return
+            if self._listeners:
+                self._set.wait_and_process_with_timeout(iox2.Duration.from_nanos(int(seconds * 1e9)))
+            else:
+                time.sleep(seconds)
+        except (iox2.ListenerWaitError, iox2.WaitSetRunError) as error:
+            if "Interrupt" not in str(error):
+                raise Short(f"cannot wait for the hub: {error}", "`ulimit -n` may be too small") from None
+
+
+def topics(domain: Domain) -> list[TopicName]:
+    """All topics of the domain, sorted. Those of a dead hub stay as long as a consumer keeps them."""
+    try:
+        found = iox2.Service.list(_config(domain), iox2.ServiceType.Ipc)
+    except Exception as error:
+        raise trouble.broken(domain, f"cannot list topics: {error}") from None
+    named = {of_service(str(details.name().to_string())) for details in found}
+    return sorted(name for name in named if name)
+
+
+def _config(domain: Domain) -> Any:
+    config = iox2.config.default()
+    everything = config.global_cfg
+    everything.prefix = iox2.FileName.new(domain.prefix)
+    everything.root_path = iox2.Path.new(domain.root)
+    everything.creation_timeout = iox2.Duration.from_millis(100)
+    # Cleaning up is the hub's business.
+    everything.node.cleanup_dead_nodes_on_creation = False
+    everything.node.cleanup_dead_nodes_on_destruction = False
+    everything.service.cleanup_dead_nodes_on_open = False
+    return config
+
+
+def _payload(kind: type[Sample]) -> Any:
+    return iox2.Slice[ctypes.c_uint8] if kind.topic == "telegram" else kind.struct
+
+
+_UNCONNECTED_LIMIT = 3.0
+"""Seconds for which a publisher may be just dying that cannot be connected to."""

@@ -1,0 +1,120 @@
+"""The names: topics, sensors, domains, and the places where a domain may be. Looks at nothing but the environment."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+from typing import NamedTuple
+
+from .errors import Impossible, NoTopic
+
+TOPICS = ("telegram", "scan", "marks", "zones", "foreground", "background", "status")
+"""What the hub publishes for each sensor."""
+
+CONTROL = "scanhub/v1/control"
+"""The service that takes requests; beside it are the events that wake the hub and its clients."""
+
+
+class TopicName(NamedTuple):
+    """One topic of one sensor."""
+
+    sensor: str
+    topic: str
+
+    def __str__(self) -> str:
+        return f"{self.sensor}/{self.topic}"
+
+    @property
+    def service(self) -> str:
+        """The name of its service."""
+        return service(self.sensor, self.topic)
+
+
+def service(sensor: str, word: str) -> str:
+    """The name of a service of `sensor`: a topic, or `wake`."""
+    return f"scanhub/v1/{sensor}/{word}"
+
+
+def of_service(name: str) -> TopicName | None:
+    """The topic whose service has this name; nothing if it is none."""
+    head, version, sensor, topic = (name.split("/") + 4 * [""])[:4]
+    is_ours = (head, version) == ("scanhub", "v1") and topic in TOPICS
+    return TopicName(sensor, topic) if is_ours else None
+
+
+def parse(text: str) -> TopicName:
+    """The topic that `text` names, as in `front/scan`; NoTopic, or Impossible for the sensor's name."""
+    sensor, slash, topic = text.partition("/")
+    if not slash or topic not in TOPICS:
+        raise NoTopic(f"no topic {text!r}", f"write SENSOR/TOPIC, as front/scan; topics are {', '.join(TOPICS)}")
+    check_sensor(sensor)
+    return TopicName(sensor, topic)
+
+
+def check_sensor(name: str) -> None:
+    """Refuses what is no sensor's name, nor that of another machine's, `HUB.SENSOR`: Impossible."""
+    halves = name.split(".")
+    if len(halves) > 2 or not all(_is_name(half) for half in halves):
+        raise Impossible(f"sensor name {name!r} is not possible", "1 to 24 of a-z, 0-9, _ and -, for example front")
+
+
+def _is_name(name: str) -> bool:
+    return 1 <= len(name) <= 24 and name != "robot" and not set(name) - _OF_SENSORS
+
+
+@dataclass(frozen=True)
+class Domain:
+    """A domain at its place: `root` is the directory of all its files."""
+
+    name: str
+    root: str
+
+    @property
+    def prefix(self) -> str:
+        """How the names of its shared memory begin."""
+        return f"sh_{self.name}_"
+
+
+def candidates(name: str | None = None, base: str | os.PathLike[str] | None = None) -> list[Domain]:
+    """Where domain `name` (None: what SCANHUB_DOMAIN says, else `scanhub`) may be: below the directory `base` only, if
+    given, else every place that a hub may have chosen, in the order in which all clients look. Impossible if the name
+    is, or root and prefix are too long together.
+    """
+    name = os.environ.get("SCANHUB_DOMAIN", "scanhub") if name is None else name
+    if not 1 <= len(name) <= 16 or set(name) - _OF_DOMAINS:
+        raise Impossible(f"domain name {name!r} is not possible", "1 to 16 of a-z, 0-9 and -, for example scanhub")
+    if base is not None:
+        domain = _at(name, os.path.abspath(base))
+        if not _fits(domain):
+            what = f"domain {name} at {domain.root} is too long: root and prefix have {_length(domain)} bytes"
+            raise Impossible(f"{what}, at most {_LIMIT - 1} are possible", "choose a shorter root or domain")
+        return [domain]
+    places = [_of_environment("RUNTIME_DIRECTORY"), "/run/scanhub"]
+    user = _of_environment("XDG_RUNTIME_DIR")
+    places += [user and os.path.join(user, "scanhub"), f"/tmp/scanhub-{os.getuid()}"]
+    domains = [_at(name, place) for place in dict.fromkeys(places) if place]
+    return [domain for domain in domains if _fits(domain)]
+
+
+def _at(name: str, base: str) -> Domain:
+    return Domain(name, os.path.join(base, name))
+
+
+def _length(domain: Domain) -> int:
+    return len(os.fsencode(domain.root)) + len(domain.prefix)
+
+
+def _fits(domain: Domain) -> bool:
+    return _length(domain) < _LIMIT
+
+
+def _of_environment(variable: str) -> str | None:
+    """The first of a colon-separated list, if it is absolute."""
+    first = os.environ.get(variable, "").split(":")[0]
+    return first if os.path.isabs(first) else None
+
+
+_OF_SENSORS = set("abcdefghijklmnopqrstuvwxyz0123456789_-")
+_OF_DOMAINS = _OF_SENSORS - {"_"}
+_LIMIT = 65
+"""Root and prefix together stay below this many bytes: with 75 listeners fail while everything else works."""

@@ -1,0 +1,110 @@
+"""Is there a hub, or a listener that stands for hubs of other machines, and where? Asks the locks of the places that a
+domain may be at; opens nothing else there."""
+
+from __future__ import annotations
+
+import fcntl
+import os
+import struct
+import time
+
+from .errors import Denied, Failure, NoHub
+from .names import Domain
+
+LOOK_EVERY = 0.1
+"""Seconds between two looks at the locks."""
+
+GRACE = 0.5
+"""Seconds that a hub which is just starting may take to appear, where it has to be there."""
+
+
+class Presence:
+    """The hub of a domain, as far as its lock tells: the first live one of several places."""
+
+    def __init__(self, places: list[Domain]) -> None:
+        self._places = places
+        self._holder: tuple[Domain, int] | None = None
+        self._looked_at = float("-inf")
+        self.denied: Denied | None = None
+
+    def look(self) -> tuple[bool, bool]:
+        """Looks again, if the last look is long enough ago; whether one went, and whether one came."""
+        now = time.monotonic()
+        if now - self._looked_at < LOOK_EVERY:
+            return False, False
+        self._looked_at, before = now, self._holder
+        self._holder = self._live()
+        changed = self._holder != before
+        return changed and before is not None, changed and self._holder is not None
+
+    @property
+    def domain(self) -> Domain | None:
+        """Where the hub lives, if there is one."""
+        return self._holder and self._holder[0]
+
+    def absent(self) -> Failure:
+        """What to tell who cannot wait for a hub."""
+        if self.denied:
+            return self.denied
+        looked = ", ".join(place.root for place in self._places)
+        name = self._places[0].name if self._places else ""
+        return NoHub(f"no hub in domain {name}", f"start one with `scanhub run`; looked at {looked}")
+
+    def _live(self) -> tuple[Domain, int] | None:
+        self.denied = None
+        for place in self._places:
+            for lock in ("hub.lock", "listen.lock"):
+                try:
+                    pid = _holder(os.path.join(place.root, lock))
+                except PermissionError:
+                    self.denied = denied(place.root)
+                    break
+                if pid:
+                    return place, pid
+        return None
+
+
+def find(places: list[Domain]) -> Domain:
+    """The hub at the first live one of `places`, waiting a moment for one that is just starting; NoHub, Denied."""
+    presence, give_up_at = Presence(places), time.monotonic() + GRACE
+    while True:
+        presence.look()
+        if presence.domain:
+            return presence.domain
+        if time.monotonic() >= give_up_at:
+            raise presence.absent()
+        time.sleep(LOOK_EVERY)
+
+
+def denied(root: str) -> Denied:
+    """Whose the directory is, or the nearest one above that can be seen."""
+    path = root
+    while True:
+        try:
+            seen = os.stat(path)
+            break
+        except OSError:
+            path = os.path.dirname(path)
+    what = f"{path} belongs to user {seen.st_uid} with mode {seen.st_mode & 0o7777:04o}, this is user {os.getuid()}"
+    remedy = "shared memory is for one user: run as that user, or take a pipe from that user's `scanhub echo --json`"
+    return Denied(what, remedy)
+
+
+def _holder(path: str) -> int:
+    """The process that holds the lock at `path`; 0 if none does, or it has not written yet who it is."""
+    try:
+        file = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
+    except (FileNotFoundError, NotADirectoryError):
+        return 0
+    try:
+        asked = fcntl.fcntl(file, fcntl.F_OFD_GETLK, struct.pack(_FLOCK, fcntl.F_RDLCK, os.SEEK_SET, 0, 0, 0))
+        if struct.unpack(_FLOCK, asked)[0] == fcntl.F_UNLCK:
+            return 0
+        written = os.read(file, 16).strip()
+        return int(written) if written.isdigit() else 0
+    finally:
+        os.close(file)
+
+
+_FLOCK = "hhqqi0q"
+"""struct flock: kind, whence, start, length (0: the whole file), process."""

@@ -1,0 +1,117 @@
+"""How a link and its sensor are. What is not known is None."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+from . import layout
+from .sample import Sample
+
+
+class Pose(NamedTuple):
+    """Where a sensor sits: x ahead of the robot's centre, y to the left, yaw counter-clockwise from ahead."""
+
+    x_m: float
+    y_m: float
+    yaw_rad: float
+    upside_down: bool
+
+
+class Status(Sample):
+    """State, properties and counters of a link."""
+
+    topic = "status"
+    struct = layout.Status
+
+    @property
+    def state(self) -> str:
+        """`absent`, `probing`, `switching`, `starting`, `streaming`, `silent` or `paused`."""
+        return _STATES[self._fields.state] if self._fields.state < len(_STATES) else "unknown"
+
+    @property
+    def since_ns(self) -> int:
+        """When the state began, CLOCK_MONOTONIC."""
+        return self._fields.since_ns
+
+    @property
+    def baud(self) -> int | None:
+        """Rate of the line."""
+        return self._fields.baud or None
+
+    @property
+    def mode(self) -> int | None:
+        """The measuring mode."""
+        return None if self._fields.mode == 0xFF else self._fields.mode
+
+    @property
+    def unit_mm(self) -> int | None:
+        """Millimetres per device unit."""
+        return self._fields.unit_mm or None
+
+    @property
+    def angle_deg(self) -> int | None:
+        """Field of view."""
+        return self._fields.angle_deg or None
+
+    @property
+    def step_deg(self) -> float | None:
+        """Between two beams."""
+        return self._fields.resolution_cdeg / 100 or None
+
+    @property
+    def hz(self) -> float:
+        """Scans per second."""
+        return self._fields.rate_mhz / 1000
+
+    @property
+    def type(self) -> str:
+        """What the sensor calls itself; empty if it has not."""
+        return layout.text(self._fields.type_text)
+
+    @property
+    def port(self) -> str:
+        """As configured."""
+        return layout.text(self._fields.port_text)
+
+    @property
+    def last_error(self) -> str:
+        """In words; empty if there was none."""
+        return layout.text(self._fields.last_error_text)
+
+    @property
+    def counters(self) -> dict[str, int]:
+        """By the names of docs/output.md: copied."""
+        return dict(zip(COUNTERS, self._fields.counters))
+
+    @property
+    def pose(self) -> Pose:
+        """Where the sensor sits, as configured."""
+        pose = self._fields.pose
+        return Pose(pose.x_m, pose.y_m, pose.yaw_rad, pose.upside_down == 1)
+
+
+_STATES = ("absent", "probing", "switching", "starting", "streaming", "silent", "paused")
+COUNTERS = (
+    "bytes_read",
+    "bytes_in_telegrams",
+    "bytes_acknowledge",
+    "bytes_discarded",
+    "bytes_buffered",
+    "telegrams",
+    "suspect",
+    "aborted",
+    "resyncs",
+    "reconnects",
+    "lost_in_restart",
+    "wakeups",
+    "loan_failed",
+    "rejected_address",
+    "rejected_length",
+    "rejected_command",
+    "rejected_count",
+    "rejected_crc",
+    "rejected_vetoed",
+    "rejected_superseded",
+    "line_errors",
+)
+"""The counters that have a name, in their order."""

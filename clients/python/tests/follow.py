@@ -1,0 +1,82 @@
+"""Follows topics and prints each sample as `scanhub echo --json` does, and notices: arguments are domain, root, topics.
+Ends by Ctrl-C, and says so."""
+
+import json
+import sys
+
+import scanhub
+
+
+def stamp(sample: scanhub.Sample) -> dict:
+    said = {
+        "class": sample.topic,
+        "sensor": sample.sensor,
+        "seq": sample.seq,
+        "topic_seq": sample.topic_seq,
+        "stamp_ns": sample.stamp_ns,
+        "wall_ns": sample.wall_ns,
+        "boot": f"{sample.boot:016x}",
+        "quality": sample.quality,
+    }
+    if sample.reasons:
+        said["reasons"] = list(sample.reasons)
+    return said
+
+
+def telegram(sample: scanhub.Telegram) -> dict:
+    fields = ("address", "command", "length")
+    return {**{name: getattr(sample, name) for name in fields}, "data": sample.data.tobytes().hex()}
+
+
+def scan(sample: scanhub.Scan) -> dict:
+    said = {name: getattr(sample, name) for name in ("unit_mm", "first_angle_deg", "step_deg", "count")}
+    said["ranges"] = [int(range) if valid else None for range, valid in zip(sample.ranges, sample.valid)]
+    said["codes"] = [list(pair) for pair in sample.codes]
+    if sample.intensities.size:
+        said["intensities"] = sample.intensities.tolist()
+    return said
+
+
+def marks(sample: scanhub.Marks) -> dict:
+    found = [mark._asdict() for mark in sample.marks]
+    return {"available": sample.available, "overflow": sample.overflow, "marks": found}
+
+
+def zones(sample: scanhub.Zones) -> dict:
+    said = {name: getattr(sample, name) for name in ("verdict", "nearest_mm", "nearest_beam", "invalid_beams")}
+    said["zones"] = [zone._asdict() for zone in sample.zones]
+    return {**said, "provisional": True} if sample.provisional else said
+
+
+def foreground(sample: scanhub.Foreground) -> dict:
+    said = {name: getattr(sample, name) for name in ("generation", "unit_mm", "left_out")}
+    said["beams"], said["ranges"] = sample.beams.tolist(), sample.ranges.tolist()
+    return {**said, "segments": [segment._asdict() for segment in sample.segments]}
+
+
+def background(sample: scanhub.Background) -> dict:
+    names = ("generation", "taught", "unit_mm", "count", "first_angle_deg", "step_deg", "frozen")
+    said = {name: getattr(sample, name) for name in names}
+    said["ranges"] = [None if range in (0, 65535) else int(range) for range in sample.ranges]
+    said["far"] = [beam for beam, range in enumerate(sample.ranges) if range == 65535]
+    return said
+
+
+def status(sample: scanhub.Status) -> dict:
+    names = ("state", "baud", "mode", "type", "unit_mm", "angle_deg", "step_deg", "hz", "port", "since_ns")
+    said = {name: getattr(sample, name) for name in (*names, "counters", "last_error")}
+    return {**said, "pose": sample.pose._asdict()}
+
+
+def notice(kind: str) -> None:
+    print(json.dumps({"class": "notice", "kind": kind}), flush=True)
+
+
+domain, root, *topics = sys.argv[1:]
+try:
+    for sample in scanhub.subscribe(*topics, domain=domain, root=root, on_notice=notice):
+        line = {**stamp(sample), **globals()[sample.topic](sample)}
+        extra = {"missed": sample.missed, "restarted": sample.restarted}
+        print(json.dumps({**line, "python": extra}), flush=True)
+except KeyboardInterrupt:
+    print(json.dumps({"class": "end"}), flush=True)

@@ -1,0 +1,61 @@
+"""Background models and the flow of data on request: arguments are domain and root. `front` has to stream."""
+
+import sys
+import time
+
+import numpy as np
+import scanhub
+
+domain, root = sys.argv[1:]
+
+
+def ask(*order: str) -> scanhub.Shown:
+    return scanhub.background("front", *order, domain=domain, root=root)
+
+
+def until(what) -> None:
+    give_up_at = time.monotonic() + 20
+    while not what():
+        assert time.monotonic() < give_up_at, "waited in vain"
+        time.sleep(0.05)
+
+
+def state() -> str:
+    return next(scanhub.subscribe("front/status", domain=domain, root=root, timeout=20)).state
+
+
+def models_are_shown_and_ordered() -> None:
+    until(lambda: ask().taught > 300)
+    model = ask("freeze")
+    assert model.frozen and model.count == 361 and model.sensor == "front"
+    assert np.isfinite(model.ranges_m).sum() > 200 and model.angles_rad[180] == np.deg2rad(90)
+    published = next(scanhub.subscribe("front/background", domain=domain, root=root, timeout=20))
+    assert published.generation == model.generation and published.count == 361
+    anew = ask("reset")
+    assert anew.generation == model.generation + 1 and anew.taught == 0 and anew.frozen
+    assert not ask("thaw").frozen
+
+
+def the_flow_is_ordered() -> None:
+    scanhub.control("front", "pause", domain=domain, root=root)
+    until(lambda: state() == "paused")
+    try:
+        next(scanhub.subscribe("front/scan", domain=domain, root=root, timeout=0.5))
+        raise AssertionError("it is paused")
+    except scanhub.Silent as silent:
+        assert "front/scan" in silent.message and "scanhub info front" in silent.remedy
+    scanhub.control("front", "resume", domain=domain, root=root)
+    until(lambda: state() == "streaming")
+
+
+def refusals_are_the_hubs() -> None:
+    try:
+        scanhub.background("rear", domain=domain, root=root)
+        raise AssertionError("there is no such sensor")
+    except scanhub.NoTopic as refused:
+        assert "rear" in refused.message and "front" in refused.remedy, refused
+
+
+for check in (models_are_shown_and_ordered, the_flow_is_ordered, refusals_are_the_hubs):
+    check()
+    print(check.__name__, flush=True)

@@ -1,0 +1,81 @@
+//! What dead processes left in a domain, taken away without a hub: their places in it, and the directory itself once
+//! nobody is there. Files in shared memory that no dead process is known to have had are not looked at.
+
+use std::fs;
+use std::io::ErrorKind;
+use std::path::Path;
+use std::time::Duration;
+
+use super::{hub_node, nodes};
+use crate::{Domain, Failure, HubLock, ListenLock};
+
+/// What was taken away.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Cleaned {
+    /// Processes that had ended without leaving.
+    pub dead: usize,
+    /// Not taken away: processes that are there.
+    pub alive: usize,
+    /// The domain's directory.
+    pub root: bool,
+}
+
+/// Takes away what dead processes left in `domain`. What living ones share with them stays, and so does the directory as
+/// long as one of them is there.
+///
+/// [`Kind::DomainHeld`](crate::Kind) if a hub or a listener publishes there, which tidies up by itself;
+/// [`Kind::Failed`](crate::Kind) if the directory is another user's.
+pub fn clean(domain: &Domain) -> Result<Cleaned, Failure> {
+    let root = domain.root();
+    if !root.exists() {
+        return Ok(Cleaned::default());
+    }
+    // Nobody begins to publish meanwhile.
+    let _hub = HubLock::acquire(root)?;
+    let _listener = ListenLock::acquire(root)?;
+    let before = nodes(domain)?;
+    let node = hub_node(domain)?;
+    node.blocking_cleanup_dead_nodes(PATIENCE);
+    drop(node);
+    let after = nodes(domain)?;
+    let root = after.alive == 0 && after.dead == 0 && take_away(root);
+    Ok(Cleaned { dead: before.dead.saturating_sub(after.dead), alive: after.alive, root })
+}
+
+/// Removes the directory `root` with what nobody needs who is not there: empty directories and locks. Whether all of it
+/// is gone; anything else in it stays.
+fn take_away(root: &Path) -> bool {
+    for entry in fs::read_dir(root).into_iter().flatten().flatten() {
+        let path = entry.path();
+        let is_lock = path.extension().is_some_and(|extension| extension == "lock");
+        let _ = if is_lock { fs::remove_file(&path) } else { fs::remove_dir(&path) };
+    }
+    match fs::remove_dir(root) {
+        Ok(()) => true,
+        Err(error) => error.kind() == ErrorKind::NotFound,
+    }
+}
+
+/// Of a dead process whose remains another one is just taking away.
+const PATIENCE: Duration = Duration::from_secs(1);
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_is_not_a_domains_stays() {
+        let root = std::env::temp_dir().join(format!("shc{}", std::process::id()));
+        fs::create_dir_all(root.join("nodes")).unwrap();
+        fs::create_dir(root.join("full")).unwrap();
+        for file in ["hub.lock", "full/something", "letter"] {
+            fs::write(root.join(file), "").unwrap();
+        }
+        assert!(!take_away(&root));
+        let mut left: Vec<_> = fs::read_dir(&root).unwrap().map(|entry| entry.unwrap().file_name()).collect();
+        left.sort();
+        assert_eq!(left, ["full", "letter"]);
+        fs::remove_dir_all(&root).unwrap();
+        assert!(take_away(&root), "it is gone already");
+    }
+}

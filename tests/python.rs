@@ -1,0 +1,166 @@
+//! The Python package beside a hub: its scripts check themselves what only Python can see, and what they follow is compared
+//! with what `echo` says. Skips, saying so, where there is no Python with iceoryx2 and numpy.
+
+mod stage;
+
+use std::collections::BTreeMap;
+use std::path::Path;
+use std::process::Command;
+
+use serde_json::Value;
+use stage::{INT, KILL, Outcome, Program, Stage, TERM, is_class, number, python, script};
+
+/// A script of the package's tests, if there is a Python for it.
+fn check(name: &str) -> Option<Command> {
+    let python = python(&["iceoryx2", "numpy"])?;
+    Some(script(&python, &format!("clients/python/tests/{name}.py")))
+}
+
+/// The same with the stage's domain and root as its first arguments.
+fn check_on(stage: &Stage, name: &str) -> Option<Command> {
+    let mut command = check(name)?;
+    let place = stage.place();
+    let root = place.root().parent().expect("a domain is below its base");
+    command.arg(place.name()).arg(root);
+    Some(command)
+}
+
+fn passed(command: Command) {
+    let outcome = Program::start(command).wait();
+    assert_eq!(outcome.code, Some(0), "{outcome}");
+    print!("{}", String::from_utf8_lossy(&outcome.out));
+}
+
+fn streaming(stage: &Stage) -> (Program, Program) {
+    let simulator = stage.simulator(&["front"], &["--seed=61", "--baud=500000"]);
+    let hub = stage.hub(&[&stage.link("front"), "--set=background.scans=20"]);
+    (simulator, hub)
+}
+
+#[test]
+fn structs_are_golden() {
+    let Some(mut command) = check("layouts") else { return };
+    command.arg(Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/vectors/v1"));
+    passed(command);
+}
+
+#[test]
+fn arrays_are_views_of_shared_memory() {
+    let stage = Stage::new();
+    let Some(command) = check_on(&stage, "views") else { return };
+    let _running = streaming(&stage);
+    passed(command);
+}
+
+#[test]
+fn what_cannot_be_followed_is_told_in_words() {
+    let stage = Stage::new();
+    let Some(command) = check_on(&stage, "refusals") else { return };
+    passed(command);
+}
+
+#[test]
+fn models_and_the_flow_of_data_on_request() {
+    let stage = Stage::new();
+    let Some(command) = check_on(&stage, "models") else { return };
+    let _running = streaming(&stage);
+    passed(command);
+}
+
+#[test]
+fn samples_say_what_echo_says() {
+    const TOPICS: [&str; 7] = ["telegram", "scan", "marks", "zones", "foreground", "background", "status"];
+    let stage = Stage::new();
+    let topics = TOPICS.map(|topic| format!("front/{topic}"));
+    let Some(mut command) = check_on(&stage, "follow") else { return };
+    let (_simulator, hub) = streaming(&stage);
+    let mut follower = Program::start({
+        command.args(&topics);
+        command
+    });
+    follower.await_line("a scan", is_class("scan"));
+    let mut echo = stage.start(&[&["echo", "--json"], &topics.each_ref().map(String::as_str)[..]].concat());
+    for program in [&mut echo, &mut follower] {
+        program.await_lines(2, "a background", is_class("background"));
+        program.await_lines(40, "a scan", is_class("scan"));
+        program.await_lines(2, "a status", is_class("status"));
+    }
+    let (echo, follower) = (echo.end(INT), ended_by_interrupt(follower));
+    drop(hub);
+    for topic in TOPICS {
+        let said = echo.of_class(topic);
+        let same = follower.of_class(topic).iter().filter(|sample| said_by(&said, sample)).count();
+        let wanted = if ["background", "status"].contains(&topic) { 1 } else { 20 };
+        assert!(same >= wanted, "{topic}: {same} of {} are what echo said", said.len());
+    }
+}
+
+/// Whether `echo` said the same of the sample; what it said otherwise fails. A status and a background have no number.
+fn said_by(echo: &[Value], sample: &Value) -> bool {
+    let is_numbered = |line: &Value| line.get("topic_seq").is_some();
+    let same = |line: &&Value| line["topic_seq"] == sample["topic_seq"] && line["boot"] == sample["boot"];
+    if !echo.iter().any(is_numbered) {
+        return echo.iter().any(|line| differing(line, sample).is_empty());
+    }
+    // Of a verdict that is too old `echo` says itself what it is.
+    let Some(line) = echo.iter().find(same).filter(|line| line["stale"] != true) else { return false };
+    let differing = differing(line, sample);
+    assert!(differing.is_empty(), "{differing:?}: {line} {sample}");
+    true
+}
+
+/// The keys of `line` that `sample` has not, or otherwise.
+fn differing<'a>(line: &'a Value, sample: &Value) -> Vec<&'a String> {
+    let keys = line.as_object().expect("an object").keys();
+    // Derived from the mode: what the package offers is the mode itself.
+    keys.filter(|key| *key != "marks" || line["class"] == "marks")
+        .filter(|key| line[*key] != sample[*key])
+        .collect()
+}
+
+#[test]
+fn a_subscription_outlives_several_hubs() {
+    let stage = Stage::new();
+    let Some(mut command) = check_on(&stage, "follow") else { return };
+    command.args(["front/scan", "front/telegram", "front/zones"]);
+    let _simulator = stage.simulator(&["front"], &["--seed=62", "--baud=500000"]);
+    // It is there before its hub is.
+    let mut follower = Program::start(command);
+    let mut hub = stage.hub(&[stage.link("front")]);
+    follower.await_line("hub_back", |line| line["kind"] == "hub_back");
+    for how in [KILL, TERM, KILL] {
+        follower.await_lines(20, "a scan", is_class("scan"));
+        let code = hub.end(how).code;
+        assert_eq!(code, (how == TERM).then_some(0));
+        follower.await_line("hub_gone", |line| line["kind"] == "hub_gone");
+        hub = stage.hub(&[stage.link("front")]);
+        follower.await_line("hub_back", |line| line["kind"] == "hub_back");
+    }
+    follower.await_lines(20, "a scan", is_class("scan"));
+    let outcome = ended_by_interrupt(follower);
+    for topic in ["scan", "telegram", "zones"] {
+        let mut lives = BTreeMap::<String, Vec<Value>>::new();
+        for line in outcome.of_class(topic) {
+            let boot = line["boot"].as_str().expect("a life").to_owned();
+            let life = lives.entry(boot).or_default();
+            let python = &line["python"];
+            // Who was there before the hub got its samples from the first one on.
+            let next = life.last().map_or(0, |last| number(last, "topic_seq") + 1);
+            let is_first_hub = outcome.of_class(topic)[0]["boot"] == line["boot"];
+            assert_eq!(python["restarted"], life.is_empty() && !is_first_hub, "{line}");
+            if !life.is_empty() || !is_first_hub {
+                assert_eq!(number(&line, "topic_seq"), next + number(python, "missed"), "{line}");
+            }
+            life.push(line);
+        }
+        assert_eq!(lives.len(), 4, "{topic}");
+    }
+}
+
+/// Ctrl-C ends it at once, as any program in Python.
+fn ended_by_interrupt(follower: Program) -> Outcome {
+    let outcome = follower.end(INT);
+    assert_eq!(outcome.code, Some(0), "{outcome}");
+    assert_eq!(outcome.of_class("end").len(), 1, "{outcome}");
+    outcome
+}
