@@ -6,9 +6,8 @@ use std::io::{self, Write};
 
 use mcap::parse_record;
 use mcap::records::{Record as Parsed, op};
-use schema::Failure;
-use schema::Topic;
 use schema::file::{METADATA, Writer};
+use schema::{Failure, Topic};
 
 use super::{CHUNK, Written};
 use crate::Recording;
@@ -42,7 +41,9 @@ pub(super) fn copy(
             Item::Record(record) => {
                 let place =
                     message(&record).and_then(|(head, _)| known.channels.place(head.channel_id).flatten());
-                if sensor.is_none() || place.is_some_and(|place| Some(&place.sensor) == sensor) {
+                let is_chosen =
+                    sensor.is_none_or(|sensor| place.is_some_and(|place| place.sensor == *sensor));
+                if is_chosen || record.opcode != op::MESSAGE {
                     copy.record(&record).map_err(failed)?;
                 }
             }

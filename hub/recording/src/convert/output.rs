@@ -31,7 +31,8 @@ impl Place {
                 return refuse(format!("{} is no file", path.display()), "name a file, or - for stdout");
             }
             if !force {
-                return refuse(format!("{} exists", path.display()), "--force replaces it");
+                let message = format!("{} exists", path.display());
+                return Err(Failure::new(Kind::Failed, message, "--force replaces it"));
             }
         }
         let Some(name) = path.file_name() else {
