@@ -153,6 +153,7 @@ pub(crate) enum Verb {
     #[command(after_help = gateway::GROUPS)]
     Gateway(Gateway),
     /// What the gateways of other machines send over the network, and what of it was lost
+    #[command(after_help = listen::SIGNALS)]
     Listen(Listen),
     /// The completion of this command line for a shell
     Completions(Completions),

@@ -64,7 +64,8 @@ pub fn run(
         let mut threads = Vec::new();
         for ((number, link), orders) in config.links.iter().enumerate().zip(orders) {
             let (node, report) = (&node, report.clone());
-            let around = Surroundings { stop: &stop, service: &service, worked: &worked[number] };
+            let around =
+                Surroundings { stop: &stop, service: &service, root: domain.root(), worked: &worked[number] };
             let body = move || match Topics::new(node, &link.name, number as u8, ready.boot) {
                 Ok(topics) => {
                     LinkThread::new(link, topics, around, orders).run(|outcome| drop(report.send(outcome)))
@@ -87,7 +88,7 @@ pub fn run(
         }
         if outcome.is_ok() {
             on_ready(&ready);
-            service.ready(&ready.sensors);
+            service.ready(&ready.sensors, None);
             let is_alive = || threads.iter().all(|thread| !thread.is_finished());
             let watchdog = Watchdog::new(&service, &worked, clock::now());
             let reload = Reload::new(config, read, &service);
@@ -153,7 +154,8 @@ fn random() -> u64 {
     RandomState::new().hash_one(std::process::id())
 }
 
-fn no_resource(what: &str, error: &dyn std::fmt::Display) -> Failure {
+/// `what` cannot be had now.
+pub(crate) fn no_resource(what: &str, error: &dyn std::fmt::Display) -> Failure {
     Failure::new(Kind::Short, format!("{what} cannot be had: {error}"), "try again later")
 }
 
