@@ -14,6 +14,7 @@ mod leds;
 mod listen;
 mod probe;
 pub(crate) mod record;
+pub(crate) mod replay;
 pub(crate) mod simulate;
 mod telegram;
 pub(crate) mod watch;
@@ -36,6 +37,7 @@ pub(crate) use latency::Latency;
 pub(crate) use leds::Leds;
 pub(crate) use listen::Listen;
 pub(crate) use record::Record;
+pub(crate) use replay::Replay;
 pub(crate) use telegram::{Telegram, Way};
 pub(crate) use watch::Watch;
 pub(crate) use zones::Zones;
@@ -100,6 +102,9 @@ impl Everywhere {
 pub(crate) enum Verb {
     /// The hub, in the foreground, until SIGINT or SIGTERM
     Run(Run),
+    /// A hub whose sensors are a recording, with the keys of a player
+    #[command(after_help = replay::KEYS)]
+    Replay(Replay),
     /// Two simulated sensors, the hub and a consumer for each, in one terminal
     Demo(Demo),
     /// Sensors at the other end of ptys

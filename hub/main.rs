@@ -3,6 +3,7 @@
 
 mod cli;
 mod demo;
+mod replay;
 
 use std::ffi::c_int;
 use std::fs::File;
@@ -18,7 +19,7 @@ use clap::error::ErrorKind;
 use clients::{EchoOptions, Format, HzOptions, InfoOptions, ListOptions};
 use daemon::Config;
 use rustix::process::Signal;
-use schema::{Failure, Kind};
+use schema::{Domain, Failure, Kind};
 use serde::Serialize;
 use signal_hook::consts::{SIGHUP, SIGINT, SIGQUIT, SIGTERM, SIGUSR1};
 use tracing::level_filters::LevelFilter;
@@ -38,9 +39,9 @@ fn main() -> ExitCode {
         Err(error) => return refuse(&error),
     };
     start_log();
-    // What the first two print on stdout is one line that says that they are up.
+    // What these print on stdout says that they are up, and how it ended; a recording is no text.
     let quiet = match &cli.verb {
-        Verb::Run(_) | Verb::Simulate(_) => true,
+        Verb::Run(_) | Verb::Replay(_) | Verb::Simulate(_) => true,
         Verb::Record(record) => record.is_to_stdout(),
         _ => false,
     };
@@ -61,6 +62,7 @@ fn dispatch(cli: &Cli) -> Result<(), Failure> {
     let mut out = stdout.map_err(|error| Failure::new(Kind::Failed, format!("no stdout: {error}"), ""))?;
     match &cli.verb {
         Verb::Run(run) => run_hub(run, everywhere),
+        Verb::Replay(replay) => replay::replay(replay, everywhere),
         Verb::Demo(demo) => {
             let options = DemoOptions {
                 headless: demo.headless,
@@ -163,22 +165,24 @@ fn dispatch(cli: &Cli) -> Result<(), Failure> {
 fn run_hub(run: &cli::Run, everywhere: &Everywhere) -> Result<(), Failure> {
     let read = || Config::load(&run.sources());
     let domain = everywhere.hub_domain()?;
-    daemon::run(&read, &domain, |ready| {
-        let line = if everywhere.json {
-            line(&HubReady {
-                class: "ready",
-                domain: domain.name(),
-                root: domain.root(),
-                pid: std::process::id(),
-                boot: format!("{:016x}", ready.boot),
-                sensors: &ready.sensors,
-            })
-        } else {
-            let place = domain.root().display();
-            format!("ready {} in {place}, sensors: {}", domain.name(), ready.sensors.join(", "))
-        };
-        say(&line);
-    })
+    daemon::run(&read, &domain, |ready| say_ready(ready, &domain, everywhere.json))
+}
+
+/// Says that a hub is up.
+fn say_ready(ready: &daemon::Ready, domain: &Domain, json: bool) {
+    say(&if json {
+        line(&HubReady {
+            class: "ready",
+            domain: domain.name(),
+            root: domain.root(),
+            pid: std::process::id(),
+            boot: format!("{:016x}", ready.boot),
+            sensors: &ready.sensors,
+        })
+    } else {
+        let place = domain.root().display();
+        format!("ready {} in {place}, sensors: {}", domain.name(), ready.sensors.join(", "))
+    });
 }
 
 fn run_simulator(simulate: &cli::simulate::Simulate, everywhere: &Everywhere) -> Result<(), Failure> {
@@ -288,7 +292,7 @@ fn refuse(error: &clap::Error) -> ExitCode {
 fn start_log() {
     let level = std::env::var("SCANHUB_LOG").ok().and_then(|level| level.parse().ok());
     tracing_subscriber::fmt()
-        .with_writer(io::stderr)
+        .with_writer(|| replay::line::Log)
         .with_max_level(level.unwrap_or(LevelFilter::INFO))
         .with_target(false)
         .init();

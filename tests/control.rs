@@ -121,10 +121,10 @@ fn what_is_not_there_or_takes_no_requests_is_refused() {
     let _hub = stage.hub(&["--link", &format!("front=file:{file}")]);
     for (sensor, code, kind, message) in [
         ("side", 3, "no_topic", "the hub has no sensor side"),
-        ("front", 1, "failed", "front: a recording plays on, only its background can be asked for"),
+        ("front", 1, "failed", "front: a recording has nobody to begin anew with"),
         ("Front", 78, "configuration", "sensor name \"Front\" is not possible"),
     ] {
-        let outcome = control(&stage, sensor, "pause");
+        let outcome = control(&stage, sensor, "resync");
         let error = &outcome.of_class("error")[0];
         assert_eq!((outcome.code, &error["kind"]), (Some(code), &kind.into()), "{outcome}");
         assert_eq!(error["message"], message);

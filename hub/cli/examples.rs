@@ -28,6 +28,14 @@ const EXAMPLES: &[(&str, &[&str])] = &[
             "scanhub run --config robot.toml",
         ],
     ),
+    (
+        "replay",
+        &[
+            "scanhub replay walk.mcap",
+            "scanhub replay walk.mcap --rate max --set zones.radii=[1.2,0.7]",
+            "scanhub replay walk.mcap --start 1m --end 90s --loop --paused",
+        ],
+    ),
     ("demo", &["scanhub demo", "scanhub demo --headless --for 10s"]),
     (
         "simulate",

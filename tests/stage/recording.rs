@@ -1,9 +1,8 @@
-//! A recording as anybody reads it who knows its form from docs/recording.md, and a Python that has other people's readers.
+//! A recording as anybody reads it who knows its form from docs/recording.md.
 
 use std::collections::BTreeMap;
 use std::fs;
-use std::path::{Path, PathBuf};
-use std::process::Command;
+use std::path::Path;
 
 use mcap::MessageStream;
 use mcap::read::{LinearReader, Options};
@@ -112,21 +111,6 @@ pub(crate) fn unbroken(kept: &[&Kept]) -> Vec<u64> {
         assert_eq!(pair[1], pair[0] + 1, "a gap");
     }
     numbers
-}
-
-/// A Python that has `modules`: that of `SCANHUB_PYTHON`, or the one that `.ci/run` makes. Nothing, said, where there is none.
-pub(crate) fn python(modules: &str) -> Option<Command> {
-    let made = Path::new(env!("CARGO_MANIFEST_DIR")).join("target/venv/bin/python");
-    let python = std::env::var_os("SCANHUB_PYTHON").map_or(made, PathBuf::from);
-    let import = format!("import {modules}");
-    let has_all = Command::new(&python).args(["-B", "-c", &import]).output();
-    if !has_all.is_ok_and(|outcome| outcome.status.success()) {
-        eprintln!("skipped: {} is not there, or has no {modules}: .ci/run makes one", python.display());
-        return None;
-    }
-    let mut command = Command::new(python);
-    command.arg("-B");
-    Some(command)
 }
 
 fn bytes(path: &Path) -> Vec<u8> {

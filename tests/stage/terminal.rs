@@ -171,7 +171,16 @@ impl Sitting {
     }
 
     /// Waits for the end: the exit code, what stands below the picture, and whether the terminal is as it was.
-    pub(crate) fn end(mut self) -> (Option<i32>, String, bool) {
+    pub(crate) fn end(self) -> (Option<i32>, String, bool) {
+        let (code, text, is_as_before) = self.end_of_lines();
+        let (picture, below) = text.rsplit_once("\x1b[?1049l").unwrap_or(("", &text));
+        let is_shown = below.contains("\x1b[?25h") && !below.contains("\x1b[?25l");
+        let is_whole = picture.contains("\x1b[?1049h") && is_shown && is_as_before;
+        (code, below.replace("\x1b[?25h", ""), is_whole)
+    }
+
+    /// The same of a program that draws no picture: with all that it wrote.
+    pub(crate) fn end_of_lines(mut self) -> (Option<i32>, String, bool) {
         let code = self.wait();
         let give_up_at = Instant::now() + PATIENCE;
         let after = tcgetattr(&self.screen).unwrap();
@@ -185,10 +194,7 @@ impl Sitting {
             thread::sleep(Duration::from_millis(10));
         }
         let text = self.text();
-        let (picture, below) = text.rsplit_once("\x1b[?1049l").unwrap_or(("", &text));
-        let is_shown = below.contains("\x1b[?25h") && !below.contains("\x1b[?25l");
-        let is_whole = picture.contains("\x1b[?1049h") && is_shown && is_as_before;
-        (code, below.replace("\x1b[?25h", "").replace(mark, ""), is_whole)
+        (code, text.replace(mark, ""), is_as_before)
     }
 }
 

@@ -3,15 +3,14 @@
 
 mod orders;
 
-use std::os::fd::{AsFd, BorrowedFd, OwnedFd};
+use std::os::fd::{AsFd, BorrowedFd};
 use std::sync::mpsc::{Receiver, SyncSender, TrySendError, channel, sync_channel};
 use std::sync::{Arc, Mutex, PoisonError};
 
-use rustix::event::{EventfdFlags, eventfd};
-use rustix::io::Errno;
 use schema::ipc::{self, Asked, ControlServer, Node};
 use schema::{Background, Failure, Kind, Response, Verb, shortage};
 
+use crate::bell::Bell;
 use crate::config::Processing;
 pub(crate) use orders::{Flow, Orders};
 
@@ -83,7 +82,7 @@ impl Desk {
 
     /// What becomes readable when there is something to [`serve`](Self::serve).
     pub(crate) fn descriptors(&self) -> [BorrowedFd<'_>; 2] {
-        [ipc::descriptor(self.server.requests()), self.bell.0.as_fd()]
+        [ipc::descriptor(self.server.requests()), self.bell.as_fd()]
     }
 
     /// Lets the link of `sensor` make of its scans what `processing` says, as soon as it looks; the last word holds.
@@ -161,28 +160,6 @@ impl Desk {
         if let Err(failure) = self.server.answer(asked, &response) {
             tracing::debug!(%failure, "a client was not answered");
         }
-    }
-}
-
-/// An eventfd that stays readable until it is hushed.
-struct Bell(OwnedFd);
-
-impl Bell {
-    fn new() -> Result<Bell, Failure> {
-        let made = eventfd(0, EventfdFlags::CLOEXEC | EventfdFlags::NONBLOCK);
-        made.map(Bell).map_err(|error: Errno| {
-            Failure::new(Kind::Short, format!("an eventfd cannot be had: {error}"), "raise `ulimit -n`")
-        })
-    }
-
-    fn ring(&self) {
-        // Fails only if it rings already.
-        let _ = rustix::io::write(&self.0, &1_u64.to_ne_bytes());
-    }
-
-    fn hush(&self) {
-        // Fails only if it does not ring.
-        let _ = rustix::io::read(&self.0, &mut [0; 8]);
     }
 }
 

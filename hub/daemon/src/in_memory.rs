@@ -14,6 +14,7 @@ use crate::config::Config;
 use crate::control::Desk;
 use crate::link::{LinkThread, Surroundings};
 use crate::preflight;
+use crate::publish::Past;
 use crate::service::Service;
 use crate::topics::Topics;
 
@@ -22,6 +23,8 @@ use crate::topics::Topics;
 pub struct DrivenLink<'a> {
     link: LinkThread<'a>,
     session: Session,
+    /// When scans stay out, by the clock of whoever drives it.
+    stale_at: Nanos,
 }
 
 /// Makes the links of `config` in `domain`, whatever their ports are, and gives them to `drive`; ends with it. Requests of
@@ -54,15 +57,21 @@ pub fn in_memory<T>(
         topics.set_flags(Flags::REPLAYED);
         let link = LinkThread::new(link, topics, around, orders);
         let session = Session::new(link.settings(true), clock::now());
-        links.push(DrivenLink { link, session });
+        links.push(DrivenLink { link, session, stale_at: Nanos::MAX });
     }
     shortage::allocate(domain)?;
     Ok(drive(&mut links))
 }
 
 impl DrivenLink<'_> {
-    /// `bytes` came, in one read at `now`: publishes what is complete with them. How many telegrams that were.
+    /// `bytes` came, in one read at `now`: publishes what is complete with them, and before that that scans stayed out, if
+    /// they did. How many telegrams that were.
     pub fn read(&mut self, now: Nanos, mut bytes: &[u8]) -> usize {
+        if now > self.stale_at {
+            self.link.topics.stale(&mut self.link.pipeline, self.stale_at);
+            self.link.wake(Wake::Status);
+            self.stale_at = Nanos::MAX;
+        }
         if self.session.buffered() > 0 {
             // As a line does while the end of a telegram is near.
             self.link.topics.prepare(&self.link.pipeline);
@@ -75,7 +84,10 @@ impl DrivenLink<'_> {
             bytes = rest;
             self.session.commit(now, piece.len());
             while let Output::Telegram(received) = self.session.poll_output() {
-                self.link.publish(&received, self.link.link.mode, 0);
+                let past = Past { mode: self.link.link.mode, ..Past::default() };
+                if let Some(limit) = self.link.publish(&received, &past) {
+                    self.stale_at = now.saturating_add(limit);
+                }
                 self.link.wake(Wake::Telegram);
                 published += 1;
             }

@@ -2,6 +2,7 @@
 //! memory; who listens is not its business.
 
 mod attend;
+mod bell;
 pub mod bus_error;
 mod clock;
 mod complaint;
@@ -20,6 +21,7 @@ mod pipeline;
 pub mod port;
 mod preflight;
 pub mod probe;
+mod publish;
 mod reload;
 mod replay;
 pub mod scanner;
@@ -32,4 +34,5 @@ mod topics;
 
 pub use config::Config;
 pub use in_memory::{DrivenLink, in_memory};
+pub use replay::{Pace, Play, Player, Progress, Replay, replay};
 pub use supervise::{Ready, run};

@@ -7,12 +7,11 @@ use std::path::Path;
 use std::sync::atomic::{AtomicBool, Ordering};
 
 use lms::framer::suspect;
-use lms::reply::Reply;
-use lms::session::{Output, Received};
-use lms::variant::{Baud, Mode, Unit, Variant};
+use lms::session::Output;
+use lms::variant::{Baud, Unit};
 use lms::{MILLIS, Nanos, Notice, Session, Settings, Trouble};
 use rustix::event::{PollFd, PollFlags, poll};
-use schema::{Failure, Flags, Scan, State, Status, Wake};
+use schema::{Failure, Flags, State, Status, Wake};
 
 use crate::clock;
 use crate::config::{Link, Source};
@@ -21,8 +20,8 @@ use crate::line_errors::LineErrors;
 use crate::memory::Memory;
 use crate::pipeline::Pipeline;
 use crate::port::Port;
-use crate::replay;
-use crate::scanner;
+use crate::publish::Past;
+use crate::replay::{self, Cast};
 use crate::service::Service;
 use crate::status::Account;
 use crate::topics::Topics;
@@ -57,7 +56,7 @@ pub(crate) struct LinkThread<'a> {
     /// The measuring mode of which was said whether it has marks.
     pub(crate) told_mode: u8,
     /// The sensor, as it turned out to be, sees too little of its circles.
-    is_blind: bool,
+    pub(crate) is_blind: bool,
 }
 
 /// What a link has around it.
@@ -116,9 +115,9 @@ impl<'a> LinkThread<'a> {
         }
     }
 
-    /// Runs until the hub shall end. `report` is called once, when it is clear whether the link can work: an absent
+    /// Runs until the hub shall end, a recording as part of `cast` or alone. `report` is called once, when it is clear whether the link can work: an absent
     /// port can, one that is busy, forbidden or no tty cannot.
-    pub(crate) fn run(mut self, report: impl FnOnce(Result<(), Failure>)) {
+    pub(crate) fn run(mut self, cast: Option<Cast<'_>>, report: impl FnOnce(Result<(), Failure>)) {
         if let Source::File { .. } = self.link.port {
             self.topics.set_flags(Flags::REPLAYED);
         }
@@ -127,14 +126,7 @@ impl<'a> LinkThread<'a> {
         self.topics.stale(&mut self.pipeline, now);
         self.topics.background(&mut self.pipeline, now);
         match &self.link.port {
-            Source::File { path, paced } => match replay::Recorded::open(path, self.link) {
-                Ok(recorded) => {
-                    report(Ok(()));
-                    let mut session = Session::new(self.settings(true), clock::now());
-                    replay::play(&mut self, &mut session, recorded, *paced);
-                }
-                Err(failure) => report(Err(failure)),
-            },
+            Source::File { path, paced } => replay::run(&mut self, cast, path, *paced, report),
             Source::Tty(_) | Source::Tcp { .. } => self.attend(report),
         }
     }
@@ -197,7 +189,7 @@ impl<'a> LinkThread<'a> {
                     self.account.line_errors += counted;
                     let is_hit = self.line_errors.note(counted);
                     received.reasons |= if is_hit { suspect::LINE_ERROR } else { 0 };
-                    self.publish(&received, None, 0);
+                    self.publish(&received, &Past::default());
                     self.wake(Wake::Telegram);
                     published = true;
                 }
@@ -231,37 +223,6 @@ impl<'a> LinkThread<'a> {
         // While telegrams come there is no need for wake-ups of the status' own.
         let bound = if state == State::Streaming { Nanos::MAX } else { self.next_status };
         Ok((watch, until.min(bound)))
-    }
-
-    /// Publishes a telegram and, if it is measured data that can be read, its scan and what is made of it. `fallback` is
-    /// the mode of a sensor that cannot be asked, `gap_us` the time to the next scan if that is known to be longer than
-    /// nominal.
-    pub(crate) fn publish(&mut self, received: &Received<'_>, fallback: Option<Mode>, gap_us: u32) {
-        let measured = match Reply::decode(received.telegram) {
-            Some(Reply::Measured(measured)) => Some(measured),
-            _ => None,
-        };
-        let mode = received.mode.or(fallback).filter(|mode| mode.has_ranges());
-        let forbidden =
-            measured.zip(mode).is_some_and(|(measured, mode)| scanner::is_forbidden(&measured, mode));
-        let reasons = received.reasons | if forbidden { suspect::FORBIDDEN_BITS } else { 0 };
-        self.account.suspect += u64::from(reasons != 0);
-        let variant = measured.and_then(|measured| Variant::of_beams(measured.count()));
-        let period_us = scanner::period_us(variant, self.link.baud.rate()).max(gap_us);
-        self.topics.telegram(received, reasons, period_us);
-        // Better no range than a wrong one.
-        let (Some(measured), Some(mode)) = (measured, mode) else { return };
-        self.account.scans += 1;
-        let fill = |scan: &mut Scan| scanner::decode(&measured, mode, scan);
-        if let Some(anew) = self.topics.scan(fill, &mut self.pipeline) {
-            tracing::warn!("{}: the background begins anew: {anew}", self.link.name);
-        }
-        let is_blind = self.pipeline.is_blind();
-        if std::mem::replace(&mut self.is_blind, is_blind) != is_blind && is_blind {
-            tracing::warn!("{}: zones unknown: too few beams meet the largest circle", self.link.name);
-        }
-        // Telegrams that had to wait for the hub are late, but scans do not stay out.
-        self.stale_at = clock::now().saturating_add(limit(period_us));
     }
 
     /// The session is over: what is wrong is not what was.
@@ -378,11 +339,6 @@ pub(crate) fn state_of(session: &Session) -> State {
     }
 }
 
-/// For how long after a scan the verdict on it stands, if scans come every `period_us`.
-fn limit(period_us: u32) -> Nanos {
-    if period_us == 0 { NO_PERIOD } else { 2000 * Nanos::from(period_us) + GRACE }
-}
-
 fn is_ready(fd: &PollFd<'_>) -> bool {
     !fd.revents().is_empty()
 }
@@ -393,7 +349,3 @@ const LONGEST_REST: Nanos = 40 * MILLIS;
 const STATUS_PERIOD: Nanos = 1_000 * MILLIS;
 /// A late joiner gets the last status after so long at the most.
 const GREETING_PERIOD: Nanos = 100 * MILLIS;
-/// A verdict stands for two scan periods and so much longer.
-const GRACE: Nanos = 20 * MILLIS;
-/// The same for scans of no variant, which have no nominal period: two of 361 beams at 38400 baud and the grace.
-const NO_PERIOD: Nanos = 480 * MILLIS;

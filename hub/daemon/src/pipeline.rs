@@ -81,6 +81,11 @@ impl Pipeline {
         }
     }
 
+    /// Forgets all that was learned, as at the start.
+    pub(crate) fn begin_anew(&mut self) {
+        *self = Pipeline::new(&self.processing);
+    }
+
     /// Goes on as `processing` says, what it says of a begin aside. A check of other circles knows nothing until it has
     /// seen its scans; a background stays, as far as it is known.
     pub(crate) fn change(&mut self, processing: &Processing) {

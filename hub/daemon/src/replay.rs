@@ -1,171 +1,179 @@
-//! A link whose other end is a recording: its bytes take the way that a line's bytes take, at the pace of its stamps,
-//! else of the scans, or as fast as they can be read. Nobody hears what the hub would say, so nothing is asked.
+//! A link whose other end is a recording, and the player that all links of a recording share. What is recorded comes in
+//! its order and at its times to each other, or as fast as it can be read. Nobody hears what the hub would say, so
+//! nothing is asked.
 
-use std::io::{self, Read};
-use std::iter::Peekable;
+mod frames;
+mod hub;
+mod playback;
+mod player;
+mod recorded;
+mod stream;
+
 use std::path::Path;
 
-use lms::measured::MEASURED;
-use lms::session::Output;
-use lms::variant::{Baud, Mode, Unit, Variant};
-use lms::{Nanos, Session};
-use recording::{Encoding, Form, Frame, Recording};
-use schema::{Failure, State, Wake};
+use lms::variant::Variant;
+use lms::{MILLIS, Nanos, Session};
+use schema::{Failure, Flags, State, Wake};
 
 use crate::clock;
-use crate::config::Link;
 use crate::control::Flow;
 use crate::link::{LinkThread, Woken};
 use crate::scanner;
+use playback::{Due, Turn};
 
-/// A recording as a line's bytes.
-pub(crate) struct Recorded {
-    bytes: Bytes,
-    /// How its values are split; one of which nobody says so is read as ranges of 13 bits.
-    mode: Mode,
+pub use hub::{Replay, replay};
+pub use playback::Play;
+pub(crate) use player::Seat;
+pub use player::{Pace, Player, Progress};
+pub(crate) use recorded::Recorded;
+
+/// What a link plays together with others.
+pub(crate) struct Cast<'a> {
+    pub(crate) recorded: Recorded,
+    pub(crate) seat: Seat<'a>,
 }
 
-enum Bytes {
-    /// As they came down a line, without stamps.
-    Stream(Box<dyn Read + Send>),
-    /// Telegram by telegram, with stamps where the recording has them.
-    Frames {
-        frames: Peekable<Box<dyn Iterator<Item = Frame> + Send>>,
-        /// Of the telegram that was begun.
-        rest: Vec<u8>,
-    },
-}
-
-/// When a telegram came, as the recording has it.
-struct Stamp {
-    wall_ns: u64,
-    /// When the one after it came.
-    next_ns: Option<u64>,
-}
-
-impl Recorded {
-    /// Opens the recording at `path`; metres become units of `link`'s.
-    ///
-    /// [`schema::Kind::Configuration`] if it cannot be read. A file without a telegram is a line that only brings noise.
-    pub(crate) fn open(path: &Path, link: &Link) -> Result<Recorded, Failure> {
-        let mut recording = Recording::open(path)?;
-        // Of several sensors the one whose name the link has.
-        if recording.contents().sensors.len() > 1 {
-            recording = recording.of(&link.name)?;
+/// Plays the part of `cast`, or the recording at `path` alone, into the topics of `link`; then stays silent until the
+/// hub ends. `report` is called once, when it is clear whether it can be read.
+pub(crate) fn run(
+    link: &mut LinkThread<'_>,
+    cast: Option<Cast<'_>>,
+    path: &Path,
+    paced: bool,
+    report: impl FnOnce(Result<(), Failure>),
+) {
+    if let Some(Cast { recorded, seat }) = cast {
+        report(Ok(()));
+        return play(link, recorded, seat);
+    }
+    let pace = if paced { Pace::default() } else { Pace::Max };
+    let alone = || {
+        let recorded = Recorded::open(path, link.link)?;
+        let player = Player::new(Play { pace, ..Play::default() }, 1, recorded.length())?;
+        Ok((recorded, player))
+    };
+    match alone() {
+        Ok((recorded, player)) => {
+            report(Ok(()));
+            player.begin();
+            play(link, recorded, Seat { player: &player, number: 0 });
         }
-        let mode = recording.contents().mode.or(link.mode).unwrap_or(Mode(0));
-        let encoding = Encoding { unit: link.unit.unwrap_or(Unit::Mm), mode };
-        let bytes = match recording.contents().form {
-            Form::Telegrams => Bytes::Stream(recording.bytes()?),
-            Form::Carmen | Form::Mcap => {
-                let frames: Box<dyn Iterator<Item = Frame> + Send> = recording.telegrams(encoding)?;
-                Bytes::Frames { frames: frames.peekable(), rest: Vec::new() }
-            }
+        Err(failure) => report(Err(failure)),
+    }
+}
+
+fn play(link: &mut LinkThread<'_>, mut recorded: Recorded, seat: Seat<'_>) {
+    let mut lap = 0;
+    if let Some(wall_ns) = recorded.begin_ns() {
+        link.topics.recall(wall_ns, Flags::REPLAYED);
+    }
+    loop {
+        let ended = match &mut recorded {
+            Recorded::Stream(stream) => stream::play(link, stream, seat),
+            Recorded::Frames(frames) => frames::play(link, frames, seat),
         };
-        Ok(Recorded { bytes, mode })
-    }
-
-    /// Writes the next bytes into `room`: how many, none at the end, and the stamp of a telegram that begins with them,
-    /// if it has one.
-    fn read(&mut self, room: &mut [u8]) -> (usize, Option<Stamp>) {
-        match &mut self.bytes {
-            Bytes::Stream(stream) => loop {
-                let piece = room.len().min(PIECE);
-                match stream.read(&mut room[..piece]) {
-                    Err(error) if error.kind() == io::ErrorKind::Interrupted => {}
-                    Err(error) => {
-                        tracing::warn!(%error, "the recording became unreadable");
-                        return (0, None);
-                    }
-                    Ok(len) => return (len, None),
-                }
-            },
-            Bytes::Frames { frames, rest } => {
-                let mut stamp = None;
-                if rest.is_empty()
-                    && let Some(frame) = frames.next()
-                {
-                    let next_ns = frames.peek().and_then(|next| next.wall_ns);
-                    stamp = frame.wall_ns.map(|wall_ns| Stamp { wall_ns, next_ns });
-                    *rest = frame.telegram;
-                }
-                let len = rest.len().min(room.len());
-                room[..len].copy_from_slice(&rest[..len]);
-                rest.drain(..len);
-                (len, stamp)
+        let Some(limit) = ended else { return };
+        link.stale_at = limit.map_or(Nanos::MAX, |limit| clock::now() + limit);
+        loop {
+            if let Turn::Anew(next) = seat.end(lap, clock::now()) {
+                lap = next;
+                begin_anew(link);
+                break;
             }
+            if rest(link, seat, clock::now() + IDLE) == Woken::Stop {
+                return;
+            }
+            link.show(None, State::Silent, "the recording is at its end");
         }
     }
 }
 
-/// Plays `recorded` through `session` into the topics of `link`, then stays silent until the hub ends.
-pub(crate) fn play(link: &mut LinkThread<'_>, session: &mut Session, mut recorded: Recorded, paced: bool) {
-    let mut due = clock::now();
-    let mut last_ns = None;
-    // From this scan to the next, as far as it is kept: so long nothing newer can be known.
-    let mut gap_ns = 0;
-    link.show(Some(session), State::Streaming, "");
-    loop {
-        let (len, stamp) = recorded.read(session.spare());
-        if let Some(Stamp { wall_ns, next_ns }) = stamp {
-            due += gap(last_ns.unwrap_or(wall_ns), wall_ns);
-            gap_ns = next_ns.filter(|_| paced).map_or(0, |next_ns| gap(wall_ns, next_ns));
-            last_ns = Some(wall_ns);
+/// Nothing is known any more, as at the hub's start.
+fn begin_anew(link: &mut LinkThread<'_>) {
+    let now = clock::now();
+    link.pipeline.begin_anew();
+    link.stale_at = STANDS;
+    link.topics.stale(&mut link.pipeline, now);
+    link.topics.background(&mut link.pipeline, now);
+    link.topics.wake(Wake::Status);
+}
+
+/// How a link waits for its turns.
+struct Turns<'a> {
+    seat: Seat<'a>,
+    /// When it is looked, where nothing is waited for, whether somebody wants something.
+    look_at: Nanos,
+}
+
+impl<'a> Turns<'a> {
+    fn new(seat: Seat<'a>) -> Turns<'a> {
+        Turns { seat, look_at: 0 }
+    }
+
+    /// Waits for the turn of what is of `media`; meanwhile the link's state is `state`. Nothing if the hub shall end.
+    fn wait(
+        &mut self,
+        link: &mut LinkThread<'_>,
+        session: Option<&Session>,
+        media: Nanos,
+        state: State,
+    ) -> Option<Due> {
+        loop {
+            let now = clock::now();
+            if self.seat.flows() && now < self.look_at {
+                return Some(Due::at_once(now));
+            }
+            let until = match self.seat.turn(media, now) {
+                Turn::Now(due) if now < self.look_at => return Some(due),
+                Turn::Now(_) => 0,
+                Turn::At(at) => at.min(now + IDLE),
+                Turn::Wait | Turn::Anew(_) | Turn::Over => now + IDLE,
+            };
+            if rest(link, self.seat, until) == Woken::Stop {
+                return None;
+            }
+            self.look_at = clock::now() + LOOK;
+            let state = if self.seat.is_paused() { State::Paused } else { state };
+            link.show(session, state, "");
         }
-        // Also where nothing is waited for, the hub's end is looked for.
-        if rest(link, if paced { due } else { 0 }) == Woken::Stop {
-            return;
-        }
+    }
+
+    /// As [`wait`](Self::wait) where nothing is published: whether to go on.
+    fn pass(&mut self, link: &mut LinkThread<'_>) -> bool {
         let now = clock::now();
-        session.commit(now, len);
-        if len == 0 {
-            // Nothing will come that could refute a telegram held back.
-            session.handle_timeout(now + lms::framer::VETO_HOLD);
+        if now < self.look_at {
+            return true;
         }
-        while let Output::Telegram(received) = session.poll_output() {
-            let is_scan = received.telegram.command() == MEASURED;
-            link.publish(&received, Some(recorded.mode), (gap_ns / 1000) as u32);
-            link.wake(Wake::Telegram);
-            if is_scan && paced && last_ns.is_none() {
-                due += period(session);
-                if rest(link, due) == Woken::Stop {
-                    return;
-                }
-            }
-        }
-        link.show(Some(session), State::Streaming, "");
-        if len == 0 {
-            break;
-        }
-    }
-    while rest(link, clock::now() + IDLE) != Woken::Stop {
-        link.show(Some(session), State::Silent, "the recording is at its end");
+        self.look_at = now + LOOK;
+        link.show(None, State::Starting, "");
+        rest(link, self.seat, 0) != Woken::Stop
     }
 }
 
-/// Waits until `until` or the hub's end.
-fn rest(link: &mut LinkThread<'_>, until: Nanos) -> Woken {
-    loop {
-        match link.wait(None, until) {
-            Woken::Order => link.obey(Flow::Recording),
-            woken => return woken,
-        }
+/// Waits until `until`, the hub's end, or news of the player.
+fn rest(link: &mut LinkThread<'_>, seat: Seat<'_>, until: Nanos) -> Woken {
+    use rustix::event::PollFlags;
+    use std::os::fd::AsFd;
+    match link.wait(Some((seat.bell().as_fd(), PollFlags::IN)), until) {
+        Woken::Order => link.obey(Flow::Recording(seat.player)),
+        Woken::Ready => seat.bell().hush(),
+        Woken::Stop => return Woken::Stop,
+        Woken::Timeout => {}
     }
+    Woken::Timeout
 }
 
-/// How long the listeners wait.
-fn gap(from_ns: u64, to_ns: u64) -> Nanos {
-    to_ns.saturating_sub(from_ns).min(LONGEST_GAP)
+/// From one scan to the next, as streams without stamps are played.
+fn period(variant: Option<Variant>) -> Nanos {
+    let rate = lms::variant::Baud::B500000.rate();
+    Nanos::from(scanner::period_us(variant.or(Some(Variant::HALF)), rate)) * 1000
 }
 
-fn period(session: &Session) -> Nanos {
-    let variant = session.sensor().variant.or(Some(Variant::HALF));
-    Nanos::from(scanner::period_us(variant, Baud::B500000.rate())) * 1000
-}
-
-/// Bytes of a stream given to the session at a time: less than a telegram, so that stamps stay near.
-const PIECE: usize = 128;
-/// Between two statuses of a recording that is at its end.
-const IDLE: Nanos = 100 * lms::MILLIS;
-/// A recording that was interrupted does not keep its listeners waiting for longer.
-const LONGEST_GAP: Nanos = 10_000 * lms::MILLIS;
+/// A verdict stands until the recording says otherwise, also while the player waits.
+const STANDS: Nanos = Nanos::MAX - 1;
+/// A period that is longer is not believed.
+const LONGEST_GAP: Nanos = 10_000 * MILLIS;
+/// Between two statuses while nothing plays.
+const IDLE: Nanos = 100 * MILLIS;
+/// Between two looks at requests and the hub's end where nothing is waited for.
+const LOOK: Nanos = 5 * MILLIS;

@@ -1,6 +1,8 @@
 //! What a link tells of itself: the words of a session and the hub's own counts as the payload of topic `status`.
 
 use lms::header::Reject;
+use lms::reply::Reply;
+use lms::telegram::Telegram;
 use lms::variant::{Mode, Variant};
 use lms::{Nanos, Session};
 use schema::{Counter, Counters, Pose, State, Status};
@@ -83,6 +85,26 @@ impl Account {
         &self.status
     }
 
+    /// A whole telegram of a recording was taken; `mode` is the one by which its values are split, if it has any.
+    pub(crate) fn recall(&mut self, telegram: Telegram<'_>, mode: Option<Mode>) {
+        let len = telegram.bytes().len() as u64;
+        self.past[Counter::BytesRead] += len;
+        self.past[Counter::BytesInTelegrams] += len;
+        self.past[Counter::Telegrams] += 1;
+        self.status.mode = mode.map_or(Status::MODE_UNKNOWN, |mode| mode.0);
+        match Reply::decode(telegram) {
+            Some(Reply::Measured(measured)) => {
+                self.status.unit_mm = measured.unit().mm();
+                if let Some(variant) = Variant::of_beams(measured.count()) {
+                    self.status.angle_deg = variant.angle_deg;
+                    self.status.resolution_cdeg = variant.resolution_cdeg;
+                }
+            }
+            Some(Reply::Type(name)) => self.status.set_sensor_type(&String::from_utf8_lossy(name)),
+            _ => {}
+        }
+    }
+
     /// The sensor sits elsewhere, or so it is said now.
     pub(crate) fn set_pose(&mut self, pose: Pose) {
         self.status.pose = pose;
@@ -100,6 +122,7 @@ impl Account {
 
     /// The session is over: its counters stay.
     pub(crate) fn close(&mut self, session: &Session) {
+        self.describe(session);
         add(&mut self.past, session);
         self.past[Counter::BytesDiscarded] += session.buffered() as u64;
         self.past[Counter::BytesBuffered] = 0;

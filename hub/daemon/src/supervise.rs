@@ -1,7 +1,7 @@
 //! The hub as a process: one per domain, one thread per link, an orderly end. It knows signals, threads and the
 //! domain's upkeep; bytes and topics are the links' business.
 
-use std::os::fd::OwnedFd;
+use std::os::fd::{AsFd, OwnedFd};
 use std::sync::atomic::AtomicBool;
 use std::sync::mpsc;
 use std::thread;
@@ -15,7 +15,8 @@ use crate::config::Config;
 use crate::control::Desk;
 use crate::link::{LinkThread, Surroundings};
 use crate::port::Port;
-use crate::reload::Reload;
+use crate::reload::{Read, Reload};
+use crate::replay::{Cast, Player, Recorded, Seat};
 use crate::service::{Service, Watchdog};
 use crate::signals::{Signals, Wanted};
 use crate::topics::Topics;
@@ -30,6 +31,36 @@ pub struct Ready {
     pub sensors: Vec<String>,
 }
 
+/// The links of a hub that plays a recording.
+pub(crate) struct Troupe<'a> {
+    pub(crate) player: &'a Player,
+    /// What each link plays.
+    pub(crate) parts: Vec<Recorded>,
+    /// Whether the hub stays when everything was played.
+    pub(crate) holds: bool,
+}
+
+/// The end of a hub that plays a recording.
+struct Curtain<'a> {
+    player: &'a Player,
+    holds: bool,
+    falls_at: Option<Nanos>,
+}
+
+impl Curtain<'_> {
+    /// Whether everything was played, and whoever listens had time to read it; or somebody does not want more.
+    fn has_fallen(&mut self, now: Nanos) -> bool {
+        self.player.over().hush();
+        if self.player.is_ended() {
+            return true;
+        }
+        if !self.holds && self.falls_at.is_none() && self.player.is_over() {
+            self.falls_at = Some(now + LINGER);
+        }
+        self.falls_at.is_some_and(|falls_at| now >= falls_at)
+    }
+}
+
 /// Runs the hub in `domain` until SIGINT or SIGTERM; `on_ready` is called once, when all topics exist. `read` tells the
 /// configuration: at the start, and at each SIGHUP, which changes what can be changed while links stream.
 ///
@@ -40,8 +71,19 @@ pub fn run(
     domain: &Domain,
     on_ready: impl FnOnce(&Ready),
 ) -> Result<(), Failure> {
-    let service = Service::of_process();
-    let config = &read()?;
+    let config = read()?;
+    serve(read, config, None, domain, on_ready)
+}
+
+/// Runs a hub that begins with `config`; all links of it are of `troupe`, if there is one, with which it ends.
+pub(crate) fn serve(
+    read: Read<'_>,
+    config: Config,
+    troupe: Option<Troupe<'_>>,
+    domain: &Domain,
+    on_ready: impl FnOnce(&Ready),
+) -> Result<(), Failure> {
+    let (service, config) = (Service::of_process(), &config);
     preflight::raise_descriptor_limit();
     let signals = Signals::of_process()?;
     let _lock = HubLock::acquire(domain.root())?;
@@ -58,6 +100,11 @@ pub fn run(
     });
     let (mut desk, orders) = Desk::open(&node, config.links.iter().map(|link| link.name.as_str()))?;
     let stop = eventfd(0, EventfdFlags::CLOEXEC).map_err(|error| no_resource("an eventfd", &error))?;
+    let (player, parts, holds) = match troupe {
+        Some(Troupe { player, parts, holds }) => (Some(player), parts, holds),
+        None => (None, Vec::new(), true),
+    };
+    let mut parts = parts.into_iter();
     let worked: Vec<_> = config.links.iter().map(|_| AtomicBool::new(true)).collect();
     thread::scope(|scope| {
         let (report, reports) = mpsc::channel();
@@ -66,10 +113,12 @@ pub fn run(
             let (node, report) = (&node, report.clone());
             let around =
                 Surroundings { stop: &stop, service: &service, root: domain.root(), worked: &worked[number] };
+            let cast = player
+                .zip(parts.next())
+                .map(|(player, recorded)| Cast { recorded, seat: Seat { player, number } });
             let body = move || match Topics::new(node, &link.name, number as u8, ready.boot) {
-                Ok(topics) => {
-                    LinkThread::new(link, topics, around, orders).run(|outcome| drop(report.send(outcome)))
-                }
+                Ok(topics) => LinkThread::new(link, topics, around, orders)
+                    .run(cast, |outcome| drop(report.send(outcome))),
                 Err(failure) => drop(report.send(Err(failure))),
             };
             let thread = thread::Builder::new().name(link.name.clone()).spawn_scoped(scope, body);
@@ -89,10 +138,12 @@ pub fn run(
         if outcome.is_ok() {
             on_ready(&ready);
             service.ready(&ready.sensors, None);
+            player.iter().for_each(|player| player.begin());
             let is_alive = || threads.iter().all(|thread| !thread.is_finished());
             let watchdog = Watchdog::new(&service, &worked, clock::now());
             let reload = Reload::new(config, read, &service);
-            outcome = keep_up(&node, &signals, reload, &mut desk, watchdog, is_alive);
+            let curtain = player.map(|player| Curtain { player, holds, falls_at: None });
+            outcome = keep_up(&node, &signals, reload, &mut desk, watchdog, curtain, is_alive);
         }
         service.stopping();
         end_links(&stop);
@@ -109,14 +160,20 @@ fn keep_up(
     mut reload: Reload<'_>,
     desk: &mut Desk,
     mut watchdog: Option<Watchdog<'_>>,
+    mut curtain: Option<Curtain<'_>>,
     is_alive: impl Fn() -> bool,
 ) -> Result<(), Failure> {
     let mut upkeep_at = clock::now() + UPKEEP;
     loop {
         let ([end, hangup], [requests, outcomes]) = (signals.descriptors(), desk.descriptors());
-        let mut fds = [end, hangup, requests, outcomes].map(|fd| PollFd::from_borrowed_fd(fd, PollFlags::IN));
+        // Nobody rings where nothing is played.
+        let over = curtain.as_ref().map_or(end, |curtain| curtain.player.over().as_fd());
+        let mut fds =
+            [end, hangup, requests, outcomes, over].map(|fd| PollFd::from_borrowed_fd(fd, PollFlags::IN));
+        let until = curtain.as_ref().and_then(|curtain| curtain.falls_at);
+        let look = until.map_or(LOOK, |until| clock::span(clock::now(), until));
         // A signal ends the wait, and is there to be taken.
-        let _ = poll(&mut fds, Some(&LOOK));
+        let _ = poll(&mut fds, Some(&look));
         match signals.take() {
             Some(Wanted::End) => return Ok(()),
             Some(Wanted::Reload) => reload.reload(desk),
@@ -128,6 +185,9 @@ fn keep_up(
             return Err(broken_thread());
         }
         let now = clock::now();
+        if curtain.as_mut().is_some_and(|curtain| curtain.has_fallen(now)) {
+            return Ok(());
+        }
         watchdog.iter_mut().for_each(|watchdog| watchdog.look(now));
         if now >= upkeep_at {
             node.try_cleanup_dead_nodes();
@@ -159,6 +219,8 @@ pub(crate) fn no_resource(what: &str, error: &dyn std::fmt::Display) -> Failure 
     Failure::new(Kind::Short, format!("{what} cannot be had: {error}"), "try again later")
 }
 
+/// A hub that plays a recording stays for so long after its end.
+const LINGER: Nanos = 1_000 * MILLIS;
 /// Between two looks whether the links are alive.
 const LOOK: Timespec = Timespec { tv_sec: 1, tv_nsec: 0 };
 /// Between two looks at what dead processes left: each reads the directory of all nodes, and nobody waits for it.

@@ -30,6 +30,8 @@ pub(crate) struct Topics {
     waker: Waker,
     /// What the next sample's header begins with.
     header: Header,
+    /// Its wall clock is that of a recording.
+    is_recalled: bool,
     next_seq: u64,
 }
 
@@ -51,6 +53,7 @@ impl Topics {
             spare_scan: Box::default(),
             waker,
             header,
+            is_recalled: false,
             next_seq: 0,
         })
     }
@@ -58,6 +61,11 @@ impl Topics {
     /// What all samples from now on have in common: bits of [`Flags`].
     pub(crate) fn set_flags(&mut self, flags: u16) {
         self.header.flags = flags;
+    }
+
+    /// What is published from now on, until the next call, was recorded at `wall_ns`, and has these [`Flags`].
+    pub(crate) fn recall(&mut self, wall_ns: u64, flags: u16) {
+        (self.header.wall_ns, self.header.flags, self.is_recalled) = (wall_ns, flags, true);
     }
 
     /// Takes loans for a telegram as long as the last one and for what `pipeline` makes of its scan, which will be there
@@ -86,7 +94,9 @@ impl Topics {
         self.next_seq += 1;
         self.header.stamp_first_ns = received.first;
         self.header.stamp_last_ns = received.last;
-        self.header.wall_ns = clock::wall(received.first, now);
+        if !self.is_recalled {
+            self.header.wall_ns = clock::wall(received.first, now);
+        }
         self.header.set_sent_at(now);
         self.header.period_us = period_us;
         let quality = if reasons == 0 { Quality::Clean } else { Quality::Suspect };
@@ -141,18 +151,24 @@ impl Topics {
         anew
     }
 
+    /// Lets `pipeline` learn from a scan that is not published, and that `fill` writes.
+    pub(crate) fn learn(&mut self, fill: impl FnOnce(&mut Scan), pipeline: &mut Pipeline) {
+        fill(&mut self.spare_scan);
+        pipeline.update(&self.spare_scan, Outputs::default());
+    }
+
     /// Publishes that nothing is known of the zones as of `now`, for scans stay out.
     pub(crate) fn stale(&mut self, pipeline: &mut Pipeline, now: u64) {
         let mut loan = self.zones.loan();
         pipeline.stale(loan.payload_mut().unwrap_or(&mut Zones::default()));
-        self.zones.send(loan, &of_moment(&self.header, now));
+        self.zones.send(loan, &self.of_moment(now));
     }
 
     /// Publishes the background as of `now`, if it is one that was not published; whether it was.
     pub(crate) fn background(&mut self, pipeline: &mut Pipeline, now: u64) -> bool {
         let is_news = pipeline.is_news();
         if is_news {
-            self.show(pipeline, &of_moment(&self.header, now));
+            self.show(pipeline, &self.of_moment(now));
         }
         is_news
     }
@@ -163,7 +179,7 @@ impl Topics {
         if let Some(payload) = loan.payload_mut() {
             *payload = *status;
         }
-        self.status.send(loan, &of_moment(&self.header, now));
+        self.status.send(loan, &self.of_moment(now));
     }
 
     /// Wakes whoever sleeps; once per telegram, after its last sample.
@@ -200,6 +216,11 @@ impl Topics {
         of_telegrams.max(of_wanted).max(self.status.missed_out())
     }
 
+    fn of_moment(&self, now: u64) -> Header {
+        let wall_ns = if self.is_recalled { self.header.wall_ns } else { clock::wall(now, clock::now()) };
+        of_moment(&self.header, now, wall_ns)
+    }
+
     fn show(&mut self, pipeline: &mut Pipeline, header: &Header) {
         let mut loan = self.background.loan();
         pipeline.show(loan.payload_mut().unwrap_or(&mut Background::default()));
@@ -208,11 +229,11 @@ impl Topics {
 }
 
 /// The header of what is said at `now` without a telegram: its number is that of `last`, the last one's.
-fn of_moment(last: &Header, now: u64) -> Header {
+fn of_moment(last: &Header, now: u64, wall_ns: u64) -> Header {
     Header {
         stamp_first_ns: now,
         stamp_last_ns: now,
-        wall_ns: clock::wall(now, clock::now()),
+        wall_ns,
         quality: Quality::Clean as u8,
         reasons: 0,
         flags: last.flags & !Flags::STAMP_ESTIMATED,
@@ -237,12 +258,12 @@ mod tests {
             hub_time: [9; 3],
             ..Header::default()
         };
-        let header = of_moment(&last, 5);
+        let header = of_moment(&last, 5, 6);
         assert_eq!((header.quality, header.reasons, header.flags), (0, 0, Flags::SIMULATED));
         assert_eq!(header.hub_time_ns(), None);
         assert_eq!(
-            (header.seq, header.period_us, header.stamp_first_ns, header.stamp_last_ns),
-            (7, 26_640, 5, 5)
+            (header.seq, header.period_us, header.stamp_first_ns, header.stamp_last_ns, header.wall_ns),
+            (7, 26_640, 5, 5, 6)
         );
     }
 }

@@ -8,10 +8,12 @@ use std::sync::{Arc, PoisonError};
 use lms::{Control, Nanos, Session};
 use schema::{Failure, Kind, Verb, Wake};
 
-use super::{Bell, Changed, Order, Outcome};
+use super::{Changed, Order, Outcome};
+use crate::bell::Bell;
 use crate::clock;
 use crate::config::Processing;
 use crate::link::LinkThread;
+use crate::replay::Player;
 
 /// The link's end of the way from the desk.
 pub(crate) struct Orders {
@@ -30,8 +32,8 @@ pub(crate) enum Flow<'a> {
     Session(&'a mut Session),
     /// Nobody, for now.
     Away,
-    /// Nobody, ever.
-    Recording,
+    /// The player of a recording.
+    Recording(&'a Player),
 }
 
 impl LinkThread<'_> {
@@ -81,8 +83,13 @@ impl Orders {
 
     fn control(&mut self, control: Control, flow: &mut Flow<'_>) -> Result<(), Failure> {
         match flow {
-            Flow::Recording => {
-                return Err(self.refusal("a recording plays on, only its background can be asked for"));
+            Flow::Recording(player) => {
+                match control {
+                    Control::Pause => player.pause(),
+                    Control::Resume => player.resume(),
+                    Control::Resync => return Err(self.refusal("a recording has nobody to begin anew with")),
+                }
+                return Ok(());
             }
             Flow::Away if control == Control::Resync => return Err(self.refusal("the port is away")),
             Flow::Away => {}
@@ -118,6 +125,6 @@ impl Orders {
 impl AsFd for Orders {
     /// Readable as long as an order waits.
     fn as_fd(&self) -> BorrowedFd<'_> {
-        self.bell.0.as_fd()
+        self.bell.as_fd()
     }
 }

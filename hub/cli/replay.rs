@@ -1,0 +1,95 @@
+//! `scanhub replay` on the command line: what it takes.
+
+use std::path::PathBuf;
+use std::time::Duration;
+
+use clap::Args;
+use clients::duration;
+use daemon::{Pace, Play};
+use schema::{Failure, Kind};
+
+use super::Configured;
+
+#[derive(Args, Debug)]
+pub(crate) struct Replay {
+    /// MCAP recording, telegram stream or CARMEN log, plain or gzipped
+    pub(crate) file: PathBuf,
+    /// How many times as fast as it was recorded, 0.015625 to 64, or max: as fast as it can be read
+    #[arg(long, default_value = "1", value_name = "FACTOR|max", value_parser = pace)]
+    rate: Pace,
+    /// Begin anew at the end, until Ctrl-C; what was learned is forgotten then
+    #[arg(long = "loop", conflicts_with = "hold")]
+    is_looped: bool,
+    /// Publish from here on, for example 90s; what comes before is read and learned from
+    #[arg(long, value_name = "DURATION", value_parser = duration::parse)]
+    start: Option<Duration>,
+    /// Publish up to here
+    #[arg(long, value_name = "DURATION", value_parser = duration::parse)]
+    end: Option<Duration>,
+    /// Wait before the first telegram, until a key or `scanhub control SENSOR resume`
+    #[arg(long)]
+    paused: bool,
+    /// Stay at the end, silent, until Ctrl-C
+    #[arg(long)]
+    pub(crate) hold: bool,
+    /// Of several sensors the only one; the name of the one that a stream or a log does not name [default: front]
+    #[arg(long, value_name = "NAME")]
+    pub(crate) sensor: Option<String>,
+    #[command(flatten)]
+    pub(crate) configured: Configured,
+}
+
+impl Replay {
+    /// What is asked of the player.
+    ///
+    /// [`Kind::Usage`] if it ends before it starts.
+    pub(crate) fn play(&self) -> Result<Play, Failure> {
+        if let (Some(start), Some(end)) = (self.start, self.end)
+            && end <= start
+        {
+            let message = format!("--end {end:?} is not after --start {start:?}");
+            return Err(Failure::new(Kind::Usage, message, "both count from the first telegram"));
+        }
+        Ok(Play {
+            pace: self.rate,
+            start_ns: self.start.map_or(0, nanos),
+            end_ns: self.end.map(nanos),
+            is_looped: self.is_looped,
+            is_paused: self.paused,
+        })
+    }
+}
+
+fn nanos(duration: Duration) -> u64 {
+    u64::try_from(duration.as_nanos()).unwrap_or(u64::MAX)
+}
+
+fn pace(text: &str) -> Result<Pace, String> {
+    if text == "max" {
+        return Ok(Pace::Max);
+    }
+    let rate = text.parse().ok().filter(|rate| (Pace::SLOWEST..=Pace::FASTEST).contains(rate));
+    rate.map(Pace::Times)
+        .ok_or_else(|| format!("a number from {} to {}, or max", Pace::SLOWEST, Pace::FASTEST))
+}
+
+/// The keys, for the end of the help.
+pub(crate) const KEYS: &str = "\
+Keys:
+  space         pause, and go on
+  . or right    one telegram, of whichever sensor has the next one, and pause
+  + and -       twice as fast, half as fast
+  q             end";
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn rates() {
+        assert_eq!((pace("max"), pace("0.5")), (Ok(Pace::Max), Ok(Pace::Times(0.5))));
+        for wrong in ["0", "-1", "65", "nan", "inf", "fast", ""] {
+            assert!(pace(wrong).is_err_and(|error| error.contains("0.015625 to 64, or max")), "{wrong}");
+        }
+    }
+}

@@ -1,0 +1,132 @@
+//! Plays telegrams that are known to be whole: each comes once, in order, bit for bit, with what was known of it when it
+//! was recorded. Silences are those of the recording, however fast it is played.
+
+use lms::Nanos;
+use lms::measured::Measured;
+use lms::session::Received;
+use lms::telegram::Telegram;
+use lms::variant::{Mode, Variant};
+use recording::Frame;
+use schema::{Flags, Header, State, Wake, Zones};
+
+use super::recorded::{Frames, told};
+use super::{LONGEST_GAP, STANDS, Seat, Turns, begin_anew, period};
+use crate::link::LinkThread;
+use crate::publish::{self, Past};
+
+/// What the last scan left.
+#[derive(Clone, Copy)]
+struct Verdict {
+    /// Until when it stands, by the clock of the recording, and as media time.
+    until_ns: Nanos,
+    until: Nanos,
+}
+
+/// Plays `frames` into the topics of `link`. At the end, for how long the last verdict stands; nothing if the hub shall
+/// end.
+pub(super) fn play(link: &mut LinkThread<'_>, frames: &Frames, seat: Seat<'_>) -> Option<Option<Nanos>> {
+    let play = seat.play();
+    let mut turns = Turns::new(seat);
+    let mut telegrams = match frames.read() {
+        Ok(telegrams) => telegrams.peekable(),
+        Err(failure) => {
+            tracing::warn!("{}: {}", link.link.name, failure.message);
+            return Some(None);
+        }
+    };
+    let mut mode = frames.first_mode();
+    let (mut media, mut last_stamp, mut boot) = (0, 0, None);
+    let (mut verdict, mut limit): (Option<Verdict>, Option<Nanos>) = (None, None);
+    let mut state = State::Streaming;
+    while let Some(frame) = telegrams.next() {
+        media = frames.media(&frame, media);
+        if play.end_ns.is_some_and(|end_ns| media >= end_ns) {
+            break;
+        }
+        let is_skipped = media < play.start_ns;
+        let header = frame.header;
+        if let Some(silence) = verdict.take_if(|verdict| is_silence(verdict, header.as_ref())) {
+            if is_skipped {
+                link.pipeline.stale(&mut Zones::default());
+            } else {
+                let due = turns.wait(link, None, silence.until.clamp(play.start_ns, media), state)?;
+                link.topics.stale(&mut link.pipeline, due.at);
+                link.wake(Wake::Status);
+                state = State::Silent;
+            }
+        }
+        // Another life of the hub, which knew nothing at its start.
+        if let Some(header) = header
+            && boot.replace(header.boot).is_some_and(|boot| boot != header.boot)
+        {
+            if is_skipped { link.pipeline.begin_anew() } else { begin_anew(link) }
+        }
+        mode = told(&frame).unwrap_or(mode);
+        let Some(telegram) = Telegram::check(&frame.telegram) else { continue };
+        if is_skipped {
+            if !turns.pass(link) {
+                return None;
+            }
+            link.learn(telegram, mode);
+        } else {
+            let due = turns.wait(link, None, media, state)?;
+            let at = due.at.max(last_stamp);
+            let took = header.map_or(0, |header| header.stamp_last_ns.saturating_sub(header.stamp_first_ns));
+            let received = Received {
+                telegram,
+                first: at.saturating_sub(took),
+                last: at,
+                estimated: header.is_some_and(|header| header.flags & Flags::STAMP_ESTIMATED != 0),
+                mode,
+                reasons: header.map_or(0, |header| header.reasons),
+            };
+            last_stamp = at;
+            let gap = telegrams.peek().and_then(|next| gap(frames, &frame, next));
+            link.account.recall(telegram, mode);
+            limit = link.publish(&received, &past(&frame, mode, gap, due.stretch)).or(limit);
+            link.stale_at = STANDS;
+            link.wake(Wake::Telegram);
+            seat.played(media);
+            state = State::Streaming;
+            link.show(None, state, "");
+        }
+        verdict = header.and_then(|header| stands(&header, &frame, media)).or(verdict);
+        if !frames.has_stamps() && frame.is_scan() {
+            media += period(Measured::decode(telegram).and_then(|it| Variant::of_beams(it.count())));
+        }
+    }
+    Some(limit)
+}
+
+fn past(frame: &Frame, mode: Option<Mode>, gap: Option<Nanos>, stretch: f64) -> Past {
+    Past {
+        mode,
+        wall_ns: frame.wall_ns,
+        period_us: frame.header.map(|header| header.period_us),
+        gap_us: gap.map_or(0, |gap| (gap / 1000) as u32),
+        stretch,
+        flags: frame.header.map_or(0, |header| header.flags & Flags::SIMULATED),
+    }
+}
+
+/// The time to the next scan of a log, which may leave scans out: so long nothing newer can be known.
+fn gap(frames: &Frames, frame: &Frame, next: &Frame) -> Option<Nanos> {
+    if frame.header.is_some() {
+        return None;
+    }
+    let (from, to) = (frames.media(frame, 0), frames.media(next, 0));
+    Some(to.saturating_sub(from).min(LONGEST_GAP))
+}
+
+/// For how long the verdict on the scan in `frame`, at `media`, stood in the hub that recorded it.
+fn stands(header: &Header, frame: &Frame, media: Nanos) -> Option<Verdict> {
+    let published = header.stamp_last_ns + header.hub_time_ns().unwrap_or(0);
+    let until_ns = published + publish::limit(header.period_us);
+    let after = until_ns.saturating_sub(header.stamp_first_ns);
+    frame.is_scan().then_some(Verdict { until_ns, until: media + after })
+}
+
+/// Whether the verdict was over when the telegram of `header` came.
+fn is_silence(verdict: &Verdict, header: Option<&Header>) -> bool {
+    header.is_some_and(|header| header.stamp_last_ns > verdict.until_ns)
+}

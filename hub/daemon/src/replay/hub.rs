@@ -1,0 +1,178 @@
+//! A hub whose links are a recording: which sensors are in it, what is configured for them, and one player for all.
+//! Refuses to know threads and topics.
+
+use std::path::Path;
+use std::sync::Arc;
+
+use recording::Recording;
+use schema::{Failure, Kind, check_sensor};
+
+use super::playback::Play;
+use super::player::{Player, Progress};
+use super::recorded::{Origin, Recorded};
+use crate::config::{Config, Source, Sources};
+use crate::supervise::{self, Ready, Troupe};
+use schema::Domain;
+
+/// What is to be replayed, and how.
+#[derive(Clone, Debug)]
+pub struct Replay<'a> {
+    /// The recording.
+    pub file: &'a Path,
+    /// Of one with several sensors the only one to play; of one that names none the name that it gets.
+    pub sensor: Option<&'a str>,
+    /// Where its sensors are configured.
+    pub sources: &'a Sources,
+    /// What is asked of the player.
+    pub play: Play,
+    /// Whether the hub stays when everything was played.
+    pub holds: bool,
+}
+
+/// Runs a hub in `domain` whose links are a recording, until everything was played and whoever listens had time to read
+/// it, or SIGINT or SIGTERM; `on_ready` is called once, when all topics exist, before the first telegram. How far it
+/// came.
+///
+/// [`Kind::Configuration`] if the recording or the configuration cannot be read or do not go together, and whatever
+/// [`run`](crate::run) fails with.
+pub fn replay(
+    replay: &Replay<'_>,
+    domain: &Domain,
+    on_ready: impl FnOnce(&Ready, &Arc<Player>),
+) -> Result<Progress, Failure> {
+    let Replay { file, sources, .. } = *replay;
+    let recording = Recording::open(file)?;
+    let damage = recording.contents().damage;
+    if !damage.is_none() {
+        tracing::warn!("{}: missing: {damage}", file.display());
+    }
+    let sensors = sensors(&recording, replay.sensor)?;
+    let read = || configuration(sources, &sensors, file);
+    let config = read()?;
+    let (links, left_out) = (config.links.len(), left_out(sources, &config)?);
+    for name in left_out {
+        tracing::info!("{name}: not in the recording, left out");
+    }
+    let mut parts = Vec::with_capacity(links);
+    for link in &config.links {
+        let of = sensors.iter().find(|sensor| sensor.link == link.name);
+        let part = match of.and_then(|sensor| sensor.recorded.as_deref()) {
+            Some(name) => recording.of(name)?,
+            None => recording.clone(),
+        };
+        parts.push(Recorded::new(part, link)?);
+    }
+    if let Some(origin) = parts.iter().filter_map(Recorded::origin).reduce(Origin::earlier) {
+        parts.iter_mut().for_each(|part| part.set_origin(origin));
+    }
+    let length = parts.iter().filter_map(Recorded::length).max();
+    let player = Arc::new(Player::new(replay.play, links, length)?);
+    let troupe = Troupe { player: &player, parts, holds: replay.holds };
+    supervise::serve(&read, config, Some(troupe), domain, |ready| on_ready(ready, &player))?;
+    Ok(player.progress())
+}
+
+/// A sensor that is played.
+struct Sensor {
+    /// Its name in the recording, where that has names.
+    recorded: Option<String>,
+    /// Its link's.
+    link: String,
+}
+
+fn sensors(recording: &Recording, wanted: Option<&str>) -> Result<Vec<Sensor>, Failure> {
+    let names = &recording.contents().sensors;
+    if names.is_empty() {
+        let link = wanted.unwrap_or(UNNAMED).to_owned();
+        check_sensor(&link)?;
+        return Ok(vec![Sensor { recorded: None, link }]);
+    }
+    if let Some(wanted) = wanted {
+        recording.of(wanted)?;
+    }
+    let played = names.iter().filter(|name| wanted.is_none_or(|wanted| wanted == name.as_str()));
+    let sensor = |name: &String| Sensor { recorded: Some(name.clone()), link: link_name(name) };
+    let sensors: Vec<Sensor> = played.map(sensor).collect();
+    for (at, sensor) in sensors.iter().enumerate() {
+        check_sensor(&sensor.link)?;
+        if sensors[..at].iter().any(|other| other.link == sensor.link) {
+            let message = format!("two sensors of the recording would be called {}", sensor.link);
+            return Err(Failure::new(Kind::Configuration, message, "play one of them: --sensor NAME"));
+        }
+    }
+    Ok(sensors)
+}
+
+/// What a link can be called: the name of a sensor of another machine has a dot.
+fn link_name(sensor: &str) -> String {
+    let name: String = sensor.chars().map(|c| if c == '.' { '-' } else { c }).collect();
+    // Of a machine without a name the number is long, and the sensor's name is what tells.
+    let excess = name.len().saturating_sub(LONGEST_NAME);
+    name.get(excess..).unwrap_or(&name).to_owned()
+}
+
+/// What is configured, with the sensors of the recording for links.
+fn configuration(sources: &Sources, sensors: &[Sensor], file: &Path) -> Result<Config, Failure> {
+    let mut sources = sources.clone();
+    // Not the path itself, which may have signs that have a meaning in a port's name.
+    sources.links.extend(sensors.iter().map(|sensor| format!("{}=file:recording", sensor.link)));
+    let mut config = Config::load(&sources)?;
+    config.links.retain(|link| sensors.iter().any(|sensor| sensor.link == link.name));
+    for link in &mut config.links {
+        link.port = Source::File { path: file.to_owned(), paced: true };
+    }
+    Ok(config)
+}
+
+/// Links that are configured and not in `config`.
+fn left_out(sources: &Sources, config: &Config) -> Result<Vec<String>, Failure> {
+    if sources.files.is_empty() {
+        return Ok(Vec::new());
+    }
+    let mut sources = sources.clone();
+    sources.links.extend(config.links.iter().map(|link| format!("{}=file:recording", link.name)));
+    let all = Config::load(&sources)?.links.into_iter().map(|link| link.name);
+    Ok(all.filter(|name| config.links.iter().all(|link| link.name != *name)).collect())
+}
+
+/// The name of the sensor of a recording that names none.
+const UNNAMED: &str = "front";
+/// Signs of a sensor's name.
+const LONGEST_NAME: usize = 24;
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn sensor(name: &str) -> Sensor {
+        Sensor { recorded: None, link: name.to_owned() }
+    }
+
+    #[test]
+    fn links_are_those_of_the_recording_as_they_are_configured() {
+        let sources = Sources { set: vec!["link.front.angle=100".into()], ..Sources::default() };
+        let file = Path::new("/tmp/a?b=c.mcap");
+        let config = configuration(&sources, &[sensor("front"), sensor("left")], file).unwrap();
+        let named: Vec<_> =
+            config.links.iter().map(|link| (link.name.as_str(), link.variant.angle_deg)).collect();
+        assert_eq!(named, [("front", 100), ("left", 180)]);
+        assert_eq!(config.links[1].port, Source::File { path: file.to_owned(), paced: true });
+        let place = std::env::temp_dir().join(format!("scanhub-replay-{}.toml", std::process::id()));
+        std::fs::write(&place, "[[link]]\nname = \"rear\"\nport = \"/dev/x\"\nbaud = 38400\n[[link]]\nname = \"up\"\nport = \"y\"\n").unwrap();
+        let sources = Sources { files: vec![place.clone()], ..Sources::default() };
+        let config = configuration(&sources, &[sensor("rear")], file).unwrap();
+        let left_out = left_out(&sources, &config).unwrap();
+        std::fs::remove_file(&place).unwrap();
+        assert_eq!(
+            (config.links.len(), config.links[0].baud.rate(), left_out),
+            (1, 38_400, vec!["up".to_owned()])
+        );
+    }
+
+    #[test]
+    fn sensors_of_other_machines_get_names_that_links_can_have() {
+        assert_eq!(link_name("robot1.front"), "robot1-front");
+        let long = link_name("5f3a12bc00d1e2f3.front_left");
+        assert_eq!((long.len(), long.ends_with("-front_left")), (24, true), "{long}");
+    }
+}

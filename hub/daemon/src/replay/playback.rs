@@ -1,0 +1,351 @@
+//! The clock of a player: when it is whose turn, so that all links of a recording keep their times to each other
+//! while it is paused, stepped, played faster, slower, and anew. Refuses to know files and threads; what time it is, is
+//! an argument.
+//!
+//! Media time is counted from the recording's first telegram, in nanoseconds.
+
+use lms::Nanos;
+
+use super::Pace;
+
+/// What a user wants of a player.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct Play {
+    /// How fast.
+    pub pace: Pace,
+    /// Media time, in ns, before which nothing is published.
+    pub start_ns: Nanos,
+    /// Media time, in ns, from which on nothing is published.
+    pub end_ns: Option<Nanos>,
+    /// Whether it begins anew at its end.
+    pub is_looped: bool,
+    /// Whether it waits to be resumed before the first telegram.
+    pub is_paused: bool,
+}
+
+/// Where all links of a recording are.
+#[derive(Clone, Debug)]
+pub(super) struct Playback {
+    play: Play,
+    /// Whether everything is up that shall be there at the first telegram.
+    is_begun: bool,
+    /// When, and what media time it was then; nothing until every link has said what it has first.
+    anchor: Option<(Nanos, Nanos)>,
+    links: Vec<Next>,
+    /// Times that it began anew.
+    lap: u32,
+    /// Whether this lap had a telegram.
+    has_played: bool,
+    /// When the first lap began, and when nothing came any more.
+    began_at: Option<Nanos>,
+    over_at: Option<Nanos>,
+    /// Whether links that wait have to ask again.
+    is_news: bool,
+}
+
+/// What a link has next.
+#[derive(Clone, Copy, Debug, PartialEq)]
+enum Next {
+    /// It looks for it.
+    Unknown,
+    /// Something of this media time.
+    At(Nanos),
+    Ended,
+}
+
+/// What a link is to do.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(super) enum Turn {
+    /// It is its turn.
+    Now(Due),
+    /// It will be its turn then.
+    At(Nanos),
+    /// It is to ask again when something has changed.
+    Wait,
+    /// It begins anew, with this lap.
+    Anew(u32),
+    /// Nothing comes any more, for nobody.
+    Over,
+}
+
+/// When something plays.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(super) struct Due {
+    /// The moment for which it stands.
+    pub(super) at: Nanos,
+    /// How many times longer than in the recording it takes until the next.
+    pub(super) stretch: f64,
+}
+
+impl Playback {
+    pub(super) fn new(play: Play, links: usize) -> Playback {
+        Playback {
+            play,
+            is_begun: false,
+            anchor: None,
+            links: vec![Next::Unknown; links],
+            lap: 0,
+            has_played: false,
+            began_at: None,
+            over_at: None,
+            is_news: false,
+        }
+    }
+
+    /// Everything is up.
+    pub(super) fn begin(&mut self, now: Nanos) {
+        self.is_begun = true;
+        self.start(now);
+    }
+
+    /// Whose turn it is, if `link` has something of `media` next.
+    pub(super) fn turn(&mut self, link: usize, media: Nanos, now: Nanos) -> Turn {
+        self.links[link] = Next::At(media);
+        self.start(now);
+        let Some((since, from)) = self.anchor else { return Turn::Wait };
+        if self.play.is_paused {
+            return if media < from { self.play_now(now) } else { Turn::Wait };
+        }
+        let Pace::Times(rate) = self.play.pace else { return self.play_now(now) };
+        if self.skip_silence(now) {
+            return self.turn(link, media, now);
+        }
+        let due = (since as f64 + (media as f64 - from as f64) / rate) as Nanos;
+        if due > now {
+            return Turn::At(due);
+        }
+        self.has_played = true;
+        Turn::Now(Due { at: due, stretch: (1.0 / rate).max(1.0) })
+    }
+
+    /// `link`, which plays lap number `lap`, has nothing more in it.
+    pub(super) fn end(&mut self, link: usize, lap: u32, now: Nanos) -> Turn {
+        if self.lap != lap {
+            return Turn::Anew(self.lap);
+        }
+        if self.is_over() {
+            return Turn::Over;
+        }
+        self.links[link] = Next::Ended;
+        self.start(now);
+        if !self.is_over() {
+            return Turn::Wait;
+        }
+        self.is_news = true;
+        // What has nothing in it would begin anew for ever.
+        if !(self.play.is_looped && self.has_played) {
+            self.over_at = Some(now);
+            return Turn::Over;
+        }
+        self.lap += 1;
+        self.links.fill(Next::Unknown);
+        (self.anchor, self.has_played) = (None, false);
+        Turn::Anew(self.lap)
+    }
+
+    /// Plays, or waits; `position` is the media time where nothing is waited for.
+    pub(super) fn pause(&mut self, is_paused: bool, now: Nanos, position: Nanos) {
+        self.hold(now, position);
+        self.play.is_paused = is_paused;
+    }
+
+    /// Pauses after what comes next.
+    pub(super) fn step(&mut self, now: Nanos, position: Nanos) {
+        self.hold(now, position);
+        self.play.is_paused = true;
+        if let Some(((_, media), next)) = self.anchor.as_mut().zip(next_of(&self.links)) {
+            *media = (*media).max(next + 1);
+        }
+    }
+
+    /// Goes on so fast.
+    pub(super) fn set_pace(&mut self, pace: Pace, now: Nanos, position: Nanos) {
+        self.hold(now, position);
+        self.play.pace = pace;
+    }
+
+    pub(super) fn play(&self) -> &Play {
+        &self.play
+    }
+
+    pub(super) fn lap(&self) -> u32 {
+        self.lap
+    }
+
+    /// Whether it is everybody's turn until something changes.
+    pub(super) fn flows(&self) -> bool {
+        self.anchor.is_some() && !self.play.is_paused && self.play.pace == Pace::Max
+    }
+
+    /// Whether nothing comes any more.
+    pub(super) fn is_over(&self) -> bool {
+        self.links.iter().all(|next| *next == Next::Ended)
+    }
+
+    /// How long it has been played, pauses too.
+    pub(super) fn took(&self, now: Nanos) -> Nanos {
+        let until = self.over_at.unwrap_or(now);
+        self.began_at.map_or(0, |began_at| until.saturating_sub(began_at))
+    }
+
+    /// Whether links that wait have to ask again since the last call.
+    pub(super) fn take_news(&mut self) -> bool {
+        std::mem::take(&mut self.is_news)
+    }
+
+    /// The media time at `now`; `position` where nothing is waited for.
+    pub(super) fn media(&self, now: Nanos, position: Nanos) -> Nanos {
+        let Some((since, from)) = self.anchor else { return self.play.start_ns };
+        match self.play.pace {
+            _ if self.play.is_paused => from,
+            Pace::Max => position.max(from),
+            Pace::Times(rate) => from + (now.saturating_sub(since) as f64 * rate) as Nanos,
+        }
+    }
+
+    fn play_now(&mut self, now: Nanos) -> Turn {
+        self.has_played = true;
+        Turn::Now(Due { at: now, stretch: 1.0 })
+    }
+
+    /// Lets the time run as soon as all are there.
+    fn start(&mut self, now: Nanos) {
+        if self.is_begun && self.anchor.is_none() && !self.links.contains(&Next::Unknown) {
+            self.anchor = Some((now, self.play.start_ns));
+            self.began_at.get_or_insert(now);
+            self.is_news = true;
+        }
+    }
+
+    /// From now on the time runs another way.
+    fn hold(&mut self, now: Nanos, position: Nanos) {
+        let media = self.media(now, position);
+        if let Some(anchor) = &mut self.anchor {
+            *anchor = (now, media);
+        }
+        self.is_news = true;
+    }
+
+    /// Where all were silent for long, for the recording was interrupted, listeners wait less.
+    fn skip_silence(&mut self, now: Nanos) -> bool {
+        let media = self.media(now, 0);
+        match next_of(&self.links) {
+            Some(next) if next > media + LONGEST_SILENCE => {
+                self.anchor = Some((now, next - LONGEST_SILENCE));
+                self.is_news = true;
+                true
+            }
+            _ => false,
+        }
+    }
+}
+
+/// Media time of what comes next of all.
+fn next_of(links: &[Next]) -> Option<Nanos> {
+    let next = |next: &Next| if let Next::At(media) = next { Some(*media) } else { None };
+    links.iter().filter_map(next).min()
+}
+
+/// A recording that was interrupted does not keep its listeners waiting for longer, at its own pace.
+const LONGEST_SILENCE: Nanos = 10_000 * lms::MILLIS;
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const SECOND: Nanos = 1_000 * lms::MILLIS;
+
+    /// One of `links` that is up, from `start` seconds on.
+    fn begun(links: usize, play: Play) -> Playback {
+        let mut playback = Playback::new(play, links);
+        playback.begin(100 * SECOND);
+        playback
+    }
+
+    fn is_now(turn: Turn, at: Nanos) -> bool {
+        matches!(turn, Turn::Now(due) if due.at == at)
+    }
+
+    #[test]
+    fn nobody_begins_before_all_are_there() {
+        let mut playback = Playback::new(Play::default(), 2);
+        assert_eq!(playback.turn(0, 0, 90 * SECOND), Turn::Wait);
+        assert_eq!(playback.turn(1, 5 * SECOND, 95 * SECOND), Turn::Wait);
+        assert!(!playback.take_news());
+        playback.begin(100 * SECOND);
+        assert!(playback.take_news());
+        assert!(is_now(playback.turn(0, 0, 100 * SECOND), 100 * SECOND));
+        assert_eq!(playback.turn(1, 5 * SECOND, 101 * SECOND), Turn::At(105 * SECOND));
+        assert!(is_now(playback.turn(1, 5 * SECOND, 106 * SECOND), 105 * SECOND), "it stands for its moment");
+    }
+
+    #[test]
+    fn a_pace_changes_from_where_it_is() {
+        let mut playback = begun(1, Play { pace: Pace::Times(2.0), ..Play::default() });
+        assert!(is_now(playback.turn(0, 0, 100 * SECOND), 100 * SECOND));
+        assert_eq!(playback.turn(0, 8 * SECOND, 101 * SECOND), Turn::At(104 * SECOND));
+        playback.set_pace(Pace::Times(0.5), 102 * SECOND, 0);
+        assert!(playback.take_news());
+        assert_eq!(playback.media(102 * SECOND, 0), 4 * SECOND);
+        assert_eq!(playback.turn(0, 8 * SECOND, 103 * SECOND), Turn::At(110 * SECOND));
+        let Turn::Now(due) = playback.turn(0, 8 * SECOND, 111 * SECOND) else { panic!("not due") };
+        assert_eq!(due, Due { at: 110 * SECOND, stretch: 2.0 });
+        playback.set_pace(Pace::Max, 112 * SECOND, 0);
+        assert!(playback.flows());
+        assert!(is_now(playback.turn(0, 9999 * SECOND, 112 * SECOND), 112 * SECOND));
+        playback.set_pace(Pace::Times(1.0), 113 * SECOND, 9999 * SECOND);
+        assert_eq!(playback.turn(0, 10_000 * SECOND, 113 * SECOND), Turn::At(114 * SECOND));
+    }
+
+    #[test]
+    fn a_pause_takes_no_media_time_and_a_step_is_one_of_all() {
+        let mut playback = begun(2, Play { is_paused: true, ..Play::default() });
+        assert_eq!(playback.turn(0, 0, 101 * SECOND), Turn::Wait);
+        assert_eq!(playback.turn(1, SECOND, 101 * SECOND), Turn::Wait, "the first one waits too");
+        playback.step(110 * SECOND, 0);
+        assert_eq!(playback.turn(1, SECOND, 110 * SECOND), Turn::Wait);
+        assert!(is_now(playback.turn(0, 0, 111 * SECOND), 111 * SECOND));
+        assert_eq!(playback.turn(0, 2 * SECOND, 111 * SECOND), Turn::Wait);
+        playback.step(112 * SECOND, 0);
+        assert!(is_now(playback.turn(1, SECOND, 112 * SECOND), 112 * SECOND));
+        assert_eq!(playback.turn(1, 3 * SECOND, 112 * SECOND), Turn::Wait);
+        playback.pause(false, 200 * SECOND, 0);
+        assert_eq!(playback.turn(0, 2 * SECOND, 200 * SECOND), Turn::At(201 * SECOND - 1));
+        playback.pause(true, 200 * SECOND + 5, 0);
+        assert_eq!(playback.turn(0, 2 * SECOND, 300 * SECOND), Turn::Wait);
+    }
+
+    #[test]
+    fn a_lap_begins_when_all_are_at_the_end_and_something_was_played() {
+        let mut playback = begun(2, Play { is_looped: true, start_ns: SECOND, ..Play::default() });
+        assert_eq!(playback.turn(0, SECOND, 100 * SECOND), Turn::Wait);
+        assert_eq!(playback.end(1, 0, 100 * SECOND), Turn::Wait, "it has nothing");
+        assert!(is_now(playback.turn(0, SECOND, 100 * SECOND), 100 * SECOND));
+        assert_eq!(playback.end(0, 0, 101 * SECOND), Turn::Anew(1));
+        assert!(playback.take_news());
+        assert_eq!(playback.turn(0, SECOND, 102 * SECOND), Turn::Wait);
+        assert_eq!(playback.end(1, 0, 102 * SECOND), Turn::Anew(1));
+        assert_eq!(playback.end(1, 1, 103 * SECOND), Turn::Wait);
+        assert!(is_now(playback.turn(0, SECOND, 104 * SECOND), 103 * SECOND));
+        let mut empty = begun(1, Play { is_looped: true, ..Play::default() });
+        assert_eq!(empty.end(0, 0, 100 * SECOND), Turn::Over);
+        assert!(empty.is_over());
+    }
+
+    #[test]
+    fn what_was_interrupted_is_not_waited_for() {
+        let mut playback = begun(2, Play::default());
+        playback.turn(1, 3 * SECOND, 100 * SECOND);
+        assert!(is_now(playback.turn(0, 0, 100 * SECOND), 100 * SECOND));
+        assert_eq!(
+            playback.turn(0, 3600 * SECOND, 101 * SECOND),
+            Turn::At(3700 * SECOND),
+            "another one plays"
+        );
+        assert!(is_now(playback.turn(1, 3 * SECOND, 103 * SECOND), 103 * SECOND));
+        playback.take_news();
+        assert_eq!(playback.turn(1, 3601 * SECOND, 103 * SECOND), Turn::At(114 * SECOND));
+        assert!(playback.take_news());
+        assert_eq!(playback.turn(0, 3600 * SECOND, 103 * SECOND), Turn::At(113 * SECOND));
+    }
+}
