@@ -9,8 +9,7 @@ use schema::Scan;
 use schema::datagram::Packed;
 use serde_json::Value;
 use stage::{
-    HUP, INT, KILL, Kept, Outcome, Program, Recording, Stage, TERM, hash, is_class, number, python, script,
-    unbroken,
+    HUP, INT, KILL, Kept, Outcome, Program, Recording, Stage, TERM, hash, is_class, number, python, unbroken,
 };
 
 /// Two sensors that stream.
@@ -113,15 +112,14 @@ fn a_kill_leaves_all_that_was_told() {
     let recording = Recording::left(&stage.path("walk.mcap"));
     assert!(recording.kept.len() as u64 >= number(&told, "samples"), "{told}: {}", recording.kept.len());
     unbroken(&recording.of("front/telegram"));
-    let Some(python) = python(&["mcap"]) else { return };
-    let mut read = script(&python, "tests/stage/read.py");
-    read.args(["left", &stage.word("walk.mcap")]);
-    assert_eq!(said(read)["messages"], recording.kept.len());
+    let Some(mut python) = python("mcap") else { return };
+    python.args(["tests/stage/read.py", "left", &stage.word("walk.mcap")]);
+    assert_eq!(said(python)["messages"], recording.kept.len());
 }
 
-/// What the reader of other people says.
-fn said(mut reader: std::process::Command) -> Value {
-    let outcome = reader.output().unwrap();
+/// What the reader of other people, which `python` starts, says.
+fn said(mut python: std::process::Command) -> Value {
+    let outcome = python.current_dir(env!("CARGO_MANIFEST_DIR")).output().unwrap();
     assert!(outcome.status.success(), "{}", String::from_utf8_lossy(&outcome.stderr));
     serde_json::from_slice(&outcome.stdout).unwrap()
 }
@@ -137,10 +135,9 @@ fn ros_reads_the_scans_that_were_there() {
     let (ours, theirs) = (recording.of("front/scan"), recording.of("/front/scan"));
     assert!(ours.len() > 20 && ours.len() == theirs.len(), "{} {}", ours.len(), theirs.len());
     assert!(theirs.iter().all(|kept| kept.encoding == "cdr" && kept.schema == "sensor_msgs/msg/LaserScan"));
-    let Some(python) = python(&["mcap", "mcap_ros2"]) else { return };
-    let mut read = script(&python, "tests/stage/read.py");
-    read.args(["scans", &stage.word("walk.mcap"), "/front/scan"]);
-    let said = said(read);
+    let Some(mut python) = python("mcap, mcap_ros2") else { return };
+    python.args(["tests/stage/read.py", "scans", &stage.word("walk.mcap"), "/front/scan"]);
+    let said = said(python);
     let said = said.as_array().unwrap();
     assert_eq!(said.len(), ours.len());
     for ((kept, theirs), said) in ours.iter().zip(&theirs).zip(said) {
