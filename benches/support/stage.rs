@@ -139,4 +139,4 @@ impl Drop for Stage {
 pub(crate) const SENSORS: [&str; 2] = ["front", "rear"];
 /// Far longer than anything takes.
 pub(crate) const PATIENCE: Duration = Duration::from_secs(20);
-const PROGRAM: &str = env!("CARGO_BIN_EXE_scanhub");
+pub(crate) const PROGRAM: &str = env!("CARGO_BIN_EXE_scanhub");
