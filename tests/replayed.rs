@@ -2,10 +2,10 @@
 //! parameters; and something else with others. Two sensors of simulated rooms with people, recorded in made-up time, and
 //! replayed telegram by telegram.
 
+#[path = "../benches/support/rooms.rs"]
+mod rooms;
 mod stage;
 
-use std::collections::BTreeMap;
-use std::fs::File;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::sync::mpsc::channel;
@@ -13,130 +13,22 @@ use std::thread;
 use std::time::{Duration, Instant};
 
 use daemon::config::Sources;
-use daemon::{Config, Play, Player, Replay};
-use lms::variant::{MIRROR_TURN, Mode, Unit, Variant};
-use schema::datagram::Packed;
-use schema::file::Writer;
-use schema::ipc::{self, Node, Payload, Subscriber};
-use schema::{Background, Flags, Foreground, Header, Marks, Scan, Topic, Zones};
-use sim::room::Room;
-use sim::world::World;
+use daemon::{Play, Player, Replay};
+use rooms::{Followers, LEARNING, Published, SENSORS};
+use schema::ipc;
+use schema::{Flags, Topic};
 use stage::{PATIENCE, Stage};
 
-const SENSORS: [(&str, &str); 2] = [("front", "fig8"), ("rear", "demo")];
 const SCANS: u64 = 400;
 /// Before this scan nothing is heard of a sensor for a second.
 const SILENCE: u64 = 300;
-/// Models are learned within the recording.
-const LEARNING: &str = "background.scans=40";
 
-/// A sample as it was published.
-#[derive(Debug, PartialEq)]
-struct Published {
-    topic: Topic,
-    header: Header,
-    payload: Vec<u8>,
-}
-
-/// The consumers of all that is made of a sensor's telegrams.
-struct Followers {
-    telegram: Subscriber<[u8]>,
-    scan: Subscriber<Scan>,
-    marks: Subscriber<Marks>,
-    zones: Subscriber<Zones>,
-    foreground: Subscriber<Foreground>,
-    background: Subscriber<Background>,
-}
-
-impl Followers {
-    fn attach(node: &Node, sensor: &str) -> Followers {
-        Followers {
-            telegram: attach(node, sensor),
-            scan: attach(node, sensor),
-            marks: attach(node, sensor),
-            zones: attach(node, sensor),
-            foreground: attach(node, sensor),
-            background: attach(node, sensor),
-        }
-    }
-
-    /// What has come since, topic by topic.
-    fn take(&self) -> Vec<Published> {
-        let mut taken = Vec::new();
-        drain(&self.telegram, &mut taken, |telegram| telegram.to_vec());
-        drain(&self.scan, &mut taken, packed);
-        drain(&self.marks, &mut taken, packed);
-        drain(&self.zones, &mut taken, packed);
-        drain(&self.foreground, &mut taken, packed);
-        drain(&self.background, &mut taken, packed);
-        taken
-    }
-}
-
-fn attach<P: Payload + ?Sized>(node: &Node, sensor: &str) -> Subscriber<P> {
-    let service = P::open(node, sensor).expect("a topic").expect("is there");
-    P::subscriber(&service).expect("a place")
-}
-
-fn drain<P: Payload + ?Sized>(from: &Subscriber<P>, to: &mut Vec<Published>, bytes: impl Fn(&P) -> Vec<u8>) {
-    while let Some(sample) = P::receive(from).expect("works") {
-        to.push(Published {
-            topic: P::TOPIC,
-            header: *sample.user_header(),
-            payload: bytes(P::read(&sample)),
-        });
-    }
-}
-
-fn packed(payload: &impl Packed) -> Vec<u8> {
-    let mut room = vec![0; 4096];
-    let len = payload.pack(&mut room).expect("there is room");
-    room.truncate(len);
-    room
-}
-
-/// Drives a hub in made-up time and writes all that it publishes of each sensor into a file, which it gives back with it.
+/// Records two sensors; where, and what was published of each.
 fn record(stage: &Stage) -> (PathBuf, Vec<Vec<Published>>) {
-    let owned = |words: &[&str]| words.iter().map(|word| (*word).to_owned()).collect();
-    let sources = Sources {
-        files: Vec::new(),
-        links: SENSORS.map(|(name, _)| format!("{name}=file:nothing")).to_vec(),
-        set: owned(&["link.front.mode=1", "link.rear.mode=1", LEARNING]),
-    };
-    let config = Config::load(&sources).expect("a configuration");
-    let rooms = SENSORS.map(|(_, name)| Room::new(&name.parse::<World>().expect("a world"), 7));
-    let file = stage.path("two.mcap");
-    let mut writer =
-        Writer::begin(File::create(&file).expect("a file"), "", BTreeMap::new()).expect("begins");
-    let mut published = vec![Vec::new(), Vec::new()];
-    let domain = stage.place();
-    let driven = daemon::in_memory(&config, &domain, |links| {
-        let node = ipc::client_node(&domain).expect("a node");
-        let followers = SENSORS.map(|(name, _)| Followers::attach(&node, name));
-        // The mode is told before the first scan.
-        for scan in 0..=SCANS {
-            for (number, room) in rooms.iter().enumerate() {
-                let silent_ns = if scan >= SILENCE { 1_000_000_000 } else { 0 };
-                let begin = 1_000_000_000 + number as u64 * 9_000_000;
-                let at = begin + scan * Variant::HALF.turns() * MIRROR_TURN + silent_ns;
-                let telegram = if scan == 0 {
-                    lms::reply::configuration(0, Mode(1), Unit::Mm, 0x10)
-                } else {
-                    let look = room.look(Variant::HALF, Unit::Mm, Mode(1), at);
-                    lms::measured::encode(0, Unit::Mm, &look.words, 0x10)
-                };
-                links[number].read(at, telegram.bytes());
-                for sample in followers[number].take() {
-                    let (name, _) = SENSORS[number];
-                    writer.sample(name, sample.topic, &sample.header, &sample.payload).expect("is written");
-                    published[number].push(sample);
-                }
-            }
-            writer.close_chunk().expect("is written");
-        }
+    let (file, mut published) = (stage.path("two.mcap"), vec![Vec::new(), Vec::new()]);
+    rooms::record(&stage.place(), &file, SCANS, Some(SILENCE), |number, sample| {
+        published[number].push(sample)
     });
-    assert_eq!(driven, Ok(()));
-    writer.finish().expect("ends");
     (file, published)
 }
 

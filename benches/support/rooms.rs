@@ -1,0 +1,141 @@
+//! A recording of two sensors in simulated rooms with people: a hub in made-up time, of which every topic is followed and
+//! written into a file. A file by itself, for benches and tests that need no stage.
+
+use std::collections::BTreeMap;
+use std::fs::File;
+use std::path::Path;
+
+use daemon::Config;
+use daemon::config::Sources;
+use lms::Nanos;
+use lms::variant::{MIRROR_TURN, Mode, Unit, Variant};
+use schema::datagram::Packed;
+use schema::file::Writer;
+use schema::ipc::{self, Node, Payload, Subscriber};
+use schema::{Background, Domain, Foreground, Header, Marks, Scan, Topic, Zones};
+use sim::room::Room;
+use sim::world::World;
+
+/// Sensors and their worlds.
+pub(crate) const SENSORS: [(&str, &str); 2] = [("front", "fig8"), ("rear", "demo")];
+/// Models are learned within the recording.
+pub(crate) const LEARNING: &str = "background.scans=40";
+
+/// From one scan to the next.
+pub(crate) fn period() -> Nanos {
+    Variant::HALF.turns() * MIRROR_TURN
+}
+
+/// Drives a hub in `domain` in made-up time for a telegram that tells the mode and `scans` scans of each sensor, and
+/// writes all that it publishes into `file`; `keep` gets it with the sensor's number. Before scan number `silence` nothing is
+/// heard of a sensor for a second.
+pub(crate) fn record(
+    domain: &Domain,
+    file: &Path,
+    scans: u64,
+    silence: Option<u64>,
+    mut keep: impl FnMut(usize, Published),
+) {
+    let sources = Sources {
+        files: Vec::new(),
+        links: SENSORS.map(|(name, _)| format!("{name}=file:nothing")).to_vec(),
+        set: ["link.front.mode=1", "link.rear.mode=1", LEARNING].map(str::to_owned).to_vec(),
+    };
+    let config = Config::load(&sources).expect("a configuration");
+    let rooms = SENSORS.map(|(_, name)| Room::new(&name.parse::<World>().expect("a world"), 7));
+    let mut writer = Writer::begin(File::create(file).expect("a file"), "", BTreeMap::new()).expect("begins");
+    let driven = daemon::in_memory(&config, domain, |links| {
+        let node = ipc::client_node(domain).expect("a node");
+        let followers = SENSORS.map(|(name, _)| Followers::attach(&node, name));
+        for scan in 0..=scans {
+            for (number, room) in rooms.iter().enumerate() {
+                let silent_ns = if silence.is_some_and(|silence| scan >= silence) { SECOND } else { 0 };
+                let at = SECOND + number as u64 * 9_000_000 + scan * period() + silent_ns;
+                let telegram = if scan == 0 {
+                    lms::reply::configuration(0, Mode(1), Unit::Mm, 0x10)
+                } else {
+                    let look = room.look(Variant::HALF, Unit::Mm, Mode(1), at);
+                    lms::measured::encode(0, Unit::Mm, &look.words, 0x10)
+                };
+                links[number].read(at, telegram.bytes());
+                for sample in followers[number].take() {
+                    let (name, _) = SENSORS[number];
+                    writer.sample(name, sample.topic, &sample.header, &sample.payload).expect("is written");
+                    keep(number, sample);
+                }
+            }
+            if scan % 4 == 0 {
+                writer.close_chunk().expect("is written");
+            }
+        }
+    });
+    assert_eq!(driven, Ok(()));
+    writer.finish().expect("ends");
+}
+
+/// A sample as it was published.
+#[derive(Debug, PartialEq)]
+pub(crate) struct Published {
+    pub(crate) topic: Topic,
+    pub(crate) header: Header,
+    pub(crate) payload: Vec<u8>,
+}
+
+/// The consumers of all that is made of a sensor's telegrams.
+pub(crate) struct Followers {
+    telegram: Subscriber<[u8]>,
+    scan: Subscriber<Scan>,
+    marks: Subscriber<Marks>,
+    zones: Subscriber<Zones>,
+    foreground: Subscriber<Foreground>,
+    background: Subscriber<Background>,
+}
+
+impl Followers {
+    pub(crate) fn attach(node: &Node, sensor: &str) -> Followers {
+        Followers {
+            telegram: attach(node, sensor),
+            scan: attach(node, sensor),
+            marks: attach(node, sensor),
+            zones: attach(node, sensor),
+            foreground: attach(node, sensor),
+            background: attach(node, sensor),
+        }
+    }
+
+    /// What has come since, topic by topic.
+    pub(crate) fn take(&self) -> Vec<Published> {
+        let mut taken = Vec::new();
+        drain(&self.telegram, &mut taken, |telegram| telegram.to_vec());
+        drain(&self.scan, &mut taken, packed);
+        drain(&self.marks, &mut taken, packed);
+        drain(&self.zones, &mut taken, packed);
+        drain(&self.foreground, &mut taken, packed);
+        drain(&self.background, &mut taken, packed);
+        taken
+    }
+}
+
+fn attach<P: Payload + ?Sized>(node: &Node, sensor: &str) -> Subscriber<P> {
+    let service = P::open(node, sensor).expect("a topic").expect("is there");
+    P::subscriber(&service).expect("a place")
+}
+
+fn drain<P: Payload + ?Sized>(from: &Subscriber<P>, to: &mut Vec<Published>, bytes: impl Fn(&P) -> Vec<u8>) {
+    while let Some(sample) = P::receive(from).expect("works") {
+        to.push(Published {
+            topic: P::TOPIC,
+            header: *sample.user_header(),
+            payload: bytes(P::read(&sample)),
+        });
+    }
+}
+
+fn packed(payload: &impl Packed) -> Vec<u8> {
+    let mut room = vec![0; 4096];
+    let len = payload.pack(&mut room).expect("there is room");
+    room.truncate(len);
+    room
+}
+
+const SECOND: Nanos = 1_000 * lms::MILLIS;
