@@ -34,11 +34,11 @@ pub(crate) fn figures(kills: usize) -> Outcome<Vec<Figure>> {
         count("kept: kills", kills, Target::None),
         count("kept: telegrams sent", spread.sent, Target::None),
         count("kept: telegrams lost", spread.lost, Target::Most(0.0)),
-        count("kept: lost without being read", spread.lost_otherwise, Target::Most(0.0)),
+        count("kept: of them at other moments", spread.lost_otherwise, Target::Most(0.0)),
         count("kept: broken off by the sensor", spread.aborted, Target::None),
         count("kept, while reading: kills", kills.div_ceil(2), Target::None),
         count("kept, while reading: lost", reading.lost, Target::None),
-        count("kept, while reading: lost otherwise", reading.lost_otherwise, Target::Most(0.0)),
+        count("kept, while reading: at other moments", reading.lost_otherwise, Target::Most(0.0)),
     ])
 }
 
@@ -52,7 +52,7 @@ struct Cost {
     /// Whole telegrams of measured data from the first that was received to the last.
     sent: usize,
     lost: usize,
-    /// Of them those that no hub was reading when it was killed.
+    /// Of them those that no hub should have been reading when it was killed: one that is woken late reads what is there.
     lost_otherwise: usize,
     /// Telegrams that the sensor broke off meanwhile, to answer the next hub.
     aborted: usize,
