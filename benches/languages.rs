@@ -24,8 +24,10 @@ struct Language {
     consumer: fn() -> Outcome<Option<Vec<String>>>,
 }
 
-const LANGUAGES: [Language; 1] =
-    [Language { figures: ["Python, p50", "Python, p90", "Python, p99"], ratio: 3.0, consumer: python }];
+const LANGUAGES: [Language; 2] = [
+    Language { figures: ["Python, p50", "Python, p90", "Python, p99"], ratio: 3.0, consumer: python },
+    Language { figures: ["C, p50", "C, p90", "C, p99"], ratio: 1.1, consumer: c },
+];
 
 fn main() -> ExitCode {
     support::main(measure)
@@ -86,6 +88,32 @@ fn python() -> Outcome<Option<Vec<String>>> {
     }
     let script = top.join("benches/languages/age.py").display().to_string();
     Ok(Some(vec![python, "-B".into(), script]))
+}
+
+/// Built against the library that Cargo put beside this bench.
+fn c() -> Outcome<Option<Vec<String>>> {
+    let top = Path::new(env!("CARGO_MANIFEST_DIR"));
+    let own = std::env::current_exe()?;
+    let library = own.parent().ok_or("a bench is in a directory")?.join("libscanhub.so");
+    let place = Path::new(env!("CARGO_TARGET_TMPDIR")).join("languages");
+    std::fs::create_dir_all(&place)?;
+    // What the linker looks for, and what the program does when it starts.
+    for name in ["libscanhub.so", "libscanhub.so.0"] {
+        let _ = std::fs::remove_file(place.join(name));
+        std::os::unix::fs::symlink(&library, place.join(name))?;
+    }
+    let program = place.join("age").display().to_string();
+    let mut cc = Command::new("cc");
+    cc.args(["-std=c99", "-D_DEFAULT_SOURCE", "-O2", "-I"]).arg(top.join("clients/c/include"));
+    cc.arg(top.join("benches/languages/age.c")).args(["-o", &program, "-lscanhub", "-L"]).arg(&place);
+    match cc.arg(format!("-Wl,-rpath,{}", place.display())).status() {
+        Ok(status) if status.success() => Ok(Some(vec![program])),
+        Ok(_) => Err("benches/languages/age.c does not compile".into()),
+        Err(_) => {
+            eprintln!("there is no C compiler (cc)");
+            Ok(None)
+        }
+    }
 }
 
 const SENSOR: &str = "front";

@@ -81,6 +81,7 @@ fn dispatch(cli: &Cli) -> Result<(), Failure> {
         },
         Verb::Probe(probe) => probe.run(everywhere.json, &*interrupt()?),
         Verb::Configure(configure) => configure.run(everywhere.json, &*interrupt_by(&ENDS)?),
+        Verb::Convert(convert) => convert.run(everywhere.json, &*interrupt()?),
         Verb::Completions(completions) => {
             completions.run();
             Ok(())

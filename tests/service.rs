@@ -81,8 +81,7 @@ fn scans_go_on_with_the_first_telegram_of_the_next_hub() {
     let hub = stage.service(&mut supervisor, &flags, None).ready();
     supervisor.hear("FDNAME=front");
     let mut samples = stage.echo(&["front/telegram", "front/scan"]);
-    // What is known of the sensor is kept once a second.
-    let scans = samples.await_lines(80, "a scan", is_class("scan"));
+    let scans = samples.await_lines(20, "a scan", is_class("scan"));
     let of_next = |line: &Value| line["boot"] != scans[0]["boot"];
     assert_eq!(hub.end(KILL).code, None);
     let hub = stage.service(&mut supervisor, &flags, None).ready();

@@ -200,6 +200,7 @@ impl<'a> LinkThread<'a> {
         if published {
             self.line_errors.wait();
         }
+        self.memory.iter_mut().for_each(|memory| memory.keep_first(session));
         let sensor = session.sensor();
         let state = if self.is_doubtful(session) { State::Absent } else { state_of(session) };
         let facts = (state, session.trouble(), sensor.unit, sensor.notices().next());

@@ -1,12 +1,14 @@
 //! What a hub knew of the sensor of a link a moment before it was killed, for the next one: without it there are no scans until
-//! the sensor has answered two questions, and each answer costs a scan. A small file in the domain's directory, written once
-//! a second while the sensor streams. Refuses to know what of a sensor is worth to be known.
+//! the sensor has answered two questions, and each answer costs a scan. A small file in the domain's directory, written as
+//! soon as that is known, and once a second while the sensor streams. Refuses to know what of a sensor is worth to be known.
 
 use std::fs::{File, OpenOptions};
 use std::os::unix::fs::{FileExt, OpenOptionsExt};
 use std::path::Path;
 
 use lms::{Identity, MILLIS, Nanos, Session};
+
+use crate::clock;
 
 /// The memory of one link.
 pub(crate) struct Memory {
@@ -44,6 +46,13 @@ impl Memory {
     pub(crate) fn keep(&mut self, session: Option<&Session>, now: Nanos) {
         if let Some(identity) = session.and_then(Session::identity) {
             self.write(identity, now);
+        }
+    }
+
+    /// As soon as anything is known; then [`keep`](Self::keep) keeps it new.
+    pub(crate) fn keep_first(&mut self, session: &Session) {
+        if self.identity.is_none() {
+            self.keep(Some(session), clock::now());
         }
     }
 

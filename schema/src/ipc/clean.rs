@@ -42,13 +42,13 @@ pub fn clean(domain: &Domain) -> Result<Cleaned, Failure> {
     Ok(Cleaned { dead: before.dead.saturating_sub(after.dead), alive: after.alive, root })
 }
 
-/// Removes the directory `root` with what nobody needs who is not there: empty directories and locks. Whether all of it
-/// is gone; anything else in it stays.
+/// Removes the directory `root` with what nobody needs who is not there: empty directories, locks, and what a hub noted of
+/// its sensors for the next one. Whether all of it is gone; anything else in it stays.
 fn take_away(root: &Path) -> bool {
     for entry in fs::read_dir(root).into_iter().flatten().flatten() {
         let path = entry.path();
-        let is_lock = path.extension().is_some_and(|extension| extension == "lock");
-        let _ = if is_lock { fs::remove_file(&path) } else { fs::remove_dir(&path) };
+        let is_ours = path.extension().is_some_and(|kind| kind == "lock" || kind == "sensor");
+        let _ = if is_ours { fs::remove_file(&path) } else { fs::remove_dir(&path) };
     }
     match fs::remove_dir(root) {
         Ok(()) => true,
@@ -68,7 +68,7 @@ mod tests {
         let root = std::env::temp_dir().join(format!("shc{}", std::process::id()));
         fs::create_dir_all(root.join("nodes")).unwrap();
         fs::create_dir(root.join("full")).unwrap();
-        for file in ["hub.lock", "full/something", "letter"] {
+        for file in ["hub.lock", "front.sensor", "full/something", "letter"] {
             fs::write(root.join(file), "").unwrap();
         }
         assert!(!take_away(&root));
