@@ -5,6 +5,7 @@ mod background;
 mod config;
 mod configure;
 mod control;
+mod convert;
 mod doctor;
 mod examples;
 mod gateway;
@@ -31,6 +32,7 @@ use schema::{DEFAULT_DOMAIN, Domain, Environment, Failure};
 pub(crate) use background::Background;
 pub(crate) use config::Config;
 pub(crate) use control::Control;
+pub(crate) use convert::Convert;
 pub(crate) use gateway::Gateway;
 pub(crate) use generated::{Completions, Man};
 pub(crate) use latency::Latency;
@@ -158,7 +160,11 @@ pub(crate) enum Verb {
     #[command(after_help = gateway::GROUPS)]
     Gateway(Gateway),
     /// What the gateways of other machines send over the network, and what of it was lost
+    #[command(after_help = listen::SIGNALS)]
     Listen(Listen),
+    /// A recording in another form, or a damaged one made whole
+    #[command(after_help = convert::REPAIR)]
+    Convert(Convert),
     /// The completion of this command line for a shell
     Completions(Completions),
     /// Manual pages

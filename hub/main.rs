@@ -39,8 +39,12 @@ fn main() -> ExitCode {
         Err(error) => return refuse(&error),
     };
     start_log();
-    // What these print on stdout says that they are up, and how it ended.
-    let quiet = matches!(cli.verb, Verb::Run(_) | Verb::Replay(_) | Verb::Simulate(_));
+    // What these print on stdout says that they are up, and how it ended; a recording is no text.
+    let quiet = match &cli.verb {
+        Verb::Run(_) | Verb::Replay(_) | Verb::Simulate(_) => true,
+        Verb::Record(record) => record.is_to_stdout(),
+        _ => false,
+    };
     daemon::bus_error::explain(cli.everywhere.json, quiet);
     match dispatch(&cli) {
         Ok(()) => ExitCode::SUCCESS,
@@ -77,6 +81,7 @@ fn dispatch(cli: &Cli) -> Result<(), Failure> {
         },
         Verb::Probe(probe) => probe.run(everywhere.json, &*interrupt()?),
         Verb::Configure(configure) => configure.run(everywhere.json, &*interrupt_by(&ENDS)?),
+        Verb::Convert(convert) => convert.run(everywhere.json, &*interrupt()?),
         Verb::Completions(completions) => {
             completions.run();
             Ok(())
@@ -132,7 +137,7 @@ fn dispatch(cli: &Cli) -> Result<(), Failure> {
             // Whatever ends it, the file is finished. A file that may not grow is an error of its write, and no end.
             let (stop, _) = (interrupt_by(&ENDS)?, interrupt_by(&[SIGXFSZ])?);
             let mut stderr = io::stderr();
-            match options.is_to_stdout() {
+            match record.is_to_stdout() {
                 true => clients::record(&options, &mut io::stderr(), &mut stderr, &stop),
                 false => clients::record(&options, &mut out, &mut stderr, &stop),
             }
@@ -152,7 +157,8 @@ fn dispatch(cli: &Cli) -> Result<(), Failure> {
             clients::gateway(&gateway.options(everywhere)?, &mut out, &mut io::stderr(), &tell, &stop)
         }
         Verb::Listen(listen) => {
-            clients::listen(&listen.options(everywhere)?, &mut out, &mut io::stderr(), &*interrupt()?)
+            let (tell, stop) = (interrupt_by(&[SIGUSR1])?, interrupt()?);
+            clients::listen(&listen.options(everywhere)?, &mut out, &mut io::stderr(), &tell, &stop)
         }
     }
 }

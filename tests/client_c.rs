@@ -11,7 +11,7 @@ use std::collections::HashSet;
 use std::path::Path;
 use std::process::{Command, Output};
 
-use installed::{Installed, compiler, header_directory, source};
+use installed::{Installed, header_directory, is_there, source};
 use schema::{Header, Scan};
 use serde_json::Value;
 use stage::{INT, KILL, Program, Stage, TERM, hash, is_class, number};
@@ -39,33 +39,33 @@ fn data(line: &Value) -> Vec<u8> {
 /// In every standard that people use.
 #[test]
 fn the_header_has_the_layout_of_schema() {
-    if !compiler("cc") {
+    if !is_there("cc") {
         return;
     }
     let stage = Stage::new();
     stage.file("layout.c", layout::program());
-    for (compiler_name, standard) in
+    for (compiler, standard) in
         [("cc", "-std=c99"), ("cc", "-std=c11"), ("c++", "-std=c++11"), ("c++", "-std=c++20")]
     {
-        if !compiler(compiler_name) {
+        if !is_there(compiler) {
             continue;
         }
-        let mut cc = Command::new(compiler_name);
+        let mut cc = Command::new(compiler);
         cc.args([standard, "-Wall", "-Wextra", "-Werror", "-pedantic", "-Wconversion"]);
-        if compiler_name == "c++" {
+        if compiler == "c++" {
             cc.args(["-x", "c++"]);
         }
         cc.arg("-I").arg(header_directory()).arg(stage.path("layout.c")).arg("-o").arg(stage.path("layout"));
         succeeded(&cc.output().expect("a compiler"));
         let said = succeeded(&Command::new(stage.path("layout")).output().expect("it runs"));
-        assert_eq!(said.lines().collect::<Vec<_>>(), layout::expected(), "{compiler_name} {standard}");
+        assert_eq!(said.lines().collect::<Vec<_>>(), layout::expected(), "{compiler} {standard}");
     }
 }
 
 /// A program may read datagrams and topics.
 #[test]
 fn both_headers_go_into_one_program() {
-    if !compiler("cc") {
+    if !is_there("cc") {
         return;
     }
     let stage = Stage::new();
@@ -82,7 +82,7 @@ fn both_headers_go_into_one_program() {
 
 #[test]
 fn what_the_header_computes_is_what_schema_computes() {
-    if !compiler("cc") {
+    if !is_there("cc") {
         return;
     }
     let stage = Stage::new();
@@ -197,26 +197,30 @@ fn zones_get_unknown_when_the_hub_is_killed() {
     }
 }
 
-/// Once as it is, once with a watch over memory, which the library shares with the program.
+/// Once as it is, and with two watches over memory, of the compiler and of valgrind: the library shares it with the program.
 #[test]
 fn what_a_program_does_wrong_is_refused() {
     let Some(installed) = Installed::once() else { return };
     let stage = Stage::new();
     let _simulator = stage.simulator(&["front"], &["--seed=34"]);
     let _hub = stage.hub(&[stage.link("front")]);
-    let watched = ["-fsanitize=address,undefined", "-fno-sanitize-recover=all"];
-    for flags in [&[][..], &watched] {
-        let misuse = match installed.try_compile(&stage, &source("misuse.c"), flags) {
-            Ok(misuse) => misuse,
-            Err(_) if !flags.is_empty() => {
-                eprintln!("without a watch over memory: this compiler has none");
-                continue;
-            }
-            Err(said) => panic!("{said}"),
-        };
-        let outcome = program(&stage, &misuse, &["front"]).wait();
+    let misuse = installed.compile(&stage, &source("misuse.c"), &[]);
+    let plain = misuse.display().to_string();
+    let mut ways = vec![vec![plain.clone()]];
+    let watch = ["-fsanitize=address,undefined", "-fno-sanitize-recover=all"];
+    match installed.try_compile(&stage, &source("misuse.c"), &watch) {
+        Ok(watched) => ways.push(vec![watched.display().to_string()]),
+        Err(_) => eprintln!("without the compiler's watch over memory: it has none"),
+    }
+    if is_there("valgrind") {
+        let words = ["valgrind", "--quiet", "--leak-check=full", "--error-exitcode=9"];
+        ways.push(words.into_iter().map(str::to_owned).chain([plain]).collect());
+    }
+    for way in ways {
+        let words: Vec<&str> = way[1..].iter().map(String::as_str).chain(["front"]).collect();
+        let outcome = program(&stage, Path::new(&way[0]), &words).wait();
         assert_eq!(outcome.code, Some(0), "{outcome}");
-        assert_eq!(outcome.out, b"all refused\n");
+        assert_eq!(outcome.out, b"all refused\n", "{outcome}");
     }
 }
 

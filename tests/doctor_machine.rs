@@ -14,7 +14,7 @@ use std::sync::atomic::AtomicBool;
 use daemon::config::Gateway;
 use daemon::doctor::{Subjects, System, examine};
 use schema::Domain;
-use stage::{Findings, KILL, Program, Stage, TERM, in_a_network, shared_memory};
+use stage::{Findings, KILL, Program, Stage, TERM, in_a_network, is_class, shared_memory};
 
 /// `sh` with these words before the program, as `ulimit -f 100; exec`, and its arguments.
 fn under(stage: &Stage, words: &str, arguments: &[&str]) -> Command {
@@ -213,6 +213,22 @@ fn what_a_dead_hub_left_is_taken_away_and_a_living_ones_is_not() {
     // The other one is as it was: who comes now finds it.
     assert_eq!(theirs.end(TERM).code, Some(0));
     assert_eq!((stage.left_behind().len(), hub.end(TERM).code), (0, Some(0)));
+}
+
+#[test]
+fn who_waits_for_the_next_hub_keeps_what_it_has() {
+    let stage = Stage::new();
+    let _simulator = stage.simulator(&["front"], &[] as &[&str]);
+    let link = stage.link("front");
+    let hub = stage.hub(&[&link]);
+    let mut consumer = stage.echo(&["front/scan"]);
+    consumer.await_line("a scan", is_class("scan"));
+    hub.end(KILL);
+    Findings::of(&stage, &["--clean", "/dev/null"]);
+    assert!(stage.place().root().exists());
+    let _hub = stage.hub(&[&link]);
+    let is_anew = |line: &serde_json::Value| line["class"] == "scan" && line["topic_seq"] == 0;
+    consumer.await_line("a scan of the next hub", is_anew);
 }
 
 #[test]

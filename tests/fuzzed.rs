@@ -92,6 +92,11 @@ fn lan() {
     run("lan");
 }
 
+#[test]
+fn recording() {
+    run("recording");
+}
+
 /// Inputs beside those of the corpus, for each target.
 const ROUNDS: u32 = 4_000;
 /// Bytes of the longest one.

@@ -1,10 +1,11 @@
-//! `scanhub listen --hub`: whom it hears where there are many, and that it says which gateway is on its own machine.
+//! `scanhub listen --hub`: whom it hears where there are many, that it says which gateway is on its own machine,
+//! and the account when it is asked.
 
 mod stage;
 
 use schema::{Topic, Verdict, Zones};
 use serde_json::json;
-use stage::{INT, Robot, Sender, Stage, in_a_network, is_class};
+use stage::{INT, Robot, Sender, Stage, USR1, in_a_network, is_class, number};
 
 const HUB: u64 = 0x5f3a_12bc_00d1_e2f3;
 
@@ -76,5 +77,23 @@ fn a_gateway_on_another_machine_is_not_called_this_one_s() {
         assert_eq!(line["here"], json!(null), "{line}");
         drop(gateway);
         assert_eq!(listener.end(INT).code, Some(0));
+    });
+}
+
+#[test]
+fn a_signal_asks_for_the_account_so_far() {
+    in_a_network("a_signal_asks_for_the_account_so_far", || {
+        let stage = Stage::new();
+        let mut program = stage.start(&["listen", "--json"]).ready();
+        let mut sender = Sender::new(HUB, 7, 0, "front");
+        for received in 1..=2 {
+            sender.send(Topic::Zones, &zones(Verdict::Clear));
+            program.await_line("zones", is_class("zones"));
+            program.signal(USR1);
+            let line = program.await_line("the account", is_class("lan"));
+            assert_eq!((number(&line, "received"), &line["topic"]), (received, &json!("zones")));
+        }
+        let outcome = program.end(INT);
+        assert_eq!((outcome.code, outcome.of_class("lan").len()), (Some(0), 3), "{outcome}");
     });
 }

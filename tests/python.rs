@@ -7,13 +7,16 @@ use std::collections::BTreeMap;
 use std::path::Path;
 use std::process::Command;
 
-use serde_json::Value;
-use stage::{INT, KILL, Outcome, Program, Stage, TERM, is_class, number, python, script};
+use serde_json::{Value, json};
+use stage::{INT, KILL, Outcome, Program, Stage, TERM, is_class, number, python};
 
 /// A script of the package's tests, if there is a Python for it.
 fn check(name: &str) -> Option<Command> {
-    let python = python(&["iceoryx2", "numpy"])?;
-    Some(script(&python, &format!("clients/python/tests/{name}.py")))
+    let mut command = python("iceoryx2, numpy")?;
+    let package = Path::new(env!("CARGO_MANIFEST_DIR")).join("clients/python");
+    command.arg(package.join("tests").join(name).with_extension("py"));
+    command.env("PYTHONPATH", package).env_remove("SCANHUB_DOMAIN");
+    Some(command)
 }
 
 /// The same with the stage's domain and root as its first arguments.
@@ -41,6 +44,12 @@ fn streaming(stage: &Stage) -> (Program, Program) {
 fn structs_are_golden() {
     let Some(mut command) = check("layouts") else { return };
     command.arg(Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/vectors/v1"));
+    passed(command);
+}
+
+#[test]
+fn verdicts_grow_stale() {
+    let Some(command) = check("freshness") else { return };
     passed(command);
 }
 
@@ -102,8 +111,11 @@ fn said_by(echo: &[Value], sample: &Value) -> bool {
     if !echo.iter().any(is_numbered) {
         return echo.iter().any(|line| differing(line, sample).is_empty());
     }
-    // Of a verdict that is too old `echo` says itself what it is.
-    let Some(line) = echo.iter().find(same).filter(|line| line["stale"] != true) else { return false };
+    // Whether a verdict is too old each of the two says of itself.
+    let is_stale = |line: &Value| line["stale"] == true;
+    let Some(line) = echo.iter().find(same).filter(|line| !is_stale(line) && !is_stale(sample)) else {
+        return false;
+    };
     let differing = differing(line, sample);
     assert!(differing.is_empty(), "{differing:?}: {line} {sample}");
     true
@@ -116,6 +128,20 @@ fn differing<'a>(line: &'a Value, sample: &Value) -> Vec<&'a String> {
     keys.filter(|key| *key != "marks" || line["class"] == "marks")
         .filter(|key| line[*key] != sample[*key])
         .collect()
+}
+
+#[test]
+fn one_subscription_follows_several_sensors() {
+    let stage = Stage::new();
+    let Some(mut command) = check_on(&stage, "follow") else { return };
+    command.args(["front/scan", "rear/scan", "rear/status"]);
+    let _simulator = stage.simulator(&["front", "rear"], &["--seed=63", "--baud=500000"]);
+    let _hub = stage.hub(&[stage.link("front"), stage.link("rear")]);
+    let mut follower = Program::start(command);
+    for (sensor, topic, count) in [("front", "scan", 40), ("rear", "scan", 40), ("rear", "status", 2)] {
+        follower.await_lines(count, sensor, |line| line["sensor"] == sensor && line["class"] == topic);
+    }
+    ended_by_interrupt(follower);
 }
 
 #[test]
@@ -138,7 +164,11 @@ fn a_subscription_outlives_several_hubs() {
     }
     follower.await_lines(20, "a scan", is_class("scan"));
     let outcome = ended_by_interrupt(follower);
-    for topic in ["scan", "telegram", "zones"] {
+    let stale: Vec<Value> =
+        outcome.of_class("zones").into_iter().filter(|line| line["stale"] == true).collect();
+    assert!(stale.iter().all(|line| line["verdict"] == "unknown" && line["zones"] == json!([])));
+    assert!(stale.len() >= 2, "killed hubs leave a silence: {stale:?}");
+    for topic in ["scan", "telegram"] {
         let mut lives = BTreeMap::<String, Vec<Value>>::new();
         for line in outcome.of_class(topic) {
             let boot = line["boot"].as_str().expect("a life").to_owned();

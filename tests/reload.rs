@@ -6,10 +6,7 @@ mod stage;
 use std::process::Command;
 
 use serde_json::Value;
-use stage::{
-    HUP, INT, MEASURED, Program, Stage, Supervisor, TERM, bytes_of, hash, is_class, number, sequence,
-    terminal,
-};
+use stage::{HUP, INT, MEASURED, Program, Stage, TERM, bytes_of, hash, is_class, number, sequence, terminal};
 
 const STREAM: [&str; 2] = ["--seed=71", "--baud=500000"];
 
@@ -33,9 +30,9 @@ fn has_radii(wanted: &'static [u64]) -> impl Fn(&Value) -> bool {
 fn circles_change_in_a_stream_without_a_gap() {
     let stage = Stage::new();
     let simulator = stage.simulator(&["front"], &STREAM);
-    let mut supervisor = Supervisor::new(&stage);
+    let mut supervisor = stage.supervisor();
     let flags = [configure(&stage, ""), "--no-system-config".to_owned()];
-    let hub = supervisor.start(&stage, &flags, None).ready();
+    let hub = stage.service(&mut supervisor, &flags, None).ready();
     supervisor.hear("READY=1");
     stage.await_info("front", |info| info["state"] == "streaming");
     let mut telegrams = stage.echo(&["front/telegram"]);
@@ -93,10 +90,10 @@ fn circles_change_in_a_stream_without_a_gap() {
 #[test]
 fn what_cannot_be_changed_is_said_and_what_cannot_be_changes_nothing() {
     let stage = Stage::new();
-    let mut supervisor = Supervisor::new(&stage);
+    let mut supervisor = stage.supervisor();
     let flags = [configure(&stage, ""), "--no-system-config".to_owned()];
     // Nothing is at the port: the topics say all the same how it is.
-    let hub = supervisor.start(&stage, &flags, None).ready();
+    let hub = stage.service(&mut supervisor, &flags, None).ready();
     supervisor.hear("READY=1");
     let mut zones = stage.echo(&["front/zones"]);
     let wrong = "baud = 38400\n[zones]\nradii = [0.6, 1.0]\n";

@@ -3,10 +3,11 @@
 
 mod stage;
 
-use std::collections::HashMap;
+use std::collections::{HashMap, HashSet};
 use std::time::Duration;
 
-use stage::{INT, KILL, MEASURED, Stage, Supervisor, TERM, bytes_of, hash, number, sequence};
+use serde_json::Value;
+use stage::{INT, KILL, MEASURED, Program, Stage, TERM, bytes_of, hash, is_class, number, sequence};
 
 const KILLS: usize = 6;
 
@@ -14,24 +15,25 @@ const KILLS: usize = 6;
 fn what_is_sent_while_a_killed_hub_is_replaced_waits_in_the_line() {
     let stage = Stage::new();
     let simulator = stage.simulator(&["front"], &["--seed=5", "--baud=500000"]);
-    let mut supervisor = Supervisor::new(&stage);
+    let mut supervisor = stage.supervisor();
     let flags = [stage.link("front")];
-    let mut hub = supervisor.start(&stage, &flags, None).ready();
+    let mut hub = stage.service(&mut supervisor, &flags, None).ready();
     supervisor.hear("FDNAME=front");
     supervisor.hear("READY=1");
     let mut telegrams = stage.echo(&["front/telegram"]);
+    let mut boots = HashSet::new();
     for _ in 0..KILLS {
-        telegrams.await_lines(20, "a measured telegram", |line| line["command"] == MEASURED);
+        live(&mut telegrams, &mut boots);
         assert_eq!(hub.end(KILL).code, None);
-        hub = supervisor.start(&stage, &flags, None).ready();
+        hub = stage.service(&mut supervisor, &flags, None).ready();
         supervisor.hear("READY=1");
     }
-    telegrams.await_lines(20, "a measured telegram", |line| line["command"] == MEASURED);
+    live(&mut telegrams, &mut boots);
     // Nobody but the one who keeps it has the line, and it is still locked.
     assert_eq!(hub.end(KILL).code, None);
     assert_eq!(stage.run(&["run", &flags[0]]).code, Some(4), "a hub of nobody's finds it busy");
-    hub = supervisor.start(&stage, &flags, None).ready();
-    telegrams.await_lines(20, "a measured telegram", |line| line["command"] == MEASURED);
+    hub = stage.service(&mut supervisor, &flags, None).ready();
+    live(&mut telegrams, &mut boots);
     assert_eq!(hub.end(TERM).code, Some(0));
     supervisor.hear("STOPPING=1");
     let got = telegrams.end(INT);
@@ -62,23 +64,57 @@ fn what_is_sent_while_a_killed_hub_is_replaced_waits_in_the_line() {
     assert_eq!(stage.simulated("front").1, 0, "EEPROM");
 }
 
+/// Waits for telegrams of a life of the hub that none of `boots` is: those of another one may still wait to be read.
+fn live(telegrams: &mut Program, boots: &mut HashSet<String>) {
+    let boot = |line: &Value| line["boot"].as_str().unwrap_or_default().to_owned();
+    let is_new = |line: &Value| line["command"] == MEASURED && !boots.contains(&boot(line));
+    let lines = telegrams.await_lines(20, "a measured telegram", is_new);
+    boots.insert(boot(&lines[0]));
+}
+
+#[test]
+fn scans_go_on_with_the_first_telegram_of_the_next_hub() {
+    let stage = Stage::new();
+    let simulator = stage.simulator(&["front"], &["--seed=8", "--baud=500000"]);
+    let mut supervisor = stage.supervisor();
+    let flags = [stage.link("front")];
+    let hub = stage.service(&mut supervisor, &flags, None).ready();
+    supervisor.hear("FDNAME=front");
+    let mut samples = stage.echo(&["front/telegram", "front/scan"]);
+    let scans = samples.await_lines(20, "a scan", is_class("scan"));
+    let of_next = |line: &Value| line["boot"] != scans[0]["boot"];
+    assert_eq!(hub.end(KILL).code, None);
+    let hub = stage.service(&mut supervisor, &flags, None).ready();
+    let first =
+        samples.await_line("a measured telegram", |line| of_next(line) && line["command"] == MEASURED);
+    let scan = samples.await_line("its scan", |line| of_next(line) && line["class"] == "scan");
+    assert_eq!(scan["seq"], first["seq"], "{scan}");
+    assert_eq!((&scan["unit_mm"], &scan["count"]), (&scans[0]["unit_mm"], &scans[0]["count"]));
+    // Its status is asked all the same, its type is known.
+    let info = stage.await_info("front", |info| info["counters"]["telegrams"].as_u64() > Some(100));
+    assert_eq!((&info["type"], &info["mode"]), (&"LMS200;301063;V02.30".into(), &1.into()), "{info}");
+    assert_eq!(hub.end(TERM).code, Some(0));
+    drop(samples);
+    assert_eq!(simulator.end(TERM).code, Some(0));
+}
+
 #[test]
 fn a_port_that_went_is_given_back_and_another_link_s_is_not_taken() {
     let stage = Stage::new();
     let simulator = stage.simulator(&["front"], &["--seed=6", "--baud=500000"]);
-    let mut supervisor = Supervisor::new(&stage);
-    let hub = supervisor.start(&stage, &[stage.link("front")], None).ready();
+    let mut supervisor = stage.supervisor();
+    let hub = stage.service(&mut supervisor, &[stage.link("front")], None).ready();
     supervisor.hear("FDNAME=front");
     supervisor.hear("READY=1");
     assert_eq!(hub.end(KILL).code, None);
     // The next one has a link of another name: what was kept is nobody's.
     let side = format!("--link=side={}", stage.word("side"));
-    let hub = supervisor.start(&stage, &[side], None).ready();
+    let hub = stage.service(&mut supervisor, &[side], None).ready();
     supervisor.hear("FDSTOREREMOVE=1");
     supervisor.hear("STATUS=sensors: side");
     assert_eq!(hub.end(TERM).code, Some(0));
     // It was closed: whoever comes finds it free.
-    let hub = supervisor.start(&stage, &[stage.link("front")], None).ready();
+    let hub = stage.service(&mut supervisor, &[stage.link("front")], None).ready();
     supervisor.hear("FDNAME=front");
     stage.await_info("front", |info| info["state"] == "streaming");
     stage.kill_simulator(simulator, "front");
@@ -92,21 +128,21 @@ fn a_port_that_went_is_given_back_and_another_link_s_is_not_taken() {
 fn a_link_that_got_another_name_goes_on_with_its_port() {
     let stage = Stage::new();
     let simulator = stage.simulator(&["front"], &["--seed=7", "--baud=500000"]);
-    let mut supervisor = Supervisor::new(&stage);
-    let hub = supervisor.start(&stage, &[stage.link("front")], None).ready();
+    let mut supervisor = stage.supervisor();
+    let hub = stage.service(&mut supervisor, &[stage.link("front")], None).ready();
     supervisor.hear("FDNAME=front");
     supervisor.hear("READY=1");
     assert_eq!(hub.end(KILL).code, None);
     // Whoever keeps it has it locked: it cannot be opened, only taken over.
     let side = format!("--link=side={}", stage.word("front"));
-    let hub = supervisor.start(&stage, &[side], None).ready();
+    let hub = stage.service(&mut supervisor, &[side], None).ready();
     supervisor.hear("FDSTOREREMOVE=1");
     supervisor.hear("FDNAME=side");
     supervisor.hear("READY=1");
     assert_eq!(hub.end(KILL).code, None);
     // The name has another port now: what was kept under it is not kept beside the new one.
     let side = format!("--link=side={}", stage.word("nowhere"));
-    let hub = supervisor.start(&stage, &[side], None).ready();
+    let hub = stage.service(&mut supervisor, &[side], None).ready();
     supervisor.hear("FDSTOREREMOVE=1");
     supervisor.hear("STATUS=sensors: side");
     assert_eq!(hub.end(TERM).code, Some(0));
@@ -116,9 +152,9 @@ fn a_link_that_got_another_name_goes_on_with_its_port() {
 #[test]
 fn the_watchdog_is_fed_while_links_work() {
     let stage = Stage::new();
-    let mut supervisor = Supervisor::new(&stage);
+    let mut supervisor = stage.supervisor();
     // A port that is not there is no link that hangs.
-    let hub = supervisor.start(&stage, &[stage.link("front")], Some(Duration::from_secs(2))).ready();
+    let hub = stage.service(&mut supervisor, &[stage.link("front")], Some(Duration::from_secs(2))).ready();
     for _ in 0..3 {
         supervisor.hear("WATCHDOG=1");
     }

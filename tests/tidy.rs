@@ -306,3 +306,17 @@ fn tables_are_of_the_last_runs() {
         ]
     });
 }
+
+#[test]
+fn the_first_consumer_is_compiled() {
+    holds(written::the_first_consumer_is_compiled, |tree| {
+        let (page, example) = ("docs/first-consumer.md", "clients/examples/first.rs");
+        let (shown, compiled) = (tree.text(page), tree.text(example));
+        vec![
+            tree.with(page, &shown.replace("from_millis(500)", "from_secs(5)")),
+            tree.with(page, &shown.replace("```rust", "```")),
+            tree.with(page, &format!("{shown}\n```rust\nlet more = 1;\n```\n")),
+            tree.with(example, &compiled.replace("continue;", "break;")),
+        ]
+    });
+}

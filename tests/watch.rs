@@ -3,10 +3,12 @@
 
 mod stage;
 
+use std::fs::{self, File};
 use std::process::Command;
+use std::time::Duration;
 
 use rustix::process::Signal;
-use stage::{INT, KILL, Sitting, Stage, TERM};
+use stage::{INT, KILL, Sitting, Stage, TERM, Tmux, can_sit};
 
 const SIZE: (u16, u16) = (60, 20);
 
@@ -42,6 +44,9 @@ fn files_and_pipes_are_refused() {
 
 #[test]
 fn it_follows_the_hub_the_keys_and_the_window() {
+    if !can_sit() {
+        return;
+    }
     let stage = Stage::new();
     let mut watch = sit(&stage, &[]);
     watch.await_words("no hub: waiting for it");
@@ -95,6 +100,9 @@ fn it_follows_the_hub_the_keys_and_the_window() {
 
 #[test]
 fn the_terminal_is_given_back_however_it_ends() {
+    if !can_sit() {
+        return;
+    }
     let stage = Stage::new();
     for signal in [INT, TERM, Signal::HUP, Signal::QUIT] {
         let watch = sit(&stage, &[]);
@@ -123,6 +131,9 @@ fn the_terminal_is_given_back_however_it_ends() {
 
 #[test]
 fn without_colours_nothing_is_coloured() {
+    if !can_sit() {
+        return;
+    }
     let stage = Stage::new();
     let mut command = stage.command(&["watch"]);
     command.env("NO_COLOR", "1");
@@ -140,6 +151,9 @@ fn without_colours_nothing_is_coloured() {
 
 #[test]
 fn a_demonstration_shows_it() {
+    if !can_sit() {
+        return;
+    }
     let mut command = Command::new(env!("CARGO_BIN_EXE_scanhub"));
     command.args(["demo", "--for=3s"]);
     let demo = Sitting::start(&command, (80, 30));
@@ -151,4 +165,60 @@ fn a_demonstration_shows_it() {
     assert_eq!(below.matches(" 0 lost in ").count(), 2, "{below:?}");
     assert!(!std::env::temp_dir().join(format!("scanhub-{name}")).exists(), "its directory is left");
     assert!(stage::shared_memory(&format!("sh_{name}_")).is_empty(), "its domain is left");
+}
+
+#[test]
+fn a_terminal_that_is_closed_is_a_quiet_end() {
+    if !can_sit() {
+        return;
+    }
+    let stage = Stage::new();
+    let _sensor = stage.simulator(&["front"], &["--seed=73", "--baud=500000"]);
+    for streams in [false, true] {
+        let _hub = streams.then(|| stage.hub(&[stage.link("front")]));
+        // With SIGHUP, as a shell's terminal sends it, and without anybody who tells it.
+        for told in [true, false] {
+            let errors = stage.path("errors");
+            let file = File::create(&errors).expect("a file");
+            let watch = Sitting::start_for_hang_up(&stage.command(&["watch"]), SIZE, told, file);
+            watch.await_words(if streams { "1 front    streaming" } else { "no hub: waiting for it" });
+            let (code, took) = watch.hang_up();
+            let errors = fs::read_to_string(errors).expect("its errors");
+            assert_eq!((code, errors.as_str()), (Some(0), ""), "told {told}, streams {streams}");
+            assert!(took < Duration::from_secs(5), "{took:?}, told {told}, streams {streams}");
+        }
+    }
+}
+
+#[test]
+fn in_tmux_it_is_what_it_is_elsewhere() {
+    let stage = Stage::new();
+    // Should the test be killed, all of it is over after a while.
+    let program = env!("CARGO_BIN_EXE_scanhub");
+    let line = format!("{program} demo --for=60s; echo ended with $?; sleep 20");
+    let Some(tmux) = Tmux::start(&stage, &line, (80, 30)) else { return };
+    let is_picture = |rows: &[String]| rows[1..].iter().flat_map(|row| row.chars()).any(is_braille);
+    let streams = |rows: &[String], sensor: &str| {
+        rows.iter().any(|row| row.starts_with(sensor) && row.contains("streaming"))
+    };
+    let both = |rows: &[String]| streams(rows, "1 front") && streams(rows, "2 rear") && is_picture(rows);
+    let rows = tmux.await_rows("picture of both sensors", both);
+    assert_eq!(rows.len(), 30);
+    tmux.press(&["?"]);
+    tmux.await_rows("help", |rows| rows.iter().any(|row| row.contains("┌ scanhub watch ")));
+    tmux.resize((60, 30));
+    let fits = |rows: &[String]| rows.iter().all(|row| row.chars().count() <= 60);
+    tmux.await_rows("help in a narrow window", |rows| {
+        fits(rows) && rows.iter().any(|row| row.contains("┌ scanhub watch "))
+    });
+    tmux.press(&["?"]);
+    let is_gone = |rows: &[String]| !rows.iter().any(|row| row.contains("┌ scanhub watch "));
+    tmux.await_rows("picture in a narrow window", |rows| fits(rows) && is_gone(rows) && both(rows));
+    tmux.resize((140, 30));
+    tmux.await_rows("a wide window", |rows| !fits(rows) && both(rows));
+    tmux.press(&["q"]);
+    // Before its time was over.
+    let rows = tmux.await_rows("end", |rows| rows.iter().any(|row| row == "ended with 130"));
+    assert!(!is_picture(&rows), "the picture is left:\n{}", rows.join("\n"));
+    assert_eq!(rows.iter().filter(|row| row.contains(" 0 lost in ")).count(), 2, "{}", rows.join("\n"));
 }

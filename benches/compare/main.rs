@@ -23,13 +23,11 @@ use std::io::IsTerminal;
 use std::process::ExitCode;
 use std::thread::available_parallelism;
 
-use rustix::process::{Signal, set_parent_process_death_signal};
-
 use run::{Case, Measured};
 use sender::Task;
+use support::Outcome;
 use support::options::Options;
 use support::stage::Stage;
-use support::{Outcome, PART};
 use way::Way;
 
 /// One result of each pair, in the order in which they were taken.
@@ -61,25 +59,12 @@ impl fmt::Display for Cell {
 }
 
 fn main() -> ExitCode {
-    let words: Vec<String> = std::env::args().skip(1).collect();
-    let outcome = match words.first().map(String::as_str) {
-        Some(PART) => play(&words[1..]),
-        _ => measure(words),
-    };
-    match outcome {
-        Ok(()) => ExitCode::SUCCESS,
-        Err(error) => {
-            eprintln!("{error}");
-            ExitCode::FAILURE
-        }
-    }
+    support::main_with(play, measure)
 }
 
 /// A process of a run.
-fn play(words: &[String]) -> Outcome<()> {
-    set_parent_process_death_signal(Some(Signal::TERM))?;
-    let words: Vec<&str> = words.iter().map(String::as_str).collect();
-    let [part, way, payload, receivers, domain, place, ref rest @ ..] = words[..] else {
+fn play(words: &[&str]) -> Outcome<()> {
+    let [part, way, payload, receivers, domain, place, ref rest @ ..] = *words else {
         return Err(format!("no part {words:?}").into());
     };
     let way = Way::named(way)?;
@@ -91,15 +76,10 @@ fn play(words: &[String]) -> Outcome<()> {
     }
 }
 
-fn measure(mut words: Vec<String>) -> Outcome<()> {
-    let all = words.len();
-    words.retain(|word| word != "--quick");
-    let quick = words.len() < all;
-    let options = Options::parse(&words)?;
-    let pairs = if quick { options.pairs().min(2) } else { options.pairs() };
+fn measure(options: &Options) -> Outcome<()> {
+    let pairs = if options.quick { options.pairs().min(2) } else { options.pairs() };
     let (payloads, receivers): (&[usize], &[usize]) =
-        if quick { (&[TELEGRAM, MEBIBYTE], &[1, 16]) } else { (&PAYLOADS, &RECEIVERS) };
-    Stage::sweep()?;
+        if options.quick { (&[TELEGRAM, MEBIBYTE], &[1, 16]) } else { (&PAYLOADS, &RECEIVERS) };
     let stage = Stage::new()?;
     let processors = available_parallelism()?.get();
     let mut cells = Vec::new();
@@ -110,8 +90,8 @@ fn measure(mut words: Vec<String>) -> Outcome<()> {
         }
     }
     drop(stage);
-    table::print(&options, processors, pairs, &cells);
-    targets::print(&options, &cells);
+    table::print(options, processors, pairs, &cells);
+    targets::print(options, &cells);
     match &options.draw {
         Some(directory) => Ok(table::draw(directory, &cells)?),
         None => Ok(()),

@@ -38,34 +38,23 @@ use std::io::IsTerminal;
 use std::process::ExitCode;
 use std::time::Duration;
 
-use rustix::process::{Signal, set_parent_process_death_signal};
 use setup::{SetUp, WORD};
+use support::Outcome;
 use support::options::Options;
-use support::{Outcome, PART};
 use tables::{Run, Tables};
 
 fn main() -> ExitCode {
-    let words: Vec<String> = std::env::args().skip(1).collect();
-    let words: Vec<&str> = words.iter().map(String::as_str).collect();
-    let [PART, WORD, part @ ..] = &words[..] else { return support::main(measure) };
-    match play(part) {
-        Ok(()) => ExitCode::SUCCESS,
-        Err(error) => {
-            eprintln!("{error}");
-            ExitCode::FAILURE
-        }
-    }
+    support::main_with(play, measure)
 }
 
 fn play(words: &[&str]) -> Outcome<()> {
-    set_parent_process_death_signal(Some(Signal::TERM))?;
     match *words {
-        ["bytes", most, front, rear] => consumer::bytes([front, rear], most.parse()?),
-        ["datagrams", port] => consumer::datagrams(port.parse()?),
-        ["scans", domain] => consumer::scans(domain),
-        ["results", domain] => consumer::results(domain),
-        ["unit", port] => unit::send(port.parse()?),
-        _ => Err(format!("no part {words:?}").into()),
+        [WORD, "bytes", most, front, rear] => consumer::bytes([front, rear], most.parse()?),
+        [WORD, "datagrams", port] => consumer::datagrams(port.parse()?),
+        [WORD, "scans", domain] => consumer::scans(domain),
+        [WORD, "results", domain] => consumer::results(domain),
+        [WORD, "unit", port] => unit::send(port.parse()?),
+        _ => support::play(words),
     }
 }
 

@@ -14,36 +14,24 @@ mod sweep;
 
 use std::process::ExitCode;
 
-use rustix::process::{Signal, set_parent_process_death_signal};
+use support::Outcome;
 use support::options::Options;
-use support::{Outcome, PART};
 
 fn main() -> ExitCode {
-    let words: Vec<String> = std::env::args().skip(1).collect();
-    let words: Vec<&str> = words.iter().map(String::as_str).collect();
-    let outcome = match words[..] {
-        [PART, "driven", begin, beams, sensors, telegrams, followed] => part(|| {
-            let followed = followed.parse()?;
-            driven::drive(begin.as_ref(), beams.parse()?, sensors.parse()?, telegrams.parse()?, followed)
-        }),
-        [PART, "followers", domain, sensor, count, seconds, wait] => {
-            part(|| crowd::follow(domain, sensor, count.parse()?, seconds.parse()?, wait))
-        }
-        _ => return support::main(measure),
-    };
-    outcome.map_or_else(
-        |error| {
-            eprintln!("{error}");
-            ExitCode::FAILURE
-        },
-        |()| ExitCode::SUCCESS,
-    )
+    support::main_with(play, measure)
 }
 
-/// What this process does for another one ends with that.
-fn part(play: impl FnOnce() -> Outcome<()>) -> Outcome<()> {
-    set_parent_process_death_signal(Some(Signal::TERM))?;
-    play()
+fn play(words: &[&str]) -> Outcome<()> {
+    match *words {
+        ["driven", begin, beams, sensors, telegrams, followed] => {
+            let followed = followed.parse()?;
+            driven::drive(begin.as_ref(), beams.parse()?, sensors.parse()?, telegrams.parse()?, followed)
+        }
+        ["followers", domain, sensor, count, seconds, wait] => {
+            crowd::follow(domain, sensor, count.parse()?, seconds.parse()?, wait)
+        }
+        _ => support::play(words),
+    }
 }
 
 fn measure(options: &Options) -> Outcome<()> {

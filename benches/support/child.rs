@@ -90,7 +90,13 @@ impl Child {
     /// Starts `program` with `arguments`.
     pub(crate) fn start(program: &str, arguments: &[String]) -> Outcome<Child> {
         let mut command = Command::new(program);
-        command.args(arguments).stdin(Stdio::null()).stdout(Stdio::piped());
+        command.args(arguments);
+        Child::of(command, Stdio::null())
+    }
+
+    /// Starts what `command` says, with this as its stdin.
+    pub(crate) fn of(mut command: Command, stdin: Stdio) -> Outcome<Child> {
+        command.stdin(stdin).stdout(Stdio::piped());
         // The program's own: nothing outlives this process, and only errors are logged.
         command.env("SCANHUB_END_WITH_PARENT", "1").env("SCANHUB_LOG", "error");
         let started_ns = clock::now();
@@ -119,6 +125,11 @@ impl Child {
                 Err(_) => return Err(format!("no line {word:?} came").into()),
             }
         }
+    }
+
+    /// The next line, whatever it is.
+    pub(crate) fn next_line(&self, patience: Duration) -> Outcome<Line> {
+        self.lines.recv_timeout(patience).map_err(|_| "no line came".into())
     }
 
     /// All lines up to the one that is `word`.

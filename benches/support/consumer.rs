@@ -23,6 +23,16 @@ pub(crate) fn scans(domain: &str, sensor: &str) -> Outcome<()> {
     }
 }
 
+/// Follows the scans of `sensor` for ever; prints each as it comes: `scanned SENSOR RECEIVED_NS BOOT`.
+pub(crate) fn each_scan(domain: &str, sensor: &str) -> Outcome<()> {
+    let mut scans = attach::<Scan>(domain, sensor)?;
+    println!("attaching {sensor}");
+    loop {
+        let Some(scan) = scans.next()? else { continue };
+        println!("scanned {sensor} {} {}", clock::now(), scan.header().boot);
+    }
+}
+
 /// Follows the telegrams of `sensor` until `count` of measured data came, then prints them; with 0 for ever, and
 /// prints each as it comes. A line is `telegram SENSOR RECEIVED_NS BOOT MISSED INTACT HASH
 /// READ_NS`, the last the hub's stamp of the last byte.

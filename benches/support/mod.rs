@@ -28,9 +28,20 @@ pub(crate) type Outcome<T> = Result<T, Box<dyn Error>>;
 /// The body of every bench: plays the part that the command line names (a bench starts itself as consumer and as
 /// floor), else measures.
 pub(crate) fn main(measure: impl FnOnce(&options::Options) -> Outcome<()>) -> ExitCode {
+    main_with(play, measure)
+}
+
+/// As [`main`], of a bench that has parts of its own; those that it does not know are for [`play`].
+pub(crate) fn main_with(
+    play: impl FnOnce(&[&str]) -> Outcome<()>,
+    measure: impl FnOnce(&options::Options) -> Outcome<()>,
+) -> ExitCode {
     let words: Vec<String> = std::env::args().skip(1).collect();
-    let outcome = match words.first().map(String::as_str) {
-        Some(PART) => play(&words[1..]),
+    let outcome = match words.iter().map(String::as_str).collect::<Vec<_>>()[..] {
+        // What this process does for another one ends with that.
+        [PART, ref part @ ..] => {
+            set_parent_process_death_signal(Some(Signal::TERM)).map_err(Into::into).and_then(|()| play(part))
+        }
         _ => stage::Stage::sweep()
             .and_then(|()| options::Options::parse(&words))
             .and_then(|options| measure(&options)),
@@ -44,11 +55,11 @@ pub(crate) fn main(measure: impl FnOnce(&options::Options) -> Outcome<()>) -> Ex
     }
 }
 
-fn play(words: &[String]) -> Outcome<()> {
-    set_parent_process_death_signal(Some(Signal::TERM))?;
-    let words: Vec<&str> = words.iter().map(String::as_str).collect();
-    match words[..] {
+/// Plays one of the parts that benches share.
+pub(crate) fn play(words: &[&str]) -> Outcome<()> {
+    match *words {
         ["consume", "scan", domain, sensor] => consumer::scans(domain, sensor),
+        ["consume", "each", domain, sensor] => consumer::each_scan(domain, sensor),
         ["consume", "telegram", domain, sensor, count] => consumer::telegrams(domain, sensor, count.parse()?),
         ["ages", topic, domain, sensor, count] => consumer::ages(topic, domain, sensor, count.parse()?),
         ["consume", "status", domain, sensor] => consumer::statuses(domain, sensor),

@@ -1,6 +1,7 @@
 //! Where it all takes place: a domain and a directory of its own, gone afterwards, and the processes in it.
 
 use std::path::{Path, PathBuf};
+use std::process::{Command, Stdio};
 use std::time::Duration;
 
 use schema::{Domain, Environment};
@@ -95,10 +96,17 @@ impl Stage {
 
     /// The hub of another build of the program.
     pub(crate) fn hub_of(&self, program: &str, sensors: &[&str]) -> Outcome<Child> {
-        let mut words = vec!["run".into(), "--domain".into(), self.domain.name().into()];
-        let link = |sensor: &&str| ["--link".into(), format!("{sensor}={}", self.port(sensor))];
-        words.extend(sensors.iter().flat_map(link));
-        Child::start(program, &words)
+        Child::of(self.hub_command(program, sensors), Stdio::null())
+    }
+
+    /// What starts the hub.
+    pub(crate) fn hub_command(&self, program: &str, sensors: &[&str]) -> Command {
+        let mut command = Command::new(program);
+        command.args(["run", "--domain", self.domain.name()]);
+        sensors.iter().for_each(|sensor| {
+            command.args(["--link", &format!("{sensor}={}", self.port(sensor))]);
+        });
+        command
     }
 
     /// This program as a consumer of `topic`, with more `words`.
@@ -139,4 +147,5 @@ impl Drop for Stage {
 pub(crate) const SENSORS: [&str; 2] = ["front", "rear"];
 /// Far longer than anything takes.
 pub(crate) const PATIENCE: Duration = Duration::from_secs(20);
+/// The program of this build.
 pub(crate) const PROGRAM: &str = env!("CARGO_BIN_EXE_scanhub");

@@ -19,6 +19,8 @@ pub(crate) struct Sent {
 #[derive(Clone, Debug, Default)]
 pub(crate) struct Truth {
     pub(crate) sent: Vec<Sent>,
+    /// When each telegram of measured data ended that the sensor broke off, because it was asked something.
+    pub(crate) aborted_ns: Vec<u64>,
     /// Only known once the simulator has ended.
     pub(crate) eeprom_writes: Option<u64>,
 }
@@ -36,6 +38,8 @@ impl Truth {
             }
             if value["class"] == "simulated" {
                 truth.eeprom_writes = value["eeprom_writes"].as_u64();
+            } else if value["kind"] == "data" && value["fault"] == "aborted" {
+                truth.aborted_ns.extend(value["sent_ns"].as_u64());
             } else if value["kind"] == "data" && value["fault"].is_null() {
                 let hash = value["sha256"].as_str().unwrap_or_default().to_owned();
                 truth.sent.push(Sent { hash, at_ns: value["sent_ns"].as_u64().unwrap_or_default() });

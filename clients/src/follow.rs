@@ -12,6 +12,7 @@ use crate::account::Account;
 use crate::names::TopicName;
 use crate::output::End;
 use crate::presence::{GRACE, Who};
+use crate::roll::Roll;
 use crate::sample::{Sample, Source};
 use crate::session::Session;
 use crate::wait::Wait;
@@ -138,8 +139,7 @@ struct Run<'a> {
     tracks: Vec<Track>,
     /// What is followed of each sensor that a hub has.
     topics: &'a [Topic],
-    /// How often the hub that is there was asked which sensors it has.
-    calls: usize,
+    roll: Roll,
     /// Samples come before news of the hub.
     closely: bool,
     bounds: &'a Bounds,
@@ -167,7 +167,7 @@ impl<'a> Run<'a> {
             session: Session::new(places.to_vec()),
             tracks: names.iter().cloned().map(Track::new).collect(),
             topics,
-            calls: 0,
+            roll: Roll::default(),
             closely: false,
             bounds,
             started: now,
@@ -208,6 +208,7 @@ impl<'a> Run<'a> {
     fn look(&mut self, sink: &mut dyn Sink) -> Result<(), End> {
         let change = self.session.look()?;
         if let Some(who) = change.gone {
+            self.roll.end();
             self.tell(sink, Notice::HubGone, |name| who == of(name))?;
         }
         if let Some(who) = change.back {
@@ -215,7 +216,7 @@ impl<'a> Run<'a> {
                 self.tell(sink, Notice::HubBack, |name| who == of(name))?;
             }
             self.hub_seen = Some(Instant::now());
-            self.calls = 0;
+            self.roll.begin(Instant::now());
         }
         self.call_the_roll(sink)
     }
@@ -321,6 +322,7 @@ impl<'a> Run<'a> {
         let end = self.bounds.run_for.and_then(|limit| self.started.checked_add(limit));
         let silence = self.bounds.timeout.and_then(|limit| self.last_sample.checked_add(limit));
         let left = self.tracks.iter().filter_map(|track| track.source.left()).min();
+        let left = left.into_iter().chain(self.roll.left()).min();
         let unheard = left.and_then(|left| Instant::now().checked_add(left));
         [end, silence, unheard].into_iter().flatten().min()
     }

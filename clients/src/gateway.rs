@@ -1,14 +1,12 @@
 //! `scanhub gateway`: what the hub publishes, as datagrams on a network, one message each and nothing sent twice. An
 //! ordinary client of the hub that outlives it, its links and its own network. Takes nothing from the network.
 
-mod errand;
 mod host;
 mod lan;
 mod life;
 mod machine;
 mod outlet;
 mod report;
-mod roll;
 mod selection;
 mod sensor;
 mod uplink;
@@ -26,12 +24,12 @@ use crate::follow::Notice;
 use crate::names::no_sensor;
 use crate::output::{End, quiet};
 use crate::presence::GRACE;
+use crate::roll::Roll;
 use crate::session::Session;
 use crate::spare::Spare;
 use lan::{Form, Lan};
 use life::Life;
 use report::Report;
-use roll::Roll;
 use selection::Selection;
 use sensor::Sensor;
 use uplink::Uplink;

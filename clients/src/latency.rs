@@ -11,7 +11,7 @@ use std::sync::atomic::AtomicBool;
 use std::thread;
 use std::time::{Duration, Instant};
 
-use schema::{Domain, Failure, Kind};
+use schema::{Domain, Failure, Flags, Kind};
 
 use crate::account::Account;
 use crate::follow::{Bounds, Notice, Sink, follow_closely};
@@ -21,7 +21,7 @@ use crate::sample::Sample;
 use crate::wait::Wait;
 use crate::{clock, json, text};
 use realtime::Realtime;
-use report::Conditions;
+use report::{Conditions, NOTHING_CAME, why_nothing};
 use spans::{Seen, Span, Spans};
 
 /// What `latency` is asked for.
@@ -102,13 +102,23 @@ impl Latency<'_> {
     fn judge(&self, limit: Duration) -> Result<(), Failure> {
         for (name, spans) in &self.topics {
             let Some(age) = spans.ages(Span::Age).quantiles() else {
+                if spans.received == 0 {
+                    let (what, hint) = (format!("{name}: {NOTHING_CAME}"), why_nothing(name));
+                    return Err(Failure::new(Kind::Check, what, hint));
+                }
                 let what = format!("{name}: no sample came whose age is known");
                 return Err(Failure::new(Kind::Check, what, "measure for longer: --for 10s"));
             };
             let p99 = Duration::from_nanos(age.p99_ns);
             if p99 > limit {
                 let what = format!("{name}: p99 of the age on arrival is {p99:?}, more than {limit:?}");
-                return Err(Failure::new(Kind::Check, what, "hub and wake tell where the time goes"));
+                let hint = if spans.flags & Flags::REMOTE != 0 {
+                    "of a remote sensor it is the time from the datagram's arrival until it was received here: see what else \
+                     runs on this machine; `network` tells the way before"
+                } else {
+                    "hub and wake tell where the time goes"
+                };
+                return Err(Failure::new(Kind::Check, what, hint));
             }
         }
         Ok(())

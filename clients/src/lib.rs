@@ -10,6 +10,7 @@ mod clock;
 mod control;
 pub mod duration;
 mod echo;
+mod errand;
 mod file;
 mod follow;
 mod follower;
@@ -31,6 +32,7 @@ mod readiness;
 #[cfg(feature = "record")]
 mod record;
 mod robot;
+mod roll;
 mod sample;
 mod session;
 mod spare;

@@ -52,8 +52,8 @@ pub struct ListenOptions {
     pub bounds: Bounds,
 }
 
-/// Writes the samples that come to `out`, and at the end the account; what is no sample goes to `notes` (stderr) if `out`
-/// is not JSON. Ends when the bounds are reached, `stop` is set, or nobody reads any more.
+/// Writes the samples that come to `out`, and the account at the end and whenever `tell` is set; what is no sample goes to
+/// `notes` (stderr) if `out` is not JSON. Ends when the bounds are reached, `stop` is set, or nobody reads any more.
 ///
 /// With a domain to publish in no samples are written: what comes is to be followed there, without a copy for each
 /// consumer. Then it takes the place of a listener in the domain, of which there is one.
@@ -65,6 +65,7 @@ pub fn listen(
     options: &ListenOptions,
     out: &mut dyn Write,
     notes: &mut dyn Write,
+    tell: &AtomicBool,
     stop: &AtomicBool,
 ) -> Result<(), Failure> {
     let wanted = topics(&options.topics)?;
@@ -92,7 +93,7 @@ pub fn listen(
         draw_at: now,
         received: 0,
     };
-    quiet(listener.listen(stop))
+    quiet(listener.listen(tell, stop))
 }
 
 struct Listener<'a> {
@@ -130,17 +131,22 @@ const FULL: &str = "datagrams are refused: more gateways (64), or more of their 
 const DRAW_EVERY: Duration = Duration::from_secs(1);
 
 impl Listener<'_> {
-    fn listen(&mut self, stop: &AtomicBool) -> Result<(), End> {
+    fn listen(&mut self, tell: &AtomicBool, stop: &AtomicBool) -> Result<(), End> {
         self.report.ready(&self.ear.interfaces(), self.options.publish.as_ref())?;
-        let end = self.run(stop);
+        let end = self.run(tell, stop);
         if !matches!(end, Err(End::ReaderGone)) {
-            self.report.account(&self.account, &self.roll)?;
-            self.publication.iter().try_for_each(|publication| self.report.publication(publication))?;
+            self.tell()?;
         }
         end
     }
 
-    fn run(&mut self, stop: &AtomicBool) -> Result<(), End> {
+    /// The account so far.
+    fn tell(&mut self) -> Result<(), End> {
+        self.report.account(&self.account, &self.roll)?;
+        self.publication.iter().try_for_each(|publication| self.report.publication(publication))
+    }
+
+    fn run(&mut self, tell: &AtomicBool, stop: &AtomicBool) -> Result<(), End> {
         let mut buffer = vec![0; LONGEST];
         loop {
             let more = self.take(&mut buffer)?;
@@ -161,6 +167,9 @@ impl Listener<'_> {
                 return Err(nothing_came(limit).into());
             }
             self.look(now)?;
+            if tell.swap(false, Ordering::Relaxed) {
+                self.tell()?;
+            }
             if !more {
                 self.ear.wait(self.left(now));
             }

@@ -62,9 +62,11 @@ pub struct RecordOptions {
 }
 
 impl RecordOptions {
-    /// The recording goes to stdout, which then takes nothing else.
-    pub fn is_to_stdout(&self) -> bool {
-        self.file.as_deref() == Some(Path::new(STDOUT))
+    /// The file that stands for stdout.
+    pub const STDOUT: &str = "-";
+
+    fn is_to_stdout(&self) -> bool {
+        self.file.as_deref() == Some(Path::new(Self::STDOUT))
     }
 }
 
@@ -126,8 +128,6 @@ pub fn record(
     }
     quiet(end).and(quiet(finished))
 }
-
-const STDOUT: &str = "-";
 
 /// The first file.
 fn begin(options: &RecordOptions, queue: &Arc<Queue>) -> Result<Disk, Failure> {

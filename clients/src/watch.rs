@@ -4,6 +4,7 @@
 mod draw;
 #[cfg(test)]
 mod golden;
+mod keys;
 mod map;
 mod meter;
 mod orders;

@@ -42,6 +42,7 @@ const EXAMPLES: &[(&str, &[&str])] = &[
         &[
             "scanhub simulate --port /tmp/front --world room",
             "scanhub simulate --port /tmp/front --fault loss=0.00135,burst=1.89",
+            "scanhub simulate --port /tmp/front --replay robot.mcap --sensor front",
         ],
     ),
     ("probe", &["scanhub probe", "scanhub probe /dev/ttyUSB0"]),
@@ -72,6 +73,14 @@ const EXAMPLES: &[(&str, &[&str])] = &[
         &[
             "scanhub telegram decode recording.bin",
             "scanhub telegram encode status | scanhub telegram decode",
+        ],
+    ),
+    (
+        "convert",
+        &[
+            "scanhub convert killed.mcap whole.mcap",
+            "scanhub convert robot.mcap front.log.gz --sensor front",
+            "scanhub convert room.log.gz room.mcap",
         ],
     ),
     ("watch", &["scanhub watch", "scanhub watch front"]),

@@ -48,3 +48,6 @@ impl Listen {
         })
     }
 }
+
+/// What the help says of signals.
+pub(crate) const SIGNALS: &str = "SIGUSR1: the account so far";

@@ -1,7 +1,7 @@
 //! `scanhub record` on the command line.
 
 use std::io::{IsTerminal, stderr, stdout};
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use clap::Args;
 use clients::{RecordLook, RecordOptions, Split};
@@ -38,8 +38,14 @@ pub(crate) struct Record {
 }
 
 impl Record {
+    /// Stdout takes the recording, and nothing else.
+    pub(crate) fn is_to_stdout(&self) -> bool {
+        self.output.as_deref() == Some(Path::new(RecordOptions::STDOUT))
+    }
+
     pub(crate) fn options(&self, everywhere: &Everywhere) -> Result<RecordOptions, Failure> {
-        let mut options = RecordOptions {
+        let is_terminal = if self.is_to_stdout() { stderr().is_terminal() } else { stdout().is_terminal() };
+        Ok(RecordOptions {
             topics: self.topics.clone(),
             everything: self.all,
             ros2: self.ros2,
@@ -47,18 +53,14 @@ impl Record {
             force: self.force,
             split: self.split,
             keep: self.keep.map(|keep| keep as usize),
-            look: RecordLook::Lines,
+            look: match (everywhere.json, is_terminal) {
+                (true, _) => RecordLook::Json,
+                (false, true) => RecordLook::Terminal,
+                (false, false) => RecordLook::Lines,
+            },
             bounds: self.limits.bounds(),
             places: everywhere.places()?,
-        };
-        let is_terminal =
-            if options.is_to_stdout() { stderr().is_terminal() } else { stdout().is_terminal() };
-        options.look = match (everywhere.json, is_terminal) {
-            (true, _) => RecordLook::Json,
-            (false, true) => RecordLook::Terminal,
-            (false, false) => RecordLook::Lines,
-        };
-        Ok(options)
+        })
     }
 }
 

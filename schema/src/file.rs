@@ -6,9 +6,9 @@ use std::collections::BTreeMap;
 use std::io::{self, BufWriter, Write};
 
 use bytemuck::bytes_of;
-use mcap::records::{MessageHeader, Metadata};
+use mcap::records::{Channel, MessageHeader, Metadata};
 use mcap::write::NoSeek;
-use mcap::{McapError, WriteOptions};
+use mcap::{Attachment, McapError, WriteOptions};
 
 use crate::{Header, Topic};
 
@@ -88,6 +88,32 @@ impl<W: Write> Writer<W> {
     pub fn message(&mut self, channel_id: u16, sequence: u32, time_ns: u64, data: &[u8]) -> io::Result<()> {
         let header = MessageHeader { channel_id, sequence, log_time: time_ns, publish_time: time_ns };
         self.mcap.write_to_known_channel(&header, data).map_err(io_error)
+    }
+
+    /// Makes a channel as another file has it, with name, language and text of its messages' type, if it has one.
+    pub fn copied_channel(
+        &mut self,
+        channel: &Channel,
+        schema: Option<(&str, &str, &[u8])>,
+    ) -> io::Result<u16> {
+        let mut add = || {
+            let schema = match schema {
+                Some((name, language, text)) => self.mcap.add_schema(name, language, text)?,
+                None => 0,
+            };
+            self.mcap.add_channel(schema, &channel.topic, &channel.message_encoding, &channel.metadata)
+        };
+        add().map_err(io_error)
+    }
+
+    /// Writes a message as another file has it, into the channel that `header` names.
+    pub fn copied_message(&mut self, header: &MessageHeader, data: &[u8]) -> io::Result<()> {
+        self.mcap.write_to_known_channel(header, data).map_err(io_error)
+    }
+
+    /// Writes a file within the file, as another one has it, behind a chunk that this closes.
+    pub fn copied_attachment(&mut self, attachment: &Attachment<'_>) -> io::Result<()> {
+        self.mcap.attach(attachment).map_err(io_error)
     }
 
     /// Writes a metadata record called `name`, behind a chunk that this closes.

@@ -22,7 +22,7 @@ impl Installed {
     /// The one that all tests share; nothing where there is no C compiler.
     pub(crate) fn once() -> Option<&'static Installed> {
         static ONCE: OnceLock<Installed> = OnceLock::new();
-        if !compiler("cc") {
+        if !is_there("cc") {
             return None;
         }
         Some(ONCE.get_or_init(|| {
@@ -60,7 +60,7 @@ impl Installed {
     /// The program of `source` in C++; nothing where there is no compiler for it.
     pub(crate) fn compile_cpp(&self, stage: &Stage, source: &Path) -> Option<PathBuf> {
         let built = || self.build("c++", stage, source, &["-std=c++11"], &self.shared());
-        compiler("c++").then(|| built().unwrap_or_else(|said| panic!("{said}")))
+        is_there("c++").then(|| built().unwrap_or_else(|said| panic!("{said}")))
     }
 
     /// The program of `source` with the library in it; nothing where pkg-config does not say how.
@@ -79,7 +79,7 @@ impl Installed {
 
     /// The directory in which CMake built what `source` describes; nothing where it is not there.
     pub(crate) fn cmake(&self, stage: &Stage, source: &Path) -> Option<PathBuf> {
-        if !["cmake", "pkg-config", "c++"].into_iter().all(compiler) {
+        if !["cmake", "pkg-config", "c++"].into_iter().all(is_there) {
             return None;
         }
         let build = stage.path("cmake");
@@ -120,12 +120,12 @@ impl Installed {
 }
 
 /// Whether there is such a tool; says so if not.
-pub(crate) fn compiler(name: &str) -> bool {
-    let is_there = Command::new(name).arg("--version").output().is_ok();
-    if !is_there {
+pub(crate) fn is_there(name: &str) -> bool {
+    let found = Command::new(name).arg("--version").output().is_ok();
+    if !found {
         eprintln!("skipped: there is no {name}");
     }
-    is_there
+    found
 }
 
 /// A program in C of these tests.

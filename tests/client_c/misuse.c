@@ -83,12 +83,23 @@ static void *elsewhere(void *handle)
     return NULL;
 }
 
+static void *leaves_it_open(void *sensor)
+{
+    struct scanhub_sample sample;
+    struct scanhub_attachment *handle = open_scans(sensor, SCANHUB_WAIT_EVENT);
+    MUST(scanhub_wait(handle, 20000) == 1 && scanhub_take(handle, &sample) == 1);
+    return NULL;
+}
+
 static void threads(const char *sensor)
 {
+    char name[32];
+    snprintf(name, sizeof name, "%s", sensor);
     struct scanhub_attachment *handle = open_scans(sensor, SCANHUB_WAIT_DOORBELL);
     pthread_t thread;
     MUST(pthread_create(&thread, NULL, elsewhere, handle) == 0 && pthread_join(thread, NULL) == 0);
     MUST(scanhub_close(handle) == 0);
+    MUST(pthread_create(&thread, NULL, leaves_it_open, name) == 0 && pthread_join(thread, NULL) == 0);
 }
 
 static void samples(const char *sensor)

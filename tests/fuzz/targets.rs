@@ -3,6 +3,7 @@
 
 mod lan;
 mod processors;
+mod recording;
 
 use lms::command::Request;
 use lms::eeprom::Write;
@@ -20,13 +21,14 @@ use lms::{Control, MILLIS, Nanos, Settings};
 pub type Target = (&'static str, fn(&[u8]));
 
 /// All of them; the names are those of the corpus' folders.
-pub const TARGETS: [Target; 6] = [
+pub const TARGETS: [Target; 7] = [
     ("framer", framer),
     ("replies", replies),
     ("session", session),
     ("configuration", configuration),
     ("processors", processors),
     ("lan", lan),
+    ("recording", recording),
 ];
 
 /// Any bytes in any pieces: what is delivered stood there and has a right checksum, in order, and no byte vanishes.
@@ -234,4 +236,9 @@ pub fn processors(data: &[u8]) {
 /// Any datagrams, one after the other, through all checks and the receiver's account.
 pub fn lan(data: &[u8]) {
     lan::lan(data);
+}
+
+/// Any bytes, as a file that shall be a recording.
+pub fn recording(data: &[u8]) {
+    recording::recording(data);
 }

@@ -9,12 +9,14 @@ mod network;
 mod program;
 mod python;
 mod receiver;
+mod recording;
 mod relay;
 mod robot;
 mod sender;
 mod supervisor;
 mod telegrams;
 mod terminal;
+mod tmux;
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -31,14 +33,16 @@ pub(crate) use line::{Line, open_line};
 pub(crate) use machine::{Machine, command_in, ip};
 pub(crate) use network::in_a_network;
 pub(crate) use program::{HUP, INT, KILL, Outcome, Program, TERM, USR1};
-pub(crate) use python::{python, script};
+pub(crate) use python::python;
 pub(crate) use receiver::{Receiver, read};
+pub(crate) use recording::{Kept, Recording, unbroken};
 pub(crate) use relay::Relay;
 pub(crate) use robot::Robot;
 pub(crate) use sender::{Sender, wall_ns};
 pub(crate) use supervisor::Supervisor;
 pub(crate) use telegrams::{MEASURED, Sent, bytes_of, hash, is_class, number, scan, sequence};
-pub(crate) use terminal::{Sitting, terminal};
+pub(crate) use terminal::{Sitting, can_sit, terminal};
+pub(crate) use tmux::Tmux;
 
 /// Far longer than anything takes on a busy machine.
 pub(crate) const PATIENCE: Duration = Duration::from_secs(20);
@@ -125,6 +129,22 @@ impl Stage {
     /// A hub with these flags that is up.
     pub(crate) fn hub<S: AsRef<str>>(&self, flags: &[S]) -> Program {
         self.start(&with(&["run", "--json"], flags)).ready()
+    }
+
+    /// What stands in for a service manager.
+    pub(crate) fn supervisor(&self) -> Supervisor {
+        Supervisor::new(self.word("notify"))
+    }
+
+    /// Starts a hub with these flags as a service of `supervisor` and with what it keeps; it is not waited for.
+    pub(crate) fn service<S: AsRef<str>>(
+        &self,
+        supervisor: &mut Supervisor,
+        flags: &[S],
+        watchdog: Option<Duration>,
+    ) -> Program {
+        let (command, stdin) = supervisor.service(&self.command(&with(&["run", "--json"], flags)), watchdog);
+        Program::start_with(command, stdin)
     }
 
     /// A gateway with these flags that has begun; its number is kept in this directory.

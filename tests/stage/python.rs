@@ -1,28 +1,19 @@
-//! A Python that has what a test needs: that of `SCANHUB_PYTHON`, else the one that `.ci/run` makes in `target/venv`.
+//! A Python that has what a test needs. Refuses to know what for.
 
 use std::path::{Path, PathBuf};
-use std::process::{Command, Stdio};
+use std::process::Command;
 
-/// The interpreter, or nothing, said why, where there is none that can import all `modules`.
-pub(crate) fn python(modules: &[&str]) -> Option<PathBuf> {
-    let top = Path::new(env!("CARGO_MANIFEST_DIR"));
-    let named = std::env::var_os("SCANHUB_PYTHON").map(PathBuf::from);
-    let python = named.unwrap_or_else(|| top.join("target/venv/bin/python"));
-    let imports = format!("import {}", modules.join(", "));
-    let has_all = Command::new(&python).args(["-c", &imports]).stderr(Stdio::null()).status();
-    if has_all.is_ok_and(|status| status.success()) {
-        return Some(python);
+/// A Python that has `modules`: that of `SCANHUB_PYTHON`, or the one that `.ci/run` makes. Nothing, said, where there is none.
+pub(crate) fn python(modules: &str) -> Option<Command> {
+    let made = Path::new(env!("CARGO_MANIFEST_DIR")).join("target/venv/bin/python");
+    let python = std::env::var_os("SCANHUB_PYTHON").map_or(made, PathBuf::from);
+    let import = format!("import {modules}");
+    let has_all = Command::new(&python).args(["-B", "-c", &import]).output();
+    if !has_all.is_ok_and(|outcome| outcome.status.success()) {
+        eprintln!("skipped: {} is not there, or has no {modules}: .ci/run makes one", python.display());
+        return None;
     }
-    let missing = modules.join(" and ");
-    eprintln!("skipped: {} is no Python with {missing}; .ci/run makes one", python.display());
-    None
-}
-
-/// Runs `script`, a path below the top, by `python`: it finds the package `scanhub` of this project, and leaves no caches.
-pub(crate) fn script(python: &Path, script: &str) -> Command {
-    let top = Path::new(env!("CARGO_MANIFEST_DIR"));
     let mut command = Command::new(python);
-    command.arg("-B").arg(top.join(script)).env("PYTHONPATH", top.join("clients/python"));
-    command.env_remove("SCANHUB_DOMAIN");
-    command
+    command.arg("-B");
+    Some(command)
 }

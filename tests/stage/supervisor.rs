@@ -8,9 +8,10 @@ use std::os::unix::net::UnixDatagram;
 use std::process::{Command, Stdio};
 use std::time::Duration;
 
+use rustix::io::Errno;
 use rustix::net::{RecvAncillaryBuffer, RecvAncillaryMessage, RecvFlags, recvmsg};
 
-use super::{PATIENCE, Program, Stage, with};
+use super::PATIENCE;
 
 /// Bound to a socket of its own.
 pub(crate) struct Supervisor {
@@ -20,18 +21,24 @@ pub(crate) struct Supervisor {
     kept: Option<(String, OwnedFd)>,
     /// All that was said to it, a line each.
     pub(crate) heard: Vec<String>,
+    /// Of that what nobody waited for yet, of the last hub: its threads speak in no order.
+    unawaited: Vec<String>,
 }
 
 impl Supervisor {
-    pub(crate) fn new(stage: &Stage) -> Supervisor {
-        let path = stage.word("notify");
+    /// One with its socket at `path`.
+    pub(crate) fn new(path: String) -> Supervisor {
         let socket = UnixDatagram::bind(&path).unwrap_or_else(|error| panic!("{path}: {error}"));
-        Supervisor { socket, path, kept: None, heard: Vec::new() }
+        Supervisor { socket, path, kept: None, heard: Vec::new(), unawaited: Vec::new() }
     }
 
-    /// Starts a hub with `flags` as its service and with what it keeps; it is not waited for.
-    pub(crate) fn start(&self, stage: &Stage, flags: &[String], watchdog: Option<Duration>) -> Program {
-        let hub = stage.command(&with(&["run", "--json"], flags));
+    /// The command that starts `hub` as its service, and the stdin by which that is handed what it keeps.
+    pub(crate) fn service(&mut self, hub: &Command, watchdog: Option<Duration>) -> (Command, Stdio) {
+        // What the one before said last is no word of this one.
+        self.socket.set_nonblocking(true).expect("a socket");
+        while self.receive().is_ok() {}
+        self.socket.set_nonblocking(false).expect("a socket");
+        self.unawaited.clear();
         // The process id of a program that is not started yet only a shell can tell.
         let mut command = Command::new("/bin/sh");
         command.args([
@@ -45,31 +52,30 @@ impl Supervisor {
         if let Some(every) = watchdog {
             command.env("WATCHDOG_USEC", every.as_micros().to_string());
         }
-        let Some((name, line)) = &self.kept else { return Program::start(command) };
+        let Some((name, line)) = &self.kept else { return (command, Stdio::null()) };
         command.env("LISTEN_FDS", "1").env("LISTEN_FDNAMES", name);
         let line = line.try_clone().unwrap_or_else(|error| panic!("no descriptor: {error}"));
-        Program::start_with(command, Stdio::from(line))
+        (command, line.into())
     }
 
-    /// Hears until the hub says `wanted`.
+    /// Hears until the hub has said `wanted`, as often as that was asked for.
     pub(crate) fn hear(&mut self, wanted: &str) {
         self.socket.set_read_timeout(Some(PATIENCE)).expect("a socket");
-        loop {
-            let begin = self.heard.len();
-            self.receive(wanted);
-            if self.heard[begin..].iter().any(|line| line == wanted) {
-                return;
+        while !self.unawaited.iter().any(|line| line == wanted) {
+            if let Err(error) = self.receive() {
+                panic!("waited in vain for {wanted}: {error}; heard {:?}", self.heard);
             }
         }
+        let at = self.unawaited.iter().position(|line| line == wanted).expect("it was said");
+        self.unawaited.remove(at);
     }
 
-    fn receive(&mut self, wanted: &str) {
+    fn receive(&mut self) -> Result<(), Errno> {
         let mut text = [0; 1024];
         let mut space = [MaybeUninit::uninit(); rustix::cmsg_space!(ScmRights(1))];
         let mut control = RecvAncillaryBuffer::new(&mut space);
         let parts = &mut [IoSliceMut::new(&mut text)];
-        let message = recvmsg(&self.socket, parts, &mut control, RecvFlags::CMSG_CLOEXEC)
-            .unwrap_or_else(|error| panic!("waited in vain for {wanted}: {error}; heard {:?}", self.heard));
+        let message = recvmsg(&self.socket, parts, &mut control, RecvFlags::CMSG_CLOEXEC)?;
         let lines = String::from_utf8_lossy(&text[..message.bytes]).into_owned();
         let name = lines.lines().find_map(|line| line.strip_prefix("FDNAME=")).unwrap_or_default();
         for passed in control.drain() {
@@ -81,5 +87,7 @@ impl Supervisor {
             self.kept = self.kept.take().filter(|(kept, _)| kept != name);
         }
         self.heard.extend(lines.lines().map(str::to_owned));
+        self.unawaited.extend(lines.lines().map(str::to_owned));
+        Ok(())
     }
 }

@@ -6,10 +6,12 @@ use std::io::{Read, Write};
 use std::os::fd::{AsFd, OwnedFd};
 use std::os::unix::ffi::OsStrExt;
 use std::process::{Child, Command, Stdio};
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex};
-use std::thread;
+use std::thread::{self, JoinHandle};
 use std::time::{Duration, Instant};
 
+use rustix::event::{PollFd, PollFlags, Timespec, poll};
 use rustix::fs::{Mode, OFlags};
 use rustix::process::{Pid, Signal, kill_process};
 use rustix::pty::{OpenptFlags, grantpt, openpt, ptsname, unlockpt};
@@ -28,44 +30,79 @@ pub(crate) fn terminal() -> (File, OwnedFd) {
     (keys.into(), screen)
 }
 
+/// Whether a test can sit at a terminal of its own here; says why not.
+pub(crate) fn can_sit() -> bool {
+    let can_sit = Command::new("setsid").arg("true").status().is_ok_and(|status| status.success());
+    if !can_sit {
+        eprintln!("skipped: there is no setsid (Debian: apt-get install util-linux)");
+    }
+    can_sit
+}
+
 /// A program with a terminal of its own, at which the test sits.
 pub(crate) struct Sitting {
     process: Child,
-    keys: File,
+    /// The person's side, until it is closed.
+    keys: Option<File>,
     screen: OwnedFd,
     before: Termios,
     seen: Arc<Mutex<Vec<u8>>>,
+    /// Sees what is written, until it is told that nobody looks any more.
+    eye: Option<JoinHandle<()>>,
+    closed: Arc<AtomicBool>,
     size: (u16, u16),
 }
 
 impl Sitting {
     /// Starts `command` on a terminal of `size`, columns and rows, which is the one of its session.
     pub(crate) fn start(command: &Command, size: (u16, u16)) -> Sitting {
+        Sitting::begin(command, size, &["-c"], None)
+    }
+
+    /// As [`Sitting::start`], with `errors` for its stderr, and if it is not `told` on a terminal that is of no session:
+    /// nobody is sent a signal when it is closed.
+    pub(crate) fn start_for_hang_up(
+        command: &Command,
+        size: (u16, u16),
+        told: bool,
+        errors: File,
+    ) -> Sitting {
+        Sitting::begin(command, size, if told { &["-c"] } else { &[] }, Some(errors))
+    }
+
+    fn begin(command: &Command, size: (u16, u16), flags: &[&str], errors: Option<File>) -> Sitting {
         let (keys, screen) = terminal();
         resize(&screen, size);
         let before = tcgetattr(&screen).unwrap();
         let program = || Stdio::from(screen.try_clone().unwrap());
         let mut setsid = Command::new("setsid");
-        setsid.arg("-c").arg(command.get_program()).args(command.get_args());
+        setsid.args(flags).arg(command.get_program()).args(command.get_args());
         for (key, value) in command.get_envs() {
             match value {
                 Some(value) => setsid.env(key, value),
                 None => setsid.env_remove(key),
             };
         }
-        setsid.env("TERM", "xterm").stdin(program()).stdout(program()).stderr(program());
+        setsid.env("TERM", "xterm").stdin(program()).stdout(program());
+        setsid.stderr(errors.map_or_else(program, Stdio::from));
         let process = setsid.spawn().unwrap();
         drop(setsid);
         let seen = Arc::new(Mutex::new(Vec::new()));
-        let (mut from, to) = (keys.try_clone().unwrap(), seen.clone());
-        thread::spawn(move || {
+        let closed = Arc::new(AtomicBool::new(false));
+        let (mut from, to, is_over) = (keys.try_clone().unwrap(), seen.clone(), closed.clone());
+        let eye = thread::spawn(move || {
             let mut piece = [0; 4096];
-            // A terminal that nobody has open any more ends by an error.
-            while let Ok(len @ 1..) = from.read(&mut piece) {
+            while !is_over.load(Ordering::Relaxed) {
+                let mut fds = [PollFd::new(&from, PollFlags::IN)];
+                if poll(&mut fds, Some(&LOOK)).unwrap() == 0 {
+                    continue;
+                }
+                // A terminal that nobody has open any more ends by an error.
+                let Ok(len @ 1..) = from.read(&mut piece) else { return };
                 to.lock().unwrap().extend_from_slice(&piece[..len]);
             }
         });
-        Sitting { process, keys, screen, before, seen, size }
+        Sitting { process, keys: Some(keys), screen, before, seen, eye: Some(eye), closed, size }
     }
 
     /// Its process id.
@@ -99,7 +136,7 @@ impl Sitting {
 
     /// Types.
     pub(crate) fn press(&mut self, keys: &str) {
-        self.keys.write_all(keys.as_bytes()).unwrap();
+        self.keys.as_mut().expect("it is open").write_all(keys.as_bytes()).unwrap();
     }
 
     /// Makes the terminal so large.
@@ -113,6 +150,26 @@ impl Sitting {
         kill_process(Pid::from_child(&self.process), signal).unwrap();
     }
 
+    /// Closes the terminal and waits for the end: the exit code, and how long that took.
+    pub(crate) fn hang_up(mut self) -> (Option<i32>, Duration) {
+        self.closed.store(true, Ordering::Relaxed);
+        self.eye.take().map(JoinHandle::join).transpose().unwrap();
+        drop(self.keys.take());
+        let closed_at = Instant::now();
+        (self.wait(), closed_at.elapsed())
+    }
+
+    fn wait(&mut self) -> Option<i32> {
+        let give_up_at = Instant::now() + PATIENCE;
+        loop {
+            if let Some(status) = self.process.try_wait().unwrap() {
+                return status.code();
+            }
+            assert!(Instant::now() < give_up_at, "it does not end:\n{}", self.rows().join("\n"));
+            thread::sleep(Duration::from_millis(10));
+        }
+    }
+
     /// Waits for the end: the exit code, what stands below the picture, and whether the terminal is as it was.
     pub(crate) fn end(self) -> (Option<i32>, String, bool) {
         let (code, text, is_as_before) = self.end_of_lines();
@@ -124,14 +181,8 @@ impl Sitting {
 
     /// The same of a program that draws no picture: with all that it wrote.
     pub(crate) fn end_of_lines(mut self) -> (Option<i32>, String, bool) {
+        let code = self.wait();
         let give_up_at = Instant::now() + PATIENCE;
-        let status = loop {
-            if let Some(status) = self.process.try_wait().unwrap() {
-                break status;
-            }
-            assert!(Instant::now() < give_up_at, "it does not end:\n{}", self.rows().join("\n"));
-            thread::sleep(Duration::from_millis(10));
-        };
         let after = tcgetattr(&self.screen).unwrap();
         let is_as_before = (after.input_modes, after.output_modes, after.local_modes)
             == (self.before.input_modes, self.before.output_modes, self.before.local_modes);
@@ -143,7 +194,7 @@ impl Sitting {
             thread::sleep(Duration::from_millis(10));
         }
         let text = self.text();
-        (status.code(), text.replace(mark, ""), is_as_before)
+        (code, text.replace(mark, ""), is_as_before)
     }
 }
 
@@ -153,6 +204,9 @@ impl Drop for Sitting {
         let _ = self.process.wait();
     }
 }
+
+/// Between two looks whether anybody looks on.
+const LOOK: Timespec = Timespec { tv_sec: 0, tv_nsec: 20_000_000 };
 
 fn resize(terminal: impl AsFd, (columns, rows): (u16, u16)) {
     tcsetwinsize(terminal, Winsize { ws_col: columns, ws_row: rows, ws_xpixel: 0, ws_ypixel: 0 }).unwrap();

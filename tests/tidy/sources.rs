@@ -104,6 +104,8 @@ pub(crate) fn nobody_writes_the_eeprom(tree: &Tree) -> Vec<String> {
     let mut breaches = find(tree, &["Writer::new", "EEPROM_WRITES"], |path| {
         !is_test(path) && !path.starts_with("hub/sim/") && !path.starts_with("hub/lms/src/")
     });
+    // Files are written too.
+    breaches.retain(|place| !place.contains("BufWriter::new") || place.matches("Writer::new").count() > 1);
     let named = ["eeprom::", "::eeprom", "{eeprom", " eeprom,", " eeprom}"];
     breaches.extend(find(tree, &named, |path| !may_name(path)));
     let lms = |path: &str| path.starts_with("hub/lms/src/") && path != "hub/lms/src/eeprom.rs";

@@ -1,4 +1,5 @@
-//! What a program has written stands as it wrote it: the tables of benches/README.md are made of the last runs' lines.
+//! What is said twice is the same: the tables of benches/README.md are made of the last runs' lines, and the program that
+//! docs/first-consumer.md shows is the example that is compiled.
 
 #[path = "../../benches/report/tables.rs"]
 mod tables;
@@ -7,6 +8,7 @@ use crate::tree::Tree;
 
 const PAGE: &str = "benches/README.md";
 const LAST: &str = "benches/last/";
+const FIRST: (&str, &str) = ("docs/first-consumer.md", "clients/examples/first.rs");
 
 pub(crate) fn tables_are_of_the_last_runs(tree: &Tree) -> Vec<String> {
     let files: Vec<(&str, &str)> = tree
@@ -19,4 +21,14 @@ pub(crate) fn tables_are_of_the_last_runs(tree: &Tree) -> Vec<String> {
         Ok(_) => vec![format!("{PAGE} is not what was measured; run `cargo bench --bench report`")],
         Err(error) => vec![format!("{PAGE}: {error}")],
     }
+}
+
+pub(crate) fn the_first_consumer_is_compiled(tree: &Tree) -> Vec<String> {
+    let (page, example) = FIRST;
+    let shown: Vec<&str> =
+        tree.text(page).split("```rust\n").skip(1).filter_map(|rest| rest.split("```").next()).collect();
+    let compiled = tree.text(example).lines().filter(|line| !line.starts_with("//!"));
+    let compiled: String =
+        compiled.skip_while(|line| line.is_empty()).map(|line| format!("{line}\n")).collect();
+    if shown == [compiled] { Vec::new() } else { vec![format!("{page} shows something else than {example}")] }
 }

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import ctypes
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from . import layout
-from .sample import Sample, view
+from .sample import Copied, Sample, view
 
 
 class Mark(NamedTuple):
@@ -57,10 +58,19 @@ class Zone(NamedTuple):
 
 
 class Zones(Sample):
-    """What is near the robot, by one sensor."""
+    """What is near the robot, by one sensor.
+
+    `stale`: nothing was heard that is new enough, be it that sensor, hub or machine stood still. Then nothing is known,
+    and the numbers and stamps are those of the last sample, 0 before the first.
+    """
 
     topic = "zones"
     struct = layout.Zones
+    stale = False
+
+    def unknown(self) -> Zones:
+        """The same as a silence: nothing is known."""
+        return nothing(self.sensor, self._header, self.missed, self.restarted)
 
     @property
     def verdict(self) -> str:
@@ -70,12 +80,12 @@ class Zones(Sample):
     @property
     def nearest_beam(self) -> int | None:
         """The beam whose point is nearest to the robot's centre."""
-        return None if self._fields.nearest_beam == 0xFFFF else self._fields.nearest_beam
+        return None if self._fields.nearest_beam == _NO_BEAM else self._fields.nearest_beam
 
     @property
     def nearest_mm(self) -> int | None:
         """That point's distance from the centre."""
-        return None if self._fields.nearest_beam == 0xFFFF else self._fields.nearest_mm
+        return None if self._fields.nearest_beam == _NO_BEAM else self._fields.nearest_mm
 
     @property
     def zones(self) -> tuple[Zone, ...]:
@@ -91,6 +101,15 @@ class Zones(Sample):
     def provisional(self) -> bool:
         """Fewer scans were seen than a violation takes."""
         return bool(self._fields.flags & 1)
+
+
+def nothing(sensor: str, header: layout.Header, missed: int = 0, restarted: bool = False) -> Zones:
+    """Nothing was heard since the sample with `header`."""
+    fields = layout.Zones(verdict=3, nearest_beam=_NO_BEAM, nearest_mm=0xFFFFFFFF)
+    data = (ctypes.c_uint8 * ctypes.sizeof(fields)).from_buffer_copy(fields)
+    zones = Zones(sensor, Copied(header, data), missed, restarted)
+    zones.stale = True
+    return zones
 
 
 class Segment(NamedTuple):
@@ -152,3 +171,4 @@ class Foreground(Sample):
 
 
 VERDICTS = ("clear", "slow", "stop", "unknown")
+_NO_BEAM = 0xFFFF

@@ -26,7 +26,9 @@ class Chunk(Protocol):
         """The payload as an array of bytes, which keeps the place."""
 
 
-class _Copy:
+class Copied:
+    """Header and payload in memory of their own."""
+
     def __init__(self, header: layout.Header, data: Any) -> None:
         self.header = layout.Header.from_buffer_copy(header)
         self._data = type(data).from_buffer_copy(data)
@@ -55,7 +57,11 @@ class Sample:
 
     def copy(self: Self) -> Self:
         """The same in memory of its own: may be kept for as long as you like."""
-        return type(self)(self.sensor, _Copy(self._header, self._data), self.missed, self.restarted)
+        return type(self)(self.sensor, Copied(self._header, self._data), self.missed, self.restarted)
+
+    def copy_of_header(self) -> layout.Header:
+        """Numbers, stamps and flags as they lie in memory."""
+        return layout.Header.from_buffer_copy(self._header)
 
     @property
     def _data(self) -> Any:

@@ -6,12 +6,13 @@ from __future__ import annotations
 import time
 from typing import Any, Callable, Iterator
 
-from . import memory
+from . import freshness, layout, memory
 from .errors import Silent
+from .freshness import REMOTE
 from .model import Background
 from .names import Domain, TopicName, service
 from .presence import Presence
-from .processed import Foreground, Marks, Zones
+from .processed import Foreground, Marks, Zones, nothing
 from .sample import Sample
 from .scan import Scan, Telegram
 from .status import Status
@@ -32,7 +33,7 @@ class Subscription(Iterator[Any]):
         timeout: float | None,
         on_notice: Callable[[str], object] | None,
     ) -> None:
-        self._followers = [_Follower(name) for name in dict.fromkeys(names)]
+        self._followers = [_follower(name) for name in dict.fromkeys(names)]
         self._turn = 0
         self._presence = Presence(places)
         self._membership: memory.Membership | None = None
@@ -64,7 +65,7 @@ class Subscription(Iterator[Any]):
             left = give_up_at - time.monotonic()
             if left <= 0:
                 raise self._silence()
-            self._wakeups.wait(min(left, _LONGEST_WAIT))
+            self._wakeups.wait(min(left, _LONGEST_WAIT, *(follower.left() for follower in self._followers)))
 
     def __enter__(self) -> Subscription:
         return self
@@ -166,15 +167,43 @@ class _Follower:
         header = received.header
         restarted = self._boot is not None and self._boot != header.boot
         # A port that outlived its hub got everything of the next one from number 0; a network's numbers go on.
-        if restarted and not header.flags & _REMOTE and self._expected is not None:
+        if restarted and not header.flags & REMOTE and self._expected is not None:
             self._expected = 0
         missed = 0 if self._expected is None else max(header.topic_seq - self._expected, 0)
         self._boot, self._expected = header.boot, header.topic_seq + 1
         return self.kind(self.name.sensor, received, missed, restarted)
+
+    def left(self) -> float:
+        """Seconds after which there is something to say even if no sample comes."""
+        return float("inf")
+
+
+class _ZonesFollower(_Follower):
+    """The zones of a sensor, never staler than they look: a verdict that is too old becomes `unknown`, once."""
+
+    def __init__(self, name: TopicName) -> None:
+        super().__init__(name)
+        self._freshness = freshness.Freshness(freshness.now())
+        self._last = layout.Header()
+
+    def receive(self) -> Sample | None:
+        zones, now = super().receive(), freshness.now()
+        if zones is None:
+            return nothing(self.name.sensor, self._last) if self._freshness.silence(now) else None
+        assert isinstance(zones, Zones)
+        self._last = zones.copy_of_header()
+        is_fresh = self._freshness.heard(self._last, zones.verdict == "unknown", now)
+        return zones if is_fresh else zones.unknown()
+
+    def left(self) -> float:
+        return self._freshness.left(freshness.now())
+
+
+def _follower(name: TopicName) -> _Follower:
+    return _ZonesFollower(name) if name.topic == Zones.topic else _Follower(name)
 
 
 _LONGEST_WAIT = 0.1
 """Seconds: so often the hub is looked for."""
 _OPEN_EVERY = 0.05
 """Seconds between two looks for a topic that is not there."""
-_REMOTE = 32

@@ -2,6 +2,7 @@
 Ends by Ctrl-C, and says so."""
 
 import json
+import os
 import sys
 
 import scanhub
@@ -45,7 +46,8 @@ def marks(sample: scanhub.Marks) -> dict:
 def zones(sample: scanhub.Zones) -> dict:
     said = {name: getattr(sample, name) for name in ("verdict", "nearest_mm", "nearest_beam", "invalid_beams")}
     said["zones"] = [zone._asdict() for zone in sample.zones]
-    return {**said, "provisional": True} if sample.provisional else said
+    said.update({name: True for name in ("provisional", "stale") if getattr(sample, name)})
+    return said
 
 
 def foreground(sample: scanhub.Foreground) -> dict:
@@ -68,8 +70,14 @@ def status(sample: scanhub.Status) -> dict:
     return {**said, "pose": sample.pose._asdict()}
 
 
+def say(line: dict) -> None:
+    """With one system call, so that Ctrl-C leaves no half of it."""
+    written = (json.dumps(line) + "\n").encode()
+    assert os.write(sys.stdout.fileno(), written) == len(written)
+
+
 def notice(kind: str) -> None:
-    print(json.dumps({"class": "notice", "kind": kind}), flush=True)
+    say({"class": "notice", "kind": kind})
 
 
 domain, root, *topics = sys.argv[1:]
@@ -77,6 +85,6 @@ try:
     for sample in scanhub.subscribe(*topics, domain=domain, root=root, on_notice=notice):
         line = {**stamp(sample), **globals()[sample.topic](sample)}
         extra = {"missed": sample.missed, "restarted": sample.restarted}
-        print(json.dumps({**line, "python": extra}), flush=True)
+        say({**line, "python": extra})
 except KeyboardInterrupt:
-    print(json.dumps({"class": "end"}), flush=True)
+    say({"class": "end"})

@@ -3,6 +3,7 @@
 import ctypes
 import fcntl
 import os
+import resource
 import struct
 import sys
 import time
@@ -108,7 +109,17 @@ def other_layouts() -> None:
     assert "front/marks, rear/scan" in said.message and "front/scan" in said.remedy, said
     said = refusal(scanhub.NoHub, lambda: scanhub.background("front", domain=domain, root=root))
     assert "takes no requests" in said.message, said
+    what_is_short()
     os.close(held[0])
+
+
+def what_is_short() -> None:
+    before = resource.getrlimit(resource.RLIMIT_NOFILE)
+    # Fewer than one more port takes.
+    resource.setrlimit(resource.RLIMIT_NOFILE, (len(os.listdir("/proc/self/fd")) + 6, before[1]))
+    said = refusal(scanhub.Short, lambda: follow("front/scan", "front/marks", timeout=1))
+    resource.setrlimit(resource.RLIMIT_NOFILE, before)
+    assert "descriptors are short" in said.message and "ulimit -n" in said.remedy, said
 
 
 domain, root = sys.argv[1:]

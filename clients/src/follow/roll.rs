@@ -10,23 +10,15 @@ use crate::names::{TopicName, no_sensor};
 use crate::output::End;
 use crate::presence::GRACE;
 
-/// After which times a hub that came is asked for its sensors: it makes their topics one after the other.
-const CALLS: [Duration; 3] = [Duration::from_millis(250), Duration::from_secs(1), Duration::from_secs(5)];
-
 /// Sensors of other machines that are there have been announced after so long: it is done once a second.
 const ANNOUNCED: Duration = Duration::from_secs(3);
 
 impl Run<'_> {
-    /// Follows the sensors of the hub that are not followed yet, if all are wanted and it is time.
+    /// Follows the sensors of the hub that are not followed yet, if all are wanted.
     pub(super) fn call_the_roll(&mut self, sink: &mut dyn Sink) -> Result<(), End> {
-        let is_due = |seen: Instant| CALLS.get(self.calls).is_some_and(|after| seen.elapsed() >= *after);
-        if self.topics.is_empty() || !self.hub_seen.is_some_and(is_due) {
-            return Ok(());
-        }
-        let sensors = self.sensors()?;
-        // One that has none yet is asked again at once.
-        self.calls += usize::from(!sensors.is_empty());
-        for sensor in sensors {
+        let Some(domain) = self.session.domain().filter(|_| !self.topics.is_empty()) else { return Ok(()) };
+        let Some(called) = self.roll.call(domain, Instant::now())? else { return Ok(()) };
+        for sensor in called.sensors {
             for &topic in self.topics {
                 let name = TopicName { sensor: sensor.clone(), topic };
                 if self.tracks.iter().all(|track| track.name != name) {

@@ -8,7 +8,7 @@ use std::time::{Duration, Instant};
 
 use schema::{Failure, Kind};
 
-use super::errand::Errand;
+use crate::errand::Errand;
 
 /// A host and port.
 #[derive(Debug)]

@@ -93,17 +93,20 @@ pub(super) fn json<'a>(name: &'a TopicName, spans: &Spans) -> impl Serialize + '
 
 /// The state of things within a run, in a line.
 pub(super) fn brief(line: &mut Vec<u8>, name: &TopicName, spans: &Spans) -> io::Result<()> {
-    let name = name.to_string();
+    let topic = name.to_string();
     match spans.ages(Span::Age).quantiles() {
         Some(age) => write!(
             line,
-            "{name:<16} {:>7} age p50 {:>9} p99 {:>9} max {:>9} us",
+            "{topic:<16} {:>7} age p50 {:>9} p99 {:>9} max {:>9} us",
             age.count,
             us(age.p50_ns),
             us(age.p99_ns),
             us(age.max_ns)
         ),
-        None => write!(line, "{name:<16}       - age, {} received", spans.received),
+        None if spans.received == 0 => {
+            write!(line, "{topic:<16}       - age, {NOTHING_CAME}; {}", why_nothing(name))
+        }
+        None => write!(line, "{topic:<16}       - age, {} received", spans.received),
     }
 }
 
@@ -129,6 +132,9 @@ pub(super) fn full(out: &mut Output<'_>, name: &TopicName, spans: &Spans, bars: 
 /// What the numbers do not say.
 fn remarks(name: &TopicName, spans: &Spans) -> Vec<String> {
     let mut remarks = Vec::new();
+    if spans.received == 0 {
+        remarks.push(format!("{name}: {NOTHING_CAME}; {}", why_nothing(name)));
+    }
     if spans.before > 0 {
         let word = if spans.before == 1 { "was" } else { "were" };
         remarks.push(format!("{name}: {} {word} sent before this listened, and left out", spans.before));
@@ -147,6 +153,17 @@ fn remarks(name: &TopicName, spans: &Spans) -> Vec<String> {
         remarks.push(format!("{name}: {}", kinds.join(", ")));
     }
     remarks
+}
+
+pub(super) const NOTHING_CAME: &str = "no sample came";
+
+/// Where it stands why nothing comes.
+pub(super) fn why_nothing(name: &TopicName) -> String {
+    if name.is_robot() {
+        "`scanhub info` shows why".into()
+    } else {
+        format!("`scanhub info {}` shows why", name.sensor)
+    }
 }
 
 fn draw(out: &mut Output<'_>, spans: &Spans) -> Result<(), End> {
@@ -219,6 +236,19 @@ mod tests {
         assert!(line.starts_with(begin), "{line}");
         assert!(line.contains(r#""hub":{"count":3,"min_ns":512,"p50_ns":512,"#), "{line}");
         assert!(line.ends_with(r#","network":null}"#), "{line}");
+    }
+
+    #[test]
+    fn of_a_silence_it_is_said_where_the_reason_stands() {
+        for (topic, verb) in [("front/scan", "info front"), ("robot/zones", "info")] {
+            let (name, spans) = (TopicName::parse(topic).expect("a topic"), Spans::new());
+            let (mut line, mut text) = (Vec::new(), Vec::new());
+            brief(&mut line, &name, &spans).expect("written");
+            full(&mut Output::new(&mut text), &name, &spans, false).expect("written");
+            let why = format!("no sample came; `scanhub {verb}` shows why");
+            assert_eq!(String::from_utf8_lossy(&line), format!("{topic:<16}       - age, {why}"));
+            assert_eq!(String::from_utf8_lossy(&text), format!("{topic}: {why}\n"));
+        }
     }
 
     #[test]

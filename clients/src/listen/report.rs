@@ -113,7 +113,7 @@ impl<'a> Report<'a> {
         self.notes.line(|line| write!(line, "{what}"))
     }
 
-    /// The account as it stands, over the one that stands on the terminal.
+    /// The account as it stands, over the one that was drawn before.
     pub(super) fn draw(&mut self, account: &Account, roll: &Roll) -> Result<(), End> {
         if self.drawn > 0 {
             self.out.raw(format!("\x1b[{}A\x1b[J", self.drawn).as_bytes())?;
@@ -122,7 +122,7 @@ impl<'a> Report<'a> {
         self.text_account(account, roll)
     }
 
-    /// The account, for the last time.
+    /// The account as it stands, over the one that stands on the terminal, if any does.
     pub(super) fn account(&mut self, account: &Account, roll: &Roll) -> Result<(), End> {
         if !self.json {
             return if self.drawn > 0 { self.draw(account, roll) } else { self.text_account(account, roll) };

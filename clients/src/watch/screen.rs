@@ -7,11 +7,9 @@ use std::panic::{PanicHookInfo, set_hook, take_hook};
 use std::rc::Rc;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
-use std::time::Duration;
 
 use ratatui::backend::CrosstermBackend;
 use ratatui::crossterm::cursor::{Hide, Show};
-use ratatui::crossterm::event::{self, Event, KeyEvent, KeyEventKind};
 use ratatui::crossterm::terminal::{
     EnterAlternateScreen, LeaveAlternateScreen, disable_raw_mode, enable_raw_mode,
 };
@@ -19,14 +17,19 @@ use ratatui::crossterm::{execute, queue};
 use ratatui::{Frame, Terminal};
 
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
+use rustix::termios::tcgetwinsize;
 use schema::{Failure, Kind};
 
+use super::keys::{Key, Keys};
 use crate::output::End;
 
 /// The terminal, as long as it is ours.
 pub(crate) struct Screen<'a> {
     terminal: Terminal<CrosstermBackend<Sheet<'a>>>,
     written: Rc<Cell<usize>>,
+    keys: Keys,
+    /// Columns and rows, as they were last.
+    size: Option<(u16, u16)>,
     hook: Arc<Hook>,
     /// A panic has given the terminal back already.
     given_back: Arc<AtomicBool>,
@@ -37,7 +40,7 @@ type Hook = dyn Fn(&PanicHookInfo<'_>) + Sync + Send;
 /// What a terminal tells besides keys.
 pub(crate) enum News {
     /// A key was pressed.
-    Key(KeyEvent),
+    Key(Key),
     /// It has another size.
     Resized,
 }
@@ -49,10 +52,12 @@ impl<'a> Screen<'a> {
         let given_back = Arc::new(AtomicBool::new(false));
         let mut sheet =
             Sheet { out, buffer: Vec::new(), written: written.clone(), given_back: given_back.clone() };
-        enable_raw_mode().map_err(|error| {
+        let no_terminal = |error| {
             let message = format!("the terminal cannot be taken over: {error}");
             Failure::new(Kind::Failed, message, "keys come from stdin or /dev/tty; `ssh -t` gives one")
-        })?;
+        };
+        let keys = Keys::open().map_err(no_terminal)?;
+        enable_raw_mode().map_err(no_terminal)?;
         let taken = execute!(sheet, EnterAlternateScreen, Hide)
             .and_then(|()| Terminal::new(CrosstermBackend::new(sheet)));
         let terminal = taken.inspect_err(|_| {
@@ -68,7 +73,7 @@ impl<'a> Screen<'a> {
             }
             before(info);
         }));
-        Ok(Screen { terminal, written, hook, given_back })
+        Ok(Screen { terminal, written, keys, size: size(), hook, given_back })
     }
 
     /// Draws a frame; how many bytes that took.
@@ -83,14 +88,11 @@ impl<'a> Screen<'a> {
         if hung_up() {
             return Err(End::ReaderGone);
         }
-        while event::poll(Duration::ZERO).map_err(gone)? {
-            match event::read().map_err(gone)? {
-                Event::Key(key) if key.kind != KeyEventKind::Release => return Ok(Some(News::Key(key))),
-                Event::Resize(..) => return Ok(Some(News::Resized)),
-                _ => {}
-            }
+        let size = size();
+        if std::mem::replace(&mut self.size, size) != size {
+            return Ok(Some(News::Resized));
         }
-        Ok(None)
+        Ok(self.keys.next().map_err(gone)?.map(News::Key))
     }
 }
 
@@ -107,6 +109,11 @@ impl Drop for Screen<'_> {
             set_hook(Box::new(move |info| hook(info)));
         }
     }
+}
+
+/// Columns and rows of the terminal, if it tells them.
+fn size() -> Option<(u16, u16)> {
+    tcgetwinsize(io::stdout()).ok().map(|size| (size.ws_col, size.ws_row))
 }
 
 /// Whether the terminal was closed: whoever draws nothing would not notice, and not everybody is sent a signal.

@@ -1,7 +1,6 @@
 //! What of a scene is shown, and how large; and what keys make of that. Refuses to know a terminal but for its keys.
 
-use ratatui::crossterm::event::{KeyCode, KeyEvent, KeyModifiers};
-
+use super::keys::Key;
 use super::scene::{Scene, Sensor};
 
 /// What is shown.
@@ -69,33 +68,31 @@ impl View {
     }
 
     /// Takes a key, with `scene` on the screen; what is left to be done for it.
-    pub(crate) fn key(&mut self, key: KeyEvent, scene: &Scene) -> Option<Wish> {
-        if key.modifiers.contains(KeyModifiers::CONTROL) {
-            return (key.code == KeyCode::Char('c')).then_some(Wish::Interrupt);
-        }
-        match key.code {
-            KeyCode::Esc if self.help => self.help = false,
-            KeyCode::Char('q') | KeyCode::Esc => return Some(Wish::Quit),
-            KeyCode::Char('R') => return Some(Wish::Reset),
-            KeyCode::Char('F') => return Some(Wish::Freeze),
-            KeyCode::Char('?') => self.help = !self.help,
-            KeyCode::Char(' ') => self.paused = !self.paused,
-            KeyCode::Char('+' | '=') => self.zoom(1.0 / ZOOM),
-            KeyCode::Char('-') => self.zoom(ZOOM),
-            KeyCode::Char('c') => self.fits = true,
-            KeyCode::Left | KeyCode::Char('h') => self.pan(0.0, 1.0),
-            KeyCode::Right | KeyCode::Char('l') => self.pan(0.0, -1.0),
-            KeyCode::Up | KeyCode::Char('k') => self.pan(1.0, 0.0),
-            KeyCode::Down | KeyCode::Char('j') => self.pan(-1.0, 0.0),
-            KeyCode::Tab => self.choose(self.only.map_or(0, |n| n + 1), scene),
-            KeyCode::Char(digit @ '0'..='9') => {
+    pub(crate) fn key(&mut self, key: Key, scene: &Scene) -> Option<Wish> {
+        match key {
+            Key::Interrupt => return Some(Wish::Interrupt),
+            Key::Escape if self.help => self.help = false,
+            Key::Sign('q') | Key::Escape => return Some(Wish::Quit),
+            Key::Sign('R') => return Some(Wish::Reset),
+            Key::Sign('F') => return Some(Wish::Freeze),
+            Key::Sign('?') => self.help = !self.help,
+            Key::Sign(' ') => self.paused = !self.paused,
+            Key::Sign('+' | '=') => self.zoom(1.0 / ZOOM),
+            Key::Sign('-') => self.zoom(ZOOM),
+            Key::Sign('c') => self.fits = true,
+            Key::Left | Key::Sign('h') => self.pan(0.0, 1.0),
+            Key::Right | Key::Sign('l') => self.pan(0.0, -1.0),
+            Key::Up | Key::Sign('k') => self.pan(1.0, 0.0),
+            Key::Down | Key::Sign('j') => self.pan(-1.0, 0.0),
+            Key::Tab => self.choose(self.only.map_or(0, |n| n + 1), scene),
+            Key::Sign(digit @ '0'..='9') => {
                 let number = digit as usize - '0' as usize;
                 self.choose(number.checked_sub(1).unwrap_or(usize::MAX), scene);
             }
-            KeyCode::Char('f') => self.foreground = !self.foreground,
-            KeyCode::Char('b') => self.background = !self.background,
-            KeyCode::Char('m') => self.marks = !self.marks,
-            KeyCode::Char('z') => self.zones = !self.zones,
+            Key::Sign('f') => self.foreground = !self.foreground,
+            Key::Sign('b') => self.background = !self.background,
+            Key::Sign('m') => self.marks = !self.marks,
+            Key::Sign('z') => self.zones = !self.zones,
             _ => {}
         }
         None
@@ -174,7 +171,7 @@ mod tests {
     use schema::{Header, Scan};
 
     fn press(view: &mut View, scene: &Scene, keys: &str) -> Option<Wish> {
-        keys.chars().map(|key| view.key(KeyCode::Char(key).into(), scene)).last().flatten()
+        keys.chars().map(|key| view.key(Key::Sign(key), scene)).last().flatten()
     }
 
     fn two() -> Scene {
@@ -193,7 +190,7 @@ mod tests {
         let (mut view, scene) = (View::new(false), two());
         assert_eq!(view.shown(&scene).len(), 2);
         for only in [Some(0), Some(1), None] {
-            view.key(KeyCode::Tab.into(), &scene);
+            view.key(Key::Tab, &scene);
             assert_eq!(view.only, only);
         }
         press(&mut view, &scene, "2fbmz ?");
@@ -208,13 +205,12 @@ mod tests {
     fn escape_closes_the_help_first() {
         let (mut view, scene) = (View::new(false), two());
         press(&mut view, &scene, "?");
-        assert_eq!(view.key(KeyCode::Esc.into(), &scene), None);
-        assert_eq!(view.key(KeyCode::Esc.into(), &scene), Some(Wish::Quit));
+        assert_eq!(view.key(Key::Escape, &scene), None);
+        assert_eq!(view.key(Key::Escape, &scene), Some(Wish::Quit));
         assert_eq!(press(&mut view, &scene, "q"), Some(Wish::Quit));
         assert_eq!(press(&mut view, &scene, "R"), Some(Wish::Reset));
         assert_eq!(press(&mut view, &scene, "F"), Some(Wish::Freeze));
-        let control_c = KeyEvent::new(KeyCode::Char('c'), KeyModifiers::CONTROL);
-        assert_eq!(view.key(control_c, &scene), Some(Wish::Interrupt));
+        assert_eq!(view.key(Key::Interrupt, &scene), Some(Wish::Interrupt));
         assert!(view.fits, "and c with it does not mean the picture");
     }
 

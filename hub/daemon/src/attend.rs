@@ -4,7 +4,7 @@
 use std::os::fd::AsFd;
 use std::sync::atomic::AtomicBool;
 
-use lms::{Control, MILLIS, Nanos, Session};
+use lms::{Control, Identity, MILLIS, Nanos, Session};
 use rustix::event::PollFlags;
 use schema::{Failure, Flags, Kind, State};
 
@@ -12,6 +12,7 @@ use crate::clock;
 use crate::config::Source;
 use crate::control::Flow;
 use crate::link::{LinkThread, Woken};
+use crate::memory::Memory;
 use crate::port::{Port, Refusal};
 
 impl LinkThread<'_> {
@@ -36,6 +37,9 @@ impl LinkThread<'_> {
             }
         }
         report(Ok(()));
+        let memory = Memory::open(self.around.root, &link.name, &link.port.name());
+        let mut known = memory.recall(clock::now());
+        self.memory = Some(memory);
         // Times in a row that it was there and went without a byte.
         let mut futile = 0;
         loop {
@@ -43,7 +47,7 @@ impl LinkThread<'_> {
                 if let Port::Tty(_) = port {
                     self.around.service.keep(&link.name, &port);
                 }
-                let (heard, end) = self.stay(&port);
+                let (heard, end) = self.stay(&port, known.take());
                 let Err(error) = end else { return };
                 self.around.service.forget(&link.name);
                 self.account.reconnects += 1;
@@ -107,9 +111,13 @@ impl LinkThread<'_> {
     }
 
     /// A session on `port`, until the hub shall end; an error says that the port is gone. Whether a byte came.
-    fn stay(&mut self, port: &Port) -> (bool, std::io::Result<()>) {
+    /// It may go on with a stream of a sensor of which something is `known`.
+    fn stay(&mut self, port: &Port, known: Option<Identity>) -> (bool, std::io::Result<()>) {
         self.topics.set_flags(if port.simulated() { Flags::SIMULATED } else { 0 });
         let mut session = Session::new(self.settings(false), clock::now());
+        if let Some(known) = known {
+            session.recall(known);
+        }
         if self.orders.is_paused() {
             session.control(Control::Pause, clock::now());
         }

@@ -87,7 +87,7 @@ pub fn examine(
     let facts = Facts::gather(domain, &subjects.places, ports.len().max(1));
     tell(machine::memory(&facts));
     tell(machine::domain(&facts));
-    tell(machine::hubs(&facts));
+    tell(machine::hubs(&facts, |user| system.name_of(user)));
     tell(leftovers::leftovers(&facts));
     tell(limits::descriptors(&facts));
     tell(limits::file_size(&facts));

@@ -15,6 +15,7 @@ mod in_memory;
 mod layer;
 mod line_errors;
 mod link;
+mod memory;
 mod origin;
 mod pipeline;
 pub mod port;

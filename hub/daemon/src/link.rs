@@ -3,6 +3,7 @@
 
 use std::io;
 use std::os::fd::{AsFd, BorrowedFd, OwnedFd};
+use std::path::Path;
 use std::sync::atomic::{AtomicBool, Ordering};
 
 use lms::framer::suspect;
@@ -16,6 +17,7 @@ use crate::clock;
 use crate::config::{Link, Source};
 use crate::control::{Flow, Orders};
 use crate::line_errors::LineErrors;
+use crate::memory::Memory;
 use crate::pipeline::Pipeline;
 use crate::port::Port;
 use crate::publish::Past;
@@ -47,6 +49,8 @@ pub(crate) struct LinkThread<'a> {
     /// Rates that the port cannot have, as was said.
     refused: Vec<Baud>,
     line_errors: LineErrors,
+    /// What the next hub would like to know; nothing where there will be none.
+    pub(crate) memory: Option<Memory>,
     /// Statuses in a row that said that consumers got nothing.
     pub(crate) unreached: u32,
     /// The measuring mode of which was said whether it has marks.
@@ -62,6 +66,8 @@ pub(crate) struct Surroundings<'a> {
     pub(crate) stop: &'a OwnedFd,
     /// Keeps the port when the hub is killed.
     pub(crate) service: &'a Service,
+    /// The domain's directory.
+    pub(crate) root: &'a Path,
     /// Set whenever the link finished something.
     pub(crate) worked: &'a AtomicBool,
 }
@@ -102,6 +108,7 @@ impl<'a> LinkThread<'a> {
             error: String::new(),
             refused: Vec::new(),
             line_errors: LineErrors::default(),
+            memory: None,
             unreached: 0,
             told_mode: Status::MODE_UNKNOWN,
             is_blind: false,
@@ -193,6 +200,7 @@ impl<'a> LinkThread<'a> {
         if published {
             self.line_errors.wait();
         }
+        self.memory.iter_mut().for_each(|memory| memory.keep_first(session));
         let sensor = session.sensor();
         let state = if self.is_doubtful(session) { State::Absent } else { state_of(session) };
         let facts = (state, session.trouble(), sensor.unit, sensor.notices().next());
@@ -246,6 +254,7 @@ impl<'a> LinkThread<'a> {
             if changed || state != State::Streaming {
                 self.topics.wake(Wake::Status);
             }
+            self.memory.iter_mut().for_each(|memory| memory.keep(session, now));
             self.watch_reach();
             self.tell_mode();
         }

@@ -51,7 +51,7 @@ impl<'a> Reload<'a> {
             }
         };
         let sensors: Vec<_> = self.running.links.iter().map(|link| link.name.clone()).collect();
-        self.service.reloaded(&sensors, refused.as_deref());
+        self.service.ready(&sensors, refused.as_deref());
     }
 
     fn take(&mut self, read: Config, desk: &Desk) {

@@ -65,20 +65,15 @@ impl Service {
         told(sd_notify::notify(&[NotifyState::FdStoreRemove, NotifyState::FdName(name)]));
     }
 
-    /// The hub is up with `sensors`.
-    pub(crate) fn ready(&self, sensors: &[String]) {
-        let status = format!("sensors: {}", sensors.join(", "));
-        told(sd_notify::notify(&[NotifyState::Ready, NotifyState::Status(&status)]));
-    }
-
-    /// The configuration is read anew, as of `now`; [`reloaded`](Self::reloaded) follows in any case.
+    /// The configuration is read anew, as of `now`; [`ready`](Self::ready) follows in any case.
     pub(crate) fn reloading(&self, now: Nanos) {
         let micros = NotifyState::MonotonicUsec(i128::from(now / 1_000));
         told(sd_notify::notify(&[NotifyState::Reloading, micros]));
     }
 
-    /// The links were told, and the hub is as before; or `refused`, and it is as it was.
-    pub(crate) fn reloaded(&self, sensors: &[String], refused: Option<&str>) {
+    /// The hub is up with `sensors`, at its start or with a configuration that it read anew; or that was `refused`, and it is
+    /// as it was.
+    pub(crate) fn ready(&self, sensors: &[String], refused: Option<&str>) {
         let refused = refused.map(|why| format!("; configuration refused: {why}")).unwrap_or_default();
         let status = format!("sensors: {}{refused}", sensors.join(", "));
         told(sd_notify::notify(&[NotifyState::Ready, NotifyState::Status(&status)]));

@@ -6,9 +6,11 @@ use std::os::fd::{AsFd, BorrowedFd};
 use std::os::unix::net::UnixStream;
 
 use rustix::fs::{Mode, OFlags, open};
-use schema::{Failure, Kind};
+use schema::Failure;
 use signal_hook::consts::{SIGHUP, SIGINT, SIGTERM};
 use signal_hook::low_level::pipe::register;
+
+use crate::supervise::no_resource;
 
 /// The signals of this process.
 pub(crate) struct Signals {
@@ -30,7 +32,7 @@ pub(crate) enum Wanted {
 impl Signals {
     /// Takes them from now on.
     ///
-    /// [`Kind::Short`] if descriptors are.
+    /// [`Kind::Short`](schema::Kind) if descriptors are.
     pub(crate) fn of_process() -> Result<Signals, Failure> {
         // `nohup` lets it be ignored.
         let ends_with_terminal = has_terminal() && !is_hangup_ignored();
@@ -42,10 +44,7 @@ impl Signals {
             register(SIGHUP, hung_up)?;
             Ok(Signals { end, hangup, ends_with_terminal })
         };
-        registered().map_err(|error: std::io::Error| {
-            let message = format!("a signal handler cannot be had: {error}");
-            Failure::new(Kind::Short, message, "try again later")
-        })
+        registered().map_err(|error: std::io::Error| no_resource("a signal handler", &error))
     }
 
     /// What becomes readable when one has come.

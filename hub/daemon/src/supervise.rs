@@ -111,7 +111,8 @@ pub(crate) fn serve(
         let mut threads = Vec::new();
         for ((number, link), orders) in config.links.iter().enumerate().zip(orders) {
             let (node, report) = (&node, report.clone());
-            let around = Surroundings { stop: &stop, service: &service, worked: &worked[number] };
+            let around =
+                Surroundings { stop: &stop, service: &service, root: domain.root(), worked: &worked[number] };
             let cast = player
                 .zip(parts.next())
                 .map(|(player, recorded)| Cast { recorded, seat: Seat { player, number } });
@@ -136,7 +137,7 @@ pub(crate) fn serve(
         }
         if outcome.is_ok() {
             on_ready(&ready);
-            service.ready(&ready.sensors);
+            service.ready(&ready.sensors, None);
             player.iter().for_each(|player| player.begin());
             let is_alive = || threads.iter().all(|thread| !thread.is_finished());
             let watchdog = Watchdog::new(&service, &worked, clock::now());
@@ -213,7 +214,8 @@ fn random() -> u64 {
     RandomState::new().hash_one(std::process::id())
 }
 
-fn no_resource(what: &str, error: &dyn std::fmt::Display) -> Failure {
+/// `what` cannot be had now.
+pub(crate) fn no_resource(what: &str, error: &dyn std::fmt::Display) -> Failure {
     Failure::new(Kind::Short, format!("{what} cannot be had: {error}"), "try again later")
 }
 

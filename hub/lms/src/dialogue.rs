@@ -5,6 +5,7 @@
 use crate::Nanos;
 use crate::command::{MODE, Request};
 use crate::header::{Expect, StreamHeader, is_data};
+use crate::identity::Identity;
 use crate::measured::Measured;
 use crate::outgoing::{FORGOTTEN, NAK_PAUSE, Outgoing};
 use crate::phase::{
@@ -24,6 +25,8 @@ pub(crate) struct Dialogue {
     change_baud: Option<Baud>,
     pub(crate) baud: Baud,
     pub(crate) sensor: Sensor,
+    /// What was known of it before this session, until anything is said to it.
+    pub(crate) recalled: Option<Identity>,
     /// What is in the way now; [`Dialogue::trouble`] is what is shown.
     pub(crate) trouble: Option<Trouble>,
     /// A user wants nothing of the sensor.
@@ -46,6 +49,7 @@ impl Dialogue {
             change_baud: None,
             baud: settings.baud,
             sensor: Sensor::default(),
+            recalled: None,
             trouble: None,
             is_paused: false,
             variant_refused: false,
@@ -291,6 +295,9 @@ impl Dialogue {
     fn stream(&mut self, telegram: Telegram<'_>, measured: Option<Measured<'_>>, now: Nanos) {
         let Some(&header) = telegram.bytes().first_chunk::<{ size_of::<StreamHeader>() }>() else { return };
         let as_asked = measured.is_some_and(|scan| scan.count() == self.settings.variant.beams());
+        if let Some(known) = self.recalled.take_if(|known| known.header == header) {
+            self.sensor.recall(known);
+        }
         self.trouble = None;
         self.variant_refused = !as_asked;
         self.sensor.streams = true;
@@ -336,6 +343,7 @@ impl Dialogue {
     }
 
     pub(crate) fn ask(&mut self, request: Request, not_before: Nanos, tries: u8) {
+        self.recalled = None;
         let address = self.sensor.address.map_or(0, |address| address & !REPLY);
         // What the sensor has half heard must be forgotten first.
         let is_cut = self.open.as_ref().is_some_and(Outgoing::is_partly_out);

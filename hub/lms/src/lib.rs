@@ -21,6 +21,7 @@ pub mod explain;
 pub mod family;
 pub mod framer;
 pub mod header;
+mod identity;
 pub mod inquiry;
 pub mod measured;
 mod notice;
@@ -40,6 +41,7 @@ pub mod telegram;
 pub mod value;
 pub mod variant;
 
+pub use identity::Identity;
 pub use inquiry::Inquiry;
 pub use notice::Notice;
 pub use phase::{Control, Reason, Settings};

@@ -4,6 +4,8 @@
 use crate::command::Request;
 use crate::condition::{Condition, Severity};
 use crate::family::Family;
+use crate::header::StreamHeader;
+use crate::identity::Identity;
 use crate::notice::Notice;
 use crate::reply::{POWER_ON, Reply};
 use crate::status_report::{DIRTY, StatusReport};
@@ -160,6 +162,20 @@ impl Sensor {
         self.defective = None;
     }
 
+    /// What a session that goes on with its stream, whose scans begin with `header`, would have to ask; nothing if that is not
+    /// known.
+    pub(crate) fn identity(&self, header: StreamHeader) -> Option<Identity> {
+        let mode = self.mode.filter(|_| self.kind_len > 0)?;
+        Some(Identity { header, mode, kind: self.kind })
+    }
+
+    /// It streams as it did when this was known of it.
+    pub(crate) fn recall(&mut self, known: Identity) {
+        self.mode = Some(known.mode);
+        self.kind = known.kind;
+        self.kind_len = known.kind.iter().position(|&byte| byte == 0).unwrap_or(KIND_LEN);
+    }
+
     /// Takes over what `telegram` tells, which is `reply`, if it can be read.
     pub(crate) fn learn(&mut self, reply: Option<&Reply<'_>>, telegram: Telegram<'_>) {
         self.address = Some(telegram.address());
@@ -184,6 +200,7 @@ impl Sensor {
                 self.variant = Variant::of_beams(measured.count()).or(self.variant);
             }
             Reply::Type(name) => {
+                self.kind = [0; KIND_LEN];
                 self.kind_len = name.len().min(KIND_LEN);
                 self.kind[..self.kind_len].copy_from_slice(&name[..self.kind_len]);
             }
@@ -225,6 +242,6 @@ const CALM: u16 = 200;
 /// Bytes of the firmware's name.
 const SOFTWARE_LEN: usize = 7;
 /// A type reply has 20 or 21 characters.
-const KIND_LEN: usize = 24;
+pub(crate) const KIND_LEN: usize = 24;
 /// Operating mode: values on request.
 const ON_REQUEST: u8 = 0x25;

@@ -8,9 +8,10 @@ use crate::Nanos;
 use crate::arrival::{Arrivals, Rhythm};
 use crate::dialogue::Dialogue;
 use crate::framer::{Advance, Framer, Place, Tally, suspect};
+use crate::identity::Identity;
 use crate::measured::MEASURED;
 use crate::outgoing::SOON;
-use crate::phase::{Control, Reason, Settings};
+use crate::phase::{Control, Phase, Reason, Settings};
 use crate::sensor::{Sensor, State, Trouble};
 use crate::telegram::Telegram;
 use crate::variant::{BYTES_PER_TURN, Baud, Mode};
@@ -103,6 +104,21 @@ impl Session {
             room: 0,
             has_more: false,
             left_until: None,
+        }
+    }
+
+    /// What a session before this one knew of the sensor a moment ago: scans begin at once if the sensor streams on as it did
+    /// then, and what its status says is asked all the same. To be said before anything is read.
+    pub fn recall(&mut self, known: Identity) {
+        self.dialogue.recalled = Some(known);
+    }
+
+    /// What the next session would have to ask if this one ended now; nothing if the sensor does not stream, or has not told
+    /// all of it.
+    pub fn identity(&self) -> Option<Identity> {
+        match self.dialogue.phase {
+            Phase::Streaming { header, .. } => self.sensor().identity(header),
+            _ => None,
         }
     }
 

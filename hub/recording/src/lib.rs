@@ -6,6 +6,8 @@
 
 mod carmen;
 mod contents;
+#[cfg(feature = "mcap")]
+pub mod convert;
 mod damage;
 #[cfg(feature = "mcap")]
 mod mcap;

@@ -5,7 +5,8 @@ mod channels;
 mod chunk;
 mod exact;
 mod knowledge;
-mod reader;
+mod originals;
+pub(crate) mod reader;
 mod records;
 mod salvage;
 mod seen;
@@ -21,9 +22,10 @@ use schema::datagram::Packed;
 use schema::{Header, Status, Topic};
 
 use crate::{Contents, Damage, Form, Frame};
-use knowledge::Knowledge;
+pub(crate) use knowledge::{Knowledge, message};
+pub(crate) use originals::Originals;
 use reader::{Item, Reader, Sighting};
-use records::Record;
+pub(crate) use records::Record;
 use source::Source;
 
 /// What is known of a file that was read through.
@@ -79,10 +81,14 @@ impl Survey {
                 Item::Record(record) => survey.note_record(&reader.knowledge, &record),
             }
         }
-        for sensor in reader.knowledge.channels.sensors() {
-            survey.sensors.entry(sensor).or_insert(Contents::new(Form::Mcap));
-        }
         survey.whole.sensors = reader.knowledge.channels.sensors();
+        for sensor in &survey.whole.sensors {
+            of_sensor(&mut survey.sensors, sensor);
+        }
+        // Those whose names are lost.
+        let others = survey.sensors.keys().filter(|name| !survey.whole.sensors.contains(name));
+        let others: Vec<_> = others.cloned().collect();
+        survey.whole.sensors.extend(others);
         if let Some(account) = reader.account() {
             survey.tell(|damage| {
                 (damage.bytes, damage.chunks) = (account.passed, account.chunks);
@@ -107,6 +113,11 @@ impl Survey {
     /// All that is in the file, as `input` has it.
     pub(crate) fn reader<R: Read>(&self, input: R) -> Reader<R> {
         if self.is_sound { Reader::sound(input) } else { Reader::harmed(input, self.knowledge.clone()) }
+    }
+
+    /// What the file says beside its telegrams.
+    pub(crate) fn knowledge(&self) -> &Knowledge {
+        &self.knowledge
     }
 
     /// Says of the whole file and of each sensor what `tell` says.

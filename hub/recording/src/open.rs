@@ -10,6 +10,8 @@ use lms::variant::{Mode, Unit};
 use schema::{Failure, Kind};
 
 use crate::carmen;
+#[cfg(feature = "mcap")]
+use crate::mcap::{Knowledge, reader::Reader};
 use crate::stream::Telegrams;
 use crate::{Contents, Form, Frame};
 
@@ -159,6 +161,40 @@ impl Recording {
     ) -> Result<Box<dyn Iterator<Item = Frame> + Send>, Failure> {
         // None could be opened.
         Ok(Box::new(std::iter::empty()))
+    }
+
+    /// The scans of a log; none of another form.
+    #[cfg(feature = "mcap")]
+    pub(crate) fn sweeps(&self) -> Result<impl Iterator<Item = carmen::Sweep> + use<>, Failure> {
+        let mut reader = Some(reader(&self.path)?).filter(|_| self.contents.form == Form::Carmen);
+        let mut line = 0;
+        Ok(std::iter::from_fn(move || carmen::next(reader.as_mut()?, &mut line).ok()?))
+    }
+
+    /// All that is in an MCAP file, and what is known of it.
+    #[cfg(feature = "mcap")]
+    pub(crate) fn reader(&self) -> Result<(Reader<impl Read + use<>>, &Knowledge), Failure> {
+        Ok((self.survey.reader(reader(&self.path)?), self.survey.knowledge()))
+    }
+
+    /// The sensor that was chosen.
+    #[cfg(feature = "mcap")]
+    pub(crate) fn chosen(&self) -> Option<&String> {
+        self.sensor.as_ref()
+    }
+
+    /// When the file was last written, ns since 1970; 0 if nobody knows.
+    #[cfg(feature = "mcap")]
+    pub(crate) fn written_ns(&self) -> u64 {
+        let written = std::fs::metadata(&self.path).and_then(|metadata| metadata.modified()).ok();
+        let since = written.and_then(|written| written.duration_since(std::time::UNIX_EPOCH).ok());
+        since.map_or(0, |since| since.as_nanos() as u64)
+    }
+
+    /// It could be read before, and cannot any more.
+    #[cfg(feature = "mcap")]
+    pub(crate) fn broken(&self, error: &io::Error) -> Failure {
+        unreadable(&self.path, error)
     }
 
     fn choice(&self) -> String {

@@ -84,3 +84,23 @@ fn what_was_written_before_a_kill_is_there() {
     assert!(rear.len() >= 8, "{}", rear.len());
     assert!(rear.iter().eq(written.telegrams.iter().filter(|known| known.sensor == "rear").take(rear.len())));
 }
+
+/// The recorder died before the first chunk was whole, or the disk lost it: names are lost, telegrams are not.
+#[test]
+fn sensors_without_their_names_are_called_by_their_numbers() {
+    let written = written::recording(4, 4);
+    let name = b"front/telegram";
+    let mut bytes = written.bytes[..written.bytes.len() / 2].to_vec();
+    let places: Vec<_> = (0..bytes.len())
+        .filter(|&at| bytes[at..].starts_with(b"front/") || bytes[at..].starts_with(b"rear/"))
+        .collect();
+    assert!(bytes.windows(name.len()).any(|window| window == name));
+    places.into_iter().for_each(|at| bytes[at] = b'?');
+    let file = File::new("nameless", &bytes);
+    let recording = Recording::open(&file.0).unwrap();
+    assert_eq!(recording.contents().sensors, ["sensor0", "sensor1"]);
+    assert_eq!(
+        recording.of("sensor1").unwrap().telegrams(MM).unwrap().next().unwrap().telegram,
+        written.telegrams[1].telegram
+    );
+}

@@ -33,6 +33,8 @@ pub(crate) struct Facts {
     pub(crate) hub: Result<Option<u32>, Failure>,
     /// Hubs of the same name at other places.
     pub(crate) others: Vec<(PathBuf, u32)>,
+    /// Such places that are another user's, with whose they are.
+    pub(crate) closed: Vec<(PathBuf, u32)>,
     /// Processes at the domain's place, and the dead ones at others where no hub is.
     pub(crate) nodes: Result<Nodes, Failure>,
     /// Files in shared memory that may be the domain's and that nobody holds.
@@ -73,9 +75,12 @@ impl Facts {
         let root = domain.root();
         let elsewhere = || places.iter().filter(|place| place.root() != root);
         let held = |place: &Domain| schema::holder(place.root()).ok().flatten();
+        let user = getuid().as_raw();
+        let owner =
+            |place: &Domain| place.root().ancestors().find_map(|path| Some(path.metadata().ok()?.uid()));
         let mut nodes = schema::ipc::nodes(domain);
         if let Ok(nodes) = &mut nodes {
-            let free = elsewhere().filter(|place| held(place).is_none());
+            let free = elsewhere().filter(|place| held(place).is_none() && owner(place) == Some(user));
             nodes.dead += free.filter_map(|place| Some(schema::ipc::nodes(place).ok()?.dead)).sum::<usize>();
         }
         // Whoever lives there may be opening files: they are left in peace.
@@ -87,16 +92,16 @@ impl Facts {
             memory: Memory::of_machine(),
             name: domain.name().to_owned(),
             root: root.to_owned(),
-            user: getuid().as_raw(),
+            user,
             place: Place::nearest(root),
             hub: schema::holder(root),
             others: elsewhere().filter_map(|place| Some((place.root().to_owned(), held(place)?))).collect(),
+            closed: elsewhere()
+                .filter(|place| schema::holder(place.root()).is_err())
+                .filter_map(|place| Some((place.root().to_owned(), owner(place)?)))
+                .collect(),
             nodes,
-            segments: if is_empty {
-                segments::abandoned(&domain.prefix(), getuid().as_raw())
-            } else {
-                Vec::new()
-            },
+            segments: if is_empty { segments::abandoned(&domain.prefix(), user) } else { Vec::new() },
             descriptors: getrlimit(Resource::Nofile).maximum,
             file_size: getrlimit(Resource::Fsize).current,
         }
@@ -207,13 +212,18 @@ pub(crate) fn domain(facts: &Facts) -> Finding {
     Finding::ok(NAME, format!("{root}: free, yours, mode {:04o}", place.mode))
 }
 
-/// Whether there is one hub of this name for everybody who names no place.
-pub(crate) fn hubs(facts: &Facts) -> Finding {
+/// Whether there is one hub of this name for everybody who names no place; where another user's may be `name_of` tells whose.
+pub(crate) fn hubs(facts: &Facts, name_of: impl Fn(u32) -> String) -> Finding {
     const NAME: &str = "hubs";
     let others: Vec<String> =
         facts.others.iter().map(|(root, pid)| format!("{} (process {pid})", root.display())).collect();
     if others.is_empty() {
-        return Finding::ok(NAME, format!("no other hub of domain {}", facts.name));
+        let mut text = format!("no other hub of domain {}", facts.name);
+        for (root, owner) in &facts.closed {
+            let (root, owner) = (root.display(), name_of(*owner));
+            text += &format!("; who is at {root} only user {owner} sees: sudo -u {owner} scanhub doctor");
+        }
+        return Finding::ok(NAME, text);
     }
     Finding::warning(
         NAME,
@@ -257,6 +267,7 @@ pub(super) mod tests {
             place: Place { path: "/run/user/7".into(), owner: 7, mode: 0o700, writable: true },
             hub: Ok(None),
             others: Vec::new(),
+            closed: Vec::new(),
             nodes: Ok(Nodes::default()),
             segments: Vec::new(),
             descriptors: Some(4096),
@@ -313,7 +324,10 @@ pub(super) mod tests {
 
     #[test]
     fn two_hubs_of_one_name_are_one_too_many() {
+        let hubs = |facts: &Facts| hubs(facts, |user| format!("u{user}"));
         says(&hubs(&facts()), State::Ok, &["scanhub"]);
+        let closed = Facts { closed: vec![("/run/scanhub/scanhub".into(), 8)], ..facts() };
+        says(&hubs(&closed), State::Ok, &["/run/scanhub/scanhub", "sudo -u u8 scanhub doctor"]);
         let two = Facts { others: vec![("/tmp/scanhub-7/scanhub".into(), 9)], ..facts() };
         says(&hubs(&two), State::Warning, &["/tmp/scanhub-7/scanhub (process 9)", "--domain"]);
     }

@@ -10,6 +10,7 @@ use schema::{Header, Quality, Topic, file};
 
 use super::channels::{Channels, Place};
 use super::exact::{self, MESSAGE, head_of_message};
+use super::originals::Originals;
 use super::records::Record;
 use super::salvage::{Found, Lone};
 use super::source::Source;
@@ -18,6 +19,7 @@ use super::source::Source;
 #[derive(Clone, Debug, Default)]
 pub(crate) struct Knowledge {
     pub(crate) channels: Channels,
+    pub(crate) originals: Originals,
     /// From the hub's monotonic clock to the wall clock, by its lives.
     lives: BTreeMap<u64, i128>,
     /// Header of the first message that is proven, by channels. What they are may be told at the end of the file.
@@ -41,6 +43,9 @@ impl Knowledge {
             Found::Likely(record) => (record, false),
             Found::Lone(_) => return,
         };
+        if record.opcode != op::MESSAGE {
+            self.originals.note(record, is_proven);
+        }
         if record.opcode == op::CHANNEL && exact::fills(record) {
             if let Ok(Parsed::Channel(channel)) = parse_record(record.opcode, &record.body) {
                 self.channels.note(&channel, is_proven);

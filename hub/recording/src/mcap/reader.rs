@@ -96,7 +96,10 @@ impl<R: Read> Reader<R> {
             // Its channel's record is lost.
             None => Telegram::check(telegram).is_some(),
         };
-        let sensor = self.sensor(Some(head.channel_id), header.sensor).filter(|_| is_telegram)?;
+        if !is_telegram {
+            return None;
+        }
+        let sensor = self.sensor(Some(head.channel_id), header.sensor);
         Some(Sighting { sensor, header, telegram: telegram.to_vec(), is_estimated: false })
     }
 
@@ -118,7 +121,7 @@ impl<R: Read> Reader<R> {
     /// What is to be thought of a telegram among harmed bytes.
     fn judge(&mut self, lone: Lone) -> Option<Sighting> {
         let id = lone.message.map(|message| message.channel_id);
-        let sensor = self.sensor(id, lone.header[SENSOR])?;
+        let sensor = self.sensor(id, lone.header[SENSOR]);
         let sound = self.knowledge.header(&lone, &sensor);
         let (is_whole_new, is_tail_new) = self.novelty(&lone.header, &lone.telegram);
         // A message that is not whole may be the end of one that was there before.
@@ -130,11 +133,16 @@ impl<R: Read> Reader<R> {
         Some(Sighting { sensor, header, telegram: lone.telegram, is_estimated: sound.is_none() })
     }
 
-    fn sensor(&self, id: Option<u16>, number: u8) -> Option<String> {
+    /// By the channel, else by the number, else that of the telegram before. Where all names are lost it is called by
+    /// its number.
+    fn sensor(&self, id: Option<u16>, number: u8) -> String {
         let named = self.knowledge.sensor(id, number).map(str::to_owned);
-        named
-            .or_else(|| self.neighbour.clone())
-            .or_else(|| self.knowledge.channels.sensors().into_iter().next())
+        let sensors = || self.knowledge.channels.sensors();
+        let near = || self.neighbour.clone().or_else(|| sensors().into_iter().next());
+        match named {
+            Some(sensor) => sensor,
+            None => near().filter(|_| !sensors().is_empty()).unwrap_or_else(|| format!("sensor{number}")),
+        }
     }
 
     /// A header after the one before: times of the message, else a period later.

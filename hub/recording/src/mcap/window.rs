@@ -80,9 +80,9 @@ mod tests {
         let at = 2 * PIECE + 17;
         assert_eq!(window.bytes(at as u64, 40).unwrap()[..40], file[at..at + 40]);
         window.release(at as u64);
-        assert_eq!(window.bytes(at as u64 - 1, 1).unwrap(), []);
+        assert_eq!(window.bytes(at as u64 - 1, 1).unwrap(), [0u8; 0]);
         assert!(window.bytes.len() <= 2 * PIECE);
         assert_eq!(*window.bytes(at as u64, usize::MAX).unwrap(), file[at..]);
-        assert_eq!(window.bytes(u64::MAX, 1).unwrap(), []);
+        assert_eq!(window.bytes(u64::MAX, 1).unwrap(), [0u8; 0]);
     }
 }

@@ -1,6 +1,6 @@
 //! A sensor that streams already when the session begins: left by a hub that was killed, or by another program.
 
-use lms::variant::{Baud, Mode};
+use lms::variant::{Baud, Mode, Unit};
 use lms::{Control, MICROS, MILLIS, Settings, State};
 use sim::machine::{self, Start};
 use sim::operating::Operating;
@@ -60,6 +60,61 @@ fn on_a_slow_line_it_is_waited_for() {
         bench.run(10_000 * MILLIS);
         assert_eq!(bench.states, [State::Probing, State::Streaming], "{bench}");
     }
+}
+
+#[test]
+fn what_the_last_session_knew_is_not_waited_for() {
+    for phase in 0..28 {
+        let mut last = Bench::new(sensor(Baud::B500000), 0);
+        last.until("known", 4_000 * MILLIS, |bench| bench.session.identity().is_some());
+        last.run(1_000 * MILLIS + phase * 970 * MICROS);
+        let known = last.session.identity().expect("it streams");
+        let begun = last.now;
+        let mut bench = Bench::new(last.machine, begun);
+        bench.session.recall(known);
+        bench.until("a scan", 60 * MILLIS, |bench| !bench.received_scans(0).is_empty());
+        bench.run(2_000 * MILLIS);
+        assert!(bench.received.iter().all(|got| got.mode == Some(Mode(1))), "{bench}");
+        assert_eq!(bench.states, [State::Probing, State::Streaming], "{bench}");
+        assert_eq!(bench.session.sensor().kind(), b"LMS200;301063;V02.30");
+        assert_eq!((bench.session.sensor().defective, bench.session.identity()), (Some(false), Some(known)));
+        // Its status is asked all the same.
+        let aborted = bench.sent.iter().filter(|sent| sent.aborted).count();
+        assert!(aborted <= 1, "{aborted} scans were broken off");
+    }
+}
+
+#[test]
+fn what_the_last_session_knew_of_another_one_is_not_believed() {
+    let mut last = Bench::new(sensor(Baud::B500000), 0);
+    last.until("known", 4_000 * MILLIS, |bench| bench.session.identity().is_some());
+    let known = last.session.identity().expect("it streams");
+    // Its scans begin otherwise.
+    let centimetres = machine::Settings {
+        baud: Baud::B500000,
+        unit: Unit::Cm,
+        mode: Mode(4),
+        ..machine::Settings::default()
+    };
+    let mut other = sensor_with(centimetres);
+    let begun = make_stream(&mut other);
+    let mut bench = Bench::new(other, begun);
+    bench.session.recall(known);
+    bench.until("its mode", 2_000 * MILLIS, |bench| bench.session.sensor().mode.is_some());
+    bench.run(200 * MILLIS);
+    assert!(bench.received.iter().filter_map(|got| got.mode).all(|mode| mode == Mode(4)), "{bench}");
+    // They begin in the same way, and mean something else: its status tells.
+    let mut other =
+        sensor_with(machine::Settings { baud: Baud::B500000, mode: Mode(4), ..machine::Settings::default() });
+    let begun = make_stream(&mut other);
+    let mut bench = Bench::new(other, begun);
+    bench.session.recall(known);
+    bench.until("its mode", 600 * MILLIS, |bench| bench.session.sensor().mode == Some(Mode(4)));
+    // Nobody streams: what was known is not known any more once somebody answers.
+    let mut bench = Bench::new(sensor(Baud::B500000), 0);
+    bench.session.recall(known);
+    bench.until("an answer", 4_000 * MILLIS, |bench| !bench.received.is_empty());
+    assert_eq!(bench.session.sensor().kind(), b"");
 }
 
 #[test]

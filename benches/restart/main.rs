@@ -1,9 +1,14 @@
 //! What does a crash of the hub cost its consumers? The hub is killed with SIGKILL and started again, twenty times in
-//! all, while a process per sensor follows its telegrams: how long until the services are up and until each consumer
+//! all, with nobody who keeps its lines, while a process per sensor follows its telegrams: how long until the services are up and until each consumer
 //! has a telegram in its hands, beside a bare reader that opens the same streaming ptys and wakes a process. Counts
-//! what was torn (CRC), what was missed within a life, and writes to the sensors' EEPROM. It does not tell how long a service
-//! manager takes to notice.
+//! what was torn (CRC), what was missed within a life, and writes to the sensors' EEPROM. Then the same under a service
+//! manager that keeps the line of one sensor: how long the silence is, and what is lost (kept.rs). It does not tell how long a
+//! service manager takes to notice.
 
+mod kept;
+#[path = "../../tests/stage/supervisor.rs"]
+mod supervisor;
+#[path = "../support/mod.rs"]
 mod support;
 
 use std::process::ExitCode;
@@ -58,7 +63,7 @@ fn measure(options: &Options) -> Outcome<()> {
         Figure { name, unit: "ms", hub: hub.iter().map(of).collect(), floor, target }
     };
     let count = |name, value, target| Figure { name, unit: "1", hub: vec![value], floor: Vec::new(), target };
-    let figures = [
+    let mut figures = vec![
         figure("exec to services up", |start| start.up_ms, Target::Most(50.0)),
         figure("exec to first telegram, sooner", |start| start.first_ms[0], Target::Most(500.0)),
         figure("exec to first telegram, later", |start| start.first_ms[1], Target::Most(500.0)),
@@ -67,6 +72,8 @@ fn measure(options: &Options) -> Outcome<()> {
         count("missed within a life", missed, Target::Most(0.0)),
         count("EEPROM writes", writes, Target::Most(0.0)),
     ];
+    drop(stage);
+    figures.extend(kept::figures(options.count(20))?);
     figures::print("restart", options.json, &figures);
     Ok(())
 }

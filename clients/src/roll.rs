@@ -5,11 +5,11 @@ use std::time::{Duration, Instant};
 
 use schema::{Domain, Failure, ipc};
 
-use super::errand::Errand;
+use crate::errand::Errand;
 
 /// The calls of the sensors of a hub that came.
 #[derive(Default)]
-pub(super) struct Roll {
+pub(crate) struct Roll {
     /// When the hub came, and how often its sensors were called.
     hub: Option<(Instant, usize)>,
     /// The call that is under way, and how long after the hub it began.
@@ -19,11 +19,11 @@ pub(super) struct Roll {
 type Answer = Result<Vec<String>, Failure>;
 
 /// What was answered.
-pub(super) struct Called {
+pub(crate) struct Called {
     /// The sensors that have topics, sorted.
-    pub(super) sensors: Vec<String>,
+    pub(crate) sensors: Vec<String>,
     /// So long after the hub came it was asked.
-    pub(super) age: Duration,
+    pub(crate) age: Duration,
 }
 
 /// When the sensors of a hub that came are called: it makes their topics one after the other.
@@ -34,24 +34,24 @@ const LOOK_EVERY: Duration = Duration::from_millis(5);
 
 impl Roll {
     /// A hub came; answers about the one before are of no use.
-    pub(super) fn begin(&mut self, now: Instant) {
+    pub(crate) fn begin(&mut self, now: Instant) {
         *self = Roll { hub: Some((now, 0)), call: None };
     }
 
     /// The hub is gone: nobody waits for what it has.
-    pub(super) fn end(&mut self) {
+    pub(crate) fn end(&mut self) {
         self.call = None;
     }
 
     /// There was a hub.
-    pub(super) fn has_begun(&self) -> bool {
+    pub(crate) fn has_begun(&self) -> bool {
         self.hub.is_some()
     }
 
     /// Calls the sensors of the hub in `domain` if it is time; what they answered, if that came since the last time.
     ///
     /// [`Kind::Failed`](schema::Kind) if the domain cannot be read.
-    pub(super) fn call(&mut self, domain: &Domain, now: Instant) -> Result<Option<Called>, Failure> {
+    pub(crate) fn call(&mut self, domain: &Domain, now: Instant) -> Result<Option<Called>, Failure> {
         if let Some((errand, age)) = &self.call {
             let Some(sensors) = errand.result() else { return Ok(None) };
             let called = Called { sensors: sensors?, age: *age };
@@ -69,7 +69,7 @@ impl Roll {
     }
 
     /// After which time there may be an answer.
-    pub(super) fn left(&self) -> Option<Duration> {
+    pub(crate) fn left(&self) -> Option<Duration> {
         self.call.as_ref().map(|_| LOOK_EVERY)
     }
 }

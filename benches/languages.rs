@@ -1,0 +1,121 @@
+//! What does a consumer in another language wait longer than one in Rust? From the last byte that the hub read to the scan
+//! in the hands of one process, which is alone at the hub; the languages take turns at it. Rust sleeps at the bell, as it
+//! does by itself; the floor is Rust. It does not tell what a program makes of the scan.
+
+mod support;
+
+use std::path::Path;
+use std::process::{Command, ExitCode, Stdio};
+use std::time::Duration;
+
+use support::Outcome;
+use support::child::Child;
+use support::figures::{self, Figure, Target, percentile};
+use support::options::Options;
+use support::stage::{PATIENCE, Stage};
+
+/// A language beside Rust.
+struct Language {
+    figures: [&'static str; 3],
+    /// What its p50 may be beside Rust's.
+    ratio: f64,
+    /// Program and first arguments of its consumer, or nothing, said why, where this machine cannot run it. What follows
+    /// are domain, sensor and number of scans; it prints `aged SENSOR NS` for each, and `end`.
+    consumer: fn() -> Outcome<Option<Vec<String>>>,
+}
+
+const LANGUAGES: [Language; 2] = [
+    Language { figures: ["Python, p50", "Python, p90", "Python, p99"], ratio: 3.0, consumer: python },
+    Language { figures: ["C, p50", "C, p90", "C, p99"], ratio: 1.1, consumer: c },
+];
+
+fn main() -> ExitCode {
+    support::main(measure)
+}
+
+fn measure(options: &Options) -> Outcome<()> {
+    let stage = Stage::new()?;
+    let _simulator = stage.simulate(&[SENSOR], 500_000)?;
+    let hub = stage.hub(&[SENSOR])?;
+    hub.await_line("ready", PATIENCE)?;
+    let count = options.count(800);
+    let rust = || stage.part(&["ages", "scan", stage.domain.name(), SENSOR, &(count + SETTLING).to_string()]);
+    let mut figures = Vec::new();
+    for Language { figures: names, ratio, consumer } in LANGUAGES {
+        let Some(words) = consumer()? else { continue };
+        let own = || {
+            let last = [stage.domain.name(), SENSOR, &(count + SETTLING).to_string()].map(str::to_owned);
+            Child::start(&words[0], &[&words[1..], &last].concat())
+        };
+        let (mut others, mut floors) = (Vec::new(), Vec::new());
+        for pair in 0..options.pairs() {
+            if pair % 2 == 0 {
+                others.push(ages(&own()?, count)?);
+                floors.push(ages(&rust()?, count)?);
+            } else {
+                floors.push(ages(&rust()?, count)?);
+                others.push(ages(&own()?, count)?);
+            }
+        }
+        let targets = [(0.5, Target::Ratio(ratio)), (0.9, Target::None), (0.99, Target::None)];
+        for (name, (part, target)) in names.into_iter().zip(targets) {
+            let at = |runs: &[Vec<f64>]| runs.iter().filter_map(|run| percentile(run, part)).collect();
+            figures.push(Figure { name, unit: "us", hub: at(&others), floor: at(&floors), target });
+        }
+    }
+    figures::print("languages", options.json, &figures);
+    Ok(())
+}
+
+/// Ages of `count` scans in microseconds, sorted. The first ones are left out.
+fn ages(consumer: &Child, count: usize) -> Outcome<Vec<f64>> {
+    let lines = consumer.lines_until("end", PATIENCE + Duration::from_millis(50) * count as u32)?;
+    let aged = lines.iter().filter(|line| line.text.starts_with("aged")).skip(SETTLING);
+    let mut ages: Vec<f64> = aged.map(|line| Ok(line.number(2)? as f64 / 1e3)).collect::<Outcome<_>>()?;
+    ages.sort_by(f64::total_cmp);
+    Ok(ages)
+}
+
+fn python() -> Outcome<Option<Vec<String>>> {
+    let top = Path::new(env!("CARGO_MANIFEST_DIR"));
+    let made = || top.join("target/venv/bin/python").display().to_string();
+    let python = std::env::var("SCANHUB_PYTHON").unwrap_or_else(|_| made());
+    let mut imports = Command::new(&python);
+    imports.args(["-c", "import iceoryx2, numpy"]).stderr(Stdio::null());
+    if !imports.status().is_ok_and(|status| status.success()) {
+        eprintln!("{python} is no Python with iceoryx2 and numpy; .ci/run makes one");
+        return Ok(None);
+    }
+    let script = top.join("benches/languages/age.py").display().to_string();
+    Ok(Some(vec![python, "-B".into(), script]))
+}
+
+/// Built against the library that Cargo put beside this bench.
+fn c() -> Outcome<Option<Vec<String>>> {
+    let top = Path::new(env!("CARGO_MANIFEST_DIR"));
+    let own = std::env::current_exe()?;
+    let library = own.parent().ok_or("a bench is in a directory")?.join("libscanhub.so");
+    let place = Path::new(env!("CARGO_TARGET_TMPDIR")).join("languages");
+    std::fs::create_dir_all(&place)?;
+    // What the linker looks for, and what the program does when it starts.
+    for name in ["libscanhub.so", "libscanhub.so.0"] {
+        let _ = std::fs::remove_file(place.join(name));
+        std::os::unix::fs::symlink(&library, place.join(name))?;
+    }
+    let program = place.join("age").display().to_string();
+    let mut cc = Command::new("cc");
+    cc.args(["-std=c99", "-D_DEFAULT_SOURCE", "-O2", "-I"]).arg(top.join("clients/c/include"));
+    cc.arg(top.join("benches/languages/age.c")).args(["-o", &program, "-lscanhub", "-L"]).arg(&place);
+    match cc.arg(format!("-Wl,-rpath,{}", place.display())).status() {
+        Ok(status) if status.success() => Ok(Some(vec![program])),
+        Ok(_) => Err("benches/languages/age.c does not compile".into()),
+        Err(_) => {
+            eprintln!("there is no C compiler (cc)");
+            Ok(None)
+        }
+    }
+}
+
+const SENSOR: &str = "front";
+/// Scans at the start of a run that do not count.
+const SETTLING: usize = 40;

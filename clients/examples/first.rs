@@ -1,0 +1,23 @@
+//! The program of docs/first-consumer.md, which shows all below this: `cargo run --release -p scanhub-clients --example first`.
+
+use std::time::Duration;
+
+use clients::attach;
+use schema::{Failure, Scan};
+
+fn main() -> Result<(), Failure> {
+    let mut scans = attach::<Scan>("front")?.timeout(Duration::from_millis(500));
+    loop {
+        let Some(scan) = scans.next()? else {
+            println!("no scan for half a second; there is a hub: {}", scans.hub_lives());
+            continue;
+        };
+        if scan.missed > 0 || scan.restarted {
+            println!("{} scans were missed; another hub: {}", scan.missed, scan.restarted);
+        }
+        let distances = (0..scan.beams()).filter_map(|i| Some((scan.distance_mm(i)?, i)));
+        if let Some((mm, i)) = distances.min() {
+            println!("{mm} mm at {} degrees", scan.angle_deg(i));
+        }
+    }
+}

@@ -1,0 +1,137 @@
+//! `scanhub convert` on the command line: what it takes, and how it is told what came of it.
+
+use std::io::{IsTerminal, Write, stderr};
+use std::path::{Path, PathBuf};
+use std::sync::atomic::AtomicBool;
+
+use clap::Args;
+use recording::Damage;
+use recording::convert::{self, ConvertOptions, Converted};
+use schema::Failure;
+use serde::Serialize;
+
+use crate::{line, say};
+
+#[derive(Args, Debug)]
+pub(crate) struct Convert {
+    /// The recording: MCAP file, telegram stream or CARMEN log, plain or gzipped, also a damaged one
+    #[arg(value_name = "IN")]
+    input: PathBuf,
+    /// What it becomes, by its ending: .mcap, .bin (telegram stream) or .log (CARMEN), the last two also with .gz; - is a
+    /// telegram stream on stdout
+    #[arg(value_name = "OUT")]
+    output: PathBuf,
+    /// One sensor of the recording; of a stream or a log its name in the MCAP file [default: front]
+    #[arg(long, value_name = "NAME")]
+    sensor: Option<String>,
+    /// Overwrite what is there
+    #[arg(short, long)]
+    force: bool,
+}
+
+impl Convert {
+    /// Converts until `stop` is set.
+    pub(crate) fn run(&self, json: bool, stop: &AtomicBool) -> Result<(), Failure> {
+        let options = ConvertOptions {
+            input: self.input.clone(),
+            output: self.output.clone(),
+            sensor: self.sensor.clone(),
+            force: self.force,
+        };
+        let is_watched = stderr().is_terminal() && !json;
+        let progress = |done: u64, all: u64| {
+            if is_watched {
+                let _ = write!(stderr(), "\r{done} of {all} telegrams");
+            }
+        };
+        let outcome = convert::convert(&options, stop, progress);
+        if is_watched {
+            let _ = write!(stderr(), "\r\x1b[K");
+        }
+        let converted = outcome?;
+        let is_stdout_taken = self.output == Path::new("-");
+        match (json, is_stdout_taken) {
+            (true, false) => say(&line(&Line::of(self, &converted))),
+            (true, true) => tell(&line(&Line::of(self, &converted))),
+            (false, _) => tell(&self.words(&converted)),
+        }
+        Ok(())
+    }
+
+    fn words(&self, converted: &Converted) -> String {
+        let Converted { telegrams, scans, left_out, took_ns, damage, .. } = converted;
+        let seconds = *took_ns as f64 / 1e9;
+        let mut words =
+            format!("{}: {telegrams} telegrams, {scans} scans, {seconds:.3} s", self.output.display());
+        if *left_out > 0 {
+            words += &format!("; left out: {left_out} telegrams that are no whole scans");
+        }
+        if !damage.is_none() {
+            words += &format!("; missing in {}: {damage}", self.input.display());
+        }
+        words
+    }
+}
+
+/// The line that says what was converted; keys in the order of their contract.
+#[derive(Serialize)]
+struct Line<'a> {
+    class: &'static str,
+    input: &'a Path,
+    output: &'a Path,
+    from: &'static str,
+    to: &'static str,
+    sensors: &'a [String],
+    telegrams: u64,
+    scans: u64,
+    left_out: u64,
+    seconds: f64,
+    missing: Missing,
+}
+
+/// What was missing of the recording.
+#[derive(Serialize)]
+struct Missing {
+    telegrams: u64,
+    bytes: u64,
+    chunks: u64,
+    stamps: u64,
+    end: bool,
+    checksum: bool,
+}
+
+impl<'a> Line<'a> {
+    fn of(convert: &'a Convert, converted: &'a Converted) -> Self {
+        let Damage { telegrams, bytes, chunks, estimated, is_cut, is_harmed } = converted.damage;
+        Line {
+            class: "converted",
+            input: &convert.input,
+            output: &convert.output,
+            from: convert::form_name(converted.forms.0),
+            to: convert::form_name(converted.forms.1),
+            sensors: &converted.sensors,
+            telegrams: converted.telegrams,
+            scans: converted.scans,
+            left_out: converted.left_out,
+            seconds: converted.took_ns as f64 / 1e9,
+            missing: Missing {
+                telegrams,
+                bytes,
+                chunks,
+                stamps: estimated,
+                end: is_cut,
+                checksum: is_harmed,
+            },
+        }
+    }
+}
+
+/// Writes one line to stderr, which may be a terminal that is gone.
+fn tell(words: &str) {
+    let _ = stderr().lock().write_all(format!("{words}\n").as_bytes());
+}
+
+/// What the help says beside the flags.
+pub(crate) const REPAIR: &str = "\
+From MCAP to MCAP everything is copied, with a new index: a file that was cut or harmed becomes a whole one of all that
+could be had of it. Damage is told and is no failure: the exit code is 0 where the result is whole.";

@@ -1,0 +1,278 @@
+//! Writes a recording anew, in the same form or another one. A file that is damaged becomes one that is not, with all
+//! that was found in it. Refuses to know who asks, and how progress looks.
+
+mod copy;
+mod output;
+mod scans;
+mod times;
+
+use std::cell::Cell;
+use std::io::{self, Write};
+use std::path::{Path, PathBuf};
+use std::sync::atomic::{AtomicBool, Ordering};
+
+use flate2::Compression;
+use flate2::write::GzEncoder;
+use lms::variant::{Mode, Unit};
+use schema::file::Writer;
+use schema::{Failure, Kind, Status, Topic, check_followed};
+
+use crate::{Damage, Encoding, Form, Recording};
+use output::{Place, unwritable};
+use times::Times;
+
+/// What to convert.
+#[derive(Clone, Debug, Default)]
+pub struct ConvertOptions {
+    /// The recording, of any form.
+    pub input: PathBuf,
+    /// What it becomes: the form is that of the ending; `-` is a telegram stream on stdout.
+    pub output: PathBuf,
+    /// Which sensor of the recording; of a stream or a log the name that it gets in an MCAP file.
+    pub sensor: Option<String>,
+    /// Overwrite what is there.
+    pub force: bool,
+}
+
+/// What was converted.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Converted {
+    /// Form of the recording, and of what it became.
+    pub forms: (Form, Form),
+    /// Its sensors.
+    pub sensors: Vec<String>,
+    /// Telegrams that were written.
+    pub telegrams: u64,
+    /// How many of them are scans.
+    pub scans: u64,
+    /// Telegrams that the form cannot hold: in a CARMEN log all but whole scans.
+    pub left_out: u64,
+    /// From the first telegram to the last one, in ns, as far as there are stamps.
+    pub took_ns: u64,
+    /// What was missing of the recording.
+    pub damage: Damage,
+}
+
+/// Converts as `options` say until `stop` is set; calls `progress` with the telegrams that were written and how many there
+/// are. Whoever closes stdout has enough.
+///
+/// [`Kind::Configuration`] if the recording cannot be read, or what it shall become cannot be said; [`Kind::Failed`] if it
+/// cannot be written, [`Kind::Interrupted`] if it was stopped. Nothing is left then.
+pub fn convert(
+    options: &ConvertOptions,
+    stop: &AtomicBool,
+    mut progress: impl FnMut(u64, u64),
+) -> Result<Converted, Failure> {
+    let form = form_of(&options.output)?;
+    let whole = Recording::open(&options.input)?;
+    let place = Place::check(&options.output, &options.input, options.force)?;
+    let recording = match &options.sensor {
+        Some(sensor) if whole.contents().form == Form::Mcap => whole.of(sensor)?,
+        Some(sensor) => check_followed(sensor).map(|()| whole)?,
+        None => whole,
+    };
+    let contents = recording.contents();
+    let mut converted = Converted {
+        forms: (contents.form, form),
+        sensors: contents.sensors.clone(),
+        telegrams: 0,
+        scans: 0,
+        left_out: 0,
+        took_ns: contents.span.map_or(0, |(first, last)| last.saturating_sub(first)),
+        damage: contents.damage,
+    };
+    let encoding = encoding(&recording)?;
+    if (contents.form, form) != (Form::Mcap, Form::Mcap) {
+        // Refuses to choose of several sensors, before anything is written.
+        drop(recording.telegrams(encoding)?);
+    }
+    let mut file = place.create()?;
+    let is_closed = Cell::new(false);
+    let failed = |error: io::Error| {
+        is_closed.set(place.is_stdout() && error.kind() == io::ErrorKind::BrokenPipe);
+        unwritable(&options.output, &error)
+    };
+    let mut count = |written: Written| {
+        converted.telegrams += u64::from(written != Written::LeftOut);
+        converted.scans += u64::from(written == Written::Scan);
+        converted.left_out += u64::from(written == Written::LeftOut);
+        if converted.telegrams.is_multiple_of(STEP) {
+            progress(converted.telegrams, contents.telegrams);
+        }
+        if stop.load(Ordering::Relaxed) {
+            return Err(Failure::new(Kind::Interrupted, "interrupted before the end", ""));
+        }
+        Ok(())
+    };
+    let written = match form {
+        Form::Mcap if contents.form == Form::Mcap => copy::copy(&recording, &mut file, &mut count, &failed),
+        Form::Mcap => {
+            let sensor = options.sensor.as_deref().unwrap_or(SENSOR);
+            write_mcap(&recording, sensor, encoding, &mut file, &mut count, &failed)
+        }
+        form => {
+            let out = Packing::of(&options.output, &mut file);
+            write_bytes(&recording, form, encoding, out, &mut count, &failed)
+        }
+    };
+    match written {
+        Err(_) if is_closed.get() => Ok(converted),
+        Err(failure) => Err(failure),
+        Ok(()) => place.put(file).map(|()| converted),
+    }
+}
+
+/// What became of a telegram.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Written {
+    Scan,
+    Other,
+    LeftOut,
+}
+
+impl Written {
+    fn of(is_scan: bool) -> Written {
+        if is_scan { Written::Scan } else { Written::Other }
+    }
+}
+
+/// Telegrams one after the other, or the lines of a log.
+fn write_bytes(
+    recording: &Recording,
+    form: Form,
+    encoding: Encoding,
+    mut out: Packing<impl Write>,
+    count: &mut impl FnMut(Written) -> Result<(), Failure>,
+    failed: &impl Fn(io::Error) -> Failure,
+) -> Result<(), Failure> {
+    let mut times = Times::of(recording);
+    let mode = recording.contents().mode.unwrap_or(encoding.mode);
+    let mut first_ns = None;
+    for frame in recording.telegrams(encoding)? {
+        if form == Form::Telegrams {
+            out.write_all(&frame.telegram).map_err(failed)?;
+            count(Written::of(frame.is_scan()))?;
+            continue;
+        }
+        let at_ns = times.wall_ns(&frame);
+        let line = scans::line(&frame.telegram, mode, at_ns, *first_ns.get_or_insert(at_ns));
+        out.write_all(line.as_deref().unwrap_or_default().as_bytes()).map_err(failed)?;
+        count(if line.is_some() { Written::Scan } else { Written::LeftOut })?;
+    }
+    out.finish().map_err(failed)
+}
+
+/// Telegrams without header into an MCAP file.
+fn write_mcap(
+    recording: &Recording,
+    sensor: &str,
+    encoding: Encoding,
+    file: &mut impl Write,
+    count: &mut impl FnMut(Written) -> Result<(), Failure>,
+    failed: &impl Fn(io::Error) -> Failure,
+) -> Result<(), Failure> {
+    let facts = [("converted from".to_owned(), form_name(recording.contents().form).to_owned())];
+    let mut writer = Writer::begin(file, "", facts.into()).map_err(failed)?;
+    let mut times = Times::of(recording);
+    let mut bytes = 0;
+    for (number, frame) in recording.telegrams(encoding)?.enumerate() {
+        let header = times.header(&frame, number as u64);
+        if number == 0 && recording.contents().form == Form::Carmen {
+            // Nothing else tells how the values are split.
+            let status = Status { mode: encoding.mode.0, unit_mm: encoding.unit.mm(), ..Status::default() };
+            let mut room = [0; 1024];
+            let len = schema::datagram::Packed::pack(&status, &mut room).unwrap_or(0);
+            writer.sample(sensor, Topic::Status, &header, &room[..len]).map_err(failed)?;
+        }
+        writer.sample(sensor, Topic::Telegram, &header, &frame.telegram).map_err(failed)?;
+        bytes += frame.telegram.len();
+        if bytes >= CHUNK {
+            writer.close_chunk().map_err(failed)?;
+            bytes = 0;
+        }
+        count(Written::of(frame.is_scan()))?;
+    }
+    writer.finish().map_err(failed).map(drop)
+}
+
+/// How the metres of a log become values with the least loss: in centimetres where it has no finer ones, else in
+/// millimetres as far as they reach.
+fn encoding(recording: &Recording) -> Result<Encoding, Failure> {
+    let cm = Encoding { unit: Unit::Cm, mode: Mode(0) };
+    if recording.contents().form != Form::Carmen {
+        return Ok(cm);
+    }
+    let (mut is_fine, mut farthest_m) = (false, 0.0f64);
+    for range_m in recording.sweeps()?.flat_map(|sweep| sweep.ranges_m) {
+        is_fine |= range_m.is_finite() && (range_m * 100.0 - (range_m * 100.0).round()).abs() > 1e-6;
+        farthest_m = if range_m.is_finite() { farthest_m.max(range_m) } else { farthest_m };
+    }
+    let reaches = |mode: &Mode| farthest_m * 1000.0 < f64::from(mode.max_value() - crate::BEYOND);
+    let fine = [Mode(0x00), Mode(0x04), Mode(0x06)].into_iter().find(reaches).filter(|_| is_fine);
+    Ok(fine.map_or(cm, |mode| Encoding { unit: Unit::Mm, mode }))
+}
+
+/// The form that the name of a file tells.
+fn form_of(path: &Path) -> Result<Form, Failure> {
+    let name = path.file_name().map(|name| name.to_string_lossy().to_lowercase()).unwrap_or_default();
+    let plain = name.strip_suffix(".gz").unwrap_or(&name);
+    match plain.rsplit_once('.') {
+        _ if name == "-" => Ok(Form::Telegrams),
+        Some((_, "mcap")) if plain == name => Ok(Form::Mcap),
+        Some((_, "log" | "clf")) => Ok(Form::Carmen),
+        Some((_, "bin" | "raw")) => Ok(Form::Telegrams),
+        _ => {
+            let message = format!("the ending of {} tells no form", path.display());
+            let hint =
+                ".mcap, .log (CARMEN), .bin (telegram stream), the last two also with .gz; or - for stdout";
+            Err(Failure::new(Kind::Configuration, message, hint))
+        }
+    }
+}
+
+/// The form as a word.
+pub fn form_name(form: Form) -> &'static str {
+    match form {
+        Form::Telegrams => "telegram stream",
+        Form::Carmen => "CARMEN log",
+        Form::Mcap => "MCAP",
+    }
+}
+
+/// Packed if the name of the file says so.
+enum Packing<W: Write> {
+    Plain(W),
+    Gzip(GzEncoder<W>),
+}
+
+impl<W: Write> Packing<W> {
+    fn of(path: &Path, file: W) -> Self {
+        match path.extension() {
+            Some(ending) if ending.eq_ignore_ascii_case("gz") => {
+                Packing::Gzip(GzEncoder::new(file, Compression::default()))
+            }
+            _ => Packing::Plain(file),
+        }
+    }
+
+    fn write_all(&mut self, bytes: &[u8]) -> io::Result<()> {
+        match self {
+            Packing::Plain(file) => file.write_all(bytes),
+            Packing::Gzip(encoder) => encoder.write_all(bytes),
+        }
+    }
+
+    fn finish(self) -> io::Result<()> {
+        match self {
+            Packing::Plain(_) => Ok(()),
+            Packing::Gzip(encoder) => encoder.finish().map(drop),
+        }
+    }
+}
+
+/// Name of the sensor of a stream or a log that has none.
+const SENSOR: &str = "front";
+/// Bytes of telegrams in a chunk.
+const CHUNK: usize = 256 * 1024;
+/// Progress is told so often.
+const STEP: u64 = 512;

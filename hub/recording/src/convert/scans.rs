@@ -1,0 +1,59 @@
+//! A scan as a line of a CARMEN log. Lost are what the log has no place for: reflector levels and field bits, which of the
+//! nine codes a beam without a reading had, address and status of the sensor. Refuses to know when it was.
+
+use lms::measured::Measured;
+use lms::telegram::Telegram;
+use lms::variant::{Mode, Unit, Variant};
+
+use crate::BEYOND;
+
+/// The line of a scan at `at_ns` since 1970, in a log that begins at `first_ns`; `None` if `telegram` is no whole scan. A
+/// beam without a reading has the greatest range that the values can say, as logs of the sensor have it.
+pub(super) fn line(telegram: &[u8], mode: Mode, at_ns: u64, first_ns: u64) -> Option<String> {
+    let measured = Measured::decode(Telegram::check(telegram)?)?;
+    if measured.partial().is_some() || Variant::of_beams(measured.count()).is_none() {
+        return None;
+    }
+    let (greatest, unit) = (mode.max_value(), measured.unit());
+    let decimals = match unit {
+        Unit::Mm => 3,
+        Unit::Cm => 2,
+        Unit::Dm => 1,
+    };
+    let mut line = format!("FLASER {}", measured.count());
+    for word in measured.words() {
+        let range = word & greatest;
+        let said = if range >= greatest - BEYOND { greatest } else { range };
+        line += &format!(" {:.decimals$}", f64::from(said) * f64::from(unit.mm()) / 1000.0);
+    }
+    let seconds = |ns: u64| format!("{}.{:06}", ns / 1_000_000_000, ns / 1000 % 1_000_000);
+    line += &format!(" 0 0 0 0 0 0 {} scanhub {}\n", seconds(at_ns), seconds(at_ns.saturating_sub(first_ns)));
+    Some(line)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::carmen::Sweep;
+    use lms::measured;
+
+    #[test]
+    fn a_line_is_read_as_it_was_written() {
+        let mut words = vec![1234; 181];
+        (words[0], words[1], words[2]) = (0xE000 | 500, 8191, 8183);
+        let telegram = measured::encode(0, Unit::Cm, &words, 0x10);
+        let line =
+            line(telegram.bytes(), Mode(1), 1_071_078_720_123_456_789, 1_071_078_720_000_000_000).unwrap();
+        assert!(line.ends_with(" 12.34 0 0 0 0 0 0 1071078720.123456 scanhub 0.123456\n"), "{line}");
+        let sweep = Sweep::parse(&line).unwrap().unwrap();
+        assert_eq!(sweep.ranges_m[..4], [5.0, 81.91, 81.91, 12.34]);
+        assert_eq!(sweep.words(Unit::Cm, Mode(0))[..4], [500, 8183, 8183, 1234]);
+    }
+
+    #[test]
+    fn what_is_no_whole_scan_has_no_line() {
+        assert_eq!(line(lms::reply::mode(0, true, 0x10).bytes(), Mode(0), 1, 0), None);
+        let part = measured::encode(0, Unit::Cm, &[7; 61], 0x10);
+        assert_eq!(line(part.bytes(), Mode(0), 1, 0), None);
+    }
+}

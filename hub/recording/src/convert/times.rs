@@ -1,0 +1,67 @@
+//! Times for telegrams that have none: one scan period after the other, so that the last one ends when the file was last
+//! written. Refuses to know what is done with them.
+
+use lms::variant::{Baud, Variant};
+use schema::{Flags, Header};
+
+use crate::{Frame, Recording};
+
+/// A clock that moves on by telegrams.
+pub(super) struct Times {
+    wall_ns: u64,
+    begin_ns: u64,
+    boot: u64,
+    variant: Variant,
+}
+
+impl Times {
+    /// For `recording`, from its beginning.
+    pub(super) fn of(recording: &Recording) -> Times {
+        let contents = recording.contents();
+        let variant = contents.variant.unwrap_or(Variant::HALF);
+        let took_ns = contents.scans * scan_ns(variant);
+        let begin_ns = match contents.span {
+            Some((first_ns, _)) => first_ns,
+            None => recording.written_ns().saturating_sub(took_ns),
+        };
+        // Any number that is another one for another recording.
+        let boot = begin_ns.wrapping_mul(0x9E37_79B9_7F4A_7C15) | 1;
+        Times { wall_ns: begin_ns, begin_ns, boot, variant }
+    }
+
+    /// When `frame`, the next one, was measured.
+    pub(super) fn wall_ns(&mut self, frame: &Frame) -> u64 {
+        let at_ns = frame.wall_ns.unwrap_or(self.wall_ns);
+        self.wall_ns = at_ns + if frame.is_scan() { scan_ns(self.variant) } else { line_ns(frame) };
+        at_ns
+    }
+
+    /// What a hub might have said of `frame`, the next one, which has this `number`.
+    pub(super) fn header(&mut self, frame: &Frame, number: u64) -> Header {
+        let wall_ns = self.wall_ns(frame);
+        let first_ns = wall_ns.saturating_sub(self.begin_ns) + UPTIME_NS;
+        Header {
+            seq: number,
+            topic_seq: number,
+            stamp_first_ns: first_ns,
+            stamp_last_ns: first_ns + line_ns(frame),
+            wall_ns,
+            boot: self.boot,
+            flags: Flags::STAMP_ESTIMATED,
+            period_us: (scan_ns(self.variant) / 1000) as u32,
+            ..Header::default()
+        }
+    }
+}
+
+/// Time between two scans at the usual rate.
+fn scan_ns(variant: Variant) -> u64 {
+    variant.period(2 * variant.beams() + 10, Baud::B500000.rate())
+}
+
+fn line_ns(frame: &Frame) -> u64 {
+    lms::line_time(frame.telegram.len(), Baud::B500000.rate())
+}
+
+/// Monotonic clock at the first telegram: that of a machine that has just started.
+const UPTIME_NS: u64 = 10_000_000_000;

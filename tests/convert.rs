@@ -1,0 +1,47 @@
+//! `scanhub convert`: recordings in another form, as a user at a terminal and a script see it.
+
+mod stage;
+
+use serde_json::json;
+use stage::Stage;
+
+#[test]
+fn a_stream_becomes_a_recording_that_plays() {
+    let stage = Stage::new();
+    let bytes = (0..20).flat_map(stage::scan).collect::<Vec<u8>>();
+    let stream = stage.file("a.bin", &bytes);
+    let mcap = stream.replace("a.bin", "a.mcap");
+    let outcome = stage.run(&["convert", &stream, &mcap, "--json", "--sensor=left"]);
+    assert_eq!(outcome.code, Some(0), "{outcome}");
+    let line = outcome.of_class("converted").pop().unwrap_or_else(|| panic!("{outcome}"));
+    let missing =
+        json!({"telegrams": 0, "bytes": 0, "chunks": 0, "stamps": 0, "end": false, "checksum": false});
+    assert_eq!((&line["telegrams"], &line["scans"], &line["missing"]), (&json!(20), &json!(20), &missing));
+    assert_eq!((&line["from"], &line["to"]), (&json!("telegram stream"), &json!("MCAP")));
+    // The telegrams as they were, to whoever reads stdout.
+    let outcome = stage.run(&["convert", &mcap, "-", "--sensor=left"]);
+    assert_eq!(outcome.code, Some(0), "{outcome}");
+    assert!(outcome.errors.contains("20 telegrams, 20 scans"), "{}", outcome.errors);
+    // A simulated sensor has the recording.
+    let _simulator =
+        stage.simulator(&["left"], &["--baud=500000", &format!("--replay={mcap}"), "--sensor=left"]);
+    let _hub = stage.hub(&[stage.link("left")]);
+    let outcome = stage.run(&["echo", "left/scan", "-n", "3", "--json", "--timeout=30s"]);
+    assert_eq!(outcome.of_class("scan").len(), 3, "{outcome}");
+}
+
+#[test]
+fn what_cannot_be_converted_is_refused() {
+    let stage = Stage::new();
+    let stream = stage.file("a.bin", stage::scan(1));
+    let there = stage.file("there.bin", "mine");
+    for (arguments, code, says) in [
+        (["convert", &stream[..], &stream[..]], 78, "both read and written"),
+        (["convert", &stream, &there], 1, "--force replaces it"),
+        (["convert", &stream, "x.txt"], 78, "tells no form"),
+        (["convert", "/no/such/file", "x.mcap"], 78, "/no/such/file"),
+    ] {
+        let outcome = stage.run(&arguments);
+        assert!(outcome.code == Some(code) && outcome.errors.contains(says), "{outcome}");
+    }
+}

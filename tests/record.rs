@@ -1,0 +1,217 @@
+//! `scanhub record`: everything that the hub published while it ran is in the file, however it was ended, and others read it.
+
+mod stage;
+
+use std::collections::{BTreeMap, BTreeSet, HashSet};
+use std::path::Path;
+
+use schema::Scan;
+use schema::datagram::Packed;
+use serde_json::Value;
+use stage::{
+    HUP, INT, KILL, Kept, Outcome, Program, Recording, Stage, TERM, hash, is_class, number, python, unbroken,
+};
+
+/// Two sensors that stream.
+fn sensors(stage: &Stage, flags: &[&str]) -> [Program; 2] {
+    let simulator = stage.simulator(&["front", "rear"], flags);
+    let hub = stage.hub(&[stage.link("front"), stage.link("rear")]);
+    for sensor in ["front", "rear"] {
+        stage.await_info(sensor, |info| info["state"] == "streaming");
+    }
+    [simulator, hub]
+}
+
+/// A recorder of these flags into `walk.mcap`, of which `count` samples are written at least.
+fn recorder(stage: &Stage, flags: &[&str], count: u64) -> Program {
+    let file = stage.word("walk.mcap");
+    let mut recorder = stage.start(&[&["record", "--json", "-o", &file], flags].concat());
+    await_samples(&mut recorder, count);
+    recorder
+}
+
+fn await_samples(recorder: &mut Program, count: u64) -> Value {
+    recorder.await_line("samples", |line| line["class"] == "recording" && number(line, "samples") >= count)
+}
+
+/// The last line, which says that it came to its end.
+fn recorded(outcome: &Outcome) -> Value {
+    assert_eq!(outcome.code, Some(0), "{outcome}");
+    let lines = outcome.lines();
+    let last = lines.last().unwrap_or_else(|| panic!("{outcome}"));
+    assert_eq!(last["class"], "recorded", "{outcome}");
+    last.clone()
+}
+
+#[test]
+fn what_was_sent_is_in_the_file_once() {
+    let stage = Stage::new();
+    let others = sensors(&stage, &["--world=room", "--seed=3"]);
+    let file = stage.path("walk.mcap");
+    let outcome = stage.run(&["record", "--json", "--for=3s", "-o", &stage.word("walk.mcap")]);
+    let end = recorded(&outcome);
+    let recording = Recording::whole(&file);
+    let topics: BTreeSet<_> = recording.kept.iter().map(|kept| kept.topic.as_str()).collect();
+    let usual = ["telegram", "marks", "zones", "foreground", "status"];
+    let wanted = ["front", "rear"].map(|sensor| usual.map(|topic| format!("{sensor}/{topic}")));
+    assert_eq!(topics, wanted.iter().flatten().map(String::as_str).collect());
+    assert_eq!(number(&end, "samples"), recording.kept.len() as u64);
+    assert_eq!(number(&end, "bytes"), std::fs::metadata(&file).unwrap().len());
+    assert_eq!(number(&end, "left_out"), 0);
+    assert!(recording.kept.iter().all(|kept| kept.encoding == "scanhub"));
+    for line in outcome.of_class("summary") {
+        let topic = format!("{}/{}", line["sensor"].as_str().unwrap(), line["topic"].as_str().unwrap());
+        assert_eq!(number(&line, "received"), recording.of(&topic).len() as u64, "{line}");
+    }
+    for sensor in ["front", "rear"] {
+        let telegrams = recording.of(&format!("{sensor}/telegram"));
+        assert!(telegrams.len() > 30, "{} telegrams", telegrams.len());
+        unbroken(&telegrams);
+        let truth = stage.truth(sensor);
+        let sent: HashSet<_> = truth.iter().map(|sent| &sent.hash).collect();
+        assert!(telegrams.iter().all(|kept| sent.contains(&hash(kept.payload()))), "never sent");
+        for kept in &telegrams {
+            assert_eq!(
+                (kept.sequence, kept.schema.as_str()),
+                (kept.topic_seq() as u32, "scanhub.Telegram.v1")
+            );
+        }
+        // What came from one telegram has its time.
+        let times: BTreeMap<_, _> = telegrams.iter().map(|kept| (kept.seq(), kept.log_time)).collect();
+        let marks = recording.of(&format!("{sensor}/marks"));
+        let same = |kept: &&&Kept| times.get(&kept.seq()).is_none_or(|time| *time == kept.log_time);
+        assert_eq!(marks.iter().filter(same).count(), marks.len());
+    }
+    let [facts] = &recording.notes("scanhub")[..] else { panic!("{:?}", recording.notes) };
+    assert_eq!((facts["part"].as_str(), facts["started"].len()), ("1", 20), "{facts:?}");
+    let [life] = &recording.notes("scanhub.life")[..] else { panic!("{:?}", recording.notes) };
+    assert_eq!(life["hub_pid"], others[1].pid().to_string());
+}
+
+#[test]
+fn whatever_ends_it_the_file_is_finished() {
+    let stage = Stage::new();
+    let _others = sensors(&stage, &[]);
+    for signal in [INT, TERM, HUP] {
+        let outcome = recorder(&stage, &["--force", "*/telegram"], 30).end(signal);
+        let end = recorded(&outcome);
+        let recording = Recording::whole(&stage.path("walk.mcap"));
+        assert_eq!(number(&end, "samples"), recording.kept.len() as u64);
+        unbroken(&recording.of("front/telegram"));
+        unbroken(&recording.of("rear/telegram"));
+    }
+}
+
+#[test]
+fn a_kill_leaves_all_that_was_told() {
+    let stage = Stage::new();
+    let _others = sensors(&stage, &[]);
+    let mut recorder = recorder(&stage, &[], 1);
+    let told = await_samples(&mut recorder, 300);
+    assert_eq!(recorder.end(KILL).code, None);
+    let recording = Recording::left(&stage.path("walk.mcap"));
+    assert!(recording.kept.len() as u64 >= number(&told, "samples"), "{told}: {}", recording.kept.len());
+    unbroken(&recording.of("front/telegram"));
+    let Some(mut python) = python("mcap") else { return };
+    python.args(["tests/stage/read.py", "left", &stage.word("walk.mcap")]);
+    assert_eq!(said(python)["messages"], recording.kept.len());
+}
+
+/// What the reader of other people, which `python` starts, says.
+fn said(mut python: std::process::Command) -> Value {
+    let outcome = python.current_dir(env!("CARGO_MANIFEST_DIR")).output().unwrap();
+    assert!(outcome.status.success(), "{}", String::from_utf8_lossy(&outcome.stderr));
+    serde_json::from_slice(&outcome.stdout).unwrap()
+}
+
+#[test]
+fn ros_reads_the_scans_that_were_there() {
+    let stage = Stage::new();
+    let _others = sensors(&stage, &["--world=room", "--mode=0x01"]);
+    let outcome =
+        stage.run(&["record", "--all", "--ros2", "--for=2s", "--json", "-o", &stage.word("walk.mcap")]);
+    recorded(&outcome);
+    let recording = Recording::whole(&stage.path("walk.mcap"));
+    let (ours, theirs) = (recording.of("front/scan"), recording.of("/front/scan"));
+    assert!(ours.len() > 20 && ours.len() == theirs.len(), "{} {}", ours.len(), theirs.len());
+    assert!(theirs.iter().all(|kept| kept.encoding == "cdr" && kept.schema == "sensor_msgs/msg/LaserScan"));
+    let Some(mut python) = python("mcap, mcap_ros2") else { return };
+    python.args(["tests/stage/read.py", "scans", &stage.word("walk.mcap"), "/front/scan"]);
+    let said = said(python);
+    let said = said.as_array().unwrap();
+    assert_eq!(said.len(), ours.len());
+    for ((kept, theirs), said) in ours.iter().zip(&theirs).zip(said) {
+        assert_eq!((kept.sequence, kept.log_time), (theirs.sequence, theirs.log_time));
+        let mut scan = Scan::default();
+        assert!(scan.unpack(kept.payload()));
+        assert_eq!((&said["frame"], &said["intensities"]), (&"front".into(), &scan.intensities().into()));
+        let first = said["angle_min"].as_f64().unwrap() - (scan.angle_deg(0) - 90.0).to_radians();
+        let step =
+            said["angle_increment"].as_f64().unwrap() - (f64::from(scan.step_mdeg) / 1000.0).to_radians();
+        assert!(first.abs() < 1e-6 && step.abs() < 1e-6, "{said}");
+        let stamp = said["stamp_ns"].as_u64().unwrap();
+        assert_eq!(stamp, kept.log_time - scan.beam_age_ns(0));
+        let ranges = said["ranges_mm"].as_array().unwrap();
+        assert_eq!(ranges.len(), scan.beams());
+        for (i, range) in ranges.iter().enumerate() {
+            match scan.distance_mm(i) {
+                Some(mm) => assert_eq!(range.as_u64(), Some(mm.into()), "beam {i}"),
+                None => assert!(range == "inf" || range == "nan", "beam {i}: {range}"),
+            }
+        }
+    }
+}
+
+#[test]
+fn a_hub_that_comes_back_goes_on_in_the_file() {
+    let stage = Stage::new();
+    let [_simulator, hub] = sensors(&stage, &[]);
+    let mut recorder = recorder(&stage, &["*/telegram"], 30);
+    assert_eq!(hub.end(KILL).code, None);
+    recorder.await_line("hub_gone", |line| line["kind"] == "hub_gone");
+    // It has another sensor than before, which is recorded, too.
+    let other = stage.hub(&[stage.link("front"), stage.link("rear").replace("rear=", "back=")]);
+    recorder.await_line("hub_back", |line| line["kind"] == "hub_back");
+    stage.await_info("back", |info| info["state"] == "streaming");
+    stage::until("the new sensor is recorded", || stage.subscribers("back/telegram") > 0);
+    let before = number(&await_samples(&mut recorder, 1), "samples");
+    await_samples(&mut recorder, before + 200);
+    recorded(&recorder.end(TERM));
+    drop(other);
+    let recording = Recording::whole(&stage.path("walk.mcap"));
+    let telegrams = recording.of("front/telegram");
+    let boots: BTreeSet<_> = telegrams.iter().map(|kept| kept.boot()).collect();
+    let lives: BTreeSet<_> =
+        recording.notes("scanhub.life").iter().map(|life| life["boot"].clone()).collect();
+    assert_eq!((boots.len(), lives.len()), (2, 2));
+    assert_eq!(boots.iter().map(|boot| format!("{boot:016x}")).collect::<BTreeSet<_>>(), lives);
+    assert!(!recording.of("back/telegram").is_empty());
+}
+
+#[test]
+fn what_cannot_be_recorded_is_refused() {
+    let stage = Stage::new();
+    let file = stage.file("walk.mcap", "somebody's");
+    let kind = |arguments: &[&str]| {
+        let outcome = stage.run(&[&["record", "--json"], arguments].concat());
+        let lines = [outcome.lines(), stderr_lines(&outcome)].concat();
+        let error = lines.into_iter().find(is_class("error")).unwrap_or_else(|| panic!("{outcome}"));
+        (outcome.code, error["kind"].as_str().unwrap_or_default().to_owned())
+    };
+    assert_eq!(kind(&["-o", &file]), (Some(1), "failed".into()));
+    assert_eq!(std::fs::read(&file).unwrap(), b"somebody's");
+    assert_eq!(kind(&["-o", &stage.word("nowhere/walk.mcap")]), (Some(1), "failed".into()));
+    assert_eq!(kind(&["-o", "-", "--split", "1h"]), (Some(2), "usage".into()));
+    assert_eq!(kind(&["--keep", "3"]), (Some(2), "usage".into()));
+    assert_eq!(kind(&["--split", "3"]), (Some(2), "usage".into()));
+    assert_eq!(kind(&["robot/zones"]), (Some(78), "configuration".into()));
+    assert_eq!(kind(&["front/scam"]), (Some(3), "no_topic".into()));
+    // Nothing came, nothing stays.
+    let new = stage.word("new.mcap");
+    assert_eq!(kind(&["-o", &new, "--for", "5s"]), (Some(3), "no_hub".into()));
+    assert!(!Path::new(&new).exists());
+}
+
+fn stderr_lines(outcome: &Outcome) -> Vec<Value> {
+    outcome.errors.lines().filter_map(|line| serde_json::from_str(line).ok()).collect()
+}
