@@ -88,7 +88,7 @@ fn what_is_wrong_is_told_with_its_remedy() {
     assert_eq!(outcome.of_class("error")[0]["kind"], "check");
     assert_eq!(findings.iter().find(|line| line["port"] == front.as_str()).unwrap()["link"], "front");
 
-    let (findings, _) = doctor(&stage, &["--set", "link.front.angle=170"], 5);
+    let (findings, _) = doctor(&stage, &["--link=front=/dev/null", "--set", "link.front.angle=170"], 5);
     let (found, text) = state(&findings, "configuration", None);
     assert!(found == "failed" && text.contains("100 or 180"), "{text}");
 }
