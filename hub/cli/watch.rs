@@ -22,7 +22,8 @@ impl Watch {
         if everywhere.json || !can_show_pictures() {
             let sensor = self.sensors.first().map_or("robot/zones".to_owned(), |name| format!("{name}/scan"));
             let hint = format!("lines for files and programs: scanhub echo {sensor}, with --json as objects");
-            return Err(Failure::new(Kind::Usage, "the picture needs a terminal", hint));
+            let what = if everywhere.json { "a picture is no JSON" } else { "the picture needs a terminal" };
+            return Err(Failure::new(Kind::Usage, what, hint));
         }
         Ok(WatchOptions {
             sensors: self.sensors.clone(),

@@ -16,8 +16,14 @@ use super::view::View;
 /// Draws `scene` as `view` says.
 pub(crate) fn draw(frame: &mut Frame<'_>, scene: &Scene, view: &View) {
     let places = Places::of(frame.area(), scene);
-    frame.render_widget(heading(scene, view), places.heading);
-    frame.render_widget(over(scene), right(places.heading, over(scene).width()));
+    let heading = heading(scene, view, places.heading.width);
+    if let Some(over) =
+        over(scene).into_iter().find(|over| heading.width() + over.width() <= width(places.heading))
+    {
+        let place = right(places.heading, over.width());
+        frame.render_widget(over, place);
+    }
+    frame.render_widget(heading, places.heading);
     frame.render_widget(map(scene, view, (places.map.width, places.map.height)), places.map);
     frame.render_widget(Line::raw(measure(view.dot_m)), last_row(places.map));
     for (row, (number, sensor)) in places.sensors.rows().zip(listed(scene, view, places.sensors.height)) {
@@ -63,8 +69,9 @@ impl Places {
     }
 }
 
-/// The verdict, and what is nearest; in words, because colours say nothing to everybody.
-fn heading(scene: &Scene, view: &View) -> Line<'static> {
+/// The verdict, and what is nearest; in words, because colours say nothing to everybody. What has no room is left out whole:
+/// a number that is cut is another number.
+fn heading(scene: &Scene, view: &View, columns: u16) -> Line<'static> {
     let shown = view.shown(scene);
     let (verdict, whose, nearest) = verdict(shown.iter().map(|(_, sensor)| *sensor));
     let mut style = Style::new().add_modifier(Modifier::BOLD | Modifier::REVERSED);
@@ -81,17 +88,25 @@ fn heading(scene: &Scene, view: &View) -> Line<'static> {
     if let Some(mm) = nearest {
         spans.push(Span::raw(format!(", nearest {:.2} m", f64::from(mm) / 1000.0)));
     }
+    while spans.len() > 1 && spans.iter().map(Span::width).sum::<usize>() > usize::from(columns) {
+        spans.pop();
+    }
     Line::from(spans)
 }
 
-/// How the hub is.
-fn over(scene: &Scene) -> Line<'static> {
-    match (scene.hub_lives, scene.hub_pid, scene.hub_percent) {
-        (false, ..) => Line::styled(" no hub: waiting for it", Modifier::BOLD),
-        (true, 0, _) => Line::raw(" hub"),
-        (true, pid, None) => Line::raw(format!(" hub {pid}")),
-        (true, pid, Some(percent)) => Line::raw(format!(" hub {pid} {percent:.1} %")),
-    }
+/// How the hub is, the longest words first.
+fn over(scene: &Scene) -> Vec<Line<'static>> {
+    let percent = scene.hub_percent.map(|percent| format!(" {percent:.1} %")).unwrap_or_default();
+    let words = match (scene.hub_lives, scene.hub_pid) {
+        (false, _) => {
+            return [" no hub: waiting for it", " no hub"]
+                .map(|text| Line::styled(text, Modifier::BOLD))
+                .into();
+        }
+        (true, 0) => vec![" hub".to_owned()],
+        (true, pid) => vec![format!(" hub {pid}{percent}"), format!(" hub {pid}")],
+    };
+    words.into_iter().map(Line::raw).collect()
 }
 
 /// The sensors that have a line in `rows`: all, or those from the chosen one on.
@@ -101,7 +116,7 @@ fn listed<'a>(scene: &'a Scene, view: &View, rows: u16) -> impl Iterator<Item = 
     scene.sensors.iter().enumerate().skip(first)
 }
 
-/// A sensor in a line, the most needed first, because a narrow screen cuts it.
+/// A sensor in a line, the most needed first: what has no room on a narrow screen is left out whole.
 fn line(number: usize, sensor: &Sensor, view: &View, width: u16) -> Line<'static> {
     let dash = |text: Option<String>| text.unwrap_or_else(|| "-".to_owned());
     let hz = dash(sensor.meter.hz().map(|hz| format!("{hz:.1}")));
@@ -112,17 +127,24 @@ fn line(number: usize, sensor: &Sensor, view: &View, width: u16) -> Line<'static
     if sensor.scan.is_none() && !error.is_empty() {
         text += &format!(" {error}");
     } else {
-        text += &format!(" {hz:>5} Hz {age:>5} ms  lost {}", sensor.lost);
+        let mut fields =
+            vec![format!(" {hz:>5} Hz"), format!(" {age:>5} ms"), format!("  lost {}", sensor.lost)];
         if sensor.is_frozen() {
-            text += "  frozen";
+            fields.push("  frozen".to_owned());
         }
-        text += &format!("  suspect {}", sensor.count(Counter::Suspect));
+        fields.push(format!("  suspect {}", sensor.count(Counter::Suspect)));
         if width >= WIDE {
             let taught = sensor.background.map_or(0, |model| model.taught);
             let marks = sensor.marks.map(|marks| marks.marks().len().to_string());
             let objects = sensor.foreground.map(|foreground| foreground.segments().len().to_string());
-            text += &format!("  max {greatest} ms  marks {}  objects {}", dash(marks), dash(objects));
-            text += &format!("  background {taught}");
+            fields.extend([format!("  max {greatest} ms"), format!("  marks {}", dash(marks))]);
+            fields.extend([format!("  objects {}", dash(objects)), format!("  background {taught}")]);
+        }
+        for field in fields {
+            if text.chars().count() + field.chars().count() > usize::from(width) {
+                break;
+            }
+            text += &field;
         }
     }
     let is_shown = view.only.is_none_or(|only| only == number);
@@ -152,6 +174,10 @@ fn help(frame: &mut Frame<'_>, area: Rect) {
 fn right(row: Rect, width: usize) -> Rect {
     let width = row.width.min(width as u16);
     Rect { x: row.right() - width, width, ..row }
+}
+
+fn width(area: Rect) -> usize {
+    usize::from(area.width)
 }
 
 fn last_row(area: Rect) -> Rect {

@@ -194,6 +194,25 @@ fn colours_are_those_of_the_terminal() {
 }
 
 #[test]
+fn no_number_is_cut_on_a_narrow_screen() {
+    let (scene, view) = (scene(), View::new(false));
+    let of = |columns| text(&screen(&scene, &view, (columns, 20)));
+    let whole = of(120);
+    let heading = |columns| of(columns).lines().next().unwrap_or_default().trim_end().to_owned();
+    assert_eq!(heading(40), " SLOW  rear, nearest 0.69 m     hub 4711");
+    assert_eq!([heading(20), heading(19)], [" SLOW  rear hub 4711", " SLOW  rear"]);
+    let words: Vec<&str> = whole.split_whitespace().collect();
+    for columns in 20..120 {
+        let narrow = of(columns);
+        let lines: Vec<&str> = narrow.lines().collect();
+        let numbers = [0, lines.len() - 3, lines.len() - 2].map(|row| lines[row]).join(" ");
+        for word in numbers.split_whitespace().filter(|word| word.starts_with(|c: char| c.is_ascii_digit())) {
+            assert!(words.contains(&word), "{columns} columns: {word} of {numbers}");
+        }
+    }
+}
+
+#[test]
 fn no_screen_is_too_small() {
     let scene = scene();
     for size in [(1, 1), (2, 3), (10, 2), (60, 4), (300, 5), (5, 60)] {
