@@ -46,9 +46,12 @@ fn install(destination: &Path, words: &[&str]) -> (Option<i32>, String) {
 fn what_is_installed_is_taken_away_again() {
     let stage = Stage::new();
     let destination = stage.path("machine");
-    let program = env!("CARGO_BIN_EXE_scanhub");
+    let program = stage.word("a program");
+    std::os::unix::fs::symlink(env!("CARGO_BIN_EXE_scanhub"), &program).expect("a name with a blank");
+    let (code, text) = install(&destination, &["--program"]);
+    assert!(code == Some(2) && text.contains("--program needs a file"), "{text}");
     for _ in 0..2 {
-        let (code, text) = install(&destination, &["--program", program]);
+        let (code, text) = install(&destination, &["--program", &program]);
         assert_eq!(code, Some(0), "{text}");
     }
     let installed = files(&destination);

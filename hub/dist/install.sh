@@ -1,20 +1,25 @@
 #!/bin/sh
 # Puts the hub in place as a service of this machine, or takes it away again.
 #
-#   hub/dist/install.sh [--program FILE]     install; the program is target/release/scanhub if no other is named
+#   hub/dist/install.sh [--program FILE]     install; the program is target/release/scanhub, or that in CARGO_TARGET_DIR, if
+#                                            no other is named
 #   hub/dist/install.sh --remove             take away all that this script puts in place; configuration stays
 #
 # DESTDIR=DIR puts everything below DIR and starts nothing, for those who make packages.
 set -eu
 
 here=$(cd "$(dirname "$0")" && pwd)
-program=$here/../../target/release/scanhub
+program=${CARGO_TARGET_DIR:-$here/../../target}/release/scanhub
 action=install
 while [ $# -gt 0 ]; do
     case $1 in
-    --program) program=${2:?--program needs a file}; shift ;;
+    --program)
+        [ -n "${2:-}" ] || { echo "install.sh: --program needs a file" >&2; exit 2; }
+        program=$2
+        shift
+        ;;
     --remove) action=remove ;;
-    -h | --help) sed -n '2,7s/^# \{0,1\}//p' "$0"; exit 0 ;;
+    -h | --help) sed -n '2,8s/^# \{0,1\}//p' "$0"; exit 0 ;;
     *) echo "install.sh: $1? --program FILE, --remove" >&2; exit 2 ;;
     esac
     shift
@@ -25,18 +30,18 @@ if [ -z "$root" ] && [ "$(id -u)" != 0 ]; then
     exit 1
 fi
 
-# What goes where, with which mode.
+# What goes where, with which mode; the source last, for there may be blanks in it.
 files="
-$program usr/local/bin/scanhub 755
-$here/scanhub.service etc/systemd/system/scanhub.service 644
-$here/scanhub-gateway.service etc/systemd/system/scanhub-gateway.service 644
-$here/60-scanhub.rules etc/udev/rules.d/60-scanhub.rules 644
-$here/scanhub.sysusers etc/sysusers.d/scanhub.conf 644
-$here/scanhub.tmpfiles etc/tmpfiles.d/scanhub.conf 644
+usr/local/bin/scanhub 755 $program
+etc/systemd/system/scanhub.service 644 $here/scanhub.service
+etc/systemd/system/scanhub-gateway.service 644 $here/scanhub-gateway.service
+etc/udev/rules.d/60-scanhub.rules 644 $here/60-scanhub.rules
+etc/sysusers.d/scanhub.conf 644 $here/scanhub.sysusers
+etc/tmpfiles.d/scanhub.conf 644 $here/scanhub.tmpfiles
 "
 
 each() { # calls $1 with source, destination and mode of each file
-    echo "$files" | while read -r source destination mode; do
+    echo "$files" | while read -r destination mode source; do
         [ -z "$source" ] || "$1" "$source" "$root/$destination" "$mode"
     done
 }
