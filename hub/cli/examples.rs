@@ -4,9 +4,18 @@ use clap::Command;
 
 /// `command` with an example below the help of each verb.
 pub(super) fn with_examples(command: Command) -> Command {
-    EXAMPLES
-        .iter()
-        .fold(command, |command, (verb, lines)| command.mut_subcommand(verb, |verb| below(verb, lines)))
+    EXAMPLES.iter().fold(command, |command, (path, lines)| {
+        let path: Vec<&str> = path.split(' ').collect();
+        put(command, &path, lines)
+    })
+}
+
+/// `command` with `lines` below the help of its subcommand at `path`.
+fn put(command: Command, path: &[&str], lines: &[&str]) -> Command {
+    match path {
+        [] => below(command, lines),
+        [verb, rest @ ..] => command.mut_subcommand(verb, |verb| put(verb, rest, lines)),
+    }
 }
 
 fn below(verb: Command, lines: &[&str]) -> Command {
@@ -19,6 +28,7 @@ fn below(verb: Command, lines: &[&str]) -> Command {
     verb.after_help(text)
 }
 
+/// By the way to the verb.
 const EXAMPLES: &[(&str, &[&str])] = &[
     (
         "run",
@@ -55,6 +65,12 @@ const EXAMPLES: &[(&str, &[&str])] = &[
             "scanhub config show",
         ],
     ),
+    ("config default", &["scanhub config default > scanhub.toml"]),
+    ("config check", &["scanhub config check scanhub.toml"]),
+    (
+        "config show",
+        &["scanhub config show", "scanhub config show --config robot.toml --set link.front.angle=100"],
+    ),
     ("doctor", &["scanhub doctor", "scanhub doctor /dev/ttyUSB0", "scanhub doctor --clean"]),
     ("list", &["scanhub list"]),
     ("info", &["scanhub info front"]),
@@ -76,6 +92,11 @@ const EXAMPLES: &[(&str, &[&str])] = &[
         ],
     ),
     (
+        "telegram decode",
+        &["scanhub telegram decode recording.bin", "echo 02 00 01 00 31 15 12 | scanhub telegram decode"],
+    ),
+    ("telegram encode", &["scanhub telegram encode status"]),
+    (
         "convert",
         &[
             "scanhub convert killed.mcap whole.mcap",
@@ -94,7 +115,14 @@ const EXAMPLES: &[(&str, &[&str])] = &[
     ),
     ("control", &["scanhub control front pause"]),
     ("background", &["scanhub background front save front.json"]),
+    ("background show", &["scanhub background front show"]),
+    ("background reset", &["scanhub background front reset"]),
+    ("background freeze", &["scanhub background front freeze"]),
+    ("background thaw", &["scanhub background front thaw"]),
+    ("background save", &["scanhub background front save front.json"]),
+    ("background load", &["scanhub background front load front.json"]),
     ("zones", &["scanhub zones front mask --for 10s"]),
+    ("zones mask", &["scanhub zones front mask --for 10s"]),
     ("leds", &["scanhub leds front", "scanhub leds robot --led green=led0"]),
     ("gateway", &["scanhub gateway --interface eth0 --topic */zones --topic front/scan:every=4"]),
     ("listen", &["scanhub listen --interface eth0 --stats"]),
@@ -106,20 +134,37 @@ const EXAMPLES: &[(&str, &[&str])] = &[
 mod tests {
     use super::*;
 
+    /// The ways to all verbs below `command`.
+    fn paths(command: &Command, before: &str) -> Vec<String> {
+        let verbs = command.get_subcommands();
+        let ways = verbs.flat_map(|verb| {
+            let path = format!("{before}{}", verb.get_name());
+            let deeper = paths(verb, &format!("{path} "));
+            [vec![path], deeper].concat()
+        });
+        ways.collect()
+    }
+
     #[test]
     fn every_verb_has_an_example_that_can_be_read() {
         let command = crate::cli::command();
-        let verbs: Vec<_> = command.get_subcommands().map(|verb| verb.get_name().to_owned()).collect();
-        assert_eq!(verbs.len(), EXAMPLES.len(), "{verbs:?}");
-        for verb in &verbs {
-            let example = EXAMPLES.iter().find(|(name, _)| name == verb);
-            let (_, lines) = example.unwrap_or_else(|| panic!("{verb} has no example"));
+        let paths = paths(&command, "");
+        assert_eq!(paths.len(), EXAMPLES.len(), "{paths:?}");
+        for path in &paths {
+            let example = EXAMPLES.iter().find(|(way, _)| way == path);
+            let (_, lines) = example.unwrap_or_else(|| panic!("{path} has no example"));
             for line in *lines {
                 // What the shell would do with it is not the program's.
-                let words = line.split(['|', '>']).next().unwrap_or_default().split_whitespace();
-                let read = crate::cli::command().try_get_matches_from(words);
+                let mut parts = line.split(['|', '>']).map(str::trim);
+                let words = parts.find(|part| part.starts_with("scanhub")).unwrap_or_default();
+                let read = crate::cli::command().try_get_matches_from(words.split_whitespace());
                 let read = read.unwrap_or_else(|error| panic!("{line}: {error}"));
-                assert_eq!(read.subcommand_name(), Some(verb.as_str()), "{line}");
+                let mut matches = &read;
+                for verb in path.split(' ') {
+                    let (name, deeper) = matches.subcommand().unwrap_or_else(|| panic!("{line}: no {verb}"));
+                    assert_eq!(name, verb, "{line}");
+                    matches = deeper;
+                }
             }
         }
         command.debug_assert();
