@@ -133,7 +133,7 @@ fn what_is_short() {
         "descriptors for few consumers",
         "descriptors",
         "warning",
-        "ulimit -Hn",
+        "sudo prlimit --pid $$ --nofile=",
     );
     limited("ulimit -f 100").complain("files may not be long", "file-size", "failed", "ulimit -f unlimited");
     let unshare = ["unshare", "--mount", "--map-root-user"];

@@ -90,15 +90,19 @@ pub(crate) fn ask(
     if is_server {
         report.baud = report.status().and_then(|status| status.baud()).or(report.baud);
     }
-    if report.answers() { Ok(report) } else { Err(silence(source, &report)) }
+    if report.answers() { Ok(report) } else { Err(silence(source, first, &report)) }
 }
 
-/// Why a sensor that did not answer may have been silent.
-fn silence(source: &Source, report: &Report) -> Failure {
+/// Why a sensor that did not answer, at a port whose greatest rate is `first`, may have been silent.
+fn silence(source: &Source, first: Baud, report: &Report) -> Failure {
     let name = source.name();
     let came = match report.bytes {
         0 => "not a byte came".to_owned(),
         bytes => format!("{bytes} bytes came, no telegram in them"),
+    };
+    let rates = match first {
+        Baud::B500000 => "9600, 19200, 38400 or 500000 Bd",
+        _ => "9600, 19200 or 38400 Bd",
     };
     let (what, remedy) = match (report.baud, source) {
         (Some(_), Source::Tcp { .. }) => (
@@ -114,13 +118,26 @@ fn silence(source: &Source, report: &Report) -> Failure {
             "set the serial server to the sensor's rate, 8 bits, no parity; power, cable?",
         ),
         (None, _) if report.bytes == 0 => (
-            format!("{name}: no answer at 9600, 19200, 38400 or 500000 Bd; {came}"),
+            format!("{name}: no answer at {rates}; {came}"),
             "power, cable, jumper 7-8 for RS-422? after power-on a sensor takes up to a minute",
         ),
         (None, _) => (
-            format!("{name}: no answer at 9600, 19200, 38400 or 500000 Bd; {came}"),
+            format!("{name}: no answer at {rates}; {came}"),
             "another device, RS-232 against RS-422, or a wire too few?",
         ),
     };
     Failure::new(Kind::Timeout, what, remedy)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn rates_that_the_port_does_not_have_were_not_tried() {
+        let report = Inquiry::new(Baud::B38400, 0).report().clone();
+        let said = |first| silence(&Source::Tty("/dev/ttyS0".into()), first, &report).message;
+        assert!(said(Baud::B500000).contains("38400 or 500000 Bd; not a byte"));
+        assert!(said(Baud::B38400).contains("no answer at 9600, 19200 or 38400 Bd; not a byte"));
+    }
 }

@@ -25,7 +25,13 @@ pub(crate) fn leftovers(facts: &Facts) -> Finding {
         (Some(_), dead, _) => {
             Finding::ok(NAME, format!("{} died; the hub is tidying up", plural(dead as u64, "process")))
         }
-        (None, 0, 0) if facts.segments.is_empty() => Finding::ok(NAME, "none"),
+        (None, 0, 0) if facts.segments.is_empty() => match &facts.lock {
+            None => Finding::ok(NAME, "none"),
+            Some(lock) => {
+                let text = format!("none but {}, a lock of 16 bytes that the next hub takes", lock.display());
+                Finding::ok(NAME, text)
+            }
+        },
         (None, 0, alive) if alive > 0 => {
             Finding::ok(NAME, format!("none; {} waiting for a hub", plural(alive as u64, "consumer")))
         }
@@ -129,6 +135,8 @@ mod tests {
     #[test]
     fn what_dead_processes_left_is_told_and_waiting_consumers_are_not() {
         says(&leftovers(&facts()), State::Ok, &["none"]);
+        let lock = Facts { lock: Some("/dev/shm/sh_a_lock".into()), ..facts() };
+        says(&leftovers(&lock), State::Ok, &["none but /dev/shm/sh_a_lock", "16 bytes"]);
         let nodes = |alive, dead| Facts { nodes: Ok(Nodes { alive, dead }), segments: segments(), ..facts() };
         says(&leftovers(&nodes(3, 0)), State::Ok, &["3 consumers waiting"]);
         let words = [

@@ -12,8 +12,8 @@ pub(crate) fn descriptors(facts: &Facts) -> Finding {
     const NAME: &str = "descriptors";
     let Some(limit) = facts.descriptors else { return Finding::ok(NAME, "no limit") };
     let own = facts.open + DESCRIPTORS_AT_START + needed_descriptors(facts.links);
-    let remedy =
-        "raise the hard limit: ulimit -Hn, LimitNOFILE= of a service, --ulimit nofile= of a container";
+    let remedy = "raise the hard limit: of this shell sudo prlimit --pid $$ --nofile=65536:65536, of a service LimitNOFILE=65536, \
+         of a container --ulimit nofile=65536";
     let Some(rest) = limit.checked_sub(own) else {
         let text = format!("{limit} at most, the hub needs {own}");
         return Finding::failed(NAME, text, remedy);

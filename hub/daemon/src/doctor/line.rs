@@ -255,14 +255,15 @@ fn rate(subject: &Subject, port: &Port, first: Baud) -> Finding {
             NAME,
             error.to_string(),
             format!(
-                "set a rate that it can: link.{}.baud = 38400; or take an adapter with an FT232R or newer",
+                "a rate that it can: --set link.{}.baud=38400; or take an adapter with an FT232R or newer",
                 link.name
             ),
         ),
         (Err(error), None) => Finding::warning(
             NAME,
             error.to_string(),
-            "at 38400 Bd a sensor sends 5 scans a second instead of 37; an adapter with an FT232R or newer does it",
+            "at 38400 Bd (--set link.NAME.baud=38400) a sensor sends 5 scans a second instead of 37; an adapter with an \
+             FT232R or newer does it",
         ),
     }
 }

@@ -45,6 +45,8 @@ pub(crate) struct Facts {
     pub(crate) nodes: Result<Nodes, Failure>,
     /// Files in shared memory that may be the domain's and that nobody holds.
     pub(crate) segments: Vec<Segment>,
+    /// The library's lock there, which the end of a hub leaves, and the next one takes.
+    pub(crate) lock: Option<PathBuf>,
     /// Hard limit of open descriptors; none: no limit.
     pub(crate) descriptors: Option<u64>,
     /// How many this process has open, as would a hub that was started in its place.
@@ -110,6 +112,7 @@ impl Facts {
                 .collect(),
             nodes,
             segments: if is_empty { segments::abandoned(&domain.prefix(), user) } else { Vec::new() },
+            lock: if is_empty { segments::lock(&domain.prefix(), user) } else { None },
             descriptors: getrlimit(Resource::Nofile).maximum,
             file_size: getrlimit(Resource::Fsize).current,
         }
@@ -152,7 +155,7 @@ impl Place {
 pub(crate) fn memory(facts: &Facts) -> Finding {
     const NAME: &str = "memory";
     let Some(Memory { size, free, free_files, is_read_only }) = facts.memory else {
-        let remedy = format!("mount a tmpfs there: mount -t tmpfs -o size=64M tmpfs {SHARED_MEMORY}");
+        let remedy = format!("mount a tmpfs there: sudo mount -t tmpfs -o size=64M tmpfs {SHARED_MEMORY}");
         return Finding::failed(NAME, format!("{SHARED_MEMORY} cannot be looked at"), remedy);
     };
     if is_read_only {
@@ -179,7 +182,9 @@ pub(crate) fn memory(facts: &Facts) -> Finding {
     let remedy = if size >= needed {
         format!("free some of {SHARED_MEMORY}")
     } else {
-        format!("make it larger: mount -o remount,size=64M {SHARED_MEMORY}; of a container by --shm-size=64m")
+        format!(
+            "make it larger: sudo mount -o remount,size=64M {SHARED_MEMORY}; of a container by --shm-size=64m"
+        )
     };
     Finding::failed(NAME, text, remedy)
 }
@@ -289,6 +294,7 @@ pub(super) mod tests {
             closed: Vec::new(),
             nodes: Ok(Nodes::default()),
             segments: Vec::new(),
+            lock: None,
             descriptors: Some(4096),
             open: 4,
             file_size: None,

@@ -42,6 +42,12 @@ pub(crate) fn abandoned(prefix: &str, user: u32) -> Vec<Segment> {
     files
 }
 
+/// The lock of the library's that nobody holds, if it is there.
+pub(crate) fn lock(prefix: &str, user: u32) -> Option<PathBuf> {
+    let short = files(prefix, user).into_iter().filter(|file| file.bytes <= ALWAYS_LEFT);
+    short.map(|file| file.path).find(|path| is_unheld(path))
+}
+
 /// One lock of the library's is never removed, and has 16 bytes.
 const ALWAYS_LEFT: u64 = 16;
 
@@ -60,6 +66,7 @@ mod tests {
         drop(file);
         let short = PathBuf::from(format!("{SHARED_MEMORY}/{prefix}b"));
         fs::write(&short, "16 bytes are few").unwrap();
+        assert_eq!(lock(&prefix, user), Some(short.clone()));
         let (closed, other) = (abandoned(&prefix, user), abandoned(&prefix, user + 1));
         let all = (files(&prefix, user).len(), unheld(&prefix, user).len());
         fs::remove_file(&path).unwrap();

@@ -16,8 +16,9 @@ pub(crate) fn examine(port: &str, report: &Report, link: Option<&Link>) -> Vec<F
     let mut told =
         Status { mode: report.status().map_or(Status::MODE_UNKNOWN, |it| it.mode().0), ..Status::default() };
     told.set_port(port);
-    let mut findings =
-        vec![answer(report), settings(port, report, link), power_on(port, report), health(report)];
+    let mut findings = vec![answer(report)];
+    findings.extend(settings(port, report, link));
+    findings.extend([power_on(port, report), health(report)]);
     findings.extend(marks(&told, ""));
     findings
 }
@@ -78,11 +79,11 @@ fn answer(report: &Report) -> Finding {
     Finding::ok(NAME, text)
 }
 
-/// Whether unit and variant are those of the configuration.
-fn settings(port: &str, report: &Report, link: Option<&Link>) -> Finding {
+/// Whether type and unit are those of the configuration: a finding of each that is not.
+fn settings(port: &str, report: &Report, link: Option<&Link>) -> Vec<Finding> {
     const NAME: &str = "settings";
     let Some(status) = report.status() else {
-        return Finding::warning(NAME, "it does not tell its settings", "power it off and on again");
+        return vec![Finding::warning(NAME, "it does not tell its settings", "power it off and on again")];
     };
     let text = format!(
         "{}, {}, measuring mode {:02x}h",
@@ -95,24 +96,25 @@ fn settings(port: &str, report: &Report, link: Option<&Link>) -> Finding {
     if let Some((expected, is)) = link.and_then(|link| link.family).zip(family)
         && expected != is
     {
-        wrong.push((
+        wrong.push(Finding::warning(
+            NAME,
             format!("the configuration says type {}, it is a {}", expected.name(), is.name()),
-            "correct the type in the configuration, or plug in the other sensor".to_owned(),
+            "correct the type in the configuration, or plug in the other sensor",
         ));
     }
     if let Some((expected, is)) = link.and_then(|link| link.unit).zip(status.unit())
         && expected != is
     {
-        wrong.push((
-            format!("the configuration says unit {} mm", expected.mm()),
+        wrong.push(Finding::warning(
+            NAME,
+            format!("{text}; the configuration says unit {} mm", expected.mm()),
             format!("scanhub configure {port} unit={}, or correct the configuration", word(expected)),
         ));
     }
     if wrong.is_empty() {
-        return Finding::ok(NAME, text);
+        return vec![Finding::ok(NAME, text)];
     }
-    let (whats, remedies): (Vec<_>, Vec<_>) = wrong.into_iter().unzip();
-    Finding::warning(NAME, format!("{text}; {}", whats.join("; ")), remedies.join("; "))
+    wrong
 }
 
 /// Whether a former owner has changed the rate at which it comes up, or left it in installation mode.
@@ -328,14 +330,12 @@ mod tests {
             baud: Baud::B500000,
             processing: Default::default(),
         };
-        let finding = settings("/dev/ttyUSB0", &report(healthy(), 0x10, &[]), Some(&link));
-        let text = finding.to_string();
-        assert_eq!(finding.state, Verdict::Warning, "{text}");
-        assert!(
-            text.contains("type lms291, it is a lms200") && text.contains("configure /dev/ttyUSB0 unit=cm"),
-            "{text}"
-        );
-        assert_eq!(settings("/dev/ttyUSB0", &report(healthy(), 0x10, &[]), None).state, Verdict::Ok);
+        let judged = |link| settings("/dev/ttyUSB0", &report(healthy(), 0x10, &[]), link);
+        let [kind, unit] = &judged(Some(&link))[..] else { panic!("two are wrong") };
+        assert!(kind.state == Verdict::Warning && unit.state == Verdict::Warning, "{kind} {unit}");
+        assert!(kind.finding.contains("type lms291, it is a lms200"), "{kind}");
+        assert!(unit.remedy.contains("configure /dev/ttyUSB0 unit=cm"), "{unit}");
+        assert_eq!(judged(None).iter().map(|finding| finding.state).collect::<Vec<_>>(), [Verdict::Ok]);
     }
 
     #[test]
