@@ -42,10 +42,11 @@ pub(crate) fn abandoned(prefix: &str, user: u32) -> Vec<Segment> {
     files
 }
 
-/// The lock of the library's that nobody holds, if it is there.
+/// The lock of the library's, if it alone is there. It is never held open: beside others it is that of a hub that lives.
 pub(crate) fn lock(prefix: &str, user: u32) -> Option<PathBuf> {
-    let short = files(prefix, user).into_iter().filter(|file| file.bytes <= ALWAYS_LEFT);
-    short.map(|file| file.path).find(|path| is_unheld(path))
+    let files = files(prefix, user);
+    let is_alone = files.iter().all(|file| file.bytes <= ALWAYS_LEFT);
+    files.into_iter().map(|file| file.path).find(|path| is_alone && is_unheld(path))
 }
 
 /// One lock of the library's is never removed, and has 16 bytes.
@@ -66,10 +67,11 @@ mod tests {
         drop(file);
         let short = PathBuf::from(format!("{SHARED_MEMORY}/{prefix}b"));
         fs::write(&short, "16 bytes are few").unwrap();
-        assert_eq!(lock(&prefix, user), Some(short.clone()));
+        let beside = lock(&prefix, user);
         let (closed, other) = (abandoned(&prefix, user), abandoned(&prefix, user + 1));
         let all = (files(&prefix, user).len(), unheld(&prefix, user).len());
         fs::remove_file(&path).unwrap();
+        assert_eq!((beside, lock(&prefix, user)), (None, Some(short.clone())));
         fs::remove_file(&short).unwrap();
         assert_eq!((open, other), (Vec::new(), Vec::new()));
         assert_eq!(closed, [Segment { path, bytes: 64 }]);
