@@ -20,7 +20,6 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::thread::{self, JoinHandle};
 use std::time::{Duration, Instant};
 
-use rustix::process::{getpriority_process, setpriority_process};
 use schema::{Domain, Failure, Header, Kind};
 
 use crate::account::Account;
@@ -120,7 +119,6 @@ pub fn record(
     let writing = thread::Builder::new().name("disk".into()).spawn(move || disk.run());
     let writing = writing
         .map_err(|error| Failure::new(Kind::Short, format!("no thread: {error}"), "see `ulimit -u`"))?;
-    go_first();
     let (names, topics) = (selection.names(), selection.topics());
     let end = begun
         .and_then(|()| follow_topics(&names, &topics, &options.places, &options.bounds, stop, &mut recorder));
@@ -187,17 +185,6 @@ fn facts(options: &RecordOptions, wall_ns: u64) -> BTreeMap<String, String> {
     ];
     facts.map(|(key, value)| (key.to_owned(), value.to_owned())).into()
 }
-
-/// Runs the calling thread before other programs, where that is permitted and nobody has said how it shall run: four
-/// samples of most topics wait for it and no more, which on a machine that is too busy is not enough for its turn.
-fn go_first() {
-    if getpriority_process(None) == Ok(0) {
-        let _ = setpriority_process(None, FIRST);
-    }
-}
-
-/// As `nice` has it.
-const FIRST: i32 = -10;
 
 /// A sample that is kept for the next file.
 struct Kept {
