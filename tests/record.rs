@@ -189,6 +189,28 @@ fn a_hub_that_comes_back_goes_on_in_the_file() {
 }
 
 #[test]
+fn what_receives_comes_before_other_programs() {
+    let trial = std::process::Command::new("nice").args(["-n", "-10", "nice"]).output();
+    if !trial.is_ok_and(|outcome| outcome.stdout == b"-10\n") {
+        eprintln!("skipped: nobody may go before others here (see `ulimit -e`)");
+        return;
+    }
+    let stage = Stage::new();
+    let _others = sensors(&stage, &[]);
+    let recorder = recorder(&stage, &["front/telegram"], 1);
+    // proc(5): the nineteenth field, of which the second may have blanks.
+    let nice = |task: &str| {
+        let stat = std::fs::read_to_string(format!("/proc/{}/task/{task}/stat", recorder.pid())).unwrap();
+        let (name, fields) = stat.rsplit_once(") ").unwrap();
+        (name.ends_with("(disk"), fields.split(' ').nth(16).unwrap().to_owned())
+    };
+    assert_eq!(nice(&recorder.pid().to_string()).1, "-10");
+    let tasks = std::fs::read_dir(format!("/proc/{}/task", recorder.pid())).unwrap();
+    let tasks: Vec<_> = tasks.map(|task| nice(&task.unwrap().file_name().to_string_lossy())).collect();
+    assert!(tasks.contains(&(true, "0".into())), "{tasks:?}");
+}
+
+#[test]
 fn what_cannot_be_recorded_is_refused() {
     let stage = Stage::new();
     let file = stage.file("walk.mcap", "somebody's");

@@ -5,9 +5,9 @@ mod stage;
 
 use std::collections::BTreeMap;
 use std::fs;
-use std::io::Read;
+use std::io::{self, Read};
 use std::path::{Path, PathBuf};
-use std::process::Command;
+use std::process::{Command, Stdio};
 use std::thread;
 
 use serde_json::Value;
@@ -193,6 +193,59 @@ fn what_cannot_be_held_is_left_out_and_said() {
     };
     let told: u64 = recording.notes("scanhub.gap").iter().map(left_out).sum();
     assert_eq!(told, number(&end, "left_out"));
+}
+
+#[test]
+fn signals_that_come_together_are_one() {
+    let stage = Stage::new();
+    let _others = sensor(&stage);
+    // So little room that it waits for who reads, also at its end.
+    let pipe = stage.path("pipe");
+    assert!(Command::new("mkfifo").arg(&pipe).status().unwrap().success());
+    let open = fs::File::options().read(true).write(true).open(&pipe).unwrap();
+    rustix::pipe::fcntl_setpipe_size(&open, 4096).unwrap();
+    let shell = format!("exec \"$@\" 2>&1 > {}", pipe.display());
+    let mut recorder = start_in(&stage, &["sh", "-c", &shell, "sh"], &["record", "--json", "-o", "-"]);
+    recorder.await_line("its begin", is_class("recording"));
+    let mut reader = fs::File::open(&pipe).unwrap();
+    drop(open);
+    until("it receives", || stage.subscribers("front/status") > 0);
+    recorder.await_lines(2, "its progress", is_class("recording"));
+    recorder.signal(INT);
+    recorder.await_line("nothing is received any more", is_class("summary"));
+    recorder.signal(INT);
+    let read = thread::spawn(move || {
+        let mut bytes = Vec::new();
+        reader.read_to_end(&mut bytes).map(|_| bytes)
+    });
+    let outcome = recorder.wait();
+    assert_eq!(outcome.code, Some(0), "{outcome}");
+    let bytes = read.join().unwrap().unwrap();
+    assert!(bytes.len() > 4096 && bytes.ends_with(b"\x89MCAP0\r\n"), "{} bytes", bytes.len());
+}
+
+#[test]
+fn what_cannot_be_begun_leaves_nothing_behind() {
+    let stage = Stage::new();
+    let limited = ["sh", "-c", "ulimit -f 0; exec \"$@\"", "sh"];
+    let outcome = start_in(&stage, &limited, &["record", "--json", "-o", &stage.word("walk.mcap")]).wait();
+    assert_eq!(outcome.code, Some(1), "{outcome}");
+    assert!(!stage.path("walk.mcap").exists());
+    // What is no file of its own stays.
+    std::os::unix::fs::symlink("/dev/null", stage.path("nothing")).unwrap();
+    let outcome = stage.run(&["record", "--json", "--force", "--for=5s", "-o", &stage.word("nothing")]);
+    assert_eq!(outcome.of_class("error")[0]["kind"], "no_hub", "{outcome}");
+    assert!(fs::symlink_metadata(stage.path("nothing")).is_ok());
+}
+
+#[test]
+fn a_reader_that_is_gone_is_a_quiet_end() {
+    let stage = Stage::new();
+    let (reader, writer) = io::pipe().unwrap();
+    drop(reader);
+    let outcome = stage.command(&["record", "-o", "-"]).stdout(writer).stderr(Stdio::piped()).output();
+    let outcome = outcome.unwrap();
+    assert_eq!((outcome.status.code(), String::from_utf8_lossy(&outcome.stderr).as_ref()), (Some(0), ""));
 }
 
 /// The program, started by other words before its own.

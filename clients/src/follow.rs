@@ -148,6 +148,8 @@ struct Run<'a> {
     hub_seen: Option<Instant>,
     /// Since when there is a hub, and not only a listener, as far as it was looked at.
     hub_lives_since: Option<Instant>,
+    /// When it was looked last which sensors there are.
+    asked_at: Option<Instant>,
     waiting_said: bool,
     received: u64,
 }
@@ -174,6 +176,7 @@ impl<'a> Run<'a> {
             last_sample: now,
             hub_seen: None,
             hub_lives_since: None,
+            asked_at: None,
             waiting_said: false,
             received: 0,
         }

@@ -20,6 +20,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::thread::{self, JoinHandle};
 use std::time::{Duration, Instant};
 
+use rustix::process::{getpriority_process, setpriority_process};
 use schema::{Domain, Failure, Header, Kind};
 
 use crate::account::Account;
@@ -95,7 +96,10 @@ pub fn record(
 ) -> Result<(), Failure> {
     let selection = Selection::parse(&options.topics, options.everything, options.ros2)?;
     let queue = Arc::new(Queue::new());
-    let disk = begin(options, &queue)?;
+    let disk = match begin(options, &queue) {
+        Ok(disk) => disk,
+        Err(end) => return quiet(Err(end)),
+    };
     let first = disk.path();
     let over = AtomicBool::new(false);
     let (mut out, mut notes) = (Spare::new(out, &over), Spare::new(notes, &over));
@@ -116,6 +120,7 @@ pub fn record(
     let writing = thread::Builder::new().name("disk".into()).spawn(move || disk.run());
     let writing = writing
         .map_err(|error| Failure::new(Kind::Short, format!("no thread: {error}"), "see `ulimit -u`"))?;
+    go_first();
     let (names, topics) = (selection.names(), selection.topics());
     let end = begun
         .and_then(|()| follow_topics(&names, &topics, &options.places, &options.bounds, stop, &mut recorder));
@@ -124,13 +129,13 @@ pub fn record(
     let finished = recorder.finish(writing, stop);
     if is_empty && !options.is_to_stdout() && matches!(end, Err(End::Failure(_))) {
         // A hub or sensor that is not there leaves nothing behind.
-        let _ = fs::remove_file(first);
+        files::discard(&first);
     }
     quiet(end).and(quiet(finished))
 }
 
 /// The first file.
-fn begin(options: &RecordOptions, queue: &Arc<Queue>) -> Result<Disk, Failure> {
+fn begin(options: &RecordOptions, queue: &Arc<Queue>) -> Result<Disk, End> {
     let wall_ns = clock::wall_ns();
     let usual = files::usual_name(wall_ns);
     let path = options.file.as_deref().unwrap_or(&usual);
@@ -144,11 +149,11 @@ fn begin(options: &RecordOptions, queue: &Arc<Queue>) -> Result<Disk, Failure> {
     };
     let files = match options.is_to_stdout() {
         true if options.split.is_some() => {
-            return Err(Failure::new(Kind::Usage, "stdout has no parts", "leave --split away"));
+            return Err(Failure::new(Kind::Usage, "stdout has no parts", "leave --split away").into());
         }
         true if io::stdout().is_terminal() => {
             let hint = "for example `scanhub record -o - | ssh host 'cat > walk.mcap'`";
-            return Err(Failure::new(Kind::Usage, "a recording is nothing for a terminal", hint));
+            return Err(Failure::new(Kind::Usage, "a recording is nothing for a terminal", hint).into());
         }
         true => Err(File::from(io::stdout().as_fd().try_clone_to_owned().map_err(failed)?)),
         false => {
@@ -156,13 +161,17 @@ fn begin(options: &RecordOptions, queue: &Arc<Queue>) -> Result<Disk, Failure> {
             if fs::metadata(path).is_ok_and(|place| place.file_type().is_fifo()) {
                 let hint = format!("the shell opens it: scanhub record -o - > {}", path.display());
                 let what = format!("{} is a pipe", path.display());
-                return Err(Failure::new(Kind::Failed, what, hint));
+                return Err(Failure::new(Kind::Failed, what, hint).into());
             }
             Ok(Files::new(path, options.split.is_some(), options.force, options.keep))
         }
     };
     let profile = if options.ros2 { ros2::PROFILE } else { "" };
-    Disk::begin(queue.clone(), files, options.split, profile, facts(options, wall_ns)).map_err(failed)
+    let begun = Disk::begin(queue.clone(), files, options.split, profile, facts(options, wall_ns));
+    begun.map_err(|error| match error.kind() {
+        ErrorKind::BrokenPipe => End::ReaderGone,
+        _ => failed(error).into(),
+    })
 }
 
 /// What the recording says of itself.
@@ -179,8 +188,23 @@ fn facts(options: &RecordOptions, wall_ns: u64) -> BTreeMap<String, String> {
     facts.map(|(key, value)| (key.to_owned(), value.to_owned())).into()
 }
 
+/// Runs the calling thread before other programs, where that is permitted and nobody has said how it shall run: four
+/// samples of most topics wait for it and no more, which on a machine that is too busy is not enough for its turn.
+fn go_first() {
+    if getpriority_process(None) == Ok(0) {
+        let _ = setpriority_process(None, FIRST);
+    }
+}
+
+/// As `nice` has it.
+const FIRST: i32 = -10;
+
 /// A sample that is kept for the next file.
-type Kept = (Header, Vec<u8>);
+struct Kept {
+    came_at: Instant,
+    header: Header,
+    payload: Vec<u8>,
+}
 
 struct Recorder<'a> {
     selection: &'a Selection,
@@ -239,8 +263,11 @@ impl Recorder<'_> {
         stop.store(false, Ordering::Relaxed);
         let told = self.end_gap();
         self.queue.end();
+        let ended_at = Instant::now();
         while !writing.is_finished() {
-            if stop.load(Ordering::Relaxed) {
+            if ended_at.elapsed() < SAME_WISH {
+                stop.store(false, Ordering::Relaxed);
+            } else if stop.load(Ordering::Relaxed) {
                 let what = "the disk did not take the end of the recording yet, and nobody waited for it";
                 return Err(Failure::new(Kind::Failed, what, REPAIR).into());
             }
@@ -303,5 +330,7 @@ impl Sink for Recorder<'_> {
 
 /// So often it is looked what the writing thread says.
 const LOOK_EVERY: Duration = Duration::from_millis(50);
+/// Signals that come together are one wish to stop: a shell that loses its terminal sends another SIGHUP than the terminal.
+const SAME_WISH: Duration = Duration::from_secs(1);
 /// What can be done with a file that has no end.
 const REPAIR: &str = "what is in the file can be read; `scanhub convert` gives it an index";

@@ -46,6 +46,10 @@ impl<W: Write + AsFd> Write for Spare<'_, W> {
         match self.to.write(bytes) {
             // Somebody set it so that it does not wait.
             Err(error) if error.kind() == ErrorKind::WouldBlock => Ok(bytes.len()),
+            // A log on a full disk is no reason to end.
+            Err(error) if error.kind() != ErrorKind::BrokenPipe && !self.stop.load(Ordering::Relaxed) => {
+                Ok(bytes.len())
+            }
             other => other,
         }
     }
@@ -81,6 +85,16 @@ mod tests {
         reader.read_to_end(&mut all).unwrap();
         assert!(all.len() >= line.len() && all.len() < 1000 * line.len(), "{}", all.len());
         assert_eq!(all.len() % line.len(), 0);
+    }
+
+    #[test]
+    fn a_log_on_a_full_disk_is_told_at_the_end() {
+        let mut full = std::fs::File::options().write(true).open("/dev/full").unwrap();
+        let stop = AtomicBool::new(false);
+        let mut spare = Spare::new(&mut full, &stop);
+        spare.write_all(b"x").unwrap();
+        stop.store(true, Ordering::Relaxed);
+        assert_eq!(spare.write_all(b"x").unwrap_err().kind(), ErrorKind::StorageFull);
     }
 
     #[test]

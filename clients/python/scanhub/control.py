@@ -63,7 +63,9 @@ class _Client:
     def ask(self, verb: int) -> bytes:
         """What the hub answers, without its head."""
         request = layout.Request(verb=verb)
-        ctypes.memmove(request.sensor_text, self._sensor.encode(), len(self._sensor))
+        # The hub has none with a longer name.
+        name = self._sensor.encode()[: len(request.sensor_text)]
+        request.sensor_text[: len(name)] = name
         try:
             pending = self._client.send_copy(request)
             if pending.number_of_server_connections == 0:

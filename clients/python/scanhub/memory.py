@@ -4,6 +4,8 @@ why somebody waits, and what a sample says."""
 from __future__ import annotations
 
 import ctypes
+import gc
+import os
 import time
 from typing import Any
 
@@ -138,6 +140,16 @@ class Wakeups:
         except (iox2.ListenerWaitError, iox2.WaitSetRunError) as error:
             if "Interrupt" not in str(error):
                 raise Short(f"cannot wait for the hub: {error}", "`ulimit -n` may be too small") from None
+
+
+def _keep_the_parents() -> None:
+    """What a child has of its parent is never given back by it, not even at its end: the parent would get no more."""
+    for found in gc.get_objects():
+        if type(found) in (Membership, Received, Port, Wakeups):
+            ctypes.pythonapi.Py_IncRef(ctypes.py_object(found))
+
+
+os.register_at_fork(after_in_child=_keep_the_parents)
 
 
 def topics(domain: Domain) -> list[TopicName]:

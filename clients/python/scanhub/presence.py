@@ -3,12 +3,13 @@ domain may be at; opens nothing else there."""
 
 from __future__ import annotations
 
+import errno
 import fcntl
 import os
 import struct
 import time
 
-from .errors import Denied, Failure, NoHub
+from .errors import Denied, Failure, NoHub, Short
 from .names import Domain
 
 LOOK_EVERY = 0.1
@@ -25,7 +26,7 @@ class Presence:
         self._places = places
         self._holder: tuple[Domain, int] | None = None
         self._looked_at = float("-inf")
-        self.denied: Denied | None = None
+        self.denied: Denied | Short | None = None
 
     def look(self) -> tuple[bool, bool]:
         """Looks again, if the last look is long enough ago; whether one went, and whether one came."""
@@ -59,6 +60,12 @@ class Presence:
                 except PermissionError:
                     self.denied = denied(place.root)
                     break
+                except OSError as error:
+                    if error.errno not in (errno.EMFILE, errno.ENFILE):
+                        raise
+                    # Nothing is known then, and who is there already goes on.
+                    self.denied = Short(f"cannot look for a hub: {error}", "`ulimit -n` may be too small")
+                    return self._holder
                 if pid:
                     return place, pid
         return None

@@ -54,6 +54,11 @@ def refusals_are_the_hubs() -> None:
         raise AssertionError("there is no such sensor")
     except scanhub.NoTopic as refused:
         assert "rear" in refused.message and "front" in refused.remedy, refused
+    try:
+        scanhub.control("robot-with-a-long-name.the-front-one", "resume", domain=domain, root=root)
+        raise AssertionError("no other machine's sensor takes orders here")
+    except scanhub.NoTopic as refused:
+        assert "robot-with" in refused.message, refused
 
 
 for check in (models_are_shown_and_ordered, the_flow_is_ordered, refusals_are_the_hubs):

@@ -11,6 +11,7 @@ import time
 import iceoryx2 as iox2
 import scanhub
 from scanhub import layout, memory, names
+from scanhub.presence import LOOK_EVERY, Presence
 
 
 def refusal(error: type, what) -> scanhub.Failure:
@@ -120,6 +121,14 @@ def what_is_short() -> None:
     said = refusal(scanhub.Short, lambda: follow("front/scan", "front/marks", timeout=1))
     resource.setrlimit(resource.RLIMIT_NOFILE, before)
     assert "descriptors are short" in said.message and "ulimit -n" in said.remedy, said
+    follower, looker = scanhub.subscribe("front/scan", domain=domain, root=root, timeout=1), Presence([place])
+    looker.look()
+    time.sleep(LOOK_EVERY)
+    resource.setrlimit(resource.RLIMIT_NOFILE, (3, before[1]))
+    said, news = refusal(scanhub.Short, lambda: next(follower)), looker.look()
+    resource.setrlimit(resource.RLIMIT_NOFILE, before)
+    assert "cannot look for a hub" in said.message and "ulimit -n" in said.remedy, said
+    assert (news, looker.domain) == ((False, False), place), "who is there already goes on"
 
 
 domain, root = sys.argv[1:]

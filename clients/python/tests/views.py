@@ -1,6 +1,7 @@
 """Where the arrays of a sample lie, and how long they stay: arguments are domain and root. `front` has to stream."""
 
 import gc
+import os
 import sys
 import threading
 import time
@@ -91,6 +92,20 @@ def other_threads_run_meanwhile(scans: scanhub.Subscription) -> None:
     assert turns[0] > 10 and used < 0.4, (turns, used)
 
 
+def a_child_takes_nothing_from_its_parent(scans: scanhub.Subscription) -> None:
+    scan = next(scans)
+    kept, before = scan.ranges, scan.ranges.copy()
+    child = os.fork()
+    if child == 0:
+        del scan, kept, scans
+        # Ends as a program does, not as multiprocessing lets it.
+        sys.exit(0)
+    assert os.waitpid(child, 0)[1] == 0
+    for _ in range(20):
+        next(scans)
+    assert np.array_equal(kept, before)
+
+
 def what_is_closed_ends(scans: scanhub.Subscription) -> None:
     with scans:
         scan = next(scans)
@@ -105,6 +120,7 @@ for check in (
     a_view_keeps_its_sample,
     four_may_be_kept_and_no_more,
     other_threads_run_meanwhile,
+    a_child_takes_nothing_from_its_parent,
     what_is_closed_ends,
 ):
     check(scanhub.subscribe("front/scan", domain=domain, root=root, timeout=20))

@@ -12,6 +12,8 @@ use crate::presence::GRACE;
 
 /// Sensors of other machines that are there have been announced after so long: it is done once a second.
 const ANNOUNCED: Duration = Duration::from_secs(3);
+/// So often it is looked which sensors there are, while one is missing: that takes milliseconds, in which samples wait.
+const ASK_EVERY: Duration = Duration::from_millis(500);
 
 impl Run<'_> {
     /// Follows the sensors of the hub that are not followed yet, if all are wanted.
@@ -38,6 +40,10 @@ impl Run<'_> {
         if self.session.domain().is_none() {
             return Ok(());
         }
+        if self.asked_at.is_some_and(|at| at.elapsed() < ASK_EVERY) {
+            return Ok(());
+        }
+        self.asked_at = Some(Instant::now());
         // A hub that came to a listener has to make its topics first.
         let lives = self.session.hub_lives();
         self.hub_lives_since = if lives { self.hub_lives_since.or(Some(Instant::now())) } else { None };

@@ -11,7 +11,7 @@ use std::time::{Duration, Instant};
 use schema::Topic;
 
 use super::Kept;
-use super::files::{Files, Split};
+use super::files::{Files, Split, discard};
 use super::part::{Part, Place};
 use super::queue::{Batch, EVERY, Entry, Queue, Track};
 
@@ -74,6 +74,7 @@ pub(super) struct Disk {
     bytes: u64,
     trouble: Option<Trouble>,
     look_at: Instant,
+    most_index: usize,
 }
 
 /// Something cannot be written.
@@ -101,7 +102,8 @@ impl Disk {
             Err(stream) => (None, Place::Stream(stream)),
         };
         let mut part = Part::begin(place, profile, numbered(&facts, files.as_ref()))?;
-        part.write()?;
+        // What could not even be begun is not in the way of the next try.
+        part.write().inspect_err(|_| part.path().into_iter().for_each(discard))?;
         let told = Told::default();
         told.account().bytes = part.written;
         Ok(Disk {
@@ -118,6 +120,7 @@ impl Disk {
             bytes: 0,
             trouble: None,
             look_at: Instant::now() + LOOK_EVERY,
+            most_index: MOST_INDEX,
         })
     }
 
@@ -152,7 +155,9 @@ impl Disk {
                     self.told.account().news.push(News::ReaderGone);
                     return Ok(());
                 }
-                Err(error) if is_over && self.trouble.is_some() => return Err(error),
+                Err(error) if is_over && (self.trouble.is_some() || self.part.is_doubtful) => {
+                    return Err(error);
+                }
                 Err(error) => self.troubled(&error, now),
             }
         }
@@ -165,6 +170,7 @@ impl Disk {
         }
         self.write()?;
         if self.part.is_finished() {
+            self.part.sync()?;
             if is_over && self.queue.is_empty() {
                 return Ok(());
             }
@@ -178,11 +184,7 @@ impl Disk {
             self.look_at = now + LOOK_EVERY;
             self.part.look()?;
         }
-        let is_full = match self.split {
-            Some(Split::Bytes(most)) => self.part.written >= most,
-            Some(Split::Time(most)) => now - self.part.begun >= most,
-            None => false,
-        };
+        let is_full = self.files.is_some() && self.is_full(now);
         if is_over || is_full {
             self.part.finish()?;
             self.write()?;
@@ -193,6 +195,18 @@ impl Disk {
             self.write()?;
         }
         Ok(())
+    }
+
+    /// It goes on in the next file. One in which nothing came lasts: nobody wants it in place of one that is kept.
+    fn is_full(&self, now: Instant) -> bool {
+        let is_split = match self.split {
+            Some(Split::Bytes(most)) => self.part.written >= most,
+            Some(Split::Time(most)) => {
+                self.part.begun.is_some_and(|begun| now.saturating_duration_since(begun) >= most)
+            }
+            None => false,
+        };
+        is_split || self.part.index >= self.most_index
     }
 
     /// Writes what was made; then the batch is on the disk.
@@ -239,12 +253,14 @@ impl Disk {
 
     /// Keeps the last statuses of the batch, for the next file.
     fn remember(&mut self) {
+        let now = Instant::now();
         for (track, header, payload) in self.batch.samples() {
             if self.tracks[track].name.topic == Topic::Status {
-                let (kept, old) = self.statuses[track].get_or_insert_default();
-                *kept = *header;
-                old.clear();
-                old.extend_from_slice(payload);
+                let mut room = self.statuses[track].take().map_or_else(Vec::new, |kept| kept.payload);
+                room.clear();
+                room.extend_from_slice(payload);
+                let kept = Kept { came_at: now, header: *header, payload: room };
+                self.statuses[track] = Some(kept);
             }
         }
     }
@@ -278,7 +294,104 @@ fn numbered(facts: &BTreeMap<String, String>, files: Option<&Files>) -> BTreeMap
     facts
 }
 
+/// The index of a file stays in memory until the file is finished, which takes twice as much again, in bytes.
+const MOST_INDEX: usize = 128 << 20;
 /// So often a disk that takes nothing is tried.
 const RETRY_EVERY: Duration = Duration::from_secs(1);
 /// So often it is seen that a file was taken away.
 const LOOK_EVERY: Duration = Duration::from_secs(1);
+
+#[cfg(test)]
+mod tests {
+    use std::fs;
+    use std::path::Path;
+
+    use schema::{Header, Status};
+
+    use super::*;
+    use crate::names::TopicName;
+
+    /// A recording in a directory of its own, of the status of these sensors.
+    fn disk(name: &str, split: Option<Split>, sensors: &[&str]) -> (PathBuf, Disk) {
+        let place = std::env::temp_dir().join(format!("scanhub-{name}-{}", std::process::id()));
+        fs::create_dir_all(&place).unwrap();
+        let files = Files::new(&place.join("walk.mcap"), split.is_some(), false, None);
+        let disk = Disk::begin(Arc::new(Queue::new()), Ok(files), split, "", BTreeMap::new()).unwrap();
+        for sensor in sensors {
+            let name = TopicName { sensor: (*sensor).to_owned(), topic: Topic::Status };
+            disk.queue.note(Entry::Track(Track { name, native: true, ros2: false }));
+        }
+        (place, disk)
+    }
+
+    fn push(disk: &Disk, track: usize) {
+        let pushed = disk
+            .queue
+            .push(track, &Header::default(), |room| schema::datagram::Packed::pack(&Status::default(), room));
+        assert!(pushed);
+    }
+
+    fn names(place: &Path) -> Vec<String> {
+        let names = fs::read_dir(place).unwrap().map(|entry| entry.unwrap().file_name());
+        let mut names: Vec<_> = names.map(|name| name.to_string_lossy().into_owned()).collect();
+        names.sort();
+        names
+    }
+
+    #[test]
+    fn a_file_in_which_nothing_came_lasts() {
+        let hour = Duration::from_secs(3600);
+        let (place, mut disk) = disk("lasts", Some(Split::Time(hour)), &["front"]);
+        let now = Instant::now();
+        for hours in 1..5 {
+            disk.step(now + hours * hour, false).unwrap();
+        }
+        assert_eq!(names(&place), ["walk-0001.mcap"]);
+        push(&disk, 0);
+        disk.step(now, false).unwrap();
+        disk.step(now + 2 * hour, false).unwrap();
+        assert_eq!(names(&place), ["walk-0001.mcap", "walk-0002.mcap"]);
+        fs::remove_dir_all(place).unwrap();
+    }
+
+    #[test]
+    fn an_index_that_grew_too_large_ends_a_file() {
+        let (place, mut disk) = disk("index", None, &["front"]);
+        disk.most_index = 1000;
+        for _ in 0..9 {
+            push(&disk, 0);
+            disk.step(Instant::now(), false).unwrap();
+        }
+        assert_eq!(names(&place), ["walk-0002.mcap", "walk.mcap"]);
+        fs::remove_dir_all(place).unwrap();
+    }
+
+    #[test]
+    fn what_a_sensor_said_that_is_gone_is_not_said_again() {
+        let (place, mut disk) = disk("gone", None, &["front", "rear"]);
+        (0..2).for_each(|track| push(&disk, track));
+        disk.step(Instant::now(), false).unwrap();
+        let mut next = || {
+            disk.renew().unwrap();
+            disk.write().unwrap();
+            disk.part.written
+        };
+        let [both, again] = [next(), next()];
+        disk.statuses[0].as_mut().unwrap().came_at += Duration::from_secs(600);
+        disk.renew().unwrap();
+        disk.write().unwrap();
+        assert!(both == again && disk.part.written < both, "{both} {again} {}", disk.part.written);
+        fs::remove_dir_all(place).unwrap();
+    }
+
+    #[test]
+    fn a_file_that_was_cut_is_lost() {
+        let (place, mut disk) = disk("cut", None, &["front"]);
+        push(&disk, 0);
+        disk.step(Instant::now(), false).unwrap();
+        assert!(disk.part.look().is_ok());
+        File::options().write(true).open(place.join("walk.mcap")).unwrap().set_len(100).unwrap();
+        assert_eq!(disk.part.look().map_err(|error| error.kind()), Err(ErrorKind::NotFound));
+        fs::remove_dir_all(place).unwrap();
+    }
+}

@@ -138,6 +138,13 @@ impl Files {
     }
 }
 
+/// Removes the file that was made at `path`, if it is one: devices and links are others' things.
+pub(super) fn discard(path: &Path) {
+    if fs::symlink_metadata(path).is_ok_and(|place| place.is_file()) {
+        let _ = fs::remove_file(path);
+    }
+}
+
 /// The name of a recording that was begun at `wall_ns` and given none.
 pub(super) fn usual_name(wall_ns: u64) -> PathBuf {
     let [year, month, day, hour, minute, second] = utc(wall_ns);

@@ -7,7 +7,7 @@ use std::io::{self, ErrorKind, Write};
 use std::os::unix::fs::{FileExt, MetadataExt};
 use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex, PoisonError};
-use std::time::Instant;
+use std::time::{Duration, Instant};
 
 use schema::datagram::Packed;
 use schema::file::Writer;
@@ -21,9 +21,16 @@ pub(super) struct Part {
     writer: Option<Writer<Made>>,
     made: Made,
     place: Place,
+    /// Bytes of what was made that a stream has taken already: it cannot take them back.
+    taken: usize,
     /// Bytes that are in the file.
     pub(super) written: u64,
-    pub(super) begun: Instant,
+    /// When its first own sample came.
+    pub(super) begun: Option<Instant>,
+    /// About how much memory its index takes, in bytes.
+    pub(super) index: usize,
+    /// The disk did not have all of it, when it was asked.
+    pub(super) is_doubtful: bool,
     /// What was said last of which life of a sensor's hub.
     lives: Vec<u64>,
     /// Channels of ROS 2, by track.
@@ -64,8 +71,11 @@ impl Part {
             writer,
             made,
             place,
+            taken: 0,
             written: 0,
-            begun: Instant::now(),
+            begun: None,
+            index: 0,
+            is_doubtful: false,
             lives: Vec::new(),
             channels: Vec::new(),
             scan: Scan::default(),
@@ -73,11 +83,14 @@ impl Part {
         })
     }
 
-    /// The statuses that stand, by track, so that it can be played without what came before.
+    /// The statuses that stand, by track, so that it can be played without what came before; not those of sensors that
+    /// said nothing any more while others did.
     pub(super) fn repeat(&mut self, tracks: &[Track], statuses: &[Option<Kept>]) -> io::Result<()> {
+        let newest = statuses.iter().flatten().map(|kept| kept.came_at).max();
         for (at, kept) in statuses.iter().enumerate() {
-            if let Some((header, payload)) = kept {
-                self.sample(tracks, at, header, payload)?;
+            let stands = |kept: &&Kept| newest.is_some_and(|newest| newest - kept.came_at < STANDS);
+            if let Some(kept) = kept.as_ref().filter(stands) {
+                self.sample(tracks, at, &kept.header, &kept.payload)?;
             }
         }
         Ok(())
@@ -85,6 +98,11 @@ impl Part {
 
     /// Makes a chunk of `batch`, whose tracks are among `tracks`.
     pub(super) fn add(&mut self, tracks: &[Track], batch: &Batch) -> io::Result<()> {
+        let samples = batch.count() as usize;
+        if samples > 0 {
+            self.begun.get_or_insert_with(Instant::now);
+            self.index += INDEX_OF_CHUNK + INDEX_OF_CHANNEL * samples.min(tracks.len());
+        }
         let mut bytes = &batch.bytes[..];
         for entry in &batch.entries {
             match entry {
@@ -118,7 +136,17 @@ impl Part {
     pub(super) fn write(&mut self) -> io::Result<()> {
         let mut made = self.made.0.lock().unwrap_or_else(PoisonError::into_inner);
         match &mut self.place {
-            Place::Stream(stream) => stream.write_all(&made)?,
+            Place::Stream(stream) => {
+                while self.taken < made.len() {
+                    match stream.write(&made[self.taken..]) {
+                        Ok(0) => return Err(ErrorKind::WriteZero.into()),
+                        Ok(count) => self.taken += count,
+                        Err(error) if error.kind() == ErrorKind::Interrupted => {}
+                        Err(error) => return Err(error),
+                    }
+                }
+                self.taken = 0;
+            }
             Place::File(file, _) => file.write_all_at(&made, self.written).inspect_err(|_| {
                 let _ = file.set_len(self.written);
             })?,
@@ -129,13 +157,14 @@ impl Part {
     }
 
     /// Asks the disk to have all of it.
-    pub(super) fn sync(&self) -> io::Result<()> {
+    pub(super) fn sync(&mut self) -> io::Result<()> {
         match &self.place {
             Place::Stream(_) => Ok(()),
             Place::File(file, _) => match file.sync_data() {
                 // Not every device keeps things.
                 Err(error) if error.kind() == ErrorKind::InvalidInput => Ok(()),
-                synced => synced,
+                // Linux tells it once: asked again, it would say that all is well.
+                synced => synced.inspect_err(|_| self.is_doubtful = true),
             },
         }
     }
@@ -148,14 +177,17 @@ impl Part {
         }
     }
 
-    /// [`ErrorKind::NotFound`] if the file is not to be found under its name any more.
+    /// [`ErrorKind::NotFound`] if the file is not to be found under its name any more, or not all of it.
     pub(super) fn look(&self) -> io::Result<()> {
         let Place::File(file, path) = &self.place else { return Ok(()) };
         let (here, there) = (file.metadata()?, fs::metadata(path)?);
-        if (here.dev(), here.ino()) == (there.dev(), there.ino()) {
-            return Ok(());
+        if (here.dev(), here.ino()) != (there.dev(), there.ino()) {
+            return Err(io::Error::new(ErrorKind::NotFound, "another file has its name"));
         }
-        Err(io::Error::new(ErrorKind::NotFound, "another file has its name"))
+        if here.is_file() && here.len() < self.written {
+            return Err(io::Error::new(ErrorKind::NotFound, "somebody cut it"));
+        }
+        Ok(())
     }
 
     fn writer(&mut self) -> io::Result<&mut Writer<Made>> {
@@ -202,7 +234,41 @@ impl Part {
     }
 }
 
+/// A status stands for so long, while others come: they do each second.
+const STANDS: Duration = Duration::from_secs(60);
+/// What a chunk takes in the index in memory, and what each channel in it does, in bytes.
+const INDEX_OF_CHUNK: usize = 200;
+const INDEX_OF_CHANNEL: usize = 24;
 /// Name of the metadata record of a life of the hub, before its first sample.
 const LIFE: &str = "scanhub.life";
 /// Name of the metadata record of samples that were left out.
 const GAP: &str = "scanhub.gap";
+
+#[cfg(test)]
+mod tests {
+    use std::io::Read;
+
+    use super::*;
+
+    #[test]
+    fn what_a_stream_has_taken_it_is_not_given_again() {
+        let (mut reader, writer) = io::pipe().unwrap();
+        rustix::io::ioctl_fionbio(&writer, true).unwrap();
+        let stream = Place::Stream(File::from(std::os::fd::OwnedFd::from(writer)));
+        let mut part = Part::begin(stream, "", BTreeMap::new()).unwrap();
+        part.made.write_all(&[7; 300_000]).unwrap();
+        let made = part.made.0.lock().unwrap().clone();
+        let mut read = Vec::new();
+        // A pipe takes less than that, and then for a while nothing.
+        while let Err(error) = part.write() {
+            assert_eq!((error.kind(), part.written), (ErrorKind::WouldBlock, 0));
+            let mut some = [0; 50_000];
+            let count = reader.read(&mut some).unwrap();
+            read.extend(&some[..count]);
+        }
+        assert_eq!(part.written, made.len() as u64);
+        drop(part);
+        reader.read_to_end(&mut read).unwrap();
+        assert!(read == made, "{} of {} bytes", read.len(), made.len());
+    }
+}

@@ -21,12 +21,15 @@ impl LinkThread<'_> {
     pub(crate) fn attend(&mut self, report: impl FnOnce(Result<(), Failure>)) {
         let link = self.link;
         let mut away = Away::default();
-        let mut opened = None;
+        let (mut opened, mut is_kept) = (None, false);
         if let Source::Tcp { .. } = link.port {
             away = Away::for_lack_of_a_port(format!("{}: not connected yet", link.port.name()));
         } else {
             match self.take_over() {
-                Ok(port) => opened = Some(port),
+                Ok((port, kept)) => {
+                    is_kept = kept;
+                    opened = Some(port);
+                }
                 // Only a hub plays recordings.
                 Err(failure) if failure.kind == Kind::PortNotTty => {
                     let hint = format!("{}, or file:PATH for a recording", failure.hint);
@@ -38,7 +41,8 @@ impl LinkThread<'_> {
         }
         report(Ok(()));
         let memory = Memory::open(self.around.root, &link.name, &link.port.name());
-        let mut known = memory.recall(clock::now());
+        // On a line that was closed meanwhile it may be another sensor, or the same in another mode.
+        let mut known = memory.recall(clock::now()).filter(|_| is_kept);
         self.memory = Some(memory);
         // Times in a row that it was there and went without a byte.
         let mut futile = 0;
@@ -74,8 +78,8 @@ impl LinkThread<'_> {
         }
     }
 
-    /// The port at the hub's start: the one that a killed hub had, if it was kept, with what lies in it.
-    fn take_over(&self) -> Result<Port, Failure> {
+    /// The port at the hub's start, and whether it is the one that a killed hub had and somebody kept, with what lies in it.
+    fn take_over(&self) -> Result<(Port, bool), Failure> {
         let (link, service) = (self.link, self.around.service);
         let mut adopted = None;
         while let Some(line) = service.take(&link.name) {
@@ -87,9 +91,9 @@ impl LinkThread<'_> {
         }
         if let Some(port) = adopted {
             tracing::info!("{}: goes on with {}, which was kept", link.name, link.port.name());
-            return Ok(port);
+            return Ok((port, true));
         }
-        Port::open(&link.port, link.baud.rate(), &AtomicBool::new(false))
+        Port::open(&link.port, link.baud.rate(), &AtomicBool::new(false)).map(|port| (port, false))
     }
 
     /// Tries to open the port, however long that takes; nothing if the hub shall end meanwhile.

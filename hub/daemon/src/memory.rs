@@ -1,6 +1,7 @@
 //! What a hub knew of the sensor of a link a moment before it was killed, for the next one: without it there are no scans until
 //! the sensor has answered two questions, and each answer costs a scan. A small file in the domain's directory, written as
-//! soon as that is known, and once a second while the sensor streams. Refuses to know what of a sensor is worth to be known.
+//! soon as that is known, and once a second while the sensor streams. Refuses to know what of a sensor is worth to be known, and whether the line
+//! was its own all the while.
 
 use std::fs::{File, OpenOptions};
 use std::os::unix::fs::{FileExt, OpenOptionsExt};
