@@ -7,8 +7,8 @@ use std::time::{Duration, Instant};
 use serde::Serialize;
 
 use super::RecordLook;
-use super::disk::{Account as Written, News};
 use super::queue::Gap;
+use super::told::{Account as Written, News};
 use crate::account::Account;
 use crate::follow::Notice;
 use crate::names::TopicName;
@@ -27,6 +27,8 @@ pub(super) struct Report<'a> {
     bytes: u64,
     /// Samples that were sent and not received.
     lost: u64,
+    /// Samples that were written, and whose file is gone.
+    gone: u64,
     is_in_trouble: bool,
 }
 
@@ -46,6 +48,7 @@ impl<'a> Report<'a> {
             files: Vec::new(),
             bytes: 0,
             lost: 0,
+            gone: 0,
             is_in_trouble: false,
         }
     }
@@ -75,20 +78,32 @@ impl<'a> Report<'a> {
         self.is_in_trouble = match news {
             News::Trouble(..) => true,
             News::Well(..) => false,
-            News::File(_) | News::ReaderGone => self.is_in_trouble,
+            News::File(_) | News::Gone(..) | News::ReaderGone => self.is_in_trouble,
         };
-        if let News::File(path) = news {
-            self.files.push(path.clone());
+        match news {
+            News::File(path) => self.files.push(path.clone()),
+            News::Gone(_, samples) => self.gone += samples,
+            _ => {}
         }
         if self.look == RecordLook::Json {
-            let (kind, path, message, seconds) = match news {
-                News::File(path) => ("file", path, None, None),
-                News::Trouble(path, message) => ("disk_trouble", path, Some(message.as_str()), None),
-                News::Well(path, after) => ("disk_well", path, None, Some(after.as_secs_f64())),
+            let of = |kind, path: &Path| Disk {
+                class: "notice",
+                kind,
+                file: path.display().to_string(),
+                message: None,
+                seconds: None,
+                samples: None,
+            };
+            let notice = match news {
+                News::File(path) => of("file", path),
+                News::Trouble(path, message) => Disk { message: Some(message), ..of("disk_trouble", path) },
+                News::Well(path, after) => {
+                    Disk { seconds: Some(after.as_secs_f64()), ..of("disk_well", path) }
+                }
+                News::Gone(path, samples) => Disk { samples: Some(*samples), ..of("file_gone", path) },
                 News::ReaderGone => return Ok(()),
             };
-            let file = path.display().to_string();
-            return self.out.json(&Disk { class: "notice", kind, file, message, seconds });
+            return self.out.json(&notice);
         }
         self.note(|line| match news {
             News::File(path) => write!(line, "goes on in {}", path.display()),
@@ -98,6 +113,9 @@ impl<'a> Report<'a> {
             }
             News::Well(path, after) => {
                 write!(line, "{} is written again, after {:.1} s", path.display(), after.as_secs_f64())
+            }
+            News::Gone(path, samples) => {
+                write!(line, "{} was removed or cut: its {samples} samples are gone", path.display())
             }
             News::ReaderGone => Ok(()),
         })
@@ -168,10 +186,12 @@ impl<'a> Report<'a> {
                 samples,
                 lost: self.lost,
                 left_out,
+                gone: self.gone,
                 seconds: self.begun.elapsed().as_secs_f64(),
             });
         }
         self.wipe()?;
+        let gone = self.gone;
         let files = &self.files;
         self.out.line(|line| {
             match &files[..] {
@@ -182,7 +202,10 @@ impl<'a> Report<'a> {
                 [] => {}
             }
             write!(line, ": {samples} samples, {}", size(bytes))?;
-            if left_out > 0 { write!(line, ", {left_out} left out") } else { Ok(()) }
+            if left_out > 0 {
+                write!(line, ", {left_out} left out")?;
+            }
+            if gone > 0 { write!(line, ", {gone} gone with files that were removed or cut") } else { Ok(()) }
         })
     }
 
@@ -251,6 +274,7 @@ struct Recorded {
     samples: u64,
     lost: u64,
     left_out: u64,
+    gone: u64,
     seconds: f64,
 }
 
@@ -264,6 +288,8 @@ struct Disk<'a> {
     message: Option<&'a str>,
     #[serde(skip_serializing_if = "Option::is_none")]
     seconds: Option<f64>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    samples: Option<u64>,
 }
 
 /// Class `notice`, of samples left out.
