@@ -104,8 +104,9 @@ pub fn record(
     };
     let first = disk.path();
     let over = AtomicBool::new(false);
+    let terminal = out.as_fd().try_clone_to_owned().ok();
     let (mut out, mut notes) = (Spare::new(out, &over), Spare::new(notes, &over));
-    let mut report = Report::new(options.look, &mut out, &mut notes);
+    let mut report = Report::new(options.look, &mut out, &mut notes, terminal);
     let begun = report.begin(&first);
     let mut recorder = Recorder {
         selection: &selection,

@@ -1,6 +1,7 @@
 //! What a recorder tells of itself: lines of JSON, or text and one line that is drawn over itself. Refuses to know why.
 
 use std::io::{self, Write};
+use std::os::fd::OwnedFd;
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
@@ -12,7 +13,7 @@ use super::told::{Account as Written, News};
 use crate::account::Account;
 use crate::follow::Notice;
 use crate::names::TopicName;
-use crate::output::{End, Output};
+use crate::output::{End, Output, columns, fitting};
 use crate::{json, text};
 
 /// Where it is told.
@@ -20,6 +21,8 @@ pub(super) struct Report<'a> {
     look: RecordLook,
     out: Output<'a>,
     notes: Output<'a>,
+    /// Where the line is drawn, to ask how long it may be.
+    terminal: Option<OwnedFd>,
     begun: Instant,
     next: Instant,
     files: Vec<PathBuf>,
@@ -36,13 +39,19 @@ pub(super) struct Report<'a> {
 const EVERY: Duration = Duration::from_secs(1);
 
 impl<'a> Report<'a> {
-    /// Accounts to `out`, and what is no account to `notes` if `out` is not JSON.
-    pub(super) fn new(look: RecordLook, out: &'a mut dyn Write, notes: &'a mut dyn Write) -> Report<'a> {
+    /// Accounts to `out`, which may be `terminal`, and what is no account to `notes` if `out` is not JSON.
+    pub(super) fn new(
+        look: RecordLook,
+        out: &'a mut dyn Write,
+        notes: &'a mut dyn Write,
+        terminal: Option<OwnedFd>,
+    ) -> Report<'a> {
         let now = Instant::now();
         Report {
             look,
             out: Output::new(out),
             notes: Output::new(notes),
+            terminal,
             begun: now,
             next: now + EVERY,
             files: Vec::new(),
@@ -156,10 +165,10 @@ impl<'a> Report<'a> {
             RecordLook::Lines => Ok(()),
             RecordLook::Json => self.recording(written, left_out),
             RecordLook::Terminal => {
-                // A line that wraps would not be drawn over: it is cut.
-                let mut line = [WIPE, b"\x1b[?7l"].concat();
-                self.status(&mut line, written, left_out)?;
-                line.extend(b"\x1b[?7h");
+                // A line that wraps would not be drawn over: one that does not fit all the same is cut.
+                let columns = self.terminal.as_ref().and_then(columns).unwrap_or(usize::MAX - 2);
+                let status = fitting(self.status(written, left_out), columns);
+                let line = [WIPE, b"\x1b[?7l", status.as_bytes(), b"\x1b[?7h"].concat();
                 self.bytes = written.bytes;
                 self.out.raw(&line)
             }
@@ -221,13 +230,19 @@ impl<'a> Report<'a> {
         })
     }
 
-    fn status(&self, line: &mut Vec<u8>, written: &Written, left_out: u64) -> io::Result<()> {
+    /// How far it is, each part with its rank: what is lost is wanted longest.
+    fn status(&self, written: &Written, left_out: u64) -> Vec<(u8, String)> {
         let seconds = self.begun.elapsed().as_secs();
         let rate = written.bytes.saturating_sub(self.bytes) / EVERY.as_secs();
-        let trouble = if self.is_in_trouble { "disk trouble, " } else { "" };
-        write!(line, "{trouble}{}:{:02}:{:02}", seconds / 3600, seconds / 60 % 60, seconds % 60)?;
-        write!(line, "  {}  {}/s  {} samples", size(written.bytes), size(rate), written.samples)?;
-        write!(line, "  {} lost", self.lost + left_out)
+        let trouble = self.is_in_trouble.then(|| (4, "disk trouble".to_owned()));
+        let parts = [
+            (3, format!("{}:{:02}:{:02}", seconds / 3600, seconds / 60 % 60, seconds % 60)),
+            (1, size(written.bytes)),
+            (0, format!("{}/s", size(rate))),
+            (2, format!("{} samples", written.samples)),
+            (5, format!("{} lost", self.lost + left_out + self.gone)),
+        ];
+        trouble.into_iter().chain(parts).collect()
     }
 
     /// A line that is no account.
