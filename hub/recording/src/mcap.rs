@@ -4,6 +4,7 @@
 mod channels;
 mod chunk;
 mod exact;
+mod headless;
 mod knowledge;
 mod originals;
 pub(crate) mod reader;
@@ -23,6 +24,7 @@ use schema::{Header, Status, Topic};
 
 use crate::open::is_end;
 use crate::{Contents, Damage, Form, Frame};
+pub(crate) use headless::is_mcap;
 pub(crate) use knowledge::{Knowledge, message};
 pub(crate) use originals::Originals;
 use reader::{Item, Reader, Sighting};
@@ -64,7 +66,9 @@ impl Default for Survey {
 
 impl Survey {
     /// Reads the file that `open` opens through: once if it is sound.
-    pub(crate) fn of<R: Read>(open: impl Fn() -> io::Result<R>) -> io::Result<Survey> {
+    ///
+    /// `is_headless`: its beginning is missing.
+    pub(crate) fn of<R: Read>(open: impl Fn() -> io::Result<R>, is_headless: bool) -> io::Result<Survey> {
         let failed = match Survey::read(Reader::sound(open()?)) {
             Err(error) if is_end(&error) => error,
             other => return other,
@@ -73,7 +77,7 @@ impl Survey {
         let mut survey = Survey::read(Reader::harmed(open()?, knowledge))?;
         survey.is_sound = false;
         let is_cut = failed.kind() == io::ErrorKind::UnexpectedEof && survey.whole.damage.is_cut;
-        survey.tell(|damage| damage.is_harmed = !is_cut);
+        survey.tell(|damage| (damage.is_headless, damage.is_harmed) = (is_headless, !is_cut));
         Ok(survey)
     }
 

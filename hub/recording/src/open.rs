@@ -48,9 +48,15 @@ impl Recording {
             return Err(refused(&path, "is empty"));
         }
         if head.starts_with(MCAP) {
-            return Recording::open_mcap(path);
+            return Recording::open_mcap(path, false);
         }
         let form = if carmen::is_log(head) { Form::Carmen } else { Form::Telegrams };
+        #[cfg(feature = "mcap")]
+        if form != Form::Carmen
+            && crate::mcap::is_mcap(self::reader(&path)?).map_err(|error| unreadable(&path, &error))?
+        {
+            return Recording::open_mcap(path, true);
+        }
         let contents = match form {
             Form::Carmen => survey_log(&path, reader)?,
             _ => survey_stream(&path, reader)?,
@@ -65,14 +71,15 @@ impl Recording {
     }
 
     #[cfg(feature = "mcap")]
-    fn open_mcap(path: PathBuf) -> Result<Recording, Failure> {
-        let survey = crate::mcap::Survey::of(|| open(&path)).map_err(|error| unreadable(&path, &error))?;
+    fn open_mcap(path: PathBuf, is_headless: bool) -> Result<Recording, Failure> {
+        let survey = crate::mcap::Survey::of(|| open(&path), is_headless)
+            .map_err(|error| unreadable(&path, &error))?;
         let contents = survey.contents();
         Ok(Recording { path, contents, survey: survey.into(), sensor: None })
     }
 
     #[cfg(not(feature = "mcap"))]
-    fn open_mcap(path: PathBuf) -> Result<Recording, Failure> {
+    fn open_mcap(path: PathBuf, _: bool) -> Result<Recording, Failure> {
         let message = format!("recording {} is an MCAP file, which this build does not read", path.display());
         Err(Failure::new(Kind::Configuration, message, "build it with the feature mcap of scanhub-recording"))
     }
