@@ -100,7 +100,7 @@ fn kill(stage: &Stage, file: &Path, number: usize) -> Outcome<f64> {
     let recorder = recorder(stage, file, &[])?;
     recorder.await_line("{\"class\":\"recording\"", PATIENCE)?;
     // Anywhere in the time between two chunks.
-    thread::sleep(Duration::from_millis(900 + 37 * number as u64));
+    thread::sleep(Duration::from_millis(1900 + 37 * number as u64));
     let now_ns = clock::now();
     recorder.guard.kill()?;
     let messages = messages(file)?;

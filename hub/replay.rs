@@ -95,8 +95,11 @@ fn attend(player: &Player, closed: &UnixStream) {
             let mut pressed = [0; 64];
             match input.lock().read(&mut pressed) {
                 Ok(len @ 1..) => obey(player, &pressed[..len]),
-                // The terminal is gone.
-                _ => keys = None,
+                // The terminal is gone, and with it whoever could end a player that goes on for ever.
+                _ => {
+                    keys = None;
+                    player.end();
+                }
             }
         }
     }

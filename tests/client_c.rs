@@ -213,7 +213,9 @@ fn what_a_program_does_wrong_is_refused() {
         Err(_) => eprintln!("without the compiler's watch over memory: it has none"),
     }
     if is_there("valgrind") {
-        let words = ["valgrind", "--quiet", "--leak-check=full", "--error-exitcode=9"];
+        // What a child keeps of its parent is found, in part by addresses of its middle.
+        let leaks = ["--leak-check=full", "--show-leak-kinds=definite", "--errors-for-leak-kinds=definite"];
+        let words = ["valgrind", "--quiet", leaks[0], leaks[1], leaks[2], "--error-exitcode=9"];
         ways.push(words.into_iter().map(str::to_owned).chain([plain]).collect());
     }
     for way in ways {

@@ -189,28 +189,6 @@ fn a_hub_that_comes_back_goes_on_in_the_file() {
 }
 
 #[test]
-fn what_receives_comes_before_other_programs() {
-    let trial = std::process::Command::new("nice").args(["-n", "-10", "nice"]).output();
-    if !trial.is_ok_and(|outcome| outcome.stdout == b"-10\n") {
-        eprintln!("skipped: nobody may go before others here (see `ulimit -e`)");
-        return;
-    }
-    let stage = Stage::new();
-    let _others = sensors(&stage, &[]);
-    let recorder = recorder(&stage, &["front/telegram"], 1);
-    // proc(5): the nineteenth field, of which the second may have blanks.
-    let nice = |task: &str| {
-        let stat = std::fs::read_to_string(format!("/proc/{}/task/{task}/stat", recorder.pid())).unwrap();
-        let (name, fields) = stat.rsplit_once(") ").unwrap();
-        (name.ends_with("(disk"), fields.split(' ').nth(16).unwrap().to_owned())
-    };
-    assert_eq!(nice(&recorder.pid().to_string()).1, "-10");
-    let tasks = std::fs::read_dir(format!("/proc/{}/task", recorder.pid())).unwrap();
-    let tasks: Vec<_> = tasks.map(|task| nice(&task.unwrap().file_name().to_string_lossy())).collect();
-    assert!(tasks.contains(&(true, "0".into())), "{tasks:?}");
-}
-
-#[test]
 fn what_cannot_be_recorded_is_refused() {
     let stage = Stage::new();
     let file = stage.file("walk.mcap", "somebody's");
@@ -223,6 +201,17 @@ fn what_cannot_be_recorded_is_refused() {
     assert_eq!(kind(&["-o", &file]), (Some(1), "failed".into()));
     assert_eq!(std::fs::read(&file).unwrap(), b"somebody's");
     assert_eq!(kind(&["-o", &stage.word("nowhere/walk.mcap")]), (Some(1), "failed".into()));
+    let hint = |arguments: &[&str]| {
+        let outcome = stage.run(&[&["record", "--json"], arguments].concat());
+        assert_eq!(outcome.code, Some(1), "{outcome}");
+        outcome.of_class("error")[0]["hint"].as_str().unwrap().to_owned()
+    };
+    assert!(hint(&["-o", &stage.word("")]).starts_with("name a file in it: -o "));
+    assert!(hint(&["-o", "/dev/full"]).contains("--force writes over what the device holds"));
+    assert!(hint(&["-o", "/dev/full", "--force"]).starts_with("make room"));
+    stage.file("parts-0007.mcap", "somebody's");
+    let earlier = hint(&["-o", &stage.word("parts.mcap"), "--split=1h"]);
+    assert!(earlier.starts_with("--force goes on after the last one's number"), "{earlier}");
     assert_eq!(kind(&["-o", "-", "--split", "1h"]), (Some(2), "usage".into()));
     assert_eq!(kind(&["--keep", "3"]), (Some(2), "usage".into()));
     assert_eq!(kind(&["--split", "3"]), (Some(2), "usage".into()));
@@ -232,6 +221,8 @@ fn what_cannot_be_recorded_is_refused() {
     let new = stage.word("new.mcap");
     assert_eq!(kind(&["-o", &new, "--for", "5s"]), (Some(3), "no_hub".into()));
     assert!(!Path::new(&new).exists());
+    let outcome = stage.run(&["record", "-o", &new, "--for", "5s"]);
+    assert!(!String::from_utf8_lossy(&outcome.out).contains("0 samples"), "{outcome}");
 }
 
 fn stderr_lines(outcome: &Outcome) -> Vec<Value> {

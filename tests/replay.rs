@@ -2,6 +2,12 @@
 
 mod stage;
 
+use std::collections::BTreeMap;
+
+use lms::variant::{Mode, Unit};
+use schema::datagram::Packed;
+use schema::file::Writer;
+use schema::{Header, Marks, Topic};
 use serde_json::Value;
 use stage::{INT, Outcome, Program, Sitting, Stage, TERM, is_class, number};
 
@@ -92,6 +98,58 @@ fn at_the_end_it_stays_if_it_is_to_and_pauses_when_asked() {
     assert_eq!(number(&replayed(&player.end(TERM)), "telegrams"), 100);
 }
 
+/// A recording of a hub of two lives, which each heard ten telegrams, of which the sixth says how values are split: marks
+/// were found from `understood` of each life on.
+fn lives(stage: &Stage, understood: [u64; 2]) -> String {
+    let file = std::fs::File::create(stage.path("lives.mcap")).expect("a file");
+    let mut writer = Writer::begin(file, "", BTreeMap::new()).expect("is written");
+    for (life, understood) in understood.into_iter().enumerate() {
+        for seq in 0..10 {
+            let reply = lms::reply::configuration(0, Mode(1), Unit::Mm, 0x10);
+            let telegram = if seq == 5 { reply.bytes().to_vec() } else { stage::scan(seq as u16) };
+            let at = (life as u64 * 20 + seq) * 20_000_000;
+            let (stamp_first_ns, stamp_last_ns) = (1_000_000_000 + at, 1_010_000_000 + at);
+            let mut header = Header {
+                seq,
+                topic_seq: seq,
+                stamp_first_ns,
+                stamp_last_ns,
+                wall_ns: 1_700_000_000_000_000_000 + at,
+                boot: 7 + life as u64,
+                hub_pid: 1,
+                period_us: 26_640,
+                ..Header::default()
+            };
+            header.set_sent_at(stamp_last_ns + 1000);
+            writer.sample("front", Topic::Telegram, &header, &telegram).expect("is written");
+            if seq != 5 && seq >= understood {
+                let mut room = [0; 4096];
+                let len = Marks::default().pack(&mut room).expect("fits");
+                writer.sample("front", Topic::Marks, &header, &room[..len]).expect("is written");
+            }
+        }
+    }
+    writer.finish().expect("is written");
+    stage.path("lives.mcap").display().to_string()
+}
+
+#[test]
+fn what_the_hub_could_not_read_yet_is_no_scan() {
+    // One of both lives knew it from the life before.
+    for understood in [[0, 6], [6, 0]] {
+        let stage = Stage::new();
+        let player = start(&stage, &[&lives(&stage, understood), "--paused"]);
+        let mut consumer = stage.echo(&["front/scan", "front/status"]);
+        resume(&stage);
+        consumer.await_line("the end", |line| line["last_error"] == "the recording is at its end");
+        let scans: Vec<_> =
+            consumer.end(INT).of_class("scan").iter().map(|scan| number(scan, "seq")).collect();
+        assert_eq!(number(&replayed(&player.wait()), "telegrams"), 20);
+        let of = |life: u64, from| (from..10).filter(|seq| *seq != 5).map(move |seq| 10 * life + seq);
+        assert!(scans.iter().copied().eq(of(0, understood[0]).chain(of(1, understood[1]))), "{scans:?}");
+    }
+}
+
 #[test]
 fn links_of_the_configuration_that_are_not_in_it_are_left_out() {
     let stage = Stage::new();
@@ -112,6 +170,7 @@ fn what_cannot_be_played_is_refused() {
     for (words, code, message) in [
         (&["/no/such/file"][..], 78, "cannot read recording /no/such/file"),
         (&[&log, "--start=2s", "--end=1s"], 2, "--end 1s is not after --start 2s"),
+        (&[&log, "--end=0s"], 2, "--end 0ns is not after --start 0ns"),
         (&[&log, "--rate=0"], 2, "--rate"),
         (&[&log, "--loop", "--hold"], 2, "--loop"),
         (&[&log, "--sensor=Front"], 78, "sensor name \"Front\" is not possible"),
@@ -165,4 +224,17 @@ fn a_signal_gives_the_terminal_back() {
         let (code, text, is_as_before) = sitting.end_of_lines();
         assert_eq!((code, is_as_before), (Some(0), true), "{text}");
     }
+}
+
+#[test]
+fn it_ends_with_its_terminal() {
+    let stage = Stage::new();
+    let words = ["replay", "--no-system-config", "--loop", "--paused", &log(&stage, 300, 100)];
+    let errors = stage.path("errors");
+    let file = std::fs::File::create(&errors).expect("a file");
+    let sitting = Sitting::start_for_hang_up(&stage.command(&words), (100, 30), true, file);
+    sitting.await_words("ready ");
+    sitting.hang_up();
+    let errors = std::fs::read_to_string(errors).expect("its errors");
+    assert!(!errors.contains("panicked"), "{errors}");
 }

@@ -167,6 +167,10 @@ impl Session {
     /// As [`wait`](Self::wait), for a time instead of until one.
     pub(crate) fn wait_for(&mut self, left: Option<Duration>) -> Result<(), Failure> {
         let left = left.map_or(LONGEST_WAIT, |left| left.min(LONGEST_WAIT));
+        // This takes events that whoever polls has not seen: for him it is readable until it is settled.
+        if let Some(readiness) = &self.readiness {
+            readiness.again_in(Duration::ZERO)?;
+        }
         match &mut self.joined {
             Some(joined) => joined.wakeups.wait(&joined.node, left),
             None => {

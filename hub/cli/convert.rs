@@ -96,13 +96,14 @@ struct Missing {
     bytes: u64,
     chunks: u64,
     stamps: u64,
+    begin: bool,
     end: bool,
     checksum: bool,
 }
 
 impl<'a> Line<'a> {
     fn of(convert: &'a Convert, converted: &'a Converted) -> Self {
-        let Damage { telegrams, bytes, chunks, estimated, is_cut, is_harmed } = converted.damage;
+        let Damage { telegrams, bytes, chunks, estimated, is_headless, is_cut, is_harmed } = converted.damage;
         Line {
             class: "converted",
             input: &convert.input,
@@ -119,6 +120,7 @@ impl<'a> Line<'a> {
                 bytes,
                 chunks,
                 stamps: estimated,
+                begin: is_headless,
                 end: is_cut,
                 checksum: is_harmed,
             },

@@ -44,15 +44,14 @@ impl Replay {
     ///
     /// [`Kind::Usage`] if it ends before it starts.
     pub(crate) fn play(&self) -> Result<Play, Failure> {
-        if let (Some(start), Some(end)) = (self.start, self.end)
-            && end <= start
-        {
+        let start = self.start.unwrap_or_default();
+        if let Some(end) = self.end.filter(|end| *end <= start) {
             let message = format!("--end {end:?} is not after --start {start:?}");
             return Err(Failure::new(Kind::Usage, message, "both count from the first telegram"));
         }
         Ok(Play {
             pace: self.rate,
-            start_ns: self.start.map_or(0, nanos),
+            start_ns: nanos(start),
             end_ns: self.end.map(nanos),
             is_looped: self.is_looped,
             is_paused: self.paused,

@@ -1,6 +1,7 @@
 /* Everything that a program may do wrong, and what the library answers: misuse SENSOR, where a hub lives. */
 #include <scanhub/attach.h>
 
+#include <poll.h>
 #include <pthread.h>
 #include <signal.h>
 #include <stdint.h>
@@ -8,6 +9,8 @@
 #include <stdlib.h>
 #include <string.h>
 #include <sys/time.h>
+#include <sys/wait.h>
+#include <unistd.h>
 
 #define MUST(what)                                                                                   \
     do {                                                                                             \
@@ -83,6 +86,13 @@ static void *elsewhere(void *handle)
     return NULL;
 }
 
+static void *releases(void *sample)
+{
+    MUST(scanhub_release(sample) == SCANHUB_REFUSED_ARGUMENT);
+    SAYS("by the thread that opened it");
+    return NULL;
+}
+
 static void *leaves_it_open(void *sensor)
 {
     struct scanhub_sample sample;
@@ -98,8 +108,51 @@ static void threads(const char *sensor)
     struct scanhub_attachment *handle = open_scans(sensor, SCANHUB_WAIT_DOORBELL);
     pthread_t thread;
     MUST(pthread_create(&thread, NULL, elsewhere, handle) == 0 && pthread_join(thread, NULL) == 0);
+    struct scanhub_sample sample;
+    MUST(scanhub_wait(handle, 20000) == 1 && scanhub_take(handle, &sample) == 1);
+    MUST(pthread_create(&thread, NULL, releases, &sample) == 0 && pthread_join(thread, NULL) == 0);
+    /* It is still there, to be given back by who took it. */
+    MUST(sample.payload != NULL && scanhub_release(&sample) == 0 && sample.payload == NULL);
     MUST(scanhub_close(handle) == 0);
     MUST(pthread_create(&thread, NULL, leaves_it_open, name) == 0 && pthread_join(thread, NULL) == 0);
+}
+
+/* A child that ends as any program does takes nothing from its parent. */
+static void children(const char *sensor)
+{
+    struct scanhub_attachment *handle = open_scans(sensor, SCANHUB_WAIT_EVENT);
+    struct scanhub_sample sample;
+    int status;
+    MUST(scanhub_wait(handle, 20000) == 1 && scanhub_take(handle, &sample) == 1);
+    const pid_t child = fork();
+    MUST(child >= 0);
+    if (child == 0) {
+        MUST(scanhub_release(&sample) == SCANHUB_REFUSED_ARGUMENT);
+        refused_as_a_handle(handle);
+        MUST(scanhub_close(handle) == SCANHUB_REFUSED_ARGUMENT);
+        exit(EXIT_SUCCESS);
+    }
+    MUST(waitpid(child, &status, 0) == child && WIFEXITED(status) && WEXITSTATUS(status) == EXIT_SUCCESS);
+    MUST(scanhub_release(&sample) == 0);
+    for (int i = 0; i < 20; i++) {
+        MUST(scanhub_wait(handle, 20000) == 1 && scanhub_take(handle, &sample) == 1);
+        MUST(scanhub_release(&sample) == 0);
+    }
+    MUST(scanhub_close(handle) == 0);
+}
+
+/* What a wait took, poll still sees. */
+static void polls(const char *sensor)
+{
+    struct scanhub_attachment *handle = open_scans(sensor, SCANHUB_WAIT_EVENT);
+    struct scanhub_sample sample;
+    struct pollfd fds = {scanhub_fd(handle), POLLIN, 0};
+    MUST(fds.fd >= 0 && scanhub_wait(handle, 20000) == 1);
+    while (scanhub_take(handle, &sample) == 1)
+        MUST(scanhub_release(&sample) == 0);
+    MUST(scanhub_wait(handle, 20000) == 1);
+    MUST(poll(&fds, 1, 0) == 1);
+    MUST(scanhub_close(handle) == 0);
 }
 
 static void samples(const char *sensor)
@@ -159,6 +212,8 @@ int main(int argc, char **argv)
     names(sensor);
     handles(sensor);
     threads(sensor);
+    children(sensor);
+    polls(sensor);
     samples(sensor);
     signals();
     /* Left open, with a sample: the end of the process is an end, too. */

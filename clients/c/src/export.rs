@@ -77,12 +77,13 @@ pub extern "C" fn scanhub_take(handle: *mut Opaque, taken: *mut Lent) -> c_int {
 pub extern "C" fn scanhub_release(taken: *mut Lent) -> c_int {
     answer(|| {
         let taken = sample(taken)?;
-        let Lent { of, number, .. } = std::mem::replace(taken, Lent::none());
-        // Released before, or never filled.
-        if of.is_null() {
-            return Ok(0);
+        let Lent { of, number, .. } = *taken;
+        // Unless it was released before, or never filled. One that is refused stays as it is, for the thread that took it.
+        if !of.is_null() {
+            table::with(of, |handle| handle.give_back(number))?;
         }
-        table::with(of, |handle| handle.give_back(number)).map(|()| 0)
+        *taken = Lent::none();
+        Ok(0)
     })
 }
 

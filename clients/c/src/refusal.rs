@@ -3,7 +3,6 @@
 
 use std::cell::RefCell;
 use std::ffi::{CString, c_char, c_int};
-use std::ptr;
 
 use schema::{Failure, Kind};
 
@@ -54,7 +53,7 @@ impl From<Failure> for Refusal {
 
 /// What the last refusal of this thread said, until its next one; an empty text if there was none.
 pub(crate) fn last() -> *const c_char {
-    LAST.try_with(|last| last.borrow().as_ptr()).unwrap_or(ptr::null())
+    LAST.try_with(|last| last.borrow().as_ptr()).unwrap_or(c"".as_ptr())
 }
 
 thread_local! {

@@ -1,9 +1,12 @@
 //! The handles of a thread. What C has in its hands is a number from here that looks like an address: whatever it brings
-//! back is looked up, never followed.
+//! back is looked up, never followed. A child after `fork` has what it copied, and never touches it: the parent's samples and
+//! its places at the hub are not the child's to give back.
 
 use std::cell::RefCell;
+use std::process;
 use std::ptr;
 use std::sync::atomic::{AtomicUsize, Ordering};
+use std::sync::{Mutex, PoisonError};
 
 use crate::handle::Handle;
 use crate::refusal::Refusal;
@@ -15,10 +18,35 @@ pub struct Opaque {
 }
 
 thread_local! {
-    // In boxes, because what a handle lends stays where it is when others come.
-    #[allow(clippy::vec_box)]
-    static HANDLES: RefCell<Vec<(usize, Box<Handle>)>> = const { RefCell::new(Vec::new()) };
+    static HANDLES: RefCell<Vec<Entry>> = const { RefCell::new(Vec::new()) };
 }
+
+struct Entry {
+    number: usize,
+    process: u32,
+    /// In a box, because what a handle lends stays where it is when others come; nothing only while it ends.
+    handle: Option<Box<Handle>>,
+}
+
+impl Entry {
+    fn is_named(&self, name: *mut Opaque) -> bool {
+        self.number == name.addr() && self.process == process::id()
+    }
+}
+
+impl Drop for Entry {
+    fn drop(&mut self) {
+        let handle = self.handle.take();
+        if self.process != process::id() {
+            // Still to be found, so that who looks for leaks finds none.
+            let mut kept = OF_PARENTS.lock().unwrap_or_else(PoisonError::into_inner);
+            kept.extend(handle.map(|handle| Box::into_raw(handle).expose_provenance()));
+        }
+    }
+}
+
+/// Where the handles are that a child has of its parent.
+static OF_PARENTS: Mutex<Vec<usize>> = Mutex::new(Vec::new());
 
 /// No number is given twice in a process.
 static NEXT: AtomicUsize = AtomicUsize::new(1);
@@ -26,8 +54,8 @@ static NEXT: AtomicUsize = AtomicUsize::new(1);
 /// Keeps `handle` for this thread; what C is to call it.
 pub(crate) fn insert(handle: Handle) -> Result<*mut Opaque, Refusal> {
     let number = NEXT.fetch_add(1, Ordering::Relaxed);
-    let handle = Box::new(handle);
-    let kept = HANDLES.try_with(|handles| handles.borrow_mut().push((number, handle)));
+    let entry = Entry { number, process: process::id(), handle: Some(Box::new(handle)) };
+    let kept = HANDLES.try_with(|handles| handles.borrow_mut().push(entry));
     kept.map(|()| ptr::without_provenance_mut(number)).map_err(|_| UNKNOWN)
 }
 
@@ -38,8 +66,8 @@ pub(crate) fn with<R>(
 ) -> Result<R, Refusal> {
     let found = HANDLES.try_with(|handles| {
         let mut handles = handles.borrow_mut();
-        let handle = handles.iter_mut().find(|(number, _)| *number == name.addr());
-        use_it(&mut handle.ok_or(UNKNOWN)?.1)
+        let entry = handles.iter_mut().find(|entry| entry.is_named(name));
+        use_it(entry.and_then(|entry| entry.handle.as_deref_mut()).ok_or(UNKNOWN)?)
     });
     found.unwrap_or(Err(UNKNOWN))
 }
@@ -48,7 +76,7 @@ pub(crate) fn with<R>(
 pub(crate) fn remove(name: *mut Opaque) -> Result<(), Refusal> {
     let removed = HANDLES.try_with(|handles| {
         let mut handles = handles.borrow_mut();
-        let at = handles.iter().position(|(number, _)| *number == name.addr());
+        let at = handles.iter().position(|entry| entry.is_named(name));
         Ok(handles.swap_remove(at.ok_or(UNKNOWN)?))
     });
     removed.unwrap_or(Err(UNKNOWN)).map(drop)
@@ -56,5 +84,5 @@ pub(crate) fn remove(name: *mut Opaque) -> Result<(), Refusal> {
 
 const UNKNOWN: Refusal = Refusal::Argument(
     "this thread has no such handle",
-    "a handle is used between scanhub_open and scanhub_close, by the thread that opened it",
+    "a handle is used between scanhub_open and scanhub_close, by the thread that opened it; a child opens its own",
 );

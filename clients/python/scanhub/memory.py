@@ -69,10 +69,12 @@ class Membership:
 class Received:
     """A sample in shared memory. Its place is not written anew as long as this, or what was made of it, is in use."""
 
+    __slots__ = ("_sample", "_size", "header")
+
     def __init__(self, sample: Any, size: int | None) -> None:
         self._sample = sample
         self._size = size
-        self.header = layout.Header.from_address(sample.user_header_ptr)
+        self.header = _header_at(sample.user_header_ptr)
 
     def data(self) -> Any:
         """The payload as an array of bytes; made when it is asked for, because whoever waits for a sample has haste."""
@@ -179,5 +181,6 @@ def _payload(kind: type[Sample]) -> Any:
     return iox2.Slice[ctypes.c_uint8] if kind.topic == "telegram" else kind.struct
 
 
+_header_at = layout.Header.from_address
 _UNCONNECTED_LIMIT = 3.0
 """Seconds for which a publisher may be just dying that cannot be connected to."""

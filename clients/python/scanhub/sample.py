@@ -46,6 +46,7 @@ class Sample:
 
     topic: ClassVar[str]
     struct: ClassVar[Any]
+    _read: Any = None
 
     def __init__(self, sensor: str, chunk: Chunk, missed: int = 0, restarted: bool = False) -> None:
         self.sensor = sensor
@@ -53,7 +54,6 @@ class Sample:
         self.restarted = restarted
         self._header = chunk.header
         self._chunk = chunk
-        self._read: Any = None
 
     def copy(self: Self) -> Self:
         """The same in memory of its own: may be kept for as long as you like."""

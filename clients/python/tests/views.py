@@ -80,16 +80,21 @@ def other_threads_run_meanwhile(scans: scanhub.Subscription) -> None:
         while not is_over.wait(0.001):
             turns[0] += 1
 
-    thread = threading.Thread(target=turn)
+    thread = threading.Thread(target=turn, daemon=True)
     thread.start()
-    begin, used = time.monotonic(), time.process_time()
-    while time.monotonic() - begin < 0.5:
-        next(scans)
-    used = time.process_time() - used
+    give_up_at = time.monotonic() + 20
+    while True:
+        turns[0], begin, used = 0, time.monotonic(), time.process_time()
+        while time.monotonic() - begin < 0.5:
+            next(scans)
+        used = time.process_time() - used
+        # They would hardly run while the lock of the interpreter is held over a wait; and who sleeps uses no time. A
+        # machine that is full gives neither, for a while.
+        if turns[0] > 50 and used < 0.4:
+            break
+        assert time.monotonic() < give_up_at, (turns, used)
     is_over.set()
     thread.join()
-    # They would not run at all while the lock of the interpreter is held over a wait; and who sleeps uses no time.
-    assert turns[0] > 10 and used < 0.4, (turns, used)
 
 
 def a_child_takes_nothing_from_its_parent(scans: scanhub.Subscription) -> None:

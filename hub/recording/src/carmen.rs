@@ -1,7 +1,7 @@
 //! CARMEN logs: text lines of which `FLASER n r1 .. rn ..` are scans in metres. They become the telegrams that an
 //! LMS 2xx would have sent. Poses and all other lines are passed over.
 
-use std::io::BufRead;
+use std::io::{self, BufRead, Read};
 
 use lms::measured;
 use lms::variant::{Mode, Unit, Variant};
@@ -80,20 +80,42 @@ pub(crate) fn is_log(head: &[u8]) -> bool {
     })
 }
 
-/// The next scan of `reader` after line number `line`, which is counted on; `Err` holds what is wrong with that line.
-/// A last line without its end that is no scan is where the recording broke off, not a mistake.
-pub(crate) fn next(reader: &mut impl BufRead, line: &mut u64) -> Result<Option<Sweep>, String> {
+/// Why there is no next scan.
+#[derive(Debug)]
+pub(crate) enum Wrong {
+    /// What is wrong with the line.
+    Line(String),
+    /// The file cannot be read.
+    File(io::Error),
+}
+
+/// The next scan of `reader` after line number `line`, which is counted on. A last line without its end that is no scan
+/// is where the recording broke off, not a mistake.
+pub(crate) fn next(reader: &mut impl BufRead, line: &mut u64) -> Result<Option<Sweep>, Wrong> {
     let mut bytes = Vec::new();
     loop {
         bytes.clear();
-        if reader.read_until(b'\n', &mut bytes).map_err(|error| error.to_string())? == 0 {
+        if reader.take(LONGEST).read_until(b'\n', &mut bytes).map_err(Wrong::File)? == 0 {
             return Ok(None);
         }
         *line += 1;
+        let is_last = bytes.last() != Some(&b'\n') && bytes.len() < LONGEST as usize;
         match Sweep::parse(&String::from_utf8_lossy(&bytes)) {
             Ok(None) => {}
-            Err(_) if bytes.last() != Some(&b'\n') => return Ok(None),
-            other => return other,
+            Err(_) if is_last => return Ok(None),
+            Err(wrong) => return Err(Wrong::Line(wrong)),
+            Ok(sweep) => return Ok(sweep),
+        }
+    }
+}
+
+/// The same of a log that was read before: lines that are wrong are passed over, where it breaks off it ends.
+pub(crate) fn following(reader: &mut impl BufRead, line: &mut u64) -> Option<Sweep> {
+    loop {
+        match next(reader, line) {
+            Ok(sweep) => return sweep,
+            Err(Wrong::Line(_)) => {}
+            Err(Wrong::File(_)) => return None,
         }
     }
 }
@@ -106,6 +128,8 @@ fn variant(beams: usize) -> Option<Variant> {
 
 /// What is subtracted from the greatest value for a range beyond the mode's (Telegram listing 10.8).
 pub const BEYOND: u16 = 8;
+/// No line is longer.
+const LONGEST: u64 = 1 << 20;
 /// Status byte of a healthy LMS type 6 (Telegram listing 8).
 const STATUS: u8 = 0x10;
 

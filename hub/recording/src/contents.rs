@@ -29,7 +29,7 @@ pub struct Contents {
     pub telegrams: u64,
     /// How many of them are measured values (B0h).
     pub scans: u64,
-    /// Wall clock of the first and of the last telegram, ns since 1970, where there are stamps.
+    /// Wall clock of the first telegram and of the latest one, ns since 1970, where there are stamps.
     pub span: Option<(u64, u64)>,
     /// Variant of the first scan.
     pub variant: Option<Variant>,
@@ -82,7 +82,8 @@ impl Contents {
 
     fn note_time(&mut self, wall_ns: Option<u64>) {
         if let Some(wall_ns) = wall_ns {
-            self.span = Some((self.span.map_or(wall_ns, |(first, _)| first), wall_ns));
+            let (first_ns, last_ns) = self.span.unwrap_or((wall_ns, wall_ns));
+            self.span = Some((first_ns, last_ns.max(wall_ns)));
         }
     }
 }

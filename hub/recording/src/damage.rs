@@ -13,6 +13,8 @@ pub struct Damage {
     pub chunks: u64,
     /// Telegrams that are there, but what the hub knew of them is not: their stamps are estimated.
     pub estimated: u64,
+    /// The beginning of the file is missing, be it by a byte: what it said of itself may be gone.
+    pub is_headless: bool,
     /// The file ends without its index, as after a kill.
     pub is_cut: bool,
     /// What the file says of itself is wrong somewhere: a checksum, a length, an order.
@@ -39,6 +41,7 @@ impl fmt::Display for Damage {
             counted(self.bytes, "byte that is in nothing", "bytes that are in nothing"),
             counted(self.chunks, "packed chunk", "packed chunks"),
             counted(self.estimated, "stamp, which is estimated", "stamps, which are estimated"),
+            self.is_headless.then(|| "the beginning of the file".to_owned()),
             self.is_cut.then(|| "the end of the file, with its index".to_owned()),
         ];
         let parts: Vec<_> = parts.into_iter().flatten().collect();

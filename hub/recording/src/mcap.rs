@@ -4,6 +4,7 @@
 mod channels;
 mod chunk;
 mod exact;
+mod headless;
 mod knowledge;
 mod originals;
 pub(crate) mod reader;
@@ -21,7 +22,9 @@ use lms::variant::Mode;
 use schema::datagram::Packed;
 use schema::{Header, Status, Topic};
 
+use crate::open::is_end;
 use crate::{Contents, Damage, Form, Frame};
+pub(crate) use headless::is_mcap;
 pub(crate) use knowledge::{Knowledge, message};
 pub(crate) use originals::Originals;
 use reader::{Item, Reader, Sighting};
@@ -36,6 +39,8 @@ pub(crate) struct Survey {
     knowledge: Knowledge,
     is_sound: bool,
     numbers: BTreeMap<String, Numbers>,
+    /// Number of the first telegram of which a hub made something, by sensor and life.
+    understood: BTreeMap<String, BTreeMap<u64, u64>>,
 }
 
 /// The last telegram of a sensor whose number is known.
@@ -54,22 +59,25 @@ impl Default for Survey {
             knowledge: Knowledge::default(),
             is_sound: true,
             numbers: BTreeMap::new(),
+            understood: BTreeMap::new(),
         }
     }
 }
 
 impl Survey {
     /// Reads the file that `open` opens through: once if it is sound.
-    pub(crate) fn of<R: Read>(open: impl Fn() -> io::Result<R>) -> io::Result<Survey> {
+    ///
+    /// `is_headless`: its beginning is missing.
+    pub(crate) fn of<R: Read>(open: impl Fn() -> io::Result<R>, is_headless: bool) -> io::Result<Survey> {
         let failed = match Survey::read(Reader::sound(open()?)) {
-            Err(error) if window::is_end(&error) => error,
+            Err(error) if is_end(&error) => error,
             other => return other,
         };
         let knowledge = Knowledge::of(Source::of(open()?, false))?;
         let mut survey = Survey::read(Reader::harmed(open()?, knowledge))?;
         survey.is_sound = false;
         let is_cut = failed.kind() == io::ErrorKind::UnexpectedEof && survey.whole.damage.is_cut;
-        survey.tell(|damage| damage.is_harmed = !is_cut);
+        survey.tell(|damage| (damage.is_headless, damage.is_harmed) = (is_headless, !is_cut));
         Ok(survey)
     }
 
@@ -120,6 +128,12 @@ impl Survey {
         &self.knowledge
     }
 
+    /// Number of the first telegram of `sensor` of which the hub with this `boot` made something. Nothing if that is in
+    /// no file, or in one that is harmed.
+    pub(crate) fn understood(&self, sensor: &str, boot: u64) -> Option<u64> {
+        self.understood.get(sensor)?.get(&boot).copied().filter(|_| !self.whole.damage.is_harmed)
+    }
+
     /// Says of the whole file and of each sensor what `tell` says.
     fn tell(&mut self, tell: impl Fn(&mut Damage)) {
         tell(&mut self.whole.damage);
@@ -141,14 +155,24 @@ impl Survey {
         }
         for contents in [&mut self.whole, of_sensor(&mut self.sensors, &sighting.sensor)] {
             contents.note(&sighting.telegram, Some(sighting.header.wall_ns));
-            contents.damage.telegrams += missing;
+            contents.damage.telegrams = contents.damage.telegrams.saturating_add(missing);
             contents.damage.estimated += u64::from(sighting.is_estimated);
         }
     }
 
-    /// The measuring mode stands in a status too.
+    /// The measuring mode stands in a status too; what was made of a scan says that it was known by then.
     fn note_record(&mut self, knowledge: &Knowledge, record: &Record) {
-        let Some((place, _, payload)) = knowledge.message(record) else { return };
+        let Some((place, header, payload)) = knowledge.message(record) else { return };
+        let is_of_scan = matches!(place.topic, Topic::Scan | Topic::Marks | Topic::Zones | Topic::Foreground);
+        // What is said without a telegram was not sent after one.
+        if is_of_scan && header.hub_time_ns().is_some() {
+            let lives = match self.understood.get_mut(&place.sensor) {
+                Some(lives) => lives,
+                None => self.understood.entry(place.sensor.clone()).or_default(),
+            };
+            let first = lives.entry(header.boot).or_insert(header.seq);
+            *first = header.seq.min(*first);
+        }
         let mut status = Status::default();
         if place.topic == Topic::Status && status.unpack(payload) && status.mode != Status::MODE_UNKNOWN {
             for contents in [&mut self.whole, of_sensor(&mut self.sensors, &place.sensor)] {

@@ -9,7 +9,7 @@ use flate2::bufread::MultiGzDecoder;
 use lms::variant::{Mode, Unit};
 use schema::{Failure, Kind};
 
-use crate::carmen;
+use crate::carmen::{self, Wrong};
 #[cfg(feature = "mcap")]
 use crate::mcap::{Knowledge, reader::Reader};
 use crate::stream::Telegrams;
@@ -48,9 +48,15 @@ impl Recording {
             return Err(refused(&path, "is empty"));
         }
         if head.starts_with(MCAP) {
-            return Recording::open_mcap(path);
+            return Recording::open_mcap(path, false);
         }
         let form = if carmen::is_log(head) { Form::Carmen } else { Form::Telegrams };
+        #[cfg(feature = "mcap")]
+        if form != Form::Carmen
+            && crate::mcap::is_mcap(self::reader(&path)?).map_err(|error| unreadable(&path, &error))?
+        {
+            return Recording::open_mcap(path, true);
+        }
         let contents = match form {
             Form::Carmen => survey_log(&path, reader)?,
             _ => survey_stream(&path, reader)?,
@@ -65,14 +71,15 @@ impl Recording {
     }
 
     #[cfg(feature = "mcap")]
-    fn open_mcap(path: PathBuf) -> Result<Recording, Failure> {
-        let survey = crate::mcap::Survey::of(|| open(&path)).map_err(|error| unreadable(&path, &error))?;
+    fn open_mcap(path: PathBuf, is_headless: bool) -> Result<Recording, Failure> {
+        let survey = crate::mcap::Survey::of(|| open(&path), is_headless)
+            .map_err(|error| unreadable(&path, &error))?;
         let contents = survey.contents();
         Ok(Recording { path, contents, survey: survey.into(), sensor: None })
     }
 
     #[cfg(not(feature = "mcap"))]
-    fn open_mcap(path: PathBuf) -> Result<Recording, Failure> {
+    fn open_mcap(path: PathBuf, _: bool) -> Result<Recording, Failure> {
         let message = format!("recording {} is an MCAP file, which this build does not read", path.display());
         Err(Failure::new(Kind::Configuration, message, "build it with the feature mcap of scanhub-recording"))
     }
@@ -97,6 +104,19 @@ impl Recording {
         }
         chosen.sensor = Some(sensor.to_owned());
         Ok(chosen)
+    }
+
+    /// Number of the first telegram of its one sensor of which the hub with this `boot` made something: from it on, the hub
+    /// knew what the values mean. Nothing if the recording does not tell.
+    #[cfg(feature = "mcap")]
+    pub fn understood(&self, boot: u64) -> Option<u64> {
+        self.survey.understood(self.contents.sensors.first()?, boot)
+    }
+
+    /// Nothing: no form but MCAP tells.
+    #[cfg(not(feature = "mcap"))]
+    pub fn understood(&self, _: u64) -> Option<u64> {
+        None
     }
 
     /// Where it is.
@@ -124,7 +144,7 @@ impl Recording {
             Form::Carmen => {
                 let mut line = 0;
                 Box::new(std::iter::from_fn(move || {
-                    let sweep = carmen::next(&mut reader, &mut line).ok()??;
+                    let sweep = carmen::following(&mut reader, &mut line)?;
                     Some(sweep.frame(encoding.unit, encoding.mode))
                 }))
             }
@@ -168,7 +188,7 @@ impl Recording {
     pub(crate) fn sweeps(&self) -> Result<impl Iterator<Item = carmen::Sweep> + use<>, Failure> {
         let mut reader = Some(reader(&self.path)?).filter(|_| self.contents.form == Form::Carmen);
         let mut line = 0;
-        Ok(std::iter::from_fn(move || carmen::next(reader.as_mut()?, &mut line).ok()?))
+        Ok(std::iter::from_fn(move || carmen::following(reader.as_mut()?, &mut line)))
     }
 
     /// All that is in an MCAP file, and what is known of it.
@@ -204,24 +224,52 @@ impl Recording {
 
 fn survey_log(path: &Path, mut reader: impl BufRead) -> Result<Contents, Failure> {
     let mut contents = Contents::new(Form::Carmen);
-    let mut line = 0;
+    let (mut line, mut refusal) = (0, None);
     loop {
-        let sweep = carmen::next(&mut reader, &mut line).map_err(|wrong| {
-            let message = format!("{}:{line}: {wrong}", path.display());
-            Failure::new(Kind::Configuration, message, "a scan is: FLASER 361 RANGE... in metres")
-        })?;
-        let Some(sweep) = sweep else { return Ok(contents) };
-        contents.note_scan(sweep.variant(), sweep.wall_ns());
+        match carmen::next(&mut reader, &mut line) {
+            Ok(Some(sweep)) => contents.note_scan(sweep.variant(), sweep.wall_ns()),
+            Ok(None) => break,
+            Err(Wrong::File(error)) if is_end(&error) && contents.scans > 0 => {
+                contents.damage.is_cut = true;
+                break;
+            }
+            Err(Wrong::File(error)) => return Err(unreadable(path, &error)),
+            Err(Wrong::Line(wrong)) => {
+                let message = format!("{}:{line}: {wrong}", path.display());
+                let hint = "a scan is: FLASER 361 RANGE... in metres";
+                refusal.get_or_insert(Failure::new(Kind::Configuration, message, hint));
+                contents.damage.telegrams += 1;
+                contents.damage.is_harmed = true;
+            }
+        }
+    }
+    // Where no line is right it is the format that is wrong, not the file.
+    match refusal.filter(|_| contents.scans == 0) {
+        Some(refusal) => Err(refusal),
+        None => Ok(contents),
     }
 }
 
 fn survey_stream(path: &Path, reader: impl Read) -> Result<Contents, Failure> {
     let mut contents = Contents::new(Form::Telegrams);
     let mut telegrams = Telegrams::new(reader);
-    while let Some(bytes) = telegrams.next().map_err(|error| unreadable(path, &error))? {
-        contents.note(&bytes, None);
+    loop {
+        match telegrams.next() {
+            Ok(Some(bytes)) => contents.note(&bytes, None),
+            Ok(None) => return Ok(contents),
+            Err(error) if is_end(&error) && contents.telegrams > 0 => {
+                contents.damage.is_cut = true;
+                return Ok(contents);
+            }
+            Err(error) => return Err(unreadable(path, &error)),
+        }
     }
-    Ok(contents)
+}
+
+/// Whether a reader that fails so has no more to give, and the disk is not to blame: a packed file is cut or harmed.
+pub(crate) fn is_end(error: &io::Error) -> bool {
+    use io::ErrorKind::{InvalidData, InvalidInput, UnexpectedEof};
+    matches!(error.kind(), InvalidData | InvalidInput | UnexpectedEof)
 }
 
 fn reader(path: &Path) -> Result<Box<dyn BufRead + Send>, Failure> {

@@ -115,6 +115,40 @@ fn what_is_no_recording_is_refused_with_place_value_and_remedy() {
 }
 
 #[test]
+fn what_is_there_of_a_packed_file_that_is_cut_is_read() {
+    // So much that what is cut off is not all of it, and different enough not to be packed to nothing.
+    let telegrams: Vec<Vec<u8>> = (0..400).map(scan).collect();
+    let packed = gzip(&telegrams.concat());
+    let file = File::new("cut.bin.gz", &packed[..packed.len() * 2 / 3]);
+    let recording = Recording::open(&file.0).unwrap();
+    let contents = recording.contents();
+    assert!(contents.damage.is_cut && (1..400).contains(&contents.telegrams), "{contents:?}");
+    let read: Vec<_> = recording.telegrams(MM).unwrap().map(|frame| frame.telegram).collect();
+    assert_eq!(read[..], telegrams[..contents.telegrams as usize]);
+}
+
+#[test]
+fn a_log_with_harmed_lines_gives_the_others() {
+    let line = |at: u32, range: &str| {
+        format!("FLASER 181 {} 0 0 0 0 0 0 {at} host {at}\n", vec![range; 181].join(" "))
+    };
+    let log: String = (1..4000).map(|at| line(at, if at == 7 { "1.\0" } else { "1.5" })).collect();
+    let file = File::new("harmed.log", log.as_bytes());
+    let recording = Recording::open(&file.0).unwrap();
+    let damage = recording.contents().damage;
+    assert_eq!((recording.contents().scans, damage.telegrams, damage.is_harmed), (3998, 1, true));
+    let walls: Vec<_> =
+        recording.telegrams(MM).unwrap().map(|frame| frame.wall_ns.unwrap() / 1_000_000_000).collect();
+    assert!(walls.iter().copied().eq((1..4000).filter(|at| *at != 7)));
+    let packed = gzip(log.as_bytes());
+    let cut = File::new("cut.log.gz", &packed[..packed.len() * 2 / 3]);
+    let recording = Recording::open(&cut.0).unwrap();
+    let contents = recording.contents();
+    assert!(contents.damage.is_cut && contents.scans > 0, "{contents:?}");
+    assert_eq!(recording.telegrams(MM).unwrap().count() as u64, contents.telegrams);
+}
+
+#[test]
 fn bytes_without_a_telegram_are_a_stream_without_telegrams() {
     let file = File::new("noise", &[0x42; 9000]);
     let recording = Recording::open(&file.0).unwrap();

@@ -104,3 +104,40 @@ fn sensors_without_their_names_are_called_by_their_numbers() {
         written.telegrams[1].telegram
     );
 }
+
+#[test]
+fn one_without_its_beginning_is_known_by_its_end_or_its_messages() {
+    let written = written::recording(40, 3);
+    let (len, end) = (written.bytes.len(), written.bytes.len() - 4000);
+    let blank = [&[0; 4096], &written.bytes[4096..]].concat();
+    let middle = written.bytes[len / 3..len / 2].to_vec();
+    for (name, bytes, sensors, telegrams) in [
+        ("rest", written.bytes[len / 3..].to_vec(), ["front", "rear"], 40..60),
+        ("end", written.bytes[end..].to_vec(), ["front", "rear"], 0..8),
+        ("blank", blank, ["front", "rear"], 60..80),
+        ("middle", middle.clone(), ["sensor0", "sensor1"], 8..20),
+    ] {
+        let file = File::new(name, &bytes);
+        let recording = Recording::open(&file.0).unwrap();
+        let contents = recording.contents();
+        assert_eq!(
+            (contents.form, &contents.sensors[..]),
+            (Form::Mcap, &sensors.map(String::from)[..]),
+            "{name}"
+        );
+        assert!(
+            telegrams.contains(&contents.telegrams) && contents.damage.is_headless,
+            "{name}: {contents:?}"
+        );
+        assert!(contents.damage.to_string().contains("the beginning of the file"), "{}", contents.damage);
+    }
+    // Its telegrams alone are a stream, also with something that is no message before each.
+    let telegrams = |before: &[u8]| {
+        written.telegrams.iter().flat_map(|known| [before, &known.telegram].concat()).collect::<Vec<u8>>()
+    };
+    for before in [&[][..], &[5; 95], &[0; 95]] {
+        let file = File::new("stream", &telegrams(before));
+        let contents = Recording::open(&file.0).unwrap().contents().clone();
+        assert_eq!((contents.form, contents.telegrams), (Form::Telegrams, 80));
+    }
+}

@@ -17,7 +17,7 @@
  * samples, and is told how many; it never slows the hub.
  *
  * A handle belongs to the thread that opened it; other threads open handles of their own. All functions may be called with
- * a handle that was closed, or with NULL: they refuse it. A child after fork() opens its own.
+ * a handle that was closed, or with NULL: they refuse it. A child after fork() opens its own, and may end as it likes.
  *
  * Functions answer 0 or more; a negative number is one of SCANHUB_REFUSED_.., and scanhub_error() says what and what to do.
  * Signals are never an error.
@@ -262,7 +262,7 @@ int scanhub_wait(struct scanhub_attachment *handle, int timeout_ms);
  */
 int scanhub_take(struct scanhub_attachment *handle, struct scanhub_sample *sample);
 
-/* Gives a sample back and empties it: 0, also if it is empty. */
+/* Gives a sample back and empties it: 0, also if it is empty. One that is refused stays as it is. */
 int scanhub_release(struct scanhub_sample *sample);
 
 /* Ends it all, lent samples too: 0, also for NULL. */

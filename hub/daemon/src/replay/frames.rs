@@ -34,34 +34,41 @@ pub(super) fn play(link: &mut LinkThread<'_>, frames: &Frames, seat: Seat<'_>) -
             return Some(None);
         }
     };
-    let mut mode = frames.first_mode();
-    let (mut media, mut last_stamp, mut boot) = (0, 0, None);
+    let (mut told_mode, mut understood_from) = (frames.first_mode(), 0);
+    let mut timeline = frames.timeline();
+    let (mut last_stamp, mut boot) = (0, None);
     let (mut verdict, mut limit): (Option<Verdict>, Option<Nanos>) = (None, None);
     let mut state = State::Streaming;
     while let Some(frame) = telegrams.next() {
-        media = frames.media(&frame, media);
+        let media = timeline.media(&frame);
         if play.end_ns.is_some_and(|end_ns| media >= end_ns) {
             break;
         }
         let is_skipped = media < play.start_ns;
         let header = frame.header;
+        let took = header.map_or(0, |header| header.stamp_last_ns.saturating_sub(header.stamp_first_ns));
+        // A hub has it with its last byte.
+        let turn = media.saturating_add(took.min(LONGEST_GAP));
         if let Some(silence) = verdict.take_if(|verdict| is_silence(verdict, header.as_ref())) {
             if is_skipped {
                 link.pipeline.stale(&mut Zones::default());
             } else {
-                let due = turns.wait(link, None, silence.until.clamp(play.start_ns, media), state)?;
+                let due = turns.wait(link, None, silence.until.clamp(play.start_ns, turn), state)?;
                 link.topics.stale(&mut link.pipeline, due.at);
                 link.wake(Wake::Status);
                 state = State::Silent;
             }
         }
         // Another life of the hub, which knew nothing at its start.
-        if let Some(header) = header
-            && boot.replace(header.boot).is_some_and(|boot| boot != header.boot)
-        {
-            if is_skipped { link.pipeline.begin_anew() } else { begin_anew(link) }
+        if let Some(header) = header.filter(|header| boot != Some(header.boot)) {
+            if boot.replace(header.boot).is_some() {
+                verdict = None;
+                if is_skipped { link.pipeline.begin_anew() } else { begin_anew(link) }
+            }
+            understood_from = frames.understood_from(&header);
         }
-        mode = told(&frame).unwrap_or(mode);
+        told_mode = told(&frame).unwrap_or(told_mode);
+        let mode = told_mode.filter(|_| header.is_none_or(|header| header.seq >= understood_from));
         let Some(telegram) = Telegram::check(&frame.telegram) else { continue };
         if is_skipped {
             if !turns.pass(link) {
@@ -69,9 +76,8 @@ pub(super) fn play(link: &mut LinkThread<'_>, frames: &Frames, seat: Seat<'_>) -
             }
             link.learn(telegram, mode);
         } else {
-            let due = turns.wait(link, None, media, state)?;
+            let due = turns.wait(link, None, turn, state)?;
             let at = due.at.max(last_stamp);
-            let took = header.map_or(0, |header| header.stamp_last_ns.saturating_sub(header.stamp_first_ns));
             let received = Received {
                 telegram,
                 first: at.saturating_sub(took),
@@ -81,7 +87,7 @@ pub(super) fn play(link: &mut LinkThread<'_>, frames: &Frames, seat: Seat<'_>) -
                 reasons: header.map_or(0, |header| header.reasons),
             };
             last_stamp = at;
-            let gap = telegrams.peek().and_then(|next| gap(frames, &frame, next));
+            let gap = telegrams.peek().and_then(|next| gap(&frame, next));
             link.account.recall(telegram, mode);
             limit = link.publish(&received, &past(&frame, mode, gap, due.stretch)).or(limit);
             link.stale_at = STANDS;
@@ -90,9 +96,12 @@ pub(super) fn play(link: &mut LinkThread<'_>, frames: &Frames, seat: Seat<'_>) -
             state = State::Streaming;
             link.show(None, state, "");
         }
-        verdict = header.and_then(|header| stands(&header, &frame, media)).or(verdict);
+        // One whose values nobody could read had none.
+        if frame.is_scan() && mode.is_some_and(Mode::has_ranges) {
+            verdict = header.map(|header| stands(&header, media)).or(verdict);
+        }
         if !frames.has_stamps() && frame.is_scan() {
-            media += period(Measured::decode(telegram).and_then(|it| Variant::of_beams(it.count())));
+            timeline.pass(period(Measured::decode(telegram).and_then(|it| Variant::of_beams(it.count()))));
         }
     }
     Some(limit)
@@ -110,20 +119,20 @@ fn past(frame: &Frame, mode: Option<Mode>, gap: Option<Nanos>, stretch: f64) -> 
 }
 
 /// The time to the next scan of a log, which may leave scans out: so long nothing newer can be known.
-fn gap(frames: &Frames, frame: &Frame, next: &Frame) -> Option<Nanos> {
+fn gap(frame: &Frame, next: &Frame) -> Option<Nanos> {
     if frame.header.is_some() {
         return None;
     }
-    let (from, to) = (frames.media(frame, 0), frames.media(next, 0));
+    let (from, to) = frame.wall_ns.zip(next.wall_ns)?;
     Some(to.saturating_sub(from).min(LONGEST_GAP))
 }
 
-/// For how long the verdict on the scan in `frame`, at `media`, stood in the hub that recorded it.
-fn stands(header: &Header, frame: &Frame, media: Nanos) -> Option<Verdict> {
-    let published = header.stamp_last_ns + header.hub_time_ns().unwrap_or(0);
-    let until_ns = published + publish::limit(header.period_us);
+/// For how long the verdict on the scan of `header`, at `media`, stood in the hub that recorded it.
+fn stands(header: &Header, media: Nanos) -> Verdict {
+    let published = header.stamp_last_ns.saturating_add(header.hub_time_ns().unwrap_or(0));
+    let until_ns = published.saturating_add(publish::limit(header.period_us));
     let after = until_ns.saturating_sub(header.stamp_first_ns);
-    frame.is_scan().then_some(Verdict { until_ns, until: media + after })
+    Verdict { until_ns, until: media.saturating_add(after) }
 }
 
 /// Whether the verdict was over when the telegram of `header` came.

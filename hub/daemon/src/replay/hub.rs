@@ -69,7 +69,11 @@ pub fn replay(
     let player = Arc::new(Player::new(replay.play, links, length)?);
     let troupe = Troupe { player: &player, parts, holds: replay.holds };
     supervise::serve(&read, config, Some(troupe), domain, |ready| on_ready(ready, &player))?;
-    Ok(player.progress())
+    let played = player.progress();
+    if played.is_over && played.telegrams == 0 && replay.play.start_ns > 0 {
+        tracing::warn!("nothing was published: {} ends before --start", file.display());
+    }
+    Ok(played)
 }
 
 /// A sensor that is played.

@@ -39,6 +39,8 @@ pub(super) struct Playback {
     /// When the first lap began, and when nothing came any more.
     began_at: Option<Nanos>,
     over_at: Option<Nanos>,
+    /// Whether what comes next is to be played, as soon as all have said what they have.
+    owes_step: bool,
     /// Whether links that wait have to ask again.
     is_news: bool,
 }
@@ -88,6 +90,7 @@ impl Playback {
             has_played: false,
             began_at: None,
             over_at: None,
+            owes_step: false,
             is_news: false,
         }
     }
@@ -102,20 +105,20 @@ impl Playback {
     pub(super) fn turn(&mut self, link: usize, media: Nanos, now: Nanos) -> Turn {
         self.links[link] = Next::At(media);
         self.start(now);
+        self.pay_step();
         let Some((since, from)) = self.anchor else { return Turn::Wait };
         if self.play.is_paused {
-            return if media < from { self.play_now(now) } else { Turn::Wait };
+            return if media < from { self.play_now(link, Due::at_once(now)) } else { Turn::Wait };
         }
-        let Pace::Times(rate) = self.play.pace else { return self.play_now(now) };
+        let Pace::Times(rate) = self.play.pace else { return self.play_now(link, Due::at_once(now)) };
         if self.skip_silence(now) {
             return self.turn(link, media, now);
         }
-        let due = (since as f64 + (media as f64 - from as f64) / rate) as Nanos;
+        let due = since.saturating_add_signed(((media as f64 - from as f64) / rate) as i64);
         if due > now {
             return Turn::At(due);
         }
-        self.has_played = true;
-        Turn::Now(Due { at: due, stretch: (1.0 / rate).max(1.0) })
+        self.play_now(link, Due { at: due, stretch: (1.0 / rate).max(1.0) })
     }
 
     /// `link`, which plays lap number `lap`, has nothing more in it.
@@ -129,6 +132,7 @@ impl Playback {
         self.links[link] = Next::Ended;
         self.start(now);
         if !self.is_over() {
+            self.pay_step();
             return Turn::Wait;
         }
         self.is_news = true;
@@ -147,15 +151,15 @@ impl Playback {
     pub(super) fn pause(&mut self, is_paused: bool, now: Nanos, position: Nanos) {
         self.hold(now, position);
         self.play.is_paused = is_paused;
+        self.owes_step = false;
     }
 
     /// Pauses after what comes next.
     pub(super) fn step(&mut self, now: Nanos, position: Nanos) {
         self.hold(now, position);
         self.play.is_paused = true;
-        if let Some(((_, media), next)) = self.anchor.as_mut().zip(next_of(&self.links)) {
-            *media = (*media).max(next + 1);
-        }
+        self.owes_step = true;
+        self.pay_step();
     }
 
     /// Goes on so fast.
@@ -199,13 +203,26 @@ impl Playback {
         match self.play.pace {
             _ if self.play.is_paused => from,
             Pace::Max => position.max(from),
-            Pace::Times(rate) => from + (now.saturating_sub(since) as f64 * rate) as Nanos,
+            Pace::Times(rate) => from.saturating_add((now.saturating_sub(since) as f64 * rate) as Nanos),
         }
     }
 
-    fn play_now(&mut self, now: Nanos) -> Turn {
+    /// It is the turn of `link`, which then looks for what it has next.
+    fn play_now(&mut self, link: usize, due: Due) -> Turn {
         self.has_played = true;
-        Turn::Now(Due { at: now, stretch: 1.0 })
+        self.links[link] = Next::Unknown;
+        Turn::Now(due)
+    }
+
+    /// Lets what comes next play in a pause, if that was asked for and all have said what they have.
+    fn pay_step(&mut self) {
+        if self.owes_step
+            && !self.links.contains(&Next::Unknown)
+            && let Some(((_, media), next)) = self.anchor.as_mut().zip(next_of(&self.links))
+        {
+            *media = (*media).max(next.saturating_add(1));
+            (self.owes_step, self.is_news) = (false, true);
+        }
     }
 
     /// Lets the time run as soon as all are there.
@@ -229,8 +246,8 @@ impl Playback {
     /// Where all were silent for long, for the recording was interrupted, listeners wait less.
     fn skip_silence(&mut self, now: Nanos) -> bool {
         let media = self.media(now, 0);
-        match next_of(&self.links) {
-            Some(next) if next > media + LONGEST_SILENCE => {
+        match next_of(&self.links).filter(|_| !self.links.contains(&Next::Unknown)) {
+            Some(next) if next > media.saturating_add(LONGEST_SILENCE) => {
                 self.anchor = Some((now, next - LONGEST_SILENCE));
                 self.is_news = true;
                 true
@@ -313,6 +330,36 @@ mod tests {
         assert_eq!(playback.turn(0, 2 * SECOND, 200 * SECOND), Turn::At(201 * SECOND - 1));
         playback.pause(true, 200 * SECOND + 5, 0);
         assert_eq!(playback.turn(0, 2 * SECOND, 300 * SECOND), Turn::Wait);
+    }
+
+    #[test]
+    fn a_step_waits_for_all_to_say_what_they_have() {
+        let mut playback = begun(2, Play { is_paused: true, ..Play::default() });
+        assert_eq!(playback.turn(0, 0, 100 * SECOND), Turn::Wait);
+        assert_eq!(playback.turn(1, 3 * SECOND, 100 * SECOND), Turn::Wait);
+        playback.step(101 * SECOND, 0);
+        assert!(is_now(playback.turn(0, 0, 101 * SECOND), 101 * SECOND));
+        // Pressed again before it has read on.
+        playback.step(101 * SECOND, 0);
+        assert_eq!(playback.turn(1, 3 * SECOND, 101 * SECOND), Turn::Wait);
+        assert!(is_now(playback.turn(0, 2 * SECOND, 102 * SECOND), 102 * SECOND));
+        // As fast as it goes nobody asks.
+        playback.set_pace(Pace::Max, 103 * SECOND, 0);
+        playback.pause(false, 103 * SECOND, 0);
+        assert!(is_now(playback.turn(0, 4 * SECOND, 103 * SECOND), 103 * SECOND));
+        assert!(is_now(playback.turn(1, 3 * SECOND, 103 * SECOND), 103 * SECOND));
+        playback.step(104 * SECOND, 700 * SECOND);
+        assert_eq!(playback.turn(0, 800 * SECOND, 104 * SECOND), Turn::Wait);
+        assert!(is_now(playback.turn(1, 701 * SECOND, 104 * SECOND), 104 * SECOND));
+    }
+
+    #[test]
+    fn after_years_of_uptime_distances_are_those_of_the_recording() {
+        let (mut playback, up) = (Playback::new(Play::default(), 1), 100_000_000 * SECOND + 1);
+        playback.begin(up);
+        for media in (0..100).map(|scan| scan * 26_640_001) {
+            assert!(is_now(playback.turn(0, media, up + media), up + media), "{media}");
+        }
     }
 
     #[test]

@@ -173,9 +173,10 @@ impl Player {
         let now = clock::now();
         let is_over = playback.is_over();
         let position = self.position();
-        let position_ns = if is_over { position } else { playback.media(now, position) };
+        // What follows the end is no place in it.
+        let media = playback.media(now, position).min(length_ns.unwrap_or(Nanos::MAX)).max(position);
         Progress {
-            position_ns: length_ns.map_or(position_ns, |length_ns| position_ns.min(length_ns)),
+            position_ns: if is_over { position } else { media },
             length_ns,
             pace: playback.play().pace,
             is_paused: playback.play().is_paused,
@@ -247,7 +248,12 @@ impl Seat<'_> {
     /// The link is at the end of lap number `lap`.
     pub(super) fn end(self, lap: u32, now: Nanos) -> Turn {
         self.place().has_ended.store(true, Ordering::Relaxed);
-        self.ask(|playback| playback.end(self.number, lap, now))
+        let turn = self.ask(|playback| playback.end(self.number, lap, now));
+        if let Turn::Anew(_) = turn {
+            self.place().media.store(0, Ordering::Relaxed);
+            self.place().has_ended.store(false, Ordering::Relaxed);
+        }
+        turn
     }
 
     /// The link has published something of `media`.

@@ -9,9 +9,9 @@ use lms::reply::Reply;
 use lms::telegram::Telegram;
 use lms::variant::{Mode, Unit, Variant};
 use recording::{Encoding, Form, Frame, Recording};
-use schema::Failure;
+use schema::{Failure, Header};
 
-use super::period;
+use super::{LONGEST_GAP, period};
 use crate::config::Link;
 
 /// A recording of one sensor.
@@ -69,9 +69,9 @@ impl Recorded {
         let mut frames = Frames { recording, encoding, origin: None, is_told_later: false };
         let mut first = frames.read()?.take(ASKED_WITHIN).peekable();
         frames.origin = first.peek().and_then(Origin::of);
-        let is_first_of_life =
-            first.peek().is_some_and(|frame| frame.header.is_some_and(|header| header.seq == 0));
-        frames.is_told_later = is_first_of_life && first.any(|frame| told(&frame).is_some());
+        let begin = first.peek().and_then(|frame| frame.header).filter(is_first);
+        let is_open = begin.is_some_and(|header| frames.recording.understood(header.boot).is_none());
+        frames.is_told_later = is_open && first.any(|frame| told(&frame).is_some());
         Ok(Recorded::Frames(frames))
     }
 
@@ -142,22 +142,67 @@ impl Frames {
         (!self.is_told_later).then_some(self.encoding.mode)
     }
 
-    /// The media time of `frame`, which comes after one of `last`, which was a scan or not.
-    pub(super) fn media(&self, frame: &Frame, last: Nanos) -> Nanos {
-        let Some(origin) = self.origin else { return last };
-        let life = frame.header.map(|header| (header.boot, header.stamp_first_ns));
-        let media = match (life, origin.life) {
-            (Some((boot, stamp_ns)), Some((same, begin_ns))) if boot == same => {
-                stamp_ns.checked_sub(begin_ns)
-            }
-            _ => frame.wall_ns.and_then(|wall_ns| wall_ns.checked_sub(origin.wall_ns)),
-        };
-        media.unwrap_or(last).max(last)
+    /// Number of the first telegram whose values the hub could read, in the life that begins with that of `header`.
+    pub(super) fn understood_from(&self, header: &Header) -> u64 {
+        let understood = is_first(header).then(|| self.recording.understood(header.boot));
+        understood.flatten().unwrap_or(0)
+    }
+
+    /// Media time, from the beginning.
+    pub(super) fn timeline(&self) -> Timeline {
+        let life = self.origin.and_then(|origin| origin.life);
+        Timeline {
+            wall_zero_ns: i128::from(self.origin.map_or(0, |origin| origin.wall_ns)),
+            life: life.map(|(boot, stamp_ns)| (boot, i128::from(stamp_ns))),
+            last: 0,
+        }
     }
 
     /// Whether it has stamps at all.
     pub(super) fn has_stamps(&self) -> bool {
         self.origin.is_some()
+    }
+}
+
+/// Media time of one telegram after the other: it never goes back. A wall clock that is set while a hub lives does not
+/// matter; one that was set back since goes on where the telegram before was.
+pub(super) struct Timeline {
+    /// The wall clock at media time 0.
+    wall_zero_ns: i128,
+    /// A life of a hub, and its monotonic clock at media time 0.
+    life: Option<(u64, i128)>,
+    last: Nanos,
+}
+
+impl Timeline {
+    /// The media time of `frame`, which comes next.
+    pub(super) fn media(&mut self, frame: &Frame) -> Nanos {
+        let media = match (frame.header, self.life) {
+            (Some(header), Some((boot, zero_ns))) if boot == header.boot => {
+                i128::from(header.stamp_first_ns) - zero_ns
+            }
+            (header, _) => {
+                let media = self.by_wall_clock(frame);
+                self.life = header.map(|header| (header.boot, i128::from(header.stamp_first_ns) - media));
+                media
+            }
+        };
+        self.last = self.last.max(Nanos::try_from(media).unwrap_or(self.last));
+        self.last
+    }
+
+    /// Something that took so long has no time of its own.
+    pub(super) fn pass(&mut self, period: Nanos) {
+        self.last = self.last.saturating_add(period);
+    }
+
+    fn by_wall_clock(&mut self, frame: &Frame) -> i128 {
+        let last = i128::from(self.last);
+        let Some(wall_ns) = frame.wall_ns.map(i128::from) else { return last };
+        if wall_ns - self.wall_zero_ns + i128::from(LONGEST_GAP) < last {
+            self.wall_zero_ns = wall_ns - last;
+        }
+        last.max(wall_ns - self.wall_zero_ns)
     }
 }
 
@@ -177,6 +222,11 @@ impl Origin {
     }
 }
 
+/// Whether it is of the first telegram that a hub had: who converts a stream is no hub.
+fn is_first(header: &Header) -> bool {
+    header.seq == 0 && header.hub_pid != 0
+}
+
 /// What `frame` tells of how values are split: of a sensor that gets its power, that this is not known any more.
 pub(super) fn told(frame: &Frame) -> Option<Option<Mode>> {
     if frame.is_scan() {
@@ -192,3 +242,49 @@ pub(super) fn told(frame: &Frame) -> Option<Option<Mode>> {
 
 /// A hub that found a sensor streaming has asked it within so many telegrams.
 const ASKED_WITHIN: usize = 500;
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const SECOND: Nanos = 1_000 * lms::MILLIS;
+
+    fn frame(wall_s: u64, header: Option<Header>) -> Frame {
+        Frame { telegram: Vec::new(), wall_ns: Some(wall_s * SECOND), header }
+    }
+
+    /// Media times, in seconds.
+    fn medias(frames: &[Frame]) -> Vec<u64> {
+        let origin = Origin::of(&frames[0]).expect("it has stamps");
+        let life = origin.life.map(|(boot, stamp_ns)| (boot, i128::from(stamp_ns)));
+        let mut timeline = Timeline { wall_zero_ns: i128::from(origin.wall_ns), life, last: 0 };
+        frames.iter().map(|frame| timeline.media(frame) / SECOND).collect()
+    }
+
+    #[test]
+    fn where_the_wall_clock_was_set_the_monotonic_one_goes_on() {
+        let header =
+            |boot, stamp_s: u64| Some(Header { boot, stamp_first_ns: stamp_s * SECOND, ..Header::default() });
+        let frames = [
+            frame(5000, header(1, 100)),
+            frame(9000, header(1, 101)),
+            // Another life, and the clock is right again.
+            frame(5003, header(2, 7)),
+            frame(5004, header(2, 8)),
+            // And is set within it.
+            frame(1000, header(2, 9)),
+            // A third one, before all others.
+            frame(10, header(3, 50)),
+            frame(11, header(3, 51)),
+            frame(1, header(3, 50)),
+        ];
+        assert_eq!(medias(&frames), [0, 1, 3, 4, 5, 5, 6, 6]);
+    }
+
+    #[test]
+    fn a_log_whose_clock_was_set_back_goes_on() {
+        let walls = [5000, 5001, 5000, 5002, 10, 11, 12, 5000];
+        let frames = walls.map(|wall_s| frame(wall_s, None));
+        assert_eq!(medias(&frames), [0, 1, 1, 2, 2, 3, 4, 4992]);
+    }
+}

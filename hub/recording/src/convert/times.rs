@@ -32,19 +32,20 @@ impl Times {
     /// When `frame`, the next one, was measured.
     pub(super) fn wall_ns(&mut self, frame: &Frame) -> u64 {
         let at_ns = frame.wall_ns.unwrap_or(self.wall_ns);
-        self.wall_ns = at_ns + if frame.is_scan() { scan_ns(self.variant) } else { line_ns(frame) };
+        let step_ns = if frame.is_scan() { scan_ns(self.variant) } else { line_ns(frame) };
+        self.wall_ns = at_ns.saturating_add(step_ns);
         at_ns
     }
 
     /// What a hub might have said of `frame`, the next one, which has this `number`.
     pub(super) fn header(&mut self, frame: &Frame, number: u64) -> Header {
         let wall_ns = self.wall_ns(frame);
-        let first_ns = wall_ns.saturating_sub(self.begin_ns) + UPTIME_NS;
+        let first_ns = wall_ns.saturating_sub(self.begin_ns).saturating_add(UPTIME_NS);
         Header {
             seq: number,
             topic_seq: number,
             stamp_first_ns: first_ns,
-            stamp_last_ns: first_ns + line_ns(frame),
+            stamp_last_ns: first_ns.saturating_add(line_ns(frame)),
             wall_ns,
             boot: self.boot,
             flags: Flags::STAMP_ESTIMATED,

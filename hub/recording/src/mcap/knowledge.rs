@@ -115,7 +115,7 @@ pub(crate) fn message(record: &Record) -> Option<(MessageHeader, &[u8])> {
 }
 
 /// Whether `header` says what the head of its message says.
-fn fits(header: &Header, message: &MessageHeader) -> bool {
+pub(crate) fn fits(header: &Header, message: &MessageHeader) -> bool {
     (header.topic_seq as u32, header.wall_ns) == (message.sequence, message.log_time)
 }
 

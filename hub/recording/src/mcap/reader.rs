@@ -8,7 +8,7 @@ use std::io::{self, Read};
 use lms::telegram::Telegram;
 use schema::{Flags, Header, Topic, file};
 
-use super::knowledge::{Knowledge, message};
+use super::knowledge::{Knowledge, fits, message};
 use super::records::Record;
 use super::salvage::{Account, Found, HEADER, Lone};
 use super::seen::Seen;
@@ -99,7 +99,7 @@ impl<R: Read> Reader<R> {
         if !is_telegram {
             return None;
         }
-        let sensor = self.sensor(Some(head.channel_id), header.sensor);
+        let sensor = self.sensor(Some(head.channel_id), header.sensor, true);
         Some(Sighting { sensor, header, telegram: telegram.to_vec(), is_estimated: false })
     }
 
@@ -121,7 +121,9 @@ impl<R: Read> Reader<R> {
     /// What is to be thought of a telegram among harmed bytes.
     fn judge(&mut self, lone: Lone) -> Option<Sighting> {
         let id = lone.message.map(|message| message.channel_id);
-        let sensor = self.sensor(id, lone.header[SENSOR]);
+        let said = file::parts(&lone.header).zip(lone.message);
+        let is_agreed = said.is_some_and(|((header, _), message)| fits(&header, &message));
+        let sensor = self.sensor(id, lone.header[SENSOR], is_agreed);
         let sound = self.knowledge.header(&lone, &sensor);
         let (is_whole_new, is_tail_new) = self.novelty(&lone.header, &lone.telegram);
         // A message that is not whole may be the end of one that was there before.
@@ -133,16 +135,15 @@ impl<R: Read> Reader<R> {
         Some(Sighting { sensor, header, telegram: lone.telegram, is_estimated: sound.is_none() })
     }
 
-    /// By the channel, else by the number, else that of the telegram before. Where all names are lost it is called by
-    /// its number.
-    fn sensor(&self, id: Option<u16>, number: u8) -> String {
-        let named = self.knowledge.sensor(id, number).map(str::to_owned);
-        let sensors = || self.knowledge.channels.sensors();
-        let near = || self.neighbour.clone().or_else(|| sensors().into_iter().next());
-        match named {
-            Some(sensor) => sensor,
-            None => near().filter(|_| !sensors().is_empty()).unwrap_or_else(|| format!("sensor{number}")),
+    /// By the channel, else by the number, else, unless the number `is_right`, that of the telegram before. One whose name
+    /// is lost is called by its number.
+    fn sensor(&self, id: Option<u16>, number: u8, is_right: bool) -> String {
+        if let Some(sensor) = self.knowledge.sensor(id, number) {
+            return sensor.to_owned();
         }
+        let sensors = self.knowledge.channels.sensors();
+        let near = self.neighbour.clone().or_else(|| sensors.first().cloned());
+        near.filter(|_| !is_right && !sensors.is_empty()).unwrap_or_else(|| format!("sensor{number}"))
     }
 
     /// A header after the one before: times of the message, else a period later.

@@ -3,6 +3,8 @@
 
 use std::io::{self, Read};
 
+use crate::open::is_end;
+
 /// The view; positions count from the beginning of the file.
 pub(crate) struct Window<R> {
     input: R,
@@ -57,12 +59,6 @@ impl<R: Read> Window<R> {
         }
         Ok(())
     }
-}
-
-/// Whether a reader that fails so has no more to give, and the disk is not to blame.
-pub(crate) fn is_end(error: &io::Error) -> bool {
-    use io::ErrorKind::{InvalidData, InvalidInput, UnexpectedEof};
-    matches!(error.kind(), InvalidData | InvalidInput | UnexpectedEof)
 }
 
 /// Bytes read at a time.
