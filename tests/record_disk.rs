@@ -72,6 +72,10 @@ fn a_recording_goes_on_in_files_of_which_the_last_stay() {
     assert_eq!(files[0], stage.path("walk-0001.mcap"));
     let (gone, stay) = files.split_at(files.len() - 3);
     assert!(gone.iter().all(|file| !file.exists()), "{files:?}");
+    // A machine that has no time for the recorder makes one chunk of what came meanwhile.
+    let lengths: Vec<_> = stay.iter().map(|file| fs::metadata(file).unwrap().len()).collect();
+    assert!(lengths.iter().all(|length| *length <= 96 << 10), "{lengths:?}");
+    assert!(lengths.iter().filter(|length| **length <= 64 << 10).count() > 1, "{lengths:?}");
     let recordings: Vec<_> = stay.iter().map(|file| Recording::whole(file)).collect();
     let wanted = |number: usize| (files.len() - 3 + number).to_string();
     for (number, recording) in recordings.iter().enumerate() {
@@ -81,7 +85,7 @@ fn a_recording_goes_on_in_files_of_which_the_last_stay() {
         assert_eq!(recording.notes("scanhub.life").len(), 1);
     }
     nothing_lost(&outcome);
-    assert!(telegrams(&recordings).len() > 60);
+    assert!(telegrams(&recordings).len() > 20);
 }
 
 #[test]

@@ -163,7 +163,10 @@ impl Disk {
     /// It goes on in the next file. One in which nothing came lasts: nobody wants it in place of one that is kept.
     fn is_full(&self, now: Instant) -> bool {
         let is_split = match self.split {
-            Some(Split::Bytes(most)) => self.part.written >= most,
+            // It is finished before it is too long, where its index leaves it some room.
+            Some(Split::Bytes(most)) => {
+                self.part.begun.is_some() && self.part.written >= most / 2 && self.part.next_len() > most
+            }
             Some(Split::Time(most)) => {
                 self.part.begun.is_some_and(|begun| now.saturating_duration_since(begun) >= most)
             }

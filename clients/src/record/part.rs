@@ -11,7 +11,7 @@ use std::time::{Duration, Instant};
 
 use schema::datagram::Packed;
 use schema::file::Writer;
-use schema::{Header, Scan};
+use schema::{Header, Scan, Topic};
 
 use super::queue::{Batch, Entry, Gap, Track};
 use super::{Kept, ros2};
@@ -31,10 +31,17 @@ pub(super) struct Part {
     pub(super) begun: Option<Instant>,
     /// About how much memory its index takes, in bytes.
     pub(super) index: usize,
+    /// About how long its index will be in the file, in bytes.
+    end: u64,
+    /// How much was written last, in bytes.
+    last: u64,
     /// The disk did not have all of it, when it was asked.
     pub(super) is_doubtful: bool,
     /// What was said last of which life of a sensor's hub.
     lives: Vec<u64>,
+    /// Topics and tracks that are in it.
+    topics: Vec<Topic>,
+    met: Vec<usize>,
     /// Channels of ROS 2, by track.
     channels: Vec<Option<u16>>,
     scan: Scan,
@@ -78,8 +85,12 @@ impl Part {
             samples: 0,
             begun: None,
             index: 0,
+            end: 0,
+            last: 0,
             is_doubtful: false,
             lives: Vec::new(),
+            topics: Vec::new(),
+            met: Vec::new(),
             channels: Vec::new(),
             scan: Scan::default(),
             message: Vec::new(),
@@ -104,7 +115,9 @@ impl Part {
         let samples = batch.count() as usize;
         if samples > 0 {
             self.begun.get_or_insert_with(Instant::now);
-            self.index += INDEX_OF_CHUNK + INDEX_OF_CHANNEL * samples.min(tracks.len());
+            let channels = samples.min(tracks.len());
+            self.index += INDEX_OF_CHUNK + INDEX_OF_CHANNEL * channels;
+            self.end += END_OF_CHUNK + END_OF_CHANNEL * channels as u64;
         }
         let mut bytes = &batch.bytes[..];
         for entry in &batch.entries {
@@ -155,8 +168,16 @@ impl Part {
             })?,
         }
         self.written += made.len() as u64;
+        if !made.is_empty() {
+            self.last = made.len() as u64;
+        }
         made.clear();
         Ok(())
+    }
+
+    /// About how long the file will be if one more chunk comes before its end, in bytes: half as long again as the last one.
+    pub(super) fn next_len(&self) -> u64 {
+        self.written + self.last * 3 / 2 + self.end
     }
 
     /// Asks the disk to have all of it.
@@ -206,6 +227,14 @@ impl Part {
     fn sample(&mut self, tracks: &[Track], at: usize, header: &Header, payload: &[u8]) -> io::Result<()> {
         let Some(track) = tracks.get(at) else { return Ok(()) };
         let name = &track.name;
+        if !self.met.contains(&at) {
+            self.met.push(at);
+            self.end += END_OF_TRACK;
+            if !self.topics.contains(&name.topic) {
+                self.topics.push(name.topic);
+                self.end += END_OF_TOPIC;
+            }
+        }
         if !self.lives.contains(&header.boot) {
             self.lives.push(header.boot);
             let facts = [
@@ -248,6 +277,12 @@ const STANDS: Duration = Duration::from_secs(60);
 /// What a chunk takes in the index in memory, and what each channel in it does, in bytes.
 const INDEX_OF_CHUNK: usize = 200;
 const INDEX_OF_CHANNEL: usize = 24;
+/// What a chunk takes in the index in the file, what each channel in it does, a track, and a topic, whose type the index
+/// describes once more; in bytes.
+const END_OF_CHUNK: u64 = 70;
+const END_OF_CHANNEL: u64 = 10;
+const END_OF_TRACK: u64 = 100;
+const END_OF_TOPIC: u64 = 3200;
 /// Name of the metadata record of a life of the hub, before its first sample.
 const LIFE: &str = "scanhub.life";
 /// Name of the metadata record of samples that were left out.
