@@ -82,10 +82,7 @@ fn dispatch(cli: &Cli) -> Result<(), Failure> {
         Verb::Probe(probe) => probe.run(everywhere.json, &*interrupt()?),
         Verb::Configure(configure) => configure.run(everywhere.json, &*interrupt_by(&ENDS)?),
         Verb::Convert(convert) => convert.run(everywhere.json, &*interrupt()?),
-        Verb::Completions(completions) => {
-            completions.run();
-            Ok(())
-        }
+        Verb::Completions(completions) => completions.run(),
         Verb::Man(man) => man.run(),
         Verb::Config(config) => config.run(everywhere),
         Verb::Doctor(doctor) => doctor.run(everywhere, &*interrupt()?),
@@ -255,6 +252,18 @@ fn interrupt_by(signals: &[c_int]) -> Result<Arc<AtomicBool>, Failure> {
 
 fn no_handler(error: io::Error) -> Failure {
     Failure::new(Kind::Failed, format!("no signal handler: {error}"), "")
+}
+
+/// Writes to stdout what the verb is for; whoever closed it does not want it.
+///
+/// [`Kind::Failed`] if it cannot be written, as on a full disk.
+fn print(text: &str) -> Result<(), Failure> {
+    match io::stdout().lock().write_all(format!("{text}\n").as_bytes()) {
+        Err(error) if error.kind() != io::ErrorKind::BrokenPipe => {
+            Err(Failure::new(Kind::Failed, format!("cannot write: {error}"), ""))
+        }
+        _ => Ok(()),
+    }
 }
 
 /// Writes one line to stdout; whoever closed it does not want it.

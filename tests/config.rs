@@ -26,13 +26,14 @@ fn the_default_can_be_loaded_and_is_what_holds_without_it() {
     let default = stage.file("default.toml", printed(&stage, &["config", "default"]));
     let ok = "ok: 2 links: front at /dev/ttyUSB0, rear at /dev/ttyUSB1\n";
     assert_eq!(printed(&stage, &["config", "check", &default]), ok);
-    assert_eq!(printed(&stage, &["config", "check", "--no-system-config"]), ok);
+    let links = ["--link=front=/dev/ttyUSB0", "--link=rear=/dev/ttyUSB1"];
+    assert_eq!(printed(&stage, &[&["config", "check", "--no-system-config"], &links[..]].concat()), ok);
     let values = |arguments: &[&str]| -> Vec<_> {
         let outcome = stage.run(&[&["config", "show", "--json", "--no-system-config"], arguments].concat());
         let lines = outcome.of_class("value");
         lines.iter().map(|line| (line["key"].clone(), line["value"].clone())).collect()
     };
-    let without = values(&[]);
+    let without = values(&links);
     assert!(without.len() > 60, "{without:?}");
     assert_eq!(values(&["--config", &default]), without);
 }
@@ -42,14 +43,20 @@ fn a_check_refuses_what_a_hub_refuses() {
     let stage = Stage::new();
     let file = stage.file("scanhub.toml", "[[link]]\nname = \"a\"\nprot = \"/dev/x\"\n");
     let gateway = stage.file("gateway.toml", "[gateway]\nbackground_every = \"10\"\n");
+    let empty = stage.file("empty.toml", "");
     let topics = stage.file("topics.toml", "[gateway]\ntopics = [\"*/scna\"]\n");
     for (arguments, place) in [
         (vec![topics.as_str()], "section gateway: ".to_owned()),
         (vec![file.as_str()], format!("{file}:3:1: unknown key `prot`")),
         (vec![gateway.as_str()], format!("{gateway}:2:20: ")),
         (vec!["--config", file.as_str()], format!("{file}:3:1: unknown key `prot`")),
-        (vec!["--no-system-config", "--set", "link.front.angle=170"], "angle = 170".to_owned()),
+        (
+            vec!["--no-system-config", "--link=front=x", "--set", "link.front.angle=170"],
+            "angle = 170".to_owned(),
+        ),
         (vec!["--no-system-config", "--link", "front"], "--link front: no = in it".to_owned()),
+        (vec!["--no-system-config"], "no link is configured\n  --link NAME=PORT".to_owned()),
+        (vec![empty.as_str()], "no link is configured".to_owned()),
         (vec!["/nowhere/scanhub.toml"], "/nowhere/scanhub.toml: No such file".to_owned()),
     ] {
         let outcome = stage.run(&[&["config", "check"], &arguments[..]].concat());

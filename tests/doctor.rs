@@ -7,6 +7,7 @@ use std::path::Path;
 
 use rustix::fs::inotify::{self, CreateFlags, WatchFlags};
 use rustix::io::Errno;
+use rustix::process::Signal;
 use serde_json::Value;
 use stage::{KILL, Outcome, Program, Stage, TERM};
 
@@ -87,7 +88,7 @@ fn what_is_wrong_is_told_with_its_remedy() {
     assert_eq!(outcome.of_class("error")[0]["kind"], "check");
     assert_eq!(findings.iter().find(|line| line["port"] == front.as_str()).unwrap()["link"], "front");
 
-    let (findings, _) = doctor(&stage, &["--set", "link.front.angle=170"], 5);
+    let (findings, _) = doctor(&stage, &["--link=front=/dev/null", "--set", "link.front.angle=170"], 5);
     let (found, text) = state(&findings, "configuration", None);
     assert!(found == "failed" && text.contains("100 or 180"), "{text}");
 }
@@ -150,6 +151,29 @@ fn a_running_hub_is_asked_instead_and_a_dead_one_leaves_traces() {
     let (found, text) = state(&findings, "leftovers", None);
     assert!(found == "warning" && text.contains("1 process died") && text.contains("scanhub run"), "{text}");
     assert!(!stage.left_behind().is_empty(), "it deleted something");
+}
+
+#[test]
+fn a_hub_that_is_stopped_is_no_good_set_up() {
+    let stage = Stage::new();
+    let _simulator = stage.simulator(&["front"], &["--baud=500000"]);
+    let hub = stage.hub(&[stage.link("front")]);
+    stage.await_info("front", |info| info["state"] == "streaming");
+    hub.signal(Signal::STOP);
+    let (findings, _) = doctor(&stage, &[&stage.link("front")], 5);
+    let (found, text) = state(&findings, "domain", None);
+    let continued = format!("kill -CONT {}", hub.pid());
+    assert!(found == "failed" && text.contains(&continued), "{text}");
+    let port = stage.word("front");
+    for name in ["sensor", "line-errors"] {
+        let (found, text) = state(&findings, name, Some(&port));
+        assert!(found == "skipped" && text.contains("does not publish"), "{text}");
+    }
+    // Its name is not taken for a port.
+    let (named, _) = doctor(&stage, &["front"], 5);
+    assert_eq!(state(&named, "port", Some("front")).0, "skipped", "{named:#?}");
+    hub.signal(Signal::CONT);
+    assert_eq!(hub.end(TERM).code, Some(0));
 }
 
 #[test]

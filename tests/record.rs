@@ -201,6 +201,17 @@ fn what_cannot_be_recorded_is_refused() {
     assert_eq!(kind(&["-o", &file]), (Some(1), "failed".into()));
     assert_eq!(std::fs::read(&file).unwrap(), b"somebody's");
     assert_eq!(kind(&["-o", &stage.word("nowhere/walk.mcap")]), (Some(1), "failed".into()));
+    let hint = |arguments: &[&str]| {
+        let outcome = stage.run(&[&["record", "--json"], arguments].concat());
+        assert_eq!(outcome.code, Some(1), "{outcome}");
+        outcome.of_class("error")[0]["hint"].as_str().unwrap().to_owned()
+    };
+    assert!(hint(&["-o", &stage.word("")]).starts_with("name a file in it: -o "));
+    assert!(hint(&["-o", "/dev/full"]).contains("--force writes over what the device holds"));
+    assert!(hint(&["-o", "/dev/full", "--force"]).starts_with("make room"));
+    stage.file("parts-0007.mcap", "somebody's");
+    let earlier = hint(&["-o", &stage.word("parts.mcap"), "--split=1h"]);
+    assert!(earlier.starts_with("--force goes on after the last one's number"), "{earlier}");
     assert_eq!(kind(&["-o", "-", "--split", "1h"]), (Some(2), "usage".into()));
     assert_eq!(kind(&["--keep", "3"]), (Some(2), "usage".into()));
     assert_eq!(kind(&["--split", "3"]), (Some(2), "usage".into()));
@@ -210,6 +221,8 @@ fn what_cannot_be_recorded_is_refused() {
     let new = stage.word("new.mcap");
     assert_eq!(kind(&["-o", &new, "--for", "5s"]), (Some(3), "no_hub".into()));
     assert!(!Path::new(&new).exists());
+    let outcome = stage.run(&["record", "-o", &new, "--for", "5s"]);
+    assert!(!String::from_utf8_lossy(&outcome.out).contains("0 samples"), "{outcome}");
 }
 
 fn stderr_lines(outcome: &Outcome) -> Vec<Value> {

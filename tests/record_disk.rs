@@ -244,13 +244,69 @@ fn what_cannot_be_begun_leaves_nothing_behind() {
 }
 
 #[test]
-fn a_reader_that_is_gone_is_a_quiet_end() {
+fn a_recording_whose_reader_went_away_has_failed() {
     let stage = Stage::new();
     let (reader, writer) = io::pipe().unwrap();
     drop(reader);
-    let outcome = stage.command(&["record", "-o", "-"]).stdout(writer).stderr(Stdio::piped()).output();
-    let outcome = outcome.unwrap();
-    assert_eq!((outcome.status.code(), String::from_utf8_lossy(&outcome.stderr).as_ref()), (Some(0), ""));
+    let refused = |outcome: std::process::Output| {
+        let said = String::from_utf8_lossy(&outcome.stderr).into_owned();
+        assert_eq!(outcome.status.code(), Some(1), "{said}");
+        assert!(said.contains("whoever read the recording is gone"), "{said}");
+    };
+    let begin = stage.command(&["record", "-o", "-"]).stdout(writer).stderr(Stdio::piped()).output();
+    refused(begin.unwrap());
+    // A connection that breaks in the middle of it looks the same.
+    let _others = sensor(&stage);
+    let (mut reader, writer) = io::pipe().unwrap();
+    let mut command = stage.command(&["record", "-o", "-", "--for=60s"]);
+    let recorder = command.stdout(writer).stderr(Stdio::piped()).spawn().unwrap();
+    drop(command);
+    reader.read_exact(&mut [0; 20_000]).unwrap();
+    drop(reader);
+    refused(recorder.wait_with_output().unwrap());
+}
+
+#[test]
+fn samples_of_a_file_that_was_removed_are_not_counted() {
+    let stage = Stage::new();
+    let _others = sensor(&stage);
+    let file = stage.word("walk.mcap");
+    let mut recorder = stage.start(&["record", "--json", "-o", &file]);
+    await_samples(&mut recorder, 20);
+    fs::remove_file(&file).unwrap();
+    let gone = recorder.await_line("the loss", is_kind("file_gone"));
+    assert_eq!(gone["file"], file);
+    await_samples(&mut recorder, 20);
+    let outcome = recorder.end(INT);
+    let end = outcome.of_class("recorded").pop().unwrap_or_else(|| panic!("{outcome}"));
+    assert_eq!((number(&end, "gone"), number(&gone, "samples") >= 20), (number(&gone, "samples"), true));
+    let next = Recording::whole(&stage.path("walk-0002.mcap"));
+    let repeated = 1;
+    assert_eq!(number(&end, "samples") + repeated, next.kept.len() as u64, "{outcome}");
+    assert_eq!(number(&end, "bytes"), fs::metadata(stage.path("walk-0002.mcap")).unwrap().len());
+    // One that is removed at the very end, too.
+    let mut recorder = stage.start(&["record", "--json", "--force", "-o", &file]);
+    await_samples(&mut recorder, 20);
+    fs::remove_file(&file).unwrap();
+    let outcome = recorder.end(INT);
+    let end = outcome.of_class("recorded").pop().unwrap_or_else(|| panic!("{outcome}"));
+    assert!(number(&end, "gone") >= 20, "{end}");
+}
+
+#[test]
+fn two_recorders_do_not_write_one_file() {
+    let stage = Stage::new();
+    let _others = sensor(&stage);
+    let file = stage.word("walk.mcap");
+    let mut recorder = stage.start(&["record", "--json", "-o", &file]);
+    await_samples(&mut recorder, 20);
+    let second = stage.run(&["record", "--json", "--force", "-o", &file]);
+    let error = &second.of_class("error")[0];
+    assert_eq!((second.code, &error["kind"]), (Some(1), &"failed".into()), "{second}");
+    assert!(error["message"].as_str().unwrap().contains("another recorder writes it"), "{error}");
+    await_samples(&mut recorder, 20);
+    nothing_lost(&recorder.end(INT));
+    telegrams(&[Recording::whole(Path::new(&file))]);
 }
 
 /// The program, started by other words before its own.

@@ -89,9 +89,16 @@ fn configuration_that_cannot_be() {
     let (place, key, missing) = (format!("{file}:4:8"), format!("{unknown}:3:1"), stage.word("no.toml"));
     for (arguments, words) in [
         (&["run", "--set", "link.front.prot=/dev/x"][..], &["link.front.prot", "`prot`", "`port`"][..]),
-        (&["run", "--set", "link.front.angle=170"], &["--set", "angle = 170", "100 or 180"]),
-        (&["run", "--set", "link.front.resolution=0.25"], &["180", "0.25", "0.5 or 1"]),
-        (&["run", "--set", "link.side.angle=100"], &["no link side", "front, rear"]),
+        (
+            &["run", "--link=front=/dev/x", "--set", "link.front.angle=170"],
+            &["--set", "angle = 170", "100 or 180"],
+        ),
+        (
+            &["run", "--link=front=/dev/x", "--set", "link.front.resolution=0.25"],
+            &["180", "0.25", "0.5 or 1"],
+        ),
+        (&["run", "--link=a=/x", "--link=b=/y", "--set", "link.side.angle=100"], &["no link side", "a, b"]),
+        (&["run", "--no-system-config"], &["no link is configured", "--link NAME=PORT", "config default"]),
         (&["run", "--set", "speed=3"], &["speed=3", "link.NAME.KEY"]),
         (&["run", "--link", "front"], &["--link front", "NAME=PORT"]),
         (&["run", "--link", "Front=/dev/x"], &["Front"]),
@@ -115,6 +122,26 @@ fn configuration_that_cannot_be() {
         (&["echo", "Front/scan"], &["Front"]),
     ] {
         refused(&stage, arguments, 78, "configuration", words);
+    }
+}
+
+#[test]
+fn a_disk_that_is_full_is_told() {
+    let stage = Stage::new();
+    for verb in [
+        &["config", "default"][..],
+        &["config", "show", "--no-system-config", "--link=front=/dev/x"],
+        &["completions", "bash"],
+        &["man"],
+        &["doctor", "--no-system-config", "/dev/null"],
+    ] {
+        let full = std::fs::File::options().write(true).open("/dev/full").expect("there is one");
+        let done = stage.command(verb).stdout(full).output().expect("it starts");
+        let said = String::from_utf8_lossy(&done.stderr);
+        assert!(
+            done.status.code() == Some(1) && said.contains("cannot write: No space"),
+            "{verb:?}: {done:?}"
+        );
     }
 }
 

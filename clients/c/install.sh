@@ -2,7 +2,7 @@
 # Puts the library for C and C++ in place, or takes it away again. Build it first: cargo build --release -p scanhub-c
 #
 #   clients/c/install.sh [--prefix DIR] [--library DIR]   install below /usr/local, or DIR; the library is taken from
-#                                                         target/release if no other place is named
+#                                                         where Cargo puts it if no other place is named
 #   clients/c/install.sh [--prefix DIR] --remove          take away all that this script puts in place
 #
 # DESTDIR=DIR puts everything below DIR, for those who make packages.
@@ -10,7 +10,7 @@ set -eu
 
 here=$(cd "$(dirname "$0")" && pwd)
 prefix=/usr/local
-library=$here/../../target/release
+library=${CARGO_TARGET_DIR:-$here/../../target}/release
 action=install
 while [ $# -gt 0 ]; do
     case $1 in

@@ -54,10 +54,14 @@ fn topics() -> String {
 
 /// The topic that `word` may have been meant for, if one is near.
 fn nearest(sensor: &str, word: &str) -> String {
-    let near = |topic: &Topic| strsim::jaro_winkler(topic.name(), word);
-    let nearest = Topic::ALL.into_iter().max_by(|a, b| near(a).total_cmp(&near(b)));
-    let nearest = nearest.filter(|topic| near(topic) > NEAR);
-    nearest.map_or(String::new(), |topic| format!("did you mean {sensor}/{}? ", topic.name()))
+    let topic = near(word, Topic::ALL.into_iter().map(Topic::name));
+    topic.map_or(String::new(), |topic| format!("did you mean {sensor}/{topic}? "))
+}
+
+/// That of `known` which `word` is nearest to, if it is near.
+fn near<'a>(word: &str, known: impl Iterator<Item = &'a str>) -> Option<&'a str> {
+    let near = |known: &str| strsim::jaro_winkler(known, word);
+    known.max_by(|a, b| near(a).total_cmp(&near(b))).filter(|known| near(known) > NEAR)
 }
 
 /// From here on a word may be meant for another: 1 is the same, 0 has nothing of it.
@@ -67,7 +71,11 @@ const NEAR: f64 = 0.8;
 pub(crate) fn no_sensor(sensor: &str, sensors: &[String]) -> Failure {
     let hint = match sensors {
         [] => "it has no sensors: `scanhub run --link NAME=PORT`".to_owned(),
-        some => format!("there are {}", some.join(", ")),
+        some => {
+            let near = near(sensor, some.iter().map(String::as_str));
+            let near = near.map_or(String::new(), |near| format!("did you mean {near}? "));
+            format!("{near}there are {}", some.join(", "))
+        }
     };
     Failure::new(Kind::NoTopic, format!("the hub has no sensor {sensor}"), hint)
 }
@@ -98,5 +106,8 @@ mod tests {
         assert_eq!(failure.kind, Kind::NoTopic);
         assert!(failure.hint.contains("robot/zones"), "{failure}");
         assert_eq!(TopicName::parse("Front/scan").unwrap_err().kind, Kind::Configuration);
+        let hint = |sensor| no_sensor(sensor, &["front".to_owned(), "rear".to_owned()]).hint;
+        assert_eq!(hint("frnt"), "did you mean front? there are front, rear");
+        assert_eq!(hint("side"), "there are front, rear");
     }
 }

@@ -122,6 +122,27 @@ pub(crate) fn table(output: &mut Output<'_>, rows: &[Vec<String>]) -> Result<(),
     Ok(())
 }
 
+/// The columns of the terminal that `out` is, if it is one that says so.
+#[cfg(feature = "record")]
+pub(crate) fn columns(out: impl std::os::fd::AsFd) -> Option<usize> {
+    let size = rustix::termios::tcgetwinsize(out).ok()?;
+    Some(usize::from(size.ws_col)).filter(|columns| *columns > 0)
+}
+
+/// `parts` with two blanks between them, in at most so many `columns`: of those that do not fit the one with the lowest rank
+/// goes first. A number that is cut would be another number. The last one stays, however long.
+#[cfg(feature = "record")]
+pub(crate) fn fitting(mut parts: Vec<(u8, String)>, columns: usize) -> String {
+    let length =
+        |parts: &[(u8, String)]| parts.iter().map(|(_, part)| part.chars().count() + 2).sum::<usize>();
+    while parts.len() > 1 && length(&parts) > columns + 2 {
+        let lowest = (0..parts.len()).min_by_key(|&at| parts[at].0).unwrap_or_default();
+        parts.remove(lowest);
+    }
+    let parts: Vec<String> = parts.into_iter().map(|(_, part)| part).collect();
+    parts.join("  ")
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -144,5 +165,18 @@ mod tests {
         let mut out = Vec::new();
         Output::new(&mut out).json(&"\x1b[2J\n").unwrap();
         assert_eq!(out, b"\"\\u001b[2J\\n\"\n");
+    }
+
+    #[cfg(feature = "record")]
+    #[test]
+    fn what_does_not_fit_goes_whole() {
+        let parts = || [(2, "0:00:10"), (0, "6.0 KiB/s"), (1, "903 samples"), (3, "0 lost")];
+        let in_columns =
+            |columns| fitting(parts().map(|(rank, part)| (rank, part.to_owned())).into(), columns);
+        assert_eq!(in_columns(39), "0:00:10  6.0 KiB/s  903 samples  0 lost");
+        assert_eq!(in_columns(38), "0:00:10  903 samples  0 lost");
+        assert_eq!(in_columns(27), "0:00:10  0 lost");
+        assert_eq!(in_columns(14), "0 lost");
+        assert_eq!(in_columns(1), "0 lost");
     }
 }

@@ -3,17 +3,19 @@
 
 mod disk;
 mod files;
+mod lock;
 mod part;
 mod queue;
+mod refusal;
 mod report;
 mod ros2;
 mod selection;
+mod told;
 
 use std::collections::BTreeMap;
 use std::fs::{self, File};
 use std::io::{self, ErrorKind, IsTerminal, Write};
 use std::os::fd::AsFd;
-use std::os::unix::fs::FileTypeExt;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -29,12 +31,13 @@ use crate::names::TopicName;
 use crate::output::{End, quiet};
 use crate::sample::Sample;
 use crate::spare::Spare;
-use disk::{Disk, News, Told};
+use disk::Disk;
 use files::Files;
 pub use files::Split;
 use queue::{Entry, Gap, Queue, Track};
 use report::Report;
 use selection::Selection;
+use told::{News, Told};
 
 /// What `record` is asked for.
 #[derive(Clone, Debug)]
@@ -101,8 +104,9 @@ pub fn record(
     };
     let first = disk.path();
     let over = AtomicBool::new(false);
+    let terminal = out.as_fd().try_clone_to_owned().ok();
     let (mut out, mut notes) = (Spare::new(out, &over), Spare::new(notes, &over));
-    let mut report = Report::new(options.look, &mut out, &mut notes);
+    let mut report = Report::new(options.look, &mut out, &mut notes, terminal);
     let begun = report.begin(&first);
     let mut recorder = Recorder {
         selection: &selection,
@@ -123,9 +127,9 @@ pub fn record(
     let end = begun
         .and_then(|()| follow_topics(&names, &topics, &options.places, &options.bounds, stop, &mut recorder));
     // Whoever went away, the hub or the reader of these lines: what is recorded is kept.
-    let is_empty = recorder.pushed == 0;
-    let finished = recorder.finish(writing, stop);
-    if is_empty && !options.is_to_stdout() && matches!(end, Err(End::Failure(_))) {
+    let stays = recorder.pushed > 0 || !matches!(end, Err(End::Failure(_)));
+    let finished = recorder.finish(writing, stays, stop);
+    if !stays && !options.is_to_stdout() {
         // A hub or sensor that is not there leaves nothing behind.
         files::discard(&first);
     }
@@ -137,14 +141,7 @@ fn begin(options: &RecordOptions, queue: &Arc<Queue>) -> Result<Disk, End> {
     let wall_ns = clock::wall_ns();
     let usual = files::usual_name(wall_ns);
     let path = options.file.as_deref().unwrap_or(&usual);
-    let failed = |error: io::Error| {
-        let hint = match error.kind() {
-            ErrorKind::AlreadyExists => "--force overwrites it; -o FILE names another one",
-            ErrorKind::StorageFull => "make room, or name another place: -o FILE",
-            _ => "the directory has to be there and writable; -o FILE names another place",
-        };
-        Failure::new(Kind::Failed, format!("cannot record into {}: {error}", path.display()), hint)
-    };
+    let failed = |error: io::Error| refusal::failed(path, options.split.is_some(), &error);
     let files = match options.is_to_stdout() {
         true if options.split.is_some() => {
             return Err(Failure::new(Kind::Usage, "stdout has no parts", "leave --split away").into());
@@ -155,19 +152,14 @@ fn begin(options: &RecordOptions, queue: &Arc<Queue>) -> Result<Disk, End> {
         }
         true => Err(File::from(io::stdout().as_fd().try_clone_to_owned().map_err(failed)?)),
         false => {
-            // Opening one waits for its reader, and nobody could end that.
-            if fs::metadata(path).is_ok_and(|place| place.file_type().is_fifo()) {
-                let hint = format!("the shell opens it: scanhub record -o - > {}", path.display());
-                let what = format!("{} is a pipe", path.display());
-                return Err(Failure::new(Kind::Failed, what, hint).into());
-            }
+            refusal::check(path, options.force)?;
             Ok(Files::new(path, options.split.is_some(), options.force, options.keep))
         }
     };
     let profile = if options.ros2 { ros2::PROFILE } else { "" };
     let begun = Disk::begin(queue.clone(), files, options.split, profile, facts(options, wall_ns));
     begun.map_err(|error| match error.kind() {
-        ErrorKind::BrokenPipe => End::ReaderGone,
+        ErrorKind::BrokenPipe => refusal::reader_gone(0).into(),
         _ => failed(error).into(),
     })
 }
@@ -237,15 +229,20 @@ impl Recorder<'_> {
         let account = self.told.look();
         for news in account.news.iter() {
             if *news == News::ReaderGone {
-                return Err(End::ReaderGone);
+                return Err(refusal::reader_gone(account.samples).into());
             }
             self.report.disk(news)?;
         }
         self.report.progress(&account, self.left_out)
     }
 
-    /// Waits until all of it is written, and says what came of it. A second wish to stop ends that, too.
-    fn finish(mut self, writing: JoinHandle<io::Result<()>>, stop: &AtomicBool) -> Result<(), End> {
+    /// Waits until all of it is written, and says what came of it, if it `stays`. A second wish to stop ends that, too.
+    fn finish(
+        mut self,
+        writing: JoinHandle<io::Result<()>>,
+        stays: bool,
+        stop: &AtomicBool,
+    ) -> Result<(), End> {
         self.over.store(true, Ordering::Relaxed);
         stop.store(false, Ordering::Relaxed);
         let told = self.end_gap();
@@ -263,14 +260,16 @@ impl Recorder<'_> {
         let written = writing.join().unwrap_or_else(|_| Err(io::Error::other("the writing thread panicked")));
         let account = self.told.look();
         if let Err(error) = written {
+            if error.kind() == ErrorKind::BrokenPipe {
+                return Err(refusal::reader_gone(account.samples).into());
+            }
             let missing = self.pushed - account.samples;
             let what =
                 format!("the end of the recording cannot be written: {error}; {missing} samples are missing");
             return Err(Failure::new(Kind::Failed, what, REPAIR).into());
         }
-        let mut news = account.news.iter().filter(|news| **news != News::ReaderGone);
-        told.and_then(|()| news.try_for_each(|news| self.report.disk(news)))
-            .and_then(|()| self.report.end(&account, self.left_out))
+        told.and_then(|()| account.news.iter().try_for_each(|news| self.report.disk(news)))?;
+        if stays { self.report.end(&account, self.left_out) } else { Ok(()) }
     }
 }
 

@@ -8,7 +8,7 @@ use schema::Failure;
 use serde::Serialize;
 
 use super::{Everywhere, Gateway, Run};
-use crate::{line, say};
+use crate::{line, print};
 
 #[derive(Args, Debug)]
 pub(crate) struct Config {
@@ -18,7 +18,7 @@ pub(crate) struct Config {
 
 #[derive(Debug, Subcommand)]
 enum Order {
-    /// Print a configuration to begin with, which says what holds without one
+    /// Print a configuration to begin with, with the values that hold where nothing is said
     Default,
     /// Whether the configuration can be loaded; 78 and the place if not
     Check {
@@ -43,8 +43,8 @@ impl Config {
                 if let Some(file) = file {
                     sources.files = vec![file.clone()];
                 }
-                let links = daemon::Config::load(&sources)?.links;
                 Gateway::check(&sources, everywhere)?;
+                let links = daemon::Config::load(&sources)?.links;
                 if everywhere.json { checked_line(&links) } else { checked(&links) }
             }
             Order::Show { run } => {
@@ -56,8 +56,7 @@ impl Config {
                 }
             }
         };
-        say(&text);
-        Ok(())
+        print(&text)
     }
 }
 

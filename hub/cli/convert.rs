@@ -10,7 +10,7 @@ use recording::convert::{self, ConvertOptions, Converted};
 use schema::Failure;
 use serde::Serialize;
 
-use crate::{line, say};
+use crate::{line, print};
 
 #[derive(Args, Debug)]
 pub(crate) struct Convert {
@@ -54,7 +54,7 @@ impl Convert {
         }
         let is_stdout_taken = self.output == Path::new("-");
         match (json, is_stdout_taken) {
-            (true, false) => say(&line(&Line::of(self, &converted))),
+            (true, false) => return print(&line(&Line::of(self, &converted))),
             (true, true) => tell(&line(&Line::of(self, &converted))),
             (false, _) => tell(&self.words(&converted)),
         }

@@ -39,16 +39,23 @@ impl Doctor {
             clean: self.clean,
         };
         let mut port = None;
-        examine(&subjects, stop, &mut |finding| {
+        let mut written = Ok(());
+        let mut say = |text: &str| {
+            if written.is_ok() {
+                written = crate::print(text);
+            }
+        };
+        let outcome = examine(&subjects, stop, &mut |finding| {
             if everywhere.json {
-                return crate::say(&crate::line(finding));
+                return say(&crate::line(finding));
             }
             if port != finding.port {
                 port.clone_from(&finding.port);
                 let link = finding.link.as_ref().map(|link| format!(" (link {link})"));
-                crate::say(&format!("\n{}{}", port.as_deref().unwrap_or_default(), link.unwrap_or_default()));
+                say(&format!("\n{}{}", port.as_deref().unwrap_or_default(), link.unwrap_or_default()));
             }
-            crate::say(&finding.to_string());
-        })
+            say(&finding.to_string());
+        });
+        written.and(outcome)
     }
 }

@@ -8,7 +8,7 @@ use clap_complete::shells;
 use schema::{Failure, Kind};
 
 use super::command;
-use crate::say;
+use crate::print;
 
 #[derive(Args, Debug)]
 pub(crate) struct Completions {
@@ -24,7 +24,8 @@ enum Shell {
 }
 
 impl Completions {
-    pub(crate) fn run(&self) {
+    /// [`Kind::Failed`] if it cannot be written.
+    pub(crate) fn run(&self) -> Result<(), Failure> {
         let mut text = Vec::new();
         let command = &mut command();
         match self.shell {
@@ -32,7 +33,7 @@ impl Completions {
             Shell::Zsh => clap_complete::generate(shells::Zsh, command, NAME, &mut text),
             Shell::Fish => clap_complete::generate(shells::Fish, command, NAME, &mut text),
         }
-        say(String::from_utf8_lossy(&text).trim_end());
+        print(String::from_utf8_lossy(&text).trim_end())
     }
 }
 
@@ -44,7 +45,7 @@ pub(crate) struct Man {
 }
 
 impl Man {
-    /// [`Kind::Failed`] if the directory cannot be written to.
+    /// [`Kind::Failed`] if the directory, or stdout, cannot be written to.
     pub(crate) fn run(&self) -> Result<(), Failure> {
         match &self.directory {
             Some(directory) => write_pages(directory),
@@ -52,8 +53,7 @@ impl Man {
                 let mut page = Vec::new();
                 let rendered = clap_mangen::Man::new(command()).render(&mut page);
                 rendered.map_err(|error| Failure::new(Kind::Failed, format!("no page: {error}"), ""))?;
-                say(String::from_utf8_lossy(&page).trim_end());
-                Ok(())
+                print(String::from_utf8_lossy(&page).trim_end())
             }
         }
     }

@@ -20,7 +20,7 @@ impl Probe {
     pub(crate) fn run(&self, json: bool, stop: &AtomicBool) -> Result<(), Failure> {
         let Some(port) = &self.port else {
             for candidate in list()? {
-                crate::say(&if json { crate::line(&Line::of(&candidate)) } else { describe(&candidate) });
+                crate::print(&if json { crate::line(&Line::of(&candidate)) } else { describe(&candidate) })?;
             }
             return Ok(());
         };
@@ -31,12 +31,11 @@ impl Probe {
         }
         drop(progress);
         let found = found?;
-        crate::say(&if json {
+        crate::print(&if json {
             crate::line(&found)
         } else {
             format!("{port}\n{}", found.to_string().trim_end())
-        });
-        Ok(())
+        })
     }
 }
 

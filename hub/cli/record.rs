@@ -24,7 +24,7 @@ pub(crate) struct Record {
     /// The recording; - for stdout [default: scanhub-DATE-TIME.mcap]
     #[arg(short, long, value_name = "FILE")]
     output: Option<PathBuf>,
-    /// Overwrite what is there
+    /// Overwrite what is there; with --split go on behind the numbers that are there
     #[arg(short, long)]
     force: bool,
     /// Go on in another file after so much or so long: 512MiB, 1h; they are called FILE-0001.mcap ..

@@ -36,6 +36,8 @@ def main() -> None:
         matplotlib.use("Agg")
     import matplotlib.pyplot as plt
 
+    if not options.output and plt.get_backend().lower() == "agg":
+        sys.exit("plot_scan.py: no window can be shown here: say --output FILE")
     figure, axes = plt.subplots()
     (dots,) = axes.plot([], [], ".", markersize=3)
     axes.plot([0], [0], "^", color="black")

@@ -5,7 +5,7 @@ use std::collections::BTreeMap;
 use std::fs::File;
 use std::io::{self, ErrorKind};
 use std::path::PathBuf;
-use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use schema::Topic;
@@ -14,47 +14,7 @@ use super::Kept;
 use super::files::{Files, Split, discard};
 use super::part::{Part, Place};
 use super::queue::{Batch, EVERY, Entry, Queue, Track};
-
-/// What the writing thread says to the other one.
-#[derive(Default)]
-pub(super) struct Told(Mutex<Account>);
-
-/// How far it came.
-#[derive(Clone, Debug, Default, PartialEq, Eq)]
-pub(super) struct Account {
-    /// Bytes in all files.
-    pub(super) bytes: u64,
-    /// Samples in all files.
-    pub(super) samples: u64,
-    /// What happened since it was looked at last.
-    pub(super) news: Vec<News>,
-}
-
-/// What is worth a word.
-#[derive(Clone, Debug, PartialEq, Eq)]
-pub(super) enum News {
-    /// It goes on in this file.
-    File(PathBuf),
-    /// What comes cannot be written, and why.
-    Trouble(PathBuf, String),
-    /// It can be written again, after this time.
-    Well(PathBuf, Duration),
-    /// Nobody reads what is written any more.
-    ReaderGone,
-}
-
-impl Told {
-    /// How far it came; news are told once.
-    pub(super) fn look(&self) -> Account {
-        let mut account = self.account();
-        let news = std::mem::take(&mut account.news);
-        Account { news, ..account.clone() }
-    }
-
-    fn account(&self) -> MutexGuard<'_, Account> {
-        self.0.lock().unwrap_or_else(PoisonError::into_inner)
-    }
-}
+use super::told::{News, Told};
 
 /// The writing of one run.
 pub(super) struct Disk {
@@ -153,7 +113,7 @@ impl Disk {
                 }
                 Err(error) if error.kind() == ErrorKind::BrokenPipe => {
                     self.told.account().news.push(News::ReaderGone);
-                    return Ok(());
+                    return Err(error);
                 }
                 Err(error) if is_over && (self.trouble.is_some() || self.part.is_doubtful) => {
                     return Err(error);
@@ -172,6 +132,7 @@ impl Disk {
         if self.part.is_finished() {
             self.part.sync()?;
             if is_over && self.queue.is_empty() {
+                self.count_gone();
                 return Ok(());
             }
             self.renew()?;
@@ -193,6 +154,8 @@ impl Disk {
         if is_full && !is_over {
             self.renew()?;
             self.write()?;
+        } else if is_over {
+            self.count_gone();
         }
         Ok(())
     }
@@ -216,6 +179,7 @@ impl Disk {
         let mut account = self.told.account();
         account.bytes = self.bytes + self.part.written;
         account.samples += self.batch.count();
+        self.part.samples += self.batch.count();
         self.batch.clear();
         Ok(())
     }
@@ -235,10 +199,21 @@ impl Disk {
         part.repeat(&self.tracks, &self.statuses)?;
         part.add(&self.tracks, &self.batch)?;
         files.prune();
+        self.count_gone();
         self.bytes += self.part.written;
         self.part = part;
         self.told.account().news.push(News::File(path));
         Ok(())
+    }
+
+    /// What was written to a file that is gone is in none.
+    fn count_gone(&mut self) {
+        let Some(path) = self.part.path().filter(|_| self.part.is_gone()).map(PathBuf::from) else { return };
+        let samples = std::mem::take(&mut self.part.samples);
+        self.part.written = 0;
+        let mut account = self.told.account();
+        (account.bytes, account.samples) = (self.bytes, account.samples - samples);
+        account.news.push(News::Gone(path, samples));
     }
 
     /// Keeps the tracks of the batch.
@@ -290,7 +265,7 @@ impl Disk {
 /// What is told of a run, with the number of the file among those of the run.
 fn numbered(facts: &BTreeMap<String, String>, files: Option<&Files>) -> BTreeMap<String, String> {
     let mut facts = facts.clone();
-    facts.insert("part".to_owned(), files.map_or(1, Files::number).to_string());
+    facts.insert("part".to_owned(), files.map_or(1, Files::count).to_string());
     facts
 }
 

@@ -5,6 +5,7 @@ use std::io::{self, ErrorKind};
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
+use super::lock;
 use crate::duration;
 
 /// When a recording goes on in the next file.
@@ -63,42 +64,40 @@ pub(super) struct Files {
     is_split: bool,
     overwrites: bool,
     keep: Option<usize>,
-    /// How many names are used up.
+    /// The last number that a name has.
     number: u32,
+    /// How many it has made.
+    count: u32,
     made: Vec<PathBuf>,
 }
 
 impl Files {
-    /// Called `path`, or with numbers behind its stem if the run `is_split`; what is there already is in the way unless it
-    /// `overwrites`. Of those made, the last `keep` stay.
+    /// Called `path`, or with numbers behind its stem if the run `is_split`. What is there already is in the way, but for a
+    /// run that `overwrites`: it does so, or goes on behind the numbers that there are. Of those made, the last `keep` stay.
     pub(super) fn new(path: &Path, is_split: bool, overwrites: bool, keep: Option<usize>) -> Files {
-        Files { path: path.to_owned(), is_split, overwrites, keep, number: 0, made: Vec::new() }
+        Files { path: path.to_owned(), is_split, overwrites, keep, number: 0, count: 0, made: Vec::new() }
     }
 
     /// The first one.
+    ///
+    /// [`ErrorKind::AlreadyExists`] if something is in the way, [`ErrorKind::ResourceBusy`] if another run writes it.
     pub(super) fn first(&mut self) -> io::Result<(PathBuf, File)> {
-        self.number = 1;
-        let path = self.name();
-        let file = self.open(&path)?;
-        self.made.push(path.clone());
-        Ok((path, file))
+        let last = if self.is_split { self.last() } else { 0 };
+        if last > 0 && !self.overwrites {
+            let name = self.name(last);
+            let what = format!("files of an earlier run are there, the last one is {}", name.display());
+            return Err(io::Error::new(ErrorKind::AlreadyExists, what));
+        }
+        self.make(last + 1, self.overwrites && !self.is_split)
     }
 
     /// The next one: a name that another run has taken is passed over.
     pub(super) fn next(&mut self) -> io::Result<(PathBuf, File)> {
+        let mut number = self.number + 1;
         loop {
-            self.number += 1;
-            let path = self.name();
-            match self.open(&path) {
-                Ok(file) => {
-                    self.made.push(path.clone());
-                    return Ok((path, file));
-                }
-                Err(error) if error.kind() == ErrorKind::AlreadyExists => {}
-                Err(error) => {
-                    self.number -= 1;
-                    return Err(error);
-                }
+            match self.make(number, false) {
+                Err(error) if TAKEN.contains(&error.kind()) => number += 1,
+                made => return made,
             }
         }
     }
@@ -110,33 +109,69 @@ impl Files {
         }
     }
 
-    /// Number of the last one, from 1.
-    pub(super) fn number(&self) -> u32 {
-        self.number
+    /// How many it has made.
+    pub(super) fn count(&self) -> u32 {
+        self.count
     }
 
-    fn name(&self) -> PathBuf {
-        if self.number == 1 && !self.is_split {
+    fn make(&mut self, number: u32, overwrites: bool) -> io::Result<(PathBuf, File)> {
+        let path = self.name(number);
+        let file = open(&path, overwrites)?;
+        (self.number, self.count) = (number, self.count + 1);
+        self.made.push(path.clone());
+        Ok((path, file))
+    }
+
+    fn name(&self, number: u32) -> PathBuf {
+        if number == 1 && !self.is_split {
             return self.path.clone();
         }
-        let stem = self.path.file_stem().unwrap_or_default().to_string_lossy();
-        let name = match self.path.extension() {
-            Some(ending) => format!("{stem}-{:04}.{}", self.number, ending.to_string_lossy()),
-            None => format!("{stem}-{:04}", self.number),
-        };
-        self.path.with_file_name(name)
+        let (stem, ending) = self.around();
+        self.path.with_file_name(format!("{stem}-{number:04}{ending}"))
     }
 
-    fn open(&self, path: &Path) -> io::Result<File> {
-        let mut options = File::options();
-        options.write(true);
-        match self.overwrites {
-            true => options.create(true).truncate(true),
-            false => options.create_new(true),
+    /// What stands before and behind a number.
+    fn around(&self) -> (String, String) {
+        let stem = self.path.file_stem().unwrap_or_default().to_string_lossy().into_owned();
+        let ending = self.path.extension().map(|ending| format!(".{}", ending.to_string_lossy()));
+        (stem, ending.unwrap_or_default())
+    }
+
+    /// The greatest number that a name in the directory has; 0 if there is none.
+    fn last(&self) -> u32 {
+        let (stem, ending) = self.around();
+        let place = self.path.parent().filter(|place| !place.as_os_str().is_empty());
+        let Ok(entries) = fs::read_dir(place.unwrap_or(Path::new("."))) else { return 0 };
+        let names = entries.flatten().map(|entry| entry.file_name());
+        let number = |name: &str| {
+            let digits = name.strip_prefix(&stem)?.strip_prefix('-')?.strip_suffix(&ending)?;
+            // Longer ones are dates.
+            let number = digits.parse().ok().filter(|number| *number < 1_000_000)?;
+            (format!("{number:04}") == digits).then_some(number)
         };
-        options.open(path)
+        names.filter_map(|name| number(name.to_str()?)).max().unwrap_or(0)
     }
 }
+
+/// Opens a file that no other run writes, empty.
+fn open(path: &Path, overwrites: bool) -> io::Result<File> {
+    let mut options = File::options();
+    options.write(true);
+    match overwrites {
+        // Emptied when it is known that nobody writes it.
+        true => options.create(true).truncate(false),
+        false => options.create_new(true),
+    };
+    let file = options.open(path)?;
+    if file.metadata()?.is_file() {
+        lock::take(&file)?;
+        file.set_len(0)?;
+    }
+    Ok(file)
+}
+
+/// Somebody else has the name.
+const TAKEN: [ErrorKind; 2] = [ErrorKind::AlreadyExists, ErrorKind::ResourceBusy];
 
 /// Removes the file that was made at `path`, if it is one: devices and links are others' things.
 pub(super) fn discard(path: &Path) {
@@ -215,18 +250,44 @@ mod tests {
         let place = std::env::temp_dir().join(format!("scanhub-files-{}", std::process::id()));
         fs::create_dir_all(&place).unwrap();
         let at = |name: &str| place.join(name);
-        fs::write(at("walk-0002.mcap"), "another's").unwrap();
         let mut files = Files::new(&at("walk.mcap"), true, false, Some(2));
         assert_eq!(files.first().unwrap().0, at("walk-0001.mcap"));
+        fs::write(at("walk-0002.mcap"), "another's").unwrap();
         assert_eq!(files.next().unwrap().0, at("walk-0003.mcap"));
         assert_eq!(files.next().unwrap().0, at("walk-0004.mcap"));
+        assert_eq!(files.count(), 3);
         files.prune();
         assert!(!at("walk-0001.mcap").exists() && at("walk-0003.mcap").exists());
-        assert_eq!(fs::read(at("walk-0002.mcap")).unwrap(), b"another's");
         let taken = Files::new(&at("walk-0002.mcap"), false, false, None).first().unwrap_err();
         assert_eq!(taken.kind(), ErrorKind::AlreadyExists);
+        // Those of an earlier run are not mixed with those of the next one.
+        for other in
+            ["walk-20261122.mcap", "walk-00009.mcap", "walk-7.mcap", "walk-0009.bag", "walks-0009.mcap"]
+        {
+            fs::write(at(other), "another's").unwrap();
+        }
+        let earlier = Files::new(&at("walk.mcap"), true, false, None).first().unwrap_err();
+        assert!(earlier.kind() == ErrorKind::AlreadyExists && earlier.to_string().contains("walk-0004.mcap"));
+        let mut behind = Files::new(&at("walk.mcap"), true, true, None);
+        assert_eq!((behind.first().unwrap().0, behind.count()), (at("walk-0005.mcap"), 1));
+        assert_eq!(fs::read(at("walk-0002.mcap")).unwrap(), b"another's");
         let mut one = Files::new(&at("one"), false, true, None);
         assert_eq!((one.first().unwrap().0, one.next().unwrap().0), (at("one"), at("one-0002")));
+        fs::remove_dir_all(place).unwrap();
+    }
+
+    #[test]
+    fn a_file_has_one_writer() {
+        let place = std::env::temp_dir().join(format!("scanhub-writer-{}", std::process::id()));
+        fs::create_dir_all(&place).unwrap();
+        let path = place.join("walk.mcap");
+        let (_, mut file) = Files::new(&path, false, false, None).first().unwrap();
+        io::Write::write_all(&mut file, b"mine").unwrap();
+        let busy = Files::new(&path, false, true, None).first().unwrap_err();
+        assert_eq!((busy.kind(), fs::read(&path).unwrap()), (ErrorKind::ResourceBusy, b"mine".to_vec()));
+        drop(file);
+        assert!(Files::new(&path, false, true, None).first().is_ok());
+        assert_eq!(fs::read(&path).unwrap(), b"");
         fs::remove_dir_all(place).unwrap();
     }
 }

@@ -25,6 +25,8 @@ pub(super) struct Part {
     taken: usize,
     /// Bytes that are in the file.
     pub(super) written: u64,
+    /// Samples that are in the file, without those that are repeated.
+    pub(super) samples: u64,
     /// When its first own sample came.
     pub(super) begun: Option<Instant>,
     /// About how much memory its index takes, in bytes.
@@ -73,6 +75,7 @@ impl Part {
             place,
             taken: 0,
             written: 0,
+            samples: 0,
             begun: None,
             index: 0,
             is_doubtful: false,
@@ -188,6 +191,12 @@ impl Part {
             return Err(io::Error::new(ErrorKind::NotFound, "somebody cut it"));
         }
         Ok(())
+    }
+
+    /// Nobody finds what was written any more: the file was removed, or cut. One that is elsewhere now has it still.
+    pub(super) fn is_gone(&self) -> bool {
+        let Place::File(file, _) = &self.place else { return false };
+        file.metadata().is_ok_and(|here| here.is_file() && (here.nlink() == 0 || here.len() < self.written))
     }
 
     fn writer(&mut self) -> io::Result<&mut Writer<Made>> {

@@ -1,18 +1,19 @@
 //! What a recorder tells of itself: lines of JSON, or text and one line that is drawn over itself. Refuses to know why.
 
 use std::io::{self, Write};
+use std::os::fd::OwnedFd;
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
 use serde::Serialize;
 
 use super::RecordLook;
-use super::disk::{Account as Written, News};
 use super::queue::Gap;
+use super::told::{Account as Written, News};
 use crate::account::Account;
 use crate::follow::Notice;
 use crate::names::TopicName;
-use crate::output::{End, Output};
+use crate::output::{End, Output, columns, fitting};
 use crate::{json, text};
 
 /// Where it is told.
@@ -20,6 +21,8 @@ pub(super) struct Report<'a> {
     look: RecordLook,
     out: Output<'a>,
     notes: Output<'a>,
+    /// Where the line is drawn, to ask how long it may be.
+    terminal: Option<OwnedFd>,
     begun: Instant,
     next: Instant,
     files: Vec<PathBuf>,
@@ -27,6 +30,8 @@ pub(super) struct Report<'a> {
     bytes: u64,
     /// Samples that were sent and not received.
     lost: u64,
+    /// Samples that were written, and whose file is gone.
+    gone: u64,
     is_in_trouble: bool,
 }
 
@@ -34,18 +39,25 @@ pub(super) struct Report<'a> {
 const EVERY: Duration = Duration::from_secs(1);
 
 impl<'a> Report<'a> {
-    /// Accounts to `out`, and what is no account to `notes` if `out` is not JSON.
-    pub(super) fn new(look: RecordLook, out: &'a mut dyn Write, notes: &'a mut dyn Write) -> Report<'a> {
+    /// Accounts to `out`, which may be `terminal`, and what is no account to `notes` if `out` is not JSON.
+    pub(super) fn new(
+        look: RecordLook,
+        out: &'a mut dyn Write,
+        notes: &'a mut dyn Write,
+        terminal: Option<OwnedFd>,
+    ) -> Report<'a> {
         let now = Instant::now();
         Report {
             look,
             out: Output::new(out),
             notes: Output::new(notes),
+            terminal,
             begun: now,
             next: now + EVERY,
             files: Vec::new(),
             bytes: 0,
             lost: 0,
+            gone: 0,
             is_in_trouble: false,
         }
     }
@@ -75,20 +87,32 @@ impl<'a> Report<'a> {
         self.is_in_trouble = match news {
             News::Trouble(..) => true,
             News::Well(..) => false,
-            News::File(_) | News::ReaderGone => self.is_in_trouble,
+            News::File(_) | News::Gone(..) | News::ReaderGone => self.is_in_trouble,
         };
-        if let News::File(path) = news {
-            self.files.push(path.clone());
+        match news {
+            News::File(path) => self.files.push(path.clone()),
+            News::Gone(_, samples) => self.gone += samples,
+            _ => {}
         }
         if self.look == RecordLook::Json {
-            let (kind, path, message, seconds) = match news {
-                News::File(path) => ("file", path, None, None),
-                News::Trouble(path, message) => ("disk_trouble", path, Some(message.as_str()), None),
-                News::Well(path, after) => ("disk_well", path, None, Some(after.as_secs_f64())),
+            let of = |kind, path: &Path| Disk {
+                class: "notice",
+                kind,
+                file: path.display().to_string(),
+                message: None,
+                seconds: None,
+                samples: None,
+            };
+            let notice = match news {
+                News::File(path) => of("file", path),
+                News::Trouble(path, message) => Disk { message: Some(message), ..of("disk_trouble", path) },
+                News::Well(path, after) => {
+                    Disk { seconds: Some(after.as_secs_f64()), ..of("disk_well", path) }
+                }
+                News::Gone(path, samples) => Disk { samples: Some(*samples), ..of("file_gone", path) },
                 News::ReaderGone => return Ok(()),
             };
-            let file = path.display().to_string();
-            return self.out.json(&Disk { class: "notice", kind, file, message, seconds });
+            return self.out.json(&notice);
         }
         self.note(|line| match news {
             News::File(path) => write!(line, "goes on in {}", path.display()),
@@ -98,6 +122,9 @@ impl<'a> Report<'a> {
             }
             News::Well(path, after) => {
                 write!(line, "{} is written again, after {:.1} s", path.display(), after.as_secs_f64())
+            }
+            News::Gone(path, samples) => {
+                write!(line, "{} was removed or cut: its {samples} samples are gone", path.display())
             }
             News::ReaderGone => Ok(()),
         })
@@ -138,10 +165,10 @@ impl<'a> Report<'a> {
             RecordLook::Lines => Ok(()),
             RecordLook::Json => self.recording(written, left_out),
             RecordLook::Terminal => {
-                // A line that wraps would not be drawn over: it is cut.
-                let mut line = [WIPE, b"\x1b[?7l"].concat();
-                self.status(&mut line, written, left_out)?;
-                line.extend(b"\x1b[?7h");
+                // A line that wraps would not be drawn over: one that does not fit all the same is cut.
+                let columns = self.terminal.as_ref().and_then(columns).unwrap_or(usize::MAX - 2);
+                let status = fitting(self.status(written, left_out), columns);
+                let line = [WIPE, b"\x1b[?7l", status.as_bytes(), b"\x1b[?7h"].concat();
                 self.bytes = written.bytes;
                 self.out.raw(&line)
             }
@@ -168,10 +195,12 @@ impl<'a> Report<'a> {
                 samples,
                 lost: self.lost,
                 left_out,
+                gone: self.gone,
                 seconds: self.begun.elapsed().as_secs_f64(),
             });
         }
         self.wipe()?;
+        let gone = self.gone;
         let files = &self.files;
         self.out.line(|line| {
             match &files[..] {
@@ -182,7 +211,10 @@ impl<'a> Report<'a> {
                 [] => {}
             }
             write!(line, ": {samples} samples, {}", size(bytes))?;
-            if left_out > 0 { write!(line, ", {left_out} left out") } else { Ok(()) }
+            if left_out > 0 {
+                write!(line, ", {left_out} left out")?;
+            }
+            if gone > 0 { write!(line, ", {gone} gone with files that were removed or cut") } else { Ok(()) }
         })
     }
 
@@ -198,13 +230,19 @@ impl<'a> Report<'a> {
         })
     }
 
-    fn status(&self, line: &mut Vec<u8>, written: &Written, left_out: u64) -> io::Result<()> {
+    /// How far it is, each part with its rank: what is lost is wanted longest.
+    fn status(&self, written: &Written, left_out: u64) -> Vec<(u8, String)> {
         let seconds = self.begun.elapsed().as_secs();
         let rate = written.bytes.saturating_sub(self.bytes) / EVERY.as_secs();
-        let trouble = if self.is_in_trouble { "disk trouble, " } else { "" };
-        write!(line, "{trouble}{}:{:02}:{:02}", seconds / 3600, seconds / 60 % 60, seconds % 60)?;
-        write!(line, "  {}  {}/s  {} samples", size(written.bytes), size(rate), written.samples)?;
-        write!(line, "  {} lost", self.lost + left_out)
+        let trouble = self.is_in_trouble.then(|| (4, "disk trouble".to_owned()));
+        let parts = [
+            (3, format!("{}:{:02}:{:02}", seconds / 3600, seconds / 60 % 60, seconds % 60)),
+            (1, size(written.bytes)),
+            (0, format!("{}/s", size(rate))),
+            (2, format!("{} samples", written.samples)),
+            (5, format!("{} lost", self.lost + left_out + self.gone)),
+        ];
+        trouble.into_iter().chain(parts).collect()
     }
 
     /// A line that is no account.
@@ -251,6 +289,7 @@ struct Recorded {
     samples: u64,
     lost: u64,
     left_out: u64,
+    gone: u64,
     seconds: f64,
 }
 
@@ -264,6 +303,8 @@ struct Disk<'a> {
     message: Option<&'a str>,
     #[serde(skip_serializing_if = "Option::is_none")]
     seconds: Option<f64>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    samples: Option<u64>,
 }
 
 /// Class `notice`, of samples left out.

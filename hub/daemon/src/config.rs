@@ -12,8 +12,7 @@ use lms::family::Family;
 use lms::variant::{Baud, Mode, Unit, Variant};
 use schema::{Failure, Kind};
 
-use crate::layer::{Drafts, parse};
-use crate::origin::Origin;
+use crate::layer::Drafts;
 
 pub use effective::{Value, values};
 pub use gateway::Gateway;
@@ -113,20 +112,22 @@ impl Source {
 }
 
 impl Config {
-    /// Reads all sources. Without any link in them there are two, `front` and `rear`, at the first two USB adapters.
+    /// Reads all sources.
     ///
-    /// [`schema::Kind::Configuration`] with place, value and remedy.
+    /// [`schema::Kind::Configuration`] with place, value and remedy; also without any link: no port is opened that nobody named.
     pub fn load(sources: &Sources) -> Result<Config, Failure> {
         let mut drafts = Drafts::default();
         for layer in sources.files().chain(sources.links()) {
             let (origin, layer) = layer?;
             drafts.merge(layer, origin, true)?;
         }
+        let settings = sources.settings().collect::<Result<Vec<_>, _>>()?;
         if drafts.len() == 0 {
-            drafts.merge(parse(&Origin::Default)?, Origin::Default, true)?;
+            let remedy =
+                "--link NAME=PORT, or a section [[link]] in a file: scanhub config default prints one";
+            return Err(Failure::new(Kind::Configuration, "no link is configured", remedy));
         }
-        for layer in sources.settings() {
-            let (origin, layer) = layer?;
+        for (origin, layer) in settings {
             drafts.merge(layer, origin, false)?;
         }
         if drafts.len() > MAX_LINKS {
@@ -164,19 +165,8 @@ fn check_ports(links: &[Link]) -> Result<(), Failure> {
 /// Links of one hub.
 const MAX_LINKS: usize = 256;
 
-/// What a hub without any configuration does, written out to begin one with.
+/// A configuration to begin with; its values are those that hold where nothing is said.
 pub const DEFAULT: &str = include_str!("config/default.toml");
-
-/// The links of a hub for which none are said.
-pub(crate) const LINKS: &str = r#"
-[[link]]
-name = "front"
-port = "/dev/ttyUSB0"
-
-[[link]]
-name = "rear"
-port = "/dev/ttyUSB1"
-"#;
 
 #[cfg(test)]
 mod tests {
@@ -184,6 +174,7 @@ mod tests {
 
     fn sources(set: &[&str], links: &[&str]) -> Sources {
         let owned = |flags: &[&str]| flags.iter().map(|flag| (*flag).to_owned()).collect();
+        let links = if links.is_empty() { &["front=/dev/ttyUSB0", "rear=/dev/ttyUSB1"] } else { links };
         Sources { files: Vec::new(), set: owned(set), links: owned(links) }
     }
 
@@ -194,8 +185,16 @@ mod tests {
     }
 
     #[test]
-    fn two_links_by_default() {
-        let config = Config::load(&Sources::default()).unwrap();
+    fn no_port_is_opened_that_nobody_named() {
+        let none = |set: &[&str]| {
+            let sources = Sources { links: Vec::new(), ..sources(set, &[]) };
+            Config::load(&sources).expect_err("no link").to_string()
+        };
+        for set in [&[][..], &["link.front.angle=100"], &["zones.margin=0.1"]] {
+            assert!(none(set).starts_with("no link is configured\n  --link NAME=PORT"), "{}", none(set));
+        }
+        assert!(none(&["speed=3"]).contains("speed=3"));
+        let config = Config::load(&sources(&[], &[])).unwrap();
         let names: Vec<_> = config.links.iter().map(|link| (link.name.as_str(), link.port.name())).collect();
         assert_eq!(names, [("front", "/dev/ttyUSB0".to_owned()), ("rear", "/dev/ttyUSB1".to_owned())]);
         assert_eq!((config.links[0].variant, config.links[0].baud), (Variant::HALF, Baud::B500000));
@@ -322,6 +321,21 @@ mod tests {
         assert!(error.contains(":5:9: link a: an lms211 does not scan 180 degrees"), "{error}");
         let error = load("[[link]]\nname = \"a\"\n").unwrap_err().to_string();
         assert!(error.contains("link a: no port"), "{error}");
+        let link = "[[link]]\nname = \"a\"\nport = \"x\"\n";
+        for (text, place, words) in [
+            ("[link]\nname = \"a\"\nport = \"x\"\n".to_owned(), ":1:1: ", "with two brackets"),
+            (format!("{link}baud = \"500000\"\n"), ":4:8: ", "baud = 500000, without quotes"),
+            (format!("{link}unit = 5\n"), ":4:8: unit = 5 is not text", "unit = \"5\", with quotes"),
+            (format!("{link}angle = \"wide\"\n"), ":4:9: ", "angle = \"wide\" is not a number"),
+            (format!("{link}[zones]\nradii = 1.0\n"), ":5:9: ", "radii = [1.0], with brackets"),
+            (format!("{link}[zones]\nexact = \"false\"\n"), ":5:9: ", "exact = false, without quotes"),
+            (format!("{link}[zones]\nexact = 1\n"), ":5:9: ", "exact = true, or exact = false"),
+        ] {
+            let error = load(&text).unwrap_err().to_string();
+            assert!(error.contains(place) && error.contains(words), "{error}");
+        }
+        let set = refusal(&["link.front.baud=\"500000\""], &[]);
+        assert!(set.starts_with("--set link.front.baud=") && set.contains("without quotes"), "{set}");
         assert!(load("[[link]]\nname = \"a\"\nport = \"x\"\nangle = 100\n").is_ok());
         std::fs::remove_file(&path).unwrap();
     }

@@ -84,7 +84,7 @@ pub fn examine(
     tell(version::version(system, pid));
     tell(installed::service(system, pid));
     tell(installed::rules(system, &there));
-    let facts = Facts::gather(domain, &subjects.places, ports.len().max(1));
+    let facts = Facts::gather(domain, &subjects.places, ports.len().max(1), hub.as_ref());
     tell(machine::memory(&facts));
     tell(machine::domain(&facts));
     tell(machine::hubs(&facts, |user| system.name_of(user)));

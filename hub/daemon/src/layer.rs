@@ -147,8 +147,13 @@ impl Draft {
         for (origin, sections) in &said {
             sections.clone().lay(origin, &mut processing)?;
         }
+        let start =
+            said.iter().rev().find_map(|(origin, sections)| Some(origin.place(Some(sections.start()?))));
         Sight { name: &name, place: &place, variant, unit, said }.check(&processing)?;
-        processing.background.read(&name, variant, unit)?;
+        processing.background.read(&name, variant, unit).map_err(|failure| {
+            let place = start.unwrap_or_default();
+            Failure::new(failure.kind, format!("{place}: {}", failure.message), failure.hint)
+        })?;
         Ok(Link { name, port, family, variant, unit, mode: mode.map(|said| said.value), baud, processing })
     }
 }

@@ -5,8 +5,6 @@ use std::path::{Path, PathBuf};
 
 use schema::{Failure, Kind};
 
-use crate::config::LINKS;
-
 /// One source of values with its text.
 #[derive(Clone, Debug)]
 pub(crate) enum Origin {
@@ -14,8 +12,6 @@ pub(crate) enum Origin {
     File { path: PathBuf, text: String },
     /// A flag of the command line, as given, and as TOML.
     Flag { flag: String, text: String },
-    /// The program's own links.
-    Default,
 }
 
 impl Origin {
@@ -34,7 +30,6 @@ impl Origin {
     pub(crate) fn text(&self) -> &str {
         match self {
             Origin::File { text, .. } | Origin::Flag { text, .. } => text,
-            Origin::Default => LINKS,
         }
     }
 
@@ -49,7 +44,6 @@ impl Origin {
             }
             (Origin::File { path, .. }, None) => path.display().to_string(),
             (Origin::Flag { flag, .. }, _) => flag.clone(),
-            (Origin::Default, _) => "default configuration".to_owned(),
         }
     }
 
@@ -79,6 +73,41 @@ impl Origin {
             });
             return self.refuse(error.span(), format!("{what} `{unknown}`"), remedy);
         }
+        if let Some(failure) = self.mistyped(message, error.span()) {
+            return failure;
+        }
         self.refuse(error.span(), message, "see docs/configuration.md")
     }
+
+    /// A value of another type than its key has, in words that need no knowledge of the program's own types.
+    fn mistyped(&self, message: &str, span: Option<Range<usize>>) -> Option<Failure> {
+        let (_, expected) = message.strip_prefix("invalid type: ")?.rsplit_once(", expected ")?;
+        let value = self.text().get(span.clone()?)?;
+        let key = self.text()[..span.as_ref()?.start].rsplit(['\n', '{', ',']).next()?.trim();
+        let key = key.strip_suffix('=').map_or("", str::trim_end);
+        let bare = value.trim_matches(['"', '\'']);
+        if expected == "a sequence" && value.starts_with("[link") {
+            let what = "[link] is one section, and there may be several links";
+            return Some(self.refuse(span, what, "write [[link]], with two brackets"));
+        }
+        let (wanted, remedy) = match expected {
+            "a string" => ("text", format!("{key} = \"{bare}\", with quotes")),
+            "a boolean" if ["true", "false"].contains(&bare) => ("a switch", without_quotes(key, bare)),
+            "a boolean" => ("a switch", format!("{key} = true, or {key} = false")),
+            "u8" | "u32" | "i64" | "usize" | "f64" => {
+                let wanted = if expected == "f64" { "a number" } else { "a whole number" };
+                match bare.parse::<f64>() {
+                    Ok(_) if bare != value => (wanted, without_quotes(key, bare)),
+                    _ => (wanted, "see docs/configuration.md".to_owned()),
+                }
+            }
+            "a sequence" => ("a list", format!("{key} = [{value}], with brackets")),
+            _ => return None,
+        };
+        (!key.is_empty()).then(|| self.refuse(span, format!("{key} = {value} is not {wanted}"), remedy))
+    }
+}
+
+fn without_quotes(key: &str, bare: &str) -> String {
+    format!("{key} = {bare}, without quotes")
 }

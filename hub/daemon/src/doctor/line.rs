@@ -35,6 +35,10 @@ pub(crate) fn examine(
         Source::Tcp { .. } => return server(subject, hub, stop, tell),
     };
     let candidate = candidate(path, there);
+    if hub.is_some_and(|hub| hub.is_mute_link(&subject.source)) {
+        tell(Finding::skipped("port", "a link of the hub, which does not say what port it has"));
+        return Ok(());
+    }
     if path.exists() && !is_tty(path) {
         tell(refused(Refusal::NotTty.explain(&subject.source)));
         return Ok(());
@@ -49,13 +53,14 @@ pub(crate) fn examine(
         match hub.filter(|hub| holders.iter().any(|holder| holder.pid == hub.pid)) {
             Some(hub) => {
                 let link = hub.link(&subject.source.name());
+                let why = hub.why_unknown();
                 tell(latency(path, latency_ms(path)));
                 tell(held(&holders, hub.pid));
                 tell(link.map_or_else(
-                    || Finding::skipped("line-errors", "the hub has the port under another name"),
+                    || Finding::skipped("line-errors", why),
                     |(_, status)| as_the_hub_counts(status),
                 ));
-                sensor::as_the_hub_says(link).into_iter().for_each(tell);
+                sensor::as_the_hub_says(link, why).into_iter().for_each(tell);
             }
             None => {
                 tell(refused(Refusal::Busy.explain(&subject.source)));
@@ -105,7 +110,7 @@ fn server(
     // Most of them serve one at a time.
     if let Some(link) = hub.and_then(|hub| hub.link(&subject.source.name())) {
         tell(Finding::ok("holder", "it is a link of the hub"));
-        sensor::as_the_hub_says(Some(link)).into_iter().for_each(tell);
+        sensor::as_the_hub_says(Some(link), "").into_iter().for_each(tell);
         return Ok(());
     }
     match probe::open(&subject.source, stop) {

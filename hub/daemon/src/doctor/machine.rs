@@ -12,6 +12,8 @@ use schema::shortage::SHARED_MEMORY;
 use schema::{Domain, Failure};
 
 use super::finding::Finding;
+use super::hub::Hub;
+use super::program;
 use super::segments::{self, Segment};
 use crate::preflight::needed;
 
@@ -31,6 +33,10 @@ pub(crate) struct Facts {
     pub(crate) place: Place,
     /// The hub's process, if one holds the domain.
     pub(crate) hub: Result<Option<u32>, Failure>,
+    /// Links of that hub whose status did not come.
+    pub(crate) mute: Vec<String>,
+    /// Whether that hub's process was stopped, by a signal or a debugger.
+    pub(crate) is_stopped: bool,
     /// Hubs of the same name at other places.
     pub(crate) others: Vec<(PathBuf, u32)>,
     /// Such places that are another user's, with whose they are.
@@ -71,7 +77,7 @@ pub(crate) struct Place {
 
 impl Facts {
     /// Looks at everything; changes nothing.
-    pub(crate) fn gather(domain: &Domain, places: &[Domain], links: usize) -> Facts {
+    pub(crate) fn gather(domain: &Domain, places: &[Domain], links: usize, hub: Option<&Hub>) -> Facts {
         let root = domain.root();
         let elsewhere = || places.iter().filter(|place| place.root() != root);
         let held = |place: &Domain| schema::holder(place.root()).ok().flatten();
@@ -95,6 +101,8 @@ impl Facts {
             user,
             place: Place::nearest(root),
             hub: schema::holder(root),
+            mute: hub.map(Hub::mute).unwrap_or_default(),
+            is_stopped: hub.is_some_and(|hub| program::is_stopped(hub.pid)),
             others: elsewhere().filter_map(|place| Some((place.root().to_owned(), held(place)?))).collect(),
             closed: elsewhere()
                 .filter(|place| schema::holder(place.root()).is_err())
@@ -183,6 +191,15 @@ pub(crate) fn domain(facts: &Facts) -> Finding {
     let at = place.path.display();
     match &facts.hub {
         Err(failure) => return Finding::failed(NAME, failure.message.clone(), failure.hint.clone()),
+        Ok(Some(pid)) if facts.is_stopped => {
+            let text = format!("{root}: the hub is stopped, process {pid}");
+            return Finding::failed(NAME, text, format!("let it go on: kill -CONT {pid}"));
+        }
+        Ok(Some(pid)) if !facts.mute.is_empty() => {
+            let links = facts.mute.join(", ");
+            let text = format!("{root}: the hub, process {pid}, does not publish: no status of {links} came");
+            return Finding::failed(NAME, text, format!("look at its log, then start it anew: kill {pid}"));
+        }
         Ok(Some(pid)) => return Finding::ok(NAME, format!("{root}: a hub runs, process {pid}")),
         Ok(None) => {}
     }
@@ -266,6 +283,8 @@ pub(super) mod tests {
             user: 7,
             place: Place { path: "/run/user/7".into(), owner: 7, mode: 0o700, writable: true },
             hub: Ok(None),
+            mute: Vec::new(),
+            is_stopped: false,
             others: Vec::new(),
             closed: Vec::new(),
             nodes: Ok(Nodes::default()),
@@ -315,6 +334,10 @@ pub(super) mod tests {
         says(&domain(&there(7, 0o500)), State::Failed, &["0500", "chmod 700"]);
         says(&domain(&there(8, 0o700)), State::Failed, &["user 8", "user 7", "--root"]);
         says(&domain(&Facts { hub: Ok(Some(41)), ..facts() }), State::Ok, &["process 41"]);
+        let mute = Facts { hub: Ok(Some(41)), mute: vec!["front".into(), "rear".into()], ..facts() };
+        says(&domain(&mute), State::Failed, &["process 41", "front, rear", "kill 41"]);
+        let stopped = Facts { is_stopped: true, ..mute };
+        says(&domain(&stopped), State::Failed, &["stopped, process 41", "kill -CONT 41"]);
         let closed = Place { path: "/run".into(), owner: 0, mode: 0o755, writable: false };
         says(&domain(&Facts { place: closed, ..facts() }), State::Failed, &["/run", "--root"]);
         let denied = Failure::new(Kind::Failed, "not yours", "ask");

@@ -47,6 +47,13 @@ pub(crate) fn user_of(pid: u32) -> Option<u32> {
     status.lines().find_map(|line| line.strip_prefix("Uid:"))?.split_whitespace().next()?.parse().ok()
 }
 
+/// Whether process `pid` was stopped, by a signal or a debugger.
+pub(crate) fn is_stopped(pid: u32) -> bool {
+    let status = std::fs::read_to_string(format!("/proc/{pid}/status")).unwrap_or_default();
+    let state = status.lines().find_map(|line| line.strip_prefix("State:"));
+    state.is_some_and(|state| state.trim_start().starts_with(['T', 't']))
+}
+
 /// Whether only this user and root may write it.
 fn is_ours(metadata: &Metadata) -> bool {
     [0, geteuid().as_raw()].contains(&metadata.uid()) && metadata.mode() & 0o022 == 0

@@ -23,9 +23,9 @@ pub(crate) fn examine(port: &str, report: &Report, link: Option<&Link>) -> Vec<F
 }
 
 /// The port is the hub's: what it says of its link.
-pub(crate) fn as_the_hub_says(link: Option<(&str, &Status)>) -> Vec<Finding> {
+pub(crate) fn as_the_hub_says(link: Option<(&str, &Status)>, why_unknown: &str) -> Vec<Finding> {
     match link {
-        None => vec![Finding::skipped("sensor", "the hub has the port under another name: scanhub info")],
+        None => vec![Finding::skipped("sensor", why_unknown)],
         Some((name, status)) => {
             let marks = marks(status, "after the hub's end: ");
             std::iter::once(link_of_the_hub(name, status)).chain(marks).collect()
@@ -341,7 +341,7 @@ mod tests {
     #[test]
     fn what_the_hub_says_is_passed_on() {
         let mut status = Status { state: State::Streaming as u8, baud: 500_000, ..Status::default() };
-        let told = |status: &Status| as_the_hub_says(Some(("front", status)));
+        let told = |status: &Status| as_the_hub_says(Some(("front", status)), "");
         assert_eq!(told(&status).iter().map(|finding| finding.state).collect::<Vec<_>>(), [Verdict::Ok]);
         status.mode = 0;
         status.set_port("/dev/ttyUSB0");
@@ -353,6 +353,6 @@ mod tests {
         assert!(dirty.state == Verdict::Warning && dirty.finding.contains("window"), "{dirty}");
         status.state = State::Silent as u8;
         assert_eq!(told(&status)[0].state, Verdict::Failed);
-        assert_eq!(as_the_hub_says(None)[0].state, Verdict::Skipped);
+        assert_eq!(as_the_hub_says(None, "it is unknown")[0].state, Verdict::Skipped);
     }
 }

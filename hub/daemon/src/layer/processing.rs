@@ -142,6 +142,11 @@ impl Sections {
         [x, y, yaw].into_iter().flatten().map(Spanned::span).next()
     }
 
+    /// Where it is said what the background begins with, if it is.
+    pub(super) fn start(&self) -> Option<Range<usize>> {
+        self.background.as_ref()?.start.as_ref().map(Spanned::span)
+    }
+
     /// Where the robot's own body is said, if it is.
     pub(super) fn self_min(&self) -> Option<Range<usize>> {
         self.zones.as_ref()?.self_min.as_ref().map(Spanned::span)

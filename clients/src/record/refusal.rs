@@ -1,0 +1,51 @@
+//! Where nothing can be recorded, and what helps. Refuses to open anything.
+
+use std::fs;
+use std::io::{self, ErrorKind};
+use std::os::unix::fs::FileTypeExt;
+use std::path::Path;
+
+use schema::{Failure, Kind};
+
+/// What stands at `path` is no place for a recording, whoever may write there; `force` takes a device all the same.
+///
+/// [`Kind::Failed`] with what would be one.
+pub(super) fn check(path: &Path, force: bool) -> Result<(), Failure> {
+    let Ok(place) = fs::metadata(path).map(|place| place.file_type()) else { return Ok(()) };
+    let shown = path.display();
+    let (what, hint) = if place.is_dir() {
+        ("directory", format!("name a file in it: -o {}", path.join("walk.mcap").display()))
+    } else if place.is_fifo() {
+        // Opening one waits for its reader, and nobody could end that.
+        ("pipe", format!("the shell opens it: scanhub record -o - > {shown}"))
+    } else if place.is_socket() {
+        ("socket", "-o FILE names a file".to_owned())
+    } else if (place.is_char_device() || place.is_block_device()) && !force {
+        ("device", "-o FILE names a file; --force writes over what the device holds".to_owned())
+    } else {
+        return Ok(());
+    };
+    Err(Failure::new(Kind::Failed, format!("cannot record into {shown}: it is a {what}"), hint))
+}
+
+/// No file could be made at `path`, of a run that `is_split`.
+pub(super) fn failed(path: &Path, is_split: bool, error: &io::Error) -> Failure {
+    let hint = match error.kind() {
+        ErrorKind::AlreadyExists if is_split => {
+            "--force goes on after the last one's number; -o FILE names others"
+        }
+        ErrorKind::AlreadyExists => "--force overwrites it; -o FILE names another one",
+        ErrorKind::ResourceBusy => "end that one first, or name another file: -o FILE",
+        ErrorKind::StorageFull => "make room, or name another place: -o FILE",
+        _ => "the directory has to be there and writable; -o FILE names another place",
+    };
+    Failure::new(Kind::Failed, format!("cannot record into {}: {error}", path.display()), hint)
+}
+
+/// Who read the recording went away after `samples`. That it goes through a pipe makes it no less a recording: what was to
+/// come is missing.
+pub(super) fn reader_gone(samples: u64) -> Failure {
+    let what = format!("whoever read the recording is gone: it ends after {samples} samples at most");
+    let hint = "see why the program or the connection behind the pipe ended; `scanhub convert` gives what it has an index";
+    Failure::new(Kind::Failed, what, hint)
+}
