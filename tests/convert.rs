@@ -2,6 +2,8 @@
 
 mod stage;
 
+use std::process::Stdio;
+
 use serde_json::json;
 use stage::Stage;
 
@@ -14,14 +16,19 @@ fn a_stream_becomes_a_recording_that_plays() {
     let outcome = stage.run(&["convert", &stream, &mcap, "--json", "--sensor=left"]);
     assert_eq!(outcome.code, Some(0), "{outcome}");
     let line = outcome.of_class("converted").pop().unwrap_or_else(|| panic!("{outcome}"));
-    let missing =
-        json!({"telegrams": 0, "bytes": 0, "chunks": 0, "stamps": 0, "end": false, "checksum": false});
+    let missing = json!({"telegrams": 0, "bytes": 0, "chunks": 0, "stamps": 0, "begin": false, "end": false, "checksum": false});
     assert_eq!((&line["telegrams"], &line["scans"], &line["missing"]), (&json!(20), &json!(20), &missing));
     assert_eq!((&line["from"], &line["to"]), (&json!("telegram stream"), &json!("MCAP")));
     // The telegrams as they were, to whoever reads stdout.
     let outcome = stage.run(&["convert", &mcap, "-", "--sensor=left"]);
     assert_eq!(outcome.code, Some(0), "{outcome}");
     assert!(outcome.errors.contains("20 telegrams, 20 scans"), "{}", outcome.errors);
+    // One who has had enough is no trouble, and is told nothing.
+    let (reader, writer) = std::io::pipe().expect("a pipe");
+    drop(reader);
+    let mut command = stage.command(&["convert", &mcap, "-"]);
+    let closed = command.stdout(writer).stderr(Stdio::piped()).output().expect("it ends");
+    assert_eq!((closed.status.code(), &closed.stderr[..]), (Some(0), &b""[..]), "{closed:?}");
     // A simulated sensor has the recording.
     let _simulator =
         stage.simulator(&["left"], &["--baud=500000", &format!("--replay={mcap}"), "--sensor=left"]);
@@ -39,6 +46,7 @@ fn what_cannot_be_converted_is_refused() {
         (["convert", &stream[..], &stream[..]], 78, "both read and written"),
         (["convert", &stream, &there], 1, "--force replaces it"),
         (["convert", &stream, "x.txt"], 78, "tells no form"),
+        (["convert", &there, "x.mcap"], 78, "no telegram in it"),
         (["convert", "/no/such/file", "x.mcap"], 78, "/no/such/file"),
     ] {
         let outcome = stage.run(&arguments);

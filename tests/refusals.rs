@@ -18,7 +18,7 @@ fn refused(stage: &Stage, arguments: &[&str], code: i32, kind: &str, words: &[&s
     assert_eq!(outcome.code, Some(code), "{outcome}");
     let text = match arguments.first() {
         // The log goes to stderr too, before it.
-        Some(&("run" | "simulate")) if kind != "usage" => {
+        Some(&("run" | "replay" | "simulate")) if kind != "usage" => {
             assert!(outcome.out.is_empty(), "{outcome}");
             outcome.errors.lines().last().unwrap_or_default().to_owned()
         }
@@ -104,6 +104,8 @@ fn configuration_that_cannot_be() {
         (&["run", "--link", "Front=/dev/x"], &["Front"]),
         (&["run", "--link", "front=file:x?rate=2"], &["rate=max"]),
         (&["run", "--link", "front=file:/no/such"], &["/no/such", "existing"]),
+        (&["replay", "/etc/passwd"], &["/etc/passwd", "no telegram in it", "MCAP"]),
+        (&["simulate", "--port=a", "--replay=/etc/passwd"], &["/etc/passwd", "no telegram in it", "MCAP"]),
         (&["run", "--config", &file], &[&place, "baud = 115200", "38400"]),
         (&["run", "--config", &unknown], &[&key, "`prot`", "`port`"]),
         (&["run", "--config", &broken], &["toml.toml:1:"]),

@@ -49,6 +49,9 @@ impl Convert {
             let _ = write!(stderr(), "\r\x1b[K");
         }
         let converted = outcome?;
+        if converted.is_closed {
+            return Ok(());
+        }
         let is_stdout_taken = self.output == Path::new("-");
         match (json, is_stdout_taken) {
             (true, false) => return print(&line(&Line::of(self, &converted))),
@@ -60,9 +63,10 @@ impl Convert {
 
     fn words(&self, converted: &Converted) -> String {
         let Converted { telegrams, scans, left_out, took_ns, damage, .. } = converted;
-        let seconds = *took_ns as f64 / 1e9;
-        let mut words =
-            format!("{}: {telegrams} telegrams, {scans} scans, {seconds:.3} s", self.output.display());
+        let mut words = format!("{}: {telegrams} telegrams, {scans} scans", self.output.display());
+        if let Some(seconds) = took_ns.map(seconds) {
+            words += &format!(", {seconds:.3} s");
+        }
         if *left_out > 0 {
             words += &format!("; left out: {left_out} telegrams that are no whole scans");
         }
@@ -85,7 +89,7 @@ struct Line<'a> {
     telegrams: u64,
     scans: u64,
     left_out: u64,
-    seconds: f64,
+    seconds: Option<f64>,
     missing: Missing,
 }
 
@@ -114,7 +118,7 @@ impl<'a> Line<'a> {
             telegrams: converted.telegrams,
             scans: converted.scans,
             left_out: converted.left_out,
-            seconds: converted.took_ns as f64 / 1e9,
+            seconds: converted.took_ns.map(seconds),
             missing: Missing {
                 telegrams,
                 bytes,
@@ -126,6 +130,10 @@ impl<'a> Line<'a> {
             },
         }
     }
+}
+
+fn seconds(ns: u64) -> f64 {
+    ns as f64 / 1e9
 }
 
 /// Writes one line to stderr, which may be a terminal that is gone.

@@ -4,6 +4,7 @@ use std::io::{self, Write, stderr};
 use std::sync::atomic::{AtomicBool, Ordering};
 
 use daemon::{Pace, Progress};
+use rustix::termios::tcgetwinsize;
 
 /// The line at the bottom of stderr, until it is dropped.
 #[derive(Default)]
@@ -19,9 +20,9 @@ static IS_SHOWN: AtomicBool = AtomicBool::new(false);
 
 impl Line {
     pub(super) fn draw(&mut self, progress: &Progress) {
-        let text = text(progress);
+        let text = text(progress, columns());
         if text != self.drawn || !IS_SHOWN.load(Ordering::Relaxed) {
-            // A line that wraps would not be drawn over: it is cut.
+            // A line that wraps would not be drawn over: should the terminal have become narrower just now, it is cut.
             IS_SHOWN.store(true, Ordering::Relaxed);
             let _ = stderr().write_all(format!("{WIPE}\x1b[?7l{text}\x1b[?7h").as_bytes());
             self.drawn = text;
@@ -54,31 +55,61 @@ fn wipe() {
 
 /// What was played, when it is over.
 pub(super) fn summary(played: &Progress) -> String {
-    let Progress { telegrams, position_ns, took_ns, .. } = *played;
-    let took = took_ns as f64 / 1e9;
-    format!("replayed {telegrams} telegrams up to {}, in {took:.1} s", clock(position_ns))
+    let Progress { telegrams, position_ns, took_ns, pace, lap, .. } = *played;
+    let took = match took_ns {
+        ..1_000_000_000 => format!("{} ms", took_ns.div_ceil(1_000_000)),
+        _ => format!("{:.1} s", took_ns as f64 / 1e9),
+    };
+    let mut words = format!("replayed {telegrams} telegrams up to {}, in {took}", clock(position_ns));
+    if pace == Pace::Max && lap == 0 && took_ns > 0 {
+        words += &format!(", {:.0} times as fast as it was recorded", position_ns as f64 / took_ns as f64);
+    }
+    words
 }
 
-fn text(progress: &Progress) -> String {
+/// As much as goes into `columns` but the last one, after which some terminals wrap.
+fn text(progress: &Progress, columns: usize) -> String {
+    let texts = (0..=SHORTEST).map(|brevity| text_of(progress, brevity));
+    texts.into_iter().find(|text| text.len() < columns).unwrap_or_default()
+}
+
+/// Whole parts, the fewer the greater `brevity` is: first goes what helps least.
+fn text_of(progress: &Progress, brevity: u32) -> String {
     let Progress { position_ns, length_ns, pace, is_paused, is_over, lap, telegrams, .. } = *progress;
     let mut text = clock(position_ns);
-    if let Some(length_ns) = length_ns.filter(|length_ns| *length_ns > 0) {
-        let done = (position_ns.min(length_ns) as u128 * BAR as u128 / u128::from(length_ns)) as usize;
-        text += &format!(" [{}{}] {}", "#".repeat(done), ".".repeat(BAR - done), clock(length_ns));
+    if let Some(length_ns) = length_ns.filter(|length_ns| *length_ns > 0 && brevity < 6) {
+        let places = if brevity < 1 { BAR } else { BAR / 2 };
+        let done = (position_ns.min(length_ns) as u128 * places as u128 / u128::from(length_ns)) as usize;
+        text += &match brevity {
+            0..4 => format!(" [{}{}] {}", "#".repeat(done), ".".repeat(places - done), clock(length_ns)),
+            _ => format!(" of {}", clock(length_ns)),
+        };
     }
-    text += &match pace {
-        Pace::Times(rate) => format!("  x{rate}"),
-        Pace::Max => "  x max".to_owned(),
-    };
-    text += &format!("  {telegrams} telegrams");
-    if lap > 0 {
+    if brevity < 7 {
+        text += &match pace {
+            Pace::Times(rate) => format!("  x{rate}"),
+            Pace::Max => "  x max".to_owned(),
+        };
+    }
+    if brevity < 2 {
+        text += &format!("  {telegrams} telegrams");
+    }
+    if lap > 0 && brevity < 5 {
         text += &format!("  lap {}", lap + 1);
     }
-    text + match (is_over, is_paused) {
-        (true, _) => "  at its end; q ends",
-        (_, true) => "  paused; space goes on, . steps, q ends",
-        _ => "  space pauses, + - rate, q ends",
-    }
+    let (state, keys) = match (is_over, is_paused) {
+        (true, _) => ("  at its end", "; q ends"),
+        (_, true) => ("  paused", "; space goes on, . steps, q ends"),
+        _ => ("", "  space pauses, + - rate, q ends"),
+    };
+    text += if brevity < SHORTEST { state } else { "" };
+    text + if brevity < 3 { keys } else { "" }
+}
+
+/// Columns of the terminal; no end of them if it does not tell.
+fn columns() -> usize {
+    let told = tcgetwinsize(stderr()).ok().map(|size| usize::from(size.ws_col));
+    told.filter(|columns| *columns > 0).unwrap_or(usize::MAX)
 }
 
 /// Minutes, or hours where there are any, seconds and tenths.
@@ -94,6 +125,8 @@ fn clock(ns: u64) -> String {
 
 /// Places of the bar.
 const BAR: usize = 20;
+/// Brevity at which nothing is left but the time.
+const SHORTEST: u32 = 8;
 /// To the line's begin, and nothing on it (ECMA-48).
 const WIPE: &str = "\r\x1b[K";
 
@@ -115,9 +148,45 @@ mod tests {
             now_ns: 2,
         };
         let begin = "1:05.2 [##########..........] 2:10.5  x0.5  7 telegrams  ";
-        assert_eq!(text(&progress), format!("{begin}space pauses, + - rate, q ends"));
+        assert_eq!(text(&progress, usize::MAX), format!("{begin}space pauses, + - rate, q ends"));
         let open = Progress { length_ns: None, pace: Pace::Max, lap: 1, is_paused: true, ..progress };
-        assert_eq!(text(&open), "1:05.2  x max  7 telegrams  lap 2  paused; space goes on, . steps, q ends");
+        assert_eq!(
+            text(&open, 200),
+            "1:05.2  x max  7 telegrams  lap 2  paused; space goes on, . steps, q ends"
+        );
+        for (columns, narrow) in [
+            (80, "1:05.2 [#####.....] 2:10.5  x0.5  7 telegrams  space pauses, + - rate, q ends"),
+            (70, "1:05.2 [#####.....] 2:10.5  x0.5  space pauses, + - rate, q ends"),
+            (64, "1:05.2 [#####.....] 2:10.5  x0.5"),
+            (30, "1:05.2 of 2:10.5  x0.5"),
+            (17, "1:05.2  x0.5"),
+            (7, "1:05.2"),
+            (6, ""),
+        ] {
+            assert_eq!(text(&progress, columns), narrow, "{columns}");
+        }
+        let paused = Progress { is_paused: true, ..progress };
+        let steps = "1:05.2 [#####.....] 2:10.5  x0.5  paused; space goes on, . steps, q ends";
+        assert_eq!((&text(&paused, 80)[..], &text(&paused, 15)[..]), (steps, "1:05.2  paused"));
         assert_eq!(clock(3_725_000_000_000), "1:02:05.0");
+    }
+
+    #[test]
+    fn how_long_it_took() {
+        let played = Progress {
+            position_ns: 60_000_000_000,
+            length_ns: None,
+            pace: Pace::Max,
+            is_paused: false,
+            is_over: true,
+            lap: 0,
+            telegrams: 7,
+            took_ns: 30_000_000,
+            now_ns: 2,
+        };
+        let words = "replayed 7 telegrams up to 1:00.0, in 30 ms, 2000 times as fast as it was recorded";
+        assert_eq!(summary(&played), words);
+        let slow = Progress { pace: Pace::Times(1.0), took_ns: 61_000_000_000, ..played };
+        assert_eq!(summary(&slow), "replayed 7 telegrams up to 1:00.0, in 61.0 s");
     }
 }

@@ -47,10 +47,13 @@ pub struct Converted {
     pub scans: u64,
     /// Telegrams that the form cannot hold: in a CARMEN log all but whole scans.
     pub left_out: u64,
-    /// From the first telegram to the last one, in ns, as far as there are stamps.
-    pub took_ns: u64,
+    /// From the first telegram to the last one, in ns, as stamps say: the recording's, or those that were made for it.
+    /// Nothing if there are neither.
+    pub took_ns: Option<u64>,
     /// What was missing of the recording.
     pub damage: Damage,
+    /// Whoever read stdout had enough before the end.
+    pub is_closed: bool,
 }
 
 /// Converts as `options` say until `stop` is set; calls `progress` with the telegrams that were written and how many there
@@ -78,8 +81,9 @@ pub fn convert(
         telegrams: 0,
         scans: 0,
         left_out: 0,
-        took_ns: contents.span.map_or(0, |(first, last)| last.saturating_sub(first)),
+        took_ns: None,
         damage: contents.damage,
+        is_closed: false,
     };
     let encoding = encoding(&recording)?;
     if (contents.form, form) != (Form::Mcap, Form::Mcap) {
@@ -89,10 +93,15 @@ pub fn convert(
     let mut file = place.create()?;
     let is_closed = Cell::new(false);
     let failed = |error: io::Error| {
-        is_closed.set(place.is_stdout() && error.kind() == io::ErrorKind::BrokenPipe);
+        is_closed.set(place.is_closed(&error));
         unwritable(&options.output, &error)
     };
-    let mut count = |written: Written| {
+    let mut first_ns = None;
+    let mut count = |written: Written, at_ns: Option<u64>| {
+        if let Some(at_ns) = at_ns.filter(|_| written != Written::LeftOut) {
+            let since_ns = at_ns.saturating_sub(*first_ns.get_or_insert(at_ns));
+            converted.took_ns = converted.took_ns.max(Some(since_ns));
+        }
         converted.telegrams += u64::from(written != Written::LeftOut);
         converted.scans += u64::from(written == Written::Scan);
         converted.left_out += u64::from(written == Written::LeftOut);
@@ -116,9 +125,9 @@ pub fn convert(
         }
     };
     match written {
-        Err(_) if is_closed.get() => Ok(converted),
+        Err(_) if is_closed.get() => Ok(Converted { is_closed: true, ..converted }),
         Err(failure) => Err(failure),
-        Ok(()) => place.put(file).map(|()| converted),
+        Ok(()) => place.put(file).map(|is_whole| Converted { is_closed: !is_whole, ..converted }),
     }
 }
 
@@ -142,7 +151,7 @@ fn write_bytes(
     form: Form,
     encoding: Encoding,
     mut out: Packing<impl Write>,
-    count: &mut impl FnMut(Written) -> Result<(), Failure>,
+    count: &mut impl FnMut(Written, Option<u64>) -> Result<(), Failure>,
     failed: &impl Fn(io::Error) -> Failure,
 ) -> Result<(), Failure> {
     let mut times = Times::of(recording);
@@ -151,13 +160,13 @@ fn write_bytes(
     for frame in recording.telegrams(encoding)? {
         if form == Form::Telegrams {
             out.write_all(&frame.telegram).map_err(failed)?;
-            count(Written::of(frame.is_scan()))?;
+            count(Written::of(frame.is_scan()), frame.wall_ns)?;
             continue;
         }
         let at_ns = times.wall_ns(&frame);
         let line = scans::line(&frame.telegram, mode, at_ns, *first_ns.get_or_insert(at_ns));
         out.write_all(line.as_deref().unwrap_or_default().as_bytes()).map_err(failed)?;
-        count(if line.is_some() { Written::Scan } else { Written::LeftOut })?;
+        count(if line.is_some() { Written::Scan } else { Written::LeftOut }, Some(at_ns))?;
     }
     out.finish().map_err(failed)
 }
@@ -168,7 +177,7 @@ fn write_mcap(
     sensor: &str,
     encoding: Encoding,
     file: &mut impl Write,
-    count: &mut impl FnMut(Written) -> Result<(), Failure>,
+    count: &mut impl FnMut(Written, Option<u64>) -> Result<(), Failure>,
     failed: &impl Fn(io::Error) -> Failure,
 ) -> Result<(), Failure> {
     let facts = [("converted from".to_owned(), form_name(recording.contents().form).to_owned())];
@@ -190,7 +199,7 @@ fn write_mcap(
             writer.close_chunk().map_err(failed)?;
             bytes = 0;
         }
-        count(Written::of(frame.is_scan()))?;
+        count(Written::of(frame.is_scan()), Some(header.wall_ns))?;
     }
     writer.finish().map_err(failed).map(drop)
 }

@@ -39,8 +39,20 @@ pub struct Recording {
 impl Recording {
     /// Opens and reads through the file at `path`.
     ///
-    /// [`Kind::Configuration`] if it is no recording. One that is damaged is opened: see [`Contents::damage`].
+    /// [`Kind::Configuration`] if it is no recording: anything without a telegram but an MCAP file. One that is damaged is opened: see [`Contents::damage`].
     pub fn open(path: impl Into<PathBuf>) -> Result<Recording, Failure> {
+        let recording = Recording::open_line(path)?;
+        if recording.contents.form == Form::Telegrams && recording.contents.telegrams == 0 {
+            let what = "is neither an MCAP file nor a CARMEN log, and there is no telegram in it";
+            return Err(refused(&recording.path, what));
+        }
+        Ok(recording)
+    }
+
+    /// The same, but also of bytes without a telegram: what came down a line that only brings noise.
+    ///
+    /// [`Kind::Configuration`] as of [`open`](Self::open).
+    pub fn open_line(path: impl Into<PathBuf>) -> Result<Recording, Failure> {
         let path = path.into();
         let mut reader = reader(&path)?;
         let head = reader.fill_buf().map_err(|error| unreadable(&path, &error))?;
@@ -61,6 +73,9 @@ impl Recording {
             Form::Carmen => survey_log(&path, reader)?,
             _ => survey_stream(&path, reader)?,
         };
+        if form == Form::Carmen && contents.telegrams == 0 {
+            return Err(refused(&path, "is a CARMEN log without a scan"));
+        }
         Ok(Recording {
             path,
             contents,

@@ -135,6 +135,12 @@ fn a_stream_gets_times_and_loses_none_of_its_telegrams() {
     let (mcap, again, log) = (folder.0.join("a.mcap"), folder.0.join("b.bin.gz"), folder.0.join("a.log.gz"));
     let account = converted(&stream, &mcap, Some("left")).unwrap();
     assert_eq!((account.forms, account.telegrams), ((Form::Telegrams, Form::Mcap), 31));
+    // As the stamps say that it gets: a reply takes its time on the line.
+    assert!(
+        account.took_ns.is_some_and(|ns| (29 * 26_640_000..30 * 26_640_000).contains(&ns)),
+        "{account:?}"
+    );
+    assert_eq!(converted(&stream, &folder.0.join("c.bin"), None).unwrap().took_ns, None);
     let recording = Recording::open(&mcap).unwrap();
     assert_eq!(
         (&recording.contents().sensors[..], recording.contents().mode),
@@ -228,6 +234,10 @@ fn logs_of_real_sensors_come_back() {
 #[test]
 fn what_cannot_be_done_is_refused_and_leaves_nothing() {
     let folder = Folder::new("refused");
+    let noise = folder.file("noise.mcap", &[0x42; 900]);
+    let failure = converted(&noise, &folder.0.join("out.mcap"), None).unwrap_err();
+    assert!(failure.kind.exit_code() == 78 && failure.message.contains("no telegram"), "{failure}");
+    fs::remove_file(noise).unwrap();
     let input = folder.file("in.mcap", &written::recording(8, 13).bytes);
     let there = folder.file("there.bin", b"mine");
     std::os::unix::fs::symlink(&input, folder.0.join("link.mcap")).unwrap();

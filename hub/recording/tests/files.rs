@@ -103,6 +103,10 @@ fn what_is_no_recording_is_refused_with_place_value_and_remedy() {
     assert!(missing.message.contains("/nonexistent/a.bin") && !missing.hint.is_empty(), "{missing}");
     for (name, bytes, says) in [
         ("empty", Vec::new(), "is empty"),
+        ("noise", vec![0x42; 9000], "no telegram in it"),
+        ("program.py", b"#!/usr/bin/env python3\nprint('\x02\x80')\n".to_vec(), "no telegram in it"),
+        ("request", Request::Stop.encode(0).bytes().to_vec(), "no telegram in it"),
+        ("poses.log", b"PARAM a b\nODOM 0 0 0 0 0 0 1.5 host 1.5\n".to_vec(), "without a scan"),
         ("wrong.log", b"PARAM a b\nFLASER 12 1 2\n".to_vec(), "wrong.log:2: 12 beams"),
         #[cfg(not(feature = "mcap"))]
         ("a.mcap", b"\x89MCAP0\r\nmore".to_vec(), "which this build does not read"),
@@ -111,6 +115,9 @@ fn what_is_no_recording_is_refused_with_place_value_and_remedy() {
         let file = File::new(name, &bytes);
         let failure = Recording::open(&file.0).unwrap_err();
         assert!(failure.message.contains(says), "{failure}");
+        // A line may bring nothing but noise.
+        let line = Recording::open_line(&file.0).ok();
+        assert_eq!(line.map(|line| line.contents().telegrams), (says == "no telegram in it").then_some(0));
     }
 }
 
@@ -146,16 +153,6 @@ fn a_log_with_harmed_lines_gives_the_others() {
     let contents = recording.contents();
     assert!(contents.damage.is_cut && contents.scans > 0, "{contents:?}");
     assert_eq!(recording.telegrams(MM).unwrap().count() as u64, contents.telegrams);
-}
-
-#[test]
-fn bytes_without_a_telegram_are_a_stream_without_telegrams() {
-    let file = File::new("noise", &[0x42; 9000]);
-    let recording = Recording::open(&file.0).unwrap();
-    assert_eq!((recording.contents().telegrams, recording.contents().variant), (0, None));
-    assert_eq!(recording.telegrams(MM).unwrap().count(), 0);
-    let file = File::new("request", Request::Stop.encode(0).bytes());
-    assert_eq!(Recording::open(&file.0).unwrap().contents().telegrams, 0);
 }
 
 #[test]

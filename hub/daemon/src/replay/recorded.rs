@@ -52,7 +52,7 @@ impl Recorded {
     /// [`schema::Kind::Configuration`] if it cannot be read, or has other sensors. A file without a telegram is a line
     /// that only brings noise.
     pub(crate) fn open(path: &Path, link: &Link) -> Result<Recorded, Failure> {
-        let recording = Recording::open(path)?;
+        let recording = Recording::open_line(path)?;
         if recording.contents().sensors.len() > 1 {
             return Recorded::new(recording.of(&link.name)?, link);
         }

@@ -18,7 +18,7 @@ use crate::mcap::{Originals, Record, message};
 pub(super) fn copy(
     recording: &Recording,
     file: &mut impl Write,
-    count: &mut impl FnMut(Written) -> Result<(), Failure>,
+    count: &mut impl FnMut(Written, Option<u64>) -> Result<(), Failure>,
     failed: &impl Fn(io::Error) -> Failure,
 ) -> Result<(), Failure> {
     let (mut reader, known) = recording.reader()?;
@@ -35,7 +35,7 @@ pub(super) fn copy(
                 let written =
                     copy.writer.sample(&sighting.sensor, Topic::Telegram, header, &sighting.telegram);
                 written.and_then(|()| copy.wrote(len)).map_err(failed)?;
-                count(Written::of(is_scan))?;
+                count(Written::of(is_scan), Some(header.wall_ns))?;
             }
             Item::Telegram(_) => {}
             Item::Record(record) => {

@@ -44,9 +44,9 @@ impl Place {
         Ok(Place { path: path.to_owned(), beside: Some(path.with_file_name(hidden)) })
     }
 
-    /// Whether it goes to whoever reads stdout.
-    pub(super) fn is_stdout(&self) -> bool {
-        self.beside.is_none()
+    /// Whether `error` says that whoever reads stdout has had enough.
+    pub(super) fn is_closed(&self, error: &io::Error) -> bool {
+        self.beside.is_none() && error.kind() == io::ErrorKind::BrokenPipe
     }
 
     /// Begins to write.
@@ -58,8 +58,8 @@ impl Place {
         Ok(BufWriter::with_capacity(BUFFER, file))
     }
 
-    /// What was written is whole now.
-    pub(super) fn put(mut self, mut file: BufWriter<Box<dyn Write>>) -> Result<(), Failure> {
+    /// What was written is whole now. `false` if whoever reads stdout has had enough before that.
+    pub(super) fn put(mut self, mut file: BufWriter<Box<dyn Write>>) -> Result<bool, Failure> {
         let put = || {
             file.flush()?;
             drop(file);
@@ -67,9 +67,12 @@ impl Place {
             File::open(beside)?.sync_all()?;
             fs::rename(beside, &self.path)
         };
-        put().map_err(|error| unwritable(&self.path, &error))?;
+        match put() {
+            Err(error) if self.is_closed(&error) => return Ok(false),
+            put => put.map_err(|error| unwritable(&self.path, &error))?,
+        }
         self.beside = None;
-        Ok(())
+        Ok(true)
     }
 }
 
