@@ -48,7 +48,7 @@ fn a_set_up_that_is_well() {
     stage.await_info("front", |info| info["state"] == "streaming");
     assert!(examine().said("version").1.ends_with("the hub runs the same program"));
     assert_eq!(hub.end(TERM).code, Some(0));
-    assert_eq!(examine().said("leftovers").1, "none");
+    assert!(examine().said("leftovers").1.starts_with("none"), "an orderly end leaves nothing");
     well_kept(&stage).are_silent();
 }
 
