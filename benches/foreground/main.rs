@@ -33,7 +33,7 @@ use play::{Scene, play};
 use rivals::{Mixtures, TeachIn};
 use score::Score;
 
-const SCENES: [Scene; 10] = [
+const SCENES: [Scene; 11] = [
     Scene { name: "Fig. 8", world: "fig8", unit: Unit::Mm, mixed: true },
     Scene { name: "Fig. 8, no mixed pixels", world: "fig8", unit: Unit::Mm, mixed: false },
     Scene { name: "corridor, in cm", world: "corridor", unit: Unit::Cm, mixed: true },
@@ -42,6 +42,7 @@ const SCENES: [Scene; 10] = [
     Scene { name: "a door opens", world: "door", unit: Unit::Mm, mixed: true },
     Scene { name: "a chair is moved", world: "chair", unit: Unit::Mm, mixed: true },
     Scene { name: "a glass wall", world: "glass", unit: Unit::Mm, mixed: true },
+    Scene { name: "a wall seldom seen", world: "faint", unit: Unit::Mm, mixed: true },
     Scene { name: "sun", world: "sun", unit: Unit::Mm, mixed: true },
     Scene { name: "a crowd", world: "crowd", unit: Unit::Mm, mixed: true },
 ];
