@@ -152,7 +152,6 @@ fn a_reader_that_does_not_read_delays_nothing() {
         let (_reader, writer) = std::io::pipe().expect("a pipe");
         fcntl_setpipe_size(&writer, 8192).expect("a small one");
         let mut command = stage.command(&["gateway", "--json", "--no-system-config", "--interface=lo"]);
-        command.env("XDG_STATE_HOME", stage.path("state")).env_remove("STATE_DIRECTORY");
         command.stdout(writer.try_clone().expect("another end")).stdin(Stdio::null());
         let mut gateway = command.spawn().expect("a gateway");
         let signal = |signal| kill_process(Pid::from_child(&gateway), signal).expect("it lives");
@@ -187,9 +186,7 @@ fn the_account_is_told_when_asked_for() {
         let _hub = stage.hub(&[stage.link("front")]);
         let flags = ["--interface=lo", "--topic=front/background", "--background-every=1s"];
         let words = [&["gateway", "--no-system-config"], &flags[..]].concat();
-        let mut command = stage.command(&words);
-        command.env("XDG_STATE_HOME", stage.path("state")).env_remove("STATE_DIRECTORY");
-        let mut gateway = Program::start(command);
+        let mut gateway = stage.start(&words);
         gateway.await_text("gateway ");
         let is_background =
             |datagram: &schema::datagram::Datagram<'_>| datagram.head.topic == Topic::Background.number();

@@ -220,9 +220,7 @@ fn what_a_gateway_sends_comes_back_once() {
         let _simulator = stage.simulator(&["front"], &["--seed=62", "--baud=500000"]);
         let mut listener = stage.start(&["listen", "--json", "--publish", "--interface=lo"]).ready();
         // The gateway waits for the hub, though the domain lives already; and what the listener brings is not its to send.
-        let mut command = stage.command(&["gateway", "--json", "--interface=lo", "--topic=front/scan"]);
-        command.env("XDG_STATE_HOME", stage.path("state")).env_remove("STATE_DIRECTORY");
-        let mut gateway = Program::start(command);
+        let mut gateway = stage.start(&["gateway", "--json", "--interface=lo", "--topic=front/scan"]);
         let id = gateway.await_line("its begin", |line| line["class"] == "gateway")["hub"].clone();
         let hub = stage.hub(&[stage.link("front")]);
         let line = listener.await_line("a sensor", |line| line["kind"] == "published");
@@ -295,9 +293,7 @@ fn a_hub_that_numbers_its_sensors_otherwise_keeps_them_apart() {
         let stage = Stage::new();
         let _simulator = stage.simulator(&["front", "rear"], &["--seed=63", "--baud=500000"]);
         let mut listener = stage.start(&["listen", "--json", "--publish", "--interface=lo"]).ready();
-        let mut command = stage.command(&["gateway", "--json", "--interface=lo"]);
-        command.env("XDG_STATE_HOME", stage.path("state")).env_remove("STATE_DIRECTORY");
-        let mut gateway = Program::start(command);
+        let mut gateway = stage.start(&["gateway", "--json", "--interface=lo"]);
         let id = gateway.await_line("its begin", |line| line["class"] == "gateway")["hub"].clone();
         let remote = |name: &str| format!("{}.{name}", id.as_str().unwrap_or_default());
         let (front, rear) = (remote("front"), remote("rear"));

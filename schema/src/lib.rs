@@ -31,6 +31,8 @@ mod lock;
 mod saved;
 #[cfg(feature = "ipc")]
 pub mod shortage;
+#[cfg(feature = "ipc")]
+mod state;
 
 pub use background::Background;
 pub use control::{Request, Response, Verb};
@@ -54,3 +56,5 @@ pub use zones::{Verdict, ZONES, Zone, Zones};
 pub use lock::{HubLock, ListenLock, holder, publisher};
 #[cfg(feature = "json")]
 pub use saved::{SavedModel, as_json};
+#[cfg(feature = "ipc")]
+pub use state::StateDirectory;
