@@ -129,10 +129,12 @@ impl Multi {
         self.slots[0].weight[i] = u16::MAX;
     }
 
-    /// The best known background of beam `i`, of equals the nearer one.
+    /// The best known background of beam `i`, of equals the nearer one; a surface before nothing, however often nothing comes
+    /// back from it: whoever begins with that alone would take the surface for somebody.
     pub(super) fn background(&self, i: usize, limits: &Limits) -> u16 {
         let known = |slots: &&Slots| slots.weight[i] >= Bounds::of(limits).known;
-        let best = self.slots.iter().filter(known).max_by_key(|s| (s.weight[i], u16::MAX - s.range[i]));
+        let rank = |s: &&Slots| (s.range[i] != Background::FAR, s.weight[i], u16::MAX - s.range[i]);
+        let best = self.slots.iter().filter(known).max_by_key(rank);
         best.map_or(Background::UNTAUGHT, |slots| slots.range[i])
     }
 }
