@@ -140,14 +140,14 @@ fn a_wall_seldom_seen_is_learned_and_who_stands_there_is_not() {
         scan
     };
     let mut model = Model::new(Settings::default());
-    (0..750).for_each(|_| drop(look(&mut model, &some(0.15, 5_000), 1)));
+    (0..750).for_each(|_| _ = look(&mut model, &some(0.15, 5_000), 1));
     let wall = look(&mut model, &some(1.0, 5_000), 1).beams;
     let before_it = look(&mut model, &some(1.0, 3_000), 1).beams;
     assert!(wall < 10 && before_it == 361, "{wall} beams of the wall, {before_it} before it");
 
     let mut model = Model::new(Settings::default());
     look(&mut model, &some(0.0, 0), 600);
-    (0..187).for_each(|_| drop(look(&mut model, &some(0.97, 3_000), 1)));
+    (0..187).for_each(|_| _ = look(&mut model, &some(0.97, 3_000), 1));
     let standing = look(&mut model, &some(1.0, 3_000), 1).beams;
     assert!(standing > 355, "{standing} beams");
 }

@@ -111,6 +111,7 @@ impl List {
         self.put((link, "background.scans"), json!(learning.scans), DEFAULT);
         self.put((link, "background.candidate"), json!(candidate), DEFAULT);
         self.put((link, "background.start"), json!(start), DEFAULT);
+        self.put((link, "background.keep"), json!(background.is_handed_on), DEFAULT);
         self.put((link, "background.no_return_is_far"), json!(learning.no_return_is_far), DEFAULT);
         self.put((link, "background.publish"), json!(publish), DEFAULT);
     }
