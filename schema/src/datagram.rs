@@ -7,6 +7,7 @@ mod lives;
 mod numbers;
 mod payload;
 mod refusal;
+mod voices;
 
 use crc::{CRC_32_ISCSI, Crc, Table};
 
