@@ -1,8 +1,8 @@
 //! The lives of gateways that are told apart: which of them go on, and which one is given up when there is no room for
-//! another. Whoever can send can invent gateways, so that one that is known to deliver is never put out by one that only
-//! announces itself. Refuses to know what came in them.
+//! another. Refuses to know what came in them.
 
-use super::voices::{SILENT_NS, Voices};
+use super::standing::{Arrival, Standing};
+use super::voices::Voices;
 
 /// The most lives of gateways that are told apart.
 pub const LIVES: usize = 64;
@@ -26,21 +26,13 @@ struct Place {
     slot: usize,
 }
 
-/// What is known of a life that goes on.
+/// What is known of a life.
 #[derive(Clone, Copy)]
 pub(super) struct Record {
+    /// When it was taken.
+    since_ns: u64,
+    pub(super) standing: Standing,
     pub(super) voices: Voices,
-    heard_ns: u64,
-    /// When the first and the last sample came.
-    delivered_ns: Option<(u64, u64)>,
-}
-
-/// What came, as far as it matters for making room.
-#[derive(Clone, Copy)]
-pub(super) struct Arrival {
-    /// It is a sample, not an announcement.
-    pub(super) delivers: bool,
-    pub(super) now_ns: u64,
 }
 
 /// A life that was given up.
@@ -51,25 +43,21 @@ pub(super) struct Gone {
     pub(super) is_displaced: bool,
 }
 
-/// Samples that came over so long a time are known to be delivered. One that did that is only put out once it is silent.
-const PROVEN_NS: u64 = 1_000_000_000;
-/// A silent one that is known to deliver is kept for so long as if it were heard.
-const KEPT_NS: u64 = 60_000_000_000;
-
 impl Lives {
     /// None.
     pub(super) fn new() -> Lives {
         Lives {
             all: core::array::from_fn(|slot| Place { life: (0, 0), slot }),
-            records: [Record::NONE; LIVES],
+            records: [Record::new(0); LIVES],
             retired: 0,
             count: 0,
         }
     }
 
-    /// It was taken and not given up.
-    pub(super) fn contains(&self, life: Life) -> bool {
-        self.all[..self.count].iter().any(|place| place.life == life)
+    /// Since when it is known, if it was taken and not given up.
+    pub(super) fn since_ns(&self, life: Life) -> Option<u64> {
+        let place = self.all[..self.count].iter().find(|place| place.life == life)?;
+        Some(self.records[place.slot].since_ns)
     }
 
     /// A greater epoch of the same gateway was taken, and not given up.
@@ -109,7 +97,7 @@ impl Lives {
         let gone = if self.is_full() { self.give_up(life, arrival) } else { None };
         let place = &mut self.all[self.count];
         place.life = life;
-        self.records[place.slot] = Record::NONE;
+        self.records[place.slot] = Record::new(arrival.now_ns);
         self.count += 1;
         gone
     }
@@ -141,9 +129,9 @@ impl Lives {
     fn least(&self, life: Life, arrival: Arrival) -> Option<usize> {
         let may_go = |at: &usize| {
             let Place { life: other, slot } = self.all[*at];
-            other != life && self.records[slot].may_go(arrival)
+            other != life && self.records[slot].standing.may_go(arrival)
         };
-        let worth = |at: &usize| self.records[self.all[*at].slot].worth_ns();
+        let worth = |at: &usize| self.records[self.all[*at].slot].standing.worth_ns();
         (self.retired..self.count).filter(may_go).min_by_key(worth)
     }
 
@@ -157,39 +145,18 @@ impl Lives {
 }
 
 impl Record {
-    const NONE: Record = Record { voices: Voices::NONE, heard_ns: 0, delivered_ns: None };
-
-    /// Something of it was taken.
-    pub(super) fn take(&mut self, arrival: Arrival) {
-        let now_ns = arrival.now_ns;
-        self.heard_ns = now_ns;
-        if arrival.delivers {
-            self.delivered_ns = Some((self.delivered_ns.map_or(now_ns, |(first_ns, _)| first_ns), now_ns));
-        }
-    }
-
-    fn is_proven(&self) -> bool {
-        self.delivered_ns.is_some_and(|(first_ns, last_ns)| last_ns.saturating_sub(first_ns) >= PROVEN_NS)
-    }
-
-    fn may_go(&self, arrival: Arrival) -> bool {
-        let silent_ns = |(_, last_ns): (u64, u64)| arrival.now_ns.saturating_sub(last_ns);
-        let is_busy = self.delivered_ns.is_some_and(|delivered_ns| silent_ns(delivered_ns) < SILENT_NS);
-        !is_busy || arrival.delivers && !self.is_proven()
-    }
-
-    /// Until when it counts as heard: the least goes first.
-    fn worth_ns(&self) -> u64 {
-        match self.delivered_ns {
-            None => self.heard_ns,
-            Some((_, last_ns)) => last_ns + if self.is_proven() { KEPT_NS } else { SILENT_NS },
-        }
+    fn new(since_ns: u64) -> Record {
+        Record { since_ns, standing: Standing::NONE, voices: Voices::NONE }
     }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    fn contains(lives: &Lives, life: Life) -> bool {
+        lives.since_ns(life).is_some()
+    }
 
     const MS: u64 = 1_000_000;
 
@@ -203,8 +170,8 @@ mod tests {
 
     /// Takes it, known or not; who was put out.
     fn hear(lives: &mut Lives, life: Life, arrival: Arrival) -> Option<Life> {
-        let gone = if lives.contains(life) { None } else { lives.take(life, arrival) };
-        lives.record_mut(life).unwrap().take(arrival);
+        let gone = if contains(lives, life) { None } else { lives.take(life, arrival) };
+        lives.record_mut(life).unwrap().standing.take(arrival);
         gone.map(|gone| gone.life)
     }
 
@@ -214,13 +181,13 @@ mod tests {
         for life in [(1, 5), (2, 5), (3, 5), (2, 6), (1, 9), (2, 7)] {
             assert_eq!(hear(&mut lives, life, delivers(0)), None);
         }
-        assert!(lives.contains((2, 5)) && lives.is_over((1, 8)) && !lives.is_over((1, 9)));
+        assert!(contains(&lives, (2, 5)) && lives.is_over((1, 8)) && !lives.is_over((1, 9)));
         let mut give_up = || lives.give_up((9, 9), announces(0)).map(|gone| (gone.life, gone.is_displaced));
         let retired = [(2, 5), (1, 5), (2, 6)].map(|life| Some((life, false)));
         assert_eq!([(); 3].map(|()| give_up()), retired);
         assert_eq!(give_up(), None, "the others deliver");
-        assert!(lives.is_over((2, 6)) && !lives.contains((2, 6)), "its gateway goes on with a greater epoch");
-        assert!(lives.contains((1, 9)) && lives.contains((2, 7)) && lives.contains((3, 5)));
+        assert!(lives.is_over((2, 6)) && !contains(&lives, (2, 6)), "its gateway goes on with a greater epoch");
+        assert!(contains(&lives, (1, 9)) && contains(&lives, (2, 7)) && contains(&lives, (3, 5)));
     }
 
     #[test]
@@ -250,7 +217,7 @@ mod tests {
             let gone = hear(&mut lives, (1000 + n, 1), announces(n));
             assert!(gone.is_none_or(|(hub, _)| hub >= 1000 || hub == 2 && n >= 3000), "{n}: {gone:?}");
         }
-        assert!(lives.contains((1, 1)) && !lives.contains((2, 1)));
+        assert!(contains(&lives, (1, 1)) && !contains(&lives, (2, 1)));
     }
 
     #[test]
@@ -265,7 +232,7 @@ mod tests {
                 displaced += u32::from(hear(&mut lives, (1000 + n, 1), delivers(n)).is_some());
             }
         }
-        assert!(lives.contains((1, 1)) && displaced > 28_000);
+        assert!(contains(&lives, (1, 1)) && displaced > 28_000);
     }
 
     #[test]
