@@ -301,8 +301,7 @@ fn it_says_what_a_model_says_that_keeps_everything() {
                 // One clock tick each: who was not heard for longest is never two.
                 ticks += 1;
                 let now_ms = ticks * tick_ms;
-                let fresh =
-                    account.receive(&sent.bytes, 1, now_ms * 1_000_000).map(|(_, fresh)| fresh);
+                let fresh = account.receive(&sent.bytes, 1, now_ms * 1_000_000).map(|(_, fresh)| fresh);
                 assert_eq!(
                     fresh,
                     model.receive(&sent, now_ms),

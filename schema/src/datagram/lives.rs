@@ -186,7 +186,10 @@ mod tests {
         let retired = [(2, 5), (1, 5), (2, 6)].map(|life| Some((life, false)));
         assert_eq!([(); 3].map(|()| give_up()), retired);
         assert_eq!(give_up(), None, "the others deliver");
-        assert!(lives.is_over((2, 6)) && !contains(&lives, (2, 6)), "its gateway goes on with a greater epoch");
+        assert!(
+            lives.is_over((2, 6)) && !contains(&lives, (2, 6)),
+            "its gateway goes on with a greater epoch"
+        );
         assert!(contains(&lives, (1, 9)) && contains(&lives, (2, 7)) && contains(&lives, (3, 5)));
     }
 
@@ -226,7 +229,11 @@ mod tests {
         let mut displaced = 0;
         for n in 0..30_000 {
             if n % 100 == 0 && (n < 10_000 || n >= 20_000) {
-                assert_eq!(hear(&mut lives, (1, 1), delivers(n)), None, "{n}: and its silence is not that long");
+                assert_eq!(
+                    hear(&mut lives, (1, 1), delivers(n)),
+                    None,
+                    "{n}: and its silence is not that long"
+                );
             }
             if n > 1000 {
                 displaced += u32::from(hear(&mut lives, (1000 + n, 1), delivers(n)).is_some());

@@ -47,7 +47,8 @@ const SHARED_NS: u64 = 500_000_000;
 impl Voices {
     /// Nobody was heard.
     pub(super) const NONE: Voices = Voices {
-        all: [Voice { from: 0, boots: [0; BOOTS], heard_ns: 0, announced_ns: 0, other_since_ns: None }; VOICES],
+        all: [Voice { from: 0, boots: [0; BOOTS], heard_ns: 0, announced_ns: 0, other_since_ns: None };
+            VOICES],
         count: 0,
         is_shared: false,
     };

@@ -137,7 +137,10 @@ impl Sums {
     /// The same for people.
     pub(super) fn text(&self, line: &mut Vec<u8>) -> io::Result<()> {
         let Sums { lives, displaced, received, lost, duplicate, reordered, .. } = self;
-        write!(line, "of {lives} former starts of gateways together, {displaced} of them given up for others: ")?;
+        write!(
+            line,
+            "of {lives} former starts of gateways together, {displaced} of them given up for others: "
+        )?;
         write!(line, "received {received}, lost {lost}, ")?;
         write!(line, "duplicate {duplicate}, reordered {reordered}")
     }

@@ -170,11 +170,7 @@ fn what_is_retired_makes_room_and_stays_in_the_sum() {
     assert_eq!(fresh(&mut account, &zones(head(5, 2, 0))), Ok(Fresh::New));
     let mut given_up = GivenUp { lives: 1, received: 3, lost: 2, ..GivenUp::default() };
     assert_eq!((account.given_up(), account.rows().count()), (given_up, 64));
-    assert_eq!(
-        fresh(&mut account, &zones(head(5, 1, 5))),
-        Err(Refusal::Epoch),
-        "given up is not forgotten"
-    );
+    assert_eq!(fresh(&mut account, &zones(head(5, 1, 5))), Err(Refusal::Epoch), "given up is not forgotten");
     assert!(knows(&account, 5, 2) && !knows(&account, 5, 1));
     // A damaged one gives up nothing.
     let mut buffer = [0; 60];
@@ -199,11 +195,7 @@ fn what_is_retired_makes_room_and_stays_in_the_sum() {
 fn announcements_count_for_topics_that_are_listened_to() {
     let mut account = Account::new(&[Topic::Zones]);
     assert_eq!(fresh(&mut account, &announce(1, 10)), Ok(Fresh::New));
-    assert_eq!(
-        account.rows().map(|row| row.topic).collect::<Vec<_>>(),
-        [0],
-        "nothing sent, nothing to tell"
-    );
+    assert_eq!(account.rows().map(|row| row.topic).collect::<Vec<_>>(), [0], "nothing sent, nothing to tell");
     assert_eq!(fresh(&mut account, &announce(1, 12)), Ok(Fresh::Duplicate));
     let rows: Vec<_> = account.rows().map(|row| (row.topic, row.received, row.lost())).collect();
     assert_eq!(rows, [(0, 1, 0), (Topic::Zones.number(), 0, 2)]);
