@@ -1,3 +1,5 @@
+//! The account against gateways that restart, crowd and share a number. What a network does to it is in `tests/account.rs`.
+
 use super::super::{HEAD, Head};
 use super::*;
 use crate::Zones;
