@@ -228,7 +228,7 @@ mod tests {
         let mut lives = Lives::new();
         let mut displaced = 0;
         for n in 0..30_000 {
-            if n % 100 == 0 && (n < 10_000 || n >= 20_000) {
+            if n % 100 == 0 && !(10_000..20_000).contains(&n) {
                 assert_eq!(
                     hear(&mut lives, (1, 1), delivers(n)),
                     None,
