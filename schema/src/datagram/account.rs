@@ -1,7 +1,7 @@
 //! The receiver's account: what came, what did not, and why something was refused, exactly and in bounded memory, whoever
 //! sends. Refuses to know sockets, time and keys; it has no heap.
 
-use super::lives::{Gone, Lives};
+use super::lives::{Found, Gone, Lives};
 use super::numbers::{Fresh, Key, Row};
 use super::standing::Arrival;
 use super::voices::Whose;
@@ -106,7 +106,10 @@ impl Account {
     /// Two gateways are known to send under this number and epoch. Of one of them everything is refused as
     /// [`Refusal::Twin`].
     pub fn is_shared(&self, hub: u64, epoch: u32) -> bool {
-        self.lives.record((hub, epoch)).is_some_and(|record| record.voices.is_shared())
+        match self.lives.find((hub, epoch)) {
+            Found::At(slot) => self.lives.record(slot).voices.is_shared(),
+            Found::Over | Found::New => false,
+        }
     }
 
     /// What is known of every sensor and topic of which anything was sent, by hub, epoch, sensor and topic.
@@ -120,24 +123,26 @@ impl Account {
     fn take(&mut self, datagram: &Datagram<'_>, from: u64, now_ns: u64) -> Result<Fresh, Refusal> {
         let head = datagram.head;
         let life = (head.hub, head.epoch);
-        if self.lives.is_over(life) {
-            return Err(Refusal::Epoch);
-        }
+        let known = match self.lives.find(life) {
+            Found::Over => return Err(Refusal::Epoch),
+            Found::At(slot) => Some(slot),
+            Found::New => None,
+        };
         let is_announce = head.topic == Announce::NUMBER;
         let announce = if is_announce { Announce::unpack(datagram.payload) } else { None };
         let boot = announce.map(|announce| announce.boot);
-        let record = self.lives.record_mut(life);
-        let whose = record.as_ref().map_or(Whose::Own, |record| record.voices.judge(from, boot, now_ns));
+        let judge = |slot: usize| self.lives.record(slot).voices.judge(from, boot, now_ns);
+        let whose = known.map_or(Whose::Own, judge);
         if whose == Whose::Twin {
-            if let Some(record) = record.filter(|_| datagram.check_payload().is_ok()) {
-                record.voices.note(from, boot, now_ns);
+            if let Some(slot) = known.filter(|_| datagram.check_payload().is_ok()) {
+                self.lives.record_mut(slot).voices.note(from, boot, now_ns);
             }
             return Err(Refusal::Twin);
         }
-        let is_known = record.is_some() && whose == Whose::Own;
+        let known = known.filter(|_| whose == Whose::Own);
         let arrival = Arrival { delivers: !is_announce, now_ns };
         let key = (head.hub, head.epoch, head.sensor, head.topic);
-        let is_full = self.row_count == ROWS || !is_known && self.lives.is_full();
+        let is_full = self.row_count == ROWS || known.is_none() && self.lives.is_full();
         match self.find(key) {
             // All of the one that is silent makes room.
             _ if whose == Whose::Next => datagram.check_payload()?,
@@ -149,13 +154,16 @@ impl Account {
             self.lives.forget(life);
             self.clear(Gone { life, is_displaced: false });
         }
-        if !is_known && let Some(gone) = self.lives.take(life, arrival) {
-            self.clear(gone);
-        }
-        if let Some(record) = self.lives.record_mut(life) {
-            record.standing.take(arrival);
-            record.voices.note(from, boot, now_ns);
-        }
+        let slot = known.unwrap_or_else(|| {
+            let (slot, gone) = self.lives.take(life, arrival);
+            if let Some(gone) = gone {
+                self.clear(gone);
+            }
+            slot
+        });
+        let record = self.lives.record_mut(slot);
+        record.standing.take(arrival);
+        record.voices.note(from, boot, now_ns);
         let fresh = self.row(key, head.sequence, arrival).map_or(Fresh::New, |row| row.take(head.sequence));
         if let Some(announce) = announce {
             self.note(key, &announce, arrival);

@@ -1,6 +1,8 @@
 //! The lives of gateways that are told apart: which of them go on, and which one is given up when there is no room for
 //! another. Refuses to know what came in them.
 
+use core::cmp::Ordering;
+
 use super::standing::{Arrival, Standing};
 use super::voices::Voices;
 
@@ -35,6 +37,17 @@ pub(super) struct Record {
     pub(super) voices: Voices,
 }
 
+/// How a life stands to what is known of its gateway.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum Found {
+    /// A greater epoch of the same gateway was taken, and not given up.
+    Over,
+    /// It goes on, and its record is there.
+    At(usize),
+    /// Nothing of it, or of its gateway, was taken.
+    New,
+}
+
 /// A life that was given up.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) struct Gone {
@@ -60,19 +73,24 @@ impl Lives {
         Some(self.records[place.slot].since_ns)
     }
 
-    /// A greater epoch of the same gateway was taken, and not given up.
-    pub(super) fn is_over(&self, (hub, epoch): Life) -> bool {
-        self.going_on().iter().any(|&Place { life: (known, greatest), .. }| known == hub && greatest > epoch)
+    /// How `life` stands to the one of its gateway that goes on.
+    pub(super) fn find(&self, (hub, epoch): Life) -> Found {
+        let Some(place) = self.going_on().iter().find(|place| place.life.0 == hub) else { return Found::New };
+        match place.life.1.cmp(&epoch) {
+            Ordering::Greater => Found::Over,
+            Ordering::Equal => Found::At(place.slot),
+            Ordering::Less => Found::New,
+        }
     }
 
-    /// What is known of `life`, if it goes on.
-    pub(super) fn record(&self, life: Life) -> Option<&Record> {
-        self.slot(life).map(|slot| &self.records[slot])
+    /// What is known of the life that was found there.
+    pub(super) fn record(&self, slot: usize) -> &Record {
+        &self.records[slot]
     }
 
     /// As [`record`](Lives::record), to be changed.
-    pub(super) fn record_mut(&mut self, life: Life) -> Option<&mut Record> {
-        self.slot(life).map(|slot| &mut self.records[slot])
+    pub(super) fn record_mut(&mut self, slot: usize) -> &mut Record {
+        &mut self.records[slot]
     }
 
     /// Whether one can be given up for what came of `life`.
@@ -88,8 +106,8 @@ impl Lives {
     }
 
     /// Takes `life`, which is not over and not there, and retires the one of its gateway that went on until now. Then
-    /// there is room, or one to give up: the caller has looked. Answers what was given up.
-    pub(super) fn take(&mut self, life: Life, arrival: Arrival) -> Option<Gone> {
+    /// there is room, or one to give up: the caller has looked. Answers where it is, and what was given up.
+    pub(super) fn take(&mut self, life: Life, arrival: Arrival) -> (usize, Option<Gone>) {
         if let Some(at) = self.going_on().iter().position(|place| place.life.0 == life.0) {
             self.all[self.retired..=self.retired + at].rotate_right(1);
             self.retired += 1;
@@ -99,7 +117,7 @@ impl Lives {
         place.life = life;
         self.records[place.slot] = Record::new(arrival.now_ns);
         self.count += 1;
-        gone
+        (place.slot, gone)
     }
 
     /// Forgets the one that has been retired longest; if there is none, that which is worth least, but not `life`, of which
@@ -135,10 +153,6 @@ impl Lives {
         (self.retired..self.count).filter(may_go).min_by_key(worth)
     }
 
-    fn slot(&self, life: Life) -> Option<usize> {
-        self.going_on().iter().find(|place| place.life == life).map(|place| place.slot)
-    }
-
     fn going_on(&self) -> &[Place] {
         &self.all[self.retired..self.count]
     }
@@ -160,6 +174,10 @@ mod tests {
 
     const MS: u64 = 1_000_000;
 
+    fn is_over(lives: &Lives, life: Life) -> bool {
+        lives.find(life) == Found::Over
+    }
+
     fn announces(at_ms: u64) -> Arrival {
         Arrival { delivers: false, now_ns: at_ms * MS }
     }
@@ -170,8 +188,11 @@ mod tests {
 
     /// Takes it, known or not; who was put out.
     fn hear(lives: &mut Lives, life: Life, arrival: Arrival) -> Option<Life> {
-        let gone = if contains(lives, life) { None } else { lives.take(life, arrival) };
-        lives.record_mut(life).unwrap().standing.take(arrival);
+        let (slot, gone) = match lives.find(life) {
+            Found::At(slot) => (slot, None),
+            _ => lives.take(life, arrival),
+        };
+        lives.record_mut(slot).standing.take(arrival);
         gone.map(|gone| gone.life)
     }
 
@@ -181,13 +202,13 @@ mod tests {
         for life in [(1, 5), (2, 5), (3, 5), (2, 6), (1, 9), (2, 7)] {
             assert_eq!(hear(&mut lives, life, delivers(0)), None);
         }
-        assert!(contains(&lives, (2, 5)) && lives.is_over((1, 8)) && !lives.is_over((1, 9)));
+        assert!(contains(&lives, (2, 5)) && is_over(&lives, (1, 8)) && !is_over(&lives, (1, 9)));
         let mut give_up = || lives.give_up((9, 9), announces(0)).map(|gone| (gone.life, gone.is_displaced));
         let retired = [(2, 5), (1, 5), (2, 6)].map(|life| Some((life, false)));
         assert_eq!([(); 3].map(|()| give_up()), retired);
         assert_eq!(give_up(), None, "the others deliver");
         assert!(
-            lives.is_over((2, 6)) && !contains(&lives, (2, 6)),
+            is_over(&lives, (2, 6)) && !contains(&lives, (2, 6)),
             "its gateway goes on with a greater epoch"
         );
         assert!(contains(&lives, (1, 9)) && contains(&lives, (2, 7)) && contains(&lives, (3, 5)));
@@ -204,7 +225,7 @@ mod tests {
         let now = delivers(1001);
         assert!(lives.is_full() && !lives.can_give_up((99, 1), now) && lives.can_give_up((7, 2), now));
         assert_eq!(hear(&mut lives, (7, 2), now), Some((7, 1)));
-        assert!(lives.is_full() && lives.is_over((7, 1)) && !lives.can_give_up((9, 1), announces(1002)));
+        assert!(lives.is_full() && is_over(&lives, (7, 1)) && !lives.can_give_up((9, 1), announces(1002)));
     }
 
     #[test]
