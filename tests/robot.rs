@@ -100,7 +100,7 @@ fn without_a_hub_the_robot_is_of_the_sensors_of_other_machines() {
         Sender::new(1, 7, 1, "mapper").announce(&[Topic::Scan]);
         listener.await_lines(2, "its sensors", |line| line["kind"] == "published");
         let mut echo = stage.start(&["echo", "--json", "robot/zones"]);
-        let mut leds = stage.start(&["leds", "--json", "robot"]);
+        let mut leds = stage.start(&["leds", "--json", "robot", "--hold=0s"]);
         let own = |line: &Value, verdict: &str, sensor: &str| {
             let sensors = json!([{"sensor": sensor, "verdict": verdict}]);
             line["class"] == "zones" && line["verdict"] == verdict && line["sensors"] == sensors
