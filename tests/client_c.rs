@@ -211,7 +211,8 @@ fn a_robot_is_as_unknown_as_its_worst_sensor() {
     }
     // All is clear: nothing in the simulated room is so near.
     let _front = stage.simulator(&["front"], &["--seed=36", "--baud=500000"]);
-    let rear = stage.start(&["simulate", "--json", "--baud=500000", &format!("--port={}", stage.word("rear"))]);
+    let rear =
+        stage.start(&["simulate", "--json", "--baud=500000", &format!("--port={}", stage.word("rear"))]);
     let rear = rear.ready();
     let hub = stage.hub(&[&stage.link("front"), &stage.link("rear"), "--set=zones.radii=[0.02,0.01]"]);
     let verdicts = |line: &Value| {
@@ -223,9 +224,13 @@ fn a_robot_is_as_unknown_as_its_worst_sensor() {
     for follower in &mut followers {
         let line = follower.await_line("all is clear", |line| verdicts(line) == (0, both(0, 0)));
         assert_eq!(line["worst"], "front", "{line}");
-        let nearest = line["sensors"].as_array().expect("a list").iter().min_by_key(|it| number(it, "nearest_mm"));
+        let nearest =
+            line["sensors"].as_array().expect("a list").iter().min_by_key(|it| number(it, "nearest_mm"));
         let nearest = nearest.expect("one of two");
-        assert_eq!((&line["nearest_mm"], &line["nearest_sensor"]), (&nearest["nearest_mm"], &nearest["sensor"]));
+        assert_eq!(
+            (&line["nearest_mm"], &line["nearest_sensor"]),
+            (&nearest["nearest_mm"], &nearest["sensor"])
+        );
     }
     stage.kill_simulator(rear, "rear");
     for follower in &mut followers {

@@ -14,9 +14,7 @@ use rustix::process::Signal;
 use rustix::time::{ClockId, clock_gettime};
 use schema::{Topic, Verdict, Zones};
 use serde_json::Value;
-use stage::{
-    INT, KILL, Program, Sender, Stage, TERM, in_a_network, is_class, number, terminal, until,
-};
+use stage::{INT, KILL, Program, Sender, Stage, TERM, in_a_network, is_class, number, terminal, until};
 
 /// The walls of a room, far from the sensor, and in it what `thing` says.
 fn world(stage: &Stage, name: &str, thing: &str) -> String {
@@ -237,9 +235,8 @@ fn a_worse_verdict_is_shown_at_once_and_a_better_one_only_when_it_has_stood() {
         };
         let (mut usual, mut long, mut none) = (leds(&[]), leds(&["--hold=1h"]), leds(&["--hold=0s"]));
         say(Verdict::Stop);
-        let is = |verdict: &'static str| {
-            move |line: &Value| is_class("leds")(line) && line["verdict"] == verdict
-        };
+        let is =
+            |verdict: &'static str| move |line: &Value| is_class("leds")(line) && line["verdict"] == verdict;
         for program in [&mut usual, &mut long, &mut none] {
             program.await_line("stop at once, whatever the hold", is("stop"));
         }

@@ -7,11 +7,9 @@ use std::collections::BTreeMap;
 use std::path::Path;
 use std::process::Command;
 
-use serde_json::{Value, json};
 use schema::{Topic, Verdict, Zones};
-use stage::{
-    INT, KILL, Outcome, Program, Sender, Stage, TERM, in_a_network, is_class, number, python,
-};
+use serde_json::{Value, json};
+use stage::{INT, KILL, Outcome, Program, Sender, Stage, TERM, in_a_network, is_class, number, python};
 
 /// A script of the package's tests, if there is a Python for it.
 fn check(name: &str) -> Option<Command> {
@@ -203,7 +201,8 @@ fn a_robot_is_as_unknown_as_its_worst_sensor() {
         assert_eq!((&first["verdict"], &first["nearest_mm"]), (&"unknown".into(), &Value::Null), "{first}");
     }
     let _front = stage.simulator(&["front"], &["--seed=64", "--baud=500000"]);
-    let rear = stage.start(&["simulate", "--json", "--baud=500000", &format!("--port={}", stage.word("rear"))]);
+    let rear =
+        stage.start(&["simulate", "--json", "--baud=500000", &format!("--port={}", stage.word("rear"))]);
     let rear = rear.ready();
     // All is clear: nothing in the simulated room is so near.
     let hub = stage.hub(&[&stage.link("front"), &stage.link("rear"), "--set=zones.radii=[0.02,0.01]"]);
@@ -216,9 +215,8 @@ fn a_robot_is_as_unknown_as_its_worst_sensor() {
         let line = follower.await_line("all is clear", are("clear", "clear", "clear"));
         assert!(line["worst"] == "front" && line["nearest_mm"].is_u64(), "{line}");
         assert!(["front", "rear"].contains(&line["nearest_sensor"].as_str().unwrap_or_default()), "{line}");
-        follower.await_line("by now, too", |line| {
-            line["class"] == "now" && are("clear", "clear", "clear")(line)
-        });
+        follower
+            .await_line("by now, too", |line| line["class"] == "now" && are("clear", "clear", "clear")(line));
     }
     stage.kill_simulator(rear, "rear");
     for follower in &mut followers {
@@ -256,7 +254,9 @@ fn without_a_hub_the_robot_is_of_the_sensors_of_other_machines() {
         // A hub has sensors of its own, and when it goes nobody stands in for them.
         let _simulator = stage.simulator(&["front"], &["--seed=65", "--baud=500000"]);
         let hub = stage.hub(&[&stage.link("front"), "--set=zones.radii=[0.02,0.01]"]);
-        robot.await_line("all is forgotten", |line| line["sensors"] == json!({}) && line["verdict"] == "unknown");
+        robot.await_line("all is forgotten", |line| {
+            line["sensors"] == json!({}) && line["verdict"] == "unknown"
+        });
         robot.await_line("the hub's own", are("clear", "front"));
         assert_eq!(hub.end(KILL).code, None);
         robot.await_line("the hub is gone", are("unknown", "front"));

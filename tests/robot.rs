@@ -88,7 +88,8 @@ fn a_program_that_follows_the_robot() {
 fn without_a_hub_the_robot_is_of_the_sensors_of_other_machines() {
     in_a_network("without_a_hub_the_robot_is_of_the_sensors_of_other_machines", || {
         let stage = Stage::new();
-        let mut listener = stage.start(&["listen", "--json", "--publish", "--name=robot1=0000000000000001"]).ready();
+        let mut listener =
+            stage.start(&["listen", "--json", "--publish", "--name=robot1=0000000000000001"]).ready();
         let refused = stage.run(&["echo", "robot/zones", "--json", "-n", "1", "--for=10s"]);
         let error = refused.of_class("error").remove(0);
         assert_eq!((refused.code, &error["kind"]), (Some(3), &"no_topic".into()), "{refused}");

@@ -11,7 +11,7 @@ mod table;
 
 pub use boundary::Lent;
 pub use export::{
-    scanhub_close, scanhub_error, scanhub_fd, scanhub_hub_lives, scanhub_open, scanhub_open_robot, scanhub_release, scanhub_take,
-    scanhub_version, scanhub_wait,
+    scanhub_close, scanhub_error, scanhub_fd, scanhub_hub_lives, scanhub_open, scanhub_open_robot,
+    scanhub_release, scanhub_take, scanhub_version, scanhub_wait,
 };
 pub use table::Opaque;

@@ -54,7 +54,9 @@ impl Run<'_> {
         if wants_all && !may_come && sensors.iter().all(|sensor| is_remote(sensor) == lives) {
             let (what, hint) = match lives {
                 true => ("the hub has no sensors", "scanhub run --link NAME=PORT"),
-                false => ("no sensor of another machine is published here", "`scanhub listen` says who sends"),
+                false => {
+                    ("no sensor of another machine is published here", "`scanhub listen` says who sends")
+                }
             };
             return Err(Failure::new(Kind::NoTopic, what, hint).into());
         }

@@ -83,7 +83,8 @@ mod tests {
 
     #[test]
     fn it_gets_better_by_steps() {
-        let steps = [(0, Some(Stop)), (10, Some(Slow)), (110, Some(Clear)), (309, None), (310, None), (409, None)];
+        let steps =
+            [(0, Some(Stop)), (10, Some(Slow)), (110, Some(Clear)), (309, None), (310, None), (409, None)];
         assert_eq!(shown(&steps), [Stop, Stop, Stop, Stop, Slow, Slow]);
         assert_eq!(shown(&[&steps[..], &[(410, None)]].concat()).last(), Some(&Clear));
     }

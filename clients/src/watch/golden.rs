@@ -166,7 +166,10 @@ fn a_held_picture_has_the_verdict_of_now() {
     let before = text(&screen(&held, &view, (60, 20)));
     let rows = |now: &Scene| {
         let rows = text(&screen_held(now, Some(&held), &view, (60, 20)));
-        assert!(rows.lines().zip(before.lines()).take(17).skip(1).all(|(now, before)| now == before), "{rows}");
+        assert!(
+            rows.lines().zip(before.lines()).take(17).skip(1).all(|(now, before)| now == before),
+            "{rows}"
+        );
         rows.lines().map(str::to_owned).collect::<Vec<_>>()
     };
     now.sensor("front").zones = zones(Verdict::Stop, 412, [1, 1]);
@@ -177,7 +180,10 @@ fn a_held_picture_has_the_verdict_of_now() {
     assert!(stop[18].contains("lost 7"), "{stop:#?}");
     now.hub_gone();
     let gone = rows(&now);
-    assert!(gone[0].starts_with(" UNKNOWN  HELD  front") && gone[0].ends_with("no hub: waiting for it"), "{gone:#?}");
+    assert!(
+        gone[0].starts_with(" UNKNOWN  HELD  front") && gone[0].ends_with("no hub: waiting for it"),
+        "{gone:#?}"
+    );
 }
 
 /// Light terminals and dark ones: nothing is painted in black or white, or on a colour; and without colours nothing is
