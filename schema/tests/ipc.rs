@@ -1,7 +1,6 @@
 //! Topics in shared memory, each test in a domain of its own.
 #![cfg(feature = "ipc")]
 
-use std::os::unix::fs::MetadataExt;
 use std::path::PathBuf;
 use std::sync::atomic::{AtomicU32, Ordering};
 use std::thread;
@@ -252,12 +251,12 @@ fn the_bell_of_a_killed_hub_is_rung_by_the_next_one() {
 fn a_bell_that_nobody_can_have_is_told() {
     let place = Place::new();
     let hub = ipc::hub_node(&place.domain).unwrap();
-    let root = place.domain.root().metadata().unwrap();
-    let name = format!("{}front.{:x}-{:x}.bell", place.domain.prefix(), root.dev(), root.ino());
-    let path = PathBuf::from("/dev/shm").join(name);
+    let prefix = std::fs::read_to_string(place.domain.root().join("prefix")).unwrap();
+    let path = PathBuf::from("/dev/shm").join(format!("{}front.bell", prefix.trim_end()));
     rustix::fs::mknodat(rustix::fs::CWD, &path, FileType::Fifo, Mode::RUSR | Mode::WUSR, 0).unwrap();
-    assert!(Waker::new(&hub, "front").is_err());
-    assert!(Bell::open(&hub, "front").unwrap().is_none(), "nobody waits for who writes");
+    let failure = Waker::new(&hub, "front").err().expect("nobody waits for who writes");
+    assert!(failure.message.contains("is no file"), "{failure}");
+    assert_eq!(Bell::open(&hub, "front").err(), Some(failure));
     std::fs::remove_file(&path).unwrap();
     std::os::unix::fs::symlink("/dev/null", &path).unwrap();
     let failure = Waker::new(&hub, "front").err().expect("a link is not followed");
@@ -367,4 +366,51 @@ fn the_librarys_version_is_the_one_that_is_built_with() {
     let pinned = manifest.lines().find_map(|line| line.strip_prefix("iceoryx2 = { version = \"="));
     let version = pinned.and_then(|rest| rest.split('"').next()).expect("it is pinned");
     assert_eq!(ipc::LIBRARY, format!("iceoryx2 {version}"));
+}
+
+#[test]
+fn the_last_one_out_takes_the_names_along() {
+    let place = Place::new();
+    let root = place.domain.root();
+    let prefix = || std::fs::read_to_string(root.join("prefix")).ok();
+    let files = || {
+        let entries = std::fs::read_dir("/dev/shm").unwrap().flatten();
+        let names = entries.map(|entry| entry.file_name().to_string_lossy().into_owned());
+        names.filter(|name| name.starts_with(&place.domain.prefix())).collect::<Vec<_>>()
+    };
+    let lock = HubLock::acquire(root).unwrap();
+    let first = prefix().expect("names are there with the lock");
+    let hub = ipc::hub_node(&place.domain).unwrap();
+    let client = ipc::client_node(&place.domain).unwrap();
+    assert!(ipc::is_member(&client, root));
+    drop((hub, lock));
+    assert_eq!(prefix().as_ref(), Some(&first), "a consumer waits for the next hub");
+    let lock = HubLock::acquire(root).unwrap();
+    drop(client);
+    assert_eq!(files().len(), 1, "the library's counter: {:?}", files());
+    drop(lock);
+    assert_eq!((prefix(), files()), (None, Vec::new()));
+    let failure = ipc::client_node(&place.domain).unwrap_err();
+    assert!(failure.message.contains("does not tell how shared memory is named"), "{failure}");
+    let _lock = HubLock::acquire(root).unwrap();
+    assert!(prefix().is_some_and(|second| second != first));
+}
+
+/// Root and prefix are as long as they may be.
+#[test]
+fn at_the_longest_place_all_works() {
+    let place = Place::new();
+    let base = |length: usize| place.base.join("x".repeat(length - place.base.as_os_str().len() - 1));
+    let name = place.domain.name();
+    let longest = (place.base.as_os_str().len() + 2..).map(|length| Domain::at(name, &base(length)));
+    let domain = longest.take_while(Result::is_ok).last().expect("one is possible").unwrap();
+    let hub = ipc::hub_node(&domain).unwrap();
+    let waker = Waker::new(&hub, &"s".repeat(24)).unwrap();
+    let topic = Scan::create(&hub, "front").unwrap();
+    let (publisher, subscriber) = (Scan::publisher(&topic).unwrap(), Scan::subscriber(&topic).unwrap());
+    let listener = ipc::listener(waker.service()).unwrap();
+    waker.wake(Wake::Telegram).unwrap();
+    assert!(ipc::take_wakeups(&[&listener]).unwrap());
+    assert_eq!(publisher.loan().unwrap().send().unwrap(), 1);
+    assert!(Scan::receive(&subscriber).unwrap().is_some());
 }

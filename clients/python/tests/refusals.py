@@ -70,7 +70,7 @@ def somebody_elses_domain() -> None:
     if child == 0:
         os.setresuid(65534, 65534, 65534)
         said = refusal(scanhub.Denied, lambda: follow("front/scan"))
-        os._exit(0 if "belongs to user 0 with mode 0700, this is user 65534" in said.message else 1)
+        os._exit(0 if "belongs to user 0 (root) with mode 0700, this is user 65534" in said.message else 1)
     assert os.waitpid(child, 0)[1] == 0
 
 
