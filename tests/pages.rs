@@ -57,6 +57,11 @@ impl Situation {
         [simulator, hub]
     }
 
+    /// Whether there is something to tell, for an example that tells anything.
+    fn wants_words(&self, example: &Example) -> bool {
+        self.wall_m.is_some() && example.text.contains("print")
+    }
+
     /// What is wrong with what an example printed here.
     fn judge(&self, example: &Example, outcome: &Outcome) -> Result<(), String> {
         let wrong = |what: &str| Err(format!("{}, {self:?}: {what}\n{outcome}", example.place));
@@ -75,7 +80,7 @@ impl Situation {
             }
         }
         let says = |line: &str| distance_m(line).is_some() || VERDICTS.iter().any(|word| line.contains(word));
-        if self.wall_m.is_some() && example.text.contains("print") && !text.lines().any(says) {
+        if self.wants_words(example) && !text.lines().any(says) {
             return wrong("it says no distance with its unit, and no verdict");
         }
         Ok(())
@@ -97,13 +102,13 @@ fn distance_m(line: &str) -> Option<f64> {
     })
 }
 
-/// Runs `example` beside the hub of `stage` until it has seen some scans.
-fn run(example: &Example, stage: &Stage) -> Outcome {
+/// Runs `example` beside the hub of `stage` until it has seen some scans, and `says` something if it should.
+fn run(example: &Example, stage: &Stage, says: bool) -> Outcome {
     let mut scans = Attachment::<Scan>::in_domain(vec![stage.place()], "front").expect("a name");
     while scans.next().expect("a hub").is_none() {}
     // Nobody types, and nobody closes it.
     let (stdin, _typed) = std::io::pipe().expect("a pipe");
-    let program = Program::start_with(example.command(stage), stdin);
+    let mut program = Program::start_with(example.command(stage), stdin);
     // From when it reads the hub's memory.
     let maps = format!("/proc/{}/maps", program.pid());
     let follows = || {
@@ -111,8 +116,13 @@ fn run(example: &Example, stage: &Stage) -> Outcome {
         maps.lines().any(|map| map.contains("/dev/shm/sh_") && map.ends_with(".data"))
     };
     until("it follows the hub", || follows() || program.is_over());
+    // Those that are sent from now on.
+    while scans.try_next().expect("a hub").is_some() {}
     for _ in 0..10 {
         scans.next().expect("a hub");
+    }
+    if says && !program.is_over() {
+        program.await_bytes(0);
     }
     if program.is_over() { program.wait() } else { program.end(TERM) }
 }
@@ -145,7 +155,9 @@ fn wrong_with(blocks: &[Block], situations: &[Situation]) -> Vec<String> {
         let recorded = stage.run(&["record", "--ros2", "-o", &stage.word("walk.mcap"), "--for=1s"]);
         assert_eq!(recorded.code, Some(0), "{recorded}");
         for example in &examples {
-            wrong.extend(situation.judge(example, &run(example, &stage)).err());
+            wrong.extend(
+                situation.judge(example, &run(example, &stage, situation.wants_words(example))).err(),
+            );
         }
     }
     wrong
