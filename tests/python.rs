@@ -4,12 +4,15 @@
 mod stage;
 
 use std::collections::BTreeMap;
+use std::io::Write;
 use std::path::Path;
 use std::process::Command;
 
 use schema::{Topic, Verdict, Zones};
 use serde_json::{Value, json};
-use stage::{INT, KILL, Outcome, Program, Sender, Stage, TERM, in_a_network, is_class, number, python};
+use stage::{
+    INT, KILL, Outcome, Program, Sender, Stage, TERM, in_a_network, is_class, number, python, until,
+};
 
 /// A script of the package's tests, if there is a Python for it.
 fn check(name: &str) -> Option<Command> {
@@ -251,9 +254,21 @@ fn without_a_hub_the_robot_is_of_the_sensors_of_other_machines() {
         front.send(Topic::Zones, &Zones { verdict: Verdict::Clear as u8, ..Zones::unknown() });
         robot.await_line("clear", are("clear", "robot1.front"));
         robot.await_line("silence", are("unknown", "robot1.front"));
+        // One who always finds something that is sent from elsewhere, too.
+        let mut command = check_on(&stage, "robot").expect("as before");
+        command.arg("--asked");
+        let (stdin, mut ask) = std::io::pipe().expect("a pipe");
+        let mut busy = Program::start_with(command, stdin);
+        let mut hear = |busy: &mut Program| {
+            front.send(Topic::Zones, &Zones { verdict: Verdict::Clear as u8, ..Zones::unknown() });
+            ask.write_all(b"\n").expect("it reads");
+            busy.await_line("what it knows", is_class("now"))["sensors"].clone()
+        };
+        until("the other machine's", || hear(&mut busy).get("robot1.front").is_some());
         // A hub has sensors of its own, and when it goes nobody stands in for them.
         let _simulator = stage.simulator(&["front"], &["--seed=65", "--baud=500000"]);
         let hub = stage.hub(&[&stage.link("front"), "--set=zones.radii=[0.02,0.01]"]);
+        until("the hub's own", || hear(&mut busy) == json!({"front": "clear"}));
         robot.await_line("all is forgotten", |line| {
             line["sensors"] == json!({}) && line["verdict"] == "unknown"
         });

@@ -3,7 +3,7 @@
 
 mod stage;
 
-use clients::RobotFollower;
+use clients::{Robot, RobotFollower};
 use schema::{Topic, Verdict, Zones};
 use serde_json::{Value, json};
 use stage::{INT, KILL, Program, Sender, Stage, TERM, in_a_network, until};
@@ -117,7 +117,18 @@ fn without_a_hub_the_robot_is_of_the_sensors_of_other_machines() {
 
         // A hub has sensors of its own, and when it goes nobody stands in for them.
         let _sensor = sensor(&stage, "front");
+        // One who always finds something that is sent from elsewhere, too.
+        let mut busy = RobotFollower::in_domain(vec![stage.place()], &[]).expect("no names");
+        let names = |robot: &Robot| robot.sensors().map(|(name, _)| name.to_owned()).collect::<Vec<_>>();
+        let mut hear = |busy: &mut RobotFollower| {
+            front.send(Topic::Zones, &Zones { verdict: Verdict::Clear as u8, ..Zones::unknown() });
+            until("it is heard", || busy.try_next().expect("a domain").is_some());
+            names(busy.now().expect("a domain"))
+        };
+        until("the other machine's", || hear(&mut busy) == ["robot1.front"]);
         let own_hub = stage.hub(&[&stage.link("front"), CLEAR]);
+        until("the hub's own", || hear(&mut busy) == ["front"]);
+        drop(busy);
         echo.await_line("the hub's own", |line| own(line, "clear", "front"));
         assert_eq!(own_hub.end(KILL).code, None);
         echo.await_line("the hub is gone", |line| own(line, "unknown", "front"));

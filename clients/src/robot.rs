@@ -129,11 +129,9 @@ impl RobotFollower {
 
     /// Takes all that waits; whether there was anything.
     fn hear(&mut self) -> Result<bool, Failure> {
-        // As with one sensor's zones: what is there comes first.
-        if self.source.drain(&mut self.session)? {
-            return Ok(true);
-        }
+        // As with one sensor's zones what is there comes first; but who always finds something has to see a hub come, too.
+        let heard = self.source.drain(&mut self.session)?;
         self.session.look()?;
-        self.source.drain(&mut self.session)
+        Ok(self.source.drain(&mut self.session)? || heard)
     }
 }

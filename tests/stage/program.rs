@@ -85,7 +85,7 @@ impl Program {
     pub(crate) fn is_over(&self) -> bool {
         let status = std::fs::read_to_string(format!("/proc/{}/stat", self.pid())).unwrap_or_default();
         // What comes behind the name in brackets is its state, if it is there.
-        !status.rsplit_once(')').is_some_and(|(_, rest)| !rest.trim_start().starts_with(['Z', 'X']))
+        status.rsplit_once(')').is_none_or(|(_, rest)| rest.trim_start().starts_with(['Z', 'X']))
     }
 
     /// It ends without a word on stdout.

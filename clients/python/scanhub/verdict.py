@@ -58,9 +58,10 @@ class RobotFollower(Subscription):
 
     def _hear(self) -> bool:
         """Takes all that waits; whether there was anything."""
+        # Who always finds something has to see a hub come, too.
         any_heard = self._drain()
-        if not any_heard and self._look():
-            any_heard = self._drain()
+        if self._look():
+            any_heard = self._drain() or any_heard
         # Last, because it takes longer than all the rest.
         return self._call_the_roll() or any_heard or self._is_nobody_there()
 

@@ -1,5 +1,6 @@
 """Follows the verdict of a robot and prints each as a line of JSON: arguments are domain, root, sensors. Each tenth is also
-asked for by `now`, which never waits. Ends by Ctrl-C, and says so."""
+asked for by `now`, which never waits. Ends by Ctrl-C, and says so. With `--asked` in place of sensors: what `now` says for each
+line of stdin."""
 
 import json
 import os
@@ -30,6 +31,12 @@ refused(lambda: scanhub.robot("robot"))
 with scanhub.robot(domain=domain, root=root) as asked:
     assert asked.now() == scanhub.Robot() and asked.now().verdict == "unknown", "nobody was heard yet"
 assert asked.now() == scanhub.Robot() and list(asked) == [], "it was closed"
+
+if sensors == ["--asked"]:
+    robot = scanhub.robot(domain=domain, root=root)
+    for _ in sys.stdin:
+        say({"class": "now", **asdict(robot.now())})
+    sys.exit()
 
 robot = scanhub.robot(*sensors, domain=domain, root=root)
 try:
