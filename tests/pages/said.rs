@@ -21,7 +21,7 @@ const TEXTS: [(&str, &str, &str); 3] = [
 fn wrong_with(block: &Block) -> Option<String> {
     match block.language.as_str() {
         "toml" => wrong_with_toml(block),
-        "json" => block.text.lines().find_map(|line| wrong_with_json(line)),
+        "json" => block.text.lines().find_map(wrong_with_json),
         "text" => {
             let is_named = |(page, begin, _): &(&str, &str, &str)| {
                 block.place.starts_with(page) && block.text.starts_with(begin)
