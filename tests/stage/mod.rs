@@ -65,7 +65,7 @@ impl Stage {
         let domain = format!("t{}-{}", std::process::id(), NEXT.fetch_add(1, Ordering::Relaxed));
         // Not TMPDIR: root and prefix of a domain have to be short.
         let directory = PathBuf::from(format!("/tmp/{domain}"));
-        let made = fs::DirBuilder::new().recursive(true).mode(0o700).create(&directory);
+        let made = fs::DirBuilder::new().recursive(true).mode(0o755).create(&directory);
         made.unwrap_or_else(|error| panic!("{}: {error}", directory.display()));
         Stage { directory, domain, network: None }
     }
