@@ -32,6 +32,7 @@ pub const CHECKS: &[&str] = &[
     "health",
     "marks",
     "line-errors",
+    "line-loss",
 ];
 
 /// How a check ended.
