@@ -75,6 +75,70 @@ fn now() -> u64 {
     now.tv_sec as u64 * 1_000_000_000 + now.tv_nsec as u64
 }
 
+/// After stops of the hub, of some tenths of a second to seconds: how far each stamp is from the truth, and whether it says
+/// that it is an estimate.
+#[test]
+fn a_stamp_is_right_or_says_that_it_is_an_estimate() {
+    let stage = Stage::new();
+    let simulator = stage.simulator(&["front"], &["--seed=7", "--baud=500000"]);
+    let hub = stage.hub(&[stage.link("front")]);
+    let mut consumer = stage.echo(&["front/telegram"]);
+    consumer.await_lines(150, "a telegram", is_class("telegram"));
+    let mut stops = Vec::new();
+    for span_ms in [300, 600, 1_000, 1_500, 3_000] {
+        let stopped = now();
+        hub.signal(Signal::STOP);
+        thread::sleep(Duration::from_millis(span_ms));
+        hub.signal(Signal::CONT);
+        stops.push((stopped, now(), span_ms));
+        consumer.await_lines(60, "a telegram", is_class("telegram"));
+    }
+    assert_eq!(hub.end(TERM).code, Some(0));
+    assert_eq!(simulator.end(INT).code, Some(0));
+    let outcome = consumer.end(INT);
+    let truth = stage.truth("front");
+    let mut place = 0;
+    // When its last byte had been sent, the stamp of its first one, and whether that says to be an estimate.
+    let scans: Vec<(u64, u64, bool)> = outcome
+        .of_class("telegram")
+        .iter()
+        .filter(|line| line["command"] == 0xB0)
+        .map(|line| {
+            let hash = hash(&bytes_of(line));
+            place += truth[place..].iter().position(|sent| sent.hash == hash).expect("it was sent");
+            let flags = line["flags"].as_array().expect("a pty is simulated");
+            let is_estimate = flags.contains(&"stamp_estimated".into());
+            (truth[place].sent_ns, number(line, "stamp_ns"), is_estimate)
+        })
+        .collect();
+    // A scan is on the line for as long as those that nothing kept from being read.
+    let waited = |sent: u64| stops.iter().any(|(from, to, _)| (*from..*to + 30_000_000).contains(&sent));
+    let mut spans: Vec<i64> = scans
+        .iter()
+        .filter(|(sent, _, is_estimate)| !waited(*sent) && !is_estimate)
+        .map(|(sent, stamp, _)| *sent as i64 - *stamp as i64)
+        .collect();
+    let usual = median(&mut spans);
+    let error = |(sent, stamp, _): &(u64, u64, bool)| (*sent as i64 - usual - *stamp as i64).abs();
+    for (from, to, span_ms) in &stops {
+        let of_stop = |(sent, ..): &&(u64, u64, bool)| (*from..*to).contains(sent);
+        let mut errors: Vec<i64> = scans.iter().filter(of_stop).map(error).collect();
+        let count = errors.len();
+        println!("{span_ms} ms: {count} waited, median error {} us", median(&mut errors) / 1000);
+        assert!(count > 3, "{count} of {span_ms} ms");
+    }
+    let wrong = scans.iter().filter(|scan| !scan.2 && error(scan) > 5_000_000).count();
+    assert_eq!(wrong, 0, "of {} stamps that say to be right", scans.len());
+    let mut errors: Vec<i64> = scans.iter().filter(|(sent, ..)| waited(*sent)).map(error).collect();
+    let of_all = median(&mut errors);
+    assert!(of_all < 5_000_000, "{of_all} ns of {} that waited", errors.len());
+}
+
+fn median(values: &mut [i64]) -> i64 {
+    values.sort_unstable();
+    values.get(values.len() / 2).copied().unwrap_or_default()
+}
+
 #[test]
 fn what_waited_for_a_listener_that_was_stopped_is_not_new() {
     in_a_network("what_waited_for_a_listener_that_was_stopped_is_not_new", || {
