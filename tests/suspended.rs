@@ -98,41 +98,52 @@ fn a_stamp_is_right_or_says_that_it_is_an_estimate() {
     let outcome = consumer.end(INT);
     let truth = stage.truth("front");
     let mut place = 0;
-    // When its last byte had been sent, the stamp of its first one, and whether that says to be an estimate.
+    // The sensor keeps its beat from its last reply on, also where the simulator was late to write: those that it wrote
+    // soonest tell when.
+    let is_answer = |sent: &stage::Sent| sent.is_reply && sent.sent_ns < stops[0].0;
+    let begin = truth.iter().rposition(is_answer).expect("it was asked") + 1;
+    let beat = |place: usize| (place - begin) as u64 * PERIOD;
+    let whole = (begin..truth.len()).filter(|&place| truth[place].fault.is_none());
+    let first = whole.map(|place| truth[place].sent_ns - beat(place)).min();
+    let first = first.expect("scans were sent");
+    // When its last byte was due, the stamp of its first one, and whether that says to be an estimate.
     let scans: Vec<(u64, u64, bool)> = outcome
         .of_class("telegram")
         .iter()
-        .filter(|line| line["command"] == 0xB0)
-        .map(|line| {
+        .filter_map(|line| {
             let hash = hash(&bytes_of(line));
             place += truth[place..].iter().position(|sent| sent.hash == hash).expect("it was sent");
             let flags = line["flags"].as_array().expect("a pty is simulated");
             let is_estimate = flags.contains(&"stamp_estimated".into());
-            (truth[place].sent_ns, number(line, "stamp_ns"), is_estimate)
+            (place >= begin).then(|| (first + beat(place), number(line, "stamp_ns"), is_estimate))
         })
         .collect();
-    // A scan is on the line for as long as those that nothing kept from being read.
-    let waited = |sent: u64| stops.iter().any(|(from, to, _)| (*from..*to + 30_000_000).contains(&sent));
-    let mut spans: Vec<i64> = scans
-        .iter()
-        .filter(|(sent, _, is_estimate)| !waited(*sent) && !is_estimate)
-        .map(|(sent, stamp, _)| *sent as i64 - *stamp as i64)
-        .collect();
+    let waited = |sent: u64| stops.iter().any(|(from, to, _)| (*from..*to).contains(&sent));
+    let sure = scans.iter().filter(|(sent, _, is_estimate)| !waited(*sent) && !is_estimate);
+    let mut spans: Vec<i64> = sure.map(|(sent, stamp, _)| *sent as i64 - *stamp as i64).collect();
     let usual = median(&mut spans);
     let error = |(sent, stamp, _): &(u64, u64, bool)| (*sent as i64 - usual - *stamp as i64).abs();
     for (from, to, span_ms) in &stops {
         let of_stop = |(sent, ..): &&(u64, u64, bool)| (*from..*to).contains(sent);
         let mut errors: Vec<i64> = scans.iter().filter(of_stop).map(error).collect();
-        let count = errors.len();
-        println!("{span_ms} ms: {count} waited, median error {} us", median(&mut errors) / 1000);
-        assert!(count > 3, "{count} of {span_ms} ms");
+        let (count, most) = (errors.len(), errors.iter().max().copied().unwrap_or_default());
+        let median = median(&mut errors);
+        println!(
+            "{span_ms} ms: {count} waited, median error {} us, greatest {} us",
+            median / 1000,
+            most / 1000
+        );
+        assert!(count > 3 && median < 5_000_000, "{count} of {span_ms} ms, {median} ns");
+        // Those that waited, and the next ones.
+        let around = |(sent, ..): &&(u64, u64, bool)| (*from..*to + 10 * PERIOD).contains(sent);
+        for scan in scans.iter().filter(around) {
+            assert!(scan.2 || error(scan) < 5_000_000, "{scan:?} is {} ns off", error(scan));
+        }
     }
-    let wrong = scans.iter().filter(|scan| !scan.2 && error(scan) > 5_000_000).count();
-    assert_eq!(wrong, 0, "of {} stamps that say to be right", scans.len());
-    let mut errors: Vec<i64> = scans.iter().filter(|(sent, ..)| waited(*sent)).map(error).collect();
-    let of_all = median(&mut errors);
-    assert!(of_all < 5_000_000, "{of_all} ns of {} that waited", errors.len());
 }
+
+/// Time between two scans of 361 beams, in ns: two mirror turns.
+const PERIOD: u64 = 26_640_000;
 
 fn median(values: &mut [i64]) -> i64 {
     values.sort_unstable();

@@ -288,7 +288,10 @@ fn what_the_line_took_away_meanwhile_is_in_the_summary() {
     let (end, out, _) = verb.join();
     assert_eq!(end, Ok(()));
     let summary = out.lines().last().unwrap();
-    assert!(summary.starts_with(r#"{"class":"summary","sensor":"front","topic":"scan","received":1,"#), "{out}");
+    assert!(
+        summary.starts_with(r#"{"class":"summary","sensor":"front","topic":"scan","received":1,"#),
+        "{out}"
+    );
     assert!(summary.ends_with(r#""damaged":0.25,"lost_on_line":80}"#), "{out}");
     assert!(!out.contains(r#""class":"status""#), "{out}");
 }

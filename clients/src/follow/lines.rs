@@ -34,8 +34,7 @@ impl Run<'_> {
     /// Receives the statuses that wait.
     pub(super) fn take_lines(&mut self, sink: &mut dyn Sink) -> Result<(), End> {
         for LineTrack { sensor, source, line } in &mut self.lines {
-            loop {
-                let Some(follower) = source else { break };
+            while let Some(follower) = source {
                 match follower.receive(&mut self.session) {
                     Ok(None) => break,
                     Ok(Some(status)) => {

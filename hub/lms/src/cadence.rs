@@ -179,7 +179,7 @@ mod tests {
     #[test]
     fn a_period_that_is_not_quite_the_nominal_one_is_learned() {
         for drift in [0.97, 0.999, 1.001, 1.03, 1.12] {
-            let kept = |n: &u32| n % 3 != 0 || n % 5 == 0;
+            let kept = |n: &u32| !n.is_multiple_of(3) || n.is_multiple_of(5);
             let scans = (0..3000).filter(kept).map(|n| f64::from(n) * drift);
             let lost = (0..3000).filter(|n| !kept(n)).count() as u64;
             let counted = heard(scans).lost();
