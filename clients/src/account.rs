@@ -4,6 +4,8 @@ use std::time::{Duration, Instant};
 
 use schema::Topic;
 
+use crate::line::Loss;
+
 /// The account of one topic in one run.
 #[derive(Clone, Debug)]
 pub(crate) struct Account {
@@ -12,6 +14,8 @@ pub(crate) struct Account {
     pub(crate) received: u64,
     /// Samples sent meanwhile and not received: missing numbers.
     pub(crate) lost: u64,
+    /// What the sensor's line took away in the run, where that was watched.
+    pub(crate) loss: Loss,
     first: Option<Instant>,
     last: Option<Instant>,
     period: Duration,
@@ -25,6 +29,7 @@ impl Account {
             topic,
             received: 0,
             lost: 0,
+            loss: Loss::default(),
             first: None,
             last: None,
             period: Duration::ZERO,

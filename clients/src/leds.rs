@@ -11,7 +11,7 @@ use std::path::{Path, PathBuf};
 use std::sync::atomic::AtomicBool;
 use std::time::{Duration, Instant};
 
-use schema::{Domain, Failure, Kind, ROBOT, Topic, Verdict, check_followed};
+use schema::{Domain, Failure, Kind, ROBOT, Status, Topic, Verdict, check_followed};
 use serde::Serialize;
 
 use crate::account::Account;
@@ -83,6 +83,7 @@ pub fn leds(
         lamps: Lamps::UNKNOWN,
         verdict: Hold::new(options.hold),
         marks: Freshness::new(clock::now()),
+        losses: Vec::new(),
         devices: Vec::new(),
         out: Output::new(out),
         notes: Output::new(notes),
@@ -127,6 +128,8 @@ struct Board<'a> {
     verdict: Hold,
     /// Until when the marks may be believed, whatever became of the zones.
     marks: Freshness,
+    /// What each sensor's line takes away, of those that lose something.
+    losses: Vec<(String, String)>,
     devices: Vec<(Light, String, Device)>,
     out: Output<'a>,
     notes: Output<'a>,
@@ -192,18 +195,29 @@ impl Board<'_> {
     }
 
     fn draw(&mut self) -> Result<(), End> {
+        let reason = self.reason();
         let Board { sensor, lamps, .. } = self;
+        let (sensor, reason) = (*sensor, reason.as_deref());
         match self.look {
-            LedsLook::Json => self.out.json(&Line::new(sensor, lamps)),
-            LedsLook::Lines => self.out.line(|line| lamps.line(line, sensor, false)),
+            LedsLook::Json => self.out.json(&Line::new(sensor, lamps, reason)),
+            LedsLook::Lines => self.out.line(|line| lamps.line(line, sensor, reason, false)),
             LedsLook::Terminal { colours } => {
                 // A line that wraps would not be drawn over: it is cut.
                 let mut line = [WIPE, b"\x1b[?7l"].concat();
-                lamps.line(&mut line, sensor, colours)?;
+                lamps.line(&mut line, sensor, reason, colours)?;
                 line.extend(b"\x1b[?7h");
                 self.out.raw(&line)
             }
         }
+    }
+
+    /// What may be behind the verdict: what the line of the sensor takes away whose verdict it is, else that of any.
+    fn reason(&self) -> Option<String> {
+        let whose = self.lamps.worst.as_deref();
+        let of_worst = self.losses.iter().find(|(sensor, _)| Some(sensor.as_str()) == whose);
+        let (sensor, loss) = of_worst.or(self.losses.first())?;
+        let is_plain = sensor == self.sensor || Some(sensor.as_str()) == whose;
+        Some(if is_plain { loss.clone() } else { format!("{sensor}: {loss}") })
     }
 
     fn wipe(&mut self) -> Result<(), End> {
@@ -243,6 +257,24 @@ impl Sink for Board<'_> {
             _ => {}
         }
         self.show_known(marks, now)
+    }
+
+    fn wants_lines(&self) -> bool {
+        true
+    }
+
+    /// A line that begins or ends to lose something is told; how much it is from second to second is not.
+    fn line(&mut self, sensor: &str, status: &Status) -> Result<(), End> {
+        let known = self.losses.iter().position(|(name, _)| name == sensor);
+        let loss = status.line_loss();
+        let is_news = known.is_some() != loss.is_some();
+        match (known, loss) {
+            (Some(at), Some(loss)) => self.losses[at].1 = loss,
+            (Some(at), None) => drop(self.losses.remove(at)),
+            (None, Some(loss)) => self.losses.push((sensor.to_owned(), loss)),
+            (None, None) => {}
+        }
+        if is_news { self.draw() } else { Ok(()) }
     }
 
     fn notice(&mut self, names: &[&TopicName], notice: Notice) -> Result<(), End> {
@@ -292,10 +324,12 @@ struct Line<'a> {
     mark: bool,
     #[serde(skip_serializing_if = "Option::is_none")]
     worst: Option<&'a str>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    reason: Option<&'a str>,
 }
 
 impl<'a> Line<'a> {
-    fn new(sensor: &'a str, lamps: &'a Lamps) -> Line<'a> {
+    fn new(sensor: &'a str, lamps: &'a Lamps, reason: Option<&'a str>) -> Line<'a> {
         Line {
             class: "leds",
             sensor,
@@ -308,6 +342,7 @@ impl<'a> Line<'a> {
             red: lamps.lit(Light::Red),
             mark: lamps.lit(Light::Mark),
             worst: lamps.worst.as_deref(),
+            reason,
         }
     }
 }

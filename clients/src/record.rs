@@ -296,6 +296,10 @@ impl Sink for Recorder<'_> {
         Ok(())
     }
 
+    fn wants_lines(&self) -> bool {
+        true
+    }
+
     fn notice(&mut self, names: &[&TopicName], notice: Notice) -> Result<(), End> {
         self.report.hub(names, notice)
     }

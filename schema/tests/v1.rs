@@ -324,7 +324,8 @@ fn counters_in_order() {
         names.join(" "),
         "bytes_read bytes_in_telegrams bytes_acknowledge bytes_discarded bytes_buffered telegrams suspect aborted \
          resyncs reconnects lost_in_restart wakeups loan_failed rejected_address rejected_length rejected_command \
-         rejected_count rejected_crc rejected_vetoed rejected_superseded line_errors"
+         rejected_count rejected_crc rejected_vetoed rejected_superseded line_errors bytes_damaged damaged_ppm \
+         due_on_line lost_on_line lost_ppm"
     );
     let names: Vec<_> = State::ALL.iter().map(|state| state.name()).collect();
     assert_eq!(names.join(" "), "absent probing switching starting streaming silent paused");

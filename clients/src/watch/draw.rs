@@ -123,12 +123,14 @@ fn line(number: usize, sensor: &Sensor, view: &View, width: u16) -> Line<'static
     let age = dash(sensor.meter.age_ms().map(|(mean, _)| format!("{mean:.2}")));
     let greatest = dash(sensor.meter.age_ms().map(|(_, greatest)| format!("{greatest:.2}")));
     let mut text = format!("{} {:<8} {:<9}", number + 1, sensor.name, sensor.state());
+    let loss = sensor.status.and_then(|status| status.line_loss());
     let error = sensor.status.map(|status| status.last_error().to_owned()).unwrap_or_default();
     if sensor.scan.is_none() && !error.is_empty() {
         text += &format!(" {error}");
     } else {
-        let mut fields =
-            vec![format!(" {hz:>5} Hz"), format!(" {age:>5} ms"), format!("  lost {}", sensor.lost)];
+        let mut fields = vec![format!(" {hz:>5} Hz")];
+        fields.extend(loss.iter().map(|loss| format!("  {loss}")));
+        fields.extend([format!(" {age:>5} ms"), format!("  lost {}", sensor.lost)]);
         if sensor.is_frozen() {
             fields.push("  frozen".to_owned());
         }
@@ -148,7 +150,10 @@ fn line(number: usize, sensor: &Sensor, view: &View, width: u16) -> Line<'static
         }
     }
     let is_shown = view.only.is_none_or(|only| only == number);
-    let style = if is_shown { Style::new() } else { Style::new().add_modifier(Modifier::DIM) };
+    let mut style = if is_shown { Style::new() } else { Style::new().add_modifier(Modifier::DIM) };
+    if loss.is_some() {
+        style = style.add_modifier(Modifier::BOLD);
+    }
     Line::styled(text, style)
 }
 

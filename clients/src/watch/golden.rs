@@ -319,3 +319,18 @@ fn ink(colour: Color) -> &'static str {
 const CELL: (u16, u16) = (8, 16);
 /// Column and row of the dots, by their bits (Unicode 2800h to 28FFh).
 const BRAILLE: [(u16, u16); 8] = [(0, 0), (0, 1), (0, 2), (1, 0), (1, 1), (1, 2), (0, 3), (1, 3)];
+
+#[test]
+fn what_the_line_takes_away_is_seen_on_a_small_screen_too() {
+    let mut scene = scene();
+    let mut status = scene.sensor("rear").status.unwrap();
+    status.counters[Counter::DueOnLine] = 1000;
+    status.counters[Counter::LostPpm] = 412_000;
+    scene.sensor("rear").take_status(&status);
+    for size in [(60, 20), (120, 40)] {
+        let screen = text(&screen(&scene, &View::new(true), size));
+        let line = screen.lines().find(|line| line.starts_with("2 rear")).unwrap();
+        assert!(line.contains(" Hz  41 % lost on the line"), "{line}");
+        assert!(!screen.lines().any(|line| line.starts_with("1 front") && line.contains("line")), "{screen}");
+    }
+}

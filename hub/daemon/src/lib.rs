@@ -23,6 +23,7 @@ pub mod port;
 mod preflight;
 pub mod probe;
 mod publish;
+mod recent;
 mod reload;
 mod replay;
 pub mod scanner;

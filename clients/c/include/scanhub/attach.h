@@ -183,7 +183,12 @@ enum scanhub_counter {
     SCANHUB_COUNTER_REJECTED_CRC,
     SCANHUB_COUNTER_REJECTED_VETOED,
     SCANHUB_COUNTER_REJECTED_SUPERSEDED,
-    SCANHUB_COUNTER_LINE_ERRORS
+    SCANHUB_COUNTER_LINE_ERRORS,
+    SCANHUB_COUNTER_BYTES_DAMAGED,
+    SCANHUB_COUNTER_DAMAGED_PPM, /* of the last 10 s, in millionths */
+    SCANHUB_COUNTER_DUE_ON_LINE, /* 0: what was lost on the line is not known */
+    SCANHUB_COUNTER_LOST_ON_LINE,
+    SCANHUB_COUNTER_LOST_PPM /* of the last 10 s, in millionths */
 };
 
 struct scanhub_pose_v1 {
