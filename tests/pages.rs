@@ -152,7 +152,7 @@ fn wrong_with(blocks: &[Block], situations: &[Situation]) -> Vec<String> {
     for situation in situations {
         let stage = Stage::new();
         let _running = situation.begin(&stage);
-        let recorded = stage.run(&["record", "--ros2", "-o", &stage.word("walk.mcap"), "--for=1s"]);
+        let recorded = stage.run(&["record", "--ros2", "-o", &stage.word("ros.mcap"), "--for=1s"]);
         assert_eq!(recorded.code, Some(0), "{recorded}");
         for example in &examples {
             wrong.extend(

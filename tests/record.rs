@@ -5,8 +5,6 @@ mod stage;
 use std::collections::{BTreeMap, BTreeSet, HashSet};
 use std::path::Path;
 
-use schema::Scan;
-use schema::datagram::Packed;
 use serde_json::Value;
 use stage::{
     HUP, INT, KILL, Kept, Outcome, Program, Recording, Stage, TERM, hash, is_class, number, python, unbroken,
@@ -125,44 +123,6 @@ fn said(mut python: std::process::Command) -> Value {
 }
 
 #[test]
-fn ros_reads_the_scans_that_were_there() {
-    let stage = Stage::new();
-    let _others = sensors(&stage, &["--world=room", "--mode=0x01"]);
-    let outcome =
-        stage.run(&["record", "--all", "--ros2", "--for=2s", "--json", "-o", &stage.word("walk.mcap")]);
-    recorded(&outcome);
-    let recording = Recording::whole(&stage.path("walk.mcap"));
-    let (ours, theirs) = (recording.of("front/scan"), recording.of("/front/scan"));
-    assert!(ours.len() > 20 && ours.len() == theirs.len(), "{} {}", ours.len(), theirs.len());
-    assert!(theirs.iter().all(|kept| kept.encoding == "cdr" && kept.schema == "sensor_msgs/msg/LaserScan"));
-    let Some(mut python) = python("mcap, mcap_ros2") else { return };
-    python.args(["tests/stage/read.py", "scans", &stage.word("walk.mcap"), "/front/scan"]);
-    let said = said(python);
-    let said = said.as_array().unwrap();
-    assert_eq!(said.len(), ours.len());
-    for ((kept, theirs), said) in ours.iter().zip(&theirs).zip(said) {
-        assert_eq!((kept.sequence, kept.log_time), (theirs.sequence, theirs.log_time));
-        let mut scan = Scan::default();
-        assert!(scan.unpack(kept.payload()));
-        assert_eq!((&said["frame"], &said["intensities"]), (&"front".into(), &scan.intensities().into()));
-        let first = said["angle_min"].as_f64().unwrap() - (scan.angle_deg(0) - 90.0).to_radians();
-        let step =
-            said["angle_increment"].as_f64().unwrap() - (f64::from(scan.step_mdeg) / 1000.0).to_radians();
-        assert!(first.abs() < 1e-6 && step.abs() < 1e-6, "{said}");
-        let stamp = said["stamp_ns"].as_u64().unwrap();
-        assert_eq!(stamp, kept.log_time - scan.beam_age_ns(0));
-        let ranges = said["ranges_mm"].as_array().unwrap();
-        assert_eq!(ranges.len(), scan.beams());
-        for (i, range) in ranges.iter().enumerate() {
-            match scan.distance_mm(i) {
-                Some(mm) => assert_eq!(range.as_u64(), Some(mm.into()), "beam {i}"),
-                None => assert!(range == "inf" || range == "nan", "beam {i}: {range}"),
-            }
-        }
-    }
-}
-
-#[test]
 fn a_hub_that_comes_back_goes_on_in_the_file() {
     let stage = Stage::new();
     let [_simulator, hub] = sensors(&stage, &[]);
@@ -215,6 +175,12 @@ fn what_cannot_be_recorded_is_refused() {
     assert_eq!(kind(&["-o", "-", "--split", "1h"]), (Some(2), "usage".into()));
     assert_eq!(kind(&["--keep", "3"]), (Some(2), "usage".into()));
     assert_eq!(kind(&["--split", "3"]), (Some(2), "usage".into()));
+    for words in [&["--ros2", "--all"][..], &["--ros2", "front/telegram"]] {
+        let outcome = stage.run(&[&["record", "-o", &stage.word("new.mcap")], words].concat());
+        assert_eq!(outcome.code, Some(2), "{outcome}");
+        assert!(outcome.errors.contains("messages of ROS alone, and"), "{outcome}");
+        assert!(outcome.errors.contains("--ros2` makes a file for ROS of it later"), "{outcome}");
+    }
     assert_eq!(kind(&["robot/zones"]), (Some(78), "configuration".into()));
     assert_eq!(kind(&["front/scam"]), (Some(3), "no_topic".into()));
     // Nothing came, nothing stays.

@@ -93,6 +93,30 @@ fn clients_know_only_schema() {
 }
 
 #[test]
+fn ros_knows_only_schema() {
+    holds(crates::ros_knows_only_schema, |tree| {
+        let (manifest, lib) = ("schema/ros/Cargo.toml", "schema/ros/src/lib.rs");
+        vec![
+            tree.with_line(manifest, "[dependencies]", "scanhub-clients.workspace = true"),
+            tree.with_line(manifest, "[dependencies]", "mcap.workspace = true"),
+            tree.with(lib, &tree.text(lib).replace("#![forbid(unsafe_code)]", "")),
+            tree.with("schema/ros/src/planted.rs", "//! A clock.\nuse std::time::SystemTime;\n"),
+        ]
+    });
+}
+
+#[test]
+fn the_scanner_only_translates() {
+    holds(crates::the_scanner_only_translates, |tree| {
+        let (manifest, lib) = ("hub/scanner/Cargo.toml", "hub/scanner/src/lib.rs");
+        vec![
+            tree.with_line(manifest, "[dependencies]", "scanhub-recording.workspace = true"),
+            tree.with(lib, &tree.text(lib).replace("#![forbid(unsafe_code)]", "")),
+        ]
+    });
+}
+
+#[test]
 fn the_library_for_c_knows_clients() {
     holds(crates::the_library_for_c_knows_clients, |tree| {
         vec![

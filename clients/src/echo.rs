@@ -1,9 +1,9 @@
 //! `scanhub echo`: samples as text, JSON, CSV or bytes. Refuses to know where they come from.
 
-use std::io::{self, Write};
+use std::io::Write;
 use std::sync::atomic::AtomicBool;
 
-use schema::{Domain, Failure, Header, Kind, Scan, Topic};
+use schema::{Domain, Failure, Header, Kind, Scan, Topic, csv};
 
 use crate::account::Account;
 use crate::follow::{Bounds, Notice, Sink, follow};
@@ -115,23 +115,10 @@ impl Echo<'_> {
     fn csv(&mut self, header: &Header, scan: &Scan) -> Result<(), End> {
         if self.columns != Some(scan.beams()) {
             self.columns = Some(scan.beams());
-            self.out.line(|line| {
-                write!(line, "seq,topic_seq,stamp_ns,wall_ns,quality,unit_mm,first_angle_deg,step_deg")?;
-                (0..scan.beams()).try_for_each(|i| write!(line, ",range_{i}"))
-            })?;
+            self.out.line(|line| csv::columns(line, scan.beams()))?;
         }
-        self.out.line(|line| csv(line, header, scan))
+        self.out.line(|line| csv::row(line, header, scan))
     }
-}
-
-fn csv(line: &mut Vec<u8>, header: &Header, scan: &Scan) -> io::Result<()> {
-    let (stamp_ns, wall_ns) = (header.stamp_first_ns, header.wall_ns);
-    write!(line, "{},{},{stamp_ns},{wall_ns},{}", header.seq, header.topic_seq, header.quality().name())?;
-    write!(line, ",{},{},{}", scan.unit_mm, scan.angle_deg(0), f64::from(scan.step_mdeg) / 1000.0)?;
-    (0..scan.beams()).try_for_each(|i| match scan.range(i) {
-        Some(range) => write!(line, ",{range}"),
-        None => write!(line, ","),
-    })
 }
 
 fn check(format: Format, names: &[TopicName]) -> Result<(), Failure> {

@@ -8,7 +8,6 @@ mod part;
 mod queue;
 mod refusal;
 mod report;
-mod ros2;
 mod selection;
 mod told;
 
@@ -34,7 +33,8 @@ use crate::spare::Spare;
 use disk::Disk;
 use files::Files;
 pub use files::Split;
-use queue::{Entry, Gap, Queue, Track};
+use part::Form;
+use queue::{Entry, Gap, Queue};
 use report::Report;
 use selection::Selection;
 use told::{News, Told};
@@ -46,7 +46,7 @@ pub struct RecordOptions {
     pub topics: Vec<String>,
     /// All topics instead of the usual ones.
     pub everything: bool,
-    /// Scans as messages of ROS 2, too.
+    /// Scans as messages of ROS 2 and where the sensors sit, and nothing else.
     pub ros2: bool,
     /// The file; `-` is stdout, and without one it is named after the time.
     pub file: Option<PathBuf>,
@@ -109,7 +109,6 @@ pub fn record(
     let mut report = Report::new(options.look, &mut out, &mut notes, terminal);
     let begun = report.begin(&first);
     let mut recorder = Recorder {
-        selection: &selection,
         told: disk.told(),
         tracks: Vec::new(),
         queue: queue.clone(),
@@ -156,8 +155,8 @@ fn begin(options: &RecordOptions, queue: &Arc<Queue>) -> Result<Disk, End> {
             Ok(Files::new(path, options.split.is_some(), options.force, options.keep))
         }
     };
-    let profile = if options.ros2 { ros2::PROFILE } else { "" };
-    let begun = Disk::begin(queue.clone(), files, options.split, profile, facts(options, wall_ns));
+    let form = if options.ros2 { Form::Ros2 } else { Form::Hub };
+    let begun = Disk::begin(queue.clone(), files, options.split, form, facts(options, wall_ns));
     begun.map_err(|error| match error.kind() {
         ErrorKind::BrokenPipe => refusal::reader_gone(0).into(),
         _ => failed(error).into(),
@@ -186,10 +185,9 @@ struct Kept {
 }
 
 struct Recorder<'a> {
-    selection: &'a Selection,
     queue: Arc<Queue>,
     told: Arc<Told>,
-    tracks: Vec<Track>,
+    tracks: Vec<TopicName>,
     /// Samples handed to the writing thread.
     pushed: u64,
     /// Samples for which there was no room.
@@ -275,9 +273,8 @@ impl Recorder<'_> {
 
 impl Sink for Recorder<'_> {
     fn begin(&mut self, name: &TopicName) {
-        let track = self.selection.track(name);
-        self.queue.note(Entry::Track(track.clone()));
-        self.tracks.push(track);
+        self.queue.note(Entry::Track(name.clone()));
+        self.tracks.push(name.clone());
     }
 
     fn sample(&mut self, name: &TopicName, sample: &Sample) -> Result<(), End> {
@@ -288,7 +285,7 @@ impl Sink for Recorder<'_> {
             }
             self.end_gap()?;
         }
-        let Some(track) = self.tracks.iter().position(|track| track.name == *name) else { return Ok(()) };
+        let Some(track) = self.tracks.iter().position(|track| track == name) else { return Ok(()) };
         if !self.queue.push(track, header, |room| sample.pack_said(room)) {
             return self.leave_out(name);
         }

@@ -9,6 +9,7 @@ use recording::Damage;
 use recording::convert::{self, ConvertOptions, Converted};
 use schema::Failure;
 use serde::Serialize;
+use sim::options;
 
 use crate::{line, print};
 
@@ -17,13 +18,19 @@ pub(crate) struct Convert {
     /// The recording: MCAP file, telegram stream or CARMEN log, plain or gzipped, also a damaged one
     #[arg(value_name = "IN")]
     input: PathBuf,
-    /// What it becomes, by its ending: .mcap, .bin (telegram stream) or .log (CARMEN), the last two also with .gz; - is a
-    /// telegram stream on stdout
+    /// What it becomes, by its ending: .mcap, .bin (telegram stream), .log (CARMEN) or .csv (a row per scan), the last
+    /// three also with .gz; - is a telegram stream on stdout
     #[arg(value_name = "OUT")]
     output: PathBuf,
     /// One sensor of the recording; of a stream or a log its name in the MCAP file [default: front]
     #[arg(long, value_name = "NAME")]
     sensor: Option<String>,
+    /// An MCAP file of ROS 2 messages alone: scans as sensor_msgs/msg/LaserScan, and /tf_static from the poses
+    #[arg(long)]
+    ros2: bool,
+    /// With --ros2 or .csv: measuring mode of a recording that does not tell it, such as 0x01
+    #[arg(long)]
+    mode: Option<String>,
     /// Overwrite what is there
     #[arg(short, long)]
     force: bool,
@@ -37,6 +44,8 @@ impl Convert {
             output: self.output.clone(),
             sensor: self.sensor.clone(),
             force: self.force,
+            ros2: self.ros2,
+            mode: self.mode.as_deref().map(options::parse_mode).transpose()?,
         };
         let is_watched = stderr().is_terminal() && !json;
         let progress = |done: u64, all: u64| {
@@ -113,7 +122,7 @@ impl<'a> Line<'a> {
             input: &convert.input,
             output: &convert.output,
             from: convert::form_name(converted.forms.0),
-            to: convert::form_name(converted.forms.1),
+            to: converted.forms.1.name(),
             sensors: &converted.sensors,
             telegrams: converted.telegrams,
             scans: converted.scans,

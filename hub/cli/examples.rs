@@ -110,6 +110,8 @@ const EXAMPLES: &[(&str, &[&str])] = &[
             "scanhub convert killed.mcap whole.mcap",
             "scanhub convert robot.mcap front.log.gz --sensor front",
             "scanhub convert room.log.gz room.mcap",
+            "scanhub convert walk.mcap ros.mcap --ros2",
+            "scanhub convert robot.mcap front.csv --sensor front",
         ],
     ),
     ("watch", &["scanhub watch", "scanhub watch front"]),
@@ -117,7 +119,7 @@ const EXAMPLES: &[(&str, &[&str])] = &[
         "record",
         &[
             "scanhub record",
-            "scanhub record -o walk.mcap --ros2 --for 10m",
+            "scanhub record --ros2 -o ros.mcap --for 10m",
             "scanhub record --all --split 512MiB --keep 20",
         ],
     ),

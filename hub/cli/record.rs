@@ -18,7 +18,7 @@ pub(crate) struct Record {
     /// Every topic of all sensors
     #[arg(long, conflicts_with = "topics")]
     all: bool,
-    /// Scans as sensor_msgs/msg/LaserScan, too, which ROS 2 and Foxglove read
+    /// A file of ROS 2 messages alone: scans as sensor_msgs/msg/LaserScan, and /tf_static from the poses
     #[arg(long)]
     ros2: bool,
     /// The recording; - for stdout [default: scanhub-DATE-TIME.mcap]

@@ -35,6 +35,8 @@ pub struct Foreign<'a> {
     pub encoding: &'a str,
     /// Name of their type, its description, and in what language that is written, such as `ros2msg`.
     pub schema: (&'a str, &'a str, &'a str),
+    /// What else is told of the channel: keys and values.
+    pub metadata: &'a [(&'a str, &'a str)],
 }
 
 impl<W: Write> Writer<W> {
@@ -63,7 +65,8 @@ impl<W: Write> Writer<W> {
             None => {
                 let name = format!("{sensor}/{}", topic.name());
                 let schema = (schema(topic), LAYOUT, ENCODING);
-                let channel = self.channel(&Foreign { topic: &name, encoding: ENCODING, schema })?;
+                let channel =
+                    self.channel(&Foreign { topic: &name, encoding: ENCODING, schema, metadata: &[] })?;
                 self.channels.push((sensor.to_owned(), topic, channel));
                 channel
             }
@@ -81,7 +84,9 @@ impl<W: Write> Writer<W> {
     pub fn channel(&mut self, foreign: &Foreign<'_>) -> io::Result<u16> {
         let (name, text, language) = foreign.schema;
         let schema = self.mcap.add_schema(name, language, text.as_bytes()).map_err(io_error)?;
-        self.mcap.add_channel(schema, foreign.topic, foreign.encoding, &BTreeMap::new()).map_err(io_error)
+        let metadata =
+            foreign.metadata.iter().map(|&(key, value)| (key.to_owned(), value.to_owned())).collect();
+        self.mcap.add_channel(schema, foreign.topic, foreign.encoding, &metadata).map_err(io_error)
     }
 
     /// Writes a message of `time_ns` since 1970 into a channel.

@@ -4,6 +4,7 @@
 mod age;
 mod background;
 mod control;
+pub mod csv;
 pub mod datagram;
 mod domain;
 mod failure;

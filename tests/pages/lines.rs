@@ -72,7 +72,7 @@ impl Desk {
         let simulator = stage.simulator(&["front", "spare"], &["--seed=82", "--baud=500000"]);
         let hub = stage.hub(&[stage.link("front")]);
         stage.await_info("front", |info| info["state"] == "streaming");
-        let recorded = stage.run(&["record", "--ros2", "-o", &stage.word("one.mcap"), "--for=1s"]);
+        let recorded = stage.run(&["record", "-o", &stage.word("one.mcap"), "--for=1s"]);
         assert_eq!(recorded.code, Some(0), "{recorded}");
         let stream = stage.run(&["echo", "front/telegram", "--raw", "-n", "5"]);
         fs::create_dir(stage.path("bin")).expect("a directory");

@@ -66,7 +66,11 @@ fn whole(block: &Block) -> String {
 }
 
 fn of_python(block: &Block, source: &Path) -> Option<Example> {
-    let modules = if block.text.contains("mcap") { "mcap, mcap_ros2" } else { "iceoryx2, numpy" };
+    let modules = match &block.text {
+        text if text.contains("rosbags") => "rosbags",
+        text if text.contains("mcap") => "mcap, mcap_ros2",
+        _ => "iceoryx2, numpy",
+    };
     let python = python(modules)?;
     let (place, text) = (block.place.clone(), block.text.clone());
     let program = PathBuf::from(python.get_program());

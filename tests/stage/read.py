@@ -5,7 +5,7 @@ import math
 import sys
 
 from mcap.exceptions import EndOfFile
-from mcap.reader import NonSeekingReader, make_reader
+from mcap.reader import NonSeekingReader
 
 
 def left(path):
@@ -20,30 +20,58 @@ def left(path):
     return {"messages": count}
 
 
-def range_mm(range_m):
-    if math.isfinite(range_m):
-        return round(range_m * 1000)
-    return "nan" if math.isnan(range_m) else "inf" if range_m > 0 else "-inf"
+def number(value):
+    if math.isfinite(value):
+        return float(value)
+    return "nan" if math.isnan(value) else "inf" if value > 0 else "-inf"
 
 
-def scans(path, topic):
-    """The scans of a topic of ROS 2."""
-    from mcap_ros2.decoder import DecoderFactory
+def header(header):
+    return {
+        "frame": header.frame_id,
+        "stamp_ns": header.stamp.sec * 1_000_000_000 + header.stamp.nanosec,
+    }
 
-    with open(path, "rb") as file:
-        reader = make_reader(file, decoder_factories=[DecoderFactory()])
+
+def told(topic, log_time, message):
+    """What a message of ROS 2 says, whoever read it."""
+    line = {"topic": topic, "log_time": log_time}
+    if topic == "/tf_static":
+        line["transforms"] = [
+            header(found.header)
+            | {"child": found.child_frame_id}
+            | {key: getattr(found.transform.translation, key) for key in "xyz"}
+            | {"q" + key: getattr(found.transform.rotation, key) for key in "xyzw"}
+            for found in message.transforms
+        ]
+        return line
+    keys = "angle_min angle_max angle_increment time_increment scan_time range_min range_max"
+    line |= header(message.header) | {key: number(getattr(message, key)) for key in keys.split()}
+    line["ranges"] = [number(value) for value in message.ranges]
+    line["intensities"] = [int(value) for value in message.intensities]
+    return line
+
+
+def mcap_ros2(path):
+    """All messages, as mcap-ros2-support reads them."""
+    from mcap_ros2.reader import read_ros2_messages
+
+    return [told(found.channel.topic, found.log_time_ns, found.ros_msg) for found in read_ros2_messages(path)]
+
+
+def rosbags(path):
+    """All messages, as rosbags reads them."""
+    from pathlib import Path
+
+    from rosbags.highlevel import AnyReader
+
+    with AnyReader([Path(path)]) as reader:
         return [
-            {
-                "frame": scan.header.frame_id,
-                "stamp_ns": scan.header.stamp.sec * 1_000_000_000 + scan.header.stamp.nanosec,
-                "angle_min": scan.angle_min,
-                "angle_increment": scan.angle_increment,
-                "ranges_mm": [range_mm(value) for value in scan.ranges],
-                "intensities": [int(value) for value in scan.intensities],
-            }
-            for _, _, _, scan in reader.iter_decoded_messages(topics=[topic])
+            told(connection.topic, log_time, reader.deserialize(data, connection.msgtype))
+            | {"durability": connection.ext.offered_qos_profiles[0].durability.name}
+            for connection, log_time, data in reader.messages()
         ]
 
 
-verb, path, *rest = sys.argv[1:]
-print(json.dumps({"left": left, "scans": scans}[verb](path, *rest)))
+verb, path = sys.argv[1:]
+print(json.dumps({"left": left, "mcap_ros2": mcap_ros2, "rosbags": rosbags}[verb](path)))

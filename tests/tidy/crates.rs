@@ -97,10 +97,34 @@ pub(crate) fn no_processor_uses_another(tree: &Tree) -> Vec<String> {
     breaches
 }
 
+/// The words of ROS are beside ours: they come with `clients` where these record.
 pub(crate) fn clients_know_only_schema(tree: &Tree) -> Vec<String> {
     let mut names = ours(&tree.members()["scanhub-clients"], &ALL);
-    names.remove("scanhub-schema");
+    names.retain(|name| !["scanhub-schema", "scanhub-ros"].contains(&name.as_str()));
     names.into_iter().collect()
+}
+
+/// From payloads to messages: nothing of the system, nothing of others, so that anybody can call it.
+pub(crate) fn ros_knows_only_schema(tree: &Tree) -> Vec<String> {
+    let mut breaches = built_of(tree, "scanhub-ros", &["scanhub-schema"]);
+    breaches.extend(lacks(tree, "schema/ros/src/lib.rs", &["#![forbid(unsafe_code)]"]));
+    let ours = |path: &str| path.starts_with("schema/ros/src/");
+    breaches.extend(find(tree, &["schema::ipc", "std::time", "std::net", "std::fs", "extern crate"], ours));
+    breaches
+}
+
+/// From a telegram to a scan: the protocol and the words for it, and no other crate.
+pub(crate) fn the_scanner_only_translates(tree: &Tree) -> Vec<String> {
+    let mut breaches = built_of(tree, "scanhub-scanner", &["scanhub-lms", "scanhub-schema"]);
+    breaches.extend(lacks(tree, "hub/scanner/src/lib.rs", &["#![forbid(unsafe_code)]"]));
+    breaches
+}
+
+/// What `package` is built with beside `known`.
+fn built_of(tree: &Tree, package: &str, known: &[&str]) -> Vec<String> {
+    let members = tree.members();
+    let others = built_with(&members[package]).filter(|name| !known.contains(&name.as_str()));
+    others.map(|name| format!("{package} is built with {name}")).collect()
 }
 
 /// The library for C is a face of the attach library: it knows nothing else, and nothing is built with it.

@@ -12,9 +12,10 @@ use schema::Topic;
 
 use super::Kept;
 use super::files::{Files, Split, discard};
-use super::part::{Part, Place};
-use super::queue::{Batch, EVERY, Entry, Queue, Track};
+use super::part::{Form, Part, Place};
+use super::queue::{Batch, EVERY, Entry, Queue};
 use super::told::{News, Told};
+use crate::names::TopicName;
 
 /// The writing of one run.
 pub(super) struct Disk {
@@ -23,9 +24,9 @@ pub(super) struct Disk {
     files: Option<Files>,
     split: Option<Split>,
     facts: BTreeMap<String, String>,
-    profile: &'static str,
+    form: Form,
     part: Part,
-    tracks: Vec<Track>,
+    tracks: Vec<TopicName>,
     /// The last one of each track of that topic.
     statuses: Vec<Option<Kept>>,
     /// What is being written; kept until it is.
@@ -51,7 +52,7 @@ impl Disk {
         queue: Arc<Queue>,
         files: Result<Files, File>,
         split: Option<Split>,
-        profile: &'static str,
+        form: Form,
         facts: BTreeMap<String, String>,
     ) -> io::Result<Disk> {
         let (files, place) = match files {
@@ -61,7 +62,7 @@ impl Disk {
             }
             Err(stream) => (None, Place::Stream(stream)),
         };
-        let mut part = Part::begin(place, profile, numbered(&facts, files.as_ref()))?;
+        let mut part = Part::begin(place, form, numbered(&facts, files.as_ref()))?;
         // What could not even be begun is not in the way of the next try.
         part.write().inspect_err(|_| part.path().into_iter().for_each(discard))?;
         let told = Told::default();
@@ -72,7 +73,7 @@ impl Disk {
             files,
             split,
             facts,
-            profile,
+            form,
             part,
             tracks: Vec::new(),
             statuses: Vec::new(),
@@ -198,7 +199,7 @@ impl Disk {
         let Some(files) = &mut self.files else { return Ok(()) };
         let (path, file) = files.next()?;
         let facts = numbered(&self.facts, Some(files));
-        let mut part = Part::begin(Place::File(file, path.clone()), self.profile, facts)?;
+        let mut part = Part::begin(Place::File(file, path.clone()), self.form, facts)?;
         part.repeat(&self.tracks, &self.statuses)?;
         part.add(&self.tracks, &self.batch)?;
         files.prune();
@@ -233,7 +234,7 @@ impl Disk {
     fn remember(&mut self) {
         let now = Instant::now();
         for (track, header, payload) in self.batch.samples() {
-            if self.tracks[track].name.topic == Topic::Status {
+            if self.tracks[track].topic == Topic::Status {
                 let mut room = self.statuses[track].take().map_or_else(Vec::new, |kept| kept.payload);
                 room.clear();
                 room.extend_from_slice(payload);
@@ -287,17 +288,16 @@ mod tests {
     use schema::{Header, Status};
 
     use super::*;
-    use crate::names::TopicName;
 
     /// A recording in a directory of its own, of the status of these sensors.
     fn disk(name: &str, split: Option<Split>, sensors: &[&str]) -> (PathBuf, Disk) {
         let place = std::env::temp_dir().join(format!("scanhub-{name}-{}", std::process::id()));
         fs::create_dir_all(&place).unwrap();
         let files = Files::new(&place.join("walk.mcap"), split.is_some(), false, None);
-        let disk = Disk::begin(Arc::new(Queue::new()), Ok(files), split, "", BTreeMap::new()).unwrap();
+        let disk = Disk::begin(Arc::new(Queue::new()), Ok(files), split, Form::Hub, BTreeMap::new()).unwrap();
         for sensor in sensors {
             let name = TopicName { sensor: (*sensor).to_owned(), topic: Topic::Status };
-            disk.queue.note(Entry::Track(Track { name, native: true, ros2: false }));
+            disk.queue.note(Entry::Track(name));
         }
         (place, disk)
     }

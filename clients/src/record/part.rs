@@ -9,12 +9,14 @@ use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
+use ros::bag::{self, Bag};
 use schema::datagram::Packed;
 use schema::file::Writer;
-use schema::{Header, Scan, Topic};
+use schema::{Header, Scan, Status, Topic};
 
-use super::queue::{Batch, Entry, Gap, Track};
-use super::{Kept, ros2};
+use super::Kept;
+use super::queue::{Batch, Entry, Gap};
+use crate::names::TopicName;
 
 /// A file that is being written.
 pub(super) struct Part {
@@ -42,10 +44,27 @@ pub(super) struct Part {
     /// Topics and tracks that are in it.
     topics: Vec<Topic>,
     met: Vec<usize>,
-    /// Channels of ROS 2, by track.
-    channels: Vec<Option<u16>>,
+    /// Of a recording for ROS 2.
+    bag: Option<Bag>,
     scan: Scan,
-    message: Vec<u8>,
+}
+
+/// What the messages are.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum Form {
+    /// As the hub publishes them.
+    Hub,
+    /// Those of ROS 2, and no other.
+    Ros2,
+}
+
+impl Form {
+    fn profile(self) -> &'static str {
+        match self {
+            Form::Hub => "",
+            Form::Ros2 => bag::PROFILE,
+        }
+    }
 }
 
 /// Where the bytes go.
@@ -73,9 +92,9 @@ impl Write for Made {
 
 impl Part {
     /// A new one at `place`, of which `facts` are told; nothing is written yet.
-    pub(super) fn begin(place: Place, profile: &str, facts: BTreeMap<String, String>) -> io::Result<Part> {
+    pub(super) fn begin(place: Place, form: Form, facts: BTreeMap<String, String>) -> io::Result<Part> {
         let made = Made::default();
-        let writer = Some(Writer::begin(made.clone(), profile, facts)?);
+        let writer = Some(Writer::begin(made.clone(), form.profile(), facts)?);
         Ok(Part {
             writer,
             made,
@@ -91,15 +110,14 @@ impl Part {
             lives: Vec::new(),
             topics: Vec::new(),
             met: Vec::new(),
-            channels: Vec::new(),
+            bag: (form == Form::Ros2).then(Bag::default),
             scan: Scan::default(),
-            message: Vec::new(),
         })
     }
 
     /// The statuses that stand, by track, so that it can be played without what came before; not those of sensors that
     /// said nothing any more while others did.
-    pub(super) fn repeat(&mut self, tracks: &[Track], statuses: &[Option<Kept>]) -> io::Result<()> {
+    pub(super) fn repeat(&mut self, tracks: &[TopicName], statuses: &[Option<Kept>]) -> io::Result<()> {
         let newest = statuses.iter().flatten().map(|kept| kept.came_at).max();
         for (at, kept) in statuses.iter().enumerate() {
             let stands = |kept: &&Kept| newest.is_some_and(|newest| newest - kept.came_at < STANDS);
@@ -111,7 +129,7 @@ impl Part {
     }
 
     /// Makes a chunk of `batch`, whose tracks are among `tracks`.
-    pub(super) fn add(&mut self, tracks: &[Track], batch: &Batch) -> io::Result<()> {
+    pub(super) fn add(&mut self, tracks: &[TopicName], batch: &Batch) -> io::Result<()> {
         let samples = batch.count() as usize;
         if samples > 0 {
             self.begun.get_or_insert_with(Instant::now);
@@ -221,12 +239,11 @@ impl Part {
     }
 
     fn writer(&mut self) -> io::Result<&mut Writer<Made>> {
-        self.writer.as_mut().ok_or_else(|| io::Error::other("nothing comes behind the index"))
+        self.writer.as_mut().ok_or_else(nothing_behind)
     }
 
-    fn sample(&mut self, tracks: &[Track], at: usize, header: &Header, payload: &[u8]) -> io::Result<()> {
-        let Some(track) = tracks.get(at) else { return Ok(()) };
-        let name = &track.name;
+    fn sample(&mut self, tracks: &[TopicName], at: usize, header: &Header, payload: &[u8]) -> io::Result<()> {
+        let Some(name) = tracks.get(at) else { return Ok(()) };
         if !self.met.contains(&at) {
             self.met.push(at);
             self.end += END_OF_TRACK;
@@ -244,24 +261,21 @@ impl Part {
             ];
             self.writer()?.note(LIFE, facts.map(|(key, value)| (key.to_owned(), value)).into())?;
         }
-        if track.native {
-            self.writer()?.sample(&name.sensor, name.topic, header, payload)?;
+        let Some(writer) = &mut self.writer else { return Err(nothing_behind()) };
+        match (&mut self.bag, name.topic) {
+            (None, topic) => writer.sample(&name.sensor, topic, header, payload),
+            (Some(bag), Topic::Scan) if self.scan.unpack(payload) => {
+                bag.scan(writer, &name.sensor, header, &self.scan)
+            }
+            (Some(bag), Topic::Status) => {
+                let mut status = Status::default();
+                match status.unpack(payload) {
+                    true => bag.pose(writer, &name.sensor, header.wall_ns, &status.pose),
+                    false => Ok(()),
+                }
+            }
+            (Some(_), _) => Ok(()),
         }
-        if track.ros2 && self.scan.unpack(payload) {
-            self.channels.resize(tracks.len(), None);
-            let channel = match self.channels[at] {
-                Some(channel) => channel,
-                None => self.writer()?.channel(&ros2::channel(&ros2::topic(&name.sensor)))?,
-            };
-            self.channels[at] = Some(channel);
-            let mut message = std::mem::take(&mut self.message);
-            message.clear();
-            ros2::write(&mut message, &name.sensor, header, &self.scan);
-            let written = self.writer()?.message(channel, header.topic_seq as u32, header.wall_ns, &message);
-            self.message = message;
-            written?;
-        }
-        Ok(())
     }
 
     fn gap(&mut self, gap: &Gap) -> io::Result<()> {
@@ -270,6 +284,10 @@ impl Part {
         let left_out = gap.left_out.iter().map(|(name, count)| (name.to_string(), count.to_string()));
         self.writer()?.note(GAP, facts.into_iter().chain(left_out).collect())
     }
+}
+
+fn nothing_behind() -> io::Error {
+    io::Error::other("nothing comes behind the index")
 }
 
 /// A status stands for so long, while others come: they do each second.
@@ -299,7 +317,7 @@ mod tests {
         let (mut reader, writer) = io::pipe().unwrap();
         rustix::io::ioctl_fionbio(&writer, true).unwrap();
         let stream = Place::Stream(File::from(std::os::fd::OwnedFd::from(writer)));
-        let mut part = Part::begin(stream, "", BTreeMap::new()).unwrap();
+        let mut part = Part::begin(stream, Form::Hub, BTreeMap::new()).unwrap();
         part.made.write_all(&[7; 300_000]).unwrap();
         let made = part.made.0.lock().unwrap().clone();
         let mut read = Vec::new();

@@ -28,22 +28,12 @@ pub(super) struct Batch {
 
 /// One thing to be kept.
 pub(super) enum Entry {
-    /// From here on there is a track; they are numbered from 0.
-    Track(Track),
+    /// From here on a topic is kept: a track; they are numbered from 0.
+    Track(TopicName),
     /// A sample of a track, whose payload is the next `len` bytes.
     Sample { track: usize, header: Header, len: usize },
     /// Here samples were left out.
     Gap(Gap),
-}
-
-/// A topic that is kept, and as what.
-#[derive(Clone, Debug)]
-pub(super) struct Track {
-    pub(super) name: TopicName,
-    /// As the hub publishes it.
-    pub(super) native: bool,
-    /// As a message of ROS 2.
-    pub(super) ros2: bool,
 }
 
 /// A time in which samples were left out, because there was no room for them.

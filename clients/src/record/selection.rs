@@ -2,7 +2,6 @@
 
 use schema::{Failure, Kind, Topic};
 
-use super::queue::Track;
 use crate::names::TopicName;
 
 /// The topics that are kept.
@@ -10,32 +9,57 @@ use crate::names::TopicName;
 pub(super) struct Selection {
     named: Vec<TopicName>,
     of_all: Vec<Topic>,
-    ros2: bool,
 }
 
+/// What a recording for ROS 2 is made of.
+const ROS2: [Topic; 2] = [Topic::Scan, Topic::Status];
 /// Telegrams, from which all else can be made again, and the results that are wanted first.
 const USUAL: [Topic; 5] = [Topic::Telegram, Topic::Marks, Topic::Zones, Topic::Foreground, Topic::Status];
 
 impl Selection {
-    /// What `texts` name, `SENSOR/TOPIC` or `*/TOPIC`; nothing named: `everything` that there is, or what is usual. With
-    /// `ros2` scans are kept as messages of ROS 2, too.
+    /// What `texts` name, `SENSOR/TOPIC` or `*/TOPIC`; nothing named: `everything` that there is, or what is usual. For
+    /// `ros2` scans, and the status of their sensors, which tells where they sit.
     ///
     /// [`Kind::NoTopic`] with the topics that there are; [`Kind::Configuration`] if a name is not possible, or stands for
-    /// no topic.
+    /// no topic; [`Kind::Usage`] if ROS has no message for it.
     pub(super) fn parse(texts: &[String], everything: bool, ros2: bool) -> Result<Selection, Failure> {
-        let mut selection = Selection { named: Vec::new(), of_all: Vec::new(), ros2 };
+        let mut selection = Selection { named: Vec::new(), of_all: Vec::new() };
         if texts.is_empty() {
-            selection.of_all = if everything { Topic::ALL.to_vec() } else { USUAL.to_vec() };
+            selection.of_all = match (everything, ros2) {
+                (true, true) => return Err(no_message("--all")),
+                (false, true) => ROS2.to_vec(),
+                (true, false) => Topic::ALL.to_vec(),
+                (false, false) => USUAL.to_vec(),
+            };
         }
         for text in texts {
-            match text.strip_prefix("*/") {
-                Some(topic) => selection.of_all.push(Topic::parse(topic).ok_or_else(|| no_topic(text))?),
-                None => selection.named.push(TopicName::parse(text)?),
+            let topic = match text.strip_prefix("*/") {
+                Some(topic) => {
+                    let topic = Topic::parse(topic).ok_or_else(|| no_topic(text))?;
+                    selection.of_all.push(topic);
+                    topic
+                }
+                None => {
+                    let name = TopicName::parse(text)?;
+                    selection.named.push(name.clone());
+                    name.topic
+                }
+            };
+            if ros2 && topic != Topic::Scan {
+                return Err(no_message(text));
             }
         }
         if let Some(fold) = selection.named.iter().find(|name| name.is_robot()) {
             let hint = "`*/zones` records the zones of each sensor";
             return Err(Failure::new(Kind::Configuration, format!("{fold} is made by who listens"), hint));
+        }
+        if ros2 {
+            let status = |name: &TopicName| TopicName { topic: Topic::Status, ..name.clone() };
+            let statuses: Vec<_> = selection.named.iter().map(status).collect();
+            selection.named.extend(statuses);
+            if !selection.of_all.is_empty() {
+                selection.of_all = ROS2.to_vec();
+            }
         }
         Ok(selection)
     }
@@ -43,11 +67,9 @@ impl Selection {
     /// The names to follow, each once.
     pub(super) fn names(&self) -> Vec<TopicName> {
         let mut names: Vec<TopicName> = Vec::new();
-        let scan = |name: &TopicName| TopicName { topic: Topic::Scan, ..name.clone() };
-        let scans = self.named.iter().filter(|_| self.ros2).map(scan);
-        for name in self.named.iter().cloned().chain(scans) {
-            if !names.contains(&name) {
-                names.push(name);
+        for name in &self.named {
+            if !names.contains(name) {
+                names.push(name.clone());
             }
         }
         names
@@ -55,17 +77,15 @@ impl Selection {
 
     /// The topics to follow of all sensors, in their order.
     pub(super) fn topics(&self) -> Vec<Topic> {
-        let is_wanted = |topic: &Topic| {
-            self.of_all.contains(topic) || (self.ros2 && *topic == Topic::Scan && !self.of_all.is_empty())
-        };
-        Topic::ALL.into_iter().filter(is_wanted).collect()
+        Topic::ALL.into_iter().filter(|topic| self.of_all.contains(topic)).collect()
     }
+}
 
-    /// As what `name` is kept.
-    pub(super) fn track(&self, name: &TopicName) -> Track {
-        let native = self.named.contains(name) || self.of_all.contains(&name.topic);
-        Track { name: name.clone(), native, ros2: self.ros2 && name.topic == Topic::Scan }
-    }
+/// `what` cannot be in a recording for ROS 2.
+fn no_message(what: &str) -> Failure {
+    let message = format!("--ros2 records messages of ROS alone, and {what} has others: only scans are such");
+    let hint = "record without --ros2, and `scanhub convert IN.mcap OUT.mcap --ros2` makes a file for ROS of it later";
+    Failure::new(Kind::Usage, message, hint)
 }
 
 fn no_topic(text: &str) -> Failure {
@@ -91,24 +111,23 @@ mod tests {
         assert_eq!(selection(&[], true, false).unwrap().topics(), Topic::ALL);
         let some = selection(&["front/scan", "*/status", "front/scan"], false, false).unwrap();
         assert_eq!((names(&some), some.topics()), (vec!["front/scan".into()], vec![Topic::Status]));
-        let track = some.track(&TopicName::parse("rear/status").unwrap());
-        assert_eq!((track.native, track.ros2), (true, false));
     }
 
     #[test]
-    fn ros_wants_scans_without_asking_for_ours() {
-        let usual = selection(&[], false, true).unwrap();
-        assert!(usual.topics().contains(&Topic::Scan));
-        let track = usual.track(&TopicName::parse("rear/scan").unwrap());
-        assert_eq!((track.native, track.ros2), (false, true));
-        let front = selection(&["front/telegram"], false, true).unwrap();
+    fn ros_takes_scans_and_where_their_sensors_sit() {
+        let ours = [Topic::Scan, Topic::Status];
+        assert_eq!(selection(&[], false, true).unwrap().topics(), ours);
+        assert_eq!(selection(&["*/scan"], false, true).unwrap().topics(), ours);
+        let front = selection(&["front/scan"], false, true).unwrap();
         assert_eq!(
             (names(&front), front.topics()),
-            (vec!["front/telegram".into(), "front/scan".into()], vec![])
+            (vec!["front/scan".into(), "front/status".into()], vec![])
         );
-        let both = selection(&["*/scan"], false, true).unwrap();
-        let track = both.track(&TopicName::parse("rear/scan").unwrap());
-        assert_eq!((track.native, track.ros2), (true, true));
+        for (texts, everything) in [(&[][..], true), (&["front/zones"], false), (&["*/telegram"], false)] {
+            let failure = selection(texts, everything, true).unwrap_err();
+            assert_eq!(failure.kind, Kind::Usage, "{texts:?}");
+            assert!(failure.hint.contains("convert"), "{failure}");
+        }
     }
 
     #[test]

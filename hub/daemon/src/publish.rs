@@ -10,7 +10,6 @@ use schema::{Flags, Scan};
 
 use crate::clock;
 use crate::link::LinkThread;
-use crate::scanner;
 
 /// What a recording knows of a telegram and nobody could ask a line for; by default nothing.
 #[derive(Clone, Copy, Debug, Default)]

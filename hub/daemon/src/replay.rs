@@ -18,7 +18,6 @@ use schema::{Failure, Flags, State, Wake};
 use crate::clock;
 use crate::control::Flow;
 use crate::link::{LinkThread, Woken};
-use crate::scanner;
 use playback::{Due, Turn};
 
 pub use hub::{Replay, replay};

@@ -2,9 +2,11 @@
 //! that was found in it. Refuses to know who asks, and how progress looks.
 
 mod copy;
+mod decoded;
 mod output;
 mod scans;
 mod times;
+mod views;
 
 use std::cell::Cell;
 use std::io::{self, Write};
@@ -18,8 +20,10 @@ use schema::file::Writer;
 use schema::{Failure, Kind, Status, Topic, check_followed};
 
 use crate::{Damage, Encoding, Form, Recording};
+use decoded::Sight;
 use output::{Place, unwritable};
 use times::Times;
+use views::{Csv, Ros2, View};
 
 /// What to convert.
 #[derive(Clone, Debug, Default)]
@@ -32,20 +36,46 @@ pub struct ConvertOptions {
     pub sensor: Option<String>,
     /// Overwrite what is there.
     pub force: bool,
+    /// An MCAP file of messages of ROS 2 alone.
+    pub ros2: bool,
+    /// For scans: the measuring mode of a recording that does not tell it.
+    pub mode: Option<Mode>,
+}
+
+/// What a recording becomes.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Target {
+    /// A recording again, of this form.
+    Recording(Form),
+    /// An MCAP file of messages of ROS 2 alone.
+    Ros2,
+    /// A row of columns for each scan.
+    Csv,
+}
+
+impl Target {
+    /// The target as a word.
+    pub fn name(self) -> &'static str {
+        match self {
+            Target::Recording(form) => form_name(form),
+            Target::Ros2 => "ROS 2",
+            Target::Csv => "CSV",
+        }
+    }
 }
 
 /// What was converted.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Converted {
     /// Form of the recording, and of what it became.
-    pub forms: (Form, Form),
+    pub forms: (Form, Target),
     /// Its sensors.
     pub sensors: Vec<String>,
     /// Telegrams that were written.
     pub telegrams: u64,
     /// How many of them are scans.
     pub scans: u64,
-    /// Telegrams that the form cannot hold: in a CARMEN log all but whole scans.
+    /// Telegrams that the form cannot hold: in a CARMEN log all but whole scans, for ROS 2 and in columns all but scans.
     pub left_out: u64,
     /// From the first telegram to the last one, in ns, as stamps say: the recording's, or those that were made for it.
     /// Nothing if there are neither.
@@ -60,13 +90,14 @@ pub struct Converted {
 /// are. Whoever closes stdout has enough.
 ///
 /// [`Kind::Configuration`] if the recording cannot be read, or what it shall become cannot be said; [`Kind::Failed`] if it
-/// cannot be written, [`Kind::Interrupted`] if it was stopped. Nothing is left then.
+/// cannot be written, [`Kind::Interrupted`] if it was stopped, [`Kind::Usage`] if options contradict each other. Nothing
+/// is left then.
 pub fn convert(
     options: &ConvertOptions,
     stop: &AtomicBool,
     mut progress: impl FnMut(u64, u64),
 ) -> Result<Converted, Failure> {
-    let form = form_of(&options.output)?;
+    let target = target_of(options)?;
     let whole = Recording::open(&options.input)?;
     let place = Place::check(&options.output, &options.input, options.force)?;
     let recording = match &options.sensor {
@@ -76,7 +107,7 @@ pub fn convert(
     };
     let contents = recording.contents();
     let mut converted = Converted {
-        forms: (contents.form, form),
+        forms: (contents.form, target),
         sensors: contents.sensors.clone(),
         telegrams: 0,
         scans: 0,
@@ -86,7 +117,8 @@ pub fn convert(
         is_closed: false,
     };
     let encoding = encoding(&recording)?;
-    if (contents.form, form) != (Form::Mcap, Form::Mcap) {
+    let is_of_all = matches!(target, Target::Recording(Form::Mcap) | Target::Ros2);
+    if !(contents.form == Form::Mcap && is_of_all) {
         // Refuses to choose of several sensors, before anything is written.
         drop(recording.telegrams(encoding)?);
     }
@@ -113,13 +145,22 @@ pub fn convert(
         }
         Ok(())
     };
-    let written = match form {
-        Form::Mcap if contents.form == Form::Mcap => copy::copy(&recording, &mut file, &mut count, &failed),
-        Form::Mcap => {
-            let sensor = options.sensor.as_deref().unwrap_or(SENSOR);
+    let sensor = options.sensor.as_deref().unwrap_or(SENSOR);
+    let written = match target {
+        Target::Recording(Form::Mcap) if contents.form == Form::Mcap => {
+            copy::copy(&recording, &mut file, &mut count, &failed)
+        }
+        Target::Recording(Form::Mcap) => {
             write_mcap(&recording, sensor, encoding, &mut file, &mut count, &failed)
         }
-        form => {
+        Target::Ros2 => Ros2::begin(&mut file, form_name(contents.form))
+            .map_err(&failed)
+            .and_then(|view| write_view(&recording, options, encoding, view, &mut count, &failed)),
+        Target::Csv => {
+            let view = Csv::begin(Packing::of(&options.output, &mut file));
+            write_view(&recording, options, encoding, view, &mut count, &failed)
+        }
+        Target::Recording(form) => {
             let out = Packing::of(&options.output, &mut file);
             write_bytes(&recording, form, encoding, out, &mut count, &failed)
         }
@@ -204,6 +245,31 @@ fn write_mcap(
     writer.finish().map_err(failed).map(drop)
 }
 
+/// The scans into `view`.
+fn write_view(
+    recording: &Recording,
+    options: &ConvertOptions,
+    encoding: Encoding,
+    mut view: impl View,
+    count: &mut impl FnMut(Written, Option<u64>) -> Result<(), Failure>,
+    failed: &impl Fn(io::Error) -> Failure,
+) -> Result<(), Failure> {
+    let sensor = options.sensor.as_deref().unwrap_or(SENSOR);
+    let mut is_empty = true;
+    decoded::each(recording, sensor, encoding, options.mode, &mut |sight| {
+        let Some(written) = view.see(&sight).map_err(failed)? else { return Ok(()) };
+        let Sight::Scan(_, header, _) = sight else { return count(written, None) };
+        is_empty = false;
+        count(written, Some(header.wall_ns))
+    })?;
+    if is_empty {
+        let message = format!("there is no scan in {}", recording.path().display());
+        let hint = "scans are made of topic telegram, or taken from topic scan";
+        return Err(Failure::new(Kind::Configuration, message, hint));
+    }
+    view.finish().map_err(failed)
+}
+
 /// How the metres of a log become values with the least loss: in centimetres where it has no finer ones, else in
 /// millimetres as far as they reach.
 fn encoding(recording: &Recording) -> Result<Encoding, Failure> {
@@ -221,19 +287,33 @@ fn encoding(recording: &Recording) -> Result<Encoding, Failure> {
     Ok(fine.map_or(cm, |mode| Encoding { unit: Unit::Mm, mode }))
 }
 
-/// The form that the name of a file tells.
-fn form_of(path: &Path) -> Result<Form, Failure> {
+/// What the name of the file and the options tell.
+fn target_of(options: &ConvertOptions) -> Result<Target, Failure> {
+    let target = ending(&options.output)?;
+    let usage = |message: &str, hint: &str| Err(Failure::new(Kind::Usage, message, hint));
+    match (target, options.ros2) {
+        (Target::Recording(Form::Mcap), true) => Ok(Target::Ros2),
+        (_, true) => usage("--ros2 makes an MCAP file", "scanhub convert IN OUT.mcap --ros2"),
+        (Target::Recording(_), _) if options.mode.is_some() => {
+            usage("--mode is for scans, and telegrams are kept as they are", "with --ros2, or OUT.csv")
+        }
+        (target, false) => Ok(target),
+    }
+}
+
+/// What the name of a file tells.
+fn ending(path: &Path) -> Result<Target, Failure> {
     let name = path.file_name().map(|name| name.to_string_lossy().to_lowercase()).unwrap_or_default();
     let plain = name.strip_suffix(".gz").unwrap_or(&name);
     match plain.rsplit_once('.') {
-        _ if name == "-" => Ok(Form::Telegrams),
-        Some((_, "mcap")) if plain == name => Ok(Form::Mcap),
-        Some((_, "log" | "clf")) => Ok(Form::Carmen),
-        Some((_, "bin" | "raw")) => Ok(Form::Telegrams),
+        _ if name == "-" => Ok(Target::Recording(Form::Telegrams)),
+        Some((_, "mcap")) if plain == name => Ok(Target::Recording(Form::Mcap)),
+        Some((_, "log" | "clf")) => Ok(Target::Recording(Form::Carmen)),
+        Some((_, "bin" | "raw")) => Ok(Target::Recording(Form::Telegrams)),
+        Some((_, "csv")) => Ok(Target::Csv),
         _ => {
             let message = format!("the ending of {} tells no form", path.display());
-            let hint =
-                ".mcap, .log (CARMEN), .bin (telegram stream), the last two also with .gz; or - for stdout";
+            let hint = ".mcap; .log (CARMEN), .bin (telegram stream), .csv, also with .gz; or - for stdout";
             Err(Failure::new(Kind::Configuration, message, hint))
         }
     }

@@ -12,7 +12,7 @@ use lms::measured::{self, Measured};
 use lms::reply;
 use lms::telegram::Telegram;
 use lms::variant::{Mode, Unit};
-use recording::convert::{ConvertOptions, Converted, convert};
+use recording::convert::{ConvertOptions, Converted, Target, convert};
 use recording::{BEYOND, Encoding, Form, Frame, Recording};
 use schema::{Failure, Flags};
 
@@ -56,6 +56,7 @@ fn converted(input: &Path, output: &Path, sensor: Option<&str>) -> Result<Conver
         output: output.to_owned(),
         sensor: sensor.map(str::to_owned),
         force: false,
+        ..ConvertOptions::default()
     };
     convert(&options, &AtomicBool::new(false), |_, _| {})
 }
@@ -134,7 +135,7 @@ fn a_stream_gets_times_and_loses_none_of_its_telegrams() {
     let stream = folder.file("a.bin", &[b"noise", &scans.concat()[..]].concat());
     let (mcap, again, log) = (folder.0.join("a.mcap"), folder.0.join("b.bin.gz"), folder.0.join("a.log.gz"));
     let account = converted(&stream, &mcap, Some("left")).unwrap();
-    assert_eq!((account.forms, account.telegrams), ((Form::Telegrams, Form::Mcap), 31));
+    assert_eq!((account.forms, account.telegrams), ((Form::Telegrams, Target::Recording(Form::Mcap)), 31));
     // As the stamps say that it gets: a reply takes its time on the line.
     assert!(
         account.took_ns.is_some_and(|ns| (29 * 26_640_000..30 * 26_640_000).contains(&ns)),

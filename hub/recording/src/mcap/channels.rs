@@ -64,6 +64,11 @@ impl Channels {
         sensors
     }
 
+    /// Whether a channel of the file is `sensor`'s `topic`.
+    pub(crate) fn has(&self, sensor: &str, topic: Topic) -> bool {
+        self.places().any(|place| place.sensor == sensor && place.topic == topic)
+    }
+
     fn places(&self) -> impl Iterator<Item = &Place> {
         self.proven.values().flatten().chain(self.likely.values().flatten())
     }

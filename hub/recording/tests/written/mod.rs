@@ -30,8 +30,12 @@ pub(crate) fn recording(rounds: u64, seed: u64) -> Written {
     let mut random = Rng::with_seed(seed);
     let facts = BTreeMap::from([("domain".to_owned(), "test".to_owned())]);
     let mut writer = Writer::begin(Vec::new(), "", facts).unwrap();
-    let cloud =
-        Foreign { topic: "/imu", encoding: "cdr", schema: ("sensor_msgs/msg/Imu", "float64 x", "ros2msg") };
+    let cloud = Foreign {
+        topic: "/imu",
+        encoding: "cdr",
+        schema: ("sensor_msgs/msg/Imu", "float64 x", "ros2msg"),
+        metadata: &[],
+    };
     let imu = writer.channel(&cloud).unwrap();
     let mut telegrams = Vec::new();
     for round in 0..rounds {

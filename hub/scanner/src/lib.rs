@@ -1,5 +1,6 @@
-//! From a telegram of the sensor's to a scan of ours: the one file that knows both. Ranges are born here, in the
-//! shared memory that consumers read.
+//! From a telegram of the sensor's to a scan of ours: the one file that knows both. Ranges are born here, for the hub in
+//! the shared memory that consumers read.
+#![forbid(unsafe_code)]
 
 use lms::framer::suspect;
 use lms::measured::Measured;
@@ -37,12 +38,12 @@ pub fn decode(measured: &Measured<'_>, mode: Mode, scan: &mut Scan) {
 }
 
 /// Whether a value of `measured` has bits set that `mode` never sets.
-pub(crate) fn is_forbidden(measured: &Measured<'_>, mode: Mode) -> bool {
+pub fn is_forbidden(measured: &Measured<'_>, mode: Mode) -> bool {
     mode.forbidden() != 0 && measured.words().any(|word| word & mode.forbidden() != 0)
 }
 
 /// Nominal time between two scans of `variant` at `baud`, in microseconds; 0 if the variant is not known.
-pub(crate) fn period_us(variant: Option<Variant>, baud: u32) -> u32 {
+pub fn period_us(variant: Option<Variant>, baud: u32) -> u32 {
     // STX to count word, status and checksum: 10 bytes beside the values.
     variant.map_or(0, |variant| (variant.period(2 * variant.beams() + 10, baud) / 1000) as u32)
 }

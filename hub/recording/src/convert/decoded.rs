@@ -1,0 +1,133 @@
+//! What others want of a recording: its scans, and where their sensors sat. Scans are made of the telegrams, as the hub
+//! makes them; of a sensor whose telegrams were not recorded they are those that the hub published. Refuses to know what
+//! becomes of them.
+
+use std::collections::BTreeMap;
+
+use lms::measured::Measured;
+use lms::reply::Reply;
+use lms::telegram::Telegram;
+use lms::variant::Mode;
+use schema::datagram::Packed;
+use schema::{Failure, Header, Kind, Pose, Scan, Status, Topic};
+
+use super::times::Times;
+use crate::mcap::reader::Item;
+use crate::{Encoding, Form, Recording};
+
+/// What comes next in a recording.
+pub(super) enum Sight<'a> {
+    /// A scan of a sensor.
+    Scan(&'a str, Header, &'a Scan),
+    /// From this time on (ns since 1970) a sensor sits there.
+    Pose(&'a str, u64, Pose),
+    /// A telegram that is no scan.
+    Other,
+}
+
+/// What is known of a sensor.
+struct Sensor {
+    mode: Option<Mode>,
+    /// Its scans are made of telegrams.
+    is_decoded: bool,
+}
+
+/// Calls `tell` with all that is in `recording`, in its order. What came without the name of a sensor is of `name`; `mode`
+/// is that of a recording that does not tell it.
+///
+/// [`Kind::Configuration`] if a measuring mode is not told, without which values are no ranges; else the error of `tell`.
+pub(super) fn each(
+    recording: &Recording,
+    name: &str,
+    encoding: Encoding,
+    mode: Option<Mode>,
+    tell: &mut impl FnMut(Sight<'_>) -> Result<(), Failure>,
+) -> Result<(), Failure> {
+    match recording.contents().form {
+        Form::Mcap => each_of_mcap(recording, mode, tell),
+        form => {
+            let told = (form == Form::Carmen).then_some(encoding.mode);
+            let mode = recording.contents().mode.or(told).or(mode);
+            let mut sensor = Sensor { mode, is_decoded: true };
+            sensor.check(recording, name)?;
+            let mut times = Times::of(recording);
+            let mut scan = Scan::default();
+            for (number, frame) in recording.telegrams(encoding)?.enumerate() {
+                let header = times.header(&frame, number as u64);
+                tell(match sensor.decode(&frame.telegram, &mut scan) {
+                    true => Sight::Scan(name, header, &scan),
+                    false => Sight::Other,
+                })?;
+            }
+            Ok(())
+        }
+    }
+}
+
+fn each_of_mcap(
+    recording: &Recording,
+    mode: Option<Mode>,
+    tell: &mut impl FnMut(Sight<'_>) -> Result<(), Failure>,
+) -> Result<(), Failure> {
+    let (mut reader, known) = recording.reader()?;
+    let mut sensors = BTreeMap::new();
+    for name in &recording.contents().sensors {
+        let contents = recording.of(name)?.contents().clone();
+        let mode = contents.mode.or(mode);
+        let is_decoded = contents.scans > 0 && (mode.is_some() || !known.channels.has(name, Topic::Scan));
+        let sensor = Sensor { mode, is_decoded };
+        sensor.check(recording, name)?;
+        sensors.insert(name.clone(), sensor);
+    }
+    let mut scan = Scan::default();
+    while let Some(item) = reader.next().map_err(|error| recording.broken(&error))? {
+        match item {
+            Item::Telegram(sighting) => {
+                let Some(sensor) = sensors.get_mut(&sighting.sensor) else { continue };
+                tell(match sensor.decode(&sighting.telegram, &mut scan) && sensor.is_decoded {
+                    true => Sight::Scan(&sighting.sensor, sighting.header, &scan),
+                    false => Sight::Other,
+                })?;
+            }
+            Item::Record(record) => {
+                let Some((place, header, payload)) = known.message(&record) else { continue };
+                let Some(sensor) = sensors.get_mut(&place.sensor) else { continue };
+                if place.topic == Topic::Scan && !sensor.is_decoded && scan.unpack(payload) {
+                    tell(Sight::Scan(&place.sensor, header, &scan))?;
+                }
+                let mut status = Status::default();
+                if place.topic == Topic::Status && status.unpack(payload) {
+                    let told = Some(Mode(status.mode)).filter(|mode| mode.0 != Status::MODE_UNKNOWN);
+                    sensor.mode = told.or(sensor.mode);
+                    tell(Sight::Pose(&place.sensor, header.wall_ns, status.pose))?;
+                }
+            }
+        }
+    }
+    Ok(())
+}
+
+impl Sensor {
+    /// Its values can become ranges.
+    fn check(&self, recording: &Recording, name: &str) -> Result<(), Failure> {
+        if self.mode.is_some() || !self.is_decoded {
+            return Ok(());
+        }
+        let message = format!("{} does not tell the measuring mode of {name}", recording.path().display());
+        let hint = "--mode says it, such as --mode 0x01; `scanhub doctor PORT` asks the sensor for it";
+        Err(Failure::new(Kind::Configuration, message, hint))
+    }
+
+    /// Makes `scan` of a telegram; `false` if it is none, or nothing says how to read it.
+    fn decode(&mut self, telegram: &[u8], scan: &mut Scan) -> bool {
+        let Some(telegram) = Telegram::check(telegram) else { return false };
+        if let Some(Reply::Configuration(configuration)) = Reply::decode(telegram) {
+            self.mode = Some(configuration.mode());
+        }
+        match (Measured::decode(telegram), self.mode) {
+            (Some(measured), Some(mode)) => scanner::decode(&measured, mode, scan),
+            _ => return false,
+        }
+        true
+    }
+}

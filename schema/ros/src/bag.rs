@@ -1,0 +1,130 @@
+//! Messages of ROS 2 in an MCAP file, as rosbag2 keeps them: profile `ros2`, each channel with its type's text and the
+//! quality of service that its publisher offers. Refuses to know where samples come from.
+
+use std::io::{self, Write};
+
+use schema::file::{Foreign, Writer};
+use schema::{Header, Pose, Scan};
+
+use crate::{LASER_SCAN, TF_MESSAGE, TF_STATIC, Type, frame, laser_scan, scan_topic, static_transforms};
+
+/// The profile of a file that has messages of ROS 2 alone.
+pub const PROFILE: &str = "ros2";
+
+/// What is in a file, as far as the next message depends on it.
+#[derive(Debug, Default)]
+pub struct Bag {
+    /// Channels of the sensors' scans; few enough to be looked through.
+    scans: Vec<(String, u16)>,
+    transforms: Option<Transforms>,
+    poses: Vec<(String, Pose)>,
+    message: Vec<u8>,
+}
+
+/// The channel of the poses.
+#[derive(Clone, Copy, Debug)]
+struct Transforms {
+    channel: u16,
+    /// Number and time of the next message at the earliest: the last one by time is the one that knows most.
+    number: u32,
+    from_ns: u64,
+}
+
+impl Bag {
+    /// Writes a scan of `sensor`, whose log time is the wall clock of its telegram.
+    pub fn scan<W: Write>(
+        &mut self,
+        writer: &mut Writer<W>,
+        sensor: &str,
+        header: &Header,
+        scan: &Scan,
+    ) -> io::Result<()> {
+        let channel = match self.scans.iter().find(|(of, _)| of == sensor) {
+            Some(&(_, channel)) => channel,
+            None => {
+                let channel = channel(writer, &scan_topic(sensor), &LASER_SCAN, EVERY_SCAN)?;
+                self.scans.push((sensor.to_owned(), channel));
+                channel
+            }
+        };
+        self.message.clear();
+        laser_scan(&mut self.message, frame(sensor), header, scan);
+        writer.message(channel, header.topic_seq as u32, header.wall_ns, &self.message)
+    }
+
+    /// Writes where all sensors that are known sit, if it is new that `sensor` sits at `pose`; log time and stamp are
+    /// `wall_ns` (since 1970), or right behind the message before.
+    pub fn pose<W: Write>(
+        &mut self,
+        writer: &mut Writer<W>,
+        sensor: &str,
+        wall_ns: u64,
+        pose: &Pose,
+    ) -> io::Result<()> {
+        match self.poses.iter_mut().find(|(of, _)| of == sensor) {
+            Some((_, known)) if known == pose => return Ok(()),
+            Some((_, known)) => *known = *pose,
+            None => self.poses.push((sensor.to_owned(), *pose)),
+        }
+        let Transforms { channel, number, from_ns } = match self.transforms {
+            Some(known) => known,
+            None => Transforms {
+                channel: channel(writer, TF_STATIC, &TF_MESSAGE, LATCHED)?,
+                number: 0,
+                from_ns: 0,
+            },
+        };
+        let at_ns = wall_ns.max(from_ns);
+        self.transforms =
+            Some(Transforms { channel, number: number.wrapping_add(1), from_ns: at_ns.saturating_add(1) });
+        self.message.clear();
+        static_transforms(&mut self.message, at_ns, &self.poses);
+        writer.message(channel, number, at_ns, &self.message)
+    }
+}
+
+fn channel<W: Write>(writer: &mut Writer<W>, topic: &str, of: &Type, offered: &str) -> io::Result<u16> {
+    writer.channel(&Foreign {
+        topic,
+        encoding: Type::ENCODING,
+        schema: (of.name, of.text, Type::LANGUAGE),
+        metadata: &[("offered_qos_profiles", offered)],
+    })
+}
+
+/// Keep the last 5, reliable, volatile: whoever plays the file offers that, and every subscriber takes it.
+const EVERY_SCAN: &str = "\
+- history: 1
+  depth: 5
+  reliability: 1
+  durability: 2
+  deadline:
+    sec: 9223372036
+    nsec: 854775807
+  lifespan:
+    sec: 9223372036
+    nsec: 854775807
+  liveliness: 1
+  liveliness_lease_duration:
+    sec: 9223372036
+    nsec: 854775807
+  avoid_ros_namespace_conventions: false
+";
+/// Keep the last one, reliable, transient local: listeners to transforms ask for that.
+const LATCHED: &str = "\
+- history: 1
+  depth: 1
+  reliability: 1
+  durability: 1
+  deadline:
+    sec: 9223372036
+    nsec: 854775807
+  lifespan:
+    sec: 9223372036
+    nsec: 854775807
+  liveliness: 1
+  liveliness_lease_duration:
+    sec: 9223372036
+    nsec: 854775807
+  avoid_ros_namespace_conventions: false
+";

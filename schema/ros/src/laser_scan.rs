@@ -1,0 +1,112 @@
+//! A scan as `sensor_msgs/msg/LaserScan`. Refuses to know where the sensor sits.
+
+use std::f64::consts::FRAC_PI_2;
+
+use schema::{Code, Header, Scan, TURN_NS};
+
+use crate::cdr::Cdr;
+
+/// Writes `scan`, of the frame `frame`, to the end of `message`: x ahead, angles in radians counter-clockwise from there as
+/// the sensor itself counts them, also where it hangs upside down; ranges in metres (REP 103), each the float that is
+/// nearest to what the sensor said. +inf where nothing came back from as far as the sensor sees, -inf where something is
+/// too near, NaN where nothing can be said (REP 117). Stamped when its first beam was measured.
+pub fn laser_scan(message: &mut Vec<u8>, frame: &str, header: &Header, scan: &Scan) {
+    let mut cdr = Cdr::begin(message);
+    cdr.header(header.wall_ns.saturating_sub(scan.beam_age_ns(0)), frame);
+    let ahead = |i: usize| (scan.angle_deg(i).to_radians() - FRAC_PI_2) as f32;
+    let step_deg = f64::from(scan.step_mdeg) / 1000.0;
+    // Beams that stand between others are measured a turn later: then no one time lies between two.
+    let beam_ns = if scan.step_mdeg >= 1000 { step_deg / 360.0 * TURN_NS as f64 } else { 0.0 };
+    let greatest = u32::from(scan.max().saturating_sub(Code::BEYOND.0 + 1));
+    for value in [
+        ahead(0),
+        ahead(scan.beams().saturating_sub(1)),
+        step_deg.to_radians() as f32,
+        (beam_ns / 1e9) as f32,
+        (f64::from(header.period_us) / 1e6) as f32,
+        metres(scan.unit_mm.into()),
+        metres(greatest * u32::from(scan.unit_mm)),
+    ] {
+        cdr.f32(value);
+    }
+    cdr.floats((0..scan.beams()).map(|i| range_m(scan, i)));
+    cdr.floats(scan.intensities().iter().map(|&value| f32::from(value)));
+}
+
+fn range_m(scan: &Scan, i: usize) -> f32 {
+    match (scan.distance_mm(i), scan.code(i)) {
+        (Some(0), _) => f32::NEG_INFINITY,
+        (Some(mm), _) => metres(mm),
+        (None, Some(Code::NO_RETURN | Code::BEYOND)) => f32::INFINITY,
+        (None, _) => f32::NAN,
+    }
+}
+
+/// The nearest float: both numbers are exact in one, and a division is rounded once.
+fn metres(mm: u32) -> f32 {
+    mm as f32 / 1000.0
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn scan(ranges: &[u16]) -> Scan {
+        let mut scan = Scan {
+            count: ranges.len() as u16,
+            unit_mm: 10,
+            range_bits: 13,
+            step_mdeg: 1000,
+            first_angle_mdeg: 0,
+            ..Scan::default()
+        };
+        scan.range_array[..ranges.len()].copy_from_slice(ranges);
+        scan
+    }
+
+    /// The numbers behind a frame of four letters, whose end makes three bytes of padding.
+    fn numbers(message: &[u8]) -> Vec<f32> {
+        let body = &message[4..];
+        assert_eq!(body[8..20], [5, 0, 0, 0, b'r', b'e', b'a', b'r', 0, 0, 0, 0]);
+        body[20..].chunks_exact(4).map(|four| f32::from_le_bytes(four.try_into().unwrap())).collect()
+    }
+
+    #[test]
+    fn a_scan_is_these_numbers() {
+        let header = Header { wall_ns: 1_700_000_001_000_000_000, period_us: 13_320, ..Header::default() };
+        let mut message = Vec::new();
+        let mut it = scan(&[100, 0x1FFF, 0x1FF7, 0x1FFE, 0, 0x1FF6]);
+        it.contents = 1;
+        it.intensity_bits = 3;
+        it.upper_array[1] = 7;
+        laser_scan(&mut message, "rear", &header, &it);
+        assert_eq!(message[..4], [0, 1, 0, 0]);
+        // The first of six beams of a degree each was measured five 360ths of a turn before the last, which stamps.
+        let nanosec = 1_000_000_000 - 5 * TURN_NS / 360;
+        assert_eq!(message[4..8], 1_700_000_000_i32.to_le_bytes());
+        assert_eq!(message[8..12], (nanosec as u32).to_le_bytes());
+        let told = numbers(&message);
+        let near = |a: f32, b: f32| (a - b).abs() < 1e-6;
+        assert!(near(told[0], -std::f32::consts::FRAC_PI_2) && near(told[1], 5_f32.to_radians() + told[0]));
+        assert!(near(told[2], 1_f32.to_radians()) && near(told[3], 37e-6) && near(told[4], 0.01332));
+        // The greatest range is within what the message says is the greatest.
+        assert_eq!((told[5], told[6], told[13]), (0.01, 81.82, 81.82));
+        assert_eq!(told[7].to_bits(), 6);
+        assert_eq!(
+            (told[8], told[9], told[10], told[12]),
+            (1.0, f32::INFINITY, f32::INFINITY, f32::NEG_INFINITY)
+        );
+        assert!(told[11].is_nan());
+        assert_eq!(told[14].to_bits(), 6);
+        assert_eq!(told[15..], [0.0, 7.0, 0.0, 0.0, 0.0, 0.0]);
+    }
+
+    #[test]
+    fn beams_of_several_turns_have_no_one_time_between_them() {
+        let mut message = Vec::new();
+        let between = Scan { step_mdeg: 500, ..scan(&[100; 9]) };
+        laser_scan(&mut message, "rear", &Header { wall_ns: 1 << 60, ..Header::default() }, &between);
+        let told = numbers(&message);
+        assert_eq!((told[3], told[7].to_bits(), told[17].to_bits(), told.len()), (0.0, 9, 0, 18));
+    }
+}
