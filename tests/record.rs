@@ -101,6 +101,26 @@ fn whatever_ends_it_the_file_is_finished() {
 }
 
 #[test]
+fn files_are_packed_as_they_are_told() {
+    let stage = Stage::new();
+    let _others = sensors(&stage, &["--world=room"]);
+    let file = stage.word("walk.mcap");
+    let bytes_each = [(&[][..], "zstd"), (&["--compression=lz4"], "lz4"), (&["--compression=none"], "")].map(
+        |(flags, wanted)| {
+            let words = [&["record", "--json", "--force", "--for=2s", "-o", &file][..], flags].concat();
+            let samples = number(&recorded(&stage.run(&words)), "samples");
+            assert_eq!(Recording::whole(&stage.path("walk.mcap")).kept.len() as u64, samples);
+            let bytes = std::fs::read(&file).unwrap();
+            let chunks = mcap::Summary::read(&bytes).unwrap().unwrap().chunk_indexes;
+            assert!(chunks.len() > 5 && chunks.iter().all(|chunk| chunk.compression == wanted), "{wanted}");
+            bytes.len() as u64 / samples
+        },
+    );
+    assert!(bytes_each[0] < bytes_each[1] && 3 * bytes_each[1] < 2 * bytes_each[2], "{bytes_each:?}");
+    assert_eq!(stage.run(&["record", "--compression=zip"]).code, Some(2));
+}
+
+#[test]
 fn a_kill_leaves_all_that_was_told() {
     let stage = Stage::new();
     let _others = sensors(&stage, &[]);

@@ -344,3 +344,17 @@ fn the_first_consumer_is_compiled() {
         ]
     });
 }
+
+/// What needs a C compiler comes with recordings alone.
+#[test]
+fn clients_that_do_not_record_need_no_c_compiler() {
+    let in_c = |features: &[&str]| {
+        let crates = crates::built_from("scanhub-clients", features);
+        // The exception is the kernel's interface in Rust.
+        let is_in_c = |name: &String| name.contains("-sys ") && !name.starts_with("linux-raw-sys");
+        crates.into_iter().filter(is_in_c).collect::<Vec<_>>()
+    };
+    assert_eq!(in_c(&["--no-default-features", "--features", "tui"]), Vec::<String>::new());
+    let recording = in_c(&["--no-default-features", "--features", "record"]);
+    assert!(recording.iter().any(|name| name.starts_with("zstd-sys")), "{recording:?}");
+}

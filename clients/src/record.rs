@@ -21,6 +21,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::thread::{self, JoinHandle};
 use std::time::{Duration, Instant};
 
+use schema::file::Compression;
 use schema::{Domain, Failure, Header, Kind};
 
 use crate::account::Account;
@@ -33,7 +34,7 @@ use crate::spare::Spare;
 use disk::Disk;
 use files::Files;
 pub use files::Split;
-use part::Form;
+use part::{Form, Style};
 use queue::{Entry, Gap, Queue};
 use report::Report;
 use selection::Selection;
@@ -48,6 +49,8 @@ pub struct RecordOptions {
     pub everything: bool,
     /// Scans as messages of ROS 2 and where the sensors sit, and nothing else.
     pub ros2: bool,
+    /// How its chunks are packed.
+    pub compression: Compression,
     /// The file; `-` is stdout, and without one it is named after the time.
     pub file: Option<PathBuf>,
     /// What stands at the file's place is overwritten.
@@ -156,7 +159,8 @@ fn begin(options: &RecordOptions, queue: &Arc<Queue>) -> Result<Disk, End> {
         }
     };
     let form = if options.ros2 { Form::Ros2 } else { Form::Hub };
-    let begun = Disk::begin(queue.clone(), files, options.split, form, facts(options, wall_ns));
+    let style = Style { form, compression: options.compression };
+    let begun = Disk::begin(queue.clone(), files, options.split, style, facts(options, wall_ns));
     begun.map_err(|error| match error.kind() {
         ErrorKind::BrokenPipe => refusal::reader_gone(0).into(),
         _ => failed(error).into(),

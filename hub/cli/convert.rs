@@ -8,6 +8,7 @@ use clap::Args;
 use recording::Damage;
 use recording::convert::{self, ConvertOptions, Converted};
 use schema::Failure;
+use schema::file::Compression;
 use serde::Serialize;
 use sim::options;
 
@@ -31,6 +32,9 @@ pub(crate) struct Convert {
     /// With --ros2 or .csv: measuring mode of a recording that does not tell it, such as 0x01
     #[arg(long)]
     mode: Option<String>,
+    /// How an MCAP file is packed: zstd, lz4 or none [default: zstd]
+    #[arg(long, value_name = "NAME", value_parser = Compression::parse)]
+    compression: Option<Compression>,
     /// Overwrite what is there
     #[arg(short, long)]
     force: bool,
@@ -45,6 +49,7 @@ impl Convert {
             sensor: self.sensor.clone(),
             force: self.force,
             ros2: self.ros2,
+            compression: self.compression,
             mode: self.mode.as_deref().map(options::parse_mode).transpose()?,
         };
         let is_watched = stderr().is_terminal() && !json;

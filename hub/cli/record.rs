@@ -6,6 +6,7 @@ use std::path::{Path, PathBuf};
 use clap::Args;
 use clients::{RecordLook, RecordOptions, Split};
 use schema::Failure;
+use schema::file::Compression;
 
 use super::{Everywhere, Limits};
 
@@ -21,6 +22,9 @@ pub(crate) struct Record {
     /// A file of ROS 2 messages alone: scans as sensor_msgs/msg/LaserScan, and /tf_static from the poses
     #[arg(long)]
     ros2: bool,
+    /// How it is packed: zstd, lz4 or none
+    #[arg(long, value_name = "NAME", default_value = "zstd", value_parser = Compression::parse)]
+    compression: Compression,
     /// The recording; - for stdout [default: scanhub-DATE-TIME.mcap]
     #[arg(short, long, value_name = "FILE")]
     output: Option<PathBuf>,
@@ -49,6 +53,7 @@ impl Record {
             topics: self.topics.clone(),
             everything: self.all,
             ros2: self.ros2,
+            compression: self.compression,
             file: self.output.clone(),
             force: self.force,
             split: self.split,

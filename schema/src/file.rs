@@ -2,6 +2,8 @@
 //! header of shared memory and, behind it, the payload as it goes over a network (docs/recording.md). Refuses to know
 //! where samples come from, when a chunk is full, and what a disk does.
 
+mod compression;
+
 use std::collections::BTreeMap;
 use std::io::{self, BufWriter, Write};
 
@@ -11,6 +13,7 @@ use mcap::write::NoSeek;
 use mcap::{Attachment, McapError, WriteOptions};
 
 use crate::{Header, Topic};
+pub use compression::Compression;
 
 /// Encoding of the messages, and of the text that describes them.
 pub const ENCODING: &str = "scanhub";
@@ -40,11 +43,24 @@ pub struct Foreign<'a> {
 }
 
 impl<W: Write> Writer<W> {
-    /// Begins a recording of `profile` (empty, or `ros2`), of which `facts` are told.
+    /// Begins a recording of `profile` (empty, or `ros2`), of which `facts` are told; its chunks are not packed.
     pub fn begin(out: W, profile: &str, facts: BTreeMap<String, String>) -> io::Result<Self> {
+        Writer::packed(out, profile, Compression::None, facts)
+    }
+
+    /// The same with chunks that are packed by `compression`.
+    pub fn packed(
+        out: W,
+        profile: &str,
+        compression: Compression,
+        facts: BTreeMap<String, String>,
+    ) -> io::Result<Self> {
         // A chunk is written when it is closed: a process that is killed leaves whole chunks and nothing else.
         let options = WriteOptions::new()
-            .compression(PACKING)
+            .compression(compression.of_library())
+            .compression_level(compression.level())
+            // Chunks are short, and whoever writes them has one thread for that.
+            .compression_threads(0)
             .profile(profile)
             .library("scanhub")
             .chunk_size(None)
@@ -161,8 +177,3 @@ fn io_error(error: McapError) -> io::Error {
 
 /// What stands in a file about the messages, for whoever has nothing but the file.
 const LAYOUT: &str = include_str!("file/layout.txt");
-
-#[cfg(feature = "lz4")]
-const PACKING: Option<mcap::Compression> = Some(mcap::Compression::Lz4);
-#[cfg(not(feature = "lz4"))]
-const PACKING: Option<mcap::Compression> = None;

@@ -40,7 +40,6 @@ fn recording() -> Vec<u8> {
     writer.finish().unwrap()
 }
 
-#[cfg(not(feature = "lz4"))]
 #[test]
 fn values_are_these_bytes() {
     let path = concat!(env!("CARGO_MANIFEST_DIR"), "/../tests/vectors/recording/v1.mcap");

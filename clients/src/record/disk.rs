@@ -12,7 +12,7 @@ use schema::Topic;
 
 use super::Kept;
 use super::files::{Files, Split, discard};
-use super::part::{Form, Part, Place};
+use super::part::{Part, Place, Style};
 use super::queue::{Batch, EVERY, Entry, Queue};
 use super::told::{News, Told};
 use crate::names::TopicName;
@@ -24,7 +24,7 @@ pub(super) struct Disk {
     files: Option<Files>,
     split: Option<Split>,
     facts: BTreeMap<String, String>,
-    form: Form,
+    style: Style,
     part: Part,
     tracks: Vec<TopicName>,
     /// The last one of each track of that topic.
@@ -52,7 +52,7 @@ impl Disk {
         queue: Arc<Queue>,
         files: Result<Files, File>,
         split: Option<Split>,
-        form: Form,
+        style: Style,
         facts: BTreeMap<String, String>,
     ) -> io::Result<Disk> {
         let (files, place) = match files {
@@ -62,7 +62,7 @@ impl Disk {
             }
             Err(stream) => (None, Place::Stream(stream)),
         };
-        let mut part = Part::begin(place, form, numbered(&facts, files.as_ref()))?;
+        let mut part = Part::begin(place, style, numbered(&facts, files.as_ref()))?;
         // What could not even be begun is not in the way of the next try.
         part.write().inspect_err(|_| part.path().into_iter().for_each(discard))?;
         let told = Told::default();
@@ -73,7 +73,7 @@ impl Disk {
             files,
             split,
             facts,
-            form,
+            style,
             part,
             tracks: Vec::new(),
             statuses: Vec::new(),
@@ -199,7 +199,7 @@ impl Disk {
         let Some(files) = &mut self.files else { return Ok(()) };
         let (path, file) = files.next()?;
         let facts = numbered(&self.facts, Some(files));
-        let mut part = Part::begin(Place::File(file, path.clone()), self.form, facts)?;
+        let mut part = Part::begin(Place::File(file, path.clone()), self.style, facts)?;
         part.repeat(&self.tracks, &self.statuses)?;
         part.add(&self.tracks, &self.batch)?;
         files.prune();
@@ -285,8 +285,10 @@ mod tests {
     use std::fs;
     use std::path::Path;
 
+    use schema::file::Compression;
     use schema::{Header, Status};
 
+    use super::super::part::Form;
     use super::*;
 
     /// A recording in a directory of its own, of the status of these sensors.
@@ -294,7 +296,8 @@ mod tests {
         let place = std::env::temp_dir().join(format!("scanhub-{name}-{}", std::process::id()));
         fs::create_dir_all(&place).unwrap();
         let files = Files::new(&place.join("walk.mcap"), split.is_some(), false, None);
-        let disk = Disk::begin(Arc::new(Queue::new()), Ok(files), split, Form::Hub, BTreeMap::new()).unwrap();
+        let style = Style { form: Form::Hub, compression: Compression::None };
+        let disk = Disk::begin(Arc::new(Queue::new()), Ok(files), split, style, BTreeMap::new()).unwrap();
         for sensor in sensors {
             let name = TopicName { sensor: (*sensor).to_owned(), topic: Topic::Status };
             disk.queue.note(Entry::Track(name));

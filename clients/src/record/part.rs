@@ -11,7 +11,7 @@ use std::time::{Duration, Instant};
 
 use ros::bag::{self, Bag};
 use schema::datagram::Packed;
-use schema::file::Writer;
+use schema::file::{Compression, Writer};
 use schema::{Header, Scan, Status, Topic};
 
 use super::Kept;
@@ -47,6 +47,13 @@ pub(super) struct Part {
     /// Of a recording for ROS 2.
     bag: Option<Bag>,
     scan: Scan,
+}
+
+/// How a file is written.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Style {
+    pub(super) form: Form,
+    pub(super) compression: Compression,
 }
 
 /// What the messages are.
@@ -92,9 +99,9 @@ impl Write for Made {
 
 impl Part {
     /// A new one at `place`, of which `facts` are told; nothing is written yet.
-    pub(super) fn begin(place: Place, form: Form, facts: BTreeMap<String, String>) -> io::Result<Part> {
+    pub(super) fn begin(place: Place, style: Style, facts: BTreeMap<String, String>) -> io::Result<Part> {
         let made = Made::default();
-        let writer = Some(Writer::begin(made.clone(), form.profile(), facts)?);
+        let writer = Some(Writer::packed(made.clone(), style.form.profile(), style.compression, facts)?);
         Ok(Part {
             writer,
             made,
@@ -110,7 +117,7 @@ impl Part {
             lives: Vec::new(),
             topics: Vec::new(),
             met: Vec::new(),
-            bag: (form == Form::Ros2).then(Bag::default),
+            bag: (style.form == Form::Ros2).then(Bag::default),
             scan: Scan::default(),
         })
     }
@@ -317,7 +324,8 @@ mod tests {
         let (mut reader, writer) = io::pipe().unwrap();
         rustix::io::ioctl_fionbio(&writer, true).unwrap();
         let stream = Place::Stream(File::from(std::os::fd::OwnedFd::from(writer)));
-        let mut part = Part::begin(stream, Form::Hub, BTreeMap::new()).unwrap();
+        let style = Style { form: Form::Hub, compression: Compression::None };
+        let mut part = Part::begin(stream, style, BTreeMap::new()).unwrap();
         part.made.write_all(&[7; 300_000]).unwrap();
         let made = part.made.0.lock().unwrap().clone();
         let mut read = Vec::new();

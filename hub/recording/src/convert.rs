@@ -13,10 +13,9 @@ use std::io::{self, Write};
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, Ordering};
 
-use flate2::Compression;
 use flate2::write::GzEncoder;
 use lms::variant::{Mode, Unit};
-use schema::file::Writer;
+use schema::file::{Compression, Writer};
 use schema::{Failure, Kind, Status, Topic, check_followed};
 
 use crate::{Damage, Encoding, Form, Recording};
@@ -40,6 +39,8 @@ pub struct ConvertOptions {
     pub ros2: bool,
     /// For scans: the measuring mode of a recording that does not tell it.
     pub mode: Option<Mode>,
+    /// How an MCAP file is packed, if not as usual.
+    pub compression: Option<Compression>,
 }
 
 /// What a recording becomes.
@@ -146,14 +147,16 @@ pub fn convert(
         Ok(())
     };
     let sensor = options.sensor.as_deref().unwrap_or(SENSOR);
+    let compression = options.compression.unwrap_or_default();
     let written = match target {
         Target::Recording(Form::Mcap) if contents.form == Form::Mcap => {
-            copy::copy(&recording, &mut file, &mut count, &failed)
+            copy::copy(&recording, compression, &mut file, &mut count, &failed)
         }
         Target::Recording(Form::Mcap) => {
-            write_mcap(&recording, sensor, encoding, &mut file, &mut count, &failed)
+            let file = (&mut file, compression);
+            write_mcap(&recording, sensor, encoding, file, &mut count, &failed)
         }
-        Target::Ros2 => Ros2::begin(&mut file, form_name(contents.form))
+        Target::Ros2 => Ros2::begin(&mut file, compression, form_name(contents.form))
             .map_err(&failed)
             .and_then(|view| write_view(&recording, options, encoding, view, &mut count, &failed)),
         Target::Csv => {
@@ -217,12 +220,12 @@ fn write_mcap(
     recording: &Recording,
     sensor: &str,
     encoding: Encoding,
-    file: &mut impl Write,
+    (file, compression): (&mut impl Write, Compression),
     count: &mut impl FnMut(Written, Option<u64>) -> Result<(), Failure>,
     failed: &impl Fn(io::Error) -> Failure,
 ) -> Result<(), Failure> {
     let facts = [("converted from".to_owned(), form_name(recording.contents().form).to_owned())];
-    let mut writer = Writer::begin(file, "", facts.into()).map_err(failed)?;
+    let mut writer = Writer::packed(file, "", compression, facts.into()).map_err(failed)?;
     let mut times = Times::of(recording);
     let mut bytes = 0;
     for (number, frame) in recording.telegrams(encoding)?.enumerate() {
@@ -293,6 +296,11 @@ fn target_of(options: &ConvertOptions) -> Result<Target, Failure> {
     let usage = |message: &str, hint: &str| Err(Failure::new(Kind::Usage, message, hint));
     match (target, options.ros2) {
         (Target::Recording(Form::Mcap), true) => Ok(Target::Ros2),
+        (Target::Csv | Target::Recording(Form::Telegrams | Form::Carmen), _)
+            if options.compression.is_some() =>
+        {
+            usage("--compression is for MCAP files", "name another OUT with .gz, which packs it")
+        }
         (_, true) => usage("--ros2 makes an MCAP file", "scanhub convert IN OUT.mcap --ros2"),
         (Target::Recording(_), _) if options.mode.is_some() => {
             usage("--mode is for scans, and telegrams are kept as they are", "with --ros2, or OUT.csv")
@@ -338,7 +346,7 @@ impl<W: Write> Packing<W> {
     fn of(path: &Path, file: W) -> Self {
         match path.extension() {
             Some(ending) if ending.eq_ignore_ascii_case("gz") => {
-                Packing::Gzip(GzEncoder::new(file, Compression::default()))
+                Packing::Gzip(GzEncoder::new(file, flate2::Compression::default()))
             }
             _ => Packing::Plain(file),
         }

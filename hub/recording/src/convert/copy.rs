@@ -6,7 +6,7 @@ use std::io::{self, Write};
 
 use mcap::parse_record;
 use mcap::records::{Record as Parsed, op};
-use schema::file::{METADATA, Writer};
+use schema::file::{Compression, METADATA, Writer};
 use schema::{Failure, Topic};
 
 use super::{CHUNK, Written};
@@ -17,6 +17,7 @@ use crate::mcap::{Originals, Record, message};
 /// Copies `recording` into `file`; `count` hears of each telegram.
 pub(super) fn copy(
     recording: &Recording,
+    compression: Compression,
     file: &mut impl Write,
     count: &mut impl FnMut(Written, Option<u64>) -> Result<(), Failure>,
     failed: &impl Fn(io::Error) -> Failure,
@@ -24,7 +25,8 @@ pub(super) fn copy(
     let (mut reader, known) = recording.reader()?;
     let originals = &known.originals;
     let sensor = recording.chosen();
-    let writer = Writer::begin(file, &originals.profile, originals.facts.clone()).map_err(failed)?;
+    let writer =
+        Writer::packed(file, &originals.profile, compression, originals.facts.clone()).map_err(failed)?;
     let mut copy = Copy { writer, originals, channels: BTreeMap::new(), has_facts: false, bytes: 0 };
     while let Some(item) = reader.next().map_err(|error| recording.broken(&error))? {
         match item {

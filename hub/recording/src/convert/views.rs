@@ -5,7 +5,7 @@ use std::io::{self, Write};
 
 use ros::bag::{self, Bag};
 use schema::csv;
-use schema::file::Writer;
+use schema::file::{Compression, Writer};
 
 use super::decoded::Sight;
 use super::{CHUNK, Packing, Written};
@@ -28,9 +28,13 @@ pub(super) struct Ros2<W: Write> {
 }
 
 impl<W: Write> Ros2<W> {
-    pub(super) fn begin(file: W, from: &str) -> io::Result<Self> {
+    pub(super) fn begin(file: W, compression: Compression, from: &str) -> io::Result<Self> {
         let facts = [("converted from".to_owned(), from.to_owned())];
-        Ok(Ros2 { writer: Writer::begin(file, bag::PROFILE, facts.into())?, bag: Bag::default(), beams: 0 })
+        Ok(Ros2 {
+            writer: Writer::packed(file, bag::PROFILE, compression, facts.into())?,
+            bag: Bag::default(),
+            beams: 0,
+        })
     }
 }
 

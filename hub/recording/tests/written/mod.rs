@@ -7,7 +7,7 @@ use lms::measured;
 use lms::reply;
 use lms::variant::{Mode, Unit};
 use schema::datagram::Packed;
-use schema::file::{Foreign, Writer};
+use schema::file::{Compression, Foreign, Writer};
 use schema::{Background, Flags, Foreground, Header, Marks, Scan, Status, Topic, Zones};
 
 /// A telegram that was written.
@@ -27,9 +27,14 @@ pub(crate) struct Written {
 /// `rounds` telegrams of each sensor with all that the hub makes of them, a chunk for each four, a channel of somebody
 /// else's.
 pub(crate) fn recording(rounds: u64, seed: u64) -> Written {
+    packed(rounds, seed, Compression::None)
+}
+
+/// The same with packed chunks.
+pub(crate) fn packed(rounds: u64, seed: u64, compression: Compression) -> Written {
     let mut random = Rng::with_seed(seed);
     let facts = BTreeMap::from([("domain".to_owned(), "test".to_owned())]);
-    let mut writer = Writer::begin(Vec::new(), "", facts).unwrap();
+    let mut writer = Writer::packed(Vec::new(), "", compression, facts).unwrap();
     let cloud = Foreign {
         topic: "/imu",
         encoding: "cdr",
