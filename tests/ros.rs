@@ -4,7 +4,6 @@
 mod stage;
 
 use std::collections::BTreeMap;
-use std::f64::consts::PI;
 use std::process::Command;
 
 use schema::datagram::Packed;
@@ -14,7 +13,7 @@ use stage::{INT, MEASURED, Recording, Stage, is_class, number, python};
 
 /// Two sensors with poses, of which one hangs upside down.
 const FRONT: Pose = Pose { x_m: 0.3, y_m: 0.1, yaw_rad: 0.25, upside_down: 0, reserved: [0; 7] };
-const REAR: Pose = Pose { x_m: -0.25, y_m: 0.0, yaw_rad: 3.1416, upside_down: 1, reserved: [0; 7] };
+const REAR: Pose = Pose { x_m: -0.25, y_m: 0.0, yaw_rad: -2.5, upside_down: 1, reserved: [0; 7] };
 
 fn link(stage: &Stage, name: &str, pose: &Pose) -> Vec<String> {
     let mut words = vec![stage.link(name)];
@@ -176,7 +175,6 @@ fn others_read_every_message_made_live_and_later() {
             }
         }
     }
-    assert!((REAR.yaw_rad - PI).abs() < 1e-4, "the rear one looks back");
 }
 
 #[test]
