@@ -27,6 +27,8 @@ pub mod ipc;
 pub mod limits;
 #[cfg(feature = "ipc")]
 mod lock;
+#[cfg(feature = "files")]
+pub mod regular;
 #[cfg(feature = "json")]
 mod saved;
 #[cfg(feature = "ipc")]
