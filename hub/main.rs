@@ -57,6 +57,8 @@ fn main() -> ExitCode {
 
 fn dispatch(cli: &Cli) -> Result<(), Failure> {
     let everywhere = &cli.everywhere;
+    // A file that may not grow is an error of its write, and no end.
+    interrupt_by(&[SIGXFSZ])?;
     // Without the standard library's buffer, which cuts at line feeds: one write is one sample, a raw one too.
     let stdout = io::stdout().as_fd().try_clone_to_owned().map(File::from);
     let mut out = stdout.map_err(|error| Failure::new(Kind::Failed, format!("no stdout: {error}"), ""))?;
@@ -131,8 +133,8 @@ fn dispatch(cli: &Cli) -> Result<(), Failure> {
         }
         Verb::Record(record) => {
             let options = record.options(everywhere)?;
-            // Whatever ends it, the file is finished. A file that may not grow is an error of its write, and no end.
-            let (stop, _) = (interrupt_by(&ENDS)?, interrupt_by(&[SIGXFSZ])?);
+            // Whatever ends it, the file is finished.
+            let stop = interrupt_by(&ENDS)?;
             let mut stderr = io::stderr();
             match record.is_to_stdout() {
                 true => clients::record(&options, &mut io::stderr(), &mut stderr, &stop),

@@ -41,7 +41,8 @@ impl Allowance {
         }
         let since = self.short.filter(|&(_, last)| now < last + CALM).map_or(now, |(since, _)| since);
         self.short = Some((since, now));
-        Some(until.clamp(any_at, enough_at))
+        // What is overdue waits for the end of the bytes, and did not come to it.
+        Some(if until > now { until.clamp(any_at, enough_at) } else { enough_at })
     }
 
     /// Whether more came for a while, as of `now`.
@@ -129,7 +130,8 @@ mod tests {
         allowance.take(100_000, SECOND);
         assert_eq!(allowance.bytes(SECOND), 0);
         let (byte, portion) = (SECOND + 10_000, SECOND + PORTION);
-        assert_eq!(allowance.rest(SECOND, 0), Some(byte), "a byte has to be allowed");
+        assert_eq!(allowance.rest(SECOND, SECOND + 1), Some(byte), "a byte has to be allowed");
+        assert_eq!(allowance.rest(SECOND, 0), Some(portion), "it is overdue");
         assert_eq!(allowance.rest(SECOND, byte + 5), Some(byte + 5));
         assert_eq!(allowance.rest(SECOND, Nanos::MAX), Some(portion));
         assert_eq!((allowance.bytes(byte), allowance.bytes(portion)), (1, 2_000));
