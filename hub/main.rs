@@ -19,7 +19,7 @@ use clap::error::ErrorKind;
 use clients::{EchoOptions, Format, HzOptions, InfoOptions, ListOptions};
 use daemon::Config;
 use rustix::process::Signal;
-use schema::{Domain, Failure, Kind};
+use schema::{Domain, Failure, Kind, Printable, json_line};
 use serde::Serialize;
 use signal_hook::consts::{SIGHUP, SIGINT, SIGQUIT, SIGTERM, SIGUSR1};
 use tracing::level_filters::LevelFilter;
@@ -229,7 +229,7 @@ struct ReadyPort<'a> {
 }
 
 fn line(value: &impl Serialize) -> String {
-    serde_json::to_string(value).unwrap_or_default()
+    json_line(serde_json::to_string(value).unwrap_or_default())
 }
 
 /// A file would become longer than is allowed; signal-hook has no name for it.
@@ -260,6 +260,11 @@ fn no_handler(error: io::Error) -> Failure {
 ///
 /// [`Kind::Failed`] if it cannot be written, as on a full disk.
 fn print(text: &str) -> Result<(), Failure> {
+    print_own(&Printable(text).to_string())
+}
+
+/// The same of text that is all ours, which may have tabs.
+fn print_own(text: &str) -> Result<(), Failure> {
     match io::stdout().lock().write_all(format!("{text}\n").as_bytes()) {
         Err(error) if error.kind() != io::ErrorKind::BrokenPipe => {
             Err(Failure::new(Kind::Failed, format!("cannot write: {error}"), ""))
@@ -270,7 +275,7 @@ fn print(text: &str) -> Result<(), Failure> {
 
 /// Writes one line to stdout; whoever closed it does not want it.
 fn say(line: &str) {
-    let _ = io::stdout().lock().write_all(format!("{line}\n").as_bytes());
+    let _ = io::stdout().lock().write_all(format!("{}\n", Printable(line)).as_bytes());
 }
 
 fn report(failure: &Failure, json: bool, quiet: bool) {
@@ -283,7 +288,7 @@ fn report(failure: &Failure, json: bool, quiet: bool) {
 
 /// Writes one line to stderr, which may be a terminal that is gone.
 fn complain(line: &str) {
-    let _ = io::stderr().lock().write_all(format!("{line}\n").as_bytes());
+    let _ = io::stderr().lock().write_all(format!("{}\n", Printable(line)).as_bytes());
 }
 
 /// The command line cannot be understood, or asks for help only.

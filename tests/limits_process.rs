@@ -71,7 +71,9 @@ fn files_that_may_not_be_as_long_as_a_segment_are_told() {
         assert_eq!(stage.left_behind(), Vec::<PathBuf>::new());
     }
     let hub = stage.hub(&[stage.link("front")]);
-    for verb in [&["record", "-o", &stage.word("walk.mcap")][..], &["info", "front"], &["echo", "front/status"]] {
+    for verb in
+        [&["record", "-o", &stage.word("walk.mcap")][..], &["info", "front"], &["echo", "front/status"]]
+    {
         is_short(&limited(&stage, "-f 1", verb).wait(), words);
     }
     assert_eq!(hub.end(TERM).code, Some(0));

@@ -69,7 +69,9 @@ pub fn check_address_space(needed: u64) -> Result<(), Failure> {
     let (free, needed, limit) = (free / 1024, needed.div_ceil(1024), limit / 1024);
     Err(Failure::new(
         Kind::Short,
-        format!("address space is short: {free} kB are free, {needed} kB more needed, the limit is {limit} kB"),
+        format!(
+            "address space is short: {free} kB are free, {needed} kB more needed, the limit is {limit} kB"
+        ),
         "raise the limit: `ulimit -v`, for a service LimitAS",
     ))
 }
