@@ -99,7 +99,7 @@ mod tests {
         let (len, end) = unpacked(&packed(|_| 0, 3 * most));
         assert!(len <= most && end == Err(ErrorKind::FileTooLarge), "{len} {end:?}");
         // The telegram of an empty room, which a line brings all day.
-        let telegram = |at: usize| (at % 732) as u8 ^ (at % 732 >> 8) as u8;
+        let telegram = |at: usize| (at % 732) as u8 ^ ((at % 732) >> 8) as u8;
         assert_eq!(unpacked(&packed(telegram, 2 * most)), (2 * most, Ok(())));
     }
 }
