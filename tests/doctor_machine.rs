@@ -169,14 +169,14 @@ fn what_is_wrong_with_the_domain() {
     let root = stage.place().root().to_owned();
     fs::create_dir(&root).expect("can be made");
     fs::set_permissions(&root, fs::Permissions::from_mode(0o777)).expect("it is ours");
-    Findings::of(&stage, &[]).complain("others may write in the domain", "domain", "warning", "chmod 700");
+    Findings::of(&stage, &[]).complain("others may write in the domain", "domain", "failed", "chmod go-w");
     if std::os::unix::fs::chown(&root, Some(1), None).is_ok() {
         fs::set_permissions(&root, fs::Permissions::from_mode(0o700)).expect("root may");
         Findings::of(&stage, &[]).complain(
             "the domain is another user's",
             "domain",
             "failed",
-            "run as that user",
+            "run as user 1",
         );
     } else {
         eprintln!("skipped: this user cannot give a directory away");

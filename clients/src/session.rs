@@ -69,7 +69,12 @@ impl Session {
                 _ => Ok(change),
             };
         };
-        if self.joined.as_ref().is_none_or(|joined| joined.domain != *domain) {
+        // After all had gone, the next hub's shared memory has other names.
+        let is_elsewhere = |joined: &Joined| {
+            joined.domain != *domain
+                || (change.back.is_some() && !ipc::is_member(&joined.node, domain.root()))
+        };
+        if self.joined.as_ref().is_none_or(is_elsewhere) {
             let node = ipc::client_node(domain)?;
             self.joined = Some(Joined { domain: domain.clone(), wakeups: Wakeups::by(self.wait), node });
             self.number += 1;

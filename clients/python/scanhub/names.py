@@ -71,7 +71,7 @@ class Domain:
 
     @property
     def prefix(self) -> str:
-        """How the names of its shared memory begin."""
+        """How the names of its shared memory begin; what follows is in the directory's file `prefix`."""
         return f"sh_{self.name}_"
 
 
@@ -101,7 +101,7 @@ def _at(name: str, base: str) -> Domain:
 
 
 def _length(domain: Domain) -> int:
-    return len(os.fsencode(domain.root)) + len(domain.prefix)
+    return len(os.fsencode(domain.root)) + len(domain.prefix) + _RANDOM
 
 
 def _fits(domain: Domain) -> bool:
@@ -116,5 +116,7 @@ def _of_environment(variable: str) -> str | None:
 
 _OF_SENSORS = set("abcdefghijklmnopqrstuvwxyz0123456789_-")
 _OF_DOMAINS = _OF_SENSORS - {"_"}
-_LIMIT = 65
-"""Root and prefix together stay below this many bytes: with 75 listeners fail while everything else works."""
+_RANDOM = 6
+"""Bytes that the file `prefix` adds."""
+_LIMIT = 66
+"""Root and prefix together stay below this many bytes, for the path of a listener's socket."""

@@ -9,6 +9,7 @@ import os
 import struct
 import time
 
+from .directory import directory_of
 from .errors import Denied, Failure, NoHub, Short
 from .names import Domain
 
@@ -56,9 +57,9 @@ class Presence:
         for place in self._places:
             for lock in ("hub.lock", "listen.lock"):
                 try:
-                    pid = _holder(os.path.join(place.root, lock))
-                except PermissionError:
-                    self.denied = denied(place.root)
+                    pid = _holder(place, lock)
+                except Denied as denied:
+                    self.denied = denied
                     break
                 except OSError as error:
                     if error.errno not in (errno.EMFILE, errno.ENFILE):
@@ -83,25 +84,14 @@ def find(places: list[Domain]) -> Domain:
         time.sleep(LOOK_EVERY)
 
 
-def denied(root: str) -> Denied:
-    """Whose the directory is, or the nearest one above that can be seen."""
-    path = root
-    while True:
-        try:
-            seen = os.stat(path)
-            break
-        except OSError:
-            path = os.path.dirname(path)
-    what = f"{path} belongs to user {seen.st_uid} with mode {seen.st_mode & 0o7777:04o}, this is user {os.getuid()}"
-    remedy = "shared memory is for one user: run as that user, or take a pipe from that user's `scanhub echo --json`"
-    return Denied(what, remedy)
-
-
-def _holder(path: str) -> int:
-    """The process that holds the lock at `path`; 0 if none does, or it has not written yet who it is."""
-    try:
-        file = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
-    except (FileNotFoundError, NotADirectoryError):
+def _holder(place: Domain, lock: str) -> int:
+    """The process that holds the lock; 0 if none does, or it has not written yet who it is. Denied."""
+    directory = directory_of(place)
+    if directory is None:
+        return 0
+    with directory:
+        file = directory.file(lock)
+    if file is None:
         return 0
     try:
         asked = fcntl.fcntl(file, fcntl.F_OFD_GETLK, struct.pack(_FLOCK, fcntl.F_RDLCK, os.SEEK_SET, 0, 0, 0))

@@ -98,7 +98,8 @@ class Subscription(Iterator[Any]):
         """Looks for the hub and for topics that are not there yet; whether something new was opened."""
         gone, back = self._presence.look()
         domain = self._presence.domain
-        if domain and (self._membership is None or self._membership.domain != domain):
+        joined = self._membership
+        if domain and (joined is None or joined.domain != domain or (back and not joined.is_current())):
             self._leave()
             self._membership = memory.Membership(domain)
         if self._membership is None and self._presence.denied:
