@@ -13,7 +13,7 @@ use std::time::Duration;
 use clients::{BackgroundOptions, ModelOrder, background, saved_model};
 use fake::Place;
 use schema::ipc::{self, ControlServer};
-use schema::{Background, Domain, Failure, HubLock, Kind, Response, Verb};
+use schema::{Background, Domain, Failure, HubLock, Kind, Response, Shown, Verb};
 
 /// A hub that answers for the background of `front`.
 struct Keeper {
@@ -42,7 +42,7 @@ impl Keeper {
                             "there are front",
                         )),
                     };
-                    server.answer(asked, &Response(answer)).unwrap();
+                    server.answer(asked, &Response(answer.map(|model| model.map(Shown::from)))).unwrap();
                 }
                 ipc::sleep(&[server.requests()], Duration::from_millis(5)).unwrap();
             }

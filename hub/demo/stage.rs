@@ -78,7 +78,12 @@ impl Stage {
         let links: Vec<_> = SENSORS.iter().flat_map(|sensor| ["--link".into(), self.link(sensor)]).collect();
         let poses = POSES.map(|pose| format!("--set=link.{pose}"));
         let hub = Child::start(
-            &[&["run".into(), "--json".into(), "--no-system-config".into()], &links[..], &poses[..]].concat(),
+            &[
+                &["run".into(), "--json".into(), "--no-system-config".into(), FORGETS.into()],
+                &links[..],
+                &poses[..],
+            ]
+            .concat(),
             &self.domain,
             None,
             self.errors(),
@@ -123,5 +128,7 @@ impl Drop for Stage {
     }
 }
 
+/// What a demonstration learns is gone with it.
+const FORGETS: &str = "--set=background.keep=false";
 /// Where the sensors sit, as the world has them (`tests/worlds/demo.toml`).
 const POSES: [&str; 3] = ["front.pose.x=0.3", "rear.pose.x=-0.3", "rear.pose.yaw=3.14159"];

@@ -1,6 +1,7 @@
 //! The words everyone speaks: what the hub publishes, and the names under which it does. Knows nobody: no serial line,
 //! no configuration, no verb. Without feature `ipc` it is plain bytes and names, enough for a receiver on the LAN.
 
+mod age;
 mod background;
 mod control;
 pub mod datagram;
@@ -37,9 +38,12 @@ pub mod regular;
 mod saved;
 #[cfg(feature = "ipc")]
 pub mod shortage;
+#[cfg(feature = "ipc")]
+mod state;
 
+pub use age::Age;
 pub use background::Background;
-pub use control::{Request, Response, Verb};
+pub use control::{Request, Response, Shown, Verb};
 pub use domain::{DEFAULT_DOMAIN, Domain, Environment};
 pub use failure::{Failure, Kind};
 pub use foreground::{Foreground, SEGMENTS, Segment};
@@ -62,3 +66,5 @@ pub use directory::Directory;
 pub use lock::{HubLock, ListenLock, holder, publisher};
 #[cfg(feature = "json")]
 pub use saved::{SavedModel, as_json};
+#[cfg(feature = "ipc")]
+pub use state::StateDirectory;

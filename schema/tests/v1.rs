@@ -361,7 +361,9 @@ fn response_bytes() {
     assert_eq!(Response(Ok(None)).encode(), [0, 0, 0, 0]);
     let model = Background { count: 1, taught: 1, unit_mm: 1, ..Background::default() };
     let shown = [0, 0, 0, 0, 0, 0, 0, 0, 1, 0, 1, 0, 1, 0, 0, 0, 0, 0];
-    assert_eq!(Response(Ok(Some(model))).encode(), shown);
+    assert_eq!(Response(Ok(Some(model.into()))).encode(), shown);
+    let kept = Response(Ok(Some(schema::Shown { model, kept_wall_ns: Some(17) })));
+    assert_eq!(kept.encode(), [&[0, 0, 2, 0, b'1', b'7'], &shown[4..]].concat());
     let refused = Response(Err(Failure::new(Kind::Short, "busy", "wait")));
     assert_eq!(refused.encode(), b"\x4b\0\x09\0busy\nwait");
 }

@@ -13,6 +13,7 @@ mod converse;
 pub mod doctor;
 mod in_memory;
 mod layer;
+mod learned;
 mod line_errors;
 mod link;
 mod memory;

@@ -16,6 +16,7 @@ use schema::{Failure, Flags, State, Status, Wake};
 use crate::clock;
 use crate::config::{Link, Source};
 use crate::control::{Flow, Orders};
+use crate::learned::Slot;
 use crate::line_errors::LineErrors;
 use crate::memory::Memory;
 use crate::pipeline::Pipeline;
@@ -70,6 +71,8 @@ pub(crate) struct Surroundings<'a> {
     pub(crate) service: &'a Service,
     /// The domain's directory.
     pub(crate) root: &'a Path,
+    /// Where what was learned goes, for the next hub; nothing where that is not wanted.
+    pub(crate) slot: Option<&'a Slot>,
     /// Set whenever the link finished something.
     pub(crate) worked: &'a AtomicBool,
 }
@@ -131,6 +134,16 @@ impl<'a> LinkThread<'a> {
         match &self.link.port {
             Source::File { path, paced } => replay::run(&mut self, cast, path, *paced, report),
             Source::Tty(_) | Source::Tcp { .. } => self.attend(report),
+        }
+        self.hand_on(true);
+    }
+
+    /// Lets what was learned be kept, if that is news; if this is the `last` time, whatever there is.
+    fn hand_on(&mut self, last: bool) {
+        if let Some(slot) = self.around.slot
+            && let Some((pose, model)) = self.pipeline.hand_on(last)
+        {
+            slot.put(pose, model);
         }
     }
 
@@ -269,6 +282,7 @@ impl<'a> LinkThread<'a> {
                 self.topics.wake(Wake::Status);
             }
             self.memory.iter_mut().for_each(|memory| memory.keep(session, now));
+            self.hand_on(false);
             self.watch_reach();
             self.tell_mode();
         }

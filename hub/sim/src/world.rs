@@ -28,7 +28,7 @@ pub enum World {
 }
 
 /// The scenes that the program brings along: name and text.
-const SCENES: [(&str, &str); 13] = [
+const SCENES: [(&str, &str); 14] = [
     ("room", include_str!("../../../tests/worlds/room.toml")),
     ("bare", include_str!("../../../tests/worlds/bare.toml")),
     ("fig8", include_str!("../../../tests/worlds/fig8.toml")),
@@ -37,6 +37,7 @@ const SCENES: [(&str, &str); 13] = [
     ("door", include_str!("../../../tests/worlds/door.toml")),
     ("corridor", include_str!("../../../tests/worlds/corridor.toml")),
     ("glass", include_str!("../../../tests/worlds/glass.toml")),
+    ("faint", include_str!("../../../tests/worlds/faint.toml")),
     ("sun", include_str!("../../../tests/worlds/sun.toml")),
     ("chair", include_str!("../../../tests/worlds/chair.toml")),
     ("strips", include_str!("../../../tests/worlds/strips.toml")),

@@ -84,7 +84,11 @@ pub struct Background {
     pub learning: Learning,
     /// The file that it begins with.
     pub file: Option<PathBuf>,
-    /// What stands in the file.
+    /// What it begins with was said, by whatever word: what an earlier hub learned is left where it is.
+    pub start_is_said: bool,
+    /// What is learned is kept for the next hub, which begins with it.
+    pub is_handed_on: bool,
+    /// What it begins with: what stands in the file, or what an earlier hub learned.
     pub model: Option<Box<schema::Background>>,
     /// The model is published with every scan, not only with a new generation and whenever it has learned for a while.
     pub every_scan: bool,
@@ -134,6 +138,8 @@ impl Default for Background {
             is_kept: true,
             learning: Learning::default(),
             file: None,
+            start_is_said: false,
+            is_handed_on: true,
             model: None,
             every_scan: false,
         }

@@ -227,7 +227,9 @@ pub(crate) fn hubs(facts: &Facts, name_of: impl Fn(u32) -> String) -> Finding {
         let mut text = format!("no other hub of domain {}", facts.name);
         for (root, owner) in &facts.closed {
             let (root, owner) = (root.display(), name_of(*owner));
-            text += &format!("; who is at {root} only user {owner} sees: sudo -u {owner} scanhub doctor");
+            text += &format!(
+                "; who is at {root} only user {owner} sees: sudo -u {owner} scanhub doctor; {SHARING}"
+            );
         }
         return Finding::ok(NAME, text);
     }
@@ -249,6 +251,10 @@ pub(crate) fn plural(count: u64, what: &str) -> String {
         _ => format!("{count} {what}s"),
     }
 }
+
+/// How another user's hub can be heard.
+const SHARING: &str = "to have its data here: `scanhub gateway --interface lo` under that user, and `scanhub listen --publish` \
+                       under this one (docs/sharing.md)";
 
 /// Files in shared memory of each link, and of what belongs to no link, with some for the first consumers.
 const FILES_OF_LINK: u64 = 24;
