@@ -56,6 +56,19 @@ fn headless_in_an_empty_environment() {
 }
 
 #[test]
+fn where_the_users_own_place_is_too_long_for_a_domain() {
+    let place = format!("/tmp/scanhub-demo-{}/{}", std::process::id(), "long".repeat(20));
+    fs::create_dir_all(&place).expect("a directory");
+    let mut command = Command::new(env!("CARGO_BIN_EXE_scanhub"));
+    command.args(["demo", "--headless", "--for", "1s", "--json"]).env_clear().env("XDG_RUNTIME_DIR", &place);
+    let outcome = Program::start(command).wait();
+    let left = fs::read_dir(&place).expect("it is there").count();
+    fs::remove_dir_all(format!("/tmp/scanhub-demo-{}", std::process::id())).expect("it is ours");
+    assert_eq!((outcome.code, left), (Some(0), 0), "{outcome}");
+    nothing_was_lost(&outcome);
+}
+
+#[test]
 fn interrupted() {
     // Its processes are there, and all of them go.
     let outcome = demo(&["--headless", "--json"], |program| {

@@ -8,7 +8,7 @@ use clap_complete::shells;
 use schema::{Failure, Kind};
 
 use super::command;
-use crate::print;
+use crate::print_own;
 
 #[derive(Args, Debug)]
 pub(crate) struct Completions {
@@ -33,7 +33,7 @@ impl Completions {
             Shell::Zsh => clap_complete::generate(shells::Zsh, command, NAME, &mut text),
             Shell::Fish => clap_complete::generate(shells::Fish, command, NAME, &mut text),
         }
-        print(String::from_utf8_lossy(&text).trim_end())
+        print_own(String::from_utf8_lossy(&text).trim_end())
     }
 }
 
@@ -53,7 +53,7 @@ impl Man {
                 let mut page = Vec::new();
                 let rendered = clap_mangen::Man::new(command()).render(&mut page);
                 rendered.map_err(|error| Failure::new(Kind::Failed, format!("no page: {error}"), ""))?;
-                print(String::from_utf8_lossy(&page).trim_end())
+                print_own(String::from_utf8_lossy(&page).trim_end())
             }
         }
     }
