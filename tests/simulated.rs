@@ -2,6 +2,11 @@
 
 mod stage;
 
+use std::io::{Read, Write};
+use std::thread::sleep;
+use std::time::Duration;
+
+use rustix::termios::{OptionalActions, tcgetattr, tcsetattr};
 use stage::{Stage, TERM, number};
 
 #[test]
@@ -46,4 +51,34 @@ fn faults_are_named_in_the_truth() {
     }
     assert_eq!(hub.end(TERM).code, Some(0));
     assert_eq!(simulator.end(TERM).code, Some(0));
+}
+
+/// A host that stopped in the middle of a request and finds no answer is told why.
+#[test]
+fn a_request_that_is_dropped_is_said() {
+    let stage = Stage::new();
+    let simulator = stage.simulator(&["front"], &["--seed=3"]);
+    let mut port =
+        std::fs::File::options().read(true).write(true).open(stage.path("front")).expect("it is there");
+    let mut termios = tcgetattr(&port).expect("a terminal");
+    termios.make_raw();
+    termios.set_speed(9_600).expect("a rate");
+    tcsetattr(&port, OptionalActions::Now, &termios).expect("can be set");
+    // A status request (Telegram listing, 31h), its second half far too late: a machine that stands still meanwhile does
+    // not excuse half a second.
+    port.write_all(&[0x02, 0x00, 0x01]).expect("room");
+    sleep(Duration::from_millis(500));
+    port.write_all(&[0x00, 0x31, 0x15, 0x12]).expect("room");
+    // A whole one, at once: its ACK says that all before it was heard.
+    port.write_all(&[0x02, 0x00, 0x01, 0x00, 0x31, 0x15, 0x12]).expect("room");
+    let mut acknowledge = [0];
+    port.read_exact(&mut acknowledge).expect("an answer");
+    assert_eq!(acknowledge, [0x06]);
+    let outcome = simulator.end(TERM);
+    let said = format!(
+        "{}: a request was dropped: more than 6 ms of silence after 3 of its bytes",
+        stage.word("front")
+    );
+    assert_eq!(outcome.code, Some(0));
+    assert!(outcome.errors.contains(&said), "{outcome}");
 }
