@@ -6,8 +6,7 @@ use std::io::{Read, Write};
 use std::thread::sleep;
 use std::time::Duration;
 
-use rustix::termios::{OptionalActions, tcgetattr, tcsetattr};
-use stage::{Stage, TERM, number};
+use stage::{Stage, TERM, number, open_line, until};
 
 #[test]
 fn a_sensor_with_a_past_tells_it_when_it_is_asked() {
@@ -44,7 +43,7 @@ fn faults_are_named_in_the_truth() {
     let hub = stage.hub(&[stage.link("front")]);
     stage.await_info("front", |info| info["state"] == "streaming");
     for name in ["truncated", "length", "unread"] {
-        stage::until(name, || {
+        until(name, || {
             let text = std::fs::read_to_string(stage.path("truth")).unwrap_or_default();
             text.contains(&format!(r#""fault":"{name}""#))
         });
@@ -58,12 +57,7 @@ fn faults_are_named_in_the_truth() {
 fn a_request_that_is_dropped_is_said() {
     let stage = Stage::new();
     let simulator = stage.simulator(&["front"], &["--seed=3"]);
-    let mut port =
-        std::fs::File::options().read(true).write(true).open(stage.path("front")).expect("it is there");
-    let mut termios = tcgetattr(&port).expect("a terminal");
-    termios.make_raw();
-    termios.set_speed(9_600).expect("a rate");
-    tcsetattr(&port, OptionalActions::Now, &termios).expect("can be set");
+    let mut port = open_line(&stage.path("front"), 9_600);
     // A status request (Telegram listing, 31h), its second half far too late: a machine that stands still meanwhile does
     // not excuse half a second.
     port.write_all(&[0x02, 0x00, 0x01]).expect("room");
@@ -72,7 +66,7 @@ fn a_request_that_is_dropped_is_said() {
     // A whole one, at once: its ACK says that all before it was heard.
     port.write_all(&[0x02, 0x00, 0x01, 0x00, 0x31, 0x15, 0x12]).expect("room");
     let mut acknowledge = [0];
-    port.read_exact(&mut acknowledge).expect("an answer");
+    until("an answer", || port.read(&mut acknowledge).is_ok_and(|len| len > 0));
     assert_eq!(acknowledge, [0x06]);
     let outcome = simulator.end(TERM);
     let said = format!(

@@ -76,6 +76,7 @@ impl Stage {
         let hub = Child::start(
             &[&["run".into(), "--json".into(), "--no-system-config".into()], &links[..], &poses[..]].concat(),
             self.domain.name(),
+            &self.directory,
             None,
             self.errors(),
         )?;
@@ -90,7 +91,13 @@ impl Stage {
         let start = |(of, sensor): (usize, &&str)| {
             let topics = ["telegram", "scan", "status"].map(|topic| format!("{sensor}/{topic}"));
             let arguments = [&["echo".into(), "--json".into()], &topics[..]].concat();
-            Child::start(&arguments, self.domain.name(), Some((of, lines.clone())), self.errors())
+            Child::start(
+                &arguments,
+                self.domain.name(),
+                &self.directory,
+                Some((of, lines.clone())),
+                self.errors(),
+            )
         };
         SENSORS.iter().enumerate().map(start).collect()
     }
@@ -101,7 +108,8 @@ impl Stage {
         let rest = ["--truth".into(), truth, "--seed".into(), seed.to_string(), "--json".into()];
         let world = ["--world".into(), "demo".into()];
         let arguments = [&["simulate".into()], &world[..], &ports[..], &rest[..]].concat();
-        Child::start(&arguments, self.domain.name(), None, self.errors())?.await_ready(SIMULATOR, lines)
+        Child::start(&arguments, self.domain.name(), &self.directory, None, self.errors())?
+            .await_ready(SIMULATOR, lines)
     }
 }
 

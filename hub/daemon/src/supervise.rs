@@ -9,7 +9,7 @@ use std::thread;
 use lms::{MILLIS, Nanos};
 use rustix::event::{EventfdFlags, PollFd, PollFlags, Timespec, eventfd, poll};
 use schema::ipc::{self, Node};
-use schema::{Domain, Failure, HubLock, Kind, shortage};
+use schema::{Domain, Failure, HubLock, Kind, StateDirectory, shortage};
 
 use crate::config::Config;
 use crate::control::Desk;
@@ -100,6 +100,8 @@ pub(crate) fn serve(
     });
     let (mut desk, orders) = Desk::open(&node, config.links.iter().map(|link| link.name.as_str()))?;
     let stop = eventfd(0, EventfdFlags::CLOEXEC).map_err(|error| no_resource("an eventfd", &error))?;
+    // What was learned of sensors is no recording's.
+    let state = StateDirectory::of_domain(domain.name()).filter(|_| troupe.is_none());
     let (player, parts, holds) = match troupe {
         Some(Troupe { player, parts, holds }) => (Some(player), parts, holds),
         None => (None, Vec::new(), true),
@@ -111,8 +113,9 @@ pub(crate) fn serve(
         let mut threads = Vec::new();
         for ((number, link), orders) in config.links.iter().enumerate().zip(orders) {
             let (node, report) = (&node, report.clone());
-            let around =
-                Surroundings { stop: &stop, service: &service, root: domain.root(), worked: &worked[number] };
+            let (root, state) = (domain.root(), state.as_ref());
+            let worked = &worked[number];
+            let around = Surroundings { stop: &stop, service: &service, root, state, worked };
             let cast = player
                 .zip(parts.next())
                 .map(|(player, recorded)| Cast { recorded, seat: Seat { player, number } });
