@@ -31,12 +31,12 @@ fn where_a_sensor_was_found_is_asked_first_by_the_next_hub() {
     // A link with the same name at another port, and a file that anybody may have written.
     let other = Line::at(&stage.path("other"));
     let hub = stage.hub(&[format!("--link=front={}", stage.word("other"))]);
-    assert_eq!(other.await_request(), (500_000, 0x31));
+    assert_eq!(other.await_request(), (9_600, 0x3A));
     assert_eq!(hub.end(TERM).code, Some(0));
     fs::set_permissions(&kept, fs::Permissions::from_mode(0o666)).expect("it is ours");
     let line = Line::at(&stage.path("again"));
     let hub = stage.hub(&[format!("--link=front={}", stage.word("again"))]);
-    assert_eq!(line.await_request(), (500_000, 0x31));
+    assert_eq!(line.await_request(), (9_600, 0x3A));
     let outcome = hub.end(TERM);
     assert!(outcome.errors.contains("others can write it"), "{outcome}");
     assert!(outcome.errors.contains("delete it; what it held is learned again"), "{outcome}");

@@ -13,6 +13,7 @@ use crate::phase::{
     SILENCE, Settings, Step,
 };
 use crate::reply::{POWER_ON, Reply};
+use crate::search::POWER_ON_BAUD;
 use crate::sensor::{Sensor, State, Trouble};
 use crate::telegram::{REPLY, Telegram};
 use crate::variant::Baud;
@@ -27,8 +28,10 @@ pub(crate) struct Dialogue {
     pub(crate) sensor: Sensor,
     /// What was known of it before this session, until anything is said to it.
     pub(crate) recalled: Option<Identity>,
-    /// The rate that is asked first on a silent line; `None`: the wanted one.
-    pub(crate) seek_first: Option<Baud>,
+    /// The rate at which a sensor most likely is that does not stream when a session begins.
+    pub(crate) rest_at: Baud,
+    /// The rate that is asked first.
+    pub(crate) first: Baud,
     /// The rate at which the search had its last answer.
     pub(crate) found_at: Option<Baud>,
     /// What is in the way now; [`Dialogue::trouble`] is what is shown.
@@ -54,7 +57,8 @@ impl Dialogue {
             baud: settings.baud,
             sensor: Sensor::default(),
             recalled: None,
-            seek_first: None,
+            rest_at: POWER_ON_BAUD,
+            first: POWER_ON_BAUD,
             found_at: None,
             trouble: None,
             is_paused: false,
@@ -149,6 +153,8 @@ impl Dialogue {
                 self.resyncs += 1;
                 self.trouble = Some(Trouble::Silence);
                 self.sensor.forget();
+                // Its cable may be back sooner than its power.
+                self.first = self.settings.baud;
                 return self.listen(now, State::Silent);
             }
             _ => {}

@@ -41,7 +41,7 @@ pub(crate) enum Phase {
     /// Without a word: whoever streams is heard. Meanwhile the state is as `shown`, afterwards comes `attempt`: at
     /// `quiet_at` if no byte came.
     Listening { give_up_at: Nanos, quiet_at: Nanos, shown: State, attempt: usize },
-    /// A status request at one rate after the other.
+    /// A question at one rate after the other.
     Probing { attempt: usize },
     /// The sensor hears us: it is brought to rest, to the wanted rate, to its settings, to a stream.
     Starting { step: Step, progress: Progress },

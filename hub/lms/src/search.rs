@@ -11,9 +11,12 @@ use crate::{MILLIS, Nanos};
 impl Dialogue {
     /// As a new session does: at the wanted rate, without a word.
     pub(crate) fn begin(&mut self, now: Nanos) {
+        self.first = self.rest_at;
         if core::mem::take(&mut self.is_paused) {
             // Whoever is not asked does not answer.
             self.quiet_since = now;
+            // It was stopped at this rate.
+            self.first = self.settings.baud;
         }
         self.trouble = None;
         self.variant_refused = false;
@@ -54,10 +57,9 @@ impl Dialogue {
         }
     }
 
-    /// Which rate has this turn in a round: where a silent sensor was the last time, the wanted one, the others.
+    /// Which rate has this turn in a round: the likeliest, the wanted one, the others.
     fn rate_of(&self, turn: usize) -> Baud {
-        let wanted = self.settings.baud;
-        let first = self.seek_first.unwrap_or(wanted);
+        let (first, wanted) = (self.first, self.settings.baud);
         let second = (first != wanted).then_some(wanted);
         let others = ORDER.into_iter().filter(|&baud| baud != first && baud != wanted);
         [first].into_iter().chain(second).chain(others).nth(turn).unwrap_or(wanted)
@@ -99,7 +101,7 @@ fn coarse(seconds: u64) -> u32 {
 /// The rates after the wanted one, likeliest first: power-on, what a hub leaves behind, what is left.
 const ORDER: [Baud; 4] = [Baud::B9600, Baud::B500000, Baud::B38400, Baud::B19200];
 /// Without another setting in its EEPROM a sensor begins at this rate.
-const POWER_ON_BAUD: Baud = Baud::B9600;
+pub(crate) const POWER_ON_BAUD: Baud = Baud::B9600;
 const HOUR: u32 = 3_600;
 const STEPS: [u32; 9] = [1, 3, 10, 30, 60, 300, 600, 1_800, HOUR];
 

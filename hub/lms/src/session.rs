@@ -113,10 +113,11 @@ impl Session {
         self.dialogue.recalled = Some(known);
     }
 
-    /// The rate that is asked first if the line is silent, in place of the wanted one: where a sensor that does not stream was
+    /// The rate that is asked first if nobody streams, in place of 9600: where a sensor that did not stream was
     /// [found](Self::found_at) the last time. To be said before anything is read.
     pub fn seek_first(&mut self, baud: Baud) {
-        self.dialogue.seek_first = Some(baud);
+        self.dialogue.rest_at = baud;
+        self.dialogue.first = baud;
     }
 
     /// The rate at which a sensor that was sought answered; nothing if none had to be sought.

@@ -68,8 +68,7 @@ impl Dialogue {
         match step {
             // Not in the mode in which it is, which was not asked yet.
             Step::Baud if failed && !was_told && progress.stops_left > STOPS => {
-                self.sensor.streams = true;
-                self.proceed(progress, now);
+                self.enter(Step::Check, progress, now);
             }
             Step::Stop | Step::Baud | Step::Stream if failed => self.refused(request, now),
             Step::Stop => {

@@ -57,7 +57,7 @@ fn nobody_there_is_said_and_the_search_goes_on() {
         bench.run((10_000 + 100 * moment) * MILLIS);
         assert_eq!(bench.states, [State::Probing]);
         bench.to_sensor = Box::new(|_, byte| Some(byte));
-        bench.until("streaming", 3_500 * MILLIS, Bench::is_streaming);
+        bench.until("streaming", 4_000 * MILLIS, Bench::is_streaming);
         assert_eq!(bench.session.trouble(), None);
     }
 }
@@ -71,7 +71,7 @@ fn prompt(baud: Baud, start: Start) -> Settings {
 #[test]
 fn a_sensor_that_just_got_its_power_streams_soon() {
     // Never seen before, or where it was the last time.
-    for (seed, first, within) in (0..20).flat_map(|seed| [(seed, None, 660), (seed, Some(Baud::B9600), 500)])
+    for (seed, first, within) in (0..20).flat_map(|seed| [(seed, None, 500), (seed, Some(Baud::B9600), 500)])
     {
         let settings = Settings { seed, ..prompt(Baud::B9600, Start::In(Operating::OnRequest)) };
         let mut bench = Bench::new(sensor_with(settings), 0);
