@@ -368,13 +368,18 @@ fn there_is_room_for_sixteen_sensors() {
     in_a_network("there_is_room_for_sixteen_sensors", || {
         let stage = Stage::new();
         let mut program = publisher(&stage);
-        for number in 0..17 {
-            let mut sender = Sender::new(0xab, 7, number, &format!("s{number}"));
-            sender.announce(&[Topic::Zones]);
-            sender.send(Topic::Zones, &zones(Verdict::Clear));
+        let mut senders: Vec<_> =
+            (0..17).map(|number| Sender::new(0xab, 7, number, &format!("s{number}"))).collect();
+        // All but the last one deliver for a second.
+        for (count, wait_ms) in [(16, 1100), (17, 0)] {
+            for sender in &mut senders[..count] {
+                sender.announce(&[Topic::Zones]);
+                sender.send(Topic::Zones, &zones(Verdict::Clear));
+            }
+            std::thread::sleep(std::time::Duration::from_millis(wait_ms));
         }
         let line = program.await_line("one too many", |line| line["kind"] == "trouble");
-        assert!(line["message"].as_str().is_some_and(|text| text.contains("16")), "{line}");
+        assert!(line["message"].as_str().is_some_and(|text| text.contains("16 published")), "{line}");
         let listed = stage.run(&["list", "--json"]).of_class("topic");
         assert_eq!(listed.len(), 16);
         let outcome = program.end(INT);

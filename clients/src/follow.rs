@@ -154,9 +154,14 @@ struct Run<'a> {
     received: u64,
 }
 
-/// Who brings what is called so.
-fn of(name: &TopicName) -> Who {
-    if is_remote(&name.sensor) { Who::Listener } else { Who::Hub }
+/// Who brings the sensor that is called so.
+fn brings(sensor: &str) -> Who {
+    if is_remote(sensor) { Who::Listener } else { Who::Hub }
+}
+
+/// Whether `name` is brought by `who`; a robot's sensors are of whoever is there.
+fn is_of(name: &TopicName, who: Who) -> bool {
+    name.is_robot() || brings(&name.sensor) == who
 }
 
 /// Samples taken from one topic before the next one has its turn.
@@ -212,11 +217,11 @@ impl<'a> Run<'a> {
         let change = self.session.look()?;
         if let Some(who) = change.gone {
             self.roll.end();
-            self.tell(sink, Notice::HubGone, |name| who == of(name))?;
+            self.tell(sink, Notice::HubGone, |name| is_of(name, who))?;
         }
         if let Some(who) = change.back {
             if self.hub_seen.is_some() || self.waiting_said {
-                self.tell(sink, Notice::HubBack, |name| who == of(name))?;
+                self.tell(sink, Notice::HubBack, |name| is_of(name, who))?;
             }
             self.hub_seen = Some(Instant::now());
             self.roll.begin(Instant::now());

@@ -3,12 +3,13 @@
 //! shows it when the hub falls silent.
 
 mod device;
+mod hold;
 mod lamps;
 
 use std::io::Write;
 use std::path::{Path, PathBuf};
 use std::sync::atomic::AtomicBool;
-use std::time::Instant;
+use std::time::{Duration, Instant};
 
 use schema::{Domain, Failure, Kind, ROBOT, Topic, Verdict, check_followed};
 use serde::Serialize;
@@ -22,6 +23,7 @@ use crate::output::{End, Output, quiet};
 use crate::sample::Sample;
 use crate::{json, text};
 use device::{Device, News};
+use hold::Hold;
 use lamps::{Lamps, Light};
 
 /// What `leds` is asked for.
@@ -35,6 +37,8 @@ pub struct LedsOptions {
     pub led_root: PathBuf,
     /// How lights are shown in the terminal.
     pub look: LedsLook,
+    /// How long a better verdict has to stand until it is shown; a worse one is at once.
+    pub hold: Duration,
     /// When it ends by itself.
     pub bounds: Bounds,
     /// Where the domain may be, see [`Domain::candidates`].
@@ -77,6 +81,7 @@ pub fn leds(
         sensor,
         look: options.look,
         lamps: Lamps::UNKNOWN,
+        verdict: Hold::new(options.hold),
         marks: Freshness::new(clock::now()),
         devices: Vec::new(),
         out: Output::new(out),
@@ -118,6 +123,8 @@ struct Board<'a> {
     sensor: &'a str,
     look: LedsLook,
     lamps: Lamps,
+    /// What was said lately.
+    verdict: Hold,
     /// Until when the marks may be believed, whatever became of the zones.
     marks: Freshness,
     devices: Vec<(Light, String, Device)>,
@@ -136,6 +143,12 @@ impl Board<'_> {
             }
         }
         Ok(())
+    }
+
+    /// Shows the verdict that holds, and so many marks.
+    fn show_known(&mut self, marks: Option<usize>, now: Instant) -> Result<(), End> {
+        let (verdict, worst) = self.verdict.shown(now).clone();
+        self.show(Lamps { verdict, marks, worst }, false)
     }
 
     /// Shows `lamps` if they are others than those that are shown, or if they `must` be.
@@ -214,21 +227,22 @@ impl Board<'_> {
 
 impl Sink for Board<'_> {
     fn sample(&mut self, _: &TopicName, sample: &Sample) -> Result<(), End> {
-        let mut lamps = self.lamps.clone();
+        let now = Instant::now();
+        let mut marks = self.lamps.marks;
         match sample {
-            Sample::Zones(heard) => lamps.verdict = heard.zones.verdict(),
+            Sample::Zones(heard) => self.verdict.take((heard.zones.verdict(), None), now),
             Sample::Robot(heard) => {
-                lamps.verdict = heard.robot.verdict();
-                lamps.worst = heard.robot.worst().map(str::to_owned);
+                let worst = heard.robot.worst().map(str::to_owned);
+                self.verdict.take((heard.robot.verdict(), worst), now);
             }
-            Sample::Marks(marks) => {
+            Sample::Marks(sample) => {
                 // A number of marks ages as a verdict does of which something is known.
-                let fresh = self.marks.heard(marks.header(), Verdict::Clear, clock::now());
-                lamps.marks = (fresh && marks.is_available()).then(|| marks.marks().len());
+                let fresh = self.marks.heard(sample.header(), Verdict::Clear, clock::now());
+                marks = (fresh && sample.is_available()).then(|| sample.marks().len());
             }
             _ => {}
         }
-        self.show(lamps, false)
+        self.show_known(marks, now)
     }
 
     fn notice(&mut self, names: &[&TopicName], notice: Notice) -> Result<(), End> {
@@ -247,12 +261,15 @@ impl Sink for Board<'_> {
         }
     }
 
-    /// Marks that became too old go out, and diodes that failed are tried again.
+    /// Marks that became too old go out, a verdict that has stood is shown, and diodes that failed are tried again.
     fn tick(&mut self, now: Instant) -> Result<(), End> {
-        if self.marks.silence(clock::now()) {
-            self.show(Lamps { marks: None, ..self.lamps.clone() }, false)?;
-        }
+        let marks = if self.marks.silence(clock::now()) { None } else { self.lamps.marks };
+        self.show_known(marks, now)?;
         self.switch(now)
+    }
+
+    fn wake_at(&self) -> Option<Instant> {
+        self.verdict.changes_at()
     }
 
     fn summary(&mut self, _: &TopicName, _: &Account) -> Result<(), End> {

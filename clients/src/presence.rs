@@ -101,6 +101,11 @@ impl Presence {
         self.hub.as_ref().map(|holder| &holder.domain)
     }
 
+    /// Who publishes there.
+    pub(crate) fn who(&self) -> Option<Who> {
+        self.hub.as_ref().map(|holder| holder.who)
+    }
+
     /// What to tell who cannot wait for a hub.
     pub(crate) fn no_hub(&self) -> Failure {
         if let Some(short) = self.short() {
@@ -108,11 +113,17 @@ impl Presence {
         }
         let name = self.places.first().map(Domain::name).unwrap_or_default();
         let roots: Vec<_> = self.places.iter().map(|place| place.root().display().to_string()).collect();
-        let hint = match &self.denied {
-            Some(denied) => denied.to_string(),
-            None => format!("start one with `scanhub run`; looked at {}", roots.join(", ")),
-        };
-        Failure::new(Kind::NoHub, format!("no hub in domain {name}"), hint)
+        match &self.denied {
+            Some(Failure { message, hint, .. }) => Failure::new(
+                Kind::NoHub,
+                format!("no hub of this user in domain {name}: {message}"),
+                hint.clone(),
+            ),
+            None => {
+                let hint = format!("start one with `scanhub run`; looked at {}", roots.join(", "));
+                Failure::new(Kind::NoHub, format!("no hub in domain {name}"), hint)
+            }
+        }
     }
 
     /// Why it is not known whether there is a hub: there was not even a descriptor to look with.

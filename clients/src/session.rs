@@ -7,7 +7,7 @@ use std::time::{Duration, Instant};
 use schema::ipc::{self, Node, Payload, Subscriber};
 use schema::{Domain, Failure, Kind, holder};
 
-use crate::presence::{Change, Presence};
+use crate::presence::{Change, Presence, Who};
 use crate::readiness::Readiness;
 use crate::wait::{Wait, Wakeups};
 
@@ -69,7 +69,12 @@ impl Session {
                 _ => Ok(change),
             };
         };
-        if self.joined.as_ref().is_none_or(|joined| joined.domain != *domain) {
+        // After all had gone, the next hub's shared memory has other names.
+        let is_elsewhere = |joined: &Joined| {
+            joined.domain != *domain
+                || (change.back.is_some() && !ipc::is_member(&joined.node, domain.root()))
+        };
+        if self.joined.as_ref().is_none_or(is_elsewhere) {
             let node = ipc::client_node(domain)?;
             self.joined = Some(Joined { domain: domain.clone(), wakeups: Wakeups::by(self.wait), node });
             self.number += 1;
@@ -80,6 +85,11 @@ impl Session {
     /// Where the hub lives, if there is one.
     pub(crate) fn domain(&self) -> Option<&Domain> {
         self.presence.domain()
+    }
+
+    /// Who publishes there, as of the last look.
+    pub(crate) fn publishes(&self) -> Option<Who> {
+        self.presence.who()
     }
 
     /// There is a hub, and not only a listener that stands for those of other machines.

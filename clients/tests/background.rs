@@ -26,9 +26,11 @@ impl Keeper {
         let (stop, domain) = (Arc::new(AtomicBool::new(false)), domain.clone());
         let lock = HubLock::acquire(domain.root()).unwrap();
         let flag = stop.clone();
+        let (ready, is_ready) = std::sync::mpsc::channel();
         let thread = std::thread::spawn(move || {
             let _lock = lock;
             let server = ControlServer::create(&ipc::hub_node(&domain).unwrap()).unwrap();
+            ready.send(()).unwrap();
             while !flag.load(Ordering::Relaxed) {
                 while let Some(asked) = server.receive().unwrap() {
                     let request = *asked.request();
@@ -45,6 +47,7 @@ impl Keeper {
                 ipc::sleep(&[server.requests()], Duration::from_millis(5)).unwrap();
             }
         });
+        is_ready.recv().unwrap();
         Keeper { stop, thread: Some(thread) }
     }
 }

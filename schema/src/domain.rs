@@ -8,8 +8,12 @@ use crate::{Failure, Kind};
 /// The domain of those who name none.
 pub const DEFAULT_DOMAIN: &str = "scanhub";
 
-/// Root and prefix together stay below this many bytes: with 75 listeners fail while everything else works.
-const PLACE_LIMIT: usize = 65;
+/// Root and prefix, with its random part, stay below this many bytes: the path of a listener's socket, 107 bytes at most
+/// (unix(7)), has a number of up to 35 digits and 7 bytes besides.
+const PLACE_LIMIT: usize = 66;
+
+/// Bytes that a domain's directory adds to the prefix (`prefix.rs`): five letters that nobody can guess, and `_`.
+const RANDOM: usize = 6;
 
 /// What systemd makes for the service; clients outside of the service look there too.
 const SERVICE_BASE: &str = "/run/scanhub";
@@ -29,14 +33,14 @@ impl Domain {
         check_name(name)?;
         let base = std::path::absolute(base).unwrap_or_else(|_| base.to_owned());
         let domain = Domain { name: name.to_owned(), root: base.join(name) };
-        let length = domain.root.as_os_str().len() + domain.prefix().len();
+        let length = domain.root.as_os_str().len() + domain.prefix().len() + RANDOM;
         if length < PLACE_LIMIT {
             return Ok(domain);
         }
         Err(Failure::new(
             Kind::Configuration,
             format!(
-                "domain {name} at {} is too long: root and prefix {} have {length} bytes, at most {} are possible",
+                "domain {name} at {} is too long: root and prefix {}xxxxx_ have {length} bytes, at most {} are possible",
                 domain.root.display(),
                 domain.prefix(),
                 PLACE_LIMIT - 1
@@ -91,7 +95,7 @@ impl Domain {
         &self.root
     }
 
-    /// How the names of its shared memory begin.
+    /// How the names of its shared memory begin; what follows is in the directory's file `prefix`.
     pub fn prefix(&self) -> String {
         format!("sh_{}_", self.name)
     }
@@ -202,13 +206,13 @@ mod tests {
                 Err(Kind::Configuration)
             );
         }
-        // "/" + 57 + "/a" and "sh_a_" are 65.
-        let base = format!("/{}", "b".repeat(57));
+        // "/" + 52 + "/a" and "sh_a_xxxxx_" are 66.
+        let base = format!("/{}", "b".repeat(52));
         assert_eq!(
             Domain::at("a", Path::new(&base)).map_err(|failure| failure.kind),
             Err(Kind::Configuration)
         );
-        assert!(Domain::at("a", Path::new(&base[..57])).is_ok());
+        assert!(Domain::at("a", Path::new(&base[..52])).is_ok());
     }
 
     #[test]

@@ -4,9 +4,11 @@
 mod bell;
 mod clean;
 mod control;
+mod counter;
 mod leftover;
 mod nodes;
 mod sleep;
+mod strangers;
 mod trouble;
 mod unheld;
 mod wake;
@@ -14,6 +16,7 @@ mod wake;
 use std::fmt::Debug;
 use std::mem::MaybeUninit;
 use std::os::unix::ffi::OsStrExt;
+use std::path::Path;
 use std::time::Duration;
 
 use iceoryx2::config::Config;
@@ -30,8 +33,8 @@ use self::trouble::{Trouble, create, full, no_port, no_publisher, open};
 use crate::lock::MakingLock;
 use crate::shortage::check_client;
 use crate::{
-    Background, Domain, Failure, Foreground, Header, Kind, Marks, Scan, Status, Topic, Zones, access, limits,
-    of_service,
+    Background, Directory, Domain, Failure, Foreground, Header, Kind, Marks, Scan, Status, Topic, Zones,
+    access, limits, of_service, prefix,
 };
 
 pub use self::bell::{Bell, Unsupported, sleep_at_bells};
@@ -39,6 +42,8 @@ pub use self::clean::{Cleaned, clean};
 pub use self::control::{Asked, ControlClient, ControlServer, Pending};
 pub use self::nodes::{Nodes, nodes};
 pub use self::sleep::{descriptor, sleep, take_wakeups};
+pub(crate) use self::strangers::in_the_way;
+pub use self::strangers::{Segment, strangers};
 pub use self::unheld::is_unheld;
 pub use self::wake::{Waker, listener, open_wake};
 pub use iceoryx2::port::update_connections::UpdateConnections;
@@ -184,17 +189,30 @@ payload!(Status, Topic::Status, |builder| builder);
 
 /// The sensors that have topics in `domain`, sorted. Those of a dead hub stay as long as a consumer keeps them.
 pub fn sensors(domain: &Domain) -> Result<Vec<String>, Failure> {
-    let mut sensors = Vec::new();
-    let listed = Service::list(&config(domain)?, |service| {
-        if let Some((sensor, Some(_))) = of_service(service.static_details.name().as_str()) {
-            sensors.push(sensor.to_owned());
+    let mut sensors: Vec<String> = topics(domain)?.into_iter().map(|(sensor, _)| sensor).collect();
+    sensors.dedup();
+    Ok(sensors)
+}
+
+/// The sensors that have zones in `domain`, sorted, as [`sensors`]: those that a robot's verdict is made of.
+pub fn sensors_with_zones(domain: &Domain) -> Result<Vec<String>, Failure> {
+    let with_zones = topics(domain)?.into_iter().filter(|(_, topic)| *topic == Topic::Zones);
+    Ok(with_zones.map(|(sensor, _)| sensor).collect())
+}
+
+/// All topics with their sensors, sorted by these.
+fn topics(domain: &Domain) -> Result<Vec<(String, Topic)>, Failure> {
+    let mut topics = Vec::new();
+    let Some(config) = config(domain.root())? else { return Ok(topics) };
+    let listed = Service::list(&config, |service| {
+        if let Some((sensor, Some(topic))) = of_service(service.static_details.name().as_str()) {
+            topics.push((sensor.to_owned(), topic));
         }
         CallbackProgression::Continue
     });
     listed.map_err(|error| access::failure(domain.root(), format!("cannot list topics: {error:?}")))?;
-    sensors.sort();
-    sensors.dedup();
-    Ok(sensors)
+    topics.sort_by(|(one, _), (other, _)| one.cmp(other));
+    Ok(topics)
 }
 
 /// The payload's revision that the maker of a service wrote into its `attributes`; 0 if it wrote none.
@@ -207,32 +225,69 @@ const REVISION: &str = "revision";
 
 fn node(domain: &Domain, cleanup: bool) -> Result<Node, Failure> {
     set_log_level_from_env_or(LogLevel::Error);
-    let mut config = config(domain)?;
+    let root = domain.root();
+    let _making = if cleanup {
+        let making = MakingLock::wait(root)?;
+        prefix::settle(root, &making)?;
+        leftover::sweep(root);
+        Some(making)
+    } else {
+        None
+    };
+    let no_names = || {
+        let hint = "restart the hub: it is of another version, or what is in that directory was removed";
+        Failure::new(
+            Kind::Failed,
+            format!("{} does not tell how shared memory is named", root.display()),
+            hint,
+        )
+    };
+    let mut config = config(root)?.ok_or_else(no_names)?;
+    counter::ensure(&config.global.prefix.to_string())?;
     config.global.node.cleanup_dead_nodes_on_creation = cleanup;
     config.global.node.cleanup_dead_nodes_on_destruction = false;
     config.global.service.cleanup_dead_nodes_on_open = false;
-    if cleanup {
-        let _making = MakingLock::wait(domain.root())?;
-        leftover::sweep(std::path::Path::new(&config.global.service_dir().to_string()));
-    } else {
+    if !cleanup {
         config.global.creation_timeout = Duration::from_millis(100);
     }
     NodeBuilder::new()
         .signal_handling_mode(SignalHandlingMode::Disabled)
         .config(&config)
         .create::<Service>()
-        .map_err(|error| access::failure(domain.root(), format!("cannot join {}: {error:?}", domain.name())))
+        .map_err(|error| access::failure(root, format!("cannot join {}: {error:?}", domain.name())))
 }
 
-/// In code, never from a file: the library would search the working directory for one.
-fn config(domain: &Domain) -> Result<Config, Failure> {
-    let unusable =
-        || Failure::new(Kind::Configuration, format!("{} cannot be a root", domain.root().display()), "");
-    let root = iceoryx2::prelude::Path::new(domain.root().as_os_str().as_bytes()).map_err(|_| unusable())?;
+/// The names of shared memory of the domain in `root` are those that `node` has; they are others after all have gone.
+pub fn is_member(node: &Node, root: &Path) -> bool {
+    matches!(prefix::of(root), Ok(Some(prefix)) if node.config().global.prefix.as_bytes() == prefix.as_bytes())
+}
+
+/// Where nobody is left in the domain in `root`: the next hub has other names, which nobody can have seen.
+pub(crate) fn forget_names(root: &Path) {
+    let Ok(Some(directory)) = Directory::open(root) else { return };
+    // Not while somebody else joins to publish.
+    let Ok(_making) = MakingLock::wait(root) else { return };
+    if nodes::at(root).is_ok_and(|nodes| nodes == Nodes::default()) {
+        forget(&directory, root);
+    }
+}
+
+fn forget(directory: &Directory, root: &Path) {
+    if let Ok(Some(prefix)) = prefix::of(root) {
+        counter::remove(&prefix);
+    }
+    directory.remove(prefix::FILE.as_ref());
+}
+
+/// Nothing for a domain without names. In code, never from a file: the library would search the working directory for one.
+fn config(root: &Path) -> Result<Option<Config>, Failure> {
+    let Some(prefix) = prefix::of(root)? else { return Ok(None) };
+    let unusable = || Failure::new(Kind::Configuration, format!("{} cannot be a root", root.display()), "");
+    let path = iceoryx2::prelude::Path::new(root.as_os_str().as_bytes()).map_err(|_| unusable())?;
     let mut config = Config::default();
-    config.global.prefix = FileName::new(domain.prefix().as_bytes()).map_err(|_| unusable())?;
-    config.global.set_root_path(&root);
-    Ok(config)
+    config.global.prefix = FileName::new(prefix.as_bytes()).map_err(|_| unusable())?;
+    config.global.set_root_path(&path);
+    Ok(Some(config))
 }
 
 fn name(service: &str) -> Result<ServiceName, Failure> {

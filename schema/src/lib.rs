@@ -23,10 +23,14 @@ mod zones;
 #[cfg(feature = "ipc")]
 mod access;
 #[cfg(feature = "ipc")]
+mod directory;
+#[cfg(feature = "ipc")]
 pub mod ipc;
 pub mod limits;
 #[cfg(feature = "ipc")]
 mod lock;
+#[cfg(feature = "ipc")]
+mod prefix;
 #[cfg(feature = "json")]
 mod saved;
 #[cfg(feature = "ipc")]
@@ -52,6 +56,8 @@ pub use topic::{
 };
 pub use zones::{Verdict, ZONES, Zone, Zones};
 
+#[cfg(feature = "ipc")]
+pub use directory::Directory;
 #[cfg(feature = "ipc")]
 pub use lock::{HubLock, ListenLock, holder, publisher};
 #[cfg(feature = "json")]

@@ -2,22 +2,23 @@
 //! that dies with its process. Consumers ask who holds them and never hold one themselves. Refuses to know what is
 //! published.
 
-use std::fs::{DirBuilder, File, OpenOptions};
-use std::io::{self, ErrorKind};
+use std::fs::File;
+use std::io;
 use std::os::fd::AsRawFd;
-use std::os::unix::fs::{DirBuilderExt, FileExt, MetadataExt, OpenOptionsExt};
-use std::path::Path;
+use std::os::unix::fs::{FileExt, MetadataExt};
+use std::path::{Path, PathBuf};
 
 use nix::errno::Errno;
 use nix::fcntl::{FcntlArg, fcntl};
 use nix::libc::{self, flock};
 
-use crate::{Failure, Kind, access, shortage};
+use crate::{Directory, Failure, Kind, ipc, prefix, shortage};
 
-/// The lock of a hub on its domain; it ends with the value or with the process, however that ends.
+/// The lock of a hub on its domain; it ends with the value or with the process, however that ends. To be dropped after
+/// the hub's node.
 #[derive(Debug)]
 pub struct HubLock {
-    _held: Held,
+    _publishing: Publishing,
 }
 
 impl HubLock {
@@ -26,20 +27,40 @@ impl HubLock {
     /// [`Kind::DomainHeld`] if another hub has it (the message names its pid), [`Kind::Failed`] if the directory is
     /// another user's or cannot be made.
     pub fn acquire(root: &Path) -> Result<HubLock, Failure> {
-        Ok(HubLock { _held: Held::acquire(root, HUB, "hub")? })
+        Ok(HubLock { _publishing: Publishing::acquire(root, HUB, "hub")? })
     }
 }
 
 /// The lock of who publishes in a domain what other machines send. It stands beside a hub's and ends as that does.
 #[derive(Debug)]
 pub struct ListenLock {
-    _held: Held,
+    _publishing: Publishing,
 }
 
 impl ListenLock {
     /// As [`HubLock::acquire`].
     pub fn acquire(root: &Path) -> Result<ListenLock, Failure> {
-        Ok(ListenLock { _held: Held::acquire(root, LISTENER, "listener")? })
+        Ok(ListenLock { _publishing: Publishing::acquire(root, LISTENER, "listener")? })
+    }
+}
+
+/// The lock of who publishes, with what has to be done at its end.
+#[derive(Debug)]
+struct Publishing {
+    root: PathBuf,
+    _held: Held,
+}
+
+impl Publishing {
+    fn acquire(root: &Path, name: &str, who: &str) -> Result<Publishing, Failure> {
+        Ok(Publishing { _held: Held::acquire(root, name, who)?, root: root.to_owned() })
+    }
+}
+
+impl Drop for Publishing {
+    /// The last one out takes the names along, while it still has the lock: the next hub has others.
+    fn drop(&mut self) {
+        ipc::forget_names(&self.root);
     }
 }
 
@@ -81,26 +102,17 @@ impl Held {
                 Err(error) => return Err(unusable(root, &error.into())),
             }
         };
+        // A process id that is read means that there is a prefix, too.
+        file.set_len(0).map_err(|error| unusable(root, &error))?;
+        let held = Held { file };
+        prefix::settle(root, &MakingLock::wait(root)?)?;
         let pid = format!("{}\n", std::process::id());
-        file.set_len(0)
-            .and_then(|()| file.write_all_at(pid.as_bytes(), 0))
-            .map_err(|error| unusable(root, &error))?;
-        Ok(Held { file })
+        held.file.write_all_at(pid.as_bytes(), 0).map_err(|error| unusable(root, &error))?;
+        Ok(held)
     }
 
     fn open(root: &Path, name: &str) -> Result<File, Failure> {
-        DirBuilder::new().recursive(true).mode(0o700).create(root).map_err(|error| unusable(root, &error))?;
-        if let Some(failure) = access::foreign(root) {
-            return Err(failure);
-        }
-        OpenOptions::new()
-            .read(true)
-            .write(true)
-            .create(true)
-            .truncate(false)
-            .mode(0o600)
-            .open(root.join(name))
-            .map_err(|error| unusable(root, &error))
+        Directory::make(root)?.file_or_new(name)
     }
 }
 
@@ -128,13 +140,8 @@ pub fn publisher(root: &Path) -> Result<Option<u32>, Failure> {
 }
 
 fn holder_of(root: &Path, name: &str) -> Result<Option<u32>, Failure> {
-    let file = match File::open(root.join(name)) {
-        Ok(file) => file,
-        Err(error) if matches!(error.kind(), ErrorKind::NotFound | ErrorKind::NotADirectory) => {
-            return Ok(None);
-        }
-        Err(error) => return Err(unusable(root, &error)),
-    };
+    let Some(directory) = Directory::open(root)? else { return Ok(None) };
+    let Some(file) = directory.file(name)? else { return Ok(None) };
     let mut lock = whole_file(libc::F_RDLCK);
     fcntl(file.as_raw_fd(), FcntlArg::F_OFD_GETLK(&mut lock))
         .map_err(|error| unusable(root, &error.into()))?;
@@ -172,7 +179,7 @@ fn held(root: &Path, who: &str, pid: u32) -> Failure {
 }
 
 fn unusable(root: &Path, error: &io::Error) -> Failure {
-    access::foreign(root).or_else(|| shortage::found(root)).unwrap_or_else(|| {
+    shortage::found(root).unwrap_or_else(|| {
         Failure::new(Kind::Failed, format!("{}: {error}", root.display()), "choose another place with --root")
     })
 }

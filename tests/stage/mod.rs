@@ -19,6 +19,7 @@ mod terminal;
 mod tmux;
 
 use std::fs;
+use std::os::unix::fs::DirBuilderExt;
 use std::path::{Path, PathBuf};
 use std::process::Command;
 use std::sync::atomic::{AtomicU32, Ordering};
@@ -47,6 +48,9 @@ pub(crate) use tmux::Tmux;
 /// Far longer than anything takes on a busy machine.
 pub(crate) const PATIENCE: Duration = Duration::from_secs(20);
 
+/// Says where the program is, for a test that hides where it was built.
+pub(crate) const PROGRAM: &str = "SCANHUB_TEST_PROGRAM";
+
 /// A domain and a directory of one test.
 pub(crate) struct Stage {
     directory: PathBuf,
@@ -61,7 +65,8 @@ impl Stage {
         let domain = format!("t{}-{}", std::process::id(), NEXT.fetch_add(1, Ordering::Relaxed));
         // Not TMPDIR: root and prefix of a domain have to be short.
         let directory = PathBuf::from(format!("/tmp/{domain}"));
-        fs::create_dir_all(&directory).unwrap_or_else(|error| panic!("{}: {error}", directory.display()));
+        let made = fs::DirBuilder::new().recursive(true).mode(0o755).create(&directory);
+        made.unwrap_or_else(|error| panic!("{}: {error}", directory.display()));
         Stage { directory, domain, network: None }
     }
 
@@ -104,9 +109,9 @@ impl Stage {
 
     /// As [`Stage::command`], with the domain in another directory.
     pub(crate) fn command_at<S: AsRef<str>>(&self, root: &Path, arguments: &[S]) -> Command {
-        let program = env!("CARGO_BIN_EXE_scanhub");
+        let program = std::env::var(PROGRAM).unwrap_or_else(|_| env!("CARGO_BIN_EXE_scanhub").into());
         let mut command = match &self.network {
-            Some(network) => command_in(network, program),
+            Some(network) => command_in(network, &program),
             None => Command::new(program),
         };
         command.args(arguments.iter().map(AsRef::as_ref));

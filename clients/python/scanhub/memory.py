@@ -12,6 +12,7 @@ from typing import Any
 import iceoryx2 as iox2
 
 from . import layout, trouble
+from .directory import directory_of
 from .errors import Held, Short
 from .names import Domain, TopicName, of_service
 from .sample import Sample
@@ -26,13 +27,20 @@ class Membership:
 
     def __init__(self, domain: Domain) -> None:
         self.domain = domain
+        self.prefix = _prefix(domain)
+        if self.prefix is None:
+            raise trouble.broken(domain, f"{domain.root} does not tell how shared memory is named")
         iox2.set_log_level_from_env_or(iox2.LogLevel.Error)
-        builder = iox2.NodeBuilder.new().config(_config(domain))
+        builder = iox2.NodeBuilder.new().config(_config(domain, self.prefix))
         try:
             builder = builder.signal_handling_mode(iox2.SignalHandlingMode.Disabled)
             self._node = builder.create(iox2.ServiceType.Ipc)
         except iox2.NodeCreationFailure as error:
             raise trouble.broken(domain, f"cannot join {domain.name}: {error}") from None
+
+    def is_current(self) -> bool:
+        """The names of shared memory are still those; after all had gone a hub has others."""
+        return _prefix(self.domain) == self.prefix
 
     def service(self, name: str) -> Any:
         """The builder of a service."""
@@ -156,18 +164,34 @@ os.register_at_fork(after_in_child=_keep_the_parents)
 
 def topics(domain: Domain) -> list[TopicName]:
     """All topics of the domain, sorted. Those of a dead hub stay as long as a consumer keeps them."""
+    prefix = _prefix(domain)
+    if prefix is None:
+        return []
     try:
-        found = iox2.Service.list(_config(domain), iox2.ServiceType.Ipc)
+        found = iox2.Service.list(_config(domain, prefix), iox2.ServiceType.Ipc)
     except Exception as error:
         raise trouble.broken(domain, f"cannot list topics: {error}") from None
     named = {of_service(str(details.name().to_string())) for details in found}
     return sorted(name for name in named if name)
 
 
-def _config(domain: Domain) -> Any:
+def _prefix(domain: Domain) -> str | None:
+    """How the names of the domain's shared memory begin, or nothing as long as it has none; Denied."""
+    directory = directory_of(domain)
+    if directory is None:
+        return None
+    with directory:
+        file = directory.file("prefix")
+    if file is None:
+        return None
+    with open(file, encoding="ascii") as opened:
+        return opened.read(64).removesuffix("\n")
+
+
+def _config(domain: Domain, prefix: str) -> Any:
     config = iox2.config.default()
     everything = config.global_cfg
-    everything.prefix = iox2.FileName.new(domain.prefix)
+    everything.prefix = iox2.FileName.new(prefix)
     everything.root_path = iox2.Path.new(domain.root)
     everything.creation_timeout = iox2.Duration.from_millis(100)
     # Cleaning up is the hub's business.

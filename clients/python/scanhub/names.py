@@ -58,6 +58,11 @@ def check_sensor(name: str) -> None:
         raise Impossible(f"sensor name {name!r} is not possible", "1 to 24 of a-z, 0-9, _ and -, for example front")
 
 
+def is_remote(name: str) -> bool:
+    """Whether this is the name of another machine's sensor."""
+    return "." in name
+
+
 def _is_name(name: str) -> bool:
     return 1 <= len(name) <= 24 and name != "robot" and not set(name) - _OF_SENSORS
 
@@ -71,7 +76,7 @@ class Domain:
 
     @property
     def prefix(self) -> str:
-        """How the names of its shared memory begin."""
+        """How the names of its shared memory begin; what follows is in the directory's file `prefix`."""
         return f"sh_{self.name}_"
 
 
@@ -101,7 +106,7 @@ def _at(name: str, base: str) -> Domain:
 
 
 def _length(domain: Domain) -> int:
-    return len(os.fsencode(domain.root)) + len(domain.prefix)
+    return len(os.fsencode(domain.root)) + len(domain.prefix) + _RANDOM
 
 
 def _fits(domain: Domain) -> bool:
@@ -116,5 +121,7 @@ def _of_environment(variable: str) -> str | None:
 
 _OF_SENSORS = set("abcdefghijklmnopqrstuvwxyz0123456789_-")
 _OF_DOMAINS = _OF_SENSORS - {"_"}
-_LIMIT = 65
-"""Root and prefix together stay below this many bytes: with 75 listeners fail while everything else works."""
+_RANDOM = 6
+"""Bytes that the file `prefix` adds."""
+_LIMIT = 66
+"""Root and prefix together stay below this many bytes, for the path of a listener's socket."""

@@ -9,6 +9,7 @@ import os
 import struct
 import time
 
+from .directory import directory_of
 from .errors import Denied, Failure, NoHub, Short
 from .names import Domain
 
@@ -24,7 +25,7 @@ class Presence:
 
     def __init__(self, places: list[Domain]) -> None:
         self._places = places
-        self._holder: tuple[Domain, int] | None = None
+        self._holder: tuple[Domain, int, bool] | None = None
         self._looked_at = float("-inf")
         self.denied: Denied | Short | None = None
 
@@ -43,6 +44,11 @@ class Presence:
         """Where the hub lives, if there is one."""
         return self._holder and self._holder[0]
 
+    @property
+    def is_hub(self) -> bool:
+        """It is a hub that lives there, not only a listener that brings the sensors of other machines."""
+        return self._holder is not None and self._holder[2]
+
     def absent(self) -> Failure:
         """What to tell who cannot wait for a hub."""
         if self.denied:
@@ -51,14 +57,14 @@ class Presence:
         name = self._places[0].name if self._places else ""
         return NoHub(f"no hub in domain {name}", f"start one with `scanhub run`; looked at {looked}")
 
-    def _live(self) -> tuple[Domain, int] | None:
+    def _live(self) -> tuple[Domain, int, bool] | None:
         self.denied = None
         for place in self._places:
-            for lock in ("hub.lock", "listen.lock"):
+            for lock, is_hub in (("hub.lock", True), ("listen.lock", False)):
                 try:
-                    pid = _holder(os.path.join(place.root, lock))
-                except PermissionError:
-                    self.denied = denied(place.root)
+                    pid = _holder(place, lock)
+                except Denied as denied:
+                    self.denied = denied
                     break
                 except OSError as error:
                     if error.errno not in (errno.EMFILE, errno.ENFILE):
@@ -67,7 +73,7 @@ class Presence:
                     self.denied = Short(f"cannot look for a hub: {error}", "`ulimit -n` may be too small")
                     return self._holder
                 if pid:
-                    return place, pid
+                    return place, pid, is_hub
         return None
 
 
@@ -83,25 +89,14 @@ def find(places: list[Domain]) -> Domain:
         time.sleep(LOOK_EVERY)
 
 
-def denied(root: str) -> Denied:
-    """Whose the directory is, or the nearest one above that can be seen."""
-    path = root
-    while True:
-        try:
-            seen = os.stat(path)
-            break
-        except OSError:
-            path = os.path.dirname(path)
-    what = f"{path} belongs to user {seen.st_uid} with mode {seen.st_mode & 0o7777:04o}, this is user {os.getuid()}"
-    remedy = "shared memory is for one user: run as that user, or take a pipe from that user's `scanhub echo --json`"
-    return Denied(what, remedy)
-
-
-def _holder(path: str) -> int:
-    """The process that holds the lock at `path`; 0 if none does, or it has not written yet who it is."""
-    try:
-        file = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
-    except (FileNotFoundError, NotADirectoryError):
+def _holder(place: Domain, lock: str) -> int:
+    """The process that holds the lock; 0 if none does, or it has not written yet who it is. Denied."""
+    directory = directory_of(place)
+    if directory is None:
+        return 0
+    with directory:
+        file = directory.file(lock)
+    if file is None:
         return 0
     try:
         asked = fcntl.fcntl(file, fcntl.F_OFD_GETLK, struct.pack(_FLOCK, fcntl.F_RDLCK, os.SEEK_SET, 0, 0, 0))

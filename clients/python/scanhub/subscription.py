@@ -65,7 +65,7 @@ class Subscription(Iterator[Any]):
             left = give_up_at - time.monotonic()
             if left <= 0:
                 raise self._silence()
-            self._wakeups.wait(min(left, _LONGEST_WAIT, *(follower.left() for follower in self._followers)))
+            self._wait(left)
 
     def __enter__(self) -> Subscription:
         return self
@@ -94,11 +94,21 @@ class Subscription(Iterator[Any]):
                 return sample
         return None
 
+    def _wait(self, longest: float) -> None:
+        """Sleeps until there may be something to say, for so many seconds at most."""
+        self._wakeups.wait(min(longest, _LONGEST_WAIT, *(follower.left() for follower in self._followers)))
+
+    def _follow(self, name: TopicName) -> None:
+        """Follows this one, too."""
+        self._followers.append(_follower(name))
+        self._opened_at = float("-inf")
+
     def _look(self) -> bool:
         """Looks for the hub and for topics that are not there yet; whether something new was opened."""
         gone, back = self._presence.look()
         domain = self._presence.domain
-        if domain and (self._membership is None or self._membership.domain != domain):
+        joined = self._membership
+        if domain and (joined is None or joined.domain != domain or (back and not joined.is_current())):
             self._leave()
             self._membership = memory.Membership(domain)
         if self._membership is None and self._presence.denied:

@@ -12,9 +12,9 @@ import resource
 from typing import Any
 
 from . import layout
-from .errors import Failure, Mismatch, Short
+from .directory import directory_of
+from .errors import Denied, Failure, Mismatch, Short
 from .names import Domain
-from .presence import denied
 
 
 def check_absent(domain: Domain, name: str, ours: str, what: str) -> None:
@@ -41,10 +41,12 @@ def broken(domain: Domain, what: str) -> Failure:
     """Why something failed in a domain: it is another user's, or something is short, or else `what`."""
     try:
         check_room()
-        if os.stat(domain.root).st_uid != os.getuid():
-            return denied(domain.root)
-    except Short as short:
-        return short
+        directory = directory_of(domain)
+        if directory:
+            with directory:
+                pass
+    except (Short, Denied) as failure:
+        return failure
     except OSError:
         pass
     return Failure(what, "IOX2_LOG_LEVEL=debug shows what the shared memory says")

@@ -23,9 +23,9 @@ pub(super) struct Life {
 }
 
 impl Life {
-    /// Begins a life of the gateway of `domain` on `interface`, or of another one if there is one already: kept in a file
-    /// in `directory`, which is made if it is not there. `now_s` is seconds since 1970. What was kept on another `machine`
-    /// than this one is another gateway's; where that is not known, it is not asked.
+    /// Begins a life of the gateway of `domain` on `interface` (or another word for where it sends), or of another one if
+    /// there is one already: kept in a file in `directory`, which is made if it is not there. `now_s` is seconds since 1970.
+    /// What was kept on another `machine` than this one is another gateway's; where that is not known, it is not asked.
     ///
     /// [`Kind::Configuration`] if the file cannot be written: then listeners could not tell this life from the last one.
     pub(super) fn begin(

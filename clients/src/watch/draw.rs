@@ -13,8 +13,8 @@ use super::map::{DOTS, colour, map};
 use super::scene::{Scene, Sensor, verdict};
 use super::view::View;
 
-/// Draws `scene` as `view` says.
-pub(crate) fn draw(frame: &mut Frame<'_>, scene: &Scene, view: &View) {
+/// Draws `scene` as `view` says, with the picture of `held` if that is there: what there is to act on is never held.
+pub(crate) fn draw(frame: &mut Frame<'_>, scene: &Scene, held: Option<&Scene>, view: &View) {
     let places = Places::of(frame.area(), scene);
     let heading = heading(scene, view, places.heading.width);
     if let Some(over) =
@@ -24,7 +24,7 @@ pub(crate) fn draw(frame: &mut Frame<'_>, scene: &Scene, view: &View) {
         frame.render_widget(over, place);
     }
     frame.render_widget(heading, places.heading);
-    frame.render_widget(map(scene, view, (places.map.width, places.map.height)), places.map);
+    frame.render_widget(map(held.unwrap_or(scene), view, (places.map.width, places.map.height)), places.map);
     frame.render_widget(Line::raw(measure(view.dot_m)), last_row(places.map));
     for (row, (number, sensor)) in places.sensors.rows().zip(listed(scene, view, places.sensors.height)) {
         frame.render_widget(line(number, sensor, view, row.width), row);

@@ -16,12 +16,13 @@ mod multicast;
 mod program;
 mod segments;
 mod sensor;
+mod strangers;
 mod system;
 mod version;
 
 use std::sync::atomic::AtomicBool;
 
-use schema::{Domain, Failure, Kind};
+use schema::{Domain, Failure, Kind, ipc};
 
 use crate::config::{Config, Gateway, Link, Source};
 use crate::port::{Candidate, candidates};
@@ -88,6 +89,7 @@ pub fn examine(
     tell(machine::memory(&facts));
     tell(machine::domain(&facts));
     tell(machine::hubs(&facts, |user| system.name_of(user)));
+    tell(strangers::strangers(&ipc::strangers(domain.root()), |user| system.name_of(user)));
     tell(leftovers::leftovers(&facts));
     tell(limits::descriptors(&facts));
     tell(limits::file_size(&facts));

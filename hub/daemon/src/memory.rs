@@ -3,11 +3,12 @@
 //! soon as that is known, and once a second while the sensor streams. Refuses to know what of a sensor is worth to be known, and whether the line
 //! was its own all the while.
 
-use std::fs::{File, OpenOptions};
-use std::os::unix::fs::{FileExt, OpenOptionsExt};
+use std::fs::File;
+use std::os::unix::fs::FileExt;
 use std::path::Path;
 
 use lms::{Identity, MILLIS, Nanos, Session};
+use schema::Directory;
 
 use crate::clock;
 
@@ -25,11 +26,12 @@ pub(crate) struct Memory {
 impl Memory {
     /// That of the link `name` at `port`, in the directory `root`.
     pub(crate) fn open(root: &Path, name: &str, port: &str) -> Memory {
-        let mut options = OpenOptions::new();
-        options.read(true).write(true).create(true).truncate(false).mode(0o600);
-        let file = options.open(root.join(format!("{name}.sensor")));
+        let file = match Directory::open(root) {
+            Ok(Some(directory)) => directory.file_or_new(&format!("{name}.sensor")).map(Some),
+            nowhere => nowhere.map(|_| None),
+        };
         let file = file.inspect_err(|error| tracing::debug!(%error, "{name}: what is known cannot be kept"));
-        Memory { file: file.ok(), port: port.to_owned(), record: Vec::new(), identity: None }
+        Memory { file: file.ok().flatten(), port: port.to_owned(), record: Vec::new(), identity: None }
     }
 
     /// What the hub before this one knew, if that was just now and of this port.
@@ -83,8 +85,9 @@ mod tests {
 
     #[test]
     fn what_was_known_just_now_of_this_port_is_known() {
-        let root = std::env::temp_dir().join(format!("scanhub-memory-{}", std::process::id()));
-        std::fs::create_dir_all(&root).unwrap();
+        let base = std::env::temp_dir().join(format!("scanhub-memory-{}", std::process::id()));
+        let root = base.join("domain");
+        Directory::make(&root).unwrap();
         let identity = |byte: u8| Identity::from_bytes([byte; Identity::LEN]);
         let (now, port) = (9_000 * MILLIS, "/dev/ttyUSB0");
         let mut memory = Memory::open(&root, "front", port);
@@ -107,6 +110,6 @@ mod tests {
         let mut nowhere = Memory::open(&root.join("nowhere"), "front", port);
         nowhere.write(identity(1), now);
         assert_eq!(nowhere.recall(now), None);
-        std::fs::remove_dir_all(&root).unwrap();
+        std::fs::remove_dir_all(&base).unwrap();
     }
 }

@@ -1,21 +1,17 @@
 //! A word in shared memory at which all consumers of a sensor sleep: one call of the hub wakes them all, however many
 //! they are, where an event is one message to each. Refuses to know what was sent, and who sleeps.
 //!
-//! The page lies in /dev/shm under the domain's prefix, and under what tells the domain's root from all others: hubs of one
-//! name may live below several. Consumers map it read-only. A hub that is killed leaves it, and the
+//! The page lies in /dev/shm under the domain's prefix. Consumers map it read-only. A hub that is killed leaves it, and the
 //! next one goes on with it, so that who sleeps meanwhile is woken; a hub that ends closes it for good.
 #![allow(unsafe_code)]
 
-use std::ffi::OsStr;
 use std::fs::{File, OpenOptions};
 use std::io;
 use std::num::NonZeroU32;
-use std::os::unix::ffi::OsStrExt;
-use std::os::unix::fs::{MetadataExt, OpenOptionsExt};
+use std::os::unix::fs::OpenOptionsExt;
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicU32, Ordering, fence};
 
-use iceoryx2::prelude::SemanticString;
 use memmap2::{MmapOptions, MmapRaw};
 use rustix::fs::{FallocateFlags, OFlags, fallocate};
 use rustix::io::Errno;
@@ -23,6 +19,7 @@ use rustix::thread::futex::{self, WaitFlags, WaitPtr, WaitvFlags};
 use rustix::time::{ClockId, Timespec};
 
 use super::Node;
+use super::strangers::{Segment, in_the_way};
 use crate::shortage::{SHARED_MEMORY, memory};
 use crate::{Failure, Kind};
 
@@ -38,18 +35,18 @@ impl Ringer {
     ///
     /// [`Kind::Short`] if there is no memory for it, [`Kind::Failed`] if the place is taken by another user.
     pub(super) fn hang(node: &Node, sensor: &str) -> Result<Ringer, Failure> {
-        let path = path(node, sensor)
-            .map_err(|error| Failure::new(Kind::Failed, error.to_string(), "choose another --root"))?;
-        Ringer::at(path).map_err(|(path, error)| match error {
-            error if error.raw_os_error() == Some(Errno::NOSPC.raw_os_error()) => {
-                memory(&format!("{} kB for {} cannot be had", PAGE / 1024, path.display()))
+        let path = path(node, sensor);
+        match Ringer::open(&path) {
+            Ok(page) => Ok(Ringer { page, path }),
+            Err(Refused::Foreign(segment)) => Err(in_the_way(&segment)),
+            Err(Refused::System(error)) if Errno::from_io_error(&error) == Some(Errno::NOSPC) => {
+                Err(memory(&format!("{} kB for {} cannot be had", PAGE / 1024, path.display())))
             }
-            error => Failure::new(
-                Kind::Failed,
-                format!("{}: {error}", path.display()),
-                "remove it, or choose another --domain",
-            ),
-        })
+            Err(Refused::System(error)) => {
+                let what = format!("{}: {error}", path.display());
+                Err(Failure::new(Kind::Failed, what, "remove it, or choose another --domain"))
+            }
+        }
     }
 
     /// Wakes all who sleep.
@@ -60,14 +57,7 @@ impl Ringer {
         let _ = futex::wake(rung, futex::Flags::empty(), i32::MAX as u32);
     }
 
-    fn at(path: PathBuf) -> Result<Ringer, (PathBuf, io::Error)> {
-        match Ringer::open(&path) {
-            Ok(page) => Ok(Ringer { page, path }),
-            Err(error) => Err((path, error)),
-        }
-    }
-
-    fn open(path: &Path) -> io::Result<Page> {
+    fn open(path: &Path) -> Result<Page, Refused> {
         loop {
             let mut options = OpenOptions::new();
             let file = own(options.read(true).write(true).create(true).truncate(false), path)?;
@@ -100,8 +90,7 @@ impl Bell {
     ///
     /// [`Kind::Short`] if memory or descriptors are, [`Kind::Failed`] if it is another user's.
     pub fn open(node: &Node, sensor: &str) -> Result<Option<Bell>, Failure> {
-        // Without a root there is no hub.
-        let Ok(path) = path(node, sensor) else { return Ok(None) };
+        let path = path(node, sensor);
         let mapped = own(OpenOptions::new().read(true), &path).and_then(|file| {
             let is_made = file.metadata()?.len() >= PAGE as u64;
             let mapped = is_made.then(|| MmapOptions::new().len(PAGE).map_raw_read_only(&file));
@@ -109,8 +98,9 @@ impl Bell {
         });
         match mapped {
             Ok(bell) => Ok(bell),
-            Err(error) if error.kind() == io::ErrorKind::NotFound => Ok(None),
-            Err(error) => {
+            Err(Refused::Foreign(segment)) => Err(in_the_way(&segment)),
+            Err(Refused::System(error)) if error.kind() == io::ErrorKind::NotFound => Ok(None),
+            Err(Refused::System(error)) => {
                 let short = [Errno::MFILE, Errno::NFILE, Errno::NOMEM].map(|errno| errno.raw_os_error());
                 let is_short = error.raw_os_error().is_some_and(|errno| short.contains(&errno));
                 let kind = if is_short { Kind::Short } else { Kind::Failed };
@@ -189,20 +179,39 @@ impl Page {
 
 const PAGE: usize = 4096;
 
-/// Device and inode tell a root that may be written in several ways.
-fn path(node: &Node, sensor: &str) -> io::Result<PathBuf> {
-    let global = &node.config().global;
-    let root = Path::new(OsStr::from_bytes(global.root_path().as_bytes())).metadata()?;
-    let name = format!("{}{sensor}.{:x}-{:x}.bell", global.prefix, root.dev(), root.ino());
-    Ok(Path::new(SHARED_MEMORY).join(name))
+fn path(node: &Node, sensor: &str) -> PathBuf {
+    Path::new(SHARED_MEMORY).join(format!("{}{sensor}.bell", node.config().global.prefix))
 }
 
-/// The file at `path`, if it is this user's: anybody may put a file there, or a pipe at which opening it waits.
-fn own(options: &mut OpenOptions, path: &Path) -> io::Result<File> {
+/// The file at `path`, if it is this user's alone: anybody may put a file there, or a pipe at which opening it waits. What
+/// another user has put there is a failure of another kind than those of the system.
+fn own(options: &mut OpenOptions, path: &Path) -> Result<File, Refused> {
+    if let Some(segment) = Segment::at(path).filter(Segment::is_foreign) {
+        return Err(Refused::Foreign(segment));
+    }
     let flags = OFlags::NOFOLLOW | OFlags::NONBLOCK;
     let file = options.mode(0o600).custom_flags(flags.bits() as i32).open(path)?;
-    if file.metadata()?.uid() != rustix::process::geteuid().as_raw() {
-        return Err(io::Error::new(io::ErrorKind::PermissionDenied, "it is another user's"));
+    // It may have come in between.
+    match Segment::of(path, &file.metadata()?) {
+        segment if segment.is_foreign() => Err(Refused::Foreign(segment)),
+        _ => Ok(file),
     }
-    Ok(file)
+}
+
+/// Why there is no page.
+enum Refused {
+    System(io::Error),
+    Foreign(Segment),
+}
+
+impl From<io::Error> for Refused {
+    fn from(error: io::Error) -> Refused {
+        Refused::System(error)
+    }
+}
+
+impl From<Errno> for Refused {
+    fn from(error: Errno) -> Refused {
+        Refused::System(error.into())
+    }
 }

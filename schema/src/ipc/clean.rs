@@ -1,13 +1,13 @@
 //! What dead processes left in a domain, taken away without a hub: their places in it, and the directory itself once
 //! nobody is there. Files in shared memory that no dead process is known to have had are not looked at.
 
-use std::fs;
-use std::io::ErrorKind;
 use std::path::Path;
 use std::time::Duration;
 
-use super::{hub_node, nodes};
-use crate::{Domain, Failure, HubLock, ListenLock};
+use rustix::fs::FileType;
+
+use super::{forget, hub_node, nodes};
+use crate::{Directory, Domain, Failure, HubLock, ListenLock};
 
 /// What was taken away.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
@@ -27,9 +27,7 @@ pub struct Cleaned {
 /// [`Kind::Failed`](crate::Kind) if the directory is another user's.
 pub fn clean(domain: &Domain) -> Result<Cleaned, Failure> {
     let root = domain.root();
-    if !root.exists() {
-        return Ok(Cleaned::default());
-    }
+    let Some(directory) = Directory::open(root)? else { return Ok(Cleaned::default()) };
     // Nobody begins to publish meanwhile.
     let _hub = HubLock::acquire(root)?;
     let _listener = ListenLock::acquire(root)?;
@@ -38,22 +36,25 @@ pub fn clean(domain: &Domain) -> Result<Cleaned, Failure> {
     node.blocking_cleanup_dead_nodes(PATIENCE);
     drop(node);
     let after = nodes(domain)?;
-    let root = after.alive == 0 && after.dead == 0 && take_away(root);
+    let root = after.alive == 0 && after.dead == 0 && take_away(&directory, root);
     Ok(Cleaned { dead: before.dead.saturating_sub(after.dead), alive: after.alive, root })
 }
 
-/// Removes the directory `root` with what nobody needs who is not there: empty directories, locks, and what a hub noted of
-/// its sensors for the next one. Whether all of it is gone; anything else in it stays.
-fn take_away(root: &Path) -> bool {
-    for entry in fs::read_dir(root).into_iter().flatten().flatten() {
-        let path = entry.path();
-        let is_ours = path.extension().is_some_and(|kind| kind == "lock" || kind == "sensor");
-        let _ = if is_ours { fs::remove_file(&path) } else { fs::remove_dir(&path) };
+/// Removes the domain's `directory` at `root` with what nobody needs who is not there: empty directories, locks, names, and
+/// what a hub noted of its sensors for the next one. Whether all of it is gone; anything else in it stays.
+fn take_away(directory: &Directory, root: &Path) -> bool {
+    forget(directory, root);
+    for (name, stat) in directory.entries() {
+        let extension = Path::new(&name).extension();
+        match FileType::from_raw_mode(stat.st_mode) {
+            FileType::Directory => directory.remove_empty(&name),
+            FileType::RegularFile if extension.is_some_and(|kind| kind == "lock" || kind == "sensor") => {
+                directory.remove(&name);
+            }
+            _ => {}
+        }
     }
-    match fs::remove_dir(root) {
-        Ok(()) => true,
-        Err(error) => error.kind() == ErrorKind::NotFound,
-    }
+    directory.remove_itself()
 }
 
 /// Of a dead process whose remains another one is just taking away.
@@ -61,21 +62,32 @@ const PATIENCE: Duration = Duration::from_secs(1);
 
 #[cfg(test)]
 mod tests {
+    use std::fs;
+    use std::os::unix::fs::symlink;
+
     use super::*;
 
     #[test]
     fn what_is_not_a_domains_stays() {
-        let root = std::env::temp_dir().join(format!("shc{}", std::process::id()));
-        fs::create_dir_all(root.join("nodes")).unwrap();
+        let base = std::env::temp_dir().join(format!("shc{}", std::process::id()));
+        let root = base.join("a");
+        let directory = Directory::make(&root).unwrap();
+        fs::create_dir(root.join("nodes")).unwrap();
+        symlink(root.join("full"), root.join("link.lock")).unwrap();
         fs::create_dir(root.join("full")).unwrap();
-        for file in ["hub.lock", "front.sensor", "full/something", "letter"] {
+        for file in ["hub.lock", "front.sensor", "prefix", "full/something.lock", "letter"] {
             fs::write(root.join(file), "").unwrap();
         }
-        assert!(!take_away(&root));
+        assert!(!take_away(&directory, &root));
         let mut left: Vec<_> = fs::read_dir(&root).unwrap().map(|entry| entry.unwrap().file_name()).collect();
         left.sort();
-        assert_eq!(left, ["full", "letter"]);
-        fs::remove_dir_all(&root).unwrap();
-        assert!(take_away(&root), "it is gone already");
+        assert_eq!(left, ["full", "letter", "link.lock"]);
+        assert!(root.join("full/something.lock").exists());
+        for file in ["link.lock", "letter", "full/something.lock"] {
+            fs::remove_file(root.join(file)).unwrap();
+        }
+        assert!(take_away(&directory, &root) && !root.exists());
+        assert!(take_away(&directory, &root), "it is gone already");
+        fs::remove_dir_all(&base).unwrap();
     }
 }

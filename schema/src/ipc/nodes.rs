@@ -1,5 +1,7 @@
 //! Who has joined a domain, living and dead. Only counts: what a dead process left is cleaned up by the next hub.
 
+use std::path::Path;
+
 use iceoryx2::node::NodeState;
 use iceoryx2::prelude::CallbackProgression;
 
@@ -19,11 +21,14 @@ pub struct Nodes {
 ///
 /// [`Kind::Failed`](crate::Kind) with owner, mode and remedy if the directory is another user's.
 pub fn nodes(domain: &Domain) -> Result<Nodes, Failure> {
+    at(domain.root())
+}
+
+/// The same of the domain in `root`.
+pub(super) fn at(root: &Path) -> Result<Nodes, Failure> {
     let mut nodes = Nodes::default();
-    if !domain.root().exists() {
-        return Ok(nodes);
-    }
-    let listed = Node::list(&config(domain)?, |state| {
+    let Some(config) = config(root)? else { return Ok(nodes) };
+    let listed = Node::list(&config, |state| {
         match state {
             NodeState::Alive(_) => nodes.alive += 1,
             NodeState::Dead(_) => nodes.dead += 1,
@@ -31,6 +36,6 @@ pub fn nodes(domain: &Domain) -> Result<Nodes, Failure> {
         }
         CallbackProgression::Continue
     });
-    listed.map_err(|error| access::failure(domain.root(), format!("cannot list processes: {error:?}")))?;
+    listed.map_err(|error| access::failure(root, format!("cannot list processes: {error:?}")))?;
     Ok(nodes)
 }

@@ -2,24 +2,33 @@
 //! that finds /dev/shm full would end the process later.
 
 use std::fs::{self, OpenOptions};
+use std::os::unix::fs::{MetadataExt, OpenOptionsExt};
 
-use rustix::fs::{FallocateFlags, fallocate};
+use rustix::fs::{FallocateFlags, OFlags, fallocate};
 use rustix::io::Errno;
 
 use super::{SHARED_MEMORY, memory};
 use crate::{
     Background, Domain, Failure, Foreground, Header, Marks, Scan, Status, Telegram, Topic, Zones, limits,
+    prefix,
 };
 
 /// Allocates what the segments of `domain` have promised so far.
 ///
 /// [`Kind::Short`](crate::Kind) if it cannot be had.
 pub fn allocate(domain: &Domain) -> Result<(), Failure> {
-    let prefix = domain.prefix();
+    let Some(prefix) = prefix::of(domain.root())? else { return Ok(()) };
+    let user = rustix::process::geteuid().as_raw();
     let entries = fs::read_dir(SHARED_MEMORY).into_iter().flatten().flatten();
     for entry in entries.filter(|entry| entry.file_name().to_string_lossy().starts_with(&prefix)) {
-        // What is another process's, or gone again, is not ours to allocate.
-        let Ok(segment) = OpenOptions::new().write(true).open(entry.path()) else { continue };
+        // What is another user's, or gone again, is not ours to allocate.
+        if !entry.metadata().is_ok_and(|metadata| metadata.is_file() && metadata.uid() == user) {
+            continue;
+        }
+        let flags = (OFlags::NOFOLLOW | OFlags::NONBLOCK).bits() as i32;
+        let Ok(segment) = OpenOptions::new().write(true).custom_flags(flags).open(entry.path()) else {
+            continue;
+        };
         let Ok(metadata) = segment.metadata() else { continue };
         if metadata.len() == 0 {
             continue;

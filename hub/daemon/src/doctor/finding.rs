@@ -16,6 +16,7 @@ pub const CHECKS: &[&str] = &[
     "memory",
     "domain",
     "hubs",
+    "strangers",
     "leftovers",
     "descriptors",
     "file-size",
