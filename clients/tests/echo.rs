@@ -211,7 +211,7 @@ fn what_the_hub_does_not_have() {
     let failure = start(&place, &["left/scan"], Format::Text, Bounds::default()).join().0.unwrap_err();
     assert_eq!((failure.kind, failure.hint.as_str()), (Kind::NoTopic, "there are front, rear"));
     for (topics, format, kind) in [
-        (&["front/zone"][..], Format::Text, Kind::NoTopic),
+        (&["front/zone"][..], Format::Text, Kind::Usage),
         (&["front/status"], Format::Csv, Kind::Usage),
         (&["front/scan", "rear/scan"], Format::Raw, Kind::Usage),
         (&[], Format::Text, Kind::Usage),

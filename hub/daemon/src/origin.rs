@@ -17,11 +17,11 @@ pub(crate) enum Origin {
 impl Origin {
     /// Reads a file.
     ///
-    /// [`Kind::Configuration`] if it cannot be read.
+    /// [`Kind::Input`] if it cannot be read.
     pub(crate) fn read(path: &Path) -> Result<Origin, Failure> {
         let text = std::fs::read_to_string(path).map_err(|error| {
             let message = format!("{}: {error}", path.display());
-            Failure::new(Kind::Configuration, message, "name a readable TOML file")
+            Failure::new(Kind::Input, message, "name a readable TOML file")
         })?;
         Ok(Origin::File { path: path.to_owned(), text })
     }

@@ -103,7 +103,7 @@ pub enum Control {
 /// Two scans of the slowest variant, and some; longer where the line is slower than the scans.
 pub(crate) const LISTEN: Nanos = 120 * MILLIS;
 /// Without measured data for so long the session begins again (paper: resynchronise after one second).
-pub(crate) const SILENCE: Nanos = 1_000 * MILLIS;
+pub const SILENCE: Nanos = 1_000 * MILLIS;
 /// After a change of rate the sensor's and the adapter's UART need a moment.
 pub(crate) const SETTLE: Nanos = 20 * MILLIS;
 /// After a refusal, before everything begins again.
