@@ -72,7 +72,7 @@ fn headless_in_an_empty_environment() {
 #[test]
 fn interrupted() {
     // Its processes are there, and all of them go.
-    let outcome = demo(&["--headless", "--json"], |mut program| {
+    let outcome = demo(&["--headless", "--json"], |program| {
         let name = format!("demo-{}", program.pid());
         until("hub, simulator and consumers", || processes(&name).len() >= 4);
         until("a domain", || !shared_memory(&format!("sh_{name}_")).is_empty());

@@ -198,12 +198,12 @@ fn what_cannot_be_recorded_is_refused() {
         let error = lines.into_iter().find(is_class("error")).unwrap_or_else(|| panic!("{outcome}"));
         (outcome.code, error["kind"].as_str().unwrap_or_default().to_owned())
     };
-    assert_eq!(kind(&["-o", &file]), (Some(1), "failed".into()));
+    assert_eq!(kind(&["-o", &file]), (Some(73), "output".into()));
     assert_eq!(std::fs::read(&file).unwrap(), b"somebody's");
-    assert_eq!(kind(&["-o", &stage.word("nowhere/walk.mcap")]), (Some(1), "failed".into()));
+    assert_eq!(kind(&["-o", &stage.word("nowhere/walk.mcap")]), (Some(73), "output".into()));
     let hint = |arguments: &[&str]| {
         let outcome = stage.run(&[&["record", "--json"], arguments].concat());
-        assert_eq!(outcome.code, Some(1), "{outcome}");
+        assert_eq!(outcome.code, Some(73), "{outcome}");
         outcome.of_class("error")[0]["hint"].as_str().unwrap().to_owned()
     };
     assert!(hint(&["-o", &stage.word("")]).starts_with("name a file in it: -o "));

@@ -126,7 +126,7 @@ fn a_model_is_saved_forgotten_and_loaded_again() {
     let (_, piped) = ask(&place, "front", keep(Path::new("-")), false);
     assert_eq!(piped, out);
     assert!(saved_model("-".as_ref(), "front", false, &mut out.as_bytes()).is_ok());
-    let (_, out) = ask(&place, "front", keep(&file), true);
+    let (_, out) = ask(&place, "front", ModelOrder::Save { file: file.clone(), force: true }, true);
     assert_eq!(
         out,
         format!(
