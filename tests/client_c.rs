@@ -197,6 +197,52 @@ fn zones_get_unknown_when_the_hub_is_killed() {
     }
 }
 
+/// The worst of its sensors, of which one is switched off, then the hub killed.
+#[test]
+fn a_robot_is_as_unknown_as_its_worst_sensor() {
+    let Some(installed) = Installed::once() else { return };
+    let stage = Stage::new();
+    let robot = installed.compile(&stage, &source("robot.c"), &[]);
+    let mut followers =
+        [&["doorbell"][..], &["poll"], &["event", "front rear"]].map(|words| program(&stage, &robot, words));
+    for follower in &mut followers {
+        let first = follower.await_line("there is no hub", is_class("robot"));
+        assert_eq!((&first["verdict"], &first["nearest_mm"]), (&3.into(), &Value::Null), "{first}");
+    }
+    // All is clear: nothing in the simulated room is so near.
+    let _front = stage.simulator(&["front"], &["--seed=36", "--baud=500000"]);
+    let rear =
+        stage.start(&["simulate", "--json", "--baud=500000", &format!("--port={}", stage.word("rear"))]);
+    let rear = rear.ready();
+    let hub = stage.hub(&[&stage.link("front"), &stage.link("rear"), "--set=zones.radii=[0.02,0.01]"]);
+    let verdicts = |line: &Value| {
+        let sensors = line["sensors"].as_array().expect("a list");
+        let of = |sensor: &Value| (sensor["sensor"].as_str().map(str::to_owned), number(sensor, "verdict"));
+        (number(line, "verdict"), sensors.iter().map(of).collect::<Vec<_>>())
+    };
+    let both = |front, rear| vec![(Some("front".to_owned()), front), (Some("rear".to_owned()), rear)];
+    for follower in &mut followers {
+        let line = follower.await_line("all is clear", |line| verdicts(line) == (0, both(0, 0)));
+        assert_eq!(line["worst"], "front", "{line}");
+        let nearest =
+            line["sensors"].as_array().expect("a list").iter().min_by_key(|it| number(it, "nearest_mm"));
+        let nearest = nearest.expect("one of two");
+        assert_eq!(
+            (&line["nearest_mm"], &line["nearest_sensor"]),
+            (&nearest["nearest_mm"], &nearest["sensor"])
+        );
+    }
+    stage.kill_simulator(rear, "rear");
+    for follower in &mut followers {
+        let line = follower.await_line("the rear is gone", |line| verdicts(line) == (3, both(0, 3)));
+        assert_eq!(line["worst"], "rear", "{line}");
+    }
+    assert_eq!(hub.end(KILL).code, None);
+    for follower in &mut followers {
+        follower.await_line("the hub is gone", |line| verdicts(line) == (3, both(3, 3)));
+    }
+}
+
 /// Once as it is, and with two watches over memory, of the compiler and of valgrind: the library shares it with the program.
 #[test]
 fn what_a_program_does_wrong_is_refused() {

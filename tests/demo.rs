@@ -12,10 +12,13 @@ use stage::{INT, Outcome, Program, is_there, number, shared_memory, until};
 /// Runs the demonstration in an empty environment; `end` may wait for something and hasten its end.
 fn demo(arguments: &[&str], end: impl FnOnce(Program) -> Outcome) -> Outcome {
     let mut command = Command::new(env!("CARGO_BIN_EXE_scanhub"));
-    command.arg("demo").args(arguments).env_clear();
+    let state =
+        std::env::temp_dir().join(format!("scanhub-demo-state-{}-{}", std::process::id(), arguments.len()));
+    command.arg("demo").args(arguments).env_clear().env("XDG_STATE_HOME", &state);
     let program = Program::start(command);
     let name = format!("demo-{}", program.pid());
     let outcome = end(program);
+    assert!(!is_there(&state), "what it learned is left");
     assert_eq!(shared_memory(&format!("sh_{name}_")), [] as [&Path; 0]);
     assert!(!is_there(format!("/tmp/scanhub-{name}").as_ref()), "its directory is left");
     let uid = rustix::process::getuid().as_raw();
@@ -66,6 +69,19 @@ fn headless_in_an_empty_environment() {
         program.wait()
     });
     assert_eq!(outcome.code, Some(0), "{outcome}");
+    nothing_was_lost(&outcome);
+}
+
+#[test]
+fn where_the_users_own_place_is_too_long_for_a_domain() {
+    let place = format!("/tmp/scanhub-demo-{}/{}", std::process::id(), "long".repeat(20));
+    fs::create_dir_all(&place).expect("a directory");
+    let mut command = Command::new(env!("CARGO_BIN_EXE_scanhub"));
+    command.args(["demo", "--headless", "--for", "1s", "--json"]).env_clear().env("XDG_RUNTIME_DIR", &place);
+    let outcome = Program::start(command).wait();
+    let left = fs::read_dir(&place).expect("it is there").count();
+    fs::remove_dir_all(format!("/tmp/scanhub-demo-{}", std::process::id())).expect("it is ours");
+    assert_eq!((outcome.code, left), (Some(0), 0), "{outcome}");
     nothing_was_lost(&outcome);
 }
 

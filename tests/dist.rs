@@ -85,6 +85,17 @@ fn an_adapter_that_is_plugged_in_after_the_start_is_not_denied() {
     }
 }
 
+/// Hub and gateway are one user, and what they keep is for that user alone.
+#[test]
+fn what_is_kept_lies_in_one_closed_directory() {
+    for unit in ["scanhub.service", "scanhub-gateway.service"] {
+        let text = fs::read_to_string(dist().join(unit)).expect("is there");
+        for wanted in ["User=scanhub", "StateDirectory=scanhub", "StateDirectoryMode=0700", "UMask=0077"] {
+            assert!(text.lines().any(|line| line == wanted), "{unit}: {wanted}");
+        }
+    }
+}
+
 #[test]
 fn units_leave_little_open() {
     for unit in ["scanhub.service", "scanhub-gateway.service"] {

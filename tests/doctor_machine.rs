@@ -169,14 +169,14 @@ fn what_is_wrong_with_the_domain() {
     let root = stage.place().root().to_owned();
     fs::create_dir(&root).expect("can be made");
     fs::set_permissions(&root, fs::Permissions::from_mode(0o777)).expect("it is ours");
-    Findings::of(&stage, &[]).complain("others may write in the domain", "domain", "warning", "chmod 700");
+    Findings::of(&stage, &[]).complain("others may write in the domain", "domain", "failed", "chmod go-w");
     if std::os::unix::fs::chown(&root, Some(1), None).is_ok() {
         fs::set_permissions(&root, fs::Permissions::from_mode(0o700)).expect("root may");
         Findings::of(&stage, &[]).complain(
             "the domain is another user's",
             "domain",
             "failed",
-            "run as that user",
+            "run as user 1",
         );
     } else {
         eprintln!("skipped: this user cannot give a directory away");
@@ -289,16 +289,8 @@ fn two_hubs_and_one_that_was_replaced() {
 fn no_way_to_the_network() {
     in_a_network("no_way_to_the_network", || {
         let stage = Stage::new();
-        let none = Findings::of(&stage, &[]);
-        none.complain("no multicast route", "multicast", "warning", "ip route add 239.255.76.0/24");
-        let added = Command::new("ip").args(["route", "add", "239.0.0.0/8", "dev", "lo"]).status();
-        assert!(added.is_ok_and(|status| status.success()));
-        Findings::of(&stage, &[]).complain(
-            "multicast by the loopback",
-            "multicast",
-            "warning",
-            "plug the network in",
-        );
+        // Nobody named an interface: nothing goes to a network.
+        assert_eq!(Findings::of(&stage, &[]).said("multicast").0, "skipped");
         let interface = Findings::of(&stage, &["--set", "gateway.interface=eth7"]);
         interface.complain("the gateway's interface is gone", "multicast", "failed", "there are lo");
     });

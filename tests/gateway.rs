@@ -7,7 +7,7 @@ use std::net::{Ipv4Addr, UdpSocket};
 
 use schema::datagram::{Account, Announce, Datagram, Packed};
 use schema::{Scan, Topic, Verdict, Zones};
-use serde_json::Value;
+use serde_json::{Value, json};
 use stage::{INT, KILL, Outcome, Receiver, Stage, TERM, hash, in_a_network, is_class, number, read, until};
 
 const STREAM: [&str; 2] = ["--seed=61", "--baud=500000"];
@@ -40,7 +40,7 @@ fn account(outcome: &Outcome) -> Vec<Value> {
 fn agrees(heard: &[Vec<u8>], outcome: &Outcome) {
     assert_eq!(outcome.code, Some(0), "{outcome}");
     let mut ours = Box::new(Account::new(&Topic::ALL));
-    heard.iter().for_each(|bytes| assert!(ours.receive(bytes).is_ok()));
+    heard.iter().for_each(|bytes| assert!(ours.receive(bytes, 1, 0).is_ok()));
     let lines = account(outcome);
     assert_eq!(ours.rows().count(), lines.len(), "{lines:#?}");
     for row in ours.rows() {
@@ -300,5 +300,29 @@ fn what_does_not_fit_is_told_and_counted() {
         let last = heard.iter().rev().find_map(|bytes| announced(bytes)).expect("an announcement");
         let next = last.topics().iter().find(|it| it.topic == Topic::Scan.number()).map(|it| it.next);
         assert_eq!(next.map(u64::from), Some(number(scans, "send_failed")));
+    });
+}
+
+#[test]
+fn without_an_interface_nothing_goes_to_groups() {
+    in_a_network("without_an_interface_nothing_goes_to_groups", || {
+        let stage = Stage::new();
+        let groups = Receiver::new(LO);
+        let _simulator = stage.simulator(&["front"], &STREAM);
+        let _hub = stage.hub(&[stage.link("front")]);
+        let copies = Receiver::at(LO, 30_000);
+        let mut gateway = stage.gateway_at(&["--to=127.0.0.1:30000"]);
+        let begin = gateway.await_line("its begin", is_class("gateway"));
+        assert_eq!((&begin["interface"], &begin["to"]), (&json!(null), &json!(["127.0.0.1:30000"])));
+        copies.await_more(30, |datagram| datagram.head.topic == Topic::Scan.number());
+        let outcome = gateway.end(TERM);
+        assert_eq!(outcome.code, Some(0), "{outcome}");
+        let to = outcome.of_class("lan_to").pop().expect("an account");
+        assert_eq!((&to["to"], number(&to, "send_failed")), (&json!("127.0.0.1:30000"), 0), "{outcome}");
+        assert_eq!(copies.finish().len() as u64, number(&to, "sent"));
+        let is_scan = |line: &&Value| line["topic"] == "scan";
+        let scan = outcome.of_class("lan").iter().rfind(is_scan).cloned().expect("a row");
+        assert!(number(&scan, "sent") >= 30 && number(&scan, "send_failed") == 0, "{scan}");
+        assert!(groups.finish().is_empty(), "somebody else could have read it");
     });
 }

@@ -62,7 +62,7 @@ fn first(heard: &[Vec<u8>], row: &Row) -> u64 {
 fn is_gap_free(heard: &[Vec<u8>], outcome: &Outcome) {
     assert_eq!(outcome.code, Some(0), "{outcome}");
     let mut ours = Box::new(Account::new(&Topic::ALL));
-    heard.iter().for_each(|bytes| assert!(ours.receive(bytes).is_ok()));
+    heard.iter().for_each(|bytes| assert!(ours.receive(bytes, 1, 0).is_ok()));
     let lines = outcome.of_class("lan");
     for row in ours.rows() {
         let topic = Topic::of_number(row.topic).map_or("announce", Topic::name);
@@ -79,8 +79,7 @@ fn a_link_that_goes_and_comes() {
         plug();
         let _simulator = stage.simulator(&["front"], &STREAM);
         let _hub = stage.hub(&[stage.link("front")]);
-        // The only one that can be meant: the other end has no address.
-        let mut gateway = stage.gateway(&["--to=10.76.0.9:22200"]);
+        let mut gateway = stage.gateway(&["--interface=ours", "--to=10.76.0.9:22200"]);
         let receiver = Receiver::new(OURS);
         receiver.await_more(10, |datagram| datagram.head.topic == Topic::Scan.number());
         await_growth(&mut gateway, "sent");
@@ -152,7 +151,6 @@ fn a_reader_that_does_not_read_delays_nothing() {
         let (_reader, writer) = std::io::pipe().expect("a pipe");
         fcntl_setpipe_size(&writer, 8192).expect("a small one");
         let mut command = stage.command(&["gateway", "--json", "--no-system-config", "--interface=lo"]);
-        command.env("XDG_STATE_HOME", stage.path("state")).env_remove("STATE_DIRECTORY");
         command.stdout(writer.try_clone().expect("another end")).stdin(Stdio::null());
         let mut gateway = command.spawn().expect("a gateway");
         let signal = |signal| kill_process(Pid::from_child(&gateway), signal).expect("it lives");
@@ -187,9 +185,7 @@ fn the_account_is_told_when_asked_for() {
         let _hub = stage.hub(&[stage.link("front")]);
         let flags = ["--interface=lo", "--topic=front/background", "--background-every=1s"];
         let words = [&["gateway", "--no-system-config"], &flags[..]].concat();
-        let mut command = stage.command(&words);
-        command.env("XDG_STATE_HOME", stage.path("state")).env_remove("STATE_DIRECTORY");
-        let mut gateway = Program::start(command);
+        let mut gateway = stage.start(&words);
         gateway.await_text("gateway ");
         let is_background =
             |datagram: &schema::datagram::Datagram<'_>| datagram.head.topic == Topic::Background.number();
@@ -233,7 +229,7 @@ fn what_cannot_be_is_refused() {
             let (message, found) = (error["message"].to_string(), error["hint"].to_string());
             assert!(message.contains(said) && found.contains(hint), "{flags:?}: {error}");
         };
-        refused(&[], 78, "no interface", "lo (127.0.0.1)");
+        refused(&[], 78, "no interface is named", "lo (127.0.0.1, this machine alone)");
         refused(&["--interface=eth7"], 78, "eth7", "lo");
         refused(&["--interface=lo", "--to=127.0.0.1"], 78, "127.0.0.1", "HOST:PORT");
         refused(&["--interface=lo", "--to=239.255.76.80:22200"], 78, "no host", "hosts");
@@ -254,8 +250,8 @@ fn what_cannot_be_is_refused() {
         refused(&[&config("[gateway]\nbackground_every = \"ten\"\n")], 78, "gateway.toml:2:20", "");
         refused(&[&config("[gateway]\ninterface = \"eth8\"\n")], 78, "eth8", "lo");
         plug();
-        ip("addr add 10.77.0.1/24 dev theirs");
-        refused(&[], 78, "several", "ours (10.76.0.1)");
+        refused(&[], 78, "no interface is named", "ours (10.76.0.1)");
+        refused(&[&config("[gateway]\ntopics = [\"front/scan\"]\n")], 78, "no interface", "--to");
         let unwritable = {
             let mut command = stage.command(&["gateway", "--json", "--no-system-config", "--interface=lo"]);
             command.env("XDG_STATE_HOME", "/dev/null").env_remove("STATE_DIRECTORY");

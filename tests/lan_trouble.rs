@@ -50,7 +50,7 @@ fn sent(outcome: &Outcome, to: &str) -> (u64, u64) {
 /// What a receiver says: received and lost, in all.
 fn account(heard: &[Vec<u8>]) -> (u64, u64) {
     let mut account = Box::new(Account::new(&Topic::ALL));
-    heard.iter().for_each(|bytes| assert!(account.receive(bytes).is_ok()));
+    heard.iter().for_each(|bytes| assert!(account.receive(bytes, 1, 0).is_ok()));
     let sums = account.rows().map(|row| (row.received, row.lost()));
     sums.fold((0, 0), |sum, row| (sum.0 + row.0, sum.1 + row.1))
 }
@@ -60,7 +60,7 @@ fn a_cable_is_pulled_and_an_address_taken() {
     in_a_network("a_cable_is_pulled_and_an_address_taken", || {
         let robot = Robot::new(&["front"]);
         let receiver = Receiver::new(robot.machine.here());
-        let mut gateway = robot.gateway(&["--interface=eth0"]);
+        let mut gateway = robot.gateway::<&str>(&[]);
         receiver.await_more(10, is_scan);
         let there = robot.machine.there();
         let address = format!("{there}/24 dev eth0");
@@ -89,7 +89,7 @@ fn a_queue_is_full() {
     in_a_network("a_queue_is_full", || {
         let robot = Robot::new(&["front"]);
         let receiver = Receiver::new(robot.machine.here());
-        let mut gateway = robot.gateway(&["--interface=eth0"]);
+        let mut gateway = robot.gateway::<&str>(&[]);
         receiver.await_more(10, is_scan);
         if !robot.machine.try_run("tc qdisc add dev eth0 root tbf rate 128kbit burst 2kb limit 4kb") {
             eprintln!("skipped: there is no tc or no tbf");
@@ -155,7 +155,7 @@ fn hubs_and_gateways_are_killed() {
             listener.await_lines(20, "scans", is_class("scan"));
             line
         };
-        let first = robot.gateway(&["--interface=eth0"]);
+        let first = robot.gateway::<&str>(&[]);
         let of_first = again("the gateway", "epoch", &Value::Null);
         let before = relay.log().len();
         robot.take_hub().end(KILL);
@@ -168,7 +168,7 @@ fn hubs_and_gateways_are_killed() {
         robot.start();
         again("the next hub", "boot", &of_first);
         drop(first.end(KILL));
-        let second = robot.gateway(&["--interface=eth0"]);
+        let second = robot.gateway::<&str>(&[]);
         again("the next gateway", "epoch", &of_first);
         let last = second.end(TERM);
         let outcome = listener.end(INT);

@@ -88,7 +88,7 @@ fn golden_datagrams_are_shown_field_by_field() {
                 wanted.insert("scanhub.crc_status".to_owned(), vec!["good".to_owned()]);
             }
             // A capture has no key, and other datagrams before it.
-            Some("unauthenticated" | "mac" | "epoch" | "stale" | "capacity") => {}
+            Some("unauthenticated" | "mac" | "epoch" | "twin" | "stale" | "capacity") => {}
             Some(refusal) => {
                 wanted.insert("scanhub.refused".to_owned(), vec![refusal.to_owned()]);
             }

@@ -6,10 +6,15 @@ use std::fs;
 use std::io::Read;
 use std::path::PathBuf;
 use std::process::Stdio;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::thread;
+use std::time::Duration;
 
 use rustix::process::Signal;
+use rustix::time::{ClockId, clock_gettime};
+use schema::{Topic, Verdict, Zones};
 use serde_json::Value;
-use stage::{INT, KILL, Program, Stage, TERM, terminal, until};
+use stage::{INT, KILL, Program, Sender, Stage, TERM, in_a_network, is_class, number, terminal, until};
 
 /// The walls of a room, far from the sensor, and in it what `thing` says.
 fn world(stage: &Stage, name: &str, thing: &str) -> String {
@@ -200,6 +205,62 @@ fn the_robot_is_red_for_the_sensor_that_is_worst_off() {
         (&"robot".into(), &"rear".into(), &true.into())
     );
     assert_eq!(leds.end(INT).code, Some(0));
+}
+
+fn now_ns() -> u64 {
+    let now = clock_gettime(ClockId::Monotonic);
+    now.tv_sec as u64 * 1_000_000_000 + now.tv_nsec as u64
+}
+
+/// Each verdict said once: what stands for a moment and what is held is known to the test.
+#[test]
+fn a_worse_verdict_is_shown_at_once_and_a_better_one_only_when_it_has_stood() {
+    in_a_network("a_worse_verdict_is_shown_at_once_and_a_better_one_only_when_it_has_stood", || {
+        let stage = Stage::new();
+        let mut front = Sender::new(1, 7, 0, "front");
+        let mut listener =
+            stage.start(&["listen", "--json", "--publish", "--name=robot1=0000000000000001"]).ready();
+        front.announce(&[Topic::Zones]);
+        listener.await_line("a sensor", |line| line["kind"] == "published");
+        let mut say = |verdict: Verdict| {
+            front.send(Topic::Zones, &Zones { verdict: verdict as u8, ..Zones::unknown() });
+            now_ns()
+        };
+        // Others see what is said as it is said.
+        let leds = |hold: &[&str]| {
+            let before = stage.subscribers("robot1.front/zones");
+            let program = stage.start(&[&["leds", "robot1.front", "--json"], hold].concat());
+            until("it follows", || stage.subscribers("robot1.front/zones") > before);
+            program
+        };
+        let (mut usual, mut long, mut none) = (leds(&[]), leds(&["--hold=1h"]), leds(&["--hold=0s"]));
+        say(Verdict::Stop);
+        let is =
+            |verdict: &'static str| move |line: &Value| is_class("leds")(line) && line["verdict"] == verdict;
+        for program in [&mut usual, &mut long, &mut none] {
+            program.await_line("stop at once, whatever the hold", is("stop"));
+        }
+        let said_ns = say(Verdict::Clear);
+        let is_shown = AtomicBool::new(false);
+        let shown_ns = thread::scope(|scope| {
+            // Again and again: however late this machine is, it stands.
+            scope.spawn(|| {
+                while !is_shown.load(Ordering::Relaxed) {
+                    thread::sleep(Duration::from_millis(100));
+                    say(Verdict::Clear);
+                }
+            });
+            none.await_line("clear at once", is("clear"));
+            let shown = usual.await_line("clear", is("clear"));
+            is_shown.store(true, Ordering::Relaxed);
+            number(&shown, "stamp_ns")
+        });
+        assert!(shown_ns - said_ns > 250_000_000, "it had stood for {} ms", (shown_ns - said_ns) / 1_000_000);
+        let outcome = long.end(INT);
+        let verdicts: Vec<_> = outcome.of_class("leds").iter().map(|line| line["verdict"].clone()).collect();
+        assert_eq!(verdicts, ["unknown", "stop", "unknown"], "at the end nobody watches: {outcome}");
+        assert_eq!((usual.end(INT).code, none.end(INT).code), (Some(0), Some(0)));
+    });
 }
 
 #[test]

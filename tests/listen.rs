@@ -327,18 +327,21 @@ fn each_refusal_has_its_reason() {
         {
             sender.throw(Topic::Zones, bad);
         }
-        let sealed = |change: &dyn Fn(&mut Sender)| {
-            let mut sender = Sender::new(HUB, 7, 0, "front");
-            change(&mut sender);
-            let datagram = sender.make(Topic::Zones, &zones(Verdict::Clear));
-            sender.throw(Topic::Zones, &datagram);
-        };
-        sealed(&|sender| sender.epoch = 6);
-        sealed(&|sender| sender.next[usize::from(Topic::Zones.number())] = 5000 - WINDOW as u32);
-        for hub in 0..63 {
-            sealed(&|sender| sender.hub = hub);
+        let number = usize::from(Topic::Zones.number());
+        sender.epoch = 6;
+        sender.send(Topic::Zones, &zones(Verdict::Clear));
+        (sender.epoch, sender.next[number]) = (7, 5000 - WINDOW as u32);
+        sender.send(Topic::Zones, &zones(Verdict::Clear));
+        sender.next[number] = 5001;
+        Sender::new(HUB, 7, 0, "front").send(Topic::Zones, &zones(Verdict::Clear));
+        // All the others deliver for a second.
+        let mut others: Vec<_> = (0..63).map(|hub| Sender::new(hub, 7, 0, "front")).collect();
+        for wait_ms in [1100, 0] {
+            sender.send(Topic::Zones, &zones(Verdict::Slow));
+            others.iter_mut().for_each(|other| other.send(Topic::Zones, &zones(Verdict::Clear)));
+            std::thread::sleep(std::time::Duration::from_millis(wait_ms));
         }
-        sealed(&|sender| sender.hub = 64);
+        Sender::new(64, 7, 0, "front").send(Topic::Zones, &zones(Verdict::Clear));
         sender.empty(8);
         sender.empty(Topic::Zones.number());
         sender.send(Topic::Zones, &zones(Verdict::Stop));

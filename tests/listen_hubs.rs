@@ -72,7 +72,7 @@ fn a_gateway_on_another_machine_is_not_called_this_one_s() {
         let robot = Robot::new(&["front"]);
         let stage = Stage::new();
         let mut listener = stage.start(&["listen", "--json", "--publish"]).ready();
-        let gateway = robot.gateway(&["--interface=eth0"]);
+        let gateway = robot.gateway::<&str>(&[]);
         let line = listener.await_line("a sensor", |line| line["kind"] == "published");
         assert_eq!(line["here"], json!(null), "{line}");
         drop(gateway);

@@ -220,9 +220,7 @@ fn what_a_gateway_sends_comes_back_once() {
         let _simulator = stage.simulator(&["front"], &["--seed=62", "--baud=500000"]);
         let mut listener = stage.start(&["listen", "--json", "--publish", "--interface=lo"]).ready();
         // The gateway waits for the hub, though the domain lives already; and what the listener brings is not its to send.
-        let mut command = stage.command(&["gateway", "--json", "--interface=lo", "--topic=front/scan"]);
-        command.env("XDG_STATE_HOME", stage.path("state")).env_remove("STATE_DIRECTORY");
-        let mut gateway = Program::start(command);
+        let mut gateway = stage.start(&["gateway", "--json", "--interface=lo", "--topic=front/scan"]);
         let id = gateway.await_line("its begin", |line| line["class"] == "gateway")["hub"].clone();
         let hub = stage.hub(&[stage.link("front")]);
         let line = listener.await_line("a sensor", |line| line["kind"] == "published");
@@ -295,9 +293,7 @@ fn a_hub_that_numbers_its_sensors_otherwise_keeps_them_apart() {
         let stage = Stage::new();
         let _simulator = stage.simulator(&["front", "rear"], &["--seed=63", "--baud=500000"]);
         let mut listener = stage.start(&["listen", "--json", "--publish", "--interface=lo"]).ready();
-        let mut command = stage.command(&["gateway", "--json", "--interface=lo"]);
-        command.env("XDG_STATE_HOME", stage.path("state")).env_remove("STATE_DIRECTORY");
-        let mut gateway = Program::start(command);
+        let mut gateway = stage.start(&["gateway", "--json", "--interface=lo"]);
         let id = gateway.await_line("its begin", |line| line["class"] == "gateway")["hub"].clone();
         let remote = |name: &str| format!("{}.{name}", id.as_str().unwrap_or_default());
         let (front, rear) = (remote("front"), remote("rear"));
@@ -372,13 +368,18 @@ fn there_is_room_for_sixteen_sensors() {
     in_a_network("there_is_room_for_sixteen_sensors", || {
         let stage = Stage::new();
         let mut program = publisher(&stage);
-        for number in 0..17 {
-            let mut sender = Sender::new(0xab, 7, number, &format!("s{number}"));
-            sender.announce(&[Topic::Zones]);
-            sender.send(Topic::Zones, &zones(Verdict::Clear));
+        let mut senders: Vec<_> =
+            (0..17).map(|number| Sender::new(0xab, 7, number, &format!("s{number}"))).collect();
+        // All but the last one deliver for a second.
+        for (count, wait_ms) in [(16, 1100), (17, 0)] {
+            for sender in &mut senders[..count] {
+                sender.announce(&[Topic::Zones]);
+                sender.send(Topic::Zones, &zones(Verdict::Clear));
+            }
+            std::thread::sleep(std::time::Duration::from_millis(wait_ms));
         }
         let line = program.await_line("one too many", |line| line["kind"] == "trouble");
-        assert!(line["message"].as_str().is_some_and(|text| text.contains("16")), "{line}");
+        assert!(line["message"].as_str().is_some_and(|text| text.contains("16 published")), "{line}");
         let listed = stage.run(&["list", "--json"]).of_class("topic");
         assert_eq!(listed.len(), 16);
         let outcome = program.end(INT);

@@ -4,11 +4,15 @@
 mod stage;
 
 use std::collections::BTreeMap;
+use std::io::Write;
 use std::path::Path;
 use std::process::Command;
 
+use schema::{Topic, Verdict, Zones};
 use serde_json::{Value, json};
-use stage::{INT, KILL, Outcome, Program, Stage, TERM, is_class, number, python};
+use stage::{
+    INT, KILL, Outcome, Program, Sender, Stage, TERM, in_a_network, is_class, number, python, until,
+};
 
 /// A script of the package's tests, if there is a Python for it.
 fn check(name: &str) -> Option<Command> {
@@ -185,6 +189,100 @@ fn a_subscription_outlives_several_hubs() {
         }
         assert_eq!(lives.len(), 4, "{topic}");
     }
+}
+
+/// The worst of its sensors, of which one is switched off, then the hub killed: nothing stays clear by itself.
+#[test]
+fn a_robot_is_as_unknown_as_its_worst_sensor() {
+    let stage = Stage::new();
+    let Some(mut named) = check_on(&stage, "robot") else { return };
+    named.args(["front", "rear"]);
+    let Some(all) = check_on(&stage, "robot") else { return };
+    let mut followers = [named, all].map(Program::start);
+    for follower in &mut followers {
+        let first = follower.await_line("there is no hub", is_class("robot"));
+        assert_eq!((&first["verdict"], &first["nearest_mm"]), (&"unknown".into(), &Value::Null), "{first}");
+    }
+    let _front = stage.simulator(&["front"], &["--seed=64", "--baud=500000"]);
+    let rear =
+        stage.start(&["simulate", "--json", "--baud=500000", &format!("--port={}", stage.word("rear"))]);
+    let rear = rear.ready();
+    // All is clear: nothing in the simulated room is so near.
+    let hub = stage.hub(&[&stage.link("front"), &stage.link("rear"), "--set=zones.radii=[0.02,0.01]"]);
+    let are = |verdict: &'static str, front: &'static str, rear: &'static str| {
+        move |line: &Value| {
+            line["verdict"] == verdict && line["sensors"] == json!({ "front": front, "rear": rear })
+        }
+    };
+    for follower in &mut followers {
+        let line = follower.await_line("all is clear", are("clear", "clear", "clear"));
+        assert!(line["worst"] == "front" && line["nearest_mm"].is_u64(), "{line}");
+        assert!(["front", "rear"].contains(&line["nearest_sensor"].as_str().unwrap_or_default()), "{line}");
+        follower
+            .await_line("by now, too", |line| line["class"] == "now" && are("clear", "clear", "clear")(line));
+    }
+    stage.kill_simulator(rear, "rear");
+    for follower in &mut followers {
+        let line = follower.await_line("the rear is gone", are("unknown", "clear", "unknown"));
+        assert_eq!(line["worst"], "rear", "{line}");
+    }
+    assert_eq!(hub.end(KILL).code, None);
+    for follower in &mut followers {
+        follower.await_line("the hub is gone", are("unknown", "unknown", "unknown"));
+    }
+    for follower in followers {
+        ended_by_interrupt(follower);
+    }
+}
+
+#[test]
+fn without_a_hub_the_robot_is_of_the_sensors_of_other_machines() {
+    in_a_network("without_a_hub_the_robot_is_of_the_sensors_of_other_machines", || {
+        let stage = Stage::new();
+        let Some(command) = check_on(&stage, "robot") else { return };
+        let mut listener =
+            stage.start(&["listen", "--json", "--publish", "--name=robot1=0000000000000001"]).ready();
+        let mut front = Sender::new(1, 7, 0, "front");
+        front.announce(&[Topic::Zones]);
+        Sender::new(1, 7, 1, "mapper").announce(&[Topic::Scan]);
+        listener.await_lines(2, "its sensors", |line| line["kind"] == "published");
+        let mut robot = Program::start(command);
+        let are = |verdict: &'static str, sensor: &'static str| {
+            move |line: &Value| line["verdict"] == verdict && line["sensors"] == json!({ sensor: verdict })
+        };
+        robot.await_line("nobody was heard", are("unknown", "robot1.front"));
+        front.send(Topic::Zones, &Zones { verdict: Verdict::Clear as u8, ..Zones::unknown() });
+        robot.await_line("clear", are("clear", "robot1.front"));
+        robot.await_line("silence", are("unknown", "robot1.front"));
+        // One who always finds something that is sent from elsewhere, too.
+        let mut command = check_on(&stage, "robot").expect("as before");
+        command.arg("--asked");
+        let (stdin, mut ask) = std::io::pipe().expect("a pipe");
+        let mut busy = Program::start_with(command, stdin);
+        let mut hear = |busy: &mut Program| {
+            front.send(Topic::Zones, &Zones { verdict: Verdict::Clear as u8, ..Zones::unknown() });
+            ask.write_all(b"\n").expect("it reads");
+            busy.await_line("what it knows", is_class("now"))["sensors"].clone()
+        };
+        until("the other machine's", || hear(&mut busy).get("robot1.front").is_some());
+        // A hub has sensors of its own, and when it goes nobody stands in for them.
+        let _simulator = stage.simulator(&["front"], &["--seed=65", "--baud=500000"]);
+        let hub = stage.hub(&[&stage.link("front"), "--set=zones.radii=[0.02,0.01]"]);
+        until("the hub's own", || hear(&mut busy) == json!({"front": "clear"}));
+        robot.await_line("all is forgotten", |line| {
+            line["sensors"] == json!({}) && line["verdict"] == "unknown"
+        });
+        robot.await_line("the hub's own", are("clear", "front"));
+        assert_eq!(hub.end(KILL).code, None);
+        robot.await_line("the hub is gone", are("unknown", "front"));
+        front.send(Topic::Zones, &Zones { verdict: Verdict::Clear as u8, ..Zones::unknown() });
+        let mut named = stage.start(&["echo", "--json", "robot1.front/zones"]);
+        named.await_line("whom one names is heard", |line| line["verdict"] == "clear");
+        let outcome = ended_by_interrupt(robot);
+        let last = outcome.of_class("robot").pop().expect("a line");
+        assert!(are("unknown", "front")(&last), "{outcome}");
+        assert_eq!(listener.end(TERM).code, Some(0));
+    });
 }
 
 /// Ctrl-C ends it at once, as any program in Python.

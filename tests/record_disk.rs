@@ -238,7 +238,8 @@ fn what_cannot_be_begun_leaves_nothing_behind() {
     let stage = Stage::new();
     let limited = ["sh", "-c", "ulimit -f 0; exec \"$@\"", "sh"];
     let outcome = start_in(&stage, &limited, &["record", "--json", "-o", &stage.word("walk.mcap")]).wait();
-    assert_eq!(outcome.code, Some(73), "{outcome}");
+    assert_eq!(outcome.code, Some(75), "{outcome}");
+    assert_eq!(outcome.of_class("error")[0]["kind"], "short", "{outcome}");
     assert!(!stage.path("walk.mcap").exists());
     // What is no file of its own stays.
     std::os::unix::fs::symlink("/dev/null", stage.path("nothing")).unwrap();

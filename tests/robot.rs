@@ -3,10 +3,10 @@
 
 mod stage;
 
-use clients::RobotFollower;
-use schema::Verdict;
-use serde_json::Value;
-use stage::{INT, KILL, Program, Stage, TERM, until};
+use clients::{Robot, RobotFollower};
+use schema::{Topic, Verdict, Zones};
+use serde_json::{Value, json};
+use stage::{INT, KILL, Program, Sender, Stage, TERM, in_a_network, until};
 
 /// So near that nothing in the simulated room is inside.
 const CLEAR: &str = "--set=zones.radii=[0.02,0.01]";
@@ -80,6 +80,68 @@ fn a_program_that_follows_the_robot() {
     assert_eq!(hub.end(TERM).code, Some(0));
     until("nobody is heard", || {
         robot.now().expect("no hub is no failure").sensors().all(|(_, verdict)| verdict == Verdict::Unknown)
+    });
+}
+
+/// A machine without a hub of its own, as an operator's: `robot` is of the sensors that its listener publishes.
+#[test]
+fn without_a_hub_the_robot_is_of_the_sensors_of_other_machines() {
+    in_a_network("without_a_hub_the_robot_is_of_the_sensors_of_other_machines", || {
+        let stage = Stage::new();
+        let mut listener =
+            stage.start(&["listen", "--json", "--publish", "--name=robot1=0000000000000001"]).ready();
+        let refused = stage.run(&["echo", "robot/zones", "--json", "-n", "1", "--for=10s"]);
+        let error = refused.of_class("error").remove(0);
+        assert_eq!((refused.code, &error["kind"]), (Some(3), &"no_topic".into()), "{refused}");
+        assert!(error["hint"].as_str().is_some_and(|hint| hint.contains("scanhub listen")), "{error}");
+
+        let mut front = Sender::new(1, 7, 0, "front");
+        front.announce(&[Topic::Zones]);
+        // Who publishes no zones is no part of the robot.
+        Sender::new(1, 7, 1, "mapper").announce(&[Topic::Scan]);
+        listener.await_lines(2, "its sensors", |line| line["kind"] == "published");
+        let mut echo = stage.start(&["echo", "--json", "robot/zones"]);
+        let mut leds = stage.start(&["leds", "--json", "robot", "--hold=0s"]);
+        let own = |line: &Value, verdict: &str, sensor: &str| {
+            let sensors = json!([{"sensor": sensor, "verdict": verdict}]);
+            line["class"] == "zones" && line["verdict"] == verdict && line["sensors"] == sensors
+        };
+        echo.await_line("nobody was heard", |line| own(line, "unknown", "robot1.front"));
+        for (verdict, word) in [(Verdict::Slow, "slow"), (Verdict::Clear, "clear")] {
+            front.send(Topic::Zones, &Zones { verdict: verdict as u8, ..Zones::unknown() });
+            echo.await_line(word, |line| own(line, word, "robot1.front"));
+        }
+        echo.await_line("silence", |line| own(line, "unknown", "robot1.front") && line["stale"] == true);
+        leds.await_line("slow", |line| line["verdict"] == "slow" && line["worst"] == "robot1.front");
+        leds.await_line("silence", |line| line["verdict"] == "unknown" && line["red"] == true);
+
+        // A hub has sensors of its own, and when it goes nobody stands in for them.
+        let _sensor = sensor(&stage, "front");
+        // One who always finds something that is sent from elsewhere, too.
+        let mut busy = RobotFollower::in_domain(vec![stage.place()], &[]).expect("no names");
+        let names = |robot: &Robot| robot.sensors().map(|(name, _)| name.to_owned()).collect::<Vec<_>>();
+        let mut hear = |busy: &mut RobotFollower| {
+            front.send(Topic::Zones, &Zones { verdict: Verdict::Clear as u8, ..Zones::unknown() });
+            until("it is heard", || busy.try_next().expect("a domain").is_some());
+            names(busy.now().expect("a domain"))
+        };
+        until("the other machine's", || hear(&mut busy) == ["robot1.front"]);
+        let own_hub = stage.hub(&[&stage.link("front"), CLEAR]);
+        until("the hub's own", || hear(&mut busy) == ["front"]);
+        drop(busy);
+        echo.await_line("the hub's own", |line| own(line, "clear", "front"));
+        assert_eq!(own_hub.end(KILL).code, None);
+        echo.await_line("the hub is gone", |line| own(line, "unknown", "front"));
+        front.send(Topic::Zones, &Zones { verdict: Verdict::Clear as u8, ..Zones::unknown() });
+        let mut named = stage.start(&["echo", "--json", "robot1.front/zones"]);
+        named.await_line("whom one names is heard", |line| line["verdict"] == "clear");
+        let outcome = echo.end(INT);
+        let lines = outcome.of_class("zones");
+        let first_own = lines.iter().position(|line| own(line, "clear", "front")).expect("it was seen");
+        let is_own = |line: &Value| line["sensors"] == json!([]) || line["sensors"][0]["sensor"] == "front";
+        assert!(lines[first_own..].iter().all(is_own), "{outcome}");
+        assert_eq!(lines[lines.len() - 1]["verdict"], "unknown", "{outcome}");
+        assert_eq!((leds.end(INT).code, listener.end(TERM).code), (Some(0), Some(0)));
     });
 }
 

@@ -75,6 +75,81 @@ fn now() -> u64 {
     now.tv_sec as u64 * 1_000_000_000 + now.tv_nsec as u64
 }
 
+/// After stops of the hub, of some tenths of a second to seconds: how far each stamp is from the truth, and whether it says
+/// that it is an estimate.
+#[test]
+fn a_stamp_is_right_or_says_that_it_is_an_estimate() {
+    let stage = Stage::new();
+    let simulator = stage.simulator(&["front"], &["--seed=7", "--baud=500000"]);
+    let hub = stage.hub(&[stage.link("front")]);
+    let mut consumer = stage.echo(&["front/telegram"]);
+    consumer.await_lines(150, "a telegram", is_class("telegram"));
+    let mut stops = Vec::new();
+    for span_ms in [300, 600, 1_000, 1_500, 3_000] {
+        let stopped = now();
+        hub.signal(Signal::STOP);
+        thread::sleep(Duration::from_millis(span_ms));
+        hub.signal(Signal::CONT);
+        stops.push((stopped, now(), span_ms));
+        consumer.await_lines(60, "a telegram", is_class("telegram"));
+    }
+    assert_eq!(hub.end(TERM).code, Some(0));
+    assert_eq!(simulator.end(INT).code, Some(0));
+    let outcome = consumer.end(INT);
+    let truth = stage.truth("front");
+    let mut place = 0;
+    // The sensor keeps its beat from its last reply on, also where the simulator was late to write: those that it wrote
+    // soonest tell when.
+    let is_answer = |sent: &stage::Sent| sent.is_reply && sent.sent_ns < stops[0].0;
+    let begin = truth.iter().rposition(is_answer).expect("it was asked") + 1;
+    let beat = |place: usize| (place - begin) as u64 * PERIOD;
+    let whole = (begin..truth.len()).filter(|&place| truth[place].fault.is_none());
+    let first = whole.map(|place| truth[place].sent_ns - beat(place)).min();
+    let first = first.expect("scans were sent");
+    // When its last byte was due, the stamp of its first one, and whether that says to be an estimate.
+    let scans: Vec<(u64, u64, bool)> = outcome
+        .of_class("telegram")
+        .iter()
+        .filter_map(|line| {
+            let hash = hash(&bytes_of(line));
+            place += truth[place..].iter().position(|sent| sent.hash == hash).expect("it was sent");
+            let flags = line["flags"].as_array().expect("a pty is simulated");
+            let is_estimate = flags.contains(&"stamp_estimated".into());
+            (place >= begin).then(|| (first + beat(place), number(line, "stamp_ns"), is_estimate))
+        })
+        .collect();
+    let waited = |sent: u64| stops.iter().any(|(from, to, _)| (*from..*to).contains(&sent));
+    let sure = scans.iter().filter(|(sent, _, is_estimate)| !waited(*sent) && !is_estimate);
+    let mut spans: Vec<i64> = sure.map(|(sent, stamp, _)| *sent as i64 - *stamp as i64).collect();
+    let usual = median(&mut spans);
+    let error = |(sent, stamp, _): &(u64, u64, bool)| (*sent as i64 - usual - *stamp as i64).abs();
+    for (from, to, span_ms) in &stops {
+        let of_stop = |(sent, ..): &&(u64, u64, bool)| (*from..*to).contains(sent);
+        let mut errors: Vec<i64> = scans.iter().filter(of_stop).map(error).collect();
+        let (count, most) = (errors.len(), errors.iter().max().copied().unwrap_or_default());
+        let median = median(&mut errors);
+        println!(
+            "{span_ms} ms: {count} waited, median error {} us, greatest {} us",
+            median / 1000,
+            most / 1000
+        );
+        assert!(count > 3 && median < 5_000_000, "{count} of {span_ms} ms, {median} ns");
+        // Those that waited, and the next ones.
+        let around = |(sent, ..): &&(u64, u64, bool)| (*from..*to + 10 * PERIOD).contains(sent);
+        for scan in scans.iter().filter(around) {
+            assert!(scan.2 || error(scan) < 5_000_000, "{scan:?} is {} ns off", error(scan));
+        }
+    }
+}
+
+/// Time between two scans of 361 beams, in ns: two mirror turns.
+const PERIOD: u64 = 26_640_000;
+
+fn median(values: &mut [i64]) -> i64 {
+    values.sort_unstable();
+    values.get(values.len() / 2).copied().unwrap_or_default()
+}
+
 #[test]
 fn what_waited_for_a_listener_that_was_stopped_is_not_new() {
     in_a_network("what_waited_for_a_listener_that_was_stopped_is_not_new", || {

@@ -86,10 +86,14 @@ fn it_follows_the_hub_the_keys_and_the_window() {
     watch.press("R");
     watch.await_words("front: background is learned anew");
 
-    // Two lives of the hub.
+    // Two lives of the hub; also while the picture is held the verdict is that of now.
+    watch.press(" ");
+    watch.await_words(" STOP  HELD  front");
     drop(hub.end(KILL));
     watch.await_words("no hub: waiting for it");
-    watch.await_words(" UNKNOWN ");
+    watch.await_words(" UNKNOWN  HELD  front");
+    watch.press(" ");
+    watch.await_words(" UNKNOWN  front");
     let hub = stage.hub(&[stage.link("front")]);
     watch.await_words(" STOP  front");
     watch.await_words(&format!("hub {}", hub.pid()));

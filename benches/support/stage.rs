@@ -103,6 +103,8 @@ impl Stage {
     pub(crate) fn hub_command(&self, program: &str, sensors: &[&str]) -> Command {
         let mut command = Command::new(program);
         command.args(["run", "--domain", self.domain.name()]);
+        // What it keeps goes with the stage.
+        command.env("XDG_STATE_HOME", &self.directory).env_remove("STATE_DIRECTORY");
         sensors.iter().for_each(|sensor| {
             command.args(["--link", &format!("{sensor}={}", self.port(sensor))]);
         });

@@ -35,6 +35,11 @@ COUNTERS = (
     "suspect", "aborted", "resyncs", "reconnects", "lost_in_restart", "wakeups", "loan_failed", "rejected_address",
     "rejected_length", "rejected_command", "rejected_count", "rejected_crc", "rejected_vetoed", "rejected_superseded",
     "line_errors",
+    "bytes_damaged",
+    "damaged_ppm",
+    "due_on_line",
+    "lost_on_line",
+    "lost_ppm",
 )
 
 AUTHENTICATED, SIMULATED, REPLAYED, STAMP_ESTIMATED, SUSPECT = 1, 2, 4, 8, 16

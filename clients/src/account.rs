@@ -4,6 +4,8 @@ use std::time::{Duration, Instant};
 
 use schema::Topic;
 
+use crate::line::Loss;
+
 /// The account of one topic in one run.
 #[derive(Clone, Debug)]
 pub(crate) struct Account {
@@ -14,6 +16,8 @@ pub(crate) struct Account {
     pub(crate) lost: u64,
     /// Samples received as they were sent, and when the first of them came.
     live: Option<(u64, Instant)>,
+    /// What the sensor's line took away in the run, where that was watched.
+    pub(crate) loss: Loss,
     first: Option<Instant>,
     last: Option<Instant>,
     period: Duration,
@@ -28,6 +32,7 @@ impl Account {
             received: 0,
             lost: 0,
             live: None,
+            loss: Loss::default(),
             first: None,
             last: None,
             period: Duration::ZERO,

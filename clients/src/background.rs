@@ -4,8 +4,11 @@
 use std::io::{Read, Write};
 use std::path::{Path, PathBuf};
 use std::sync::atomic::AtomicBool;
+use std::time::{Duration, SystemTime};
 
-use schema::{Background, Domain, Failure, Kind, Request, SavedModel, Verb, as_json, check_sensor};
+use schema::{
+    Age, Background, Domain, Failure, Kind, Request, SavedModel, Shown, Verb, as_json, check_sensor,
+};
 use serde::Serialize;
 
 use crate::control::request;
@@ -71,7 +74,7 @@ pub fn background(
     match order {
         ModelOrder::Reset => {
             ask(Verb::Reset)?;
-            let is_frozen = !json && shown(sensor, ask(Verb::Show)?)?.is_frozen();
+            let is_frozen = !json && shown(sensor, ask(Verb::Show)?)?.model.is_frozen();
             taken(&mut output, Verb::Reset)?;
             if is_frozen {
                 let hint =
@@ -87,19 +90,23 @@ pub fn background(
             taken(&mut output, Verb::Load)
         }
         ModelOrder::Show => {
-            let model = shown(sensor, ask(Verb::Show)?)?;
+            let Shown { model, kept_wall_ns } = shown(sensor, ask(Verb::Show)?)?;
             quiet(if *json {
-                output.json(&as_json(sensor, &model))
+                output.json(&Kept { model: as_json(sensor, &model), kept_wall_ns })
             } else {
                 output.line(|line| {
                     write!(line, "{sensor}: ")?;
-                    text::background(line, &model)
+                    text::background(line, &model)?;
+                    match kept_wall_ns.map(Duration::from_nanos) {
+                        Some(kept) => write!(line, ", kept {} ago", Age(wall().saturating_sub(kept))),
+                        None => Ok(()),
+                    }
                 })
             })
         }
         ModelOrder::Save { file, force } => {
             check(file, *force)?;
-            let model = shown(sensor, ask(Verb::Show)?)?;
+            let Shown { model, .. } = shown(sensor, ask(Verb::Show)?)?;
             save(file, sensor, &model, *json, &mut output)
         }
     }
@@ -113,9 +120,23 @@ fn check(path: &Path, force: bool) -> Result<(), Failure> {
     Err(Failure::new(Kind::Output, format!("{} exists", path.display()), "--force replaces it"))
 }
 
-fn shown(sensor: &str, model: Option<Background>) -> Result<Background, Failure> {
+/// What is shown: a model, and when it was kept for the next hub.
+#[derive(Serialize)]
+struct Kept<M> {
+    #[serde(flatten)]
+    model: M,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    kept_wall_ns: Option<u64>,
+}
+
+/// The time since 1970.
+fn wall() -> Duration {
+    SystemTime::UNIX_EPOCH.elapsed().unwrap_or_default()
+}
+
+fn shown(sensor: &str, shown: Option<Shown>) -> Result<Shown, Failure> {
     let hint = "client and hub are of different versions";
-    model.ok_or_else(|| {
+    shown.ok_or_else(|| {
         Failure::new(Kind::Failed, format!("the hub answered without a model of {sensor}"), hint)
     })
 }

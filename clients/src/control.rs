@@ -7,7 +7,7 @@ use std::thread::sleep;
 use std::time::{Duration, Instant};
 
 use schema::ipc::{self, ControlClient, Node};
-use schema::{Background, Domain, Failure, Kind, Request, Verb, check_sensor, holder};
+use schema::{Domain, Failure, Kind, Request, Shown, Verb, check_sensor, holder};
 
 use crate::json;
 use crate::names::as_word;
@@ -50,7 +50,7 @@ pub(crate) fn request(
     places: &[Domain],
     request: &Request,
     stop: &AtomicBool,
-) -> Result<Option<Background>, Failure> {
+) -> Result<Option<Shown>, Failure> {
     let domain = find(places)?;
     let node = ipc::client_node(&domain)?;
     ask(&open(&node)?, &domain, request, stop)
@@ -75,7 +75,7 @@ fn ask(
     domain: &Domain,
     request: &Request,
     stop: &AtomicBool,
-) -> Result<Option<Background>, Failure> {
+) -> Result<Option<Shown>, Failure> {
     let pending = client.ask(request)?;
     let give_up_at = Instant::now() + PATIENCE;
     loop {

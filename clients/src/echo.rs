@@ -78,6 +78,10 @@ impl Sink for Echo<'_> {
         }
     }
 
+    fn wants_lines(&self) -> bool {
+        true
+    }
+
     fn notice(&mut self, names: &[&TopicName], notice: Notice) -> Result<(), End> {
         match self.format {
             Format::Json => json::notices(&mut self.out, names, notice),

@@ -7,26 +7,19 @@ use std::io::{self, Read, Write};
 use std::os::unix::fs::{MetadataExt, fchown};
 use std::path::{Path, PathBuf};
 
-use schema::{Failure, Kind};
+use schema::{Failure, Kind, regular};
 
 /// All of the file at `path`, at most `longest` bytes.
 ///
 /// [`Kind::Input`] if it cannot be read or is longer: another one was meant.
 pub(crate) fn read(path: &Path, longest: u64) -> Result<Vec<u8>, Failure> {
     let place = path.display().to_string();
-    let mut file = File::open(path).map_err(|error| unreadable(&place, &error))?;
-    read_all(&mut file, &place, longest)
+    regular::read(path, longest).map_err(|error| unreadable(&place, &error))
 }
 
 /// All of `input`, which is at `place`; failures as [`read`].
 pub(crate) fn read_all(input: &mut dyn Read, place: &str, longest: u64) -> Result<Vec<u8>, Failure> {
-    let mut content = Vec::new();
-    input.take(longest + 1).read_to_end(&mut content).map_err(|error| unreadable(place, &error))?;
-    if content.len() as u64 > longest {
-        let message = format!("{place} is longer than {longest} bytes, so it is something else");
-        return Err(Failure::new(Kind::Input, message, "look whether it is the right file"));
-    }
-    Ok(content)
+    regular::read_all(input, longest).map_err(|error| unreadable(place, &error))
 }
 
 /// Puts a file of `content` at `path`. Whoever reads meanwhile, and whatever happens, finds the old one or the new one

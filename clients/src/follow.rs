@@ -1,12 +1,13 @@
 //! The loop of every verb that follows topics: receive, account, say what is wrong, end when the bounds say so.
 //! Refuses to know what becomes of a sample.
 
+mod lines;
 mod roll;
 
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
-use schema::{Domain, Failure, Kind, Topic, is_remote};
+use schema::{Domain, Failure, Kind, Status, Topic, is_remote};
 
 use crate::account::Account;
 use crate::clock;
@@ -17,6 +18,7 @@ use crate::roll::Roll;
 use crate::sample::{Sample, Source};
 use crate::session::Session;
 use crate::wait::Wait;
+use lines::{LineTrack, watch_parts};
 
 /// When a verb that follows ends by itself.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
@@ -69,6 +71,14 @@ pub(crate) trait Sink {
     fn wake_at(&self) -> Option<Instant> {
         None
     }
+    /// Whether the statuses of what is followed are wanted too, for what its lines take away.
+    fn wants_lines(&self) -> bool {
+        false
+    }
+    /// A status of `sensor` came.
+    fn line(&mut self, _sensor: &str, _status: &Status) -> Result<(), End> {
+        Ok(())
+    }
     /// The run is over, for good or ill; nothing comes any more.
     fn summary(&mut self, name: &TopicName, account: &Account) -> Result<(), End>;
 }
@@ -104,8 +114,11 @@ fn carry(mut run: Run<'_>, names: &[TopicName], stop: &AtomicBool, sink: &mut dy
     names.iter().for_each(|name| sink.begin(name));
     let end = run.run(stop, sink);
     if !matches!(end, Err(End::ReaderGone)) {
+        run.take_lines(sink)?;
         for track in &run.tracks {
-            sink.summary(&track.name, &track.account)?;
+            let mut account = track.account.clone();
+            account.loss = run.loss(&track.name.sensor);
+            sink.summary(&track.name, &account)?;
         }
     }
     end
@@ -128,6 +141,9 @@ impl Track {
 struct Run<'a> {
     session: Session,
     tracks: Vec<Track>,
+    /// The lines of the sensors, if they are wanted, and for how many tracks that was looked after.
+    lines: Vec<LineTrack>,
+    lined: usize,
     /// What is followed of each sensor that a hub has.
     topics: &'a [Topic],
     roll: Roll,
@@ -145,9 +161,14 @@ struct Run<'a> {
     received: u64,
 }
 
-/// Who brings what is called so.
-fn of(name: &TopicName) -> Who {
-    if is_remote(&name.sensor) { Who::Listener } else { Who::Hub }
+/// Who brings the sensor that is called so.
+fn brings(sensor: &str) -> Who {
+    if is_remote(sensor) { Who::Listener } else { Who::Hub }
+}
+
+/// Whether `name` is brought by `who`; a robot's sensors are of whoever is there.
+fn is_of(name: &TopicName, who: Who) -> bool {
+    name.is_robot() || brings(&name.sensor) == who
 }
 
 /// Samples taken from one topic before the next one has its turn.
@@ -159,6 +180,8 @@ impl<'a> Run<'a> {
         Run {
             session: Session::new(places.to_vec()),
             tracks: names.iter().cloned().map(Track::new).collect(),
+            lines: Vec::new(),
+            lined: 0,
             topics,
             roll: Roll::default(),
             closely: false,
@@ -185,6 +208,10 @@ impl<'a> Run<'a> {
             if self.closely {
                 self.look(sink)?;
             }
+            if sink.wants_lines() {
+                self.watch_lines();
+                self.take_lines(sink)?;
+            }
             let now = Instant::now();
             sink.tick(now)?;
             self.check(sink, now)?;
@@ -203,11 +230,11 @@ impl<'a> Run<'a> {
         let change = self.session.look()?;
         if let Some(who) = change.gone {
             self.roll.end();
-            self.tell(sink, Notice::HubGone, |name| who == of(name))?;
+            self.tell(sink, Notice::HubGone, |name| is_of(name, who))?;
         }
         if let Some(who) = change.back {
             if self.hub_seen.is_some() || self.waiting_said {
-                self.tell(sink, Notice::HubBack, |name| who == of(name))?;
+                self.tell(sink, Notice::HubBack, |name| is_of(name, who))?;
             }
             self.hub_seen = Some(Instant::now());
             // What the new one said before anybody looked for it waited for that.
@@ -257,6 +284,9 @@ impl<'a> Run<'a> {
                         sink.notice(&[&track.name], Notice::Missed(missed))?;
                     }
                     sink.sample(&track.name, &sample)?;
+                    if track.name.is_robot() && sink.wants_lines() {
+                        watch_parts(&mut self.lines, &sample);
+                    }
                     self.last_sample = now;
                     self.received += 1;
                     if self.bounds.count.is_some_and(|count| self.received >= count) {

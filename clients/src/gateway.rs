@@ -37,7 +37,7 @@ use uplink::Uplink;
 /// What `gateway` is asked for.
 #[derive(Clone, Debug)]
 pub struct GatewayOptions {
-    /// The network interface of the groups; without one the only one that can be meant.
+    /// The network interface of the groups; without one nothing goes to groups.
     pub interface: Option<String>,
     /// `SENSOR/TOPIC`, `*/TOPIC` or `SENSOR/*`, with `:every=N` if it is to be thinned; none: all but telegrams, of all sensors.
     pub topics: Vec<String>,
@@ -90,8 +90,8 @@ pub enum GatewayLook {
 /// whenever `tell` is set; what is no account to `notes` (stderr) if `out` is not JSON. Lines for which there is no room
 /// are left out: whoever does not read delays nothing but the end, and that by a second.
 ///
-/// [`Kind::Configuration`] if there is no such interface or not just one, a destination is no host, or a
-/// value is not possible; [`Kind::Usage`] if there is no such topic; [`Kind::NoTopic`] if the first hub that is met has no
+/// [`Kind::Configuration`] if there is no such interface, neither an interface nor a host is named, a destination is no host,
+/// or a value is not possible; [`Kind::Usage`] if there is no such topic; [`Kind::NoTopic`] if the first hub that is met has no
 /// such sensor; [`Kind::Short`] if descriptors or memory are; [`Kind::Interrupted`] if `stop` is set before it is known
 /// where the hosts are.
 pub fn gateway(
@@ -122,17 +122,24 @@ struct Gateway<'a> {
     tick_at: Instant,
 }
 
+/// In the place of an interface, in the name of the file that keeps a gateway's number: it sends to no group.
+const HOSTS: &str = "hosts";
+
 /// Between two announcements, and between two lines of the account.
 const TICK: Duration = Duration::from_secs(1);
 
 impl<'a> Gateway<'a> {
     fn open(options: &'a GatewayOptions, stop: &AtomicBool) -> Result<Gateway<'a>, Failure> {
         let selection = options.selection()?;
-        let interface = Uplink::choose(options.interface.as_deref())?;
+        if options.interface.is_none() && options.to.is_empty() {
+            return Err(uplink::nowhere());
+        }
+        let interface = options.interface.as_deref().map(Uplink::open).transpose()?;
         let domain = options.places.first().map(Domain::name).unwrap_or_default();
         let now_s = clock::wall_ns() / 1_000_000_000;
         let machine = machine::machine(Path::new(machine::ID));
-        let life = Life::begin(&life::directory()?, domain, interface.name(), now_s, machine)?;
+        let way = interface.as_ref().map_or(HOSTS, Uplink::name);
+        let life = Life::begin(&life::directory()?, domain, way, now_s, machine)?;
         let form = if options.bare { Form::Bare } else { Form::Sealed };
         let lan = Lan::open(life, interface, &options.to, form, options.ttl, options.longest, stop)?;
         let sensor = |name: &&str| Sensor::new(name, &selection, !options.bare);
@@ -153,7 +160,7 @@ impl<'a> Gateway<'a> {
 
     fn run(&mut self, report: &mut Report<'_>, tell: &AtomicBool, stop: &AtomicBool) -> Result<(), End> {
         report.begin(&self.lan, self.options.bare)?;
-        if !self.lan.interface.is_up() {
+        if self.lan.groups.as_ref().is_some_and(|groups| !groups.interface.is_up()) {
             report.interface(&self.lan)?;
         }
         let end = self.go_on(report, tell, stop);
@@ -243,8 +250,7 @@ impl<'a> Gateway<'a> {
             self.sensors.iter_mut().for_each(|sensor| sensor.repeat(every, now, &mut self.lan));
         }
         self.announce();
-        let Lan { groups, copies, .. } = &mut self.lan;
-        for outlet in std::iter::once(groups).chain(copies) {
+        for outlet in self.lan.outlets_mut() {
             if let Some(address) = outlet.follow_name(now) {
                 report.moved(&outlet.name, address)?;
             }

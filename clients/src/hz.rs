@@ -1,10 +1,11 @@
 //! `scanhub hz`: rate, jitter, minimum, maximum and loss of topics, once a second, as they arrive here.
 
+use std::collections::VecDeque;
 use std::io::Write;
 use std::sync::atomic::AtomicBool;
 use std::time::{Duration, Instant};
 
-use schema::{Domain, Failure, Topic};
+use schema::{Domain, Failure, Status, Topic};
 use serde::Serialize;
 
 use crate::account::Account;
@@ -45,6 +46,7 @@ pub fn hz(
         json: options.json,
         length: options.window,
         windows: Vec::new(),
+        lines: Vec::new(),
         next: Instant::now() + EVERY,
         out: Output::new(out),
         notes: Output::new(notes),
@@ -58,6 +60,7 @@ struct Hz<'a> {
     json: bool,
     length: Duration,
     windows: Vec<Followed>,
+    lines: Vec<LineWindow>,
     next: Instant,
     out: Output<'a>,
     notes: Output<'a>,
@@ -92,6 +95,20 @@ impl Sink for Hz<'_> {
         Ok(())
     }
 
+    fn wants_lines(&self) -> bool {
+        true
+    }
+
+    fn line(&mut self, sensor: &str, status: &Status) -> Result<(), End> {
+        if self.lines.iter().all(|line| line.sensor != sensor) {
+            self.lines.push(LineWindow::new(sensor));
+        }
+        if let Some(line) = self.lines.iter_mut().find(|line| line.sensor == sensor) {
+            line.note(Instant::now(), status, self.length);
+        }
+        Ok(())
+    }
+
     fn notice(&mut self, names: &[&TopicName], notice: Notice) -> Result<(), End> {
         if notice == Notice::HubBack {
             names.iter().for_each(|name| self.attached(name));
@@ -111,7 +128,8 @@ impl Sink for Hz<'_> {
         }
         for Followed { name, window, .. } in &mut self.windows {
             window.slide(now);
-            let line = Line::new(name, window);
+            let lost = self.lines.iter().find(|line| line.sensor == name.sensor);
+            let line = Line::new(name, window, lost);
             if self.json {
                 self.out.json(&line)?;
             } else {
@@ -129,6 +147,38 @@ impl Sink for Hz<'_> {
     }
 }
 
+/// What the line of a sensor took away within the window.
+struct LineWindow {
+    sensor: String,
+    /// When statuses came, and what was lost by then, the newest last.
+    lost: VecDeque<(Instant, Option<u64>)>,
+    /// The last one.
+    status: Status,
+}
+
+impl LineWindow {
+    fn new(sensor: &str) -> LineWindow {
+        LineWindow { sensor: sensor.to_owned(), lost: VecDeque::new(), status: Status::default() }
+    }
+
+    fn note(&mut self, now: Instant, status: &Status, length: Duration) {
+        // A hub that began anew counts from 0.
+        if self.lost.back().is_some_and(|(_, lost)| *lost > status.lost_on_line()) {
+            self.lost.clear();
+        }
+        while self.lost.get(1).is_some_and(|(at, _)| now - *at >= length) {
+            self.lost.pop_front();
+        }
+        self.lost.push_back((now, status.lost_on_line()));
+        self.status = *status;
+    }
+
+    fn lost_on_line(&self) -> Option<u64> {
+        let (_, first) = self.lost.front()?;
+        Some(self.status.lost_on_line()? - first.unwrap_or(0))
+    }
+}
+
 /// Class `hz`; what two arrivals would be needed for is null.
 #[derive(Serialize)]
 struct Line<'a> {
@@ -142,10 +192,14 @@ struct Line<'a> {
     received: u64,
     lost: u64,
     window_s: f64,
+    damaged: Option<f64>,
+    lost_on_line: Option<u64>,
+    #[serde(skip)]
+    loss: Option<String>,
 }
 
 impl<'a> Line<'a> {
-    fn new(name: &'a TopicName, window: &Window) -> Line<'a> {
+    fn new(name: &'a TopicName, window: &Window, line: Option<&LineWindow>) -> Line<'a> {
         let rate = window.rate();
         Line {
             class: "hz",
@@ -158,6 +212,9 @@ impl<'a> Line<'a> {
             received: window.received(),
             lost: window.lost(),
             window_s: window.seconds(),
+            damaged: line.map(|line| line.status.damaged()),
+            lost_on_line: line.and_then(LineWindow::lost_on_line),
+            loss: line.and_then(|line| line.status.line_loss()),
         }
     }
 
@@ -166,8 +223,9 @@ impl<'a> Line<'a> {
         match (self.hz, self.jitter_ms, self.min_ms, self.max_ms) {
             (Some(hz), Some(jitter), Some(min), Some(max)) => write!(
                 line,
-                "{name:<16} {hz:8.2} Hz jitter {jitter:6.2} min {min:6.2} max {max:8.2} ms lost {}",
-                self.lost
+                "{name:<16} {hz:8.2} Hz jitter {jitter:6.2} min {min:6.2} max {max:8.2} ms lost {}{}",
+                self.lost,
+                self.loss.as_ref().map_or(String::new(), |loss| format!(", {loss}"))
             ),
             _ => write!(line, "{name:<16}        - Hz {} received", self.received),
         }

@@ -4,7 +4,7 @@ use std::io::Write;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
-use schema::{Domain, Failure, Kind, Pose, Status, check_followed, ipc};
+use schema::{Counter, Domain, Failure, Kind, Pose, Status, check_followed, ipc};
 
 use crate::clock;
 use crate::follower::Follower;
@@ -115,6 +115,7 @@ fn properties(sensor: &str, status: &Status, now_ns: u64) -> Vec<Vec<String>> {
             known(format!("{} deg in steps of {step_deg}", status.angle_deg), status.angle_deg != 0),
         ),
         row("  rate", format!("{:.2} Hz", f64::from(status.rate_mhz) / 1000.0)),
+        row("  line", line(status)),
         row("  pose", pose(&status.pose)),
         row("  marks", marks(sensor, status)),
     ];
@@ -122,6 +123,19 @@ fn properties(sensor: &str, status: &Status, now_ns: u64) -> Vec<Vec<String>> {
         rows.push(row("  last error", status.last_error().into()));
     }
     rows
+}
+
+/// What the line takes away: lately, and since the hub's start.
+fn line(status: &Status) -> String {
+    let percent = |share: f64| format!("{:.2} %", 100.0 * share);
+    let lost = match (status.lost_on_line(), status.lost_share()) {
+        (Some(lost), Some(share)) => {
+            let due = status.counters[Counter::DueOnLine];
+            format!("{} of the scans lost in 10 s, {lost} of {due} in all", percent(share))
+        }
+        _ => "what is lost is not known".to_owned(),
+    };
+    format!("{} of the bytes damaged, {lost}", percent(status.damaged()))
 }
 
 fn pose(pose: &Pose) -> String {

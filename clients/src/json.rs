@@ -2,7 +2,7 @@
 
 mod processed;
 
-use schema::{Counters, Failure, Header, Reasons, Scan, Status, Telegram, Verb};
+use schema::{Counters, Failure, Flags, Header, Reasons, Scan, Status, Telegram, Verb};
 use serde::Serialize;
 use serde::ser::{SerializeMap, Serializer};
 
@@ -53,6 +53,19 @@ impl<'a> Stamp<'a> {
     }
 }
 
+/// What they end with: which flags are set, if any is.
+#[derive(Serialize)]
+pub(crate) struct Words {
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    flags: Vec<&'static str>,
+}
+
+impl Words {
+    pub(crate) fn of(header: &Header) -> Words {
+        Words { flags: Flags::names(header.flags).collect() }
+    }
+}
+
 /// Class `telegram`.
 pub(crate) fn telegram<'a>(sensor: &'a str, header: &Header, bytes: &'a [u8]) -> impl Serialize + 'a {
     #[derive(Serialize)]
@@ -64,6 +77,8 @@ pub(crate) fn telegram<'a>(sensor: &'a str, header: &Header, bytes: &'a [u8]) ->
         length: u16,
         #[serde(serialize_with = "hex")]
         data: &'a [u8],
+        #[serde(flatten)]
+        flags: Words,
     }
     let telegram = Telegram(bytes);
     Line {
@@ -72,6 +87,7 @@ pub(crate) fn telegram<'a>(sensor: &'a str, header: &Header, bytes: &'a [u8]) ->
         command: telegram.command(),
         length: telegram.length(),
         data: bytes,
+        flags: Words::of(header),
     }
 }
 
@@ -91,6 +107,8 @@ pub(crate) fn scan<'a>(sensor: &'a str, header: &Header, scan: &'a Scan) -> impl
         codes: &'a Scan,
         #[serde(skip_serializing_if = "<[u8]>::is_empty")]
         intensities: &'a [u8],
+        #[serde(flatten)]
+        flags: Words,
     }
     Line {
         stamp: Stamp::new("scan", sensor, header),
@@ -101,6 +119,7 @@ pub(crate) fn scan<'a>(sensor: &'a str, header: &Header, scan: &'a Scan) -> impl
         ranges: scan,
         codes: scan,
         intensities: scan.intensities(),
+        flags: Words::of(header),
     }
 }
 
@@ -142,6 +161,8 @@ pub(crate) fn status<'a>(sensor: &'a str, status: &'a Status) -> impl Serialize 
         last_error: &'a str,
         pose: Place,
         marks: MarksOffer,
+        damaged: f64,
+        lost_on_line: Option<u64>,
     }
     Line {
         class: "status",
@@ -165,6 +186,8 @@ pub(crate) fn status<'a>(sensor: &'a str, status: &'a Status) -> impl Serialize 
             upside_down: status.pose.upside_down != 0,
         },
         marks: MarksOffer { available: status.has_reflector_bits(), remedy: status.reflector_remedy() },
+        damaged: status.damaged(),
+        lost_on_line: status.lost_on_line(),
     }
 }
 
@@ -204,6 +227,8 @@ pub(crate) fn summary<'a>(name: &'a TopicName, account: &Account) -> impl Serial
         lost: u64,
         seconds: f64,
         hz: Option<f64>,
+        damaged: Option<f64>,
+        lost_on_line: Option<u64>,
     }
     Line {
         class: "summary",
@@ -213,6 +238,8 @@ pub(crate) fn summary<'a>(name: &'a TopicName, account: &Account) -> impl Serial
         lost: account.lost,
         seconds: account.seconds(),
         hz: account.hz(),
+        damaged: account.loss.damaged,
+        lost_on_line: account.loss.lost_on_line,
     }
 }
 
@@ -239,7 +266,7 @@ pub fn error(failure: &Failure) -> String {
     }
     let line =
         Line { class: "error", kind: failure.kind.name(), message: &failure.message, hint: &failure.hint };
-    serde_json::to_string(&line).unwrap_or_default()
+    schema::json_line(serde_json::to_string(&line).unwrap_or_default())
 }
 
 fn known<T: PartialEq>(value: T, unknown: T) -> Option<T> {

@@ -3,14 +3,15 @@
 //! shows it when the hub falls silent.
 
 mod device;
+mod hold;
 mod lamps;
 
 use std::io::Write;
 use std::path::{Path, PathBuf};
 use std::sync::atomic::AtomicBool;
-use std::time::Instant;
+use std::time::{Duration, Instant};
 
-use schema::{Domain, Failure, Kind, ROBOT, Topic, Verdict, check_followed};
+use schema::{Domain, Failure, Kind, ROBOT, Status, Topic, Verdict, check_followed};
 use serde::Serialize;
 
 use crate::account::Account;
@@ -22,6 +23,7 @@ use crate::output::{End, Output, quiet};
 use crate::sample::Sample;
 use crate::{json, text};
 use device::{Device, News};
+use hold::Hold;
 use lamps::{Lamps, Light};
 
 /// What `leds` is asked for.
@@ -35,6 +37,8 @@ pub struct LedsOptions {
     pub led_root: PathBuf,
     /// How lights are shown in the terminal.
     pub look: LedsLook,
+    /// How long a better verdict has to stand until it is shown; a worse one is at once.
+    pub hold: Duration,
     /// When it ends by itself.
     pub bounds: Bounds,
     /// Where the domain may be, see [`Domain::candidates`].
@@ -77,7 +81,9 @@ pub fn leds(
         sensor,
         look: options.look,
         lamps: Lamps::UNKNOWN,
+        verdict: Hold::new(options.hold),
         marks: Freshness::new(clock::now()),
+        losses: Vec::new(),
         devices: Vec::new(),
         out: Output::new(out),
         notes: Output::new(notes),
@@ -118,8 +124,12 @@ struct Board<'a> {
     sensor: &'a str,
     look: LedsLook,
     lamps: Lamps,
+    /// What was said lately.
+    verdict: Hold,
     /// Until when the marks may be believed, whatever became of the zones.
     marks: Freshness,
+    /// What each sensor's line takes away, of those that lose something.
+    losses: Vec<(String, String)>,
     devices: Vec<(Light, String, Device)>,
     out: Output<'a>,
     notes: Output<'a>,
@@ -136,6 +146,12 @@ impl Board<'_> {
             }
         }
         Ok(())
+    }
+
+    /// Shows the verdict that holds, and so many marks.
+    fn show_known(&mut self, marks: Option<usize>, now: Instant) -> Result<(), End> {
+        let (verdict, worst) = self.verdict.shown(now).clone();
+        self.show(Lamps { verdict, marks, worst }, false)
     }
 
     /// Shows `lamps` if they are others than those that are shown, or if they `must` be.
@@ -179,18 +195,29 @@ impl Board<'_> {
     }
 
     fn draw(&mut self) -> Result<(), End> {
+        let reason = self.reason();
         let Board { sensor, lamps, .. } = self;
+        let (sensor, reason) = (*sensor, reason.as_deref());
         match self.look {
-            LedsLook::Json => self.out.json(&Line::new(sensor, lamps)),
-            LedsLook::Lines => self.out.line(|line| lamps.line(line, sensor, false)),
+            LedsLook::Json => self.out.json(&Line::new(sensor, lamps, reason)),
+            LedsLook::Lines => self.out.line(|line| lamps.line(line, sensor, reason, false)),
             LedsLook::Terminal { colours } => {
                 // A line that wraps would not be drawn over: it is cut.
                 let mut line = [WIPE, b"\x1b[?7l"].concat();
-                lamps.line(&mut line, sensor, colours)?;
+                lamps.line(&mut line, sensor, reason, colours)?;
                 line.extend(b"\x1b[?7h");
                 self.out.raw(&line)
             }
         }
+    }
+
+    /// What may be behind the verdict: what the line of the sensor takes away whose verdict it is, else that of any.
+    fn reason(&self) -> Option<String> {
+        let whose = self.lamps.worst.as_deref();
+        let of_worst = self.losses.iter().find(|(sensor, _)| Some(sensor.as_str()) == whose);
+        let (sensor, loss) = of_worst.or(self.losses.first())?;
+        let is_plain = sensor == self.sensor || Some(sensor.as_str()) == whose;
+        Some(if is_plain { loss.clone() } else { format!("{sensor}: {loss}") })
     }
 
     fn wipe(&mut self) -> Result<(), End> {
@@ -214,21 +241,40 @@ impl Board<'_> {
 
 impl Sink for Board<'_> {
     fn sample(&mut self, _: &TopicName, sample: &Sample) -> Result<(), End> {
-        let mut lamps = self.lamps.clone();
+        let now = Instant::now();
+        let mut marks = self.lamps.marks;
         match sample {
-            Sample::Zones(heard) => lamps.verdict = heard.zones.verdict(),
+            Sample::Zones(heard) => self.verdict.take((heard.zones.verdict(), None), now),
             Sample::Robot(heard) => {
-                lamps.verdict = heard.robot.verdict();
-                lamps.worst = heard.robot.worst().map(str::to_owned);
+                let worst = heard.robot.worst().map(str::to_owned);
+                self.verdict.take((heard.robot.verdict(), worst), now);
             }
-            Sample::Marks(marks) => {
+            Sample::Marks(sample) => {
                 // A number of marks ages as a verdict does of which something is known.
-                let fresh = self.marks.heard(marks.header(), Verdict::Clear, clock::now());
-                lamps.marks = (fresh && marks.is_available()).then(|| marks.marks().len());
+                let fresh = self.marks.heard(sample.header(), Verdict::Clear, clock::now());
+                marks = (fresh && sample.is_available()).then(|| sample.marks().len());
             }
             _ => {}
         }
-        self.show(lamps, false)
+        self.show_known(marks, now)
+    }
+
+    fn wants_lines(&self) -> bool {
+        true
+    }
+
+    /// A line that begins or ends to lose something is told; how much it is from second to second is not.
+    fn line(&mut self, sensor: &str, status: &Status) -> Result<(), End> {
+        let known = self.losses.iter().position(|(name, _)| name == sensor);
+        let loss = status.line_loss();
+        let is_news = known.is_some() != loss.is_some();
+        match (known, loss) {
+            (Some(at), Some(loss)) => self.losses[at].1 = loss,
+            (Some(at), None) => drop(self.losses.remove(at)),
+            (None, Some(loss)) => self.losses.push((sensor.to_owned(), loss)),
+            (None, None) => {}
+        }
+        if is_news { self.draw() } else { Ok(()) }
     }
 
     fn notice(&mut self, names: &[&TopicName], notice: Notice) -> Result<(), End> {
@@ -247,12 +293,15 @@ impl Sink for Board<'_> {
         }
     }
 
-    /// Marks that became too old go out, and diodes that failed are tried again.
+    /// Marks that became too old go out, a verdict that has stood is shown, and diodes that failed are tried again.
     fn tick(&mut self, now: Instant) -> Result<(), End> {
-        if self.marks.silence(clock::now()) {
-            self.show(Lamps { marks: None, ..self.lamps.clone() }, false)?;
-        }
+        let marks = if self.marks.silence(clock::now()) { None } else { self.lamps.marks };
+        self.show_known(marks, now)?;
         self.switch(now)
+    }
+
+    fn wake_at(&self) -> Option<Instant> {
+        self.verdict.changes_at()
     }
 
     fn summary(&mut self, _: &TopicName, _: &Account) -> Result<(), End> {
@@ -275,10 +324,12 @@ struct Line<'a> {
     mark: bool,
     #[serde(skip_serializing_if = "Option::is_none")]
     worst: Option<&'a str>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    reason: Option<&'a str>,
 }
 
 impl<'a> Line<'a> {
-    fn new(sensor: &'a str, lamps: &'a Lamps) -> Line<'a> {
+    fn new(sensor: &'a str, lamps: &'a Lamps, reason: Option<&'a str>) -> Line<'a> {
         Line {
             class: "leds",
             sensor,
@@ -291,6 +342,7 @@ impl<'a> Line<'a> {
             red: lamps.lit(Light::Red),
             mark: lamps.lit(Light::Mark),
             worst: lamps.worst.as_deref(),
+            reason,
         }
     }
 }

@@ -22,6 +22,7 @@ mod interface;
 mod json;
 mod latency;
 mod leds;
+mod line;
 mod list;
 mod listen;
 mod mask;

@@ -1,6 +1,7 @@
 //! `scanhub listen`: what gateways send over the network, checked, with an account of what did not come. Refuses to know
 //! who sends it, and to answer.
 
+mod crowd;
 mod ear;
 mod names;
 mod publish;
@@ -10,13 +11,14 @@ mod roll;
 mod twins;
 
 use std::io::Write;
-use std::net::IpAddr;
+use std::net::SocketAddrV4;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
-use schema::datagram::{Account, Announce, Datagram, Fresh, Refusal, group};
+use schema::datagram::{Account, Announce, Arrival, Datagram, Fresh, Head, Refusal, group};
 use schema::{Domain, Failure, Kind, Topic};
 
+use self::crowd::{Crowd, Crowding};
 use self::ear::{Caught, Ear, LONGEST};
 use self::names::{Hubs, Names};
 use self::publish::Publication;
@@ -87,6 +89,7 @@ pub fn listen(
         account: Box::new(Account::new(&heard)),
         roll: Roll::default(),
         twins: Twins::default(),
+        crowd: Crowd::default(),
         report: Report::new(options.json, Output::new(out), Output::new(notes), names),
         started: now,
         last_sample: now,
@@ -107,6 +110,7 @@ struct Listener<'a> {
     account: Box<Account>,
     roll: Roll,
     twins: Twins,
+    crowd: Crowd,
     report: Report<'a>,
     started: Instant,
     last_sample: Instant,
@@ -122,10 +126,6 @@ const LONGEST_WAIT: Duration = Duration::from_millis(100);
 
 /// The most things that are told to be wrong: it may be the network that makes them.
 const TOLD: usize = 16;
-
-/// What to do about [`Refusal::Capacity`].
-const FULL: &str = "datagrams are refused: more gateways (64), or more of their sensors and topics (1024), were heard than \
-                    one listener keeps apart: start it anew";
 
 /// Between two accounts on a terminal.
 const DRAW_EVERY: Duration = Duration::from_secs(1);
@@ -184,14 +184,13 @@ impl Listener<'_> {
             if !self.hubs.want(bytes) {
                 continue;
             }
-            match self.account.receive(bytes) {
+            match self.account.receive(bytes, sender(caught.from), caught.arrival_ns) {
                 Ok((_, Fresh::Duplicate)) => {}
                 Ok((datagram, fresh)) => {
                     self.twins.taken(datagram.head.hub);
                     self.heard(datagram, fresh == Fresh::Late, &caught)?;
                 }
-                Err(Refusal::Capacity) => self.trouble(FULL)?,
-                Err(Refusal::Epoch) => self.of_another_life(bytes)?,
+                Err(Refusal::Epoch | Refusal::Twin) => self.of_another_life(bytes)?,
                 Err(_) => {}
             }
             if self.options.bounds.count.is_some_and(|count| self.received >= count) {
@@ -203,25 +202,31 @@ impl Listener<'_> {
 
     /// A datagram that was not there before, as it was `caught`.
     fn heard(&mut self, datagram: Datagram<'_>, late: bool, caught: &Caught<'_>) -> Result<(), End> {
-        let &Caught { from, arrival_ns, wall_ns, .. } = caught;
+        let &Caught { arrival_ns, wall_ns, .. } = caught;
         let head = datagram.head;
         let Some(topic) = Topic::of_number(head.topic) else {
             // What it says was said again, and better, by a newer one.
-            return if late { Ok(()) } else { self.announced(&datagram, wall_ns, from) };
+            return if late { Ok(()) } else { self.announced(&datagram, caught) };
         };
         let life = self.roll.life(&head, &self.account);
         let age_ns = life.age_ns(head.stamp_ns, wall_ns);
         let sensor = life.sensor(head.sensor);
         let missed = if late { 0 } else { sensor.advance(head.topic, head.sequence) };
-        let boot = sensor.announced.map_or(0, |announced| announced.boot);
+        let announced = sensor.announced;
+        let boot = announced.map_or(0, |announced| announced.boot);
         if !self.wanted.contains(&topic) {
             return Ok(());
         }
         self.received += 1;
         self.last_sample = Instant::now();
         let remote = Remote { topic, datagram, boot, arrival_ns, age_ns, late };
-        if let Some(publication) = &mut self.publication {
-            publication.sample(&remote, self.last_sample);
+        if let Some(publication) = &self.publication {
+            if let Some(announce) = announced.filter(|_| publication.may_make_room(&head)) {
+                self.publish(&head, &announce, Arrival { delivers: true, now_ns: arrival_ns }, caught.from)?;
+            }
+            if let Some(publication) = &mut self.publication {
+                publication.sample(&remote, self.last_sample);
+            }
             return Ok(());
         }
         if self.options.stats {
@@ -234,28 +239,41 @@ impl Listener<'_> {
         self.report.sample(sensor, &remote)
     }
 
-    fn announced(&mut self, datagram: &Datagram<'_>, wall_ns: u64, from: IpAddr) -> Result<(), End> {
+    fn announced(&mut self, datagram: &Datagram<'_>, caught: &Caught<'_>) -> Result<(), End> {
         let head = datagram.head;
         let Some(announce) = Announce::unpack(datagram.payload) else { return Ok(()) };
-        let behind_ns = self.roll.announce(&head, &self.account, &announce, wall_ns);
+        let behind_ns = self.roll.announce(&head, &self.account, &announce, caught.wall_ns);
         if self.roll.life(&head, &self.account).sensor(head.sensor).take_numbered() {
             self.report.named(&head, announce.sensor())?;
         }
         if let Some(behind_ns) = behind_ns {
             self.report.clocks_differ(&head, behind_ns)?;
         }
+        let arrival = Arrival { delivers: false, now_ns: caught.arrival_ns };
+        self.publish(&head, &announce, arrival, caught.from)
+    }
+
+    /// Makes the topics of the sensor that is `announced` so, if it is to be published and there is room.
+    fn publish(
+        &mut self,
+        head: &Head,
+        announced: &Announce,
+        arrival: Arrival,
+        from: SocketAddrV4,
+    ) -> Result<(), End> {
         let Some(publication) = &mut self.publication else { return Ok(()) };
-        match publication.announced(&head, &self.report.names.of(head.hub), &announce) {
-            Ok(Some(name)) => self.report.published(&head, &name, is_of_this_machine(from)),
+        match publication.announced(head, &self.report.names.of(head.hub), announced, arrival) {
+            Ok(Some(name)) => self.report.published(head, &name, is_of_this_machine((*from.ip()).into())),
             Ok(None) => Ok(()),
             Err(failure) => self.trouble(&failure.to_string()),
         }
     }
 
-    /// `bytes` were refused as of a life of their gateway that is over.
+    /// `bytes` were refused as of a life of their gateway that is over, or of another gateway with its number.
     fn of_another_life(&mut self, bytes: &[u8]) -> Result<(), End> {
         let Ok(Datagram { head, .. }) = Datagram::read(bytes) else { return Ok(()) };
-        if !self.twins.refused(head.hub, Instant::now()) {
+        let is_shared = self.account.is_shared(head.hub, head.epoch);
+        if !is_shared && !self.twins.refused(head.hub, Instant::now()) {
             return Ok(());
         }
         let what = twins::remedy(&self.report.names.of(head.hub));
@@ -280,11 +298,25 @@ impl Listener<'_> {
         if let Some(publication) = &mut self.publication {
             publication.look(now);
         }
+        let so_far = self.crowding();
+        if let Some(what) = self.crowd.look(so_far, now) {
+            self.report.trouble(&what)?;
+        }
         if self.options.stats && self.options.terminal && !self.options.json && now >= self.draw_at {
             self.draw_at = now + DRAW_EVERY;
             self.report.draw(&self.account, &self.roll)?;
         }
         Ok(())
+    }
+
+    fn crowding(&self) -> Crowding {
+        let publication = self.publication.as_ref();
+        Crowding {
+            gateways: self.account.given_up().displaced,
+            refused: self.account.refused(Refusal::Capacity),
+            sensors: publication.map_or(0, |publication| publication.displaced),
+            samples: publication.map_or(0, |publication| publication.left_out.capacity),
+        }
     }
 
     fn left(&self, now: Instant) -> Duration {
@@ -311,6 +343,11 @@ impl Listener<'_> {
             None => Ok(()),
         }
     }
+}
+
+/// The number of a sender in the account.
+fn sender(from: SocketAddrV4) -> u64 {
+    u64::from(from.ip().to_bits()) << 16 | u64::from(from.port())
 }
 
 fn nothing_came(limit: Duration) -> Failure {

@@ -101,6 +101,11 @@ impl Presence {
         self.hub.as_ref().map(|holder| &holder.domain)
     }
 
+    /// Who publishes there.
+    pub(crate) fn who(&self) -> Option<Who> {
+        self.hub.as_ref().map(|holder| holder.who)
+    }
+
     /// What to tell who cannot wait for a hub.
     pub(crate) fn no_hub(&self) -> Failure {
         if let Some(short) = self.short() {

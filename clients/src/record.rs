@@ -88,7 +88,8 @@ pub enum RecordLook {
 /// for. How far it is goes to `out`, and what is no account to `notes` (stderr) if `out` is not JSON; lines for which there
 /// is no room are left out before they delay what is recorded.
 ///
-/// [`Kind::Output`] if there is no file to be had; [`Kind::Failed`] if its end cannot be written; [`Kind::Usage`] if stdout is no place for
+/// [`Kind::Output`] if there is no file to be had, [`Kind::Failed`] if its end cannot be written, [`Kind::Short`] if either is for
+/// lack of room; [`Kind::Usage`] if stdout is no place for
 /// it; else as [`echo`](crate::echo()).
 pub fn record(
     options: &RecordOptions,
@@ -266,7 +267,7 @@ impl Recorder<'_> {
             let missing = self.pushed - account.samples;
             let what =
                 format!("the end of the recording cannot be written: {error}; {missing} samples are missing");
-            return Err(Failure::new(Kind::Failed, what, REPAIR).into());
+            return Err(Failure::new(refusal::kind(&error), what, REPAIR).into());
         }
         told.and_then(|()| account.news.iter().try_for_each(|news| self.report.disk(news)))?;
         if stays { self.report.end(&account, self.left_out) } else { Ok(()) }
@@ -294,6 +295,10 @@ impl Sink for Recorder<'_> {
         }
         self.pushed += 1;
         Ok(())
+    }
+
+    fn wants_lines(&self) -> bool {
+        true
     }
 
     fn notice(&mut self, names: &[&TopicName], notice: Notice) -> Result<(), End> {

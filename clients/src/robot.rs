@@ -1,18 +1,19 @@
 //! The robot's verdict: the fold over its sensors' zones, in which a sensor that is not heard counts as unknown.
 
-use std::time::{Duration, Instant};
+mod source;
 
-use schema::{Domain, Failure, Verdict, Zones, check_followed, ipc, is_remote};
+use std::os::fd::BorrowedFd;
+use std::time::Duration;
+
+use schema::{Domain, Failure, Verdict, Zones, check_followed};
 
 use crate::attach::places;
-use crate::clock;
-use crate::freshness::Freshness;
-use crate::presence::GRACE;
 use crate::session::Session;
-use crate::zones::{Heard, ZonesSource};
+use crate::wait::Wait;
+pub(crate) use source::{RobotHeard, RobotSource};
 
-/// Follows the zones of `sensors` (none: all sensors of the hub on this machine) in the domain that SCANHUB_DOMAIN names. There need
-/// not be a hub yet.
+/// Follows the zones of `sensors` in the domain that SCANHUB_DOMAIN names. None: all sensors of the hub there; in a domain
+/// without a hub those of other machines that are published there. There need not be a hub yet.
 ///
 /// [`Kind::Configuration`](schema::Kind) if a name is not possible.
 pub fn robot(sensors: &[&str]) -> Result<RobotFollower, Failure> {
@@ -49,6 +50,11 @@ impl Robot {
         self.parts.iter().map(|(sensor, zones)| (sensor.as_str(), zones.verdict()))
     }
 
+    /// Each sensor's zones; unknown where it was not heard lately, or never.
+    pub fn zones(&self) -> impl Iterator<Item = (&str, &Zones)> {
+        self.parts.iter().map(|(sensor, zones)| (sensor.as_str(), zones))
+    }
+
     /// Counts `sensor` as unknown until it is heard.
     fn expect(&mut self, sensor: &str) {
         self.parts.push((sensor.to_owned(), Zones::unknown()));
@@ -70,144 +76,62 @@ impl RobotFollower {
         Ok(RobotFollower { session: Session::new(places), source: RobotSource::new(sensors) })
     }
 
+    /// As [`Attachment::wait_by`](crate::Attachment::wait_by).
+    pub fn wait_by(self, wait: Wait) -> RobotFollower {
+        RobotFollower { session: self.session.by(wait), ..self }
+    }
+
     /// Waits until any of the sensors is heard, or any is heard no more; what is known then. The first time it waits for
     /// a word of each. A sensor becomes unknown as with [`ZonesFollower::next`](crate::ZonesFollower::next), and this
     /// fails likewise.
     #[allow(clippy::should_implement_trait)] // There is no end that an iterator would have.
     pub fn next(&mut self) -> Result<&Robot, Failure> {
         while !self.hear()? {
-            self.session.wait_for(self.source.left())?;
+            self.wait(Duration::MAX)?;
         }
-        Ok(&self.source.robot)
+        Ok(self.source.robot())
     }
 
     /// What is known now; never waits. Failures as [`next`](Self::next).
     pub fn now(&mut self) -> Result<&Robot, Failure> {
         self.hear()?;
-        Ok(&self.source.robot)
+        Ok(self.source.robot())
+    }
+
+    /// What is known now, if anything was heard, or became too old, since the last call; never waits. Failures as
+    /// [`next`](Self::next).
+    pub fn try_next(&mut self) -> Result<Option<&Robot>, Failure> {
+        loop {
+            if self.hear()? {
+                return Ok(Some(self.source.robot()));
+            }
+            if !self.session.settle(self.source.left())? {
+                return Ok(None);
+            }
+        }
+    }
+
+    /// As [`Attachment::wait`](crate::Attachment::wait); it is also over when a verdict becomes too old.
+    pub fn wait(&mut self, longest: Duration) -> Result<(), Failure> {
+        self.session.wait_for(Some(self.source.left().map_or(longest, |left| left.min(longest))))
+    }
+
+    /// As [`ZonesFollower::descriptor`](crate::ZonesFollower::descriptor).
+    pub fn descriptor(&mut self) -> Result<BorrowedFd<'_>, Failure> {
+        self.session.descriptor()
+    }
+
+    /// Somebody publishes in the domain, a hub or a listener, as of the last call of [`next`](Self::next),
+    /// [`now`](Self::now) or [`try_next`](Self::try_next) that found no news.
+    pub fn hub_lives(&self) -> bool {
+        self.session.domain().is_some()
     }
 
     /// Takes all that waits; whether there was anything.
     fn hear(&mut self) -> Result<bool, Failure> {
-        // As with one sensor's zones: what is there comes first.
-        if self.source.drain(&mut self.session)? {
-            return Ok(true);
-        }
+        // As with one sensor's zones what is there comes first; but who always finds something has to see a hub come, too.
+        let heard = self.source.drain(&mut self.session)?;
         self.session.look()?;
-        self.source.drain(&mut self.session)
-    }
-}
-
-/// The fold, sample by sample, in a session of the caller's.
-pub(crate) struct RobotSource {
-    robot: Robot,
-    parts: Vec<ZonesSource>,
-    /// Whose turn it is: no sensor shall wait for another one's samples.
-    turn: usize,
-    /// Each sensor has spoken once: the fold is of all of them.
-    begun: bool,
-    /// As long as there are no sensors.
-    nobody: Freshness,
-    /// The sensors are those of the hub.
-    all: bool,
-    /// When the hub is asked for its sensors, if there is one.
-    call_at: Option<Instant>,
-}
-
-/// A sample of any sensor, or that it is silent, and what is known with it.
-pub(crate) struct RobotHeard {
-    pub(crate) robot: Robot,
-    pub(crate) heard: Heard,
-}
-
-/// A hub that starts makes its topics one after the other: nobody shall be overlooked for long.
-const CALL_EVERY: Duration = Duration::from_secs(1);
-
-impl RobotSource {
-    /// Will follow the zones of `sensors`; none: all of the hub.
-    pub(crate) fn new(sensors: &[&str]) -> RobotSource {
-        let mut source = RobotSource {
-            robot: Robot::default(),
-            parts: Vec::new(),
-            turn: 0,
-            begun: false,
-            nobody: Freshness::new(clock::now()),
-            all: sensors.is_empty(),
-            call_at: None,
-        };
-        sensors.iter().for_each(|sensor| source.follow(sensor));
-        source
-    }
-
-    /// The topic of each sensor has been there at least once.
-    pub(crate) fn attached(&self) -> bool {
-        !self.parts.is_empty() && self.parts.iter().all(ZonesSource::attached)
-    }
-
-    /// The next sample of any sensor, or a silence, once each has spoken; failures as [`ZonesSource::receive`].
-    pub(crate) fn receive(&mut self, session: &mut Session) -> Result<Option<RobotHeard>, Failure> {
-        let heard = self.hear(session)?;
-        Ok(heard.map(|heard| RobotHeard { robot: self.robot.clone(), heard }))
-    }
-
-    /// After which time [`receive`](Self::receive) has something to say even if no sample comes.
-    pub(crate) fn left(&self) -> Option<Duration> {
-        match &self.parts[..] {
-            [] => self.nobody.left(clock::now()),
-            parts => parts.iter().filter_map(ZonesSource::left).min(),
-        }
-    }
-
-    /// Takes all that waits; whether there was anything.
-    fn drain(&mut self, session: &mut Session) -> Result<bool, Failure> {
-        let mut any = false;
-        while self.hear(session)?.is_some() {
-            any = true;
-        }
-        Ok(any)
-    }
-
-    fn hear(&mut self, session: &mut Session) -> Result<Option<Heard>, Failure> {
-        for _ in 0..self.parts.len() {
-            let turn = self.turn;
-            self.turn = (turn + 1) % self.parts.len();
-            if let Some(heard) = self.parts[turn].receive(session)? {
-                self.robot.parts[turn].1 = heard.zones;
-                self.begun = self.begun || self.parts.iter().all(ZonesSource::has_spoken);
-                if self.begun {
-                    return Ok(Some(heard));
-                }
-            }
-        }
-        // Last, because it takes longer than all the rest.
-        self.call_the_roll(session)?;
-        let silence = self.parts.is_empty() && self.nobody.silence(clock::now());
-        Ok(silence.then(Heard::nothing))
-    }
-
-    /// Adds the sensors that the hub has and that are not followed yet. One that is, stays: that it is missing is to be
-    /// seen.
-    fn call_the_roll(&mut self, session: &Session) -> Result<(), Failure> {
-        let Some(domain) = session.domain().filter(|_| self.all) else {
-            self.call_at = None;
-            return Ok(());
-        };
-        let now = Instant::now();
-        if now < *self.call_at.get_or_insert(now + GRACE / 2) {
-            return Ok(());
-        }
-        self.call_at = Some(now + CALL_EVERY);
-        // The zones of another robot's sensors are around its own centre.
-        for sensor in ipc::sensors(domain)?.into_iter().filter(|sensor| !is_remote(sensor)) {
-            if self.robot.sensors().all(|(known, _)| known != sensor) {
-                self.follow(&sensor);
-            }
-        }
-        Ok(())
-    }
-
-    fn follow(&mut self, sensor: &str) {
-        self.robot.expect(sensor);
-        self.parts.push(ZonesSource::new(sensor));
+        Ok(self.source.drain(&mut self.session)? || heard)
     }
 }

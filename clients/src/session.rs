@@ -7,7 +7,7 @@ use std::time::{Duration, Instant};
 use schema::ipc::{self, Node, Payload, Subscriber};
 use schema::{Domain, Failure, Kind, holder};
 
-use crate::presence::{Change, Presence};
+use crate::presence::{Change, Presence, Who};
 use crate::readiness::Readiness;
 use crate::wait::{Wait, Wakeups};
 
@@ -85,6 +85,11 @@ impl Session {
     /// Where the hub lives, if there is one.
     pub(crate) fn domain(&self) -> Option<&Domain> {
         self.presence.domain()
+    }
+
+    /// Who publishes there, as of the last look.
+    pub(crate) fn publishes(&self) -> Option<Who> {
+        self.presence.who()
     }
 
     /// There is a hub, and not only a listener that stands for those of other machines.

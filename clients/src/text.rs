@@ -5,7 +5,7 @@ mod processed;
 use std::fmt;
 use std::io::{self, Write};
 
-use schema::{Header, Reasons, Scan, Status, Telegram};
+use schema::{Flags, Header, Reasons, Scan, Status, Telegram};
 
 use crate::account::Account;
 use crate::follow::Notice;
@@ -63,8 +63,15 @@ pub(crate) fn summary(line: &mut Vec<u8>, name: &TopicName, account: &Account) -
         account.lost,
         account.seconds()
     )?;
-    match account.hz() {
-        Some(hz) => write!(line, ", {hz:.2} Hz"),
+    if let Some(hz) = account.hz() {
+        write!(line, ", {hz:.2} Hz")?;
+    }
+    // That nothing was is not worth a word.
+    if let Some(lost) = account.loss.lost_on_line.filter(|&lost| lost > 0) {
+        write!(line, ", {lost} lost on the line")?;
+    }
+    match account.loss.damaged.filter(|&share| share > 0.0) {
+        Some(share) => write!(line, ", {:.2} % of its bytes damaged", 100.0 * share),
         None => Ok(()),
     }
 }
@@ -81,7 +88,7 @@ fn numbers(line: &mut Vec<u8>, header: &Header) -> io::Result<()> {
     for reason in Reasons::names(header.reasons) {
         write!(line, " {reason}")?;
     }
-    Ok(())
+    if header.flags & Flags::STAMP_ESTIMATED != 0 { write!(line, " stamp_estimated") } else { Ok(()) }
 }
 
 /// What follows the name of a sample of topic `telegram`.
@@ -124,6 +131,9 @@ pub(crate) fn status(line: &mut Vec<u8>, status: &Status) -> io::Result<()> {
         f64::from(status.rate_mhz) / 1000.0,
         status.port()
     )?;
+    if let Some(loss) = status.line_loss() {
+        write!(line, " {loss}")?;
+    }
     if !status.last_error().is_empty() {
         write!(line, " last error: {}", status.last_error())?;
     }

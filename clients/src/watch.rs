@@ -80,7 +80,7 @@ const TOPICS: [Topic; 6] =
 struct Watcher<'a> {
     options: &'a WatchOptions,
     scene: Scene,
-    /// The scene that is shown while the picture is held.
+    /// The scene whose picture is shown while that is held; the verdict and the sensors' lines go on.
     held: Option<Scene>,
     view: View,
     screen: Screen<'a>,
@@ -107,7 +107,7 @@ impl Watcher<'_> {
             // Whoever types waits for the answer.
             self.draw_at = now;
             let News::Key(key) = news else { continue };
-            let wish = self.view.key(key, self.held.as_ref().unwrap_or(&self.scene));
+            let wish = self.view.key(key, &self.scene);
             match (self.view.paused, &self.held) {
                 (true, None) => self.held = Some(self.scene.clone()),
                 (false, Some(_)) => self.held = None,
@@ -144,10 +144,10 @@ impl Watcher<'_> {
     }
 
     fn draw(&mut self, now: Instant) -> Result<(), End> {
-        let (scene, view) = (self.held.as_ref().unwrap_or(&self.scene), &mut self.view);
+        let (scene, held, view) = (&self.scene, self.held.as_ref(), &mut self.view);
         let bytes = self.screen.draw(|frame| {
-            view.fit(scene, draw::dots(frame.area(), scene));
-            draw::draw(frame, scene, view);
+            view.fit(held.unwrap_or(scene), draw::dots(frame.area(), scene));
+            draw::draw(frame, scene, held, view);
         })?;
         self.changed = false;
         self.draw_at = now + FRAME.max(Duration::from_secs_f64(bytes as f64 / BYTES_PER_SECOND));

@@ -13,7 +13,7 @@ use std::time::Duration;
 use clients::{BackgroundOptions, ModelOrder, background, saved_model};
 use fake::Place;
 use schema::ipc::{self, ControlServer};
-use schema::{Background, Domain, Failure, HubLock, Kind, Response, Verb};
+use schema::{Background, Domain, Failure, HubLock, Kind, Response, Shown, Verb};
 
 /// A hub that answers for the background of `front`.
 struct Keeper {
@@ -26,9 +26,11 @@ impl Keeper {
         let (stop, domain) = (Arc::new(AtomicBool::new(false)), domain.clone());
         let lock = HubLock::acquire(domain.root()).unwrap();
         let flag = stop.clone();
+        let (ready, is_ready) = std::sync::mpsc::channel();
         let thread = std::thread::spawn(move || {
             let _lock = lock;
             let server = ControlServer::create(&ipc::hub_node(&domain).unwrap()).unwrap();
+            ready.send(()).unwrap();
             while !flag.load(Ordering::Relaxed) {
                 while let Some(asked) = server.receive().unwrap() {
                     let request = *asked.request();
@@ -40,11 +42,12 @@ impl Keeper {
                             "there are front",
                         )),
                     };
-                    server.answer(asked, &Response(answer)).unwrap();
+                    server.answer(asked, &Response(answer.map(|model| model.map(Shown::from)))).unwrap();
                 }
                 ipc::sleep(&[server.requests()], Duration::from_millis(5)).unwrap();
             }
         });
+        is_ready.recv().unwrap();
         Keeper { stop, thread: Some(thread) }
     }
 }

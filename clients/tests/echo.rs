@@ -8,7 +8,7 @@ use std::time::{Duration, Instant};
 
 use clients::{Bounds, EchoOptions, Format, echo};
 use fake::{FakeHub, Place, Verb};
-use schema::{Counter, Kind};
+use schema::{Counter, Flags, Kind, Verdict};
 
 const ANSWER: [u8; 9] = [0x02, 0x80, 0x03, 0x00, 0xA0, 0x00, 0x10, 0x16, 0x0A];
 
@@ -79,7 +79,7 @@ fn telegrams_and_status_as_json() {
         out.lines().take(2).collect::<Vec<_>>(),
         [
             r#"{"class":"telegram","sensor":"front","seq":0,"topic_seq":0,"stamp_ns":1000000000,"wall_ns":1700000000000000000,"boot":"0000000000000001","quality":"clean","address":128,"command":160,"length":3,"data":"02800300a00010160a"}"#,
-            r#"{"class":"status","sensor":"front","state":"streaming","baud":500000,"mode":null,"type":"","unit_mm":null,"angle_deg":null,"step_deg":null,"hz":0.0,"port":"/dev/ttyUSB0","since_ns":0,"counters":{"bytes_read":0,"bytes_in_telegrams":0,"bytes_acknowledge":0,"bytes_discarded":0,"bytes_buffered":0,"telegrams":0,"suspect":0,"aborted":0,"resyncs":0,"reconnects":0,"lost_in_restart":0,"wakeups":0,"loan_failed":0,"rejected_address":0,"rejected_length":0,"rejected_command":0,"rejected_count":0,"rejected_crc":3,"rejected_vetoed":0,"rejected_superseded":0,"line_errors":0},"last_error":"","pose":{"x_m":0.0,"y_m":0.0,"yaw_rad":0.0,"upside_down":false},"marks":{"available":null,"remedy":null}}"#,
+            r#"{"class":"status","sensor":"front","state":"streaming","baud":500000,"mode":null,"type":"","unit_mm":null,"angle_deg":null,"step_deg":null,"hz":0.0,"port":"/dev/ttyUSB0","since_ns":0,"counters":{"bytes_read":0,"bytes_in_telegrams":0,"bytes_acknowledge":0,"bytes_discarded":0,"bytes_buffered":0,"telegrams":0,"suspect":0,"aborted":0,"resyncs":0,"reconnects":0,"lost_in_restart":0,"wakeups":0,"loan_failed":0,"rejected_address":0,"rejected_length":0,"rejected_command":0,"rejected_count":0,"rejected_crc":3,"rejected_vetoed":0,"rejected_superseded":0,"line_errors":0,"bytes_damaged":0,"damaged_ppm":0,"due_on_line":0,"lost_on_line":0,"lost_ppm":0},"last_error":"","pose":{"x_m":0.0,"y_m":0.0,"yaw_rad":0.0,"upside_down":false},"marks":{"available":null,"remedy":null},"damaged":0.0,"lost_on_line":null}"#,
         ]
     );
     assert_eq!(out.lines().filter(|line| line.contains("summary")).count(), 2);
@@ -268,4 +268,55 @@ fn a_reader_that_goes_away_is_a_quiet_end() {
     hub.front().scan.await_subscribers(1);
     hub.front().scan(&[1]);
     assert_eq!(verb.join().0, Ok(()));
+}
+
+#[test]
+fn flags_are_the_last_key_of_a_line_with_a_head() {
+    let place = Place::new();
+    let mut hub = FakeHub::new(&place.domain, &["front"], 1);
+    let verb = start(&place, &["front/scan", "front/zones", "front/telegram"], Format::Json, count(4));
+    hub.front().scan.await_subscribers(1);
+    hub.front().zones.await_subscribers(1);
+    hub.front().telegram.await_subscribers(1);
+    hub.front().flags = Flags::SIMULATED | Flags::REPLAYED | Flags::STAMP_ESTIMATED;
+    hub.front().scan(&[1000]);
+    hub.front().zones(Verdict::Clear, 1000);
+    hub.front().telegram(&ANSWER);
+    verb.out.await_lines("stamp_estimated", 3);
+    hub.front().flags = 0;
+    hub.front().telegram(&ANSWER);
+    let (end, out, _) = verb.join();
+    assert_eq!(end, Ok(()));
+    let flagged: Vec<_> = out.lines().filter(|line| line.contains("flags")).collect();
+    let last = r#","flags":["simulated","replayed","stamp_estimated"]}"#;
+    assert!(flagged.len() == 3 && flagged.iter().all(|line| line.ends_with(last)), "{out}");
+}
+
+#[test]
+fn what_the_line_took_away_meanwhile_is_in_the_summary() {
+    let place = Place::new();
+    let mut hub = FakeHub::new(&place.domain, &["front"], 1);
+    let verb = start(&place, &["front/scan"], Format::Json, Bounds::default());
+    hub.front().scan.await_subscribers(1);
+    hub.front().status.await_subscribers(1);
+    for n in 1..=3 {
+        hub.front().status(|status| {
+            status.counters[Counter::BytesRead] = 1000 * n;
+            status.counters[Counter::BytesDamaged] = 250 * n;
+            status.counters[Counter::DueOnLine] = 100 * n;
+            status.counters[Counter::LostOnLine] = 40 * n;
+        });
+    }
+    hub.front().scan(&[1000]);
+    verb.out.await_lines("ranges", 1);
+    verb.stop();
+    let (end, out, _) = verb.join();
+    assert_eq!(end, Ok(()));
+    let summary = out.lines().last().unwrap();
+    assert!(
+        summary.starts_with(r#"{"class":"summary","sensor":"front","topic":"scan","received":1,"#),
+        "{out}"
+    );
+    assert!(summary.ends_with(r#""damaged":0.25,"lost_on_line":80}"#), "{out}");
+    assert!(!out.contains(r#""class":"status""#), "{out}");
 }

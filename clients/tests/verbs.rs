@@ -144,7 +144,11 @@ fn rates_of_all_topics() {
     let line = out.lines().find(|line| line.contains(r#""topic":"scan""#)).unwrap();
     let keys: Vec<_> =
         line.split("\"").skip(1).step_by(2).filter(|it| !["hz", "front", "scan"].contains(it)).collect();
-    assert_eq!(keys.join(" "), "class sensor topic jitter_ms min_ms max_ms received lost window_s", "{line}");
+    assert_eq!(
+        keys.join(" "),
+        "class sensor topic jitter_ms min_ms max_ms received lost window_s damaged lost_on_line",
+        "{line}"
+    );
     assert!(
         out.lines().any(|line| line.contains(r#""topic":"telegram","hz":null,"jitter_ms":null"#)),
         "{out}"

@@ -7,7 +7,7 @@ use clap::{Arg, Args, Command, CommandFactory};
 use schema::{Domain, Environment};
 
 use super::{Cli, command};
-use crate::print;
+use crate::print_own;
 
 /// Not for people: the scripts of `completions` ask it.
 #[derive(Args, Debug)]
@@ -35,7 +35,7 @@ impl Complete {
             words.push(if name == Name::Sensor { "robot" } else { "robot/zones" }.to_owned());
         }
         if !words.is_empty() {
-            let _ = print(&words.join("\n"));
+            let _ = print_own(&words.join("\n"));
         }
     }
 }

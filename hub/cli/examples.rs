@@ -1,4 +1,12 @@
-//! An example for each verb, as its help and its manual page show it. A test reads every one of them as a command line.
+//! An example for each verb, as its help and its manual page show it. A test reads every one of them as a command line, and
+//! so those of the pages.
+
+#[cfg(test)]
+#[path = "../../tests/pages/blocks.rs"]
+mod blocks;
+#[cfg(test)]
+#[path = "../../tests/pages/shell.rs"]
+mod shell;
 
 use clap::Command;
 
@@ -133,6 +141,15 @@ const EXAMPLES: &[(&str, &[&str])] = &[
 #[cfg(test)]
 mod tests {
     use super::*;
+    use clap::ArgMatches;
+
+    /// What this program makes of the first command line of its in `line`.
+    fn read(line: &str) -> ArgMatches {
+        let words = shell::of_the_program(line);
+        let first = words.first().unwrap_or_else(|| panic!("nothing for this program: {line}"));
+        let read = crate::cli::command().try_get_matches_from(first);
+        read.unwrap_or_else(|error| panic!("{line}: {error}"))
+    }
 
     /// The ways to all verbs below `command`.
     fn paths(command: &Command, before: &str) -> Vec<String> {
@@ -155,11 +172,7 @@ mod tests {
             let example = EXAMPLES.iter().find(|(way, _)| way == path);
             let (_, lines) = example.unwrap_or_else(|| panic!("{path} has no example"));
             for line in *lines {
-                // What the shell would do with it is not the program's.
-                let mut parts = line.split(['|', '>']).map(str::trim);
-                let words = parts.find(|part| part.starts_with("scanhub")).unwrap_or_default();
-                let read = crate::cli::command().try_get_matches_from(words.split_whitespace());
-                let read = read.unwrap_or_else(|error| panic!("{line}: {error}"));
+                let read = read(line);
                 let mut matches = &read;
                 for verb in path.split(' ') {
                     let (name, deeper) = matches.subcommand().unwrap_or_else(|| panic!("{line}: no {verb}"));
@@ -169,5 +182,22 @@ mod tests {
             }
         }
         command.debug_assert();
+    }
+
+    #[test]
+    fn every_command_line_on_a_page_can_be_read() {
+        let mut count = 0;
+        for block in blocks::blocks().into_iter().filter(|block| block.language == "sh") {
+            for line in shell::lines(&block.text) {
+                for words in shell::of_the_program(&line) {
+                    let read = crate::cli::command().try_get_matches_from(&words);
+                    read.unwrap_or_else(|error| panic!("{}: {line}: {error}", block.place));
+                    count += 1;
+                }
+            }
+        }
+        assert!(count > 40, "{count}");
+        let unknown = crate::cli::command().try_get_matches_from(["scanhub", "record", "--ros3"]);
+        assert!(unknown.is_err(), "what is wrong would be found");
     }
 }

@@ -13,14 +13,15 @@ use super::{Configured, Everywhere};
 /// Each flag is also a key of section `gateway` of the configuration, and wins over it.
 #[derive(Args, Debug, Default)]
 pub(crate) struct Gateway {
-    /// Network interface of the groups; need not be named if only one is up and has multicast
+    /// Network interface of the groups: whoever is on it can read all that is sent. Without one nothing goes to groups, and
+    /// hosts have to be named. lo is this machine alone
     #[arg(long, value_name = "NAME")]
     interface: Option<String>,
     /// What goes out, front/scan, */scan for all sensors or front/* for all topics; :every=4 behind it keeps the samples of every fourth telegram.
     /// May be given several times; without it all topics but telegrams, of all sensors
     #[arg(long = "topic", value_name = "SENSOR/TOPIC[:every=N]")]
     topics: Vec<String>,
-    /// A host that gets copies, besides the groups, or [IPV6]:PORT; a name is asked for again while it runs. May be given
+    /// A host that gets copies, or [IPV6]:PORT; a name is asked for again while it runs. May be given
     /// several times
     #[arg(long, value_name = "HOST:PORT")]
     to: Vec<String>,

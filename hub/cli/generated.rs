@@ -8,7 +8,7 @@ use clap_complete::shells;
 use schema::{Failure, Kind};
 
 use super::{command, complete};
-use crate::print;
+use crate::print_own;
 
 #[derive(Args, Debug)]
 pub(crate) struct Completions {
@@ -37,14 +37,14 @@ impl Completions {
         let text = text.trim_end();
         // What the definition cannot know is the hub's.
         match self.shell {
-            Shell::Bash => print(&format!("{text}\n{}", complete::BASH.trim_end())),
+            Shell::Bash => print_own(&format!("{text}\n{}", complete::BASH.trim_end())),
             // The script's last lines call what stands before them.
             Shell::Zsh => {
                 let (head, body) = text.split_once('\n').unwrap_or((text, ""));
                 let body = body.replace(":_default'", ":_scanhub_live'");
-                print(&format!("{head}\n{}\n{body}", complete::ZSH.trim_end()))
+                print_own(&format!("{head}\n{}\n{body}", complete::ZSH.trim_end()))
             }
-            Shell::Fish => print(&format!("{text}\n{}", complete::FISH.trim())),
+            Shell::Fish => print_own(&format!("{text}\n{}", complete::FISH.trim())),
         }
     }
 }
@@ -65,7 +65,7 @@ impl Man {
                 let mut page = Vec::new();
                 let rendered = clap_mangen::Man::new(command()).render(&mut page);
                 rendered.map_err(|error| Failure::new(Kind::Failed, format!("no page: {error}"), ""))?;
-                print(String::from_utf8_lossy(&page).trim_end())
+                print_own(String::from_utf8_lossy(&page).trim_end())
             }
         }
     }

@@ -2,9 +2,10 @@
 
 use std::io::{IsTerminal, stdout};
 use std::path::PathBuf;
+use std::time::Duration;
 
 use clap::Args;
-use clients::{LedsLook, LedsOptions};
+use clients::{LedsLook, LedsOptions, duration};
 use schema::Failure;
 
 use super::watch::colours;
@@ -21,6 +22,9 @@ pub(crate) struct Leds {
     /// Where they are
     #[arg(long, default_value = "/sys/class/leds", value_name = "DIR")]
     led_root: PathBuf,
+    /// How long a better verdict has to stand until it is shown; a worse one is shown at once
+    #[arg(long, default_value = "300ms", value_name = "DURATION", value_parser = duration::parse)]
+    hold: Duration,
     #[command(flatten)]
     limits: Limits,
 }
@@ -36,6 +40,7 @@ impl Leds {
                 (false, true) => LedsLook::Terminal { colours: colours() },
                 (false, false) => LedsLook::Lines,
             },
+            hold: self.hold,
             bounds: self.limits.bounds(),
             places: everywhere.places()?,
         })

@@ -30,8 +30,8 @@ pub(crate) struct Simulate {
     /// The sensors' own address, 0 to 127; they answer to 0 too
     #[arg(long, default_value_t = 0, value_name = "NUMBER")]
     address: u8,
-    /// What the sensors see: room, bare, fig8, standing, approach, door, corridor, glass, sun, chair, strips, crowd,
-    /// demo, empty, wall640 or random; or a TOML file, see docs/worlds.md
+    /// What the sensors see: room, bare, fig8, standing, approach, door, corridor, glass, faint, sun, chair, strips,
+    /// crowd, demo, empty, wall640 or random; or a TOML file, see docs/worlds.md
     #[arg(long, default_value = "room", value_name = "NAME|FILE", conflicts_with = "replay")]
     world: String,
     /// A recording to send instead: MCAP file, telegram stream or CARMEN log, plain or gzipped

@@ -44,6 +44,9 @@ pub(crate) struct Sensor {
     pub(crate) first_ns: u64,
     pub(crate) last_ns: u64,
     eeprom_writes: u64,
+    /// What the line took away, as the hub says, since its start.
+    pub(crate) damaged: Option<f64>,
+    pub(crate) lost_on_line: Option<u64>,
 }
 
 /// A moment in the hub's life: when, and how much processor time it had used.
@@ -67,6 +70,8 @@ struct Summary<'a> {
     nearest_mm: Option<u64>,
     hub_cpu_percent: f64,
     eeprom_writes: u64,
+    damaged: Option<f64>,
+    lost_on_line: Option<u64>,
 }
 
 impl Account {
@@ -91,6 +96,10 @@ impl Account {
             Some("scan") => sensor.take_scan(line),
             Some("status") => {
                 sensor.state = line["state"].as_str().unwrap_or_default().to_owned();
+                let count = |name: &str| line["counters"][name].as_u64().unwrap_or_default();
+                let (damaged, read) = (count("bytes_damaged"), count("bytes_read"));
+                sensor.damaged = (read > 0).then(|| damaged as f64 / read as f64);
+                sensor.lost_on_line = line["lost_on_line"].as_u64();
                 sensor.baud = line["baud"].as_u64().unwrap_or_default();
             }
             _ => {}
@@ -169,17 +178,20 @@ impl Account {
                 nearest_mm: sensor.nearest_mm,
                 hub_cpu_percent: self.hub_cpu_percent,
                 eeprom_writes: sensor.eeprom_writes,
+                damaged: sensor.damaged,
+                lost_on_line: sensor.lost_on_line,
             };
             let line = if json {
                 serde_json::to_string(&summary).unwrap_or_default()
             } else {
                 format!(
-                    "{:6} {}: {sent} telegrams sent, {} received, {lost} lost in {:.1} s, {:.2} Hz, nearest {}, hub \
-                     {:.1} % of a processor, {} EEPROM writes",
+                    "{:6} {}: {sent} telegrams sent, {} received, {lost} lost in {:.1} s, {} on the line, {:.2} Hz, nearest \
+                     {}, hub {:.1} % of a processor, {} EEPROM writes",
                     summary.sensor,
                     summary.state,
                     summary.received,
                     summary.seconds,
+                    sensor.lost_on_line.map_or("unknown".into(), |lost| lost.to_string()),
                     summary.hz,
                     sensor.nearest_mm.map_or("nothing".into(), |mm| format!("{mm} mm")),
                     summary.hub_cpu_percent,

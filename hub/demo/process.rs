@@ -8,7 +8,7 @@ use std::thread;
 use std::time::{Duration, Instant};
 
 use rustix::process::{Pid, Signal, kill_process};
-use schema::{Failure, Kind};
+use schema::{Domain, Failure, Kind};
 
 /// What a child does, with its number.
 #[derive(Debug)]
@@ -30,7 +30,7 @@ impl Child {
     /// errors to `errors`.
     pub(crate) fn start(
         arguments: &[String],
-        domain: &str,
+        domain: &Domain,
         listener: Option<(usize, Sender<Line>)>,
         errors: Stdio,
     ) -> Result<Child, Failure> {
@@ -40,7 +40,8 @@ impl Child {
         let program = std::env::current_exe().map_err(failed)?;
         let mut process = Command::new(program)
             .args(arguments)
-            .args(["--domain", domain])
+            .args(["--domain", domain.name(), "--root"])
+            .arg(domain.root().parent().unwrap_or(domain.root()))
             .env("SCANHUB_LOG", std::env::var("SCANHUB_LOG").unwrap_or("error".into()))
             .env(crate::END_WITH_PARENT, "1")
             // Ctrl-C is for the demonstration; it ends its children itself, in their order.

@@ -26,7 +26,11 @@ impl Stage {
     /// `quiet`: what the processes have to say of errors is kept until [`tell_errors`](Self::tell_errors).
     pub(super) fn new(quiet: bool) -> Result<Stage, Failure> {
         let name = format!("demo-{}", std::process::id());
-        let domain = Domain::of_hub(&name, None, &Environment::of_process())?;
+        let environment = Environment::of_process();
+        // Where the user's own place is too long a name for a domain, that of who has none is not.
+        let fallback = Environment { uid: environment.uid, ..Environment::default() };
+        let domain =
+            Domain::of_hub(&name, None, &environment).or_else(|_| Domain::of_hub(&name, None, &fallback))?;
         let directory = std::env::temp_dir().join(format!("scanhub-{name}"));
         std::fs::create_dir_all(&directory).map_err(|error| {
             let message = format!("cannot make {}: {error}", directory.display());
@@ -74,8 +78,13 @@ impl Stage {
         let links: Vec<_> = SENSORS.iter().flat_map(|sensor| ["--link".into(), self.link(sensor)]).collect();
         let poses = POSES.map(|pose| format!("--set=link.{pose}"));
         let hub = Child::start(
-            &[&["run".into(), "--json".into(), "--no-system-config".into()], &links[..], &poses[..]].concat(),
-            self.domain.name(),
+            &[
+                &["run".into(), "--json".into(), "--no-system-config".into(), FORGETS.into()],
+                &links[..],
+                &poses[..],
+            ]
+            .concat(),
+            &self.domain,
             None,
             self.errors(),
         )?;
@@ -90,7 +99,7 @@ impl Stage {
         let start = |(of, sensor): (usize, &&str)| {
             let topics = ["telegram", "scan", "status"].map(|topic| format!("{sensor}/{topic}"));
             let arguments = [&["echo".into(), "--json".into()], &topics[..]].concat();
-            Child::start(&arguments, self.domain.name(), Some((of, lines.clone())), self.errors())
+            Child::start(&arguments, &self.domain, Some((of, lines.clone())), self.errors())
         };
         SENSORS.iter().enumerate().map(start).collect()
     }
@@ -101,7 +110,7 @@ impl Stage {
         let rest = ["--truth".into(), truth, "--seed".into(), seed.to_string(), "--json".into()];
         let world = ["--world".into(), "demo".into()];
         let arguments = [&["simulate".into()], &world[..], &ports[..], &rest[..]].concat();
-        Child::start(&arguments, self.domain.name(), None, self.errors())?.await_ready(SIMULATOR, lines)
+        Child::start(&arguments, &self.domain, None, self.errors())?.await_ready(SIMULATOR, lines)
     }
 }
 
@@ -119,5 +128,7 @@ impl Drop for Stage {
     }
 }
 
+/// What a demonstration learns is gone with it.
+const FORGETS: &str = "--set=background.keep=false";
 /// Where the sensors sit, as the world has them (`tests/worlds/demo.toml`).
 const POSES: [&str; 3] = ["front.pose.x=0.3", "rear.pose.x=-0.3", "rear.pose.yaw=3.14159"];

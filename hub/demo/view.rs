@@ -58,13 +58,14 @@ fn sensor_lines(sensor: &Sensor) -> [String; 3] {
     };
     [
         format!(
-            "{:6} {:9} {:6} Bd  {:5.2} Hz   {} telegrams   {} lost",
+            "{:6} {:9} {:6} Bd  {:5.2} Hz   {} telegrams   {} lost, {} on the line",
             sensor.name,
             sensor.state,
             sensor.baud,
             sensor.hz(),
             sensor.received_count,
             lost,
+            sensor.lost_on_line.unwrap_or_default(),
         ),
         format!("  left  {}  right", profile(sensor)),
         format!("        {:<COLUMNS$}", format!("(the taller, the nearer)   {nearest}")),

@@ -122,10 +122,27 @@ impl Request {
     }
 }
 
-/// An answer: done, with the model that was asked for, or why not. Its bytes are exit code and message length, two bytes
-/// each and the lower one first, then the message, whose second line is a remedy, then the packed model.
+/// A model that was asked for.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub struct Response(pub Result<Option<Background>, Failure>);
+pub struct Shown {
+    /// As it is now.
+    pub model: Background,
+    /// When the one was written that the next hub would begin with, in nanoseconds since 1970; nothing if there is none.
+    pub kept_wall_ns: Option<u64>,
+}
+
+impl From<Background> for Shown {
+    /// One that is not kept.
+    fn from(model: Background) -> Shown {
+        Shown { model, kept_wall_ns: None }
+    }
+}
+
+/// An answer: done, with the model that was asked for, or why not. Its bytes are exit code and message length, two bytes
+/// each and the lower one first, then the message, then the packed model. The second line of a message that says why not is a
+/// remedy; that of a model is the time in decimal digits at which one was kept.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Response(pub Result<Option<Shown>, Failure>);
 
 impl Response {
     /// The longest response in bytes; a message beyond it is cut.
@@ -134,13 +151,17 @@ impl Response {
     /// The response as bytes.
     pub fn encode(&self) -> Vec<u8> {
         let (code, said) = match &self.0 {
-            Ok(_) => (0, String::new()),
+            Ok(shown) => {
+                let kept = shown.as_ref().and_then(|shown| shown.kept_wall_ns);
+                (0, kept.map(|wall_ns| wall_ns.to_string()).unwrap_or_default())
+            }
             Err(failure) => (failure.kind.exit_code(), format!("{}\n{}", failure.message, failure.hint)),
         };
         let mut message = vec![0; said.trim_end().len().min(Response::MAX - HEAD)];
         text::write(&mut message, said.trim_end());
         let head = [u16::from(code), message.len() as u16].map(u16::to_le_bytes);
-        let model = self.0.as_ref().ok().and_then(Option::as_ref).map_or(&[][..], Background::packed);
+        let model = self.0.as_ref().ok().and_then(Option::as_ref);
+        let model = model.map_or(&[][..], |shown| shown.model.packed());
         [head.as_flattened(), &message, model].concat()
     }
 
@@ -150,10 +171,10 @@ impl Response {
         let (message, model) = rest.split_at_checked(usize::from(u16::from_le_bytes([low, high])))?;
         let (message, code) = (text::read(message), u16::from_le_bytes([code_low, code_high]));
         if code == 0 {
-            let model = (!model.is_empty()).then(|| Background::unpack(model));
+            let kept_wall_ns = message.parse().ok();
             return Some(Response(Ok(match model {
-                Some(model) => Some(model?),
-                None => None,
+                [] => None,
+                model => Some(Shown { model: Background::unpack(model)?, kept_wall_ns }),
             })));
         }
         let kind = ANSWERS.into_iter().find(|kind| u16::from(kind.exit_code()) == code);
@@ -188,9 +209,11 @@ mod tests {
     #[test]
     fn responses_go_there_and_back() {
         let failure = |kind, hint: &str| Response(Err(Failure::new(kind, "front: no", hint)));
+        let model = Background { count: 361, generation: 7, ..Background::default() };
         for response in [
             Response(Ok(None)),
-            Response(Ok(Some(Background { count: 361, generation: 7, ..Background::default() }))),
+            Response(Ok(Some(model.into()))),
+            Response(Ok(Some(Shown { model, kept_wall_ns: Some(u64::MAX) }))),
             failure(Kind::Failed, ""),
             failure(Kind::Short, "later"),
             failure(Kind::NoTopic, "a, b"),

@@ -7,6 +7,8 @@ mod lives;
 mod numbers;
 mod payload;
 mod refusal;
+mod standing;
+mod voices;
 
 use crc::{CRC_32_ISCSI, Crc, Table};
 
@@ -16,6 +18,7 @@ pub use lives::LIVES;
 pub use numbers::{Fresh, Row, WINDOW};
 pub use payload::{Packed, telegram};
 pub use refusal::Refusal;
+pub use standing::{Arrival, Standing};
 
 use crate::{Telegram, Topic};
 

@@ -154,7 +154,7 @@ fn check_name(name: &str) -> Result<(), Failure> {
 
 /// The first of a colon-separated list (systemd lists several runtime directories so), if it is absolute.
 #[cfg(any(feature = "ipc", test))]
-fn first_path(value: std::ffi::OsString) -> Option<PathBuf> {
+pub(crate) fn first_path(value: std::ffi::OsString) -> Option<PathBuf> {
     let text = value.into_string().ok()?;
     let first = PathBuf::from(text.split(':').next()?);
     first.is_absolute().then_some(first)

@@ -127,6 +127,17 @@ impl Flags {
     pub const STAMP_ESTIMATED: u16 = 8;
     /// The sample came from another machine.
     pub const REMOTE: u16 = 32;
+
+    /// The names of the bits that are set, as in all output.
+    pub fn names(flags: u16) -> impl Iterator<Item = &'static str> {
+        let named = [
+            (Flags::SIMULATED, "simulated"),
+            (Flags::REPLAYED, "replayed"),
+            (Flags::STAMP_ESTIMATED, "stamp_estimated"),
+            (Flags::REMOTE, "remote"),
+        ];
+        named.into_iter().filter(move |(bit, _)| flags & bit != 0).map(|(_, name)| name)
+    }
 }
 
 #[cfg(test)]

@@ -189,18 +189,30 @@ payload!(Status, Topic::Status, |builder| builder);
 
 /// The sensors that have topics in `domain`, sorted. Those of a dead hub stay as long as a consumer keeps them.
 pub fn sensors(domain: &Domain) -> Result<Vec<String>, Failure> {
-    let mut sensors = Vec::new();
-    let Some(config) = config(domain.root())? else { return Ok(sensors) };
+    let mut sensors: Vec<String> = topics(domain)?.into_iter().map(|(sensor, _)| sensor).collect();
+    sensors.dedup();
+    Ok(sensors)
+}
+
+/// The sensors that have zones in `domain`, sorted, as [`sensors`]: those that a robot's verdict is made of.
+pub fn sensors_with_zones(domain: &Domain) -> Result<Vec<String>, Failure> {
+    let with_zones = topics(domain)?.into_iter().filter(|(_, topic)| *topic == Topic::Zones);
+    Ok(with_zones.map(|(sensor, _)| sensor).collect())
+}
+
+/// All topics with their sensors, sorted by these.
+fn topics(domain: &Domain) -> Result<Vec<(String, Topic)>, Failure> {
+    let mut topics = Vec::new();
+    let Some(config) = config(domain.root())? else { return Ok(topics) };
     let listed = Service::list(&config, |service| {
-        if let Some((sensor, Some(_))) = of_service(service.static_details.name().as_str()) {
-            sensors.push(sensor.to_owned());
+        if let Some((sensor, Some(topic))) = of_service(service.static_details.name().as_str()) {
+            topics.push((sensor.to_owned(), topic));
         }
         CallbackProgression::Continue
     });
     listed.map_err(|error| access::failure(domain.root(), format!("cannot list topics: {error:?}")))?;
-    sensors.sort();
-    sensors.dedup();
-    Ok(sensors)
+    topics.sort_by(|(one, _), (other, _)| one.cmp(other));
+    Ok(topics)
 }
 
 /// The payload's revision that the maker of a service wrote into its `attributes`; 0 if it wrote none.

@@ -1,6 +1,7 @@
 //! The words everyone speaks: what the hub publishes, and the names under which it does. Knows nobody: no serial line,
 //! no configuration, no verb. Without feature `ipc` it is plain bytes and names, enough for a receiver on the LAN.
 
+mod age;
 mod background;
 mod control;
 pub mod datagram;
@@ -31,20 +32,25 @@ pub mod limits;
 mod lock;
 #[cfg(feature = "ipc")]
 mod prefix;
+#[cfg(feature = "files")]
+pub mod regular;
 #[cfg(feature = "json")]
 mod saved;
 #[cfg(feature = "ipc")]
 pub mod shortage;
+#[cfg(feature = "ipc")]
+mod state;
 
+pub use age::Age;
 pub use background::Background;
-pub use control::{Request, Response, Verb};
+pub use control::{Request, Response, Shown, Verb};
 pub use domain::{DEFAULT_DOMAIN, Domain, Environment};
 pub use failure::{Failure, Kind};
 pub use foreground::{Foreground, SEGMENTS, Segment};
 pub use header::{Flags, Header, Quality, Reasons};
 pub use marks::{MARKS, Mark, Marks};
 pub use pose::Pose;
-pub use printable::Printable;
+pub use printable::{Printable, escape_json, json_line};
 pub use scan::{BEAMS, CONTENTS_UPPER, Code, Scan, TURN_NS};
 pub use status::{COUNTERS, Counter, Counters, State, Status};
 pub use telegram::Telegram;
@@ -60,3 +66,5 @@ pub use directory::Directory;
 pub use lock::{HubLock, ListenLock, holder, publisher};
 #[cfg(feature = "json")]
 pub use saved::{SavedModel, as_json};
+#[cfg(feature = "ipc")]
+pub use state::StateDirectory;

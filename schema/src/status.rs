@@ -75,6 +75,32 @@ impl Status {
         is_wanted.then(|| format!("scanhub configure {} mode=0x01", self.port()))
     }
 
+    /// Share of the line's bytes that were in nothing over the last 10 s, 0 to 1: those of a stream, without scans that the
+    /// sensor broke off to answer.
+    pub fn damaged(&self) -> f64 {
+        self.counters[Counter::DamagedPpm] as f64 / 1e6
+    }
+
+    /// Scans that must have been sent, by the sensor's period, and did not arrive; nothing where that cannot be known.
+    pub fn lost_on_line(&self) -> Option<u64> {
+        (self.counters[Counter::DueOnLine] > 0).then_some(self.counters[Counter::LostOnLine])
+    }
+
+    /// Their share of the scans that were due in the last 10 s, 0 to 1.
+    pub fn lost_share(&self) -> Option<f64> {
+        self.lost_on_line().map(|_| self.counters[Counter::LostPpm] as f64 / 1e6)
+    }
+
+    /// What the line takes away, in words such as `41 % lost on the line`, if that is more than a thousandth in the last
+    /// 10 s.
+    pub fn line_loss(&self) -> Option<String> {
+        let lost = self.lost_share().filter(|&share| share > WELL);
+        let damaged = Some(self.damaged()).filter(|&share| share > WELL);
+        let (share, word) = lost.map(|share| (share, "lost")).or(damaged.map(|share| (share, "damaged")))?;
+        let (percent, digits) = (100.0 * share, usize::from(share < 0.0995));
+        Some(format!("{percent:.digits$} % {word} on the line"))
+    }
+
     /// Whether the sensor is a recording, of which nothing can be asked.
     pub fn is_replayed(&self) -> bool {
         self.port().starts_with("file:")
@@ -110,6 +136,9 @@ impl Status {
         text::write(&mut self.last_error_text, value);
     }
 }
+
+/// A line that takes away more than this share has something that is to be looked for.
+const WELL: f64 = 0.001;
 
 /// What the link is doing.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -157,7 +186,7 @@ impl State {
     }
 }
 
-/// The counters of a link. All grow only, except `bytes_buffered`.
+/// The counters of a link. All grow only, except the gauges: `bytes_buffered`, `damaged_ppm` and `lost_ppm`.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Pod, Zeroable)]
 #[cfg_attr(feature = "ipc", derive(ZeroCopySend), type_name("scanhub.Counters.v1"))]
 #[repr(C)]
@@ -226,6 +255,11 @@ counters! {
     RejectedVetoed "rejected_vetoed" "Candidates rejected: a right telegram began inside them.",
     RejectedSuperseded "rejected_superseded" "Candidates rejected: another one was complete first.",
     LineErrors "line_errors" "Framing, parity and overrun errors and breaks that the line's driver counted.",
+    BytesDamaged "bytes_damaged" "Of the discarded bytes those that the line damaged while scans came.",
+    DamagedPpm "damaged_ppm" "Their share of the bytes of the last 10 s, in millionths: a gauge.",
+    DueOnLine "due_on_line" "Scans that the sensor must have sent, by its period; 0 while that is not known.",
+    LostOnLine "lost_on_line" "Those of them that did not arrive.",
+    LostPpm "lost_ppm" "Their share of those that were due in the last 10 s, in millionths: a gauge.",
 }
 
 #[cfg(test)]
@@ -255,6 +289,23 @@ mod tests {
         status.mode = 0;
         assert_eq!((status.has_reflector_bits(), status.reflector_remedy()), (Some(false), None));
         assert_eq!(Status::default().has_reflector_bits(), None);
+    }
+
+    #[test]
+    fn what_the_line_takes_away_is_told_in_words() {
+        let mut status = Status::default();
+        assert_eq!((status.damaged(), status.lost_on_line(), status.line_loss()), (0.0, None, None));
+        status.counters[Counter::DamagedPpm] = 430_000;
+        assert_eq!(status.line_loss().as_deref(), Some("43 % damaged on the line"));
+        status.counters[Counter::DueOnLine] = 1000;
+        status.counters[Counter::LostOnLine] = 7;
+        status.counters[Counter::LostPpm] = 7_000;
+        assert_eq!((status.lost_on_line(), status.lost_share()), (Some(7), Some(0.007)));
+        assert_eq!(status.line_loss().as_deref(), Some("0.7 % lost on the line"));
+        (status.counters[Counter::LostPpm], status.counters[Counter::DamagedPpm]) = (1_000, 1_000);
+        assert_eq!(status.line_loss(), None, "that much is well");
+        status.counters[Counter::LostPpm] = 408_000;
+        assert_eq!(status.line_loss().as_deref(), Some("41 % lost on the line"));
     }
 
     #[test]

@@ -59,6 +59,8 @@ struct Model {
     rows: BTreeMap<Key, Numbers>,
     /// The greatest epoch of each hub.
     living: BTreeMap<u64, u32>,
+    /// When they were heard last, and when the first and the last sample came, in ms.
+    heard: BTreeMap<u64, (u64, Option<(u64, u64)>)>,
     /// The others, in the order in which they were retired.
     retired: Vec<(u64, u32)>,
     given_up: GivenUp,
@@ -66,16 +68,17 @@ struct Model {
 }
 
 impl Model {
-    fn receive(&mut self, sent: &Sent) -> Result<Fresh, Refusal> {
-        let result = self.take(sent);
+    fn receive(&mut self, sent: &Sent, now_ms: u64) -> Result<Fresh, Refusal> {
+        let result = self.take(sent, now_ms);
         if let Err(refusal) = result {
             *self.refused.entry(refusal.name()).or_default() += 1;
         }
         result
     }
 
-    fn take(&mut self, sent: &Sent) -> Result<Fresh, Refusal> {
-        let (hub, epoch, sensor, _) = sent.key;
+    fn take(&mut self, sent: &Sent, now_ms: u64) -> Result<Fresh, Refusal> {
+        let (hub, epoch, sensor, topic) = sent.key;
+        let delivers = topic != Announce::NUMBER;
         let before = self.living.get(&hub).copied();
         if before.is_some_and(|greatest| greatest > epoch) {
             return Err(Refusal::Epoch);
@@ -88,17 +91,25 @@ impl Model {
         let lives = self.living.len() + self.retired.len();
         let is_full = self.rows.len() == ROWS || is_new && lives == LIVES;
         let has_retired = !self.retired.is_empty() || before.is_some_and(|older| older < epoch);
-        if !self.rows.contains_key(&sent.key) && is_full && !has_retired {
+        let can_give_up = has_retired || self.least(hub, delivers, now_ms).is_some();
+        if !self.rows.contains_key(&sent.key) && is_full && !can_give_up {
             return Err(Refusal::Capacity);
         }
         if is_new {
             self.retired.extend(before.map(|older| (hub, older)));
+            self.living.remove(&hub);
+            self.heard.remove(&hub);
             if lives == LIVES {
-                self.give_up();
+                self.give_up(hub, delivers, now_ms);
             }
             self.living.insert(hub, epoch);
         }
-        assert!(self.has_room(sent.key));
+        let (heard, delivered) = self.heard.entry(hub).or_default();
+        *heard = now_ms;
+        if delivers {
+            *delivered = Some((delivered.map_or(now_ms, |(first, _)| first), now_ms));
+        }
+        assert!(self.has_room(sent.key, delivers, now_ms));
         let row = self.rows.entry(sent.key).or_default();
         let fresh = match highest {
             _ if row.came.contains(&sent.number) => Fresh::Duplicate,
@@ -111,23 +122,48 @@ impl Model {
         row.expect(sent.number, sent.number + 1);
         for &(topic, next) in &sent.next {
             let key = (hub, epoch, sensor, topic);
-            if self.has_room(key) {
+            if self.has_room(key, delivers, now_ms) {
                 self.rows.entry(key).or_default().expect(next, next);
             }
         }
         Ok(fresh)
     }
 
-    /// There is a row, or there can be one, after what is retired was given up if need be.
-    fn has_room(&mut self, key: Key) -> bool {
-        if !self.rows.contains_key(&key) && self.rows.len() == ROWS && !self.retired.is_empty() {
-            self.give_up();
+    /// There is a row, or there can be one, after another life was given up if need be.
+    fn has_room(&mut self, key: Key, delivers: bool, now_ms: u64) -> bool {
+        if !self.rows.contains_key(&key) && self.rows.len() == ROWS {
+            self.give_up(key.0, delivers, now_ms);
         }
         self.rows.contains_key(&key) || self.rows.len() < ROWS
     }
 
-    fn give_up(&mut self) {
-        let life = self.retired.remove(0);
+    /// The gateway that makes room for a datagram of `hub`, if nothing is retired.
+    fn least(&self, hub: u64, delivers: bool, now_ms: u64) -> Option<u64> {
+        let mut least: Option<(u64, u64)> = None;
+        for (&other, &(heard, delivered)) in &self.heard {
+            let (mut kept_until, mut is_proven, mut is_busy) = (heard, false, false);
+            if let Some((first, last)) = delivered {
+                is_proven = last >= first + 1_000;
+                is_busy = now_ms < last + 3_000;
+                kept_until = last + if is_proven { 60_000 } else { 3_000 };
+            }
+            let may_go = other != hub && if delivers { !is_busy || !is_proven } else { !is_busy };
+            if may_go && least.is_none_or(|(until, _)| kept_until < until) {
+                least = Some((kept_until, other));
+            }
+        }
+        least.map(|(_, other)| other)
+    }
+
+    fn give_up(&mut self, hub: u64, delivers: bool, now_ms: u64) {
+        let life = if self.retired.is_empty() {
+            let Some(other) = self.least(hub, delivers, now_ms) else { return };
+            self.heard.remove(&other);
+            self.given_up.displaced += 1;
+            (other, self.living.remove(&other).unwrap())
+        } else {
+            self.retired.remove(0)
+        };
         let sum = &mut self.given_up;
         sum.lives += 1;
         self.rows.retain(|&(hub, epoch, ..), row| {
@@ -187,6 +223,8 @@ struct World {
     count: u64,
     /// One datagram of a stranger to so many of the gateways.
     strangers: u8,
+    /// So many strangers.
+    crowd: u64,
 }
 
 impl World {
@@ -203,8 +241,8 @@ impl World {
                 gateways.push((hub, 1, sensor, (0..4).map(|_| (1 << 33) + start(&mut random)).collect()));
             }
         }
-        let strangers = [60, 5][random.usize(..2)];
-        World { random, now: 0, gateways, underway: BTreeMap::new(), count: 0, strangers }
+        let (strangers, crowd) = ([60, 5][random.usize(..2)], [30, 70][random.usize(..2)]);
+        World { random, now: 0, gateways, underway: BTreeMap::new(), count: 0, strangers, crowd }
     }
 
     /// One datagram goes out, and all that arrive meanwhile come back.
@@ -230,7 +268,9 @@ impl World {
         }
         // A stranger.
         if self.random.u8(..self.strangers) == 0 {
-            let key = (self.random.u64(100..170), self.random.u32(1..3), self.random.u8(..), 4);
+            let topic = [Announce::NUMBER, 4, 4, 4][self.random.usize(..4)];
+            let hub = 100 + self.random.u64(..self.crowd);
+            let key = (hub, self.random.u32(1..3), self.random.u8(..), topic);
             self.carry(Sent::new(key, 1 << 33, Vec::new()));
         }
         let later = self.underway.split_off(&(self.now, 0));
@@ -250,16 +290,21 @@ impl World {
 
 #[test]
 fn it_says_what_a_model_says_that_keeps_everything() {
-    let (mut refused, mut full, mut given_up) = (BTreeMap::new(), 0, 0);
-    for seed in 0..10 {
+    let (mut refused, mut full, mut given_up, mut displaced) = (BTreeMap::new(), 0, 0, 0);
+    for seed in 0..20 {
         let mut world = World::new(seed);
         let (mut account, mut model) = (Account::new(&Topic::ALL), Model::default());
+        // All that deliver are busy, or hardly any is.
+        let (mut ticks, tick_ms) = (0, [1, 40][seed as usize % 2]);
         for step in 0..16_000 {
             for sent in world.step() {
-                let fresh = account.receive(&sent.bytes).map(|(_, fresh)| fresh);
+                // One clock tick each: who was not heard for longest is never two.
+                ticks += 1;
+                let now_ms = ticks * tick_ms;
+                let fresh = account.receive(&sent.bytes, 1, now_ms * 1_000_000).map(|(_, fresh)| fresh);
                 assert_eq!(
                     fresh,
-                    model.receive(&sent),
+                    model.receive(&sent, now_ms),
                     "seed {seed}, step {step}, {:?}",
                     (sent.key, sent.number)
                 );
@@ -270,6 +315,7 @@ fn it_says_what_a_model_says_that_keeps_everything() {
         }
         full += u32::from(model.rows.len() == ROWS);
         given_up += model.given_up.lives;
+        displaced += model.given_up.displaced;
         assert_eq!((figures(&account), account.given_up()), (model.figures(), model.given_up), "seed {seed}");
         for refusal in Refusal::ALL {
             let count = model.refused.get(refusal.name()).copied().unwrap_or_default();
@@ -279,6 +325,7 @@ fn it_says_what_a_model_says_that_keeps_everything() {
     }
     // The network did what it was made for.
     assert!(full > 0 && given_up > 100, "{full} full, {given_up} lives given up");
+    assert!(displaced > 100 && given_up > displaced, "{displaced} of them not over");
     for refusal in [Refusal::Epoch, Refusal::Stale, Refusal::Capacity] {
         assert!(refused[refusal.name()] > 0, "nothing was ever {}", refusal.name());
     }
@@ -311,13 +358,13 @@ fn it_is_the_log_of_a_relay() {
         arrivals.sort_by_key(|&(at, _)| at);
         let mut account = Account::new(&Topic::ALL);
         let (mut highest, mut below, mut came) = (0, 0, BTreeSet::new());
-        account.receive(&announce(0, first).bytes).unwrap();
+        account.receive(&announce(0, first).bytes, 1, 0).unwrap();
         for (_, sent) in &arrivals {
-            account.receive(&sent.bytes).unwrap();
+            account.receive(&sent.bytes, 1, 0).unwrap();
             below += u64::from(came.insert(sent.number) && sent.number < highest);
             highest = highest.max(sent.number);
         }
-        account.receive(&announce(1, first + SENT).bytes).unwrap();
+        account.receive(&announce(1, first + SENT).bytes, 1, 0).unwrap();
         let expected = [SENT - dropped, dropped, doubled, below];
         assert_eq!(figures(&account)[&(1, 1, 0, topic)], expected, "seed {seed}");
         assert!(dropped > 100 && doubled > 30 && below > 100);

@@ -82,6 +82,7 @@ fn refusals_are_these_bytes() {
         ("length", with(&zones, |bytes| bytes.push(0))),
         ("unauthenticated", zones.clone()),
         ("epoch", numbered(Head { sequence: 5001, epoch: values::ZONES.epoch - 1, ..values::ZONES })),
+        ("twin", numbered(Head { sequence: 5001, ..values::ZONES })),
         ("stale", numbered(Head { sequence: 5000 - 1024, ..values::ZONES })),
         ("capacity", numbered(Head { hub: 0xFEDC_BA98_7654_3210, ..values::ZONES })),
         ("skipped", numbered(Head { topic: 8, ..values::ZONES })),
@@ -105,13 +106,17 @@ fn these_bytes_are_values_or_refused() {
         }
         let mut account = Account::new(&Topic::ALL);
         for before in says["after"].as_array().into_iter().flatten() {
-            account.receive(&vector(before.as_str().unwrap().trim_end_matches(".hex"))).unwrap();
+            account.receive(&vector(before.as_str().unwrap().trim_end_matches(".hex")), 1, 0).unwrap();
         }
-        for hub in 0..says["after_hubs"].as_u64().unwrap_or_default() {
-            let bytes = sealed(Head { hub, ..values::ZONES }, &vector("zones")[HEAD..]);
-            account.receive(&bytes).unwrap();
+        // For a second, so that they are known to deliver.
+        for (sequence, now_ns) in [(5000, 0), (5001, 1_000_000_000)] {
+            for hub in 0..says["after_hubs"].as_u64().unwrap_or_default() {
+                let bytes = sealed(Head { hub, sequence, ..values::ZONES }, &vector("zones")[HEAD..]);
+                account.receive(&bytes, 1, now_ns).unwrap();
+            }
         }
-        let result = account.receive(&bytes);
+        let from = if says["from_another"] == true { 2 } else { 1 };
+        let result = account.receive(&bytes, from, 1_000_000_000);
         let Some(refusal) = says["refusal"].as_str() else {
             let (datagram, fresh) = result.unwrap_or_else(|refusal| panic!("{file}: {refusal:?}"));
             assert_eq!(fresh, Fresh::New, "{file}");

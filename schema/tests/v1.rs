@@ -324,7 +324,8 @@ fn counters_in_order() {
         names.join(" "),
         "bytes_read bytes_in_telegrams bytes_acknowledge bytes_discarded bytes_buffered telegrams suspect aborted \
          resyncs reconnects lost_in_restart wakeups loan_failed rejected_address rejected_length rejected_command \
-         rejected_count rejected_crc rejected_vetoed rejected_superseded line_errors"
+         rejected_count rejected_crc rejected_vetoed rejected_superseded line_errors bytes_damaged damaged_ppm \
+         due_on_line lost_on_line lost_ppm"
     );
     let names: Vec<_> = State::ALL.iter().map(|state| state.name()).collect();
     assert_eq!(names.join(" "), "absent probing switching starting streaming silent paused");
@@ -361,7 +362,9 @@ fn response_bytes() {
     assert_eq!(Response(Ok(None)).encode(), [0, 0, 0, 0]);
     let model = Background { count: 1, taught: 1, unit_mm: 1, ..Background::default() };
     let shown = [0, 0, 0, 0, 0, 0, 0, 0, 1, 0, 1, 0, 1, 0, 0, 0, 0, 0];
-    assert_eq!(Response(Ok(Some(model))).encode(), shown);
+    assert_eq!(Response(Ok(Some(model.into()))).encode(), shown);
+    let kept = Response(Ok(Some(schema::Shown { model, kept_wall_ns: Some(17) })));
+    assert_eq!(kept.encode(), [&[0, 0, 2, 0, b'1', b'7'], &shown[4..]].concat());
     let refused = Response(Err(Failure::new(Kind::Short, "busy", "wait")));
     assert_eq!(refused.encode(), b"\x4b\0\x09\0busy\nwait");
 }

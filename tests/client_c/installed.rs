@@ -1,5 +1,6 @@
 //! The library installed as its users have it, and programs built against it as they build theirs. Refuses to know what
 //! the programs do.
+#![allow(dead_code)] // Every test takes what it needs.
 
 use std::ffi::OsStr;
 use std::path::{Path, PathBuf};
@@ -59,8 +60,13 @@ impl Installed {
 
     /// The program of `source` in C++; nothing where there is no compiler for it.
     pub(crate) fn compile_cpp(&self, stage: &Stage, source: &Path) -> Option<PathBuf> {
-        let built = || self.build("c++", stage, source, &["-std=c++11"], &self.shared());
-        is_there("c++").then(|| built().unwrap_or_else(|said| panic!("{said}")))
+        let built = self.try_compile_cpp(stage, source)?;
+        Some(built.unwrap_or_else(|said| panic!("{said}")))
+    }
+
+    /// As [`compile_cpp`](Self::compile_cpp); what the compiler says if it does not.
+    pub(crate) fn try_compile_cpp(&self, stage: &Stage, source: &Path) -> Option<Result<PathBuf, String>> {
+        is_there("c++").then(|| self.build("c++", stage, source, &["-std=c++11"], &self.shared()))
     }
 
     /// The program of `source` with the library in it; nothing where pkg-config does not say how.

@@ -45,6 +45,11 @@ static void names(const char *sensor)
     MUST(scanhub_open(&handle, NULL, "\xff", SCANHUB_TOPIC_SCAN, 0) == SCANHUB_REFUSED_ARGUMENT);
     MUST(scanhub_open(&handle, NULL, "Front", SCANHUB_TOPIC_SCAN, 0) == SCANHUB_REFUSED_CONFIGURATION);
     SAYS("\"Front\" is not possible\n  1 to 24 of a-z");
+    MUST(scanhub_open_robot(NULL, NULL, NULL, 0) == SCANHUB_REFUSED_ARGUMENT);
+    MUST(scanhub_open_robot(&handle, NULL, NULL, 3) == SCANHUB_REFUSED_ARGUMENT && handle == NULL);
+    SAYS("SCANHUB_WAIT_");
+    MUST(scanhub_open_robot(&handle, NULL, "front Front", 0) == SCANHUB_REFUSED_CONFIGURATION && handle == NULL);
+    SAYS("\"Front\" is not possible");
     MUST(scanhub_open(&handle, "no/domain", sensor, SCANHUB_TOPIC_SCAN, 0) == SCANHUB_REFUSED_CONFIGURATION);
     MUST(handle == NULL);
 }
@@ -180,6 +185,24 @@ static void samples(const char *sensor)
     MUST(scanhub_release(&copy) == SCANHUB_REFUSED_ARGUMENT);
 }
 
+/* What a robot's verdict points to lives until it is released. */
+static void robots(const char *sensor)
+{
+    struct scanhub_attachment *handle;
+    struct scanhub_sample lent[4], copy;
+    MUST(scanhub_open_robot(&handle, NULL, sensor, SCANHUB_WAIT_DOORBELL) == 0);
+    for (int i = 0; i < 4; i++)
+        MUST(scanhub_wait(handle, 20000) == 1 && scanhub_take(handle, &lent[i]) == 1);
+    for (int i = 0; i < 4; i++) {
+        const struct scanhub_robot *robot = lent[i].payload;
+        MUST(robot->count == 1 && strcmp(robot->sensors[0].name, sensor) == 0 && robot->worst == robot->sensors[0].name);
+        MUST(robot->verdict == robot->sensors[0].verdict && robot->nearest_mm == robot->sensors[0].nearest_mm);
+    }
+    copy = lent[2];
+    MUST(scanhub_release(&lent[2]) == 0 && scanhub_release(&copy) == SCANHUB_REFUSED_ARGUMENT);
+    MUST(scanhub_close(handle) == 0);
+}
+
 static volatile sig_atomic_t alarms;
 
 static void on_alarm(int signal)
@@ -215,6 +238,7 @@ int main(int argc, char **argv)
     children(sensor);
     polls(sensor);
     samples(sensor);
+    robots(sensor);
     signals();
     /* Left open, with a sample: the end of the process is an end, too. */
     struct scanhub_attachment *left = open_scans(sensor, SCANHUB_WAIT_EVENT);

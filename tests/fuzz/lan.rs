@@ -22,7 +22,9 @@ pub(crate) fn lan(data: &[u8]) {
         let bytes = if mode & 1 == 0 { Some(piece) } else { sealed(piece, &mut buffer) };
         let Some(bytes) = bytes else { continue };
         let before = figures(&account);
-        let result = account.receive(bytes);
+        // From one of two senders, half a second later.
+        let (from, now_ns) = (u64::from(mode >> 1 & 1), 500_000_000 * given);
+        let result = account.receive(bytes, from, now_ns);
         given += 1;
         match result {
             Ok((datagram, fresh)) => {
@@ -32,7 +34,7 @@ pub(crate) fn lan(data: &[u8]) {
                 can_be_said_again(&datagram);
                 is_seen_if_damaged(bytes, data);
                 assert_ne!(
-                    account.receive(bytes).map(|(_, again)| again),
+                    account.receive(bytes, from, now_ns).map(|(_, again)| again),
                     Ok(Fresh::New),
                     "{fresh:?} and new again"
                 );

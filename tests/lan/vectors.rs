@@ -12,7 +12,8 @@ pub(crate) struct Vector {
     /// The datagram.
     pub(crate) bytes: Vec<u8>,
     /// `head` and `payload`, or `refusal` and, where one is needed, how it comes to that: `with_key`, `after` (files
-    /// that were received before), `after_hubs` (so many other hubs were heard before).
+    /// that were received before), `after_hubs` (so many other hubs delivered for a second before),
+    /// `from_another` (another sender than that of what was received before).
     pub(crate) says: Value,
 }
 

@@ -65,7 +65,7 @@ impl Stage {
         let domain = format!("t{}-{}", std::process::id(), NEXT.fetch_add(1, Ordering::Relaxed));
         // Not TMPDIR: root and prefix of a domain have to be short.
         let directory = PathBuf::from(format!("/tmp/{domain}"));
-        let made = fs::DirBuilder::new().recursive(true).mode(0o700).create(&directory);
+        let made = fs::DirBuilder::new().recursive(true).mode(0o755).create(&directory);
         made.unwrap_or_else(|error| panic!("{}: {error}", directory.display()));
         Stage { directory, domain, network: None }
     }
@@ -118,6 +118,8 @@ impl Stage {
         command.args(["--domain", &self.domain, "--root"]).arg(root);
         // Should the whole test be killed, its children end too.
         command.env("SCANHUB_END_WITH_PARENT", "1").env("SCANHUB_LOG", "info").env_remove("SCANHUB_CONFIG");
+        // What is kept is kept here, not in the home of who runs the tests.
+        command.env("XDG_STATE_HOME", self.path("state")).env_remove("STATE_DIRECTORY");
         command
     }
 
@@ -161,9 +163,7 @@ impl Stage {
 
     /// As [`Stage::gateway`], however it begins.
     pub(crate) fn gateway_at<S: AsRef<str>>(&self, flags: &[S]) -> Program {
-        let mut command = self.command(&with(&["gateway", "--json", "--no-system-config"], flags));
-        command.env("XDG_STATE_HOME", self.path("state")).env_remove("STATE_DIRECTORY");
-        Program::start(command)
+        self.start(&with(&["gateway", "--json", "--no-system-config"], flags))
     }
 
     /// A simulator with a port of each of these names that is up; its truth is in the file `truth`.

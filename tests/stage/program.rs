@@ -81,6 +81,18 @@ impl Program {
         self.process.id()
     }
 
+    /// It has ended.
+    pub(crate) fn is_over(&self) -> bool {
+        let status = std::fs::read_to_string(format!("/proc/{}/stat", self.pid())).unwrap_or_default();
+        // What comes behind the name in brackets is its state, if it is there.
+        status.rsplit_once(')').is_none_or(|(_, rest)| rest.trim_start().starts_with(['Z', 'X']))
+    }
+
+    /// It ends without a word on stdout.
+    pub(crate) fn is_over_before_it_says(&mut self) -> bool {
+        self.receive(Instant::now() + PATIENCE) == Err(RecvTimeoutError::Disconnected)
+    }
+
     /// Its first line from now on that is `wanted`.
     pub(crate) fn await_line(&mut self, what: &str, wanted: impl Fn(&Value) -> bool) -> Value {
         let give_up_at = Instant::now() + PATIENCE;

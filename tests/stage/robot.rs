@@ -35,9 +35,11 @@ impl Robot {
         self.hub.take().expect("it was started")
     }
 
-    /// A gateway that has begun, on the only interface that can be meant.
+    /// A gateway that has begun, on the cable.
     pub(crate) fn gateway<S: AsRef<str>>(&self, flags: &[S]) -> Program {
-        let mut gateway = self.stage.gateway_at(flags);
+        let flags = flags.iter().map(|flag| flag.as_ref().to_owned());
+        let flags: Vec<String> = flags.chain(["--interface=eth0".to_owned()]).collect();
+        let mut gateway = self.stage.gateway_at(&flags);
         let begin = gateway.await_line("its begin", is_class("gateway"));
         assert_eq!(begin["interface"], "eth0");
         gateway

@@ -29,15 +29,25 @@ pub extern "C" fn scanhub_open(
         let sensor = text(sensor)?.ok_or(Refusal::Argument("no sensor is named", "for example \"front\""))?;
         let topic = u8::try_from(topic).ok().and_then(Topic::of_number);
         let topic = topic.ok_or(Refusal::Argument("there is no such topic", "one of SCANHUB_TOPIC_.."))?;
-        let wait = match wait {
-            0 => Wait::Doorbell,
-            1 => Wait::Event,
-            2 => Wait::Spin,
-            _ => {
-                return Err(Refusal::Argument("there is no such way to wait", "one of SCANHUB_WAIT_.."));
-            }
-        };
-        let opened = Handle::open(places(text(domain)?)?, sensor, topic, wait)?;
+        let opened = Handle::open(places(text(domain)?)?, sensor, topic, way(wait)?)?;
+        handle.write(table::insert(opened)?);
+        Ok(0)
+    })
+}
+
+/// Begins to follow the verdict of a robot; answers 0.
+#[unsafe(no_mangle)]
+pub extern "C" fn scanhub_open_robot(
+    handle: *mut *mut Opaque,
+    domain: *const c_char,
+    sensors: *const c_char,
+    wait: c_int,
+) -> c_int {
+    answer(|| {
+        let handle = place(handle)?;
+        handle.write(std::ptr::null_mut());
+        let sensors: Vec<&str> = text(sensors)?.unwrap_or_default().split_ascii_whitespace().collect();
+        let opened = Handle::open_robot(places(text(domain)?)?, &sensors, way(wait)?)?;
         handle.write(table::insert(opened)?);
         Ok(0)
     })
@@ -115,6 +125,15 @@ const VERSION: &CStr = match CStr::from_bytes_with_nul(concat!(env!("CARGO_PKG_V
     Ok(version) => version,
     Err(_) => panic!("a version is no text"),
 };
+
+fn way(wait: c_int) -> Result<Wait, Refusal> {
+    match wait {
+        0 => Ok(Wait::Doorbell),
+        1 => Ok(Wait::Event),
+        2 => Ok(Wait::Spin),
+        _ => Err(Refusal::Argument("there is no such way to wait", "one of SCANHUB_WAIT_..")),
+    }
+}
 
 fn answer(call: impl FnOnce() -> Result<c_int, Refusal>) -> c_int {
     let answered = catch_unwind(AssertUnwindSafe(call)).unwrap_or(Err(Refusal::Bug));

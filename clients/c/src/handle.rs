@@ -5,11 +5,12 @@ use std::os::fd::AsRawFd;
 use std::ptr;
 use std::time::{Duration, Instant};
 
-use clients::{Attachment, Heard, Received, Wait, ZonesFollower};
+use clients::{Attachment, Heard, Received, RobotFollower, Wait, ZonesFollower};
 use schema::{Background, Domain, Failure, Foreground, Header, Marks, Scan, Status, Topic, limits};
 
 use crate::boundary::Lent;
 use crate::refusal::Refusal;
+use crate::robot::Told;
 
 /// An open attachment.
 pub(crate) struct Handle {
@@ -23,12 +24,12 @@ pub(crate) struct Handle {
 /// Samples that may be lent at a time, as many as the hub has in store for each consumer.
 const LENT: usize = limits::BORROWED;
 
-/// Declares the topics once, of which all but zones are followed alike.
+/// Declares the topics once, of which all but zones are followed alike; a robot is all zones in one.
 macro_rules! topics {
     ($($topic:ident $payload:ty;)*) => {
-        enum Source { Zones(ZonesFollower), $($topic(Attachment<$payload>),)* }
+        enum Source { Robot(RobotFollower), Zones(ZonesFollower), $($topic(Attachment<$payload>),)* }
 
-        enum Held { Zones(Heard), $($topic(Received<$payload>),)* }
+        enum Held { Robot(Told), Zones(Heard), $($topic(Received<$payload>),)* }
 
         impl Source {
             fn open(places: Vec<Domain>, sensor: &str, topic: Topic, wait: Wait) -> Result<Source, Failure> {
@@ -40,6 +41,7 @@ macro_rules! topics {
 
             fn try_next(&mut self) -> Result<Option<Held>, Failure> {
                 Ok(match self {
+                    Source::Robot(robot) => robot.try_next()?.map(Told::new).map(Held::Robot),
                     Source::Zones(zones) => zones.try_next()?.map(Held::Zones),
                     $(Source::$topic(attachment) => attachment.try_next()?.map(Held::$topic),)*
                 })
@@ -47,6 +49,7 @@ macro_rules! topics {
 
             fn wait(&mut self, longest: Duration) -> Result<(), Failure> {
                 match self {
+                    Source::Robot(robot) => robot.wait(longest),
                     Source::Zones(zones) => zones.wait(longest),
                     $(Source::$topic(attachment) => attachment.wait(longest),)*
                 }
@@ -54,6 +57,7 @@ macro_rules! topics {
 
             fn descriptor(&mut self) -> Result<c_int, Failure> {
                 Ok(match self {
+                    Source::Robot(robot) => robot.descriptor()?,
                     Source::Zones(zones) => zones.descriptor()?,
                     $(Source::$topic(attachment) => attachment.descriptor()?,)*
                 }.as_raw_fd())
@@ -61,6 +65,7 @@ macro_rules! topics {
 
             fn hub_lives(&self) -> bool {
                 match self {
+                    Source::Robot(robot) => robot.hub_lives(),
                     Source::Zones(zones) => zones.hub_lives(),
                     $(Source::$topic(attachment) => attachment.hub_lives(),)*
                 }
@@ -70,6 +75,7 @@ macro_rules! topics {
         impl Held {
             fn lend(&self) -> Lent {
                 match self {
+                    Held::Robot(told) => Lent::new(None, told.verdict()),
                     Held::Zones(heard) => Lent {
                         missed: heard.missed,
                         stale: heard.stale.into(),
@@ -103,8 +109,16 @@ impl Handle {
         topic: Topic,
         wait: Wait,
     ) -> Result<Handle, Refusal> {
-        let source = Source::open(places, sensor, topic, wait)?;
-        Ok(Handle { lent: Default::default(), found: None, next: 1, source })
+        Ok(Handle::of(Source::open(places, sensor, topic, wait)?))
+    }
+
+    /// Will follow the robot of `sensors` (none: all) in the first live one of `places`.
+    pub(crate) fn open_robot(places: Vec<Domain>, sensors: &[&str], wait: Wait) -> Result<Handle, Refusal> {
+        Ok(Handle::of(Source::Robot(RobotFollower::in_domain(places, sensors)?.wait_by(wait))))
+    }
+
+    fn of(source: Source) -> Handle {
+        Handle { lent: Default::default(), found: None, next: 1, source }
     }
 
     /// Waits until there is a sample to take, or `timeout` is over (none: never); whether there is.

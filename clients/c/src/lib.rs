@@ -6,11 +6,12 @@ mod boundary;
 mod export;
 mod handle;
 mod refusal;
+mod robot;
 mod table;
 
 pub use boundary::Lent;
 pub use export::{
-    scanhub_close, scanhub_error, scanhub_fd, scanhub_hub_lives, scanhub_open, scanhub_release, scanhub_take,
-    scanhub_version, scanhub_wait,
+    scanhub_close, scanhub_error, scanhub_fd, scanhub_hub_lives, scanhub_open, scanhub_open_robot,
+    scanhub_release, scanhub_take, scanhub_version, scanhub_wait,
 };
 pub use table::Opaque;

@@ -3,9 +3,10 @@
     import scanhub
 
     for scan in scanhub.subscribe("front/scan"):
-        print(scan.seq, scan.ranges.min(), scan.ranges_m[180])
+        print(scan.seq, scan.ranges_m[180])
 
-`scan.ranges` is a numpy view of the hub's memory that cannot be written. A hub that is not there is waited for, one
+`scan.ranges_m` has metres, NaN where there is no reading; `scan.ranges` is a numpy view of the hub's memory that cannot be
+written, in device units and with codes. A hub that is not there is waited for, one
 that restarts too. docs/python.md has the rest.
 """
 
@@ -18,13 +19,14 @@ from . import memory
 from .control import background, control
 from .errors import Denied, Failure, Held, Impossible, Mismatch, NoHub, NoTopic, Refused, Short, Silent
 from .model import Background, Shown
-from .names import TopicName, candidates, parse
+from .names import TopicName, candidates, check_sensor, parse
 from .presence import find
 from .processed import Foreground, Mark, Marks, Segment, Zone, Zones
 from .sample import Sample
 from .scan import Scan, Telegram
 from .status import Pose, Status
 from .subscription import Subscription
+from .verdict import Robot, RobotFollower
 
 __version__ = "0.1.0"
 
@@ -42,6 +44,8 @@ __all__ = [
     "NoTopic",
     "Pose",
     "Refused",
+    "Robot",
+    "RobotFollower",
     "Sample",
     "Scan",
     "Segment",
@@ -56,6 +60,7 @@ __all__ = [
     "Zones",
     "background",
     "control",
+    "robot",
     "sensors",
     "subscribe",
     "topics",
@@ -78,6 +83,18 @@ def subscribe(
     if not topics:
         raise NoTopic("no topic is named", "write SENSOR/TOPIC, as front/scan")
     return Subscription([parse(topic) for topic in topics], candidates(domain, root), timeout, on_notice)
+
+
+def robot(*sensors: str, domain: str | None = None, root: str | os.PathLike[str] | None = None) -> RobotFollower:
+    """Follows the verdict over the zones of `sensors`. None: all sensors of the hub; in a domain without a hub those of
+    other machines that are published there.
+
+    Iterate over what is returned, for ever, or ask `now()` in a loop of your own. What is not heard lately is `unknown`
+    by itself, with a hub or without one. Impossible at once if a name is.
+    """
+    for sensor in sensors:
+        check_sensor(sensor)
+    return RobotFollower(list(sensors), candidates(domain, root))
 
 
 def topics(*, domain: str | None = None, root: str | os.PathLike[str] | None = None) -> list[TopicName]:

@@ -58,6 +58,11 @@ def check_sensor(name: str) -> None:
         raise Impossible(f"sensor name {name!r} is not possible", "1 to 24 of a-z, 0-9, _ and -, for example front")
 
 
+def is_remote(name: str) -> bool:
+    """Whether this is the name of another machine's sensor."""
+    return "." in name
+
+
 def _is_name(name: str) -> bool:
     return 1 <= len(name) <= 24 and name != "robot" and not set(name) - _OF_SENSORS
 

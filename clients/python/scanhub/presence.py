@@ -25,7 +25,7 @@ class Presence:
 
     def __init__(self, places: list[Domain]) -> None:
         self._places = places
-        self._holder: tuple[Domain, int] | None = None
+        self._holder: tuple[Domain, int, bool] | None = None
         self._looked_at = float("-inf")
         self.denied: Denied | Short | None = None
 
@@ -44,6 +44,11 @@ class Presence:
         """Where the hub lives, if there is one."""
         return self._holder and self._holder[0]
 
+    @property
+    def is_hub(self) -> bool:
+        """It is a hub that lives there, not only a listener that brings the sensors of other machines."""
+        return self._holder is not None and self._holder[2]
+
     def absent(self) -> Failure:
         """What to tell who cannot wait for a hub."""
         if self.denied:
@@ -52,10 +57,10 @@ class Presence:
         name = self._places[0].name if self._places else ""
         return NoHub(f"no hub in domain {name}", f"start one with `scanhub run`; looked at {looked}")
 
-    def _live(self) -> tuple[Domain, int] | None:
+    def _live(self) -> tuple[Domain, int, bool] | None:
         self.denied = None
         for place in self._places:
-            for lock in ("hub.lock", "listen.lock"):
+            for lock, is_hub in (("hub.lock", True), ("listen.lock", False)):
                 try:
                     pid = _holder(place, lock)
                 except Denied as denied:
@@ -68,7 +73,7 @@ class Presence:
                     self.denied = Short(f"cannot look for a hub: {error}", "`ulimit -n` may be too small")
                     return self._holder
                 if pid:
-                    return place, pid
+                    return place, pid, is_hub
         return None
 
 

@@ -84,6 +84,17 @@ class Status(Sample):
         return dict(zip(COUNTERS, self._fields.counters))
 
     @property
+    def damaged(self) -> float:
+        """Share of the line's bytes that were in nothing over the last 10 s, 0 to 1."""
+        return self.counters["damaged_ppm"] / 1e6
+
+    @property
+    def lost_on_line(self) -> int | None:
+        """Scans that must have been sent and did not arrive; `None` where that cannot be known."""
+        counters = self.counters
+        return counters["lost_on_line"] if counters["due_on_line"] else None
+
+    @property
     def pose(self) -> Pose:
         """Where the sensor sits, as configured."""
         pose = self._fields.pose
@@ -113,5 +124,10 @@ COUNTERS = (
     "rejected_vetoed",
     "rejected_superseded",
     "line_errors",
+    "bytes_damaged",
+    "damaged_ppm",
+    "due_on_line",
+    "lost_on_line",
+    "lost_ppm",
 )
 """The counters that have a name, in their order."""

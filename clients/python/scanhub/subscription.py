@@ -65,7 +65,7 @@ class Subscription(Iterator[Any]):
             left = give_up_at - time.monotonic()
             if left <= 0:
                 raise self._silence()
-            self._wakeups.wait(min(left, _LONGEST_WAIT, *(follower.left() for follower in self._followers)))
+            self._wait(left)
 
     def __enter__(self) -> Subscription:
         return self
@@ -93,6 +93,15 @@ class Subscription(Iterator[Any]):
             if sample is not None:
                 return sample
         return None
+
+    def _wait(self, longest: float) -> None:
+        """Sleeps until there may be something to say, for so many seconds at most."""
+        self._wakeups.wait(min(longest, _LONGEST_WAIT, *(follower.left() for follower in self._followers)))
+
+    def _follow(self, name: TopicName) -> None:
+        """Follows this one, too."""
+        self._followers.append(_follower(name))
+        self._opened_at = float("-inf")
 
     def _look(self) -> bool:
         """Looks for the hub and for topics that are not there yet; whether something new was opened."""

@@ -90,6 +90,7 @@ def payloads_say_what_they_are() -> None:
     assert of.pose == (0.5, -0.5, 2.0, True)
     named = {name: value for name, value in of.counters.items() if value}
     assert named == {"bytes_read": 3, "rejected_superseded": 4, "line_errors": 5}
+    assert (of.damaged, of.lost_on_line) == (0.0, None)
 
 
 def copies_are_the_same() -> None:

@@ -70,7 +70,7 @@ def somebody_elses_domain() -> None:
     if child == 0:
         os.setresuid(65534, 65534, 65534)
         said = refusal(scanhub.Denied, lambda: follow("front/scan"))
-        os._exit(0 if "belongs to user 0 (root) with mode 0700, this is user 65534" in said.message else 1)
+        os._exit(0 if "belongs to user 0 (root) with mode 0755, this is user 65534" in said.message else 1)
     assert os.waitpid(child, 0)[1] == 0
 
 
@@ -90,6 +90,8 @@ def hub_of_another_layout() -> list:
     lock = os.open(f"{place.root}/hub.lock", os.O_RDWR | os.O_CREAT, 0o600)
     fcntl.fcntl(lock, fcntl.F_OFD_SETLK, struct.pack("hhqqi0q", fcntl.F_WRLCK, os.SEEK_SET, 0, 0, 0))
     os.write(lock, b"%d\n" % os.getpid())
+    with open(f"{place.root}/prefix", "w", encoding="ascii") as names_begin:
+        names_begin.write(f"{place.prefix}01234_\n")
     hub = memory.Membership(place)
     wake = hub.service("scanhub/v1/front/wake").event().open_or_create()
     scan = hub.service("scanhub/v1/front/scan").publish_subscribe(Scan).user_header(layout.Header)

@@ -3,12 +3,12 @@
 
 use std::time::{Duration, Instant};
 
-use schema::{Failure, Kind, ROBOT, ipc, is_remote};
+use schema::{Failure, Kind, ipc, is_remote};
 
-use super::{Run, Sink, Track};
+use super::{Run, Sink, Track, brings};
 use crate::names::{TopicName, no_sensor};
 use crate::output::End;
-use crate::presence::GRACE;
+use crate::presence::{GRACE, Who};
 
 /// Sensors of other machines that are there have been announced after so long: it is done once a second.
 const ANNOUNCED: Duration = Duration::from_secs(3);
@@ -49,17 +49,20 @@ impl Run<'_> {
         self.hub_lives_since = if lives { self.hub_lives_since.or(Some(Instant::now())) } else { None };
         let sensors = self.sensors()?;
         let wants_all = self.tracks.iter().all(|track| track.name.is_robot());
-        if wants_all && !self.may_come(ROBOT) && sensors.iter().all(|sensor| is_remote(sensor)) {
-            return Err(Failure::new(
-                Kind::NoTopic,
-                "the hub has no sensors",
-                "scanhub run --link NAME=PORT",
-            )
-            .into());
+        // Those of the hub, or where there is none, of other machines.
+        let may_come = self.may_come(if lives { Who::Hub } else { Who::Listener });
+        if wants_all && !may_come && sensors.iter().all(|sensor| is_remote(sensor) == lives) {
+            let (what, hint) = match lives {
+                true => ("the hub has no sensors", "scanhub run --link NAME=PORT"),
+                false => {
+                    ("no sensor of another machine is published here", "`scanhub listen` says who sends")
+                }
+            };
+            return Err(Failure::new(Kind::NoTopic, what, hint).into());
         }
         for track in &self.tracks {
             let sensor = &track.name.sensor;
-            let is_there = track.name.is_robot() || sensors.contains(sensor) || self.may_come(sensor);
+            let is_there = track.name.is_robot() || sensors.contains(sensor) || self.may_come(brings(sensor));
             if !track.source.attached() && !is_there {
                 return Err(no_sensor(sensor, &sensors).into());
             }
@@ -68,11 +71,11 @@ impl Run<'_> {
     }
 
     /// Who is not there may come: another machine that is switched on later, or the hub, where only a listener is yet.
-    fn may_come(&self, sensor: &str) -> bool {
+    fn may_come(&self, who: Who) -> bool {
         let unbounded = !self.bounds.bounded();
-        match is_remote(sensor) {
-            true => unbounded || self.started.elapsed() < ANNOUNCED,
-            false => unbounded && self.hub_lives_since.is_none_or(|since| since.elapsed() < GRACE),
+        match who {
+            Who::Listener => unbounded || self.started.elapsed() < ANNOUNCED,
+            Who::Hub => unbounded && self.hub_lives_since.is_none_or(|since| since.elapsed() < GRACE),
         }
     }
 

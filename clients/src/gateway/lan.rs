@@ -13,9 +13,8 @@ use super::uplink::Uplink;
 /// What goes out, and the account of it.
 pub(super) struct Lan {
     pub(super) life: Life,
-    pub(super) interface: Uplink,
-    /// The groups; what is sent to them is what the rows count.
-    pub(super) groups: Outlet,
+    /// The groups, if an interface was named for them.
+    pub(super) groups: Option<Groups>,
     /// Hosts that get copies.
     pub(super) copies: Vec<Outlet>,
     sensors: Vec<Rows>,
@@ -24,6 +23,12 @@ pub(super) struct Lan {
     /// What did not fit into a datagram.
     pub(super) unfit: u64,
     buffer: [u8; MTU_ETHERNET],
+}
+
+/// The groups on an interface.
+pub(super) struct Groups {
+    pub(super) interface: Uplink,
+    outlet: Outlet,
 }
 
 /// How a payload becomes a datagram.
@@ -46,9 +51,9 @@ pub(super) struct Rows {
 /// The account of one sensor and topic.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub(super) struct Row {
-    /// Datagrams that the groups were sent.
+    /// Datagrams that the groups were sent, or without groups a host at least.
     pub(super) sent: u64,
-    /// Datagrams that have a number and were not sent to the groups.
+    /// Datagrams that have a number and were not sent there.
     pub(super) failed: u64,
     /// Bytes in what was sent.
     pub(super) bytes: u64,
@@ -83,14 +88,14 @@ impl Rows {
 }
 
 impl Lan {
-    /// Datagrams of at most `longest` bytes, as `life`, to the groups on `interface`, which routers pass on `ttl` times,
-    /// and to the hosts in `to`.
+    /// Datagrams of at most `longest` bytes, as `life`, to the groups on `interface`, if there is one, which routers pass on
+    /// `ttl` times, and to the hosts in `to`.
     ///
     /// [`Kind::Configuration`] if `longest` is not possible, a host is none or is named twice; [`Kind::Failed`] without sockets;
     /// [`Kind::Interrupted`] if `stop` is set before it is known where the hosts are.
     pub(super) fn open(
         life: Life,
-        interface: Uplink,
+        interface: Option<Uplink>,
         to: &[String],
         form: Form,
         ttl: u8,
@@ -107,7 +112,11 @@ impl Lan {
             Form::Sealed => (PORT, 0),
             Form::Bare => (BARE_PORT, u16::from(u8::MAX)),
         };
-        let groups = Outlet::groups(interface.name(), port, ttl)?;
+        let groups = interface.map(|interface| {
+            let outlet = Outlet::groups(interface.name(), port, ttl)?;
+            Ok(Groups { interface, outlet })
+        });
+        let groups = groups.transpose()?;
         let mut copies: Vec<Outlet> = Vec::new();
         for text in to {
             let copy = Outlet::host(text, more, stop)?;
@@ -119,9 +128,11 @@ impl Lan {
             copies.push(copy);
         }
         let (sensors, buffer) = (Vec::new(), [0; MTU_ETHERNET]);
-        let mut lan = Lan { life, interface, groups, copies, sensors, form, longest, unfit: 0, buffer };
-        lan.use_interface();
-        let room = lan.interface.index().and_then(|index| lan.groups.room(index));
+        let mut lan = Lan { life, groups, copies, sensors, form, longest, unfit: 0, buffer };
+        let room = lan.groups.as_mut().and_then(|groups| {
+            groups.use_interface();
+            groups.outlet.room(groups.interface.index()?)
+        });
         lan.longest = longest.min(room.unwrap_or(longest)).max(HEAD);
         Ok(lan)
     }
@@ -131,11 +142,22 @@ impl Lan {
         self.longest
     }
 
+    /// All destinations, the groups first.
+    pub(super) fn outlets(&self) -> impl Iterator<Item = &Outlet> {
+        self.groups.iter().map(|groups| &groups.outlet).chain(&self.copies)
+    }
+
+    /// As [`outlets`](Lan::outlets).
+    pub(super) fn outlets_mut(&mut self) -> impl Iterator<Item = &mut Outlet> {
+        self.groups.iter_mut().map(|groups| &mut groups.outlet).chain(&mut self.copies)
+    }
+
     /// Goes on where the interface is now; whether its state is another one than before.
     pub(super) fn look(&mut self) -> bool {
-        let changed = self.interface.look();
+        let Some(groups) = &mut self.groups else { return false };
+        let changed = groups.interface.look();
         if changed {
-            self.use_interface();
+            groups.use_interface();
         }
         changed
     }
@@ -189,11 +211,12 @@ impl Lan {
         let group = Topic::of_number(head.topic).map_or(Announce::GROUP, group);
         let mut taken = None;
         if let Some(datagram) = datagram {
-            let is_sent = self.groups.send(datagram, group, above);
-            taken = is_sent.then_some(datagram.len());
+            let of_groups = self.groups.as_mut().map(|groups| groups.outlet.send(datagram, group, above));
+            let mut of_copies = false;
             for copy in &mut self.copies {
-                copy.send(datagram, group, above);
+                of_copies |= copy.send(datagram, group, above);
             }
+            taken = of_groups.unwrap_or(of_copies).then_some(datagram.len());
         }
         if let Some(row) = self.row(head.sensor, head.topic) {
             match taken {
@@ -223,11 +246,13 @@ impl Lan {
     fn row(&mut self, number: u8, topic: u8) -> Option<&mut Row> {
         self.sensors.get_mut(usize::from(number))?.rows.get_mut(usize::from(topic))
     }
+}
 
+impl Groups {
     fn use_interface(&mut self) {
-        self.groups.is_cut = !self.interface.is_up();
+        self.outlet.is_cut = !self.interface.is_up();
         if let Some(index) = self.interface.index() {
-            self.groups.use_interface(index);
+            self.outlet.use_interface(index);
         }
     }
 }

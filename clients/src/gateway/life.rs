@@ -7,7 +7,7 @@ use std::io;
 use std::os::unix::fs::{DirBuilderExt, FileExt};
 use std::path::{Path, PathBuf};
 
-use schema::{Failure, Kind};
+use schema::{Failure, Kind, StateDirectory};
 
 /// One life of a gateway. Nobody else has its number as long as this value is there.
 #[derive(Debug)]
@@ -23,9 +23,9 @@ pub(super) struct Life {
 }
 
 impl Life {
-    /// Begins a life of the gateway of `domain` on `interface`, or of another one if there is one already: kept in a file
-    /// in `directory`, which is made if it is not there. `now_s` is seconds since 1970. What was kept on another `machine`
-    /// than this one is another gateway's; where that is not known, it is not asked.
+    /// Begins a life of the gateway of `domain` on `interface` (or another word for where it sends), or of another one if
+    /// there is one already: kept in a file in `directory`, which is made if it is not there. `now_s` is seconds since 1970.
+    /// What was kept on another `machine` than this one is another gateway's; where that is not known, it is not asked.
     ///
     /// [`Kind::Configuration`] if the file cannot be written: then listeners could not tell this life from the last one.
     pub(super) fn begin(
@@ -104,18 +104,11 @@ impl Kept {
     }
 }
 
-/// Where such files are: what systemd made for the service, else what the user's environment says.
+/// Where such files are: beside the directories of domains.
 ///
-/// [`Kind::Configuration`] if it says nothing.
+/// [`Kind::Configuration`] if the environment names no place.
 pub(super) fn directory() -> Result<PathBuf, Failure> {
-    let path = |name: &str| {
-        let value = std::env::var(name).ok()?;
-        // systemd lists several with colons between them.
-        let first = PathBuf::from(value.split(':').next()?);
-        first.is_absolute().then_some(first)
-    };
-    let user = || path("XDG_STATE_HOME").or_else(|| Some(path("HOME")?.join(".local/state")));
-    path("STATE_DIRECTORY").or_else(|| Some(user()?.join("scanhub"))).ok_or_else(|| {
+    StateDirectory::base().ok_or_else(|| {
         let what = "no place for the gateway's number: neither XDG_STATE_HOME nor HOME is set";
         Failure::new(Kind::Configuration, what, "let XDG_STATE_HOME name a directory that can be written")
     })

@@ -7,7 +7,7 @@ use schema::Topic;
 use serde::Serialize;
 
 use super::GatewayLook;
-use super::lan::Lan;
+use super::lan::{Groups, Lan};
 use super::outlet::{News, Outlet};
 use crate::follow::Notice;
 use crate::output::{End, Output};
@@ -18,7 +18,7 @@ pub(super) struct Report<'a> {
     look: GatewayLook,
     out: Output<'a>,
     notes: Output<'a>,
-    /// Datagrams to the groups, as of the last status line.
+    /// Datagrams to the first destination, as of the last status line.
     sent: u64,
 }
 
@@ -36,7 +36,7 @@ impl<'a> Report<'a> {
                 class: "gateway",
                 hub: id(lan),
                 epoch: lan.life.epoch,
-                interface: lan.interface.name(),
+                interface: lan.groups.as_ref().map(|groups| groups.interface.name()),
                 to,
                 bare,
                 longest: lan.longest(),
@@ -47,7 +47,10 @@ impl<'a> Report<'a> {
             self.notes.line(|line| write!(line, "{}: {RENUMBERED}", id(lan)))?;
         }
         self.out.line(|line| {
-            write!(line, "gateway {} epoch {} on {}", id(lan), lan.life.epoch, lan.interface.name())?;
+            write!(line, "gateway {} epoch {}", id(lan), lan.life.epoch)?;
+            if let Some(groups) = &lan.groups {
+                write!(line, " on {}", groups.interface.name())?;
+            }
             to.iter().try_for_each(|to| write!(line, ", copies to {to}"))?;
             write!(line, ", datagrams of {} bytes at most", lan.longest())
         })
@@ -64,10 +67,10 @@ impl<'a> Report<'a> {
 
     /// The state of the interface became another one.
     pub(super) fn interface(&mut self, lan: &Lan) -> Result<(), End> {
-        let name = lan.interface.name();
-        match lan.interface.is_up() {
-            true => self.link(name, "up", None),
-            false => self.link(name, "down", Some("no carrier, no IPv4 address, or not there")),
+        let Some(Groups { interface, .. }) = &lan.groups else { return Ok(()) };
+        match interface.is_up() {
+            true => self.link(interface.name(), "up", None),
+            false => self.link(interface.name(), "down", Some("no carrier, no IPv4 address, or not there")),
         }
     }
 
@@ -131,7 +134,7 @@ impl<'a> Report<'a> {
             let longest = lan.longest();
             self.out.line(|line| write!(line, "too long for {longest} bytes: {}, see --mtu", lan.unfit))?;
         }
-        std::iter::once(&lan.groups).chain(&lan.copies).try_for_each(|outlet| self.outlet(lan, outlet))
+        lan.outlets().try_for_each(|outlet| self.outlet(lan, outlet))
     }
 
     fn outlet(&mut self, lan: &Lan, outlet: &Outlet) -> Result<(), End> {
@@ -166,7 +169,7 @@ impl<'a> Report<'a> {
         let mut line = [WIPE, b"\x1b[?7l"].concat();
         status(&mut line, lan, hub_lives, self.sent)?;
         line.extend(b"\x1b[?7h");
-        self.sent = lan.groups.sent;
+        self.sent = first(lan).0;
         self.out.raw(&line)
     }
 
@@ -179,21 +182,31 @@ impl<'a> Report<'a> {
 }
 
 fn status(line: &mut Vec<u8>, lan: &Lan, hub_lives: bool, sent_before: u64) -> io::Result<()> {
-    let groups = &lan.groups;
-    let state = if lan.interface.is_up() { "" } else { " down" };
+    let is_down = lan.groups.as_ref().is_some_and(|groups| !groups.interface.is_up());
+    let state = if is_down { " down" } else { "" };
     let hub = if hub_lives { "" } else { "no hub, " };
-    write!(line, "{hub}{}{state}: {}/s, {} sent", groups.name, groups.sent - sent_before, groups.sent)?;
-    if groups.failed > 0 {
-        write!(line, ", {} failed", groups.failed)?;
-    }
-    for copy in &lan.copies {
-        write!(line, "; {}: {} sent, {} failed", copy.name, copy.sent, copy.failed)?;
+    let (sent, name) = first(lan);
+    write!(line, "{hub}{name}{state}: {}/s", sent - sent_before)?;
+    for (number, outlet) in lan.outlets().enumerate() {
+        let Outlet { name, sent, failed, .. } = outlet;
+        match number {
+            0 => write!(line, ", {sent} sent")?,
+            _ => write!(line, "; {name}: {sent} sent")?,
+        }
+        if number > 0 || *failed > 0 {
+            write!(line, ", {failed} failed")?;
+        }
     }
     let missed: u64 = lan.sensors().flat_map(|sensor| sensor.used()).map(|(_, row)| row.missed).sum();
     if missed > 0 {
         write!(line, "; {missed} missed")?;
     }
     if lan.unfit > 0 { write!(line, "; {} too long", lan.unfit) } else { Ok(()) }
+}
+
+/// How many datagrams went to the first destination, which there always is, and its name.
+fn first(lan: &Lan) -> (u64, &str) {
+    lan.outlets().next().map_or((0, ""), |outlet| (outlet.sent, &outlet.name))
 }
 
 fn id(lan: &Lan) -> String {
@@ -206,7 +219,7 @@ struct Begin<'a> {
     class: &'static str,
     hub: String,
     epoch: u32,
-    interface: &'a str,
+    interface: Option<&'a str>,
     to: Vec<&'a str>,
     bare: bool,
     longest: usize,

@@ -1,5 +1,5 @@
-//! The network interface that datagrams leave by: which one is meant, and whether anything gets out there. The kernel
-//! takes datagrams for an interface whose cable is out, and says nothing. Refuses to know what is sent.
+//! The network interface that datagrams to groups leave by, and whether anything gets out there. The kernel takes
+//! datagrams for an interface whose cable is out, and says nothing. Refuses to know what is sent.
 
 use std::fmt::Display;
 use std::io::{PipeReader, PipeWriter, pipe};
@@ -35,20 +35,16 @@ struct State {
 const AGAIN: Duration = Duration::from_millis(500);
 
 impl Uplink {
-    /// The interface called `name`; without a name the only one that is up, not the loopback, and has multicast and an
-    /// IPv4 address.
+    /// The interface called `name`.
     ///
-    /// [`Kind::Configuration`] with those that there are if it is not there, or not just one.
-    pub(super) fn choose(name: Option<&str>) -> Result<Uplink, Failure> {
+    /// [`Kind::Configuration`] with those that there are if it is not there, [`Kind::Failed`] if it cannot be watched.
+    pub(super) fn open(name: &str) -> Result<Uplink, Failure> {
         let unwatched = |why: &dyn Display| {
             Failure::new(Kind::Failed, format!("cannot watch network interfaces: {why}"), "")
         };
         // First the watch: what changes after the look is heard.
         let changes = Changes::watch()?;
-        let found = match name {
-            Some(name) => named(name)?,
-            None => only(interfaces()?)?,
-        };
+        let found = named(name)?;
         let state = State::of(Some(&found));
         let seen = Arc::new(AtomicU64::new(state.word()));
         let (ending, end) = pipe().map_err(|error| unwatched(&error))?;
@@ -128,26 +124,31 @@ fn watch(name: &str, mut changes: Changes, end: &PipeReader, seen: &AtomicU64) {
     }
 }
 
-/// The one of `all` that can be meant; one without a carrier, as at the start of a robot, is one too.
-fn only(mut all: Vec<Interface>) -> Result<Interface, Failure> {
-    let is_candidate = |one: &Interface| one.up && one.multicast && !one.loopback && one.address.is_some();
-    let candidates = all.iter().filter(|one| is_candidate(one)).count();
-    match all.iter().position(is_candidate) {
-        Some(at) if candidates == 1 => Ok(all.swap_remove(at)),
-        _ => {
-            let what = match candidates {
-                0 => "no interface is up and has multicast and an IPv4 address",
-                _ => "several interfaces have multicast",
-            };
-            let tell = |one: &Interface| match (one.up, one.address) {
-                (false, _) => format!("{} (down)", one.name),
-                (true, None) => format!("{} (no IPv4 address)", one.name),
-                (true, Some(address)) => format!("{} ({address})", one.name),
-            };
-            let hint = all.iter().map(tell).collect::<Vec<_>>().join(", ");
-            Err(Failure::new(Kind::Configuration, what, format!("name one by --interface: {hint}")))
-        }
+/// Nobody said where to send: what goes to groups is heard by everybody on the network, so that it goes to none that was
+/// not named.
+///
+/// [`Kind::Failed`] instead if the system does not tell its interfaces.
+pub(super) fn nowhere() -> Failure {
+    match interfaces() {
+        Ok(all) => choose_one(&all),
+        Err(failure) => failure,
     }
+}
+
+fn choose_one(all: &[Interface]) -> Failure {
+    let tell = |one: &Interface| match (one.up, one.multicast, one.address) {
+        (false, ..) => format!("{} (down)", one.name),
+        (_, false, _) => format!("{} (no multicast)", one.name),
+        (.., None) => format!("{} (no IPv4 address)", one.name),
+        (.., Some(address)) if one.loopback => format!("{} ({address}, this machine alone)", one.name),
+        (.., Some(address)) => format!("{} ({address})", one.name),
+    };
+    let list = all.iter().map(tell).collect::<Vec<_>>().join(", ");
+    let hint = format!(
+        "whoever is on the interface can read what is sent there: name one by --interface, or as `interface` under \
+         [gateway]; there are {list}; or name hosts by --to"
+    );
+    Failure::new(Kind::Configuration, "no interface is named for the groups, and no host", hint)
 }
 
 #[cfg(test)]
@@ -163,15 +164,15 @@ mod tests {
     }
 
     #[test]
-    fn only_one_can_be_meant() {
+    fn who_names_none_is_told_which_there_are() {
         let some = Some(Ipv4Addr::LOCALHOST);
         let (lo, eth0, wlan0) = (interface("lo", some), interface("eth0", some), interface("wlan0", None));
-        let unplugged = Interface { running: false, ..eth0.clone() };
-        assert_eq!(only(vec![lo.clone(), wlan0.clone(), unplugged.clone()]), Ok(unplugged));
-        let none = only(vec![lo.clone(), wlan0.clone()]).unwrap_err();
-        assert!(none.kind == Kind::Configuration && none.hint.contains("wlan0 (no IPv4 address)"), "{none}");
-        let two = only(vec![lo, eth0, Interface { address: some, ..wlan0 }]).unwrap_err();
-        assert!(two.kind == Kind::Configuration && two.hint.contains("eth0 (127.0.0.1), wlan0"), "{two}");
+        let down = Interface { name: "eth1".into(), up: false, ..eth0.clone() };
+        let failure = choose_one(&[lo, eth0, wlan0, down]);
+        assert_eq!(failure.kind, Kind::Configuration);
+        let list =
+            "lo (127.0.0.1, this machine alone), eth0 (127.0.0.1), wlan0 (no IPv4 address), eth1 (down)";
+        assert!(failure.hint.contains(list), "{failure}");
     }
 
     #[test]

@@ -3,7 +3,7 @@
 use schema::{Foreground, Header, Mark, Marks, ROBOT, Segment, Verdict, Zone, Zones};
 use serde::{Serialize, Serializer};
 
-use super::Stamp;
+use super::{Stamp, Words};
 use crate::robot::Robot;
 use crate::zones::Heard;
 
@@ -17,12 +17,15 @@ pub(crate) fn marks<'a>(sensor: &'a str, header: &Header, marks: &'a Marks) -> i
         overflow: bool,
         #[serde(serialize_with = "mark_list")]
         marks: &'a [Mark],
+        #[serde(flatten)]
+        flags: Words,
     }
     Line {
         stamp: Stamp::new("marks", sensor, header),
         available: marks.is_available(),
         overflow: marks.is_overflow(),
         marks: marks.marks(),
+        flags: Words::of(header),
     }
 }
 
@@ -42,6 +45,8 @@ pub(crate) fn zones<'a>(sensor: &'a str, heard: &'a Heard) -> impl Serialize + '
         provisional: bool,
         #[serde(skip_serializing_if = "std::ops::Not::not")]
         stale: bool,
+        #[serde(flatten)]
+        flags: Option<Words>,
     }
     let zones = &heard.zones;
     let (nearest_beam, nearest_mm) = zones.nearest().unzip();
@@ -58,6 +63,7 @@ pub(crate) fn zones<'a>(sensor: &'a str, heard: &'a Heard) -> impl Serialize + '
         invalid_beams: zones.invalid_beams,
         provisional: zones.flags & Zones::PROVISIONAL != 0,
         stale: heard.stale,
+        flags: heard.header.as_ref().map(Words::of),
     }
 }
 
@@ -109,6 +115,8 @@ pub(crate) fn foreground<'a>(
         #[serde(serialize_with = "segment_list")]
         segments: &'a Foreground,
         left_out: u8,
+        #[serde(flatten)]
+        flags: Words,
     }
     Line {
         stamp: Stamp::new("foreground", sensor, header),
@@ -118,6 +126,7 @@ pub(crate) fn foreground<'a>(
         ranges: foreground.ranges(),
         segments: foreground,
         left_out: foreground.left_out,
+        flags: Words::of(header),
     }
 }
 

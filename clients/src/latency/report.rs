@@ -81,7 +81,7 @@ pub(super) fn json<'a>(name: &'a TopicName, spans: &Spans) -> impl Serialize + '
         received: spans.received,
         before: spans.before,
         ahead: spans.ahead,
-        flags: flags(spans.flags),
+        flags: Flags::names(spans.flags).collect(),
         age: of(Span::Age),
         line: of(Span::Line),
         hub: of(Span::Hub),
@@ -148,7 +148,7 @@ fn remarks(name: &TopicName, spans: &Spans) -> Vec<String> {
         remarks
             .push(format!("{name}: {} have stamps ahead of the clock here: the clocks differ", spans.ahead));
     }
-    let kinds: Vec<_> = flags(spans.flags).into_iter().filter(|flag| *flag != "remote").collect();
+    let kinds: Vec<_> = Flags::names(spans.flags).filter(|flag| *flag != "remote").collect();
     if !kinds.is_empty() {
         remarks.push(format!("{name}: {}", kinds.join(", ")));
     }
@@ -182,17 +182,6 @@ fn draw(out: &mut Output<'_>, spans: &Spans) -> Result<(), End> {
 }
 
 const LONGEST_BAR: u64 = 40;
-
-/// The words for bits of [`Flags`].
-fn flags(flags: u16) -> Vec<&'static str> {
-    let named = [
-        (Flags::SIMULATED, "simulated"),
-        (Flags::REPLAYED, "replayed"),
-        (Flags::STAMP_ESTIMATED, "stamp_estimated"),
-        (Flags::REMOTE, "remote"),
-    ];
-    named.into_iter().filter(|(bit, _)| flags & bit != 0).map(|(_, name)| name).collect()
-}
 
 fn us(ns: u64) -> String {
     format!("{:.1}", ns as f64 / 1e3)

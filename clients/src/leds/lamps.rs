@@ -67,8 +67,14 @@ impl Lamps {
         }
     }
 
-    /// The lights of `sensor` as a line: readable with colours and without.
-    pub(crate) fn line(&self, line: &mut Vec<u8>, sensor: &str, colours: bool) -> io::Result<()> {
+    /// The lights of `sensor` as a line, with what may be the `reason`: readable with colours and without.
+    pub(crate) fn line(
+        &self,
+        line: &mut Vec<u8>,
+        sensor: &str,
+        reason: Option<&str>,
+        colours: bool,
+    ) -> io::Result<()> {
         write!(line, "{sensor}")?;
         for light in Light::ALL {
             let (name, lit) = (light.name(), self.lit(light));
@@ -83,8 +89,12 @@ impl Lamps {
             write!(line, " {worst}")?;
         }
         match self.marks {
-            Some(1) => write!(line, ", 1 mark"),
-            Some(marks) => write!(line, ", {marks} marks"),
+            Some(1) => write!(line, ", 1 mark")?,
+            Some(marks) => write!(line, ", {marks} marks")?,
+            None => {}
+        }
+        match reason {
+            Some(reason) => write!(line, ", {reason}"),
             None => Ok(()),
         }
     }
@@ -121,7 +131,7 @@ mod tests {
     fn lines() {
         let text = |lamps: &Lamps, colours| {
             let mut line = Vec::new();
-            lamps.line(&mut line, "front", colours).unwrap();
+            lamps.line(&mut line, "front", None, colours).unwrap();
             String::from_utf8(line).unwrap()
         };
         let stop = Lamps { worst: Some("rear".into()), ..lamps(Verdict::Stop, None) };
@@ -133,5 +143,8 @@ mod tests {
             "front  \x1b[1;32m● green\x1b[0m  ○ yellow  ○ red  \x1b[1;36m● mark\x1b[0m  clear, 1 mark"
         );
         assert!(text(&lamps(Verdict::Slow, Some(0)), false).ends_with("  slow, 0 marks"));
+        let mut line = Vec::new();
+        stop.line(&mut line, "robot", Some("41 % lost on the line"), false).unwrap();
+        assert!(line.ends_with(b"  stop rear, 41 % lost on the line"));
     }
 }

@@ -2,7 +2,7 @@
 //! It sends nothing. Refuses to know what a datagram says.
 
 use std::io::{self, IoSliceMut};
-use std::net::{IpAddr, Ipv4Addr, SocketAddrV4, UdpSocket};
+use std::net::{Ipv4Addr, SocketAddrV4, UdpSocket};
 use std::os::fd::AsRawFd;
 use std::time::{Duration, Instant};
 
@@ -42,8 +42,8 @@ pub(super) struct Ear {
 pub(super) struct Caught<'a> {
     /// All of it.
     pub(super) bytes: &'a [u8],
-    /// Its sender's address.
-    pub(super) from: IpAddr,
+    /// Its sender's address and port.
+    pub(super) from: SocketAddrV4,
     /// When it came, in ns of CLOCK_MONOTONIC and since 1970, however late it is read.
     pub(super) arrival_ns: u64,
     pub(super) wall_ns: u64,
@@ -168,7 +168,7 @@ impl Ear {
                     ControlMessageOwned::ScmTimestampns(at) => Some(wall_ns(at)),
                     _ => None,
                 });
-                (message.bytes, message.address.map_or(0, |address| address.ip()), came_ns)
+                (message.bytes, message.address, came_ns)
             }
             Err(Errno::EAGAIN) => {
                 self.empty_ns = clock::now_ns();
@@ -181,7 +181,7 @@ impl Ear {
         let waited_ns = waited_ns(came_ns, wall_ns, now_ns.saturating_sub(self.empty_ns));
         Ok(Some(Caught {
             bytes: &buffer[..len],
-            from: Ipv4Addr::from(from).into(),
+            from: from.map_or(SocketAddrV4::new(Ipv4Addr::UNSPECIFIED, 0), SocketAddrV4::from),
             arrival_ns: now_ns - waited_ns,
             wall_ns: wall_ns.saturating_sub(waited_ns),
         }))

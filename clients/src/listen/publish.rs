@@ -7,10 +7,10 @@ mod topics;
 
 use std::time::{Duration, Instant};
 
-use schema::datagram::{Announce, Head};
+use schema::datagram::{Announce, Arrival, Head};
 use schema::ipc::{self, Node};
 use schema::shortage::{allocate, check_descriptors, check_memory, raise_descriptor_limit, sensor_bytes};
-use schema::{Domain, Failure, Kind, ListenLock, Topic};
+use schema::{Domain, Failure, ListenLock, Topic};
 
 use super::remote::Remote;
 use topics::RemoteTopics;
@@ -21,6 +21,11 @@ pub(super) struct Publication {
     sensors: Vec<RemoteTopics>,
     /// What was not published.
     pub(super) left_out: LeftOut,
+    /// Sensors that were put out for others.
+    pub(super) displaced: u64,
+    /// So many may still be put out, and when there will be one more.
+    allowance: usize,
+    allow_at: Instant,
     greet_at: Instant,
     upkeep_at: Instant,
     node: Node,
@@ -36,7 +41,7 @@ pub(super) struct LeftOut {
     pub(super) unannounced: u64,
     /// A newer one was published already.
     pub(super) late: u64,
-    /// Of more than [`SENSORS`] sensors.
+    /// Of sensors beyond the [`SENSORS`] for which there was room.
     pub(super) capacity: u64,
     /// Announced, but there was no memory or no descriptor for their topic.
     pub(super) shortage: u64,
@@ -44,6 +49,10 @@ pub(super) struct LeftOut {
 
 /// The most sensors: each takes up to 6 MB of shared memory, and whoever can send to the network can announce some.
 pub(super) const SENSORS: usize = 16;
+
+/// To put out a sensor and make the topics of another takes milliseconds, and whoever can send can ask for it: so long it
+/// takes until one more may be, after as many as there is room for.
+const ALLOW_EVERY: Duration = Duration::from_millis(250);
 
 /// Descriptors of a service, and of its first consumer.
 const SERVICE_DESCRIPTORS: u64 = 8;
@@ -70,6 +79,9 @@ impl Publication {
             domain: domain.clone(),
             sensors: Vec::new(),
             left_out: LeftOut::default(),
+            displaced: 0,
+            allowance: SENSORS,
+            allow_at: now,
             greet_at: now,
             upkeep_at: now + UPKEEP,
             node,
@@ -77,16 +89,19 @@ impl Publication {
         })
     }
 
-    /// `announce` came from the gateway that is called `hub`: makes what is not there yet of its sensor. The name of the
-    /// sensor here, when all of it is there for the first time. Whoever had its number before has it no more, even if
-    /// there is no room for this one: no sensor's samples are ever another's.
+    /// `announce` came from the gateway that is called `hub`, or now a sample of the sensor that it announced: makes what is
+    /// not there yet of its sensor. The name of the sensor here, when all of it is there for the first time. Whoever had its
+    /// number before has it no more, even if there is no room for this one: no sensor's samples are ever another's.
     ///
-    /// [`Kind::Short`] if memory, descriptors or places are; the sensors that are there go on.
+    /// A sample puts out another sensor where there is no room, but none that is known to deliver; an announcement does not.
+    ///
+    /// [`Kind::Short`] if memory or descriptors are; the sensors that are there go on.
     pub(super) fn announced(
         &mut self,
         head: &Head,
         hub: &str,
         announce: &Announce,
+        arrival: Arrival,
     ) -> Result<Option<String>, Failure> {
         let name = format!("{hub}.{}", announce.sensor());
         for sensor in self.sensors.iter_mut().filter(|sensor| sensor.is(head) && sensor.name != name) {
@@ -94,17 +109,14 @@ impl Publication {
         }
         let at = self.sensors.iter().position(|sensor| sensor.name == name);
         if at.is_none() && self.sensors.len() == SENSORS {
-            let what =
-                format!("more than {SENSORS} remote sensors are announced: the others are not published");
-            return Err(Failure::new(
-                Kind::Short,
-                what,
-                "let another listener with another --domain have them",
-            ));
+            match self.least(arrival).filter(|_| arrival.delivers && self.allowance > 0) {
+                Some(least) => self.put_out(least),
+                None => return Ok(None),
+            }
         }
         if let Some(at) = at {
             // What it has goes on, even if there is no room for more.
-            self.sensors[at].announced(head, announce);
+            self.sensors[at].announced(head, announce, arrival);
         }
         let is_missing = |topic: &Topic| {
             let is_announced = announce.topics().iter().any(|announced| announced.topic == topic.number());
@@ -119,7 +131,7 @@ impl Publication {
             Some(at) => at,
             None => {
                 let mut sensor = RemoteTopics::new(&self.node, &name)?;
-                sensor.announced(head, announce);
+                sensor.announced(head, announce, arrival);
                 self.sensors.push(sensor);
                 self.sensors.len() - 1
             }
@@ -134,6 +146,12 @@ impl Publication {
         }
         let is_told = std::mem::replace(&mut self.sensors[at].is_told, true);
         Ok((!is_told).then_some(name))
+    }
+
+    /// What comes with `head` is of no sensor here, and one may be put out for it.
+    pub(super) fn may_make_room(&self, head: &Head) -> bool {
+        let is_full = self.sensors.len() == SENSORS && self.allowance > 0;
+        is_full && !self.sensors.iter().any(|sensor| sensor.is(head))
     }
 
     /// Publishes `remote`, if it can be.
@@ -168,6 +186,10 @@ impl Publication {
             self.greet_at = now + GREET_EVERY;
             self.sensors.iter_mut().for_each(|sensor| sensor.look(now));
         }
+        if now >= self.allow_at {
+            self.allow_at = now + ALLOW_EVERY;
+            self.allowance = SENSORS.min(self.allowance + 1);
+        }
         if now >= self.upkeep_at {
             self.upkeep_at = now + UPKEEP;
             self.node.try_cleanup_dead_nodes();
@@ -182,5 +204,18 @@ impl Publication {
     /// The names of the sensors here.
     pub(super) fn names(&self) -> Vec<&str> {
         self.sensors.iter().map(|sensor| sensor.name.as_str()).collect()
+    }
+
+    /// Where the sensor stands that is put out for another of which this came.
+    fn least(&self, arrival: Arrival) -> Option<usize> {
+        let may_go = |at: &usize| self.sensors[*at].standing.may_go(arrival);
+        (0..self.sensors.len()).filter(may_go).min_by_key(|&at| self.sensors[at].standing.worth_ns())
+    }
+
+    /// Takes the sensor away, after a last word to who follows it.
+    fn put_out(&mut self, at: usize) {
+        self.sensors.remove(at).replaced();
+        self.displaced += 1;
+        self.allowance -= 1;
     }
 }

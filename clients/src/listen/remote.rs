@@ -56,7 +56,8 @@ impl Remote<'_> {
 
     /// A line of JSON; `sensor` is called so by [`Roll::name`](super::roll::Roll::name).
     pub(super) fn json(&self, sensor: &str, out: &mut Output<'_>) -> Result<(), End> {
-        let header = &self.header();
+        // The flags come behind all that there is of a sample here.
+        let header = &Header { flags: 0, ..self.header() };
         let payload = self.datagram.payload;
         match self.topic {
             Topic::Telegram => {
@@ -109,11 +110,15 @@ impl Remote<'_> {
             age_ms: Option<f64>,
             #[serde(skip_serializing_if = "std::ops::Not::not")]
             late: bool,
+            #[serde(flatten)]
+            flags: Option<json::Words>,
         }
         let Head { hub, epoch, .. } = self.datagram.head;
         // Nobody has keys yet: what is flagged may be as false as what is not.
         let authenticated = false;
-        out.json(&Line { sample, hub, epoch, authenticated, age_ms: self.age_ms(), late: self.late })
+        let has_head = !matches!(self.topic, Topic::Background | Topic::Status);
+        let flags = has_head.then(|| json::Words::of(&self.header()));
+        out.json(&Line { sample, hub, epoch, authenticated, age_ms: self.age_ms(), late: self.late, flags })
     }
 
     fn age_ms(&self) -> Option<f64> {

@@ -3,19 +3,21 @@
 
 use std::collections::{HashMap, HashSet};
 
-use schema::datagram::{Account, Announce, Head};
+use schema::datagram::{Account, Announce, Head, LIVES};
 
 /// All lives of gateways that were heard, as long as the account keeps them apart.
 #[derive(Default)]
 pub(super) struct Roll {
     lives: HashMap<(u64, u32), Life>,
-    /// The gateways of which it was told that their clocks differ; an account takes no more of them than it has lives.
+    /// The gateways of which it was told that their clocks differ, the first ones: whoever can send can invent more.
     told: HashSet<u64>,
 }
 
 /// One life of one gateway.
 #[derive(Default)]
 pub(super) struct Life {
+    /// When the account took it: another time, and it is another one.
+    since_ns: Option<u64>,
     sensors: HashMap<u8, Sensor>,
     delays: Delays,
 }
@@ -40,10 +42,11 @@ impl Roll {
     /// The life that sent `head`, which `account` has taken.
     pub(super) fn life(&mut self, head: &Head, account: &Account) -> &mut Life {
         let life = (head.hub, head.epoch);
-        if !self.lives.contains_key(&life) {
-            self.lives.retain(|&(hub, epoch), _| account.knows(hub, epoch));
+        let since_ns = account.since_ns(head.hub, head.epoch);
+        if self.lives.get(&life).is_none_or(|known| known.since_ns != since_ns) {
+            self.lives.retain(|&(hub, epoch), known| account.since_ns(hub, epoch) == known.since_ns);
         }
-        self.lives.entry(life).or_default()
+        self.lives.entry(life).or_insert_with(|| Life { since_ns, ..Life::default() })
     }
 
     /// An announcement that came with `head`, which `account` has taken, at `wall_ns`. If it tells that the clocks differ, how
@@ -57,7 +60,8 @@ impl Roll {
     ) -> Option<i64> {
         let difference_ns =
             self.life(head, account).announce(head.sensor, announce, head.stamp_ns, wall_ns)?;
-        self.told.insert(head.hub).then_some(difference_ns)
+        let is_new = self.told.len() < LIVES && self.told.insert(head.hub);
+        is_new.then_some(difference_ns)
     }
 
     /// What the sensor is called: its name, or `#` and its number as long as nobody announced it.
@@ -165,7 +169,7 @@ impl Delays {
 mod tests {
     use super::*;
 
-    use schema::datagram::{Announced, HEAD, LIVES, Packed};
+    use schema::datagram::{Announced, HEAD, Packed};
     use schema::{Topic, Zones};
 
     const MS: u64 = 1_000_000;
@@ -202,7 +206,7 @@ mod tests {
             let head = Head { topic: 4, revision: 1, hub: 5, epoch, ..Head::default() };
             let mut buffer = [0; 100];
             let len = Zones::unknown().pack(&mut buffer[HEAD..]).unwrap();
-            account.receive(head.seal(&mut buffer, len).unwrap()).unwrap();
+            account.receive(head.seal(&mut buffer, len).unwrap(), 1, 0).unwrap();
             roll.life(&head, &account).announce(0, &Announce::new(3, "rear", ""), MS, MS);
         }
         assert_eq!((roll.lives.len(), account.given_up().lives), (LIVES, 299 - LIVES as u64));

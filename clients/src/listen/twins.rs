@@ -1,6 +1,7 @@
-//! Two gateways that send under one number, as those of two machines made from one disk image do: the datagrams of the
-//! one that began first are refused, for as long as both send. Told apart from a gateway that was started anew, of whose
-//! life before something comes late. Time is an argument; refuses to know why a datagram is refused.
+//! Two gateways that send under one number in two epochs, as those of two machines made from one disk image do: the
+//! datagrams of the one that began first are refused, for as long as both send. (Those of one epoch the account keeps
+//! apart.) Told apart from a gateway that was started anew, of whose life before something comes late. Time is an argument;
+//! refuses to know why a datagram is refused.
 
 use std::time::{Duration, Instant};
 
@@ -38,10 +39,11 @@ impl Twins {
     /// is said once.
     pub(super) fn refused(&mut self, hub: u64, now: Instant) -> bool {
         let Some(twin) = self.of(hub) else {
-            // Of no more hubs anything is taken.
-            if self.0.len() < LIVES {
-                self.0.push(Twin { hub, since: now, turns: 0, is_taken: false, is_told: false });
+            // Whoever can send can invent hubs: the oldest makes room.
+            if self.0.len() == LIVES {
+                self.0.remove(0);
             }
+            self.0.push(Twin { hub, since: now, turns: 0, is_taken: false, is_told: false });
             return false;
         };
         if now - twin.since >= WINDOW {

@@ -13,8 +13,8 @@ use super::map::{DOTS, colour, map};
 use super::scene::{Scene, Sensor, verdict};
 use super::view::View;
 
-/// Draws `scene` as `view` says.
-pub(crate) fn draw(frame: &mut Frame<'_>, scene: &Scene, view: &View) {
+/// Draws `scene` as `view` says, with the picture of `held` if that is there: what there is to act on is never held.
+pub(crate) fn draw(frame: &mut Frame<'_>, scene: &Scene, held: Option<&Scene>, view: &View) {
     let places = Places::of(frame.area(), scene);
     let heading = heading(scene, view, places.heading.width);
     if let Some(over) =
@@ -24,7 +24,7 @@ pub(crate) fn draw(frame: &mut Frame<'_>, scene: &Scene, view: &View) {
         frame.render_widget(over, place);
     }
     frame.render_widget(heading, places.heading);
-    frame.render_widget(map(scene, view, (places.map.width, places.map.height)), places.map);
+    frame.render_widget(map(held.unwrap_or(scene), view, (places.map.width, places.map.height)), places.map);
     frame.render_widget(Line::raw(measure(view.dot_m)), last_row(places.map));
     for (row, (number, sensor)) in places.sensors.rows().zip(listed(scene, view, places.sensors.height)) {
         frame.render_widget(line(number, sensor, view, row.width), row);
@@ -127,12 +127,14 @@ fn line(number: usize, sensor: &Sensor, view: &View, width: u16) -> Line<'static
     let age = dash(sensor.meter.age_ms().map(|(mean, _)| format!("{mean:.2}")));
     let greatest = dash(sensor.meter.age_ms().map(|(_, greatest)| format!("{greatest:.2}")));
     let mut text = format!("{} {:<8} {:<9}", number + 1, sensor.name, sensor.state());
+    let loss = sensor.status.and_then(|status| status.line_loss());
     let error = sensor.status.map(|status| status.last_error().to_owned()).unwrap_or_default();
     if sensor.scan.is_none() && !error.is_empty() {
         text += &format!(" {error}");
     } else {
-        let mut fields =
-            vec![format!(" {hz:>5} Hz"), format!(" {age:>5} ms"), format!("  lost {}", sensor.lost)];
+        let mut fields = vec![format!(" {hz:>5} Hz")];
+        fields.extend(loss.iter().map(|loss| format!("  {loss}")));
+        fields.extend([format!(" {age:>5} ms"), format!("  lost {}", sensor.lost)]);
         if sensor.is_frozen() {
             fields.push("  frozen".to_owned());
         }
@@ -152,7 +154,10 @@ fn line(number: usize, sensor: &Sensor, view: &View, width: u16) -> Line<'static
         }
     }
     let is_shown = view.only.is_none_or(|only| only == number);
-    let style = if is_shown { Style::new() } else { Style::new().add_modifier(Modifier::DIM) };
+    let mut style = if is_shown { Style::new() } else { Style::new().add_modifier(Modifier::DIM) };
+    if loss.is_some() {
+        style = style.add_modifier(Modifier::BOLD);
+    }
     Line::styled(text, style)
 }
 

@@ -106,12 +106,16 @@ fn scene() -> Scene {
     scene
 }
 
-fn screen(scene: &Scene, view: &View, (columns, rows): (u16, u16)) -> Buffer {
+fn screen(scene: &Scene, view: &View, size: (u16, u16)) -> Buffer {
+    screen_held(scene, None, view, size)
+}
+
+fn screen_held(scene: &Scene, held: Option<&Scene>, view: &View, (columns, rows): (u16, u16)) -> Buffer {
     let mut terminal = Terminal::new(TestBackend::new(columns, rows)).unwrap();
     let mut view = view.clone();
     let drawn = terminal.draw(|frame| {
-        view.fit(scene, dots(frame.area(), scene));
-        draw(frame, scene, &view);
+        view.fit(held.unwrap_or(scene), dots(frame.area(), scene));
+        draw(frame, scene, held, &view);
     });
     drawn.unwrap().buffer.clone()
 }
@@ -152,6 +156,34 @@ fn help_one_sensor_and_a_hub_that_went() {
     scene.hub_gone();
     let gone = View { dot_m: 0.12, ..View::new(false) };
     compare("tests/watch/gone_60x20.txt", &text(&screen(&scene, &gone, (60, 20))));
+}
+
+/// A person who looks at a picture that stands still sees the verdict of now.
+#[test]
+fn a_held_picture_has_the_verdict_of_now() {
+    let (held, mut now) = (scene(), scene());
+    let view = View { paused: true, ..View::new(false) };
+    let before = text(&screen(&held, &view, (60, 20)));
+    let rows = |now: &Scene| {
+        let rows = text(&screen_held(now, Some(&held), &view, (60, 20)));
+        assert!(
+            rows.lines().zip(before.lines()).take(17).skip(1).all(|(now, before)| now == before),
+            "{rows}"
+        );
+        rows.lines().map(str::to_owned).collect::<Vec<_>>()
+    };
+    now.sensor("front").zones = zones(Verdict::Stop, 412, [1, 1]);
+    now.sensor("front").scan = None;
+    now.sensor("rear").lost = 7;
+    let stop = rows(&now);
+    assert!(stop[0].starts_with(" STOP  HELD  front, nearest 0.41 m"), "{stop:#?}");
+    assert!(stop[18].contains("lost 7"), "{stop:#?}");
+    now.hub_gone();
+    let gone = rows(&now);
+    assert!(
+        gone[0].starts_with(" UNKNOWN  HELD  front") && gone[0].ends_with("no hub: waiting for it"),
+        "{gone:#?}"
+    );
 }
 
 /// Light terminals and dark ones: nothing is painted in black or white, or on a colour; and without colours nothing is
@@ -287,3 +319,18 @@ fn ink(colour: Color) -> &'static str {
 const CELL: (u16, u16) = (8, 16);
 /// Column and row of the dots, by their bits (Unicode 2800h to 28FFh).
 const BRAILLE: [(u16, u16); 8] = [(0, 0), (0, 1), (0, 2), (1, 0), (1, 1), (1, 2), (0, 3), (1, 3)];
+
+#[test]
+fn what_the_line_takes_away_is_seen_on_a_small_screen_too() {
+    let mut scene = scene();
+    let mut status = scene.sensor("rear").status.unwrap();
+    status.counters[Counter::DueOnLine] = 1000;
+    status.counters[Counter::LostPpm] = 412_000;
+    scene.sensor("rear").take_status(&status);
+    for size in [(60, 20), (120, 40)] {
+        let screen = text(&screen(&scene, &View::new(true), size));
+        let line = screen.lines().find(|line| line.starts_with("2 rear")).unwrap();
+        assert!(line.contains(" Hz  41 % lost on the line"), "{line}");
+        assert!(!screen.lines().any(|line| line.starts_with("1 front") && line.contains("line")), "{screen}");
+    }
+}

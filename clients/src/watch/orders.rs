@@ -53,8 +53,8 @@ fn carry_out(places: &[Domain], sensors: &[String], verb: Verb, stop: &AtomicBoo
     let mut models = Vec::new();
     let mut order = |sensor: &String| -> Result<(), Failure> {
         request(places, &Request::new(sensor, verb), stop)?;
-        let model = request(places, &Request::new(sensor, Verb::Show), stop)?;
-        models.extend(model.map(|model| (sensor.clone(), model)));
+        let shown = request(places, &Request::new(sensor, Verb::Show), stop)?;
+        models.extend(shown.map(|shown| (sensor.clone(), shown.model)));
         Ok(())
     };
     let news = match sensors.iter().try_for_each(&mut order) {

@@ -126,6 +126,7 @@ impl LinkThread<'_> {
             session.control(Control::Pause, clock::now());
         }
         let end = self.stream(port, &mut session);
+        self.is_flooded = false;
         self.account.close(&session);
         (session.tally().read > 0, end)
     }

@@ -8,7 +8,7 @@ use std::sync::mpsc::{Receiver, SyncSender, TrySendError, channel, sync_channel}
 use std::sync::{Arc, Mutex, PoisonError};
 
 use schema::ipc::{self, Asked, ControlServer, Node};
-use schema::{Background, Failure, Kind, Response, Verb, shortage};
+use schema::{Background, Failure, Kind, Response, Shown, Verb, shortage};
 
 use crate::bell::Bell;
 use crate::config::Processing;
@@ -37,7 +37,7 @@ struct Inbox {
 type Changed = Arc<Mutex<Option<Box<Processing>>>>;
 
 /// What came of an order: done, with the model that was asked for, or why not.
-type Outcome = Result<Option<Box<Background>>, Failure>;
+type Outcome = Result<Option<Box<Shown>>, Failure>;
 
 struct Order {
     number: u64,
@@ -156,7 +156,7 @@ impl Desk {
     }
 
     fn answer(&self, asked: Asked, outcome: Outcome) {
-        let response = Response(outcome.map(|model| model.map(|model| *model)));
+        let response = Response(outcome.map(|shown| shown.map(|shown| *shown)));
         if let Err(failure) = self.server.answer(asked, &response) {
             tracing::debug!(%failure, "a client was not answered");
         }

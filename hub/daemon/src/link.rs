@@ -16,6 +16,7 @@ use schema::{Failure, Flags, State, Status, Wake};
 use crate::clock;
 use crate::config::{Link, Source};
 use crate::control::{Flow, Orders};
+use crate::learned::Slot;
 use crate::line_errors::LineErrors;
 use crate::memory::Memory;
 use crate::pipeline::Pipeline;
@@ -53,6 +54,8 @@ pub(crate) struct LinkThread<'a> {
     pub(crate) memory: Option<Memory>,
     /// Statuses in a row that said that consumers got nothing.
     pub(crate) unreached: u32,
+    /// The port brings more than its line can.
+    pub(crate) is_flooded: bool,
     /// The measuring mode of which was said whether it has marks.
     pub(crate) told_mode: u8,
     /// The sensor, as it turned out to be, sees too little of its circles.
@@ -68,6 +71,8 @@ pub(crate) struct Surroundings<'a> {
     pub(crate) service: &'a Service,
     /// The domain's directory.
     pub(crate) root: &'a Path,
+    /// Where what was learned goes, for the next hub; nothing where that is not wanted.
+    pub(crate) slot: Option<&'a Slot>,
     /// Set whenever the link finished something.
     pub(crate) worked: &'a AtomicBool,
 }
@@ -110,6 +115,7 @@ impl<'a> LinkThread<'a> {
             line_errors: LineErrors::default(),
             memory: None,
             unreached: 0,
+            is_flooded: false,
             told_mode: Status::MODE_UNKNOWN,
             is_blind: false,
         }
@@ -129,15 +135,27 @@ impl<'a> LinkThread<'a> {
             Source::File { path, paced } => replay::run(&mut self, cast, path, *paced, report),
             Source::Tty(_) | Source::Tcp { .. } => self.attend(report),
         }
+        self.hand_on(true);
+    }
+
+    /// Lets what was learned be kept, if that is news; if this is the `last` time, whatever there is.
+    fn hand_on(&mut self, last: bool) {
+        if let Some(slot) = self.around.slot
+            && let Some((pose, model)) = self.pipeline.hand_on(last)
+        {
+            slot.put(pose, model);
+        }
     }
 
     /// Drives `session` on `tty` until the hub shall end; an error says that the port is gone.
     pub(crate) fn stream(&mut self, port: &Port, session: &mut Session) -> io::Result<()> {
+        let mut allowance = port.allowance(self.link.baud.rate());
         loop {
             let (watch, until) = self.drain(port, session)?;
+            let rest = allowance.as_mut().and_then(|allowance| allowance.rest(clock::now(), until));
             // Also while bytes are left alone the port may go away.
-            let events = if watch { PollFlags::IN } else { PollFlags::empty() };
-            match self.wait(Some((port.as_fd(), events)), until) {
+            let events = if watch && rest.is_none() { PollFlags::IN } else { PollFlags::empty() };
+            match self.wait(Some((port.as_fd(), events)), rest.unwrap_or(until)) {
                 Woken::Stop => return Ok(()),
                 Woken::Order => {
                     self.obey(Flow::Session(session));
@@ -156,9 +174,18 @@ impl<'a> LinkThread<'a> {
             {
                 continue;
             }
-            let len = port.read(session.spare())?;
+            let mut spare = session.spare();
+            if let Some(allowance) = &allowance {
+                let most = spare.len().min(allowance.bytes(clock::now()).max(1));
+                spare = &mut spare[..most];
+            }
+            let len = port.read(spare)?;
             let now = clock::now();
             session.commit(now, len);
+            if let Some(allowance) = &mut allowance {
+                allowance.take(len, now);
+                self.watch_flood(allowance.is_flooded(now));
+            }
             if len == 0 && now >= until {
                 session.handle_timeout(now);
             }
@@ -255,6 +282,7 @@ impl<'a> LinkThread<'a> {
                 self.topics.wake(Wake::Status);
             }
             self.memory.iter_mut().for_each(|memory| memory.keep(session, now));
+            self.hand_on(false);
             self.watch_reach();
             self.tell_mode();
         }

@@ -85,8 +85,9 @@ mod tests {
 
     #[test]
     fn what_was_known_just_now_of_this_port_is_known() {
-        let root = std::env::temp_dir().join(format!("scanhub-memory-{}", std::process::id()));
-        std::fs::create_dir_all(&root).unwrap();
+        let base = std::env::temp_dir().join(format!("scanhub-memory-{}", std::process::id()));
+        let root = base.join("domain");
+        Directory::make(&root).unwrap();
         let identity = |byte: u8| Identity::from_bytes([byte; Identity::LEN]);
         let (now, port) = (9_000 * MILLIS, "/dev/ttyUSB0");
         let mut memory = Memory::open(&root, "front", port);
@@ -109,6 +110,6 @@ mod tests {
         let mut nowhere = Memory::open(&root.join("nowhere"), "front", port);
         nowhere.write(identity(1), now);
         assert_eq!(nowhere.recall(now), None);
-        std::fs::remove_dir_all(&root).unwrap();
+        std::fs::remove_dir_all(&base).unwrap();
     }
 }

@@ -7,7 +7,7 @@ use preprocess::background::{Mismatch, Model};
 use preprocess::marks::Finder;
 use preprocess::segments::Cutter;
 use preprocess::zones::Check;
-use schema::{Background, Failure, Foreground, Kind, Marks, Scan, Verb, Zones};
+use schema::{Background, Failure, Foreground, Kind, Marks, Pose, Scan, Verb, Zones};
 
 use crate::config::Processing;
 
@@ -32,6 +32,8 @@ struct Kept {
     published: Option<u32>,
     /// Scans that it has learned from since.
     learned: u32,
+    /// The generation that was handed on last, and scans that it has learned from since.
+    handed_on: (u32, u32),
     /// Beams and unit of the model, as far as something was learned or loaded.
     shape: Option<(u16, u8)>,
 }
@@ -156,6 +158,22 @@ impl Pipeline {
         }
     }
 
+    /// The model for the next hub, if that shall have it, and where the sensor sits: of a generation that was not handed on,
+    /// or that has learned since for as long as it takes; or, if it is `last` time, for however long.
+    pub(crate) fn hand_on(&mut self, last: bool) -> Option<(Pose, Background)> {
+        let Processing { pose, background, .. } = &self.processing;
+        let kept = self.background.as_mut().filter(|_| background.is_handed_on)?;
+        let (generation, learned) = kept.handed_on;
+        let enough = if last { 1 } else { u32::from(kept.model.scans()) };
+        if learned < enough && generation == kept.model.generation() {
+            return None;
+        }
+        kept.handed_on = (kept.model.generation(), 0);
+        let mut model = Background::default();
+        kept.model.show(&mut model);
+        Some((*pose, model))
+    }
+
     /// Does what a user asks of the background of `sensor`; the model, for [`Verb::Show`]. `model` is that of a request
     /// to load.
     ///
@@ -201,11 +219,13 @@ impl Kept {
             every_scan: background.every_scan,
             published: None,
             learned: 0,
+            handed_on: (0, 0),
             shape: None,
         };
         if let Some(model) = &background.model {
             // Before the first scan every model is taken.
             let _ = kept.load(model);
+            kept.handed_on.0 = kept.model.generation();
         }
         kept
     }
@@ -225,7 +245,9 @@ impl Kept {
             }
             None => self.model.update(scan, spare),
         }
-        self.learned = self.learned.saturating_add(u32::from(!self.model.is_frozen()));
+        let scans = u32::from(!self.model.is_frozen());
+        self.learned = self.learned.saturating_add(scans);
+        self.handed_on.1 = self.handed_on.1.saturating_add(scans);
         let sensor = (scan.beams() as u16, scan.unit_mm);
         let model = self.shape.replace(sensor).filter(|shape| *shape != sensor);
         let anew = model.map_or(Anew::Angles, |model| Anew::Shape(Mismatch { model, sensor }));

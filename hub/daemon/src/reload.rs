@@ -124,8 +124,9 @@ impl Differences {
 fn taken(old: &Processing, new: &Processing) -> Processing {
     let mut taken = new.clone();
     if old.background.is_kept {
-        let Background { learning, file, model, .. } = &old.background;
+        let Background { learning, file, model, start_is_said, .. } = &old.background;
         taken.background.learning.start = learning.start;
+        taken.background.start_is_said = *start_is_said;
         (taken.background.file, taken.background.model) = (file.clone(), model.clone());
     }
     taken

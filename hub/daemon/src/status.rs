@@ -8,6 +8,7 @@ use lms::{Nanos, Session};
 use schema::{Counter, Counters, Pose, State, Status};
 
 use crate::config::Link;
+use crate::recent::Recent;
 
 /// The link's account, across all sessions on its port.
 pub(crate) struct Account {
@@ -16,6 +17,8 @@ pub(crate) struct Account {
     mode: Option<Mode>,
     /// Counters of the sessions that ended.
     past: Counters,
+    /// What the line took away lately.
+    recent: Recent,
     /// Counters as they were when the rate was last computed.
     measured_at: Option<(Nanos, u64)>,
     /// Scans published.
@@ -37,6 +40,7 @@ impl Account {
             status,
             mode: link.mode,
             past: Counters::default(),
+            recent: Recent::new(),
             measured_at: None,
             scans: 0,
             wakeups: 0,
@@ -74,6 +78,7 @@ impl Account {
         counters[Counter::Wakeups] = self.wakeups;
         counters[Counter::LoanFailed] = loan_failed;
         counters[Counter::LineErrors] = self.line_errors;
+        self.recent.gauge(now, &mut counters);
         self.status.counters = counters;
         let (since, scans) = *self.measured_at.get_or_insert((now, self.scans));
         if now > since {
@@ -152,6 +157,9 @@ fn add(counters: &mut Counters, session: &Session) {
     counters[Counter::Telegrams] += tally.telegrams;
     counters[Counter::Aborted] += tally.aborted;
     counters[Counter::Resyncs] += session.resyncs();
+    counters[Counter::BytesDamaged] += session.bytes_damaged();
+    counters[Counter::DueOnLine] += session.scans_due();
+    counters[Counter::LostOnLine] += session.scans_lost();
     counters[Counter::LostInRestart] += u64::from(session.began_with_a_cut());
     for (reject, counter) in REJECTS {
         counters[counter] += tally.rejected[reject as usize];

@@ -9,7 +9,7 @@ use std::thread;
 use lms::{MILLIS, Nanos};
 use rustix::event::{EventfdFlags, PollFd, PollFlags, Timespec, eventfd, poll};
 use schema::ipc::{self, Node};
-use schema::{Domain, Failure, HubLock, Kind, shortage};
+use schema::{Domain, Failure, HubLock, Kind, StateDirectory, shortage};
 
 use crate::config::Config;
 use crate::control::Desk;
@@ -20,7 +20,7 @@ use crate::replay::{Cast, Player, Recorded, Seat};
 use crate::service::{Service, Watchdog};
 use crate::signals::{Signals, Wanted};
 use crate::topics::Topics;
-use crate::{clock, preflight};
+use crate::{clock, learned, preflight};
 
 /// What is up.
 #[derive(Clone, Debug)]
@@ -83,10 +83,15 @@ pub(crate) fn serve(
     domain: &Domain,
     on_ready: impl FnOnce(&Ready),
 ) -> Result<(), Failure> {
-    let (service, config) = (Service::of_process(), &config);
+    let service = Service::of_process();
     preflight::raise_descriptor_limit();
     let signals = Signals::of_process()?;
     let _lock = HubLock::acquire(domain.root())?;
+    // What was learned of sensors is no recording's.
+    let state = StateDirectory::of_domain(domain.name()).filter(|_| troupe.is_none());
+    // Ends after the links: it writes what they had learned last.
+    let (config, keeper) = learned::begin(config, state.as_ref())?;
+    let config = &config;
     preflight::check_descriptors(config.links.len())?;
     preflight::check_memory(config.links.len())?;
     let node = ipc::hub_node(domain)?;
@@ -111,8 +116,9 @@ pub(crate) fn serve(
         let mut threads = Vec::new();
         for ((number, link), orders) in config.links.iter().enumerate().zip(orders) {
             let (node, report) = (&node, report.clone());
-            let around =
-                Surroundings { stop: &stop, service: &service, root: domain.root(), worked: &worked[number] };
+            let slot = keeper.as_ref().and_then(|keeper| keeper.slot(&link.name));
+            let (root, worked) = (domain.root(), &worked[number]);
+            let around = Surroundings { stop: &stop, service: &service, root, slot, worked };
             let cast = player
                 .zip(parts.next())
                 .map(|(player, recorded)| Cast { recorded, seat: Seat { player, number } });

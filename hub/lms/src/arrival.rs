@@ -41,6 +41,9 @@ struct Backlog {
 pub(crate) struct Stamp {
     pub(crate) at: Nanos,
     pub(crate) estimated: bool,
+    /// Where the byte waited while the host did not run: when it must have been there at the latest. Then `at` is the
+    /// earliest time that is possible.
+    pub(crate) latest: Option<Nanos>,
 }
 
 impl Arrivals {
@@ -94,10 +97,11 @@ impl Arrivals {
 
     /// When byte number `offset` arrived at the latest: whatever came behind it, in the same read or in one right after
     /// it, took its time on the line. Of a backlog it is the earliest time that is possible: whoever looks at the age of
-    /// what was measured shall not take it for new.
+    /// what was measured shall not take it for new. Where the beat of the stream is known, [`crate::cadence`] knows better.
     pub(crate) fn stamp(&self, offset: u64, baud: u32) -> Stamp {
         let oldest = self.next.saturating_sub(Arrivals::CAPACITY);
         let (mut at, mut own, mut own_behind) = (Nanos::MAX, Nanos::MAX, ESTIMATED + 1);
+        let (mut latest, mut waited) = (Nanos::MAX, false);
         for n in (oldest..self.next).rev() {
             let read = self.reads[n % Arrivals::CAPACITY];
             if read.end <= offset {
@@ -106,13 +110,15 @@ impl Arrivals {
             own_behind = (read.end - offset - 1) as usize;
             own = read.now.saturating_sub(line_time(own_behind, baud));
             at = at.min(own);
+            latest = latest.min(own);
             if let Some(backlog) = read.backlog.filter(|backlog| backlog.begin <= offset) {
                 at = at.min(backlog.since + line_time((offset - backlog.begin) as usize + 1, baud));
+                waited = true;
             }
         }
         // A host that wakes up a little later for one read than for another is no estimate.
         let moved = own - at > line_time(ESTIMATED, baud);
-        Stamp { at, estimated: own_behind > ESTIMATED || moved }
+        Stamp { at, estimated: own_behind > ESTIMATED || moved, latest: waited.then_some(latest) }
     }
 }
 
@@ -138,9 +144,9 @@ impl Rhythm {
         self.first = Some(first);
     }
 
-    /// Whether it is known how long a telegram takes.
-    pub(crate) fn is_known(&self) -> bool {
-        self.duration.is_some()
+    /// How long a telegram takes, if that is known.
+    pub(crate) fn duration(&self) -> Option<Nanos> {
+        self.duration
     }
 
     /// Until when nothing can be complete; answered once per telegram.
@@ -196,21 +202,27 @@ const SLOW: Nanos = 8 * MILLIS;
 mod tests {
     use super::*;
 
+    /// When a byte arrived, and whether that is an estimate.
+    fn seen(arrivals: &Arrivals, offset: u64) -> (Nanos, bool) {
+        let Stamp { at, estimated, .. } = arrivals.stamp(offset, 500_000);
+        (at, estimated)
+    }
+
     #[test]
     fn a_stamp_knows_what_came_behind_it() {
         let mut arrivals = Arrivals::new(0);
         arrivals.note(1_000_000, 16, Some(500_000));
         arrivals.note(11_000_000, 484, Some(500_000));
-        assert_eq!(arrivals.stamp(0, 500_000), Stamp { at: 1_000_000 - 15 * 20_000, estimated: false });
-        assert_eq!(arrivals.stamp(499, 500_000), Stamp { at: 11_000_000, estimated: false });
-        assert_eq!(arrivals.stamp(16, 500_000), Stamp { at: 11_000_000 - 483 * 20_000, estimated: true });
+        assert_eq!(seen(&arrivals, 0), (1_000_000 - 15 * 20_000, false));
+        assert_eq!(seen(&arrivals, 499), (11_000_000, false));
+        assert_eq!(seen(&arrivals, 16), (11_000_000 - 483 * 20_000, true));
         // Two reads of what had been waiting: the line was not faster because of that.
         arrivals.note(11_010_000, 500, Some(500_000));
-        assert_eq!(arrivals.stamp(499, 500_000), Stamp { at: 11_010_000 - 500 * 20_000, estimated: true });
+        assert_eq!(seen(&arrivals, 499), (11_010_000 - 500 * 20_000, true));
         // Reads with a jitter of some microseconds are what they are.
         arrivals.note(31_000_000, 16, Some(500_000));
         arrivals.note(31_300_000, 16, Some(500_000));
-        assert_eq!(arrivals.stamp(1_015, 500_000), Stamp { at: 30_980_000, estimated: false });
+        assert_eq!(seen(&arrivals, 1_015), (30_980_000, false));
         for _ in 0..200 {
             arrivals.note(40_000_000, 1, Some(500_000));
         }
@@ -234,12 +246,12 @@ mod tests {
         arrivals.note(3_015 * MILLIS, 16, Some(500_000));
         for byte in [0, 731, 1_599, 1_600, 6_399, 6_400, 7_999] {
             let at = 1_000 * MILLIS + (byte + 1) * 20_000;
-            assert_eq!(arrivals.stamp(16 + byte, 500_000), Stamp { at, estimated: true });
+            assert_eq!(seen(&arrivals, 16 + byte), (at, true));
         }
-        assert_eq!(arrivals.stamp(8_031, 500_000), Stamp { at: 3_010 * MILLIS, estimated: false });
+        assert_eq!(seen(&arrivals, 8_031), (3_010 * MILLIS, false));
         // A line that was silent is looked at in time; a slow one that was slept through has kept its pace.
         arrivals.note(5_000 * MILLIS, 62, Some(500_000));
-        assert_eq!(arrivals.stamp(8_109, 500_000), Stamp { at: 5_000 * MILLIS, estimated: false });
+        assert_eq!(seen(&arrivals, 8_109), (5_000 * MILLIS, false));
         arrivals.note(5_762 * MILLIS, 730, Some(9600));
         let stamp = arrivals.stamp(8_110 + 729, 9600);
         assert!(stamp.at > 5_760 * MILLIS && !stamp.estimated, "{stamp:?}");
@@ -250,7 +262,7 @@ mod tests {
         let mut arrivals = Arrivals::new(9_000 * MILLIS);
         arrivals.note(9_010 * MILLIS, 400, Some(500_000));
         let at = 9_010 * MILLIS - 399 * 20_000;
-        assert_eq!(arrivals.stamp(0, 500_000), Stamp { at, estimated: true });
+        assert_eq!(seen(&arrivals, 0), (at, true));
     }
 
     #[test]
@@ -259,10 +271,10 @@ mod tests {
         arrivals.sense(1_000_000, 16);
         arrivals.note(18_000_000, 700, Some(500_000));
         arrivals.note(18_400_000, 32, Some(500_000));
-        assert_eq!(arrivals.stamp(0, 500_000), Stamp { at: 700_000, estimated: false });
-        assert_eq!(arrivals.stamp(731, 500_000), Stamp { at: 18_400_000, estimated: false });
+        assert_eq!(seen(&arrivals, 0), (700_000, false));
+        assert_eq!(seen(&arrivals, 731), (18_400_000, false));
         arrivals.note(30_000_000, 1, Some(500_000));
-        assert_eq!(arrivals.stamp(732, 500_000), Stamp { at: 30_000_000, estimated: false });
+        assert_eq!(seen(&arrivals, 732), (30_000_000, false));
     }
 
     #[test]

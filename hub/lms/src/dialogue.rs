@@ -319,7 +319,7 @@ impl Dialogue {
         let sensor = &self.sensor;
         let is_open = |question: Request| match question {
             Request::Type => sensor.kind().is_empty(),
-            Request::Status => sensor.defective.is_none(),
+            Request::Status => sensor.defective.is_none() || sensor.is_complaint_open(),
             _ => sensor.mode.is_none(),
         };
         while let Some((&question, rest)) = questions.split_first() {
@@ -334,6 +334,7 @@ impl Dialogue {
             *questions = QUESTIONS;
         } else if mode_is_known {
             *ask_at = Nanos::MAX;
+            self.sensor.believe();
             self.trouble = self.trouble.filter(|&trouble| trouble != Trouble::ModeUnknown);
         } else {
             *ask_at = now + QUESTION_PAUSE;

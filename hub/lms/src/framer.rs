@@ -26,6 +26,8 @@ pub struct Tally {
     pub acknowledge: u64,
     /// Bytes that were in nothing.
     pub discarded: u64,
+    /// Of these the bytes of measured-value telegrams that broke off for a reply.
+    pub broken_off: u64,
     /// Delivered telegrams.
     pub telegrams: u64,
     /// Measured-value telegrams that broke off for a reply.
@@ -326,25 +328,28 @@ impl Framer {
             until -= 1;
             self.tally.acknowledge += 1;
         }
+        let mut broken_off = 0;
         for at in self.start..until {
-            if self.buffer[at] == STX {
-                self.count_refusal(at, reply, decided);
+            if self.buffer[at] == STX && self.count_refusal(at, reply, decided) {
+                broken_off = broken_off.max(until - at);
             }
         }
+        self.tally.broken_off += broken_off as u64;
         self.damage |= until > self.start && !reply;
         self.tally.discarded += (until - self.start) as u64;
         self.start = to;
     }
 
-    /// Counts why the start byte at `at` was none, as it stood when the bytes before `decided` were there.
-    fn count_refusal(&mut self, at: usize, winner_is_reply: bool, decided: usize) {
+    /// Counts why the start byte at `at` was none, as it stood when the bytes before `decided` were there. Whether a scan
+    /// began there that broke off.
+    fn count_refusal(&mut self, at: usize, winner_is_reply: bool, decided: usize) -> bool {
         let reject = match judge(&self.buffer[at..self.end.min(at + MAX_HEADER)], &self.expect) {
             Judgement::Refused(reject) => reject,
             Judgement::Prefix(_) => Reject::Superseded,
             Judgement::Candidate { len } if at + len > decided => {
                 if winner_is_reply && self.buffer[at + 4] == MEASURED {
                     self.tally.aborted += 1;
-                    return;
+                    return true;
                 }
                 Reject::Superseded
             }
@@ -354,6 +359,7 @@ impl Framer {
             },
         };
         self.tally.rejected[reject as usize] += 1;
+        false
     }
 
     /// The bytes before `by` are gone from the buffer.

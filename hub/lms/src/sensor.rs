@@ -116,7 +116,18 @@ pub struct Sensor {
     kind_len: usize,
     /// Telegrams in a row whose condition was better.
     calm: u16,
+    /// The line damages what it carries, so that one telegram alone proves nothing bad.
+    is_doubted: bool,
+    /// How often a worse condition was told on such a line, and telegrams since the first time.
+    sightings: u8,
+    sighted_since: u16,
+    /// The last status report complained, and whether the one before it did so likewise.
+    complaint: Option<Complaint>,
+    is_confirmed: bool,
 }
+
+/// What a status report says of the sensor's health: that it is defective, that its window is dirty.
+type Complaint = (bool, bool);
 
 impl Sensor {
     /// Type, number and firmware as ASCII, such as `LMS200;S18063;V02.19`; empty if it was not asked yet.
@@ -143,11 +154,12 @@ impl Sensor {
     pub fn notices(&self) -> impl Iterator<Item = Notice> {
         let severity = self.condition.and_then(Condition::severity);
         let dirty = self.condition.is_some_and(Condition::is_polluted);
+        let (defective, dim) = self.complaint.filter(|_| self.is_confirmed).unwrap_or_default();
         [
-            (self.defective == Some(true), Notice::Defective),
+            (defective, Notice::Defective),
             (severity == Some(Severity::Fatal), Notice::Fatal),
             (severity == Some(Severity::Error), Notice::Error),
-            (dirty || self.window_percent.is_some_and(|percent| percent < DIRTY), Notice::Dirty),
+            (dirty || dim, Notice::Dirty),
             (self.permanent_baud == Some(true), Notice::PermanentBaud),
         ]
         .into_iter()
@@ -160,6 +172,23 @@ impl Sensor {
         self.mode = None;
         self.kind_len = 0;
         self.defective = None;
+        self.complaint = None;
+        self.is_confirmed = false;
+    }
+
+    /// Whether the line that it speaks on damages telegrams now: some of them pass their weak checksum all the same.
+    pub(crate) fn doubt(&mut self, is_doubted: bool) {
+        self.is_doubted = is_doubted;
+    }
+
+    /// Whether its health has to be asked again: one report that complains may be a damaged one.
+    pub(crate) fn is_complaint_open(&self) -> bool {
+        self.complaint.is_some() && !self.is_confirmed
+    }
+
+    /// No second report is to be had: the one that there is counts.
+    pub(crate) fn believe(&mut self) {
+        self.is_confirmed = true;
     }
 
     /// What a session that goes on with its stream, whose scans begin with `header`, would have to ask; nothing if that is not
@@ -217,10 +246,28 @@ impl Sensor {
         self.permanent_baud = Some(report.has_permanent_baud());
         self.laser_power_percent = Some(report.laser_power_percent());
         self.window_percent = report.window_percent();
+        let is_dim = self.window_percent.is_some_and(|percent| percent < DIRTY);
+        let complaint = Some((report.is_defective(), is_dim)).filter(|&it| it != (false, false));
+        self.is_confirmed = complaint.is_some() && complaint == self.complaint;
+        self.complaint = complaint;
         self.software = *report.bytes().first_chunk().unwrap_or(&[0; SOFTWARE_LEN]);
     }
 
+    /// A worse condition was told once more on a line that damages telegrams; whether that is often enough.
+    fn is_sighted(&mut self) -> bool {
+        if self.sightings == 0 || self.sighted_since > CALM {
+            (self.sightings, self.sighted_since) = (0, 0);
+        }
+        self.sightings += 1;
+        self.sightings == SIGHTINGS
+    }
+
     fn feel(&mut self, condition: Option<Condition>) {
+        self.sighted_since = self.sighted_since.saturating_add(1);
+        if self.is_doubted && badness(condition) > badness(self.condition) && !self.is_sighted() {
+            return;
+        }
+        self.sightings = if badness(condition) > 0 { 0 } else { self.sightings };
         let is_better = badness(condition) < badness(self.condition);
         self.calm = if is_better { self.calm + 1 } else { 0 };
         if !is_better || self.calm > CALM {
@@ -239,9 +286,51 @@ fn badness(condition: Option<Condition>) -> u8 {
 
 /// Better telegrams in a row before a bad one is forgotten: some seconds of scans.
 const CALM: u16 = 200;
+/// Telegrams among so many that tell a worse condition before it is believed, on a line that damages some of them.
+const SIGHTINGS: u8 = 3;
 /// Bytes of the firmware's name.
 const SOFTWARE_LEN: usize = 7;
 /// A type reply has 20 or 21 characters.
 pub(crate) const KIND_LEN: usize = 24;
 /// Operating mode: values on request.
 const ON_REQUEST: u8 = 0x25;
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::command::STATUS;
+    use crate::status_report::Health;
+    use crate::telegram::{REPLY, Writer};
+
+    #[test]
+    fn a_report_that_complains_counts_once_another_one_does() {
+        let healthy = Health {
+            software: *b"V02.30 ",
+            operating_mode: ON_REQUEST,
+            mode: Mode(1),
+            variant: Variant::HALF,
+            unit: Unit::Mm,
+            baud: Baud::B500000,
+        };
+        let healthy = healthy.report();
+        let mut defective = healthy;
+        defective[8] = 1;
+        let mut sensor = Sensor::default();
+        let mut told = |report: &[u8]| {
+            let telegram = Writer::new(REPLY, STATUS | REPLY).slice(report).byte(0x10).finish();
+            let reply = Reply::decode(telegram.telegram());
+            assert!(matches!(reply, Some(Reply::Status(_))));
+            sensor.learn(reply.as_ref(), telegram.telegram());
+            (sensor.notices().next(), sensor.is_complaint_open())
+        };
+        assert_eq!(told(&healthy), (None, false));
+        assert_eq!(told(&defective), (None, true));
+        assert_eq!(told(&healthy), (None, false));
+        assert_eq!(told(&defective), (None, true));
+        assert_eq!(told(&defective), (Some(Notice::Defective), false));
+        assert_eq!(told(&healthy), (None, false));
+        told(&defective);
+        sensor.believe();
+        assert_eq!(sensor.notices().next(), Some(Notice::Defective), "no other one is to be had");
+    }
+}

@@ -5,16 +5,18 @@
 //! [`Output::Rest`].
 
 use crate::Nanos;
-use crate::arrival::{Arrivals, Rhythm};
+use crate::arrival::{Arrivals, Rhythm, Stamp};
+use crate::cadence::Cadence;
+use crate::damage::Damage;
 use crate::dialogue::Dialogue;
 use crate::framer::{Advance, Framer, Place, Tally, suspect};
 use crate::identity::Identity;
-use crate::measured::MEASURED;
+use crate::measured::{MEASURED, Measured};
 use crate::outgoing::SOON;
 use crate::phase::{Control, Phase, Reason, Settings};
 use crate::sensor::{Sensor, State, Trouble};
 use crate::telegram::Telegram;
-use crate::variant::{BYTES_PER_TURN, Baud, Mode};
+use crate::variant::{BYTES_PER_TURN, Baud, Mode, Variant};
 
 /// What the session wants, in the order in which it wants it.
 #[derive(Debug)]
@@ -77,6 +79,10 @@ pub struct Session {
     dialogue: Dialogue,
     arrivals: Arrivals,
     rhythm: Rhythm,
+    cadence: Cadence,
+    damage: Damage,
+    /// Number of the first byte of the last scan.
+    last_scan: u64,
     now: Nanos,
     last_byte: Nanos,
     /// Of the last byte of the last telegram.
@@ -97,6 +103,9 @@ impl Session {
             dialogue: Dialogue::new(settings, now),
             arrivals: Arrivals::new(now),
             rhythm: Rhythm::new(),
+            cadence: Cadence::new(),
+            damage: Damage::default(),
+            last_scan: 0,
             now,
             last_byte: now,
             last_stamp: 0,
@@ -134,7 +143,7 @@ impl Session {
         let begins = self.framer.buffered() == 0 && !self.has_more && self.left_until.is_none();
         // An answer takes less time than a scan.
         let is_silent = self.dialogue.open.is_none();
-        begins && is_silent && self.rhythm.is_known() && self.has_pace() && self.is_live()
+        begins && is_silent && self.rhythm.duration().is_some() && self.has_pace() && self.is_live()
     }
 
     /// The line has `waiting` bytes at `now` that were not read. Whether they may stay there until the telegram that they
@@ -172,6 +181,10 @@ impl Session {
     pub fn handle_timeout(&mut self, now: Nanos) {
         self.now = now;
         self.framer.release(now.saturating_sub(self.last_byte));
+        if self.is_live() {
+            // The stream may be over now.
+            self.damage.note(self.framer.tally(), now);
+        }
         self.dialogue.handle_timeout(now);
     }
 
@@ -210,6 +223,8 @@ impl Session {
         self.framer.await_acknowledge(self.dialogue.awaits_acknowledge());
         let next_byte = self.dialogue.outgoing().and_then(|outgoing| outgoing.byte());
         if let Some((byte, not_before)) = next_byte.filter(|&(_, at)| at <= self.now + SOON) {
+            // Whoever answers lets scans out.
+            self.cadence.rest();
             return Output::Transmit { byte, not_before };
         }
         if let Some(until) = self.left_until {
@@ -263,6 +278,23 @@ impl Session {
         self.framer.buffered()
     }
 
+    /// Scans that a streaming sensor must have sent, by its period, after the first one of each stream. A stream ends when
+    /// scans stay out for a second, and where the sensor is asked something; of one whose period is not known, of parts of
+    /// scans and of a recording there are none.
+    pub fn scans_due(&self) -> u64 {
+        self.cadence.due()
+    }
+
+    /// Those of [`scans_due`](Self::scans_due) that did not arrive; known a second later.
+    pub fn scans_lost(&self) -> u64 {
+        self.cadence.lost()
+    }
+
+    /// Bytes of streams that were in nothing, without those of scans that the sensor broke off to answer.
+    pub fn bytes_damaged(&self) -> u64 {
+        self.damage.damaged(self.framer.tally())
+    }
+
     /// How often everything began anew: measured data stayed out for a second, the sensor said that it had just got its
     /// power, or a user asked for it.
     pub fn resyncs(&self) -> u64 {
@@ -278,12 +310,21 @@ impl Session {
         let baud = self.dialogue.baud.rate();
         let telegram = self.framer.view(place).telegram;
         let (len, is_scan) = (telegram.bytes().len() as u64, telegram.command() == MEASURED);
+        let period = self.period(telegram);
         let mut first = self.arrivals.stamp(place.offset, baud);
+        let last = self.arrivals.stamp(place.offset + len - 1, baud);
+        let due = period.and(self.due(&first, place.offset, len));
         // What is read later may tell that bytes were older than was thought; those before them were older still, but
         // that has been said.
-        first.at = first.at.max(self.last_stamp);
-        let last = self.arrivals.stamp(place.offset + len - 1, baud).at.max(first.at);
+        first.at = due.unwrap_or(first.at).max(self.last_stamp);
+        let last = match due.and(self.rhythm.duration()) {
+            Some(usual) => (first.at + usual).min(last.latest.unwrap_or(last.at)),
+            None => last.at,
+        };
+        let last = last.max(first.at);
         self.last_stamp = last;
+        self.watch_line(&first, period);
+        self.last_scan = if is_scan { place.offset } else { self.last_scan };
         self.cut |= is_scan && self.tally().telegrams == 1 && self.tally().discarded > 0;
         // Replies come when they are asked for, and a recording has the pace of whoever reads it.
         let has_rhythm = is_scan && self.is_live() && !first.estimated;
@@ -297,6 +338,7 @@ impl Session {
         if self.framer.buffered() > 0 {
             self.begin_rhythm();
         }
+        self.dialogue.sensor.doubt(self.damage.is_recent(self.now));
         self.dialogue.on_telegram(self.framer.view(place).telegram, first.at, self.now);
         let framed = self.framer.view(place);
         Received {
@@ -306,6 +348,35 @@ impl Session {
             estimated: first.estimated,
             mode: self.dialogue.sensor.mode_of_scans(),
             reasons: framed.reasons | if slow { suspect::SLOW } else { 0 },
+        }
+    }
+
+    /// Time between two scans like `telegram`, if it is one of a stream whose beat is known.
+    fn period(&self, telegram: Telegram<'_>) -> Option<Nanos> {
+        let measured = Measured::decode(telegram).filter(|_| self.is_live())?;
+        let variant = Variant::of_beams(measured.count()).filter(|_| measured.partial().is_none())?;
+        Some(variant.period(telegram.bytes().len(), self.dialogue.baud.rate()))
+    }
+
+    /// When the scan at `offset` of `len` bytes began, if it waited with others for a host that did not run: by its place
+    /// among them, as far as when it was read allows.
+    fn due(&self, first: &Stamp, offset: u64, len: u64) -> Option<Nanos> {
+        let latest = first.latest?;
+        let slots = (offset - self.last_scan + len / 2) / len;
+        self.cadence.after(slots).map(|due| due.clamp(first.at, latest))
+    }
+
+    /// Takes account of what the line did to the stream up to a telegram that began at `first`; `period` is that of its
+    /// scans, if it is one.
+    fn watch_line(&mut self, first: &Stamp, period: Option<Nanos>) {
+        match period {
+            Some(period) => self.cadence.note(first.at, first.estimated, period),
+            None => self.cadence.rest(),
+        }
+        if self.is_live() {
+            self.damage.note(self.framer.tally(), self.now);
+        } else {
+            self.damage.end();
         }
     }
 

@@ -127,6 +127,31 @@ fn the_first_scan_may_be_the_background() {
     }
 }
 
+/// A wall from which 15 % of the beams come back is learned in 20 s, and nobody who stands there for 5 s, though some beams
+/// that meet him are lost.
+#[test]
+fn a_wall_seldom_seen_is_learned_and_who_stands_there_is_not() {
+    let mut random = fastrand::Rng::with_seed(3);
+    let mut some = |share: f64, range: u16| {
+        let mut scan = scan(361, 1, 8191);
+        for value in &mut scan.range_array[..361] {
+            *value = if random.f64() < share { range } else { 8191 };
+        }
+        scan
+    };
+    let mut model = Model::new(Settings::default());
+    (0..750).for_each(|_| _ = look(&mut model, &some(0.15, 5_000), 1));
+    let wall = look(&mut model, &some(1.0, 5_000), 1).beams;
+    let before_it = look(&mut model, &some(1.0, 3_000), 1).beams;
+    assert!(wall < 10 && before_it == 361, "{wall} beams of the wall, {before_it} before it");
+
+    let mut model = Model::new(Settings::default());
+    look(&mut model, &some(0.0, 0), 600);
+    (0..187).for_each(|_| _ = look(&mut model, &some(0.97, 3_000), 1));
+    let standing = look(&mut model, &some(1.0, 3_000), 1).beams;
+    assert!(standing > 355, "{standing} beams");
+}
+
 #[test]
 fn no_scan_makes_it_panic() {
     let mut random = fastrand::Rng::with_seed(1);

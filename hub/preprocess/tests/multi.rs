@@ -31,6 +31,8 @@ const NOTHING: Surface = Surface { at: -FAR, weight: 0.0 };
 struct Slow {
     settings: Settings,
     beams: Vec<[Surface; 3]>,
+    /// Times in a row that each beam, whenever it told anything, told that nothing came back.
+    lost: Vec<u32>,
     /// Foreground beams of the last scan with their readings: those that were seen, those that were told.
     seen: Vec<(usize, f64)>,
     told: Vec<(usize, f64)>,
@@ -43,7 +45,8 @@ struct Slow {
 impl Slow {
     fn new(settings: Settings, count: u16) -> Slow {
         let beams = vec![[NOTHING; 3]; usize::from(count)];
-        Slow { settings, beams, seen: vec![], told: vec![], frozen: false, fresh: true, scans: 0.0 }
+        let lost = vec![0; usize::from(count)];
+        Slow { settings, beams, lost, seen: vec![], told: vec![], frozen: false, fresh: true, scans: 0.0 }
     }
 
     fn reset(&mut self, count: u16) {
@@ -83,7 +86,10 @@ impl Slow {
         if !self.frozen {
             for (i, reading) in readings.iter().enumerate() {
                 let Some(reading) = *reading else { continue };
-                learn(&mut self.beams[i], reading, threshold, scans);
+                let lost = if reading == FAR { 0 } else { std::mem::take(&mut self.lost[i]) };
+                self.lost[i] += u32::from(reading == FAR);
+                let gain = f64::from(lost + 1).min((scans / 16.0).floor().clamp(1.0, 16.0));
+                learn(&mut self.beams[i], reading, gain, threshold, scans);
                 if self.fresh && self.settings.start == Start::FirstScan {
                     self.adopt(i, reading);
                 }
@@ -146,13 +152,13 @@ impl Slow {
     }
 }
 
-fn learn(surfaces: &mut [Surface; 3], reading: f64, threshold: f64, scans: f64) {
+fn learn(surfaces: &mut [Surface; 3], reading: f64, gain: f64, threshold: f64, scans: f64) {
     surfaces.iter_mut().for_each(|surface| surface.weight = surface.weight.min(scans));
     let apart = |number: &usize| (surfaces[*number].at - reading).abs();
     let met = (0..3).filter(|number| apart(number) <= threshold).min_by(|a, b| apart(a).total_cmp(&apart(b)));
     for (number, surface) in surfaces.iter_mut().enumerate() {
         if Some(number) == met {
-            surface.weight = (surface.weight + 1.0).min(scans);
+            surface.weight = (surface.weight + gain).min(scans);
             surface.at += ((reading - surface.at) / 16.0).trunc();
         } else {
             let leak = if reading > surface.at { 0.5 } else { 0.125 };
@@ -164,7 +170,7 @@ fn learn(surfaces: &mut [Surface; 3], reading: f64, threshold: f64, scans: f64) 
     }
     let least = (0..3).min_by(|&a, &b| surfaces[a].weight.total_cmp(&surfaces[b].weight)).expect("three");
     if met.is_none() && surfaces[least].weight < scans / 4.0 {
-        surfaces[least] = Surface { at: reading, weight: 1.0 };
+        surfaces[least] = Surface { at: reading, weight: gain };
     }
 }
 
@@ -176,7 +182,7 @@ fn identical_beam_by_beam() {
         let settings = Settings {
             method: Method::Multi,
             threshold_mm: if random.bool() { Some(random.u16(5..120)) } else { None },
-            scans: if random.u8(..4) > 0 { Some(random.u32(1..90)) } else { None },
+            scans: if random.u8(..4) > 0 { Some(random.u32(1..300)) } else { None },
             start: if random.bool() { Start::Empty } else { Start::FirstScan },
             no_return_is_far: any_choice(&mut random),
             ..Settings::default()

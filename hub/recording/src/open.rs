@@ -1,17 +1,16 @@
 //! Opens a recording by what is in it, not by its name, and reads it through once: what it holds is known, and what
 //! is wrong with it is said, before anything is sent from it. Nothing is kept in memory.
 
-use std::fs::File;
 use std::io::{self, BufRead, BufReader, Read};
 use std::path::{Path, PathBuf};
 
-use flate2::bufread::MultiGzDecoder;
 use lms::variant::{Mode, Unit};
-use schema::{Failure, Kind};
+use schema::{Failure, Kind, regular};
 
 use crate::carmen::{self, Wrong};
 #[cfg(feature = "mcap")]
 use crate::mcap::{Knowledge, reader::Reader};
+use crate::packed::Packed;
 use crate::stream::Telegrams;
 use crate::{Contents, Form, Frame};
 
@@ -238,7 +237,12 @@ impl Recording {
     }
 
     fn choice(&self) -> String {
-        format!("choose one: {}", self.contents.sensors.join(", "))
+        let sensors = &self.contents.sensors;
+        let more = match sensors.len().saturating_sub(TOLD) {
+            0 => String::new(),
+            more => format!(" and {more} more"),
+        };
+        format!("choose one: {}{more}", sensors[..sensors.len().min(TOLD)].join(", "))
     }
 }
 
@@ -297,13 +301,9 @@ fn reader(path: &Path) -> Result<Box<dyn BufRead + Send>, Failure> {
 }
 
 fn open(path: &Path) -> io::Result<Box<dyn BufRead + Send>> {
-    // A pipe or a device has no end, and would be waited for.
-    if !std::fs::metadata(path)?.is_file() {
-        return Err(io::Error::new(io::ErrorKind::InvalidInput, "it is no regular file"));
-    }
-    let mut file = BufReader::with_capacity(BUFFER, File::open(path)?);
+    let mut file = BufReader::with_capacity(BUFFER, regular::open(path)?);
     if file.fill_buf()?.starts_with(GZIP) {
-        return Ok(Box::new(BufReader::with_capacity(BUFFER, MultiGzDecoder::new(file))));
+        return Ok(Box::new(BufReader::with_capacity(BUFFER, Packed::new(file))));
     }
     Ok(Box::new(file))
 }
@@ -314,6 +314,10 @@ fn unreadable(path: &Path, error: &io::Error) -> Failure {
         io::ErrorKind::PermissionDenied => "the file must be readable by this user",
         io::ErrorKind::UnexpectedEof => "the gzip file is cut: `zcat FILE > WHOLE` saves what is there",
         io::ErrorKind::Unsupported => "`mcap compress --compression none IN -o OUT` (of mcap.dev) unpacks it",
+        io::ErrorKind::FileTooLarge => {
+            "`zcat FILE > WHOLE` unpacks a packed file; `mcap filter --output-compression none IN -o OUT` (of mcap.dev) \
+             writes short chunks, and with -y TOPIC some topics alone"
+        }
         _ => FORMS,
     };
     Failure::new(Kind::Input, format!("cannot read recording {}: {error}", path.display()), hint)
@@ -323,6 +327,8 @@ fn refused(path: &Path, what: &str) -> Failure {
     Failure::new(Kind::Input, format!("recording {} {what}", path.display()), FORMS)
 }
 
+/// Sensors that a failure names.
+const TOLD: usize = 32;
 const FORMS: &str = "a recording is an MCAP file, a stream of telegrams or a CARMEN log, plain or gzipped";
 /// First bytes of a gzip file.
 const GZIP: &[u8] = &[0x1F, 0x8B];

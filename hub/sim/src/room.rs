@@ -127,7 +127,7 @@ fn word(stage: &Stage, echo: &Echo, sun: f64, unit: Unit, mode: Mode, dice: &Dic
     let code = |code: u16| mode.max_value() - code;
     if stage.layers.dazzles(sun, dice) {
         code(layers::DAZZLE)
-    } else if echo.range_mm.is_infinite() {
+    } else if echo.range_mm.is_infinite() || dice.code >= echo.returns {
         code(layers::NO_RETURN)
     } else if stage.layers.loses(echo.signal, echo.torn, dice) {
         code(layers::TOO_WEAK)

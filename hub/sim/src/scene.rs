@@ -24,6 +24,8 @@ pub(crate) enum Surface {
     Reflector,
     /// Glass: the beam goes through, but where it falls squarely.
     Glass,
+    /// So glossy or so oblique to the eye that few beams come back; of the others nothing does.
+    Faint,
 }
 
 /// A wall, a piece of furniture, a box, a door.

@@ -14,6 +14,8 @@ pub(crate) struct Echo {
     pub(crate) range_mm: f64,
     /// How much, beside a white surface at 1 m on which the beam falls squarely.
     pub(crate) signal: f64,
+    /// Share of such beams that come back at all.
+    pub(crate) returns: f64,
     /// Share of the light that fell on reflectors.
     pub(crate) bright: f64,
     /// Whether a beam as wide as a real one meets two surfaces, one behind the other, and no reflector.
@@ -73,6 +75,7 @@ pub(crate) fn echo(view: &View, angle_mdeg: i32, wide: bool, dice: &Dice) -> Ech
     Echo {
         range_mm,
         signal: face.map_or(0.0, |face| signal(face, range_mm, angle_mdeg)),
+        returns: face.map_or(1.0, |face| if face.surface == Surface::Faint { FAINT_RETURNS } else { 1.0 }),
         bright,
         edge: dull
             && spread.iter().any(|part| (part.hit.range_mm - spread[0].hit.range_mm).abs() > CONTINUOUS_MM),
@@ -162,7 +165,7 @@ fn met(parts: &[Part]) -> Met {
 /// What a face sends back from `range_mm`.
 fn signal(face: &Face, range_mm: f64, angle_mdeg: i32) -> f64 {
     let white = match face.surface {
-        Surface::Plain => 0.5,
+        Surface::Plain | Surface::Faint => 0.5,
         Surface::Dark => 0.02,
         // A mirror of glass, a reflector: always enough.
         Surface::Reflector | Surface::Glass => return f64::INFINITY,
@@ -189,6 +192,8 @@ const TORN_MM: f64 = 300.0;
 const OUTSHINES: f64 = 100.0;
 /// A surface with less than this share of the light is never told.
 const CLEAR: f64 = 0.17;
+/// Share of the beams on a faint surface that come back.
+const FAINT_RETURNS: f64 = 0.15;
 /// Share of the undecided readings that lie between the surfaces: two pulses that the sensor takes for one.
 const MIXED: f64 = 0.3;
 

@@ -8,7 +8,7 @@ use std::path::Path;
 use std::str::FromStr;
 use std::sync::Arc;
 
-use schema::{Failure, Kind};
+use schema::{Failure, Kind, regular};
 
 use crate::layers::Layers;
 use crate::scene::Scene;
@@ -28,7 +28,7 @@ pub enum World {
 }
 
 /// The scenes that the program brings along: name and text.
-const SCENES: [(&str, &str); 13] = [
+const SCENES: [(&str, &str); 14] = [
     ("room", include_str!("../../../tests/worlds/room.toml")),
     ("bare", include_str!("../../../tests/worlds/bare.toml")),
     ("fig8", include_str!("../../../tests/worlds/fig8.toml")),
@@ -37,6 +37,7 @@ const SCENES: [(&str, &str); 13] = [
     ("door", include_str!("../../../tests/worlds/door.toml")),
     ("corridor", include_str!("../../../tests/worlds/corridor.toml")),
     ("glass", include_str!("../../../tests/worlds/glass.toml")),
+    ("faint", include_str!("../../../tests/worlds/faint.toml")),
     ("sun", include_str!("../../../tests/worlds/sun.toml")),
     ("chair", include_str!("../../../tests/worlds/chair.toml")),
     ("strips", include_str!("../../../tests/worlds/strips.toml")),
@@ -102,7 +103,7 @@ impl FromStr for World {
 }
 
 fn read(path: &str) -> Result<String, Failure> {
-    std::fs::read_to_string(Path::new(path)).map_err(|error| {
+    regular::read_text(Path::new(path), regular::LONGEST).map_err(|error| {
         let names: Vec<_> = World::names().collect();
         let message = format!("world {path:?} is not known, and as a file: {error}");
         Failure::new(Kind::Input, message, format!("a TOML file, or one of: {}", names.join(", ")))

@@ -1,8 +1,10 @@
 //! The receiver's account: what came, what did not, and why something was refused, exactly and in bounded memory, whoever
 //! sends. Refuses to know sockets, time and keys; it has no heap.
 
-use super::lives::{Life, Lives};
+use super::lives::{Found, Gone, Lives};
 use super::numbers::{Fresh, Key, Row};
+use super::standing::Arrival;
+use super::voices::Whose;
 use super::{Announce, Datagram, Refusal};
 use crate::Topic;
 
@@ -17,7 +19,13 @@ pub const ROWS: usize = 1024;
 ///
 /// A greater epoch of a gateway retires the one before, whose rows stay. Where there is no room, the life that has been
 /// retired longest is given up, and its rows are added to [`given_up`](Account::given_up): so rows and that together
-/// always are everything that was taken. A life that goes on is never given up; what has no room beside those is refused.
+/// always are everything that was taken. If none is retired, one that goes on makes room: what never delivered a sample or
+/// is silent for 3 s, whatever was not heard for longest first; for a sample also what delivered for less than a second.
+/// One that is known to deliver is kept for a minute of silence longer, and is never put out while it delivers; what has no
+/// room beside those is refused.
+///
+/// Two gateways with one number and one epoch are told apart by their senders and by what they announce: only one of them
+/// is taken, the first that was heard, until it is silent for 3 s.
 pub struct Account {
     /// Bit n: topic number n is listened to.
     followed: u8,
@@ -35,6 +43,8 @@ pub struct Account {
 pub struct GivenUp {
     /// Lives of gateways.
     pub lives: u64,
+    /// Of them those that were not known to be over: they made room for others.
+    pub displaced: u64,
     /// Distinct numbers that came.
     pub received: u64,
     /// Numbers that did not come, and now never will: their epoch is over.
@@ -60,10 +70,17 @@ impl Account {
         }
     }
 
-    /// Checks and counts `bytes`, a whole datagram as it was received. What is refused is counted by its reason and
-    /// changes nothing else; what is not, can be unpacked.
-    pub fn receive<'a>(&mut self, bytes: &'a [u8]) -> Result<(Datagram<'a>, Fresh), Refusal> {
-        let result = Datagram::read(bytes).and_then(|datagram| Ok((datagram, self.take(&datagram)?)));
+    /// Checks and counts `bytes`, a whole datagram as it was received `from` a sender, at `now_ns` of any clock that is
+    /// never set. A sender is any number that others do not have, for example its address and port. What is refused is
+    /// counted by its reason and changes nothing else; what is not, can be unpacked.
+    pub fn receive<'a>(
+        &mut self,
+        bytes: &'a [u8],
+        from: u64,
+        now_ns: u64,
+    ) -> Result<(Datagram<'a>, Fresh), Refusal> {
+        let read = Datagram::read(bytes);
+        let result = read.and_then(|datagram| Ok((datagram, self.take(&datagram, from, now_ns)?)));
         if let Err(refusal) = result {
             self.refused[refusal as usize] += 1;
         }
@@ -80,9 +97,19 @@ impl Account {
         self.given_up
     }
 
-    /// Something of this life of `hub` was taken, and it was not given up.
-    pub fn knows(&self, hub: u64, epoch: u32) -> bool {
-        self.lives.contains((hub, epoch))
+    /// When the first datagram of this life of `hub` was taken, if it was not given up since. Another time of the same life
+    /// is another gateway, or one that was forgotten meanwhile.
+    pub fn since_ns(&self, hub: u64, epoch: u32) -> Option<u64> {
+        self.lives.since_ns((hub, epoch))
+    }
+
+    /// Two gateways are known to send under this number and epoch. Of one of them everything is refused as
+    /// [`Refusal::Twin`].
+    pub fn is_shared(&self, hub: u64, epoch: u32) -> bool {
+        match self.lives.find((hub, epoch)) {
+            Found::At(slot) => self.lives.record(slot).voices.is_shared(),
+            Found::Over | Found::New => false,
+        }
     }
 
     /// What is known of every sensor and topic of which anything was sent, by hub, epoch, sensor and topic.
@@ -93,52 +120,77 @@ impl Account {
             .filter(|row| row.received + row.lost() > 0)
     }
 
-    fn take(&mut self, datagram: &Datagram<'_>) -> Result<Fresh, Refusal> {
+    fn take(&mut self, datagram: &Datagram<'_>, from: u64, now_ns: u64) -> Result<Fresh, Refusal> {
         let head = datagram.head;
         let life = (head.hub, head.epoch);
-        if self.lives.is_over(life) {
-            return Err(Refusal::Epoch);
+        let known = match self.lives.find(life) {
+            Found::Over => return Err(Refusal::Epoch),
+            Found::At(slot) => Some(slot),
+            Found::New => None,
+        };
+        let is_announce = head.topic == Announce::NUMBER;
+        let announce = if is_announce { Announce::unpack(datagram.payload) } else { None };
+        let boot = announce.map(|announce| announce.boot);
+        let judge = |slot: usize| self.lives.record(slot).voices.judge(from, boot, now_ns);
+        let whose = known.map_or(Whose::Own, judge);
+        if whose == Whose::Twin {
+            if let Some(slot) = known.filter(|_| datagram.check_payload().is_ok()) {
+                self.lives.record_mut(slot).voices.note(from, boot, now_ns);
+            }
+            return Err(Refusal::Twin);
         }
-        let is_known = self.lives.contains(life);
-        let is_full = self.row_count == ROWS || !is_known && self.lives.is_full();
+        let known = known.filter(|_| whose == Whose::Own);
+        let arrival = Arrival { delivers: !is_announce, now_ns };
         let key = (head.hub, head.epoch, head.sensor, head.topic);
+        let is_full = self.row_count == ROWS || known.is_none() && self.lives.is_full();
         match self.find(key) {
+            // All of the one that is silent makes room.
+            _ if whose == Whose::Next => datagram.check_payload()?,
             Some(at) if self.rows[at].is_stale(head.sequence) => return Err(Refusal::Stale),
-            None if is_full && !self.lives.can_give_up(life) => return Err(Refusal::Capacity),
+            None if is_full && !self.lives.can_give_up(life, arrival) => return Err(Refusal::Capacity),
             _ => datagram.check_payload()?,
         }
-        if !is_known && let Some(given_up) = self.lives.take(life) {
-            self.clear(given_up);
+        if whose == Whose::Next {
+            self.lives.forget(life);
+            self.clear(Gone { life, is_displaced: false });
         }
-        let fresh = self.row(key, head.sequence).map_or(Fresh::New, |row| row.take(head.sequence));
-        if head.topic == Announce::NUMBER
-            && let Some(announce) = Announce::unpack(datagram.payload)
-        {
-            self.note(key, &announce);
+        let slot = known.unwrap_or_else(|| {
+            let (slot, gone) = self.lives.take(life, arrival);
+            if let Some(gone) = gone {
+                self.clear(gone);
+            }
+            slot
+        });
+        let record = self.lives.record_mut(slot);
+        record.standing.take(arrival);
+        record.voices.note(from, boot, now_ns);
+        let fresh = self.row(key, head.sequence, arrival).map_or(Fresh::New, |row| row.take(head.sequence));
+        if let Some(announce) = announce {
+            self.note(key, &announce, arrival);
         }
         Ok(fresh)
     }
 
     /// What has no room is not noted: it begins with its first datagram, if there is room then.
-    fn note(&mut self, (hub, epoch, sensor, _): Key, announce: &Announce) {
+    fn note(&mut self, (hub, epoch, sensor, _): Key, announce: &Announce, arrival: Arrival) {
         let followed = self.followed;
         let is_followed = |number: u8| number < 8 && followed >> number & 1 == 1;
         for announced in announce.topics().iter().filter(|announced| is_followed(announced.topic)) {
-            if let Some(row) = self.row((hub, epoch, sensor, announced.topic), announced.next) {
+            if let Some(row) = self.row((hub, epoch, sensor, announced.topic), announced.next, arrival) {
                 row.announce(announced.next);
             }
         }
     }
 
     /// The row of `key`, a new one that begins with `first` if there is none; nothing if there is no room.
-    fn row(&mut self, key: Key, first: u32) -> Option<&mut Row> {
+    fn row(&mut self, key: Key, first: u32, arrival: Arrival) -> Option<&mut Row> {
         let at = match self.find(key) {
             Some(at) => at,
             None => {
                 // Each life has a row at least.
                 if self.row_count == ROWS {
-                    let given_up = self.lives.give_up()?;
-                    self.clear(given_up);
+                    let gone = self.lives.give_up((key.0, key.1), arrival)?;
+                    self.clear(gone);
                 }
                 let position = self.below(|other| other < key);
                 self.order[position..=self.row_count].rotate_right(1);
@@ -151,12 +203,13 @@ impl Account {
         Some(&mut self.rows[at])
     }
 
-    /// Adds the rows of `life` to what was given up.
-    fn clear(&mut self, life: Life) {
+    /// Adds the rows of a life that is `gone` to what was given up.
+    fn clear(&mut self, Gone { life, is_displaced }: Gone) {
         let first = self.below(|(hub, epoch, ..)| (hub, epoch) < life);
         let end = self.below(|(hub, epoch, ..)| (hub, epoch) <= life);
         let sum = &mut self.given_up;
         sum.lives += 1;
+        sum.displaced += u64::from(is_displaced);
         for row in self.order[first..end].iter().map(|&at| &self.rows[usize::from(at)]) {
             sum.received += row.received;
             sum.lost += row.lost();
@@ -181,141 +234,4 @@ impl Account {
 }
 
 #[cfg(test)]
-mod tests {
-    use super::super::{HEAD, Head};
-    use super::*;
-    use crate::Zones;
-    use crate::datagram::{Announced, Packed};
-
-    fn zones(head: Head) -> Vec<u8> {
-        let mut buffer = [0; 100];
-        let len = Zones::unknown().pack(&mut buffer[HEAD..]).unwrap();
-        head.seal(&mut buffer, len).unwrap().to_vec()
-    }
-
-    fn head(hub: u64, epoch: u32, sequence: u32) -> Head {
-        Head { topic: Topic::Zones.number(), revision: 1, hub, epoch, sequence, ..Head::default() }
-    }
-
-    fn announce(hub: u64, next: u32) -> Vec<u8> {
-        let mut announce = Announce::new(1, "front", "");
-        for topic in [Topic::Zones, Topic::Telegram] {
-            announce.add(Announced { topic: topic.number(), group: 81, port: 22_200, next });
-        }
-        let mut buffer = [0; 200];
-        let len = announce.pack(&mut buffer[HEAD..]).unwrap();
-        Head { topic: 0, ..head(hub, 1, 0) }.seal(&mut buffer, len).unwrap().to_vec()
-    }
-
-    fn fresh(account: &mut Account, bytes: &[u8]) -> Result<Fresh, Refusal> {
-        account.receive(bytes).map(|(_, fresh)| fresh)
-    }
-
-    #[test]
-    fn a_greater_epoch_retires_the_older_one_of_its_hub() {
-        let mut account = Account::new(&Topic::ALL);
-        for (hub, epoch, expected) in [
-            (1, 7, Ok(Fresh::New)),
-            (2, 3, Ok(Fresh::New)),
-            (1, 6, Err(Refusal::Epoch)),
-            (1, 8, Ok(Fresh::New)),
-            (1, 7, Err(Refusal::Epoch)),
-            (2, 3, Ok(Fresh::Duplicate)),
-        ] {
-            assert_eq!(fresh(&mut account, &zones(head(hub, epoch, 0))), expected, "{hub} {epoch}");
-        }
-        let rows: Vec<_> = account.rows().map(|row| (row.hub, row.epoch, row.received)).collect();
-        assert_eq!(rows, [(1, 7, 1), (1, 8, 1), (2, 3, 1)]);
-        assert_eq!(account.refused(Refusal::Epoch), 2);
-    }
-
-    #[test]
-    fn what_is_refused_changes_nothing() {
-        let mut account = Account::new(&Topic::ALL);
-        let damaged = |head: Head| {
-            let mut buffer = [0; 60];
-            head.seal(&mut buffer, 3).unwrap().to_vec()
-        };
-        let refused = [
-            (Refusal::Payload, damaged(head(1, 2, 0))),
-            (Refusal::Payload, zones(Head { revision: 0, ..head(1, 2, 0) })),
-            (Refusal::Skipped, zones(Head { topic: 8, revision: 0, ..head(1, 2, 0) })),
-        ];
-        for (refusal, bytes) in &refused {
-            assert_eq!(fresh(&mut account, bytes), Err(*refusal));
-        }
-        assert_eq!(account.rows().count(), 0);
-        assert_eq!(fresh(&mut account, &zones(head(1, 1, 0))), Ok(Fresh::New), "epoch 2 was not believed");
-        assert_eq!(account.refused(Refusal::Payload), 2);
-    }
-
-    #[test]
-    fn memory_is_bounded() {
-        let mut account = Account::new(&Topic::ALL);
-        for hub in 0..64 {
-            assert_eq!(fresh(&mut account, &zones(head(hub, 1, 0))), Ok(Fresh::New));
-        }
-        assert_eq!(fresh(&mut account, &zones(head(64, 1, 0))), Err(Refusal::Capacity));
-        assert_eq!(fresh(&mut account, &zones(head(1, 1, 1))), Ok(Fresh::New), "all go on");
-        for sensor in 1..=240 {
-            for hub in 0..4 {
-                let bytes = zones(Head { sensor, ..head(hub, 1, 0) });
-                assert_eq!(fresh(&mut account, &bytes), Ok(Fresh::New));
-            }
-        }
-        let more = zones(Head { sensor: 241, ..head(1, 1, 0) });
-        assert_eq!(fresh(&mut account, &more), Err(Refusal::Capacity));
-        assert_eq!((account.rows().count(), account.refused(Refusal::Capacity)), (ROWS, 2));
-        assert_eq!(account.given_up(), GivenUp::default());
-    }
-
-    #[test]
-    fn what_is_retired_makes_room_and_stays_in_the_sum() {
-        let mut account = Account::new(&Topic::ALL);
-        for hub in 0..64 {
-            assert_eq!(fresh(&mut account, &zones(head(hub, 1, 0))), Ok(Fresh::New));
-        }
-        assert_eq!(fresh(&mut account, &zones(head(5, 1, 3))), Ok(Fresh::New));
-        // A gateway that starts again is heard, though all places are taken.
-        assert_eq!(fresh(&mut account, &zones(head(5, 2, 0))), Ok(Fresh::New));
-        let mut given_up = GivenUp { lives: 1, received: 2, lost: 2, ..GivenUp::default() };
-        assert_eq!((account.given_up(), account.rows().count()), (given_up, 64));
-        assert_eq!(
-            fresh(&mut account, &zones(head(5, 1, 4))),
-            Err(Refusal::Epoch),
-            "given up is not forgotten"
-        );
-        assert!(account.knows(5, 2) && !account.knows(5, 1));
-        // A damaged one gives up nothing.
-        let mut buffer = [0; 60];
-        let damaged = head(5, 3, 0).seal(&mut buffer, 3).unwrap();
-        assert_eq!(fresh(&mut account, damaged), Err(Refusal::Payload));
-        assert!(account.knows(5, 2) && !account.knows(5, 3));
-        // As many sensors as there is room for, in a life that is retired then: one row more, and it goes.
-        for sensor in 1..=240 {
-            for hub in 0..4 {
-                let bytes = zones(Head { sensor, ..head(hub, 1, 0) });
-                assert_eq!(fresh(&mut account, &bytes), Ok(Fresh::New));
-            }
-        }
-        assert_eq!(fresh(&mut account, &zones(head(2, 9, 0))), Ok(Fresh::New));
-        given_up = GivenUp { lives: 2, received: 2 + 241, ..given_up };
-        assert_eq!((account.given_up(), account.rows().count()), (given_up, ROWS - 240));
-        let counted: u64 = account.rows().map(|row| row.received).sum();
-        assert_eq!(counted + given_up.received, 64 + 2 + 4 * 240 + 1);
-    }
-
-    #[test]
-    fn announcements_count_for_topics_that_are_listened_to() {
-        let mut account = Account::new(&[Topic::Zones]);
-        assert_eq!(fresh(&mut account, &announce(1, 10)), Ok(Fresh::New));
-        assert_eq!(
-            account.rows().map(|row| row.topic).collect::<Vec<_>>(),
-            [0],
-            "nothing sent, nothing to tell"
-        );
-        assert_eq!(fresh(&mut account, &announce(1, 12)), Ok(Fresh::Duplicate));
-        let rows: Vec<_> = account.rows().map(|row| (row.topic, row.received, row.lost())).collect();
-        assert_eq!(rows, [(0, 1, 0), (Topic::Zones.number(), 0, 2)]);
-    }
-}
+mod tests;

@@ -22,9 +22,12 @@ pub enum Refusal {
     Mac,
     /// A later epoch of the same hub was seen.
     Epoch,
+    /// Of another sender than the hub's epoch was taken from, which is not known to be the same gateway's: of another one
+    /// with the same number.
+    Twin,
     /// Older than the window, so that nobody knows whether it came before.
     Stale,
-    /// More hubs that go on, or more topics of theirs, than there is memory for.
+    /// More hubs that deliver, or more topics of theirs, than there is memory for.
     Capacity,
     /// A topic that is not known here.
     Skipped,
@@ -34,7 +37,7 @@ pub enum Refusal {
 
 impl Refusal {
     /// All reasons, in the order of the checks.
-    pub const ALL: [Refusal; 13] = [
+    pub const ALL: [Refusal; 14] = [
         Refusal::Short,
         Refusal::Magic,
         Refusal::Version,
@@ -44,6 +47,7 @@ impl Refusal {
         Refusal::Unauthenticated,
         Refusal::Mac,
         Refusal::Epoch,
+        Refusal::Twin,
         Refusal::Stale,
         Refusal::Capacity,
         Refusal::Skipped,
@@ -62,6 +66,7 @@ impl Refusal {
             Refusal::Unauthenticated => "unauthenticated",
             Refusal::Mac => "mac",
             Refusal::Epoch => "epoch",
+            Refusal::Twin => "twin",
             Refusal::Stale => "stale",
             Refusal::Capacity => "capacity",
             Refusal::Skipped => "skipped",

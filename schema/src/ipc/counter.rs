@@ -65,7 +65,7 @@ const NAME: &str = "9204dd183d1c4d8e1ff592a30766ffa6765aa8b5_node.0_10_0.global_
 
 /// What the library writes (`posix_shared_memory::Data`): its version as it packs it, then the counter, from 0.
 const CONTENT: [u8; 16] = {
-    let (version, mut content) = (((0_u64 << 32) | (10 << 16)).to_ne_bytes(), [0; 16]);
+    let (version, mut content) = ((10_u64 << 16).to_ne_bytes(), [0; 16]);
     let mut i = 0;
     while i < version.len() {
         content[i] = version[i];

@@ -183,7 +183,12 @@ enum scanhub_counter {
     SCANHUB_COUNTER_REJECTED_CRC,
     SCANHUB_COUNTER_REJECTED_VETOED,
     SCANHUB_COUNTER_REJECTED_SUPERSEDED,
-    SCANHUB_COUNTER_LINE_ERRORS
+    SCANHUB_COUNTER_LINE_ERRORS,
+    SCANHUB_COUNTER_BYTES_DAMAGED,
+    SCANHUB_COUNTER_DAMAGED_PPM, /* of the last 10 s, in millionths */
+    SCANHUB_COUNTER_DUE_ON_LINE, /* 0: what was lost on the line is not known */
+    SCANHUB_COUNTER_LOST_ON_LINE,
+    SCANHUB_COUNTER_LOST_PPM /* of the last 10 s, in millionths */
 };
 
 struct scanhub_pose_v1 {
@@ -221,9 +226,29 @@ struct scanhub_status_v1 {
     struct scanhub_pose_v1 pose;
 };
 
+/* No beam has a valid reading. */
+#define SCANHUB_NOTHING_MM UINT32_MAX
+
+/* A sensor of a robot. */
+struct scanhub_robot_sensor {
+    const char *name;
+    uint8_t verdict;     /* unknown where it was not heard lately, or never */
+    uint32_t nearest_mm; /* from the robot's centre, of what it sees nearest; or SCANHUB_NOTHING_MM */
+};
+
+/* What is known of a robot: the payload of scanhub_open_robot. All of it is lent with the sample. */
+struct scanhub_robot {
+    uint8_t verdict;     /* the worst of its sensors: stop, unknown, slow, clear; unknown as long as there are none */
+    uint32_t nearest_mm; /* of all sensors; or SCANHUB_NOTHING_MM */
+    const char *worst;   /* the first sensor with this verdict; NULL: there are none */
+    const char *nearest; /* the sensor that sees what is nearest; NULL: nobody does */
+    size_t count;        /* of sensors */
+    const struct scanhub_robot_sensor *sensors;
+};
+
 /* A sample that is lent: scanhub_take fills it, scanhub_release empties it. */
 struct scanhub_sample {
-    const struct scanhub_header_v1 *header; /* NULL: nobody sent it, see stale */
+    const struct scanhub_header_v1 *header; /* NULL: nobody sent it, see stale; of a robot */
     const void *payload;                    /* where the hub wrote it, for reading */
     size_t length;                          /* its bytes */
     uint64_t missed;                        /* samples that were sent before it and not received */
@@ -238,6 +263,14 @@ struct scanhub_sample {
  * does not wait for a hub. Answers 0; *handle is NULL after a refusal.
  */
 int scanhub_open(struct scanhub_attachment **handle, const char *domain, const char *sensor, int topic, int wait);
+
+/*
+ * Begins to follow the verdict over the zones of `sensors`: names with blanks between them, "front rear". NULL: all sensors of
+ * the hub; in a domain without a hub those of other machines that are published there. scanhub_take lends what is known then
+ * (struct scanhub_robot, a copy without header), once there was a word of each sensor, whenever one is heard, and when one is
+ * heard no more: its verdict is unknown then, by itself. All else is as with scanhub_open.
+ */
+int scanhub_open_robot(struct scanhub_attachment **handle, const char *domain, const char *sensors, int wait);
 
 /*
  * A descriptor that is readable while there may be a sample, for poll, select and epoll: never read, written or closed. It

@@ -72,6 +72,13 @@ public:
     {
         check(scanhub_open(&handle_, domain, sensor, topic, wait));
     }
+    /* The verdict over several sensors, as scanhub_open_robot: its samples are scanhub_robot. */
+    static Attachment robot(const char *sensors = nullptr, int wait = SCANHUB_WAIT_DOORBELL, const char *domain = nullptr)
+    {
+        Attachment all;
+        check(scanhub_open_robot(&all.handle_, domain, sensors, wait));
+        return all;
+    }
     Attachment(Attachment &&other) noexcept : handle_(other.handle_) { other.handle_ = nullptr; }
     Attachment &operator=(Attachment &&other) noexcept
     {
@@ -101,6 +108,7 @@ public:
     bool hub_lives() { return check(scanhub_hub_lives(handle_)) == 1; }
 
 private:
+    Attachment() : handle_(nullptr) {}
     scanhub_attachment *handle_;
 };
 

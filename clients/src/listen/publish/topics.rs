@@ -3,7 +3,7 @@
 
 use std::time::{Duration, Instant};
 
-use schema::datagram::{Announce, Head};
+use schema::datagram::{Announce, Arrival, Head, Standing};
 use schema::ipc::{Node, Payload, Waker};
 use schema::{Background, Failure, Foreground, Header, Marks, Scan, State, Status, Topic, Wake, Zones};
 
@@ -19,6 +19,8 @@ pub(super) struct RemoteTopics {
     source: Option<(u64, u32, u8)>,
     /// Bit n: topic number n was announced last.
     announced: u8,
+    /// What it is worth when there is no room for another.
+    pub(super) standing: Standing,
     /// It has all that was announced, and that was told.
     pub(super) is_told: bool,
     telegram: Option<Outlet<[u8]>>,
@@ -48,6 +50,7 @@ impl RemoteTopics {
             name: name.to_owned(),
             source: None,
             announced: 0,
+            standing: Standing::NONE,
             is_told: false,
             telegram: None,
             scan: None,
@@ -106,13 +109,14 @@ impl RemoteTopics {
     }
 
     /// `announce` came with `head`: it is this one.
-    pub(super) fn announced(&mut self, head: &Head, announce: &Announce) {
+    pub(super) fn announced(&mut self, head: &Head, announce: &Announce, arrival: Arrival) {
+        self.standing.take(arrival);
         self.source = Some((head.hub, head.epoch, head.sensor));
         let numbers = announce.topics().iter().map(|announced| announced.topic).filter(|number| *number < 8);
         self.announced = numbers.fold(0, |bits, number| bits | 1 << number);
     }
 
-    /// Another sensor is announced with the number that this one had: nothing comes of it any more, which is said at once.
+    /// Another sensor has the number or the place that this one had: nothing comes of it any more, which is said at once.
     pub(super) fn replaced(&mut self) {
         self.source = None;
         self.heard_at = None;
@@ -139,6 +143,7 @@ impl RemoteTopics {
     /// Publishes `remote`; `false` if it has no such topic. A payload cannot fail to be read: the account has checked it.
     pub(super) fn publish(&mut self, remote: &Remote<'_>, now: Instant) -> bool {
         self.heard_at = Some(now);
+        self.standing.take(Arrival { delivers: true, now_ns: remote.arrival_ns });
         let sent = match remote.topic {
             Topic::Telegram => self.telegram.as_mut().map(|outlet| outlet.send_telegram(remote)),
             Topic::Scan => self.scan.as_mut().map(|outlet| outlet.unpack(remote)),

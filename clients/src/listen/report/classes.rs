@@ -121,6 +121,7 @@ impl<'a> Published<'a> {
 pub(super) struct Sums {
     class: &'static str,
     lives: u64,
+    displaced: u64,
     received: u64,
     lost: u64,
     duplicate: u64,
@@ -129,14 +130,18 @@ pub(super) struct Sums {
 
 impl Sums {
     pub(super) fn new(given_up: GivenUp) -> Sums {
-        let GivenUp { lives, received, lost, duplicate, reordered } = given_up;
-        Sums { class: "lan_given_up", lives, received, lost, duplicate, reordered }
+        let GivenUp { lives, displaced, received, lost, duplicate, reordered } = given_up;
+        Sums { class: "lan_given_up", lives, displaced, received, lost, duplicate, reordered }
     }
 
     /// The same for people.
     pub(super) fn text(&self, line: &mut Vec<u8>) -> io::Result<()> {
-        let Sums { lives, received, lost, duplicate, reordered, .. } = self;
-        write!(line, "of {lives} former starts of gateways together: received {received}, lost {lost}, ")?;
+        let Sums { lives, displaced, received, lost, duplicate, reordered, .. } = self;
+        write!(
+            line,
+            "of {lives} former starts of gateways together, {displaced} of them given up for others: "
+        )?;
+        write!(line, "received {received}, lost {lost}, ")?;
         write!(line, "duplicate {duplicate}, reordered {reordered}")
     }
 }

@@ -110,7 +110,10 @@ impl List {
         self.put((link, "background.candidate_mm"), json!(learning.candidate_mm), DEFAULT);
         self.put((link, "background.scans"), json!(learning.scans), DEFAULT);
         self.put((link, "background.candidate"), json!(candidate), DEFAULT);
+        // Without a word it is what an earlier hub has kept, if that fits.
+        let start = background.start_is_said.then_some(start);
         self.put((link, "background.start"), json!(start), DEFAULT);
+        self.put((link, "background.keep"), json!(background.is_handed_on), DEFAULT);
         self.put((link, "background.no_return_is_far"), json!(learning.no_return_is_far), DEFAULT);
         self.put((link, "background.publish"), json!(publish), DEFAULT);
     }

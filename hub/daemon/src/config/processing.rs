@@ -6,7 +6,7 @@ use std::path::PathBuf;
 use lms::variant::{Unit, Variant};
 use preprocess::background::Settings as Learning;
 use preprocess::{marks, zones};
-use schema::{Failure, Kind, Pose, SavedModel};
+use schema::{Failure, Kind, Pose, SavedModel, regular};
 
 /// What is made of the scans of one link.
 #[derive(Clone, Debug, Default, PartialEq)]
@@ -84,7 +84,11 @@ pub struct Background {
     pub learning: Learning,
     /// The file that it begins with.
     pub file: Option<PathBuf>,
-    /// What stands in the file.
+    /// What it begins with was said, by whatever word: what an earlier hub learned is left where it is.
+    pub start_is_said: bool,
+    /// What is learned is kept for the next hub, which begins with it.
+    pub is_handed_on: bool,
+    /// What it begins with: what stands in the file, or what an earlier hub learned.
     pub model: Option<Box<schema::Background>>,
     /// The model is published with every scan, not only with a new generation and whenever it has learned for a while.
     pub every_scan: bool,
@@ -102,7 +106,7 @@ impl Background {
             let message = format!("link {sensor}: background.start = {place}: {what}");
             Err(Failure::new(Kind::Configuration, message, hint))
         };
-        let text = match std::fs::read(file) {
+        let text = match regular::read(file, regular::LONGEST) {
             Ok(text) => text,
             Err(error) => return refuse(error.to_string(), START),
         };
@@ -134,6 +138,8 @@ impl Default for Background {
             is_kept: true,
             learning: Learning::default(),
             file: None,
+            start_is_said: false,
+            is_handed_on: true,
             model: None,
             every_scan: false,
         }

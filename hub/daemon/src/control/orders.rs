@@ -6,12 +6,13 @@ use std::sync::mpsc::{Receiver, Sender};
 use std::sync::{Arc, PoisonError};
 
 use lms::{Control, Nanos, Session};
-use schema::{Failure, Kind, Verb, Wake};
+use schema::{Failure, Kind, Shown, Verb, Wake};
 
 use super::{Changed, Order, Outcome};
 use crate::bell::Bell;
 use crate::clock;
 use crate::config::Processing;
+use crate::learned::Slot;
 use crate::link::LinkThread;
 use crate::replay::Player;
 
@@ -51,7 +52,11 @@ impl LinkThread<'_> {
             };
             let outcome = match control {
                 Some(control) => self.orders.control(control, &mut flow).map(|()| None),
-                None => self.pipeline.obey(&self.link.name, order.verb, &order.model),
+                None => {
+                    let shown = self.pipeline.obey(&self.link.name, order.verb, &order.model);
+                    let kept_wall_ns = self.around.slot.and_then(Slot::kept_wall_ns);
+                    shown.map(|model| model.map(|model| Box::new(Shown { model: *model, kept_wall_ns })))
+                }
             };
             let now = clock::now();
             if self.topics.background(&mut self.pipeline, now) {

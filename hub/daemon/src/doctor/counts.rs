@@ -45,6 +45,21 @@ pub(crate) fn as_the_hub_counts(status: &Status) -> Finding {
     }
 }
 
+/// Judges what a line of the hub takes away of its stream.
+pub(crate) fn line_loss(status: &Status) -> Finding {
+    const NAME: &str = "line-loss";
+    let due = status.counters[Counter::DueOnLine];
+    let all = match status.lost_on_line() {
+        Some(lost) => format!("{lost} of {due} scans lost since the hub's start"),
+        None => "how many scans are lost is not known".to_owned(),
+    };
+    let text = format!("{:.2} % of the bytes damaged in the last 10 s, {all}", 100.0 * status.damaged());
+    match status.line_loss() {
+        Some(loss) => Finding::warning(NAME, format!("{loss}; {text}"), LOSS_REMEDY),
+        None => Finding::ok(NAME, text),
+    }
+}
+
 fn is_large(errors: u64, bytes: u64) -> bool {
     errors > SOME && errors.saturating_mul(OF_BYTES) > bytes
 }
@@ -57,6 +72,8 @@ fn remedy(is_lost: bool) -> &'static str {
     }
 }
 
+const LOSS_REMEDY: &str = "the cable and its ground; the adapter: one with an FT232R or newer, in a socket of the \
+     machine; of a UART its FIFO (setserial -g); 120 ohm of termination at the receiving end; docs/wiring.md";
 /// A byte that was cut when the rate changed, and one more.
 const FEW: u64 = 2;
 /// Looking for the rates of sensors makes some.
@@ -84,6 +101,23 @@ mod tests {
         let lost = of(Counts { overrun: 10_000, buffer: 80_000, ..healthy }, 0);
         assert!(lost.state == State::Warning && lost.remedy.contains("FIFO"), "{lost}");
         assert!(lost.finding.contains("overruns 90000 in 100000000 bytes"), "{lost}");
+    }
+
+    #[test]
+    fn a_line_that_loses_more_than_a_thousandth_is_told() {
+        let mut status = Status::default();
+        assert_eq!(line_loss(&status).state, State::Ok);
+        status.counters[Counter::DueOnLine] = 22_000;
+        status.counters[Counter::LostOnLine] = 9_000;
+        let past = line_loss(&status);
+        assert!(past.state == State::Ok && past.finding.contains("9000 of 22000 scans lost"), "{past}");
+        status.counters[Counter::LostPpm] = 408_000;
+        status.counters[Counter::DamagedPpm] = 430_000;
+        let now = line_loss(&status);
+        assert!(now.state == State::Warning && now.finding.starts_with("41 % lost on the line"), "{now}");
+        for word in ["cable", "FIFO", "adapter", "termination"] {
+            assert!(now.remedy.contains(word), "{now}");
+        }
     }
 
     #[test]

@@ -33,6 +33,7 @@ pub const CHECKS: &[&str] = &[
     "health",
     "marks",
     "line-errors",
+    "line-loss",
 ];
 
 /// How a check ended.

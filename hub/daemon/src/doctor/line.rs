@@ -8,7 +8,7 @@ use lms::variant::Baud;
 use schema::{Failure, Kind};
 
 use super::Subject;
-use super::counts::{as_the_hub_counts, line_errors};
+use super::counts::{as_the_hub_counts, line_errors, line_loss};
 use super::finding::Finding;
 use super::hub::Hub;
 use super::sensor;
@@ -56,10 +56,12 @@ pub(crate) fn examine(
                 let why = hub.why_unknown();
                 tell(latency(path, latency_ms(path)));
                 tell(held(&holders, hub.pid));
-                tell(link.map_or_else(
-                    || Finding::skipped("line-errors", why),
-                    |(_, status)| as_the_hub_counts(status),
-                ));
+                match link {
+                    Some((_, status)) => {
+                        [as_the_hub_counts(status), line_loss(status)].into_iter().for_each(&mut *tell)
+                    }
+                    None => tell(Finding::skipped("line-errors", why)),
+                }
                 sensor::as_the_hub_says(link, why).into_iter().for_each(tell);
             }
             None => {
@@ -110,6 +112,7 @@ fn server(
     // Most of them serve one at a time.
     if let Some(link) = hub.and_then(|hub| hub.link(&subject.source.name())) {
         tell(Finding::ok("holder", "it is a link of the hub"));
+        tell(line_loss(link.1));
         sensor::as_the_hub_says(Some(link), "").into_iter().for_each(tell);
         return Ok(());
     }

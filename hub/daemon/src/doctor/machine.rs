@@ -27,8 +27,6 @@ pub(crate) struct Facts {
     pub(crate) name: String,
     /// Root path of the domain.
     pub(crate) root: PathBuf,
-    /// This user's number.
-    pub(crate) user: u32,
     /// The root path, or the nearest directory above that exists.
     pub(crate) place: Place,
     /// The hub's process, if one holds the domain.
@@ -70,7 +68,6 @@ pub(crate) struct Memory {
 #[derive(Clone, Debug)]
 pub(crate) struct Place {
     pub(crate) path: PathBuf,
-    pub(crate) owner: u32,
     /// Permission bits.
     pub(crate) mode: u32,
     /// Something can be made in it.
@@ -100,7 +97,6 @@ impl Facts {
             memory: Memory::of_machine(),
             name: domain.name().to_owned(),
             root: root.to_owned(),
-            user,
             place: Place::nearest(root),
             hub: schema::holder(root),
             mute: hub.map(Hub::mute).unwrap_or_default(),
@@ -142,11 +138,10 @@ impl Place {
         match found {
             Some((path, metadata)) => Place {
                 path: path.to_owned(),
-                owner: metadata.uid(),
                 mode: metadata.mode() & 0o7777,
                 writable: metadata.is_dir() && access(path, Access::WRITE_OK | Access::EXEC_OK).is_ok(),
             },
-            None => Place { path: root.to_owned(), owner: 0, mode: 0, writable: false },
+            None => Place { path: root.to_owned(), mode: 0, writable: false },
         }
     }
 }
@@ -192,7 +187,7 @@ pub(crate) fn memory(facts: &Facts) -> Finding {
 /// Whether a hub of this user can take its place, or has it.
 pub(crate) fn domain(facts: &Facts) -> Finding {
     const NAME: &str = "domain";
-    let (root, place, user) = (facts.root.display(), &facts.place, facts.user);
+    let (root, place) = (facts.root.display(), &facts.place);
     let at = place.path.display();
     match &facts.hub {
         Err(failure) => return Finding::failed(NAME, failure.message.clone(), failure.hint.clone()),
@@ -216,20 +211,9 @@ pub(crate) fn domain(facts: &Facts) -> Finding {
             Finding::failed(NAME, text, "name another place with --root")
         };
     }
-    if place.owner != user {
-        return Finding::failed(
-            NAME,
-            format!("{at} belongs to user {}, mode {:04o}; this is user {user}", place.owner, place.mode),
-            "run as that user, or choose another --root or --domain",
-        );
-    }
     if !place.writable {
         let text = format!("{at}: nothing can be made there, mode {:04o}", place.mode);
         return Finding::failed(NAME, text, format!("chmod 700 {at}, or name another place with --root"));
-    }
-    if place.mode & 0o022 != 0 {
-        let text = format!("{at}: others may write there, mode {:04o}", place.mode);
-        return Finding::warning(NAME, text, format!("chmod 700 {at}"));
     }
     Finding::ok(NAME, format!("{root}: free, yours, mode {:04o}", place.mode))
 }
@@ -243,7 +227,9 @@ pub(crate) fn hubs(facts: &Facts, name_of: impl Fn(u32) -> String) -> Finding {
         let mut text = format!("no other hub of domain {}", facts.name);
         for (root, owner) in &facts.closed {
             let (root, owner) = (root.display(), name_of(*owner));
-            text += &format!("; who is at {root} only user {owner} sees: sudo -u {owner} scanhub doctor");
+            text += &format!(
+                "; who is at {root} only user {owner} sees: sudo -u {owner} scanhub doctor; {SHARING}"
+            );
         }
         return Finding::ok(NAME, text);
     }
@@ -266,6 +252,10 @@ pub(crate) fn plural(count: u64, what: &str) -> String {
     }
 }
 
+/// How another user's hub can be heard.
+const SHARING: &str = "to have its data here: `scanhub gateway --interface lo` under that user, and `scanhub listen --publish` \
+                       under this one (docs/sharing.md)";
+
 /// Files in shared memory of each link, and of what belongs to no link, with some for the first consumers.
 const FILES_OF_LINK: u64 = 24;
 const FILES: u64 = 8;
@@ -285,8 +275,7 @@ pub(super) mod tests {
             memory: Some(ROOMY),
             name: "scanhub".into(),
             root: "/run/user/7/scanhub/scanhub".into(),
-            user: 7,
-            place: Place { path: "/run/user/7".into(), owner: 7, mode: 0o700, writable: true },
+            place: Place { path: "/run/user/7".into(), mode: 0o700, writable: true },
             hub: Ok(None),
             mute: Vec::new(),
             is_stopped: false,
@@ -330,21 +319,19 @@ pub(super) mod tests {
     #[test]
     fn a_domain_is_free_held_foreign_or_impossible() {
         let root: PathBuf = facts().root;
-        let there = |owner, mode| Facts {
-            place: Place { path: root.clone(), owner, mode, writable: mode & 0o200 != 0 },
+        let there = |mode| Facts {
+            place: Place { path: root.clone(), mode, writable: mode & 0o200 != 0 },
             ..facts()
         };
         says(&domain(&facts()), State::Ok, &["not there yet"]);
-        says(&domain(&there(7, 0o700)), State::Ok, &["free", "0700"]);
-        says(&domain(&there(7, 0o777)), State::Warning, &["0777", "chmod 700"]);
-        says(&domain(&there(7, 0o500)), State::Failed, &["0500", "chmod 700"]);
-        says(&domain(&there(8, 0o700)), State::Failed, &["user 8", "user 7", "--root"]);
+        says(&domain(&there(0o700)), State::Ok, &["free", "0700"]);
+        says(&domain(&there(0o500)), State::Failed, &["0500", "chmod 700"]);
         says(&domain(&Facts { hub: Ok(Some(41)), ..facts() }), State::Ok, &["process 41"]);
         let mute = Facts { hub: Ok(Some(41)), mute: vec!["front".into(), "rear".into()], ..facts() };
         says(&domain(&mute), State::Failed, &["process 41", "front, rear", "kill 41"]);
         let stopped = Facts { is_stopped: true, ..mute };
         says(&domain(&stopped), State::Failed, &["stopped, process 41", "kill -CONT 41"]);
-        let closed = Place { path: "/run".into(), owner: 0, mode: 0o755, writable: false };
+        let closed = Place { path: "/run".into(), mode: 0o755, writable: false };
         says(&domain(&Facts { place: closed, ..facts() }), State::Failed, &["/run", "--root"]);
         let denied = Failure::new(Kind::Failed, "not yours", "ask");
         says(&domain(&Facts { hub: Err(denied), ..facts() }), State::Failed, &["not yours", "ask"]);

@@ -63,6 +63,7 @@ pub(super) struct BackgroundLayer {
     scans: Option<Spanned<i64>>,
     candidate: Option<CandidateLayer>,
     start: Option<Spanned<String>>,
+    keep: Option<bool>,
     no_return_is_far: Option<bool>,
     publish: Option<PublishLayer>,
 }
@@ -200,7 +201,9 @@ impl BackgroundLayer {
                 CandidateLayer::Latest => Candidate::Latest,
             };
         }
+        background.is_handed_on = self.keep.unwrap_or(background.is_handed_on);
         if let Some(start) = self.start {
+            background.start_is_said = true;
             (learning.start, background.file) = match start.get_ref().as_str() {
                 "empty" => (Start::Empty, None),
                 "first-scan" => (Start::FirstScan, None),

@@ -13,6 +13,8 @@ use schema::{BEAMS, Background};
 #[derive(Clone)]
 pub(super) struct Multi {
     slots: [Slots; SLOTS],
+    /// What a surface weighs that the beam meets next: more where nothing came back from it before.
+    gain: [u16; BEAMS],
     runs: Runs,
 }
 
@@ -29,6 +31,7 @@ struct Slots {
 #[derive(Clone, Copy)]
 struct Bounds {
     threshold: u16,
+    returned: u16,
     full: u16,
     known: u16,
     replaced: u16,
@@ -36,7 +39,8 @@ struct Bounds {
 
 impl Multi {
     pub(super) fn new() -> Multi {
-        Multi { slots: [Slots { range: [0; BEAMS], weight: [0; BEAMS] }; SLOTS], runs: Runs::new() }
+        let slots = [Slots { range: [0; BEAMS], weight: [0; BEAMS] }; SLOTS];
+        Multi { slots, gain: [MET; BEAMS], runs: Runs::new() }
     }
 
     /// Compares all beams with the state before this scan, then learns from them.
@@ -91,16 +95,31 @@ impl Multi {
     /// went more than those that may be hidden. What is none of them takes the place of the least known one, unless all
     /// are known too well.
     fn learn(&mut self, readings: &[u16], bounds: Bounds) {
+        let gains = self.gains(readings, bounds);
         for (i, &reading) in readings.iter().enumerate() {
             let range = self.slots.each_ref().map(|slots| slots.range[i]);
             let weight = self.slots.each_ref().map(|slots| slots.weight[i]);
-            let (new_range, new_weight) = learned(range, weight, reading, bounds);
+            let (new_range, new_weight) = learned(range, weight, reading, gains[i], bounds);
             let valid = reading != INVALID;
             for (k, slots) in self.slots.iter_mut().enumerate() {
                 slots.range[i] = if valid { new_range[k] } else { range[k] };
                 slots.weight[i] = if valid { new_weight[k] } else { weight[k] };
             }
         }
+    }
+
+    /// What the surface that each beam meets gains in this scan. By themselves: the processor does not do so many things at
+    /// once in the loop over the surfaces.
+    fn gains(&mut self, readings: &[u16], bounds: Bounds) -> [u16; BEAMS] {
+        let mut gains = [MET; BEAMS];
+        for ((gain, next), &reading) in gains.iter_mut().zip(&mut self.gain).zip(readings) {
+            let is_far = reading == Background::FAR;
+            *gain = if is_far { MET } else { *next };
+            let more = (*next + MET).min(bounds.returned);
+            let after = if is_far { more } else { MET };
+            *next = if reading == INVALID { *next } else { after };
+        }
+        gains
     }
 
     /// Takes `range` for the only background of beam `i`, as well known as can be.
@@ -110,20 +129,23 @@ impl Multi {
         self.slots[0].weight[i] = u16::MAX;
     }
 
-    /// The best known background of beam `i`, of equals the nearer one.
+    /// The best known background of beam `i`, of equals the nearer one; a surface before nothing, however often nothing comes
+    /// back from it: whoever begins with that alone would take the surface for somebody.
     pub(super) fn background(&self, i: usize, limits: &Limits) -> u16 {
         let known = |slots: &&Slots| slots.weight[i] >= Bounds::of(limits).known;
-        let best = self.slots.iter().filter(known).max_by_key(|s| (s.weight[i], u16::MAX - s.range[i]));
+        let rank = |s: &&Slots| (s.range[i] != Background::FAR, s.weight[i], u16::MAX - s.range[i]);
+        let best = self.slots.iter().filter(known).max_by_key(rank);
         best.map_or(Background::UNTAUGHT, |slots| slots.range[i])
     }
 }
 
-/// The surfaces of one beam after `reading`.
+/// The surfaces of one beam after `reading`; the one that was met gains so much.
 #[inline]
 fn learned(
     range: [u16; SLOTS],
     weight: [u16; SLOTS],
     reading: u16,
+    gain: u16,
     bounds: Bounds,
 ) -> ([u16; SLOTS], [u16; SLOTS]) {
     const NOT_MET: u16 = u16::MAX;
@@ -144,7 +166,7 @@ fn learned(
         new_range[k] = if met { range[k].wrapping_add_signed(step) } else { range[k] };
         let before = weight[k].min(bounds.full);
         let leak = if reading > range[k] { PASSED } else { HIDDEN };
-        let more = before.saturating_add(MET).min(bounds.full);
+        let more = before.saturating_add(gain).min(bounds.full);
         new_weight[k] = if met { more } else { before.saturating_sub(leak) };
         least = least.min(new_weight[k]);
     }
@@ -153,7 +175,7 @@ fn learned(
         let replaced = homeless & (new_weight[k] == least);
         homeless &= !replaced;
         new_range[k] = if replaced { reading } else { new_range[k] };
-        new_weight[k] = if replaced { MET } else { new_weight[k] };
+        new_weight[k] = if replaced { gain } else { new_weight[k] };
     }
     (new_range, new_weight)
 }
@@ -163,6 +185,7 @@ impl Bounds {
         let scans = limits.scans;
         Bounds {
             threshold: limits.threshold,
+            returned: MET * (scans / RETURNED_OF).clamp(1, RETURNED),
             full: MET * scans,
             known: KNOWN * scans,
             replaced: REPLACED * scans,
@@ -178,6 +201,11 @@ const DRAWN: i16 = 16;
 
 /// Weight of a scan in which the surface was met; it is fully known after as many scans as are set.
 const MET: u16 = 8;
+/// A surface counts as met also in the scans just before from which nothing came back, at most so many with the one in
+/// which it was met, and at most one for so many that are set. So a wall from which 15 % of the beams come back is
+/// background after 5/4 of the scans that are set, and somebody who stands there no sooner for a beam that is lost.
+const RETURNED: u16 = 16;
+const RETURNED_OF: u16 = 16;
 /// Weight lost in a scan that saw what is behind the surface: what was taken away is no background any more after 3/4
 /// of the scans that are set, and what is met in more than a third of the scans becomes one in the end.
 const PASSED: u16 = 4;

@@ -329,9 +329,10 @@ fn surface(origin: &Origin, name: &Spanned<String>) -> Result<Surface, Failure> 
         "dark" => Ok(Surface::Dark),
         "reflector" => Ok(Surface::Reflector),
         "glass" => Ok(Surface::Glass),
+        "faint" => Ok(Surface::Faint),
         other => {
             let what = format!("surface = \"{other}\"");
-            Err(origin.refuse(name.span(), what, "plain, dark, reflector or glass"))
+            Err(origin.refuse(name.span(), what, "plain, dark, reflector, glass or faint"))
         }
     }
 }

@@ -42,6 +42,8 @@ pub(crate) struct Bench {
     /// Every state that was seen, once in a row.
     pub(crate) states: Vec<State>,
     port: Baud,
+    /// How many bytes may wait to be read; more are lost, as in the buffer of a tty.
+    pub(crate) room: usize,
     /// Bytes that came and were not read.
     inbox: VecDeque<u8>,
     mistuned: Mistuned,
@@ -86,6 +88,8 @@ pub(crate) struct Received {
     /// When its first byte came, as the session says.
     #[allow(dead_code, reason = "for the tests of stamps")]
     pub(crate) first: Nanos,
+    #[allow(dead_code, reason = "for the tests of stamps")]
+    pub(crate) estimated: bool,
     /// Reads since the one before it.
     pub(crate) looks: u32,
 }
@@ -142,6 +146,7 @@ impl Bench {
             received: Vec::new(),
             states: Vec::new(),
             port: wanted.baud,
+            room: usize::MAX,
             inbox: VecDeque::new(),
             mistuned: Mistuned::default(),
             damaged: false,
@@ -234,8 +239,9 @@ impl Bench {
                 Output::Telegram(received) => {
                     let telegram = received.telegram.bytes().to_vec();
                     let looks = std::mem::take(&mut self.looks);
-                    let lms::session::Received { mode, reasons, first, .. } = received;
-                    self.received.push(Received { at: self.now, telegram, mode, reasons, first, looks });
+                    let lms::session::Received { mode, reasons, first, estimated, .. } = received;
+                    let at = self.now;
+                    self.received.push(Received { at, telegram, mode, reasons, first, estimated, looks });
                 }
                 Output::Rest(until) => break (false, until),
                 Output::Wait { until, .. } => break (true, until),
@@ -313,6 +319,7 @@ impl Bench {
         if baud != self.port {
             bytes = self.mistuned.receive((baud.rate(), self.port.rate()), &bytes, idle_after);
         }
+        bytes.truncate(self.room - self.inbox.len());
         self.damaged |= bytes != brought;
         self.inbox.extend(bytes);
         match part {

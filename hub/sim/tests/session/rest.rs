@@ -63,32 +63,6 @@ fn what_a_killed_host_would_lose_is_not_read_before_it_is_nearly_complete() {
 }
 
 #[test]
-fn what_waited_while_a_host_between_two_telegrams_was_stopped_is_no_newer_than_it_is() {
-    let settings = Settings { baud: Baud::B500000, ..Settings::default() };
-    let machine = Machine::new(settings, Source::Room(Room::new(&"room".parse().unwrap(), 5)));
-    let mut bench = Bench::new(machine, 0);
-    bench.until("streaming", 3_000 * MILLIS, Bench::is_streaming);
-    for _ in 0..20 {
-        bench.run(100 * MILLIS);
-        while !bench.session.may_leave() {
-            bench.run(MILLIS);
-        }
-        let stopped = bench.now;
-        // As much as a tty has room for.
-        bench.stop(140 * MILLIS);
-        let continued = bench.now;
-        bench.run(5 * MILLIS);
-        let waited: Vec<_> = bench.received.iter().filter(|got| got.at >= stopped).collect();
-        assert!(waited.len() >= 4, "{} telegrams", waited.len());
-        for got in waited.into_iter().filter(|got| got.at < continued + 2 * MILLIS) {
-            let sent =
-                bench.sent.iter().rev().find(|sent| sent.telegram == got.telegram).expect("it was sent");
-            assert!((stopped..sent.at).contains(&got.first), "{} was sent by {}", got.first, sent.at);
-        }
-    }
-}
-
-#[test]
 fn what_is_asked_of_a_running_stream_is_heard_as_soon_as_it_is_answered() {
     let mut machine = sensor(Baud::B500000);
     let now = make_stream(&mut machine);

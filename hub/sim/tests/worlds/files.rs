@@ -51,7 +51,7 @@ fn every_world_runs_for_a_minute_as_its_name_says() {
         }
         kinds.into_iter().collect::<Vec<_>>().join(" ")
     };
-    for name in ["room", "standing", "approach", "corridor", "glass", "sun", "crowd"] {
+    for name in ["room", "standing", "approach", "corridor", "glass", "faint", "sun", "crowd"] {
         assert_eq!(met(name), "grazed invalid person static", "{name}");
     }
     for name in ["fig8", "door", "chair"] {
@@ -62,7 +62,9 @@ fn every_world_runs_for_a_minute_as_its_name_says() {
 
 #[test]
 fn ten_seeds_are_ten_runs() {
-    for name in ["fig8", "standing", "approach", "door", "corridor", "glass", "sun", "chair", "crowd"] {
+    for name in
+        ["fig8", "standing", "approach", "door", "corridor", "glass", "faint", "sun", "chair", "crowd"]
+    {
         let world: World = name.parse().unwrap();
         let world = world.with_layers(sim::layers::Layers::NONE);
         let scan = |seed| Room::new(&world, seed).scan(Variant::HALF, Unit::Mm, Mode(1), 17_000_000_000);
@@ -179,12 +181,12 @@ proptest! {
     /// Whatever a file has become, it is refused with a place or it runs.
     #[test]
     fn a_damaged_file_is_refused_or_runs(
-        file in 0..12usize,
+        file in 0..13usize,
         at in any::<prop::sample::Index>(),
         cut in 0..12usize,
         patch in "[-0-9.,=a-z_\\[\\]\"é# \n]{0,8}",
     ) {
-        let names = ["fig8", "door", "crowd", "sun", "approach", "room", "standing", "corridor", "glass", "chair", "strips", "bare"];
+        let names = ["fig8", "door", "crowd", "sun", "approach", "room", "standing", "corridor", "glass", "chair", "strips", "bare", "faint"];
         let mut characters: Vec<char> = text(names[file]).chars().collect();
         let from = at.index(characters.len());
         let until = (from + cut).min(characters.len());

@@ -1,0 +1,129 @@
+"""The robot's verdict: the fold over its sensors' zones, in which a sensor that is not heard counts as unknown."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+from . import memory
+from .freshness import Freshness, now
+from .names import Domain, TopicName, is_remote
+from .presence import GRACE
+from .processed import Zones
+from .subscription import Subscription
+
+
+@dataclass(frozen=True)
+class Robot:
+    """What is known of the robot's surroundings at a moment, by value.
+
+    `verdict` is the worst of all sensors: `stop`, `unknown`, `slow`, `clear`; `unknown` as long as there are none, and to
+    be taken as `stop`. `worst` is the first sensor with it, `nearest_mm` how far from the robot's centre the nearest of
+    all points is, and `nearest_sensor` who sees it. `sensors` has each sensor's own verdict.
+    """
+
+    verdict: str = "unknown"
+    worst: str | None = None
+    nearest_mm: int | None = None
+    nearest_sensor: str | None = None
+    sensors: dict[str, str] = field(default_factory=dict)
+
+
+class RobotFollower(Subscription):
+    """Iterates over what is known of the robot, for ever. Made by `scanhub.robot`."""
+
+    def __init__(self, sensors: list[str], places: list[Domain]) -> None:
+        super().__init__([TopicName(sensor, Zones.topic) for sensor in sensors], places, None, None)
+        self._heard: dict[str, _Said | None] = dict.fromkeys(sensors)
+        self._begun = False
+        self._nobody = Freshness(now())
+        self._is_named = bool(sensors)
+        self._is_of_hub: bool | None = None
+        self._call_at: float | None = None
+
+    def __next__(self) -> Robot:
+        """Waits until any of the sensors is heard, or any is heard no more; the first time for a word of each."""
+        if self._closed:
+            raise StopIteration
+        while not self._hear():
+            self._wait(self._nobody.left(now()) if not self._followers else float("inf"))
+        return self._fold()
+
+    def now(self) -> Robot:
+        """What is known now; never waits."""
+        if not self._closed:
+            self._hear()
+        return Robot() if self._closed else self._fold()
+
+    def _hear(self) -> bool:
+        """Takes all that waits; whether there was anything."""
+        # Who always finds something has to see a hub come, too.
+        any_heard = self._drain()
+        if self._look():
+            any_heard = self._drain() or any_heard
+        # Last, because it takes longer than all the rest.
+        return self._call_the_roll() or any_heard or self._is_nobody_there()
+
+    def _drain(self) -> bool:
+        any_heard = False
+        while (zones := self._receive()) is not None:
+            self._heard[zones.sensor] = _Said(zones.verdict, zones.nearest_mm)
+            self._begun = self._begun or None not in self._heard.values()
+            any_heard = True
+        return any_heard and self._begun
+
+    def _is_nobody_there(self) -> bool:
+        return not self._followers and self._nobody.silence(now())
+
+    def _call_the_roll(self) -> bool:
+        """Adds the sensors that there are and that are not followed yet; one that is, stays: that it is missing is to be
+        seen. Sensors of other machines give way to a hub that comes, because their zones are around another centre;
+        nobody stands in for a hub that goes. True if all that was known was forgotten just now."""
+        domain = self._presence.domain
+        if self._is_named or domain is None or self._membership is None:
+            self._call_at = None
+            return False
+        if self._is_of_hub is False and self._presence.is_hub:
+            self._forget()
+            return True
+        at = time.monotonic()
+        if self._call_at is None:
+            self._call_at = at + GRACE / 2
+        if at < self._call_at:
+            return False
+        self._call_at = at + _CALL_EVERY
+        of_hub = self._presence.is_hub if self._is_of_hub is None else self._is_of_hub
+        for name in memory.topics(domain):
+            if name.topic == Zones.topic and is_remote(name.sensor) != of_hub:
+                self._is_of_hub = of_hub
+                if name.sensor not in self._heard:
+                    self._heard[name.sensor] = None
+                    self._follow(name)
+        return False
+
+    def _forget(self) -> None:
+        self._leave()
+        self._followers, self._turn, self._heard = [], 0, {}
+        self._begun, self._is_of_hub, self._call_at = False, True, None
+
+    def _fold(self) -> Robot:
+        sensors = {sensor: said.verdict if said else "unknown" for sensor, said in self._heard.items()}
+        # The first of the worst.
+        worst = max(sensors, key=lambda sensor: _RANKS[sensors[sensor]], default=None)
+        seen = [(said.nearest_mm, sensor) for sensor, said in self._heard.items() if said]
+        nearest = min(((mm, sensor) for mm, sensor in seen if mm is not None), default=(None, None))
+        return Robot(sensors[worst] if worst else "unknown", worst, *nearest, sensors)
+
+
+class _Said(NamedTuple):
+    """The last word of a sensor."""
+
+    verdict: str
+    nearest_mm: int | None
+
+
+_RANKS = {"clear": 0, "slow": 1, "unknown": 2, "stop": 3}
+"""What is seen inside outweighs what is not known."""
+_CALL_EVERY = 1.0
+"""Seconds: a hub that starts makes its topics one after the other, and nobody shall be overlooked for long."""

@@ -1,0 +1,50 @@
+"""Follows the verdict of a robot and prints each as a line of JSON: arguments are domain, root, sensors. Each tenth is also
+asked for by `now`, which never waits. Ends by Ctrl-C, and says so. With `--asked` in place of sensors: what `now` says for each
+line of stdin."""
+
+import json
+import os
+import sys
+import time
+from dataclasses import asdict
+
+import scanhub
+
+
+def say(line: dict) -> None:
+    """With one system call, so that Ctrl-C leaves no half of it."""
+    written = (json.dumps(line) + "\n").encode()
+    assert os.write(sys.stdout.fileno(), written) == len(written)
+
+
+def refused(what) -> None:
+    try:
+        what()
+    except scanhub.Impossible:
+        return
+    raise AssertionError("a name that is not possible")
+
+
+domain, root, *sensors = sys.argv[1:]
+refused(lambda: scanhub.robot("front", "Front"))
+refused(lambda: scanhub.robot("robot"))
+with scanhub.robot(domain=domain, root=root) as asked:
+    assert asked.now() == scanhub.Robot() and asked.now().verdict == "unknown", "nobody was heard yet"
+assert asked.now() == scanhub.Robot() and list(asked) == [], "it was closed"
+
+if sensors == ["--asked"]:
+    robot = scanhub.robot(domain=domain, root=root)
+    for _ in sys.stdin:
+        say({"class": "now", **asdict(robot.now())})
+    sys.exit()
+
+robot = scanhub.robot(*sensors, domain=domain, root=root)
+try:
+    for number, now in enumerate(robot):
+        say({"class": "robot", **asdict(now)})
+        if number % 10 == 0:
+            begin = time.monotonic()
+            now = robot.now()
+            say({"class": "now", **asdict(now), "took_s": time.monotonic() - begin})
+except KeyboardInterrupt:
+    say({"class": "end"})

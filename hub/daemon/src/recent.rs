@@ -1,0 +1,71 @@
+//! What the line took away lately: shares of the last ten seconds, made of counters that only grow. Time is an argument.
+
+use std::collections::VecDeque;
+
+use lms::{MILLIS, Nanos};
+use schema::{Counter, Counters};
+
+/// The counters of the last ten seconds.
+pub(crate) struct Recent {
+    /// When they were looked at, a second apart, the newest last.
+    looks: VecDeque<(Nanos, Counters)>,
+}
+
+impl Recent {
+    /// Nothing was looked at yet.
+    pub(crate) fn new() -> Recent {
+        Recent { looks: VecDeque::with_capacity(LOOKS) }
+    }
+
+    /// Sets the gauges of `counters`, which are those of `now`.
+    pub(crate) fn gauge(&mut self, now: Nanos, counters: &mut Counters) {
+        while self.looks.get(1).is_some_and(|(at, _)| now.saturating_sub(*at) >= WINDOW) {
+            self.looks.pop_front();
+        }
+        let zero = Counters::default();
+        let since = self.looks.front().map_or(&zero, |(_, counters)| counters);
+        let ppm = |part: Counter, whole: Counter| {
+            let grown = |counter| counters[counter].saturating_sub(since[counter]);
+            (1_000_000 * grown(part)).checked_div(grown(whole)).unwrap_or(0).min(1_000_000)
+        };
+        let damaged = ppm(Counter::BytesDamaged, Counter::BytesRead);
+        let lost = ppm(Counter::LostOnLine, Counter::DueOnLine);
+        (counters[Counter::DamagedPpm], counters[Counter::LostPpm]) = (damaged, lost);
+        if self.looks.back().is_none_or(|(at, _)| now.saturating_sub(*at) >= STEP) {
+            self.looks.push_back((now, *counters));
+        }
+    }
+}
+
+const WINDOW: Nanos = 10_000 * MILLIS;
+const STEP: Nanos = 1_000 * MILLIS;
+/// One before the window, one at its end.
+const LOOKS: usize = (WINDOW / STEP) as usize + 2;
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn shares_are_those_of_the_last_ten_seconds() {
+        let mut recent = Recent::new();
+        let mut counters = Counters::default();
+        for second in 0..40 {
+            counters[Counter::BytesRead] += 1000;
+            counters[Counter::DueOnLine] += 40;
+            if (10..20).contains(&second) {
+                counters[Counter::BytesDamaged] += 500;
+                counters[Counter::LostOnLine] += 10;
+            }
+            recent.gauge(second * 1_000 * MILLIS, &mut counters);
+            let told = (counters[Counter::DamagedPpm], counters[Counter::LostPpm]);
+            match second {
+                0..10 | 29.. => assert_eq!(told, (0, 0), "{second}"),
+                19 => assert_eq!(told, (500_000, 250_000)),
+                14 => assert_eq!(told, (250_000, 125_000)),
+                _ => assert!(told.0 > 0 && told.0 < 500_000, "{second}: {told:?}"),
+            }
+        }
+        assert_eq!(recent.looks.len(), 11);
+    }
+}

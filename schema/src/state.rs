@@ -1,0 +1,230 @@
+//! What a domain keeps over restarts: small text files that are replaced whole, for this user alone. A crash leaves the old
+//! file or the new one. Whoever reads one checks what it says: it may be from another version, or missing. Refuses to
+//! know what the files are about; losing them loses nothing but time.
+
+use std::ffi::OsString;
+use std::fs::{self, DirBuilder, File, OpenOptions};
+use std::io::{self, ErrorKind, Read, Write};
+use std::os::unix::fs::{DirBuilderExt, MetadataExt, OpenOptionsExt};
+use std::path::{Path, PathBuf};
+
+use rustix::fs::OFlags;
+
+use crate::domain::first_path;
+use crate::{Failure, Kind};
+
+/// The directory of a domain's files: `$STATE_DIRECTORY/DOMAIN`, else `$XDG_STATE_HOME/scanhub/DOMAIN`, else
+/// `~/.local/state/scanhub/DOMAIN`.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct StateDirectory {
+    path: PathBuf,
+}
+
+impl StateDirectory {
+    /// Where the directories of all domains are, as the environment of this process says: what systemd made for the service,
+    /// else the user's own. `None` if it names no place.
+    pub fn base() -> Option<PathBuf> {
+        base_in(|name| std::env::var_os(name))
+    }
+
+    /// The directory of `domain`; `None` as for [`base`](Self::base). It need not be there.
+    pub fn of_domain(domain: &str) -> Option<StateDirectory> {
+        Some(StateDirectory::at(StateDirectory::base()?.join(domain)))
+    }
+
+    /// The directory `path`, which need not be there.
+    pub fn at(path: impl Into<PathBuf>) -> StateDirectory {
+        StateDirectory { path: path.into() }
+    }
+
+    /// Where file `name` is, or would be.
+    pub fn path(&self, name: &str) -> PathBuf {
+        self.path.join(name)
+    }
+
+    /// What file `name` holds; `None` if there is none.
+    ///
+    /// [`Kind::Failed`] if it cannot be read, is not a plain file of this user that nobody else can write, has more than
+    /// `most` bytes, or is no UTF-8.
+    pub fn read(&self, name: &str, most: u64) -> Result<Option<String>, Failure> {
+        let path = self.path(name);
+        match read(&path, most) {
+            Ok(text) => Ok(Some(text)),
+            Err(error) if matches!(error.kind(), ErrorKind::NotFound | ErrorKind::NotADirectory) => Ok(None),
+            Err(error) => Err(Failure::new(
+                Kind::Failed,
+                format!("cannot use {}: {error}", path.display()),
+                "delete it; what it held is learned again",
+            )),
+        }
+    }
+
+    /// Puts `text` into file `name`, mode 0600, in place of what it held; makes the directory, mode 0700, if it is not there.
+    /// It takes as long as the disk does: not for a thread that has a line to read.
+    ///
+    /// [`Kind::Failed`] if that is not possible; then what the file held is still there.
+    pub fn write(&self, name: &str, text: &str) -> Result<(), Failure> {
+        self.replace(name, text).map_err(|error| {
+            let what = format!("cannot keep {}: {error}", self.path(name).display());
+            Failure::new(
+                Kind::Failed,
+                what,
+                "let STATE_DIRECTORY or XDG_STATE_HOME name a directory of this user",
+            )
+        })
+    }
+
+    fn replace(&self, name: &str, text: &str) -> io::Result<()> {
+        DirBuilder::new().recursive(true).mode(0o700).create(&self.path)?;
+        let beside = self.path(&format!("{name}.new"));
+        // One that a crash left may have another mode, or lead elsewhere.
+        match fs::remove_file(&beside) {
+            Err(error) if error.kind() != ErrorKind::NotFound => return Err(error),
+            _ => {}
+        }
+        let mut file = OpenOptions::new().write(true).create_new(true).mode(0o600).open(&beside)?;
+        let written = file.write_all(text.as_bytes()).and_then(|()| file.sync_data());
+        let renamed = written.and_then(|()| fs::rename(&beside, self.path(name)));
+        if renamed.is_err() {
+            let _ = fs::remove_file(&beside);
+        }
+        renamed
+    }
+}
+
+fn base_in(variable: impl Fn(&str) -> Option<OsString>) -> Option<PathBuf> {
+    let path = |name| variable(name).and_then(first_path);
+    let user = || path("XDG_STATE_HOME").or_else(|| Some(path("HOME")?.join(".local/state")));
+    path("STATE_DIRECTORY").or_else(|| Some(user()?.join("scanhub")))
+}
+
+fn read(path: &Path, most: u64) -> io::Result<String> {
+    // A FIFO would be waited for.
+    let flags = (OFlags::NOFOLLOW | OFlags::NONBLOCK).bits() as i32;
+    let file = OpenOptions::new().read(true).custom_flags(flags).open(path)?;
+    check(&file)?;
+    let mut text = String::new();
+    let len = file.take(most + 1).read_to_string(&mut text)?;
+    if len as u64 > most { Err(refused(format!("it has more than {most} bytes"))) } else { Ok(text) }
+}
+
+fn check(file: &File) -> io::Result<()> {
+    let metadata = file.metadata()?;
+    let (owner, mode) = (metadata.uid(), metadata.mode() & 0o7777);
+    if !metadata.is_file() {
+        return Err(refused("it is no file".into()));
+    }
+    if owner != rustix::process::geteuid().as_raw() || mode & 0o022 != 0 {
+        return Err(refused(format!("others can write it: owner {owner}, mode {mode:04o}")));
+    }
+    Ok(())
+}
+
+fn refused(what: String) -> io::Error {
+    io::Error::new(ErrorKind::InvalidData, what)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use std::os::unix::fs::{PermissionsExt, symlink};
+
+    /// A directory that is not there yet, and goes with the value.
+    struct Place(PathBuf);
+
+    impl Place {
+        fn new(name: &str) -> (Place, StateDirectory) {
+            let path =
+                std::env::temp_dir().join(format!("scanhub-state-{}-{name}", std::process::id())).join("a");
+            (Place(path.clone()), StateDirectory::at(path))
+        }
+    }
+
+    impl Drop for Place {
+        fn drop(&mut self) {
+            let _ = fs::remove_dir_all(self.0.parent().unwrap());
+        }
+    }
+
+    fn mode(path: &Path) -> u32 {
+        fs::metadata(path).unwrap().mode() & 0o7777
+    }
+
+    #[test]
+    fn the_environment_says_where() {
+        let base = |set: &[(&str, &str)]| {
+            base_in(|name| set.iter().find(|(key, _)| *key == name).map(|(_, value)| value.into()))
+        };
+        let [service, user, home] =
+            [("STATE_DIRECTORY", "/s/a:/s/b"), ("XDG_STATE_HOME", "/x"), ("HOME", "/h")];
+        assert_eq!(base(&[service, user, home]), Some("/s/a".into()));
+        assert_eq!(base(&[user, home]), Some("/x/scanhub".into()));
+        assert_eq!(base(&[home]), Some("/h/.local/state/scanhub".into()));
+        assert_eq!(base(&[("XDG_STATE_HOME", "relative"), home]), Some("/h/.local/state/scanhub".into()));
+        assert_eq!(base(&[]), None);
+    }
+
+    #[test]
+    fn what_was_written_is_read_by_this_user_alone() {
+        let (place, state) = Place::new("written");
+        assert_eq!(state.read("f", 9), Ok(None));
+        for text in ["first", "second", ""] {
+            state.write("f", text).unwrap();
+            assert_eq!(state.read("f", 6), Ok(Some(text.to_owned())));
+            assert_eq!((mode(&place.0), mode(&state.path("f"))), (0o700, 0o600));
+        }
+        assert_eq!(fs::read_dir(&place.0).unwrap().count(), 1, "nothing is left beside it");
+    }
+
+    #[test]
+    fn what_a_crash_left_is_replaced() {
+        let (place, state) = Place::new("crash");
+        fs::create_dir_all(&place.0).unwrap();
+        let other = place.0.join("other");
+        fs::write(&other, "untouched").unwrap();
+        symlink(&other, state.path("f.new")).unwrap();
+        state.write("f", "text").unwrap();
+        assert_eq!(state.read("f", 9), Ok(Some("text".to_owned())));
+        assert_eq!(fs::read_to_string(&other).unwrap(), "untouched");
+        assert_eq!(mode(&state.path("f")), 0o600);
+    }
+
+    #[test]
+    fn what_is_not_ours_is_not_believed() {
+        let (place, state) = Place::new("foreign");
+        state.write("f", "12345").unwrap();
+        let refused = |state: &StateDirectory, name, says: &str| {
+            let failure = state.read(name, 5).unwrap_err();
+            assert!(failure.message.contains(says) && failure.message.contains("/a/"), "{failure}");
+            assert!(failure.hint.contains("delete it"), "{failure}");
+        };
+        fs::write(state.path("long"), "123456").unwrap();
+        refused(&state, "long", "more than 5 bytes");
+        fs::write(state.path("binary"), [0xff]).unwrap();
+        refused(&state, "binary", "UTF-8");
+        symlink(state.path("f"), state.path("link")).unwrap();
+        refused(&state, "link", "");
+        fs::create_dir(state.path("directory")).unwrap();
+        refused(&state, "directory", "no file");
+        fs::set_permissions(state.path("f"), fs::Permissions::from_mode(0o620)).unwrap();
+        refused(&state, "f", "mode 0620");
+        drop(place);
+    }
+
+    #[test]
+    fn where_nothing_can_be_written_the_remedy_is_told() {
+        let state = StateDirectory::at("/dev/null/x");
+        assert_eq!(state.read("f", 9), Ok(None));
+        let failure = state.write("f", "text").unwrap_err();
+        assert!(failure.message.contains("/dev/null/x/f"), "{failure}");
+        assert!(failure.hint.contains("STATE_DIRECTORY"), "{failure}");
+    }
+
+    #[test]
+    fn a_name_that_is_taken_by_a_directory_stays_as_it_is() {
+        let (place, state) = Place::new("taken");
+        fs::create_dir_all(state.path("f").join("full")).unwrap();
+        state.write("f", "text").unwrap_err();
+        assert_eq!(fs::read_dir(&place.0).unwrap().count(), 1, "nothing is left beside it");
+    }
+}

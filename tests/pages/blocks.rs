@@ -1,0 +1,64 @@
+//! The examples of the pages: every block of code in README.md, `docs/` and beside the libraries, with its place and its
+//! language. Refuses to know what becomes of it.
+#![allow(dead_code)] // Every test takes what it needs.
+
+use std::fs;
+use std::path::{Path, PathBuf};
+
+/// A block of code on a page.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub(crate) struct Block {
+    /// The page and the line on which it begins, as compilers write it.
+    pub(crate) place: String,
+    /// What is written behind the fence: sh, rust, python ..
+    pub(crate) language: String,
+    /// Its lines, each with a line feed.
+    pub(crate) text: String,
+}
+
+/// All blocks of all pages.
+pub(crate) fn blocks() -> Vec<Block> {
+    let top = Path::new(env!("CARGO_MANIFEST_DIR"));
+    let mut pages = vec![top.join("README.md")];
+    for directory in ["docs", "clients/python", "clients/c"] {
+        pages.extend(fs::read_dir(top.join(directory)).expect(directory).map(|entry| entry.unwrap().path()));
+    }
+    pages.retain(|page| page.extension().is_some_and(|it| it == "md"));
+    pages.sort();
+    let read = |page: &PathBuf| {
+        let name = page.strip_prefix(top).expect("below the top").display().to_string();
+        of_page(&name, &fs::read_to_string(page).expect("a page"))
+    };
+    pages.iter().flat_map(read).collect()
+}
+
+/// The blocks of one page.
+pub(crate) fn of_page(name: &str, text: &str) -> Vec<Block> {
+    let mut blocks = Vec::new();
+    let mut open: Option<Block> = None;
+    for (number, line) in text.lines().enumerate() {
+        match (&mut open, line.trim_start().strip_prefix("```")) {
+            (None, Some(language)) => {
+                let place = format!("{name}:{}", number + 1);
+                open = Some(Block { place, language: language.trim().to_owned(), text: String::new() });
+            }
+            (Some(_), Some(_)) => blocks.extend(open.take()),
+            (Some(block), None) => block.text.extend([line, "\n"]),
+            (None, None) => {}
+        }
+    }
+    assert_eq!(open, None, "a block without an end");
+    blocks
+}
+
+#[test]
+fn blocks_have_a_place_and_a_language() {
+    let page = "words\n```sh\none\n\ntwo\n```\n- item\n  ```\n  three\n  ```\n";
+    let block = |place: &str, language: &str, text: &str| Block {
+        place: place.into(),
+        language: language.into(),
+        text: text.into(),
+    };
+    let wanted = [block("p.md:2", "sh", "one\n\ntwo\n"), block("p.md:8", "", "  three\n")];
+    assert_eq!(of_page("p.md", page), wanted);
+}

@@ -1,0 +1,93 @@
+//! Lines for a shell, as far as examples use it: comments, quotes, pipes and redirections. Refuses to run anything.
+#![allow(dead_code)] // Every test takes what it needs.
+
+/// The lines of a block without their comments.
+pub(crate) fn lines(text: &str) -> Vec<String> {
+    let lines = text.lines().map(|line| without_comment(line).trim().to_owned());
+    lines.filter(|line| !line.is_empty()).collect()
+}
+
+/// The words of each command in a line; redirections are none of them.
+pub(crate) fn commands(line: &str) -> Vec<Vec<String>> {
+    let mut commands = vec![Vec::new()];
+    let mut is_redirected = false;
+    for (word, is_quoted) in words(line) {
+        match word.as_str() {
+            "|" | "&&" | ";" if !is_quoted => commands.push(Vec::new()),
+            ">" | "<" if !is_quoted => is_redirected = true,
+            _ if is_redirected => is_redirected = false,
+            _ => commands.last_mut().expect("there is one").push(word),
+        }
+    }
+    commands
+}
+
+/// The words of each `scanhub` in a line, also of those that Cargo runs.
+pub(crate) fn of_the_program(line: &str) -> Vec<Vec<String>> {
+    let of_cargo = |words: &[String]| {
+        let at = words
+            .iter()
+            .position(|word| word == "--")
+            .filter(|_| words.starts_with(&["cargo".into(), "run".into()]))?;
+        Some([&["scanhub".to_owned()], &words[at + 1..]].concat())
+    };
+    let commands = commands(line).into_iter();
+    let ours = commands.filter_map(|words| match words.first()?.as_str() {
+        "scanhub" => Some(words),
+        _ => of_cargo(&words),
+    });
+    ours.collect()
+}
+
+fn without_comment(line: &str) -> &str {
+    let mut quote = None;
+    let mut before = ' ';
+    for (at, sign) in line.char_indices() {
+        match (quote, sign) {
+            (None, '#') if before == ' ' => return &line[..at],
+            (None, '\'' | '"') => quote = Some(sign),
+            (Some(open), _) if open == sign => quote = None,
+            _ => {}
+        }
+        before = sign;
+    }
+    line
+}
+
+/// Words and signs between commands, and whether there were quotes around them.
+fn words(line: &str) -> Vec<(String, bool)> {
+    let mut words = Vec::new();
+    let (mut word, mut quote, mut is_quoted) = (String::new(), None, false);
+    for sign in without_comment(line).chars().chain([' ']) {
+        match (quote, sign) {
+            (None, '\'' | '"') => (quote, is_quoted) = (Some(sign), true),
+            (Some(open), _) if open == sign => quote = None,
+            (None, ' ' | '|' | ';' | '>' | '<') => {
+                if !word.is_empty() || is_quoted {
+                    words.push((std::mem::take(&mut word), is_quoted));
+                }
+                is_quoted = false;
+                if sign != ' ' {
+                    words.push((sign.into(), false));
+                }
+            }
+            _ => word.push(sign),
+        }
+    }
+    words
+}
+
+#[test]
+fn lines_are_read_as_a_shell_does() {
+    assert_eq!(lines("# no\na b   # c\n\nd '# e'#f\n"), ["a b", "d '# e'#f"]);
+    let line = "scanhub a 'b c' \"d|e\" | scanhub f > g && x; cargo run --release -- h i # j";
+    let wanted: [&[&str]; 4] = [
+        &["scanhub", "a", "b c", "d|e"],
+        &["scanhub", "f"],
+        &["x"],
+        &["cargo", "run", "--release", "--", "h", "i"],
+    ];
+    assert_eq!(commands(line), wanted);
+    assert_eq!(of_the_program(line), [wanted[0], wanted[1], &["scanhub", "h", "i"]]);
+    assert_eq!(commands(""), [[""; 0]]);
+}
