@@ -129,7 +129,8 @@ fn rates_of_all_topics() {
     hub.front().status(|_| {});
     let verb = Verb::start(move |out, notes, stop| hz(&options, out, notes, stop));
     hub.front().scan.await_subscribers(1);
-    hub.front().status.await_subscribers(1);
+    // It follows the state of the line, too.
+    hub.front().status.await_subscribers(2);
     hub.front().status(|_| {});
     // From here on they are sent to who is there: after all that was.
     hub.front().begun_ns = u64::MAX / 2;
