@@ -12,13 +12,12 @@ use stage::{INT, Outcome, Program, is_there, number, shared_memory, until};
 /// Runs the demonstration in an empty environment; `end` may wait for something and hasten its end.
 fn demo(arguments: &[&str], end: impl FnOnce(Program) -> Outcome) -> Outcome {
     let mut command = Command::new(env!("CARGO_BIN_EXE_scanhub"));
-    let state =
-        std::env::temp_dir().join(format!("scanhub-demo-state-{}-{}", std::process::id(), arguments.len()));
-    command.arg("demo").args(arguments).env_clear().env("XDG_STATE_HOME", &state);
+    let home = std::env::temp_dir().join(format!("scanhub-home-{}-{}", std::process::id(), arguments.len()));
+    command.arg("demo").args(arguments).env_clear().env("XDG_STATE_HOME", &home);
     let program = Program::start(command);
     let name = format!("demo-{}", program.pid());
     let outcome = end(program);
-    assert!(!is_there(&state), "what it learned is left");
+    assert!(!is_there(&home), "it kept something");
     assert_eq!(shared_memory(&format!("sh_{name}_")), [] as [&Path; 0]);
     assert!(!is_there(format!("/tmp/scanhub-{name}").as_ref()), "its directory is left");
     let uid = rustix::process::getuid().as_raw();

@@ -85,6 +85,7 @@ impl Stage {
             ]
             .concat(),
             &self.domain,
+            &self.directory,
             None,
             self.errors(),
         )?;
@@ -99,7 +100,7 @@ impl Stage {
         let start = |(of, sensor): (usize, &&str)| {
             let topics = ["telegram", "scan", "status"].map(|topic| format!("{sensor}/{topic}"));
             let arguments = [&["echo".into(), "--json".into()], &topics[..]].concat();
-            Child::start(&arguments, &self.domain, Some((of, lines.clone())), self.errors())
+            Child::start(&arguments, &self.domain, &self.directory, Some((of, lines.clone())), self.errors())
         };
         SENSORS.iter().enumerate().map(start).collect()
     }
@@ -110,7 +111,8 @@ impl Stage {
         let rest = ["--truth".into(), truth, "--seed".into(), seed.to_string(), "--json".into()];
         let world = ["--world".into(), "demo".into()];
         let arguments = [&["simulate".into()], &world[..], &ports[..], &rest[..]].concat();
-        Child::start(&arguments, &self.domain, None, self.errors())?.await_ready(SIMULATOR, lines)
+        Child::start(&arguments, &self.domain, &self.directory, None, self.errors())?
+            .await_ready(SIMULATOR, lines)
     }
 }
 

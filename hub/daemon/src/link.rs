@@ -11,11 +11,12 @@ use lms::session::Output;
 use lms::variant::{Baud, Unit};
 use lms::{MILLIS, Nanos, Notice, Session, Settings, Trouble};
 use rustix::event::{PollFd, PollFlags, poll};
-use schema::{Failure, Flags, State, Status, Wake};
+use schema::{Failure, Flags, State, StateDirectory, Status, Wake};
 
 use crate::clock;
 use crate::config::{Link, Source};
 use crate::control::{Flow, Orders};
+use crate::last_rate::LastRate;
 use crate::learned::Slot;
 use crate::line_errors::LineErrors;
 use crate::memory::Memory;
@@ -52,6 +53,8 @@ pub(crate) struct LinkThread<'a> {
     line_errors: LineErrors,
     /// What the next hub would like to know; nothing where there will be none.
     pub(crate) memory: Option<Memory>,
+    /// Where the sensor was found the last time; nothing on a line whose rate cannot be changed.
+    pub(crate) last_rate: Option<LastRate>,
     /// Statuses in a row that said that consumers got nothing.
     pub(crate) unreached: u32,
     /// The port brings more than its line can.
@@ -73,6 +76,8 @@ pub(crate) struct Surroundings<'a> {
     pub(crate) root: &'a Path,
     /// Where what was learned goes, for the next hub; nothing where that is not wanted.
     pub(crate) slot: Option<&'a Slot>,
+    /// What outlives the machine's power; nothing where that is not wanted.
+    pub(crate) state: Option<&'a StateDirectory>,
     /// Set whenever the link finished something.
     pub(crate) worked: &'a AtomicBool,
 }
@@ -114,6 +119,7 @@ impl<'a> LinkThread<'a> {
             refused: Vec::new(),
             line_errors: LineErrors::default(),
             memory: None,
+            last_rate: None,
             unreached: 0,
             is_flooded: false,
             told_mode: Status::MODE_UNKNOWN,
@@ -242,6 +248,7 @@ impl<'a> LinkThread<'a> {
             }
             self.facts = Some(facts);
             self.error = self.trouble(session);
+            self.last_rate.iter_mut().for_each(|last| last.keep(session));
         }
         if changed || clock::now() >= self.next_status.min(self.next_greeting) {
             let error = std::mem::take(&mut self.error);
