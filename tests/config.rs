@@ -160,7 +160,7 @@ fn every_verb_has_an_example_a_page_and_a_completion() {
 /// What bash itself completes behind `words`, the last of which is being typed.
 fn completed(stage: &Stage, words: &[&str]) -> Option<Vec<String>> {
     let program = Path::new(env!("CARGO_BIN_EXE_scanhub"));
-    let script = stage.file("completion", &printed(stage, &["completions", "bash"]));
+    let script = stage.file("completion", printed(stage, &["completions", "bash"]));
     let ask = "source \"$0\"; COMP_WORDS=(\"$@\"); COMP_CWORD=$(($# - 1)); \
                \"$(complete -p scanhub | sed 's/.*-F \\([^ ]*\\).*/\\1/')\" \"$1\" \"${@: -1}\" \"${@: -2:1}\"; printf '%s\\n' \"${COMPREPLY[@]}\"";
     let path = format!("{}:{}", program.parent()?.display(), std::env::var("PATH").unwrap_or_default());

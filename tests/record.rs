@@ -217,8 +217,8 @@ fn what_cannot_be_recorded_is_refused() {
     assert_eq!(kind(&["-o", "-", "--split", "1h"]), (Some(2), "usage".into()));
     assert_eq!(kind(&["--keep", "3"]), (Some(2), "usage".into()));
     assert_eq!(kind(&["--split", "3"]), (Some(2), "usage".into()));
-    assert_eq!(kind(&["robot/zones"]), (Some(78), "configuration".into()));
-    assert_eq!(kind(&["front/scam"]), (Some(3), "no_topic".into()));
+    assert_eq!(kind(&["robot/zones"]), (Some(2), "usage".into()));
+    assert_eq!(kind(&["front/scam"]), (Some(2), "usage".into()));
     // Nothing came, nothing stays.
     let new = stage.word("new.mcap");
     assert_eq!(kind(&["-o", &new, "--for", "5s"]), (Some(3), "no_hub".into()));

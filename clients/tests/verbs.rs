@@ -159,5 +159,5 @@ fn rates_of_all_topics() {
     let (summary, lines) = statuses.split_last().unwrap();
     // What is handed over at once would be hundreds of thousands a second.
     assert!(lines.iter().all(|line| line.contains(r#""hz":null"#)), "{statuses:?}");
-    assert!(summary.contains(r#""received":2,"#) && summary.ends_with(r#""hz":null}"#), "{statuses:?}");
+    assert!(summary.contains(r#""received":2,"#) && summary.contains(r#""hz":null"#), "{statuses:?}");
 }
