@@ -48,19 +48,24 @@ impl ListenLock {
 #[derive(Debug)]
 struct Publishing {
     root: PathBuf,
+    name: &'static str,
     _held: Held,
 }
 
 impl Publishing {
-    fn acquire(root: &Path, name: &str, who: &str) -> Result<Publishing, Failure> {
-        Ok(Publishing { _held: Held::acquire(root, name, who)?, root: root.to_owned() })
+    fn acquire(root: &Path, name: &'static str, who: &str) -> Result<Publishing, Failure> {
+        Ok(Publishing { _held: Held::acquire(root, name, who)?, root: root.to_owned(), name })
     }
 }
 
 impl Drop for Publishing {
     /// The last one out takes the names along, while it still has the lock: the next hub has others.
     fn drop(&mut self) {
-        ipc::forget_names(&self.root);
+        let other = if self.name == HUB { LISTENER } else { HUB };
+        // Whoever holds the other lock has the names, or is about to join under them.
+        if let Ok(None) = holder_of(&self.root, other) {
+            ipc::forget_names(&self.root);
+        }
     }
 }
 

@@ -89,11 +89,11 @@ pub(crate) fn serve(
     let _lock = HubLock::acquire(domain.root())?;
     // What is known of sensors is no recording's.
     let state = StateDirectory::of_domain(domain.name()).filter(|_| troupe.is_none());
+    preflight::check_descriptors(config.links.len())?;
+    preflight::check_memory(config.links.len())?;
     // Ends after the links: it writes what they had learned last.
     let (config, keeper) = learned::begin(config, state.as_ref())?;
     let config = &config;
-    preflight::check_descriptors(config.links.len())?;
-    preflight::check_memory(config.links.len())?;
     let node = ipc::hub_node(domain)?;
     node.try_cleanup_dead_nodes();
     let ready =
