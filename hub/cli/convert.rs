@@ -12,7 +12,7 @@ use schema::file::Compression;
 use serde::Serialize;
 use sim::options;
 
-use crate::{line, print};
+use crate::{complain, line, print};
 
 #[derive(Args, Debug)]
 pub(crate) struct Convert {
@@ -69,8 +69,8 @@ impl Convert {
         let is_stdout_taken = self.output == Path::new("-");
         match (json, is_stdout_taken) {
             (true, false) => return print(&line(&Line::of(self, &converted))),
-            (true, true) => tell(&line(&Line::of(self, &converted))),
-            (false, _) => tell(&self.words(&converted)),
+            (true, true) => complain(&line(&Line::of(self, &converted))),
+            (false, _) => complain(&self.words(&converted)),
         }
         Ok(())
     }
@@ -148,11 +148,6 @@ impl<'a> Line<'a> {
 
 fn seconds(ns: u64) -> f64 {
     ns as f64 / 1e9
-}
-
-/// Writes one line to stderr, which may be a terminal that is gone.
-fn tell(words: &str) {
-    let _ = stderr().lock().write_all(format!("{words}\n").as_bytes());
 }
 
 /// What the help says beside the flags.

@@ -3,71 +3,56 @@
 use schema::{Failure, Kind, Topic};
 
 use crate::names::TopicName;
+use crate::selection;
 
 /// The topics that are kept.
 #[derive(Clone, Debug)]
 pub(super) struct Selection {
-    named: Vec<TopicName>,
-    of_all: Vec<Topic>,
+    chosen: selection::Selection,
 }
 
-/// What a recording for ROS 2 is made of.
-const ROS2: [Topic; 2] = [Topic::Scan, Topic::Status];
 /// Telegrams, from which all else can be made again, and the results that are wanted first.
 const USUAL: [Topic; 5] = [Topic::Telegram, Topic::Marks, Topic::Zones, Topic::Foreground, Topic::Status];
 
 impl Selection {
-    /// What `texts` name, `SENSOR/TOPIC` or `*/TOPIC`; nothing named: `everything` that there is, or what is usual. For
+    /// What `texts` name, see [`selection::Word`]; nothing named: `everything` that there is, or what is usual. For
     /// `ros2` scans, and the status of their sensors, which tells where they sit.
     ///
-    /// [`Kind::NoTopic`] with the topics that there are; [`Kind::Configuration`] if a name is not possible, or stands for
-    /// no topic; [`Kind::Usage`] if ROS has no message for it.
+    /// [`Kind::Usage`] with the topics that there are, if a name is not possible or stands for what no hub publishes, or if
+    /// ROS has no message for it.
     pub(super) fn parse(texts: &[String], everything: bool, ros2: bool) -> Result<Selection, Failure> {
-        let mut selection = Selection { named: Vec::new(), of_all: Vec::new() };
+        let mut chosen = selection::Selection::parse(texts)?;
         if texts.is_empty() {
-            selection.of_all = match (everything, ros2) {
+            chosen.of_all = match (everything, ros2) {
                 (true, true) => return Err(no_message("--all")),
-                (false, true) => ROS2.to_vec(),
+                (false, true) => vec![Topic::Scan],
                 (true, false) => Topic::ALL.to_vec(),
                 (false, false) => USUAL.to_vec(),
             };
         }
-        for text in texts {
-            let topic = match text.strip_prefix("*/") {
-                Some(topic) => {
-                    let topic = Topic::parse(topic).ok_or_else(|| no_topic(text))?;
-                    selection.of_all.push(topic);
-                    topic
-                }
-                None => {
-                    let name = TopicName::parse(text)?;
-                    selection.named.push(name.clone());
-                    name.topic
-                }
-            };
-            if ros2 && topic != Topic::Scan {
-                return Err(no_message(text));
-            }
-        }
-        if let Some(fold) = selection.named.iter().find(|name| name.is_robot()) {
+        if let Some(fold) = chosen.named.iter().find(|name| name.is_robot()) {
             let hint = "`*/zones` records the zones of each sensor";
-            return Err(Failure::new(Kind::Configuration, format!("{fold} is made by who listens"), hint));
+            return Err(Failure::new(Kind::Usage, format!("{fold} is made by who listens"), hint));
         }
         if ros2 {
-            let status = |name: &TopicName| TopicName { topic: Topic::Status, ..name.clone() };
-            let statuses: Vec<_> = selection.named.iter().map(status).collect();
-            selection.named.extend(statuses);
-            if !selection.of_all.is_empty() {
-                selection.of_all = ROS2.to_vec();
+            let named = chosen.named.iter().map(|name| name.topic);
+            if let Some(other) =
+                named.chain(chosen.of_all.iter().copied()).find(|&topic| topic != Topic::Scan)
+            {
+                return Err(no_message(&format!("topic {}", other.name())));
             }
+            let status = |name: &TopicName| TopicName { topic: Topic::Status, ..name.clone() };
+            let statuses: Vec<_> = chosen.named.iter().map(status).collect();
+            chosen.named.extend(statuses);
+            chosen.of_all.extend(chosen.of_all.first().map(|_| Topic::Status));
         }
-        Ok(selection)
+        Ok(Selection { chosen })
     }
 
     /// The names to follow, each once.
     pub(super) fn names(&self) -> Vec<TopicName> {
         let mut names: Vec<TopicName> = Vec::new();
-        for name in &self.named {
+        for name in &self.chosen.named {
             if !names.contains(name) {
                 names.push(name.clone());
             }
@@ -77,7 +62,7 @@ impl Selection {
 
     /// The topics to follow of all sensors, in their order.
     pub(super) fn topics(&self) -> Vec<Topic> {
-        Topic::ALL.into_iter().filter(|topic| self.of_all.contains(topic)).collect()
+        Topic::ALL.into_iter().filter(|topic| self.chosen.of_all.contains(topic)).collect()
     }
 }
 
@@ -86,11 +71,6 @@ fn no_message(what: &str) -> Failure {
     let message = format!("--ros2 records messages of ROS alone, and {what} has others: only scans are such");
     let hint = "record without --ros2, and `scanhub convert IN.mcap OUT.mcap --ros2` makes a file for ROS of it later";
     Failure::new(Kind::Usage, message, hint)
-}
-
-fn no_topic(text: &str) -> Failure {
-    let topics = Topic::ALL.map(|topic| format!("*/{}", topic.name()));
-    Failure::new(Kind::NoTopic, format!("no topic {text:?}"), format!("there are {}", topics.join(", ")))
 }
 
 #[cfg(test)]
@@ -133,11 +113,9 @@ mod tests {
     #[test]
     fn what_is_no_topic_is_refused() {
         let kind = |text| selection(&[text], false, false).map(drop).map_err(|failure| failure.kind);
-        for bad in ["front", "*/scam", "front/scam", "robot/scan", "*"] {
-            assert_eq!(kind(bad), Err(Kind::NoTopic), "{bad}");
+        for bad in ["front", "*/scam", "front/scam", "robot/scan", "*", "robot/zones", "Front/scan"] {
+            assert_eq!(kind(bad), Err(Kind::Usage), "{bad}");
         }
-        for bad in ["robot/zones", "Front/scan"] {
-            assert_eq!(kind(bad), Err(Kind::Configuration), "{bad}");
-        }
+        assert_eq!(kind("front/*"), Ok(()));
     }
 }

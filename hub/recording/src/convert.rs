@@ -90,9 +90,9 @@ pub struct Converted {
 /// Converts as `options` say until `stop` is set; calls `progress` with the telegrams that were written and how many there
 /// are. Whoever closes stdout has enough.
 ///
-/// [`Kind::Configuration`] if the recording cannot be read, or what it shall become cannot be said; [`Kind::Failed`] if it
-/// cannot be written, [`Kind::Interrupted`] if it was stopped, [`Kind::Usage`] if options contradict each other. Nothing
-/// is left then.
+/// [`Kind::Input`] if the recording cannot be read, [`Kind::NoTopic`] if it has no such sensor, [`Kind::Usage`] if what it
+/// shall become cannot be said or options contradict each other, [`Kind::Output`] if that is there or cannot be written, [`Kind::Interrupted`] if it was
+/// stopped. Nothing is left then.
 pub fn convert(
     options: &ConvertOptions,
     stop: &AtomicBool,
@@ -103,7 +103,10 @@ pub fn convert(
     let place = Place::check(&options.output, &options.input, options.force)?;
     let recording = match &options.sensor {
         Some(sensor) if whole.contents().form == Form::Mcap => whole.of(sensor)?,
-        Some(sensor) => check_followed(sensor).map(|()| whole)?,
+        Some(sensor) => {
+            let named = check_followed(sensor).map(|()| whole);
+            named.map_err(|failure| Failure { kind: Kind::Usage, ..failure })?
+        }
         None => whole,
     };
     let contents = recording.contents();
@@ -268,7 +271,7 @@ fn write_view(
     if is_empty {
         let message = format!("there is no scan in {}", recording.path().display());
         let hint = "scans are made of topic telegram, or taken from topic scan";
-        return Err(Failure::new(Kind::Configuration, message, hint));
+        return Err(Failure::new(Kind::Input, message, hint));
     }
     view.finish().map_err(failed)
 }
@@ -322,7 +325,7 @@ fn ending(path: &Path) -> Result<Target, Failure> {
         _ => {
             let message = format!("the ending of {} tells no form", path.display());
             let hint = ".mcap; .log (CARMEN), .bin (telegram stream), .csv, also with .gz; or - for stdout";
-            Err(Failure::new(Kind::Configuration, message, hint))
+            Err(Failure::new(Kind::Usage, message, hint))
         }
     }
 }
