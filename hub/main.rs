@@ -85,6 +85,10 @@ fn dispatch(cli: &Cli) -> Result<(), Failure> {
         Verb::Configure(configure) => configure.run(everywhere.json, &*interrupt_by(&ENDS)?),
         Verb::Convert(convert) => convert.run(everywhere.json, &*interrupt()?),
         Verb::Completions(completions) => completions.run(),
+        Verb::Complete(complete) => {
+            complete.run();
+            Ok(())
+        }
         Verb::Man(man) => man.run(),
         Verb::Config(config) => config.run(everywhere),
         Verb::Doctor(doctor) => doctor.run(everywhere, &*interrupt()?),

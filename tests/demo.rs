@@ -35,7 +35,7 @@ fn processes(domain: &str) -> Vec<String> {
 
 /// Whether the two last lines say that nothing was lost of a stream that lived.
 fn nothing_was_lost(outcome: &Outcome) {
-    let lines = outcome.lines();
+    let lines = outcome.of_class("summary");
     let sensors: Vec<_> = lines.iter().map(|line| line["sensor"].as_str().unwrap_or_default()).collect();
     assert_eq!(sensors, ["front", "rear"], "{outcome}");
     for line in &lines {
@@ -49,7 +49,24 @@ fn nothing_was_lost(outcome: &Outcome) {
 
 #[test]
 fn headless_in_an_empty_environment() {
-    let outcome = demo(&["--headless", "--for", "2s", "--json"], Program::wait);
+    let outcome = demo(&["--headless", "--for", "2s", "--json"], |mut program| {
+        let ready = program.await_line("ready", stage::is_class("ready"));
+        let (domain, root) =
+            (ready["domain"].as_str().expect("a name"), ready["root"].as_str().expect("a path"));
+        assert_eq!(
+            (domain, number(&ready, "pid")),
+            (&*format!("demo-{}", program.pid()), u64::from(program.pid()))
+        );
+        // Another terminal finds it by its name alone.
+        let mut list = Command::new(env!("CARGO_BIN_EXE_scanhub"));
+        let list = list.args(["list", "--json", "--domain", domain]).env_clear().output().expect("it starts");
+        assert!(
+            list.status.success() && String::from_utf8_lossy(&list.stdout).contains("\"rear\""),
+            "{list:?}"
+        );
+        assert!(root.ends_with(domain), "{root}");
+        program.wait()
+    });
     assert_eq!(outcome.code, Some(0), "{outcome}");
     nothing_was_lost(&outcome);
 }
@@ -85,7 +102,9 @@ fn the_picture_into_a_pipe() {
     assert_eq!(outcome.code, Some(0), "{outcome}");
     let text = String::from_utf8_lossy(&outcome.out);
     assert!(!text.contains('\x1b'), "controls a terminal that is none: {text:?}");
-    for word in ["scanhub demo", "front", "rear", "nearest", "0 lost"] {
+    for word in
+        ["scanhub demo", "front", "rear", "nearest", "0 lost", "scanhub echo front/scan --domain demo-"]
+    {
         assert!(text.contains(word), "no {word:?}: {outcome}");
     }
 }

@@ -307,7 +307,7 @@ fn two_recorders_do_not_write_one_file() {
     await_samples(&mut recorder, 20);
     let second = stage.run(&["record", "--json", "--force", "-o", &file]);
     let error = &second.of_class("error")[0];
-    assert_eq!((second.code, &error["kind"]), (Some(1), &"failed".into()), "{second}");
+    assert_eq!((second.code, &error["kind"]), (Some(73), &"output".into()), "{second}");
     assert!(error["message"].as_str().unwrap().contains("another recorder writes it"), "{error}");
     await_samples(&mut recorder, 20);
     nothing_lost(&recorder.end(INT));

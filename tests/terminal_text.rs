@@ -44,7 +44,7 @@ fn a_configuration_commands_no_terminal() {
             (78, with(&["config", "check", &key])),
             (78, with(&["config", "check", &name])),
             (5, with(&["doctor", "--no-system-config", "--config", &sound])),
-            (78, with(&["convert", &name, "x.mcap"])),
+            (66, with(&["convert", &name, "x.mcap"])),
             (4, with(&["probe", &name])),
         ] {
             assert_eq!(outcome.code, Some(code), "{outcome}");

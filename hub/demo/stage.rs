@@ -3,7 +3,7 @@
 
 use std::fs::{File, OpenOptions};
 use std::io::{self, Write};
-use std::os::unix::fs::OpenOptionsExt;
+use std::os::unix::fs::{DirBuilderExt, OpenOptionsExt};
 use std::path::PathBuf;
 use std::process::Stdio;
 use std::sync::mpsc;
@@ -32,9 +32,14 @@ impl Stage {
         let domain =
             Domain::of_hub(&name, None, &environment).or_else(|_| Domain::of_hub(&name, None, &fallback))?;
         let directory = std::env::temp_dir().join(format!("scanhub-{name}"));
-        std::fs::create_dir_all(&directory).map_err(|error| {
+        // Not one that is there already: it may be another user's.
+        std::fs::DirBuilder::new().mode(0o700).create(&directory).map_err(|error| {
             let message = format!("cannot make {}: {error}", directory.display());
-            Failure::new(Kind::Failed, message, "set TMPDIR to a directory that this user may write")
+            Failure::new(
+                Kind::Failed,
+                message,
+                "set TMPDIR to a directory that this user may write, or remove what is in the way",
+            )
         })?;
         Ok(Stage { domain, directory, quiet })
     }

@@ -150,7 +150,11 @@ fn holder_of(root: &Path, name: &str) -> Result<Option<u32>, Failure> {
     let mut lock = whole_file(libc::F_RDLCK);
     fcntl(file.as_raw_fd(), FcntlArg::F_OFD_GETLK(&mut lock))
         .map_err(|error| unusable(root, &error.into()))?;
-    if lock.l_type == libc::F_UNLCK as libc::c_short { Ok(None) } else { Ok(Some(pid_in(&file))) }
+    if lock.l_type == libc::F_UNLCK as libc::c_short {
+        return Ok(None);
+    }
+    // Whoever is just starting or ending has the lock, and an earlier one's process id may stand in it.
+    Ok(Some(if prefix::of(root)?.is_some() { pid_in(&file) } else { 0 }))
 }
 
 const HUB: &str = "hub.lock";

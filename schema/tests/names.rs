@@ -116,7 +116,7 @@ fn the_last_one_out_takes_the_names_along() {
     let first = prefix().expect("names are there with the lock");
     let hub = ipc::hub_node(&place.domain).unwrap();
     let client = ipc::client_node(&place.domain).unwrap();
-    assert!(ipc::is_member(&client, root));
+    assert_eq!(ipc::is_member(&client, root), Ok(true));
     drop((hub, lock));
     assert_eq!(prefix().as_ref(), Some(&first), "a consumer waits for the next hub");
     let lock = HubLock::acquire(root).unwrap();

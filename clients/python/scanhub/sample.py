@@ -114,11 +114,6 @@ class Sample:
         return tuple(name for bit, name in enumerate(_REASONS) if self._header.reasons >> bit & 1)
 
     @property
-    def flags(self) -> tuple[str, ...]:
-        """What holds of the sample: `simulated`, `replayed`, `stamp_estimated`, `remote`."""
-        return tuple(name for bit, name in _FLAGS.items() if self._header.flags & bit)
-
-    @property
     def flags(self) -> frozenset[str]:
         """Of `simulated`, `replayed`, `stamp_estimated` and `remote` what holds."""
         return frozenset(name for bit, name in _FLAGS.items() if self._header.flags & bit)
@@ -145,5 +140,4 @@ def view(data: Any, field: Any, kind: str, count: int) -> NDArray[Any]:
 
 
 _REASONS = ("line_error", "neighbour", "slow", "forbidden_bits", "header_inside")
-_FLAGS = {2: "simulated", 4: "replayed", 8: "stamp_estimated", 32: "remote"}
 _FLAGS = {2: "simulated", 4: "replayed", 8: "stamp_estimated", 32: "remote"}

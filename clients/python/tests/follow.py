@@ -25,7 +25,8 @@ def stamp(sample: scanhub.Sample) -> dict:
 
 
 def flags(sample: scanhub.Sample) -> dict:
-    return {"flags": list(sample.flags)} if sample.flags else {}
+    order = ("simulated", "replayed", "stamp_estimated", "remote")
+    return {"flags": sorted(sample.flags, key=order.index)} if sample.flags else {}
 
 
 def telegram(sample: scanhub.Telegram) -> dict:

@@ -17,11 +17,11 @@ pub(crate) enum Origin {
 impl Origin {
     /// Reads a file.
     ///
-    /// [`Kind::Configuration`] if it cannot be read.
+    /// [`Kind::Input`] if it cannot be read.
     pub(crate) fn read(path: &Path) -> Result<Origin, Failure> {
         let text = regular::read_text(path, regular::LONGEST).map_err(|error| {
             let message = format!("{}: {error}", path.display());
-            Failure::new(Kind::Configuration, message, "name a readable TOML file")
+            Failure::new(Kind::Input, message, "name a readable TOML file")
         })?;
         let lines = std::iter::once(0).chain(text.match_indices('\n').map(|(end, _)| end + 1)).collect();
         Ok(Origin::File { path: path.to_owned(), text, lines })

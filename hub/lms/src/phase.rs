@@ -128,7 +128,7 @@ pub(crate) const LISTEN: Nanos = 120 * MILLIS;
 /// bytes on the line for a third of that at least. Two telegram times of the usual one.
 pub(crate) const QUIET: Nanos = 55 * MILLIS;
 /// Without measured data for so long the session begins again (paper: resynchronise after one second).
-pub(crate) const SILENCE: Nanos = 1_000 * MILLIS;
+pub const SILENCE: Nanos = 1_000 * MILLIS;
 /// After a change of rate the sensor's and the adapter's UART need a moment.
 pub(crate) const SETTLE: Nanos = 20 * MILLIS;
 /// After a refusal, before everything begins again.

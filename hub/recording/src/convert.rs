@@ -59,8 +59,9 @@ pub struct Converted {
 /// Converts as `options` say until `stop` is set; calls `progress` with the telegrams that were written and how many there
 /// are. Whoever closes stdout has enough.
 ///
-/// [`Kind::Configuration`] if the recording cannot be read, or what it shall become cannot be said; [`Kind::Failed`] if it
-/// cannot be written, [`Kind::Interrupted`] if it was stopped. Nothing is left then.
+/// [`Kind::Input`] if the recording cannot be read, [`Kind::NoTopic`] if it has no such sensor, [`Kind::Usage`] if what it
+/// shall become cannot be said, [`Kind::Output`] if that is there or cannot be written, [`Kind::Interrupted`] if it was
+/// stopped. Nothing is left then.
 pub fn convert(
     options: &ConvertOptions,
     stop: &AtomicBool,
@@ -71,7 +72,10 @@ pub fn convert(
     let place = Place::check(&options.output, &options.input, options.force)?;
     let recording = match &options.sensor {
         Some(sensor) if whole.contents().form == Form::Mcap => whole.of(sensor)?,
-        Some(sensor) => check_followed(sensor).map(|()| whole)?,
+        Some(sensor) => {
+            let named = check_followed(sensor).map(|()| whole);
+            named.map_err(|failure| Failure { kind: Kind::Usage, ..failure })?
+        }
         None => whole,
     };
     let contents = recording.contents();
@@ -234,7 +238,7 @@ fn form_of(path: &Path) -> Result<Form, Failure> {
             let message = format!("the ending of {} tells no form", path.display());
             let hint =
                 ".mcap, .log (CARMEN), .bin (telegram stream), the last two also with .gz; or - for stdout";
-            Err(Failure::new(Kind::Configuration, message, hint))
+            Err(Failure::new(Kind::Usage, message, hint))
         }
     }
 }

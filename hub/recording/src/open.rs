@@ -38,7 +38,7 @@ pub struct Recording {
 impl Recording {
     /// Opens and reads through the file at `path`.
     ///
-    /// [`Kind::Configuration`] if it is no recording: anything without a telegram but an MCAP file. One that is damaged is opened: see [`Contents::damage`].
+    /// [`Kind::Input`] if it is no recording: anything without a telegram but an MCAP file. One that is damaged is opened: see [`Contents::damage`].
     pub fn open(path: impl Into<PathBuf>) -> Result<Recording, Failure> {
         let recording = Recording::open_line(path)?;
         if recording.contents.form == Form::Telegrams && recording.contents.telegrams == 0 {
@@ -50,7 +50,7 @@ impl Recording {
 
     /// The same, but also of bytes without a telegram: what came down a line that only brings noise.
     ///
-    /// [`Kind::Configuration`] as of [`open`](Self::open).
+    /// [`Kind::Input`] as of [`open`](Self::open).
     pub fn open_line(path: impl Into<PathBuf>) -> Result<Recording, Failure> {
         let path = path.into();
         let mut reader = reader(&path)?;
@@ -95,21 +95,26 @@ impl Recording {
     #[cfg(not(feature = "mcap"))]
     fn open_mcap(path: PathBuf, _: bool) -> Result<Recording, Failure> {
         let message = format!("recording {} is an MCAP file, which this build does not read", path.display());
-        Err(Failure::new(Kind::Configuration, message, "build it with the feature mcap of scanhub-recording"))
+        Err(Failure::new(Kind::Input, message, "build it with the feature mcap of scanhub-recording"))
+    }
+
+    /// Whether a file that begins with `head` has its telegrams inside something else, MCAP's framing or gzip's.
+    pub fn is_framed(head: &[u8]) -> bool {
+        head.starts_with(MCAP) || head.starts_with(GZIP)
     }
 
     /// The part of it that is `sensor`'s.
     ///
-    /// [`Kind::Configuration`] if it has no such sensor; says which it has.
+    /// [`Kind::NoTopic`] if it has no such sensor; says which it has. [`Kind::Usage`] if it names none.
     pub fn of(&self, sensor: &str) -> Result<Recording, Failure> {
         let place = self.path.display();
         if self.contents.sensors.is_empty() {
             let message = format!("recording {place} does not name its sensor, so {sensor} cannot be chosen");
-            return Err(Failure::new(Kind::Configuration, message, "leave the sensor away"));
+            return Err(Failure::new(Kind::Usage, message, "leave the sensor away"));
         }
         if !self.contents.sensors.iter().any(|name| name == sensor) {
             let message = format!("recording {place} has no sensor {sensor:?}");
-            return Err(Failure::new(Kind::Configuration, message, self.choice()));
+            return Err(Failure::new(Kind::NoTopic, message, self.choice()));
         }
         let mut chosen = self.clone();
         #[cfg(feature = "mcap")]
@@ -151,7 +156,7 @@ impl Recording {
     /// Its telegrams in order, replies too; a log's scans as `encoding` says. Should the file become unreadable in the
     /// meantime, they end there.
     ///
-    /// [`Kind::Configuration`] if it has several sensors and none was chosen by [`of`](Self::of).
+    /// [`Kind::Usage`] if it has several sensors and none was chosen by [`of`](Self::of).
     pub fn telegrams(&self, encoding: Encoding) -> Result<Box<dyn Iterator<Item = Frame> + Send>, Failure> {
         let mut reader = reader(&self.path)?;
         Ok(match self.contents.form {
@@ -182,7 +187,7 @@ impl Recording {
             (None, []) => return Ok(Box::new(std::iter::empty())),
             (None, _) => {
                 let message = format!("recording {} has several sensors", self.path.display());
-                return Err(Failure::new(Kind::Configuration, message, self.choice()));
+                return Err(Failure::new(Kind::Usage, message, self.choice()));
             }
         };
         Ok(Box::new(crate::mcap::Frames::new(reader, &self.survey, sensor)))
@@ -256,7 +261,7 @@ fn survey_log(path: &Path, mut reader: impl BufRead) -> Result<Contents, Failure
             Err(Wrong::Line(wrong)) => {
                 let message = format!("{}:{line}: {wrong}", path.display());
                 let hint = "a scan is: FLASER 361 RANGE... in metres";
-                refusal.get_or_insert(Failure::new(Kind::Configuration, message, hint));
+                refusal.get_or_insert(Failure::new(Kind::Input, message, hint));
                 contents.damage.telegrams += 1;
                 contents.damage.is_harmed = true;
             }
@@ -315,11 +320,11 @@ fn unreadable(path: &Path, error: &io::Error) -> Failure {
         }
         _ => FORMS,
     };
-    Failure::new(Kind::Configuration, format!("cannot read recording {}: {error}", path.display()), hint)
+    Failure::new(Kind::Input, format!("cannot read recording {}: {error}", path.display()), hint)
 }
 
 fn refused(path: &Path, what: &str) -> Failure {
-    Failure::new(Kind::Configuration, format!("recording {} {what}", path.display()), FORMS)
+    Failure::new(Kind::Input, format!("recording {} {what}", path.display()), FORMS)
 }
 
 /// Sensors that a failure names.

@@ -239,9 +239,9 @@ fn two_ports_and_what_is_refused() {
             },
             78,
         ),
-        (SimulateOptions { replay: Some(file), ..options(folder.path("x")) }, 78),
-        (SimulateOptions { replay: Some("/no/file".into()), ..options(folder.path("x")) }, 78),
-        (SimulateOptions { truth: Some("/no/file".into()), ..options(folder.path("x")) }, 1),
+        (SimulateOptions { replay: Some(file), ..options(folder.path("x")) }, 66),
+        (SimulateOptions { replay: Some("/no/file".into()), ..options(folder.path("x")) }, 66),
+        (SimulateOptions { truth: Some("/no/file".into()), ..options(folder.path("x")) }, 73),
     ] {
         let failure = simulate(&options, &stop, |_| panic!("ready"), |_| {}).unwrap_err();
         assert_eq!(failure.kind.exit_code(), code, "{failure}");
