@@ -146,10 +146,10 @@ fn a_carmen_log() {
     assert_eq!(scans.len(), 10, "{outcome}");
     for (number, scan) in scans.iter().enumerate() {
         let expected: Vec<Value> =
-            (0..181).map(|beam| ((metres(number, beam) * 1000.0).round() as u64).into()).collect();
+            (0..181).map(|beam| ((metres(number, beam) * 100.0).round() as u64).into()).collect();
         assert_eq!(
             (&scan["ranges"], &scan["step_deg"], &scan["unit_mm"]),
-            (&expected.into(), &1.0.into(), &1.into())
+            (&expected.into(), &1.0.into(), &10.into())
         );
     }
 }

@@ -5,7 +5,7 @@ use lms::reply::Reply;
 use lms::telegram::Telegram;
 use lms::variant::{Mode, Unit, Variant};
 
-use crate::Damage;
+use crate::{Damage, Unfit};
 
 /// What kind of recording it is.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -33,10 +33,13 @@ pub struct Contents {
     pub span: Option<(u64, u64)>,
     /// Variant of the first scan.
     pub variant: Option<Variant>,
-    /// Unit of the first scan; a log has none, its metres become what is asked for.
+    /// Unit of the first scan; of a log the one in which its ranges are whole values.
     pub unit: Option<Unit>,
-    /// Measuring mode, where a configuration reply (F4h) or a status tells it.
+    /// Measuring mode, where a configuration reply (F4h) or a status tells it; of a log one whose values reach as far as
+    /// its ranges.
     pub mode: Option<Mode>,
+    /// Ranges of a log that its unit and mode cannot say.
+    pub unfit: Unfit,
     /// What is missing of the file. Telegrams that follow are those that are there.
     pub damage: Damage,
 }
@@ -53,6 +56,7 @@ impl Contents {
             variant: None,
             unit: None,
             mode: None,
+            unfit: Unfit::default(),
             damage: Damage::default(),
         }
     }

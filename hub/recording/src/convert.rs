@@ -13,11 +13,11 @@ use std::sync::atomic::{AtomicBool, Ordering};
 
 use flate2::Compression;
 use flate2::write::GzEncoder;
-use lms::variant::{Mode, Unit};
+use lms::variant::{Baud, Mode, Unit};
 use schema::file::Writer;
-use schema::{Failure, Kind, Status, Topic, check_followed};
+use schema::{Failure, Kind, Topic, check_followed};
 
-use crate::{Damage, Encoding, Form, Recording};
+use crate::{Damage, Encoding, Form, Frame, Recording, carmen};
 use output::{Place, unwritable};
 use times::Times;
 
@@ -39,6 +39,8 @@ pub struct ConvertOptions {
 pub struct Converted {
     /// Form of the recording, and of what it became.
     pub forms: (Form, Form),
+    /// How the ranges of a log are values; nothing of another form.
+    pub encoding: Option<Encoding>,
     /// Its sensors.
     pub sensors: Vec<String>,
     /// Telegrams that were written.
@@ -77,6 +79,7 @@ pub fn convert(
     let contents = recording.contents();
     let mut converted = Converted {
         forms: (contents.form, form),
+        encoding: recording.encoding().filter(|_| contents.form == Form::Carmen),
         sensors: contents.sensors.clone(),
         telegrams: 0,
         scans: 0,
@@ -155,14 +158,19 @@ fn write_bytes(
     failed: &impl Fn(io::Error) -> Failure,
 ) -> Result<(), Failure> {
     let mut times = Times::of(recording);
-    let mode = recording.contents().mode.unwrap_or(encoding.mode);
-    let mut first_ns = None;
-    for frame in recording.telegrams(encoding)? {
-        if form == Form::Telegrams {
+    if form == Form::Telegrams {
+        for frame in frames(recording, encoding)? {
             out.write_all(&frame.telegram).map_err(failed)?;
             count(Written::of(frame.is_scan()), frame.wall_ns)?;
-            continue;
         }
+        return out.finish().map_err(failed);
+    }
+    let contents = recording.contents();
+    let mode = contents.mode.unwrap_or(encoding.mode);
+    let told = carmen::line_of(Encoding { mode, unit: contents.unit.unwrap_or(encoding.unit) });
+    out.write_all(told.as_bytes()).map_err(failed)?;
+    let mut first_ns = None;
+    for frame in recording.telegrams(encoding)? {
         let at_ns = times.wall_ns(&frame);
         let line = scans::line(&frame.telegram, mode, at_ns, *first_ns.get_or_insert(at_ns));
         out.write_all(line.as_deref().unwrap_or_default().as_bytes()).map_err(failed)?;
@@ -184,15 +192,10 @@ fn write_mcap(
     let mut writer = Writer::begin(file, "", facts.into()).map_err(failed)?;
     let mut times = Times::of(recording);
     let mut bytes = 0;
-    for (number, frame) in recording.telegrams(encoding)?.enumerate() {
-        let header = times.header(&frame, number as u64);
-        if number == 0 && recording.contents().form == Form::Carmen {
-            // Nothing else tells how the values are split.
-            let status = Status { mode: encoding.mode.0, unit_mm: encoding.unit.mm(), ..Status::default() };
-            let mut room = [0; 1024];
-            let len = schema::datagram::Packed::pack(&status, &mut room).unwrap_or(0);
-            writer.sample(sensor, Topic::Status, &header, &room[..len]).map_err(failed)?;
-        }
+    let mut frames = frames(recording, encoding)?.enumerate().peekable();
+    while let Some((number, frame)) = frames.next() {
+        let next_ns = frames.peek().and_then(|(_, next)| next.wall_ns);
+        let header = times.header(&frame, number as u64, next_ns);
         writer.sample(sensor, Topic::Telegram, &header, &frame.telegram).map_err(failed)?;
         bytes += frame.telegram.len();
         if bytes >= CHUNK {
@@ -204,21 +207,29 @@ fn write_mcap(
     writer.finish().map_err(failed).map(drop)
 }
 
-/// How the metres of a log become values with the least loss: in centimetres where it has no finer ones, else in
-/// millimetres as far as they reach.
+/// How the values are encoded, where that can be said without loss or is not asked.
+///
+/// [`Kind::Configuration`] of a log whose ranges no sensor could have sent.
 fn encoding(recording: &Recording) -> Result<Encoding, Failure> {
-    let cm = Encoding { unit: Unit::Cm, mode: Mode(0) };
-    if recording.contents().form != Form::Carmen {
-        return Ok(cm);
+    let unfit = recording.contents().unfit;
+    if !unfit.is_none() {
+        let message = format!("{} cannot become telegrams without loss: {unfit}", recording.path().display());
+        let hint = "round its ranges first; `scanhub replay` plays it rounded";
+        return Err(Failure::new(Kind::Configuration, message, hint));
     }
-    let (mut is_fine, mut farthest_m) = (false, 0.0f64);
-    for range_m in recording.sweeps()?.flat_map(|sweep| sweep.ranges_m) {
-        is_fine |= range_m.is_finite() && (range_m * 100.0 - (range_m * 100.0).round()).abs() > 1e-6;
-        farthest_m = if range_m.is_finite() { farthest_m.max(range_m) } else { farthest_m };
-    }
-    let reaches = |mode: &Mode| farthest_m * 1000.0 < f64::from(mode.max_value() - crate::BEYOND);
-    let fine = [Mode(0x00), Mode(0x04), Mode(0x06)].into_iter().find(reaches).filter(|_| is_fine);
-    Ok(fine.map_or(cm, |mode| Encoding { unit: Unit::Mm, mode }))
+    Ok(recording.encoding().unwrap_or(Encoding { unit: Unit::Cm, mode: Mode(0) }))
+}
+
+/// What becomes of `recording`: its telegrams, and before those of a log the reply that says how their values are encoded.
+fn frames(recording: &Recording, encoding: Encoding) -> Result<impl Iterator<Item = Frame> + use<>, Failure> {
+    let contents = recording.contents();
+    let told = (contents.form == Form::Carmen).then(|| {
+        let telegram = carmen::configuration(encoding);
+        let took_ns = lms::line_time(telegram.len(), Baud::B500000.rate());
+        let wall_ns = contents.span.map(|(first_ns, _)| first_ns.saturating_sub(took_ns));
+        Frame { telegram, wall_ns, header: None }
+    });
+    Ok(told.into_iter().chain(recording.telegrams(encoding)?))
 }
 
 /// The form that the name of a file tells.

@@ -14,7 +14,7 @@ mod mcap;
 mod open;
 mod stream;
 
-pub use carmen::BEYOND;
+pub use carmen::{BEYOND, Unfit};
 pub use contents::{Contents, Form};
 pub use damage::Damage;
 pub use open::{Encoding, Recording};

@@ -59,13 +59,14 @@ impl Recorded {
         Recorded::new(recording, link)
     }
 
-    /// `recording`, which is of one sensor; metres become units of `link`'s.
+    /// `recording`, which is of one sensor, as the link of `link`; says how the ranges of a log are read.
     pub(crate) fn new(recording: Recording, link: &Link) -> Result<Recorded, Failure> {
+        tell_of_log(&recording, &link.name);
         let mode = recording.contents().mode.or(link.mode).unwrap_or(Mode(0));
         if recording.contents().form == Form::Telegrams {
             return Ok(Recorded::Stream(Stream { recording, mode }));
         }
-        let encoding = Encoding { unit: link.unit.unwrap_or(Unit::Mm), mode };
+        let encoding = Encoding { unit: recording.contents().unit.unwrap_or(Unit::Mm), mode };
         let mut frames = Frames { recording, encoding, origin: None, is_told_later: false };
         let mut first = frames.read()?.take(ASKED_WITHIN).peekable();
         frames.origin = first.peek().and_then(Origin::of);
@@ -219,6 +220,16 @@ impl Origin {
             _ => self.wall_ns <= other.wall_ns,
         };
         if is_earlier { self } else { other }
+    }
+}
+
+/// How the ranges of a log are read, and what of them goes into no value.
+fn tell_of_log(recording: &Recording, name: &str) {
+    let contents = recording.contents();
+    let Some(encoding) = recording.encoding().filter(|_| contents.form == Form::Carmen) else { return };
+    tracing::info!("{name}: a CARMEN log, read as {encoding}");
+    if !contents.unfit.is_none() {
+        tracing::warn!("{name}: {}", contents.unfit);
     }
 }
 
