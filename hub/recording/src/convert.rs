@@ -41,7 +41,7 @@ pub struct Converted {
     pub forms: (Form, Form),
     /// How the ranges of a log are values; nothing of another form.
     pub encoding: Option<Encoding>,
-    /// Its sensors.
+    /// Its sensors; of one that names none the name that it gets in an MCAP file.
     pub sensors: Vec<String>,
     /// Telegrams that were written.
     pub telegrams: u64,
@@ -120,6 +120,7 @@ pub fn convert(
         Form::Mcap if contents.form == Form::Mcap => copy::copy(&recording, &mut file, &mut count, &failed),
         Form::Mcap => {
             let sensor = options.sensor.as_deref().unwrap_or(SENSOR);
+            converted.sensors = vec![sensor.to_owned()];
             write_mcap(&recording, sensor, encoding, &mut file, &mut count, &failed)
         }
         form => {

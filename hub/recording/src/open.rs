@@ -278,14 +278,16 @@ fn survey_stream(path: &Path, reader: impl Read) -> Result<Contents, Failure> {
     loop {
         match telegrams.next() {
             Ok(Some(bytes)) => contents.note(&bytes, None),
-            Ok(None) => return Ok(contents),
+            Ok(None) => break,
             Err(error) if is_end(&error) && contents.telegrams > 0 => {
                 contents.damage.is_cut = true;
-                return Ok(contents);
+                break;
             }
             Err(error) => return Err(unreadable(path, &error)),
         }
     }
+    contents.damage.bytes = telegrams.discarded();
+    Ok(contents)
 }
 
 /// Whether a reader that fails so has no more to give, and the disk is not to blame: a packed file is cut or harmed.

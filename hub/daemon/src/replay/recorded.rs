@@ -53,6 +53,7 @@ impl Recorded {
     /// that only brings noise.
     pub(crate) fn open(path: &Path, link: &Link) -> Result<Recorded, Failure> {
         let recording = Recording::open_line(path)?;
+        tell_of_damage(&recording);
         if recording.contents().sensors.len() > 1 {
             return Recorded::new(recording.of(&link.name)?, link);
         }
@@ -220,6 +221,14 @@ impl Origin {
             _ => self.wall_ns <= other.wall_ns,
         };
         if is_earlier { self } else { other }
+    }
+}
+
+/// What is missing of it, if anything is.
+pub(super) fn tell_of_damage(recording: &Recording) {
+    let damage = recording.contents().damage;
+    if !damage.is_none() {
+        tracing::warn!("{}: missing: {damage}", recording.path().display());
     }
 }
 
