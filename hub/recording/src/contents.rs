@@ -38,6 +38,8 @@ pub struct Contents {
     /// Measuring mode, where a configuration reply (F4h) or a status tells it; of a log one whose values reach as far as
     /// its ranges.
     pub mode: Option<Mode>,
+    /// Bits that are set in any value of its scans; of a log none.
+    pub bits: u16,
     /// Ranges of a log that its unit and mode cannot say.
     pub unfit: Unfit,
     /// What is missing of the file. Telegrams that follow are those that are there.
@@ -45,6 +47,13 @@ pub struct Contents {
 }
 
 impl Contents {
+    /// The measuring mode by which the values are read: the one that is told, else that of 13 bits where no value has a
+    /// higher bit, which then says nothing in any mode. Nothing where the values could be split in several ways.
+    pub fn readable(&self) -> Option<Mode> {
+        let plain = Mode(0x00);
+        self.mode.or((self.bits <= plain.max_value()).then_some(plain))
+    }
+
     /// Nothing yet.
     pub(crate) fn new(form: Form) -> Contents {
         Contents {
@@ -56,6 +65,7 @@ impl Contents {
             variant: None,
             unit: None,
             mode: None,
+            bits: 0,
             unfit: Unfit::default(),
             damage: Damage::default(),
         }
@@ -73,6 +83,7 @@ impl Contents {
             self.scans += 1;
             self.variant = self.variant.or(Variant::of_beams(measured.count()));
             self.unit = self.unit.or(Some(measured.unit()));
+            self.bits = measured.words().fold(self.bits, |bits, word| bits | word);
         }
     }
 

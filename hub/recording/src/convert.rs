@@ -88,7 +88,7 @@ pub fn convert(
         damage: contents.damage,
         is_closed: false,
     };
-    let encoding = encoding(&recording)?;
+    let encoding = encoding(&recording, form)?;
     if (contents.form, form) != (Form::Mcap, Form::Mcap) {
         // Refuses to choose of several sensors, before anything is written.
         drop(recording.telegrams(encoding)?);
@@ -166,9 +166,8 @@ fn write_bytes(
         }
         return out.finish().map_err(failed);
     }
-    let contents = recording.contents();
-    let mode = contents.mode.unwrap_or(encoding.mode);
-    let told = carmen::line_of(Encoding { mode, unit: contents.unit.unwrap_or(encoding.unit) });
+    let mode = encoding.mode;
+    let told = carmen::line_of(encoding);
     out.write_all(told.as_bytes()).map_err(failed)?;
     let mut first_ns = None;
     for frame in recording.telegrams(encoding)? {
@@ -210,15 +209,23 @@ fn write_mcap(
 
 /// How the values are encoded, where that can be said without loss or is not asked.
 ///
-/// [`Kind::Configuration`] of a log whose ranges no sensor could have sent.
-fn encoding(recording: &Recording) -> Result<Encoding, Failure> {
-    let unfit = recording.contents().unfit;
+/// [`Kind::Configuration`] of a log whose ranges no sensor could have sent, and for a log, of values of which nobody knows
+/// where a range ends.
+fn encoding(recording: &Recording, form: Form) -> Result<Encoding, Failure> {
+    let contents = recording.contents();
+    let unfit = contents.unfit;
     if !unfit.is_none() {
         let message = format!("{} cannot become telegrams without loss: {unfit}", recording.path().display());
         let hint = "round its ranges first; `scanhub replay` plays it rounded";
         return Err(Failure::new(Kind::Configuration, message, hint));
     }
-    Ok(recording.encoding().unwrap_or(Encoding { unit: Unit::Cm, mode: Mode(0) }))
+    let mode = contents.readable();
+    if mode.is_none() && form == Form::Carmen {
+        let message = format!("{} does not tell its measuring mode", recording.path().display());
+        let hint = "`scanhub replay --set link.front.mode=0x04` plays it, and `scanhub record` records it with its mode";
+        return Err(Failure::new(Kind::Configuration, message, hint));
+    }
+    Ok(Encoding { unit: contents.unit.unwrap_or(Unit::Cm), mode: mode.unwrap_or(Mode(0)) })
 }
 
 /// What becomes of `recording`: its telegrams, and before those of a log the reply that says how their values are encoded.
