@@ -1,6 +1,7 @@
 //! How long does it take to have a stream, whatever mood the sensor is in? Each of the four rates, idle, streaming or left
-//! in installation mode; and a sensor whose power is cycled in the middle of a scan while another one streams. It does
-//! not tell how long a real sensor boots: that is up to a minute, and passes before its banner.
+//! in installation mode; a sensor that just got its power and answers quickly, beside a host that knows its rate and asks
+//! nothing; and a sensor whose power is cycled in the middle of a scan while another one streams. It does not tell how
+//! long a real sensor boots: that is up to a minute, and passes before its banner.
 
 mod support;
 
@@ -27,6 +28,8 @@ fn measure(options: &Options) -> Outcome<()> {
         let most = if (rate, state) == ("500000", "streaming") { 500.0 } else { 5_000.0 };
         figures.push(Figure { name, unit: "ms", hub: times, floor: Vec::new(), target: Target::Most(most) });
     }
+    figures.extend(cold_starts(options.pairs())?);
+    figures.push(stale(options.pairs())?);
     figures.extend(power_cycles(options.pairs())?);
     figures::print("moods", options.json, &figures);
     Ok(())
@@ -40,6 +43,46 @@ fn start(rate: &str, state: &str) -> Outcome<f64> {
     scans.await_line("attaching", PATIENCE)?;
     let hub = stage.hub(&["front"])?;
     Ok((scans.await_line("scan", PATIENCE)?.number(2)? - hub.started_ns) as f64 / 1e6)
+}
+
+/// A sensor at rest at 9600 that answers after 60 ms: the hub's first start, the next one with what it keeps of the first,
+/// and the least that could be said, in turns.
+fn cold_starts(count: usize) -> Outcome<[Figure; 2]> {
+    let (mut first, mut again, mut least) = (Vec::new(), Vec::new(), Vec::new());
+    for _ in 0..count {
+        let stage = Stage::new()?;
+        for times in [&mut first, &mut again] {
+            let _simulator = stage.simulate_one("front", &QUICK)?;
+            let scans = stage.consumer("scan", "front", &[])?;
+            scans.await_line("attaching", PATIENCE)?;
+            let hub = stage.hub(&["front"])?;
+            times.push((scans.await_line("scan", PATIENCE)?.number(2)? - hub.started_ns) as f64 / 1e6);
+        }
+        drop(stage);
+        let stage = Stage::new()?;
+        let _simulator = stage.simulate_one("front", &QUICK)?;
+        let host = stage.part(&["host", "blindly", &stage.port("front"), "9600"])?;
+        least.push((host.await_line("scan", PATIENCE)?.number(1)? - host.started_ns) as f64 / 1e6);
+    }
+    let figure =
+        |name, hub, most| Figure { name, unit: "ms", hub, floor: least.clone(), target: Target::Most(most) };
+    Ok([figure("power on, quick answers", first, 700.0), figure("the same, the next start", again, 700.0)])
+}
+
+/// A stream at the wanted rate that somebody left: from exec of the hub until it has adopted it, as its status says.
+fn stale(count: usize) -> Outcome<Figure> {
+    let mut hub = Vec::new();
+    for _ in 0..count {
+        let stage = Stage::new()?;
+        let _simulator = stage.simulate_one("front", &["--baud", "500000", "--state", "streaming"])?;
+        let statuses = stage.consumer("status", "front", &[])?;
+        statuses.await_line("attaching", PATIENCE)?;
+        let process = stage.hub(&["front"])?;
+        let adopted = statuses.await_line("status front streaming", PATIENCE)?.number(3)?;
+        hub.push((adopted - process.started_ns) as f64 / 1e6);
+    }
+    let target = Target::Most(150.0);
+    Ok(Figure { name: "500000 Bd, streaming, adopted", unit: "ms", hub, floor: Vec::new(), target })
 }
 
 /// Cycles the power of one of two sensors: from its banner to its first telegram, and what the other one lost.
@@ -108,6 +151,9 @@ fn await_banner(stage: &Stage) -> Outcome<u64> {
         support::clock::rest(support::clock::now() + 20_000_000);
     }
 }
+
+/// Idle at 9600, 60 ms from ACK to reply.
+const QUICK: [&str; 4] = ["--baud", "9600", "--fault", "answer=0.06"];
 
 /// Rate of the line, what the sensor was left doing, and the name of the figure.
 const STARTS: [(&str, &str, &str); 12] = [

@@ -2,6 +2,7 @@
 //! uses it.
 
 mod background;
+mod complete;
 mod config;
 mod configure;
 mod control;
@@ -30,6 +31,7 @@ use daemon::config::Sources;
 use schema::{DEFAULT_DOMAIN, Domain, Environment, Failure};
 
 pub(crate) use background::Background;
+pub(crate) use complete::Complete;
 pub(crate) use config::Config;
 pub(crate) use control::Control;
 pub(crate) use convert::Convert;
@@ -167,6 +169,9 @@ pub(crate) enum Verb {
     Convert(Convert),
     /// The completion of this command line for a shell
     Completions(Completions),
+    /// Names of the running hub for those completions
+    #[command(hide = true)]
+    Complete(Complete),
     /// Manual pages
     Man(Man),
 }
@@ -243,7 +248,7 @@ impl Limits {
 
 #[derive(Args, Debug)]
 pub(crate) struct Echo {
-    /// What to follow: front/scan, rear/telegram, front/zones .. or robot/zones, all sensors' zones in one
+    /// What to follow: front/scan, */scan for all sensors, front/* for all topics; or robot/zones, all sensors' zones in one
     #[arg(required = true, value_name = "SENSOR/TOPIC")]
     pub(crate) topics: Vec<String>,
     /// Comma-separated values
@@ -258,7 +263,7 @@ pub(crate) struct Echo {
 
 #[derive(Args, Debug)]
 pub(crate) struct Hz {
-    /// What to follow; all topics if nothing is named
+    /// What to follow: front/scan, */scan for all sensors, front/* for all topics; without it everything
     #[arg(value_name = "SENSOR/TOPIC")]
     pub(crate) topics: Vec<String>,
     /// Span of time that a line looks back on

@@ -8,13 +8,15 @@ mod stage;
 mod view;
 
 use std::io::Write;
+use std::path::Path;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::mpsc::{self, RecvTimeoutError};
 use std::thread;
 use std::time::{Duration, Instant};
 
 use clients::{Bounds, WatchOptions};
-use schema::{Failure, Kind};
+use schema::{Domain, Failure, Kind};
+use serde::Serialize;
 use serde_json::Value;
 
 use crate::cli::watch::{can_show_pictures, colours};
@@ -47,10 +49,12 @@ pub(crate) fn demo(options: &DemoOptions, out: &mut dyn Write, stop: &AtomicBool
     let played = if has_picture {
         play_with_picture(options, &stage, out, stop)
     } else {
-        let mut view = View::new(stage.domain.name());
+        let (mut view, mut is_said) = (View::new(&stage.domain), false);
         let mut show = |account: &Account, elapsed: Duration| {
             if shows {
                 view.draw(out, account, elapsed);
+            } else if !std::mem::replace(&mut is_said, true) {
+                say_ready(out, &stage.domain, options.json);
             }
         };
         play(options, &stage, &mut show, &|| stop.load(Ordering::Relaxed))
@@ -77,6 +81,7 @@ fn play_with_picture(
     let picture = WatchOptions {
         sensors: SENSORS.map(String::from).to_vec(),
         colours: colours(),
+        note: attach(&stage.domain),
         bounds: Bounds::default(),
         places: vec![stage.domain.clone()],
     };
@@ -102,6 +107,30 @@ impl Drop for Raise<'_> {
     fn drop(&mut self) {
         self.0.store(true, Ordering::Relaxed);
     }
+}
+
+/// What somebody types in another terminal to look at it.
+fn attach(domain: &Domain) -> String {
+    format!("other terminal: scanhub echo front/scan --domain {}", domain.name())
+}
+
+/// Says where it takes place.
+fn say_ready(out: &mut dyn Write, domain: &Domain, json: bool) {
+    let ready = Ready { class: "ready", domain: domain.name(), root: domain.root(), pid: std::process::id() };
+    let line = match json {
+        true => crate::line(&ready),
+        false => format!("ready {} in {}; {}", ready.domain, ready.root.display(), attach(domain)),
+    };
+    let _ = out.write_all(format!("{line}\n").as_bytes());
+}
+
+/// Class `ready`; keys in the order of their contract.
+#[derive(Serialize)]
+struct Ready<'a> {
+    class: &'static str,
+    domain: &'a str,
+    root: &'a Path,
+    pid: u32,
 }
 
 /// Starts everybody and keeps account until the time is over or `is_stopped`, which is the second answer.

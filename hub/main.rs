@@ -19,7 +19,7 @@ use clap::error::ErrorKind;
 use clients::{EchoOptions, Format, HzOptions, InfoOptions, ListOptions};
 use daemon::Config;
 use rustix::process::Signal;
-use schema::{Domain, Failure, Kind};
+use schema::{Domain, Failure, Kind, Printable, json_line};
 use serde::Serialize;
 use signal_hook::consts::{SIGHUP, SIGINT, SIGQUIT, SIGTERM, SIGUSR1};
 use tracing::level_filters::LevelFilter;
@@ -57,6 +57,8 @@ fn main() -> ExitCode {
 
 fn dispatch(cli: &Cli) -> Result<(), Failure> {
     let everywhere = &cli.everywhere;
+    // A file that may not grow is an error of its write, and no end.
+    interrupt_by(&[SIGXFSZ])?;
     // Without the standard library's buffer, which cuts at line feeds: one write is one sample, a raw one too.
     let stdout = io::stdout().as_fd().try_clone_to_owned().map(File::from);
     let mut out = stdout.map_err(|error| Failure::new(Kind::Failed, format!("no stdout: {error}"), ""))?;
@@ -83,6 +85,10 @@ fn dispatch(cli: &Cli) -> Result<(), Failure> {
         Verb::Configure(configure) => configure.run(everywhere.json, &*interrupt_by(&ENDS)?),
         Verb::Convert(convert) => convert.run(everywhere.json, &*interrupt()?),
         Verb::Completions(completions) => completions.run(),
+        Verb::Complete(complete) => {
+            complete.run();
+            Ok(())
+        }
         Verb::Man(man) => man.run(),
         Verb::Config(config) => config.run(everywhere),
         Verb::Doctor(doctor) => doctor.run(everywhere, &*interrupt()?),
@@ -131,8 +137,8 @@ fn dispatch(cli: &Cli) -> Result<(), Failure> {
         }
         Verb::Record(record) => {
             let options = record.options(everywhere)?;
-            // Whatever ends it, the file is finished. A file that may not grow is an error of its write, and no end.
-            let (stop, _) = (interrupt_by(&ENDS)?, interrupt_by(&[SIGXFSZ])?);
+            // Whatever ends it, the file is finished.
+            let stop = interrupt_by(&ENDS)?;
             let mut stderr = io::stderr();
             match record.is_to_stdout() {
                 true => clients::record(&options, &mut io::stderr(), &mut stderr, &stop),
@@ -227,7 +233,7 @@ struct ReadyPort<'a> {
 }
 
 fn line(value: &impl Serialize) -> String {
-    serde_json::to_string(value).unwrap_or_default()
+    json_line(serde_json::to_string(value).unwrap_or_default())
 }
 
 /// A file would become longer than is allowed; signal-hook has no name for it.
@@ -258,6 +264,11 @@ fn no_handler(error: io::Error) -> Failure {
 ///
 /// [`Kind::Failed`] if it cannot be written, as on a full disk.
 fn print(text: &str) -> Result<(), Failure> {
+    print_own(&Printable(text).to_string())
+}
+
+/// The same of text that is all ours, which may have tabs.
+fn print_own(text: &str) -> Result<(), Failure> {
     match io::stdout().lock().write_all(format!("{text}\n").as_bytes()) {
         Err(error) if error.kind() != io::ErrorKind::BrokenPipe => {
             Err(Failure::new(Kind::Failed, format!("cannot write: {error}"), ""))
@@ -268,7 +279,7 @@ fn print(text: &str) -> Result<(), Failure> {
 
 /// Writes one line to stdout; whoever closed it does not want it.
 fn say(line: &str) {
-    let _ = io::stdout().lock().write_all(format!("{line}\n").as_bytes());
+    let _ = io::stdout().lock().write_all(format!("{}\n", Printable(line)).as_bytes());
 }
 
 fn report(failure: &Failure, json: bool, quiet: bool) {
@@ -281,7 +292,7 @@ fn report(failure: &Failure, json: bool, quiet: bool) {
 
 /// Writes one line to stderr, which may be a terminal that is gone.
 fn complain(line: &str) {
-    let _ = io::stderr().lock().write_all(format!("{line}\n").as_bytes());
+    let _ = io::stderr().lock().write_all(format!("{}\n", Printable(line)).as_bytes());
 }
 
 /// The command line cannot be understood, or asks for help only.

@@ -104,16 +104,16 @@ fn what_is_no_model_of_the_sensor_is_refused_and_the_hub_goes_on() {
     let foreign = stage.file("foreign.json", text.replacen("\"front\"", "\"rear\"", 1));
     let centimetres = stage.file("cm.json", text.replacen("\"unit_mm\":1,", "\"unit_mm\":10,", 1));
     let scan = stage.file("scan.json", "{\"class\":\"scan\"}");
-    for (file, why) in [
-        (&cut, "cut short"),
-        (&foreign, "is the background of rear, not of front"),
-        (&centimetres, "361 beams in units of 10 mm"),
-        (&scan, "its class is \"scan\""),
-        (&stage.word("nothing.json"), "nothing.json"),
+    for (file, code, kind, why) in [
+        (&cut, 66, "input", "cut short"),
+        (&foreign, 78, "configuration", "is the background of rear, not of front"),
+        (&centimetres, 78, "configuration", "361 beams in units of 10 mm"),
+        (&scan, 66, "input", "its class is \"scan\""),
+        (&stage.word("nothing.json"), 66, "input", "nothing.json"),
     ] {
         let outcome = ask(&stage, &["load", file]);
         let error = &outcome.of_class("error")[0];
-        assert_eq!((outcome.code, &error["kind"]), (Some(78), &"configuration".into()), "{outcome}");
+        assert_eq!((outcome.code, &error["kind"]), (Some(code), &kind.into()), "{outcome}");
         assert!(error["message"].as_str().is_some_and(|message| message.contains(why)), "{outcome}");
         assert!(error["hint"].as_str().is_some_and(|hint| !hint.is_empty()), "{outcome}");
     }

@@ -57,7 +57,6 @@ fn a_check_refuses_what_a_hub_refuses() {
         (vec!["--no-system-config", "--link", "front"], "--link front: no = in it".to_owned()),
         (vec!["--no-system-config"], "no link is configured\n  --link NAME=PORT".to_owned()),
         (vec![empty.as_str()], "no link is configured".to_owned()),
-        (vec!["/nowhere/scanhub.toml"], "/nowhere/scanhub.toml: No such file".to_owned()),
     ] {
         let outcome = stage.run(&[&["config", "check"], &arguments[..]].concat());
         assert_eq!((outcome.code, outcome.out.len()), (Some(78), 0), "{outcome}");
@@ -66,6 +65,9 @@ fn a_check_refuses_what_a_hub_refuses() {
         let error = &outcome.of_class("error")[0];
         assert_eq!((outcome.code, error["kind"].as_str()), (Some(78), Some("configuration")), "{outcome}");
     }
+    let missing = stage.run(&["config", "check", "/nowhere/scanhub.toml"]);
+    assert_eq!((missing.code, missing.out.len()), (Some(66), 0), "{missing}");
+    assert!(missing.errors.contains("/nowhere/scanhub.toml: No such file"), "{missing}");
     let link = ["config", "check", "--json", "--no-system-config", "--link", "a=tcp:box:4001"];
     let checked = stage.run(&link).of_class("checked");
     assert_eq!(checked[0]["links"][0]["port"], "tcp:box:4001", "{checked:?}");
@@ -144,7 +146,7 @@ fn every_verb_has_an_example_a_page_and_a_completion() {
     }
     assert!(printed(&stage, &["man"]).contains(".TH scanhub 1"));
     let refused = stage.run(&["man", "/dev/null/man"]);
-    assert_eq!((refused.code, refused.errors.contains("/dev/null/man: ")), (Some(1), true), "{refused}");
+    assert_eq!((refused.code, refused.errors.contains("/dev/null/man: ")), (Some(73), true), "{refused}");
 
     // The shell itself says what it would complete; there is a bash on most machines.
     let script = stage.file("completion", &completions[0]);
@@ -153,6 +155,54 @@ fn every_verb_has_an_example_a_page_and_a_completion() {
         Ok(said) => assert_eq!(String::from_utf8_lossy(&said.stdout).trim(), "echo"),
         Err(error) => eprintln!("skipped: no bash: {error}"),
     }
+}
+
+/// What bash itself completes behind `words`, the last of which is being typed.
+fn completed(stage: &Stage, words: &[&str]) -> Option<Vec<String>> {
+    let program = Path::new(env!("CARGO_BIN_EXE_scanhub"));
+    let script = stage.file("completion", printed(stage, &["completions", "bash"]));
+    let ask = "source \"$0\"; COMP_WORDS=(\"$@\"); COMP_CWORD=$(($# - 1)); \
+               \"$(complete -p scanhub | sed 's/.*-F \\([^ ]*\\).*/\\1/')\" \"$1\" \"${@: -1}\" \"${@: -2:1}\"; printf '%s\\n' \"${COMPREPLY[@]}\"";
+    let path = format!("{}:{}", program.parent()?.display(), std::env::var("PATH").unwrap_or_default());
+    let mut bash = Command::new("bash");
+    bash.args(["-c", ask, &script, "scanhub"]).args(words).env("PATH", path);
+    let said = match bash.output() {
+        Ok(said) => said,
+        Err(error) => {
+            eprintln!("skipped: no bash: {error}");
+            return None;
+        }
+    };
+    assert_eq!((said.status.success(), said.stderr.is_empty()), (true, true), "{said:?}");
+    Some(String::from_utf8_lossy(&said.stdout).lines().map(String::from).collect())
+}
+
+#[test]
+fn sensors_and_topics_of_the_running_hub_are_completed() {
+    let stage = Stage::new();
+    let (domain, root) = (format!("--domain={}", stage.place().name()), stage.place().root().to_owned());
+    let root = format!("--root={}", root.parent().expect("a directory").display());
+    let ask = |words: &[&str]| completed(&stage, &[&words[..1], &[&domain, &root], &words[1..]].concat());
+    let Some(before) = ask(&["echo", "front/s"]) else { return };
+    assert_eq!(before, [""; 1], "without a hub there is nothing to add");
+    let hub = stage.hub(&["--link=front=/no/such/port", "--link=rear=/no/such/port2"]);
+    for (words, expected) in [
+        (&["echo", "front/s"][..], &["front/scan", "front/status"][..]),
+        (&["hz", "front/scan", "rear/sc"], &["rear/scan"]),
+        (&["gateway", "--topic", "rear/z"], &["rear/zones"]),
+        (&["info", ""], &["front", "rear"]),
+        (&["control", "r"], &["rear"]),
+        (&["leds", "ro"], &["robot"]),
+        (&["control", "rear", "pau"], &["pause"]),
+        (&["echo", "--cs"], &["--csv"]),
+    ] {
+        assert_eq!(
+            ask(words).as_deref(),
+            Some(&expected.iter().map(|&it| it.to_owned()).collect::<Vec<_>>()[..]),
+            "{words:?}"
+        );
+    }
+    assert_eq!(hub.end(stage::TERM).code, Some(0));
 }
 
 /// All files below `directory`.

@@ -122,7 +122,7 @@ fn what_is_not_there_or_takes_no_requests_is_refused() {
     for (sensor, code, kind, message) in [
         ("side", 3, "no_topic", "the hub has no sensor side"),
         ("front", 1, "failed", "front: a recording has nobody to begin anew with"),
-        ("Front", 78, "configuration", "sensor name \"Front\" is not possible"),
+        ("Front", 2, "usage", "sensor name \"Front\" is not possible"),
     ] {
         let outcome = control(&stage, sensor, "resync");
         let error = &outcome.of_class("error")[0];

@@ -1,6 +1,12 @@
 //! Ten megabytes of garbage as fast as the hub reads, with a telegram now and then: each is delivered, and nothing grows.
+//! From a serial server no more is read than twice what the line brings, and what it costs is little.
 
 mod stage;
+
+use std::io::Write;
+use std::net::TcpListener;
+use std::thread;
+use std::time::{Duration, Instant};
 
 use fastrand::Rng;
 use stage::{INT, Line, Program, Stage, TERM, bytes_of, is_class, number, scan};
@@ -80,4 +86,60 @@ fn telegrams_in_a_flood_of_garbage() {
     assert_eq!(number(&info["counters"], "telegrams"), all, "{info}");
     consumer.end(INT);
     assert_eq!(hub.end(TERM).code, Some(0));
+}
+
+/// Processor time that a process has taken.
+fn worked(pid: u32) -> Duration {
+    let tasks = std::fs::read_dir(format!("/proc/{pid}/task")).expect("the hub lives").flatten();
+    let of_task = |task: std::fs::DirEntry| {
+        let text = std::fs::read_to_string(task.path().join("schedstat")).ok()?;
+        text.split_whitespace().next()?.parse::<u64>().ok()
+    };
+    Duration::from_nanos(tasks.filter_map(of_task).sum())
+}
+
+#[test]
+fn a_serial_server_that_sends_garbage_at_full_speed() {
+    let stage = Stage::new();
+    let listener = TcpListener::bind("127.0.0.1:0").expect("a port of the loopback");
+    let link = format!("--link=front=tcp:{}", listener.local_addr().expect("it has an address"));
+    let hub = stage.hub(&[link]);
+    let mut consumer = stage.echo(&["front/telegram"]);
+    let (mut server, _) = listener.accept().expect("the hub comes");
+    // More than is allowed at once, with telegrams in it; then garbage without an end.
+    let mut random = Rng::with_seed(5);
+    let sent: Vec<Vec<u8>> = (0..20).map(|number| scan(1000 + number)).collect();
+    let steady = scan(0);
+    let mut flood = [&steady[..], &steady].concat();
+    for telegram in &sent {
+        flood.extend(garbage(&mut random, 15_000));
+        flood.extend(telegram);
+    }
+    let endless = garbage(&mut random, 1 << 20);
+    let writer = thread::spawn(move || {
+        server.write_all(&flood).expect("the hub reads");
+        while server.write_all(&endless).is_ok() {}
+    });
+    consumer.await_lines(2, "the stream", is_class("telegram"));
+    receive(&mut consumer, &sent);
+    consumer.end(INT);
+    let says = "more comes than a line of 500000 baud brings";
+    stage
+        .await_info("front", |info| info["last_error"].as_str().is_some_and(|error| error.starts_with(says)));
+    let bytes = || number(&stage.info("front")["counters"], "bytes_read");
+    // The counters are as old as the last status: a second.
+    let (before, since, idle) = (bytes(), Instant::now(), worked(hub.pid()));
+    thread::sleep(Duration::from_secs(3));
+    let worked = worked(hub.pid()).saturating_sub(idle);
+    let (read, took) = (bytes() - before, since.elapsed());
+    let most = 100_000.0 * (took.as_secs_f64() + 2.0);
+    let share = worked.as_secs_f64() / took.as_secs_f64();
+    eprintln!("{read} bytes in {took:?}, {:.1} % of a processor", 100.0 * share);
+    assert!(read as f64 <= most && read > 100_000, "{read} bytes in {took:?}");
+    assert!(share < 0.5, "{:.1} % of a processor, in a program that is not optimized", 100.0 * share);
+    let outcome = hub.end(TERM);
+    assert_eq!(outcome.code, Some(0), "{outcome}");
+    let said = outcome.errors.lines().filter(|line| line.contains(says)).count();
+    assert!((1..=2).contains(&said), "{outcome}");
+    writer.join().expect("it ends with the hub");
 }

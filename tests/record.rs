@@ -198,25 +198,26 @@ fn what_cannot_be_recorded_is_refused() {
         let error = lines.into_iter().find(is_class("error")).unwrap_or_else(|| panic!("{outcome}"));
         (outcome.code, error["kind"].as_str().unwrap_or_default().to_owned())
     };
-    assert_eq!(kind(&["-o", &file]), (Some(1), "failed".into()));
+    assert_eq!(kind(&["-o", &file]), (Some(73), "output".into()));
     assert_eq!(std::fs::read(&file).unwrap(), b"somebody's");
-    assert_eq!(kind(&["-o", &stage.word("nowhere/walk.mcap")]), (Some(1), "failed".into()));
-    let hint = |arguments: &[&str]| {
+    assert_eq!(kind(&["-o", &stage.word("nowhere/walk.mcap")]), (Some(73), "output".into()));
+    let refused = |arguments: &[&str], code| {
         let outcome = stage.run(&[&["record", "--json"], arguments].concat());
-        assert_eq!(outcome.code, Some(1), "{outcome}");
+        assert_eq!(outcome.code, Some(code), "{outcome}");
         outcome.of_class("error")[0]["hint"].as_str().unwrap().to_owned()
     };
+    let hint = |arguments: &[&str]| refused(arguments, 73);
     assert!(hint(&["-o", &stage.word("")]).starts_with("name a file in it: -o "));
     assert!(hint(&["-o", "/dev/full"]).contains("--force writes over what the device holds"));
-    assert!(hint(&["-o", "/dev/full", "--force"]).starts_with("make room"));
+    assert!(refused(&["-o", "/dev/full", "--force"], 75).starts_with("make room"));
     stage.file("parts-0007.mcap", "somebody's");
     let earlier = hint(&["-o", &stage.word("parts.mcap"), "--split=1h"]);
     assert!(earlier.starts_with("--force goes on after the last one's number"), "{earlier}");
     assert_eq!(kind(&["-o", "-", "--split", "1h"]), (Some(2), "usage".into()));
     assert_eq!(kind(&["--keep", "3"]), (Some(2), "usage".into()));
     assert_eq!(kind(&["--split", "3"]), (Some(2), "usage".into()));
-    assert_eq!(kind(&["robot/zones"]), (Some(78), "configuration".into()));
-    assert_eq!(kind(&["front/scam"]), (Some(3), "no_topic".into()));
+    assert_eq!(kind(&["robot/zones"]), (Some(2), "usage".into()));
+    assert_eq!(kind(&["front/scam"]), (Some(2), "usage".into()));
     // Nothing came, nothing stays.
     let new = stage.word("new.mcap");
     assert_eq!(kind(&["-o", &new, "--for", "5s"]), (Some(3), "no_hub".into()));

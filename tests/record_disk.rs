@@ -238,7 +238,8 @@ fn what_cannot_be_begun_leaves_nothing_behind() {
     let stage = Stage::new();
     let limited = ["sh", "-c", "ulimit -f 0; exec \"$@\"", "sh"];
     let outcome = start_in(&stage, &limited, &["record", "--json", "-o", &stage.word("walk.mcap")]).wait();
-    assert_eq!(outcome.code, Some(1), "{outcome}");
+    assert_eq!(outcome.code, Some(75), "{outcome}");
+    assert_eq!(outcome.of_class("error")[0]["kind"], "short", "{outcome}");
     assert!(!stage.path("walk.mcap").exists());
     // What is no file of its own stays.
     std::os::unix::fs::symlink("/dev/null", stage.path("nothing")).unwrap();
@@ -306,7 +307,7 @@ fn two_recorders_do_not_write_one_file() {
     await_samples(&mut recorder, 20);
     let second = stage.run(&["record", "--json", "--force", "-o", &file]);
     let error = &second.of_class("error")[0];
-    assert_eq!((second.code, &error["kind"]), (Some(1), &"failed".into()), "{second}");
+    assert_eq!((second.code, &error["kind"]), (Some(73), &"output".into()), "{second}");
     assert!(error["message"].as_str().unwrap().contains("another recorder writes it"), "{error}");
     await_samples(&mut recorder, 20);
     nothing_lost(&recorder.end(INT));

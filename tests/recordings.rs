@@ -95,7 +95,7 @@ fn values_that_could_be_split_in_several_ways_are_no_scans_until_the_mode_is_tol
     let log = stage.path("a.log").display().to_string();
     let refused = stage.run(&["convert", &file, &log]);
     assert!(
-        refused.code == Some(78) && refused.errors.contains("does not tell its measuring mode"),
+        refused.code == Some(66) && refused.errors.contains("does not tell its measuring mode"),
         "{refused}"
     );
     let hub = stage.hub(&[&format!("--link=a=file:{file}"), "--set=link.a.mode=0x04"]);

@@ -86,7 +86,7 @@ fn configuration_that_cannot_be() {
     let file = stage.file("hub.toml", "[[link]]\nname = \"front\"\nport = \"/dev/x\"\nbaud = 115200\n");
     let unknown = stage.file("key.toml", "[[link]]\nname = \"front\"\nprot = \"/dev/x\"\n");
     let broken = stage.file("toml.toml", "[[link]\n");
-    let (place, key, missing) = (format!("{file}:4:8"), format!("{unknown}:3:1"), stage.word("no.toml"));
+    let (place, key) = (format!("{file}:4:8"), format!("{unknown}:3:1"));
     for (arguments, words) in [
         (&["run", "--set", "link.front.prot=/dev/x"][..], &["link.front.prot", "`prot`", "`port`"][..]),
         (
@@ -103,26 +103,169 @@ fn configuration_that_cannot_be() {
         (&["run", "--link", "front"], &["--link front", "NAME=PORT"]),
         (&["run", "--link", "Front=/dev/x"], &["Front"]),
         (&["run", "--link", "front=file:x?rate=2"], &["rate=max"]),
-        (&["run", "--link", "front=file:/no/such"], &["/no/such", "existing"]),
-        (&["replay", "/etc/passwd"], &["/etc/passwd", "no telegram in it", "MCAP"]),
-        (&["simulate", "--port=a", "--replay=/etc/passwd"], &["/etc/passwd", "no telegram in it", "MCAP"]),
         (&["run", "--config", &file], &[&place, "baud = 115200", "38400"]),
         (&["run", "--config", &unknown], &[&key, "`prot`", "`port`"]),
         (&["run", "--config", &broken], &["toml.toml:1:"]),
-        (&["run", "--config", &missing], &["no.toml"]),
         (&["simulate", "--port=a", "--fault=los=1"], &["los=1", "loss, burst"]),
-        (&["simulate", "--port=a", "--world=moon"], &["\"moon\"", "fig8"]),
         (&["simulate", "--port=a", "--baud=115200"], &["115200", "9600"]),
         (&["simulate", "--port=a", "--variant=180/0.25"], &["180/0.25", "one of"]),
         (&["simulate", "--port=a", "--speed=0"], &["speed"]),
         (&["simulate", "--port=a", "--state=asleep"], &["asleep", "installation"]),
         (&["simulate", "--port=a", "--fault=silence=-1"], &["silence=-1", "from 0 to"]),
         (&["simulate", "--port=a", "--type=lms211", "--variant=180/0.5"], &["180/0.5", "100 degrees"]),
-        (&["simulate", "--port=a", "--replay=/no/such"], &["/no/such", "existing"]),
-        (&["echo", "Front/scan"], &["Front"]),
     ] {
         refused(&stage, arguments, 78, "configuration", words);
     }
+}
+
+#[test]
+fn no_topic_is_called_so_whoever_is_asked() {
+    let stage = Stage::new();
+    for (arguments, words) in [
+        (&["echo", "front/scam"][..], &["front/scam", "front/scan"][..]),
+        (&["hz", "front/scam"], &["front/scam", "front/scan"]),
+        (&["latency", "front/scam"], &["front/scam", "front/scan"]),
+        (&["record", "front/scam"], &["front/scam", "front/scan"]),
+        (&["gateway", "--topic=front/scam"], &["front/scam", "front/scan"]),
+        (&["listen", "--topic=scam"], &["scam", "scan"]),
+        (&["echo", "*/scam"], &["*/scam", "*/scan"]),
+        (&["echo", "*"], &["topics are"]),
+        (&["record", "*/scam"], &["*/scam", "*/scan"]),
+        (&["gateway", "--topic=*/scam"], &["*/scam", "*/scan"]),
+        // Forms that these do not take.
+        (&["echo", "*/scan", "--csv"], &["--csv"]),
+        (&["echo", "front/*", "--raw"], &["--raw"]),
+        (&["latency", "*/scan"], &["*"]),
+        (&["record", "robot/zones"], &["robot/zones", "*/zones"]),
+        (&["gateway", "--topic=robot/zones"], &["robot/zones", "*/zones"]),
+        (&["gateway", "--topic=front/status:every=2"], &["thinned"]),
+        // No sensor can be called so.
+        (&["echo", "Front/scan"], &["Front"]),
+        (&["info", "Front"], &["Front"]),
+        (&["control", "Front", "pause"], &["Front"]),
+        (&["background", "Front", "show"], &["Front"]),
+        (&["zones", "Front", "mask"], &["Front"]),
+        (&["leds", "Front"], &["Front"]),
+    ] {
+        let outcome = stage.run(arguments);
+        assert_eq!((outcome.code, outcome.out.is_empty()), (Some(2), true), "{outcome}");
+        says_all(&outcome.errors, words, &outcome);
+        let outcome = stage.run(&[arguments, &["--json"]].concat());
+        // What is no flag of that command line is refused there.
+        let kind = outcome.of_class("error").pop().map(|line| line["kind"].clone());
+        assert_eq!((outcome.code, kind), (Some(2), Some("usage".into())), "{outcome}");
+    }
+    let config = stage.file("topics.toml", "[gateway]\ntopics = [\"front/scam\"]\n");
+    let arguments = ["gateway", "--no-system-config", "--config", &config];
+    refused(&stage, &arguments, 78, "configuration", &["gateway", "front/scam"]);
+}
+
+#[test]
+fn what_is_to_be_read_and_is_not_there() {
+    let stage = Stage::new();
+    let missing = stage.word("missing");
+    let output = stage.word("out.mcap");
+    for arguments in [
+        &["run", "--no-system-config", "--config", &missing][..],
+        &["run", "--no-system-config", &format!("--link=front=file:{missing}")],
+        &["config", "check", "--no-system-config", "--config", &missing],
+        &["config", "show", "--no-system-config", "--config", &missing],
+        &["replay", &missing],
+        &["replay", "/etc/passwd"],
+        &[
+            "replay",
+            "--config",
+            &missing,
+            concat!(env!("CARGO_MANIFEST_DIR"), "/tests/vectors/recording/v1.mcap"),
+        ],
+        &["simulate", "--port=a", "--replay", &missing],
+        &["simulate", "--port=a", "--replay=/etc/passwd"],
+        &["simulate", "--port=a", "--world", &missing],
+        &["convert", &missing, &output],
+        &["convert", "/etc/passwd", &output],
+        &["telegram", "decode", &missing],
+        &["background", "front", "load", &missing],
+        &["background", "front", "load", "/etc/passwd"],
+        &["gateway", "--no-system-config", "--config", &missing],
+    ] {
+        let is_there = arguments.iter().any(|word| word.ends_with("/etc/passwd"));
+        let named = if is_there { "/etc/passwd" } else { &missing };
+        refused(&stage, arguments, 66, "input", &[named]);
+    }
+    // A value in a file that is there.
+    let wrong = stage.file("wrong.toml", "[background]\nmethod = \"magic\"\n");
+    refused(
+        &stage,
+        &["run", "--no-system-config", "--link=a=/x", "--config", &wrong],
+        78,
+        "configuration",
+        &["magic"],
+    );
+}
+
+#[test]
+fn what_is_to_be_written_and_is_there_or_cannot_be() {
+    let stage = Stage::new();
+    let there = stage.file("there.mcap", "whole");
+    let nowhere = stage.word("no/such/directory/out.mcap");
+    let input = concat!(env!("CARGO_MANIFEST_DIR"), "/tests/vectors/recording/v1.mcap");
+    let whole = stage.word("whole.mcap");
+    std::fs::copy(input, &whole).expect("a copy");
+    for (arguments, words) in [
+        (&["convert", input, &there][..], &["there.mcap", "--force"][..]),
+        (&["convert", input, &nowhere], &["no/such"]),
+        (&["convert", &whole, &whole], &["whole.mcap", "both read and written"]),
+        (&["record", "-o", &there], &["there.mcap", "--force"]),
+        (&["record", "-o", &nowhere], &["no/such"]),
+        (&["record", "-o", "/"], &["directory"]),
+        (&["man", "/proc/pages"], &["/proc/pages"]),
+        (&["simulate", "--port=a", "--truth", &nowhere], &["no/such"]),
+        (&["background", "front", "save", &there], &["there.mcap", "--force"]),
+    ] {
+        refused(&stage, arguments, 73, "output", words);
+    }
+    assert_eq!(std::fs::read(stage.path("there.mcap")).unwrap(), b"whole");
+}
+
+#[test]
+fn no_such_sensor_or_hub() {
+    let stage = Stage::new();
+    let golden = concat!(env!("CARGO_MANIFEST_DIR"), "/tests/vectors/recording/v1.mcap");
+    let verbs = [
+        &["echo", "side/scan", "--for=9s"][..],
+        &["echo", "side/*", "--for=9s"],
+        &["hz", "side/scan", "--for=9s"],
+        &["latency", "side/scan", "--for=9s", "--no-realtime"],
+        &["record", "side/scan", "--for=9s", "-o", &stage.word("side.mcap")],
+        &["leds", "side", "--for=9s"],
+        &["zones", "side", "mask", "--for=9s"],
+        &["info", "side"],
+        &["control", "side", "pause"],
+        &["background", "side", "show"],
+        &["background", "side", "save", &stage.word("side.json")],
+    ];
+    let asks = |verb: &[&str], kind: &str| {
+        let outcome = stage.run(&[verb, &["--json"]].concat());
+        let errors = outcome.of_class("error");
+        let told = errors.last().map(|line| line["kind"].clone());
+        assert_eq!((outcome.code, told), (Some(3), Some(kind.into())), "{verb:?}: {outcome}");
+    };
+    for verb in verbs {
+        asks(verb, "no_hub");
+    }
+    asks(&["list"], "no_hub");
+    for verb in [
+        &["replay", golden, "--sensor=side"][..],
+        &["convert", golden, &stage.word("x.bin"), "--sensor=side"],
+    ] {
+        let outcome = stage.run(verb);
+        assert_eq!(outcome.code, Some(3), "{outcome}");
+    }
+    let hub = stage.hub(&["--link=front=/no/such/port"]);
+    for verb in verbs {
+        asks(verb, "no_topic");
+    }
+    assert_eq!(hub.end(TERM).code, Some(0));
 }
 
 #[test]
@@ -193,8 +336,7 @@ fn what_the_hub_does_not_have_and_what_does_not_come() {
     let info = stage.await_info("front", |info| info["state"] == "absent");
     assert!(info["last_error"].as_str().is_some_and(|error| error.contains("no such port")), "{info}");
     for (arguments, kind, words) in [
-        (&["echo", "front/scam", "-n", "1"][..], "no_topic", &["front/scam", "front/scan"][..]),
-        (&["echo", "side/scan", "-n", "1"], "no_topic", &["side", "front"]),
+        (&["echo", "side/scan", "-n", "1"][..], "no_topic", &["side", "front"][..]),
         (&["echo", "side/scan"], "no_topic", &["side", "front"]),
         (&["hz", "side/scan"], "no_topic", &["side", "front"]),
         (&["info", "side"], "no_topic", &["side", "front"]),

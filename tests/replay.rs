@@ -133,6 +133,51 @@ fn lives(stage: &Stage, understood: [u64; 2]) -> String {
     stage.path("lives.mcap").display().to_string()
 }
 
+/// A line that loses six of ten scans, and is silent for two seconds in the middle; the last 300 of 20 s.
+fn lossy(stage: &Stage) -> String {
+    let file = std::fs::File::create(stage.path("lossy.mcap")).expect("a file");
+    let mut writer = Writer::begin(file, "", BTreeMap::new()).expect("is written");
+    let is_lost = |scan: &u64| scan % 10 > 3 || (300..375).contains(scan);
+    for (seq, scan) in (0..750).filter(|scan| !is_lost(scan)).enumerate() {
+        let at = scan * 26_640_000;
+        let seq = seq as u64;
+        let mut header = Header {
+            seq,
+            topic_seq: seq,
+            stamp_first_ns: 1_000_000_000 + at,
+            stamp_last_ns: 1_014_000_000 + at,
+            wall_ns: 1_700_000_000_000_000_000 + at,
+            boot: 7,
+            hub_pid: 1,
+            period_us: 26_640,
+            ..Header::default()
+        };
+        header.set_sent_at(header.stamp_last_ns + 1000);
+        writer.sample("front", Topic::Telegram, &header, &stage::scan(seq as u16)).expect("is written");
+    }
+    writer.finish().expect("is written");
+    stage.path("lossy.mcap").display().to_string()
+}
+
+#[test]
+fn scans_that_are_missing_are_no_silence_of_the_sensor() {
+    let stage = Stage::new();
+    let player = start(&stage, &[&lossy(&stage), "--rate=2", "--set=link.front.mode=0", "--hold"]);
+    stage::until("a rate in the list", || {
+        let listed = stage.run(&["list", "--json"]);
+        assert_eq!(listed.code, Some(0), "{listed}");
+        let rate =
+            listed.lines().into_iter().find(|line| line["topic"] == "scan").map(|line| line["hz"].clone());
+        // Of 37.5 scans a second 15 come, twice as fast.
+        rate.and_then(|rate| rate.as_f64()).is_some_and(|hz| (15.0..60.0).contains(&hz))
+    });
+    stage.await_info("front", |info| info["last_error"] == "the recording is at its end");
+    let outcome = player.end(INT);
+    let said = |word: &str| outcome.errors.lines().filter(|line| line.contains(word)).count();
+    // Once for the pause, and at the end.
+    assert_eq!((said("front: silent"), said("front: streaming")), (2, 2), "{outcome}");
+}
+
 #[test]
 fn what_the_hub_could_not_read_yet_is_no_scan() {
     // One of both lives knew it from the life before.
@@ -168,13 +213,15 @@ fn what_cannot_be_played_is_refused() {
     let log = log(&stage, 3, 100);
     let golden = concat!(env!("CARGO_MANIFEST_DIR"), "/tests/vectors/recording/v1.mcap");
     for (words, code, message) in [
-        (&["/no/such/file"][..], 78, "cannot read recording /no/such/file"),
+        (&["/no/such/file"][..], 66, "cannot read recording /no/such/file"),
         (&[&log, "--start=2s", "--end=1s"], 2, "--end 1s is not after --start 2s"),
         (&[&log, "--end=0s"], 2, "--end 0ns is not after --start 0ns"),
         (&[&log, "--rate=0"], 2, "--rate"),
         (&[&log, "--loop", "--hold"], 2, "--loop"),
-        (&[&log, "--sensor=Front"], 78, "sensor name \"Front\" is not possible"),
-        (&[golden, "--sensor=left"], 78, "has no sensor \"left\""),
+        (&[&log, "--start=201ms"], 2, "which lasts 0.200 s"),
+        (&[&log, "--start=1h", "--hold"], 2, "--start 3600 s is behind the end of "),
+        (&[&log, "--sensor=Front"], 2, "sensor name \"Front\" is not possible"),
+        (&[golden, "--sensor=left"], 3, "has no sensor \"left\""),
     ] {
         let outcome = stage.run(&[&["replay"], words].concat());
         assert_eq!(outcome.code, Some(code), "{outcome}");

@@ -2,7 +2,11 @@
 
 mod stage;
 
-use stage::{Stage, TERM, number};
+use std::io::{Read, Write};
+use std::thread::sleep;
+use std::time::Duration;
+
+use stage::{Stage, TERM, number, open_line, until};
 
 #[test]
 fn a_sensor_with_a_past_tells_it_when_it_is_asked() {
@@ -39,11 +43,36 @@ fn faults_are_named_in_the_truth() {
     let hub = stage.hub(&[stage.link("front")]);
     stage.await_info("front", |info| info["state"] == "streaming");
     for name in ["truncated", "length", "unread"] {
-        stage::until(name, || {
+        until(name, || {
             let text = std::fs::read_to_string(stage.path("truth")).unwrap_or_default();
             text.contains(&format!(r#""fault":"{name}""#))
         });
     }
     assert_eq!(hub.end(TERM).code, Some(0));
     assert_eq!(simulator.end(TERM).code, Some(0));
+}
+
+/// A host that stopped in the middle of a request and finds no answer is told why.
+#[test]
+fn a_request_that_is_dropped_is_said() {
+    let stage = Stage::new();
+    let simulator = stage.simulator(&["front"], &["--seed=3"]);
+    let mut port = open_line(&stage.path("front"), 9_600);
+    // A status request (Telegram listing, 31h), its second half far too late: a machine that stands still meanwhile does
+    // not excuse half a second.
+    port.write_all(&[0x02, 0x00, 0x01]).expect("room");
+    sleep(Duration::from_millis(500));
+    port.write_all(&[0x00, 0x31, 0x15, 0x12]).expect("room");
+    // A whole one, at once: its ACK says that all before it was heard.
+    port.write_all(&[0x02, 0x00, 0x01, 0x00, 0x31, 0x15, 0x12]).expect("room");
+    let mut acknowledge = [0];
+    until("an answer", || port.read(&mut acknowledge).is_ok_and(|len| len > 0));
+    assert_eq!(acknowledge, [0x06]);
+    let outcome = simulator.end(TERM);
+    let said = format!(
+        "{}: a request was dropped: more than 6 ms of silence after 3 of its bytes",
+        stage.word("front")
+    );
+    assert_eq!(outcome.code, Some(0));
+    assert!(outcome.errors.contains(&said), "{outcome}");
 }

@@ -218,6 +218,40 @@ fn values_are_read_as_the_telegrams_tell() {
 }
 
 #[test]
+fn the_telegrams_inside_a_recording_are_decoded() {
+    let golden = concat!(env!("CARGO_MANIFEST_DIR"), "/tests/vectors/recording/v1.mcap");
+    let bytes = std::fs::read(golden).expect("it is there");
+    let output = telegram(&["decode", "--json", golden], &[]);
+    assert_eq!(output.status.code(), Some(0), "{}", text(&output.stderr));
+    let (decoded, summary) = (lines(&output), lines(&output).pop().expect("a summary"));
+    // Every byte is of a telegram: nothing of the framing is taken for one.
+    let inside: u64 = decoded.iter().filter_map(|line| line["length"].as_u64()).sum();
+    assert!(inside > 0 && inside < bytes.len() as u64, "{summary}");
+    assert_eq!((summary["bytes"].as_u64(), summary["other_bytes"].as_u64()), (Some(inside), Some(0)));
+    assert!(
+        summary["broken"] == 0 && summary["cut"] == 0 && summary["telegrams"].as_u64() > Some(0),
+        "{summary}"
+    );
+    assert!(
+        decoded.iter().all(|line| line["kind"] == "telegram" || line["class"] == "summary"),
+        "{decoded:?}"
+    );
+    let chosen = telegram(&["decode", "--json", "--sensor=rear", golden], &[]);
+    assert_eq!(chosen.stdout, output.stdout);
+
+    for (words, input, code, told) in [
+        (&["decode", golden, "--sensor=left"][..], &b""[..], 3, "has no sensor \"left\""),
+        (&["decode", "--sensor=front"], b"", 2, "stdin is none"),
+        (&["decode"], &bytes, 66, "name its file"),
+    ] {
+        let output = telegram(words, input);
+        let errors = text(&output.stderr);
+        assert_eq!(output.status.code(), Some(code), "{words:?}: {errors}");
+        assert!(errors.contains(told), "{words:?}: {errors}");
+    }
+}
+
+#[test]
 fn refusals_have_a_remedy() {
     for (words, code, told) in [
         (&["encode", "variant", "180", "0.25"][..], 78, "180 degrees at 0.5 or 1, 100 degrees at 0.25"),
@@ -235,7 +269,7 @@ fn refusals_have_a_remedy() {
         (&["encode", "write-password"], 78, "pairs of digits"),
         (&["encode", "teach"], 78, "pairs of digits"),
         (&["encode"], 2, "NAME"),
-        (&["decode", "/nowhere/at/all"], 78, "/nowhere/at/all: No such file"),
+        (&["decode", "/nowhere/at/all"], 66, "/nowhere/at/all: No such file"),
         (&["decode", "--mode", "x"], 78, "is no number"),
         (&["decode"], 5, "no telegram in 0 bytes"),
     ] {
@@ -245,6 +279,6 @@ fn refusals_have_a_remedy() {
         assert!(errors.contains(told), "{words:?}: {errors}");
     }
     let garbled = telegram(&["decode", "--json"], b"02 00 0q");
-    assert_eq!(garbled.status.code(), Some(78));
+    assert_eq!(garbled.status.code(), Some(66));
     assert!(lines(&garbled)[0]["message"].as_str().expect("words").contains("line 1: \"0q\" is no byte"));
 }

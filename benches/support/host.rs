@@ -10,20 +10,27 @@ use lms::variant::Baud;
 use super::line::Line;
 use super::{Outcome, clock};
 
-/// Starts the sensor at `port`, which is at `rate`; prints when its stream was promised and when its first scan was
-/// there.
+/// Starts the sensor at `port`, which is at `rate`, as a hub would that knew that; prints when its stream was promised and
+/// when its first scan was there.
 pub(crate) fn start(port: &Path, rate: u32) -> Outcome<()> {
+    stream(port, rate, &[Request::Status], &[Request::Type, Request::Configuration])
+}
+
+/// The same without a question: the least that can be said.
+pub(crate) fn start_blindly(port: &Path, rate: u32) -> Outcome<()> {
+    stream(port, rate, &[], &[])
+}
+
+fn stream(port: &Path, rate: u32, before: &[Request], after: &[Request]) -> Outcome<()> {
     let mut host = Host { line: Line::open(port, rate)?, framer: Framer::default(), rate };
-    host.ask(Request::Status)?;
+    before.iter().try_for_each(|&request| host.ask(request))?;
     if rate != STREAM.rate() {
         host.ask(Request::Baud(STREAM))?;
         host.line.set_rate(STREAM.rate())?;
         host.rate = STREAM.rate();
         clock::rest(clock::now() + SETTLE);
     }
-    for request in [Request::Type, Request::Configuration, Request::Stream] {
-        host.ask(request)?;
-    }
+    after.iter().chain(&[Request::Stream]).try_for_each(|&request| host.ask(request))?;
     println!("streaming {}", clock::now());
     host.hear(lms::measured::MEASURED, clock::now() + PATIENCE)?.then_some(()).ok_or("no scan")?;
     println!("scan {}", clock::now());

@@ -70,6 +70,7 @@ pub(crate) fn play(words: &[&str]) -> Outcome<()> {
         ["stay", domain, sensor, count] => crowd::stay(domain, sensor, count.parse()?),
         ["bare", count, ref ports @ ..] => bare::chain(ports, count.parse()?),
         ["sleeper", number, count] => bare::sleeper(number, count.parse()?),
+        ["host", "blindly", port, rate] => host::start_blindly(port.as_ref(), rate.parse()?),
         ["host", port, rate] => host::start(port.as_ref(), rate.parse()?),
         _ => Err(format!("no part {words:?}").into()),
     }

@@ -14,6 +14,8 @@ pub(crate) struct Account {
     pub(crate) received: u64,
     /// Samples sent meanwhile and not received: missing numbers.
     pub(crate) lost: u64,
+    /// Samples received as they were sent, and when the first of them came.
+    live: Option<(u64, Instant)>,
     /// What the sensor's line took away in the run, where that was watched.
     pub(crate) loss: Loss,
     first: Option<Instant>,
@@ -29,6 +31,7 @@ impl Account {
             topic,
             received: 0,
             lost: 0,
+            live: None,
             loss: Loss::default(),
             first: None,
             last: None,
@@ -37,9 +40,13 @@ impl Account {
         }
     }
 
-    /// A sample came, `missed` before it did not; scans are `period_us` apart.
-    pub(crate) fn count(&mut self, now: Instant, missed: u64, period_us: u32) {
+    /// A sample came, `missed` before it did not; scans are `period_us` apart. One that `is_of_before` was sent before
+    /// anybody waited for it here, and its arrival says nothing of the rate.
+    pub(crate) fn count(&mut self, now: Instant, missed: u64, period_us: u32, is_of_before: bool) {
         self.received += 1;
+        if !is_of_before {
+            self.live.get_or_insert((0, now)).0 += 1;
+        }
         self.lost += missed;
         self.first.get_or_insert(now);
         self.last = Some(now);
@@ -55,10 +62,11 @@ impl Account {
         }
     }
 
-    /// Samples per second between the first and the last, if there were two.
+    /// Samples per second between the first that was received as it was sent and the last, if there were two.
     pub(crate) fn hz(&self) -> Option<f64> {
-        let seconds = self.seconds();
-        (seconds > 0.0).then(|| (self.received - 1) as f64 / seconds)
+        let ((live, first), last) = (self.live?, self.last?);
+        let seconds = (last - first).as_secs_f64();
+        (seconds > 0.0).then(|| (live - 1) as f64 / seconds)
     }
 
     /// The silence since the last sample became too long just now; said once per silence.
@@ -94,7 +102,7 @@ mod tests {
         let start = Instant::now();
         assert!(!account.stale(start + Duration::from_secs(9)));
         for i in 0..5 {
-            account.count(start + Duration::from_millis(500 * i), i, 0);
+            account.count(start + Duration::from_millis(500 * i), i, 0, false);
         }
         assert_eq!(
             (account.received, account.lost, account.seconds(), account.hz()),
@@ -103,5 +111,18 @@ mod tests {
         assert!(!account.stale(start + Duration::from_millis(2900)));
         assert!(account.stale(start + Duration::from_millis(3000)));
         assert!(!account.stale(start + Duration::from_millis(9000)));
+    }
+
+    #[test]
+    fn what_a_topic_keeps_for_late_joiners_has_no_rate() {
+        let mut account = Account::new(Topic::Status);
+        let start = Instant::now();
+        account.count(start, 0, 0, true);
+        account.count(start + Duration::from_micros(2), 0, 0, true);
+        assert_eq!((account.received, account.hz()), (2, None));
+        account.count(start + Duration::from_millis(10), 0, 0, false);
+        assert_eq!((account.received, account.hz()), (3, None));
+        account.count(start + Duration::from_millis(1010), 0, 0, false);
+        assert_eq!((account.received, account.hz()), (4, Some(1.0)));
     }
 }

@@ -12,6 +12,7 @@ use schema::{
 use serde::Serialize;
 
 use crate::control::request;
+use crate::names::as_word;
 use crate::output::{Output, quiet};
 use crate::{file, json, text};
 
@@ -39,23 +40,28 @@ pub enum ModelOrder {
     Freeze,
     /// Learn on.
     Thaw,
-    /// Write it to this file, whole or not at all; to `-` as to stdout.
-    Save(PathBuf),
+    /// Write it to a file, whole or not at all.
+    Save {
+        /// The file; `-` is stdout.
+        file: PathBuf,
+        /// What is there is replaced.
+        force: bool,
+    },
     /// Take this one for it, see [`saved_model`].
     Load(Box<Background>),
 }
 
 /// Does what `options` say and writes a line to `out`.
 ///
-/// [`Kind::Configuration`] if the hub refuses a model; [`Kind::Failed`] if a file cannot be written, or if there is no
-/// model yet to be saved; else as [`control`](crate::control()).
+/// [`Kind::Configuration`] if the hub refuses a model; [`Kind::Output`] if a file is there or cannot be written;
+/// [`Kind::Failed`] if there is no model yet to be saved; else as [`control`](crate::control()).
 pub fn background(
     options: &BackgroundOptions,
     out: &mut dyn Write,
     stop: &AtomicBool,
 ) -> Result<(), Failure> {
     let BackgroundOptions { sensor, order, json, places } = options;
-    check_sensor(sensor)?;
+    as_word(check_sensor(sensor))?;
     let ask = |verb| request(places, &Request::new(sensor, verb), stop);
     let mut output = Output::new(out);
     let taken = |output: &mut Output<'_>, verb: Verb| {
@@ -98,11 +104,20 @@ pub fn background(
                 })
             })
         }
-        ModelOrder::Save(file) => {
+        ModelOrder::Save { file, force } => {
+            check(file, *force)?;
             let Shown { model, .. } = shown(sensor, ask(Verb::Show)?)?;
             save(file, sensor, &model, *json, &mut output)
         }
     }
+}
+
+/// Whether there may be a file made at `path`; what is there may be replaced if `force`.
+fn check(path: &Path, force: bool) -> Result<(), Failure> {
+    if force || path == Path::new(STANDARD) || !path.is_file() {
+        return Ok(());
+    }
+    Err(Failure::new(Kind::Output, format!("{} exists", path.display()), "--force replaces it"))
 }
 
 /// What is shown: a model, and when it was kept for the next hub.
@@ -184,7 +199,8 @@ struct Saved<'a> {
 
 /// The model for `sensor` in `file`, `-` is `input`. It has to be saved from that sensor unless `any_sensor`.
 ///
-/// [`Kind::Configuration`] with place and reason if it cannot be read, is no model, or another sensor's.
+/// [`Kind::Input`] with place and reason if it cannot be read or is no model, [`Kind::Configuration`] if it is another
+/// sensor's.
 pub fn saved_model(
     file: &Path,
     sensor: &str,

@@ -10,6 +10,7 @@ use schema::ipc::{self, ControlClient, Node};
 use schema::{Domain, Failure, Kind, Request, Shown, Verb, check_sensor, holder};
 
 use crate::json;
+use crate::names::as_word;
 use crate::output::{Output, quiet};
 use crate::presence::{GRACE, find};
 
@@ -34,7 +35,7 @@ pub struct ControlOptions {
 /// [`Kind::Interrupted`] if `stop` is set.
 pub fn control(options: &ControlOptions, out: &mut dyn Write, stop: &AtomicBool) -> Result<(), Failure> {
     let ControlOptions { sensor, verb, .. } = options;
-    check_sensor(sensor)?;
+    as_word(check_sensor(sensor))?;
     request(&options.places, &Request::new(sensor, *verb), stop)?;
     let mut output = Output::new(out);
     quiet(if options.json {

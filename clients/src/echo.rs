@@ -10,12 +10,13 @@ use crate::follow::{Bounds, Notice, Sink, follow};
 use crate::names::TopicName;
 use crate::output::{End, Output, quiet};
 use crate::sample::Sample;
+use crate::selection::Selection;
 use crate::{json, text};
 
 /// What `echo` is asked for.
 #[derive(Clone, Debug)]
 pub struct EchoOptions {
-    /// `SENSOR/TOPIC`, at least one; CSV and bytes take exactly one.
+    /// `SENSOR/TOPIC`, `*/TOPIC` or `SENSOR/*`, at least one; CSV and bytes take exactly one.
     pub topics: Vec<String>,
     /// How samples are written.
     pub format: Format,
@@ -42,7 +43,8 @@ pub enum Format {
 /// Writes the samples of topics to `out` as they come; what is no sample to `notes` (stderr) if `out` is not JSON.
 /// Ends when the bounds are reached, `stop` is set, or nobody reads any more.
 ///
-/// [`Kind::Usage`] if the format does not go with the topics, [`Kind::NoTopic`] with what there is,
+/// [`Kind::Usage`] if there is no such topic or the format does not go with the topics, [`Kind::NoTopic`] with the sensors
+/// that there are,
 /// [`Kind::NoHub`] if bounded and there is none at the start, [`Kind::Timeout`], [`Kind::Interrupted`] if bounded and
 /// `stop` came first.
 pub fn echo(
@@ -51,11 +53,11 @@ pub fn echo(
     notes: &mut dyn Write,
     stop: &AtomicBool,
 ) -> Result<(), Failure> {
-    let names: Vec<_> = options.topics.iter().map(|text| TopicName::parse(text)).collect::<Result<_, _>>()?;
-    check(options.format, &names)?;
+    let Selection { named, of_all } = Selection::parse(&options.topics)?;
+    check(options.format, &named, &of_all)?;
     let mut echo =
         Echo { format: options.format, out: Output::new(out), notes: Output::new(notes), columns: None };
-    quiet(follow(&names, &options.places, &options.bounds, stop, &mut echo))
+    quiet(follow(&named, &of_all, &options.places, &options.bounds, stop, &mut echo))
 }
 
 struct Echo<'a> {
@@ -134,10 +136,13 @@ fn csv(line: &mut Vec<u8>, header: &Header, scan: &Scan) -> io::Result<()> {
     })
 }
 
-fn check(format: Format, names: &[TopicName]) -> Result<(), Failure> {
+fn check(format: Format, named: &[TopicName], of_all: &[Topic]) -> Result<(), Failure> {
     let usage = |what: &str| Err(Failure::new(Kind::Usage, what, "for example `scanhub echo front/scan`"));
-    match (format, names) {
-        (_, []) => usage("echo needs a topic"),
+    match (format, named) {
+        (_, []) if of_all.is_empty() => usage("echo needs a topic"),
+        (Format::Csv | Format::Raw, _) if !of_all.is_empty() => {
+            usage("--csv and --raw take one topic of one sensor")
+        }
         (Format::Csv, [one]) if one.topic == Topic::Scan => Ok(()),
         (Format::Csv, _) => usage("--csv takes one topic, and that a scan"),
         (Format::Raw, [_, _, ..]) => usage("--raw takes one topic"),

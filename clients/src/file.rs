@@ -7,32 +7,25 @@ use std::io::{self, Read, Write};
 use std::os::unix::fs::{MetadataExt, fchown};
 use std::path::{Path, PathBuf};
 
-use schema::{Failure, Kind};
+use schema::{Failure, Kind, regular};
 
 /// All of the file at `path`, at most `longest` bytes.
 ///
-/// [`Kind::Configuration`] if it cannot be read or is longer: another one was meant.
+/// [`Kind::Input`] if it cannot be read or is longer: another one was meant.
 pub(crate) fn read(path: &Path, longest: u64) -> Result<Vec<u8>, Failure> {
     let place = path.display().to_string();
-    let mut file = File::open(path).map_err(|error| unreadable(&place, &error))?;
-    read_all(&mut file, &place, longest)
+    regular::read(path, longest).map_err(|error| unreadable(&place, &error))
 }
 
 /// All of `input`, which is at `place`; failures as [`read`].
 pub(crate) fn read_all(input: &mut dyn Read, place: &str, longest: u64) -> Result<Vec<u8>, Failure> {
-    let mut content = Vec::new();
-    input.take(longest + 1).read_to_end(&mut content).map_err(|error| unreadable(place, &error))?;
-    if content.len() as u64 > longest {
-        let message = format!("{place} is longer than {longest} bytes, so it is something else");
-        return Err(Failure::new(Kind::Configuration, message, "look whether it is the right file"));
-    }
-    Ok(content)
+    regular::read_all(input, longest).map_err(|error| unreadable(place, &error))
 }
 
 /// Puts a file of `content` at `path`. Whoever reads meanwhile, and whatever happens, finds the old one or the new one
 /// whole; who may read it stays as it was. What is there and no file, a device or a pipe, is written to.
 ///
-/// [`Kind::Failed`] if it cannot be written; nothing is left then.
+/// [`Kind::Output`] if it cannot be written; nothing is left then.
 pub(crate) fn replace(path: &Path, content: &[u8]) -> Result<(), Failure> {
     // A link stays, and what it points to is replaced.
     let path = fs::canonicalize(path).unwrap_or_else(|_| path.to_owned());
@@ -45,7 +38,7 @@ pub(crate) fn replace(path: &Path, content: &[u8]) -> Result<(), Failure> {
     };
     written.map_err(|error| {
         let hint = "the directory has to be there, writable, and with room";
-        Failure::new(Kind::Failed, format!("cannot write {}: {error}", path.display()), hint)
+        Failure::new(Kind::Output, format!("cannot write {}: {error}", path.display()), hint)
     })
 }
 
@@ -77,5 +70,5 @@ fn beside(path: &Path) -> io::Result<PathBuf> {
 
 fn unreadable(place: &str, error: &io::Error) -> Failure {
     let hint = "it has to be there, and readable for this user";
-    Failure::new(Kind::Configuration, format!("cannot read {place}: {error}"), hint)
+    Failure::new(Kind::Input, format!("cannot read {place}: {error}"), hint)
 }

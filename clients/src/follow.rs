@@ -10,6 +10,7 @@ use std::time::{Duration, Instant};
 use schema::{Domain, Failure, Kind, Status, Topic, is_remote};
 
 use crate::account::Account;
+use crate::clock;
 use crate::names::TopicName;
 use crate::output::End;
 use crate::presence::{GRACE, Who};
@@ -82,21 +83,9 @@ pub(crate) trait Sink {
     fn summary(&mut self, name: &TopicName, account: &Account) -> Result<(), End>;
 }
 
-/// Follows `names` (none: all topics of the hub) in the first live one of `places` until `bounds` or `stop` end it.
+/// Follows `names`, and `topics` of each sensor that a hub has when it comes, in the first live one of `places` until
+/// `bounds` or `stop` end it.
 pub(crate) fn follow(
-    names: &[TopicName],
-    places: &[Domain],
-    bounds: &Bounds,
-    stop: &AtomicBool,
-    sink: &mut dyn Sink,
-) -> Result<(), End> {
-    let topics: &[Topic] = if names.is_empty() { &Topic::ALL } else { &[] };
-    carry(Run::new(names, topics, places, bounds), names, stop, sink)
-}
-
-/// As [`follow`], and beside `names` these `topics` of each sensor that a hub has when it comes.
-#[cfg(any(feature = "record", feature = "tui"))]
-pub(crate) fn follow_topics(
     names: &[TopicName],
     topics: &[Topic],
     places: &[Domain],
@@ -139,11 +128,13 @@ struct Track {
     name: TopicName,
     source: Source,
     account: Account,
+    /// CLOCK_MONOTONIC since when samples are received as they are sent, in ns.
+    since_ns: u64,
 }
 
 impl Track {
     fn new(name: TopicName) -> Track {
-        Track { source: Source::new(&name), account: Account::new(name.topic), name }
+        Track { source: Source::new(&name), account: Account::new(name.topic), name, since_ns: u64::MAX }
     }
 }
 
@@ -246,6 +237,12 @@ impl<'a> Run<'a> {
                 self.tell(sink, Notice::HubBack, |name| is_of(name, who))?;
             }
             self.hub_seen = Some(Instant::now());
+            // What the new one said before anybody looked for it waited for that.
+            let now_ns = clock::now_ns();
+            self.tracks
+                .iter_mut()
+                .filter(|track| track.source.attached())
+                .for_each(|track| track.since_ns = now_ns);
             self.roll.begin(Instant::now());
         }
         self.call_the_roll(sink)
@@ -271,6 +268,7 @@ impl<'a> Run<'a> {
                     }
                     if !was_attached && track.source.attached() {
                         attached = true;
+                        track.since_ns = clock::now_ns();
                         sink.attached(&track.name);
                     }
                     let Some(sample) = received else { break };
@@ -281,7 +279,7 @@ impl<'a> Run<'a> {
                         continue;
                     }
                     let missed = sample.missed();
-                    track.account.count(now, missed, sample.period_us());
+                    track.account.count(now, missed, sample.period_us(), sample.is_of_before(track.since_ns));
                     if missed > 0 {
                         sink.notice(&[&track.name], Notice::Missed(missed))?;
                     }

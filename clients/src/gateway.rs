@@ -39,7 +39,7 @@ use uplink::Uplink;
 pub struct GatewayOptions {
     /// The network interface of the groups; without one nothing goes to groups.
     pub interface: Option<String>,
-    /// `SENSOR/TOPIC` or `*/TOPIC`, with `:every=N` if it is to be thinned; none: all but telegrams, of all sensors.
+    /// `SENSOR/TOPIC`, `*/TOPIC` or `SENSOR/*`, with `:every=N` if it is to be thinned; none: all but telegrams, of all sensors.
     pub topics: Vec<String>,
     /// `HOST:PORT` of those that get copies; a name is asked for again while it runs, as its address may change.
     pub to: Vec<String>,
@@ -60,7 +60,7 @@ pub struct GatewayOptions {
 impl GatewayOptions {
     /// What can be known without a network and without a hub: whether the topics are some, and go with the rest.
     ///
-    /// [`Kind::NoTopic`] with the topics that there are, else [`Kind::Configuration`].
+    /// [`Kind::Usage`] with the topics that there are, else [`Kind::Configuration`].
     pub fn check(&self) -> Result<(), Failure> {
         self.selection().map(drop)
     }
@@ -91,7 +91,7 @@ pub enum GatewayLook {
 /// are left out: whoever does not read delays nothing but the end, and that by a second.
 ///
 /// [`Kind::Configuration`] if there is no such interface, neither an interface nor a host is named, a destination is no host,
-/// or a value is not possible; [`Kind::NoTopic`] if there is no such topic, or the first hub that is met has no
+/// or a value is not possible; [`Kind::Usage`] if there is no such topic; [`Kind::NoTopic`] if the first hub that is met has no
 /// such sensor; [`Kind::Short`] if descriptors or memory are; [`Kind::Interrupted`] if `stop` is set before it is known
 /// where the hosts are.
 pub fn gateway(

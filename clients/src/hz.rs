@@ -5,7 +5,7 @@ use std::io::Write;
 use std::sync::atomic::AtomicBool;
 use std::time::{Duration, Instant};
 
-use schema::{Domain, Failure, Status};
+use schema::{Domain, Failure, Status, Topic};
 use serde::Serialize;
 
 use crate::account::Account;
@@ -13,13 +13,14 @@ use crate::follow::{Bounds, Notice, Sink, follow};
 use crate::names::TopicName;
 use crate::output::{End, Output, quiet};
 use crate::sample::Sample;
+use crate::selection::Selection;
 use crate::window::Window;
-use crate::{json, text};
+use crate::{clock, json, text};
 
 /// What `hz` is asked for.
 #[derive(Clone, Debug)]
 pub struct HzOptions {
-    /// `SENSOR/TOPIC`; none: all topics of the hub.
+    /// `SENSOR/TOPIC`, `*/TOPIC` or `SENSOR/*`; none: all topics of the hub.
     pub topics: Vec<String>,
     /// Objects instead of text.
     pub json: bool,
@@ -39,7 +40,8 @@ pub fn hz(
     notes: &mut dyn Write,
     stop: &AtomicBool,
 ) -> Result<(), Failure> {
-    let names: Vec<_> = options.topics.iter().map(|text| TopicName::parse(text)).collect::<Result<_, _>>()?;
+    let Selection { named, of_all } = Selection::parse(&options.topics)?;
+    let of_all = if options.topics.is_empty() { Topic::ALL.to_vec() } else { of_all };
     let mut hz = Hz {
         json: options.json,
         length: options.window,
@@ -49,7 +51,7 @@ pub fn hz(
         out: Output::new(out),
         notes: Output::new(notes),
     };
-    quiet(follow(&names, &options.places, &options.bounds, stop, &mut hz))
+    quiet(follow(&named, &of_all, &options.places, &options.bounds, stop, &mut hz))
 }
 
 const EVERY: Duration = Duration::from_secs(1);
@@ -57,23 +59,38 @@ const EVERY: Duration = Duration::from_secs(1);
 struct Hz<'a> {
     json: bool,
     length: Duration,
-    windows: Vec<(TopicName, Window)>,
+    windows: Vec<Followed>,
     lines: Vec<LineWindow>,
     next: Instant,
     out: Output<'a>,
     notes: Output<'a>,
 }
 
+/// A topic, and since when of CLOCK_MONOTONIC its samples are received as they are sent, in ns: what it keeps for late
+/// joiners comes before that, and at no rate.
+struct Followed {
+    name: TopicName,
+    since_ns: u64,
+    window: Window,
+}
+
 impl Sink for Hz<'_> {
     fn begin(&mut self, name: &TopicName) {
-        self.windows.push((name.clone(), Window::new(self.length)));
+        let window = Window::new(self.length);
+        self.windows.push(Followed { name: name.clone(), since_ns: u64::MAX, window });
+    }
+
+    fn attached(&mut self, name: &TopicName) {
+        let now_ns = clock::now_ns();
+        self.windows.iter_mut().filter(|it| it.name == *name).for_each(|it| it.since_ns = now_ns);
     }
 
     fn sample(&mut self, name: &TopicName, sample: &Sample) -> Result<(), End> {
         if !sample.is_silence()
-            && let Some((_, window)) = self.windows.iter_mut().find(|(known, _)| known == name)
+            && let Some(followed) = self.windows.iter_mut().find(|followed| followed.name == *name)
+            && !sample.is_of_before(followed.since_ns)
         {
-            window.arrived(Instant::now(), sample.missed());
+            followed.window.arrived(Instant::now(), sample.missed());
         }
         Ok(())
     }
@@ -93,6 +110,9 @@ impl Sink for Hz<'_> {
     }
 
     fn notice(&mut self, names: &[&TopicName], notice: Notice) -> Result<(), End> {
+        if notice == Notice::HubBack {
+            names.iter().for_each(|name| self.attached(name));
+        }
         if self.json {
             return json::notices(&mut self.out, names, notice);
         }
@@ -106,7 +126,7 @@ impl Sink for Hz<'_> {
         while self.next <= now {
             self.next += EVERY;
         }
-        for (name, window) in &mut self.windows {
+        for Followed { name, window, .. } in &mut self.windows {
             window.slide(now);
             let lost = self.lines.iter().find(|line| line.sensor == name.sensor);
             let line = Line::new(name, window, lost);

@@ -4,12 +4,12 @@ use std::io::Write;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
-use schema::{Counter, Domain, Failure, Kind, Pose, Status, ipc};
+use schema::{Counter, Domain, Failure, Kind, Pose, Status, check_followed, ipc};
 
 use crate::clock;
 use crate::follower::Follower;
 use crate::json;
-use crate::names::no_sensor;
+use crate::names::{as_word, no_sensor};
 use crate::output::{Output, quiet, table};
 use crate::presence::{GRACE, find};
 use crate::session::Session;
@@ -30,6 +30,7 @@ pub struct InfoOptions {
 /// [`Kind::NoHub`] within a second if there is none, [`Kind::NoTopic`] with the sensors that there are,
 /// [`Kind::Timeout`] if a sensor's status does not come, [`Kind::Interrupted`] if `stop` is set.
 pub fn info(options: &InfoOptions, out: &mut dyn Write, stop: &AtomicBool) -> Result<(), Failure> {
+    options.sensor.iter().try_for_each(|sensor| as_word(check_followed(sensor)))?;
     let domain = find(&options.places)?;
     let sensors = wanted(options.sensor.as_deref(), &domain)?;
     let now_ns = clock::now().monotonic_ns;

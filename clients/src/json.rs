@@ -266,7 +266,7 @@ pub fn error(failure: &Failure) -> String {
     }
     let line =
         Line { class: "error", kind: failure.kind.name(), message: &failure.message, hint: &failure.hint };
-    serde_json::to_string(&line).unwrap_or_default()
+    schema::json_line(serde_json::to_string(&line).unwrap_or_default())
 }
 
 fn known<T: PartialEq>(value: T, unknown: T) -> Option<T> {

@@ -18,7 +18,7 @@ use crate::account::Account;
 use crate::clock;
 use crate::follow::{Bounds, Notice, Sink, follow};
 use crate::freshness::Freshness;
-use crate::names::TopicName;
+use crate::names::{TopicName, as_word};
 use crate::output::{End, Output, quiet};
 use crate::sample::Sample;
 use crate::{json, text};
@@ -73,7 +73,7 @@ pub fn leds(
     let LedsOptions { sensor, leds, .. } = options;
     let topics = if sensor == ROBOT { &[Topic::Zones][..] } else { &[Topic::Zones, Topic::Marks] };
     if sensor != ROBOT {
-        check_followed(sensor)?;
+        as_word(check_followed(sensor))?;
     }
     let names: Vec<_> = topics.iter().map(|&topic| TopicName { sensor: sensor.clone(), topic }).collect();
     let wanted = wanted(sensor, leds)?;
@@ -89,7 +89,7 @@ pub fn leds(
         notes: Output::new(notes),
     };
     let began = board.take(&options.led_root, &wanted).and_then(|()| board.show(Lamps::UNKNOWN, true));
-    let end = began.and_then(|()| follow(&names, &options.places, &options.bounds, stop, &mut board));
+    let end = began.and_then(|()| follow(&names, &[], &options.places, &options.bounds, stop, &mut board));
     quiet(end.and(board.leave()))
 }
 

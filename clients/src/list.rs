@@ -5,7 +5,7 @@ use std::path::PathBuf;
 use std::sync::atomic::AtomicBool;
 
 use schema::ipc::{self, Node, Payload, PortFactory};
-use schema::{Background, Domain, Failure, Foreground, Marks, Scan, Status, Topic, Zones, publisher};
+use schema::{Background, Domain, Failure, Foreground, Marks, Scan, State, Status, Topic, Zones, publisher};
 use serde::{Serialize, Serializer};
 
 use crate::info::statuses;
@@ -40,7 +40,7 @@ pub fn list(options: &ListOptions, out: &mut dyn Write, stop: &AtomicBool) -> Re
     }
     for (sensor, status) in statuses(&domain, &sensors, stop)? {
         for line in lines.iter_mut().filter(|line| line.sensor == sensor && comes_with_scans(line.topic)) {
-            line.hz = status.as_ref().map(|status| f64::from(status.rate_mhz) / 1000.0);
+            line.hz = status.as_ref().and_then(rate_hz);
         }
     }
     let mut output = Output::new(out);
@@ -86,6 +86,18 @@ pub fn list_domains(bases: &[PathBuf], json: bool, out: &mut dyn Write) -> Resul
     quiet(table(&mut output, &rows))
 }
 
+/// The sensors of the hub at the first live one of `places`, for who wants no failure; never waits.
+pub fn live_sensors(places: &[Domain]) -> Vec<String> {
+    let lives = |domain: &&Domain| matches!(publisher(domain.root()), Ok(Some(_)));
+    places.iter().find(lives).and_then(|domain| ipc::sensors(domain).ok()).unwrap_or_default()
+}
+
+/// As [`live_sensors`], the topics of each as `SENSOR/TOPIC`.
+pub fn live_topics(places: &[Domain]) -> Vec<String> {
+    let of = |sensor: String| Topic::ALL.map(|topic| format!("{sensor}/{}", topic.name()));
+    live_sensors(places).into_iter().flat_map(of).collect()
+}
+
 /// Class `topic`; the rate is the hub's own measurement of the scans, null where it does not say one and for topics that
 /// come at their own time. Marks and foreground are sent while somebody listens.
 #[derive(Serialize)]
@@ -123,6 +135,12 @@ fn line<P: Payload + ?Sized>(node: &Node, sensor: &str) -> Result<Option<Line>, 
         hz: None,
         subscribers: service.dynamic_config().number_of_subscribers(),
     }))
+}
+
+/// The rate of the scans; none yet of a stream that just began, which has not been measured.
+fn rate_hz(status: &Status) -> Option<f64> {
+    let is_unmeasured = status.rate_mhz == 0 && status.state() == Some(State::Streaming);
+    (!is_unmeasured).then(|| f64::from(status.rate_mhz) / 1000.0)
 }
 
 /// Not each second or when there is something new, but scan by scan.

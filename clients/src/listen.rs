@@ -60,7 +60,7 @@ pub struct ListenOptions {
 /// With a domain to publish in no samples are written: what comes is to be followed there, without a copy for each
 /// consumer. Then it takes the place of a listener in the domain, of which there is one.
 ///
-/// [`Kind::NoTopic`] with what there is, [`Kind::Configuration`] if there is no such interface or a name or hub is not possible,
+/// [`Kind::Usage`] with the topics that there are, [`Kind::Configuration`] if there is no such interface or a name or hub is not possible,
 /// [`Kind::DomainHeld`] if another listener publishes in the domain, [`Kind::Short`] if memory for that is, [`Kind::Failed`]
 /// if the port cannot be had, [`Kind::Timeout`], [`Kind::Interrupted`] if bounded and `stop` came first.
 pub fn listen(
@@ -366,7 +366,7 @@ fn topics(names: &[String]) -> Result<Vec<Topic>, Failure> {
     let parse = |name: &String| {
         Topic::parse(name).ok_or_else(|| {
             let hint = format!("there are {}; they are those of all sensors", known.join(", "));
-            Failure::new(Kind::NoTopic, format!("no topic {name:?}"), hint)
+            Failure::new(Kind::Usage, format!("no topic {name:?}"), hint)
         })
     };
     names.iter().map(parse).collect()

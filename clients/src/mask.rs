@@ -12,7 +12,7 @@ use serde::Serialize;
 use crate::account::Account;
 use crate::body::{Body, Mask, SLICES, Sector};
 use crate::follow::{Bounds, Notice, Sink, follow};
-use crate::names::TopicName;
+use crate::names::{TopicName, as_word};
 use crate::output::{End, Output, quiet};
 use crate::sample::Sample;
 use crate::text;
@@ -48,7 +48,7 @@ pub fn mask(
     stop: &AtomicBool,
 ) -> Result<(), Failure> {
     let MaskOptions { sensor, run_for, within_m, .. } = options;
-    check_sensor(sensor)?;
+    as_word(check_sensor(sensor))?;
     if let Some(within_m) = within_m.filter(|metres| !(0.001..=FARTHEST_M).contains(metres)) {
         let message = format!("--within {within_m} is no radius");
         return Err(Failure::new(Kind::Configuration, message, "metres from the robot's centre, at most 65"));
@@ -72,7 +72,7 @@ pub fn mask(
         progress,
         told: 0,
     };
-    quiet(follow(&names, &options.places, &bounds, stop, &mut look))?;
+    quiet(follow(&names, &[], &options.places, &bounds, stop, &mut look))?;
     let (body, within_mm) = look.seen(sensor)?;
     let (scans, mask) = (body.scans(), body.mask());
     let is_violated = look.is_violated();

@@ -16,10 +16,10 @@ pub struct TopicName {
 impl TopicName {
     /// The topic that `text` names, as in `front/scan`; `robot/zones` is the fold over all sensors.
     ///
-    /// [`Kind::NoTopic`] with the topics that there are, [`Kind::Configuration`] if the sensor's name is not possible.
+    /// [`Kind::Usage`] with the topics that there are, or if the sensor's name is not possible.
     pub fn parse(text: &str) -> Result<TopicName, Failure> {
         let unknown = |how: String| {
-            Failure::new(Kind::NoTopic, format!("no topic {text:?}"), format!("{how}{}", topics()))
+            Failure::new(Kind::Usage, format!("no topic {text:?}"), format!("{how}{}", topics()))
         };
         let (sensor, word) =
             text.split_once('/').ok_or_else(|| unknown("write SENSOR/TOPIC, as front/zones; ".into()))?;
@@ -27,10 +27,10 @@ impl TopicName {
         let name = TopicName { sensor: sensor.to_owned(), topic };
         if sensor == ROBOT && topic != Topic::Zones {
             let hint = format!("{ROBOT} stands for all sensors, and only their zones add up: {ROBOT}/zones");
-            return Err(Failure::new(Kind::NoTopic, format!("no topic {text:?}"), hint));
+            return Err(Failure::new(Kind::Usage, format!("no topic {text:?}"), hint));
         }
         if !name.is_robot() {
-            check_followed(sensor)?;
+            as_word(check_followed(sensor))?;
         }
         Ok(name)
     }
@@ -47,13 +47,18 @@ impl fmt::Display for TopicName {
     }
 }
 
+/// What is `checked` is a word of the command line, which cannot be understood if it is not possible: [`Kind::Usage`].
+pub(crate) fn as_word(checked: Result<(), Failure>) -> Result<(), Failure> {
+    checked.map_err(|failure| Failure { kind: Kind::Usage, ..failure })
+}
+
 /// All topics of a sensor.
-fn topics() -> String {
+pub(crate) fn topics() -> String {
     format!("topics are {}", Topic::ALL.map(Topic::name).join(", "))
 }
 
 /// The topic that `word` may have been meant for, if one is near.
-fn nearest(sensor: &str, word: &str) -> String {
+pub(crate) fn nearest(sensor: &str, word: &str) -> String {
     let topic = near(word, Topic::ALL.into_iter().map(Topic::name));
     topic.map_or(String::new(), |topic| format!("did you mean {sensor}/{topic}? "))
 }
@@ -93,7 +98,7 @@ mod tests {
         );
         for bad in ["front", "front/scam", "front/scan/x", ""] {
             let failure = TopicName::parse(bad).unwrap_err();
-            assert_eq!(failure.kind, Kind::NoTopic, "{bad}");
+            assert_eq!(failure.kind, Kind::Usage, "{bad}");
             assert!(failure.hint.contains("topics are telegram, scan, "), "{failure}");
         }
         let hint = |text: &str| TopicName::parse(text).unwrap_err().hint;
@@ -103,9 +108,9 @@ mod tests {
         assert!(TopicName::parse("robot/zones").unwrap().is_robot());
         assert!(!TopicName::parse("front/zones").unwrap().is_robot());
         let failure = TopicName::parse("robot/scan").unwrap_err();
-        assert_eq!(failure.kind, Kind::NoTopic);
+        assert_eq!(failure.kind, Kind::Usage);
         assert!(failure.hint.contains("robot/zones"), "{failure}");
-        assert_eq!(TopicName::parse("Front/scan").unwrap_err().kind, Kind::Configuration);
+        assert_eq!(TopicName::parse("Front/scan").unwrap_err().kind, Kind::Usage);
         let hint = |sensor| no_sensor(sensor, &["front".to_owned(), "rear".to_owned()]).hint;
         assert_eq!(hint("frnt"), "did you mean front? there are front, rear");
         assert_eq!(hint("side"), "there are front, rear");

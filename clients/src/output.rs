@@ -3,7 +3,7 @@
 
 use std::io::{self, ErrorKind, Write};
 
-use schema::{Failure, Kind};
+use schema::{Failure, Kind, escape_json};
 use serde::Serialize;
 
 /// Why a verb ended early.
@@ -50,10 +50,11 @@ impl<'a> Output<'a> {
         Output { out, line: Vec::with_capacity(8192) }
     }
 
-    /// A line of JSON.
+    /// A line of JSON, which a terminal does not obey either.
     pub(crate) fn json(&mut self, value: &impl Serialize) -> Result<(), End> {
         self.line.clear();
         serde_json::to_writer(&mut self.line, value).map_err(io::Error::from)?;
+        escape_json(&mut self.line);
         self.end()
     }
 
@@ -163,8 +164,8 @@ mod tests {
     #[test]
     fn json_says_what_is_there() {
         let mut out = Vec::new();
-        Output::new(&mut out).json(&"\x1b[2J\n").unwrap();
-        assert_eq!(out, b"\"\\u001b[2J\\n\"\n");
+        Output::new(&mut out).json(&"\x1b[2J\n\u{9b}2J").unwrap();
+        assert_eq!(out, b"\"\\u001b[2J\\n\\u009b2J\"\n");
     }
 
     #[cfg(feature = "record")]

@@ -26,7 +26,7 @@ use schema::{Domain, Failure, Header, Kind};
 
 use crate::account::Account;
 use crate::clock;
-use crate::follow::{Bounds, Notice, Sink, follow_topics};
+use crate::follow::{Bounds, Notice, Sink, follow};
 use crate::names::TopicName;
 use crate::output::{End, quiet};
 use crate::sample::Sample;
@@ -88,7 +88,8 @@ pub enum RecordLook {
 /// for. How far it is goes to `out`, and what is no account to `notes` (stderr) if `out` is not JSON; lines for which there
 /// is no room are left out before they delay what is recorded.
 ///
-/// [`Kind::Failed`] if there is no file to be had, or its end cannot be written; [`Kind::Usage`] if stdout is no place for
+/// [`Kind::Output`] if there is no file to be had, [`Kind::Failed`] if its end cannot be written, [`Kind::Short`] if either is for
+/// lack of room; [`Kind::Usage`] if stdout is no place for
 /// it; else as [`echo`](crate::echo()).
 pub fn record(
     options: &RecordOptions,
@@ -124,8 +125,8 @@ pub fn record(
     let writing = writing
         .map_err(|error| Failure::new(Kind::Short, format!("no thread: {error}"), "see `ulimit -u`"))?;
     let (names, topics) = (selection.names(), selection.topics());
-    let end = begun
-        .and_then(|()| follow_topics(&names, &topics, &options.places, &options.bounds, stop, &mut recorder));
+    let end =
+        begun.and_then(|()| follow(&names, &topics, &options.places, &options.bounds, stop, &mut recorder));
     // Whoever went away, the hub or the reader of these lines: what is recorded is kept.
     let stays = recorder.pushed > 0 || !matches!(end, Err(End::Failure(_)));
     let finished = recorder.finish(writing, stays, stop);
@@ -266,7 +267,7 @@ impl Recorder<'_> {
             let missing = self.pushed - account.samples;
             let what =
                 format!("the end of the recording cannot be written: {error}; {missing} samples are missing");
-            return Err(Failure::new(Kind::Failed, what, REPAIR).into());
+            return Err(Failure::new(refusal::kind(&error), what, REPAIR).into());
         }
         told.and_then(|()| account.news.iter().try_for_each(|news| self.report.disk(news)))?;
         if stays { self.report.end(&account, self.left_out) } else { Ok(()) }

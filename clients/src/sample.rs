@@ -90,6 +90,11 @@ impl Sample {
         self.header().map_or(0, |header| header.period_us)
     }
 
+    /// It was said before `since_ns` of CLOCK_MONOTONIC: a topic keeps it for late joiners, or it waited for them.
+    pub(crate) fn is_of_before(&self, since_ns: u64) -> bool {
+        self.header().is_some_and(|header| header.stamp_last_ns < since_ns)
+    }
+
     /// Nobody sent it: it stands for a silence.
     pub(crate) fn is_silence(&self) -> bool {
         self.header().is_none()

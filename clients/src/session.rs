@@ -21,6 +21,8 @@ const MAKE_SURE_EVERY: Duration = Duration::from_secs(1);
 pub(crate) struct Session {
     presence: Presence,
     joined: Option<Joined>,
+    /// A hub came, and it was not yet seen whether its shared memory has the names that were joined.
+    is_unsure: bool,
     number: u32,
     wait: Wait,
     /// For who waits at a descriptor of his own.
@@ -40,6 +42,7 @@ impl Session {
         Session {
             presence: Presence::new(places),
             joined: None,
+            is_unsure: false,
             number: 0,
             wait: Wait::default(),
             readiness: None,
@@ -69,16 +72,27 @@ impl Session {
                 _ => Ok(change),
             };
         };
-        // After all had gone, the next hub's shared memory has other names.
-        let is_elsewhere = |joined: &Joined| {
-            joined.domain != *domain
-                || (change.back.is_some() && !ipc::is_member(&joined.node, domain.root()))
-        };
-        if self.joined.as_ref().is_none_or(is_elsewhere) {
-            let node = ipc::client_node(domain)?;
-            self.joined = Some(Joined { domain: domain.clone(), wakeups: Wakeups::by(self.wait), node });
-            self.number += 1;
+        self.is_unsure |= change.back.is_some();
+        let is_here = self.joined.as_ref().is_some_and(|joined| joined.domain == *domain);
+        if is_here && !self.is_unsure {
+            return Ok(change);
         }
+        // After all had gone, the next hub's shared memory has other names.
+        let is_member = |joined: &Joined| ipc::is_member(&joined.node, domain.root());
+        match self.joined.as_ref().filter(|_| is_here).map(is_member).transpose()? {
+            Some(true) => {}
+            _ => match ipc::client_node(domain) {
+                Ok(node) => {
+                    let (domain, wakeups) = (domain.clone(), Wakeups::by(self.wait));
+                    self.joined = Some(Joined { domain, wakeups, node });
+                    self.number += 1;
+                }
+                // It is just starting or ending: the next look tells.
+                Err(failure) if failure.kind == Kind::NoHub => return Ok(change),
+                Err(failure) => return Err(failure),
+            },
+        }
+        self.is_unsure = false;
         Ok(change)
     }
 

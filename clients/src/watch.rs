@@ -21,8 +21,8 @@ use schema::{Domain, Failure, Kind, Topic, Verb, check_followed, is_remote};
 
 use crate::account::Account;
 use crate::clock;
-use crate::follow::{Bounds, Notice, Sink, follow_topics};
-use crate::names::TopicName;
+use crate::follow::{Bounds, Notice, Sink, follow};
+use crate::names::{TopicName, as_word};
 use crate::output::{End, quiet};
 use crate::sample::Sample;
 use orders::Orders;
@@ -38,6 +38,8 @@ pub struct WatchOptions {
     pub sensors: Vec<String>,
     /// Colours may be used.
     pub colours: bool,
+    /// What stands below the picture beside the keys; empty: nothing.
+    pub note: String,
     /// When it ends by itself; a person ends it at any time.
     pub bounds: Bounds,
     /// Where the domain may be, see [`Domain::candidates`].
@@ -49,7 +51,7 @@ pub struct WatchOptions {
 /// [`Kind::Failed`] if there is no terminal that can be taken over, [`Kind::Interrupted`] if Ctrl-C ends a bounded run;
 /// else as [`echo`](crate::echo()).
 pub fn watch(options: &WatchOptions, out: &mut dyn Write, stop: &AtomicBool) -> Result<(), Failure> {
-    options.sensors.iter().try_for_each(|sensor| check_followed(sensor))?;
+    options.sensors.iter().try_for_each(|sensor| as_word(check_followed(sensor)))?;
     let named = |sensor: &String| TOPICS.map(|topic| TopicName { sensor: sensor.clone(), topic });
     let names: Vec<_> = options.sensors.iter().flat_map(named).collect();
     let end = Screen::new(out).and_then(|screen| {
@@ -57,7 +59,7 @@ pub fn watch(options: &WatchOptions, out: &mut dyn Write, stop: &AtomicBool) -> 
             options,
             scene: Scene::default(),
             held: None,
-            view: View::new(options.colours),
+            view: View { note: options.note.clone(), ..View::new(options.colours) },
             screen,
             orders: Orders::default(),
             work: Work::default(),
@@ -66,7 +68,7 @@ pub fn watch(options: &WatchOptions, out: &mut dyn Write, stop: &AtomicBool) -> 
             news_until: None,
         };
         let topics: &[Topic] = if names.is_empty() { &TOPICS } else { &[] };
-        follow_topics(&names, topics, &options.places, &options.bounds, stop, &mut watcher)
+        follow(&names, topics, &options.places, &options.bounds, stop, &mut watcher)
     });
     quiet(end)
 }

@@ -4,7 +4,7 @@ mod fake;
 
 use std::fs;
 use std::os::unix::fs::{MetadataExt, PermissionsExt, chown};
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::thread::JoinHandle;
@@ -91,6 +91,11 @@ fn ask(place: &Place, sensor: &str, order: ModelOrder, json: bool) -> (Result<()
     (end, String::from_utf8(out).unwrap())
 }
 
+/// To save a model where nothing is yet.
+fn keep(file: &Path) -> ModelOrder {
+    ModelOrder::Save { file: file.to_owned(), force: false }
+}
+
 #[test]
 fn a_model_is_saved_forgotten_and_loaded_again() {
     let place = Place::new();
@@ -103,7 +108,7 @@ fn a_model_is_saved_forgotten_and_loaded_again() {
     };
     assert_eq!(say(ModelOrder::Show), "front: generation 4: 3 of 181 beams known, 1 far, in 10 mm\n");
     let saved = format!("front: 3 of 181 beams saved to {}\n", file.display());
-    assert_eq!(say(ModelOrder::Save(file.clone())), saved);
+    assert_eq!(say(keep(&file)), saved);
     assert_eq!(say(ModelOrder::Freeze), "front: freeze taken\n");
     assert!(say(ModelOrder::Show).ends_with(", frozen\n"));
     assert_eq!(say(ModelOrder::Thaw), "front: thaw taken\n");
@@ -121,10 +126,10 @@ fn a_model_is_saved_forgotten_and_loaded_again() {
             .0
     );
     // What is shown is what a file is.
-    let (_, piped) = ask(&place, "front", ModelOrder::Save("-".into()), false);
+    let (_, piped) = ask(&place, "front", keep(Path::new("-")), false);
     assert_eq!(piped, out);
     assert!(saved_model("-".as_ref(), "front", false, &mut out.as_bytes()).is_ok());
-    let (_, out) = ask(&place, "front", ModelOrder::Save(file.clone()), true);
+    let (_, out) = ask(&place, "front", ModelOrder::Save { file: file.clone(), force: true }, true);
     assert_eq!(
         out,
         format!(
@@ -141,7 +146,7 @@ fn what_does_not_go_with_the_sensor_is_refused() {
     let place = Place::new();
     let _keeper = Keeper::new(&place.domain, Background { count: 361, ..model() });
     let file = place.base.join("model.json");
-    ask(&place, "front", ModelOrder::Save(file.clone()), false).0.unwrap();
+    ask(&place, "front", keep(&file), false).0.unwrap();
 
     let foreign = saved_model(&file, "rear", false, &mut &b""[..]).unwrap_err();
     let message = format!("{} is the background of front, not of rear", file.display());
@@ -157,15 +162,15 @@ fn what_does_not_go_with_the_sensor_is_refused() {
     );
     let unknown = ask(&place, "rear", ModelOrder::Show, false).0.unwrap_err();
     assert_eq!((unknown.kind, unknown.hint.as_str()), (Kind::NoTopic, "there are front"));
-    assert_eq!(ask(&place, "Front", ModelOrder::Show, false).0.unwrap_err().kind, Kind::Configuration);
+    assert_eq!(ask(&place, "Front", ModelOrder::Show, false).0.unwrap_err().kind, Kind::Usage);
 
     let text = fs::read(&file).unwrap();
     fs::write(&file, &text[..text.len() / 2]).unwrap();
     let cut = saved_model(&file, "front", false, &mut &b""[..]).unwrap_err();
-    assert!(cut.kind == Kind::Configuration && cut.message.contains("cut short"), "{cut}");
+    assert!(cut.kind == Kind::Input && cut.message.contains("cut short"), "{cut}");
     for unreadable in ["/dev/zero", "/nowhere/model.json", "/"] {
         let failure = saved_model(unreadable.as_ref(), "front", false, &mut &b""[..]).unwrap_err();
-        assert!(failure.kind == Kind::Configuration && failure.message.contains(unreadable), "{failure}");
+        assert!(failure.kind == Kind::Input && failure.message.contains(unreadable), "{failure}");
     }
 }
 
@@ -173,11 +178,11 @@ fn what_does_not_go_with_the_sensor_is_refused() {
 fn nothing_is_saved_by_halves() {
     let place = Place::new();
     let _keeper = Keeper::new(&place.domain, model());
-    let save = |file: PathBuf| ask(&place, "front", ModelOrder::Save(file), false);
+    let save = |file: PathBuf| ask(&place, "front", ModelOrder::Save { file, force: true }, false);
     for impossible in ["/nowhere/model.json", "/"] {
         let (end, out) = save(impossible.into());
         let failure = end.unwrap_err();
-        assert!(failure.kind == Kind::Failed && failure.message.contains(impossible), "{failure}");
+        assert!(failure.kind == Kind::Output && failure.message.contains(impossible), "{failure}");
         assert_eq!(out, "");
     }
     // A link stays one, a device too, and nothing lies about.
@@ -201,18 +206,33 @@ fn nothing_is_saved_by_halves() {
 }
 
 #[test]
+fn what_is_there_is_replaced_only_if_it_may_be() {
+    let place = Place::new();
+    let _keeper = Keeper::new(&place.domain, model());
+    let file = place.base.join("model.json");
+    let save = |force| ask(&place, "front", ModelOrder::Save { file: file.clone(), force }, false).0;
+    save(false).unwrap();
+    fs::write(&file, "mine").unwrap();
+    let failure = save(false).unwrap_err();
+    assert_eq!((failure.kind, failure.hint.as_str()), (Kind::Output, "--force replaces it"));
+    assert_eq!(fs::read(&file).unwrap(), b"mine");
+    save(true).unwrap();
+    assert!(saved_model(&file, "front", false, &mut &b""[..]).is_ok());
+}
+
+#[test]
 fn a_model_that_knows_nothing_takes_no_others_place() {
     let place = Place::new();
     let _keeper = Keeper::new(&place.domain, model());
     let file = place.base.join("model.json");
     let say = |order| ask(&place, "front", order, false);
-    say(ModelOrder::Save(file.clone())).0.unwrap();
+    say(keep(&file)).0.unwrap();
     say(ModelOrder::Freeze).0.unwrap();
     let (_, out) = say(ModelOrder::Reset);
     let hint = "it is frozen: nothing is learned until `scanhub background front thaw`";
     assert_eq!(out, format!("front: reset taken\n{hint}\n"));
     for to in [file.clone(), "-".into()] {
-        let (end, out) = say(ModelOrder::Save(to));
+        let (end, out) = say(ModelOrder::Save { file: to, force: true });
         let failure = end.unwrap_err();
         assert_eq!(failure.message, "the background of front knows no beam yet");
         assert_eq!((failure.kind, out.as_str()), (Kind::Failed, ""));
@@ -225,7 +245,7 @@ fn before_the_first_scan_there_is_nothing_to_save() {
     let place = Place::new();
     let _keeper = Keeper::new(&place.domain, Background::default());
     let file = place.base.join("model.json");
-    let failure = ask(&place, "front", ModelOrder::Save(file.clone()), false).0.unwrap_err();
+    let failure = ask(&place, "front", keep(&file), false).0.unwrap_err();
     assert_eq!((failure.kind, failure.message.as_str()), (Kind::Failed, "front has no background model yet"));
     assert!(!file.exists());
 }

@@ -205,13 +205,38 @@ fn bounds_that_are_not_met() {
 }
 
 #[test]
+fn all_sensors_and_all_topics() {
+    let place = Place::new();
+    let mut hub = FakeHub::new(&place.domain, &["front", "rear"], 1);
+    let verb = start(&place, &["*/scan", "rear/*"], Format::Json, count(3));
+    for sensor in &hub.sensors {
+        sensor.scan.await_subscribers(1);
+    }
+    hub.sensors[1].telegram.await_subscribers(1);
+    hub.sensors[0].scan(&[1]);
+    hub.sensors[1].scan(&[2]);
+    hub.sensors[1].telegram(&[2, 0x80, 0, 0]);
+    let (end, out, _) = verb.join();
+    assert_eq!(end, Ok(()));
+    for begin in [
+        r#"{"class":"scan","sensor":"front","#,
+        r#"{"class":"scan","sensor":"rear","#,
+        r#"{"class":"telegram","sensor":"rear","#,
+    ] {
+        assert_eq!(out.matches(begin).count(), 1, "{out}");
+    }
+    // One of the front's, all of the rear's, each once.
+    assert_eq!(out.matches(r#"{"class":"summary""#).count(), 1 + 7, "{out}");
+}
+
+#[test]
 fn what_the_hub_does_not_have() {
     let place = Place::new();
     let _hub = FakeHub::new(&place.domain, &["front", "rear"], 1);
     let failure = start(&place, &["left/scan"], Format::Text, Bounds::default()).join().0.unwrap_err();
     assert_eq!((failure.kind, failure.hint.as_str()), (Kind::NoTopic, "there are front, rear"));
     for (topics, format, kind) in [
-        (&["front/zone"][..], Format::Text, Kind::NoTopic),
+        (&["front/zone"][..], Format::Text, Kind::Usage),
         (&["front/status"], Format::Csv, Kind::Usage),
         (&["front/scan", "rear/scan"], Format::Raw, Kind::Usage),
         (&[], Format::Text, Kind::Usage),

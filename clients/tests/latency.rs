@@ -152,5 +152,5 @@ fn without_a_hub_it_ends_within_a_second() {
     let failure = start(options(&place, &["front/scan"], 1)).join().0.expect_err("no hub");
     assert_eq!(failure.kind, Kind::NoHub);
     let failure = start(options(&place, &["front"], 1)).join().0.expect_err("no topic");
-    assert_eq!(failure.kind, Kind::NoTopic);
+    assert_eq!(failure.kind, Kind::Usage);
 }

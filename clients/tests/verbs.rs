@@ -125,10 +125,18 @@ fn rates_of_all_topics() {
         bounds: Bounds::default(),
         places: place.places(),
     };
+    // Statuses from before anybody followed them wait for whoever comes.
+    hub.front().status(|_| {});
     let verb = Verb::start(move |out, notes, stop| hz(&options, out, notes, stop));
     hub.front().scan.await_subscribers(1);
+    // It follows the state of the line, too.
+    hub.front().status.await_subscribers(2);
+    hub.front().status(|_| {});
+    // From here on they are sent to who is there: after all that was.
+    hub.front().begun_ns = u64::MAX / 2;
     while !verb.out.text().contains(r#""topic":"scan","hz":"#) {
         hub.front().scan(&[1]);
+        hub.serve_history(|| true);
         std::thread::sleep(Duration::from_millis(10));
     }
     verb.stop();
@@ -147,4 +155,9 @@ fn rates_of_all_topics() {
         "{out}"
     );
     assert_eq!(out.lines().filter(|line| line.contains("summary")).count(), 7);
+    let statuses: Vec<_> = out.lines().filter(|line| line.contains(r#""topic":"status""#)).collect();
+    let (summary, lines) = statuses.split_last().unwrap();
+    // What is handed over at once would be hundreds of thousands a second.
+    assert!(lines.iter().all(|line| line.contains(r#""hz":null"#)), "{statuses:?}");
+    assert!(summary.contains(r#""received":2,"#) && summary.contains(r#""hz":null"#), "{statuses:?}");
 }

@@ -31,6 +31,9 @@ enum Order {
     Save {
         /// The file; - is stdout
         file: PathBuf,
+        /// Replace what is there
+        #[arg(short, long)]
+        force: bool,
     },
     /// Take a saved one for it
     Load {
@@ -49,7 +52,7 @@ impl Background {
             Order::Reset => ModelOrder::Reset,
             Order::Freeze => ModelOrder::Freeze,
             Order::Thaw => ModelOrder::Thaw,
-            Order::Save { file } => ModelOrder::Save(file.clone()),
+            Order::Save { file, force } => ModelOrder::Save { file: file.clone(), force: *force },
             Order::Load { file, any_sensor } => {
                 let model = saved_model(file, &self.sensor, *any_sensor, &mut stdin())?;
                 ModelOrder::Load(Box::new(model))

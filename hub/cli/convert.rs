@@ -10,7 +10,7 @@ use recording::convert::{self, ConvertOptions, Converted};
 use schema::Failure;
 use serde::Serialize;
 
-use crate::{line, print};
+use crate::{complain, line, print};
 
 #[derive(Args, Debug)]
 pub(crate) struct Convert {
@@ -55,8 +55,8 @@ impl Convert {
         let is_stdout_taken = self.output == Path::new("-");
         match (json, is_stdout_taken) {
             (true, false) => return print(&line(&Line::of(self, &converted))),
-            (true, true) => tell(&line(&Line::of(self, &converted))),
-            (false, _) => tell(&self.words(&converted)),
+            (true, true) => complain(&line(&Line::of(self, &converted))),
+            (false, _) => complain(&self.words(&converted)),
         }
         Ok(())
     }
@@ -137,11 +137,6 @@ impl<'a> Line<'a> {
 
 fn seconds(ns: u64) -> f64 {
     ns as f64 / 1e9
-}
-
-/// Writes one line to stderr, which may be a terminal that is gone.
-fn tell(words: &str) {
-    let _ = stderr().lock().write_all(format!("{words}\n").as_bytes());
 }
 
 /// What the help says beside the flags.

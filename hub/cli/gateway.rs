@@ -17,7 +17,7 @@ pub(crate) struct Gateway {
     /// hosts have to be named. lo is this machine alone
     #[arg(long, value_name = "NAME")]
     interface: Option<String>,
-    /// What goes out, front/scan or */scan for all sensors; :every=4 behind it keeps the samples of every fourth telegram.
+    /// What goes out, front/scan, */scan for all sensors or front/* for all topics; :every=4 behind it keeps the samples of every fourth telegram.
     /// May be given several times; without it all topics but telegrams, of all sensors
     #[arg(long = "topic", value_name = "SENSOR/TOPIC[:every=N]")]
     topics: Vec<String>,
@@ -43,15 +43,18 @@ pub(crate) struct Gateway {
 
 impl Gateway {
     pub(crate) fn options(&self, everywhere: &Everywhere) -> Result<GatewayOptions, Failure> {
-        self.over(config::Gateway::load(&self.configured.sources())?, everywhere)
+        let options = self.over(config::Gateway::load(&self.configured.sources())?, everywhere)?;
+        if self.topics.is_empty() {
+            // They stand in the configuration.
+            options.check().map_err(of_section)?;
+        }
+        Ok(options)
     }
 
     /// Whether the section in `sources` is one that a gateway takes.
     pub(super) fn check(sources: &Sources, everywhere: &Everywhere) -> Result<(), Failure> {
         let checked = Gateway::default().over(config::Gateway::load(sources)?, everywhere)?.check();
-        checked.map_err(|failure| {
-            Failure::new(Kind::Configuration, format!("section gateway: {}", failure.message), failure.hint)
-        })
+        checked.map_err(of_section)
     }
 
     /// These flags over what is `said` in the section.
@@ -77,6 +80,10 @@ impl Gateway {
             places: everywhere.places()?,
         })
     }
+}
+
+fn of_section(failure: Failure) -> Failure {
+    Failure::new(Kind::Configuration, format!("section gateway: {}", failure.message), failure.hint)
 }
 
 /// How often the configuration wants a background to go out.

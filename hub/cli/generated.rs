@@ -7,8 +7,8 @@ use clap::{Args, ValueEnum};
 use clap_complete::shells;
 use schema::{Failure, Kind};
 
-use super::command;
-use crate::print;
+use super::{command, complete};
+use crate::print_own;
 
 #[derive(Args, Debug)]
 pub(crate) struct Completions {
@@ -33,7 +33,19 @@ impl Completions {
             Shell::Zsh => clap_complete::generate(shells::Zsh, command, NAME, &mut text),
             Shell::Fish => clap_complete::generate(shells::Fish, command, NAME, &mut text),
         }
-        print(String::from_utf8_lossy(&text).trim_end())
+        let text = String::from_utf8_lossy(&text);
+        let text = text.trim_end();
+        // What the definition cannot know is the hub's.
+        match self.shell {
+            Shell::Bash => print_own(&format!("{text}\n{}", complete::BASH.trim_end())),
+            // The script's last lines call what stands before them.
+            Shell::Zsh => {
+                let (head, body) = text.split_once('\n').unwrap_or((text, ""));
+                let body = body.replace(":_default'", ":_scanhub_live'");
+                print_own(&format!("{head}\n{}\n{body}", complete::ZSH.trim_end()))
+            }
+            Shell::Fish => print_own(&format!("{text}\n{}", complete::FISH.trim())),
+        }
     }
 }
 
@@ -45,7 +57,7 @@ pub(crate) struct Man {
 }
 
 impl Man {
-    /// [`Kind::Failed`] if the directory, or stdout, cannot be written to.
+    /// [`Kind::Output`] if the directory cannot be written to, [`Kind::Failed`] if stdout cannot.
     pub(crate) fn run(&self) -> Result<(), Failure> {
         match &self.directory {
             Some(directory) => write_pages(directory),
@@ -53,7 +65,7 @@ impl Man {
                 let mut page = Vec::new();
                 let rendered = clap_mangen::Man::new(command()).render(&mut page);
                 rendered.map_err(|error| Failure::new(Kind::Failed, format!("no page: {error}"), ""))?;
-                print(String::from_utf8_lossy(&page).trim_end())
+                print_own(String::from_utf8_lossy(&page).trim_end())
             }
         }
     }
@@ -64,7 +76,7 @@ fn write_pages(directory: &Path) -> Result<(), Failure> {
         std::fs::create_dir_all(directory).and_then(|()| clap_mangen::generate_to(command(), directory));
     written.map_err(|error: io::Error| {
         let message = format!("{}: {error}", directory.display());
-        Failure::new(Kind::Failed, message, "name a directory that can be written to")
+        Failure::new(Kind::Output, message, "name a directory that can be written to")
     })
 }
 

@@ -11,7 +11,7 @@ use super::{Everywhere, Limits};
 
 #[derive(Args, Debug)]
 pub(crate) struct Record {
-    /// What to record: front/telegram, or */scan for all sensors; without it telegram, marks, zones, foreground and status
+    /// What to record: front/telegram, */scan for all sensors, or front/* for all topics; without it telegram, marks, zones, foreground and status
     /// of all sensors
     #[arg(value_name = "SENSOR/TOPIC")]
     topics: Vec<String>,

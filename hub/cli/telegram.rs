@@ -22,8 +22,11 @@ pub(crate) enum Way {
 
 #[derive(Args, Debug)]
 pub(crate) struct Decode {
-    /// File with the bytes, as they came down a line or as text; - or nothing is stdin
+    /// File with the bytes, as they came down a line or as text, or an MCAP recording; - or nothing is stdin
     file: Option<PathBuf>,
+    /// Of a recording of several sensors the one whose telegrams are meant
+    #[arg(long, value_name = "NAME")]
+    sensor: Option<String>,
     /// Measuring mode of the values, for example 0x01 [default: what the telegrams tell]
     #[arg(long, value_name = "BYTE")]
     mode: Option<String>,
@@ -34,7 +37,8 @@ pub(crate) struct Decode {
 
 impl Decode {
     pub(crate) fn options(&self, json: bool) -> DecodeOptions {
-        DecodeOptions { file: self.file.clone(), mode: self.mode.clone(), all: self.all, json }
+        let Decode { file, sensor, mode, all } = self;
+        DecodeOptions { file: file.clone(), sensor: sensor.clone(), mode: mode.clone(), all: *all, json }
     }
 }
 

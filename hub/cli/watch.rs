@@ -28,6 +28,7 @@ impl Watch {
         Ok(WatchOptions {
             sensors: self.sensors.clone(),
             colours: colours(),
+            note: String::new(),
             bounds: self.limits.bounds(),
             places: everywhere.places()?,
         })

@@ -246,8 +246,10 @@ impl Sensor {
         let unit = line["unit_mm"].as_u64().unwrap_or(1);
         let ranges = line["ranges"].as_array().map(Vec::as_slice).unwrap_or_default();
         self.ranges = ranges.iter().map(|range| range.as_u64().map(|range| range * unit)).collect();
-        let valid = self.ranges.iter().enumerate().filter_map(|(i, range)| Some(((*range)?, i)));
-        let nearest = valid.min();
+        // What is there is seen by two beams side by side; a single one may be noise. Of both the farther one counts.
+        let both = |pair: &[Option<u64>]| Some(pair[0]?.max(pair[1]?));
+        let pairs = self.ranges.windows(2).enumerate();
+        let nearest = pairs.filter_map(|(i, pair)| Some((both(pair)?, i))).min();
         self.nearest_mm = nearest.map(|(mm, _)| mm);
         let angle = |key: &str| line[key].as_f64().unwrap_or_default();
         self.nearest_deg =
@@ -282,3 +284,18 @@ fn processor_time_ns(pid: u32) -> u64 {
 
 /// Command of a measured-value telegram.
 const MEASURED: u64 = 0xB0;
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_single_beam_is_not_the_nearest() {
+        let mut sensor = Sensor::default();
+        let scan = |ranges: Value| serde_json::json!({ "unit_mm": 10, "first_angle_deg": 0.0, "step_deg": 0.5, "ranges": ranges });
+        sensor.take_scan(&scan(serde_json::json!([400, 400, 3, 400, null, 7, null, 120, 110, 300])));
+        assert_eq!((sensor.nearest_mm, sensor.nearest_deg), (Some(1200), 3.5));
+        sensor.take_scan(&scan(serde_json::json!([null, 3, null])));
+        assert_eq!(sensor.nearest_mm, None);
+    }
+}

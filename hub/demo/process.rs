@@ -2,13 +2,14 @@
 
 use std::io::{BufRead, BufReader};
 use std::os::unix::process::CommandExt;
+use std::path::Path;
 use std::process::{Child as Process, ChildStdout, Command, Stdio};
 use std::sync::mpsc::Sender;
 use std::thread;
 use std::time::{Duration, Instant};
 
 use rustix::process::{Pid, Signal, kill_process};
-use schema::{Failure, Kind};
+use schema::{Domain, Failure, Kind};
 
 /// What a child does, with its number.
 #[derive(Debug)]
@@ -27,10 +28,11 @@ pub(crate) struct Child {
 
 impl Child {
     /// Starts this program with `arguments` in `domain`; its lines go to `listener` with its number, what it says of
-    /// errors to `errors`.
+    /// errors to `errors`, what it keeps to `state`.
     pub(crate) fn start(
         arguments: &[String],
-        domain: &str,
+        domain: &Domain,
+        state: &Path,
         listener: Option<(usize, Sender<Line>)>,
         errors: Stdio,
     ) -> Result<Child, Failure> {
@@ -40,9 +42,11 @@ impl Child {
         let program = std::env::current_exe().map_err(failed)?;
         let mut process = Command::new(program)
             .args(arguments)
-            .args(["--domain", domain])
+            .args(["--domain", domain.name(), "--root"])
+            .arg(domain.root().parent().unwrap_or(domain.root()))
             .env("SCANHUB_LOG", std::env::var("SCANHUB_LOG").unwrap_or("error".into()))
             .env(crate::END_WITH_PARENT, "1")
+            .env("STATE_DIRECTORY", state)
             // Ctrl-C is for the demonstration; it ends its children itself, in their order.
             .process_group(0)
             .stdin(Stdio::null())

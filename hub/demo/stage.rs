@@ -3,7 +3,7 @@
 
 use std::fs::{File, OpenOptions};
 use std::io::{self, Write};
-use std::os::unix::fs::OpenOptionsExt;
+use std::os::unix::fs::{DirBuilderExt, OpenOptionsExt};
 use std::path::PathBuf;
 use std::process::Stdio;
 use std::sync::mpsc;
@@ -26,11 +26,20 @@ impl Stage {
     /// `quiet`: what the processes have to say of errors is kept until [`tell_errors`](Self::tell_errors).
     pub(super) fn new(quiet: bool) -> Result<Stage, Failure> {
         let name = format!("demo-{}", std::process::id());
-        let domain = Domain::of_hub(&name, None, &Environment::of_process())?;
+        let environment = Environment::of_process();
+        // Where the user's own place is too long a name for a domain, that of who has none is not.
+        let fallback = Environment { uid: environment.uid, ..Environment::default() };
+        let domain =
+            Domain::of_hub(&name, None, &environment).or_else(|_| Domain::of_hub(&name, None, &fallback))?;
         let directory = std::env::temp_dir().join(format!("scanhub-{name}"));
-        std::fs::create_dir_all(&directory).map_err(|error| {
+        // Not one that is there already: it may be another user's.
+        std::fs::DirBuilder::new().mode(0o700).create(&directory).map_err(|error| {
             let message = format!("cannot make {}: {error}", directory.display());
-            Failure::new(Kind::Failed, message, "set TMPDIR to a directory that this user may write")
+            Failure::new(
+                Kind::Failed,
+                message,
+                "set TMPDIR to a directory that this user may write, or remove what is in the way",
+            )
         })?;
         Ok(Stage { domain, directory, quiet })
     }
@@ -80,7 +89,8 @@ impl Stage {
                 &poses[..],
             ]
             .concat(),
-            self.domain.name(),
+            &self.domain,
+            &self.directory,
             None,
             self.errors(),
         )?;
@@ -95,7 +105,7 @@ impl Stage {
         let start = |(of, sensor): (usize, &&str)| {
             let topics = ["telegram", "scan", "status"].map(|topic| format!("{sensor}/{topic}"));
             let arguments = [&["echo".into(), "--json".into()], &topics[..]].concat();
-            Child::start(&arguments, self.domain.name(), Some((of, lines.clone())), self.errors())
+            Child::start(&arguments, &self.domain, &self.directory, Some((of, lines.clone())), self.errors())
         };
         SENSORS.iter().enumerate().map(start).collect()
     }
@@ -106,7 +116,8 @@ impl Stage {
         let rest = ["--truth".into(), truth, "--seed".into(), seed.to_string(), "--json".into()];
         let world = ["--world".into(), "demo".into()];
         let arguments = [&["simulate".into()], &world[..], &ports[..], &rest[..]].concat();
-        Child::start(&arguments, self.domain.name(), None, self.errors())?.await_ready(SIMULATOR, lines)
+        Child::start(&arguments, &self.domain, &self.directory, None, self.errors())?
+            .await_ready(SIMULATOR, lines)
     }
 }
 

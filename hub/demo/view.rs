@@ -3,19 +3,22 @@
 use std::io::Write;
 use std::time::Duration;
 
+use schema::Domain;
+
 use super::account::{Account, Sensor};
+use super::attach;
 
 /// What was said last.
 pub(crate) struct View {
-    domain: String,
+    attach: String,
     /// Seconds for which there are lines.
     seconds: u64,
 }
 
 impl View {
     /// Of the demonstration in `domain`.
-    pub(crate) fn new(domain: &str) -> Self {
-        View { domain: domain.to_owned(), seconds: 0 }
+    pub(crate) fn new(domain: &Domain) -> Self {
+        View { attach: attach(domain), seconds: 0 }
     }
 
     /// Says once a second how the account is after `elapsed`.
@@ -36,7 +39,7 @@ impl View {
                 seconds % 60,
                 account.hub_cpu_percent
             ),
-            format!("look from another terminal:  scanhub echo front/scan --domain {}", self.domain),
+            self.attach.clone(),
         ];
         for sensor in &account.sensors {
             lines.push(String::new());

@@ -13,11 +13,11 @@ pub enum Kind {
     Failed,
     /// Another hub holds the domain: exit 1.
     DomainHeld,
-    /// Syntax of the command line: exit 2.
+    /// Syntax of the command line, a topic that there is not, or a form that the verb does not take: exit 2.
     Usage,
     /// No hub lives in the domain: exit 3.
     NoHub,
-    /// The hub has no such sensor or topic: exit 3.
+    /// The hub, or the recording, has no such sensor: exit 3.
     NoTopic,
     /// Nothing came within the time allowed: exit 3.
     Timeout,
@@ -33,6 +33,10 @@ pub enum Kind {
     PortRate,
     /// A check failed (telegrams lost, a limit exceeded): exit 5.
     Check,
+    /// A file to read is missing, unreadable, or not what it has to be: exit 66.
+    Input,
+    /// A file to write exists, or cannot be made: exit 73.
+    Output,
     /// Shared memory or descriptors are short, try later: exit 75.
     Short,
     /// A value in the configuration, in `--set` or in `--link`: exit 78.
@@ -57,6 +61,8 @@ impl Kind {
             Kind::PortNotTty => "port_not_tty",
             Kind::PortRate => "port_rate",
             Kind::Check => "check",
+            Kind::Input => "input",
+            Kind::Output => "output",
             Kind::Short => "short",
             Kind::Configuration => "configuration",
             Kind::Interrupted => "interrupted",
@@ -73,6 +79,8 @@ impl Kind {
                 4
             }
             Kind::Check => 5,
+            Kind::Input => 66,
+            Kind::Output => 73,
             Kind::Short => 75,
             Kind::Configuration => 78,
             Kind::Interrupted => 130,

@@ -21,8 +21,8 @@ pub const METADATA: &str = "scanhub";
 /// follows; until then it lies in memory.
 pub struct Writer<W: Write> {
     mcap: mcap::Writer<NoSeek<BufWriter<W>>>,
-    /// Few enough to be looked through.
-    channels: Vec<(String, Topic, u16)>,
+    /// Of each sensor, few enough to be looked through.
+    channels: BTreeMap<String, Vec<(Topic, u16)>>,
     message: Vec<u8>,
 }
 
@@ -48,7 +48,7 @@ impl<W: Write> Writer<W> {
             .chunk_size(None)
             .disable_seeking(true);
         let mcap = options.create(NoSeek::new(BufWriter::new(out))).map_err(io_error)?;
-        let mut writer = Writer { mcap, channels: Vec::new(), message: Vec::with_capacity(4096) };
+        let mut writer = Writer { mcap, channels: BTreeMap::new(), message: Vec::with_capacity(4096) };
         writer.note(METADATA, facts)?;
         writer.close_chunk()?;
         Ok(writer)
@@ -57,14 +57,14 @@ impl<W: Write> Writer<W> {
     /// Writes a sample of `sensor`'s `topic`; `payload` is packed as for a network
     /// ([`Packed`](crate::datagram::Packed)).
     pub fn sample(&mut self, sensor: &str, topic: Topic, header: &Header, payload: &[u8]) -> io::Result<()> {
-        let known = self.channels.iter().find(|(of, its, _)| *its == topic && of == sensor);
+        let known = self.channels.get(sensor).and_then(|its| its.iter().find(|(its, _)| *its == topic));
         let channel = match known {
-            Some(&(_, _, channel)) => channel,
+            Some(&(_, channel)) => channel,
             None => {
                 let name = format!("{sensor}/{}", topic.name());
                 let schema = (schema(topic), LAYOUT, ENCODING);
                 let channel = self.channel(&Foreign { topic: &name, encoding: ENCODING, schema })?;
-                self.channels.push((sensor.to_owned(), topic, channel));
+                self.channels.entry(sensor.to_owned()).or_default().push((topic, channel));
                 channel
             }
         };

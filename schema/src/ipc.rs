@@ -235,9 +235,9 @@ fn node(domain: &Domain, cleanup: bool) -> Result<Node, Failure> {
         None
     };
     let no_names = || {
-        let hint = "restart the hub: it is of another version, or what is in that directory was removed";
+        let hint = "its hub is just starting or ending, or is of another version";
         Failure::new(
-            Kind::Failed,
+            Kind::NoHub,
             format!("{} does not tell how shared memory is named", root.display()),
             hint,
         )
@@ -258,8 +258,13 @@ fn node(domain: &Domain, cleanup: bool) -> Result<Node, Failure> {
 }
 
 /// The names of shared memory of the domain in `root` are those that `node` has; they are others after all have gone.
-pub fn is_member(node: &Node, root: &Path) -> bool {
-    matches!(prefix::of(root), Ok(Some(prefix)) if node.config().global.prefix.as_bytes() == prefix.as_bytes())
+///
+/// # Errors
+///
+/// As [`client_node`].
+pub fn is_member(node: &Node, root: &Path) -> Result<bool, Failure> {
+    let prefix = prefix::of(root)?;
+    Ok(prefix.is_some_and(|prefix| node.config().global.prefix.as_bytes() == prefix.as_bytes()))
 }
 
 /// Where nobody is left in the domain in `root`: the next hub has other names, which nobody can have seen.

@@ -32,6 +32,8 @@ pub mod limits;
 mod lock;
 #[cfg(feature = "ipc")]
 mod prefix;
+#[cfg(feature = "files")]
+pub mod regular;
 #[cfg(feature = "json")]
 mod saved;
 #[cfg(feature = "ipc")]
@@ -48,7 +50,7 @@ pub use foreground::{Foreground, SEGMENTS, Segment};
 pub use header::{Flags, Header, Quality, Reasons};
 pub use marks::{MARKS, Mark, Marks};
 pub use pose::Pose;
-pub use printable::Printable;
+pub use printable::{Printable, escape_json, json_line};
 pub use scan::{BEAMS, CONTENTS_UPPER, Code, Scan, TURN_NS};
 pub use status::{COUNTERS, Counter, Counters, State, Status};
 pub use telegram::Telegram;

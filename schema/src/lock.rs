@@ -48,19 +48,24 @@ impl ListenLock {
 #[derive(Debug)]
 struct Publishing {
     root: PathBuf,
+    name: &'static str,
     _held: Held,
 }
 
 impl Publishing {
-    fn acquire(root: &Path, name: &str, who: &str) -> Result<Publishing, Failure> {
-        Ok(Publishing { _held: Held::acquire(root, name, who)?, root: root.to_owned() })
+    fn acquire(root: &Path, name: &'static str, who: &str) -> Result<Publishing, Failure> {
+        Ok(Publishing { _held: Held::acquire(root, name, who)?, root: root.to_owned(), name })
     }
 }
 
 impl Drop for Publishing {
     /// The last one out takes the names along, while it still has the lock: the next hub has others.
     fn drop(&mut self) {
-        ipc::forget_names(&self.root);
+        let other = if self.name == HUB { LISTENER } else { HUB };
+        // Whoever holds the other lock has the names, or is about to join under them.
+        if let Ok(None) = holder_of(&self.root, other) {
+            ipc::forget_names(&self.root);
+        }
     }
 }
 
@@ -145,7 +150,11 @@ fn holder_of(root: &Path, name: &str) -> Result<Option<u32>, Failure> {
     let mut lock = whole_file(libc::F_RDLCK);
     fcntl(file.as_raw_fd(), FcntlArg::F_OFD_GETLK(&mut lock))
         .map_err(|error| unusable(root, &error.into()))?;
-    if lock.l_type == libc::F_UNLCK as libc::c_short { Ok(None) } else { Ok(Some(pid_in(&file))) }
+    if lock.l_type == libc::F_UNLCK as libc::c_short {
+        return Ok(None);
+    }
+    // Whoever is just starting or ending has the lock, and an earlier one's process id may stand in it.
+    Ok(Some(if prefix::of(root)?.is_some() { pid_in(&file) } else { 0 }))
 }
 
 const HUB: &str = "hub.lock";

@@ -1,5 +1,5 @@
 //! Text of whatever origin for a terminal: names and errors may come from another machine, and must not move its cursor
-//! or change its colours. Refuses to know what is text of ours.
+//! or change its colours. Every place that writes lines writes them so. Refuses to know what is text of ours.
 
 use std::fmt::{self, Write};
 
@@ -13,6 +13,33 @@ impl fmt::Display for Printable<'_> {
     }
 }
 
+/// Writes in a line of JSON what JSON leaves as it is and a terminal obeys, DEL and C1, as `\u` and four digits: it says
+/// the same then. C0 is written so anyway.
+pub fn escape_json(line: &mut Vec<u8>) {
+    let code = |at: usize, line: &[u8]| match line[at] {
+        0x7f => Some((1, 0x7f)),
+        0xc2 => line.get(at + 1).filter(|byte| (0x80..0xa0).contains(*byte)).map(|&byte| (2, byte)),
+        _ => None,
+    };
+    let mut at = 0;
+    while at < line.len() {
+        let Some((length, code)) = code(at, line) else {
+            at += 1;
+            continue;
+        };
+        let escaped = format!("\\u{code:04x}");
+        at += escaped.len();
+        line.splice(at - escaped.len()..at - escaped.len() + length, escaped.into_bytes());
+    }
+}
+
+/// `line` of JSON with [`escape_json`].
+pub fn json_line(line: String) -> String {
+    let mut line = line.into_bytes();
+    escape_json(&mut line);
+    String::from_utf8(line).unwrap_or_default()
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -24,5 +51,13 @@ mod tests {
         assert_eq!(Printable(text).to_string(), "é ?[2J??31m??,\n  ok");
         let failure = Failure::new(Kind::Failed, "no \x1b]0;x\x07", "try \u{9d}y");
         assert_eq!(failure.to_string(), "no ?]0;x?\n  try ?y");
+    }
+
+    #[test]
+    fn a_line_of_json_says_the_same_without_control_characters() {
+        let text = "é\u{80}\x1b \u{9f}\x7f\u{a0}\u{9b}\u{9b}°\n";
+        let line = json_line(serde_json::to_string(text).unwrap());
+        assert_eq!(line, "\"é\\u0080\\u001b \\u009f\\u007f\u{a0}\\u009b\\u009b°\\n\"");
+        assert_eq!(serde_json::from_str::<String>(&line).unwrap(), text);
     }
 }

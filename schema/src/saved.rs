@@ -146,7 +146,7 @@ fn read<'a, T: Deserialize<'a>>(text: &'a [u8], place: &str) -> Result<T, Failur
 
 fn broken(place: &str, why: &str) -> Failure {
     let hint = "such a file is made by `scanhub background SENSOR save FILE`";
-    Failure::new(Kind::Configuration, format!("{place} is no background model: {why}"), hint)
+    Failure::new(Kind::Input, format!("{place} is no background model: {why}"), hint)
 }
 
 fn known_ranges<S: Serializer>(ranges: &[u16], serializer: S) -> Result<S::Ok, S::Error> {
@@ -201,7 +201,7 @@ mod tests {
         let empty = Background { count: 361, unit_mm: 1, ..Background::default() };
         let failure = SavedModel::parse(text(&empty).as_bytes(), "m").unwrap_err();
         let expected = "m is no background model: it knows no beam";
-        assert_eq!((failure.kind, failure.message.as_str()), (Kind::Configuration, expected));
+        assert_eq!((failure.kind, failure.message.as_str()), (Kind::Input, expected));
     }
 
     #[test]
@@ -209,7 +209,7 @@ mod tests {
         let whole = text(&model(361));
         for length in 0..whole.len() {
             let failure = SavedModel::parse(&whole.as_bytes()[..length], "/m.json").unwrap_err();
-            assert_eq!(failure.kind, Kind::Configuration);
+            assert_eq!(failure.kind, Kind::Input);
             let why = if length == 0 { "it is empty" } else { "it is cut short" };
             let expected = format!("/m.json is no background model: {why}");
             assert!(failure.message.starts_with(&expected), "{length}: {failure}");

@@ -9,11 +9,12 @@ use std::path::Path;
 
 use rustix::fs::{StatVfs, statvfs};
 use rustix::io::Errno;
+use rustix::param::page_size;
 use rustix::process::{Resource, getrlimit, setrlimit};
 
 use crate::{Failure, Kind};
 
-pub use segments::{allocate, sensor_bytes};
+pub use segments::{allocate, longest_segment, sensor_bytes};
 
 /// Where POSIX shared memory lives on Linux.
 pub const SHARED_MEMORY: &str = "/dev/shm";
@@ -28,11 +29,51 @@ const PORT_DESCRIPTORS: u64 = 8;
 /// Descriptors that a client of the control service takes.
 pub(crate) const CONTROL_DESCRIPTORS: u64 = 24;
 
-/// Refuses to go on where fewer than `needed` bytes of shared memory are free.
+/// Refuses to go on where fewer than `needed` bytes of shared memory are free, or may not be had by this process.
 ///
 /// [`Kind::Short`] with what is free and what is needed.
 pub fn check_memory(needed: u64) -> Result<(), Failure> {
-    check_place(Path::new(SHARED_MEMORY), needed).map_err(|what| memory(&what))
+    check_place(Path::new(SHARED_MEMORY), needed).map_err(|what| memory(&what))?;
+    check_file_size(needed.min(longest_segment()))?;
+    check_address_space(needed)
+}
+
+/// Refuses to go on where this process may not make files of `needed` bytes, which segments are.
+///
+/// [`Kind::Short`] with the limit and what is needed.
+fn check_file_size(needed: u64) -> Result<(), Failure> {
+    let limit = getrlimit(Resource::Fsize).current.unwrap_or(u64::MAX);
+    if limit >= needed {
+        return Ok(());
+    }
+    let what = format!(
+        "files are too short: {} kB at most, a segment of shared memory needs {} kB",
+        limit / 1024,
+        needed.div_ceil(1024)
+    );
+    Err(Failure::new(Kind::Short, what, "raise the limit: `ulimit -f unlimited`, for a service LimitFSIZE"))
+}
+
+/// Refuses to go on where this process may not map `needed` more bytes, and what making them takes: one that cannot be
+/// mapped is left behind by the library.
+///
+/// [`Kind::Short`] with the limit and what is needed.
+pub fn check_address_space(needed: u64) -> Result<(), Failure> {
+    let Some(limit) = getrlimit(Resource::As).current else { return Ok(()) };
+    let taken = std::fs::read_to_string(MAPPED).ok().and_then(|text| text.split(' ').next()?.parse().ok());
+    let free = limit.saturating_sub(taken.unwrap_or(0) * page_size() as u64);
+    let needed = needed + MAKING_BYTES;
+    if free >= needed {
+        return Ok(());
+    }
+    let (free, needed, limit) = (free / 1024, needed.div_ceil(1024), limit / 1024);
+    Err(Failure::new(
+        Kind::Short,
+        format!(
+            "address space is short: {free} kB are free, {needed} kB more needed, the limit is {limit} kB"
+        ),
+        "raise the limit: `ulimit -v`, for a service LimitAS",
+    ))
 }
 
 /// Refuses to go on where fewer than `needed` more descriptors can be opened.
@@ -117,6 +158,12 @@ fn check_place(place: &Path, needed: u64) -> Result<(), String> {
 fn free(stat: &StatVfs) -> u64 {
     if stat.f_blocks == 0 { u64::MAX } else { stat.f_bavail * stat.f_frsize }
 }
+
+/// Address space that making a few segments takes beside them: a heap for a thread, tables, a message about a failure.
+const MAKING_BYTES: u64 = 8 << 20;
+
+/// How many pages the own process has, first of all that are mapped.
+const MAPPED: &str = "/proc/self/statm";
 
 /// The list of the own open descriptors.
 const OPEN: &str = "/proc/self/fd";

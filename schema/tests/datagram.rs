@@ -166,7 +166,7 @@ fn the_page_shows_these_bytes() {
     let sound = vectors.iter().filter(|vector| vector.says["refusal"].is_null());
     assert!(sizes.eq(sound.map(|vector| (vector.file.as_str(), vector.bytes.len()))));
     let example =
-        vector("zones").chunks(16).enumerate().fold(String::from("\n"), |lines, (number, bytes)| {
+        vector("zones").chunks(16).enumerate().fold(String::from("text\n"), |lines, (number, bytes)| {
             let digits: String = bytes.iter().map(|byte| format!("{byte:02x}")).collect();
             format!("{lines}{:2}  {digits}\n", 16 * number)
         });

@@ -10,7 +10,7 @@ use place::Place;
 use rustix::fs::{FileType, Mode};
 use rustix::time::{ClockId, clock_gettime};
 use schema::ipc::{self, Bell, Payload, Waker, sleep_at_bells};
-use schema::{Domain, HubLock, Kind, Scan, Wake};
+use schema::{Domain, HubLock, Kind, ListenLock, Scan, Wake};
 
 #[test]
 fn one_ring_wakes_all_who_sleep_at_a_bell() {
@@ -116,13 +116,16 @@ fn the_last_one_out_takes_the_names_along() {
     let first = prefix().expect("names are there with the lock");
     let hub = ipc::hub_node(&place.domain).unwrap();
     let client = ipc::client_node(&place.domain).unwrap();
-    assert!(ipc::is_member(&client, root));
+    assert_eq!(ipc::is_member(&client, root), Ok(true));
     drop((hub, lock));
     assert_eq!(prefix().as_ref(), Some(&first), "a consumer waits for the next hub");
     let lock = HubLock::acquire(root).unwrap();
     drop(client);
     assert_eq!(files().len(), 1, "the library's counter: {:?}", files());
+    let listener = ListenLock::acquire(root).unwrap();
     drop(lock);
+    assert!(prefix().is_some(), "a listener is about to join");
+    drop(listener);
     assert_eq!((prefix(), files()), (None, Vec::new()));
     let failure = ipc::client_node(&place.domain).unwrap_err();
     assert!(failure.message.contains("does not tell how shared memory is named"), "{failure}");

@@ -63,6 +63,8 @@ struct Desk {
 
 /// Recordings of `front` under these names.
 const RECORDINGS: [&str; 5] = ["walk.mcap", "day-0001.mcap", "cut.mcap", "killed.mcap", "robot.mcap"];
+/// A part of a recording that lasts longer than the one here, and the like of this one.
+const MINUTES: (&str, &str) = ("--start 1m --end 90s", "--start 200ms --end 500ms");
 /// Ports that pages name.
 const PORTS: [&str; 3] = ["/dev/serial/by-id/usb-FTDI...", "/dev/ttyUSB0", "/tmp/lms"];
 
@@ -103,6 +105,7 @@ impl Desk {
             let is_made = line.starts_with("scanhub simulate");
             line.replace(port, &if is_made { "lms".into() } else { self.stage.word("spare") })
         });
+        let typed = typed.replace(MINUTES.0, MINUTES.1);
         let mut shell = Command::new("sh");
         // A single command is the shell's own process, so that what ends it ends that.
         let exec = if commands(line).len() == 1 { "exec " } else { "" };

@@ -49,6 +49,19 @@ impl Line {
         poll(&mut fds, Some(&now)).is_ok() && !fds[0].revents().contains(PollFlags::HUP)
     }
 
+    /// The rate to which the hub has set the line when it says its first request, and the command of that.
+    pub(crate) fn await_request(&self) -> (u32, u8) {
+        let mut said = Vec::new();
+        super::until("a request is said", || {
+            let mut bytes = [0; 16];
+            let len = read(&self.0, &mut bytes).unwrap_or(0);
+            said.extend(&bytes[..len]);
+            said.len() >= REQUEST
+        });
+        let rate = tcgetattr(&self.0).expect("a terminal").output_speed();
+        (rate, said[COMMAND])
+    }
+
     /// Sends all of `bytes`, in the pace of whoever reads them; what the other end says meanwhile is not heard.
     pub(crate) fn send(&self, mut bytes: &[u8]) {
         let give_up_at = Instant::now() + PATIENCE;
@@ -67,6 +80,10 @@ impl Line {
         }
     }
 }
+
+/// Bytes of a request that asks for something, and which of them says what.
+const REQUEST: usize = 7;
+const COMMAND: usize = 4;
 
 /// The host's end of the line at `place`, raw, at `rate`; reads and writes do not block.
 pub(crate) fn open_line(place: &Path, rate: u32) -> std::fs::File {

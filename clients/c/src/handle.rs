@@ -146,6 +146,11 @@ impl Handle {
             return Err(Refusal::Argument("four samples are lent already", "scanhub_release one of them"));
         };
         let held = match self.found.take() {
+            // A verdict is of now: the caller may have waited, and it has no stamp.
+            Some(Held::Robot(found)) => match &mut self.source {
+                Source::Robot(robot) => Held::Robot(Told::new(robot.now()?)),
+                _ => Held::Robot(found),
+            },
             Some(held) => held,
             None => match self.source.try_next()? {
                 Some(held) => held,

@@ -5,6 +5,7 @@ to this user and nobody else can write there; links are followed only above them
 
 from __future__ import annotations
 
+import errno
 import os
 import pwd
 import stat
@@ -35,7 +36,9 @@ class Directory:
         except FileNotFoundError:
             return None
         except OSError as error:
-            raise _planted(path, str(error.strerror)) from None
+            if error.errno != errno.ELOOP:
+                raise
+            raise _planted(path, "is a link") from None
         seen = os.fstat(opened)
         if stat.S_ISREG(seen.st_mode) and seen.st_uid == os.geteuid():
             return opened

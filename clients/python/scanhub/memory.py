@@ -11,9 +11,9 @@ from typing import Any
 
 import iceoryx2 as iox2
 
-from . import layout, trouble
+from . import counter, layout, trouble
 from .directory import directory_of
-from .errors import Held, Short
+from .errors import Held, NoHub, Short
 from .names import Domain, TopicName, of_service
 from .sample import Sample
 
@@ -29,7 +29,9 @@ class Membership:
         self.domain = domain
         self.prefix = _prefix(domain)
         if self.prefix is None:
-            raise trouble.broken(domain, f"{domain.root} does not tell how shared memory is named")
+            what = f"{domain.root} does not tell how shared memory is named"
+            raise NoHub(what, "its hub is just starting or ending, or is of another version")
+        counter.ensure(self.prefix)
         iox2.set_log_level_from_env_or(iox2.LogLevel.Error)
         builder = iox2.NodeBuilder.new().config(_config(domain, self.prefix))
         try:

@@ -37,6 +37,8 @@ class Subscription(Iterator[Any]):
         self._turn = 0
         self._presence = Presence(places)
         self._membership: memory.Membership | None = None
+        self._is_unsure = False
+        """A hub came, and it was not yet seen whether its shared memory has the names that were joined."""
         self._wakeups = memory.Wakeups()
         self._listened: set[str] = set()
         self._opened_at = float("-inf")
@@ -107,10 +109,17 @@ class Subscription(Iterator[Any]):
         """Looks for the hub and for topics that are not there yet; whether something new was opened."""
         gone, back = self._presence.look()
         domain = self._presence.domain
+        self._is_unsure |= back
         joined = self._membership
-        if domain and (joined is None or joined.domain != domain or (back and not joined.is_current())):
+        if domain and (joined is None or joined.domain != domain or (self._is_unsure and not joined.is_current())):
+            try:
+                entered = memory.Membership(domain)
+            except NoHub:
+                # It is just starting or ending.
+                return False
             self._leave()
-            self._membership = memory.Membership(domain)
+            self._membership = entered
+        self._is_unsure &= domain is None
         if self._membership is None and self._presence.denied:
             raise self._presence.denied
         if gone:

@@ -24,6 +24,11 @@ def stamp(sample: scanhub.Sample) -> dict:
     return said
 
 
+def flags(sample: scanhub.Sample) -> dict:
+    order = ("simulated", "replayed", "stamp_estimated", "remote")
+    return {"flags": sorted(sample.flags, key=order.index)} if sample.flags else {}
+
+
 def telegram(sample: scanhub.Telegram) -> dict:
     fields = ("address", "command", "length")
     return {**{name: getattr(sample, name) for name in fields}, "data": sample.data.tobytes().hex()}
@@ -66,7 +71,7 @@ def background(sample: scanhub.Background) -> dict:
 
 def status(sample: scanhub.Status) -> dict:
     names = ("state", "baud", "mode", "type", "unit_mm", "angle_deg", "step_deg", "hz", "port", "since_ns")
-    said = {name: getattr(sample, name) for name in (*names, "counters", "last_error")}
+    said = {name: getattr(sample, name) for name in (*names, "counters", "last_error", "damaged", "lost_on_line")}
     return {**said, "pose": sample.pose._asdict()}
 
 
@@ -83,7 +88,7 @@ def notice(kind: str) -> None:
 domain, root, *topics = sys.argv[1:]
 try:
     for sample in scanhub.subscribe(*topics, domain=domain, root=root, on_notice=notice):
-        line = {**stamp(sample), **globals()[sample.topic](sample)}
+        line = {**stamp(sample), **globals()[sample.topic](sample), **flags(sample)}
         extra = {"missed": sample.missed, "restarted": sample.restarted}
         say({**line, "python": extra})
 except KeyboardInterrupt:

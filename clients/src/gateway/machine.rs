@@ -2,10 +2,12 @@
 
 use std::path::Path;
 
+use schema::regular;
+
 /// A number for this machine: of its own alone, and always the same (machine-id(5), which is not to be handed on as it is).
 /// Nothing where the file at `path` is missing or is no such id.
 pub(super) fn machine(path: &Path) -> Option<u64> {
-    let text = std::fs::read_to_string(path).ok()?;
+    let text = regular::read_text(path, regular::LONGEST).ok()?;
     let id = text.trim_end();
     let is_id = id.len() == 32 && id.bytes().all(|byte| byte.is_ascii_hexdigit());
     is_id.then(|| hash(id))

@@ -2,9 +2,9 @@
 
 use std::num::NonZeroU64;
 
-use schema::{Failure, Kind, Topic, is_remote};
+use schema::{Failure, Kind, ROBOT, Topic, is_remote};
 
-use crate::names::TopicName;
+use crate::selection::Word;
 
 /// The topics that go out.
 #[derive(Clone, Debug)]
@@ -14,27 +14,25 @@ pub(super) struct Selection {
 
 #[derive(Clone, Debug)]
 struct Entry {
-    /// Nothing: all sensors that are not named beside this topic.
-    sensor: Option<String>,
-    topic: Topic,
+    word: Word,
     every: NonZeroU64,
 }
 
 impl Selection {
-    /// What `texts` name: `SENSOR/TOPIC` or `*/TOPIC`, with `:every=N` behind it if the samples are to be thinned. Nothing
+    /// What `texts` name, see [`Word`], with `:every=N` behind it if the samples are to be thinned. Nothing
     /// named is all sensors, and of these telegrams if `bare`, else all other topics.
     ///
-    /// [`Kind::NoTopic`] with the topics that there are; [`Kind::Configuration`] if a name or a number is not possible,
-    /// something is named twice, or is no telegram and `bare`.
+    /// [`Kind::Usage`] with the topics that there are, or if a name or a number is not possible, something is named twice,
+    /// or is no telegram and `bare`.
     pub(super) fn parse(texts: &[String], bare: bool) -> Result<Selection, Failure> {
         let mut entries: Vec<Entry> = Vec::new();
         for text in texts {
             let entry = Entry::parse(text)?;
-            if bare && entry.topic != Topic::Telegram {
+            if bare && entry.word.topic != Some(Topic::Telegram) {
                 let hint = "without --bare all topics can go out";
                 return Err(refuse(text, "is no telegram, and nothing else goes out bare", hint));
             }
-            if entries.iter().any(|other| (&other.sensor, other.topic) == (&entry.sensor, entry.topic)) {
+            if entries.iter().any(|other| other.word == entry.word) {
                 return Err(refuse(text, "is named twice", "name each topic once"));
             }
             entries.push(entry);
@@ -42,21 +40,26 @@ impl Selection {
         if entries.is_empty() {
             let wanted = |topic: &Topic| (*topic == Topic::Telegram) == bare;
             let all = Topic::ALL.into_iter().filter(wanted);
-            entries.extend(all.map(|topic| Entry { sensor: None, topic, every: NonZeroU64::MIN }));
+            entries.extend(all.map(|topic| Entry {
+                word: Word { sensor: None, topic: Some(topic) },
+                every: NonZeroU64::MIN,
+            }));
         }
         Ok(Selection { entries })
     }
 
-    /// Every how manieth sample of this topic goes out, if any do.
+    /// Every how manieth sample of this topic goes out, if any do: what names it closest wins.
     pub(super) fn every(&self, sensor: &str, topic: Topic) -> Option<NonZeroU64> {
-        let of_topic = || self.entries.iter().filter(move |entry| entry.topic == topic);
-        let named = of_topic().find(|entry| entry.sensor.as_deref() == Some(sensor));
-        named.or_else(|| of_topic().find(|entry| entry.sensor.is_none())).map(|entry| entry.every)
+        let word = |sensor: Option<&str>, topic| Word { sensor: sensor.map(str::to_owned), topic };
+        let closest = [(Some(sensor), Some(topic)), (Some(sensor), None), (None, Some(topic)), (None, None)];
+        let find = |wanted: Word| self.entries.iter().find(|entry| entry.word == wanted);
+        closest.into_iter().find_map(|(sensor, topic)| find(word(sensor, topic))).map(|entry| entry.every)
     }
 
     /// The sensors that are named, each once.
     pub(super) fn named(&self) -> Vec<&str> {
-        let mut named: Vec<_> = self.entries.iter().filter_map(|entry| entry.sensor.as_deref()).collect();
+        let mut named: Vec<_> =
+            self.entries.iter().filter_map(|entry| entry.word.sensor.as_deref()).collect();
         named.sort_unstable();
         named.dedup();
         named
@@ -64,7 +67,7 @@ impl Selection {
 
     /// Something goes out of sensors that are not named.
     pub(super) fn wants_all(&self) -> bool {
-        self.entries.iter().any(|entry| entry.sensor.is_none())
+        self.entries.iter().any(|entry| entry.word.sensor.is_none())
     }
 }
 
@@ -77,34 +80,23 @@ impl Entry {
                 (name, every.ok_or_else(|| refuse(text, "cannot be thinned so", EVERY_FORM))?)
             }
         };
-        let (sensor, topic) = match name.strip_prefix("*/") {
-            Some(topic) => (None, Topic::parse(topic).ok_or_else(|| no_topic(name))?),
-            None => {
-                let name = TopicName::parse(name)?;
-                if name.is_robot() {
-                    return Err(refuse(text, "is a fold", "*/zones sends the zones of each sensor"));
-                }
-                if is_remote(&name.sensor) {
-                    let hint = "a gateway sends what the hub of its own machine publishes";
-                    return Err(refuse(text, "is another machine's", hint));
-                }
-                (Some(name.sensor), name.topic)
-            }
-        };
-        if every > NonZeroU64::MIN && matches!(topic, Topic::Background | Topic::Status) {
-            return Err(refuse(text, "is not of each telegram, and cannot be thinned", name));
+        let word = Word::parse(name)?;
+        if word.sensor.as_deref() == Some(ROBOT) {
+            return Err(refuse(text, "is a fold", "*/zones sends the zones of each sensor"));
         }
-        Ok(Entry { sensor, topic, every })
+        if word.sensor.as_deref().is_some_and(is_remote) {
+            let hint = "a gateway sends what the hub of its own machine publishes";
+            return Err(refuse(text, "is another machine's", hint));
+        }
+        if every > NonZeroU64::MIN && matches!(word.topic, None | Some(Topic::Background | Topic::Status)) {
+            return Err(refuse(text, "is not only of each telegram, and cannot be thinned", name));
+        }
+        Ok(Entry { word, every })
     }
 }
 
 fn refuse(text: &str, what: &str, hint: &str) -> Failure {
-    Failure::new(Kind::Configuration, format!("topic {text} {what}"), hint)
-}
-
-fn no_topic(name: &str) -> Failure {
-    let topics = Topic::ALL.map(|topic| format!("*/{}", topic.name()));
-    Failure::new(Kind::NoTopic, format!("no topic {name:?}"), format!("there are {}", topics.join(", ")))
+    Failure::new(Kind::Usage, format!("topic {text} {what}"), hint)
 }
 
 const EVERY_FORM: &str = "front/scan:every=4 keeps the samples of every fourth telegram";
@@ -145,13 +137,20 @@ mod tests {
         );
         assert_eq!((some.named(), some.wants_all()), (vec!["front"], true));
         assert!(!selection(&["front/zones"], false).unwrap().wants_all());
+        let front = selection(&["*/scan:every=8", "front/*", "front/marks:every=2"], false).unwrap();
+        assert_eq!(every(&front, "front", Topic::Scan), Some(1));
+        assert_eq!(every(&front, "front", Topic::Marks), Some(2));
+        assert_eq!(
+            (every(&front, "rear", Topic::Scan), every(&front, "rear", Topic::Marks)),
+            (Some(8), None)
+        );
     }
 
     #[test]
     fn what_cannot_go_out_is_refused() {
         let kind = |texts: &[&str], bare| selection(texts, bare).map(drop).map_err(|failure| failure.kind);
         for bad in ["front", "front/scam", "*", "*/scam", "robot/scan"] {
-            assert_eq!(kind(&[bad], false), Err(Kind::NoTopic), "{bad}");
+            assert_eq!(kind(&[bad], false), Err(Kind::Usage), "{bad}");
         }
         for bad in [
             "Front/scan",
@@ -162,11 +161,13 @@ mod tests {
             "front/scan:4",
             "front/status:every=2",
             "*/background:every=2",
+            "front/*:every=2",
         ] {
-            assert_eq!(kind(&[bad], false), Err(Kind::Configuration), "{bad}");
+            assert_eq!(kind(&[bad], false), Err(Kind::Usage), "{bad}");
         }
-        assert_eq!(kind(&["front/scan", "front/scan:every=2"], false), Err(Kind::Configuration));
-        assert_eq!(kind(&["front/scan"], true), Err(Kind::Configuration));
+        assert_eq!(kind(&["front/scan", "front/scan:every=2"], false), Err(Kind::Usage));
+        assert_eq!(kind(&["front/scan"], true), Err(Kind::Usage));
+        assert_eq!(kind(&["*/*"], true), Err(Kind::Usage));
         assert_eq!(kind(&["front/telegram:every=2"], true), Ok(()));
     }
 }

@@ -9,7 +9,7 @@ use schema::{Failure, Kind};
 
 /// What stands at `path` is no place for a recording, whoever may write there; `force` takes a device all the same.
 ///
-/// [`Kind::Failed`] with what would be one.
+/// [`Kind::Output`] with what would be one.
 pub(super) fn check(path: &Path, force: bool) -> Result<(), Failure> {
     let Ok(place) = fs::metadata(path).map(|place| place.file_type()) else { return Ok(()) };
     let shown = path.display();
@@ -25,7 +25,16 @@ pub(super) fn check(path: &Path, force: bool) -> Result<(), Failure> {
     } else {
         return Ok(());
     };
-    Err(Failure::new(Kind::Failed, format!("cannot record into {shown}: it is a {what}"), hint))
+    Err(Failure::new(Kind::Output, format!("cannot record into {shown}: it is a {what}"), hint))
+}
+
+/// What kind of failure it is that `error` comes of a write: of a disk that is full, or may not be filled any further,
+/// there may be more later.
+pub(super) fn kind(error: &io::Error) -> Kind {
+    match error.kind() {
+        ErrorKind::StorageFull | ErrorKind::QuotaExceeded | ErrorKind::FileTooLarge => Kind::Short,
+        _ => Kind::Failed,
+    }
 }
 
 /// No file could be made at `path`, of a run that `is_split`.
@@ -36,10 +45,15 @@ pub(super) fn failed(path: &Path, is_split: bool, error: &io::Error) -> Failure 
         }
         ErrorKind::AlreadyExists => "--force overwrites it; -o FILE names another one",
         ErrorKind::ResourceBusy => "end that one first, or name another file: -o FILE",
-        ErrorKind::StorageFull => "make room, or name another place: -o FILE",
+        ErrorKind::StorageFull | ErrorKind::QuotaExceeded => "make room, or name another place: -o FILE",
+        ErrorKind::FileTooLarge => "raise the limit: `ulimit -f unlimited`, for a service LimitFSIZE",
         _ => "the directory has to be there and writable; -o FILE names another place",
     };
-    Failure::new(Kind::Failed, format!("cannot record into {}: {error}", path.display()), hint)
+    let kind = match kind(error) {
+        Kind::Failed => Kind::Output,
+        other => other,
+    };
+    Failure::new(kind, format!("cannot record into {}: {error}", path.display()), hint)
 }
 
 /// Who read the recording went away after `samples`. That it goes through a pipe makes it no less a recording: what was to

@@ -4,12 +4,12 @@ use schema::{Failure, Kind, Topic};
 
 use super::queue::Track;
 use crate::names::TopicName;
+use crate::selection;
 
 /// The topics that are kept.
 #[derive(Clone, Debug)]
 pub(super) struct Selection {
-    named: Vec<TopicName>,
-    of_all: Vec<Topic>,
+    chosen: selection::Selection,
     ros2: bool,
 }
 
@@ -17,35 +17,28 @@ pub(super) struct Selection {
 const USUAL: [Topic; 5] = [Topic::Telegram, Topic::Marks, Topic::Zones, Topic::Foreground, Topic::Status];
 
 impl Selection {
-    /// What `texts` name, `SENSOR/TOPIC` or `*/TOPIC`; nothing named: `everything` that there is, or what is usual. With
+    /// What `texts` name, see [`selection::Word`]; nothing named: `everything` that there is, or what is usual. With
     /// `ros2` scans are kept as messages of ROS 2, too.
     ///
-    /// [`Kind::NoTopic`] with the topics that there are; [`Kind::Configuration`] if a name is not possible, or stands for
-    /// no topic.
+    /// [`Kind::Usage`] with the topics that there are, or if a name is not possible or stands for what no hub publishes.
     pub(super) fn parse(texts: &[String], everything: bool, ros2: bool) -> Result<Selection, Failure> {
-        let mut selection = Selection { named: Vec::new(), of_all: Vec::new(), ros2 };
+        let mut chosen = selection::Selection::parse(texts)?;
         if texts.is_empty() {
-            selection.of_all = if everything { Topic::ALL.to_vec() } else { USUAL.to_vec() };
+            chosen.of_all = if everything { Topic::ALL.to_vec() } else { USUAL.to_vec() };
         }
-        for text in texts {
-            match text.strip_prefix("*/") {
-                Some(topic) => selection.of_all.push(Topic::parse(topic).ok_or_else(|| no_topic(text))?),
-                None => selection.named.push(TopicName::parse(text)?),
-            }
-        }
-        if let Some(fold) = selection.named.iter().find(|name| name.is_robot()) {
+        if let Some(fold) = chosen.named.iter().find(|name| name.is_robot()) {
             let hint = "`*/zones` records the zones of each sensor";
-            return Err(Failure::new(Kind::Configuration, format!("{fold} is made by who listens"), hint));
+            return Err(Failure::new(Kind::Usage, format!("{fold} is made by who listens"), hint));
         }
-        Ok(selection)
+        Ok(Selection { chosen, ros2 })
     }
 
     /// The names to follow, each once.
     pub(super) fn names(&self) -> Vec<TopicName> {
         let mut names: Vec<TopicName> = Vec::new();
         let scan = |name: &TopicName| TopicName { topic: Topic::Scan, ..name.clone() };
-        let scans = self.named.iter().filter(|_| self.ros2).map(scan);
-        for name in self.named.iter().cloned().chain(scans) {
+        let scans = self.chosen.named.iter().filter(|_| self.ros2).map(scan);
+        for name in self.chosen.named.iter().cloned().chain(scans) {
             if !names.contains(&name) {
                 names.push(name);
             }
@@ -56,21 +49,17 @@ impl Selection {
     /// The topics to follow of all sensors, in their order.
     pub(super) fn topics(&self) -> Vec<Topic> {
         let is_wanted = |topic: &Topic| {
-            self.of_all.contains(topic) || (self.ros2 && *topic == Topic::Scan && !self.of_all.is_empty())
+            self.chosen.of_all.contains(topic)
+                || (self.ros2 && *topic == Topic::Scan && !self.chosen.of_all.is_empty())
         };
         Topic::ALL.into_iter().filter(is_wanted).collect()
     }
 
     /// As what `name` is kept.
     pub(super) fn track(&self, name: &TopicName) -> Track {
-        let native = self.named.contains(name) || self.of_all.contains(&name.topic);
+        let native = self.chosen.named.contains(name) || self.chosen.of_all.contains(&name.topic);
         Track { name: name.clone(), native, ros2: self.ros2 && name.topic == Topic::Scan }
     }
-}
-
-fn no_topic(text: &str) -> Failure {
-    let topics = Topic::ALL.map(|topic| format!("*/{}", topic.name()));
-    Failure::new(Kind::NoTopic, format!("no topic {text:?}"), format!("there are {}", topics.join(", ")))
 }
 
 #[cfg(test)]
@@ -114,11 +103,9 @@ mod tests {
     #[test]
     fn what_is_no_topic_is_refused() {
         let kind = |text| selection(&[text], false, false).map(drop).map_err(|failure| failure.kind);
-        for bad in ["front", "*/scam", "front/scam", "robot/scan", "*"] {
-            assert_eq!(kind(bad), Err(Kind::NoTopic), "{bad}");
+        for bad in ["front", "*/scam", "front/scam", "robot/scan", "*", "robot/zones", "Front/scan"] {
+            assert_eq!(kind(bad), Err(Kind::Usage), "{bad}");
         }
-        for bad in ["robot/zones", "Front/scan"] {
-            assert_eq!(kind(bad), Err(Kind::Configuration), "{bad}");
-        }
+        assert_eq!(kind("front/*"), Ok(()));
     }
 }

@@ -29,7 +29,11 @@ pub(crate) fn draw(frame: &mut Frame<'_>, scene: &Scene, held: Option<&Scene>, v
     for (row, (number, sensor)) in places.sensors.rows().zip(listed(scene, view, places.sensors.height)) {
         frame.render_widget(line(number, sensor, view, row.width), row);
     }
-    let keys = if view.news.is_empty() { Line::raw(KEYS) } else { Line::raw(view.news.clone()) };
+    let keys = match (view.news.as_str(), view.note.as_str()) {
+        ("", "") => Line::raw(KEYS),
+        ("", note) => Line::raw(format!("{FEW_KEYS}  {note}")),
+        (news, _) => Line::raw(news.to_owned()),
+    };
     frame.render_widget(keys.patch_style(Modifier::DIM), places.keys);
     if view.help {
         help(frame, places.map);
@@ -190,6 +194,7 @@ fn last_row(area: Rect) -> Rect {
     Rect { y: area.bottom() - height, height, ..area }
 }
 
+const FEW_KEYS: &str = "q quit  ? help";
 const KEYS: &str = "q quit  ? help  +- zoom  tab sensor  fbmz layers  space hold";
 
 /// What keys do, and what signs mean; narrow enough for 60 columns, low enough for 16 rows.

@@ -23,6 +23,8 @@ pub(crate) struct View {
     pub(crate) help: bool,
     /// Colours may be used.
     pub(crate) colours: bool,
+    /// What stands below the picture for as long as it does.
+    pub(crate) note: String,
     /// What became of a request, in words; empty if there is nothing new.
     pub(crate) news: String,
 }
@@ -55,6 +57,7 @@ impl View {
             paused: false,
             help: false,
             colours,
+            note: String::new(),
             news: String::new(),
         }
     }

@@ -80,6 +80,8 @@ pub(crate) struct FakeSensor {
     /// Of the headers.
     pub(crate) flags: u16,
     pub(crate) seq: u64,
+    /// CLOCK_MONOTONIC at its first telegram, in ns; without a word long before any consumer.
+    pub(crate) begun_ns: u64,
     /// Of the scans, in us.
     pub(crate) period_us: u32,
 }
@@ -89,8 +91,8 @@ impl FakeSensor {
         Header {
             seq: self.seq,
             topic_seq,
-            stamp_first_ns: 1_000_000_000 + self.seq,
-            stamp_last_ns: 1_010_000_000 + self.seq,
+            stamp_first_ns: self.begun_ns + self.seq,
+            stamp_last_ns: self.begun_ns + 10_000_000 + self.seq,
             wall_ns: 1_700_000_000_000_000_000 + self.seq,
             boot: self.boot,
             period_us: self.period_us,
@@ -183,6 +185,7 @@ impl FakeHub {
             boot,
             flags: 0,
             seq: 0,
+            begun_ns: 1_000_000_000,
             period_us: 26_640,
         };
         FakeHub { sensors: sensors.iter().map(sensor).collect(), _node: node, _lock: lock }

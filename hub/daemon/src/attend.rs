@@ -11,6 +11,7 @@ use schema::{Failure, Flags, Kind, State};
 use crate::clock;
 use crate::config::Source;
 use crate::control::Flow;
+use crate::last_rate::LastRate;
 use crate::link::{LinkThread, Woken};
 use crate::memory::Memory;
 use crate::port::{Port, Refusal};
@@ -44,6 +45,9 @@ impl LinkThread<'_> {
         // On a line that was closed meanwhile it may be another sensor, or the same in another mode.
         let mut known = memory.recall(clock::now()).filter(|_| is_kept);
         self.memory = Some(memory);
+        if let Source::Tty(_) = link.port {
+            self.last_rate = Some(LastRate::open(self.around.state, &link.name, &link.port.name()));
+        }
         // Times in a row that it was there and went without a byte.
         let mut futile = 0;
         loop {
@@ -122,10 +126,14 @@ impl LinkThread<'_> {
         if let Some(known) = known {
             session.recall(known);
         }
+        if let Some(baud) = self.last_rate.as_ref().and_then(LastRate::baud) {
+            session.seek_first(baud);
+        }
         if self.orders.is_paused() {
             session.control(Control::Pause, clock::now());
         }
         let end = self.stream(port, &mut session);
+        self.is_flooded = false;
         self.account.close(&session);
         (session.tally().read > 0, end)
     }

@@ -1,5 +1,5 @@
 //! What is wrong with a link, in words for its status: the session's trouble, a unit that is not the configured one,
-//! consumers that get nothing. Refuses to know when a status goes out.
+//! more bytes than its line can bring, consumers that get nothing. Refuses to know when a status goes out.
 
 use lms::{Session, Trouble};
 
@@ -17,6 +17,13 @@ impl LinkThread<'_> {
     pub(crate) fn trouble(&self, session: &Session) -> String {
         if self.is_doubtful(session) {
             return self.doubt.clone();
+        }
+        if self.is_flooded {
+            return format!(
+                "more comes than a line of {} baud brings, and no more than twice that is read; the serial server has to \
+                 be in raw mode at that rate",
+                self.link.baud.rate()
+            );
         }
         let unit = session.sensor().unit;
         match (session.trouble(), unit, self.link.unit) {
@@ -60,6 +67,13 @@ impl LinkThread<'_> {
         }
         if self.unreached == UNREACHED_LIMIT {
             tracing::warn!("{}: {}", self.link.name, self.unserved());
+        }
+    }
+
+    /// Notices that the port brings more than its line can, or does not any more.
+    pub(crate) fn watch_flood(&mut self, is_flooded: bool) {
+        if std::mem::replace(&mut self.is_flooded, is_flooded) != is_flooded {
+            self.facts = None;
         }
     }
 

@@ -50,8 +50,14 @@ pub fn in_memory<T>(
         Failure::new(schema::Kind::Short, message, "raise `ulimit -n`")
     })?;
     let (service, worked) = (Service::default(), AtomicBool::new(false));
-    let around =
-        Surroundings { stop: &stop, service: &service, root: domain.root(), slot: None, worked: &worked };
+    let around = Surroundings {
+        stop: &stop,
+        service: &service,
+        root: domain.root(),
+        slot: None,
+        state: None,
+        worked: &worked,
+    };
     let mut links = Vec::with_capacity(config.links.len());
     for ((number, link), orders) in config.links.iter().enumerate().zip(orders) {
         let mut topics = Topics::new(&node, &link.name, number as u8, 0)?;

@@ -13,7 +13,7 @@ use schema::{Failure, Kind, check_sensor};
 use serde::Deserialize;
 use toml::Spanned;
 
-use crate::config::{Link, Processing, Source};
+use crate::config::{Link, MAX_LINKS, Processing, Source};
 use crate::origin::Origin;
 use gateway::GatewayLayer;
 use processing::{BackgroundLayer, MarksLayer, PoseLayer, Sections, ZonesLayer};
@@ -184,6 +184,10 @@ fn merge(
         let known = links.iter().position(|draft| draft.name == name);
         let at = match known {
             Some(at) => at,
+            None if may_add && links.len() >= MAX_LINKS => {
+                let what = format!("more than {MAX_LINKS} links: a sample names its sensor in one byte");
+                return Err(origin.refuse(span, what, format!("{MAX_LINKS} links for one hub")));
+            }
             None if may_add => {
                 links.push(Draft {
                     name: name.clone(),

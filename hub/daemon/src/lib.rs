@@ -12,6 +12,7 @@ mod control;
 mod converse;
 pub mod doctor;
 mod in_memory;
+mod last_rate;
 mod layer;
 mod learned;
 mod line_errors;

@@ -11,11 +11,12 @@ use lms::session::Output;
 use lms::variant::{Baud, Unit};
 use lms::{MILLIS, Nanos, Notice, Session, Settings, Trouble};
 use rustix::event::{PollFd, PollFlags, poll};
-use schema::{Failure, Flags, State, Status, Wake};
+use schema::{Failure, Flags, State, StateDirectory, Status, Wake};
 
 use crate::clock;
 use crate::config::{Link, Source};
 use crate::control::{Flow, Orders};
+use crate::last_rate::LastRate;
 use crate::learned::Slot;
 use crate::line_errors::LineErrors;
 use crate::memory::Memory;
@@ -52,8 +53,12 @@ pub(crate) struct LinkThread<'a> {
     line_errors: LineErrors,
     /// What the next hub would like to know; nothing where there will be none.
     pub(crate) memory: Option<Memory>,
+    /// Where the sensor was found the last time; nothing on a line whose rate cannot be changed.
+    pub(crate) last_rate: Option<LastRate>,
     /// Statuses in a row that said that consumers got nothing.
     pub(crate) unreached: u32,
+    /// The port brings more than its line can.
+    pub(crate) is_flooded: bool,
     /// The measuring mode of which was said whether it has marks.
     pub(crate) told_mode: u8,
     /// The sensor, as it turned out to be, sees too little of its circles.
@@ -71,6 +76,8 @@ pub(crate) struct Surroundings<'a> {
     pub(crate) root: &'a Path,
     /// Where what was learned goes, for the next hub; nothing where that is not wanted.
     pub(crate) slot: Option<&'a Slot>,
+    /// What outlives the machine's power; nothing where that is not wanted.
+    pub(crate) state: Option<&'a StateDirectory>,
     /// Set whenever the link finished something.
     pub(crate) worked: &'a AtomicBool,
 }
@@ -112,7 +119,9 @@ impl<'a> LinkThread<'a> {
             refused: Vec::new(),
             line_errors: LineErrors::default(),
             memory: None,
+            last_rate: None,
             unreached: 0,
+            is_flooded: false,
             told_mode: Status::MODE_UNKNOWN,
             is_blind: false,
         }
@@ -146,11 +155,13 @@ impl<'a> LinkThread<'a> {
 
     /// Drives `session` on `tty` until the hub shall end; an error says that the port is gone.
     pub(crate) fn stream(&mut self, port: &Port, session: &mut Session) -> io::Result<()> {
+        let mut allowance = port.allowance(self.link.baud.rate());
         loop {
             let (watch, until) = self.drain(port, session)?;
+            let rest = allowance.as_mut().and_then(|allowance| allowance.rest(clock::now(), until));
             // Also while bytes are left alone the port may go away.
-            let events = if watch { PollFlags::IN } else { PollFlags::empty() };
-            match self.wait(Some((port.as_fd(), events)), until) {
+            let events = if watch && rest.is_none() { PollFlags::IN } else { PollFlags::empty() };
+            match self.wait(Some((port.as_fd(), events)), rest.unwrap_or(until)) {
                 Woken::Stop => return Ok(()),
                 Woken::Order => {
                     self.obey(Flow::Session(session));
@@ -169,9 +180,18 @@ impl<'a> LinkThread<'a> {
             {
                 continue;
             }
-            let len = port.read(session.spare())?;
+            let mut spare = session.spare();
+            if let Some(allowance) = &allowance {
+                let most = spare.len().min(allowance.bytes(clock::now()).max(1));
+                spare = &mut spare[..most];
+            }
+            let len = port.read(spare)?;
             let now = clock::now();
             session.commit(now, len);
+            if let Some(allowance) = &mut allowance {
+                allowance.take(len, now);
+                self.watch_flood(allowance.is_flooded(now));
+            }
             if len == 0 && now >= until {
                 session.handle_timeout(now);
             }
@@ -228,6 +248,7 @@ impl<'a> LinkThread<'a> {
             }
             self.facts = Some(facts);
             self.error = self.trouble(session);
+            self.last_rate.iter_mut().for_each(|last| last.keep(session));
         }
         if changed || clock::now() >= self.next_status.min(self.next_greeting) {
             let error = std::mem::take(&mut self.error);

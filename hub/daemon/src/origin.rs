@@ -3,13 +3,13 @@
 use std::ops::Range;
 use std::path::{Path, PathBuf};
 
-use schema::{Failure, Kind};
+use schema::{Failure, Kind, regular};
 
 /// One source of values with its text.
 #[derive(Clone, Debug)]
 pub(crate) enum Origin {
-    /// A TOML file.
-    File { path: PathBuf, text: String },
+    /// A TOML file, and where its lines begin.
+    File { path: PathBuf, text: String, lines: Vec<usize> },
     /// A flag of the command line, as given, and as TOML.
     Flag { flag: String, text: String },
 }
@@ -17,13 +17,14 @@ pub(crate) enum Origin {
 impl Origin {
     /// Reads a file.
     ///
-    /// [`Kind::Configuration`] if it cannot be read.
+    /// [`Kind::Input`] if it cannot be read.
     pub(crate) fn read(path: &Path) -> Result<Origin, Failure> {
-        let text = std::fs::read_to_string(path).map_err(|error| {
+        let text = regular::read_text(path, regular::LONGEST).map_err(|error| {
             let message = format!("{}: {error}", path.display());
-            Failure::new(Kind::Configuration, message, "name a readable TOML file")
+            Failure::new(Kind::Input, message, "name a readable TOML file")
         })?;
-        Ok(Origin::File { path: path.to_owned(), text })
+        let lines = std::iter::once(0).chain(text.match_indices('\n').map(|(end, _)| end + 1)).collect();
+        Ok(Origin::File { path: path.to_owned(), text, lines })
     }
 
     /// What stands in it, as TOML.
@@ -36,10 +37,10 @@ impl Origin {
     /// The place of `span` in this source: `FILE:LINE:COLUMN`, or the flag.
     pub(crate) fn place(&self, span: Option<Range<usize>>) -> String {
         match (self, span) {
-            (Origin::File { path, text }, Some(span)) => {
-                let before = &text[..span.start.min(text.len())];
-                let line = before.matches('\n').count() + 1;
-                let column = before.chars().rev().take_while(|&c| c != '\n').count() + 1;
+            (Origin::File { path, text, lines }, Some(span)) => {
+                let at = span.start.min(text.len());
+                let line = lines.partition_point(|&begin| begin <= at);
+                let column = text[lines[line - 1]..at].chars().count() + 1;
                 format!("{}:{line}:{column}", path.display())
             }
             (Origin::File { path, .. }, None) => path.display().to_string(),

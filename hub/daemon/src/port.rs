@@ -1,6 +1,7 @@
 //! Where a link's bytes come from: a serial line, here or behind a serial server. Above this file nobody knows how it is
 //! opened, and what may go wrong then.
 
+mod allowance;
 mod candidates;
 mod holder;
 mod kernel;
@@ -15,7 +16,9 @@ use std::sync::atomic::AtomicBool;
 
 use schema::Failure;
 
+use crate::clock;
 use crate::config::Source;
+pub(crate) use allowance::Allowance;
 #[cfg(test)]
 pub(crate) use candidates::found_in;
 pub use candidates::{Candidate, candidates};
@@ -118,6 +121,14 @@ impl Port {
         match self {
             Port::Tty(tty) => tty.waiting(),
             Port::Tcp(_) => None,
+        }
+    }
+
+    /// How much may be read of it: of a serial line, which has a rate, all that there is.
+    pub(crate) fn allowance(&self, baud: u32) -> Option<Allowance> {
+        match self {
+            Port::Tty(_) => None,
+            Port::Tcp(_) => Some(Allowance::new(baud, clock::now())),
         }
     }
 

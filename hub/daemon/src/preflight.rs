@@ -11,10 +11,11 @@ pub(crate) fn raise_descriptor_limit() {
     }
 }
 
-/// Whether /dev/shm has room for `links` links and the first consumers.
+/// Whether /dev/shm has room for `links` links and the first consumers, and the process may map it beside its threads.
 ///
 /// [`Kind::Short`](schema::Kind) with what is free and what is needed.
 pub(crate) fn check_memory(links: usize) -> Result<(), Failure> {
+    shortage::check_address_space(needed(links) + links as u64 * THREAD)?;
     shortage::check_memory(needed(links))
 }
 
@@ -39,6 +40,8 @@ pub(crate) fn needed_descriptors(links: usize) -> u64 {
 const BASE_DESCRIPTORS: u64 = 24;
 /// Descriptors of a link: four for each of its eight services, its port, and a first consumer.
 const LINK_DESCRIPTORS: u64 = 38;
+/// Address space of a link's thread: its stack, its heap, and what it maps beside its segments.
+const THREAD: u64 = 4 << 20;
 /// The control service, what belongs to no link, and the first consumers.
 const REST: u64 = 512 * 1024;
 

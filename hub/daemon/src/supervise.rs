@@ -87,13 +87,13 @@ pub(crate) fn serve(
     preflight::raise_descriptor_limit();
     let signals = Signals::of_process()?;
     let _lock = HubLock::acquire(domain.root())?;
-    // What was learned of sensors is no recording's.
+    // What is known of sensors is no recording's.
     let state = StateDirectory::of_domain(domain.name()).filter(|_| troupe.is_none());
+    preflight::check_descriptors(config.links.len())?;
+    preflight::check_memory(config.links.len())?;
     // Ends after the links: it writes what they had learned last.
     let (config, keeper) = learned::begin(config, state.as_ref())?;
     let config = &config;
-    preflight::check_descriptors(config.links.len())?;
-    preflight::check_memory(config.links.len())?;
     let node = ipc::hub_node(domain)?;
     node.try_cleanup_dead_nodes();
     let ready =
@@ -117,8 +117,8 @@ pub(crate) fn serve(
         for ((number, link), orders) in config.links.iter().enumerate().zip(orders) {
             let (node, report) = (&node, report.clone());
             let slot = keeper.as_ref().and_then(|keeper| keeper.slot(&link.name));
-            let (root, worked) = (domain.root(), &worked[number]);
-            let around = Surroundings { stop: &stop, service: &service, root, slot, worked };
+            let (root, state, worked) = (domain.root(), state.as_ref(), &worked[number]);
+            let around = Surroundings { stop: &stop, service: &service, root, slot, state, worked };
             let cast = player
                 .zip(parts.next())
                 .map(|(player, recorded)| Cast { recorded, seat: Seat { player, number } });

@@ -6,6 +6,7 @@ mod encode;
 mod find;
 mod input;
 mod show;
+mod unpack;
 
 pub use encode::{EncodeOptions, encode, names};
 
@@ -25,6 +26,8 @@ use show::{Form, Show};
 pub struct DecodeOptions {
     /// The file to read; `None` or `-` is stdin.
     pub file: Option<PathBuf>,
+    /// Of a recording of several sensors the one whose telegrams are meant.
+    pub sensor: Option<String>,
     /// The measuring mode, as `0x01` or `1`; without it the one that the telegrams tell is taken.
     pub mode: Option<String>,
     /// Every value instead of a summary.
@@ -33,17 +36,27 @@ pub struct DecodeOptions {
     pub json: bool,
 }
 
-/// Explains all telegrams in a stream of bytes or in hexadecimal text, and accounts for the bytes between them.
+/// Explains all telegrams in a stream of bytes, in hexadecimal text or inside an MCAP recording, and accounts for the bytes
+/// between them. Bytes of a recording are those of its telegrams, one after the other.
 ///
-/// [`Kind::Check`] if there is no telegram in it, [`Kind::Configuration`] if it cannot be read.
+/// [`Kind::Check`] if there is no telegram in it, [`Kind::Input`] if it cannot be read; [`Kind::NoTopic`] and
+/// [`Kind::Usage`] if it has no such sensor, or several and none is chosen.
 pub fn decode(options: &DecodeOptions, out: &mut dyn Write) -> Result<(), Failure> {
-    let mode = options.mode.as_deref().map(arguments::byte).transpose()?.map(Mode);
+    let said = options.mode.as_deref().map(arguments::byte).transpose()?.map(Mode);
     let file = options.file.as_deref().filter(|path| *path != Path::new("-"));
     let name = file.map_or("stdin".into(), |path| path.display().to_string());
-    let reader: Box<dyn Read> = match file {
-        Some(path) => Box::new(File::open(path).map_err(|error| unreadable(&name, &error))?),
-        None => Box::new(io::stdin()),
+    let (reader, told): (Box<dyn Read>, _) = match (file, &options.sensor) {
+        (Some(path), sensor) if sensor.is_some() || unpack::is_framed(path) => {
+            unpack::open(path, sensor.as_deref())?
+        }
+        (Some(path), _) => (Box::new(File::open(path).map_err(|error| unreadable(&name, &error))?), None),
+        (None, None) => (Box::new(io::stdin()), None),
+        (None, Some(_)) => {
+            let hint = "for example `scanhub telegram decode walk.mcap --sensor front`";
+            return Err(Failure::new(Kind::Usage, "--sensor is one of a recording, and stdin is none", hint));
+        }
     };
+    let mode = said.or(told);
     let mut input = Input::new(reader).map_err(|error| unreadable(&name, &error))?;
     let form = match (options.json, options.all) {
         (true, _) => Form::Json,
@@ -76,8 +89,9 @@ pub fn decode(options: &DecodeOptions, out: &mut dyn Write) -> Result<(), Failur
 
 fn unreadable(name: &str, error: &io::Error) -> Failure {
     let hint = match error.kind() {
+        ErrorKind::Unsupported => "name its file: scanhub telegram decode FILE",
         ErrorKind::InvalidData => "write pairs of digits, as 02 80 03 00 or 0x02,0x80; text between quotes",
         _ => "name a readable file, or - for stdin",
     };
-    Failure::new(Kind::Configuration, format!("{name}: {error}"), hint)
+    Failure::new(Kind::Input, format!("{name}: {error}"), hint)
 }

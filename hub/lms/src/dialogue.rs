@@ -13,6 +13,7 @@ use crate::phase::{
     SILENCE, Settings, Step,
 };
 use crate::reply::{POWER_ON, Reply};
+use crate::search::POWER_ON_BAUD;
 use crate::sensor::{Sensor, State, Trouble};
 use crate::telegram::{REPLY, Telegram};
 use crate::variant::Baud;
@@ -27,6 +28,12 @@ pub(crate) struct Dialogue {
     pub(crate) sensor: Sensor,
     /// What was known of it before this session, until anything is said to it.
     pub(crate) recalled: Option<Identity>,
+    /// The rate at which a sensor most likely is that does not stream when a session begins.
+    pub(crate) rest_at: Baud,
+    /// The rate that is asked first.
+    pub(crate) first: Baud,
+    /// The rate at which the search had its last answer.
+    pub(crate) found_at: Option<Baud>,
     /// What is in the way now; [`Dialogue::trouble`] is what is shown.
     pub(crate) trouble: Option<Trouble>,
     /// A user wants nothing of the sensor.
@@ -34,7 +41,7 @@ pub(crate) struct Dialogue {
     /// The sensor keeps another variant than the wanted one.
     pub(crate) variant_refused: bool,
     pub(crate) resyncs: u64,
-    /// Bytes came since the last round of the search began.
+    /// Bytes came since it began to listen, or to search for another round.
     pub(crate) heard: bool,
     /// When the last telegram came.
     pub(crate) quiet_since: Nanos,
@@ -50,6 +57,9 @@ impl Dialogue {
             baud: settings.baud,
             sensor: Sensor::default(),
             recalled: None,
+            rest_at: POWER_ON_BAUD,
+            first: POWER_ON_BAUD,
+            found_at: None,
             trouble: None,
             is_paused: false,
             variant_refused: false,
@@ -99,6 +109,13 @@ impl Dialogue {
         self.open.is_some()
     }
 
+    /// Bytes came, whatever they are.
+    pub(crate) fn hear(&mut self) {
+        self.heard = true;
+        let baud = self.baud;
+        self.open.iter_mut().for_each(|open| open.hear(baud));
+    }
+
     /// Which headers may come.
     pub(crate) fn expect(&self) -> Expect {
         match self.phase {
@@ -112,7 +129,9 @@ impl Dialogue {
     pub(crate) fn deadline(&self) -> (Nanos, Reason) {
         let reply = self.open.as_ref().map_or(Nanos::MAX, Outgoing::give_up_at);
         let (own, reason) = match self.phase {
-            Phase::Listening { give_up_at, .. } => (give_up_at, Reason::Listening),
+            Phase::Listening { give_up_at, quiet_at, .. } => {
+                (if self.heard { give_up_at } else { quiet_at }, Reason::Listening)
+            }
             Phase::Streaming { silent_at, .. } => (silent_at, Reason::Silence),
             _ => (Nanos::MAX, Reason::Never),
         };
@@ -125,13 +144,17 @@ impl Dialogue {
 
     pub(crate) fn handle_timeout(&mut self, now: Nanos) {
         match self.phase {
-            Phase::Listening { give_up_at, attempt, .. } if now >= give_up_at => {
+            Phase::Listening { give_up_at, quiet_at, attempt, .. }
+                if now >= give_up_at || (now >= quiet_at && !self.heard) =>
+            {
                 return self.probe(now, attempt);
             }
             Phase::Streaming { silent_at, .. } if now >= silent_at => {
                 self.resyncs += 1;
                 self.trouble = Some(Trouble::Silence);
                 self.sensor.forget();
+                // Its cable may be back sooner than its power.
+                self.first = self.settings.baud;
                 return self.listen(now, State::Silent);
             }
             _ => {}
@@ -240,10 +263,15 @@ impl Dialogue {
         match self.phase {
             Phase::Probing { .. } if self.is_paused => self.stop(now),
             Phase::Probing { .. } => {
+                self.found_at = Some(self.baud);
                 // Somebody is there after all.
                 self.trouble
                     .take_if(|trouble| matches!(trouble, Trouble::NoAnswer { .. } | Trouble::Silence));
-                self.proceed(Progress::BEGIN, now);
+                if request == Request::Type {
+                    // The line was silent until it was asked. What else it does is asked at the wanted rate.
+                    self.sensor.streams = false;
+                }
+                self.proceed(Progress::begin(request, reply.as_ref()), now);
             }
             Phase::Starting { step, progress } => self.on_step(step, progress, request, reply, now),
             Phase::Paused { .. } => self.on_stopped(reply, now),

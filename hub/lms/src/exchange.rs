@@ -85,6 +85,8 @@ impl<R: Say> Exchange<R> {
         if len > 0 {
             self.framer.commit(len);
             self.last_byte = now;
+            let baud = self.baud;
+            self.open.iter_mut().for_each(|open| open.hear(baud));
         }
     }
 

@@ -46,7 +46,7 @@ pub mod variant;
 pub use identity::Identity;
 pub use inquiry::Inquiry;
 pub use notice::Notice;
-pub use phase::{Control, Reason, Settings};
+pub use phase::{Control, Reason, SILENCE, Settings};
 pub use sensor::{Sensor, State, Trouble};
 pub use session::Session;
 

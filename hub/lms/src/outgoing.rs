@@ -54,6 +54,8 @@ pub(crate) struct Outgoing<R = Request> {
     /// Added to every wait for the acknowledgement.
     patience: Nanos,
     acknowledged: bool,
+    /// Whether a byte came since it was out.
+    is_heard: bool,
     /// When its last byte left.
     out_at: Option<Nanos>,
     /// When its reply is given up; counts from the last byte.
@@ -73,6 +75,7 @@ impl<R: Say> Outgoing<R> {
             tries_left: tries - 1,
             patience: 0,
             acknowledged: false,
+            is_heard: false,
             out_at: None,
             give_up_at: Nanos::MAX,
         }
@@ -94,11 +97,17 @@ impl<R: Say> Outgoing<R> {
         self.not_before = now + line_time(1, baud.rate()) + GAP;
         if self.sent == self.encoded.bytes().len() {
             self.out_at = Some(now);
-            // Behind the head of a scan that the request broke off, the acknowledgement is not seen: the reply is.
             // A sensor that is slower than it should be needs a longer wait, not more tries: each breaks off the last.
             let tried = Nanos::from(self.tries - self.tries_left - 1);
-            let wait = self.request.sign() + tried * ACKNOWLEDGE_TIMEOUT + self.patience;
-            self.give_up_at = now + wait + line_time(1 + LONGEST_REPLY, baud.rate());
+            self.give_up_at = now + self.request.sign() + tried * ACKNOWLEDGE_TIMEOUT + self.patience;
+        }
+    }
+
+    /// A byte came. Behind the head of a scan that the request broke off, the acknowledgement is not seen: the reply is,
+    /// which may have begun now.
+    pub(crate) fn hear(&mut self, baud: Baud) {
+        if self.is_out() && !core::mem::replace(&mut self.is_heard, true) {
+            self.give_up_at += line_time(1 + LONGEST_REPLY, baud.rate());
         }
     }
 
@@ -116,6 +125,7 @@ impl<R: Say> Outgoing<R> {
         self.sent = 0;
         self.not_before = at;
         self.acknowledged = false;
+        self.is_heard = false;
         self.out_at = None;
         self.give_up_at = Nanos::MAX;
         self.tries_left.checked_sub(1).map(|left| self.tries_left = left).is_some()
@@ -190,7 +200,12 @@ mod tests {
             outgoing.transmitted(now, Baud::B500000);
         }
         assert!(outgoing.is_out());
-        assert_eq!(outgoing.give_up_at(), now + 153_220_000);
+        assert_eq!(outgoing.give_up_at(), now + ACKNOWLEDGE_TIMEOUT);
+        // What came may be the begin of the longest reply; it begins once.
+        for _ in 0..2 {
+            outgoing.hear(Baud::B500000);
+            assert_eq!(outgoing.give_up_at(), now + ACKNOWLEDGE_TIMEOUT + line_time(161, 500_000));
+        }
         assert!(outgoing.again(now));
         assert!(!outgoing.is_out() && outgoing.out_at().is_none());
         assert!(!outgoing.again(now));

@@ -3,6 +3,7 @@
 
 use crate::command::Request;
 use crate::header::StreamHeader;
+use crate::reply::Reply;
 use crate::sensor::State;
 use crate::variant::{Baud, Variant};
 use crate::{MILLIS, Nanos};
@@ -37,9 +38,10 @@ pub enum Reason {
 
 #[derive(Clone, Copy, Debug)]
 pub(crate) enum Phase {
-    /// Without a word: whoever streams is heard. Meanwhile the state is as `shown`, afterwards comes `attempt`.
-    Listening { give_up_at: Nanos, shown: State, attempt: usize },
-    /// A status request at one rate after the other.
+    /// Without a word: whoever streams is heard. Meanwhile the state is as `shown`, afterwards comes `attempt`: at
+    /// `quiet_at` if no byte came.
+    Listening { give_up_at: Nanos, quiet_at: Nanos, shown: State, attempt: usize },
+    /// A question at one rate after the other.
     Probing { attempt: usize },
     /// The sensor hears us: it is brought to rest, to the wanted rate, to its settings, to a stream.
     Starting { step: Step, progress: Progress },
@@ -79,6 +81,10 @@ pub(crate) struct Progress {
     pub(crate) stops_left: u8,
     /// What follows once the sensor is at rest and at the wanted rate.
     pub(crate) settings: &'static [Step],
+    /// Whether it told its status: what it does, and how its values are split.
+    pub(crate) has_status: bool,
+    /// Whether it told its type.
+    pub(crate) has_type: bool,
 }
 
 impl Progress {
@@ -86,7 +92,23 @@ impl Progress {
     pub(crate) const BEGIN: Progress = Progress {
         stops_left: STOPS + 1,
         settings: &[Step::Variant, Step::Type, Step::Configuration, Step::Stream],
+        has_status: false,
+        has_type: false,
     };
+
+    /// Nothing was done yet but `request`, which the sensor answered with `reply`.
+    pub(crate) fn begin(request: Request, reply: Option<&Reply<'_>>) -> Progress {
+        Progress::BEGIN.after(request, reply)
+    }
+
+    /// So far, and the sensor answered `request` with `reply`. What it refuses to tell is asked another way.
+    pub(crate) fn after(self, request: Request, reply: Option<&Reply<'_>>) -> Progress {
+        Progress {
+            has_status: self.has_status || matches!(reply, Some(Reply::Status(_))),
+            has_type: self.has_type || request == Request::Type,
+            ..self
+        }
+    }
 }
 
 /// What a user may ask of a running session.
@@ -102,8 +124,11 @@ pub enum Control {
 
 /// Two scans of the slowest variant, and some; longer where the line is slower than the scans.
 pub(crate) const LISTEN: Nanos = 120 * MILLIS;
+/// On a line that is silent for so long nobody streams whole scans: the slowest variant begins one every 53 ms, and has
+/// bytes on the line for a third of that at least. Two telegram times of the usual one.
+pub(crate) const QUIET: Nanos = 55 * MILLIS;
 /// Without measured data for so long the session begins again (paper: resynchronise after one second).
-pub(crate) const SILENCE: Nanos = 1_000 * MILLIS;
+pub const SILENCE: Nanos = 1_000 * MILLIS;
 /// After a change of rate the sensor's and the adapter's UART need a moment.
 pub(crate) const SETTLE: Nanos = 20 * MILLIS;
 /// After a refusal, before everything begins again.

@@ -122,6 +122,18 @@ impl Session {
         self.dialogue.recalled = Some(known);
     }
 
+    /// The rate that is asked first if nobody streams, in place of 9600: where a sensor that did not stream was
+    /// [found](Self::found_at) the last time. To be said before anything is read.
+    pub fn seek_first(&mut self, baud: Baud) {
+        self.dialogue.rest_at = baud;
+        self.dialogue.first = baud;
+    }
+
+    /// The rate at which a sensor that was sought answered; nothing if none had to be sought.
+    pub fn found_at(&self) -> Option<Baud> {
+        self.dialogue.found_at
+    }
+
     /// What the next session would have to ask if this one ended now; nothing if the sensor does not stream, or has not told
     /// all of it.
     pub fn identity(&self) -> Option<Identity> {
@@ -171,7 +183,7 @@ impl Session {
         let was_empty = self.framer.buffered() == 0;
         self.framer.commit(len);
         self.last_byte = now;
-        self.dialogue.heard = true;
+        self.dialogue.hear();
         if was_empty {
             self.begin_rhythm();
         }
@@ -199,9 +211,13 @@ impl Session {
     /// The byte of [`Output::Transmit`] was written at `now`.
     pub fn transmitted(&mut self, now: Nanos) {
         self.now = now;
-        let baud = self.dialogue.baud;
+        let (baud, is_fixed) = (self.dialogue.baud, self.dialogue.settings.fixed_rate);
         if let Some(outgoing) = self.dialogue.outgoing() {
             outgoing.transmitted(now, baud);
+            if is_fixed {
+                // From a network the first sign of a reply may be all of it.
+                outgoing.hear(baud);
+            }
         }
     }
 

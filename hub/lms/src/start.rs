@@ -4,7 +4,7 @@
 use crate::Nanos;
 use crate::command::Request;
 use crate::dialogue::Dialogue;
-use crate::phase::{MORE_TRIES, Phase, Progress, SETTLE, Step, TRIES};
+use crate::phase::{MORE_TRIES, Phase, Progress, SETTLE, STOPS, Step, TRIES};
 use crate::reply::Reply;
 use crate::sensor::{State, Trouble};
 
@@ -24,7 +24,13 @@ impl Dialogue {
     fn settle(&mut self, mut progress: Progress, now: Nanos) {
         while let Some((&step, rest)) = progress.settings.split_first() {
             progress.settings = rest;
-            if step != Step::Variant || self.sensor.variant != Some(self.settings.variant) {
+            let is_known = match step {
+                Step::Variant => self.sensor.variant == Some(self.settings.variant),
+                Step::Type => progress.has_type,
+                Step::Configuration => progress.has_status,
+                _ => false,
+            };
+            if !is_known {
                 return self.enter(step, progress, now);
             }
         }
@@ -57,7 +63,13 @@ impl Dialogue {
         now: Nanos,
     ) {
         let failed = matches!(reply, Some(Reply::Refused | Reply::Mode { done: false }));
+        let was_told = progress.has_status;
+        let progress = progress.after(request, reply.as_ref());
         match step {
+            // Not in the mode in which it is, which was not asked yet.
+            Step::Baud if failed && !was_told && progress.stops_left > STOPS => {
+                self.enter(Step::Check, progress, now);
+            }
             Step::Stop | Step::Baud | Step::Stream if failed => self.refused(request, now),
             Step::Stop => {
                 self.sensor.streams = false;
@@ -75,8 +87,13 @@ impl Dialogue {
             Step::Type | Step::Configuration => self.settle(progress, now),
             // The stream is there when its first telegram is, which is due like one that went missing.
             Step::Stream => {
-                self.phase =
-                    Phase::Listening { give_up_at: self.silent_at(now), shown: State::Starting, attempt: 0 };
+                let until = self.silent_at(now);
+                self.phase = Phase::Listening {
+                    give_up_at: until,
+                    quiet_at: until,
+                    shown: State::Starting,
+                    attempt: 0,
+                };
             }
         }
     }

@@ -61,8 +61,9 @@ pub struct Converted {
 /// Converts as `options` say until `stop` is set; calls `progress` with the telegrams that were written and how many there
 /// are. Whoever closes stdout has enough.
 ///
-/// [`Kind::Configuration`] if the recording cannot be read, or what it shall become cannot be said; [`Kind::Failed`] if it
-/// cannot be written, [`Kind::Interrupted`] if it was stopped. Nothing is left then.
+/// [`Kind::Input`] if the recording cannot be read, [`Kind::NoTopic`] if it has no such sensor, [`Kind::Usage`] if what it
+/// shall become cannot be said, [`Kind::Output`] if that is there or cannot be written, [`Kind::Interrupted`] if it was
+/// stopped. Nothing is left then.
 pub fn convert(
     options: &ConvertOptions,
     stop: &AtomicBool,
@@ -73,7 +74,10 @@ pub fn convert(
     let place = Place::check(&options.output, &options.input, options.force)?;
     let recording = match &options.sensor {
         Some(sensor) if whole.contents().form == Form::Mcap => whole.of(sensor)?,
-        Some(sensor) => check_followed(sensor).map(|()| whole)?,
+        Some(sensor) => {
+            let named = check_followed(sensor).map(|()| whole);
+            named.map_err(|failure| Failure { kind: Kind::Usage, ..failure })?
+        }
         None => whole,
     };
     let contents = recording.contents();
@@ -209,7 +213,7 @@ fn write_mcap(
 
 /// How the values are encoded, where that can be said without loss or is not asked.
 ///
-/// [`Kind::Configuration`] of a log whose ranges no sensor could have sent, and for a log, of values of which nobody knows
+/// [`Kind::Input`] of a log whose ranges no sensor could have sent, and for a log, of values of which nobody knows
 /// where a range ends.
 fn encoding(recording: &Recording, form: Form) -> Result<Encoding, Failure> {
     let contents = recording.contents();
@@ -217,13 +221,13 @@ fn encoding(recording: &Recording, form: Form) -> Result<Encoding, Failure> {
     if !unfit.is_none() {
         let message = format!("{} cannot become telegrams without loss: {unfit}", recording.path().display());
         let hint = "round its ranges first; `scanhub replay` plays it rounded";
-        return Err(Failure::new(Kind::Configuration, message, hint));
+        return Err(Failure::new(Kind::Input, message, hint));
     }
     let mode = contents.readable();
     if mode.is_none() && form == Form::Carmen {
         let message = format!("{} does not tell its measuring mode", recording.path().display());
         let hint = "`scanhub replay --set link.front.mode=0x04` plays it, and `scanhub record` records it with its mode";
-        return Err(Failure::new(Kind::Configuration, message, hint));
+        return Err(Failure::new(Kind::Input, message, hint));
     }
     Ok(Encoding { unit: contents.unit.unwrap_or(Unit::Cm), mode: mode.unwrap_or(Mode(0)) })
 }
@@ -253,7 +257,7 @@ fn form_of(path: &Path) -> Result<Form, Failure> {
             let message = format!("the ending of {} tells no form", path.display());
             let hint =
                 ".mcap, .log (CARMEN), .bin (telegram stream), the last two also with .gz; or - for stdout";
-            Err(Failure::new(Kind::Configuration, message, hint))
+            Err(Failure::new(Kind::Usage, message, hint))
         }
     }
 }

@@ -12,6 +12,7 @@ mod damage;
 #[cfg(feature = "mcap")]
 mod mcap;
 mod open;
+mod packed;
 mod stream;
 
 pub use carmen::{BEYOND, Unfit};

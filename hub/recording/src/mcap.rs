@@ -14,7 +14,7 @@ mod seen;
 mod source;
 mod window;
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, HashSet};
 use std::io::{self, Read};
 use std::sync::Arc;
 
@@ -24,7 +24,9 @@ use schema::{Header, Status, Topic};
 
 use crate::open::is_end;
 use crate::{Contents, Damage, Form, Frame};
+pub(crate) use exact::parse;
 pub(crate) use headless::is_mcap;
+use knowledge::MOST_LIVES;
 pub(crate) use knowledge::{Knowledge, message};
 pub(crate) use originals::Originals;
 use reader::{Item, Reader, Sighting};
@@ -41,6 +43,8 @@ pub(crate) struct Survey {
     numbers: BTreeMap<String, Numbers>,
     /// Number of the first telegram of which a hub made something, by sensor and life.
     understood: BTreeMap<String, BTreeMap<u64, u64>>,
+    /// Pairs of sensor and life in it.
+    lives: usize,
 }
 
 /// The last telegram of a sensor whose number is known.
@@ -60,6 +64,7 @@ impl Default for Survey {
             is_sound: true,
             numbers: BTreeMap::new(),
             understood: BTreeMap::new(),
+            lives: 0,
         }
     }
 }
@@ -94,7 +99,8 @@ impl Survey {
             of_sensor(&mut survey.sensors, sensor);
         }
         // Those whose names are lost.
-        let others = survey.sensors.keys().filter(|name| !survey.whole.sensors.contains(name));
+        let named: HashSet<_> = survey.whole.sensors.iter().collect();
+        let others = survey.sensors.keys().filter(|name| !named.contains(name));
         let others: Vec<_> = others.cloned().collect();
         survey.whole.sensors.extend(others);
         if let Some(account) = reader.account() {
@@ -170,8 +176,14 @@ impl Survey {
                 Some(lives) => lives,
                 None => self.understood.entry(place.sensor.clone()).or_default(),
             };
-            let first = lives.entry(header.boot).or_insert(header.seq);
-            *first = header.seq.min(*first);
+            match lives.get_mut(&header.boot) {
+                Some(first) => *first = header.seq.min(*first),
+                None if self.lives < MOST_LIVES => {
+                    lives.insert(header.boot, header.seq);
+                    self.lives += 1;
+                }
+                None => {}
+            }
         }
         let mut status = Status::default();
         if place.topic == Topic::Status && status.unpack(payload) && status.mode != Status::MODE_UNKNOWN {

@@ -2,17 +2,16 @@
 //! is wrong with it is said, before anything is sent from it. Nothing is kept in memory.
 
 use std::fmt;
-use std::fs::File;
 use std::io::{self, BufRead, BufReader, Read};
 use std::path::{Path, PathBuf};
 
-use flate2::bufread::MultiGzDecoder;
 use lms::variant::{Mode, Unit};
-use schema::{Failure, Kind};
+use schema::{Failure, Kind, regular};
 
 use crate::carmen::{self, Census, Log, Wrong};
 #[cfg(feature = "mcap")]
 use crate::mcap::{Knowledge, reader::Reader};
+use crate::packed::Packed;
 use crate::stream::Telegrams;
 use crate::{Contents, Form, Frame};
 
@@ -47,7 +46,7 @@ pub struct Recording {
 impl Recording {
     /// Opens and reads through the file at `path`.
     ///
-    /// [`Kind::Configuration`] if it is no recording: anything without a telegram but an MCAP file. One that is damaged is opened: see [`Contents::damage`].
+    /// [`Kind::Input`] if it is no recording: anything without a telegram but an MCAP file. One that is damaged is opened: see [`Contents::damage`].
     pub fn open(path: impl Into<PathBuf>) -> Result<Recording, Failure> {
         let recording = Recording::open_line(path)?;
         if recording.contents.form == Form::Telegrams && recording.contents.telegrams == 0 {
@@ -59,7 +58,7 @@ impl Recording {
 
     /// The same, but also of bytes without a telegram: what came down a line that only brings noise.
     ///
-    /// [`Kind::Configuration`] as of [`open`](Self::open).
+    /// [`Kind::Input`] as of [`open`](Self::open).
     pub fn open_line(path: impl Into<PathBuf>) -> Result<Recording, Failure> {
         let path = path.into();
         let mut reader = reader(&path)?;
@@ -104,21 +103,26 @@ impl Recording {
     #[cfg(not(feature = "mcap"))]
     fn open_mcap(path: PathBuf, _: bool) -> Result<Recording, Failure> {
         let message = format!("recording {} is an MCAP file, which this build does not read", path.display());
-        Err(Failure::new(Kind::Configuration, message, "build it with the feature mcap of scanhub-recording"))
+        Err(Failure::new(Kind::Input, message, "build it with the feature mcap of scanhub-recording"))
+    }
+
+    /// Whether a file that begins with `head` has its telegrams inside something else, MCAP's framing or gzip's.
+    pub fn is_framed(head: &[u8]) -> bool {
+        head.starts_with(MCAP) || head.starts_with(GZIP)
     }
 
     /// The part of it that is `sensor`'s.
     ///
-    /// [`Kind::Configuration`] if it has no such sensor; says which it has.
+    /// [`Kind::NoTopic`] if it has no such sensor; says which it has. [`Kind::Usage`] if it names none.
     pub fn of(&self, sensor: &str) -> Result<Recording, Failure> {
         let place = self.path.display();
         if self.contents.sensors.is_empty() {
             let message = format!("recording {place} does not name its sensor, so {sensor} cannot be chosen");
-            return Err(Failure::new(Kind::Configuration, message, "leave the sensor away"));
+            return Err(Failure::new(Kind::Usage, message, "leave the sensor away"));
         }
         if !self.contents.sensors.iter().any(|name| name == sensor) {
             let message = format!("recording {place} has no sensor {sensor:?}");
-            return Err(Failure::new(Kind::Configuration, message, self.choice()));
+            return Err(Failure::new(Kind::NoTopic, message, self.choice()));
         }
         let mut chosen = self.clone();
         #[cfg(feature = "mcap")]
@@ -165,7 +169,7 @@ impl Recording {
     /// Its telegrams in order, replies too; a log's scans as `encoding` says: without loss if that is its own. Should the file become unreadable in the
     /// meantime, they end there.
     ///
-    /// [`Kind::Configuration`] if it has several sensors and none was chosen by [`of`](Self::of).
+    /// [`Kind::Usage`] if it has several sensors and none was chosen by [`of`](Self::of).
     pub fn telegrams(&self, encoding: Encoding) -> Result<Box<dyn Iterator<Item = Frame> + Send>, Failure> {
         let reader = reader(&self.path)?;
         Ok(match self.contents.form {
@@ -193,7 +197,7 @@ impl Recording {
             (None, []) => return Ok(Box::new(std::iter::empty())),
             (None, _) => {
                 let message = format!("recording {} has several sensors", self.path.display());
-                return Err(Failure::new(Kind::Configuration, message, self.choice()));
+                return Err(Failure::new(Kind::Usage, message, self.choice()));
             }
         };
         Ok(Box::new(crate::mcap::Frames::new(reader, &self.survey, sensor)))
@@ -235,7 +239,12 @@ impl Recording {
     }
 
     fn choice(&self) -> String {
-        format!("choose one: {}", self.contents.sensors.join(", "))
+        let sensors = &self.contents.sensors;
+        let more = match sensors.len().saturating_sub(TOLD) {
+            0 => String::new(),
+            more => format!(" and {more} more"),
+        };
+        format!("choose one: {}{more}", sensors[..sensors.len().min(TOLD)].join(", "))
     }
 }
 
@@ -257,7 +266,7 @@ fn survey_log(path: &Path, reader: impl BufRead) -> Result<Contents, Failure> {
             Err(Wrong::Line(wrong)) => {
                 let message = format!("{}:{}: {wrong}", path.display(), log.line);
                 let hint = "a scan is: FLASER 361 RANGE... in metres";
-                refusal.get_or_insert(Failure::new(Kind::Configuration, message, hint));
+                refusal.get_or_insert(Failure::new(Kind::Input, message, hint));
                 contents.damage.telegrams += 1;
                 contents.damage.is_harmed = true;
             }
@@ -301,13 +310,9 @@ fn reader(path: &Path) -> Result<Box<dyn BufRead + Send>, Failure> {
 }
 
 fn open(path: &Path) -> io::Result<Box<dyn BufRead + Send>> {
-    // A pipe or a device has no end, and would be waited for.
-    if !std::fs::metadata(path)?.is_file() {
-        return Err(io::Error::new(io::ErrorKind::InvalidInput, "it is no regular file"));
-    }
-    let mut file = BufReader::with_capacity(BUFFER, File::open(path)?);
+    let mut file = BufReader::with_capacity(BUFFER, regular::open(path)?);
     if file.fill_buf()?.starts_with(GZIP) {
-        return Ok(Box::new(BufReader::with_capacity(BUFFER, MultiGzDecoder::new(file))));
+        return Ok(Box::new(BufReader::with_capacity(BUFFER, Packed::new(file))));
     }
     Ok(Box::new(file))
 }
@@ -318,15 +323,21 @@ fn unreadable(path: &Path, error: &io::Error) -> Failure {
         io::ErrorKind::PermissionDenied => "the file must be readable by this user",
         io::ErrorKind::UnexpectedEof => "the gzip file is cut: `zcat FILE > WHOLE` saves what is there",
         io::ErrorKind::Unsupported => "`mcap compress --compression none IN -o OUT` (of mcap.dev) unpacks it",
+        io::ErrorKind::FileTooLarge => {
+            "`zcat FILE > WHOLE` unpacks a packed file; `mcap filter --output-compression none IN -o OUT` (of mcap.dev) \
+             writes short chunks, and with -y TOPIC some topics alone"
+        }
         _ => FORMS,
     };
-    Failure::new(Kind::Configuration, format!("cannot read recording {}: {error}", path.display()), hint)
+    Failure::new(Kind::Input, format!("cannot read recording {}: {error}", path.display()), hint)
 }
 
 fn refused(path: &Path, what: &str) -> Failure {
-    Failure::new(Kind::Configuration, format!("recording {} {what}", path.display()), FORMS)
+    Failure::new(Kind::Input, format!("recording {} {what}", path.display()), FORMS)
 }
 
+/// Sensors that a failure names.
+const TOLD: usize = 32;
 const FORMS: &str = "a recording is an MCAP file, a stream of telegrams or a CARMEN log, plain or gzipped";
 /// First bytes of a gzip file.
 const GZIP: &[u8] = &[0x1F, 0x8B];

@@ -152,7 +152,7 @@ fn what_cannot_be_done_is_refused_and_leaves_nothing() {
     let folder = Folder::new("refused");
     let noise = folder.file("noise.mcap", &[0x42; 900]);
     let failure = converted(&noise, &folder.0.join("out.mcap"), None).unwrap_err();
-    assert!(failure.kind.exit_code() == 78 && failure.message.contains("no telegram"), "{failure}");
+    assert!(failure.kind.exit_code() == 66 && failure.message.contains("no telegram"), "{failure}");
     fs::remove_file(noise).unwrap();
     let input = folder.file("in.mcap", &written::recording(8, 13).bytes);
     let there = folder.file("there.bin", b"mine");

@@ -100,7 +100,7 @@ fn a_log_becomes_telegrams() {
 #[test]
 fn what_is_no_recording_is_refused_with_place_value_and_remedy() {
     let missing = Recording::open("/nonexistent/a.bin").unwrap_err();
-    assert_eq!(missing.kind.exit_code(), 78);
+    assert_eq!(missing.kind.exit_code(), 66);
     assert!(missing.message.contains("/nonexistent/a.bin") && !missing.hint.is_empty(), "{missing}");
     for (name, bytes, says) in [
         ("empty", Vec::new(), "is empty"),

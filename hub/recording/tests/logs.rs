@@ -162,7 +162,7 @@ fn a_log_that_no_sensor_could_have_sent_is_refused_with_the_reason() {
         let input = folder.file(&format!("{name}.log"), log(361, ranges).as_bytes());
         for output in ["out.mcap", "out.bin", "out.log"] {
             let failure = converted(&input, &folder.0.join(output), None).unwrap_err();
-            assert_eq!(failure.kind.exit_code(), 78);
+            assert_eq!(failure.kind.exit_code(), 66);
             let all = format!("{failure} {}", failure.hint);
             assert!(all.contains("cannot become telegrams without loss"), "{name}: {all}");
             assert!(all.contains(says), "{name}: {all}");

@@ -67,8 +67,9 @@ fn each_sensor_has_its_telegrams() {
 fn a_sensor_has_to_be_chosen_of_several() {
     let file = File::new("choice", &written::recording(4, 2).bytes);
     let recording = Recording::open(&file.0).unwrap();
-    for failure in [recording.telegrams(MM).err().unwrap(), recording.of("left").unwrap_err()] {
-        assert_eq!(failure.kind.exit_code(), 78);
+    let refused = [(recording.telegrams(MM).err().unwrap(), 2), (recording.of("left").unwrap_err(), 3)];
+    for (failure, code) in refused {
+        assert_eq!(failure.kind.exit_code(), code);
         assert_eq!(failure.hint, "choose one: front, rear");
     }
 }

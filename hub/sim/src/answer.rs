@@ -187,12 +187,20 @@ impl Machine {
 
     /// Between ACK and reply where nothing changes.
     fn thinking_ns(&mut self) -> Nanos {
-        self.random.u64(THINKING_NS)
+        self.delay_ns(THINKING_NS)
     }
 
     /// Between ACK and A0h or BBh.
     fn mode_ns(&mut self) -> Nanos {
-        self.random.u64(MODE_NS) + self.settings.habits.late_mode_ns
+        self.delay_ns(MODE_NS) + self.settings.habits.late_mode_ns
+    }
+
+    fn delay_ns(&mut self, usual: Range<Nanos>) -> Nanos {
+        let by_chance = self.random.u64(usual);
+        match self.settings.habits.answer_ns {
+            0 => by_chance,
+            answer_ns => answer_ns,
+        }
     }
 
     /// Between ACK and F7h or E6h.

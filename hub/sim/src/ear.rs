@@ -1,5 +1,9 @@
-//! Host bytes to requests, the way the sensor hears them: a request whose bytes came too close together or too far
-//! apart is not heard at all. What a request means is [`crate::machine`]'s affair.
+//! Host bytes to requests, the way the sensor hears them. What a host writes at once leaves its UART one byte after the
+//! other, which a pty does not imitate: so each byte is heard when the line would have carried it. A request with a gap
+//! that is too long is dropped, and one with gaps that are too short by a sensor that is strict. What a request means is
+//! [`crate::machine`]'s affair.
+
+use std::fmt;
 
 use lms::telegram::{FRAME, MAX_LENGTH, STX};
 use lms::{MICROS, MILLIS, Nanos, line_time};
@@ -20,47 +24,73 @@ impl Arrival {
     }
 }
 
+/// A request that was not heard, and why.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Dropped {
+    /// More than 6 ms passed behind the first so many of its bytes.
+    LongGap {
+        /// How many.
+        after: usize,
+    },
+    /// Its bytes came less than 55 us apart, to a sensor that is strict.
+    ShortGap,
+}
+
+impl fmt::Display for Dropped {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Dropped::LongGap { after } => {
+                write!(f, "a request was dropped: more than 6 ms of silence after {after} of its bytes")
+            }
+            Dropped::ShortGap => f.write_str(
+                "a request was dropped: less than 55 us between its bytes, which strict_gap=1 demands",
+            ),
+        }
+    }
+}
+
+/// A request that was heard.
+#[derive(Debug, PartialEq, Eq)]
+pub(crate) struct Heard {
+    /// All of it; its checksum was not looked at.
+    pub(crate) bytes: Vec<u8>,
+    /// When the line had carried its last byte.
+    pub(crate) at: Nanos,
+}
+
 /// Collects one request.
 #[derive(Debug)]
 pub(crate) struct Ear {
     bytes: Vec<u8>,
-    /// When the last byte can have come if every gap of the request before it was right; `None` before the first.
+    /// When the last byte can have come if every gap before it was right; `None` before the first.
     last: Option<Arrival>,
     broken: bool,
+    /// Whether the host itself has to leave the least gap.
+    pub(crate) is_strict: bool,
     /// Machine time per host time: the host keeps its gaps by its own clock, however fast the sensor runs.
     speed: f64,
+    dropped: Option<Dropped>,
 }
 
 impl Ear {
-    pub(crate) fn new(speed: f64) -> Self {
-        Ear { bytes: Vec::new(), last: None, broken: false, speed }
+    pub(crate) fn new(speed: f64, is_strict: bool) -> Self {
+        Ear { bytes: Vec::new(), last: None, broken: false, is_strict, speed, dropped: None }
     }
 
-    /// Takes a byte on a line of `baud` bits per second; returns the bytes of a request that is whole and whose gaps
-    /// were not provably wrong. Its checksum was not looked at.
-    pub(crate) fn hear(&mut self, byte: u8, arrival: Arrival, baud: u32) -> Option<Vec<u8>> {
-        let speed = self.speed;
-        let scaled = |span: Nanos| (span as f64 * speed) as Nanos;
-        let mut possible = arrival;
-        if let Some(last) = self.last {
-            let byte_ns = scaled(line_time(1, baud));
-            let soonest = last.not_before + byte_ns + scaled(MIN_GAP);
-            let latest = last.not_after + byte_ns + scaled(MAX_GAP);
-            if arrival.not_before > latest {
-                self.forget();
-            } else if soonest > arrival.not_after {
-                self.broken = true;
-            } else {
-                // Several bytes seen at once must have come one after the other: each leaves less for the next.
-                possible.not_before = arrival.not_before.max(soonest);
-                possible.not_after = arrival.not_after.min(latest);
-            }
-        }
+    /// The last request that was dropped, told once.
+    pub(crate) fn take_dropped(&mut self) -> Option<Dropped> {
+        self.dropped.take()
+    }
+
+    /// Takes a byte on a line of `baud` bits per second; returns a request that is whole and whose gaps were not
+    /// provably wrong.
+    pub(crate) fn hear(&mut self, byte: u8, arrival: Arrival, baud: u32) -> Option<Heard> {
+        let possible = self.place(arrival, baud);
+        self.last = Some(possible);
         if self.bytes.is_empty() && byte != STX {
             return None;
         }
         self.bytes.push(byte);
-        self.last = Some(possible);
         let [_, _, low, high, ..] = self.bytes[..] else { return None };
         let length = usize::from(u16::from_le_bytes([low, high]));
         if !(1..=MAX_LENGTH).contains(&length) {
@@ -70,15 +100,47 @@ impl Ear {
         if self.bytes.len() < length + FRAME {
             return None;
         }
-        let whole = (!self.broken).then(|| self.bytes.clone());
-        self.forget();
-        whole
+        let is_broken = self.broken;
+        let bytes = self.forget();
+        if is_broken {
+            self.dropped = Some(Dropped::ShortGap);
+            return None;
+        }
+        Some(Heard { bytes, at: possible.not_before.max(arrival.not_after) })
     }
 
-    fn forget(&mut self) {
-        self.bytes.clear();
-        self.last = None;
+    /// When the line can have carried a byte that came at `arrival`; drops the request that it comes too late for.
+    fn place(&mut self, arrival: Arrival, baud: u32) -> Arrival {
+        let Some(last) = self.last else { return arrival };
+        let scaled = |span: Nanos| (span as f64 * self.speed) as Nanos;
+        let byte_ns = scaled(line_time(1, baud));
+        // Several bytes seen at once came one after the other: each leaves less for the next.
+        let least = if self.is_strict { scaled(MIN_GAP) } else { 0 };
+        let soonest = last.not_before + byte_ns + least;
+        let latest = last.not_after + byte_ns + scaled(MAX_GAP);
+        if arrival.not_before > latest {
+            if !self.bytes.is_empty() {
+                self.dropped = Some(Dropped::LongGap { after: self.bytes.len() });
+            }
+            self.forget();
+            return arrival;
+        }
+        let is_host_s = self.is_strict && !self.bytes.is_empty();
+        if is_host_s && soonest > arrival.not_after {
+            self.broken = true;
+            return arrival;
+        }
+        // Else a UART keeps it until it is through with the one before.
+        let carried = if is_host_s { 0 } else { last.not_after + byte_ns };
+        Arrival {
+            not_before: arrival.not_before.max(soonest),
+            not_after: arrival.not_after.max(carried).min(latest),
+        }
+    }
+
+    fn forget(&mut self) -> Vec<u8> {
         self.broken = false;
+        std::mem::take(&mut self.bytes)
     }
 }
 
@@ -92,8 +154,8 @@ mod tests {
     use super::*;
     use lms::command::Request;
 
-    /// Whether a status request is heard whose bytes are known to come with `gap` of idle time between them.
-    fn heard(ear: &mut Ear, start: Nanos, gap: Nanos, width: Nanos) -> bool {
+    /// When a status request is heard whose bytes are known to come with `gap` of idle time between them.
+    fn heard_at(ear: &mut Ear, start: Nanos, gap: Nanos, width: Nanos) -> Option<Nanos> {
         let request = Request::Status.encode(0);
         let step = line_time(1, 9_600) + gap;
         let mut heard = None;
@@ -102,11 +164,78 @@ mod tests {
             let arrival = Arrival { not_before: at.saturating_sub(width), not_after: at + width };
             heard = heard.or(ear.hear(byte, arrival, 9_600));
         }
-        heard.as_deref() == Some(request.bytes())
+        heard.filter(|heard| heard.bytes == request.bytes()).map(|heard| heard.at)
+    }
+
+    fn heard(ear: &mut Ear, start: Nanos, gap: Nanos, width: Nanos) -> bool {
+        heard_at(ear, start, gap, width).is_some()
+    }
+
+    /// When a status request is heard that is written at once at `start`.
+    fn written_at_once(ear: &mut Ear, start: Nanos, baud: u32) -> Option<Nanos> {
+        let request = Request::Status.encode(0);
+        let heard =
+            request.bytes().iter().filter_map(|&byte| ear.hear(byte, Arrival::at(start), baud)).last();
+        heard.filter(|heard| heard.bytes == request.bytes()).map(|heard| heard.at)
     }
 
     #[test]
-    fn gaps_decide_whether_a_request_is_heard() {
+    fn what_is_written_at_once_is_heard_when_the_line_has_carried_it() {
+        let mut ear = Ear::new(1.0, false);
+        for (round, baud) in [9_600, 19_200, 38_400, 500_000].repeat(25).into_iter().enumerate() {
+            let start = (round as Nanos + 1) * 1_000 * MILLIS;
+            assert_eq!(written_at_once(&mut ear, start, baud), Some(start + 6 * line_time(1, baud)));
+            // As some drivers do: 55 us from one byte to the next, whatever the rate.
+            let request = Request::Stop.encode(0);
+            let bytes = request.bytes().iter().enumerate();
+            let at = |i: usize| Arrival::at(start + 500 * MILLIS + i as Nanos * 55 * MICROS);
+            assert!(bytes.filter_map(|(i, &byte)| ear.hear(byte, at(i), baud)).count() == 1);
+        }
+        assert_eq!(ear.take_dropped(), None);
+    }
+
+    #[test]
+    fn a_second_request_waits_for_the_first_one_to_leave() {
+        let mut ear = Ear::new(1.0, false);
+        let byte_ns = line_time(1, 9_600);
+        assert_eq!(written_at_once(&mut ear, 0, 9_600), Some(6 * byte_ns));
+        assert_eq!(written_at_once(&mut ear, 0, 9_600), Some(13 * byte_ns));
+        // Noise takes its time too.
+        ear.hear(0xFF, Arrival::at(0), 9_600);
+        assert_eq!(written_at_once(&mut ear, 0, 9_600), Some(21 * byte_ns));
+    }
+
+    #[test]
+    fn a_long_gap_drops_a_request() {
+        for (gap, width, expected) in [
+            (0, 0, true),
+            (54 * MICROS, 0, true),
+            (6 * MILLIS, 0, true),
+            (6 * MILLIS + MICROS, 0, false),
+            // Nothing is proved by bytes that may have come long before they were seen.
+            (6_100 * MICROS, MILLIS, true),
+        ] {
+            let mut ear = Ear::new(1.0, false);
+            assert_eq!(heard(&mut ear, 1_000 * MILLIS, gap, width), expected, "{gap} {width}");
+            assert_eq!(ear.take_dropped(), (!expected).then_some(Dropped::LongGap { after: 1 }), "{gap}");
+            assert!(heard(&mut ear, 2_000 * MILLIS, 100 * MICROS, 0), "not heard again after {gap}");
+            assert_eq!(ear.take_dropped(), None);
+        }
+        // What was written at once is on the line for as long as that takes, and the gap begins behind it.
+        let request = Request::Status.encode(0);
+        let (head, tail) = request.bytes().split_at(4);
+        let byte_ns = line_time(1, 9_600);
+        for (pause, expected) in [(4 * byte_ns + 6 * MILLIS, true), (4 * byte_ns + 6 * MILLIS + 1, false)] {
+            let mut ear = Ear::new(1.0, false);
+            assert!(head.iter().all(|&byte| ear.hear(byte, Arrival::at(0), 9_600).is_none()));
+            let heard = tail.iter().filter_map(|&byte| ear.hear(byte, Arrival::at(pause), 9_600)).count();
+            assert_eq!(heard == 1, expected, "{pause}");
+            assert_eq!(ear.take_dropped(), (!expected).then_some(Dropped::LongGap { after: 4 }));
+        }
+    }
+
+    #[test]
+    fn short_gaps_decide_for_a_strict_sensor() {
         for (gap, width, expected) in [
             (55 * MICROS, 0, true),
             (54 * MICROS, 0, false),
@@ -119,8 +248,10 @@ mod tests {
             (0, 100 * MICROS, false),
             (6_100 * MICROS, MILLIS, true),
         ] {
-            let mut ear = Ear::new(1.0);
+            let mut ear = Ear::new(1.0, true);
             assert_eq!(heard(&mut ear, 1_000 * MILLIS, gap, width), expected, "{gap} {width}");
+            let dropped = if gap < MIN_GAP { Dropped::ShortGap } else { Dropped::LongGap { after: 1 } };
+            assert_eq!(ear.take_dropped(), (!expected).then_some(dropped), "{gap} {width}");
             assert!(heard(&mut ear, 2_000 * MILLIS, 100 * MICROS, 0), "not heard again after {gap}");
         }
     }
@@ -130,7 +261,7 @@ mod tests {
         let request = Request::Status.encode(0);
         let least = 6 * (line_time(1, 9_600) + MIN_GAP);
         for (window, expected) in [(least, true), (least - 1, false)] {
-            let mut ear = Ear::new(1.0);
+            let mut ear = Ear::new(1.0, true);
             let arrival = Arrival { not_before: 5 * MILLIS, not_after: 5 * MILLIS + window };
             let heard = request.bytes().iter().filter_map(|&byte| ear.hear(byte, arrival, 9_600)).count();
             assert_eq!(heard == 1, expected, "{window}");
@@ -138,9 +269,18 @@ mod tests {
     }
 
     #[test]
+    fn what_was_spaced_and_is_read_late_is_not_spaced_again() {
+        let mut ear = Ear::new(1.0, false);
+        let arrival = Arrival { not_before: 5 * MILLIS, not_after: 25 * MILLIS };
+        let request = Request::Status.encode(0);
+        let heard = request.bytes().iter().filter_map(|&byte| ear.hear(byte, arrival, 9_600)).last();
+        assert_eq!(heard.map(|heard| heard.at), Some(25 * MILLIS));
+    }
+
+    #[test]
     fn the_host_keeps_its_own_time() {
         // Four times as fast: 240 us of machine time are 60 us of the host's.
-        let mut ear = Ear::new(4.0);
+        let mut ear = Ear::new(4.0, true);
         let request = Request::Stop.encode(0);
         let mut heard = None;
         for (i, &byte) in request.bytes().iter().enumerate() {
@@ -152,15 +292,18 @@ mod tests {
 
     #[test]
     fn noise_before_a_request_is_passed_over() {
-        let mut ear = Ear::new(1.0);
-        for byte in [0x00, 0xFF, 0x06] {
-            assert_eq!(ear.hear(byte, Arrival::at(0), 9_600), None);
+        for is_strict in [false, true] {
+            let mut ear = Ear::new(1.0, is_strict);
+            for byte in [0x00, 0xFF, 0x06] {
+                assert_eq!(ear.hear(byte, Arrival::at(0), 9_600), None);
+            }
+            assert!(heard(&mut ear, 100 * MILLIS, 100 * MICROS, 0));
+            // A length that cannot be is given up at once.
+            for (i, byte) in [STX, 0, 0xFF, 0xFF].into_iter().enumerate() {
+                assert_eq!(ear.hear(byte, Arrival::at(200 * MILLIS + i as Nanos * 2 * MILLIS), 9_600), None);
+            }
+            assert!(heard(&mut ear, 210 * MILLIS, 100 * MICROS, 0));
+            assert_eq!(ear.take_dropped(), None);
         }
-        assert!(heard(&mut ear, 100 * MILLIS, 100 * MICROS, 0));
-        // A length that cannot be is given up at once.
-        for (i, byte) in [STX, 0, 0xFF, 0xFF].into_iter().enumerate() {
-            assert_eq!(ear.hear(byte, Arrival::at(200 * MILLIS + i as Nanos * 2 * MILLIS), 9_600), None);
-        }
-        assert!(heard(&mut ear, 210 * MILLIS, 100 * MICROS, 0));
     }
 }

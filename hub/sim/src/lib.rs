@@ -34,6 +34,6 @@ mod view;
 pub mod wire;
 pub mod world;
 
-pub use ear::Arrival;
+pub use ear::{Arrival, Dropped};
 pub use simulate::{Ready, simulate};
 pub use transmission::ChunkSize;

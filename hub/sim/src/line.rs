@@ -96,6 +96,9 @@ impl Line<'_> {
                 };
                 for &byte in &buffer[..count] {
                     self.wire.receive(&mut self.machine, byte, arrival);
+                    if let Some(dropped) = self.machine.take_dropped() {
+                        tracing::warn!("{}: {dropped}", self.port.display());
+                    }
                 }
             }
             if count == 0 {
@@ -191,6 +194,6 @@ const MOST_LATE_NS: Nanos = 100 * MILLIS;
 /// A byte may lie in the kernel for so long before it can be read: a worker thread carries it over.
 const PTY_DELAY_NS: Nanos = 2 * MILLIS;
 /// How often the port is looked at even if nothing happens: nothing announces that it was opened, and how well it is
-/// known when a byte came depends on it. At 9600, where every host begins, this proves that a request was written
-/// without gaps.
+/// known when a byte came depends on it. At 9600, where every host begins, this proves to a strict sensor that a request
+/// was written without gaps.
 const LOOK_NS: Nanos = 4 * MILLIS;

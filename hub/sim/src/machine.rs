@@ -12,7 +12,7 @@ use lms::variant::{Baud, MIRROR_TURN, Variant};
 use lms::{MILLIS, Nanos};
 
 use crate::answer::{After, Answer};
-use crate::ear::{Arrival, Ear};
+use crate::ear::{Arrival, Dropped, Ear, Heard};
 use crate::eeprom::Eeprom;
 use crate::operating::{Operating, Shot};
 use crate::source::Source;
@@ -98,7 +98,7 @@ impl Machine {
             operating: Operating::OnRequest,
             variant: settings.variant,
             baud: settings.baud,
-            ear: Ear::new(settings.speed),
+            ear: Ear::new(settings.speed, settings.habits.strict_gap),
             random: fastrand::Rng::with_seed(settings.seed),
             habits: fastrand::Rng::with_seed(!settings.seed),
             settings,
@@ -136,6 +136,7 @@ impl Machine {
 
     /// From now on it behaves like this.
     pub fn set_habits(&mut self, habits: Habits) {
+        self.ear.is_strict = habits.strict_gap;
         self.settings.habits = habits;
     }
 
@@ -169,12 +170,12 @@ impl Machine {
         if arrival.not_after < self.started_ns {
             return;
         }
-        let Some(bytes) = self.ear.hear(byte, arrival, self.baud.rate()) else { return };
+        let Some(Heard { bytes, at }) = self.ear.hear(byte, arrival, self.baud.rate()) else { return };
         let is_mine = bytes[1] == 0 || bytes[1] == self.settings.address;
         if !is_mine || self.settings.habits.mute || self.chance(self.settings.habits.overlooks) {
             return;
         }
-        let free_ns = self.interrupt(arrival.not_after);
+        let free_ns = self.interrupt(at);
         let late_ns = self.settings.habits.late_acknowledge_ns;
         let first_ns = free_ns + late_ns + self.random.u64(2 * MILLIS..8 * MILLIS);
         let request = Telegram::check(&bytes).filter(|_| !self.chance(self.settings.habits.naks));
@@ -192,6 +193,11 @@ impl Machine {
             let again_ns = end_ns + self.habits.u64(..20 * MILLIS);
             self.send(reply, again_ns, Tag::Reply { late, after: After::Nothing });
         }
+    }
+
+    /// The last request that it dropped for its gaps, told once.
+    pub fn take_dropped(&mut self) -> Option<Dropped> {
+        self.ear.take_dropped()
     }
 
     /// The next bytes that are through at `now`.
@@ -288,7 +294,7 @@ impl Machine {
         self.scans = 0;
         self.partials = 0;
         self.started_ns = now + self.settings.boot_ns;
-        self.ear = Ear::new(self.settings.speed);
+        self.ear = Ear::new(self.settings.speed, self.settings.habits.strict_gap);
         self.send(self.banner(), self.started_ns, Tag::Reply { late: false, after: After::Nothing });
     }
 

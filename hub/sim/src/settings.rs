@@ -105,6 +105,11 @@ pub struct Habits {
     /// Whether it refuses in installation mode to measure, with 92h: the monitoring mode is wanted first (Telegram listing
     /// 6.3.2; its table 7-1 allows it).
     pub strict: bool,
+    /// Whether it drops requests whose bytes come less than 55 us apart (Telegram listing 4.3), which most hosts leave to
+    /// their UART.
+    pub strict_gap: bool,
+    /// How long it thinks between each ACK and its reply; 0: as long as real ones did, by chance.
+    pub answer_ns: Nanos,
     /// Commands that it refuses with 92h.
     pub refuses: Vec<u8>,
     /// Whether it answers nothing at all. A stream goes on.

@@ -78,9 +78,9 @@ pub struct Truth {
 }
 
 impl Truth {
-    /// Makes or empties the file at `path`.
+    /// Makes or empties the file at `path`; [`Kind::Output`] if that cannot be.
     pub fn create(path: &Path) -> Result<Self, Failure> {
-        let file = File::create(path).map_err(|error| failure(path, &error))?;
+        let file = File::create(path).map_err(|error| failure(Kind::Output, path, &error))?;
         Ok(Truth { path: path.to_owned(), file: Mutex::new(file) })
     }
 
@@ -88,13 +88,14 @@ impl Truth {
     pub fn write(&self, line: &str) -> Result<(), Failure> {
         // A thread that panicked with the lock wrote its line or not: either way the next one begins a new line.
         let mut file = self.file.lock().unwrap_or_else(std::sync::PoisonError::into_inner);
-        file.write_all(format!("{line}\n").as_bytes()).map_err(|error| failure(&self.path, &error))
+        file.write_all(format!("{line}\n").as_bytes())
+            .map_err(|error| failure(Kind::Failed, &self.path, &error))
     }
 }
 
-fn failure(path: &Path, error: &std::io::Error) -> Failure {
+fn failure(kind: Kind, path: &Path, error: &std::io::Error) -> Failure {
     Failure::new(
-        Kind::Failed,
+        kind,
         format!("cannot write the truth to {}: {error}", path.display()),
         "give a path in a directory that exists and is writable",
     )

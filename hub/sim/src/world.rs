@@ -8,7 +8,7 @@ use std::path::Path;
 use std::str::FromStr;
 use std::sync::Arc;
 
-use schema::{Failure, Kind};
+use schema::{Failure, Kind, regular};
 
 use crate::layers::Layers;
 use crate::scene::Scene;
@@ -88,7 +88,7 @@ impl FromStr for World {
 
     /// The world of this name, else of this file.
     ///
-    /// [`Kind::Configuration`] if it is neither, or if the file is wrong: then with the place and a remedy.
+    /// [`Kind::Input`] if it is neither; [`Kind::Configuration`] if the file is wrong: with the place and a remedy.
     fn from_str(text: &str) -> Result<World, Failure> {
         match text {
             "empty" => Ok(World::Empty),
@@ -103,9 +103,9 @@ impl FromStr for World {
 }
 
 fn read(path: &str) -> Result<String, Failure> {
-    std::fs::read_to_string(Path::new(path)).map_err(|error| {
+    regular::read_text(Path::new(path), regular::LONGEST).map_err(|error| {
         let names: Vec<_> = World::names().collect();
         let message = format!("world {path:?} is not known, and as a file: {error}");
-        Failure::new(Kind::Configuration, message, format!("a TOML file, or one of: {}", names.join(", ")))
+        Failure::new(Kind::Input, message, format!("a TOML file, or one of: {}", names.join(", ")))
     })
 }

@@ -24,9 +24,9 @@ pub(super) fn ensure(prefix: &str) -> Result<(), Failure> {
     let path = path(prefix);
     loop {
         match Segment::at(&path) {
-            Some(segment) if segment.is_foreign() => return Err(in_the_way(&segment)),
-            // The library would wait for ever for the rest of it.
-            Some(segment) if segment.bytes != CONTENT.len() as u64 => remove(prefix),
+            Some(segment) if !segment.is_own() => return Err(in_the_way(&segment)),
+            // The library's own, or one for the rest of which it would wait for ever.
+            Some(segment) if segment.is_foreign() || segment.bytes != CONTENT.len() as u64 => remove(prefix),
             Some(_) => return Ok(()),
             None => make(&path)?,
         }
@@ -114,6 +114,10 @@ mod tests {
         let counted = files();
         ensure(&prefix).unwrap();
         let kept = (files(), Segment::at(&path(&prefix)).map(|it| it.mode));
+        remove(&prefix);
+        drop(join());
+        ensure(&prefix).unwrap();
+        let closed = Segment::at(&path(&prefix)).map(|it| it.mode);
         fs::write(path(&prefix), "cut").unwrap();
         ensure(&prefix).unwrap();
         let mended = files();
@@ -128,5 +132,6 @@ mod tests {
         assert_eq!((theirs, mode), (content(1), Some(0o666)), "another version of the library");
         assert_eq!((removed, ours, &counted), (vec![], content(0), &content(1)));
         assert_eq!((kept, mended), ((counted, Some(0o600)), content(0)));
+        assert_eq!(closed, Some(0o600), "the library's own, which is open to all, does not stay");
     }
 }

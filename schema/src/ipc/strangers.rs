@@ -43,9 +43,14 @@ impl Segment {
         }
     }
 
-    /// It is another user's, or others may write to it, or it is no file.
+    /// It is a file of this user.
+    pub(super) fn is_own(&self) -> bool {
+        self.owner == rustix::process::geteuid().as_raw() && self.is_file
+    }
+
+    /// It is no file of this user, or others may write to it.
     pub(super) fn is_foreign(&self) -> bool {
-        self.owner != rustix::process::geteuid().as_raw() || self.mode & 0o022 != 0 || !self.is_file
+        !self.is_own() || self.mode & 0o022 != 0
     }
 }
 

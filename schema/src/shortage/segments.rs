@@ -59,6 +59,11 @@ pub fn sensor_bytes(topics: &[Topic]) -> u64 {
     topics.iter().map(chunk).sum::<usize>() as u64 + services
 }
 
+/// Bytes of the longest segment of any topic.
+pub fn longest_segment() -> u64 {
+    Topic::ALL.iter().map(|&topic| sensor_bytes(&[topic])).max().unwrap_or_default()
+}
+
 /// What the shared-memory library puts before each sample, rounded up.
 const CHUNK_HEADER: usize = 64;
 /// The list of ports and processes of one service, rounded up.

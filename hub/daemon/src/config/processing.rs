@@ -6,7 +6,7 @@ use std::path::PathBuf;
 use lms::variant::{Unit, Variant};
 use preprocess::background::Settings as Learning;
 use preprocess::{marks, zones};
-use schema::{Failure, Kind, Pose, SavedModel};
+use schema::{Failure, Kind, Pose, SavedModel, regular};
 
 /// What is made of the scans of one link.
 #[derive(Clone, Debug, Default, PartialEq)]
@@ -106,7 +106,7 @@ impl Background {
             let message = format!("link {sensor}: background.start = {place}: {what}");
             Err(Failure::new(Kind::Configuration, message, hint))
         };
-        let text = match std::fs::read(file) {
+        let text = match regular::read(file, regular::LONGEST) {
             Ok(text) => text,
             Err(error) => return refuse(error.to_string(), START),
         };

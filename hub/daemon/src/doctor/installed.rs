@@ -5,6 +5,8 @@ use std::fs;
 use std::io::ErrorKind;
 use std::path::{Path, PathBuf};
 
+use schema::regular;
+
 use super::finding::Finding;
 use super::program::{Build, VERSION, compare};
 use super::system::System;
@@ -66,7 +68,7 @@ pub(crate) fn rules(system: &System, there: &[Candidate]) -> Finding {
         return Finding::skipped(NAME, "no rule installed; hub/dist/install.sh puts it in place");
     };
     let at = path.display();
-    match fs::read_to_string(&path) {
+    match regular::read_text(&path, regular::LONGEST) {
         Ok(text) if text == TEXT => {}
         Ok(_) => {
             let text = format!("{at} is not that of this version");
@@ -104,7 +106,7 @@ fn program(system: &System, unit: &Path) -> Option<PathBuf> {
     let directories: Vec<String> = UNITS.iter().map(|place| format!("{place}/{UNIT}.d")).collect();
     let mut program = None;
     for path in std::iter::once(unit.to_owned()).chain(system.drop_ins(&directories)) {
-        let text = fs::read_to_string(path).unwrap_or_default();
+        let text = regular::read_text(&path, regular::LONGEST).unwrap_or_default();
         for line in text.lines() {
             let Some(said) = line.trim().strip_prefix("ExecStart=") else { continue };
             // Empty it takes back what stood before; signs in front of the path say how it is started.

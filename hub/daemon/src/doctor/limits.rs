@@ -1,7 +1,6 @@
 //! What the system lets a process have: descriptors, and files as long as the hub's segments.
 
-use schema::Topic;
-use schema::shortage::sensor_bytes;
+use schema::shortage::longest_segment;
 
 use super::finding::Finding;
 use super::machine::Facts;
@@ -27,7 +26,7 @@ pub(crate) fn descriptors(facts: &Facts) -> Finding {
 pub(crate) fn file_size(facts: &Facts) -> Finding {
     const NAME: &str = "file-size";
     let Some(limit) = facts.file_size else { return Finding::ok(NAME, "no limit") };
-    let longest = Topic::ALL.iter().map(|&topic| sensor_bytes(&[topic])).max().unwrap_or_default();
+    let longest = longest_segment();
     let text = format!("{} kB at most; the longest segment has {} kB", limit / 1024, longest / 1024);
     if limit >= longest {
         return Finding::ok(NAME, text);

@@ -1,6 +1,8 @@
 //! Whether the hub's shared memory outlives its user's logging out: logind takes what an ordinary user has in /dev/shm
 //! away with the last session, under the feet of a hub that goes on (logind.conf(5), RemoveIPC=).
 
+use schema::regular;
+
 use super::finding::Finding;
 use super::system::System;
 
@@ -41,7 +43,7 @@ fn removes_ipc(system: &System) -> (bool, String) {
     let files = first.into_iter().chain(system.drop_ins(&directories));
     let mut found = (true, "the default".to_owned());
     for path in files {
-        let text = std::fs::read_to_string(&path).unwrap_or_default();
+        let text = regular::read_text(&path, regular::LONGEST).unwrap_or_default();
         if let Some(said) = said(&text) {
             found = (said, path.display().to_string());
         }

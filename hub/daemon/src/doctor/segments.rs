@@ -28,11 +28,17 @@ pub(crate) fn files(prefix: &str, user: u32) -> Vec<Segment> {
     files
 }
 
-/// Those of them that no process has open or mapped.
+/// Those of them that no process has open or mapped. The library's lock is never held open: it is that of whoever holds
+/// another file whose name begins like its own, in a domain of this name at another place.
 pub(crate) fn unheld(prefix: &str, user: u32) -> Vec<Segment> {
-    let mut files = files(prefix, user);
-    files.retain(|file| is_unheld(&file.path));
-    files
+    let files = files(prefix, user);
+    let (free, held): (Vec<_>, Vec<_>) = files.into_iter().partition(|file| is_unheld(&file.path));
+    let domain = |file: &Segment| {
+        let name = file.path.file_name().unwrap_or_default().to_string_lossy().into_owned();
+        name.get(..prefix.len() + RANDOM).map(str::to_owned)
+    };
+    let is_used = |file: &Segment| held.iter().any(|other| domain(other) == domain(file));
+    free.into_iter().filter(|file| file.bytes > ALWAYS_LEFT || !is_used(file)).collect()
 }
 
 /// Those of them that are worth a word: each end of a hub leaves a very short one.
@@ -49,6 +55,8 @@ pub(crate) fn lock(prefix: &str, user: u32) -> Option<PathBuf> {
     files.into_iter().map(|file| file.path).find(|path| is_alone && is_unheld(path))
 }
 
+/// Letters that the names of each domain have behind its own name (docs/topics.md, "Domain").
+const RANDOM: usize = 6;
 /// One lock of the library's is never removed, and has 16 bytes.
 const ALWAYS_LEFT: u64 = 16;
 
@@ -68,6 +76,18 @@ mod tests {
         let short = PathBuf::from(format!("{SHARED_MEMORY}/{prefix}b"));
         fs::write(&short, "16 bytes are few").unwrap();
         let beside = lock(&prefix, user);
+        let of_one_that_lives = {
+            let other = [format!("{prefix}abcde_data"), format!("{prefix}abcde_lock")];
+            let [data, counter] = other.map(|name| PathBuf::from(format!("{SHARED_MEMORY}/{name}")));
+            let held = fs::File::create_new(&data).unwrap();
+            held.set_len(64).unwrap();
+            fs::write(&counter, "16 bytes are few").unwrap();
+            let is_spared = !unheld(&prefix, user).iter().any(|file| file.path == counter);
+            drop(held);
+            let is_left = unheld(&prefix, user).iter().any(|file| file.path == counter);
+            [data, counter].iter().for_each(|path| fs::remove_file(path).unwrap());
+            (is_spared, is_left)
+        };
         let (closed, other) = (abandoned(&prefix, user), abandoned(&prefix, user + 1));
         let all = (files(&prefix, user).len(), unheld(&prefix, user).len());
         fs::remove_file(&path).unwrap();
@@ -76,5 +96,6 @@ mod tests {
         assert_eq!((open, other), (Vec::new(), Vec::new()));
         assert_eq!(closed, [Segment { path, bytes: 64 }]);
         assert_eq!(all, (2, 2));
+        assert_eq!(of_one_that_lives, (true, true));
     }
 }

@@ -5,6 +5,7 @@ use std::fs;
 use std::path::{Path, PathBuf};
 
 use rustix::process::getuid;
+use schema::regular;
 
 /// The files of a machine, and who looks at them.
 #[derive(Clone, Debug)]
@@ -37,7 +38,7 @@ impl System {
 
     /// What stands in a file, if it can be read.
     pub(crate) fn text(&self, path: &str) -> Option<String> {
-        fs::read_to_string(self.path(path)).ok()
+        regular::read_text(&self.path(path), regular::LONGEST).ok()
     }
 
     /// `name` in the first of `directories` that has it, be it a symlink to nothing.

@@ -1,11 +1,11 @@
 //! Plays telegrams that are known to be whole: each comes once, in order, bit for bit, with what was known of it when it
 //! was recorded. Silences are those of the recording, however fast it is played.
 
-use lms::Nanos;
 use lms::measured::Measured;
 use lms::session::Received;
 use lms::telegram::Telegram;
 use lms::variant::{Mode, Variant};
+use lms::{Nanos, SILENCE};
 use recording::Frame;
 use schema::{Flags, Header, State, Wake, Zones};
 
@@ -17,6 +17,8 @@ use crate::publish::{self, Past};
 /// What the last scan left.
 #[derive(Clone, Copy)]
 struct Verdict {
+    /// Media time of that scan.
+    of: Nanos,
     /// Until when it stands, by the clock of the recording, and as media time.
     until_ns: Nanos,
     until: Nanos,
@@ -61,7 +63,10 @@ pub(super) fn play(
                 let due = turns.wait(link, None, silence.until.clamp(play.start_ns, turn), state)?;
                 link.topics.stale(&mut link.pipeline, due.at);
                 link.wake(Wake::Status);
-                state = State::Silent;
+                // A scan that was lost on the line makes the verdict old, and the sensor not silent.
+                if turn.saturating_sub(silence.of) >= SILENCE.max(silence.until - silence.of) {
+                    state = State::Silent;
+                }
             }
         }
         // Another life of the hub, which knew nothing at its start.
@@ -137,7 +142,7 @@ fn stands(header: &Header, media: Nanos) -> Verdict {
     let published = header.stamp_last_ns.saturating_add(header.hub_time_ns().unwrap_or(0));
     let until_ns = published.saturating_add(publish::limit(header.period_us));
     let after = until_ns.saturating_sub(header.stamp_first_ns);
-    Verdict { until_ns, until: media.saturating_add(after) }
+    Verdict { of: media, until_ns, until: media.saturating_add(after) }
 }
 
 /// Whether the verdict was over when the telegram of `header` came.

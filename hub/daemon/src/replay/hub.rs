@@ -4,6 +4,7 @@
 use std::path::Path;
 use std::sync::Arc;
 
+use lms::Nanos;
 use recording::Recording;
 use schema::{Failure, Kind, check_sensor};
 
@@ -33,7 +34,8 @@ pub struct Replay<'a> {
 /// it, or SIGINT or SIGTERM; `on_ready` is called once, when all topics exist, before the first telegram. How far it
 /// came.
 ///
-/// [`Kind::Configuration`] if the recording or the configuration cannot be read or do not go together, and whatever
+/// [`Kind::Input`] if the recording cannot be read, [`Kind::NoTopic`] if it has no such sensor, [`Kind::Usage`] if it ends
+/// before it shall start, [`Kind::Configuration`] if it and the configuration do not go together, and whatever
 /// [`run`](crate::run) fails with.
 pub fn replay(
     replay: &Replay<'_>,
@@ -63,14 +65,29 @@ pub fn replay(
         parts.iter_mut().for_each(|part| part.set_origin(origin));
     }
     let length = parts.iter().filter_map(Recorded::length).max();
+    let start_ns = replay.play.start_ns;
+    if length.is_some_and(|length| start_ns > length) {
+        // By wall clocks, of which one may have been set: all of it is read to be sure.
+        let mut ends = Vec::with_capacity(links);
+        for part in &parts {
+            ends.push(part.end()?);
+        }
+        let end = ends.into_iter().max().unwrap_or(0);
+        if start_ns > end {
+            return Err(behind_the_end(file, start_ns, end));
+        }
+    }
     let player = Arc::new(Player::new(replay.play, links, length)?);
     let troupe = Troupe { player: &player, parts, holds: replay.holds };
     supervise::serve(&read, config, Some(troupe), domain, |ready| on_ready(ready, &player))?;
-    let played = player.progress();
-    if played.is_over && played.telegrams == 0 && replay.play.start_ns > 0 {
-        tracing::warn!("nothing was published: {} ends before --start", file.display());
-    }
-    Ok(played)
+    Ok(player.progress())
+}
+
+fn behind_the_end(file: &Path, start_ns: Nanos, end_ns: Nanos) -> Failure {
+    let [start_s, end_s] = [start_ns, end_ns].map(|ns| ns as f64 / 1e9);
+    let message =
+        format!("--start {start_s} s is behind the end of {}, which lasts {end_s:.3} s", file.display());
+    Failure::new(Kind::Usage, message, "it counts from the first telegram")
 }
 
 /// A sensor that is played.
@@ -85,7 +102,7 @@ fn sensors(recording: &Recording, wanted: Option<&str>) -> Result<Vec<Sensor>, F
     let names = &recording.contents().sensors;
     if names.is_empty() {
         let link = wanted.unwrap_or(UNNAMED).to_owned();
-        check_sensor(&link)?;
+        check_sensor(&link).map_err(|failure| Failure { kind: Kind::Usage, ..failure })?;
         return Ok(vec![Sensor { recorded: None, link }]);
     }
     if let Some(wanted) = wanted {
@@ -98,7 +115,7 @@ fn sensors(recording: &Recording, wanted: Option<&str>) -> Result<Vec<Sensor>, F
         check_sensor(&sensor.link)?;
         if sensors[..at].iter().any(|other| other.link == sensor.link) {
             let message = format!("two sensors of the recording would be called {}", sensor.link);
-            return Err(Failure::new(Kind::Configuration, message, "play one of them: --sensor NAME"));
+            return Err(Failure::new(Kind::Usage, message, "play one of them: --sensor NAME"));
         }
     }
     Ok(sensors)

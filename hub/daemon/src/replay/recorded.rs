@@ -9,7 +9,7 @@ use lms::reply::Reply;
 use lms::telegram::Telegram;
 use lms::variant::{Mode, Unit, Variant};
 use recording::{Encoding, Form, Frame, Recording};
-use schema::{Failure, Header};
+use schema::{Failure, Header, Kind};
 
 use super::{LONGEST_GAP, period};
 use crate::config::Link;
@@ -51,13 +51,16 @@ pub(crate) struct Origin {
 impl Recorded {
     /// Opens the recording at `path`: of several sensors the one that has the name of `link`.
     ///
-    /// [`schema::Kind::Configuration`] if it cannot be read, or has other sensors. A file without a telegram is a line
+    /// [`Kind::Input`] if it cannot be read, [`Kind::Configuration`] if it has other sensors. A file without a telegram is a line
     /// that only brings noise.
     pub(crate) fn open(path: &Path, link: &Link) -> Result<Recorded, Failure> {
         let recording = Recording::open_line(path)?;
         tell_of_damage(&recording);
         if recording.contents().sensors.len() > 1 {
-            return Recorded::new(recording.of(&link.name)?, link);
+            // Its name is configured, and not a word of somebody who asks.
+            let part = recording.of(&link.name);
+            let part = part.map_err(|failure| Failure { kind: Kind::Configuration, ..failure })?;
+            return Recorded::new(part, link);
         }
         Recorded::new(recording, link)
     }
@@ -121,6 +124,17 @@ impl Recorded {
         match (contents.span, self.begin_ns()) {
             (Some((_, last_ns)), Some(begin_ns)) => Some(last_ns.saturating_sub(begin_ns)),
             _ => Some(contents.scans.saturating_sub(1) * period(contents.variant)),
+        }
+    }
+
+    /// Media time of its last telegram, for which all of it is read where it has stamps.
+    pub(crate) fn end(&self) -> Result<Nanos, Failure> {
+        match self {
+            Recorded::Frames(frames) if frames.has_stamps() => {
+                let mut timeline = frames.timeline();
+                Ok(frames.read()?.map(|frame| timeline.media(&frame)).last().unwrap_or(0))
+            }
+            _ => Ok(self.length().unwrap_or(0)),
         }
     }
 }

@@ -71,7 +71,7 @@ pub fn encode(options: &EncodeOptions, out: &mut dyn Write) -> Result<(), Failur
                 words: Headline(telegram).to_string(),
                 raw: hex.concat().to_lowercase(),
             };
-            let line = serde_json::to_string(&line).unwrap_or_default();
+            let line = schema::json_line(serde_json::to_string(&line).unwrap_or_default());
             out.write_all(format!("{line}\n").as_bytes())
         }
         (false, true) => out.write_all(encoded.bytes()),

@@ -3,6 +3,8 @@
 
 use std::io::{self, ErrorKind, Read};
 
+use recording::Recording;
+
 /// Where bytes come from, piece by piece.
 pub(super) struct Input {
     reader: Box<dyn Read>,
@@ -13,11 +15,15 @@ pub(super) struct Input {
 }
 
 impl Input {
-    /// Reads the first piece, to see what it is.
+    /// Reads the first piece, to see what it is. [`ErrorKind::Unsupported`] if it has telegrams inside something else.
     pub(super) fn new(reader: Box<dyn Read>) -> io::Result<Input> {
         let mut input = Input { reader, buffer: vec![0; PIECE], ahead: 0, is_text: false };
         input.ahead = input.read()?;
         let head = &input.buffer[..input.ahead];
+        if Recording::is_framed(head) {
+            let what = "telegrams inside MCAP or gzip cannot be read from a pipe";
+            return Err(io::Error::new(ErrorKind::Unsupported, what));
+        }
         input.is_text =
             !head.is_empty() && head.iter().all(|byte| byte.is_ascii_graphic() || byte.is_ascii_whitespace());
         Ok(input)

@@ -7,6 +7,7 @@ use lms::explain::{Field, Headline, Value, explain};
 use lms::reply::Reply;
 use lms::telegram::{REPLY, Telegram};
 use lms::variant::Mode;
+use schema::Printable;
 use serde::Serialize;
 
 use super::find::Item;
@@ -158,13 +159,13 @@ impl<'o> Show<'o> {
         if matches!(item, Item::Broken { .. } | Item::Cut { .. } | Item::Other(_)) {
             self.account.bytes_discarded += bytes.len() as u64;
         }
-        let mut text = match self.form {
+        let text = match self.form {
             Form::Json => {
                 if let Item::Telegram(telegram) = item {
                     explain(telegram, self.mode, &mut |field| line.fields.push(json(field)));
                 }
                 line.raw = bytes.iter().map(|byte| format!("{byte:02x}")).collect();
-                serde_json::to_string(&line)?
+                schema::json_line(serde_json::to_string(&line)?)
             }
             Form::Text { all } => {
                 let mut text = format!("{offset:>8}  {:4} bytes  {}", line.length, line.words);
@@ -180,8 +181,7 @@ impl<'o> Show<'o> {
                 text
             }
         };
-        text.push('\n');
-        self.out.write_all(text.as_bytes())
+        self.out.write_all(format!("{}\n", Printable(&text)).as_bytes())
     }
 
     /// Writes what there was in all.

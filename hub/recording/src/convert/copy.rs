@@ -4,7 +4,6 @@
 use std::collections::BTreeMap;
 use std::io::{self, Write};
 
-use mcap::parse_record;
 use mcap::records::{Record as Parsed, op};
 use schema::file::{METADATA, Writer};
 use schema::{Failure, Topic};
@@ -12,7 +11,7 @@ use schema::{Failure, Topic};
 use super::{CHUNK, Written};
 use crate::Recording;
 use crate::mcap::reader::Item;
-use crate::mcap::{Originals, Record, message};
+use crate::mcap::{Originals, Record, message, parse};
 
 /// Copies `recording` into `file`; `count` hears of each telegram.
 pub(super) fn copy(
@@ -66,13 +65,13 @@ impl<W: Write> Copy<'_, W> {
     fn record(&mut self, record: &Record) -> io::Result<()> {
         match record.opcode {
             op::MESSAGE => self.message(record),
-            op::METADATA | op::ATTACHMENT => match parse_record(record.opcode, &record.body) {
-                Ok(Parsed::Metadata(metadata)) if metadata.name == METADATA && !self.has_facts => {
+            op::METADATA | op::ATTACHMENT => match parse(record) {
+                Some(Parsed::Metadata(metadata)) if metadata.name == METADATA && !self.has_facts => {
                     self.has_facts = true;
                     Ok(())
                 }
-                Ok(Parsed::Metadata(metadata)) => self.writer.note(&metadata.name, metadata.metadata),
-                Ok(Parsed::Attachment { header, data, .. }) => {
+                Some(Parsed::Metadata(metadata)) => self.writer.note(&metadata.name, metadata.metadata),
+                Some(Parsed::Attachment { header, data, .. }) => {
                     self.writer.copied_attachment(&mcap::Attachment {
                         log_time: header.log_time,
                         create_time: header.create_time,

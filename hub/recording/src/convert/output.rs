@@ -18,7 +18,7 @@ pub(super) struct Place {
 impl Place {
     /// Looks whether there may be a file made of `input` at `path`; what is there may be replaced if `force`.
     pub(super) fn check(path: &Path, input: &Path, force: bool) -> Result<Place, Failure> {
-        let refuse = |message: String, hint: &str| Err(Failure::new(Kind::Configuration, message, hint));
+        let refuse = |message: String, hint: &str| Err(Failure::new(Kind::Output, message, hint));
         if path == Path::new("-") {
             return Ok(Place { path: path.to_owned(), beside: None });
         }
@@ -32,7 +32,7 @@ impl Place {
             }
             if !force {
                 let message = format!("{} exists", path.display());
-                return Err(Failure::new(Kind::Failed, message, "--force replaces it"));
+                return refuse(message, "--force replaces it");
             }
         }
         let Some(name) = path.file_name() else {
@@ -86,7 +86,7 @@ impl Drop for Place {
 
 pub(super) fn unwritable(path: &Path, error: &io::Error) -> Failure {
     let hint = "the directory has to be there, writable, and with room";
-    Failure::new(Kind::Failed, format!("cannot write {}: {error}", path.display()), hint)
+    Failure::new(Kind::Output, format!("cannot write {}: {error}", path.display()), hint)
 }
 
 const BUFFER: usize = 1 << 20;

@@ -1,7 +1,8 @@
 //! Which channel of a file has which sensor's topic, as the records of the channels say. Of a file that is harmed they
 //! may contradict each other: then a checksum decides, else how often a sensor is named. Refuses to know messages.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, HashMap, HashSet};
+use std::io;
 
 use mcap::records::Channel;
 use schema::file::ENCODING;
@@ -28,18 +29,44 @@ impl Place {
 #[derive(Clone, Debug, Default)]
 pub(crate) struct Channels {
     proven: BTreeMap<u16, Option<Place>>,
+    /// The last different ones, the latest at the end.
     likely: BTreeMap<u16, Vec<Place>>,
+    /// How often a sensor is named.
+    named: HashMap<String, u32>,
+    /// The first channel of any sensor.
+    first: Option<u16>,
 }
 
 impl Channels {
     /// Takes over a channel's record, which may be repeated; `is_proven` if a checksum vouches for it.
     pub(crate) fn note(&mut self, channel: &Channel, is_proven: bool) {
         let place = Place::of(channel);
+        if let Some(place) = &place {
+            match self.named.get_mut(&place.sensor) {
+                Some(count) => *count = count.saturating_add(1),
+                None => drop(self.named.insert(place.sensor.clone(), 1)),
+            }
+            self.first = Some(self.first.map_or(channel.id, |first| first.min(channel.id)));
+        }
         if is_proven {
             self.proven.insert(channel.id, place);
         } else if let Some(place) = place {
-            self.likely.entry(channel.id).or_default().push(place);
+            let likely = self.likely.entry(channel.id).or_default();
+            likely.retain(|other| *other != place);
+            likely.push(place);
+            if likely.len() > MOST_LIKELY {
+                likely.remove(0);
+            }
         }
+    }
+
+    /// [`io::ErrorKind::FileTooLarge`] if more sensors are named than are kept.
+    pub(crate) fn check(&self) -> io::Result<()> {
+        if self.named.len() <= MOST_SENSORS {
+            return Ok(());
+        }
+        let what = format!("it names more than {MOST_SENSORS} sensors");
+        Err(io::Error::new(io::ErrorKind::FileTooLarge, what))
     }
 
     /// What the channel with this number is: `None` if nothing is known of it, `Some(None)` if it is somebody else's.
@@ -47,7 +74,7 @@ impl Channels {
         if let Some(place) = self.proven.get(&id) {
             return Some(place.as_ref());
         }
-        let named = |place: &&Place| self.places().filter(|other| other.sensor == place.sensor).count();
+        let named = |place: &&Place| self.named.get(&place.sensor);
         self.likely.get(&id)?.iter().max_by_key(named).map(Some)
     }
 
@@ -55,19 +82,21 @@ impl Channels {
     pub(crate) fn sensors(&self) -> Vec<String> {
         let mut ids: Vec<u16> = self.proven.keys().chain(self.likely.keys()).copied().collect();
         ids.sort_unstable();
-        let mut sensors: Vec<String> = Vec::new();
-        for place in ids.into_iter().filter_map(|id| self.place(id)?) {
-            if !sensors.contains(&place.sensor) {
-                sensors.push(place.sensor.clone());
-            }
-        }
-        sensors
+        let mut seen = HashSet::new();
+        let sensors = ids.into_iter().filter_map(|id| Some(&self.place(id)??.sensor));
+        sensors.filter(|sensor| seen.insert(*sensor)).cloned().collect()
     }
 
-    fn places(&self) -> impl Iterator<Item = &Place> {
-        self.proven.values().flatten().chain(self.likely.values().flatten())
+    /// The first sensor that is named.
+    pub(crate) fn first_sensor(&self) -> Option<&str> {
+        self.first.and_then(|id| Some(&self.place(id)??.sensor[..]))
     }
 }
+
+/// What a channel is said to be in a file that is harmed: a few bytes of a name may be others, or more.
+const MOST_LIKELY: usize = 4;
+/// Of sixteen hubs with as many sensors as one can have.
+const MOST_SENSORS: usize = 4096;
 
 #[cfg(test)]
 mod tests {

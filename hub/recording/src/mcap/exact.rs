@@ -3,18 +3,19 @@
 
 use std::str;
 
-use mcap::records::{MessageHeader, op};
+use mcap::parse_record;
+use mcap::records::{MessageHeader, Record as Parsed, op};
 
 use super::records::Record;
 
 /// Opcode and length, with which every record begins.
 pub(crate) const HEAD: usize = 1 + 8;
 
-/// Length of the body of the record that `bytes` begin with, if it is at most [`LONGEST`].
+/// Length of the body of the record that `bytes` begin with, if it is not longer than [`longest`] allows.
 pub(crate) fn any_length(bytes: &[u8]) -> Option<usize> {
     let (head, _) = bytes.split_first_chunk::<HEAD>()?;
     let length = u64::from_le_bytes(*head.last_chunk()?);
-    (length <= LONGEST).then_some(length as usize)
+    (length <= longest(bytes[0])).then_some(length as usize)
 }
 
 /// The same of a record of a kind that is known.
@@ -28,6 +29,26 @@ pub(crate) fn record(bytes: &[u8]) -> Option<Record> {
     let length = length(bytes)?;
     let (opcode, body) = (bytes[0], bytes.get(HEAD..HEAD + length)?);
     is_filled(opcode, body)?.then(|| Record { opcode, body: body.to_vec() })
+}
+
+/// Length of the chunk that `bytes` begin with, if it fits what the chunk says of itself and is more than [`LONGEST`].
+pub(crate) fn long_chunk(bytes: &[u8]) -> Option<u64> {
+    let length = u64::from_le_bytes(*bytes.get(1..HEAD)?.first_chunk()?);
+    (bytes[0] == op::CHUNK && length > LONGEST && is_as_long(bytes, length)).then_some(length)
+}
+
+/// Bytes of a record with this opcode that are held in memory; a longer one is not read. Those that are taken to pieces
+/// become many times as long.
+pub(crate) fn longest(opcode: u8) -> u64 {
+    match opcode {
+        op::HEADER | op::CHANNEL | op::METADATA => 1 << 20,
+        _ => LONGEST,
+    }
+}
+
+/// What `record` says, if its fields fill it: of others the library may panic.
+pub(crate) fn parse(record: &Record) -> Option<Parsed<'_>> {
+    fills(record).then(|| parse_record(record.opcode, &record.body).ok())?
 }
 
 /// A chunk whose length fits what it says of itself.
@@ -54,15 +75,19 @@ impl<'a> ChunkHead<'a> {
 
 /// Whether the chunk that `bytes` begin with may be sound, as far as its head tells, which is there.
 pub(crate) fn may_be_chunk(bytes: &[u8]) -> bool {
+    bytes.first() == Some(&op::CHUNK) && length(bytes).is_some_and(|length| is_as_long(bytes, length as u64))
+}
+
+/// Whether the head of a chunk says that its body has this `length`.
+fn is_as_long(bytes: &[u8], length: u64) -> bool {
     let told = || {
-        let length = length(bytes)? as u64;
         let mut fields = Fields(bytes.get(HEAD..)?);
         fields.take(8 + 8 + 8 + 4)?;
         let packing = fields.text()?;
         let head = 8 + 8 + 8 + 4 + 4 + packing.len() as u64 + 8;
-        Some(fields.u64()?.checked_add(head)? == length)
+        fields.u64()?.checked_add(head)
     };
-    bytes.first() == Some(&op::CHUNK) && told() == Some(true)
+    told() == Some(length)
 }
 
 /// Channel, sequence and times of the message with this `body`.
@@ -79,7 +104,7 @@ pub(crate) fn head_of_message(body: &[u8]) -> Option<MessageHeader> {
 }
 
 /// Whether the fields of a record fill it.
-pub(crate) fn fills(record: &Record) -> bool {
+fn fills(record: &Record) -> bool {
     is_filled(record.opcode, &record.body) == Some(true)
 }
 
@@ -179,8 +204,8 @@ impl<'a> Fields<'a> {
 
 /// Bytes of channel, sequence and two times, with which a message begins.
 pub(crate) const MESSAGE: usize = 2 + 4 + 8 + 8;
-/// Longer ones are not held in memory.
-pub(crate) const LONGEST: u64 = 256 << 20;
+/// Of all records: a few times this is held in memory. Chunks of recorders have less than half of it.
+pub(crate) const LONGEST: u64 = 8 << 20;
 
 #[cfg(test)]
 mod tests {

@@ -2,9 +2,9 @@
 //! lives of the hub. With it is judged what no checksum vouches for. Refuses to know where telegrams come from.
 
 use std::collections::BTreeMap;
+use std::collections::btree_map::Entry;
 use std::io::{self, Read};
 
-use mcap::parse_record;
 use mcap::records::{MessageHeader, Record as Parsed, op};
 use schema::{Header, Quality, Topic, file};
 
@@ -24,7 +24,13 @@ pub(crate) struct Knowledge {
     lives: BTreeMap<u64, i128>,
     /// Header of the first message that is proven, by channels. What they are may be told at the end of the file.
     first: BTreeMap<u16, Header>,
+    /// Channel of the first of those headers, by numbers of sensors and by their names.
+    numbers: BTreeMap<u8, Rank>,
+    names: BTreeMap<String, Rank>,
 }
+
+/// Which of several channels of a sensor is asked: of telegrams before all else (`false` is less), then by numbers.
+type Rank = (bool, u16);
 
 impl Knowledge {
     /// Learns from all that `source` has.
@@ -32,8 +38,19 @@ impl Knowledge {
         let mut knowledge = Knowledge::default();
         while let Some(found) = source.next()? {
             knowledge.note(&found);
+            knowledge.check()?;
         }
+        // What a channel is may have been told otherwise before.
+        knowledge.numbers.clear();
+        knowledge.names.clear();
+        let ids: Vec<u16> = knowledge.first.keys().copied().collect();
+        ids.into_iter().for_each(|id| knowledge.list(id));
         Ok(knowledge)
+    }
+
+    /// [`io::ErrorKind::FileTooLarge`] if the file says more than is kept.
+    pub(crate) fn check(&self) -> io::Result<()> {
+        self.channels.check().and_then(|()| self.originals.check())
     }
 
     /// Takes over what `found` says.
@@ -46,9 +63,10 @@ impl Knowledge {
         if record.opcode != op::MESSAGE {
             self.originals.note(record, is_proven);
         }
-        if record.opcode == op::CHANNEL && exact::fills(record) {
-            if let Ok(Parsed::Channel(channel)) = parse_record(record.opcode, &record.body) {
+        if record.opcode == op::CHANNEL {
+            if let Some(Parsed::Channel(channel)) = exact::parse(record) {
                 self.channels.note(&channel, is_proven);
+                self.list(channel.id);
             }
         } else if let Some((head, data)) = message(record) {
             self.note_message(&head, data);
@@ -58,15 +76,33 @@ impl Knowledge {
     fn note_message(&mut self, message: &MessageHeader, data: &[u8]) {
         // A channel of somebody else's has other bytes there.
         if let Some((header, _)) = file::parts(data).filter(|(header, _)| fits(header, message)) {
-            self.lives.entry(header.boot).or_insert_with(|| offset(&header));
-            self.first.entry(message.channel_id).or_insert(header);
+            if self.lives.len() < MOST_LIVES {
+                self.lives.entry(header.boot).or_insert_with(|| offset(&header));
+            }
+            if let Entry::Vacant(first) = self.first.entry(message.channel_id) {
+                first.insert(header);
+                self.list(message.channel_id);
+            }
+        }
+    }
+
+    /// Lists the channel with number `id` by its sensor, if both that and a header are known.
+    fn list(&mut self, id: u16) {
+        if let (Some(place), Some(header)) = (self.channels.place(id).flatten(), self.first.get(&id)) {
+            let rank = (place.topic != Topic::Telegram, id);
+            let listed = self.numbers.entry(header.sensor).or_insert(rank);
+            *listed = rank.min(*listed);
+            match self.names.get_mut(&place.sensor) {
+                Some(listed) => *listed = rank.min(*listed),
+                None => drop(self.names.insert(place.sensor.clone(), rank)),
+            }
         }
     }
 
     /// The sensor that a message of channel `id` is of, whose header says `number`.
     pub(crate) fn sensor(&self, id: Option<u16>, number: u8) -> Option<&str> {
         let place = id.and_then(|id| self.channels.place(id)?).filter(|place| place.topic == Topic::Telegram);
-        let named = || self.firsts().find(|(_, first)| first.sensor == number).map(|(place, _)| place);
+        let named = || self.channels.place(self.numbers.get(&number)?.1).flatten();
         place.or_else(named).map(|place| &place.sensor[..])
     }
 
@@ -74,7 +110,7 @@ impl Knowledge {
     pub(crate) fn header(&self, lone: &Lone, sensor: &str) -> Option<Header> {
         let (header, _) = file::parts(&lone.header)?;
         let fits_message = lone.message.is_none_or(|message| fits(&header, &message));
-        let number = self.firsts().find(|(place, _)| place.sensor == sensor).map(|(_, first)| first.sensor);
+        let number = self.first(sensor).map(|first| first.sensor);
         let took_ns = header.stamp_last_ns.checked_sub(header.stamp_first_ns)?;
         let fits_life = match self.lives.get(&header.boot) {
             Some(known) => known.abs_diff(offset(&header)) < STEPPED_NS,
@@ -89,15 +125,8 @@ impl Knowledge {
 
     /// The header that a telegram of `sensor` had at the earliest.
     pub(crate) fn first(&self, sensor: &str) -> Option<Header> {
-        self.firsts().find(|(place, _)| place.sensor == sensor).map(|(_, first)| *first)
-    }
-
-    /// The first header of each of the hub's channels, telegrams before all else.
-    fn firsts(&self) -> impl Iterator<Item = (&Place, &Header)> {
-        let of = |id: &u16| self.channels.place(*id).flatten();
-        let all = move || self.first.iter().filter_map(move |(id, header)| Some((of(id)?, header)));
-        let is_telegram = |(place, _): &(&Place, &Header)| place.topic == Topic::Telegram;
-        all().filter(is_telegram).chain(all().filter(move |first| !is_telegram(first)))
+        let (_, id) = self.names.get(sensor)?;
+        self.first.get(id).copied()
     }
 
     /// What the message in `record` is, and its header, if it is one of the hub's.
@@ -123,6 +152,8 @@ fn offset(header: &Header) -> i128 {
     i128::from(header.wall_ns) - i128::from(header.stamp_first_ns)
 }
 
+/// Lives of the hub of which a file may tell: one in a minute for a month.
+pub(super) const MOST_LIVES: usize = 50_000;
 /// Telegrams take no longer.
 const LONGEST_NS: u64 = 10_000_000_000;
 /// The wall clock is not set by more in a life of the hub, or was not right before.

@@ -3,7 +3,8 @@
 
 use std::collections::BTreeMap;
 
-use mcap::parse_record;
+use std::io;
+
 use mcap::records::{Channel, Record as Parsed};
 use schema::file::METADATA;
 
@@ -19,47 +20,70 @@ pub(crate) struct Originals {
     pub(crate) facts: BTreeMap<String, String>,
     schemas: BTreeMap<u16, Kept<Schema>>,
     channels: BTreeMap<u16, Kept<Channel>>,
+    /// About what all of it takes in memory.
+    bytes: usize,
 }
 
 /// Name, language and text of a type.
 pub(crate) type Schema = (String, String, Vec<u8>);
 
-/// A record, and whether a checksum vouches for it.
-type Kept<T> = (T, bool);
+/// What a record says.
+#[derive(Clone, Debug)]
+struct Kept<T> {
+    value: T,
+    /// A checksum vouches for it.
+    is_proven: bool,
+    /// About what it takes in memory.
+    bytes: usize,
+}
 
 impl Originals {
     /// Takes over a record; what a checksum vouches for replaces what none does.
     pub(crate) fn note(&mut self, record: &Record, is_proven: bool) {
-        if !exact::fills(record) {
-            return;
-        }
-        match parse_record(record.opcode, &record.body) {
-            Ok(Parsed::Header(header)) => self.profile = header.profile,
-            Ok(Parsed::Metadata(metadata)) if metadata.name == METADATA && self.facts.is_empty() => {
+        match exact::parse(record) {
+            Some(Parsed::Header(header)) => self.profile = header.profile,
+            Some(Parsed::Metadata(metadata)) if metadata.name == METADATA && self.facts.is_empty() => {
                 self.facts = metadata.metadata;
             }
-            Ok(Parsed::Schema { header, data }) => {
-                keep(
-                    &mut self.schemas,
-                    header.id,
-                    (header.name, header.encoding, data.into_owned()),
-                    is_proven,
-                );
+            Some(Parsed::Schema { header, data }) => {
+                let value = (header.name, header.encoding, data.into_owned());
+                let bytes = record.body.len() + OVERHEAD;
+                let kept = Kept { value, is_proven, bytes };
+                keep(&mut self.schemas, header.id, kept, &mut self.bytes);
             }
-            Ok(Parsed::Channel(channel)) => keep(&mut self.channels, channel.id, channel, is_proven),
+            Some(Parsed::Channel(channel)) => {
+                let (id, bytes) = (channel.id, record.body.len() + OVERHEAD * (1 + channel.metadata.len()));
+                keep(&mut self.channels, id, Kept { value: channel, is_proven, bytes }, &mut self.bytes);
+            }
             _ => {}
         }
     }
 
+    /// [`io::ErrorKind::FileTooLarge`] if channels and schemas are more than is kept.
+    pub(crate) fn check(&self) -> io::Result<()> {
+        if self.bytes <= MOST {
+            return Ok(());
+        }
+        let what = format!("its channels and schemas take more than {} MB", MOST >> 20);
+        Err(io::Error::new(io::ErrorKind::FileTooLarge, what))
+    }
+
     /// The channel with this number and its schema.
     pub(crate) fn channel(&self, id: u16) -> Option<(&Channel, Option<&Schema>)> {
-        let (channel, _) = self.channels.get(&id)?;
-        Some((channel, self.schemas.get(&channel.schema_id).map(|(schema, _)| schema)))
+        let channel = &self.channels.get(&id)?.value;
+        Some((channel, self.schemas.get(&channel.schema_id).map(|schema| &schema.value)))
     }
 }
 
-fn keep<T>(kept: &mut BTreeMap<u16, Kept<T>>, id: u16, value: T, is_proven: bool) {
-    if is_proven || kept.get(&id).is_none_or(|(_, was_proven)| !was_proven) {
-        kept.insert(id, (value, is_proven));
+/// Takes `new` unless what is there is better; `bytes` is what all of it takes.
+fn keep<T>(kept: &mut BTreeMap<u16, Kept<T>>, id: u16, new: Kept<T>, bytes: &mut usize) {
+    if new.is_proven || kept.get(&id).is_none_or(|old| !old.is_proven) {
+        *bytes += new.bytes;
+        *bytes -= kept.insert(id, new).map_or(0, |old| old.bytes);
     }
 }
+
+/// What a record takes in memory beside its text.
+const OVERHEAD: usize = 128;
+/// Enough for as many channels as have a number; files of many sensors have some hundred, and a megabyte of schemas.
+const MOST: usize = 20 << 20;

@@ -69,6 +69,7 @@ impl<R: Read> Reader<R> {
         while let Some(found) = self.source.next()? {
             if matches!(self.source, Source::Sound(_)) {
                 self.knowledge.note(&found);
+                self.knowledge.check()?;
             }
             let sighting = match found {
                 Found::Lone(lone) => self.judge(lone),
@@ -141,9 +142,9 @@ impl<R: Read> Reader<R> {
         if let Some(sensor) = self.knowledge.sensor(id, number) {
             return sensor.to_owned();
         }
-        let sensors = self.knowledge.channels.sensors();
-        let near = self.neighbour.clone().or_else(|| sensors.first().cloned());
-        near.filter(|_| !is_right && !sensors.is_empty()).unwrap_or_else(|| format!("sensor{number}"))
+        let first = self.knowledge.channels.first_sensor();
+        let near = self.neighbour.as_deref().or(first).filter(|_| !is_right && first.is_some());
+        near.map_or_else(|| format!("sensor{number}"), str::to_owned)
     }
 
     /// A header after the one before: times of the message, else a period later.

@@ -1,15 +1,14 @@
 //! The records of an MCAP file that is sound, one after the other, also those in chunks. Refuses to know what is in
 //! them.
 
-use std::collections::VecDeque;
 use std::io::{self, Read};
 
 use mcap::McapError;
 use mcap::records::op;
 use mcap::sans_io::{LinearReadEvent, LinearReader, LinearReaderOptions};
 
-use super::chunk;
-use super::exact::LONGEST;
+use super::chunk::Chunk;
+use super::exact::{self, LONGEST, longest};
 
 /// A record: what kind ([`mcap::records::op`]), and its bytes.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -23,7 +22,7 @@ pub(crate) struct Records<R> {
     input: R,
     reader: LinearReader,
     /// Of the chunk that is being read.
-    of_chunk: VecDeque<Record>,
+    of_chunk: Chunk,
 }
 
 impl<R: Read> Records<R> {
@@ -36,23 +35,32 @@ impl<R: Read> Records<R> {
             .with_check_finishes_after_end_magic(true)
             .with_record_length_limit(LONGEST as usize);
         let reader = LinearReader::new_with_options(options);
-        Records { input, reader, of_chunk: VecDeque::new() }
+        Records { input, reader, of_chunk: Chunk::default() }
     }
 
     /// The next record; an error where the file is not sound, or cannot be read.
     pub(crate) fn next(&mut self) -> Result<Option<Record>, McapError> {
         loop {
-            if let Some(record) = self.of_chunk.pop_front() {
+            if let Some(record) = self.of_chunk.next() {
                 return Ok(Some(record));
             }
             match read(&mut self.reader, &mut self.input)? {
-                Some(record) if record.opcode == op::CHUNK => {
-                    self.of_chunk = chunk::open(&record.body)?.into()
+                Some(record) if record.opcode == op::CHUNK => self.of_chunk = Chunk::open(record.body)?,
+                Some(Record { opcode, body }) if body.len() as u64 > longest(opcode) => {
+                    return Err(McapError::RecordTooLarge { opcode, len: body.len() as u64 });
+                }
+                // One that cannot be copied is not passed over in silence.
+                Some(record) if is_for_copies(record.opcode) && exact::parse(&record).is_none() => {
+                    return Err(McapError::UnexpectedEoc);
                 }
                 other => return Ok(other),
             }
         }
     }
+}
+
+fn is_for_copies(opcode: u8) -> bool {
+    matches!(opcode, op::METADATA | op::ATTACHMENT)
 }
 
 /// What `reader` finds next in `input`.

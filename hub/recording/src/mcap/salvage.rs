@@ -2,16 +2,16 @@
 //! themselves, wherever they are: a chunk by its CRC-32, and a telegram by its own length and CRC. Everything else is
 //! looked at byte by byte, so what is harmed never hides what is not. Refuses to know which sensor a telegram is of.
 
-use std::collections::{BTreeSet, VecDeque};
 use std::io::{self, Read};
 
 use lms::telegram::{FRAME, MAX_TELEGRAM, REPLY, STX, Telegram};
 use mcap::MAGIC;
 use mcap::records::{MessageHeader, op};
 
-use super::chunk;
+use super::chunk::Chunk;
 use super::exact::{self, ChunkHead, HEAD, MESSAGE};
 use super::records::Record;
+use super::seen::Seen;
 use super::window::Window;
 
 /// What was found.
@@ -41,9 +41,9 @@ pub(crate) struct Salvage<R> {
     /// Where the search goes on.
     at: u64,
     /// Records of a sound chunk.
-    records: VecDeque<Record>,
+    records: Chunk,
     /// Chunks that were there: their places in time, and their checksums.
-    chunks: BTreeSet<Vec<u8>>,
+    chunks: Seen,
     /// All bytes before it were counted or belong to something.
     accounted: u64,
     account: Account,
@@ -65,8 +65,8 @@ impl<R: Read> Salvage<R> {
         Salvage {
             window: Window::new(input),
             at: 0,
-            records: VecDeque::new(),
-            chunks: BTreeSet::new(),
+            records: Chunk::default(),
+            chunks: Seen::default(),
             accounted: 0,
             account: Account::default(),
         }
@@ -77,10 +77,10 @@ impl<R: Read> Salvage<R> {
         self.account
     }
 
-    /// What comes next; an error if the file cannot be read.
+    /// What comes next; an error if the file cannot be read, of kind `FileTooLarge` at a chunk that is too long.
     pub(crate) fn next(&mut self) -> io::Result<Option<Found>> {
         loop {
-            if let Some(record) = self.records.pop_front() {
+            if let Some(record) = self.records.next() {
                 return Ok(Some(Found::Proven(record)));
             }
             // What is before a telegram is looked at when it is found.
@@ -117,6 +117,11 @@ impl<R: Read> Salvage<R> {
             return Ok(None);
         }
         self.at += 1;
+        if let Some(length) = exact::long_chunk(bytes) {
+            let (megabytes, most) = (length >> 20, exact::LONGEST >> 20);
+            let what = format!("a chunk of it has {megabytes} MB, and at most {most} are read at a time");
+            return Err(io::Error::new(io::ErrorKind::FileTooLarge, what));
+        }
         let Some(length) = exact::length(bytes) else { return Ok(None) };
         if bytes[0] == op::CHUNK {
             self.open_chunk(at, length)?;
@@ -137,12 +142,12 @@ impl<R: Read> Salvage<R> {
         let bytes = self.window.bytes(at, HEAD + length)?;
         let Some(body) = bytes.get(HEAD..HEAD + length) else { return Ok(()) };
         let Some(head) = ChunkHead::of(body) else { return Ok(()) };
-        let Ok(records) = chunk::open(body) else {
+        let Ok(records) = Chunk::open(body.to_vec()) else {
             self.account.chunks += u64::from(!head.packing.is_empty());
             return Ok(());
         };
-        if self.chunks.insert(head.name.to_vec()) {
-            self.records.extend(records);
+        if self.chunks.is_new(head.name, &[]) {
+            self.records = records;
         }
         let end = at + (HEAD + length) as u64;
         self.belongs(at, end);

@@ -83,6 +83,8 @@ faults! {
     late_mode, 0.0 to 60.0, 0.0, "seconds more that a change of mode, rate or variant takes";
     late_write, 0.0 to 60.0, 0.0, "seconds more that a write to the EEPROM takes";
     strict, 0.0 to 1.0, 0.0, "1: in installation mode it refuses to measure";
+    strict_gap, 0.0 to 1.0, 0.0, "1: it drops requests whose bytes come less than 55 us apart";
+    answer, 0.0 to 10.0, 0.0, "seconds from each ACK to its reply; 0: by chance 0.055 to 0.145";
     refuse, 0.0 to 255.0, 0.0, "command that it refuses, such as 0x3B";
     mute, 0.0 to 1.0, 0.0, "1: it answers nothing";
 }
@@ -107,6 +109,8 @@ impl Faults {
             late_mode_ns: (self.late_mode * 1e9) as Nanos,
             late_write_ns: (self.late_write * 1e9) as Nanos,
             strict: self.strict > 0.0,
+            strict_gap: self.strict_gap > 0.0,
+            answer_ns: (self.answer * 1e9) as Nanos,
             refuses: if self.refuse > 0.0 { vec![self.refuse as u8] } else { Vec::new() },
             mute: self.mute > 0.0,
         }
@@ -194,6 +198,8 @@ mod tests {
         let habits = "overlook=0.5,late=1.5,refuse=0x3B,mute=1".parse::<Faults>().unwrap().habits();
         assert_eq!((habits.overlooks, habits.late_reply_ns), (0.5, 1_500_000_000));
         assert_eq!((habits.refuses, habits.mute), (vec![0x3B], true));
+        let habits = "strict_gap=1,answer=0.06".parse::<Faults>().unwrap().habits();
+        assert_eq!((habits.strict_gap, habits.answer_ns), (true, 60_000_000));
         let habits = "late_mode=2.5,late_write=6".parse::<Faults>().unwrap().habits();
         assert_eq!((habits.late_mode_ns, habits.late_write_ns), (2_500_000_000, 6_000_000_000));
         assert_eq!(Faults::default().habits(), Habits::default());

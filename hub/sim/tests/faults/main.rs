@@ -106,8 +106,8 @@ scenes! {
         |all| all.faulty > 300;
     requests_overlooked: "overlook=0.3", 650, |all| all.effects.unheard > 60 && all.back_ms < 4_000;
     requests_refused_by_nak: "nak=0.3", 650, |all| all.effects.naks > 60 && all.back_ms < 4_000;
-    acknowledgements_at_the_limit: "late_ack=0.052", 900, |all| all.effects.late_acknowledgements > 300;
-    acknowledgements_late: "late_ack=0.1", 900, |all| all.effects.late_acknowledgements > 300;
+    acknowledgements_at_the_limit: "late_ack=0.052", 900, |all| all.effects.late_acknowledgements >= 300;
+    acknowledgements_late: "late_ack=0.1", 900, |all| all.effects.late_acknowledgements >= 300;
     replies_late: "late=0.4", 2200, |all| all.effects.late_replies > 200;
     replies_twice: "twice=0.5", 650, |all| all.effects.doubled > 30;
     modes_changed_slowly: "late_mode=2.9", 3600, |all| all.effects.late_replies >= 100 && all.back_ms < 1_000;

@@ -1,6 +1,5 @@
 //! Bad habits of a sensor, each alone.
 
-use lms::MILLIS;
 use lms::command::Request;
 use lms::eeprom::{PowerOn, Write};
 use lms::operating::Operating;
@@ -8,7 +7,9 @@ use lms::parameters::Password;
 use lms::reply::Reply;
 use lms::telegram::{ACK, NAK};
 use lms::variant::{Baud, Variant};
+use lms::{MICROS, MILLIS, line_time};
 use sim::machine::{Habits, Settings};
+use sim::{Arrival, Dropped};
 
 use crate::bench::Bench;
 use crate::{fast, reply};
@@ -125,5 +126,57 @@ fn a_strict_sensor_does_not_measure_in_installation_mode() {
         assert_eq!(*bench.machine.operating(), sim::operating::Operating::OnRequest);
         let bytes = bench.ask(Request::Stream.encode(0).bytes());
         assert_eq!(bytes[5], 0xA0);
+    }
+}
+
+/// How many of 100 requests, each written at once or with 55 us between its bytes, get an answer.
+fn answered_unspaced(bench: &mut Bench) -> usize {
+    let request = Request::Stop.encode(0);
+    let mut count = 0;
+    for step in [0, 55 * MICROS].repeat(50) {
+        let before = bench.sent().len();
+        for &byte in request.bytes() {
+            bench.run_until(bench.now + step);
+            bench.machine.receive(byte, Arrival::at(bench.now));
+        }
+        bench.run_until(bench.now + 500 * MILLIS);
+        count += bench.sent().len() - before;
+    }
+    count
+}
+
+#[test]
+fn what_a_host_leaves_to_its_uart_is_heard_unless_the_sensor_is_strict() {
+    for (baud, line_ns) in
+        [(Baud::B9600, 6 * line_time(1, 9_600)), (Baud::B500000, 6 * line_time(1, 500_000))]
+    {
+        let slow = Settings { baud, ..fast() };
+        let mut bench = Bench::new(slow.clone());
+        assert_eq!(answered_unspaced(&mut bench), 100);
+        assert_eq!(bench.machine.take_dropped(), None);
+        assert!(bench.chunks[0].0 >= line_ns + 2 * MILLIS, "the line carries it first");
+        bench.machine.set_habits(Habits { strict_gap: true, ..Habits::default() });
+        assert_eq!(answered_unspaced(&mut bench), 0);
+        assert_eq!(bench.machine.take_dropped(), Some(Dropped::ShortGap));
+        let strict = Settings { habits: Habits { strict_gap: true, ..Habits::default() }, ..slow };
+        assert_eq!(answered_unspaced(&mut Bench::new(strict.clone())), 0);
+        assert!(matches!(
+            reply(&Bench::new(strict).ask(Request::Status.encode(0).bytes())),
+            Reply::Status(_)
+        ));
+    }
+}
+
+#[test]
+fn a_sensor_may_think_as_long_each_time() {
+    let mut bench = with(Habits { answer_ns: 60 * MILLIS, ..Habits::default() });
+    for request in [Request::Type, Request::Stop, Request::Variant(Variant::HALF)] {
+        let before = bench.chunks.len();
+        bench.ask(request.encode(0).bytes());
+        let [(acknowledged, _), (replied, chunk), ..] = &bench.chunks[before..] else {
+            panic!("{request:?}")
+        };
+        let line_ns = line_time(chunk.bytes.len(), 500_000);
+        assert_eq!(replied - acknowledged, 60 * MILLIS + line_ns, "{request:?}");
     }
 }

@@ -45,6 +45,12 @@ impl Host {
         }
     }
 
+    /// Says `request` as most drivers do: at once, for the UART to space.
+    pub(crate) fn write(&self, request: Request) {
+        let encoded = request.encode(0);
+        assert_eq!(rustix::io::write(&self.port, encoded.bytes()), Ok(encoded.bytes().len()));
+    }
+
     /// The next telegram that comes within `patience`.
     pub(crate) fn telegram(&mut self, patience: Duration) -> Option<Vec<u8>> {
         let end = Instant::now() + patience;

@@ -81,6 +81,22 @@ fn from_9600_to_a_stream_at_500k_bit_for_bit_as_the_truth_says() {
 }
 
 #[test]
+fn requests_that_are_written_at_once_are_all_answered_at_9600() {
+    let folder = Folder::new("unspaced");
+    let port = folder.path("front");
+    let faults = Faults { answer: 0.001, ..Faults::default() };
+    let baud = Some(Baud::B9600);
+    let simulator = Simulator::start(SimulateOptions { baud, faults, ..options(port.clone()) });
+    let mut host = Host::open(&port, 9_600);
+    for number in 0..100 {
+        host.write(Request::Stop);
+        let reply = host.telegram(PATIENCE).unwrap_or_else(|| panic!("request {number} got no answer"));
+        assert_eq!(reply[4], 0xA0);
+    }
+    assert_eq!(simulator.end().0[0].sent, 100);
+}
+
+#[test]
 fn a_closed_port_loses_what_is_sent_and_keeps_nothing_for_the_next_host() {
     let folder = Folder::new("closed");
     let port = folder.path("front");
@@ -223,9 +239,9 @@ fn two_ports_and_what_is_refused() {
             },
             78,
         ),
-        (SimulateOptions { replay: Some(file), ..options(folder.path("x")) }, 78),
-        (SimulateOptions { replay: Some("/no/file".into()), ..options(folder.path("x")) }, 78),
-        (SimulateOptions { truth: Some("/no/file".into()), ..options(folder.path("x")) }, 1),
+        (SimulateOptions { replay: Some(file), ..options(folder.path("x")) }, 66),
+        (SimulateOptions { replay: Some("/no/file".into()), ..options(folder.path("x")) }, 66),
+        (SimulateOptions { truth: Some("/no/file".into()), ..options(folder.path("x")) }, 73),
     ] {
         let failure = simulate(&options, &stop, |_| panic!("ready"), |_| {}).unwrap_err();
         assert_eq!(failure.kind.exit_code(), code, "{failure}");

@@ -55,7 +55,7 @@ fn any_byte_of_the_requests_may_be_lost_or_damaged() {
         bench.until("streaming", 3_000 * MILLIS, Bench::is_streaming);
         bench.said.len()
     };
-    assert!(said > 40);
+    assert!(said >= 30);
     for wrong in 0..said {
         for damage in [None, Some(0x40)] {
             let mut bench = Bench::new(sensor(Baud::B9600), 0);
@@ -79,7 +79,7 @@ fn any_reply_may_be_lost_or_damaged() {
         bench.until("streaming", 3_000 * MILLIS, Bench::is_streaming);
         bench.sent.iter().filter(|sent| sent.is_reply).count()
     };
-    assert!(replies >= 5);
+    assert!(replies >= 4);
     // By the number of the chunk: replies and their acknowledgements are the first ones.
     for wrong in 0..replies * 8 {
         for damage in [None, Some(0x04)] {

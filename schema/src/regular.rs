@@ -1,0 +1,86 @@
+//! Files that somebody names: regular ones alone, and no more of them than is expected. A pipe may have no writer and a
+//! device no end, so neither is waited for. Refuses to know what is in them.
+
+use std::fs::{File, OpenOptions};
+use std::io::{self, ErrorKind, Read};
+use std::os::unix::fs::{FileTypeExt, OpenOptionsExt};
+use std::path::Path;
+
+use rustix::fs::OFlags;
+
+/// Bytes of a configuration, a world or a model, at most: many times what people write. Taken to pieces it is a hundred
+/// times as long.
+pub const LONGEST: u64 = 512 << 10;
+
+/// Opens the regular file at `path`; never waits.
+///
+/// [`ErrorKind::InvalidInput`] with what it is instead, else the system's error.
+pub fn open(path: &Path) -> io::Result<File> {
+    let flags = OFlags::NONBLOCK | OFlags::NOCTTY;
+    let file = OpenOptions::new().read(true).custom_flags(flags.bits() as i32).open(path)?;
+    let kind = file.metadata()?.file_type();
+    let what = match () {
+        () if kind.is_file() => return Ok(file),
+        () if kind.is_dir() => "a directory",
+        () if kind.is_fifo() => "a pipe",
+        () => "a device",
+    };
+    Err(io::Error::new(ErrorKind::InvalidInput, format!("it is {what}, not a regular file")))
+}
+
+/// All of the regular file at `path`, which has at most `longest` bytes.
+///
+/// As [`open`]; [`ErrorKind::FileTooLarge`] if it is longer.
+pub fn read(path: &Path, longest: u64) -> io::Result<Vec<u8>> {
+    read_all(&mut open(path)?, longest)
+}
+
+/// The same as text; [`ErrorKind::InvalidData`] if it is not UTF-8.
+pub fn read_text(path: &Path, longest: u64) -> io::Result<String> {
+    String::from_utf8(read(path, longest)?)
+        .map_err(|_| io::Error::new(ErrorKind::InvalidData, "it is no text in UTF-8"))
+}
+
+/// All of `input`, which has at most `longest` bytes; [`ErrorKind::FileTooLarge`] if it has more.
+pub fn read_all(input: &mut dyn Read, longest: u64) -> io::Result<Vec<u8>> {
+    let mut content = Vec::new();
+    input.take(longest + 1).read_to_end(&mut content)?;
+    if content.len() as u64 > longest {
+        let what = format!("it is longer than {longest} bytes, so it is something else");
+        return Err(io::Error::new(ErrorKind::FileTooLarge, what));
+    }
+    Ok(content)
+}
+
+#[cfg(test)]
+mod tests {
+    use std::fs;
+
+    use rustix::fs::{CWD, FileType, Mode, mknodat};
+
+    use super::*;
+
+    #[test]
+    fn what_is_no_regular_file_or_too_long_is_refused_at_once() {
+        let directory = std::env::temp_dir().join(format!("scanhub-regular-{}", std::process::id()));
+        fs::create_dir_all(&directory).unwrap();
+        let [pipe, file, link] = ["pipe", "file", "link"].map(|name| directory.join(name));
+        mknodat(CWD, &pipe, FileType::Fifo, Mode::RUSR | Mode::WUSR, 0).unwrap();
+        fs::write(&file, "1234567").unwrap();
+        std::os::unix::fs::symlink(&file, &link).unwrap();
+        let refused = |path: &Path| read(path, 7).map_err(|error| (error.kind(), error.to_string()));
+        let is = |what: &str| Err((ErrorKind::InvalidInput, format!("it is {what}, not a regular file")));
+        assert_eq!(refused(&pipe), is("a pipe"));
+        assert_eq!(refused(&directory), is("a directory"));
+        assert_eq!(refused(Path::new("/dev/zero")), is("a device"));
+        assert_eq!(refused(&file).as_deref(), Ok(&b"1234567"[..]));
+        assert_eq!(refused(&link).as_deref(), Ok(&b"1234567"[..]));
+        assert_eq!(read(&file, 6).unwrap_err().kind(), ErrorKind::FileTooLarge);
+        // Its size is said to be 0.
+        assert!(read(Path::new("/proc/self/status"), 1 << 16).unwrap().len() > 100);
+        fs::write(&file, b"\xFF").unwrap();
+        assert_eq!(read_text(&file, 6).unwrap_err().kind(), ErrorKind::InvalidData);
+        fs::remove_dir_all(&directory).unwrap();
+        assert_eq!(read(&file, 6).unwrap_err().kind(), ErrorKind::NotFound);
+    }
+}
