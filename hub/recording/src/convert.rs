@@ -61,7 +61,8 @@ pub struct Converted {
 /// Converts as `options` say until `stop` is set; calls `progress` with the telegrams that were written and how many there
 /// are. Whoever closes stdout has enough.
 ///
-/// [`Kind::Input`] if the recording cannot be read, [`Kind::NoTopic`] if it has no such sensor, [`Kind::Usage`] if what it
+/// [`Kind::Input`] if the recording cannot be read, or not become that without loss, [`Kind::NoTopic`] if it has no such
+/// sensor, [`Kind::Usage`] if what it
 /// shall become cannot be said, [`Kind::Output`] if that is there or cannot be written, [`Kind::Interrupted`] if it was
 /// stopped. Nothing is left then.
 pub fn convert(
