@@ -61,7 +61,11 @@ fn a_true_gateway_is_heard_at_once_after_64_invented_ones() {
             let took = begin.elapsed();
             eprintln!("64 invented gateways that {what}, then a true one: heard after {took:?}");
             assert!(took < Duration::from_secs(1), "{took:?}");
-            program.await_line("that there was no room", |line| line["kind"] == "trouble");
+            // It may come before the true one is heard, or after.
+            let is_told = |line: &Value| line["kind"] == "trouble";
+            if !program.has_said(is_told) {
+                program.await_line("that there was no room", is_told);
+            }
             // Its first announcement puts out none that just delivered, its next one is taken.
             deliver(&mut sender);
             program.await_line("its name", |line| line["sensor"] == "front" && line["class"] == "zones");

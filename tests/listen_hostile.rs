@@ -152,8 +152,8 @@ fn words_that_make_no_sense_have_a_remedy() {
     let stage = Stage::new();
     for (words, code, kind, hint) in [
         (&["--interface=none0"][..], 78, "configuration", "there are "),
-        (&["--topic=scam"], 3, "no_topic", "zones"),
-        (&["--topic=front/zones"], 3, "no_topic", "zones"),
+        (&["--topic=scam"], 2, "usage", "zones"),
+        (&["--topic=front/zones"], 2, "usage", "zones"),
         (&["--name=robot"], 78, "configuration", "NAME=HUB"),
         (&["--name=robot=0000000000000001"], 78, "configuration", "but not robot, for example"),
         (&["--hub=robot1"], 78, "configuration", "--name robot1="),

@@ -203,7 +203,7 @@ fn a_hub_and_two_remote_ones_live_in_one_domain() {
             "{absent}"
         );
         let refused = stage.run(&["control", "robot1.front", "pause", "--json"]);
-        assert_eq!(refused.code, Some(78), "nobody commands another machine's sensor: {refused}");
+        assert_eq!(refused.code, Some(2), "nobody commands another machine's sensor: {refused}");
         assert_eq!(hub.end(TERM).code, Some(0));
         one.send(Topic::Zones, &zones(Verdict::Clear));
         echo.await_line("the remote sensor goes on", |line| line["verdict"] == "clear");

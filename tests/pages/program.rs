@@ -81,14 +81,14 @@ fn of_cpp(source: &Path, stage: &Stage) -> Result<Option<PathBuf>, String> {
     Installed::once().and_then(|installed| installed.try_compile_cpp(stage, source)).transpose()
 }
 
-/// By the compiler itself, with the libraries that Cargo made for this test.
+/// By the compiler itself, with the libraries that Cargo makes.
 fn of_rust(source: &Path, stage: &Stage) -> Result<PathBuf, String> {
     let program = stage.path(&format!("{}-rust", source.file_stem().expect("a name").display()));
     let mut command = Command::new(std::env::var_os("RUSTC").unwrap_or_else(|| "rustc".into()));
     command.args(["--edition=2024", "-Dwarnings", "-o"]).arg(&program).arg(source);
     for (name, library) in libraries() {
         let directory = library.parent().expect("a directory");
-        command.arg(format!("-Ldependency={}", directory.display()));
+        command.arg(format!("-Ldependency={}", directory.join("deps").display()));
         command.arg(format!("--extern={name}={}", library.display()));
     }
     let output = command.output().expect("a compiler");
@@ -98,10 +98,12 @@ fn of_rust(source: &Path, stage: &Stage) -> Result<PathBuf, String> {
     Ok(program)
 }
 
-/// The libraries of this project that a consumer depends on, as Cargo made them for this test: by name.
+/// The libraries of this project that a consumer depends on, by name. Built alone: this test and the program, which run,
+/// are not made again.
 fn libraries() -> Vec<(String, PathBuf)> {
     let mut command = Command::new(env!("CARGO"));
-    command.args(["test", "--offline", "--no-run", "--message-format=json", "--quiet", "--test=pages"]);
+    command.args(["build", "--offline", "--message-format=json", "--quiet", "--lib"]);
+    command.args(["--package=scanhub-clients", "--package=scanhub-schema"]);
     if !cfg!(debug_assertions) {
         command.arg("--release");
     }

@@ -104,6 +104,12 @@ impl Program {
         }
     }
 
+    /// Whether a line that it said so far is `wanted`.
+    pub(crate) fn has_said(&self, wanted: impl Fn(&Value) -> bool) -> bool {
+        let lines = self.out.split(|byte| *byte == b'\n');
+        lines.filter_map(|line| serde_json::from_slice(line).ok()).any(|line| wanted(&line))
+    }
+
     /// Its next `count` lines from now on that are `wanted`.
     pub(crate) fn await_lines(
         &mut self,

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import os
 import stat
+import threading
 
 from .errors import Denied
 
@@ -12,7 +13,7 @@ from .errors import Denied
 def ensure(prefix: str) -> None:
     """Makes sure that the counter under `prefix` is there and this user's alone; Denied."""
     path = f"/dev/shm/{prefix}{_NAME}"
-    beside = f"{path}.new-{os.getpid()}"
+    beside = f"{path}.new-{os.getpid()}-{threading.get_ident()}"
     while True:
         try:
             seen = os.lstat(path)

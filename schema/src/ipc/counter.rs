@@ -6,6 +6,7 @@ use std::fs::{File, OpenOptions};
 use std::io::Write;
 use std::os::unix::fs::OpenOptionsExt;
 use std::path::{Path, PathBuf};
+use std::sync::atomic::{AtomicU32, Ordering};
 
 use rustix::fs::{CWD, RenameFlags, renameat_with};
 use rustix::io::Errno;
@@ -40,7 +41,10 @@ pub(super) fn remove(prefix: &str) {
 
 /// It appears with its content, or another process was faster.
 fn make(path: &Path) -> Result<(), Failure> {
-    let beside = path.with_extension(format!("new-{}", std::process::id()));
+    // Threads of one process may make it at the same time.
+    static MADE: AtomicU32 = AtomicU32::new(0);
+    let number = MADE.fetch_add(1, Ordering::Relaxed);
+    let beside = path.with_extension(format!("new-{}-{number}", std::process::id()));
     let written = OpenOptions::new().write(true).create_new(true).mode(0o600).open(&beside);
     let written = written.and_then(|mut file: File| file.write_all(&CONTENT));
     let placed =
