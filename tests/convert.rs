@@ -17,6 +17,7 @@ fn a_stream_becomes_a_recording_that_plays() {
     assert_eq!(outcome.code, Some(0), "{outcome}");
     let line = outcome.of_class("converted").pop().unwrap_or_else(|| panic!("{outcome}"));
     let missing = json!({"telegrams": 0, "bytes": 0, "chunks": 0, "stamps": 0, "begin": false, "end": false, "checksum": false});
+    assert_eq!(line["sensors"], json!(["left"]));
     assert_eq!((&line["telegrams"], &line["scans"], &line["missing"]), (&json!(20), &json!(20), &missing));
     assert_eq!((&line["from"], &line["to"]), (&json!("telegram stream"), &json!("MCAP")));
     // The telegrams as they were, to whoever reads stdout.
@@ -35,6 +36,33 @@ fn a_stream_becomes_a_recording_that_plays() {
     let _hub = stage.hub(&[stage.link("left")]);
     let outcome = stage.run(&["echo", "left/scan", "-n", "3", "--json", "--timeout=30s"]);
     assert_eq!(outcome.of_class("scan").len(), 3, "{outcome}");
+}
+
+#[test]
+fn bytes_between_telegrams_are_counted_by_whoever_reads_them() {
+    let stage = Stage::new();
+    let mut random = fastrand::Rng::with_seed(5);
+    let mut bytes = stage::scan(1);
+    bytes.extend((0..31_002).map(|_| random.u8(..)));
+    bytes.extend((2..9).flat_map(stage::scan));
+    let stream = stage.file("a.bin", &bytes);
+    let mcap = stream.replace("a.bin", "a.mcap");
+    let outcome = stage.run(&["convert", &stream, &mcap, "--json"]);
+    let line = outcome.of_class("converted").pop().unwrap_or_else(|| panic!("{outcome}"));
+    assert_eq!((&line["telegrams"], &line["missing"]["bytes"]), (&json!(8), &json!(31_002)));
+    assert_eq!(line["sensors"], json!(["front"]));
+    let outcome = stage.run(&["convert", &stream, &mcap, "--force"]);
+    assert!(outcome.errors.contains("31002 bytes that are in nothing"), "{outcome}");
+    let outcome = stage.run(&["telegram", "decode", &stream, "--json"]);
+    let summary = outcome.of_class("summary").pop().unwrap_or_else(|| panic!("{outcome}"));
+    assert_eq!((&summary["telegrams"], &summary["bytes_discarded"]), (&json!(8), &json!(31_002)));
+    assert!(stage.run(&["telegram", "decode", &stream]).to_string().contains("31002 bytes in nothing"));
+    let hub = stage.hub(&[format!("--link=a=file:{stream}?rate=max")]);
+    let info = stage.await_info("a", |info| info["state"] == "silent");
+    let counters = &info["counters"];
+    assert_eq!((&counters["telegrams"], &counters["bytes_discarded"]), (&json!(8), &json!(31_002)));
+    let outcome = hub.end(stage::INT);
+    assert!(outcome.errors.contains("missing: 31002 bytes that are in nothing"), "{outcome}");
 }
 
 #[test]

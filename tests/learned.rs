@@ -128,10 +128,18 @@ fn what_does_not_fit_or_is_not_wanted_is_not_taken() {
     fs::set_permissions(file(&stage), fs::Permissions::from_mode(0o600)).expect("set");
     look(&stage, &[LATE], || assert!(taught(&stage) > 350));
     // What was forgotten on purpose does not come back.
-    look(&stage, &[LATE], || {
-        assert_eq!(stage.run(&["background", "front", "reset"]).code, Some(0));
-        stage::until("it is gone", || !file(&stage).exists());
-    });
+    for (flags, content) in [
+        (vec![LATE], &kept[..]),
+        // Also not what the hub that forgets did not take.
+        (vec![LATE, "--set=link.front.pose.x=0.2"], &kept),
+        (vec![LATE], b"cut short"),
+    ] {
+        fs::write(file(&stage), content).expect("written");
+        look(&stage, &flags, || {
+            assert_eq!(stage.run(&["background", "front", "reset"]).code, Some(0));
+            stage::until("it is gone", || !file(&stage).exists());
+        });
+    }
 }
 
 #[test]

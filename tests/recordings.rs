@@ -83,6 +83,59 @@ fn a_recording_without_its_mode_has_marks_where_the_mode_is_set() {
 }
 
 #[test]
+fn values_that_could_be_split_in_several_ways_are_no_scans_until_the_mode_is_told() {
+    let stage = Stage::new();
+    // 8.6 m in 14 bits; in 13 bits it would be 0.4 m.
+    let scan = lms::measured::encode(0, Unit::Mm, &[8600; 181], 0x10);
+    let file = stage.file("recording", scan.bytes().repeat(100));
+    let trouble = "the recording does not tell its measuring mode: no scans; set link.a.mode";
+    let (outcome, _) = play(&stage, &file, "", &["a/telegram", "a/scan", "a/status"]);
+    assert_eq!((outcome.of_class("telegram").len(), outcome.of_class("scan").len()), (100, 0), "{outcome}");
+    assert!(outcome.of_class("status").iter().any(|line| line["last_error"] == trouble), "{outcome}");
+    let log = stage.path("a.log").display().to_string();
+    let refused = stage.run(&["convert", &file, &log]);
+    assert!(
+        refused.code == Some(66) && refused.errors.contains("does not tell its measuring mode"),
+        "{refused}"
+    );
+    let hub = stage.hub(&[&format!("--link=a=file:{file}"), "--set=link.a.mode=0x04"]);
+    let outcome = stage.run(&["echo", "--json", "a/scan", "-n", "1", "--timeout=30s"]);
+    let ranges: Vec<_> = outcome.of_class("scan").iter().map(|scan| scan["ranges"][7].clone()).collect();
+    assert_eq!(ranges, [8600], "{outcome}");
+    assert_eq!(hub.end(INT).code, Some(0));
+    // Where no value has a higher bit there is one way.
+    let plain = stage.file("plain", stage::scan(1).repeat(2));
+    let (hub, words) = (stage.hub(&[&format!("--link=a=file:{plain}")]), "no value has more than 13 bits");
+    assert_eq!(at_the_end(&stage)["counters"]["telegrams"], 2);
+    let outcome = hub.end(INT);
+    assert!(outcome.errors.contains(words), "{outcome}");
+}
+
+#[test]
+fn who_is_started_with_the_hub_gets_a_recording_from_its_beginning() {
+    let stage = Stage::new();
+    let (bytes, whole) = stream(14);
+    let file = stage.file("recording", &bytes);
+    let hub = stage.hub(&[&format!("--link=a=file:{file}?rate=max")]);
+    // It attaches to one topic after the other, well within the second that the hub waits.
+    let outcome =
+        stage.run(&["echo", "--json", "a/telegram", "-n", &whole.len().to_string(), "--timeout=30s"]);
+    check(&outcome, &whole);
+    assert_eq!(hub.end(INT).code, Some(0));
+}
+
+#[test]
+fn a_file_without_a_telegram_does_not_stream() {
+    let stage = Stage::new();
+    let hub = stage.hub(&[&format!("--link=a=file:{}", stage.file("noise", vec![0x42; 4000]))]);
+    let info = at_the_end(&stage);
+    assert_eq!(info["counters"]["bytes_discarded"], 4000);
+    let outcome = hub.end(INT);
+    assert!(outcome.errors.contains("there is no telegram in the recording"), "{outcome}");
+    assert!(!outcome.errors.contains("streaming"), "{outcome}");
+}
+
+#[test]
 fn the_reflectors_of_a_recording_are_marks() {
     let Some(data) = data() else { return };
     let recording = data.join("captures/reflector_levels_cm_18s.bin");
@@ -146,10 +199,10 @@ fn a_carmen_log() {
     assert_eq!(scans.len(), 10, "{outcome}");
     for (number, scan) in scans.iter().enumerate() {
         let expected: Vec<Value> =
-            (0..181).map(|beam| ((metres(number, beam) * 1000.0).round() as u64).into()).collect();
+            (0..181).map(|beam| ((metres(number, beam) * 100.0).round() as u64).into()).collect();
         assert_eq!(
             (&scan["ranges"], &scan["step_deg"], &scan["unit_mm"]),
-            (&expected.into(), &1.0.into(), &1.into())
+            (&expected.into(), &1.0.into(), &10.into())
         );
     }
 }

@@ -149,7 +149,7 @@ fn without_a_hub_the_robot_is_of_the_sensors_of_other_machines() {
 fn what_the_robot_is_not() {
     let stage = Stage::new();
     let scan = stage.run(&["echo", "--json", "robot/scan"]);
-    assert_eq!((scan.code, &scan.of_class("error")[0]["kind"]), (Some(3), &"no_topic".into()), "{scan}");
+    assert_eq!((scan.code, &scan.of_class("error")[0]["kind"]), (Some(2), &"usage".into()), "{scan}");
     let link = stage.run(&["run", "--json", "--no-system-config", "--link=robot=/dev/ttyS0"]);
     assert_eq!(link.code, Some(78), "{link}");
     assert!(link.errors.contains("robot"), "{link}");

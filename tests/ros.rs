@@ -6,6 +6,7 @@ mod stage;
 use std::collections::BTreeMap;
 use std::process::Command;
 
+use lms::variant::Unit;
 use schema::datagram::Packed;
 use schema::{Code, Header, Pose, Scan, file};
 use serde_json::Value;
@@ -180,7 +181,9 @@ fn others_read_every_message_made_live_and_later() {
 #[test]
 fn a_stream_becomes_messages_and_rows_where_its_mode_is_known() {
     let stage = Stage::new();
-    let bytes = (0..20).flat_map(stage::scan).collect::<Vec<u8>>();
+    let words: [u16; 361] = std::array::from_fn(|beam| (beam as u16 % 8) << 13 | (500 + 11 * beam as u16));
+    let scan = lms::measured::encode(0, Unit::Mm, &words, 0x10);
+    let bytes = scan.bytes().repeat(20);
     let stream = stage.file("a.bin", &bytes);
     let [bag, rows] = ["bag.mcap", "rows.csv"].map(|name| stage.word(name));
     for words in [&[&bag[..], "--ros2"][..], &[&rows]] {
@@ -201,10 +204,7 @@ fn a_stream_becomes_messages_and_rows_where_its_mode_is_known() {
     assert_eq!((lines.len(), lines[0].len()), (21, 8 + 361));
     assert_eq!(lines[0][..2], ["seq", "topic_seq"]);
     for (number, line) in lines[1..].iter().enumerate() {
-        let words: Vec<String> = stage::scan(number as u16)[7..729]
-            .chunks_exact(2)
-            .map(|two| u16::from_le_bytes([two[0], two[1]]).to_string())
-            .collect();
+        let words: Vec<String> = words.iter().map(|word| (word & 0x1FFF).to_string()).collect();
         assert_eq!((line[0], line[5..8].to_vec()), (&number.to_string()[..], vec!["1", "0", "0.5"]));
         assert_eq!(line[8..], words);
     }

@@ -204,6 +204,10 @@ impl Listener<'_> {
     fn heard(&mut self, datagram: Datagram<'_>, late: bool, caught: &Caught<'_>) -> Result<(), End> {
         let &Caught { arrival_ns, wall_ns, .. } = caught;
         let head = datagram.head;
+        if self.account.since_ns(head.hub, head.epoch) == Some(arrival_ns) {
+            // A life began with it; if one of the same epoch went on until now, that was another sender's.
+            self.publication.iter_mut().for_each(|publication| publication.begun(&head));
+        }
         let Some(topic) = Topic::of_number(head.topic) else {
             // What it says was said again, and better, by a newer one.
             return if late { Ok(()) } else { self.announced(&datagram, caught) };

@@ -76,10 +76,13 @@ impl Convert {
     }
 
     fn words(&self, converted: &Converted) -> String {
-        let Converted { telegrams, scans, left_out, took_ns, damage, .. } = converted;
+        let Converted { telegrams, scans, left_out, took_ns, encoding, damage, .. } = converted;
         let mut words = format!("{}: {telegrams} telegrams, {scans} scans", self.output.display());
         if let Some(seconds) = took_ns.map(seconds) {
             words += &format!(", {seconds:.3} s");
+        }
+        if let Some(encoding) = encoding {
+            words += &format!("; the log was read as {encoding}");
         }
         if *left_out > 0 {
             words += &format!("; left out: {left_out} telegrams that are no whole scans");

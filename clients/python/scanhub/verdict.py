@@ -97,10 +97,19 @@ class RobotFollower(Subscription):
         for name in memory.topics(domain):
             if name.topic == Zones.topic and is_remote(name.sensor) != of_hub:
                 self._is_of_hub = of_hub
-                if name.sensor not in self._heard:
-                    self._heard[name.sensor] = None
-                    self._follow(name)
+                self._meet(name)
         return False
+
+    def _meet(self, name: TopicName) -> None:
+        """Follows a sensor that is not followed yet. Of those of other machines that are too many none is: in their place
+        stands one that is always unknown."""
+        if name.sensor in self._heard:
+            return
+        if is_remote(name.sensor) and len(self._followers) >= _MOST_REMOTE:
+            self._heard[_OTHERS] = _Said("unknown", None)
+            return
+        self._heard[name.sensor] = None
+        self._follow(name)
 
     def _forget(self) -> None:
         self._leave()
@@ -125,5 +134,10 @@ class _Said(NamedTuple):
 
 _RANKS = {"clear": 0, "slow": 1, "unknown": 2, "stop": 3}
 """What is seen inside outweighs what is not known."""
+_MOST_REMOTE = 16
+"""As many as a listener publishes at a time. None is forgotten, and whoever can send to its network can announce ever new
+ones."""
+_OTHERS = "others..."
+"""No sensor can have this name."""
 _CALL_EVERY = 1.0
 """Seconds: a hub that starts makes its topics one after the other, and nobody shall be overlooked for long."""

@@ -9,6 +9,8 @@ import time
 from dataclasses import asdict
 
 import scanhub
+from scanhub.names import TopicName
+from scanhub.verdict import _Said
 
 
 def say(line: dict) -> None:
@@ -31,6 +33,15 @@ refused(lambda: scanhub.robot("robot"))
 with scanhub.robot(domain=domain, root=root) as asked:
     assert asked.now() == scanhub.Robot() and asked.now().verdict == "unknown", "nobody was heard yet"
 assert asked.now() == scanhub.Robot() and list(asked) == [], "it was closed"
+
+with scanhub.robot(domain=domain, root=root) as crowd:
+    crowd._follow = crowd._followers.append
+    for sensor in range(1000):
+        crowd._meet(TopicName(f"robot{sensor}.front", "zones"))
+    assert len(crowd._followers) == 16 and len(crowd._heard) == 17, "of other machines' sensors no more are followed"
+    crowd._heard = {sensor: said or _Said("clear", None) for sensor, said in crowd._heard.items()}
+    assert (crowd._fold().verdict, crowd._fold().worst) == ("unknown", "others..."), "and one stands for the others"
+    crowd._followers.clear()
 
 if sensors == ["--asked"]:
     robot = scanhub.robot(domain=domain, root=root)

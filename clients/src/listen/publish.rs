@@ -148,6 +148,14 @@ impl Publication {
         Ok((!is_told).then_some(name))
     }
 
+    /// A life of a gateway began with `head`: sensors that were published of the same epoch are another gateway's.
+    pub(super) fn begun(&mut self, head: &Head) {
+        self.sensors
+            .iter_mut()
+            .filter(|sensor| sensor.is_of(head.hub, head.epoch))
+            .for_each(RemoteTopics::replaced);
+    }
+
     /// What comes with `head` is of no sensor here, and one may be put out for it.
     pub(super) fn may_make_room(&self, head: &Head) -> bool {
         let is_full = self.sensors.len() == SENSORS && self.allowance > 0;

@@ -44,6 +44,13 @@ pub(crate) struct RobotHeard {
     pub(crate) heard: Heard,
 }
 
+/// The most sensors of other machines that are followed: as many as a listener publishes at a time. None is forgotten, and
+/// whoever can send to its network can announce ever new ones.
+const MOST_REMOTE: usize = 16;
+
+/// Stands for the sensors of other machines that are not followed, and is always unknown. No sensor can have this name.
+const OTHERS: &str = "others...";
+
 /// A hub that starts makes its topics one after the other: nobody shall be overlooked for long.
 const CALL_EVERY: Duration = Duration::from_secs(1);
 
@@ -144,11 +151,23 @@ impl RobotSource {
         let is_followed = |sensor: &String| is_remote(sensor) == (whose == Some(Who::Listener));
         for sensor in ipc::sensors_with_zones(domain)?.into_iter().filter(is_followed) {
             self.whose = Whose::All(whose);
-            if self.robot.sensors().all(|(known, _)| known != sensor) {
-                self.follow(&sensor);
-            }
+            self.meet(&sensor);
         }
         Ok(())
+    }
+
+    /// Follows `sensor`, if it is not followed yet. Of those of other machines that are too many none is: in their place stands
+    /// [`OTHERS`], which is never heard.
+    fn meet(&mut self, sensor: &str) {
+        let is_known = |name: &str| self.robot.sensors().any(|(known, _)| known == name);
+        if is_known(sensor) {
+            return;
+        }
+        if !is_remote(sensor) || self.parts.len() < MOST_REMOTE {
+            self.follow(sensor);
+        } else if !is_known(OTHERS) {
+            self.robot.expect(OTHERS);
+        }
     }
 
     fn follow(&mut self, sensor: &str) {
@@ -160,6 +179,28 @@ impl RobotSource {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use schema::Verdict;
+
+    #[test]
+    fn remote_sensors_without_number_are_one_unknown_part() {
+        let mut source = RobotSource::new(&[]);
+        source.whose = Whose::All(Some(Who::Listener));
+        for n in 0..1000 {
+            source.meet(&format!("robot{n}.front"));
+            source.meet("robot0.front");
+        }
+        assert_eq!((source.parts.len(), source.robot.parts.len()), (MOST_REMOTE, MOST_REMOTE + 1));
+        for (name, zones) in source.robot.parts.iter_mut().filter(|(name, _)| name != OTHERS) {
+            assert!(is_remote(name));
+            zones.verdict = Verdict::Clear as u8;
+        }
+        assert_eq!((source.robot.verdict(), source.robot.worst()), (Verdict::Unknown, Some(OTHERS)));
+        assert!(schema::check_followed(OTHERS).is_err(), "no sensor has its name");
+        // A hub's own sensors are as many as its configuration says.
+        let mut source = RobotSource::new(&[]);
+        (0..40).for_each(|n| source.meet(&format!("front{n}")));
+        assert_eq!(source.parts.len(), 40);
+    }
 
     #[test]
     fn remote_sensors_give_way_to_the_hub_and_never_the_hub_to_them() {

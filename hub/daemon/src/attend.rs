@@ -133,7 +133,7 @@ impl LinkThread<'_> {
             session.control(Control::Pause, clock::now());
         }
         let end = self.stream(port, &mut session);
-        self.is_flooded = false;
+        (self.is_flooded, self.is_behind) = (false, false);
         self.account.close(&session);
         (session.tally().read > 0, end)
     }

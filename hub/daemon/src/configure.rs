@@ -81,6 +81,9 @@ pub fn configure(order: &Order, stop: &AtomicBool, tell: &mut dyn FnMut(News<'_>
     // What a stream has sent meanwhile is not looked at.
     port.begin_anew(plan.baud.rate()).map_err(|error| outcome::untouched(&name, &error))?;
     let mut change = Change::new(consent, clock::now());
+    if let Source::Tcp { .. } = order.source {
+        change = change.behind_server();
+    }
     let mut shown = None;
     // An interrupt would leave it half done; it takes seconds, and ends in any case.
     let to_the_end = AtomicBool::new(false);

@@ -4,6 +4,8 @@
 
 mod file;
 
+use std::io;
+use std::path::Path;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::thread::{self, JoinHandle};
@@ -11,7 +13,7 @@ use std::time::Duration;
 
 use lms::{MILLIS, Nanos};
 use rustix::event::{PollFd, PollFlags, poll};
-use schema::{Age, Background, Failure, Pose, StateDirectory};
+use schema::{Age, Background, Failure, Kind, Pose, StateDirectory};
 
 use crate::bell::Bell;
 use crate::clock;
@@ -190,10 +192,10 @@ impl Desk {
     fn put(&self, slot: &Slot, pose: Pose, model: &Background) -> Result<(), Failure> {
         let file = file_of(&slot.sensor);
         if model.taught == 0 {
-            if slot.kept_wall_ns.swap(0, Ordering::Relaxed) != 0 {
-                let _ = std::fs::remove_file(self.state.path(&file));
-            }
-            return Ok(());
+            // A hub that did not begin with it has something to say of it once its own was forgotten.
+            let was_kept = slot.kept_wall_ns.swap(0, Ordering::Relaxed) != 0;
+            let is_forgotten = was_kept || model.generation > 0;
+            return if is_forgotten { remove(&self.state.path(&file)) } else { Ok(()) };
         }
         let now = clock::now();
         let wall_ns = clock::wall(now, now);
@@ -201,6 +203,17 @@ impl Desk {
         self.state.write(&file, &text)?;
         slot.kept_wall_ns.store(wall_ns, Ordering::Relaxed);
         Ok(())
+    }
+}
+
+/// Removes the file at `path`, if there is one.
+fn remove(path: &Path) -> Result<(), Failure> {
+    match std::fs::remove_file(path) {
+        Err(error) if error.kind() != io::ErrorKind::NotFound => {
+            let message = format!("{}: an old background stays: {error}", path.display());
+            Err(Failure::new(Kind::Failed, message, "remove the file"))
+        }
+        _ => Ok(()),
     }
 }
 

@@ -59,6 +59,8 @@ pub(crate) struct LinkThread<'a> {
     pub(crate) unreached: u32,
     /// The port brings more than its line can.
     pub(crate) is_flooded: bool,
+    /// What is read waited in the port, who knows for how long.
+    pub(crate) is_behind: bool,
     /// The measuring mode of which was said whether it has marks.
     pub(crate) told_mode: u8,
     /// The sensor, as it turned out to be, sees too little of its circles.
@@ -122,6 +124,7 @@ impl<'a> LinkThread<'a> {
             last_rate: None,
             unreached: 0,
             is_flooded: false,
+            is_behind: false,
             told_mode: Status::MODE_UNKNOWN,
             is_blind: false,
         }
@@ -185,11 +188,13 @@ impl<'a> LinkThread<'a> {
                 let most = spare.len().min(allowance.bytes(clock::now()).max(1));
                 spare = &mut spare[..most];
             }
+            let room = spare.len();
             let len = port.read(spare)?;
             let now = clock::now();
             session.commit(now, len);
             if let Some(allowance) = &mut allowance {
-                allowance.take(len, now);
+                allowance.take(len, room, now);
+                self.is_behind = allowance.is_behind(now);
                 self.watch_flood(allowance.is_flooded(now));
             }
             if len == 0 && now >= until {
@@ -221,6 +226,7 @@ impl<'a> LinkThread<'a> {
                     let counted = port.line_errors();
                     self.account.line_errors += counted;
                     let is_hit = self.line_errors.note(counted);
+                    received.estimated |= self.is_behind;
                     received.reasons |= if is_hit { suspect::LINE_ERROR } else { 0 };
                     self.publish(&received, &Past::default());
                     self.wake(Wake::Telegram);

@@ -14,7 +14,7 @@ use crate::config::Processing;
 /// The processors of one link. Suspect scans take the same way as clean ones: an obstacle counts also where it is only
 /// suspected, and a background needs hundreds of scans in agreement, which the one bad one among them does not spoil.
 pub(crate) struct Pipeline {
-    zones: Check,
+    pub(crate) zones: Check,
     marks: Finder,
     background: Option<Kept>,
     /// By which they are made.
@@ -117,11 +117,6 @@ impl Pipeline {
             self.marks.update(scan, marks);
         }
         self.background.as_mut()?.update(scan, out.foreground, &mut self.spare.foreground)
-    }
-
-    /// Whether the sensor sees too little of the largest circle to find anything inside.
-    pub(crate) fn is_blind(&self) -> bool {
-        self.zones.is_blind()
     }
 
     /// What to say of the zones when scans stay out.

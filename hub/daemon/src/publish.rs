@@ -54,10 +54,12 @@ impl LinkThread<'_> {
         let (measured, mode) = measured.zip(mode)?;
         self.account.scans += 1;
         let fill = |scan: &mut Scan| scanner::decode(&measured, mode, scan);
+        // How it looks around the robot now, what waited in the port does not tell.
+        self.pipeline.zones.doubt(self.is_behind);
         if let Some(anew) = self.topics.scan(fill, &mut self.pipeline) {
             tracing::warn!("{}: the background begins anew: {anew}", self.link.name);
         }
-        let is_blind = self.pipeline.is_blind();
+        let is_blind = self.pipeline.zones.is_blind();
         if std::mem::replace(&mut self.is_blind, is_blind) != is_blind && is_blind {
             tracing::warn!("{}: zones unknown: too few beams meet the largest circle", self.link.name);
         }

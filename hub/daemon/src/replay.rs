@@ -54,22 +54,46 @@ pub(crate) fn run(
     match alone() {
         Ok((recorded, player)) => {
             report(Ok(()));
+            let seat = Seat { player: &player, number: 0 };
+            if await_consumer(link, seat) == Woken::Stop {
+                return;
+            }
             player.begin();
-            play(link, recorded, Seat { player: &player, number: 0 });
+            play(link, recorded, seat);
         }
         Err(failure) => report(Err(failure)),
     }
 }
 
+/// Waits a moment until somebody is attached: who starts a hub and a consumer together wants the recording from its
+/// beginning.
+fn await_consumer(link: &mut LinkThread<'_>, seat: Seat<'_>) -> Woken {
+    let (mut until, mut is_heard) = (clock::now() + FIRST_CONSUMER, false);
+    while clock::now() < until {
+        if !is_heard && link.topics.is_heard() {
+            is_heard = true;
+            // One consumer follows several topics, and others are started with it.
+            until = until.min(clock::now() + OTHER_TOPICS);
+        }
+        link.show(None, State::Starting, "");
+        let next = (clock::now() + LOOK).min(until);
+        if rest(link, seat, next) == Woken::Stop {
+            return Woken::Stop;
+        }
+    }
+    Woken::Timeout
+}
+
 fn play(link: &mut LinkThread<'_>, mut recorded: Recorded, seat: Seat<'_>) {
     let mut lap = 0;
+    let trouble = recorded.trouble(&link.link.name);
     if let Some(wall_ns) = recorded.begin_ns() {
         link.topics.recall(wall_ns, Flags::REPLAYED);
     }
     loop {
         let ended = match &mut recorded {
-            Recorded::Stream(stream) => stream::play(link, stream, seat),
-            Recorded::Frames(frames) => frames::play(link, frames, seat),
+            Recorded::Stream(stream) => stream::play(link, stream, seat, &trouble),
+            Recorded::Frames(frames) => frames::play(link, frames, seat, &trouble),
         };
         let Some(limit) = ended else { return };
         link.stale_at = limit.map_or(Nanos::MAX, |limit| clock::now() + limit);
@@ -102,11 +126,13 @@ struct Turns<'a> {
     seat: Seat<'a>,
     /// When it is looked, where nothing is waited for, whether somebody wants something.
     look_at: Nanos,
+    /// What is wrong with the recording, in words.
+    trouble: &'a str,
 }
 
 impl<'a> Turns<'a> {
-    fn new(seat: Seat<'a>) -> Turns<'a> {
-        Turns { seat, look_at: 0 }
+    fn new(seat: Seat<'a>, trouble: &'a str) -> Turns<'a> {
+        Turns { seat, look_at: 0, trouble }
     }
 
     /// Waits for the turn of what is of `media`; meanwhile the link's state is `state`. Nothing if the hub shall end.
@@ -133,7 +159,7 @@ impl<'a> Turns<'a> {
             }
             self.look_at = clock::now() + LOOK;
             let state = if self.seat.is_paused() { State::Paused } else { state };
-            link.show(session, state, "");
+            link.show(session, state, self.trouble);
         }
     }
 
@@ -144,7 +170,7 @@ impl<'a> Turns<'a> {
             return true;
         }
         self.look_at = now + LOOK;
-        link.show(None, State::Starting, "");
+        link.show(None, State::Starting, self.trouble);
         rest(link, self.seat, 0) != Woken::Stop
     }
 }
@@ -174,5 +200,9 @@ const STANDS: Nanos = Nanos::MAX - 1;
 const LONGEST_GAP: Nanos = 10_000 * MILLIS;
 /// Between two statuses while nothing plays.
 const IDLE: Nanos = 100 * MILLIS;
+/// The recording of a link begins without a consumer after so long.
+const FIRST_CONSUMER: Nanos = 1_000 * MILLIS;
+/// After its first topic a consumer has time for the others.
+const OTHER_TOPICS: Nanos = 100 * MILLIS;
 /// Between two looks at requests and the hub's end where nothing is waited for.
 const LOOK: Nanos = 5 * MILLIS;

@@ -196,6 +196,13 @@ impl Topics {
         self.background.connect();
     }
 
+    /// Whether anybody is attached to anything.
+    pub(crate) fn is_heard(&self) -> bool {
+        let of_telegrams = self.telegram.is_heard() || self.scan.is_heard() || self.zones.is_heard();
+        let of_wanted = self.marks.is_heard() || self.foreground.is_heard() || self.background.is_heard();
+        of_telegrams || of_wanted || self.status.is_heard()
+    }
+
     /// Samples without memory.
     pub(crate) fn loan_failed(&self) -> u64 {
         let of_scans = self.scan.failed + self.zones.failed + self.marks.failed;

@@ -153,6 +153,12 @@ impl Change {
         change
     }
 
+    /// As a change on the line of a serial server, which may pack a reply before it sends it.
+    pub fn behind_server(mut self) -> Self {
+        self.exchange.behind_server = true;
+        self
+    }
+
     /// How far it is.
     pub fn step(&self) -> Step {
         self.step

@@ -60,6 +60,8 @@ pub(crate) struct Exchange<R> {
     last_byte: Nanos,
     /// The sensor's own address, once it has said it; 0 is for all.
     pub(crate) address: u8,
+    /// Behind a server, whose first sign of a reply may be all of it.
+    pub(crate) behind_server: bool,
 }
 
 impl<R: Say> Exchange<R> {
@@ -73,6 +75,7 @@ impl<R: Say> Exchange<R> {
             now,
             last_byte: now,
             address: 0,
+            behind_server: false,
         }
     }
 
@@ -101,6 +104,9 @@ impl<R: Say> Exchange<R> {
         self.now = now;
         if let Some(open) = &mut self.open {
             open.transmitted(now, self.baud);
+            if self.behind_server {
+                open.hear(self.baud);
+            }
         }
     }
 
@@ -193,4 +199,29 @@ impl<R: Say> Exchange<R> {
 pub(crate) enum Heard {
     Telegram(Place),
     Nak,
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::command::Request;
+    use crate::{MILLIS, line_time};
+
+    #[test]
+    fn a_server_that_packs_the_longest_reply_is_waited_for() {
+        let until = |behind_server: bool| {
+            let mut exchange = Exchange::new(Baud::B9600, 0);
+            exchange.behind_server = behind_server;
+            exchange.ask(Request::Status, 0, 1);
+            loop {
+                match exchange.output(Nanos::MAX) {
+                    Output::Transmit { not_before, .. } => exchange.transmitted(not_before),
+                    Output::Wait { until } => return until - exchange.now,
+                    output => panic!("{output:?}"),
+                }
+            }
+        };
+        assert_eq!(until(false), 150 * MILLIS);
+        assert_eq!(until(true), 150 * MILLIS + line_time(161, 9600));
+    }
 }

@@ -64,9 +64,11 @@ impl Inquiry {
         Inquiry::with(rates, rates.len(), now)
     }
 
-    /// On a line whose rate cannot be changed from here.
+    /// On the line of a serial server, whose rate cannot be changed from here.
     pub fn at(baud: Baud, now: Nanos) -> Self {
-        Inquiry::with([baud; Baud::ALL.len()], 1, now)
+        let mut inquiry = Inquiry::with([baud; Baud::ALL.len()], 1, now);
+        inquiry.exchange.behind_server = true;
+        inquiry
     }
 
     fn with(rates: [Baud; Baud::ALL.len()], count: usize, now: Nanos) -> Self {

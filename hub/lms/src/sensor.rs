@@ -121,6 +121,8 @@ pub struct Sensor {
     /// How often a worse condition was told on such a line, and telegrams since the first time.
     sightings: u8,
     sighted_since: u16,
+    /// How often a fatal one was.
+    fatal_sightings: u8,
     /// The last status report complained, and whether the one before it did so likewise.
     complaint: Option<Complaint>,
     is_confirmed: bool,
@@ -179,6 +181,9 @@ impl Sensor {
     /// Whether the line that it speaks on damages telegrams now: some of them pass their weak checksum all the same.
     pub(crate) fn doubt(&mut self, is_doubted: bool) {
         self.is_doubted = is_doubted;
+        if !is_doubted {
+            (self.sightings, self.fatal_sightings) = (0, 0);
+        }
     }
 
     /// Whether its health has to be asked again: one report that complains may be a damaged one.
@@ -253,8 +258,13 @@ impl Sensor {
         self.software = *report.bytes().first_chunk().unwrap_or(&[0; SOFTWARE_LEN]);
     }
 
-    /// A worse condition was told once more on a line that damages telegrams; whether that is often enough.
-    fn is_sighted(&mut self) -> bool {
+    /// A worse condition was told once more on a line that damages telegrams; whether that is often enough. A sensor that
+    /// calls itself fatal may do so now and then only: two of its scans tell, however far apart.
+    fn is_sighted(&mut self, is_fatal: bool) -> bool {
+        if is_fatal {
+            self.fatal_sightings += 1;
+            return self.fatal_sightings == FATAL_SIGHTINGS;
+        }
         if self.sightings == 0 || self.sighted_since > CALM {
             (self.sightings, self.sighted_since) = (0, 0);
         }
@@ -264,9 +274,11 @@ impl Sensor {
 
     fn feel(&mut self, condition: Option<Condition>) {
         self.sighted_since = self.sighted_since.saturating_add(1);
-        if self.is_doubted && badness(condition) > badness(self.condition) && !self.is_sighted() {
+        let is_fatal = condition.and_then(Condition::severity) == Some(Severity::Fatal);
+        if self.is_doubted && badness(condition) > badness(self.condition) && !self.is_sighted(is_fatal) {
             return;
         }
+        self.fatal_sightings = if is_fatal { 0 } else { self.fatal_sightings };
         self.sightings = if badness(condition) > 0 { 0 } else { self.sightings };
         let is_better = badness(condition) < badness(self.condition);
         self.calm = if is_better { self.calm + 1 } else { 0 };
@@ -288,6 +300,8 @@ fn badness(condition: Option<Condition>) -> u8 {
 const CALM: u16 = 200;
 /// Telegrams among so many that tell a worse condition before it is believed, on a line that damages some of them.
 const SIGHTINGS: u8 = 3;
+/// The same for a fatal one, among however many.
+const FATAL_SIGHTINGS: u8 = 2;
 /// Bytes of the firmware's name.
 const SOFTWARE_LEN: usize = 7;
 /// A type reply has 20 or 21 characters.
@@ -301,6 +315,33 @@ mod tests {
     use crate::command::STATUS;
     use crate::status_report::Health;
     use crate::telegram::{REPLY, Writer};
+
+    #[test]
+    fn a_doubted_line_is_believed_what_a_sensor_repeats() {
+        // Severity in the lowest bits: 0 ok, 4 fatal; the highest one is a dirty window.
+        let (ok, fatal, dirty) = (Condition(0x10), Condition(0x14), Condition(0x90));
+        let tell = |sensor: &mut Sensor, condition: Condition, calm: u32| {
+            sensor.feel(Some(condition));
+            let notice = sensor.notices().next();
+            (0..calm).for_each(|_| sensor.feel(Some(ok)));
+            notice
+        };
+        let mut sensor = Sensor::default();
+        tell(&mut sensor, ok, 1);
+        sensor.doubt(true);
+        assert_eq!(tell(&mut sensor, fatal, 5_000), None, "one telegram proves nothing");
+        assert_eq!(tell(&mut sensor, fatal, 5_000), Some(Notice::Fatal));
+        for _ in 0..5 {
+            assert_eq!(tell(&mut sensor, dirty, 150), None, "fewer than three of 200");
+        }
+        for _ in 0..2 {
+            assert_eq!(tell(&mut sensor, fatal, 10), None);
+            sensor.doubt(false);
+            sensor.feel(Some(ok));
+            sensor.doubt(true);
+        }
+        assert_eq!([(); 3].map(|()| tell(&mut sensor, dirty, 10)), [None, None, Some(Notice::Dirty)]);
+    }
 
     #[test]
     fn a_report_that_complains_counts_once_another_one_does() {

@@ -4,19 +4,21 @@
 //! After every call that changes it, drain [`Session::poll_output`] until it answers [`Output::Wait`] or
 //! [`Output::Rest`].
 
+mod beat;
+
 use crate::Nanos;
-use crate::arrival::{Arrivals, Rhythm, Stamp};
+use crate::arrival::{Arrivals, Rhythm};
 use crate::cadence::Cadence;
 use crate::damage::Damage;
 use crate::dialogue::Dialogue;
 use crate::framer::{Advance, Framer, Place, Tally, suspect};
 use crate::identity::Identity;
-use crate::measured::{MEASURED, Measured};
+use crate::measured::MEASURED;
 use crate::outgoing::SOON;
 use crate::phase::{Control, Phase, Reason, Settings};
 use crate::sensor::{Sensor, State, Trouble};
 use crate::telegram::Telegram;
-use crate::variant::{BYTES_PER_TURN, Baud, Mode, Variant};
+use crate::variant::{BYTES_PER_TURN, Baud, Mode};
 
 /// What the session wants, in the order in which it wants it.
 #[derive(Debug)]
@@ -365,45 +367,6 @@ impl Session {
             mode: self.dialogue.sensor.mode_of_scans(),
             reasons: framed.reasons | if slow { suspect::SLOW } else { 0 },
         }
-    }
-
-    /// Time between two scans like `telegram`, if it is one of a stream whose beat is known.
-    fn period(&self, telegram: Telegram<'_>) -> Option<Nanos> {
-        let measured = Measured::decode(telegram).filter(|_| self.is_live())?;
-        let variant = Variant::of_beams(measured.count()).filter(|_| measured.partial().is_none())?;
-        Some(variant.period(telegram.bytes().len(), self.dialogue.baud.rate()))
-    }
-
-    /// When the scan at `offset` of `len` bytes began, if it waited with others for a host that did not run: by its place
-    /// among them, as far as when it was read allows.
-    fn due(&self, first: &Stamp, offset: u64, len: u64) -> Option<Nanos> {
-        let latest = first.latest?;
-        let slots = (offset - self.last_scan + len / 2) / len;
-        self.cadence.after(slots).map(|due| due.clamp(first.at, latest))
-    }
-
-    /// Takes account of what the line did to the stream up to a telegram that began at `first`; `period` is that of its
-    /// scans, if it is one.
-    fn watch_line(&mut self, first: &Stamp, period: Option<Nanos>) {
-        match period {
-            Some(period) => self.cadence.note(first.at, first.estimated, period),
-            None => self.cadence.rest(),
-        }
-        if self.is_live() {
-            self.damage.note(self.framer.tally(), self.now);
-        } else {
-            self.damage.end();
-        }
-    }
-
-    /// Whether a sensor streams, not a recording.
-    fn is_live(&self) -> bool {
-        self.state() == State::Streaming && !self.dialogue.settings.listen_only
-    }
-
-    /// Neither a recording nor a network has the pace of a line.
-    fn has_pace(&self) -> bool {
-        !(self.dialogue.settings.listen_only || self.dialogue.settings.fixed_rate)
     }
 
     fn begin_rhythm(&mut self) {

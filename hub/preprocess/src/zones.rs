@@ -76,6 +76,8 @@ pub struct Check {
     seen: u16,
     /// Scans one after the other in which enough beams met something, by circle.
     streaks: [u16; ZONES],
+    /// Scans may be older than they seem.
+    is_late: bool,
 }
 
 impl Check {
@@ -87,6 +89,7 @@ impl Check {
             table: Table::new(pose, settings),
             seen: 0,
             streaks: [0; ZONES],
+            is_late: false,
         }
     }
 
@@ -101,8 +104,8 @@ impl Check {
         let ranges = &scan.range_array;
         let invalid = self.table.invalid(ranges);
         let nearest = self.table.nearest(ranges);
-        let is_known =
-            self.seen >= self.min_scans && !self.is_blind() && invalid <= self.table.most_invalid();
+        let is_enough = self.seen >= self.min_scans && !self.is_blind();
+        let is_known = is_enough && !self.is_late && invalid <= self.table.most_invalid();
         let mut beams = [0; ZONES];
         for (zone, beams) in beams.iter_mut().enumerate().take(self.table.circles()) {
             *beams = self.table.inside(zone, ranges);
@@ -122,6 +125,12 @@ impl Check {
         self.forget();
         *out = Zones { count: self.table.circles() as u8, ..Zones::unknown() };
         self.write_circles(&[0; ZONES], out);
+    }
+
+    /// The scans from now on may be older than they seem, or are not any more. What such a scan sees in the smallest circle
+    /// counts; else the verdict is unknown.
+    pub fn doubt(&mut self, is_late: bool) {
+        self.is_late = is_late;
     }
 
     /// Beams of the last scan's layout that can tell something of the largest circle; none before the first scan.
@@ -283,6 +292,20 @@ mod tests {
             let mut check = Check::new(Pose { x_m, yaw_rad, ..Pose::default() }, &settings);
             assert_eq!(told(&mut check, &scan(&[])).verdict(), Verdict::Unknown);
         }
+    }
+
+    #[test]
+    fn an_old_scan_is_never_clear() {
+        let mut check = Check::new(Pose::default(), &Settings::default());
+        let mut of = |is_late, scan: &Scan| {
+            check.doubt(is_late);
+            told(&mut check, scan).verdict()
+        };
+        assert_eq!(of(false, &scan(&[])), Verdict::Clear);
+        assert_eq!(of(true, &scan(&[])), Verdict::Unknown);
+        assert_eq!(of(true, &scan(&[(7, 700)])), Verdict::Unknown);
+        assert_eq!(of(true, &scan(&[(7, 500)])), Verdict::Stop);
+        assert_eq!(of(false, &scan(&[])), Verdict::Clear);
     }
 
     #[test]

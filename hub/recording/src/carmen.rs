@@ -1,33 +1,71 @@
-//! CARMEN logs: text lines of which `FLASER n r1 .. rn ..` are scans in metres. They become the telegrams that an
-//! LMS 2xx would have sent. Poses and all other lines are passed over.
+//! CARMEN logs: text lines of which `FLASER n r1 .. rn ..`, `ROBOTLASER1` and `RAWLASER1` are scans in metres. They become
+//! the telegrams that an LMS 2xx would have sent. Poses and all other lines are passed over.
 
-use std::io::{self, BufRead, Read};
+mod census;
+mod log;
 
 use lms::measured;
-use lms::variant::{Mode, Unit, Variant};
+use lms::variant::{Unit, Variant};
 
-use crate::Frame;
+use crate::{Encoding, Frame};
+pub(crate) use census::Census;
+pub use census::Unfit;
+#[cfg(feature = "mcap")]
+pub(crate) use log::line_of;
+pub(crate) use log::{Log, Wrong, is_log};
 
 /// A scan of a log.
 #[derive(Clone, Debug, PartialEq)]
 pub(crate) struct Sweep {
+    pub(crate) form: LineForm,
     /// Metres, from right to left.
     pub(crate) ranges_m: Vec<f64>,
-    /// Seconds since 1970 (or since the log's start), where the line has its nine fields after the ranges.
+    /// Seconds since 1970 (or since the log's start), where the line has all its fields after the ranges.
     pub(crate) time_s: Option<f64>,
+}
+
+/// How a scan is written. A log may have each scan in two of them.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum LineForm {
+    /// `FLASER`: ranges, two poses, time.
+    Flaser,
+    /// `ROBOTLASER1`: seven fields of the sensor, ranges, remissions, two poses and five fields of the robot, time.
+    RobotLaser,
+    /// `RAWLASER1`: the same without what is of the robot.
+    RawLaser,
+}
+
+impl LineForm {
+    fn of(word: &str) -> Option<LineForm> {
+        Some(match word {
+            "FLASER" => LineForm::Flaser,
+            "ROBOTLASER1" => LineForm::RobotLaser,
+            "RAWLASER1" => LineForm::RawLaser,
+            _ => return None,
+        })
+    }
 }
 
 impl Sweep {
     /// The scan that `line` is. `Ok(None)` if it is another kind of line, `Err` with what is wrong with it.
     pub(crate) fn parse(line: &str) -> Result<Option<Sweep>, String> {
         let mut fields = line.split_ascii_whitespace();
-        if fields.next() != Some("FLASER") {
-            return Ok(None);
-        }
-        let count = fields.next().unwrap_or("");
-        let count: usize = count.parse().map_err(|_| format!("{count:?} is not a number of beams"))?;
-        if variant(count).is_none() {
+        let Some(form) = fields.next().and_then(LineForm::of) else { return Ok(None) };
+        // Type, start angle, field of view in radians, resolution, greatest range, accuracy, remission mode.
+        let view = match form {
+            LineForm::Flaser => None,
+            LineForm::RobotLaser | LineForm::RawLaser => {
+                let view: Option<f64> = fields.nth(2).and_then(|view| view.parse().ok());
+                let _ = fields.nth(3);
+                Some(view.ok_or("no field of view")?.to_degrees())
+            }
+        };
+        let count = count(fields.next())?;
+        let Some(variant) = variant(count) else {
             return Err(format!("{count} beams, which no LMS 2xx sends"));
+        };
+        if let Some(view_deg) = view.filter(|view| (view - f64::from(variant.angle_deg)).abs() > VIEW_DEG) {
+            return Err(format!("{count} beams over {view_deg:.1} degrees, which no LMS 2xx sends"));
         }
         let ranges_m = (0..count)
             .map(|beam| {
@@ -35,9 +73,14 @@ impl Sweep {
                 field.parse().map_err(|_| format!("range {field:?} is not a number"))
             })
             .collect::<Result<Vec<f64>, String>>()?;
-        // Six numbers of pose, then the time, the host's name and the time in the log.
-        let time_s = fields.nth(6).and_then(|time| time.parse().ok());
-        Ok(Some(Sweep { ranges_m, time_s }))
+        // Before the time: two poses; remissions, two poses and five numbers; remissions.
+        let before = match form {
+            LineForm::Flaser => Some(6),
+            LineForm::RobotLaser => remissions(fields.next()).map(|remissions| remissions + 11),
+            LineForm::RawLaser => remissions(fields.next()),
+        };
+        let time_s = before.and_then(|before| fields.nth(before)).and_then(|time| time.parse().ok());
+        Ok(Some(Sweep { form, ranges_m, time_s }))
     }
 
     /// The variant whose beams it has.
@@ -45,25 +88,29 @@ impl Sweep {
         variant(self.ranges_m.len())
     }
 
-    /// The value words: `round(m * 1000 / unit_mm)`, [`BEYOND`] the range if too far, no return where the log has no
-    /// number, and for the beam that logs of 180 and 360 beams leave out at the end.
-    pub(crate) fn words(&self, unit: Unit, mode: Mode) -> Vec<u16> {
-        let no_return = mode.max_value();
+    /// The value words as `encoding` has them, in a log whose ranges are encoded as `own` says: a code of it stays that
+    /// code. A range that does not go into `encoding` is rounded, or too far; what is no number is no return. The beam that
+    /// logs of 180 and 360 beams leave out at the end is [`LEFT_OUT`].
+    pub(crate) fn words(&self, own: Encoding, encoding: Encoding) -> Vec<u16> {
+        let greatest = encoding.mode.max_value();
         let word = |&range_m: &f64| {
             if !range_m.is_finite() || range_m < 0.0 {
-                return no_return;
+                return greatest;
             }
-            let units = (range_m * 1000.0 / f64::from(unit.mm())).round();
-            (units as u16).min(no_return - BEYOND)
+            match code(range_m, own) {
+                Some(below_greatest) => greatest - below_greatest,
+                None => (units(range_m, encoding.unit) as u16).min(greatest - BEYOND),
+            }
         };
         let mut words: Vec<u16> = self.ranges_m.iter().map(word).collect();
-        words.resize(self.variant().map_or(words.len(), Variant::beams), no_return);
+        words.resize(self.variant().map_or(words.len(), Variant::beams), greatest - LEFT_OUT);
         words
     }
 
-    /// The telegram that a sensor with address 0 would have sent.
-    pub(crate) fn frame(&self, unit: Unit, mode: Mode) -> Frame {
-        let telegram = measured::encode(0, unit, &self.words(unit, mode), STATUS).bytes().to_vec();
+    /// The telegram that a sensor with address 0 would have sent; see [`words`](Self::words).
+    pub(crate) fn frame(&self, own: Encoding, encoding: Encoding) -> Frame {
+        let words = self.words(own, encoding);
+        let telegram = measured::encode(0, encoding.unit, &words, STATUS).bytes().to_vec();
         Frame { telegram, wall_ns: self.wall_ns(), header: None }
     }
 
@@ -73,51 +120,31 @@ impl Sweep {
     }
 }
 
-/// Whether `head`, the beginning of a file, looks like a log.
-pub(crate) fn is_log(head: &[u8]) -> bool {
-    head.split(|&byte| byte == b'\n').any(|line| {
-        [&b"FLASER "[..], b"PARAM ", b"ODOM ", b"# message formats"].iter().any(|word| line.starts_with(word))
-    })
+/// The reply in which a sensor says that its values are as `encoding` has them.
+#[cfg(feature = "mcap")]
+pub(crate) fn configuration(encoding: Encoding) -> Vec<u8> {
+    lms::reply::configuration(0, encoding.mode, encoding.unit, STATUS).bytes().to_vec()
 }
 
-/// Why there is no next scan.
-#[derive(Debug)]
-pub(crate) enum Wrong {
-    /// What is wrong with the line.
-    Line(String),
-    /// The file cannot be read.
-    File(io::Error),
+/// A range in whole units.
+fn units(range_m: f64, unit: Unit) -> f64 {
+    (range_m * 1000.0 / f64::from(unit.mm())).round()
 }
 
-/// The next scan of `reader` after line number `line`, which is counted on. A last line without its end that is no scan
-/// is where the recording broke off, not a mistake.
-pub(crate) fn next(reader: &mut impl BufRead, line: &mut u64) -> Result<Option<Sweep>, Wrong> {
-    let mut bytes = Vec::new();
-    loop {
-        bytes.clear();
-        if reader.take(LONGEST).read_until(b'\n', &mut bytes).map_err(Wrong::File)? == 0 {
-            return Ok(None);
-        }
-        *line += 1;
-        let is_last = bytes.last() != Some(&b'\n') && bytes.len() < LONGEST as usize;
-        match Sweep::parse(&String::from_utf8_lossy(&bytes)) {
-            Ok(None) => {}
-            Err(_) if is_last => return Ok(None),
-            Err(wrong) => return Err(Wrong::Line(wrong)),
-            Ok(sweep) => return Ok(sweep),
-        }
-    }
+/// How much less than the greatest value a range is, if so little that it is a code.
+fn code(range_m: f64, encoding: Encoding) -> Option<u16> {
+    let below = f64::from(encoding.mode.max_value()) - units(range_m, encoding.unit);
+    (0.0..=f64::from(BEYOND)).contains(&below).then_some(below as u16)
 }
 
-/// The same of a log that was read before: lines that are wrong are passed over, where it breaks off it ends.
-pub(crate) fn following(reader: &mut impl BufRead, line: &mut u64) -> Option<Sweep> {
-    loop {
-        match next(reader, line) {
-            Ok(sweep) => return sweep,
-            Err(Wrong::Line(_)) => {}
-            Err(Wrong::File(_)) => return None,
-        }
-    }
+fn count(field: Option<&str>) -> Result<usize, String> {
+    let field = field.unwrap_or("");
+    field.parse().map_err(|_| format!("{field:?} is not a number of beams"))
+}
+
+/// Remissions are as many as are said, which is none where there are none.
+fn remissions(field: Option<&str>) -> Option<usize> {
+    field?.parse().ok().filter(|count| *count < 10_000)
 }
 
 fn variant(beams: usize) -> Option<Variant> {
@@ -128,8 +155,10 @@ fn variant(beams: usize) -> Option<Variant> {
 
 /// What is subtracted from the greatest value for a range beyond the mode's (Telegram listing 10.8).
 pub const BEYOND: u16 = 8;
-/// No line is longer.
-const LONGEST: u64 = 1 << 20;
+/// The same for the last beam of a scan that has none there: a code without a meaning, which no sensor sends.
+pub(crate) const LEFT_OUT: u16 = 7;
+/// Logs say the field of view with a step more or less.
+const VIEW_DEG: f64 = 1.5;
 /// Status byte of a healthy LMS type 6 (Telegram listing 8).
 const STATUS: u8 = 0x10;
 
@@ -138,36 +167,78 @@ mod tests {
     use super::*;
     use lms::measured::Measured;
     use lms::telegram::Telegram;
+    use lms::variant::Mode;
 
     fn line(count: usize, range: &str) -> String {
         let ranges = vec![range; count].join(" ");
         format!("FLASER {count} {ranges} 1 2 3 4 5 6 1071078720.5 nohost 2.5\n")
     }
 
+    fn encoding(unit: Unit, mode: u8) -> Encoding {
+        Encoding { unit, mode: Mode(mode) }
+    }
+
     #[test]
     fn a_scan_becomes_the_telegram_of_a_sensor() {
         let sweep = Sweep::parse(&line(180, "2.5")).unwrap().unwrap();
         assert_eq!(sweep.time_s, Some(1_071_078_720.5));
-        let frame = sweep.frame(Unit::Mm, Mode(1));
+        let mm = encoding(Unit::Mm, 1);
+        let frame = sweep.frame(mm, mm);
         assert_eq!(frame.wall_ns, Some(1_071_078_720_500_000_000));
         let measured = Measured::decode(Telegram::check(&frame.telegram).unwrap()).unwrap();
         let words: Vec<u16> = measured.words().collect();
-        assert_eq!((words.len(), words[0], words[179], words[180]), (181, 2500, 2500, 8191));
+        assert_eq!((words.len(), words[0], words[179], words[180]), (181, 2500, 2500, 8184));
     }
 
     #[test]
     fn ranges_are_rounded_and_what_is_too_far_has_its_code() {
-        let words = |range: &str, unit, mode| {
-            Sweep::parse(&line(361, range)).unwrap().unwrap().words(unit, Mode(mode))[0]
+        // Of a log that can say all of them.
+        let word = |range: &str, unit, mode| {
+            let sweep = Sweep::parse(&line(361, range)).unwrap().unwrap();
+            sweep.words(encoding(Unit::Cm, 6), encoding(unit, mode))[0]
         };
-        assert_eq!(words("8.1824", Unit::Mm, 1), 8182);
-        assert_eq!(words("8.1830", Unit::Mm, 1), 8183);
-        assert_eq!(words("81.91", Unit::Mm, 1), 8183);
-        assert_eq!(words("1e30", Unit::Mm, 4), 16375);
-        assert_eq!(words("2.499", Unit::Cm, 1), 250);
-        assert_eq!(words("nan", Unit::Cm, 1), 8191);
-        assert_eq!(words("inf", Unit::Cm, 5), 32767);
-        assert_eq!(words("-1", Unit::Cm, 1), 8191);
+        assert_eq!(word("8.1824", Unit::Mm, 1), 8182);
+        assert_eq!(word("8.1830", Unit::Mm, 1), 8183);
+        assert_eq!(word("81.91", Unit::Mm, 1), 8183);
+        assert_eq!(word("1e30", Unit::Mm, 4), 16375);
+        assert_eq!(word("2.499", Unit::Cm, 1), 250);
+        assert_eq!(word("nan", Unit::Cm, 1), 8191);
+        assert_eq!(word("inf", Unit::Cm, 5), 32767);
+        assert_eq!(word("-1", Unit::Cm, 1), 8191);
+    }
+
+    #[test]
+    fn a_code_stays_that_code_in_every_encoding() {
+        let word =
+            |range: &str, own, other| Sweep::parse(&line(181, range)).unwrap().unwrap().words(own, other)[7];
+        let (cm, mm14, mm15) = (encoding(Unit::Cm, 0), encoding(Unit::Mm, 4), encoding(Unit::Mm, 6));
+        for (range, code) in [("81.91", 0), ("81.90", 1), ("81.87", 4), ("81.83", 8)] {
+            assert_eq!((word(range, cm, cm), word(range, cm, mm14)), (8191 - code, 16383 - code), "{range}");
+        }
+        assert_eq!(word("81.82", cm, cm), 8182);
+        assert_eq!((word("16.383", mm14, mm14), word("16.374", mm14, mm14)), (16383, 16374));
+        assert_eq!((word("32.763", mm15, mm15), word("32.763", mm15, cm)), (32763, 8187));
+    }
+
+    #[test]
+    fn lines_of_later_logs_are_scans_too() {
+        let sensor = "0 -1.570796 3.141593 0.008727 81.91 0.01 0";
+        let ranges = vec!["2.5"; 361].join(" ");
+        for line in [
+            format!("ROBOTLASER1 {sensor} 361 {ranges} 2 7 8 1 2 3 1 2 3 0 0 0.1 0.2 0.3 12.25 host 1\n"),
+            format!("RAWLASER1 {sensor} 361 {ranges} 0 12.25 host 1\n"),
+        ] {
+            let sweep = Sweep::parse(&line).unwrap().unwrap();
+            assert_eq!(
+                (sweep.ranges_m.len(), sweep.ranges_m[360], sweep.time_s),
+                (361, 2.5, Some(12.25)),
+                "{line}"
+            );
+        }
+        let wide = format!("RAWLASER1 {} 361 {ranges} 0 1 host 1", sensor.replace("3.141593", "4.18"));
+        assert!(Sweep::parse(&wide).unwrap_err().contains("361 beams over 239.5 degrees"));
+        assert!(Sweep::parse("ROBOTLASER1 0 1").unwrap_err().contains("no field of view"));
+        assert_eq!(Sweep::parse("ROBOTLASER2 0 1"), Ok(None));
     }
 
     #[test]

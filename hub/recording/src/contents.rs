@@ -5,7 +5,7 @@ use lms::reply::Reply;
 use lms::telegram::Telegram;
 use lms::variant::{Mode, Unit, Variant};
 
-use crate::Damage;
+use crate::{Damage, Unfit};
 
 /// What kind of recording it is.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -33,15 +33,27 @@ pub struct Contents {
     pub span: Option<(u64, u64)>,
     /// Variant of the first scan.
     pub variant: Option<Variant>,
-    /// Unit of the first scan; a log has none, its metres become what is asked for.
+    /// Unit of the first scan; of a log the one in which its ranges are whole values.
     pub unit: Option<Unit>,
-    /// Measuring mode, where a configuration reply (F4h) or a status tells it.
+    /// Measuring mode, where a configuration reply (F4h) or a status tells it; of a log one whose values reach as far as
+    /// its ranges.
     pub mode: Option<Mode>,
+    /// Bits that are set in any value of its scans; of a log none.
+    pub bits: u16,
+    /// Ranges of a log that its unit and mode cannot say.
+    pub unfit: Unfit,
     /// What is missing of the file. Telegrams that follow are those that are there.
     pub damage: Damage,
 }
 
 impl Contents {
+    /// The measuring mode by which the values are read: the one that is told, else that of 13 bits where no value has a
+    /// higher bit, which then says nothing in any mode. Nothing where the values could be split in several ways.
+    pub fn readable(&self) -> Option<Mode> {
+        let plain = Mode(0x00);
+        self.mode.or((self.bits <= plain.max_value()).then_some(plain))
+    }
+
     /// Nothing yet.
     pub(crate) fn new(form: Form) -> Contents {
         Contents {
@@ -53,6 +65,8 @@ impl Contents {
             variant: None,
             unit: None,
             mode: None,
+            bits: 0,
+            unfit: Unfit::default(),
             damage: Damage::default(),
         }
     }
@@ -69,6 +83,7 @@ impl Contents {
             self.scans += 1;
             self.variant = self.variant.or(Variant::of_beams(measured.count()));
             self.unit = self.unit.or(Some(measured.unit()));
+            self.bits = measured.words().fold(self.bits, |bits, word| bits | word);
         }
     }
 

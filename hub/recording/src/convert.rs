@@ -14,11 +14,11 @@ use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, Ordering};
 
 use flate2::write::GzEncoder;
-use lms::variant::{Mode, Unit};
+use lms::variant::{Baud, Mode, Unit};
 use schema::file::{Compression, Writer};
-use schema::{Failure, Kind, Status, Topic, check_followed};
+use schema::{Failure, Kind, Topic, check_followed};
 
-use crate::{Damage, Encoding, Form, Recording};
+use crate::{Damage, Encoding, Form, Frame, Recording, carmen};
 use decoded::Sight;
 use output::{Place, unwritable};
 use times::Times;
@@ -70,7 +70,9 @@ impl Target {
 pub struct Converted {
     /// Form of the recording, and of what it became.
     pub forms: (Form, Target),
-    /// Its sensors.
+    /// How the ranges of a log are values; nothing of another form.
+    pub encoding: Option<Encoding>,
+    /// Its sensors; of one that names none the name that it gets in an MCAP file.
     pub sensors: Vec<String>,
     /// Telegrams that were written.
     pub telegrams: u64,
@@ -90,7 +92,8 @@ pub struct Converted {
 /// Converts as `options` say until `stop` is set; calls `progress` with the telegrams that were written and how many there
 /// are. Whoever closes stdout has enough.
 ///
-/// [`Kind::Input`] if the recording cannot be read, [`Kind::NoTopic`] if it has no such sensor, [`Kind::Usage`] if what it
+/// [`Kind::Input`] if the recording cannot be read, or not become that without loss, [`Kind::NoTopic`] if it has no such
+/// sensor, [`Kind::Usage`] if what it
 /// shall become cannot be said or options contradict each other, [`Kind::Output`] if that is there or cannot be written, [`Kind::Interrupted`] if it was
 /// stopped. Nothing is left then.
 pub fn convert(
@@ -112,6 +115,7 @@ pub fn convert(
     let contents = recording.contents();
     let mut converted = Converted {
         forms: (contents.form, target),
+        encoding: recording.encoding().filter(|_| contents.form == Form::Carmen),
         sensors: contents.sensors.clone(),
         telegrams: 0,
         scans: 0,
@@ -120,7 +124,7 @@ pub fn convert(
         damage: contents.damage,
         is_closed: false,
     };
-    let encoding = encoding(&recording)?;
+    let encoding = encoding(&recording, target)?;
     let is_of_all = matches!(target, Target::Recording(Form::Mcap) | Target::Ros2);
     if !(contents.form == Form::Mcap && is_of_all) {
         // Refuses to choose of several sensors, before anything is written.
@@ -157,6 +161,7 @@ pub fn convert(
         }
         Target::Recording(Form::Mcap) => {
             let file = (&mut file, compression);
+            converted.sensors = vec![sensor.to_owned()];
             write_mcap(&recording, sensor, encoding, file, &mut count, &failed)
         }
         Target::Ros2 => Ros2::begin(&mut file, compression, form_name(contents.form))
@@ -202,14 +207,18 @@ fn write_bytes(
     failed: &impl Fn(io::Error) -> Failure,
 ) -> Result<(), Failure> {
     let mut times = Times::of(recording);
-    let mode = recording.contents().mode.unwrap_or(encoding.mode);
-    let mut first_ns = None;
-    for frame in recording.telegrams(encoding)? {
-        if form == Form::Telegrams {
+    if form == Form::Telegrams {
+        for frame in frames(recording, encoding)? {
             out.write_all(&frame.telegram).map_err(failed)?;
             count(Written::of(frame.is_scan()), frame.wall_ns)?;
-            continue;
         }
+        return out.finish().map_err(failed);
+    }
+    let mode = encoding.mode;
+    let told = carmen::line_of(encoding);
+    out.write_all(told.as_bytes()).map_err(failed)?;
+    let mut first_ns = None;
+    for frame in recording.telegrams(encoding)? {
         let at_ns = times.wall_ns(&frame);
         let line = scans::line(&frame.telegram, mode, at_ns, *first_ns.get_or_insert(at_ns));
         out.write_all(line.as_deref().unwrap_or_default().as_bytes()).map_err(failed)?;
@@ -231,15 +240,10 @@ fn write_mcap(
     let mut writer = Writer::packed(file, "", compression, facts.into()).map_err(failed)?;
     let mut times = Times::of(recording);
     let mut bytes = 0;
-    for (number, frame) in recording.telegrams(encoding)?.enumerate() {
-        let header = times.header(&frame, number as u64);
-        if number == 0 && recording.contents().form == Form::Carmen {
-            // Nothing else tells how the values are split.
-            let status = Status { mode: encoding.mode.0, unit_mm: encoding.unit.mm(), ..Status::default() };
-            let mut room = [0; 1024];
-            let len = schema::datagram::Packed::pack(&status, &mut room).unwrap_or(0);
-            writer.sample(sensor, Topic::Status, &header, &room[..len]).map_err(failed)?;
-        }
+    let mut frames = frames(recording, encoding)?.enumerate().peekable();
+    while let Some((number, frame)) = frames.next() {
+        let next_ns = frames.peek().and_then(|(_, next)| next.wall_ns);
+        let header = times.header(&frame, number as u64, next_ns);
         writer.sample(sensor, Topic::Telegram, &header, &frame.telegram).map_err(failed)?;
         bytes += frame.telegram.len();
         if bytes >= CHUNK {
@@ -276,21 +280,37 @@ fn write_view(
     view.finish().map_err(failed)
 }
 
-/// How the metres of a log become values with the least loss: in centimetres where it has no finer ones, else in
-/// millimetres as far as they reach.
-fn encoding(recording: &Recording) -> Result<Encoding, Failure> {
-    let cm = Encoding { unit: Unit::Cm, mode: Mode(0) };
-    if recording.contents().form != Form::Carmen {
-        return Ok(cm);
+/// How the values are encoded, where that can be said without loss or is not asked.
+///
+/// [`Kind::Input`] of a log whose ranges no sensor could have sent, and for a log, of values of which nobody knows
+/// where a range ends.
+fn encoding(recording: &Recording, target: Target) -> Result<Encoding, Failure> {
+    let contents = recording.contents();
+    let unfit = contents.unfit;
+    if !unfit.is_none() {
+        let message = format!("{} cannot become telegrams without loss: {unfit}", recording.path().display());
+        let hint = "round its ranges first; `scanhub replay` plays it rounded";
+        return Err(Failure::new(Kind::Input, message, hint));
     }
-    let (mut is_fine, mut farthest_m) = (false, 0.0f64);
-    for range_m in recording.sweeps()?.flat_map(|sweep| sweep.ranges_m) {
-        is_fine |= range_m.is_finite() && (range_m * 100.0 - (range_m * 100.0).round()).abs() > 1e-6;
-        farthest_m = if range_m.is_finite() { farthest_m.max(range_m) } else { farthest_m };
+    let mode = contents.readable();
+    if mode.is_none() && target == Target::Recording(Form::Carmen) {
+        let message = format!("{} does not tell its measuring mode", recording.path().display());
+        let hint = "`scanhub replay --set link.front.mode=0x04` plays it, and `scanhub record` records it with its mode";
+        return Err(Failure::new(Kind::Input, message, hint));
     }
-    let reaches = |mode: &Mode| farthest_m * 1000.0 < f64::from(mode.max_value() - crate::BEYOND);
-    let fine = [Mode(0x00), Mode(0x04), Mode(0x06)].into_iter().find(reaches).filter(|_| is_fine);
-    Ok(fine.map_or(cm, |mode| Encoding { unit: Unit::Mm, mode }))
+    Ok(Encoding { unit: contents.unit.unwrap_or(Unit::Cm), mode: mode.unwrap_or(Mode(0)) })
+}
+
+/// What becomes of `recording`: its telegrams, and before those of a log the reply that says how their values are encoded.
+fn frames(recording: &Recording, encoding: Encoding) -> Result<impl Iterator<Item = Frame> + use<>, Failure> {
+    let contents = recording.contents();
+    let told = (contents.form == Form::Carmen).then(|| {
+        let telegram = carmen::configuration(encoding);
+        let took_ns = lms::line_time(telegram.len(), Baud::B500000.rate());
+        let wall_ns = contents.span.map(|(first_ns, _)| first_ns.saturating_sub(took_ns));
+        Frame { telegram, wall_ns, header: None }
+    });
+    Ok(told.into_iter().chain(recording.telegrams(encoding)?))
 }
 
 /// What the name of the file and the options tell.

@@ -15,7 +15,7 @@ mod open;
 mod packed;
 mod stream;
 
-pub use carmen::BEYOND;
+pub use carmen::{BEYOND, Unfit};
 pub use contents::{Contents, Form};
 pub use damage::Damage;
 pub use open::{Encoding, Recording};

@@ -1,13 +1,14 @@
 //! Opens a recording by what is in it, not by its name, and reads it through once: what it holds is known, and what
 //! is wrong with it is said, before anything is sent from it. Nothing is kept in memory.
 
+use std::fmt;
 use std::io::{self, BufRead, BufReader, Read};
 use std::path::{Path, PathBuf};
 
 use lms::variant::{Mode, Unit};
 use schema::{Failure, Kind, regular};
 
-use crate::carmen::{self, Wrong};
+use crate::carmen::{self, Census, Log, Wrong};
 #[cfg(feature = "mcap")]
 use crate::mcap::{Knowledge, reader::Reader};
 use crate::packed::Packed;
@@ -21,6 +22,13 @@ pub struct Encoding {
     pub unit: Unit,
     /// How the 16 bits of a value are split.
     pub mode: Mode,
+}
+
+/// In words.
+impl fmt::Display for Encoding {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "values of {} mm in {} bits", self.unit.mm(), self.mode.range_bits())
+    }
 }
 
 /// A recording that could be read to its end.
@@ -153,19 +161,21 @@ impl Recording {
         Ok(reader(&self.path)?)
     }
 
-    /// Its telegrams in order, replies too; a log's scans as `encoding` says. Should the file become unreadable in the
+    /// How the values are encoded, as far as it says so; of a log, how its ranges are whole values.
+    pub fn encoding(&self) -> Option<Encoding> {
+        Some(Encoding { unit: self.contents.unit?, mode: self.contents.mode? })
+    }
+
+    /// Its telegrams in order, replies too; a log's scans as `encoding` says: without loss if that is its own. Should the file become unreadable in the
     /// meantime, they end there.
     ///
     /// [`Kind::Usage`] if it has several sensors and none was chosen by [`of`](Self::of).
     pub fn telegrams(&self, encoding: Encoding) -> Result<Box<dyn Iterator<Item = Frame> + Send>, Failure> {
-        let mut reader = reader(&self.path)?;
+        let reader = reader(&self.path)?;
         Ok(match self.contents.form {
             Form::Carmen => {
-                let mut line = 0;
-                Box::new(std::iter::from_fn(move || {
-                    let sweep = carmen::following(&mut reader, &mut line)?;
-                    Some(sweep.frame(encoding.unit, encoding.mode))
-                }))
+                let (mut log, own) = (Log::new(reader), self.encoding().unwrap_or(encoding));
+                Box::new(std::iter::from_fn(move || Some(log.following()?.frame(own, encoding))))
             }
             Form::Telegrams => {
                 let mut telegrams = Telegrams::new(reader);
@@ -200,14 +210,6 @@ impl Recording {
     ) -> Result<Box<dyn Iterator<Item = Frame> + Send>, Failure> {
         // None could be opened.
         Ok(Box::new(std::iter::empty()))
-    }
-
-    /// The scans of a log; none of another form.
-    #[cfg(feature = "mcap")]
-    pub(crate) fn sweeps(&self) -> Result<impl Iterator<Item = carmen::Sweep> + use<>, Failure> {
-        let mut reader = Some(reader(&self.path)?).filter(|_| self.contents.form == Form::Carmen);
-        let mut line = 0;
-        Ok(std::iter::from_fn(move || carmen::following(reader.as_mut()?, &mut line)))
     }
 
     /// All that is in an MCAP file, and what is known of it.
@@ -246,12 +248,15 @@ impl Recording {
     }
 }
 
-fn survey_log(path: &Path, mut reader: impl BufRead) -> Result<Contents, Failure> {
+fn survey_log(path: &Path, reader: impl BufRead) -> Result<Contents, Failure> {
     let mut contents = Contents::new(Form::Carmen);
-    let (mut line, mut refusal) = (0, None);
+    let (mut log, mut census, mut refusal) = (Log::new(reader), Census::default(), None);
     loop {
-        match carmen::next(&mut reader, &mut line) {
-            Ok(Some(sweep)) => contents.note_scan(sweep.variant(), sweep.wall_ns()),
+        match log.next() {
+            Ok(Some(sweep)) => {
+                contents.note_scan(sweep.variant(), sweep.wall_ns());
+                census.note(&sweep.ranges_m);
+            }
             Ok(None) => break,
             Err(Wrong::File(error)) if is_end(&error) && contents.scans > 0 => {
                 contents.damage.is_cut = true;
@@ -259,7 +264,7 @@ fn survey_log(path: &Path, mut reader: impl BufRead) -> Result<Contents, Failure
             }
             Err(Wrong::File(error)) => return Err(unreadable(path, &error)),
             Err(Wrong::Line(wrong)) => {
-                let message = format!("{}:{line}: {wrong}", path.display());
+                let message = format!("{}:{}: {wrong}", path.display(), log.line);
                 let hint = "a scan is: FLASER 361 RANGE... in metres";
                 refusal.get_or_insert(Failure::new(Kind::Input, message, hint));
                 contents.damage.telegrams += 1;
@@ -267,6 +272,8 @@ fn survey_log(path: &Path, mut reader: impl BufRead) -> Result<Contents, Failure
             }
         }
     }
+    let (encoding, unfit) = census.encoding(log.told);
+    (contents.unit, contents.mode, contents.unfit) = (Some(encoding.unit), Some(encoding.mode), unfit);
     // Where no line is right it is the format that is wrong, not the file.
     match refusal.filter(|_| contents.scans == 0) {
         Some(refusal) => Err(refusal),
@@ -280,14 +287,16 @@ fn survey_stream(path: &Path, reader: impl Read) -> Result<Contents, Failure> {
     loop {
         match telegrams.next() {
             Ok(Some(bytes)) => contents.note(&bytes, None),
-            Ok(None) => return Ok(contents),
+            Ok(None) => break,
             Err(error) if is_end(&error) && contents.telegrams > 0 => {
                 contents.damage.is_cut = true;
-                return Ok(contents);
+                break;
             }
             Err(error) => return Err(unreadable(path, &error)),
         }
     }
+    contents.damage.bytes = telegrams.discarded();
+    Ok(contents)
 }
 
 /// Whether a reader that fails so has no more to give, and the disk is not to blame: a packed file is cut or harmed.

@@ -1,5 +1,5 @@
 //! Telegrams out of a stream of bytes as they came down a line, with whatever else came: bytes that are in no telegram
-//! are passed over. A stream has no stamps.
+//! are passed over, and counted. A stream has no stamps.
 
 use std::io::Read;
 
@@ -16,6 +16,12 @@ pub(crate) struct Telegrams<R> {
 impl<R: Read> Telegrams<R> {
     pub(crate) fn new(reader: R) -> Self {
         Telegrams { reader, framer: Framer::default(), ended: false }
+    }
+
+    /// Bytes so far that were in no telegram; at the end all of them.
+    pub(crate) fn discarded(&self) -> u64 {
+        let open = if self.ended { self.framer.buffered() as u64 } else { 0 };
+        self.framer.tally().discarded + open
     }
 
     /// The next whole telegram, or `None` at the end.

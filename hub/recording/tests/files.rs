@@ -80,14 +80,15 @@ fn a_log_becomes_telegrams() {
     let file = File::new("log.gz", &gzip(log.as_bytes()));
     let recording = Recording::open(&file.0).unwrap();
     assert_eq!((recording.contents().form, recording.contents().scans), (Form::Carmen, 2));
-    assert_eq!((recording.contents().variant, recording.contents().unit), (Some(Variant::HALF), None));
+    assert_eq!(recording.contents().variant, Some(Variant::HALF));
+    assert_eq!(recording.encoding(), Some(Encoding { unit: Unit::Mm, mode: Mode(0) }));
     let frames: Vec<_> = recording.telegrams(MM).unwrap().collect();
     let last = |i: usize| {
         let telegram = Telegram::check(&frames[i].telegram).unwrap();
         let words: Vec<u16> = Measured::decode(telegram).unwrap().words().collect();
         (words.len(), words[0], words[360])
     };
-    assert_eq!((last(0), last(1)), ((361, 1234, 8191), (361, 1234, 1234)));
+    assert_eq!((last(0), last(1)), ((361, 1234, 8184), (361, 1234, 1234)));
     assert_eq!((frames[0].wall_ns, frames[0].header), (Some(12_250_000_000), None));
     let contents = recording.contents();
     assert_eq!(contents.span, Some((12_250_000_000, 12_250_000_000)));

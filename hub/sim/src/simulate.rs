@@ -158,7 +158,7 @@ fn scans(
         return Err(Failure::new(
             Kind::Configuration,
             format!("recording {} holds no scan", recording.path().display()),
-            "replay one with measured-value telegrams (B0h), or a CARMEN log with FLASER lines",
+            "replay one with measured-value telegrams (B0h), or a CARMEN log with scans",
         ));
     }
     let recording = recording.clone();

@@ -25,7 +25,8 @@ pub const ROWS: usize = 1024;
 /// room beside those is refused.
 ///
 /// Two gateways with one number and one epoch are told apart by their senders and by what they announce: only one of them
-/// is taken, the first that was heard, until it is silent for 3 s.
+/// is taken, the first that was heard. After 3 s of its silence another sender is taken, as a new life; but never once two
+/// are known to send.
 pub struct Account {
     /// Bit n: topic number n is listened to.
     followed: u8,

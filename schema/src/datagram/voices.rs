@@ -30,7 +30,8 @@ pub(super) enum Whose {
     Own,
     /// Another gateway's with the same number, or not known to be the same one's.
     Twin,
-    /// Another one's, and the one that was heard is silent: its life is over.
+    /// Another one's, and the one that was heard is silent: its life is over. Never where two are known to send: then a
+    /// sample of the one would appear under the other one's name.
     Next,
 }
 
@@ -62,7 +63,7 @@ impl Voices {
         let boot = boot.or(announced).filter(|boot| *boot != 0);
         match boot.is_some_and(|boot| first.boots.contains(&boot)) {
             true => Whose::Own,
-            false if first.is_silent(now_ns) => Whose::Next,
+            false if first.is_silent(now_ns) && !self.is_shared => Whose::Next,
             false => Whose::Twin,
         }
     }
@@ -159,6 +160,14 @@ mod tests {
             }
         }
         assert_eq!(told_ms, Some(1300));
+        for (from, boot) in [(2, None), (2, Some(300)), (3, Some(9))] {
+            assert_eq!(
+                hear(&mut voices, from, boot, 60_000),
+                Whose::Twin,
+                "nobody stands in for the first one"
+            );
+        }
+        assert_eq!(hear(&mut voices, 3, Some(10), 60_100), Whose::Own, "the first one at another address");
     }
 
     #[test]

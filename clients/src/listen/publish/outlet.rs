@@ -76,8 +76,7 @@ impl<P: Payload + ?Sized> Outlet<P> {
 
     /// How many numbers the sample with `head` is behind the last one, if both are of one count.
     fn steps(&self, head: &Head) -> Option<u32> {
-        let (epoch, sensor, last) = self.last;
-        (head.epoch == epoch && head.sensor == sensor).then(|| head.sequence.wrapping_sub(last))
+        steps(self.last, (head.epoch, head.sensor, head.sequence))
     }
 }
 
@@ -116,5 +115,26 @@ impl<P: Payload + ZeroCopySend + Default + Packed> Outlet<P> {
         self.send(&header, |sample| {
             let _ = sample.unpack(remote.datagram.payload);
         });
+    }
+}
+
+/// How many numbers `next` is behind `last`, each with its epoch and the sensor's number, if both are of one count. What comes
+/// late is not published: a lower number is of another sender's count, who came in the place of a silent one.
+fn steps(last: (u32, u8, u32), next: (u32, u8, u32)) -> Option<u32> {
+    let steps = next.2.wrapping_sub(last.2);
+    ((next.0, next.1) == (last.0, last.1) && steps <= u32::MAX / 2).then_some(steps)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn numbers_that_begin_anew_are_of_another_count() {
+        assert_eq!(steps((1, 0, 100), (1, 0, 103)), Some(3));
+        assert_eq!(steps((1, 0, u32::MAX), (1, 0, 1)), Some(2));
+        assert_eq!(steps((1, 0, 100), (1, 0, 20)), None);
+        assert_eq!(steps((1, 0, 100), (2, 0, 103)), None);
+        assert_eq!(steps((1, 0, 100), (1, 1, 103)), None);
     }
 }

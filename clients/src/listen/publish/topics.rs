@@ -140,6 +140,11 @@ impl RemoteTopics {
         self.source == Some((head.hub, head.epoch, head.sensor))
     }
 
+    /// Its gateway is this one, in this epoch.
+    pub(super) fn is_of(&self, hub: u64, epoch: u32) -> bool {
+        self.source.is_some_and(|source| (source.0, source.1) == (hub, epoch))
+    }
+
     /// Publishes `remote`; `false` if it has no such topic. A payload cannot fail to be read: the account has checked it.
     pub(super) fn publish(&mut self, remote: &Remote<'_>, now: Instant) -> bool {
         self.heard_at = Some(now);

@@ -112,7 +112,7 @@ impl Background {
         };
         let SavedModel { sensor: of, model } = SavedModel::parse(&text, &place).map_err(|failure| {
             let message = format!("link {sensor}: background.start: {}", failure.message);
-            Failure::new(failure.kind, message, failure.hint)
+            Failure::new(Kind::Configuration, message, failure.hint)
         })?;
         if of != sensor {
             let hint = "name the file of each sensor by background.start of its link";

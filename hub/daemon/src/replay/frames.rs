@@ -26,9 +26,14 @@ struct Verdict {
 
 /// Plays `frames` into the topics of `link`. At the end, for how long the last verdict stands; nothing if the hub shall
 /// end.
-pub(super) fn play(link: &mut LinkThread<'_>, frames: &Frames, seat: Seat<'_>) -> Option<Option<Nanos>> {
+pub(super) fn play(
+    link: &mut LinkThread<'_>,
+    frames: &Frames,
+    seat: Seat<'_>,
+    trouble: &str,
+) -> Option<Option<Nanos>> {
     let play = seat.play();
-    let mut turns = Turns::new(seat);
+    let mut turns = Turns::new(seat, trouble);
     let mut telegrams = match frames.read() {
         Ok(telegrams) => telegrams.peekable(),
         Err(failure) => {
@@ -99,7 +104,7 @@ pub(super) fn play(link: &mut LinkThread<'_>, frames: &Frames, seat: Seat<'_>) -
             link.wake(Wake::Telegram);
             seat.played(media);
             state = State::Streaming;
-            link.show(None, state, "");
+            link.show(None, state, trouble);
         }
         // One whose values nobody could read had none.
         if frame.is_scan() && mode.is_some_and(Mode::has_ranges) {

@@ -10,7 +10,7 @@ use schema::{Failure, Kind, check_sensor};
 
 use super::playback::Play;
 use super::player::{Player, Progress};
-use super::recorded::{Origin, Recorded};
+use super::recorded::{self, Origin, Recorded};
 use crate::config::{Config, Source, Sources};
 use crate::supervise::{self, Ready, Troupe};
 use schema::Domain;
@@ -44,10 +44,7 @@ pub fn replay(
 ) -> Result<Progress, Failure> {
     let Replay { file, sources, .. } = *replay;
     let recording = Recording::open(file)?;
-    let damage = recording.contents().damage;
-    if !damage.is_none() {
-        tracing::warn!("{}: missing: {damage}", file.display());
-    }
+    recorded::tell_of_damage(&recording);
     let sensors = sensors(&recording, replay.sensor)?;
     let read = || configuration(sources, &sensors, file);
     let config = read()?;

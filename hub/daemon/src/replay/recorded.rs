@@ -25,13 +25,15 @@ pub(crate) enum Recorded {
 /// A stream of telegrams, with whatever came between them.
 pub(crate) struct Stream {
     recording: Recording,
-    pub(super) mode: Mode,
+    pub(super) mode: Option<Mode>,
 }
 
 /// Telegrams that are known to be whole.
 pub(crate) struct Frames {
     recording: Recording,
+    /// Of a log the metres, of others nothing.
     encoding: Encoding,
+    mode: Option<Mode>,
     origin: Option<Origin>,
     /// At its beginning it is not known how values are split: the hub that recorded it learned that from a telegram.
     is_told_later: bool,
@@ -53,6 +55,7 @@ impl Recorded {
     /// that only brings noise.
     pub(crate) fn open(path: &Path, link: &Link) -> Result<Recorded, Failure> {
         let recording = Recording::open_line(path)?;
+        tell_of_damage(&recording);
         if recording.contents().sensors.len() > 1 {
             // Its name is configured, and not a word of somebody who asks.
             let part = recording.of(&link.name);
@@ -62,14 +65,17 @@ impl Recorded {
         Recorded::new(recording, link)
     }
 
-    /// `recording`, which is of one sensor; metres become units of `link`'s.
+    /// `recording`, which is of one sensor, as the link of `link`; says how the ranges of a log are read.
     pub(crate) fn new(recording: Recording, link: &Link) -> Result<Recorded, Failure> {
-        let mode = recording.contents().mode.or(link.mode).unwrap_or(Mode(0));
+        tell_of_log(&recording, &link.name);
+        let contents = recording.contents();
+        let mode = contents.mode.or(link.mode).or(contents.readable());
+        tell_of_mode(&recording, link);
         if recording.contents().form == Form::Telegrams {
             return Ok(Recorded::Stream(Stream { recording, mode }));
         }
-        let encoding = Encoding { unit: link.unit.unwrap_or(Unit::Mm), mode };
-        let mut frames = Frames { recording, encoding, origin: None, is_told_later: false };
+        let encoding = Encoding { unit: contents.unit.unwrap_or(Unit::Mm), mode: mode.unwrap_or(Mode(0)) };
+        let mut frames = Frames { recording, encoding, mode, origin: None, is_told_later: false };
         let mut first = frames.read()?.take(ASKED_WITHIN).peekable();
         frames.origin = first.peek().and_then(Origin::of);
         let begin = first.peek().and_then(|frame| frame.header).filter(is_first);
@@ -98,6 +104,19 @@ impl Recorded {
         self.origin().map(|origin| origin.wall_ns)
     }
 
+    /// Why no scan can be read, in words; empty if they can.
+    pub(super) fn trouble(&self, name: &str) -> String {
+        let (Recorded::Stream(Stream { mode, recording }) | Recorded::Frames(Frames { mode, recording, .. })) =
+            self;
+        if recording.contents().telegrams == 0 {
+            return "there is no telegram in the recording".to_owned();
+        }
+        if mode.is_some() || recording.contents().scans == 0 {
+            return String::new();
+        }
+        format!("the recording does not tell its measuring mode: no scans; set link.{name}.mode")
+    }
+
     /// Media time of its end, as far as that is known.
     pub(crate) fn length(&self) -> Option<Nanos> {
         let (Recorded::Stream(Stream { recording, .. }) | Recorded::Frames(Frames { recording, .. })) = self;
@@ -121,6 +140,11 @@ impl Recorded {
 }
 
 impl Stream {
+    /// Whether there is any telegram in it.
+    pub(super) fn has_telegrams(&self) -> bool {
+        self.recording.contents().telegrams > 0
+    }
+
     /// Its bytes from the beginning.
     pub(super) fn bytes(&self) -> Result<Box<dyn Read + Send>, Failure> {
         self.recording.bytes()
@@ -153,7 +177,7 @@ impl Frames {
 
     /// How values are split, as it is known at the beginning.
     pub(super) fn first_mode(&self) -> Option<Mode> {
-        (!self.is_told_later).then_some(self.encoding.mode)
+        self.mode.filter(|_| !self.is_told_later)
     }
 
     /// Number of the first telegram whose values the hub could read, in the life that begins with that of `header`.
@@ -233,6 +257,35 @@ impl Origin {
             _ => self.wall_ns <= other.wall_ns,
         };
         if is_earlier { self } else { other }
+    }
+}
+
+/// That the values are read in a way which neither the recording nor the configuration tells.
+fn tell_of_mode(recording: &Recording, link: &Link) {
+    let contents = recording.contents();
+    if contents.mode.or(link.mode).is_none() && contents.scans > 0 && contents.readable().is_some() {
+        let name = &link.name;
+        tracing::info!(
+            "{name}: no measuring mode is told, and no value has more than 13 bits: read as ranges of 13"
+        );
+    }
+}
+
+/// What is missing of it, if anything is.
+pub(super) fn tell_of_damage(recording: &Recording) {
+    let damage = recording.contents().damage;
+    if !damage.is_none() {
+        tracing::warn!("{}: missing: {damage}", recording.path().display());
+    }
+}
+
+/// How the ranges of a log are read, and what of them goes into no value.
+fn tell_of_log(recording: &Recording, name: &str) {
+    let contents = recording.contents();
+    let Some(encoding) = recording.encoding().filter(|_| contents.form == Form::Carmen) else { return };
+    tracing::info!("{name}: a CARMEN log, read as {encoding}");
+    if !contents.unfit.is_none() {
+        tracing::warn!("{name}: {}", contents.unfit);
     }
 }
 

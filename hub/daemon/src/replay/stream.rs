@@ -15,9 +15,14 @@ use crate::publish::Past;
 
 /// Plays `stream` into the topics of `link`. At the end, for how long the last verdict stands; nothing if the hub shall
 /// end.
-pub(super) fn play(link: &mut LinkThread<'_>, stream: &Stream, seat: Seat<'_>) -> Option<Option<Nanos>> {
+pub(super) fn play(
+    link: &mut LinkThread<'_>,
+    stream: &Stream,
+    seat: Seat<'_>,
+    trouble: &str,
+) -> Option<Option<Nanos>> {
     let play = seat.play();
-    let mut turns = Turns::new(seat);
+    let mut turns = Turns::new(seat, trouble);
     let mut bytes = match stream.bytes() {
         Ok(bytes) => bytes,
         Err(failure) => {
@@ -26,8 +31,9 @@ pub(super) fn play(link: &mut LinkThread<'_>, stream: &Stream, seat: Seat<'_>) -
         }
     };
     let mut session = Session::new(link.settings(true), clock::now());
-    let mut past = Past { mode: Some(stream.mode), ..Past::default() };
+    let mut past = Past { mode: stream.mode, ..Past::default() };
     let (mut media, mut limit) = (0, None);
+    let state = if stream.has_telegrams() { State::Streaming } else { State::Probing };
     loop {
         if play.end_ns.is_some_and(|end_ns| media >= end_ns) {
             break;
@@ -38,7 +44,7 @@ pub(super) fn play(link: &mut LinkThread<'_>, stream: &Stream, seat: Seat<'_>) -
                 return None;
             }
         } else {
-            past.stretch = turns.wait(link, Some(&session), media, State::Streaming)?.stretch;
+            past.stretch = turns.wait(link, Some(&session), media, state)?.stretch;
         }
         let room = session.spare();
         let piece = room.len().min(PIECE);
@@ -65,7 +71,7 @@ pub(super) fn play(link: &mut LinkThread<'_>, stream: &Stream, seat: Seat<'_>) -
             }
         }
         if !is_skipped {
-            link.show(Some(&session), State::Streaming, "");
+            link.show(Some(&session), state, trouble);
         }
         if len == 0 {
             break;

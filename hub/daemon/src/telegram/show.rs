@@ -44,6 +44,7 @@ struct Account {
     cut: u64,
     acknowledge: u64,
     other_bytes: u64,
+    bytes_discarded: u64,
 }
 
 /// Class `decoded`.
@@ -155,6 +156,9 @@ impl<'o> Show<'o> {
         };
         line.length = bytes.len();
         self.account.bytes += bytes.len() as u64;
+        if matches!(item, Item::Broken { .. } | Item::Cut { .. } | Item::Other(_)) {
+            self.account.bytes_discarded += bytes.len() as u64;
+        }
         let text = match self.form {
             Form::Json => {
                 if let Item::Telegram(telegram) = item {
@@ -182,12 +186,12 @@ impl<'o> Show<'o> {
 
     /// Writes what there was in all.
     pub(super) fn summary(&mut self) -> io::Result<()> {
-        let Account { bytes, telegrams, broken, cut, acknowledge, other_bytes, .. } = self.account;
+        let Account { bytes, telegrams, broken, cut, acknowledge, bytes_discarded, .. } = self.account;
         let text = match self.form {
             Form::Json => serde_json::to_string(&self.account)?,
             Form::Text { .. } => format!(
                 "{bytes} bytes: {telegrams} telegrams, {broken} with a wrong checksum, {cut} broken off, \
-                 {acknowledge} acknowledgements, {other_bytes} bytes in nothing"
+                 {acknowledge} acknowledgements, {bytes_discarded} bytes in nothing"
             ),
         };
         self.out.write_all(format!("{text}\n").as_bytes())

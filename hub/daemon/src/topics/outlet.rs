@@ -55,7 +55,12 @@ impl<P: Payload + ?Sized> Outlet<P> {
 
     /// Whether a sample is made at all: somebody is attached, or whoever comes will want it.
     pub(super) fn is_wanted(&self) -> bool {
-        history(P::TOPIC) > 0 || self.subscribers() > 0
+        history(P::TOPIC) > 0 || self.is_heard()
+    }
+
+    /// Whether anybody is attached.
+    pub(super) fn is_heard(&self) -> bool {
+        self.subscribers() > 0
     }
 
     /// Consumers that are attached and did not get the last sample.

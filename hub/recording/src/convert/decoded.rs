@@ -47,13 +47,16 @@ pub(super) fn each(
         Form::Mcap => each_of_mcap(recording, mode, tell),
         form => {
             let told = (form == Form::Carmen).then_some(encoding.mode);
-            let mode = recording.contents().mode.or(told).or(mode);
+            let contents = recording.contents();
+            let mode = contents.mode.or(told).or(mode).or(contents.readable());
             let mut sensor = Sensor { mode, is_decoded: true };
             sensor.check(recording, name)?;
             let mut times = Times::of(recording);
             let mut scan = Scan::default();
-            for (number, frame) in recording.telegrams(encoding)?.enumerate() {
-                let header = times.header(&frame, number as u64);
+            let mut frames = recording.telegrams(encoding)?.enumerate().peekable();
+            while let Some((number, frame)) = frames.next() {
+                let next_ns = frames.peek().and_then(|(_, next)| next.wall_ns);
+                let header = times.header(&frame, number as u64, next_ns);
                 tell(match sensor.decode(&frame.telegram, &mut scan) {
                     true => Sight::Scan(name, header, &scan),
                     false => Sight::Other,
@@ -73,7 +76,7 @@ fn each_of_mcap(
     let mut sensors = BTreeMap::new();
     for name in &recording.contents().sensors {
         let contents = recording.of(name)?.contents().clone();
-        let mode = contents.mode.or(mode);
+        let mode = contents.mode.or(mode).or(contents.readable());
         let is_decoded = contents.scans > 0 && (mode.is_some() || !known.channels.has(name, Topic::Scan));
         let sensor = Sensor { mode, is_decoded };
         sensor.check(recording, name)?;

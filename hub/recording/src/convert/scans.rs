@@ -1,14 +1,14 @@
-//! A scan as a line of a CARMEN log. Lost are what the log has no place for: reflector levels and field bits, which of the
-//! nine codes a beam without a reading had, address and status of the sensor. Refuses to know when it was.
+//! A scan as a line of a CARMEN log. Lost are what the log has no place for: reflector levels and field bits, address and
+//! status of the sensor. Refuses to know when it was.
 
 use lms::measured::Measured;
 use lms::telegram::Telegram;
 use lms::variant::{Mode, Unit, Variant};
 
-use crate::BEYOND;
+use crate::carmen::LEFT_OUT;
 
 /// The line of a scan at `at_ns` since 1970, in a log that begins at `first_ns`; `None` if `telegram` is no whole scan. A
-/// beam without a reading has the greatest range that the values can say, as logs of the sensor have it.
+/// code is written as the range that its value would be, as logs of the sensor have it.
 pub(super) fn line(telegram: &[u8], mode: Mode, at_ns: u64, first_ns: u64) -> Option<String> {
     let measured = Measured::decode(Telegram::check(telegram)?)?;
     if measured.partial().is_some() || Variant::of_beams(measured.count()).is_none() {
@@ -20,11 +20,15 @@ pub(super) fn line(telegram: &[u8], mode: Mode, at_ns: u64, first_ns: u64) -> Op
         Unit::Cm => 2,
         Unit::Dm => 1,
     };
-    let mut line = format!("FLASER {}", measured.count());
-    for word in measured.words() {
-        let range = word & greatest;
-        let said = if range >= greatest - BEYOND { greatest } else { range };
-        line += &format!(" {:.decimals$}", f64::from(said) * f64::from(unit.mm()) / 1000.0);
+    let ranges: Vec<u16> = measured.words().map(|word| word & greatest).collect();
+    let ranges = match &ranges[..] {
+        // What came from a log without a last beam has none there either.
+        [ranges @ .., last] if *last == greatest - LEFT_OUT && matches!(ranges.len(), 180 | 360) => ranges,
+        ranges => ranges,
+    };
+    let mut line = format!("FLASER {}", ranges.len());
+    for &range in ranges {
+        line += &format!(" {:.decimals$}", f64::from(range) * f64::from(unit.mm()) / 1000.0);
     }
     let seconds = |ns: u64| format!("{}.{:06}", ns / 1_000_000_000, ns / 1000 % 1_000_000);
     line += &format!(" 0 0 0 0 0 0 {} scanhub {}\n", seconds(at_ns), seconds(at_ns.saturating_sub(first_ns)));
@@ -34,6 +38,7 @@ pub(super) fn line(telegram: &[u8], mode: Mode, at_ns: u64, first_ns: u64) -> Op
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::Encoding;
     use crate::carmen::Sweep;
     use lms::measured;
 
@@ -46,8 +51,12 @@ mod tests {
             line(telegram.bytes(), Mode(1), 1_071_078_720_123_456_789, 1_071_078_720_000_000_000).unwrap();
         assert!(line.ends_with(" 12.34 0 0 0 0 0 0 1071078720.123456 scanhub 0.123456\n"), "{line}");
         let sweep = Sweep::parse(&line).unwrap().unwrap();
-        assert_eq!(sweep.ranges_m[..4], [5.0, 81.91, 81.91, 12.34]);
-        assert_eq!(sweep.words(Unit::Cm, Mode(0))[..4], [500, 8183, 8183, 1234]);
+        assert_eq!(sweep.ranges_m[..4], [5.0, 81.91, 81.83, 12.34]);
+        let cm = Encoding { unit: Unit::Cm, mode: Mode(0) };
+        assert_eq!(sweep.words(cm, cm)[..4], [500, 8191, 8183, 1234]);
+        words[180] = 8191 - LEFT_OUT;
+        let line = super::line(measured::encode(0, Unit::Cm, &words, 0x10).bytes(), Mode(1), 1, 1).unwrap();
+        assert!(line.starts_with("FLASER 180 5.00 81.91 81.83 12.34"), "{line}");
     }
 
     #[test]

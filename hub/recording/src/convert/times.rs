@@ -37,10 +37,13 @@ impl Times {
         at_ns
     }
 
-    /// What a hub might have said of `frame`, the next one, which has this `number`.
-    pub(super) fn header(&mut self, frame: &Frame, number: u64) -> Header {
+    /// What a hub might have said of `frame`, the next one, which has this `number`, before one at `next_ns`: logs leave
+    /// scans out, and nothing newer than a scan can be known until the next one.
+    pub(super) fn header(&mut self, frame: &Frame, number: u64, next_ns: Option<u64>) -> Header {
         let wall_ns = self.wall_ns(frame);
-        let first_ns = wall_ns.saturating_sub(self.begin_ns).saturating_add(UPTIME_NS);
+        let first_ns = wall_ns.saturating_add(UPTIME_NS).saturating_sub(self.begin_ns);
+        let gap_ns = next_ns.map_or(0, |next_ns| next_ns.saturating_sub(wall_ns));
+        let period_ns = scan_ns(self.variant).max(gap_ns).min(LONGEST_PERIOD_NS);
         Header {
             seq: number,
             topic_seq: number,
@@ -49,7 +52,7 @@ impl Times {
             wall_ns,
             boot: self.boot,
             flags: Flags::STAMP_ESTIMATED,
-            period_us: (scan_ns(self.variant) / 1000) as u32,
+            period_us: (period_ns / 1000) as u32,
             ..Header::default()
         }
     }
@@ -64,5 +67,7 @@ fn line_ns(frame: &Frame) -> u64 {
     lms::line_time(frame.telegram.len(), Baud::B500000.rate())
 }
 
+/// What a header has room for, and what nobody waits for.
+const LONGEST_PERIOD_NS: u64 = 3_600_000_000_000;
 /// Monotonic clock at the first telegram: that of a machine that has just started.
 const UPTIME_NS: u64 = 10_000_000_000;

@@ -152,15 +152,32 @@ fn two_gateways_with_one_number_and_one_epoch_are_never_mixed() {
         assert_eq!(hear(1, &zones(head(5, 1, n)), now_ms), Ok(Fresh::New));
         assert_eq!(hear(2, &zones(head(5, 1, 500 + n)), now_ms + 50), Err(Refusal::Twin));
     }
-    // The other one goes on alone: its numbers begin anew, and none of the first one's count as lost.
+    // The other one goes on alone: it never stands in for the first one.
+    assert_eq!(hear(2, &zones(head(5, 1, 100)), 5899), Err(Refusal::Twin));
+    assert_eq!(hear(2, &zones(head(5, 1, 101)), 60_000), Err(Refusal::Twin));
+    assert_eq!(hear(1, &zones(head(5, 1, 30)), 60_001), Ok(Fresh::New));
+    assert!(account.is_shared(5, 1));
+    assert_eq!(account.refused(Refusal::Twin), 35);
+}
+
+#[test]
+fn whoever_follows_a_silent_gateway_begins_anew() {
+    let mut account = Account::new(&Topic::ALL);
+    let mut hear = |from: u64, bytes: &[u8], now_ms: u64| {
+        account.receive(bytes, from, now_ms * 1_000_000).map(|(_, fresh)| fresh)
+    };
+    for n in 0..30 {
+        assert_eq!(hear(1, &zones(head(5, 1, 200 + n)), 100 * u64::from(n)), Ok(Fresh::New));
+    }
+    // Its numbers begin anew, and none of the first one's count as lost.
     assert_eq!(hear(2, &zones(head(5, 1, 100)), 5899), Err(Refusal::Twin));
     assert_eq!(hear(2, &zones(head(5, 1, 101)), 5900), Ok(Fresh::New));
     assert!(!account.is_shared(5, 1), "a new life");
     let rows: Vec<_> = account.rows().map(|row| (row.received, row.lost())).collect();
     assert_eq!(rows, [(1, 0)]);
     let given_up = account.given_up();
-    assert_eq!((given_up.lives, given_up.displaced, given_up.received, given_up.lost), (1, 0, 33, 0));
-    assert_eq!(account.refused(Refusal::Twin), 34);
+    assert_eq!((given_up.lives, given_up.displaced, given_up.received, given_up.lost), (1, 0, 30, 0));
+    assert_eq!(account.refused(Refusal::Twin), 1);
 }
 
 #[test]

@@ -1,0 +1,50 @@
+//! The beat of a stream: when its scans are due, and what the line did to them. Refuses to know what a scan says.
+
+use super::Session;
+use crate::Nanos;
+use crate::arrival::Stamp;
+use crate::measured::Measured;
+use crate::sensor::State;
+use crate::telegram::Telegram;
+use crate::variant::Variant;
+
+impl Session {
+    /// Time between two scans like `telegram`, if it is one of a stream whose beat is known.
+    pub(super) fn period(&self, telegram: Telegram<'_>) -> Option<Nanos> {
+        let measured = Measured::decode(telegram).filter(|_| self.is_live())?;
+        let variant = Variant::of_beams(measured.count()).filter(|_| measured.partial().is_none())?;
+        Some(variant.period(telegram.bytes().len(), self.dialogue.baud.rate()))
+    }
+
+    /// When the scan at `offset` of `len` bytes began, if it waited with others for a host that did not run: by its place
+    /// among them, as far as when it was read allows.
+    pub(super) fn due(&self, first: &Stamp, offset: u64, len: u64) -> Option<Nanos> {
+        let latest = first.latest?;
+        let slots = (offset - self.last_scan + len / 2) / len;
+        self.cadence.after(slots).map(|due| due.clamp(first.at, latest))
+    }
+
+    /// Takes account of what the line did to the stream up to a telegram that began at `first`; `period` is that of its
+    /// scans, if it is one.
+    pub(super) fn watch_line(&mut self, first: &Stamp, period: Option<Nanos>) {
+        match period {
+            Some(period) => self.cadence.note(first.at, first.estimated, period),
+            None => self.cadence.rest(),
+        }
+        if self.is_live() {
+            self.damage.note(self.framer.tally(), self.now);
+        } else {
+            self.damage.end();
+        }
+    }
+
+    /// Whether a sensor streams, not a recording.
+    pub(super) fn is_live(&self) -> bool {
+        self.state() == State::Streaming && !self.dialogue.settings.listen_only
+    }
+
+    /// Neither a recording nor a network has the pace of a line.
+    pub(super) fn has_pace(&self) -> bool {
+        !(self.dialogue.settings.listen_only || self.dialogue.settings.fixed_rate)
+    }
+}
