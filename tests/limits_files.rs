@@ -139,7 +139,7 @@ fn a_chunk_that_is_too_long_is_told_and_others_are_read() {
     };
     let whole = stage.file("whole.mcap", mcap(&[channel(0, "t", "cdr"), chunk(7 << 20), chunk(7 << 20)]));
     let copy = stage.word("copy.mcap");
-    let outcome = bounded(&stage, &["convert", &whole, &copy]);
+    let outcome = bounded(&stage, &["convert", &whole, &copy, "--compression", "none"]);
     assert_eq!((outcome.code, outcome.errors.contains("missing")), (Some(0), false), "{outcome}");
     assert!(std::fs::metadata(&copy).expect("it was written").len() > 14 << 20);
     let long = stage.file("long.mcap", mcap(&[channel(0, "t", "cdr"), chunk(20 << 20)]));
@@ -163,11 +163,11 @@ fn as_many_channels_as_there_are_numbers_are_read_at_once() {
         refused(&stage, &["convert", &ours, &copy, "--force"], 66, "it names more than 4096 sensors");
         refused(&stage, &["replay", &ours], 66, "it names more than 4096 sensors");
         let others = stage.file(name, cut(mcap(&channels(|id| format!("t{id}"), "cdr"))));
-        let outcome = bounded(&stage, &["convert", &others, &copy, "--force"]);
+        let outcome = bounded(&stage, &["convert", &others, &copy, "--force", "--compression", "none"]);
         assert_eq!(outcome.code, Some(0), "{outcome}");
         let some = channels(|id| format!("s{}/telegram", id % 4000), "scanhub");
         let some = stage.file(name, cut(mcap(&some)));
-        let outcome = bounded(&stage, &["convert", &some, &copy, "--force"]);
+        let outcome = bounded(&stage, &["convert", &some, &copy, "--force", "--compression", "none"]);
         assert_eq!(outcome.code, Some(0), "{outcome}");
         refused(&stage, &["replay", &some], 78, "more than 256 links");
     }
