@@ -12,12 +12,12 @@ use flate2::write::GzEncoder;
 use rustix::fs::{CWD, FileType, Mode, mknodat};
 use stage::{Outcome, Program, Stage};
 
-/// Runs the program with all its address space in 80 MB, of which some 15 are itself, and in two seconds of processor
+/// Runs the program with all its address space in 90 MB, of which some 23 are itself, and in two seconds of processor
 /// time, which a program that is not optimized needs for what takes a second.
 fn bounded(stage: &Stage, arguments: &[&str]) -> Outcome {
     let own = stage.command(arguments);
     let mut command = Command::new("sh");
-    command.args(["-c", "ulimit -v 80000 && ulimit -t 2 && exec \"$0\" \"$@\""]).arg(own.get_program());
+    command.args(["-c", "ulimit -v 90000 && ulimit -t 2 && exec \"$0\" \"$@\""]).arg(own.get_program());
     command.args(own.get_args());
     let changed = own.get_envs().map(|(key, value)| (key.to_owned(), value.map(ToOwned::to_owned)));
     for (key, value) in changed.collect::<Vec<_>>() {
