@@ -256,11 +256,14 @@ impl Walk {
         }
         if stat.st_mode & OTHERS_WRITE != 0 {
             let (path, mode) = (self.path.display(), stat.st_mode & 0o7777);
-            return Err(Failure::new(
-                Kind::Failed,
-                format!("{path} has mode {mode:04o}: others can put files there"),
-                format!("chmod go-w {path}, or choose another --root"),
-            ));
+            // One that all are to write to, as /tmp, stays so.
+            let hint = if mode & STICKY != 0 {
+                format!("choose a directory of your own, for example --root {path}/NAME")
+            } else {
+                format!("chmod go-w {path}, or choose another --root")
+            };
+            let what = format!("{path} has mode {mode:04o}: others can put files there");
+            return Err(Failure::new(Kind::Failed, what, hint));
         }
         Ok(())
     }
@@ -332,6 +335,8 @@ fn user() -> u32 {
 const OPEN_DIRECTORY: OFlags = OFlags::DIRECTORY.union(OFlags::NOFOLLOW).union(OFlags::CLOEXEC);
 /// Group and others may write.
 const OTHERS_WRITE: u32 = 0o022;
+/// Only owners may rename and remove what is in the directory (inode(7)).
+const STICKY: u32 = 0o1000;
 /// As many links as the kernel follows (path_resolution(7)).
 const LINKS: usize = 40;
 

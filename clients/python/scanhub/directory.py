@@ -112,7 +112,8 @@ def _check_own(path: str, seen: os.stat_result) -> None:
         raise foreign(path, seen)
     if seen.st_mode & _OTHERS_WRITE:
         what = f"{path} has mode {seen.st_mode & 0o7777:04o}: others can put files there"
-        raise Denied(what, f"chmod go-w {path}, or choose another root")
+        own = "choose a directory of your own as root"
+        raise Denied(what, own if seen.st_mode & stat.S_ISVTX else f"chmod go-w {path}, or {own}")
 
 
 def foreign(path: str, seen: os.stat_result) -> Denied:

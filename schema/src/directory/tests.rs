@@ -62,6 +62,8 @@ fn base_and_domain_are_this_users_alone() {
             here.mode(open, mode);
             let said = refusal(Directory::open(&path));
             assert!(said.starts_with(&format!("{} has mode {mode:04o}", here.at(open).display())), "{said}");
+            let hint = Directory::open(&path).unwrap_err().hint;
+            assert_eq!(hint.contains("chmod go-w"), mode & STICKY == 0, "{hint}");
         }
         here.mode(open, 0o755);
     }
