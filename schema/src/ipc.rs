@@ -278,7 +278,7 @@ pub(crate) fn forget_names(root: &Path) {
 }
 
 fn forget(directory: &Directory, root: &Path) {
-    if let Ok(Some(prefix)) = prefix::of(root) {
+    if let Ok(Some(prefix)) = prefix::read(directory, root) {
         counter::remove(&prefix);
     }
     directory.remove(prefix::FILE.as_ref());

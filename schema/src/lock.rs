@@ -154,7 +154,7 @@ fn holder_of(root: &Path, name: &str) -> Result<Option<u32>, Failure> {
         return Ok(None);
     }
     // Whoever is just starting or ending has the lock, and an earlier one's process id may stand in it.
-    Ok(Some(if prefix::of(root)?.is_some() { pid_in(&file) } else { 0 }))
+    Ok(Some(if prefix::read(&directory, root)?.is_some() { pid_in(&file) } else { 0 }))
 }
 
 const HUB: &str = "hub.lock";

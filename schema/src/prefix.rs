@@ -57,8 +57,12 @@ fn is_free(prefix: &str) -> bool {
     !entries.any(|entry| entry.file_name().to_string_lossy().starts_with(prefix))
 }
 
-/// One that is not of this form was not written here, and counts as none.
-fn read(directory: &Directory, root: &Path) -> Result<Option<String>, Failure> {
+/// The same, of the open `directory` of `root`. One that is not of this form was not written here, and counts as none.
+///
+/// # Errors
+///
+/// As [`Directory::file`].
+pub(crate) fn read(directory: &Directory, root: &Path) -> Result<Option<String>, Failure> {
     let Some(file) = directory.file(FILE)? else { return Ok(None) };
     let mut text = String::new();
     let read = file.take(LONGEST).read_to_string(&mut text);
