@@ -65,7 +65,8 @@ fn telegrams_and_status_as_json() {
     let mut hub = FakeHub::new(&place.domain, &["front"], 1);
     let verb = start(&place, &["front/telegram", "front/status"], Format::Json, count(2));
     hub.front().telegram.await_subscribers(1);
-    hub.front().status.await_subscribers(1);
+    // What was asked for, and the state of the line beside it.
+    hub.front().status.await_subscribers(2);
     hub.front().telegram(&ANSWER);
     verb.out.await_lines("telegram", 1);
     hub.front().status(|status| {
