@@ -160,12 +160,7 @@ impl<'a> Datagram<'a> {
 /// The last byte of the group that `topic` goes to: a group for each class of traffic, because switches filter by
 /// group and not by port. That of announcements is [`Announce::GROUP`].
 pub fn group(topic: Topic) -> u8 {
-    match topic {
-        Topic::Status => Announce::GROUP,
-        Topic::Zones | Topic::Marks | Topic::Foreground => 81,
-        Topic::Scan | Topic::Background => 82,
-        Topic::Telegram => 83,
-    }
+    topic.row().group
 }
 
 const MAGIC: &[u8; 4] = b"SHUB";

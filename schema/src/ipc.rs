@@ -179,13 +179,20 @@ macro_rules! payload {
     };
 }
 
-payload!([u8], Topic::Telegram, |builder| builder.initial_max_slice_len(crate::Telegram::MAX));
-payload!(Scan, Topic::Scan, |builder| builder);
-payload!(Marks, Topic::Marks, |builder| builder);
-payload!(Zones, Topic::Zones, |builder| builder);
-payload!(Foreground, Topic::Foreground, |builder| builder);
-payload!(Background, Topic::Background, |builder| builder);
-payload!(Status, Topic::Status, |builder| builder);
+/// A payload without a size of its own is loaned in the length of the longest.
+macro_rules! payloads {
+    ($($topic:ident $payload:tt, $name:literal, $($column:tt),*: $about:literal;)*) => {
+        $(payloads!($payload, $topic);)*
+    };
+    ([u8], $topic:ident) => {
+        payload!([u8], Topic::$topic, |builder| builder.initial_max_slice_len(crate::Telegram::MAX));
+    };
+    ($payload:tt, $topic:ident) => {
+        payload!($payload, Topic::$topic, |builder| builder);
+    };
+}
+
+crate::for_each_topic!(payloads);
 
 /// The sensors that have topics in `domain`, sorted. Those of a dead hub stay as long as a consumer keeps them.
 pub fn sensors(domain: &Domain) -> Result<Vec<String>, Failure> {

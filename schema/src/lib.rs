@@ -56,8 +56,8 @@ pub use scan::{BEAMS, CONTENTS_UPPER, Code, Scan, TURN_NS};
 pub use status::{COUNTERS, Counter, Counters, State, Status};
 pub use telegram::Telegram;
 pub use topic::{
-    CONTROL, CONTROL_REQUEST, CONTROL_RESPONSE, ROBOT, Topic, WAKE, Wake, check_followed, check_sensor,
-    is_remote, of_service,
+    CONTROL, CONTROL_REQUEST, CONTROL_RESPONSE, Pace, ROBOT, Row, Topic, WAKE, Wake, check_followed,
+    check_sensor, is_remote, of_service,
 };
 pub use zones::{Verdict, ZONES, Zone, Zones};
 

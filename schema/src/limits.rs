@@ -23,31 +23,19 @@ pub const CONTROL_CLIENTS: usize = 16;
 /// Processes that have the control service open, dead ones that are not cleaned up yet among them.
 pub const CONTROL_NODES: usize = 32;
 
-/// Consumers of `topic`. For each sample the shared-memory library looks at all places that there are, three times, and they
-/// are far apart: where few programs follow, many places cost more than the sample.
+/// Consumers of `topic` at a time.
 pub const fn subscribers(topic: Topic) -> usize {
-    match topic {
-        Topic::Scan | Topic::Zones => 200,
-        Topic::Status => 64,
-        Topic::Telegram | Topic::Marks | Topic::Foreground | Topic::Background => 32,
-    }
+    topic.row().consumers
 }
 
-/// Samples that wait for a consumer of `topic`; with one more the oldest is dropped. Of what comes with each scan it is
-/// 0.4 s: a recorder on a machine that is full gets no processor for longer than four scans.
+/// Samples that wait for a consumer of `topic`.
 pub const fn buffer(topic: Topic) -> usize {
-    match topic {
-        Topic::Telegram | Topic::Scan | Topic::Marks | Topic::Zones | Topic::Foreground => 16,
-        Topic::Background | Topic::Status => 4,
-    }
+    topic.row().waiting
 }
 
-/// Samples that a consumer gets which comes later.
+/// Samples that a consumer of `topic` gets which comes later.
 pub const fn history(topic: Topic) -> usize {
-    match topic {
-        Topic::Telegram | Topic::Scan | Topic::Marks | Topic::Foreground => 0,
-        Topic::Zones | Topic::Background | Topic::Status => 1,
-    }
+    topic.row().kept
 }
 
 /// Samples to reserve memory for. All queues hold the same latest samples, so that their number does not count.

@@ -1,49 +1,20 @@
 //! The names: topics, their services, sensors. Refuses to know how a service is made.
 
+mod table;
+
 use crate::{Failure, Kind};
 
-/// What the hub publishes for each sensor.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
-pub enum Topic {
-    /// The telegrams' bytes, replies too.
-    Telegram,
-    /// Decoded measurements.
-    Scan,
-    /// Reflector marks.
-    Marks,
-    /// What is near the robot.
-    Zones,
-    /// What stands before the background.
-    Foreground,
-    /// The background model.
-    Background,
-    /// State, properties and counters of the link.
-    Status,
-}
+pub use table::{Pace, Row, Topic};
 
 impl Topic {
-    /// All topics, in the order of all output.
-    pub const ALL: [Topic; 7] = [
-        Topic::Telegram,
-        Topic::Scan,
-        Topic::Marks,
-        Topic::Zones,
-        Topic::Foreground,
-        Topic::Background,
-        Topic::Status,
-    ];
+    /// What the table says of the topic.
+    pub const fn row(self) -> &'static Row {
+        &table::ROWS[self as usize]
+    }
 
     /// The topic's name, as in `front/scan`.
     pub fn name(self) -> &'static str {
-        match self {
-            Topic::Telegram => "telegram",
-            Topic::Scan => "scan",
-            Topic::Marks => "marks",
-            Topic::Zones => "zones",
-            Topic::Foreground => "foreground",
-            Topic::Background => "background",
-            Topic::Status => "status",
-        }
+        self.row().name
     }
 
     /// The topic called `name`.
@@ -63,15 +34,7 @@ impl Topic {
 
     /// The payload's type, the same in all languages.
     pub fn payload(self) -> &'static str {
-        match self {
-            Topic::Telegram => "u8[]",
-            Topic::Scan => "scanhub.Scan.v1",
-            Topic::Marks => "scanhub.Marks.v1",
-            Topic::Zones => "scanhub.Zones.v1",
-            Topic::Foreground => "scanhub.Foreground.v1",
-            Topic::Background => "scanhub.Background.v1",
-            Topic::Status => "scanhub.Status.v1",
-        }
+        self.row().payload
     }
 
     /// The payload's revision: a greater one only appends.

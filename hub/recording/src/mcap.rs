@@ -20,7 +20,7 @@ use std::sync::Arc;
 
 use lms::variant::Mode;
 use schema::datagram::Packed;
-use schema::{Header, Status, Topic};
+use schema::{Header, Pace, Status, Topic};
 
 use crate::open::is_end;
 use crate::{Contents, Damage, Form, Frame};
@@ -169,7 +169,7 @@ impl Survey {
     /// The measuring mode stands in a status too; what was made of a scan says that it was known by then.
     fn note_record(&mut self, knowledge: &Knowledge, record: &Record) {
         let Some((place, header, payload)) = knowledge.message(record) else { return };
-        let is_of_scan = matches!(place.topic, Topic::Scan | Topic::Marks | Topic::Zones | Topic::Foreground);
+        let is_of_scan = place.topic.row().pace == Pace::Scan && place.topic != Topic::Telegram;
         // What is said without a telegram was not sent after one.
         if is_of_scan && header.hub_time_ns().is_some() {
             let lives = match self.understood.get_mut(&place.sensor) {

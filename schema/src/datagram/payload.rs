@@ -33,17 +33,31 @@ impl Datagram<'_> {
         let is_sound = match Topic::of_number(self.head.topic) {
             None if self.head.topic == Announce::NUMBER => Announce::unpack(self.payload).is_some(),
             None => return Err(Refusal::Skipped),
-            Some(Topic::Telegram) => telegram(self.payload).is_some(),
-            Some(Topic::Scan) => Scan::default().unpack(self.payload),
-            Some(Topic::Marks) => Marks::default().unpack(self.payload),
-            Some(Topic::Zones) => Zones::unknown().unpack(self.payload),
-            Some(Topic::Foreground) => Foreground::default().unpack(self.payload),
-            Some(Topic::Background) => Background::default().unpack(self.payload),
-            Some(Topic::Status) => Status::default().unpack(self.payload),
+            Some(topic) => is_sound(topic, self.payload),
         };
         if is_sound && self.head.revision > 0 { Ok(()) } else { Err(Refusal::Payload) }
     }
 }
+
+macro_rules! check {
+    ($($topic:ident $payload:tt, $name:literal, $($column:tt),*: $about:literal;)*) => {
+        /// The payload is one of `topic`.
+        fn is_sound(topic: Topic, payload: &[u8]) -> bool {
+            match topic { $(Topic::$topic => read!($payload, payload),)* }
+        }
+    };
+}
+
+macro_rules! read {
+    ([u8], $bytes:ident) => {
+        telegram($bytes).is_some()
+    };
+    ($payload:tt, $bytes:ident) => {
+        $payload::default().unpack($bytes)
+    };
+}
+
+crate::for_each_topic!(check);
 
 impl Packed for Scan {
     /// Without the upper bits where all of them are 0: they were sent, and say nothing.

@@ -8,10 +8,7 @@ use rustix::fs::{FallocateFlags, OFlags, fallocate};
 use rustix::io::Errno;
 
 use super::{SHARED_MEMORY, memory};
-use crate::{
-    Background, Domain, Failure, Foreground, Header, Marks, Scan, Status, Telegram, Topic, Zones, limits,
-    prefix,
-};
+use crate::{Domain, Failure, Topic, limits, prefix};
 
 /// Allocates what the segments of `domain` have promised so far.
 ///
@@ -44,17 +41,7 @@ pub fn allocate(domain: &Domain) -> Result<(), Failure> {
 
 /// Bytes of the segments of one sensor's `topics`: the payloads with their headers, and who is at each service.
 pub fn sensor_bytes(topics: &[Topic]) -> u64 {
-    let payload = |topic| match topic {
-        Topic::Telegram => Telegram::MAX,
-        Topic::Scan => size_of::<Scan>(),
-        Topic::Marks => size_of::<Marks>(),
-        Topic::Zones => size_of::<Zones>(),
-        Topic::Foreground => size_of::<Foreground>(),
-        Topic::Background => size_of::<Background>(),
-        Topic::Status => size_of::<Status>(),
-    };
-    let chunk =
-        |&topic: &Topic| limits::samples(topic) * (payload(topic) + size_of::<Header>() + CHUNK_HEADER);
+    let chunk = |&topic: &Topic| limits::samples(topic) * (topic.row().bytes + CHUNK_HEADER);
     let services = (topics.len() + 1) as u64 * SERVICE;
     topics.iter().map(chunk).sum::<usize>() as u64 + services
 }
