@@ -112,6 +112,7 @@ crate::for_each_topic!(rows);
 
 #[cfg(test)]
 mod tests {
+    #[allow(unreachable_pub)]
     mod with_one_more {
         use super::super::{Pace, Row, Telegram};
         use crate::Header;
