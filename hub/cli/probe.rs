@@ -4,8 +4,8 @@ use std::io::{IsTerminal, Write, stderr};
 use std::sync::atomic::AtomicBool;
 
 use clap::Args;
-use daemon::port::Candidate;
 use daemon::probe::{list, probe, source};
+use port::Candidate;
 use schema::Failure;
 use serde::Serialize;
 

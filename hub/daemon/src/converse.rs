@@ -6,11 +6,9 @@ use std::time::Duration;
 
 use lms::exchange::{Conversation, Output};
 use lms::{MILLIS, Nanos};
+use port::{Port, clock};
 use rustix::event::{PollFd, PollFlags, poll};
 use schema::{Failure, Kind};
-
-use crate::clock;
-use crate::port::Port;
 
 /// Drives `talk` on `port`; `look` sees it whenever it waits. A rate that the port cannot have is passed over.
 ///

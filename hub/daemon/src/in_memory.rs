@@ -6,10 +6,10 @@ use std::sync::atomic::AtomicBool;
 
 use lms::session::Output;
 use lms::{Nanos, Session};
+use port::clock;
 use rustix::event::{EventfdFlags, eventfd};
 use schema::{Domain, Failure, Flags, HubLock, State, Wake, ipc, shortage};
 
-use crate::clock;
 use crate::config::Config;
 use crate::control::Desk;
 use crate::link::{LinkThread, Surroundings};

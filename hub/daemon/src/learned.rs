@@ -12,11 +12,11 @@ use std::thread::{self, JoinHandle};
 use std::time::Duration;
 
 use lms::{MILLIS, Nanos};
+use port::clock;
 use rustix::event::{PollFd, PollFlags, poll};
 use schema::{Age, Background, Failure, Kind, Pose, StateDirectory};
 
 use crate::bell::Bell;
-use crate::clock;
 use crate::config::{Config, Link, Source};
 use crate::supervise::no_resource;
 use file::Learned;

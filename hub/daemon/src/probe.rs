@@ -6,12 +6,11 @@ use std::sync::atomic::AtomicBool;
 
 use lms::inquiry::{Inquiry, Report};
 use lms::variant::Baud;
+use port::{Candidate, Port, candidates, clock};
 use schema::{Failure, Kind};
 
-use crate::clock;
 use crate::config::Source;
 use crate::converse::converse;
-use crate::port::{Candidate, Port, candidates};
 pub use description::Description;
 pub(crate) use description::{hex, measuring};
 

@@ -1,9 +1,9 @@
 //! The configuration read anew while the hub runs: what is made of scans changes with the next scan, and nothing of the
 //! stream is lost for it; what belongs to a line waits for the next start, which is said. One that cannot be changes nothing.
 
+use port::clock;
 use schema::Failure;
 
-use crate::clock;
 use crate::config::{Background, Config, Link, Processing};
 use crate::control::Desk;
 use crate::service::Service;

@@ -1,10 +1,10 @@
 //! What the driver of a line counted: bytes that came damaged, or were lost before anybody could read them. At a wrong rate
 //! every byte is an error, and whoever looks for a sensor tries wrong ones: a few in all are no finding.
 
+use port::Counts;
 use schema::{Counter, Status};
 
 use super::finding::Finding;
-use crate::port::Counts;
 
 const NAME: &str = "line-errors";
 

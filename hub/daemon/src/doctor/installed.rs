@@ -5,12 +5,12 @@ use std::fs;
 use std::io::ErrorKind;
 use std::path::{Path, PathBuf};
 
+use port::Candidate;
 use schema::regular;
 
 use super::finding::Finding;
 use super::program::{Build, VERSION, compare};
 use super::system::System;
-use crate::port::Candidate;
 
 /// Whether the service is installed, starts this version, and runs if it shall; `hub` is the hub that lives, if one does.
 pub(crate) fn service(system: &System, hub: Option<u32>) -> Finding {
@@ -160,7 +160,7 @@ mod tests {
     use super::super::finding::State;
     use super::super::system::tests::Laid;
     use super::*;
-    use crate::port::found_in;
+    use port::found_in;
 
     const SERVICE: &str = include_str!("../../../dist/scanhub.service");
 

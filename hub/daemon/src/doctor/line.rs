@@ -5,6 +5,7 @@ use std::path::Path;
 use std::sync::atomic::AtomicBool;
 
 use lms::variant::Baud;
+use port::{Candidate, Holder, PROMPT_MS, Port, Refusal, Rights, all_holders, is_tty, latency_ms};
 use schema::{Failure, Kind};
 
 use super::Subject;
@@ -13,7 +14,6 @@ use super::finding::Finding;
 use super::hub::Hub;
 use super::sensor;
 use crate::config::Source;
-use crate::port::{Candidate, Holder, PROMPT_MS, Port, Refusal, Rights, all_holders, is_tty, latency_ms};
 use crate::probe;
 
 /// Examines a port and its sensor.

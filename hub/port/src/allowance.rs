@@ -6,7 +6,7 @@ use lms::{MILLIS, Nanos, line_time};
 
 /// What may be read, and for how long there was more.
 #[derive(Clone, Debug)]
-pub(crate) struct Allowance {
+pub struct Allowance {
     /// Time that a byte takes.
     byte_ns: Nanos,
     /// The time until which all was read that was allowed.
@@ -19,25 +19,25 @@ pub(crate) struct Allowance {
 
 impl Allowance {
     /// All of it, at `now`, for a line of `baud`.
-    pub(crate) fn new(baud: u32, now: Nanos) -> Allowance {
+    pub fn new(baud: u32, now: Nanos) -> Allowance {
         let byte_ns = line_time(1, baud) / TIMES;
         Allowance { byte_ns, spent: now.saturating_sub(BURST), short: None, is_full: false }
     }
 
     /// Bytes that may be read at `now`.
-    pub(crate) fn bytes(&self, now: Nanos) -> usize {
+    pub fn bytes(&self, now: Nanos) -> usize {
         (now.saturating_sub(self.begin(now)) / self.byte_ns) as usize
     }
 
     /// `len` bytes were read at `now`, where there was room for `room`.
-    pub(crate) fn take(&mut self, len: usize, room: usize, now: Nanos) {
+    pub fn take(&mut self, len: usize, room: usize, now: Nanos) {
         self.is_full = len > 0 && len == room;
         self.spent = self.begin(now) + len as Nanos * self.byte_ns;
     }
 
     /// When to read again, if what may be read at `now` is not worth it: then nothing is waited for but the time. By
     /// `until` something else has to be done, for which a byte may be read.
-    pub(crate) fn rest(&mut self, now: Nanos, until: Nanos) -> Option<Nanos> {
+    pub fn rest(&mut self, now: Nanos, until: Nanos) -> Option<Nanos> {
         let (any_at, enough_at) = (self.spent + self.byte_ns, self.spent + PORTION);
         if now >= enough_at {
             return None;
@@ -49,13 +49,13 @@ impl Allowance {
     }
 
     /// Whether more came for a while, as of `now`.
-    pub(crate) fn is_flooded(&self, now: Nanos) -> bool {
+    pub fn is_flooded(&self, now: Nanos) -> bool {
         self.short.is_some_and(|(since, last)| now < last + CALM && last >= since + PATIENCE)
     }
 
     /// Whether what was read last may have waited in the connection, as of `now`: more was there than could be read, or has
     /// been a moment ago.
-    pub(crate) fn is_behind(&self, now: Nanos) -> bool {
+    pub fn is_behind(&self, now: Nanos) -> bool {
         self.is_full || self.short.is_some_and(|(_, last)| now < last + SETTLED)
     }
 

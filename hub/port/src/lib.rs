@@ -3,10 +3,13 @@
 
 mod allowance;
 mod candidates;
+pub mod clock;
 mod holder;
 mod kernel;
+mod line_errors;
 mod refusal;
 mod rights;
+mod source;
 mod tcp;
 mod tty;
 
@@ -16,24 +19,19 @@ use std::sync::atomic::AtomicBool;
 
 use schema::Failure;
 
-use crate::clock;
-use crate::config::Source;
-pub(crate) use allowance::Allowance;
-#[cfg(test)]
-pub(crate) use candidates::found_in;
-pub use candidates::{Candidate, candidates};
-pub(crate) use candidates::{PROMPT_MS, is_tty, latency_ms};
-pub(crate) use holder::all_holders;
-pub use holder::{Holder, holder};
-pub(crate) use kernel::Counts;
-pub(crate) use refusal::Refusal;
-pub(crate) use rights::Rights;
-pub(crate) use tcp::Dial;
-use tcp::Tcp;
-use tty::Tty;
+pub use allowance::Allowance;
+pub use candidates::{Candidate, PROMPT_MS, candidates, found_in, is_tty, latency_ms};
+pub use holder::{Holder, all_holders, holder};
+pub use kernel::Counts;
+pub use line_errors::LineErrors;
+pub use refusal::Refusal;
+pub use rights::{Ownership, Rights};
+pub use source::Source;
+pub use tcp::{Dial, Tcp};
+pub use tty::Tty;
 
 /// An open line to a sensor; reads and writes never block.
-pub(crate) enum Port {
+pub enum Port {
     /// A serial line, exclusive and raw.
     Tty(Tty),
     /// A connection to a serial server.
@@ -45,12 +43,12 @@ impl Port {
     ///
     /// A failure of one of the port kinds, with its remedy; of kind `short` without descriptors, of kind
     /// `configuration` if it is a recording, of kind `interrupted` if `stop` is set.
-    pub(crate) fn open(source: &Source, baud: u32, stop: &AtomicBool) -> Result<Port, Failure> {
+    pub fn open(source: &Source, baud: u32, stop: &AtomicBool) -> Result<Port, Failure> {
         Port::attempt(source, baud, stop).map_err(|refusal| refusal.explain(source))
     }
 
     /// As [`Port::open`], for who tries again and again: the reason alone, without looking for its circumstances.
-    pub(crate) fn attempt(source: &Source, baud: u32, stop: &AtomicBool) -> Result<Port, Refusal> {
+    pub fn attempt(source: &Source, baud: u32, stop: &AtomicBool) -> Result<Port, Refusal> {
         match source {
             Source::Tty(path) => Tty::open(path, baud).map(Port::Tty),
             Source::Tcp { host, port } => Tcp::open(host, *port, stop).map(Port::Tcp),
@@ -59,7 +57,7 @@ impl Port {
     }
 
     /// Goes on with `line`, which a hub before this one had opened, if it still is what `source` names.
-    pub(crate) fn adopt(line: OwnedFd, source: &Source, baud: u32) -> Option<Port> {
+    pub fn adopt(line: OwnedFd, source: &Source, baud: u32) -> Option<Port> {
         match source {
             Source::Tty(path) => Tty::adopt(line, path, baud).ok().map(Port::Tty),
             // What stands in a connection that nobody reads is old, and the other end may have given up.
@@ -68,12 +66,12 @@ impl Port {
     }
 
     /// Whether `source` names the `line`, which is open.
-    pub(crate) fn is_at(line: &OwnedFd, source: &Source) -> bool {
+    pub fn is_at(line: &OwnedFd, source: &Source) -> bool {
         matches!(source, Source::Tty(path) if Tty::is_at(line, path))
     }
 
     /// Whether another program plays the sensor.
-    pub(crate) fn simulated(&self) -> bool {
+    pub fn simulated(&self) -> bool {
         match self {
             Port::Tty(tty) => tty.simulated,
             Port::Tcp(_) => false,
@@ -81,7 +79,7 @@ impl Port {
     }
 
     /// Begins to open `source` if that takes its time; nothing if [`Port::attempt`] is over at once.
-    pub(crate) fn dial(source: &Source) -> Option<Result<Dial, Refusal>> {
+    pub fn dial(source: &Source) -> Option<Result<Dial, Refusal>> {
         match source {
             Source::Tcp { host, port } => Some(Dial::start(host, *port)),
             _ => None,
@@ -90,7 +88,7 @@ impl Port {
 
     /// Changes the rate, and forgets what came in at the old one. An error of kind `Unsupported` says that the driver
     /// refused it or made another rate of it, or that it cannot be changed from here.
-    pub(crate) fn set_baud(&self, baud: u32) -> io::Result<()> {
+    pub fn set_baud(&self, baud: u32) -> io::Result<()> {
         match self {
             Port::Tty(tty) => tty.set_baud(baud),
             Port::Tcp(_) => {
@@ -101,7 +99,7 @@ impl Port {
     }
 
     /// As [`Port::set_baud`], for who has other rates to try: what is said of one that cannot be had, if it cannot.
-    pub(crate) fn try_baud(&self, baud: u32) -> io::Result<Option<io::Error>> {
+    pub fn try_baud(&self, baud: u32) -> io::Result<Option<io::Error>> {
         match self.set_baud(baud) {
             Err(error) if error.kind() == io::ErrorKind::Unsupported => Ok(Some(error)),
             other => other.map(|()| None),
@@ -109,7 +107,7 @@ impl Port {
     }
 
     /// Forgets what came in, at `baud` from now on; where a serial server has the rate, at the one that it has.
-    pub(crate) fn begin_anew(&self, baud: u32) -> io::Result<()> {
+    pub fn begin_anew(&self, baud: u32) -> io::Result<()> {
         match self {
             Port::Tty(tty) => tty.set_baud(baud),
             Port::Tcp(tcp) => tcp.forget(),
@@ -117,7 +115,7 @@ impl Port {
     }
 
     /// How many bytes there are to read; nothing where that is not worth a question.
-    pub(crate) fn waiting(&self) -> Option<usize> {
+    pub fn waiting(&self) -> Option<usize> {
         match self {
             Port::Tty(tty) => tty.waiting(),
             Port::Tcp(_) => None,
@@ -125,7 +123,7 @@ impl Port {
     }
 
     /// How much may be read of it: of a serial line, which has a rate, all that there is.
-    pub(crate) fn allowance(&self, baud: u32) -> Option<Allowance> {
+    pub fn allowance(&self, baud: u32) -> Option<Allowance> {
         match self {
             Port::Tty(_) => None,
             Port::Tcp(_) => Some(Allowance::new(baud, clock::now())),
@@ -133,7 +131,7 @@ impl Port {
     }
 
     /// Reads what there is: 0 bytes if nothing, an error if the line is gone.
-    pub(crate) fn read(&self, buffer: &mut [u8]) -> io::Result<usize> {
+    pub fn read(&self, buffer: &mut [u8]) -> io::Result<usize> {
         match self {
             Port::Tty(tty) => tty.read(buffer),
             Port::Tcp(tcp) => tcp.read(buffer),
@@ -141,7 +139,7 @@ impl Port {
     }
 
     /// Writes one byte; a full line drops it, as a cable would, and the request is tried again.
-    pub(crate) fn write(&self, byte: u8) -> io::Result<()> {
+    pub fn write(&self, byte: u8) -> io::Result<()> {
         match self {
             Port::Tty(tty) => tty.write(byte),
             Port::Tcp(tcp) => tcp.write(byte),
@@ -151,7 +149,7 @@ impl Port {
 
 impl Port {
     /// Errors that the driver counted on the line since this was last asked; 0 where it counts none, without asking it.
-    pub(crate) fn line_errors(&self) -> u64 {
+    pub fn line_errors(&self) -> u64 {
         match self {
             Port::Tty(tty) => tty.line_errors(),
             Port::Tcp(_) => 0,
@@ -159,7 +157,7 @@ impl Port {
     }
 
     /// What the driver counted on the line since it was loaded, if it counts.
-    pub(crate) fn counts(&self) -> Option<Counts> {
+    pub fn counts(&self) -> Option<Counts> {
         match self {
             Port::Tty(tty) => tty.counts(),
             Port::Tcp(_) => None,
@@ -167,7 +165,7 @@ impl Port {
     }
 
     /// The rate that the driver says it has; nothing where it is set elsewhere.
-    pub(crate) fn baud(&self) -> Option<u32> {
+    pub fn baud(&self) -> Option<u32> {
         match self {
             Port::Tty(tty) => tty.baud(),
             Port::Tcp(_) => None,

@@ -4,7 +4,7 @@
 
 /// Whether errors are to be put down to what is read.
 #[derive(Debug, Default)]
-pub(crate) struct LineErrors {
+pub struct LineErrors {
     /// The count moved since the last wait for bytes.
     moved: bool,
     /// It did so in the time before that.
@@ -14,13 +14,13 @@ pub(crate) struct LineErrors {
 impl LineErrors {
     /// A telegram was read, and the driver counted so many errors since the one before; returns whether they may lie in
     /// it.
-    pub(crate) fn note(&mut self, errors: u64) -> bool {
+    pub fn note(&mut self, errors: u64) -> bool {
         self.moved |= errors > 0;
         self.moved || self.before
     }
 
     /// All telegrams of a read were noted, at least one.
-    pub(crate) fn wait(&mut self) {
+    pub fn wait(&mut self) {
         self.before = std::mem::take(&mut self.moved);
     }
 }

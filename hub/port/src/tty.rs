@@ -18,7 +18,7 @@ use super::candidates::{PROMPT_MS, is_tty, latency_ms};
 use super::kernel::{self, Counts};
 
 /// An open serial line, exclusive and raw; reads and writes never block.
-pub(crate) struct Tty {
+pub struct Tty {
     line: OwnedFd,
     /// Whether another program plays the sensor.
     pub(crate) simulated: bool,

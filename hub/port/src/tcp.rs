@@ -20,7 +20,7 @@ use schema::shortage;
 use super::{Port, Refusal};
 
 /// A connection to a serial server; reads and writes never block.
-pub(crate) struct Tcp {
+pub struct Tcp {
     stream: TcpStream,
 }
 
@@ -86,7 +86,7 @@ impl AsFd for Tcp {
 }
 
 /// A connection that is being made. Its descriptor is ready when the outcome is there.
-pub(crate) struct Dial {
+pub struct Dial {
     outcome: Receiver<Result<Tcp, Refusal>>,
     /// Ready once its other end is gone.
     bell: PipeReader,
@@ -109,7 +109,7 @@ impl Dial {
     }
 
     /// What came of it; a refusal if it is not over.
-    pub(crate) fn finish(self) -> Result<Port, Refusal> {
+    pub fn finish(self) -> Result<Port, Refusal> {
         self.outcome.try_recv().unwrap_or(Err(Refusal::TimedOut)).map(Port::Tcp)
     }
 }

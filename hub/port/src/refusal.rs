@@ -11,11 +11,11 @@ use schema::{Failure, Kind};
 use super::candidates::{Candidate, candidates};
 use super::holder::{Holder, holder, is_own};
 use super::rights::Rights;
-use crate::config::Source;
+use crate::Source;
 
 /// The reason alone; equal as long as nothing changed.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub(crate) enum Refusal {
+pub enum Refusal {
     /// There is nothing at that path.
     Missing,
     /// There is, but no terminal.
@@ -29,7 +29,12 @@ pub(crate) enum Refusal {
     /// This process has no descriptor or thread left, or the kernel no memory.
     Short(Errno),
     /// The driver made another rate of the one that was wanted.
-    Rate { wanted: u32, given: u32 },
+    Rate {
+        /// What was wanted, in Bd.
+        wanted: u32,
+        /// What the driver has instead.
+        given: u32,
+    },
     /// The serial server's name cannot be looked up.
     NoHost(String),
     /// The serial server is there, and takes no connection at this port.
@@ -52,7 +57,7 @@ impl Refusal {
     }
 
     /// The reason with its circumstances at `source`, as they are now.
-    pub(crate) fn explain(&self, source: &Source) -> Failure {
+    pub fn explain(&self, source: &Source) -> Failure {
         let name = source.name();
         let path = Path::new(&name);
         let told = self.to_string();

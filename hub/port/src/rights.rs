@@ -9,33 +9,35 @@ use rustix::process::{getegid, geteuid, getgroups};
 
 /// What decides whether a port may be opened.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
-pub(crate) struct Rights {
+pub struct Rights {
     /// Owner, group and mode of the port; nothing if not even they may be seen.
-    pub(crate) port: Option<Ownership>,
+    pub port: Option<Ownership>,
     /// This process's user.
-    pub(crate) uid: u32,
+    pub uid: u32,
     /// Groups of this process.
-    pub(crate) groups: Vec<u32>,
+    pub groups: Vec<u32>,
     /// The user's name, else its number.
-    pub(crate) user: String,
+    pub user: String,
     /// The port's group by name, else its number.
-    pub(crate) group: String,
+    pub group: String,
     /// Whether the list of groups names the user in the port's group, whatever groups this process has.
-    pub(crate) is_listed: bool,
+    pub is_listed: bool,
 }
 
 /// To whom a file belongs.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(crate) struct Ownership {
-    pub(crate) uid: u32,
-    pub(crate) gid: u32,
+pub struct Ownership {
+    /// Its owner.
+    pub uid: u32,
+    /// Its group.
+    pub gid: u32,
     /// The permission bits.
-    pub(crate) mode: u32,
+    pub mode: u32,
 }
 
 impl Rights {
     /// The rights of this process at `path`.
-    pub(crate) fn of(path: &Path) -> Rights {
+    pub fn of(path: &Path) -> Rights {
         let port = fs::metadata(path).ok().map(|metadata| Ownership {
             uid: metadata.uid(),
             gid: metadata.gid(),
@@ -57,7 +59,7 @@ impl Rights {
     }
 
     /// What is the case, and the remedy.
-    pub(crate) fn explain(&self, path: &Path) -> (String, String) {
+    pub fn explain(&self, path: &Path) -> (String, String) {
         let Rights { user, group, .. } = self;
         let path = path.display();
         let Some(Ownership { uid, gid, mode }) = self.port else {

@@ -10,29 +10,31 @@ use rustix::ioctl::{Opcode, Updater, ioctl};
 
 /// What happened on a line since its driver was loaded. All wrap.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub(crate) struct Counts {
+pub struct Counts {
     /// Bytes received.
-    pub(crate) received: u32,
+    pub received: u32,
     /// Bytes without a stop bit.
-    pub(crate) framing: u32,
+    pub framing: u32,
     /// Bytes that the UART lost.
-    pub(crate) overrun: u32,
-    pub(crate) parity: u32,
-    pub(crate) breaks: u32,
+    pub overrun: u32,
+    /// Bytes of the wrong parity.
+    pub parity: u32,
+    /// Times that the line was held low for longer than a byte.
+    pub breaks: u32,
     /// Bytes for which the kernel's buffer had no room.
-    pub(crate) buffer: u32,
+    pub buffer: u32,
 }
 
 impl Counts {
     /// Asks the driver of `line`.
-    pub(super) fn of(line: impl AsFd) -> Result<Counts, Errno> {
+    pub(crate) fn of(line: impl AsFd) -> Result<Counts, Errno> {
         let mut words = [0; WORDS];
         call::<TIOCGICOUNT>(line.as_fd(), &mut words)?;
         Ok(Counts::in_words(&words))
     }
 
     /// All errors in one number.
-    pub(crate) fn errors(self) -> u32 {
+    pub fn errors(self) -> u32 {
         let Counts { received: _, framing, overrun, parity, breaks, buffer } = self;
         [framing, overrun, parity, breaks, buffer].into_iter().fold(0, u32::wrapping_add)
     }

@@ -26,7 +26,7 @@ pub fn holder(path: &Path) -> Option<Holder> {
 }
 
 /// All other processes that have `path` open, as far as this user may see.
-pub(crate) fn all_holders(path: &Path) -> Vec<Holder> {
+pub fn all_holders(path: &Path) -> Vec<Holder> {
     let device = path.canonicalize().ok();
     device.and_then(|device| holders(&[&device]).pop()).unwrap_or_default()
 }

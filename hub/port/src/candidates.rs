@@ -50,7 +50,7 @@ pub fn candidates() -> Vec<Candidate> {
 }
 
 /// What `sys` and `dev` below `root` tell.
-pub(crate) fn found_in(root: &Path) -> Vec<Candidate> {
+pub fn found_in(root: &Path) -> Vec<Candidate> {
     let stable: Vec<(PathBuf, PathBuf)> = ["by-id", "by-path"]
         .iter()
         .flat_map(|kind| entries(&root.join("dev/serial").join(kind)))
@@ -82,7 +82,7 @@ pub(crate) fn found_in(root: &Path) -> Vec<Candidate> {
 
 /// Whether `path` is a terminal, by what the kernel says of its device; opening others can do harm: a watchdog, a pipe
 /// that waits for its other end.
-pub(crate) fn is_tty(path: &Path) -> bool {
+pub fn is_tty(path: &Path) -> bool {
     let Ok(metadata) = path.metadata() else { return false };
     if !metadata.file_type().is_char_device() {
         return false;
@@ -97,7 +97,7 @@ pub(crate) fn is_tty(path: &Path) -> bool {
 }
 
 /// How long the adapter at `path` collects bytes before it hands them over, in milliseconds, if it says so.
-pub(crate) fn latency_ms(path: &Path) -> Option<u8> {
+pub fn latency_ms(path: &Path) -> Option<u8> {
     let device = path.canonicalize().ok()?;
     latency_of(&Path::new("/sys/class/tty").join(device.file_name()?).join("device"))
 }
@@ -141,7 +141,7 @@ fn entries(directory: &Path) -> Vec<PathBuf> {
 }
 
 /// An adapter that collects bytes for longer blurs the stamps.
-pub(crate) const PROMPT_MS: u8 = 2;
+pub const PROMPT_MS: u8 = 2;
 /// Majors of the ends of ptys that are opened by name (Linux, devices.txt).
 const UNIX98_PTYS: RangeInclusive<u32> = 136..=143;
 
