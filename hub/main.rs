@@ -17,7 +17,7 @@ use std::sync::atomic::AtomicBool;
 
 use clap::error::ErrorKind;
 use clients::{EchoOptions, Format, HzOptions, InfoOptions, ListOptions};
-use daemon::Config;
+use config::Config;
 use rustix::process::Signal;
 use schema::{Domain, Failure, Kind, Printable, json_line};
 use serde::Serialize;

@@ -11,7 +11,7 @@ use std::path::Path;
 use std::process::Command;
 use std::sync::atomic::AtomicBool;
 
-use daemon::config::Gateway;
+use config::Gateway;
 use daemon::doctor::{Subjects, System, examine};
 use schema::Domain;
 use stage::{Findings, KILL, Program, Stage, TERM, in_a_network, is_class, shared_memory};

@@ -12,7 +12,7 @@ use std::sync::mpsc::channel;
 use std::thread;
 use std::time::{Duration, Instant};
 
-use daemon::config::Sources;
+use config::Sources;
 use daemon::{Play, Player, Replay};
 use rooms::{Followers, LEARNING, Published, SENSORS};
 use schema::ipc;

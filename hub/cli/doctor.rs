@@ -3,8 +3,7 @@
 use std::sync::atomic::AtomicBool;
 
 use clap::Args;
-use daemon::Config;
-use daemon::config::Gateway;
+use config::{Config, Gateway};
 use daemon::doctor::{Subjects, System, examine};
 use daemon::probe::source;
 use schema::Failure;

@@ -5,7 +5,7 @@ use std::time::Duration;
 
 use clap::Args;
 use clients::{GatewayLook, GatewayOptions, duration};
-use daemon::config::{self, Sources};
+use config::Sources;
 use schema::{Failure, Kind};
 
 use super::{Configured, Everywhere};

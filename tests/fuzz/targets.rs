@@ -209,7 +209,7 @@ fn assert_harmless(said: &[u8]) {
 ///
 /// The text is cut at zero bytes: the first piece is a file, the others are `--set` and `--link` in turn.
 pub fn configuration(data: &[u8]) {
-    use daemon::config::{Config, Sources};
+    use config::{Config, Sources};
     let text = String::from_utf8_lossy(data);
     let mut pieces = text.split('\0');
     let path = std::env::temp_dir().join(format!("scanhub-fuzz-{}.toml", std::process::id()));

@@ -5,11 +5,10 @@ use std::os::fd::AsFd;
 use std::sync::atomic::AtomicBool;
 
 use lms::{Control, Identity, MILLIS, Nanos, Session};
-use port::{Port, Refusal, clock};
+use port::{Port, Refusal, Source, clock};
 use rustix::event::PollFlags;
 use schema::{Failure, Flags, Kind, State};
 
-use crate::config::Source;
 use crate::control::Flow;
 use crate::last_rate::LastRate;
 use crate::link::{LinkThread, Woken};

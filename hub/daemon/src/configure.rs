@@ -11,10 +11,9 @@ use std::sync::atomic::AtomicBool;
 use lms::change::{Change, Plan, Step};
 use lms::family::Family;
 use lms::parameters::Password;
-use port::clock;
+use port::{Source, clock};
 use schema::{Failure, Kind};
 
-use crate::config::Source;
 use crate::converse::converse;
 use crate::probe::{ask, open};
 pub use difference::Difference;

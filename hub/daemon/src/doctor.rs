@@ -22,10 +22,10 @@ mod version;
 
 use std::sync::atomic::AtomicBool;
 
-use port::{Candidate, candidates};
+use port::{Candidate, Source, candidates};
 use schema::{Domain, Failure, Kind, ipc};
 
-use crate::config::{Config, Gateway, Link, Source};
+use config::{Config, Gateway, Link};
 pub use finding::{CHECKS, Finding, State};
 use hub::Hub;
 use machine::Facts;

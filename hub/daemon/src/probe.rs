@@ -6,10 +6,9 @@ use std::sync::atomic::AtomicBool;
 
 use lms::inquiry::{Inquiry, Report};
 use lms::variant::Baud;
-use port::{Candidate, Port, candidates, clock};
+use port::{Candidate, Port, Source, candidates, clock};
 use schema::{Failure, Kind};
 
-use crate::config::Source;
 use crate::converse::converse;
 pub use description::Description;
 pub(crate) use description::{hex, measuring};

@@ -6,13 +6,13 @@ use std::sync::atomic::AtomicBool;
 use std::sync::mpsc;
 use std::thread;
 
+use config::Config;
 use lms::{MILLIS, Nanos};
 use port::{Port, clock};
 use rustix::event::{EventfdFlags, PollFd, PollFlags, Timespec, eventfd, poll};
 use schema::ipc::{self, Node};
 use schema::{Domain, Failure, HubLock, Kind, StateDirectory, shortage};
 
-use crate::config::Config;
 use crate::control::Desk;
 use crate::link::{LinkThread, Surroundings};
 use crate::reload::{Read, Reload};

@@ -2,10 +2,9 @@
 
 use std::time::Duration;
 
+use port::Source;
 use schema::ipc::{self, Payload};
 use schema::{Domain, Failure, Status, is_remote};
-
-use crate::config::Source;
 
 /// A running hub.
 pub(crate) struct Hub {

@@ -1,16 +1,16 @@
 //! What the system lets a process have: descriptors, and files as long as the hub's segments.
 
+use config::needs;
 use schema::shortage::longest_segment;
 
 use super::finding::Finding;
 use super::machine::Facts;
-use crate::preflight::needed_descriptors;
 
 /// Whether the process may open enough.
 pub(crate) fn descriptors(facts: &Facts) -> Finding {
     const NAME: &str = "descriptors";
     let Some(limit) = facts.descriptors else { return Finding::ok(NAME, "no limit") };
-    let own = facts.open + DESCRIPTORS_AT_START + needed_descriptors(facts.links);
+    let own = facts.open + DESCRIPTORS_AT_START + needs::descriptors(facts.links);
     let remedy = "raise the hard limit: of this shell sudo prlimit --pid $$ --nofile=65536:65536, of a service LimitNOFILE=65536, \
          of a container --ulimit nofile=65536";
     let Some(rest) = limit.checked_sub(own) else {

@@ -5,7 +5,7 @@ use std::path::Path;
 use std::sync::atomic::AtomicBool;
 
 use lms::variant::Baud;
-use port::{Candidate, Holder, PROMPT_MS, Port, Refusal, Rights, all_holders, is_tty, latency_ms};
+use port::{Candidate, Holder, PROMPT_MS, Port, Refusal, Rights, Source, all_holders, is_tty, latency_ms};
 use schema::{Failure, Kind};
 
 use super::Subject;
@@ -13,7 +13,6 @@ use super::counts::{as_the_hub_counts, line_errors, line_loss};
 use super::finding::Finding;
 use super::hub::Hub;
 use super::sensor;
-use crate::config::Source;
 use crate::probe;
 
 /// Examines a port and its sensor.

@@ -5,6 +5,7 @@ use std::fs;
 use std::os::unix::fs::MetadataExt;
 use std::path::{Path, PathBuf};
 
+use config::needs;
 use rustix::fs::{Access, access, statvfs};
 use rustix::process::{Resource, getrlimit, getuid};
 use schema::ipc::Nodes;
@@ -15,7 +16,6 @@ use super::finding::Finding;
 use super::hub::Hub;
 use super::program;
 use super::segments::{self, Segment};
-use crate::preflight::needed;
 
 /// What is known of the machine and the domain.
 #[derive(Clone, Debug)]
@@ -165,7 +165,7 @@ pub(crate) fn memory(facts: &Facts) -> Finding {
     if size == 0 {
         return Finding::ok(NAME, format!("{SHARED_MEMORY} has no limit"));
     }
-    let needed = needed(facts.links);
+    let needed = needs::memory(facts.links);
     let has = format!("{SHARED_MEMORY} has {} kB, {} kB of them free", size / 1024, free / 1024);
     if facts.lives().is_some() {
         return Finding::ok(NAME, format!("{has}; the hub has what it needs"));

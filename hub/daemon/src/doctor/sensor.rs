@@ -1,6 +1,7 @@
 //! The sensor at the other end: does it answer, is it set as the configuration wants it, is it well. Judges what it said;
 //! refuses to ask.
 
+use config::Link;
 use lms::condition::{Condition, Severity};
 use lms::errors::Fault;
 use lms::family::Family;
@@ -9,7 +10,6 @@ use lms::variant::{Unit, Variant};
 use schema::{State, Status};
 
 use super::finding::Finding;
-use crate::config::Link;
 
 /// What follows from what the sensor at `port` said of itself.
 pub(crate) fn examine(port: &str, report: &Report, link: Option<&Link>) -> Vec<Finding> {
@@ -322,7 +322,7 @@ mod tests {
     fn what_the_configuration_says_otherwise_is_told() {
         let link = Link {
             name: "front".into(),
-            port: crate::config::Source::Tty("/dev/ttyUSB0".into()),
+            port: port::Source::Tty("/dev/ttyUSB0".into()),
             family: Some(Family::Lms291),
             variant: Variant::HALF,
             unit: Some(Unit::Cm),

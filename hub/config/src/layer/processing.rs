@@ -9,8 +9,8 @@ use schema::{BEAMS, Failure, ZONES};
 use serde::Deserialize;
 use toml::Spanned;
 
-use crate::config::{Background, Processing, START, Zones};
 use crate::origin::Origin;
+use crate::processing::{Background, Processing, START, Zones};
 
 /// Section `pose` of a link.
 #[derive(Clone, Deserialize)]

@@ -4,8 +4,7 @@
 use std::fs;
 use std::path::PathBuf;
 
-use daemon::Config;
-use daemon::config::{DEFAULT, Gateway, Sources, Value, values};
+use config::{Config, DEFAULT, Gateway, Sources, Value, values};
 use serde_json::{Value as Json, json};
 
 /// A file that goes with the test.

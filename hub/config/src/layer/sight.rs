@@ -8,8 +8,8 @@ use preprocess::zones::{Check, Settings};
 use schema::{Failure, Kind, Scan, Zones};
 
 use super::processing::Sections;
-use crate::config::Processing;
 use crate::origin::Origin;
+use crate::processing::Processing;
 
 /// A link with what was said about it.
 pub(super) struct Sight<'a> {

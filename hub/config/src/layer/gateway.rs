@@ -5,7 +5,7 @@ use schema::datagram::{MTU_ETHERNET, MTU_LEAST};
 use serde::Deserialize;
 use toml::Spanned;
 
-use crate::config::Gateway;
+use crate::gateway::Gateway;
 use crate::origin::Origin;
 
 /// Section `gateway`.

@@ -9,12 +9,14 @@ use std::rc::Rc;
 
 use lms::family::Family;
 use lms::variant::{Baud, Mode, Unit, Variant};
+use port::Source;
 use schema::{Failure, Kind, check_sensor};
 use serde::Deserialize;
 use toml::Spanned;
 
-use crate::config::{Link, MAX_LINKS, Processing, Source};
+use crate::link::{Link, MAX_LINKS};
 use crate::origin::Origin;
+use crate::processing::Processing;
 use gateway::GatewayLayer;
 use processing::{BackgroundLayer, MarksLayer, PoseLayer, Sections, ZonesLayer};
 use sight::Sight;

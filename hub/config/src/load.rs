@@ -1,51 +1,12 @@
-//! What the hub is told: links with their ports and what to ask of their sensors. Several sources, the last one wins.
+//! Reads all sources of a configuration into the values in effect; the last one wins.
 
-mod effective;
-mod gateway;
-mod places;
-mod processing;
-mod sources;
-
-use lms::family::Family;
-use lms::variant::{Baud, Mode, Unit, Variant};
-pub use port::Source;
+use port::Source;
 use schema::{Failure, Kind};
 
+use crate::gateway::Gateway;
 use crate::layer::Drafts;
-
-pub use effective::{Value, values};
-pub use gateway::Gateway;
-pub(crate) use processing::START;
-pub use processing::{Background, Processing, Zones};
-pub use sources::Sources;
-
-/// The effective configuration.
-#[derive(Clone, Debug, PartialEq)]
-pub struct Config {
-    /// The links in their order: a sensor's number is its place here.
-    pub links: Vec<Link>,
-}
-
-/// One link and what to ask of its sensor.
-#[derive(Clone, Debug, PartialEq)]
-pub struct Link {
-    /// The sensor's name in topics.
-    pub name: String,
-    /// Where its bytes come from.
-    pub port: Source,
-    /// What the sensor is expected to be, if the user said it: nothing is asked for that it cannot do.
-    pub family: Option<Family>,
-    /// Angle and resolution.
-    pub variant: Variant,
-    /// Unit that the sensor is expected to measure in, if the user said one; it is compared, never written.
-    pub unit: Option<Unit>,
-    /// Measuring mode of a recording that does not tell it; a sensor is asked.
-    pub mode: Option<Mode>,
-    /// Rate to stream at.
-    pub baud: Baud,
-    /// What is made of its scans.
-    pub processing: Processing,
-}
+use crate::link::{Config, Link};
+use crate::sources::Sources;
 
 impl Config {
     /// Reads all sources.
@@ -94,15 +55,27 @@ fn check_ports(links: &[Link]) -> Result<(), Failure> {
     Ok(())
 }
 
-/// Links of one hub.
-pub(crate) const MAX_LINKS: usize = 256;
-
-/// A configuration to begin with; its values are those that hold where nothing is said.
-pub const DEFAULT: &str = include_str!("config/default.toml");
+impl Gateway {
+    /// Reads the section in all sources, the last one wins. Links need not be there.
+    ///
+    /// [`schema::Kind::Configuration`] with place, value and remedy.
+    pub fn load(sources: &Sources) -> Result<Gateway, Failure> {
+        let mut gateway = Gateway::default();
+        for layer in sources.files().chain(sources.settings()) {
+            let (origin, layer) = layer?;
+            if let Some(section) = layer.gateway {
+                section.lay(&origin, &mut gateway)?;
+            }
+        }
+        Ok(gateway)
+    }
+}
 
 #[cfg(test)]
 mod tests {
     use super::*;
+    use lms::family::Family;
+    use lms::variant::{Baud, Mode, Unit, Variant};
 
     fn sources(set: &[&str], links: &[&str]) -> Sources {
         let owned = |flags: &[&str]| flags.iter().map(|flag| (*flag).to_owned()).collect();

@@ -4,8 +4,7 @@
 use std::fs;
 use std::path::PathBuf;
 
-use daemon::Config;
-use daemon::config::{Gateway, Processing, Sources};
+use config::{Config, Gateway, Processing, Sources};
 use preprocess::background::{Candidate, Method, Start};
 use preprocess::zones::Sector;
 use schema::{Background, Kind, as_json};

@@ -9,8 +9,11 @@ use schema::{Failure, Pose};
 use serde::Serialize;
 use serde_json::{Value as Json, json};
 
-use super::places::Places;
-use super::{Background, Config, Gateway, Link, Sources, Zones};
+use crate::gateway::Gateway;
+use crate::link::{Config, Link};
+use crate::places::Places;
+use crate::processing::{Background, Zones};
+use crate::sources::Sources;
 
 /// One value in effect.
 #[derive(Clone, Debug, PartialEq, Serialize)]

@@ -37,7 +37,7 @@ impl Sources {
     }
 
     /// The files as they are read.
-    pub(super) fn files(&self) -> impl Iterator<Item = Said> {
+    pub(crate) fn files(&self) -> impl Iterator<Item = Said> {
         self.files.iter().map(|path| {
             let origin = Origin::read(path)?;
             let layer = parse(&origin)?;
@@ -46,7 +46,7 @@ impl Sources {
     }
 
     /// The links of the command line.
-    pub(super) fn links(&self) -> impl Iterator<Item = Said> {
+    pub(crate) fn links(&self) -> impl Iterator<Item = Said> {
         self.links.iter().map(|flag| {
             let text = flag
                 .split_once('=')
@@ -57,7 +57,7 @@ impl Sources {
     }
 
     /// The single values of the command line.
-    pub(super) fn settings(&self) -> impl Iterator<Item = Said> {
+    pub(crate) fn settings(&self) -> impl Iterator<Item = Said> {
         self.set.iter().map(|flag| {
             let remedy = "write --set link.NAME.KEY=VALUE, as link.front.angle=100, or for all links --set \
                           zones.radii=[1.2,0.7]";
@@ -66,7 +66,7 @@ impl Sources {
     }
 
     /// All of them, in the order in which they win.
-    pub(super) fn all(&self) -> impl Iterator<Item = Said> {
+    pub(crate) fn all(&self) -> impl Iterator<Item = Said> {
         self.files().chain(self.links()).chain(self.settings())
     }
 }

@@ -6,17 +6,17 @@ use std::collections::BTreeMap;
 use schema::Failure;
 use toml::de::{DeTable, DeValue};
 
-use super::Sources;
 use crate::origin::Origin;
+use crate::sources::Sources;
 
 /// The places of all keys that are said, as `link.front.zones.radii` and `zones.radii`.
-pub(super) struct Places(BTreeMap<String, String>);
+pub(crate) struct Places(BTreeMap<String, String>);
 
 impl Places {
     /// Reads `sources`.
     ///
     /// [`schema::Kind::Configuration`] with place, value and remedy.
-    pub(super) fn of(sources: &Sources) -> Result<Places, Failure> {
+    pub(crate) fn of(sources: &Sources) -> Result<Places, Failure> {
         let mut places = Places(BTreeMap::new());
         for said in sources.all() {
             let (origin, _) = said?;
@@ -27,12 +27,12 @@ impl Places {
     }
 
     /// Where `key` of the link `link` is said last, if it is: what is said for one link wins.
-    pub(super) fn of_link(&self, link: &str, key: &str) -> Option<&str> {
+    pub(crate) fn of_link(&self, link: &str, key: &str) -> Option<&str> {
         self.of_key(&format!("link.{link}.{key}")).or_else(|| self.of_key(key))
     }
 
     /// Where `key` is said last, if it is.
-    pub(super) fn of_key(&self, key: &str) -> Option<&str> {
+    pub(crate) fn of_key(&self, key: &str) -> Option<&str> {
         self.0.get(key).map(String::as_str)
     }
 

@@ -1,9 +1,6 @@
 //! Section `gateway` over all sources. Refuses to know what a gateway is: who makes one reads what only it understands.
 
-use schema::Failure;
 use schema::datagram::MTU_SAFE;
-
-use super::Sources;
 
 /// What is said of the gateway; what is not said is nothing.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
@@ -29,18 +26,4 @@ impl Gateway {
     pub const TTL: u8 = 1;
     /// The longest datagram in bytes if nobody says it.
     pub const MTU: usize = MTU_SAFE;
-
-    /// Reads the section in all sources, the last one wins. Links need not be there.
-    ///
-    /// [`schema::Kind::Configuration`] with place, value and remedy.
-    pub fn load(sources: &Sources) -> Result<Gateway, Failure> {
-        let mut gateway = Gateway::default();
-        for layer in sources.files().chain(sources.settings()) {
-            let (origin, layer) = layer?;
-            if let Some(section) = layer.gateway {
-                section.lay(&origin, &mut gateway)?;
-            }
-        }
-        Ok(gateway)
-    }
 }
