@@ -6,7 +6,6 @@ mod processors;
 mod recording;
 
 use lms::command::Request;
-use lms::eeprom::Write;
 use lms::explain::explain;
 use lms::framer::{Found, Framer, SUFFIX_HOLD, Tally, VETO_HOLD};
 use lms::header::Expect;
@@ -16,6 +15,7 @@ use lms::session::{Output, Session};
 use lms::telegram::{FRAME, MAX_LENGTH, STX, Telegram, Writer};
 use lms::variant::{Baud, Variant};
 use lms::{Control, MILLIS, Nanos, Settings};
+use lms_configure::eeprom::Write;
 
 /// A target by its name.
 pub type Target = (&'static str, fn(&[u8]));

@@ -8,9 +8,9 @@ mod wanted;
 
 use std::sync::atomic::AtomicBool;
 
-use lms::change::{Change, Plan, Step};
 use lms::family::Family;
 use lms::parameters::Password;
+use lms_configure::{Change, Plan, Step};
 use port::{Source, clock};
 use schema::{Failure, Kind};
 

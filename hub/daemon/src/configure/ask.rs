@@ -4,7 +4,7 @@
 use std::io::{IsTerminal, Write, stderr, stdin};
 use std::sync::atomic::{AtomicBool, Ordering};
 
-use lms::change::{Consent, Plan};
+use lms_configure::{Consent, Plan};
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
 use rustix::termios::{QueueSelector, tcflush};
 use schema::{Failure, Kind};

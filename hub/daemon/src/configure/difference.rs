@@ -2,11 +2,10 @@
 
 use std::fmt;
 
-use lms::change::Plan;
 use lms::configuration::{Item, availability_words};
-use lms::eeprom::PowerOn;
 use lms::family::Family;
 use lms::variant::{Mode, Unit};
+use lms_configure::{Plan, eeprom::PowerOn};
 use serde::Serialize;
 
 use super::wanted::{AVAILABILITY, MODE, SENSITIVITIES, SENSITIVITY, UNIT};

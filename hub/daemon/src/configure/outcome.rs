@@ -2,8 +2,8 @@
 
 use std::fmt;
 
-use lms::change::{Change, Failing, Kept, Outcome, Plan, Step};
 use lms::operating;
+use lms_configure::{Change, Failing, Kept, Outcome, Plan, Step};
 use schema::{Failure, Kind};
 use serde::Serialize;
 

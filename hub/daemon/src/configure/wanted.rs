@@ -1,11 +1,10 @@
 //! `KEY=VALUE` of the command line: which settings there are, what each may be, and what it does to a configuration. What
 //! the sensor's type cannot do is refused with the reason.
 
-use lms::change::{Kept, Plan};
-use lms::eeprom::PowerOn;
 use lms::family::Family;
 use lms::inquiry::Report;
 use lms::variant::{Mode, Unit};
+use lms_configure::{Kept, Plan, eeprom::PowerOn};
 use schema::{Failure, Kind};
 
 /// Everything that is wanted.

@@ -6,7 +6,6 @@ use std::io::{ErrorKind, Write};
 use lms::command::Request;
 use lms::condition::Condition;
 use lms::configuration::Configuration;
-use lms::eeprom::{self, PowerOn};
 use lms::errors::Errors;
 use lms::explain::Headline;
 use lms::measured;
@@ -15,6 +14,7 @@ use lms::parameters::Password;
 use lms::reply::{self, Health, Reply};
 use lms::telegram::{Encoded, REPLY};
 use lms::variant::{Baud, MAX_BEAMS, Mode, Unit, Variant};
+use lms_configure::eeprom::{self, PowerOn};
 use schema::{Failure, Kind};
 use serde::Serialize;
 

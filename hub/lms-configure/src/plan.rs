@@ -1,11 +1,12 @@
 //! What is to be changed for ever, and somebody's consent to it. A plan is values; only with consent can it be carried
 //! out, and consent is to one plan as it was shown.
 
-use crate::configuration::{Configuration, ITEMS, Item, LEN};
+use lms::configuration::{Configuration, ITEMS, Item, LEN};
+use lms::inquiry::Report;
+use lms::parameters::Password;
+use lms::variant::Baud;
+
 use crate::eeprom::PowerOn;
-use crate::inquiry::Report;
-use crate::parameters::Password;
-use crate::variant::Baud;
 
 /// The first part of a configuration with its own storage: 34 bytes, 32 with older firmware.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -102,8 +103,8 @@ impl Consent {
 mod tests {
     extern crate std;
     use super::*;
-    use crate::configuration::factory;
-    use crate::variant::{Mode, Unit};
+    use lms::configuration::factory;
+    use lms::variant::{Mode, Unit};
     use std::vec::Vec;
 
     #[test]

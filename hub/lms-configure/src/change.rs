@@ -6,20 +6,16 @@
 //! The only code that sends a request of [`crate::eeprom`], and it needs [`Consent`]. A write that was not acknowledged
 //! is not simply said again: first the configuration tells whether it was done.
 
-mod plan;
+use lms::command::{self, Request};
+use lms::exchange::{Conversation, Exchange, Heard, MODE_TIMEOUT, MORE_TRIES, Output, Say, TRIES};
+use lms::framer::Place;
+use lms::operating::{ON_REQUEST, Operating, PARTIAL, STREAM};
+use lms::reply::Reply;
+use lms::telegram::Encoded;
+use lms::{MILLIS, Nanos};
 
-use crate::Nanos;
-use crate::command::Request;
 use crate::eeprom::{PowerOn, Write};
-use crate::exchange::{Conversation, Exchange, Heard, Output};
-use crate::framer::Place;
-use crate::operating::{ON_REQUEST, Operating, PARTIAL, STREAM};
-use crate::outgoing::{MODE_TIMEOUT, Say};
-use crate::phase::{MORE_TRIES, TRIES};
-use crate::reply::Reply;
-use crate::telegram::Encoded;
-use crate::{MILLIS, command};
-pub use plan::{Consent, Kept, Plan};
+use crate::plan::{Consent, Kept, Plan};
 
 /// A change under way; it cannot be copied, as consent is to one.
 #[derive(Debug)]

@@ -1,8 +1,8 @@
 //! Requests that a sensor keeps for ever: they write its EEPROM, which wears out after a few thousand writes, and they are
 //! done in installation mode only (Telegram listing 7-1). Here they are made and read: for people, for the simulator.
-//! Nothing here sends one, and no code that talks to a sensor by itself may name this module.
+//! Nothing here sends one.
 
-use crate::telegram::{Encoded, Telegram, Writer};
+use lms::telegram::{Encoded, MAX_LENGTH, Telegram, Writer};
 
 /// A request that writes the EEPROM.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -73,7 +73,7 @@ impl<'a> Write<'a> {
             Write::Configuration(_) => (1..=CONFIGURATION_LEN).contains(&len),
             Write::Configuration2(_) => (1..=CONFIGURATION_2_LEN).contains(&len),
             Write::PowerOn(_) => len == 1,
-            Write::Field(_) | Write::Password(_) | Write::Teach(_) => len < crate::telegram::MAX_LENGTH,
+            Write::Field(_) | Write::Password(_) | Write::Teach(_) => len < MAX_LENGTH,
         }
     }
 }
@@ -133,7 +133,7 @@ pub const CONFIGURATION_2: u8 = 0x7C;
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::command::{EEPROM_WRITES, Request};
+    use lms::command::{EEPROM_WRITES, Request};
 
     const PRINTED: [u8; 34] = [
         0, 0, 0x46, 0, 0, 0, 1, 0, 0, 2, 2, 2, 0, 0, 0x0A, 0x0A, 0x50, 0x64, 0, 0x0A, 0x0A, 0x50, 0x80, 0,
