@@ -12,9 +12,9 @@ use std::process::Command;
 use std::sync::atomic::AtomicBool;
 
 use config::Gateway;
-use daemon::doctor::{Subjects, System, examine};
 use schema::Domain;
 use stage::{Findings, KILL, Program, Stage, TERM, in_a_network, is_class, shared_memory};
+use tools::doctor::{Subjects, System, examine};
 
 /// `sh` with these words before the program, as `ulimit -f 100; exec`, and its arguments.
 fn under(stage: &Stage, words: &str, arguments: &[&str]) -> Command {
@@ -89,7 +89,7 @@ fn laid_out(stage: &Stage) -> Findings {
     };
     let mut lines = Vec::new();
     let mut tell =
-        |finding: &daemon::doctor::Finding| lines.push(serde_json::to_value(finding).expect("is JSON"));
+        |finding: &tools::doctor::Finding| lines.push(serde_json::to_value(finding).expect("is JSON"));
     // Of this machine's ports no test knows anything.
     let _ = examine(&subjects, &AtomicBool::new(false), &mut tell);
     Findings::in_lines(lines).of_machine().without(&["ports", "multicast"])

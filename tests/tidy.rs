@@ -156,6 +156,8 @@ fn the_daemon_knows_neither_clients_nor_sim() {
         vec![
             tree.with_line("hub/daemon/Cargo.toml", "[dependencies]", "scanhub-clients.workspace = true"),
             tree.with_line("hub/recording/Cargo.toml", "[dependencies]", "scanhub-sim.workspace = true"),
+            tree.with_line("hub/port/Cargo.toml", "[dependencies]", "scanhub-lms-configure.workspace = true"),
+            tree.with_line("hub/daemon/Cargo.toml", "[dependencies]", "scanhub-tools.workspace = true"),
         ]
     });
 }
@@ -254,7 +256,10 @@ fn shared_memory_is_built_in_one_module() {
 #[test]
 fn ranges_are_born_in_one_file() {
     holds(sources::ranges_are_born_in_one_file, |tree| {
-        vec![tree.with("hub/daemon/src/link.rs", "//! A link.\nfor word in measured.words() {}\n")]
+        vec![
+            tree.with("hub/daemon/src/link.rs", "//! A link.\nfor word in measured.words() {}\n"),
+            tree.with("hub/tools/src/probe.rs", "//! Probes.\nfor word in measured.words() {}\n"),
+        ]
     });
 }
 
@@ -276,7 +281,7 @@ fn nobody_writes_the_eeprom() {
                 "//! Sends.\nlet request = crate::eeprom::Write::Field(&[]);\n",
             ),
             tree.with("hub/daemon/src/link.rs", "//! A link.\nuse lms_configure::Change;\n"),
-            tree.with("hub/daemon/src/probe.rs", "//! Probes.\nuse lms_configure::{eeprom, Plan};\n"),
+            tree.with("hub/tools/src/probe.rs", "//! Probes.\nuse lms_configure::{eeprom, Plan};\n"),
             tree.with("clients/src/planted.rs", "//! Knows.\nuse lms_configure::eeprom::Write;\n"),
         ]
     });
@@ -286,14 +291,14 @@ fn nobody_writes_the_eeprom() {
 fn consent_is_given_by_persons() {
     holds(sources::consent_is_given_by_persons, |tree| {
         let planted = "//! Writes.\nlet consent = Consent::of_a_person(plan);\n";
-        let ask = tree.text("hub/daemon/src/configure/ask.rs");
+        let ask = tree.text("hub/tools/src/configure/ask.rs");
         let plan = tree.text("hub/lms-configure/src/plan.rs");
         vec![
             tree.with("hub/daemon/src/link.rs", planted),
-            tree.with("hub/daemon/src/configure.rs", planted),
+            tree.with("hub/tools/src/configure.rs", planted),
             tree.with("hub/cli/configure.rs", planted),
             tree.with(
-                "hub/daemon/src/configure/ask.rs",
+                "hub/tools/src/configure/ask.rs",
                 &ask.replace("fn person", &format!("{planted}fn person")),
             ),
             tree.with(

@@ -4,9 +4,9 @@ use std::sync::atomic::AtomicBool;
 
 use clap::Args;
 use config::{Config, Gateway};
-use daemon::doctor::{Subjects, System, examine};
-use daemon::probe::source;
 use schema::Failure;
+use tools::doctor::{Subjects, System, examine};
+use tools::probe::source;
 
 use super::{Everywhere, Run};
 

@@ -77,7 +77,9 @@ pub(crate) fn shared_memory_is_built_in_one_module(tree: &Tree) -> Vec<String> {
 
 /// Words of the wire become ranges in a unit in one file, between the protocol and what consumers see.
 pub(crate) fn ranges_are_born_in_one_file(tree: &Tree) -> Vec<String> {
-    find(tree, &[".words()", "range_array", "upper_array"], |path| path.starts_with("hub/daemon/src/"))
+    find(tree, &[".words()", "range_array", "upper_array"], |path| {
+        path.starts_with("hub/daemon/src/") || path.starts_with("hub/tools/src/")
+    })
 }
 
 /// Nobody who talks to a sensor by itself can say a request that writes its EEPROM. Requests are made in `lms` and
@@ -87,7 +89,7 @@ pub(crate) fn ranges_are_born_in_one_file(tree: &Tree) -> Vec<String> {
 pub(crate) fn nobody_writes_the_eeprom(tree: &Tree) -> Vec<String> {
     const WRITES: [&str; 6] = ["0x40", "0x42", "0x46", "0x66", "0x77", "0x7C"];
     const MAY_NAME: [&str; 4] =
-        ["hub/sim/", "hub/lms-configure/", "hub/daemon/src/configure", "hub/daemon/src/telegram"];
+        ["hub/sim/", "hub/lms-configure/", "hub/tools/src/configure", "hub/tools/src/telegram"];
     const MAY_SAY: [&str; 3] = ["hub/sim/", "hub/lms/src/", "hub/lms-configure/src/"];
     /// Here requests are explained, and none is made.
     const EXPLAINS: &str = "hub/lms/src/explain";
@@ -117,7 +119,7 @@ pub(crate) fn nobody_writes_the_eeprom(tree: &Tree) -> Vec<String> {
 
 /// Only where a person is asked is consent made, without which nothing that writes the EEPROM leaves for a port.
 pub(crate) fn consent_is_given_by_persons(tree: &Tree) -> Vec<String> {
-    const ASKS: &str = "hub/daemon/src/configure/ask.rs";
+    const ASKS: &str = "hub/tools/src/configure/ask.rs";
     const TAKES: &str = "hub/lms-configure/src/";
     let mut breaches = find(tree, &["of_a_person", "Consent("], |path| {
         !is_test(path) && path != ASKS && !path.starts_with(TAKES)
