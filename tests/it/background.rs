@@ -1,11 +1,10 @@
 //! The background model of a running hub: shown, kept in a file, forgotten, taken back; and what is no model of it.
 
-mod stage;
-
 use std::fs;
 
+use crate::testkit;
+use crate::testkit::{Outcome, Program, Stage, TERM, is_class, number};
 use serde_json::Value;
-use stage::{Outcome, Program, Stage, TERM, is_class, number};
 
 /// What a hub is told so that a wall is learned within a second.
 const SOON: &str = "--set=background.scans=20";
@@ -31,7 +30,7 @@ fn told(stage: &Stage, order: &[&str]) -> Value {
 
 /// The model once most of its beams are known, held as it is.
 fn learned(stage: &Stage) -> Value {
-    stage::until("the background is learned", || number(&told(stage, &["show"]), "taught") > 300);
+    testkit::until("the background is learned", || number(&told(stage, &["show"]), "taught") > 300);
     told(stage, &["freeze"]);
     told(stage, &["show"])
 }
@@ -93,7 +92,7 @@ fn what_is_no_model_of_the_sensor_is_refused_and_the_hub_goes_on() {
     assert_eq!((no_hub.code, &no_hub.of_class("error")[0]["kind"]), (Some(3), &"no_hub".into()));
 
     let _simulator = simulator(&stage);
-    let rear = stage.file("rear", stage::scan(1));
+    let rear = stage.file("rear", testkit::scan(1));
     let hub = stage.hub(&[&stage.link("front"), &format!("--link=rear=file:{rear}"), SOON]);
     let model = learned(&stage);
     let file = stage.word("model.json");

@@ -1,6 +1,6 @@
 //! The charts of the benches: well-formed whatever the names are, and every value beside the tick of its number.
 
-#[path = "../benches/support/chart.rs"]
+#[path = "../../benches/support/chart.rs"]
 mod chart;
 
 use std::collections::BTreeMap;

@@ -1,20 +1,17 @@
 //! The library for C and C++ from outside: its header against `schema`, programs in C and C++ built as its users build them
 //! and run against a hub. Skips, saying so, where there is no C compiler.
 
-#[path = "client_c/installed.rs"]
-mod installed;
-#[path = "client_c/layout.rs"]
+pub(crate) mod installed;
 mod layout;
-mod stage;
 
 use std::collections::HashSet;
 use std::path::Path;
 use std::process::{Command, Output};
 
+use crate::testkit::{INT, KILL, Program, Stage, TERM, hash, is_class, number};
 use installed::{Installed, header_directory, is_there, source};
 use schema::{Header, Scan};
 use serde_json::Value;
-use stage::{INT, KILL, Program, Stage, TERM, hash, is_class, number};
 
 fn succeeded(output: &Output) -> String {
     let text = |bytes| String::from_utf8_lossy(bytes).into_owned();

@@ -1,13 +1,12 @@
 //! `scanhub config`: what it prints loads, what it checks a hub would take, and what it shows names every place. And what
 //! follows from the command line's own definition: examples, the nearest name, completions, manual pages.
 
-mod stage;
-
 use std::fs;
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
-use stage::{Outcome, Stage};
+use crate::testkit;
+use crate::testkit::{Outcome, Stage};
 
 fn text(outcome: &Outcome) -> String {
     String::from_utf8_lossy(&outcome.out).into_owned()
@@ -202,7 +201,7 @@ fn sensors_and_topics_of_the_running_hub_are_completed() {
             "{words:?}"
         );
     }
-    assert_eq!(hub.end(stage::TERM).code, Some(0));
+    assert_eq!(hub.end(testkit::TERM).code, Some(0));
 }
 
 /// All files below `directory`.

@@ -1,16 +1,15 @@
 //! `scanhub configure`, as a person runs it at a terminal, and as no person does: a sensor's EEPROM is written once, after
 //! a `yes`, and otherwise never.
 
-mod stage;
-
 use std::fs::File;
 use std::io::{Read, Write};
 use std::process::{Child, Stdio};
 use std::thread;
 
+use crate::testkit;
+use crate::testkit::{INT, Stage, TERM, number, terminal, until};
 use rustix::process::{Pid, Signal, kill_process};
 use serde_json::Value;
-use stage::{INT, Stage, TERM, number, terminal, until};
 
 /// The program with a person before it: what it asks is read, and answered on a terminal.
 struct Person {
@@ -125,7 +124,7 @@ fn marks_become_available_by_the_command_that_is_named() {
     let stage = Stage::new();
     let _simulator = stage.simulator(&["front"], &["--baud=38400", "--mode=0x00"]);
     let port = stage.word("front");
-    let marks = |hub: stage::Program| {
+    let marks = |hub: testkit::Program| {
         let told = stage.await_info("front", |info| !info["marks"]["available"].is_null())["marks"].clone();
         let outcome = stage.run(&["echo", "--json", "front/marks", "-n", "3"]);
         let lines = outcome.of_class("marks");
@@ -253,7 +252,7 @@ fn a_stream_that_was_found_goes_on() {
     let simulator = stage.simulator(&["front"], &["--baud=500000"]);
     let hub = stage.hub(&[stage.link("front")]);
     stage.await_info("front", |info| info["state"] == "streaming");
-    hub.end(stage::KILL);
+    hub.end(testkit::KILL);
     let seen = Person::start(&stage, &[&stage.word("front"), "availability=3"]).types("yes\n");
     assert_eq!(seen.code, Some(0), "{}", seen.errors);
     assert!(seen.out.contains("now at: all values, continuously"), "{}", seen.out);

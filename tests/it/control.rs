@@ -1,9 +1,8 @@
 //! What users ask of a running hub: a sensor is stopped, streams again, is begun anew with; and what is refused.
 
-mod stage;
-
+use crate::testkit;
+use crate::testkit::{INT, Outcome, Stage, TERM, is_class, number, sequence, until};
 use serde_json::Value;
-use stage::{INT, Outcome, Stage, TERM, is_class, number, sequence, until};
 
 fn control(stage: &Stage, sensor: &str, verb: &str) -> Outcome {
     stage.run(&["control", sensor, verb, "--json"])
@@ -116,7 +115,7 @@ fn what_is_not_there_or_takes_no_requests_is_refused() {
     let outcome = control(&stage, "front", "pause");
     assert_eq!((outcome.code, &outcome.of_class("error")[0]["kind"]), (Some(3), &"no_hub".into()));
 
-    let scans: Vec<u8> = (0..4000).flat_map(stage::scan).collect();
+    let scans: Vec<u8> = (0..4000).flat_map(testkit::scan).collect();
     let file = stage.file("scans", scans);
     let _hub = stage.hub(&["--link", &format!("front=file:{file}")]);
     for (sensor, code, kind, message) in [
@@ -147,7 +146,7 @@ fn many_ask_at_once_and_some_are_killed_while_they_do() {
         for (number, program) in asking {
             if number % 2 == 0 {
                 // Killed at whatever it is doing.
-                drop(program.end(stage::KILL));
+                drop(program.end(testkit::KILL));
                 continue;
             }
             let outcome = program.wait();

@@ -1,16 +1,15 @@
 //! `scanhub convert`: recordings in another form, as a user at a terminal and a script see it.
 
-mod stage;
-
 use std::process::Stdio;
 
+use crate::testkit;
+use crate::testkit::Stage;
 use serde_json::json;
-use stage::Stage;
 
 #[test]
 fn a_stream_becomes_a_recording_that_plays() {
     let stage = Stage::new();
-    let bytes = (0..20).flat_map(stage::scan).collect::<Vec<u8>>();
+    let bytes = (0..20).flat_map(testkit::scan).collect::<Vec<u8>>();
     let stream = stage.file("a.bin", &bytes);
     let mcap = stream.replace("a.bin", "a.mcap");
     let outcome = stage.run(&["convert", &stream, &mcap, "--json", "--sensor=left"]);
@@ -42,9 +41,9 @@ fn a_stream_becomes_a_recording_that_plays() {
 fn bytes_between_telegrams_are_counted_by_whoever_reads_them() {
     let stage = Stage::new();
     let mut random = fastrand::Rng::with_seed(5);
-    let mut bytes = stage::scan(1);
+    let mut bytes = testkit::scan(1);
     bytes.extend((0..31_002).map(|_| random.u8(..)));
-    bytes.extend((2..9).flat_map(stage::scan));
+    bytes.extend((2..9).flat_map(testkit::scan));
     let stream = stage.file("a.bin", &bytes);
     let mcap = stream.replace("a.bin", "a.mcap");
     let outcome = stage.run(&["convert", &stream, &mcap, "--json"]);
@@ -61,14 +60,14 @@ fn bytes_between_telegrams_are_counted_by_whoever_reads_them() {
     let info = stage.await_info("a", |info| info["state"] == "silent");
     let counters = &info["counters"];
     assert_eq!((&counters["telegrams"], &counters["bytes_discarded"]), (&json!(8), &json!(31_002)));
-    let outcome = hub.end(stage::INT);
+    let outcome = hub.end(testkit::INT);
     assert!(outcome.errors.contains("missing: 31002 bytes that are in nothing"), "{outcome}");
 }
 
 #[test]
 fn what_cannot_be_converted_is_refused() {
     let stage = Stage::new();
-    let stream = stage.file("a.bin", stage::scan(1));
+    let stream = stage.file("a.bin", testkit::scan(1));
     let there = stage.file("there.bin", "mine");
     for (arguments, code, says) in [
         (["convert", &stream[..], &stream[..]], 73, "both read and written"),

@@ -1,13 +1,12 @@
 //! The demonstration, as somebody runs it who has nothing set up: it ends well, tells that nothing was lost, and leaves
 //! nothing behind.
 
-mod stage;
-
 use std::fs;
 use std::path::Path;
 use std::process::Command;
 
-use stage::{INT, Outcome, Program, is_there, number, shared_memory, until};
+use crate::testkit;
+use crate::testkit::{INT, Outcome, Program, is_there, number, shared_memory, until};
 
 /// Runs the demonstration in an empty environment; `end` may wait for something and hasten its end.
 fn demo(arguments: &[&str], end: impl FnOnce(Program) -> Outcome) -> Outcome {
@@ -50,7 +49,7 @@ fn nothing_was_lost(outcome: &Outcome) {
 #[test]
 fn headless_in_an_empty_environment() {
     let outcome = demo(&["--headless", "--for", "2s", "--json"], |mut program| {
-        let ready = program.await_line("ready", stage::is_class("ready"));
+        let ready = program.await_line("ready", testkit::is_class("ready"));
         let (domain, root) =
             (ready["domain"].as_str().expect("a name"), ready["root"].as_str().expect("a path"));
         assert_eq!(

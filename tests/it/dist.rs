@@ -1,13 +1,11 @@
 //! What makes the hub a service: the script puts it in place and takes it away again, and the units are as closed as they
 //! say.
 
-mod stage;
-
 use std::fs;
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
-use stage::Stage;
+use crate::testkit::Stage;
 
 /// How much a unit may be exposed, by the measure of systemd-analyze, in tenths.
 const MOST_EXPOSED: u32 = 15;

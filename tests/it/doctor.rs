@@ -1,15 +1,13 @@
 //! `scanhub doctor`, as somebody runs it: every condition has its line, what is wrong has its remedy, and nothing is
 //! changed by looking.
 
-mod stage;
-
 use std::path::Path;
 
+use crate::testkit::{KILL, Outcome, Program, Stage, TERM};
 use rustix::fs::inotify::{self, CreateFlags, WatchFlags};
 use rustix::io::Errno;
 use rustix::process::Signal;
 use serde_json::Value;
-use stage::{KILL, Outcome, Program, Stage, TERM};
 
 /// Findings by the name of their check; those of a port after it.
 fn state<'a>(findings: &'a [Value], name: &str, port: Option<&str>) -> (&'a str, String) {
@@ -34,7 +32,7 @@ fn doctor(stage: &Stage, arguments: &[&str], code: i32) -> (Vec<Value>, Outcome)
 
 #[test]
 fn the_page_has_a_line_for_each_check() {
-    let page = include_str!("../docs/doctor.md");
+    let page = include_str!("../../docs/doctor.md");
     let lines = page.lines().filter_map(|line| line.strip_prefix("| `")?.split('`').next());
     assert_eq!(lines.collect::<Vec<_>>(), daemon::doctor::CHECKS);
 }

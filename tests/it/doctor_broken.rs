@@ -1,15 +1,13 @@
 //! Set-ups that are broken on purpose between the sensor and the hub's configuration: `scanhub doctor` finds each and names
 //! the remedy. `--nocapture` shows them as a table. Those of the machine are in `doctor_machine.rs`.
 
-mod stage;
-
 use std::fs::{self, File};
 use std::net::TcpListener;
 use std::os::unix::fs::{PermissionsExt, symlink};
 use std::os::unix::process::CommandExt;
 use std::process::Command;
 
-use stage::{Findings, Line, Program, Stage, open_line};
+use crate::testkit::{Findings, Line, Program, Stage, open_line};
 
 /// What a simulated sensor has, and what the doctor says of it.
 const SENSORS: [(&str, &[&str], &str, &str, &str); 10] = [

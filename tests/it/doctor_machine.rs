@@ -2,8 +2,6 @@
 //! remedy, and has no complaint of the other. `--nocapture` shows them as a table. What an administrator may have
 //! written is laid out below a directory of the test.
 
-mod stage;
-
 use std::fs::{self, OpenOptions};
 use std::io::Write;
 use std::os::unix::fs::{PermissionsExt, symlink};
@@ -11,10 +9,10 @@ use std::path::Path;
 use std::process::Command;
 use std::sync::atomic::AtomicBool;
 
+use crate::testkit::{Findings, KILL, Program, Stage, TERM, in_a_network, is_class, shared_memory};
 use daemon::config::Gateway;
 use daemon::doctor::{Subjects, System, examine};
 use schema::Domain;
-use stage::{Findings, KILL, Program, Stage, TERM, in_a_network, is_class, shared_memory};
 
 /// `sh` with these words before the program, as `ulimit -f 100; exec`, and its arguments.
 fn under(stage: &Stage, words: &str, arguments: &[&str]) -> Command {
@@ -72,7 +70,7 @@ fn well_kept(stage: &Stage) -> Findings {
     put("run/systemd/system/here", "");
     put("sys/fs/cgroup/system.slice/scanhub.service/cgroup.procs", "7\n");
     fs::create_dir_all(machine.join("usr/local/bin")).expect("can be made");
-    let _ = symlink(std::env::current_exe().expect("has a path"), machine.join("usr/local/bin/scanhub"));
+    let _ = symlink(crate::testkit::own_program(), machine.join("usr/local/bin/scanhub"));
     laid_out(stage)
 }
 
@@ -287,7 +285,7 @@ fn two_hubs_and_one_that_was_replaced() {
 
 #[test]
 fn no_way_to_the_network() {
-    in_a_network("no_way_to_the_network", || {
+    in_a_network("doctor_machine::no_way_to_the_network", || {
         let stage = Stage::new();
         // Nobody named an interface: nothing goes to a network.
         assert_eq!(Findings::of(&stage, &[]).said("multicast").0, "skipped");

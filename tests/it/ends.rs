@@ -1,19 +1,18 @@
 //! How programs end: by a signal, by a reader that goes away, or by being killed, and what they leave behind.
 
-mod stage;
-
 use std::fs::{self, File};
 use std::io::{BufRead, BufReader};
 use std::os::unix::fs::symlink;
 use std::process::Stdio;
 
+use crate::testkit;
+use crate::testkit::{INT, KILL, Program, Stage, TERM, is_class, is_there, until};
 use rustix::pipe::{PipeFlags, pipe_with};
 use serde_json::Value;
-use stage::{INT, KILL, Program, Stage, TERM, is_class, is_there, until};
 
 /// A hub whose sensor is a recording of some minutes, in the sensor's pace.
 fn hub(stage: &Stage) -> Program {
-    let scans: Vec<u8> = (0..4000).flat_map(stage::scan).collect();
+    let scans: Vec<u8> = (0..4000).flat_map(testkit::scan).collect();
     let file = stage.file("scans", scans);
     stage.hub(&["--link", &format!("front=file:{file}")])
 }

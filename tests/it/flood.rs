@@ -1,15 +1,13 @@
 //! Ten megabytes of garbage as fast as the hub reads, with a telegram now and then: each is delivered, and nothing grows.
 //! From a serial server no more is read than twice what the line brings, and what it costs is little.
 
-mod stage;
-
 use std::io::Write;
 use std::net::TcpListener;
 use std::thread;
 use std::time::{Duration, Instant};
 
+use crate::testkit::{INT, Line, Program, Stage, TERM, bytes_of, is_class, number, scan};
 use fastrand::Rng;
-use stage::{INT, Line, Program, Stage, TERM, bytes_of, is_class, number, scan};
 
 /// Garbage that a framer has to work for: noise, start bytes, and heads of telegrams that never end.
 fn garbage(random: &mut Rng, len: usize) -> Vec<u8> {

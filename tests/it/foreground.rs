@@ -1,15 +1,15 @@
 //! That `multi` tells people from a room, and better than the paper's method: one run of each scene that has a target, as
 //! `benches/foreground` measures ten. What the simulated world or a method changes shows here first.
 
-#[path = "../benches/foreground/boxes.rs"]
+#[path = "../../benches/foreground/boxes.rs"]
 mod boxes;
-#[path = "../benches/foreground/method.rs"]
+#[path = "../../benches/foreground/method.rs"]
 mod method;
-#[path = "../benches/foreground/play.rs"]
+#[path = "../../benches/foreground/play.rs"]
 mod play;
-#[path = "../benches/foreground/score.rs"]
+#[path = "../../benches/foreground/score.rs"]
 mod score;
-#[path = "../benches/support/seen.rs"]
+#[path = "../../benches/support/seen.rs"]
 mod seen;
 
 use boxes::Boxes;

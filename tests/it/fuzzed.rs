@@ -3,7 +3,7 @@
 
 // Public for the fuzzer, which has them as a crate.
 #[allow(unreachable_pub)]
-#[path = "fuzz/targets.rs"]
+#[path = "../fuzz/targets.rs"]
 mod targets;
 
 use std::fs;

@@ -1,14 +1,14 @@
 //! The hub on a network: everything that is sent is heard, checked and counted by a receiver that knows nothing of the
 //! gateway. Each test has a network of its own.
 
-mod stage;
-
 use std::net::{Ipv4Addr, UdpSocket};
 
+use crate::testkit::{
+    INT, KILL, Outcome, Receiver, Stage, TERM, hash, in_a_network, is_class, number, read, until,
+};
 use schema::datagram::{Account, Announce, Datagram, Packed};
 use schema::{Scan, Topic, Verdict, Zones};
 use serde_json::{Value, json};
-use stage::{INT, KILL, Outcome, Receiver, Stage, TERM, hash, in_a_network, is_class, number, read, until};
 
 const STREAM: [&str; 2] = ["--seed=61", "--baud=500000"];
 const LO: Ipv4Addr = Ipv4Addr::LOCALHOST;
@@ -68,7 +68,7 @@ fn from_row(bytes: &[u8], sensor: u8, topic: u8) -> bool {
 
 #[test]
 fn two_sensors_go_out_whole() {
-    in_a_network("two_sensors_go_out_whole", || {
+    in_a_network("gateway::two_sensors_go_out_whole", || {
         let stage = Stage::new();
         let receiver = Receiver::new(LO);
         let _simulator = stage.simulator(&["front", "rear"], &STREAM);
@@ -117,7 +117,7 @@ fn two_sensors_go_out_whole() {
 
 #[test]
 fn what_is_thinned_stays_together() {
-    in_a_network("what_is_thinned_stays_together", || {
+    in_a_network("gateway::what_is_thinned_stays_together", || {
         let stage = Stage::new();
         let receiver = Receiver::new(LO);
         let _simulator = stage.simulator(&["front", "rear"], &STREAM);
@@ -156,7 +156,7 @@ fn is_unknown(datagram: &Datagram<'_>) -> bool {
 
 #[test]
 fn bare_telegrams_are_those_of_the_line() {
-    in_a_network("bare_telegrams_are_those_of_the_line", || {
+    in_a_network("gateway::bare_telegrams_are_those_of_the_line", || {
         let stage = Stage::new();
         let (usual, front, rear) = (Receiver::new(LO), Receiver::at(LO, 22_201), Receiver::at(LO, 22_202));
         let mut waiting = stage.gateway(&["--interface=lo", "--bare"]);
@@ -181,7 +181,7 @@ fn bare_telegrams_are_those_of_the_line() {
 
 #[test]
 fn copies_are_the_same_and_a_dead_host_disturbs_nobody() {
-    in_a_network("copies_are_the_same_and_a_dead_host_disturbs_nobody", || {
+    in_a_network("gateway::copies_are_the_same_and_a_dead_host_disturbs_nobody", || {
         let stage = Stage::new();
         let (receiver, copies) = (Receiver::new(LO), Receiver::at(LO, 30_000));
         let _simulator = stage.simulator(&["front"], &STREAM);
@@ -208,7 +208,7 @@ fn copies_are_the_same_and_a_dead_host_disturbs_nobody() {
 
 #[test]
 fn copies_go_over_ipv6_too() {
-    in_a_network("copies_go_over_ipv6_too", || {
+    in_a_network("gateway::copies_go_over_ipv6_too", || {
         let Ok(copies) = UdpSocket::bind("[::1]:30000") else {
             eprintln!("skipped: no IPv6 here");
             return;
@@ -234,7 +234,7 @@ fn copies_go_over_ipv6_too() {
 
 #[test]
 fn hubs_and_gateways_are_replaced() {
-    in_a_network("hubs_and_gateways_are_replaced", || {
+    in_a_network("gateway::hubs_and_gateways_are_replaced", || {
         let stage = Stage::new();
         let receiver = Receiver::new(LO);
         let mut first = stage.gateway(&["--interface=lo"]);
@@ -278,7 +278,7 @@ fn announced(bytes: &[u8]) -> Option<Announce> {
 
 #[test]
 fn what_does_not_fit_is_told_and_counted() {
-    in_a_network("what_does_not_fit_is_told_and_counted", || {
+    in_a_network("gateway::what_does_not_fit_is_told_and_counted", || {
         let stage = Stage::new();
         let receiver = Receiver::new(LO);
         let _simulator = stage.simulator(&["front"], &STREAM);
@@ -305,7 +305,7 @@ fn what_does_not_fit_is_told_and_counted() {
 
 #[test]
 fn without_an_interface_nothing_goes_to_groups() {
-    in_a_network("without_an_interface_nothing_goes_to_groups", || {
+    in_a_network("gateway::without_an_interface_nothing_goes_to_groups", || {
         let stage = Stage::new();
         let groups = Receiver::new(LO);
         let _simulator = stage.simulator(&["front"], &STREAM);

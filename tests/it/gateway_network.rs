@@ -1,18 +1,18 @@
 //! What becomes of a gateway when the network does: interfaces that go and come, queues that are full, and what it is told
 //! that cannot be. Each test has a network of its own.
 
-mod stage;
-
 use std::net::Ipv4Addr;
 use std::process::{Command, Stdio};
 
+use crate::testkit::{
+    Outcome, Program, Receiver, Stage, TERM, USR1, in_a_network, ip, is_class, number, read, until,
+};
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
 use rustix::pipe::fcntl_setpipe_size;
 use rustix::process::{Pid, kill_process};
 use schema::Topic;
 use schema::datagram::{Account, Announce, Datagram, Row};
 use serde_json::Value;
-use stage::{Outcome, Program, Receiver, Stage, TERM, USR1, in_a_network, ip, is_class, number, read, until};
 
 const STREAM: [&str; 2] = ["--seed=62", "--baud=500000"];
 const OURS: Ipv4Addr = Ipv4Addr::new(10, 76, 0, 1);
@@ -74,7 +74,7 @@ fn is_gap_free(heard: &[Vec<u8>], outcome: &Outcome) {
 
 #[test]
 fn a_link_that_goes_and_comes() {
-    in_a_network("a_link_that_goes_and_comes", || {
+    in_a_network("gateway_network::a_link_that_goes_and_comes", || {
         let stage = Stage::new();
         plug();
         let _simulator = stage.simulator(&["front"], &STREAM);
@@ -115,7 +115,7 @@ fn a_link_that_goes_and_comes() {
 
 #[test]
 fn what_a_full_queue_drops_is_counted() {
-    in_a_network("what_a_full_queue_drops_is_counted", || {
+    in_a_network("gateway_network::what_a_full_queue_drops_is_counted", || {
         let stage = Stage::new();
         plug();
         let _simulator = stage.simulator(&["front"], &STREAM);
@@ -142,7 +142,7 @@ fn what_a_full_queue_drops_is_counted() {
 
 #[test]
 fn a_reader_that_does_not_read_delays_nothing() {
-    in_a_network("a_reader_that_does_not_read_delays_nothing", || {
+    in_a_network("gateway_network::a_reader_that_does_not_read_delays_nothing", || {
         let stage = Stage::new();
         let receiver = Receiver::new(Ipv4Addr::LOCALHOST);
         let _simulator = stage.simulator(&["front"], &STREAM);
@@ -178,7 +178,7 @@ fn a_reader_that_does_not_read_delays_nothing() {
 
 #[test]
 fn the_account_is_told_when_asked_for() {
-    in_a_network("the_account_is_told_when_asked_for", || {
+    in_a_network("gateway_network::the_account_is_told_when_asked_for", || {
         let stage = Stage::new();
         let receiver = Receiver::new(Ipv4Addr::LOCALHOST);
         let _simulator = stage.simulator(&["front"], &STREAM);
@@ -218,7 +218,7 @@ fn the_account_is_told_when_asked_for() {
 
 #[test]
 fn what_cannot_be_is_refused() {
-    in_a_network("what_cannot_be_is_refused", || {
+    in_a_network("gateway_network::what_cannot_be_is_refused", || {
         let stage = Stage::new();
         let _hub = stage.hub(&[stage.link("front")]);
         let config = |text: &str| format!("--config={}", stage.file("gateway.toml", text));

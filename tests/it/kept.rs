@@ -1,11 +1,9 @@
 //! What a hub keeps for the next one beside shared memory: where it is, for whom, and that nothing depends on it.
 
-mod stage;
-
 use std::fs;
 use std::os::unix::fs::{MetadataExt, PermissionsExt};
 
-use stage::{Line, Program, Stage, TERM, until};
+use crate::testkit::{Line, Program, Stage, TERM, until};
 
 #[test]
 fn where_a_sensor_was_found_is_asked_first_by_the_next_hub() {

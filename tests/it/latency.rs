@@ -1,15 +1,14 @@
 //! `scanhub latency` with a hub that streams: the stretches of an age add up, limits end in exit 5, and remote sensors have
 //! the part of their way that is here.
 
-mod stage;
-
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::thread;
 use std::time::Duration;
 
+use crate::testkit;
+use crate::testkit::{INT, Outcome, Sender, Stage, TERM, in_a_network, number, until};
 use schema::{Topic, Verdict, Zones};
 use serde_json::{Value, json};
-use stage::{INT, Outcome, Sender, Stage, TERM, in_a_network, number, until};
 
 const ORDER: [&str; 6] = ["min_ns", "p50_ns", "p90_ns", "p99_ns", "p999_ns", "max_ns"];
 
@@ -89,7 +88,7 @@ fn ages_of_a_stream_are_split_and_judged() {
 
 #[test]
 fn of_a_remote_sensor_the_way_on_this_machine_is_known() {
-    in_a_network("of_a_remote_sensor_the_way_on_this_machine_is_known", || {
+    in_a_network("latency::of_a_remote_sensor_the_way_on_this_machine_is_known", || {
         let stage = Stage::new();
         let mut sender = Sender::new(0x5f3a_12bc_00d1_e2f3, 7, 3, "front");
         let publisher = ["listen", "--json", "--publish", "--name=robot1=5f3a12bc00d1e2f3"];
@@ -100,7 +99,7 @@ fn of_a_remote_sensor_the_way_on_this_machine_is_known() {
         until("it is attached", || stage.subscribers("robot1.front/zones") == 1);
         let zones = Zones { verdict: Verdict::Clear as u8, ..Zones::unknown() };
         let known = |line: &Value| line["class"] == "latency" && line["age"] != Value::Null;
-        sender.stamp_ns = stage::wall_ns() - 50_000_000;
+        sender.stamp_ns = testkit::wall_ns() - 50_000_000;
         let done = AtomicBool::new(false);
         let line = thread::scope(|scope| {
             // What comes before it says itself that it is attached is left out.
@@ -124,7 +123,7 @@ fn of_a_remote_sensor_the_way_on_this_machine_is_known() {
         assert!((1..=count(&line, "age")).contains(&count(&line, "network")), "{line}");
         assert_eq!(number(&line, "ahead"), 0, "{line}");
         // Its clock goes ahead of ours.
-        sender.stamp_ns = stage::wall_ns() + 3_600_000_000_000;
+        sender.stamp_ns = testkit::wall_ns() + 3_600_000_000_000;
         sender.send(Topic::Zones, &zones);
         let line = latency.await_line("clocks that differ", |line| line["ahead"] == 1);
         assert!(count(&line, "age") > count(&line, "network"), "{line}");

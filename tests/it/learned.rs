@@ -1,14 +1,13 @@
 //! What a hub has learned of its sensors' surroundings is there when the next one begins, also after a kill; and is not
 //! where it would be wrong: at another pose, where somebody said otherwise, in a recording.
 
-mod stage;
-
 use std::fs;
 use std::os::unix::fs::PermissionsExt;
 use std::path::PathBuf;
 
+use crate::testkit;
+use crate::testkit::{KILL, Outcome, Program, Stage, TERM, is_class, number};
 use serde_json::Value;
-use stage::{KILL, Outcome, Program, Stage, TERM, is_class, number};
 
 /// Whoever learns so soon is a first hub; whoever needs so long learns nothing in a test.
 const SOON: &str = "--set=background.scans=20";
@@ -54,7 +53,7 @@ fn look(stage: &Stage, flags: &[&str], look: impl FnOnce()) -> Outcome {
 
 /// The room as a first hub has learned and kept it.
 fn learn(stage: &Stage) {
-    look(stage, &[SOON], || stage::until("the room is learned", || taught(stage) > 350));
+    look(stage, &[SOON], || testkit::until("the room is learned", || taught(stage) > 350));
     assert!(file(stage).exists());
 }
 
@@ -64,7 +63,7 @@ fn who_comes_while_the_hub_is_away_is_foreground_at_once() {
         let stage = Stage::new();
         let room = simulator(&stage, ROOM);
         let hub = stage.hub(&[&stage.link("front"), SOON]);
-        stage::until("the room is learned and kept", || {
+        testkit::until("the room is learned and kept", || {
             let shown = shown(&stage);
             number(&shown, "taught") > 350 && shown["kept_wall_ns"].is_u64()
         });
@@ -137,7 +136,7 @@ fn what_does_not_fit_or_is_not_wanted_is_not_taken() {
         fs::write(file(&stage), content).expect("written");
         look(&stage, &flags, || {
             assert_eq!(stage.run(&["background", "front", "reset"]).code, Some(0));
-            stage::until("it is gone", || !file(&stage).exists());
+            testkit::until("it is gone", || !file(&stage).exists());
         });
     }
 }
@@ -146,7 +145,7 @@ fn what_does_not_fit_or_is_not_wanted_is_not_taken() {
 fn where_nothing_is_kept_nothing_is_written() {
     let stage = Stage::new();
     let simulator = simulator(&stage, ROOM);
-    let is_known = || stage::until("it is learned", || taught(&stage) > 350);
+    let is_known = || testkit::until("it is learned", || taught(&stage) > 350);
     look(&stage, &[SOON, "--set=background.keep=false"], || {
         is_known();
         assert!(shown(&stage)["kept_wall_ns"].is_null());
@@ -163,7 +162,7 @@ fn where_nothing_is_kept_nothing_is_written() {
         .collect();
     let log = stage.file("log", log);
     let is_played = |hub: Program, words: &str| {
-        stage::until("it is learned", || taught(&stage) == 181);
+        testkit::until("it is learned", || taught(&stage) == 181);
         assert!(shown(&stage)["kept_wall_ns"].is_null(), "{words}");
         hub.end(TERM);
         assert!(!file(&stage).exists(), "{words}");

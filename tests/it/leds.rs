@@ -1,7 +1,5 @@
 //! The lights: what a robot shows of its zones and marks, on a terminal and on diodes that a directory stands in for.
 
-mod stage;
-
 use std::fs;
 use std::io::Read;
 use std::path::PathBuf;
@@ -10,11 +8,13 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::thread;
 use std::time::Duration;
 
+use crate::testkit::{
+    INT, KILL, Program, Sender, Stage, TERM, in_a_network, is_class, number, terminal, until,
+};
 use rustix::process::Signal;
 use rustix::time::{ClockId, clock_gettime};
 use schema::{Topic, Verdict, Zones};
 use serde_json::Value;
-use stage::{INT, KILL, Program, Sender, Stage, TERM, in_a_network, is_class, number, terminal, until};
 
 /// The walls of a room, far from the sensor, and in it what `thing` says.
 fn world(stage: &Stage, name: &str, thing: &str) -> String {
@@ -215,7 +215,7 @@ fn now_ns() -> u64 {
 /// Each verdict said once: what stands for a moment and what is held is known to the test.
 #[test]
 fn a_worse_verdict_is_shown_at_once_and_a_better_one_only_when_it_has_stood() {
-    in_a_network("a_worse_verdict_is_shown_at_once_and_a_better_one_only_when_it_has_stood", || {
+    in_a_network("leds::a_worse_verdict_is_shown_at_once_and_a_better_one_only_when_it_has_stood", || {
         let stage = Stage::new();
         let mut front = Sender::new(1, 7, 0, "front");
         let mut listener =

@@ -1,18 +1,17 @@
 //! Many consumers, slow ones and dead ones: nobody else loses anything, everybody can tell exactly what was missed, and
 //! the hub is as it was before they came.
 
-mod stage;
-
 use std::fs;
 use std::thread;
 use std::time::Duration;
 
+use crate::testkit;
+use crate::testkit::{INT, KILL, Program, Stage, TERM, is_class, number, sequence, until};
 use clients::Attachment;
 use rustix::process::Signal;
 use schema::ipc::{self, Payload};
 use schema::{Domain, Scan, limits};
 use serde_json::Value;
-use stage::{INT, KILL, Program, Stage, TERM, is_class, number, sequence, until};
 
 /// What a consumer that is killed holds its samples of: the domain's name and where it is.
 const HOLD: [&str; 2] = ["SCANHUB_TEST_DOMAIN", "SCANHUB_TEST_BASE"];
@@ -130,13 +129,13 @@ fn killed_consumers_that_held_samples_leave_nothing() {
     let mut echo = stage.echo(&["front/scan"]);
     let descriptors = || fs::read_dir(format!("/proc/{}/fd", hub.pid())).expect("lives").count();
     let place = stage.place();
-    let segments = || stage::shared_memory(&place.prefix()).len();
+    let segments = || testkit::shared_memory(&place.prefix()).len();
     let (open_before, segments_before) = (descriptors(), segments());
     // Were their samples lost, the hub would have none left.
     const { assert!(KILLS * HELD * limits::BORROWED > limits::samples(schema::Topic::Scan)) };
     for _ in 0..KILLS {
-        let mut holder = std::process::Command::new(std::env::current_exe().expect("has a path"));
-        holder.args(["--exact", "killed_consumers_that_held_samples_leave_nothing", "--nocapture"]);
+        let mut holder = std::process::Command::new(testkit::own_program());
+        holder.args(testkit::only("limits_consumers::killed_consumers_that_held_samples_leave_nothing"));
         holder.env(HOLD[0], place.name()).env(HOLD[1], place.root().parent().expect("a base"));
         let mut holder = Program::start(holder);
         holder.await_text("holding");

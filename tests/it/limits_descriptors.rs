@@ -1,12 +1,10 @@
 //! Descriptors that are short: whoever cannot work says so and exits 75; a hub that runs out of them serves on whom it
 //! serves, and says that others get nothing.
 
-mod stage;
-
 use std::process::Command;
 
+use crate::testkit::{INT, Outcome, Program, Stage, TERM, in_a_network, is_class, number, sequence, until};
 use rustix::process::{Pid, Resource, Rlimit, getrlimit, prlimit};
-use stage::{INT, Outcome, Program, Stage, TERM, in_a_network, is_class, number, sequence, until};
 
 /// Starts the program with at most so many descriptors.
 fn limited<S: AsRef<str>>(stage: &Stage, limit: u64, arguments: &[S]) -> Program {
@@ -105,7 +103,7 @@ fn a_hub_that_runs_out_of_them_serves_on_whom_it_serves() {
 
 #[test]
 fn a_listener_that_runs_out_of_them_listens_on() {
-    in_a_network("a_listener_that_runs_out_of_them_listens_on", || {
+    in_a_network("limits_descriptors::a_listener_that_runs_out_of_them_listens_on", || {
         let stage = Stage::new();
         let mut listener = stage.start(&["listen", "--json", "--interface=lo"]).ready();
         let pid = Pid::from_raw(listener.pid() as i32);

@@ -2,15 +2,13 @@
 //! thousands of channels or links. Each is refused or read within 64 MB and a second, in the words and with the exit
 //! code of what is wrong.
 
-mod stage;
-
 use std::io::Write;
 use std::process::Command;
 
+use crate::testkit::{Outcome, Program, Stage};
 use flate2::Compression;
 use flate2::write::GzEncoder;
 use rustix::fs::{CWD, FileType, Mode, mknodat};
-use stage::{Outcome, Program, Stage};
 
 /// Runs the program with all its address space in 90 MB, of which some 23 are itself, and in two seconds of processor
 /// time, which a program that is not optimized needs for what takes a second.

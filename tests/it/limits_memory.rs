@@ -1,14 +1,12 @@
 //! Shared memory that is short, from the start or later on: a message and exit 75, never a bare signal; who is there
 //! already loses nothing. Each test has a /dev/shm of its own, in a mount namespace of its own.
 
-mod stage;
-
 use std::fs::{File, OpenOptions};
 use std::io::{ErrorKind, Write};
 use std::process::Command;
 
+use crate::testkit::{INT, Outcome, Stage, TERM, is_class, only, own_program, run_again, sequence};
 use rustix::process::Signal;
-use stage::{INT, Outcome, Stage, TERM, is_class, sequence};
 
 /// Where the namespace is made: the test that shall run in it.
 const INSIDE: &str = "SCANHUB_TEST_INSIDE";
@@ -18,7 +16,6 @@ fn in_a_namespace(name: &str, test: impl FnOnce()) {
     if std::env::var_os(INSIDE).is_some() {
         return test();
     }
-    let own = std::env::current_exe().expect("has a path");
     let mut unshare = Command::new("unshare");
     unshare.arg("--mount");
     if !rustix::process::getuid().is_root() {
@@ -31,8 +28,8 @@ fn in_a_namespace(name: &str, test: impl FnOnce()) {
         eprintln!("skipped: this user may not make a mount namespace");
         return;
     }
-    let status = unshare.arg(own).args(["--exact", name, "--nocapture"]).env(INSIDE, "1").status();
-    assert!(status.expect("unshare runs").success(), "failed in its namespace");
+    unshare.arg(own_program()).args(only(name)).env(INSIDE, "1");
+    run_again(name, unshare);
 }
 
 /// A new and empty /dev/shm of so many bytes.
@@ -80,7 +77,7 @@ fn done_or_short(outcome: &Outcome) {
 
 #[test]
 fn a_hub_starts_or_says_what_it_needs() {
-    in_a_namespace("a_hub_starts_or_says_what_it_needs", || {
+    in_a_namespace("limits_memory::a_hub_starts_or_says_what_it_needs", || {
         let stage = Stage::new();
         let run = ["run".to_owned(), "--json".to_owned(), stage.link("front")];
         let short = |bytes: u64| {
@@ -115,7 +112,7 @@ fn a_hub_starts_or_says_what_it_needs() {
 
 #[test]
 fn memory_that_is_full_stops_nobody_who_is_there() {
-    in_a_namespace("memory_that_is_full_stops_nobody_who_is_there", || {
+    in_a_namespace("limits_memory::memory_that_is_full_stops_nobody_who_is_there", || {
         mount(8 << 20);
         let stage = Stage::new();
         let _simulator = stage.simulator(&["front"], &["--seed=41", "--baud=500000"]);
@@ -155,7 +152,7 @@ fn memory_that_is_full_stops_nobody_who_is_there() {
 
 #[test]
 fn consumers_that_come_together_where_little_is_left_end_in_order() {
-    in_a_namespace("consumers_that_come_together_where_little_is_left_end_in_order", || {
+    in_a_namespace("limits_memory::consumers_that_come_together_where_little_is_left_end_in_order", || {
         mount(8 << 20);
         let stage = Stage::new();
         let hub = stage.hub(&[stage.link("front")]);

@@ -1,11 +1,9 @@
 //! One port and more than one who wants it: two hubs, and two links of one hub.
 
-mod stage;
-
 use std::fs;
 use std::os::unix::fs::symlink;
 
-use stage::{Outcome, Stage, TERM, until};
+use crate::testkit::{Outcome, Stage, TERM, until};
 
 fn error_of(outcome: &Outcome) -> serde_json::Value {
     let line = outcome.errors.lines().last().unwrap_or_else(|| panic!("{outcome}"));

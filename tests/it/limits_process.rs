@@ -1,14 +1,12 @@
 //! What the system allows a process, address space and the length of its files: who needs more says so and ends with 75,
 //! before it has made anything that would stay.
 
-mod stage;
-
 use std::io::{BufRead, BufReader};
 use std::path::PathBuf;
 use std::process::{Command, Stdio};
 
+use crate::testkit::{Outcome, Program, Stage, TERM};
 use rustix::process::{Pid, kill_process};
-use stage::{Outcome, Program, Stage, TERM};
 
 /// Starts the program with at most this, in the words of ulimit.
 fn limited<S: AsRef<str>>(stage: &Stage, limit: &str, arguments: &[S]) -> Program {

@@ -1,11 +1,9 @@
 //! A line that loses bytes: hub and clients say how much of the stream that costs, as the simulator has it.
 
-mod stage;
-
 use std::thread;
 use std::time::Duration;
 
-use stage::{INT, Stage, TERM, number};
+use crate::testkit::{INT, Stage, TERM, number};
 
 /// What the paper found on a line of theirs.
 const BURSTS: &str = "--fault=loss=0.00135,burst=1.89";

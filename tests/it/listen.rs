@@ -1,14 +1,15 @@
 //! `scanhub listen` against datagrams that the test sends: lines of every topic, the account of what did not come, and
 //! what is refused.
 
-mod stage;
-
 use std::io::Read;
 
+use crate::testkit;
+use crate::testkit::{
+    INT, Outcome, Program, Sender, Stage, in_a_network, is_class, number, terminal, until, wall_ns,
+};
 use schema::datagram::{HEAD, Refusal, WINDOW};
 use schema::{Background, Foreground, Mark, Marks, Scan, State, Status, Topic, Verdict, Zones};
 use serde_json::{Value, json};
-use stage::{INT, Outcome, Program, Sender, Stage, in_a_network, is_class, number, terminal, until, wall_ns};
 
 const HUB: u64 = 0x5f3a_12bc_00d1_e2f3;
 
@@ -34,7 +35,7 @@ fn account(outcome: &Outcome, epoch: u32, topic: &str) -> [u64; 4] {
     let lines = outcome.of_class("lan");
     let found: Vec<_> = lines.iter().filter(|it| it["epoch"] == epoch && it["topic"] == topic).collect();
     let [line] = found[..] else { panic!("not one line of {topic}: {outcome}") };
-    ["received", "lost", "duplicate", "reordered"].map(|key| stage::number(line, key))
+    ["received", "lost", "duplicate", "reordered"].map(|key| testkit::number(line, key))
 }
 
 fn refused(outcome: &Outcome) -> Value {
@@ -45,7 +46,7 @@ fn refused(outcome: &Outcome) -> Value {
 
 #[test]
 fn every_topic_is_a_line() {
-    in_a_network("every_topic_is_a_line", || {
+    in_a_network("listen::every_topic_is_a_line", || {
         let stage = Stage::new();
         let mut program = listener(&stage, &[]);
         let mut sender = Sender::new(HUB, 7, 2, "front");
@@ -107,7 +108,7 @@ fn every_topic_is_a_line() {
 
 #[test]
 fn people_read_lines_too() {
-    in_a_network("people_read_lines_too", || {
+    in_a_network("listen::people_read_lines_too", || {
         let stage = Stage::new();
         let words = ["listen", "--interface=lo", "--topic=zones", "--name=robot1=5f3a12bc00d1e2f3", "-n2"];
         let program = stage.start(&words);
@@ -159,7 +160,7 @@ fn ip(words: &str) -> bool {
 
 #[test]
 fn on_a_terminal_the_account_is_drawn_over_itself() {
-    in_a_network("on_a_terminal_the_account_is_drawn_over_itself", || {
+    in_a_network("listen::on_a_terminal_the_account_is_drawn_over_itself", || {
         let stage = Stage::new();
         let (mut keys, screen) = terminal();
         let mut command = stage.command(&["listen", "--stats", "--interface=lo"]);
@@ -186,7 +187,7 @@ fn on_a_terminal_the_account_is_drawn_over_itself() {
 
 #[test]
 fn groups_are_joined_where_a_link_comes_or_comes_back() {
-    in_a_network("groups_are_joined_where_a_link_comes_or_comes_back", || {
+    in_a_network("listen::groups_are_joined_where_a_link_comes_or_comes_back", || {
         let make = || ip("link add scan0 type veth peer name far0") && ip("addr add 10.9.0.1/24 dev scan0");
         if !make() {
             eprintln!("skipped: the kernel makes no pair of interfaces");
@@ -211,7 +212,7 @@ fn groups_are_joined_where_a_link_comes_or_comes_back() {
 
 #[test]
 fn the_account_is_exact() {
-    in_a_network("the_account_is_exact", || {
+    in_a_network("listen::the_account_is_exact", || {
         let stage = Stage::new();
         let mut program = listener(&stage, &["--topic=zones", "--topic=scan"]);
         let mut sender = Sender::new(HUB, 7, 0, "front");
@@ -244,7 +245,7 @@ fn the_account_is_exact() {
         assert_eq!(late, [20, 40]);
         let missed = |topic: &str| -> u64 {
             let notices = outcome.of_class("notice").into_iter().filter(|line| line["topic"] == topic);
-            notices.map(|line| stage::number(&line, "missed")).sum()
+            notices.map(|line| testkit::number(&line, "missed")).sum()
         };
         // When the next one came, 20 and 40 were missing.
         assert_eq!((missed("zones"), missed("scan")), (5, 2));
@@ -253,7 +254,7 @@ fn the_account_is_exact() {
 
 #[test]
 fn a_gateway_that_starts_again_and_a_second_hub_are_told_apart() {
-    in_a_network("a_gateway_that_starts_again_and_a_second_hub_are_told_apart", || {
+    in_a_network("listen::a_gateway_that_starts_again_and_a_second_hub_are_told_apart", || {
         let stage = Stage::new();
         let mut program = listener(&stage, &["--topic=zones"]);
         let mut first = Sender::new(HUB, 7, 0, "front");
@@ -283,7 +284,7 @@ fn a_gateway_that_starts_again_and_a_second_hub_are_told_apart() {
 
 #[test]
 fn a_gateway_that_starts_ever_again_stays_heard_and_accounted_for() {
-    in_a_network("a_gateway_that_starts_ever_again_stays_heard_and_accounted_for", || {
+    in_a_network("listen::a_gateway_that_starts_ever_again_stays_heard_and_accounted_for", || {
         const LIVES: u64 = 90;
         let stage = Stage::new();
         let mut program = listener(&stage, &["--topic=zones"]);
@@ -310,7 +311,7 @@ fn a_gateway_that_starts_ever_again_stays_heard_and_accounted_for() {
 
 #[test]
 fn each_refusal_has_its_reason() {
-    in_a_network("each_refusal_has_its_reason", || {
+    in_a_network("listen::each_refusal_has_its_reason", || {
         let stage = Stage::new();
         let mut program = listener(&stage, &["--topic=zones"]);
         let mut sender = Sender::new(HUB, 7, 0, "front");
@@ -363,7 +364,7 @@ fn each_refusal_has_its_reason() {
 
 #[test]
 fn two_gateways_with_one_number_are_told_once() {
-    in_a_network("two_gateways_with_one_number_are_told_once", || {
+    in_a_network("listen::two_gateways_with_one_number_are_told_once", || {
         let stage = Stage::new();
         let mut program = listener(&stage, &["--topic=zones", "--stats"]);
         // Of the later life first: all of the earlier one are refused.

@@ -1,13 +1,11 @@
 //! `scanhub listen` where more is sent than there is room for, as when somebody invents gateways and sensors: what is known
 //! to deliver stays, a true one that comes later is heard at once, and the log says what happened without a line for each.
 
-mod stage;
-
 use std::time::{Duration, Instant};
 
+use crate::testkit::{INT, Outcome, Program, Sender, Stage, in_a_network, is_class, number};
 use schema::{State, Status, Topic, Verdict, Zones};
 use serde_json::{Value, json};
-use stage::{INT, Outcome, Program, Sender, Stage, in_a_network, is_class, number};
 
 const HUB: u64 = 0x5f3a_12bc_00d1_e2f3;
 const NAME: &str = "--name=robot1=5f3a12bc00d1e2f3";
@@ -42,7 +40,7 @@ fn zones_row(outcome: &Outcome, hub: &str) -> Value {
 
 #[test]
 fn a_true_gateway_is_heard_at_once_after_64_invented_ones() {
-    in_a_network("a_true_gateway_is_heard_at_once_after_64_invented_ones", || {
+    in_a_network("listen_crowd::a_true_gateway_is_heard_at_once_after_64_invented_ones", || {
         let stage = Stage::new();
         for (what, is_delivered) in [("announce", false), ("announce and deliver", true)] {
             let mut program = stage.start(&["listen", "--json", "--topic=zones", NAME]).ready();
@@ -80,7 +78,7 @@ fn a_true_gateway_is_heard_at_once_after_64_invented_ones() {
 
 #[test]
 fn a_flood_of_invented_gateways_puts_out_none_that_delivers() {
-    in_a_network("a_flood_of_invented_gateways_puts_out_none_that_delivers", || {
+    in_a_network("listen_crowd::a_flood_of_invented_gateways_puts_out_none_that_delivers", || {
         let stage = Stage::new();
         let mut program = stage.start(&["listen", "--json", "--topic=zones", NAME]).ready();
         let mut sender = Sender::new(HUB, 7, 0, "front");
@@ -130,7 +128,7 @@ fn until_published(stage: &Stage, program: &mut Program) -> (Duration, Sender) {
 
 #[test]
 fn a_true_sensor_is_published_at_once_after_16_invented_ones() {
-    in_a_network("a_true_sensor_is_published_at_once_after_16_invented_ones", || {
+    in_a_network("listen_crowd::a_true_sensor_is_published_at_once_after_16_invented_ones", || {
         let stage = Stage::new();
         for (what, is_delivered) in [("announced", false), ("announced and delivered", true)] {
             let mut program = publisher(&stage);
@@ -156,7 +154,7 @@ fn a_true_sensor_is_published_at_once_after_16_invented_ones() {
 
 #[test]
 fn a_published_sensor_that_delivers_is_not_put_out() {
-    in_a_network("a_published_sensor_that_delivers_is_not_put_out", || {
+    in_a_network("listen_crowd::a_published_sensor_that_delivers_is_not_put_out", || {
         let stage = Stage::new();
         let mut program = publisher(&stage);
         let (_, mut sender) = until_published(&stage, &mut program);
@@ -184,20 +182,23 @@ fn a_published_sensor_that_delivers_is_not_put_out() {
 
 #[test]
 fn who_follows_a_sensor_that_was_put_out_is_told_and_goes_on_when_it_is_back() {
-    in_a_network("who_follows_a_sensor_that_was_put_out_is_told_and_goes_on_when_it_is_back", || {
-        let stage = Stage::new();
-        let mut program = publisher(&stage);
-        let (_, mut sender) = until_published(&stage, &mut program);
-        let mut echo = stage.echo(&["robot1.front/zones"]);
-        let mut others: Vec<_> = (0..16).map(|n| Sender::new(0xab, 7, n, &format!("s{n}"))).collect();
-        others.iter_mut().for_each(deliver);
-        program.await_line("the last one", |line| line["sensor"] == "00000000000000ab.s15");
-        echo.await_line("nothing is known any more", |line| line["verdict"] == "unknown");
-        deliver(&mut sender);
-        program.await_line("it is back", |line| line["sensor"] == "robot1.front");
-        sender.send(Topic::Zones, &zones(Verdict::Stop));
-        echo.await_line("it is followed", |line| is_class("zones")(line) && line["verdict"] == "stop");
-        drop((echo.end(INT), program.end(INT)));
-        assert!(stage.left_behind().is_empty(), "{:?}", stage.left_behind());
-    });
+    in_a_network(
+        "listen_crowd::who_follows_a_sensor_that_was_put_out_is_told_and_goes_on_when_it_is_back",
+        || {
+            let stage = Stage::new();
+            let mut program = publisher(&stage);
+            let (_, mut sender) = until_published(&stage, &mut program);
+            let mut echo = stage.echo(&["robot1.front/zones"]);
+            let mut others: Vec<_> = (0..16).map(|n| Sender::new(0xab, 7, n, &format!("s{n}"))).collect();
+            others.iter_mut().for_each(deliver);
+            program.await_line("the last one", |line| line["sensor"] == "00000000000000ab.s15");
+            echo.await_line("nothing is known any more", |line| line["verdict"] == "unknown");
+            deliver(&mut sender);
+            program.await_line("it is back", |line| line["sensor"] == "robot1.front");
+            sender.send(Topic::Zones, &zones(Verdict::Stop));
+            echo.await_line("it is followed", |line| is_class("zones")(line) && line["verdict"] == "stop");
+            drop((echo.end(INT), program.end(INT)));
+            assert!(stage.left_behind().is_empty(), "{:?}", stage.left_behind());
+        },
+    );
 }

@@ -1,11 +1,9 @@
 //! `scanhub listen` against what nobody should send: damaged datagrams of every kind, and words that make no sense.
 
-mod stage;
-
+use crate::testkit::{INT, Program, Sender, Stage, in_a_network, number};
 use schema::datagram::{HEAD, Head, MTU_ETHERNET, Packed, Refusal};
 use schema::{Foreground, Marks, Scan, Status, Topic, Verdict, Zones};
 use serde_json::Value;
-use stage::{INT, Program, Sender, Stage, in_a_network, number};
 
 const DAMAGED: u64 = 100_000;
 
@@ -34,7 +32,7 @@ fn whole(sender: &mut Sender) -> Vec<Vec<u8>> {
 
 #[test]
 fn nothing_damaged_is_accepted_and_memory_stays_flat() {
-    in_a_network("nothing_damaged_is_accepted_and_memory_stays_flat", || {
+    in_a_network("listen_hostile::nothing_damaged_is_accepted_and_memory_stays_flat", || {
         let stage = Stage::new();
         let mut program = stage.start(&["listen", "--json", "--topic=zones"]).ready();
         let mut sender = Sender::new(0xabcd, 7, 0, "front");
@@ -88,7 +86,7 @@ fn nothing_damaged_is_accepted_and_memory_stays_flat() {
 /// Whoever sends may seal what it likes: nonsense with a right checksum.
 #[test]
 fn sealed_nonsense_neither_ends_it_nor_fills_memory() {
-    in_a_network("sealed_nonsense_neither_ends_it_nor_fills_memory", || {
+    in_a_network("listen_hostile::sealed_nonsense_neither_ends_it_nor_fills_memory", || {
         let stage = Stage::new();
         let words = ["listen", "--json", "--publish", "--timeout=20s"];
         let mut program = stage.start(&words).ready();
@@ -169,7 +167,7 @@ fn words_that_make_no_sense_have_a_remedy() {
 
 #[test]
 fn bounds_that_are_not_reached_are_told() {
-    in_a_network("bounds_that_are_not_reached_are_told", || {
+    in_a_network("listen_hostile::bounds_that_are_not_reached_are_told", || {
         let stage = Stage::new();
         for words in [&["--timeout=100ms"][..], &["-n5", "--for=100ms"]] {
             let outcome = stage.run(&[&["listen", "--json"], words].concat());

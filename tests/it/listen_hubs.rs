@@ -1,11 +1,9 @@
 //! `scanhub listen --hub`: whom it hears where there are many, that it says which gateway is on its own machine,
 //! and the account when it is asked.
 
-mod stage;
-
+use crate::testkit::{INT, Robot, Sender, Stage, USR1, in_a_network, is_class, number};
 use schema::{Topic, Verdict, Zones};
 use serde_json::json;
-use stage::{INT, Robot, Sender, Stage, USR1, in_a_network, is_class, number};
 
 const HUB: u64 = 0x5f3a_12bc_00d1_e2f3;
 
@@ -24,7 +22,7 @@ fn crowd() {
 
 #[test]
 fn a_hub_that_is_named_is_heard_in_a_crowd() {
-    in_a_network("a_hub_that_is_named_is_heard_in_a_crowd", || {
+    in_a_network("listen_hubs::a_hub_that_is_named_is_heard_in_a_crowd", || {
         let stage = Stage::new();
         let name = "--name=robot1=5f3a12bc00d1e2f3";
         let words = ["listen", "--json", "--topic=zones", name, "--hub=robot1", "--hub=00000000000000ab"];
@@ -52,7 +50,7 @@ fn a_hub_that_is_named_is_heard_in_a_crowd() {
 
 #[test]
 fn hubs_that_are_not_named_are_not_published() {
-    in_a_network("hubs_that_are_not_named_are_not_published", || {
+    in_a_network("listen_hubs::hubs_that_are_not_named_are_not_published", || {
         let stage = Stage::new();
         let words = ["listen", "--json", "--publish", "--hub=5f3a12bc00d1e2f3"];
         let mut program = stage.start(&words).ready();
@@ -68,7 +66,7 @@ fn hubs_that_are_not_named_are_not_published() {
 
 #[test]
 fn a_gateway_on_another_machine_is_not_called_this_one_s() {
-    in_a_network("a_gateway_on_another_machine_is_not_called_this_one_s", || {
+    in_a_network("listen_hubs::a_gateway_on_another_machine_is_not_called_this_one_s", || {
         let robot = Robot::new(&["front"]);
         let stage = Stage::new();
         let mut listener = stage.start(&["listen", "--json", "--publish"]).ready();
@@ -82,7 +80,7 @@ fn a_gateway_on_another_machine_is_not_called_this_one_s() {
 
 #[test]
 fn a_signal_asks_for_the_account_so_far() {
-    in_a_network("a_signal_asks_for_the_account_so_far", || {
+    in_a_network("listen_hubs::a_signal_asks_for_the_account_so_far", || {
         let stage = Stage::new();
         let mut program = stage.start(&["listen", "--json"]).ready();
         let mut sender = Sender::new(HUB, 7, 0, "front");

@@ -1,13 +1,11 @@
 //! `scanhub listen` and links that go away for a moment: what the switch behind them hears, which filters by group and
 //! forgets who was there.
 
-mod stage;
-
 use std::collections::BTreeSet;
 use std::os::fd::OwnedFd;
 
+use crate::testkit::{INT, Machine, Stage, command_in, in_a_network, ip, until};
 use rustix::net::{AddressFamily, RecvFlags, SocketFlags, SocketType, eth, recv, socket_with};
-use stage::{INT, Machine, Stage, command_in, in_a_network, ip, until};
 
 /// What comes to the network of the test of IGMP, version 2.
 struct Switch {
@@ -56,7 +54,7 @@ fn message(packet: &[u8]) -> Option<(u8, u8)> {
 
 #[test]
 fn a_link_that_is_away_for_a_moment_is_joined_again() {
-    in_a_network("a_link_that_is_away_for_a_moment_is_joined_again", || {
+    in_a_network("listen_links::a_link_that_is_away_for_a_moment_is_joined_again", || {
         let machine = Machine::new(1);
         if !speaks_version_2(&machine, "eth0") {
             return;
@@ -83,7 +81,7 @@ fn a_link_that_is_away_for_a_moment_is_joined_again() {
 
 #[test]
 fn an_interface_that_is_made_anew_is_heard_as_often_as_that_happens() {
-    in_a_network("an_interface_that_is_made_anew_is_heard_as_often_as_that_happens", || {
+    in_a_network("listen_links::an_interface_that_is_made_anew_is_heard_as_often_as_that_happens", || {
         let machine = Machine::new(1);
         if !speaks_version_2(&machine, "default") {
             return;

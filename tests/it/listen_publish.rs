@@ -1,13 +1,11 @@
 //! `scanhub listen --publish`: remote sensors as local ones, for every verb that follows, through loss, restarts and
 //! kills.
 
-mod stage;
-
+use crate::testkit::{INT, KILL, Program, Sender, Stage, TERM, in_a_network, number, until};
 use rustix::process::{Pid, Resource, Rlimit, getrlimit, prlimit};
 use schema::datagram::Announce;
 use schema::{Marks, Scan, State, Status, Topic, Verdict, Zones};
 use serde_json::{Value, json};
-use stage::{INT, KILL, Program, Sender, Stage, TERM, in_a_network, number, until};
 
 const HUB: u64 = 0x5f3a_12bc_00d1_e2f3;
 const FRONT: &str = "robot1.front";
@@ -38,7 +36,7 @@ fn zones(verdict: Verdict) -> Zones {
 
 #[test]
 fn a_remote_sensor_is_as_a_local_one() {
-    in_a_network("a_remote_sensor_is_as_a_local_one", || {
+    in_a_network("listen_publish::a_remote_sensor_is_as_a_local_one", || {
         let stage = Stage::new();
         let mut sender = Sender::new(HUB, 7, 3, "front");
         let program = published(&stage, &mut sender);
@@ -107,7 +105,7 @@ fn a_remote_sensor_is_as_a_local_one() {
 
 #[test]
 fn consumers_outlive_the_listener_and_see_what_they_missed() {
-    in_a_network("consumers_outlive_the_listener_and_see_what_they_missed", || {
+    in_a_network("listen_publish::consumers_outlive_the_listener_and_see_what_they_missed", || {
         let stage = Stage::new();
         let mut sender = Sender::new(HUB, 7, 0, "front");
         let first = published(&stage, &mut sender);
@@ -132,7 +130,7 @@ fn consumers_outlive_the_listener_and_see_what_they_missed() {
 
 #[test]
 fn gateways_and_hubs_that_start_again_are_followed() {
-    in_a_network("gateways_and_hubs_that_start_again_are_followed", || {
+    in_a_network("listen_publish::gateways_and_hubs_that_start_again_are_followed", || {
         let stage = Stage::new();
         let mut sender = Sender::new(HUB, 7, 0, "front");
         let program = published(&stage, &mut sender);
@@ -165,7 +163,7 @@ fn gateways_and_hubs_that_start_again_are_followed() {
 
 #[test]
 fn a_hub_and_two_remote_ones_live_in_one_domain() {
-    in_a_network("a_hub_and_two_remote_ones_live_in_one_domain", || {
+    in_a_network("listen_publish::a_hub_and_two_remote_ones_live_in_one_domain", || {
         let stage = Stage::new();
         let _simulator = stage.simulator(&["front"], &["--seed=61", "--baud=500000"]);
         let mut one = Sender::new(HUB, 7, 0, "front");
@@ -215,7 +213,7 @@ fn a_hub_and_two_remote_ones_live_in_one_domain() {
 
 #[test]
 fn what_a_gateway_sends_comes_back_once() {
-    in_a_network("what_a_gateway_sends_comes_back_once", || {
+    in_a_network("listen_publish::what_a_gateway_sends_comes_back_once", || {
         let stage = Stage::new();
         let _simulator = stage.simulator(&["front"], &["--seed=62", "--baud=500000"]);
         let mut listener = stage.start(&["listen", "--json", "--publish", "--interface=lo"]).ready();
@@ -249,7 +247,7 @@ fn what_a_gateway_sends_comes_back_once() {
 
 #[test]
 fn a_number_that_another_sensor_has_is_its_own() {
-    in_a_network("a_number_that_another_sensor_has_is_its_own", || {
+    in_a_network("listen_publish::a_number_that_another_sensor_has_is_its_own", || {
         let stage = Stage::new();
         let mut sender = Sender::new(HUB, 7, 0, "front");
         let mut program = published(&stage, &mut sender);
@@ -289,7 +287,7 @@ fn a_number_that_another_sensor_has_is_its_own() {
 
 #[test]
 fn a_hub_that_numbers_its_sensors_otherwise_keeps_them_apart() {
-    in_a_network("a_hub_that_numbers_its_sensors_otherwise_keeps_them_apart", || {
+    in_a_network("listen_publish::a_hub_that_numbers_its_sensors_otherwise_keeps_them_apart", || {
         let stage = Stage::new();
         let _simulator = stage.simulator(&["front", "rear"], &["--seed=63", "--baud=500000"]);
         let mut listener = stage.start(&["listen", "--json", "--publish", "--interface=lo"]).ready();
@@ -334,7 +332,7 @@ fn publisher_refused(stage: &Stage) -> String {
 
 #[test]
 fn what_has_no_room_is_counted_as_such() {
-    in_a_network("what_has_no_room_is_counted_as_such", || {
+    in_a_network("listen_publish::what_has_no_room_is_counted_as_such", || {
         let stage = Stage::new();
         let mut front = Sender::new(HUB, 7, 3, "front");
         let mut program = publisher(&stage);
@@ -365,7 +363,7 @@ fn what_has_no_room_is_counted_as_such() {
 
 #[test]
 fn there_is_room_for_sixteen_sensors() {
-    in_a_network("there_is_room_for_sixteen_sensors", || {
+    in_a_network("listen_publish::there_is_room_for_sixteen_sensors", || {
         let stage = Stage::new();
         let mut program = publisher(&stage);
         let mut senders: Vec<_> =

@@ -1,12 +1,10 @@
 //! Two machines with one state directory, as after a disk was copied, whose gateways begin in one epoch: they send under one
 //! number. Who listens hears one of them and is told, and no sample of the other one is ever taken for the first one's.
 
-mod stage;
-
 use std::time::{Duration, Instant};
 
+use crate::testkit::{INT, Machine, Outcome, Program, Stage, TERM, in_a_network, is_class, number};
 use serde_json::{Value, json};
-use stage::{INT, Machine, Outcome, Program, Stage, TERM, in_a_network, is_class, number};
 
 /// A machine with a hub, whose sensor has so many beams, and what it keeps of its gateway.
 struct Robot {
@@ -57,7 +55,7 @@ fn beams(outcome: &Outcome) -> Vec<usize> {
 
 #[test]
 fn two_machines_with_one_state_directory_are_told_and_never_mixed() {
-    in_a_network("two_machines_with_one_state_directory_are_told_and_never_mixed", || {
+    in_a_network("listen_twins::two_machines_with_one_state_directory_are_told_and_never_mixed", || {
         let (one, other) = (Robot::new(1, 361), Robot::new(2, 181));
         // Here both cables are plugged in.
         let stage = Stage::new();

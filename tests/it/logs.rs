@@ -1,10 +1,8 @@
 //! CARMEN logs through the program: each range and each code of a log reaches a consumer, from the log itself and from
 //! what it was converted to.
 
-mod stage;
-
+use crate::testkit::{INT, Outcome, Stage, number};
 use serde_json::{Value, json};
-use stage::{INT, Outcome, Stage, number};
 
 /// A log of scans `period_ms` apart, each of which has these ranges first.
 fn log(stage: &Stage, ranges: &[&str], scans: u64, period_ms: u64) -> String {

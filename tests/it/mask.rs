@@ -1,8 +1,7 @@
 //! A robot that sees itself: it stops for its own post until it is told to look past it.
 
-mod stage;
-
-use stage::{INT, KILL, Program, Stage, TERM, is_class};
+use crate::testkit;
+use crate::testkit::{INT, KILL, Program, Stage, TERM, is_class};
 
 /// A room of six metres, and 0.4 m before the sensor what `thing` says.
 fn world(stage: &Stage, thing: &str) -> String {
@@ -136,10 +135,10 @@ fn too_little_to_learn_from_is_refused() {
 
     // Interrupted, and left alone by the hub.
     let looking = stage.start(&["zones", "front", "mask", "--for=1h", "--json"]);
-    stage::until("it looks", || stage.subscribers("front/scan") == 1);
+    testkit::until("it looks", || stage.subscribers("front/scan") == 1);
     assert_eq!(looking.end(INT).code, Some(130));
     let looking = stage.start(&["zones", "front", "mask", "--for=1h", "--json"]);
-    stage::until("it looks", || stage.subscribers("front/scan") == 1);
+    testkit::until("it looks", || stage.subscribers("front/scan") == 1);
     drop(hub.end(KILL));
     let left = looking.wait();
     assert_eq!(left.code, Some(1), "{left}");

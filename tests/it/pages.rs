@@ -2,25 +2,17 @@
 //! nothing, of sensors that measure in mm and in cm; lines for the shell run; configurations and worlds are read. What cannot
 //! be run is named here, with the reason.
 
-#[path = "pages/blocks.rs"]
 mod blocks;
-#[path = "client_c/installed.rs"]
-mod installed;
-#[path = "pages/lines.rs"]
 mod lines;
-#[path = "pages/program.rs"]
 mod program;
-#[path = "pages/said.rs"]
 mod said;
-#[path = "pages/shell.rs"]
 mod shell;
-mod stage;
 
+use crate::testkit::{Outcome, Program, Stage, TERM, until};
 use blocks::{Block, blocks};
 use clients::Attachment;
 use program::Example;
 use schema::Scan;
-use stage::{Outcome, Program, Stage, TERM, until};
 
 /// A room, and a sensor in it.
 #[derive(Clone, Copy, Debug)]

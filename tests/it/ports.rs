@@ -1,13 +1,11 @@
 //! The ways in which a port cannot be used: each has its exit code, its message and its remedy.
 
-mod stage;
-
 use std::os::unix::fs::{PermissionsExt, chown, symlink};
 use std::os::unix::process::CommandExt;
 
+use crate::testkit::{Line, Program, Stage, TERM, until};
 use rustix::process::geteuid;
 use serde_json::Value;
-use stage::{Line, Program, Stage, TERM, until};
 
 /// Whoever is not root and owns nothing.
 const NOBODY: u32 = 65534;

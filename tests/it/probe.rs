@@ -1,9 +1,8 @@
 //! `scanhub probe`, as somebody runs it: it tells what is there, and leaves it as it was.
 
-mod stage;
-
+use crate::testkit;
+use crate::testkit::{INT, Stage, TERM, number};
 use serde_json::Value;
-use stage::{INT, Stage, TERM, number};
 
 #[test]
 fn a_sensor_tells_of_itself_and_is_left_as_it_was() {
@@ -56,11 +55,11 @@ fn a_stream_goes_on() {
     // A hub that is killed leaves its sensor streaming.
     let hub = stage.hub(&[stage.link("front")]);
     stage.await_info("front", |info| info["state"] == "streaming");
-    hub.end(stage::KILL);
+    hub.end(testkit::KILL);
     let found = stage.run(&["probe", &stage.word("front"), "--json"]);
     assert_eq!((found.code, number(&found.lines()[0], "operating_mode")), (Some(0), 0x24), "{found}");
     let sent = stage.truth("front").len();
-    stage::until("it streams on", || stage.truth("front").len() > sent + 20);
+    testkit::until("it streams on", || stage.truth("front").len() > sent + 20);
     assert_eq!(simulator.end(TERM).code, Some(0));
     assert_eq!(stage.simulated("front").1, 0);
 }
@@ -90,8 +89,8 @@ fn an_interrupt_ends_it() {
     let _simulator = stage.simulator(&["front"], &["--fault=mute=1"]);
     let mut probe = stage.command(&["probe", &stage.word("front"), "--json"]);
     probe.env("SCANHUB_LOG", "off");
-    let program = stage::Program::start(probe);
-    stage::until("it has the port", || {
+    let program = testkit::Program::start(probe);
+    testkit::until("it has the port", || {
         let device = stage.path("front").canonicalize().unwrap();
         let open = std::fs::read_dir(format!("/proc/{}/fd", program.pid())).into_iter().flatten().flatten();
         open.filter_map(|fd| std::fs::read_link(fd.path()).ok()).any(|target| target == device)

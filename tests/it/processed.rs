@@ -1,10 +1,9 @@
 //! What the hub makes of scans, from a line to consumers: marks, zones, foreground and background with each scan, the one
 //! `unknown` when scans stay out, and what users may ask of the background.
 
-mod stage;
-
+use crate::testkit;
+use crate::testkit::{INT, Outcome, Stage, TERM, is_class, number, sequence, until};
 use serde_json::Value;
-use stage::{INT, Outcome, Stage, TERM, is_class, number, sequence, until};
 
 const STREAM: [&str; 2] = ["--seed=51", "--baud=500000"];
 
@@ -228,7 +227,7 @@ fn a_background_with_every_scan_or_none_at_all() {
 #[test]
 fn a_recording_is_processed_too_and_its_background_can_be_asked_for() {
     let stage = Stage::new();
-    let scans: Vec<u8> = (0..4000).flat_map(stage::scan).collect();
+    let scans: Vec<u8> = (0..4000).flat_map(testkit::scan).collect();
     let file = stage.file("scans", scans);
     let _hub = stage.hub(&["--link", &format!("front=file:{file}")]);
     let mut zones = stage.echo(&["front/zones"]);

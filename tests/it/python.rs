@@ -1,18 +1,16 @@
 //! The Python package beside a hub: its scripts check themselves what only Python can see, and what they follow is compared
 //! with what `echo` says. Skips, saying so, where there is no Python with iceoryx2 and numpy.
 
-mod stage;
-
 use std::collections::BTreeMap;
 use std::io::Write;
 use std::path::Path;
 use std::process::Command;
 
-use schema::{Topic, Verdict, Zones};
-use serde_json::{Value, json};
-use stage::{
+use crate::testkit::{
     INT, KILL, Outcome, Program, Sender, Stage, TERM, in_a_network, is_class, number, python, until,
 };
+use schema::{Topic, Verdict, Zones};
+use serde_json::{Value, json};
 
 /// A script of the package's tests, if there is a Python for it.
 fn check(name: &str) -> Option<Command> {
@@ -237,7 +235,7 @@ fn a_robot_is_as_unknown_as_its_worst_sensor() {
 
 #[test]
 fn without_a_hub_the_robot_is_of_the_sensors_of_other_machines() {
-    in_a_network("without_a_hub_the_robot_is_of_the_sensors_of_other_machines", || {
+    in_a_network("python::without_a_hub_the_robot_is_of_the_sensors_of_other_machines", || {
         let stage = Stage::new();
         let Some(command) = check_on(&stage, "robot") else { return };
         let mut listener =

@@ -1,10 +1,10 @@
 //! A port that goes away and comes back under its name while the hub and its consumers run on.
 
-mod stage;
-
+use crate::testkit::{
+    INT, Line, Program, Stage, TERM, bytes_of, hash, is_class, is_there, number, scan, sequence,
+};
 use rustix::fs::{FlockOperation, flock};
 use serde_json::Value;
-use stage::{INT, Line, Program, Stage, TERM, bytes_of, hash, is_class, is_there, number, scan, sequence};
 
 #[test]
 fn a_sensor_that_goes_and_comes_back() {

@@ -1,14 +1,13 @@
 //! `scanhub record`: everything that the hub published while it ran is in the file, however it was ended, and others read it.
 
-mod stage;
-
 use std::collections::{BTreeMap, BTreeSet, HashSet};
 use std::path::Path;
 
-use serde_json::Value;
-use stage::{
+use crate::testkit;
+use crate::testkit::{
     HUP, INT, KILL, Kept, Outcome, Program, Recording, Stage, TERM, hash, is_class, number, python, unbroken,
 };
+use serde_json::Value;
 
 /// Two sensors that stream.
 fn sensors(stage: &Stage, flags: &[&str]) -> [Program; 2] {
@@ -132,7 +131,7 @@ fn a_kill_leaves_all_that_was_told() {
     assert!(recording.kept.len() as u64 >= number(&told, "samples"), "{told}: {}", recording.kept.len());
     unbroken(&recording.of("front/telegram"));
     let Some(mut python) = python("mcap") else { return };
-    python.args(["tests/stage/read.py", "left", &stage.word("walk.mcap")]);
+    python.args(["tests/testkit/read.py", "left", &stage.word("walk.mcap")]);
     assert_eq!(said(python)["messages"], recording.kept.len());
 }
 
@@ -154,7 +153,7 @@ fn a_hub_that_comes_back_goes_on_in_the_file() {
     let other = stage.hub(&[stage.link("front"), stage.link("rear").replace("rear=", "back=")]);
     recorder.await_line("hub_back", |line| line["kind"] == "hub_back");
     stage.await_info("back", |info| info["state"] == "streaming");
-    stage::until("the new sensor is recorded", || stage.subscribers("back/telegram") > 0);
+    testkit::until("the new sensor is recorded", || stage.subscribers("back/telegram") > 0);
     let before = number(&await_samples(&mut recorder, 1), "samples");
     await_samples(&mut recorder, before + 200);
     recorded(&recorder.end(TERM));

@@ -1,8 +1,6 @@
 //! `scanhub record` on disks that are full, gone, slow or too small: no live topic loses a sample to them, what can be held
 //! is not lost either, and what is missing is said and seen in the file.
 
-mod stage;
-
 use std::collections::BTreeMap;
 use std::fs;
 use std::io::{self, Read};
@@ -11,8 +9,10 @@ use std::process::{Command, Stdio};
 use std::thread;
 use std::time::{Duration, Instant};
 
+use crate::testkit::{
+    INT, Kept, Outcome, Program, Recording, Stage, is_class, number, scan, unbroken, until,
+};
 use serde_json::Value;
-use stage::{INT, Kept, Outcome, Program, Recording, Stage, is_class, number, scan, unbroken, until};
 
 /// A sensor that streams.
 fn sensor(stage: &Stage) -> [Program; 2] {

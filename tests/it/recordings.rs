@@ -1,13 +1,12 @@
 //! A hub whose sensor is a recording: every telegram of it is published once and in order, whatever lies between them,
 //! and the link is silent at its end.
 
-mod stage;
-
 use std::path::PathBuf;
 
+use crate::testkit;
+use crate::testkit::{INT, KILL, Outcome, Program, Stage, bytes_of, number, sequence};
 use lms::variant::{Mode, Unit};
 use serde_json::Value;
-use stage::{INT, KILL, Outcome, Program, Stage, bytes_of, number, sequence};
 
 /// Publishes `file` with `option` behind its name to a consumer of `topics` that was there before, so that it gets the
 /// very first sample; returns what it received up to the end of the recording.
@@ -42,7 +41,8 @@ fn stream(scans: u16) -> (Vec<u8>, Vec<Vec<u8>>) {
     let mut random = fastrand::Rng::with_seed(31);
     let mut noise = move |len: usize| -> Vec<u8> { (0..len).map(|_| random.u8(..)).collect() };
     let (mut bytes, mut whole) = (noise(100), Vec::new());
-    for (number, telegram) in [configuration, mode].into_iter().chain((0..scans).map(stage::scan)).enumerate()
+    for (number, telegram) in
+        [configuration, mode].into_iter().chain((0..scans).map(testkit::scan)).enumerate()
     {
         if number == 4 {
             // Bytes of it are missing.
@@ -67,7 +67,7 @@ fn check(outcome: &Outcome, whole: &[Vec<u8>]) {
 #[test]
 fn a_recording_without_its_mode_has_marks_where_the_mode_is_set() {
     let stage = Stage::new();
-    let bytes = (0..4).flat_map(stage::scan).collect::<Vec<u8>>();
+    let bytes = (0..4).flat_map(testkit::scan).collect::<Vec<u8>>();
     let link = format!("--link=a=file:{}", stage.file("recording", &bytes));
     let hub = stage.hub(&[&link]);
     at_the_end(&stage);
@@ -104,7 +104,7 @@ fn values_that_could_be_split_in_several_ways_are_no_scans_until_the_mode_is_tol
     assert_eq!(ranges, [8600], "{outcome}");
     assert_eq!(hub.end(INT).code, Some(0));
     // Where no value has a higher bit there is one way.
-    let plain = stage.file("plain", stage::scan(1).repeat(2));
+    let plain = stage.file("plain", testkit::scan(1).repeat(2));
     let (hub, words) = (stage.hub(&[&format!("--link=a=file:{plain}")]), "no value has more than 13 bits");
     assert_eq!(at_the_end(&stage)["counters"]["telegrams"], 2);
     let outcome = hub.end(INT);

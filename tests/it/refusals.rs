@@ -1,12 +1,11 @@
 //! What is refused: the exit code of each kind of failure, and a message that names the place, the value and the
 //! remedy; with `--json` an object, on stdout unless that belongs to the line that says that all is up.
 
-mod stage;
-
 use std::process::Command;
 
+use crate::testkit;
+use crate::testkit::{Outcome, Stage, TERM};
 use serde_json::Value;
-use stage::{Outcome, Stage, TERM};
 
 /// Runs the program, which must refuse with `code` and `kind` and say all of `words`, in text and in JSON.
 fn refused(stage: &Stage, arguments: &[&str], code: i32, kind: &str, words: &[&str]) {
@@ -293,7 +292,7 @@ fn domains_that_cannot_be() {
     let at = |domain: &str, root: &str| {
         let mut command = Command::new(env!("CARGO_BIN_EXE_scanhub"));
         command.args(["list", "--json", "--domain", domain, "--root", root]);
-        stage::Program::start(command).wait()
+        testkit::Program::start(command).wait()
     };
     for (domain, root, word) in [
         ("Robot", "/tmp", "a-z"),

@@ -1,12 +1,12 @@
 //! A configuration that changes while the hub runs: zones, marks, background and pose with the next scan, without a gap in
 //! the stream; lines at the next start; and one that cannot be changes nothing. A hangup of its terminal still ends a hub.
 
-mod stage;
-
 use std::process::Command;
 
+use crate::testkit::{
+    HUP, INT, MEASURED, Program, Stage, TERM, bytes_of, hash, is_class, number, sequence, terminal,
+};
 use serde_json::Value;
-use stage::{HUP, INT, MEASURED, Program, Stage, TERM, bytes_of, hash, is_class, number, sequence, terminal};
 
 const STREAM: [&str; 2] = ["--seed=71", "--baud=500000"];
 

@@ -1,15 +1,14 @@
 //! `scanhub replay`: a hub whose sensors are a recording, with its options, its keys, and its end.
 
-mod stage;
-
 use std::collections::BTreeMap;
 
+use crate::testkit;
+use crate::testkit::{INT, Outcome, Program, Sitting, Stage, TERM, is_class, number};
 use lms::variant::{Mode, Unit};
 use schema::datagram::Packed;
 use schema::file::Writer;
 use schema::{Header, Marks, Topic};
 use serde_json::Value;
-use stage::{INT, Outcome, Program, Sitting, Stage, TERM, is_class, number};
 
 /// A log with a scan every `period_ms`, from 1000 s on.
 fn log(stage: &Stage, scans: u64, period_ms: u64) -> String {
@@ -106,7 +105,7 @@ fn lives(stage: &Stage, understood: [u64; 2]) -> String {
     for (life, understood) in understood.into_iter().enumerate() {
         for seq in 0..10 {
             let reply = lms::reply::configuration(0, Mode(1), Unit::Mm, 0x10);
-            let telegram = if seq == 5 { reply.bytes().to_vec() } else { stage::scan(seq as u16) };
+            let telegram = if seq == 5 { reply.bytes().to_vec() } else { testkit::scan(seq as u16) };
             let at = (life as u64 * 20 + seq) * 20_000_000;
             let (stamp_first_ns, stamp_last_ns) = (1_000_000_000 + at, 1_010_000_000 + at);
             let mut header = Header {
@@ -153,7 +152,7 @@ fn lossy(stage: &Stage) -> String {
             ..Header::default()
         };
         header.set_sent_at(header.stamp_last_ns + 1000);
-        writer.sample("front", Topic::Telegram, &header, &stage::scan(seq as u16)).expect("is written");
+        writer.sample("front", Topic::Telegram, &header, &testkit::scan(seq as u16)).expect("is written");
     }
     writer.finish().expect("is written");
     stage.path("lossy.mcap").display().to_string()
@@ -163,7 +162,7 @@ fn lossy(stage: &Stage) -> String {
 fn scans_that_are_missing_are_no_silence_of_the_sensor() {
     let stage = Stage::new();
     let player = start(&stage, &[&lossy(&stage), "--rate=2", "--set=link.front.mode=0", "--hold"]);
-    stage::until("a rate in the list", || {
+    testkit::until("a rate in the list", || {
         let listed = stage.run(&["list", "--json"]);
         assert_eq!(listed.code, Some(0), "{listed}");
         let rate =
@@ -236,7 +235,7 @@ fn keys() {
     let mut sitting = Sitting::start(&stage.command(&words), (100, 30));
     sitting.await_words("paused; space goes on");
     let says = |sitting: &Sitting, word: &str| {
-        let give_up_at = std::time::Instant::now() + stage::PATIENCE;
+        let give_up_at = std::time::Instant::now() + testkit::PATIENCE;
         while !sitting.text().contains(word) {
             assert!(std::time::Instant::now() < give_up_at, "no {word:?}: {}", sitting.text());
             std::thread::sleep(std::time::Duration::from_millis(10));

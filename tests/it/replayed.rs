@@ -2,22 +2,20 @@
 //! parameters; and something else with others. Two sensors of simulated rooms with people, recorded in made-up time, and
 //! replayed telegram by telegram.
 
-#[path = "../benches/support/rooms.rs"]
+#[path = "../../benches/support/rooms.rs"]
 mod rooms;
-mod stage;
-
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::sync::mpsc::channel;
 use std::thread;
 use std::time::{Duration, Instant};
 
+use crate::testkit::{PATIENCE, Stage};
 use daemon::config::Sources;
 use daemon::{Play, Player, Replay};
 use rooms::{Followers, LEARNING, Published, SENSORS};
 use schema::ipc;
 use schema::{Flags, Topic};
-use stage::{PATIENCE, Stage};
 
 const SCANS: u64 = 400;
 /// Before this scan nothing is heard of a sensor for a second.

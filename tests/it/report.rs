@@ -1,8 +1,8 @@
 //! The tables of benches/README.md: lines of a bench become these rows, and what criterion wrote becomes such lines.
 
-#[path = "../benches/report/criterion.rs"]
+#[path = "../../benches/report/criterion.rs"]
 mod criterion;
-#[path = "../benches/report/tables.rs"]
+#[path = "../../benches/report/tables.rs"]
 mod tables;
 
 use std::fs;

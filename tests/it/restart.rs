@@ -1,12 +1,10 @@
 //! A hub that is killed or ended and started again while its consumers run on: they say so and go on by themselves,
 //! and the sensor is taken as it streams.
 
-mod stage;
-
 use std::collections::{BTreeMap, HashSet};
 
+use crate::testkit::{INT, KILL, MEASURED, Stage, TERM, bytes_of, hash, is_class, number, sequence};
 use serde_json::Value;
-use stage::{INT, KILL, MEASURED, Stage, TERM, bytes_of, hash, is_class, number, sequence};
 
 #[test]
 fn consumers_outlive_several_hubs() {

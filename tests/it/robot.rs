@@ -1,12 +1,10 @@
 //! The robot's verdict over two sensors, to those who follow it: a sensor that dies makes it unknown, a hub that dies
 //! too, and whoever comes back is heard again.
 
-mod stage;
-
+use crate::testkit::{INT, KILL, Program, Sender, Stage, TERM, in_a_network, until};
 use clients::{Robot, RobotFollower};
 use schema::{Topic, Verdict, Zones};
 use serde_json::{Value, json};
-use stage::{INT, KILL, Program, Sender, Stage, TERM, in_a_network, until};
 
 /// So near that nothing in the simulated room is inside.
 const CLEAR: &str = "--set=zones.radii=[0.02,0.01]";
@@ -86,7 +84,7 @@ fn a_program_that_follows_the_robot() {
 /// A machine without a hub of its own, as an operator's: `robot` is of the sensors that its listener publishes.
 #[test]
 fn without_a_hub_the_robot_is_of_the_sensors_of_other_machines() {
-    in_a_network("without_a_hub_the_robot_is_of_the_sensors_of_other_machines", || {
+    in_a_network("robot::without_a_hub_the_robot_is_of_the_sensors_of_other_machines", || {
         let stage = Stage::new();
         let mut listener =
             stage.start(&["listen", "--json", "--publish", "--name=robot1=0000000000000001"]).ready();

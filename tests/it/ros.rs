@@ -1,16 +1,14 @@
 //! Recordings for ROS 2, made while sensors stream and later of what was recorded: other people's readers read every message
 //! of them, and what they read is what was measured, where and when.
 
-mod stage;
-
 use std::collections::BTreeMap;
 use std::process::Command;
 
+use crate::testkit::{INT, MEASURED, Recording, Stage, is_class, number, python};
 use lms::variant::Unit;
 use schema::datagram::Packed;
 use schema::{Code, Header, Pose, Scan, file};
 use serde_json::Value;
-use stage::{INT, MEASURED, Recording, Stage, is_class, number, python};
 
 /// Two sensors with poses, of which one hangs upside down.
 const FRONT: Pose = Pose { x_m: 0.3, y_m: 0.1, yaw_rad: 0.25, upside_down: 0, reserved: [0; 7] };
@@ -41,7 +39,7 @@ fn published(recording: &Recording) -> BTreeMap<(String, u64), (Header, Scan)> {
 
 /// What other people's reader `verb` says of the file at `path`: all messages.
 fn said(mut python: Command, verb: &str, path: &str) -> Vec<Value> {
-    python.args(["tests/stage/read.py", verb, path]).current_dir(env!("CARGO_MANIFEST_DIR"));
+    python.args(["tests/testkit/read.py", verb, path]).current_dir(env!("CARGO_MANIFEST_DIR"));
     let outcome = python.output().expect("Python");
     assert!(outcome.status.success(), "{verb} {path}: {}", String::from_utf8_lossy(&outcome.stderr));
     serde_json::from_slice(&outcome.stdout).expect("a list of messages")

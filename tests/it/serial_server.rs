@@ -1,8 +1,6 @@
 //! A sensor behind a serial server: the server is played here, between a socket on the loopback and the simulator's
 //! pty.
 
-mod stage;
-
 use std::io::{Read, Write};
 use std::net::{TcpListener, TcpStream};
 use std::process::Stdio;
@@ -11,9 +9,10 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::thread::{self, JoinHandle};
 use std::time::{Duration, Instant};
 
+use crate::testkit;
+use crate::testkit::{INT, Stage, TERM, is_class, number, open_line, sequence, terminal};
 use rustix::process::Signal;
 use serde_json::Value;
-use stage::{INT, Stage, TERM, is_class, number, open_line, sequence, terminal};
 
 /// One connection at a time, until it is dropped.
 struct Server {
@@ -171,7 +170,7 @@ fn a_want_of_descriptors_is_not_the_servers_fault() {
         let mut command = std::process::Command::new("sh");
         command.args(["-c", "ulimit -n \"$0\" && exec \"$@\"", &limit.to_string()]);
         command.arg(inner.get_program()).args(inner.get_args()).env("SCANHUB_END_WITH_PARENT", "1");
-        let outcome = stage::Program::start(command).wait();
+        let outcome = testkit::Program::start(command).wait();
         match outcome.code {
             Some(75) => {}
             Some(4) => assert!(outcome.errors.contains("connection refused"), "{limit}: {outcome}"),
@@ -195,7 +194,7 @@ fn nobody_has_to_wait_for_a_serial_server_that_does_not_answer() {
         let is_socket = |entry: std::fs::DirEntry| {
             entry.path().read_link().is_ok_and(|target| target.to_string_lossy().starts_with("socket:"))
         };
-        stage::until("it dials", || {
+        testkit::until("it dials", || {
             std::fs::read_dir(&descriptors).is_ok_and(|entries| entries.flatten().any(is_socket))
         });
         assert_eq!(program.end(INT).code, Some(130));

@@ -1,13 +1,11 @@
 //! The hub as a service: it says when it is up, feeds the watchdog with work that is done, and leaves its ports with
 //! the service manager, so that what a sensor sends while a killed hub is replaced is not lost.
 
-mod stage;
-
 use std::collections::{HashMap, HashSet};
 use std::time::Duration;
 
+use crate::testkit::{INT, KILL, MEASURED, Program, Stage, TERM, bytes_of, hash, is_class, number, sequence};
 use serde_json::Value;
-use stage::{INT, KILL, MEASURED, Program, Stage, TERM, bytes_of, hash, is_class, number, sequence};
 
 const KILLS: usize = 6;
 

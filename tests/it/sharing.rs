@@ -1,17 +1,16 @@
 //! docs/sharing.md, tried: a hub under one user, its consumers under another one. Each test has a network, a /run, a /tmp and
 //! a /dev/shm of its own.
 
-mod stage;
-
 use std::fs;
 use std::os::unix::fs::{DirBuilderExt, chown};
 use std::os::unix::process::CommandExt;
 use std::process::Command;
 
+use crate::testkit;
+use crate::testkit::{INT, Program, TERM, is_class, number, until};
 use serde_json::{Value, json};
-use stage::{INT, Program, TERM, is_class, number, until};
 
-const PAGE: &str = include_str!("../docs/sharing.md");
+const PAGE: &str = include_str!("../../docs/sharing.md");
 /// Where the namespaces are made: the test that shall run in them.
 const INSIDE: &str = "SCANHUB_TEST_SHARING";
 /// Users that need not be known to the system.
@@ -30,7 +29,7 @@ fn among_users(name: &str, test: impl FnOnce()) {
     let unshare = |then: &str| {
         let mut command = Command::new("unshare");
         command.args(["--net", "--mount", "sh", "-c", &format!("{script} && {then}"), "sh"]);
-        command.arg(std::env::current_exe().expect("has a path")).arg(env!("CARGO_BIN_EXE_scanhub"));
+        command.arg(testkit::own_program()).arg(env!("CARGO_BIN_EXE_scanhub"));
         command
     };
     let is_root = rustix::process::getuid().is_root();
@@ -39,8 +38,8 @@ fn among_users(name: &str, test: impl FnOnce()) {
         return;
     }
     let mut inside = unshare(&format!("exec /mnt/test --exact {name} --nocapture"));
-    let status = inside.env(INSIDE, "1").current_dir("/").status();
-    assert!(status.expect("unshare runs").success(), "failed among users");
+    inside.env(INSIDE, "1").current_dir("/");
+    testkit::run_again(name, inside);
 }
 
 /// A directory of `user` alone, which is there already if `path` is.
@@ -84,7 +83,7 @@ fn words(texts: &[String]) -> Vec<&str> {
 
 #[test]
 fn consumers_under_another_user_get_what_the_page_says() {
-    among_users("consumers_under_another_user_get_what_the_page_says", || {
+    among_users("sharing::consumers_under_another_user_get_what_the_page_says", || {
         fs::create_dir("/run/user").expect("an empty /run");
         own(HUB, "/run/scanhub");
         for user in [HUB, OTHER] {
@@ -141,7 +140,7 @@ fn consumers_under_another_user_get_what_the_page_says() {
 #[test]
 fn the_page_s_configuration_is_one() {
     let block = PAGE.split("```toml\n").nth(1).and_then(|rest| rest.split("```").next()).expect("a block");
-    let stage = stage::Stage::new();
+    let stage = testkit::Stage::new();
     let file = stage.file("scanhub.toml", block);
     let shown = stage.run(&[
         "config",

@@ -1,12 +1,10 @@
 //! `scanhub simulate`, as somebody runs it: what its flags say is what is there to be found.
 
-mod stage;
-
 use std::io::{Read, Write};
 use std::thread::sleep;
 use std::time::Duration;
 
-use stage::{Stage, TERM, number, open_line, until};
+use crate::testkit::{Stage, TERM, number, open_line, until};
 
 #[test]
 fn a_sensor_with_a_past_tells_it_when_it_is_asked() {

@@ -1,15 +1,14 @@
 //! What another user of the same machine can do to hub and clients of this one: nothing but to be named. Each test has
 //! a /tmp and a /dev/shm of its own; the user is root, whom no permission stops, and the stranger somebody else.
 
-mod stage;
-
 use std::fs;
 use std::os::unix::fs::{DirBuilderExt, MetadataExt, PermissionsExt, symlink};
 use std::os::unix::process::CommandExt;
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
-use stage::{INT, KILL, Outcome, Program, Stage, TERM, is_class, until};
+use crate::testkit;
+use crate::testkit::{INT, KILL, Outcome, Program, Stage, TERM, is_class, until};
 
 /// Where the namespace is made: the test that shall run in it.
 const INSIDE: &str = "SCANHUB_TEST_STRANGERS";
@@ -28,7 +27,7 @@ fn beside_a_stranger(name: &str, test: impl FnOnce()) {
     let unshare = |then: &str| {
         let mut command = Command::new("unshare");
         command.args(["--mount", "sh", "-c", &format!("{script} && {then}"), "sh"]);
-        command.arg(std::env::current_exe().expect("has a path")).arg(env!("CARGO_BIN_EXE_scanhub"));
+        command.arg(testkit::own_program()).arg(env!("CARGO_BIN_EXE_scanhub"));
         command
     };
     let is_root = rustix::process::getuid().is_root();
@@ -37,8 +36,8 @@ fn beside_a_stranger(name: &str, test: impl FnOnce()) {
         return;
     }
     let mut inside = unshare(&format!("exec /mnt/test --exact {name} --nocapture"));
-    let status = inside.env(INSIDE, "1").env(stage::PROGRAM, "/mnt/scanhub").current_dir("/").status();
-    assert!(status.expect("unshare runs").success(), "failed beside a stranger");
+    inside.env(INSIDE, "1").env(testkit::PROGRAM, "/mnt/scanhub").current_dir("/");
+    testkit::run_again(name, inside);
 }
 
 /// The program with `arguments` and nothing but them, as root or as the stranger.
@@ -105,7 +104,7 @@ fn all_refuse(prey: &Path, base: &[&str], words: &[&str]) {
 
 #[test]
 fn the_fallback_directory_that_a_stranger_made() {
-    beside_a_stranger("the_fallback_directory_that_a_stranger_made", || {
+    beside_a_stranger("strangers::the_fallback_directory_that_a_stranger_made", || {
         let prey = prey();
         stranger("mkdir /tmp/scanhub-0 && ln -s /tmp/prey /tmp/scanhub-0/scanhub");
         all_refuse(&prey, &[], &["/tmp/scanhub-0", "belongs to user 65533"]);
@@ -120,7 +119,7 @@ fn the_fallback_directory_that_a_stranger_made() {
 
 #[test]
 fn links_in_a_domain_and_on_the_way_to_it() {
-    beside_a_stranger("links_in_a_domain_and_on_the_way_to_it", || {
+    beside_a_stranger("strangers::links_in_a_domain_and_on_the_way_to_it", || {
         let prey = prey();
         let base = Path::new("/tmp/base");
         fs::DirBuilder::new().mode(0o700).create(base).expect("a base");
@@ -148,14 +147,14 @@ fn links_in_a_domain_and_on_the_way_to_it() {
 
 /// Segments and bells of `stage`.
 fn segments(stage: &Stage) -> Vec<PathBuf> {
-    let mut paths = stage::shared_memory(&stage.place().prefix());
+    let mut paths = testkit::shared_memory(&stage.place().prefix());
     paths.sort();
     paths
 }
 
 #[test]
 fn shared_memory_of_strangers() {
-    beside_a_stranger("shared_memory_of_strangers", || {
+    beside_a_stranger("strangers::shared_memory_of_strangers", || {
         // Both would be the names, if they could be guessed.
         stranger("touch /dev/shm/sh_scanhub_front.bell");
         let stage = Stage::new();
@@ -226,11 +225,11 @@ fn shared_memory_of_strangers() {
 
 #[test]
 fn a_hub_of_another_user_is_told_and_not_attached_to() {
-    beside_a_stranger("a_hub_of_another_user_is_told_and_not_attached_to", || {
+    beside_a_stranger("strangers::a_hub_of_another_user_is_told_and_not_attached_to", || {
         stranger("mkdir -m 755 /tmp/theirs");
         let arguments = ["run", "--json", "--no-system-config", "--link=front=/tmp/no", "--root=/tmp/theirs"];
         let hub = Program::start(scanhub(STRANGER, &arguments)).ready();
-        for bell in stage::shared_memory("sh_scanhub_")
+        for bell in testkit::shared_memory("sh_scanhub_")
             .iter()
             .filter(|path| path.extension().is_some_and(|it| it == "bell"))
         {
@@ -251,6 +250,6 @@ fn a_hub_of_another_user_is_told_and_not_attached_to() {
         let theirs = run(STRANGER, &["list", "--root=/tmp/theirs"]);
         assert_eq!(theirs.code, Some(0), "{theirs}");
         assert_eq!(hub.end(INT).code, Some(0));
-        until("it is gone", || stage::shared_memory("sh_scanhub_").is_empty());
+        until("it is gone", || testkit::shared_memory("sh_scanhub_").is_empty());
     });
 }

@@ -1,14 +1,12 @@
 //! Two sensors that stream into a running hub, and consumers in processes of their own: everything that was sent
 //! arrives, bit for bit and in order, and all verbs tell the same of it.
 
-mod stage;
-
+use crate::testkit::{INT, MEASURED, Stage, TERM, bytes_of, hash, is_class, number, sequence};
 use lms::framer::{Found, Framer};
 use lms::measured::Measured;
 use lms::telegram::Telegram;
 use schema::Topic;
 use serde_json::Value;
-use stage::{INT, MEASURED, Stage, TERM, bytes_of, hash, is_class, number, sequence};
 
 #[test]
 fn everything_sent_arrives_bit_for_bit_and_in_order() {

@@ -2,15 +2,14 @@
 //! delivered, what it had no room for is lost and counted, and then it goes on as if nothing had been. And a listener: what
 //! waited for it is not new.
 
-mod stage;
-
 use std::thread;
 use std::time::Duration;
 
+use crate::testkit;
+use crate::testkit::{INT, Sender, Stage, TERM, bytes_of, hash, in_a_network, is_class, number, until};
 use rustix::process::Signal;
 use rustix::time::{ClockId, clock_gettime};
 use schema::{Topic, Verdict, Zones};
-use stage::{INT, Sender, Stage, TERM, bytes_of, hash, in_a_network, is_class, number, until};
 
 #[test]
 fn a_hub_that_was_stopped() {
@@ -100,7 +99,7 @@ fn a_stamp_is_right_or_says_that_it_is_an_estimate() {
     let mut place = 0;
     // The sensor keeps its beat from its last reply on, also where the simulator was late to write: those that it wrote
     // soonest tell when.
-    let is_answer = |sent: &stage::Sent| sent.is_reply && sent.sent_ns < stops[0].0;
+    let is_answer = |sent: &testkit::Sent| sent.is_reply && sent.sent_ns < stops[0].0;
     let begin = truth.iter().rposition(is_answer).expect("it was asked") + 1;
     let beat = |place: usize| (place - begin) as u64 * PERIOD;
     let whole = (begin..truth.len()).filter(|&place| truth[place].fault.is_none());
@@ -152,7 +151,7 @@ fn median(values: &mut [i64]) -> i64 {
 
 #[test]
 fn what_waited_for_a_listener_that_was_stopped_is_not_new() {
-    in_a_network("what_waited_for_a_listener_that_was_stopped_is_not_new", || {
+    in_a_network("suspended::what_waited_for_a_listener_that_was_stopped_is_not_new", || {
         let stage = Stage::new();
         let mut listener = stage.start(&["listen", "--json"]).ready();
         let mut sender = Sender::new(0x5f3a_12bc_00d1_e2f3, 7, 2, "front");

@@ -1,12 +1,10 @@
 //! What stands in a file, on a line or in a name is shown, and obeyed by no terminal: control characters reach neither
 //! stdout nor stderr, in text and in JSON, which says them all the same.
 
-mod stage;
-
 use std::fs;
 
+use crate::testkit::{Outcome, Stage, TERM};
 use lms::telegram::Writer;
-use stage::{Outcome, Stage, TERM};
 
 /// C0, DEL and C1, as a terminal takes them for a command.
 const HOSTILE: &str = "\u{1b}]0;x\u{7}\u{9b}31m\u{7f}\u{85}\u{9d}";

@@ -1,13 +1,9 @@
 //! The walls of the house, each one an assertion that was seen to fail: every test first finds the project in order,
 //! then plants a breach and must find that.
 
-#[path = "tidy/crates.rs"]
 mod crates;
-#[path = "tidy/sources.rs"]
 mod sources;
-#[path = "tidy/tree.rs"]
 mod tree;
-#[path = "tidy/written.rs"]
 mod written;
 
 use tree::{Tree, Wall};

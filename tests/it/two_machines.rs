@@ -1,16 +1,14 @@
 //! A hub and its gateway on one machine, listeners on others, and what is between them: it loses, doubles and moves
 //! datagrams, and knows which.
 
-mod stage;
-
 use std::collections::{BTreeMap, BTreeSet};
 
+use crate::testkit::{
+    INT, Machine, Outcome, Program, Relay, Robot, Stage, TERM, in_a_network, is_class, number, read, until,
+};
 use schema::Topic;
 use schema::datagram::Announce;
 use serde_json::Value;
-use stage::{
-    INT, Machine, Outcome, Program, Relay, Robot, Stage, TERM, in_a_network, is_class, number, read, until,
-};
 
 /// Passed on while the network is rough: some seconds.
 const MANY: usize = 2000;
@@ -104,7 +102,7 @@ fn truth(log: &[Vec<u8>]) -> BTreeMap<Stream, [u64; 4]> {
 
 #[test]
 fn every_listener_knows_exactly_what_it_missed() {
-    in_a_network("every_listener_knows_exactly_what_it_missed", || {
+    in_a_network("two_machines::every_listener_knows_exactly_what_it_missed", || {
         let (second, third) = (Machine::new(2), Machine::new(3));
         let robot = Robot::new(&["front", "rear"]);
         let relay = Relay::new(&robot.machine, 7);
@@ -155,7 +153,7 @@ fn last_of_class(outcome: &Outcome, class: &str) -> Vec<Value> {
 
 #[test]
 fn a_sensor_of_another_machine_is_followed_as_one_here() {
-    in_a_network("a_sensor_of_another_machine_is_followed_as_one_here", || {
+    in_a_network("two_machines::a_sensor_of_another_machine_is_followed_as_one_here", || {
         let second = Machine::new(2);
         let mut robot = Robot::new(&["front", "rear"]);
         let relay = Relay::new(&robot.machine, 7);

@@ -1,14 +1,13 @@
 //! The picture on a terminal, as somebody sits at it: it follows the hub, keys and the size of the window, and gives the
 //! terminal back however it ends.
 
-mod stage;
-
 use std::fs::{self, File};
 use std::process::Command;
 use std::time::Duration;
 
+use crate::testkit;
+use crate::testkit::{INT, KILL, Sitting, Stage, TERM, Tmux, can_sit};
 use rustix::process::Signal;
-use stage::{INT, KILL, Sitting, Stage, TERM, Tmux, can_sit};
 
 const SIZE: (u16, u16) = (60, 20);
 
@@ -168,7 +167,7 @@ fn a_demonstration_shows_it() {
     assert!(code == Some(0) && is_whole, "{code:?} {below:?}");
     assert_eq!(below.matches(" 0 lost in ").count(), 2, "{below:?}");
     assert!(!std::env::temp_dir().join(format!("scanhub-{name}")).exists(), "its directory is left");
-    assert!(stage::shared_memory(&format!("sh_{name}_")).is_empty(), "its domain is left");
+    assert!(testkit::shared_memory(&format!("sh_{name}_")).is_empty(), "its domain is left");
 }
 
 #[test]

@@ -2,6 +2,7 @@
 //! it ends. Everything is waited for by what it says, with a deadline far beyond what it takes.
 #![allow(dead_code, unused_imports)] // Every test file takes what it needs.
 
+mod again;
 mod findings;
 mod line;
 mod machine;
@@ -29,6 +30,7 @@ use std::time::{Duration, Instant};
 use schema::Domain;
 use serde_json::Value;
 
+pub(crate) use again::{only, own_program, run_again};
 pub(crate) use findings::Findings;
 pub(crate) use line::{Line, open_line};
 pub(crate) use machine::{Machine, command_in, ip};

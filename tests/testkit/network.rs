@@ -2,6 +2,8 @@
 
 use std::process::Command;
 
+use super::{only, own_program, run_again};
+
 /// Where the namespace is made: the test that shall run in it.
 const INSIDE: &str = "SCANHUB_TEST_NETWORK";
 
@@ -21,9 +23,7 @@ pub(crate) fn in_a_network(name: &str, test: impl FnOnce()) {
         eprintln!("skipped: this user may not make a network namespace, or there is no `ip`");
         return;
     }
-    let own = std::env::current_exe().expect("has a path");
     let up = "ip link set lo up && exec \"$@\"";
-    unshare.args(["sh", "-c", up, "sh"]).arg(own).args(["--exact", name, "--nocapture"]);
-    let status = unshare.env(INSIDE, "1").status();
-    assert!(status.expect("unshare runs").success(), "failed in its network");
+    unshare.args(["sh", "-c", up, "sh"]).arg(own_program()).args(only(name)).env(INSIDE, "1");
+    run_again(name, unshare);
 }

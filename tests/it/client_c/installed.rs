@@ -7,7 +7,7 @@ use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
 use std::sync::OnceLock;
 
-use crate::stage::Stage;
+use crate::testkit::Stage;
 
 /// A place where the library and its header are.
 pub(crate) struct Installed {
@@ -136,7 +136,7 @@ pub(crate) fn is_there(name: &str) -> bool {
 
 /// A program in C of these tests.
 pub(crate) fn source(name: &str) -> PathBuf {
-    top().join("tests/client_c").join(name)
+    top().join("tests/it/client_c").join(name)
 }
 
 /// Where the header is, in the project.

@@ -1,18 +1,9 @@
 //! The C header against the golden datagrams and against `schema`; skips, saying so, where there is no C compiler.
 
-#[path = "lan/damaged.rs"]
-mod damaged;
-#[path = "lan/readers.rs"]
-mod readers;
-#[path = "../schema/tests/datagram/says.rs"]
-mod says;
-#[path = "lan/vectors.rs"]
-mod vectors;
-
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
-use readers::Reader;
+use super::readers::{self, Reader};
 
 /// The reader, compiled as strictly as it goes; with a watch over its memory where the compiler has one.
 fn reader() -> Option<PathBuf> {
@@ -25,7 +16,11 @@ fn reader() -> Option<PathBuf> {
     let compile = |watch: &[&str]| {
         let mut cc = Command::new("cc");
         cc.args(["-std=c99", "-Wall", "-Wextra", "-Wpedantic", "-Wconversion", "-Werror", "-g"]).args(watch);
-        cc.arg("-I").arg(top.join("clients/c")).arg(top.join("tests/lan/reader.c")).arg("-o").arg(&program);
+        cc.arg("-I")
+            .arg(top.join("clients/c"))
+            .arg(top.join("tests/it/lan/reader.c"))
+            .arg("-o")
+            .arg(&program);
         cc.output().expect("a compiler")
     };
     if !compile(&["-fsanitize=address,undefined", "-fno-sanitize-recover=all"]).status.success() {

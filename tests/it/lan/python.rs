@@ -1,19 +1,11 @@
 //! The Python module against the golden datagrams and against `schema`; skips, saying so, where there is no python3. Its
 //! numpy part skips by itself.
 
-#[path = "lan/damaged.rs"]
-mod damaged;
-#[path = "lan/readers.rs"]
-mod readers;
-#[path = "../schema/tests/datagram/says.rs"]
-mod says;
-#[path = "lan/vectors.rs"]
-mod vectors;
-
 use std::path::Path;
 use std::process::Command;
 
-use readers::Reader;
+use super::readers::{self, Reader};
+use super::vectors;
 
 /// The reader in the Python of `SCANHUB_PYTHON`, or in the first one.
 fn reader() -> Option<Reader> {
@@ -25,7 +17,7 @@ fn reader() -> Option<Reader> {
         return None;
     }
     let mut command = Command::new(python);
-    command.arg("-B").arg(top.join("tests/lan/reader.py")).env("PYTHONPATH", top.join("clients/python"));
+    command.arg("-B").arg(top.join("tests/it/lan/reader.py")).env("PYTHONPATH", top.join("clients/python"));
     Some(Reader::start(&mut command))
 }
 

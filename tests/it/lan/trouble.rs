@@ -1,17 +1,15 @@
 //! What happens to networks and programs, as heard at the other end of the cable: the gateway outlives it, what it could
 //! not send is counted, and it sends again. How long that took is printed.
 
-mod stage;
-
 use std::time::Instant;
 
-use schema::datagram::{Account, Datagram, Packed};
-use schema::{Topic, Verdict, Zones};
-use serde_json::Value;
-use stage::{
+use crate::testkit::{
     INT, KILL, Machine, Outcome, Program, Receiver, Relay, Robot, Stage, TERM, in_a_network, ip, is_class,
     number, read, until,
 };
+use schema::datagram::{Account, Datagram, Packed};
+use schema::{Topic, Verdict, Zones};
+use serde_json::Value;
 
 fn is_scan(datagram: &Datagram<'_>) -> bool {
     datagram.head.topic == Topic::Scan.number()
@@ -57,7 +55,7 @@ fn account(heard: &[Vec<u8>]) -> (u64, u64) {
 
 #[test]
 fn a_cable_is_pulled_and_an_address_taken() {
-    in_a_network("a_cable_is_pulled_and_an_address_taken", || {
+    in_a_network("lan::trouble::a_cable_is_pulled_and_an_address_taken", || {
         let robot = Robot::new(&["front"]);
         let receiver = Receiver::new(robot.machine.here());
         let mut gateway = robot.gateway::<&str>(&[]);
@@ -86,7 +84,7 @@ fn a_cable_is_pulled_and_an_address_taken() {
 
 #[test]
 fn a_queue_is_full() {
-    in_a_network("a_queue_is_full", || {
+    in_a_network("lan::trouble::a_queue_is_full", || {
         let robot = Robot::new(&["front"]);
         let receiver = Receiver::new(robot.machine.here());
         let mut gateway = robot.gateway::<&str>(&[]);
@@ -111,7 +109,7 @@ fn a_queue_is_full() {
 
 #[test]
 fn hosts_that_are_not_there_disturb_nobody() {
-    in_a_network("hosts_that_are_not_there_disturb_nobody", || {
+    in_a_network("lan::trouble::hosts_that_are_not_there_disturb_nobody", || {
         let robot = Robot::new(&["front"]);
         let here = robot.machine.here();
         ip("link set lo up");
@@ -140,7 +138,7 @@ fn hosts_that_are_not_there_disturb_nobody() {
 
 #[test]
 fn hubs_and_gateways_are_killed() {
-    in_a_network("hubs_and_gateways_are_killed", || {
+    in_a_network("lan::trouble::hubs_and_gateways_are_killed", || {
         let second = Machine::new(2);
         let mut robot = Robot::new(&["front"]);
         let relay = Relay::new(&robot.machine, 7);

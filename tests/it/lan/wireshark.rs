@@ -1,18 +1,10 @@
 //! The dissector for Wireshark on captures that are written here: every field of the golden datagrams, and what is flagged
 //! in a sequence. Skips, saying so, where there is no tshark.
 
-#[path = "lan/capture.rs"]
-mod capture;
-#[path = "lan/damaged.rs"]
-mod damaged;
-#[path = "../schema/tests/datagram/says.rs"]
-mod says;
-#[path = "lan/vectors.rs"]
-mod vectors;
-
 use std::collections::{BTreeMap, BTreeSet};
 
-use capture::{Capture, has_tshark};
+use super::capture::{Capture, has_tshark};
+use super::{damaged, vectors};
 use schema::datagram::{HEAD, Head, Packed};
 use schema::{State, Topic, Verdict, Zones};
 use serde_json::Value;

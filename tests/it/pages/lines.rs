@@ -10,17 +10,17 @@ use std::time::{Duration, Instant};
 
 use rustix::process::{Pid, Signal, kill_process_group};
 
-use crate::blocks::blocks;
-use crate::shell::{commands, lines};
-use crate::stage::{Program, Sender, Stage, in_a_network, is_class};
+use super::blocks::blocks;
+use super::shell::{commands, lines};
+use crate::testkit::{Program, Sender, Stage, in_a_network, is_class};
 use schema::Topic;
 
 /// Commands that are not run, by how their line begins or what is in it, and what makes sure of them. Those of the program
 /// are read by `hub/cli/examples.rs`.
 const NOT_RUN: [(&str, &str); 12] = [
-    ("sudo ", "changes the machine; tests/dist.rs and tests/client_c.rs install elsewhere"),
+    ("sudo ", "changes the machine; tests/it/dist.rs and tests/it/client_c.rs install elsewhere"),
     ("sudoedit ", "an editor"),
-    ("systemctl ", "asks the machine's service manager; tests/service.rs has one of its own"),
+    ("systemctl ", "asks the machine's service manager; tests/it/service.rs has one of its own"),
     ("cargo build", "builds for minutes; this test was built so"),
     ("cargo test", "this is it"),
     ("cargo run", "builds for minutes; what follows `--` is read as a command line"),
@@ -28,8 +28,8 @@ const NOT_RUN: [(&str, &str); 12] = [
     ("cargo add", "the same"),
     ("python3 -m venv", "fetches packages; the package is used from its directory"),
     ("~/scans/bin/pip", "the same"),
-    ("cc ", "tests/client_c.rs builds the same program against an installed library"),
-    ("scanhub watch", "needs a terminal; tests/watch.rs has one"),
+    ("cc ", "tests/it/client_c.rs builds the same program against an installed library"),
+    ("scanhub watch", "needs a terminal; tests/it/watch.rs has one"),
 ];
 /// The same of what is in the middle of a line.
 const NOT_RUN_WITH: [(&str, &str); 1] = [("| ssh ", "needs another machine")];
@@ -154,7 +154,7 @@ fn every_line_for_a_shell_runs() {
 
 #[test]
 fn every_line_about_a_network_runs() {
-    in_a_network("lines::every_line_about_a_network_runs", || {
+    in_a_network("pages::lines::every_line_about_a_network_runs", || {
         let lines: Vec<_> = all().into_iter().filter(|(_, line)| is_of_a_network(line)).collect();
         assert!(lines.len() > 3, "{lines:#?}");
         let desk = Desk::new();

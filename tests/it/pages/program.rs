@@ -7,9 +7,9 @@ use std::process::Command;
 
 use serde_json::Value;
 
-use crate::blocks::Block;
-use crate::installed::Installed;
-use crate::stage::{Stage, python};
+use super::blocks::Block;
+use crate::client_c::installed::Installed;
+use crate::testkit::{Stage, python};
 
 /// Something to start.
 pub(crate) struct Example {

@@ -6,9 +6,9 @@ use std::path::Path;
 
 use serde_json::Value;
 
-use crate::blocks::{Block, blocks};
-use crate::is_program;
-use crate::stage::{Stage, TERM};
+use super::blocks::{Block, blocks};
+use super::is_program;
+use crate::testkit::{Stage, TERM};
 
 /// Texts that are no examples, by how they begin, and what makes sure of them.
 const TEXTS: [(&str, &str, &str); 3] = [

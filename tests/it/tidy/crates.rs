@@ -1,6 +1,6 @@
 //! Who may know whom: walls between the crates, read from the manifests and from what Cargo makes of them.
 
-use crate::tree::{Tree, find};
+use super::tree::{Tree, find};
 use std::collections::BTreeSet;
 use std::process::Command;
 

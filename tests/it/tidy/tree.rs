@@ -55,7 +55,7 @@ impl Tree {
 
     /// All Rust files but this test itself, whose planted breaches would be found.
     pub(crate) fn sources(&self) -> impl Iterator<Item = (&str, &str)> {
-        self.files(".rs").filter(|(path, _)| !path.starts_with("tests/tidy"))
+        self.files(".rs").filter(|(path, _)| !path.starts_with("tests/it/tidy"))
     }
 
     /// A manifest, parsed.

@@ -1,10 +1,10 @@
 //! What is said twice is the same: the tables of benches/README.md are made of the last runs' lines, and the program that
 //! docs/first-consumer.md shows is the example that is compiled.
 
-#[path = "../../benches/report/tables.rs"]
+#[path = "../../../benches/report/tables.rs"]
 mod tables;
 
-use crate::tree::Tree;
+use super::tree::Tree;
 
 const PAGE: &str = "benches/README.md";
 const LAST: &str = "benches/last/";
