@@ -1,11 +1,11 @@
 //! The charts of the benches: well-formed whatever the names are, and every value beside the tick of its number.
 
 #[path = "../../benches/support/chart.rs"]
-mod chart;
+mod plot;
 
 use std::collections::BTreeMap;
 
-use chart::{Chart, Point, Scale, Series};
+use plot::{Chart, Point, Scale, Series};
 
 /// A tag of the picture, with the text right behind it.
 struct Element {

@@ -3,7 +3,7 @@
 #[path = "../../benches/report/criterion.rs"]
 mod criterion;
 #[path = "../../benches/report/tables.rs"]
-mod tables;
+pub(crate) mod tables;
 
 use std::fs;
 

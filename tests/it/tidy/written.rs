@@ -1,10 +1,8 @@
 //! What is said twice is the same: the tables of benches/README.md are made of the last runs' lines, and the program that
 //! docs/first-consumer.md shows is the example that is compiled.
 
-#[path = "../../../benches/report/tables.rs"]
-mod tables;
-
 use super::tree::Tree;
+use crate::report::tables;
 
 const PAGE: &str = "benches/README.md";
 const LAST: &str = "benches/last/";
