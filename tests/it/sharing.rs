@@ -140,9 +140,9 @@ fn consumers_under_another_user_get_what_the_page_says() {
 #[test]
 fn the_page_s_configuration_is_one() {
     let block = PAGE.split("```toml\n").nth(1).and_then(|rest| rest.split("```").next()).expect("a block");
-    let stage = testkit::Stage::new();
-    let file = stage.file("scanhub.toml", block);
-    let shown = stage.run(&[
+    let env = testkit::TestEnv::new();
+    let file = env.file("scanhub.toml", block);
+    let shown = env.run(&[
         "config",
         "show",
         "--json",

@@ -4,7 +4,7 @@
 use std::time::Instant;
 
 use crate::testkit::{
-    INT, KILL, Machine, Outcome, Program, Receiver, Relay, Robot, Stage, TERM, in_a_network, ip, is_class,
+    INT, KILL, Machine, Outcome, Program, Receiver, Relay, Robot, TERM, TestEnv, in_a_network, ip, is_class,
     number, read, until,
 };
 use schema::datagram::{Account, Datagram, Packed};
@@ -143,8 +143,8 @@ fn hubs_and_gateways_are_killed() {
         let mut robot = Robot::new(&["front"]);
         let relay = Relay::new(&robot.machine, 7);
         relay.connect(&second);
-        let stage = Stage::on(&second);
-        let mut listener = stage.start(&["listen", "--json", "--topic=scan"]).ready();
+        let env = TestEnv::on(&second);
+        let mut listener = env.start(&["listen", "--json", "--topic=scan"]).ready();
         // Scans of another life than those before.
         let mut again = |what: &str, key: &str, before: &Value| {
             let since = Instant::now();
