@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 use std::process::Command;
 
 use crate::testkit;
-use crate::testkit::{Outcome, TestEnv};
+use crate::testkit::{Outcome, TestEnv, skip};
 
 fn text(outcome: &Outcome) -> String {
     String::from_utf8_lossy(&outcome.out).into_owned()
@@ -152,7 +152,7 @@ fn every_verb_has_an_example_a_page_and_a_completion() {
     let ask = "source \"$0\"; COMP_WORDS=(scanhub ec); COMP_CWORD=1; _scanhub scanhub ec scanhub; echo \"${COMPREPLY[*]}\"";
     match Command::new("bash").args(["-c", ask, &script]).output() {
         Ok(said) => assert_eq!(String::from_utf8_lossy(&said.stdout).trim(), "echo"),
-        Err(error) => eprintln!("skipped: no bash: {error}"),
+        Err(error) => skip("bash", error),
     }
 }
 
@@ -168,7 +168,7 @@ fn completed(env: &TestEnv, words: &[&str]) -> Option<Vec<String>> {
     let said = match bash.output() {
         Ok(said) => said,
         Err(error) => {
-            eprintln!("skipped: no bash: {error}");
+            skip("bash", error);
             return None;
         }
     };

@@ -7,7 +7,7 @@ use std::os::unix::fs::{PermissionsExt, symlink};
 use std::os::unix::process::CommandExt;
 use std::process::Command;
 
-use crate::testkit::{Findings, Line, Program, TestEnv, open_line};
+use crate::testkit::{Findings, Line, Program, TestEnv, open_line, skip};
 
 /// What a simulated sensor has, and what the doctor says of it.
 const SENSORS: [(&str, &[&str], &str, &str, &str); 10] = [
@@ -113,7 +113,7 @@ fn who_may_not_open_the_port() {
     };
     let mut attempt = as_nobody(Command::new(env!("CARGO_BIN_EXE_scanhub")));
     if !attempt.arg("--version").output().is_ok_and(|output| output.status.success()) {
-        eprintln!("skipped: the program lies where other users cannot start it");
+        skip("open-directory", "the program lies where other users cannot start it");
         return;
     }
     let group = |gid, mode| {

@@ -9,7 +9,7 @@ use std::path::Path;
 use std::process::Command;
 use std::sync::atomic::AtomicBool;
 
-use crate::testkit::{Findings, KILL, Program, TERM, TestEnv, in_a_network, is_class, shared_memory};
+use crate::testkit::{Findings, KILL, Program, TERM, TestEnv, in_a_network, is_class, shared_memory, skip};
 use daemon::config::Gateway;
 use daemon::doctor::{Subjects, System, examine};
 use schema::Domain;
@@ -144,7 +144,7 @@ fn what_is_short() {
     };
     let attempt = mounted("size=64k", "true").arg("true").output();
     if !attempt.is_ok_and(|output| output.status.success()) {
-        eprintln!("skipped: this user may not make a mount namespace");
+        skip("mounts", "this user may not make a mount namespace");
         return;
     }
     for (set_up, options, after, remedy) in [
@@ -172,7 +172,7 @@ fn what_is_wrong_with_the_domain() {
         fs::set_permissions(&root, fs::Permissions::from_mode(0o700)).expect("root may");
         Findings::of(&env, &[]).complain("the domain is another user's", "domain", "failed", "run as user 1");
     } else {
-        eprintln!("skipped: this user cannot give a directory away");
+        skip("root", "this user cannot give a directory away");
     }
     let nowhere = env.command_at(Path::new("/dev/null"), &["doctor", "--json", "--no-system-config"]);
     let findings = Findings::in_outcome(&Program::start(nowhere).wait());

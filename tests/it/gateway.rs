@@ -4,7 +4,7 @@
 use std::net::{Ipv4Addr, UdpSocket};
 
 use crate::testkit::{
-    INT, KILL, Outcome, Receiver, TERM, TestEnv, hash, in_a_network, is_class, number, read, until,
+    INT, KILL, Outcome, Receiver, TERM, TestEnv, hash, in_a_network, is_class, number, read, skip, until,
 };
 use schema::datagram::{Account, Announce, Datagram, Packed};
 use schema::{Scan, Topic, Verdict, Zones};
@@ -210,7 +210,7 @@ fn copies_are_the_same_and_a_dead_host_disturbs_nobody() {
 fn copies_go_over_ipv6_too() {
     in_a_network("gateway::copies_go_over_ipv6_too", || {
         let Ok(copies) = UdpSocket::bind("[::1]:30000") else {
-            eprintln!("skipped: no IPv6 here");
+            skip("ipv6", "no IPv6 here");
             return;
         };
         let env = TestEnv::new();

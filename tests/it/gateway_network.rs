@@ -5,7 +5,7 @@ use std::net::Ipv4Addr;
 use std::process::{Command, Stdio};
 
 use crate::testkit::{
-    Outcome, Program, Receiver, TERM, TestEnv, USR1, in_a_network, ip, is_class, number, read, until,
+    Outcome, Program, Receiver, TERM, TestEnv, USR1, in_a_network, ip, is_class, number, read, skip, until,
 };
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
 use rustix::pipe::fcntl_setpipe_size;
@@ -125,7 +125,7 @@ fn what_a_full_queue_drops_is_counted() {
         receiver.await_more(10, |datagram| datagram.head.topic == Topic::Scan.number());
         let limit = "qdisc add dev ours root tbf rate 64kbit burst 2000 limit 4000";
         if !Command::new("tc").args(limit.split(' ')).status().is_ok_and(|status| status.success()) {
-            eprintln!("skipped: there is no queue that can be limited here");
+            skip("tc", "there is no queue that can be limited here");
             return;
         }
         let failing = await_state(&mut gateway, "failing");

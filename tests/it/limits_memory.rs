@@ -5,7 +5,7 @@ use std::fs::{File, OpenOptions};
 use std::io::{ErrorKind, Write};
 use std::process::Command;
 
-use crate::testkit::{INT, Outcome, TERM, TestEnv, is_class, only, own_program, run_again, sequence};
+use crate::testkit::{INT, Outcome, TERM, TestEnv, is_class, only, own_program, run_again, sequence, skip};
 use rustix::process::Signal;
 
 /// Where the namespace is made: the test that shall run in it.
@@ -25,7 +25,7 @@ fn in_a_namespace(name: &str, test: impl FnOnce()) {
     let mut attempt = Command::new("unshare");
     attempt.args(unshare.get_args()).args(["mount", "-t", "tmpfs", "tmpfs", "/dev/shm"]);
     if !allowed(attempt) {
-        eprintln!("skipped: this user may not make a mount namespace");
+        skip("mounts", "this user may not make a mount namespace");
         return;
     }
     unshare.arg(own_program()).args(only(name)).env(INSIDE, "1");

@@ -5,7 +5,7 @@ use std::io::Read;
 
 use crate::testkit;
 use crate::testkit::{
-    INT, Outcome, Program, Sender, TestEnv, in_a_network, is_class, number, terminal, until, wall_ns,
+    INT, Outcome, Program, Sender, TestEnv, in_a_network, is_class, number, skip, terminal, until, wall_ns,
 };
 use schema::datagram::{HEAD, Refusal, WINDOW};
 use schema::{Background, Foreground, Mark, Marks, Scan, State, Status, Topic, Verdict, Zones};
@@ -190,7 +190,7 @@ fn groups_are_joined_where_a_link_comes_or_comes_back() {
     in_a_network("listen::groups_are_joined_where_a_link_comes_or_comes_back", || {
         let make = || ip("link add scan0 type veth peer name far0") && ip("addr add 10.9.0.1/24 dev scan0");
         if !make() {
-            eprintln!("skipped: the kernel makes no pair of interfaces");
+            skip("veth", "the kernel makes no pair of interfaces");
             return;
         }
         let env = TestEnv::new();

@@ -4,7 +4,7 @@
 use std::collections::BTreeSet;
 use std::os::fd::OwnedFd;
 
-use crate::testkit::{INT, Machine, TestEnv, command_in, in_a_network, ip, until};
+use crate::testkit::{INT, Machine, TestEnv, command_in, in_a_network, ip, skip, until};
 use rustix::net::{AddressFamily, RecvFlags, SocketFlags, SocketType, eth, recv, socket_with};
 
 /// What comes to the network of the test of IGMP, version 2.
@@ -108,7 +108,7 @@ fn speaks_version_2(machine: &Machine, interface: &str) -> bool {
     version.args(["-c", &format!("echo 2 > {path}")]);
     let is_done = version.status().is_ok_and(|status| status.success());
     if !is_done {
-        eprintln!("skipped: the version of IGMP cannot be chosen here");
+        skip("igmp", "its version cannot be chosen here");
     }
     is_done
 }

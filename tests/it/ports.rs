@@ -3,7 +3,7 @@
 use std::os::unix::fs::{PermissionsExt, chown, symlink};
 use std::os::unix::process::CommandExt;
 
-use crate::testkit::{Line, Program, TERM, TestEnv, until};
+use crate::testkit::{Line, Program, TERM, TestEnv, skip, until};
 use rustix::process::geteuid;
 use serde_json::Value;
 
@@ -77,7 +77,7 @@ fn what_this_user_may_not_open() {
     if is_root {
         chown(&home, Some(NOBODY), Some(NOBODY)).expect("root may");
         if !command_can_run(NOBODY) {
-            eprintln!("skipped: the program lies where only root may run it");
+            skip("open-directory", "the program lies where only root may run it");
             return;
         }
         command.uid(NOBODY).gid(NOBODY);

@@ -10,7 +10,7 @@ use std::thread;
 use std::time::{Duration, Instant};
 
 use crate::testkit::{
-    INT, Kept, Outcome, Program, Recording, TestEnv, is_class, number, scan, unbroken, until,
+    INT, Kept, Outcome, Program, Recording, TestEnv, is_class, number, scan, skip, unbroken, until,
 };
 use serde_json::Value;
 
@@ -138,7 +138,7 @@ fn a_full_disk_is_waited_for() {
     let mount = format!("mount -t tmpfs -o size=256k none {0} && echo > {0}/filler", place.display());
     let trial = Command::new("unshare").args(["-rm", "sh", "-c", &mount]).output();
     if !trial.is_ok_and(|outcome| outcome.status.success()) {
-        eprintln!("skipped: this user may not make a file system of its own (unshare -rm, mount)");
+        skip("mounts", "this user may not make a file system of its own (unshare -rm, mount)");
         return;
     }
     let _others = sensor(&env);

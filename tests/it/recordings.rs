@@ -4,7 +4,7 @@
 use std::path::PathBuf;
 
 use crate::testkit;
-use crate::testkit::{INT, KILL, Outcome, Program, TestEnv, bytes_of, number, sequence};
+use crate::testkit::{INT, KILL, Outcome, Program, TestEnv, bytes_of, number, sequence, skip};
 use lms::variant::{Mode, Unit};
 use serde_json::Value;
 
@@ -213,7 +213,7 @@ fn data() -> Option<PathBuf> {
     if place.is_dir() {
         return Some(place);
     }
-    println!("skipped: no recordings of real sensors at {}", place.display());
+    skip("recordings", format!("none of real sensors at {}", place.display()));
     None
 }
 

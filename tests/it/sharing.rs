@@ -34,7 +34,7 @@ fn among_users(name: &str, test: impl FnOnce()) {
     };
     let is_root = rustix::process::getuid().is_root();
     if !is_root || !unshare("true").output().is_ok_and(|output| output.status.success()) {
-        eprintln!("skipped: only root can be two users, and needs namespaces and `ip` for it");
+        testkit::skip("root", "only root can be two users, and needs namespaces and `ip` for it");
         return;
     }
     let mut inside = unshare(&format!("exec /mnt/test --exact {name} --nocapture"));

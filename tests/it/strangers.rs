@@ -32,7 +32,7 @@ fn beside_a_stranger(name: &str, test: impl FnOnce()) {
     };
     let is_root = rustix::process::getuid().is_root();
     if !is_root || !unshare("true").output().is_ok_and(|output| output.status.success()) {
-        eprintln!("skipped: only root can be two users, and needs a mount namespace for it");
+        testkit::skip("root", "only root can be two users, and needs a mount namespace for it");
         return;
     }
     let mut inside = unshare(&format!("exec /mnt/test --exact {name} --nocapture"));

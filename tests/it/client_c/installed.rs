@@ -7,7 +7,7 @@ use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
 use std::sync::OnceLock;
 
-use crate::testkit::TestEnv;
+use crate::testkit::{TestEnv, skip};
 
 /// A place where the library and its header are.
 pub(crate) struct Installed {
@@ -73,7 +73,7 @@ impl Installed {
     pub(crate) fn compile_static(&self, env: &TestEnv, source: &Path) -> Option<PathBuf> {
         let mut ask = self.with_packages("pkg-config");
         let Ok(said) = ask.args(["--static", "--libs-only-l", "scanhub"]).output() else {
-            eprintln!("skipped: a program with the library in it (there is no pkg-config)");
+            skip("pkg-config", "there is none, which says how the library gets into a program");
             return None;
         };
         let said = done(&said).unwrap_or_else(|said| panic!("{said}"));
@@ -129,7 +129,7 @@ impl Installed {
 pub(crate) fn is_there(name: &str) -> bool {
     let found = Command::new(name).arg("--version").output().is_ok();
     if !found {
-        eprintln!("skipped: there is no {name}");
+        skip(name, "there is none");
     }
     found
 }

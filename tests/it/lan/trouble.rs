@@ -5,7 +5,7 @@ use std::time::Instant;
 
 use crate::testkit::{
     INT, KILL, Machine, Outcome, Program, Receiver, Relay, Robot, TERM, TestEnv, in_a_network, ip, is_class,
-    number, read, until,
+    number, read, skip, until,
 };
 use schema::datagram::{Account, Datagram, Packed};
 use schema::{Topic, Verdict, Zones};
@@ -90,7 +90,7 @@ fn a_queue_is_full() {
         let mut gateway = robot.gateway::<&str>(&[]);
         receiver.await_more(10, is_scan);
         if !robot.machine.try_run("tc qdisc add dev eth0 root tbf rate 128kbit burst 2kb limit 4kb") {
-            eprintln!("skipped: there is no tc or no tbf");
+            skip("tc", "there is no tc or no tbf");
             return;
         }
         await_link(&mut gateway, "eth0", "failing");
