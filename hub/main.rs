@@ -316,5 +316,6 @@ fn start_log() {
         .with_writer(|| replay::line::Log)
         .with_max_level(level.unwrap_or(LevelFilter::INFO))
         .with_target(false)
+        .with_ansi(false)
         .init();
 }
