@@ -1,0 +1,75 @@
+//! A line that loses bytes: hub and clients say how much of the stream that costs, as the simulator has it.
+
+use std::thread;
+use std::time::Duration;
+
+use crate::testkit::{INT, Stage, TERM, number};
+
+/// What the paper found on a line of theirs.
+const BURSTS: &str = "--fault=loss=0.00135,burst=1.89";
+
+#[test]
+fn a_line_that_loses_is_seen_everywhere() {
+    let stage = Stage::new();
+    let flags = ["--baud=500000", "--state=streaming", "--seed=5", BURSTS];
+    let simulator = stage.simulator(&["front"], &flags);
+    let hub = stage.hub(&[stage.link("front")]);
+    let mut consumer = stage.start(&["hz", "--json", "front/scan"]);
+    let leds = stage.start(&["leds", "front", "--json"]);
+    stage.await_info("front", |info| number(&info["counters"], "due_on_line") > 30);
+    let begin = stage.info("front");
+    let begun = stage.truth("front").len();
+    thread::sleep(Duration::from_secs(12));
+    let end = stage.info("front");
+    // A status is of this second, and what is missing is lost a second later.
+    let sent = &stage.truth("front")[begun..];
+    let damaged = sent.iter().filter(|sent| sent.fault.is_some()).count() as f64;
+    let grown = |name: &str| number(&end["counters"], name) as f64 - number(&begin["counters"], name) as f64;
+    let (lost, due) = (grown("lost_on_line"), grown("due_on_line"));
+    let (share, truth) = (lost / due, damaged / sent.len() as f64);
+    println!("{lost} of {due} lost, {damaged} of {} in truth", sent.len());
+    assert!(due > 350.0 && (share - truth).abs() < 0.1, "{share} instead of {truth}: {end}");
+    let told = end["damaged"].as_f64().unwrap_or_default();
+    assert!((0.3..0.55).contains(&told), "{end}");
+    assert_eq!(number(&end, "lost_on_line"), number(&end["counters"], "lost_on_line"));
+
+    let text = stage.run(&["info", "front"]).to_string();
+    assert!(text.contains("of the bytes damaged") && text.contains("of the scans lost in 10 s"), "{text}");
+    let outcome = stage.run(&["doctor", &stage.word("front"), "--json"]);
+    let checks = outcome.of_class("check");
+    let check = checks.iter().find(|check| check["name"] == "line-loss").expect("it is looked at");
+    assert_eq!(check["state"], "warning", "{check}");
+    let found = check["finding"].as_str().unwrap_or_default();
+    assert!(found.contains(" % lost on the line; "), "{check}");
+
+    let line = consumer.await_line("a rate with losses", |line| {
+        line["class"] == "hz" && line["lost_on_line"].as_u64() > Some(50)
+    });
+    assert!(line["lost"] == 0 && line["damaged"].as_f64() > Some(0.3), "{line}");
+    let outcome = consumer.end(INT);
+    let [summary] = &outcome.of_class("summary")[..] else { panic!("{outcome}") };
+    assert!(summary["lost_on_line"].as_u64() > Some(50), "{summary}");
+    assert!((0.3..0.55).contains(&summary["damaged"].as_f64().unwrap_or_default()), "{summary}");
+    let outcome = leds.end(INT);
+    let is_told = |line: &serde_json::Value| {
+        line["reason"].as_str().is_some_and(|reason| reason.ends_with(" % lost on the line"))
+    };
+    assert!(outcome.of_class("leds").iter().any(is_told), "{outcome}");
+    assert_eq!(hub.end(TERM).code, Some(0));
+    assert_eq!(simulator.end(INT).code, Some(0));
+}
+
+#[test]
+fn a_line_that_is_well_says_so_from_the_first_second() {
+    let stage = Stage::new();
+    let simulator = stage.simulator(&["front"], &["--baud=9600", "--seed=5"]);
+    let hub = stage.hub(&[stage.link("front")]);
+    let info = stage.await_info("front", |info| number(&info["counters"], "due_on_line") > 60);
+    assert_eq!((&info["damaged"], &info["lost_on_line"]), (&0.0.into(), &0.into()), "{info}");
+    let outcome = stage.run(&["doctor", &stage.word("front"), "--json"]);
+    let checks = outcome.of_class("check");
+    let check = checks.iter().find(|check| check["name"] == "line-loss").expect("it is looked at");
+    assert_eq!(check["state"], "ok", "{check}");
+    assert_eq!(hub.end(TERM).code, Some(0));
+    assert_eq!(simulator.end(INT).code, Some(0));
+}
