@@ -7,8 +7,8 @@ use std::fs;
 use std::thread;
 use std::time::Duration;
 
-use clients::Attachment;
 use rustix::process::Signal;
+use scanhub_client::Attachment;
 use schema::ipc::{self, Payload};
 use schema::{Domain, Scan, limits};
 use serde_json::Value;

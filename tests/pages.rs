@@ -17,8 +17,8 @@ mod shell;
 mod stage;
 
 use blocks::{Block, blocks};
-use clients::Attachment;
 use program::Example;
+use scanhub_client::Attachment;
 use schema::Scan;
 use stage::{Outcome, Program, Stage, TERM, until};
 
@@ -176,7 +176,7 @@ fn a_program_that_takes_codes_for_distances_is_found() {
         (block("python", &format!("{follow}print(scan.ranges.min() * scan.unit_mm, 'mm')\n")), "it says"),
         (block("python", &format!("{follow}print(scan.ranges_m[scan.valid].min(), 'm')\n")), "it failed"),
         (block("python", &format!("{follow}print(scan.ranges[180])\n")), "no distance with its unit"),
-        (block("rust", "clients::attach::<schema::Scan>(\"front\").unwrap();\n"), "mismatched types"),
+        (block("rust", "scanhub_client::attach::<schema::Scan>(\"front\").unwrap();\n"), "mismatched types"),
         (block("c", "puts(scanhub_open());\n"), "too few arguments"),
     ];
     let situations = [SITUATIONS[0], SITUATIONS[4]];

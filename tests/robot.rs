@@ -3,7 +3,7 @@
 
 mod stage;
 
-use clients::{Robot, RobotFollower};
+use scanhub_client::{Robot, RobotFollower};
 use schema::{Topic, Verdict, Zones};
 use serde_json::{Value, json};
 use stage::{INT, KILL, Program, Sender, Stage, TERM, in_a_network, until};

@@ -1,8 +1,8 @@
 //! Topics: a service with the settings of the hub's own, for messages of any length, and the hub's own topic of scans for
 //! comparison. Published as the hub does: loaned, written in place, sent, then all are woken once.
 
-use clients::Attachment;
 use iceoryx2::prelude::ServiceName;
+use scanhub_client::Attachment;
 use schema::ipc::{
     self, Bell, Listener, Node, Payload, Publisher, SampleMut, Subscriber, TopicService, Waker,
 };

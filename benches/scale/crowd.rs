@@ -6,7 +6,7 @@ use std::sync::Barrier;
 use std::thread;
 use std::time::Duration;
 
-use clients::Wait;
+use scanhub_client::Wait;
 use schema::Scan;
 
 use crate::support::child::Child;

@@ -3,7 +3,7 @@
 
 use std::io::Write;
 
-use clients::Attachment;
+use scanhub_client::Attachment;
 use schema::ipc::Payload;
 use schema::{Domain, Environment, Header, Scan, Status, Zones};
 

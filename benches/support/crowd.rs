@@ -74,8 +74,9 @@ struct Counted {
 }
 
 fn count_scans(domain: &str, sensor: &str, all: &Barrier, seconds: u64) -> Outcome<Counted> {
-    let last =
-        |scan: Option<clients::Received<Scan>>| Ok::<_, &str>(scan.ok_or("nothing came")?.header().topic_seq);
+    let last = |scan: Option<scanhub_client::Received<Scan>>| {
+        Ok::<_, &str>(scan.ok_or("nothing came")?.header().topic_seq)
+    };
     let attached = || -> Outcome<_> {
         let mut scans = attach::<Scan>(domain, sensor)?.timeout(LONG);
         last(scans.next()?)?;

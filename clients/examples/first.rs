@@ -1,8 +1,8 @@
-//! The program of docs/first-consumer.md, which shows all below this: `cargo run --release -p scanhub-clients --example first`.
+//! The program of docs/first-consumer.md, which shows all below this: `cargo run --release -p scanhub-client --example first`.
 
 use std::time::Duration;
 
-use clients::attach;
+use scanhub_client::attach;
 use schema::{Failure, Scan};
 
 fn main() -> Result<(), Failure> {

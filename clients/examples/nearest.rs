@@ -1,6 +1,6 @@
 //! The nearest beam of every scan: `cargo run --example nearest front`.
 
-use clients::attach;
+use scanhub_client::attach;
 use schema::{Failure, Scan};
 
 fn main() -> Result<(), Failure> {

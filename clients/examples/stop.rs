@@ -1,6 +1,6 @@
 //! Whether the robot may go, said when it changes: `cargo run --example stop`.
 
-use clients::robot;
+use scanhub_client::robot;
 use schema::Failure;
 
 fn main() -> Result<(), Failure> {

@@ -107,7 +107,7 @@ fn of_rust(source: &Path, stage: &Stage) -> Result<PathBuf, String> {
 fn libraries() -> Vec<(String, PathBuf)> {
     let mut command = Command::new(env!("CARGO"));
     command.args(["build", "--offline", "--message-format=json", "--quiet", "--lib"]);
-    command.args(["--package=scanhub-clients", "--package=scanhub-schema"]);
+    command.args(["--package=scanhub-client", "--package=scanhub-schema"]);
     if !cfg!(debug_assertions) {
         command.arg("--release");
     }
@@ -119,7 +119,7 @@ fn libraries() -> Vec<(String, PathBuf)> {
         let name = message["target"]["name"].as_str()?.to_owned();
         let files = message["filenames"].as_array()?;
         let library = files.iter().filter_map(Value::as_str).find(|file| file.ends_with(".rlib"))?;
-        ["clients", "schema"]
+        ["scanhub_client", "schema"]
             .contains(&name.as_str())
             .then(|| (name, fs::canonicalize(library).expect("a file")))
     };

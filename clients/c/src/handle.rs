@@ -5,7 +5,7 @@ use std::os::fd::AsRawFd;
 use std::ptr;
 use std::time::{Duration, Instant};
 
-use clients::{Attachment, Heard, Received, RobotFollower, Wait, ZonesFollower};
+use scanhub_client::{Attachment, Heard, Received, RobotFollower, Wait, ZonesFollower};
 use schema::{Background, Domain, Failure, Foreground, Header, Marks, Scan, Status, Topic, limits};
 
 use crate::boundary::Lent;
