@@ -190,14 +190,27 @@ fn the_daemon_is_built_from_few_crates() {
     assert!(crates.len() <= 85, "{} crates: {crates:#?}", crates.len());
 }
 
-/// A consumer pays for shared memory, and for little else.
+/// A consumer pays for shared memory, and for little else: for no verb, nor for what verbs need.
 #[test]
-fn clients_are_built_from_few_crates() {
+fn the_client_is_built_from_few_crates() {
     let mut crates = crates::built_from("scanhub-client", &[]);
     let shared_memory = crates::built_from("iceoryx2", &[]);
     crates.retain(|name| !shared_memory.contains(name));
-    eprintln!("clients: {} crates beside those of iceoryx2", crates.len());
-    assert!(crates.len() <= 30, "{} crates: {crates:#?}", crates.len());
+    eprintln!("client: {} crates beside those of iceoryx2", crates.len());
+    assert!(crates.len() <= 15, "{} crates: {crates:#?}", crates.len());
+    const OF_VERBS: [&str; 8] = [
+        "scanhub-verbs",
+        "ratatui",
+        "hdrhistogram",
+        "serde_json",
+        "mcap",
+        "socket2",
+        "strsim",
+        "thread-priority",
+    ];
+    let of_verbs = |name: &&String| OF_VERBS.iter().any(|verb| name.split(' ').next() == Some(verb));
+    assert_eq!(crates.iter().find(of_verbs), None);
+    assert!(crates::built_from("scanhub-verbs", &[]).iter().any(|name| of_verbs(&name)));
 }
 
 #[test]
