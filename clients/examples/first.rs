@@ -2,11 +2,10 @@
 
 use std::time::Duration;
 
-use scanhub_client::attach;
-use schema::{Failure, Scan};
+use scanhub_client::{Failure, Scan, subscribe};
 
 fn main() -> Result<(), Failure> {
-    let mut scans = attach::<Scan>("front")?.timeout(Duration::from_millis(500));
+    let mut scans = subscribe::<Scan>("front")?.timeout(Duration::from_millis(500));
     loop {
         let Some(scan) = scans.next()? else {
             println!("no scan for half a second; there is a hub: {}", scans.hub_lives());

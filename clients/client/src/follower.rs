@@ -75,7 +75,7 @@ impl<P: Payload + ?Sized> Follower<P> {
     }
 
     /// The topic has been there at least once.
-    pub fn attached(&self) -> bool {
+    pub fn subscribed(&self) -> bool {
         self.port.is_some()
     }
 
@@ -84,7 +84,7 @@ impl<P: Payload + ?Sized> Follower<P> {
     /// [`Kind::Short`] if descriptors or memory are short, [`Kind::Failed`] if more than four samples are held or the
     /// topic has another layout.
     pub fn receive(&mut self, session: &mut Session) -> Result<Option<Received<P>>, Failure> {
-        if !self.attach(session)? {
+        if !self.subscribe(session)? {
             return Ok(None);
         }
         let Some((_, subscriber)) = &self.port else {
@@ -117,7 +117,7 @@ impl<P: Payload + ?Sized> Follower<P> {
         }
     }
 
-    fn attach(&mut self, session: &mut Session) -> Result<bool, Failure> {
+    fn subscribe(&mut self, session: &mut Session) -> Result<bool, Failure> {
         if self.port.as_ref().is_some_and(|(number, _)| *number == session.number()) {
             return Ok(true);
         }

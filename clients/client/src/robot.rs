@@ -7,8 +7,8 @@ use std::time::Duration;
 
 use schema::{Domain, Failure, Verdict, Zones, check_followed};
 
-use crate::attach::places;
 use crate::session::Session;
+use crate::subscribe::places;
 use crate::wait::Wait;
 pub use source::{RobotHeard, RobotSource};
 
@@ -76,7 +76,7 @@ impl RobotFollower {
         Ok(RobotFollower { session: Session::new(places), source: RobotSource::new(sensors) })
     }
 
-    /// As [`Attachment::wait_by`](crate::Attachment::wait_by).
+    /// As [`Subscription::wait_by`](crate::Subscription::wait_by).
     pub fn wait_by(self, wait: Wait) -> RobotFollower {
         RobotFollower { session: self.session.by(wait), ..self }
     }
@@ -111,7 +111,7 @@ impl RobotFollower {
         }
     }
 
-    /// As [`Attachment::wait`](crate::Attachment::wait); it is also over when a verdict becomes too old.
+    /// As [`Subscription::wait`](crate::Subscription::wait); it is also over when a verdict becomes too old.
     pub fn wait(&mut self, longest: Duration) -> Result<(), Failure> {
         self.session.wait_for(Some(self.source.left().map_or(longest, |left| left.min(longest))))
     }

@@ -34,8 +34,8 @@ macro_rules! samples {
 
         impl Source {
             /// The topic has been there at least once.
-            pub fn attached(&self) -> bool {
-                match self { $(Source::$kind(source) => source.attached(),)* }
+            pub fn subscribed(&self) -> bool {
+                match self { $(Source::$kind(source) => source.subscribed(),)* }
             }
 
             /// The next sample that waits, or nothing; failures as [`Follower::receive`].

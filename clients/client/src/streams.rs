@@ -1,5 +1,5 @@
 //! Many topics in one thread: a session in a domain, what follows topics in it, and whether a hub is there. For programs
-//! for which one [`Attachment`](crate::Attachment) is too little.
+//! for which one [`Subscription`](crate::Subscription) is too little.
 
 pub use crate::follower::Follower;
 pub use crate::freshness::Freshness;

@@ -6,11 +6,11 @@ use std::time::Duration;
 
 use schema::{Domain, Failure, Header, Zones, check_followed};
 
-use crate::attach::places;
 use crate::clock;
 use crate::follower::Follower;
 use crate::freshness::Freshness;
 use crate::session::Session;
+use crate::subscribe::places;
 use crate::wait::Wait;
 
 /// Follows the zones of `sensor` in the domain that SCANHUB_DOMAIN names. There need not be a hub yet.
@@ -57,7 +57,7 @@ impl ZonesFollower {
         Ok(ZonesFollower { session: Session::new(places), source: ZonesSource::new(sensor) })
     }
 
-    /// As [`Attachment::wait_by`](crate::Attachment::wait_by).
+    /// As [`Subscription::wait_by`](crate::Subscription::wait_by).
     pub fn wait_by(self, wait: Wait) -> ZonesFollower {
         ZonesFollower { session: self.session.by(wait), ..self }
     }
@@ -66,7 +66,7 @@ impl ZonesFollower {
     /// after the last sample (of another machine not before half a second), a second after the start if there was none, and
     /// with a hub as without one.
     ///
-    /// Failures as [`Attachment::next`](crate::Attachment::next): nothing is known then either.
+    /// Failures as [`Subscription::next`](crate::Subscription::next): nothing is known then either.
     #[allow(clippy::should_implement_trait)] // There is no end that an iterator would have.
     pub fn next(&mut self) -> Result<Heard, Failure> {
         loop {
@@ -77,12 +77,12 @@ impl ZonesFollower {
         }
     }
 
-    /// As [`Attachment::wait`](crate::Attachment::wait); it is also over when the verdict becomes too old.
+    /// As [`Subscription::wait`](crate::Subscription::wait); it is also over when the verdict becomes too old.
     pub fn wait(&mut self, longest: Duration) -> Result<(), Failure> {
         self.session.wait_for(Some(self.source.left().map_or(longest, |left| left.min(longest))))
     }
 
-    /// As [`Attachment::descriptor`](crate::Attachment::descriptor), with [`try_next`](Self::try_next) of the zones; it gets
+    /// As [`Subscription::descriptor`](crate::Subscription::descriptor), with [`try_next`](Self::try_next) of the zones; it gets
     /// readable also when the verdict becomes too old.
     pub fn descriptor(&mut self) -> Result<BorrowedFd<'_>, Failure> {
         self.session.descriptor()
@@ -108,7 +108,7 @@ impl ZonesFollower {
 
     fn look(&mut self) -> Result<Option<Heard>, Failure> {
         // What is there comes before the question whether the hub still is: that takes longer than receiving.
-        if self.source.attached()
+        if self.source.subscribed()
             && let Some(heard) = self.source.newest(&mut self.session)?
         {
             return Ok(Some(heard));
@@ -136,8 +136,8 @@ impl ZonesSource {
     }
 
     /// The topic has been there at least once.
-    pub fn attached(&self) -> bool {
-        self.follower.attached()
+    pub fn subscribed(&self) -> bool {
+        self.follower.subscribed()
     }
 
     /// There was a sample, or the silence of one that does not come.

@@ -1,4 +1,4 @@
-//! Attachments in a poll set: readable when there is something to take, not readable after it was taken, over lives of
+//! Subscriptions in a poll set: readable when there is something to take, not readable after it was taken, over lives of
 //! the hub.
 
 mod fake;
@@ -8,7 +8,7 @@ use std::time::{Duration, Instant};
 
 use fake::{FakeHub, Place, until};
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
-use scanhub_client::{Attachment, Wait, ZonesFollower};
+use scanhub_client::{Subscription, Wait, ZonesFollower};
 use schema::ipc::{PortFactory, UpdateConnections};
 use schema::{Kind, Scan, Status, Verdict};
 
@@ -19,8 +19,8 @@ fn is_readable(descriptor: &OwnedFd, longest: Duration) -> bool {
     poll(&mut fds, Some(&longest)).unwrap() == 1
 }
 
-fn scans(place: &Place) -> (Attachment<Scan>, OwnedFd) {
-    let scans = Attachment::<Scan>::in_domain(place.places(), "front").unwrap();
+fn scans(place: &Place) -> (Subscription<Scan>, OwnedFd) {
+    let scans = Subscription::<Scan>::in_domain(place.places(), "front").unwrap();
     let mut scans = scans.wait_by(Wait::Event);
     let descriptor = scans.descriptor().unwrap().try_clone_to_owned().unwrap();
     (scans, descriptor)
@@ -30,7 +30,7 @@ fn scans(place: &Place) -> (Attachment<Scan>, OwnedFd) {
 const LONG: Duration = Duration::from_secs(20);
 
 /// Polls until there is a scan.
-fn polled(scans: &mut Attachment<Scan>, descriptor: &OwnedFd) -> (u64, bool, usize) {
+fn polled(scans: &mut Subscription<Scan>, descriptor: &OwnedFd) -> (u64, bool, usize) {
     let give_up_at = Instant::now() + LONG;
     loop {
         assert!(is_readable(descriptor, LONG) && Instant::now() < give_up_at);
@@ -43,7 +43,7 @@ fn polled(scans: &mut Attachment<Scan>, descriptor: &OwnedFd) -> (u64, bool, usi
 #[test]
 fn a_bell_has_no_descriptor() {
     let place = Place::new();
-    let mut scans = Attachment::<Scan>::in_domain(place.places(), "front").unwrap();
+    let mut scans = Subscription::<Scan>::in_domain(place.places(), "front").unwrap();
     let failure = scans.descriptor().unwrap_err();
     assert_eq!(failure.kind, Kind::Configuration);
     assert!(failure.hint.contains("by event"), "{failure}");
@@ -97,7 +97,7 @@ fn what_a_late_joiner_is_handed_makes_it_readable() {
     let place = Place::new();
     let mut hub = FakeHub::new(&place.domain, &["front"], 1);
     hub.front().status(|status| status.baud = 500_000);
-    let statuses = Attachment::<Status>::in_domain(place.places(), "front").unwrap();
+    let statuses = Subscription::<Status>::in_domain(place.places(), "front").unwrap();
     let mut statuses = statuses.wait_by(Wait::Event);
     let descriptor = statuses.descriptor().unwrap().try_clone_to_owned().unwrap();
     until("the status", || {

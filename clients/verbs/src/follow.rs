@@ -53,7 +53,7 @@ pub(crate) trait Sink {
     /// A topic will be followed.
     fn begin(&mut self, _name: &TopicName) {}
     /// The topic is there, and what is sent from now on will be received.
-    fn attached(&mut self, _name: &TopicName) {}
+    fn subscribed(&mut self, _name: &TopicName) {}
     /// A sample was received just now; who it is from and what was missed before it comes next.
     fn arrived(&mut self) {}
     /// A sample came, or one that stands for a silence and does not count.
@@ -243,7 +243,7 @@ impl<'a> Run<'a> {
             let now_ns = clock::now_ns();
             self.tracks
                 .iter_mut()
-                .filter(|track| track.source.attached())
+                .filter(|track| track.source.subscribed())
                 .for_each(|track| track.since_ns = now_ns);
             self.roll.begin(Instant::now());
         }
@@ -255,23 +255,23 @@ impl<'a> Run<'a> {
         let mut more = true;
         while more && !stop.load(Ordering::Relaxed) {
             more = false;
-            let mut attached = false;
+            let mut subscribed = false;
             for track in &mut self.tracks {
                 // That takes a thousand times as long as receiving: what waits of others comes before the next one.
-                if attached && !track.source.attached() {
+                if subscribed && !track.source.subscribed() {
                     more = true;
                     continue;
                 }
                 for turn in 0..TURN {
-                    let was_attached = track.source.attached();
+                    let was_subscribed = track.source.subscribed();
                     let received = track.source.receive(&mut self.session)?;
                     if received.is_some() {
                         sink.arrived();
                     }
-                    if !was_attached && track.source.attached() {
-                        attached = true;
+                    if !was_subscribed && track.source.subscribed() {
+                        subscribed = true;
                         track.since_ns = clock::now_ns();
-                        sink.attached(&track.name);
+                        sink.subscribed(&track.name);
                     }
                     let Some(sample) = received else { break };
                     more |= turn + 1 == TURN;

@@ -174,9 +174,9 @@ impl<'a> Gateway<'a> {
                 report.interface(&self.lan)?;
             }
             // What is there comes before the question whether the hub still is: that takes longer than sending.
-            let (mut more, mut attached) = (false, false);
+            let (mut more, mut subscribed) = (false, false);
             for sensor in &mut self.sensors {
-                more |= sensor.forward(&mut self.session, &mut self.lan, &mut attached)?;
+                more |= sensor.forward(&mut self.session, &mut self.lan, &mut subscribed)?;
             }
             let now = Instant::now();
             self.look(report, now)?;

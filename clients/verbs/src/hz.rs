@@ -81,7 +81,7 @@ impl Sink for Hz<'_> {
         self.windows.push(Followed { name: name.clone(), since_ns: u64::MAX, window });
     }
 
-    fn attached(&mut self, name: &TopicName) {
+    fn subscribed(&mut self, name: &TopicName) {
         let now_ns = clock::now_ns();
         self.windows.iter_mut().filter(|it| it.name == *name).for_each(|it| it.since_ns = now_ns);
     }
@@ -112,7 +112,7 @@ impl Sink for Hz<'_> {
 
     fn notice(&mut self, names: &[&TopicName], notice: Notice) -> Result<(), End> {
         if notice == Notice::HubBack {
-            names.iter().for_each(|name| self.attached(name));
+            names.iter().for_each(|name| self.subscribed(name));
         }
         if self.json {
             return json::notices(&mut self.out, names, notice);

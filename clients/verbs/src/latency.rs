@@ -1,5 +1,5 @@
 //! `scanhub latency`: how old samples are when they are received here, and where they spent that time. What is seen is
-//! what a consumer of the attach library sees that waits in the same way.
+//! what a consumer of the client library sees that waits in the same way.
 
 mod ages;
 mod grain;
@@ -127,7 +127,7 @@ impl Latency<'_> {
 }
 
 impl Sink for Latency<'_> {
-    fn attached(&mut self, name: &TopicName) {
+    fn subscribed(&mut self, name: &TopicName) {
         let now_ns = clock::now_ns();
         if let Some((_, spans)) = self.topics.iter_mut().find(|(known, _)| known == name) {
             spans.begin(now_ns);

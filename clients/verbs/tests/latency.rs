@@ -32,7 +32,7 @@ fn three_zones(place: &Place, options: LatencyOptions) -> (Result<(), Failure>, 
     let mut hub = FakeHub::new(&place.domain, &["front"], 1);
     let verb = start(options);
     hub.front().zones.await_subscribers(1);
-    // It has to be past its attachment, which is told by nothing but what it receives.
+    // It has to be past its subscription, which is told by nothing but what it receives.
     while !verb.finished() {
         hub.front().zones(Verdict::Clear, 700);
         std::thread::sleep(Duration::from_millis(5));

@@ -7,7 +7,7 @@ use std::process::{Child, Command};
 use std::time::Duration;
 
 use fake::{FakeHub, Place, Verb, until};
-use scanhub_client::Attachment;
+use scanhub_client::Subscription;
 use schema::ipc::PortFactory;
 use schema::{Domain, Scan, holder};
 use verbs::{Bounds, EchoOptions, Format, echo};
@@ -79,9 +79,9 @@ fn echo_goes_on_after_a_killed_hub() {
 }
 
 #[test]
-fn an_attachment_says_that_the_hub_was_restarted() {
+fn a_subscription_says_that_the_hub_was_restarted() {
     let place = Place::new();
-    let mut scans = Attachment::<Scan>::in_domain(place.places(), "front").unwrap();
+    let mut scans = Subscription::<Scan>::in_domain(place.places(), "front").unwrap();
     assert!(!scans.hub_lives() && scans.try_next().unwrap().is_none());
     let hub = Hub::start(&place, 1);
     for _ in 0..5 {
@@ -100,11 +100,11 @@ fn an_attachment_says_that_the_hub_was_restarted() {
 }
 
 #[test]
-fn an_attachment_times_out_and_goes_on() {
+fn a_subscription_times_out_and_goes_on() {
     let place = Place::new();
     let mut hub = FakeHub::new(&place.domain, &["front"], 1);
     let timeout = Duration::from_millis(20);
-    let mut scans = Attachment::<Scan>::in_domain(place.places(), "front").unwrap().timeout(timeout);
+    let mut scans = Subscription::<Scan>::in_domain(place.places(), "front").unwrap().timeout(timeout);
     until("nothing", || scans.next().unwrap().is_none() && scans.hub_lives());
     hub.front().scan.await_subscribers(1);
     hub.front().scan(&[7; 361]);
@@ -114,9 +114,9 @@ fn an_attachment_times_out_and_goes_on() {
 }
 
 #[test]
-fn an_attachment_goes_on_after_a_hub_that_ended_well() {
+fn a_subscription_goes_on_after_a_hub_that_ended_well() {
     let place = Place::new();
-    let mut scans = Attachment::<Scan>::in_domain(place.places(), "front").unwrap();
+    let mut scans = Subscription::<Scan>::in_domain(place.places(), "front").unwrap();
     for boot in 1..4 {
         let mut hub = FakeHub::new(&place.domain, &["front"], boot);
         until("the consumer", || {
@@ -137,7 +137,7 @@ fn a_client_that_comes_between_two_hubs() {
     until("its topics", || schema::ipc::sensors(&place.domain).is_ok_and(|sensors| !sensors.is_empty()));
     hub.kill(&place);
     let timeout = Duration::from_millis(50);
-    let mut scans = Attachment::<Scan>::in_domain(place.places(), "front").unwrap().timeout(timeout);
+    let mut scans = Subscription::<Scan>::in_domain(place.places(), "front").unwrap().timeout(timeout);
     assert!(scans.next().unwrap().is_none() && !scans.hub_lives());
     let _hub = Hub::start(&place, 2);
     until("a scan", || scans.next().unwrap().is_some_and(|scan| scan.header().boot == 2 && !scan.restarted));
@@ -147,7 +147,7 @@ fn a_client_that_comes_between_two_hubs() {
 fn the_numbers_of_a_network_go_on_over_lives_of_a_hub() {
     let place = Place::new();
     let mut hub = FakeHub::new(&place.domain, &["front"], 1);
-    let mut scans = Attachment::<Scan>::in_domain(place.places(), "front").unwrap();
+    let mut scans = Subscription::<Scan>::in_domain(place.places(), "front").unwrap();
     assert!(scans.try_next().unwrap().is_none());
     hub.front().flags = schema::Flags::REMOTE;
     let mut missed = |hub: &mut FakeHub, boot: u64, topic_seq: u64| {

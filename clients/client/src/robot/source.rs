@@ -78,8 +78,8 @@ impl RobotSource {
     }
 
     /// The topic of each sensor has been there at least once.
-    pub fn attached(&self) -> bool {
-        !self.parts.is_empty() && self.parts.iter().all(ZonesSource::attached)
+    pub fn subscribed(&self) -> bool {
+        !self.parts.is_empty() && self.parts.iter().all(ZonesSource::subscribed)
     }
 
     /// The next sample of any sensor, or a silence, once each has spoken; failures as [`ZonesSource::receive`].

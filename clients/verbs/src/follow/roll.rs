@@ -34,7 +34,7 @@ impl Run<'_> {
 
     /// A hub that is up has all its topics: a sensor that is not among them is no sensor of it.
     pub(super) fn check_sensors(&mut self) -> Result<(), End> {
-        if !self.tracks.is_empty() && self.tracks.iter().all(|track| track.source.attached()) {
+        if !self.tracks.is_empty() && self.tracks.iter().all(|track| track.source.subscribed()) {
             return Ok(());
         }
         if self.session.domain().is_none() {
@@ -63,7 +63,7 @@ impl Run<'_> {
         for track in &self.tracks {
             let sensor = &track.name.sensor;
             let is_there = track.name.is_robot() || sensors.contains(sensor) || self.may_come(brings(sensor));
-            if !track.source.attached() && !is_there {
+            if !track.source.subscribed() && !is_there {
                 return Err(no_sensor(sensor, &sensors).into());
             }
         }

@@ -57,19 +57,19 @@ impl Sensor {
         Sensor { name: name.to_owned(), tracks, heard: None, kind: String::new(), model: None, is_announced }
     }
 
-    /// Sends what waits; whether more may. If nothing `attached` to a topic yet in this round it may, and says so: that takes
+    /// Sends what waits; whether more may. If nothing `subscribed` to a topic yet in this round it may, and says so: that takes
     /// a thousand times as long as sending, so that what waits of others has its turn before the next one. Failures as
     /// [`Source::receive`].
     pub(super) fn forward(
         &mut self,
         session: &mut Session,
         lan: &mut Lan,
-        attached: &mut bool,
+        subscribed: &mut bool,
     ) -> Result<bool, Failure> {
         let mut more = false;
         for at in 0..self.tracks.len() {
-            let is_new = !self.tracks[at].source.attached();
-            if is_new && *attached {
+            let is_new = !self.tracks[at].source.subscribed();
+            if is_new && *subscribed {
                 more = true;
                 continue;
             }
@@ -78,7 +78,7 @@ impl Sensor {
                 more |= turn + 1 == TURN;
                 self.take(at, &sample, lan);
             }
-            *attached |= is_new && self.tracks[at].source.attached();
+            *subscribed |= is_new && self.tracks[at].source.subscribed();
         }
         Ok(more)
     }

@@ -1,4 +1,4 @@
-//! The attach library: one topic of one sensor, in place, for as long as you like. Waits for a hub that is not there
+//! The client library: one topic of one sensor, in place, for as long as you like. Waits for a hub that is not there
 //! yet and goes on after one that was killed. Hides what it is woken by.
 
 use std::os::fd::BorrowedFd;
@@ -15,8 +15,8 @@ use crate::wait::Wait;
 /// SCANHUB_DOMAIN names. There need not be a hub yet. Who acts on zones follows them by [`zones`](crate::zones).
 ///
 /// [`Kind::Configuration`](schema::Kind) if a name is not possible.
-pub fn attach<P: Payload + ?Sized>(sensor: &str) -> Result<Attachment<P>, Failure> {
-    Attachment::in_domain(places(None)?, sensor)
+pub fn subscribe<P: Payload + ?Sized>(sensor: &str) -> Result<Subscription<P>, Failure> {
+    Subscription::in_domain(places(None)?, sensor)
 }
 
 /// Where `domain` may be, or if none is named that which SCANHUB_DOMAIN names.
@@ -34,19 +34,19 @@ pub fn places(domain: Option<&str>) -> Result<Vec<Domain>, Failure> {
 }
 
 /// A topic that is being followed.
-pub struct Attachment<P: Payload + ?Sized> {
+pub struct Subscription<P: Payload + ?Sized> {
     session: Session,
     follower: Follower<P>,
     timeout: Option<Duration>,
 }
 
-impl<P: Payload + ?Sized> Attachment<P> {
-    /// As [`attach`], in the first live one of `places`.
+impl<P: Payload + ?Sized> Subscription<P> {
+    /// As [`subscribe`], in the first live one of `places`.
     ///
     /// [`Kind::Configuration`](schema::Kind) if the sensor's name is not possible.
     pub fn in_domain(places: Vec<Domain>, sensor: &str) -> Result<Self, Failure> {
         check_followed(sensor)?;
-        Ok(Attachment { session: Session::new(places), follower: Follower::new(sensor), timeout: None })
+        Ok(Subscription { session: Session::new(places), follower: Follower::new(sensor), timeout: None })
     }
 
     /// Lets [`next`](Self::next) answer `None` after a silence of `timeout`; without it waits forever.
@@ -57,7 +57,7 @@ impl<P: Payload + ?Sized> Attachment<P> {
 
     /// Waits by `wait`, to be said before the first sample is asked for; without it by [`Wait::Doorbell`].
     pub fn wait_by(self, wait: Wait) -> Self {
-        Attachment { session: self.session.by(wait), ..self }
+        Subscription { session: self.session.by(wait), ..self }
     }
 
     /// Waits for the next sample; `None` only after the timeout. Drop the sample before the next call.
@@ -100,7 +100,7 @@ impl<P: Payload + ?Sized> Attachment<P> {
     }
 
     /// What is readable while there may be a sample, for who waits for other things as well: to be polled, never read. It
-    /// is the same for as long as the attachment lives, whatever becomes of the hub. [`try_next`](Self::try_next) makes it
+    /// is the same for as long as the subscription lives, whatever becomes of the hub. [`try_next`](Self::try_next) makes it
     /// unreadable by answering `None`; until then poll does not sleep. It also gets readable when there is nothing: each
     /// second, ten times a second while there is no hub, and when other topics of the sensor have something.
     ///
@@ -111,7 +111,7 @@ impl<P: Payload + ?Sized> Attachment<P> {
 
     fn look(&mut self) -> Result<Option<Received<P>>, Failure> {
         // What is there comes before the question whether the hub still is: that takes longer than receiving.
-        if self.follower.attached()
+        if self.follower.subscribed()
             && let Some(received) = self.follower.receive(&mut self.session)?
         {
             return Ok(Some(received));
