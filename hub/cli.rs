@@ -26,9 +26,9 @@ use std::path::PathBuf;
 use std::time::Duration;
 
 use clap::{Args, Command, CommandFactory, FromArgMatches, Parser, Subcommand};
-use clients::{Bounds, duration};
 use daemon::config::Sources;
 use schema::{DEFAULT_DOMAIN, Domain, Environment, Failure};
+use verbs::{Bounds, duration};
 
 pub(crate) use background::Background;
 pub(crate) use complete::Complete;
