@@ -8,7 +8,7 @@ use std::collections::HashSet;
 use std::path::Path;
 use std::process::{Command, Output};
 
-use crate::testkit::{INT, KILL, Program, Stage, TERM, hash, is_class, number};
+use crate::testkit::{INT, KILL, Program, TERM, TestEnv, hash, is_class, number};
 use installed::{Installed, header_directory, is_there, source};
 use schema::{Header, Scan};
 use serde_json::Value;
@@ -19,11 +19,11 @@ fn succeeded(output: &Output) -> String {
     text(&output.stdout)
 }
 
-/// A program that finds the hub of this stage.
-fn program(stage: &Stage, program: &Path, words: &[&str]) -> Program {
+/// A program that finds the hub of this environment.
+fn program(env: &TestEnv, program: &Path, words: &[&str]) -> Program {
     let mut command = Command::new(program);
-    command.args(words).env("SCANHUB_DOMAIN", stage.place().name()).env_remove("XDG_RUNTIME_DIR");
-    command.env("RUNTIME_DIRECTORY", stage.place().root().parent().expect("it has one"));
+    command.args(words).env("SCANHUB_DOMAIN", env.place().name()).env_remove("XDG_RUNTIME_DIR");
+    command.env("RUNTIME_DIRECTORY", env.place().root().parent().expect("it has one"));
     Program::start(command)
 }
 
@@ -39,8 +39,8 @@ fn the_header_has_the_layout_of_schema() {
     if !is_there("cc") {
         return;
     }
-    let stage = Stage::new();
-    stage.file("layout.c", layout::program());
+    let env = TestEnv::new();
+    env.file("layout.c", layout::program());
     for (compiler, standard) in
         [("cc", "-std=c99"), ("cc", "-std=c11"), ("c++", "-std=c++11"), ("c++", "-std=c++20")]
     {
@@ -52,9 +52,9 @@ fn the_header_has_the_layout_of_schema() {
         if compiler == "c++" {
             cc.args(["-x", "c++"]);
         }
-        cc.arg("-I").arg(header_directory()).arg(stage.path("layout.c")).arg("-o").arg(stage.path("layout"));
+        cc.arg("-I").arg(header_directory()).arg(env.path("layout.c")).arg("-o").arg(env.path("layout"));
         succeeded(&cc.output().expect("a compiler"));
-        let said = succeeded(&Command::new(stage.path("layout")).output().expect("it runs"));
+        let said = succeeded(&Command::new(env.path("layout")).output().expect("it runs"));
         assert_eq!(said.lines().collect::<Vec<_>>(), layout::expected(), "{compiler} {standard}");
     }
 }
@@ -65,13 +65,13 @@ fn both_headers_go_into_one_program() {
     if !is_there("cc") {
         return;
     }
-    let stage = Stage::new();
+    let env = TestEnv::new();
     let [lan, attach] = ["#include <scanhub.h>\n", "#include <scanhub/attach.h>\n"];
     for text in [format!("{lan}{attach}"), format!("{attach}{lan}{attach}")] {
-        let file = stage.file("both.c", format!("{text}int both(void);\nint both(void) {{ return 0; }}\n"));
+        let file = env.file("both.c", format!("{text}int both(void);\nint both(void) {{ return 0; }}\n"));
         let mut cc = Command::new("cc");
         cc.args(["-std=c99", "-Wall", "-Wextra", "-Werror", "-pedantic", "-c", &file, "-o"]);
-        cc.arg(stage.path("both.o")).arg("-I").arg(header_directory());
+        cc.arg(env.path("both.o")).arg("-I").arg(header_directory());
         cc.arg("-I").arg(Path::new(env!("CARGO_MANIFEST_DIR")).join("clients/c"));
         succeeded(&cc.output().expect("a compiler"));
     }
@@ -82,7 +82,7 @@ fn what_the_header_computes_is_what_schema_computes() {
     if !is_there("cc") {
         return;
     }
-    let stage = Stage::new();
+    let env = TestEnv::new();
     let header = Header { stamp_first_ns: 5_000_000_000, ..Header::default() };
     for (count, range_bits, step_mdeg, unit_mm) in
         [(361, 13, 500, 1), (181, 14, 1000, 10), (401, 15, 250, 100), (0, 13, 0, 1), (u16::MAX, 13, 1, 1)]
@@ -93,12 +93,12 @@ fn what_the_header_computes_is_what_schema_computes() {
         for (i, range) in scan.range_array.iter_mut().enumerate() {
             *range = (max - (i as u32 * 3) % 40) as u16;
         }
-        stage.file("computes.c", layout::computes(&header, &scan));
+        env.file("computes.c", layout::computes(&header, &scan));
         let mut cc = Command::new("cc");
         cc.args(["-std=c99", "-Wall", "-Wextra", "-Werror", "-pedantic", "-fsanitize=undefined"]);
-        cc.args(["-fno-sanitize-recover=all", "-I"]).arg(header_directory()).arg(stage.path("computes.c"));
-        succeeded(&cc.arg("-o").arg(stage.path("computes")).output().expect("a compiler"));
-        let said = succeeded(&Command::new(stage.path("computes")).output().expect("it runs"));
+        cc.args(["-fno-sanitize-recover=all", "-I"]).arg(header_directory()).arg(env.path("computes.c"));
+        succeeded(&cc.arg("-o").arg(env.path("computes")).output().expect("a compiler"));
+        let said = succeeded(&Command::new(env.path("computes")).output().expect("it runs"));
         let expected = (0..405).map(|i| {
             let mm = scan.distance_mm(i).map_or(-1, i64::from);
             let at_ns = header.stamp_first_ns.saturating_sub(scan.beam_age_ns(i));
@@ -112,14 +112,14 @@ fn what_the_header_computes_is_what_schema_computes() {
 #[test]
 fn a_program_in_c_has_every_sample_in_shared_memory() {
     let Some(installed) = Installed::once() else { return };
-    let stage = Stage::new();
-    let follow = installed.compile(&stage, &source("follow.c"), &[]);
-    let simulator = stage.simulator(&["front"], &["--seed=31"]);
-    let hub = stage.hub(&[stage.link("front")]);
-    stage.await_info("front", |info| info["state"] == "streaming");
+    let env = TestEnv::new();
+    let follow = installed.compile(&env, &source("follow.c"), &[]);
+    let simulator = env.simulator(&["front"], &["--seed=31"]);
+    let hub = env.hub(&[env.link("front")]);
+    env.await_info("front", |info| info["state"] == "streaming");
     let mut followers: Vec<_> = ["doorbell", "event", "spin", "poll"]
         .iter()
-        .map(|way| program(&stage, &follow, &["front", "1", way, "60"]))
+        .map(|way| program(&env, &follow, &["front", "1", way, "60"]))
         .collect();
     for follower in &mut followers {
         follower.await_line("its begin", is_class("open"));
@@ -127,7 +127,7 @@ fn a_program_in_c_has_every_sample_in_shared_memory() {
     let outcomes: Vec<_> = followers.into_iter().map(Program::wait).collect();
     assert_eq!(hub.end(TERM).code, Some(0));
     assert_eq!(simulator.end(TERM).code, Some(0));
-    let sent: HashSet<String> = stage.truth("front").into_iter().map(|sent| sent.hash).collect();
+    let sent: HashSet<String> = env.truth("front").into_iter().map(|sent| sent.hash).collect();
     for outcome in &outcomes {
         assert_eq!(outcome.code, Some(0), "{outcome}");
         let samples = outcome.of_class("sample");
@@ -144,17 +144,17 @@ fn a_program_in_c_has_every_sample_in_shared_memory() {
 #[test]
 fn a_program_in_c_outlives_its_hub() {
     let Some(installed) = Installed::once() else { return };
-    let stage = Stage::new();
-    let follow = installed.compile(&stage, &source("follow.c"), &[]);
+    let env = TestEnv::new();
+    let follow = installed.compile(&env, &source("follow.c"), &[]);
     // There is no hub yet.
-    let mut followers = ["doorbell", "poll"].map(|way| program(&stage, &follow, &["front", "2", way, "0"]));
+    let mut followers = ["doorbell", "poll"].map(|way| program(&env, &follow, &["front", "2", way, "0"]));
     for follower in &mut followers {
         follower.await_line("its begin", is_class("open"));
     }
-    let simulator = stage.simulator(&["front"], &["--seed=32"]);
+    let simulator = env.simulator(&["front"], &["--seed=32"]);
     let mut boots = Vec::new();
     for how in [KILL, TERM, KILL] {
-        let hub = stage.hub(&[stage.link("front")]);
+        let hub = env.hub(&[env.link("front")]);
         for follower in &mut followers {
             let is_new = |line: &Value| is_class("sample")(line) && !boots.contains(&line["boot"]);
             let first = follower.await_line("a scan of this hub", is_new);
@@ -162,7 +162,7 @@ fn a_program_in_c_outlives_its_hub() {
             assert_eq!((number(&first, "missed"), data(&first).len()), (0, 1216), "{first}");
             follower.await_lines(20, "scans", |line| line["boot"] == first["boot"] && line["restarted"] == 0);
         }
-        let info = stage.info("front");
+        let info = env.info("front");
         boots.push(followers[0].await_line("one more", is_class("sample"))["boot"].clone());
         assert_eq!(info["state"], "streaming");
         hub.end(how);
@@ -177,11 +177,11 @@ fn a_program_in_c_outlives_its_hub() {
 #[test]
 fn zones_get_unknown_when_the_hub_is_killed() {
     let Some(installed) = Installed::once() else { return };
-    let stage = Stage::new();
-    let follow = installed.compile(&stage, &source("follow.c"), &[]);
-    let _simulator = stage.simulator(&["front"], &["--seed=33"]);
-    let hub = stage.hub(&[stage.link("front")]);
-    let mut followers = ["doorbell", "poll"].map(|way| program(&stage, &follow, &["front", "4", way, "0"]));
+    let env = TestEnv::new();
+    let follow = installed.compile(&env, &source("follow.c"), &[]);
+    let _simulator = env.simulator(&["front"], &["--seed=33"]);
+    let hub = env.hub(&[env.link("front")]);
+    let mut followers = ["doorbell", "poll"].map(|way| program(&env, &follow, &["front", "4", way, "0"]));
     for follower in &mut followers {
         follower.await_line("a verdict", |line| {
             is_class("sample")(line) && line["stale"] == 0 && data(line)[0] < 3
@@ -198,20 +198,19 @@ fn zones_get_unknown_when_the_hub_is_killed() {
 #[test]
 fn a_robot_is_as_unknown_as_its_worst_sensor() {
     let Some(installed) = Installed::once() else { return };
-    let stage = Stage::new();
-    let robot = installed.compile(&stage, &source("robot.c"), &[]);
+    let env = TestEnv::new();
+    let robot = installed.compile(&env, &source("robot.c"), &[]);
     let mut followers =
-        [&["doorbell"][..], &["poll"], &["event", "front rear"]].map(|words| program(&stage, &robot, words));
+        [&["doorbell"][..], &["poll"], &["event", "front rear"]].map(|words| program(&env, &robot, words));
     for follower in &mut followers {
         let first = follower.await_line("there is no hub", is_class("robot"));
         assert_eq!((&first["verdict"], &first["nearest_mm"]), (&3.into(), &Value::Null), "{first}");
     }
     // All is clear: nothing in the simulated room is so near.
-    let _front = stage.simulator(&["front"], &["--seed=36", "--baud=500000"]);
-    let rear =
-        stage.start(&["simulate", "--json", "--baud=500000", &format!("--port={}", stage.word("rear"))]);
+    let _front = env.simulator(&["front"], &["--seed=36", "--baud=500000"]);
+    let rear = env.start(&["simulate", "--json", "--baud=500000", &format!("--port={}", env.word("rear"))]);
     let rear = rear.ready();
-    let hub = stage.hub(&[&stage.link("front"), &stage.link("rear"), "--set=zones.radii=[0.02,0.01]"]);
+    let hub = env.hub(&[&env.link("front"), &env.link("rear"), "--set=zones.radii=[0.02,0.01]"]);
     let verdicts = |line: &Value| {
         let sensors = line["sensors"].as_array().expect("a list");
         let of = |sensor: &Value| (sensor["sensor"].as_str().map(str::to_owned), number(sensor, "verdict"));
@@ -229,7 +228,7 @@ fn a_robot_is_as_unknown_as_its_worst_sensor() {
             (&nearest["nearest_mm"], &nearest["sensor"])
         );
     }
-    stage.kill_simulator(rear, "rear");
+    env.kill_simulator(rear, "rear");
     for follower in &mut followers {
         let line = follower.await_line("the rear is gone", |line| verdicts(line) == (3, both(0, 3)));
         assert_eq!(line["worst"], "rear", "{line}");
@@ -244,14 +243,14 @@ fn a_robot_is_as_unknown_as_its_worst_sensor() {
 #[test]
 fn what_a_program_does_wrong_is_refused() {
     let Some(installed) = Installed::once() else { return };
-    let stage = Stage::new();
-    let _simulator = stage.simulator(&["front"], &["--seed=34"]);
-    let _hub = stage.hub(&[stage.link("front")]);
-    let misuse = installed.compile(&stage, &source("misuse.c"), &[]);
+    let env = TestEnv::new();
+    let _simulator = env.simulator(&["front"], &["--seed=34"]);
+    let _hub = env.hub(&[env.link("front")]);
+    let misuse = installed.compile(&env, &source("misuse.c"), &[]);
     let plain = misuse.display().to_string();
     let mut ways = vec![vec![plain.clone()]];
     let watch = ["-fsanitize=address,undefined", "-fno-sanitize-recover=all"];
-    match installed.try_compile(&stage, &source("misuse.c"), &watch) {
+    match installed.try_compile(&env, &source("misuse.c"), &watch) {
         Ok(watched) => ways.push(vec![watched.display().to_string()]),
         Err(_) => eprintln!("without the compiler's watch over memory: it has none"),
     }
@@ -263,7 +262,7 @@ fn what_a_program_does_wrong_is_refused() {
     }
     for way in ways {
         let words: Vec<&str> = way[1..].iter().map(String::as_str).chain(["front"]).collect();
-        let outcome = program(&stage, Path::new(&way[0]), &words).wait();
+        let outcome = program(&env, Path::new(&way[0]), &words).wait();
         assert_eq!(outcome.code, Some(0), "{outcome}");
         assert_eq!(outcome.out, b"all refused\n", "{outcome}");
     }
@@ -273,30 +272,30 @@ fn what_a_program_does_wrong_is_refused() {
 #[test]
 fn the_examples_build_and_run() {
     let Some(installed) = Installed::once() else { return };
-    let stage = Stage::new();
-    let _simulator = stage.simulator(&["front"], &["--seed=35"]);
-    let _hub = stage.hub(&[stage.link("front")]);
+    let env = TestEnv::new();
+    let _simulator = env.simulator(&["front"], &["--seed=35"]);
+    let _hub = env.hub(&[env.link("front")]);
     let examples = Path::new(env!("CARGO_MANIFEST_DIR")).join("clients/c/examples");
-    let mut built = vec![installed.compile(&stage, &examples.join("nearest.c"), &[])];
-    built.extend(installed.compile_static(&stage, &examples.join("nearest.c")));
-    let cmake = installed.cmake(&stage, &examples);
+    let mut built = vec![installed.compile(&env, &examples.join("nearest.c"), &[])];
+    built.extend(installed.compile_static(&env, &examples.join("nearest.c")));
+    let cmake = installed.cmake(&env, &examples);
     built.extend(cmake.iter().map(|build| build.join("nearest")));
     for nearest in &built {
-        let outcome = program(&stage, nearest, &["front", "5"]).wait();
+        let outcome = program(&env, nearest, &["front", "5"]).wait();
         assert_eq!(outcome.code, Some(0), "{outcome}");
         let said = String::from_utf8_lossy(&outcome.out).into_owned();
         assert_eq!(said.lines().count(), 5, "{said}");
         assert!(said.lines().all(|line| line.contains(" mm at ") && line.ends_with(" degrees")), "{said}");
     }
-    let Some(stop) = installed.compile_cpp(&stage, &examples.join("stop.cpp")) else { return };
+    let Some(stop) = installed.compile_cpp(&env, &examples.join("stop.cpp")) else { return };
     for stop in cmake.iter().map(|build| build.join("stop")).chain([stop]) {
-        let outcome = program(&stage, &stop, &["Front"]).wait();
+        let outcome = program(&env, &stop, &["Front"]).wait();
         assert_eq!(outcome.code, Some(1), "{outcome}");
         assert!(outcome.errors.contains("\"Front\" is not possible"), "{outcome}");
         let (feed, _keep) = std::io::pipe().expect("a pipe");
         let mut command = Command::new(&stop);
-        command.arg("front").env("SCANHUB_DOMAIN", stage.place().name()).env_remove("XDG_RUNTIME_DIR");
-        command.env("RUNTIME_DIRECTORY", stage.place().root().parent().expect("it has one"));
+        command.arg("front").env("SCANHUB_DOMAIN", env.place().name()).env_remove("XDG_RUNTIME_DIR");
+        command.env("RUNTIME_DIRECTORY", env.place().root().parent().expect("it has one"));
         let mut stop = Program::start_with(command, feed);
         let verdict = stop.next_text();
         assert!(
@@ -309,8 +308,8 @@ fn the_examples_build_and_run() {
 #[test]
 fn what_is_installed_is_taken_away_again() {
     let Some(installed) = Installed::once() else { return };
-    let stage = Stage::new();
-    let destination = stage.path("machine");
+    let env = TestEnv::new();
+    let destination = env.path("machine");
     let run = |words: &[&str]| {
         let script = Path::new(env!("CARGO_MANIFEST_DIR")).join("clients/c/install.sh");
         let mut command = Command::new(script);

@@ -6,29 +6,29 @@ use std::path::{Path, PathBuf};
 use std::process::Command;
 
 use crate::testkit;
-use crate::testkit::{Outcome, Stage};
+use crate::testkit::{Outcome, TestEnv, skip};
 
 fn text(outcome: &Outcome) -> String {
     String::from_utf8_lossy(&outcome.out).into_owned()
 }
 
 /// What the program prints for `arguments`, which it takes.
-fn printed(stage: &Stage, arguments: &[&str]) -> String {
-    let outcome = stage.run(arguments);
+fn printed(env: &TestEnv, arguments: &[&str]) -> String {
+    let outcome = env.run(arguments);
     assert_eq!((outcome.code, outcome.errors.as_str()), (Some(0), ""), "{outcome}");
     text(&outcome)
 }
 
 #[test]
 fn the_default_can_be_loaded_and_is_what_holds_without_it() {
-    let stage = Stage::new();
-    let default = stage.file("default.toml", printed(&stage, &["config", "default"]));
+    let env = TestEnv::new();
+    let default = env.file("default.toml", printed(&env, &["config", "default"]));
     let ok = "ok: 2 links: front at /dev/ttyUSB0, rear at /dev/ttyUSB1\n";
-    assert_eq!(printed(&stage, &["config", "check", &default]), ok);
+    assert_eq!(printed(&env, &["config", "check", &default]), ok);
     let links = ["--link=front=/dev/ttyUSB0", "--link=rear=/dev/ttyUSB1"];
-    assert_eq!(printed(&stage, &[&["config", "check", "--no-system-config"], &links[..]].concat()), ok);
+    assert_eq!(printed(&env, &[&["config", "check", "--no-system-config"], &links[..]].concat()), ok);
     let values = |arguments: &[&str]| -> Vec<_> {
-        let outcome = stage.run(&[&["config", "show", "--json", "--no-system-config"], arguments].concat());
+        let outcome = env.run(&[&["config", "show", "--json", "--no-system-config"], arguments].concat());
         let lines = outcome.of_class("value");
         lines.iter().map(|line| (line["key"].clone(), line["value"].clone())).collect()
     };
@@ -39,11 +39,11 @@ fn the_default_can_be_loaded_and_is_what_holds_without_it() {
 
 #[test]
 fn a_check_refuses_what_a_hub_refuses() {
-    let stage = Stage::new();
-    let file = stage.file("scanhub.toml", "[[link]]\nname = \"a\"\nprot = \"/dev/x\"\n");
-    let gateway = stage.file("gateway.toml", "[gateway]\nbackground_every = \"10\"\n");
-    let empty = stage.file("empty.toml", "");
-    let topics = stage.file("topics.toml", "[gateway]\ntopics = [\"*/scna\"]\n");
+    let env = TestEnv::new();
+    let file = env.file("scanhub.toml", "[[link]]\nname = \"a\"\nprot = \"/dev/x\"\n");
+    let gateway = env.file("gateway.toml", "[gateway]\nbackground_every = \"10\"\n");
+    let empty = env.file("empty.toml", "");
+    let topics = env.file("topics.toml", "[gateway]\ntopics = [\"*/scna\"]\n");
     for (arguments, place) in [
         (vec![topics.as_str()], "section gateway: ".to_owned()),
         (vec![file.as_str()], format!("{file}:3:1: unknown key `prot`")),
@@ -57,28 +57,28 @@ fn a_check_refuses_what_a_hub_refuses() {
         (vec!["--no-system-config"], "no link is configured\n  --link NAME=PORT".to_owned()),
         (vec![empty.as_str()], "no link is configured".to_owned()),
     ] {
-        let outcome = stage.run(&[&["config", "check"], &arguments[..]].concat());
+        let outcome = env.run(&[&["config", "check"], &arguments[..]].concat());
         assert_eq!((outcome.code, outcome.out.len()), (Some(78), 0), "{outcome}");
         assert!(outcome.errors.contains(&place), "{place}: {outcome}");
-        let outcome = stage.run(&[&["config", "check", "--json"], &arguments[..]].concat());
+        let outcome = env.run(&[&["config", "check", "--json"], &arguments[..]].concat());
         let error = &outcome.of_class("error")[0];
         assert_eq!((outcome.code, error["kind"].as_str()), (Some(78), Some("configuration")), "{outcome}");
     }
-    let missing = stage.run(&["config", "check", "/nowhere/scanhub.toml"]);
+    let missing = env.run(&["config", "check", "/nowhere/scanhub.toml"]);
     assert_eq!((missing.code, missing.out.len()), (Some(66), 0), "{missing}");
     assert!(missing.errors.contains("/nowhere/scanhub.toml: No such file"), "{missing}");
     let link = ["config", "check", "--json", "--no-system-config", "--link", "a=tcp:box:4001"];
-    let checked = stage.run(&link).of_class("checked");
+    let checked = env.run(&link).of_class("checked");
     assert_eq!(checked[0]["links"][0]["port"], "tcp:box:4001", "{checked:?}");
 }
 
 #[test]
 fn values_stand_below_each_other_with_their_places() {
-    let stage = Stage::new();
-    let file = stage
-        .file("scanhub.toml", "[[link]]\nname = \"a\"\nport = \"/dev/x\"\n[zones]\nradii = [2.0, 1.0]\n");
+    let env = TestEnv::new();
+    let file =
+        env.file("scanhub.toml", "[[link]]\nname = \"a\"\nport = \"/dev/x\"\n[zones]\nradii = [2.0, 1.0]\n");
     let words = ["config", "show", "--no-system-config", "--config", &file, "--set", "link.a.pose.x=0.3"];
-    let shown = printed(&stage, &words);
+    let shown = printed(&env, &words);
     let row = |key: &str| {
         let found = shown.lines().find(|line| line.split_whitespace().next() == Some(key));
         found.unwrap_or_else(|| panic!("no {key}: {shown}"))
@@ -96,26 +96,26 @@ fn values_stand_below_each_other_with_their_places() {
 
 #[test]
 fn a_slip_is_told_the_nearest_name() {
-    let stage = Stage::new();
+    let env = TestEnv::new();
     for (arguments, nearest) in [
         (&["ehco"][..], "'echo'"),
         (&["echo", "--jsn"], "'--json'"),
         (&["config", "shwo"], "'show'"),
         (&["run", "--lnik", "a=b"], "'--link'"),
     ] {
-        let outcome = stage.run(arguments);
+        let outcome = env.run(arguments);
         assert_eq!(outcome.code, Some(2), "{outcome}");
         assert!(outcome.errors.contains("tip: "), "{outcome}");
         assert!(outcome.errors.contains(nearest), "{outcome}");
     }
-    let outcome = stage.run(&["wacth", "--json"]);
+    let outcome = env.run(&["wacth", "--json"]);
     let error = &outcome.lines()[0];
     assert_eq!((outcome.code, &error["hint"]), (Some(2), &"a similar subcommand exists: 'watch'".into()));
 }
 
 /// The verbs that the help names, but `help` itself.
-fn verbs(stage: &Stage) -> Vec<String> {
-    let help = printed(stage, &["--help"]);
+fn verbs(env: &TestEnv) -> Vec<String> {
+    let help = printed(env, &["--help"]);
     let rows =
         help.lines().skip_while(|line| *line != "Commands:").skip(1).take_while(|line| !line.is_empty());
     let verbs = rows.filter(|row| row.starts_with("  ") && !row.starts_with("   "));
@@ -128,14 +128,14 @@ fn verbs(stage: &Stage) -> Vec<String> {
 
 #[test]
 fn every_verb_has_an_example_a_page_and_a_completion() {
-    let stage = Stage::new();
-    let verbs = verbs(&stage);
+    let env = TestEnv::new();
+    let verbs = verbs(&env);
     assert!(verbs.len() > 15, "{verbs:?}");
-    let pages = stage.word("man");
-    printed(&stage, &["man", &pages]);
-    let completions = ["bash", "zsh", "fish"].map(|shell| printed(&stage, &["completions", shell]));
+    let pages = env.word("man");
+    printed(&env, &["man", &pages]);
+    let completions = ["bash", "zsh", "fish"].map(|shell| printed(&env, &["completions", shell]));
     for verb in &verbs {
-        assert!(printed(&stage, &[verb, "--help"]).contains(&format!("  scanhub {verb}")), "{verb}");
+        assert!(printed(&env, &[verb, "--help"]).contains(&format!("  scanhub {verb}")), "{verb}");
         let page = fs::read_to_string(Path::new(&pages).join(format!("scanhub-{verb}.1")));
         let page = page.unwrap_or_else(|error| panic!("{verb}: {error}"));
         assert!(page.contains(&format!("scanhub {verb}")), "{page}");
@@ -143,23 +143,23 @@ fn every_verb_has_an_example_a_page_and_a_completion() {
             assert!(text.contains(verb.as_str()), "{verb}: {text}");
         }
     }
-    assert!(printed(&stage, &["man"]).contains(".TH scanhub 1"));
-    let refused = stage.run(&["man", "/dev/null/man"]);
+    assert!(printed(&env, &["man"]).contains(".TH scanhub 1"));
+    let refused = env.run(&["man", "/dev/null/man"]);
     assert_eq!((refused.code, refused.errors.contains("/dev/null/man: ")), (Some(73), true), "{refused}");
 
     // The shell itself says what it would complete; there is a bash on most machines.
-    let script = stage.file("completion", &completions[0]);
+    let script = env.file("completion", &completions[0]);
     let ask = "source \"$0\"; COMP_WORDS=(scanhub ec); COMP_CWORD=1; _scanhub scanhub ec scanhub; echo \"${COMPREPLY[*]}\"";
     match Command::new("bash").args(["-c", ask, &script]).output() {
         Ok(said) => assert_eq!(String::from_utf8_lossy(&said.stdout).trim(), "echo"),
-        Err(error) => eprintln!("skipped: no bash: {error}"),
+        Err(error) => skip("bash", error),
     }
 }
 
 /// What bash itself completes behind `words`, the last of which is being typed.
-fn completed(stage: &Stage, words: &[&str]) -> Option<Vec<String>> {
+fn completed(env: &TestEnv, words: &[&str]) -> Option<Vec<String>> {
     let program = Path::new(env!("CARGO_BIN_EXE_scanhub"));
-    let script = stage.file("completion", printed(stage, &["completions", "bash"]));
+    let script = env.file("completion", printed(env, &["completions", "bash"]));
     let ask = "source \"$0\"; COMP_WORDS=(\"$@\"); COMP_CWORD=$(($# - 1)); \
                \"$(complete -p scanhub | sed 's/.*-F \\([^ ]*\\).*/\\1/')\" \"$1\" \"${@: -1}\" \"${@: -2:1}\"; printf '%s\\n' \"${COMPREPLY[@]}\"";
     let path = format!("{}:{}", program.parent()?.display(), std::env::var("PATH").unwrap_or_default());
@@ -168,7 +168,7 @@ fn completed(stage: &Stage, words: &[&str]) -> Option<Vec<String>> {
     let said = match bash.output() {
         Ok(said) => said,
         Err(error) => {
-            eprintln!("skipped: no bash: {error}");
+            skip("bash", error);
             return None;
         }
     };
@@ -178,13 +178,13 @@ fn completed(stage: &Stage, words: &[&str]) -> Option<Vec<String>> {
 
 #[test]
 fn sensors_and_topics_of_the_running_hub_are_completed() {
-    let stage = Stage::new();
-    let (domain, root) = (format!("--domain={}", stage.place().name()), stage.place().root().to_owned());
+    let env = TestEnv::new();
+    let (domain, root) = (format!("--domain={}", env.place().name()), env.place().root().to_owned());
     let root = format!("--root={}", root.parent().expect("a directory").display());
-    let ask = |words: &[&str]| completed(&stage, &[&words[..1], &[&domain, &root], &words[1..]].concat());
+    let ask = |words: &[&str]| completed(&env, &[&words[..1], &[&domain, &root], &words[1..]].concat());
     let Some(before) = ask(&["echo", "front/s"]) else { return };
     assert_eq!(before, [""; 1], "without a hub there is nothing to add");
-    let hub = stage.hub(&["--link=front=/no/such/port", "--link=rear=/no/such/port2"]);
+    let hub = env.hub(&["--link=front=/no/such/port", "--link=rear=/no/such/port2"]);
     for (words, expected) in [
         (&["echo", "front/s"][..], &["front/scan", "front/status"][..]),
         (&["hz", "front/scan", "rear/sc"], &["rear/scan"]),
@@ -212,16 +212,16 @@ fn files(directory: &Path) -> Vec<PathBuf> {
 
 #[test]
 fn what_is_installed_can_be_taken_away() {
-    let stage = Stage::new();
+    let env = TestEnv::new();
     let install = |arguments: &[&str]| {
         let mut command = Command::new("sh");
         command.arg(concat!(env!("CARGO_MANIFEST_DIR"), "/hub/dist/install.sh")).args(arguments);
-        let done = command.env("DESTDIR", stage.path("root")).output().expect("a shell");
+        let done = command.env("DESTDIR", env.path("root")).output().expect("a shell");
         assert!(done.status.success(), "{done:?}");
         String::from_utf8_lossy(&done.stderr).into_owned()
     };
     assert_eq!(install(&["--program", env!("CARGO_BIN_EXE_scanhub")]), "");
-    let root = stage.path("root");
+    let root = env.path("root");
     let local = root.join("usr/local");
     for file in [
         "bin/scanhub",
@@ -239,7 +239,7 @@ fn what_is_installed_can_be_taken_away() {
     install(&["--remove"]);
     assert_eq!(files(&root), Vec::<PathBuf>::new());
     // One that does not run here is installed without.
-    let other = stage.file("other", "of another processor");
+    let other = env.file("other", "of another processor");
     assert!(install(&["--program", &other]).contains("no manual pages, no completions"));
     assert!(!local.join("share").exists() || files(&local.join("share")).is_empty());
 }

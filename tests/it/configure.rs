@@ -7,7 +7,7 @@ use std::process::{Child, Stdio};
 use std::thread;
 
 use crate::testkit;
-use crate::testkit::{INT, Stage, TERM, number, terminal, until};
+use crate::testkit::{INT, TERM, TestEnv, number, terminal, until};
 use rustix::process::{Pid, Signal, kill_process};
 use serde_json::Value;
 
@@ -26,9 +26,9 @@ struct Seen {
 }
 
 impl Person {
-    fn start(stage: &Stage, arguments: &[&str]) -> Person {
+    fn start(env: &TestEnv, arguments: &[&str]) -> Person {
         let (keys, screen) = terminal();
-        let mut command = stage.command(&[&["configure"], arguments].concat());
+        let mut command = env.command(&[&["configure"], arguments].concat());
         command.stdin(Stdio::from(screen.try_clone().unwrap()));
         command.stdout(Stdio::piped()).stderr(Stdio::from(screen));
         Person { process: command.spawn().unwrap(), keys }
@@ -72,17 +72,17 @@ fn signal(pid: u32, signal: Signal) {
     kill_process(Pid::from_raw(pid as i32).unwrap(), signal).unwrap();
 }
 
-fn probe(stage: &Stage, port: &str) -> Value {
-    stage.run(&["probe", &stage.word(port), "--json"]).lines()[0].clone()
+fn probe(env: &TestEnv, port: &str) -> Value {
+    env.run(&["probe", &env.word(port), "--json"]).lines()[0].clone()
 }
 
 #[test]
 fn a_person_says_yes_and_it_is_written_once() {
-    let stage = Stage::new();
-    let simulator = stage.simulator(&["front"], &["--baud=38400"]);
-    let port = stage.word("front");
-    let before = probe(&stage, "front");
-    let seen = Person::start(&stage, &[&port, "unit=cm", "mode=fields-ab", "--json"]).types("yes\n");
+    let env = TestEnv::new();
+    let simulator = env.simulator(&["front"], &["--baud=38400"]);
+    let port = env.word("front");
+    let before = probe(&env, "front");
+    let seen = Person::start(&env, &[&port, "unit=cm", "mode=fields-ab", "--json"]).types("yes\n");
     assert_eq!(seen.code, Some(0), "{}\n{}", seen.out, seen.errors);
     let lines = seen.lines();
     let items: Vec<_> = lines.iter().map(|line| (&line["class"], &line["item"], &line["offset"])).collect();
@@ -98,44 +98,44 @@ fn a_person_says_yes_and_it_is_written_once() {
     // Stdout is a pipe: who is asked sees it on the terminal.
     let shown = seen.errors.split("Type yes").next().unwrap();
     assert!(shown.contains("unit: 01h (1 mm) -> 00h (10 mm)"), "{}", seen.errors);
-    let after = probe(&stage, "front");
+    let after = probe(&env, "front");
     assert_eq!(configured["after"], after["configuration"]);
     assert_eq!((number(&after, "unit_mm"), number(&after, "mode")), (10, 4), "{after}");
     assert_eq!((number(&after, "operating_mode"), number(&after, "baud")), (0x25, 38_400), "{after}");
 
     // Back by what it was told, in words this time.
     let backup = format!("configuration={}", before["configuration"].as_str().unwrap());
-    let seen = Person::start(&stage, &[&port, &backup]).types("yes\n");
+    let seen = Person::start(&env, &[&port, &backup]).types("yes\n");
     assert_eq!(seen.code, Some(0), "{}", seen.errors);
     assert!(seen.out.contains("unit: 00h (10 mm) -> 01h (1 mm)"), "{}", seen.out);
     assert!(seen.out.contains("to go back: scanhub configure"), "{}", seen.out);
-    assert_eq!(probe(&stage, "front")["configuration"], before["configuration"]);
+    assert_eq!(probe(&env, "front")["configuration"], before["configuration"]);
 
     // And again: nothing to do, nothing asked.
-    let outcome = stage.run(&["configure", &port, &backup, "unit=mm"]);
+    let outcome = env.run(&["configure", &port, &backup, "unit=mm"]);
     assert_eq!(outcome.code, Some(0), "{outcome}");
     assert!(String::from_utf8_lossy(&outcome.out).contains("nothing to change"), "{outcome}");
     assert_eq!(simulator.end(TERM).code, Some(0));
-    assert_eq!(stage.simulated("front").1, 2);
+    assert_eq!(env.simulated("front").1, 2);
 }
 
 #[test]
 fn marks_become_available_by_the_command_that_is_named() {
-    let stage = Stage::new();
-    let _simulator = stage.simulator(&["front"], &["--baud=38400", "--mode=0x00"]);
-    let port = stage.word("front");
+    let env = TestEnv::new();
+    let _simulator = env.simulator(&["front"], &["--baud=38400", "--mode=0x00"]);
+    let port = env.word("front");
     let marks = |hub: testkit::Program| {
-        let told = stage.await_info("front", |info| !info["marks"]["available"].is_null())["marks"].clone();
-        let outcome = stage.run(&["echo", "--json", "front/marks", "-n", "3"]);
+        let told = env.await_info("front", |info| !info["marks"]["available"].is_null())["marks"].clone();
+        let outcome = env.run(&["echo", "--json", "front/marks", "-n", "3"]);
         let lines = outcome.of_class("marks");
         assert!(lines.iter().all(|line| line["available"] == told["available"]), "{outcome}");
-        let doctor = stage.run(&["doctor", &port, "--json", "--no-system-config"]).of_class("check");
+        let doctor = env.run(&["doctor", &port, "--json", "--no-system-config"]).of_class("check");
         let found = doctor.iter().find(|line| line["name"] == "marks").expect("it is checked").clone();
         let ended = hub.end(TERM);
         assert_eq!(ended.code, Some(0), "{ended}");
         (told, found, ended.errors)
     };
-    let (told, found, log) = marks(stage.hub(&[stage.link("front")]));
+    let (told, found, log) = marks(env.hub(&[env.link("front")]));
     let command = format!("scanhub configure {port} mode=0x01");
     assert_eq!(told, serde_json::json!({ "available": false, "remedy": command }));
     assert_eq!(
@@ -145,9 +145,9 @@ fn marks_become_available_by_the_command_that_is_named() {
     assert!(log.contains(&command), "{log}");
 
     let words: Vec<&str> = command.split(' ').skip(2).collect();
-    let seen = Person::start(&stage, &words).types("yes\n");
+    let seen = Person::start(&env, &words).types("yes\n");
     assert_eq!(seen.code, Some(0), "{}", seen.errors);
-    let (told, found, log) = marks(stage.hub(&[stage.link("front")]));
+    let (told, found, log) = marks(env.hub(&[env.link("front")]));
     assert_eq!(told, serde_json::json!({ "available": true, "remedy": null }));
     assert_eq!(found["state"], "ok");
     assert!(!log.contains("scanhub configure"), "{log}");
@@ -155,125 +155,125 @@ fn marks_become_available_by_the_command_that_is_named() {
 
 #[test]
 fn the_way_back_brings_back_what_was_changed() {
-    let stage = Stage::new();
-    let _simulator = stage.simulator(&["front"], &["--baud=38400"]);
-    let port = stage.word("front");
+    let env = TestEnv::new();
+    let _simulator = env.simulator(&["front"], &["--baud=38400"]);
+    let port = env.word("front");
     let done = |settings: &[&str]| {
-        let seen = Person::start(&stage, &[&[&port[..]], settings].concat()).types("yes\n");
+        let seen = Person::start(&env, &[&[&port[..]], settings].concat()).types("yes\n");
         assert_eq!(seen.code, Some(0), "{}", seen.errors);
         assert!(seen.errors.contains("EEPROM wears out after a few thousand writes."), "{}", seen.errors);
         seen.out
     };
-    let hex = probe(&stage, "front")["configuration"].as_str().unwrap().to_owned();
+    let hex = probe(&env, "front")["configuration"].as_str().unwrap().to_owned();
     let out = done(&["power_on_baud=keep"]);
     let change = "9600 Bd -> 38400 Bd: the present rate of the line becomes permanent";
     assert!(out.contains(change), "{out}");
     let back = format!("to go back: scanhub configure {port} power_on_baud=9600\n");
     assert!(out.contains(&back), "{out}");
-    assert_eq!(probe(&stage, "front")["permanent_rate"], true);
+    assert_eq!(probe(&env, "front")["permanent_rate"], true);
     // What was permanent before, the sensor does not tell.
     let out = done(&["power_on_baud=9600"]);
     assert!(out.contains("cannot be brought back") && !out.contains("to go back"), "{out}");
-    assert_eq!(probe(&stage, "front")["permanent_rate"], false);
+    assert_eq!(probe(&env, "front")["permanent_rate"], false);
     let out = done(&["unit=cm", "power_on_baud=keep"]);
     assert!(out.contains(&format!("{port} configuration={hex} power_on_baud=9600\n")), "{out}");
 }
 
 #[test]
 fn everything_else_than_yes_writes_nothing() {
-    let stage = Stage::new();
-    let simulator = stage.simulator(&["front"], &["--baud=500000"]);
-    let port = stage.word("front");
+    let env = TestEnv::new();
+    let simulator = env.simulator(&["front"], &["--baud=500000"]);
+    let port = env.word("front");
     for answer in ["no\n", "y\n", "\n", "YES\n", "\x04"] {
-        let seen = Person::start(&stage, &[&port, "unit=cm"]).types(answer);
+        let seen = Person::start(&env, &[&port, "unit=cm"]).types(answer);
         assert_eq!(seen.code, Some(1), "{answer:?}: {}", seen.errors);
         assert!(seen.errors.contains("nothing was written"), "{}", seen.errors);
         assert!(seen.errors.contains("\nscanhub: not confirmed"), "{answer:?}: {:?}", seen.errors);
     }
-    let seen = Person::start(&stage, &[&port, "unit=cm"]).answer(|_, pid| {
+    let seen = Person::start(&env, &[&port, "unit=cm"]).answer(|_, pid| {
         signal(pid, INT);
     });
     assert_eq!(seen.code, Some(130), "{}", seen.errors);
     // No terminal, no person: the difference is shown all the same.
-    let outcome = stage.run(&["configure", &port, "unit=cm", "--json"]);
+    let outcome = env.run(&["configure", &port, "unit=cm", "--json"]);
     assert_eq!(outcome.code, Some(2), "{outcome}");
     assert_eq!(outcome.of_class("difference").len(), 1, "{outcome}");
     assert_eq!(outcome.of_class("error")[0]["kind"], "usage", "{outcome}");
     // Nor is one asked who cannot see the question.
     let (_keys, screen) = terminal();
-    let mut unseen = stage.command(&["configure", &port, "unit=cm"]);
+    let mut unseen = env.command(&["configure", &port, "unit=cm"]);
     unseen.stdin(Stdio::from(screen)).stdout(Stdio::null()).stderr(Stdio::null());
     let mut process = unseen.spawn().unwrap();
     until("it does not ask", || process.try_wait().unwrap().is_some());
     assert_eq!(process.wait().unwrap().code(), Some(2));
-    assert_eq!(number(&probe(&stage, "front"), "unit_mm"), 1);
+    assert_eq!(number(&probe(&env, "front"), "unit_mm"), 1);
     assert_eq!(simulator.end(TERM).code, Some(0));
-    assert_eq!(stage.simulated("front").1, 0);
+    assert_eq!(env.simulated("front").1, 0);
 }
 
 #[test]
 fn what_cannot_be_is_refused_before_anything_is_written() {
-    let stage = Stage::new();
-    let simulator = stage.simulator(&["front"], &["--baud=500000"]);
-    let port = stage.word("front");
+    let env = TestEnv::new();
+    let simulator = env.simulator(&["front"], &["--baud=500000"]);
+    let port = env.word("front");
     for (setting, code, words) in [
         ("unit=dm", 78, "mm or cm"),
         ("units=mm", 78, "did you mean unit"),
         ("mode=7", 78, "reflector3"),
         ("sensitivity=high", 78, "only the LMS 291"),
     ] {
-        let outcome = stage.run(&["configure", &port, setting]);
+        let outcome = env.run(&["configure", &port, setting]);
         assert_eq!(outcome.code, Some(code), "{outcome}");
         assert!(outcome.errors.contains(words), "{outcome}");
     }
-    assert_eq!(stage.run(&["configure", &port]).code, Some(2));
-    assert_eq!(stage.run(&["configure", &port, "unit=cm", "--password=short"]).code, Some(78));
-    let wrong = Person::start(&stage, &[&port, "unit=cm", "--password=mistaken"]).types("yes\n");
+    assert_eq!(env.run(&["configure", &port]).code, Some(2));
+    assert_eq!(env.run(&["configure", &port, "unit=cm", "--password=short"]).code, Some(78));
+    let wrong = Person::start(&env, &[&port, "unit=cm", "--password=mistaken"]).types("yes\n");
     assert_eq!(wrong.code, Some(1), "{}", wrong.errors);
     for words in ["wrong password?", "nothing was written", "values on request"] {
         assert!(wrong.errors.contains(words), "{words}: {}", wrong.errors);
     }
     assert!(wrong.errors.contains(" ..\r\nscanhub: "), "{:?}", wrong.errors);
     // A port that a hub has.
-    let hub = stage.hub(&[stage.link("front")]);
-    stage.await_info("front", |info| info["state"] == "streaming");
-    let outcome = stage.run(&["configure", &port, "unit=cm"]);
+    let hub = env.hub(&[env.link("front")]);
+    env.await_info("front", |info| info["state"] == "streaming");
+    let outcome = env.run(&["configure", &port, "unit=cm"]);
     assert_eq!(outcome.code, Some(4), "{outcome}");
     assert!(outcome.errors.contains(&format!("process {} (scanhub)", hub.pid())), "{outcome}");
-    assert_eq!(stage.info("front")["state"], "streaming");
+    assert_eq!(env.info("front")["state"], "streaming");
     drop(hub);
     assert_eq!(simulator.end(TERM).code, Some(0));
-    assert_eq!(stage.simulated("front").1, 0);
+    assert_eq!(env.simulated("front").1, 0);
 }
 
 #[test]
 fn a_stream_that_was_found_goes_on() {
-    let stage = Stage::new();
-    let simulator = stage.simulator(&["front"], &["--baud=500000"]);
-    let hub = stage.hub(&[stage.link("front")]);
-    stage.await_info("front", |info| info["state"] == "streaming");
+    let env = TestEnv::new();
+    let simulator = env.simulator(&["front"], &["--baud=500000"]);
+    let hub = env.hub(&[env.link("front")]);
+    env.await_info("front", |info| info["state"] == "streaming");
     hub.end(testkit::KILL);
-    let seen = Person::start(&stage, &[&stage.word("front"), "availability=3"]).types("yes\n");
+    let seen = Person::start(&env, &[&env.word("front"), "availability=3"]).types("yes\n");
     assert_eq!(seen.code, Some(0), "{}", seen.errors);
     assert!(seen.out.contains("now at: all values, continuously"), "{}", seen.out);
-    let sent = stage.truth("front").len();
-    until("it streams on", || stage.truth("front").len() > sent + 20);
-    assert_eq!(number(&probe(&stage, "front"), "availability"), 1);
+    let sent = env.truth("front").len();
+    until("it streams on", || env.truth("front").len() > sent + 20);
+    assert_eq!(number(&probe(&env, "front"), "availability"), 1);
     assert_eq!(simulator.end(TERM).code, Some(0));
-    assert_eq!(stage.simulated("front").1, 1);
+    assert_eq!(env.simulated("front").1, 1);
 }
 
 #[test]
 fn what_was_begun_goes_to_its_end() {
-    let stage = Stage::new();
-    let simulator = stage.simulator(&["front"], &["--baud=500000"]);
-    let port = stage.word("front");
+    let env = TestEnv::new();
+    let simulator = env.simulator(&["front"], &["--baud=500000"]);
+    let port = env.word("front");
     let signals = [(Signal::HUP, "unit=cm", 10), (Signal::QUIT, "unit=mm", 1), (TERM, "unit=cm", 10)];
     for (sent, setting, unit_mm) in signals {
-        let seen = Person::start(&stage, &[&port, setting, "--json"]).answer(|keys, pid| {
-            let before = stage.truth("front").len();
+        let seen = Person::start(&env, &[&port, setting, "--json"]).answer(|keys, pid| {
+            let before = env.truth("front").len();
             keys.write_all(b"yes\n").unwrap();
-            until("it has begun", || stage.truth("front").len() > before);
+            until("it has begun", || env.truth("front").len() > before);
             if sent == Signal::HUP {
                 // The terminal is closed, too.
                 *keys = File::open("/dev/null").unwrap();
@@ -282,8 +282,8 @@ fn what_was_begun_goes_to_its_end() {
         });
         assert_eq!(seen.code, Some(0), "{sent:?}: {}", seen.errors);
         assert_eq!(seen.lines().last().unwrap()["written"], true, "{sent:?}: {}", seen.out);
-        assert_eq!(number(&probe(&stage, "front"), "unit_mm"), unit_mm, "{sent:?}");
+        assert_eq!(number(&probe(&env, "front"), "unit_mm"), unit_mm, "{sent:?}");
     }
     assert_eq!(simulator.end(TERM).code, Some(0));
-    assert_eq!(stage.simulated("front").1, 3);
+    assert_eq!(env.simulated("front").1, 3);
 }

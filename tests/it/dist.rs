@@ -5,7 +5,7 @@ use std::fs;
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
-use crate::testkit::Stage;
+use crate::testkit::{TestEnv, skip};
 
 /// How much a unit may be exposed, by the measure of systemd-analyze, in tenths.
 const MOST_EXPOSED: u32 = 15;
@@ -42,9 +42,9 @@ fn install(destination: &Path, words: &[&str]) -> (Option<i32>, String) {
 
 #[test]
 fn what_is_installed_is_taken_away_again() {
-    let stage = Stage::new();
-    let destination = stage.path("machine");
-    let program = stage.word("a program");
+    let env = TestEnv::new();
+    let destination = env.path("machine");
+    let program = env.word("a program");
     std::os::unix::fs::symlink(env!("CARGO_BIN_EXE_scanhub"), &program).expect("a name with a blank");
     let (code, text) = install(&destination, &["--program"]);
     assert!(code == Some(2) && text.contains("--program needs a file"), "{text}");
@@ -101,12 +101,12 @@ fn units_leave_little_open() {
         let analyze = |words: &[&str]| Command::new("systemd-analyze").args(words).arg(&path).output();
         let limit = format!("--threshold={MOST_EXPOSED}");
         let Ok(output) = analyze(&["security", "--offline=true", "--no-pager", &limit]) else {
-            println!("skipped: there is no systemd-analyze");
+            skip("systemd-analyze", "there is none");
             return;
         };
         let text = String::from_utf8_lossy(&output.stdout);
         if !text.contains("exposure level") {
-            println!("skipped: this systemd-analyze looks at no files");
+            skip("systemd-analyze", "this one looks at no files");
             return;
         }
         assert!(output.status.success(), "{unit} is too open:\n{text}");

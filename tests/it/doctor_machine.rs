@@ -9,14 +9,14 @@ use std::path::Path;
 use std::process::Command;
 use std::sync::atomic::AtomicBool;
 
-use crate::testkit::{Findings, KILL, Program, Stage, TERM, in_a_network, is_class, shared_memory};
+use crate::testkit::{Findings, KILL, Program, TERM, TestEnv, in_a_network, is_class, shared_memory, skip};
 use daemon::config::Gateway;
 use daemon::doctor::{Subjects, System, examine};
 use schema::Domain;
 
 /// `sh` with these words before the program, as `ulimit -f 100; exec`, and its arguments.
-fn under(stage: &Stage, words: &str, arguments: &[&str]) -> Command {
-    let inner = stage.command(&[&["doctor", "--json", "--no-system-config"], arguments].concat());
+fn under(env: &TestEnv, words: &str, arguments: &[&str]) -> Command {
+    let inner = env.command(&[&["doctor", "--json", "--no-system-config"], arguments].concat());
     let mut command = Command::new("sh");
     command
         .args(["-c", &format!("{words} && exec \"$@\""), "sh"])
@@ -28,12 +28,12 @@ fn under(stage: &Stage, words: &str, arguments: &[&str]) -> Command {
 
 #[test]
 fn a_set_up_that_is_well() {
-    let stage = Stage::new();
-    let _simulator = stage.simulator(&["front"], &[] as &[&str]);
-    let flags = [stage.link("front"), "--set=gateway.interface=lo".to_owned()];
+    let env = TestEnv::new();
+    let _simulator = env.simulator(&["front"], &[] as &[&str]);
+    let flags = [env.link("front"), "--set=gateway.interface=lo".to_owned()];
     let flags: Vec<&str> = flags.iter().map(String::as_str).collect();
     let examine = || {
-        let findings = Findings::of(&stage, &flags);
+        let findings = Findings::of(&env, &flags);
         // How this machine itself is set up no test can know.
         let not_of_the_machine = ["service", "udev", "logout"];
         assert!(not_of_the_machine.iter().all(|name| !findings.said(name).1.is_empty()));
@@ -42,17 +42,17 @@ fn a_set_up_that_is_well() {
     };
     let findings = examine();
     assert!(findings.said("version").1.contains(env!("CARGO_PKG_VERSION")), "{:?}", findings.said("version"));
-    let hub = stage.hub(&flags[..1]);
-    stage.await_info("front", |info| info["state"] == "streaming");
+    let hub = env.hub(&flags[..1]);
+    env.await_info("front", |info| info["state"] == "streaming");
     assert!(examine().said("version").1.ends_with("the hub runs the same program"));
     assert_eq!(hub.end(TERM).code, Some(0));
     assert!(examine().said("leftovers").1.starts_with("none"), "an orderly end leaves nothing");
-    well_kept(&stage).are_silent();
+    well_kept(&env).are_silent();
 }
 
 /// A machine on which everything is installed, looked at by an ordinary user.
-fn well_kept(stage: &Stage) -> Findings {
-    let machine = stage.path("machine");
+fn well_kept(env: &TestEnv) -> Findings {
+    let machine = env.path("machine");
     let put = |path: &str, text: &str| {
         let path = machine.join(path);
         fs::create_dir_all(path.parent().expect("a directory")).expect("can be made");
@@ -71,18 +71,18 @@ fn well_kept(stage: &Stage) -> Findings {
     put("sys/fs/cgroup/system.slice/scanhub.service/cgroup.procs", "7\n");
     fs::create_dir_all(machine.join("usr/local/bin")).expect("can be made");
     let _ = symlink(crate::testkit::own_program(), machine.join("usr/local/bin/scanhub"));
-    laid_out(stage)
+    laid_out(env)
 }
 
-/// What is found on the machine below the stage's directory `machine`, for the user 1000.
-fn laid_out(stage: &Stage) -> Findings {
+/// What is found on the machine below the environment's directory `machine`, for the user 1000.
+fn laid_out(env: &TestEnv) -> Findings {
     let subjects = Subjects {
         ports: Vec::new(),
         config: None,
         gateway: Gateway { interface: Some("lo".to_owned()), ..Gateway::default() },
-        domain: stage.place(),
+        domain: env.place(),
         places: Vec::new(),
-        system: System::at(stage.path("machine"), 1000),
+        system: System::at(env.path("machine"), 1000),
         clean: false,
     };
     let mut lines = Vec::new();
@@ -95,37 +95,37 @@ fn laid_out(stage: &Stage) -> Findings {
 
 #[test]
 fn what_an_administrator_may_have_left() {
-    let stage = Stage::new();
-    well_kept(&stage);
-    let at = |path: &str| stage.path("machine").join(path);
+    let env = TestEnv::new();
+    well_kept(&env);
+    let at = |path: &str| env.path("machine").join(path);
     let remove = |path: &str| fs::remove_file(at(path)).unwrap_or_else(|error| panic!("{path}: {error}"));
     remove("var/lib/systemd/linger/robot");
-    laid_out(&stage).complain(
+    laid_out(&env).complain(
         "logging out takes shared memory away",
         "logout",
         "warning",
         "enable-linger robot",
     );
     remove("sys/fs/cgroup/system.slice/scanhub.service/cgroup.procs");
-    laid_out(&stage).complain("the service does not run", "service", "failed", "systemctl status scanhub");
+    laid_out(&env).complain("the service does not run", "service", "failed", "systemctl status scanhub");
     remove("usr/local/bin/scanhub");
-    laid_out(&stage).complain("the service's program is gone", "service", "failed", "install.sh");
+    laid_out(&env).complain("the service's program is gone", "service", "failed", "install.sh");
     // A child writes it: who starts it must not find it open for writing.
     let write = "printf '#!/bin/sh\\necho scanhub 0.0.1\\n' > \"$0\" && chmod 755 \"$0\"";
     let written = Command::new("sh").args(["-c", write]).arg(at("usr/local/bin/scanhub")).status();
     assert!(written.is_ok_and(|status| status.success()));
-    let stale = laid_out(&stage);
+    let stale = laid_out(&env);
     stale.complain("the service is of another version", "service", "warning", "restart scanhub");
     assert!(stale.said("service").1.contains("version 0.0.1"), "{:?}", stale.said("service"));
     fs::write(at("etc/udev/rules.d/60-scanhub.rules"), "# of a year ago\n").expect("can be written");
-    laid_out(&stage).complain("the udev rule is of another version", "udev", "warning", "install.sh");
+    laid_out(&env).complain("the udev rule is of another version", "udev", "warning", "install.sh");
 }
 
 #[test]
 fn what_is_short() {
-    let stage = Stage::new();
-    let link = stage.link("absent");
-    let limited = |words| Findings::in_outcome(&Program::start(under(&stage, words, &[&link])).wait());
+    let env = TestEnv::new();
+    let link = env.link("absent");
+    let limited = |words| Findings::in_outcome(&Program::start(under(&env, words, &[&link])).wait());
     limited("ulimit -n 64").complain("descriptors are short", "descriptors", "failed", "LimitNOFILE=");
     limited("ulimit -n 128").complain(
         "descriptors for few consumers",
@@ -144,7 +144,7 @@ fn what_is_short() {
     };
     let attempt = mounted("size=64k", "true").arg("true").output();
     if !attempt.is_ok_and(|output| output.status.success()) {
-        eprintln!("skipped: this user may not make a mount namespace");
+        skip("mounts", "this user may not make a mount namespace");
         return;
     }
     for (set_up, options, after, remedy) in [
@@ -153,7 +153,7 @@ fn what_is_short() {
         ("shared memory has room for few files", "size=64m,nr_inodes=9", "true", "nr_inodes"),
         ("shared memory cannot be written to", "size=64m,ro", "true", "remount,rw"),
     ] {
-        let inner = stage.command(&["doctor", "--json", "--no-system-config", &link]);
+        let inner = env.command(&["doctor", "--json", "--no-system-config", &link]);
         let mut command = mounted(options, after);
         command.arg(inner.get_program()).args(inner.get_args()).env("SCANHUB_END_WITH_PARENT", "1");
         let findings = Findings::in_outcome(&Program::start(command).wait());
@@ -163,116 +163,111 @@ fn what_is_short() {
 
 #[test]
 fn what_is_wrong_with_the_domain() {
-    let stage = Stage::new();
-    let root = stage.place().root().to_owned();
+    let env = TestEnv::new();
+    let root = env.place().root().to_owned();
     fs::create_dir(&root).expect("can be made");
     fs::set_permissions(&root, fs::Permissions::from_mode(0o777)).expect("it is ours");
-    Findings::of(&stage, &[]).complain("others may write in the domain", "domain", "failed", "chmod go-w");
+    Findings::of(&env, &[]).complain("others may write in the domain", "domain", "failed", "chmod go-w");
     if std::os::unix::fs::chown(&root, Some(1), None).is_ok() {
         fs::set_permissions(&root, fs::Permissions::from_mode(0o700)).expect("root may");
-        Findings::of(&stage, &[]).complain(
-            "the domain is another user's",
-            "domain",
-            "failed",
-            "run as user 1",
-        );
+        Findings::of(&env, &[]).complain("the domain is another user's", "domain", "failed", "run as user 1");
     } else {
-        eprintln!("skipped: this user cannot give a directory away");
+        skip("root", "this user cannot give a directory away");
     }
-    let nowhere = stage.command_at(Path::new("/dev/null"), &["doctor", "--json", "--no-system-config"]);
+    let nowhere = env.command_at(Path::new("/dev/null"), &["doctor", "--json", "--no-system-config"]);
     let findings = Findings::in_outcome(&Program::start(nowhere).wait());
     findings.complain("no domain can be made there", "domain", "failed", "--root");
 }
 
 #[test]
 fn what_a_dead_hub_left_is_taken_away_and_a_living_ones_is_not() {
-    let stage = Stage::new();
-    let link = stage.link("absent");
-    let hub = stage.hub(&[&link]);
-    let before = stage.left_behind();
-    let alive = Findings::of(&stage, &["--clean"]);
+    let env = TestEnv::new();
+    let link = env.link("absent");
+    let hub = env.hub(&[&link]);
+    let before = env.left_behind();
+    let alive = Findings::of(&env, &["--clean"]);
     assert!(alive.said("clean").0 == "skipped" && alive.said("clean").1.contains(&hub.pid().to_string()));
     assert!(before.iter().all(|path| path.exists()), "{before:?}");
     hub.end(KILL);
-    Findings::of(&stage, &[]).complain("a hub was killed", "leftovers", "warning", "doctor --clean");
+    Findings::of(&env, &[]).complain("a hub was killed", "leftovers", "warning", "doctor --clean");
     // A neighbour whose name begins alike, and one that is a hub of this name elsewhere.
-    let (neighbour, other) = (Stage::new(), stage.path("other"));
-    let theirs = Program::start(stage.command_at(&other, &["run", "--json", &link])).ready();
-    let held = stage.left_behind().len();
+    let (neighbour, other) = (TestEnv::new(), env.path("other"));
+    let theirs = Program::start(env.command_at(&other, &["run", "--json", &link])).ready();
+    let held = env.left_behind().len();
     let hub = neighbour.hub(&[&link]);
     let neighbours = neighbour.left_behind();
-    let clean = Findings::of(&stage, &["--clean"]);
+    let clean = Findings::of(&env, &["--clean"]);
     assert!(clean.said("clean").1.starts_with("removed what 1 process left"), "{:?}", clean.said("clean"));
     clean.without(&["multicast", "logout", "service", "udev", "port"]).of_machine().are_silent();
-    assert!(!stage.place().root().exists());
-    let left = stage.left_behind();
+    assert!(!env.place().root().exists());
+    let left = env.left_behind();
     assert!(left.len() < held && !left.is_empty(), "{left:?}");
     assert_eq!(neighbour.left_behind(), neighbours);
     // The other one is as it was: who comes now finds it.
     assert_eq!(theirs.end(TERM).code, Some(0));
-    assert_eq!((stage.left_behind().len(), hub.end(TERM).code), (0, Some(0)));
+    assert_eq!((env.left_behind().len(), hub.end(TERM).code), (0, Some(0)));
 }
 
 #[test]
 fn who_waits_for_the_next_hub_keeps_what_it_has() {
-    let stage = Stage::new();
-    let _simulator = stage.simulator(&["front"], &[] as &[&str]);
-    let link = stage.link("front");
-    let hub = stage.hub(&[&link]);
-    let mut consumer = stage.echo(&["front/scan"]);
+    let env = TestEnv::new();
+    let _simulator = env.simulator(&["front"], &[] as &[&str]);
+    let link = env.link("front");
+    let hub = env.hub(&[&link]);
+    let mut consumer = env.echo(&["front/scan"]);
     consumer.await_line("a scan", is_class("scan"));
     hub.end(KILL);
-    Findings::of(&stage, &["--clean", "/dev/null"]);
-    assert!(stage.place().root().exists());
-    let _hub = stage.hub(&[&link]);
+    Findings::of(&env, &["--clean", "/dev/null"]);
+    assert!(env.place().root().exists());
+    let _hub = env.hub(&[&link]);
     let is_anew = |line: &serde_json::Value| line["class"] == "scan" && line["topic_seq"] == 0;
     consumer.await_line("a scan of the next hub", is_anew);
 }
 
 #[test]
 fn files_without_a_domain_are_taken_away() {
-    let stage = Stage::new();
-    let hub = stage.hub(&[stage.link("absent")]);
+    let env = TestEnv::new();
+    let hub = env.hub(&[env.link("absent")]);
     hub.end(KILL);
-    fs::remove_dir_all(stage.place().root()).expect("it is ours");
-    let findings = Findings::of(&stage, &[]);
+    fs::remove_dir_all(env.place().root()).expect("it is ours");
+    let findings = Findings::of(&env, &[]);
     findings.complain("files of a domain that is gone", "leftovers", "warning", "doctor --clean");
     // Somebody still reads one of them.
-    let files = stage.left_behind();
+    let files = env.left_behind();
     let held = fs::File::open(&files[0]).expect("it is ours");
-    Findings::of(&stage, &["--clean"]);
-    assert_eq!(stage.left_behind(), files[..1]);
+    Findings::of(&env, &["--clean"]);
+    assert_eq!(env.left_behind(), files[..1]);
     drop(held);
-    Findings::of(&stage, &["--clean"]);
-    assert!(shared_memory(&stage.place().prefix()).is_empty());
-    assert_eq!(Findings::of(&stage, &["--clean"]).said("clean").1, "nothing to remove");
+    Findings::of(&env, &["--clean"]);
+    assert!(shared_memory(&env.place().prefix()).is_empty());
+    assert_eq!(Findings::of(&env, &["--clean"]).said("clean").1, "nothing to remove");
 }
 
 #[test]
 fn two_hubs_and_one_that_was_replaced() {
-    let stage = Stage::new();
-    let link = stage.link("absent");
-    let program = stage.path("scanhub");
+    let env = TestEnv::new();
+    let link = env.link("absent");
+    let program = env.path("scanhub");
     fs::copy(env!("CARGO_BIN_EXE_scanhub"), &program).expect("can be copied");
     let append =
         OpenOptions::new().append(true).open(&program).and_then(|mut file| file.write_all(b"another build"));
     append.expect("can be written");
     let run_at = |program: &Path, root: &Path| {
-        let inner = stage.command_at(root, &["run", "--json", "--no-system-config", &link]);
+        let inner = env.command_at(root, &["run", "--json", "--no-system-config", &link]);
         let mut command = Command::new(program);
         command.args(inner.get_args()).env("SCANHUB_END_WITH_PARENT", "1").env_remove("SCANHUB_CONFIG");
         Program::start(command).ready()
     };
-    let (service, user) = (stage.path("a"), stage.path("b/scanhub"));
+    let (service, user) = (env.path("a"), env.path("b/scanhub"));
     let _first = run_at(&program, &service);
     let _second = run_at(Path::new(env!("CARGO_BIN_EXE_scanhub")), &user);
     fs::remove_file(&program).expect("it is ours");
-    let name = stage.place().name().to_owned();
+    let name = env.place().name().to_owned();
     let mut doctor = Command::new(env!("CARGO_BIN_EXE_scanhub"));
     doctor.args(["doctor", "--json", "--no-system-config", "--domain", &name, &link]);
     doctor
         .env("RUNTIME_DIRECTORY", &service)
-        .env("XDG_RUNTIME_DIR", stage.path("b"))
+        .env("XDG_RUNTIME_DIR", env.path("b"))
         .env_remove("SCANHUB_CONFIG");
     let findings = Findings::in_outcome(&Program::start(doctor).wait());
     findings.complain("two hubs of one name", "hubs", "warning", "--domain");
@@ -286,10 +281,10 @@ fn two_hubs_and_one_that_was_replaced() {
 #[test]
 fn no_way_to_the_network() {
     in_a_network("doctor_machine::no_way_to_the_network", || {
-        let stage = Stage::new();
+        let env = TestEnv::new();
         // Nobody named an interface: nothing goes to a network.
-        assert_eq!(Findings::of(&stage, &[]).said("multicast").0, "skipped");
-        let interface = Findings::of(&stage, &["--set", "gateway.interface=eth7"]);
+        assert_eq!(Findings::of(&env, &[]).said("multicast").0, "skipped");
+        let interface = Findings::of(&env, &["--set", "gateway.interface=eth7"]);
         interface.complain("the gateway's interface is gone", "multicast", "failed", "there are lo");
     });
 }

@@ -6,42 +6,42 @@ use std::os::unix::fs::symlink;
 use std::process::Stdio;
 
 use crate::testkit;
-use crate::testkit::{INT, KILL, Program, Stage, TERM, is_class, is_there, until};
+use crate::testkit::{INT, KILL, Program, TERM, TestEnv, is_class, is_there, until};
 use rustix::pipe::{PipeFlags, pipe_with};
 use serde_json::Value;
 
 /// A hub whose sensor is a recording of some minutes, in the sensor's pace.
-fn hub(stage: &Stage) -> Program {
+fn hub(env: &TestEnv) -> Program {
     let scans: Vec<u8> = (0..4000).flat_map(testkit::scan).collect();
-    let file = stage.file("scans", scans);
-    stage.hub(&["--link", &format!("front=file:{file}")])
+    let file = env.file("scans", scans);
+    env.hub(&["--link", &format!("front=file:{file}")])
 }
 
 #[test]
 fn a_hub_ends_by_both_signals_and_leaves_nothing() {
     for signal in [INT, TERM] {
-        let stage = Stage::new();
-        let simulator = stage.simulator(&["front"], &["--baud=500000"]);
-        let hub = stage.hub(&[stage.link("front"), stage.link("rear")]);
-        let mut consumer = stage.echo(&["front/scan"]);
+        let env = TestEnv::new();
+        let simulator = env.simulator(&["front"], &["--baud=500000"]);
+        let hub = env.hub(&[env.link("front"), env.link("rear")]);
+        let mut consumer = env.echo(&["front/scan"]);
         consumer.await_lines(3, "a scan", is_class("scan"));
-        assert!(!stage.left_behind().is_empty(), "looked at the wrong place");
+        assert!(!env.left_behind().is_empty(), "looked at the wrong place");
         assert_eq!(hub.end(signal).code, Some(0), "{signal:?}");
         // Once the consumer has gone too.
         assert_eq!(consumer.end(INT).code, Some(0));
-        until("shared memory is free", || stage.left_behind().is_empty());
+        until("shared memory is free", || env.left_behind().is_empty());
         assert_eq!(simulator.end(signal).code, Some(0));
-        assert!(!is_there(&stage.path("front")), "the simulator's symlink is left");
+        assert!(!is_there(&env.path("front")), "the simulator's symlink is left");
     }
 }
 
 #[test]
 fn interrupted_consumers_say_what_they_received() {
-    let stage = Stage::new();
-    let _hub = hub(&stage);
+    let env = TestEnv::new();
+    let _hub = hub(&env);
     for signal in [INT, TERM] {
         for (bounds, code) in [(&[][..], 0), (&["-n", "100000"], 130), (&["--for", "5m"], 130)] {
-            let mut consumer = stage.start(&[&["echo", "--json", "front/scan"], bounds].concat());
+            let mut consumer = env.start(&[&["echo", "--json", "front/scan"], bounds].concat());
             consumer.await_lines(3, "a scan", is_class("scan"));
             let outcome = consumer.end(signal);
             assert_eq!(outcome.code, Some(code), "{}", outcome.errors);
@@ -53,16 +53,16 @@ fn interrupted_consumers_say_what_they_received() {
         }
     }
     // One that is through is not interrupted.
-    let outcome = stage.run(&["echo", "--json", "front/scan", "-n", "5"]);
+    let outcome = env.run(&["echo", "--json", "front/scan", "-n", "5"]);
     assert_eq!((outcome.code, outcome.of_class("scan").len()), (Some(0), 5), "{outcome}");
 }
 
 #[test]
 fn a_reader_that_has_enough_is_no_failure() {
-    let stage = Stage::new();
-    let _hub = hub(&stage);
+    let env = TestEnv::new();
+    let _hub = hub(&env);
     for format in ["--json", "--csv"] {
-        let mut command = stage.command(&["echo", "front/scan", format]);
+        let mut command = env.command(&["echo", "front/scan", format]);
         let mut echo = command.stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().expect("starts");
         let mut line = String::new();
         let mut reader = BufReader::with_capacity(1, echo.stdout.take().expect("a pipe"));
@@ -77,11 +77,11 @@ fn a_reader_that_has_enough_is_no_failure() {
 
 #[test]
 fn every_line_is_one_write() {
-    let stage = Stage::new();
-    let _hub = hub(&stage);
+    let env = TestEnv::new();
+    let _hub = hub(&env);
     // A pipe that keeps writes apart: what is read at once was written at once.
     let (read, write) = pipe_with(PipeFlags::DIRECT | PipeFlags::CLOEXEC).expect("a pipe");
-    let mut command = stage.command(&["echo", "--json", "front/scan", "front/telegram", "front/status"]);
+    let mut command = env.command(&["echo", "--json", "front/scan", "front/telegram", "front/status"]);
     let mut echo = command.stdout(write).stderr(Stdio::null()).spawn().expect("starts");
     drop(command);
     for _ in 0..60 {
@@ -96,12 +96,12 @@ fn every_line_is_one_write() {
 
 #[test]
 fn a_killed_echo_leaves_whole_lines() {
-    let stage = Stage::new();
-    let _hub = hub(&stage);
+    let env = TestEnv::new();
+    let _hub = hub(&env);
     for number in 0..5 {
-        let path = stage.path(&format!("lines{number}"));
+        let path = env.path(&format!("lines{number}"));
         let file = File::create(&path).expect("a file");
-        let mut command = stage.command(&["echo", "--json", "front/scan", "front/telegram"]);
+        let mut command = env.command(&["echo", "--json", "front/scan", "front/telegram"]);
         let mut echo = command.stdout(file).stderr(Stdio::null()).spawn().expect("starts");
         until("some lines", || fs::metadata(&path).is_ok_and(|metadata| metadata.len() > 40_000));
         echo.kill().expect("is killed");
@@ -115,22 +115,22 @@ fn a_killed_echo_leaves_whole_lines() {
 
 #[test]
 fn a_simulator_takes_and_leaves_only_its_own_place() {
-    let stage = Stage::new();
-    let (port, mine) = (stage.path("front"), stage.file("mine", "mine"));
+    let env = TestEnv::new();
+    let (port, mine) = (env.path("front"), env.file("mine", "mine"));
     // What a killed simulator left behind is replaced.
-    let simulator = stage.simulator(&["front"], &[] as &[&str]);
+    let simulator = env.simulator(&["front"], &[] as &[&str]);
     let old = fs::read_link(&port).expect("a symlink");
     assert_eq!(simulator.end(KILL).code, None);
     assert_eq!(fs::read_link(&port).ok(), Some(old));
-    let simulator = stage.simulator(&["front"], &[] as &[&str]);
+    let simulator = env.simulator(&["front"], &[] as &[&str]);
     assert!(fs::metadata(&port).is_ok(), "leads nowhere");
     assert_eq!(simulator.end(INT).code, Some(0));
     assert!(!is_there(&port));
     // Nothing else is.
     symlink(&mine, &port).expect("a symlink");
-    let link = stage.word("front");
+    let link = env.word("front");
     for place in [&mine, &link] {
-        let outcome = stage.run(&["simulate", "--port", place]);
+        let outcome = env.run(&["simulate", "--port", place]);
         assert_eq!(outcome.code, Some(4), "{outcome}");
         assert!(outcome.errors.contains(place), "{outcome}");
     }

@@ -6,7 +6,7 @@ use std::net::TcpListener;
 use std::thread;
 use std::time::{Duration, Instant};
 
-use crate::testkit::{INT, Line, Program, Stage, TERM, bytes_of, is_class, number, scan};
+use crate::testkit::{INT, Line, Program, TERM, TestEnv, bytes_of, is_class, number, scan};
 use fastrand::Rng;
 
 /// Garbage that a framer has to work for: noise, start bytes, and heads of telegrams that never end.
@@ -51,10 +51,10 @@ fn receive(consumer: &mut Program, sent: &[Vec<u8>]) -> u64 {
 
 #[test]
 fn telegrams_in_a_flood_of_garbage() {
-    let stage = Stage::new();
-    let line = Line::at(&stage.path("front"));
-    let hub = stage.hub(&[stage.link("front")]);
-    let mut consumer = stage.echo(&["front/telegram"]);
+    let env = TestEnv::new();
+    let line = Line::at(&env.path("front"));
+    let hub = env.hub(&[env.link("front")]);
+    let mut consumer = env.echo(&["front/telegram"]);
     line.await_open();
     let mut random = Rng::with_seed(4);
     let mut sent = Vec::new();
@@ -80,7 +80,7 @@ fn telegrams_in_a_flood_of_garbage() {
     eprintln!("resident memory: {before_kb} kB, {grown_kb} kB more after {} more bytes", 50 * 200_000);
     assert!(grown_kb <= 64, "the hub grew by {grown_kb} kB");
     let all = 2 + wrong + sent.len() as u64;
-    let info = stage.await_info("front", |info| number(&info["counters"], "telegrams") >= all);
+    let info = env.await_info("front", |info| number(&info["counters"], "telegrams") >= all);
     assert_eq!(number(&info["counters"], "telegrams"), all, "{info}");
     consumer.end(INT);
     assert_eq!(hub.end(TERM).code, Some(0));
@@ -98,11 +98,11 @@ fn worked(pid: u32) -> Duration {
 
 #[test]
 fn a_serial_server_that_sends_garbage_at_full_speed() {
-    let stage = Stage::new();
+    let env = TestEnv::new();
     let listener = TcpListener::bind("127.0.0.1:0").expect("a port of the loopback");
     let link = format!("--link=front=tcp:{}", listener.local_addr().expect("it has an address"));
-    let hub = stage.hub(&[link]);
-    let mut consumer = stage.echo(&["front/telegram"]);
+    let hub = env.hub(&[link]);
+    let mut consumer = env.echo(&["front/telegram"]);
     let (mut server, _) = listener.accept().expect("the hub comes");
     // More than is allowed at once, with telegrams in it; then garbage without an end.
     let mut random = Rng::with_seed(5);
@@ -122,9 +122,8 @@ fn a_serial_server_that_sends_garbage_at_full_speed() {
     receive(&mut consumer, &sent);
     consumer.end(INT);
     let says = "more comes than a line of 500000 baud brings";
-    stage
-        .await_info("front", |info| info["last_error"].as_str().is_some_and(|error| error.starts_with(says)));
-    let bytes = || number(&stage.info("front")["counters"], "bytes_read");
+    env.await_info("front", |info| info["last_error"].as_str().is_some_and(|error| error.starts_with(says)));
+    let bytes = || number(&env.info("front")["counters"], "bytes_read");
     // The counters are as old as the last status: a second.
     let (before, since, idle) = (bytes(), Instant::now(), worked(hub.pid()));
     thread::sleep(Duration::from_secs(3));

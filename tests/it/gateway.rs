@@ -4,7 +4,7 @@
 use std::net::{Ipv4Addr, UdpSocket};
 
 use crate::testkit::{
-    INT, KILL, Outcome, Receiver, Stage, TERM, hash, in_a_network, is_class, number, read, until,
+    INT, KILL, Outcome, Receiver, TERM, TestEnv, hash, in_a_network, is_class, number, read, skip, until,
 };
 use schema::datagram::{Account, Announce, Datagram, Packed};
 use schema::{Scan, Topic, Verdict, Zones};
@@ -69,13 +69,13 @@ fn from_row(bytes: &[u8], sensor: u8, topic: u8) -> bool {
 #[test]
 fn two_sensors_go_out_whole() {
     in_a_network("gateway::two_sensors_go_out_whole", || {
-        let stage = Stage::new();
+        let env = TestEnv::new();
         let receiver = Receiver::new(LO);
-        let _simulator = stage.simulator(&["front", "rear"], &STREAM);
-        let _hub = stage.hub(&[stage.link("front"), stage.link("rear")]);
-        let gateway = stage.gateway(&["--interface=lo"]);
+        let _simulator = env.simulator(&["front", "rear"], &STREAM);
+        let _hub = env.hub(&[env.link("front"), env.link("rear")]);
+        let gateway = env.gateway(&["--interface=lo"]);
         receiver.await_more(1, from(1, Topic::Scan));
-        let mut echo = stage.echo(&["front/scan"]);
+        let mut echo = env.echo(&["front/scan"]);
         let lines = echo.await_lines(40, "a scan", is_class("scan"));
         receiver.await_more(40, from(1, Topic::Scan));
         let outcome = gateway.end(TERM);
@@ -118,13 +118,13 @@ fn two_sensors_go_out_whole() {
 #[test]
 fn what_is_thinned_stays_together() {
     in_a_network("gateway::what_is_thinned_stays_together", || {
-        let stage = Stage::new();
+        let env = TestEnv::new();
         let receiver = Receiver::new(LO);
-        let _simulator = stage.simulator(&["front", "rear"], &STREAM);
-        let _hub = stage.hub(&[stage.link("front"), stage.link("rear")]);
-        stage.await_info("front", |info| info["state"] == "streaming");
+        let _simulator = env.simulator(&["front", "rear"], &STREAM);
+        let _hub = env.hub(&[env.link("front"), env.link("rear")]);
+        env.await_info("front", |info| info["state"] == "streaming");
         let flags = ["--interface=lo", "--topic=front/scan:every=4", "--topic=front/zones:every=4"];
-        let gateway = stage.gateway(&flags);
+        let gateway = env.gateway(&flags);
         receiver.await_more(20, from(0, Topic::Scan));
         let outcome = gateway.end(TERM);
         let heard = receiver.finish();
@@ -157,12 +157,12 @@ fn is_unknown(datagram: &Datagram<'_>) -> bool {
 #[test]
 fn bare_telegrams_are_those_of_the_line() {
     in_a_network("gateway::bare_telegrams_are_those_of_the_line", || {
-        let stage = Stage::new();
+        let env = TestEnv::new();
         let (usual, front, rear) = (Receiver::new(LO), Receiver::at(LO, 22_201), Receiver::at(LO, 22_202));
-        let mut waiting = stage.gateway(&["--interface=lo", "--bare"]);
+        let mut waiting = env.gateway(&["--interface=lo", "--bare"]);
         waiting.await_line("no hub", |line| line["kind"] == "hub_gone");
-        let _simulator = stage.simulator(&["front", "rear"], &STREAM);
-        let hub = stage.hub(&[stage.link("front"), stage.link("rear")]);
+        let _simulator = env.simulator(&["front", "rear"], &STREAM);
+        let hub = env.hub(&[env.link("front"), env.link("rear")]);
         until("telegrams", || front.heard().len() >= 50 && rear.heard().len() >= 50);
         assert_eq!(hub.end(TERM).code, Some(0));
         let outcome = waiting.end(INT);
@@ -170,7 +170,7 @@ fn bare_telegrams_are_those_of_the_line() {
         assert!(usual.finish().is_empty(), "nothing goes to the port of what has a header");
         for (receiver, name) in [(front, "front"), (rear, "rear")] {
             let heard = receiver.finish();
-            let sent: Vec<_> = stage.truth(name).into_iter().map(|sent| sent.hash).collect();
+            let sent: Vec<_> = env.truth(name).into_iter().map(|sent| sent.hash).collect();
             assert!(heard.iter().all(|bytes| sent.contains(&hash(bytes))), "{name}");
             let lines = account(&outcome);
             let line = lines.iter().find(|line| line["sensor"] == name).expect("its account");
@@ -182,12 +182,12 @@ fn bare_telegrams_are_those_of_the_line() {
 #[test]
 fn copies_are_the_same_and_a_dead_host_disturbs_nobody() {
     in_a_network("gateway::copies_are_the_same_and_a_dead_host_disturbs_nobody", || {
-        let stage = Stage::new();
+        let env = TestEnv::new();
         let (receiver, copies) = (Receiver::new(LO), Receiver::at(LO, 30_000));
-        let _simulator = stage.simulator(&["front"], &STREAM);
-        let _hub = stage.hub(&[stage.link("front")]);
+        let _simulator = env.simulator(&["front"], &STREAM);
+        let _hub = env.hub(&[env.link("front")]);
         let flags = ["--interface=lo", "--to=127.0.0.1:9", "--to=localhost:30000"];
-        let mut gateway = stage.gateway(&flags);
+        let mut gateway = env.gateway(&flags);
         let failing = gateway.await_line("the dead host", is_class("lan_link"));
         assert_eq!((&failing["to"], &failing["state"]), (&"127.0.0.1:9".into(), &"failing".into()));
         receiver.await_more(30, of_topic(Topic::Scan));
@@ -210,14 +210,14 @@ fn copies_are_the_same_and_a_dead_host_disturbs_nobody() {
 fn copies_go_over_ipv6_too() {
     in_a_network("gateway::copies_go_over_ipv6_too", || {
         let Ok(copies) = UdpSocket::bind("[::1]:30000") else {
-            eprintln!("skipped: no IPv6 here");
+            skip("ipv6", "no IPv6 here");
             return;
         };
-        let stage = Stage::new();
+        let env = TestEnv::new();
         let receiver = Receiver::new(LO);
-        let _simulator = stage.simulator(&["front"], &STREAM);
-        let _hub = stage.hub(&[stage.link("front")]);
-        let gateway = stage.gateway(&["--interface=lo", "--topic=front/zones", "--to=[::1]:30000"]);
+        let _simulator = env.simulator(&["front"], &STREAM);
+        let _hub = env.hub(&[env.link("front")]);
+        let gateway = env.gateway(&["--interface=lo", "--topic=front/zones", "--to=[::1]:30000"]);
         receiver.await_more(10, of_topic(Topic::Zones));
         let outcome = gateway.end(TERM);
         let heard = receiver.finish();
@@ -235,13 +235,13 @@ fn copies_go_over_ipv6_too() {
 #[test]
 fn hubs_and_gateways_are_replaced() {
     in_a_network("gateway::hubs_and_gateways_are_replaced", || {
-        let stage = Stage::new();
+        let env = TestEnv::new();
         let receiver = Receiver::new(LO);
-        let mut first = stage.gateway(&["--interface=lo"]);
+        let mut first = env.gateway(&["--interface=lo"]);
         first.await_line("no hub", |line| line["kind"] == "hub_gone");
-        let _simulator = stage.simulator(&["front"], &STREAM);
-        let links = [stage.link("front")];
-        let hub = stage.hub(&links);
+        let _simulator = env.simulator(&["front"], &STREAM);
+        let links = [env.link("front")];
+        let hub = env.hub(&links);
         first.await_line("the hub", |line| line["kind"] == "hub_back");
         receiver.await_more(10, of_topic(Topic::Scan));
         hub.end(KILL);
@@ -251,11 +251,11 @@ fn hubs_and_gateways_are_replaced() {
             let last = heard.iter().map(|bytes| read(bytes)).rfind(of_topic(Topic::Zones));
             last.is_some_and(|last| is_unknown(&last))
         });
-        let _hub = stage.hub(&links);
+        let _hub = env.hub(&links);
         first.await_line("the next hub", |line| line["kind"] == "hub_back");
         receiver.await_more(10, of_topic(Topic::Scan));
         let outcome = first.end(TERM);
-        let second = stage.gateway(&["--interface=lo"]);
+        let second = env.gateway(&["--interface=lo"]);
         receiver.await_more(10, of_topic(Topic::Scan));
         drop(second.end(TERM));
         let heard = receiver.finish();
@@ -279,13 +279,13 @@ fn announced(bytes: &[u8]) -> Option<Announce> {
 #[test]
 fn what_does_not_fit_is_told_and_counted() {
     in_a_network("gateway::what_does_not_fit_is_told_and_counted", || {
-        let stage = Stage::new();
+        let env = TestEnv::new();
         let receiver = Receiver::new(LO);
-        let _simulator = stage.simulator(&["front"], &STREAM);
-        let _hub = stage.hub(&[stage.link("front")]);
+        let _simulator = env.simulator(&["front"], &STREAM);
+        let _hub = env.hub(&[env.link("front")]);
         // The room's scans have intensities: 1143 bytes.
         let mut gateway =
-            stage.gateway(&["--interface=lo", "--mtu=1000", "--topic=*/scan", "--topic=*/telegram"]);
+            env.gateway(&["--interface=lo", "--mtu=1000", "--topic=*/scan", "--topic=*/telegram"]);
         let told = gateway.await_line("what does not fit", is_class("lan_link"));
         assert_eq!((&told["to"], &told["state"]), (&"front/scan".into(), &"failing".into()));
         receiver.await_more(20, of_topic(Topic::Telegram));
@@ -306,12 +306,12 @@ fn what_does_not_fit_is_told_and_counted() {
 #[test]
 fn without_an_interface_nothing_goes_to_groups() {
     in_a_network("gateway::without_an_interface_nothing_goes_to_groups", || {
-        let stage = Stage::new();
+        let env = TestEnv::new();
         let groups = Receiver::new(LO);
-        let _simulator = stage.simulator(&["front"], &STREAM);
-        let _hub = stage.hub(&[stage.link("front")]);
+        let _simulator = env.simulator(&["front"], &STREAM);
+        let _hub = env.hub(&[env.link("front")]);
         let copies = Receiver::at(LO, 30_000);
-        let mut gateway = stage.gateway_at(&["--to=127.0.0.1:30000"]);
+        let mut gateway = env.gateway_at(&["--to=127.0.0.1:30000"]);
         let begin = gateway.await_line("its begin", is_class("gateway"));
         assert_eq!((&begin["interface"], &begin["to"]), (&json!(null), &json!(["127.0.0.1:30000"])));
         copies.await_more(30, |datagram| datagram.head.topic == Topic::Scan.number());

@@ -5,7 +5,7 @@ use std::net::Ipv4Addr;
 use std::process::{Command, Stdio};
 
 use crate::testkit::{
-    Outcome, Program, Receiver, Stage, TERM, USR1, in_a_network, ip, is_class, number, read, until,
+    Outcome, Program, Receiver, TERM, TestEnv, USR1, in_a_network, ip, is_class, number, read, skip, until,
 };
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
 use rustix::pipe::fcntl_setpipe_size;
@@ -75,11 +75,11 @@ fn is_gap_free(heard: &[Vec<u8>], outcome: &Outcome) {
 #[test]
 fn a_link_that_goes_and_comes() {
     in_a_network("gateway_network::a_link_that_goes_and_comes", || {
-        let stage = Stage::new();
+        let env = TestEnv::new();
         plug();
-        let _simulator = stage.simulator(&["front"], &STREAM);
-        let _hub = stage.hub(&[stage.link("front")]);
-        let mut gateway = stage.gateway(&["--interface=ours", "--to=10.76.0.9:22200"]);
+        let _simulator = env.simulator(&["front"], &STREAM);
+        let _hub = env.hub(&[env.link("front")]);
+        let mut gateway = env.gateway(&["--interface=ours", "--to=10.76.0.9:22200"]);
         let receiver = Receiver::new(OURS);
         receiver.await_more(10, |datagram| datagram.head.topic == Topic::Scan.number());
         await_growth(&mut gateway, "sent");
@@ -116,16 +116,16 @@ fn a_link_that_goes_and_comes() {
 #[test]
 fn what_a_full_queue_drops_is_counted() {
     in_a_network("gateway_network::what_a_full_queue_drops_is_counted", || {
-        let stage = Stage::new();
+        let env = TestEnv::new();
         plug();
-        let _simulator = stage.simulator(&["front"], &STREAM);
-        let _hub = stage.hub(&[stage.link("front")]);
-        let mut gateway = stage.gateway(&["--interface=ours"]);
+        let _simulator = env.simulator(&["front"], &STREAM);
+        let _hub = env.hub(&[env.link("front")]);
+        let mut gateway = env.gateway(&["--interface=ours"]);
         let receiver = Receiver::new(OURS);
         receiver.await_more(10, |datagram| datagram.head.topic == Topic::Scan.number());
         let limit = "qdisc add dev ours root tbf rate 64kbit burst 2000 limit 4000";
         if !Command::new("tc").args(limit.split(' ')).status().is_ok_and(|status| status.success()) {
-            eprintln!("skipped: there is no queue that can be limited here");
+            skip("tc", "there is no queue that can be limited here");
             return;
         }
         let failing = await_state(&mut gateway, "failing");
@@ -143,14 +143,14 @@ fn what_a_full_queue_drops_is_counted() {
 #[test]
 fn a_reader_that_does_not_read_delays_nothing() {
     in_a_network("gateway_network::a_reader_that_does_not_read_delays_nothing", || {
-        let stage = Stage::new();
+        let env = TestEnv::new();
         let receiver = Receiver::new(Ipv4Addr::LOCALHOST);
-        let _simulator = stage.simulator(&["front"], &STREAM);
-        let _hub = stage.hub(&[stage.link("front")]);
+        let _simulator = env.simulator(&["front"], &STREAM);
+        let _hub = env.hub(&[env.link("front")]);
         // The pipe stays open, and is soon full.
         let (_reader, writer) = std::io::pipe().expect("a pipe");
         fcntl_setpipe_size(&writer, 8192).expect("a small one");
-        let mut command = stage.command(&["gateway", "--json", "--no-system-config", "--interface=lo"]);
+        let mut command = env.command(&["gateway", "--json", "--no-system-config", "--interface=lo"]);
         command.stdout(writer.try_clone().expect("another end")).stdin(Stdio::null());
         let mut gateway = command.spawn().expect("a gateway");
         let signal = |signal| kill_process(Pid::from_child(&gateway), signal).expect("it lives");
@@ -179,13 +179,13 @@ fn a_reader_that_does_not_read_delays_nothing() {
 #[test]
 fn the_account_is_told_when_asked_for() {
     in_a_network("gateway_network::the_account_is_told_when_asked_for", || {
-        let stage = Stage::new();
+        let env = TestEnv::new();
         let receiver = Receiver::new(Ipv4Addr::LOCALHOST);
-        let _simulator = stage.simulator(&["front"], &STREAM);
-        let _hub = stage.hub(&[stage.link("front")]);
+        let _simulator = env.simulator(&["front"], &STREAM);
+        let _hub = env.hub(&[env.link("front")]);
         let flags = ["--interface=lo", "--topic=front/background", "--background-every=1s"];
         let words = [&["gateway", "--no-system-config"], &flags[..]].concat();
-        let mut gateway = stage.start(&words);
+        let mut gateway = env.start(&words);
         gateway.await_text("gateway ");
         let is_background =
             |datagram: &schema::datagram::Datagram<'_>| datagram.head.topic == Topic::Background.number();
@@ -199,7 +199,7 @@ fn the_account_is_told_when_asked_for() {
             let is_one = is_background(&datagram);
             is_one.then(|| datagram.payload[..4].to_vec())
         };
-        assert_eq!(stage.run(&["background", "front", "reset"]).code, Some(0));
+        assert_eq!(env.run(&["background", "front", "reset"]).code, Some(0));
         until("another generation", || {
             let mut all: Vec<_> = receiver.heard().iter().filter_map(|bytes| generation(bytes)).collect();
             all.dedup();
@@ -219,11 +219,11 @@ fn the_account_is_told_when_asked_for() {
 #[test]
 fn what_cannot_be_is_refused() {
     in_a_network("gateway_network::what_cannot_be_is_refused", || {
-        let stage = Stage::new();
-        let _hub = stage.hub(&[stage.link("front")]);
-        let config = |text: &str| format!("--config={}", stage.file("gateway.toml", text));
+        let env = TestEnv::new();
+        let _hub = env.hub(&[env.link("front")]);
+        let config = |text: &str| format!("--config={}", env.file("gateway.toml", text));
         let refused = |flags: &[&str], code: i32, said: &str, hint: &str| {
-            let outcome = stage.gateway_at(flags).wait();
+            let outcome = env.gateway_at(flags).wait();
             let error = outcome.of_class("error").pop().unwrap_or_else(|| panic!("{flags:?}: {outcome}"));
             assert_eq!(outcome.code, Some(code), "{flags:?}: {outcome}");
             let (message, found) = (error["message"].to_string(), error["hint"].to_string());
@@ -253,14 +253,14 @@ fn what_cannot_be_is_refused() {
         refused(&[], 78, "no interface is named", "ours (10.76.0.1)");
         refused(&[&config("[gateway]\ntopics = [\"front/scan\"]\n")], 78, "no interface", "--to");
         let unwritable = {
-            let mut command = stage.command(&["gateway", "--json", "--no-system-config", "--interface=lo"]);
+            let mut command = env.command(&["gateway", "--json", "--no-system-config", "--interface=lo"]);
             command.env("XDG_STATE_HOME", "/dev/null").env_remove("STATE_DIRECTORY");
             Program::start(command).wait()
         };
         assert_eq!(unwritable.code, Some(78), "{unwritable}");
         // What the configuration says counts, and a flag wins over it.
         let said = config("[gateway]\ninterface = \"eth8\"\ntopics = [\"front/status\"]\nmtu = 1400\n");
-        let mut gateway = stage.gateway_at(&["--interface=lo", &said]);
+        let mut gateway = env.gateway_at(&["--interface=lo", &said]);
         let begin = gateway.await_line("its begin", is_class("gateway"));
         assert_eq!((&begin["interface"], number(&begin, "longest")), (&"lo".into(), 1400));
         let line =

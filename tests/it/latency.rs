@@ -6,7 +6,7 @@ use std::thread;
 use std::time::Duration;
 
 use crate::testkit;
-use crate::testkit::{INT, Outcome, Sender, Stage, TERM, in_a_network, number, until};
+use crate::testkit::{INT, Outcome, Sender, TERM, TestEnv, in_a_network, number, until};
 use schema::{Topic, Verdict, Zones};
 use serde_json::{Value, json};
 
@@ -30,13 +30,13 @@ fn count(line: &Value, span: &str) -> u64 {
 
 #[test]
 fn ages_of_a_stream_are_split_and_judged() {
-    let stage = Stage::new();
-    let simulator = stage.simulator(&["front"], &["--seed=71", "--baud=500000"]);
-    let hub = stage.hub(&[stage.link("front")]);
-    stage.await_info("front", |info| info["state"] == "streaming");
+    let env = TestEnv::new();
+    let simulator = env.simulator(&["front"], &["--seed=71", "--baud=500000"]);
+    let hub = env.hub(&[env.link("front")]);
+    env.await_info("front", |info| info["state"] == "streaming");
     for wait in ["doorbell", "event", "spin"] {
         let by = format!("--wait={wait}");
-        let outcome = stage.run(&["latency", "front/scan", "-n", "20", "--json", &by, "--max-p99=1h"]);
+        let outcome = env.run(&["latency", "front/scan", "-n", "20", "--json", &by, "--max-p99=1h"]);
         assert_eq!(outcome.code, Some(0), "{outcome}");
         let conditions = &outcome.lines()[0];
         assert_eq!((&conditions["class"], &conditions["wait"]), (&json!("conditions"), &json!(wait)));
@@ -57,46 +57,46 @@ fn ages_of_a_stream_are_split_and_judged() {
         let summary = &outcome.of_class("summary")[0];
         assert_eq!((number(summary, "received"), &summary["topic"]), (20, &json!("scan")));
     }
-    let outcome = stage.run(&["latency", "front/scan", "front/telegram", "-n20", "--json", "--max-p99=1us"]);
+    let outcome = env.run(&["latency", "front/scan", "front/telegram", "-n20", "--json", "--max-p99=1us"]);
     assert_eq!(
         (outcome.code, &outcome.of_class("error")[0]["kind"]),
         (Some(5), &json!("check")),
         "{outcome}"
     );
     assert_eq!(outcome.of_class("latency").len(), 2, "{outcome}");
-    let mut latency = stage.start(&["latency", "front/scan", "--json"]);
+    let mut latency = env.start(&["latency", "front/scan", "--json"]);
     let line = latency.await_line("a time on the line", |line| count(line, "line") > 0);
     // 732 bytes of ten bits.
     assert!(number(&line["line"], "max_ns") > 14_000_000, "{line}");
     assert!(number(&line["total"], "min_ns") > number(&line["line"], "min_ns"), "{line}");
     assert_eq!(latency.end(INT).code, Some(0));
     // A status says something without a telegram: it has an age, and nothing else.
-    let mut latency = stage.start(&["latency", "front/status", "--json", "--no-realtime"]);
+    let mut latency = env.start(&["latency", "front/status", "--json", "--no-realtime"]);
     let line = latency.await_line("a status", |line| line["age"] != Value::Null);
     assert_eq!((&line["line"], &line["hub"], &line["total"]), (&Value::Null, &Value::Null, &Value::Null));
     let outcome = latency.end(INT);
     assert_eq!((outcome.code, &outcome.lines()[0]["realtime"]), (Some(0), &json!(false)), "{outcome}");
     assert!(number(&told(&outcome), "before") <= 1, "the one that is kept for late joiners");
-    let text = stage.run(&["latency", "front/scan", "-n", "5"]);
+    let text = env.run(&["latency", "front/scan", "-n", "5"]);
     let out = String::from_utf8_lossy(&text.out).into_owned();
     assert!(out.contains("p99.9") && out.contains("\nwake ") && !out.contains(" ##"), "{text}");
     assert!(text.errors.contains("wait by doorbell") && text.errors.contains("ns to read"), "{text}");
-    assert_eq!(stage.run(&["latency"]).code, Some(2));
-    assert_eq!(stage.run(&["latency", "front/scan", "--wait=long"]).code, Some(2));
+    assert_eq!(env.run(&["latency"]).code, Some(2));
+    assert_eq!(env.run(&["latency", "front/scan", "--wait=long"]).code, Some(2));
     assert_eq!((hub.end(TERM).code, simulator.end(TERM).code), (Some(0), Some(0)));
 }
 
 #[test]
 fn of_a_remote_sensor_the_way_on_this_machine_is_known() {
     in_a_network("latency::of_a_remote_sensor_the_way_on_this_machine_is_known", || {
-        let stage = Stage::new();
+        let env = TestEnv::new();
         let mut sender = Sender::new(0x5f3a_12bc_00d1_e2f3, 7, 3, "front");
         let publisher = ["listen", "--json", "--publish", "--name=robot1=5f3a12bc00d1e2f3"];
-        let mut listener = stage.start(&publisher).ready();
+        let mut listener = env.start(&publisher).ready();
         sender.announce(&[Topic::Zones]);
         listener.await_line("a sensor", |line| line["kind"] == "published");
-        let mut latency = stage.start(&["latency", "--json", "robot1.front/zones"]);
-        until("it is attached", || stage.subscribers("robot1.front/zones") == 1);
+        let mut latency = env.start(&["latency", "--json", "robot1.front/zones"]);
+        until("it is attached", || env.subscribers("robot1.front/zones") == 1);
         let zones = Zones { verdict: Verdict::Clear as u8, ..Zones::unknown() };
         let known = |line: &Value| line["class"] == "latency" && line["age"] != Value::Null;
         sender.stamp_ns = testkit::wall_ns() - 50_000_000;

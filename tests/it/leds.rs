@@ -9,7 +9,7 @@ use std::thread;
 use std::time::Duration;
 
 use crate::testkit::{
-    INT, KILL, Program, Sender, Stage, TERM, in_a_network, is_class, number, terminal, until,
+    INT, KILL, Program, Sender, TERM, TestEnv, in_a_network, is_class, number, terminal, until,
 };
 use rustix::process::Signal;
 use rustix::time::{ClockId, clock_gettime};
@@ -17,16 +17,16 @@ use schema::{Topic, Verdict, Zones};
 use serde_json::Value;
 
 /// The walls of a room, far from the sensor, and in it what `thing` says.
-fn world(stage: &Stage, name: &str, thing: &str) -> String {
+fn world(env: &TestEnv, name: &str, thing: &str) -> String {
     let room = "[noise]\ntail = 0\n\n[[thing]]\nline = [[3000, -3000], [3000, 3000], [-3000, 3000], [-3000, -3000]]\n";
-    format!("--world={}", stage.file(name, format!("{room}\n{thing}")))
+    format!("--world={}", env.file(name, format!("{room}\n{thing}")))
 }
 
 const POST: &str = "[[thing]]\nradius_mm = 20\npose = [0, 400]\n";
 const STRIP: &str = "[[thing]]\nline = [[-50, 2000], [50, 2000]]\nsurface = \"reflector\"\n";
 
-fn simulator(stage: &Stage, world: &str) -> Program {
-    stage.simulator(&["front"], &["--seed=61", "--baud=500000", world])
+fn simulator(env: &TestEnv, world: &str) -> Program {
+    env.simulator(&["front"], &["--seed=61", "--baud=500000", world])
 }
 
 /// Diodes as Linux has them.
@@ -35,8 +35,8 @@ struct Diodes(PathBuf);
 const NAMES: [&str; 4] = ["gn", "ye", "rd", "mk"];
 
 impl Diodes {
-    fn new(stage: &Stage) -> Diodes {
-        let diodes = Diodes(stage.path("leds"));
+    fn new(env: &TestEnv) -> Diodes {
+        let diodes = Diodes(env.path("leds"));
         fs::create_dir(&diodes.0).unwrap();
         NAMES.iter().for_each(|name| diodes.plug(name));
         diodes
@@ -83,24 +83,24 @@ impl Diodes {
 
 #[test]
 fn the_lights_follow_the_verdict_and_stop_is_lit_when_nobody_says_anything() {
-    let stage = Stage::new();
-    let diodes = Diodes::new(&stage);
+    let env = TestEnv::new();
+    let diodes = Diodes::new(&env);
     let [root, led] = diodes.flags();
     // Before there is a hub.
-    let leds = stage.start(&["leds", "front", "--json", &root, &led]);
+    let leds = env.start(&["leds", "front", "--json", &root, &led]);
     diodes.await_lit("rd");
-    let open = world(&stage, "open", STRIP);
-    let sensor = simulator(&stage, &open);
-    let hub = stage.hub(&[stage.link("front")]);
+    let open = world(&env, "open", STRIP);
+    let sensor = simulator(&env, &open);
+    let hub = env.hub(&[env.link("front")]);
     diodes.await_lit("gn mk");
     // The sensor falls silent, then the hub.
     assert_eq!(sensor.end(TERM).code, Some(0));
     diodes.await_lit("rd");
-    let _sensor = simulator(&stage, &open);
+    let _sensor = simulator(&env, &open);
     diodes.await_lit("gn mk");
     drop(hub.end(KILL));
     diodes.await_lit("rd");
-    let hub = stage.hub(&[stage.link("front")]);
+    let hub = env.hub(&[env.link("front")]);
     diodes.await_lit("gn mk");
     // The reader's own end: nobody watches any more.
     let outcome = leds.end(INT);
@@ -123,18 +123,18 @@ fn the_lights_follow_the_verdict_and_stop_is_lit_when_nobody_says_anything() {
 
 #[test]
 fn a_mark_that_nobody_sees_any_more_is_dark() {
-    let stage = Stage::new();
-    let diodes = Diodes::new(&stage);
+    let env = TestEnv::new();
+    let diodes = Diodes::new(&env);
     let [root, led] = diodes.flags();
-    let sensor = simulator(&stage, &world(&stage, "open", STRIP));
-    let hub = stage.hub(&[stage.link("front")]);
-    let leds = stage.start(&["leds", "front", "--json", &root, &led]);
+    let sensor = simulator(&env, &world(&env, "open", STRIP));
+    let hub = env.hub(&[env.link("front")]);
+    let leds = env.start(&["leds", "front", "--json", &root, &led]);
     diodes.await_lit("gn mk");
     // The last marks wait together with the hub's word that there are no scans.
     leds.signal(Signal::STOP);
-    assert_eq!(stage.run(&["echo", "front/marks", "-n", "5"]).code, Some(0));
+    assert_eq!(env.run(&["echo", "front/marks", "-n", "5"]).code, Some(0));
     assert_eq!(sensor.end(TERM).code, Some(0));
-    stage.echo(&["front/zones"]).await_line("unknown", |line| line["verdict"] == "unknown");
+    env.echo(&["front/zones"]).await_line("unknown", |line| line["verdict"] == "unknown");
     leds.signal(Signal::CONT);
     diodes.await_lit("rd");
     let outcome = leds.end(INT);
@@ -145,16 +145,16 @@ fn a_mark_that_nobody_sees_any_more_is_dark() {
 
 #[test]
 fn a_post_before_the_robot_is_red_and_one_in_the_outer_circle_yellow() {
-    let stage = Stage::new();
-    let diodes = Diodes::new(&stage);
+    let env = TestEnv::new();
+    let diodes = Diodes::new(&env);
     let [root, led] = diodes.flags();
-    let _sensor = simulator(&stage, &world(&stage, "post", POST));
-    let hub = stage.hub(&[stage.link("front")]);
-    let mut leds = stage.start(&["leds", "front", "--json", &root, &led]);
+    let _sensor = simulator(&env, &world(&env, "post", POST));
+    let hub = env.hub(&[env.link("front")]);
+    let mut leds = env.start(&["leds", "front", "--json", &root, &led]);
     leds.await_line("stop", |line| line["verdict"] == "stop" && line["red"] == true);
     assert_eq!(diodes.lit().as_deref(), Some("rd"));
     assert_eq!(hub.end(TERM).code, Some(0));
-    let _hub = stage.hub(&[&stage.link("front"), "--set=zones.radii=[1.0, 0.2]"]);
+    let _hub = env.hub(&[&env.link("front"), "--set=zones.radii=[1.0, 0.2]"]);
     leds.await_line("slow", |line| line["verdict"] == "slow" && line["yellow"] == true);
     diodes.await_lit("ye");
     assert_eq!(leds.end(TERM).code, Some(0));
@@ -163,12 +163,12 @@ fn a_post_before_the_robot_is_red_and_one_in_the_outer_circle_yellow() {
 
 #[test]
 fn a_diode_that_is_unplugged_is_told_and_the_others_go_on() {
-    let stage = Stage::new();
-    let diodes = Diodes::new(&stage);
+    let env = TestEnv::new();
+    let diodes = Diodes::new(&env);
     let [root, led] = diodes.flags();
-    let sensor = simulator(&stage, &world(&stage, "open", STRIP));
-    let _hub = stage.hub(&[stage.link("front")]);
-    let mut leds = stage.start(&["leds", "front", "--json", &root, &led]);
+    let sensor = simulator(&env, &world(&env, "open", STRIP));
+    let _hub = env.hub(&[env.link("front")]);
+    let mut leds = env.start(&["leds", "front", "--json", &root, &led]);
     diodes.await_lit("gn mk");
     diodes.unplug("gn");
     assert_eq!(sensor.end(TERM).code, Some(0));
@@ -183,19 +183,19 @@ fn a_diode_that_is_unplugged_is_told_and_the_others_go_on() {
     let back = leds.await_line("its return", |line| line["class"] == "led");
     assert_eq!((&back["name"], &back["state"]), (&"gn".into(), &"back".into()));
     assert_eq!(diodes.lit().as_deref(), Some("rd"));
-    let _sensor = simulator(&stage, &world(&stage, "open", STRIP));
+    let _sensor = simulator(&env, &world(&env, "open", STRIP));
     diodes.await_lit("gn mk");
     assert_eq!(leds.end(INT).code, Some(0));
 }
 
 #[test]
 fn the_robot_is_red_for_the_sensor_that_is_worst_off() {
-    let stage = Stage::new();
-    let open = world(&stage, "open", "");
-    let _front = simulator(&stage, &open);
-    let rear = stage.simulator(&["rear"], &["--seed=62", "--baud=500000", &open]);
-    let _hub = stage.hub(&[stage.link("front"), stage.link("rear")]);
-    let mut leds = stage.start(&["leds", "robot", "--json"]);
+    let env = TestEnv::new();
+    let open = world(&env, "open", "");
+    let _front = simulator(&env, &open);
+    let rear = env.simulator(&["rear"], &["--seed=62", "--baud=500000", &open]);
+    let _hub = env.hub(&[env.link("front"), env.link("rear")]);
+    let mut leds = env.start(&["leds", "robot", "--json"]);
     leds.await_line("clear", |line| line["verdict"] == "clear" && line["green"] == true);
     assert_eq!(rear.end(TERM).code, Some(0));
     // Any sensor may be late for a moment; that one stays away.
@@ -216,10 +216,10 @@ fn now_ns() -> u64 {
 #[test]
 fn a_worse_verdict_is_shown_at_once_and_a_better_one_only_when_it_has_stood() {
     in_a_network("leds::a_worse_verdict_is_shown_at_once_and_a_better_one_only_when_it_has_stood", || {
-        let stage = Stage::new();
+        let env = TestEnv::new();
         let mut front = Sender::new(1, 7, 0, "front");
         let mut listener =
-            stage.start(&["listen", "--json", "--publish", "--name=robot1=0000000000000001"]).ready();
+            env.start(&["listen", "--json", "--publish", "--name=robot1=0000000000000001"]).ready();
         front.announce(&[Topic::Zones]);
         listener.await_line("a sensor", |line| line["kind"] == "published");
         let mut say = |verdict: Verdict| {
@@ -228,9 +228,9 @@ fn a_worse_verdict_is_shown_at_once_and_a_better_one_only_when_it_has_stood() {
         };
         // Others see what is said as it is said.
         let leds = |hold: &[&str]| {
-            let before = stage.subscribers("robot1.front/zones");
-            let program = stage.start(&[&["leds", "robot1.front", "--json"], hold].concat());
-            until("it follows", || stage.subscribers("robot1.front/zones") > before);
+            let before = env.subscribers("robot1.front/zones");
+            let program = env.start(&[&["leds", "robot1.front", "--json"], hold].concat());
+            until("it follows", || env.subscribers("robot1.front/zones") > before);
             program
         };
         let (mut usual, mut long, mut none) = (leds(&[]), leds(&["--hold=1h"]), leds(&["--hold=0s"]));
@@ -265,8 +265,8 @@ fn a_worse_verdict_is_shown_at_once_and_a_better_one_only_when_it_has_stood() {
 
 #[test]
 fn what_is_no_light_is_refused() {
-    let stage = Stage::new();
-    let diodes = Diodes::new(&stage);
+    let env = TestEnv::new();
+    let diodes = Diodes::new(&env);
     let [root, _] = diodes.flags();
     for (sensor, led, what) in [
         ("front", "red=nd", "has no light \"nd\""),
@@ -276,13 +276,13 @@ fn what_is_no_light_is_refused() {
         ("robot", "mark=mk", "--led mark=mk cannot be shown"),
         ("front", "yellow=rd,red=rd", "--led red=rd cannot be shown"),
     ] {
-        let outcome = stage.run(&["leds", sensor, "--json", &root, "--led", led]);
+        let outcome = env.run(&["leds", sensor, "--json", &root, "--led", led]);
         let error = &outcome.of_class("error")[0];
         assert_eq!((outcome.code, &error["kind"]), (Some(78), &"configuration".into()), "{outcome}");
         assert!(error["message"].as_str().is_some_and(|message| message.contains(what)), "{outcome}");
         assert!(error["hint"].as_str().is_some_and(|hint| !hint.is_empty()), "{outcome}");
     }
-    let misspelt = stage.run(&["leds", "front", "--json", "--led=gren=rd"]);
+    let misspelt = env.run(&["leds", "front", "--json", "--led=gren=rd"]);
     let hint = misspelt.of_class("error")[0]["hint"].clone();
     assert!(
         hint.as_str().is_some_and(|hint| hint.starts_with("no light \"gren\": green=NAME")),
@@ -291,18 +291,18 @@ fn what_is_no_light_is_refused() {
     // One that was taken before another was refused shows the stop light.
     assert_eq!(fs::read_to_string(diodes.0.join("rd/brightness")).unwrap(), "255\n");
     // As with all that follow: bounded needs a hub, and a hub knows its sensors.
-    assert_eq!(stage.run(&["leds", "front", "--for=1s"]).code, Some(3));
-    let _hub = stage.hub(&[stage.link("front")]);
-    let unknown = stage.run(&["leds", "side", "--json"]);
+    assert_eq!(env.run(&["leds", "front", "--for=1s"]).code, Some(3));
+    let _hub = env.hub(&[env.link("front")]);
+    let unknown = env.run(&["leds", "side", "--json"]);
     assert_eq!((unknown.code, &unknown.of_class("error")[0]["hint"]), (Some(3), &"there are front".into()));
 }
 
 #[test]
 fn on_a_terminal_one_line_is_drawn_over_itself() {
     for (no_color, colour) in [(None, "\x1b[1;31m● red\x1b[0m"), (Some("1"), "  ● red  ")] {
-        let stage = Stage::new();
+        let env = TestEnv::new();
         let (mut keys, screen) = terminal();
-        let mut command = stage.command(&["leds", "front", "--for=1s", "--timeout=200ms"]);
+        let mut command = env.command(&["leds", "front", "--for=1s", "--timeout=200ms"]);
         command.env_remove("NO_COLOR").envs(no_color.map(|value| ("NO_COLOR", value)));
         command.stdin(Stdio::null()).stderr(Stdio::null()).stdout(Stdio::from(screen));
         let mut process = command.spawn().unwrap();

@@ -6,7 +6,7 @@ use std::thread;
 use std::time::Duration;
 
 use crate::testkit;
-use crate::testkit::{INT, KILL, Program, Stage, TERM, is_class, number, sequence, until};
+use crate::testkit::{INT, KILL, Program, TERM, TestEnv, is_class, number, sequence, until};
 use rustix::process::Signal;
 use scanhub_client::Subscription;
 use schema::ipc::{self, Payload};
@@ -18,13 +18,13 @@ const HOLD: [&str; 2] = ["SCANHUB_TEST_DOMAIN", "SCANHUB_TEST_BASE"];
 
 /// A hub with a recording of many minutes that has a scan every `period_ms`: slow enough that whoever loses one was not
 /// just kept waiting by a busy machine.
-fn streaming(stage: &Stage, period_ms: u32) -> Program {
+fn streaming(env: &TestEnv, period_ms: u32) -> Program {
     let line = |scan: u32| {
         let (ranges, at) = (vec!["1.5"; 181].join(" "), f64::from(scan * period_ms) / 1000.0);
         format!("FLASER 181 {ranges} 0 0 0 0 0 0 {at} host {at}\n")
     };
-    let file = stage.file("log", (1..3000).map(line).collect::<String>());
-    stage.hub(&["--link", &format!("front=file:{file}")])
+    let file = env.file("log", (1..3000).map(line).collect::<String>());
+    env.hub(&["--link", &format!("front=file:{file}")])
 }
 
 fn subscribe(place: &Domain) -> Subscription<Scan> {
@@ -51,10 +51,10 @@ fn follow(place: &Domain, count: usize, wanted: usize) -> u64 {
 
 #[test]
 fn forty_consumers_lose_nothing() {
-    let stage = Stage::new();
-    let hub = streaming(&stage, 100);
-    let mut echo = stage.echo(&["front/scan"]);
-    let place = stage.place();
+    let env = TestEnv::new();
+    let hub = streaming(&env, 100);
+    let mut echo = env.echo(&["front/scan"]);
+    let place = env.place();
     let threads: Vec<_> = (0..4)
         .map(|_| {
             let place = place.clone();
@@ -66,20 +66,20 @@ fn forty_consumers_lose_nothing() {
     echo.await_lines(10, "a scan", is_class("scan"));
     let outcome = echo.end(INT);
     sequence(&outcome.of_class("scan"), "topic_seq");
-    assert_eq!(stage.info("front")["counters"]["loan_failed"], 0);
+    assert_eq!(env.info("front")["counters"]["loan_failed"], 0);
     assert_eq!(hub.end(TERM).code, Some(0));
 }
 
 #[test]
 fn more_consumers_than_there_are_places_are_refused_with_the_limit() {
-    let stage = Stage::new();
-    let hub = stage.hub(&[stage.link("front")]);
-    let node = ipc::client_node(&stage.place()).expect("joins");
+    let env = TestEnv::new();
+    let hub = env.hub(&[env.link("front")]);
+    let node = ipc::client_node(&env.place()).expect("joins");
     let topic = Scan::open(&node, "front").expect("works").expect("is there");
     let subscribers: Vec<_> =
         (0..limits::subscribers(Scan::TOPIC)).map(|_| Scan::subscriber(&topic).expect("a place")).collect();
-    assert_eq!(stage.subscribers("front/scan"), 200);
-    let outcome = stage.run(&["echo", "front/scan", "--json"]);
+    assert_eq!(env.subscribers("front/scan"), 200);
+    let outcome = env.run(&["echo", "front/scan", "--json"]);
     let error = &outcome.of_class("error")[0];
     assert_eq!((outcome.code, &error["kind"]), (Some(75), &"short".into()), "{outcome}");
     assert_eq!(
@@ -87,18 +87,18 @@ fn more_consumers_than_there_are_places_are_refused_with_the_limit() {
         "scanhub/v1/front/scan has 200 consumers: there is no place for another one"
     );
     // The other topics are not concerned.
-    assert_eq!(stage.info("front")["state"], "absent");
+    assert_eq!(env.info("front")["state"], "absent");
     drop(subscribers);
-    let late = stage.echo(&["front/scan"]);
+    let late = env.echo(&["front/scan"]);
     assert_eq!(late.end(INT).code, Some(0));
     assert_eq!(hub.end(TERM).code, Some(0));
 }
 
 #[test]
 fn a_stopped_consumer_knows_what_it_missed_and_nobody_else_misses_anything() {
-    let stage = Stage::new();
-    let hub = streaming(&stage, 50);
-    let (mut stopped, mut other) = (stage.echo(&["front/scan"]), stage.echo(&["front/scan"]));
+    let env = TestEnv::new();
+    let hub = streaming(&env, 50);
+    let (mut stopped, mut other) = (env.echo(&["front/scan"]), env.echo(&["front/scan"]));
     stopped.await_lines(10, "a scan", is_class("scan"));
     stopped.signal(Signal::STOP);
     let first = number(&other.await_line("a scan", is_class("scan")), "topic_seq");
@@ -124,11 +124,11 @@ fn killed_consumers_that_held_samples_leave_nothing() {
     if let [Ok(domain), Ok(base)] = HOLD.map(std::env::var) {
         return hold(&Domain::at(&domain, base.as_ref()).expect("a place"));
     }
-    let stage = Stage::new();
-    let hub = streaming(&stage, 50);
-    let mut echo = stage.echo(&["front/scan"]);
+    let env = TestEnv::new();
+    let hub = streaming(&env, 50);
+    let mut echo = env.echo(&["front/scan"]);
     let descriptors = || fs::read_dir(format!("/proc/{}/fd", hub.pid())).expect("lives").count();
-    let place = stage.place();
+    let place = env.place();
     let segments = || testkit::shared_memory(&place.prefix()).len();
     let (open_before, segments_before) = (descriptors(), segments());
     // Were their samples lost, the hub would have none left.
@@ -144,12 +144,12 @@ fn killed_consumers_that_held_samples_leave_nothing() {
     // Before there may have been more of them: whoever asked how many consumers there are was just leaving.
     until("the hub is as before", || descriptors() <= open_before && segments() <= segments_before);
     echo.await_lines(40, "a scan", is_class("scan"));
-    assert_eq!(stage.info("front")["counters"]["loan_failed"], 0);
+    assert_eq!(env.info("front")["counters"]["loan_failed"], 0);
     let outcome = echo.end(INT);
     sequence(&outcome.of_class("scan"), "topic_seq");
     assert_eq!(outcome.of_class("summary")[0]["lost"], 0);
     assert_eq!(hub.end(TERM).code, Some(0));
-    assert!(stage.left_behind().is_empty(), "{:?}", stage.left_behind());
+    assert!(env.left_behind().is_empty(), "{:?}", env.left_behind());
 }
 
 /// Takes all the samples that it may hold, says so, and stays.

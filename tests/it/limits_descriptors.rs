@@ -3,12 +3,12 @@
 
 use std::process::Command;
 
-use crate::testkit::{INT, Outcome, Program, Stage, TERM, in_a_network, is_class, number, sequence, until};
+use crate::testkit::{INT, Outcome, Program, TERM, TestEnv, in_a_network, is_class, number, sequence, until};
 use rustix::process::{Pid, Resource, Rlimit, getrlimit, prlimit};
 
 /// Starts the program with at most so many descriptors.
-fn limited<S: AsRef<str>>(stage: &Stage, limit: u64, arguments: &[S]) -> Program {
-    let inner = stage.command(arguments);
+fn limited<S: AsRef<str>>(env: &TestEnv, limit: u64, arguments: &[S]) -> Program {
+    let inner = env.command(arguments);
     let mut command = Command::new("sh");
     command.args(["-c", "ulimit -n \"$0\" && exec \"$@\"", &limit.to_string()]);
     command.arg(inner.get_program()).args(inner.get_args());
@@ -26,23 +26,23 @@ fn is_short(outcome: &Outcome) {
 
 #[test]
 fn a_hub_starts_or_says_how_many_it_needs() {
-    let stage = Stage::new();
-    let run = ["run", "--json", &stage.link("front")];
+    let env = TestEnv::new();
+    let run = ["run", "--json", &env.link("front")];
     for limit in [6, 8, 12, 16, 24, 32, 40, 48] {
-        is_short(&limited(&stage, limit, &run).wait());
+        is_short(&limited(&env, limit, &run).wait());
     }
     for limit in [74, 80, 128] {
-        let hub = limited(&stage, limit, &run).ready();
-        assert_eq!(stage.info("front")["state"], "absent", "{limit}");
+        let hub = limited(&env, limit, &run).ready();
+        assert_eq!(env.info("front")["state"], "absent", "{limit}");
         assert_eq!(hub.end(TERM).code, Some(0), "{limit}");
     }
 }
 
 #[test]
 fn a_client_works_or_says_how_many_it_needs() {
-    let stage = Stage::new();
-    let _hub = stage.hub(&[stage.link("front")]);
-    stage.await_info("front", |info| info["state"] == "absent");
+    let env = TestEnv::new();
+    let _hub = env.hub(&[env.link("front")]);
+    env.await_info("front", |info| info["state"] == "absent");
     let verbs = [
         &["info", "front"][..],
         &["list"],
@@ -51,11 +51,11 @@ fn a_client_works_or_says_how_many_it_needs() {
     ];
     for limit in [5, 6, 8, 10] {
         // Nor does one wait for a hub that it cannot see.
-        is_short(&limited(&stage, limit, &["echo", "front/status"]).wait());
+        is_short(&limited(&env, limit, &["echo", "front/status"]).wait());
     }
     for verb in verbs {
         for limit in [5, 6, 8, 10, 12, 14, 16, 18, 20, 22, 24, 26, 28, 30, 32, 40] {
-            let outcome = limited(&stage, limit, verb).wait();
+            let outcome = limited(&env, limit, verb).wait();
             if outcome.code != Some(0) {
                 is_short(&outcome);
                 assert!(limit < 40, "{outcome}");
@@ -66,21 +66,21 @@ fn a_client_works_or_says_how_many_it_needs() {
 
 #[test]
 fn a_hub_that_runs_out_of_them_serves_on_whom_it_serves() {
-    let stage = Stage::new();
-    let _simulator = stage.simulator(&["front"], &["--seed=51", "--baud=500000"]);
-    let hub = limited(&stage, 74, &["run", "--json", &stage.link("front")]).ready();
-    let mut served = stage.echo(&["front/scan", "front/status"]);
+    let env = TestEnv::new();
+    let _simulator = env.simulator(&["front"], &["--seed=51", "--baud=500000"]);
+    let hub = limited(&env, 74, &["run", "--json", &env.link("front")]).ready();
+    let mut served = env.echo(&["front/scan", "front/status"]);
     served.await_lines(20, "a scan", is_class("scan"));
-    let others: Vec<_> = (0..16).map(|_| stage.start(&["echo", "--json", "front/scan"])).collect();
+    let others: Vec<_> = (0..16).map(|_| env.start(&["echo", "--json", "front/scan"])).collect();
     // Who is attached also ends by a signal as it should.
-    until("all are attached", || stage.subscribers("front/scan") == 17);
+    until("all are attached", || env.subscribers("front/scan") == 17);
     let tells = |line: &serde_json::Value| {
         line["class"] == "status"
             && line["last_error"].as_str().is_some_and(|error| error.contains("attached but get nothing"))
     };
     served.await_line("that others get nothing", tells);
     served.await_lines(20, "a scan", is_class("scan"));
-    let asked = stage.run(&["control", "front", "resync", "--json"]);
+    let asked = env.run(&["control", "front", "resync", "--json"]);
     let error = &asked.of_class("error")[0];
     assert_eq!((asked.code, &error["kind"]), (Some(3), &"timeout".into()), "{asked}");
     assert_eq!(error["message"], "the hub did not answer for front in 5 s");
@@ -88,9 +88,9 @@ fn a_hub_that_runs_out_of_them_serves_on_whom_it_serves() {
         assert_eq!(other.end(INT).code, Some(0));
     }
     // Who comes now is served again.
-    until("there is room again", || stage.run(&["info", "front"]).code == Some(0));
+    until("there is room again", || env.run(&["info", "front"]).code == Some(0));
     served.await_line("that all get something", |line| line["class"] == "status" && line["last_error"] == "");
-    assert_eq!(stage.run(&["echo", "front/scan", "-n", "5", "--timeout", "9s"]).code, Some(0));
+    assert_eq!(env.run(&["echo", "front/scan", "-n", "5", "--timeout", "9s"]).code, Some(0));
     let outcome = served.end(INT);
     sequence(&outcome.of_class("scan"), "topic_seq");
     let summaries = outcome.of_class("summary");
@@ -104,8 +104,8 @@ fn a_hub_that_runs_out_of_them_serves_on_whom_it_serves() {
 #[test]
 fn a_listener_that_runs_out_of_them_listens_on() {
     in_a_network("limits_descriptors::a_listener_that_runs_out_of_them_listens_on", || {
-        let stage = Stage::new();
-        let mut listener = stage.start(&["listen", "--json", "--interface=lo"]).ready();
+        let env = TestEnv::new();
+        let mut listener = env.start(&["listen", "--json", "--interface=lo"]).ready();
         let pid = Pid::from_raw(listener.pid() as i32);
         let maximum = getrlimit(Resource::Nofile).maximum;
         let none = Rlimit { current: Some(0), maximum };

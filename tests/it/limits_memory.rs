@@ -5,7 +5,7 @@ use std::fs::{File, OpenOptions};
 use std::io::{ErrorKind, Write};
 use std::process::Command;
 
-use crate::testkit::{INT, Outcome, Stage, TERM, is_class, only, own_program, run_again, sequence};
+use crate::testkit::{INT, Outcome, TERM, TestEnv, is_class, only, own_program, run_again, sequence, skip};
 use rustix::process::Signal;
 
 /// Where the namespace is made: the test that shall run in it.
@@ -25,7 +25,7 @@ fn in_a_namespace(name: &str, test: impl FnOnce()) {
     let mut attempt = Command::new("unshare");
     attempt.args(unshare.get_args()).args(["mount", "-t", "tmpfs", "tmpfs", "/dev/shm"]);
     if !allowed(attempt) {
-        eprintln!("skipped: this user may not make a mount namespace");
+        skip("mounts", "this user may not make a mount namespace");
         return;
     }
     unshare.arg(own_program()).args(only(name)).env(INSIDE, "1");
@@ -78,11 +78,11 @@ fn done_or_short(outcome: &Outcome) {
 #[test]
 fn a_hub_starts_or_says_what_it_needs() {
     in_a_namespace("limits_memory::a_hub_starts_or_says_what_it_needs", || {
-        let stage = Stage::new();
-        let run = ["run".to_owned(), "--json".to_owned(), stage.link("front")];
+        let env = TestEnv::new();
+        let run = ["run".to_owned(), "--json".to_owned(), env.link("front")];
         let short = |bytes: u64| {
             mount(bytes);
-            let outcome = stage.run(&run);
+            let outcome = env.run(&run);
             unmount();
             assert_eq!((outcome.code, outcome.out.is_empty()), (Some(75), true), "{outcome}");
             let free = format!("shared memory is short: /dev/shm: {} kB free, ", bytes / 1024);
@@ -101,10 +101,10 @@ fn a_hub_starts_or_says_what_it_needs() {
         }
         for bytes in [needed.next_multiple_of(4096), 8 << 20, 16 << 20] {
             mount(bytes);
-            let hub = stage.hub(&[stage.link("front")]);
-            assert_eq!(stage.info("front")["state"], "absent");
+            let hub = env.hub(&[env.link("front")]);
+            assert_eq!(env.info("front")["state"], "absent");
             assert_eq!(hub.end(TERM).code, Some(0));
-            assert!(stage.left_behind().is_empty(), "{:?}", stage.left_behind());
+            assert!(env.left_behind().is_empty(), "{:?}", env.left_behind());
             unmount();
         }
     });
@@ -114,10 +114,10 @@ fn a_hub_starts_or_says_what_it_needs() {
 fn memory_that_is_full_stops_nobody_who_is_there() {
     in_a_namespace("limits_memory::memory_that_is_full_stops_nobody_who_is_there", || {
         mount(8 << 20);
-        let stage = Stage::new();
-        let _simulator = stage.simulator(&["front"], &["--seed=41", "--baud=500000"]);
-        let hub = stage.hub(&[stage.link("front")]);
-        let mut scans = stage.echo(&["front/scan"]);
+        let env = TestEnv::new();
+        let _simulator = env.simulator(&["front"], &["--seed=41", "--baud=500000"]);
+        let hub = env.hub(&[env.link("front")]);
+        let mut scans = env.echo(&["front/scan"]);
         scans.await_lines(10, "a scan", is_class("scan"));
         for _ in 0..2 {
             fill(0);
@@ -130,7 +130,7 @@ fn memory_that_is_full_stops_nobody_who_is_there() {
                 &["hz", "-n", "1"],
                 &["control", "front", "resync"],
             ] {
-                let outcome = stage.run(&[verb, &["--json"]].concat());
+                let outcome = env.run(&[verb, &["--json"]].concat());
                 let lines = outcome.lines();
                 let error = lines.last().unwrap_or_else(|| panic!("{outcome}"));
                 assert_eq!((outcome.code, &error["kind"]), (Some(75), &"short".into()), "{outcome}");
@@ -139,13 +139,13 @@ fn memory_that_is_full_stops_nobody_who_is_there() {
             }
             scans.await_lines(20, "a scan", is_class("scan"));
             free();
-            assert_eq!(stage.info("front")["state"], "streaming");
-            assert_eq!(stage.run(&["echo", "front/scan", "-n", "5"]).code, Some(0));
+            assert_eq!(env.info("front")["state"], "streaming");
+            assert_eq!(env.run(&["echo", "front/scan", "-n", "5"]).code, Some(0));
         }
         let outcome = scans.end(INT);
         sequence(&outcome.of_class("scan"), "topic_seq");
         assert_eq!(outcome.of_class("summary")[0]["lost"], 0);
-        assert_eq!(stage.info("front")["counters"]["loan_failed"], 0);
+        assert_eq!(env.info("front")["counters"]["loan_failed"], 0);
         assert_eq!(hub.end(TERM).code, Some(0));
     });
 }
@@ -154,14 +154,14 @@ fn memory_that_is_full_stops_nobody_who_is_there() {
 fn consumers_that_come_together_where_little_is_left_end_in_order() {
     in_a_namespace("limits_memory::consumers_that_come_together_where_little_is_left_end_in_order", || {
         mount(8 << 20);
-        let stage = Stage::new();
-        let hub = stage.hub(&[stage.link("front")]);
+        let env = TestEnv::new();
+        let hub = env.hub(&[env.link("front")]);
         let mut short = 0;
         for pages in [0, 1, 15, 16, 17, 18, 20, 24, 32] {
             fill(pages * 4096);
             let topics = ["front/telegram", "front/scan", "front/status"];
             let words = [&["echo"], &topics[..], &["-n", "1"]].concat();
-            let together: Vec<_> = (0..8).map(|_| stage.start(&words)).collect();
+            let together: Vec<_> = (0..8).map(|_| env.start(&words)).collect();
             for program in together {
                 let outcome = program.wait();
                 done_or_short(&outcome);
@@ -170,17 +170,17 @@ fn consumers_that_come_together_where_little_is_left_end_in_order() {
             free();
         }
         assert!(short >= 24, "memory was never short: {short}");
-        assert_eq!(stage.info("front")["state"], "absent");
+        assert_eq!(env.info("front")["state"], "absent");
         assert_eq!(hub.end(TERM).code, Some(0));
     });
 }
 
 #[test]
 fn a_bus_error_has_a_last_line() {
-    let stage = Stage::new();
-    let _simulator = stage.simulator(&["front"], &["--seed=42", "--baud=500000"]);
-    let hub = stage.hub(&[stage.link("front")]);
-    let mut consumer = stage.start(&["echo", "--json", "front/scan"]);
+    let env = TestEnv::new();
+    let _simulator = env.simulator(&["front"], &["--seed=42", "--baud=500000"]);
+    let hub = env.hub(&[env.link("front")]);
+    let mut consumer = env.start(&["echo", "--json", "front/scan"]);
     consumer.await_lines(3, "a scan", is_class("scan"));
     for (program, on_stdout) in [(hub, false), (consumer, true)] {
         let outcome = program.end(Signal::BUS);
@@ -193,6 +193,6 @@ fn a_bus_error_has_a_last_line() {
         assert_eq!((outcome.code, &error["kind"]), (Some(75), &"short".into()), "{outcome}");
         assert!(error["message"].as_str().is_some_and(|message| message.contains("full")), "{outcome}");
     }
-    let outcome = stage.hub(&[stage.link("front")]).end(Signal::BUS);
+    let outcome = env.hub(&[env.link("front")]).end(Signal::BUS);
     assert_eq!(outcome.code, Some(75), "{outcome}");
 }

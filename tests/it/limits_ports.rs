@@ -3,7 +3,7 @@
 use std::fs;
 use std::os::unix::fs::symlink;
 
-use crate::testkit::{Outcome, Stage, TERM, until};
+use crate::testkit::{Outcome, TERM, TestEnv, until};
 
 fn error_of(outcome: &Outcome) -> serde_json::Value {
     let line = outcome.errors.lines().last().unwrap_or_else(|| panic!("{outcome}"));
@@ -12,17 +12,17 @@ fn error_of(outcome: &Outcome) -> serde_json::Value {
 
 #[test]
 fn the_second_hub_is_told_who_has_the_port_and_gets_it_once_it_is_free() {
-    let (stage, other) = (Stage::new(), Stage::new());
-    let _simulator = stage.simulator(&["front"], &["--seed=71", "--baud=500000"]);
-    let first = stage.hub(&[stage.link("front")]);
-    stage.await_info("front", |info| info["state"] == "streaming");
-    let link = [stage.link("front")];
+    let (env, other) = (TestEnv::new(), TestEnv::new());
+    let _simulator = env.simulator(&["front"], &["--seed=71", "--baud=500000"]);
+    let first = env.hub(&[env.link("front")]);
+    env.await_info("front", |info| info["state"] == "streaming");
+    let link = [env.link("front")];
     let refused = other.run(&["run", "--json", &link[0]]);
     let error = error_of(&refused);
     assert_eq!((refused.code, &error["kind"]), (Some(4), &"port_busy".into()), "{refused}");
     let pid = format!("process {}", first.pid());
     assert!(error["message"].as_str().is_some_and(|message| message.contains(&pid)), "{refused}");
-    assert_eq!(stage.info("front")["state"], "streaming", "was disturbed");
+    assert_eq!(env.info("front")["state"], "streaming", "was disturbed");
     assert_eq!(first.end(TERM).code, Some(0));
     let second = other.hub(&link);
     other.await_info("front", |info| info["state"] == "streaming");
@@ -31,12 +31,12 @@ fn the_second_hub_is_told_who_has_the_port_and_gets_it_once_it_is_free() {
 
 #[test]
 fn two_links_at_one_port_are_refused() {
-    let stage = Stage::new();
-    let _simulator = stage.simulator(&["front"], &["--baud=500000"]);
-    symlink(stage.path("front"), stage.path("stable")).expect("a symlink");
+    let env = TestEnv::new();
+    let _simulator = env.simulator(&["front"], &["--baud=500000"]);
+    symlink(env.path("front"), env.path("stable")).expect("a symlink");
     for second in ["front", "stable"] {
-        let links = [stage.link("front"), format!("--link=rear={}", stage.word(second))];
-        let refused = stage.run(&["run", "--json", &links[0], &links[1]]);
+        let links = [env.link("front"), format!("--link=rear={}", env.word(second))];
+        let refused = env.run(&["run", "--json", &links[0], &links[1]]);
         let error = error_of(&refused);
         assert_eq!((refused.code, &error["kind"]), (Some(78), &"configuration".into()), "{refused}");
         let said = "links front and rear have the same port: ";
@@ -46,16 +46,16 @@ fn two_links_at_one_port_are_refused() {
 
 #[test]
 fn two_names_that_become_one_port_later_are_told_apart() {
-    let stage = Stage::new();
-    let hub = stage.hub(&[stage.link("one"), stage.link("two")]);
-    let _simulator = stage.simulator(&["front"], &["--seed=72", "--baud=500000"]);
-    let pty = fs::read_link(stage.path("front")).expect("a symlink");
+    let env = TestEnv::new();
+    let hub = env.hub(&[env.link("one"), env.link("two")]);
+    let _simulator = env.simulator(&["front"], &["--seed=72", "--baud=500000"]);
+    let pty = fs::read_link(env.path("front")).expect("a symlink");
     for name in ["one", "two"] {
-        symlink(&pty, stage.path(name)).expect("a symlink");
+        symlink(&pty, env.path(name)).expect("a symlink");
     }
     // Whoever comes first has it.
     until("one of them streams and the other one says why not", || {
-        let infos = ["one", "two"].map(|name| stage.info(name));
+        let infos = ["one", "two"].map(|name| env.info(name));
         let streams = infos.iter().filter(|info| info["state"] == "streaming").count();
         let tells = |info: &&serde_json::Value| {
             let error = info["last_error"].as_str().unwrap_or_default();

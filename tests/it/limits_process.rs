@@ -5,12 +5,12 @@ use std::io::{BufRead, BufReader};
 use std::path::PathBuf;
 use std::process::{Command, Stdio};
 
-use crate::testkit::{Outcome, Program, Stage, TERM};
+use crate::testkit::{Outcome, Program, TERM, TestEnv};
 use rustix::process::{Pid, kill_process};
 
 /// Starts the program with at most this, in the words of ulimit.
-fn limited<S: AsRef<str>>(stage: &Stage, limit: &str, arguments: &[S]) -> Program {
-    let inner = stage.command(arguments);
+fn limited<S: AsRef<str>>(env: &TestEnv, limit: &str, arguments: &[S]) -> Program {
+    let inner = env.command(arguments);
     let mut command = Command::new("sh");
     command.args(["-c", &format!("ulimit {limit} && exec \"$0\" \"$@\"")]);
     command.arg(inner.get_program()).args(inner.get_args());
@@ -27,11 +27,11 @@ fn is_short(outcome: &Outcome, words: &str) {
 
 #[test]
 fn a_hub_without_address_space_leaves_no_segment_behind() {
-    let stage = Stage::new();
+    let env = TestEnv::new();
     let (mut short, mut is_up) = (0, false);
     // Until one has room; the first ones cannot even be loaded.
     for limit in (16_000..400_000).step_by(1_000) {
-        let inner = stage.command(&["run", "--json", &stage.link("front")]);
+        let inner = env.command(&["run", "--json", &env.link("front")]);
         let mut command = Command::new("sh");
         command.args(["-c", &format!("ulimit -v {limit} && exec \"$0\" \"$@\"")]);
         command.arg(inner.get_program()).args(inner.get_args()).env("SCANHUB_END_WITH_PARENT", "1");
@@ -51,7 +51,7 @@ fn a_hub_without_address_space_leaves_no_segment_behind() {
         } else if short > 0 {
             assert_eq!((is_up, outcome.status.code()), (true, Some(0)), "{limit}: {errors}");
         }
-        assert_eq!(stage.left_behind(), Vec::<PathBuf>::new(), "{limit}: {errors}");
+        assert_eq!(env.left_behind(), Vec::<PathBuf>::new(), "{limit}: {errors}");
         if is_up {
             break;
         }
@@ -61,21 +61,20 @@ fn a_hub_without_address_space_leaves_no_segment_behind() {
 
 #[test]
 fn files_that_may_not_be_as_long_as_a_segment_are_told() {
-    let stage = Stage::new();
+    let env = TestEnv::new();
     let words = "files are too short: ";
     for limit in ["1", "64", "1000"] {
         let limit = format!("-f {limit}");
-        is_short(&limited(&stage, &limit, &["run", "--json", &stage.link("front")]).wait(), words);
-        assert_eq!(stage.left_behind(), Vec::<PathBuf>::new());
+        is_short(&limited(&env, &limit, &["run", "--json", &env.link("front")]).wait(), words);
+        assert_eq!(env.left_behind(), Vec::<PathBuf>::new());
     }
-    let hub = stage.hub(&[stage.link("front")]);
-    for verb in
-        [&["record", "-o", &stage.word("walk.mcap")][..], &["info", "front"], &["echo", "front/status"]]
+    let hub = env.hub(&[env.link("front")]);
+    for verb in [&["record", "-o", &env.word("walk.mcap")][..], &["info", "front"], &["echo", "front/status"]]
     {
-        is_short(&limited(&stage, "-f 1", verb).wait(), words);
+        is_short(&limited(&env, "-f 1", verb).wait(), words);
     }
     assert_eq!(hub.end(TERM).code, Some(0));
-    let file = stage.word("none.mcap");
-    is_short(&limited(&stage, "-f 0", &["record", "-o", &file]).wait(), "cannot record into");
-    assert!(!stage.path("none.mcap").exists());
+    let file = env.word("none.mcap");
+    is_short(&limited(&env, "-f 0", &["record", "-o", &file]).wait(), "cannot record into");
+    assert!(!env.path("none.mcap").exists());
 }

@@ -3,26 +3,26 @@
 use std::thread;
 use std::time::Duration;
 
-use crate::testkit::{INT, Stage, TERM, number};
+use crate::testkit::{INT, TERM, TestEnv, number};
 
 /// What the paper found on a line of theirs.
 const BURSTS: &str = "--fault=loss=0.00135,burst=1.89";
 
 #[test]
 fn a_line_that_loses_is_seen_everywhere() {
-    let stage = Stage::new();
+    let env = TestEnv::new();
     let flags = ["--baud=500000", "--state=streaming", "--seed=5", BURSTS];
-    let simulator = stage.simulator(&["front"], &flags);
-    let hub = stage.hub(&[stage.link("front")]);
-    let mut consumer = stage.start(&["hz", "--json", "front/scan"]);
-    let leds = stage.start(&["leds", "front", "--json"]);
-    stage.await_info("front", |info| number(&info["counters"], "due_on_line") > 30);
-    let begin = stage.info("front");
-    let begun = stage.truth("front").len();
+    let simulator = env.simulator(&["front"], &flags);
+    let hub = env.hub(&[env.link("front")]);
+    let mut consumer = env.start(&["hz", "--json", "front/scan"]);
+    let leds = env.start(&["leds", "front", "--json"]);
+    env.await_info("front", |info| number(&info["counters"], "due_on_line") > 30);
+    let begin = env.info("front");
+    let begun = env.truth("front").len();
     thread::sleep(Duration::from_secs(12));
-    let end = stage.info("front");
+    let end = env.info("front");
     // A status is of this second, and what is missing is lost a second later.
-    let sent = &stage.truth("front")[begun..];
+    let sent = &env.truth("front")[begun..];
     let damaged = sent.iter().filter(|sent| sent.fault.is_some()).count() as f64;
     let grown = |name: &str| number(&end["counters"], name) as f64 - number(&begin["counters"], name) as f64;
     let (lost, due) = (grown("lost_on_line"), grown("due_on_line"));
@@ -33,9 +33,9 @@ fn a_line_that_loses_is_seen_everywhere() {
     assert!((0.3..0.55).contains(&told), "{end}");
     assert_eq!(number(&end, "lost_on_line"), number(&end["counters"], "lost_on_line"));
 
-    let text = stage.run(&["info", "front"]).to_string();
+    let text = env.run(&["info", "front"]).to_string();
     assert!(text.contains("of the bytes damaged") && text.contains("of the scans lost in 10 s"), "{text}");
-    let outcome = stage.run(&["doctor", &stage.word("front"), "--json"]);
+    let outcome = env.run(&["doctor", &env.word("front"), "--json"]);
     let checks = outcome.of_class("check");
     let check = checks.iter().find(|check| check["name"] == "line-loss").expect("it is looked at");
     assert_eq!(check["state"], "warning", "{check}");
@@ -61,12 +61,12 @@ fn a_line_that_loses_is_seen_everywhere() {
 
 #[test]
 fn a_line_that_is_well_says_so_from_the_first_second() {
-    let stage = Stage::new();
-    let simulator = stage.simulator(&["front"], &["--baud=9600", "--seed=5"]);
-    let hub = stage.hub(&[stage.link("front")]);
-    let info = stage.await_info("front", |info| number(&info["counters"], "due_on_line") > 60);
+    let env = TestEnv::new();
+    let simulator = env.simulator(&["front"], &["--baud=9600", "--seed=5"]);
+    let hub = env.hub(&[env.link("front")]);
+    let info = env.await_info("front", |info| number(&info["counters"], "due_on_line") > 60);
     assert_eq!((&info["damaged"], &info["lost_on_line"]), (&0.0.into(), &0.into()), "{info}");
-    let outcome = stage.run(&["doctor", &stage.word("front"), "--json"]);
+    let outcome = env.run(&["doctor", &env.word("front"), "--json"]);
     let checks = outcome.of_class("check");
     let check = checks.iter().find(|check| check["name"] == "line-loss").expect("it is looked at");
     assert_eq!(check["state"], "ok", "{check}");

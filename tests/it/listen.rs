@@ -5,7 +5,7 @@ use std::io::Read;
 
 use crate::testkit;
 use crate::testkit::{
-    INT, Outcome, Program, Sender, Stage, in_a_network, is_class, number, terminal, until, wall_ns,
+    INT, Outcome, Program, Sender, TestEnv, in_a_network, is_class, number, skip, terminal, until, wall_ns,
 };
 use schema::datagram::{HEAD, Refusal, WINDOW};
 use schema::{Background, Foreground, Mark, Marks, Scan, State, Status, Topic, Verdict, Zones};
@@ -26,8 +26,8 @@ fn zones(verdict: Verdict) -> Zones {
     Zones { verdict: verdict as u8, ..Zones::unknown() }
 }
 
-fn listener(stage: &Stage, words: &[&str]) -> Program {
-    stage.start(&[&["listen", "--json"], words].concat()).ready()
+fn listener(env: &TestEnv, words: &[&str]) -> Program {
+    env.start(&[&["listen", "--json"], words].concat()).ready()
 }
 
 /// What the account says of these topics: received, lost, duplicate, reordered.
@@ -47,8 +47,8 @@ fn refused(outcome: &Outcome) -> Value {
 #[test]
 fn every_topic_is_a_line() {
     in_a_network("listen::every_topic_is_a_line", || {
-        let stage = Stage::new();
-        let mut program = listener(&stage, &[]);
+        let env = TestEnv::new();
+        let mut program = listener(&env, &[]);
         let mut sender = Sender::new(HUB, 7, 2, "front");
         sender.send(Topic::Zones, &zones(Verdict::Stop));
         let early = program.await_line("zones", is_class("zones"));
@@ -109,9 +109,9 @@ fn every_topic_is_a_line() {
 #[test]
 fn people_read_lines_too() {
     in_a_network("listen::people_read_lines_too", || {
-        let stage = Stage::new();
+        let env = TestEnv::new();
         let words = ["listen", "--interface=lo", "--topic=zones", "--name=robot1=5f3a12bc00d1e2f3", "-n2"];
-        let program = stage.start(&words);
+        let program = env.start(&words);
         let mut sender = Sender::new(HUB, 7, 0, "front");
         // It does not say on stdout that it listens.
         until("the group is joined", || igmp().contains("514CFFEF"));
@@ -161,9 +161,9 @@ fn ip(words: &str) -> bool {
 #[test]
 fn on_a_terminal_the_account_is_drawn_over_itself() {
     in_a_network("listen::on_a_terminal_the_account_is_drawn_over_itself", || {
-        let stage = Stage::new();
+        let env = TestEnv::new();
         let (mut keys, screen) = terminal();
-        let mut command = stage.command(&["listen", "--stats", "--interface=lo"]);
+        let mut command = env.command(&["listen", "--stats", "--interface=lo"]);
         command.stdout(screen).stderr(std::process::Stdio::null());
         let mut process = command.spawn().expect("starts");
         drop(command);
@@ -190,12 +190,12 @@ fn groups_are_joined_where_a_link_comes_or_comes_back() {
     in_a_network("listen::groups_are_joined_where_a_link_comes_or_comes_back", || {
         let make = || ip("link add scan0 type veth peer name far0") && ip("addr add 10.9.0.1/24 dev scan0");
         if !make() {
-            eprintln!("skipped: the kernel makes no pair of interfaces");
+            skip("veth", "the kernel makes no pair of interfaces");
             return;
         }
-        let stage = Stage::new();
+        let env = TestEnv::new();
         for words in [&["--interface=scan0"][..], &[]] {
-            let program = listener(&stage, words);
+            let program = listener(&env, words);
             assert_eq!(joined("scan0"), 0, "it is down");
             assert!(ip("link set scan0 up") && ip("link set far0 up"));
             until("the groups are joined", || joined("scan0") == 4);
@@ -213,8 +213,8 @@ fn groups_are_joined_where_a_link_comes_or_comes_back() {
 #[test]
 fn the_account_is_exact() {
     in_a_network("listen::the_account_is_exact", || {
-        let stage = Stage::new();
-        let mut program = listener(&stage, &["--topic=zones", "--topic=scan"]);
+        let env = TestEnv::new();
+        let mut program = listener(&env, &["--topic=zones", "--topic=scan"]);
         let mut sender = Sender::new(HUB, 7, 0, "front");
         sender.announce(&[Topic::Zones, Topic::Scan, Topic::Telegram]);
         // Of 100 zones numbers 10, 11 and 50 are lost, 20 and 21 change places, 30 comes twice, and 40 after 45.
@@ -255,8 +255,8 @@ fn the_account_is_exact() {
 #[test]
 fn a_gateway_that_starts_again_and_a_second_hub_are_told_apart() {
     in_a_network("listen::a_gateway_that_starts_again_and_a_second_hub_are_told_apart", || {
-        let stage = Stage::new();
-        let mut program = listener(&stage, &["--topic=zones"]);
+        let env = TestEnv::new();
+        let mut program = listener(&env, &["--topic=zones"]);
         let mut first = Sender::new(HUB, 7, 0, "front");
         let mut other = Sender::new(1, 3, 0, "front");
         first.announce(&[Topic::Zones]);
@@ -286,8 +286,8 @@ fn a_gateway_that_starts_again_and_a_second_hub_are_told_apart() {
 fn a_gateway_that_starts_ever_again_stays_heard_and_accounted_for() {
     in_a_network("listen::a_gateway_that_starts_ever_again_stays_heard_and_accounted_for", || {
         const LIVES: u64 = 90;
-        let stage = Stage::new();
-        let mut program = listener(&stage, &["--topic=zones"]);
+        let env = TestEnv::new();
+        let mut program = listener(&env, &["--topic=zones"]);
         for epoch in 1..=LIVES {
             let mut sender = Sender::new(HUB, epoch as u32, 0, "front");
             sender.announce(&[Topic::Zones]);
@@ -312,8 +312,8 @@ fn a_gateway_that_starts_ever_again_stays_heard_and_accounted_for() {
 #[test]
 fn each_refusal_has_its_reason() {
     in_a_network("listen::each_refusal_has_its_reason", || {
-        let stage = Stage::new();
-        let mut program = listener(&stage, &["--topic=zones"]);
+        let env = TestEnv::new();
+        let mut program = listener(&env, &["--topic=zones"]);
         let mut sender = Sender::new(HUB, 7, 0, "front");
         sender.next[usize::from(Topic::Zones.number())] = 5000;
         let good = sender.make(Topic::Zones, &zones(Verdict::Clear));
@@ -365,8 +365,8 @@ fn each_refusal_has_its_reason() {
 #[test]
 fn two_gateways_with_one_number_are_told_once() {
     in_a_network("listen::two_gateways_with_one_number_are_told_once", || {
-        let stage = Stage::new();
-        let mut program = listener(&stage, &["--topic=zones", "--stats"]);
+        let env = TestEnv::new();
+        let mut program = listener(&env, &["--topic=zones", "--stats"]);
         // Of the later life first: all of the earlier one are refused.
         let mut gateways = [9, 7].map(|epoch| Sender::new(HUB, epoch, 0, "front"));
         for _ in 0..80 {

@@ -3,7 +3,7 @@
 
 use std::time::{Duration, Instant};
 
-use crate::testkit::{INT, Outcome, Program, Sender, Stage, in_a_network, is_class, number};
+use crate::testkit::{INT, Outcome, Program, Sender, TestEnv, in_a_network, is_class, number};
 use schema::{State, Status, Topic, Verdict, Zones};
 use serde_json::{Value, json};
 
@@ -41,9 +41,9 @@ fn zones_row(outcome: &Outcome, hub: &str) -> Value {
 #[test]
 fn a_true_gateway_is_heard_at_once_after_64_invented_ones() {
     in_a_network("listen_crowd::a_true_gateway_is_heard_at_once_after_64_invented_ones", || {
-        let stage = Stage::new();
+        let env = TestEnv::new();
         for (what, is_delivered) in [("announce", false), ("announce and deliver", true)] {
-            let mut program = stage.start(&["listen", "--json", "--topic=zones", NAME]).ready();
+            let mut program = env.start(&["listen", "--json", "--topic=zones", NAME]).ready();
             for hub in 0..64 {
                 let mut sender = Sender::new(hub, 7, 0, "other");
                 sender.announce(&[Topic::Zones]);
@@ -79,8 +79,8 @@ fn a_true_gateway_is_heard_at_once_after_64_invented_ones() {
 #[test]
 fn a_flood_of_invented_gateways_puts_out_none_that_delivers() {
     in_a_network("listen_crowd::a_flood_of_invented_gateways_puts_out_none_that_delivers", || {
-        let stage = Stage::new();
-        let mut program = stage.start(&["listen", "--json", "--topic=zones", NAME]).ready();
+        let env = TestEnv::new();
+        let mut program = env.start(&["listen", "--json", "--topic=zones", NAME]).ready();
         let mut sender = Sender::new(HUB, 7, 0, "front");
         prove(&mut sender);
         const TURNS: u64 = 100;
@@ -108,19 +108,19 @@ fn a_flood_of_invented_gateways_puts_out_none_that_delivers() {
     });
 }
 
-fn publisher(stage: &Stage) -> Program {
-    stage.start(&["listen", "--json", "--publish", NAME]).ready()
+fn publisher(env: &TestEnv) -> Program {
+    env.start(&["listen", "--json", "--publish", NAME]).ready()
 }
 
 /// The time until a consumer of a true sensor has its second verdict, beginning with its announcement.
-fn until_published(stage: &Stage, program: &mut Program) -> (Duration, Sender) {
+fn until_published(env: &TestEnv, program: &mut Program) -> (Duration, Sender) {
     let mut sender = Sender::new(HUB, 7, 0, "front");
     let begin = Instant::now();
     deliver(&mut sender);
     program.await_line("it is published", |line| line["sensor"] == "robot1.front");
     let took = begin.elapsed();
     sender.send(Topic::Status, &Status { state: State::Streaming as u8, ..Status::default() });
-    let mut echo = stage.echo(&["robot1.front/zones"]);
+    let mut echo = env.echo(&["robot1.front/zones"]);
     sender.send(Topic::Zones, &zones(Verdict::Slow));
     echo.await_line("its verdict", |line| line["verdict"] == "slow");
     (took, sender)
@@ -129,9 +129,9 @@ fn until_published(stage: &Stage, program: &mut Program) -> (Duration, Sender) {
 #[test]
 fn a_true_sensor_is_published_at_once_after_16_invented_ones() {
     in_a_network("listen_crowd::a_true_sensor_is_published_at_once_after_16_invented_ones", || {
-        let stage = Stage::new();
+        let env = TestEnv::new();
         for (what, is_delivered) in [("announced", false), ("announced and delivered", true)] {
-            let mut program = publisher(&stage);
+            let mut program = publisher(&env);
             for n in 0..16 {
                 let mut sender = Sender::new(0xab, 7, n, &format!("s{n}"));
                 sender.announce(&[Topic::Zones]);
@@ -140,7 +140,7 @@ fn a_true_sensor_is_published_at_once_after_16_invented_ones() {
                 }
             }
             program.await_lines(16, "all of them", |line| line["kind"] == "published");
-            let (took, _sender) = until_published(&stage, &mut program);
+            let (took, _sender) = until_published(&env, &mut program);
             eprintln!("16 invented sensors {what}, then a true one: published after {took:?}");
             assert!(took < Duration::from_secs(1), "{took:?}");
             let outcome = program.end(INT);
@@ -155,11 +155,11 @@ fn a_true_sensor_is_published_at_once_after_16_invented_ones() {
 #[test]
 fn a_published_sensor_that_delivers_is_not_put_out() {
     in_a_network("listen_crowd::a_published_sensor_that_delivers_is_not_put_out", || {
-        let stage = Stage::new();
-        let mut program = publisher(&stage);
-        let (_, mut sender) = until_published(&stage, &mut program);
+        let env = TestEnv::new();
+        let mut program = publisher(&env);
+        let (_, mut sender) = until_published(&env, &mut program);
         prove(&mut sender);
-        let mut echo = stage.echo(&["robot1.front/zones"]);
+        let mut echo = env.echo(&["robot1.front/zones"]);
         let mut invented = Sender::new(0xab, 7, 0, "s");
         for turn in 0..50_u8 {
             for n in 0..4 {
@@ -185,10 +185,10 @@ fn who_follows_a_sensor_that_was_put_out_is_told_and_goes_on_when_it_is_back() {
     in_a_network(
         "listen_crowd::who_follows_a_sensor_that_was_put_out_is_told_and_goes_on_when_it_is_back",
         || {
-            let stage = Stage::new();
-            let mut program = publisher(&stage);
-            let (_, mut sender) = until_published(&stage, &mut program);
-            let mut echo = stage.echo(&["robot1.front/zones"]);
+            let env = TestEnv::new();
+            let mut program = publisher(&env);
+            let (_, mut sender) = until_published(&env, &mut program);
+            let mut echo = env.echo(&["robot1.front/zones"]);
             let mut others: Vec<_> = (0..16).map(|n| Sender::new(0xab, 7, n, &format!("s{n}"))).collect();
             others.iter_mut().for_each(deliver);
             program.await_line("the last one", |line| line["sensor"] == "00000000000000ab.s15");
@@ -198,7 +198,7 @@ fn who_follows_a_sensor_that_was_put_out_is_told_and_goes_on_when_it_is_back() {
             sender.send(Topic::Zones, &zones(Verdict::Stop));
             echo.await_line("it is followed", |line| is_class("zones")(line) && line["verdict"] == "stop");
             drop((echo.end(INT), program.end(INT)));
-            assert!(stage.left_behind().is_empty(), "{:?}", stage.left_behind());
+            assert!(env.left_behind().is_empty(), "{:?}", env.left_behind());
         },
     );
 }

@@ -1,6 +1,6 @@
 //! `scanhub listen` against what nobody should send: damaged datagrams of every kind, and words that make no sense.
 
-use crate::testkit::{INT, Program, Sender, Stage, in_a_network, number};
+use crate::testkit::{INT, Program, Sender, TestEnv, in_a_network, number};
 use schema::datagram::{HEAD, Head, MTU_ETHERNET, Packed, Refusal};
 use schema::{Foreground, Marks, Scan, Status, Topic, Verdict, Zones};
 use serde_json::Value;
@@ -33,8 +33,8 @@ fn whole(sender: &mut Sender) -> Vec<Vec<u8>> {
 #[test]
 fn nothing_damaged_is_accepted_and_memory_stays_flat() {
     in_a_network("listen_hostile::nothing_damaged_is_accepted_and_memory_stays_flat", || {
-        let stage = Stage::new();
-        let mut program = stage.start(&["listen", "--json", "--topic=zones"]).ready();
+        let env = TestEnv::new();
+        let mut program = env.start(&["listen", "--json", "--topic=zones"]).ready();
         let mut sender = Sender::new(0xabcd, 7, 0, "front");
         let whole = whole(&mut Sender::new(0xabcd, 7, 1, "rear"));
         let mut random = fastrand::Rng::with_seed(6);
@@ -87,9 +87,9 @@ fn nothing_damaged_is_accepted_and_memory_stays_flat() {
 #[test]
 fn sealed_nonsense_neither_ends_it_nor_fills_memory() {
     in_a_network("listen_hostile::sealed_nonsense_neither_ends_it_nor_fills_memory", || {
-        let stage = Stage::new();
+        let env = TestEnv::new();
         let words = ["listen", "--json", "--publish", "--timeout=20s"];
-        let mut program = stage.start(&words).ready();
+        let mut program = env.start(&words).ready();
         let mut sender = Sender::new(0xabcd, 7, 0, "front");
         sender.announce(&[Topic::Zones]);
         program.await_line("a name", |line| line["kind"] == "published");
@@ -147,7 +147,7 @@ fn sealed_nonsense_neither_ends_it_nor_fills_memory() {
 
 #[test]
 fn words_that_make_no_sense_have_a_remedy() {
-    let stage = Stage::new();
+    let env = TestEnv::new();
     for (words, code, kind, hint) in [
         (&["--interface=none0"][..], 78, "configuration", "there are "),
         (&["--topic=scam"], 2, "usage", "zones"),
@@ -157,7 +157,7 @@ fn words_that_make_no_sense_have_a_remedy() {
         (&["--hub=robot1"], 78, "configuration", "--name robot1="),
         (&["--nonsense"], 2, "usage", "--help"),
     ] {
-        let outcome = stage.run(&[&["listen", "--json"], words].concat());
+        let outcome = env.run(&[&["listen", "--json"], words].concat());
         let lines = outcome.lines();
         let error = lines.last().unwrap_or_else(|| panic!("{outcome}"));
         assert_eq!((outcome.code, &error["kind"]), (Some(code), &kind.into()), "{outcome}");
@@ -168,18 +168,18 @@ fn words_that_make_no_sense_have_a_remedy() {
 #[test]
 fn bounds_that_are_not_reached_are_told() {
     in_a_network("listen_hostile::bounds_that_are_not_reached_are_told", || {
-        let stage = Stage::new();
+        let env = TestEnv::new();
         for words in [&["--timeout=100ms"][..], &["-n5", "--for=100ms"]] {
-            let outcome = stage.run(&[&["listen", "--json"], words].concat());
+            let outcome = env.run(&[&["listen", "--json"], words].concat());
             assert_eq!(outcome.code, Some(3), "{outcome}");
             let lines = outcome.lines();
             let error = lines.last().unwrap_or_else(|| panic!("{outcome}"));
             assert_eq!(error["kind"], "timeout", "{outcome}");
             assert_eq!(outcome.of_class("lan_refused").len(), 1, "the account comes all the same");
         }
-        assert_eq!(stage.run(&["listen", "--json", "--for=100ms"]).code, Some(0));
+        assert_eq!(env.run(&["listen", "--json", "--for=100ms"]).code, Some(0));
         let holder = std::net::UdpSocket::bind("0.0.0.0:22200").expect("nobody has it");
-        let outcome = stage.run(&["listen", "--json"]);
+        let outcome = env.run(&["listen", "--json"]);
         assert_eq!(outcome.code, Some(1), "{outcome}");
         assert!(
             outcome.lines()[0]["message"].as_str().is_some_and(|text| text.contains("22200")),

@@ -1,7 +1,7 @@
 //! `scanhub listen --hub`: whom it hears where there are many, that it says which gateway is on its own machine,
 //! and the account when it is asked.
 
-use crate::testkit::{INT, Robot, Sender, Stage, USR1, in_a_network, is_class, number};
+use crate::testkit::{INT, Robot, Sender, TestEnv, USR1, in_a_network, is_class, number};
 use schema::{Topic, Verdict, Zones};
 use serde_json::json;
 
@@ -23,10 +23,10 @@ fn crowd() {
 #[test]
 fn a_hub_that_is_named_is_heard_in_a_crowd() {
     in_a_network("listen_hubs::a_hub_that_is_named_is_heard_in_a_crowd", || {
-        let stage = Stage::new();
+        let env = TestEnv::new();
         let name = "--name=robot1=5f3a12bc00d1e2f3";
         let words = ["listen", "--json", "--topic=zones", name, "--hub=robot1", "--hub=00000000000000ab"];
-        let mut program = stage.start(&words).ready();
+        let mut program = env.start(&words).ready();
         crowd();
         let senders = [HUB, 0xab].map(|hub| {
             let mut sender = Sender::new(hub, 7, 0, "front");
@@ -51,9 +51,9 @@ fn a_hub_that_is_named_is_heard_in_a_crowd() {
 #[test]
 fn hubs_that_are_not_named_are_not_published() {
     in_a_network("listen_hubs::hubs_that_are_not_named_are_not_published", || {
-        let stage = Stage::new();
+        let env = TestEnv::new();
         let words = ["listen", "--json", "--publish", "--hub=5f3a12bc00d1e2f3"];
-        let mut program = stage.start(&words).ready();
+        let mut program = env.start(&words).ready();
         crowd();
         Sender::new(HUB, 7, 0, "front").announce(&[Topic::Zones]);
         let line = program.await_line("a sensor", |line| line["kind"] == "published");
@@ -68,8 +68,8 @@ fn hubs_that_are_not_named_are_not_published() {
 fn a_gateway_on_another_machine_is_not_called_this_one_s() {
     in_a_network("listen_hubs::a_gateway_on_another_machine_is_not_called_this_one_s", || {
         let robot = Robot::new(&["front"]);
-        let stage = Stage::new();
-        let mut listener = stage.start(&["listen", "--json", "--publish"]).ready();
+        let env = TestEnv::new();
+        let mut listener = env.start(&["listen", "--json", "--publish"]).ready();
         let gateway = robot.gateway::<&str>(&[]);
         let line = listener.await_line("a sensor", |line| line["kind"] == "published");
         assert_eq!(line["here"], json!(null), "{line}");
@@ -81,8 +81,8 @@ fn a_gateway_on_another_machine_is_not_called_this_one_s() {
 #[test]
 fn a_signal_asks_for_the_account_so_far() {
     in_a_network("listen_hubs::a_signal_asks_for_the_account_so_far", || {
-        let stage = Stage::new();
-        let mut program = stage.start(&["listen", "--json"]).ready();
+        let env = TestEnv::new();
+        let mut program = env.start(&["listen", "--json"]).ready();
         let mut sender = Sender::new(HUB, 7, 0, "front");
         for received in 1..=2 {
             sender.send(Topic::Zones, &zones(Verdict::Clear));

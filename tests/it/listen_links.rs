@@ -4,7 +4,7 @@
 use std::collections::BTreeSet;
 use std::os::fd::OwnedFd;
 
-use crate::testkit::{INT, Machine, Stage, command_in, in_a_network, ip, until};
+use crate::testkit::{INT, Machine, TestEnv, command_in, in_a_network, ip, skip, until};
 use rustix::net::{AddressFamily, RecvFlags, SocketFlags, SocketType, eth, recv, socket_with};
 
 /// What comes to the network of the test of IGMP, version 2.
@@ -60,9 +60,9 @@ fn a_link_that_is_away_for_a_moment_is_joined_again() {
             return;
         }
         let mut switch = Switch::new();
-        let stage = Stage::on(&machine);
+        let env = TestEnv::on(&machine);
         for words in [&["--interface=eth0"][..], &[]] {
-            let listener = stage.start(&[&["listen", "--json"], words].concat()).ready();
+            let listener = env.start(&[&["listen", "--json"], words].concat()).ready();
             switch.await_each("the groups are joined", REPORT);
             for _ in 0..3 {
                 switch.heard.clear();
@@ -87,8 +87,8 @@ fn an_interface_that_is_made_anew_is_heard_as_often_as_that_happens() {
             return;
         }
         let mut switch = Switch::new();
-        let stage = Stage::on(&machine);
-        let listener = stage.start(&["listen", "--json"]).ready();
+        let env = TestEnv::on(&machine);
+        let listener = env.start(&["listen", "--json"]).ready();
         // A socket can join 20 groups, and there are four of them.
         for _ in 0..8 {
             switch.heard.clear();
@@ -108,7 +108,7 @@ fn speaks_version_2(machine: &Machine, interface: &str) -> bool {
     version.args(["-c", &format!("echo 2 > {path}")]);
     let is_done = version.status().is_ok_and(|status| status.success());
     if !is_done {
-        eprintln!("skipped: the version of IGMP cannot be chosen here");
+        skip("igmp", "its version cannot be chosen here");
     }
     is_done
 }

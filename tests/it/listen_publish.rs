@@ -1,7 +1,7 @@
 //! `scanhub listen --publish`: remote sensors as local ones, for every verb that follows, through loss, restarts and
 //! kills.
 
-use crate::testkit::{INT, KILL, Program, Sender, Stage, TERM, in_a_network, number, until};
+use crate::testkit::{INT, KILL, Program, Sender, TERM, TestEnv, in_a_network, number, until};
 use rustix::process::{Pid, Resource, Rlimit, getrlimit, prlimit};
 use schema::datagram::Announce;
 use schema::{Marks, Scan, State, Status, Topic, Verdict, Zones};
@@ -10,13 +10,13 @@ use serde_json::{Value, json};
 const HUB: u64 = 0x5f3a_12bc_00d1_e2f3;
 const FRONT: &str = "robot1.front";
 
-fn publisher(stage: &Stage) -> Program {
-    stage.start(&["listen", "--json", "--publish", "--name=robot1=5f3a12bc00d1e2f3"]).ready()
+fn publisher(env: &TestEnv) -> Program {
+    env.start(&["listen", "--json", "--publish", "--name=robot1=5f3a12bc00d1e2f3"]).ready()
 }
 
 /// A listener that publishes what a sender has announced.
-fn published(stage: &Stage, sender: &mut Sender) -> Program {
-    let mut program = publisher(stage);
+fn published(env: &TestEnv, sender: &mut Sender) -> Program {
+    let mut program = publisher(env);
     sender.announce(&[Topic::Zones, Topic::Scan, Topic::Status, Topic::Telegram]);
     let line = program.await_line("a sensor", |line| line["kind"] == "published");
     assert_eq!(line["sensor"], FRONT);
@@ -37,12 +37,12 @@ fn zones(verdict: Verdict) -> Zones {
 #[test]
 fn a_remote_sensor_is_as_a_local_one() {
     in_a_network("listen_publish::a_remote_sensor_is_as_a_local_one", || {
-        let stage = Stage::new();
+        let env = TestEnv::new();
         let mut sender = Sender::new(HUB, 7, 3, "front");
-        let program = published(&stage, &mut sender);
-        let mut echo = stage.echo(&["robot1.front/zones", "robot1.front/scan", "robot1.front/telegram"]);
-        let mut hz = stage.start(&["hz", "--json", "robot1.front/zones"]);
-        until("hz is attached", || stage.subscribers("robot1.front/zones") == 2);
+        let program = published(&env, &mut sender);
+        let mut echo = env.echo(&["robot1.front/zones", "robot1.front/scan", "robot1.front/telegram"]);
+        let mut hz = env.start(&["hz", "--json", "robot1.front/zones"]);
+        until("hz is attached", || env.subscribers("robot1.front/zones") == 2);
         let mut scan = Scan { count: 2, unit_mm: 10, range_bits: 13, ..Scan::default() };
         scan.range_array[..2].copy_from_slice(&[11, 12]);
         let mut status = Status { state: State::Streaming as u8, since_ns: 5, ..Status::default() };
@@ -82,15 +82,15 @@ fn a_remote_sensor_is_as_a_local_one() {
         assert_eq!((&of_zones["received"], &of_zones["lost"]), (&json!(3), &json!(3)));
         assert_eq!(hz.end(INT).of_class("summary")[0]["lost"], 3);
 
-        let info = stage.await_info(FRONT, |info| info["state"] == "streaming");
+        let info = env.await_info(FRONT, |info| info["state"] == "streaming");
         assert_eq!(info["port"], "/dev/ttyUSB7");
         assert!(number(&info, "since_ns") > 5, "the beginning is on another machine's clock: {info}");
-        let listed = stage.run(&["list", "--json"]).of_class("topic");
+        let listed = env.run(&["list", "--json"]).of_class("topic");
         let topics: Vec<_> = listed.iter().map(|line| &line["topic"]).collect();
         assert_eq!(topics, ["telegram", "scan", "zones", "status"], "those that were announced");
-        let domains = stage.command(&["list", "--domains", "--json"]).output().expect("runs");
+        let domains = env.command(&["list", "--domains", "--json"]).output().expect("runs");
         assert!(String::from_utf8_lossy(&domains.stdout).contains(&program.pid().to_string()));
-        stage.await_info(FRONT, |info| info["state"] == "silent" && info["last_error"] != "");
+        env.await_info(FRONT, |info| info["state"] == "silent" && info["last_error"] != "");
 
         let outcome = program.end(TERM);
         assert_eq!(outcome.code, Some(0), "{outcome}");
@@ -99,17 +99,17 @@ fn a_remote_sensor_is_as_a_local_one() {
             (&line["sensors"], &line["late"], &line["loan_failed"]),
             (&json!([FRONT]), &json!(1), &json!(0))
         );
-        assert_eq!(stage.run(&["info", FRONT, "--json"]).code, Some(3), "nobody publishes");
+        assert_eq!(env.run(&["info", FRONT, "--json"]).code, Some(3), "nobody publishes");
     });
 }
 
 #[test]
 fn consumers_outlive_the_listener_and_see_what_they_missed() {
     in_a_network("listen_publish::consumers_outlive_the_listener_and_see_what_they_missed", || {
-        let stage = Stage::new();
+        let env = TestEnv::new();
         let mut sender = Sender::new(HUB, 7, 0, "front");
-        let first = published(&stage, &mut sender);
-        let mut echo = stage.echo(&["robot1.front/zones"]);
+        let first = published(&env, &mut sender);
+        let mut echo = env.echo(&["robot1.front/zones"]);
         sender.send(Topic::Zones, &zones(Verdict::Clear));
         echo.await_line("zones", is_zones);
         assert_eq!(first.end(KILL).code, None);
@@ -117,24 +117,24 @@ fn consumers_outlive_the_listener_and_see_what_they_missed() {
         for _ in 0..4 {
             sender.send(Topic::Zones, &zones(Verdict::Slow));
         }
-        let second = published(&stage, &mut sender);
+        let second = published(&env, &mut sender);
         echo.await_line("the news", |line| line["kind"] == "hub_back");
         sender.send(Topic::Zones, &zones(Verdict::Stop));
         echo.await_line("zones", |line| line["verdict"] == "stop");
         let outcome = echo.end(INT);
         assert_eq!(outcome.of_class("summary")[0]["lost"], 4, "{outcome}");
         assert_eq!(second.end(TERM).code, Some(0));
-        assert!(stage.left_behind().is_empty(), "{:?}", stage.left_behind());
+        assert!(env.left_behind().is_empty(), "{:?}", env.left_behind());
     });
 }
 
 #[test]
 fn gateways_and_hubs_that_start_again_are_followed() {
     in_a_network("listen_publish::gateways_and_hubs_that_start_again_are_followed", || {
-        let stage = Stage::new();
+        let env = TestEnv::new();
         let mut sender = Sender::new(HUB, 7, 0, "front");
-        let program = published(&stage, &mut sender);
-        let mut echo = stage.echo(&["robot1.front/zones"]);
+        let program = published(&env, &mut sender);
+        let mut echo = env.echo(&["robot1.front/zones"]);
         for _ in 0..3 {
             sender.send(Topic::Zones, &zones(Verdict::Clear));
         }
@@ -164,67 +164,67 @@ fn gateways_and_hubs_that_start_again_are_followed() {
 #[test]
 fn a_hub_and_two_remote_ones_live_in_one_domain() {
     in_a_network("listen_publish::a_hub_and_two_remote_ones_live_in_one_domain", || {
-        let stage = Stage::new();
-        let _simulator = stage.simulator(&["front"], &["--seed=61", "--baud=500000"]);
+        let env = TestEnv::new();
+        let _simulator = env.simulator(&["front"], &["--seed=61", "--baud=500000"]);
         let mut one = Sender::new(HUB, 7, 0, "front");
         let mut other = Sender::new(0xab, 7, 0, "front");
-        let listener = published(&stage, &mut one);
+        let listener = published(&env, &mut one);
         // Somebody who follows the hub's sensor waits for the hub, whoever else is in the domain.
-        let mut early = stage.start(&["echo", "--json", "front/scan"]);
-        let absent = stage.run(&["echo", "--json", "front/scan", "-n", "1"]);
+        let mut early = env.start(&["echo", "--json", "front/scan"]);
+        let absent = env.run(&["echo", "--json", "front/scan", "-n", "1"]);
         assert_eq!(
             (absent.code, &absent.of_class("error")[0]["kind"]),
             (Some(3), &json!("no_topic")),
             "{absent}"
         );
-        let hub = stage.hub(&[stage.link("front")]);
+        let hub = env.hub(&[env.link("front")]);
         early.await_line("a scan", |line| line["class"] == "scan");
         assert_eq!(early.end(INT).code, Some(0));
         other.announce(&[Topic::Zones, Topic::Status]);
         other.send(Topic::Status, &Status::default());
-        let second = publisher_refused(&stage);
+        let second = publisher_refused(&env);
         assert!(second.contains(&format!("pid {}", listener.pid())), "{second}");
-        let mut echo = stage.echo(&["front/scan", "robot1.front/zones", "00000000000000ab.front/zones"]);
+        let mut echo = env.echo(&["front/scan", "robot1.front/zones", "00000000000000ab.front/zones"]);
         one.send(Topic::Zones, &zones(Verdict::Stop));
         other.send(Topic::Zones, &zones(Verdict::Slow));
         for sensor in ["front", FRONT, "00000000000000ab.front"] {
             echo.await_line(sensor, |line| line["sensor"] == sensor && line["class"] != "notice");
         }
         // The robot's own sensors: those of other robots stand elsewhere.
-        let outcome = stage.run(&["echo", "--json", "robot/zones", "-n", "3"]);
+        let outcome = env.run(&["echo", "--json", "robot/zones", "-n", "3"]);
         let lines = outcome.of_class("zones");
         assert!(lines.iter().all(|line| line["sensors"].as_array().map(Vec::len) == Some(1)), "{outcome}");
-        let absent = stage.run(&["echo", "--json", "robot2.front/zones", "-n", "1"]);
+        let absent = env.run(&["echo", "--json", "robot2.front/zones", "-n", "1"]);
         assert_eq!(
             (absent.code, &absent.of_class("error")[0]["kind"]),
             (Some(3), &json!("no_topic")),
             "{absent}"
         );
-        let refused = stage.run(&["control", "robot1.front", "pause", "--json"]);
+        let refused = env.run(&["control", "robot1.front", "pause", "--json"]);
         assert_eq!(refused.code, Some(2), "nobody commands another machine's sensor: {refused}");
         assert_eq!(hub.end(TERM).code, Some(0));
         one.send(Topic::Zones, &zones(Verdict::Clear));
         echo.await_line("the remote sensor goes on", |line| line["verdict"] == "clear");
         drop(echo);
         assert_eq!(listener.end(TERM).code, Some(0));
-        assert!(stage.left_behind().is_empty(), "{:?}", stage.left_behind());
+        assert!(env.left_behind().is_empty(), "{:?}", env.left_behind());
     });
 }
 
 #[test]
 fn what_a_gateway_sends_comes_back_once() {
     in_a_network("listen_publish::what_a_gateway_sends_comes_back_once", || {
-        let stage = Stage::new();
-        let _simulator = stage.simulator(&["front"], &["--seed=62", "--baud=500000"]);
-        let mut listener = stage.start(&["listen", "--json", "--publish", "--interface=lo"]).ready();
+        let env = TestEnv::new();
+        let _simulator = env.simulator(&["front"], &["--seed=62", "--baud=500000"]);
+        let mut listener = env.start(&["listen", "--json", "--publish", "--interface=lo"]).ready();
         // The gateway waits for the hub, though the domain lives already; and what the listener brings is not its to send.
-        let mut gateway = stage.start(&["gateway", "--json", "--interface=lo", "--topic=front/scan"]);
+        let mut gateway = env.start(&["gateway", "--json", "--interface=lo", "--topic=front/scan"]);
         let id = gateway.await_line("its begin", |line| line["class"] == "gateway")["hub"].clone();
-        let hub = stage.hub(&[stage.link("front")]);
+        let hub = env.hub(&[env.link("front")]);
         let line = listener.await_line("a sensor", |line| line["kind"] == "published");
         let remote = format!("{}.front", id.as_str().unwrap_or_default());
         assert_eq!((&line["sensor"], &line["here"]), (&json!(remote), &json!(true)));
-        let mut echo = stage.echo(&["front/scan", &format!("{remote}/scan")]);
+        let mut echo = env.echo(&["front/scan", &format!("{remote}/scan")]);
         echo.await_lines(40, "scans", |line| line["sensor"] == remote.as_str());
         let outcome = echo.end(INT);
         let scans = outcome.of_class("scan");
@@ -248,10 +248,10 @@ fn what_a_gateway_sends_comes_back_once() {
 #[test]
 fn a_number_that_another_sensor_has_is_its_own() {
     in_a_network("listen_publish::a_number_that_another_sensor_has_is_its_own", || {
-        let stage = Stage::new();
+        let env = TestEnv::new();
         let mut sender = Sender::new(HUB, 7, 0, "front");
-        let mut program = published(&stage, &mut sender);
-        let mut echo = stage.echo(&["robot1.front/zones"]);
+        let mut program = published(&env, &mut sender);
+        let mut echo = env.echo(&["robot1.front/zones"]);
         sender.send(Topic::Zones, &zones(Verdict::Clear));
         echo.await_line("zones", is_zones);
         (sender.name, sender.boot) = ("rear".to_owned(), 0xb008);
@@ -261,8 +261,8 @@ fn a_number_that_another_sensor_has_is_its_own() {
         let line = program.await_line("a sensor", |line| line["kind"] == "published");
         assert_eq!(line["sensor"], "robot1.rear");
         echo.await_line("nothing is known any more", |line| line["verdict"] == "unknown");
-        stage.await_info(FRONT, |info| info["state"] == "silent");
-        let mut rear = stage.echo(&["robot1.rear/zones"]);
+        env.await_info(FRONT, |info| info["state"] == "silent");
+        let mut rear = env.echo(&["robot1.rear/zones"]);
         sender.send(Topic::Zones, &zones(Verdict::Stop));
         rear.await_line("its own", |line| line["verdict"] == "stop");
         // The first one comes back with another number, of which it knows nothing. What is late says nothing.
@@ -288,32 +288,32 @@ fn a_number_that_another_sensor_has_is_its_own() {
 #[test]
 fn a_hub_that_numbers_its_sensors_otherwise_keeps_them_apart() {
     in_a_network("listen_publish::a_hub_that_numbers_its_sensors_otherwise_keeps_them_apart", || {
-        let stage = Stage::new();
-        let _simulator = stage.simulator(&["front", "rear"], &["--seed=63", "--baud=500000"]);
-        let mut listener = stage.start(&["listen", "--json", "--publish", "--interface=lo"]).ready();
-        let mut gateway = stage.start(&["gateway", "--json", "--interface=lo"]);
+        let env = TestEnv::new();
+        let _simulator = env.simulator(&["front", "rear"], &["--seed=63", "--baud=500000"]);
+        let mut listener = env.start(&["listen", "--json", "--publish", "--interface=lo"]).ready();
+        let mut gateway = env.start(&["gateway", "--json", "--interface=lo"]);
         let id = gateway.await_line("its begin", |line| line["class"] == "gateway")["hub"].clone();
         let remote = |name: &str| format!("{}.{name}", id.as_str().unwrap_or_default());
         let (front, rear) = (remote("front"), remote("rear"));
-        let hub = stage.hub(&[stage.link("front"), stage.link("rear")]);
+        let hub = env.hub(&[env.link("front"), env.link("rear")]);
         listener.await_line("a sensor", |line| line["kind"] == "published");
         listener.await_line("the other", |line| line["kind"] == "published");
         let topics = [&front, &rear].map(|name| ["status", "scan"].map(|topic| format!("{name}/{topic}")));
         let topics: Vec<_> = topics.iter().flatten().map(String::as_str).collect();
-        let mut echo = stage.echo(&topics);
+        let mut echo = env.echo(&topics);
         let is_scan =
             |line: &Value, name: &String| line["class"] == "scan" && line["sensor"] == name.as_str();
         let first = echo.await_line("a life", |line| is_scan(line, &front))["boot"].clone();
         assert_eq!(hub.end(TERM).code, Some(0));
-        let hub = stage.hub(&[stage.link("rear"), stage.link("front")]);
+        let hub = env.hub(&[env.link("rear"), env.link("front")]);
         let is_next = |line: &Value, name| is_scan(line, name) && line["boot"] != first;
         let next = echo.await_line("the next life", |line| is_next(line, &front))["boot"].clone();
         echo.await_line("the next life of the other", |line| is_next(line, &rear));
         assert_eq!(hub.end(TERM).code, Some(0));
         // The one that has the other's number now takes it at once.
-        let _hub = stage.hub(&[stage.link("front")]);
+        let _hub = env.hub(&[env.link("front")]);
         echo.await_line("one is left", |line| is_next(line, &front) && line["boot"] != next);
-        stage.await_info(&rear, |info| info["state"] == "silent");
+        env.await_info(&rear, |info| info["state"] == "silent");
         for line in echo.end(INT).of_class("status") {
             let (sensor, port) =
                 (line["sensor"].as_str().unwrap_or_default(), line["port"].as_str().unwrap_or_default());
@@ -324,8 +324,8 @@ fn a_hub_that_numbers_its_sensors_otherwise_keeps_them_apart() {
     });
 }
 
-fn publisher_refused(stage: &Stage) -> String {
-    let outcome = stage.run(&["listen", "--json", "--publish"]);
+fn publisher_refused(env: &TestEnv) -> String {
+    let outcome = env.run(&["listen", "--json", "--publish"]);
     assert_eq!((outcome.code, &outcome.lines()[0]["kind"]), (Some(1), &json!("domain_held")), "{outcome}");
     outcome.lines()[0]["message"].as_str().unwrap_or_default().to_owned()
 }
@@ -333,12 +333,12 @@ fn publisher_refused(stage: &Stage) -> String {
 #[test]
 fn what_has_no_room_is_counted_as_such() {
     in_a_network("listen_publish::what_has_no_room_is_counted_as_such", || {
-        let stage = Stage::new();
+        let env = TestEnv::new();
         let mut front = Sender::new(HUB, 7, 3, "front");
-        let mut program = publisher(&stage);
+        let mut program = publisher(&env);
         front.announce(&[Topic::Zones]);
         program.await_line("a sensor", |line| line["kind"] == "published");
-        let mut echo = stage.echo(&["robot1.front/zones"]);
+        let mut echo = env.echo(&["robot1.front/zones"]);
         let pid = program.pid();
         let used = std::fs::read_dir(format!("/proc/{pid}/fd")).expect("it runs").count() as u64;
         let few = Rlimit { current: Some(used + 4), maximum: getrlimit(Resource::Nofile).maximum };
@@ -364,8 +364,8 @@ fn what_has_no_room_is_counted_as_such() {
 #[test]
 fn there_is_room_for_sixteen_sensors() {
     in_a_network("listen_publish::there_is_room_for_sixteen_sensors", || {
-        let stage = Stage::new();
-        let mut program = publisher(&stage);
+        let env = TestEnv::new();
+        let mut program = publisher(&env);
         let mut senders: Vec<_> =
             (0..17).map(|number| Sender::new(0xab, 7, number, &format!("s{number}"))).collect();
         // All but the last one deliver for a second.
@@ -378,7 +378,7 @@ fn there_is_room_for_sixteen_sensors() {
         }
         let line = program.await_line("one too many", |line| line["kind"] == "trouble");
         assert!(line["message"].as_str().is_some_and(|text| text.contains("16 published")), "{line}");
-        let listed = stage.run(&["list", "--json"]).of_class("topic");
+        let listed = env.run(&["list", "--json"]).of_class("topic");
         assert_eq!(listed.len(), 16);
         let outcome = program.end(INT);
         assert_eq!(outcome.of_class("lan_published")[0]["capacity"], 1, "{outcome}");

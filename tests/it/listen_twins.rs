@@ -3,12 +3,12 @@
 
 use std::time::{Duration, Instant};
 
-use crate::testkit::{INT, Machine, Outcome, Program, Stage, TERM, in_a_network, is_class, number};
+use crate::testkit::{INT, Machine, Outcome, Program, TERM, TestEnv, in_a_network, is_class, number};
 use serde_json::{Value, json};
 
 /// A machine with a hub, whose sensor has so many beams, and what it keeps of its gateway.
 struct Robot {
-    stage: Stage,
+    env: TestEnv,
     _simulator: Program,
     _hub: Program,
     _machine: Machine,
@@ -17,24 +17,24 @@ struct Robot {
 impl Robot {
     fn new(number: u8, beams: u32) -> Robot {
         let machine = Machine::new(number);
-        let stage = Stage::on(&machine);
-        let simulator = stage.simulator(&["front"], &["--seed=61", "--baud=500000"]);
+        let env = TestEnv::on(&machine);
+        let simulator = env.simulator(&["front"], &["--seed=61", "--baud=500000"]);
         let resolution = format!("--set=link.front.resolution={}", 180.0 / f64::from(beams - 1));
-        let hub = stage.hub(&[stage.link("front"), resolution]);
-        stage.await_info("front", |info| info["state"] == "streaming");
-        Robot { stage, _simulator: simulator, _hub: hub, _machine: machine }
+        let hub = env.hub(&[env.link("front"), resolution]);
+        env.await_info("front", |info| info["state"] == "streaming");
+        Robot { env, _simulator: simulator, _hub: hub, _machine: machine }
     }
 
     /// A gateway that goes on from the state that both have: an epoch far ahead, so that the seconds of their starts do
     /// not matter.
     fn gateway(&self) -> Program {
-        let domain = self.stage.place().name().to_owned();
-        let state = self.stage.path("state/scanhub");
+        let domain = self.env.place().name().to_owned();
+        let state = self.env.path("state/scanhub");
         std::fs::create_dir_all(&state).expect("a state directory");
         let file = state.join(format!("gateway-{domain}-eth0-1"));
         std::fs::write(file, "5f3a12bc00d1e2f3 4000000000\n").expect("can be written");
         let mut gateway =
-            self.stage.gateway_at(&["--interface=eth0", "--topic=front/scan", "--topic=front/status"]);
+            self.env.gateway_at(&["--interface=eth0", "--topic=front/scan", "--topic=front/status"]);
         let begin = gateway.await_line("its begin", is_class("gateway"));
         assert_eq!((&begin["hub"], number(&begin, "epoch")), (&json!("5f3a12bc00d1e2f3"), 4_000_000_001));
         gateway
@@ -58,13 +58,13 @@ fn two_machines_with_one_state_directory_are_told_and_never_mixed() {
     in_a_network("listen_twins::two_machines_with_one_state_directory_are_told_and_never_mixed", || {
         let (one, other) = (Robot::new(1, 361), Robot::new(2, 181));
         // Here both cables are plugged in.
-        let stage = Stage::new();
-        let mut listener = stage.start(&["listen", "--json"]).ready();
-        let mut publisher = stage.start(&["listen", "--json", "--publish"]).ready();
+        let env = TestEnv::new();
+        let mut listener = env.start(&["listen", "--json"]).ready();
+        let mut publisher = env.start(&["listen", "--json", "--publish"]).ready();
         let first = one.gateway();
         listener.await_lines(10, "scans of the first one", is_class("scan"));
         publisher.await_line("a sensor", |line| line["kind"] == "published");
-        let mut echo = stage.echo(&["5f3a12bc00d1e2f3.front/scan"]);
+        let mut echo = env.echo(&["5f3a12bc00d1e2f3.front/scan"]);
         let second = other.gateway();
         let begin = Instant::now();
         listener.await_line("that there are two", is_told);
@@ -76,14 +76,14 @@ fn two_machines_with_one_state_directory_are_told_and_never_mixed() {
         assert_eq!(beams(&echoed), [361], "{echoed}");
         assert_eq!(echoed.of_class("summary")[0]["lost"], 0, "{echoed}");
         // One that comes now hears either, but not both.
-        let mut late = stage.start(&["listen", "--json"]).ready();
+        let mut late = env.start(&["listen", "--json"]).ready();
         late.await_line("that there are two", is_told);
         late.await_lines(10, "scans", is_class("scan"));
         let late = late.end(INT);
         assert!(beams(&late) == [361] || beams(&late) == [181], "{:?}", beams(&late));
         // When the first one ends, the other one does not stand in for it: more than 3 s of it are refused.
         assert_eq!(first.end(TERM).code, Some(0));
-        let mut other = stage.start(&["listen", "--json"]).ready();
+        let mut other = env.start(&["listen", "--json"]).ready();
         other.await_lines(200, "scans of the second one", is_class("scan"));
         assert_eq!(beams(&other.end(INT)), [181], "alone it is heard by who comes now");
         assert_eq!(second.end(TERM).code, Some(0));

@@ -64,6 +64,7 @@ mod serial_server;
 mod service;
 mod sharing;
 mod simulated;
+mod skips;
 mod strangers;
 mod streaming;
 mod suspended;

@@ -1,12 +1,12 @@
 //! A robot that sees itself: it stops for its own post until it is told to look past it.
 
 use crate::testkit;
-use crate::testkit::{INT, KILL, Program, Stage, TERM, is_class};
+use crate::testkit::{INT, KILL, Program, TERM, TestEnv, is_class};
 
 /// A room of six metres, and 0.4 m before the sensor what `thing` says.
-fn world(stage: &Stage, thing: &str) -> String {
+fn world(env: &TestEnv, thing: &str) -> String {
     let room = "[noise]\ntail = 0\n\n[[thing]]\nline = [[3000, -3000], [3000, 3000], [-3000, 3000], [-3000, -3000]]\n";
-    format!("--world={}", stage.file("world.toml", format!("{room}\n{thing}")))
+    format!("--world={}", env.file("world.toml", format!("{room}\n{thing}")))
 }
 
 /// What is told beside a mask that a person should look at; on a busy machine also that scans were missed.
@@ -14,29 +14,29 @@ const DOUBTS: [&str; 3] = ["nothing of the robot", "something moved", "are hidde
 
 const POST: &str = "[[thing]]\nradius_mm = 20\npose = [0, 400]\n";
 
-fn simulator(stage: &Stage, world: &str) -> Program {
-    stage.simulator(&["front"], &["--seed=51", "--baud=500000", world])
+fn simulator(env: &TestEnv, world: &str) -> Program {
+    env.simulator(&["front"], &["--seed=51", "--baud=500000", world])
 }
 
 /// Waits until scans come and the verdict is `verdict`.
-fn await_verdict(stage: &Stage, verdict: &str) {
-    stage.echo(&["front/zones"]).await_line(verdict, |line| line["verdict"] == verdict);
+fn await_verdict(env: &TestEnv, verdict: &str) {
+    env.echo(&["front/zones"]).await_line(verdict, |line| line["verdict"] == verdict);
 }
 
 #[test]
 fn no_time_at_all_is_refused() {
-    let outcome = Stage::new().run(&["zones", "front", "mask", "--for=0s", "--json"]);
+    let outcome = TestEnv::new().run(&["zones", "front", "mask", "--for=0s", "--json"]);
     assert_eq!(outcome.code, Some(78), "{outcome}");
     assert_eq!(outcome.of_class("error")[0]["message"], "--for 0s sees nothing");
 }
 
 #[test]
 fn a_robot_that_knows_its_own_post_goes_on() {
-    let stage = Stage::new();
-    let _simulator = simulator(&stage, &world(&stage, POST));
-    let hub = stage.hub(&[stage.link("front")]);
-    await_verdict(&stage, "stop");
-    let outcome = stage.run(&["zones", "front", "mask", "--for", "3s"]);
+    let env = TestEnv::new();
+    let _simulator = simulator(&env, &world(&env, POST));
+    let hub = env.hub(&[env.link("front")]);
+    await_verdict(&env, "stop");
+    let outcome = env.run(&["zones", "front", "mask", "--for", "3s"]);
     assert_eq!(outcome.code, Some(0), "{outcome}");
     assert!(!DOUBTS.iter().any(|doubt| outcome.errors.contains(doubt)), "{outcome}");
     assert_eq!(hub.end(TERM).code, Some(0));
@@ -51,17 +51,17 @@ fn a_robot_that_knows_its_own_post_goes_on() {
     assert!((85.0..=87.5).contains(&first) && (92.5..=95.0).contains(&last), "{outcome}");
     assert!(sectors.iter().all(|sector| key(sector, "range") > 0.38), "{outcome}");
 
-    let file = stage.file("mask.toml", &text);
-    let _hub = stage.hub(&[&stage.link("front"), "--config", &file]);
-    await_verdict(&stage, "clear");
-    let mut consumer = stage.echo(&["front/zones"]);
+    let file = env.file("mask.toml", &text);
+    let _hub = env.hub(&[&env.link("front"), "--config", &file]);
+    await_verdict(&env, "clear");
+    let mut consumer = env.echo(&["front/zones"]);
     let lines = consumer.await_lines(100, "a verdict", is_class("zones"));
     // On a busy machine a scan may be late, which is `unknown`; but nothing is seen.
     let seen: Vec<_> =
         lines.iter().filter(|line| line["verdict"] == "stop" || line["verdict"] == "slow").collect();
     assert!(seen.is_empty(), "{seen:#?}");
     // A mask that is in force does not hinder the next one: scans are as the sensor sends them.
-    let again = stage.run(&["zones", "front", "mask", "--for", "4s", "--json"]);
+    let again = env.run(&["zones", "front", "mask", "--for", "4s", "--json"]);
     assert_eq!(again.code, Some(0), "{again}");
     let mask = &again.of_class("mask")[0];
     assert_eq!(
@@ -74,37 +74,37 @@ fn a_robot_that_knows_its_own_post_goes_on() {
 
 #[test]
 fn nothing_there_is_an_empty_mask_that_a_hub_takes_too() {
-    let stage = Stage::new();
-    let _simulator = simulator(&stage, &world(&stage, ""));
-    let hub = stage.hub(&[stage.link("front")]);
-    await_verdict(&stage, "clear");
-    let outcome = stage.run(&["zones", "front", "mask", "--for", "3s"]);
+    let env = TestEnv::new();
+    let _simulator = simulator(&env, &world(&env, ""));
+    let hub = env.hub(&[env.link("front")]);
+    await_verdict(&env, "clear");
+    let outcome = env.run(&["zones", "front", "mask", "--for", "3s"]);
     assert_eq!(outcome.code, Some(0), "{outcome}");
     let doubt = "nothing of the robot is seen within 1.0 m of its centre: no mask is needed";
     assert!(outcome.errors.contains(doubt), "{outcome}");
     assert!(outcome.out.ends_with(b"self_min = []\n"), "{outcome}");
     assert_eq!(hub.end(TERM).code, Some(0));
-    let file = stage.file("mask.toml", &outcome.out);
-    let _hub = stage.hub(&[&stage.link("front"), "--config", &file]);
-    await_verdict(&stage, "clear");
+    let file = env.file("mask.toml", &outcome.out);
+    let _hub = env.hub(&[&env.link("front"), "--config", &file]);
+    await_verdict(&env, "clear");
 
     // The walls are no body, but in a circle that is as large as the room they are: that is told.
-    let outcome = stage.run(&["zones", "front", "mask", "--for", "4s", "--within", "6"]);
+    let outcome = env.run(&["zones", "front", "mask", "--for", "4s", "--within", "6"]);
     assert_eq!(outcome.code, Some(0), "{outcome}");
     assert!(outcome.errors.contains("the hub will be blind there"), "{outcome}");
 }
 
 #[test]
 fn a_body_beyond_the_circle_that_violates_it_is_no_reason_to_do_without_a_mask() {
-    let stage = Stage::new();
-    let _simulator = simulator(&stage, &world(&stage, "[[thing]]\nradius_mm = 40\npose = [0, 1200]\n"));
-    let _hub = stage.hub(&[&stage.link("front"), "--set=zones.margin=0.5"]);
-    await_verdict(&stage, "slow");
-    let outcome = stage.run(&["zones", "front", "mask", "--for", "3s"]);
+    let env = TestEnv::new();
+    let _simulator = simulator(&env, &world(&env, "[[thing]]\nradius_mm = 40\npose = [0, 1200]\n"));
+    let _hub = env.hub(&[&env.link("front"), "--set=zones.margin=0.5"]);
+    await_verdict(&env, "slow");
+    let outcome = env.run(&["zones", "front", "mask", "--for", "3s"]);
     assert_eq!(outcome.code, Some(0), "{outcome}");
     assert!(outcome.errors.contains("the largest circle is violated") && outcome.errors.contains("--within"));
     assert!(!outcome.errors.contains("no mask is needed"), "{outcome}");
-    let outcome = stage.run(&["zones", "front", "mask", "--for", "3s", "--within", "1.5"]);
+    let outcome = env.run(&["zones", "front", "mask", "--for", "3s", "--within", "1.5"]);
     assert_eq!(outcome.code, Some(0), "{outcome}");
     assert!(!DOUBTS.iter().any(|doubt| outcome.errors.contains(doubt)), "{outcome}");
     assert!(!outcome.out.ends_with(b"self_min = []\n"), "{outcome}");
@@ -112,12 +112,12 @@ fn a_body_beyond_the_circle_that_violates_it_is_no_reason_to_do_without_a_mask()
 
 #[test]
 fn too_little_to_learn_from_is_refused() {
-    let stage = Stage::new();
-    let mask = |more: &[&str]| stage.run(&[&["zones", "front", "mask", "--json"], more].concat());
+    let env = TestEnv::new();
+    let mask = |more: &[&str]| env.run(&[&["zones", "front", "mask", "--json"], more].concat());
     assert_eq!(mask(&["--for=1s"]).code, Some(3), "no hub");
-    let simulator = simulator(&stage, &world(&stage, POST));
-    let hub = stage.hub(&[stage.link("front")]);
-    await_verdict(&stage, "stop");
+    let simulator = simulator(&env, &world(&env, POST));
+    let hub = env.hub(&[env.link("front")]);
+    await_verdict(&env, "stop");
 
     let outcome = mask(&["--for=700ms"]);
     let error = &outcome.of_class("error")[0];
@@ -126,7 +126,7 @@ fn too_little_to_learn_from_is_refused() {
     for within in ["--within=0", "--within=-1", "--within=nan", "--within=66"] {
         assert_eq!(mask(&["--for=1s", within]).code, Some(78), "{within}");
     }
-    let unknown = stage.run(&["zones", "side", "mask", "--for=1s", "--json"]);
+    let unknown = env.run(&["zones", "side", "mask", "--for=1s", "--json"]);
     assert_eq!(unknown.code, Some(3), "{unknown}");
     assert!(
         unknown.errors.is_empty() && unknown.of_class("error")[0]["hint"] == "there are front",
@@ -134,11 +134,11 @@ fn too_little_to_learn_from_is_refused() {
     );
 
     // Interrupted, and left alone by the hub.
-    let looking = stage.start(&["zones", "front", "mask", "--for=1h", "--json"]);
-    testkit::until("it looks", || stage.subscribers("front/scan") == 1);
+    let looking = env.start(&["zones", "front", "mask", "--for=1h", "--json"]);
+    testkit::until("it looks", || env.subscribers("front/scan") == 1);
     assert_eq!(looking.end(INT).code, Some(130));
-    let looking = stage.start(&["zones", "front", "mask", "--for=1h", "--json"]);
-    testkit::until("it looks", || stage.subscribers("front/scan") == 1);
+    let looking = env.start(&["zones", "front", "mask", "--for=1h", "--json"]);
+    testkit::until("it looks", || env.subscribers("front/scan") == 1);
     drop(hub.end(KILL));
     let left = looking.wait();
     assert_eq!(left.code, Some(1), "{left}");

@@ -8,7 +8,7 @@ mod program;
 mod said;
 mod shell;
 
-use crate::testkit::{Outcome, Program, Stage, TERM, until};
+use crate::testkit::{Outcome, Program, TERM, TestEnv, until};
 use blocks::{Block, blocks};
 use program::Example;
 use scanhub_client::Subscription;
@@ -34,7 +34,7 @@ const SITUATIONS: [Situation; 5] = [
 
 impl Situation {
     /// A hub with a sensor `front` that streams.
-    fn begin(&self, stage: &Stage) -> [Program; 2] {
+    fn begin(&self, env: &TestEnv) -> [Program; 2] {
         let Situation { world, sensor, unit, .. } = self;
         let flags = [
             format!("--world={world}"),
@@ -43,9 +43,9 @@ impl Situation {
             "--seed=81".to_owned(),
             "--baud=500000".to_owned(),
         ];
-        let simulator = stage.simulator(&["front"], &flags);
-        let hub = stage.hub(&[stage.link("front"), format!("--set=link.front.type={sensor}")]);
-        stage.await_info("front", |info| info["state"] == "streaming");
+        let simulator = env.simulator(&["front"], &flags);
+        let hub = env.hub(&[env.link("front"), format!("--set=link.front.type={sensor}")]);
+        env.await_info("front", |info| info["state"] == "streaming");
         [simulator, hub]
     }
 
@@ -94,13 +94,13 @@ fn distance_m(line: &str) -> Option<f64> {
     })
 }
 
-/// Runs `example` beside the hub of `stage` until it has seen some scans, and `says` something if it should.
-fn run(example: &Example, stage: &Stage, says: bool) -> Outcome {
-    let mut scans = Subscription::<Scan>::in_domain(vec![stage.place()], "front").expect("a name");
+/// Runs `example` beside the hub of `env` until it has seen some scans, and `says` something if it should.
+fn run(example: &Example, env: &TestEnv, says: bool) -> Outcome {
+    let mut scans = Subscription::<Scan>::in_domain(vec![env.place()], "front").expect("a name");
     while scans.next().expect("a hub").is_none() {}
     // Nobody types, and nobody closes it.
     let (stdin, _typed) = std::io::pipe().expect("a pipe");
-    let mut program = Program::start_with(example.command(stage), stdin);
+    let mut program = Program::start_with(example.command(env), stdin);
     // From when it reads the hub's memory.
     let maps = format!("/proc/{}/maps", program.pid());
     let follows = || {
@@ -133,7 +133,7 @@ fn every_program_on_a_page_runs_and_tells_distances_only_where_there_are_some() 
 
 /// What is wrong with the programs `blocks`, each line with its place.
 fn wrong_with(blocks: &[Block], situations: &[Situation]) -> Vec<String> {
-    let shop = Stage::new();
+    let shop = TestEnv::new();
     let (mut examples, mut wrong) = (Vec::new(), Vec::new());
     for block in blocks {
         match Example::build(block, &shop) {
@@ -142,14 +142,12 @@ fn wrong_with(blocks: &[Block], situations: &[Situation]) -> Vec<String> {
         }
     }
     for situation in situations {
-        let stage = Stage::new();
-        let _running = situation.begin(&stage);
-        let recorded = stage.run(&["record", "--ros2", "-o", &stage.word("ros.mcap"), "--for=1s"]);
+        let env = TestEnv::new();
+        let _running = situation.begin(&env);
+        let recorded = env.run(&["record", "--ros2", "-o", &env.word("ros.mcap"), "--for=1s"]);
         assert_eq!(recorded.code, Some(0), "{recorded}");
         for example in &examples {
-            wrong.extend(
-                situation.judge(example, &run(example, &stage, situation.wants_words(example))).err(),
-            );
+            wrong.extend(situation.judge(example, &run(example, &env, situation.wants_words(example))).err());
         }
     }
     wrong
@@ -176,7 +174,7 @@ fn a_program_that_takes_codes_for_distances_is_found() {
     ];
     let situations = [SITUATIONS[0], SITUATIONS[4]];
     for (block, what) in planted {
-        let is_skipped = Example::build(&block, &Stage::new()).is_ok_and(|example| example.is_none());
+        let is_skipped = Example::build(&block, &TestEnv::new()).is_ok_and(|example| example.is_none());
         let wrong = wrong_with(std::slice::from_ref(&block), &situations);
         assert!(is_skipped || wrong.iter().any(|wrong| wrong.contains(what)), "{block:#?}: {wrong:#?}");
     }

@@ -7,7 +7,7 @@ use std::path::Path;
 use std::process::Command;
 
 use crate::testkit::{
-    INT, KILL, Outcome, Program, Sender, Stage, TERM, in_a_network, is_class, number, python, until,
+    INT, KILL, Outcome, Program, Sender, TERM, TestEnv, in_a_network, is_class, number, python, until,
 };
 use schema::{Topic, Verdict, Zones};
 use serde_json::{Value, json};
@@ -21,10 +21,10 @@ fn check(name: &str) -> Option<Command> {
     Some(command)
 }
 
-/// The same with the stage's domain and root as its first arguments.
-fn check_on(stage: &Stage, name: &str) -> Option<Command> {
+/// The same with the environment's domain and root as its first arguments.
+fn check_on(env: &TestEnv, name: &str) -> Option<Command> {
     let mut command = check(name)?;
-    let place = stage.place();
+    let place = env.place();
     let root = place.root().parent().expect("a domain is below its base");
     command.arg(place.name()).arg(root);
     Some(command)
@@ -36,9 +36,9 @@ fn passed(command: Command) {
     print!("{}", String::from_utf8_lossy(&outcome.out));
 }
 
-fn streaming(stage: &Stage) -> (Program, Program) {
-    let simulator = stage.simulator(&["front"], &["--seed=61", "--baud=500000"]);
-    let hub = stage.hub(&[&stage.link("front"), "--set=background.scans=20"]);
+fn streaming(env: &TestEnv) -> (Program, Program) {
+    let simulator = env.simulator(&["front"], &["--seed=61", "--baud=500000"]);
+    let hub = env.hub(&[&env.link("front"), "--set=background.scans=20"]);
     (simulator, hub)
 }
 
@@ -57,40 +57,40 @@ fn verdicts_grow_stale() {
 
 #[test]
 fn arrays_are_views_of_shared_memory() {
-    let stage = Stage::new();
-    let Some(command) = check_on(&stage, "views") else { return };
-    let _running = streaming(&stage);
+    let env = TestEnv::new();
+    let Some(command) = check_on(&env, "views") else { return };
+    let _running = streaming(&env);
     passed(command);
 }
 
 #[test]
 fn what_cannot_be_followed_is_told_in_words() {
-    let stage = Stage::new();
-    let Some(command) = check_on(&stage, "refusals") else { return };
+    let env = TestEnv::new();
+    let Some(command) = check_on(&env, "refusals") else { return };
     passed(command);
 }
 
 #[test]
 fn models_and_the_flow_of_data_on_request() {
-    let stage = Stage::new();
-    let Some(command) = check_on(&stage, "models") else { return };
-    let _running = streaming(&stage);
+    let env = TestEnv::new();
+    let Some(command) = check_on(&env, "models") else { return };
+    let _running = streaming(&env);
     passed(command);
 }
 
 #[test]
 fn samples_say_what_echo_says() {
     const TOPICS: [&str; 7] = ["telegram", "scan", "marks", "zones", "foreground", "background", "status"];
-    let stage = Stage::new();
+    let env = TestEnv::new();
     let topics = TOPICS.map(|topic| format!("front/{topic}"));
-    let Some(mut command) = check_on(&stage, "follow") else { return };
-    let (_simulator, hub) = streaming(&stage);
+    let Some(mut command) = check_on(&env, "follow") else { return };
+    let (_simulator, hub) = streaming(&env);
     let mut follower = Program::start({
         command.args(&topics);
         command
     });
     follower.await_line("a scan", is_class("scan"));
-    let mut echo = stage.start(&[&["echo", "--json"], &topics.each_ref().map(String::as_str)[..]].concat());
+    let mut echo = env.start(&[&["echo", "--json"], &topics.each_ref().map(String::as_str)[..]].concat());
     for program in [&mut echo, &mut follower] {
         program.await_lines(2, "a background", is_class("background"));
         program.await_lines(40, "a scan", is_class("scan"));
@@ -134,11 +134,11 @@ fn differing<'a>(line: &'a Value, sample: &Value) -> Vec<&'a String> {
 
 #[test]
 fn one_subscription_follows_several_sensors() {
-    let stage = Stage::new();
-    let Some(mut command) = check_on(&stage, "follow") else { return };
+    let env = TestEnv::new();
+    let Some(mut command) = check_on(&env, "follow") else { return };
     command.args(["front/scan", "rear/scan", "rear/status"]);
-    let _simulator = stage.simulator(&["front", "rear"], &["--seed=63", "--baud=500000"]);
-    let _hub = stage.hub(&[stage.link("front"), stage.link("rear")]);
+    let _simulator = env.simulator(&["front", "rear"], &["--seed=63", "--baud=500000"]);
+    let _hub = env.hub(&[env.link("front"), env.link("rear")]);
     let mut follower = Program::start(command);
     for (sensor, topic, count) in [("front", "scan", 40), ("rear", "scan", 40), ("rear", "status", 2)] {
         follower.await_lines(count, sensor, |line| line["sensor"] == sensor && line["class"] == topic);
@@ -148,20 +148,20 @@ fn one_subscription_follows_several_sensors() {
 
 #[test]
 fn a_subscription_outlives_several_hubs() {
-    let stage = Stage::new();
-    let Some(mut command) = check_on(&stage, "follow") else { return };
+    let env = TestEnv::new();
+    let Some(mut command) = check_on(&env, "follow") else { return };
     command.args(["front/scan", "front/telegram", "front/zones"]);
-    let _simulator = stage.simulator(&["front"], &["--seed=62", "--baud=500000"]);
+    let _simulator = env.simulator(&["front"], &["--seed=62", "--baud=500000"]);
     // It is there before its hub is.
     let mut follower = Program::start(command);
-    let mut hub = stage.hub(&[stage.link("front")]);
+    let mut hub = env.hub(&[env.link("front")]);
     follower.await_line("hub_back", |line| line["kind"] == "hub_back");
     for how in [KILL, TERM, KILL] {
         follower.await_lines(20, "a scan", is_class("scan"));
         let code = hub.end(how).code;
         assert_eq!(code, (how == TERM).then_some(0));
         follower.await_line("hub_gone", |line| line["kind"] == "hub_gone");
-        hub = stage.hub(&[stage.link("front")]);
+        hub = env.hub(&[env.link("front")]);
         follower.await_line("hub_back", |line| line["kind"] == "hub_back");
     }
     follower.await_lines(20, "a scan", is_class("scan"));
@@ -192,21 +192,20 @@ fn a_subscription_outlives_several_hubs() {
 /// The worst of its sensors, of which one is switched off, then the hub killed: nothing stays clear by itself.
 #[test]
 fn a_robot_is_as_unknown_as_its_worst_sensor() {
-    let stage = Stage::new();
-    let Some(mut named) = check_on(&stage, "robot") else { return };
+    let env = TestEnv::new();
+    let Some(mut named) = check_on(&env, "robot") else { return };
     named.args(["front", "rear"]);
-    let Some(all) = check_on(&stage, "robot") else { return };
+    let Some(all) = check_on(&env, "robot") else { return };
     let mut followers = [named, all].map(Program::start);
     for follower in &mut followers {
         let first = follower.await_line("there is no hub", is_class("robot"));
         assert_eq!((&first["verdict"], &first["nearest_mm"]), (&"unknown".into(), &Value::Null), "{first}");
     }
-    let _front = stage.simulator(&["front"], &["--seed=64", "--baud=500000"]);
-    let rear =
-        stage.start(&["simulate", "--json", "--baud=500000", &format!("--port={}", stage.word("rear"))]);
+    let _front = env.simulator(&["front"], &["--seed=64", "--baud=500000"]);
+    let rear = env.start(&["simulate", "--json", "--baud=500000", &format!("--port={}", env.word("rear"))]);
     let rear = rear.ready();
     // All is clear: nothing in the simulated room is so near.
-    let hub = stage.hub(&[&stage.link("front"), &stage.link("rear"), "--set=zones.radii=[0.02,0.01]"]);
+    let hub = env.hub(&[&env.link("front"), &env.link("rear"), "--set=zones.radii=[0.02,0.01]"]);
     let are = |verdict: &'static str, front: &'static str, rear: &'static str| {
         move |line: &Value| {
             line["verdict"] == verdict && line["sensors"] == json!({ "front": front, "rear": rear })
@@ -219,7 +218,7 @@ fn a_robot_is_as_unknown_as_its_worst_sensor() {
         follower
             .await_line("by now, too", |line| line["class"] == "now" && are("clear", "clear", "clear")(line));
     }
-    stage.kill_simulator(rear, "rear");
+    env.kill_simulator(rear, "rear");
     for follower in &mut followers {
         let line = follower.await_line("the rear is gone", are("unknown", "clear", "unknown"));
         assert_eq!(line["worst"], "rear", "{line}");
@@ -236,10 +235,10 @@ fn a_robot_is_as_unknown_as_its_worst_sensor() {
 #[test]
 fn without_a_hub_the_robot_is_of_the_sensors_of_other_machines() {
     in_a_network("python::without_a_hub_the_robot_is_of_the_sensors_of_other_machines", || {
-        let stage = Stage::new();
-        let Some(command) = check_on(&stage, "robot") else { return };
+        let env = TestEnv::new();
+        let Some(command) = check_on(&env, "robot") else { return };
         let mut listener =
-            stage.start(&["listen", "--json", "--publish", "--name=robot1=0000000000000001"]).ready();
+            env.start(&["listen", "--json", "--publish", "--name=robot1=0000000000000001"]).ready();
         let mut front = Sender::new(1, 7, 0, "front");
         front.announce(&[Topic::Zones]);
         Sender::new(1, 7, 1, "mapper").announce(&[Topic::Scan]);
@@ -253,7 +252,7 @@ fn without_a_hub_the_robot_is_of_the_sensors_of_other_machines() {
         robot.await_line("clear", are("clear", "robot1.front"));
         robot.await_line("silence", are("unknown", "robot1.front"));
         // One who always finds something that is sent from elsewhere, too.
-        let mut command = check_on(&stage, "robot").expect("as before");
+        let mut command = check_on(&env, "robot").expect("as before");
         command.arg("--asked");
         let (stdin, mut ask) = std::io::pipe().expect("a pipe");
         let mut busy = Program::start_with(command, stdin);
@@ -264,8 +263,8 @@ fn without_a_hub_the_robot_is_of_the_sensors_of_other_machines() {
         };
         until("the other machine's", || hear(&mut busy).get("robot1.front").is_some());
         // A hub has sensors of its own, and when it goes nobody stands in for them.
-        let _simulator = stage.simulator(&["front"], &["--seed=65", "--baud=500000"]);
-        let hub = stage.hub(&[&stage.link("front"), "--set=zones.radii=[0.02,0.01]"]);
+        let _simulator = env.simulator(&["front"], &["--seed=65", "--baud=500000"]);
+        let hub = env.hub(&[&env.link("front"), "--set=zones.radii=[0.02,0.01]"]);
         until("the hub's own", || hear(&mut busy) == json!({"front": "clear"}));
         robot.await_line("all is forgotten", |line| {
             line["sensors"] == json!({}) && line["verdict"] == "unknown"
@@ -274,7 +273,7 @@ fn without_a_hub_the_robot_is_of_the_sensors_of_other_machines() {
         assert_eq!(hub.end(KILL).code, None);
         robot.await_line("the hub is gone", are("unknown", "front"));
         front.send(Topic::Zones, &Zones { verdict: Verdict::Clear as u8, ..Zones::unknown() });
-        let mut named = stage.start(&["echo", "--json", "robot1.front/zones"]);
+        let mut named = env.start(&["echo", "--json", "robot1.front/zones"]);
         named.await_line("whom one names is heard", |line| line["verdict"] == "clear");
         let outcome = ended_by_interrupt(robot);
         let last = outcome.of_class("robot").pop().expect("a line");

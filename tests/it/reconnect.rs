@@ -1,26 +1,26 @@
 //! A port that goes away and comes back under its name while the hub and its consumers run on.
 
 use crate::testkit::{
-    INT, Line, Program, Stage, TERM, bytes_of, hash, is_class, is_there, number, scan, sequence,
+    INT, Line, Program, TERM, TestEnv, bytes_of, hash, is_class, is_there, number, scan, sequence,
 };
 use rustix::fs::{FlockOperation, flock};
 use serde_json::Value;
 
 #[test]
 fn a_sensor_that_goes_and_comes_back() {
-    let stage = Stage::new();
-    let simulator = stage.simulator(&["front"], &["--seed=22"]);
-    let hub = stage.hub(&[stage.link("front")]);
-    let mut consumer = stage.echo(&["front/scan", "front/status"]);
+    let env = TestEnv::new();
+    let simulator = env.simulator(&["front"], &["--seed=22"]);
+    let hub = env.hub(&[env.link("front")]);
+    let mut consumer = env.echo(&["front/scan", "front/status"]);
     consumer.await_lines(10, "a scan", is_class("scan"));
     assert_eq!(simulator.end(INT).code, Some(0));
-    assert!(!is_there(&stage.path("front")));
+    assert!(!is_there(&env.path("front")));
     let absent = consumer.await_line("absent", |line| line["state"] == "absent");
     assert!(absent["last_error"].as_str().is_some_and(|error| error.contains("front")), "{absent}");
-    let _simulator = stage.simulator(&["front"], &["--seed=23"]);
+    let _simulator = env.simulator(&["front"], &["--seed=23"]);
     consumer.await_line("streaming", |line| line["state"] == "streaming");
     consumer.await_lines(10, "a scan", is_class("scan"));
-    let info = stage.info("front");
+    let info = env.info("front");
     assert_eq!(number(&info["counters"], "reconnects"), 1, "{info}");
     assert_eq!(info["last_error"], "");
     let outcome = consumer.end(INT);
@@ -40,10 +40,10 @@ fn stream(line: &Line, consumer: &mut Program, seed: u16) {
 
 #[test]
 fn a_port_is_taken_back_under_its_name_whatever_device_it_is() {
-    let stage = Stage::new();
-    let port = stage.path("front");
-    let hub = stage.hub(&[stage.link("front")]);
-    let mut consumer = stage.echo(&["front/telegram", "front/status"]);
+    let env = TestEnv::new();
+    let port = env.path("front");
+    let hub = env.hub(&[env.link("front")]);
+    let mut consumer = env.echo(&["front/telegram", "front/status"]);
     // Another pty each time: the one before is still there when the next one is made.
     let mut line = Line::at(&port);
     for plugged in 1..=5 {
@@ -67,11 +67,11 @@ fn a_port_is_taken_back_under_its_name_whatever_device_it_is() {
 
 #[test]
 fn a_name_that_moves_while_its_old_device_lives() {
-    let stage = Stage::new();
-    let port = stage.path("front");
+    let env = TestEnv::new();
+    let port = env.path("front");
     let old = Line::at(&port);
-    let _hub = stage.hub(&[stage.link("front")]);
-    let mut consumer = stage.echo(&["front/telegram", "front/status"]);
+    let _hub = env.hub(&[env.link("front")]);
+    let mut consumer = env.echo(&["front/telegram", "front/status"]);
     stream(&old, &mut consumer, 1);
     std::fs::remove_file(&port).expect("the name is there");
     let new = Line::at(&port);
@@ -84,21 +84,21 @@ fn a_name_that_moves_while_its_old_device_lives() {
 
 #[test]
 fn a_port_that_comes_back_in_other_hands() {
-    let stage = Stage::new();
-    let port = stage.path("front");
-    let hub = stage.hub(&[stage.link("front")]);
-    stage.await_info("front", |info| info["state"] == "absent");
+    let env = TestEnv::new();
+    let port = env.path("front");
+    let hub = env.hub(&[env.link("front")]);
+    env.await_info("front", |info| info["state"] == "absent");
     // This test holds it before it has its name.
-    let line = Line::at(&stage.path("elsewhere"));
-    let holder = std::fs::File::open(stage.path("elsewhere")).expect("a tty");
+    let line = Line::at(&env.path("elsewhere"));
+    let holder = std::fs::File::open(env.path("elsewhere")).expect("a tty");
     flock(&holder, FlockOperation::LockExclusive).expect("a lock");
-    std::fs::rename(stage.path("elsewhere"), &port).expect("a name");
+    std::fs::rename(env.path("elsewhere"), &port).expect("a name");
     let myself = format!("in use by process {} (", std::process::id());
     let said = |info: &Value| info["last_error"].as_str().is_some_and(|error| error.contains(&myself));
-    let info = stage.await_info("front", said);
+    let info = env.await_info("front", said);
     assert_eq!(info["state"], "absent");
     drop(holder);
-    let mut consumer = stage.echo(&["front/telegram"]);
+    let mut consumer = env.echo(&["front/telegram"]);
     stream(&line, &mut consumer, 1);
     assert_eq!(hub.end(TERM).code, Some(0));
 }

@@ -5,24 +5,25 @@ use std::path::Path;
 
 use crate::testkit;
 use crate::testkit::{
-    HUP, INT, KILL, Kept, Outcome, Program, Recording, Stage, TERM, hash, is_class, number, python, unbroken,
+    HUP, INT, KILL, Kept, Outcome, Program, Recording, TERM, TestEnv, hash, is_class, number, python,
+    unbroken,
 };
 use serde_json::Value;
 
 /// Two sensors that stream.
-fn sensors(stage: &Stage, flags: &[&str]) -> [Program; 2] {
-    let simulator = stage.simulator(&["front", "rear"], flags);
-    let hub = stage.hub(&[stage.link("front"), stage.link("rear")]);
+fn sensors(env: &TestEnv, flags: &[&str]) -> [Program; 2] {
+    let simulator = env.simulator(&["front", "rear"], flags);
+    let hub = env.hub(&[env.link("front"), env.link("rear")]);
     for sensor in ["front", "rear"] {
-        stage.await_info(sensor, |info| info["state"] == "streaming");
+        env.await_info(sensor, |info| info["state"] == "streaming");
     }
     [simulator, hub]
 }
 
 /// A recorder of these flags into `walk.mcap`, of which `count` samples are written at least.
-fn recorder(stage: &Stage, flags: &[&str], count: u64) -> Program {
-    let file = stage.word("walk.mcap");
-    let mut recorder = stage.start(&[&["record", "--json", "-o", &file], flags].concat());
+fn recorder(env: &TestEnv, flags: &[&str], count: u64) -> Program {
+    let file = env.word("walk.mcap");
+    let mut recorder = env.start(&[&["record", "--json", "-o", &file], flags].concat());
     await_samples(&mut recorder, count);
     recorder
 }
@@ -42,10 +43,10 @@ fn recorded(outcome: &Outcome) -> Value {
 
 #[test]
 fn what_was_sent_is_in_the_file_once() {
-    let stage = Stage::new();
-    let others = sensors(&stage, &["--world=room", "--seed=3"]);
-    let file = stage.path("walk.mcap");
-    let outcome = stage.run(&["record", "--json", "--for=3s", "-o", &stage.word("walk.mcap")]);
+    let env = TestEnv::new();
+    let others = sensors(&env, &["--world=room", "--seed=3"]);
+    let file = env.path("walk.mcap");
+    let outcome = env.run(&["record", "--json", "--for=3s", "-o", &env.word("walk.mcap")]);
     let end = recorded(&outcome);
     let recording = Recording::whole(&file);
     let topics: BTreeSet<_> = recording.kept.iter().map(|kept| kept.topic.as_str()).collect();
@@ -64,7 +65,7 @@ fn what_was_sent_is_in_the_file_once() {
         let telegrams = recording.of(&format!("{sensor}/telegram"));
         assert!(telegrams.len() > 30, "{} telegrams", telegrams.len());
         unbroken(&telegrams);
-        let truth = stage.truth(sensor);
+        let truth = env.truth(sensor);
         let sent: HashSet<_> = truth.iter().map(|sent| &sent.hash).collect();
         assert!(telegrams.iter().all(|kept| sent.contains(&hash(kept.payload()))), "never sent");
         for kept in &telegrams {
@@ -87,12 +88,12 @@ fn what_was_sent_is_in_the_file_once() {
 
 #[test]
 fn whatever_ends_it_the_file_is_finished() {
-    let stage = Stage::new();
-    let _others = sensors(&stage, &[]);
+    let env = TestEnv::new();
+    let _others = sensors(&env, &[]);
     for signal in [INT, TERM, HUP] {
-        let outcome = recorder(&stage, &["--force", "*/telegram"], 30).end(signal);
+        let outcome = recorder(&env, &["--force", "*/telegram"], 30).end(signal);
         let end = recorded(&outcome);
-        let recording = Recording::whole(&stage.path("walk.mcap"));
+        let recording = Recording::whole(&env.path("walk.mcap"));
         assert_eq!(number(&end, "samples"), recording.kept.len() as u64);
         unbroken(&recording.of("front/telegram"));
         unbroken(&recording.of("rear/telegram"));
@@ -101,14 +102,14 @@ fn whatever_ends_it_the_file_is_finished() {
 
 #[test]
 fn files_are_packed_as_they_are_told() {
-    let stage = Stage::new();
-    let _others = sensors(&stage, &["--world=room"]);
-    let file = stage.word("walk.mcap");
+    let env = TestEnv::new();
+    let _others = sensors(&env, &["--world=room"]);
+    let file = env.word("walk.mcap");
     let bytes_each = [(&[][..], "zstd"), (&["--compression=lz4"], "lz4"), (&["--compression=none"], "")].map(
         |(flags, wanted)| {
             let words = [&["record", "--json", "--force", "--for=2s", "-o", &file][..], flags].concat();
-            let samples = number(&recorded(&stage.run(&words)), "samples");
-            assert_eq!(Recording::whole(&stage.path("walk.mcap")).kept.len() as u64, samples);
+            let samples = number(&recorded(&env.run(&words)), "samples");
+            assert_eq!(Recording::whole(&env.path("walk.mcap")).kept.len() as u64, samples);
             let bytes = std::fs::read(&file).unwrap();
             let chunks = mcap::Summary::read(&bytes).unwrap().unwrap().chunk_indexes;
             assert!(chunks.len() > 5 && chunks.iter().all(|chunk| chunk.compression == wanted), "{wanted}");
@@ -117,21 +118,21 @@ fn files_are_packed_as_they_are_told() {
     );
     let [zstd, lz4, none] = bytes_each;
     assert!(zstd < lz4 && lz4 < none && 3 * zstd < 2 * none, "{bytes_each:?}");
-    assert_eq!(stage.run(&["record", "--compression=zip"]).code, Some(2));
+    assert_eq!(env.run(&["record", "--compression=zip"]).code, Some(2));
 }
 
 #[test]
 fn a_kill_leaves_all_that_was_told() {
-    let stage = Stage::new();
-    let _others = sensors(&stage, &[]);
-    let mut recorder = recorder(&stage, &[], 1);
+    let env = TestEnv::new();
+    let _others = sensors(&env, &[]);
+    let mut recorder = recorder(&env, &[], 1);
     let told = await_samples(&mut recorder, 300);
     assert_eq!(recorder.end(KILL).code, None);
-    let recording = Recording::left(&stage.path("walk.mcap"));
+    let recording = Recording::left(&env.path("walk.mcap"));
     assert!(recording.kept.len() as u64 >= number(&told, "samples"), "{told}: {}", recording.kept.len());
     unbroken(&recording.of("front/telegram"));
     let Some(mut python) = python("mcap") else { return };
-    python.args(["tests/testkit/read.py", "left", &stage.word("walk.mcap")]);
+    python.args(["tests/testkit/read.py", "left", &env.word("walk.mcap")]);
     assert_eq!(said(python)["messages"], recording.kept.len());
 }
 
@@ -144,21 +145,21 @@ fn said(mut python: std::process::Command) -> Value {
 
 #[test]
 fn a_hub_that_comes_back_goes_on_in_the_file() {
-    let stage = Stage::new();
-    let [_simulator, hub] = sensors(&stage, &[]);
-    let mut recorder = recorder(&stage, &["*/telegram"], 30);
+    let env = TestEnv::new();
+    let [_simulator, hub] = sensors(&env, &[]);
+    let mut recorder = recorder(&env, &["*/telegram"], 30);
     assert_eq!(hub.end(KILL).code, None);
     recorder.await_line("hub_gone", |line| line["kind"] == "hub_gone");
     // It has another sensor than before, which is recorded, too.
-    let other = stage.hub(&[stage.link("front"), stage.link("rear").replace("rear=", "back=")]);
+    let other = env.hub(&[env.link("front"), env.link("rear").replace("rear=", "back=")]);
     recorder.await_line("hub_back", |line| line["kind"] == "hub_back");
-    stage.await_info("back", |info| info["state"] == "streaming");
-    testkit::until("the new sensor is recorded", || stage.subscribers("back/telegram") > 0);
+    env.await_info("back", |info| info["state"] == "streaming");
+    testkit::until("the new sensor is recorded", || env.subscribers("back/telegram") > 0);
     let before = number(&await_samples(&mut recorder, 1), "samples");
     await_samples(&mut recorder, before + 200);
     recorded(&recorder.end(TERM));
     drop(other);
-    let recording = Recording::whole(&stage.path("walk.mcap"));
+    let recording = Recording::whole(&env.path("walk.mcap"));
     let telegrams = recording.of("front/telegram");
     let boots: BTreeSet<_> = telegrams.iter().map(|kept| kept.boot()).collect();
     let lives: BTreeSet<_> =
@@ -170,34 +171,34 @@ fn a_hub_that_comes_back_goes_on_in_the_file() {
 
 #[test]
 fn what_cannot_be_recorded_is_refused() {
-    let stage = Stage::new();
-    let file = stage.file("walk.mcap", "somebody's");
+    let env = TestEnv::new();
+    let file = env.file("walk.mcap", "somebody's");
     let kind = |arguments: &[&str]| {
-        let outcome = stage.run(&[&["record", "--json"], arguments].concat());
+        let outcome = env.run(&[&["record", "--json"], arguments].concat());
         let lines = [outcome.lines(), stderr_lines(&outcome)].concat();
         let error = lines.into_iter().find(is_class("error")).unwrap_or_else(|| panic!("{outcome}"));
         (outcome.code, error["kind"].as_str().unwrap_or_default().to_owned())
     };
     assert_eq!(kind(&["-o", &file]), (Some(73), "output".into()));
     assert_eq!(std::fs::read(&file).unwrap(), b"somebody's");
-    assert_eq!(kind(&["-o", &stage.word("nowhere/walk.mcap")]), (Some(73), "output".into()));
+    assert_eq!(kind(&["-o", &env.word("nowhere/walk.mcap")]), (Some(73), "output".into()));
     let refused = |arguments: &[&str], code| {
-        let outcome = stage.run(&[&["record", "--json"], arguments].concat());
+        let outcome = env.run(&[&["record", "--json"], arguments].concat());
         assert_eq!(outcome.code, Some(code), "{outcome}");
         outcome.of_class("error")[0]["hint"].as_str().unwrap().to_owned()
     };
     let hint = |arguments: &[&str]| refused(arguments, 73);
-    assert!(hint(&["-o", &stage.word("")]).starts_with("name a file in it: -o "));
+    assert!(hint(&["-o", &env.word("")]).starts_with("name a file in it: -o "));
     assert!(hint(&["-o", "/dev/full"]).contains("--force writes over what the device holds"));
     assert!(refused(&["-o", "/dev/full", "--force"], 75).starts_with("make room"));
-    stage.file("parts-0007.mcap", "somebody's");
-    let earlier = hint(&["-o", &stage.word("parts.mcap"), "--split=1h"]);
+    env.file("parts-0007.mcap", "somebody's");
+    let earlier = hint(&["-o", &env.word("parts.mcap"), "--split=1h"]);
     assert!(earlier.starts_with("--force goes on after the last one's number"), "{earlier}");
     assert_eq!(kind(&["-o", "-", "--split", "1h"]), (Some(2), "usage".into()));
     assert_eq!(kind(&["--keep", "3"]), (Some(2), "usage".into()));
     assert_eq!(kind(&["--split", "3"]), (Some(2), "usage".into()));
     for words in [&["--ros2", "--all"][..], &["--ros2", "front/telegram"]] {
-        let outcome = stage.run(&[&["record", "-o", &stage.word("new.mcap")], words].concat());
+        let outcome = env.run(&[&["record", "-o", &env.word("new.mcap")], words].concat());
         assert_eq!(outcome.code, Some(2), "{outcome}");
         assert!(outcome.errors.contains("messages of ROS alone, and"), "{outcome}");
         assert!(outcome.errors.contains("--ros2` makes a file for ROS of it later"), "{outcome}");
@@ -205,10 +206,10 @@ fn what_cannot_be_recorded_is_refused() {
     assert_eq!(kind(&["robot/zones"]), (Some(2), "usage".into()));
     assert_eq!(kind(&["front/scam"]), (Some(2), "usage".into()));
     // Nothing came, nothing stays.
-    let new = stage.word("new.mcap");
+    let new = env.word("new.mcap");
     assert_eq!(kind(&["-o", &new, "--for", "5s"]), (Some(3), "no_hub".into()));
     assert!(!Path::new(&new).exists());
-    let outcome = stage.run(&["record", "-o", &new, "--for", "5s"]);
+    let outcome = env.run(&["record", "-o", &new, "--for", "5s"]);
     assert!(!String::from_utf8_lossy(&outcome.out).contains("0 samples"), "{outcome}");
 }
 

@@ -10,15 +10,15 @@ use std::thread;
 use std::time::{Duration, Instant};
 
 use crate::testkit::{
-    INT, Kept, Outcome, Program, Recording, Stage, is_class, number, scan, unbroken, until,
+    INT, Kept, Outcome, Program, Recording, TestEnv, is_class, number, scan, skip, unbroken, until,
 };
 use serde_json::Value;
 
 /// A sensor that streams.
-fn sensor(stage: &Stage) -> [Program; 2] {
-    let simulator = stage.simulator(&["front"], &["--world=room"]);
-    let hub = stage.hub(&[stage.link("front")]);
-    stage.await_info("front", |info| info["state"] == "streaming");
+fn sensor(env: &TestEnv) -> [Program; 2] {
+    let simulator = env.simulator(&["front"], &["--world=room"]);
+    let hub = env.hub(&[env.link("front")]);
+    env.await_info("front", |info| info["state"] == "streaming");
     [simulator, hub]
 }
 
@@ -59,17 +59,17 @@ fn telegrams(recordings: &[Recording]) -> Vec<&Kept> {
 
 #[test]
 fn a_recording_goes_on_in_files_of_which_the_last_stay() {
-    let stage = Stage::new();
-    let _others = sensor(&stage);
-    let file = stage.word("walk.mcap");
-    let mut recorder = stage.start(&["record", "--json", "--split=64KiB", "--keep=3", "-o", &file]);
+    let env = TestEnv::new();
+    let _others = sensor(&env);
+    let file = env.word("walk.mcap");
+    let mut recorder = env.start(&["record", "--json", "--split=64KiB", "--keep=3", "-o", &file]);
     for _ in 0..4 {
         recorder.await_line("the next file", is_kind("file"));
     }
     await_samples(&mut recorder, 20);
     let outcome = recorder.end(INT);
     let files = files(&outcome);
-    assert_eq!(files[0], stage.path("walk-0001.mcap"));
+    assert_eq!(files[0], env.path("walk-0001.mcap"));
     let (gone, stay) = files.split_at(files.len() - 3);
     assert!(gone.iter().all(|file| !file.exists()), "{files:?}");
     // A machine that has no time for the recorder makes one chunk of what came meanwhile.
@@ -90,16 +90,16 @@ fn a_recording_goes_on_in_files_of_which_the_last_stay() {
 
 #[test]
 fn a_file_that_may_not_grow_is_followed_by_another() {
-    let stage = Stage::new();
-    let _others = sensor(&stage);
+    let env = TestEnv::new();
+    let _others = sensor(&env);
     // 128 blocks of 512 or 1024 bytes.
     let limited = ["sh", "-c", "ulimit -f 128; exec \"$@\"", "sh"];
-    let mut recorder = start_in(&stage, &limited, &["record", "--json", "-o", &stage.word("walk.mcap")]);
+    let mut recorder = start_in(&env, &limited, &["record", "--json", "-o", &env.word("walk.mcap")]);
     recorder.await_line("the next file", is_kind("file"));
     recorder.await_line("the next file", is_kind("file"));
     let outcome = recorder.end(INT);
     let files = files(&outcome);
-    assert_eq!(files[..2], [stage.path("walk.mcap"), stage.path("walk-0002.mcap")]);
+    assert_eq!(files[..2], [env.path("walk.mcap"), env.path("walk-0002.mcap")]);
     // There is no room for the index of any but the last one.
     let recordings: Vec<_> = files.iter().map(|file| Recording::left(file)).collect();
     nothing_lost(&outcome);
@@ -108,14 +108,14 @@ fn a_file_that_may_not_grow_is_followed_by_another() {
 
 #[test]
 fn a_directory_that_vanishes_is_waited_for() {
-    let stage = Stage::new();
-    let _others = sensor(&stage);
-    let place = stage.path("usb");
+    let env = TestEnv::new();
+    let _others = sensor(&env);
+    let place = env.path("usb");
     fs::create_dir(&place).unwrap();
     let file = place.join("walk.mcap");
-    let mut recorder = stage.start(&["record", "--json", "-o", &file.display().to_string()]);
+    let mut recorder = env.start(&["record", "--json", "-o", &file.display().to_string()]);
     await_samples(&mut recorder, 20);
-    fs::rename(&place, stage.path("unplugged")).unwrap();
+    fs::rename(&place, env.path("unplugged")).unwrap();
     let trouble = recorder.await_line("trouble", is_kind("disk_trouble"));
     assert_eq!(trouble["file"], file.display().to_string());
     fs::create_dir(&place).unwrap();
@@ -124,7 +124,7 @@ fn a_directory_that_vanishes_is_waited_for() {
     let outcome = recorder.end(INT);
     assert_eq!(files(&outcome)[1], place.join("walk-0002.mcap"));
     // What was written until it was seen is where the directory is now.
-    let places = [stage.path("unplugged/walk.mcap"), place.join("walk-0002.mcap")];
+    let places = [env.path("unplugged/walk.mcap"), place.join("walk-0002.mcap")];
     let recordings = [Recording::left(&places[0]), Recording::whole(&places[1])];
     nothing_lost(&outcome);
     assert!(telegrams(&recordings).len() > 10);
@@ -132,20 +132,20 @@ fn a_directory_that_vanishes_is_waited_for() {
 
 #[test]
 fn a_full_disk_is_waited_for() {
-    let stage = Stage::new();
-    let place = stage.path("small");
+    let env = TestEnv::new();
+    let place = env.path("small");
     fs::create_dir(&place).unwrap();
     let mount = format!("mount -t tmpfs -o size=256k none {0} && echo > {0}/filler", place.display());
     let trial = Command::new("unshare").args(["-rm", "sh", "-c", &mount]).output();
     if !trial.is_ok_and(|outcome| outcome.status.success()) {
-        eprintln!("skipped: this user may not make a file system of its own (unshare -rm, mount)");
+        skip("mounts", "this user may not make a file system of its own (unshare -rm, mount)");
         return;
     }
-    let _others = sensor(&stage);
+    let _others = sensor(&env);
     let script = format!("{mount} && head -c 131072 /dev/zero > {}/filler && exec \"$@\"", place.display());
     let file = place.join("walk.mcap").display().to_string();
     let mut recorder =
-        start_in(&stage, &["unshare", "-rm", "sh", "-c", &script, "sh"], &["record", "--json", "-o", &file]);
+        start_in(&env, &["unshare", "-rm", "sh", "-c", &script, "sh"], &["record", "--json", "-o", &file]);
     recorder.await_line("trouble", is_kind("disk_trouble"));
     // As the recorder sees it.
     let seen = PathBuf::from(format!("/proc/{}/root{}", recorder.pid(), place.display()));
@@ -162,25 +162,25 @@ fn a_full_disk_is_waited_for() {
     let mut bytes = Vec::new();
     open.read_to_end(&mut bytes).unwrap();
     nothing_lost(&outcome);
-    telegrams(&[Recording::whole(Path::new(&stage.file("walk.mcap", bytes)))]);
+    telegrams(&[Recording::whole(Path::new(&env.file("walk.mcap", bytes)))]);
 }
 
 #[test]
 fn what_cannot_be_held_is_left_out_and_said() {
-    let stage = Stage::new();
+    let env = TestEnv::new();
     let stream: Vec<u8> = (0..40_000_u32).flat_map(|seed| scan((seed % 8000) as u16)).collect();
-    stage.file("stream", stream);
+    env.file("stream", stream);
     // A pipe that nobody reads: as slow as a disk can be. Held open so that the shell need not wait for its reader.
-    let pipe = stage.path("pipe");
+    let pipe = env.path("pipe");
     assert!(Command::new("mkfifo").arg(&pipe).status().unwrap().success());
     let open = fs::File::options().read(true).write(true).open(&pipe).unwrap();
     let shell = format!("exec \"$@\" 2>&1 > {}", pipe.display());
     let topics = ["record", "--json", "-o", "-", "front/telegram", "front/scan", "front/status"];
-    let mut recorder = start_in(&stage, &["sh", "-c", &shell, "sh"], &topics);
+    let mut recorder = start_in(&env, &["sh", "-c", &shell, "sh"], &topics);
     recorder.await_line("its begin", is_class("recording"));
     let mut reader = fs::File::open(&pipe).unwrap();
     drop(open);
-    let _hub = stage.hub(&[format!("--link=front=file:{}?rate=max", stage.word("stream"))]);
+    let _hub = env.hub(&[format!("--link=front=file:{}?rate=max", env.word("stream"))]);
     recorder.await_line("the gap", is_kind("gap_begins"));
     let read = thread::spawn(move || {
         let mut bytes = Vec::new();
@@ -202,19 +202,19 @@ fn what_cannot_be_held_is_left_out_and_said() {
 
 #[test]
 fn signals_that_come_together_are_one() {
-    let stage = Stage::new();
-    let _others = sensor(&stage);
+    let env = TestEnv::new();
+    let _others = sensor(&env);
     // So little room that it waits for who reads, also at its end.
-    let pipe = stage.path("pipe");
+    let pipe = env.path("pipe");
     assert!(Command::new("mkfifo").arg(&pipe).status().unwrap().success());
     let open = fs::File::options().read(true).write(true).open(&pipe).unwrap();
     rustix::pipe::fcntl_setpipe_size(&open, 4096).unwrap();
     let shell = format!("exec \"$@\" 2>&1 > {}", pipe.display());
-    let mut recorder = start_in(&stage, &["sh", "-c", &shell, "sh"], &["record", "--json", "-o", "-"]);
+    let mut recorder = start_in(&env, &["sh", "-c", &shell, "sh"], &["record", "--json", "-o", "-"]);
     recorder.await_line("its begin", is_class("recording"));
     let mut reader = fs::File::open(&pipe).unwrap();
     drop(open);
-    until("it receives", || stage.subscribers("front/status") > 0);
+    until("it receives", || env.subscribers("front/status") > 0);
     recorder.await_lines(2, "its progress", is_class("recording"));
     recorder.signal(INT);
     recorder.await_line("the last summary", |line| line["class"] == "summary" && line["topic"] == "status");
@@ -235,22 +235,22 @@ fn signals_that_come_together_are_one() {
 
 #[test]
 fn what_cannot_be_begun_leaves_nothing_behind() {
-    let stage = Stage::new();
+    let env = TestEnv::new();
     let limited = ["sh", "-c", "ulimit -f 0; exec \"$@\"", "sh"];
-    let outcome = start_in(&stage, &limited, &["record", "--json", "-o", &stage.word("walk.mcap")]).wait();
+    let outcome = start_in(&env, &limited, &["record", "--json", "-o", &env.word("walk.mcap")]).wait();
     assert_eq!(outcome.code, Some(75), "{outcome}");
     assert_eq!(outcome.of_class("error")[0]["kind"], "short", "{outcome}");
-    assert!(!stage.path("walk.mcap").exists());
+    assert!(!env.path("walk.mcap").exists());
     // What is no file of its own stays.
-    std::os::unix::fs::symlink("/dev/null", stage.path("nothing")).unwrap();
-    let outcome = stage.run(&["record", "--json", "--force", "--for=5s", "-o", &stage.word("nothing")]);
+    std::os::unix::fs::symlink("/dev/null", env.path("nothing")).unwrap();
+    let outcome = env.run(&["record", "--json", "--force", "--for=5s", "-o", &env.word("nothing")]);
     assert_eq!(outcome.of_class("error")[0]["kind"], "no_hub", "{outcome}");
-    assert!(fs::symlink_metadata(stage.path("nothing")).is_ok());
+    assert!(fs::symlink_metadata(env.path("nothing")).is_ok());
 }
 
 #[test]
 fn a_recording_whose_reader_went_away_has_failed() {
-    let stage = Stage::new();
+    let env = TestEnv::new();
     let (reader, writer) = io::pipe().unwrap();
     drop(reader);
     let refused = |outcome: std::process::Output| {
@@ -258,12 +258,12 @@ fn a_recording_whose_reader_went_away_has_failed() {
         assert_eq!(outcome.status.code(), Some(1), "{said}");
         assert!(said.contains("whoever read the recording is gone"), "{said}");
     };
-    let begin = stage.command(&["record", "-o", "-"]).stdout(writer).stderr(Stdio::piped()).output();
+    let begin = env.command(&["record", "-o", "-"]).stdout(writer).stderr(Stdio::piped()).output();
     refused(begin.unwrap());
     // A connection that breaks in the middle of it looks the same.
-    let _others = sensor(&stage);
+    let _others = sensor(&env);
     let (mut reader, writer) = io::pipe().unwrap();
-    let mut command = stage.command(&["record", "-o", "-", "--for=60s"]);
+    let mut command = env.command(&["record", "-o", "-", "--for=60s"]);
     let recorder = command.stdout(writer).stderr(Stdio::piped()).spawn().unwrap();
     drop(command);
     reader.read_exact(&mut [0; 20_000]).unwrap();
@@ -273,10 +273,10 @@ fn a_recording_whose_reader_went_away_has_failed() {
 
 #[test]
 fn samples_of_a_file_that_was_removed_are_not_counted() {
-    let stage = Stage::new();
-    let _others = sensor(&stage);
-    let file = stage.word("walk.mcap");
-    let mut recorder = stage.start(&["record", "--json", "-o", &file]);
+    let env = TestEnv::new();
+    let _others = sensor(&env);
+    let file = env.word("walk.mcap");
+    let mut recorder = env.start(&["record", "--json", "-o", &file]);
     await_samples(&mut recorder, 20);
     fs::remove_file(&file).unwrap();
     let gone = recorder.await_line("the loss", is_kind("file_gone"));
@@ -285,12 +285,12 @@ fn samples_of_a_file_that_was_removed_are_not_counted() {
     let outcome = recorder.end(INT);
     let end = outcome.of_class("recorded").pop().unwrap_or_else(|| panic!("{outcome}"));
     assert_eq!((number(&end, "gone"), number(&gone, "samples") >= 20), (number(&gone, "samples"), true));
-    let next = Recording::whole(&stage.path("walk-0002.mcap"));
+    let next = Recording::whole(&env.path("walk-0002.mcap"));
     let repeated = 1;
     assert_eq!(number(&end, "samples") + repeated, next.kept.len() as u64, "{outcome}");
-    assert_eq!(number(&end, "bytes"), fs::metadata(stage.path("walk-0002.mcap")).unwrap().len());
+    assert_eq!(number(&end, "bytes"), fs::metadata(env.path("walk-0002.mcap")).unwrap().len());
     // One that is removed at the very end, too.
-    let mut recorder = stage.start(&["record", "--json", "--force", "-o", &file]);
+    let mut recorder = env.start(&["record", "--json", "--force", "-o", &file]);
     await_samples(&mut recorder, 20);
     fs::remove_file(&file).unwrap();
     let outcome = recorder.end(INT);
@@ -300,12 +300,12 @@ fn samples_of_a_file_that_was_removed_are_not_counted() {
 
 #[test]
 fn two_recorders_do_not_write_one_file() {
-    let stage = Stage::new();
-    let _others = sensor(&stage);
-    let file = stage.word("walk.mcap");
-    let mut recorder = stage.start(&["record", "--json", "-o", &file]);
+    let env = TestEnv::new();
+    let _others = sensor(&env);
+    let file = env.word("walk.mcap");
+    let mut recorder = env.start(&["record", "--json", "-o", &file]);
     await_samples(&mut recorder, 20);
-    let second = stage.run(&["record", "--json", "--force", "-o", &file]);
+    let second = env.run(&["record", "--json", "--force", "-o", &file]);
     let error = &second.of_class("error")[0];
     assert_eq!((second.code, &error["kind"]), (Some(73), &"output".into()), "{second}");
     assert!(error["message"].as_str().unwrap().contains("another recorder writes it"), "{error}");
@@ -315,8 +315,8 @@ fn two_recorders_do_not_write_one_file() {
 }
 
 /// The program, started by other words before its own.
-fn start_in(stage: &Stage, before: &[&str], arguments: &[&str]) -> Program {
-    let program = stage.command(arguments);
+fn start_in(env: &TestEnv, before: &[&str], arguments: &[&str]) -> Program {
+    let program = env.command(arguments);
     let mut command = Command::new(before[0]);
     command.args(&before[1..]).arg(program.get_program()).args(program.get_args());
     for (key, value) in program.get_envs() {

@@ -4,19 +4,19 @@
 use std::path::PathBuf;
 
 use crate::testkit;
-use crate::testkit::{INT, KILL, Outcome, Program, Stage, bytes_of, number, sequence};
+use crate::testkit::{INT, KILL, Outcome, Program, TestEnv, bytes_of, number, sequence, skip};
 use lms::variant::{Mode, Unit};
 use serde_json::Value;
 
 /// Publishes `file` with `option` behind its name to a consumer of `topics` that was there before, so that it gets the
 /// very first sample; returns what it received up to the end of the recording.
-fn play(stage: &Stage, file: &str, option: &str, topics: &[&str]) -> (Outcome, Value) {
-    let before = stage.hub(&["--link=a=/no/such/port"]);
-    let mut consumer = stage.echo(topics);
+fn play(env: &TestEnv, file: &str, option: &str, topics: &[&str]) -> (Outcome, Value) {
+    let before = env.hub(&["--link=a=/no/such/port"]);
+    let mut consumer = env.echo(topics);
     assert_eq!(before.end(KILL).code, None);
     consumer.await_line("hub_gone", |line| line["kind"] == "hub_gone");
-    let hub = stage.hub(&["--link", &format!("a=file:{file}{option}")]);
-    let info = at_the_end(stage);
+    let hub = env.hub(&["--link", &format!("a=file:{file}{option}")]);
+    let info = at_the_end(env);
     consumer.await_line("the end", |line| line["state"] == "silent");
     let outcome = consumer.end(INT);
     assert_eq!(hub.end(INT).code, Some(0));
@@ -24,8 +24,8 @@ fn play(stage: &Stage, file: &str, option: &str, topics: &[&str]) -> (Outcome, V
 }
 
 /// What `info` says when the recording is at its end. Every byte of it is accounted for.
-fn at_the_end(stage: &Stage) -> Value {
-    let info = stage.await_info("a", |info| info["state"] == "silent");
+fn at_the_end(env: &TestEnv) -> Value {
+    let info = env.await_info("a", |info| info["state"] == "silent");
     assert_eq!(info["last_error"], "the recording is at its end");
     let counter = |name: &str| number(&info["counters"], name);
     let parts = ["bytes_in_telegrams", "bytes_acknowledge", "bytes_discarded", "bytes_buffered"].map(counter);
@@ -66,69 +66,68 @@ fn check(outcome: &Outcome, whole: &[Vec<u8>]) {
 
 #[test]
 fn a_recording_without_its_mode_has_marks_where_the_mode_is_set() {
-    let stage = Stage::new();
+    let env = TestEnv::new();
     let bytes = (0..4).flat_map(testkit::scan).collect::<Vec<u8>>();
-    let link = format!("--link=a=file:{}", stage.file("recording", &bytes));
-    let hub = stage.hub(&[&link]);
-    at_the_end(&stage);
-    let info = stage.run(&["info", "a"]).to_string();
+    let link = format!("--link=a=file:{}", env.file("recording", &bytes));
+    let hub = env.hub(&[&link]);
+    at_the_end(&env);
+    let info = env.run(&["info", "a"]).to_string();
     assert!(info.contains("does not tell its measuring mode; set link.a.mode"), "{info}");
-    assert_eq!(stage.info("a")["marks"]["available"], Value::Null);
+    assert_eq!(env.info("a")["marks"]["available"], Value::Null);
     assert_eq!(hub.end(INT).code, Some(0));
-    let hub = stage.hub(&[&link, "--set=link.a.mode=0x01"]);
-    at_the_end(&stage);
-    let info = stage.info("a");
+    let hub = env.hub(&[&link, "--set=link.a.mode=0x01"]);
+    at_the_end(&env);
+    let info = env.info("a");
     assert_eq!((&info["marks"]["available"], &info["mode"]), (&Value::Bool(true), &Value::from(1)), "{info}");
     assert_eq!(hub.end(INT).code, Some(0));
 }
 
 #[test]
 fn values_that_could_be_split_in_several_ways_are_no_scans_until_the_mode_is_told() {
-    let stage = Stage::new();
+    let env = TestEnv::new();
     // 8.6 m in 14 bits; in 13 bits it would be 0.4 m.
     let scan = lms::measured::encode(0, Unit::Mm, &[8600; 181], 0x10);
-    let file = stage.file("recording", scan.bytes().repeat(100));
+    let file = env.file("recording", scan.bytes().repeat(100));
     let trouble = "the recording does not tell its measuring mode: no scans; set link.a.mode";
-    let (outcome, _) = play(&stage, &file, "", &["a/telegram", "a/scan", "a/status"]);
+    let (outcome, _) = play(&env, &file, "", &["a/telegram", "a/scan", "a/status"]);
     assert_eq!((outcome.of_class("telegram").len(), outcome.of_class("scan").len()), (100, 0), "{outcome}");
     assert!(outcome.of_class("status").iter().any(|line| line["last_error"] == trouble), "{outcome}");
-    let log = stage.path("a.log").display().to_string();
-    let refused = stage.run(&["convert", &file, &log]);
+    let log = env.path("a.log").display().to_string();
+    let refused = env.run(&["convert", &file, &log]);
     assert!(
         refused.code == Some(66) && refused.errors.contains("does not tell its measuring mode"),
         "{refused}"
     );
-    let hub = stage.hub(&[&format!("--link=a=file:{file}"), "--set=link.a.mode=0x04"]);
-    let outcome = stage.run(&["echo", "--json", "a/scan", "-n", "1", "--timeout=30s"]);
+    let hub = env.hub(&[&format!("--link=a=file:{file}"), "--set=link.a.mode=0x04"]);
+    let outcome = env.run(&["echo", "--json", "a/scan", "-n", "1", "--timeout=30s"]);
     let ranges: Vec<_> = outcome.of_class("scan").iter().map(|scan| scan["ranges"][7].clone()).collect();
     assert_eq!(ranges, [8600], "{outcome}");
     assert_eq!(hub.end(INT).code, Some(0));
     // Where no value has a higher bit there is one way.
-    let plain = stage.file("plain", testkit::scan(1).repeat(2));
-    let (hub, words) = (stage.hub(&[&format!("--link=a=file:{plain}")]), "no value has more than 13 bits");
-    assert_eq!(at_the_end(&stage)["counters"]["telegrams"], 2);
+    let plain = env.file("plain", testkit::scan(1).repeat(2));
+    let (hub, words) = (env.hub(&[&format!("--link=a=file:{plain}")]), "no value has more than 13 bits");
+    assert_eq!(at_the_end(&env)["counters"]["telegrams"], 2);
     let outcome = hub.end(INT);
     assert!(outcome.errors.contains(words), "{outcome}");
 }
 
 #[test]
 fn who_is_started_with_the_hub_gets_a_recording_from_its_beginning() {
-    let stage = Stage::new();
+    let env = TestEnv::new();
     let (bytes, whole) = stream(14);
-    let file = stage.file("recording", &bytes);
-    let hub = stage.hub(&[&format!("--link=a=file:{file}?rate=max")]);
+    let file = env.file("recording", &bytes);
+    let hub = env.hub(&[&format!("--link=a=file:{file}?rate=max")]);
     // It attaches to one topic after the other, well within the second that the hub waits.
-    let outcome =
-        stage.run(&["echo", "--json", "a/telegram", "-n", &whole.len().to_string(), "--timeout=30s"]);
+    let outcome = env.run(&["echo", "--json", "a/telegram", "-n", &whole.len().to_string(), "--timeout=30s"]);
     check(&outcome, &whole);
     assert_eq!(hub.end(INT).code, Some(0));
 }
 
 #[test]
 fn a_file_without_a_telegram_does_not_stream() {
-    let stage = Stage::new();
-    let hub = stage.hub(&[&format!("--link=a=file:{}", stage.file("noise", vec![0x42; 4000]))]);
-    let info = at_the_end(&stage);
+    let env = TestEnv::new();
+    let hub = env.hub(&[&format!("--link=a=file:{}", env.file("noise", vec![0x42; 4000]))]);
+    let info = at_the_end(&env);
     assert_eq!(info["counters"]["bytes_discarded"], 4000);
     let outcome = hub.end(INT);
     assert!(outcome.errors.contains("there is no telegram in the recording"), "{outcome}");
@@ -139,10 +138,10 @@ fn a_file_without_a_telegram_does_not_stream() {
 fn the_reflectors_of_a_recording_are_marks() {
     let Some(data) = data() else { return };
     let recording = data.join("captures/reflector_levels_cm_18s.bin");
-    let stage = Stage::new();
+    let env = TestEnv::new();
     let link = format!("--link=a=file:{}", recording.display());
-    let hub = stage.hub(&[&link, "--set=link.a.mode=0x01"]);
-    let outcome = stage.run(&["echo", "--json", "a/marks", "-n", "20"]);
+    let hub = env.hub(&[&link, "--set=link.a.mode=0x01"]);
+    let outcome = env.run(&["echo", "--json", "a/marks", "-n", "20"]);
     let found = |line: &Value| line["marks"].as_array().map_or(0, Vec::len);
     assert!(outcome.of_class("marks").iter().any(|line| found(line) == 5), "{outcome}");
     assert_eq!(hub.end(INT).code, Some(0));
@@ -150,11 +149,11 @@ fn the_reflectors_of_a_recording_are_marks() {
 
 #[test]
 fn as_fast_as_it_can_be_read() {
-    let stage = Stage::new();
+    let env = TestEnv::new();
     // No more than a consumer's buffer holds: nobody waits for it.
     let (bytes, whole) = stream(14);
-    let file = stage.file("recording", &bytes);
-    let (outcome, info) = play(&stage, &file, "?rate=max", &["a/telegram", "a/status"]);
+    let file = env.file("recording", &bytes);
+    let (outcome, info) = play(&env, &file, "?rate=max", &["a/telegram", "a/status"]);
     check(&outcome, &whole);
     let [read, telegrams] = ["bytes_read", "telegrams"].map(|name| number(&info["counters"], name));
     assert_eq!((read, telegrams), (bytes.len() as u64, whole.len() as u64));
@@ -163,10 +162,10 @@ fn as_fast_as_it_can_be_read() {
 
 #[test]
 fn in_the_pace_of_the_sensor() {
-    let stage = Stage::new();
+    let env = TestEnv::new();
     let (bytes, whole) = stream(60);
-    let file = stage.file("recording", &bytes);
-    let (outcome, _) = play(&stage, &file, "", &["a/telegram", "a/scan", "a/status"]);
+    let file = env.file("recording", &bytes);
+    let (outcome, _) = play(&env, &file, "", &["a/telegram", "a/scan", "a/status"]);
     check(&outcome, &whole);
     let scans = outcome.of_class("scan");
     assert_eq!((scans.len(), sequence(&scans, "topic_seq")[0]), (whole.len() - 2, 0));
@@ -186,15 +185,15 @@ fn in_the_pace_of_the_sensor() {
 
 #[test]
 fn a_carmen_log() {
-    let stage = Stage::new();
+    let env = TestEnv::new();
     let metres = |scan: usize, beam: usize| 1.0 + 0.25 * scan as f64 + 0.01 * beam as f64;
     let line = |scan: usize| {
         let ranges: Vec<_> = (0..181).map(|beam| format!("{:.2}", metres(scan, beam))).collect();
         format!("FLASER 181 {} 0 0 0 0 0 0 {scan}.5 host {scan}.5\n", ranges.join(" "))
     };
     let log = (0..10).fold("# a log\nPARAM robot_length 0.5\n".to_owned(), |log, scan| log + &line(scan));
-    let file = stage.file("log", log);
-    let (outcome, _) = play(&stage, &file, "?rate=max", &["a/scan", "a/status"]);
+    let file = env.file("log", log);
+    let (outcome, _) = play(&env, &file, "?rate=max", &["a/scan", "a/status"]);
     let scans = outcome.of_class("scan");
     assert_eq!(scans.len(), 10, "{outcome}");
     for (number, scan) in scans.iter().enumerate() {
@@ -214,17 +213,17 @@ fn data() -> Option<PathBuf> {
     if place.is_dir() {
         return Some(place);
     }
-    println!("skipped: no recordings of real sensors at {}", place.display());
+    skip("recordings", format!("none of real sensors at {}", place.display()));
     None
 }
 
 /// The counters of a hub that has read the file `name` of `data` to its end.
 fn counters_of(data: &std::path::Path, name: &str) -> Value {
-    let stage = Stage::new();
+    let env = TestEnv::new();
     let path = data.join(name);
     let link = format!("--link=a=file:{}?rate=max", path.display());
-    let _hub: Program = stage.hub(&[link]);
-    at_the_end(&stage)["counters"].clone()
+    let _hub: Program = env.hub(&[link]);
+    at_the_end(&env)["counters"].clone()
 }
 
 #[test]

@@ -4,16 +4,16 @@
 use std::process::Command;
 
 use crate::testkit;
-use crate::testkit::{Outcome, Stage, TERM};
+use crate::testkit::{Outcome, TERM, TestEnv};
 use serde_json::Value;
 
 /// Runs the program, which must refuse with `code` and `kind` and say all of `words`, in text and in JSON.
-fn refused(stage: &Stage, arguments: &[&str], code: i32, kind: &str, words: &[&str]) {
-    let outcome = stage.run(arguments);
+fn refused(env: &TestEnv, arguments: &[&str], code: i32, kind: &str, words: &[&str]) {
+    let outcome = env.run(arguments);
     assert_eq!((outcome.code, outcome.out.is_empty()), (Some(code), true), "{outcome}");
     says_all(&outcome.errors, words, &outcome);
 
-    let outcome = stage.run(&[arguments, &["--json"]].concat());
+    let outcome = env.run(&[arguments, &["--json"]].concat());
     assert_eq!(outcome.code, Some(code), "{outcome}");
     let text = match arguments.first() {
         // The log goes to stderr too, before it.
@@ -44,7 +44,7 @@ fn says_all(text: &str, words: &[&str], outcome: &Outcome) {
 
 #[test]
 fn what_is_no_command_line() {
-    let stage = Stage::new();
+    let env = TestEnv::new();
     for (arguments, word) in [
         (&["fly"][..], "fly"),
         (&["lst"], "list"),
@@ -58,33 +58,33 @@ fn what_is_no_command_line() {
         (&["simulate", "--port=a", "--world=room", "--replay=x"], "--replay"),
         (&["run", "--link"], "--link"),
     ] {
-        refused(&stage, arguments, 2, "usage", &[word]);
+        refused(&env, arguments, 2, "usage", &[word]);
     }
-    let help = stage.run(&["--help"]);
+    let help = env.run(&["--help"]);
     assert_eq!((help.code, help.errors.as_str()), (Some(0), ""));
 }
 
 #[test]
 fn formats_that_do_not_go_with_their_topics() {
-    let stage = Stage::new();
+    let env = TestEnv::new();
     for (arguments, word) in [
         (["echo", "front/telegram", "--csv"], "--csv takes one topic"),
         (["echo", "front/status", "--csv"], "--csv takes one topic"),
     ] {
-        let outcome = stage.run(&arguments);
+        let outcome = env.run(&arguments);
         assert_eq!(outcome.code, Some(2), "{outcome}");
         says_all(&outcome.errors, &[word], &outcome);
     }
-    let outcome = stage.run(&["echo", "front/telegram", "rear/telegram", "--raw"]);
+    let outcome = env.run(&["echo", "front/telegram", "rear/telegram", "--raw"]);
     assert_eq!(outcome.code, Some(2), "{outcome}");
 }
 
 #[test]
 fn configuration_that_cannot_be() {
-    let stage = Stage::new();
-    let file = stage.file("hub.toml", "[[link]]\nname = \"front\"\nport = \"/dev/x\"\nbaud = 115200\n");
-    let unknown = stage.file("key.toml", "[[link]]\nname = \"front\"\nprot = \"/dev/x\"\n");
-    let broken = stage.file("toml.toml", "[[link]\n");
+    let env = TestEnv::new();
+    let file = env.file("hub.toml", "[[link]]\nname = \"front\"\nport = \"/dev/x\"\nbaud = 115200\n");
+    let unknown = env.file("key.toml", "[[link]]\nname = \"front\"\nprot = \"/dev/x\"\n");
+    let broken = env.file("toml.toml", "[[link]\n");
     let (place, key) = (format!("{file}:4:8"), format!("{unknown}:3:1"));
     for (arguments, words) in [
         (&["run", "--set", "link.front.prot=/dev/x"][..], &["link.front.prot", "`prot`", "`port`"][..]),
@@ -113,13 +113,13 @@ fn configuration_that_cannot_be() {
         (&["simulate", "--port=a", "--fault=silence=-1"], &["silence=-1", "from 0 to"]),
         (&["simulate", "--port=a", "--type=lms211", "--variant=180/0.5"], &["180/0.5", "100 degrees"]),
     ] {
-        refused(&stage, arguments, 78, "configuration", words);
+        refused(&env, arguments, 78, "configuration", words);
     }
 }
 
 #[test]
 fn no_topic_is_called_so_whoever_is_asked() {
-    let stage = Stage::new();
+    let env = TestEnv::new();
     for (arguments, words) in [
         (&["echo", "front/scam"][..], &["front/scam", "front/scan"][..]),
         (&["hz", "front/scam"], &["front/scam", "front/scan"]),
@@ -146,24 +146,24 @@ fn no_topic_is_called_so_whoever_is_asked() {
         (&["zones", "Front", "mask"], &["Front"]),
         (&["leds", "Front"], &["Front"]),
     ] {
-        let outcome = stage.run(arguments);
+        let outcome = env.run(arguments);
         assert_eq!((outcome.code, outcome.out.is_empty()), (Some(2), true), "{outcome}");
         says_all(&outcome.errors, words, &outcome);
-        let outcome = stage.run(&[arguments, &["--json"]].concat());
+        let outcome = env.run(&[arguments, &["--json"]].concat());
         // What is no flag of that command line is refused there.
         let kind = outcome.of_class("error").pop().map(|line| line["kind"].clone());
         assert_eq!((outcome.code, kind), (Some(2), Some("usage".into())), "{outcome}");
     }
-    let config = stage.file("topics.toml", "[gateway]\ntopics = [\"front/scam\"]\n");
+    let config = env.file("topics.toml", "[gateway]\ntopics = [\"front/scam\"]\n");
     let arguments = ["gateway", "--no-system-config", "--config", &config];
-    refused(&stage, &arguments, 78, "configuration", &["gateway", "front/scam"]);
+    refused(&env, &arguments, 78, "configuration", &["gateway", "front/scam"]);
 }
 
 #[test]
 fn what_is_to_be_read_and_is_not_there() {
-    let stage = Stage::new();
-    let missing = stage.word("missing");
-    let output = stage.word("out.mcap");
+    let env = TestEnv::new();
+    let missing = env.word("missing");
+    let output = env.word("out.mcap");
     for arguments in [
         &["run", "--no-system-config", "--config", &missing][..],
         &["run", "--no-system-config", &format!("--link=front=file:{missing}")],
@@ -189,12 +189,12 @@ fn what_is_to_be_read_and_is_not_there() {
     ] {
         let is_there = arguments.iter().any(|word| word.ends_with("/etc/passwd"));
         let named = if is_there { "/etc/passwd" } else { &missing };
-        refused(&stage, arguments, 66, "input", &[named]);
+        refused(&env, arguments, 66, "input", &[named]);
     }
     // A value in a file that is there.
-    let wrong = stage.file("wrong.toml", "[background]\nmethod = \"magic\"\n");
+    let wrong = env.file("wrong.toml", "[background]\nmethod = \"magic\"\n");
     refused(
-        &stage,
+        &env,
         &["run", "--no-system-config", "--link=a=/x", "--config", &wrong],
         78,
         "configuration",
@@ -204,11 +204,11 @@ fn what_is_to_be_read_and_is_not_there() {
 
 #[test]
 fn what_is_to_be_written_and_is_there_or_cannot_be() {
-    let stage = Stage::new();
-    let there = stage.file("there.mcap", "whole");
-    let nowhere = stage.word("no/such/directory/out.mcap");
+    let env = TestEnv::new();
+    let there = env.file("there.mcap", "whole");
+    let nowhere = env.word("no/such/directory/out.mcap");
     let input = concat!(env!("CARGO_MANIFEST_DIR"), "/tests/vectors/recording/v1.mcap");
-    let whole = stage.word("whole.mcap");
+    let whole = env.word("whole.mcap");
     std::fs::copy(input, &whole).expect("a copy");
     for (arguments, words) in [
         (&["convert", input, &there][..], &["there.mcap", "--force"][..]),
@@ -221,30 +221,30 @@ fn what_is_to_be_written_and_is_there_or_cannot_be() {
         (&["simulate", "--port=a", "--truth", &nowhere], &["no/such"]),
         (&["background", "front", "save", &there], &["there.mcap", "--force"]),
     ] {
-        refused(&stage, arguments, 73, "output", words);
+        refused(&env, arguments, 73, "output", words);
     }
-    assert_eq!(std::fs::read(stage.path("there.mcap")).unwrap(), b"whole");
+    assert_eq!(std::fs::read(env.path("there.mcap")).unwrap(), b"whole");
 }
 
 #[test]
 fn no_such_sensor_or_hub() {
-    let stage = Stage::new();
+    let env = TestEnv::new();
     let golden = concat!(env!("CARGO_MANIFEST_DIR"), "/tests/vectors/recording/v1.mcap");
     let verbs = [
         &["echo", "side/scan", "--for=9s"][..],
         &["echo", "side/*", "--for=9s"],
         &["hz", "side/scan", "--for=9s"],
         &["latency", "side/scan", "--for=9s", "--no-realtime"],
-        &["record", "side/scan", "--for=9s", "-o", &stage.word("side.mcap")],
+        &["record", "side/scan", "--for=9s", "-o", &env.word("side.mcap")],
         &["leds", "side", "--for=9s"],
         &["zones", "side", "mask", "--for=9s"],
         &["info", "side"],
         &["control", "side", "pause"],
         &["background", "side", "show"],
-        &["background", "side", "save", &stage.word("side.json")],
+        &["background", "side", "save", &env.word("side.json")],
     ];
     let asks = |verb: &[&str], kind: &str| {
-        let outcome = stage.run(&[verb, &["--json"]].concat());
+        let outcome = env.run(&[verb, &["--json"]].concat());
         let errors = outcome.of_class("error");
         let told = errors.last().map(|line| line["kind"].clone());
         assert_eq!((outcome.code, told), (Some(3), Some(kind.into())), "{verb:?}: {outcome}");
@@ -253,14 +253,13 @@ fn no_such_sensor_or_hub() {
         asks(verb, "no_hub");
     }
     asks(&["list"], "no_hub");
-    for verb in [
-        &["replay", golden, "--sensor=side"][..],
-        &["convert", golden, &stage.word("x.bin"), "--sensor=side"],
-    ] {
-        let outcome = stage.run(verb);
+    for verb in
+        [&["replay", golden, "--sensor=side"][..], &["convert", golden, &env.word("x.bin"), "--sensor=side"]]
+    {
+        let outcome = env.run(verb);
         assert_eq!(outcome.code, Some(3), "{outcome}");
     }
-    let hub = stage.hub(&["--link=front=/no/such/port"]);
+    let hub = env.hub(&["--link=front=/no/such/port"]);
     for verb in verbs {
         asks(verb, "no_topic");
     }
@@ -269,7 +268,7 @@ fn no_such_sensor_or_hub() {
 
 #[test]
 fn a_disk_that_is_full_is_told() {
-    let stage = Stage::new();
+    let env = TestEnv::new();
     for verb in [
         &["config", "default"][..],
         &["config", "show", "--no-system-config", "--link=front=/dev/x"],
@@ -278,7 +277,7 @@ fn a_disk_that_is_full_is_told() {
         &["doctor", "--no-system-config", "/dev/null"],
     ] {
         let full = std::fs::File::options().write(true).open("/dev/full").expect("there is one");
-        let done = stage.command(verb).stdout(full).output().expect("it starts");
+        let done = env.command(verb).stdout(full).output().expect("it starts");
         let said = String::from_utf8_lossy(&done.stderr);
         assert!(
             done.status.code() == Some(1) && said.contains("cannot write: No space"),
@@ -308,7 +307,7 @@ fn domains_that_cannot_be() {
 
 #[test]
 fn without_a_hub_that_is_what_is_said() {
-    let stage = Stage::new();
+    let env = TestEnv::new();
     for arguments in [
         &["list"][..],
         &["info"],
@@ -317,22 +316,22 @@ fn without_a_hub_that_is_what_is_said() {
         &["echo", "front/scan", "--for", "9s"],
         &["hz", "-n", "1"],
     ] {
-        let outcome = stage.run(arguments);
+        let outcome = env.run(arguments);
         assert_eq!(outcome.code, Some(3), "{outcome}");
         says_all(&outcome.errors, &["no hub", "scanhub run"], &outcome);
     }
     for arguments in [&["list", "--json"][..], &["info", "--json"], &["echo", "a/scan", "-n1", "--json"]] {
-        let outcome = stage.run(arguments);
+        let outcome = env.run(arguments);
         assert_eq!((outcome.code, &outcome.of_class("error")[0]["kind"]), (Some(3), &"no_hub".into()));
     }
 }
 
 #[test]
 fn what_the_hub_does_not_have_and_what_does_not_come() {
-    let stage = Stage::new();
+    let env = TestEnv::new();
     // A port that is not there is a state of the hub's, no failure.
-    let hub = stage.hub(&[stage.link("front")]);
-    let info = stage.await_info("front", |info| info["state"] == "absent");
+    let hub = env.hub(&[env.link("front")]);
+    let info = env.await_info("front", |info| info["state"] == "absent");
     assert!(info["last_error"].as_str().is_some_and(|error| error.contains("no such port")), "{info}");
     for (arguments, kind, words) in [
         (&["echo", "side/scan", "-n", "1"][..], "no_topic", &["side", "front"][..]),
@@ -340,15 +339,15 @@ fn what_the_hub_does_not_have_and_what_does_not_come() {
         (&["hz", "side/scan"], "no_topic", &["side", "front"]),
         (&["info", "side"], "no_topic", &["side", "front"]),
     ] {
-        let outcome = stage.run(arguments);
+        let outcome = env.run(arguments);
         assert_eq!(outcome.code, Some(3), "{outcome}");
         says_all(&outcome.errors, words, &outcome);
-        let outcome = stage.run(&[arguments, &["--json"]].concat());
+        let outcome = env.run(&[arguments, &["--json"]].concat());
         assert_eq!(outcome.of_class("error")[0]["kind"], kind, "{outcome}");
     }
     for bound in [&["--timeout", "300ms"][..], &["-n", "1", "--for", "300ms"], &["-n", "1", "--timeout=0.3s"]]
     {
-        let outcome = stage.run(&[&["echo", "front/scan", "--json"], bound].concat());
+        let outcome = env.run(&[&["echo", "front/scan", "--json"], bound].concat());
         assert_eq!(
             (outcome.code, &outcome.of_class("error")[0]["kind"]),
             (Some(3), &"timeout".into()),
@@ -361,29 +360,29 @@ fn what_the_hub_does_not_have_and_what_does_not_come() {
 
 #[test]
 fn ports_that_cannot_be_used() {
-    let stage = Stage::new();
-    let file = stage.file("file", "not a tty");
-    refused(&stage, &["run", "--link=front=/dev/null"], 4, "port_not_tty", &["/dev/null", "name a tty"]);
-    refused(&stage, &["run", &format!("--link=front={file}")], 4, "port_not_tty", &[&file, "or file:PATH"]);
-    refused(&stage, &["simulate", "--port=/no/where/front"], 4, "port_missing", &["/no/where/front"]);
+    let env = TestEnv::new();
+    let file = env.file("file", "not a tty");
+    refused(&env, &["run", "--link=front=/dev/null"], 4, "port_not_tty", &["/dev/null", "name a tty"]);
+    refused(&env, &["run", &format!("--link=front={file}")], 4, "port_not_tty", &[&file, "or file:PATH"]);
+    refused(&env, &["simulate", "--port=/no/where/front"], 4, "port_missing", &["/no/where/front"]);
 
-    let _simulator = stage.simulator(&["front"], &["--baud=500000"]);
-    let hub = stage.hub(&[stage.link("front")]);
-    stage.await_info("front", |info| info["state"] == "streaming");
-    let other = Stage::new();
+    let _simulator = env.simulator(&["front"], &["--baud=500000"]);
+    let hub = env.hub(&[env.link("front")]);
+    env.await_info("front", |info| info["state"] == "streaming");
+    let other = TestEnv::new();
     let pid = format!("process {}", hub.pid());
-    refused(&other, &["run", &stage.link("front")], 4, "port_busy", &[&stage.word("front"), &pid, "stop it"]);
-    assert_eq!(stage.info("front")["state"], "streaming", "was disturbed");
+    refused(&other, &["run", &env.link("front")], 4, "port_busy", &[&env.word("front"), &pid, "stop it"]);
+    assert_eq!(env.info("front")["state"], "streaming", "was disturbed");
 }
 
 #[test]
 fn a_second_hub_in_the_domain() {
-    let stage = Stage::new();
-    let hub = stage.hub(&[stage.link("front")]);
+    let env = TestEnv::new();
+    let hub = env.hub(&[env.link("front")]);
     let pid = format!("pid {}", hub.pid());
-    refused(&stage, &["run", &stage.link("front")], 1, "domain_held", &[&pid, "--domain"]);
+    refused(&env, &["run", &env.link("front")], 1, "domain_held", &[&pid, "--domain"]);
     assert_eq!(hub.end(TERM).code, Some(0));
     // It is free again.
-    let hub = stage.hub(&[stage.link("front")]);
+    let hub = env.hub(&[env.link("front")]);
     assert_eq!(hub.end(TERM).code, Some(0));
 }

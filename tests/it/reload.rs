@@ -4,17 +4,17 @@
 use std::process::Command;
 
 use crate::testkit::{
-    HUP, INT, MEASURED, Program, Stage, TERM, bytes_of, hash, is_class, number, sequence, terminal,
+    HUP, INT, MEASURED, Program, TERM, TestEnv, bytes_of, hash, is_class, number, sequence, skip, terminal,
 };
 use serde_json::Value;
 
 const STREAM: [&str; 2] = ["--seed=71", "--baud=500000"];
 
 /// The configuration of one link in a file, with `more` behind it.
-fn configure(stage: &Stage, more: &str) -> String {
-    let port = stage.word("front");
+fn configure(env: &TestEnv, more: &str) -> String {
+    let port = env.word("front");
     let text = format!("[[link]]\nname = \"front\"\nport = \"{port}\"\n{more}");
-    format!("--config={}", stage.file("scanhub.toml", text))
+    format!("--config={}", env.file("scanhub.toml", text))
 }
 
 /// The radii of a line of class `zones` in mm.
@@ -28,15 +28,15 @@ fn has_radii(wanted: &'static [u64]) -> impl Fn(&Value) -> bool {
 
 #[test]
 fn circles_change_in_a_stream_without_a_gap() {
-    let stage = Stage::new();
-    let simulator = stage.simulator(&["front"], &STREAM);
-    let mut supervisor = stage.supervisor();
-    let flags = [configure(&stage, ""), "--no-system-config".to_owned()];
-    let hub = stage.service(&mut supervisor, &flags, None).ready();
+    let env = TestEnv::new();
+    let simulator = env.simulator(&["front"], &STREAM);
+    let mut supervisor = env.supervisor();
+    let flags = [configure(&env, ""), "--no-system-config".to_owned()];
+    let hub = env.service(&mut supervisor, &flags, None).ready();
     supervisor.hear("READY=1");
-    stage.await_info("front", |info| info["state"] == "streaming");
-    let mut telegrams = stage.echo(&["front/telegram"]);
-    let mut zones = stage.echo(&["front/zones"]);
+    env.await_info("front", |info| info["state"] == "streaming");
+    let mut telegrams = env.echo(&["front/telegram"]);
+    let mut zones = env.echo(&["front/zones"]);
     zones.await_lines(10, "a verdict", has_radii(&[1000, 600]));
     for (more, wanted) in [
         ("pose = { x = 0.3 }\n[zones]\nradii = [2.0, 1.0, 0.5]\n", &[2000, 1000, 500][..]),
@@ -44,7 +44,7 @@ fn circles_change_in_a_stream_without_a_gap() {
         ("[background]\nmethod = \"off\"\n", &[1000, 600]),
         ("[zones]\nradii = [3.0]\n", &[3000]),
     ] {
-        configure(&stage, more);
+        configure(&env, more);
         hub.signal(HUP);
         supervisor.hear("RELOADING=1");
         supervisor.hear("READY=1");
@@ -53,7 +53,7 @@ fn circles_change_in_a_stream_without_a_gap() {
     let told = supervisor.heard.iter().filter(|line| line.starts_with("MONOTONIC_USEC="));
     assert_eq!(told.count(), 4);
     telegrams.await_lines(10, "a telegram", is_class("telegram"));
-    let info = stage.info("front");
+    let info = env.info("front");
     assert_eq!((number(&info["counters"], "resyncs"), number(&info["counters"], "reconnects")), (0, 0));
     assert_eq!(info["pose"]["x_m"], 0.0);
     let (telegrams, zones) = (telegrams.end(INT), zones.end(INT));
@@ -75,12 +75,12 @@ fn circles_change_in_a_stream_without_a_gap() {
     assert!(ended.errors.contains("front: pose, zones as configured now"), "{ended}");
     assert!(ended.errors.contains("front: zones, marks, background as configured now"), "{ended}");
     assert_eq!(simulator.end(TERM).code, Some(0));
-    assert_eq!(stage.simulated("front").1, 0, "EEPROM");
+    assert_eq!(env.simulated("front").1, 0, "EEPROM");
     // What was sent from the first to the last that was received, was received.
     let received = telegrams.of_class("telegram");
     let received: Vec<_> = received.iter().filter(|line| line["command"] == MEASURED).collect();
     let received: Vec<String> = received.iter().map(|line| hash(&bytes_of(line))).collect();
-    let truth: Vec<_> = stage.truth("front").into_iter().filter(|sent| sent.is_intact_scan()).collect();
+    let truth: Vec<_> = env.truth("front").into_iter().filter(|sent| sent.is_intact_scan()).collect();
     let first = truth.iter().position(|sent| sent.hash == received[0]).expect("it was sent");
     let sent: Vec<String> =
         truth[first..].iter().map(|sent| sent.hash.clone()).take(received.len()).collect();
@@ -89,30 +89,30 @@ fn circles_change_in_a_stream_without_a_gap() {
 
 #[test]
 fn what_cannot_be_changed_is_said_and_what_cannot_be_changes_nothing() {
-    let stage = Stage::new();
-    let mut supervisor = stage.supervisor();
-    let flags = [configure(&stage, ""), "--no-system-config".to_owned()];
+    let env = TestEnv::new();
+    let mut supervisor = env.supervisor();
+    let flags = [configure(&env, ""), "--no-system-config".to_owned()];
     // Nothing is at the port: the topics say all the same how it is.
-    let hub = stage.service(&mut supervisor, &flags, None).ready();
+    let hub = env.service(&mut supervisor, &flags, None).ready();
     supervisor.hear("READY=1");
-    let mut zones = stage.echo(&["front/zones"]);
+    let mut zones = env.echo(&["front/zones"]);
     let wrong = "baud = 38400\n[zones]\nradii = [0.6, 1.0]\n";
-    configure(&stage, wrong);
+    configure(&env, wrong);
     hub.signal(HUP);
     supervisor.hear("RELOADING=1");
     supervisor.hear("READY=1");
     let refused = supervisor.heard.iter().find(|line| line.contains("configuration refused")).cloned();
-    let place = format!("{}:6:9: radii = [0.6, 1.0]", stage.word("scanhub.toml"));
+    let place = format!("{}:6:9: radii = [0.6, 1.0]", env.word("scanhub.toml"));
     let status = format!("STATUS=sensors: front; configuration refused: {place}");
     assert_eq!(refused, Some(status));
     let more = "baud = 38400\npose = { x = 0.5 }\n[zones]\nradii = [2.0]\n\n[[link]]\nname = \"side\"\nport = \"/dev/null\"\n";
-    configure(&stage, more);
+    configure(&env, more);
     hub.signal(HUP);
     let first =
         zones.await_line("the new circles", |line| line["class"] == "zones" && radii(line) != [1000, 600]);
     assert_eq!((radii(&first), &first["verdict"]), (vec![2000], &"unknown".into()));
-    stage.await_info("front", |info| info["pose"]["x_m"] == 0.5);
-    assert!(!stage.run(&["list", "--json"]).to_string().contains("side"));
+    env.await_info("front", |info| info["pose"]["x_m"] == 0.5);
+    assert!(!env.run(&["list", "--json"]).to_string().contains("side"));
     let ended = hub.end(TERM);
     assert_eq!(ended.code, Some(0));
     for words in [
@@ -128,12 +128,12 @@ fn what_cannot_be_changed_is_said_and_what_cannot_be_changes_nothing() {
 #[test]
 fn a_hub_ends_with_its_terminal_unless_nohup_says_otherwise() {
     if Command::new("setsid").arg("--version").output().is_err() {
-        return eprintln!("skipped: no setsid");
+        return skip("setsid", "there is none");
     }
     for (nohup, survives) in [(&[][..], false), (&["nohup"], true)] {
-        let stage = Stage::new();
+        let env = TestEnv::new();
         let (keys, screen) = terminal();
-        let hub = stage.command(&["run", "--json", "--no-system-config", &configure(&stage, "")]);
+        let hub = env.command(&["run", "--json", "--no-system-config", &configure(&env, "")]);
         // Leader of a session that has this terminal.
         let mut command = Command::new("setsid");
         command.arg("--ctty").args(nohup).arg(hub.get_program()).args(hub.get_args());
@@ -143,9 +143,9 @@ fn a_hub_ends_with_its_terminal_unless_nohup_says_otherwise() {
         drop(keys);
         if survives {
             // It is asked to read its configuration instead, and does.
-            configure(&stage, "pose = { x = 0.5 }\n");
+            configure(&env, "pose = { x = 0.5 }\n");
             hub.signal(HUP);
-            stage.await_info("front", |info| info["pose"]["x_m"] == 0.5);
+            env.await_info("front", |info| info["pose"]["x_m"] == 0.5);
             let ended = hub.end(TERM);
             assert_eq!(ended.code, Some(0));
         } else {

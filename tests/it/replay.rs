@@ -3,7 +3,7 @@
 use std::collections::BTreeMap;
 
 use crate::testkit;
-use crate::testkit::{INT, Outcome, Program, Sitting, Stage, TERM, is_class, number};
+use crate::testkit::{INT, Outcome, Program, Sitting, TERM, TestEnv, is_class, number};
 use lms::variant::{Mode, Unit};
 use schema::datagram::Packed;
 use schema::file::Writer;
@@ -11,17 +11,17 @@ use schema::{Header, Marks, Topic};
 use serde_json::Value;
 
 /// A log with a scan every `period_ms`, from 1000 s on.
-fn log(stage: &Stage, scans: u64, period_ms: u64) -> String {
+fn log(env: &TestEnv, scans: u64, period_ms: u64) -> String {
     let line = |scan: u64| {
         let ranges = vec!["1.5"; 181].join(" ");
         let at = 1000.0 + (scan * period_ms) as f64 / 1000.0;
         format!("FLASER 181 {ranges} 0 0 0 0 0 0 {at} host {at}\n")
     };
-    stage.file("log", (0..scans).map(line).collect::<String>())
+    env.file("log", (0..scans).map(line).collect::<String>())
 }
 
-fn start(stage: &Stage, words: &[&str]) -> Program {
-    stage.start(&[&["replay", "--json", "--no-system-config"], words].concat()).ready()
+fn start(env: &TestEnv, words: &[&str]) -> Program {
+    env.start(&[&["replay", "--json", "--no-system-config"], words].concat()).ready()
 }
 
 /// The wall clocks of scans, in ms from the log's beginning.
@@ -34,17 +34,17 @@ fn replayed(outcome: &Outcome) -> Value {
     outcome.of_class("replayed").pop().unwrap_or_else(|| panic!("no word of what was played: {outcome}"))
 }
 
-fn resume(stage: &Stage) {
-    assert_eq!(stage.run(&["control", "front", "resume"]).code, Some(0));
+fn resume(env: &TestEnv) {
+    assert_eq!(env.run(&["control", "front", "resume"]).code, Some(0));
 }
 
 #[test]
 fn it_waits_for_a_word_plays_everything_with_its_times_and_ends() {
-    let stage = Stage::new();
-    let player = start(&stage, &[&log(&stage, 12, 80), "--paused"]);
-    let mut consumer = stage.echo(&["front/scan", "front/status"]);
-    stage.await_info("front", |info| info["state"] == "paused");
-    resume(&stage);
+    let env = TestEnv::new();
+    let player = start(&env, &[&log(&env, 12, 80), "--paused"]);
+    let mut consumer = env.echo(&["front/scan", "front/status"]);
+    env.await_info("front", |info| info["state"] == "paused");
+    resume(&env);
     consumer.await_line("the end", |line| line["state"] == "silent");
     let end = replayed(&player.wait());
     assert_eq!((number(&end, "telegrams"), number(&end, "laps")), (12, 0));
@@ -58,10 +58,10 @@ fn it_waits_for_a_word_plays_everything_with_its_times_and_ends() {
 
 #[test]
 fn from_here_to_there_faster() {
-    let stage = Stage::new();
-    let player = start(&stage, &[&log(&stage, 60, 100), "--paused", "--start=2s", "--end=4s", "--rate=4"]);
-    let mut consumer = stage.echo(&["front/scan", "front/status"]);
-    resume(&stage);
+    let env = TestEnv::new();
+    let player = start(&env, &[&log(&env, 60, 100), "--paused", "--start=2s", "--end=4s", "--rate=4"]);
+    let mut consumer = env.echo(&["front/scan", "front/status"]);
+    resume(&env);
     consumer.await_line("the end", |line| line["state"] == "silent");
     let outcome = consumer.end(INT);
     assert_eq!(walls(&outcome), (20..40).map(|scan| scan * 100).collect::<Vec<_>>());
@@ -74,9 +74,9 @@ fn from_here_to_there_faster() {
 
 #[test]
 fn a_lap_follows_another_until_somebody_ends_it() {
-    let stage = Stage::new();
-    let player = start(&stage, &[&log(&stage, 5, 20), "--loop"]);
-    let mut consumer = stage.echo(&["front/scan"]);
+    let env = TestEnv::new();
+    let player = start(&env, &[&log(&env, 5, 20), "--loop"]);
+    let mut consumer = env.echo(&["front/scan"]);
     let scans = consumer.await_lines(12, "a scan", is_class("scan"));
     let walls: Vec<_> = scans.iter().map(|scan| number(scan, "wall_ns") / 1_000_000 - 1_000_000).collect();
     assert!(walls.iter().filter(|wall| **wall == 0).count() >= 2, "{walls:?}");
@@ -85,13 +85,13 @@ fn a_lap_follows_another_until_somebody_ends_it() {
 
 #[test]
 fn at_the_end_it_stays_if_it_is_to_and_pauses_when_asked() {
-    let stage = Stage::new();
-    let player = start(&stage, &[&log(&stage, 100, 100), "--sensor=left", "--hold"]);
-    assert_eq!(stage.run(&["control", "left", "pause"]).code, Some(0));
-    stage.await_info("left", |info| info["state"] == "paused");
+    let env = TestEnv::new();
+    let player = start(&env, &[&log(&env, 100, 100), "--sensor=left", "--hold"]);
+    assert_eq!(env.run(&["control", "left", "pause"]).code, Some(0));
+    env.await_info("left", |info| info["state"] == "paused");
     assert!(number(&replayed(&player.end(TERM)), "telegrams") < 100);
-    let player = start(&stage, &[&log(&stage, 100, 100), "--rate=max", "--hold"]);
-    let info = stage.await_info("front", |info| info["state"] == "silent");
+    let player = start(&env, &[&log(&env, 100, 100), "--rate=max", "--hold"]);
+    let info = env.await_info("front", |info| info["state"] == "silent");
     assert_eq!((number(&info["counters"], "telegrams"), &info["angle_deg"]), (100, &180.into()));
     // It would have ended after a second.
     assert_eq!(number(&replayed(&player.end(TERM)), "telegrams"), 100);
@@ -99,8 +99,8 @@ fn at_the_end_it_stays_if_it_is_to_and_pauses_when_asked() {
 
 /// A recording of a hub of two lives, which each heard ten telegrams, of which the sixth says how values are split: marks
 /// were found from `understood` of each life on.
-fn lives(stage: &Stage, understood: [u64; 2]) -> String {
-    let file = std::fs::File::create(stage.path("lives.mcap")).expect("a file");
+fn lives(env: &TestEnv, understood: [u64; 2]) -> String {
+    let file = std::fs::File::create(env.path("lives.mcap")).expect("a file");
     let mut writer = Writer::begin(file, "", BTreeMap::new()).expect("is written");
     for (life, understood) in understood.into_iter().enumerate() {
         for seq in 0..10 {
@@ -129,12 +129,12 @@ fn lives(stage: &Stage, understood: [u64; 2]) -> String {
         }
     }
     writer.finish().expect("is written");
-    stage.path("lives.mcap").display().to_string()
+    env.path("lives.mcap").display().to_string()
 }
 
 /// A line that loses six of ten scans, and is silent for two seconds in the middle; the last 300 of 20 s.
-fn lossy(stage: &Stage) -> String {
-    let file = std::fs::File::create(stage.path("lossy.mcap")).expect("a file");
+fn lossy(env: &TestEnv) -> String {
+    let file = std::fs::File::create(env.path("lossy.mcap")).expect("a file");
     let mut writer = Writer::begin(file, "", BTreeMap::new()).expect("is written");
     let is_lost = |scan: &u64| scan % 10 > 3 || (300..375).contains(scan);
     for (seq, scan) in (0..750).filter(|scan| !is_lost(scan)).enumerate() {
@@ -155,22 +155,22 @@ fn lossy(stage: &Stage) -> String {
         writer.sample("front", Topic::Telegram, &header, &testkit::scan(seq as u16)).expect("is written");
     }
     writer.finish().expect("is written");
-    stage.path("lossy.mcap").display().to_string()
+    env.path("lossy.mcap").display().to_string()
 }
 
 #[test]
 fn scans_that_are_missing_are_no_silence_of_the_sensor() {
-    let stage = Stage::new();
-    let player = start(&stage, &[&lossy(&stage), "--rate=2", "--set=link.front.mode=0", "--hold"]);
+    let env = TestEnv::new();
+    let player = start(&env, &[&lossy(&env), "--rate=2", "--set=link.front.mode=0", "--hold"]);
     testkit::until("a rate in the list", || {
-        let listed = stage.run(&["list", "--json"]);
+        let listed = env.run(&["list", "--json"]);
         assert_eq!(listed.code, Some(0), "{listed}");
         let rate =
             listed.lines().into_iter().find(|line| line["topic"] == "scan").map(|line| line["hz"].clone());
         // Of 37.5 scans a second 15 come, twice as fast.
         rate.and_then(|rate| rate.as_f64()).is_some_and(|hz| (15.0..60.0).contains(&hz))
     });
-    stage.await_info("front", |info| info["last_error"] == "the recording is at its end");
+    env.await_info("front", |info| info["last_error"] == "the recording is at its end");
     let outcome = player.end(INT);
     let said = |word: &str| outcome.errors.lines().filter(|line| line.contains(word)).count();
     // Once for the pause, and at the end.
@@ -181,10 +181,10 @@ fn scans_that_are_missing_are_no_silence_of_the_sensor() {
 fn what_the_hub_could_not_read_yet_is_no_scan() {
     // One of both lives knew it from the life before.
     for understood in [[0, 6], [6, 0]] {
-        let stage = Stage::new();
-        let player = start(&stage, &[&lives(&stage, understood), "--paused"]);
-        let mut consumer = stage.echo(&["front/scan", "front/status"]);
-        resume(&stage);
+        let env = TestEnv::new();
+        let player = start(&env, &[&lives(&env, understood), "--paused"]);
+        let mut consumer = env.echo(&["front/scan", "front/status"]);
+        resume(&env);
         consumer.await_line("the end", |line| line["last_error"] == "the recording is at its end");
         let scans: Vec<_> =
             consumer.end(INT).of_class("scan").iter().map(|scan| number(scan, "seq")).collect();
@@ -196,11 +196,11 @@ fn what_the_hub_could_not_read_yet_is_no_scan() {
 
 #[test]
 fn links_of_the_configuration_that_are_not_in_it_are_left_out() {
-    let stage = Stage::new();
+    let env = TestEnv::new();
     let text = "[[link]]\nname = \"front\"\nport = \"/dev/x\"\npose = { x = 0.25 }\n[[link]]\nname = \"rear\"\nport = \"y\"\n";
-    let config = format!("--config={}", stage.file("config.toml", text));
-    let player = start(&stage, &[&log(&stage, 3, 100), &config, "--hold"]);
-    assert_eq!(stage.info("front")["pose"]["x_m"], 0.25);
+    let config = format!("--config={}", env.file("config.toml", text));
+    let player = start(&env, &[&log(&env, 3, 100), &config, "--hold"]);
+    assert_eq!(env.info("front")["pose"]["x_m"], 0.25);
     let outcome = player.end(INT);
     assert_eq!(outcome.of_class("ready")[0]["sensors"], Value::from(vec!["front"]));
     assert!(outcome.errors.contains("rear: not in the recording, left out"), "{outcome}");
@@ -208,8 +208,8 @@ fn links_of_the_configuration_that_are_not_in_it_are_left_out() {
 
 #[test]
 fn what_cannot_be_played_is_refused() {
-    let stage = Stage::new();
-    let log = log(&stage, 3, 100);
+    let env = TestEnv::new();
+    let log = log(&env, 3, 100);
     let golden = concat!(env!("CARGO_MANIFEST_DIR"), "/tests/vectors/recording/v1.mcap");
     for (words, code, message) in [
         (&["/no/such/file"][..], 66, "cannot read recording /no/such/file"),
@@ -222,7 +222,7 @@ fn what_cannot_be_played_is_refused() {
         (&[&log, "--sensor=Front"], 2, "sensor name \"Front\" is not possible"),
         (&[golden, "--sensor=left"], 3, "has no sensor \"left\""),
     ] {
-        let outcome = stage.run(&[&["replay"], words].concat());
+        let outcome = env.run(&[&["replay"], words].concat());
         assert_eq!(outcome.code, Some(code), "{outcome}");
         assert!(outcome.errors.contains(message), "{outcome}");
     }
@@ -230,9 +230,9 @@ fn what_cannot_be_played_is_refused() {
 
 #[test]
 fn keys() {
-    let stage = Stage::new();
-    let words = ["replay", "--no-system-config", "--paused", &log(&stage, 300, 100)];
-    let mut sitting = Sitting::start(&stage.command(&words), (100, 30));
+    let env = TestEnv::new();
+    let words = ["replay", "--no-system-config", "--paused", &log(&env, 300, 100)];
+    let mut sitting = Sitting::start(&env.command(&words), (100, 30));
     sitting.await_words("paused; space goes on");
     let says = |sitting: &Sitting, word: &str| {
         let give_up_at = std::time::Instant::now() + testkit::PATIENCE;
@@ -251,7 +251,7 @@ fn keys() {
     says(&sitting, "  x2  ");
     says(&sitting, "space pauses");
     sitting.press(" ");
-    stage.await_info("front", |info| info["state"] == "paused");
+    env.await_info("front", |info| info["state"] == "paused");
     sitting.press("q");
     let (code, text, is_as_before) = sitting.end_of_lines();
     assert_eq!((code, is_as_before), (Some(0), true), "{text}");
@@ -262,9 +262,9 @@ fn keys() {
 #[test]
 fn a_signal_gives_the_terminal_back() {
     for signal in [INT, TERM] {
-        let stage = Stage::new();
-        let words = ["replay", "--no-system-config", &log(&stage, 300, 100)];
-        let sitting = Sitting::start(&stage.command(&words), (100, 30));
+        let env = TestEnv::new();
+        let words = ["replay", "--no-system-config", &log(&env, 300, 100)];
+        let sitting = Sitting::start(&env.command(&words), (100, 30));
         sitting.await_words("space pauses");
         sitting.signal(signal);
         let (code, text, is_as_before) = sitting.end_of_lines();
@@ -274,11 +274,11 @@ fn a_signal_gives_the_terminal_back() {
 
 #[test]
 fn it_ends_with_its_terminal() {
-    let stage = Stage::new();
-    let words = ["replay", "--no-system-config", "--loop", "--paused", &log(&stage, 300, 100)];
-    let errors = stage.path("errors");
+    let env = TestEnv::new();
+    let words = ["replay", "--no-system-config", "--loop", "--paused", &log(&env, 300, 100)];
+    let errors = env.path("errors");
     let file = std::fs::File::create(&errors).expect("a file");
-    let sitting = Sitting::start_for_hang_up(&stage.command(&words), (100, 30), true, file);
+    let sitting = Sitting::start_for_hang_up(&env.command(&words), (100, 30), true, file);
     sitting.await_words("ready ");
     sitting.hang_up();
     let errors = std::fs::read_to_string(errors).expect("its errors");

@@ -10,7 +10,7 @@ use std::sync::mpsc::channel;
 use std::thread;
 use std::time::{Duration, Instant};
 
-use crate::testkit::{PATIENCE, Stage};
+use crate::testkit::{PATIENCE, TestEnv};
 use daemon::config::Sources;
 use daemon::{Play, Player, Replay};
 use rooms::{Followers, LEARNING, Published, SENSORS};
@@ -22,16 +22,14 @@ const SCANS: u64 = 400;
 const SILENCE: u64 = 300;
 
 /// Records two sensors; where, and what was published of each.
-fn record(stage: &Stage) -> (PathBuf, Vec<Vec<Published>>) {
-    let (file, mut published) = (stage.path("two.mcap"), vec![Vec::new(), Vec::new()]);
-    rooms::record(&stage.place(), &file, SCANS, Some(SILENCE), |number, sample| {
-        published[number].push(sample)
-    });
+fn record(env: &TestEnv) -> (PathBuf, Vec<Vec<Published>>) {
+    let (file, mut published) = (env.path("two.mcap"), vec![Vec::new(), Vec::new()]);
+    rooms::record(&env.place(), &file, SCANS, Some(SILENCE), |number, sample| published[number].push(sample));
     (file, published)
 }
 
 /// Replays `file` step by step; what was published of each sensor.
-fn replay(stage: &Stage, file: &Path, play: Play, set: &[&str]) -> Vec<Vec<Published>> {
+fn replay(env: &TestEnv, file: &Path, play: Play, set: &[&str]) -> Vec<Vec<Published>> {
     let set = set.iter().map(|word| (*word).to_owned()).collect();
     let sources = Sources { set, ..Sources::default() };
     let replay = Replay {
@@ -41,7 +39,7 @@ fn replay(stage: &Stage, file: &Path, play: Play, set: &[&str]) -> Vec<Vec<Publi
         play: Play { is_paused: true, ..play },
         holds: false,
     };
-    let domain = stage.place();
+    let domain = env.place();
     let (tell, ready) = channel();
     thread::scope(|scope| {
         let hub = scope.spawn(|| {
@@ -99,9 +97,9 @@ fn payloads(published: &[Published], topic: Topic) -> Vec<&[u8]> {
 
 #[test]
 fn the_same_parameters_give_the_same_bytes_and_others_give_others() {
-    let stage = Stage::new();
-    let (file, recorded) = record(&stage);
-    let replayed = replay(&stage, &file, Play::default(), &[LEARNING]);
+    let env = TestEnv::new();
+    let (file, recorded) = record(&env);
+    let replayed = replay(&env, &file, Play::default(), &[LEARNING]);
     for ((recorded, replayed), (name, _)) in recorded.iter().zip(&replayed).zip(SENSORS) {
         let count = |topic| [replayed, recorded].map(|published| payloads(published, topic).len());
         for topic in [Topic::Telegram, Topic::Scan, Topic::Marks, Topic::Foreground, Topic::Background] {
@@ -118,17 +116,17 @@ fn the_same_parameters_give_the_same_bytes_and_others_give_others() {
         };
         assert_eq!(walls(recorded), walls(replayed), "{name}");
     }
-    let others = replay(&stage, &file, Play::default(), &[LEARNING, "zones.radii=[2.5,1.5]"]);
+    let others = replay(&env, &file, Play::default(), &[LEARNING, "zones.radii=[2.5,1.5]"]);
     assert!(payloads(&others[0], Topic::Zones) != payloads(&recorded[0], Topic::Zones));
     assert!(payloads(&others[0], Topic::Foreground) == payloads(&recorded[0], Topic::Foreground));
 }
 
 #[test]
 fn what_is_skipped_is_learned_from() {
-    let stage = Stage::new();
-    let (file, recorded) = record(&stage);
+    let env = TestEnv::new();
+    let (file, recorded) = record(&env);
     let play = Play { start_ns: 5_000_000_000, ..Play::default() };
-    let replayed = replay(&stage, &file, play, &[LEARNING]);
+    let replayed = replay(&env, &file, play, &[LEARNING]);
     for (recorded, replayed) in recorded.iter().zip(&replayed) {
         for topic in [Topic::Scan, Topic::Marks, Topic::Zones, Topic::Foreground] {
             let (all, late) = (payloads(recorded, topic), payloads(replayed, topic));

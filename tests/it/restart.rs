@@ -3,17 +3,17 @@
 
 use std::collections::{BTreeMap, HashSet};
 
-use crate::testkit::{INT, KILL, MEASURED, Stage, TERM, bytes_of, hash, is_class, number, sequence};
+use crate::testkit::{INT, KILL, MEASURED, TERM, TestEnv, bytes_of, hash, is_class, number, sequence};
 use serde_json::Value;
 
 #[test]
 fn consumers_outlive_several_hubs() {
-    let stage = Stage::new();
-    let simulator = stage.simulator(&["front"], &["--seed=21"]);
-    let link = [stage.link("front")];
-    let mut hub = stage.hub(&link);
-    let mut telegrams = stage.echo(&["front/telegram"]);
-    let mut scans = stage.echo(&["front/scan", "front/status"]);
+    let env = TestEnv::new();
+    let simulator = env.simulator(&["front"], &["--seed=21"]);
+    let link = [env.link("front")];
+    let mut hub = env.hub(&link);
+    let mut telegrams = env.echo(&["front/telegram"]);
+    let mut scans = env.echo(&["front/scan", "front/status"]);
     for how in [KILL, KILL, TERM, KILL] {
         telegrams.await_lines(25, "a measured telegram", |line| line["command"] == MEASURED);
         scans.await_lines(25, "a scan", is_class("scan"));
@@ -22,14 +22,14 @@ fn consumers_outlive_several_hubs() {
         for consumer in [&mut telegrams, &mut scans] {
             consumer.await_line("hub_gone", |line| line["kind"] == "hub_gone");
         }
-        hub = stage.hub(&link);
+        hub = env.hub(&link);
         for consumer in [&mut telegrams, &mut scans] {
             consumer.await_line("hub_back", |line| line["kind"] == "hub_back");
         }
     }
     telegrams.await_lines(25, "a measured telegram", |line| line["command"] == MEASURED);
     scans.await_lines(25, "a scan", is_class("scan"));
-    let info = stage.info("front");
+    let info = env.info("front");
     let (telegrams, scans) = (telegrams.end(INT), scans.end(INT));
     assert_eq!((telegrams.code, scans.code), (Some(0), Some(0)), "{}", telegrams.errors);
     assert_eq!(hub.end(TERM).code, Some(0));
@@ -38,7 +38,7 @@ fn consumers_outlive_several_hubs() {
     let news = telegrams.of_class("notice");
     let news: Vec<_> = news.iter().map(|line| line["kind"].as_str().unwrap_or_default()).collect();
     assert_eq!(news, ["hub_gone", "hub_back"].repeat(4));
-    let truth = stage.truth("front");
+    let truth = env.truth("front");
     let sent: HashSet<_> = truth.iter().map(|sent| &sent.hash).collect();
     let lives = by_boot(telegrams.of_class("telegram"));
     assert_eq!(lives.len(), 5);
@@ -68,7 +68,7 @@ fn consumers_outlive_several_hubs() {
     assert!(!truth[streams..].iter().any(|sent| at_another_rate(&sent.fault)), "the rate was changed");
     let aborted = truth[streams..].iter().filter(|sent| sent.fault.as_deref() == Some("aborted")).count();
     assert!(aborted <= 4 * 2, "{aborted} scans were broken off by four adoptions");
-    assert_eq!(stage.simulated("front").1, 0, "EEPROM");
+    assert_eq!(env.simulated("front").1, 0, "EEPROM");
 }
 
 /// Lines by the life of the hub that they are from, in their order.

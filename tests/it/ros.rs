@@ -4,7 +4,7 @@
 use std::collections::BTreeMap;
 use std::process::Command;
 
-use crate::testkit::{INT, MEASURED, Recording, Stage, is_class, number, python};
+use crate::testkit::{INT, MEASURED, Recording, TestEnv, is_class, number, python};
 use lms::variant::Unit;
 use schema::datagram::Packed;
 use schema::{Code, Header, Pose, Scan, file};
@@ -14,8 +14,8 @@ use serde_json::Value;
 const FRONT: Pose = Pose { x_m: 0.3, y_m: 0.1, yaw_rad: 0.25, upside_down: 0, reserved: [0; 7] };
 const REAR: Pose = Pose { x_m: -0.25, y_m: 0.0, yaw_rad: -2.5, upside_down: 1, reserved: [0; 7] };
 
-fn link(stage: &Stage, name: &str, pose: &Pose) -> Vec<String> {
-    let mut words = vec![stage.link(name)];
+fn link(env: &TestEnv, name: &str, pose: &Pose) -> Vec<String> {
+    let mut words = vec![env.link(name)];
     let numbers = [("x", pose.x_m), ("y", pose.y_m), ("yaw", pose.yaw_rad)];
     words.extend(numbers.map(|(key, value)| format!("--set=link.{name}.pose.{key}={value:?}")));
     words.push(format!("--set=link.{name}.pose.upside_down={}", pose.upside_down == 1));
@@ -114,25 +114,25 @@ fn check_transforms(said: &[Value]) {
 
 #[test]
 fn others_read_every_message_made_live_and_later() {
-    let stage = Stage::new();
-    let _simulator = stage.simulator(&["front", "rear"], &["--world=room", "--seed=5", "--mode=0x01"]);
-    let _hub = stage.hub(&[link(&stage, "front", &FRONT), link(&stage, "rear", &REAR)].concat());
+    let env = TestEnv::new();
+    let _simulator = env.simulator(&["front", "rear"], &["--world=room", "--seed=5", "--mode=0x01"]);
+    let _hub = env.hub(&[link(&env, "front", &FRONT), link(&env, "rear", &REAR)].concat());
     for sensor in ["front", "rear"] {
-        stage.await_info(sensor, |info| info["state"] == "streaming");
+        env.await_info(sensor, |info| info["state"] == "streaming");
     }
     // What goes on around it is recorded from before until after.
-    let [all, live, later] = ["all.mcap", "live.mcap", "later.mcap"].map(|name| stage.word(name));
-    let mut around = stage.start(&["record", "--all", "--json", "-o", &all]);
+    let [all, live, later] = ["all.mcap", "live.mcap", "later.mcap"].map(|name| env.word(name));
+    let mut around = env.start(&["record", "--all", "--json", "-o", &all]);
     around.await_line("samples", |line| is_class("recording")(line) && number(line, "samples") >= 100);
-    let outcome = stage.run(&["record", "--ros2", "--json", "--for=3s", "-o", &live]);
+    let outcome = env.run(&["record", "--ros2", "--json", "--for=3s", "-o", &live]);
     assert_eq!(outcome.code, Some(0), "{outcome}");
     assert_eq!(around.end(INT).code, Some(0));
-    let outcome = stage.run(&["convert", &all, &later, "--ros2", "--json"]);
+    let outcome = env.run(&["convert", &all, &later, "--ros2", "--json"]);
     assert_eq!(outcome.code, Some(0), "{outcome}");
     let account = outcome.of_class("converted").pop().expect("an account");
     assert_eq!((&account["to"], &account["sensors"]), (&"ROS 2".into(), &Value::from(vec!["front", "rear"])));
 
-    let recording = Recording::whole(&stage.path("all.mcap"));
+    let recording = Recording::whole(&env.path("all.mcap"));
     let published = published(&recording);
     let is_at_an_end = |(topic, log_time): &(String, u64)| {
         let mut times = published.keys().filter(|(of, _)| of == topic).map(|(_, time)| time);
@@ -140,7 +140,7 @@ fn others_read_every_message_made_live_and_later() {
         Some(log_time) < times.next() || Some(log_time) > last
     };
     for (name, path) in [("live.mcap", &live), ("later.mcap", &later)] {
-        let ours = Recording::whole(&stage.path(name));
+        let ours = Recording::whole(&env.path(name));
         assert!(ours.kept.iter().all(|kept| kept.encoding == "cdr"), "{name} has other messages");
         let scans = ours.kept.iter().filter(|kept| kept.topic != "/tf_static").count();
         assert!(scans > 60, "{name}: {scans} scans");
@@ -178,21 +178,21 @@ fn others_read_every_message_made_live_and_later() {
 
 #[test]
 fn a_stream_becomes_messages_and_rows_where_its_mode_is_known() {
-    let stage = Stage::new();
+    let env = TestEnv::new();
     let words: [u16; 361] = std::array::from_fn(|beam| (beam as u16 % 8) << 13 | (500 + 11 * beam as u16));
     let scan = lms::measured::encode(0, Unit::Mm, &words, 0x10);
     let bytes = scan.bytes().repeat(20);
-    let stream = stage.file("a.bin", &bytes);
-    let [bag, rows] = ["bag.mcap", "rows.csv"].map(|name| stage.word(name));
+    let stream = env.file("a.bin", &bytes);
+    let [bag, rows] = ["bag.mcap", "rows.csv"].map(|name| env.word(name));
     for words in [&[&bag[..], "--ros2"][..], &[&rows]] {
-        let outcome = stage.run(&[&["convert", &stream], words].concat());
+        let outcome = env.run(&[&["convert", &stream], words].concat());
         assert_eq!(outcome.code, Some(78), "{outcome}");
         assert!(outcome.errors.contains("does not tell the measuring mode of front"), "{outcome}");
         assert!(outcome.errors.contains("--mode"), "{outcome}");
-        let outcome = stage.run(&[&["convert", &stream, "--mode=0x01"], words].concat());
+        let outcome = env.run(&[&["convert", &stream, "--mode=0x01"], words].concat());
         assert_eq!(outcome.code, Some(0), "{outcome}");
     }
-    let told: Vec<_> = Recording::whole(&stage.path("bag.mcap")).kept;
+    let told: Vec<_> = Recording::whole(&env.path("bag.mcap")).kept;
     assert_eq!(told.len(), 20);
     assert!(
         told.iter().all(|kept| kept.topic == "/front/scan" && kept.schema == "sensor_msgs/msg/LaserScan")
@@ -211,7 +211,7 @@ fn a_stream_becomes_messages_and_rows_where_its_mode_is_known() {
         (&["b.bin", "--mode=0x01"], 2, "--mode is for scans"),
         (&["b.csv", "--mode=0x77"], 78, "none of a range"),
     ] {
-        let outcome = stage.run(&[&["convert", &stream], words].concat());
+        let outcome = env.run(&[&["convert", &stream], words].concat());
         assert!(outcome.code == Some(code) && outcome.errors.contains(says), "{outcome}");
     }
 }

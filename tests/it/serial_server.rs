@@ -10,7 +10,7 @@ use std::thread::{self, JoinHandle};
 use std::time::{Duration, Instant};
 
 use crate::testkit;
-use crate::testkit::{INT, Stage, TERM, is_class, number, open_line, sequence, terminal};
+use crate::testkit::{INT, TERM, TestEnv, is_class, number, open_line, sequence, terminal};
 use rustix::process::Signal;
 use serde_json::Value;
 
@@ -25,12 +25,12 @@ struct Server {
 
 impl Server {
     /// A server whose serial port is the line at `place`, set to `rate` by hand.
-    fn new(stage: &Stage, place: &str, rate: u32) -> Server {
+    fn new(env: &TestEnv, place: &str, rate: u32) -> Server {
         let listener = TcpListener::bind("127.0.0.1:0").expect("a port of the loopback");
         let address = listener.local_addr().expect("it has an address").to_string();
         listener.set_nonblocking(true).expect("a socket");
         let (hang_up, end) = (Arc::new(AtomicBool::new(false)), Arc::new(AtomicBool::new(false)));
-        let line = open_line(&stage.path(place), rate);
+        let line = open_line(&env.path(place), rate);
         let body = {
             let (hang_up, end) = (hang_up.clone(), end.clone());
             move || {
@@ -86,11 +86,11 @@ fn carry(line: &std::fs::File, socket: &TcpStream, is_over: &dyn Fn() -> bool) {
 
 #[test]
 fn a_sensor_behind_a_serial_server() {
-    let stage = Stage::new();
-    let _simulator = stage.simulator(&["line"], &["--baud=38400", "--seed=5"]);
-    let server = Server::new(&stage, "line", 38_400);
-    let hub = stage.hub(&[&server.link(), "--set=link.front.baud=38400"]);
-    let mut consumer = stage.echo(&["front/telegram", "front/status"]);
+    let env = TestEnv::new();
+    let _simulator = env.simulator(&["line"], &["--baud=38400", "--seed=5"]);
+    let server = Server::new(&env, "line", 38_400);
+    let hub = env.hub(&[&server.link(), "--set=link.front.baud=38400"]);
+    let mut consumer = env.echo(&["front/telegram", "front/status"]);
     consumer.await_lines(5, "a telegram", is_class("telegram"));
     server.hang_up.store(true, Ordering::Relaxed);
     let absent = consumer.await_line("absent", |line| line["state"] == "absent");
@@ -98,7 +98,7 @@ fn a_sensor_behind_a_serial_server() {
     assert!(error.contains(&server.address) && error.contains("closed by the serial server"), "{absent}");
     consumer.await_line("streaming", |line| line["state"] == "streaming");
     consumer.await_lines(5, "a telegram", is_class("telegram"));
-    let info = stage.info("front");
+    let info = env.info("front");
     assert_eq!(number(&info["counters"], "reconnects"), 1, "{info}");
     assert_eq!(info["port"], format!("tcp:{}", server.address));
     let outcome = consumer.end(INT);
@@ -108,11 +108,11 @@ fn a_sensor_behind_a_serial_server() {
 
 #[test]
 fn scans_that_waited_for_a_hub_at_a_standstill_say_nothing_of_now() {
-    let stage = Stage::new();
-    let _simulator = stage.simulator(&["line"], &["--baud=38400", "--seed=5"]);
-    let server = Server::new(&stage, "line", 38_400);
-    let hub = stage.hub(&[&server.link(), "--set=link.front.baud=38400", "--set=zones.radii=[0.02,0.01]"]);
-    let mut consumer = stage.echo(&["front/zones"]);
+    let env = TestEnv::new();
+    let _simulator = env.simulator(&["line"], &["--baud=38400", "--seed=5"]);
+    let server = Server::new(&env, "line", 38_400);
+    let hub = env.hub(&[&server.link(), "--set=link.front.baud=38400", "--set=zones.radii=[0.02,0.01]"]);
+    let mut consumer = env.echo(&["front/zones"]);
     consumer.await_line("a verdict", |line| line["verdict"] == "clear");
     hub.signal(Signal::STOP);
     // Five scans come in a second, and ten are read at once.
@@ -133,28 +133,27 @@ fn scans_that_waited_for_a_hub_at_a_standstill_say_nothing_of_now() {
 
 #[test]
 fn a_serial_server_that_is_set_to_another_rate() {
-    let stage = Stage::new();
-    let _simulator = stage.simulator(&["line"], &["--baud=9600"]);
-    let server = Server::new(&stage, "line", 38_400);
-    let _hub = stage.hub(&[&server.link(), "--set=link.front.baud=38400"]);
+    let env = TestEnv::new();
+    let _simulator = env.simulator(&["line"], &["--baud=9600"]);
+    let server = Server::new(&env, "line", 38_400);
+    let _hub = env.hub(&[&server.link(), "--set=link.front.baud=38400"]);
     let says = "no answer at 38400 baud, to which the serial server was set";
     let said = |info: &Value| info["last_error"].as_str().is_some_and(|error| error.contains(says));
-    stage.await_info("front", said);
+    env.await_info("front", said);
 }
 
 #[test]
 fn a_serial_server_that_is_not_there() {
-    let stage = Stage::new();
+    let env = TestEnv::new();
     // The port was free a moment ago.
     let address = TcpListener::bind("127.0.0.1:0").and_then(|socket| socket.local_addr()).expect("a port");
     // Too long for a name: nobody is asked for it.
     let nowhere = "x".repeat(64);
-    let hub =
-        stage.hub(&[&format!("--link=front=tcp:{address}"), &format!("--link=named=tcp:{nowhere}:4001")]);
+    let hub = env.hub(&[&format!("--link=front=tcp:{address}"), &format!("--link=named=tcp:{nowhere}:4001")]);
     for (sensor, says) in [("front", "connection refused; nothing listens there"), ("named", "no such host")]
     {
         let said = |info: &Value| info["last_error"].as_str().is_some_and(|error| error.contains(says));
-        let info = stage.await_info(sensor, said);
+        let info = env.await_info(sensor, said);
         assert_eq!(info["state"], "absent", "{info}");
     }
     assert_eq!(hub.end(TERM).code, Some(0));
@@ -162,11 +161,11 @@ fn a_serial_server_that_is_not_there() {
 
 #[test]
 fn a_want_of_descriptors_is_not_the_servers_fault() {
-    let stage = Stage::new();
+    let env = TestEnv::new();
     let free = TcpListener::bind("127.0.0.1:0").and_then(|socket| socket.local_addr()).expect("a port");
     let port = format!("tcp:localhost:{}", free.port());
     for limit in 5..16 {
-        let inner = stage.command(&["probe", &port]);
+        let inner = env.command(&["probe", &port]);
         let mut command = std::process::Command::new("sh");
         command.args(["-c", "ulimit -n \"$0\" && exec \"$@\"", &limit.to_string()]);
         command.arg(inner.get_program()).args(inner.get_args()).env("SCANHUB_END_WITH_PARENT", "1");
@@ -181,7 +180,7 @@ fn a_want_of_descriptors_is_not_the_servers_fault() {
 
 #[test]
 fn nobody_has_to_wait_for_a_serial_server_that_does_not_answer() {
-    let stage = Stage::new();
+    let env = TestEnv::new();
     // Nobody accepts, and there is no room for one more: the kernel drops who comes.
     let listener = TcpListener::bind("127.0.0.1:0").expect("a port of the loopback");
     rustix::net::listen(&listener, 0).expect("a socket");
@@ -189,7 +188,7 @@ fn nobody_has_to_wait_for_a_serial_server_that_does_not_answer() {
     let _waiting = TcpStream::connect(address).expect("room for one");
     let port = format!("tcp:{address}");
     for arguments in [["probe", &port, "--json"], ["doctor", &port, "--json"]] {
-        let program = stage.start(&arguments);
+        let program = env.start(&arguments);
         let descriptors = format!("/proc/{}/fd", program.pid());
         let is_socket = |entry: std::fs::DirEntry| {
             entry.path().read_link().is_ok_and(|target| target.to_string_lossy().starts_with("socket:"))
@@ -203,15 +202,15 @@ fn nobody_has_to_wait_for_a_serial_server_that_does_not_answer() {
 
 #[test]
 fn a_serial_server_that_serves_somebody_else_is_asked_seldom_and_told_of_once() {
-    let stage = Stage::new();
+    let env = TestEnv::new();
     let listener = TcpListener::bind("127.0.0.1:0").expect("a port of the loopback");
     let address = listener.local_addr().expect("it has an address");
-    let hub = stage.hub(&[format!("--link=front=tcp:{address}")]);
+    let hub = env.hub(&[format!("--link=front=tcp:{address}")]);
     let came = [0; 6].map(|_| {
         let _connection = listener.accept().expect("the hub comes again");
         Instant::now()
     });
-    let info = stage.await_info("front", |info| info["counters"]["reconnects"] == 6);
+    let info = env.await_info("front", |info| info["counters"]["reconnects"] == 6);
     assert_eq!(info["state"], "absent", "{info}");
     let outcome = hub.end(TERM);
     let said = outcome.errors.lines().filter(|line| line.contains("closed by the serial server")).count();
@@ -223,29 +222,29 @@ fn a_serial_server_that_serves_somebody_else_is_asked_seldom_and_told_of_once() 
 
 #[test]
 fn probe_and_doctor_ask_there_too() {
-    let stage = Stage::new();
-    let _simulator = stage.simulator(&["sensor"], &["--baud=38400"]);
-    let server = Server::new(&stage, "sensor", 38_400);
+    let env = TestEnv::new();
+    let _simulator = env.simulator(&["sensor"], &["--baud=38400"]);
+    let server = Server::new(&env, "sensor", 38_400);
     let port = format!("tcp:{}", server.address);
-    let outcome = stage.run(&["probe", &port, "--json"]);
+    let outcome = env.run(&["probe", &port, "--json"]);
     assert_eq!(outcome.code, Some(0), "{outcome}");
     let found = &outcome.lines()[0];
     // The server has the rate; the sensor tells which it is.
     assert_eq!((number(found, "baud"), number(found, "operating_mode")), (38_400, 0x25), "{found}");
-    let outcome = stage.run(&["doctor", &port, "--no-system-config", "--json"]);
+    let outcome = env.run(&["doctor", &port, "--no-system-config", "--json"]);
     assert_eq!(outcome.code, Some(0), "{outcome}");
     let findings = outcome.of_class("check");
     let sensor = findings.iter().find(|line| line["name"] == "sensor").expect("it is asked");
     assert!(sensor["finding"].as_str().is_some_and(|text| text.contains("38400 Bd")), "{sensor}");
     drop(server);
-    let outcome = stage.run(&["probe", &port, "--json"]);
+    let outcome = env.run(&["probe", &port, "--json"]);
     assert_eq!(outcome.code, Some(4), "{outcome}");
 }
 
 /// What a person sees who runs the program with `arguments` at a terminal and answers its question by yes; its exit code.
-fn confirmed(stage: &Stage, arguments: &[&str]) -> (String, Option<i32>) {
+fn confirmed(env: &TestEnv, arguments: &[&str]) -> (String, Option<i32>) {
     let (mut keys, screen) = terminal();
-    let mut command = stage.command(arguments);
+    let mut command = env.command(arguments);
     let screens = [0; 3].map(|_| Stdio::from(screen.try_clone().unwrap()));
     let [stdin, stdout, stderr] = screens;
     let mut process = command.stdin(stdin).stdout(stdout).stderr(stderr).spawn().expect("it starts");
@@ -263,14 +262,14 @@ fn confirmed(stage: &Stage, arguments: &[&str]) -> (String, Option<i32>) {
 
 #[test]
 fn a_sensor_there_can_be_configured() {
-    let stage = Stage::new();
-    let simulator = stage.simulator(&["front"], &["--baud=38400"]);
-    let server = Server::new(&stage, "front", 38_400);
+    let env = TestEnv::new();
+    let simulator = env.simulator(&["front"], &["--baud=38400"]);
+    let server = Server::new(&env, "front", 38_400);
     let port = format!("tcp:{}", server.address);
-    let (seen, code) = confirmed(&stage, &["configure", &port, "unit=cm"]);
+    let (seen, code) = confirmed(&env, &["configure", &port, "unit=cm"]);
     assert_eq!(code, Some(0), "{seen}");
-    assert_eq!(number(&stage.run(&["probe", &port, "--json"]).lines()[0], "unit_mm"), 10);
+    assert_eq!(number(&env.run(&["probe", &port, "--json"]).lines()[0], "unit_mm"), 10);
     drop(server);
     assert_eq!(simulator.end(TERM).code, Some(0));
-    assert_eq!(stage.simulated("front").1, 1);
+    assert_eq!(env.simulated("front").1, 1);
 }

@@ -4,33 +4,35 @@
 use std::collections::{HashMap, HashSet};
 use std::time::Duration;
 
-use crate::testkit::{INT, KILL, MEASURED, Program, Stage, TERM, bytes_of, hash, is_class, number, sequence};
+use crate::testkit::{
+    INT, KILL, MEASURED, Program, TERM, TestEnv, bytes_of, hash, is_class, number, sequence,
+};
 use serde_json::Value;
 
 const KILLS: usize = 6;
 
 #[test]
 fn what_is_sent_while_a_killed_hub_is_replaced_waits_in_the_line() {
-    let stage = Stage::new();
-    let simulator = stage.simulator(&["front"], &["--seed=5", "--baud=500000"]);
-    let mut supervisor = stage.supervisor();
-    let flags = [stage.link("front")];
-    let mut hub = stage.service(&mut supervisor, &flags, None).ready();
+    let env = TestEnv::new();
+    let simulator = env.simulator(&["front"], &["--seed=5", "--baud=500000"]);
+    let mut supervisor = env.supervisor();
+    let flags = [env.link("front")];
+    let mut hub = env.service(&mut supervisor, &flags, None).ready();
     supervisor.hear("FDNAME=front");
     supervisor.hear("READY=1");
-    let mut telegrams = stage.echo(&["front/telegram"]);
+    let mut telegrams = env.echo(&["front/telegram"]);
     let mut boots = HashSet::new();
     for _ in 0..KILLS {
         live(&mut telegrams, &mut boots);
         assert_eq!(hub.end(KILL).code, None);
-        hub = stage.service(&mut supervisor, &flags, None).ready();
+        hub = env.service(&mut supervisor, &flags, None).ready();
         supervisor.hear("READY=1");
     }
     live(&mut telegrams, &mut boots);
     // Nobody but the one who keeps it has the line, and it is still locked.
     assert_eq!(hub.end(KILL).code, None);
-    assert_eq!(stage.run(&["run", &flags[0]]).code, Some(4), "a hub of nobody's finds it busy");
-    hub = stage.service(&mut supervisor, &flags, None).ready();
+    assert_eq!(env.run(&["run", &flags[0]]).code, Some(4), "a hub of nobody's finds it busy");
+    hub = env.service(&mut supervisor, &flags, None).ready();
     live(&mut telegrams, &mut boots);
     assert_eq!(hub.end(TERM).code, Some(0));
     supervisor.hear("STOPPING=1");
@@ -48,7 +50,7 @@ fn what_is_sent_while_a_killed_hub_is_replaced_waits_in_the_line() {
     }
     let received: Vec<_> = lines.iter().filter(|line| line["command"] == MEASURED).collect();
     let received: Vec<String> = received.iter().map(|line| hash(&bytes_of(line))).collect();
-    let truth: Vec<_> = stage.truth("front").into_iter().filter(|sent| sent.is_intact_scan()).collect();
+    let truth: Vec<_> = env.truth("front").into_iter().filter(|sent| sent.is_intact_scan()).collect();
     let at = |hash: &String| truth.iter().position(|sent| &sent.hash == hash).expect("it was sent");
     let span = &truth[at(&received[0])..=at(&received[received.len() - 1])];
     let lost = span.iter().filter(|sent| !received.contains(&sent.hash)).count();
@@ -59,7 +61,7 @@ fn what_is_sent_while_a_killed_hub_is_replaced_waits_in_the_line() {
     sorted.dedup();
     assert_eq!(sorted.len(), received.len(), "twice");
     println!("{lost} of {} telegrams lost by {} kills", span.len(), KILLS + 1);
-    assert_eq!(stage.simulated("front").1, 0, "EEPROM");
+    assert_eq!(env.simulated("front").1, 0, "EEPROM");
 }
 
 /// Waits for telegrams of a life of the hub that none of `boots` is: those of another one may still wait to be read.
@@ -72,24 +74,24 @@ fn live(telegrams: &mut Program, boots: &mut HashSet<String>) {
 
 #[test]
 fn scans_go_on_with_the_first_telegram_of_the_next_hub() {
-    let stage = Stage::new();
-    let simulator = stage.simulator(&["front"], &["--seed=8", "--baud=500000"]);
-    let mut supervisor = stage.supervisor();
-    let flags = [stage.link("front")];
-    let hub = stage.service(&mut supervisor, &flags, None).ready();
+    let env = TestEnv::new();
+    let simulator = env.simulator(&["front"], &["--seed=8", "--baud=500000"]);
+    let mut supervisor = env.supervisor();
+    let flags = [env.link("front")];
+    let hub = env.service(&mut supervisor, &flags, None).ready();
     supervisor.hear("FDNAME=front");
-    let mut samples = stage.echo(&["front/telegram", "front/scan"]);
+    let mut samples = env.echo(&["front/telegram", "front/scan"]);
     let scans = samples.await_lines(20, "a scan", is_class("scan"));
     let of_next = |line: &Value| line["boot"] != scans[0]["boot"];
     assert_eq!(hub.end(KILL).code, None);
-    let hub = stage.service(&mut supervisor, &flags, None).ready();
+    let hub = env.service(&mut supervisor, &flags, None).ready();
     let first =
         samples.await_line("a measured telegram", |line| of_next(line) && line["command"] == MEASURED);
     let scan = samples.await_line("its scan", |line| of_next(line) && line["class"] == "scan");
     assert_eq!(scan["seq"], first["seq"], "{scan}");
     assert_eq!((&scan["unit_mm"], &scan["count"]), (&scans[0]["unit_mm"], &scans[0]["count"]));
     // Its status is asked all the same, its type is known.
-    let info = stage.await_info("front", |info| info["counters"]["telegrams"].as_u64() > Some(100));
+    let info = env.await_info("front", |info| info["counters"]["telegrams"].as_u64() > Some(100));
     assert_eq!((&info["type"], &info["mode"]), (&"LMS200;301063;V02.30".into(), &1.into()), "{info}");
     assert_eq!(hub.end(TERM).code, Some(0));
     drop(samples);
@@ -98,49 +100,49 @@ fn scans_go_on_with_the_first_telegram_of_the_next_hub() {
 
 #[test]
 fn a_port_that_went_is_given_back_and_another_link_s_is_not_taken() {
-    let stage = Stage::new();
-    let simulator = stage.simulator(&["front"], &["--seed=6", "--baud=500000"]);
-    let mut supervisor = stage.supervisor();
-    let hub = stage.service(&mut supervisor, &[stage.link("front")], None).ready();
+    let env = TestEnv::new();
+    let simulator = env.simulator(&["front"], &["--seed=6", "--baud=500000"]);
+    let mut supervisor = env.supervisor();
+    let hub = env.service(&mut supervisor, &[env.link("front")], None).ready();
     supervisor.hear("FDNAME=front");
     supervisor.hear("READY=1");
     assert_eq!(hub.end(KILL).code, None);
     // The next one has a link of another name: what was kept is nobody's.
-    let side = format!("--link=side={}", stage.word("side"));
-    let hub = stage.service(&mut supervisor, &[side], None).ready();
+    let side = format!("--link=side={}", env.word("side"));
+    let hub = env.service(&mut supervisor, &[side], None).ready();
     supervisor.hear("FDSTOREREMOVE=1");
     supervisor.hear("STATUS=sensors: side");
     assert_eq!(hub.end(TERM).code, Some(0));
     // It was closed: whoever comes finds it free.
-    let hub = stage.service(&mut supervisor, &[stage.link("front")], None).ready();
+    let hub = env.service(&mut supervisor, &[env.link("front")], None).ready();
     supervisor.hear("FDNAME=front");
-    stage.await_info("front", |info| info["state"] == "streaming");
-    stage.kill_simulator(simulator, "front");
+    env.await_info("front", |info| info["state"] == "streaming");
+    env.kill_simulator(simulator, "front");
     supervisor.hear("FDSTOREREMOVE=1");
-    let info = stage.await_info("front", |info| info["state"] == "absent");
+    let info = env.await_info("front", |info| info["state"] == "absent");
     assert_eq!(number(&info["counters"], "reconnects"), 1);
     assert_eq!(hub.end(TERM).code, Some(0));
 }
 
 #[test]
 fn a_link_that_got_another_name_goes_on_with_its_port() {
-    let stage = Stage::new();
-    let simulator = stage.simulator(&["front"], &["--seed=7", "--baud=500000"]);
-    let mut supervisor = stage.supervisor();
-    let hub = stage.service(&mut supervisor, &[stage.link("front")], None).ready();
+    let env = TestEnv::new();
+    let simulator = env.simulator(&["front"], &["--seed=7", "--baud=500000"]);
+    let mut supervisor = env.supervisor();
+    let hub = env.service(&mut supervisor, &[env.link("front")], None).ready();
     supervisor.hear("FDNAME=front");
     supervisor.hear("READY=1");
     assert_eq!(hub.end(KILL).code, None);
     // Whoever keeps it has it locked: it cannot be opened, only taken over.
-    let side = format!("--link=side={}", stage.word("front"));
-    let hub = stage.service(&mut supervisor, &[side], None).ready();
+    let side = format!("--link=side={}", env.word("front"));
+    let hub = env.service(&mut supervisor, &[side], None).ready();
     supervisor.hear("FDSTOREREMOVE=1");
     supervisor.hear("FDNAME=side");
     supervisor.hear("READY=1");
     assert_eq!(hub.end(KILL).code, None);
     // The name has another port now: what was kept under it is not kept beside the new one.
-    let side = format!("--link=side={}", stage.word("nowhere"));
-    let hub = stage.service(&mut supervisor, &[side], None).ready();
+    let side = format!("--link=side={}", env.word("nowhere"));
+    let hub = env.service(&mut supervisor, &[side], None).ready();
     supervisor.hear("FDSTOREREMOVE=1");
     supervisor.hear("STATUS=sensors: side");
     assert_eq!(hub.end(TERM).code, Some(0));
@@ -149,10 +151,10 @@ fn a_link_that_got_another_name_goes_on_with_its_port() {
 
 #[test]
 fn the_watchdog_is_fed_while_links_work() {
-    let stage = Stage::new();
-    let mut supervisor = stage.supervisor();
+    let env = TestEnv::new();
+    let mut supervisor = env.supervisor();
     // A port that is not there is no link that hangs.
-    let hub = stage.service(&mut supervisor, &[stage.link("front")], Some(Duration::from_secs(2))).ready();
+    let hub = env.service(&mut supervisor, &[env.link("front")], Some(Duration::from_secs(2))).ready();
     for _ in 0..3 {
         supervisor.hear("WATCHDOG=1");
     }

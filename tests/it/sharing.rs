@@ -34,7 +34,7 @@ fn among_users(name: &str, test: impl FnOnce()) {
     };
     let is_root = rustix::process::getuid().is_root();
     if !is_root || !unshare("true").output().is_ok_and(|output| output.status.success()) {
-        eprintln!("skipped: only root can be two users, and needs namespaces and `ip` for it");
+        testkit::skip("root", "only root can be two users, and needs namespaces and `ip` for it");
         return;
     }
     let mut inside = unshare(&format!("exec /mnt/test --exact {name} --nocapture"));
@@ -140,9 +140,9 @@ fn consumers_under_another_user_get_what_the_page_says() {
 #[test]
 fn the_page_s_configuration_is_one() {
     let block = PAGE.split("```toml\n").nth(1).and_then(|rest| rest.split("```").next()).expect("a block");
-    let stage = testkit::Stage::new();
-    let file = stage.file("scanhub.toml", block);
-    let shown = stage.run(&[
+    let env = testkit::TestEnv::new();
+    let file = env.file("scanhub.toml", block);
+    let shown = env.run(&[
         "config",
         "show",
         "--json",

@@ -4,11 +4,11 @@ use std::io::{Read, Write};
 use std::thread::sleep;
 use std::time::Duration;
 
-use crate::testkit::{Stage, TERM, number, open_line, until};
+use crate::testkit::{TERM, TestEnv, number, open_line, until};
 
 #[test]
 fn a_sensor_with_a_past_tells_it_when_it_is_asked() {
-    let stage = Stage::new();
+    let env = TestEnv::new();
     let flags = [
         "--permanent-baud=38400",
         "--state=installation",
@@ -20,8 +20,8 @@ fn a_sensor_with_a_past_tells_it_when_it_is_asked() {
         "--pollution=60",
         "--short-configuration",
     ];
-    let simulator = stage.simulator(&["front"], &flags);
-    let outcome = stage.run(&["probe", &stage.word("front"), "--json"]);
+    let simulator = env.simulator(&["front"], &flags);
+    let outcome = env.run(&["probe", &env.word("front"), "--json"]);
     assert_eq!(outcome.code, Some(0), "{outcome}");
     let [found] = &outcome.lines()[..] else { panic!("{outcome}") };
     assert_eq!((number(found, "baud"), number(found, "operating_mode")), (38_400, 0), "{found}");
@@ -30,19 +30,19 @@ fn a_sensor_with_a_past_tells_it_when_it_is_asked() {
     assert_eq!(found["errors"].as_array().map(Vec::len), Some(2), "{found}");
     assert_eq!(found["configuration"].as_str().map(str::len), Some(64), "{found}");
     assert_eq!(simulator.end(TERM).code, Some(0));
-    assert_eq!(stage.simulated("front").1, 0);
+    assert_eq!(env.simulated("front").1, 0);
 }
 
 #[test]
 fn faults_are_named_in_the_truth() {
-    let stage = Stage::new();
+    let env = TestEnv::new();
     let fault = "--fault=truncate=0.3,length=0.3";
-    let simulator = stage.simulator(&["front"], &["--baud=500000", "--state=streaming", fault]);
-    let hub = stage.hub(&[stage.link("front")]);
-    stage.await_info("front", |info| info["state"] == "streaming");
+    let simulator = env.simulator(&["front"], &["--baud=500000", "--state=streaming", fault]);
+    let hub = env.hub(&[env.link("front")]);
+    env.await_info("front", |info| info["state"] == "streaming");
     for name in ["truncated", "length", "unread"] {
         until(name, || {
-            let text = std::fs::read_to_string(stage.path("truth")).unwrap_or_default();
+            let text = std::fs::read_to_string(env.path("truth")).unwrap_or_default();
             text.contains(&format!(r#""fault":"{name}""#))
         });
     }
@@ -53,9 +53,9 @@ fn faults_are_named_in_the_truth() {
 /// A host that stopped in the middle of a request and finds no answer is told why.
 #[test]
 fn a_request_that_is_dropped_is_said() {
-    let stage = Stage::new();
-    let simulator = stage.simulator(&["front"], &["--seed=3"]);
-    let mut port = open_line(&stage.path("front"), 9_600);
+    let env = TestEnv::new();
+    let simulator = env.simulator(&["front"], &["--seed=3"]);
+    let mut port = open_line(&env.path("front"), 9_600);
     // A status request (Telegram listing, 31h), its second half far too late: a machine that stands still meanwhile does
     // not excuse half a second.
     port.write_all(&[0x02, 0x00, 0x01]).expect("room");
@@ -69,7 +69,7 @@ fn a_request_that_is_dropped_is_said() {
     let outcome = simulator.end(TERM);
     let said = format!(
         "{}: a request was dropped: more than 6 ms of silence after 3 of its bytes",
-        stage.word("front")
+        env.word("front")
     );
     assert_eq!(outcome.code, Some(0));
     assert!(outcome.errors.contains(&said), "{outcome}");

@@ -8,7 +8,7 @@ use std::path::{Path, PathBuf};
 use std::process::Command;
 
 use crate::testkit;
-use crate::testkit::{INT, KILL, Outcome, Program, Stage, TERM, is_class, until};
+use crate::testkit::{INT, KILL, Outcome, Program, TERM, TestEnv, is_class, until};
 
 /// Where the namespace is made: the test that shall run in it.
 const INSIDE: &str = "SCANHUB_TEST_STRANGERS";
@@ -32,7 +32,7 @@ fn beside_a_stranger(name: &str, test: impl FnOnce()) {
     };
     let is_root = rustix::process::getuid().is_root();
     if !is_root || !unshare("true").output().is_ok_and(|output| output.status.success()) {
-        eprintln!("skipped: only root can be two users, and needs a mount namespace for it");
+        testkit::skip("root", "only root can be two users, and needs a mount namespace for it");
         return;
     }
     let mut inside = unshare(&format!("exec /mnt/test --exact {name} --nocapture"));
@@ -145,9 +145,9 @@ fn links_in_a_domain_and_on_the_way_to_it() {
     });
 }
 
-/// Segments and bells of `stage`.
-fn segments(stage: &Stage) -> Vec<PathBuf> {
-    let mut paths = testkit::shared_memory(&stage.place().prefix());
+/// Segments and bells of `env`.
+fn segments(env: &TestEnv) -> Vec<PathBuf> {
+    let mut paths = testkit::shared_memory(&env.place().prefix());
     paths.sort();
     paths
 }
@@ -157,12 +157,12 @@ fn shared_memory_of_strangers() {
     beside_a_stranger("strangers::shared_memory_of_strangers", || {
         // Both would be the names, if they could be guessed.
         stranger("touch /dev/shm/sh_scanhub_front.bell");
-        let stage = Stage::new();
-        let simulator = stage.simulator(&["front"], &["--baud=500000"]);
-        let hub = stage.hub(&[stage.link("front")]);
-        let mut consumer = stage.echo(&["front/scan"]);
+        let env = TestEnv::new();
+        let simulator = env.simulator(&["front"], &["--baud=500000"]);
+        let hub = env.hub(&[env.link("front")]);
+        let mut consumer = env.echo(&["front/scan"]);
         consumer.await_lines(3, "a scan", is_class("scan"));
-        let own = segments(&stage);
+        let own = segments(&env);
         assert!(own.iter().any(|path| path.to_string_lossy().ends_with(".global_mgmt")), "{own:?}");
         for path in &own {
             let mode = fs::metadata(path).expect("is there").mode();
@@ -179,13 +179,13 @@ fn shared_memory_of_strangers() {
             }
         }
         // A file of no use under the names, which all can see now, is in nobody's way.
-        let prefix = fs::read_to_string(stage.place().root().join("prefix")).expect("the hub's");
+        let prefix = fs::read_to_string(env.place().root().join("prefix")).expect("the hub's");
         let prefix = prefix.trim_end();
         stranger(&format!("touch /dev/shm/{prefix}anything; ln -s /mnt/letter /dev/shm/{prefix}link"));
         fs::write("/mnt/letter", LETTER).expect("a file");
-        let mut second = stage.echo(&["front/zones"]);
+        let mut second = env.echo(&["front/zones"]);
         second.await_line("a verdict", is_class("zones"));
-        let told = stage.run(&["doctor", "--json", "--no-system-config"]);
+        let told = env.run(&["doctor", "--json", "--no-system-config"]);
         let told = told.lines().into_iter().find(|line| line["name"] == "strangers").expect("a finding");
         let text = told.to_string();
         assert!(text.contains(&format!("{prefix}anything")) && text.contains("65533"), "{text}");
@@ -193,18 +193,18 @@ fn shared_memory_of_strangers() {
         // The bell goes with the hub; who waits keeps the names, so that a stranger can occupy it meanwhile.
         assert_eq!(hub.end(TERM).code, Some(0));
         stranger(&format!("mkfifo /dev/shm/{prefix}front.bell"));
-        let refused = stage.run(&["run", "--no-system-config", &stage.link("front")]);
+        let refused = env.run(&["run", "--no-system-config", &env.link("front")]);
         assert_eq!(refused.code, Some(1), "{refused}");
         for word in [&format!("{prefix}front.bell belongs to user 65533"), "sudo rm"] {
             assert!(refused.errors.contains(word), "{word}: {refused}");
         }
         stranger(&format!("rm /dev/shm/{prefix}front.bell"));
-        let hub = stage.hub(&[stage.link("front")]);
+        let hub = env.hub(&[env.link("front")]);
         consumer.await_line("the next hub's", |line| line["kind"] == "hub_back");
         consumer.await_line("a scan", is_class("scan"));
         // Killed, it leaves all of them.
         assert_eq!(hub.end(KILL).code, None);
-        let hub = stage.hub(&[stage.link("front")]);
+        let hub = env.hub(&[env.link("front")]);
         consumer.await_line("the third hub's", |line| line["kind"] == "hub_back");
         consumer.await_line("a scan", is_class("scan"));
         for program in [consumer, second, hub] {
@@ -212,12 +212,12 @@ fn shared_memory_of_strangers() {
         }
         // After the last one nothing but the stranger's is there, and none of it was written to.
         assert_eq!(
-            segments(&stage),
+            segments(&env),
             [format!("/dev/shm/{prefix}anything"), format!("/dev/shm/{prefix}link")].map(PathBuf::from)
         );
         assert_eq!(fs::read_to_string("/mnt/letter").expect("a file"), LETTER);
-        let next = stage.hub(&[stage.link("front")]);
-        let others = fs::read_to_string(stage.place().root().join("prefix")).expect("the hub's");
+        let next = env.hub(&[env.link("front")]);
+        let others = fs::read_to_string(env.place().root().join("prefix")).expect("the hub's");
         assert_ne!(others.trim_end(), prefix);
         assert_eq!((next.end(INT).code, simulator.end(INT).code), (Some(0), Some(0)));
     });

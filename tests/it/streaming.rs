@@ -1,7 +1,7 @@
 //! Two sensors that stream into a running hub, and consumers in processes of their own: everything that was sent
 //! arrives, bit for bit and in order, and all verbs tell the same of it.
 
-use crate::testkit::{INT, MEASURED, Stage, TERM, bytes_of, hash, is_class, number, sequence};
+use crate::testkit::{INT, MEASURED, TERM, TestEnv, bytes_of, hash, is_class, number, sequence};
 use lms::framer::{Found, Framer};
 use lms::measured::Measured;
 use lms::telegram::Telegram;
@@ -10,19 +10,19 @@ use serde_json::Value;
 
 #[test]
 fn everything_sent_arrives_bit_for_bit_and_in_order() {
-    let stage = Stage::new();
-    let hub = stage.hub(&[stage.link("front"), stage.link("rear")]);
+    let env = TestEnv::new();
+    let hub = env.hub(&[env.link("front"), env.link("rear")]);
     let sensors = ["front", "rear"];
     // They listen before anything is sent: nothing may be missing from the very first on.
     let mut consumers =
-        sensors.map(|sensor| ["telegram", "scan"].map(|topic| stage.echo(&[&format!("{sensor}/{topic}")])));
-    let simulator = stage.simulator(&sensors, &["--seed=11"]);
+        sensors.map(|sensor| ["telegram", "scan"].map(|topic| env.echo(&[&format!("{sensor}/{topic}")])));
+    let simulator = env.simulator(&sensors, &["--seed=11"]);
     for [telegrams, scans] in &mut consumers {
         telegrams.await_lines(300, "a measured telegram", |line| line["command"] == MEASURED);
         scans.await_lines(300, "a scan", is_class("scan"));
     }
     for (sensor, [telegrams, scans]) in sensors.into_iter().zip(consumers) {
-        let truth = stage.truth(sensor);
+        let truth = env.truth(sensor);
         let telegrams = telegrams.end(INT).of_class("telegram");
         let scans = scans.end(INT).of_class("scan");
         let intact: Vec<_> =
@@ -44,8 +44,8 @@ fn everything_sent_arrives_bit_for_bit_and_in_order() {
     assert_eq!(hub.end(TERM).code, Some(0));
     assert_eq!(simulator.end(TERM).code, Some(0));
     for sensor in sensors {
-        let (sent, eeprom_writes) = stage.simulated(sensor);
-        assert_eq!((sent, eeprom_writes), (stage.truth(sensor).len() as u64, 0));
+        let (sent, eeprom_writes) = env.simulated(sensor);
+        assert_eq!((sent, eeprom_writes), (env.truth(sensor).len() as u64, 0));
     }
 }
 
@@ -74,21 +74,21 @@ fn check_scan(scan: &Value, telegram: &[u8]) {
 
 #[test]
 fn the_bytes_themselves_and_what_all_verbs_say_agree() {
-    let stage = Stage::new();
-    let _simulator = stage.simulator(&["front"], &["--seed=12", "--baud=500000"]);
-    let hub = stage.hub(&[stage.link("front")]);
-    let mut raw = stage.start(&["echo", "--raw", "front/telegram"]);
+    let env = TestEnv::new();
+    let _simulator = env.simulator(&["front"], &["--seed=12", "--baud=500000"]);
+    let hub = env.hub(&[env.link("front")]);
+    let mut raw = env.start(&["echo", "--raw", "front/telegram"]);
     raw.await_bytes(40 * 732);
-    let rate = stage.run(&["hz", "front/scan", "--json", "-n", "60"]);
+    let rate = env.run(&["hz", "front/scan", "--json", "-n", "60"]);
     let summary = &rate.of_class("summary")[0];
     assert_eq!((rate.code, number(summary, "received"), number(summary, "lost")), (Some(0), 60, 0), "{rate}");
     let hz = summary["hz"].as_f64().unwrap_or_default();
-    let listed = stage.run(&["list", "--json"]).of_class("topic");
+    let listed = env.run(&["list", "--json"]).of_class("topic");
     let topics: Vec<_> = listed.iter().map(|line| (&line["topic"], &line["payload"])).collect();
     let expected = Topic::ALL.map(|topic| (topic.name().into(), topic.payload().into()));
     assert_eq!(topics, expected.each_ref().map(|(name, payload): &(Value, Value)| (name, payload)));
     assert_eq!(number(&listed[0], "subscribers"), 1, "{listed:?}");
-    let info = stage.await_info("front", |info| info["hz"].as_f64().is_some_and(|hz| hz > 0.0));
+    let info = env.await_info("front", |info| info["hz"].as_f64().is_some_and(|hz| hz > 0.0));
     // Two looks at the same stream; neither is exact on a busy machine.
     let told = info["hz"].as_f64().unwrap_or_default();
     assert!((told / hz - 1.0).abs() < 0.3, "info says {told}, hz {hz}");

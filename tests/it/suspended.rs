@@ -6,28 +6,28 @@ use std::thread;
 use std::time::Duration;
 
 use crate::testkit;
-use crate::testkit::{INT, Sender, Stage, TERM, bytes_of, hash, in_a_network, is_class, number, until};
+use crate::testkit::{INT, Sender, TERM, TestEnv, bytes_of, hash, in_a_network, is_class, number, until};
 use rustix::process::Signal;
 use rustix::time::{ClockId, clock_gettime};
 use schema::{Topic, Verdict, Zones};
 
 #[test]
 fn a_hub_that_was_stopped() {
-    let stage = Stage::new();
-    let simulator = stage.simulator(&["front"], &["--seed=31", "--baud=500000"]);
-    let hub = stage.hub(&[stage.link("front")]);
-    let mut consumer = stage.echo(&["front/telegram", "front/scan", "front/zones", "front/status"]);
+    let env = TestEnv::new();
+    let simulator = env.simulator(&["front"], &["--seed=31", "--baud=500000"]);
+    let hub = env.hub(&[env.link("front")]);
+    let mut consumer = env.echo(&["front/telegram", "front/scan", "front/zones", "front/status"]);
     consumer.await_lines(20, "a telegram", is_class("telegram"));
     let stopped = now();
     hub.signal(Signal::STOP);
-    let lost = |stage: &Stage| stage.truth("front").iter().filter(|sent| sent.fault.is_some()).count();
-    let before = lost(&stage);
+    let lost = |env: &TestEnv| env.truth("front").iter().filter(|sent| sent.fault.is_some()).count();
+    let before = lost(&env);
     // The buffer is full, and more than a second passes.
-    until("telegrams are lost", || lost(&stage) > before + 50);
+    until("telegrams are lost", || lost(&env) > before + 50);
     let continued = now();
     hub.signal(Signal::CONT);
     consumer.await_lines(60, "a telegram", is_class("telegram"));
-    let info = stage.await_info("front", |info| number(&info["counters"], "bytes_discarded") > 0);
+    let info = env.await_info("front", |info| number(&info["counters"], "bytes_discarded") > 0);
     assert_eq!((&info["state"], number(&info["counters"], "resyncs")), (&"streaming".into(), 0), "{info}");
     assert_eq!(hub.end(TERM).code, Some(0));
     assert_eq!(simulator.end(INT).code, Some(0));
@@ -35,7 +35,7 @@ fn a_hub_that_was_stopped() {
     let outcome = consumer.end(INT);
     let lines = outcome.of_class("telegram");
     let got: Vec<String> = lines.iter().map(|line| hash(&bytes_of(line))).collect();
-    let truth = stage.truth("front");
+    let truth = env.truth("front");
     let at = |hash: &String| truth.iter().position(|sent| sent.hash == *hash).expect("it was sent");
     let places: Vec<usize> = got.iter().map(at).collect();
     let (Some(&first), Some(&last)) = (places.first(), places.last()) else { panic!("nothing came") };
@@ -78,10 +78,10 @@ fn now() -> u64 {
 /// that it is an estimate.
 #[test]
 fn a_stamp_is_right_or_says_that_it_is_an_estimate() {
-    let stage = Stage::new();
-    let simulator = stage.simulator(&["front"], &["--seed=7", "--baud=500000"]);
-    let hub = stage.hub(&[stage.link("front")]);
-    let mut consumer = stage.echo(&["front/telegram"]);
+    let env = TestEnv::new();
+    let simulator = env.simulator(&["front"], &["--seed=7", "--baud=500000"]);
+    let hub = env.hub(&[env.link("front")]);
+    let mut consumer = env.echo(&["front/telegram"]);
     consumer.await_lines(150, "a telegram", is_class("telegram"));
     let mut stops = Vec::new();
     for span_ms in [300, 600, 1_000, 1_500, 3_000] {
@@ -95,7 +95,7 @@ fn a_stamp_is_right_or_says_that_it_is_an_estimate() {
     assert_eq!(hub.end(TERM).code, Some(0));
     assert_eq!(simulator.end(INT).code, Some(0));
     let outcome = consumer.end(INT);
-    let truth = stage.truth("front");
+    let truth = env.truth("front");
     let mut place = 0;
     // The sensor keeps its beat from its last reply on, also where the simulator was late to write: those that it wrote
     // soonest tell when.
@@ -152,8 +152,8 @@ fn median(values: &mut [i64]) -> i64 {
 #[test]
 fn what_waited_for_a_listener_that_was_stopped_is_not_new() {
     in_a_network("suspended::what_waited_for_a_listener_that_was_stopped_is_not_new", || {
-        let stage = Stage::new();
-        let mut listener = stage.start(&["listen", "--json"]).ready();
+        let env = TestEnv::new();
+        let mut listener = env.start(&["listen", "--json"]).ready();
         let mut sender = Sender::new(0x5f3a_12bc_00d1_e2f3, 7, 2, "front");
         listener.signal(Signal::STOP);
         let before = now();

@@ -3,7 +3,7 @@
 
 use std::fs;
 
-use crate::testkit::{Outcome, Stage, TERM};
+use crate::testkit::{Outcome, TERM, TestEnv};
 use lms::telegram::Writer;
 
 /// C0, DEL and C1, as a terminal takes them for a command.
@@ -19,21 +19,21 @@ fn is_text(outcome: &Outcome) {
 
 #[test]
 fn a_configuration_commands_no_terminal() {
-    let stage = Stage::new();
+    let env = TestEnv::new();
     let quoted: String = HOSTILE.chars().map(|c| format!("\\u{:04x}", c as u32)).collect();
     let port = format!("/dev/{quoted}");
-    let sound = stage.file(
+    let sound = env.file(
         "sound.toml",
         format!("[[link]]\nname = \"a\"\nport = \"{port}\"\n[gateway]\ninterface = \"{quoted}\"\n"),
     );
     // Bytes that no TOML has, in a comment, a key and a value; C1 it may have.
-    let raw = stage.file("raw.toml", "[[link]]\nname = \"a\"\npo\u{1b}[2Jrt = 1\n");
-    let value = stage.file("value.toml", "[[link]]\nname = \"\u{9b}31m\"\nport = \"x\"\n");
-    let key = stage.file("key.toml", "[[link]]\n\"\u{9b}31m\\u001b\" = 1\n");
-    let name = stage.word(&format!("{HOSTILE}.toml"));
+    let raw = env.file("raw.toml", "[[link]]\nname = \"a\"\npo\u{1b}[2Jrt = 1\n");
+    let value = env.file("value.toml", "[[link]]\nname = \"\u{9b}31m\"\nport = \"x\"\n");
+    let key = env.file("key.toml", "[[link]]\n\"\u{9b}31m\\u001b\" = 1\n");
+    let name = env.word(&format!("{HOSTILE}.toml"));
     fs::write(&name, "nothing = 1\n").expect("a file of any name");
     for json in [&[][..], &["--json"]] {
-        let with = |words: &[&str]| stage.run(&[words, json].concat());
+        let with = |words: &[&str]| env.run(&[words, json].concat());
         for (code, outcome) in [
             (0, with(&["config", "check", &sound])),
             (0, with(&["config", "show", "--config", &sound])),
@@ -50,14 +50,14 @@ fn a_configuration_commands_no_terminal() {
         }
     }
     // JSON says what is there.
-    let outcome = stage.run(&["config", "check", &sound, "--json"]);
+    let outcome = env.run(&["config", "check", &sound, "--json"]);
     assert_eq!(outcome.lines()[0]["links"][0]["port"], format!("/dev/{HOSTILE}"), "{outcome}");
     // The log of a hub, its status, and who shows that.
-    let hub = stage.hub(&["--config", &sound]);
+    let hub = env.hub(&["--config", &sound]);
     for verb in
         [&["info", "a"][..], &["info", "a", "--json"], &["list"], &["echo", "a/status", "-n1", "--json"]]
     {
-        let outcome = stage.run(verb);
+        let outcome = env.run(verb);
         assert_eq!(outcome.code, Some(0), "{outcome}");
         is_text(&outcome);
     }
@@ -68,11 +68,11 @@ fn a_configuration_commands_no_terminal() {
 
 #[test]
 fn a_line_commands_no_terminal() {
-    let stage = Stage::new();
+    let env = TestEnv::new();
     let bytes = Writer::new(0x80, 0xBA).slice(HOSTILE.as_bytes()).byte(0x10).finish();
-    let file = stage.file("type.bin", bytes.bytes());
+    let file = env.file("type.bin", bytes.bytes());
     for flags in [&[][..], &["--all"], &["--json"]] {
-        let outcome = stage.run(&[&["telegram", "decode", &file], flags].concat());
+        let outcome = env.run(&[&["telegram", "decode", &file], flags].concat());
         assert_eq!(outcome.code, Some(0), "{outcome}");
         is_text(&outcome);
     }

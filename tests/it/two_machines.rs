@@ -4,7 +4,7 @@
 use std::collections::{BTreeMap, BTreeSet};
 
 use crate::testkit::{
-    INT, Machine, Outcome, Program, Relay, Robot, Stage, TERM, in_a_network, is_class, number, read, until,
+    INT, Machine, Outcome, Program, Relay, Robot, TERM, TestEnv, in_a_network, is_class, number, read, until,
 };
 use schema::Topic;
 use schema::datagram::Announce;
@@ -21,8 +21,8 @@ fn gateway(robot: &Robot) -> Program {
     robot.gateway(&Topic::ALL.map(|topic| format!("--topic=*/{}", topic.name())))
 }
 
-fn listener(stage: &Stage, words: &[&str]) -> Program {
-    stage.start(&[&["listen", "--json"], words].concat()).ready()
+fn listener(env: &TestEnv, words: &[&str]) -> Program {
+    env.start(&[&["listen", "--json"], words].concat()).ready()
 }
 
 /// What a listener says of each stream: received, lost, duplicate, reordered.
@@ -107,14 +107,14 @@ fn every_listener_knows_exactly_what_it_missed() {
         let robot = Robot::new(&["front", "rear"]);
         let relay = Relay::new(&robot.machine, 7);
         assert_eq!(relay.connect(&second), 0);
-        let stage = Stage::on(&second);
-        let early = listener(&stage, &["--stats"]);
+        let env = TestEnv::on(&second);
+        let early = listener(&env, &["--stats"]);
         let gateway = gateway(&robot);
         until("all topics of both sensors", || truth(&relay.log()).len() == 2 * (Topic::ALL.len() + 1));
         relay.set_rough(true);
         until("half of what is rough", || relay.log().len() > MANY / 2);
-        let stage = Stage::on(&third);
-        let late = listener(&stage, &["--stats"]);
+        let env = TestEnv::on(&third);
+        let late = listener(&env, &["--stats"]);
         let before_late = relay.connect(&third);
         until("the other half", || relay.log().len() > before_late + MANY / 2);
         // The last announcement gets through, so that what was lost at the end is known to be.
@@ -159,16 +159,16 @@ fn a_sensor_of_another_machine_is_followed_as_one_here() {
         let relay = Relay::new(&robot.machine, 7);
         relay.connect(&second);
         let gateway = gateway(&robot);
-        let stage = Stage::on(&second);
-        let listener = listener(&stage, &["--publish"]);
+        let env = TestEnv::on(&second);
+        let listener = listener(&env, &["--publish"]);
         until("the first announcement", || !names(&relay.log()).is_empty());
         let hub = format!("{:016x}", read(&relay.log()[0]).head.hub);
         let (front, rear) = (format!("{hub}.front/scan"), format!("{hub}.rear/zones"));
-        let topics = || stage.run(&["list", "--json"]).of_class("topic").len();
+        let topics = || env.run(&["list", "--json"]).of_class("topic").len();
         until("both sensors are published", || topics() == 2 * Topic::ALL.len());
-        let mut hz = stage.start(&["hz", "--json", &front]);
-        let mut there = robot.stage.echo(&["front/scan"]);
-        let mut here = stage.echo(&[&front, &rear]);
+        let mut hz = env.start(&["hz", "--json", &front]);
+        let mut there = robot.env.echo(&["front/scan"]);
+        let mut here = env.echo(&[&front, &rear]);
         let scan = here.await_lines(40, "a scan", is_class("scan")).pop().expect("forty");
         let same = there.await_line("the same scan", |line| line["seq"] == scan["seq"]);
         assert_eq!((&scan["ranges"], &scan["wall_ns"]), (&same["ranges"], &same["wall_ns"]));
@@ -184,6 +184,6 @@ fn a_sensor_of_another_machine_is_followed_as_one_here() {
         assert_eq!(listener.end(TERM).code, Some(0));
         here.await_line("the news", |line| line["kind"] == "hub_gone");
         drop((here.end(INT), hz.end(INT)));
-        assert!(stage.left_behind().is_empty(), "{:?}", stage.left_behind());
+        assert!(env.left_behind().is_empty(), "{:?}", env.left_behind());
     });
 }

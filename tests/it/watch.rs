@@ -6,7 +6,7 @@ use std::process::Command;
 use std::time::Duration;
 
 use crate::testkit;
-use crate::testkit::{INT, KILL, Sitting, Stage, TERM, Tmux, can_sit};
+use crate::testkit::{INT, KILL, Sitting, TERM, TestEnv, Tmux, can_sit};
 use rustix::process::Signal;
 
 const SIZE: (u16, u16) = (60, 20);
@@ -17,8 +17,8 @@ const WORLD: &str =
 [[thing]]\nradius_mm = 20\npose = [0, 400]\n
 [[thing]]\nline = [[900, 2000], [1000, 2000]]\nsurface = \"reflector\"\n";
 
-fn sit(stage: &Stage, arguments: &[&str]) -> Sitting {
-    let mut command = stage.command(&[&["watch"], arguments].concat());
+fn sit(env: &TestEnv, arguments: &[&str]) -> Sitting {
+    let mut command = env.command(&[&["watch"], arguments].concat());
     command.env_remove("NO_COLOR");
     Sitting::start(&command, SIZE)
 }
@@ -29,11 +29,11 @@ fn is_braille(sign: char) -> bool {
 
 #[test]
 fn files_and_pipes_are_refused() {
-    let stage = Stage::new();
-    let outcome = stage.run(&["watch", "front"]);
+    let env = TestEnv::new();
+    let outcome = env.run(&["watch", "front"]);
     assert_eq!((outcome.code, &outcome.out[..]), (Some(2), &b""[..]), "{outcome}");
     assert!(outcome.errors.contains("scanhub echo front/scan"), "{outcome}");
-    let outcome = stage.run(&["watch", "--json"]);
+    let outcome = env.run(&["watch", "--json"]);
     assert_eq!(
         (outcome.code, &outcome.of_class("error")[0]["kind"]),
         (Some(2), &"usage".into()),
@@ -46,12 +46,12 @@ fn it_follows_the_hub_the_keys_and_the_window() {
     if !can_sit() {
         return;
     }
-    let stage = Stage::new();
-    let mut watch = sit(&stage, &[]);
+    let env = TestEnv::new();
+    let mut watch = sit(&env, &[]);
     watch.await_words("no hub: waiting for it");
-    let world = format!("--world={}", stage.file("world", WORLD));
-    let _sensor = stage.simulator(&["front"], &["--seed=71", "--baud=500000", &world]);
-    let hub = stage.hub(&[stage.link("front")]);
+    let world = format!("--world={}", env.file("world", WORLD));
+    let _sensor = env.simulator(&["front"], &["--seed=71", "--baud=500000", &world]);
+    let hub = env.hub(&[env.link("front")]);
     watch.await_words("1 front    streaming");
     watch.await_words(" STOP  front, nearest 0.3");
     watch.await_words("0.60!");
@@ -78,7 +78,7 @@ fn it_follows_the_hub_the_keys_and_the_window() {
     watch.press("F");
     watch.await_words("front: background is held as it is");
     watch.await_words("lost 0  frozen");
-    let model = stage.run(&["background", "front", "show"]);
+    let model = env.run(&["background", "front", "show"]);
     assert!(String::from_utf8_lossy(&model.out).contains("frozen"), "{model}");
     watch.press("F");
     watch.await_words("front: background is learned on");
@@ -93,7 +93,7 @@ fn it_follows_the_hub_the_keys_and_the_window() {
     watch.await_words(" UNKNOWN  HELD  front");
     watch.press(" ");
     watch.await_words(" UNKNOWN  front");
-    let hub = stage.hub(&[stage.link("front")]);
+    let hub = env.hub(&[env.link("front")]);
     watch.await_words(" STOP  front");
     watch.await_words(&format!("hub {}", hub.pid()));
     watch.press("q");
@@ -106,29 +106,29 @@ fn the_terminal_is_given_back_however_it_ends() {
     if !can_sit() {
         return;
     }
-    let stage = Stage::new();
+    let env = TestEnv::new();
     for signal in [INT, TERM, Signal::HUP, Signal::QUIT] {
-        let watch = sit(&stage, &[]);
+        let watch = sit(&env, &[]);
         watch.await_words("no hub");
         watch.signal(signal);
         assert_eq!(watch.end(), (Some(0), String::new(), true), "{signal:?}");
     }
     for key in ["q", "\x1b", "\x03"] {
-        let mut watch = sit(&stage, &[]);
+        let mut watch = sit(&env, &[]);
         watch.await_words("no hub");
         watch.press(key);
         assert_eq!(watch.end(), (Some(0), String::new(), true), "{key:?}");
     }
     // As with all that follow: bounded needs a hub.
-    let (code, below, is_whole) = sit(&stage, &["--for=5s"]).end();
+    let (code, below, is_whole) = sit(&env, &["--for=5s"]).end();
     assert!(code == Some(3) && below.contains("scanhub: no hub in domain") && is_whole, "{code:?} {below:?}");
-    let _hub = stage.hub(&[stage.link("front")]);
-    let mut watch = sit(&stage, &["front", "--for=5m"]);
+    let _hub = env.hub(&[env.link("front")]);
+    let mut watch = sit(&env, &["front", "--for=5m"]);
     watch.await_words("1 front");
     watch.press("\x03");
     let (code, _, is_whole) = watch.end();
     assert_eq!((code, is_whole), (Some(130), true));
-    let (code, below, is_whole) = sit(&stage, &["side"]).end();
+    let (code, below, is_whole) = sit(&env, &["side"]).end();
     assert!(code == Some(3) && below.contains("there are front") && is_whole, "{code:?} {below:?}");
 }
 
@@ -137,13 +137,13 @@ fn without_colours_nothing_is_coloured() {
     if !can_sit() {
         return;
     }
-    let stage = Stage::new();
-    let mut command = stage.command(&["watch"]);
+    let env = TestEnv::new();
+    let mut command = env.command(&["watch"]);
     command.env("NO_COLOR", "1");
     let mut watch = Sitting::start(&command, SIZE);
-    let world = format!("--world={}", stage.file("world", WORLD));
-    let _sensor = stage.simulator(&["front"], &["--seed=72", "--baud=500000", &world]);
-    let _hub = stage.hub(&[stage.link("front")]);
+    let world = format!("--world={}", env.file("world", WORLD));
+    let _sensor = env.simulator(&["front"], &["--seed=72", "--baud=500000", &world]);
+    let _hub = env.hub(&[env.link("front")]);
     watch.await_words(" STOP  front");
     watch.await_words("0.60!");
     watch.press("q");
@@ -175,15 +175,15 @@ fn a_terminal_that_is_closed_is_a_quiet_end() {
     if !can_sit() {
         return;
     }
-    let stage = Stage::new();
-    let _sensor = stage.simulator(&["front"], &["--seed=73", "--baud=500000"]);
+    let env = TestEnv::new();
+    let _sensor = env.simulator(&["front"], &["--seed=73", "--baud=500000"]);
     for streams in [false, true] {
-        let _hub = streams.then(|| stage.hub(&[stage.link("front")]));
+        let _hub = streams.then(|| env.hub(&[env.link("front")]));
         // With SIGHUP, as a shell's terminal sends it, and without anybody who tells it.
         for told in [true, false] {
-            let errors = stage.path("errors");
+            let errors = env.path("errors");
             let file = File::create(&errors).expect("a file");
-            let watch = Sitting::start_for_hang_up(&stage.command(&["watch"]), SIZE, told, file);
+            let watch = Sitting::start_for_hang_up(&env.command(&["watch"]), SIZE, told, file);
             watch.await_words(if streams { "1 front    streaming" } else { "no hub: waiting for it" });
             let (code, took) = watch.hang_up();
             let errors = fs::read_to_string(errors).expect("its errors");
@@ -195,11 +195,11 @@ fn a_terminal_that_is_closed_is_a_quiet_end() {
 
 #[test]
 fn in_tmux_it_is_what_it_is_elsewhere() {
-    let stage = Stage::new();
+    let env = TestEnv::new();
     // Should the test be killed, all of it is over after a while.
     let program = env!("CARGO_BIN_EXE_scanhub");
     let line = format!("{program} demo --for=60s; echo ended with $?; sleep 20");
-    let Some(tmux) = Tmux::start(&stage, &line, (80, 30)) else { return };
+    let Some(tmux) = Tmux::start(&env, &line, (80, 30)) else { return };
     let is_picture = |rows: &[String]| rows[1..].iter().flat_map(|row| row.chars()).any(is_braille);
     let streams = |rows: &[String], sensor: &str| {
         rows.iter().any(|row| row.starts_with(sensor) && row.contains("streaming"))

@@ -3,15 +3,15 @@
 
 use serde_json::Value;
 
-use super::{Outcome, Stage};
+use super::{Outcome, TestEnv};
 
 /// All findings of one examination.
 pub(crate) struct Findings(Vec<Value>);
 
 impl Findings {
     /// Those of the program with these arguments.
-    pub(crate) fn of(stage: &Stage, arguments: &[&str]) -> Findings {
-        Findings::in_outcome(&stage.run(&[&["doctor", "--json", "--no-system-config"], arguments].concat()))
+    pub(crate) fn of(env: &TestEnv, arguments: &[&str]) -> Findings {
+        Findings::in_outcome(&env.run(&[&["doctor", "--json", "--no-system-config"], arguments].concat()))
     }
 
     /// Those that it said. Whether one failed it said by its exit code too.

@@ -14,6 +14,7 @@ mod recording;
 mod relay;
 mod robot;
 mod sender;
+mod skip;
 mod supervisor;
 mod telegrams;
 mod terminal;
@@ -42,6 +43,7 @@ pub(crate) use recording::{Kept, Recording, unbroken};
 pub(crate) use relay::Relay;
 pub(crate) use robot::Robot;
 pub(crate) use sender::{Sender, wall_ns};
+pub(crate) use skip::{skip, verdict as skip_verdict};
 pub(crate) use supervisor::Supervisor;
 pub(crate) use telegrams::{MEASURED, Sent, bytes_of, hash, is_class, number, scan, sequence};
 pub(crate) use terminal::{Sitting, can_sit, terminal};
@@ -54,29 +56,29 @@ pub(crate) const PATIENCE: Duration = Duration::from_secs(20);
 pub(crate) const PROGRAM: &str = "SCANHUB_TEST_PROGRAM";
 
 /// A domain and a directory of one test.
-pub(crate) struct Stage {
+pub(crate) struct TestEnv {
     directory: PathBuf,
     domain: String,
     /// Where its programs run, if not where the test does.
     network: Option<PathBuf>,
 }
 
-impl Stage {
-    pub(crate) fn new() -> Stage {
+impl TestEnv {
+    pub(crate) fn new() -> TestEnv {
         static NEXT: AtomicU32 = AtomicU32::new(0);
         let domain = format!("t{}-{}", std::process::id(), NEXT.fetch_add(1, Ordering::Relaxed));
         // Not TMPDIR: root and prefix of a domain have to be short.
         let directory = PathBuf::from(format!("/tmp/{domain}"));
         let made = fs::DirBuilder::new().recursive(true).mode(0o755).create(&directory);
         made.unwrap_or_else(|error| panic!("{}: {error}", directory.display()));
-        Stage { directory, domain, network: None }
+        TestEnv { directory, domain, network: None }
     }
 
     /// One whose programs run on another machine.
-    pub(crate) fn on(machine: &Machine) -> Stage {
-        let mut stage = Stage::new();
-        stage.network = Some(machine.network());
-        stage
+    pub(crate) fn on(machine: &Machine) -> TestEnv {
+        let mut env = TestEnv::new();
+        env.network = Some(machine.network());
+        env
     }
 
     /// Where its hub is, for consumers in the test itself.
@@ -109,7 +111,7 @@ impl Stage {
         self.command_at(&self.directory, arguments)
     }
 
-    /// As [`Stage::command`], with the domain in another directory.
+    /// As [`TestEnv::command`], with the domain in another directory.
     pub(crate) fn command_at<S: AsRef<str>>(&self, root: &Path, arguments: &[S]) -> Command {
         let program = std::env::var(PROGRAM).unwrap_or_else(|_| env!("CARGO_BIN_EXE_scanhub").into());
         let mut command = match &self.network {
@@ -163,7 +165,7 @@ impl Stage {
         gateway
     }
 
-    /// As [`Stage::gateway`], however it begins.
+    /// As [`TestEnv::gateway`], however it begins.
     pub(crate) fn gateway_at<S: AsRef<str>>(&self, flags: &[S]) -> Program {
         self.start(&with(&["gateway", "--json", "--no-system-config"], flags))
     }
@@ -255,7 +257,7 @@ impl Stage {
     }
 }
 
-impl Drop for Stage {
+impl Drop for TestEnv {
     fn drop(&mut self) {
         let _ = fs::remove_dir_all(&self.directory);
         for path in shared_memory(&format!("sh_{}_", self.domain)) {

@@ -2,7 +2,7 @@
 
 use std::process::Command;
 
-use super::{only, own_program, run_again};
+use super::{only, own_program, run_again, skip};
 
 /// Where the namespace is made: the test that shall run in it.
 const INSIDE: &str = "SCANHUB_TEST_NETWORK";
@@ -20,7 +20,7 @@ pub(crate) fn in_a_network(name: &str, test: impl FnOnce()) {
     let mut attempt = Command::new("unshare");
     attempt.args(unshare.get_args()).args(["ip", "link", "set", "lo", "up"]);
     if !attempt.output().is_ok_and(|output| output.status.success()) {
-        eprintln!("skipped: this user may not make a network namespace, or there is no `ip`");
+        skip("netns", "this user may not make a network namespace, or there is no `ip`");
         return;
     }
     let up = "ip link set lo up && exec \"$@\"";

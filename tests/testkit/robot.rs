@@ -1,13 +1,13 @@
 //! A machine that carries sensors, with its hub and what its gateway sends.
 
-use super::{Machine, Program, Stage, is_class};
+use super::{Machine, Program, TestEnv, is_class};
 
 const STREAM: [&str; 2] = ["--seed=61", "--baud=500000"];
 
 /// Machine number 1, on which a hub streams.
 pub(crate) struct Robot {
     pub(crate) machine: Machine,
-    pub(crate) stage: Stage,
+    pub(crate) env: TestEnv,
     pub(crate) hub: Option<Program>,
     links: Vec<String>,
     _simulator: Program,
@@ -17,17 +17,17 @@ impl Robot {
     /// With these sensors.
     pub(crate) fn new(sensors: &[&str]) -> Robot {
         let machine = Machine::new(1);
-        let stage = Stage::on(&machine);
-        let simulator = stage.simulator(sensors, &STREAM);
-        let links = sensors.iter().map(|sensor| stage.link(sensor)).collect();
-        let mut robot = Robot { machine, stage, hub: None, links, _simulator: simulator };
+        let env = TestEnv::on(&machine);
+        let simulator = env.simulator(sensors, &STREAM);
+        let links = sensors.iter().map(|sensor| env.link(sensor)).collect();
+        let mut robot = Robot { machine, env, hub: None, links, _simulator: simulator };
         robot.start();
         robot
     }
 
     /// Starts its hub.
     pub(crate) fn start(&mut self) {
-        self.hub = Some(self.stage.hub(&self.links));
+        self.hub = Some(self.env.hub(&self.links));
     }
 
     /// Its hub, to be ended.
@@ -39,7 +39,7 @@ impl Robot {
     pub(crate) fn gateway<S: AsRef<str>>(&self, flags: &[S]) -> Program {
         let flags = flags.iter().map(|flag| flag.as_ref().to_owned());
         let flags: Vec<String> = flags.chain(["--interface=eth0".to_owned()]).collect();
-        let mut gateway = self.stage.gateway_at(&flags);
+        let mut gateway = self.env.gateway_at(&flags);
         let begin = gateway.await_line("its begin", is_class("gateway"));
         assert_eq!(begin["interface"], "eth0");
         gateway

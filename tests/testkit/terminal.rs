@@ -17,7 +17,7 @@ use rustix::process::{Pid, Signal, kill_process};
 use rustix::pty::{OpenptFlags, grantpt, openpt, ptsname, unlockpt};
 use rustix::termios::{Termios, Winsize, tcgetattr, tcsetwinsize};
 
-use super::PATIENCE;
+use super::{PATIENCE, skip};
 
 /// The person's side of a new terminal, and the program's.
 pub(crate) fn terminal() -> (File, OwnedFd) {
@@ -34,7 +34,7 @@ pub(crate) fn terminal() -> (File, OwnedFd) {
 pub(crate) fn can_sit() -> bool {
     let can_sit = Command::new("setsid").arg("true").status().is_ok_and(|status| status.success());
     if !can_sit {
-        eprintln!("skipped: there is no setsid (Debian: apt-get install util-linux)");
+        skip("setsid", "there is none (Debian: apt-get install util-linux)");
     }
     can_sit
 }

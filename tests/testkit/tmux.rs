@@ -6,7 +6,7 @@ use std::process::{Command, Output};
 use std::thread;
 use std::time::{Duration, Instant};
 
-use super::{PATIENCE, Stage};
+use super::{PATIENCE, TestEnv, skip};
 
 /// A session with one window.
 pub(crate) struct Tmux {
@@ -15,12 +15,12 @@ pub(crate) struct Tmux {
 
 impl Tmux {
     /// Runs the shell's `line` in a window of `size`, columns and rows; nothing, and why, where there is no tmux.
-    pub(crate) fn start(stage: &Stage, line: &str, (columns, rows): (u16, u16)) -> Option<Tmux> {
+    pub(crate) fn start(env: &TestEnv, line: &str, (columns, rows): (u16, u16)) -> Option<Tmux> {
         if Command::new("tmux").arg("-V").output().is_err() {
-            eprintln!("skipped: there is no tmux (Debian: apt-get install tmux)");
+            skip("tmux", "there is none (Debian: apt-get install tmux)");
             return None;
         }
-        let tmux = Tmux { socket: stage.path("tmux") };
+        let tmux = Tmux { socket: env.path("tmux") };
         let (columns, rows) = (columns.to_string(), rows.to_string());
         tmux.tell(&["-f", "/dev/null", "new-session", "-d", "-x", &columns, "-y", &rows, line]);
         Some(tmux)

@@ -7,7 +7,7 @@ use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
 use std::sync::OnceLock;
 
-use crate::testkit::Stage;
+use crate::testkit::{TestEnv, skip};
 
 /// A place where the library and its header are.
 pub(crate) struct Installed {
@@ -43,52 +43,52 @@ impl Installed {
     }
 
     /// The program of `source`, against the shared library.
-    pub(crate) fn compile(&self, stage: &Stage, source: &Path, flags: &[&str]) -> PathBuf {
-        self.try_compile(stage, source, flags).unwrap_or_else(|said| panic!("{said}"))
+    pub(crate) fn compile(&self, env: &TestEnv, source: &Path, flags: &[&str]) -> PathBuf {
+        self.try_compile(env, source, flags).unwrap_or_else(|said| panic!("{said}"))
     }
 
     /// As [`compile`](Self::compile); what the compiler says if it does not.
     pub(crate) fn try_compile(
         &self,
-        stage: &Stage,
+        env: &TestEnv,
         source: &Path,
         flags: &[&str],
     ) -> Result<PathBuf, String> {
         let words = ["-std=c99", "-D_DEFAULT_SOURCE", "-g", "-pthread"];
-        self.build("cc", stage, source, &[&words, flags].concat(), &self.shared())
+        self.build("cc", env, source, &[&words, flags].concat(), &self.shared())
     }
 
     /// The program of `source` in C++; nothing where there is no compiler for it.
-    pub(crate) fn compile_cpp(&self, stage: &Stage, source: &Path) -> Option<PathBuf> {
-        let built = self.try_compile_cpp(stage, source)?;
+    pub(crate) fn compile_cpp(&self, env: &TestEnv, source: &Path) -> Option<PathBuf> {
+        let built = self.try_compile_cpp(env, source)?;
         Some(built.unwrap_or_else(|said| panic!("{said}")))
     }
 
     /// As [`compile_cpp`](Self::compile_cpp); what the compiler says if it does not.
-    pub(crate) fn try_compile_cpp(&self, stage: &Stage, source: &Path) -> Option<Result<PathBuf, String>> {
-        is_there("c++").then(|| self.build("c++", stage, source, &["-std=c++11"], &self.shared()))
+    pub(crate) fn try_compile_cpp(&self, env: &TestEnv, source: &Path) -> Option<Result<PathBuf, String>> {
+        is_there("c++").then(|| self.build("c++", env, source, &["-std=c++11"], &self.shared()))
     }
 
     /// The program of `source` with the library in it; nothing where pkg-config does not say how.
-    pub(crate) fn compile_static(&self, stage: &Stage, source: &Path) -> Option<PathBuf> {
+    pub(crate) fn compile_static(&self, env: &TestEnv, source: &Path) -> Option<PathBuf> {
         let mut ask = self.with_packages("pkg-config");
         let Ok(said) = ask.args(["--static", "--libs-only-l", "scanhub"]).output() else {
-            eprintln!("skipped: a program with the library in it (there is no pkg-config)");
+            skip("pkg-config", "there is none, which says how the library gets into a program");
             return None;
         };
         let said = done(&said).unwrap_or_else(|said| panic!("{said}"));
         let mut libraries = vec![built().join("libscanhub.a").display().to_string()];
         libraries.extend(said.split_whitespace().filter(|word| *word != "-lscanhub").map(str::to_owned));
-        let program = self.build("cc", stage, source, &["-std=c99"], &libraries);
+        let program = self.build("cc", env, source, &["-std=c99"], &libraries);
         Some(program.unwrap_or_else(|said| panic!("{said}")))
     }
 
     /// The directory in which CMake built what `source` describes; nothing where it is not there.
-    pub(crate) fn cmake(&self, stage: &Stage, source: &Path) -> Option<PathBuf> {
+    pub(crate) fn cmake(&self, env: &TestEnv, source: &Path) -> Option<PathBuf> {
         if !["cmake", "pkg-config", "c++"].into_iter().all(is_there) {
             return None;
         }
-        let build = stage.path("cmake");
+        let build = env.path("cmake");
         let mut configure = self.with_packages("cmake");
         configure.arg("-S").arg(source).arg("-B").arg(&build);
         for command in [&mut configure, Command::new("cmake").arg("--build").arg(&build)] {
@@ -100,13 +100,13 @@ impl Installed {
     fn build<S: AsRef<OsStr>>(
         &self,
         compiler: &str,
-        stage: &Stage,
+        env: &TestEnv,
         source: &Path,
         flags: &[&str],
         libraries: &[S],
     ) -> Result<PathBuf, String> {
         let name = source.file_stem().expect("a file");
-        let program = stage.path(&format!("{}-{}", name.display(), flags.concat().len() + libraries.len()));
+        let program = env.path(&format!("{}-{}", name.display(), flags.concat().len() + libraries.len()));
         let mut command = Command::new(compiler);
         command.args(STRICT).args(flags).arg("-I").arg(self.prefix.join("include")).arg(source);
         command.args(libraries).arg("-o").arg(&program);
@@ -129,7 +129,7 @@ impl Installed {
 pub(crate) fn is_there(name: &str) -> bool {
     let found = Command::new(name).arg("--version").output().is_ok();
     if !found {
-        eprintln!("skipped: there is no {name}");
+        skip(name, "there is none");
     }
     found
 }

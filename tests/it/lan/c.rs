@@ -3,6 +3,8 @@
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
+use crate::testkit::skip;
+
 use super::readers::{self, Reader};
 
 /// The reader, compiled as strictly as it goes; with a watch over its memory where the compiler has one.
@@ -10,7 +12,7 @@ fn reader() -> Option<PathBuf> {
     let top = Path::new(env!("CARGO_MANIFEST_DIR"));
     let program = Path::new(env!("CARGO_TARGET_TMPDIR")).join("lan-reader");
     if Command::new("cc").arg("--version").output().is_err() {
-        eprintln!("skipped: there is no C compiler (cc)");
+        skip("cc", "there is no C compiler");
         return None;
     }
     let compile = |watch: &[&str]| {

@@ -4,6 +4,8 @@ use std::collections::BTreeMap;
 use std::path::Path;
 use std::process::Command;
 
+use crate::testkit::skip;
+
 /// A capture file as it grows: pcap 2.4, in which every packet begins with its IPv4 header (link type 101).
 #[derive(Default)]
 pub(crate) struct Capture {
@@ -14,7 +16,7 @@ pub(crate) struct Capture {
 pub(crate) fn has_tshark() -> bool {
     let found = Command::new("tshark").arg("--version").output().is_ok_and(|output| output.status.success());
     if !found {
-        eprintln!("skipped: there is no tshark (Debian: apt-get install tshark)");
+        skip("tshark", "there is none (Debian: apt-get install tshark)");
     }
     found
 }

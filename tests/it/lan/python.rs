@@ -4,6 +4,8 @@
 use std::path::Path;
 use std::process::Command;
 
+use crate::testkit::skip;
+
 use super::readers::{self, Reader};
 use super::vectors;
 
@@ -13,7 +15,7 @@ fn reader() -> Option<Reader> {
     let python = std::env::var("SCANHUB_PYTHON").unwrap_or("python3".to_owned());
     let recent = "import sys; sys.exit(sys.version_info < (3, 9))";
     if !Command::new(&python).args(["-c", recent]).status().is_ok_and(|status| status.success()) {
-        eprintln!("skipped: there is no {python}, or it is older than 3.9");
+        skip("python", format!("there is no {python}, or it is older than 3.9"));
         return None;
     }
     let mut command = Command::new(python);

@@ -4,8 +4,8 @@
 use std::time::Instant;
 
 use crate::testkit::{
-    INT, KILL, Machine, Outcome, Program, Receiver, Relay, Robot, Stage, TERM, in_a_network, ip, is_class,
-    number, read, until,
+    INT, KILL, Machine, Outcome, Program, Receiver, Relay, Robot, TERM, TestEnv, in_a_network, ip, is_class,
+    number, read, skip, until,
 };
 use schema::datagram::{Account, Datagram, Packed};
 use schema::{Topic, Verdict, Zones};
@@ -90,7 +90,7 @@ fn a_queue_is_full() {
         let mut gateway = robot.gateway::<&str>(&[]);
         receiver.await_more(10, is_scan);
         if !robot.machine.try_run("tc qdisc add dev eth0 root tbf rate 128kbit burst 2kb limit 4kb") {
-            eprintln!("skipped: there is no tc or no tbf");
+            skip("tc", "there is no tc or no tbf");
             return;
         }
         await_link(&mut gateway, "eth0", "failing");
@@ -143,8 +143,8 @@ fn hubs_and_gateways_are_killed() {
         let mut robot = Robot::new(&["front"]);
         let relay = Relay::new(&robot.machine, 7);
         relay.connect(&second);
-        let stage = Stage::on(&second);
-        let mut listener = stage.start(&["listen", "--json", "--topic=scan"]).ready();
+        let env = TestEnv::on(&second);
+        let mut listener = env.start(&["listen", "--json", "--topic=scan"]).ready();
         // Scans of another life than those before.
         let mut again = |what: &str, key: &str, before: &Value| {
             let since = Instant::now();

@@ -12,7 +12,7 @@ use rustix::process::{Pid, Signal, kill_process_group};
 
 use super::blocks::blocks;
 use super::shell::{commands, lines};
-use crate::testkit::{Program, Sender, Stage, in_a_network, is_class};
+use crate::testkit::{Program, Sender, TestEnv, in_a_network, is_class};
 use schema::Topic;
 
 /// Commands that are not run, by how their line begins or what is in it, and what makes sure of them. Those of the program
@@ -55,7 +55,7 @@ fn all() -> Vec<(String, String)> {
 
 /// What the pages take for granted.
 struct Desk {
-    stage: Stage,
+    env: TestEnv,
     /// Of lines that were run.
     count: AtomicUsize,
     _running: Vec<Program>,
@@ -70,46 +70,46 @@ const PORTS: [&str; 3] = ["/dev/serial/by-id/usb-FTDI...", "/dev/ttyUSB0", "/tmp
 
 impl Desk {
     fn new() -> Desk {
-        let stage = Stage::new();
-        let simulator = stage.simulator(&["front", "spare"], &["--seed=82", "--baud=500000"]);
-        let hub = stage.hub(&[stage.link("front")]);
-        stage.await_info("front", |info| info["state"] == "streaming");
-        let recorded = stage.run(&["record", "-o", &stage.word("one.mcap"), "--for=1s"]);
+        let env = TestEnv::new();
+        let simulator = env.simulator(&["front", "spare"], &["--seed=82", "--baud=500000"]);
+        let hub = env.hub(&[env.link("front")]);
+        env.await_info("front", |info| info["state"] == "streaming");
+        let recorded = env.run(&["record", "-o", &env.word("one.mcap"), "--for=1s"]);
         assert_eq!(recorded.code, Some(0), "{recorded}");
-        let stream = stage.run(&["echo", "front/telegram", "--raw", "-n", "5"]);
-        fs::create_dir(stage.path("bin")).expect("a directory");
+        let stream = env.run(&["echo", "front/telegram", "--raw", "-n", "5"]);
+        fs::create_dir(env.path("bin")).expect("a directory");
         // One domain is not enough for two hubs.
-        let (name, root) = (stage.place().name().to_owned(), stage.path("").display().to_string());
+        let (name, root) = (env.place().name().to_owned(), env.path("").display().to_string());
         let script = format!(
             "#!/bin/sh\ncase $1 in run | replay) other=x ;; esac\n\
              exec '{}' \"$@\" --domain \"{name}$other\" --root '{root}'\n",
             env!("CARGO_BIN_EXE_scanhub"),
         );
-        let program = stage.file("bin/scanhub", script);
+        let program = env.file("bin/scanhub", script);
         let mode = std::os::unix::fs::PermissionsExt::from_mode(0o755);
         fs::set_permissions(program, mode).expect("it is ours");
-        stage.file("capture.bin", stream.out);
-        Desk { stage, count: AtomicUsize::new(0), _running: vec![simulator, hub] }
+        env.file("capture.bin", stream.out);
+        Desk { env, count: AtomicUsize::new(0), _running: vec![simulator, hub] }
     }
 
     /// Runs `line` in a directory of its own, as long as it wants, or ends it by Ctrl-C; what is wrong, if anything is.
     fn run(&self, line: &str) -> Option<String> {
-        let here = self.stage.path(&format!("line{}", self.count.fetch_add(1, Ordering::Relaxed)));
+        let here = self.env.path(&format!("line{}", self.count.fetch_add(1, Ordering::Relaxed)));
         fs::create_dir(&here).expect("a directory");
         let writes = line.starts_with("scanhub record");
         for name in RECORDINGS.iter().filter(|_| !writes) {
-            fs::copy(self.stage.path("one.mcap"), here.join(name)).expect("a recording");
+            fs::copy(self.env.path("one.mcap"), here.join(name)).expect("a recording");
         }
-        fs::copy(self.stage.path("capture.bin"), here.join("capture.bin")).expect("a stream");
+        fs::copy(self.env.path("capture.bin"), here.join("capture.bin")).expect("a stream");
         let typed = PORTS.iter().fold(line.to_owned(), |line, port| {
             let is_made = line.starts_with("scanhub simulate");
-            line.replace(port, &if is_made { "lms".into() } else { self.stage.word("spare") })
+            line.replace(port, &if is_made { "lms".into() } else { self.env.word("spare") })
         });
         let typed = typed.replace(MINUTES.0, MINUTES.1);
         let mut shell = Command::new("sh");
         // A single command is the shell's own process, so that what ends it ends that.
         let exec = if commands(line).len() == 1 { "exec " } else { "" };
-        let path = format!("{}:{}", self.stage.word("bin"), std::env::var("PATH").unwrap_or_default());
+        let path = format!("{}:{}", self.env.word("bin"), std::env::var("PATH").unwrap_or_default());
         shell.arg("-c").arg(format!("{exec}{typed}")).current_dir(&here).process_group(0).env("PATH", path);
         shell.env("HOME", &here).env("XDG_STATE_HOME", here.join("state")).env_remove("STATE_DIRECTORY");
         shell.env("SCANHUB_END_WITH_PARENT", "1").env("SCANHUB_LOG", "error").env_remove("SCANHUB_CONFIG");
@@ -164,8 +164,7 @@ fn every_line_about_a_network_runs() {
             .partition(|(_, line)| line.contains("scanhub listen") || line.contains("gateway"));
         let mut wrong = wrong_with(&desk, &alone);
         let name = "--name=robot1=5f3a12bc00d1e2f3";
-        let mut listener =
-            desk.stage.start(&["listen", "--json", "--publish", name, "--interface=lo"]).ready();
+        let mut listener = desk.env.start(&["listen", "--json", "--publish", name, "--interface=lo"]).ready();
         let mut sender = Sender::new(0x5f3a_12bc_00d1_e2f3, 7, 0, "front");
         sender.announce(&[Topic::Scan, Topic::Zones]);
         listener.await_line("a sensor", |line| is_class("notice")(line) && line["kind"] == "published");

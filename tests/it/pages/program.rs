@@ -9,7 +9,7 @@ use serde_json::Value;
 
 use super::blocks::Block;
 use crate::client_c::installed::Installed;
-use crate::testkit::{Stage, python};
+use crate::testkit::{TestEnv, python};
 
 /// Something to start.
 pub(crate) struct Example {
@@ -22,30 +22,30 @@ pub(crate) struct Example {
 }
 
 impl Example {
-    /// Built in `stage`; nothing, said, where this machine has not what that takes.
+    /// Built in `env`; nothing, said, where this machine has not what that takes.
     ///
     /// The words of the compiler if it refuses.
-    pub(crate) fn build(block: &Block, stage: &Stage) -> Result<Option<Example>, String> {
+    pub(crate) fn build(block: &Block, env: &TestEnv) -> Result<Option<Example>, String> {
         let name = block.place.replace(['/', '.', ':'], "_");
-        let source = |ending: &str, text: &str| PathBuf::from(stage.file(&format!("{name}.{ending}"), text));
+        let source = |ending: &str, text: &str| PathBuf::from(env.file(&format!("{name}.{ending}"), text));
         let program = match block.language.as_str() {
             "python" => return Ok(of_python(block, &source("py", &block.text))),
-            "rust" => Some(of_rust(&source("rs", &whole(block)), stage)?),
-            "c" => of_c(&source("c", &whole(block)), stage)?,
-            "cpp" => of_cpp(&source("cpp", &whole(block)), stage)?,
+            "rust" => Some(of_rust(&source("rs", &whole(block)), env)?),
+            "c" => of_c(&source("c", &whole(block)), env)?,
+            "cpp" => of_cpp(&source("cpp", &whole(block)), env)?,
             other => return Err(format!("{}: {other} is no language of programs", block.place)),
         };
         let (place, text) = (block.place.clone(), block.text.clone());
         Ok(program.map(|program| Example { place, text, program, arguments: Vec::new() }))
     }
 
-    /// The program, to be run in `stage` and with the hub there.
-    pub(crate) fn command(&self, stage: &Stage) -> Command {
+    /// The program, to be run in `env` and with the hub there.
+    pub(crate) fn command(&self, env: &TestEnv) -> Command {
         let mut command = Command::new(&self.program);
         // What warns is wrong.
-        command.args(&self.arguments).current_dir(stage.path("")).env_remove("XDG_RUNTIME_DIR");
-        command.env("SCANHUB_DOMAIN", stage.place().name()).env("PYTHONWARNINGS", "error");
-        command.env("RUNTIME_DIRECTORY", stage.place().root().parent().expect("it has one"));
+        command.args(&self.arguments).current_dir(env.path("")).env_remove("XDG_RUNTIME_DIR");
+        command.env("SCANHUB_DOMAIN", env.place().name()).env("PYTHONWARNINGS", "error");
+        command.env("RUNTIME_DIRECTORY", env.place().root().parent().expect("it has one"));
         command.env("PYTHONUNBUFFERED", "1").env("PYTHONDONTWRITEBYTECODE", "1");
         command.env("PYTHONPATH", Path::new(env!("CARGO_MANIFEST_DIR")).join("clients/python"));
         command
@@ -77,17 +77,17 @@ fn of_python(block: &Block, source: &Path) -> Option<Example> {
     Some(Example { place, text, program, arguments: vec![source.to_owned()] })
 }
 
-fn of_c(source: &Path, stage: &Stage) -> Result<Option<PathBuf>, String> {
-    Installed::once().map(|installed| installed.try_compile(stage, source, &[])).transpose()
+fn of_c(source: &Path, env: &TestEnv) -> Result<Option<PathBuf>, String> {
+    Installed::once().map(|installed| installed.try_compile(env, source, &[])).transpose()
 }
 
-fn of_cpp(source: &Path, stage: &Stage) -> Result<Option<PathBuf>, String> {
-    Installed::once().and_then(|installed| installed.try_compile_cpp(stage, source)).transpose()
+fn of_cpp(source: &Path, env: &TestEnv) -> Result<Option<PathBuf>, String> {
+    Installed::once().and_then(|installed| installed.try_compile_cpp(env, source)).transpose()
 }
 
 /// By the compiler itself, with the library that Cargo makes.
-fn of_rust(source: &Path, stage: &Stage) -> Result<PathBuf, String> {
-    let program = stage.path(&format!("{}-rust", source.file_stem().expect("a name").display()));
+fn of_rust(source: &Path, env: &TestEnv) -> Result<PathBuf, String> {
+    let program = env.path(&format!("{}-rust", source.file_stem().expect("a name").display()));
     let mut command = Command::new(std::env::var_os("RUSTC").unwrap_or_else(|| "rustc".into()));
     command.args(["--edition=2024", "-Dwarnings", "-o"]).arg(&program).arg(source);
     let library = library();

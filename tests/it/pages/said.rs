@@ -8,7 +8,7 @@ use serde_json::Value;
 
 use super::blocks::{Block, blocks};
 use super::is_program;
-use crate::testkit::{Stage, TERM};
+use crate::testkit::{TERM, TestEnv};
 
 /// Texts that are no examples, by how they begin, and what makes sure of them.
 const TEXTS: [(&str, &str, &str); 3] = [
@@ -36,20 +36,20 @@ fn wrong_with(block: &Block) -> Option<String> {
 
 /// A configuration, or a world.
 fn wrong_with_toml(block: &Block) -> Option<String> {
-    let stage = Stage::new();
-    let file = stage.file("page.toml", &block.text);
-    let checked = stage.run(&["config", "check", &file]);
+    let env = TestEnv::new();
+    let file = env.file("page.toml", &block.text);
+    let checked = env.run(&["config", "check", &file]);
     if checked.code == Some(0) {
         return None;
     }
     // A section of its own is one of a configuration that has a link.
     let with_link = format!("{}\n[[link]]\nname = \"front\"\nport = \"/dev/ttyUSB0\"\n", block.text);
-    let completed = stage.run(&["config", "check", &stage.file("completed.toml", with_link)]);
+    let completed = env.run(&["config", "check", &env.file("completed.toml", with_link)]);
     if checked.errors.contains("no link is configured") && completed.code == Some(0) {
         return None;
     }
-    let port = format!("--port={}", stage.word("front"));
-    let mut world = stage.start(&["simulate", "--json", "--world", &file, &port]);
+    let port = format!("--port={}", env.word("front"));
+    let mut world = env.start(&["simulate", "--json", "--world", &file, &port]);
     if !world.is_over_before_it_says() {
         let outcome = world.end(TERM);
         return (outcome.code != Some(0)).then(|| outcome.to_string());
@@ -110,10 +110,10 @@ fn what_nobody_could_read_is_found() {
 fn a_wrong_world_is_refused_as_the_page_says() {
     let is_it = |block: &Block| block.place.starts_with("docs/worlds.md") && block.language == "text";
     let block = blocks().into_iter().find(is_it).expect("it is there");
-    let stage = Stage::new();
-    stage.file("w.toml", "[[thing]]\nradius_m = 0.04\n");
-    let mut command = stage.command(&["simulate", "--world=w.toml", "--port=front"]);
-    let output = command.current_dir(stage.path("")).output().expect("it runs");
+    let env = TestEnv::new();
+    env.file("w.toml", "[[thing]]\nradius_m = 0.04\n");
+    let mut command = env.command(&["simulate", "--world=w.toml", "--port=front"]);
+    let output = command.current_dir(env.path("")).output().expect("it runs");
     let said = String::from_utf8_lossy(&output.stderr);
     assert_eq!(output.status.code(), Some(78), "{said}");
     for line in block.text.lines() {
