@@ -16,7 +16,7 @@ use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
 
 use clap::error::ErrorKind;
-use daemon::Config;
+use config::Config;
 use rustix::process::Signal;
 use schema::{Domain, Failure, Kind, Printable, json_line};
 use serde::Serialize;
@@ -78,8 +78,8 @@ fn dispatch(cli: &Cli) -> Result<(), Failure> {
         }
         Verb::Simulate(simulate) => run_simulator(simulate, everywhere),
         Verb::Telegram(telegram) => match &telegram.way {
-            Way::Decode(decode) => daemon::telegram::decode(&decode.options(everywhere.json), &mut out),
-            Way::Encode(encode) => daemon::telegram::encode(&encode.options(everywhere.json), &mut out),
+            Way::Decode(decode) => tools::telegram::decode(&decode.options(everywhere.json), &mut out),
+            Way::Encode(encode) => tools::telegram::encode(&encode.options(everywhere.json), &mut out),
         },
         Verb::Probe(probe) => probe.run(everywhere.json, &*interrupt()?),
         Verb::Configure(configure) => configure.run(everywhere.json, &*interrupt_by(&ENDS)?),

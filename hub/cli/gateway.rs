@@ -4,7 +4,7 @@ use std::io::{IsTerminal, stdout};
 use std::time::Duration;
 
 use clap::Args;
-use daemon::config::{self, Sources};
+use config::Sources;
 use schema::{Failure, Kind};
 use verbs::{GatewayLook, GatewayOptions, duration};
 

@@ -39,6 +39,30 @@ pub(crate) fn lms_stands_alone(tree: &Tree) -> Vec<String> {
     breaches
 }
 
+/// What writes the EEPROM is a part of the protocol and as plain.
+pub(crate) fn what_writes_the_eeprom_is_protocol_alone(tree: &Tree) -> Vec<String> {
+    let below = |path: &str| path.starts_with("hub/lms-configure/src/");
+    let mut breaches = built_of(tree, "scanhub-lms-configure", &["scanhub-lms"]);
+    let attributes = ["#![no_std]", "#![forbid(unsafe_code)]"];
+    breaches.extend(lacks(tree, "hub/lms-configure/src/lib.rs", &attributes));
+    breaches.extend(find(tree, &["std::", "extern crate", "alloc::"], below));
+    breaches
+}
+
+/// Cargo keeps requests that write the EEPROM from all crates but these: the one where a person is asked, and the
+/// simulator, which is the sensor. Tests of others may have them.
+pub(crate) fn few_crates_can_write_the_eeprom(tree: &Tree) -> Vec<String> {
+    const MAY: [&str; 2] = ["scanhub-tools", "scanhub-sim"];
+    let top = ("scanhub".to_owned(), tree.manifest("Cargo.toml"));
+    let others = tree.members().into_iter().chain([top]).filter(|(name, _)| !MAY.contains(&name.as_str()));
+    // The fuzzer's crate is a test.
+    let built = others.filter(|(name, _)| name != "scanhub-fuzz");
+    built
+        .filter(|(_, manifest)| built_with(manifest).any(|name| name == "scanhub-lms-configure"))
+        .map(|(name, _)| format!("{name} is built with what writes the EEPROM"))
+        .collect()
+}
+
 fn lacks(tree: &Tree, path: &str, attributes: &[&str]) -> Vec<String> {
     let has = |attribute: &str| tree.text(path).lines().any(|line| line == attribute);
     let missing = attributes.iter().filter(|attribute| !has(attribute));
@@ -150,6 +174,7 @@ pub(crate) fn the_library_for_c_knows_clients(tree: &Tree) -> Vec<String> {
     breaches
 }
 
+/// Nor anything that writes the EEPROM.
 pub(crate) fn the_daemon_knows_neither_clients_nor_sim(tree: &Tree) -> Vec<String> {
     let members = tree.members();
     let mut reached = BTreeSet::new();
@@ -158,13 +183,15 @@ pub(crate) fn the_daemon_knows_neither_clients_nor_sim(tree: &Tree) -> Vec<Strin
         open.extend(ours(&members[&name], &NORMAL).into_iter().filter(|name| !reached.contains(name)));
         reached.insert(name);
     }
-    const NOT: [&str; 3] = ["scanhub-client", "scanhub-verbs", "scanhub-sim"];
-    reached.into_iter().filter(|name| NOT.contains(&name.as_str())).collect()
+    const STRANGERS: [&str; 5] =
+        ["scanhub-client", "scanhub-verbs", "scanhub-sim", "scanhub-tools", "scanhub-lms-configure"];
+    reached.into_iter().filter(|name| STRANGERS.contains(&name.as_str())).collect()
 }
 
-/// The daemon, the clients and the simulator meet nowhere but in the program: no crate has two of them.
+/// The daemon, the clients, the simulator and the tools meet nowhere but in the program: no crate has two of them.
 pub(crate) fn only_the_program_sees_all(tree: &Tree) -> Vec<String> {
-    let ends: [&[&str]; 3] = [&["scanhub-daemon"], &["scanhub-client", "scanhub-verbs"], &["scanhub-sim"]];
+    let ends: [&[&str]; 4] =
+        [&["scanhub-daemon"], &["scanhub-client", "scanhub-verbs"], &["scanhub-sim"], &["scanhub-tools"]];
     let mut breaches = Vec::new();
     for (name, manifest) in tree.members() {
         let mut known = ours(&manifest, &NORMAL);
