@@ -25,14 +25,14 @@ mod zones;
 use std::path::PathBuf;
 use std::time::Duration;
 
+use ::config::Sources;
 use clap::{Args, Command, CommandFactory, FromArgMatches, Parser, Subcommand};
-use clients::{Bounds, duration};
-use daemon::config::Sources;
 use schema::{DEFAULT_DOMAIN, Domain, Environment, Failure};
+use verbs::{Bounds, duration};
 
+pub(crate) use self::config::Config;
 pub(crate) use background::Background;
 pub(crate) use complete::Complete;
-pub(crate) use config::Config;
 pub(crate) use control::Control;
 pub(crate) use convert::Convert;
 pub(crate) use gateway::Gateway;

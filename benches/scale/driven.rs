@@ -5,8 +5,8 @@
 use std::path::Path;
 use std::time::Duration;
 
-use daemon::config::Sources;
-use daemon::{Config, DrivenLink};
+use config::{Config, Sources};
+use daemon::DrivenLink;
 use lms::Nanos;
 use lms::measured;
 use lms::telegram::STX;

@@ -5,8 +5,7 @@ use std::collections::BTreeMap;
 use std::fs::File;
 use std::path::Path;
 
-use daemon::Config;
-use daemon::config::Sources;
+use config::{Config, Sources};
 use lms::Nanos;
 use lms::variant::{MIRROR_TURN, Mode, Unit, Variant};
 use schema::datagram::Packed;

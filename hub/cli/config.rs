@@ -3,7 +3,7 @@
 use std::path::PathBuf;
 
 use clap::{Args, Subcommand};
-use daemon::config::{DEFAULT, Link, Value, values};
+use config::{DEFAULT, Link, Value, values};
 use schema::Failure;
 use serde::Serialize;
 
@@ -44,7 +44,7 @@ impl Config {
                     sources.files = vec![file.clone()];
                 }
                 Gateway::check(&sources, everywhere)?;
-                let links = daemon::Config::load(&sources)?.links;
+                let links = config::Config::load(&sources)?.links;
                 if everywhere.json { checked_line(&links) } else { checked(&links) }
             }
             Order::Show { run } => {

@@ -4,9 +4,9 @@ use std::io::{IsTerminal, stderr, stdout};
 use std::sync::atomic::AtomicBool;
 
 use clap::Args;
-use daemon::configure::{News, Order, configure};
-use daemon::probe::source;
 use schema::Failure;
+use tools::configure::{News, Order, configure};
+use tools::probe::source;
 
 use super::probe::Progress;
 

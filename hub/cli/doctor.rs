@@ -3,11 +3,10 @@
 use std::sync::atomic::AtomicBool;
 
 use clap::Args;
-use daemon::Config;
-use daemon::config::Gateway;
-use daemon::doctor::{Subjects, System, examine};
-use daemon::probe::source;
+use config::{Config, Gateway};
 use schema::Failure;
+use tools::doctor::{Subjects, System, examine};
+use tools::probe::source;
 
 use super::{Everywhere, Run};
 

@@ -4,10 +4,10 @@ use std::io::{IsTerminal, Write, stderr};
 use std::sync::atomic::AtomicBool;
 
 use clap::Args;
-use daemon::port::Candidate;
-use daemon::probe::{list, probe, source};
+use port::Candidate;
 use schema::Failure;
 use serde::Serialize;
+use tools::probe::{list, probe, source};
 
 #[derive(Args, Debug)]
 pub(crate) struct Probe {

@@ -3,7 +3,7 @@
 use std::path::PathBuf;
 
 use clap::{Args, Subcommand};
-use daemon::telegram::{DecodeOptions, EncodeOptions};
+use tools::telegram::{DecodeOptions, EncodeOptions};
 
 #[derive(Args, Debug)]
 pub(crate) struct Telegram {
@@ -16,7 +16,7 @@ pub(crate) enum Way {
     /// Bytes to words: the telegrams in a recording, a pipe, or text such as 02 00 01 00 31 15 12
     Decode(Decode),
     /// Words to bytes, which are printed and not sent
-    #[command(after_help = daemon::telegram::names())]
+    #[command(after_help = tools::telegram::names())]
     Encode(Encode),
 }
 

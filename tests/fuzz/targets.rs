@@ -6,7 +6,6 @@ mod processors;
 mod recording;
 
 use lms::command::Request;
-use lms::eeprom::Write;
 use lms::explain::explain;
 use lms::framer::{Found, Framer, SUFFIX_HOLD, Tally, VETO_HOLD};
 use lms::header::Expect;
@@ -16,6 +15,7 @@ use lms::session::{Output, Session};
 use lms::telegram::{FRAME, MAX_LENGTH, STX, Telegram, Writer};
 use lms::variant::{Baud, Variant};
 use lms::{Control, MILLIS, Nanos, Settings};
+use lms_configure::eeprom::Write;
 
 /// A target by its name.
 pub type Target = (&'static str, fn(&[u8]));
@@ -209,7 +209,7 @@ fn assert_harmless(said: &[u8]) {
 ///
 /// The text is cut at zero bytes: the first piece is a file, the others are `--set` and `--link` in turn.
 pub fn configuration(data: &[u8]) {
-    use daemon::config::{Config, Sources};
+    use config::{Config, Sources};
     let text = String::from_utf8_lossy(data);
     let mut pieces = text.split('\0');
     let path = std::env::temp_dir().join(format!("scanhub-fuzz-{}.toml", std::process::id()));

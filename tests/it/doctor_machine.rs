@@ -10,9 +10,9 @@ use std::process::Command;
 use std::sync::atomic::AtomicBool;
 
 use crate::testkit::{Findings, KILL, Program, TERM, TestEnv, in_a_network, is_class, shared_memory, skip};
-use daemon::config::Gateway;
-use daemon::doctor::{Subjects, System, examine};
+use config::Gateway;
 use schema::Domain;
+use tools::doctor::{Subjects, System, examine};
 
 /// `sh` with these words before the program, as `ulimit -f 100; exec`, and its arguments.
 fn under(env: &TestEnv, words: &str, arguments: &[&str]) -> Command {
@@ -87,7 +87,7 @@ fn laid_out(env: &TestEnv) -> Findings {
     };
     let mut lines = Vec::new();
     let mut tell =
-        |finding: &daemon::doctor::Finding| lines.push(serde_json::to_value(finding).expect("is JSON"));
+        |finding: &tools::doctor::Finding| lines.push(serde_json::to_value(finding).expect("is JSON"));
     // Of this machine's ports no test knows anything.
     let _ = examine(&subjects, &AtomicBool::new(false), &mut tell);
     Findings::in_lines(lines).of_machine().without(&["ports", "multicast"])

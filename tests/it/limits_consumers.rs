@@ -7,8 +7,8 @@ use std::time::Duration;
 
 use crate::testkit;
 use crate::testkit::{INT, KILL, Program, TERM, TestEnv, is_class, number, sequence, until};
-use clients::Attachment;
 use rustix::process::Signal;
+use scanhub_client::Subscription;
 use schema::ipc::{self, Payload};
 use schema::{Domain, Scan, limits};
 use serde_json::Value;
@@ -27,13 +27,13 @@ fn streaming(env: &TestEnv, period_ms: u32) -> Program {
     env.hub(&["--link", &format!("front=file:{file}")])
 }
 
-fn attach(place: &Domain) -> Attachment<Scan> {
-    Attachment::in_domain(vec![place.clone()], "front").expect("a name").timeout(Duration::from_secs(20))
+fn subscribe(place: &Domain) -> Subscription<Scan> {
+    Subscription::in_domain(vec![place.clone()], "front").expect("a name").timeout(Duration::from_secs(20))
 }
 
-/// Attaches `count` consumers and receives until each has `wanted` scans: what they missed between them, in all.
+/// Subscribes `count` consumers and receives until each has `wanted` scans: what they missed between them, in all.
 fn follow(place: &Domain, count: usize, wanted: usize) -> u64 {
-    let mut consumers: Vec<_> = (0..count).map(|_| (attach(place), 0, 0)).collect();
+    let mut consumers: Vec<_> = (0..count).map(|_| (subscribe(place), 0, 0)).collect();
     while consumers.iter().any(|(_, received, _)| *received < wanted) {
         for (consumer, received, missed) in &mut consumers {
             while let Some(scan) = consumer.try_next().expect("works") {

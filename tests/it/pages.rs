@@ -10,8 +10,8 @@ mod shell;
 
 use crate::testkit::{Outcome, Program, TERM, TestEnv, until};
 use blocks::{Block, blocks};
-use clients::Attachment;
 use program::Example;
+use scanhub_client::Subscription;
 use schema::Scan;
 
 /// A room, and a sensor in it.
@@ -96,7 +96,7 @@ fn distance_m(line: &str) -> Option<f64> {
 
 /// Runs `example` beside the hub of `env` until it has seen some scans, and `says` something if it should.
 fn run(example: &Example, env: &TestEnv, says: bool) -> Outcome {
-    let mut scans = Attachment::<Scan>::in_domain(vec![env.place()], "front").expect("a name");
+    let mut scans = Subscription::<Scan>::in_domain(vec![env.place()], "front").expect("a name");
     while scans.next().expect("a hub").is_none() {}
     // Nobody types, and nobody closes it.
     let (stdin, _typed) = std::io::pipe().expect("a pipe");
@@ -166,7 +166,10 @@ fn a_program_that_takes_codes_for_distances_is_found() {
         (block("python", &format!("{follow}print(scan.ranges.min() * scan.unit_mm, 'mm')\n")), "it says"),
         (block("python", &format!("{follow}print(scan.ranges_m[scan.valid].min(), 'm')\n")), "it failed"),
         (block("python", &format!("{follow}print(scan.ranges[180])\n")), "no distance with its unit"),
-        (block("rust", "clients::attach::<schema::Scan>(\"front\").unwrap();\n"), "mismatched types"),
+        (
+            block("rust", "scanhub_client::subscribe::<scanhub_client::Scan>(\"front\").unwrap();\n"),
+            "mismatched types",
+        ),
         (block("c", "puts(scanhub_open());\n"), "too few arguments"),
     ];
     let situations = [SITUATIONS[0], SITUATIONS[4]];

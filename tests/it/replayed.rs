@@ -11,7 +11,7 @@ use std::thread;
 use std::time::{Duration, Instant};
 
 use crate::testkit::{PATIENCE, TestEnv};
-use daemon::config::Sources;
+use config::Sources;
 use daemon::{Play, Player, Replay};
 use rooms::{Followers, LEARNING, Published, SENSORS};
 use schema::ipc;

@@ -2,7 +2,7 @@
 //! too, and whoever comes back is heard again.
 
 use crate::testkit::{INT, KILL, Program, Sender, TERM, TestEnv, in_a_network, until};
-use clients::{Robot, RobotFollower};
+use scanhub_client::{Robot, RobotFollower};
 use schema::{Topic, Verdict, Zones};
 use serde_json::{Value, json};
 

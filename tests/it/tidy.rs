@@ -51,6 +51,28 @@ fn lms_stands_alone() {
 }
 
 #[test]
+fn what_writes_the_eeprom_is_protocol_alone() {
+    holds(crates::what_writes_the_eeprom_is_protocol_alone, |tree| {
+        let (manifest, lib) = ("hub/lms-configure/Cargo.toml", "hub/lms-configure/src/lib.rs");
+        vec![
+            tree.with_line(manifest, "[dependencies]", "scanhub-port.workspace = true"),
+            tree.with(lib, &tree.text(lib).replace("#![no_std]", "")),
+            tree.with("hub/lms-configure/src/planted.rs", "//! A file.\nuse std::fs;\n"),
+        ]
+    });
+}
+
+#[test]
+fn few_crates_can_write_the_eeprom() {
+    holds(crates::few_crates_can_write_the_eeprom, |tree| {
+        let line = "scanhub-lms-configure.workspace = true";
+        ["hub/port/Cargo.toml", "hub/lms/Cargo.toml", "clients/Cargo.toml", "Cargo.toml"]
+            .map(|manifest| tree.with_line(manifest, "[dependencies]", line))
+            .to_vec()
+    });
+}
+
+#[test]
 fn preprocess_only_computes() {
     holds(crates::preprocess_only_computes, |tree| {
         let planted = |code: &str| tree.with("hub/preprocess/src/planted.rs", &format!("//! So.\n{code}\n"));
@@ -84,7 +106,13 @@ fn no_processor_uses_another() {
 #[test]
 fn clients_know_only_schema() {
     holds(crates::clients_know_only_schema, |tree| {
-        vec![tree.with_line("clients/Cargo.toml", "[dependencies]", "scanhub-lms.workspace = true")]
+        let (client, verbs) = ("clients/client/Cargo.toml", "clients/verbs/Cargo.toml");
+        vec![
+            tree.with_line(client, "[dependencies]", "scanhub-lms.workspace = true"),
+            tree.with_line(client, "[dependencies]", "scanhub-verbs.workspace = true"),
+            tree.with_line(client, "[dev-dependencies]", "scanhub-ros.workspace = true"),
+            tree.with_line(verbs, "[dependencies]", "scanhub-lms.workspace = true"),
+        ]
     });
 }
 
@@ -93,7 +121,7 @@ fn ros_knows_only_schema() {
     holds(crates::ros_knows_only_schema, |tree| {
         let (manifest, lib) = ("schema/ros/Cargo.toml", "schema/ros/src/lib.rs");
         vec![
-            tree.with_line(manifest, "[dependencies]", "scanhub-clients.workspace = true"),
+            tree.with_line(manifest, "[dependencies]", "scanhub-client.workspace = true"),
             tree.with_line(manifest, "[dependencies]", "mcap.workspace = true"),
             tree.with(lib, &tree.text(lib).replace("#![forbid(unsafe_code)]", "")),
             tree.with("schema/ros/src/planted.rs", "//! A clock.\nuse std::time::SystemTime;\n"),
@@ -118,7 +146,8 @@ fn the_library_for_c_knows_clients() {
         vec![
             tree.with_line("clients/c/Cargo.toml", "[dependencies]", "scanhub-lms.workspace = true"),
             tree.with_line("clients/c/Cargo.toml", "[dependencies]", "iceoryx2.workspace = true"),
-            tree.with_line("clients/Cargo.toml", "[dependencies]", "scanhub-c.workspace = true"),
+            tree.with_line("clients/c/Cargo.toml", "[dependencies]", "scanhub-verbs.workspace = true"),
+            tree.with_line("clients/verbs/Cargo.toml", "[dependencies]", "scanhub-c.workspace = true"),
             tree.with_line("Cargo.toml", "[dependencies]", "scanhub-c.workspace = true"),
         ]
     });
@@ -128,8 +157,11 @@ fn the_library_for_c_knows_clients() {
 fn the_daemon_knows_neither_clients_nor_sim() {
     holds(crates::the_daemon_knows_neither_clients_nor_sim, |tree| {
         vec![
-            tree.with_line("hub/daemon/Cargo.toml", "[dependencies]", "scanhub-clients.workspace = true"),
+            tree.with_line("hub/daemon/Cargo.toml", "[dependencies]", "scanhub-client.workspace = true"),
+            tree.with_line("hub/daemon/Cargo.toml", "[dependencies]", "scanhub-verbs.workspace = true"),
             tree.with_line("hub/recording/Cargo.toml", "[dependencies]", "scanhub-sim.workspace = true"),
+            tree.with_line("hub/port/Cargo.toml", "[dependencies]", "scanhub-lms-configure.workspace = true"),
+            tree.with_line("hub/daemon/Cargo.toml", "[dependencies]", "scanhub-tools.workspace = true"),
         ]
     });
 }
@@ -137,7 +169,10 @@ fn the_daemon_knows_neither_clients_nor_sim() {
 #[test]
 fn only_the_program_sees_all() {
     holds(crates::only_the_program_sees_all, |tree| {
-        vec![tree.with_line("hub/sim/Cargo.toml", "[dependencies]", "scanhub-daemon.workspace = true")]
+        vec![
+            tree.with_line("hub/sim/Cargo.toml", "[dependencies]", "scanhub-daemon.workspace = true"),
+            tree.with_line("hub/sim/Cargo.toml", "[dependencies]", "scanhub-client.workspace = true"),
+        ]
     });
 }
 
@@ -170,19 +205,33 @@ fn shared_memory_is_pinned() {
 /// A hub is small: most of its crates come with shared memory.
 #[test]
 fn the_daemon_is_built_from_few_crates() {
-    let crates = crates::built_from("scanhub-daemon", &[]);
-    eprintln!("daemon: {} crates", crates.len());
-    assert!(crates.len() <= 85, "{} crates: {crates:#?}", crates.len());
+    let mut crates = crates::built_from("scanhub-daemon", &[]);
+    crates.retain(|name| !name.starts_with("scanhub-"));
+    eprintln!("daemon: {} crates of others", crates.len());
+    assert!(crates.len() <= 79, "{} crates: {crates:#?}", crates.len());
 }
 
-/// A consumer pays for shared memory, and for little else.
+/// A consumer pays for shared memory, and for little else: for no verb, nor for what verbs need.
 #[test]
-fn clients_are_built_from_few_crates() {
-    let mut crates = crates::built_from("scanhub-clients", &["--no-default-features"]);
+fn the_client_is_built_from_few_crates() {
+    let mut crates = crates::built_from("scanhub-client", &[]);
     let shared_memory = crates::built_from("iceoryx2", &[]);
     crates.retain(|name| !shared_memory.contains(name));
-    eprintln!("clients: {} crates beside those of iceoryx2", crates.len());
-    assert!(crates.len() <= 30, "{} crates: {crates:#?}", crates.len());
+    eprintln!("client: {} crates beside those of iceoryx2", crates.len());
+    assert!(crates.len() <= 15, "{} crates: {crates:#?}", crates.len());
+    const OF_VERBS: [&str; 8] = [
+        "scanhub-verbs",
+        "ratatui",
+        "hdrhistogram",
+        "serde_json",
+        "mcap",
+        "socket2",
+        "strsim",
+        "thread-priority",
+    ];
+    let of_verbs = |name: &&String| OF_VERBS.iter().any(|verb| name.split(' ').next() == Some(verb));
+    assert_eq!(crates.iter().find(of_verbs), None);
+    assert!(crates::built_from("scanhub-verbs", &[]).iter().any(|name| of_verbs(&name)));
 }
 
 #[test]
@@ -219,7 +268,7 @@ fn unsafe_code_is_rare_and_explained() {
 fn shared_memory_is_built_in_one_module() {
     holds(sources::shared_memory_is_built_in_one_module, |tree| {
         vec![
-            tree.with("clients/src/planted.rs", "//! A client.\nuse iceoryx2::prelude::*;\n"),
+            tree.with("clients/verbs/src/planted.rs", "//! A client.\nuse iceoryx2::prelude::*;\n"),
             tree.with("schema/src/scan.rs", "//! A scan.\nuse iceoryx2::node::NodeBuilder;\n"),
         ]
     });
@@ -228,7 +277,10 @@ fn shared_memory_is_built_in_one_module() {
 #[test]
 fn ranges_are_born_in_one_file() {
     holds(sources::ranges_are_born_in_one_file, |tree| {
-        vec![tree.with("hub/daemon/src/link.rs", "//! A link.\nfor word in measured.words() {}\n")]
+        vec![
+            tree.with("hub/daemon/src/link.rs", "//! A link.\nfor word in measured.words() {}\n"),
+            tree.with("hub/tools/src/probe.rs", "//! Probes.\nfor word in measured.words() {}\n"),
+        ]
     });
 }
 
@@ -242,15 +294,16 @@ fn nobody_writes_the_eeprom() {
             ),
             tree.with("hub/lms/src/planted.rs", "//! Knows.\npub const CONFIGURE: u8 = 0x77;\n"),
             tree.with("hub/lms/src/planted.rs", "//! Writes.\nlet telegram = Writer::new(address, 0x66);\n"),
+            tree.with("hub/lms/src/explain/planted.rs", "//! Writes.\nlet telegram = Writer::new(0, SET);\n"),
             tree.with("hub/lms/src/dialogue.rs", "//! Talks.\nuse crate::eeprom::Write;\n"),
             tree.with("hub/lms/src/session.rs", "//! Talks.\nuse crate::{Nanos, eeprom};\n"),
             tree.with(
                 "hub/lms/src/outgoing.rs",
                 "//! Sends.\nlet request = crate::eeprom::Write::Field(&[]);\n",
             ),
-            tree.with("hub/daemon/src/link.rs", "//! A link.\nuse lms::eeprom;\n"),
-            tree.with("hub/daemon/src/probe.rs", "//! Probes.\nuse lms::{eeprom, command};\n"),
-            tree.with("clients/src/planted.rs", "//! Knows.\nuse lms::eeprom::Write;\n"),
+            tree.with("hub/daemon/src/link.rs", "//! A link.\nuse lms_configure::Change;\n"),
+            tree.with("hub/tools/src/probe.rs", "//! Probes.\nuse lms_configure::{eeprom, Plan};\n"),
+            tree.with("clients/verbs/src/planted.rs", "//! Knows.\nuse lms_configure::eeprom::Write;\n"),
         ]
     });
 }
@@ -259,18 +312,18 @@ fn nobody_writes_the_eeprom() {
 fn consent_is_given_by_persons() {
     holds(sources::consent_is_given_by_persons, |tree| {
         let planted = "//! Writes.\nlet consent = Consent::of_a_person(plan);\n";
-        let ask = tree.text("hub/daemon/src/configure/ask.rs");
-        let plan = tree.text("hub/lms/src/change/plan.rs");
+        let ask = tree.text("hub/tools/src/configure/ask.rs");
+        let plan = tree.text("hub/lms-configure/src/plan.rs");
         vec![
             tree.with("hub/daemon/src/link.rs", planted),
-            tree.with("hub/daemon/src/configure.rs", planted),
+            tree.with("hub/tools/src/configure.rs", planted),
             tree.with("hub/cli/configure.rs", planted),
             tree.with(
-                "hub/daemon/src/configure/ask.rs",
+                "hub/tools/src/configure/ask.rs",
                 &ask.replace("fn person", &format!("{planted}fn person")),
             ),
             tree.with(
-                "hub/lms/src/change/plan.rs",
+                "hub/lms-configure/src/plan.rs",
                 &plan.replace("Consent(plan)", "Consent(plan); Consent(plan)\n Consent(plan)"),
             ),
         ]
@@ -281,8 +334,11 @@ fn consent_is_given_by_persons() {
 fn files_are_short_and_say_what_they_are_for() {
     holds(sources::files_are_short_and_say_what_they_are_for, |tree| {
         vec![
-            tree.with("clients/src/planted.rs", &format!("//! Long.\n{}", "const N: u8 = 0;\n".repeat(400))),
-            tree.with("clients/src/planted.rs", "use std::fmt;\n"),
+            tree.with(
+                "clients/verbs/src/planted.rs",
+                &format!("//! Long.\n{}", "const N: u8 = 0;\n".repeat(400)),
+            ),
+            tree.with("clients/verbs/src/planted.rs", "use std::fmt;\n"),
         ]
     });
 }
@@ -291,10 +347,10 @@ fn files_are_short_and_say_what_they_are_for() {
 fn names_say_something() {
     holds(sources::names_say_something, |tree| {
         vec![
-            tree.with("clients/src/utils.rs", "//! Things.\n"),
-            tree.with("clients/src/planted.rs", "//! Things.\nstruct LinkManager;\n"),
-            tree.with("clients/src/planted.rs", "//! Things.\nmod common;\n"),
-            tree.with("clients/src/planted.rs", "//! Things.\nfn get_range() {}\n"),
+            tree.with("clients/verbs/src/utils.rs", "//! Things.\n"),
+            tree.with("clients/verbs/src/planted.rs", "//! Things.\nstruct LinkManager;\n"),
+            tree.with("clients/verbs/src/planted.rs", "//! Things.\nmod common;\n"),
+            tree.with("clients/verbs/src/planted.rs", "//! Things.\nfn get_range() {}\n"),
         ]
     });
 }
@@ -303,7 +359,7 @@ fn names_say_something() {
 fn nothing_promises_safety() {
     holds(sources::nothing_promises_safety, |tree| {
         vec![
-            tree.with("clients/src/planted.rs", "//! A protective field.\n"),
+            tree.with("clients/verbs/src/planted.rs", "//! A protective field.\n"),
             tree.with("CHANGELOG.md", "- A safety function for robots.\n"),
         ]
     });
@@ -345,7 +401,7 @@ fn the_first_consumer_is_compiled() {
 #[test]
 fn clients_that_do_not_record_need_no_c_compiler() {
     let in_c = |features: &[&str]| {
-        let crates = crates::built_from("scanhub-clients", features);
+        let crates = crates::built_from("scanhub-verbs", features);
         // The exception is the kernel's interface in Rust.
         let is_in_c = |name: &String| name.contains("-sys ") && !name.starts_with("linux-raw-sys");
         crates.into_iter().filter(is_in_c).collect::<Vec<_>>()

@@ -5,16 +5,14 @@ use std::os::fd::AsFd;
 use std::sync::atomic::AtomicBool;
 
 use lms::{Control, Identity, MILLIS, Nanos, Session};
+use port::{Port, Refusal, Source, clock};
 use rustix::event::PollFlags;
 use schema::{Failure, Flags, Kind, State};
 
-use crate::clock;
-use crate::config::Source;
 use crate::control::Flow;
 use crate::last_rate::LastRate;
 use crate::link::{LinkThread, Woken};
 use crate::memory::Memory;
-use crate::port::{Port, Refusal};
 
 impl LinkThread<'_> {
     /// Streams from the port, and takes it back whenever it was away. `report` is called once, as in

@@ -7,11 +7,11 @@ use std::os::fd::{AsFd, BorrowedFd};
 use std::sync::mpsc::{Receiver, SyncSender, TrySendError, channel, sync_channel};
 use std::sync::{Arc, Mutex, PoisonError};
 
+use config::Processing;
 use schema::ipc::{self, Asked, ControlServer, Node};
 use schema::{Background, Failure, Kind, Response, Shown, Verb, shortage};
 
 use crate::bell::Bell;
-use crate::config::Processing;
 pub(crate) use orders::{Flow, Orders};
 
 /// Where requests come in; stays in the supervising thread.

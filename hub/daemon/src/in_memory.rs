@@ -4,13 +4,13 @@
 
 use std::sync::atomic::AtomicBool;
 
+use config::Config;
 use lms::session::Output;
 use lms::{Nanos, Session};
+use port::clock;
 use rustix::event::{EventfdFlags, eventfd};
 use schema::{Domain, Failure, Flags, HubLock, State, Wake, ipc, shortage};
 
-use crate::clock;
-use crate::config::Config;
 use crate::control::Desk;
 use crate::link::{LinkThread, Surroundings};
 use crate::preflight;

@@ -11,13 +11,13 @@ use std::sync::{Arc, Mutex, PoisonError};
 use std::thread::{self, JoinHandle};
 use std::time::Duration;
 
+use config::{Config, Link};
 use lms::{MILLIS, Nanos};
+use port::{Source, clock};
 use rustix::event::{PollFd, PollFlags, poll};
 use schema::{Age, Background, Failure, Kind, Pose, StateDirectory};
 
 use crate::bell::Bell;
-use crate::clock;
-use crate::config::{Config, Link, Source};
 use crate::supervise::no_resource;
 use file::Learned;
 

@@ -6,22 +6,20 @@ use std::os::fd::{AsFd, BorrowedFd, OwnedFd};
 use std::path::Path;
 use std::sync::atomic::{AtomicBool, Ordering};
 
+use config::Link;
 use lms::framer::suspect;
 use lms::session::Output;
 use lms::variant::{Baud, Unit};
 use lms::{MILLIS, Nanos, Notice, Session, Settings, Trouble};
+use port::{LineErrors, Port, Source, clock};
 use rustix::event::{PollFd, PollFlags, poll};
 use schema::{Failure, Flags, State, StateDirectory, Status, Wake};
 
-use crate::clock;
-use crate::config::{Link, Source};
 use crate::control::{Flow, Orders};
 use crate::last_rate::LastRate;
 use crate::learned::Slot;
-use crate::line_errors::LineErrors;
 use crate::memory::Memory;
 use crate::pipeline::Pipeline;
-use crate::port::Port;
 use crate::publish::Past;
 use crate::replay::{self, Cast};
 use crate::service::Service;

@@ -8,9 +8,8 @@ use std::os::unix::fs::FileExt;
 use std::path::Path;
 
 use lms::{Identity, MILLIS, Nanos, Session};
+use port::clock;
 use schema::Directory;
-
-use crate::clock;
 
 /// The memory of one link.
 pub(crate) struct Memory {

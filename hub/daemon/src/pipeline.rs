@@ -3,13 +3,12 @@
 
 use std::fmt;
 
+use config::Processing;
 use preprocess::background::{Mismatch, Model};
 use preprocess::marks::Finder;
 use preprocess::segments::Cutter;
 use preprocess::zones::Check;
 use schema::{Background, Failure, Foreground, Kind, Marks, Pose, Scan, Verb, Zones};
-
-use crate::config::Processing;
 
 /// The processors of one link. Suspect scans take the same way as clean ones: an obstacle counts also where it is only
 /// suspected, and a background needs hundreds of scans in agreement, which the one bad one among them does not spoil.

@@ -6,9 +6,9 @@ use lms::reply::Reply;
 use lms::session::Received;
 use lms::telegram::Telegram;
 use lms::variant::{Mode, Variant};
+use port::clock;
 use schema::{Flags, Scan};
 
-use crate::clock;
 use crate::link::LinkThread;
 
 /// What a recording knows of a telegram and nobody could ask a line for; by default nothing.

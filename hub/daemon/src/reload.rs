@@ -1,10 +1,10 @@
 //! The configuration read anew while the hub runs: what is made of scans changes with the next scan, and nothing of the
 //! stream is lost for it; what belongs to a line waits for the next start, which is said. One that cannot be changes nothing.
 
+use config::{Background, Config, Link, Processing};
+use port::clock;
 use schema::Failure;
 
-use crate::clock;
-use crate::config::{Background, Config, Link, Processing};
 use crate::control::Desk;
 use crate::service::Service;
 
@@ -140,7 +140,7 @@ fn of_others<const N: usize>(compared: [(&'static str, bool); N]) -> Vec<&'stati
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::config::Sources;
+    use config::Sources;
     use preprocess::background::Start;
 
     fn config(links: &[&str], set: &[&str]) -> Config {

@@ -13,9 +13,9 @@ use std::path::Path;
 
 use lms::variant::Variant;
 use lms::{MILLIS, Nanos, Session};
+use port::clock;
 use schema::{Failure, Flags, State, Wake};
 
-use crate::clock;
 use crate::control::Flow;
 use crate::link::{LinkThread, Woken};
 use playback::{Due, Turn};

@@ -1,5 +1,6 @@
 //! What a link tells of itself: the words of a session and the hub's own counts as the payload of topic `status`.
 
+use config::Link;
 use lms::header::Reject;
 use lms::reply::Reply;
 use lms::telegram::Telegram;
@@ -7,7 +8,6 @@ use lms::variant::{Mode, Variant};
 use lms::{Nanos, Session};
 use schema::{Counter, Counters, Pose, State, Status};
 
-use crate::config::Link;
 use crate::recent::Recent;
 
 /// The link's account, across all sessions on its port.

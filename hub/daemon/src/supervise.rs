@@ -6,21 +6,21 @@ use std::sync::atomic::AtomicBool;
 use std::sync::mpsc;
 use std::thread;
 
+use config::Config;
 use lms::{MILLIS, Nanos};
+use port::{Port, clock};
 use rustix::event::{EventfdFlags, PollFd, PollFlags, Timespec, eventfd, poll};
 use schema::ipc::{self, Node};
 use schema::{Domain, Failure, HubLock, Kind, StateDirectory, shortage};
 
-use crate::config::Config;
 use crate::control::Desk;
 use crate::link::{LinkThread, Surroundings};
-use crate::port::Port;
 use crate::reload::{Read, Reload};
 use crate::replay::{Cast, Player, Recorded, Seat};
 use crate::service::{Service, Watchdog};
 use crate::signals::{Signals, Wanted};
 use crate::topics::Topics;
-use crate::{clock, learned, preflight};
+use crate::{learned, preflight};
 
 /// What is up.
 #[derive(Clone, Debug)]

@@ -4,10 +4,10 @@
 mod outlet;
 
 use lms::session::Received;
+use port::clock;
 use schema::ipc::{BytesMut, Node, Waker};
 use schema::{Background, Failure, Flags, Foreground, Header, Marks, Quality, Scan, Status, Wake, Zones};
 
-use crate::clock;
 use crate::pipeline::{Anew, Outputs, Pipeline};
 use outlet::{Loan, Outlet};
 

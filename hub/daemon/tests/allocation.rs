@@ -11,9 +11,8 @@ use std::sync::mpsc::channel;
 use std::thread;
 use std::time::{Duration, Instant};
 
+use config::{Config, Sources};
 use counting::{HELD, TAKEN, WATCHED};
-use daemon::Config;
-use daemon::config::Sources;
 use lms::command::Request;
 use lms::reply::{self, Health};
 use lms::telegram::ACK;

@@ -3,8 +3,7 @@
 
 use std::fs;
 
-use daemon::Config;
-use daemon::config::Sources;
+use config::{Config, Sources};
 use lms::variant::Unit;
 use schema::ipc::{self, Payload};
 use schema::{Domain, Kind, Marks, Scan, State, Status};

@@ -1,5 +1,5 @@
 //! Requests that leave no trace: what a host says to a sensor and a power cycle undoes. Encoded by whoever asks, decoded
-//! by the simulator and for people. What the sensor would keep for ever is not here but in [`crate::eeprom`], so code
+//! by the simulator and for people. What the sensor would keep for ever is not here but in `lms_configure`, so code
 //! that has only a [`Request`] cannot write the EEPROM.
 
 use crate::operating::{self, Operating};
@@ -207,7 +207,7 @@ pub const CARTESIAN: u8 = 0x76;
 pub const CONFIGURATION_2: u8 = 0x7B;
 
 /// Commands that write the sensor's EEPROM: fields, password, taught fields, permanent rate, configuration parts 1 and 2
-/// (Telegram listing 7-1: those that need the installation mode). They are [`crate::eeprom::Write`], never a
+/// (Telegram listing 7-1: those that need the installation mode). They are written by `lms_configure`, never a
 /// [`Request`].
 pub const EEPROM_WRITES: [u8; 6] = [0x40, 0x42, 0x46, 0x66, 0x77, 0x7C];
 

@@ -1,9 +1,11 @@
-//! One request after the other, and what comes back: what [`crate::inquiry`] and [`crate::change`] have in common. Knows
+//! One request after the other, and what comes back: what [`crate::inquiry`] and a change of the configuration have in common. Knows
 //! pace, tries and bytes; refuses to know what is asked, and why.
 
 use crate::Nanos;
 use crate::framer::{Advance, Framer, Place, Tally};
-use crate::outgoing::{NAK_PAUSE, Outgoing, SOON, Say};
+pub use crate::outgoing::{MODE_TIMEOUT, Say};
+use crate::outgoing::{NAK_PAUSE, Outgoing, SOON};
+pub use crate::phase::{MORE_TRIES, TRIES};
 use crate::reply::REFUSED;
 use crate::telegram::{REPLY, Telegram};
 use crate::variant::Baud;
@@ -51,22 +53,24 @@ pub trait Conversation {
 
 /// A line with at most one open request.
 #[derive(Clone, Debug)]
-pub(crate) struct Exchange<R> {
+pub struct Exchange<R> {
     framer: Framer,
     open: Option<Outgoing<R>>,
     change_baud: bool,
-    pub(crate) baud: Baud,
-    pub(crate) now: Nanos,
+    /// The rate that the port is to have.
+    pub baud: Baud,
+    /// When it was last told something.
+    pub now: Nanos,
     last_byte: Nanos,
     /// The sensor's own address, once it has said it; 0 is for all.
-    pub(crate) address: u8,
+    pub address: u8,
     /// Behind a server, whose first sign of a reply may be all of it.
-    pub(crate) behind_server: bool,
+    pub behind_server: bool,
 }
 
 impl<R: Say> Exchange<R> {
     /// On a port that is open at `baud`.
-    pub(crate) fn new(baud: Baud, now: Nanos) -> Self {
+    pub fn new(baud: Baud, now: Nanos) -> Self {
         Exchange {
             framer: Framer::default(),
             open: None,
@@ -79,11 +83,13 @@ impl<R: Say> Exchange<R> {
         }
     }
 
-    pub(crate) fn spare(&mut self) -> &mut [u8] {
+    /// As [`Conversation::spare`].
+    pub fn spare(&mut self) -> &mut [u8] {
         self.framer.spare()
     }
 
-    pub(crate) fn commit(&mut self, now: Nanos, len: usize) {
+    /// As [`Conversation::commit`].
+    pub fn commit(&mut self, now: Nanos, len: usize) {
         self.now = now;
         if len > 0 {
             self.framer.commit(len);
@@ -94,13 +100,14 @@ impl<R: Say> Exchange<R> {
     }
 
     /// A read found nothing; returns whether the open request has waited long enough.
-    pub(crate) fn handle_timeout(&mut self, now: Nanos) -> bool {
+    pub fn handle_timeout(&mut self, now: Nanos) -> bool {
         self.now = now;
         self.framer.release(now.saturating_sub(self.last_byte));
         self.open.as_ref().is_some_and(|open| now >= open.give_up_at())
     }
 
-    pub(crate) fn transmitted(&mut self, now: Nanos) {
+    /// As [`Conversation::transmitted`].
+    pub fn transmitted(&mut self, now: Nanos) {
         self.now = now;
         if let Some(open) = &mut self.open {
             open.transmitted(now, self.baud);
@@ -111,18 +118,18 @@ impl<R: Say> Exchange<R> {
     }
 
     /// Changes the rate, if it is another one.
-    pub(crate) fn set_baud(&mut self, baud: Baud) {
+    pub fn set_baud(&mut self, baud: Baud) {
         self.change_baud |= self.baud != baud;
         self.baud = baud;
     }
 
     /// Says `request` from `not_before` on, at most `tries` times.
-    pub(crate) fn ask(&mut self, request: R, not_before: Nanos, tries: u8) {
+    pub fn ask(&mut self, request: R, not_before: Nanos, tries: u8) {
         self.open = Some(Outgoing::new(request, self.address, not_before, tries));
     }
 
     /// Says the open request once more from `at` on; `false` if its tries are used up or there is none.
-    pub(crate) fn again(&mut self, at: Nanos) -> bool {
+    pub fn again(&mut self, at: Nanos) -> bool {
         let more = self.open.as_mut().is_some_and(|open| open.again(at));
         if !more {
             self.open = None;
@@ -131,12 +138,12 @@ impl<R: Say> Exchange<R> {
     }
 
     /// A NAK came that is to be believed; returns whether there was a request, and whether it will be said again.
-    pub(crate) fn refused_checksum(&mut self) -> Option<bool> {
+    pub fn refused_checksum(&mut self) -> Option<bool> {
         self.open.as_ref().is_some_and(Outgoing::is_out).then(|| self.again(self.now + NAK_PAUSE))
     }
 
     /// Takes the open request if `telegram` answers it, or refuses it.
-    pub(crate) fn answered(&mut self, command: u8) -> Option<R> {
+    pub fn answered(&mut self, command: u8) -> Option<R> {
         let answers = |open: &mut Outgoing<R>| {
             open.is_out() && (command == REFUSED || command == open.request.command() | REPLY)
         };
@@ -144,7 +151,7 @@ impl<R: Say> Exchange<R> {
     }
 
     /// The next thing found in the bytes; an acknowledgement is taken note of.
-    pub(crate) fn advance(&mut self) -> Option<Heard> {
+    pub fn advance(&mut self) -> Option<Heard> {
         // Another rate is about to be set: what came at the old one is not looked at.
         while !self.change_baud {
             match self.framer.advance()? {
@@ -161,12 +168,12 @@ impl<R: Say> Exchange<R> {
     }
 
     /// The telegram that was found last.
-    pub(crate) fn view(&self, place: Place) -> Telegram<'_> {
+    pub fn view(&self, place: Place) -> Telegram<'_> {
         self.framer.view(place).telegram
     }
 
     /// What it wants, with a deadline of its user's own.
-    pub(crate) fn output(&mut self, own: Nanos) -> Output {
+    pub fn output(&mut self, own: Nanos) -> Output {
         if core::mem::take(&mut self.change_baud) {
             self.framer.clear();
             return Output::SetBaud(self.baud);
@@ -189,15 +196,17 @@ impl<R: Say> Exchange<R> {
     }
 
     /// What became of the bytes, and how many are open.
-    pub(crate) fn tally(&self) -> (&Tally, usize) {
+    pub fn tally(&self) -> (&Tally, usize) {
         (self.framer.tally(), self.framer.buffered())
     }
 }
 
 /// What came.
 #[derive(Clone, Copy, Debug)]
-pub(crate) enum Heard {
+pub enum Heard {
+    /// A telegram, to be seen by [`Exchange::view`].
     Telegram(Place),
+    /// A NAK.
     Nak,
 }
 

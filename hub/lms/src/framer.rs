@@ -84,7 +84,7 @@ pub(crate) enum Advance {
 
 /// Where in the buffer a telegram lies, until the next bytes come.
 #[derive(Clone, Copy, Debug)]
-pub(crate) struct Place {
+pub struct Place {
     at: usize,
     end: usize,
     pub(crate) offset: u64,

@@ -9,14 +9,12 @@
 mod arrival;
 mod cadence;
 mod candidates;
-pub mod change;
 pub mod command;
 pub mod condition;
 pub mod configuration;
 pub mod crc;
 mod damage;
 mod dialogue;
-pub mod eeprom;
 pub mod errors;
 pub mod exchange;
 pub mod explain;

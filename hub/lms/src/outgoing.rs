@@ -8,7 +8,7 @@ use crate::variant::Baud;
 use crate::{MICROS, MILLIS, Nanos, line_time};
 
 /// What can be said: a telegram that has a reply, which takes its time.
-pub(crate) trait Say {
+pub trait Say {
     /// The telegram that says it to the sensor at `address`.
     fn encode(&self, address: u8) -> Encoded;
     /// Its command byte.
@@ -178,7 +178,7 @@ const STOP_TIMEOUT: Nanos = 300 * MILLIS;
 pub(crate) const REPLY_TIMEOUT: Nanos = 500 * MILLIS;
 /// A change of mode takes up to 3 s (Telegram listing 7.3), but mostly a tenth of one. Who asks what became of it before
 /// it is over finds the mode that was, and undoes the change.
-pub(crate) const MODE_TIMEOUT: Nanos = 3_200 * MILLIS;
+pub const MODE_TIMEOUT: Nanos = 3_200 * MILLIS;
 /// Bytes of the status reply.
 const LONGEST_REPLY: usize = 160;
 /// After a NAK the sensor wants 30 ms of peace (Telegram listing 4.3).

@@ -134,9 +134,9 @@ pub(crate) const SETTLE: Nanos = 20 * MILLIS;
 /// After a refusal, before everything begins again.
 pub(crate) const PAUSE: Nanos = 500 * MILLIS;
 /// A sensor may overlook a request while its mirror turns; three tries are what all drivers give it.
-pub(crate) const TRIES: u8 = 3;
+pub const TRIES: u8 = 3;
 /// Of requests without which there is no stream.
-pub(crate) const MORE_TRIES: u8 = 5;
+pub const MORE_TRIES: u8 = 5;
 /// A whole scan that began so long after a request says that the request was overlooked: it breaks off what is sent.
 /// The time is for bytes that an adapter keeps.
 pub(crate) const OVERLOOKED: Nanos = 25 * MILLIS;

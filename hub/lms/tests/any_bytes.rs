@@ -2,7 +2,6 @@
 //! came.
 
 use lms::command::Request;
-use lms::eeprom::Write;
 use lms::explain::{Headline, explain};
 use lms::reply::Reply;
 use lms::telegram::{Encoded, Telegram, Writer};
@@ -58,7 +57,7 @@ proptest! {
     #[test]
     fn bytes_without_a_checksum(bytes in proptest::collection::vec(any::<u8>(), 0..900)) {
         if let Some(telegram) = Telegram::check(&bytes) {
-            let _ = (Request::decode(telegram), Reply::decode(telegram), Write::decode(telegram));
+            let _ = (Request::decode(telegram), Reply::decode(telegram));
         }
     }
 
@@ -80,11 +79,6 @@ proptest! {
         if let Some(request) = Request::decode(telegram) {
             let again = request.encode(address);
             prop_assert_eq!(again.bytes(), telegram.bytes(), "{:?}", request);
-            prop_assert_eq!(Write::decode(telegram), None);
-        }
-        if let Some(write) = Write::decode(telegram) {
-            let again = write.encode(address);
-            prop_assert_eq!(again.as_ref().map(|again| again.bytes()), Some(telegram.bytes()));
         }
     }
 

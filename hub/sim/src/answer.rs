@@ -8,7 +8,6 @@
 use std::ops::Range;
 
 use lms::command::{self, EEPROM_WRITES, Request};
-use lms::eeprom::{self, PowerOn, Write};
 use lms::family::Family;
 use lms::operating::Operating as Asked;
 use lms::parameters::Password;
@@ -16,6 +15,7 @@ use lms::reply::{self, Health};
 use lms::telegram::{Encoded, REPLY, Telegram, Writer};
 use lms::variant::{Baud, MIRROR_TURN, Variant};
 use lms::{MILLIS, Nanos};
+use lms_configure::eeprom::{self, PowerOn, Write};
 
 use crate::machine::Machine;
 use crate::operating::Operating;

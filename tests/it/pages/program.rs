@@ -57,7 +57,7 @@ fn whole(block: &Block) -> String {
     let Block { language, text, .. } = block;
     match language.as_str() {
         "rust" if !text.contains("fn main") => {
-            format!("fn main() -> Result<(), schema::Failure> {{\n{text}}}\n")
+            format!("fn main() -> Result<(), scanhub_client::Failure> {{\n{text}}}\n")
         }
         "c" if !text.contains("int main") => format!("{C}int main(void)\n{{\n{LINES}{text}return 0;\n}}\n"),
         "cpp" if !text.contains("int main") => format!("{CPP}int main()\n{{\n{LINES}{text}}}\n"),
@@ -85,16 +85,15 @@ fn of_cpp(source: &Path, env: &TestEnv) -> Result<Option<PathBuf>, String> {
     Installed::once().and_then(|installed| installed.try_compile_cpp(env, source)).transpose()
 }
 
-/// By the compiler itself, with the libraries that Cargo makes.
+/// By the compiler itself, with the library that Cargo makes.
 fn of_rust(source: &Path, env: &TestEnv) -> Result<PathBuf, String> {
     let program = env.path(&format!("{}-rust", source.file_stem().expect("a name").display()));
     let mut command = Command::new(std::env::var_os("RUSTC").unwrap_or_else(|| "rustc".into()));
     command.args(["--edition=2024", "-Dwarnings", "-o"]).arg(&program).arg(source);
-    for (name, library) in libraries() {
-        let directory = library.parent().expect("a directory");
-        command.arg(format!("-Ldependency={}", directory.join("deps").display()));
-        command.arg(format!("--extern={name}={}", library.display()));
-    }
+    let library = library();
+    let directory = library.parent().expect("a directory");
+    command.arg(format!("-Ldependency={}", directory.join("deps").display()));
+    command.arg(format!("--extern={LIBRARY}={}", library.display()));
     let output = command.output().expect("a compiler");
     if !output.status.success() {
         return Err(String::from_utf8_lossy(&output.stderr).into_owned());
@@ -102,12 +101,15 @@ fn of_rust(source: &Path, env: &TestEnv) -> Result<PathBuf, String> {
     Ok(program)
 }
 
-/// The libraries of this project that a consumer depends on, by name. Built alone: this test and the program, which run,
-/// are not made again.
-fn libraries() -> Vec<(String, PathBuf)> {
+/// What a consumer depends on.
+const LIBRARY: &str = "scanhub_client";
+
+/// The one library of this project that a consumer depends on. Built alone: this test and the program, which run, are not made
+/// again.
+fn library() -> PathBuf {
     let mut command = Command::new(env!("CARGO"));
     command.args(["build", "--offline", "--message-format=json", "--quiet", "--lib"]);
-    command.args(["--package=scanhub-clients", "--package=scanhub-schema"]);
+    command.arg("--package=scanhub-client");
     if !cfg!(debug_assertions) {
         command.arg("--release");
     }
@@ -116,16 +118,13 @@ fn libraries() -> Vec<(String, PathBuf)> {
     let messages = String::from_utf8(output.stdout).expect("text");
     let messages = messages.lines().filter_map(|line| serde_json::from_str::<Value>(line).ok());
     let library = |message: Value| {
-        let name = message["target"]["name"].as_str()?.to_owned();
         let files = message["filenames"].as_array()?;
         let library = files.iter().filter_map(Value::as_str).find(|file| file.ends_with(".rlib"))?;
-        ["clients", "schema"]
-            .contains(&name.as_str())
-            .then(|| (name, fs::canonicalize(library).expect("a file")))
+        (message["target"]["name"] == LIBRARY).then(|| fs::canonicalize(library).expect("a file"))
     };
     let libraries: Vec<_> = messages.filter_map(library).collect();
-    assert_eq!(libraries.len(), 2, "{libraries:?}");
-    libraries
+    let [library] = &libraries[..] else { panic!("{libraries:?}") };
+    library.clone()
 }
 
 /// What stands before each example in C that is a part of a program.

@@ -39,6 +39,30 @@ pub(crate) fn lms_stands_alone(tree: &Tree) -> Vec<String> {
     breaches
 }
 
+/// What writes the EEPROM is a part of the protocol and as plain.
+pub(crate) fn what_writes_the_eeprom_is_protocol_alone(tree: &Tree) -> Vec<String> {
+    let below = |path: &str| path.starts_with("hub/lms-configure/src/");
+    let mut breaches = built_of(tree, "scanhub-lms-configure", &["scanhub-lms"]);
+    let attributes = ["#![no_std]", "#![forbid(unsafe_code)]"];
+    breaches.extend(lacks(tree, "hub/lms-configure/src/lib.rs", &attributes));
+    breaches.extend(find(tree, &["std::", "extern crate", "alloc::"], below));
+    breaches
+}
+
+/// Cargo keeps requests that write the EEPROM from all crates but these: the one where a person is asked, and the
+/// simulator, which is the sensor. Tests of others may have them.
+pub(crate) fn few_crates_can_write_the_eeprom(tree: &Tree) -> Vec<String> {
+    const MAY: [&str; 2] = ["scanhub-tools", "scanhub-sim"];
+    let top = ("scanhub".to_owned(), tree.manifest("Cargo.toml"));
+    let others = tree.members().into_iter().chain([top]).filter(|(name, _)| !MAY.contains(&name.as_str()));
+    // The fuzzer's crate is a test.
+    let built = others.filter(|(name, _)| name != "scanhub-fuzz");
+    built
+        .filter(|(_, manifest)| built_with(manifest).any(|name| name == "scanhub-lms-configure"))
+        .map(|(name, _)| format!("{name} is built with what writes the EEPROM"))
+        .collect()
+}
+
 fn lacks(tree: &Tree, path: &str, attributes: &[&str]) -> Vec<String> {
     let has = |attribute: &str| tree.text(path).lines().any(|line| line == attribute);
     let missing = attributes.iter().filter(|attribute| !has(attribute));
@@ -97,11 +121,19 @@ pub(crate) fn no_processor_uses_another(tree: &Tree) -> Vec<String> {
     breaches
 }
 
-/// The words of ROS are beside ours: they come with `clients` where these record.
+/// A consumer's program has nothing of ours below it but the library and the words. The verbs stand on it as others do; the
+/// words of ROS come with them where they record.
 pub(crate) fn clients_know_only_schema(tree: &Tree) -> Vec<String> {
-    let mut names = ours(&tree.members()["scanhub-clients"], &ALL);
-    names.retain(|name| !["scanhub-schema", "scanhub-ros"].contains(&name.as_str()));
-    names.into_iter().collect()
+    let known: [(&str, &[&str]); 2] = [
+        ("scanhub-client", &["scanhub-schema"]),
+        ("scanhub-verbs", &["scanhub-client", "scanhub-schema", "scanhub-ros"]),
+    ];
+    let members = tree.members();
+    let others = known.iter().flat_map(|(name, known)| {
+        let names = ours(&members[*name], &ALL).into_iter().filter(|other| !known.contains(&other.as_str()));
+        names.map(move |other| format!("{name} knows {other}"))
+    });
+    others.collect()
 }
 
 /// From payloads to messages: nothing of the system, nothing of others, so that anybody can call it.
@@ -131,7 +163,7 @@ fn built_of(tree: &Tree, package: &str, known: &[&str]) -> Vec<String> {
 pub(crate) fn the_library_for_c_knows_clients(tree: &Tree) -> Vec<String> {
     const OWN: &str = "scanhub-c";
     let members = tree.members();
-    let known = ["scanhub-clients", "scanhub-schema"];
+    let known = ["scanhub-client", "scanhub-schema"];
     let mut breaches: Vec<String> =
         built_with(&members[OWN]).filter(|name| !known.contains(&name.as_str())).cloned().collect();
     let top = ("scanhub".to_owned(), tree.manifest("Cargo.toml"));
@@ -142,6 +174,7 @@ pub(crate) fn the_library_for_c_knows_clients(tree: &Tree) -> Vec<String> {
     breaches
 }
 
+/// Nor anything that writes the EEPROM.
 pub(crate) fn the_daemon_knows_neither_clients_nor_sim(tree: &Tree) -> Vec<String> {
     let members = tree.members();
     let mut reached = BTreeSet::new();
@@ -150,18 +183,22 @@ pub(crate) fn the_daemon_knows_neither_clients_nor_sim(tree: &Tree) -> Vec<Strin
         open.extend(ours(&members[&name], &NORMAL).into_iter().filter(|name| !reached.contains(name)));
         reached.insert(name);
     }
-    reached.into_iter().filter(|name| name == "scanhub-clients" || name == "scanhub-sim").collect()
+    const STRANGERS: [&str; 5] =
+        ["scanhub-client", "scanhub-verbs", "scanhub-sim", "scanhub-tools", "scanhub-lms-configure"];
+    reached.into_iter().filter(|name| STRANGERS.contains(&name.as_str())).collect()
 }
 
-/// The daemon, the clients and the simulator meet nowhere but in the program: no crate has two of them.
+/// The daemon, the clients, the simulator and the tools meet nowhere but in the program: no crate has two of them.
 pub(crate) fn only_the_program_sees_all(tree: &Tree) -> Vec<String> {
-    let ends = ["scanhub-daemon", "scanhub-clients", "scanhub-sim"];
+    let ends: [&[&str]; 4] =
+        [&["scanhub-daemon"], &["scanhub-client", "scanhub-verbs"], &["scanhub-sim"], &["scanhub-tools"]];
     let mut breaches = Vec::new();
     for (name, manifest) in tree.members() {
         let mut known = ours(&manifest, &NORMAL);
         known.insert(name.clone());
-        known.retain(|known| ends.contains(&known.as_str()));
-        if known.len() > 1 {
+        let met = ends.iter().filter(|end| end.iter().any(|name| known.contains(*name))).count();
+        if met > 1 {
+            known.retain(|known| ends.concat().contains(&known.as_str()));
             breaches.push(format!("{name} brings {known:?} together"));
         }
     }

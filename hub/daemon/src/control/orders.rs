@@ -5,13 +5,13 @@ use std::os::fd::{AsFd, BorrowedFd};
 use std::sync::mpsc::{Receiver, Sender};
 use std::sync::{Arc, PoisonError};
 
+use config::Processing;
 use lms::{Control, Nanos, Session};
+use port::clock;
 use schema::{Failure, Kind, Shown, Verb, Wake};
 
 use super::{Changed, Order, Outcome};
 use crate::bell::Bell;
-use crate::clock;
-use crate::config::Processing;
 use crate::learned::Slot;
 use crate::link::LinkThread;
 use crate::replay::Player;

@@ -1,11 +1,10 @@
 //! A learned background as text: the file of `scanhub background SENSOR save` with where the sensor sat and when it was
 //! written. What is read is checked against the link that would begin with it. Refuses to know where files lie.
 
+use config::Link;
 use lms::variant::Unit;
 use schema::{Background, Failure, Kind, Pose, SavedModel, as_json};
 use serde::{Deserialize, Serialize};
-
-use crate::config::Link;
 
 /// A model, where its sensor sat, and when it was written, in nanoseconds since 1970.
 #[derive(Clone, Debug, PartialEq)]
@@ -81,7 +80,7 @@ const SAME: f64 = 1e-9;
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::config::{Config, Sources};
+    use config::{Config, Sources};
 
     fn link(set: &[&str]) -> Link {
         let set = set.iter().map(|flag| (*flag).to_owned()).collect();

@@ -4,14 +4,15 @@
 use std::path::Path;
 use std::sync::Arc;
 
+use config::{Config, Sources};
 use lms::Nanos;
+use port::Source;
 use recording::Recording;
 use schema::{Failure, Kind, check_sensor};
 
 use super::playback::Play;
 use super::player::{Player, Progress};
 use super::recorded::{self, Origin, Recorded};
-use crate::config::{Config, Source, Sources};
 use crate::supervise::{self, Ready, Troupe};
 use schema::Domain;
 

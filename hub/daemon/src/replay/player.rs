@@ -5,11 +5,11 @@ use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::sync::{Mutex, MutexGuard, PoisonError};
 
 use lms::Nanos;
+use port::clock;
 use schema::Failure;
 
 use super::playback::{Due, Play, Playback, Turn};
 use crate::bell::Bell;
-use crate::clock;
 
 /// How fast a recording is played.
 #[derive(Clone, Copy, Debug, PartialEq)]

@@ -4,6 +4,7 @@
 use std::io::{self, Read};
 use std::path::Path;
 
+use config::Link;
 use lms::Nanos;
 use lms::reply::Reply;
 use lms::telegram::Telegram;
@@ -12,7 +13,6 @@ use recording::{Encoding, Form, Frame, Recording};
 use schema::{Failure, Header, Kind};
 
 use super::{LONGEST_GAP, period};
-use crate::config::Link;
 
 /// A recording of one sensor.
 pub(crate) enum Recorded {

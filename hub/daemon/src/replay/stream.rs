@@ -5,11 +5,11 @@ use lms::measured::{MEASURED, Measured};
 use lms::session::Output;
 use lms::variant::Variant;
 use lms::{Nanos, Session};
+use port::clock;
 use schema::State;
 
 use super::recorded::{Stream, read};
 use super::{STANDS, Seat, Turns};
-use crate::clock;
 use crate::link::LinkThread;
 use crate::publish::Past;
 

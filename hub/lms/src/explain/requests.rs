@@ -5,7 +5,6 @@ use super::{Degrees, replies};
 use crate::command::{
     CARTESIAN, MEANS, MODE, RANGE, RANGE_FIELDS, RANGE_MEANS, REFLECTIVITIES, REFLECTIVITY, VALUES, VARIANT,
 };
-use crate::eeprom;
 use crate::operating;
 use crate::telegram::Telegram;
 
@@ -31,8 +30,8 @@ pub(super) fn fields(walk: &mut Walk<'_, '_>, telegram: Telegram<'_>) -> Option<
             walk.word_as("angle", |angle| said(move |f| write!(f, "{angle} degrees")))?;
             walk.word_as("resolution", |step| said(move |f| write!(f, "{} degrees", Degrees(step)))).map(drop)
         }
-        eeprom::CONFIGURATION => replies::configuration(walk),
-        eeprom::POWER_ON_RATE => walk.byte_as("rate after power-on", power_on).map(drop),
+        WRITE_CONFIGURATION => replies::configuration(walk),
+        POWER_ON_RATE => walk.byte_as("rate after power-on", power_on).map(drop),
         _ => walk.rest("parameters"),
     }
 }
@@ -66,11 +65,11 @@ fn spans(walk: &mut Walk<'_, '_>) -> Option<()> {
 
 /// What 66h sets, in words.
 pub(super) fn power_on(byte: u8) -> &'static str {
-    match eeprom::PowerOn::of_byte(byte) {
-        Some(eeprom::PowerOn::Baud9600) => "9600",
-        Some(eeprom::PowerOn::KeepBaud) => "the present rate is kept",
-        Some(eeprom::PowerOn::KeepType) => "the type is kept",
-        None => "unknown",
+    match byte {
+        0 => "9600",
+        1 => "the present rate is kept",
+        2 => "the type is kept",
+        _ => "unknown",
     }
 }
 
@@ -86,5 +85,9 @@ fn selection(byte: u8) -> &'static str {
     }
 }
 
+/// Two requests that write the EEPROM. They are explained here and made in `lms_configure` only.
+const POWER_ON_RATE: u8 = 0x66;
+/// See [`POWER_ON_RATE`].
+const WRITE_CONFIGURATION: u8 = 0x77;
 /// Bit of the first value of a sub-range.
 const DIRECT: u16 = 1 << 15;

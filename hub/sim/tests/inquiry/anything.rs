@@ -1,7 +1,6 @@
 //! Random bytes and random orders of events: nothing panics, everything comes to its end, and nothing is said that was
 //! not to be.
 
-use lms::change::{Change, Consent, Kept, Plan};
 use lms::configuration::factory;
 use lms::exchange::{Conversation, Output};
 use lms::framer::Tally;
@@ -9,6 +8,7 @@ use lms::parameters::Password;
 use lms::telegram::{FRAME, Telegram, Writer};
 use lms::variant::{Baud, Mode, Unit};
 use lms::{Inquiry, MILLIS, Nanos};
+use lms_configure::{Change, Consent, Kept, Plan};
 
 /// Drives `talk` until it is over, by what comes to mind; returns the telegrams that it said.
 fn drive<C: Conversation>(talk: &mut C, seed: u64) -> Vec<Vec<u8>> {

@@ -1,13 +1,12 @@
 //! Changing what a sensor keeps for ever, with consent: written once, read back, and the stream goes on; and what is
 //! known when it goes wrong.
 
-use lms::change::{Change, Consent, Failing, Outcome, Plan, Step};
 use lms::configuration::Configuration;
-use lms::eeprom::PowerOn;
 use lms::parameters::Password;
 use lms::telegram::{NAK, Writer};
 use lms::variant::{Baud, Mode, Unit};
 use lms::{Inquiry, MILLIS, Nanos};
+use lms_configure::{Change, Consent, Failing, Outcome, Plan, Step, eeprom::PowerOn};
 use sim::machine::{Habits, Machine, Settings};
 use sim::operating::Operating;
 

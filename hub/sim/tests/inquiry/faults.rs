@@ -1,9 +1,9 @@
 //! The fault table against conversations that come to an end: they end, what they tell is true, and a change writes no
 //! more often than it may and never unnoticed.
 
-use lms::change::Change;
 use lms::variant::Baud;
 use lms::{Inquiry, MILLIS};
+use lms_configure::Change;
 use sim::fault::Faults;
 use sim::machine::{Habits, Machine};
 use sim::wire::Wire;

@@ -1,13 +1,13 @@
 //! Bad habits of a sensor, each alone.
 
 use lms::command::Request;
-use lms::eeprom::{PowerOn, Write};
 use lms::operating::Operating;
 use lms::parameters::Password;
 use lms::reply::Reply;
 use lms::telegram::{ACK, NAK};
 use lms::variant::{Baud, Variant};
 use lms::{MICROS, MILLIS, line_time};
+use lms_configure::eeprom::{PowerOn, Write};
 use sim::machine::{Habits, Settings};
 use sim::{Arrival, Dropped};
 

@@ -2,12 +2,12 @@
 //! once a healthy sensor is there, its stream is. One seed reproduces a run.
 
 use lms::command::{EEPROM_WRITES, Request};
-use lms::eeprom::Write;
 use lms::reply::{self, Health};
 use lms::session::{Output, Session};
 use lms::telegram::{FRAME, REPLY, STX, Telegram, Writer};
 use lms::variant::{Baud, Mode, Unit, Variant};
 use lms::{Control, MILLIS, Nanos, Settings, State, line_time};
+use lms_configure::eeprom::Write;
 use sim::machine::{self, Start};
 use sim::operating::Operating;
 

@@ -1,0 +1,195 @@
+//! The configuration as it is in effect, value by value, each with the place that it has it from. Refuses to know how it
+//! is read: what is shown is what the hub would work with.
+
+use std::fmt;
+
+use preprocess::background::{Candidate, Method, Start};
+use preprocess::{marks, zones};
+use schema::{Failure, Pose};
+use serde::Serialize;
+use serde_json::{Value as Json, json};
+
+use crate::gateway::Gateway;
+use crate::link::{Config, Link};
+use crate::places::Places;
+use crate::processing::{Background, Zones};
+use crate::sources::Sources;
+
+/// One value in effect.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct Value {
+    class: &'static str,
+    /// The key as `--set` takes it.
+    pub key: String,
+    /// What it is, in the words and units of the configuration; null if there is nothing without a word.
+    pub value: Json,
+    /// Where it is said, `FILE:LINE:COLUMN` or a flag; else `default`, possibly with what that follows from.
+    pub origin: String,
+}
+
+/// All values of the links and of the gateway, as `sources` say them.
+///
+/// [`schema::Kind::Configuration`] with place, value and remedy.
+pub fn values(sources: &Sources) -> Result<Vec<Value>, Failure> {
+    let (config, gateway) = (Config::load(sources)?, Gateway::load(sources)?);
+    let mut list = List { places: Places::of(sources)?, values: Vec::new() };
+    for link in &config.links {
+        list.link(link);
+    }
+    list.gateway(&gateway);
+    Ok(list.values)
+}
+
+struct List {
+    places: Places,
+    values: Vec<Value>,
+}
+
+impl List {
+    fn link(&mut self, link: &Link) {
+        let Link { name, port, family, variant, unit, mode, baud, processing } = link;
+        let of = |key: &'static str| (name.as_str(), key);
+        let by_type = match family {
+            Some(family) => format!("default of {}", family.name()),
+            None => DEFAULT.to_owned(),
+        };
+        self.put(of("port"), json!(port.name()), DEFAULT);
+        self.put(of("type"), json!(family.map(|family| family.name())), DEFAULT);
+        self.put(of("angle"), json!(variant.angle_deg), &by_type);
+        self.put(of("resolution"), json!(f64::from(variant.resolution_cdeg) / 100.0), &by_type);
+        self.put(of("unit"), json!(unit.map(|unit| if unit.mm() == 1 { "mm" } else { "cm" })), DEFAULT);
+        self.put(of("mode"), json!(mode.map(|mode| mode.0)), DEFAULT);
+        self.put(of("baud"), json!(baud.rate()), DEFAULT);
+        let Pose { x_m, y_m, yaw_rad, upside_down, .. } = processing.pose;
+        self.put(of("pose.x"), json!(x_m), DEFAULT);
+        self.put(of("pose.y"), json!(y_m), DEFAULT);
+        self.put(of("pose.yaw"), json!(yaw_rad), DEFAULT);
+        self.put(of("pose.upside_down"), json!(upside_down != 0), DEFAULT);
+        self.zones(name, &processing.zones);
+        let marks::Settings { i_min, max_range_step_mm, max_gap } = processing.marks;
+        self.put(of("marks.i_min"), json!(i_min), DEFAULT);
+        self.put(of("marks.max_range_step"), json!(metres(max_range_step_mm)), DEFAULT);
+        self.put(of("marks.max_gap"), json!(max_gap), DEFAULT);
+        self.background(name, &processing.background);
+    }
+
+    fn zones(&mut self, link: &str, zones: &Zones) {
+        let radii: Vec<f64> = zones.radii_mm.iter().copied().map(metres).collect();
+        let sector = |sector: &zones::Sector| {
+            let [from, to] = [sector.from_mdeg, sector.to_mdeg].map(|mdeg| f64::from(mdeg) / 1000.0);
+            json!({ "from": from, "to": to, "range": metres(sector.range_mm) })
+        };
+        let self_min: Vec<Json> = zones.self_min.iter().map(sector).collect();
+        self.put((link, "zones.radii"), json!(radii), DEFAULT);
+        self.put((link, "zones.self_min"), json!(self_min), DEFAULT);
+        self.put((link, "zones.margin"), json!(metres(zones.margin_mm)), DEFAULT);
+        self.put((link, "zones.min_beams"), json!(zones.min_beams), DEFAULT);
+        self.put((link, "zones.min_scans"), json!(zones.min_scans), DEFAULT);
+        self.put((link, "zones.max_invalid"), json!(zones.max_invalid), DEFAULT);
+        self.put((link, "zones.exact"), json!(zones.exact), DEFAULT);
+        self.put((link, "zones.no_return_is_far"), json!(zones.no_return_is_far), DEFAULT);
+    }
+
+    fn background(&mut self, link: &str, background: &Background) {
+        let learning = &background.learning;
+        let method = match learning.method {
+            _ if !background.is_kept => "off",
+            Method::Multi => "multi",
+            Method::Paper => "paper",
+        };
+        let candidate = match learning.candidate {
+            Candidate::First => "first",
+            Candidate::Latest => "latest",
+        };
+        let start = match (&background.file, learning.start) {
+            (Some(file), _) => file.display().to_string(),
+            (None, Start::Empty) => "empty".to_owned(),
+            (None, Start::FirstScan) => "first-scan".to_owned(),
+        };
+        let publish = if background.every_scan { "every-scan" } else { "on-demand" };
+        // What follows from unit, resolution and method where nothing is said (docs/configuration.md) is null.
+        self.put((link, "background.method"), json!(method), DEFAULT);
+        self.put((link, "background.threshold_mm"), json!(learning.threshold_mm), DEFAULT);
+        self.put((link, "background.candidate_mm"), json!(learning.candidate_mm), DEFAULT);
+        self.put((link, "background.scans"), json!(learning.scans), DEFAULT);
+        self.put((link, "background.candidate"), json!(candidate), DEFAULT);
+        // Without a word it is what an earlier hub has kept, if that fits.
+        let start = background.start_is_said.then_some(start);
+        self.put((link, "background.start"), json!(start), DEFAULT);
+        self.put((link, "background.keep"), json!(background.is_handed_on), DEFAULT);
+        self.put((link, "background.no_return_is_far"), json!(learning.no_return_is_far), DEFAULT);
+        self.put((link, "background.publish"), json!(publish), DEFAULT);
+    }
+
+    fn gateway(&mut self, gateway: &Gateway) {
+        let Gateway { interface, topics, to, bare, ttl, background_every, mtu } = gateway;
+        let every = background_every.as_ref().map(|(text, _)| text);
+        for (key, value) in [
+            ("gateway.interface", json!(interface)),
+            ("gateway.topics", json!(topics)),
+            ("gateway.to", json!(to.as_deref().unwrap_or_default())),
+            ("gateway.bare", json!(bare.unwrap_or_default())),
+            ("gateway.ttl", json!(ttl.unwrap_or(Gateway::TTL))),
+            ("gateway.background_every", json!(every)),
+            ("gateway.mtu", json!(mtu.unwrap_or(Gateway::MTU))),
+        ] {
+            let place = self.places.of_key(key).unwrap_or(DEFAULT).to_owned();
+            self.values.push(Value { class: CLASS, key: key.to_owned(), value, origin: place });
+        }
+    }
+
+    /// A value of a link; `default` is what to say where nobody says it.
+    fn put(&mut self, (link, key): (&str, &str), value: Json, default: &str) {
+        let origin = self.places.of_link(link, key).unwrap_or(default).to_owned();
+        self.values.push(Value { class: CLASS, key: format!("link.{link}.{key}"), value, origin });
+    }
+}
+
+impl Value {
+    /// The value as it is written in a configuration; `-` for none.
+    pub fn text(&self) -> String {
+        Written(&self.value).to_string()
+    }
+}
+
+/// JSON as the TOML that says the same.
+struct Written<'a>(&'a Json);
+
+impl fmt::Display for Written<'_> {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self.0 {
+            Json::Null => f.write_str("-"),
+            Json::Array(values) => {
+                let values: Vec<_> = values.iter().map(|value| Written(value).to_string()).collect();
+                write!(f, "[{}]", values.join(", "))
+            }
+            Json::Object(keys) => {
+                let keys: Vec<_> =
+                    keys.iter().map(|(key, value)| format!("{key} = {}", Written(value))).collect();
+                write!(f, "{{ {} }}", keys.join(", "))
+            }
+            plain => plain.fmt(f),
+        }
+    }
+}
+
+fn metres(mm: u16) -> f64 {
+    f64::from(mm) / 1000.0
+}
+
+const CLASS: &str = "value";
+const DEFAULT: &str = "default";
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_value_is_written_as_a_configuration_says_it() {
+        let written = |value: Json| Written(&value).to_string();
+        assert_eq!(written(json!("a \"b\"")), "\"a \\\"b\\\"\"");
+        assert_eq!(written(json!([1.0, 0.6])), "[1.0, 0.6]");
+        assert_eq!(written(json!([{ "from": 1.5, "to": 2.0 }])), "[{ from = 1.5, to = 2.0 }]");
+        assert_eq!((written(json!(null)), written(json!(true))), ("-".to_owned(), "true".to_owned()));
+    }
+}

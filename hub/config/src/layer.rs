@@ -1,0 +1,319 @@
+//! One source of configuration laid over the others: every value is checked where it stands, so that an error names
+//! file, line and column, or the flag.
+
+mod gateway;
+mod processing;
+mod sight;
+
+use std::rc::Rc;
+
+use lms::family::Family;
+use lms::variant::{Baud, Mode, Unit, Variant};
+use port::Source;
+use schema::{Failure, Kind, check_sensor};
+use serde::Deserialize;
+use toml::Spanned;
+
+use crate::link::{Link, MAX_LINKS};
+use crate::origin::Origin;
+use crate::processing::Processing;
+use gateway::GatewayLayer;
+use processing::{BackgroundLayer, MarksLayer, PoseLayer, Sections, ZonesLayer};
+use sight::Sight;
+
+/// What one source says. Knows the keys; what is not here is an unknown key.
+#[derive(Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(crate) struct Layer {
+    #[serde(default)]
+    link: Vec<LinkLayer>,
+    zones: Option<ZonesLayer>,
+    marks: Option<MarksLayer>,
+    background: Option<BackgroundLayer>,
+    /// The hub's own configuration may be that of its gateway, too.
+    pub(crate) gateway: Option<GatewayLayer>,
+}
+
+#[derive(Deserialize)]
+#[serde(deny_unknown_fields)]
+struct LinkLayer {
+    name: Spanned<String>,
+    port: Option<Spanned<String>>,
+    #[serde(rename = "type")]
+    family: Option<Spanned<String>>,
+    angle: Option<Spanned<f64>>,
+    resolution: Option<Spanned<f64>>,
+    unit: Option<Spanned<String>>,
+    mode: Option<Spanned<i64>>,
+    baud: Option<Spanned<u32>>,
+    pose: Option<PoseLayer>,
+    zones: Option<ZonesLayer>,
+    marks: Option<MarksLayer>,
+    background: Option<BackgroundLayer>,
+}
+
+/// All links while sources are merged.
+#[derive(Default)]
+pub(crate) struct Drafts {
+    links: Vec<Draft>,
+    /// What was said for all links, in the order of the sources.
+    general: Vec<(Rc<Origin>, Sections)>,
+}
+
+/// A link while sources are merged.
+struct Draft {
+    name: String,
+    place: String,
+    port: Option<Source>,
+    family: Option<Said<Family>>,
+    angle_deg: Option<Said<u16>>,
+    resolution_cdeg: Option<Said<u16>>,
+    unit: Option<Unit>,
+    mode: Option<Said<Mode>>,
+    baud: Baud,
+    /// What was said for this link, in the order of the sources.
+    own: Vec<(Rc<Origin>, Sections)>,
+}
+
+/// A value, and where it was said last.
+struct Said<T> {
+    value: T,
+    place: String,
+}
+
+impl Drafts {
+    pub(crate) fn len(&self) -> usize {
+        self.links.len()
+    }
+
+    /// Lays `layer` over the others; only where `may_add` may it bring links that were not there.
+    pub(crate) fn merge(&mut self, layer: Layer, origin: Origin, may_add: bool) -> Result<(), Failure> {
+        let Layer { link, zones, marks, background, gateway: _ } = layer;
+        let origin = Rc::new(origin);
+        merge(&mut self.links, link, &origin, may_add)?;
+        self.general.push((origin, Sections { pose: None, zones, marks, background }));
+        Ok(())
+    }
+
+    /// The links as they are when all has been said.
+    pub(crate) fn finish(self) -> Result<Vec<Link>, Failure> {
+        let Drafts { links, general } = self;
+        links.into_iter().map(|draft| draft.finish(&general)).collect()
+    }
+}
+
+impl Draft {
+    /// What was said for the link wins over what was said for all, wherever either stands.
+    fn finish(self, general: &[(Rc<Origin>, Sections)]) -> Result<Link, Failure> {
+        let Draft { name, place, port, family, angle_deg, resolution_cdeg, unit, mode, baud, own } = self;
+        let refuse = |place: &str, what: String, remedy: &str| {
+            Failure::new(Kind::Configuration, format!("{place}: link {name}: {what}"), remedy)
+        };
+        let port = port.ok_or_else(|| refuse(&place, "no port".into(), "add port = \"/dev/ttyUSB0\""))?;
+        if let Some(mode) = mode.as_ref().filter(|_| !matches!(port, Source::File { .. })) {
+            let what = format!("the mode of {} is asked of the sensor", port.name());
+            return Err(refuse(
+                &mode.place,
+                what,
+                "mode is a key for recordings, port = \"file:PATH\"; leave it out",
+            ));
+        }
+        // The place of what clashes, or of what implies it.
+        let type_place = family.as_ref().map_or(&place, |said| &said.place);
+        let angle_place = angle_deg.as_ref().map_or(type_place, |said| &said.place);
+        let step_place = resolution_cdeg.as_ref().map_or(angle_place, |said| &said.place);
+        let family = family.as_ref().map(|said| said.value);
+        let factory = family.and_then(Family::factory_variant).unwrap_or(Variant::HALF);
+        let angle_deg = angle_deg.as_ref().map_or(factory.angle_deg, |said| said.value);
+        let resolution_cdeg = resolution_cdeg.as_ref().map_or(factory.resolution_cdeg, |said| said.value);
+        if family == Some(Family::Fast) {
+            // Its 181 values look like those of 180 degrees at 1.
+            let what = "the beams of version S14 look elsewhere: 90 degrees at 0.5, which no telegram tells";
+            return Err(refuse(
+                type_place,
+                what.into(),
+                "a hub can stream lms200, lms211, lms221 and lms291",
+            ));
+        }
+        let variant = Variant::new(angle_deg, resolution_cdeg).ok_or_else(|| {
+            let step = f64::from(resolution_cdeg) / 100.0;
+            let remedy = "180 degrees at 0.5 or 1, 100 degrees at 0.25, 0.5 or 1";
+            refuse(step_place, format!("no sensor scans {angle_deg} degrees at {step}"), remedy)
+        })?;
+        if let Some((family, why)) = family.and_then(|f| Some((f, f.refuses_variant(variant)?))) {
+            let what = format!("an {} does not scan {angle_deg} degrees: {why}", family.name());
+            return Err(refuse(angle_place, what, "angle = 100"));
+        }
+        let mut processing = Processing::default();
+        let said: Vec<_> = general.iter().chain(&own).collect();
+        for (origin, sections) in &said {
+            sections.clone().lay(origin, &mut processing)?;
+        }
+        let start =
+            said.iter().rev().find_map(|(origin, sections)| Some(origin.place(Some(sections.start()?))));
+        Sight { name: &name, place: &place, variant, unit, said }.check(&processing)?;
+        processing.background.read(&name, variant, unit).map_err(|failure| {
+            let place = start.unwrap_or_default();
+            Failure::new(failure.kind, format!("{place}: {}", failure.message), failure.hint)
+        })?;
+        Ok(Link { name, port, family, variant, unit, mode: mode.map(|said| said.value), baud, processing })
+    }
+}
+
+/// What `origin` says.
+pub(crate) fn parse(origin: &Origin) -> Result<Layer, Failure> {
+    toml::from_str(origin.text()).map_err(|error| origin.explain(&error))
+}
+
+fn merge(
+    links: &mut Vec<Draft>,
+    layers: Vec<LinkLayer>,
+    origin: &Rc<Origin>,
+    may_add: bool,
+) -> Result<(), Failure> {
+    let mut seen: Vec<String> = Vec::new();
+    for link in layers {
+        let (span, name) = (Some(link.name.span()), link.name.into_inner());
+        check_sensor(&name).map_err(|failure| origin.refuse(span.clone(), failure.message, failure.hint))?;
+        if seen.contains(&name) {
+            return Err(origin.refuse(
+                span,
+                format!("a second link {name}"),
+                "give each link a name of its own, or put its keys beside those of the first one",
+            ));
+        }
+        seen.push(name.clone());
+        let known = links.iter().position(|draft| draft.name == name);
+        let at = match known {
+            Some(at) => at,
+            None if may_add && links.len() >= MAX_LINKS => {
+                let what = format!("more than {MAX_LINKS} links: a sample names its sensor in one byte");
+                return Err(origin.refuse(span, what, format!("{MAX_LINKS} links for one hub")));
+            }
+            None if may_add => {
+                links.push(Draft {
+                    name: name.clone(),
+                    place: origin.place(span),
+                    port: None,
+                    family: None,
+                    angle_deg: None,
+                    resolution_cdeg: None,
+                    unit: None,
+                    mode: None,
+                    baud: Baud::B500000,
+                    own: Vec::new(),
+                });
+                links.len() - 1
+            }
+            None => {
+                let names: Vec<_> = links.iter().map(|draft| draft.name.as_str()).collect();
+                let remedy = format!("there are: {}", names.join(", "));
+                return Err(origin.refuse(span, format!("no link {name}"), remedy));
+            }
+        };
+        let draft = &mut links[at];
+        if let Some(port) = link.port {
+            let port_span = Some(port.span());
+            let port = port.into_inner();
+            draft.port = Some(Source::parse(&port).map_err(|what| {
+                origin.refuse(
+                    port_span,
+                    what,
+                    "name a tty, tcp:HOST:PORT, or file:PATH with ?rate=max if you like",
+                )
+            })?);
+        }
+        if let Some(family) = link.family {
+            let value = Family::of_name(family.get_ref()).ok_or_else(|| {
+                let what = format!("type = \"{}\"", family.get_ref());
+                origin.refuse(Some(family.span()), what, "lms200, lms211, lms221 or lms291")
+            })?;
+            draft.family = Some(Said { value, place: origin.place(Some(family.span())) });
+        }
+        if let Some(angle) = link.angle {
+            let value = whole(origin, &angle, 1.0, "angle", "100 or 180")?;
+            draft.angle_deg = Some(Said { value, place: origin.place(Some(angle.span())) });
+        }
+        if let Some(step) = link.resolution {
+            let value = whole(origin, &step, 100.0, "resolution", "0.25, 0.5 or 1")?;
+            draft.resolution_cdeg = Some(Said { value, place: origin.place(Some(step.span())) });
+        }
+        if let Some(unit) = link.unit {
+            draft.unit = Some(match unit.get_ref().as_str() {
+                "mm" => Unit::Mm,
+                "cm" => Unit::Cm,
+                other => {
+                    let what = format!("unit = \"{other}\"");
+                    return Err(origin.refuse(Some(unit.span()), what, "\"mm\" or \"cm\""));
+                }
+            });
+        }
+        if let Some(mode) = link.mode {
+            let known = u8::try_from(*mode.get_ref()).ok().map(Mode).filter(|mode| mode.has_ranges());
+            let value = known.ok_or_else(|| {
+                let what = format!("mode = {}", mode.get_ref());
+                origin.refuse(Some(mode.span()), what, MODES)
+            })?;
+            draft.mode = Some(Said { value, place: origin.place(Some(mode.span())) });
+        }
+        if let Some(baud) = link.baud {
+            draft.baud = Baud::of_rate(*baud.get_ref()).ok_or_else(|| {
+                let what = format!("baud = {}", baud.get_ref());
+                origin.refuse(Some(baud.span()), what, "500000, 38400, 19200 or 9600")
+            })?;
+        }
+        let LinkLayer { pose, zones, marks, background, .. } = link;
+        draft.own.push((origin.clone(), Sections { pose, zones, marks, background }));
+    }
+    Ok(())
+}
+
+/// `value * scale` as one of the numbers that `allowed` names.
+fn whole(
+    origin: &Origin,
+    value: &Spanned<f64>,
+    scale: f64,
+    key: &str,
+    allowed: &str,
+) -> Result<u16, Failure> {
+    let scaled = value.get_ref() * scale;
+    let known = |v: &Variant| if scale == 1.0 { v.angle_deg } else { v.resolution_cdeg };
+    let found = Variant::ALL.iter().map(known).find(|&number| f64::from(number) == scaled);
+    found.ok_or_else(|| origin.refuse(Some(value.span()), format!("{key} = {}", value.get_ref()), allowed))
+}
+
+/// `link.NAME.KEY=VALUE`, or a key of all links as `zones.margin=0.05`, as TOML; a value that is none is taken as text.
+pub(crate) fn setting(flag: &str) -> Option<String> {
+    let (path, value) = flag.split_once('=')?;
+    let (table, key) = path.split_once('.')?;
+    let (head, key) = match (table, key.split_once('.')) {
+        ("link", Some((name, key))) => (format!("[[link]]\nname = {}\n", quoted(name)), key),
+        ("link", None) => return None,
+        _ => (String::new(), path),
+    };
+    let is_key = |c: char| c.is_ascii_alphanumeric() || c == '_' || c == '-';
+    if key == "name" || key.split('.').any(|word| word.is_empty() || !word.chars().all(is_key)) {
+        return None;
+    }
+    let value = match toml::from_str::<toml::Table>(&format!("v = {value}")) {
+        Ok(table) if table.len() == 1 => value.to_owned(),
+        _ => quoted(value),
+    };
+    Some(format!("{head}{key} = {value}"))
+}
+
+/// As a TOML string.
+pub(crate) fn quoted(text: &str) -> String {
+    let escaped: String = text
+        .chars()
+        .map(|c| match c {
+            '"' | '\\' => format!("\\{c}"),
+            c if c.is_control() => format!("\\u{:04X}", c as u32),
+            c => c.to_string(),
+        })
+        .collect();
+    format!("\"{escaped}\"")
+}
+
+/// The modes whose values are ranges (Telegram listing, 77h block D).
+const MODES: &str = "0x00 to 0x06, or 0x0F: 0x01 has 3 reflector bits, 0x03 has 2, 0x05 has 1";

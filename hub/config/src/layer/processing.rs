@@ -1,0 +1,327 @@
+//! The keys of sections pose, zones, marks and background, and which values they may have. Metres, radians and degrees
+//! become what the processors count in. Each value is checked where it stands; it refuses to know which source wins.
+
+use std::ops::{Range, RangeInclusive};
+
+use preprocess::background::{Candidate, Method, Start};
+use preprocess::zones::{SECTORS, Sector};
+use schema::{BEAMS, Failure, ZONES};
+use serde::Deserialize;
+use toml::Spanned;
+
+use crate::origin::Origin;
+use crate::processing::{Background, Processing, START, Zones};
+
+/// Section `pose` of a link.
+#[derive(Clone, Deserialize)]
+#[serde(deny_unknown_fields, expecting = "where the sensor sits, as { x = 0.3, y = 0.0, yaw = 1.5708 }")]
+pub(super) struct PoseLayer {
+    x: Option<Spanned<f64>>,
+    y: Option<Spanned<f64>>,
+    yaw: Option<Spanned<f64>>,
+    upside_down: Option<bool>,
+}
+
+/// Section `zones`.
+#[derive(Clone, Deserialize)]
+#[serde(deny_unknown_fields, expecting = "keys of zones, as { radii = [1.0, 0.6] }")]
+pub(super) struct ZonesLayer {
+    radii: Option<Spanned<Vec<f64>>>,
+    self_min: Option<Spanned<Vec<Spanned<SectorLayer>>>>,
+    margin: Option<Spanned<f64>>,
+    min_beams: Option<Spanned<i64>>,
+    min_scans: Option<Spanned<i64>>,
+    max_invalid: Option<Spanned<f64>>,
+    exact: Option<bool>,
+    no_return_is_far: Option<bool>,
+}
+
+#[derive(Clone, Deserialize)]
+#[serde(deny_unknown_fields, expecting = "a sector, as { from = 12.5, to = 30.0, range = 0.42 }")]
+struct SectorLayer {
+    from: f64,
+    to: f64,
+    range: f64,
+}
+
+/// Section `marks`.
+#[derive(Clone, Deserialize)]
+#[serde(deny_unknown_fields, expecting = "keys of marks, as { i_min = 1 }")]
+pub(super) struct MarksLayer {
+    i_min: Option<Spanned<i64>>,
+    max_range_step: Option<Spanned<f64>>,
+    max_gap: Option<Spanned<i64>>,
+}
+
+/// Section `background`.
+#[derive(Clone, Deserialize)]
+#[serde(deny_unknown_fields, expecting = "keys of background, as { method = \"multi\" }")]
+pub(super) struct BackgroundLayer {
+    method: Option<MethodLayer>,
+    threshold_mm: Option<Spanned<i64>>,
+    candidate_mm: Option<Spanned<i64>>,
+    scans: Option<Spanned<i64>>,
+    candidate: Option<CandidateLayer>,
+    start: Option<Spanned<String>>,
+    keep: Option<bool>,
+    no_return_is_far: Option<bool>,
+    publish: Option<PublishLayer>,
+}
+
+#[derive(Clone, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+enum MethodLayer {
+    Multi,
+    Paper,
+    Off,
+}
+
+#[derive(Clone, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+enum CandidateLayer {
+    First,
+    Latest,
+}
+
+#[derive(Clone, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+enum PublishLayer {
+    OnDemand,
+    EveryScan,
+}
+
+/// The sections of one source, for all links or for one.
+#[derive(Clone)]
+pub(super) struct Sections {
+    pub(super) pose: Option<PoseLayer>,
+    pub(super) zones: Option<ZonesLayer>,
+    pub(super) marks: Option<MarksLayer>,
+    pub(super) background: Option<BackgroundLayer>,
+}
+
+impl Sections {
+    /// Lays what `origin` says over `processing`.
+    pub(super) fn lay(self, origin: &Origin, processing: &mut Processing) -> Result<(), Failure> {
+        let Sections { pose, zones, marks, background } = self;
+        if let Some(layer) = pose {
+            let pose = &mut processing.pose;
+            put(&mut pose.x_m, layer.x, |value| place(origin, "x", value))?;
+            put(&mut pose.y_m, layer.y, |value| place(origin, "y", value))?;
+            put(&mut pose.yaw_rad, layer.yaw, |value| {
+                within(
+                    origin,
+                    "yaw",
+                    value,
+                    -TURN..=TURN,
+                    "radians, counter-clockwise: 90 degrees are 1.5708",
+                )
+            })?;
+            pose.upside_down = layer.upside_down.map_or(pose.upside_down, u8::from);
+        }
+        if let Some(layer) = zones {
+            layer.lay(origin, &mut processing.zones)?;
+        }
+        if let Some(layer) = marks {
+            let marks = &mut processing.marks;
+            put(&mut marks.i_min, layer.i_min, |value| whole(origin, "i_min", value, 1..=7))?;
+            put(&mut marks.max_range_step_mm, layer.max_range_step, |value| {
+                millimetres(origin, "max_range_step", value, 0.001..=10.0)
+            })?;
+            put(&mut marks.max_gap, layer.max_gap, |value| {
+                whole(origin, "max_gap", value, 0..=BEAMS as i64)
+            })?;
+        }
+        if let Some(layer) = background {
+            layer.lay(origin, &mut processing.background)?;
+        }
+        Ok(())
+    }
+
+    /// Where the sensor's place is said, if it is.
+    pub(super) fn pose(&self) -> Option<Range<usize>> {
+        let PoseLayer { x, y, yaw, .. } = self.pose.as_ref()?;
+        [x, y, yaw].into_iter().flatten().map(Spanned::span).next()
+    }
+
+    /// Where it is said what the background begins with, if it is.
+    pub(super) fn start(&self) -> Option<Range<usize>> {
+        self.background.as_ref()?.start.as_ref().map(Spanned::span)
+    }
+
+    /// Where the robot's own body is said, if it is.
+    pub(super) fn self_min(&self) -> Option<Range<usize>> {
+        self.zones.as_ref()?.self_min.as_ref().map(Spanned::span)
+    }
+
+    /// Where it is said how many beams violate a circle, if it is.
+    pub(super) fn min_beams(&self) -> Option<Range<usize>> {
+        self.zones.as_ref()?.min_beams.as_ref().map(Spanned::span)
+    }
+}
+
+impl ZonesLayer {
+    fn lay(self, origin: &Origin, zones: &mut Zones) -> Result<(), Failure> {
+        put(&mut zones.radii_mm, self.radii, |value| radii(origin, value))?;
+        put(&mut zones.self_min, self.self_min, |value| sectors(origin, value))?;
+        put(&mut zones.margin_mm, self.margin, |value| millimetres(origin, "margin", value, 0.0..=10.0))?;
+        put(&mut zones.min_beams, self.min_beams, |value| {
+            whole(origin, "min_beams", value, 1..=BEAMS as i64)
+        })?;
+        put(&mut zones.min_scans, self.min_scans, |value| whole(origin, "min_scans", value, 1..=1000))?;
+        put(&mut zones.max_invalid, self.max_invalid, |value| {
+            within(origin, "max_invalid", value, 0.0..=1.0, "a share from 0 to 1")
+        })?;
+        zones.exact = self.exact.unwrap_or(zones.exact);
+        zones.no_return_is_far = self.no_return_is_far.unwrap_or(zones.no_return_is_far);
+        Ok(())
+    }
+}
+
+impl BackgroundLayer {
+    fn lay(self, origin: &Origin, background: &mut Background) -> Result<(), Failure> {
+        let learning = &mut background.learning;
+        if let Some(method) = self.method {
+            background.is_kept = !matches!(method, MethodLayer::Off);
+            learning.method = match method {
+                MethodLayer::Multi => Method::Multi,
+                MethodLayer::Paper => Method::Paper,
+                MethodLayer::Off => learning.method,
+            };
+        }
+        put(&mut learning.threshold_mm, self.threshold_mm, |value| {
+            whole(origin, "threshold_mm", value, 1..=10_000).map(Some)
+        })?;
+        put(&mut learning.candidate_mm, self.candidate_mm, |value| {
+            whole(origin, "candidate_mm", value, 1..=10_000).map(Some)
+        })?;
+        put(&mut learning.scans, self.scans, |value| whole(origin, "scans", value, 1..=8_191).map(Some))?;
+        if let Some(candidate) = self.candidate {
+            learning.candidate = match candidate {
+                CandidateLayer::First => Candidate::First,
+                CandidateLayer::Latest => Candidate::Latest,
+            };
+        }
+        background.is_handed_on = self.keep.unwrap_or(background.is_handed_on);
+        if let Some(start) = self.start {
+            background.start_is_said = true;
+            (learning.start, background.file) = match start.get_ref().as_str() {
+                "empty" => (Start::Empty, None),
+                "first-scan" => (Start::FirstScan, None),
+                "" => return Err(origin.refuse(Some(start.span()), "start = \"\"", START)),
+                file => (Start::Empty, Some(file.into())),
+            };
+        }
+        learning.no_return_is_far = self.no_return_is_far.or(learning.no_return_is_far);
+        if let Some(publish) = self.publish {
+            background.every_scan = matches!(publish, PublishLayer::EveryScan);
+        }
+        Ok(())
+    }
+}
+
+/// Puts what `check` makes of `value` into `field`, if there is a value.
+fn put<T, V>(
+    field: &mut T,
+    value: Option<Spanned<V>>,
+    check: impl FnOnce(Spanned<V>) -> Result<T, Failure>,
+) -> Result<(), Failure> {
+    if let Some(value) = value {
+        *field = check(value)?;
+    }
+    Ok(())
+}
+
+fn within(
+    origin: &Origin,
+    key: &str,
+    value: Spanned<f64>,
+    allowed: RangeInclusive<f64>,
+    remedy: &str,
+) -> Result<f64, Failure> {
+    // Not a number is within nothing.
+    if allowed.contains(value.get_ref()) {
+        return Ok(*value.get_ref());
+    }
+    Err(origin.refuse(Some(value.span()), format!("{key} = {}", value.get_ref()), remedy))
+}
+
+fn whole<T: TryFrom<i64>>(
+    origin: &Origin,
+    key: &str,
+    value: Spanned<i64>,
+    allowed: RangeInclusive<i64>,
+) -> Result<T, Failure> {
+    let number = Some(*value.get_ref()).filter(|number| allowed.contains(number));
+    number.and_then(|number| T::try_from(number).ok()).ok_or_else(|| {
+        let remedy = format!("a whole number from {} to {}", allowed.start(), allowed.end());
+        origin.refuse(Some(value.span()), format!("{key} = {}", value.get_ref()), remedy)
+    })
+}
+
+fn place(origin: &Origin, key: &str, value: Spanned<f64>) -> Result<f64, Failure> {
+    within(origin, key, value, -FARTHEST_M..=FARTHEST_M, "metres from the robot's centre, at most 100")
+}
+
+fn millimetres(
+    origin: &Origin,
+    key: &str,
+    value: Spanned<f64>,
+    allowed_m: RangeInclusive<f64>,
+) -> Result<u16, Failure> {
+    let remedy = format!("metres, from {} to {}", allowed_m.start(), allowed_m.end());
+    within(origin, key, value, allowed_m, &remedy).map(in_mm)
+}
+
+/// The nearest whole number of millimetres; what a u16 does not hold ends at its bounds.
+fn in_mm(metres: f64) -> u16 {
+    (metres * 1000.0).round() as u16
+}
+
+fn radii(origin: &Origin, value: Spanned<Vec<f64>>) -> Result<Vec<u16>, Failure> {
+    let radii = value.get_ref();
+    let refuse = |remedy: &str| Err(origin.refuse(Some(value.span()), format!("radii = {radii:?}"), remedy));
+    if !(1..=ZONES).contains(&radii.len()) {
+        return refuse("1 to 8 radii, the largest first, for example [1.0, 0.6]");
+    }
+    if !radii.iter().all(|radius| (0.001..=LARGEST_M).contains(radius)) {
+        return refuse("metres around the robot's centre, more than 0 and at most 65");
+    }
+    let radii: Vec<u16> = radii.iter().copied().map(in_mm).collect();
+    if radii.is_sorted_by(|one, next| one > next) {
+        Ok(radii)
+    } else {
+        refuse("the largest first, none twice")
+    }
+}
+
+fn sectors(origin: &Origin, value: Spanned<Vec<Spanned<SectorLayer>>>) -> Result<Vec<Sector>, Failure> {
+    if value.get_ref().len() > SECTORS {
+        let what = format!("self_min has {} sectors", value.get_ref().len());
+        return Err(origin.refuse(Some(value.span()), what, format!("at most {SECTORS}: join neighbours")));
+    }
+    value.into_inner().into_iter().map(|sector| in_sector(origin, sector)).collect()
+}
+
+fn in_sector(origin: &Origin, sector: Spanned<SectorLayer>) -> Result<Sector, Failure> {
+    let span = Some(sector.span());
+    let SectorLayer { from, to, range } = sector.into_inner();
+    let refuse = |remedy: &str| {
+        let what = format!("self_min = {{ from = {from}, to = {to}, range = {range} }}");
+        Err(origin.refuse(span.clone(), what, remedy))
+    };
+    if !(0.0..=180.0).contains(&from) || !(from..=180.0).contains(&to) {
+        return refuse("from and to are the sensor's angles in degrees: 0 right, 180 left, from before to");
+    }
+    if !(0.001..=LARGEST_M).contains(&range) {
+        return refuse("range in metres: readings that are nearer are the robot's own body");
+    }
+    let mdeg = |deg: f64| (deg * 1000.0).round() as i32;
+    Ok(Sector { from_mdeg: mdeg(from), to_mdeg: mdeg(to), range_mm: in_mm(range) })
+}
+
+/// No robot is larger; a greater value is millimetres, or a slip.
+const FARTHEST_M: f64 = 100.0;
+/// A radius in mm fits 16 bits.
+const LARGEST_M: f64 = 65.0;
+/// A full turn either way: whoever writes degrees is told.
+const TURN: f64 = 2.0 * std::f64::consts::PI;

@@ -1,0 +1,93 @@
+//! Whether a sensor sees enough of its largest circle to ever find something inside: a zone that nothing can violate is a
+//! mistake of the configuration. Refuses to know what the sensor turns out to be; the hub looks again at its scans.
+
+use std::rc::Rc;
+
+use lms::variant::{Unit, Variant};
+use preprocess::zones::{Check, Settings};
+use schema::{Failure, Kind, Scan, Zones};
+
+use super::processing::Sections;
+use crate::origin::Origin;
+use crate::processing::Processing;
+
+/// A link with what was said about it.
+pub(super) struct Sight<'a> {
+    pub(super) name: &'a str,
+    /// Where the link was begun.
+    pub(super) place: &'a str,
+    pub(super) variant: Variant,
+    pub(super) unit: Option<Unit>,
+    /// What was said for all links, then for this one, in the order of the sources.
+    pub(super) said: Vec<&'a (Rc<Origin>, Sections)>,
+}
+
+impl Sight<'_> {
+    /// [`Kind::Configuration`] with the place of what hinders it if `processing` leaves fewer beams to the largest circle
+    /// than a violation takes.
+    pub(super) fn check(&self, processing: &Processing) -> Result<(), Failure> {
+        let settings = processing.zones.settings();
+        let (beams, min_beams) = (self.variant.beams(), settings.min_beams);
+        if usize::from(min_beams) > beams {
+            let what = format!("min_beams = {min_beams}, and a scan has {beams} beams");
+            return Err(self.refuse(Sections::min_beams, what, "a few beams: one is enough by default"));
+        }
+        let telling = self.telling(processing, &settings);
+        if telling >= min_beams {
+            return Ok(());
+        }
+        let circle_m = f64::from(settings.radii_mm.first().copied().unwrap_or_default()) / 1000.0;
+        let meeting = self.telling(processing, &Settings { self_min: &[], ..settings });
+        let (place, what, remedy): (Place, _, _) = match (meeting, telling) {
+            (0, _) => (
+                Sections::pose,
+                format!("no beam meets the circle of {circle_m} m"),
+                "correct the sensor's pose, or give it a circle that it sees: link.NAME.zones.radii",
+            ),
+            (_, 0) => (
+                Sections::self_min,
+                format!("self_min covers every beam up to the circle of {circle_m} m"),
+                "shorten self_min: it is for the robot's own body",
+            ),
+            _ => (
+                Sections::min_beams,
+                format!("min_beams = {min_beams}, and {telling} can see the circle of {circle_m} m"),
+                "fewer beams, a larger circle, or another pose or self_min",
+            ),
+        };
+        Err(self.refuse(place, what, remedy))
+    }
+
+    /// Beams that can tell something of the largest circle, in the best of cases: the measuring mode is not known here,
+    /// nor the unit if none is expected.
+    fn telling(&self, processing: &Processing, settings: &Settings<'_>) -> u16 {
+        let units = [Unit::Mm, Unit::Cm].into_iter().filter(|unit| self.unit.is_none_or(|is| is == *unit));
+        let of_unit = |unit: Unit| {
+            let mut check = Check::new(processing.pose, settings);
+            let scan = Scan {
+                count: self.variant.beams() as u16,
+                unit_mm: unit.mm(),
+                range_bits: MOST_RANGE_BITS,
+                first_angle_mdeg: self.variant.first_angle_mdeg(),
+                step_mdeg: self.variant.resolution_cdeg * 10,
+                ..Scan::default()
+            };
+            check.update(&scan, &mut Zones::unknown());
+            check.telling()
+        };
+        units.map(of_unit).max().unwrap_or_default()
+    }
+
+    /// The place is where `place` was said last; where the link was begun if nobody said it.
+    fn refuse(&self, place: Place, what: String, remedy: &str) -> Failure {
+        let at = |(origin, sections): &&(Rc<Origin>, Sections)| Some(origin.place(Some(place(sections)?)));
+        let place = self.said.iter().rev().find_map(at).unwrap_or_else(|| self.place.to_owned());
+        let message = format!("{place}: link {}: {what}", self.name);
+        Failure::new(Kind::Configuration, message, remedy.replace("NAME", self.name))
+    }
+}
+
+type Place = fn(&Sections) -> Option<std::ops::Range<usize>>;
+
+/// Of all measuring modes (Telegram listing, 77h block D).
+const MOST_RANGE_BITS: u8 = 15;

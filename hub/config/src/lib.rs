@@ -1,0 +1,21 @@
+//! What the hub is told: links with their ports and what to ask of their sensors. Several sources, the last one wins.
+
+mod effective;
+mod gateway;
+mod layer;
+mod link;
+mod load;
+pub mod needs;
+mod origin;
+mod places;
+mod processing;
+mod sources;
+
+pub use effective::{Value, values};
+pub use gateway::Gateway;
+pub use link::{Config, Link};
+pub use processing::{Background, Processing, Zones};
+pub use sources::Sources;
+
+/// A configuration to begin with; its values are those that hold where nothing is said.
+pub const DEFAULT: &str = include_str!("default.toml");

@@ -1,0 +1,247 @@
+//! Reads all sources of a configuration into the values in effect; the last one wins.
+
+use port::Source;
+use schema::{Failure, Kind};
+
+use crate::gateway::Gateway;
+use crate::layer::Drafts;
+use crate::link::{Config, Link};
+use crate::sources::Sources;
+
+impl Config {
+    /// Reads all sources.
+    ///
+    /// [`schema::Kind::Configuration`] with place, value and remedy; also without any link: no port is opened that nobody named.
+    pub fn load(sources: &Sources) -> Result<Config, Failure> {
+        let mut drafts = Drafts::default();
+        for layer in sources.files().chain(sources.links()) {
+            let (origin, layer) = layer?;
+            drafts.merge(layer, origin, true)?;
+        }
+        let settings = sources.settings().collect::<Result<Vec<_>, _>>()?;
+        if drafts.len() == 0 {
+            let remedy =
+                "--link NAME=PORT, or a section [[link]] in a file: scanhub config default prints one";
+            return Err(Failure::new(Kind::Configuration, "no link is configured", remedy));
+        }
+        for (origin, layer) in settings {
+            drafts.merge(layer, origin, false)?;
+        }
+        let links = drafts.finish()?;
+        check_ports(&links)?;
+        Ok(Config { links })
+    }
+}
+
+/// Refuses two links at one line, also where it goes by two names at this moment.
+fn check_ports(links: &[Link]) -> Result<(), Failure> {
+    let is_same = |a: &Source, b: &Source| match (a, b) {
+        (Source::File { .. }, _) => false,
+        (Source::Tty(a), Source::Tty(b)) => {
+            a == b || a.canonicalize().is_ok_and(|a| b.canonicalize().is_ok_and(|b| a == b))
+        }
+        _ => a == b,
+    };
+    for (at, link) in links.iter().enumerate() {
+        if let Some(other) = links[..at].iter().find(|other| is_same(&other.port, &link.port)) {
+            let names = match (other.port.name(), link.port.name()) {
+                (one, same) if one == same => one,
+                (one, another) => format!("{one} is {another}"),
+            };
+            let message = format!("links {} and {} have the same port: {names}", other.name, link.name);
+            return Err(Failure::new(Kind::Configuration, message, "name the port of each sensor"));
+        }
+    }
+    Ok(())
+}
+
+impl Gateway {
+    /// Reads the section in all sources, the last one wins. Links need not be there.
+    ///
+    /// [`schema::Kind::Configuration`] with place, value and remedy.
+    pub fn load(sources: &Sources) -> Result<Gateway, Failure> {
+        let mut gateway = Gateway::default();
+        for layer in sources.files().chain(sources.settings()) {
+            let (origin, layer) = layer?;
+            if let Some(section) = layer.gateway {
+                section.lay(&origin, &mut gateway)?;
+            }
+        }
+        Ok(gateway)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use lms::family::Family;
+    use lms::variant::{Baud, Mode, Unit, Variant};
+
+    fn sources(set: &[&str], links: &[&str]) -> Sources {
+        let owned = |flags: &[&str]| flags.iter().map(|flag| (*flag).to_owned()).collect();
+        let links = if links.is_empty() { &["front=/dev/ttyUSB0", "rear=/dev/ttyUSB1"] } else { links };
+        Sources { files: Vec::new(), set: owned(set), links: owned(links) }
+    }
+
+    fn refusal(set: &[&str], links: &[&str]) -> String {
+        let failure = Config::load(&sources(set, links)).expect_err("must be refused");
+        assert_eq!(failure.kind, Kind::Configuration);
+        failure.to_string()
+    }
+
+    #[test]
+    fn no_port_is_opened_that_nobody_named() {
+        let none = |set: &[&str]| {
+            let sources = Sources { links: Vec::new(), ..sources(set, &[]) };
+            Config::load(&sources).expect_err("no link").to_string()
+        };
+        for set in [&[][..], &["link.front.angle=100"], &["zones.margin=0.1"]] {
+            assert!(none(set).starts_with("no link is configured\n  --link NAME=PORT"), "{}", none(set));
+        }
+        assert!(none(&["speed=3"]).contains("speed=3"));
+        let config = Config::load(&sources(&[], &[])).unwrap();
+        let names: Vec<_> = config.links.iter().map(|link| (link.name.as_str(), link.port.name())).collect();
+        assert_eq!(names, [("front", "/dev/ttyUSB0".to_owned()), ("rear", "/dev/ttyUSB1".to_owned())]);
+        assert_eq!((config.links[0].variant, config.links[0].baud), (Variant::HALF, Baud::B500000));
+    }
+
+    #[test]
+    fn flags_win() {
+        let config = Config::load(&sources(
+            &["link.a.angle=100", "link.a.resolution=0.25", "link.a.unit=cm", "link.b.baud=38400"],
+            &["a=/dev/x", "b=file:/tmp/a b.bin?rate=max"],
+        ))
+        .unwrap();
+        assert_eq!(config.links[0].variant, Variant { angle_deg: 100, resolution_cdeg: 25 });
+        assert_eq!((config.links[0].unit, config.links[1].baud), (Some(Unit::Cm), Baud::B38400));
+        assert_eq!(config.links[1].port, Source::File { path: "/tmp/a b.bin".into(), paced: false });
+    }
+
+    #[test]
+    fn serial_servers() {
+        for (text, host, port) in [
+            ("tcp:box:4001", "box", 4001),
+            ("tcp:10.0.0.7:23", "10.0.0.7", 23),
+            ("tcp:[::1]:4001", "::1", 4001),
+        ] {
+            let source = Source::parse(text).unwrap();
+            assert_eq!((source.name().as_str(), &source), (text, &Source::Tcp { host: host.into(), port }));
+        }
+    }
+
+    #[test]
+    fn refusals_name_place_value_and_remedy() {
+        let unknown = refusal(&["link.front.prot=/dev/x"], &[]);
+        assert!(unknown.contains("--set link.front.prot=/dev/x: unknown key `prot`"), "{unknown}");
+        assert!(unknown.contains("did you mean `port`?"), "{unknown}");
+        assert!(refusal(&["link.front.angle=170"], &[]).contains("angle = 170\n  100 or 180"));
+        assert!(refusal(&["link.side.angle=100"], &[]).contains("no link side\n  there are: front, rear"));
+        assert!(
+            refusal(&["link.front.resolution=0.25"], &[]).contains("no sensor scans 180 degrees at 0.25")
+        );
+        let pose = refusal(&["link.front.pose=3"], &[]);
+        assert!(pose.contains("integer `3`, expected where the sensor sits, as { x = 0.3, "), "{pose}");
+        assert!(refusal(&["baud=3"], &[]).contains("not a setting"));
+        assert!(refusal(&[], &["front"]).contains("--link front: no = in it"));
+        assert!(refusal(&[], &["Front=/dev/x"]).contains("sensor name \"Front\" is not possible"));
+        assert!(refusal(&[], &["front=file:x?rate=2"]).contains("rate=max"));
+        assert!(refusal(&[], &["front=tcp:box"]).contains("write tcp:HOST:PORT"));
+        assert!(refusal(&[], &["front=tcp::4001"]).contains("without a host"));
+        assert!(refusal(&[], &["front=tcp:box:0"]).contains("a number to 65535"));
+        assert!(refusal(&[], &["front=tcp:fe80::1:4001"]).contains("in brackets"));
+    }
+
+    #[test]
+    fn only_a_recording_is_told_its_mode() {
+        let config = Config::load(&sources(&["link.a.mode=0x01"], &["a=file:x"])).unwrap();
+        assert_eq!(config.links[0].mode, Some(Mode(1)));
+        let live = refusal(&["link.front.mode=0x01"], &["front=/dev/x"]);
+        assert!(
+            live.contains("--set link.front.mode=0x01: link front: the mode of /dev/x is asked"),
+            "{live}"
+        );
+        for mode in ["0x07", "-1", "257"] {
+            let odd = refusal(&[&format!("link.a.mode={mode}")], &["a=file:x"]);
+            assert!(odd.contains("mode = ") && odd.contains("0x00 to 0x06"), "{odd}");
+        }
+    }
+
+    #[test]
+    fn what_a_type_cannot_do_is_refused() {
+        let of = |set: &[&str]| Config::load(&sources(set, &[])).map(|config| config.links[0].clone());
+        let link = of(&["link.front.type=lms211"]).unwrap();
+        assert_eq!((link.family, link.variant), (Some(Family::Lms211), Variant::new(100, 50).unwrap()));
+        let fine = of(&["link.front.type=lms211", "link.front.resolution=0.25"]).unwrap();
+        assert_eq!(fine.variant.beams(), 401);
+        let wide = refusal(&["link.front.angle=180", "link.front.type=lms211"], &[]);
+        assert!(
+            wide.starts_with("--set link.front.angle=180: link front: an lms211 does not scan 180"),
+            "{wide}"
+        );
+        assert!(wide.contains("its window is 100 degrees wide\n  angle = 100"), "{wide}");
+        let fast = refusal(&["link.front.type=s14"], &[]);
+        assert!(
+            fast.contains("--set link.front.type=s14: link front: ") && fast.contains("90 degrees"),
+            "{fast}"
+        );
+        let unknown = refusal(&["link.front.type=lms100"], &[]);
+        assert!(unknown.contains("type = \"lms100\"\n  lms200, lms211, lms221 or lms291"), "{unknown}");
+    }
+
+    #[test]
+    fn one_port_is_for_one_link() {
+        let own = std::env::temp_dir().join(format!("scanhub-port-{}", std::process::id()));
+        std::os::unix::fs::symlink("/dev/null", &own).unwrap();
+        let twice = refusal(&[], &["a=/dev/x", "b=/dev/y", "c=/dev/x"]);
+        let named = refusal(&[], &["a=/dev/null", &format!("b={}", own.display())]);
+        let moved = refusal(&["link.b.port=/dev/x"], &["a=/dev/x", "b=/dev/y"]);
+        assert!(refusal(&[], &["a=tcp:h:1", "b=tcp:h:1"]).contains("have the same port: tcp:h:1"));
+        std::fs::remove_file(&own).unwrap();
+        assert!(twice.starts_with("links a and c have the same port: /dev/x\n"), "{twice}");
+        assert!(named.contains(&format!("same port: /dev/null is {}\n", own.display())), "{named}");
+        assert!(moved.starts_with("links a and b have the same port: /dev/x\n"), "{moved}");
+        assert!(Config::load(&sources(&[], &["a=file:x", "b=file:x", "c=tcp:h:1", "d=tcp:h:2"])).is_ok());
+    }
+
+    #[test]
+    fn a_file_error_has_line_and_column() {
+        let path = std::env::temp_dir().join(format!("scanhub-config-{}.toml", std::process::id()));
+        let load = |text: &str| {
+            std::fs::write(&path, text).unwrap();
+            Config::load(&Sources { files: vec![path.clone()], ..Sources::default() })
+        };
+        let error = load("[[link]]\nname = \"front\"\nprot = \"/dev/x\"\n").unwrap_err().to_string();
+        assert!(error.contains(&format!("{}:3:1: unknown key `prot`", path.display())), "{error}");
+        let error =
+            load("[[link]]\nname = \"front\"\nport = \"/dev/x\"\nbaud = 115200\n").unwrap_err().to_string();
+        assert!(error.contains(":4:8: baud = 115200"), "{error}");
+        let error =
+            load("[[link]]\nname = \"a\"\nport = \"x\"\n[[link]]\nname = \"a\"\n").unwrap_err().to_string();
+        assert!(
+            error.contains(":5:8: a second link a") && error.contains("beside those of the first"),
+            "{error}"
+        );
+        let text = "[[link]]\nname = \"a\"\nport = \"x\"\ntype = \"lms211\"\nangle = 180\n";
+        let error = load(text).unwrap_err().to_string();
+        assert!(error.contains(":5:9: link a: an lms211 does not scan 180 degrees"), "{error}");
+        let error = load("[[link]]\nname = \"a\"\n").unwrap_err().to_string();
+        assert!(error.contains("link a: no port"), "{error}");
+        let link = "[[link]]\nname = \"a\"\nport = \"x\"\n";
+        for (text, place, words) in [
+            ("[link]\nname = \"a\"\nport = \"x\"\n".to_owned(), ":1:1: ", "with two brackets"),
+            (format!("{link}baud = \"500000\"\n"), ":4:8: ", "baud = 500000, without quotes"),
+            (format!("{link}unit = 5\n"), ":4:8: unit = 5 is not text", "unit = \"5\", with quotes"),
+            (format!("{link}angle = \"wide\"\n"), ":4:9: ", "angle = \"wide\" is not a number"),
+            (format!("{link}[zones]\nradii = 1.0\n"), ":5:9: ", "radii = [1.0], with brackets"),
+            (format!("{link}[zones]\nexact = \"false\"\n"), ":5:9: ", "exact = false, without quotes"),
+            (format!("{link}[zones]\nexact = 1\n"), ":5:9: ", "exact = true, or exact = false"),
+        ] {
+            let error = load(&text).unwrap_err().to_string();
+            assert!(error.contains(place) && error.contains(words), "{error}");
+        }
+        let set = refusal(&["link.front.baud=\"500000\""], &[]);
+        assert!(set.starts_with("--set link.front.baud=") && set.contains("without quotes"), "{set}");
+        assert!(load("[[link]]\nname = \"a\"\nport = \"x\"\nangle = 100\n").is_ok());
+        std::fs::remove_file(&path).unwrap();
+    }
+}

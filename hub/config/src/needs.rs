@@ -1,0 +1,21 @@
+//! What the links of a configuration take of the machine: shared memory and descriptors. Refuses to know what there is.
+
+use schema::Topic;
+use schema::shortage::sensor_bytes;
+
+/// Bytes of shared memory for `links` links and the first consumers.
+pub fn memory(links: usize) -> u64 {
+    links as u64 * sensor_bytes(&Topic::ALL) + REST
+}
+
+/// Descriptors for `links` links and a first consumer of each, beside those open from the start.
+pub fn descriptors(links: usize) -> u64 {
+    BASE_DESCRIPTORS + links as u64 * LINK_DESCRIPTORS
+}
+
+/// Descriptors of what belongs to no link, beside those open from the start: 16 are left open, making them takes more.
+const BASE_DESCRIPTORS: u64 = 24;
+/// Descriptors of a link: four for each of its eight services, its port, and a first consumer.
+const LINK_DESCRIPTORS: u64 = 38;
+/// The control service, what belongs to no link, and the first consumers.
+const REST: u64 = 512 * 1024;

@@ -1,0 +1,276 @@
+//! What is made of the scans, as it is configured: who wins over whom, what cannot be, and that each refusal names place,
+//! value and remedy.
+
+use std::fs;
+use std::path::PathBuf;
+
+use config::{Config, Gateway, Processing, Sources};
+use preprocess::background::{Candidate, Method, Start};
+use preprocess::zones::Sector;
+use schema::{Background, Kind, as_json};
+
+/// A file that goes with the test.
+struct Scratch(PathBuf);
+
+impl Scratch {
+    fn new(name: &str, text: impl AsRef<[u8]>) -> Scratch {
+        let path = std::env::temp_dir().join(format!("scanhub-{}-{name}", std::process::id()));
+        fs::write(&path, text).expect("a file");
+        Scratch(path)
+    }
+}
+
+impl Drop for Scratch {
+    fn drop(&mut self) {
+        let _ = fs::remove_file(&self.0);
+    }
+}
+
+/// Where no file says which there are.
+const LINKS: [&str; 2] = ["front=/dev/ttyUSB0", "rear=/dev/ttyUSB1"];
+
+fn load(files: &[&Scratch], set: &[&str]) -> Result<Config, String> {
+    let sources = Sources {
+        files: files.iter().map(|file| file.0.clone()).collect(),
+        set: set.iter().map(|flag| (*flag).to_owned()).collect(),
+        links: if files.is_empty() { LINKS.map(str::to_owned).into() } else { Vec::new() },
+    };
+    Config::load(&sources).map_err(|failure| {
+        assert_eq!(failure.kind, Kind::Configuration);
+        failure.to_string()
+    })
+}
+
+fn processing(files: &[&Scratch], set: &[&str], link: usize) -> Processing {
+    load(files, set).unwrap().links[link].processing.clone()
+}
+
+#[test]
+fn the_page_holds() {
+    let page = include_str!("../../../docs/configuration.md");
+    let example =
+        page.split("```toml\n").nth(1).and_then(|rest| rest.split("```").next()).expect("an example");
+    let file = Scratch::new("page.toml", example);
+    let config = load(&[&file], &[]).unwrap();
+    let [front, rear] = &config.links[..] else { panic!("{config:?}") };
+    assert_eq!((front.processing.pose.x_m, rear.processing.pose.upside_down), (0.3, 1));
+    assert_eq!(front.processing.zones.self_min.len(), 1);
+    assert_eq!(front.processing.zones.margin_mm, 50);
+    // What the page shows as the values without a word are those: the front's are changed in these sections.
+    let Processing { zones, marks, background, .. } = Processing::default();
+    let shown = &rear.processing;
+    assert_eq!((&shown.zones, shown.marks, &shown.background), (&zones, marks, &background));
+}
+
+#[test]
+fn a_link_wins_over_all_links_and_the_later_source_over_the_earlier() {
+    let first = Scratch::new(
+        "first.toml",
+        "[[link]]\nname = \"a\"\nport = \"/dev/x\"\npose = { x = 0.3, yaw = 1.5 }\n\
+         [link.zones]\nmargin = 0.05\n\n[[link]]\nname = \"b\"\nport = \"/dev/y\"\n",
+    );
+    let second = Scratch::new(
+        "second.toml",
+        "[zones]\nmargin = 0.01\nradii = [2.0]\nself_min = [{ from = 12.5, to = 30, range = 0.42 }]\n\
+         [background]\nmethod = \"paper\"\ncandidate = \"latest\"\nthreshold_mm = 40\nscans = 100\n\
+         publish = \"every-scan\"\nstart = \"first-scan\"\n[marks]\nmax_range_step = 0.2\ni_min = 2\nmax_gap = 1\n",
+    );
+    let set = ["link.a.pose.x=-0.25", "link.a.pose.upside_down=true", "zones.radii=[1.2,0.7]"];
+    let set = [&set[..], &["link.b.background.method=off", "link.b.zones.exact=false"]].concat();
+    let [a, b] = [0, 1].map(|link| processing(&[&first, &second], &set, link));
+    assert_eq!((a.pose.x_m, a.pose.y_m, a.pose.yaw_rad, a.pose.upside_down), (-0.25, 0.0, 1.5, 1));
+    assert_eq!((a.zones.margin_mm, b.zones.margin_mm), (50, 10));
+    assert_eq!((&a.zones.radii_mm, &b.zones.radii_mm), (&vec![1200, 700], &vec![1200, 700]));
+    assert_eq!(a.zones.self_min, [Sector { from_mdeg: 12_500, to_mdeg: 30_000, range_mm: 420 }]);
+    assert_eq!((a.zones.exact, b.zones.exact), (true, false));
+    let learning = a.background.learning;
+    assert_eq!(
+        (learning.method, learning.candidate, learning.start),
+        (Method::Paper, Candidate::Latest, Start::FirstScan)
+    );
+    assert_eq!((learning.threshold_mm, learning.candidate_mm, learning.scans), (Some(40), None, Some(100)));
+    assert_eq!((a.background.is_kept, b.background.is_kept, a.background.every_scan), (true, false, true));
+    assert_eq!((a.marks.max_range_step_mm, a.marks.i_min, a.marks.max_gap), (200, 2, 1));
+}
+
+#[test]
+fn what_cannot_be_is_refused_with_place_value_and_remedy() {
+    for (setting, words) in [
+        ("link.front.pose.x=nan", "x = NaN\n  metres"),
+        ("link.front.pose.y=300", "y = 300\n  metres from the robot's centre, at most 100"),
+        ("link.front.pose.yaw=90", "yaw = 90\n  radians, counter-clockwise: 90 degrees are 1.5708"),
+        (
+            "link.front.pose.yam=1",
+            "unknown key `yam`\n  did you mean `yaw`? Known here: x, y, yaw, upside_down",
+        ),
+        ("link.front.pose.upside_down=1", "upside_down = 1 is not a switch\n  "),
+        ("link.front.pose.x=left", "x = \"left\" is not a number\n  see docs"),
+        ("link.front.zones.radi=[1]", "unknown key `radi`\n  did you mean `radii`?"),
+        ("zones.radii=[0.6,1.0]", "radii = [0.6, 1.0]\n  the largest first"),
+        ("zones.radii=[1.0,1.0]", "the largest first, none twice"),
+        ("zones.radii=[]", "1 to 8 radii"),
+        ("zones.radii=[9,8,7,6,5,4,3,2,1]", "1 to 8 radii"),
+        ("zones.radii=[1.0,0]", "more than 0 and at most 65"),
+        ("zones.radii=[1000]", "more than 0 and at most 65"),
+        ("zones.radii=1.0", "radii = 1.0 is not a list\n  zones.radii = [1.0], with brackets"),
+        ("zones.margin=-0.1", "margin = -0.1\n  metres, from 0 to 10"),
+        ("zones.max_invalid=10", "max_invalid = 10\n  a share from 0 to 1"),
+        ("zones.max_invalid=nan", "max_invalid = NaN"),
+        ("zones.min_beams=0", "min_beams = 0\n  a whole number from 1 to 401"),
+        ("zones.min_scans=1.5", "min_scans = 1.5 is not a whole number\n  see docs"),
+        ("zones.self_min=[{from=30,to=12,range=0.4}]", "from before to"),
+        ("zones.self_min=[{from=-1,to=12,range=0.4}]", "self_min = { from = -1, to = 12, range = 0.4 }"),
+        ("zones.self_min=[{from=1,to=12,range=0}]", "range in metres"),
+        ("zones.self_min=[{from=1,to=12,rang=1}]", "unknown key `rang`\n  did you mean `range`?"),
+        ("zonse.margin=1", "unknown key `zonse`\n  did you mean `zones`?"),
+        ("marks.i_min=8", "i_min = 8\n  a whole number from 1 to 7"),
+        ("marks.max_range_step=100", "max_range_step = 100\n  metres"),
+        ("marks.max_gap=-1", "max_gap = -1"),
+        ("background.method=mult", "`mult`\n  did you mean `multi`? Possible here: multi, paper, off"),
+        ("background.threshold_mm=0", "threshold_mm = 0\n  a whole number from 1 to 10000"),
+        ("background.scans=-4", "scans = -4"),
+        ("background.publish=always", "`always`\n  did you mean"),
+        (
+            "background.start=first_scan",
+            "=first_scan: link front: background.start = first_scan: No such file",
+        ),
+        ("background.start=\"\"", "start = \"\""),
+    ] {
+        let refusal = load(&[], &[setting]).expect_err(setting);
+        assert!(refusal.contains(words), "{setting}: {refusal}");
+        assert!(refusal.starts_with(&format!("--set {setting}: ")), "{refusal}");
+    }
+    let many = vec!["{ from = 1, to = 2, range = 1 }"; 65].join(",");
+    let refusal = load(&[], &[&format!("zones.self_min=[{many}]")]).unwrap_err();
+    assert!(refusal.contains("self_min has 65 sectors\n  at most 64"), "{refusal}");
+    let deep = Scratch::new("deep.toml", "[[link]]\nname = \"a\"\nport = \"x\"\n[link.marks]\ni_mni = 1\n");
+    let refusal = load(&[&deep], &[]).unwrap_err();
+    assert!(refusal.contains("deep.toml:5:1: unknown key `i_mni`\n  did you mean `i_min`?"), "{refusal}");
+    let nowhere = "[[link]]\nname = \"a\"\nport = \"x\"\n[background]\nstart = \"/nope.json\"\n";
+    let nowhere = Scratch::new("nowhere.toml", nowhere);
+    let refusal = load(&[&nowhere], &[]).unwrap_err();
+    assert!(
+        refusal.contains("nowhere.toml:5:9: link a: background.start = /nope.json: No such"),
+        "{refusal}"
+    );
+    let place = Scratch::new(
+        "place.toml",
+        "[[link]]\nname = \"a\"\nport = \"x\"\n[zones]\nmargin = 0.1\nradii = [0.6, 1.0]\n",
+    );
+    let refusal = load(&[&place], &[]).unwrap_err();
+    assert!(refusal.contains("place.toml:6:9: radii = [0.6, 1.0]"), "{refusal}");
+}
+
+#[test]
+fn a_circle_that_the_sensor_cannot_see_is_refused() {
+    let set = |settings: &[&str]| load(&[], settings).map(drop);
+    let refused = |settings: &[&str], words: &str| {
+        let refusal = set(settings).expect_err("must be refused");
+        assert!(refusal.contains(words), "{settings:?}: {refusal}");
+    };
+    assert_eq!(set(&["link.front.zones.min_beams=361"]), Ok(()));
+    refused(
+        &["zones.min_beams=362"],
+        "--set zones.min_beams=362: link front: min_beams = 362, and a scan has 361 beams\n  a few beams",
+    );
+    refused(
+        &["zones.min_beams=300", "link.rear.resolution=1"],
+        "link rear: min_beams = 300, and a scan has 181",
+    );
+    // Two metres ahead it looks away; turned about, it sees the circle. 30 degrees of it: 61 beams.
+    let away = "link.front.pose.x=2";
+    refused(
+        &[away, "link.front.pose.y=0"],
+        "--set link.front.pose.y=0: link front: no beam meets the circle of 1 m\n  correct the sensor's pose, or give it \
+         a circle that it sees: link.front.zones.radii",
+    );
+    assert_eq!(set(&[away, "link.front.zones.radii=[2.5,1]"]), Ok(()));
+    let back = [away, "link.front.pose.yaw=3.1416", "link.front.zones.min_beams=100"];
+    assert_eq!(set(&back), Ok(()));
+    refused(
+        &[&back[..], &["zones.radii=[0.5]"]].concat(),
+        "min_beams = 100, and 57 can see the circle of 0.5 m\n  fewer",
+    );
+    // The farthest reading in mm is 32 m.
+    let far = ["link.front.pose.x=40", "link.front.pose.yaw=3.1416"];
+    assert_eq!(set(&far), Ok(()));
+    refused(&[&far[..], &["link.front.unit=mm"]].concat(), "no beam meets the circle of 1 m");
+    let body = |range: &str| format!("link.rear.zones.self_min=[{{from=0,to=180,range={range}}}]");
+    assert_eq!(set(&[&body("0.99")]), Ok(()));
+    refused(
+        &[&body("1.0")],
+        "link rear: self_min covers every beam up to the circle of 1 m\n  shorten self_min",
+    );
+    let file =
+        Scratch::new("away.toml", "[[link]]\nname = \"a\"\nport = \"x\"\n[link.pose]\nyaw = 0.1\nx = 2\n");
+    let refusal = load(&[&file], &[]).unwrap_err();
+    assert!(refusal.contains("away.toml:6:5: link a: no beam meets the circle of 1 m"), "{refusal}");
+}
+
+#[test]
+fn a_background_begins_with_a_model_of_its_own_sensor() {
+    let mut model = Background { count: 361, unit_mm: 1, taught: 1, ..Background::default() };
+    model.range_array[7] = 1234;
+    let text = serde_json::to_string(&as_json("front", &model)).unwrap();
+    let file = Scratch::new("model.json", &text);
+    let start = format!("link.front.background.start={}", file.0.display());
+    let begun = processing(&[], &[&start], 0).background;
+    assert_eq!((begun.model.as_deref(), begun.learning.start), (Some(&model), Start::Empty));
+    assert_eq!(processing(&[], &[&start, "link.front.background.start=empty"], 0).background.model, None);
+    // Of no use to who keeps none.
+    assert!(load(&[], &[&start, "background.method=off"]).is_ok());
+
+    let name = file.0.display().to_string();
+    let refusal = load(&[], &[&format!("link.rear.background.start={name}")]).unwrap_err();
+    assert!(refusal.contains(&format!("start = {name}: the model is that of sensor front")), "{refusal}");
+    let refusal = load(&[], &[&start, "link.front.resolution=1"]).unwrap_err();
+    assert!(refusal.contains("the model has 361 beams in units of 1 mm"), "{refusal}");
+    assert!(refusal.contains("configured for 181 beams"), "{refusal}");
+    let refusal = load(&[], &[&start, "link.front.unit=cm"]).unwrap_err();
+    assert!(refusal.contains("361 beams in units of 10 mm"), "{refusal}");
+    let cut = Scratch::new("cut.json", &text[..900]);
+    let refusal = load(&[], &[&format!("link.front.background.start={}", cut.0.display())]).unwrap_err();
+    assert!(refusal.contains(": link front: background.start: "), "{refusal}");
+    assert!(refusal.contains("cut.json is no background model: it is cut short"), "{refusal}");
+}
+
+#[test]
+fn the_gateway_has_a_section_that_needs_no_links() {
+    let first =
+        Scratch::new("gateway-1.toml", "[gateway]\ninterface = \"eth0\"\nttl = 2\ntopics = [\"a/scan\"]\n");
+    let second = Scratch::new("gateway-2.toml", "[gateway]\nbackground_every = \"10s\"\ntopics = []\n");
+    let gateway = |files: &[&Scratch], set: &[&str]| {
+        let sources = Sources {
+            files: files.iter().map(|file| file.0.clone()).collect(),
+            set: set.iter().map(|flag| (*flag).to_owned()).collect(),
+            links: Vec::new(),
+        };
+        Gateway::load(&sources).map_err(|failure| failure.to_string())
+    };
+    let place = format!("{}:2:20", second.0.display());
+    assert_eq!(
+        gateway(&[&first, &second], &["gateway.ttl=3", "gateway.bare=true"]).unwrap(),
+        Gateway {
+            interface: Some("eth0".into()),
+            topics: Some(Vec::new()),
+            to: None,
+            bare: Some(true),
+            ttl: Some(3),
+            background_every: Some(("10s".into(), place)),
+            mtu: None,
+        }
+    );
+    assert_eq!(gateway(&[], &[]).unwrap(), Gateway::default());
+    // A hub takes the same files.
+    let links = Scratch::new("gateway-links.toml", "[[link]]\nname = \"a\"\nport = \"x\"\n");
+    assert_eq!(load(&[&first, &links], &[]).unwrap().links.len(), 1);
+    for (set, said) in [
+        ("gateway.ttl=256", "ttl = 256\n  0 to 255"),
+        ("gateway.mtu=861", "mtu = 861\n  862 to 1472"),
+        ("gateway.mtu=-1", "mtu = -1"),
+        ("gateway.tll=1", "did you mean `ttl`?"),
+    ] {
+        let error = gateway(&[], &[set]).unwrap_err();
+        assert!(error.starts_with(&format!("--set {set}: ")) && error.contains(said), "{error}");
+    }
+}

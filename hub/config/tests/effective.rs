@@ -1,0 +1,134 @@
+//! What is in effect, and where it is said: each value of each link has a place, whichever source it is from, and what is
+//! shown is what the hub works with.
+
+use std::fs;
+use std::path::PathBuf;
+
+use config::{Config, DEFAULT, Gateway, Sources, Value, values};
+use serde_json::{Value as Json, json};
+
+/// A file that goes with the test.
+struct Scratch(PathBuf);
+
+impl Scratch {
+    fn new(name: &str, text: &str) -> Scratch {
+        let path = std::env::temp_dir().join(format!("scanhub-{}-{name}", std::process::id()));
+        fs::write(&path, text).expect("a file");
+        Scratch(path)
+    }
+
+    fn place(&self, line_and_column: &str) -> String {
+        format!("{}:{line_and_column}", self.0.display())
+    }
+}
+
+impl Drop for Scratch {
+    fn drop(&mut self) {
+        let _ = fs::remove_file(&self.0);
+    }
+}
+
+/// Those of the default.
+const LINKS: [&str; 2] = ["front=/dev/ttyUSB0", "rear=/dev/ttyUSB1"];
+
+fn sources(files: &[&Scratch], links: &[&str], set: &[&str]) -> Sources {
+    let owned = |flags: &[&str]| flags.iter().map(|flag| (*flag).to_owned()).collect();
+    Sources { files: files.iter().map(|file| file.0.clone()).collect(), links: owned(links), set: owned(set) }
+}
+
+/// Value and origin of `key`.
+fn shown<'a>(values: &'a [Value], key: &str) -> (&'a Json, &'a str) {
+    let found: Vec<_> = values.iter().filter(|value| value.key == key).collect();
+    let [value] = &found[..] else { panic!("{key}: {found:?}") };
+    (&value.value, &value.origin)
+}
+
+#[test]
+fn each_value_has_the_place_where_it_is_said_last() {
+    let first = Scratch::new(
+        "first.toml",
+        "[[link]]\nname = \"a\"\nport = \"/dev/x\"\npose = { x = 0.3, yaw = 1.5 }\n[link.zones]\nmargin = 0.05\n\n\
+         [[link]]\nname = \"b\"\nport = \"/dev/y\"\nunit = \"cm\"\n\n[gateway]\nttl = 2\nto = [\"10.0.0.7:22200\"]\n",
+    );
+    let second = Scratch::new(
+        "second.toml",
+        "[zones]\nmargin = 0.01\nself_min = [{ from = 12.5, to = 30, range = 0.42 }]\n\n[background]\n\
+         method = \"off\"\nscans = 100\nstart = \"first-scan\"\n[[link]]\nname = \"a\"\nbaud = 38400\n",
+    );
+    let links = ["c=file:/tmp/x?rate=max"];
+    let set = ["link.a.pose.x=-0.25", "zones.radii=[1.2,0.7]", "link.c.type=lms211", "link.c.mode=0x01"];
+    let values = values(&sources(&[&first, &second], &links, &set)).unwrap();
+    for (key, value, place) in [
+        ("link.a.port", json!("/dev/x"), first.place("3:8")),
+        ("link.a.baud", json!(38400), second.place("11:8")),
+        ("link.b.baud", json!(500_000), "default".to_owned()),
+        ("link.a.pose.x", json!(-0.25), "--set link.a.pose.x=-0.25".to_owned()),
+        ("link.a.pose.yaw", json!(1.5), first.place("4:25")),
+        ("link.b.pose.x", json!(0.0), "default".to_owned()),
+        // What is said for one link wins, wherever either stands.
+        ("link.a.zones.margin", json!(0.05), first.place("6:10")),
+        ("link.b.zones.margin", json!(0.01), second.place("2:10")),
+        ("link.b.zones.radii", json!([1.2, 0.7]), "--set zones.radii=[1.2,0.7]".to_owned()),
+        ("link.a.zones.self_min", json!([{ "from": 12.5, "to": 30.0, "range": 0.42 }]), second.place("3:12")),
+        ("link.b.unit", json!("cm"), first.place("11:8")),
+        ("link.a.unit", Json::Null, "default".to_owned()),
+        ("link.c.port", json!("file:/tmp/x?rate=max"), "--link c=file:/tmp/x?rate=max".to_owned()),
+        ("link.c.angle", json!(100), "default of lms211".to_owned()),
+        ("link.c.mode", json!(1), "--set link.c.mode=0x01".to_owned()),
+        ("link.a.background.method", json!("off"), second.place("6:10")),
+        ("link.a.background.scans", json!(100), second.place("7:9")),
+        ("link.a.background.threshold_mm", Json::Null, "default".to_owned()),
+        ("link.a.background.start", json!("first-scan"), second.place("8:9")),
+        ("link.a.marks.max_range_step", json!(0.1), "default".to_owned()),
+        ("gateway.ttl", json!(2), first.place("14:7")),
+        ("gateway.to", json!(["10.0.0.7:22200"]), first.place("15:6")),
+        ("gateway.mtu", json!(1372), "default".to_owned()),
+    ] {
+        assert_eq!(shown(&values, key), (&value, place.as_str()), "{key}");
+    }
+}
+
+#[test]
+fn what_is_shown_can_be_set() {
+    let said = ["link.front.zones.self_min=[{from=1,to=2,range=0.4}]", "link.front.unit=cm", "gateway.ttl=3"];
+    let of = |set: &[&str]| sources(&[], &LINKS, set);
+    let values = values(&of(&said)).unwrap();
+    let set: Vec<String> = values
+        .iter()
+        .filter(|value| !value.value.is_null())
+        .map(|value| format!("{}={}", value.key, value.text()))
+        .collect();
+    let set: Vec<&str> = set.iter().map(String::as_str).collect();
+    assert!(set.len() >= 50, "{set:?}");
+    assert_eq!(Config::load(&of(&set)), Config::load(&of(&said)));
+    let gateway = Gateway::load(&of(&set)).unwrap();
+    assert_eq!((gateway.ttl, gateway.mtu), (Some(3), Some(1372)));
+}
+
+#[test]
+fn every_key_of_the_page_is_shown() {
+    let page = include_str!("../../../docs/configuration.md");
+    let example =
+        page.split("```toml\n").nth(1).and_then(|rest| rest.split("```").next()).expect("an example");
+    let file = Scratch::new("shown.toml", example);
+    let values = values(&sources(&[&file], &[], &[])).unwrap();
+    for line in example.lines().filter(|line| !line.starts_with('[') && !line.starts_with("name")) {
+        let Some((key, _)) = line.split_once(" = ") else { continue };
+        let key = key.trim_start_matches("# ");
+        let is_it = |value: &&Value| value.key.split('.').any(|word| word == key);
+        assert!(values.iter().any(|value| is_it(&value)), "{key} is not shown");
+    }
+}
+
+#[test]
+fn the_default_is_what_holds_without_a_word() {
+    let file = Scratch::new("default.toml", DEFAULT);
+    let written = Config::load(&sources(&[&file], &[], &[])).unwrap();
+    assert_eq!(written, Config::load(&sources(&[], &LINKS, &[])).unwrap());
+    assert!(DEFAULT.lines().count() <= 24, "more than a screen");
+    assert!(DEFAULT.lines().all(|line| line.len() <= 90), "wider than a screen");
+    // What is commented out can be said, too.
+    let all = Scratch::new("all.toml", &DEFAULT.replace("\n# ", "\n"));
+    let all = Config::load(&sources(&[&all], &[], &[])).unwrap();
+    assert!(all.links[0].family.is_some() && all.links[0].unit.is_some());
+}

@@ -1,0 +1,361 @@
+//! Changes what a sensor keeps for ever. It looks whether the sensor still keeps what it did, goes into installation
+//! mode, writes, leaves it again, reads back what is in force now, and brings back the operating mode in which the
+//! sensor was. Whatever goes wrong on the way, it tries to leave the installation mode, and says in the end what it
+//! knows of the sensor's state.
+//!
+//! The only code that sends a request of [`crate::eeprom`], and it needs [`Consent`]. A write that was not acknowledged
+//! is not simply said again: first the configuration tells whether it was done.
+
+use lms::command::{self, Request};
+use lms::exchange::{Conversation, Exchange, Heard, MODE_TIMEOUT, MORE_TRIES, Output, Say, TRIES};
+use lms::framer::Place;
+use lms::operating::{ON_REQUEST, Operating, PARTIAL, STREAM};
+use lms::reply::Reply;
+use lms::telegram::Encoded;
+use lms::{MILLIS, Nanos};
+
+use crate::eeprom::{PowerOn, Write};
+use crate::plan::{Consent, Kept, Plan};
+
+/// A change under way; it cannot be copied, as consent is to one.
+#[derive(Debug)]
+pub struct Change {
+    plan: Plan,
+    exchange: Exchange<Saying>,
+    step: Step,
+    /// How often more the configuration may be written.
+    writes_left: u8,
+    /// The sensor sends nothing unasked. Before that the rest of a scan may look like a NAK.
+    is_quiet: bool,
+    outcome: Outcome,
+}
+
+/// How far a change is, in its order.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Step {
+    /// Whether it is still the sensor that the plan was made for: a person takes time to answer.
+    Compare,
+    /// Into installation mode.
+    Enter,
+    /// The configuration is written.
+    Write,
+    /// Nobody said whether it was: the configuration is read.
+    Check,
+    /// The rate after power-on is written.
+    PowerOn,
+    /// Out of installation mode.
+    Leave,
+    /// The configuration that is in force now.
+    ReadBack,
+    /// Whether another rate than 9600 comes after power-on.
+    ReadStatus,
+    /// Back to the stream that was found.
+    Restore,
+    /// Over.
+    Done,
+}
+
+/// What became of it.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Outcome {
+    /// The step that failed first, and how; `None` if all went well.
+    pub failed: Option<(Step, Failing)>,
+    /// Whether a write may have reached the sensor.
+    pub written: bool,
+    /// The configuration as it was read back.
+    pub configuration: Option<Kept>,
+    /// Whether a rate other than 9600 comes after power-on, if that was to change and could be read back.
+    pub permanent_baud: Option<bool>,
+    /// The operating mode in which the sensor is now; `None` if it may still be in installation mode.
+    pub operating_mode: Option<u8>,
+}
+
+/// How a step failed.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Failing {
+    /// No reply, or none that can be read.
+    Unanswered,
+    /// The sensor said no; to [`Step::Enter`]: the password is wrong.
+    Refused,
+    /// What was read back is not what was to be written; to [`Step::Compare`]: not what was there before.
+    Differs,
+}
+
+#[derive(Clone, Debug)]
+enum Saying {
+    Ask(Request),
+    Keep(Kept),
+    PowerOn(PowerOn),
+}
+
+impl Saying {
+    /// What of it is written.
+    fn write(&self) -> Option<Write<'_>> {
+        match self {
+            Saying::Ask(_) => None,
+            Saying::Keep(kept) => Some(Write::Configuration(kept.bytes())),
+            Saying::PowerOn(power_on) => Some(Write::PowerOn(*power_on)),
+        }
+    }
+}
+
+impl Say for Saying {
+    fn encode(&self, address: u8) -> Encoded {
+        let request = match self {
+            Saying::Ask(request) => *request,
+            // Which configuration there is does no harm to ask; but none is longer than a write may be.
+            Saying::Keep(_) | Saying::PowerOn(_) => Request::Configuration,
+        };
+        let write = self.write().and_then(|write| write.encode(address));
+        write.unwrap_or_else(|| request.encode(address))
+    }
+
+    fn command(&self) -> u8 {
+        match self {
+            Saying::Ask(request) => request.command(),
+            Saying::Keep(kept) => Write::Configuration(kept.bytes()).command(),
+            Saying::PowerOn(power_on) => Write::PowerOn(*power_on).command(),
+        }
+    }
+
+    fn work(&self) -> Nanos {
+        match self {
+            Saying::Ask(request) if request.command() == command::MODE => MODE_TIMEOUT,
+            Saying::Ask(request) => request.work(),
+            Saying::Keep(_) | Saying::PowerOn(_) => WRITE_TIMEOUT,
+        }
+    }
+
+    /// A sensor that writes, or changes its mode, may have acknowledged unheard, behind a scan that it broke off: it is
+    /// waited for as long.
+    fn sign(&self) -> Nanos {
+        match self {
+            Saying::Ask(request) if request.command() == command::MODE => MODE_TIMEOUT,
+            Saying::Ask(request) => request.sign(),
+            Saying::Keep(_) | Saying::PowerOn(_) => WRITE_TIMEOUT,
+        }
+    }
+}
+
+impl Change {
+    /// Carries out the plan that somebody consented to, on a port that is open at its rate.
+    pub fn new(consent: Consent, now: Nanos) -> Self {
+        let plan = consent.into_plan();
+        let mut exchange = Exchange::new(plan.baud, now);
+        exchange.address = plan.address;
+        let (step, outcome) = (Step::Compare, Outcome::default());
+        let mut change = Change { plan, exchange, step, writes_left: TRIES, is_quiet: false, outcome };
+        change.begin(Step::Compare);
+        change
+    }
+
+    /// As a change on the line of a serial server, which may pack a reply before it sends it.
+    pub fn behind_server(mut self) -> Self {
+        self.exchange.behind_server = true;
+        self
+    }
+
+    /// How far it is.
+    pub fn step(&self) -> Step {
+        self.step
+    }
+
+    /// What became of it; all of it after [`Output::Done`].
+    pub fn outcome(&self) -> &Outcome {
+        &self.outcome
+    }
+
+    /// Begins with `step`, or the first one after it that has something to do.
+    fn begin(&mut self, step: Step) {
+        self.step = step;
+        let plan = self.plan;
+        let ask = |request| Some((Saying::Ask(request), TRIES));
+        // A wrong or lost request does nothing; it is for the next step to find out.
+        let once = |saying| Some((saying, 1));
+        let said = match step {
+            Step::Enter => ask(Request::Operate(Operating::Installation(plan.password))),
+            Step::Write if plan.old == plan.new => None,
+            Step::Write => once(Saying::Keep(plan.new)),
+            Step::Compare | Step::Check | Step::ReadBack => ask(Request::Configuration),
+            Step::PowerOn => plan.power_on.map(Saying::PowerOn).and_then(once),
+            Step::Leave => Some((Saying::Ask(Request::Stop), MORE_TRIES)),
+            Step::ReadStatus if plan.power_on.is_none() => None,
+            Step::ReadStatus => ask(Request::Status),
+            // It may still be in installation mode.
+            Step::Restore if self.outcome.operating_mode.is_none() => {
+                Some((Saying::Ask(Request::Stop), MORE_TRIES))
+            }
+            Step::Restore => match plan.operating_mode {
+                STREAM => ask(Request::Stream),
+                PARTIAL => ask(Request::Operate(Operating::Partial)),
+                // What other modes need beside their byte nobody tells.
+                _ => None,
+            },
+            Step::Done => return,
+        };
+        match said {
+            Some((saying, tries)) => {
+                self.outcome.written |= saying.write().is_some();
+                self.exchange.ask(saying, self.exchange.now, tries);
+            }
+            None => self.begin(following(step)),
+        }
+    }
+
+    fn on_telegram(&mut self, place: Place) {
+        let telegram = self.exchange.view(place);
+        let reply = Reply::decode(telegram);
+        let kept = match &reply {
+            Some(Reply::Configuration(it) | Reply::ConfigurationWritten { configuration: it, .. }) => {
+                Kept::new(it.bytes())
+            }
+            _ => None,
+        };
+        let done = match &reply {
+            Some(Reply::Mode { done } | Reply::ConfigurationWritten { done, .. }) => Some(*done),
+            // What its first byte says is told in no two ways alike: the status tells it afterwards.
+            Some(Reply::PowerOnSet { .. } | Reply::Status(_) | Reply::Configuration(_)) => Some(true),
+            Some(Reply::Refused) => Some(false),
+            _ => None,
+        };
+        let is_changed = matches!(reply, Some(Reply::Mode { done: true }));
+        let permanent = match &reply {
+            Some(Reply::Status(status)) => Some(status.has_permanent_baud()),
+            _ => None,
+        };
+        let command = telegram.command();
+        if self.exchange.answered(command).is_none() {
+            return;
+        }
+        self.is_quiet |= is_changed;
+        match self.step {
+            _ if done == Some(false) => self.fail(Failing::Refused),
+            // An answer that cannot be read says no more than none.
+            Step::Write if done.is_none() => self.ask_what_is_kept(),
+            _ if done.is_none() => self.fail(Failing::Unanswered),
+            Step::Compare if kept != Some(self.plan.old) => self.fail(Failing::Differs),
+            Step::Check if kept == Some(self.plan.new) => self.begin(Step::PowerOn),
+            Step::Check if self.writes_left > 0 => self.begin(Step::Write),
+            Step::Check => {
+                self.step = Step::Write;
+                self.fail(Failing::Unanswered);
+            }
+            Step::Leave => {
+                self.outcome.operating_mode = Some(ON_REQUEST);
+                self.begin(Step::ReadBack);
+            }
+            Step::ReadBack => {
+                self.outcome.configuration = kept;
+                if kept != Some(self.plan.new) {
+                    self.note(Failing::Differs);
+                }
+                self.begin(Step::ReadStatus);
+            }
+            Step::ReadStatus => {
+                self.outcome.permanent_baud = permanent;
+                let wanted = self.plan.power_on.map(|power_on| power_on == PowerOn::KeepBaud);
+                if wanted != permanent {
+                    self.note(Failing::Differs);
+                }
+                self.begin(Step::Restore);
+            }
+            Step::Restore if self.outcome.operating_mode.is_none() => {
+                self.outcome.operating_mode = Some(ON_REQUEST);
+                self.begin(Step::Restore);
+            }
+            Step::Restore => {
+                self.outcome.operating_mode = Some(self.plan.operating_mode);
+                self.begin(Step::Done);
+            }
+            step => self.begin(following(step)),
+        }
+    }
+
+    fn on_silence(&mut self) {
+        if self.exchange.again(self.exchange.now) {
+            return;
+        }
+        match self.step {
+            Step::Write => self.ask_what_is_kept(),
+            _ => self.fail(Failing::Unanswered),
+        }
+    }
+
+    fn ask_what_is_kept(&mut self) {
+        self.writes_left = self.writes_left.saturating_sub(1);
+        self.begin(Step::Check);
+    }
+
+    fn fail(&mut self, failing: Failing) {
+        self.note(failing);
+        match self.step {
+            // Nothing was said that changes anything.
+            Step::Compare => {
+                self.outcome.operating_mode = Some(self.plan.operating_mode);
+                self.begin(Step::Done);
+            }
+            // Whether it heard that or not, it may be in installation mode.
+            Step::Enter | Step::Write | Step::Check | Step::PowerOn => self.begin(Step::Leave),
+            Step::Leave => self.begin(Step::ReadBack),
+            step => self.begin(following(step)),
+        }
+    }
+
+    /// The first failure is the cause of the others.
+    fn note(&mut self, failing: Failing) {
+        self.outcome.failed.get_or_insert((self.step, failing));
+    }
+}
+
+impl Conversation for Change {
+    fn spare(&mut self) -> &mut [u8] {
+        self.exchange.spare()
+    }
+
+    fn commit(&mut self, now: Nanos, len: usize) {
+        self.exchange.commit(now, len);
+    }
+
+    fn handle_timeout(&mut self, now: Nanos) {
+        if self.exchange.handle_timeout(now) {
+            self.on_silence();
+        }
+    }
+
+    fn transmitted(&mut self, now: Nanos) {
+        self.exchange.transmitted(now);
+    }
+
+    fn poll_output(&mut self) -> Output {
+        while let Some(heard) = self.exchange.advance() {
+            match heard {
+                Heard::Telegram(place) => self.on_telegram(place),
+                // While it may be writing, only time says no: noise is not worth a second write.
+                Heard::Nak if !self.is_quiet || matches!(self.step, Step::Write | Step::PowerOn) => {}
+                Heard::Nak => {
+                    if self.exchange.refused_checksum() == Some(false) {
+                        self.on_silence();
+                    }
+                }
+            }
+        }
+        if self.step == Step::Done { Output::Done } else { self.exchange.output(Nanos::MAX) }
+    }
+}
+
+/// The step after one that went as it should.
+fn following(step: Step) -> Step {
+    match step {
+        Step::Compare => Step::Enter,
+        Step::Enter => Step::Write,
+        Step::Write | Step::Check => Step::PowerOn,
+        Step::PowerOn => Step::Leave,
+        Step::Leave => Step::ReadBack,
+        Step::ReadBack => Step::ReadStatus,
+        Step::ReadStatus => Step::Restore,
+        Step::Restore | Step::Done => Step::Done,
+    }
+}
+
+/// A change of unit was seen to take 7 s (QM), one driver waits 15 s.
+const WRITE_TIMEOUT: Nanos = 15_000 * MILLIS;

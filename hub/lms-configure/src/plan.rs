@@ -1,0 +1,125 @@
+//! What is to be changed for ever, and somebody's consent to it. A plan is values; only with consent can it be carried
+//! out, and consent is to one plan as it was shown.
+
+use lms::configuration::{Configuration, ITEMS, Item, LEN};
+use lms::inquiry::Report;
+use lms::parameters::Password;
+use lms::variant::Baud;
+
+use crate::eeprom::PowerOn;
+
+/// The first part of a configuration with its own storage: 34 bytes, 32 with older firmware.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Kept {
+    bytes: [u8; LEN],
+    len: usize,
+}
+
+impl Kept {
+    /// A copy of `bytes`; `None` if they are no configuration.
+    pub fn new(bytes: &[u8]) -> Option<Kept> {
+        Configuration::new(bytes)?;
+        let mut kept = Kept { bytes: [0; LEN], len: bytes.len() };
+        kept.bytes.get_mut(..bytes.len())?.copy_from_slice(bytes);
+        Some(kept)
+    }
+
+    /// The bytes as the sensor keeps them.
+    pub fn bytes(&self) -> &[u8] {
+        &self.bytes[..self.len]
+    }
+
+    /// Sets one byte; beyond its end nothing.
+    pub fn set(&mut self, at: usize, byte: u8) {
+        if let Some(place) = self.bytes[..self.len].get_mut(at) {
+            *place = byte;
+        }
+    }
+
+    /// The items in which `self` and `other` differ.
+    pub fn differences<'a>(&'a self, other: &'a Kept) -> impl Iterator<Item = Item> + 'a {
+        let of = |kept: &'a Kept, item: &Item| kept.bytes().get(item.at..item.at + item.len);
+        ITEMS.into_iter().filter(move |item| of(self, item) != of(other, item))
+    }
+}
+
+/// What is to be changed in one sensor.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Plan {
+    /// The rate at which the sensor talks.
+    pub baud: Baud,
+    /// Its own address.
+    pub address: u8,
+    /// The operating mode in which it was found.
+    pub operating_mode: u8,
+    /// Its configuration.
+    pub old: Kept,
+    /// What its configuration shall be.
+    pub new: Kept,
+    /// What the rate after power-on shall be, if that shall change.
+    pub power_on: Option<PowerOn>,
+    /// The password of the installation mode.
+    pub password: Password,
+}
+
+impl Plan {
+    /// No change of the sensor that told `report`; `None` if it did not tell all that is needed.
+    pub fn of(report: &Report) -> Option<Plan> {
+        let old = Kept::new(report.configuration()?.bytes())?;
+        Some(Plan {
+            baud: report.baud?,
+            address: report.address?,
+            operating_mode: report.status()?.operating_mode(),
+            old,
+            new: old,
+            power_on: None,
+            password: Password::FACTORY,
+        })
+    }
+
+    /// Whether there is nothing to do.
+    pub fn is_empty(&self) -> bool {
+        self.old == self.new && self.power_on.is_none()
+    }
+}
+
+/// Somebody saw a plan and said yes. Whoever has one can write a sensor's EEPROM, so it is made where a person is asked,
+/// and nowhere else.
+#[derive(Debug)]
+pub struct Consent(Plan);
+
+impl Consent {
+    /// A person at a terminal saw `plan` and confirmed it.
+    pub fn of_a_person(plan: Plan) -> Consent {
+        Consent(plan)
+    }
+
+    pub(crate) fn into_plan(self) -> Plan {
+        self.0
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    extern crate std;
+    use super::*;
+    use lms::configuration::factory;
+    use lms::variant::{Mode, Unit};
+    use std::vec::Vec;
+
+    #[test]
+    fn differences_are_told_by_item() {
+        let old = Kept::new(&factory(Mode(1), Unit::Mm)).unwrap();
+        let mut new = old;
+        assert_eq!(old.differences(&new).count(), 0);
+        new.set(5, 4);
+        new.set(1, 1);
+        new.set(LEN, 9);
+        let names: Vec<_> = old.differences(&new).map(|item| item.name).collect();
+        assert_eq!(names, ["blanking", "measuring mode"]);
+        assert_eq!(new.bytes().len(), LEN);
+        assert_eq!(Kept::new(&old.bytes()[..32]).map(|kept| kept.bytes().len()), Some(32));
+        assert_eq!(Kept::new(&[0; 35]), None);
+        assert_eq!(Kept::new(&[0; 31]), None);
+    }
+}

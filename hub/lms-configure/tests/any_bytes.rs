@@ -1,0 +1,70 @@
+//! Any bytes at all, as telegrams with a right checksum: nothing panics, what was understood as a write is said again as it
+//! came and is no request, and what is explained of it is what it says.
+
+use lms::command::Request;
+use lms::explain::explain;
+use lms::telegram::{Encoded, Telegram, Writer};
+use lms_configure::eeprom::{PowerOn, Write};
+use proptest::prelude::*;
+
+fn telegram(address: u8, command: u8, data: &[u8]) -> Encoded {
+    Writer::new(address, command).slice(data).finish()
+}
+
+/// Commands that mean something, more often than others.
+fn commands() -> impl Strategy<Value = u8> {
+    let known: Vec<u8> = (0x10..=0x7C).chain(0x90..=0xFC).collect();
+    prop_oneof![proptest::sample::select(known), any::<u8>()]
+}
+
+/// Data of which the counts are small enough to fit now and then.
+fn data() -> impl Strategy<Value = Vec<u8>> {
+    prop_oneof![
+        proptest::collection::vec(any::<u8>(), 0..800),
+        proptest::collection::vec(0u8..6, 0..60),
+        (any::<u8>(), proptest::collection::vec(any::<u8>(), 0..12)).prop_map(|(first, mut rest)| {
+            rest.insert(0, first);
+            rest
+        }),
+        proptest::sample::select(vec![1, 4, 5, 32, 33, 34, 35, 84, 85, 152])
+            .prop_flat_map(|len| proptest::collection::vec(any::<u8>(), len)),
+    ]
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig { cases: 4000, failure_persistence: None, ..ProptestConfig::default() })]
+
+    #[test]
+    fn bytes_without_a_checksum(bytes in proptest::collection::vec(any::<u8>(), 0..900)) {
+        if let Some(telegram) = Telegram::check(&bytes) {
+            let _ = Write::decode(telegram);
+        }
+    }
+
+    #[test]
+    fn requests(address in 0u8..0x80, command in commands(), data in data()) {
+        let encoded = telegram(address, command, &data);
+        let telegram = encoded.telegram();
+        if Request::decode(telegram).is_some() {
+            prop_assert_eq!(Write::decode(telegram), None);
+        }
+        if let Some(write) = Write::decode(telegram) {
+            let again = write.encode(address);
+            prop_assert_eq!(again.as_ref().map(|again| again.bytes()), Some(telegram.bytes()));
+        }
+    }
+}
+
+#[test]
+fn the_rate_after_power_on_is_explained() {
+    for (power_on, words) in
+        PowerOn::ALL.into_iter().zip(["9600", "the present rate is kept", "the type is kept"])
+    {
+        let encoded = Write::PowerOn(power_on).encode(0).expect("one byte fits");
+        let mut said = String::new();
+        explain(encoded.telegram(), None, &mut |field| {
+            said += &field.words.map(|words| words.to_string()).unwrap_or_default();
+        });
+        assert!(said.contains(words), "{power_on:?}: {said}");
+    }
+}

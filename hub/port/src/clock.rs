@@ -1,0 +1,25 @@
+//! The only place of the hub that asks what time it is.
+
+use lms::Nanos;
+use rustix::event::Timespec;
+use rustix::time::{ClockId, clock_gettime};
+
+/// CLOCK_MONOTONIC, the clock of every stamp and deadline.
+pub fn now() -> Nanos {
+    nanos(clock_gettime(ClockId::Monotonic))
+}
+
+/// Nanoseconds since 1970 of the moment that CLOCK_MONOTONIC called `stamp`; `now` was read just now.
+pub fn wall(stamp: Nanos, now: Nanos) -> u64 {
+    nanos(clock_gettime(ClockId::Realtime)).saturating_sub(now.saturating_sub(stamp))
+}
+
+/// The time from `now` to `until` as poll wants it; nothing if `until` is past, at least a nanosecond otherwise.
+pub fn span(now: Nanos, until: Nanos) -> Timespec {
+    let left = until.saturating_sub(now);
+    Timespec { tv_sec: (left / 1_000_000_000) as i64, tv_nsec: (left % 1_000_000_000) as i64 }
+}
+
+fn nanos(time: Timespec) -> Nanos {
+    time.tv_sec as u64 * 1_000_000_000 + time.tv_nsec as u64
+}

@@ -1,0 +1,279 @@
+//! Why a port cannot be opened, and what to do about it. The reason is found by trying; its circumstances (who has it,
+//! what is there instead) are looked for once, when somebody is to be told.
+
+use std::fmt;
+use std::io;
+use std::path::Path;
+
+use rustix::io::Errno;
+use schema::{Failure, Kind};
+
+use super::candidates::{Candidate, candidates};
+use super::holder::{Holder, holder, is_own};
+use super::rights::Rights;
+use crate::Source;
+
+/// The reason alone; equal as long as nothing changed.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum Refusal {
+    /// There is nothing at that path.
+    Missing,
+    /// There is, but no terminal.
+    NotTty,
+    /// This user may not.
+    Denied,
+    /// Another process has it.
+    Busy,
+    /// There is a name and nothing behind it.
+    Dead,
+    /// This process has no descriptor or thread left, or the kernel no memory.
+    Short(Errno),
+    /// The driver made another rate of the one that was wanted.
+    Rate {
+        /// What was wanted, in Bd.
+        wanted: u32,
+        /// What the driver has instead.
+        given: u32,
+    },
+    /// The serial server's name cannot be looked up.
+    NoHost(String),
+    /// The serial server is there, and takes no connection at this port.
+    Refused,
+    /// The serial server does not answer.
+    TimedOut,
+    /// The network does not reach it.
+    Network(String),
+    /// Somebody wanted to stop.
+    Interrupted,
+    /// It is no line at all.
+    Recording,
+    /// Whatever else the kernel says.
+    Other(Errno),
+}
+
+impl Refusal {
+    pub(crate) fn of_io(error: &io::Error) -> Refusal {
+        Errno::from_io_error(error).map_or(Refusal::Other(Errno::IO), Refusal::from)
+    }
+
+    /// The reason with its circumstances at `source`, as they are now.
+    pub fn explain(&self, source: &Source) -> Failure {
+        let name = source.name();
+        let path = Path::new(&name);
+        let told = self.to_string();
+        let failure = |kind, hint: &str| Failure::new(kind, format!("{name}: {told}"), hint);
+        match self {
+            Refusal::Missing => missing(path, &candidates()),
+            Refusal::Denied => {
+                let (what, remedy) = Rights::of(path).explain(path);
+                Failure::new(Kind::PortPermission, what, remedy)
+            }
+            Refusal::Busy => match holder(path) {
+                None if is_own(path) => Failure::new(
+                    Kind::PortBusy,
+                    format!("{name}: in use by another link of this hub"),
+                    "name the port of each sensor",
+                ),
+                holder => busy(path, holder),
+            },
+            Refusal::NotTty if path.is_dir() => {
+                let hint = format!("it is a directory; {}", instead(&name, &candidates()));
+                failure(Kind::PortNotTty, &hint)
+            }
+            Refusal::NotTty => failure(Kind::PortNotTty, "name a tty, or tcp:HOST:PORT"),
+            Refusal::Dead => failure(Kind::PortMissing, &instead(&name, &candidates())),
+            Refusal::Short(Errno::AGAIN) => failure(Kind::Short, "raise the limit of threads (ulimit -u)"),
+            Refusal::Short(_) => failure(Kind::Short, "raise the limit of open descriptors (ulimit -n)"),
+            Refusal::Rate { wanted, .. } => failure(Kind::PortRate, remedy_of_rate(*wanted)),
+            Refusal::NoHost(_) => failure(Kind::PortMissing, "correct the name, or give the address instead"),
+            Refusal::Refused => failure(
+                Kind::PortMissing,
+                "nothing listens there, or it serves somebody else: the server's port must be in raw TCP mode",
+            ),
+            Refusal::TimedOut => failure(Kind::PortMissing, "is it switched on, and is the address right?"),
+            Refusal::Network(_) => {
+                failure(Kind::PortMissing, "is the network plugged in, and is there a way to it?")
+            }
+            Refusal::Interrupted => Failure::new(Kind::Interrupted, "interrupted", ""),
+            Refusal::Recording => failure(Kind::Configuration, "name a tty, or tcp:HOST:PORT"),
+            Refusal::Other(_) => {
+                failure(Kind::PortNotTty, "name a tty; the kernel's log (dmesg) may tell more")
+            }
+        }
+    }
+}
+
+impl fmt::Display for Refusal {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Refusal::Missing => f.write_str("no such port"),
+            Refusal::NotTty => f.write_str("not a serial line"),
+            Refusal::Denied => f.write_str("no permission"),
+            Refusal::Busy => f.write_str("in use"),
+            Refusal::Dead => f.write_str("no such port: there is a name, but no line behind it"),
+            Refusal::Short(errno) => write!(f, "cannot be opened: {errno}"),
+            Refusal::Rate { wanted, given } => {
+                write!(f, "{wanted} Bd is not possible here, the driver gives {given} Bd")
+            }
+            Refusal::NoHost(why) => write!(f, "no such host: {why}"),
+            Refusal::Refused => f.write_str("connection refused"),
+            Refusal::TimedOut => f.write_str("no answer"),
+            Refusal::Network(why) => write!(f, "cannot be reached: {why}"),
+            Refusal::Interrupted => f.write_str("interrupted"),
+            Refusal::Recording => f.write_str("a recording, no line to a sensor"),
+            Refusal::Other(errno) => write!(f, "cannot be used as a serial line: {errno}"),
+        }
+    }
+}
+
+impl From<Errno> for Refusal {
+    fn from(errno: Errno) -> Refusal {
+        match errno {
+            Errno::NOENT => Refusal::Missing,
+            Errno::ACCESS | Errno::PERM => Refusal::Denied,
+            Errno::BUSY => Refusal::Busy,
+            Errno::NOTTY | Errno::ISDIR | Errno::NOTDIR => Refusal::NotTty,
+            // A UART that the board does not have, an adapter that was pulled out a moment ago, half a pty.
+            Errno::IO | Errno::NXIO | Errno::NODEV => Refusal::Dead,
+            Errno::MFILE | Errno::NFILE | Errno::NOMEM => Refusal::Short(errno),
+            errno => Refusal::Other(errno),
+        }
+    }
+}
+
+fn missing(path: &Path, there: &[Candidate]) -> Failure {
+    let name = path.display().to_string();
+    let what = match path.read_link() {
+        Ok(target) => format!("{name}: no such port: it points to {}, which is not there", target.display()),
+        Err(_) if path.starts_with("/dev/serial") => {
+            format!("{name}: no such port: its adapter is not plugged in, or another one than this was")
+        }
+        Err(_) => format!("{name}: no such port"),
+    };
+    Failure::new(Kind::PortMissing, what, instead(&name, there))
+}
+
+/// What is there instead of `name`, what is called alike first.
+fn instead(name: &str, there: &[Candidate]) -> String {
+    let mut there: Vec<&Candidate> = there.iter().collect();
+    there.sort_by_key(|candidate| {
+        let names = [&candidate.name, &candidate.device];
+        names.map(|known| strsim::levenshtein(name, &known.to_string_lossy())).into_iter().min()
+    });
+    match &there[..] {
+        [] => "no serial line is plugged in".to_owned(),
+        there => {
+            let names: Vec<String> = there.iter().map(|candidate| candidate.to_string()).collect();
+            format!("there are: {}", names.join(", "))
+        }
+    }
+}
+
+fn busy(path: &Path, holder: Option<Holder>) -> Failure {
+    let name = path.display();
+    let (who, remedy) = match holder {
+        None => {
+            ("another process".to_owned(), format!("stop it first; sudo fuser -v {name} tells which it is"))
+        }
+        Some(holder) => {
+            let remedy = match holder.program.as_str() {
+                "ModemManager" => {
+                    "stop it first (sudo systemctl stop ModemManager), or a udev rule keeps it away: \
+                     ENV{ID_MM_DEVICE_IGNORE}=\"1\""
+                }
+                "brltty" => "stop it first: without a Braille display, sudo apt remove brltty",
+                "agetty" | "getty" => {
+                    "a login waits there: stop it first (sudo systemctl stop serial-getty@...)"
+                }
+                "systemd" => {
+                    "the service manager keeps it for a service that is to go on with it: sudo systemctl stop scanhub"
+                }
+                "gpsd" => "stop it first (sudo systemctl stop gpsd.socket gpsd)",
+                "scanhub" => "stop it first, or listen to it: scanhub list --domains",
+                _ => "stop it first",
+            };
+            (holder.to_string(), remedy.to_owned())
+        }
+    };
+    Failure::new(Kind::PortBusy, format!("{name}: in use by {who}"), remedy)
+}
+
+fn remedy_of_rate(wanted: u32) -> &'static str {
+    if wanted == 500_000 {
+        "adapters with an FT232R, FT232H or FT4232H do it exactly; a UART clocked with 1.8432 MHz cannot: baud = 38400"
+    } else {
+        "say another rate: baud = 38400, 19200 or 9600"
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_the_kernel_says_and_what_it_means() {
+        let source = Source::Tty("/dev/full".into());
+        for (refusal, kind, says) in [
+            (Errno::NOTTY.into(), Kind::PortNotTty, "name a tty, or tcp:HOST:PORT"),
+            (Errno::IO.into(), Kind::PortMissing, "no line behind it"),
+            (Errno::NXIO.into(), Kind::PortMissing, "no line behind it"),
+            (Errno::MFILE.into(), Kind::Short, "ulimit -n"),
+            (Refusal::Short(Errno::AGAIN), Kind::Short, "ulimit -u"),
+            (Errno::LOOP.into(), Kind::PortNotTty, "dmesg"),
+            (Errno::PERM.into(), Kind::PortPermission, "/dev/full"),
+            (Errno::BUSY.into(), Kind::PortBusy, "stop it first"),
+            (
+                Refusal::Rate { wanted: 500_000, given: 115_200 },
+                Kind::PortRate,
+                "/dev/full: 500000 Bd is not possible here, the driver gives 115200 Bd\n  adapters with an FT232R",
+            ),
+            (Refusal::Rate { wanted: 9600, given: 0 }, Kind::PortRate, "say another rate"),
+        ] {
+            let failure = Refusal::explain(&refusal, &source);
+            assert_eq!(failure.kind, kind, "{failure}");
+            assert!(failure.to_string().contains(says) && !failure.hint.is_empty(), "{failure}");
+        }
+    }
+
+    #[test]
+    fn what_is_called_alike_stands_first() {
+        let candidate = |name: &str, device: &str| Candidate {
+            name: name.into(),
+            device: device.into(),
+            driver: Some("ftdi_sio".to_owned()),
+            product: None,
+            holder: None,
+            is_permitted: true,
+        };
+        let there = [
+            candidate("/dev/serial/by-id/usb-FTDI-A-if00-port0", "/dev/ttyUSB1"),
+            candidate("/dev/serial/by-id/usb-Prolific-if00-port0", "/dev/ttyUSB0"),
+            candidate("/dev/ttyS0", "/dev/ttyS0"),
+        ];
+        let first = |name: &str| {
+            let hint = missing(Path::new(name), &there).hint;
+            hint.split([' ', ',']).nth(2).map(str::to_owned).unwrap_or_default()
+        };
+        assert_eq!(first("/dev/ttyUSB1"), "/dev/serial/by-id/usb-FTDI-A-if00-port0");
+        assert_eq!(first("/dev/serial/by-id/usb-Prolific-if00-port1"), there[1].name.display().to_string());
+        assert_eq!(first("/dev/ttyS1"), "/dev/ttyS0");
+        assert_eq!(missing(Path::new("/dev/x"), &[]).hint, "no serial line is plugged in");
+    }
+
+    #[test]
+    fn who_has_it_and_how_to_get_it_back() {
+        for (program, says) in [
+            ("ModemManager", "systemctl stop ModemManager"),
+            ("brltty", "apt remove brltty"),
+            ("agetty", "serial-getty"),
+            ("scanhub", "scanhub list --domains"),
+            ("systemd", "systemctl stop scanhub"),
+            ("minicom", "stop it first"),
+        ] {
+            let failure = busy(Path::new("/dev/x"), Some(Holder { pid: 7, program: program.to_owned() }));
+            assert!(failure.message.ends_with(&format!("in use by process 7 ({program})")), "{failure}");
+            assert!(failure.hint.contains(says), "{failure}");
+        }
+        assert!(busy(Path::new("/dev/x"), None).hint.contains("sudo fuser -v /dev/x"));
+    }
+}

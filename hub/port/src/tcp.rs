@@ -1,0 +1,180 @@
+//! A serial line behind a serial server on the network, as a plain stream of bytes. Its rate was set there by hand and
+//! cannot be changed from here. Looking up a name and connecting block for as long as the network likes: a thread of
+//! its own does both, and ends by itself.
+
+use std::io::{self, ErrorKind, PipeReader, PipeWriter};
+use std::net::{SocketAddr, TcpStream, ToSocketAddrs};
+use std::os::fd::{AsFd, BorrowedFd};
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::mpsc::{Receiver, Sender, channel};
+use std::thread;
+use std::time::Duration;
+
+use rustix::io::Errno;
+use rustix::net::sockopt::{
+    set_socket_keepalive, set_tcp_keepcnt, set_tcp_keepidle, set_tcp_keepintvl, set_tcp_nodelay,
+    set_tcp_user_timeout,
+};
+use schema::shortage;
+
+use super::{Port, Refusal};
+
+/// A connection to a serial server; reads and writes never block.
+pub struct Tcp {
+    stream: TcpStream,
+}
+
+impl Tcp {
+    /// Connects to `port` of `host`, and waits for the outcome, or until `stop` is set.
+    pub(crate) fn open(host: &str, port: u16, stop: &AtomicBool) -> Result<Tcp, Refusal> {
+        let dial = Dial::start(host, port)?;
+        for _ in 0..LOOKS {
+            match dial.outcome.recv_timeout(LOOK) {
+                Ok(outcome) => return outcome,
+                Err(_) if stop.load(Ordering::Relaxed) => return Err(Refusal::Interrupted),
+                Err(_) => {}
+            }
+        }
+        Err(Refusal::TimedOut)
+    }
+
+    pub(crate) fn read(&self, buffer: &mut [u8]) -> io::Result<usize> {
+        match rustix::io::read(&self.stream, buffer) {
+            Ok(0) => Err(io::Error::new(ErrorKind::UnexpectedEof, "closed by the serial server")),
+            Err(Errno::AGAIN | Errno::INTR) => Ok(0),
+            other => Ok(other?),
+        }
+    }
+
+    /// Throws away what came in.
+    pub(crate) fn forget(&self) -> io::Result<()> {
+        let mut buffer = [0; 4096];
+        // Bounded, for somebody may send as fast as this reads.
+        for _ in 0..MOST_FORGOTTEN / buffer.len() {
+            if self.read(&mut buffer)? == 0 {
+                break;
+            }
+        }
+        Ok(())
+    }
+
+    pub(crate) fn write(&self, byte: u8) -> io::Result<()> {
+        match rustix::io::write(&self.stream, &[byte]) {
+            Ok(_) | Err(Errno::AGAIN | Errno::INTR) => Ok(()),
+            Err(error) => Err(error.into()),
+        }
+    }
+
+    fn new(stream: TcpStream) -> Result<Tcp, Errno> {
+        // The bytes of a request leave one by one, as the sensor wants them.
+        set_tcp_nodelay(&stream, true)?;
+        // A server that lost its power says nothing; the socket shall notice.
+        set_socket_keepalive(&stream, true)?;
+        set_tcp_keepidle(&stream, Duration::from_secs(2))?;
+        set_tcp_keepintvl(&stream, Duration::from_secs(1))?;
+        set_tcp_keepcnt(&stream, 3)?;
+        set_tcp_user_timeout(&stream, 5_000)?;
+        rustix::io::ioctl_fionbio(&stream, true)?;
+        Ok(Tcp { stream })
+    }
+}
+
+impl AsFd for Tcp {
+    fn as_fd(&self) -> BorrowedFd<'_> {
+        self.stream.as_fd()
+    }
+}
+
+/// A connection that is being made. Its descriptor is ready when the outcome is there.
+pub struct Dial {
+    outcome: Receiver<Result<Tcp, Refusal>>,
+    /// Ready once its other end is gone.
+    bell: PipeReader,
+}
+
+impl Dial {
+    /// Begins.
+    pub(crate) fn start(host: &str, port: u16) -> Result<Dial, Refusal> {
+        let (bell, rope) = io::pipe().map_err(|error| Refusal::of_io(&error))?;
+        let (send, outcome) = channel();
+        let host = host.to_owned();
+        let body = move || tell(connect(&host, port), &send, rope);
+        // A thread is refused by AGAIN.
+        let refuse = |error: io::Error| match Refusal::of_io(&error) {
+            Refusal::Other(Errno::AGAIN) => Refusal::Short(Errno::AGAIN),
+            refusal => refusal,
+        };
+        thread::Builder::new().name("dial".to_owned()).spawn(body).map_err(refuse)?;
+        Ok(Dial { outcome, bell })
+    }
+
+    /// What came of it; a refusal if it is not over.
+    pub fn finish(self) -> Result<Port, Refusal> {
+        self.outcome.try_recv().unwrap_or(Err(Refusal::TimedOut)).map(Port::Tcp)
+    }
+}
+
+impl AsFd for Dial {
+    fn as_fd(&self) -> BorrowedFd<'_> {
+        self.bell.as_fd()
+    }
+}
+
+fn tell(outcome: Result<Tcp, Refusal>, send: &Sender<Result<Tcp, Refusal>>, rope: PipeWriter) {
+    // Whoever gave up waiting wants no outcome.
+    let _ = send.send(outcome);
+    drop(rope);
+}
+
+fn connect(host: &str, port: u16) -> Result<Tcp, Refusal> {
+    let addresses: Vec<SocketAddr> = match (host, port).to_socket_addrs() {
+        Ok(addresses) => addresses.collect(),
+        // A look-up that lacks descriptors says that there is no such host.
+        Err(_) if shortage::check_descriptors(LOOK_UP).is_err() => return Err(Refusal::Short(Errno::MFILE)),
+        Err(error) => return Err(failed(&error, Refusal::NoHost)),
+    };
+    let mut last = Refusal::NoHost("it has no address".to_owned());
+    for address in addresses {
+        match TcpStream::connect_timeout(&address, CONNECT) {
+            Ok(stream) => return Ok(Tcp::new(stream)?),
+            Err(error) if error.kind() == ErrorKind::TimedOut => last = Refusal::TimedOut,
+            Err(error) if error.kind() == ErrorKind::ConnectionRefused => last = Refusal::Refused,
+            Err(error) => last = failed(&error, Refusal::Network),
+        }
+    }
+    Err(last)
+}
+
+/// What is short here is neither the network's fault nor the server's, which `otherwise` tells of.
+fn failed(error: &io::Error, otherwise: fn(String) -> Refusal) -> Refusal {
+    match Refusal::of_io(error) {
+        short @ Refusal::Short(_) => short,
+        _ => otherwise(error.to_string()),
+    }
+}
+
+/// Descriptors that looking up a name takes at the most: a file, and a socket for each of its servers.
+const LOOK_UP: u64 = 4;
+/// A serial server in the same house answers sooner.
+const CONNECT: Duration = Duration::from_secs(3);
+/// Bytes that are thrown away at the most: more than a minute of 500 kBd.
+const MOST_FORGOTTEN: usize = 1 << 24;
+/// Between two looks whether somebody wants to stop.
+const LOOK: Duration = Duration::from_millis(100);
+/// Six seconds for name and connection together.
+const LOOKS: u32 = 60;
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_is_short_here_is_not_blamed_on_the_network() {
+        let of = |errno: Errno| failed(&errno.into(), Refusal::Network);
+        assert_eq!(of(Errno::MFILE), Refusal::Short(Errno::MFILE));
+        assert_eq!(of(Errno::NFILE), Refusal::Short(Errno::NFILE));
+        assert!(matches!(of(Errno::HOSTUNREACH), Refusal::Network(_)));
+        let unknown = io::Error::other("Name or service not known");
+        assert!(matches!(failed(&unknown, Refusal::NoHost), Refusal::NoHost(_)));
+    }
+}

@@ -1,0 +1,199 @@
+//! A serial line: opened for us alone, raw, and at a rate that the driver was seen to take.
+
+use std::cell::Cell;
+use std::io::{self, ErrorKind};
+use std::os::fd::{AsFd, BorrowedFd, OwnedFd};
+use std::os::unix::fs::MetadataExt;
+use std::path::Path;
+
+use rustix::fs::{FlockOperation, Mode, OFlags, flock, fstat, open};
+use rustix::io::Errno;
+use rustix::termios::{
+    ControlModes, InputModes, OptionalActions, QueueSelector, Termios, ioctl_tiocexcl, ioctl_tiocnxcl,
+    tcflush, tcgetattr, tcsetattr,
+};
+
+use super::Refusal;
+use super::candidates::{PROMPT_MS, is_tty, latency_ms};
+use super::kernel::{self, Counts};
+
+/// An open serial line, exclusive and raw; reads and writes never block.
+pub struct Tty {
+    line: OwnedFd,
+    /// Whether another program plays the sensor.
+    pub(crate) simulated: bool,
+    /// The driver's count of errors when it was last looked at; nothing if it has none.
+    errors: Cell<Option<u32>>,
+}
+
+impl Tty {
+    /// Opens `path` at `baud`. What lies in the line's buffer stays there: it may be what a hub that crashed did not
+    /// read.
+    pub(crate) fn open(path: &Path, baud: u32) -> Result<Tty, Refusal> {
+        path.metadata().map_err(|error| Refusal::of_io(&error))?;
+        if !is_tty(path) {
+            return Err(Refusal::NotTty);
+        }
+        let flags = OFlags::RDWR | OFlags::NOCTTY | OFlags::NONBLOCK | OFlags::CLOEXEC;
+        Tty::begin(open(path, flags, Mode::empty())?, path, baud)
+    }
+
+    /// As [`Tty::open`], of a `line` that is open already.
+    ///
+    /// [`Refusal::Missing`] if `path` names another line by now.
+    pub(crate) fn adopt(line: OwnedFd, path: &Path, baud: u32) -> Result<Tty, Refusal> {
+        if Tty::is_at(&line, path) { Tty::begin(line, path, baud) } else { Err(Refusal::Missing) }
+    }
+
+    /// Whether `path` names the `line`, which is open.
+    pub(crate) fn is_at(line: &OwnedFd, path: &Path) -> bool {
+        let open = fstat(line).map(|stat| stat.st_rdev);
+        path.metadata().is_ok_and(|now| open == Ok(now.rdev())) && is_tty(path)
+    }
+
+    fn begin(line: OwnedFd, path: &Path, baud: u32) -> Result<Tty, Refusal> {
+        let mut termios = tcgetattr(&line)?;
+        // Before the exclusive mode: who does not get the lock must not end that of its owner.
+        flock(&line, FlockOperation::NonBlockingLockExclusive).map_err(|error| match error {
+            Errno::WOULDBLOCK => Refusal::Busy,
+            error => error.into(),
+        })?;
+        ioctl_tiocexcl(&line)?;
+        let simulated = path.canonicalize().is_ok_and(|real| real.starts_with("/dev/pts"));
+        let tty = Tty { line, simulated, errors: Cell::new(None) };
+        // Not all drivers have this, and a sensor streams without it.
+        if let Err(error) = kernel::hand_over_at_once(&tty.line) {
+            tracing::debug!(%error, "{}: no low latency", path.display());
+        }
+        termios.make_raw();
+        termios.input_modes.remove(InputModes::IXOFF | InputModes::IXANY | InputModes::INPCK);
+        // 8N1 without handshake (Telegram listing 4); the modem's lines mean nothing here.
+        termios.control_modes.remove(ControlModes::CSTOPB | ControlModes::CRTSCTS);
+        termios.control_modes.insert(ControlModes::CREAD | ControlModes::CLOCAL);
+        termios.set_speed(baud)?;
+        tty.apply(&termios)?;
+        if let Some(ms) = latency_ms(path).filter(|&ms| ms > PROMPT_MS) {
+            tracing::warn!(
+                "{}: the adapter collects bytes for {ms} ms, so stamps are off by as much; a udev rule ends that: \
+                 ACTION==\"add\", SUBSYSTEM==\"usb-serial\", DRIVER==\"ftdi_sio\", ATTR{{latency_timer}}=\"1\"",
+                path.display()
+            );
+        }
+        tty.errors.set(tty.counts().map(|counts| counts.errors()));
+        Ok(tty)
+    }
+
+    /// What the driver counted since it was loaded, if it counts.
+    pub(crate) fn counts(&self) -> Option<Counts> {
+        Counts::of(&self.line).ok()
+    }
+
+    /// The rate that the driver says it has.
+    pub(crate) fn baud(&self) -> Option<u32> {
+        tcgetattr(&self.line).ok().map(|termios| termios.output_speed())
+    }
+
+    /// Errors that the driver counted since it was last asked, be it by a change of the rate.
+    pub(crate) fn line_errors(&self) -> u64 {
+        let Some(before) = self.errors.get() else { return 0 };
+        let now = self.counts().map_or(before, |counts| counts.errors());
+        self.errors.set(Some(now));
+        u64::from(now.wrapping_sub(before))
+    }
+
+    pub(crate) fn set_baud(&self, baud: u32) -> io::Result<()> {
+        let mut termios = tcgetattr(&self.line)?;
+        termios.set_speed(baud)?;
+        let applied = self.apply(&termios);
+        tcflush(&self.line, QueueSelector::IFlush)?;
+        // At a wrong rate every byte is an error.
+        self.line_errors();
+        applied.map_err(|refusal| match refusal {
+            Refusal::Rate { .. } => io::Error::new(ErrorKind::Unsupported, refusal.to_string()),
+            refusal => io::Error::other(refusal.to_string()),
+        })
+    }
+
+    /// How many bytes there are to read, if the driver tells.
+    pub(crate) fn waiting(&self) -> Option<usize> {
+        rustix::io::ioctl_fionread(&self.line).ok().map(|waiting| waiting as usize)
+    }
+
+    pub(crate) fn read(&self, buffer: &mut [u8]) -> io::Result<usize> {
+        match rustix::io::read(&self.line, buffer) {
+            Ok(0) | Err(Errno::IO) => Err(hung_up()),
+            Err(Errno::AGAIN | Errno::INTR) => Ok(0),
+            other => Ok(other?),
+        }
+    }
+
+    pub(crate) fn write(&self, byte: u8) -> io::Result<()> {
+        match rustix::io::write(&self.line, &[byte]) {
+            Err(Errno::IO) => Err(hung_up()),
+            Ok(_) | Err(Errno::AGAIN | Errno::INTR) => Ok(()),
+            Err(error) => Err(error.into()),
+        }
+    }
+
+    /// Tells the driver its settings, and looks which rate it made of the one that was wanted.
+    fn apply(&self, termios: &Termios) -> Result<(), Refusal> {
+        let told = tcsetattr(&self.line, OptionalActions::Now, termios);
+        let given = tcgetattr(&self.line)?.output_speed();
+        judge(told, given, termios.output_speed())
+    }
+}
+
+impl AsFd for Tty {
+    fn as_fd(&self) -> BorrowedFd<'_> {
+        self.line.as_fd()
+    }
+}
+
+impl Drop for Tty {
+    fn drop(&mut self) {
+        // On a pty the exclusive mode would outlive the close. One that hung up needs it no more.
+        let _ = ioctl_tiocnxcl(&self.line);
+    }
+}
+
+/// How the kernel tells that the adapter was unplugged, the pty's other side closed, or the line hung up.
+fn hung_up() -> io::Error {
+    io::Error::new(ErrorKind::UnexpectedEof, "the line hung up")
+}
+
+/// What a driver that was `told` a rate and has `given` means: some take another, some refuse what they cannot have.
+fn judge(told: Result<(), Errno>, given: u32, wanted: u32) -> Result<(), Refusal> {
+    match told {
+        Ok(()) | Err(Errno::INVAL) if !is_near(given, wanted) => Err(Refusal::Rate { wanted, given }),
+        told => Ok(told?),
+    }
+}
+
+/// Whether a UART at `given` understands one at `wanted`: in the middle of the last bit it may be half a bit off, both
+/// ends together, so 3 % is the most of one of them.
+fn is_near(given: u32, wanted: u32) -> bool {
+    u64::from(given.abs_diff(wanted)) * 100 <= u64::from(wanted) * 3
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn rates_that_are_near_enough() {
+        assert!(is_near(500_000, 500_000) && is_near(485_000, 500_000) && is_near(515_000, 500_000));
+        // What drivers make of 500 kBd that cannot do it.
+        assert!(!is_near(460_800, 500_000) && !is_near(9600, 500_000) && !is_near(0, 500_000));
+    }
+
+    #[test]
+    fn a_rate_that_is_refused_is_not_had_and_a_line_that_is_gone_is_gone() {
+        let no_rate = |given| Err(Refusal::Rate { wanted: 500_000, given });
+        assert_eq!(judge(Ok(()), 500_000, 500_000), Ok(()));
+        assert_eq!(judge(Ok(()), 460_800, 500_000), no_rate(460_800));
+        assert_eq!(judge(Err(Errno::INVAL), 38_400, 500_000), no_rate(38_400));
+        // It has the rate, and cannot have something else.
+        assert_eq!(judge(Err(Errno::INVAL), 500_000, 500_000), Err(Refusal::Other(Errno::INVAL)));
+        assert_eq!(judge(Err(Errno::IO), 38_400, 500_000), Err(Refusal::Dead));
+    }
+}

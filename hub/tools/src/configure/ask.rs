@@ -1,0 +1,53 @@
+//! Asks a person at a terminal whether a plan shall be carried out. The one place where consent is made: what no person
+//! has typed `yes` to is not written into any sensor.
+
+use std::io::{IsTerminal, Write, stderr, stdin};
+use std::sync::atomic::{AtomicBool, Ordering};
+
+use lms_configure::{Consent, Plan};
+use rustix::event::{PollFd, PollFlags, Timespec, poll};
+use rustix::termios::{QueueSelector, tcflush};
+use schema::{Failure, Kind};
+
+/// Asks for consent to `plan`, whose differences were shown.
+///
+/// [`Kind::Usage`] if stdin or stderr, which has the question, is no terminal, [`Kind::Interrupted`] if `stop` is set, [`Kind::Failed`] if the answer is
+/// not yes.
+pub(crate) fn person(plan: Plan, stop: &AtomicBool) -> Result<Consent, Failure> {
+    let input = stdin();
+    if !input.is_terminal() || !stderr().is_terminal() {
+        return Err(Failure::new(
+            Kind::Usage,
+            "nothing was written: a person has to confirm it",
+            "run the same at a terminal, with stdin and stderr not redirected",
+        ));
+    }
+    // What was typed before the question is no answer to it.
+    let _ = tcflush(&input, QueueSelector::IFlush);
+    let question = "The EEPROM wears out after a few thousand writes. Write this into it? Type yes: ";
+    let _ = stderr().write_all(question.as_bytes());
+    loop {
+        if stop.load(Ordering::Relaxed) {
+            let _ = stderr().write_all(b"\n");
+            return Err(Failure::new(Kind::Interrupted, "interrupted, nothing was written", ""));
+        }
+        // A terminal has bytes once there is a whole line.
+        let mut fds = [PollFd::new(&input, PollFlags::IN)];
+        if poll(&mut fds, Some(&LOOK)).is_ok_and(|ready| ready > 0) {
+            break;
+        }
+    }
+    let mut answer = String::new();
+    let read = input.read_line(&mut answer);
+    // An answer without an end, such as Ctrl-D, leaves the cursor behind the question.
+    if !answer.ends_with('\n') {
+        let _ = stderr().write_all(b"\n");
+    }
+    if read.is_ok() && answer.trim() == "yes" {
+        return Ok(Consent::of_a_person(plan));
+    }
+    Err(Failure::new(Kind::Failed, "not confirmed: nothing was written", "the answer that writes is: yes"))
+}
+
+/// Between two looks whether somebody interrupts.
+const LOOK: Timespec = Timespec { tv_sec: 0, tv_nsec: 100_000_000 };

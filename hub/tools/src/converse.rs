@@ -1,0 +1,73 @@
+//! Drives a conversation on an open port until it is over. What a link's thread does for ever and for consumers, this
+//! does once and for somebody who waits at a terminal.
+
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::Duration;
+
+use lms::exchange::{Conversation, Output};
+use lms::{MILLIS, Nanos};
+use port::{Port, clock};
+use rustix::event::{PollFd, PollFlags, poll};
+use schema::{Failure, Kind};
+
+/// Drives `talk` on `port`; `look` sees it whenever it waits. A rate that the port cannot have is passed over.
+///
+/// [`Kind::PortMissing`] if the port goes away, [`Kind::Interrupted`] if `stop` is set.
+pub(crate) fn converse<C: Conversation>(
+    port: &Port,
+    talk: &mut C,
+    stop: &AtomicBool,
+    mut look: impl FnMut(&C),
+) -> Result<(), Failure> {
+    while let Some(until) = drain(port, talk).map_err(|error| gone(&error))? {
+        look(talk);
+        if stop.load(Ordering::Relaxed) {
+            return Err(Failure::new(Kind::Interrupted, "interrupted", ""));
+        }
+        let now = clock::now();
+        let mut fds = [PollFd::new(port, PollFlags::IN)];
+        // An interrupted wait is a short one.
+        let _ = poll(&mut fds, Some(&clock::span(now, until.min(now + LOOK))));
+        let len = port.read(talk.spare()).map_err(|error| gone(&error))?;
+        let now = clock::now();
+        talk.commit(now, len);
+        if len == 0 && now >= until {
+            talk.handle_timeout(now);
+        }
+    }
+    Ok(())
+}
+
+/// Does what `talk` wants until it wants to wait, or is over.
+fn drain<C: Conversation>(port: &Port, talk: &mut C) -> std::io::Result<Option<Nanos>> {
+    loop {
+        match talk.poll_output() {
+            Output::SetBaud(baud) => {
+                if let Some(error) = port.try_baud(baud.rate())? {
+                    tracing::warn!("{error}");
+                }
+            }
+            Output::Transmit { byte, not_before } => {
+                let now = clock::now();
+                if not_before > now {
+                    std::thread::sleep(Duration::from_nanos(not_before - now));
+                }
+                port.write(byte)?;
+                talk.transmitted(clock::now());
+            }
+            Output::Wait { until } => return Ok(Some(until)),
+            Output::Done => return Ok(None),
+        }
+    }
+}
+
+fn gone(error: &std::io::Error) -> Failure {
+    Failure::new(
+        Kind::PortMissing,
+        format!("the port went away: {error}"),
+        "was it unplugged? plug it in and begin again",
+    )
+}
+
+/// Between two looks whether somebody wants to stop, or see how far it is.
+const LOOK: Nanos = 100 * MILLIS;

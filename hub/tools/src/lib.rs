@@ -1,0 +1,8 @@
+//! The verbs that deal with a port or with telegrams and are no hub: `probe`, `doctor`, `configure` and `telegram`. Each does
+//! its work once and ends; who waits at a terminal is told of it.
+
+pub mod configure;
+mod converse;
+pub mod doctor;
+pub mod probe;
+pub mod telegram;

@@ -1,0 +1,141 @@
+//! `scanhub probe`: what is at the other end of a port. Opens it, lets the sensor tell of itself, and leaves it as it was.
+
+mod description;
+
+use std::sync::atomic::AtomicBool;
+
+use lms::inquiry::{Inquiry, Report};
+use lms::variant::Baud;
+use port::{Candidate, Port, Source, candidates, clock};
+use schema::{Failure, Kind};
+
+use crate::converse::converse;
+pub use description::Description;
+pub(crate) use description::{hex, measuring};
+
+/// The serial lines of this machine.
+///
+/// [`Kind::PortMissing`] if there is none.
+pub fn list() -> Result<Vec<Candidate>, Failure> {
+    let found = candidates();
+    if found.is_empty() {
+        return Err(Failure::new(
+            Kind::PortMissing,
+            "no serial line on this machine",
+            "plug in an adapter for RS-422 (500 kBd) or RS-232; `dmesg` shows whether the kernel saw it",
+        ));
+    }
+    Ok(found)
+}
+
+/// Asks the sensor at `source` what it is. `look` is told the rate at which it is looked for, whenever that changes.
+///
+/// The port kinds if the port cannot be used, [`Kind::Timeout`] if nobody answers, [`Kind::Interrupted`] if `stop` is
+/// set.
+pub fn probe(source: &Source, stop: &AtomicBool, look: impl FnMut(u32)) -> Result<Description, Failure> {
+    let (port, first) = open(source, stop)?;
+    let report = ask(&port, first, source, stop, look)?;
+    Ok(Description::new(source.name(), &report))
+}
+
+/// The port that `text` names: a tty, or `tcp:HOST:PORT`.
+///
+/// [`Kind::Configuration`] if it can be none.
+pub fn source(text: &str) -> Result<Source, Failure> {
+    Source::parse(text).map_err(|what| {
+        Failure::new(
+            Kind::Configuration,
+            format!("{text}: {what}"),
+            "name a tty (scanhub probe lists them), or tcp:HOST:PORT",
+        )
+    })
+}
+
+/// Opens `source` at the greatest rate that it can have, unless `stop` is set before it is open.
+pub(crate) fn open(source: &Source, stop: &AtomicBool) -> Result<(Port, Baud), Failure> {
+    let open = |baud: Baud| Port::open(source, baud.rate(), stop).map(|port| (port, baud));
+    let (port, baud) = open(Baud::B500000).or_else(|failure| match failure.kind {
+        Kind::PortRate => open(Baud::B38400),
+        _ => Err(failure),
+    })?;
+    // What waits in its buffer may be older than the sensor's last power-on.
+    let _ = port.set_baud(baud.rate());
+    Ok((port, baud))
+}
+
+/// Asks the sensor at `port`, which is open at `first`.
+///
+/// [`Kind::Timeout`] if nobody answers; the rest as [`probe`].
+pub(crate) fn ask(
+    port: &Port,
+    first: Baud,
+    source: &Source,
+    stop: &AtomicBool,
+    mut look: impl FnMut(u32),
+) -> Result<Report, Failure> {
+    let is_server = matches!(source, Source::Tcp { .. });
+    // Which rate a serial server has the sensor tells afterwards; the slowest one waits long enough for any.
+    let now = clock::now();
+    let mut inquiry = if is_server { Inquiry::at(Baud::B9600, now) } else { Inquiry::new(first, now) };
+    let mut shown = None;
+    converse(port, &mut inquiry, stop, |inquiry| {
+        if shown != Some(inquiry.baud()) && !is_server {
+            shown = Some(inquiry.baud());
+            look(inquiry.baud().rate());
+        }
+    })?;
+    let mut report = inquiry.report().clone();
+    if is_server {
+        report.baud = report.status().and_then(|status| status.baud()).or(report.baud);
+    }
+    if report.answers() { Ok(report) } else { Err(silence(source, first, &report)) }
+}
+
+/// Why a sensor that did not answer, at a port whose greatest rate is `first`, may have been silent.
+fn silence(source: &Source, first: Baud, report: &Report) -> Failure {
+    let name = source.name();
+    let came = match report.bytes {
+        0 => "not a byte came".to_owned(),
+        bytes => format!("{bytes} bytes came, no telegram in them"),
+    };
+    let rates = match first {
+        Baud::B500000 => "9600, 19200, 38400 or 500000 Bd",
+        _ => "9600, 19200 or 38400 Bd",
+    };
+    let (what, remedy) = match (report.baud, source) {
+        (Some(_), Source::Tcp { .. }) => (
+            format!("{name}: a sensor streams and answers nothing"),
+            "it does not hear the serial server: look at the wire that goes to it",
+        ),
+        (Some(baud), _) => (
+            format!("{name}: a sensor streams at {} Bd and answers nothing", baud.rate()),
+            "it does not hear this port: look at the wire that goes to it",
+        ),
+        (None, Source::Tcp { .. }) => (
+            format!("{name}: connected, but no answer; {came}"),
+            "set the serial server to the sensor's rate, 8 bits, no parity; power, cable?",
+        ),
+        (None, _) if report.bytes == 0 => (
+            format!("{name}: no answer at {rates}; {came}"),
+            "power, cable, jumper 7-8 for RS-422? after power-on a sensor takes up to a minute",
+        ),
+        (None, _) => (
+            format!("{name}: no answer at {rates}; {came}"),
+            "another device, RS-232 against RS-422, or a wire too few?",
+        ),
+    };
+    Failure::new(Kind::Timeout, what, remedy)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn rates_that_the_port_does_not_have_were_not_tried() {
+        let report = Inquiry::new(Baud::B38400, 0).report().clone();
+        let said = |first| silence(&Source::Tty("/dev/ttyS0".into()), first, &report).message;
+        assert!(said(Baud::B500000).contains("38400 or 500000 Bd; not a byte"));
+        assert!(said(Baud::B38400).contains("no answer at 9600, 19200 or 38400 Bd; not a byte"));
+    }
+}
