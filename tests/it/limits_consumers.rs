@@ -6,7 +6,7 @@ use std::thread;
 use std::time::Duration;
 
 use crate::testkit;
-use crate::testkit::{INT, KILL, Program, TERM, TestEnv, is_class, number, sequence, until};
+use crate::testkit::{INT, KILL, Program, TERM, TestEnv, in_own_process, is_class, number, sequence, until};
 use rustix::process::Signal;
 use scanhub_client::Subscription;
 use schema::ipc::{self, Payload};
@@ -51,47 +51,55 @@ fn follow(place: &Domain, count: usize, wanted: usize) -> u64 {
 
 #[test]
 fn forty_consumers_lose_nothing() {
-    let env = TestEnv::new();
-    let hub = streaming(&env, 100);
-    let mut echo = env.echo(&["front/scan"]);
-    let place = env.place();
-    let threads: Vec<_> = (0..4)
-        .map(|_| {
-            let place = place.clone();
-            thread::spawn(move || follow(&place, 10, 40))
-        })
-        .collect();
-    let missed: Vec<_> = threads.into_iter().map(|thread| thread.join().expect("no panic")).collect();
-    assert_eq!(missed, [0; 4]);
-    echo.await_lines(10, "a scan", is_class("scan"));
-    let outcome = echo.end(INT);
-    sequence(&outcome.of_class("scan"), "topic_seq");
-    assert_eq!(env.info("front")["counters"]["loan_failed"], 0);
-    assert_eq!(hub.end(TERM).code, Some(0));
+    in_own_process("limits_consumers::forty_consumers_lose_nothing", || {
+        let env = TestEnv::new();
+        let hub = streaming(&env, 100);
+        let mut echo = env.echo(&["front/scan"]);
+        let place = env.place();
+        let threads: Vec<_> = (0..4)
+            .map(|_| {
+                let place = place.clone();
+                thread::spawn(move || follow(&place, 10, 40))
+            })
+            .collect();
+        let missed: Vec<_> = threads.into_iter().map(|thread| thread.join().expect("no panic")).collect();
+        assert_eq!(missed, [0; 4]);
+        echo.await_lines(10, "a scan", is_class("scan"));
+        let outcome = echo.end(INT);
+        sequence(&outcome.of_class("scan"), "topic_seq");
+        assert_eq!(env.info("front")["counters"]["loan_failed"], 0);
+        assert_eq!(hub.end(TERM).code, Some(0));
+    });
 }
 
 #[test]
 fn more_consumers_than_there_are_places_are_refused_with_the_limit() {
-    let env = TestEnv::new();
-    let hub = env.hub(&[env.link("front")]);
-    let node = ipc::client_node(&env.place()).expect("joins");
-    let topic = Scan::open(&node, "front").expect("works").expect("is there");
-    let subscribers: Vec<_> =
-        (0..limits::subscribers(Scan::TOPIC)).map(|_| Scan::subscriber(&topic).expect("a place")).collect();
-    assert_eq!(env.subscribers("front/scan"), 200);
-    let outcome = env.run(&["echo", "front/scan", "--json"]);
-    let error = &outcome.of_class("error")[0];
-    assert_eq!((outcome.code, &error["kind"]), (Some(75), &"short".into()), "{outcome}");
-    assert_eq!(
-        error["message"],
-        "scanhub/v1/front/scan has 200 consumers: there is no place for another one"
+    in_own_process(
+        "limits_consumers::more_consumers_than_there_are_places_are_refused_with_the_limit",
+        || {
+            let env = TestEnv::new();
+            let hub = env.hub(&[env.link("front")]);
+            let node = ipc::client_node(&env.place()).expect("joins");
+            let topic = Scan::open(&node, "front").expect("works").expect("is there");
+            let subscribers: Vec<_> = (0..limits::subscribers(Scan::TOPIC))
+                .map(|_| Scan::subscriber(&topic).expect("a place"))
+                .collect();
+            assert_eq!(env.subscribers("front/scan"), 200);
+            let outcome = env.run(&["echo", "front/scan", "--json"]);
+            let error = &outcome.of_class("error")[0];
+            assert_eq!((outcome.code, &error["kind"]), (Some(75), &"short".into()), "{outcome}");
+            assert_eq!(
+                error["message"],
+                "scanhub/v1/front/scan has 200 consumers: there is no place for another one"
+            );
+            // The other topics are not concerned.
+            assert_eq!(env.info("front")["state"], "absent");
+            drop(subscribers);
+            let late = env.echo(&["front/scan"]);
+            assert_eq!(late.end(INT).code, Some(0));
+            assert_eq!(hub.end(TERM).code, Some(0));
+        },
     );
-    // The other topics are not concerned.
-    assert_eq!(env.info("front")["state"], "absent");
-    drop(subscribers);
-    let late = env.echo(&["front/scan"]);
-    assert_eq!(late.end(INT).code, Some(0));
-    assert_eq!(hub.end(TERM).code, Some(0));
 }
 
 #[test]

@@ -10,7 +10,7 @@ use std::sync::mpsc::channel;
 use std::thread;
 use std::time::{Duration, Instant};
 
-use crate::testkit::{PATIENCE, TestEnv};
+use crate::testkit::{PATIENCE, TestEnv, in_own_process};
 use config::Sources;
 use daemon::{Play, Player, Replay};
 use rooms::{Followers, LEARNING, Published, SENSORS};
@@ -97,45 +97,53 @@ fn payloads(published: &[Published], topic: Topic) -> Vec<&[u8]> {
 
 #[test]
 fn the_same_parameters_give_the_same_bytes_and_others_give_others() {
-    let env = TestEnv::new();
-    let (file, recorded) = record(&env);
-    let replayed = replay(&env, &file, Play::default(), &[LEARNING]);
-    for ((recorded, replayed), (name, _)) in recorded.iter().zip(&replayed).zip(SENSORS) {
-        let count = |topic| [replayed, recorded].map(|published| payloads(published, topic).len());
-        for topic in [Topic::Telegram, Topic::Scan, Topic::Marks, Topic::Foreground, Topic::Background] {
-            let [replayed, recorded] = count(topic);
-            assert_eq!(replayed, recorded, "{name}/{}", topic.name());
+    in_own_process("replayed::the_same_parameters_give_the_same_bytes_and_others_give_others", || {
+        let env = TestEnv::new();
+        let (file, recorded) = record(&env);
+        let replayed = replay(&env, &file, Play::default(), &[LEARNING]);
+        for ((recorded, replayed), (name, _)) in recorded.iter().zip(&replayed).zip(SENSORS) {
+            let count = |topic| [replayed, recorded].map(|published| payloads(published, topic).len());
+            for topic in [Topic::Telegram, Topic::Scan, Topic::Marks, Topic::Foreground, Topic::Background] {
+                let [replayed, recorded] = count(topic);
+                assert_eq!(replayed, recorded, "{name}/{}", topic.name());
+            }
+            let [_, zones] = count(Topic::Zones);
+            assert_eq!(zones, SCANS as usize + 1, "one says that scans stayed out");
+            assert!(count(Topic::Background)[1] > 5, "models change");
+            assert!(said(recorded) == said(replayed), "{name} differs");
+            assert!(replayed.iter().all(|it| it.header.flags & Flags::REPLAYED != 0));
+            let walls = |published: &[Published]| -> Vec<u64> {
+                published
+                    .iter()
+                    .filter(|it| it.topic == Topic::Telegram)
+                    .map(|it| it.header.wall_ns)
+                    .collect()
+            };
+            assert_eq!(walls(recorded), walls(replayed), "{name}");
         }
-        let [_, zones] = count(Topic::Zones);
-        assert_eq!(zones, SCANS as usize + 1, "one says that scans stayed out");
-        assert!(count(Topic::Background)[1] > 5, "models change");
-        assert!(said(recorded) == said(replayed), "{name} differs");
-        assert!(replayed.iter().all(|it| it.header.flags & Flags::REPLAYED != 0));
-        let walls = |published: &[Published]| -> Vec<u64> {
-            published.iter().filter(|it| it.topic == Topic::Telegram).map(|it| it.header.wall_ns).collect()
-        };
-        assert_eq!(walls(recorded), walls(replayed), "{name}");
-    }
-    let others = replay(&env, &file, Play::default(), &[LEARNING, "zones.radii=[2.5,1.5]"]);
-    assert!(payloads(&others[0], Topic::Zones) != payloads(&recorded[0], Topic::Zones));
-    assert!(payloads(&others[0], Topic::Foreground) == payloads(&recorded[0], Topic::Foreground));
+        let others = replay(&env, &file, Play::default(), &[LEARNING, "zones.radii=[2.5,1.5]"]);
+        assert!(payloads(&others[0], Topic::Zones) != payloads(&recorded[0], Topic::Zones));
+        assert!(payloads(&others[0], Topic::Foreground) == payloads(&recorded[0], Topic::Foreground));
+    });
 }
 
 #[test]
 fn what_is_skipped_is_learned_from() {
-    let env = TestEnv::new();
-    let (file, recorded) = record(&env);
-    let play = Play { start_ns: 5_000_000_000, ..Play::default() };
-    let replayed = replay(&env, &file, play, &[LEARNING]);
-    for (recorded, replayed) in recorded.iter().zip(&replayed) {
-        for topic in [Topic::Scan, Topic::Marks, Topic::Zones, Topic::Foreground] {
-            let (all, late) = (payloads(recorded, topic), payloads(replayed, topic));
-            assert!(
-                late.len() > 100 && late.len() < 300 && all.ends_with(&late),
-                "{}: {}",
-                topic.name(),
-                late.len()
-            );
+    in_own_process("replayed::what_is_skipped_is_learned_from", || {
+        let env = TestEnv::new();
+        let (file, recorded) = record(&env);
+        let play = Play { start_ns: 5_000_000_000, ..Play::default() };
+        let replayed = replay(&env, &file, play, &[LEARNING]);
+        for (recorded, replayed) in recorded.iter().zip(&replayed) {
+            for topic in [Topic::Scan, Topic::Marks, Topic::Zones, Topic::Foreground] {
+                let (all, late) = (payloads(recorded, topic), payloads(replayed, topic));
+                assert!(
+                    late.len() > 100 && late.len() < 300 && all.ends_with(&late),
+                    "{}: {}",
+                    topic.name(),
+                    late.len()
+                );
+            }
         }
-    }
+    });
 }

@@ -31,3 +31,19 @@ pub(crate) fn run_again(name: &str, mut command: Command) {
     let status = child.wait().expect("it can be waited for");
     assert!(status.success() && passed, "{name} failed where it ran again: {status}");
 }
+
+/// Runs `test`, which is called `name`, in a process of its own: it opens descriptors that processes which other tests
+/// start would inherit, whose number counts.
+///
+/// # Panics
+///
+/// If the test fails.
+pub(crate) fn in_own_process(name: &str, test: impl FnOnce()) {
+    const INSIDE: &str = "SCANHUB_TEST_PROCESS";
+    if std::env::var_os(INSIDE).is_some_and(|inside| inside == name) {
+        return test();
+    }
+    let mut command = Command::new(own_program());
+    command.args(only(name)).env(INSIDE, name);
+    run_again(name, command);
+}

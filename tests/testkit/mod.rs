@@ -4,6 +4,7 @@
 
 mod again;
 mod findings;
+mod gentle;
 mod line;
 mod machine;
 mod network;
@@ -31,8 +32,9 @@ use std::time::{Duration, Instant};
 use schema::Domain;
 use serde_json::Value;
 
-pub(crate) use again::{only, own_program, run_again};
+pub(crate) use again::{in_own_process, only, own_program, run_again};
 pub(crate) use findings::Findings;
+pub(crate) use gentle::{compute_gently, gentle};
 pub(crate) use line::{Line, open_line};
 pub(crate) use machine::{Machine, command_in, ip};
 pub(crate) use network::in_a_network;

@@ -7,7 +7,7 @@ use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
 use std::sync::OnceLock;
 
-use crate::testkit::{TestEnv, skip};
+use crate::testkit::{TestEnv, gentle, skip};
 
 /// A place where the library and its header are.
 pub(crate) struct Installed {
@@ -71,7 +71,7 @@ impl Installed {
 
     /// The program of `source` with the library in it; nothing where pkg-config does not say how.
     pub(crate) fn compile_static(&self, env: &TestEnv, source: &Path) -> Option<PathBuf> {
-        let mut ask = self.with_packages("pkg-config");
+        let mut ask = self.with_packages(Command::new("pkg-config"));
         let Ok(said) = ask.args(["--static", "--libs-only-l", "scanhub"]).output() else {
             skip("pkg-config", "there is none, which says how the library gets into a program");
             return None;
@@ -89,9 +89,9 @@ impl Installed {
             return None;
         }
         let build = env.path("cmake");
-        let mut configure = self.with_packages("cmake");
+        let mut configure = self.with_packages(gentle("cmake"));
         configure.arg("-S").arg(source).arg("-B").arg(&build);
-        for command in [&mut configure, Command::new("cmake").arg("--build").arg(&build)] {
+        for command in [&mut configure, gentle("cmake").arg("--build").arg(&build)] {
             done(&command.output().expect("it is there")).unwrap_or_else(|said| panic!("{said}"));
         }
         Some(build)
@@ -107,7 +107,7 @@ impl Installed {
     ) -> Result<PathBuf, String> {
         let name = source.file_stem().expect("a file");
         let program = env.path(&format!("{}-{}", name.display(), flags.concat().len() + libraries.len()));
-        let mut command = Command::new(compiler);
+        let mut command = gentle(compiler);
         command.args(STRICT).args(flags).arg("-I").arg(self.prefix.join("include")).arg(source);
         command.args(libraries).arg("-o").arg(&program);
         done(&command.output().expect("a compiler")).map(|_| program)
@@ -118,8 +118,7 @@ impl Installed {
         vec![format!("-L{library}"), "-lscanhub".to_owned(), format!("-Wl,-rpath,{library}")]
     }
 
-    fn with_packages(&self, program: &str) -> Command {
-        let mut command = Command::new(program);
+    fn with_packages(&self, mut command: Command) -> Command {
         command.env("PKG_CONFIG_PATH", self.prefix.join("lib/pkgconfig"));
         command
     }

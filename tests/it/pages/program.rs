@@ -4,12 +4,13 @@
 use std::fs;
 use std::path::{Path, PathBuf};
 use std::process::Command;
+use std::sync::OnceLock;
 
 use serde_json::Value;
 
 use super::blocks::Block;
 use crate::client_c::installed::Installed;
-use crate::testkit::{TestEnv, python};
+use crate::testkit::{TestEnv, gentle, python};
 
 /// Something to start.
 pub(crate) struct Example {
@@ -88,7 +89,7 @@ fn of_cpp(source: &Path, env: &TestEnv) -> Result<Option<PathBuf>, String> {
 /// By the compiler itself, with the library that Cargo makes.
 fn of_rust(source: &Path, env: &TestEnv) -> Result<PathBuf, String> {
     let program = env.path(&format!("{}-rust", source.file_stem().expect("a name").display()));
-    let mut command = Command::new(std::env::var_os("RUSTC").unwrap_or_else(|| "rustc".into()));
+    let mut command = gentle(std::env::var_os("RUSTC").unwrap_or_else(|| "rustc".into()));
     command.args(["--edition=2024", "-Dwarnings", "-o"]).arg(&program).arg(source);
     let library = library();
     let directory = library.parent().expect("a directory");
@@ -106,8 +107,13 @@ const LIBRARY: &str = "scanhub_client";
 
 /// The one library of this project that a consumer depends on. Built alone: this test and the program, which run, are not made
 /// again.
-fn library() -> PathBuf {
-    let mut command = Command::new(env!("CARGO"));
+fn library() -> &'static Path {
+    static BUILT: OnceLock<PathBuf> = OnceLock::new();
+    BUILT.get_or_init(build_library)
+}
+
+fn build_library() -> PathBuf {
+    let mut command = gentle(env!("CARGO"));
     command.args(["build", "--offline", "--message-format=json", "--quiet", "--lib"]);
     command.arg("--package=scanhub-client");
     if !cfg!(debug_assertions) {
