@@ -8,6 +8,7 @@ mod follower;
 mod freshness;
 mod live;
 mod presence;
+mod publish;
 mod readiness;
 mod robot;
 mod sample;
@@ -20,6 +21,7 @@ mod zones;
 pub use control::request;
 pub use follower::Received;
 pub use live::{live_sensors, live_topics};
+pub use publish::{Publication, PublishSession, SensorPublisher, publish};
 pub use robot::{Robot, RobotFollower, robot};
 pub use subscribe::{Subscription, places, subscribe};
 pub use wait::Wait;
@@ -29,5 +31,5 @@ pub use zones::{Heard, ZonesFollower, zones};
 pub use schema::{
     Age, BEAMS, Background, Code, Counter, Counters, DEFAULT_DOMAIN, Domain, Environment, Failure, Flags,
     Foreground, Header, Kind, MARKS, Mark, Marks, Pose, Quality, ROBOT, Reasons, Request, SEGMENTS, Scan,
-    Segment, Shown, State, Status, Telegram, Topic, Verb, Verdict, ZONES, Zone, Zones, ipc::Payload,
+    Segment, Shown, State, Status, Telegram, Topic, Verb, Verdict, Wake, ZONES, Zone, Zones, ipc::Payload,
 };

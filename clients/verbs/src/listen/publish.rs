@@ -2,22 +2,21 @@
 //! Refuses to know the network: what it gets was checked and is new.
 
 mod arrivals;
-mod outlet;
+mod remote_publisher;
 mod topics;
 
 use std::time::{Duration, Instant};
 
+use scanhub_client::PublishSession;
 use schema::datagram::{Announce, Arrival, Head};
-use schema::ipc::{self, Node};
-use schema::shortage::{allocate, check_descriptors, check_memory, raise_descriptor_limit, sensor_bytes};
-use schema::{Domain, Failure, ListenLock, Topic};
+use schema::shortage::raise_descriptor_limit;
+use schema::{Domain, Failure, Topic};
 
 use super::remote::Remote;
 use topics::RemoteTopics;
 
 /// The publishing end of all remote sensors of a domain.
 pub(super) struct Publication {
-    domain: Domain,
     sensors: Vec<RemoteTopics>,
     /// What was not published.
     pub(super) left_out: LeftOut,
@@ -28,8 +27,7 @@ pub(super) struct Publication {
     allow_at: Instant,
     greet_at: Instant,
     upkeep_at: Instant,
-    node: Node,
-    _lock: ListenLock,
+    session: PublishSession,
 }
 
 /// Samples that came and were not published, by the reason.
@@ -54,9 +52,6 @@ pub(super) const SENSORS: usize = 16;
 /// takes until one more may be, after as many as there is room for.
 const ALLOW_EVERY: Duration = Duration::from_millis(250);
 
-/// Descriptors of a service, and of its first consumer.
-const SERVICE_DESCRIPTORS: u64 = 8;
-
 /// So often late joiners get the last status, zones and background.
 const GREET_EVERY: Duration = Duration::from_millis(100);
 
@@ -71,12 +66,8 @@ impl Publication {
     pub(super) fn open(domain: &Domain, now: Instant) -> Result<Publication, Failure> {
         // With fewer, fewer consumers can attach.
         let _ = raise_descriptor_limit();
-        let lock = ListenLock::acquire(domain.root())?;
-        check_memory(sensor_bytes(&Topic::ALL))?;
-        let node = ipc::hub_node(domain)?;
-        node.try_cleanup_dead_nodes();
+        let session = PublishSession::open(domain, &Topic::ALL)?;
         Ok(Publication {
-            domain: domain.clone(),
             sensors: Vec::new(),
             left_out: LeftOut::default(),
             displaced: 0,
@@ -84,8 +75,7 @@ impl Publication {
             allow_at: now,
             greet_at: now,
             upkeep_at: now + UPKEEP,
-            node,
-            _lock: lock,
+            session,
         })
     }
 
@@ -124,13 +114,12 @@ impl Publication {
         };
         let missing: Vec<_> = Topic::ALL.into_iter().filter(is_missing).collect();
         if at.is_none() || !missing.is_empty() {
-            check_memory(sensor_bytes(&missing))?;
-            check_descriptors((missing.len() as u64 + 1) * SERVICE_DESCRIPTORS)?;
+            self.session.check_room(&missing)?;
         }
         let at = match at {
             Some(at) => at,
             None => {
-                let mut sensor = RemoteTopics::new(&self.node, &name)?;
+                let mut sensor = RemoteTopics::new(&self.session, &name)?;
                 sensor.announced(head, announce, arrival);
                 self.sensors.push(sensor);
                 self.sensors.len() - 1
@@ -138,11 +127,9 @@ impl Publication {
         };
         if !missing.is_empty() {
             let sensor = &mut self.sensors[at];
-            let made = missing.iter().try_for_each(|&topic| sensor.add(&self.node, topic));
-            made.and_then(|()| allocate(&self.domain)).inspect_err(|_| {
-                // To write into what has no memory behind it would end the process.
-                missing.iter().for_each(|&topic| sensor.remove(topic));
-            })?;
+            // All of them or none.
+            let made = missing.iter().try_for_each(|&topic| sensor.add(topic));
+            made.inspect_err(|_| missing.iter().for_each(|&topic| sensor.remove(topic)))?;
         }
         let is_told = std::mem::replace(&mut self.sensors[at].is_told, true);
         Ok((!is_told).then_some(name))
@@ -200,7 +187,7 @@ impl Publication {
         }
         if now >= self.upkeep_at {
             self.upkeep_at = now + UPKEEP;
-            self.node.try_cleanup_dead_nodes();
+            self.session.clean_up();
         }
     }
 

@@ -3,13 +3,12 @@
 
 use std::time::{Duration, Instant};
 
-use scanhub_client::clock;
+use scanhub_client::{PublishSession, SensorPublisher, clock};
 use schema::datagram::{Announce, Arrival, Head, Standing};
-use schema::ipc::{Node, Payload, Waker};
-use schema::{Background, Failure, Foreground, Header, Marks, Scan, State, Status, Topic, Wake, Zones};
+use schema::{Failure, Header, State, Status, Topic, Wake, Zones};
 
 use super::super::remote::Remote;
-use super::outlet::Outlet;
+use super::remote_publisher::{AnyPublisher, RemotePublisher};
 
 /// One sensor of another machine.
 pub(super) struct RemoteTopics {
@@ -18,18 +17,13 @@ pub(super) struct RemoteTopics {
     /// Gateway, its life, and the sensor's number in it, as last announced.
     source: Option<(u64, u32, u8)>,
     /// Bit n: topic number n was announced last.
-    announced: u8,
+    announced: u64,
     /// What it is worth when there is no room for another.
     pub(super) standing: Standing,
     /// It has all that was announced, and that was told.
     pub(super) is_told: bool,
-    telegram: Option<Outlet<[u8]>>,
-    scan: Option<Outlet<Scan>>,
-    marks: Option<Outlet<Marks>>,
-    zones: Option<Outlet<Zones>>,
-    foreground: Option<Outlet<Foreground>>,
-    background: Option<Outlet<Background>>,
-    status: Option<Outlet<Status>>,
+    /// One for each of [`Topic::ALL`].
+    topics: [Option<AnyPublisher>; Topic::ALL.len()],
     /// The last status, and the header it came with.
     last: Option<(Status, Header)>,
     /// The header of the last zones.
@@ -37,7 +31,8 @@ pub(super) struct RemoteTopics {
     heard_at: Option<Instant>,
     /// Why consumers are to be woken.
     news: Option<Wake>,
-    waker: Waker,
+    // Behind the topics: it wakes their consumers.
+    sensor: SensorPublisher,
 }
 
 /// So long nothing comes before the sensor counts as silent: three announcements.
@@ -45,66 +40,49 @@ const SILENT_AFTER: Duration = Duration::from_secs(3);
 
 impl RemoteTopics {
     /// The sensor `name`, without topics.
-    pub(super) fn new(node: &Node, name: &str) -> Result<RemoteTopics, Failure> {
+    pub(super) fn new(session: &PublishSession, name: &str) -> Result<RemoteTopics, Failure> {
         Ok(RemoteTopics {
             name: name.to_owned(),
             source: None,
             announced: 0,
             standing: Standing::NONE,
             is_told: false,
-            telegram: None,
-            scan: None,
-            marks: None,
-            zones: None,
-            foreground: None,
-            background: None,
-            status: None,
+            topics: [const { None }; Topic::ALL.len()],
             last: None,
             zoned: None,
             heard_at: None,
             news: None,
-            waker: Waker::new(node, name)?,
+            sensor: session.sensor(name)?,
         })
     }
 
     /// It has this topic.
     pub(super) fn has(&self, topic: Topic) -> bool {
-        match topic {
-            Topic::Telegram => self.telegram.is_some(),
-            Topic::Scan => self.scan.is_some(),
-            Topic::Marks => self.marks.is_some(),
-            Topic::Zones => self.zones.is_some(),
-            Topic::Foreground => self.foreground.is_some(),
-            Topic::Background => self.background.is_some(),
-            Topic::Status => self.status.is_some(),
-        }
+        self.topics[topic as usize].is_some()
     }
 
     /// Makes `topic`, which it does not have.
-    pub(super) fn add(&mut self, node: &Node, topic: Topic) -> Result<(), Failure> {
-        let name = &self.name;
-        match topic {
-            Topic::Telegram => self.telegram = Some(Outlet::new(node, name)?),
-            Topic::Scan => self.scan = Some(Outlet::new(node, name)?),
-            Topic::Marks => self.marks = Some(Outlet::new(node, name)?),
-            Topic::Zones => self.zones = Some(Outlet::new(node, name)?),
-            Topic::Foreground => self.foreground = Some(Outlet::new(node, name)?),
-            Topic::Background => self.background = Some(Outlet::new(node, name)?),
-            Topic::Status => self.status = Some(Outlet::new(node, name)?),
-        }
+    pub(super) fn add(&mut self, topic: Topic) -> Result<(), Failure> {
+        self.topics[topic as usize] = Some(AnyPublisher::new(topic, &self.sensor)?);
         Ok(())
     }
 
     /// Takes `topic` away.
     pub(super) fn remove(&mut self, topic: Topic) {
-        match topic {
-            Topic::Telegram => self.telegram = None,
-            Topic::Scan => self.scan = None,
-            Topic::Marks => self.marks = None,
-            Topic::Zones => self.zones = None,
-            Topic::Foreground => self.foreground = None,
-            Topic::Background => self.background = None,
-            Topic::Status => self.status = None,
+        self.topics[topic as usize] = None;
+    }
+
+    fn zones(&mut self) -> Option<&mut RemotePublisher<Zones>> {
+        match &mut self.topics[Topic::Zones as usize] {
+            Some(AnyPublisher::Zones(zones)) => Some(zones),
+            _ => None,
+        }
+    }
+
+    fn status(&mut self) -> Option<&mut RemotePublisher<Status>> {
+        match &mut self.topics[Topic::Status as usize] {
+            Some(AnyPublisher::Status(status)) => Some(status),
+            _ => None,
         }
     }
 
@@ -112,7 +90,7 @@ impl RemoteTopics {
     pub(super) fn announced(&mut self, head: &Head, announce: &Announce, arrival: Arrival) {
         self.standing.take(arrival);
         self.source = Some((head.hub, head.epoch, head.sensor));
-        let numbers = announce.topics().iter().map(|announced| announced.topic).filter(|number| *number < 8);
+        let numbers = announce.topics().iter().map(|announced| announced.topic).filter(|number| *number < 64);
         self.announced = numbers.fold(0, |bits, number| bits | 1 << number);
     }
 
@@ -120,10 +98,9 @@ impl RemoteTopics {
     pub(super) fn replaced(&mut self) {
         self.source = None;
         self.heard_at = None;
-        if let (Some(mut header), Some(outlet)) = (self.zoned.take(), &mut self.zones) {
+        if let (Some(mut header), Some(zones)) = (self.zoned.take(), self.zones()) {
             stamp(&mut header);
-            header.topic_seq = outlet.own_number();
-            outlet.send(&header, |sample| *sample = Zones::unknown());
+            zones.send(&header, |sample| *sample = Zones::unknown());
             self.news = Some(Wake::Telegram);
         }
         self.silent();
@@ -149,37 +126,30 @@ impl RemoteTopics {
     pub(super) fn publish(&mut self, remote: &Remote<'_>, now: Instant) -> bool {
         self.heard_at = Some(now);
         self.standing.take(Arrival { delivers: true, now_ns: remote.arrival_ns });
-        let sent = match remote.topic {
-            Topic::Telegram => self.telegram.as_mut().map(|outlet| outlet.send_telegram(remote)),
-            Topic::Scan => self.scan.as_mut().map(|outlet| outlet.unpack(remote)),
-            Topic::Marks => self.marks.as_mut().map(|outlet| outlet.unpack(remote)),
-            Topic::Zones => {
-                self.zoned = Some(remote.header());
-                self.zones.as_mut().map(|outlet| outlet.unpack(remote))
-            }
-            Topic::Foreground => self.foreground.as_mut().map(|outlet| outlet.unpack(remote)),
-            Topic::Background => self.background.as_mut().map(|outlet| outlet.unpack(remote)),
-            Topic::Status => {
-                let Some(status) = remote.payload::<Status>() else { return true };
-                let header = self.status.as_mut().map(|outlet| outlet.header(remote));
-                header.map(|header| self.tell(status, &header))
-            }
-        };
-        if sent.is_some() {
-            let why = if remote.topic == Topic::Status { Wake::Status } else { Wake::Telegram };
-            self.news = match self.news {
-                Some(Wake::Telegram) => Some(Wake::Telegram),
-                _ => Some(why),
-            };
+        if remote.topic == Topic::Status {
+            let Some(status) = remote.payload::<Status>() else { return true };
+            let Some(header) = self.status().map(|topic| topic.header(remote)) else { return false };
+            self.tell(status, &header);
+        } else {
+            let Some(topic) = &mut self.topics[remote.topic as usize] else { return false };
+            topic.publish(remote);
         }
-        sent.is_some()
+        if remote.topic == Topic::Zones {
+            self.zoned = Some(remote.header());
+        }
+        let why = if remote.topic == Topic::Status { Wake::Status } else { Wake::Telegram };
+        self.news = match self.news {
+            Some(Wake::Telegram) => Some(Wake::Telegram),
+            _ => Some(why),
+        };
+        true
     }
 
     /// Wakes the consumers, if something was published since the last call.
     pub(super) fn wake(&mut self) {
         if let Some(why) = self.news.take() {
             // Those that cannot be woken look by themselves ten times a second.
-            let _ = self.waker.wake(why);
+            let _ = self.sensor.wake(why);
         }
     }
 
@@ -191,18 +161,14 @@ impl RemoteTopics {
             self.silent();
             self.wake();
         }
-        connect(&self.status);
-        connect(&self.zones);
-        connect(&self.background);
+        let keeps = |(topic, publisher)| Some(publisher).filter(|_| Topic::row(topic).kept > 0);
+        let kept = Topic::ALL.into_iter().zip(&self.topics).filter_map(keeps).flatten();
+        kept.for_each(AnyPublisher::connect);
     }
 
     /// Samples for which there was no memory.
     pub(super) fn loan_failed(&self) -> u64 {
-        fn of<P: Payload + ?Sized>(outlet: &Option<Outlet<P>>) -> u64 {
-            outlet.as_ref().map_or(0, |outlet| outlet.failed)
-        }
-        let of_scans = of(&self.scan) + of(&self.marks) + of(&self.zones) + of(&self.foreground);
-        of(&self.telegram) + of_scans + of(&self.background) + of(&self.status)
+        self.topics.iter().flatten().map(AnyPublisher::failed).sum()
     }
 
     /// Publishes a status as it came, but for the beginning of its state: that is on a clock of another machine. Here the
@@ -211,8 +177,8 @@ impl RemoteTopics {
         let same = self.last.filter(|(last, _)| last.state == status.state);
         status.since_ns = same.map_or(header.stamp_first_ns, |(last, _)| last.since_ns);
         self.last = Some((status, *header));
-        if let Some(outlet) = &mut self.status {
-            outlet.send(header, |sample| *sample = status);
+        if let Some(topic) = self.status() {
+            topic.send(header, |sample| *sample = status);
         }
     }
 
@@ -223,8 +189,7 @@ impl RemoteTopics {
         status.rate_mhz = 0;
         status.set_last_error("nothing comes over the network");
         stamp(&mut header);
-        if let Some(number) = self.status.as_mut().map(Outlet::own_number) {
-            header.topic_seq = number;
+        if self.has(Topic::Status) {
             self.tell(status, &header);
             self.news = self.news.or(Some(Wake::Status));
         }
@@ -235,10 +200,4 @@ impl RemoteTopics {
 fn stamp(header: &mut Header) {
     (header.stamp_first_ns, header.wall_ns) = (clock::now().monotonic_ns, clock::wall_ns());
     header.stamp_last_ns = header.stamp_first_ns;
-}
-
-fn connect<P: Payload + ?Sized>(outlet: &Option<Outlet<P>>) {
-    if let Some(outlet) = outlet {
-        outlet.connect();
-    }
 }
