@@ -12,7 +12,7 @@ use std::hint::black_box;
 use criterion::{Criterion, criterion_group, criterion_main};
 use lms::variant::{MIRROR_TURN, Unit, Variant};
 use preprocess::background::{self, Method, Model};
-use preprocess::segments::Cutter;
+use preprocess::segments::Segmenter;
 use preprocess::{marks, zones};
 use schema::{Foreground, Marks, Pose, Scan, Zones};
 use sim::room::Room;
@@ -64,7 +64,7 @@ fn check(c: &mut Criterion) {
 
 fn find(c: &mut Criterion) {
     for (name, world) in [("marks, none", "fig8"), ("marks, 12", "strips")] {
-        let mut finder = marks::Finder::new(marks::Settings::default());
+        let mut finder = marks::MarkDetector::new(marks::Settings::default());
         let mut out = Marks::default();
         bench(c, name, &scans(world, COUNT), |scan| finder.update(scan, black_box(&mut out)));
     }
@@ -78,7 +78,7 @@ fn learn(c: &mut Criterion) {
         bench(c, name, scans, |scan| model.update(scan, black_box(&mut out)));
     }
     let (mut model, scans) = model(Method::Multi, &scans);
-    let mut cutter = Cutter::new(POSE);
+    let mut cutter = Segmenter::new(POSE);
     // What stands before the background is found once, and cut again and again.
     let mut foreground = Foreground::default();
     model.update(&scans[0], &mut foreground);
@@ -94,9 +94,9 @@ fn all(c: &mut Criterion) {
     ];
     for (name, method, with_segments) in cases {
         let mut check = zones::Check::new(POSE, &zones::Settings::default());
-        let mut finder = marks::Finder::new(marks::Settings::default());
+        let mut finder = marks::MarkDetector::new(marks::Settings::default());
         let (mut model, scans) = model(method, &scans);
-        let mut cutter = Cutter::new(POSE);
+        let mut cutter = Segmenter::new(POSE);
         let (mut zones, mut marks) = (Zones::default(), Marks::default());
         let mut foreground = Foreground::default();
         bench(c, name, scans, |scan| {

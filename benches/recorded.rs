@@ -66,9 +66,9 @@ fn run(path: &Path, fallback: Mode) -> Result<Account, Box<dyn std::error::Error
     let unit = recording.contents().unit.unwrap_or(Unit::Mm);
     let mode = recording.contents().mode.unwrap_or(fallback);
     let mut zones = zones::Check::new(Pose::default(), &zones::Settings::default());
-    let mut marks = marks::Finder::new(marks::Settings::default());
+    let mut marks = marks::MarkDetector::new(marks::Settings::default());
     let mut model = background::Model::new(background::Settings::default());
-    let mut cutter = segments::Cutter::new(Pose::default());
+    let mut cutter = segments::Segmenter::new(Pose::default());
     let (mut scan, mut found, mut near) = (Scan::default(), Marks::default(), Zones::default());
     let (mut foreground, mut shown) = (Foreground::default(), Background::default());
     let mut account = Account::default();

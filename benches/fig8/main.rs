@@ -12,7 +12,7 @@ use std::process::ExitCode;
 use lms::Nanos;
 use lms::variant::{MIRROR_TURN, Unit, Variant};
 use preprocess::background::{Method, Model, Settings};
-use preprocess::segments::Cutter;
+use preprocess::segments::Segmenter;
 use schema::{Background, Foreground, Pose, Scan};
 
 use sim::room::Room;
@@ -78,7 +78,7 @@ impl Run {
     fn new(options: &Options) -> Run {
         let mut run = Run::default();
         let mut model = Model::new(Settings { method: options.method, ..Settings::default() });
-        let mut cutter = Cutter::new(Pose::default());
+        let mut cutter = Segmenter::new(Pose::default());
         let (mut foreground, mut background) = (Foreground::default(), Background::default());
         let room = Room::new(&"fig8".parse().expect("a world that the program brings along"), options.seed);
         for end_ns in (1..=SCANS).map(|number| number * SCAN_NS) {

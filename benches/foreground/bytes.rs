@@ -1,7 +1,7 @@
 //! How many bytes a second go over a network: all scans, or the foreground alone.
 
 use preprocess::background::{Model, Settings};
-use preprocess::segments::Cutter;
+use preprocess::segments::Segmenter;
 use schema::{Foreground, Pose};
 
 use super::play::Frame;
@@ -20,7 +20,7 @@ impl Bytes {
     /// Adds a run of `frames`, compared by the method of `settings`.
     pub(crate) fn add(&mut self, settings: Settings, frames: &[Frame]) {
         let mut model = Model::new(settings);
-        let mut cutter = Cutter::new(Pose::default());
+        let mut cutter = Segmenter::new(Pose::default());
         let mut out = Foreground::default();
         for frame in frames {
             model.update(&frame.scan, &mut out);

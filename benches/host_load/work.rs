@@ -13,9 +13,9 @@ use schema::{Foreground, Marks, Pose, Scan, Zones};
 /// Everything that is made of the scans of one sensor.
 pub(crate) struct Work {
     zones: zones::Check,
-    marks: marks::Finder,
+    marks: marks::MarkDetector,
     model: background::Model,
-    cutter: segments::Cutter,
+    cutter: segments::Segmenter,
     scan: Scan,
     near: Zones,
     found: Marks,
@@ -26,9 +26,9 @@ impl Work {
     pub(crate) fn new() -> Box<Work> {
         Box::new(Work {
             zones: zones::Check::new(Pose::default(), &zones::Settings::default()),
-            marks: marks::Finder::new(marks::Settings::default()),
+            marks: marks::MarkDetector::new(marks::Settings::default()),
             model: background::Model::new(background::Settings::default()),
-            cutter: segments::Cutter::new(Pose::default()),
+            cutter: segments::Segmenter::new(Pose::default()),
             scan: Scan::default(),
             near: Zones::default(),
             found: Marks::default(),

@@ -1,7 +1,7 @@
 //! Any scans and any settings, through all processors: whatever the bytes say, what comes out keeps to its own rules.
 
 use preprocess::background::{Candidate, Method, Model, Settings, Start};
-use preprocess::segments::Cutter;
+use preprocess::segments::Segmenter;
 use preprocess::{marks, zones};
 use schema::{BEAMS, Background, Foreground, Marks, Pose, Scan, Verdict, ZONES, Zones};
 
@@ -35,8 +35,11 @@ pub(super) fn processors(data: &[u8]) {
         },
     );
     let max_gap = u16::from(bytes.u8());
-    let mut finder =
-        marks::Finder::new(marks::Settings { i_min: bytes.u8(), max_range_step_mm: bytes.u16(), max_gap });
+    let mut finder = marks::MarkDetector::new(marks::Settings {
+        i_min: bytes.u8(),
+        max_range_step_mm: bytes.u16(),
+        max_gap,
+    });
     let mut model = Model::new(Settings {
         method: if is(2) { Method::Paper } else { Method::Multi },
         threshold_mm: is(3).then(|| bytes.u16()),
@@ -46,7 +49,7 @@ pub(super) fn processors(data: &[u8]) {
         start: if is(7) { Start::FirstScan } else { Start::Empty },
         no_return_is_far: Some(is(1)),
     });
-    let mut cutter = Cutter::new(pose);
+    let mut cutter = Segmenter::new(pose);
     let (mut zones, mut marks) = (Zones::unknown(), Marks::default());
     let (mut foreground, mut background) = (Foreground::default(), Background::default());
     let mut scan = Scan::default();

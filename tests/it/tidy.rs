@@ -98,7 +98,7 @@ fn no_processor_uses_another() {
     holds(crates::no_processor_uses_another, |tree| {
         let planted = |path: &str, code: &str| tree.with(path, &format!("//! So.\n{code}\n"));
         vec![
-            planted("hub/preprocess/src/zones.rs", "use crate::marks::Finder;"),
+            planted("hub/preprocess/src/zones.rs", "use crate::marks::MarkDetector;"),
             planted("hub/preprocess/src/zones/table.rs", "use crate::{background, Reading};"),
             planted("hub/preprocess/src/segments.rs", "let class = super::background::Class::Unknown;"),
         ]

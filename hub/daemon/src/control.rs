@@ -1,36 +1,36 @@
 //! Requests from outside on their way to the links: each is handed to its link's thread by a bounded queue and answered
 //! when the link has taken it. Never waits for a link; what a request does to a sensor is the session's business.
 
-mod orders;
+mod queue;
 
 use std::os::fd::{AsFd, BorrowedFd};
 use std::sync::mpsc::{Receiver, SyncSender, TrySendError, channel, sync_channel};
 use std::sync::{Arc, Mutex, PoisonError};
 
 use config::Processing;
-use schema::ipc::{self, Asked, ControlServer, Node};
+use schema::ipc::{self, Asked, Node};
 use schema::{Background, Failure, Kind, Response, Shown, Verb, shortage};
 
-use crate::bell::Bell;
-pub(crate) use orders::{Flow, Orders};
+use crate::event_fd::EventFd;
+pub(crate) use queue::{ControlQueue, Flow};
 
 /// Where requests come in; stays in the supervising thread.
-pub(crate) struct Desk {
-    server: ControlServer,
-    links: Vec<Inbox>,
+pub(crate) struct ControlServer {
+    server: ipc::ControlServer,
+    links: Vec<LinkQueue>,
     outcomes: Receiver<(u64, Outcome)>,
-    bell: Arc<Bell>,
+    event: Arc<EventFd>,
     /// Requests that a link has not taken yet, by the numbers of their orders.
     open: Vec<(u64, Asked)>,
     next: u64,
 }
 
 /// The way to a link's thread.
-struct Inbox {
+struct LinkQueue {
     sensor: String,
     queue: SyncSender<Order>,
     changed: Changed,
-    bell: Arc<Bell>,
+    event: Arc<EventFd>,
 }
 
 /// What a link shall make of its scans from now on, until it has taken it.
@@ -46,43 +46,43 @@ struct Order {
     model: Box<Background>,
 }
 
-impl Desk {
+impl ControlServer {
     /// Opens the control service, for a link of each of `sensors`; what comes for them arrives at the second value.
     ///
     /// [`Kind::Short`] if memory or descriptors are.
     pub(crate) fn open<'a>(
         node: &Node,
         sensors: impl Iterator<Item = &'a str>,
-    ) -> Result<(Desk, Vec<Orders>), Failure> {
-        let server = ControlServer::create(node)?;
-        let bell = Arc::new(Bell::new()?);
+    ) -> Result<(ControlServer, Vec<ControlQueue>), Failure> {
+        let server = ipc::ControlServer::create(node)?;
+        let event = Arc::new(EventFd::new()?);
         let (told, outcomes) = channel();
         let (mut links, mut ends) = (Vec::new(), Vec::new());
         for sensor in sensors {
             let (sender, queue) = sync_channel(QUEUE);
-            let (own, changed) = (Arc::new(Bell::new()?), Changed::default());
-            links.push(Inbox {
+            let (own, changed) = (Arc::new(EventFd::new()?), Changed::default());
+            links.push(LinkQueue {
                 sensor: sensor.to_owned(),
                 queue: sender,
                 changed: changed.clone(),
-                bell: own.clone(),
+                event: own.clone(),
             });
-            ends.push(Orders {
+            ends.push(ControlQueue {
                 sensor: sensor.to_owned(),
                 paused: false,
                 queue,
                 changed,
-                bell: own,
+                event: own,
                 outcomes: told.clone(),
-                desk: bell.clone(),
+                server: event.clone(),
             });
         }
-        Ok((Desk { server, links, outcomes, bell, open: Vec::new(), next: 0 }, ends))
+        Ok((ControlServer { server, links, outcomes, event, open: Vec::new(), next: 0 }, ends))
     }
 
     /// What becomes readable when there is something to [`serve`](Self::serve).
     pub(crate) fn descriptors(&self) -> [BorrowedFd<'_>; 2] {
-        [ipc::descriptor(self.server.requests()), self.bell.as_fd()]
+        [ipc::descriptor(self.server.requests()), self.event.as_fd()]
     }
 
     /// Lets the link of `sensor` make of its scans what `processing` says, as soon as it looks; the last word holds.
@@ -90,13 +90,13 @@ impl Desk {
         if let Some(link) = self.links.iter().find(|link| link.sensor == sensor) {
             let mut changed = link.changed.lock().unwrap_or_else(PoisonError::into_inner);
             *changed = Some(Box::new(processing.clone()));
-            link.bell.ring();
+            link.event.signal();
         }
     }
 
     /// Answers what the links have taken, and hands on what came in.
     pub(crate) fn serve(&mut self) {
-        self.bell.hush();
+        self.event.clear();
         while let Ok((number, outcome)) = self.outcomes.try_recv() {
             if let Some(at) = self.open.iter().position(|(open, _)| *open == number) {
                 let (_, asked) = self.open.swap_remove(at);
@@ -150,7 +150,7 @@ impl Desk {
                 return Err(Failure::new(Kind::Failed, format!("the link {sensor} has ended"), ""));
             }
         }
-        link.bell.ring();
+        link.event.signal();
         self.next += 1;
         Ok(self.next - 1)
     }

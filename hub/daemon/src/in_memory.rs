@@ -11,10 +11,10 @@ use port::clock;
 use rustix::event::{EventfdFlags, eventfd};
 use schema::{Domain, Failure, Flags, HubLock, State, Wake, ipc, shortage};
 
-use crate::control::Desk;
+use crate::control::ControlServer;
 use crate::link::{LinkThread, Surroundings};
 use crate::preflight;
-use crate::publish::Past;
+use crate::process_telegram::RecordedContext;
 use crate::service::Service;
 use crate::topics::Topics;
 
@@ -44,7 +44,7 @@ pub fn in_memory<T>(
     preflight::check_descriptors(config.links.len())?;
     preflight::check_memory(config.links.len())?;
     let node = ipc::hub_node(domain)?;
-    let (_desk, orders) = Desk::open(&node, config.links.iter().map(|link| link.name.as_str()))?;
+    let (_control, orders) = ControlServer::open(&node, config.links.iter().map(|link| link.name.as_str()))?;
     let stop = eventfd(0, EventfdFlags::CLOEXEC).map_err(|error| {
         let message = format!("an eventfd cannot be had: {error}");
         Failure::new(schema::Kind::Short, message, "raise `ulimit -n`")
@@ -91,7 +91,7 @@ impl DrivenLink<'_> {
             bytes = rest;
             self.session.commit(now, piece.len());
             while let Output::Telegram(received) = self.session.poll_output() {
-                let past = Past { mode: self.link.link.mode, ..Past::default() };
+                let past = RecordedContext { mode: self.link.link.mode, ..RecordedContext::default() };
                 if let Some(limit) = self.link.publish(&received, &past) {
                     self.stale_at = now.saturating_add(limit);
                 }

@@ -17,20 +17,20 @@ use port::{Source, clock};
 use rustix::event::{PollFd, PollFlags, poll};
 use schema::{Age, Background, Failure, Kind, Pose, StateDirectory};
 
-use crate::bell::Bell;
-use crate::supervise::no_resource;
+use crate::event_fd::EventFd;
+use crate::preflight::no_resource;
 use file::Learned;
 
 /// The thread that writes; ends when this is dropped, after what was handed on until then.
 pub(crate) struct Keeper {
-    desk: Arc<Desk>,
+    shared: Arc<Shared>,
     thread: Option<JoinHandle<()>>,
 }
 
-struct Desk {
+struct Shared {
     state: StateDirectory,
     slots: Vec<Slot>,
-    bell: Arc<Bell>,
+    event: Arc<EventFd>,
     is_over: AtomicBool,
 }
 
@@ -41,7 +41,7 @@ pub(crate) struct Slot {
     model: Mutex<Option<(Pose, Background)>>,
     /// 0 if none is kept.
     kept_wall_ns: AtomicU64,
-    bell: Arc<Bell>,
+    event: Arc<EventFd>,
 }
 
 /// Gives the links of `config` the models to begin with that `state` has for them, and whoever writes theirs there.
@@ -53,7 +53,7 @@ pub(crate) fn begin(
 ) -> Result<(Config, Option<Keeper>), Failure> {
     let is_live = |link: &&mut Link| !matches!(link.port, Source::File { .. });
     let Some(state) = state else { return Ok((config, None)) };
-    let bell = Arc::new(Bell::new()?);
+    let event = Arc::new(EventFd::new()?);
     let mut slots = Vec::new();
     for link in config.links.iter_mut().filter(is_live) {
         let kept_wall_ns = AtomicU64::new(recall(link, state));
@@ -61,17 +61,17 @@ pub(crate) fn begin(
             sensor: link.name.clone(),
             model: Mutex::default(),
             kept_wall_ns,
-            bell: bell.clone(),
+            event: event.clone(),
         });
     }
     if slots.is_empty() {
         return Ok((config, None));
     }
-    let desk = Arc::new(Desk { state: state.clone(), slots, bell, is_over: AtomicBool::new(false) });
-    let body = desk.clone();
+    let shared = Arc::new(Shared { state: state.clone(), slots, event, is_over: AtomicBool::new(false) });
+    let body = shared.clone();
     let thread = thread::Builder::new().name(THREAD.into()).spawn(move || body.write());
     let thread = thread.map_err(|error| no_resource("a thread", &error))?;
-    Ok((config, Some(Keeper { desk, thread: Some(thread) })))
+    Ok((config, Some(Keeper { shared, thread: Some(thread) })))
 }
 
 /// Lets `link` begin with what is kept for it, if it fits and nothing else was said; when that was written, else 0.
@@ -113,14 +113,14 @@ fn recall(link: &mut Link, state: &StateDirectory) -> u64 {
 impl Keeper {
     /// The way of the models of `sensor`.
     pub(crate) fn slot(&self, sensor: &str) -> Option<&Slot> {
-        self.desk.slots.iter().find(|slot| slot.sensor == sensor)
+        self.shared.slots.iter().find(|slot| slot.sensor == sensor)
     }
 }
 
 impl Drop for Keeper {
     fn drop(&mut self) {
-        self.desk.is_over.store(true, Ordering::Relaxed);
-        self.desk.bell.ring();
+        self.shared.is_over.store(true, Ordering::Relaxed);
+        self.shared.event.signal();
         // One that panicked has said so.
         let _ = self.thread.take().map(JoinHandle::join);
     }
@@ -130,7 +130,7 @@ impl Slot {
     /// Lets `model` be written, of a sensor that sits at `pose`. Waits for nothing but a copy of it.
     pub(crate) fn put(&self, pose: Pose, model: Background) {
         *self.model.lock().unwrap_or_else(PoisonError::into_inner) = Some((pose, model));
-        self.bell.ring();
+        self.event.signal();
     }
 
     /// When the one was written that the next hub would begin with, in nanoseconds since 1970.
@@ -155,12 +155,12 @@ struct Written {
     is_told: bool,
 }
 
-impl Desk {
+impl Shared {
     /// Writes what comes until it is over: the first model of a generation at once, later ones every [`INTERVAL`].
     fn write(&self) {
         let mut files: Vec<Written> = self.slots.iter().map(|_| Written::default()).collect();
         loop {
-            self.bell.hush();
+            self.event.clear();
             let is_over = self.is_over.load(Ordering::Relaxed);
             let now = clock::now();
             let mut until = Nanos::MAX;
@@ -184,7 +184,7 @@ impl Desk {
             }
             let span = (until != Nanos::MAX).then(|| clock::span(now, until));
             // Whatever ends the wait, it is looked what there is.
-            let _ = poll(&mut [PollFd::new(&*self.bell, PollFlags::IN)], span.as_ref());
+            let _ = poll(&mut [PollFd::new(&*self.event, PollFlags::IN)], span.as_ref());
         }
     }
 

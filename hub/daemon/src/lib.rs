@@ -1,29 +1,32 @@
 //! The hub: all the I/O there is. It owns the serial links, one thread each, and publishes what they say into shared
 //! memory; who listens is not its business.
 
-mod attend;
-mod bell;
 pub mod bus_error;
-mod complaint;
 mod control;
+mod diagnosis;
+mod event_fd;
+mod identity_cache;
 mod in_memory;
 mod last_rate;
 mod learned;
 mod link;
-mod memory;
+mod link_stats;
 mod pipeline;
+mod player;
 mod preflight;
-mod publish;
+mod process_telegram;
 mod recent;
+mod reconnect;
 mod reload;
 mod replay;
+mod replay_hub;
 mod service;
 mod signals;
-mod status;
 mod supervise;
 mod topics;
 
 pub use in_memory::{DrivenLink, in_memory};
-pub use replay::{Pace, Play, Player, Progress, Replay, replay};
+pub use player::{Pace, Play, Player, Progress};
+pub use replay_hub::{Replay, replay};
 pub use scanner;
 pub use supervise::{Ready, run};

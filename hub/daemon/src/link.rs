@@ -15,25 +15,25 @@ use port::{LineErrors, Port, Source, clock};
 use rustix::event::{PollFd, PollFlags, poll};
 use schema::{Failure, Flags, State, StateDirectory, Status, Wake};
 
-use crate::control::{Flow, Orders};
+use crate::control::{ControlQueue, Flow};
+use crate::identity_cache::IdentityCache;
 use crate::last_rate::LastRate;
 use crate::learned::Slot;
-use crate::memory::Memory;
+use crate::link_stats::LinkStats;
 use crate::pipeline::Pipeline;
-use crate::publish::Past;
-use crate::replay::{self, Cast};
+use crate::process_telegram::RecordedContext;
+use crate::replay::{self, ReplayPart};
 use crate::service::Service;
-use crate::status::Account;
 use crate::topics::Topics;
 
 /// A link with everything that belongs to its thread.
 pub(crate) struct LinkThread<'a> {
     pub(crate) link: &'a Link,
     pub(crate) topics: Topics,
-    pub(crate) account: Account,
+    pub(crate) account: LinkStats,
     pub(crate) around: Surroundings<'a>,
     /// What users ask for.
-    pub(crate) orders: Orders,
+    pub(crate) orders: ControlQueue,
     /// What is made of the scans.
     pub(crate) pipeline: Pipeline,
     /// When the last verdict of the zones is too old to stand; `Nanos::MAX` if none stands.
@@ -50,7 +50,7 @@ pub(crate) struct LinkThread<'a> {
     refused: Vec<Baud>,
     line_errors: LineErrors,
     /// What the next hub would like to know; nothing where there will be none.
-    pub(crate) memory: Option<Memory>,
+    pub(crate) memory: Option<IdentityCache>,
     /// Where the sensor was found the last time; nothing on a line whose rate cannot be changed.
     pub(crate) last_rate: Option<LastRate>,
     /// Statuses in a row that said that consumers got nothing.
@@ -100,9 +100,14 @@ pub(crate) enum Woken {
 
 impl<'a> LinkThread<'a> {
     /// The thread's values; nothing happens yet.
-    pub(crate) fn new(link: &'a Link, topics: Topics, around: Surroundings<'a>, orders: Orders) -> Self {
+    pub(crate) fn new(
+        link: &'a Link,
+        topics: Topics,
+        around: Surroundings<'a>,
+        orders: ControlQueue,
+    ) -> Self {
         let now = clock::now();
-        let account = Account::new(link, now);
+        let account = LinkStats::new(link, now);
         LinkThread {
             link,
             topics,
@@ -128,9 +133,9 @@ impl<'a> LinkThread<'a> {
         }
     }
 
-    /// Runs until the hub shall end, a recording as part of `cast` or alone. `report` is called once, when it is clear whether the link can work: an absent
+    /// Runs until the hub shall end, a recording as part of `part` or alone. `report` is called once, when it is clear whether the link can work: an absent
     /// port can, one that is busy, forbidden or no tty cannot.
-    pub(crate) fn run(mut self, cast: Option<Cast<'_>>, report: impl FnOnce(Result<(), Failure>)) {
+    pub(crate) fn run(mut self, part: Option<ReplayPart<'_>>, report: impl FnOnce(Result<(), Failure>)) {
         if let Source::File { .. } = self.link.port {
             self.topics.set_flags(Flags::REPLAYED);
         }
@@ -139,7 +144,7 @@ impl<'a> LinkThread<'a> {
         self.topics.stale(&mut self.pipeline, now);
         self.topics.background(&mut self.pipeline, now);
         match &self.link.port {
-            Source::File { path, paced } => replay::run(&mut self, cast, path, *paced, report),
+            Source::File { path, paced } => replay::run(&mut self, part, path, *paced, report),
             Source::Tty(_) | Source::Tcp { .. } => self.attend(report),
         }
         self.hand_on(true);
@@ -226,7 +231,7 @@ impl<'a> LinkThread<'a> {
                     let is_hit = self.line_errors.note(counted);
                     received.estimated |= self.is_behind;
                     received.reasons |= if is_hit { suspect::LINE_ERROR } else { 0 };
-                    self.publish(&received, &Past::default());
+                    self.publish(&received, &RecordedContext::default());
                     self.wake(Wake::Telegram);
                     published = true;
                 }

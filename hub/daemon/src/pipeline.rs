@@ -5,8 +5,8 @@ use std::fmt;
 
 use config::Processing;
 use preprocess::background::{Mismatch, Model};
-use preprocess::marks::Finder;
-use preprocess::segments::Cutter;
+use preprocess::marks::MarkDetector;
+use preprocess::segments::Segmenter;
 use preprocess::zones::Check;
 use schema::{Background, Failure, Foreground, Kind, Marks, Pose, Scan, Verb, Zones};
 
@@ -14,8 +14,8 @@ use schema::{Background, Failure, Foreground, Kind, Marks, Pose, Scan, Verb, Zon
 /// suspected, and a background needs hundreds of scans in agreement, which the one bad one among them does not spoil.
 pub(crate) struct Pipeline {
     pub(crate) zones: Check,
-    marks: Finder,
-    background: Option<Kept>,
+    marks: MarkDetector,
+    background: Option<BackgroundStage>,
     /// By which they are made.
     processing: Processing,
     /// Where a payload is written that nobody wants, or for which there is no memory.
@@ -23,9 +23,9 @@ pub(crate) struct Pipeline {
 }
 
 /// A background, and what is known of it outside.
-struct Kept {
+struct BackgroundStage {
     model: Box<Model>,
-    cutter: Cutter,
+    cutter: Segmenter,
     every_scan: bool,
     /// The generation that was published last.
     published: Option<u32>,
@@ -75,8 +75,8 @@ impl Pipeline {
         let Processing { pose, zones, marks, background } = processing;
         Pipeline {
             zones: Check::new(*pose, &zones.settings()),
-            marks: Finder::new(*marks),
-            background: background.is_kept.then(|| Kept::new(processing)),
+            marks: MarkDetector::new(*marks),
+            background: background.is_kept.then(|| BackgroundStage::new(processing)),
             processing: processing.clone(),
             spare: Spare::default(),
         }
@@ -95,16 +95,16 @@ impl Pipeline {
         if (pose, zones) != (&before.pose, &before.zones) {
             self.zones = Check::new(*pose, &zones.settings());
         }
-        self.marks = Finder::new(*marks);
+        self.marks = MarkDetector::new(*marks);
         match &mut self.background {
             Some(kept) if background.is_kept => {
-                kept.cutter = Cutter::new(*pose);
+                kept.cutter = Segmenter::new(*pose);
                 kept.every_scan = background.every_scan;
                 if background.learning != before.background.learning {
                     kept.model.change(background.learning);
                 }
             }
-            kept => *kept = background.is_kept.then(|| Kept::new(processing)),
+            kept => *kept = background.is_kept.then(|| BackgroundStage::new(processing)),
         }
     }
 
@@ -136,8 +136,8 @@ impl Pipeline {
     /// Whether there is a model, of a generation that was not published, or that has had the time since to learn what
     /// stands there.
     pub(crate) fn is_news(&self) -> bool {
-        let is_new = |kept: &Kept| kept.published != Some(kept.model.generation());
-        let has_learned = |kept: &Kept| kept.learned >= u32::from(kept.model.scans());
+        let is_new = |kept: &BackgroundStage| kept.published != Some(kept.model.generation());
+        let has_learned = |kept: &BackgroundStage| kept.learned >= u32::from(kept.model.scans());
         self.background
             .as_ref()
             .is_some_and(|kept| kept.shape.is_some() && (is_new(kept) || has_learned(kept)))
@@ -204,12 +204,12 @@ impl Pipeline {
     }
 }
 
-impl Kept {
-    fn new(processing: &Processing) -> Kept {
+impl BackgroundStage {
+    fn new(processing: &Processing) -> BackgroundStage {
         let background = &processing.background;
-        let mut kept = Kept {
+        let mut kept = BackgroundStage {
             model: Box::new(Model::new(background.learning)),
-            cutter: Cutter::new(processing.pose),
+            cutter: Segmenter::new(processing.pose),
             every_scan: background.every_scan,
             published: None,
             learned: 0,

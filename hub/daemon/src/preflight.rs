@@ -2,7 +2,7 @@
 //! segment of its own. A sparse segment that finds /dev/shm full would kill the hub later.
 
 use config::needs;
-use schema::{Failure, shortage};
+use schema::{Failure, Kind, shortage};
 
 /// Lets the process have as many descriptors as its hard limit allows.
 pub(crate) fn raise_descriptor_limit() {
@@ -26,14 +26,17 @@ pub(crate) fn check_descriptors(links: usize) -> Result<(), Failure> {
     shortage::check_descriptors(needs::descriptors(links))
 }
 
+/// `what` cannot be had now.
+pub(crate) fn no_resource(what: &str, error: &dyn std::fmt::Display) -> Failure {
+    Failure::new(Kind::Short, format!("{what} cannot be had: {error}"), "try again later")
+}
+
 /// Address space of a link's thread: its stack, its heap, and what it maps beside its segments.
 const THREAD: u64 = 4 << 20;
 
 #[cfg(test)]
 mod tests {
     use super::*;
-
-    use schema::Kind;
 
     #[test]
     fn more_links_than_memory_are_refused() {

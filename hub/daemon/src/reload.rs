@@ -5,7 +5,7 @@ use config::{Background, Config, Link, Processing};
 use port::clock;
 use schema::Failure;
 
-use crate::control::Desk;
+use crate::control::ControlServer;
 use crate::service::Service;
 
 /// How the configuration is read.
@@ -33,12 +33,12 @@ impl<'a> Reload<'a> {
         Reload { running: running.clone(), read, service }
     }
 
-    /// Reads the configuration, tells the links by `desk` what concerns them, and the log what came of it.
-    pub(crate) fn reload(&mut self, desk: &Desk) {
+    /// Reads the configuration, tells the links by `control` what concerns them, and the log what came of it.
+    pub(crate) fn reload(&mut self, control: &ControlServer) {
         self.service.reloading(clock::now());
         let refused = match (self.read)() {
             Ok(read) => {
-                self.take(read, desk);
+                self.take(read, control);
                 None
             }
             Err(failure) => {
@@ -54,14 +54,14 @@ impl<'a> Reload<'a> {
         self.service.ready(&sensors, refused.as_deref());
     }
 
-    fn take(&mut self, read: Config, desk: &Desk) {
+    fn take(&mut self, read: Config, control: &ControlServer) {
         let Differences { now, later } = Differences::between(&self.running, &read);
         if now.is_empty() && later.is_empty() {
             tracing::info!("the configuration is as it was");
         }
         for (name, processing, sections) in now {
             tracing::info!("{name}: {} as configured now", sections.join(", "));
-            desk.change(&name, &processing);
+            control.change(&name, &processing);
             if let Some(link) = self.running.links.iter_mut().find(|link| link.name == name) {
                 link.processing = processing;
             }

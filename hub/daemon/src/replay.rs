@@ -3,9 +3,6 @@
 //! nothing is asked.
 
 mod frames;
-mod hub;
-mod playback;
-mod player;
 mod recorded;
 mod stream;
 
@@ -18,32 +15,28 @@ use schema::{Failure, Flags, State, Wake};
 
 use crate::control::Flow;
 use crate::link::{LinkThread, Woken};
-use playback::{Due, Turn};
+use crate::player::{Due, Pace, Play, Player, PlayerHandle, Turn};
 
-pub use hub::{Replay, replay};
-pub use playback::Play;
-pub(crate) use player::Seat;
-pub use player::{Pace, Player, Progress};
-pub(crate) use recorded::Recorded;
+pub(crate) use recorded::{Origin, Recorded, tell_of_damage};
 
 /// What a link plays together with others.
-pub(crate) struct Cast<'a> {
+pub(crate) struct ReplayPart<'a> {
     pub(crate) recorded: Recorded,
-    pub(crate) seat: Seat<'a>,
+    pub(crate) handle: PlayerHandle<'a>,
 }
 
-/// Plays the part of `cast`, or the recording at `path` alone, into the topics of `link`; then stays silent until the
+/// Plays the part of `part`, or the recording at `path` alone, into the topics of `link`; then stays silent until the
 /// hub ends. `report` is called once, when it is clear whether it can be read.
 pub(crate) fn run(
     link: &mut LinkThread<'_>,
-    cast: Option<Cast<'_>>,
+    part: Option<ReplayPart<'_>>,
     path: &Path,
     paced: bool,
     report: impl FnOnce(Result<(), Failure>),
 ) {
-    if let Some(Cast { recorded, seat }) = cast {
+    if let Some(ReplayPart { recorded, handle }) = part {
         report(Ok(()));
-        return play(link, recorded, seat);
+        return play(link, recorded, handle);
     }
     let pace = if paced { Pace::default() } else { Pace::Max };
     let alone = || {
@@ -54,12 +47,12 @@ pub(crate) fn run(
     match alone() {
         Ok((recorded, player)) => {
             report(Ok(()));
-            let seat = Seat { player: &player, number: 0 };
-            if await_consumer(link, seat) == Woken::Stop {
+            let handle = PlayerHandle { player: &player, number: 0 };
+            if await_consumer(link, handle) == Woken::Stop {
                 return;
             }
             player.begin();
-            play(link, recorded, seat);
+            play(link, recorded, handle);
         }
         Err(failure) => report(Err(failure)),
     }
@@ -67,7 +60,7 @@ pub(crate) fn run(
 
 /// Waits a moment until somebody is attached: who starts a hub and a consumer together wants the recording from its
 /// beginning.
-fn await_consumer(link: &mut LinkThread<'_>, seat: Seat<'_>) -> Woken {
+fn await_consumer(link: &mut LinkThread<'_>, handle: PlayerHandle<'_>) -> Woken {
     let (mut until, mut is_heard) = (clock::now() + FIRST_CONSUMER, false);
     while clock::now() < until {
         if !is_heard && link.topics.is_heard() {
@@ -77,14 +70,14 @@ fn await_consumer(link: &mut LinkThread<'_>, seat: Seat<'_>) -> Woken {
         }
         link.show(None, State::Starting, "");
         let next = (clock::now() + LOOK).min(until);
-        if rest(link, seat, next) == Woken::Stop {
+        if rest(link, handle, next) == Woken::Stop {
             return Woken::Stop;
         }
     }
     Woken::Timeout
 }
 
-fn play(link: &mut LinkThread<'_>, mut recorded: Recorded, seat: Seat<'_>) {
+fn play(link: &mut LinkThread<'_>, mut recorded: Recorded, handle: PlayerHandle<'_>) {
     let mut lap = 0;
     let trouble = recorded.trouble(&link.link.name);
     if let Some(wall_ns) = recorded.begin_ns() {
@@ -92,18 +85,18 @@ fn play(link: &mut LinkThread<'_>, mut recorded: Recorded, seat: Seat<'_>) {
     }
     loop {
         let ended = match &mut recorded {
-            Recorded::Stream(stream) => stream::play(link, stream, seat, &trouble),
-            Recorded::Frames(frames) => frames::play(link, frames, seat, &trouble),
+            Recorded::Stream(stream) => stream::play(link, stream, handle, &trouble),
+            Recorded::Frames(frames) => frames::play(link, frames, handle, &trouble),
         };
         let Some(limit) = ended else { return };
         link.stale_at = limit.map_or(Nanos::MAX, |limit| clock::now() + limit);
         loop {
-            if let Turn::Anew(next) = seat.end(lap, clock::now()) {
+            if let Turn::Anew(next) = handle.end(lap, clock::now()) {
                 lap = next;
                 begin_anew(link);
                 break;
             }
-            if rest(link, seat, clock::now() + IDLE) == Woken::Stop {
+            if rest(link, handle, clock::now() + IDLE) == Woken::Stop {
                 return;
             }
             link.show(None, State::Silent, "the recording is at its end");
@@ -123,7 +116,7 @@ fn begin_anew(link: &mut LinkThread<'_>) {
 
 /// How a link waits for its turns.
 struct Turns<'a> {
-    seat: Seat<'a>,
+    handle: PlayerHandle<'a>,
     /// When it is looked, where nothing is waited for, whether somebody wants something.
     look_at: Nanos,
     /// What is wrong with the recording, in words.
@@ -131,8 +124,8 @@ struct Turns<'a> {
 }
 
 impl<'a> Turns<'a> {
-    fn new(seat: Seat<'a>, trouble: &'a str) -> Turns<'a> {
-        Turns { seat, look_at: 0, trouble }
+    fn new(handle: PlayerHandle<'a>, trouble: &'a str) -> Turns<'a> {
+        Turns { handle, look_at: 0, trouble }
     }
 
     /// Waits for the turn of what is of `media`; meanwhile the link's state is `state`. Nothing if the hub shall end.
@@ -145,20 +138,20 @@ impl<'a> Turns<'a> {
     ) -> Option<Due> {
         loop {
             let now = clock::now();
-            if self.seat.flows() && now < self.look_at {
+            if self.handle.flows() && now < self.look_at {
                 return Some(Due::at_once(now));
             }
-            let until = match self.seat.turn(media, now) {
+            let until = match self.handle.turn(media, now) {
                 Turn::Now(due) if now < self.look_at => return Some(due),
                 Turn::Now(_) => 0,
                 Turn::At(at) => at.min(now + IDLE),
                 Turn::Wait | Turn::Anew(_) | Turn::Over => now + IDLE,
             };
-            if rest(link, self.seat, until) == Woken::Stop {
+            if rest(link, self.handle, until) == Woken::Stop {
                 return None;
             }
             self.look_at = clock::now() + LOOK;
-            let state = if self.seat.is_paused() { State::Paused } else { state };
+            let state = if self.handle.is_paused() { State::Paused } else { state };
             link.show(session, state, self.trouble);
         }
     }
@@ -171,17 +164,17 @@ impl<'a> Turns<'a> {
         }
         self.look_at = now + LOOK;
         link.show(None, State::Starting, self.trouble);
-        rest(link, self.seat, 0) != Woken::Stop
+        rest(link, self.handle, 0) != Woken::Stop
     }
 }
 
 /// Waits until `until`, the hub's end, or news of the player.
-fn rest(link: &mut LinkThread<'_>, seat: Seat<'_>, until: Nanos) -> Woken {
+fn rest(link: &mut LinkThread<'_>, handle: PlayerHandle<'_>, until: Nanos) -> Woken {
     use rustix::event::PollFlags;
     use std::os::fd::AsFd;
-    match link.wait(Some((seat.bell().as_fd(), PollFlags::IN)), until) {
-        Woken::Order => link.obey(Flow::Recording(seat.player)),
-        Woken::Ready => seat.bell().hush(),
+    match link.wait(Some((handle.news().as_fd(), PollFlags::IN)), until) {
+        Woken::Order => link.obey(Flow::Recording(handle.player)),
+        Woken::Ready => handle.news().clear(),
         Woken::Stop => return Woken::Stop,
         Woken::Timeout => {}
     }

@@ -10,7 +10,7 @@ use schema::Failure;
 use signal_hook::consts::{SIGHUP, SIGINT, SIGTERM};
 use signal_hook::low_level::pipe::register;
 
-use crate::supervise::no_resource;
+use crate::preflight::no_resource;
 
 /// The signals of this process.
 pub(crate) struct Signals {

@@ -13,10 +13,12 @@ use rustix::event::{EventfdFlags, PollFd, PollFlags, Timespec, eventfd, poll};
 use schema::ipc::{self, Node};
 use schema::{Domain, Failure, HubLock, Kind, StateDirectory, shortage};
 
-use crate::control::Desk;
+use crate::control::ControlServer;
 use crate::link::{LinkThread, Surroundings};
+use crate::player::{Player, PlayerHandle};
+use crate::preflight::no_resource;
 use crate::reload::{Read, Reload};
-use crate::replay::{Cast, Player, Recorded, Seat};
+use crate::replay::{Recorded, ReplayPart};
 use crate::service::{Service, Watchdog};
 use crate::signals::{Signals, Wanted};
 use crate::topics::Topics;
@@ -32,7 +34,7 @@ pub struct Ready {
 }
 
 /// The links of a hub that plays a recording.
-pub(crate) struct Troupe<'a> {
+pub(crate) struct ReplaySet<'a> {
     pub(crate) player: &'a Player,
     /// What each link plays.
     pub(crate) parts: Vec<Recorded>,
@@ -41,23 +43,23 @@ pub(crate) struct Troupe<'a> {
 }
 
 /// The end of a hub that plays a recording.
-struct Curtain<'a> {
+struct EndOfPlayback<'a> {
     player: &'a Player,
     holds: bool,
-    falls_at: Option<Nanos>,
+    ends_at: Option<Nanos>,
 }
 
-impl Curtain<'_> {
+impl EndOfPlayback<'_> {
     /// Whether everything was played, and whoever listens had time to read it; or somebody does not want more.
-    fn has_fallen(&mut self, now: Nanos) -> bool {
-        self.player.over().hush();
+    fn has_ended(&mut self, now: Nanos) -> bool {
+        self.player.over().clear();
         if self.player.is_ended() {
             return true;
         }
-        if !self.holds && self.falls_at.is_none() && self.player.is_over() {
-            self.falls_at = Some(now + LINGER);
+        if !self.holds && self.ends_at.is_none() && self.player.is_over() {
+            self.ends_at = Some(now + LINGER);
         }
-        self.falls_at.is_some_and(|falls_at| now >= falls_at)
+        self.ends_at.is_some_and(|ends_at| now >= ends_at)
     }
 }
 
@@ -75,11 +77,11 @@ pub fn run(
     serve(read, config, None, domain, on_ready)
 }
 
-/// Runs a hub that begins with `config`; all links of it are of `troupe`, if there is one, with which it ends.
+/// Runs a hub that begins with `config`; all links of it are of `set`, if there is one, with which it ends.
 pub(crate) fn serve(
     read: Read<'_>,
     config: Config,
-    troupe: Option<Troupe<'_>>,
+    set: Option<ReplaySet<'_>>,
     domain: &Domain,
     on_ready: impl FnOnce(&Ready),
 ) -> Result<(), Failure> {
@@ -88,7 +90,7 @@ pub(crate) fn serve(
     let signals = Signals::of_process()?;
     let _lock = HubLock::acquire(domain.root())?;
     // What is known of sensors is no recording's.
-    let state = StateDirectory::of_domain(domain.name()).filter(|_| troupe.is_none());
+    let state = StateDirectory::of_domain(domain.name()).filter(|_| set.is_none());
     preflight::check_descriptors(config.links.len())?;
     preflight::check_memory(config.links.len())?;
     // Ends after the links: it writes what they had learned last.
@@ -103,10 +105,11 @@ pub(crate) fn serve(
         let owner = config.links.iter().find(|link| Port::is_at(line, &link.port));
         owner.map(|link| link.name.clone())
     });
-    let (mut desk, orders) = Desk::open(&node, config.links.iter().map(|link| link.name.as_str()))?;
+    let (mut control, orders) =
+        ControlServer::open(&node, config.links.iter().map(|link| link.name.as_str()))?;
     let stop = eventfd(0, EventfdFlags::CLOEXEC).map_err(|error| no_resource("an eventfd", &error))?;
-    let (player, parts, holds) = match troupe {
-        Some(Troupe { player, parts, holds }) => (Some(player), parts, holds),
+    let (player, parts, holds) = match set {
+        Some(ReplaySet { player, parts, holds }) => (Some(player), parts, holds),
         None => (None, Vec::new(), true),
     };
     let mut parts = parts.into_iter();
@@ -119,12 +122,12 @@ pub(crate) fn serve(
             let slot = keeper.as_ref().and_then(|keeper| keeper.slot(&link.name));
             let (root, state, worked) = (domain.root(), state.as_ref(), &worked[number]);
             let around = Surroundings { stop: &stop, service: &service, root, slot, state, worked };
-            let cast = player
+            let part = player
                 .zip(parts.next())
-                .map(|(player, recorded)| Cast { recorded, seat: Seat { player, number } });
+                .map(|(player, recorded)| ReplayPart { recorded, handle: PlayerHandle { player, number } });
             let body = move || match Topics::new(node, &link.name, number as u8, ready.boot) {
                 Ok(topics) => LinkThread::new(link, topics, around, orders)
-                    .run(cast, |outcome| drop(report.send(outcome))),
+                    .run(part, |outcome| drop(report.send(outcome))),
                 Err(failure) => drop(report.send(Err(failure))),
             };
             let thread = thread::Builder::new().name(link.name.clone()).spawn_scoped(scope, body);
@@ -148,8 +151,8 @@ pub(crate) fn serve(
             let is_alive = || threads.iter().all(|thread| !thread.is_finished());
             let watchdog = Watchdog::new(&service, &worked, clock::now());
             let reload = Reload::new(config, read, &service);
-            let curtain = player.map(|player| Curtain { player, holds, falls_at: None });
-            outcome = keep_up(&node, &signals, reload, &mut desk, watchdog, curtain, is_alive);
+            let end_of_playback = player.map(|player| EndOfPlayback { player, holds, ends_at: None });
+            outcome = keep_up(&node, &signals, reload, &mut control, watchdog, end_of_playback, is_alive);
         }
         service.stopping();
         end_links(&stop);
@@ -164,34 +167,35 @@ fn keep_up(
     node: &Node,
     signals: &Signals,
     mut reload: Reload<'_>,
-    desk: &mut Desk,
+    control: &mut ControlServer,
     mut watchdog: Option<Watchdog<'_>>,
-    mut curtain: Option<Curtain<'_>>,
+    mut end_of_playback: Option<EndOfPlayback<'_>>,
     is_alive: impl Fn() -> bool,
 ) -> Result<(), Failure> {
     let mut upkeep_at = clock::now() + UPKEEP;
     loop {
-        let ([end, hangup], [requests, outcomes]) = (signals.descriptors(), desk.descriptors());
+        let ([end, hangup], [requests, outcomes]) = (signals.descriptors(), control.descriptors());
         // Nobody rings where nothing is played.
-        let over = curtain.as_ref().map_or(end, |curtain| curtain.player.over().as_fd());
+        let over =
+            end_of_playback.as_ref().map_or(end, |end_of_playback| end_of_playback.player.over().as_fd());
         let mut fds =
             [end, hangup, requests, outcomes, over].map(|fd| PollFd::from_borrowed_fd(fd, PollFlags::IN));
-        let until = curtain.as_ref().and_then(|curtain| curtain.falls_at);
+        let until = end_of_playback.as_ref().and_then(|end_of_playback| end_of_playback.ends_at);
         let look = until.map_or(LOOK, |until| clock::span(clock::now(), until));
         // A signal ends the wait, and is there to be taken.
         let _ = poll(&mut fds, Some(&look));
         match signals.take() {
             Some(Wanted::End) => return Ok(()),
-            Some(Wanted::Reload) => reload.reload(desk),
+            Some(Wanted::Reload) => reload.reload(control),
             None => {}
         }
         // Without a wake-up too: what is behind a request that could not be received has been announced already.
-        desk.serve();
+        control.serve();
         if !is_alive() {
             return Err(broken_thread());
         }
         let now = clock::now();
-        if curtain.as_mut().is_some_and(|curtain| curtain.has_fallen(now)) {
+        if end_of_playback.as_mut().is_some_and(|end_of_playback| end_of_playback.has_ended(now)) {
             return Ok(());
         }
         watchdog.iter_mut().for_each(|watchdog| watchdog.look(now));
@@ -218,11 +222,6 @@ fn broken_thread() -> Failure {
 fn random() -> u64 {
     use std::hash::{BuildHasher, RandomState};
     RandomState::new().hash_one(std::process::id())
-}
-
-/// `what` cannot be had now.
-pub(crate) fn no_resource(what: &str, error: &dyn std::fmt::Display) -> Failure {
-    Failure::new(Kind::Short, format!("{what} cannot be had: {error}"), "try again later")
 }
 
 /// A hub that plays a recording stays for so long after its end.

@@ -1,7 +1,7 @@
 //! The topics of one link: numbers every sample, fills it in place, sends it, wakes the consumers. A sample for which
 //! there is no memory is counted and its number used up, so that consumers see the gap; nothing ever waits for one.
 
-mod outlet;
+mod publisher;
 
 use lms::session::Received;
 use port::clock;
@@ -9,17 +9,17 @@ use schema::ipc::{BytesMut, Node, Waker};
 use schema::{Background, Failure, Flags, Foreground, Header, Marks, Quality, Scan, Status, Wake, Zones};
 
 use crate::pipeline::{Anew, Outputs, Pipeline};
-use outlet::{Loan, Outlet};
+use publisher::{Loan, TopicPublisher};
 
 /// The publishing end of one sensor; stays in its link's thread.
 pub(crate) struct Topics {
-    telegram: Outlet<[u8]>,
-    scan: Outlet<Scan>,
-    zones: Outlet<Zones>,
-    marks: Outlet<Marks>,
-    foreground: Outlet<Foreground>,
-    background: Outlet<Background>,
-    status: Outlet<Status>,
+    telegram: TopicPublisher<[u8]>,
+    scan: TopicPublisher<Scan>,
+    zones: TopicPublisher<Zones>,
+    marks: TopicPublisher<Marks>,
+    foreground: TopicPublisher<Foreground>,
+    background: TopicPublisher<Background>,
+    status: TopicPublisher<Status>,
     /// Loaned while there was time, for the telegram that is coming.
     next_telegram: Option<BytesMut>,
     /// Length of the last telegram.
@@ -41,13 +41,13 @@ impl Topics {
         let waker = Waker::new(node, sensor)?;
         let header = Header { sensor: number, boot, hub_pid: std::process::id(), ..Header::default() };
         Ok(Topics {
-            telegram: Outlet::new(node, sensor)?,
-            scan: Outlet::new(node, sensor)?,
-            zones: Outlet::new(node, sensor)?,
-            marks: Outlet::new(node, sensor)?,
-            foreground: Outlet::new(node, sensor)?,
-            background: Outlet::new(node, sensor)?,
-            status: Outlet::new(node, sensor)?,
+            telegram: TopicPublisher::new(node, sensor)?,
+            scan: TopicPublisher::new(node, sensor)?,
+            zones: TopicPublisher::new(node, sensor)?,
+            marks: TopicPublisher::new(node, sensor)?,
+            foreground: TopicPublisher::new(node, sensor)?,
+            background: TopicPublisher::new(node, sensor)?,
+            status: TopicPublisher::new(node, sensor)?,
             next_telegram: None,
             last_len: 0,
             spare_scan: Box::default(),

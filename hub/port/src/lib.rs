@@ -7,7 +7,7 @@ pub mod clock;
 mod holder;
 mod kernel;
 mod line_errors;
-mod refusal;
+mod port_error;
 mod rights;
 mod source;
 mod tcp;
@@ -24,7 +24,7 @@ pub use candidates::{Candidate, PROMPT_MS, candidates, found_in, is_tty, latency
 pub use holder::{Holder, all_holders, holder};
 pub use kernel::Counts;
 pub use line_errors::LineErrors;
-pub use refusal::Refusal;
+pub use port_error::PortError;
 pub use rights::{Ownership, Rights};
 pub use source::Source;
 pub use tcp::{Dial, Tcp};
@@ -48,11 +48,11 @@ impl Port {
     }
 
     /// As [`Port::open`], for who tries again and again: the reason alone, without looking for its circumstances.
-    pub fn attempt(source: &Source, baud: u32, stop: &AtomicBool) -> Result<Port, Refusal> {
+    pub fn attempt(source: &Source, baud: u32, stop: &AtomicBool) -> Result<Port, PortError> {
         match source {
             Source::Tty(path) => Tty::open(path, baud).map(Port::Tty),
             Source::Tcp { host, port } => Tcp::open(host, *port, stop).map(Port::Tcp),
-            Source::File { .. } => Err(Refusal::Recording),
+            Source::File { .. } => Err(PortError::Recording),
         }
     }
 
@@ -79,7 +79,7 @@ impl Port {
     }
 
     /// Begins to open `source` if that takes its time; nothing if [`Port::attempt`] is over at once.
-    pub fn dial(source: &Source) -> Option<Result<Dial, Refusal>> {
+    pub fn dial(source: &Source) -> Option<Result<Dial, PortError>> {
         match source {
             Source::Tcp { host, port } => Some(Dial::start(host, *port)),
             _ => None,

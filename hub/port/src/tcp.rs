@@ -17,7 +17,7 @@ use rustix::net::sockopt::{
 };
 use schema::shortage;
 
-use super::{Port, Refusal};
+use super::{Port, PortError};
 
 /// A connection to a serial server; reads and writes never block.
 pub struct Tcp {
@@ -26,16 +26,16 @@ pub struct Tcp {
 
 impl Tcp {
     /// Connects to `port` of `host`, and waits for the outcome, or until `stop` is set.
-    pub(crate) fn open(host: &str, port: u16, stop: &AtomicBool) -> Result<Tcp, Refusal> {
+    pub(crate) fn open(host: &str, port: u16, stop: &AtomicBool) -> Result<Tcp, PortError> {
         let dial = Dial::start(host, port)?;
         for _ in 0..LOOKS {
             match dial.outcome.recv_timeout(LOOK) {
                 Ok(outcome) => return outcome,
-                Err(_) if stop.load(Ordering::Relaxed) => return Err(Refusal::Interrupted),
+                Err(_) if stop.load(Ordering::Relaxed) => return Err(PortError::Interrupted),
                 Err(_) => {}
             }
         }
-        Err(Refusal::TimedOut)
+        Err(PortError::TimedOut)
     }
 
     pub(crate) fn read(&self, buffer: &mut [u8]) -> io::Result<usize> {
@@ -87,21 +87,21 @@ impl AsFd for Tcp {
 
 /// A connection that is being made. Its descriptor is ready when the outcome is there.
 pub struct Dial {
-    outcome: Receiver<Result<Tcp, Refusal>>,
+    outcome: Receiver<Result<Tcp, PortError>>,
     /// Ready once its other end is gone.
     bell: PipeReader,
 }
 
 impl Dial {
     /// Begins.
-    pub(crate) fn start(host: &str, port: u16) -> Result<Dial, Refusal> {
-        let (bell, rope) = io::pipe().map_err(|error| Refusal::of_io(&error))?;
+    pub(crate) fn start(host: &str, port: u16) -> Result<Dial, PortError> {
+        let (bell, rope) = io::pipe().map_err(|error| PortError::of_io(&error))?;
         let (send, outcome) = channel();
         let host = host.to_owned();
         let body = move || tell(connect(&host, port), &send, rope);
         // A thread is refused by AGAIN.
-        let refuse = |error: io::Error| match Refusal::of_io(&error) {
-            Refusal::Other(Errno::AGAIN) => Refusal::Short(Errno::AGAIN),
+        let refuse = |error: io::Error| match PortError::of_io(&error) {
+            PortError::Other(Errno::AGAIN) => PortError::Short(Errno::AGAIN),
             refusal => refusal,
         };
         thread::Builder::new().name("dial".to_owned()).spawn(body).map_err(refuse)?;
@@ -109,8 +109,8 @@ impl Dial {
     }
 
     /// What came of it; a refusal if it is not over.
-    pub fn finish(self) -> Result<Port, Refusal> {
-        self.outcome.try_recv().unwrap_or(Err(Refusal::TimedOut)).map(Port::Tcp)
+    pub fn finish(self) -> Result<Port, PortError> {
+        self.outcome.try_recv().unwrap_or(Err(PortError::TimedOut)).map(Port::Tcp)
     }
 }
 
@@ -120,35 +120,37 @@ impl AsFd for Dial {
     }
 }
 
-fn tell(outcome: Result<Tcp, Refusal>, send: &Sender<Result<Tcp, Refusal>>, rope: PipeWriter) {
+fn tell(outcome: Result<Tcp, PortError>, send: &Sender<Result<Tcp, PortError>>, rope: PipeWriter) {
     // Whoever gave up waiting wants no outcome.
     let _ = send.send(outcome);
     drop(rope);
 }
 
-fn connect(host: &str, port: u16) -> Result<Tcp, Refusal> {
+fn connect(host: &str, port: u16) -> Result<Tcp, PortError> {
     let addresses: Vec<SocketAddr> = match (host, port).to_socket_addrs() {
         Ok(addresses) => addresses.collect(),
         // A look-up that lacks descriptors says that there is no such host.
-        Err(_) if shortage::check_descriptors(LOOK_UP).is_err() => return Err(Refusal::Short(Errno::MFILE)),
-        Err(error) => return Err(failed(&error, Refusal::NoHost)),
+        Err(_) if shortage::check_descriptors(LOOK_UP).is_err() => {
+            return Err(PortError::Short(Errno::MFILE));
+        }
+        Err(error) => return Err(failed(&error, PortError::NoHost)),
     };
-    let mut last = Refusal::NoHost("it has no address".to_owned());
+    let mut last = PortError::NoHost("it has no address".to_owned());
     for address in addresses {
         match TcpStream::connect_timeout(&address, CONNECT) {
             Ok(stream) => return Ok(Tcp::new(stream)?),
-            Err(error) if error.kind() == ErrorKind::TimedOut => last = Refusal::TimedOut,
-            Err(error) if error.kind() == ErrorKind::ConnectionRefused => last = Refusal::Refused,
-            Err(error) => last = failed(&error, Refusal::Network),
+            Err(error) if error.kind() == ErrorKind::TimedOut => last = PortError::TimedOut,
+            Err(error) if error.kind() == ErrorKind::ConnectionRefused => last = PortError::Refused,
+            Err(error) => last = failed(&error, PortError::Network),
         }
     }
     Err(last)
 }
 
 /// What is short here is neither the network's fault nor the server's, which `otherwise` tells of.
-fn failed(error: &io::Error, otherwise: fn(String) -> Refusal) -> Refusal {
-    match Refusal::of_io(error) {
-        short @ Refusal::Short(_) => short,
+fn failed(error: &io::Error, otherwise: fn(String) -> PortError) -> PortError {
+    match PortError::of_io(error) {
+        short @ PortError::Short(_) => short,
         _ => otherwise(error.to_string()),
     }
 }
@@ -170,11 +172,11 @@ mod tests {
 
     #[test]
     fn what_is_short_here_is_not_blamed_on_the_network() {
-        let of = |errno: Errno| failed(&errno.into(), Refusal::Network);
-        assert_eq!(of(Errno::MFILE), Refusal::Short(Errno::MFILE));
-        assert_eq!(of(Errno::NFILE), Refusal::Short(Errno::NFILE));
-        assert!(matches!(of(Errno::HOSTUNREACH), Refusal::Network(_)));
+        let of = |errno: Errno| failed(&errno.into(), PortError::Network);
+        assert_eq!(of(Errno::MFILE), PortError::Short(Errno::MFILE));
+        assert_eq!(of(Errno::NFILE), PortError::Short(Errno::NFILE));
+        assert!(matches!(of(Errno::HOSTUNREACH), PortError::Network(_)));
         let unknown = io::Error::other("Name or service not known");
-        assert!(matches!(failed(&unknown, Refusal::NoHost), Refusal::NoHost(_)));
+        assert!(matches!(failed(&unknown, PortError::NoHost), PortError::NoHost(_)));
     }
 }

@@ -13,7 +13,7 @@ use rustix::termios::{
     tcflush, tcgetattr, tcsetattr,
 };
 
-use super::Refusal;
+use super::PortError;
 use super::candidates::{PROMPT_MS, is_tty, latency_ms};
 use super::kernel::{self, Counts};
 
@@ -29,10 +29,10 @@ pub struct Tty {
 impl Tty {
     /// Opens `path` at `baud`. What lies in the line's buffer stays there: it may be what a hub that crashed did not
     /// read.
-    pub(crate) fn open(path: &Path, baud: u32) -> Result<Tty, Refusal> {
-        path.metadata().map_err(|error| Refusal::of_io(&error))?;
+    pub(crate) fn open(path: &Path, baud: u32) -> Result<Tty, PortError> {
+        path.metadata().map_err(|error| PortError::of_io(&error))?;
         if !is_tty(path) {
-            return Err(Refusal::NotTty);
+            return Err(PortError::NotTty);
         }
         let flags = OFlags::RDWR | OFlags::NOCTTY | OFlags::NONBLOCK | OFlags::CLOEXEC;
         Tty::begin(open(path, flags, Mode::empty())?, path, baud)
@@ -40,9 +40,9 @@ impl Tty {
 
     /// As [`Tty::open`], of a `line` that is open already.
     ///
-    /// [`Refusal::Missing`] if `path` names another line by now.
-    pub(crate) fn adopt(line: OwnedFd, path: &Path, baud: u32) -> Result<Tty, Refusal> {
-        if Tty::is_at(&line, path) { Tty::begin(line, path, baud) } else { Err(Refusal::Missing) }
+    /// [`PortError::Missing`] if `path` names another line by now.
+    pub(crate) fn adopt(line: OwnedFd, path: &Path, baud: u32) -> Result<Tty, PortError> {
+        if Tty::is_at(&line, path) { Tty::begin(line, path, baud) } else { Err(PortError::Missing) }
     }
 
     /// Whether `path` names the `line`, which is open.
@@ -51,11 +51,11 @@ impl Tty {
         path.metadata().is_ok_and(|now| open == Ok(now.rdev())) && is_tty(path)
     }
 
-    fn begin(line: OwnedFd, path: &Path, baud: u32) -> Result<Tty, Refusal> {
+    fn begin(line: OwnedFd, path: &Path, baud: u32) -> Result<Tty, PortError> {
         let mut termios = tcgetattr(&line)?;
         // Before the exclusive mode: who does not get the lock must not end that of its owner.
         flock(&line, FlockOperation::NonBlockingLockExclusive).map_err(|error| match error {
-            Errno::WOULDBLOCK => Refusal::Busy,
+            Errno::WOULDBLOCK => PortError::Busy,
             error => error.into(),
         })?;
         ioctl_tiocexcl(&line)?;
@@ -109,7 +109,7 @@ impl Tty {
         // At a wrong rate every byte is an error.
         self.line_errors();
         applied.map_err(|refusal| match refusal {
-            Refusal::Rate { .. } => io::Error::new(ErrorKind::Unsupported, refusal.to_string()),
+            PortError::Rate { .. } => io::Error::new(ErrorKind::Unsupported, refusal.to_string()),
             refusal => io::Error::other(refusal.to_string()),
         })
     }
@@ -136,7 +136,7 @@ impl Tty {
     }
 
     /// Tells the driver its settings, and looks which rate it made of the one that was wanted.
-    fn apply(&self, termios: &Termios) -> Result<(), Refusal> {
+    fn apply(&self, termios: &Termios) -> Result<(), PortError> {
         let told = tcsetattr(&self.line, OptionalActions::Now, termios);
         let given = tcgetattr(&self.line)?.output_speed();
         judge(told, given, termios.output_speed())
@@ -162,9 +162,9 @@ fn hung_up() -> io::Error {
 }
 
 /// What a driver that was `told` a rate and has `given` means: some take another, some refuse what they cannot have.
-fn judge(told: Result<(), Errno>, given: u32, wanted: u32) -> Result<(), Refusal> {
+fn judge(told: Result<(), Errno>, given: u32, wanted: u32) -> Result<(), PortError> {
     match told {
-        Ok(()) | Err(Errno::INVAL) if !is_near(given, wanted) => Err(Refusal::Rate { wanted, given }),
+        Ok(()) | Err(Errno::INVAL) if !is_near(given, wanted) => Err(PortError::Rate { wanted, given }),
         told => Ok(told?),
     }
 }
@@ -188,12 +188,12 @@ mod tests {
 
     #[test]
     fn a_rate_that_is_refused_is_not_had_and_a_line_that_is_gone_is_gone() {
-        let no_rate = |given| Err(Refusal::Rate { wanted: 500_000, given });
+        let no_rate = |given| Err(PortError::Rate { wanted: 500_000, given });
         assert_eq!(judge(Ok(()), 500_000, 500_000), Ok(()));
         assert_eq!(judge(Ok(()), 460_800, 500_000), no_rate(460_800));
         assert_eq!(judge(Err(Errno::INVAL), 38_400, 500_000), no_rate(38_400));
         // It has the rate, and cannot have something else.
-        assert_eq!(judge(Err(Errno::INVAL), 500_000, 500_000), Err(Refusal::Other(Errno::INVAL)));
-        assert_eq!(judge(Err(Errno::IO), 38_400, 500_000), Err(Refusal::Dead));
+        assert_eq!(judge(Err(Errno::INVAL), 500_000, 500_000), Err(PortError::Other(Errno::INVAL)));
+        assert_eq!(judge(Err(Errno::IO), 38_400, 500_000), Err(PortError::Dead));
     }
 }

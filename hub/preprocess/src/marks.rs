@@ -26,14 +26,14 @@ impl Default for Settings {
 }
 
 /// Finds the marks of one scan; nothing is kept from one to the next.
-pub struct Finder {
+pub struct MarkDetector {
     settings: Settings,
 }
 
-impl Finder {
+impl MarkDetector {
     /// A finder that goes by `settings`.
-    pub const fn new(settings: Settings) -> Finder {
-        Finder { settings }
+    pub const fn new(settings: Settings) -> MarkDetector {
+        MarkDetector { settings }
     }
 
     /// Writes the marks of `scan` into `out`, every byte of it.

@@ -7,7 +7,7 @@ use schema::{BEAMS, Foreground, Pose, Scan, Segment};
 ///
 /// Points are computed in 64-bit floating point and rounded to mm: its four basic operations and the square root are
 /// the same on every machine.
-pub struct Cutter {
+pub struct Segmenter {
     pose: Pose,
     /// First angle and step of the scans that the tables below are for.
     angles: Option<(i32, u16)>,
@@ -24,10 +24,10 @@ const FLATTEST_DEG: f64 = 10.0;
 /// Noise of two ranges, on top, in mm.
 const NOISE_MM: f64 = 15.0;
 
-impl Cutter {
+impl Segmenter {
     /// For a sensor that sits at `pose`.
-    pub fn new(pose: Pose) -> Cutter {
-        Cutter { pose, angles: None, directions: [(0.0, 0.0); BEAMS], spread: 0.0, slope: 0.0 }
+    pub fn new(pose: Pose) -> Segmenter {
+        Segmenter { pose, angles: None, directions: [(0.0, 0.0); BEAMS], spread: 0.0, slope: 0.0 }
     }
 
     /// Fills in the segments of `foreground`, which was made from `scan`, and writes every byte of them.

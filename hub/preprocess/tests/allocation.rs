@@ -9,7 +9,7 @@ use std::sync::atomic::Ordering::Relaxed;
 
 use counting::{TAKEN, WATCHED};
 use preprocess::background::{self, Method, Model};
-use preprocess::segments::Cutter;
+use preprocess::segments::Segmenter;
 use preprocess::{marks, zones};
 use rustix::thread::gettid;
 use schema::{Background, CONTENTS_UPPER, Foreground, Marks, Pose, Scan, Zones};
@@ -30,10 +30,10 @@ fn a_scan_takes_nothing_from_the_heap() {
     }
     let pose = Pose { x_m: 0.3, yaw_rad: 1.0, ..Pose::default() };
     let mut check = zones::Check::new(pose, &zones::Settings::default());
-    let mut finder = marks::Finder::new(marks::Settings::default());
+    let mut finder = marks::MarkDetector::new(marks::Settings::default());
     let mut models = [Method::Paper, Method::Multi]
         .map(|method| Model::new(background::Settings { method, scans: Some(10), ..Default::default() }));
-    let mut cutter = Cutter::new(pose);
+    let mut cutter = Segmenter::new(pose);
     let (mut zones, mut marks) = (Zones::default(), Marks::default());
     let (mut foreground, mut background) = (Foreground::default(), Background::default());
     let mut segments = 0;

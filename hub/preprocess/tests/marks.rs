@@ -3,7 +3,7 @@
 mod scans;
 
 use fastrand::Rng;
-use preprocess::marks::{Finder, Settings};
+use preprocess::marks::{MarkDetector, Settings};
 use schema::{CONTENTS_UPPER, MARKS, Mark, Marks, Scan};
 
 /// A beam that belongs to a mark: its index, range in mm and intensity.
@@ -90,7 +90,7 @@ fn marks_are_those_of_the_definition() {
         let mut scan = scans::layout(&mut random, unit_mm);
         fill(&mut random, &mut scan);
         let mut out: Marks = bytemuck::pod_read_unaligned(&[0xA5; size_of::<Marks>()]);
-        Finder::new(settings).update(&scan, &mut out);
+        MarkDetector::new(settings).update(&scan, &mut out);
         let groups = groups(&scan, settings);
         assert_eq!(usize::from(out.count), groups.len().min(MARKS), "{settings:?}");
         assert_eq!((out.is_overflow(), out.is_available()), (groups.len() > MARKS, true));
@@ -127,7 +127,7 @@ fn lit(intensities: &[(usize, u8)]) -> Scan {
 
 fn find(scan: &Scan, settings: Settings) -> Marks {
     let mut out = Marks::default();
-    Finder::new(settings).update(scan, &mut out);
+    MarkDetector::new(settings).update(scan, &mut out);
     out
 }
 

@@ -1,7 +1,7 @@
 //! What a model is made for, what is done to it by command, and what it does with scans that no sensor sends.
 
 use preprocess::background::{Class, Method, Mismatch, Model, Settings, Start};
-use preprocess::segments::Cutter;
+use preprocess::segments::Segmenter;
 use schema::{Background, Foreground, Pose, Scan};
 
 const METHODS: [Method; 2] = [Method::Paper, Method::Multi];
@@ -169,7 +169,7 @@ fn no_scan_makes_it_panic() {
                 ..Settings::default()
             };
             let mut model = Model::new(settings);
-            let mut cutter = Cutter::new(Pose { x_m: f64::NAN, y_m: f64::MAX, ..Pose::default() });
+            let mut cutter = Segmenter::new(Pose { x_m: f64::NAN, y_m: f64::MAX, ..Pose::default() });
             let mut bytes = [0_u8; size_of::<Scan>()];
             for _ in 0..40 {
                 // A sensor keeps the shape of its scans for a while, however odd it is.

@@ -1,6 +1,6 @@
 //! Segments against a slow version of them: every point by sine and cosine, every distance from two points.
 
-use preprocess::segments::Cutter;
+use preprocess::segments::Segmenter;
 use schema::{BEAMS, Foreground, Pose, SEGMENTS, Scan, Segment};
 
 /// A foreground with the beams `ranges`, in the order of the beams.
@@ -70,7 +70,7 @@ fn segments_are_those_of_the_formula() {
         most = most.max(expected.len());
 
         let mut out = foreground(&ranges);
-        Cutter::new(pose).update(&scan, &mut out);
+        Segmenter::new(pose).update(&scan, &mut out);
         assert_eq!(usize::from(out.segments), expected.len().min(SEGMENTS), "round {round}");
         assert_eq!(usize::from(out.left_out), expected.len().saturating_sub(SEGMENTS));
         assert!(out.segment_array[out.segments().len()..].iter().all(|rest| *rest == Segment::default()));
@@ -96,7 +96,7 @@ fn segments_are_those_of_the_formula() {
 
 #[test]
 fn other_angles_are_pointed_anew() {
-    let mut cutter = Cutter::new(Pose::default());
+    let mut cutter = Segmenter::new(Pose::default());
     let mut x_mm = |first_angle_mdeg, step_mdeg| {
         let scan = Scan { count: 361, unit_mm: 1, first_angle_mdeg, step_mdeg, ..Scan::default() };
         let mut out = foreground(&[(180, 1_000)]);

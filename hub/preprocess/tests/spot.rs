@@ -6,7 +6,7 @@
 //! stands squarely to its beam anywhere between 20 and 160 degrees. A constant error of a device is left out.
 
 use fastrand::Rng;
-use preprocess::marks::{Finder, Settings};
+use preprocess::marks::{MarkDetector, Settings};
 use schema::{CONTENTS_UPPER, Marks, Scan};
 
 const RANGE_SIGMA_MM: f64 = 5.0;
@@ -60,7 +60,7 @@ fn look(random: &mut Rng, width_mm: f64, range_mm: f64, angle_deg: f64) -> Scan 
 
 /// RMS of the errors of angle in degrees and range in mm.
 fn errors(width_mm: f64, range_mm: f64, random: &mut Rng) -> (f64, f64) {
-    let mut finder = Finder::new(Settings::default());
+    let mut finder = MarkDetector::new(Settings::default());
     let mut marks = Marks::default();
     let (mut of_angle, mut of_range) = (0.0, 0.0);
     for _ in 0..TRIALS {

@@ -7,7 +7,6 @@
 //! knows nothing of the hub.
 
 mod answer;
-mod ear;
 mod eeprom;
 pub mod fault;
 pub mod layers;
@@ -20,6 +19,7 @@ pub mod options;
 mod people;
 mod place;
 pub mod pty;
+mod request_decoder;
 pub mod room;
 mod scene;
 mod settings;
@@ -27,13 +27,13 @@ mod shape;
 mod simulate;
 pub mod source;
 mod spot;
-mod stage;
 mod transmission;
 pub mod truth;
 mod view;
 pub mod wire;
 pub mod world;
+mod world_view;
 
-pub use ear::{Arrival, Dropped};
+pub use request_decoder::{Arrival, Dropped};
 pub use simulate::{Ready, simulate};
 pub use transmission::ChunkSize;

@@ -7,12 +7,12 @@ use std::path::{Path, PathBuf};
 use lms::{MILLIS, Nanos};
 use schema::Failure;
 
-use crate::ear::Arrival;
 use crate::fault::Fault;
 use crate::machine::{Machine, Part};
 use crate::noise::Mistuned;
 use crate::place::Place;
 use crate::pty::{Pty, Wake, now_ns, wait};
+use crate::request_decoder::Arrival;
 use crate::truth::{Record, Summary};
 use crate::wire::{Carried, Wire};
 

@@ -12,9 +12,9 @@ use lms::variant::{Baud, MIRROR_TURN, Variant};
 use lms::{MILLIS, Nanos};
 
 use crate::answer::{After, Answer};
-use crate::ear::{Arrival, Dropped, Ear, Heard};
 use crate::eeprom::Eeprom;
 use crate::operating::{Operating, Shot};
+use crate::request_decoder::{Arrival, Dropped, Heard, RequestDecoder};
 use crate::source::Source;
 use crate::transmission::Transmission;
 
@@ -64,7 +64,7 @@ pub struct Machine {
     pub(crate) operating: Operating,
     pub(crate) variant: Variant,
     baud: Baud,
-    ear: Ear,
+    decoder: RequestDecoder,
     pub(crate) random: fastrand::Rng,
     habits: fastrand::Rng,
     queue: VecDeque<Transmission<Tag>>,
@@ -98,7 +98,7 @@ impl Machine {
             operating: Operating::OnRequest,
             variant: settings.variant,
             baud: settings.baud,
-            ear: Ear::new(settings.speed, settings.habits.strict_gap),
+            decoder: RequestDecoder::new(settings.speed, settings.habits.strict_gap),
             random: fastrand::Rng::with_seed(settings.seed),
             habits: fastrand::Rng::with_seed(!settings.seed),
             settings,
@@ -136,7 +136,7 @@ impl Machine {
 
     /// From now on it behaves like this.
     pub fn set_habits(&mut self, habits: Habits) {
-        self.ear.is_strict = habits.strict_gap;
+        self.decoder.is_strict = habits.strict_gap;
         self.settings.habits = habits;
     }
 
@@ -170,7 +170,7 @@ impl Machine {
         if arrival.not_after < self.started_ns {
             return;
         }
-        let Some(Heard { bytes, at }) = self.ear.hear(byte, arrival, self.baud.rate()) else { return };
+        let Some(Heard { bytes, at }) = self.decoder.hear(byte, arrival, self.baud.rate()) else { return };
         let is_mine = bytes[1] == 0 || bytes[1] == self.settings.address;
         if !is_mine || self.settings.habits.mute || self.chance(self.settings.habits.overlooks) {
             return;
@@ -197,7 +197,7 @@ impl Machine {
 
     /// The last request that it dropped for its gaps, told once.
     pub fn take_dropped(&mut self) -> Option<Dropped> {
-        self.ear.take_dropped()
+        self.decoder.take_dropped()
     }
 
     /// The next bytes that are through at `now`.
@@ -294,7 +294,7 @@ impl Machine {
         self.scans = 0;
         self.partials = 0;
         self.started_ns = now + self.settings.boot_ns;
-        self.ear = Ear::new(self.settings.speed, self.settings.habits.strict_gap);
+        self.decoder = RequestDecoder::new(self.settings.speed, self.settings.habits.strict_gap);
         self.send(self.banner(), self.started_ns, Tag::Reply { late: false, after: After::Nothing });
     }
 

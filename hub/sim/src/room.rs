@@ -7,9 +7,9 @@ use lms::variant::{Mode, Unit, Variant};
 use crate::layers::{self, Dice};
 use crate::look::{Look, Mark, Met};
 use crate::spot::{Echo, echo};
-use crate::stage::Stage;
 use crate::view::View;
 use crate::world::World;
+use crate::world_view::WorldView;
 
 /// A world with its furniture in place, as one sensor in it sees it.
 #[derive(Clone, Debug)]
@@ -25,7 +25,7 @@ enum Sight {
     /// Every value is this.
     Value(u16),
     Random,
-    Scene(Box<Stage>),
+    Scene(Box<WorldView>),
 }
 
 impl Room {
@@ -43,7 +43,7 @@ impl Room {
             World::Empty => Sight::Empty,
             World::Wall640 => Sight::Value(640),
             World::Random => Sight::Random,
-            World::Scene(scene) => Sight::Scene(Box::new(Stage::new(scene, seed, sensor))),
+            World::Scene(scene) => Sight::Scene(Box::new(WorldView::new(scene, seed, sensor))),
         };
         Room { seed: seed ^ sensor.wrapping_mul(0xD1B5_4A32_D192_ED03), sight }
     }
@@ -97,7 +97,7 @@ impl Room {
 
 /// What the beams at `angles_mdeg` tell of `stage`, every one after the other in the next of `turns` mirror turns.
 fn measure(
-    stage: &Stage,
+    stage: &WorldView,
     angles_mdeg: &[i32],
     turns: u64,
     unit: Unit,
@@ -123,7 +123,7 @@ fn measure(
 }
 
 /// What a beam says that got `echo`, while the sun dazzles `sun` of its like.
-fn word(stage: &Stage, echo: &Echo, sun: f64, unit: Unit, mode: Mode, dice: &Dice) -> u16 {
+fn word(stage: &WorldView, echo: &Echo, sun: f64, unit: Unit, mode: Mode, dice: &Dice) -> u16 {
     let code = |code: u16| mode.max_value() - code;
     if stage.layers.dazzles(sun, dice) {
         code(layers::DAZZLE)

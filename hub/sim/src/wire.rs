@@ -9,9 +9,9 @@ use std::collections::VecDeque;
 use lms::Nanos;
 use lms::variant::Baud;
 
-use crate::ear::Arrival;
 use crate::fault::{Blemishes, Extra, Fate, Fault, Faults, Lateness, Noise, Schedule, Window};
 use crate::machine::{Chunk, Machine, Part, Sent};
+use crate::request_decoder::Arrival;
 
 /// What arrives at once.
 #[derive(Clone, Debug, PartialEq, Eq)]

@@ -14,7 +14,7 @@ use lms_configure::{Change, Plan, Step};
 use port::{Source, clock};
 use schema::{Failure, Kind};
 
-use crate::converse::converse;
+use crate::drive::drive;
 use crate::probe::{ask, open};
 pub use difference::Difference;
 pub use outcome::Configured;
@@ -86,7 +86,7 @@ pub fn configure(order: &Order, stop: &AtomicBool, tell: &mut dyn FnMut(News<'_>
     let mut shown = None;
     // An interrupt would leave it half done; it takes seconds, and ends in any case.
     let to_the_end = AtomicBool::new(false);
-    let ended = converse(&port, &mut change, &to_the_end, |change| {
+    let ended = drive(&port, &mut change, &to_the_end, |change| {
         if shown != Some(change.step()) {
             shown = Some(change.step());
             tell(News::Doing(words(change.step())));

@@ -2,7 +2,7 @@
 //! its work once and ends; who waits at a terminal is told of it.
 
 pub mod configure;
-mod converse;
 pub mod doctor;
+mod drive;
 pub mod probe;
 pub mod telegram;

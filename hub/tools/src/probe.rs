@@ -9,7 +9,7 @@ use lms::variant::Baud;
 use port::{Candidate, Port, Source, candidates, clock};
 use schema::{Failure, Kind};
 
-use crate::converse::converse;
+use crate::drive::drive;
 pub use description::Description;
 pub(crate) use description::{hex, measuring};
 
@@ -78,7 +78,7 @@ pub(crate) fn ask(
     let now = clock::now();
     let mut inquiry = if is_server { Inquiry::at(Baud::B9600, now) } else { Inquiry::new(first, now) };
     let mut shown = None;
-    converse(port, &mut inquiry, stop, |inquiry| {
+    drive(port, &mut inquiry, stop, |inquiry| {
         if shown != Some(inquiry.baud()) && !is_server {
             shown = Some(inquiry.baud());
             look(inquiry.baud().rate());

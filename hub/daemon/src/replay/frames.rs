@@ -10,9 +10,9 @@ use recording::Frame;
 use schema::{Flags, Header, State, Wake, Zones};
 
 use super::recorded::{Frames, told};
-use super::{LONGEST_GAP, STANDS, Seat, Turns, begin_anew, period};
+use super::{LONGEST_GAP, PlayerHandle, STANDS, Turns, begin_anew, period};
 use crate::link::LinkThread;
-use crate::publish::{self, Past};
+use crate::process_telegram::{self, RecordedContext};
 
 /// What the last scan left.
 #[derive(Clone, Copy)]
@@ -29,11 +29,11 @@ struct Verdict {
 pub(super) fn play(
     link: &mut LinkThread<'_>,
     frames: &Frames,
-    seat: Seat<'_>,
+    handle: PlayerHandle<'_>,
     trouble: &str,
 ) -> Option<Option<Nanos>> {
-    let play = seat.play();
-    let mut turns = Turns::new(seat, trouble);
+    let play = handle.play();
+    let mut turns = Turns::new(handle, trouble);
     let mut telegrams = match frames.read() {
         Ok(telegrams) => telegrams.peekable(),
         Err(failure) => {
@@ -102,7 +102,7 @@ pub(super) fn play(
             limit = link.publish(&received, &past(&frame, mode, gap, due.stretch)).or(limit);
             link.stale_at = STANDS;
             link.wake(Wake::Telegram);
-            seat.played(media);
+            handle.played(media);
             state = State::Streaming;
             link.show(None, state, trouble);
         }
@@ -117,8 +117,8 @@ pub(super) fn play(
     Some(limit)
 }
 
-fn past(frame: &Frame, mode: Option<Mode>, gap: Option<Nanos>, stretch: f64) -> Past {
-    Past {
+fn past(frame: &Frame, mode: Option<Mode>, gap: Option<Nanos>, stretch: f64) -> RecordedContext {
+    RecordedContext {
         mode,
         wall_ns: frame.wall_ns,
         period_us: frame.header.map(|header| header.period_us),
@@ -140,7 +140,7 @@ fn gap(frame: &Frame, next: &Frame) -> Option<Nanos> {
 /// For how long the verdict on the scan of `header`, at `media`, stood in the hub that recorded it.
 fn stands(header: &Header, media: Nanos) -> Verdict {
     let published = header.stamp_last_ns.saturating_add(header.hub_time_ns().unwrap_or(0));
-    let until_ns = published.saturating_add(publish::limit(header.period_us));
+    let until_ns = published.saturating_add(process_telegram::limit(header.period_us));
     let after = until_ns.saturating_sub(header.stamp_first_ns);
     Verdict { of: media, until_ns, until: media.saturating_add(after) }
 }

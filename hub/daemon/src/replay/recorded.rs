@@ -272,7 +272,7 @@ fn tell_of_mode(recording: &Recording, link: &Link) {
 }
 
 /// What is missing of it, if anything is.
-pub(super) fn tell_of_damage(recording: &Recording) {
+pub(crate) fn tell_of_damage(recording: &Recording) {
     let damage = recording.contents().damage;
     if !damage.is_none() {
         tracing::warn!("{}: missing: {damage}", recording.path().display());

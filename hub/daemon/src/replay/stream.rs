@@ -9,20 +9,20 @@ use port::clock;
 use schema::State;
 
 use super::recorded::{Stream, read};
-use super::{STANDS, Seat, Turns};
+use super::{PlayerHandle, STANDS, Turns};
 use crate::link::LinkThread;
-use crate::publish::Past;
+use crate::process_telegram::RecordedContext;
 
 /// Plays `stream` into the topics of `link`. At the end, for how long the last verdict stands; nothing if the hub shall
 /// end.
 pub(super) fn play(
     link: &mut LinkThread<'_>,
     stream: &Stream,
-    seat: Seat<'_>,
+    handle: PlayerHandle<'_>,
     trouble: &str,
 ) -> Option<Option<Nanos>> {
-    let play = seat.play();
-    let mut turns = Turns::new(seat, trouble);
+    let play = handle.play();
+    let mut turns = Turns::new(handle, trouble);
     let mut bytes = match stream.bytes() {
         Ok(bytes) => bytes,
         Err(failure) => {
@@ -31,7 +31,7 @@ pub(super) fn play(
         }
     };
     let mut session = Session::new(link.settings(true), clock::now());
-    let mut past = Past { mode: stream.mode, ..Past::default() };
+    let mut past = RecordedContext { mode: stream.mode, ..RecordedContext::default() };
     let (mut media, mut limit) = (0, None);
     let state = if stream.has_telegrams() { State::Streaming } else { State::Probing };
     loop {
@@ -63,7 +63,7 @@ pub(super) fn play(
                 limit = link.publish(&received, &past).or(limit);
                 link.stale_at = STANDS;
                 link.wake(schema::Wake::Telegram);
-                seat.played(media);
+                handle.played(media);
             }
             if telegram.command() == MEASURED {
                 let variant = Measured::decode(telegram).and_then(|it| Variant::of_beams(it.count()));

@@ -5,7 +5,7 @@ use std::path::Path;
 use std::sync::atomic::AtomicBool;
 
 use lms::variant::Baud;
-use port::{Candidate, Holder, PROMPT_MS, Port, Refusal, Rights, Source, all_holders, is_tty, latency_ms};
+use port::{Candidate, Holder, PROMPT_MS, Port, PortError, Rights, Source, all_holders, is_tty, latency_ms};
 use schema::{Failure, Kind};
 
 use super::Subject;
@@ -39,7 +39,7 @@ pub(crate) fn examine(
         return Ok(());
     }
     if path.exists() && !is_tty(path) {
-        tell(refused(Refusal::NotTty.explain(&subject.source)));
+        tell(refused(PortError::NotTty.explain(&subject.source)));
         return Ok(());
     }
     tell(presence(&subject.source, path, candidate));
@@ -64,7 +64,7 @@ pub(crate) fn examine(
                 sensor::as_the_hub_says(link, why).into_iter().for_each(tell);
             }
             None => {
-                tell(refused(Refusal::Busy.explain(&subject.source)));
+                tell(refused(PortError::Busy.explain(&subject.source)));
                 tell(Finding::skipped("sensor", "its port is in use"));
             }
         }
@@ -76,7 +76,7 @@ pub(crate) fn examine(
         tell(if candidate.is_none_or(|candidate| candidate.is_permitted) {
             Finding::ok("access", "may be opened")
         } else {
-            refused(Refusal::Denied.explain(&subject.source))
+            refused(PortError::Denied.explain(&subject.source))
         });
         let name = subject.source.name();
         let why = format!("not asked: nobody said that it is a sensor's port; scanhub doctor {name} asks");
@@ -189,7 +189,7 @@ fn candidate<'a>(path: &Path, there: &'a [Candidate]) -> Option<&'a Candidate> {
 fn presence(source: &Source, path: &Path, candidate: Option<&Candidate>) -> Finding {
     const NAME: &str = "port";
     if !path.exists() {
-        return refused(Refusal::Missing.explain(source));
+        return refused(PortError::Missing.explain(source));
     }
     let Some(Candidate { name, device, .. }) = candidate else {
         let device = path.canonicalize().unwrap_or_else(|_| path.to_owned());

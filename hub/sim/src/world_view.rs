@@ -12,7 +12,7 @@ use crate::view::{Face, Kind, View};
 
 /// A scene as a seed makes it.
 #[derive(Clone, Debug)]
-pub(crate) struct Stage {
+pub(crate) struct WorldView {
     pub(crate) layers: Layers,
     sensor: Pose,
     /// By how much all ranges of this sensor are off.
@@ -25,9 +25,9 @@ pub(crate) struct Stage {
     pub(crate) suns: Vec<Sun>,
 }
 
-impl Stage {
+impl WorldView {
     /// `scene` as `seed` makes it, seen by its sensor number `sensor`.
-    pub(crate) fn new(scene: &Scene, seed: u64, sensor: u64) -> Stage {
+    pub(crate) fn new(scene: &Scene, seed: u64, sensor: u64) -> WorldView {
         let mut random = fastrand::Rng::with_seed(seed);
         let people = scene.people.iter().map(|plan| Person::new(plan, &mut random)).collect();
         let mut things = scene.things.clone();
@@ -37,7 +37,7 @@ impl Stage {
         }
         let (still_things, changing): (Vec<_>, Vec<_>) = things.into_iter().partition(Thing::is_still);
         let bias = fastrand::Rng::with_seed(!seed ^ sensor << 32).f64();
-        let mut stage = Stage {
+        let mut stage = WorldView {
             layers: scene.layers,
             sensor: scene.sensors[sensor as usize],
             bias_mm: scene.layers.bias_mm * (2.0 * bias - 1.0),

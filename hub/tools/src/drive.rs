@@ -13,7 +13,7 @@ use schema::{Failure, Kind};
 /// Drives `talk` on `port`; `look` sees it whenever it waits. A rate that the port cannot have is passed over.
 ///
 /// [`Kind::PortMissing`] if the port goes away, [`Kind::Interrupted`] if `stop` is set.
-pub(crate) fn converse<C: Conversation>(
+pub(crate) fn drive<C: Conversation>(
     port: &Port,
     talk: &mut C,
     stop: &AtomicBool,

@@ -8,13 +8,11 @@ use config::{Config, Sources};
 use lms::Nanos;
 use port::Source;
 use recording::Recording;
-use schema::{Failure, Kind, check_sensor};
+use schema::{Domain, Failure, Kind, check_sensor};
 
-use super::playback::Play;
-use super::player::{Player, Progress};
-use super::recorded::{self, Origin, Recorded};
-use crate::supervise::{self, Ready, Troupe};
-use schema::Domain;
+use crate::player::{Play, Player, Progress};
+use crate::replay::{Origin, Recorded, tell_of_damage};
+use crate::supervise::{self, Ready, ReplaySet};
 
 /// What is to be replayed, and how.
 #[derive(Clone, Debug)]
@@ -45,7 +43,7 @@ pub fn replay(
 ) -> Result<Progress, Failure> {
     let Replay { file, sources, .. } = *replay;
     let recording = Recording::open(file)?;
-    recorded::tell_of_damage(&recording);
+    tell_of_damage(&recording);
     let sensors = sensors(&recording, replay.sensor)?;
     let read = || configuration(sources, &sensors, file);
     let config = read()?;
@@ -79,8 +77,8 @@ pub fn replay(
         }
     }
     let player = Arc::new(Player::new(replay.play, links, length)?);
-    let troupe = Troupe { player: &player, parts, holds: replay.holds };
-    supervise::serve(&read, config, Some(troupe), domain, |ready| on_ready(ready, &player))?;
+    let set = ReplaySet { player: &player, parts, holds: replay.holds };
+    supervise::serve(&read, config, Some(set), domain, |ready| on_ready(ready, &player))?;
     Ok(player.progress())
 }
 

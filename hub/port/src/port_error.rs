@@ -15,7 +15,7 @@ use crate::Source;
 
 /// The reason alone; equal as long as nothing changed.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub enum Refusal {
+pub enum PortError {
     /// There is nothing at that path.
     Missing,
     /// There is, but no terminal.
@@ -51,9 +51,9 @@ pub enum Refusal {
     Other(Errno),
 }
 
-impl Refusal {
-    pub(crate) fn of_io(error: &io::Error) -> Refusal {
-        Errno::from_io_error(error).map_or(Refusal::Other(Errno::IO), Refusal::from)
+impl PortError {
+    pub(crate) fn of_io(error: &io::Error) -> PortError {
+        Errno::from_io_error(error).map_or(PortError::Other(Errno::IO), PortError::from)
     }
 
     /// The reason with its circumstances at `source`, as they are now.
@@ -63,12 +63,12 @@ impl Refusal {
         let told = self.to_string();
         let failure = |kind, hint: &str| Failure::new(kind, format!("{name}: {told}"), hint);
         match self {
-            Refusal::Missing => missing(path, &candidates()),
-            Refusal::Denied => {
+            PortError::Missing => missing(path, &candidates()),
+            PortError::Denied => {
                 let (what, remedy) = Rights::of(path).explain(path);
                 Failure::new(Kind::PortPermission, what, remedy)
             }
-            Refusal::Busy => match holder(path) {
+            PortError::Busy => match holder(path) {
                 None if is_own(path) => Failure::new(
                     Kind::PortBusy,
                     format!("{name}: in use by another link of this hub"),
@@ -76,67 +76,69 @@ impl Refusal {
                 ),
                 holder => busy(path, holder),
             },
-            Refusal::NotTty if path.is_dir() => {
+            PortError::NotTty if path.is_dir() => {
                 let hint = format!("it is a directory; {}", instead(&name, &candidates()));
                 failure(Kind::PortNotTty, &hint)
             }
-            Refusal::NotTty => failure(Kind::PortNotTty, "name a tty, or tcp:HOST:PORT"),
-            Refusal::Dead => failure(Kind::PortMissing, &instead(&name, &candidates())),
-            Refusal::Short(Errno::AGAIN) => failure(Kind::Short, "raise the limit of threads (ulimit -u)"),
-            Refusal::Short(_) => failure(Kind::Short, "raise the limit of open descriptors (ulimit -n)"),
-            Refusal::Rate { wanted, .. } => failure(Kind::PortRate, remedy_of_rate(*wanted)),
-            Refusal::NoHost(_) => failure(Kind::PortMissing, "correct the name, or give the address instead"),
-            Refusal::Refused => failure(
+            PortError::NotTty => failure(Kind::PortNotTty, "name a tty, or tcp:HOST:PORT"),
+            PortError::Dead => failure(Kind::PortMissing, &instead(&name, &candidates())),
+            PortError::Short(Errno::AGAIN) => failure(Kind::Short, "raise the limit of threads (ulimit -u)"),
+            PortError::Short(_) => failure(Kind::Short, "raise the limit of open descriptors (ulimit -n)"),
+            PortError::Rate { wanted, .. } => failure(Kind::PortRate, remedy_of_rate(*wanted)),
+            PortError::NoHost(_) => {
+                failure(Kind::PortMissing, "correct the name, or give the address instead")
+            }
+            PortError::Refused => failure(
                 Kind::PortMissing,
                 "nothing listens there, or it serves somebody else: the server's port must be in raw TCP mode",
             ),
-            Refusal::TimedOut => failure(Kind::PortMissing, "is it switched on, and is the address right?"),
-            Refusal::Network(_) => {
+            PortError::TimedOut => failure(Kind::PortMissing, "is it switched on, and is the address right?"),
+            PortError::Network(_) => {
                 failure(Kind::PortMissing, "is the network plugged in, and is there a way to it?")
             }
-            Refusal::Interrupted => Failure::new(Kind::Interrupted, "interrupted", ""),
-            Refusal::Recording => failure(Kind::Configuration, "name a tty, or tcp:HOST:PORT"),
-            Refusal::Other(_) => {
+            PortError::Interrupted => Failure::new(Kind::Interrupted, "interrupted", ""),
+            PortError::Recording => failure(Kind::Configuration, "name a tty, or tcp:HOST:PORT"),
+            PortError::Other(_) => {
                 failure(Kind::PortNotTty, "name a tty; the kernel's log (dmesg) may tell more")
             }
         }
     }
 }
 
-impl fmt::Display for Refusal {
+impl fmt::Display for PortError {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
-            Refusal::Missing => f.write_str("no such port"),
-            Refusal::NotTty => f.write_str("not a serial line"),
-            Refusal::Denied => f.write_str("no permission"),
-            Refusal::Busy => f.write_str("in use"),
-            Refusal::Dead => f.write_str("no such port: there is a name, but no line behind it"),
-            Refusal::Short(errno) => write!(f, "cannot be opened: {errno}"),
-            Refusal::Rate { wanted, given } => {
+            PortError::Missing => f.write_str("no such port"),
+            PortError::NotTty => f.write_str("not a serial line"),
+            PortError::Denied => f.write_str("no permission"),
+            PortError::Busy => f.write_str("in use"),
+            PortError::Dead => f.write_str("no such port: there is a name, but no line behind it"),
+            PortError::Short(errno) => write!(f, "cannot be opened: {errno}"),
+            PortError::Rate { wanted, given } => {
                 write!(f, "{wanted} Bd is not possible here, the driver gives {given} Bd")
             }
-            Refusal::NoHost(why) => write!(f, "no such host: {why}"),
-            Refusal::Refused => f.write_str("connection refused"),
-            Refusal::TimedOut => f.write_str("no answer"),
-            Refusal::Network(why) => write!(f, "cannot be reached: {why}"),
-            Refusal::Interrupted => f.write_str("interrupted"),
-            Refusal::Recording => f.write_str("a recording, no line to a sensor"),
-            Refusal::Other(errno) => write!(f, "cannot be used as a serial line: {errno}"),
+            PortError::NoHost(why) => write!(f, "no such host: {why}"),
+            PortError::Refused => f.write_str("connection refused"),
+            PortError::TimedOut => f.write_str("no answer"),
+            PortError::Network(why) => write!(f, "cannot be reached: {why}"),
+            PortError::Interrupted => f.write_str("interrupted"),
+            PortError::Recording => f.write_str("a recording, no line to a sensor"),
+            PortError::Other(errno) => write!(f, "cannot be used as a serial line: {errno}"),
         }
     }
 }
 
-impl From<Errno> for Refusal {
-    fn from(errno: Errno) -> Refusal {
+impl From<Errno> for PortError {
+    fn from(errno: Errno) -> PortError {
         match errno {
-            Errno::NOENT => Refusal::Missing,
-            Errno::ACCESS | Errno::PERM => Refusal::Denied,
-            Errno::BUSY => Refusal::Busy,
-            Errno::NOTTY | Errno::ISDIR | Errno::NOTDIR => Refusal::NotTty,
+            Errno::NOENT => PortError::Missing,
+            Errno::ACCESS | Errno::PERM => PortError::Denied,
+            Errno::BUSY => PortError::Busy,
+            Errno::NOTTY | Errno::ISDIR | Errno::NOTDIR => PortError::NotTty,
             // A UART that the board does not have, an adapter that was pulled out a moment ago, half a pty.
-            Errno::IO | Errno::NXIO | Errno::NODEV => Refusal::Dead,
-            Errno::MFILE | Errno::NFILE | Errno::NOMEM => Refusal::Short(errno),
-            errno => Refusal::Other(errno),
+            Errno::IO | Errno::NXIO | Errno::NODEV => PortError::Dead,
+            Errno::MFILE | Errno::NFILE | Errno::NOMEM => PortError::Short(errno),
+            errno => PortError::Other(errno),
         }
     }
 }
@@ -218,18 +220,18 @@ mod tests {
             (Errno::IO.into(), Kind::PortMissing, "no line behind it"),
             (Errno::NXIO.into(), Kind::PortMissing, "no line behind it"),
             (Errno::MFILE.into(), Kind::Short, "ulimit -n"),
-            (Refusal::Short(Errno::AGAIN), Kind::Short, "ulimit -u"),
+            (PortError::Short(Errno::AGAIN), Kind::Short, "ulimit -u"),
             (Errno::LOOP.into(), Kind::PortNotTty, "dmesg"),
             (Errno::PERM.into(), Kind::PortPermission, "/dev/full"),
             (Errno::BUSY.into(), Kind::PortBusy, "stop it first"),
             (
-                Refusal::Rate { wanted: 500_000, given: 115_200 },
+                PortError::Rate { wanted: 500_000, given: 115_200 },
                 Kind::PortRate,
                 "/dev/full: 500000 Bd is not possible here, the driver gives 115200 Bd\n  adapters with an FT232R",
             ),
-            (Refusal::Rate { wanted: 9600, given: 0 }, Kind::PortRate, "say another rate"),
+            (PortError::Rate { wanted: 9600, given: 0 }, Kind::PortRate, "say another rate"),
         ] {
-            let failure = Refusal::explain(&refusal, &source);
+            let failure = PortError::explain(&refusal, &source);
             assert_eq!(failure.kind, kind, "{failure}");
             assert!(failure.to_string().contains(says) && !failure.hint.is_empty(), "{failure}");
         }

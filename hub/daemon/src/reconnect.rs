@@ -5,14 +5,14 @@ use std::os::fd::AsFd;
 use std::sync::atomic::AtomicBool;
 
 use lms::{Control, Identity, MILLIS, Nanos, Session};
-use port::{Port, Refusal, Source, clock};
+use port::{Port, PortError, Source, clock};
 use rustix::event::PollFlags;
 use schema::{Failure, Flags, Kind, State};
 
 use crate::control::Flow;
+use crate::identity_cache::IdentityCache;
 use crate::last_rate::LastRate;
 use crate::link::{LinkThread, Woken};
-use crate::memory::Memory;
 
 impl LinkThread<'_> {
     /// Streams from the port, and takes it back whenever it was away. `report` is called once, as in
@@ -39,7 +39,7 @@ impl LinkThread<'_> {
             }
         }
         report(Ok(()));
-        let memory = Memory::open(self.around.root, &link.name, &link.port.name());
+        let memory = IdentityCache::open(self.around.root, &link.name, &link.port.name());
         // On a line that was closed meanwhile it may be another sensor, or the same in another mode.
         let mut known = memory.recall(clock::now()).filter(|_| is_kept);
         self.memory = Some(memory);
@@ -99,7 +99,7 @@ impl LinkThread<'_> {
     }
 
     /// Tries to open the port, however long that takes; nothing if the hub shall end meanwhile.
-    fn reach(&mut self, words: &str) -> Option<Result<Port, Refusal>> {
+    fn reach(&mut self, words: &str) -> Option<Result<Port, PortError>> {
         let link = self.link;
         let dial = match Port::dial(&link.port) {
             None => return Some(Port::attempt(&link.port, link.baud.rate(), &AtomicBool::new(false))),
@@ -140,7 +140,7 @@ impl LinkThread<'_> {
 /// Why a port is away, for how many looks, and in which words.
 #[derive(Default)]
 struct Away {
-    refusal: Option<Refusal>,
+    refusal: Option<PortError>,
     words: String,
     /// When the words were found.
     since: Nanos,
@@ -151,12 +151,12 @@ struct Away {
 impl Away {
     /// There is no port, which `words` say: that the next look finds none is no news.
     fn for_lack_of_a_port(words: String) -> Away {
-        Away { refusal: Some(Refusal::Missing), words, ..Away::default() }
+        Away { refusal: Some(PortError::Missing), words, ..Away::default() }
     }
 
     /// The port cannot be opened because of `refusal`.
-    fn learn(&mut self, refusal: Refusal, source: &Source, now: Nanos) {
-        let is_missing = refusal == Refusal::Missing;
+    fn learn(&mut self, refusal: PortError, source: &Source, now: Nanos) {
+        let is_missing = refusal == PortError::Missing;
         self.refused = if is_missing { 0 } else { self.refused + 1 };
         let is_news = self.refusal.as_ref() != Some(&refusal);
         // Another process may hold it now than the one that was named.
@@ -196,18 +196,18 @@ mod tests {
     fn why_it_is_away_is_looked_for_once_per_change() {
         let source = Source::Tty("/dev/no-such-port".into());
         let mut away = Away::for_lack_of_a_port("it went".to_owned());
-        away.learn(Refusal::Missing, &source, 1);
+        away.learn(PortError::Missing, &source, 1);
         assert_eq!((away.words.as_str(), away.pause()), ("it went", LOOK));
-        away.learn(Refusal::Busy, &source, 2);
+        away.learn(PortError::Busy, &source, 2);
         assert!(away.words.contains("in use by another process; stop it first"), "{}", away.words);
         assert_eq!((away.since, away.pause()), (2, LOOK));
         for look in 3..20 {
-            away.learn(Refusal::Busy, &source, look);
+            away.learn(PortError::Busy, &source, look);
         }
         assert_eq!((away.since, away.pause()), (2, 16 * LOOK));
-        away.learn(Refusal::Busy, &source, 2 + STALE);
+        away.learn(PortError::Busy, &source, 2 + STALE);
         assert_eq!(away.since, 2 + STALE);
-        away.learn(Refusal::Missing, &source, 3 + STALE);
+        away.learn(PortError::Missing, &source, 3 + STALE);
         assert!(away.words.contains("no such port"), "{}", away.words);
         assert_eq!(away.pause(), LOOK);
     }

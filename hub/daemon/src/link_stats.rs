@@ -11,7 +11,7 @@ use schema::{Counter, Counters, Pose, State, Status};
 use crate::recent::Recent;
 
 /// The link's account, across all sessions on its port.
-pub(crate) struct Account {
+pub(crate) struct LinkStats {
     status: Status,
     /// The measuring mode while no reply has told it, as configured.
     mode: Option<Mode>,
@@ -32,11 +32,11 @@ pub(crate) struct Account {
     pub(crate) line_errors: u64,
 }
 
-impl Account {
+impl LinkStats {
     pub(crate) fn new(link: &Link, now: Nanos) -> Self {
         let mut status = Status { since_ns: now, pose: link.processing.pose, ..Status::default() };
         status.set_port(&link.port.name());
-        Account {
+        LinkStats {
             status,
             mode: link.mode,
             past: Counters::default(),

@@ -12,7 +12,7 @@ use schema::limits::history;
 use schema::{Failure, Header};
 
 /// One topic of one sensor.
-pub(super) struct Outlet<P: Payload + ?Sized> {
+pub(super) struct TopicPublisher<P: Payload + ?Sized> {
     pub(super) publisher: Publisher<P>,
     service: TopicService<P>,
     /// The number of the next sample.
@@ -25,12 +25,12 @@ pub(super) struct Outlet<P: Payload + ?Sized> {
     pub(super) failed: u64,
 }
 
-impl<P: Payload + ?Sized> Outlet<P> {
+impl<P: Payload + ?Sized> TopicPublisher<P> {
     /// The topic of `sensor`.
     pub(super) fn new(node: &Node, sensor: &str) -> Result<Self, Failure> {
         let service = P::create(node, sensor)?;
         let publisher = P::publisher(&service)?;
-        Ok(Outlet { publisher, service, next: 0, reached: 0, prepared: None, failed: 0 })
+        Ok(TopicPublisher { publisher, service, next: 0, reached: 0, prepared: None, failed: 0 })
     }
 
     /// The number of the sample that is being made.
@@ -80,7 +80,7 @@ impl<P: Payload + ?Sized> Outlet<P> {
     }
 }
 
-impl<P: Payload + ZeroCopySend + Default> Outlet<P> {
+impl<P: Payload + ZeroCopySend + Default> TopicPublisher<P> {
     /// Takes a loan for the sample that will be there in a moment, and connects who came.
     pub(super) fn prepare(&mut self) {
         if self.prepared.is_none() && self.is_wanted() {

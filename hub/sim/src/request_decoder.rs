@@ -60,7 +60,7 @@ pub(crate) struct Heard {
 
 /// Collects one request.
 #[derive(Debug)]
-pub(crate) struct Ear {
+pub(crate) struct RequestDecoder {
     bytes: Vec<u8>,
     /// When the last byte can have come if every gap before it was right; `None` before the first.
     last: Option<Arrival>,
@@ -72,9 +72,9 @@ pub(crate) struct Ear {
     dropped: Option<Dropped>,
 }
 
-impl Ear {
+impl RequestDecoder {
     pub(crate) fn new(speed: f64, is_strict: bool) -> Self {
-        Ear { bytes: Vec::new(), last: None, broken: false, is_strict, speed, dropped: None }
+        RequestDecoder { bytes: Vec::new(), last: None, broken: false, is_strict, speed, dropped: None }
     }
 
     /// The last request that was dropped, told once.
@@ -155,54 +155,54 @@ mod tests {
     use lms::command::Request;
 
     /// When a status request is heard whose bytes are known to come with `gap` of idle time between them.
-    fn heard_at(ear: &mut Ear, start: Nanos, gap: Nanos, width: Nanos) -> Option<Nanos> {
+    fn heard_at(decoder: &mut RequestDecoder, start: Nanos, gap: Nanos, width: Nanos) -> Option<Nanos> {
         let request = Request::Status.encode(0);
         let step = line_time(1, 9_600) + gap;
         let mut heard = None;
         for (i, &byte) in request.bytes().iter().enumerate() {
             let at = start + i as Nanos * step;
             let arrival = Arrival { not_before: at.saturating_sub(width), not_after: at + width };
-            heard = heard.or(ear.hear(byte, arrival, 9_600));
+            heard = heard.or(decoder.hear(byte, arrival, 9_600));
         }
         heard.filter(|heard| heard.bytes == request.bytes()).map(|heard| heard.at)
     }
 
-    fn heard(ear: &mut Ear, start: Nanos, gap: Nanos, width: Nanos) -> bool {
-        heard_at(ear, start, gap, width).is_some()
+    fn heard(decoder: &mut RequestDecoder, start: Nanos, gap: Nanos, width: Nanos) -> bool {
+        heard_at(decoder, start, gap, width).is_some()
     }
 
     /// When a status request is heard that is written at once at `start`.
-    fn written_at_once(ear: &mut Ear, start: Nanos, baud: u32) -> Option<Nanos> {
+    fn written_at_once(decoder: &mut RequestDecoder, start: Nanos, baud: u32) -> Option<Nanos> {
         let request = Request::Status.encode(0);
         let heard =
-            request.bytes().iter().filter_map(|&byte| ear.hear(byte, Arrival::at(start), baud)).last();
+            request.bytes().iter().filter_map(|&byte| decoder.hear(byte, Arrival::at(start), baud)).last();
         heard.filter(|heard| heard.bytes == request.bytes()).map(|heard| heard.at)
     }
 
     #[test]
     fn what_is_written_at_once_is_heard_when_the_line_has_carried_it() {
-        let mut ear = Ear::new(1.0, false);
+        let mut decoder = RequestDecoder::new(1.0, false);
         for (round, baud) in [9_600, 19_200, 38_400, 500_000].repeat(25).into_iter().enumerate() {
             let start = (round as Nanos + 1) * 1_000 * MILLIS;
-            assert_eq!(written_at_once(&mut ear, start, baud), Some(start + 6 * line_time(1, baud)));
+            assert_eq!(written_at_once(&mut decoder, start, baud), Some(start + 6 * line_time(1, baud)));
             // As some drivers do: 55 us from one byte to the next, whatever the rate.
             let request = Request::Stop.encode(0);
             let bytes = request.bytes().iter().enumerate();
             let at = |i: usize| Arrival::at(start + 500 * MILLIS + i as Nanos * 55 * MICROS);
-            assert!(bytes.filter_map(|(i, &byte)| ear.hear(byte, at(i), baud)).count() == 1);
+            assert!(bytes.filter_map(|(i, &byte)| decoder.hear(byte, at(i), baud)).count() == 1);
         }
-        assert_eq!(ear.take_dropped(), None);
+        assert_eq!(decoder.take_dropped(), None);
     }
 
     #[test]
     fn a_second_request_waits_for_the_first_one_to_leave() {
-        let mut ear = Ear::new(1.0, false);
+        let mut decoder = RequestDecoder::new(1.0, false);
         let byte_ns = line_time(1, 9_600);
-        assert_eq!(written_at_once(&mut ear, 0, 9_600), Some(6 * byte_ns));
-        assert_eq!(written_at_once(&mut ear, 0, 9_600), Some(13 * byte_ns));
+        assert_eq!(written_at_once(&mut decoder, 0, 9_600), Some(6 * byte_ns));
+        assert_eq!(written_at_once(&mut decoder, 0, 9_600), Some(13 * byte_ns));
         // Noise takes its time too.
-        ear.hear(0xFF, Arrival::at(0), 9_600);
-        assert_eq!(written_at_once(&mut ear, 0, 9_600), Some(21 * byte_ns));
+        decoder.hear(0xFF, Arrival::at(0), 9_600);
+        assert_eq!(written_at_once(&mut decoder, 0, 9_600), Some(21 * byte_ns));
     }
 
     #[test]
@@ -215,22 +215,22 @@ mod tests {
             // Nothing is proved by bytes that may have come long before they were seen.
             (6_100 * MICROS, MILLIS, true),
         ] {
-            let mut ear = Ear::new(1.0, false);
-            assert_eq!(heard(&mut ear, 1_000 * MILLIS, gap, width), expected, "{gap} {width}");
-            assert_eq!(ear.take_dropped(), (!expected).then_some(Dropped::LongGap { after: 1 }), "{gap}");
-            assert!(heard(&mut ear, 2_000 * MILLIS, 100 * MICROS, 0), "not heard again after {gap}");
-            assert_eq!(ear.take_dropped(), None);
+            let mut decoder = RequestDecoder::new(1.0, false);
+            assert_eq!(heard(&mut decoder, 1_000 * MILLIS, gap, width), expected, "{gap} {width}");
+            assert_eq!(decoder.take_dropped(), (!expected).then_some(Dropped::LongGap { after: 1 }), "{gap}");
+            assert!(heard(&mut decoder, 2_000 * MILLIS, 100 * MICROS, 0), "not heard again after {gap}");
+            assert_eq!(decoder.take_dropped(), None);
         }
         // What was written at once is on the line for as long as that takes, and the gap begins behind it.
         let request = Request::Status.encode(0);
         let (head, tail) = request.bytes().split_at(4);
         let byte_ns = line_time(1, 9_600);
         for (pause, expected) in [(4 * byte_ns + 6 * MILLIS, true), (4 * byte_ns + 6 * MILLIS + 1, false)] {
-            let mut ear = Ear::new(1.0, false);
-            assert!(head.iter().all(|&byte| ear.hear(byte, Arrival::at(0), 9_600).is_none()));
-            let heard = tail.iter().filter_map(|&byte| ear.hear(byte, Arrival::at(pause), 9_600)).count();
+            let mut decoder = RequestDecoder::new(1.0, false);
+            assert!(head.iter().all(|&byte| decoder.hear(byte, Arrival::at(0), 9_600).is_none()));
+            let heard = tail.iter().filter_map(|&byte| decoder.hear(byte, Arrival::at(pause), 9_600)).count();
             assert_eq!(heard == 1, expected, "{pause}");
-            assert_eq!(ear.take_dropped(), (!expected).then_some(Dropped::LongGap { after: 4 }));
+            assert_eq!(decoder.take_dropped(), (!expected).then_some(Dropped::LongGap { after: 4 }));
         }
     }
 
@@ -248,11 +248,11 @@ mod tests {
             (0, 100 * MICROS, false),
             (6_100 * MICROS, MILLIS, true),
         ] {
-            let mut ear = Ear::new(1.0, true);
-            assert_eq!(heard(&mut ear, 1_000 * MILLIS, gap, width), expected, "{gap} {width}");
+            let mut decoder = RequestDecoder::new(1.0, true);
+            assert_eq!(heard(&mut decoder, 1_000 * MILLIS, gap, width), expected, "{gap} {width}");
             let dropped = if gap < MIN_GAP { Dropped::ShortGap } else { Dropped::LongGap { after: 1 } };
-            assert_eq!(ear.take_dropped(), (!expected).then_some(dropped), "{gap} {width}");
-            assert!(heard(&mut ear, 2_000 * MILLIS, 100 * MICROS, 0), "not heard again after {gap}");
+            assert_eq!(decoder.take_dropped(), (!expected).then_some(dropped), "{gap} {width}");
+            assert!(heard(&mut decoder, 2_000 * MILLIS, 100 * MICROS, 0), "not heard again after {gap}");
         }
     }
 
@@ -261,31 +261,31 @@ mod tests {
         let request = Request::Status.encode(0);
         let least = 6 * (line_time(1, 9_600) + MIN_GAP);
         for (window, expected) in [(least, true), (least - 1, false)] {
-            let mut ear = Ear::new(1.0, true);
+            let mut decoder = RequestDecoder::new(1.0, true);
             let arrival = Arrival { not_before: 5 * MILLIS, not_after: 5 * MILLIS + window };
-            let heard = request.bytes().iter().filter_map(|&byte| ear.hear(byte, arrival, 9_600)).count();
+            let heard = request.bytes().iter().filter_map(|&byte| decoder.hear(byte, arrival, 9_600)).count();
             assert_eq!(heard == 1, expected, "{window}");
         }
     }
 
     #[test]
     fn what_was_spaced_and_is_read_late_is_not_spaced_again() {
-        let mut ear = Ear::new(1.0, false);
+        let mut decoder = RequestDecoder::new(1.0, false);
         let arrival = Arrival { not_before: 5 * MILLIS, not_after: 25 * MILLIS };
         let request = Request::Status.encode(0);
-        let heard = request.bytes().iter().filter_map(|&byte| ear.hear(byte, arrival, 9_600)).last();
+        let heard = request.bytes().iter().filter_map(|&byte| decoder.hear(byte, arrival, 9_600)).last();
         assert_eq!(heard.map(|heard| heard.at), Some(25 * MILLIS));
     }
 
     #[test]
     fn the_host_keeps_its_own_time() {
         // Four times as fast: 240 us of machine time are 60 us of the host's.
-        let mut ear = Ear::new(4.0, true);
+        let mut decoder = RequestDecoder::new(4.0, true);
         let request = Request::Stop.encode(0);
         let mut heard = None;
         for (i, &byte) in request.bytes().iter().enumerate() {
             let at = 4 * i as Nanos * (line_time(1, 500_000) + 60 * MICROS);
-            heard = heard.or(ear.hear(byte, Arrival::at(at), 500_000));
+            heard = heard.or(decoder.hear(byte, Arrival::at(at), 500_000));
         }
         assert!(heard.is_some());
     }
@@ -293,17 +293,20 @@ mod tests {
     #[test]
     fn noise_before_a_request_is_passed_over() {
         for is_strict in [false, true] {
-            let mut ear = Ear::new(1.0, is_strict);
+            let mut decoder = RequestDecoder::new(1.0, is_strict);
             for byte in [0x00, 0xFF, 0x06] {
-                assert_eq!(ear.hear(byte, Arrival::at(0), 9_600), None);
+                assert_eq!(decoder.hear(byte, Arrival::at(0), 9_600), None);
             }
-            assert!(heard(&mut ear, 100 * MILLIS, 100 * MICROS, 0));
+            assert!(heard(&mut decoder, 100 * MILLIS, 100 * MICROS, 0));
             // A length that cannot be is given up at once.
             for (i, byte) in [STX, 0, 0xFF, 0xFF].into_iter().enumerate() {
-                assert_eq!(ear.hear(byte, Arrival::at(200 * MILLIS + i as Nanos * 2 * MILLIS), 9_600), None);
+                assert_eq!(
+                    decoder.hear(byte, Arrival::at(200 * MILLIS + i as Nanos * 2 * MILLIS), 9_600),
+                    None
+                );
             }
-            assert!(heard(&mut ear, 210 * MILLIS, 100 * MICROS, 0));
-            assert_eq!(ear.take_dropped(), None);
+            assert!(heard(&mut decoder, 210 * MILLIS, 100 * MICROS, 0));
+            assert_eq!(decoder.take_dropped(), None);
         }
     }
 }

@@ -13,7 +13,7 @@ use crate::link::LinkThread;
 
 /// What a recording knows of a telegram and nobody could ask a line for; by default nothing.
 #[derive(Clone, Copy, Debug, Default)]
-pub(crate) struct Past {
+pub(crate) struct RecordedContext {
     /// The mode of a sensor that cannot be asked.
     pub(crate) mode: Option<Mode>,
     /// Wall clock of its first byte.
@@ -31,7 +31,7 @@ pub(crate) struct Past {
 impl LinkThread<'_> {
     /// Publishes a telegram and, if it is measured data that can be read, its scan and what is made of it. The time for
     /// which the verdict stands, where there is one.
-    pub(crate) fn publish(&mut self, received: &Received<'_>, past: &Past) -> Option<Nanos> {
+    pub(crate) fn publish(&mut self, received: &Received<'_>, past: &RecordedContext) -> Option<Nanos> {
         let measured = match Reply::decode(received.telegram) {
             Some(Reply::Measured(measured)) => Some(measured),
             _ => None,

@@ -1,6 +1,8 @@
 //! A player as its users and its links see it: the links' threads ask whose turn it is, keys and requests change how it
 //! goes on. Where nothing is waited for, nobody asks and nothing is locked. Refuses to know what is played.
 
+mod playback;
+
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::sync::{Mutex, MutexGuard, PoisonError};
 
@@ -8,8 +10,10 @@ use lms::Nanos;
 use port::clock;
 use schema::Failure;
 
-use super::playback::{Due, Play, Playback, Turn};
-use crate::bell::Bell;
+use crate::event_fd::EventFd;
+pub use playback::Play;
+use playback::Playback;
+pub(crate) use playback::{Due, Turn};
 
 /// How fast a recording is played.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -25,17 +29,17 @@ pub struct Player {
     playback: Mutex<Playback>,
     /// Whether it is everybody's turn.
     flows: AtomicBool,
-    links: Vec<Place>,
+    links: Vec<LinkPlace>,
     /// Rings at the end.
-    over: Bell,
+    over: EventFd,
     /// Somebody wants it to end now.
     is_ended: AtomicBool,
     length_ns: Option<Nanos>,
 }
 
 /// Where a link is.
-struct Place {
-    bell: Bell,
+struct LinkPlace {
+    event: EventFd,
     media: AtomicU64,
     has_ended: AtomicBool,
     telegrams: AtomicU64,
@@ -43,7 +47,7 @@ struct Place {
 
 /// A link's place at a player.
 #[derive(Clone, Copy)]
-pub(crate) struct Seat<'a> {
+pub(crate) struct PlayerHandle<'a> {
     pub(crate) player: &'a Player,
     pub(crate) number: usize,
 }
@@ -104,15 +108,15 @@ impl Player {
     ///
     /// [`Kind::Short`](schema::Kind) if descriptors are.
     pub(crate) fn new(play: Play, links: usize, length_ns: Option<Nanos>) -> Result<Player, Failure> {
-        let place = |_| -> Result<Place, Failure> {
+        let place = |_| -> Result<LinkPlace, Failure> {
             let (media, telegrams) = Default::default();
-            Ok(Place { bell: Bell::new()?, media, has_ended: AtomicBool::new(false), telegrams })
+            Ok(LinkPlace { event: EventFd::new()?, media, has_ended: AtomicBool::new(false), telegrams })
         };
         Ok(Player {
             playback: Mutex::new(Playback::new(play, links)),
             flows: AtomicBool::new(false),
             links: (0..links).map(place).collect::<Result<_, _>>()?,
-            over: Bell::new()?,
+            over: EventFd::new()?,
             is_ended: AtomicBool::new(false),
             length_ns,
         })
@@ -163,7 +167,7 @@ impl Player {
     /// Ends, wherever it is.
     pub fn end(&self) {
         self.is_ended.store(true, Ordering::Relaxed);
-        self.over.ring();
+        self.over.signal();
     }
 
     /// How far it is.
@@ -189,7 +193,7 @@ impl Player {
     }
 
     /// What becomes readable when it [`is_over`](Self::is_over) or shall end.
-    pub(crate) fn over(&self) -> &Bell {
+    pub(crate) fn over(&self) -> &EventFd {
         &self.over
     }
 
@@ -215,16 +219,16 @@ impl Player {
         let (is_news, is_over) = (playback.take_news(), playback.is_over());
         drop(playback);
         if is_news {
-            self.links.iter().for_each(|link| link.bell.ring());
+            self.links.iter().for_each(|link| link.event.signal());
         }
         if is_over {
-            self.over.ring();
+            self.over.signal();
         }
     }
 
     /// The media time of the link that has come the least far of those that go on.
     fn position(&self) -> Nanos {
-        let media = |link: &Place| link.media.load(Ordering::Relaxed);
+        let media = |link: &LinkPlace| link.media.load(Ordering::Relaxed);
         let going = self.links.iter().filter(|link| !link.has_ended.load(Ordering::Relaxed));
         going.map(media).min().or_else(|| self.links.iter().map(media).max()).unwrap_or(0)
     }
@@ -234,19 +238,19 @@ impl Player {
     }
 }
 
-impl Seat<'_> {
+impl PlayerHandle<'_> {
     /// Whether it is the link's turn without asking.
-    pub(super) fn flows(self) -> bool {
+    pub(crate) fn flows(self) -> bool {
         self.player.flows.load(Ordering::Relaxed)
     }
 
     /// Whether it is the link's turn, which has something of `media` next.
-    pub(super) fn turn(self, media: Nanos, now: Nanos) -> Turn {
+    pub(crate) fn turn(self, media: Nanos, now: Nanos) -> Turn {
         self.ask(|playback| playback.turn(self.number, media, now))
     }
 
     /// The link is at the end of lap number `lap`.
-    pub(super) fn end(self, lap: u32, now: Nanos) -> Turn {
+    pub(crate) fn end(self, lap: u32, now: Nanos) -> Turn {
         self.place().has_ended.store(true, Ordering::Relaxed);
         let turn = self.ask(|playback| playback.end(self.number, lap, now));
         if let Turn::Anew(_) = turn {
@@ -257,7 +261,7 @@ impl Seat<'_> {
     }
 
     /// The link has published something of `media`.
-    pub(super) fn played(self, media: Nanos) {
+    pub(crate) fn played(self, media: Nanos) {
         let place = self.place();
         place.media.store(media, Ordering::Relaxed);
         place.has_ended.store(false, Ordering::Relaxed);
@@ -265,18 +269,18 @@ impl Seat<'_> {
     }
 
     /// What was asked for.
-    pub(super) fn play(self) -> Play {
+    pub(crate) fn play(self) -> Play {
         *self.player.lock().play()
     }
 
     /// Whether the player waits.
-    pub(super) fn is_paused(self) -> bool {
+    pub(crate) fn is_paused(self) -> bool {
         self.player.lock().play().is_paused
     }
 
     /// What becomes readable when it is worth asking again.
-    pub(super) fn bell(&self) -> &Bell {
-        &self.place().bell
+    pub(crate) fn news(&self) -> &EventFd {
+        &self.place().event
     }
 
     fn ask(self, question: impl FnOnce(&mut Playback) -> Turn) -> Turn {
@@ -286,14 +290,14 @@ impl Seat<'_> {
         turn
     }
 
-    fn place(&self) -> &Place {
+    fn place(&self) -> &LinkPlace {
         &self.player.links[self.number]
     }
 }
 
 impl Due {
     /// What nobody waits for.
-    pub(super) fn at_once(now: Nanos) -> Due {
+    pub(crate) fn at_once(now: Nanos) -> Due {
         Due { at: now, stretch: 1.0 }
     }
 }

@@ -11,20 +11,20 @@ use port::clock;
 use schema::{Failure, Kind, Shown, Verb, Wake};
 
 use super::{Changed, Order, Outcome};
-use crate::bell::Bell;
+use crate::event_fd::EventFd;
 use crate::learned::Slot;
 use crate::link::LinkThread;
-use crate::replay::Player;
+use crate::player::Player;
 
-/// The link's end of the way from the desk.
-pub(crate) struct Orders {
+/// The link's end of the way from the server.
+pub(crate) struct ControlQueue {
     pub(super) sensor: String,
     pub(super) paused: bool,
     pub(super) queue: Receiver<Order>,
     pub(super) changed: Changed,
-    pub(super) bell: Arc<Bell>,
+    pub(super) event: Arc<EventFd>,
     pub(super) outcomes: Sender<(u64, Outcome)>,
-    pub(super) desk: Arc<Bell>,
+    pub(super) server: Arc<EventFd>,
 }
 
 /// Who can be told to pause, to resume, to begin anew.
@@ -80,7 +80,7 @@ impl LinkThread<'_> {
     }
 }
 
-impl Orders {
+impl ControlQueue {
     /// Whether a user wants nothing of the sensor for now: a pause outlasts an absence of the port.
     pub(crate) fn is_paused(&self) -> bool {
         self.paused
@@ -105,19 +105,19 @@ impl Orders {
     }
 
     fn changed(&self) -> Option<Box<Processing>> {
-        self.bell.hush();
+        self.event.clear();
         self.changed.lock().unwrap_or_else(PoisonError::into_inner).take()
     }
 
     fn take(&self) -> Option<Order> {
-        self.bell.hush();
+        self.event.clear();
         self.queue.try_recv().ok()
     }
 
     fn answer(&self, number: u64, outcome: Outcome) {
-        // A desk that is closed has no client that waits.
+        // A server that is closed has no client that waits.
         if self.outcomes.send((number, outcome)).is_ok() {
-            self.desk.ring();
+            self.server.signal();
         }
     }
 
@@ -127,9 +127,9 @@ impl Orders {
     }
 }
 
-impl AsFd for Orders {
+impl AsFd for ControlQueue {
     /// Readable as long as an order waits.
     fn as_fd(&self) -> BorrowedFd<'_> {
-        self.bell.as_fd()
+        self.event.as_fd()
     }
 }

@@ -7,31 +7,31 @@ use rustix::io::Errno;
 use schema::{Failure, Kind};
 
 /// Rings until it is hushed.
-pub(crate) struct Bell(OwnedFd);
+pub(crate) struct EventFd(OwnedFd);
 
-impl Bell {
+impl EventFd {
     /// One that does not ring.
     ///
     /// [`Kind::Short`] if descriptors are.
-    pub(crate) fn new() -> Result<Bell, Failure> {
+    pub(crate) fn new() -> Result<EventFd, Failure> {
         let made = eventfd(0, EventfdFlags::CLOEXEC | EventfdFlags::NONBLOCK);
-        made.map(Bell).map_err(|error: Errno| {
+        made.map(EventFd).map_err(|error: Errno| {
             Failure::new(Kind::Short, format!("an eventfd cannot be had: {error}"), "raise `ulimit -n`")
         })
     }
 
-    pub(crate) fn ring(&self) {
+    pub(crate) fn signal(&self) {
         // Fails only if it rings already.
         let _ = rustix::io::write(&self.0, &1_u64.to_ne_bytes());
     }
 
-    pub(crate) fn hush(&self) {
+    pub(crate) fn clear(&self) {
         // Fails only if it does not ring.
         let _ = rustix::io::read(&self.0, &mut [0; 8]);
     }
 }
 
-impl AsFd for Bell {
+impl AsFd for EventFd {
     /// Readable as long as it rings.
     fn as_fd(&self) -> BorrowedFd<'_> {
         self.0.as_fd()

@@ -12,7 +12,7 @@ use port::clock;
 use schema::Directory;
 
 /// The memory of one link.
-pub(crate) struct Memory {
+pub(crate) struct IdentityCache {
     /// Stamp, identity, port; nothing where it cannot be written: then the sensor is asked.
     file: Option<File>,
     /// Of which port it is.
@@ -22,15 +22,15 @@ pub(crate) struct Memory {
     identity: Option<Identity>,
 }
 
-impl Memory {
+impl IdentityCache {
     /// That of the link `name` at `port`, in the directory `root`.
-    pub(crate) fn open(root: &Path, name: &str, port: &str) -> Memory {
+    pub(crate) fn open(root: &Path, name: &str, port: &str) -> IdentityCache {
         let file = match Directory::open(root) {
             Ok(Some(directory)) => directory.file_or_new(&format!("{name}.sensor")).map(Some),
             nowhere => nowhere.map(|_| None),
         };
         let file = file.inspect_err(|error| tracing::debug!(%error, "{name}: what is known cannot be kept"));
-        Memory { file: file.ok().flatten(), port: port.to_owned(), record: Vec::new(), identity: None }
+        IdentityCache { file: file.ok().flatten(), port: port.to_owned(), record: Vec::new(), identity: None }
     }
 
     /// What the hub before this one knew, if that was just now and of this port.
@@ -89,24 +89,24 @@ mod tests {
         Directory::make(&root).unwrap();
         let identity = |byte: u8| Identity::from_bytes([byte; Identity::LEN]);
         let (now, port) = (9_000 * MILLIS, "/dev/ttyUSB0");
-        let mut memory = Memory::open(&root, "front", port);
+        let mut memory = IdentityCache::open(&root, "front", port);
         assert_eq!(memory.recall(now), None, "the first one");
         memory.write(identity(1), now - 1);
         memory.write(identity(2), now);
-        let next = |name, port, now| Memory::open(&root, name, port).recall(now);
+        let next = |name, port, now| IdentityCache::open(&root, name, port).recall(now);
         assert_eq!(next("front", port, now + FRESH - 1), Some(identity(2)));
         assert_eq!(next("front", port, now + FRESH), None, "too old");
         assert_eq!(next("front", port, now - 1), None, "of another life of the machine");
         assert_eq!(next("rear", port, now), None);
         assert_eq!(next("front", "/dev/ttyUSB", now), None);
         assert_eq!(next("front", "/dev/ttyUSB01", now), None);
-        let mut other = Memory::open(&root, "front", "/dev/x");
+        let mut other = IdentityCache::open(&root, "front", "/dev/x");
         other.write(identity(3), now);
         assert_eq!((next("front", "/dev/x", now), next("front", port, now)), (Some(identity(3)), None));
         std::fs::write(root.join("front.sensor"), [0; 9]).unwrap();
         assert_eq!(next("front", port, now), None, "cut short");
         // Where nothing can be kept, nothing is known.
-        let mut nowhere = Memory::open(&root.join("nowhere"), "front", port);
+        let mut nowhere = IdentityCache::open(&root.join("nowhere"), "front", port);
         nowhere.write(identity(1), now);
         assert_eq!(nowhere.recall(now), None);
         std::fs::remove_dir_all(&base).unwrap();

@@ -57,7 +57,7 @@ enum Next {
 
 /// What a link is to do.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub(super) enum Turn {
+pub(crate) enum Turn {
     /// It is its turn.
     Now(Due),
     /// It will be its turn then.
@@ -72,11 +72,11 @@ pub(super) enum Turn {
 
 /// When something plays.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub(super) struct Due {
+pub(crate) struct Due {
     /// The moment for which it stands.
-    pub(super) at: Nanos,
+    pub(crate) at: Nanos,
     /// How many times longer than in the recording it takes until the next.
-    pub(super) stretch: f64,
+    pub(crate) stretch: f64,
 }
 
 impl Playback {
