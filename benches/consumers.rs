@@ -155,7 +155,7 @@ fn sum_of_missed(lines: &[Line]) -> Outcome<f64> {
 }
 
 fn counter(stage: &Stage, counter: Counter) -> Outcome<f64> {
-    let mut status = consumer::attach::<Status>(stage.domain.name(), SENSOR)?.timeout(PATIENCE);
+    let mut status = consumer::subscribe::<Status>(stage.domain.name(), SENSOR)?.timeout(PATIENCE);
     Ok(status.next()?.ok_or("no status")?.counters[counter] as f64)
 }
 

@@ -147,7 +147,7 @@ fn counters(stage: &Stage) -> Outcome<(f64, f64)> {
     let mut sum = (0, 0);
     for sensor in SENSORS {
         let mut statuses =
-            consumer::attach::<Status>(stage.domain.name(), sensor)?.timeout(Duration::from_secs(3));
+            consumer::subscribe::<Status>(stage.domain.name(), sensor)?.timeout(Duration::from_secs(3));
         let status = statuses.next()?.ok_or("no status")?;
         sum.0 += status.counters[Counter::Wakeups];
         sum.1 += status.counters[Counter::Telegrams];

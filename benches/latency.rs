@@ -1,5 +1,5 @@
 //! How old is a telegram when a consumer has it? From the last byte written into the pty (the simulator's own stamp) to
-//! the sample in the hands of another process that sleeps at the attach library, at 37.5 Hz from each of two sensors,
+//! the sample in the hands of another process that sleeps at the client library, at 37.5 Hz from each of two sensors,
 //! beside a bare chain with the same late read: pty, process, eventfd, process. Sent and received are matched by hash.
 //! It does not tell when a beam was measured, nor what an adapter adds.
 

@@ -1,5 +1,5 @@
 //! What does recording everything from two sensors cost, how much is a scan in the file, and what does a `kill -9` of the
-//! recorder cost the recording? It does not tell what a slow disk does: that is what tests/record_disk.rs is for.
+//! recorder cost the recording? It does not tell what a slow disk does: that is what tests/it/record_disk.rs is for.
 
 mod support;
 

@@ -106,7 +106,7 @@ fn look(stage: &Stage, size: (u16, u16), span: Duration) -> Outcome<Seen> {
     let frames = Arc::new(Mutex::new(Vec::new()));
     let to = frames.clone();
     thread::spawn(move || read(keys, &to));
-    let mut scans = consumer::attach::<Scan>(stage.domain.name(), SENSORS[0])?.timeout(PATIENCE);
+    let mut scans = consumer::subscribe::<Scan>(stage.domain.name(), SENSORS[0])?.timeout(PATIENCE);
     let begin = clock::now() + SETTLING.as_nanos() as u64;
     while clock::now() < begin {
         scans.next()?.ok_or("no scan")?;

@@ -27,8 +27,8 @@ use std::time::Duration;
 
 use ::config::Sources;
 use clap::{Args, Command, CommandFactory, FromArgMatches, Parser, Subcommand};
-use clients::{Bounds, duration};
 use schema::{DEFAULT_DOMAIN, Domain, Environment, Failure};
+use verbs::{Bounds, duration};
 
 pub(crate) use self::config::Config;
 pub(crate) use background::Background;

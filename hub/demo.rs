@@ -14,10 +14,10 @@ use std::sync::mpsc::{self, RecvTimeoutError};
 use std::thread;
 use std::time::{Duration, Instant};
 
-use clients::{Bounds, WatchOptions};
 use schema::{Domain, Failure, Kind};
 use serde::Serialize;
 use serde_json::Value;
+use verbs::{Bounds, WatchOptions};
 
 use crate::cli::watch::{can_show_pictures, colours};
 use account::Account;
@@ -93,7 +93,7 @@ fn play_with_picture(
             play(options, stage, &mut |_, _| {}, &is_stopped)
         });
         let closing = Raise(&closed);
-        let shown = clients::watch(&picture, out, &over);
+        let shown = verbs::watch(&picture, out, &over);
         drop(closing);
         let played = play.join().unwrap_or_else(|panic| std::panic::resume_unwind(panic));
         shown.and(played)

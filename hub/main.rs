@@ -16,13 +16,13 @@ use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
 
 use clap::error::ErrorKind;
-use clients::{EchoOptions, Format, HzOptions, InfoOptions, ListOptions};
 use config::Config;
 use rustix::process::Signal;
 use schema::{Domain, Failure, Kind, Printable, json_line};
 use serde::Serialize;
 use signal_hook::consts::{SIGHUP, SIGINT, SIGQUIT, SIGTERM, SIGUSR1};
 use tracing::level_filters::LevelFilter;
+use verbs::{EchoOptions, Format, HzOptions, InfoOptions, ListOptions};
 
 use cli::{Cli, Everywhere, Verb, Way};
 use demo::DemoOptions;
@@ -92,15 +92,15 @@ fn dispatch(cli: &Cli) -> Result<(), Failure> {
         Verb::Man(man) => man.run(),
         Verb::Config(config) => config.run(everywhere),
         Verb::Doctor(doctor) => doctor.run(everywhere, &*interrupt()?),
-        Verb::List { domains: true } => clients::list_domains(&everywhere.bases(), everywhere.json, &mut out),
+        Verb::List { domains: true } => verbs::list_domains(&everywhere.bases(), everywhere.json, &mut out),
         Verb::List { domains: false } => {
             let options = ListOptions { json: everywhere.json, places: everywhere.places()? };
-            clients::list(&options, &mut out, &*interrupt()?)
+            verbs::list(&options, &mut out, &*interrupt()?)
         }
         Verb::Info { sensor } => {
             let options =
                 InfoOptions { sensor: sensor.clone(), json: everywhere.json, places: everywhere.places()? };
-            clients::info(&options, &mut out, &*interrupt()?)
+            verbs::info(&options, &mut out, &*interrupt()?)
         }
         Verb::Echo(echo) => {
             let format = match (everywhere.json, echo.csv, echo.raw) {
@@ -115,7 +115,7 @@ fn dispatch(cli: &Cli) -> Result<(), Failure> {
                 bounds: echo.limits.bounds(),
                 places: everywhere.places()?,
             };
-            clients::echo(&options, &mut out, &mut io::stderr(), &*interrupt()?)
+            verbs::echo(&options, &mut out, &mut io::stderr(), &*interrupt()?)
         }
         Verb::Hz(hz) => {
             let options = HzOptions {
@@ -125,15 +125,15 @@ fn dispatch(cli: &Cli) -> Result<(), Failure> {
                 bounds: hz.limits.bounds(),
                 places: everywhere.places()?,
             };
-            clients::hz(&options, &mut out, &mut io::stderr(), &*interrupt()?)
+            verbs::hz(&options, &mut out, &mut io::stderr(), &*interrupt()?)
         }
         Verb::Latency(latency) => {
-            clients::latency(&latency.options(everywhere)?, &mut out, &mut io::stderr(), &*interrupt()?)
+            verbs::latency(&latency.options(everywhere)?, &mut out, &mut io::stderr(), &*interrupt()?)
         }
         Verb::Watch(watch) => {
             // The terminal is given back, whoever ends it.
             let stop = interrupt_by(&ENDS)?;
-            clients::watch(&watch.options(everywhere)?, &mut out, &stop)
+            verbs::watch(&watch.options(everywhere)?, &mut out, &stop)
         }
         Verb::Record(record) => {
             let options = record.options(everywhere)?;
@@ -141,27 +141,27 @@ fn dispatch(cli: &Cli) -> Result<(), Failure> {
             let stop = interrupt_by(&ENDS)?;
             let mut stderr = io::stderr();
             match record.is_to_stdout() {
-                true => clients::record(&options, &mut io::stderr(), &mut stderr, &stop),
-                false => clients::record(&options, &mut out, &mut stderr, &stop),
+                true => verbs::record(&options, &mut io::stderr(), &mut stderr, &stop),
+                false => verbs::record(&options, &mut out, &mut stderr, &stop),
             }
         }
-        Verb::Control(control) => clients::control(&control.options(everywhere)?, &mut out, &*interrupt()?),
+        Verb::Control(control) => verbs::control(&control.options(everywhere)?, &mut out, &*interrupt()?),
         Verb::Background(background) => {
             // A model is read before Ctrl-C is a flag, which would not end a person's typing.
             let options = background.options(everywhere)?;
-            clients::background(&options, &mut out, &*interrupt()?)
+            verbs::background(&options, &mut out, &*interrupt()?)
         }
         Verb::Zones(zones) => zones.run(everywhere, &mut out, &*interrupt()?),
         Verb::Leds(leds) => {
-            clients::leds(&leds.options(everywhere)?, &mut out, &mut io::stderr(), &*interrupt()?)
+            verbs::leds(&leds.options(everywhere)?, &mut out, &mut io::stderr(), &*interrupt()?)
         }
         Verb::Gateway(gateway) => {
             let (tell, stop) = (interrupt_by(&[SIGUSR1])?, interrupt()?);
-            clients::gateway(&gateway.options(everywhere)?, &mut out, &mut io::stderr(), &tell, &stop)
+            verbs::gateway(&gateway.options(everywhere)?, &mut out, &mut io::stderr(), &tell, &stop)
         }
         Verb::Listen(listen) => {
             let (tell, stop) = (interrupt_by(&[SIGUSR1])?, interrupt()?);
-            clients::listen(&listen.options(everywhere)?, &mut out, &mut io::stderr(), &tell, &stop)
+            verbs::listen(&listen.options(everywhere)?, &mut out, &mut io::stderr(), &tell, &stop)
         }
     }
 }
@@ -284,8 +284,8 @@ fn say(line: &str) {
 
 fn report(failure: &Failure, json: bool, quiet: bool) {
     match (json, quiet) {
-        (true, false) => say(&clients::error_line(failure)),
-        (true, true) => complain(&clients::error_line(failure)),
+        (true, false) => say(&verbs::error_line(failure)),
+        (true, true) => complain(&verbs::error_line(failure)),
         (false, _) => complain(&format!("scanhub: {failure}")),
     }
 }
@@ -316,5 +316,6 @@ fn start_log() {
         .with_writer(|| replay::line::Log)
         .with_max_level(level.unwrap_or(LevelFilter::INFO))
         .with_target(false)
+        .with_ansi(false)
         .init();
 }

@@ -42,7 +42,7 @@ pub(crate) fn play(task: &Task, number: usize, address: &str) -> Outcome<()> {
 fn inlet(task: &Task, number: usize, address: &str) -> Outcome<Box<dyn Inlet>> {
     Ok(match task.way {
         Way::Doorbell | Way::Event | Way::Spin => Box::new(topic::BytesInlet::new(task)?),
-        Way::Attachment => Box::new(topic::ScansInlet::new(task)?),
+        Way::Subscription => Box::new(topic::ScansInlet::new(task)?),
         Way::Multicast | Way::UnixDatagram => {
             Box::new(datagrams::DatagramsInlet::new(task, number, address)?)
         }

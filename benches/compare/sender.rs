@@ -96,7 +96,7 @@ pub(crate) fn busy_ns() -> u64 {
 fn outlet(task: &Task) -> Outcome<Box<dyn Outlet>> {
     Ok(match task.way {
         Way::Doorbell | Way::Event | Way::Spin => Box::new(topic::Bytes::new(task)?),
-        Way::Attachment => Box::new(topic::Scans::new(task)?),
+        Way::Subscription => Box::new(topic::Scans::new(task)?),
         Way::Multicast | Way::UnixDatagram => Box::new(datagrams::Datagrams::new(task)?),
         Way::UnixStream | Way::Tcp | Way::Pipe => Box::new(streams::Streams::new(task)?),
         Way::FutexFloor | Way::SpinFloor => Box::new(floors::Word::new(task)?),

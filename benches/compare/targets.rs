@@ -16,7 +16,7 @@ pub(crate) fn print(options: &Options, cells: &[Cell]) {
     for cell in cells.iter().filter(|cell| cell.is_paced()) {
         verdicts.extend(of_waits(cell, cells));
         verdicts.extend(of_spinning(cell, cells));
-        verdicts.extend(of_attaching(cell, cells));
+        verdicts.extend(of_subscriptions(cell, cells));
         verdicts.extend(of_many(cell, cells));
     }
     verdicts.extend(of_sockets(cells));
@@ -100,10 +100,10 @@ fn of_spinning(cell: &Cell, cells: &[Cell]) -> Option<Verdict> {
     Some(Verdict { target: format!("<= {MOST_US} us where processors are free"), is_met, ..verdict })
 }
 
-/// The attach library beside the path that is used for all lengths here.
-fn of_attaching(cell: &Cell, cells: &[Cell]) -> Option<Verdict> {
+/// The client library beside the path that is used for all lengths here.
+fn of_subscriptions(cell: &Cell, cells: &[Cell]) -> Option<Verdict> {
     const COST: (&str, Of) = ("receiver's processor time", |run| run.receiver_us);
-    if cell.case.way != Way::Attachment {
+    if cell.case.way != Way::Subscription {
         return None;
     }
     let path = beside(cell, cells, Way::Doorbell)?;

@@ -1,8 +1,8 @@
 //! Topics: a service with the settings of the hub's own, for messages of any length, and the hub's own topic of scans for
 //! comparison. Published as the hub does: loaned, written in place, sent, then all are woken once.
 
-use clients::Attachment;
 use iceoryx2::prelude::ServiceName;
+use scanhub_client::Subscription;
 use schema::ipc::{
     self, Bell, Listener, Node, Payload, Publisher, SampleMut, Subscriber, TopicService, Waker,
 };
@@ -106,7 +106,7 @@ pub(crate) struct BytesInlet {
     _node: Node,
 }
 
-/// What it waits at, as the attach library does.
+/// What it waits at, as the client library does.
 enum Wait {
     /// How often the bell was rung when samples were last looked for; whether it sleeps.
     Bell(Bell, u32, bool),
@@ -209,12 +209,12 @@ impl Outlet for Scans {
     }
 }
 
-/// The attach library at it.
-pub(crate) struct ScansInlet(Attachment<Scan>);
+/// The client library at it.
+pub(crate) struct ScansInlet(Subscription<Scan>);
 
 impl ScansInlet {
     pub(crate) fn new(task: &Task) -> Outcome<ScansInlet> {
-        let mut scans = consumer::attach::<Scan>(task.domain, SENSOR)?;
+        let mut scans = consumer::subscribe::<Scan>(task.domain, SENSOR)?;
         // Joins the domain; nothing is sent yet.
         scans.try_next()?;
         Ok(ScansInlet(scans))

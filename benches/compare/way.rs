@@ -11,8 +11,8 @@ pub(crate) enum Way {
     Event,
     /// A topic; receivers look at its doorbell all the time.
     Spin,
-    /// The scan topic itself, followed by the attach library as programs do.
-    Attachment,
+    /// The scan topic itself, followed by the client library as programs do.
+    Subscription,
     /// Datagrams to a UDP multicast group on the loopback.
     Multicast,
     /// A Unix datagram socket for each receiver.
@@ -37,7 +37,7 @@ impl Way {
         Way::Doorbell,
         Way::Event,
         Way::Spin,
-        Way::Attachment,
+        Way::Subscription,
         Way::Multicast,
         Way::UnixDatagram,
         Way::UnixStream,
@@ -54,7 +54,7 @@ impl Way {
             Way::Doorbell => "topic, doorbell",
             Way::Event => "topic, event",
             Way::Spin => "topic, spinning",
-            Way::Attachment => "topic, Attachment::next",
+            Way::Subscription => "topic, Subscription::next",
             Way::Multicast => "UDP multicast",
             Way::UnixDatagram => "Unix datagrams",
             Way::UnixStream => "Unix streams",
@@ -87,13 +87,13 @@ impl Way {
     }
 
     /// Whether it is run with so many receivers and messages of this size. Who spins needs a processor for itself, and
-    /// so does the sender; a floor is between two processes; the attach library is compared once, for what it is used.
+    /// so does the sender; a floor is between two processes; the client library is compared once, for what it is used.
     pub(crate) fn runs(self, receivers: usize, payload: usize, processors: usize) -> bool {
         match self {
             Way::Spin => receivers < processors,
             Way::SpinFloor => receivers == 1 && processors > 1,
             Way::FutexFloor | Way::EventfdFloor => receivers == 1,
-            Way::Attachment => receivers == 1 && payload == size_of::<schema::Scan>(),
+            Way::Subscription => receivers == 1 && payload == size_of::<schema::Scan>(),
             _ => true,
         }
     }

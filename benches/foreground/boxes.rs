@@ -4,8 +4,8 @@
 use schema::Scan;
 use sim::look::Met;
 
-use crate::method::Method;
-use crate::play::Frame;
+use super::method::Method;
+use super::play::Frame;
 
 /// Scans until a surface is background: the default at half degrees.
 const N: usize = 375;

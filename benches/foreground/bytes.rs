@@ -4,7 +4,7 @@ use preprocess::background::{Model, Settings};
 use preprocess::segments::Segmenter;
 use schema::{Foreground, Pose};
 
-use crate::play::Frame;
+use super::play::Frame;
 
 /// Bytes of payloads over some runs, without headers.
 #[derive(Clone, Copy, Debug, Default)]

@@ -7,7 +7,7 @@ use sim::look::Met;
 use sim::room::Room;
 use sim::world::World;
 
-use crate::seen;
+use super::seen;
 
 /// A scene of the table, 2000 scans of it, 53 s.
 #[derive(Clone, Copy)]

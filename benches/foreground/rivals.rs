@@ -3,7 +3,7 @@
 
 use schema::Scan;
 
-use crate::method::Method;
+use super::method::Method;
 
 /// The background is the median of what each beam told in the first [`TEACH_SCANS`] scans, for ever; nearer by more
 /// than 30 mm (60 in cm mode) is foreground.

@@ -2,8 +2,8 @@
 
 use std::ops::AddAssign;
 
-use crate::method::Method;
-use crate::play::{Due, Frame};
+use super::method::Method;
+use super::play::{Due, Frame};
 
 /// Beams by what was due and what was told.
 #[derive(Clone, Copy, Debug, Default)]

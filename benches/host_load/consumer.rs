@@ -13,7 +13,7 @@ use schema::{Foreground, Scan, Zones};
 
 use crate::line::account::Parser;
 use crate::rivals::Discarding;
-use crate::support::consumer::attach;
+use crate::support::consumer::subscribe;
 use crate::support::line::Line;
 use crate::support::stage::SENSORS;
 use crate::support::{Outcome, clock};
@@ -57,7 +57,7 @@ pub(crate) fn datagrams(port: u16) -> Outcome<()> {
 /// Follows the hub's scans and looks at every range.
 pub(crate) fn scans(domain: &str) -> Outcome<()> {
     for_both(|number, progress| {
-        let mut scans = attach::<Scan>(domain, SENSORS[number])?;
+        let mut scans = subscribe::<Scan>(domain, SENSORS[number])?;
         loop {
             let Some(scan) = scans.next()? else { continue };
             black_box(scan.ranges().iter().map(|&range| u32::from(range)).sum::<u32>());
@@ -69,8 +69,8 @@ pub(crate) fn scans(domain: &str) -> Outcome<()> {
 /// Follows the hub's verdicts and what stands before the background, and looks at both.
 pub(crate) fn results(domain: &str) -> Outcome<()> {
     for_both(|number, progress| {
-        let mut foreground = attach::<Foreground>(domain, SENSORS[number])?;
-        let mut zones = attach::<Zones>(domain, SENSORS[number])?;
+        let mut foreground = subscribe::<Foreground>(domain, SENSORS[number])?;
+        let mut zones = subscribe::<Zones>(domain, SENSORS[number])?;
         loop {
             let Some(foreground) = foreground.next()? else { continue };
             black_box((foreground.beams, foreground.segments().len()));

@@ -6,7 +6,7 @@
 mod damage;
 mod hop;
 mod load;
-#[path = "../../tests/stage/machine.rs"]
+#[path = "../../tests/testkit/machine.rs"]
 #[allow(dead_code)] // Tests use more of it.
 mod machine;
 mod pulled;

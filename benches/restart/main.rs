@@ -6,7 +6,7 @@
 //! service manager takes to notice.
 
 mod kept;
-#[path = "../../tests/stage/supervisor.rs"]
+#[path = "../../tests/testkit/supervisor.rs"]
 mod supervisor;
 #[path = "../support/mod.rs"]
 mod support;

@@ -6,11 +6,11 @@ use std::sync::Barrier;
 use std::thread;
 use std::time::Duration;
 
-use clients::Wait;
+use scanhub_client::Wait;
 use schema::Scan;
 
 use crate::support::child::Child;
-use crate::support::consumer::attach;
+use crate::support::consumer::subscribe;
 use crate::support::figures::percentile;
 use crate::support::memory::{Resident, segments};
 use crate::support::options::Options;
@@ -59,7 +59,7 @@ pub(crate) fn follow(domain: &str, sensor: &str, count: usize, seconds: u64, wai
     let wait = if wait == "event" { Wait::Event } else { Wait::Doorbell };
     let all = Barrier::new(count + 1);
     let follow = || -> Result<(Vec<(u64, u64)>, u64), String> {
-        let attached = attach::<Scan>(domain, sensor).map(|scans| scans.wait_by(wait).timeout(PATIENCE));
+        let attached = subscribe::<Scan>(domain, sensor).map(|scans| scans.wait_by(wait).timeout(PATIENCE));
         let attached = attached
             .and_then(|mut scans| scans.next()?.map(drop).map_or(Err("nothing came".into()), |()| Ok(scans)));
         // One that cannot come is not waited for by the others.

@@ -1,9 +1,9 @@
-//! A consumer of the hub as a process of its own: follows a topic with the attach library, wakes by event, stamps what
+//! A consumer of the hub as a process of its own: follows a topic with the client library, wakes by event, stamps what
 //! it has in its hands.
 
 use std::io::Write;
 
-use clients::Attachment;
+use scanhub_client::Subscription;
 use schema::ipc::Payload;
 use schema::{Domain, Environment, Header, Scan, Status, Zones};
 
@@ -11,7 +11,7 @@ use super::{Outcome, clock, truth};
 
 /// Follows the scans of `sensor` for ever; prints when the first of each hub's life came.
 pub(crate) fn scans(domain: &str, sensor: &str) -> Outcome<()> {
-    let mut scans = attach::<Scan>(domain, sensor)?;
+    let mut scans = subscribe::<Scan>(domain, sensor)?;
     let mut boot = 0;
     println!("attaching {sensor}");
     loop {
@@ -25,7 +25,7 @@ pub(crate) fn scans(domain: &str, sensor: &str) -> Outcome<()> {
 
 /// Follows the scans of `sensor` for ever; prints each as it comes: `scanned SENSOR RECEIVED_NS BOOT`.
 pub(crate) fn each_scan(domain: &str, sensor: &str) -> Outcome<()> {
-    let mut scans = attach::<Scan>(domain, sensor)?;
+    let mut scans = subscribe::<Scan>(domain, sensor)?;
     println!("attaching {sensor}");
     loop {
         let Some(scan) = scans.next()? else { continue };
@@ -37,7 +37,7 @@ pub(crate) fn each_scan(domain: &str, sensor: &str) -> Outcome<()> {
 /// prints each as it comes. A line is `telegram SENSOR RECEIVED_NS BOOT MISSED INTACT HASH
 /// READ_NS`, the last the hub's stamp of the last byte.
 pub(crate) fn telegrams(domain: &str, sensor: &str, count: usize) -> Outcome<()> {
-    let mut telegrams = attach::<[u8]>(domain, sensor)?;
+    let mut telegrams = subscribe::<[u8]>(domain, sensor)?;
     let mut kept = Vec::with_capacity(count);
     let mut out = std::io::stdout().lock();
     writeln!(out, "attaching {sensor}")?;
@@ -74,7 +74,7 @@ pub(crate) fn ages(topic: &str, domain: &str, sensor: &str, count: usize) -> Out
 }
 
 fn collect_ages<P: Payload>(domain: &str, sensor: &str, count: usize) -> Outcome<Vec<u64>> {
-    let mut samples = attach::<P>(domain, sensor)?;
+    let mut samples = subscribe::<P>(domain, sensor)?;
     let mut ages = Vec::with_capacity(count);
     println!("attaching {sensor}");
     while ages.len() < count {
@@ -86,7 +86,7 @@ fn collect_ages<P: Payload>(domain: &str, sensor: &str, count: usize) -> Outcome
 
 /// Follows the status of `sensor` for ever; prints each: `status SENSOR STATE SINCE_NS BOOT`.
 pub(crate) fn statuses(domain: &str, sensor: &str) -> Outcome<()> {
-    let mut statuses = attach::<Status>(domain, sensor)?;
+    let mut statuses = subscribe::<Status>(domain, sensor)?;
     println!("attaching {sensor}");
     loop {
         let Some(status) = statuses.next()? else { continue };
@@ -95,10 +95,10 @@ pub(crate) fn statuses(domain: &str, sensor: &str) -> Outcome<()> {
     }
 }
 
-/// Attaches in the place where the hub of this domain puts itself.
-pub(crate) fn attach<P: Payload + ?Sized>(domain: &str, sensor: &str) -> Outcome<Attachment<P>> {
+/// Subscribes in the place where the hub of this domain puts itself.
+pub(crate) fn subscribe<P: Payload + ?Sized>(domain: &str, sensor: &str) -> Outcome<Subscription<P>> {
     let places = Domain::candidates(domain, None, &Environment::of_process())?;
-    Ok(Attachment::in_domain(places, sensor)?)
+    Ok(Subscription::in_domain(places, sensor)?)
 }
 
 struct Found {

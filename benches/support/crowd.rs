@@ -7,7 +7,7 @@ use std::time::Duration;
 
 use schema::{Scan, limits};
 
-use super::consumer::attach;
+use super::consumer::subscribe;
 use super::{Outcome, clock};
 
 /// Follows the scans of `sensor` with `count` consumers for `seconds` from when all of them have one; prints for each
@@ -34,7 +34,7 @@ pub(crate) fn follow(domain: &str, sensor: &str, count: usize, seconds: u64) -> 
 
 /// Takes all the samples that `count` consumers may hold, says so, and stays.
 pub(crate) fn hold(domain: &str, sensor: &str, count: usize) -> Outcome<()> {
-    let mut consumers = (0..count).map(|_| attach::<Scan>(domain, sensor)).collect::<Outcome<Vec<_>>>()?;
+    let mut consumers = (0..count).map(|_| subscribe::<Scan>(domain, sensor)).collect::<Outcome<Vec<_>>>()?;
     let mut held = Vec::new();
     for consumer in &mut consumers {
         for _ in 0..limits::BORROWED {
@@ -51,7 +51,7 @@ pub(crate) fn hold(domain: &str, sensor: &str, count: usize) -> Outcome<()> {
 pub(crate) fn stay(domain: &str, sensor: &str, count: usize) -> Outcome<()> {
     let mut consumers = Vec::new();
     for _ in 0..count {
-        let mut consumer = attach::<Scan>(domain, sensor)?.timeout(LONG);
+        let mut consumer = subscribe::<Scan>(domain, sensor)?.timeout(LONG);
         if let Err(failure) = consumer.next() {
             println!("refused {} {}", consumers.len(), failure.message);
             break;
@@ -74,10 +74,11 @@ struct Counted {
 }
 
 fn count_scans(domain: &str, sensor: &str, all: &Barrier, seconds: u64) -> Outcome<Counted> {
-    let last =
-        |scan: Option<clients::Received<Scan>>| Ok::<_, &str>(scan.ok_or("nothing came")?.header().topic_seq);
+    let last = |scan: Option<scanhub_client::Received<Scan>>| {
+        Ok::<_, &str>(scan.ok_or("nothing came")?.header().topic_seq)
+    };
     let attached = || -> Outcome<_> {
-        let mut scans = attach::<Scan>(domain, sensor)?.timeout(LONG);
+        let mut scans = subscribe::<Scan>(domain, sensor)?.timeout(LONG);
         last(scans.next()?)?;
         Ok(scans)
     };

@@ -1,12 +1,11 @@
-//! The program of docs/first-consumer.md, which shows all below this: `cargo run --release -p scanhub-clients --example first`.
+//! The program of docs/first-consumer.md, which shows all below this: `cargo run --release -p scanhub-client --example first`.
 
 use std::time::Duration;
 
-use clients::attach;
-use schema::{Failure, Scan};
+use scanhub_client::{Failure, Scan, subscribe};
 
 fn main() -> Result<(), Failure> {
-    let mut scans = attach::<Scan>("front")?.timeout(Duration::from_millis(500));
+    let mut scans = subscribe::<Scan>("front")?.timeout(Duration::from_millis(500));
     loop {
         let Some(scan) = scans.next()? else {
             println!("no scan for half a second; there is a hub: {}", scans.hub_lives());

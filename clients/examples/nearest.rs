@@ -1,11 +1,10 @@
 //! The nearest beam of every scan: `cargo run --example nearest front`.
 
-use clients::attach;
-use schema::{Failure, Scan};
+use scanhub_client::{Failure, Scan, subscribe};
 
 fn main() -> Result<(), Failure> {
     let sensor = std::env::args().nth(1).unwrap_or_else(|| "front".into());
-    let mut scans = attach::<Scan>(&sensor)?;
+    let mut scans = subscribe::<Scan>(&sensor)?;
     while let Some(scan) = scans.next()? {
         let distances = (0..scan.beams()).filter_map(|i| Some((scan.distance_mm(i)?, i)));
         if let Some((mm, i)) = distances.min() {

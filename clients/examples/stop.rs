@@ -1,7 +1,6 @@
 //! Whether the robot may go, said when it changes: `cargo run --example stop`.
 
-use clients::robot;
-use schema::Failure;
+use scanhub_client::{Failure, robot};
 
 fn main() -> Result<(), Failure> {
     let mut robot = robot(&[])?;

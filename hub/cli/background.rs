@@ -4,8 +4,8 @@ use std::io::stdin;
 use std::path::PathBuf;
 
 use clap::{Args, Subcommand};
-use clients::{BackgroundOptions, ModelOrder, saved_model};
 use schema::Failure;
+use verbs::{BackgroundOptions, ModelOrder, saved_model};
 
 use super::Everywhere;
 

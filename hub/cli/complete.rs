@@ -28,8 +28,8 @@ impl Complete {
         let root = root.as_deref().map(std::path::Path::new);
         let Ok(places) = Domain::candidates(&domain, root, &Environment::of_process()) else { return };
         let mut words = match name {
-            Name::Sensor => clients::live_sensors(&places),
-            Name::Topic => clients::live_topics(&places),
+            Name::Sensor => scanhub_client::live_sensors(&places),
+            Name::Topic => scanhub_client::live_topics(&places),
         };
         if line.takes_robot && !words.is_empty() {
             words.push(if name == Name::Sensor { "robot" } else { "robot/zones" }.to_owned());

@@ -2,8 +2,8 @@
 
 use clap::Args;
 use clap::builder::{PossibleValuesParser, TypedValueParser};
-use clients::ControlOptions;
 use schema::{Failure, Verb};
+use verbs::ControlOptions;
 
 use super::Everywhere;
 

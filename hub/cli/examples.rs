@@ -2,10 +2,10 @@
 //! so those of the pages.
 
 #[cfg(test)]
-#[path = "../../tests/pages/blocks.rs"]
+#[path = "../../tests/it/pages/blocks.rs"]
 mod blocks;
 #[cfg(test)]
-#[path = "../../tests/pages/shell.rs"]
+#[path = "../../tests/it/pages/shell.rs"]
 mod shell;
 
 use clap::Command;

@@ -4,9 +4,9 @@ use std::io::{IsTerminal, stdout};
 use std::time::Duration;
 
 use clap::Args;
-use clients::{GatewayLook, GatewayOptions, duration};
 use config::Sources;
 use schema::{Failure, Kind};
+use verbs::{GatewayLook, GatewayOptions, duration};
 
 use super::{Configured, Everywhere};
 

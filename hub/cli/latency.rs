@@ -4,8 +4,9 @@ use std::io::{IsTerminal, stdout};
 use std::time::Duration;
 
 use clap::{Args, ValueEnum};
-use clients::{LatencyOptions, Wait, duration};
+use scanhub_client::Wait;
 use schema::Failure;
+use verbs::{LatencyOptions, duration};
 
 use super::{Everywhere, Limits};
 

@@ -3,8 +3,8 @@
 use std::io::{IsTerminal, stdout};
 
 use clap::Args;
-use clients::ListenOptions;
 use schema::Failure;
+use verbs::ListenOptions;
 
 use super::{Everywhere, Limits};
 

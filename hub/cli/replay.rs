@@ -4,9 +4,9 @@ use std::path::PathBuf;
 use std::time::Duration;
 
 use clap::Args;
-use clients::duration;
 use daemon::{Pace, Play};
 use schema::{Failure, Kind};
+use verbs::duration;
 
 use super::Configured;
 

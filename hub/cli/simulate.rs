@@ -4,10 +4,10 @@ use std::path::PathBuf;
 use std::time::Duration;
 
 use clap::Args;
-use clients::duration;
 use schema::Failure;
 use sim::fault::Faults;
 use sim::options::{self, SimulateOptions};
+use verbs::duration;
 
 #[derive(Args, Debug)]
 pub(crate) struct Simulate {

@@ -3,8 +3,8 @@
 use std::io::{IsTerminal, stdout};
 
 use clap::Args;
-use clients::WatchOptions;
 use schema::{Failure, Kind};
+use verbs::WatchOptions;
 
 use super::{Everywhere, Limits};
 

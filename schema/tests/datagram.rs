@@ -5,7 +5,7 @@
 mod says;
 #[path = "datagram/values.rs"]
 mod values;
-#[path = "../../tests/lan/vectors.rs"]
+#[path = "../../tests/it/lan/vectors.rs"]
 mod vectors;
 
 use schema::Topic;

@@ -1,5 +1,5 @@
 //! What has to hold whatever comes: one function for each place where the world's bytes enter. The fuzzer calls them
-//! with what it invents, `tests/fuzzed.rs` with the corpus and with seeded noise. They know invariants, no examples.
+//! with what it invents, `tests/it/fuzzed.rs` with the corpus and with seeded noise. They know invariants, no examples.
 
 mod lan;
 mod processors;

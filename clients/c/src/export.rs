@@ -6,7 +6,7 @@ use std::ffi::{CStr, c_char, c_int};
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::time::Duration;
 
-use clients::{Wait, places};
+use scanhub_client::{Wait, places};
 use schema::Topic;
 
 use crate::boundary::{Lent, place, sample, text};

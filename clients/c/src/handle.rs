@@ -1,18 +1,18 @@
-//! An attachment as C sees it: of any topic, with a sample that a wait found and nobody took yet, and those that are lent.
+//! A subscription as C sees it: of any topic, with a sample that a wait found and nobody took yet, and those that are lent.
 
 use std::ffi::c_int;
 use std::os::fd::AsRawFd;
 use std::ptr;
 use std::time::{Duration, Instant};
 
-use clients::{Attachment, Heard, Received, RobotFollower, Wait, ZonesFollower};
+use scanhub_client::{Heard, Received, RobotFollower, Subscription, Wait, ZonesFollower};
 use schema::{Background, Domain, Failure, Foreground, Header, Marks, Scan, Status, Topic, limits};
 
 use crate::boundary::Lent;
 use crate::refusal::Refusal;
 use crate::robot::Told;
 
-/// An open attachment.
+/// An open subscription.
 pub(crate) struct Handle {
     // Before the source: they are given back to it.
     lent: [Option<(u64, Held)>; LENT],
@@ -27,7 +27,7 @@ const LENT: usize = limits::BORROWED;
 /// Declares the topics once, of which all but zones are followed alike; a robot is all zones in one.
 macro_rules! topics {
     ($($topic:ident $payload:ty;)*) => {
-        enum Source { Robot(RobotFollower), Zones(ZonesFollower), $($topic(Attachment<$payload>),)* }
+        enum Source { Robot(RobotFollower), Zones(ZonesFollower), $($topic(Subscription<$payload>),)* }
 
         enum Held { Robot(Told), Zones(Heard), $($topic(Received<$payload>),)* }
 
@@ -35,7 +35,7 @@ macro_rules! topics {
             fn open(places: Vec<Domain>, sensor: &str, topic: Topic, wait: Wait) -> Result<Source, Failure> {
                 Ok(match topic {
                     Topic::Zones => Source::Zones(ZonesFollower::in_domain(places, sensor)?.wait_by(wait)),
-                    $(Topic::$topic => Source::$topic(Attachment::in_domain(places, sensor)?.wait_by(wait)),)*
+                    $(Topic::$topic => Source::$topic(Subscription::in_domain(places, sensor)?.wait_by(wait)),)*
                 })
             }
 
@@ -43,7 +43,7 @@ macro_rules! topics {
                 Ok(match self {
                     Source::Robot(robot) => robot.try_next()?.map(Told::new).map(Held::Robot),
                     Source::Zones(zones) => zones.try_next()?.map(Held::Zones),
-                    $(Source::$topic(attachment) => attachment.try_next()?.map(Held::$topic),)*
+                    $(Source::$topic(subscription) => subscription.try_next()?.map(Held::$topic),)*
                 })
             }
 
@@ -51,7 +51,7 @@ macro_rules! topics {
                 match self {
                     Source::Robot(robot) => robot.wait(longest),
                     Source::Zones(zones) => zones.wait(longest),
-                    $(Source::$topic(attachment) => attachment.wait(longest),)*
+                    $(Source::$topic(subscription) => subscription.wait(longest),)*
                 }
             }
 
@@ -59,7 +59,7 @@ macro_rules! topics {
                 Ok(match self {
                     Source::Robot(robot) => robot.descriptor()?,
                     Source::Zones(zones) => zones.descriptor()?,
-                    $(Source::$topic(attachment) => attachment.descriptor()?,)*
+                    $(Source::$topic(subscription) => subscription.descriptor()?,)*
                 }.as_raw_fd())
             }
 
@@ -67,7 +67,7 @@ macro_rules! topics {
                 match self {
                     Source::Robot(robot) => robot.hub_lives(),
                     Source::Zones(zones) => zones.hub_lives(),
-                    $(Source::$topic(attachment) => attachment.hub_lives(),)*
+                    $(Source::$topic(subscription) => subscription.hub_lives(),)*
                 }
             }
         }
@@ -172,12 +172,12 @@ impl Handle {
         Ok(())
     }
 
-    /// As [`Attachment::descriptor`].
+    /// As [`Subscription::descriptor`].
     pub(crate) fn descriptor(&mut self) -> Result<c_int, Refusal> {
         Ok(self.source.descriptor()?)
     }
 
-    /// As [`Attachment::hub_lives`].
+    /// As [`Subscription::hub_lives`].
     pub(crate) fn hub_lives(&self) -> bool {
         self.source.hub_lives()
     }

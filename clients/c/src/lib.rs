@@ -1,6 +1,6 @@
-//! The attach library for programs in C and C++: `include/scanhub/attach.h` is its contract, this is what stands behind it.
+//! The client library for programs in C and C++: `include/scanhub/attach.h` is its contract, this is what stands behind it.
 //! A handle is a number, not an address: one that was closed, or is another thread's, is found out and not followed.
-//! Refuses to know how samples come: that is `clients`.
+//! Refuses to know how samples come: that is `scanhub_client`.
 
 mod boundary;
 mod export;

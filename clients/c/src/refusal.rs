@@ -10,7 +10,7 @@ use schema::{Failure, Kind};
 pub(crate) enum Refusal {
     /// The caller's fault: what is wrong with an argument, and what would be right.
     Argument(&'static str, &'static str),
-    /// What the attach library says.
+    /// What the client library says.
     Failure(Failure),
     /// A panic; its words went to stderr.
     Bug,

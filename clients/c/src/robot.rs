@@ -4,7 +4,7 @@
 use std::ffi::{CString, c_char};
 use std::ptr;
 
-use clients::Robot;
+use scanhub_client::Robot;
 
 /// `scanhub_robot` of the header.
 #[repr(C)]

@@ -1,10 +1,14 @@
 //! Recordings of real sensors through the framer: every telegram bit for bit at its place, nothing else, and a
 //! reason for every refused start byte. The recordings are no part of this project: without them the tests skip.
 
+#[path = "../../../tests/testkit/skip.rs"]
+mod skip;
+
 use lms::framer::{Found, Framer, Tally, VETO_HOLD};
 use lms::header::{Expect, StreamHeader};
 use lms::measured::MEASURED;
 use lms::telegram::{ACK, STX};
+use skip::skip;
 use std::path::PathBuf;
 
 /// A file of `$SCANHUB_DATA/captures` or `../shared/data/captures`.
@@ -15,7 +19,7 @@ fn capture(name: &str) -> Option<Vec<u8>> {
     match std::fs::read(&path) {
         Ok(bytes) => Some(bytes),
         Err(error) => {
-            eprintln!("skipped: {}: {error}", path.display());
+            skip("recordings", format!("{}: {error}", path.display()));
             None
         }
     }

@@ -3,6 +3,8 @@
 #![cfg(feature = "mcap")]
 
 mod folder;
+#[path = "../../../tests/testkit/skip.rs"]
+mod skip;
 mod written;
 
 use std::fs;
@@ -16,6 +18,7 @@ use lms::variant::{Mode, Unit};
 use recording::convert::{ConvertOptions, Target, convert};
 use recording::{Encoding, Form, Frame, Recording};
 use schema::Flags;
+use skip::skip;
 
 const CM: Encoding = Encoding { unit: Unit::Cm, mode: Mode(0) };
 
@@ -136,7 +139,7 @@ fn a_stream_of_a_real_sensor_comes_back() {
         PathBuf::from,
     );
     if !data.is_dir() {
-        println!("skipped: no recordings at {}", data.display());
+        skip("recordings", format!("none at {}", data.display()));
         return;
     }
     let folder = Folder::new("real");

@@ -1,5 +1,8 @@
 //! Recordings as files: what they are is told by their bytes, and what comes out of them is what went in.
 
+#[path = "../../../tests/testkit/skip.rs"]
+mod skip;
+
 use std::fs;
 use std::io::{Read, Write};
 use std::path::PathBuf;
@@ -12,6 +15,7 @@ use lms::reply;
 use lms::telegram::Telegram;
 use lms::variant::{Mode, Unit, Variant};
 use recording::{Encoding, Form, Recording};
+use skip::skip;
 
 const MM: Encoding = Encoding { unit: Unit::Mm, mode: Mode(1) };
 
@@ -163,7 +167,7 @@ fn recordings_of_real_sensors() {
         PathBuf::from,
     );
     if !data.is_dir() {
-        println!("skipped: no recordings at {}", data.display());
+        skip("recordings", format!("none at {}", data.display()));
         return;
     }
     let capture = Recording::open(data.join("captures/lms200_38400.bin")).unwrap();

@@ -3,6 +3,8 @@
 #![cfg(feature = "mcap")]
 
 mod folder;
+#[path = "../../../tests/testkit/skip.rs"]
+mod skip;
 
 use std::fs;
 use std::io::Read;
@@ -13,6 +15,7 @@ use lms::measured;
 use lms::reply;
 use lms::variant::{Mode, Unit};
 use recording::{Encoding, Frame, Recording};
+use skip::skip;
 
 #[test]
 fn a_log_comes_back_from_an_mcap_file() {
@@ -198,7 +201,7 @@ fn logs_of_real_sensors_come_back() {
         PathBuf::from,
     );
     if !data.is_dir() {
-        println!("skipped: no recordings at {}", data.display());
+        skip("recordings", format!("none at {}", data.display()));
         return;
     }
     let folder = Folder::new("real");

@@ -110,6 +110,10 @@ impl Receiver {
 const SAMPLE_POSITION: f64 = 0.45;
 
 #[cfg(test)]
+#[path = "../../../tests/testkit/skip.rs"]
+mod skip;
+
+#[cfg(test)]
 mod tests {
     use super::*;
     use std::collections::HashSet;
@@ -155,7 +159,7 @@ mod tests {
         let read = |name: &str| std::fs::read(data.join("captures").join(name));
         let (Ok(real), Ok(sent)) = (read("host19200_while_sensor_38400.bin"), read("lms200_38400.bin"))
         else {
-            println!("skipped: no recordings at {}", data.display());
+            super::skip::skip("recordings", format!("none at {}", data.display()));
             return;
         };
         let model = Receiver::new(38_400, 19_200).receive(&sent, true);

@@ -5,12 +5,14 @@
 //! next one goes on with it, so that who sleeps meanwhile is woken; a hub that ends closes it for good.
 #![allow(unsafe_code)]
 
+mod words;
+
 use std::fs::{File, OpenOptions};
 use std::io;
 use std::num::NonZeroU32;
 use std::os::unix::fs::OpenOptionsExt;
 use std::path::{Path, PathBuf};
-use std::sync::atomic::{AtomicU32, Ordering, fence};
+use std::sync::atomic::{AtomicU32, Ordering};
 
 use memmap2::{MmapOptions, MmapRaw};
 use rustix::fs::{FallocateFlags, OFlags, fallocate};
@@ -51,10 +53,7 @@ impl Ringer {
 
     /// Wakes all who sleep.
     pub(super) fn ring(&self) {
-        let rung = &self.page.words().rung;
-        rung.fetch_add(1, Ordering::Release);
-        // Nobody there is no error, and there is no other one for a word that is mapped.
-        let _ = futex::wake(rung, futex::Flags::empty(), i32::MAX as u32);
+        words::ring(&self.page.words().rung);
     }
 
     fn open(path: &Path) -> Result<Page, Refused> {
@@ -75,8 +74,7 @@ impl Ringer {
 impl Drop for Ringer {
     fn drop(&mut self) {
         // In this order: a hub that is killed in between leaves no page that looks alive and that nobody can find.
-        self.page.words().closed.store(1, Ordering::Relaxed);
-        self.ring();
+        words::close(&self.page.words().closed, &self.page.words().rung);
         let _ = std::fs::remove_file(&self.path);
     }
 }
@@ -112,10 +110,7 @@ impl Bell {
 
     /// How often it was rung, modulo 2^32. What was sent before that can be received after this.
     pub fn rung(&self) -> u32 {
-        // Only a relaxed load may touch memory that is mapped read-only.
-        let rung = self.0.words().rung.load(Ordering::Relaxed);
-        fence(Ordering::Acquire);
-        rung
+        words::rung(&self.0.words().rung)
     }
 
     /// Its hub has ended: nobody rings it any more.

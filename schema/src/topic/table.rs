@@ -37,6 +37,24 @@ macro_rules! for_each_topic {
     };
 }
 
+/// The type of a row's payload in [`for_each_topic!`](crate::for_each_topic), wherever that is called.
+///
+/// # Examples
+///
+/// ```
+/// assert_eq!(size_of::<schema::payload_type!(Scan)>(), 1216);
+/// let telegram: &schema::payload_type!([u8]) = &[2, 0x80];
+/// ```
+#[macro_export]
+macro_rules! payload_type {
+    ([u8]) => {
+        [u8]
+    };
+    ($payload:ident) => {
+        $crate::$payload
+    };
+}
+
 /// All that differs between topics, beside what their payloads say.
 #[derive(Clone, Copy, Debug)]
 pub struct Row {

@@ -1,0 +1,32 @@
+//! What time it is, on the clocks that matter here.
+
+use rustix::time::{ClockId, Timespec, clock_gettime};
+
+/// One moment on two clocks, in ns.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Moment {
+    /// CLOCK_MONOTONIC, the clock of all stamps; it stands still while the machine is suspended.
+    pub monotonic_ns: u64,
+    /// CLOCK_BOOTTIME: the same, and it goes on.
+    pub boottime_ns: u64,
+}
+
+/// This moment.
+pub fn now() -> Moment {
+    Moment { monotonic_ns: read(ClockId::Monotonic), boottime_ns: read(ClockId::Boottime) }
+}
+
+/// CLOCK_MONOTONIC alone, in ns.
+pub fn now_ns() -> u64 {
+    read(ClockId::Monotonic)
+}
+
+/// The wall clock, ns since 1970.
+pub fn wall_ns() -> u64 {
+    read(ClockId::Realtime)
+}
+
+fn read(clock: ClockId) -> u64 {
+    let Timespec { tv_sec, tv_nsec } = clock_gettime(clock);
+    tv_sec as u64 * 1_000_000_000 + tv_nsec as u64
+}

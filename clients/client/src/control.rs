@@ -1,0 +1,78 @@
+//! A request to the hub: asked, and waited for until the link has taken it.
+
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::thread::sleep;
+use std::time::{Duration, Instant};
+
+use schema::ipc::{self, ControlClient, Node};
+use schema::{Domain, Failure, Kind, Request, Shown, holder};
+
+use crate::presence::{GRACE, find};
+
+/// Asks the hub at the first live one of `places` for `request`, and answers what it answered.
+///
+/// [`Kind::NoHub`] within a second if there is none, or if it ends before it answers; [`Kind::NoTopic`] with the sensors
+/// that there are; [`Kind::Short`] if too much is asked at a time; [`Kind::Failed`] if the link cannot do it;
+/// [`Kind::Timeout`] if the hub does not answer: it is short of something, or the link is busy;
+/// [`Kind::Interrupted`] if `stop` is set.
+pub fn request(places: &[Domain], request: &Request, stop: &AtomicBool) -> Result<Option<Shown>, Failure> {
+    let domain = find(places)?;
+    let node = ipc::client_node(&domain)?;
+    ask(&open(&node)?, &domain, request, stop)
+}
+
+/// The control service; that of a hub that is just starting is waited for.
+fn open(node: &Node) -> Result<ControlClient, Failure> {
+    let give_up_at = Instant::now() + GRACE;
+    loop {
+        if let Some(client) = ControlClient::open(node)? {
+            return Ok(client);
+        }
+        if Instant::now() >= give_up_at {
+            return Err(Failure::new(Kind::NoHub, "the hub takes no requests", "it may be an older one"));
+        }
+        sleep(ASK_AGAIN);
+    }
+}
+
+fn ask(
+    client: &ControlClient,
+    domain: &Domain,
+    request: &Request,
+    stop: &AtomicBool,
+) -> Result<Option<Shown>, Failure> {
+    let pending = client.ask(request)?;
+    let give_up_at = Instant::now() + PATIENCE;
+    loop {
+        ipc::take_wakeups(&[client.responses()])?;
+        // In this order: what was answered before the hub went is an answer.
+        let lives = pending.is_open() && holder(domain.root())?.is_some();
+        if let Some(response) = pending.response()? {
+            return response.0;
+        }
+        if !lives {
+            let hint = "whether it was done is not known: `scanhub info` tells how the sensor is";
+            return Err(Failure::new(Kind::NoHub, "the hub went away before it answered", hint));
+        }
+        if stop.load(Ordering::Relaxed) {
+            return Err(Failure::new(Kind::Interrupted, "interrupted before the hub answered", ""));
+        }
+        if Instant::now() >= give_up_at {
+            let message =
+                format!("the hub did not answer for {} in {} s", request.sensor(), PATIENCE.as_secs());
+            let hint = format!(
+                "its log tells if it is short of something; `scanhub info {}` how it is",
+                request.sensor()
+            );
+            return Err(Failure::new(Kind::Timeout, message, hint));
+        }
+        ipc::sleep(&[client.responses()], LOOK_EVERY)?;
+    }
+}
+
+/// A link takes a request within milliseconds; one that opens its port may need longer.
+const PATIENCE: Duration = Duration::from_secs(5);
+/// How often the hub's life and the wish to stop are looked at.
+const LOOK_EVERY: Duration = Duration::from_millis(100);
+/// How often a service that is not there is asked for.
+const ASK_AGAIN: Duration = Duration::from_millis(10);

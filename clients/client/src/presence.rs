@@ -1,0 +1,206 @@
+//! Is there a hub, or a listener that stands for hubs of other machines, and where? Asks the locks of the places that a domain may be at; refuses to open anything there.
+
+use std::time::{Duration, Instant};
+
+use schema::{Domain, Failure, Kind, holder, publisher};
+
+/// How often the locks are looked at.
+const LOOK_EVERY: Duration = Duration::from_millis(100);
+
+/// How often the locks are looked at although the hub is heard.
+const MAKE_SURE_EVERY: Duration = Duration::from_secs(1);
+
+/// The hub of a domain, as far as its lock tells.
+pub(crate) struct Presence {
+    places: Vec<Domain>,
+    hub: Option<Holder>,
+    looked_at: Option<Instant>,
+    /// When the locks were asked last.
+    asked_at: Option<Instant>,
+    heard_at: Option<Instant>,
+    denied: Option<Failure>,
+}
+
+/// Who publishes in a domain. Where both are there the hub counts.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Who {
+    /// A hub.
+    Hub,
+    /// A listener that brings the sensors of other machines.
+    Listener,
+}
+
+#[derive(Clone, Debug, PartialEq, Eq)]
+struct Holder {
+    domain: Domain,
+    pid: u32,
+    who: Who,
+}
+
+/// What became different since the last look. Both: one was replaced in between.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Change {
+    /// Who was there is not there any more.
+    pub gone: Option<Who>,
+    /// Somebody is there who was not there before.
+    pub back: Option<Who>,
+}
+
+impl Change {
+    /// A listener that stays behind a hub has not come with that hub's end, and has not gone when a hub stands before it.
+    fn between(before: Option<&Holder>, now: Option<&Holder>) -> Change {
+        let who = |holder: Option<&Holder>| holder.map(|holder| holder.who);
+        let is_beside = before.zip(now).is_some_and(|(a, b)| a.domain == b.domain && a.who != b.who);
+        let counts = |who: &Who| !is_beside || *who == Who::Hub;
+        match before == now {
+            true => Change::default(),
+            false => Change { gone: who(before).filter(counts), back: who(now).filter(counts) },
+        }
+    }
+}
+
+impl Presence {
+    /// Watches for a hub at `places`; the first live one is taken.
+    pub(crate) fn new(places: Vec<Domain>) -> Presence {
+        Presence { places, hub: None, looked_at: None, asked_at: None, heard_at: None, denied: None }
+    }
+
+    /// A sign of life of the hub.
+    pub(crate) fn heard(&mut self) {
+        self.heard_at = Some(Instant::now());
+    }
+
+    /// Looks again, if the last look is long enough ago. A hub that is heard is seldom asked for.
+    pub(crate) fn look(&mut self) -> Change {
+        let now = Instant::now();
+        let is_within = |at: Option<Instant>, limit| at.is_some_and(|at| now - at < limit);
+        if is_within(self.looked_at, LOOK_EVERY) {
+            return Change::default();
+        }
+        self.looked_at = Some(now);
+        let is_heard = is_within(self.heard_at, LOOK_EVERY) && is_within(self.asked_at, MAKE_SURE_EVERY);
+        // One that is heard and was not there has come.
+        if is_heard && self.hub.is_some() {
+            return Change::default();
+        }
+        self.asked_at = Some(now);
+        self.denied = None;
+        let found = self.live();
+        let change = Change::between(self.hub.as_ref(), found.as_ref());
+        self.hub = found;
+        change
+    }
+
+    /// When it was looked for last.
+    pub(crate) fn looked_at(&self) -> Option<Instant> {
+        self.looked_at
+    }
+
+    /// Where the hub lives, if there is one.
+    pub(crate) fn domain(&self) -> Option<&Domain> {
+        self.hub.as_ref().map(|holder| &holder.domain)
+    }
+
+    /// Who publishes there.
+    pub(crate) fn who(&self) -> Option<Who> {
+        self.hub.as_ref().map(|holder| holder.who)
+    }
+
+    /// What to tell who cannot wait for a hub.
+    pub(crate) fn no_hub(&self) -> Failure {
+        if let Some(short) = self.short() {
+            return short;
+        }
+        let name = self.places.first().map(Domain::name).unwrap_or_default();
+        let roots: Vec<_> = self.places.iter().map(|place| place.root().display().to_string()).collect();
+        match &self.denied {
+            Some(Failure { message, hint, .. }) => Failure::new(
+                Kind::NoHub,
+                format!("no hub of this user in domain {name}: {message}"),
+                hint.clone(),
+            ),
+            None => {
+                let hint = format!("start one with `scanhub run`; looked at {}", roots.join(", "));
+                Failure::new(Kind::NoHub, format!("no hub in domain {name}"), hint)
+            }
+        }
+    }
+
+    /// Why it is not known whether there is a hub: there was not even a descriptor to look with.
+    pub(crate) fn short(&self) -> Option<Failure> {
+        self.denied.clone().filter(|denied| denied.kind == Kind::Short)
+    }
+
+    fn live(&mut self) -> Option<Holder> {
+        for place in &self.places {
+            let asked = holder(place.root()).and_then(|hub| match hub {
+                None => Ok((publisher(place.root())?, Who::Listener)),
+                hub => Ok((hub, Who::Hub)),
+            });
+            match asked {
+                // 0: it has the lock and not yet written who it is.
+                Ok((None | Some(0), _)) => {}
+                Ok((Some(pid), who)) => return Some(Holder { domain: place.clone(), pid, who }),
+                Err(failure) => self.denied = Some(failure),
+            }
+        }
+        None
+    }
+}
+
+/// The hub at the first live one of `places`, waiting a moment for one that is just starting.
+///
+/// [`Kind::NoHub`] after half a second.
+pub fn find(places: &[Domain]) -> Result<Domain, Failure> {
+    let give_up_at = Instant::now() + GRACE;
+    let mut presence = Presence::new(places.to_vec());
+    loop {
+        presence.look();
+        if let Some(domain) = presence.domain() {
+            return Ok(domain.clone());
+        }
+        if Instant::now() >= give_up_at {
+            return Err(presence.no_hub());
+        }
+        std::thread::sleep(LOOK_EVERY);
+    }
+}
+
+/// How long what has to be there may take to appear while a hub is starting: a verb without a hub ends within a second.
+pub const GRACE: Duration = Duration::from_millis(500);
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_hub_that_is_heard_is_not_asked_for_and_time_goes_on() {
+        let domain = Domain::at("presence", std::path::Path::new("/tmp/presence")).unwrap();
+        let mut presence = Presence::new(vec![domain.clone()]);
+        presence.hub = Some(Holder { domain, pid: 1, who: Who::Hub });
+        let long_ago = Instant::now().checked_sub(2 * LOOK_EVERY);
+        (presence.looked_at, presence.asked_at) = (long_ago, long_ago);
+        presence.heard();
+        assert_eq!(presence.look(), Change::default(), "nobody holds that place");
+        assert!(presence.looked_at() > long_ago && presence.asked_at == long_ago);
+        (presence.looked_at, presence.heard_at) = (long_ago, long_ago);
+        assert_eq!(presence.look(), Change { gone: Some(Who::Hub), back: None });
+    }
+
+    #[test]
+    fn a_listener_does_not_come_because_a_hub_goes() {
+        let domain = Domain::at("presence", std::path::Path::new("/tmp/presence")).unwrap();
+        let holder = |pid, who| Some(Holder { domain: domain.clone(), pid, who });
+        let (hub, other, listener) = (holder(1, Who::Hub), holder(2, Who::Hub), holder(3, Who::Listener));
+        let change = |before: &Option<Holder>, now: &Option<Holder>| {
+            let Change { gone, back } = Change::between(before.as_ref(), now.as_ref());
+            (gone, back)
+        };
+        assert_eq!(change(&None, &hub), (None, Some(Who::Hub)));
+        assert_eq!(change(&hub, &hub), (None, None));
+        assert_eq!(change(&hub, &other), (Some(Who::Hub), Some(Who::Hub)));
+        assert_eq!(change(&hub, &listener), (Some(Who::Hub), None));
+        assert_eq!(change(&listener, &hub), (None, Some(Who::Hub)));
+        assert_eq!(change(&listener, &None), (Some(Who::Listener), None));
+    }
+}

@@ -1,0 +1,203 @@
+//! A process's stay in a domain, over several lives of its hub: membership, what wakes it, and the news that a hub went or
+//! came. Refuses to know what is followed.
+
+use std::os::fd::{AsFd, BorrowedFd};
+use std::time::{Duration, Instant};
+
+use schema::ipc::{self, Node, Payload, Subscriber};
+use schema::{Domain, Failure, Kind, holder};
+
+use crate::presence::{Change, Presence, Who};
+use crate::readiness::Readiness;
+use crate::wait::{Wait, Wakeups};
+
+/// The longest wait: so often the hub is looked for, and the caller's reasons to stop are seen.
+const LONGEST_WAIT: Duration = Duration::from_millis(100);
+
+/// How often whoever waits at the descriptor looks for a hub that lives: an event tells of the next one.
+const MAKE_SURE_EVERY: Duration = Duration::from_secs(1);
+
+/// Membership in the first live one of several domains.
+pub struct Session {
+    presence: Presence,
+    joined: Option<Joined>,
+    /// A hub came, and it was not yet seen whether its shared memory has the names that were joined.
+    is_unsure: bool,
+    number: u32,
+    wait: Wait,
+    /// For who waits at a descriptor of his own.
+    readiness: Option<Readiness>,
+    subscribed_at: Option<Instant>,
+}
+
+struct Joined {
+    domain: Domain,
+    wakeups: Wakeups,
+    node: Node,
+}
+
+impl Session {
+    /// Will join the first live one of `places`, as soon as one is.
+    pub fn new(places: Vec<Domain>) -> Session {
+        Session {
+            presence: Presence::new(places),
+            joined: None,
+            is_unsure: false,
+            number: 0,
+            wait: Wait::default(),
+            readiness: None,
+            subscribed_at: None,
+        }
+    }
+
+    /// Will be woken by `wait`; to be said before anything is followed.
+    pub fn by(self, wait: Wait) -> Session {
+        Session { wait, ..self }
+    }
+
+    /// Looks whether the hub is there, and joins its domain if it is a new place.
+    ///
+    /// [`Kind::Short`](schema::Kind) if memory or descriptors are; who has joined already goes on without a look.
+    pub fn look(&mut self) -> Result<Change, Failure> {
+        if self.joined.as_mut().is_some_and(|joined| joined.wakeups.take_rang()) {
+            self.presence.heard();
+        }
+        let change = self.presence.look();
+        if let Some(joined) = self.joined.as_mut().filter(|_| change != Change::default()) {
+            joined.wakeups.renew();
+        }
+        let Some(domain) = self.presence.domain() else {
+            return match self.presence.short() {
+                Some(short) if self.joined.is_none() => Err(short),
+                _ => Ok(change),
+            };
+        };
+        self.is_unsure |= change.back.is_some();
+        let is_here = self.joined.as_ref().is_some_and(|joined| joined.domain == *domain);
+        if is_here && !self.is_unsure {
+            return Ok(change);
+        }
+        // After all had gone, the next hub's shared memory has other names.
+        let is_member = |joined: &Joined| ipc::is_member(&joined.node, domain.root());
+        match self.joined.as_ref().filter(|_| is_here).map(is_member).transpose()? {
+            Some(true) => {}
+            _ => match ipc::client_node(domain) {
+                Ok(node) => {
+                    let (domain, wakeups) = (domain.clone(), Wakeups::by(self.wait));
+                    self.joined = Some(Joined { domain, wakeups, node });
+                    self.number += 1;
+                }
+                // It is just starting or ending: the next look tells.
+                Err(failure) if failure.kind == Kind::NoHub => return Ok(change),
+                Err(failure) => return Err(failure),
+            },
+        }
+        self.is_unsure = false;
+        Ok(change)
+    }
+
+    /// Where the hub lives, if there is one.
+    pub fn domain(&self) -> Option<&Domain> {
+        self.presence.domain()
+    }
+
+    /// Who publishes there, as of the last look.
+    pub fn publishes(&self) -> Option<Who> {
+        self.presence.who()
+    }
+
+    /// There is a hub, and not only a listener that stands for those of other machines.
+    pub fn hub_lives(&self) -> bool {
+        self.domain().is_some_and(|domain| matches!(holder(domain.root()), Ok(Some(_))))
+    }
+
+    /// What to tell who cannot wait for a hub.
+    pub fn no_hub(&self) -> Failure {
+        self.presence.no_hub()
+    }
+
+    /// Counts the domains joined: ports of an earlier one are to be opened again.
+    pub fn number(&self) -> u32 {
+        self.number
+    }
+
+    /// A subscriber of `sensor`, or nothing as long as its hub or topic is not there. What wakes it comes first, so that
+    /// nothing is sent unheard between the two.
+    pub fn subscribe<P: Payload + ?Sized>(&mut self, sensor: &str) -> Result<Option<Subscriber<P>>, Failure> {
+        let (Some(_), Some(joined)) = (self.presence.domain(), &mut self.joined) else {
+            return Ok(None);
+        };
+        if !joined.wakeups.add(&joined.node, sensor)? {
+            return Ok(None);
+        }
+        if let Some(readiness) = &self.readiness {
+            joined.wakeups.descriptors().try_for_each(|event| readiness.add(event))?;
+        }
+        let subscriber = P::open(&joined.node, sensor)?.map(|topic| P::subscriber(&topic)).transpose()?;
+        self.subscribed_at = subscriber.as_ref().map(|_| Instant::now());
+        Ok(subscriber)
+    }
+
+    /// A moment in the life of `sensor`'s topics: as long as it is the same, nothing new was sent. Nothing where that is not
+    /// known. What late joiners get comes without a word, so a moment ends with the next look for the hub, too.
+    pub fn moment(&self, sensor: &str) -> Option<(u32, Instant)> {
+        let rung = self.joined.as_ref()?.wakeups.rung(sensor)?;
+        Some((rung, self.presence.looked_at()?))
+    }
+
+    /// Readable while there may be something to receive or to see to, the same over all lives of the hub; from the first
+    /// call on it takes [`settle`](Self::settle) to make it unreadable.
+    ///
+    /// [`Kind::Configuration`] if it is not waited by event, [`Kind::Short`] if descriptors are short.
+    pub fn descriptor(&mut self) -> Result<BorrowedFd<'_>, Failure> {
+        if self.wait != Wait::Event {
+            let hint = "say that it waits by event: a bell has no descriptor";
+            return Err(Failure::new(Kind::Configuration, "no descriptor to wait at", hint));
+        }
+        let readiness: &Readiness = match &mut self.readiness {
+            Some(readiness) => readiness,
+            none => {
+                let readiness = Readiness::new()?;
+                if let Some(joined) = &self.joined {
+                    joined.wakeups.descriptors().try_for_each(|event| readiness.add(event))?;
+                }
+                none.insert(readiness)
+            }
+        };
+        Ok(readiness.as_fd())
+    }
+
+    /// Nothing waits, and nothing will have to be looked for before `left`: the descriptor, if it is used, is not readable
+    /// before. Whether something was sent meanwhile: then look again first.
+    pub fn settle(&mut self, left: Option<Duration>) -> Result<bool, Failure> {
+        let Some(readiness) = &self.readiness else { return Ok(false) };
+        // What a late joiner is handed comes without an event.
+        let is_settled = self.subscribed_at.is_some_and(|at| at.elapsed() >= MAKE_SURE_EVERY);
+        let pace =
+            if is_settled && self.presence.domain().is_some() { MAKE_SURE_EVERY } else { LONGEST_WAIT };
+        readiness.again_in(left.map_or(pace, |left| left.min(pace)))?;
+        self.joined.as_mut().map_or(Ok(false), |joined| joined.wakeups.take())
+    }
+
+    /// Sleeps until something was sent, at the latest until `until`, and 100 ms at most; returns at once if something
+    /// may have been sent since the caller looked. Hold no sample meanwhile.
+    pub fn wait(&mut self, until: Option<Instant>) -> Result<(), Failure> {
+        self.wait_for(until.map(|until| until.saturating_duration_since(Instant::now())))
+    }
+
+    /// As [`wait`](Self::wait), for a time instead of until one.
+    pub fn wait_for(&mut self, left: Option<Duration>) -> Result<(), Failure> {
+        let left = left.map_or(LONGEST_WAIT, |left| left.min(LONGEST_WAIT));
+        // This takes events that whoever polls has not seen: for him it is readable until it is settled.
+        if let Some(readiness) = &self.readiness {
+            readiness.again_in(Duration::ZERO)?;
+        }
+        match &mut self.joined {
+            Some(joined) => joined.wakeups.wait(&joined.node, left),
+            None => {
+                std::thread::sleep(left);
+                Ok(())
+            }
+        }
+    }
+}

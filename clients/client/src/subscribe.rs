@@ -1,0 +1,128 @@
+//! The client library: one topic of one sensor, in place, for as long as you like. Waits for a hub that is not there
+//! yet and goes on after one that was killed. Hides what it is woken by.
+
+use std::os::fd::BorrowedFd;
+use std::time::{Duration, Instant};
+
+use schema::ipc::Payload;
+use schema::{DEFAULT_DOMAIN, Domain, Environment, Failure, check_followed};
+
+use crate::follower::{Follower, Received};
+use crate::session::Session;
+use crate::wait::Wait;
+
+/// Follows the topic of `sensor` that carries `P` (`[u8]`: telegram, `Scan`, `Marks` ..), in the domain that
+/// SCANHUB_DOMAIN names. There need not be a hub yet. Who acts on zones follows them by [`zones`](crate::zones).
+///
+/// [`Kind::Configuration`](schema::Kind) if a name is not possible.
+pub fn subscribe<P: Payload + ?Sized>(sensor: &str) -> Result<Subscription<P>, Failure> {
+    Subscription::in_domain(places(None)?, sensor)
+}
+
+/// Where `domain` may be, or if none is named that which SCANHUB_DOMAIN names.
+///
+/// [`Kind::Configuration`](schema::Kind) if the name is not possible.
+pub fn places(domain: Option<&str>) -> Result<Vec<Domain>, Failure> {
+    let environment = Environment::of_process();
+    match domain {
+        Some(domain) => Domain::candidates(domain, None, &environment),
+        None => {
+            let domain = std::env::var("SCANHUB_DOMAIN").unwrap_or_else(|_| DEFAULT_DOMAIN.to_owned());
+            Domain::candidates(&domain, None, &environment)
+        }
+    }
+}
+
+/// A topic that is being followed.
+pub struct Subscription<P: Payload + ?Sized> {
+    session: Session,
+    follower: Follower<P>,
+    timeout: Option<Duration>,
+}
+
+impl<P: Payload + ?Sized> Subscription<P> {
+    /// As [`subscribe`], in the first live one of `places`.
+    ///
+    /// [`Kind::Configuration`](schema::Kind) if the sensor's name is not possible.
+    pub fn in_domain(places: Vec<Domain>, sensor: &str) -> Result<Self, Failure> {
+        check_followed(sensor)?;
+        Ok(Subscription { session: Session::new(places), follower: Follower::new(sensor), timeout: None })
+    }
+
+    /// Lets [`next`](Self::next) answer `None` after a silence of `timeout`; without it waits forever.
+    pub fn timeout(mut self, timeout: Duration) -> Self {
+        self.timeout = Some(timeout);
+        self
+    }
+
+    /// Waits by `wait`, to be said before the first sample is asked for; without it by [`Wait::Doorbell`].
+    pub fn wait_by(self, wait: Wait) -> Self {
+        Subscription { session: self.session.by(wait), ..self }
+    }
+
+    /// Waits for the next sample; `None` only after the timeout. Drop the sample before the next call.
+    ///
+    /// [`Kind::Short`](schema::Kind) if descriptors or places are short, [`Kind::Failed`](schema::Kind) if the domain
+    /// is another user's or the topic has another layout.
+    #[allow(clippy::should_implement_trait)] // An iterator would have to hold samples over waits.
+    pub fn next(&mut self) -> Result<Option<Received<P>>, Failure> {
+        // A timeout beyond all time is none.
+        let until = self.timeout.and_then(|timeout| Instant::now().checked_add(timeout));
+        loop {
+            if let Some(received) = self.try_next()? {
+                return Ok(Some(received));
+            }
+            if until.is_some_and(|until| Instant::now() >= until) {
+                return Ok(None);
+            }
+            self.session.wait(until)?;
+        }
+    }
+
+    /// The next sample if one waits; never waits itself. Failures as [`next`](Self::next).
+    pub fn try_next(&mut self) -> Result<Option<Received<P>>, Failure> {
+        loop {
+            if let Some(received) = self.look()? {
+                return Ok(Some(received));
+            }
+            if !self.session.settle(None)? {
+                return Ok(None);
+            }
+        }
+    }
+
+    /// Sleeps until there may be a sample; for `longest` at most, and a tenth of a second at most, so that whoever wants to
+    /// stop can. Hold no sample meanwhile.
+    ///
+    /// [`Kind::Short`](schema::Kind) if the system cannot wait.
+    pub fn wait(&mut self, longest: Duration) -> Result<(), Failure> {
+        self.session.wait_for(Some(longest))
+    }
+
+    /// What is readable while there may be a sample, for who waits for other things as well: to be polled, never read. It
+    /// is the same for as long as the subscription lives, whatever becomes of the hub. [`try_next`](Self::try_next) makes it
+    /// unreadable by answering `None`; until then poll does not sleep. It also gets readable when there is nothing: each
+    /// second, ten times a second while there is no hub, and when other topics of the sensor have something.
+    ///
+    /// [`Kind::Configuration`](schema::Kind) without [`Wait::Event`], [`Kind::Short`](schema::Kind) if descriptors are.
+    pub fn descriptor(&mut self) -> Result<BorrowedFd<'_>, Failure> {
+        self.session.descriptor()
+    }
+
+    fn look(&mut self) -> Result<Option<Received<P>>, Failure> {
+        // What is there comes before the question whether the hub still is: that takes longer than receiving.
+        if self.follower.subscribed()
+            && let Some(received) = self.follower.receive(&mut self.session)?
+        {
+            return Ok(Some(received));
+        }
+        self.session.look()?;
+        self.follower.receive(&mut self.session)
+    }
+
+    /// A hub lives in the domain, as of the last call of [`next`](Self::next) or [`try_next`](Self::try_next) that found
+    /// no sample waiting.
+    pub fn hub_lives(&self) -> bool {
+        self.session.domain().is_some()
+    }
+}

@@ -1,0 +1,186 @@
+//! The zones of one sensor, by value and never staler than they look: a verdict that is too old becomes `unknown` here,
+//! whether the sensor, the hub or the machine stood still. So nobody who acts on it has to think of silence.
+
+use std::os::fd::BorrowedFd;
+use std::time::Duration;
+
+use schema::{Domain, Failure, Header, Zones, check_followed};
+
+use crate::clock;
+use crate::follower::Follower;
+use crate::freshness::Freshness;
+use crate::session::Session;
+use crate::subscribe::places;
+use crate::wait::Wait;
+
+/// Follows the zones of `sensor` in the domain that SCANHUB_DOMAIN names. There need not be a hub yet.
+///
+/// [`Kind::Configuration`](schema::Kind) if a name is not possible.
+pub fn zones(sensor: &str) -> Result<ZonesFollower, Failure> {
+    ZonesFollower::in_domain(places(None)?, sensor)
+}
+
+/// What was heard of a sensor's zones, or that nothing was.
+#[derive(Clone, Copy, Debug)]
+pub struct Heard {
+    /// The zones of the sample, [`Zones::unknown`] if it was too old when it came, and in a silence.
+    pub zones: Zones,
+    /// Of the sample; nothing in a silence.
+    pub header: Option<Header>,
+    /// Samples that were sent since the one heard before and are not handed out.
+    pub missed: u64,
+    /// The zones are unknown because nothing was heard that is new enough, not because the hub says so.
+    pub stale: bool,
+    /// What the hub said, however old it was when it came: for who keeps it, and does not act on it.
+    pub said: Zones,
+}
+
+impl Heard {
+    /// A silence.
+    pub(crate) fn nothing() -> Heard {
+        Heard { zones: Zones::unknown(), header: None, missed: 0, stale: true, said: Zones::unknown() }
+    }
+}
+
+/// The zones of a sensor that is being followed.
+pub struct ZonesFollower {
+    session: Session,
+    source: ZonesSource,
+}
+
+impl ZonesFollower {
+    /// As [`zones`], in the first live one of `places`.
+    ///
+    /// [`Kind::Configuration`](schema::Kind) if the sensor's name is not possible.
+    pub fn in_domain(places: Vec<Domain>, sensor: &str) -> Result<ZonesFollower, Failure> {
+        check_followed(sensor)?;
+        Ok(ZonesFollower { session: Session::new(places), source: ZonesSource::new(sensor) })
+    }
+
+    /// As [`Subscription::wait_by`](crate::Subscription::wait_by).
+    pub fn wait_by(self, wait: Wait) -> ZonesFollower {
+        ZonesFollower { session: self.session.by(wait), ..self }
+    }
+
+    /// Waits for news: the newest sample, or the one `unknown` of a silence. That comes two scan periods and 40 ms
+    /// after the last sample (of another machine not before half a second), a second after the start if there was none, and
+    /// with a hub as without one.
+    ///
+    /// Failures as [`Subscription::next`](crate::Subscription::next): nothing is known then either.
+    #[allow(clippy::should_implement_trait)] // There is no end that an iterator would have.
+    pub fn next(&mut self) -> Result<Heard, Failure> {
+        loop {
+            if let Some(heard) = self.try_next()? {
+                return Ok(heard);
+            }
+            self.wait(Duration::MAX)?;
+        }
+    }
+
+    /// As [`Subscription::wait`](crate::Subscription::wait); it is also over when the verdict becomes too old.
+    pub fn wait(&mut self, longest: Duration) -> Result<(), Failure> {
+        self.session.wait_for(Some(self.source.left().map_or(longest, |left| left.min(longest))))
+    }
+
+    /// As [`Subscription::descriptor`](crate::Subscription::descriptor), with [`try_next`](Self::try_next) of the zones; it gets
+    /// readable also when the verdict becomes too old.
+    pub fn descriptor(&mut self) -> Result<BorrowedFd<'_>, Failure> {
+        self.session.descriptor()
+    }
+
+    /// A hub lives in the domain, as of the last call of [`next`](Self::next) or [`try_next`](Self::try_next) that found
+    /// no news.
+    pub fn hub_lives(&self) -> bool {
+        self.session.domain().is_some()
+    }
+
+    /// The news, if there are any since the last call; never waits. Failures as [`next`](Self::next).
+    pub fn try_next(&mut self) -> Result<Option<Heard>, Failure> {
+        loop {
+            if let Some(heard) = self.look()? {
+                return Ok(Some(heard));
+            }
+            if !self.session.settle(self.source.left())? {
+                return Ok(None);
+            }
+        }
+    }
+
+    fn look(&mut self) -> Result<Option<Heard>, Failure> {
+        // What is there comes before the question whether the hub still is: that takes longer than receiving.
+        if self.source.subscribed()
+            && let Some(heard) = self.source.newest(&mut self.session)?
+        {
+            return Ok(Some(heard));
+        }
+        self.session.look()?;
+        self.source.newest(&mut self.session)
+    }
+}
+
+/// The zones of a sensor, sample by sample and silence by silence, in a session of the caller's.
+pub struct ZonesSource {
+    follower: Follower<Zones>,
+    freshness: Freshness,
+    spoken: bool,
+}
+
+impl ZonesSource {
+    /// Will follow the zones of `sensor`.
+    pub fn new(sensor: &str) -> ZonesSource {
+        ZonesSource {
+            follower: Follower::new(sensor),
+            freshness: Freshness::new(clock::now()),
+            spoken: false,
+        }
+    }
+
+    /// The topic has been there at least once.
+    pub fn subscribed(&self) -> bool {
+        self.follower.subscribed()
+    }
+
+    /// There was a sample, or the silence of one that does not come.
+    pub fn has_spoken(&self) -> bool {
+        self.spoken
+    }
+
+    /// The next sample that waits; if there is none and the last one became too old just now, that. Failures as
+    /// [`Follower::receive`].
+    pub fn receive(&mut self, session: &mut Session) -> Result<Option<Heard>, Failure> {
+        let sample = self.follower.receive(session)?;
+        let now = clock::now();
+        let heard = match sample {
+            Some(sample) => {
+                let header = *sample.header();
+                let fresh = self.freshness.heard(&header, sample.verdict(), now);
+                let zones = if fresh { *sample } else { Zones::unknown() };
+                Some(Heard {
+                    zones,
+                    header: Some(header),
+                    missed: sample.missed,
+                    stale: !fresh,
+                    said: *sample,
+                })
+            }
+            None => self.freshness.silence(now).then(Heard::nothing),
+        };
+        self.spoken |= heard.is_some();
+        Ok(heard)
+    }
+
+    /// The last of all that waits: what stands now. What it supersedes counts as missed.
+    fn newest(&mut self, session: &mut Session) -> Result<Option<Heard>, Failure> {
+        let mut newest: Option<Heard> = None;
+        while let Some(mut heard) = self.receive(session)? {
+            heard.missed += newest.map_or(0, |passed| passed.missed + u64::from(passed.header.is_some()));
+            newest = Some(heard);
+        }
+        Ok(newest)
+    }
+
+    /// After which time [`receive`](Self::receive) has something to say even if no sample comes.
+    pub fn left(&self) -> Option<Duration> {
+        self.freshness.left(clock::now())
+    }
+}

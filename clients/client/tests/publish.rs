@@ -1,0 +1,150 @@
+//! Topics that a program publishes: followed like a hub's own, with a hub and without one.
+
+mod fake;
+
+use std::time::Duration;
+
+use fake::{FakeHub, Place, until};
+use scanhub_client::{Kind, Marks, PublishSession, Scan, Subscription, Topic, Verdict, Wait, Wake, Zones};
+use schema::publisher;
+
+fn marks(count: u8) -> Marks {
+    Marks { count, ..Marks::default() }
+}
+
+/// What a consumer says of its next sample: missed, restarted, number, marks.
+fn next(followed: &mut Subscription<Marks>) -> (u64, bool, u64, u8) {
+    let sample = followed.next().unwrap().expect("a sample in time");
+    (sample.missed, sample.restarted, sample.header().topic_seq, sample.count)
+}
+
+fn follow(place: &Place, sensor: &str) -> Subscription<Marks> {
+    Subscription::in_domain(place.places(), sensor).unwrap().timeout(Duration::from_secs(10))
+}
+
+#[test]
+fn it_is_followed_without_a_hub_and_what_is_skipped_is_missed() {
+    let place = Place::new();
+    for wait in [Wait::Doorbell, Wait::Event] {
+        let session = PublishSession::open(&place.domain, &[Topic::Marks]).unwrap();
+        assert_eq!(publisher(place.domain.root()), Ok(Some(std::process::id())));
+        let mut near = session.sensor("tracker.near").unwrap().topic::<Marks>().unwrap();
+        let mut followed = follow(&place, "tracker.near").wait_by(wait);
+        assert!(followed.try_next().unwrap().is_none() && near.subscribers() == 1 && followed.hub_lives());
+        for count in 0..3 {
+            near.send(|sample| *sample = marks(count)).unwrap();
+            assert_eq!(next(&mut followed), (0, false, count.into(), count));
+        }
+        near.skip(4);
+        let before_ns = near.header().stamp_last_ns;
+        near.send(|sample| *sample = marks(9)).unwrap();
+        let sample = followed.next().unwrap().unwrap();
+        assert_eq!((sample.missed, sample.header().topic_seq, sample.header().seq), (4, 7, 7));
+        assert_eq!(sample.header().hub_pid, std::process::id());
+        assert!(sample.header().stamp_first_ns >= before_ns && sample.header().quality == 0);
+        drop((session, near));
+    }
+    assert_eq!(publisher(place.domain.root()), Ok(None), "the domain is held by nobody");
+}
+
+/// As a hub that sends nothing wakes nobody: a consumer sleeps until it is woken, once for several samples.
+#[test]
+fn samples_that_are_sent_together_wake_once() {
+    let place = Place::new();
+    let session = PublishSession::open(&place.domain, &[Topic::Marks]).unwrap();
+    let sensor = session.sensor("tracker.near").unwrap();
+    let (mut near, mut zones) = (sensor.topic::<Marks>().unwrap(), sensor.topic::<Zones>().unwrap());
+    let mut followed = follow(&place, "tracker.near");
+    assert!(followed.try_next().unwrap().is_none());
+    let header = near.header();
+    assert_eq!(near.send_with(&header, |sample| *sample = marks(1)).unwrap(), 1);
+    assert_eq!(zones.send_with(&header, |sample| *sample = Zones::unknown()).unwrap(), 0);
+    sensor.wake(Wake::Telegram).unwrap();
+    assert_eq!(next(&mut followed), (0, false, 0, 1));
+    // Who comes later gets what the topic keeps.
+    let mut late = Subscription::<Zones>::in_domain(place.places(), "tracker.near").unwrap();
+    until("the last zones", || {
+        zones.connect();
+        late.try_next().unwrap().is_some_and(|zones| zones.verdict() == Verdict::Unknown)
+    });
+}
+
+#[test]
+fn another_life_begins_again() {
+    let place = Place::new();
+    let open = || {
+        PublishSession::open(&place.domain, &[Topic::Marks])
+            .unwrap()
+            .sensor("tracker.near")
+            .unwrap()
+            .topic::<Marks>()
+            .unwrap()
+    };
+    let mut near = open();
+    let mut followed = follow(&place, "tracker.near");
+    assert!(followed.try_next().unwrap().is_none());
+    near.send(|sample| *sample = marks(1)).unwrap();
+    assert_eq!(next(&mut followed), (0, false, 0, 1));
+    drop(near);
+    let mut near = open();
+    // Its consumer has to find it first.
+    until("the consumer", || {
+        let _ = followed.try_next().unwrap();
+        near.subscribers() == 1
+    });
+    near.send(|sample| *sample = marks(2)).unwrap();
+    assert_eq!(next(&mut followed), (0, true, 0, 2));
+}
+
+#[test]
+fn a_name_that_is_made_twice_wakes_its_consumers_all_the_same() {
+    let place = Place::new();
+    let session = PublishSession::open(&place.domain, &[Topic::Marks]).unwrap();
+    let mut near = session.sensor("tracker.near").unwrap().topic::<Marks>().unwrap();
+    let zones = session.sensor("tracker.near").unwrap().topic::<Zones>().unwrap();
+    let again = session.sensor("tracker.near").and_then(|sensor| sensor.topic::<Marks>()).map(drop);
+    assert_eq!(again.unwrap_err().kind, Kind::DomainHeld);
+    drop((session, zones));
+    let mut followed = follow(&place, "tracker.near");
+    assert!(followed.try_next().unwrap().is_none());
+    near.send(|sample| *sample = marks(1)).unwrap();
+    assert_eq!(next(&mut followed), (0, false, 0, 1));
+}
+
+#[test]
+fn telegrams_have_the_length_that_they_have() {
+    let place = Place::new();
+    let session = PublishSession::open(&place.domain, &[Topic::Marks]).unwrap();
+    let mut bytes = session.sensor("tracker.near").unwrap().topic::<[u8]>().unwrap();
+    let mut followed = Subscription::<[u8]>::in_domain(place.places(), "tracker.near")
+        .unwrap()
+        .timeout(Duration::from_secs(10));
+    assert!(followed.try_next().unwrap().is_none());
+    bytes.send_bytes(&[1, 2, 3]).unwrap();
+    assert_eq!(*followed.next().unwrap().unwrap(), [1, 2, 3]);
+    assert_eq!(bytes.send_bytes(&[0; 815]).unwrap_err().kind, Kind::Short);
+    assert_eq!((bytes.failed(), bytes.next_number()), (1, 2));
+}
+
+#[test]
+fn one_process_publishes_beside_the_hub_and_no_name_of_its_sensors() {
+    let place = Place::new();
+    let mut hub = FakeHub::new(&place.domain, &["front"], 1);
+    let session = PublishSession::open(&place.domain, &[Topic::Marks]).unwrap();
+    assert_eq!(
+        PublishSession::open(&place.domain, &[Topic::Marks]).map(drop).unwrap_err().kind,
+        Kind::DomainHeld
+    );
+    let topic = |name: &str| session.sensor(name).and_then(|sensor| sensor.topic::<Scan>()).map(drop);
+    // A hub may have a sensor without a dot, now or later.
+    for impossible in ["front", "near", "", "robot", "tracker.Near", "a.b.c"] {
+        assert_eq!(topic(impossible).unwrap_err().kind, Kind::Configuration, "{impossible}");
+    }
+    assert!(topic("tracker.near").is_ok() && session.check_room(&Topic::ALL).is_ok());
+    // The hub goes on.
+    let scans = Subscription::<Scan>::in_domain(place.places(), "front").unwrap();
+    let mut scans = scans.timeout(Duration::from_secs(10));
+    assert!(scans.try_next().unwrap().is_none());
+    hub.front().scan(&[1000]);
+    assert_eq!(scans.next().unwrap().unwrap().beams(), 1);
+}

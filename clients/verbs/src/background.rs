@@ -1,0 +1,226 @@
+//! `scanhub background`: shows the background model of a sensor, lets it be learned anew, held or learned on, and keeps
+//! it in a file. Files are this side's business; the hub sees models only.
+
+use std::io::{Read, Write};
+use std::path::{Path, PathBuf};
+use std::sync::atomic::AtomicBool;
+use std::time::{Duration, SystemTime};
+
+use scanhub_client::request;
+use schema::{
+    Age, Background, Domain, Failure, Kind, Request, SavedModel, Shown, Verb, as_json, check_sensor,
+};
+use serde::Serialize;
+
+use crate::names::as_word;
+use crate::output::{Output, quiet};
+use crate::{file, json, text};
+
+/// What `background` is asked for.
+#[derive(Clone, Debug)]
+pub struct BackgroundOptions {
+    /// The sensor.
+    pub sensor: String,
+    /// What to do with its model.
+    pub order: ModelOrder,
+    /// Objects instead of text.
+    pub json: bool,
+    /// Where the domain may be, see [`Domain::candidates`].
+    pub places: Vec<Domain>,
+}
+
+/// What to do with a background model.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum ModelOrder {
+    /// Show it.
+    Show,
+    /// Forget it and learn anew.
+    Reset,
+    /// Keep it as it is.
+    Freeze,
+    /// Learn on.
+    Thaw,
+    /// Write it to a file, whole or not at all.
+    Save {
+        /// The file; `-` is stdout.
+        file: PathBuf,
+        /// What is there is replaced.
+        force: bool,
+    },
+    /// Take this one for it, see [`saved_model`].
+    Load(Box<Background>),
+}
+
+/// Does what `options` say and writes a line to `out`.
+///
+/// [`Kind::Configuration`] if the hub refuses a model; [`Kind::Output`] if a file is there or cannot be written;
+/// [`Kind::Failed`] if there is no model yet to be saved; else as [`control`](crate::control()).
+pub fn background(
+    options: &BackgroundOptions,
+    out: &mut dyn Write,
+    stop: &AtomicBool,
+) -> Result<(), Failure> {
+    let BackgroundOptions { sensor, order, json, places } = options;
+    as_word(check_sensor(sensor))?;
+    let ask = |verb| request(places, &Request::new(sensor, verb), stop);
+    let mut output = Output::new(out);
+    let taken = |output: &mut Output<'_>, verb: Verb| {
+        quiet(if *json {
+            output.json(&json::control(sensor, verb))
+        } else {
+            output.line(|line| write!(line, "{sensor}: {} taken", verb.name()))
+        })
+    };
+    match order {
+        ModelOrder::Reset => {
+            ask(Verb::Reset)?;
+            let is_frozen = !json && shown(sensor, ask(Verb::Show)?)?.model.is_frozen();
+            taken(&mut output, Verb::Reset)?;
+            if is_frozen {
+                let hint =
+                    format!("it is frozen: nothing is learned until `scanhub background {sensor} thaw`");
+                quiet(output.line(|line| write!(line, "{hint}")))?;
+            }
+            Ok(())
+        }
+        ModelOrder::Freeze => ask(Verb::Freeze).and_then(|_| taken(&mut output, Verb::Freeze)),
+        ModelOrder::Thaw => ask(Verb::Thaw).and_then(|_| taken(&mut output, Verb::Thaw)),
+        ModelOrder::Load(model) => {
+            request(places, &Request::load(sensor, model), stop)?;
+            taken(&mut output, Verb::Load)
+        }
+        ModelOrder::Show => {
+            let Shown { model, kept_wall_ns } = shown(sensor, ask(Verb::Show)?)?;
+            quiet(if *json {
+                output.json(&Kept { model: as_json(sensor, &model), kept_wall_ns })
+            } else {
+                output.line(|line| {
+                    write!(line, "{sensor}: ")?;
+                    text::background(line, &model)?;
+                    match kept_wall_ns.map(Duration::from_nanos) {
+                        Some(kept) => write!(line, ", kept {} ago", Age(wall().saturating_sub(kept))),
+                        None => Ok(()),
+                    }
+                })
+            })
+        }
+        ModelOrder::Save { file, force } => {
+            check(file, *force)?;
+            let Shown { model, .. } = shown(sensor, ask(Verb::Show)?)?;
+            save(file, sensor, &model, *json, &mut output)
+        }
+    }
+}
+
+/// Whether there may be a file made at `path`; what is there may be replaced if `force`.
+fn check(path: &Path, force: bool) -> Result<(), Failure> {
+    if force || path == Path::new(STANDARD) || !path.is_file() {
+        return Ok(());
+    }
+    Err(Failure::new(Kind::Output, format!("{} exists", path.display()), "--force replaces it"))
+}
+
+/// What is shown: a model, and when it was kept for the next hub.
+#[derive(Serialize)]
+struct Kept<M> {
+    #[serde(flatten)]
+    model: M,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    kept_wall_ns: Option<u64>,
+}
+
+/// The time since 1970.
+fn wall() -> Duration {
+    SystemTime::UNIX_EPOCH.elapsed().unwrap_or_default()
+}
+
+fn shown(sensor: &str, shown: Option<Shown>) -> Result<Shown, Failure> {
+    let hint = "client and hub are of different versions";
+    shown.ok_or_else(|| {
+        Failure::new(Kind::Failed, format!("the hub answered without a model of {sensor}"), hint)
+    })
+}
+
+/// Writes `model` to `file`, and to `output` that it was; to `output` alone if that is the file.
+fn save(
+    file: &Path,
+    sensor: &str,
+    model: &Background,
+    json: bool,
+    output: &mut Output<'_>,
+) -> Result<(), Failure> {
+    if model.count == 0 {
+        let hint = format!("a scan has to come first: `scanhub info {sensor}` shows how it is");
+        return Err(Failure::new(Kind::Failed, format!("{sensor} has no background model yet"), hint));
+    }
+    if model.taught == 0 {
+        let hint = format!(
+            "learning takes some seconds: `scanhub background {sensor} show`; frozen it learns nothing"
+        );
+        return Err(Failure::new(
+            Kind::Failed,
+            format!("the background of {sensor} knows no beam yet"),
+            hint,
+        ));
+    }
+    let object = as_json(sensor, model);
+    if file == Path::new(STANDARD) {
+        return quiet(output.json(&object));
+    }
+    let mut content = serde_json::to_vec(&object)
+        .map_err(|error| Failure::new(Kind::Failed, format!("the model is no JSON: {error}"), ""))?;
+    content.push(b'\n');
+    file::replace(file, &content)?;
+    let (Background { taught, count, generation, .. }, place) = (model, file.display());
+    quiet(if json {
+        output.json(&Saved {
+            class: "saved",
+            sensor,
+            file: place.to_string(),
+            generation: *generation,
+            taught: *taught,
+            count: *count,
+        })
+    } else {
+        output.line(|line| write!(line, "{sensor}: {taught} of {count} beams saved to {place}"))
+    })
+}
+
+/// Class `saved`.
+#[derive(Serialize)]
+struct Saved<'a> {
+    class: &'static str,
+    sensor: &'a str,
+    file: String,
+    generation: u32,
+    taught: u16,
+    count: u16,
+}
+
+/// The model for `sensor` in `file`, `-` is `input`. It has to be saved from that sensor unless `any_sensor`.
+///
+/// [`Kind::Input`] with place and reason if it cannot be read or is no model, [`Kind::Configuration`] if it is another
+/// sensor's.
+pub fn saved_model(
+    file: &Path,
+    sensor: &str,
+    any_sensor: bool,
+    input: &mut dyn Read,
+) -> Result<Background, Failure> {
+    let (text, place) = if file == Path::new(STANDARD) {
+        (file::read_all(input, "stdin", LONGEST)?, "stdin".to_owned())
+    } else {
+        (file::read(file, LONGEST)?, file.display().to_string())
+    };
+    let saved = SavedModel::parse(&text, &place)?;
+    if saved.sensor == sensor || any_sensor {
+        return Ok(saved.model);
+    }
+    let message = format!("{place} is the background of {}, not of {sensor}", saved.sensor);
+    Err(Failure::new(Kind::Configuration, message, "--any-sensor takes it all the same"))
+}
+
+/// The file that is stdin or stdout.
+const STANDARD: &str = "-";
+/// Far more bytes than a model of 401 beams has as text, and as it would be if people had laid it out.
+const LONGEST: u64 = 1 << 20;

@@ -1,0 +1,40 @@
+//! `scanhub control`: asks the hub to stop a sensor, to let it stream again, or to begin anew with it. Done is what the
+//! link has taken; `info` tells how far it is.
+
+use std::io::Write;
+use std::sync::atomic::AtomicBool;
+
+use scanhub_client::request;
+use schema::{Domain, Failure, Request, Verb, check_sensor};
+
+use crate::json;
+use crate::names::as_word;
+use crate::output::{Output, quiet};
+
+/// What `control` is asked for.
+#[derive(Clone, Debug)]
+pub struct ControlOptions {
+    /// The sensor.
+    pub sensor: String,
+    /// What its link shall do.
+    pub verb: Verb,
+    /// An object instead of text.
+    pub json: bool,
+    /// Where the domain may be, see [`Domain::candidates`].
+    pub places: Vec<Domain>,
+}
+
+/// Sends the request, waits until the link has taken it, and writes a line to `out`.
+///
+/// Failures as [`request`].
+pub fn control(options: &ControlOptions, out: &mut dyn Write, stop: &AtomicBool) -> Result<(), Failure> {
+    let ControlOptions { sensor, verb, .. } = options;
+    as_word(check_sensor(sensor))?;
+    request(&options.places, &Request::new(sensor, *verb), stop)?;
+    let mut output = Output::new(out);
+    quiet(if options.json {
+        output.json(&json::control(sensor, *verb))
+    } else {
+        output.line(|line| write!(line, "{sensor}: {} taken", verb.name()))
+    })
+}

@@ -1,0 +1,139 @@
+//! `scanhub echo`: samples as text, JSON, CSV or bytes. Refuses to know where they come from.
+
+use std::io::Write;
+use std::sync::atomic::AtomicBool;
+
+use scanhub_client::streams::Sample;
+use schema::{Domain, Failure, Header, Kind, Scan, Topic, csv};
+
+use crate::account::Account;
+use crate::follow::{Bounds, Notice, Sink, follow};
+use crate::names::TopicName;
+use crate::output::{End, Output, quiet};
+use crate::selection::Selection;
+use crate::{json, text};
+
+/// What `echo` is asked for.
+#[derive(Clone, Debug)]
+pub struct EchoOptions {
+    /// `SENSOR/TOPIC`, `*/TOPIC` or `SENSOR/*`, at least one; CSV and bytes take exactly one.
+    pub topics: Vec<String>,
+    /// How samples are written.
+    pub format: Format,
+    /// When it ends by itself.
+    pub bounds: Bounds,
+    /// Where the domain may be, see [`Domain::candidates`].
+    pub places: Vec<Domain>,
+}
+
+/// How samples are written.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum Format {
+    /// A line for people; notices go to `notes`.
+    #[default]
+    Text,
+    /// An object per line, notices and summary too.
+    Json,
+    /// Columns, scans only; notices and summary go to `notes`.
+    Csv,
+    /// The payloads' bytes, one after the other; notices and summary go to `notes`.
+    Raw,
+}
+
+/// Writes the samples of topics to `out` as they come; what is no sample to `notes` (stderr) if `out` is not JSON.
+/// Ends when the bounds are reached, `stop` is set, or nobody reads any more.
+///
+/// [`Kind::Usage`] if there is no such topic or the format does not go with the topics, [`Kind::NoTopic`] with the sensors
+/// that there are,
+/// [`Kind::NoHub`] if bounded and there is none at the start, [`Kind::Timeout`], [`Kind::Interrupted`] if bounded and
+/// `stop` came first.
+pub fn echo(
+    options: &EchoOptions,
+    out: &mut dyn Write,
+    notes: &mut dyn Write,
+    stop: &AtomicBool,
+) -> Result<(), Failure> {
+    let Selection { named, of_all } = Selection::parse(&options.topics)?;
+    check(options.format, &named, &of_all)?;
+    let mut echo =
+        Echo { format: options.format, out: Output::new(out), notes: Output::new(notes), columns: None };
+    quiet(follow(&named, &of_all, &options.places, &options.bounds, stop, &mut echo))
+}
+
+struct Echo<'a> {
+    format: Format,
+    out: Output<'a>,
+    notes: Output<'a>,
+    columns: Option<usize>,
+}
+
+impl Sink for Echo<'_> {
+    fn sample(&mut self, name: &TopicName, sample: &Sample) -> Result<(), End> {
+        match (self.format, sample) {
+            (Format::Text, _) => self.out.line(|line| text::sample(line, name, sample)),
+            (Format::Raw, _) => self.out.raw(sample.bytes()),
+            (Format::Csv, Sample::Scan(scan)) => self.csv(scan.header(), scan),
+            (Format::Csv, _) => Ok(()),
+            (Format::Json, _) => self.json(&name.sensor, sample),
+        }
+    }
+
+    fn wants_lines(&self) -> bool {
+        true
+    }
+
+    fn notice(&mut self, names: &[&TopicName], notice: Notice) -> Result<(), End> {
+        match self.format {
+            Format::Json => json::notices(&mut self.out, names, notice),
+            _ => self.notes.line(|line| text::notice(line, names, notice)),
+        }
+    }
+
+    fn summary(&mut self, name: &TopicName, account: &Account) -> Result<(), End> {
+        match self.format {
+            Format::Json => self.out.json(&json::summary(name, account)),
+            Format::Text => self.out.line(|line| text::summary(line, name, account)),
+            Format::Csv | Format::Raw => self.notes.line(|line| text::summary(line, name, account)),
+        }
+    }
+}
+
+impl Echo<'_> {
+    fn json(&mut self, sensor: &str, sample: &Sample) -> Result<(), End> {
+        let out = &mut self.out;
+        match sample {
+            Sample::Telegram(found) => out.json(&json::telegram(sensor, found.header(), found)),
+            Sample::Scan(found) => out.json(&json::scan(sensor, found.header(), found)),
+            Sample::Marks(found) => out.json(&json::marks(sensor, found.header(), found)),
+            Sample::Zones(heard) => out.json(&json::zones(sensor, heard)),
+            Sample::Foreground(found) => out.json(&json::foreground(sensor, found.header(), found)),
+            Sample::Background(found) => out.json(&json::background(sensor, found)),
+            Sample::Status(found) => out.json(&json::status(sensor, found)),
+            Sample::Robot(found) => out.json(&json::robot(&found.robot, &found.heard)),
+        }
+    }
+
+    /// A line of columns; the names of the columns first, and again if their number changes.
+    fn csv(&mut self, header: &Header, scan: &Scan) -> Result<(), End> {
+        if self.columns != Some(scan.beams()) {
+            self.columns = Some(scan.beams());
+            self.out.line(|line| csv::columns(line, scan.beams()))?;
+        }
+        self.out.line(|line| csv::row(line, header, scan))
+    }
+}
+
+fn check(format: Format, named: &[TopicName], of_all: &[Topic]) -> Result<(), Failure> {
+    let usage = |what: &str| Err(Failure::new(Kind::Usage, what, "for example `scanhub echo front/scan`"));
+    match (format, named) {
+        (_, []) if of_all.is_empty() => usage("echo needs a topic"),
+        (Format::Csv | Format::Raw, _) if !of_all.is_empty() => {
+            usage("--csv and --raw take one topic of one sensor")
+        }
+        (Format::Csv, [one]) if one.topic == Topic::Scan => Ok(()),
+        (Format::Csv, _) => usage("--csv takes one topic, and that a scan"),
+        (Format::Raw, [_, _, ..]) => usage("--raw takes one topic"),
+        (Format::Raw, [one]) if one.is_robot() => usage("--raw takes the topic of a sensor"),
+        _ => Ok(()),
+    }
+}

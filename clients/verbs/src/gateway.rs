@@ -1,0 +1,269 @@
+//! `scanhub gateway`: what the hub publishes, as datagrams on a network, one message each and nothing sent twice. An
+//! ordinary client of the hub that outlives it, its links and its own network. Takes nothing from the network.
+
+mod host;
+mod lan;
+mod life;
+mod machine;
+mod outlet;
+mod report;
+mod selection;
+mod sensor;
+mod uplink;
+
+use std::io::Write;
+use std::os::fd::AsFd;
+use std::path::Path;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::{Duration, Instant};
+
+use scanhub_client::clock;
+use scanhub_client::streams::{GRACE, Session};
+use schema::{Domain, Failure, Kind, check_sensor};
+
+use crate::follow::Notice;
+use crate::names::no_sensor;
+use crate::output::{End, quiet};
+use crate::roll::Roll;
+use crate::spare::Spare;
+use lan::{Form, Lan};
+use life::Life;
+use report::Report;
+use selection::Selection;
+use sensor::Sensor;
+use uplink::Uplink;
+
+/// What `gateway` is asked for.
+#[derive(Clone, Debug)]
+pub struct GatewayOptions {
+    /// The network interface of the groups; without one nothing goes to groups.
+    pub interface: Option<String>,
+    /// `SENSOR/TOPIC`, `*/TOPIC` or `SENSOR/*`, with `:every=N` if it is to be thinned; none: all but telegrams, of all sensors.
+    pub topics: Vec<String>,
+    /// `HOST:PORT` of those that get copies; a name is asked for again while it runs, as its address may change.
+    pub to: Vec<String>,
+    /// Telegrams and nothing else, without a header.
+    pub bare: bool,
+    /// How many routers pass on what goes to the groups.
+    pub ttl: u8,
+    /// The background goes out so often, besides when it is a new one.
+    pub background_every: Option<Duration>,
+    /// The longest datagram, in bytes.
+    pub longest: usize,
+    /// How it tells of itself.
+    pub look: GatewayLook,
+    /// Where the domain may be, see [`Domain::candidates`].
+    pub places: Vec<Domain>,
+}
+
+impl GatewayOptions {
+    /// What can be known without a network and without a hub: whether the topics are some, and go with the rest.
+    ///
+    /// [`Kind::Usage`] with the topics that there are, else [`Kind::Configuration`].
+    pub fn check(&self) -> Result<(), Failure> {
+        self.selection().map(drop)
+    }
+
+    fn selection(&self) -> Result<Selection, Failure> {
+        let selection = Selection::parse(&self.topics, self.bare)?;
+        if self.bare && self.background_every.is_some() {
+            let what = "no background goes out where only telegrams do";
+            return Err(Failure::new(Kind::Configuration, what, "leave bare or background_every away"));
+        }
+        Ok(selection)
+    }
+}
+
+/// How a gateway tells of itself.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum GatewayLook {
+    /// Lines at the begin, at the end and when asked.
+    Lines,
+    /// Objects, once a second.
+    Json,
+    /// One line that is drawn over itself.
+    Terminal,
+}
+
+/// Sends until `stop` is set, whatever becomes of the hub and of the network. The account goes to `out` at the end and
+/// whenever `tell` is set; what is no account to `notes` (stderr) if `out` is not JSON. Lines for which there is no room
+/// are left out: whoever does not read delays nothing but the end, and that by a second.
+///
+/// [`Kind::Configuration`] if there is no such interface, neither an interface nor a host is named, a destination is no host,
+/// or a value is not possible; [`Kind::Usage`] if there is no such topic; [`Kind::NoTopic`] if the first hub that is met has no
+/// such sensor; [`Kind::Short`] if descriptors or memory are; [`Kind::Interrupted`] if `stop` is set before it is known
+/// where the hosts are.
+pub fn gateway(
+    options: &GatewayOptions,
+    out: &mut (impl Write + AsFd),
+    notes: &mut (impl Write + AsFd),
+    tell: &AtomicBool,
+    stop: &AtomicBool,
+) -> Result<(), Failure> {
+    let mut gateway = Gateway::open(options, stop)?;
+    let (mut out, mut notes) = (Spare::new(out, stop), Spare::new(notes, stop));
+    let mut report = Report::new(options.look, &mut out, &mut notes);
+    quiet(gateway.run(&mut report, tell, stop))
+}
+
+struct Gateway<'a> {
+    options: &'a GatewayOptions,
+    selection: Selection,
+    session: Session,
+    sensors: Vec<Sensor>,
+    lan: Lan,
+    started: Instant,
+    roll: Roll,
+    is_there: bool,
+    /// The sensors that are named were found in a hub.
+    is_checked: bool,
+    waiting_said: bool,
+    tick_at: Instant,
+}
+
+/// In the place of an interface, in the name of the file that keeps a gateway's number: it sends to no group.
+const HOSTS: &str = "hosts";
+
+/// Between two announcements, and between two lines of the account.
+const TICK: Duration = Duration::from_secs(1);
+
+impl<'a> Gateway<'a> {
+    fn open(options: &'a GatewayOptions, stop: &AtomicBool) -> Result<Gateway<'a>, Failure> {
+        let selection = options.selection()?;
+        if options.interface.is_none() && options.to.is_empty() {
+            return Err(uplink::nowhere());
+        }
+        let interface = options.interface.as_deref().map(Uplink::open).transpose()?;
+        let domain = options.places.first().map(Domain::name).unwrap_or_default();
+        let now_s = clock::wall_ns() / 1_000_000_000;
+        let machine = machine::machine(Path::new(machine::ID));
+        let way = interface.as_ref().map_or(HOSTS, Uplink::name);
+        let life = Life::begin(&life::directory()?, domain, way, now_s, machine)?;
+        let form = if options.bare { Form::Bare } else { Form::Sealed };
+        let lan = Lan::open(life, interface, &options.to, form, options.ttl, options.longest, stop)?;
+        let sensor = |name: &&str| Sensor::new(name, &selection, !options.bare);
+        Ok(Gateway {
+            options,
+            sensors: selection.named().iter().map(sensor).collect(),
+            selection,
+            session: Session::new(options.places.clone()),
+            lan,
+            started: Instant::now(),
+            roll: Roll::default(),
+            waiting_said: false,
+            is_there: false,
+            is_checked: false,
+            tick_at: Instant::now(),
+        })
+    }
+
+    fn run(&mut self, report: &mut Report<'_>, tell: &AtomicBool, stop: &AtomicBool) -> Result<(), End> {
+        report.begin(&self.lan, self.options.bare)?;
+        if self.lan.groups.as_ref().is_some_and(|groups| !groups.interface.is_up()) {
+            report.interface(&self.lan)?;
+        }
+        let end = self.go_on(report, tell, stop);
+        // However it ends: how many were sent is the last word.
+        self.announce();
+        end.and_then(|()| report.account(&self.lan))
+    }
+
+    fn go_on(&mut self, report: &mut Report<'_>, tell: &AtomicBool, stop: &AtomicBool) -> Result<(), End> {
+        while !stop.load(Ordering::Relaxed) {
+            if self.lan.look() {
+                report.interface(&self.lan)?;
+            }
+            // What is there comes before the question whether the hub still is: that takes longer than sending.
+            let (mut more, mut subscribed) = (false, false);
+            for sensor in &mut self.sensors {
+                more |= sensor.forward(&mut self.session, &mut self.lan, &mut subscribed)?;
+            }
+            let now = Instant::now();
+            self.look(report, now)?;
+            self.tick(report, now)?;
+            if tell.swap(false, Ordering::Relaxed) {
+                report.account(&self.lan)?;
+            }
+            if !more {
+                let tick = self.tick_at.saturating_duration_since(now);
+                let left = self.sensors.iter().filter_map(Sensor::left).chain(self.roll.left());
+                self.session.wait_for(Some(left.fold(tick, Duration::min)))?;
+            }
+        }
+        Ok(())
+    }
+
+    /// News of the hub, and the sensors of one that came.
+    fn look(&mut self, report: &mut Report<'_>, now: Instant) -> Result<(), End> {
+        let change = self.session.look()?;
+        if change.gone.is_some() && self.is_there {
+            self.is_there = false;
+            self.roll.end();
+            report.hub(Notice::HubGone)?;
+        }
+        // Somebody else may bring the sensors of other machines, which are not sent on.
+        if change.back.is_some() && self.session.hub_lives() {
+            if self.roll.has_begun() || self.waiting_said {
+                report.hub(Notice::HubBack)?;
+            }
+            self.is_there = true;
+            self.roll.begin(now);
+        }
+        if !self.roll.has_begun() && !self.waiting_said && now - self.started >= GRACE {
+            self.waiting_said = true;
+            report.hub(Notice::HubGone)?;
+        }
+        Ok(self.call_the_roll(now)?)
+    }
+
+    /// Follows the sensors of the hub if all are wanted; those that are named have to be there in the first hub.
+    fn call_the_roll(&mut self, now: Instant) -> Result<(), Failure> {
+        let Some(domain) = self.session.domain().filter(|_| self.is_there) else { return Ok(()) };
+        let Some(called) = self.roll.call(domain, now)? else { return Ok(()) };
+        if self.selection.wants_all() {
+            for name in &called.sensors {
+                // One that came from another machine has another name.
+                let is_known = self.sensors.iter().any(|sensor| sensor.name == *name);
+                if !is_known && check_sensor(name).is_ok() {
+                    self.sensors.push(Sensor::new(name, &self.selection, !self.options.bare));
+                }
+            }
+        }
+        if !self.is_checked && called.age >= GRACE {
+            let is_there = |name: &&str| called.sensors.iter().any(|it| it == name);
+            if let Some(name) = self.selection.named().into_iter().find(|name| !is_there(name)) {
+                return Err(no_sensor(name, &called.sensors));
+            }
+            self.is_checked = true;
+        }
+        Ok(())
+    }
+
+    /// Once a second: announcements, backgrounds, and what became of destinations.
+    fn tick(&mut self, report: &mut Report<'_>, now: Instant) -> Result<(), End> {
+        if now < self.tick_at {
+            return Ok(());
+        }
+        self.tick_at = now + TICK;
+        if let Some(every) = self.options.background_every {
+            self.sensors.iter_mut().for_each(|sensor| sensor.repeat(every, now, &mut self.lan));
+        }
+        self.announce();
+        for outlet in self.lan.outlets_mut() {
+            if let Some(address) = outlet.follow_name(now) {
+                report.moved(&outlet.name, address)?;
+            }
+            if let Some(news) = outlet.news() {
+                report.destination(&outlet.name, &news)?;
+            }
+        }
+        if let Some(what) = self.lan.misfit() {
+            report.misfit(&what, self.lan.longest())?;
+        }
+        report.periodic(&self.lan, self.is_there)
+    }
+
+    fn announce(&mut self) {
+        self.sensors.iter().for_each(|sensor| sensor.announce(&mut self.lan));
+    }
+}

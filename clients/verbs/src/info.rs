@@ -1,0 +1,166 @@
+//! `scanhub info`: how the links and their sensors are, from the last status that each has published.
+
+use std::io::Write;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::{Duration, Instant};
+
+use scanhub_client::clock;
+use scanhub_client::streams::{Follower, GRACE, Session, find};
+use schema::{Counter, Domain, Failure, Kind, Pose, Status, check_followed, ipc};
+
+use crate::json;
+use crate::names::{as_word, no_sensor};
+use crate::output::{Output, quiet, table};
+
+/// What `info` is asked for.
+#[derive(Clone, Debug)]
+pub struct InfoOptions {
+    /// The sensor; none: all of them.
+    pub sensor: Option<String>,
+    /// Objects instead of text.
+    pub json: bool,
+    /// Where the domain may be, see [`Domain::candidates`].
+    pub places: Vec<Domain>,
+}
+
+/// Writes state, properties, counters and last error of the sensors to `out`.
+///
+/// [`Kind::NoHub`] within a second if there is none, [`Kind::NoTopic`] with the sensors that there are,
+/// [`Kind::Timeout`] if a sensor's status does not come, [`Kind::Interrupted`] if `stop` is set.
+pub fn info(options: &InfoOptions, out: &mut dyn Write, stop: &AtomicBool) -> Result<(), Failure> {
+    options.sensor.iter().try_for_each(|sensor| as_word(check_followed(sensor)))?;
+    let domain = find(&options.places)?;
+    let sensors = wanted(options.sensor.as_deref(), &domain)?;
+    let now_ns = clock::now().monotonic_ns;
+    let mut output = Output::new(out);
+    for (sensor, status) in statuses(&domain, &sensors, stop)? {
+        let Some(status) = status else {
+            let hint = "the hub is there and does not publish: look at its log";
+            return Err(Failure::new(Kind::Timeout, format!("no status of {sensor} came"), hint));
+        };
+        quiet(if options.json {
+            output.json(&json::status(&sensor, &status))
+        } else {
+            table(&mut output, &properties(&sensor, &status, now_ns))
+                .and_then(|()| table(&mut output, &counters(&status)))
+        })?;
+    }
+    Ok(())
+}
+
+/// The sensors to tell of. One that is not there may belong to a hub that is just starting.
+fn wanted(sensor: Option<&str>, domain: &Domain) -> Result<Vec<String>, Failure> {
+    let give_up_at = Instant::now() + GRACE;
+    loop {
+        let sensors = ipc::sensors(domain)?;
+        match sensor {
+            None => return Ok(sensors),
+            Some(sensor) if sensors.iter().any(|it| it == sensor) => return Ok(vec![sensor.to_owned()]),
+            Some(sensor) if Instant::now() >= give_up_at => return Err(no_sensor(sensor, &sensors)),
+            Some(_) => std::thread::sleep(ASK_AGAIN),
+        }
+    }
+}
+
+/// The last status of each of `sensors`, or none for one whose status does not come in time.
+pub(crate) fn statuses(
+    domain: &Domain,
+    sensors: &[String],
+    stop: &AtomicBool,
+) -> Result<Vec<(String, Option<Status>)>, Failure> {
+    let give_up_at = Instant::now() + PATIENCE;
+    let mut session = Session::new(vec![domain.clone()]);
+    let mut followers: Vec<_> = sensors.iter().map(|sensor| Follower::<Status>::new(sensor)).collect();
+    let mut found: Vec<_> = sensors.iter().map(|sensor| (sensor.clone(), None)).collect();
+    loop {
+        session.look()?;
+        for (follower, (_, status)) in followers.iter_mut().zip(&mut found) {
+            while let Some(sample) = follower.receive(&mut session)? {
+                *status = Some(*sample);
+            }
+        }
+        if found.iter().all(|(_, status)| status.is_some()) || Instant::now() >= give_up_at {
+            return Ok(found);
+        }
+        if stop.load(Ordering::Relaxed) {
+            return Err(Failure::new(Kind::Interrupted, "interrupted", ""));
+        }
+        session.wait(Some((Instant::now() + ASK_AGAIN).min(give_up_at)))?;
+    }
+}
+
+/// The hub hands its last status to newcomers ten times a second.
+const PATIENCE: Duration = Duration::from_millis(1500);
+
+/// The history comes without a wake-up.
+const ASK_AGAIN: Duration = Duration::from_millis(10);
+
+fn properties(sensor: &str, status: &Status, now_ns: u64) -> Vec<Vec<String>> {
+    let seconds = now_ns.saturating_sub(status.since_ns) as f64 / 1e9;
+    let state = status.state().map_or("unknown", |state| state.name());
+    let step_deg = f64::from(status.resolution_cdeg) / 100.0;
+    let known = |text: String, known: bool| if known { text } else { "unknown".into() };
+    let row = |label: &str, value: String| vec![format!("{label:<WIDTH$}"), value];
+    let mut rows = vec![
+        row(sensor, format!("{state} for {seconds:.1} s")),
+        row("  type", known(status.sensor_type().into(), !status.sensor_type().is_empty())),
+        row("  port", status.port().into()),
+        row("  baud rate", known(format!("{} Bd", status.baud), status.baud != 0)),
+        row("  mode", known(format!("{:02x}h", status.mode), status.mode != Status::MODE_UNKNOWN)),
+        row("  unit", known(format!("{} mm", status.unit_mm), status.unit_mm != 0)),
+        row(
+            "  view",
+            known(format!("{} deg in steps of {step_deg}", status.angle_deg), status.angle_deg != 0),
+        ),
+        row("  rate", format!("{:.2} Hz", f64::from(status.rate_mhz) / 1000.0)),
+        row("  line", line(status)),
+        row("  pose", pose(&status.pose)),
+        row("  marks", marks(sensor, status)),
+    ];
+    if !status.last_error().is_empty() {
+        rows.push(row("  last error", status.last_error().into()));
+    }
+    rows
+}
+
+/// What the line takes away: lately, and since the hub's start.
+fn line(status: &Status) -> String {
+    let percent = |share: f64| format!("{:.2} %", 100.0 * share);
+    let lost = match (status.lost_on_line(), status.lost_share()) {
+        (Some(lost), Some(share)) => {
+            let due = status.counters[Counter::DueOnLine];
+            format!("{} of the scans lost in 10 s, {lost} of {due} in all", percent(share))
+        }
+        _ => "what is lost is not known".to_owned(),
+    };
+    format!("{} of the bytes damaged, {lost}", percent(status.damaged()))
+}
+
+fn pose(pose: &Pose) -> String {
+    let Pose { x_m, y_m, yaw_rad, upside_down, .. } = pose;
+    let mounted = if *upside_down == 0 { "" } else { ", upside down" };
+    format!("x {x_m} m, y {y_m} m, yaw {:.1} deg{mounted}", yaw_rad.to_degrees())
+}
+
+fn marks(sensor: &str, status: &Status) -> String {
+    match (status.has_reflector_bits(), status.reflector_remedy()) {
+        (None, _) if status.is_replayed() => {
+            format!("unavailable: the recording does not tell its measuring mode; set link.{sensor}.mode")
+        }
+        (None, _) => "unknown".into(),
+        (Some(true), _) => "available".into(),
+        (Some(false), None) => "unavailable: the recording has no reflector bits".into(),
+        (Some(false), Some(remedy)) => format!("unavailable: no reflector bits; `{remedy}`"),
+    }
+}
+
+fn counters(status: &Status) -> Vec<Vec<String>> {
+    status
+        .counters
+        .named()
+        .map(|(name, value)| vec![format!("  {name:<0$}", WIDTH - 2), value.to_string()])
+        .collect()
+}
+
+/// Of the labels: the longest counter's name and its indent.
+const WIDTH: usize = 21;

@@ -1,0 +1,202 @@
+//! The classes of what the hub makes of a scan: marks, zones, foreground. A contract, as its parent.
+
+use scanhub_client::{Heard, Robot};
+use schema::{Foreground, Header, Mark, Marks, ROBOT, Segment, Verdict, Zone, Zones};
+use serde::{Serialize, Serializer};
+
+use super::{Stamp, Words};
+
+/// Class `marks`.
+pub(crate) fn marks<'a>(sensor: &'a str, header: &Header, marks: &'a Marks) -> impl Serialize + 'a {
+    #[derive(Serialize)]
+    struct Line<'a> {
+        #[serde(flatten)]
+        stamp: Stamp<'a>,
+        available: bool,
+        overflow: bool,
+        #[serde(serialize_with = "mark_list")]
+        marks: &'a [Mark],
+        #[serde(flatten)]
+        flags: Words,
+    }
+    Line {
+        stamp: Stamp::new("marks", sensor, header),
+        available: marks.is_available(),
+        overflow: marks.is_overflow(),
+        marks: marks.marks(),
+        flags: Words::of(header),
+    }
+}
+
+/// Class `zones`; a silence has neither numbers nor stamps.
+pub(crate) fn zones<'a>(sensor: &'a str, heard: &'a Heard) -> impl Serialize + 'a {
+    #[derive(Serialize)]
+    struct Line<'a> {
+        #[serde(flatten)]
+        stamp: Stamp<'a>,
+        verdict: &'static str,
+        nearest_mm: Option<u32>,
+        nearest_beam: Option<u16>,
+        #[serde(serialize_with = "zone_list")]
+        zones: &'a [Zone],
+        invalid_beams: u16,
+        #[serde(skip_serializing_if = "std::ops::Not::not")]
+        provisional: bool,
+        #[serde(skip_serializing_if = "std::ops::Not::not")]
+        stale: bool,
+        #[serde(flatten)]
+        flags: Option<Words>,
+    }
+    let zones = &heard.zones;
+    let (nearest_beam, nearest_mm) = zones.nearest().unzip();
+    let stamp = match &heard.header {
+        Some(header) => Stamp::new("zones", sensor, header),
+        None => Stamp::unheard("zones", sensor),
+    };
+    Line {
+        stamp,
+        verdict: zones.verdict().name(),
+        nearest_mm,
+        nearest_beam,
+        zones: zones.zones(),
+        invalid_beams: zones.invalid_beams,
+        provisional: zones.flags & Zones::PROVISIONAL != 0,
+        stale: heard.stale,
+        flags: heard.header.as_ref().map(Words::of),
+    }
+}
+
+/// Class `zones` of the robot: the fold over its sensors after `heard`, the last sample of one of them.
+pub(crate) fn robot<'a>(robot: &'a Robot, heard: &Heard) -> impl Serialize + 'a {
+    #[derive(Serialize)]
+    struct Line<'a> {
+        class: &'static str,
+        sensor: &'static str,
+        stamp_ns: Option<u64>,
+        wall_ns: Option<u64>,
+        verdict: &'static str,
+        nearest_mm: Option<u32>,
+        nearest_sensor: Option<&'a str>,
+        #[serde(serialize_with = "verdict_list")]
+        sensors: &'a Robot,
+        #[serde(skip_serializing_if = "std::ops::Not::not")]
+        stale: bool,
+    }
+    let (nearest_mm, nearest_sensor) = robot.nearest().unzip();
+    Line {
+        class: "zones",
+        sensor: ROBOT,
+        stamp_ns: heard.header.map(|header| header.stamp_first_ns),
+        wall_ns: heard.header.map(|header| header.wall_ns),
+        verdict: robot.verdict().name(),
+        nearest_mm,
+        nearest_sensor,
+        sensors: robot,
+        stale: heard.stale,
+    }
+}
+
+/// Class `foreground`.
+pub(crate) fn foreground<'a>(
+    sensor: &'a str,
+    header: &Header,
+    foreground: &'a Foreground,
+) -> impl Serialize + 'a {
+    #[derive(Serialize)]
+    struct Line<'a> {
+        #[serde(flatten)]
+        stamp: Stamp<'a>,
+        generation: u32,
+        unit_mm: u8,
+        #[serde(serialize_with = "beams")]
+        beams: &'a Foreground,
+        ranges: &'a [u16],
+        #[serde(serialize_with = "segment_list")]
+        segments: &'a Foreground,
+        left_out: u8,
+        #[serde(flatten)]
+        flags: Words,
+    }
+    Line {
+        stamp: Stamp::new("foreground", sensor, header),
+        generation: foreground.generation,
+        unit_mm: foreground.unit_mm,
+        beams: foreground,
+        ranges: foreground.ranges(),
+        segments: foreground,
+        left_out: foreground.left_out,
+        flags: Words::of(header),
+    }
+}
+
+fn mark_list<S: Serializer>(marks: &[Mark], serializer: S) -> Result<S::Ok, S::Error> {
+    #[derive(Serialize)]
+    struct Item {
+        angle_deg: f64,
+        range_mm: f64,
+        peak: u8,
+        weight: u16,
+        first_beam: u16,
+        last_beam: u16,
+        edge: bool,
+    }
+    serializer.collect_seq(marks.iter().map(|mark| Item {
+        angle_deg: f64::from(mark.angle_mdeg) / 1000.0,
+        range_mm: f64::from(mark.range_dmm) / 10.0,
+        peak: mark.peak,
+        weight: mark.weight,
+        first_beam: mark.first_beam,
+        last_beam: mark.last_beam,
+        edge: mark.edge != 0,
+    }))
+}
+
+fn zone_list<S: Serializer>(zones: &[Zone], serializer: S) -> Result<S::Ok, S::Error> {
+    #[derive(Serialize)]
+    struct Item {
+        radius_mm: u16,
+        violated: bool,
+        beams: u16,
+    }
+    serializer.collect_seq(zones.iter().map(|zone| Item {
+        radius_mm: zone.radius_mm,
+        violated: zone.violated != 0,
+        beams: zone.beams,
+    }))
+}
+
+fn verdict_list<S: Serializer>(robot: &Robot, serializer: S) -> Result<S::Ok, S::Error> {
+    #[derive(Serialize)]
+    struct Item<'a> {
+        sensor: &'a str,
+        verdict: &'static str,
+    }
+    let item = |(sensor, verdict): (_, Verdict)| Item { sensor, verdict: verdict.name() };
+    serializer.collect_seq(robot.sensors().map(item))
+}
+
+fn segment_list<S: Serializer>(foreground: &Foreground, serializer: S) -> Result<S::Ok, S::Error> {
+    #[derive(Serialize)]
+    struct Item {
+        first: u16,
+        last: u16,
+        nearest_mm: u32,
+        width_mm: u32,
+        x_mm: i32,
+        y_mm: i32,
+    }
+    let unit_mm = u32::from(foreground.unit_mm);
+    let item = |segment: &Segment| Item {
+        first: segment.first,
+        last: segment.last,
+        nearest_mm: u32::from(segment.nearest) * unit_mm,
+        width_mm: u32::from(segment.width) * unit_mm,
+        x_mm: segment.x_mm,
+        y_mm: segment.y_mm,
+    };
+    serializer.collect_seq(foreground.segments().iter().map(item))
+}
+
+fn beams<S: Serializer>(foreground: &Foreground, serializer: S) -> Result<S::Ok, S::Error> {
+    serializer.collect_seq(foreground.readings().map(|(beam, _)| beam))
+}

@@ -1,0 +1,53 @@
+//! The verbs that follow a hub and show, keep or pass on what it publishes: everything that prints. Each stands on
+//! `scanhub_client` and never on a hub. Refuses to know command lines and signals: options come as structs, the wish to stop
+//! as a flag.
+
+mod account;
+mod background;
+mod body;
+mod control;
+pub mod duration;
+mod echo;
+mod errand;
+mod file;
+mod follow;
+mod gateway;
+mod hz;
+mod info;
+mod interface;
+mod json;
+mod latency;
+mod leds;
+mod line;
+mod list;
+mod listen;
+mod mask;
+mod names;
+mod output;
+#[cfg(feature = "record")]
+mod record;
+mod roll;
+mod selection;
+mod spare;
+mod text;
+#[cfg(feature = "tui")]
+mod watch;
+mod window;
+
+pub use background::{BackgroundOptions, ModelOrder, background, saved_model};
+pub use control::{ControlOptions, control};
+pub use echo::{EchoOptions, Format, echo};
+pub use follow::Bounds;
+pub use gateway::{GatewayLook, GatewayOptions, gateway};
+pub use hz::{HzOptions, hz};
+pub use info::{InfoOptions, info};
+pub use json::error as error_line;
+pub use latency::{LatencyOptions, latency};
+pub use leds::{LedsLook, LedsOptions, leds};
+pub use list::{ListOptions, list, list_domains};
+pub use listen::{ListenOptions, listen};
+pub use mask::{MaskOptions, mask};
+#[cfg(feature = "record")]
+pub use record::{RecordLook, RecordOptions, Split, record};
+#[cfg(feature = "tui")]
+pub use watch::{WatchOptions, watch};

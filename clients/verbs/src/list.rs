@@ -1,0 +1,144 @@
+//! `scanhub list`: what the running hub publishes, and which domains of this user are live.
+
+use std::io::Write;
+use std::path::PathBuf;
+use std::sync::atomic::AtomicBool;
+
+use scanhub_client::streams::find;
+use schema::ipc::{self, Node, Payload, PortFactory};
+use schema::{Background, Domain, Failure, Foreground, Marks, Scan, State, Status, Topic, Zones, publisher};
+use serde::{Serialize, Serializer};
+
+use crate::info::statuses;
+use crate::output::{Output, quiet, table};
+
+/// What `list` is asked for.
+#[derive(Clone, Debug)]
+pub struct ListOptions {
+    /// Objects instead of a table.
+    pub json: bool,
+    /// Where the domain may be, see [`Domain::candidates`].
+    pub places: Vec<Domain>,
+}
+
+/// Writes the topics of every sensor of the hub to `out`, with rate, consumers, payload type and revision.
+///
+/// [`Kind::NoHub`](schema::Kind) within a second if there is none, [`Kind::Interrupted`](schema::Kind) if `stop` is set.
+pub fn list(options: &ListOptions, out: &mut dyn Write, stop: &AtomicBool) -> Result<(), Failure> {
+    let domain = find(&options.places)?;
+    let node = ipc::client_node(&domain)?;
+    let sensors = ipc::sensors(&domain)?;
+    let mut lines = Vec::new();
+    for sensor in &sensors {
+        lines.extend(line::<[u8]>(&node, sensor)?);
+        lines.extend(line::<Scan>(&node, sensor)?);
+        lines.extend(line::<Marks>(&node, sensor)?);
+        lines.extend(line::<Zones>(&node, sensor)?);
+        lines.extend(line::<Foreground>(&node, sensor)?);
+        lines.extend(line::<Background>(&node, sensor)?);
+        lines.extend(line::<Status>(&node, sensor)?);
+    }
+    for (sensor, status) in statuses(&domain, &sensors, stop)? {
+        for line in lines.iter_mut().filter(|line| line.sensor == sensor && comes_with_scans(line.topic)) {
+            line.hz = status.as_ref().and_then(rate_hz);
+        }
+    }
+    let mut output = Output::new(out);
+    if options.json {
+        return quiet(lines.iter().try_for_each(|line| output.json(line)));
+    }
+    let mut rows = vec![["TOPIC", "HZ", "CONSUMERS", "PAYLOAD", "REVISION"].map(String::from).to_vec()];
+    rows.extend(lines.iter().map(Line::row));
+    quiet(table(&mut output, &rows))
+}
+
+/// Writes every live domain below `bases` (`--root`, or [`Environment::bases`](schema::Environment::bases)) to `out`.
+pub fn list_domains(bases: &[PathBuf], json: bool, out: &mut dyn Write) -> Result<(), Failure> {
+    #[derive(Serialize)]
+    struct Line {
+        class: &'static str,
+        domain: String,
+        root: PathBuf,
+        pid: u32,
+    }
+    let mut lines = Vec::new();
+    for base in bases {
+        for entry in base.read_dir().into_iter().flatten().flatten() {
+            let Some(domain) = entry.file_name().to_str().and_then(|name| Domain::at(name, base).ok()) else {
+                continue;
+            };
+            // Another user's domain is not one of this user's.
+            if let Ok(Some(pid)) = publisher(domain.root()) {
+                let root = domain.root().to_owned();
+                lines.push(Line { class: "domain", domain: domain.name().to_owned(), root, pid });
+            }
+        }
+    }
+    lines.sort_by(|a, b| a.root.cmp(&b.root));
+    let mut output = Output::new(out);
+    if json {
+        return quiet(lines.iter().try_for_each(|line| output.json(line)));
+    }
+    let mut rows = vec![["DOMAIN", "PID", "ROOT"].map(String::from).to_vec()];
+    rows.extend(
+        lines.iter().map(|it| vec![it.domain.clone(), it.pid.to_string(), it.root.display().to_string()]),
+    );
+    quiet(table(&mut output, &rows))
+}
+
+/// Class `topic`; the rate is the hub's own measurement of the scans, null where it does not say one and for topics that
+/// come at their own time. Marks and foreground are sent while somebody listens.
+#[derive(Serialize)]
+struct Line {
+    class: &'static str,
+    sensor: String,
+    #[serde(serialize_with = "name")]
+    topic: Topic,
+    payload: &'static str,
+    revision: u32,
+    hz: Option<f64>,
+    subscribers: usize,
+}
+
+impl Line {
+    fn row(&self) -> Vec<String> {
+        vec![
+            format!("{}/{}", self.sensor, self.topic.name()),
+            self.hz.map_or_else(|| "-".into(), |hz| format!("{hz:.2}")),
+            self.subscribers.to_string(),
+            self.payload.to_owned(),
+            self.revision.to_string(),
+        ]
+    }
+}
+
+fn line<P: Payload + ?Sized>(node: &Node, sensor: &str) -> Result<Option<Line>, Failure> {
+    let topic = P::TOPIC;
+    Ok(P::open(node, sensor)?.map(|service| Line {
+        class: "topic",
+        sensor: sensor.to_owned(),
+        topic,
+        payload: topic.payload(),
+        revision: ipc::payload_revision(service.attributes()),
+        hz: None,
+        subscribers: service.dynamic_config().number_of_subscribers(),
+    }))
+}
+
+/// The rate of the scans; none yet of a stream that just began, which has not been measured.
+fn rate_hz(status: &Status) -> Option<f64> {
+    let is_unmeasured = status.rate_mhz == 0 && status.state() == Some(State::Streaming);
+    (!is_unmeasured).then(|| f64::from(status.rate_mhz) / 1000.0)
+}
+
+/// Not each second or when there is something new, but scan by scan.
+fn comes_with_scans(topic: Topic) -> bool {
+    match topic {
+        Topic::Telegram | Topic::Scan | Topic::Marks | Topic::Zones | Topic::Foreground => true,
+        Topic::Background | Topic::Status => false,
+    }
+}
+
+fn name<S: Serializer>(topic: &Topic, serializer: S) -> Result<S::Ok, S::Error> {
+    serializer.serialize_str(topic.name())
+}

@@ -1,0 +1,318 @@
+//! `scanhub zones SENSOR mask`: looks at what a sensor sees of its own robot, and prints it as the configuration that
+//! makes the hub look past it. What is body is decided by `body`; what is printed changes nothing by itself.
+
+use std::fmt::Write as _;
+use std::io::Write;
+use std::sync::atomic::AtomicBool;
+use std::time::{Duration, Instant};
+
+use scanhub_client::streams::Sample;
+use schema::{Domain, Failure, Kind, Pose, Quality, Topic, check_sensor};
+use serde::Serialize;
+
+use crate::account::Account;
+use crate::body::{Body, Mask, SLICES, Sector};
+use crate::follow::{Bounds, Notice, Sink, follow};
+use crate::names::{TopicName, as_word};
+use crate::output::{End, Output, quiet};
+use crate::text;
+
+/// What `mask` is asked for.
+#[derive(Clone, Debug)]
+pub struct MaskOptions {
+    /// The sensor.
+    pub sensor: String,
+    /// How long to look.
+    pub run_for: Duration,
+    /// What is nearer than so many metres to the robot's centre may be its body; without it the largest circle of the
+    /// sensor's zones.
+    pub within_m: Option<f64>,
+    /// An object instead of TOML.
+    pub json: bool,
+    /// Where the domain may be, see [`Domain::candidates`].
+    pub places: Vec<Domain>,
+}
+
+/// Follows the sensor for a while, then writes its mask to `out` as TOML that a hub takes; what a person has to know of
+/// it to `notes` (stderr). `progress` is told what is going on,
+/// and nothing before a note.
+///
+/// [`Kind::Configuration`] if a value is not possible; [`Kind::NoHub`] and [`Kind::NoTopic`] as
+/// [`echo`](crate::echo()); [`Kind::Timeout`] if too few scans came; [`Kind::Failed`] if the hub went away or the sensor
+/// was set otherwise meanwhile; [`Kind::Interrupted`] if `stop` is set.
+pub fn mask(
+    options: &MaskOptions,
+    out: &mut dyn Write,
+    notes: &mut dyn Write,
+    progress: &mut dyn FnMut(Option<&str>),
+    stop: &AtomicBool,
+) -> Result<(), Failure> {
+    let MaskOptions { sensor, run_for, within_m, .. } = options;
+    as_word(check_sensor(sensor))?;
+    if let Some(within_m) = within_m.filter(|metres| !(0.001..=FARTHEST_M).contains(metres)) {
+        let message = format!("--within {within_m} is no radius");
+        return Err(Failure::new(Kind::Configuration, message, "metres from the robot's centre, at most 65"));
+    }
+    if run_for.is_zero() {
+        let message = "--for 0s sees nothing";
+        return Err(Failure::new(Kind::Configuration, message, "--for 10s, which is what it is without it"));
+    }
+    let topics = [Topic::Status, Topic::Zones, Topic::Scan];
+    let names: Vec<_> = topics.into_iter().map(|topic| TopicName { sensor: sensor.clone(), topic }).collect();
+    let bounds = Bounds { run_for: Some(*run_for), ..Bounds::default() };
+    let mut look = Look {
+        run_for: *run_for,
+        since: Instant::now(),
+        pose: None,
+        within_mm: within_m.map(|metres| 1000.0 * metres),
+        verdicts: 0,
+        violated: 0,
+        body: None,
+        notes: Output::new(notes),
+        progress,
+        told: 0,
+    };
+    quiet(follow(&names, &[], &options.places, &bounds, stop, &mut look))?;
+    let (body, within_mm) = look.seen(sensor)?;
+    let (scans, mask) = (body.scans(), body.mask());
+    let is_violated = look.is_violated();
+    let found = Found { sensor, run_for: *run_for, within_mm, scans, mask, is_violated };
+    let Look { mut notes, progress, .. } = look;
+    progress(None);
+    quiet(found.doubts().iter().try_for_each(|doubt| notes.line(|line| write!(line, "{doubt}"))))?;
+    let mut output = Output::new(out);
+    quiet(if options.json {
+        output.json(&found.object())
+    } else {
+        found.toml().lines().try_for_each(|text| output.line(|line| write!(line, "{text}")))
+    })
+}
+
+/// What comes in while one looks.
+struct Look<'a> {
+    run_for: Duration,
+    since: Instant,
+    pose: Option<Pose>,
+    within_mm: Option<f64>,
+    /// Samples of zones with circles.
+    verdicts: u32,
+    /// Those of them in which the largest circle is violated.
+    violated: u32,
+    body: Option<Body>,
+    notes: Output<'a>,
+    progress: &'a mut dyn FnMut(Option<&str>),
+    /// Whole seconds that were told.
+    told: u64,
+}
+
+impl Look<'_> {
+    /// What was seen, if it is enough to tell a body from noise.
+    fn seen(&self, sensor: &str) -> Result<(&Body, f64), Failure> {
+        let few = |message: String, hint: String| Err(Failure::new(Kind::Timeout, message, hint));
+        let see = format!("`scanhub info {sensor}` shows how it is");
+        if self.pose.is_none() {
+            return few(format!("no status of {sensor} came"), see);
+        }
+        let Some(within_mm) = self.within_mm else {
+            return few(
+                format!("no zones of {sensor} came"),
+                "--within RADIUS says how large they are".into(),
+            );
+        };
+        match &self.body {
+            None => few(format!("no scan of {sensor} came in {:?}", self.run_for), see),
+            Some(body) if body.scans() < LEAST_SCANS || 2 * body.seen_slices() < SLICES => {
+                let message = format!("only {} scans of {sensor} came in {:?}", body.scans(), self.run_for);
+                few(message, format!("{LEAST_SCANS} are needed, over all of the time: a longer --for"))
+            }
+            Some(body) => Ok((body, within_mm)),
+        }
+    }
+
+    /// The largest circle is violated all the while.
+    fn is_violated(&self) -> bool {
+        self.verdicts > 0 && f64::from(self.violated) >= ALL_THE_WHILE * f64::from(self.verdicts)
+    }
+
+    fn slice(&self) -> usize {
+        let share = self.since.elapsed().as_secs_f64() / self.run_for.as_secs_f64();
+        ((share * SLICES as f64) as usize).min(SLICES - 1)
+    }
+}
+
+impl Sink for Look<'_> {
+    fn sample(&mut self, name: &TopicName, sample: &Sample) -> Result<(), End> {
+        match sample {
+            Sample::Status(status) => self.pose = Some(status.pose),
+            Sample::Zones(heard) => {
+                let Some(largest) = heard.zones.zones().first() else { return Ok(()) };
+                self.within_mm.get_or_insert(f64::from(largest.radius_mm));
+                self.verdicts += 1;
+                self.violated += u32::from(largest.violated != 0);
+            }
+            // A telegram that may be broken is no evidence.
+            Sample::Scan(scan) if scan.header().quality() == Quality::Clean => {
+                let slice = self.slice();
+                if let (Some(pose), Some(within_mm)) = (self.pose, self.within_mm) {
+                    let body = self.body.get_or_insert_with(|| Body::new(pose, within_mm));
+                    if !body.look(slice, scan) {
+                        let message = format!("{} was set to another resolution or unit", name.sensor);
+                        return Err(Failure::new(Kind::Failed, message, "look again").into());
+                    }
+                }
+            }
+            _ => {}
+        }
+        Ok(())
+    }
+
+    fn notice(&mut self, names: &[&TopicName], notice: Notice) -> Result<(), End> {
+        if notice == Notice::HubGone {
+            return Err(Failure::new(Kind::Failed, "the hub went away", "look again when it is back").into());
+        }
+        (self.progress)(None);
+        self.notes.line(|line| text::notice(line, names, notice))
+    }
+
+    fn tick(&mut self, now: Instant) -> Result<(), End> {
+        let seconds = (now - self.since).as_secs();
+        if seconds >= self.told {
+            self.told = seconds + 1;
+            let scans = self.body.as_ref().map_or(0, Body::scans);
+            let done = format!("{seconds} of {} s, {scans} scans", self.run_for.as_secs_f64());
+            (self.progress)(Some(&done));
+        }
+        Ok(())
+    }
+
+    fn summary(&mut self, _: &TopicName, _: &Account) -> Result<(), End> {
+        Ok(())
+    }
+}
+
+/// What was found, to be told.
+struct Found<'a> {
+    sensor: &'a str,
+    run_for: Duration,
+    within_mm: f64,
+    scans: u32,
+    mask: Mask,
+    /// The hub finds something in the largest circle all the while.
+    is_violated: bool,
+}
+
+impl Found<'_> {
+    /// What a person should look at before the hub is told.
+    fn doubts(&self) -> Vec<String> {
+        let within = metres(self.within_mm as u32);
+        let mut doubts = Vec::new();
+        if self.mask.sectors.is_empty() {
+            let so = if self.is_violated {
+                // The hub adds zones.margin to its circles, and keeps it to itself.
+                "but the largest circle is violated all the while. If by the robot, look farther: --within RADIUS, \
+                 at least the circle's and zones.margin"
+            } else {
+                "no mask is needed"
+            };
+            doubts.push(format!("nothing of the robot is seen within {within} m of its centre: {so}"));
+        }
+        for Sector { from_mdeg, to_mdeg, range_mm, .. } in &self.mask.moving {
+            let (from, to) = (degrees(*from_mdeg), degrees(*to_mdeg));
+            doubts.push(format!(
+                "from {from} to {to} degrees something moved, at {} m and farther: left out. Look again with nobody near",
+                metres(*range_mm)
+            ));
+        }
+        if self.beams() * MOST_SHARE > self.mask.of_beams {
+            doubts.push(format!(
+                "{} of {} beams are hidden: the hub will be blind there. Look in the open, with nothing else within {within} m",
+                self.beams(),
+                self.mask.of_beams
+            ));
+        }
+        doubts
+    }
+
+    fn beams(&self) -> usize {
+        self.mask.sectors.iter().map(|sector| sector.beams).sum()
+    }
+
+    /// The section of the link that masks the body.
+    fn toml(&self) -> String {
+        let Found { sensor, run_for, scans, mask, .. } = self;
+        let mut text = format!(
+            "# What {sensor} sees of its own robot within {} m of the centre: {} of {} beams, from {scans} scans in {run_for:?}.\n",
+            metres(self.within_mm as u32),
+            self.beams(),
+            mask.of_beams
+        );
+        text += "# In a file of its own it goes to /etc/scanhub/conf.d; beside the link's other keys without its first lines.\n";
+        let _ = writeln!(text, "[[link]]\nname = \"{sensor}\"\n\n[link.zones]");
+        if mask.sectors.is_empty() {
+            return text + "self_min = []\n";
+        }
+        text += "self_min = [\n";
+        for Sector { from_mdeg, to_mdeg, range_mm, .. } in &mask.sectors {
+            let (from, to, range) = (degrees(*from_mdeg), degrees(*to_mdeg), metres(*range_mm));
+            let _ = writeln!(text, "    {{ from = {from}, to = {to}, range = {range} }},");
+        }
+        text + "]\n"
+    }
+
+    /// Class `mask`.
+    fn object(&self) -> impl Serialize {
+        #[derive(Serialize)]
+        struct Line<'a> {
+            class: &'static str,
+            sensor: &'a str,
+            seconds: f64,
+            scans: u32,
+            within_m: f64,
+            beams: usize,
+            of_beams: usize,
+            self_min: Vec<Part>,
+            moving: Vec<Part>,
+        }
+        /// As in the configuration: degrees and metres.
+        #[derive(Serialize)]
+        struct Part {
+            from: f64,
+            to: f64,
+            range: f64,
+        }
+        let part = |sector: &Sector| Part {
+            from: f64::from(sector.from_mdeg) / 1000.0,
+            to: f64::from(sector.to_mdeg) / 1000.0,
+            range: f64::from(sector.range_mm) / 1000.0,
+        };
+        Line {
+            class: "mask",
+            sensor: self.sensor,
+            seconds: self.run_for.as_secs_f64(),
+            scans: self.scans,
+            within_m: self.within_mm / 1000.0,
+            beams: self.beams(),
+            of_beams: self.mask.of_beams,
+            self_min: self.mask.sectors.iter().map(part).collect(),
+            moving: self.mask.moving.iter().map(part).collect(),
+        }
+    }
+}
+
+/// As TOML has it: 1000 is 1.0.
+fn metres(mm: u32) -> String {
+    format!("{:?}", f64::from(mm) / 1000.0)
+}
+
+fn degrees(mdeg: i32) -> String {
+    format!("{:?}", f64::from(mdeg) / 1000.0)
+}
+
+/// Fewer tell little of noise: five in each slice.
+const LEAST_SCANS: u32 = 50;
+/// Of the zones' samples, so that one scan without a reading changes nothing.
+const ALL_THE_WHILE: f64 = 0.9;
+/// As large as a circle of the zones may be.
+const FARTHEST_M: f64 = 65.0;
+/// A robot hides at most the third part of its sensor's view; more will be the room around it.
+const MOST_SHARE: usize = 3;

@@ -1,0 +1,118 @@
+//! `SENSOR/TOPIC` on the command line, and what to say if there is no such thing.
+
+use std::fmt;
+
+use schema::{Failure, Kind, ROBOT, Topic, check_followed};
+
+/// One topic of one sensor.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub(crate) struct TopicName {
+    /// The sensor's name.
+    pub(crate) sensor: String,
+    /// The topic.
+    pub(crate) topic: Topic,
+}
+
+impl TopicName {
+    /// The topic that `text` names, as in `front/scan`; `robot/zones` is the fold over all sensors.
+    ///
+    /// [`Kind::Usage`] with the topics that there are, or if the sensor's name is not possible.
+    pub(crate) fn parse(text: &str) -> Result<TopicName, Failure> {
+        let unknown = |how: String| {
+            Failure::new(Kind::Usage, format!("no topic {text:?}"), format!("{how}{}", topics()))
+        };
+        let (sensor, word) =
+            text.split_once('/').ok_or_else(|| unknown("write SENSOR/TOPIC, as front/zones; ".into()))?;
+        let topic = Topic::parse(word).ok_or_else(|| unknown(nearest(sensor, word)))?;
+        let name = TopicName { sensor: sensor.to_owned(), topic };
+        if sensor == ROBOT && topic != Topic::Zones {
+            let hint = format!("{ROBOT} stands for all sensors, and only their zones add up: {ROBOT}/zones");
+            return Err(Failure::new(Kind::Usage, format!("no topic {text:?}"), hint));
+        }
+        if !name.is_robot() {
+            as_word(check_followed(sensor))?;
+        }
+        Ok(name)
+    }
+
+    /// Not one sensor's topic but the fold over all of them.
+    pub(crate) fn is_robot(&self) -> bool {
+        self.sensor == ROBOT && self.topic == Topic::Zones
+    }
+}
+
+impl fmt::Display for TopicName {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "{}/{}", self.sensor, self.topic.name())
+    }
+}
+
+/// What is `checked` is a word of the command line, which cannot be understood if it is not possible: [`Kind::Usage`].
+pub(crate) fn as_word(checked: Result<(), Failure>) -> Result<(), Failure> {
+    checked.map_err(|failure| Failure { kind: Kind::Usage, ..failure })
+}
+
+/// All topics of a sensor.
+pub(crate) fn topics() -> String {
+    format!("topics are {}", Topic::ALL.map(Topic::name).join(", "))
+}
+
+/// The topic that `word` may have been meant for, if one is near.
+pub(crate) fn nearest(sensor: &str, word: &str) -> String {
+    let topic = near(word, Topic::ALL.into_iter().map(Topic::name));
+    topic.map_or(String::new(), |topic| format!("did you mean {sensor}/{topic}? "))
+}
+
+/// That of `known` which `word` is nearest to, if it is near.
+fn near<'a>(word: &str, known: impl Iterator<Item = &'a str>) -> Option<&'a str> {
+    let near = |known: &str| strsim::jaro_winkler(known, word);
+    known.max_by(|a, b| near(a).total_cmp(&near(b))).filter(|known| near(known) > NEAR)
+}
+
+/// From here on a word may be meant for another: 1 is the same, 0 has nothing of it.
+const NEAR: f64 = 0.8;
+
+/// The hub has no `sensor`, but `sensors`.
+pub(crate) fn no_sensor(sensor: &str, sensors: &[String]) -> Failure {
+    let hint = match sensors {
+        [] => "it has no sensors: `scanhub run --link NAME=PORT`".to_owned(),
+        some => {
+            let near = near(sensor, some.iter().map(String::as_str));
+            let near = near.map_or(String::new(), |near| format!("did you mean {near}? "));
+            format!("{near}there are {}", some.join(", "))
+        }
+    };
+    Failure::new(Kind::NoTopic, format!("the hub has no sensor {sensor}"), hint)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn names() {
+        let name = TopicName::parse("front/scan").unwrap();
+        assert_eq!(
+            (name.sensor.as_str(), name.topic, name.to_string()),
+            ("front", Topic::Scan, "front/scan".into())
+        );
+        for bad in ["front", "front/scam", "front/scan/x", ""] {
+            let failure = TopicName::parse(bad).unwrap_err();
+            assert_eq!(failure.kind, Kind::Usage, "{bad}");
+            assert!(failure.hint.contains("topics are telegram, scan, "), "{failure}");
+        }
+        let hint = |text: &str| TopicName::parse(text).unwrap_err().hint;
+        assert!(hint("zones").starts_with("write SENSOR/TOPIC, as front/zones; topics are "));
+        assert!(hint("front/backgroud").starts_with("did you mean front/background? topics are "));
+        assert!(hint("front/x").starts_with("topics are "));
+        assert!(TopicName::parse("robot/zones").unwrap().is_robot());
+        assert!(!TopicName::parse("front/zones").unwrap().is_robot());
+        let failure = TopicName::parse("robot/scan").unwrap_err();
+        assert_eq!(failure.kind, Kind::Usage);
+        assert!(failure.hint.contains("robot/zones"), "{failure}");
+        assert_eq!(TopicName::parse("Front/scan").unwrap_err().kind, Kind::Usage);
+        let hint = |sensor| no_sensor(sensor, &["front".to_owned(), "rear".to_owned()]).hint;
+        assert_eq!(hint("frnt"), "did you mean front? there are front, rear");
+        assert_eq!(hint("side"), "there are front, rear");
+    }
+}

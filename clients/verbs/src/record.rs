@@ -1,0 +1,328 @@
+//! `scanhub record`: what the hub publishes, in MCAP files. The thread that receives never touches the disk, so that a slow,
+//! full or vanished one costs no live topic a sample; what it costs the recording is counted, told, and seen in the file.
+
+mod disk;
+mod files;
+mod lock;
+mod part;
+mod queue;
+mod refusal;
+mod report;
+mod selection;
+mod told;
+
+use std::collections::BTreeMap;
+use std::fs::{self, File};
+use std::io::{self, ErrorKind, IsTerminal, Write};
+use std::os::fd::AsFd;
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::thread::{self, JoinHandle};
+use std::time::{Duration, Instant};
+
+use scanhub_client::clock;
+use scanhub_client::streams::Sample;
+use schema::file::Compression;
+use schema::{Domain, Failure, Header, Kind};
+
+use crate::account::Account;
+use crate::follow::{Bounds, Notice, Sink, follow};
+use crate::names::TopicName;
+use crate::output::{End, quiet};
+use crate::spare::Spare;
+use disk::Disk;
+use files::Files;
+pub use files::Split;
+use part::{Form, Style};
+use queue::{Entry, Gap, Queue};
+use report::Report;
+use selection::Selection;
+use told::{News, Told};
+
+/// What `record` is asked for.
+#[derive(Clone, Debug)]
+pub struct RecordOptions {
+    /// `SENSOR/TOPIC` or `*/TOPIC`; none: what is usual, of all sensors.
+    pub topics: Vec<String>,
+    /// All topics instead of the usual ones.
+    pub everything: bool,
+    /// Scans as messages of ROS 2 and where the sensors sit, and nothing else.
+    pub ros2: bool,
+    /// How its chunks are packed.
+    pub compression: Compression,
+    /// The file; `-` is stdout, and without one it is named after the time.
+    pub file: Option<PathBuf>,
+    /// What stands at the file's place is overwritten.
+    pub force: bool,
+    /// When it goes on in the next file.
+    pub split: Option<Split>,
+    /// How many of the files stay; the oldest go first.
+    pub keep: Option<usize>,
+    /// How it tells of itself.
+    pub look: RecordLook,
+    /// When it ends by itself.
+    pub bounds: Bounds,
+    /// Where the domain may be, see [`Domain::candidates`].
+    pub places: Vec<Domain>,
+}
+
+impl RecordOptions {
+    /// The file that stands for stdout.
+    pub const STDOUT: &str = "-";
+
+    fn is_to_stdout(&self) -> bool {
+        self.file.as_deref() == Some(Path::new(Self::STDOUT))
+    }
+}
+
+/// How a recorder tells of itself.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum RecordLook {
+    /// Lines at the begin, at the end and when something happens.
+    Lines,
+    /// Objects, once a second too.
+    Json,
+    /// A line that is drawn over itself.
+    Terminal,
+}
+
+/// Records until the bounds are reached or `stop` is set, and finishes the file; set again meanwhile, the end is not waited
+/// for. How far it is goes to `out`, and what is no account to `notes` (stderr) if `out` is not JSON; lines for which there
+/// is no room are left out before they delay what is recorded.
+///
+/// [`Kind::Output`] if there is no file to be had, [`Kind::Failed`] if its end cannot be written, [`Kind::Short`] if either is for
+/// lack of room; [`Kind::Usage`] if stdout is no place for
+/// it; else as [`echo`](crate::echo()).
+pub fn record(
+    options: &RecordOptions,
+    out: &mut (impl Write + AsFd),
+    notes: &mut (impl Write + AsFd),
+    stop: &AtomicBool,
+) -> Result<(), Failure> {
+    let selection = Selection::parse(&options.topics, options.everything, options.ros2)?;
+    let queue = Arc::new(Queue::new());
+    let disk = match begin(options, &queue) {
+        Ok(disk) => disk,
+        Err(end) => return quiet(Err(end)),
+    };
+    let first = disk.path();
+    let over = AtomicBool::new(false);
+    let terminal = out.as_fd().try_clone_to_owned().ok();
+    let (mut out, mut notes) = (Spare::new(out, &over), Spare::new(notes, &over));
+    let mut report = Report::new(options.look, &mut out, &mut notes, terminal);
+    let begun = report.begin(&first);
+    let mut recorder = Recorder {
+        told: disk.told(),
+        tracks: Vec::new(),
+        queue: queue.clone(),
+        pushed: 0,
+        left_out: 0,
+        gap: None,
+        tick_at: Instant::now(),
+        report,
+        over: &over,
+    };
+    let writing = thread::Builder::new().name("disk".into()).spawn(move || disk.run());
+    let writing = writing
+        .map_err(|error| Failure::new(Kind::Short, format!("no thread: {error}"), "see `ulimit -u`"))?;
+    let (names, topics) = (selection.names(), selection.topics());
+    let end =
+        begun.and_then(|()| follow(&names, &topics, &options.places, &options.bounds, stop, &mut recorder));
+    // Whoever went away, the hub or the reader of these lines: what is recorded is kept.
+    let stays = recorder.pushed > 0 || !matches!(end, Err(End::Failure(_)));
+    let finished = recorder.finish(writing, stays, stop);
+    if !stays && !options.is_to_stdout() {
+        // A hub or sensor that is not there leaves nothing behind.
+        files::discard(&first);
+    }
+    quiet(end).and(quiet(finished))
+}
+
+/// The first file.
+fn begin(options: &RecordOptions, queue: &Arc<Queue>) -> Result<Disk, End> {
+    let wall_ns = clock::wall_ns();
+    let usual = files::usual_name(wall_ns);
+    let path = options.file.as_deref().unwrap_or(&usual);
+    let failed = |error: io::Error| refusal::failed(path, options.split.is_some(), &error);
+    let files = match options.is_to_stdout() {
+        true if options.split.is_some() => {
+            return Err(Failure::new(Kind::Usage, "stdout has no parts", "leave --split away").into());
+        }
+        true if io::stdout().is_terminal() => {
+            let hint = "for example `scanhub record -o - | ssh host 'cat > walk.mcap'`";
+            return Err(Failure::new(Kind::Usage, "a recording is nothing for a terminal", hint).into());
+        }
+        true => Err(File::from(io::stdout().as_fd().try_clone_to_owned().map_err(failed)?)),
+        false => {
+            refusal::check(path, options.force)?;
+            Ok(Files::new(path, options.split.is_some(), options.force, options.keep))
+        }
+    };
+    let form = if options.ros2 { Form::Ros2 } else { Form::Hub };
+    let style = Style { form, compression: options.compression };
+    let begun = Disk::begin(queue.clone(), files, options.split, style, facts(options, wall_ns));
+    begun.map_err(|error| match error.kind() {
+        ErrorKind::BrokenPipe => refusal::reader_gone(0).into(),
+        _ => failed(error).into(),
+    })
+}
+
+/// What the recording says of itself.
+fn facts(options: &RecordOptions, wall_ns: u64) -> BTreeMap<String, String> {
+    let host = fs::read_to_string("/proc/sys/kernel/hostname").unwrap_or_default();
+    let domain = options.places.first().map(Domain::name).unwrap_or_default();
+    let facts = [
+        ("domain", domain),
+        ("host", host.trim()),
+        ("version", env!("CARGO_PKG_VERSION")),
+        ("started", &files::iso(wall_ns)),
+        ("started_ns", &wall_ns.to_string()),
+    ];
+    facts.map(|(key, value)| (key.to_owned(), value.to_owned())).into()
+}
+
+/// A sample that is kept for the next file.
+struct Kept {
+    came_at: Instant,
+    header: Header,
+    payload: Vec<u8>,
+}
+
+struct Recorder<'a> {
+    queue: Arc<Queue>,
+    told: Arc<Told>,
+    tracks: Vec<TopicName>,
+    /// Samples handed to the writing thread.
+    pushed: u64,
+    /// Samples for which there was no room.
+    left_out: u64,
+    gap: Option<Gap>,
+    tick_at: Instant,
+    report: Report<'a>,
+    /// Nothing is received any more: now readers of lines may be waited for.
+    over: &'a AtomicBool,
+}
+
+impl Recorder<'_> {
+    /// A sample for which there is no room: from here on all are left out, until there is room again for many.
+    fn leave_out(&mut self, name: &TopicName) -> Result<(), End> {
+        self.left_out += 1;
+        let is_first = self.gap.is_none();
+        let now_ns = clock::wall_ns();
+        let gap =
+            self.gap.get_or_insert_with(|| Gap { from_ns: now_ns, to_ns: now_ns, left_out: Vec::new() });
+        match gap.left_out.iter_mut().find(|(other, _)| other == name) {
+            Some((_, count)) => *count += 1,
+            None => gap.left_out.push((name.clone(), 1)),
+        }
+        if is_first { self.report.gap_begins() } else { Ok(()) }
+    }
+
+    /// The gap is over: it is put down in the file, and told.
+    fn end_gap(&mut self) -> Result<(), End> {
+        let Some(mut gap) = self.gap.take() else { return Ok(()) };
+        gap.to_ns = clock::wall_ns();
+        let told = self.report.gap_ends(&gap);
+        self.queue.note(Entry::Gap(gap));
+        told
+    }
+
+    fn look(&mut self) -> Result<(), End> {
+        let account = self.told.look();
+        for news in account.news.iter() {
+            if *news == News::ReaderGone {
+                return Err(refusal::reader_gone(account.samples).into());
+            }
+            self.report.disk(news)?;
+        }
+        self.report.progress(&account, self.left_out)
+    }
+
+    /// Waits until all of it is written, and says what came of it, if it `stays`. A second wish to stop ends that, too.
+    fn finish(
+        mut self,
+        writing: JoinHandle<io::Result<()>>,
+        stays: bool,
+        stop: &AtomicBool,
+    ) -> Result<(), End> {
+        self.over.store(true, Ordering::Relaxed);
+        stop.store(false, Ordering::Relaxed);
+        let told = self.end_gap();
+        self.queue.end();
+        let ended_at = Instant::now();
+        while !writing.is_finished() {
+            if ended_at.elapsed() < SAME_WISH {
+                stop.store(false, Ordering::Relaxed);
+            } else if stop.load(Ordering::Relaxed) {
+                let what = "the disk did not take the end of the recording yet, and nobody waited for it";
+                return Err(Failure::new(Kind::Failed, what, REPAIR).into());
+            }
+            thread::sleep(LOOK_EVERY);
+        }
+        let written = writing.join().unwrap_or_else(|_| Err(io::Error::other("the writing thread panicked")));
+        let account = self.told.look();
+        if let Err(error) = written {
+            if error.kind() == ErrorKind::BrokenPipe {
+                return Err(refusal::reader_gone(account.samples).into());
+            }
+            let missing = self.pushed - account.samples;
+            let what =
+                format!("the end of the recording cannot be written: {error}; {missing} samples are missing");
+            return Err(Failure::new(refusal::kind(&error), what, REPAIR).into());
+        }
+        told.and_then(|()| account.news.iter().try_for_each(|news| self.report.disk(news)))?;
+        if stays { self.report.end(&account, self.left_out) } else { Ok(()) }
+    }
+}
+
+impl Sink for Recorder<'_> {
+    fn begin(&mut self, name: &TopicName) {
+        self.queue.note(Entry::Track(name.clone()));
+        self.tracks.push(name.clone());
+    }
+
+    fn sample(&mut self, name: &TopicName, sample: &Sample) -> Result<(), End> {
+        let Some(header) = sample.header() else { return Ok(()) };
+        if self.gap.is_some() {
+            if !self.queue.is_roomy() {
+                return self.leave_out(name);
+            }
+            self.end_gap()?;
+        }
+        let Some(track) = self.tracks.iter().position(|track| track == name) else { return Ok(()) };
+        if !self.queue.push(track, header, |room| sample.pack_said(room)) {
+            return self.leave_out(name);
+        }
+        self.pushed += 1;
+        Ok(())
+    }
+
+    fn wants_lines(&self) -> bool {
+        true
+    }
+
+    fn notice(&mut self, names: &[&TopicName], notice: Notice) -> Result<(), End> {
+        self.report.hub(names, notice)
+    }
+
+    fn tick(&mut self, now: Instant) -> Result<(), End> {
+        if now < self.tick_at {
+            return Ok(());
+        }
+        self.tick_at = now + LOOK_EVERY;
+        self.look()
+    }
+
+    fn summary(&mut self, name: &TopicName, account: &Account) -> Result<(), End> {
+        self.over.store(true, Ordering::Relaxed);
+        self.report.topic(name, account)
+    }
+}
+
+/// So often it is looked what the writing thread says.
+const LOOK_EVERY: Duration = Duration::from_millis(50);
+/// Signals that come together are one wish to stop: a shell that loses its terminal sends another SIGHUP than the terminal.
+const SAME_WISH: Duration = Duration::from_secs(1);
+/// What can be done with a file that has no end.
+const REPAIR: &str = "what is in the file can be read; `scanhub convert` gives it an index";

@@ -1,0 +1,141 @@
+//! The same as the classes of `--json`, for people on a terminal: a line a sample, what matters first. No contract.
+
+mod processed;
+
+use std::fmt;
+use std::io::{self, Write};
+
+use scanhub_client::streams::Sample;
+use schema::{Flags, Header, Reasons, Scan, Status, Telegram};
+
+use crate::account::Account;
+use crate::follow::Notice;
+use crate::names::TopicName;
+
+pub(crate) use processed::{background, foreground, marks, zones};
+
+/// Bytes as lower hex, without spaces.
+pub(crate) struct Hex<'a>(pub(crate) &'a [u8]);
+
+impl fmt::Display for Hex<'_> {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        self.0.iter().try_for_each(|byte| write!(f, "{byte:02x}"))
+    }
+}
+
+/// One sample.
+pub(crate) fn sample(line: &mut Vec<u8>, name: &TopicName, sample: &Sample) -> io::Result<()> {
+    write!(line, "{name} ")?;
+    match sample {
+        Sample::Telegram(bytes) => telegram(line, bytes.header(), bytes),
+        Sample::Scan(found) => scan(line, found.header(), found),
+        Sample::Marks(found) => processed::marks(line, found.header(), found),
+        Sample::Zones(heard) => processed::zones(line, heard),
+        Sample::Foreground(found) => processed::foreground(line, found.header(), found),
+        Sample::Background(found) => background(line, found),
+        Sample::Status(found) => status(line, found),
+        Sample::Robot(found) => processed::robot(line, &found.robot),
+    }
+}
+
+/// One notice, for stderr; news of the hub are the same for all streams.
+pub(crate) fn notice(line: &mut Vec<u8>, names: &[&TopicName], notice: Notice) -> io::Result<()> {
+    match notice {
+        Notice::HubGone => return write!(line, "no hub, waiting for one"),
+        Notice::HubBack => return write!(line, "the hub is here"),
+        Notice::Missed(_) | Notice::Stale => {}
+    }
+    for name in names {
+        write!(line, "{name}: ")?;
+    }
+    match notice {
+        Notice::Missed(missed) => write!(line, "missed {missed}"),
+        _ => write!(line, "nothing comes any more"),
+    }
+}
+
+/// The end of a run.
+pub(crate) fn summary(line: &mut Vec<u8>, name: &TopicName, account: &Account) -> io::Result<()> {
+    write!(
+        line,
+        "{name}: {} received, {} lost in {:.1} s",
+        account.received,
+        account.lost,
+        account.seconds()
+    )?;
+    if let Some(hz) = account.hz() {
+        write!(line, ", {hz:.2} Hz")?;
+    }
+    // That nothing was is not worth a word.
+    if let Some(lost) = account.loss.lost_on_line.filter(|&lost| lost > 0) {
+        write!(line, ", {lost} lost on the line")?;
+    }
+    match account.loss.damaged.filter(|&share| share > 0.0) {
+        Some(share) => write!(line, ", {:.2} % of its bytes damaged", 100.0 * share),
+        None => Ok(()),
+    }
+}
+
+fn numbers(line: &mut Vec<u8>, header: &Header) -> io::Result<()> {
+    let seconds = header.stamp_first_ns as f64 / 1e9;
+    write!(
+        line,
+        "seq {} topic_seq {} at {seconds:.6} {}",
+        header.seq,
+        header.topic_seq,
+        header.quality().name()
+    )?;
+    for reason in Reasons::names(header.reasons) {
+        write!(line, " {reason}")?;
+    }
+    if header.flags & Flags::STAMP_ESTIMATED != 0 { write!(line, " stamp_estimated") } else { Ok(()) }
+}
+
+/// What follows the name of a sample of topic `telegram`.
+pub(crate) fn telegram(line: &mut Vec<u8>, header: &Header, bytes: &[u8]) -> io::Result<()> {
+    const SHOWN: usize = 16;
+    numbers(line, header)?;
+    let telegram = Telegram(bytes);
+    write!(
+        line,
+        " address {:02x} command {:02x} {} bytes ",
+        telegram.address(),
+        telegram.command(),
+        bytes.len()
+    )?;
+    write!(line, "{}", Hex(&bytes[..bytes.len().min(SHOWN)]))?;
+    if bytes.len() > SHOWN { write!(line, "...") } else { Ok(()) }
+}
+
+/// What follows the name of a sample of topic `scan`.
+pub(crate) fn scan(line: &mut Vec<u8>, header: &Header, scan: &Scan) -> io::Result<()> {
+    numbers(line, header)?;
+    let beams = scan.beams();
+    let last = scan.angle_deg(beams.saturating_sub(1));
+    write!(line, " {beams} beams {} to {last} deg", scan.angle_deg(0))?;
+    let valid = (0..beams).filter_map(|i| Some((scan.distance_mm(i)?, i)));
+    write!(line, " {} valid", valid.clone().count())?;
+    match valid.min() {
+        Some((mm, i)) => write!(line, " nearest {mm} mm at {} deg", scan.angle_deg(i)),
+        None => Ok(()),
+    }
+}
+
+/// What follows the name of a sample of topic `status`.
+pub(crate) fn status(line: &mut Vec<u8>, status: &Status) -> io::Result<()> {
+    let state = status.state().map_or("unknown", |state| state.name());
+    write!(
+        line,
+        "{state} {} Bd {:.2} Hz {}",
+        status.baud,
+        f64::from(status.rate_mhz) / 1000.0,
+        status.port()
+    )?;
+    if let Some(loss) = status.line_loss() {
+        write!(line, " {loss}")?;
+    }
+    if !status.last_error().is_empty() {
+        write!(line, " last error: {}", status.last_error())?;
+    }
+    Ok(())
+}

@@ -1,0 +1,113 @@
+//! The lines of what the hub makes of a scan. No contract, as its parent.
+
+use std::io::{self, Write};
+
+use scanhub_client::{Heard, Robot};
+use schema::{Background, Flags, Foreground, Header, Marks, Verdict};
+
+use super::numbers;
+
+pub(crate) fn marks(line: &mut Vec<u8>, header: &Header, marks: &Marks) -> io::Result<()> {
+    numbers(line, header)?;
+    if !marks.is_available() {
+        // A sample does not tell whether the mode of a recording is known; `info` does.
+        return if header.flags & Flags::REPLAYED != 0 {
+            write!(
+                line,
+                " unavailable: the recording has no reflector bits, or does not tell its measuring mode: "
+            )?;
+            write!(line, "then set link.NAME.mode")
+        } else {
+            write!(line, " unavailable: the sensor's measuring mode has no reflector bits")
+        };
+    }
+    let count = marks.marks().len();
+    write!(line, " {count} {}", if count == 1 { "mark" } else { "marks" })?;
+    for mark in marks.marks() {
+        let (angle_deg, range_mm) = (f64::from(mark.angle_mdeg) / 1000.0, f64::from(mark.range_dmm) / 10.0);
+        write!(line, ", {range_mm:.1} mm at {angle_deg:.3} deg")?;
+    }
+    if marks.is_overflow() { write!(line, ", and more") } else { Ok(()) }
+}
+
+pub(crate) fn zones(line: &mut Vec<u8>, heard: &Heard) -> io::Result<()> {
+    let Heard { zones, header, .. } = heard;
+    let Some(header) = header else {
+        return write!(line, "unknown: nothing new is heard");
+    };
+    numbers(line, header)?;
+    if heard.stale {
+        return write!(line, " unknown: too old");
+    }
+    write!(line, " {}", zones.verdict().name())?;
+    match zones.nearest() {
+        Some((beam, mm)) => write!(line, " nearest {mm} mm, beam {beam}")?,
+        None => write!(line, " {}", without_nearest(zones.verdict()))?,
+    }
+    for zone in zones.zones() {
+        let violated = if zone.violated != 0 { " violated" } else { "" };
+        write!(line, ", {} mm{violated} {}", zone.radius_mm, zone.beams)?;
+    }
+    if zones.invalid_beams > 0 { write!(line, ", {} invalid", zones.invalid_beams) } else { Ok(()) }
+}
+
+/// The fold over all sensors.
+pub(super) fn robot(line: &mut Vec<u8>, robot: &Robot) -> io::Result<()> {
+    write!(line, "{}", robot.verdict().name())?;
+    match robot.nearest() {
+        Some((mm, sensor)) => write!(line, " nearest {mm} mm, {sensor}:")?,
+        None => write!(line, " {}:", without_nearest(robot.verdict()))?,
+    }
+    for (sensor, verdict) in robot.sensors() {
+        write!(line, " {sensor} {}", verdict.name())?;
+    }
+    Ok(())
+}
+
+/// In place of what is nearest, where no beam met anything.
+fn without_nearest(verdict: Verdict) -> &'static str {
+    if verdict == Verdict::Unknown { "nearest not known" } else { "nothing near" }
+}
+
+pub(crate) fn foreground(line: &mut Vec<u8>, header: &Header, foreground: &Foreground) -> io::Result<()> {
+    numbers(line, header)?;
+    write!(line, " {} beams, {} segments", foreground.beams, foreground.segments)?;
+    let unit_mm = u32::from(foreground.unit_mm);
+    for segment in foreground.segments() {
+        let width_mm = u32::from(segment.width) * unit_mm;
+        write!(line, ", {width_mm} mm wide at ({}, {})", segment.x_mm, segment.y_mm)?;
+    }
+    Ok(())
+}
+
+pub(crate) fn background(line: &mut Vec<u8>, model: &Background) -> io::Result<()> {
+    let far = model.ranges().iter().filter(|&&range| range == Background::FAR).count();
+    let frozen = if model.is_frozen() { ", frozen" } else { "" };
+    let Background { generation, taught, count, unit_mm, .. } = model;
+    write!(
+        line,
+        "generation {generation}: {taught} of {count} beams known, {far} far, in {unit_mm} mm{frozen}"
+    )
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use schema::Zones;
+
+    #[test]
+    fn what_is_not_known_is_not_called_far() {
+        let text = |verdict: Verdict| {
+            let zones = Zones { verdict: verdict as u8, ..Zones::unknown() };
+            let mut line = Vec::new();
+            let header = Some(Header::default());
+            super::zones(&mut line, &Heard { zones, header, missed: 0, stale: false, said: zones }).unwrap();
+            String::from_utf8(line).unwrap()
+        };
+        assert!(text(Verdict::Clear).ends_with(" clear nothing near"));
+        assert!(text(Verdict::Unknown).ends_with(" unknown nearest not known"));
+        let mut line = Vec::new();
+        robot(&mut line, &Robot::default()).unwrap();
+        assert_eq!(line, b"unknown nearest not known:");
+    }
+}

@@ -1,0 +1,236 @@
+//! `scanhub watch`: what the sensors see, live, as a picture in the terminal. It sleeps until there is something new, draws
+//! no more frames than an eye needs and a slow line carries, and gives the terminal back however it ends.
+
+mod draw;
+#[cfg(test)]
+mod golden;
+mod keys;
+mod map;
+mod meter;
+mod orders;
+mod scene;
+mod screen;
+mod view;
+mod work;
+
+use std::io::Write;
+use std::sync::atomic::AtomicBool;
+use std::time::{Duration, Instant};
+
+use scanhub_client::clock;
+use scanhub_client::streams::Sample;
+use schema::{Domain, Failure, Kind, Topic, Verb, check_followed, is_remote};
+
+use crate::account::Account;
+use crate::follow::{Bounds, Notice, Sink, follow};
+use crate::names::{TopicName, as_word};
+use crate::output::{End, quiet};
+use orders::Orders;
+use scene::Scene;
+use screen::{News, Screen};
+use view::{View, Wish};
+use work::Work;
+
+/// What `watch` is asked for.
+#[derive(Clone, Debug)]
+pub struct WatchOptions {
+    /// The sensors; none: all of the hub.
+    pub sensors: Vec<String>,
+    /// Colours may be used.
+    pub colours: bool,
+    /// What stands below the picture beside the keys; empty: nothing.
+    pub note: String,
+    /// When it ends by itself; a person ends it at any time.
+    pub bounds: Bounds,
+    /// Where the domain may be, see [`Domain::candidates`].
+    pub places: Vec<Domain>,
+}
+
+/// Shows the picture on the terminal that `out` writes to, until a person ends it, the bounds are reached or `stop` is set.
+///
+/// [`Kind::Failed`] if there is no terminal that can be taken over, [`Kind::Interrupted`] if Ctrl-C ends a bounded run;
+/// else as [`echo`](crate::echo()).
+pub fn watch(options: &WatchOptions, out: &mut dyn Write, stop: &AtomicBool) -> Result<(), Failure> {
+    options.sensors.iter().try_for_each(|sensor| as_word(check_followed(sensor)))?;
+    let named = |sensor: &String| TOPICS.map(|topic| TopicName { sensor: sensor.clone(), topic });
+    let names: Vec<_> = options.sensors.iter().flat_map(named).collect();
+    let end = Screen::new(out).and_then(|screen| {
+        let mut watcher = Watcher {
+            options,
+            scene: Scene::default(),
+            held: None,
+            view: View { note: options.note.clone(), ..View::new(options.colours) },
+            screen,
+            orders: Orders::default(),
+            work: Work::default(),
+            changed: true,
+            draw_at: Instant::now(),
+            news_until: None,
+        };
+        let topics: &[Topic] = if names.is_empty() { &TOPICS } else { &[] };
+        follow(&names, topics, &options.places, &options.bounds, stop, &mut watcher)
+    });
+    quiet(end)
+}
+
+/// What a picture is made of.
+const TOPICS: [Topic; 6] =
+    [Topic::Scan, Topic::Marks, Topic::Zones, Topic::Foreground, Topic::Background, Topic::Status];
+
+struct Watcher<'a> {
+    options: &'a WatchOptions,
+    scene: Scene,
+    /// The scene whose picture is shown while that is held; the verdict and the sensors' lines go on.
+    held: Option<Scene>,
+    view: View,
+    screen: Screen<'a>,
+    orders: Orders,
+    work: Work,
+    /// The screen does not show what is known.
+    changed: bool,
+    /// No frame before.
+    draw_at: Instant,
+    news_until: Option<Instant>,
+}
+
+impl Watcher<'_> {
+    fn tell(&mut self, news: String, now: Instant) {
+        self.view.news = news;
+        self.news_until = Some(now + READING_TIME);
+        self.changed = true;
+    }
+
+    /// Does what was typed; a window of another size is drawn anew.
+    fn listen(&mut self, now: Instant) -> Result<(), End> {
+        while let Some(news) = self.screen.news()? {
+            self.changed = true;
+            // Whoever types waits for the answer.
+            self.draw_at = now;
+            let News::Key(key) = news else { continue };
+            let wish = self.view.key(key, &self.scene);
+            match (self.view.paused, &self.held) {
+                (true, None) => self.held = Some(self.scene.clone()),
+                (false, Some(_)) => self.held = None,
+                _ => {}
+            }
+            match wish {
+                Some(Wish::Interrupt) if self.options.bounds.bounded() => {
+                    return Err(
+                        Failure::new(Kind::Interrupted, "interrupted before it was through", "").into()
+                    );
+                }
+                Some(Wish::Quit | Wish::Interrupt) => return Err(End::ReaderGone),
+                Some(Wish::Reset) => self.order(Verb::Reset, now),
+                Some(Wish::Freeze) => self.order(Verb::Freeze, now),
+                None => {}
+            }
+        }
+        Ok(())
+    }
+
+    /// Asks the hub about the background of the sensors that are shown; where all of them are frozen already they thaw.
+    fn order(&mut self, verb: Verb, now: Instant) {
+        let shown = self.view.shown(&self.scene);
+        let own: Vec<_> = shown.into_iter().filter(|(_, sensor)| !is_remote(&sensor.name)).collect();
+        let is_frozen = !own.is_empty() && own.iter().all(|(_, sensor)| sensor.is_frozen());
+        let sensors: Vec<_> = own.into_iter().map(|(_, sensor)| sensor.name.clone()).collect();
+        if sensors.is_empty() {
+            return self.tell("no sensor of this machine is shown".into(), now);
+        }
+        let verb = if verb == Verb::Freeze && is_frozen { Verb::Thaw } else { verb };
+        if !self.orders.give(&self.options.places, sensors, verb) {
+            self.tell("the hub still works on the last request".into(), now);
+        }
+    }
+
+    fn draw(&mut self, now: Instant) -> Result<(), End> {
+        let (scene, held, view) = (&self.scene, self.held.as_ref(), &mut self.view);
+        let bytes = self.screen.draw(|frame| {
+            view.fit(held.unwrap_or(scene), draw::dots(frame.area(), scene));
+            draw::draw(frame, scene, held, view);
+        })?;
+        self.changed = false;
+        self.draw_at = now + FRAME.max(Duration::from_secs_f64(bytes as f64 / BYTES_PER_SECOND));
+        Ok(())
+    }
+}
+
+impl Sink for Watcher<'_> {
+    fn begin(&mut self, name: &TopicName) {
+        self.scene.sensor(&name.sensor);
+    }
+
+    fn sample(&mut self, name: &TopicName, sample: &Sample) -> Result<(), End> {
+        if let Some(header) = sample.header() {
+            self.scene.hub_lives = true;
+            if !is_remote(&name.sensor) {
+                self.scene.hub_pid = header.hub_pid;
+            }
+        }
+        let sensor = self.scene.sensor(&name.sensor);
+        match sample {
+            Sample::Scan(scan) => sensor.take_scan(scan.header(), scan, clock::now_ns()),
+            Sample::Marks(marks) => sensor.marks = marks.is_available().then_some(**marks),
+            Sample::Zones(heard) => sensor.zones = heard.zones,
+            Sample::Foreground(foreground) => sensor.foreground = Some(**foreground),
+            Sample::Background(model) => sensor.background = Some(**model),
+            Sample::Status(status) => sensor.take_status(status),
+            Sample::Telegram(_) | Sample::Robot(_) => return Ok(()),
+        }
+        self.changed = true;
+        Ok(())
+    }
+
+    fn notice(&mut self, names: &[&TopicName], notice: Notice) -> Result<(), End> {
+        match (notice, names) {
+            (Notice::Missed(missed), [name]) if name.topic == Topic::Scan => {
+                self.scene.sensor(&name.sensor).lost += missed;
+            }
+            (Notice::HubGone, _) => self.scene.hub_gone(),
+            (Notice::HubBack, _) => self.scene.hub_lives = true,
+            _ => {}
+        }
+        self.changed = true;
+        Ok(())
+    }
+
+    fn tick(&mut self, now: Instant) -> Result<(), End> {
+        self.listen(now)?;
+        if let Some(done) = self.orders.done() {
+            for (sensor, model) in done.models {
+                self.scene.sensor(&sensor).background = Some(model);
+            }
+            self.tell(done.news, now);
+        }
+        if self.news_until.is_some_and(|until| now >= until) {
+            self.news_until = None;
+            self.view.news.clear();
+            self.changed = true;
+        }
+        self.changed |= self.scene.age(clock::now_ns());
+        if self.scene.hub_pid != 0 {
+            let percent = self.work.look(self.scene.hub_pid, now);
+            self.changed |= percent != self.scene.hub_percent;
+            self.scene.hub_percent = percent;
+        }
+        if self.changed && now >= self.draw_at {
+            self.draw(now)?;
+        }
+        Ok(())
+    }
+
+    fn wake_at(&self) -> Option<Instant> {
+        self.changed.then_some(self.draw_at)
+    }
+
+    fn summary(&mut self, _: &TopicName, _: &Account) -> Result<(), End> {
+        Ok(())
+    }
+}
+
+/// Between two frames: what a scan shows is on the screen within 50 ms.
+const FRAME: Duration = Duration::from_millis(45);
+/// A line that carries no more shows fewer frames.
+const BYTES_PER_SECOND: f64 = 80_000.0;
+/// How long news stand where the keys are told.
+const READING_TIME: Duration = Duration::from_secs(4);

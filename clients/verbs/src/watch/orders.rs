@@ -1,0 +1,73 @@
+//! What a person asks of the hub while watching: the background learned anew, held, or learned on. In a thread of its
+//! own, because a hub may take its time and the picture shall not.
+
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::thread::JoinHandle;
+
+use scanhub_client::request;
+use schema::{Background, Domain, Failure, Request, Verb};
+
+/// At most one order at a time.
+#[derive(Default)]
+pub(crate) struct Orders {
+    running: Option<JoinHandle<Done>>,
+    stop: Arc<AtomicBool>,
+}
+
+/// What became of an order.
+pub(crate) struct Done {
+    /// In words.
+    pub(crate) news: String,
+    /// The models afterwards, with their sensors.
+    pub(crate) models: Vec<(String, Background)>,
+}
+
+impl Orders {
+    /// Gives `verb` to the hub at `places` for each of `sensors`; not if it still works on the last one.
+    pub(crate) fn give(&mut self, places: &[Domain], sensors: Vec<String>, verb: Verb) -> bool {
+        if self.running.is_some() {
+            return false;
+        }
+        let (places, stop) = (places.to_vec(), self.stop.clone());
+        self.running = Some(std::thread::spawn(move || carry_out(&places, &sensors, verb, &stop)));
+        true
+    }
+
+    /// What became of the order, once.
+    pub(crate) fn done(&mut self) -> Option<Done> {
+        self.running.take_if(|running| running.is_finished())?.join().ok()
+    }
+}
+
+impl Drop for Orders {
+    fn drop(&mut self) {
+        self.stop.store(true, Ordering::Relaxed);
+        // It holds a place in the domain, which is to be given back.
+        let _ = self.running.take().map(JoinHandle::join);
+    }
+}
+
+fn carry_out(places: &[Domain], sensors: &[String], verb: Verb, stop: &AtomicBool) -> Done {
+    let mut models = Vec::new();
+    let mut order = |sensor: &String| -> Result<(), Failure> {
+        request(places, &Request::new(sensor, verb), stop)?;
+        let shown = request(places, &Request::new(sensor, Verb::Show), stop)?;
+        models.extend(shown.map(|shown| (sensor.clone(), shown.model)));
+        Ok(())
+    };
+    let news = match sensors.iter().try_for_each(&mut order) {
+        Ok(()) => format!("{}: background {}", sensors.join(", "), outcome(verb)),
+        Err(failure) => failure.to_string(),
+    };
+    Done { news, models }
+}
+
+fn outcome(verb: Verb) -> &'static str {
+    match verb {
+        Verb::Reset => "is learned anew",
+        Verb::Freeze => "is held as it is",
+        Verb::Thaw => "is learned on",
+        other => other.name(),
+    }
+}

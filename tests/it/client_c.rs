@@ -1,0 +1,340 @@
+//! The library for C and C++ from outside: its header against `schema`, programs in C and C++ built as its users build them
+//! and run against a hub. Skips, saying so, where there is no C compiler.
+
+pub(crate) mod installed;
+mod layout;
+
+use std::collections::HashSet;
+use std::path::Path;
+use std::process::{Command, Output};
+
+use crate::testkit::{INT, KILL, Program, TERM, TestEnv, hash, is_class, number};
+use installed::{Installed, header_directory, is_there, source};
+use schema::{Header, Scan};
+use serde_json::Value;
+
+fn succeeded(output: &Output) -> String {
+    let text = |bytes| String::from_utf8_lossy(bytes).into_owned();
+    assert!(output.status.success(), "{}{}", text(&output.stdout), text(&output.stderr));
+    text(&output.stdout)
+}
+
+/// A program that finds the hub of this environment.
+fn program(env: &TestEnv, program: &Path, words: &[&str]) -> Program {
+    let mut command = Command::new(program);
+    command.args(words).env("SCANHUB_DOMAIN", env.place().name()).env_remove("XDG_RUNTIME_DIR");
+    command.env("RUNTIME_DIRECTORY", env.place().root().parent().expect("it has one"));
+    Program::start(command)
+}
+
+/// Bytes that a line has as hex.
+fn data(line: &Value) -> Vec<u8> {
+    let text = line["data"].as_str().unwrap_or_else(|| panic!("no data: {line}"));
+    (0..text.len()).step_by(2).map(|at| u8::from_str_radix(&text[at..at + 2], 16).expect("hex")).collect()
+}
+
+/// In every standard that people use.
+#[test]
+fn the_header_has_the_layout_of_schema() {
+    if !is_there("cc") {
+        return;
+    }
+    let env = TestEnv::new();
+    env.file("layout.c", layout::program());
+    for (compiler, standard) in
+        [("cc", "-std=c99"), ("cc", "-std=c11"), ("c++", "-std=c++11"), ("c++", "-std=c++20")]
+    {
+        if !is_there(compiler) {
+            continue;
+        }
+        let mut cc = Command::new(compiler);
+        cc.args([standard, "-Wall", "-Wextra", "-Werror", "-pedantic", "-Wconversion"]);
+        if compiler == "c++" {
+            cc.args(["-x", "c++"]);
+        }
+        cc.arg("-I").arg(header_directory()).arg(env.path("layout.c")).arg("-o").arg(env.path("layout"));
+        succeeded(&cc.output().expect("a compiler"));
+        let said = succeeded(&Command::new(env.path("layout")).output().expect("it runs"));
+        assert_eq!(said.lines().collect::<Vec<_>>(), layout::expected(), "{compiler} {standard}");
+    }
+}
+
+/// A program may read datagrams and topics.
+#[test]
+fn both_headers_go_into_one_program() {
+    if !is_there("cc") {
+        return;
+    }
+    let env = TestEnv::new();
+    let [lan, attach] = ["#include <scanhub.h>\n", "#include <scanhub/attach.h>\n"];
+    for text in [format!("{lan}{attach}"), format!("{attach}{lan}{attach}")] {
+        let file = env.file("both.c", format!("{text}int both(void);\nint both(void) {{ return 0; }}\n"));
+        let mut cc = Command::new("cc");
+        cc.args(["-std=c99", "-Wall", "-Wextra", "-Werror", "-pedantic", "-c", &file, "-o"]);
+        cc.arg(env.path("both.o")).arg("-I").arg(header_directory());
+        cc.arg("-I").arg(Path::new(env!("CARGO_MANIFEST_DIR")).join("clients/c"));
+        succeeded(&cc.output().expect("a compiler"));
+    }
+}
+
+#[test]
+fn what_the_header_computes_is_what_schema_computes() {
+    if !is_there("cc") {
+        return;
+    }
+    let env = TestEnv::new();
+    let header = Header { stamp_first_ns: 5_000_000_000, ..Header::default() };
+    for (count, range_bits, step_mdeg, unit_mm) in
+        [(361, 13, 500, 1), (181, 14, 1000, 10), (401, 15, 250, 100), (0, 13, 0, 1), (u16::MAX, 13, 1, 1)]
+    {
+        let mut scan = Scan { count, range_bits, step_mdeg, unit_mm, ..Scan::default() };
+        scan.first_angle_mdeg = -40_000;
+        let max = (1_u32 << range_bits) - 1;
+        for (i, range) in scan.range_array.iter_mut().enumerate() {
+            *range = (max - (i as u32 * 3) % 40) as u16;
+        }
+        env.file("computes.c", layout::computes(&header, &scan));
+        let mut cc = Command::new("cc");
+        cc.args(["-std=c99", "-Wall", "-Wextra", "-Werror", "-pedantic", "-fsanitize=undefined"]);
+        cc.args(["-fno-sanitize-recover=all", "-I"]).arg(header_directory()).arg(env.path("computes.c"));
+        succeeded(&cc.arg("-o").arg(env.path("computes")).output().expect("a compiler"));
+        let said = succeeded(&Command::new(env.path("computes")).output().expect("it runs"));
+        let expected = (0..405).map(|i| {
+            let mm = scan.distance_mm(i).map_or(-1, i64::from);
+            let at_ns = header.stamp_first_ns.saturating_sub(scan.beam_age_ns(i));
+            format!("{mm} {} {at_ns}", scan.angle_mdeg(i))
+        });
+        assert_eq!(said.lines().collect::<Vec<_>>(), expected.collect::<Vec<_>>());
+    }
+}
+
+/// Everybody who waits in another way gets the same, where the hub wrote it.
+#[test]
+fn a_program_in_c_has_every_sample_in_shared_memory() {
+    let Some(installed) = Installed::once() else { return };
+    let env = TestEnv::new();
+    let follow = installed.compile(&env, &source("follow.c"), &[]);
+    let simulator = env.simulator(&["front"], &["--seed=31"]);
+    let hub = env.hub(&[env.link("front")]);
+    env.await_info("front", |info| info["state"] == "streaming");
+    let mut followers: Vec<_> = ["doorbell", "event", "spin", "poll"]
+        .iter()
+        .map(|way| program(&env, &follow, &["front", "1", way, "60"]))
+        .collect();
+    for follower in &mut followers {
+        follower.await_line("its begin", is_class("open"));
+    }
+    let outcomes: Vec<_> = followers.into_iter().map(Program::wait).collect();
+    assert_eq!(hub.end(TERM).code, Some(0));
+    assert_eq!(simulator.end(TERM).code, Some(0));
+    let sent: HashSet<String> = env.truth("front").into_iter().map(|sent| sent.hash).collect();
+    for outcome in &outcomes {
+        assert_eq!(outcome.code, Some(0), "{outcome}");
+        let samples = outcome.of_class("sample");
+        assert_eq!(samples.len(), 60, "{outcome}");
+        assert!(samples.iter().all(|line| line["shared"] == true && line["restarted"] == 0), "{outcome}");
+        assert!(samples.iter().all(|line| sent.contains(&hash(&data(line)))), "never sent: {outcome}");
+        for pair in samples.windows(2) {
+            let gap = number(&pair[1], "topic_seq") - number(&pair[0], "topic_seq") - 1;
+            assert_eq!(gap, number(&pair[1], "missed"), "{outcome}");
+        }
+    }
+}
+
+#[test]
+fn a_program_in_c_outlives_its_hub() {
+    let Some(installed) = Installed::once() else { return };
+    let env = TestEnv::new();
+    let follow = installed.compile(&env, &source("follow.c"), &[]);
+    // There is no hub yet.
+    let mut followers = ["doorbell", "poll"].map(|way| program(&env, &follow, &["front", "2", way, "0"]));
+    for follower in &mut followers {
+        follower.await_line("its begin", is_class("open"));
+    }
+    let simulator = env.simulator(&["front"], &["--seed=32"]);
+    let mut boots = Vec::new();
+    for how in [KILL, TERM, KILL] {
+        let hub = env.hub(&[env.link("front")]);
+        for follower in &mut followers {
+            let is_new = |line: &Value| is_class("sample")(line) && !boots.contains(&line["boot"]);
+            let first = follower.await_line("a scan of this hub", is_new);
+            assert_eq!(first["restarted"], u64::from(!boots.is_empty()), "{first}");
+            assert_eq!((number(&first, "missed"), data(&first).len()), (0, 1216), "{first}");
+            follower.await_lines(20, "scans", |line| line["boot"] == first["boot"] && line["restarted"] == 0);
+        }
+        let info = env.info("front");
+        boots.push(followers[0].await_line("one more", is_class("sample"))["boot"].clone());
+        assert_eq!(info["state"], "streaming");
+        hub.end(how);
+    }
+    for follower in followers {
+        assert_eq!(follower.end(INT).code, None);
+    }
+    drop(simulator);
+}
+
+/// Nobody who acts on zones needs a clock.
+#[test]
+fn zones_get_unknown_when_the_hub_is_killed() {
+    let Some(installed) = Installed::once() else { return };
+    let env = TestEnv::new();
+    let follow = installed.compile(&env, &source("follow.c"), &[]);
+    let _simulator = env.simulator(&["front"], &["--seed=33"]);
+    let hub = env.hub(&[env.link("front")]);
+    let mut followers = ["doorbell", "poll"].map(|way| program(&env, &follow, &["front", "4", way, "0"]));
+    for follower in &mut followers {
+        follower.await_line("a verdict", |line| {
+            is_class("sample")(line) && line["stale"] == 0 && data(line)[0] < 3
+        });
+    }
+    hub.end(KILL);
+    for follower in &mut followers {
+        let unknown = follower.await_line("silence", |line| line["stale"] == 1);
+        assert_eq!((data(&unknown)[0], unknown.get("seq")), (3, None), "{unknown}");
+    }
+}
+
+/// The worst of its sensors, of which one is switched off, then the hub killed.
+#[test]
+fn a_robot_is_as_unknown_as_its_worst_sensor() {
+    let Some(installed) = Installed::once() else { return };
+    let env = TestEnv::new();
+    let robot = installed.compile(&env, &source("robot.c"), &[]);
+    let mut followers =
+        [&["doorbell"][..], &["poll"], &["event", "front rear"]].map(|words| program(&env, &robot, words));
+    for follower in &mut followers {
+        let first = follower.await_line("there is no hub", is_class("robot"));
+        assert_eq!((&first["verdict"], &first["nearest_mm"]), (&3.into(), &Value::Null), "{first}");
+    }
+    // All is clear: nothing in the simulated room is so near.
+    let _front = env.simulator(&["front"], &["--seed=36", "--baud=500000"]);
+    let rear = env.start(&["simulate", "--json", "--baud=500000", &format!("--port={}", env.word("rear"))]);
+    let rear = rear.ready();
+    let hub = env.hub(&[&env.link("front"), &env.link("rear"), "--set=zones.radii=[0.02,0.01]"]);
+    let verdicts = |line: &Value| {
+        let sensors = line["sensors"].as_array().expect("a list");
+        let of = |sensor: &Value| (sensor["sensor"].as_str().map(str::to_owned), number(sensor, "verdict"));
+        (number(line, "verdict"), sensors.iter().map(of).collect::<Vec<_>>())
+    };
+    let both = |front, rear| vec![(Some("front".to_owned()), front), (Some("rear".to_owned()), rear)];
+    for follower in &mut followers {
+        let line = follower.await_line("all is clear", |line| verdicts(line) == (0, both(0, 0)));
+        assert_eq!(line["worst"], "front", "{line}");
+        let nearest =
+            line["sensors"].as_array().expect("a list").iter().min_by_key(|it| number(it, "nearest_mm"));
+        let nearest = nearest.expect("one of two");
+        assert_eq!(
+            (&line["nearest_mm"], &line["nearest_sensor"]),
+            (&nearest["nearest_mm"], &nearest["sensor"])
+        );
+    }
+    env.kill_simulator(rear, "rear");
+    for follower in &mut followers {
+        let line = follower.await_line("the rear is gone", |line| verdicts(line) == (3, both(0, 3)));
+        assert_eq!(line["worst"], "rear", "{line}");
+    }
+    assert_eq!(hub.end(KILL).code, None);
+    for follower in &mut followers {
+        follower.await_line("the hub is gone", |line| verdicts(line) == (3, both(3, 3)));
+    }
+}
+
+/// Once as it is, and with two watches over memory, of the compiler and of valgrind: the library shares it with the program.
+#[test]
+fn what_a_program_does_wrong_is_refused() {
+    let Some(installed) = Installed::once() else { return };
+    let env = TestEnv::new();
+    let _simulator = env.simulator(&["front"], &["--seed=34"]);
+    let _hub = env.hub(&[env.link("front")]);
+    let misuse = installed.compile(&env, &source("misuse.c"), &[]);
+    let plain = misuse.display().to_string();
+    let mut ways = vec![vec![plain.clone()]];
+    let watch = ["-fsanitize=address,undefined", "-fno-sanitize-recover=all"];
+    match installed.try_compile(&env, &source("misuse.c"), &watch) {
+        Ok(watched) => ways.push(vec![watched.display().to_string()]),
+        Err(_) => eprintln!("without the compiler's watch over memory: it has none"),
+    }
+    if is_there("valgrind") {
+        // What a child keeps of its parent is found, in part by addresses of its middle.
+        let leaks = ["--leak-check=full", "--show-leak-kinds=definite", "--errors-for-leak-kinds=definite"];
+        let words = ["valgrind", "--quiet", leaks[0], leaks[1], leaks[2], "--error-exitcode=9"];
+        ways.push(words.into_iter().map(str::to_owned).chain([plain]).collect());
+    }
+    for way in ways {
+        let words: Vec<&str> = way[1..].iter().map(String::as_str).chain(["front"]).collect();
+        let outcome = program(&env, Path::new(&way[0]), &words).wait();
+        assert_eq!(outcome.code, Some(0), "{outcome}");
+        assert_eq!(outcome.out, b"all refused\n", "{outcome}");
+    }
+}
+
+/// The examples, as the page about them builds them; and a program into which the library is linked.
+#[test]
+fn the_examples_build_and_run() {
+    let Some(installed) = Installed::once() else { return };
+    let env = TestEnv::new();
+    let _simulator = env.simulator(&["front"], &["--seed=35"]);
+    let _hub = env.hub(&[env.link("front")]);
+    let examples = Path::new(env!("CARGO_MANIFEST_DIR")).join("clients/c/examples");
+    let mut built = vec![installed.compile(&env, &examples.join("nearest.c"), &[])];
+    built.extend(installed.compile_static(&env, &examples.join("nearest.c")));
+    let cmake = installed.cmake(&env, &examples);
+    built.extend(cmake.iter().map(|build| build.join("nearest")));
+    for nearest in &built {
+        let outcome = program(&env, nearest, &["front", "5"]).wait();
+        assert_eq!(outcome.code, Some(0), "{outcome}");
+        let said = String::from_utf8_lossy(&outcome.out).into_owned();
+        assert_eq!(said.lines().count(), 5, "{said}");
+        assert!(said.lines().all(|line| line.contains(" mm at ") && line.ends_with(" degrees")), "{said}");
+    }
+    let Some(stop) = installed.compile_cpp(&env, &examples.join("stop.cpp")) else { return };
+    for stop in cmake.iter().map(|build| build.join("stop")).chain([stop]) {
+        let outcome = program(&env, &stop, &["Front"]).wait();
+        assert_eq!(outcome.code, Some(1), "{outcome}");
+        assert!(outcome.errors.contains("\"Front\" is not possible"), "{outcome}");
+        let (feed, _keep) = std::io::pipe().expect("a pipe");
+        let mut command = Command::new(&stop);
+        command.arg("front").env("SCANHUB_DOMAIN", env.place().name()).env_remove("XDG_RUNTIME_DIR");
+        command.env("RUNTIME_DIRECTORY", env.place().root().parent().expect("it has one"));
+        let mut stop = Program::start_with(command, feed);
+        let verdict = stop.next_text();
+        assert!(
+            ["clear", "slow", "stop", "unknown"].iter().any(|name| verdict.starts_with(name)),
+            "{verdict}"
+        );
+    }
+}
+
+#[test]
+fn what_is_installed_is_taken_away_again() {
+    let Some(installed) = Installed::once() else { return };
+    let env = TestEnv::new();
+    let destination = env.path("machine");
+    let run = |words: &[&str]| {
+        let script = Path::new(env!("CARGO_MANIFEST_DIR")).join("clients/c/install.sh");
+        let mut command = Command::new(script);
+        command
+            .args(words)
+            .args(["--library"])
+            .arg(&installed.library)
+            .env("DESTDIR", &destination)
+            .output()
+            .expect("sh")
+    };
+    for _ in 0..2 {
+        succeeded(&run(&["--prefix", "/opt/robot"]));
+    }
+    let below = destination.join("opt/robot");
+    for file in
+        ["lib/libscanhub.so", "lib/libscanhub.so.0", "include/scanhub/attach.h", "include/scanhub/attach.hpp"]
+    {
+        assert!(below.join(file).is_file(), "{file}");
+    }
+    let description = std::fs::read_to_string(below.join("lib/pkgconfig/scanhub.pc")).expect("is there");
+    assert!(description.contains("prefix=/opt/robot\n"), "{description}");
+    assert!(description.contains(concat!("Version: ", env!("CARGO_PKG_VERSION"), "\n")), "{description}");
+    succeeded(&run(&["--prefix", "/opt/robot", "--remove"]));
+    let left = Command::new("find").arg(&destination).args(["!", "-type", "d"]).output().expect("find");
+    assert_eq!(succeeded(&left), "");
+    assert_eq!(run(&["--prefix", "here"]).status.code(), Some(2));
+}

@@ -1,0 +1,162 @@
+//! The library installed as its users have it, and programs built against it as they build theirs. Refuses to know what
+//! the programs do.
+#![allow(dead_code)] // Every test takes what it needs.
+
+use std::ffi::OsStr;
+use std::path::{Path, PathBuf};
+use std::process::{Command, Output};
+use std::sync::OnceLock;
+
+use crate::testkit::{TestEnv, gentle, skip};
+
+/// A place where the library and its header are.
+pub(crate) struct Installed {
+    prefix: PathBuf,
+    /// Where it was installed from.
+    pub(crate) library: PathBuf,
+}
+
+/// As strictly as it goes.
+const STRICT: [&str; 5] = ["-Wall", "-Wextra", "-Wpedantic", "-Wconversion", "-Werror"];
+
+impl Installed {
+    /// The one that all tests share; nothing where there is no C compiler.
+    pub(crate) fn once() -> Option<&'static Installed> {
+        static ONCE: OnceLock<Installed> = OnceLock::new();
+        if !is_there("cc") {
+            return None;
+        }
+        Some(ONCE.get_or_init(|| {
+            let here = Path::new(env!("CARGO_TARGET_TMPDIR")).join("client_c");
+            let _ = std::fs::remove_dir_all(&here);
+            let (prefix, library) = (here.join("prefix"), here.join("library"));
+            std::fs::create_dir_all(&library).expect("a directory");
+            // Not the one for linking into programs, which has 100 MB.
+            let shared = "libscanhub.so";
+            std::os::unix::fs::symlink(built().join(shared), library.join(shared))
+                .expect("a place for a link");
+            let mut command = Command::new(top().join("clients/c/install.sh"));
+            command.arg("--prefix").arg(&prefix).arg("--library").arg(&library).env_remove("DESTDIR");
+            done(&command.output().expect("there is a shell")).unwrap_or_else(|said| panic!("{said}"));
+            Installed { prefix, library }
+        }))
+    }
+
+    /// The program of `source`, against the shared library.
+    pub(crate) fn compile(&self, env: &TestEnv, source: &Path, flags: &[&str]) -> PathBuf {
+        self.try_compile(env, source, flags).unwrap_or_else(|said| panic!("{said}"))
+    }
+
+    /// As [`compile`](Self::compile); what the compiler says if it does not.
+    pub(crate) fn try_compile(
+        &self,
+        env: &TestEnv,
+        source: &Path,
+        flags: &[&str],
+    ) -> Result<PathBuf, String> {
+        let words = ["-std=c99", "-D_DEFAULT_SOURCE", "-g", "-pthread"];
+        self.build("cc", env, source, &[&words, flags].concat(), &self.shared())
+    }
+
+    /// The program of `source` in C++; nothing where there is no compiler for it.
+    pub(crate) fn compile_cpp(&self, env: &TestEnv, source: &Path) -> Option<PathBuf> {
+        let built = self.try_compile_cpp(env, source)?;
+        Some(built.unwrap_or_else(|said| panic!("{said}")))
+    }
+
+    /// As [`compile_cpp`](Self::compile_cpp); what the compiler says if it does not.
+    pub(crate) fn try_compile_cpp(&self, env: &TestEnv, source: &Path) -> Option<Result<PathBuf, String>> {
+        is_there("c++").then(|| self.build("c++", env, source, &["-std=c++11"], &self.shared()))
+    }
+
+    /// The program of `source` with the library in it; nothing where pkg-config does not say how.
+    pub(crate) fn compile_static(&self, env: &TestEnv, source: &Path) -> Option<PathBuf> {
+        let mut ask = self.with_packages(Command::new("pkg-config"));
+        let Ok(said) = ask.args(["--static", "--libs-only-l", "scanhub"]).output() else {
+            skip("pkg-config", "there is none, which says how the library gets into a program");
+            return None;
+        };
+        let said = done(&said).unwrap_or_else(|said| panic!("{said}"));
+        let mut libraries = vec![built().join("libscanhub.a").display().to_string()];
+        libraries.extend(said.split_whitespace().filter(|word| *word != "-lscanhub").map(str::to_owned));
+        let program = self.build("cc", env, source, &["-std=c99"], &libraries);
+        Some(program.unwrap_or_else(|said| panic!("{said}")))
+    }
+
+    /// The directory in which CMake built what `source` describes; nothing where it is not there.
+    pub(crate) fn cmake(&self, env: &TestEnv, source: &Path) -> Option<PathBuf> {
+        if !["cmake", "pkg-config", "c++"].into_iter().all(is_there) {
+            return None;
+        }
+        let build = env.path("cmake");
+        let mut configure = self.with_packages(gentle("cmake"));
+        configure.arg("-S").arg(source).arg("-B").arg(&build);
+        for command in [&mut configure, gentle("cmake").arg("--build").arg(&build)] {
+            done(&command.output().expect("it is there")).unwrap_or_else(|said| panic!("{said}"));
+        }
+        Some(build)
+    }
+
+    fn build<S: AsRef<OsStr>>(
+        &self,
+        compiler: &str,
+        env: &TestEnv,
+        source: &Path,
+        flags: &[&str],
+        libraries: &[S],
+    ) -> Result<PathBuf, String> {
+        let name = source.file_stem().expect("a file");
+        let program = env.path(&format!("{}-{}", name.display(), flags.concat().len() + libraries.len()));
+        let mut command = gentle(compiler);
+        command.args(STRICT).args(flags).arg("-I").arg(self.prefix.join("include")).arg(source);
+        command.args(libraries).arg("-o").arg(&program);
+        done(&command.output().expect("a compiler")).map(|_| program)
+    }
+
+    fn shared(&self) -> Vec<String> {
+        let library = self.prefix.join("lib").display().to_string();
+        vec![format!("-L{library}"), "-lscanhub".to_owned(), format!("-Wl,-rpath,{library}")]
+    }
+
+    fn with_packages(&self, mut command: Command) -> Command {
+        command.env("PKG_CONFIG_PATH", self.prefix.join("lib/pkgconfig"));
+        command
+    }
+}
+
+/// Whether there is such a tool; says so if not.
+pub(crate) fn is_there(name: &str) -> bool {
+    let found = Command::new(name).arg("--version").output().is_ok();
+    if !found {
+        skip(name, "there is none");
+    }
+    found
+}
+
+/// A program in C of these tests.
+pub(crate) fn source(name: &str) -> PathBuf {
+    top().join("tests/it/client_c").join(name)
+}
+
+/// Where the header is, in the project.
+pub(crate) fn header_directory() -> PathBuf {
+    top().join("clients/c/include")
+}
+
+fn top() -> &'static Path {
+    Path::new(env!("CARGO_MANIFEST_DIR"))
+}
+
+/// Cargo builds the library for this test, and puts it beside the test's own program.
+fn built() -> PathBuf {
+    let own = std::env::current_exe().expect("the path of this test");
+    own.parent().expect("a directory").to_owned()
+}
+
+fn done(output: &Output) -> Result<String, String> {
+    let text = |bytes| String::from_utf8_lossy(bytes).into_owned();
+    match output.status.success() {
+        true => Ok(text(&output.stdout)),
+        false => Err(text(&output.stdout) + &text(&output.stderr)),
+    }
+}

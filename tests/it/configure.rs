@@ -1,0 +1,289 @@
+//! `scanhub configure`, as a person runs it at a terminal, and as no person does: a sensor's EEPROM is written once, after
+//! a `yes`, and otherwise never.
+
+use std::fs::File;
+use std::io::{Read, Write};
+use std::process::{Child, Stdio};
+use std::thread;
+
+use crate::testkit;
+use crate::testkit::{INT, TERM, TestEnv, number, terminal, until};
+use rustix::process::{Pid, Signal, kill_process};
+use serde_json::Value;
+
+/// The program with a person before it: what it asks is read, and answered on a terminal.
+struct Person {
+    process: Child,
+    /// The person's side of the terminal.
+    keys: File,
+}
+
+/// What came of it.
+struct Seen {
+    code: Option<i32>,
+    out: String,
+    errors: String,
+}
+
+impl Person {
+    fn start(env: &TestEnv, arguments: &[&str]) -> Person {
+        let (keys, screen) = terminal();
+        let mut command = env.command(&[&["configure"], arguments].concat());
+        command.stdin(Stdio::from(screen.try_clone().unwrap()));
+        command.stdout(Stdio::piped()).stderr(Stdio::from(screen));
+        Person { process: command.spawn().unwrap(), keys }
+    }
+
+    /// Reads until it asks, answers by `act`, and waits for its end.
+    fn answer(mut self, act: impl FnOnce(&mut File, u32)) -> Seen {
+        let mut stdout = self.process.stdout.take().unwrap();
+        let out = thread::spawn(move || {
+            let mut text = String::new();
+            stdout.read_to_string(&mut text).map(|_| text).unwrap()
+        });
+        let mut errors = Vec::new();
+        let mut byte = [0];
+        // A terminal that nobody has open any more ends by an error.
+        while !errors.ends_with(b"Type yes: ") && self.keys.read(&mut byte).is_ok_and(|len| len > 0) {
+            errors.push(byte[0]);
+        }
+        if errors.ends_with(b"Type yes: ") {
+            act(&mut self.keys, self.process.id());
+        }
+        while self.keys.read(&mut byte).is_ok_and(|len| len > 0) {
+            errors.push(byte[0]);
+        }
+        let code = self.process.wait().unwrap().code();
+        Seen { code, out: out.join().unwrap(), errors: String::from_utf8(errors).unwrap() }
+    }
+
+    fn types(self, text: &str) -> Seen {
+        self.answer(|keys, _| keys.write_all(text.as_bytes()).unwrap())
+    }
+}
+
+impl Seen {
+    fn lines(&self) -> Vec<Value> {
+        self.out.lines().map(|line| serde_json::from_str(line).unwrap_or_else(|_| panic!("{line}"))).collect()
+    }
+}
+
+fn signal(pid: u32, signal: Signal) {
+    kill_process(Pid::from_raw(pid as i32).unwrap(), signal).unwrap();
+}
+
+fn probe(env: &TestEnv, port: &str) -> Value {
+    env.run(&["probe", &env.word(port), "--json"]).lines()[0].clone()
+}
+
+#[test]
+fn a_person_says_yes_and_it_is_written_once() {
+    let env = TestEnv::new();
+    let simulator = env.simulator(&["front"], &["--baud=38400"]);
+    let port = env.word("front");
+    let before = probe(&env, "front");
+    let seen = Person::start(&env, &[&port, "unit=cm", "mode=fields-ab", "--json"]).types("yes\n");
+    assert_eq!(seen.code, Some(0), "{}\n{}", seen.out, seen.errors);
+    let lines = seen.lines();
+    let items: Vec<_> = lines.iter().map(|line| (&line["class"], &line["item"], &line["offset"])).collect();
+    assert_eq!(items[0], (&"difference".into(), &"measuring mode".into(), &5.into()), "{lines:?}");
+    assert_eq!(items[1], (&"difference".into(), &"unit".into(), &6.into()), "{lines:?}");
+    let configured = &lines[2];
+    assert_eq!(
+        (&configured["class"], &configured["written"]),
+        (&"configured".into(), &Value::Bool(true)),
+        "{configured}"
+    );
+    assert_eq!(configured["before"], before["configuration"]);
+    // Stdout is a pipe: who is asked sees it on the terminal.
+    let shown = seen.errors.split("Type yes").next().unwrap();
+    assert!(shown.contains("unit: 01h (1 mm) -> 00h (10 mm)"), "{}", seen.errors);
+    let after = probe(&env, "front");
+    assert_eq!(configured["after"], after["configuration"]);
+    assert_eq!((number(&after, "unit_mm"), number(&after, "mode")), (10, 4), "{after}");
+    assert_eq!((number(&after, "operating_mode"), number(&after, "baud")), (0x25, 38_400), "{after}");
+
+    // Back by what it was told, in words this time.
+    let backup = format!("configuration={}", before["configuration"].as_str().unwrap());
+    let seen = Person::start(&env, &[&port, &backup]).types("yes\n");
+    assert_eq!(seen.code, Some(0), "{}", seen.errors);
+    assert!(seen.out.contains("unit: 00h (10 mm) -> 01h (1 mm)"), "{}", seen.out);
+    assert!(seen.out.contains("to go back: scanhub configure"), "{}", seen.out);
+    assert_eq!(probe(&env, "front")["configuration"], before["configuration"]);
+
+    // And again: nothing to do, nothing asked.
+    let outcome = env.run(&["configure", &port, &backup, "unit=mm"]);
+    assert_eq!(outcome.code, Some(0), "{outcome}");
+    assert!(String::from_utf8_lossy(&outcome.out).contains("nothing to change"), "{outcome}");
+    assert_eq!(simulator.end(TERM).code, Some(0));
+    assert_eq!(env.simulated("front").1, 2);
+}
+
+#[test]
+fn marks_become_available_by_the_command_that_is_named() {
+    let env = TestEnv::new();
+    let _simulator = env.simulator(&["front"], &["--baud=38400", "--mode=0x00"]);
+    let port = env.word("front");
+    let marks = |hub: testkit::Program| {
+        let told = env.await_info("front", |info| !info["marks"]["available"].is_null())["marks"].clone();
+        let outcome = env.run(&["echo", "--json", "front/marks", "-n", "3"]);
+        let lines = outcome.of_class("marks");
+        assert!(lines.iter().all(|line| line["available"] == told["available"]), "{outcome}");
+        let doctor = env.run(&["doctor", &port, "--json", "--no-system-config"]).of_class("check");
+        let found = doctor.iter().find(|line| line["name"] == "marks").expect("it is checked").clone();
+        let ended = hub.end(TERM);
+        assert_eq!(ended.code, Some(0), "{ended}");
+        (told, found, ended.errors)
+    };
+    let (told, found, log) = marks(env.hub(&[env.link("front")]));
+    let command = format!("scanhub configure {port} mode=0x01");
+    assert_eq!(told, serde_json::json!({ "available": false, "remedy": command }));
+    assert_eq!(
+        (&found["state"], &found["remedy"]),
+        (&"warning".into(), &format!("after the hub's end: {command}").into())
+    );
+    assert!(log.contains(&command), "{log}");
+
+    let words: Vec<&str> = command.split(' ').skip(2).collect();
+    let seen = Person::start(&env, &words).types("yes\n");
+    assert_eq!(seen.code, Some(0), "{}", seen.errors);
+    let (told, found, log) = marks(env.hub(&[env.link("front")]));
+    assert_eq!(told, serde_json::json!({ "available": true, "remedy": null }));
+    assert_eq!(found["state"], "ok");
+    assert!(!log.contains("scanhub configure"), "{log}");
+}
+
+#[test]
+fn the_way_back_brings_back_what_was_changed() {
+    let env = TestEnv::new();
+    let _simulator = env.simulator(&["front"], &["--baud=38400"]);
+    let port = env.word("front");
+    let done = |settings: &[&str]| {
+        let seen = Person::start(&env, &[&[&port[..]], settings].concat()).types("yes\n");
+        assert_eq!(seen.code, Some(0), "{}", seen.errors);
+        assert!(seen.errors.contains("EEPROM wears out after a few thousand writes."), "{}", seen.errors);
+        seen.out
+    };
+    let hex = probe(&env, "front")["configuration"].as_str().unwrap().to_owned();
+    let out = done(&["power_on_baud=keep"]);
+    let change = "9600 Bd -> 38400 Bd: the present rate of the line becomes permanent";
+    assert!(out.contains(change), "{out}");
+    let back = format!("to go back: scanhub configure {port} power_on_baud=9600\n");
+    assert!(out.contains(&back), "{out}");
+    assert_eq!(probe(&env, "front")["permanent_rate"], true);
+    // What was permanent before, the sensor does not tell.
+    let out = done(&["power_on_baud=9600"]);
+    assert!(out.contains("cannot be brought back") && !out.contains("to go back"), "{out}");
+    assert_eq!(probe(&env, "front")["permanent_rate"], false);
+    let out = done(&["unit=cm", "power_on_baud=keep"]);
+    assert!(out.contains(&format!("{port} configuration={hex} power_on_baud=9600\n")), "{out}");
+}
+
+#[test]
+fn everything_else_than_yes_writes_nothing() {
+    let env = TestEnv::new();
+    let simulator = env.simulator(&["front"], &["--baud=500000"]);
+    let port = env.word("front");
+    for answer in ["no\n", "y\n", "\n", "YES\n", "\x04"] {
+        let seen = Person::start(&env, &[&port, "unit=cm"]).types(answer);
+        assert_eq!(seen.code, Some(1), "{answer:?}: {}", seen.errors);
+        assert!(seen.errors.contains("nothing was written"), "{}", seen.errors);
+        assert!(seen.errors.contains("\nscanhub: not confirmed"), "{answer:?}: {:?}", seen.errors);
+    }
+    let seen = Person::start(&env, &[&port, "unit=cm"]).answer(|_, pid| {
+        signal(pid, INT);
+    });
+    assert_eq!(seen.code, Some(130), "{}", seen.errors);
+    // No terminal, no person: the difference is shown all the same.
+    let outcome = env.run(&["configure", &port, "unit=cm", "--json"]);
+    assert_eq!(outcome.code, Some(2), "{outcome}");
+    assert_eq!(outcome.of_class("difference").len(), 1, "{outcome}");
+    assert_eq!(outcome.of_class("error")[0]["kind"], "usage", "{outcome}");
+    // Nor is one asked who cannot see the question.
+    let (_keys, screen) = terminal();
+    let mut unseen = env.command(&["configure", &port, "unit=cm"]);
+    unseen.stdin(Stdio::from(screen)).stdout(Stdio::null()).stderr(Stdio::null());
+    let mut process = unseen.spawn().unwrap();
+    until("it does not ask", || process.try_wait().unwrap().is_some());
+    assert_eq!(process.wait().unwrap().code(), Some(2));
+    assert_eq!(number(&probe(&env, "front"), "unit_mm"), 1);
+    assert_eq!(simulator.end(TERM).code, Some(0));
+    assert_eq!(env.simulated("front").1, 0);
+}
+
+#[test]
+fn what_cannot_be_is_refused_before_anything_is_written() {
+    let env = TestEnv::new();
+    let simulator = env.simulator(&["front"], &["--baud=500000"]);
+    let port = env.word("front");
+    for (setting, code, words) in [
+        ("unit=dm", 78, "mm or cm"),
+        ("units=mm", 78, "did you mean unit"),
+        ("mode=7", 78, "reflector3"),
+        ("sensitivity=high", 78, "only the LMS 291"),
+    ] {
+        let outcome = env.run(&["configure", &port, setting]);
+        assert_eq!(outcome.code, Some(code), "{outcome}");
+        assert!(outcome.errors.contains(words), "{outcome}");
+    }
+    assert_eq!(env.run(&["configure", &port]).code, Some(2));
+    assert_eq!(env.run(&["configure", &port, "unit=cm", "--password=short"]).code, Some(78));
+    let wrong = Person::start(&env, &[&port, "unit=cm", "--password=mistaken"]).types("yes\n");
+    assert_eq!(wrong.code, Some(1), "{}", wrong.errors);
+    for words in ["wrong password?", "nothing was written", "values on request"] {
+        assert!(wrong.errors.contains(words), "{words}: {}", wrong.errors);
+    }
+    assert!(wrong.errors.contains(" ..\r\nscanhub: "), "{:?}", wrong.errors);
+    // A port that a hub has.
+    let hub = env.hub(&[env.link("front")]);
+    env.await_info("front", |info| info["state"] == "streaming");
+    let outcome = env.run(&["configure", &port, "unit=cm"]);
+    assert_eq!(outcome.code, Some(4), "{outcome}");
+    assert!(outcome.errors.contains(&format!("process {} (scanhub)", hub.pid())), "{outcome}");
+    assert_eq!(env.info("front")["state"], "streaming");
+    drop(hub);
+    assert_eq!(simulator.end(TERM).code, Some(0));
+    assert_eq!(env.simulated("front").1, 0);
+}
+
+#[test]
+fn a_stream_that_was_found_goes_on() {
+    let env = TestEnv::new();
+    let simulator = env.simulator(&["front"], &["--baud=500000"]);
+    let hub = env.hub(&[env.link("front")]);
+    env.await_info("front", |info| info["state"] == "streaming");
+    hub.end(testkit::KILL);
+    let seen = Person::start(&env, &[&env.word("front"), "availability=3"]).types("yes\n");
+    assert_eq!(seen.code, Some(0), "{}", seen.errors);
+    assert!(seen.out.contains("now at: all values, continuously"), "{}", seen.out);
+    let sent = env.truth("front").len();
+    until("it streams on", || env.truth("front").len() > sent + 20);
+    assert_eq!(number(&probe(&env, "front"), "availability"), 1);
+    assert_eq!(simulator.end(TERM).code, Some(0));
+    assert_eq!(env.simulated("front").1, 1);
+}
+
+#[test]
+fn what_was_begun_goes_to_its_end() {
+    let env = TestEnv::new();
+    let simulator = env.simulator(&["front"], &["--baud=500000"]);
+    let port = env.word("front");
+    let signals = [(Signal::HUP, "unit=cm", 10), (Signal::QUIT, "unit=mm", 1), (TERM, "unit=cm", 10)];
+    for (sent, setting, unit_mm) in signals {
+        let seen = Person::start(&env, &[&port, setting, "--json"]).answer(|keys, pid| {
+            let before = env.truth("front").len();
+            keys.write_all(b"yes\n").unwrap();
+            until("it has begun", || env.truth("front").len() > before);
+            if sent == Signal::HUP {
+                // The terminal is closed, too.
+                *keys = File::open("/dev/null").unwrap();
+            }
+            signal(pid, sent);
+        });
+        assert_eq!(seen.code, Some(0), "{sent:?}: {}", seen.errors);
+        assert_eq!(seen.lines().last().unwrap()["written"], true, "{sent:?}: {}", seen.out);
+        assert_eq!(number(&probe(&env, "front"), "unit_mm"), unit_mm, "{sent:?}");
+    }
+    assert_eq!(simulator.end(TERM).code, Some(0));
+    assert_eq!(env.simulated("front").1, 3);
+}

@@ -1,0 +1,109 @@
+//! The demonstration, as somebody runs it who has nothing set up: it ends well, tells that nothing was lost, and leaves
+//! nothing behind.
+
+use std::fs;
+use std::path::Path;
+use std::process::Command;
+
+use crate::testkit;
+use crate::testkit::{INT, Outcome, Program, is_there, number, shared_memory, until};
+
+/// Runs the demonstration in an empty environment; `end` may wait for something and hasten its end.
+fn demo(arguments: &[&str], end: impl FnOnce(Program) -> Outcome) -> Outcome {
+    let mut command = Command::new(env!("CARGO_BIN_EXE_scanhub"));
+    let home = std::env::temp_dir().join(format!("scanhub-home-{}-{}", std::process::id(), arguments.len()));
+    command.arg("demo").args(arguments).env_clear().env("XDG_STATE_HOME", &home);
+    let program = Program::start(command);
+    let name = format!("demo-{}", program.pid());
+    let outcome = end(program);
+    assert!(!is_there(&home), "it kept something");
+    assert_eq!(shared_memory(&format!("sh_{name}_")), [] as [&Path; 0]);
+    assert!(!is_there(format!("/tmp/scanhub-{name}").as_ref()), "its directory is left");
+    let uid = rustix::process::getuid().as_raw();
+    assert!(!is_there(format!("/tmp/scanhub-{uid}/{name}").as_ref()), "its domain is left");
+    assert_eq!(processes(&name), [] as [String; 0]);
+    outcome
+}
+
+/// Processes whose command line names `domain`.
+fn processes(domain: &str) -> Vec<String> {
+    let entries = fs::read_dir("/proc").into_iter().flatten().flatten();
+    let lines = entries.filter_map(|entry| fs::read_to_string(entry.path().join("cmdline")).ok());
+    lines.filter(|line| line.split('\0').any(|word| word == domain)).collect()
+}
+
+/// Whether the two last lines say that nothing was lost of a stream that lived.
+fn nothing_was_lost(outcome: &Outcome) {
+    let lines = outcome.of_class("summary");
+    let sensors: Vec<_> = lines.iter().map(|line| line["sensor"].as_str().unwrap_or_default()).collect();
+    assert_eq!(sensors, ["front", "rear"], "{outcome}");
+    for line in &lines {
+        assert_eq!((&line["class"], &line["state"]), (&"summary".into(), &"streaming".into()), "{outcome}");
+        assert_eq!((number(line, "lost"), number(line, "eeprom_writes")), (0, 0), "{outcome}");
+        let (sent, received) = (number(line, "sent"), number(line, "received"));
+        assert!(sent >= 20 && received >= sent, "{outcome}");
+        assert!(line["nearest_mm"].is_u64() && line["hub_cpu_percent"].is_f64(), "{outcome}");
+    }
+}
+
+#[test]
+fn headless_in_an_empty_environment() {
+    let outcome = demo(&["--headless", "--for", "2s", "--json"], |mut program| {
+        let ready = program.await_line("ready", testkit::is_class("ready"));
+        let (domain, root) =
+            (ready["domain"].as_str().expect("a name"), ready["root"].as_str().expect("a path"));
+        assert_eq!(
+            (domain, number(&ready, "pid")),
+            (&*format!("demo-{}", program.pid()), u64::from(program.pid()))
+        );
+        // Another terminal finds it by its name alone.
+        let mut list = Command::new(env!("CARGO_BIN_EXE_scanhub"));
+        let list = list.args(["list", "--json", "--domain", domain]).env_clear().output().expect("it starts");
+        assert!(
+            list.status.success() && String::from_utf8_lossy(&list.stdout).contains("\"rear\""),
+            "{list:?}"
+        );
+        assert!(root.ends_with(domain), "{root}");
+        program.wait()
+    });
+    assert_eq!(outcome.code, Some(0), "{outcome}");
+    nothing_was_lost(&outcome);
+}
+
+#[test]
+fn where_the_users_own_place_is_too_long_for_a_domain() {
+    let place = format!("/tmp/scanhub-demo-{}/{}", std::process::id(), "long".repeat(20));
+    fs::create_dir_all(&place).expect("a directory");
+    let mut command = Command::new(env!("CARGO_BIN_EXE_scanhub"));
+    command.args(["demo", "--headless", "--for", "1s", "--json"]).env_clear().env("XDG_RUNTIME_DIR", &place);
+    let outcome = Program::start(command).wait();
+    let left = fs::read_dir(&place).expect("it is there").count();
+    fs::remove_dir_all(format!("/tmp/scanhub-demo-{}", std::process::id())).expect("it is ours");
+    assert_eq!((outcome.code, left), (Some(0), 0), "{outcome}");
+    nothing_was_lost(&outcome);
+}
+
+#[test]
+fn interrupted() {
+    // Its processes are there, and all of them go.
+    let outcome = demo(&["--headless", "--json"], |program| {
+        let name = format!("demo-{}", program.pid());
+        until("hub, simulator and consumers", || processes(&name).len() >= 4);
+        until("a domain", || !shared_memory(&format!("sh_{name}_")).is_empty());
+        program.end(INT)
+    });
+    assert_eq!(outcome.code, Some(0), "{outcome}");
+}
+
+#[test]
+fn the_picture_into_a_pipe() {
+    let outcome = demo(&["--for", "2s"], Program::wait);
+    assert_eq!(outcome.code, Some(0), "{outcome}");
+    let text = String::from_utf8_lossy(&outcome.out);
+    assert!(!text.contains('\x1b'), "controls a terminal that is none: {text:?}");
+    for word in
+        ["scanhub demo", "front", "rear", "nearest", "0 lost", "scanhub echo front/scan --domain demo-"]
+    {
+        assert!(text.contains(word), "no {word:?}: {outcome}");
+    }
+}

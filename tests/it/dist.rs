@@ -1,0 +1,121 @@
+//! What makes the hub a service: the script puts it in place and takes it away again, and the units are as closed as they
+//! say.
+
+use std::fs;
+use std::path::{Path, PathBuf};
+use std::process::Command;
+
+use crate::testkit::{TestEnv, skip};
+
+/// How much a unit may be exposed, by the measure of systemd-analyze, in tenths.
+const MOST_EXPOSED: u32 = 15;
+
+fn dist() -> PathBuf {
+    Path::new(env!("CARGO_MANIFEST_DIR")).join("hub/dist")
+}
+
+/// All files below `directory`, as paths from there.
+fn files(directory: &Path) -> Vec<String> {
+    let mut all = Vec::new();
+    let mut open = vec![directory.to_owned()];
+    while let Some(next) = open.pop() {
+        for entry in fs::read_dir(&next).into_iter().flatten().flatten() {
+            let path = entry.path();
+            if path.is_dir() {
+                open.push(path);
+            } else {
+                let path = path.strip_prefix(directory).expect("it is below");
+                all.push(path.display().to_string());
+            }
+        }
+    }
+    all.sort();
+    all
+}
+
+fn install(destination: &Path, words: &[&str]) -> (Option<i32>, String) {
+    let output = Command::new(dist().join("install.sh")).args(words).env("DESTDIR", destination).output();
+    let output = output.unwrap_or_else(|error| panic!("install.sh: {error}"));
+    let text = [output.stdout, output.stderr].concat();
+    (output.status.code(), String::from_utf8_lossy(&text).into_owned())
+}
+
+#[test]
+fn what_is_installed_is_taken_away_again() {
+    let env = TestEnv::new();
+    let destination = env.path("machine");
+    let program = env.word("a program");
+    std::os::unix::fs::symlink(env!("CARGO_BIN_EXE_scanhub"), &program).expect("a name with a blank");
+    let (code, text) = install(&destination, &["--program"]);
+    assert!(code == Some(2) && text.contains("--program needs a file"), "{text}");
+    for _ in 0..2 {
+        let (code, text) = install(&destination, &["--program", &program]);
+        assert_eq!(code, Some(0), "{text}");
+    }
+    let installed = files(&destination);
+    for file in
+        ["usr/local/bin/scanhub", "etc/systemd/system/scanhub.service", "etc/udev/rules.d/60-scanhub.rules"]
+    {
+        assert!(installed.iter().any(|path| path == file), "{file} is missing: {installed:?}");
+    }
+    let unit = fs::read_to_string(destination.join("etc/systemd/system/scanhub.service")).expect("is there");
+    assert!(unit.contains("ExecStart=/usr/local/bin/scanhub run\n"));
+    let (code, text) = install(&destination, &["--remove"]);
+    assert_eq!((code, files(&destination)), (Some(0), Vec::new()), "{text}");
+    let (code, text) = install(&destination, &["--program", "/no/such/program"]);
+    assert!(code == Some(1) && text.contains("cargo build --release"), "{text}");
+    let (code, text) = install(&destination, &["--prefix"]);
+    assert!(code == Some(2) && text.contains("--program FILE, --remove"), "{text}");
+}
+
+#[test]
+fn an_adapter_that_is_plugged_in_after_the_start_is_not_denied() {
+    let unit = fs::read_to_string(dist().join("scanhub.service")).expect("is there");
+    let is_said = |line: &str| unit.lines().any(|it| it == line);
+    // systemd.resource-control(5): a group that no driver has registered at the start is left out of the list.
+    for (group, driver) in [("ttyUSB", "usbserial"), ("ttyACM", "cdc_acm")] {
+        assert!(is_said(&format!("DeviceAllow=char-{group} rw")), "{group}");
+        for key in ["Wants=", "After="] {
+            let mut named = unit.lines().filter_map(|line| line.strip_prefix(key));
+            let loads = format!("modprobe@{driver}.service");
+            assert!(named.any(|units| units.split(' ').any(|it| it == loads)), "{key}{loads}");
+        }
+    }
+}
+
+/// Hub and gateway are one user, and what they keep is for that user alone.
+#[test]
+fn what_is_kept_lies_in_one_closed_directory() {
+    for unit in ["scanhub.service", "scanhub-gateway.service"] {
+        let text = fs::read_to_string(dist().join(unit)).expect("is there");
+        for wanted in ["User=scanhub", "StateDirectory=scanhub", "StateDirectoryMode=0700", "UMask=0077"] {
+            assert!(text.lines().any(|line| line == wanted), "{unit}: {wanted}");
+        }
+    }
+}
+
+#[test]
+fn units_leave_little_open() {
+    for unit in ["scanhub.service", "scanhub-gateway.service"] {
+        let path = dist().join(unit);
+        let analyze = |words: &[&str]| Command::new("systemd-analyze").args(words).arg(&path).output();
+        let limit = format!("--threshold={MOST_EXPOSED}");
+        let Ok(output) = analyze(&["security", "--offline=true", "--no-pager", &limit]) else {
+            skip("systemd-analyze", "there is none");
+            return;
+        };
+        let text = String::from_utf8_lossy(&output.stdout);
+        if !text.contains("exposure level") {
+            skip("systemd-analyze", "this one looks at no files");
+            return;
+        }
+        assert!(output.status.success(), "{unit} is too open:\n{text}");
+        // What it says of a program that is not installed here is no fault of the unit.
+        let output = analyze(&["verify"]).unwrap_or_else(|error| panic!("{error}"));
+        let said = String::from_utf8_lossy(&output.stderr).into_owned();
+        let faults: Vec<_> = said.lines().filter(|line| line.contains(unit)).collect();
+        let is_fault = |line: &&&str| !line.contains("not executable") && !line.contains("man scanhub(1)");
+        let faults: Vec<_> = faults.iter().filter(is_fault).collect();
+        assert!(faults.is_empty(), "{faults:?}");
+    }
+}

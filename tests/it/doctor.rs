@@ -1,0 +1,241 @@
+//! `scanhub doctor`, as somebody runs it: every condition has its line, what is wrong has its remedy, and nothing is
+//! changed by looking.
+
+use std::path::Path;
+
+use crate::testkit::{KILL, Outcome, Program, TERM, TestEnv};
+use rustix::fs::inotify::{self, CreateFlags, WatchFlags};
+use rustix::io::Errno;
+use rustix::process::Signal;
+use serde_json::Value;
+
+/// Findings by the name of their check; those of a port after it.
+fn state<'a>(findings: &'a [Value], name: &str, port: Option<&str>) -> (&'a str, String) {
+    let found = findings.iter().find(|line| line["name"] == name && line["port"].as_str() == port);
+    let found = found.unwrap_or_else(|| panic!("no {name} of {port:?}: {findings:#?}"));
+    let text = |key: &str| found[key].as_str().unwrap_or_default();
+    let needs_remedy = matches!(text("state"), "warning" | "failed");
+    assert_eq!(text("remedy").is_empty(), !needs_remedy, "{found}");
+    (text("state"), format!("{} {}", text("finding"), text("remedy")))
+}
+
+/// Runs it; all its lines but a last error must be checks.
+fn doctor(env: &TestEnv, arguments: &[&str], code: i32) -> (Vec<Value>, Outcome) {
+    let outcome = env.run(&[&["doctor", "--json", "--no-system-config"], arguments].concat());
+    assert_eq!(outcome.code, Some(code), "{outcome}");
+    let findings = outcome.of_class("check");
+    let errors = outcome.of_class("error");
+    assert_eq!(findings.len() + errors.len(), outcome.lines().len());
+    assert_eq!(errors.len(), usize::from(code != 0), "{outcome}");
+    (findings, outcome)
+}
+
+#[test]
+fn the_page_has_a_line_for_each_check() {
+    let page = include_str!("../../docs/doctor.md");
+    let lines = page.lines().filter_map(|line| line.strip_prefix("| `")?.split('`').next());
+    assert_eq!(lines.collect::<Vec<_>>(), tools::doctor::CHECKS);
+}
+
+#[test]
+fn a_set_up_that_works() {
+    let env = TestEnv::new();
+    let simulator = env.simulator(&["front"], &["--baud=38400"]);
+    let port = env.word("front");
+    let (findings, _) = doctor(&env, &[&port], 0);
+    for name in ["memory", "domain", "leftovers", "descriptors"] {
+        assert_eq!(state(&findings, name, None).0, "ok", "{findings:#?}");
+    }
+    // Once it is open, for opening ends the adapter's collecting.
+    let place = |name: &str| findings.iter().position(|line| line["name"] == name);
+    assert!(place("latency") > place("access"), "{findings:#?}");
+    for name in ["port", "holder", "access", "rate", "settings", "power-on", "health"] {
+        assert_eq!(state(&findings, name, Some(&port)).0, "ok", "{findings:#?}");
+    }
+    let (found, text) = state(&findings, "sensor", Some(&port));
+    assert!(found == "ok" && text.contains("LMS200") && text.contains("38400 Bd"), "{text}");
+    let outcome = env.run(&["doctor", &port, "--no-system-config"]);
+    let text = String::from_utf8_lossy(&outcome.out);
+    assert!(text.contains("ok       sensor") && text.contains(&port), "{outcome}");
+    assert_eq!(simulator.end(TERM).code, Some(0));
+    assert_eq!(env.simulated("front").1, 0);
+}
+
+#[test]
+fn what_is_wrong_is_told_with_its_remedy() {
+    let env = TestEnv::new();
+    let _simulator = env.simulator(&["front"], &[] as &[&str]);
+    let (front, absent) = (env.word("front"), env.word("absent"));
+    let links = [env.link("front"), env.link("absent"), "--link=null=/dev/null".into()];
+    let mut arguments: Vec<&str> = links.iter().map(String::as_str).collect();
+    arguments.extend(["--set", "link.front.unit=cm"]);
+    let (findings, outcome) = doctor(&env, &arguments, 5);
+    assert!(state(&findings, "configuration", None).1.contains("front, absent, null"));
+    let (found, text) = state(&findings, "settings", Some(&front));
+    assert!(found == "warning" && text.contains("unit=cm"), "{text}");
+    let (found, text) = state(&findings, "port", Some(&absent));
+    assert!(found == "failed" && text.contains("no such port"), "{text}");
+    let (found, text) = state(&findings, "access", Some("/dev/null"));
+    assert!(!text.contains("file:"), "no recording is asked: {text}");
+    let of_null = findings.iter().filter(|line| line["port"] == "/dev/null");
+    assert!(
+        of_null.clone().count() > 0 && of_null.clone().all(|line| line["state"] != "ok"),
+        "{findings:#?}"
+    );
+    assert!(found == "failed" && text.contains("not a serial line"), "{text}");
+    assert_eq!(outcome.of_class("error")[0]["kind"], "check");
+    assert_eq!(findings.iter().find(|line| line["port"] == front.as_str()).unwrap()["link"], "front");
+
+    let (findings, _) = doctor(&env, &["--link=front=/dev/null", "--set", "link.front.angle=170"], 5);
+    let (found, text) = state(&findings, "configuration", None);
+    assert!(found == "failed" && text.contains("100 or 180"), "{text}");
+}
+
+#[test]
+fn a_sensor_that_is_not_well_is_no_good_set_up() {
+    let env = TestEnv::new();
+    let dirty = env.simulator(&["dirty"], &["--type=lms291", "--pollution=20"]);
+    let port = env.word("dirty");
+    let (findings, _) = doctor(&env, &[&port], 0);
+    let (found, text) = state(&findings, "health", Some(&port));
+    assert!(found == "warning" && text.contains("window is dirty, lets through 20 %"), "{text}");
+    drop(dirty);
+    let _broken = env.simulator(&["broken"], &["--type=lms211", "--status=0x13", "--error=3:18"]);
+    let port = env.word("broken");
+    let (findings, _) = doctor(&env, &[&port], 5);
+    let (found, text) = state(&findings, "health", Some(&port));
+    assert!(found == "failed" && text.contains("error 18: dirt on the window"), "{text}");
+    let _former = env.simulator(&["former"], &["--permanent-baud=38400", "--status=0x12", "--error=2:18"]);
+    let port = env.word("former");
+    let (findings, _) = doctor(&env, &[&port], 0);
+    assert_eq!(state(&findings, "health", Some(&port)).0, "warning");
+    let (found, text) = state(&findings, "power-on", Some(&port));
+    let remedy = format!("scanhub configure {port} power_on_baud=9600");
+    assert!(found == "warning" && text.contains(&remedy), "{text}");
+}
+
+#[test]
+fn a_port_without_a_sensor_is_asked_for_a_bounded_time() {
+    let env = TestEnv::new();
+    // A sensor that answers nothing.
+    let _simulator = env.simulator(&["front"], &["--fault=mute=1"]);
+    let (findings, _) = doctor(&env, &[&env.word("front")], 5);
+    let (found, text) = state(&findings, "sensor", Some(&env.word("front")));
+    assert!(found == "failed" && text.contains("no answer at 9600"), "{text}");
+}
+
+#[test]
+fn a_running_hub_is_asked_instead_and_a_dead_one_leaves_traces() {
+    let env = TestEnv::new();
+    let _simulator = env.simulator(&["front"], &["--baud=500000"]);
+    let hub = env.hub(&[env.link("front")]);
+    env.await_info("front", |info| info["state"] == "streaming");
+    let before = env.info("front");
+    let (port, link) = (env.word("front"), env.link("front"));
+    let (findings, _) = doctor(&env, &[&link], 0);
+    // A link of the hub stands for its port.
+    let (named, _) = doctor(&env, &["front"], 0);
+    assert_eq!(state(&named, "sensor", Some(&env.word("front"))).0, "ok", "{named:#?}");
+    let pid = format!("process {}", hub.pid());
+    assert!(state(&findings, "domain", None).1.contains(&pid));
+    assert!(state(&findings, "holder", Some(&port)).1.contains(&pid));
+    assert!(state(&findings, "sensor", Some(&port)).1.contains("streaming"));
+    let after = env.info("front");
+    let account = |info: &Value| (info["counters"]["aborted"].clone(), info["counters"]["resyncs"].clone());
+    assert_eq!(account(&before), account(&after), "it was disturbed");
+
+    assert_eq!(hub.end(KILL).code, None);
+    let (findings, _) = doctor(&env, &[&link], 0);
+    let (found, text) = state(&findings, "leftovers", None);
+    assert!(found == "warning" && text.contains("1 process died") && text.contains("scanhub run"), "{text}");
+    assert!(!env.left_behind().is_empty(), "it deleted something");
+}
+
+#[test]
+fn a_hub_that_is_stopped_is_no_good_set_up() {
+    let env = TestEnv::new();
+    let _simulator = env.simulator(&["front"], &["--baud=500000"]);
+    let hub = env.hub(&[env.link("front")]);
+    env.await_info("front", |info| info["state"] == "streaming");
+    hub.signal(Signal::STOP);
+    let (findings, _) = doctor(&env, &[&env.link("front")], 5);
+    let (found, text) = state(&findings, "domain", None);
+    let continued = format!("kill -CONT {}", hub.pid());
+    assert!(found == "failed" && text.contains(&continued), "{text}");
+    let port = env.word("front");
+    for name in ["sensor", "line-errors"] {
+        let (found, text) = state(&findings, name, Some(&port));
+        assert!(found == "skipped" && text.contains("does not publish"), "{text}");
+    }
+    // Its name is not taken for a port.
+    let (named, _) = doctor(&env, &["front"], 5);
+    assert_eq!(state(&named, "port", Some("front")).0, "skipped", "{named:#?}");
+    hub.signal(Signal::CONT);
+    assert_eq!(hub.end(TERM).code, Some(0));
+}
+
+#[test]
+fn a_hub_is_listed_below_its_root_and_is_no_leftover_below_another() {
+    let env = TestEnv::new();
+    let hub = env.hub(&[env.link("absent")]);
+    assert!(!env.left_behind().is_empty(), "it has shared memory");
+    let domains = |root: &Path| Program::start(env.command_at(root, &["list", "--domains", "--json"])).wait();
+    let place = env.place();
+    let here = domains(place.root().parent().unwrap()).of_class("domain");
+    assert!(here.len() == 1 && here[0]["pid"] == hub.pid(), "{here:?}");
+    let other = env.path("other");
+    assert!(domains(&other).of_class("domain").is_empty());
+    let outcome = Program::start(env.command_at(&other, &["doctor", "--json", "--no-system-config"])).wait();
+    let findings = outcome.of_class("check");
+    let (found, text) = state(&findings, "leftovers", None);
+    assert_eq!((found, text.as_str()), ("ok", "none "), "{outcome}");
+}
+
+#[test]
+fn what_another_program_has_is_not_touched() {
+    let env = TestEnv::new();
+    let _simulator = env.simulator(&["front"], &[] as &[&str]);
+    let holder = std::fs::File::options().read(true).write(true).open(env.path("front")).unwrap();
+    let before = rustix::termios::tcgetattr(&holder).unwrap();
+    let watch = inotify::init(CreateFlags::CLOEXEC | CreateFlags::NONBLOCK).unwrap();
+    let device = env.path("front").canonicalize().unwrap();
+    inotify::add_watch(&watch, &device, WatchFlags::OPEN).unwrap();
+    // This process has it open.
+    let (findings, _) = doctor(&env, &[&env.word("front")], 5);
+    assert_eq!(rustix::io::read(&watch, &mut [0; 64]), Err(Errno::AGAIN), "it was opened");
+    drop(std::fs::File::open(&device).unwrap());
+    assert!(rustix::io::read(&watch, &mut [0; 64]).is_ok(), "nobody would have noticed");
+    let (found, text) = state(&findings, "holder", Some(&env.word("front")));
+    assert!(found == "failed" && text.contains(&format!("process {}", std::process::id())), "{text}");
+    assert_eq!(state(&findings, "sensor", Some(&env.word("front"))).0, "skipped");
+    let after = rustix::termios::tcgetattr(&holder).unwrap();
+    assert_eq!(before.output_speed(), after.output_speed());
+}
+
+#[test]
+fn a_hub_that_would_not_start_for_want_of_descriptors_is_no_good_set_up() {
+    let env = TestEnv::new();
+    let link = env.link("absent");
+    let limited = |limit: u64, arguments: &[&str]| {
+        let inner = env.command(arguments);
+        let mut command = std::process::Command::new("sh");
+        command.args(["-c", "ulimit -n \"$0\" && exec \"$@\"", &limit.to_string()]);
+        command.arg(inner.get_program()).args(inner.get_args());
+        command.env_remove("SCANHUB_CONFIG").env("SCANHUB_END_WITH_PARENT", "1");
+        Program::start(command)
+    };
+    let doctor = |limit| {
+        let outcome = limited(limit, &["doctor", "--json", "--no-system-config", &link]).wait();
+        state(&outcome.of_class("check"), "descriptors", None).0.to_owned()
+    };
+    let run = ["run", "--json", &link];
+    let refused = limited(40, &run).wait();
+    assert_eq!(refused.code, Some(75), "{refused}");
+    let words = refused.errors.split_once("descriptors are short: ").expect("it says so").1.split(' ');
+    let numbers: Vec<u64> = words.filter_map(|word| word.parse().ok()).collect();
+    let enough = numbers[0] + numbers[1];
+    assert_eq!(limited(enough - 1, &run).wait().code, Some(75));
+    assert_eq!(doctor(enough - 1), "failed");
+    assert_eq!(limited(enough, &run).ready().end(TERM).code, Some(0));
+    assert_eq!(doctor(enough), "warning");
+}

@@ -1,0 +1,151 @@
+//! Set-ups that are broken on purpose between the sensor and the hub's configuration: `scanhub doctor` finds each and names
+//! the remedy. `--nocapture` shows them as a table. Those of the machine are in `doctor_machine.rs`.
+
+use std::fs::{self, File};
+use std::net::TcpListener;
+use std::os::unix::fs::{PermissionsExt, symlink};
+use std::os::unix::process::CommandExt;
+use std::process::Command;
+
+use crate::testkit::{Findings, Line, Program, TestEnv, open_line, skip};
+
+/// What a simulated sensor has, and what the doctor says of it.
+const SENSORS: [(&str, &[&str], &str, &str, &str); 10] = [
+    ("the window is dirty", &["--type=lms291", "--pollution=60"], "health", "warning", "clean its window"),
+    (
+        "an error of the sensor",
+        &["--type=lms211", "--status=0x13", "--error=3:18"],
+        "health",
+        "failed",
+        "a repair",
+    ),
+    (
+        "a former owner's permanent rate",
+        &["--permanent-baud=38400"],
+        "power-on",
+        "warning",
+        "power_on_baud=9600",
+    ),
+    ("left in installation mode", &["--state=installation"], "power-on", "warning", "power it off and on"),
+    ("it measures in another unit", &["--unit=cm"], "settings", "warning", "unit=mm"),
+    (
+        "another type was plugged in",
+        &["--type=lms291", "--unit=mm"],
+        "settings",
+        "warning",
+        "correct the type",
+    ),
+    ("a mode without reflector bits", &["--mode=0x00"], "marks", "warning", "mode=0x01"),
+    ("nobody answers", &["--fault=mute=1"], "sensor", "failed", "power, cable, jumper 7-8"),
+    (
+        "a wire is broken: it streams and hears nothing",
+        &["--state=streaming", "--baud=38400", "--fault=overlook=1"],
+        "sensor",
+        "failed",
+        "the wire that goes to it",
+    ),
+    (
+        "noise is all that comes",
+        &["--state=streaming", "--baud=500000", "--fault=flip=0.5,flip_bits=64,overlook=1"],
+        "sensor",
+        "failed",
+        "RS-232 against RS-422",
+    ),
+];
+
+#[test]
+fn what_is_wrong_with_a_sensor() {
+    let env = TestEnv::new();
+    for (number, (set_up, flags, name, state, remedy)) in SENSORS.into_iter().enumerate() {
+        let port = format!("p{number}");
+        let _simulator = env.simulator(&[&port], flags);
+        let (link, of) = (env.link(&port), |key: &str| format!("link.{port}.{key}"));
+        let wanted = [of("unit=mm"), of("type=lms200")];
+        let findings = Findings::of(&env, &[&link, "--set", &wanted[0], "--set", &wanted[1]]);
+        findings.complain(set_up, name, state, remedy);
+    }
+}
+
+#[test]
+fn what_is_wrong_with_a_port() {
+    let env = TestEnv::new();
+    let port = |name: &str| Findings::of(&env, &[&env.word(name)]);
+    // What there is instead depends on the machine.
+    let instead = |finding: &Findings| if finding.said("port").1.is_empty() { "there are" } else { "" };
+    let absent = port("absent");
+    absent.complain("no such port", "port", "failed", instead(&absent));
+    symlink("/dev/pts/no-such-line", env.path("unplugged")).expect("a symlink");
+    let unplugged = port("unplugged");
+    assert!(unplugged.said("port").1.contains("points to"), "{:?}", unplugged.said("port"));
+    unplugged.complain("the adapter behind the name is gone", "port", "failed", "");
+    Findings::of(&env, &["/dev/null"]).complain("no serial line", "access", "failed", "name a tty");
+    port("").complain("a directory", "access", "failed", "it is a directory");
+
+    let line = Line::at(&env.path("held"));
+    let holder = open_line(&env.path("held"), 9600);
+    port("held").complain("another program has the port", "holder", "failed", "stop it first");
+    drop((holder, line));
+
+    let listener = TcpListener::bind("127.0.0.1:0").expect("a port");
+    let server = format!("tcp:{}", listener.local_addr().expect("an address"));
+    drop(listener);
+    Findings::of(&env, &[&server]).complain("the serial server refuses", "port", "failed", "raw TCP mode");
+    let recording = env.word("recording");
+    let link = format!("--link=front=file:{recording}");
+    Findings::of(&env, &[&link]).complain("no such recording", "port", "failed", "existing recording");
+}
+
+#[test]
+fn who_may_not_open_the_port() {
+    const SET_UP: &str = "no permission at the port";
+    let env = TestEnv::new();
+    let _line = Line::at(&env.path("front"));
+    let arguments = ["doctor", "--json", "--no-system-config", &env.word("front")];
+    if !rustix::process::getuid().is_root() {
+        fs::set_permissions(env.path("front"), fs::Permissions::from_mode(0o000)).expect("it is ours");
+        let findings = Findings::in_outcome(&env.run(&arguments));
+        return findings.complain(SET_UP, "access", "failed", "chmod u+rw");
+    }
+    // Root may open all: somebody else asks.
+    let as_nobody = |mut command: Command| {
+        command.uid(NOBODY).gid(NOBODY);
+        command
+    };
+    let mut attempt = as_nobody(Command::new(env!("CARGO_BIN_EXE_scanhub")));
+    if !attempt.arg("--version").output().is_ok_and(|output| output.status.success()) {
+        skip("open-directory", "the program lies where other users cannot start it");
+        return;
+    }
+    let group = |gid, mode| {
+        let device = env.path("front").canonicalize().expect("a device");
+        std::os::unix::fs::chown(&device, Some(0), Some(gid)).expect("root may");
+        fs::set_permissions(&device, fs::Permissions::from_mode(mode)).expect("root may");
+        Findings::in_outcome(&Program::start(as_nobody(env.command(&arguments))).wait())
+    };
+    group(20, 0o660).complain(SET_UP, "access", "failed", "sudo usermod -aG");
+    group(0, 0o600).complain("no group may use the port", "access", "failed", "udev rule");
+}
+
+#[test]
+fn what_is_wrong_with_the_configuration() {
+    let env = TestEnv::new();
+    let broken = |set_up, text: &str, remedy| {
+        let file = env.file("scanhub.toml", text);
+        Findings::of(&env, &["--config", &file]).complain(set_up, "configuration", "failed", remedy);
+    };
+    broken("an unknown key", "[[link]]\nname = \"front\"\nbuad = 500000\n", "baud");
+    broken(
+        "a value that cannot be",
+        "[[link]]\nname = \"front\"\nport = \"/dev/x\"\nangle = 170\n",
+        "100 or 180",
+    );
+    let two = "[[link]]\nname = \"a\"\nport = \"/dev/x\"\n[[link]]\nname = \"b\"\nport = \"/dev/x\"\n";
+    broken("two links at one port", two, "name the port of each sensor");
+    broken("a gateway that cannot be", "[gateway]\nttl = 1000\n", "");
+    File::create(env.path("scanhub.toml")).expect("an empty file");
+    let missing = env.word("no-such.toml");
+    Findings::of(&env, &["--config", &missing]).complain("no such file", "configuration", "failed", "");
+}
+
+/// The user that has nothing.
+const NOBODY: u32 = 65534;

@@ -1,0 +1,139 @@
+//! How programs end: by a signal, by a reader that goes away, or by being killed, and what they leave behind.
+
+use std::fs::{self, File};
+use std::io::{BufRead, BufReader};
+use std::os::unix::fs::symlink;
+use std::process::Stdio;
+
+use crate::testkit;
+use crate::testkit::{INT, KILL, Program, TERM, TestEnv, is_class, is_there, until};
+use rustix::pipe::{PipeFlags, pipe_with};
+use serde_json::Value;
+
+/// A hub whose sensor is a recording of some minutes, in the sensor's pace.
+fn hub(env: &TestEnv) -> Program {
+    let scans: Vec<u8> = (0..4000).flat_map(testkit::scan).collect();
+    let file = env.file("scans", scans);
+    env.hub(&["--link", &format!("front=file:{file}")])
+}
+
+#[test]
+fn a_hub_ends_by_both_signals_and_leaves_nothing() {
+    for signal in [INT, TERM] {
+        let env = TestEnv::new();
+        let simulator = env.simulator(&["front"], &["--baud=500000"]);
+        let hub = env.hub(&[env.link("front"), env.link("rear")]);
+        let mut consumer = env.echo(&["front/scan"]);
+        consumer.await_lines(3, "a scan", is_class("scan"));
+        assert!(!env.left_behind().is_empty(), "looked at the wrong place");
+        assert_eq!(hub.end(signal).code, Some(0), "{signal:?}");
+        // Once the consumer has gone too.
+        assert_eq!(consumer.end(INT).code, Some(0));
+        until("shared memory is free", || env.left_behind().is_empty());
+        assert_eq!(simulator.end(signal).code, Some(0));
+        assert!(!is_there(&env.path("front")), "the simulator's symlink is left");
+    }
+}
+
+#[test]
+fn interrupted_consumers_say_what_they_received() {
+    let env = TestEnv::new();
+    let _hub = hub(&env);
+    for signal in [INT, TERM] {
+        for (bounds, code) in [(&[][..], 0), (&["-n", "100000"], 130), (&["--for", "5m"], 130)] {
+            let mut consumer = env.start(&[&["echo", "--json", "front/scan"], bounds].concat());
+            consumer.await_lines(3, "a scan", is_class("scan"));
+            let outcome = consumer.end(signal);
+            assert_eq!(outcome.code, Some(code), "{}", outcome.errors);
+            let (lines, scans) = (outcome.lines(), outcome.of_class("scan").len() as u64);
+            let end: Vec<_> = lines.iter().skip_while(|line| line["class"] != "summary").collect();
+            assert_eq!((end[0]["received"].as_u64(), &end[0]["lost"]), (Some(scans), &0.into()));
+            let error = end.get(1).map(|line| line["kind"].as_str());
+            assert_eq!(error, (code == 130).then_some(Some("interrupted")));
+        }
+    }
+    // One that is through is not interrupted.
+    let outcome = env.run(&["echo", "--json", "front/scan", "-n", "5"]);
+    assert_eq!((outcome.code, outcome.of_class("scan").len()), (Some(0), 5), "{outcome}");
+}
+
+#[test]
+fn a_reader_that_has_enough_is_no_failure() {
+    let env = TestEnv::new();
+    let _hub = hub(&env);
+    for format in ["--json", "--csv"] {
+        let mut command = env.command(&["echo", "front/scan", format]);
+        let mut echo = command.stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().expect("starts");
+        let mut line = String::new();
+        let mut reader = BufReader::with_capacity(1, echo.stdout.take().expect("a pipe"));
+        let read = reader.read_line(&mut line);
+        drop(reader);
+        let outcome = echo.wait_with_output().expect("ends");
+        assert!(read.is_ok() && line.len() > 100, "{line:?}");
+        let errors = String::from_utf8_lossy(&outcome.stderr);
+        assert_eq!((outcome.status.code(), &*errors), (Some(0), ""));
+    }
+}
+
+#[test]
+fn every_line_is_one_write() {
+    let env = TestEnv::new();
+    let _hub = hub(&env);
+    // A pipe that keeps writes apart: what is read at once was written at once.
+    let (read, write) = pipe_with(PipeFlags::DIRECT | PipeFlags::CLOEXEC).expect("a pipe");
+    let mut command = env.command(&["echo", "--json", "front/scan", "front/telegram", "front/status"]);
+    let mut echo = command.stdout(write).stderr(Stdio::null()).spawn().expect("starts");
+    drop(command);
+    for _ in 0..60 {
+        let mut buffer = [0; 8192];
+        let len = rustix::io::read(&read, &mut buffer).expect("a line");
+        let whole = buffer[..len].ends_with(b"\n") && buffer[..len].starts_with(b"{");
+        assert!(whole, "a piece: {:?}", String::from_utf8_lossy(&buffer[..len]));
+    }
+    echo.kill().expect("is killed");
+    echo.wait().expect("is dead");
+}
+
+#[test]
+fn a_killed_echo_leaves_whole_lines() {
+    let env = TestEnv::new();
+    let _hub = hub(&env);
+    for number in 0..5 {
+        let path = env.path(&format!("lines{number}"));
+        let file = File::create(&path).expect("a file");
+        let mut command = env.command(&["echo", "--json", "front/scan", "front/telegram"]);
+        let mut echo = command.stdout(file).stderr(Stdio::null()).spawn().expect("starts");
+        until("some lines", || fs::metadata(&path).is_ok_and(|metadata| metadata.len() > 40_000));
+        echo.kill().expect("is killed");
+        echo.wait().expect("is dead");
+        let text = fs::read_to_string(&path).expect("is text");
+        assert!(text.ends_with('\n'), "half a line is left");
+        let lines: Vec<Value> = text.lines().map(|line| serde_json::from_str(line).expect(line)).collect();
+        assert!(lines.len() > 10);
+    }
+}
+
+#[test]
+fn a_simulator_takes_and_leaves_only_its_own_place() {
+    let env = TestEnv::new();
+    let (port, mine) = (env.path("front"), env.file("mine", "mine"));
+    // What a killed simulator left behind is replaced.
+    let simulator = env.simulator(&["front"], &[] as &[&str]);
+    let old = fs::read_link(&port).expect("a symlink");
+    assert_eq!(simulator.end(KILL).code, None);
+    assert_eq!(fs::read_link(&port).ok(), Some(old));
+    let simulator = env.simulator(&["front"], &[] as &[&str]);
+    assert!(fs::metadata(&port).is_ok(), "leads nowhere");
+    assert_eq!(simulator.end(INT).code, Some(0));
+    assert!(!is_there(&port));
+    // Nothing else is.
+    symlink(&mine, &port).expect("a symlink");
+    let link = env.word("front");
+    for place in [&mine, &link] {
+        let outcome = env.run(&["simulate", "--port", place]);
+        assert_eq!(outcome.code, Some(4), "{outcome}");
+        assert!(outcome.errors.contains(place), "{outcome}");
+    }
+    assert_eq!(fs::read(&mine).ok(), Some(b"mine".to_vec()));
+    assert_eq!(fs::read_link(&port).ok(), Some(mine.into()));
+}

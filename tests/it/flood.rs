@@ -1,0 +1,142 @@
+//! Ten megabytes of garbage as fast as the hub reads, with a telegram now and then: each is delivered, and nothing grows.
+//! From a serial server no more is read than twice what the line brings, and what it costs is little.
+
+use std::io::Write;
+use std::net::TcpListener;
+use std::thread;
+use std::time::{Duration, Instant};
+
+use crate::testkit::{INT, Line, Program, TERM, TestEnv, bytes_of, is_class, number, scan};
+use fastrand::Rng;
+
+/// Garbage that a framer has to work for: noise, start bytes, and heads of telegrams that never end.
+fn garbage(random: &mut Rng, len: usize) -> Vec<u8> {
+    let head = &scan(0)[..7];
+    let mut bytes = Vec::with_capacity(len + 64);
+    while bytes.len() < len {
+        match random.u8(..8) {
+            0 => bytes.extend(head),
+            1 => bytes.extend([0x02, 0x80].repeat(random.usize(1..20))),
+            2 => bytes.extend(&scan(random.u16(..5_000))[..random.usize(7..600)]),
+            _ => bytes.extend((0..random.usize(1..200)).map(|_| random.u8(..))),
+        }
+    }
+    bytes.truncate(len);
+    // Its end must not be the beginning of what follows it.
+    bytes.extend([0; 8]);
+    bytes
+}
+
+/// Resident kilobytes of a process.
+fn resident_kb(pid: u32) -> u64 {
+    let status = std::fs::read_to_string(format!("/proc/{pid}/status")).expect("the hub lives");
+    let line = status.lines().find(|line| line.starts_with("VmRSS:")).expect("a resident size");
+    line.split_whitespace().nth(1).and_then(|number| number.parse().ok()).expect("a number")
+}
+
+/// Waits for all that was `sent`, in order and bit for bit. Of random frames one in 65,536 has a right checksum by
+/// chance: what else comes must be marked, and is counted.
+fn receive(consumer: &mut Program, sent: &[Vec<u8>]) -> u64 {
+    let mut wrong = 0;
+    for sent in sent {
+        while let line = consumer.await_line("a telegram in garbage", is_class("telegram"))
+            && bytes_of(&line) != *sent
+        {
+            assert_eq!(line["quality"], "suspect", "{line}");
+            wrong += 1;
+        }
+    }
+    wrong
+}
+
+#[test]
+fn telegrams_in_a_flood_of_garbage() {
+    let env = TestEnv::new();
+    let line = Line::at(&env.path("front"));
+    let hub = env.hub(&[env.link("front")]);
+    let mut consumer = env.echo(&["front/telegram"]);
+    line.await_open();
+    let mut random = Rng::with_seed(4);
+    let mut sent = Vec::new();
+    let mut flood = |sent: &mut Vec<Vec<u8>>, telegrams: usize| {
+        for _ in 0..telegrams {
+            line.send(&garbage(&mut random, 200_000));
+            sent.push(scan(1000 + sent.len() as u16));
+            line.send(&sent[sent.len() - 1]);
+        }
+    };
+    // A stream to be adopted, until the mode of the sensor, which nobody tells, has been asked for in vain; and a
+    // first flood, after which everything that the hub ever touches was touched.
+    let steady = scan(0);
+    line.send(&[&steady[..], &steady].concat());
+    consumer.await_lines(2, "the stream", is_class("telegram"));
+    flood(&mut sent, 10);
+    let mut wrong = receive(&mut consumer, &sent);
+    let before_kb = resident_kb(hub.pid());
+    let begun = sent.len();
+    flood(&mut sent, 50);
+    wrong += receive(&mut consumer, &sent[begun..]);
+    let grown_kb = resident_kb(hub.pid()).saturating_sub(before_kb);
+    eprintln!("resident memory: {before_kb} kB, {grown_kb} kB more after {} more bytes", 50 * 200_000);
+    assert!(grown_kb <= 64, "the hub grew by {grown_kb} kB");
+    let all = 2 + wrong + sent.len() as u64;
+    let info = env.await_info("front", |info| number(&info["counters"], "telegrams") >= all);
+    assert_eq!(number(&info["counters"], "telegrams"), all, "{info}");
+    consumer.end(INT);
+    assert_eq!(hub.end(TERM).code, Some(0));
+}
+
+/// Processor time that a process has taken.
+fn worked(pid: u32) -> Duration {
+    let tasks = std::fs::read_dir(format!("/proc/{pid}/task")).expect("the hub lives").flatten();
+    let of_task = |task: std::fs::DirEntry| {
+        let text = std::fs::read_to_string(task.path().join("schedstat")).ok()?;
+        text.split_whitespace().next()?.parse::<u64>().ok()
+    };
+    Duration::from_nanos(tasks.filter_map(of_task).sum())
+}
+
+#[test]
+fn a_serial_server_that_sends_garbage_at_full_speed() {
+    let env = TestEnv::new();
+    let listener = TcpListener::bind("127.0.0.1:0").expect("a port of the loopback");
+    let link = format!("--link=front=tcp:{}", listener.local_addr().expect("it has an address"));
+    let hub = env.hub(&[link]);
+    let mut consumer = env.echo(&["front/telegram"]);
+    let (mut server, _) = listener.accept().expect("the hub comes");
+    // More than is allowed at once, with telegrams in it; then garbage without an end.
+    let mut random = Rng::with_seed(5);
+    let sent: Vec<Vec<u8>> = (0..20).map(|number| scan(1000 + number)).collect();
+    let steady = scan(0);
+    let mut flood = [&steady[..], &steady].concat();
+    for telegram in &sent {
+        flood.extend(garbage(&mut random, 15_000));
+        flood.extend(telegram);
+    }
+    let endless = garbage(&mut random, 1 << 20);
+    let writer = thread::spawn(move || {
+        server.write_all(&flood).expect("the hub reads");
+        while server.write_all(&endless).is_ok() {}
+    });
+    consumer.await_lines(2, "the stream", is_class("telegram"));
+    receive(&mut consumer, &sent);
+    consumer.end(INT);
+    let says = "more comes than a line of 500000 baud brings";
+    env.await_info("front", |info| info["last_error"].as_str().is_some_and(|error| error.starts_with(says)));
+    let bytes = || number(&env.info("front")["counters"], "bytes_read");
+    // The counters are as old as the last status: a second.
+    let (before, since, idle) = (bytes(), Instant::now(), worked(hub.pid()));
+    thread::sleep(Duration::from_secs(3));
+    let worked = worked(hub.pid()).saturating_sub(idle);
+    let (read, took) = (bytes() - before, since.elapsed());
+    let most = 100_000.0 * (took.as_secs_f64() + 2.0);
+    let share = worked.as_secs_f64() / took.as_secs_f64();
+    eprintln!("{read} bytes in {took:?}, {:.1} % of a processor", 100.0 * share);
+    assert!(read as f64 <= most && read > 100_000, "{read} bytes in {took:?}");
+    assert!(share < 0.5, "{:.1} % of a processor, in a program that is not optimized", 100.0 * share);
+    let outcome = hub.end(TERM);
+    assert_eq!(outcome.code, Some(0), "{outcome}");
+    let said = outcome.errors.lines().filter(|line| line.contains(says)).count();
+    assert!((1..=2).contains(&said), "{outcome}");
+    writer.join().expect("it ends with the hub");
+}

@@ -1,0 +1,271 @@
+//! What becomes of a gateway when the network does: interfaces that go and come, queues that are full, and what it is told
+//! that cannot be. Each test has a network of its own.
+
+use std::net::Ipv4Addr;
+use std::process::{Command, Stdio};
+
+use crate::testkit::{
+    Outcome, Program, Receiver, TERM, TestEnv, USR1, in_a_network, ip, is_class, number, read, skip, until,
+};
+use rustix::event::{PollFd, PollFlags, Timespec, poll};
+use rustix::pipe::fcntl_setpipe_size;
+use rustix::process::{Pid, kill_process};
+use schema::Topic;
+use schema::datagram::{Account, Announce, Datagram, Row};
+use serde_json::Value;
+
+const STREAM: [&str; 2] = ["--seed=62", "--baud=500000"];
+const OURS: Ipv4Addr = Ipv4Addr::new(10, 76, 0, 1);
+
+/// An interface with another one at the end of its cable.
+fn plug() {
+    ip("link add ours type veth peer name theirs");
+    ip("addr add 10.76.0.1/24 dev ours");
+    ip("link set ours up");
+    ip("link set theirs up");
+}
+
+/// Waits for the state of a destination.
+fn await_state(gateway: &mut Program, state: &str) -> Value {
+    gateway.await_line(state, |line| line["class"] == "lan_link" && line["state"] == state)
+}
+
+/// Waits until the account of the scans says more of `key` than now.
+fn await_growth(gateway: &mut Program, key: &str) {
+    let mut asked = || {
+        gateway.signal(USR1);
+        number(&gateway.await_line("the account", |it| it["class"] == "lan" && it["topic"] == "scan"), key)
+    };
+    let now = asked();
+    until(key, || asked() > now + 3);
+}
+
+/// The first number that the account of `row` can begin with: that of its first datagram, or that which an earlier
+/// announcement says is next.
+fn first(heard: &[Vec<u8>], row: &Row) -> u64 {
+    let found = heard.iter().find_map(|bytes| {
+        let Datagram { head, payload, .. } = read(bytes);
+        if head.sensor != row.sensor {
+            return None;
+        }
+        if head.topic == row.topic {
+            return Some(head.sequence);
+        }
+        let announce = Announce::unpack(payload).filter(|_| head.topic == Announce::NUMBER)?;
+        let next = announce.topics().iter().find(|topic| topic.topic == row.topic)?.next;
+        Some(next)
+    });
+    u64::from(found.expect("it was heard"))
+}
+
+/// All numbers from the first one heard on were used once: what was not sent has failed.
+fn is_gap_free(heard: &[Vec<u8>], outcome: &Outcome) {
+    assert_eq!(outcome.code, Some(0), "{outcome}");
+    let mut ours = Box::new(Account::new(&Topic::ALL));
+    heard.iter().for_each(|bytes| assert!(ours.receive(bytes, 1, 0).is_ok()));
+    let lines = outcome.of_class("lan");
+    for row in ours.rows() {
+        let topic = Topic::of_number(row.topic).map_or("announce", Topic::name);
+        let line = lines.iter().rfind(|line| line["topic"] == topic).expect("its account");
+        let numbered = number(line, "sent") + number(line, "send_failed");
+        assert_eq!(first(heard, row) + row.received + row.lost(), numbered, "{line}");
+    }
+}
+
+#[test]
+fn a_link_that_goes_and_comes() {
+    in_a_network("gateway_network::a_link_that_goes_and_comes", || {
+        let env = TestEnv::new();
+        plug();
+        let _simulator = env.simulator(&["front"], &STREAM);
+        let _hub = env.hub(&[env.link("front")]);
+        let mut gateway = env.gateway(&["--interface=ours", "--to=10.76.0.9:22200"]);
+        let receiver = Receiver::new(OURS);
+        receiver.await_more(10, |datagram| datagram.head.topic == Topic::Scan.number());
+        await_growth(&mut gateway, "sent");
+        // The cable is out, then it is switched off, then it is another one of that name.
+        for (away, back) in [
+            ("link set theirs down", "link set theirs up"),
+            ("link set ours down", "link set ours up"),
+            ("addr flush dev ours", "addr add 10.76.0.1/24 dev ours"),
+        ] {
+            ip(away);
+            let down = await_state(&mut gateway, "down");
+            assert_eq!(down["to"], "ours");
+            await_growth(&mut gateway, "send_failed");
+            ip(back);
+            await_state(&mut gateway, "up");
+            await_growth(&mut gateway, "sent");
+        }
+        let mut heard = receiver.finish();
+        ip("link del ours");
+        await_state(&mut gateway, "down");
+        await_growth(&mut gateway, "send_failed");
+        plug();
+        await_state(&mut gateway, "up");
+        await_growth(&mut gateway, "sent");
+        // There the groups have to be joined anew.
+        let again = Receiver::new(OURS);
+        again.await_more(10, |datagram| datagram.head.topic == Topic::Scan.number());
+        let outcome = gateway.end(TERM);
+        heard.extend(again.finish());
+        is_gap_free(&heard, &outcome);
+    });
+}
+
+#[test]
+fn what_a_full_queue_drops_is_counted() {
+    in_a_network("gateway_network::what_a_full_queue_drops_is_counted", || {
+        let env = TestEnv::new();
+        plug();
+        let _simulator = env.simulator(&["front"], &STREAM);
+        let _hub = env.hub(&[env.link("front")]);
+        let mut gateway = env.gateway(&["--interface=ours"]);
+        let receiver = Receiver::new(OURS);
+        receiver.await_more(10, |datagram| datagram.head.topic == Topic::Scan.number());
+        let limit = "qdisc add dev ours root tbf rate 64kbit burst 2000 limit 4000";
+        if !Command::new("tc").args(limit.split(' ')).status().is_ok_and(|status| status.success()) {
+            skip("tc", "there is no queue that can be limited here");
+            return;
+        }
+        let failing = await_state(&mut gateway, "failing");
+        assert_eq!(failing["to"], "ours");
+        await_growth(&mut gateway, "send_failed");
+        let free = Command::new("tc").args(["qdisc", "del", "dev", "ours", "root"]).status();
+        assert!(free.is_ok_and(|status| status.success()));
+        await_state(&mut gateway, "well");
+        await_growth(&mut gateway, "sent");
+        let outcome = gateway.end(TERM);
+        is_gap_free(&receiver.finish(), &outcome);
+    });
+}
+
+#[test]
+fn a_reader_that_does_not_read_delays_nothing() {
+    in_a_network("gateway_network::a_reader_that_does_not_read_delays_nothing", || {
+        let env = TestEnv::new();
+        let receiver = Receiver::new(Ipv4Addr::LOCALHOST);
+        let _simulator = env.simulator(&["front"], &STREAM);
+        let _hub = env.hub(&[env.link("front")]);
+        // The pipe stays open, and is soon full.
+        let (_reader, writer) = std::io::pipe().expect("a pipe");
+        fcntl_setpipe_size(&writer, 8192).expect("a small one");
+        let mut command = env.command(&["gateway", "--json", "--no-system-config", "--interface=lo"]);
+        command.stdout(writer.try_clone().expect("another end")).stdin(Stdio::null());
+        let mut gateway = command.spawn().expect("a gateway");
+        let signal = |signal| kill_process(Pid::from_child(&gateway), signal).expect("it lives");
+        let is_scan = |datagram: &schema::datagram::Datagram<'_>| datagram.head.topic == Topic::Scan.number();
+        receiver.await_more(3, is_scan);
+        let now = Timespec { tv_sec: 0, tv_nsec: 0 };
+        until("a full pipe", || {
+            signal(USR1);
+            poll(&mut [PollFd::new(&writer, PollFlags::OUT)], Some(&now)) == Ok(0)
+        });
+        // Some seconds of accounts that nobody can be told.
+        let is_announce = |datagram: &schema::datagram::Datagram<'_>| datagram.head.topic == Announce::NUMBER;
+        receiver.await_more(3, is_announce);
+        signal(USR1);
+        receiver.await_more(30, is_scan);
+        signal(TERM);
+        let mut status = None;
+        until("its end", || {
+            status = gateway.try_wait().expect("a child");
+            status.is_some()
+        });
+        assert_eq!(status.and_then(|status| status.code()), Some(0));
+    });
+}
+
+#[test]
+fn the_account_is_told_when_asked_for() {
+    in_a_network("gateway_network::the_account_is_told_when_asked_for", || {
+        let env = TestEnv::new();
+        let receiver = Receiver::new(Ipv4Addr::LOCALHOST);
+        let _simulator = env.simulator(&["front"], &STREAM);
+        let _hub = env.hub(&[env.link("front")]);
+        let flags = ["--interface=lo", "--topic=front/background", "--background-every=1s"];
+        let words = [&["gateway", "--no-system-config"], &flags[..]].concat();
+        let mut gateway = env.start(&words);
+        gateway.await_text("gateway ");
+        let is_background =
+            |datagram: &schema::datagram::Datagram<'_>| datagram.head.topic == Topic::Background.number();
+        receiver.await_more(3, is_background);
+        gateway.signal(USR1);
+        gateway.await_text("front/background: ");
+        gateway.await_text("to lo: ");
+        // A new one goes out at once, between the repetitions.
+        let generation = |bytes: &[u8]| {
+            let datagram = read(bytes);
+            let is_one = is_background(&datagram);
+            is_one.then(|| datagram.payload[..4].to_vec())
+        };
+        assert_eq!(env.run(&["background", "front", "reset"]).code, Some(0));
+        until("another generation", || {
+            let mut all: Vec<_> = receiver.heard().iter().filter_map(|bytes| generation(bytes)).collect();
+            all.dedup();
+            all.len() > 1
+        });
+        let outcome = gateway.end(TERM);
+        assert_eq!(outcome.code, Some(0), "{outcome}");
+        let text = String::from_utf8_lossy(&outcome.out);
+        assert_eq!(text.lines().filter(|line| line.starts_with("to lo: ")).count(), 2, "{text}");
+        for bytes in receiver.finish() {
+            let topic = read(&bytes).head.topic;
+            assert!([Announce::NUMBER, Topic::Background.number()].contains(&topic), "{topic}");
+        }
+    });
+}
+
+#[test]
+fn what_cannot_be_is_refused() {
+    in_a_network("gateway_network::what_cannot_be_is_refused", || {
+        let env = TestEnv::new();
+        let _hub = env.hub(&[env.link("front")]);
+        let config = |text: &str| format!("--config={}", env.file("gateway.toml", text));
+        let refused = |flags: &[&str], code: i32, said: &str, hint: &str| {
+            let outcome = env.gateway_at(flags).wait();
+            let error = outcome.of_class("error").pop().unwrap_or_else(|| panic!("{flags:?}: {outcome}"));
+            assert_eq!(outcome.code, Some(code), "{flags:?}: {outcome}");
+            let (message, found) = (error["message"].to_string(), error["hint"].to_string());
+            assert!(message.contains(said) && found.contains(hint), "{flags:?}: {error}");
+        };
+        refused(&[], 78, "no interface is named", "lo (127.0.0.1, this machine alone)");
+        refused(&["--interface=eth7"], 78, "eth7", "lo");
+        refused(&["--interface=lo", "--to=127.0.0.1"], 78, "127.0.0.1", "HOST:PORT");
+        refused(&["--interface=lo", "--to=239.255.76.80:22200"], 78, "no host", "hosts");
+        refused(&["--interface=lo", "--to=no-such-host.invalid:22200"], 78, "no-such-host", "HOST:PORT");
+        let twice = ["--interface=lo", "--to=127.0.0.1:22200", "--to=localhost:22200"];
+        refused(&twice, 78, "localhost:22200: it is named twice", "127.0.0.1:22200");
+        refused(&["--interface=lo", "--to=127.0.0.1:65500", "--bare"], 78, "port", "65280");
+        refused(&["--interface=lo", "--topic=front/scam"], 2, "front/scam", "front/scan");
+        refused(&["--interface=lo", "--topic=side/scan"], 3, "side", "front");
+        refused(&["--interface=lo", "--topic=front/scan:every=0"], 2, "every=0", "every=4");
+        refused(&["--interface=lo", "--topic=front/scan", "--bare"], 2, "no telegram", "--bare");
+        refused(&["--interface=lo", "--mtu=1500"], 78, "1500", "1472");
+        refused(&["--interface=lo", "--mtu=100"], 78, "100", "862");
+        refused(&["--ttl=300"], 2, "300", "");
+        refused(&["--background-every=ten"], 2, "ten", "");
+        refused(&[&config("[gateway]\nmtu = 9000\n")], 78, "gateway.toml:2:7: mtu = 9000", "1472");
+        refused(&[&config("[gateway]\nintreface = \"lo\"\n")], 78, "intreface", "interface");
+        refused(&[&config("[gateway]\nbackground_every = \"ten\"\n")], 78, "gateway.toml:2:20", "");
+        refused(&[&config("[gateway]\ninterface = \"eth8\"\n")], 78, "eth8", "lo");
+        plug();
+        refused(&[], 78, "no interface is named", "ours (10.76.0.1)");
+        refused(&[&config("[gateway]\ntopics = [\"front/scan\"]\n")], 78, "no interface", "--to");
+        let unwritable = {
+            let mut command = env.command(&["gateway", "--json", "--no-system-config", "--interface=lo"]);
+            command.env("XDG_STATE_HOME", "/dev/null").env_remove("STATE_DIRECTORY");
+            Program::start(command).wait()
+        };
+        assert_eq!(unwritable.code, Some(78), "{unwritable}");
+        // What the configuration says counts, and a flag wins over it.
+        let said = config("[gateway]\ninterface = \"eth8\"\ntopics = [\"front/status\"]\nmtu = 1400\n");
+        let mut gateway = env.gateway_at(&["--interface=lo", &said]);
+        let begin = gateway.await_line("its begin", is_class("gateway"));
+        assert_eq!((&begin["interface"], number(&begin, "longest")), (&"lo".into(), 1400));
+        let line =
+            gateway.await_line("a status", |line| line["class"] == "lan" && line["topic"] != "announce");
+        assert_eq!(line["topic"], "status");
+        assert_eq!(gateway.end(TERM).code, Some(0));
+    });
+}

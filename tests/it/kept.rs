@@ -1,0 +1,54 @@
+//! What a hub keeps for the next one beside shared memory: where it is, for whom, and that nothing depends on it.
+
+use std::fs;
+use std::os::unix::fs::{MetadataExt, PermissionsExt};
+
+use crate::testkit::{Line, Program, TERM, TestEnv, until};
+
+#[test]
+fn where_a_sensor_was_found_is_asked_first_by_the_next_hub() {
+    let env = TestEnv::new();
+    let simulator = env.simulator(&["front"], &["--permanent-baud=19200"]);
+    let hub = env.hub(&[env.link("front")]);
+    let directory = env.path("state/scanhub").join(env.place().name());
+    let kept = directory.join("front.rate");
+    let said = format!("19200 {}\n", env.word("front"));
+    until("it is kept", || fs::read_to_string(&kept).is_ok_and(|text| text == said));
+    let mode = |path| fs::metadata(path).expect("it is there").mode() & 0o7777;
+    assert_eq!((mode(&directory), mode(&kept)), (0o700, 0o600));
+    assert_eq!(hub.end(TERM).code, Some(0));
+    assert_eq!(simulator.end(TERM).code, Some(0));
+    assert_eq!(env.simulated("front").1, 0);
+
+    // Nobody streams: the next one asks there, for what is told in few bytes.
+    let line = Line::at(&env.path("front"));
+    let hub = env.hub(&[env.link("front")]);
+    assert_eq!(line.await_request(), (19_200, 0x3A));
+    assert_eq!(hub.end(TERM).code, Some(0));
+
+    // A link with the same name at another port, and a file that anybody may have written.
+    let other = Line::at(&env.path("other"));
+    let hub = env.hub(&[format!("--link=front={}", env.word("other"))]);
+    assert_eq!(other.await_request(), (9_600, 0x3A));
+    assert_eq!(hub.end(TERM).code, Some(0));
+    fs::set_permissions(&kept, fs::Permissions::from_mode(0o666)).expect("it is ours");
+    let line = Line::at(&env.path("again"));
+    let hub = env.hub(&[format!("--link=front={}", env.word("again"))]);
+    assert_eq!(line.await_request(), (9_600, 0x3A));
+    let outcome = hub.end(TERM);
+    assert!(outcome.errors.contains("others can write it"), "{outcome}");
+    assert!(outcome.errors.contains("delete it; what it held is learned again"), "{outcome}");
+}
+
+#[test]
+fn where_nothing_can_be_kept_the_hub_streams() {
+    let env = TestEnv::new();
+    let _simulator = env.simulator(&["front"], &["--seed=4"]);
+    let mut command = env.command(&["run", "--json", &env.link("front")]);
+    command.env("XDG_STATE_HOME", "/dev/null");
+    let hub = Program::start(command).ready();
+    env.await_info("front", |info| info["state"] == "streaming");
+    let outcome = hub.end(TERM);
+    assert_eq!(outcome.code, Some(0), "{outcome}");
+    assert!(outcome.errors.contains("cannot keep /dev/null/scanhub"), "{outcome}");
+}

@@ -1,0 +1,12 @@
+//! Datagrams as other languages and tools read them, and what networks do to them.
+
+mod c;
+mod capture;
+mod damaged;
+mod python;
+mod readers;
+#[path = "../../schema/tests/datagram/says.rs"]
+mod says;
+mod trouble;
+mod vectors;
+mod wireshark;

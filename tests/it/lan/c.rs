@@ -1,0 +1,43 @@
+//! The C header against the golden datagrams and against `schema`; skips, saying so, where there is no C compiler.
+
+use std::path::{Path, PathBuf};
+use std::process::Command;
+
+use crate::testkit::{gentle, skip};
+
+use super::readers::{self, Reader};
+
+/// The reader, compiled as strictly as it goes; with a watch over its memory where the compiler has one.
+fn reader() -> Option<PathBuf> {
+    let top = Path::new(env!("CARGO_MANIFEST_DIR"));
+    let program = Path::new(env!("CARGO_TARGET_TMPDIR")).join("lan-reader");
+    if Command::new("cc").arg("--version").output().is_err() {
+        skip("cc", "there is no C compiler");
+        return None;
+    }
+    let compile = |watch: &[&str]| {
+        let mut cc = gentle("cc");
+        cc.args(["-std=c99", "-Wall", "-Wextra", "-Wpedantic", "-Wconversion", "-Werror", "-g"]).args(watch);
+        cc.arg("-I")
+            .arg(top.join("clients/c"))
+            .arg(top.join("tests/it/lan/reader.c"))
+            .arg("-o")
+            .arg(&program);
+        cc.output().expect("a compiler")
+    };
+    if !compile(&["-fsanitize=address,undefined", "-fno-sanitize-recover=all"]).status.success() {
+        eprintln!("without a watch over memory: this compiler has none");
+        let output = compile(&[]);
+        assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+    }
+    Some(program)
+}
+
+#[test]
+fn the_header_reads_what_schema_reads() {
+    let Some(program) = reader() else { return };
+    let mut reader = Reader::start(&mut Command::new(program));
+    readers::golden(&mut reader);
+    readers::damaged(&mut reader, 5_000);
+    reader.end();
+}

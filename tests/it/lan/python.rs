@@ -1,0 +1,47 @@
+//! The Python module against the golden datagrams and against `schema`; skips, saying so, where there is no python3. Its
+//! numpy part skips by itself.
+
+use std::path::Path;
+use std::process::Command;
+
+use crate::testkit::skip;
+
+use super::readers::{self, Reader};
+use super::vectors;
+
+/// The reader in the Python of `SCANHUB_PYTHON`, or in the first one.
+fn reader() -> Option<Reader> {
+    let top = Path::new(env!("CARGO_MANIFEST_DIR"));
+    let python = std::env::var("SCANHUB_PYTHON").unwrap_or("python3".to_owned());
+    let recent = "import sys; sys.exit(sys.version_info < (3, 9))";
+    if !Command::new(&python).args(["-c", recent]).status().is_ok_and(|status| status.success()) {
+        skip("python", format!("there is no {python}, or it is older than 3.9"));
+        return None;
+    }
+    let mut command = Command::new(python);
+    command.arg("-B").arg(top.join("tests/it/lan/reader.py")).env("PYTHONPATH", top.join("clients/python"));
+    Some(Reader::start(&mut command))
+}
+
+#[test]
+fn the_module_reads_what_schema_reads() {
+    let Some(mut reader) = reader() else { return };
+    readers::golden(&mut reader);
+    readers::damaged(&mut reader, 5_000);
+    reader.end();
+}
+
+#[test]
+fn the_module_knows_keys() {
+    let Some(mut reader) = reader() else { return };
+    let list = vectors::list();
+    let key = list["key"].as_str().expect("a key");
+    for vector in vectors::vectors() {
+        let said = reader.read(Some(key), &vector.bytes);
+        if vector.says["with_key"] == true {
+            assert_eq!(said["refusal"], vector.says["refusal"], "{}", vector.file);
+        }
+        assert_eq!(said["authenticated"] == true, vector.file == "authenticated.hex", "{}", vector.file);
+    }
+    reader.end();
+}

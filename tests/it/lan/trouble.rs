@@ -1,0 +1,185 @@
+//! What happens to networks and programs, as heard at the other end of the cable: the gateway outlives it, what it could
+//! not send is counted, and it sends again. How long that took is printed.
+
+use std::time::Instant;
+
+use crate::testkit::{
+    INT, KILL, Machine, Outcome, Program, Receiver, Relay, Robot, TERM, TestEnv, in_a_network, ip, is_class,
+    number, read, skip, until,
+};
+use schema::datagram::{Account, Datagram, Packed};
+use schema::{Topic, Verdict, Zones};
+use serde_json::Value;
+
+fn is_scan(datagram: &Datagram<'_>) -> bool {
+    datagram.head.topic == Topic::Scan.number()
+}
+
+/// Waits for the gateway's word on a destination.
+fn await_link(gateway: &mut Program, to: &str, state: &str) {
+    let is_it = |line: &Value| line["class"] == "lan_link" && line["to"] == to && line["state"] == state;
+    gateway.await_line(state, is_it);
+}
+
+/// Waits until a second's account has `more` failures to `to` than the last.
+fn await_failures(gateway: &mut Program, to: &str, more: u64) {
+    let count =
+        |line: &Value| (line["class"] == "lan_to" && line["to"] == to).then(|| number(line, "send_failed"));
+    let before = count(&gateway.await_line("an account", |line| count(line).is_some())).unwrap_or_default();
+    gateway.await_line("failures", |line| count(line).is_some_and(|failed| failed >= before + more));
+}
+
+/// Waits for scans, and says how long it took.
+fn await_scans(what: &str, receiver: &Receiver) {
+    let since = Instant::now();
+    receiver.await_more(1, is_scan);
+    eprintln!("{what}: heard again after {} ms", since.elapsed().as_millis());
+    receiver.await_more(20, is_scan);
+}
+
+/// What was sent to `to` in all, and what was not.
+fn sent(outcome: &Outcome, to: &str) -> (u64, u64) {
+    assert_eq!(outcome.code, Some(0), "{outcome}");
+    let last = outcome.of_class("lan_to").into_iter().rfind(|line| line["to"] == to);
+    let last = last.unwrap_or_else(|| panic!("no {to}: {outcome}"));
+    (number(&last, "sent"), number(&last, "send_failed"))
+}
+
+/// What a receiver says: received and lost, in all.
+fn account(heard: &[Vec<u8>]) -> (u64, u64) {
+    let mut account = Box::new(Account::new(&Topic::ALL));
+    heard.iter().for_each(|bytes| assert!(account.receive(bytes, 1, 0).is_ok()));
+    let sums = account.rows().map(|row| (row.received, row.lost()));
+    sums.fold((0, 0), |sum, row| (sum.0 + row.0, sum.1 + row.1))
+}
+
+#[test]
+fn a_cable_is_pulled_and_an_address_taken() {
+    in_a_network("lan::trouble::a_cable_is_pulled_and_an_address_taken", || {
+        let robot = Robot::new(&["front"]);
+        let receiver = Receiver::new(robot.machine.here());
+        let mut gateway = robot.gateway::<&str>(&[]);
+        receiver.await_more(10, is_scan);
+        let there = robot.machine.there();
+        let address = format!("{there}/24 dev eth0");
+        let pulls = [
+            ("ip link set eth0 down".to_owned(), "ip link set eth0 up".to_owned()),
+            (format!("ip address del {address}"), format!("ip address add {address}")),
+        ];
+        for (pull, plug) in pulls {
+            robot.machine.run(&pull);
+            await_link(&mut gateway, "eth0", "down");
+            await_failures(&mut gateway, "eth0", 150);
+            robot.machine.run(&plug);
+            await_scans(&pull, &receiver);
+            await_link(&mut gateway, "eth0", "up");
+        }
+        let outcome = gateway.end(TERM);
+        let (sent, failed) = sent(&outcome, "eth0");
+        let (received, lost) = account(&receiver.finish());
+        assert_eq!(received + lost, sent + failed, "every number is accounted for");
+        assert!(lost >= 300 && lost <= failed, "{lost} lost, {failed} counted");
+    });
+}
+
+#[test]
+fn a_queue_is_full() {
+    in_a_network("lan::trouble::a_queue_is_full", || {
+        let robot = Robot::new(&["front"]);
+        let receiver = Receiver::new(robot.machine.here());
+        let mut gateway = robot.gateway::<&str>(&[]);
+        receiver.await_more(10, is_scan);
+        if !robot.machine.try_run("tc qdisc add dev eth0 root tbf rate 128kbit burst 2kb limit 4kb") {
+            skip("tc", "there is no tc or no tbf");
+            return;
+        }
+        await_link(&mut gateway, "eth0", "failing");
+        await_failures(&mut gateway, "eth0", 100);
+        // What waits in it goes with it.
+        robot.machine.run("tc qdisc change dev eth0 root tbf rate 1gbit burst 100kb limit 1mb");
+        await_scans("full queue", &receiver);
+        await_link(&mut gateway, "eth0", "well");
+        let outcome = gateway.end(TERM);
+        let (sent, failed) = sent(&outcome, "eth0");
+        // What the kernel took got there, what it did not take was counted: nothing is lost that nobody knows of.
+        assert_eq!(account(&receiver.finish()), (sent, failed));
+        assert!(failed >= 100, "{failed}");
+    });
+}
+
+#[test]
+fn hosts_that_are_not_there_disturb_nobody() {
+    in_a_network("lan::trouble::hosts_that_are_not_there_disturb_nobody", || {
+        let robot = Robot::new(&["front"]);
+        let here = robot.machine.here();
+        ip("link set lo up");
+        ip("address add 10.99.0.1/32 dev lo");
+        let (receiver, copies) = (Receiver::new(here), Receiver::at(here, 30_000));
+        let (no_route, nobody, copy) = ("10.99.0.1:30001", "10.76.1.77:30000", format!("{here}:30000"));
+        let far = Receiver::at(here, 30_001);
+        let flags = [no_route, nobody, &copy].map(|to| format!("--to={to}"));
+        let mut gateway = robot.gateway(&flags);
+        await_failures(&mut gateway, no_route, 100);
+        assert!(far.heard().is_empty());
+        robot.machine.run(&format!("ip route add 10.99.0.0/24 via {here}"));
+        await_scans("a route", &far);
+        await_link(&mut gateway, no_route, "well");
+        let outcome = gateway.end(TERM);
+        let heard = receiver.finish();
+        assert_eq!(account(&heard), sent(&outcome, "eth0"));
+        assert_eq!(sent(&outcome, "eth0").1, 0);
+        assert_eq!(copies.finish(), heard, "copies of all, in their order");
+        assert_eq!(account(&far.finish()).0, sent(&outcome, no_route).0);
+        let lines = outcome.of_class("lan_link");
+        assert!(lines.iter().any(|line| line["to"] == nobody && line["state"] == "failing"), "{lines:?}");
+        assert!(lines.iter().all(|line| line["to"] != copy.as_str() && line["to"] != "eth0"), "{lines:?}");
+    });
+}
+
+#[test]
+fn hubs_and_gateways_are_killed() {
+    in_a_network("lan::trouble::hubs_and_gateways_are_killed", || {
+        let second = Machine::new(2);
+        let mut robot = Robot::new(&["front"]);
+        let relay = Relay::new(&robot.machine, 7);
+        relay.connect(&second);
+        let env = TestEnv::on(&second);
+        let mut listener = env.start(&["listen", "--json", "--topic=scan"]).ready();
+        // Scans of another life than those before.
+        let mut again = |what: &str, key: &str, before: &Value| {
+            let since = Instant::now();
+            let line = listener.await_line(what, |line| line["class"] == "scan" && line[key] != before[key]);
+            eprintln!("{what}: heard after {} ms", since.elapsed().as_millis());
+            listener.await_lines(20, "scans", is_class("scan"));
+            line
+        };
+        let first = robot.gateway::<&str>(&[]);
+        let of_first = again("the gateway", "epoch", &Value::Null);
+        let before = relay.log().len();
+        robot.take_hub().end(KILL);
+        let is_unknown = |bytes: &Vec<u8>| {
+            let (datagram, mut zones) = (read(bytes), Zones::unknown());
+            let is_zones = datagram.head.topic == Topic::Zones.number() && zones.unpack(datagram.payload);
+            is_zones && zones.verdict() == Verdict::Unknown
+        };
+        until("that nothing is known", || relay.log()[before..].iter().any(is_unknown));
+        robot.start();
+        again("the next hub", "boot", &of_first);
+        drop(first.end(KILL));
+        let second = robot.gateway::<&str>(&[]);
+        again("the next gateway", "epoch", &of_first);
+        let last = second.end(TERM);
+        let outcome = listener.end(INT);
+        let of_epoch = |is_first: bool| {
+            let lines = outcome.of_class("lan").into_iter().filter(|line| line["topic"] == "scan");
+            let mut lines = lines.filter(|line| (line["epoch"] == of_first["epoch"]) == is_first);
+            lines.next().unwrap_or_else(|| panic!("no account: {outcome}"))
+        };
+        for line in [of_epoch(true), of_epoch(false)] {
+            assert!(number(&line, "received") >= 20 && line["lost"] == 0, "{line}");
+        }
+        let sent =
+            last.of_class("lan").into_iter().rfind(|line| line["topic"] == "scan").expect("its account");
+        assert_eq!(of_epoch(false)["received"], sent["sent"]);
+    });
+}

@@ -1,0 +1,160 @@
+//! The dissector for Wireshark on captures that are written here: every field of the golden datagrams, and what is flagged
+//! in a sequence. Skips, saying so, where there is no tshark.
+
+use std::collections::{BTreeMap, BTreeSet};
+
+use super::capture::{Capture, has_tshark};
+use super::{damaged, vectors};
+use schema::datagram::{HEAD, Head, Packed};
+use schema::{State, Topic, Verdict, Zones};
+use serde_json::Value;
+
+/// What the list says of a payload, in the names and the words of the dissector: the values of each field, in their order.
+fn fields(topic: &str, says: &Value) -> BTreeMap<String, Vec<String>> {
+    let mut fields = BTreeMap::new();
+    flatten(topic, "", says, &mut fields);
+    fields
+}
+
+fn flatten(topic: &str, name: &str, says: &Value, fields: &mut BTreeMap<String, Vec<String>>) {
+    match says {
+        Value::Object(items) => items.iter().for_each(|(key, item)| flatten(topic, key, item, fields)),
+        Value::Array(items) => {
+            let single = match name {
+                "beams" => "beam",
+                "ranges" => "range",
+                name => name,
+            };
+            items.iter().for_each(|item| flatten(topic, single, item, fields));
+        }
+        // In the bytes it is a number that stands for nothing.
+        Value::Null => {}
+        value => {
+            let field = match name {
+                "telegram" => "scanhub.telegram".to_owned(),
+                name => format!("scanhub.{topic}.{name}"),
+            };
+            fields.entry(field).or_default().push(word(name, value));
+        }
+    }
+}
+
+fn word(name: &str, value: &Value) -> String {
+    let number = |of: Option<usize>| of.expect("a known name").to_string();
+    match (name, value) {
+        ("verdict", Value::String(name)) => {
+            number(Verdict::ALL.iter().find(|known| known.name() == name).map(|&known| known as usize))
+        }
+        ("state", Value::String(name)) => number(State::ALL.iter().position(|known| known.name() == name)),
+        ("boot" | "hub", Value::String(digits)) => format!("0x{digits}"),
+        ("mode" | "flags", value) => format!("0x{:02x}", value.as_u64().expect("a byte")),
+        (_, Value::Bool(value)) => u8::from(*value).to_string(),
+        (_, Value::String(text)) => text.clone(),
+        (_, value) => value.to_string(),
+    }
+}
+
+#[test]
+fn golden_datagrams_are_shown_field_by_field() {
+    if !has_tshark() {
+        return;
+    }
+    let vectors = vectors::vectors();
+    let mut capture = Capture::default();
+    vectors.iter().for_each(|vector| capture.add(&vector.bytes));
+    // Field by vector.
+    let mut expected: Vec<BTreeMap<String, Vec<String>>> = Vec::new();
+    for vector in &vectors {
+        let mut wanted = BTreeMap::new();
+        match vector.says["refusal"].as_str() {
+            None => {
+                let head = &vector.says["head"];
+                let topic = head["topic"].as_u64().expect("a number");
+                let topic = Topic::of_number(topic as u8).map_or("announce", Topic::name);
+                wanted = fields(topic, &vector.says["payload"]);
+                for (key, value) in head.as_object().expect("an object") {
+                    let key = if key == "payload_len" { "payload_length" } else { key };
+                    wanted.insert(format!("scanhub.{key}"), vec![word(key, value)]);
+                }
+                wanted.insert("scanhub.refused".to_owned(), Vec::new());
+                wanted.insert("scanhub.crc_status".to_owned(), vec!["good".to_owned()]);
+            }
+            // A capture has no key, and other datagrams before it.
+            Some("unauthenticated" | "mac" | "epoch" | "twin" | "stale" | "capacity") => {}
+            Some(refusal) => {
+                wanted.insert("scanhub.refused".to_owned(), vec![refusal.to_owned()]);
+            }
+        }
+        expected.push(wanted);
+    }
+    let names: BTreeSet<&String> = expected.iter().flat_map(BTreeMap::keys).collect();
+    let names: Vec<String> = names.into_iter().cloned().collect();
+    let shown = capture.fields("golden", &names);
+    assert_eq!(shown.len(), vectors.len());
+    for ((vector, wanted), shown) in vectors.iter().zip(&expected).zip(&shown) {
+        for (name, values) in wanted {
+            assert_eq!(shown[name], values.join(","), "{name} of {}", vector.file);
+        }
+    }
+    assert!(names.len() > 80, "{names:?}");
+}
+
+/// What a receiver refuses is shown with the reason, and nothing stops the dissector.
+#[test]
+fn damaged_datagrams_are_shown_as_refused() {
+    if !has_tshark() {
+        return;
+    }
+    let damaged = damaged::datagrams(3_000);
+    let mut capture = Capture::default();
+    damaged.iter().for_each(|(datagram, _)| capture.add(datagram));
+    let shown = capture.fields("damaged", &["scanhub.refused".to_owned()]);
+    assert_eq!(shown.len(), damaged.len());
+    for ((datagram, expected), shown) in damaged.iter().zip(&shown) {
+        let refusal = expected["refusal"].as_str().unwrap_or_default();
+        assert_eq!(shown["scanhub.refused"], refusal, "{datagram:02x?}");
+    }
+}
+
+#[test]
+fn gaps_are_flagged_per_hub_epoch_sensor_and_topic() {
+    if !has_tshark() {
+        return;
+    }
+    let zones =
+        |sequence| Head { topic: Topic::Zones.number(), revision: 1, epoch: 7, sequence, ..Head::default() };
+    let nothing = ("", "");
+    let sent = [
+        (zones(u32::MAX - 1), nothing),
+        (zones(u32::MAX), nothing),
+        (zones(0), nothing),
+        (zones(3), ("lost", "2")),
+        (Head { sensor: 1, ..zones(900) }, nothing),
+        (Head { hub: 9, ..zones(800) }, nothing),
+        (zones(2), ("reordered", "1")),
+        (zones(2), ("duplicate", "1")),
+        (zones(3), ("duplicate", "0")),
+        (zones(4), nothing),
+        (Head { sensor: 1, ..zones(902) }, ("lost", "1")),
+        (zones(1028), ("lost", "1023")),
+        (zones(5), ("reordered", "1023")),
+        (zones(4), ("stale", "1024")),
+        (Head { epoch: 8, ..zones(0) }, nothing),
+        (Head { epoch: 7, ..zones(1029) }, ("retired", "8")),
+        (Head { hub: 9, ..zones(801) }, nothing),
+    ];
+    let mut capture = Capture::default();
+    for (head, _) in sent {
+        let mut buffer = [0; 100];
+        let len = Zones::unknown().pack(&mut buffer[HEAD..]).expect("room");
+        capture.add(head.seal(&mut buffer, len).expect("room"));
+    }
+    let flags = ["lost", "reordered", "duplicate", "stale", "retired"];
+    let names = flags.map(|name| format!("scanhub.{name}"));
+    for (number, ((_, (flag, value)), shown)) in sent.iter().zip(capture.fields("gaps", &names)).enumerate() {
+        for name in flags {
+            let expected = if name == *flag { value } else { "" };
+            assert_eq!(shown[&format!("scanhub.{name}")], expected, "{name} of datagram {number}");
+        }
+    }
+}

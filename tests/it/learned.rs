@@ -1,0 +1,175 @@
+//! What a hub has learned of its sensors' surroundings is there when the next one begins, also after a kill; and is not
+//! where it would be wrong: at another pose, where somebody said otherwise, in a recording.
+
+use std::fs;
+use std::os::unix::fs::PermissionsExt;
+use std::path::PathBuf;
+
+use crate::testkit;
+use crate::testkit::{KILL, Outcome, Program, TERM, TestEnv, is_class, number};
+use serde_json::Value;
+
+/// Whoever learns so soon is a first hub; whoever needs so long learns nothing in a test.
+const SOON: &str = "--set=background.scans=20";
+const LATE: &str = "--set=background.scans=8191";
+
+/// A wall around the sensor, 3 m ahead.
+const ROOM: &str = "[noise]\nerrors = 0\ntail = 0\n\n\
+     [[thing]]\nline = [[3000, -500], [3000, 3000], [-3000, 3000], [-3000, -500]]\n";
+/// In it somebody who stands 1.5 m ahead.
+const PERSON: &str = "\n[[thing]]\nradius_mm = 150\npose = [0, 1500]\n";
+
+fn simulator(env: &TestEnv, world: &str) -> Program {
+    let world = env.file("world.toml", world);
+    env.simulator(&["front"], &["--seed=17", "--baud=500000", &format!("--world={world}")])
+}
+
+fn file(env: &TestEnv) -> PathBuf {
+    env.path("state/scanhub").join(env.place().name()).join("front.background.json")
+}
+
+fn shown(env: &TestEnv) -> Value {
+    let outcome = env.run(&["background", "front", "show", "--json"]);
+    let [line] = &outcome.lines()[..] else { panic!("not one line: {outcome}") };
+    line.clone()
+}
+
+fn taught(env: &TestEnv) -> u64 {
+    number(&shown(env), "taught")
+}
+
+/// A hub that has seen scans, and what it ended with.
+fn look(env: &TestEnv, flags: &[&str], look: impl FnOnce()) -> Outcome {
+    let link = env.link("front");
+    let hub = env.hub(&[&[link.as_str()], flags].concat());
+    let mut scans = env.echo(&["front/scan"]);
+    scans.await_lines(3, "a scan", is_class("scan"));
+    look();
+    drop(scans);
+    let outcome = hub.end(TERM);
+    assert_eq!(outcome.code, Some(0), "{outcome}");
+    outcome
+}
+
+/// The room as a first hub has learned and kept it.
+fn learn(env: &TestEnv) {
+    look(env, &[SOON], || testkit::until("the room is learned", || taught(env) > 350));
+    assert!(file(env).exists());
+}
+
+#[test]
+fn who_comes_while_the_hub_is_away_is_foreground_at_once() {
+    for how in [TERM, KILL] {
+        let env = TestEnv::new();
+        let room = simulator(&env, ROOM);
+        let hub = env.hub(&[&env.link("front"), SOON]);
+        testkit::until("the room is learned and kept", || {
+            let shown = shown(&env);
+            number(&shown, "taught") > 350 && shown["kept_wall_ns"].is_u64()
+        });
+        assert_eq!(fs::metadata(file(&env)).expect("kept").permissions().mode() & 0o777, 0o600);
+        hub.end(how);
+        room.end(TERM);
+
+        let _simulator = simulator(&env, &[ROOM, PERSON].concat());
+        let hub = env.hub(&[&env.link("front"), LATE]);
+        let mut consumer = env.echo(&["front/foreground"]);
+        let first = consumer.await_line("foreground", is_class("foreground"));
+        // The post is 11 degrees wide. Of a first scan two beams may not have been believed.
+        let (beams, generation) =
+            (first["beams"].as_array().map_or(0, Vec::len), number(&first, "generation"));
+        assert!((18..=26).contains(&beams) && generation == 1, "{first}");
+        let nearest = number(&first["segments"][0], "nearest_mm");
+        assert!((1300..1400).contains(&nearest), "{first}");
+        let text = env.run(&["background", "front", "show"]);
+        assert!(String::from_utf8_lossy(&text.out).contains(" beams known, 0 far, in 1 mm, kept "), "{text}");
+        let log = hub.end(TERM).errors;
+        assert!(log.contains("front: begins with the background of "), "{log}");
+    }
+}
+
+#[test]
+fn what_does_not_fit_or_is_not_wanted_is_not_taken() {
+    let env = TestEnv::new();
+    let _simulator = simulator(&env, ROOM);
+    learn(&env);
+    let kept = fs::read(file(&env)).expect("kept");
+    let empty = |flags: &[&str], why: &str| {
+        let flags = [&[LATE], flags].concat();
+        let outcome = look(&env, &flags, || assert_eq!(taught(&env), 0, "{flags:?}"));
+        assert!(outcome.errors.contains(why), "{outcome}\n{}", outcome.errors);
+        assert_eq!(fs::read(file(&env)).expect("still there"), kept, "{flags:?}");
+    };
+    empty(&["--set=link.front.pose.x=0.2"], "the background begins empty: ");
+    empty(&["--set=link.front.pose.yaw=0.1"], "is of another pose");
+    empty(
+        &["--set=link.front.unit=cm"],
+        "361 beams in units of 1 mm, the link is configured for 361 in units of 10 mm",
+    );
+    empty(&["--set=background.keep=false"], "");
+    empty(&["--set=background.start=empty"], "");
+    // Damaged, cut short, of another sensor, somebody else's.
+    let text = String::from_utf8(kept.clone()).expect("text");
+    for (wrong, why) in [
+        (text[..text.len() / 2].to_owned(), "cut short"),
+        (text.replacen("\"front\"", "\"rear\"", 1), "is the background of rear"),
+        (text.replacen("\"taught\":", "\"taught\":9", 1), "is no background model"),
+        ("\u{0}\u{1}".to_owned(), "is no background model"),
+    ] {
+        fs::write(file(&env), &wrong).expect("written");
+        let outcome = look(&env, &[LATE], || assert_eq!(taught(&env), 0, "{why}"));
+        assert!(outcome.errors.contains(why), "{why}: {}", outcome.errors);
+    }
+    fs::write(file(&env), &kept).expect("written");
+    fs::set_permissions(file(&env), fs::Permissions::from_mode(0o666)).expect("set");
+    empty(&[], "others can write it");
+    // As it was it is taken.
+    fs::set_permissions(file(&env), fs::Permissions::from_mode(0o600)).expect("set");
+    look(&env, &[LATE], || assert!(taught(&env) > 350));
+    // What was forgotten on purpose does not come back.
+    for (flags, content) in [
+        (vec![LATE], &kept[..]),
+        // Also not what the hub that forgets did not take.
+        (vec![LATE, "--set=link.front.pose.x=0.2"], &kept),
+        (vec![LATE], b"cut short"),
+    ] {
+        fs::write(file(&env), content).expect("written");
+        look(&env, &flags, || {
+            assert_eq!(env.run(&["background", "front", "reset"]).code, Some(0));
+            testkit::until("it is gone", || !file(&env).exists());
+        });
+    }
+}
+
+#[test]
+fn where_nothing_is_kept_nothing_is_written() {
+    let env = TestEnv::new();
+    let simulator = simulator(&env, ROOM);
+    let is_known = || testkit::until("it is learned", || taught(&env) > 350);
+    look(&env, &[SOON, "--set=background.keep=false"], || {
+        is_known();
+        assert!(shown(&env)["kept_wall_ns"].is_null());
+    });
+    assert!(!file(&env).exists());
+    simulator.end(TERM);
+
+    // Of recordings nothing is kept, and what is there is not theirs.
+    let log: String = (0..60)
+        .map(|scan| {
+            let at = 1000.0 + f64::from(scan) / 50.0;
+            format!("FLASER 181 {} 0 0 0 0 0 0 {at} host {at}\n", vec!["1.5"; 181].join(" "))
+        })
+        .collect();
+    let log = env.file("log", log);
+    let is_played = |hub: Program, words: &str| {
+        testkit::until("it is learned", || taught(&env) == 181);
+        assert!(shown(&env)["kept_wall_ns"].is_null(), "{words}");
+        hub.end(TERM);
+        assert!(!file(&env).exists(), "{words}");
+    };
+    let link = format!("--link=front=file:{log}");
+    let resolution = "--set=link.front.resolution=1";
+    is_played(env.hub(&[&link, SOON, resolution]), "file:");
+    let words = ["replay", "--json", "--no-system-config", &log, "--hold", SOON, resolution];
+    is_played(env.start(&words).ready(), "replay");
+}

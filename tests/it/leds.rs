@@ -1,0 +1,319 @@
+//! The lights: what a robot shows of its zones and marks, on a terminal and on diodes that a directory stands in for.
+
+use std::fs;
+use std::io::Read;
+use std::path::PathBuf;
+use std::process::Stdio;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::thread;
+use std::time::Duration;
+
+use crate::testkit::{
+    INT, KILL, Program, Sender, TERM, TestEnv, in_a_network, is_class, number, terminal, until,
+};
+use rustix::process::Signal;
+use rustix::time::{ClockId, clock_gettime};
+use schema::{Topic, Verdict, Zones};
+use serde_json::Value;
+
+/// The walls of a room, far from the sensor, and in it what `thing` says.
+fn world(env: &TestEnv, name: &str, thing: &str) -> String {
+    let room = "[noise]\ntail = 0\n\n[[thing]]\nline = [[3000, -3000], [3000, 3000], [-3000, 3000], [-3000, -3000]]\n";
+    format!("--world={}", env.file(name, format!("{room}\n{thing}")))
+}
+
+const POST: &str = "[[thing]]\nradius_mm = 20\npose = [0, 400]\n";
+const STRIP: &str = "[[thing]]\nline = [[-50, 2000], [50, 2000]]\nsurface = \"reflector\"\n";
+
+fn simulator(env: &TestEnv, world: &str) -> Program {
+    env.simulator(&["front"], &["--seed=61", "--baud=500000", world])
+}
+
+/// Diodes as Linux has them.
+struct Diodes(PathBuf);
+
+const NAMES: [&str; 4] = ["gn", "ye", "rd", "mk"];
+
+impl Diodes {
+    fn new(env: &TestEnv) -> Diodes {
+        let diodes = Diodes(env.path("leds"));
+        fs::create_dir(&diodes.0).unwrap();
+        NAMES.iter().for_each(|name| diodes.plug(name));
+        diodes
+    }
+
+    /// There is one with all its files, or none.
+    fn plug(&self, name: &str) {
+        let aside = self.0.with_extension(name);
+        fs::create_dir(&aside).unwrap();
+        for (file, content) in
+            [("max_brightness", "255\n"), ("trigger", "[none] timer\n"), ("brightness", "9\n")]
+        {
+            fs::write(aside.join(file), content).unwrap();
+        }
+        fs::rename(&aside, self.0.join(name)).unwrap();
+    }
+
+    fn unplug(&self, name: &str) {
+        fs::remove_dir_all(self.0.join(name)).unwrap();
+    }
+
+    /// Those that are lit; nothing while one is neither on nor off.
+    fn lit(&self) -> Option<String> {
+        let mut lit = Vec::new();
+        for name in NAMES {
+            match fs::read_to_string(self.0.join(name).join("brightness")).ok()?.as_str() {
+                "255\n" => lit.push(name),
+                "0\n" => {}
+                _ => return None,
+            }
+        }
+        Some(lit.join(" "))
+    }
+
+    fn await_lit(&self, names: &str) {
+        until(&format!("{names} lit"), || self.lit().as_deref() == Some(names));
+    }
+
+    fn flags(&self) -> [String; 2] {
+        let root = format!("--led-root={}", self.0.display());
+        [root, "--led=green=gn,yellow=ye,red=rd,mark=mk".to_owned()]
+    }
+}
+
+#[test]
+fn the_lights_follow_the_verdict_and_stop_is_lit_when_nobody_says_anything() {
+    let env = TestEnv::new();
+    let diodes = Diodes::new(&env);
+    let [root, led] = diodes.flags();
+    // Before there is a hub.
+    let leds = env.start(&["leds", "front", "--json", &root, &led]);
+    diodes.await_lit("rd");
+    let open = world(&env, "open", STRIP);
+    let sensor = simulator(&env, &open);
+    let hub = env.hub(&[env.link("front")]);
+    diodes.await_lit("gn mk");
+    // The sensor falls silent, then the hub.
+    assert_eq!(sensor.end(TERM).code, Some(0));
+    diodes.await_lit("rd");
+    let _sensor = simulator(&env, &open);
+    diodes.await_lit("gn mk");
+    drop(hub.end(KILL));
+    diodes.await_lit("rd");
+    let hub = env.hub(&[env.link("front")]);
+    diodes.await_lit("gn mk");
+    // The reader's own end: nobody watches any more.
+    let outcome = leds.end(INT);
+    assert_eq!((outcome.code, diodes.lit().as_deref()), (Some(0), Some("rd")), "{outcome}");
+    assert_eq!(hub.end(TERM).code, Some(0));
+
+    let lines = outcome.of_class("leds");
+    let verdicts: Vec<_> = lines.iter().map(|line| line["verdict"].as_str().unwrap()).collect();
+    assert_eq!((verdicts[0], verdicts[verdicts.len() - 1]), ("unknown", "unknown"), "{outcome}");
+    for line in &lines {
+        let is_clear = line["verdict"] == "clear";
+        assert_eq!((&line["green"], &line["red"]), (&is_clear.into(), &(!is_clear).into()), "{line}");
+        assert_eq!(line["mark"], line["marks"].as_u64().is_some_and(|marks| marks > 0), "{line}");
+    }
+    for pair in lines.windows(2) {
+        let shown = |line: &Value| (line["verdict"].clone(), line["marks"].clone());
+        assert!(shown(&pair[0]) != shown(&pair[1]), "no change: {pair:#?}");
+    }
+}
+
+#[test]
+fn a_mark_that_nobody_sees_any_more_is_dark() {
+    let env = TestEnv::new();
+    let diodes = Diodes::new(&env);
+    let [root, led] = diodes.flags();
+    let sensor = simulator(&env, &world(&env, "open", STRIP));
+    let hub = env.hub(&[env.link("front")]);
+    let leds = env.start(&["leds", "front", "--json", &root, &led]);
+    diodes.await_lit("gn mk");
+    // The last marks wait together with the hub's word that there are no scans.
+    leds.signal(Signal::STOP);
+    assert_eq!(env.run(&["echo", "front/marks", "-n", "5"]).code, Some(0));
+    assert_eq!(sensor.end(TERM).code, Some(0));
+    env.echo(&["front/zones"]).await_line("unknown", |line| line["verdict"] == "unknown");
+    leds.signal(Signal::CONT);
+    diodes.await_lit("rd");
+    let outcome = leds.end(INT);
+    let last = outcome.of_class("leds").pop().expect("a line");
+    assert_eq!((outcome.code, &last["mark"], &last["marks"]), (Some(0), &false.into(), &Value::Null));
+    assert_eq!(hub.end(TERM).code, Some(0));
+}
+
+#[test]
+fn a_post_before_the_robot_is_red_and_one_in_the_outer_circle_yellow() {
+    let env = TestEnv::new();
+    let diodes = Diodes::new(&env);
+    let [root, led] = diodes.flags();
+    let _sensor = simulator(&env, &world(&env, "post", POST));
+    let hub = env.hub(&[env.link("front")]);
+    let mut leds = env.start(&["leds", "front", "--json", &root, &led]);
+    leds.await_line("stop", |line| line["verdict"] == "stop" && line["red"] == true);
+    assert_eq!(diodes.lit().as_deref(), Some("rd"));
+    assert_eq!(hub.end(TERM).code, Some(0));
+    let _hub = env.hub(&[&env.link("front"), "--set=zones.radii=[1.0, 0.2]"]);
+    leds.await_line("slow", |line| line["verdict"] == "slow" && line["yellow"] == true);
+    diodes.await_lit("ye");
+    assert_eq!(leds.end(TERM).code, Some(0));
+    assert_eq!(diodes.lit().as_deref(), Some("rd"));
+}
+
+#[test]
+fn a_diode_that_is_unplugged_is_told_and_the_others_go_on() {
+    let env = TestEnv::new();
+    let diodes = Diodes::new(&env);
+    let [root, led] = diodes.flags();
+    let sensor = simulator(&env, &world(&env, "open", STRIP));
+    let _hub = env.hub(&[env.link("front")]);
+    let mut leds = env.start(&["leds", "front", "--json", &root, &led]);
+    diodes.await_lit("gn mk");
+    diodes.unplug("gn");
+    assert_eq!(sensor.end(TERM).code, Some(0));
+    let failed = leds.await_line("the failure", |line| line["class"] == "led");
+    assert_eq!(
+        (&failed["light"], &failed["name"], &failed["state"]),
+        (&"green".into(), &"gn".into(), &"failed".into())
+    );
+    assert!(failed["message"].as_str().is_some_and(|message| message.contains("gn/brightness")), "{failed}");
+    assert_eq!(fs::read_to_string(diodes.0.join("rd/brightness")).unwrap(), "255\n", "the stop light");
+    diodes.plug("gn");
+    let back = leds.await_line("its return", |line| line["class"] == "led");
+    assert_eq!((&back["name"], &back["state"]), (&"gn".into(), &"back".into()));
+    assert_eq!(diodes.lit().as_deref(), Some("rd"));
+    let _sensor = simulator(&env, &world(&env, "open", STRIP));
+    diodes.await_lit("gn mk");
+    assert_eq!(leds.end(INT).code, Some(0));
+}
+
+#[test]
+fn the_robot_is_red_for_the_sensor_that_is_worst_off() {
+    let env = TestEnv::new();
+    let open = world(&env, "open", "");
+    let _front = simulator(&env, &open);
+    let rear = env.simulator(&["rear"], &["--seed=62", "--baud=500000", &open]);
+    let _hub = env.hub(&[env.link("front"), env.link("rear")]);
+    let mut leds = env.start(&["leds", "robot", "--json"]);
+    leds.await_line("clear", |line| line["verdict"] == "clear" && line["green"] == true);
+    assert_eq!(rear.end(TERM).code, Some(0));
+    // Any sensor may be late for a moment; that one stays away.
+    let lost = leds.await_line("unknown", |line| line["verdict"] == "unknown" && line["worst"] == "rear");
+    assert_eq!(
+        (&lost["sensor"], &lost["worst"], &lost["red"]),
+        (&"robot".into(), &"rear".into(), &true.into())
+    );
+    assert_eq!(leds.end(INT).code, Some(0));
+}
+
+fn now_ns() -> u64 {
+    let now = clock_gettime(ClockId::Monotonic);
+    now.tv_sec as u64 * 1_000_000_000 + now.tv_nsec as u64
+}
+
+/// Each verdict said once: what stands for a moment and what is held is known to the test.
+#[test]
+fn a_worse_verdict_is_shown_at_once_and_a_better_one_only_when_it_has_stood() {
+    in_a_network("leds::a_worse_verdict_is_shown_at_once_and_a_better_one_only_when_it_has_stood", || {
+        let env = TestEnv::new();
+        let mut front = Sender::new(1, 7, 0, "front");
+        let mut listener =
+            env.start(&["listen", "--json", "--publish", "--name=robot1=0000000000000001"]).ready();
+        front.announce(&[Topic::Zones]);
+        listener.await_line("a sensor", |line| line["kind"] == "published");
+        let mut say = |verdict: Verdict| {
+            front.send(Topic::Zones, &Zones { verdict: verdict as u8, ..Zones::unknown() });
+            now_ns()
+        };
+        // Others see what is said as it is said.
+        let leds = |hold: &[&str]| {
+            let before = env.subscribers("robot1.front/zones");
+            let program = env.start(&[&["leds", "robot1.front", "--json"], hold].concat());
+            until("it follows", || env.subscribers("robot1.front/zones") > before);
+            program
+        };
+        let (mut usual, mut long, mut none) = (leds(&[]), leds(&["--hold=1h"]), leds(&["--hold=0s"]));
+        say(Verdict::Stop);
+        let is =
+            |verdict: &'static str| move |line: &Value| is_class("leds")(line) && line["verdict"] == verdict;
+        for program in [&mut usual, &mut long, &mut none] {
+            program.await_line("stop at once, whatever the hold", is("stop"));
+        }
+        let said_ns = say(Verdict::Clear);
+        let is_shown = AtomicBool::new(false);
+        let shown_ns = thread::scope(|scope| {
+            // Again and again: however late this machine is, it stands.
+            scope.spawn(|| {
+                while !is_shown.load(Ordering::Relaxed) {
+                    thread::sleep(Duration::from_millis(100));
+                    say(Verdict::Clear);
+                }
+            });
+            none.await_line("clear at once", is("clear"));
+            let shown = usual.await_line("clear", is("clear"));
+            is_shown.store(true, Ordering::Relaxed);
+            number(&shown, "stamp_ns")
+        });
+        assert!(shown_ns - said_ns > 250_000_000, "it had stood for {} ms", (shown_ns - said_ns) / 1_000_000);
+        let outcome = long.end(INT);
+        let verdicts: Vec<_> = outcome.of_class("leds").iter().map(|line| line["verdict"].clone()).collect();
+        assert_eq!(verdicts, ["unknown", "stop", "unknown"], "at the end nobody watches: {outcome}");
+        assert_eq!((usual.end(INT).code, none.end(INT).code), (Some(0), Some(0)));
+    });
+}
+
+#[test]
+fn what_is_no_light_is_refused() {
+    let env = TestEnv::new();
+    let diodes = Diodes::new(&env);
+    let [root, _] = diodes.flags();
+    for (sensor, led, what) in [
+        ("front", "red=nd", "has no light \"nd\""),
+        ("front", "red=rd,green=nd", "has no light \"nd\""),
+        ("front", "blue=rd", "--led blue=rd cannot be shown"),
+        ("front", "red", "--led red cannot be shown"),
+        ("robot", "mark=mk", "--led mark=mk cannot be shown"),
+        ("front", "yellow=rd,red=rd", "--led red=rd cannot be shown"),
+    ] {
+        let outcome = env.run(&["leds", sensor, "--json", &root, "--led", led]);
+        let error = &outcome.of_class("error")[0];
+        assert_eq!((outcome.code, &error["kind"]), (Some(78), &"configuration".into()), "{outcome}");
+        assert!(error["message"].as_str().is_some_and(|message| message.contains(what)), "{outcome}");
+        assert!(error["hint"].as_str().is_some_and(|hint| !hint.is_empty()), "{outcome}");
+    }
+    let misspelt = env.run(&["leds", "front", "--json", "--led=gren=rd"]);
+    let hint = misspelt.of_class("error")[0]["hint"].clone();
+    assert!(
+        hint.as_str().is_some_and(|hint| hint.starts_with("no light \"gren\": green=NAME")),
+        "{misspelt}"
+    );
+    // One that was taken before another was refused shows the stop light.
+    assert_eq!(fs::read_to_string(diodes.0.join("rd/brightness")).unwrap(), "255\n");
+    // As with all that follow: bounded needs a hub, and a hub knows its sensors.
+    assert_eq!(env.run(&["leds", "front", "--for=1s"]).code, Some(3));
+    let _hub = env.hub(&[env.link("front")]);
+    let unknown = env.run(&["leds", "side", "--json"]);
+    assert_eq!((unknown.code, &unknown.of_class("error")[0]["hint"]), (Some(3), &"there are front".into()));
+}
+
+#[test]
+fn on_a_terminal_one_line_is_drawn_over_itself() {
+    for (no_color, colour) in [(None, "\x1b[1;31m● red\x1b[0m"), (Some("1"), "  ● red  ")] {
+        let env = TestEnv::new();
+        let (mut keys, screen) = terminal();
+        let mut command = env.command(&["leds", "front", "--for=1s", "--timeout=200ms"]);
+        command.env_remove("NO_COLOR").envs(no_color.map(|value| ("NO_COLOR", value)));
+        command.stdin(Stdio::null()).stderr(Stdio::null()).stdout(Stdio::from(screen));
+        let mut process = command.spawn().unwrap();
+        drop(command);
+        let mut seen = Vec::new();
+        // A terminal that nobody has open any more ends by an error.
+        let _ = keys.read_to_end(&mut seen);
+        assert_eq!(process.wait().unwrap().code(), Some(3));
+        let text = String::from_utf8(seen).unwrap();
+        assert!(text.starts_with("\r\x1b[K\x1b[?7lfront"), "{text:?}");
+        assert!(text.contains(colour) && text.ends_with("unknown\x1b[?7h\r\n"), "{text:?}");
+        assert_eq!(text.matches('\n').count(), 1, "{text:?}");
+    }
+}

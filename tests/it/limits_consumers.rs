@@ -1,0 +1,187 @@
+//! Many consumers, slow ones and dead ones: nobody else loses anything, everybody can tell exactly what was missed, and
+//! the hub is as it was before they came.
+
+use std::fs;
+use std::thread;
+use std::time::Duration;
+
+use crate::testkit;
+use crate::testkit::{INT, KILL, Program, TERM, TestEnv, in_own_process, is_class, number, sequence, until};
+use rustix::process::Signal;
+use scanhub_client::Subscription;
+use schema::ipc::{self, Payload};
+use schema::{Domain, Scan, limits};
+use serde_json::Value;
+
+/// What a consumer that is killed holds its samples of: the domain's name and where it is.
+const HOLD: [&str; 2] = ["SCANHUB_TEST_DOMAIN", "SCANHUB_TEST_BASE"];
+
+/// A hub with a recording of many minutes that has a scan every `period_ms`: slow enough that whoever loses one was not
+/// just kept waiting by a busy machine.
+fn streaming(env: &TestEnv, period_ms: u32) -> Program {
+    let line = |scan: u32| {
+        let (ranges, at) = (vec!["1.5"; 181].join(" "), f64::from(scan * period_ms) / 1000.0);
+        format!("FLASER 181 {ranges} 0 0 0 0 0 0 {at} host {at}\n")
+    };
+    let file = env.file("log", (1..3000).map(line).collect::<String>());
+    env.hub(&["--link", &format!("front=file:{file}")])
+}
+
+fn subscribe(place: &Domain) -> Subscription<Scan> {
+    Subscription::in_domain(vec![place.clone()], "front").expect("a name").timeout(Duration::from_secs(20))
+}
+
+/// Subscribes `count` consumers and receives until each has `wanted` scans: what they missed between them, in all.
+fn follow(place: &Domain, count: usize, wanted: usize) -> u64 {
+    let mut consumers: Vec<_> = (0..count).map(|_| (subscribe(place), 0, 0)).collect();
+    while consumers.iter().any(|(_, received, _)| *received < wanted) {
+        for (consumer, received, missed) in &mut consumers {
+            while let Some(scan) = consumer.try_next().expect("works") {
+                assert!(!scan.restarted);
+                (*received, *missed) = (*received + 1, *missed + scan.missed);
+            }
+        }
+        // The next one comes for all at the same time.
+        let (consumer, received, missed) = &mut consumers[0];
+        let scan = consumer.next().expect("works").expect("comes");
+        (*received, *missed) = (*received + 1, *missed + scan.missed);
+    }
+    consumers.iter().map(|(.., missed)| missed).sum()
+}
+
+#[test]
+fn forty_consumers_lose_nothing() {
+    in_own_process("limits_consumers::forty_consumers_lose_nothing", || {
+        let env = TestEnv::new();
+        let hub = streaming(&env, 100);
+        let mut echo = env.echo(&["front/scan"]);
+        let place = env.place();
+        let threads: Vec<_> = (0..4)
+            .map(|_| {
+                let place = place.clone();
+                thread::spawn(move || follow(&place, 10, 40))
+            })
+            .collect();
+        let missed: Vec<_> = threads.into_iter().map(|thread| thread.join().expect("no panic")).collect();
+        assert_eq!(missed, [0; 4]);
+        echo.await_lines(10, "a scan", is_class("scan"));
+        let outcome = echo.end(INT);
+        sequence(&outcome.of_class("scan"), "topic_seq");
+        assert_eq!(env.info("front")["counters"]["loan_failed"], 0);
+        assert_eq!(hub.end(TERM).code, Some(0));
+    });
+}
+
+#[test]
+fn more_consumers_than_there_are_places_are_refused_with_the_limit() {
+    in_own_process(
+        "limits_consumers::more_consumers_than_there_are_places_are_refused_with_the_limit",
+        || {
+            let env = TestEnv::new();
+            let hub = env.hub(&[env.link("front")]);
+            let node = ipc::client_node(&env.place()).expect("joins");
+            let topic = Scan::open(&node, "front").expect("works").expect("is there");
+            let subscribers: Vec<_> = (0..limits::subscribers(Scan::TOPIC))
+                .map(|_| Scan::subscriber(&topic).expect("a place"))
+                .collect();
+            assert_eq!(env.subscribers("front/scan"), 200);
+            let outcome = env.run(&["echo", "front/scan", "--json"]);
+            let error = &outcome.of_class("error")[0];
+            assert_eq!((outcome.code, &error["kind"]), (Some(75), &"short".into()), "{outcome}");
+            assert_eq!(
+                error["message"],
+                "scanhub/v1/front/scan has 200 consumers: there is no place for another one"
+            );
+            // The other topics are not concerned.
+            assert_eq!(env.info("front")["state"], "absent");
+            drop(subscribers);
+            let late = env.echo(&["front/scan"]);
+            assert_eq!(late.end(INT).code, Some(0));
+            assert_eq!(hub.end(TERM).code, Some(0));
+        },
+    );
+}
+
+#[test]
+fn a_stopped_consumer_knows_what_it_missed_and_nobody_else_misses_anything() {
+    let env = TestEnv::new();
+    let hub = streaming(&env, 50);
+    let (mut stopped, mut other) = (env.echo(&["front/scan"]), env.echo(&["front/scan"]));
+    stopped.await_lines(10, "a scan", is_class("scan"));
+    stopped.signal(Signal::STOP);
+    let first = number(&other.await_line("a scan", is_class("scan")), "topic_seq");
+    other.await_line("many scans", |line| line["class"] == "scan" && number(line, "topic_seq") > first + 60);
+    stopped.signal(Signal::CONT);
+    stopped.await_line("what it missed", |line| line["kind"] == "missed");
+    stopped.await_lines(20, "a scan", is_class("scan"));
+    let (stopped, other) = (stopped.end(INT), other.end(INT));
+    let (scans, notices) = (stopped.of_class("scan"), stopped.of_class("notice"));
+    let summary = &stopped.of_class("summary")[0];
+    let at = |scan: &Value| number(scan, "topic_seq");
+    let published = at(&scans[scans.len() - 1]) - at(&scans[0]) + 1;
+    let told: u64 = notices.iter().map(|notice| number(notice, "missed")).sum();
+    assert_eq!((number(summary, "received"), number(summary, "lost")), (scans.len() as u64, told));
+    assert_eq!(scans.len() as u64 + told, published);
+    sequence(&other.of_class("scan"), "topic_seq");
+    assert_eq!(other.of_class("summary")[0]["lost"], 0);
+    assert_eq!(hub.end(TERM).code, Some(0));
+}
+
+#[test]
+fn killed_consumers_that_held_samples_leave_nothing() {
+    if let [Ok(domain), Ok(base)] = HOLD.map(std::env::var) {
+        return hold(&Domain::at(&domain, base.as_ref()).expect("a place"));
+    }
+    let env = TestEnv::new();
+    let hub = streaming(&env, 50);
+    let mut echo = env.echo(&["front/scan"]);
+    let descriptors = || fs::read_dir(format!("/proc/{}/fd", hub.pid())).expect("lives").count();
+    let place = env.place();
+    let segments = || testkit::shared_memory(&place.prefix()).len();
+    let (open_before, segments_before) = (descriptors(), segments());
+    // Were their samples lost, the hub would have none left.
+    const { assert!(KILLS * HELD * limits::BORROWED > limits::samples(schema::Topic::Scan)) };
+    for _ in 0..KILLS {
+        let mut holder = std::process::Command::new(testkit::own_program());
+        holder.args(testkit::only("limits_consumers::killed_consumers_that_held_samples_leave_nothing"));
+        holder.env(HOLD[0], place.name()).env(HOLD[1], place.root().parent().expect("a base"));
+        let mut holder = Program::start(holder);
+        holder.await_text("holding");
+        assert_eq!(holder.end(KILL).code, None);
+    }
+    // Before there may have been more of them: whoever asked how many consumers there are was just leaving.
+    until("the hub is as before", || descriptors() <= open_before && segments() <= segments_before);
+    echo.await_lines(40, "a scan", is_class("scan"));
+    assert_eq!(env.info("front")["counters"]["loan_failed"], 0);
+    let outcome = echo.end(INT);
+    sequence(&outcome.of_class("scan"), "topic_seq");
+    assert_eq!(outcome.of_class("summary")[0]["lost"], 0);
+    assert_eq!(hub.end(TERM).code, Some(0));
+    assert!(env.left_behind().is_empty(), "{:?}", env.left_behind());
+}
+
+/// Takes all the samples that it may hold, says so, and stays.
+fn hold(place: &Domain) {
+    let node = ipc::client_node(place).expect("joins");
+    let topic = Scan::open(&node, "front").expect("works").expect("is there");
+    let mut consumers = Vec::new();
+    // Those that were killed before have their places until the hub looks after them.
+    until("places", || {
+        consumers.extend(Scan::subscriber(&topic));
+        consumers.len() == HELD
+    });
+    let mut held = Vec::new();
+    for consumer in &consumers {
+        for _ in 0..limits::BORROWED {
+            until("a scan", || Scan::receive(consumer).expect("works").map(|scan| held.push(scan)).is_some());
+        }
+    }
+    println!("\nholding {}", held.len());
+    loop {
+        thread::park();
+    }
+}
+
+const KILLS: usize = 20;
+/// Consumers in each process that is killed.
+const HELD: usize = 12;

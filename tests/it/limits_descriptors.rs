@@ -1,0 +1,120 @@
+//! Descriptors that are short: whoever cannot work says so and exits 75; a hub that runs out of them serves on whom it
+//! serves, and says that others get nothing.
+
+use std::process::Command;
+
+use crate::testkit::{INT, Outcome, Program, TERM, TestEnv, in_a_network, is_class, number, sequence, until};
+use rustix::process::{Pid, Resource, Rlimit, getrlimit, prlimit};
+
+/// Starts the program with at most so many descriptors.
+fn limited<S: AsRef<str>>(env: &TestEnv, limit: u64, arguments: &[S]) -> Program {
+    let inner = env.command(arguments);
+    let mut command = Command::new("sh");
+    command.args(["-c", "ulimit -n \"$0\" && exec \"$@\"", &limit.to_string()]);
+    command.arg(inner.get_program()).args(inner.get_args());
+    command.envs(inner.get_envs().filter_map(|(key, value)| Some((key, value?))));
+    command.env_remove("SCANHUB_CONFIG");
+    Program::start(command)
+}
+
+fn is_short(outcome: &Outcome) {
+    assert_eq!(outcome.code, Some(75), "{outcome}");
+    let text = outcome.errors.clone() + &String::from_utf8_lossy(&outcome.out);
+    assert!(text.contains("descriptors are short: ") || text.contains("Too many open files"), "{outcome}");
+    assert!(!text.contains("panicked"), "{outcome}");
+}
+
+#[test]
+fn a_hub_starts_or_says_how_many_it_needs() {
+    let env = TestEnv::new();
+    let run = ["run", "--json", &env.link("front")];
+    for limit in [6, 8, 12, 16, 24, 32, 40, 48] {
+        is_short(&limited(&env, limit, &run).wait());
+    }
+    for limit in [74, 80, 128] {
+        let hub = limited(&env, limit, &run).ready();
+        assert_eq!(env.info("front")["state"], "absent", "{limit}");
+        assert_eq!(hub.end(TERM).code, Some(0), "{limit}");
+    }
+}
+
+#[test]
+fn a_client_works_or_says_how_many_it_needs() {
+    let env = TestEnv::new();
+    let _hub = env.hub(&[env.link("front")]);
+    env.await_info("front", |info| info["state"] == "absent");
+    let verbs = [
+        &["info", "front"][..],
+        &["list"],
+        &["echo", "front/status", "-n", "1"],
+        &["control", "front", "pause"],
+    ];
+    for limit in [5, 6, 8, 10] {
+        // Nor does one wait for a hub that it cannot see.
+        is_short(&limited(&env, limit, &["echo", "front/status"]).wait());
+    }
+    for verb in verbs {
+        for limit in [5, 6, 8, 10, 12, 14, 16, 18, 20, 22, 24, 26, 28, 30, 32, 40] {
+            let outcome = limited(&env, limit, verb).wait();
+            if outcome.code != Some(0) {
+                is_short(&outcome);
+                assert!(limit < 40, "{outcome}");
+            }
+        }
+    }
+}
+
+#[test]
+fn a_hub_that_runs_out_of_them_serves_on_whom_it_serves() {
+    let env = TestEnv::new();
+    let _simulator = env.simulator(&["front"], &["--seed=51", "--baud=500000"]);
+    let hub = limited(&env, 74, &["run", "--json", &env.link("front")]).ready();
+    let mut served = env.echo(&["front/scan", "front/status"]);
+    served.await_lines(20, "a scan", is_class("scan"));
+    let others: Vec<_> = (0..16).map(|_| env.start(&["echo", "--json", "front/scan"])).collect();
+    // Who is attached also ends by a signal as it should.
+    until("all are attached", || env.subscribers("front/scan") == 17);
+    let tells = |line: &serde_json::Value| {
+        line["class"] == "status"
+            && line["last_error"].as_str().is_some_and(|error| error.contains("attached but get nothing"))
+    };
+    served.await_line("that others get nothing", tells);
+    served.await_lines(20, "a scan", is_class("scan"));
+    let asked = env.run(&["control", "front", "resync", "--json"]);
+    let error = &asked.of_class("error")[0];
+    assert_eq!((asked.code, &error["kind"]), (Some(3), &"timeout".into()), "{asked}");
+    assert_eq!(error["message"], "the hub did not answer for front in 5 s");
+    for other in others {
+        assert_eq!(other.end(INT).code, Some(0));
+    }
+    // Who comes now is served again.
+    until("there is room again", || env.run(&["info", "front"]).code == Some(0));
+    served.await_line("that all get something", |line| line["class"] == "status" && line["last_error"] == "");
+    assert_eq!(env.run(&["echo", "front/scan", "-n", "5", "--timeout", "9s"]).code, Some(0));
+    let outcome = served.end(INT);
+    sequence(&outcome.of_class("scan"), "topic_seq");
+    let summaries = outcome.of_class("summary");
+    assert!(summaries.iter().all(|summary| number(summary, "lost") == 0), "{summaries:?}");
+    let outcome = hub.end(TERM);
+    assert_eq!(outcome.code, Some(0), "{outcome}");
+    assert!(outcome.errors.contains("attached but get nothing"), "{outcome}");
+    assert!(outcome.errors.contains("a request was not received: descriptors are short: "), "{outcome}");
+}
+
+#[test]
+fn a_listener_that_runs_out_of_them_listens_on() {
+    in_a_network("limits_descriptors::a_listener_that_runs_out_of_them_listens_on", || {
+        let env = TestEnv::new();
+        let mut listener = env.start(&["listen", "--json", "--interface=lo"]).ready();
+        let pid = Pid::from_raw(listener.pid() as i32);
+        let maximum = getrlimit(Resource::Nofile).maximum;
+        let none = Rlimit { current: Some(0), maximum };
+        let usual = prlimit(pid, Resource::Nofile, none).expect("it may have fewer");
+        let told = listener.await_line("what is wrong", |line| line["kind"] == "trouble");
+        assert!(told["message"].to_string().contains("cannot list network interfaces"), "{told}");
+        prlimit(pid, Resource::Nofile, usual).expect("as before");
+        let outcome = listener.end(TERM);
+        assert_eq!(outcome.code, Some(0), "{outcome}");
+        assert_eq!(outcome.of_class("notice").len(), 1, "{outcome}");
+    });
+}

@@ -1,0 +1,192 @@
+//! Files that eat memory or time: a device or a pipe where a file is expected, one that unpacks to far more than it is,
+//! thousands of channels or links. Each is refused or read within 64 MB and a second, in the words and with the exit
+//! code of what is wrong.
+
+use std::io::Write;
+use std::process::Command;
+
+use crate::testkit::{Outcome, Program, TestEnv};
+use flate2::Compression;
+use flate2::write::GzEncoder;
+use rustix::fs::{CWD, FileType, Mode, mknodat};
+
+/// Runs the program with all its address space in 90 MB, of which some 23 are itself, and in two seconds of processor
+/// time, which a program that is not optimized needs for what takes a second.
+fn bounded(env: &TestEnv, arguments: &[&str]) -> Outcome {
+    let own = env.command(arguments);
+    let mut command = Command::new("sh");
+    command.args(["-c", "ulimit -v 90000 && ulimit -t 2 && exec \"$0\" \"$@\""]).arg(own.get_program());
+    command.args(own.get_args());
+    let changed = own.get_envs().map(|(key, value)| (key.to_owned(), value.map(ToOwned::to_owned)));
+    for (key, value) in changed.collect::<Vec<_>>() {
+        match value {
+            Some(value) => command.env(key, value),
+            None => command.env_remove(key),
+        };
+    }
+    Program::start(command).wait()
+}
+
+fn refused(env: &TestEnv, arguments: &[&str], code: i32, words: &str) {
+    let outcome = bounded(env, arguments);
+    assert_eq!(outcome.code, Some(code), "{arguments:?}: {outcome}");
+    assert!(outcome.errors.contains(words), "{arguments:?}: {outcome}");
+}
+
+/// A pipe that nobody writes to.
+fn pipe(env: &TestEnv) -> String {
+    let path = env.path("pipe");
+    mknodat(CWD, &path, FileType::Fifo, Mode::RUSR | Mode::WUSR, 0).expect("a pipe");
+    path.display().to_string()
+}
+
+fn packed(env: &TestEnv, name: &str, content: &[u8]) -> String {
+    let mut encoder = GzEncoder::new(Vec::new(), Compression::best());
+    encoder.write_all(content).expect("memory");
+    env.file(name, encoder.finish().expect("memory"))
+}
+
+fn record(opcode: u8, body: &[u8]) -> Vec<u8> {
+    [&[opcode][..], &(body.len() as u64).to_le_bytes(), body].concat()
+}
+
+fn text(text: &str) -> Vec<u8> {
+    [&(text.len() as u32).to_le_bytes()[..], text.as_bytes()].concat()
+}
+
+/// An MCAP file of these records.
+fn mcap(records: &[Vec<u8>]) -> Vec<u8> {
+    const MAGIC: &[u8] = b"\x89MCAP0\r\n";
+    let header = record(1, &[text(""), text("")].concat());
+    let end = [record(15, &[0; 4]), record(2, &[0; 20])].concat();
+    [MAGIC, &header, &records.concat(), &end, MAGIC].concat()
+}
+
+fn channel(id: u16, topic: &str, encoding: &str) -> Vec<u8> {
+    record(4, &[&id.to_le_bytes()[..], &[0; 2], &text(topic), &text(encoding), &[0; 4]].concat())
+}
+
+#[test]
+fn what_is_no_regular_file_is_not_waited_for() {
+    let env = TestEnv::new();
+    let pipe = pipe(&env);
+    for (path, words) in
+        [(&pipe[..], "it is a pipe"), ("/dev/zero", "it is a device"), ("/", "it is a directory")]
+    {
+        let model = format!("[[link]]\nname = \"a\"\nport = \"x\"\n[background]\nstart = \"{path}\"\n");
+        let model = env.file("model.toml", model);
+        for arguments in [
+            &["config", "check", path][..],
+            &["run", "--config", path],
+            &["gateway", "--config", path],
+            &["config", "check", &model],
+            &["run", "--config", &model],
+            &["simulate", "--port", "p", "--world", path],
+            &["simulate", "--port", "p", "--replay", path],
+            &["replay", path],
+            &["convert", path, "x.mcap"],
+            &["background", "a", "load", path],
+        ] {
+            // What a configuration names is a value of it.
+            let code = if arguments.contains(&model.as_str()) { 78 } else { 66 };
+            refused(&env, arguments, code, words);
+        }
+    }
+    // Stdin is what it is: a file is read, a pipe is not.
+    let file = env.file("links.toml", "[[link]]\nname = \"a\"\nport = \"x\"\n");
+    let check = |stdin: std::process::Stdio| {
+        let command = env.command(&["config", "check", "/dev/stdin"]);
+        Program::start_with(command, stdin).wait()
+    };
+    let taken = check(std::fs::File::open(&file).expect("it was written").into());
+    assert_eq!((taken.code, &taken.out[..]), (Some(0), &b"ok: 1 link: a at x\n"[..]), "{taken}");
+    let outcome = check(std::process::Stdio::piped());
+    assert_eq!(outcome.code, Some(66), "{outcome}");
+    assert!(outcome.errors.contains("/dev/stdin: it is a pipe, not a regular file"), "{outcome}");
+}
+
+#[test]
+fn what_unpacks_to_far_more_than_it_is_is_refused() {
+    let env = TestEnv::new();
+    let long = |len: usize| {
+        record(
+            9,
+            &[&[0; 16][..], &text("a"), &text("b"), &(len as u64).to_le_bytes(), &vec![0; len + 4]].concat(),
+        )
+    };
+    let bomb = packed(&env, "bomb.mcap.gz", &mcap(&[long(100 << 20)]));
+    let zeros = packed(&env, "zeros.bin.gz", &vec![0; 100 << 20]);
+    for file in [&bomb, &zeros] {
+        refused(
+            &env,
+            &["convert", file, &env.word("x.mcap")],
+            66,
+            "unpacks to more than 400 times its length",
+        );
+        refused(&env, &["replay", file], 66, "`zcat FILE > WHOLE`");
+    }
+}
+
+#[test]
+fn a_chunk_that_is_too_long_is_told_and_others_are_read() {
+    let env = TestEnv::new();
+    let chunk = |len: usize| {
+        let content = record(5, &vec![0; len]);
+        let size = (content.len() as u64).to_le_bytes();
+        record(6, &[&[0; 16][..], &size, &[0; 4], &text(""), &size, &content].concat())
+    };
+    let whole = env.file("whole.mcap", mcap(&[channel(0, "t", "cdr"), chunk(7 << 20), chunk(7 << 20)]));
+    let copy = env.word("copy.mcap");
+    let outcome = bounded(&env, &["convert", &whole, &copy, "--compression", "none"]);
+    assert_eq!((outcome.code, outcome.errors.contains("missing")), (Some(0), false), "{outcome}");
+    assert!(std::fs::metadata(&copy).expect("it was written").len() > 14 << 20);
+    let long = env.file("long.mcap", mcap(&[channel(0, "t", "cdr"), chunk(20 << 20)]));
+    refused(&env, &["convert", &long, &copy, "--force"], 66, "a chunk of it has 20 MB, and at most 8");
+    refused(&env, &["convert", &long, &copy, "--force"], 66, "mcap filter");
+}
+
+#[test]
+fn as_many_channels_as_there_are_numbers_are_read_at_once() {
+    let env = TestEnv::new();
+    let channels = |topic: fn(u16) -> String, encoding| -> Vec<_> {
+        (0..60_000).map(|id| channel(id, &topic(id), encoding)).collect()
+    };
+    let copy = env.word("copy.mcap");
+    for (name, is_whole) in [("whole.mcap", true), ("cut.mcap", false)] {
+        let cut = |mut file: Vec<u8>| {
+            file.truncate(file.len() - if is_whole { 0 } else { 30 });
+            file
+        };
+        let ours = env.file(name, cut(mcap(&channels(|id| format!("s{id}/telegram"), "scanhub"))));
+        refused(&env, &["convert", &ours, &copy, "--force"], 66, "it names more than 4096 sensors");
+        refused(&env, &["replay", &ours], 66, "it names more than 4096 sensors");
+        let others = env.file(name, cut(mcap(&channels(|id| format!("t{id}"), "cdr"))));
+        let outcome = bounded(&env, &["convert", &others, &copy, "--force", "--compression", "none"]);
+        assert_eq!(outcome.code, Some(0), "{outcome}");
+        let some = channels(|id| format!("s{}/telegram", id % 4000), "scanhub");
+        let some = env.file(name, cut(mcap(&some)));
+        let outcome = bounded(&env, &["convert", &some, &copy, "--force", "--compression", "none"]);
+        assert_eq!(outcome.code, Some(0), "{outcome}");
+        refused(&env, &["replay", &some], 78, "more than 256 links");
+    }
+}
+
+#[test]
+fn more_links_than_a_hub_can_have_are_refused_at_the_first_of_them() {
+    let env = TestEnv::new();
+    let links = |count: u32| -> String {
+        (0..count).map(|n| format!("[[link]]\nname = \"s{n}\"\nport = \"/dev/x{n}\"\n")).collect()
+    };
+    let most = env.file("most.toml", links(256));
+    let outcome = bounded(&env, &["config", "check", &most]);
+    assert_eq!(outcome.code, Some(0), "{outcome}");
+    let more = env.file("more.toml", links(11_000));
+    refused(&env, &["config", "check", &more], 78, "more.toml:770:8: more than 256 links");
+    let far_more = env.file("far-more.toml", links(20_000));
+    refused(&env, &["config", "check", &far_more], 66, "it is longer than 524288 bytes");
+    // Values of which each has a place of its own.
+    let sectors = "{ from = 1.0, to = 2.0, range = 0.1 }, ".repeat(13_000);
+    let sectors = format!("{}[zones]\nself_min = [{sectors}]\n", links(2));
+    let outcome = bounded(&env, &["config", "check", &env.file("sectors.toml", sectors)]);
+    assert!(matches!(outcome.code, Some(0 | 78)), "{outcome}");
+}

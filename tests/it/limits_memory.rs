@@ -1,0 +1,198 @@
+//! Shared memory that is short, from the start or later on: a message and exit 75, never a bare signal; who is there
+//! already loses nothing. Each test has a /dev/shm of its own, in a mount namespace of its own.
+
+use std::fs::{File, OpenOptions};
+use std::io::{ErrorKind, Write};
+use std::process::Command;
+
+use crate::testkit::{INT, Outcome, TERM, TestEnv, is_class, only, own_program, run_again, sequence, skip};
+use rustix::process::Signal;
+
+/// Where the namespace is made: the test that shall run in it.
+const INSIDE: &str = "SCANHUB_TEST_INSIDE";
+
+/// Runs `test`, which is called `name`, in a mount namespace of its own; says so if the system does not allow that.
+fn in_a_namespace(name: &str, test: impl FnOnce()) {
+    if std::env::var_os(INSIDE).is_some() {
+        return test();
+    }
+    let mut unshare = Command::new("unshare");
+    unshare.arg("--mount");
+    if !rustix::process::getuid().is_root() {
+        unshare.arg("--map-root-user");
+    }
+    let allowed = |mut command: Command| command.output().is_ok_and(|output| output.status.success());
+    let mut attempt = Command::new("unshare");
+    attempt.args(unshare.get_args()).args(["mount", "-t", "tmpfs", "tmpfs", "/dev/shm"]);
+    if !allowed(attempt) {
+        skip("mounts", "this user may not make a mount namespace");
+        return;
+    }
+    unshare.arg(own_program()).args(only(name)).env(INSIDE, "1");
+    run_again(name, unshare);
+}
+
+/// A new and empty /dev/shm of so many bytes.
+fn mount(bytes: u64) {
+    let size = format!("size={bytes}");
+    let mounted = Command::new("mount").args(["-t", "tmpfs", "-o", &size, "tmpfs", "/dev/shm"]).status();
+    assert!(mounted.is_ok_and(|status| status.success()), "no tmpfs of {bytes} bytes");
+}
+
+fn unmount() {
+    assert!(Command::new("umount").arg("/dev/shm").status().is_ok_and(|status| status.success()));
+}
+
+/// Takes all of /dev/shm but so many bytes.
+fn fill(left: u64) {
+    let mut file = File::create(FILL).expect("an empty file needs no memory");
+    let mut len = 0;
+    loop {
+        match file.write(&[0xFF; 4096]) {
+            Ok(written) => len += written as u64,
+            Err(error) if error.kind() == ErrorKind::StorageFull => break,
+            Err(error) => panic!("{error}"),
+        }
+    }
+    file.set_len(len.saturating_sub(left)).expect("is cut");
+}
+
+/// Gives all of it back; the file may be gone with its /dev/shm.
+fn free() {
+    if let Ok(file) = OpenOptions::new().write(true).open(FILL) {
+        file.set_len(0).expect("is cut");
+    }
+}
+
+const FILL: &str = "/dev/shm/fill";
+
+/// Ended in order, or said that memory is short.
+fn done_or_short(outcome: &Outcome) {
+    match outcome.code {
+        Some(0) => {}
+        Some(75) => assert!(outcome.errors.contains("shared memory is"), "{outcome}"),
+        _ => panic!("{outcome}"),
+    }
+}
+
+#[test]
+fn a_hub_starts_or_says_what_it_needs() {
+    in_a_namespace("limits_memory::a_hub_starts_or_says_what_it_needs", || {
+        let env = TestEnv::new();
+        let run = ["run".to_owned(), "--json".to_owned(), env.link("front")];
+        let short = |bytes: u64| {
+            mount(bytes);
+            let outcome = env.run(&run);
+            unmount();
+            assert_eq!((outcome.code, outcome.out.is_empty()), (Some(75), true), "{outcome}");
+            let free = format!("shared memory is short: /dev/shm: {} kB free, ", bytes / 1024);
+            let said = outcome.errors.split_once(&free).unwrap_or_else(|| panic!("{outcome}")).1;
+            let needed = said.split_once(" kB needed").and_then(|(number, _)| number.parse::<u64>().ok());
+            needed.unwrap_or_else(|| panic!("{outcome}")) * 1024
+        };
+        let needed = short(16 << 10);
+        assert!(needed <= 8 << 20, "{needed} bytes for one link");
+        for bytes in (15..22)
+            .map(|shift| 1 << shift)
+            .filter(|bytes| *bytes < needed)
+            .chain([(needed / 4096 - 1) * 4096])
+        {
+            assert_eq!(short(bytes), needed);
+        }
+        for bytes in [needed.next_multiple_of(4096), 8 << 20, 16 << 20] {
+            mount(bytes);
+            let hub = env.hub(&[env.link("front")]);
+            assert_eq!(env.info("front")["state"], "absent");
+            assert_eq!(hub.end(TERM).code, Some(0));
+            assert!(env.left_behind().is_empty(), "{:?}", env.left_behind());
+            unmount();
+        }
+    });
+}
+
+#[test]
+fn memory_that_is_full_stops_nobody_who_is_there() {
+    in_a_namespace("limits_memory::memory_that_is_full_stops_nobody_who_is_there", || {
+        mount(8 << 20);
+        let env = TestEnv::new();
+        let _simulator = env.simulator(&["front"], &["--seed=41", "--baud=500000"]);
+        let hub = env.hub(&[env.link("front")]);
+        let mut scans = env.echo(&["front/scan"]);
+        scans.await_lines(10, "a scan", is_class("scan"));
+        for _ in 0..2 {
+            fill(0);
+            scans.await_lines(20, "a scan", is_class("scan"));
+            for verb in [
+                &["info", "front"][..],
+                &["list"],
+                &["echo", "front/scan"],
+                &["echo", "front/telegram", "front/status", "-n", "1"],
+                &["hz", "-n", "1"],
+                &["control", "front", "resync"],
+            ] {
+                let outcome = env.run(&[verb, &["--json"]].concat());
+                let lines = outcome.lines();
+                let error = lines.last().unwrap_or_else(|| panic!("{outcome}"));
+                assert_eq!((outcome.code, &error["kind"]), (Some(75), &"short".into()), "{outcome}");
+                let message = error["message"].as_str().unwrap_or_default();
+                assert!(message.starts_with("shared memory is short: /dev/shm: "), "{outcome}");
+            }
+            scans.await_lines(20, "a scan", is_class("scan"));
+            free();
+            assert_eq!(env.info("front")["state"], "streaming");
+            assert_eq!(env.run(&["echo", "front/scan", "-n", "5"]).code, Some(0));
+        }
+        let outcome = scans.end(INT);
+        sequence(&outcome.of_class("scan"), "topic_seq");
+        assert_eq!(outcome.of_class("summary")[0]["lost"], 0);
+        assert_eq!(env.info("front")["counters"]["loan_failed"], 0);
+        assert_eq!(hub.end(TERM).code, Some(0));
+    });
+}
+
+#[test]
+fn consumers_that_come_together_where_little_is_left_end_in_order() {
+    in_a_namespace("limits_memory::consumers_that_come_together_where_little_is_left_end_in_order", || {
+        mount(8 << 20);
+        let env = TestEnv::new();
+        let hub = env.hub(&[env.link("front")]);
+        let mut short = 0;
+        for pages in [0, 1, 15, 16, 17, 18, 20, 24, 32] {
+            fill(pages * 4096);
+            let topics = ["front/telegram", "front/scan", "front/status"];
+            let words = [&["echo"], &topics[..], &["-n", "1"]].concat();
+            let together: Vec<_> = (0..8).map(|_| env.start(&words)).collect();
+            for program in together {
+                let outcome = program.wait();
+                done_or_short(&outcome);
+                short += usize::from(outcome.code == Some(75));
+            }
+            free();
+        }
+        assert!(short >= 24, "memory was never short: {short}");
+        assert_eq!(env.info("front")["state"], "absent");
+        assert_eq!(hub.end(TERM).code, Some(0));
+    });
+}
+
+#[test]
+fn a_bus_error_has_a_last_line() {
+    let env = TestEnv::new();
+    let _simulator = env.simulator(&["front"], &["--seed=42", "--baud=500000"]);
+    let hub = env.hub(&[env.link("front")]);
+    let mut consumer = env.start(&["echo", "--json", "front/scan"]);
+    consumer.await_lines(3, "a scan", is_class("scan"));
+    for (program, on_stdout) in [(hub, false), (consumer, true)] {
+        let outcome = program.end(Signal::BUS);
+        let error = if on_stdout {
+            outcome.lines().pop()
+        } else {
+            outcome.errors.lines().last().and_then(|line| serde_json::from_str(line).ok())
+        };
+        let error = error.unwrap_or_else(|| panic!("{outcome}"));
+        assert_eq!((outcome.code, &error["kind"]), (Some(75), &"short".into()), "{outcome}");
+        assert!(error["message"].as_str().is_some_and(|message| message.contains("full")), "{outcome}");
+    }
+    let outcome = env.hub(&[env.link("front")]).end(Signal::BUS);
+    assert_eq!(outcome.code, Some(75), "{outcome}");
+}

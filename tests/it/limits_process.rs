@@ -1,0 +1,80 @@
+//! What the system allows a process, address space and the length of its files: who needs more says so and ends with 75,
+//! before it has made anything that would stay.
+
+use std::io::{BufRead, BufReader};
+use std::path::PathBuf;
+use std::process::{Command, Stdio};
+
+use crate::testkit::{Outcome, Program, TERM, TestEnv};
+use rustix::process::{Pid, kill_process};
+
+/// Starts the program with at most this, in the words of ulimit.
+fn limited<S: AsRef<str>>(env: &TestEnv, limit: &str, arguments: &[S]) -> Program {
+    let inner = env.command(arguments);
+    let mut command = Command::new("sh");
+    command.args(["-c", &format!("ulimit {limit} && exec \"$0\" \"$@\"")]);
+    command.arg(inner.get_program()).args(inner.get_args());
+    command.envs(inner.get_envs().filter_map(|(key, value)| Some((key, value?))));
+    command.env_remove("SCANHUB_CONFIG");
+    Program::start(command)
+}
+
+fn is_short(outcome: &Outcome, words: &str) {
+    assert_eq!(outcome.code, Some(75), "{outcome}");
+    let text = outcome.errors.clone() + &String::from_utf8_lossy(&outcome.out);
+    assert!(text.contains(words), "{outcome}");
+}
+
+#[test]
+fn a_hub_without_address_space_leaves_no_segment_behind() {
+    let env = TestEnv::new();
+    let (mut short, mut is_up) = (0, false);
+    // Until one has room; the first ones cannot even be loaded.
+    for limit in (16_000..400_000).step_by(1_000) {
+        let inner = env.command(&["run", "--json", &env.link("front")]);
+        let mut command = Command::new("sh");
+        command.args(["-c", &format!("ulimit -v {limit} && exec \"$0\" \"$@\"")]);
+        command.arg(inner.get_program()).args(inner.get_args()).env("SCANHUB_END_WITH_PARENT", "1");
+        let mut hub = command.stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().expect("a shell");
+        let mut line = String::new();
+        BufReader::new(hub.stdout.take().expect("a pipe")).read_line(&mut line).expect("text");
+        is_up = line.contains("ready");
+        if is_up {
+            let pid = Pid::from_raw(hub.id() as i32).expect("a process");
+            kill_process(pid, TERM).expect("it is there");
+        }
+        let outcome = hub.wait_with_output().expect("it ends");
+        let errors = String::from_utf8_lossy(&outcome.stderr);
+        if errors.contains("address space is short: ") {
+            assert_eq!(outcome.status.code(), Some(75), "{limit}: {errors}");
+            short += 1;
+        } else if short > 0 {
+            assert_eq!((is_up, outcome.status.code()), (true, Some(0)), "{limit}: {errors}");
+        }
+        assert_eq!(env.left_behind(), Vec::<PathBuf>::new(), "{limit}: {errors}");
+        if is_up {
+            break;
+        }
+    }
+    assert!(is_up && short > 4, "{short}");
+}
+
+#[test]
+fn files_that_may_not_be_as_long_as_a_segment_are_told() {
+    let env = TestEnv::new();
+    let words = "files are too short: ";
+    for limit in ["1", "64", "1000"] {
+        let limit = format!("-f {limit}");
+        is_short(&limited(&env, &limit, &["run", "--json", &env.link("front")]).wait(), words);
+        assert_eq!(env.left_behind(), Vec::<PathBuf>::new());
+    }
+    let hub = env.hub(&[env.link("front")]);
+    for verb in [&["record", "-o", &env.word("walk.mcap")][..], &["info", "front"], &["echo", "front/status"]]
+    {
+        is_short(&limited(&env, "-f 1", verb).wait(), words);
+    }
+    assert_eq!(hub.end(TERM).code, Some(0));
+    let file = env.word("none.mcap");
+    is_short(&limited(&env, "-f 0", &["record", "-o", &file]).wait(), "cannot record into");
+    assert!(!env.path("none.mcap").exists());
+}

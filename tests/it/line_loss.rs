@@ -1,0 +1,79 @@
+//! A line that loses bytes: hub and clients say how much of the stream that costs, as the simulator has it.
+
+use crate::testkit::{INT, TERM, TestEnv, is_class, number};
+
+/// What the paper found on a line of theirs.
+const BURSTS: &str = "--fault=loss=0.00135,burst=1.89";
+
+#[test]
+fn a_line_that_loses_is_seen_everywhere() {
+    let env = TestEnv::new();
+    let flags = ["--baud=500000", "--state=streaming", "--seed=5", BURSTS];
+    let simulator = env.simulator(&["front"], &flags);
+    let hub = env.hub(&[env.link("front")]);
+    let mut consumer = env.start(&["hz", "--json", "front/scan"]);
+    let leds = env.start(&["leds", "front", "--json"]);
+    env.await_info("front", |info| number(&info["counters"], "due_on_line") > 30);
+    let begin = env.info("front");
+    let begun = env.truth("front").len();
+    let mut statuses = env.echo(&["front/status"]);
+    // Ten seconds and more on any machine.
+    for due in [200, 400] {
+        let due = number(&begin["counters"], "due_on_line") + due;
+        statuses.await_line("scans that were due", |line| {
+            is_class("status")(line) && number(&line["counters"], "due_on_line") > due
+        });
+    }
+    let end = env.info("front");
+    // A status is of this second, and what is missing is lost a second later.
+    let sent = &env.truth("front")[begun..];
+    let damaged = sent.iter().filter(|sent| sent.fault.is_some()).count() as f64;
+    let grown = |name: &str| number(&end["counters"], name) as f64 - number(&begin["counters"], name) as f64;
+    let (lost, due) = (grown("lost_on_line"), grown("due_on_line"));
+    let (share, truth) = (lost / due, damaged / sent.len() as f64);
+    println!("{lost} of {due} lost, {damaged} of {} in truth", sent.len());
+    assert!(due > 350.0 && (share - truth).abs() < 0.1, "{share} instead of {truth}: {end}");
+    let told = end["damaged"].as_f64().unwrap_or_default();
+    assert!((0.3..0.55).contains(&told), "{end}");
+    assert_eq!(number(&end, "lost_on_line"), number(&end["counters"], "lost_on_line"));
+
+    let text = env.run(&["info", "front"]).to_string();
+    assert!(text.contains("of the bytes damaged") && text.contains("of the scans lost in 10 s"), "{text}");
+    let outcome = env.run(&["doctor", &env.word("front"), "--json"]);
+    let checks = outcome.of_class("check");
+    let check = checks.iter().find(|check| check["name"] == "line-loss").expect("it is looked at");
+    assert_eq!(check["state"], "warning", "{check}");
+    let found = check["finding"].as_str().unwrap_or_default();
+    assert!(found.contains(" % lost on the line; "), "{check}");
+
+    let line = consumer.await_line("a rate with losses", |line| {
+        line["class"] == "hz" && line["lost_on_line"].as_u64() > Some(50)
+    });
+    assert!(line["lost"] == 0 && line["damaged"].as_f64() > Some(0.3), "{line}");
+    let outcome = consumer.end(INT);
+    let [summary] = &outcome.of_class("summary")[..] else { panic!("{outcome}") };
+    assert!(summary["lost_on_line"].as_u64() > Some(50), "{summary}");
+    assert!((0.3..0.55).contains(&summary["damaged"].as_f64().unwrap_or_default()), "{summary}");
+    let outcome = leds.end(INT);
+    let is_told = |line: &serde_json::Value| {
+        line["reason"].as_str().is_some_and(|reason| reason.ends_with(" % lost on the line"))
+    };
+    assert!(outcome.of_class("leds").iter().any(is_told), "{outcome}");
+    assert_eq!(hub.end(TERM).code, Some(0));
+    assert_eq!(simulator.end(INT).code, Some(0));
+}
+
+#[test]
+fn a_line_that_is_well_says_so_from_the_first_second() {
+    let env = TestEnv::new();
+    let simulator = env.simulator(&["front"], &["--baud=9600", "--seed=5"]);
+    let hub = env.hub(&[env.link("front")]);
+    let info = env.await_info("front", |info| number(&info["counters"], "due_on_line") > 60);
+    assert_eq!((&info["damaged"], &info["lost_on_line"]), (&0.0.into(), &0.into()), "{info}");
+    let outcome = env.run(&["doctor", &env.word("front"), "--json"]);
+    let checks = outcome.of_class("check");
+    let check = checks.iter().find(|check| check["name"] == "line-loss").expect("it is looked at");
+    assert_eq!(check["state"], "ok", "{check}");
+    assert_eq!(hub.end(TERM).code, Some(0));
+    assert_eq!(simulator.end(INT).code, Some(0));
+}

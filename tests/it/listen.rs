@@ -1,0 +1,385 @@
+//! `scanhub listen` against datagrams that the test sends: lines of every topic, the account of what did not come, and
+//! what is refused.
+
+use std::io::Read;
+
+use crate::testkit;
+use crate::testkit::{
+    INT, Outcome, Program, Sender, TestEnv, in_a_network, is_class, number, skip, terminal, until, wall_ns,
+};
+use schema::datagram::{HEAD, Refusal, WINDOW};
+use schema::{Background, Foreground, Mark, Marks, Scan, State, Status, Topic, Verdict, Zones};
+use serde_json::{Value, json};
+
+const HUB: u64 = 0x5f3a_12bc_00d1_e2f3;
+
+/// A reply with the shortest status there is; its checksum is nobody's business here.
+const TELEGRAM: [u8; 9] = [0x02, 0x80, 0x03, 0x00, 0xA0, 0x00, 0x10, 0x16, 0x0A];
+
+fn scan() -> Scan {
+    let mut scan = Scan { count: 3, unit_mm: 10, range_bits: 13, step_mdeg: 500, ..Scan::default() };
+    scan.range_array[..3].copy_from_slice(&[100, 0x1FFF, 300]);
+    scan
+}
+
+fn zones(verdict: Verdict) -> Zones {
+    Zones { verdict: verdict as u8, ..Zones::unknown() }
+}
+
+fn listener(env: &TestEnv, words: &[&str]) -> Program {
+    env.start(&[&["listen", "--json"], words].concat()).ready()
+}
+
+/// What the account says of these topics: received, lost, duplicate, reordered.
+fn account(outcome: &Outcome, epoch: u32, topic: &str) -> [u64; 4] {
+    let lines = outcome.of_class("lan");
+    let found: Vec<_> = lines.iter().filter(|it| it["epoch"] == epoch && it["topic"] == topic).collect();
+    let [line] = found[..] else { panic!("not one line of {topic}: {outcome}") };
+    ["received", "lost", "duplicate", "reordered"].map(|key| testkit::number(line, key))
+}
+
+fn refused(outcome: &Outcome) -> Value {
+    let mut lines = outcome.of_class("lan_refused");
+    assert_eq!(lines.len(), 1, "{outcome}");
+    lines.remove(0)
+}
+
+#[test]
+fn every_topic_is_a_line() {
+    in_a_network("listen::every_topic_is_a_line", || {
+        let env = TestEnv::new();
+        let mut program = listener(&env, &[]);
+        let mut sender = Sender::new(HUB, 7, 2, "front");
+        sender.send(Topic::Zones, &zones(Verdict::Stop));
+        let early = program.await_line("zones", is_class("zones"));
+        assert_eq!(
+            (&early["sensor"], &early["age_ms"], &early["boot"]),
+            (&json!("#2"), &Value::Null, &Value::Null)
+        );
+        sender.announce(&Topic::ALL);
+        let named = program.await_line("its name", |line| line["kind"] == "named");
+        assert_eq!((&named["number"], &named["sensor"]), (&json!(2), &json!("front")));
+        sender.counter = 77;
+        sender.stamp_ns = wall_ns() - 5_000_000;
+        let mut marks = Marks { count: 1, ..Marks::default() };
+        marks.mark_array[0] = Mark { angle_mdeg: 90_000, range_dmm: 12_345, ..Mark::default() };
+        let mut status = Status { state: State::Streaming as u8, baud: 500_000, ..Status::default() };
+        status.set_port("/dev/ttyUSB0");
+        let telegram = sender.telegram(&TELEGRAM);
+        sender.throw(Topic::Telegram, &telegram);
+        sender.send(Topic::Scan, &scan());
+        sender.send(Topic::Marks, &marks);
+        sender.send(Topic::Zones, &zones(Verdict::Slow));
+        sender.send(Topic::Foreground, &Foreground { generation: 4, ..Foreground::default() });
+        sender.send(Topic::Background, &Background { generation: 5, ..Background::default() });
+        sender.send(Topic::Status, &status);
+        program.await_line("the last one", is_class("status"));
+        let outcome = program.end(INT);
+        assert_eq!(outcome.code, Some(0), "{outcome}");
+        let lines = outcome.lines();
+        for topic in Topic::ALL {
+            let of_topic: Vec<_> = lines.iter().filter(|line| line["class"] == topic.name()).collect();
+            let line = of_topic.last().unwrap_or_else(|| panic!("no {}: {outcome}", topic.name()));
+            assert_eq!(line["sensor"], "front");
+            assert_eq!(line["hub"], "5f3a12bc00d1e2f3");
+            assert_eq!((&line["epoch"], &line["authenticated"]), (&json!(7), &json!(false)));
+            let age_ms = line["age_ms"].as_f64().unwrap_or_else(|| panic!("no age: {line}"));
+            assert!((5.0..20_000.0).contains(&age_ms), "{line}");
+            if !matches!(topic, Topic::Background | Topic::Status) {
+                assert_eq!((&line["seq"], &line["boot"]), (&json!(77), &json!("000000000000b007")));
+                assert_eq!(line["wall_ns"], sender.stamp_ns);
+            }
+        }
+        let line = |class| outcome.of_class(class).pop().unwrap_or_default();
+        assert_eq!(line("telegram")["data"], "02800300a00010160a");
+        assert_eq!(line("scan")["ranges"], json!([100, null, 300]));
+        assert_eq!(line("marks")["marks"][0]["range_mm"], 1234.5);
+        assert_eq!((&line("zones")["verdict"], &line("zones")["topic_seq"]), (&json!("slow"), &json!(1)));
+        assert_eq!(
+            (&line("foreground")["generation"], &line("background")["generation"]),
+            (&json!(4), &json!(5))
+        );
+        assert_eq!(line("status")["port"], "/dev/ttyUSB0");
+        for (topic, received) in [("announce", 1), ("zones", 2), ("scan", 1), ("status", 1)] {
+            assert_eq!(account(&outcome, 7, topic), [received, 0, 0, 0], "{topic}");
+        }
+    });
+}
+
+#[test]
+fn people_read_lines_too() {
+    in_a_network("listen::people_read_lines_too", || {
+        let env = TestEnv::new();
+        let words = ["listen", "--interface=lo", "--topic=zones", "--name=robot1=5f3a12bc00d1e2f3", "-n2"];
+        let program = env.start(&words);
+        let mut sender = Sender::new(HUB, 7, 0, "front");
+        // It does not say on stdout that it listens.
+        until("the group is joined", || igmp().contains("514CFFEF"));
+        sender.announce(&[Topic::Zones]);
+        sender.send(Topic::Marks, &Marks::default());
+        sender.send(Topic::Zones, &zones(Verdict::Clear));
+        sender.next[usize::from(Topic::Zones.number())] += 3;
+        sender.send(Topic::Zones, &zones(Verdict::Stop));
+        let outcome = program.wait();
+        let text = String::from_utf8_lossy(&outcome.out);
+        let lines: Vec<_> = text.lines().collect();
+        assert_eq!(outcome.code, Some(0), "{outcome}");
+        assert!(lines[0].starts_with("robot1.front/zones seq 0 topic_seq 0 at "), "{outcome}");
+        assert!(
+            lines[0].contains(" clear nothing near") && lines[1].contains(" stop nothing near"),
+            "{outcome}"
+        );
+        assert!(lines[1].ends_with(" ms old"), "{outcome}");
+        assert!(lines[2].starts_with("HUB"), "{outcome}");
+        let rows = lines.iter().map(|line| line.split_whitespace().collect::<Vec<_>>());
+        let of_zones = rows.into_iter().find(|row| row.contains(&"front/zones") && row.len() == 7);
+        assert_eq!(of_zones, Some(vec!["robot1", "7", "front/zones", "2", "3", "0", "0"]), "{outcome}");
+        assert_eq!(lines.last(), Some(&"refused: none"), "{outcome}");
+        assert!(outcome.errors.contains("listening on lo"), "{outcome}");
+        assert!(outcome.errors.contains("robot1.front/zones: missed 3"), "{outcome}");
+    });
+}
+
+/// The groups that this network namespace has joined, as the kernel lists them.
+fn igmp() -> String {
+    std::fs::read_to_string("/proc/net/igmp").expect("the kernel has multicast")
+}
+
+/// How many of our groups were joined on `interface`.
+fn joined(interface: &str) -> usize {
+    let text = igmp();
+    let mut lines = text.lines().skip_while(|line| line.split_whitespace().nth(1) != Some(interface)).skip(1);
+    let groups = lines.by_ref().take_while(|line| line.starts_with("\t\t"));
+    groups.filter(|line| line.contains("4CFFEF")).count()
+}
+
+/// Runs `ip` with these words.
+fn ip(words: &str) -> bool {
+    std::process::Command::new("ip").args(words.split(' ')).status().is_ok_and(|status| status.success())
+}
+
+#[test]
+fn on_a_terminal_the_account_is_drawn_over_itself() {
+    in_a_network("listen::on_a_terminal_the_account_is_drawn_over_itself", || {
+        let env = TestEnv::new();
+        let (mut keys, screen) = terminal();
+        let mut command = env.command(&["listen", "--stats", "--interface=lo"]);
+        command.stdout(screen).stderr(std::process::Stdio::null());
+        let mut process = command.spawn().expect("starts");
+        drop(command);
+        until("the groups are joined", || joined("lo") == 4);
+        Sender::new(HUB, 7, 0, "front").send(Topic::Zones, &zones(Verdict::Clear));
+        let mut text = String::new();
+        let mut read = |wanted: &str| {
+            let mut bytes = [0; 4096];
+            while !text.contains(wanted) {
+                let len =
+                    keys.read(&mut bytes).unwrap_or_else(|error| panic!("no {wanted:?}: {error}: {text}"));
+                text.push_str(&String::from_utf8_lossy(&bytes[..len]));
+            }
+        };
+        read("#0/zones");
+        read("\x1b[3A\x1b[J");
+        rustix::process::kill_process(rustix::process::Pid::from_child(&process), INT).expect("it lives");
+        assert!(process.wait().expect("it ends").success());
+    });
+}
+
+#[test]
+fn groups_are_joined_where_a_link_comes_or_comes_back() {
+    in_a_network("listen::groups_are_joined_where_a_link_comes_or_comes_back", || {
+        let make = || ip("link add scan0 type veth peer name far0") && ip("addr add 10.9.0.1/24 dev scan0");
+        if !make() {
+            skip("veth", "the kernel makes no pair of interfaces");
+            return;
+        }
+        let env = TestEnv::new();
+        for words in [&["--interface=scan0"][..], &[]] {
+            let program = listener(&env, words);
+            assert_eq!(joined("scan0"), 0, "it is down");
+            assert!(ip("link set scan0 up") && ip("link set far0 up"));
+            until("the groups are joined", || joined("scan0") == 4);
+            assert!(ip("link set far0 down") && ip("link set far0 up"));
+            assert!(ip("link del scan0") && make() && ip("link set scan0 up") && ip("link set far0 up"));
+            until("the groups are joined again", || joined("scan0") == 4);
+            assert_eq!(joined("lo"), if words.is_empty() { 4 } else { 0 });
+            let outcome = program.end(INT);
+            assert_eq!((outcome.code, outcome.of_class("notice").len()), (Some(0), 0), "{outcome}");
+            assert!(ip("link set scan0 down"));
+        }
+    });
+}
+
+#[test]
+fn the_account_is_exact() {
+    in_a_network("listen::the_account_is_exact", || {
+        let env = TestEnv::new();
+        let mut program = listener(&env, &["--topic=zones", "--topic=scan"]);
+        let mut sender = Sender::new(HUB, 7, 0, "front");
+        sender.announce(&[Topic::Zones, Topic::Scan, Topic::Telegram]);
+        // Of 100 zones numbers 10, 11 and 50 are lost, 20 and 21 change places, 30 comes twice, and 40 after 45.
+        let datagrams: Vec<_> = (0..100).map(|_| sender.make(Topic::Zones, &zones(Verdict::Clear))).collect();
+        let mut order: Vec<usize> = (0..100).filter(|n| ![10, 11, 40, 50].contains(n)).collect();
+        order.swap(18, 19);
+        order.insert(order.iter().position(|&n| n == 30).unwrap(), 30);
+        order.insert(order.iter().position(|&n| n == 46).unwrap(), 40);
+        for n in order {
+            sender.throw(Topic::Zones, &datagrams[n]);
+        }
+        // Two scans are lost before an announcement tells of them, and nobody asked for telegrams.
+        sender.send(Topic::Scan, &scan());
+        sender.next[usize::from(Topic::Scan.number())] += 2;
+        sender.next[usize::from(Topic::Telegram.number())] += 9;
+        sender.announce(&[Topic::Zones, Topic::Scan, Topic::Telegram]);
+        sender.send(Topic::Scan, &scan());
+        program.await_lines(2, "scans", is_class("scan"));
+        let outcome = program.end(INT);
+        assert_eq!(account(&outcome, 7, "zones"), [97, 3, 1, 2], "{outcome}");
+        assert_eq!(account(&outcome, 7, "scan"), [2, 2, 0, 0], "{outcome}");
+        assert_eq!(account(&outcome, 7, "announce"), [2, 0, 0, 0], "{outcome}");
+        assert!(outcome.of_class("lan").iter().all(|line| line["topic"] != "telegram"), "{outcome}");
+        let zones = outcome.of_class("zones");
+        assert_eq!(zones.len(), 97);
+        let late: Vec<_> =
+            zones.iter().filter(|line| line["late"] == true).map(|line| &line["topic_seq"]).collect();
+        assert_eq!(late, [20, 40]);
+        let missed = |topic: &str| -> u64 {
+            let notices = outcome.of_class("notice").into_iter().filter(|line| line["topic"] == topic);
+            notices.map(|line| testkit::number(&line, "missed")).sum()
+        };
+        // When the next one came, 20 and 40 were missing.
+        assert_eq!((missed("zones"), missed("scan")), (5, 2));
+    });
+}
+
+#[test]
+fn a_gateway_that_starts_again_and_a_second_hub_are_told_apart() {
+    in_a_network("listen::a_gateway_that_starts_again_and_a_second_hub_are_told_apart", || {
+        let env = TestEnv::new();
+        let mut program = listener(&env, &["--topic=zones"]);
+        let mut first = Sender::new(HUB, 7, 0, "front");
+        let mut other = Sender::new(1, 3, 0, "front");
+        first.announce(&[Topic::Zones]);
+        other.announce(&[Topic::Zones]);
+        for _ in 0..3 {
+            first.send(Topic::Zones, &zones(Verdict::Clear));
+            other.send(Topic::Zones, &zones(Verdict::Stop));
+        }
+        let mut again = Sender::new(HUB, 8, 0, "front");
+        again.send(Topic::Zones, &zones(Verdict::Slow));
+        first.send(Topic::Zones, &zones(Verdict::Clear));
+        other.send(Topic::Zones, &zones(Verdict::Stop));
+        program.await_line("the other one's last", |line| {
+            line["hub"] == "0000000000000001" && line["topic_seq"] == 3
+        });
+        let outcome = program.end(INT);
+        assert_eq!(account(&outcome, 7, "zones"), [3, 0, 0, 0], "{outcome}");
+        assert_eq!(account(&outcome, 8, "zones"), [1, 0, 0, 0], "{outcome}");
+        assert_eq!(account(&outcome, 3, "zones"), [4, 0, 0, 0], "{outcome}");
+        assert_eq!(refused(&outcome)["epoch"], 1, "{outcome}");
+        let slow = outcome.of_class("zones").into_iter().find(|line| line["verdict"] == "slow");
+        assert_eq!(slow.map(|line| line["sensor"].clone()), Some(json!("#0")), "not announced in this life");
+    });
+}
+
+#[test]
+fn a_gateway_that_starts_ever_again_stays_heard_and_accounted_for() {
+    in_a_network("listen::a_gateway_that_starts_ever_again_stays_heard_and_accounted_for", || {
+        const LIVES: u64 = 90;
+        let env = TestEnv::new();
+        let mut program = listener(&env, &["--topic=zones"]);
+        for epoch in 1..=LIVES {
+            let mut sender = Sender::new(HUB, epoch as u32, 0, "front");
+            sender.announce(&[Topic::Zones]);
+            sender.send(Topic::Zones, &zones(Verdict::Clear));
+            sender.next[usize::from(Topic::Zones.number())] += 2;
+            sender.send(Topic::Zones, &zones(Verdict::Stop));
+            program.await_line("a life", |line| line["epoch"] == epoch && line["verdict"] == "stop");
+        }
+        let outcome = program.end(INT);
+        let lines = outcome.of_class("lan");
+        assert_eq!(lines.len(), 2 * 64, "{outcome}");
+        let given_up = &outcome.of_class("lan_given_up")[0];
+        assert_eq!(given_up["lives"], LIVES - 64, "{outcome}");
+        let sum = |key| number(given_up, key) + lines.iter().map(|line| number(line, key)).sum::<u64>();
+        // An announcement, and of four zones the first and the last.
+        assert_eq!((sum("received"), sum("lost")), (3 * LIVES, 2 * LIVES), "{outcome}");
+        assert_eq!(refused(&outcome)["capacity"], 0, "{outcome}");
+        assert!(outcome.of_class("notice").iter().all(|line| line["kind"] == "missed"), "{outcome}");
+    });
+}
+
+#[test]
+fn each_refusal_has_its_reason() {
+    in_a_network("listen::each_refusal_has_its_reason", || {
+        let env = TestEnv::new();
+        let mut program = listener(&env, &["--topic=zones"]);
+        let mut sender = Sender::new(HUB, 7, 0, "front");
+        sender.next[usize::from(Topic::Zones.number())] = 5000;
+        let good = sender.make(Topic::Zones, &zones(Verdict::Clear));
+        sender.throw(Topic::Zones, &good);
+        let with = |at: usize, byte: u8| {
+            let mut bytes = good.clone();
+            bytes[at] = byte;
+            bytes
+        };
+        for bad in
+            [&good[..HEAD - 1], &with(0, b'X'), &with(4, 2), &with(5, 47), &with(36, 0), &with(HEAD, 9)]
+        {
+            sender.throw(Topic::Zones, bad);
+        }
+        let number = usize::from(Topic::Zones.number());
+        sender.epoch = 6;
+        sender.send(Topic::Zones, &zones(Verdict::Clear));
+        (sender.epoch, sender.next[number]) = (7, 5000 - WINDOW as u32);
+        sender.send(Topic::Zones, &zones(Verdict::Clear));
+        sender.next[number] = 5001;
+        Sender::new(HUB, 7, 0, "front").send(Topic::Zones, &zones(Verdict::Clear));
+        // All the others deliver for a second.
+        let mut others: Vec<_> = (0..63).map(|hub| Sender::new(hub, 7, 0, "front")).collect();
+        for wait_ms in [1100, 0] {
+            sender.send(Topic::Zones, &zones(Verdict::Slow));
+            others.iter_mut().for_each(|other| other.send(Topic::Zones, &zones(Verdict::Clear)));
+            std::thread::sleep(std::time::Duration::from_millis(wait_ms));
+        }
+        Sender::new(64, 7, 0, "front").send(Topic::Zones, &zones(Verdict::Clear));
+        sender.empty(8);
+        sender.empty(Topic::Zones.number());
+        sender.send(Topic::Zones, &zones(Verdict::Stop));
+        program.await_line("the last one", |line| line["verdict"] == "stop");
+        let outcome = program.end(INT);
+        let refused = refused(&outcome);
+        for reason in Refusal::ALL {
+            // A listener without keys has no use for two of them.
+            let expected = u64::from(!matches!(reason, Refusal::Unauthenticated | Refusal::Mac));
+            assert_eq!(refused[reason.name()], expected, "{}: {outcome}", reason.name());
+        }
+        let keys: Vec<_> = Refusal::ALL.iter().map(|reason| reason.name()).collect();
+        let line = String::from_utf8_lossy(&outcome.out);
+        let line = line.lines().last().unwrap_or_default();
+        let places: Vec<_> = keys.iter().map(|key| line.find(&format!("\"{key}\""))).collect();
+        assert!(places.iter().all(Option::is_some) && places.is_sorted(), "{line}");
+    });
+}
+
+#[test]
+fn two_gateways_with_one_number_are_told_once() {
+    in_a_network("listen::two_gateways_with_one_number_are_told_once", || {
+        let env = TestEnv::new();
+        let mut program = listener(&env, &["--topic=zones", "--stats"]);
+        // Of the later life first: all of the earlier one are refused.
+        let mut gateways = [9, 7].map(|epoch| Sender::new(HUB, epoch, 0, "front"));
+        for _ in 0..80 {
+            gateways.iter_mut().for_each(|gateway| gateway.send(Topic::Zones, &zones(Verdict::Clear)));
+            // As far apart as they send: what comes in one moment is no second gateway.
+            std::thread::sleep(std::time::Duration::from_millis(50));
+        }
+        let line = program.await_line("the remedy", |line| line["kind"] == "trouble");
+        let message = line["message"].as_str().unwrap_or_default();
+        assert!(message.contains(&format!("{HUB:016x}")) && message.contains("gateway-*"), "{line}");
+        let outcome = program.end(INT);
+        assert_eq!(outcome.of_class("notice").len(), 1, "{outcome}");
+        assert_eq!(account(&outcome, 9, "zones"), [80, 0, 0, 0]);
+        assert_eq!(refused(&outcome)["epoch"], 80);
+    });
+}

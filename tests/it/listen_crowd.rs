@@ -1,0 +1,209 @@
+//! `scanhub listen` where more is sent than there is room for, as when somebody invents gateways and sensors: what is known
+//! to deliver stays, a true one that comes later is heard at once, and the log says what happened without a line for each.
+
+use std::time::{Duration, Instant};
+
+use crate::testkit::{INT, Outcome, Program, Sender, TestEnv, in_a_network, is_class, number};
+use schema::{State, Status, Topic, Verdict, Zones};
+use serde_json::{Value, json};
+
+const HUB: u64 = 0x5f3a_12bc_00d1_e2f3;
+const NAME: &str = "--name=robot1=5f3a12bc00d1e2f3";
+
+fn zones(verdict: Verdict) -> Zones {
+    Zones { verdict: verdict as u8, ..Zones::unknown() }
+}
+
+/// Announces a sensor and delivers a sample of it.
+fn deliver(sender: &mut Sender) {
+    sender.announce(&[Topic::Zones, Topic::Status]);
+    sender.send(Topic::Zones, &zones(Verdict::Clear));
+}
+
+/// Whoever has delivered for so long, by the listener's clock, is known for it.
+const KNOWN_AFTER: Duration = Duration::from_secs(1);
+
+/// Delivers for as long as it takes to be known for it; `is_heard` waits until the next sample is.
+fn prove(sender: &mut Sender, mut is_heard: impl FnMut()) {
+    deliver(sender);
+    is_heard();
+    std::thread::sleep(KNOWN_AFTER);
+    deliver(sender);
+    is_heard();
+}
+
+/// How often it was told that there was no room.
+fn told(outcome: &Outcome) -> usize {
+    let is_told = |line: &&Value| line["message"].as_str().is_some_and(|text| text.contains("--hub"));
+    outcome.of_class("notice").iter().filter(is_told).count()
+}
+
+fn zones_row(outcome: &Outcome, hub: &str) -> Value {
+    let row = outcome.of_class("lan").into_iter().find(|line| line["hub"] == hub && line["topic"] == "zones");
+    row.unwrap_or_else(|| panic!("no row of {hub}: {outcome}"))
+}
+
+#[test]
+fn a_true_gateway_is_heard_at_once_after_64_invented_ones() {
+    in_a_network("listen_crowd::a_true_gateway_is_heard_at_once_after_64_invented_ones", || {
+        let env = TestEnv::new();
+        for (what, is_delivered) in [("announce", false), ("announce and deliver", true)] {
+            let mut program = env.start(&["listen", "--json", "--topic=zones", NAME]).ready();
+            for hub in 0..64 {
+                let mut sender = Sender::new(hub, 7, 0, "other");
+                sender.announce(&[Topic::Zones]);
+                if is_delivered {
+                    sender.send(Topic::Zones, &zones(Verdict::Stop));
+                }
+            }
+            let mut sender = Sender::new(HUB, 7, 0, "front");
+            let begin = Instant::now();
+            deliver(&mut sender);
+            let hub = json!("5f3a12bc00d1e2f3");
+            program.await_line("the true one", |line| line["hub"] == hub && line["class"] == "zones");
+            let took = begin.elapsed();
+            eprintln!("64 invented gateways that {what}, then a true one: heard after {took:?}");
+            assert!(took < Duration::from_secs(1), "{took:?}");
+            // It may come before the true one is heard, or after.
+            let is_told = |line: &Value| line["kind"] == "trouble";
+            if !program.has_said(is_told) {
+                program.await_line("that there was no room", is_told);
+            }
+            // Its first announcement puts out none that just delivered, its next one is taken.
+            deliver(&mut sender);
+            program.await_line("its name", |line| line["sensor"] == "front" && line["class"] == "zones");
+            let outcome = program.end(INT);
+            let capacity = number(&outcome.of_class("lan_refused")[0], "capacity");
+            assert_eq!((told(&outcome), capacity), (1, u64::from(is_delivered)), "{outcome}");
+            let sums = &outcome.of_class("lan_given_up")[0];
+            assert_eq!((&sums["lives"], &sums["displaced"]), (&json!(1), &json!(1)), "{outcome}");
+        }
+    });
+}
+
+#[test]
+fn a_flood_of_invented_gateways_puts_out_none_that_delivers() {
+    in_a_network("listen_crowd::a_flood_of_invented_gateways_puts_out_none_that_delivers", || {
+        let env = TestEnv::new();
+        let mut program = env.start(&["listen", "--json", "--topic=zones", NAME]).ready();
+        let mut sender = Sender::new(HUB, 7, 0, "front");
+        prove(&mut sender, || drop(program.await_line("it is heard", is_class("zones"))));
+        const TURNS: u64 = 100;
+        let mut invented = Sender::new(0, 7, 0, "other");
+        for turn in 0..TURNS {
+            for n in 0..40 {
+                invented.hub = 40 * turn + n;
+                invented.announce(&[Topic::Zones]);
+                if n % 2 == 0 {
+                    invented.send(Topic::Zones, &zones(Verdict::Clear));
+                }
+            }
+            let topic_seq = sender.next[usize::from(Topic::Zones.number())];
+            sender.send(Topic::Zones, &zones(Verdict::Stop));
+            // What is read keeps the flood from running over the kernel's buffer.
+            program.await_line("the true one", |line| {
+                line["verdict"] == "stop" && line["topic_seq"] == json!(topic_seq)
+            });
+        }
+        let outcome = program.end(INT);
+        let row = zones_row(&outcome, "5f3a12bc00d1e2f3");
+        assert_eq!((number(&row, "received"), number(&row, "lost")), (TURNS + 2, 0), "{row}");
+        assert!(number(&outcome.of_class("lan_given_up")[0], "displaced") > 1000, "{outcome}");
+        assert_eq!(told(&outcome), 1, "4000 of them, one line");
+    });
+}
+
+fn publisher(env: &TestEnv) -> Program {
+    env.start(&["listen", "--json", "--publish", NAME]).ready()
+}
+
+/// The time until a consumer of a true sensor has its second verdict, beginning with its announcement.
+fn until_published(env: &TestEnv, program: &mut Program) -> (Duration, Sender) {
+    let mut sender = Sender::new(HUB, 7, 0, "front");
+    let begin = Instant::now();
+    deliver(&mut sender);
+    program.await_line("it is published", |line| line["sensor"] == "robot1.front");
+    let took = begin.elapsed();
+    sender.send(Topic::Status, &Status { state: State::Streaming as u8, ..Status::default() });
+    let mut echo = env.echo(&["robot1.front/zones"]);
+    sender.send(Topic::Zones, &zones(Verdict::Slow));
+    echo.await_line("its verdict", |line| line["verdict"] == "slow");
+    (took, sender)
+}
+
+#[test]
+fn a_true_sensor_is_published_at_once_after_16_invented_ones() {
+    in_a_network("listen_crowd::a_true_sensor_is_published_at_once_after_16_invented_ones", || {
+        let env = TestEnv::new();
+        for (what, is_delivered) in [("announced", false), ("announced and delivered", true)] {
+            let mut program = publisher(&env);
+            for n in 0..16 {
+                let mut sender = Sender::new(0xab, 7, n, &format!("s{n}"));
+                sender.announce(&[Topic::Zones]);
+                if is_delivered {
+                    sender.send(Topic::Zones, &zones(Verdict::Stop));
+                }
+            }
+            program.await_lines(16, "all of them", |line| line["kind"] == "published");
+            let (took, _sender) = until_published(&env, &mut program);
+            eprintln!("16 invented sensors {what}, then a true one: published after {took:?}");
+            assert!(took < Duration::from_secs(1), "{took:?}");
+            let outcome = program.end(INT);
+            assert_eq!(told(&outcome), 1, "{outcome}");
+            let sensors = &outcome.of_class("lan_published")[0]["sensors"];
+            assert_eq!(sensors.as_array().map(Vec::len), Some(16), "{outcome}");
+            assert!(!sensors.to_string().contains("ab.s0\""), "the oldest made room: {sensors}");
+        }
+    });
+}
+
+#[test]
+fn a_published_sensor_that_delivers_is_not_put_out() {
+    in_a_network("listen_crowd::a_published_sensor_that_delivers_is_not_put_out", || {
+        let env = TestEnv::new();
+        let mut program = publisher(&env);
+        let (_, mut sender) = until_published(&env, &mut program);
+        let mut echo = env.echo(&["robot1.front/zones"]);
+        prove(&mut sender, || drop(echo.await_line("it is heard", |line| line["verdict"] == "clear")));
+        let mut invented = Sender::new(0xab, 7, 0, "s");
+        for turn in 0..50_u8 {
+            for n in 0..4 {
+                (invented.sensor, invented.name) = (4 * turn + n, format!("s{turn}-{n}"));
+                invented.announce(&[Topic::Zones]);
+                invented.send(Topic::Zones, &zones(Verdict::Clear));
+            }
+            sender.send(Topic::Zones, &zones(Verdict::Stop));
+            echo.await_line("it goes on", |line| line["verdict"] == "stop");
+        }
+        let echoed = echo.end(INT);
+        assert_eq!(echoed.of_class("summary")[0]["lost"], 0, "{echoed}");
+        let outcome = program.end(INT);
+        let line = &outcome.of_class("lan_published")[0];
+        assert!(line["sensors"].to_string().contains("robot1.front"), "{line}");
+        assert!(number(line, "capacity") > 0, "so many are not made at once: {line}");
+        assert_eq!(told(&outcome), 1, "{outcome}");
+    });
+}
+
+#[test]
+fn who_follows_a_sensor_that_was_put_out_is_told_and_goes_on_when_it_is_back() {
+    in_a_network(
+        "listen_crowd::who_follows_a_sensor_that_was_put_out_is_told_and_goes_on_when_it_is_back",
+        || {
+            let env = TestEnv::new();
+            let mut program = publisher(&env);
+            let (_, mut sender) = until_published(&env, &mut program);
+            let mut echo = env.echo(&["robot1.front/zones"]);
+            let mut others: Vec<_> = (0..16).map(|n| Sender::new(0xab, 7, n, &format!("s{n}"))).collect();
+            others.iter_mut().for_each(deliver);
+            program.await_line("the last one", |line| line["sensor"] == "00000000000000ab.s15");
+            echo.await_line("nothing is known any more", |line| line["verdict"] == "unknown");
+            deliver(&mut sender);
+            program.await_line("it is back", |line| line["sensor"] == "robot1.front");
+            sender.send(Topic::Zones, &zones(Verdict::Stop));
+            echo.await_line("it is followed", |line| is_class("zones")(line) && line["verdict"] == "stop");
+            drop((echo.end(INT), program.end(INT)));
+            assert!(env.left_behind().is_empty(), "{:?}", env.left_behind());
+        },
+    );
+}

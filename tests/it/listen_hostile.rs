@@ -1,0 +1,190 @@
+//! `scanhub listen` against what nobody should send: damaged datagrams of every kind, and words that make no sense.
+
+use crate::testkit::{INT, Program, Sender, TestEnv, in_a_network, number};
+use schema::datagram::{HEAD, Head, MTU_ETHERNET, Packed, Refusal};
+use schema::{Foreground, Marks, Scan, Status, Topic, Verdict, Zones};
+use serde_json::Value;
+
+const DAMAGED: u64 = 100_000;
+
+/// What a listener's buffer surely holds at once.
+const TURN: u64 = 50;
+
+fn resident_kb(program: &Program) -> u64 {
+    let path = format!("/proc/{}/status", program.pid());
+    let text = std::fs::read_to_string(path).expect("it lives");
+    let line = text.lines().find(|line| line.starts_with("VmRSS")).expect("it has memory");
+    line.split_whitespace().nth(1).and_then(|number| number.parse().ok()).expect("kB")
+}
+
+/// A datagram of each of these topics, whole.
+fn whole(sender: &mut Sender) -> Vec<Vec<u8>> {
+    let scan = Scan { count: 361, unit_mm: 1, range_bits: 13, ..Scan::default() };
+    vec![
+        sender.make(Topic::Scan, &scan),
+        sender.make(Topic::Marks, &Marks { count: 5, ..Marks::default() }),
+        sender.make(Topic::Zones, &Zones::unknown()),
+        sender.make(Topic::Foreground, &Foreground { count: 361, ..Foreground::default() }),
+        sender.make(Topic::Status, &Status::default()),
+        sender.telegram(&[0x02, 0x80, 0x03, 0x00, 0xA0, 0x00, 0x10, 0x16, 0x0A]),
+    ]
+}
+
+#[test]
+fn nothing_damaged_is_accepted_and_memory_stays_flat() {
+    in_a_network("listen_hostile::nothing_damaged_is_accepted_and_memory_stays_flat", || {
+        let env = TestEnv::new();
+        let mut program = env.start(&["listen", "--json", "--topic=zones"]).ready();
+        let mut sender = Sender::new(0xabcd, 7, 0, "front");
+        let whole = whole(&mut Sender::new(0xabcd, 7, 1, "rear"));
+        let mut random = fastrand::Rng::with_seed(6);
+        let mut kb = 0;
+        for n in 0..DAMAGED {
+            let mut bytes = whole[random.usize(..whole.len())].clone();
+            match random.u8(..4) {
+                0 => (0..random.usize(1..4)).for_each(|_| {
+                    let bit = random.usize(..8 * bytes.len());
+                    bytes[bit / 8] ^= 1 << (bit % 8);
+                }),
+                1 => bytes.truncate(random.usize(..bytes.len())),
+                2 => bytes.extend((0..random.usize(1..40)).map(|_| random.u8(..))),
+                _ => {
+                    let begin = random.usize(..bytes.len());
+                    bytes[begin..].iter_mut().for_each(|byte| *byte = random.u8(..));
+                    bytes[begin] ^= 1;
+                }
+            }
+            // Flips may have undone each other.
+            if whole.contains(&bytes) {
+                bytes[0] ^= 0x80;
+            }
+            sender.throw(Topic::Zones, &bytes);
+            if n % TURN == TURN - 1 {
+                let seq = sender.next[usize::from(Topic::Zones.number())];
+                sender.send(Topic::Zones, &Zones { verdict: Verdict::Stop as u8, ..Zones::unknown() });
+                program.await_line("what is whole", |line| line["topic_seq"] == seq);
+            }
+            if n == DAMAGED / 10 {
+                kb = resident_kb(&program);
+            }
+        }
+        let grown_kb = resident_kb(&program).saturating_sub(kb);
+        assert!(grown_kb < 512, "{grown_kb} kB more");
+        let outcome = program.end(INT);
+        let refused = &outcome.of_class("lan_refused")[0];
+        let all: u64 = Refusal::ALL.iter().map(|reason| number(refused, reason.name())).sum();
+        assert_eq!(all, DAMAGED, "{refused}");
+        for reason in ["short", "magic", "version", "header", "length", "crc"] {
+            assert!(number(refused, reason) > 0, "{reason}: {refused}");
+        }
+        let lines = outcome.of_class("lan");
+        let [line] = &lines[..] else { panic!("{lines:?}") };
+        assert_eq!((number(line, "received"), number(line, "lost")), (DAMAGED / TURN, 0));
+    });
+}
+
+/// Whoever sends may seal what it likes: nonsense with a right checksum.
+#[test]
+fn sealed_nonsense_neither_ends_it_nor_fills_memory() {
+    in_a_network("listen_hostile::sealed_nonsense_neither_ends_it_nor_fills_memory", || {
+        let env = TestEnv::new();
+        let words = ["listen", "--json", "--publish", "--timeout=20s"];
+        let mut program = env.start(&words).ready();
+        let mut sender = Sender::new(0xabcd, 7, 0, "front");
+        sender.announce(&[Topic::Zones]);
+        program.await_line("a name", |line| line["kind"] == "published");
+        let mut random = fastrand::Rng::with_seed(7);
+        let mut kb = 0;
+        let mut counted = 0;
+        for n in 0..20_000_u32 {
+            let mut buffer = [0; MTU_ETHERNET];
+            let len = random.usize(..600);
+            buffer[HEAD..HEAD + len].iter_mut().for_each(|byte| *byte = random.u8(..));
+            if random.bool() {
+                let _ = Zones::unknown().pack(&mut buffer[HEAD..]);
+            }
+            let head = Head {
+                topic: random.u8(..9),
+                flags: random.u8(..) & !1,
+                hub: random.u64(..100),
+                epoch: random.u32(..4),
+                sequence: random.u32(..),
+                stamp_ns: random.u64(..),
+                sensor: random.u8(..),
+                revision: random.u16(..3),
+                counter: random.u32(..),
+            };
+            sender.throw(Topic::Zones, head.seal(&mut buffer, len).expect("it fits"));
+            if n % 50 == 49 {
+                // Its place in the list was taken before: it goes on whatever else there is.
+                sender.send(Topic::Zones, &Zones::unknown());
+                counted += 1;
+                std::thread::yield_now();
+            }
+            if n == 15_000 {
+                kb = resident_kb(&program);
+            }
+        }
+        assert!(resident_kb(&program).saturating_sub(kb) < 2048, "{kb} kB and more");
+        let outcome = program.end(INT);
+        assert_eq!(outcome.code, Some(0), "{outcome}");
+        let told = |it: &&Value| {
+            it["message"].as_str().is_some_and(|told| told.contains("more is sent than there is room for"))
+        };
+        assert_eq!(outcome.of_class("notice").iter().filter(told).count(), 1, "{outcome}");
+        let lines = outcome.of_class("lan");
+        assert!(lines.len() <= 1024, "{} lines", lines.len());
+        let own = lines.iter().find(|it| it["hub"] == "000000000000abcd" && it["topic"] == "zones");
+        let own = own.unwrap_or_else(|| panic!("its sender is forgotten: {lines:?}"));
+        // What the flood pushed out behind the last one that came, nobody here can know.
+        let known = number(own, "received") + number(own, "lost");
+        assert!((counted / 2..=counted).contains(&known), "{known} of {counted}");
+        let sensors = &outcome.of_class("lan_published")[0]["sensors"];
+        let sensors = sensors.as_array().map(Vec::len).unwrap_or_default();
+        assert!((1..=16).contains(&sensors), "{sensors} of nonsense and one");
+    });
+}
+
+#[test]
+fn words_that_make_no_sense_have_a_remedy() {
+    let env = TestEnv::new();
+    for (words, code, kind, hint) in [
+        (&["--interface=none0"][..], 78, "configuration", "there are "),
+        (&["--topic=scam"], 2, "usage", "zones"),
+        (&["--topic=front/zones"], 2, "usage", "zones"),
+        (&["--name=robot"], 78, "configuration", "NAME=HUB"),
+        (&["--name=robot=0000000000000001"], 78, "configuration", "but not robot, for example"),
+        (&["--hub=robot1"], 78, "configuration", "--name robot1="),
+        (&["--nonsense"], 2, "usage", "--help"),
+    ] {
+        let outcome = env.run(&[&["listen", "--json"], words].concat());
+        let lines = outcome.lines();
+        let error = lines.last().unwrap_or_else(|| panic!("{outcome}"));
+        assert_eq!((outcome.code, &error["kind"]), (Some(code), &kind.into()), "{outcome}");
+        assert!(error["hint"].as_str().is_some_and(|text| text.contains(hint)), "{outcome}");
+    }
+}
+
+#[test]
+fn bounds_that_are_not_reached_are_told() {
+    in_a_network("listen_hostile::bounds_that_are_not_reached_are_told", || {
+        let env = TestEnv::new();
+        for words in [&["--timeout=100ms"][..], &["-n5", "--for=100ms"]] {
+            let outcome = env.run(&[&["listen", "--json"], words].concat());
+            assert_eq!(outcome.code, Some(3), "{outcome}");
+            let lines = outcome.lines();
+            let error = lines.last().unwrap_or_else(|| panic!("{outcome}"));
+            assert_eq!(error["kind"], "timeout", "{outcome}");
+            assert_eq!(outcome.of_class("lan_refused").len(), 1, "the account comes all the same");
+        }
+        assert_eq!(env.run(&["listen", "--json", "--for=100ms"]).code, Some(0));
+        let holder = std::net::UdpSocket::bind("0.0.0.0:22200").expect("nobody has it");
+        let outcome = env.run(&["listen", "--json"]);
+        assert_eq!(outcome.code, Some(1), "{outcome}");
+        assert!(
+            outcome.lines()[0]["message"].as_str().is_some_and(|text| text.contains("22200")),
+            "{outcome}"
+        );
+        drop(holder);
+    });
+}

@@ -1,0 +1,97 @@
+//! `scanhub listen --hub`: whom it hears where there are many, that it says which gateway is on its own machine,
+//! and the account when it is asked.
+
+use crate::testkit::{INT, Robot, Sender, TestEnv, USR1, in_a_network, is_class, number};
+use schema::{Topic, Verdict, Zones};
+use serde_json::json;
+
+const HUB: u64 = 0x5f3a_12bc_00d1_e2f3;
+
+fn zones(verdict: Verdict) -> Zones {
+    Zones { verdict: verdict as u8, ..Zones::unknown() }
+}
+
+/// More gateways than a listener keeps apart.
+fn crowd() {
+    for hub in 0..70 {
+        let mut sender = Sender::new(hub, 7, 0, "other");
+        sender.announce(&[Topic::Zones]);
+        sender.send(Topic::Zones, &zones(Verdict::Stop));
+    }
+}
+
+#[test]
+fn a_hub_that_is_named_is_heard_in_a_crowd() {
+    in_a_network("listen_hubs::a_hub_that_is_named_is_heard_in_a_crowd", || {
+        let env = TestEnv::new();
+        let name = "--name=robot1=5f3a12bc00d1e2f3";
+        let words = ["listen", "--json", "--topic=zones", name, "--hub=robot1", "--hub=00000000000000ab"];
+        let mut program = env.start(&words).ready();
+        crowd();
+        let senders = [HUB, 0xab].map(|hub| {
+            let mut sender = Sender::new(hub, 7, 0, "front");
+            sender.announce(&[Topic::Zones]);
+            sender.throw(Topic::Zones, b"short");
+            sender.send(Topic::Zones, &zones(Verdict::Clear));
+            sender
+        });
+        program.await_lines(2, "zones", is_class("zones"));
+        drop(senders);
+        let outcome = program.end(INT);
+        assert!(outcome.of_class("zones").iter().all(|line| line["verdict"] == "clear"), "{outcome}");
+        let rows = outcome.of_class("lan");
+        let hubs: Vec<_> = rows.iter().map(|line| line["hub"].as_str().unwrap_or_default()).collect();
+        let (other, robot1) = ("00000000000000ab", "5f3a12bc00d1e2f3");
+        assert_eq!(hubs, [other, other, robot1, robot1], "{outcome}");
+        let refused = &outcome.of_class("lan_refused")[0];
+        assert_eq!((&refused["capacity"], &refused["short"]), (&json!(0), &json!(2)), "{outcome}");
+    });
+}
+
+#[test]
+fn hubs_that_are_not_named_are_not_published() {
+    in_a_network("listen_hubs::hubs_that_are_not_named_are_not_published", || {
+        let env = TestEnv::new();
+        let words = ["listen", "--json", "--publish", "--hub=5f3a12bc00d1e2f3"];
+        let mut program = env.start(&words).ready();
+        crowd();
+        Sender::new(HUB, 7, 0, "front").announce(&[Topic::Zones]);
+        let line = program.await_line("a sensor", |line| line["kind"] == "published");
+        assert_eq!((&line["sensor"], &line["here"]), (&json!("5f3a12bc00d1e2f3.front"), &json!(true)));
+        let outcome = program.end(INT);
+        assert_eq!(outcome.of_class("notice").len(), 1, "{outcome}");
+        assert_eq!(outcome.of_class("lan_published")[0]["sensors"], json!(["5f3a12bc00d1e2f3.front"]));
+    });
+}
+
+#[test]
+fn a_gateway_on_another_machine_is_not_called_this_one_s() {
+    in_a_network("listen_hubs::a_gateway_on_another_machine_is_not_called_this_one_s", || {
+        let robot = Robot::new(&["front"]);
+        let env = TestEnv::new();
+        let mut listener = env.start(&["listen", "--json", "--publish"]).ready();
+        let gateway = robot.gateway::<&str>(&[]);
+        let line = listener.await_line("a sensor", |line| line["kind"] == "published");
+        assert_eq!(line["here"], json!(null), "{line}");
+        drop(gateway);
+        assert_eq!(listener.end(INT).code, Some(0));
+    });
+}
+
+#[test]
+fn a_signal_asks_for_the_account_so_far() {
+    in_a_network("listen_hubs::a_signal_asks_for_the_account_so_far", || {
+        let env = TestEnv::new();
+        let mut program = env.start(&["listen", "--json"]).ready();
+        let mut sender = Sender::new(HUB, 7, 0, "front");
+        for received in 1..=2 {
+            sender.send(Topic::Zones, &zones(Verdict::Clear));
+            program.await_line("zones", is_class("zones"));
+            program.signal(USR1);
+            let line = program.await_line("the account", is_class("lan"));
+            assert_eq!((number(&line, "received"), &line["topic"]), (received, &json!("zones")));
+        }
+        let outcome = program.end(INT);
+        assert_eq!((outcome.code, outcome.of_class("lan").len()), (Some(0), 3), "{outcome}");
+    });
+}

@@ -1,0 +1,99 @@
+//! Two machines with one state directory, as after a disk was copied, whose gateways begin in one epoch: they send under one
+//! number. Who listens hears one of them and is told, and no sample of the other one is ever taken for the first one's.
+
+use std::time::{Duration, Instant};
+
+use crate::testkit::{INT, Machine, Outcome, Program, TERM, TestEnv, in_a_network, is_class, number};
+use serde_json::{Value, json};
+
+/// A machine with a hub, whose sensor has so many beams, and what it keeps of its gateway.
+struct Robot {
+    env: TestEnv,
+    _simulator: Program,
+    _hub: Program,
+    _machine: Machine,
+}
+
+impl Robot {
+    fn new(number: u8, beams: u32) -> Robot {
+        let machine = Machine::new(number);
+        let env = TestEnv::on(&machine);
+        let simulator = env.simulator(&["front"], &["--seed=61", "--baud=500000"]);
+        let resolution = format!("--set=link.front.resolution={}", 180.0 / f64::from(beams - 1));
+        let hub = env.hub(&[env.link("front"), resolution]);
+        env.await_info("front", |info| info["state"] == "streaming");
+        Robot { env, _simulator: simulator, _hub: hub, _machine: machine }
+    }
+
+    /// A gateway that goes on from the state that both have: an epoch far ahead, so that the seconds of their starts do
+    /// not matter.
+    fn gateway(&self) -> Program {
+        let domain = self.env.place().name().to_owned();
+        let state = self.env.path("state/scanhub");
+        std::fs::create_dir_all(&state).expect("a state directory");
+        let file = state.join(format!("gateway-{domain}-eth0-1"));
+        std::fs::write(file, "5f3a12bc00d1e2f3 4000000000\n").expect("can be written");
+        let mut gateway =
+            self.env.gateway_at(&["--interface=eth0", "--topic=front/scan", "--topic=front/status"]);
+        let begin = gateway.await_line("its begin", is_class("gateway"));
+        assert_eq!((&begin["hub"], number(&begin, "epoch")), (&json!("5f3a12bc00d1e2f3"), 4_000_000_001));
+        gateway
+    }
+}
+
+fn is_told(line: &Value) -> bool {
+    line["message"].as_str().is_some_and(|text| text.contains("two gateways send as 5f3a12bc00d1e2f3"))
+}
+
+/// The numbers of beams of the scans.
+fn beams(outcome: &Outcome) -> Vec<usize> {
+    let scans = outcome.of_class("scan");
+    let mut beams: Vec<_> = scans.iter().map(|line| line["ranges"].as_array().map_or(0, Vec::len)).collect();
+    beams.dedup();
+    beams
+}
+
+#[test]
+fn two_machines_with_one_state_directory_are_told_and_never_mixed() {
+    in_a_network("listen_twins::two_machines_with_one_state_directory_are_told_and_never_mixed", || {
+        let (one, other) = (Robot::new(1, 361), Robot::new(2, 181));
+        // Here both cables are plugged in.
+        let env = TestEnv::new();
+        let mut listener = env.start(&["listen", "--json"]).ready();
+        let mut publisher = env.start(&["listen", "--json", "--publish"]).ready();
+        let first = one.gateway();
+        listener.await_lines(10, "scans of the first one", is_class("scan"));
+        publisher.await_line("a sensor", |line| line["kind"] == "published");
+        let mut echo = env.echo(&["5f3a12bc00d1e2f3.front/scan"]);
+        let second = other.gateway();
+        let begin = Instant::now();
+        listener.await_line("that there are two", is_told);
+        let took = begin.elapsed();
+        eprintln!("two machines with one state directory: told {took:?} after the second one began");
+        assert!(took < Duration::from_secs(3), "{took:?}");
+        echo.await_lines(100, "scans of the first one", is_class("scan"));
+        let echoed = echo.end(INT);
+        assert_eq!(beams(&echoed), [361], "{echoed}");
+        assert_eq!(echoed.of_class("summary")[0]["lost"], 0, "{echoed}");
+        // One that comes now hears either, but not both.
+        let mut late = env.start(&["listen", "--json"]).ready();
+        late.await_line("that there are two", is_told);
+        late.await_lines(10, "scans", is_class("scan"));
+        let late = late.end(INT);
+        assert!(beams(&late) == [361] || beams(&late) == [181], "{:?}", beams(&late));
+        // When the first one ends, the other one does not stand in for it: more than 3 s of it are refused.
+        assert_eq!(first.end(TERM).code, Some(0));
+        let mut other = env.start(&["listen", "--json"]).ready();
+        other.await_lines(200, "scans of the second one", is_class("scan"));
+        assert_eq!(beams(&other.end(INT)), [181], "alone it is heard by who comes now");
+        assert_eq!(second.end(TERM).code, Some(0));
+        let (listener, publisher) = (listener.end(INT), publisher.end(INT));
+        assert_eq!(beams(&listener), [361], "only the first one");
+        for outcome in [&listener, &publisher] {
+            let told = outcome.of_class("notice").iter().filter(|line| is_told(line)).count();
+            assert_eq!(told, 1, "{outcome}");
+            assert!(number(&outcome.of_class("lan_refused")[0], "twin") > 10, "{outcome}");
+            assert!(outcome.of_class("lan").iter().all(|line| line["lost"] == 0), "{outcome}");
+        }
+    });
+}

@@ -1,0 +1,86 @@
+//! CARMEN logs through the program: each range and each code of a log reaches a consumer, from the log itself and from
+//! what it was converted to.
+
+use crate::testkit::{INT, Outcome, TestEnv, number};
+use serde_json::{Value, json};
+
+/// A log of scans `period_ms` apart, each of which has these ranges first.
+fn log(env: &TestEnv, ranges: &[&str], scans: u64, period_ms: u64) -> String {
+    let line = |scan: u64| {
+        let beams: Vec<&str> = ranges.iter().chain([&"1.50"; 181]).take(181).copied().collect();
+        let at = 1000.0 + (scan * period_ms) as f64 / 1000.0;
+        format!("FLASER 181 {} 0 0 0 0 0 0 {at} host {at}\n", beams.join(" "))
+    };
+    env.file("a.log", (0..scans).map(line).collect::<String>())
+}
+
+/// What a consumer gets of `file` that is played, and what the player said.
+fn played(env: &TestEnv, file: &str) -> (Outcome, Outcome) {
+    let words = ["replay", "--json", "--no-system-config", file, "--paused"];
+    let player = env.start(&words).ready();
+    let mut consumer = env.echo(&["front/scan", "front/zones", "front/status"]);
+    env.await_info("front", |info| info["state"] == "paused");
+    assert_eq!(env.run(&["control", "front", "resume"]).code, Some(0));
+    consumer.await_line("the end", |line| line["last_error"] == "the recording is at its end");
+    let player = player.wait();
+    (consumer.end(INT), player)
+}
+
+#[test]
+fn a_log_is_read_as_it_reaches_and_says_so_first() {
+    for (ranges, unit_mm, bits, units, codes) in [
+        (
+            ["20.00", "81.90", "81.83", "81.82"],
+            10,
+            13,
+            json!([2000, null, null, 8182]),
+            json!([[1, 1], [2, 8]]),
+        ),
+        (
+            ["9.001", "16.383", "16.379", "8.190"],
+            1,
+            14,
+            json!([9001, null, null, 8190]),
+            json!([[1, 0], [2, 4]]),
+        ),
+    ] {
+        let env = TestEnv::new();
+        let file = log(&env, &ranges, 3, 50);
+        let stream = file.replace("a.log", "a.bin");
+        let converted = env.run(&["convert", &file, &stream]);
+        let read = format!("read as values of {unit_mm} mm in {bits} bits");
+        assert!(converted.code == Some(0) && converted.errors.contains(&read), "{converted}");
+        let (heard, player) = played(&env, &file);
+        assert!(player.errors.lines().next().is_some_and(|line| line.contains(&read)), "{player}");
+        for heard in [heard, played(&env, &stream).0] {
+            let scans = heard.of_class("scan");
+            assert_eq!(scans.len(), 3, "{heard}");
+            for scan in scans {
+                let first: Vec<_> =
+                    scan["ranges"].as_array().into_iter().flatten().take(4).cloned().collect();
+                assert_eq!((&scan["unit_mm"], Value::from(first)), (&unit_mm.into(), units.clone()));
+                assert_eq!(scan["codes"], codes);
+            }
+        }
+    }
+}
+
+#[test]
+fn zones_stand_until_the_next_scan_of_a_log_that_became_an_mcap_file() {
+    let env = TestEnv::new();
+    // Much longer than a sensor that is at work leaves between two scans.
+    let file = log(&env, &["1.50"], 4, 400);
+    let mcap = file.replace("a.log", "a.mcap");
+    assert_eq!(env.run(&["convert", &file, &mcap]).code, Some(0));
+    for file in [file, mcap] {
+        let (heard, _) = played(&env, &file);
+        let last = number(&heard.of_class("scan")[3], "seq");
+        let zones = heard.of_class("zones");
+        let first =
+            zones.iter().position(|zones| zones["verdict"] != "unknown").unwrap_or_else(|| panic!("{heard}"));
+        let unknown = zones[first..]
+            .iter()
+            .filter(|zones| zones["verdict"] == "unknown" && number(zones, "seq") < last);
+        assert_eq!(unknown.count(), 0, "{file}: {heard}");
+    }
+}

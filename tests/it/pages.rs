@@ -1,0 +1,198 @@
+//! Every example of every page, as it stands there: programs run beside a hub, in rooms with something in them and with
+//! nothing, of sensors that measure in mm and in cm; lines for the shell run; configurations and worlds are read. What cannot
+//! be run is named here, with the reason.
+
+mod blocks;
+mod lines;
+mod program;
+mod said;
+mod shell;
+
+use std::thread;
+
+use crate::testkit::{Outcome, Program, TERM, TestEnv, until};
+use blocks::{Block, blocks};
+use program::Example;
+use rustix::time::{ClockId, clock_gettime};
+
+/// A room, and a sensor in it.
+#[derive(Clone, Copy, Debug)]
+struct Situation {
+    world: &'static str,
+    sensor: &'static str,
+    unit: &'static str,
+    /// How far everything is; nothing where there is nothing.
+    wall_m: Option<f64>,
+}
+
+const SITUATIONS: [Situation; 5] = [
+    Situation { world: "empty", sensor: "lms200", unit: "mm", wall_m: None },
+    Situation { world: "empty", sensor: "lms291", unit: "cm", wall_m: None },
+    Situation { world: "wall640", sensor: "lms200", unit: "mm", wall_m: Some(0.64) },
+    Situation { world: "wall640", sensor: "lms200", unit: "cm", wall_m: Some(6.4) },
+    Situation { world: "wall640", sensor: "lms291", unit: "cm", wall_m: Some(6.4) },
+];
+
+impl Situation {
+    /// A hub with a sensor `front` that streams.
+    fn begin(&self, env: &TestEnv) -> [Program; 2] {
+        let Situation { world, sensor, unit, .. } = self;
+        let flags = [
+            format!("--world={world}"),
+            format!("--type={sensor}"),
+            format!("--unit={unit}"),
+            "--seed=81".to_owned(),
+            "--baud=500000".to_owned(),
+        ];
+        let simulator = env.simulator(&["front"], &flags);
+        let hub = env.hub(&[env.link("front"), format!("--set=link.front.type={sensor}")]);
+        env.await_info("front", |info| info["state"] == "streaming");
+        [simulator, hub]
+    }
+
+    /// What is wrong with what these print here.
+    fn judge_all(&self, examples: &[Example]) -> Vec<String> {
+        let env = TestEnv::new();
+        let _running = self.begin(&env);
+        let recorded = env.run(&["record", "--ros2", "-o", &env.word("ros.mcap"), "--for=1s"]);
+        assert_eq!(recorded.code, Some(0), "{recorded}");
+        let mut verdicts = env.echo(&["front/zones"]);
+        let mut run = |example| run(example, &env, &mut verdicts, self.wants_words(example));
+        examples.iter().filter_map(|example| self.judge(example, &run(example)).err()).collect()
+    }
+
+    /// Whether there is something to tell, for an example that tells anything.
+    fn wants_words(&self, example: &Example) -> bool {
+        self.wall_m.is_some() && example.text.contains("print")
+    }
+
+    /// What is wrong with what an example printed here.
+    fn judge(&self, example: &Example, outcome: &Outcome) -> Result<(), String> {
+        let wrong = |what: &str| Err(format!("{}, {self:?}: {what}\n{outcome}", example.place));
+        // Either it ends when it is through, or not before it is ended.
+        if !matches!(outcome.code, None | Some(0)) || !outcome.errors.is_empty() {
+            return wrong("it failed");
+        }
+        let text = String::from_utf8_lossy(&outcome.out);
+        for (line, distance) in text.lines().filter_map(|line| Some((line, distance_m(line)?))) {
+            let is_right = match self.wall_m {
+                Some(wall) => (distance - wall).abs() < 0.001,
+                None => !distance.is_finite(),
+            };
+            if !is_right {
+                return wrong(&format!("it says {line:?}"));
+            }
+        }
+        let says = |line: &str| distance_m(line).is_some() || VERDICTS.iter().any(|word| line.contains(word));
+        if self.wants_words(example) && !text.lines().any(says) {
+            return wrong("it says no distance with its unit, and no verdict");
+        }
+        Ok(())
+    }
+}
+
+const VERDICTS: [&str; 4] = ["clear", "slow", "stop", "unknown"];
+
+/// The distance that a line tells: the number before a unit.
+fn distance_m(line: &str) -> Option<f64> {
+    let words: Vec<&str> = line.split_whitespace().collect();
+    words.windows(2).find_map(|pair| {
+        let metres = match pair[1] {
+            "m" => 1.0,
+            "mm" => 0.001,
+            _ => return None,
+        };
+        Some(pair[0].parse::<f64>().ok()? * metres)
+    })
+}
+
+/// Runs `example` beside the hub of `env` until it has seen some scans, and `says` something if it should. `verdicts` come
+/// with the scans.
+fn run(example: &Example, env: &TestEnv, verdicts: &mut Program, says: bool) -> Outcome {
+    // Nobody types, and nobody closes it.
+    let (stdin, _typed) = std::io::pipe().expect("a pipe");
+    let mut program = Program::start_with(example.command(env), stdin);
+    // From when it reads the hub's memory.
+    let maps = format!("/proc/{}/maps", program.pid());
+    let follows = || {
+        let maps = std::fs::read_to_string(&maps).unwrap_or_default();
+        maps.lines().any(|map| map.contains("/dev/shm/sh_") && map.ends_with(".data"))
+    };
+    until("it follows the hub", || follows() || program.is_over());
+    let now_ns = monotonic_ns();
+    verdicts.await_lines(10, "a scan that began after that", |line| line["stamp_ns"].as_u64() > Some(now_ns));
+    if says && !program.is_over() {
+        program.await_bytes(0);
+    }
+    if program.is_over() { program.wait() } else { program.end(TERM) }
+}
+
+/// CLOCK_MONOTONIC, as in stamps.
+fn monotonic_ns() -> u64 {
+    let now = clock_gettime(ClockId::Monotonic);
+    now.tv_sec as u64 * 1_000_000_000 + now.tv_nsec as u64
+}
+
+fn is_program(block: &Block) -> bool {
+    ["python", "rust", "c", "cpp"].contains(&block.language.as_str())
+}
+
+#[test]
+fn every_program_on_a_page_runs_and_tells_distances_only_where_there_are_some() {
+    let blocks: Vec<Block> = blocks().into_iter().filter(is_program).collect();
+    assert!(blocks.len() > 10, "{blocks:#?}");
+    let wrong = wrong_with(&blocks, &SITUATIONS);
+    assert!(wrong.is_empty(), "{}", wrong.join("\n"));
+}
+
+/// What is wrong with the programs `blocks`, each line with its place.
+fn wrong_with(blocks: &[Block], situations: &[Situation]) -> Vec<String> {
+    let shop = TestEnv::new();
+    let (mut examples, mut wrong) = (Vec::new(), Vec::new());
+    for block in blocks {
+        match Example::build(block, &shop) {
+            Ok(example) => examples.extend(example),
+            Err(refused) => wrong.push(format!("{}: {refused}", block.place)),
+        }
+    }
+    let examples = &examples;
+    // Each has a hub of its own, and all of them wait most of the time.
+    thread::scope(|scope| {
+        let judged: Vec<_> =
+            situations.iter().map(|situation| scope.spawn(|| situation.judge_all(examples))).collect();
+        wrong.extend(judged.into_iter().flat_map(|judged| judged.join().expect("all are judged")));
+    });
+    wrong
+}
+
+/// What stood on pages once, and what is wrong with it.
+#[test]
+fn a_program_that_takes_codes_for_distances_is_found() {
+    let block = |language: &str, text: &str| Block {
+        place: format!("planted.md:{}", text.len()),
+        language: language.to_owned(),
+        text: text.to_owned(),
+    };
+    let follow = "import scanhub\nfor scan in scanhub.subscribe('front/scan'):\n    ";
+    let planted = [
+        (block("python", &format!("{follow}print(scan.ranges.min() * scan.unit_mm, 'mm')\n")), "it says"),
+        (block("python", &format!("{follow}print(scan.ranges_m[scan.valid].min(), 'm')\n")), "it failed"),
+        (block("python", &format!("{follow}print(scan.ranges[180])\n")), "no distance with its unit"),
+        (
+            block("rust", "scanhub_client::subscribe::<scanhub_client::Scan>(\"front\").unwrap();\n"),
+            "mismatched types",
+        ),
+        (block("c", "puts(scanhub_open());\n"), "too few arguments"),
+    ];
+    let situations = [SITUATIONS[0], SITUATIONS[4]];
+    let blocks = planted.each_ref().map(|(block, _)| block.clone());
+    let wrong = wrong_with(&blocks, &situations);
+    for (block, what) in planted {
+        let is_skipped = Example::build(&block, &TestEnv::new()).is_ok_and(|example| example.is_none());
+        let of_it = |wrong: &&String| {
+            wrong.strip_prefix(&block.place).is_some_and(|rest| rest.starts_with([',', ':']))
+        };
+        let is_found = wrong.iter().filter(of_it).any(|wrong| wrong.contains(what));
+        assert!(is_skipped || is_found, "{block:#?}: {wrong:#?}");
+    }
+}

@@ -1,0 +1,206 @@
+//! The lines for a shell on the pages, run by a shell: with a hub and a sensor `front`, recordings under the names that the
+//! pages use, and a spare sensor at every port that they name. What cannot be run is named here, with the reason.
+
+use std::fs;
+use std::os::unix::process::CommandExt;
+use std::process::Command;
+use std::sync::atomic::{AtomicUsize, Ordering};
+use std::thread;
+use std::time::{Duration, Instant};
+
+use rustix::process::{Pid, Signal, kill_process_group};
+
+use super::blocks::blocks;
+use super::shell::{commands, lines};
+use crate::testkit::{Program, Sender, TestEnv, in_a_network, is_class};
+use schema::Topic;
+
+/// Commands that are not run, by how their line begins or what is in it, and what makes sure of them. Those of the program
+/// are read by `hub/cli/examples.rs`.
+const NOT_RUN: [(&str, &str); 12] = [
+    ("sudo ", "changes the machine; tests/it/dist.rs and tests/it/client_c.rs install elsewhere"),
+    ("sudoedit ", "an editor"),
+    ("systemctl ", "asks the machine's service manager; tests/it/service.rs has one of its own"),
+    ("cargo build", "builds for minutes; this test was built so"),
+    ("cargo test", "this is it"),
+    ("cargo run", "builds for minutes; what follows `--` is read as a command line"),
+    ("cargo new", "needs a directory beside the project; the example behind it is built and run"),
+    ("cargo add", "the same"),
+    ("python3 -m venv", "fetches packages; the package is used from its directory"),
+    ("~/scans/bin/pip", "the same"),
+    ("cc ", "tests/it/client_c.rs builds the same program against an installed library"),
+    ("scanhub watch", "needs a terminal; tests/it/watch.rs has one"),
+];
+/// The same of what is in the middle of a line.
+const NOT_RUN_WITH: [(&str, &str); 1] = [("| ssh ", "needs another machine")];
+
+/// Whether `line` is not run.
+fn is_left_out(line: &str) -> bool {
+    NOT_RUN.iter().any(|(begin, _)| line.starts_with(begin))
+        || NOT_RUN_WITH.iter().any(|(part, _)| line.contains(part))
+}
+
+/// Whether `line` has to do with a network.
+fn is_of_a_network(line: &str) -> bool {
+    ["scanhub listen", "scanhub gateway", "robot1."].iter().any(|part| line.contains(part))
+}
+
+/// All lines of all pages with their places.
+fn all() -> Vec<(String, String)> {
+    let blocks = blocks().into_iter().filter(|block| block.language == "sh");
+    let lines =
+        blocks.flat_map(|block| lines(&block.text).into_iter().map(move |line| (block.place.clone(), line)));
+    lines.collect()
+}
+
+/// What the pages take for granted.
+struct Desk {
+    env: TestEnv,
+    /// Of lines that were run.
+    count: AtomicUsize,
+    _running: Vec<Program>,
+}
+
+/// Recordings of `front` under these names.
+const RECORDINGS: [&str; 5] = ["walk.mcap", "day-0001.mcap", "cut.mcap", "killed.mcap", "robot.mcap"];
+/// A part of a recording that lasts longer than the one here, and the like of this one.
+const MINUTES: (&str, &str) = ("--start 1m --end 90s", "--start 200ms --end 500ms");
+/// Ports that pages name.
+const PORTS: [&str; 3] = ["/dev/serial/by-id/usb-FTDI...", "/dev/ttyUSB0", "/tmp/lms"];
+
+impl Desk {
+    fn new() -> Desk {
+        let env = TestEnv::new();
+        let simulator = env.simulator(&["front", "spare"], &["--seed=82", "--baud=500000"]);
+        let hub = env.hub(&[env.link("front")]);
+        env.await_info("front", |info| info["state"] == "streaming");
+        let recorded = env.run(&["record", "-o", &env.word("one.mcap"), "--for=1s"]);
+        assert_eq!(recorded.code, Some(0), "{recorded}");
+        let stream = env.run(&["echo", "front/telegram", "--raw", "-n", "5"]);
+        fs::create_dir(env.path("bin")).expect("a directory");
+        // One domain is not enough for two hubs.
+        let (name, root) = (env.place().name().to_owned(), env.path("").display().to_string());
+        let script = format!(
+            "#!/bin/sh\ncase $1 in run | replay) other=x ;; esac\n\
+             exec '{}' \"$@\" --domain \"{name}$other\" --root '{root}'\n",
+            env!("CARGO_BIN_EXE_scanhub"),
+        );
+        let program = env.file("bin/scanhub", script);
+        let mode = std::os::unix::fs::PermissionsExt::from_mode(0o755);
+        fs::set_permissions(program, mode).expect("it is ours");
+        env.file("capture.bin", stream.out);
+        Desk { env, count: AtomicUsize::new(0), _running: vec![simulator, hub] }
+    }
+
+    /// Runs `line` in a directory of its own, as long as it wants, or ends it by Ctrl-C; what is wrong, if anything is.
+    fn run(&self, line: &str) -> Option<String> {
+        let here = self.env.path(&format!("line{}", self.count.fetch_add(1, Ordering::Relaxed)));
+        fs::create_dir(&here).expect("a directory");
+        let writes = line.starts_with("scanhub record");
+        for name in RECORDINGS.iter().filter(|_| !writes) {
+            fs::copy(self.env.path("one.mcap"), here.join(name)).expect("a recording");
+        }
+        fs::copy(self.env.path("capture.bin"), here.join("capture.bin")).expect("a stream");
+        let typed = PORTS.iter().fold(line.to_owned(), |line, port| {
+            let is_made = line.starts_with("scanhub simulate");
+            line.replace(port, &if is_made { "lms".into() } else { self.env.word("spare") })
+        });
+        let typed = typed.replace(MINUTES.0, MINUTES.1);
+        let mut shell = Command::new("sh");
+        // A single command is the shell's own process, so that what ends it ends that.
+        let exec = if commands(line).len() == 1 { "exec " } else { "" };
+        let path = format!("{}:{}", self.env.word("bin"), std::env::var("PATH").unwrap_or_default());
+        shell.arg("-c").arg(format!("{exec}{typed}")).current_dir(&here).process_group(0).env("PATH", path);
+        shell.env("HOME", &here).env("XDG_STATE_HOME", here.join("state")).env_remove("STATE_DIRECTORY");
+        shell.env("SCANHUB_END_WITH_PARENT", "1").env("SCANHUB_LOG", "error").env_remove("SCANHUB_CONFIG");
+        let program = Program::start(shell);
+        let group = Pid::from_raw(program.pid() as i32).expect("a process");
+        let end_at = Instant::now() + LONG_ENOUGH;
+        while !program.is_over() && Instant::now() < end_at {
+            thread::sleep(Duration::from_millis(20));
+        }
+        let is_ended = !program.is_over() && kill_process_group(group, Signal::INT).is_ok();
+        let outcome = program.wait();
+        let is_bounded = [" --for ", " -n "].iter().any(|flag| line.contains(flag));
+        let is_right = match outcome.code {
+            Some(0) => true,
+            // A bounded run that is interrupted says so.
+            Some(130) => is_ended && is_bounded,
+            // Of doctor: a condition is not met, here or on the machine that runs the test.
+            Some(5) => line.starts_with("scanhub doctor"),
+            _ => false,
+        };
+        (!is_right).then(|| format!("{line}: {outcome}"))
+    }
+}
+
+/// What does not end by itself has begun by then.
+const LONG_ENOUGH: Duration = Duration::from_millis(1500);
+
+/// What is wrong with those of `lines` that can be run.
+fn wrong_with(desk: &Desk, lines: &[(String, String)]) -> Vec<String> {
+    let wrong = |(place, line): &(String, String)| Some(format!("{place}: {}", desk.run(line)?));
+    lines.iter().filter_map(wrong).collect()
+}
+
+#[test]
+fn every_line_for_a_shell_runs() {
+    let lines: Vec<_> =
+        all().into_iter().filter(|(_, line)| !is_left_out(line) && !is_of_a_network(line)).collect();
+    assert!(lines.len() > 25, "{lines:#?}");
+    let wrong = wrong_with(&Desk::new(), &lines);
+    assert!(wrong.is_empty(), "{}", wrong.join("\n"));
+}
+
+#[test]
+fn every_line_about_a_network_runs() {
+    in_a_network("pages::lines::every_line_about_a_network_runs", || {
+        let lines: Vec<_> = all().into_iter().filter(|(_, line)| is_of_a_network(line)).collect();
+        assert!(lines.len() > 3, "{lines:#?}");
+        let desk = Desk::new();
+        // One after the other, each with what the one before it leaves running on the page.
+        let (alone, follows): (Vec<_>, Vec<_>) = lines
+            .into_iter()
+            .partition(|(_, line)| line.contains("scanhub listen") || line.contains("gateway"));
+        let mut wrong = wrong_with(&desk, &alone);
+        let name = "--name=robot1=5f3a12bc00d1e2f3";
+        let mut listener = desk.env.start(&["listen", "--json", "--publish", name, "--interface=lo"]).ready();
+        let mut sender = Sender::new(0x5f3a_12bc_00d1_e2f3, 7, 0, "front");
+        sender.announce(&[Topic::Scan, Topic::Zones]);
+        listener.await_line("a sensor", |line| is_class("notice")(line) && line["kind"] == "published");
+        wrong.extend(wrong_with(&desk, &follows));
+        assert!(wrong.is_empty(), "{}", wrong.join("\n"));
+    });
+}
+
+/// What is not run is still a command that exists, with files that exist.
+#[test]
+fn what_is_not_run_is_little_and_names_what_there_is() {
+    let lines = all();
+    for (begin, reason) in NOT_RUN {
+        assert!(lines.iter().any(|(_, line)| line.starts_with(begin)), "{begin} is on no page: {reason}");
+    }
+    for (part, reason) in NOT_RUN_WITH {
+        assert!(lines.iter().any(|(_, line)| line.contains(part)), "{part} is on no page: {reason}");
+    }
+    let top = std::path::Path::new(env!("CARGO_MANIFEST_DIR"));
+    for (place, line) in lines.iter().filter(|(_, line)| is_left_out(line)) {
+        for word in commands(line).concat() {
+            let path = word.trim_start_matches("./").trim_start_matches("../scanhub/");
+            let is_ours =
+                ["clients", "schema", "hub/", "tests/", "docs/"].iter().any(|top| path.starts_with(top));
+            assert!(!is_ours || top.join(path).exists(), "{place}: {line}: there is no {path}");
+        }
+    }
+}
+
+#[test]
+fn a_line_that_does_not_run_is_found() {
+    let desk = Desk::new();
+    for line in
+        ["scanhub ecko front/scan", "scanhub info rear", "scanhub convert none.mcap x.mcap", "scnahub list"]
+    {
+        assert!(desk.run(line).is_some(), "{line}");
+    }
+    assert_eq!(desk.run("scanhub list"), None);
+}

@@ -1,0 +1,140 @@
+//! An example of a page as a program: built as its reader would build it, beside a hub, and what it prints. Refuses to know
+//! what should be printed.
+
+use std::fs;
+use std::path::{Path, PathBuf};
+use std::process::Command;
+use std::sync::OnceLock;
+
+use serde_json::Value;
+
+use super::blocks::Block;
+use crate::client_c::installed::Installed;
+use crate::testkit::{TestEnv, gentle, python};
+
+/// Something to start.
+pub(crate) struct Example {
+    /// The page and the line.
+    pub(crate) place: String,
+    /// As it stands there.
+    pub(crate) text: String,
+    program: PathBuf,
+    arguments: Vec<PathBuf>,
+}
+
+impl Example {
+    /// Built in `env`; nothing, said, where this machine has not what that takes.
+    ///
+    /// The words of the compiler if it refuses.
+    pub(crate) fn build(block: &Block, env: &TestEnv) -> Result<Option<Example>, String> {
+        let name = block.place.replace(['/', '.', ':'], "_");
+        let source = |ending: &str, text: &str| PathBuf::from(env.file(&format!("{name}.{ending}"), text));
+        let program = match block.language.as_str() {
+            "python" => return Ok(of_python(block, &source("py", &block.text))),
+            "rust" => Some(of_rust(&source("rs", &whole(block)), env)?),
+            "c" => of_c(&source("c", &whole(block)), env)?,
+            "cpp" => of_cpp(&source("cpp", &whole(block)), env)?,
+            other => return Err(format!("{}: {other} is no language of programs", block.place)),
+        };
+        let (place, text) = (block.place.clone(), block.text.clone());
+        Ok(program.map(|program| Example { place, text, program, arguments: Vec::new() }))
+    }
+
+    /// The program, to be run in `env` and with the hub there.
+    pub(crate) fn command(&self, env: &TestEnv) -> Command {
+        let mut command = Command::new(&self.program);
+        // What warns is wrong.
+        command.args(&self.arguments).current_dir(env.path("")).env_remove("XDG_RUNTIME_DIR");
+        command.env("SCANHUB_DOMAIN", env.place().name()).env("PYTHONWARNINGS", "error");
+        command.env("RUNTIME_DIRECTORY", env.place().root().parent().expect("it has one"));
+        command.env("PYTHONUNBUFFERED", "1").env("PYTHONDONTWRITEBYTECODE", "1");
+        command.env("PYTHONPATH", Path::new(env!("CARGO_MANIFEST_DIR")).join("clients/python"));
+        command
+    }
+}
+
+/// The block, with a main function around it where it has none.
+fn whole(block: &Block) -> String {
+    let Block { language, text, .. } = block;
+    match language.as_str() {
+        "rust" if !text.contains("fn main") => {
+            format!("fn main() -> Result<(), scanhub_client::Failure> {{\n{text}}}\n")
+        }
+        "c" if !text.contains("int main") => format!("{C}int main(void)\n{{\n{LINES}{text}return 0;\n}}\n"),
+        "cpp" if !text.contains("int main") => format!("{CPP}int main()\n{{\n{LINES}{text}}}\n"),
+        _ => text.clone(),
+    }
+}
+
+fn of_python(block: &Block, source: &Path) -> Option<Example> {
+    let modules = match &block.text {
+        text if text.contains("rosbags") => "rosbags",
+        text if text.contains("mcap") => "mcap, mcap_ros2",
+        _ => "iceoryx2, numpy",
+    };
+    let python = python(modules)?;
+    let (place, text) = (block.place.clone(), block.text.clone());
+    let program = PathBuf::from(python.get_program());
+    Some(Example { place, text, program, arguments: vec![source.to_owned()] })
+}
+
+fn of_c(source: &Path, env: &TestEnv) -> Result<Option<PathBuf>, String> {
+    Installed::once().map(|installed| installed.try_compile(env, source, &[])).transpose()
+}
+
+fn of_cpp(source: &Path, env: &TestEnv) -> Result<Option<PathBuf>, String> {
+    Installed::once().and_then(|installed| installed.try_compile_cpp(env, source)).transpose()
+}
+
+/// By the compiler itself, with the library that Cargo makes.
+fn of_rust(source: &Path, env: &TestEnv) -> Result<PathBuf, String> {
+    let program = env.path(&format!("{}-rust", source.file_stem().expect("a name").display()));
+    let mut command = gentle(std::env::var_os("RUSTC").unwrap_or_else(|| "rustc".into()));
+    command.args(["--edition=2024", "-Dwarnings", "-o"]).arg(&program).arg(source);
+    let library = library();
+    let directory = library.parent().expect("a directory");
+    command.arg(format!("-Ldependency={}", directory.join("deps").display()));
+    command.arg(format!("--extern={LIBRARY}={}", library.display()));
+    let output = command.output().expect("a compiler");
+    if !output.status.success() {
+        return Err(String::from_utf8_lossy(&output.stderr).into_owned());
+    }
+    Ok(program)
+}
+
+/// What a consumer depends on.
+const LIBRARY: &str = "scanhub_client";
+
+/// The one library of this project that a consumer depends on. Built alone: this test and the program, which run, are not made
+/// again.
+fn library() -> &'static Path {
+    static BUILT: OnceLock<PathBuf> = OnceLock::new();
+    BUILT.get_or_init(build_library)
+}
+
+fn build_library() -> PathBuf {
+    let mut command = gentle(env!("CARGO"));
+    command.args(["build", "--offline", "--message-format=json", "--quiet", "--lib"]);
+    command.arg("--package=scanhub-client");
+    if !cfg!(debug_assertions) {
+        command.arg("--release");
+    }
+    let output = command.current_dir(env!("CARGO_MANIFEST_DIR")).output().expect("Cargo");
+    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+    let messages = String::from_utf8(output.stdout).expect("text");
+    let messages = messages.lines().filter_map(|line| serde_json::from_str::<Value>(line).ok());
+    let library = |message: Value| {
+        let files = message["filenames"].as_array()?;
+        let library = files.iter().filter_map(Value::as_str).find(|file| file.ends_with(".rlib"))?;
+        (message["target"]["name"] == LIBRARY).then(|| fs::canonicalize(library).expect("a file"))
+    };
+    let libraries: Vec<_> = messages.filter_map(library).collect();
+    let [library] = &libraries[..] else { panic!("{libraries:?}") };
+    library.clone()
+}
+
+/// What stands before each example in C that is a part of a program.
+const C: &str = "#include <errno.h>\n#include <poll.h>\n#include <scanhub/attach.h>\n#include <stdio.h>\n#include <unistd.h>\n";
+const CPP: &str = "#include <cstdio>\n#include <scanhub/attach.hpp>\n";
+/// What is printed is to be seen by a test, too.
+const LINES: &str = "setvbuf(stdout, NULL, _IOLBF, BUFSIZ);\n";

@@ -1,0 +1,122 @@
+//! What is no program on a page, but what one reads or writes: configurations, worlds, lines of JSON. What is only a text is
+//! named here, with where it is held to the truth.
+
+use std::fs;
+use std::path::Path;
+
+use serde_json::Value;
+
+use super::blocks::{Block, blocks};
+use super::is_program;
+use crate::testkit::{TERM, TestEnv};
+
+/// Texts that are no examples, by how they begin, and what makes sure of them.
+const TEXTS: [(&str, &str, &str); 3] = [
+    ("README.md", " LMS 291 ──RS-422", "a drawing"),
+    ("docs/datagram.md", " 0  53485542", "schema/tests/datagram.rs compares it with the golden datagram"),
+    ("docs/worlds.md", "w.toml:2:1: unknown key", "a_wrong_world_is_refused_as_the_page_says"),
+];
+
+/// What is wrong with a block that is no program, if anything is.
+fn wrong_with(block: &Block) -> Option<String> {
+    match block.language.as_str() {
+        "toml" => wrong_with_toml(block),
+        "json" => block.text.lines().find_map(wrong_with_json),
+        "text" => {
+            let is_named = |(page, begin, _): &(&str, &str, &str)| {
+                block.place.starts_with(page) && block.text.starts_with(begin)
+            };
+            (!TEXTS.iter().any(is_named)).then(|| "a text that nobody checks".to_owned())
+        }
+        "sh" => None,
+        _ if is_program(block) => None,
+        other => Some(format!("nobody knows what to do with {other:?}")),
+    }
+}
+
+/// A configuration, or a world.
+fn wrong_with_toml(block: &Block) -> Option<String> {
+    let env = TestEnv::new();
+    let file = env.file("page.toml", &block.text);
+    let checked = env.run(&["config", "check", &file]);
+    if checked.code == Some(0) {
+        return None;
+    }
+    // A section of its own is one of a configuration that has a link.
+    let with_link = format!("{}\n[[link]]\nname = \"front\"\nport = \"/dev/ttyUSB0\"\n", block.text);
+    let completed = env.run(&["config", "check", &env.file("completed.toml", with_link)]);
+    if checked.errors.contains("no link is configured") && completed.code == Some(0) {
+        return None;
+    }
+    let port = format!("--port={}", env.word("front"));
+    let mut world = env.start(&["simulate", "--json", "--world", &file, &port]);
+    if !world.is_over_before_it_says() {
+        let outcome = world.end(TERM);
+        return (outcome.code != Some(0)).then(|| outcome.to_string());
+    }
+    Some(format!("neither a configuration nor a world: {checked}{}", world.wait()))
+}
+
+/// A line of output, with keys that docs/output.md names.
+fn wrong_with_json(line: &str) -> Option<String> {
+    let Ok(Value::Object(keys)) = serde_json::from_str(line) else {
+        return Some(format!("no object: {line}"));
+    };
+    let page =
+        fs::read_to_string(Path::new(env!("CARGO_MANIFEST_DIR")).join("docs/output.md")).expect("the page");
+    let class = keys.get("class").and_then(Value::as_str).unwrap_or_default();
+    let rows = page.lines().filter(|row| row.starts_with(&format!("| `{class}` |")));
+    let quoted = rows.flat_map(|row| row.split('`').skip(1).step_by(2)).flat_map(str::split_whitespace);
+    let known: Vec<&str> = quoted.collect();
+    let unknown = keys.keys().find(|key| *key != "class" && !known.contains(&key.as_str()));
+    match (known.is_empty(), unknown) {
+        (true, _) => Some(format!("docs/output.md has no class {class:?}: {line}")),
+        (_, Some(key)) => Some(format!("docs/output.md has no key {key} in class {class}: {line}")),
+        (false, None) => None,
+    }
+}
+
+#[test]
+fn what_a_page_shows_is_what_is_read_and_written() {
+    let all = blocks();
+    let wrong: Vec<String> =
+        all.iter().filter_map(|block| Some(format!("{}: {}", block.place, wrong_with(block)?))).collect();
+    assert!(wrong.is_empty(), "{}", wrong.join("\n"));
+    for (page, begin, _) in TEXTS {
+        let is_it = |block: &Block| block.place.starts_with(page) && block.text.starts_with(begin);
+        assert!(all.iter().any(is_it), "{page} has no {begin:?} any more");
+    }
+}
+
+#[test]
+fn what_nobody_could_read_is_found() {
+    for (language, text, what) in [
+        ("toml", "[[link]]\nname = \"front\"\nprot = \"/dev/ttyUSB0\"\n", "did you mean"),
+        ("toml", "[[person]]\npath = [[0, 0]]\nspeed_m_s = 1\n", "unknown key"),
+        ("json", "{\"class\":\"zones\",\"sensor\":\"front\",\"verdikt\":\"clear\"}\n", "no key verdikt"),
+        ("json", "{\"class\":\"zone\"}\n", "no class \"zone\""),
+        ("json", "{\"class\":\"zones\"\n", "no object"),
+        ("text", "8191 mm\n", "nobody checks"),
+        ("", "scanhub list\n", "nobody knows"),
+    ] {
+        let block = Block { place: "docs/planted.md:1".into(), language: language.into(), text: text.into() };
+        assert!(wrong_with(&block).is_some_and(|wrong| wrong.contains(what)), "{block:#?}");
+    }
+    let line = "{\"class\":\"zones\",\"sensor\":\"robot\",\"verdict\":\"clear\",\"nearest_sensor\":null}";
+    assert_eq!(wrong_with_json(line), None);
+}
+
+#[test]
+fn a_wrong_world_is_refused_as_the_page_says() {
+    let is_it = |block: &Block| block.place.starts_with("docs/worlds.md") && block.language == "text";
+    let block = blocks().into_iter().find(is_it).expect("it is there");
+    let env = TestEnv::new();
+    env.file("w.toml", "[[thing]]\nradius_m = 0.04\n");
+    let mut command = env.command(&["simulate", "--world=w.toml", "--port=front"]);
+    let output = command.current_dir(env.path("")).output().expect("it runs");
+    let said = String::from_utf8_lossy(&output.stderr);
+    assert_eq!(output.status.code(), Some(78), "{said}");
+    for line in block.text.lines() {
+        assert!(said.contains(line.trim_end_matches(" ...")), "{line:?} is not in {said}");
+    }
+}

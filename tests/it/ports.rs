@@ -1,0 +1,117 @@
+//! The ways in which a port cannot be used: each has its exit code, its message and its remedy.
+
+use std::os::unix::fs::{PermissionsExt, chown, symlink};
+use std::os::unix::process::CommandExt;
+
+use crate::testkit::{Line, Program, TERM, TestEnv, skip, until};
+use rustix::process::geteuid;
+use serde_json::Value;
+
+/// Whoever is not root and owns nothing.
+const NOBODY: u32 = 65534;
+
+/// What a hub at `port` says, which must end with code 4 and `kind`.
+fn refused(env: &TestEnv, port: &str, kind: &str) -> String {
+    let outcome = env.run(&["run", "--json", &format!("--link=front={port}")]);
+    assert_eq!(outcome.code, Some(4), "{outcome}");
+    said(&outcome.errors, kind)
+}
+
+/// Message and hint of the error at the end of a log.
+fn said(log: &str, kind: &str) -> String {
+    let line: Value = serde_json::from_str(log.lines().last().unwrap_or_default())
+        .unwrap_or_else(|error| panic!("{error}: {log}"));
+    assert_eq!(line["kind"], kind, "{line}");
+    ["message", "hint"].map(|key| line[key].as_str().unwrap_or_default().to_owned()).join("\n")
+}
+
+#[test]
+fn what_is_no_serial_line() {
+    let env = TestEnv::new();
+    let directory = env.word("directory");
+    std::fs::create_dir(&directory).expect("a directory");
+    let file = env.file("file", "");
+    for (port, says) in [
+        (directory.as_str(), "it is a directory"),
+        (file.as_str(), "name a tty"),
+        ("/dev/null", "not a serial line"),
+        (&format!("{file}/front"), "not a serial line"),
+    ] {
+        let text = refused(&env, port, "port_not_tty");
+        assert!(text.contains(port) && text.contains(says), "{text}");
+    }
+}
+
+#[test]
+fn what_is_missing_is_waited_for() {
+    let env = TestEnv::new();
+    symlink("/dev/ttyGone", env.path("dangling")).expect("a link");
+    let hub = env.hub(&[
+        "--link=gone=/dev/serial/by-id/usb-Nobody_Has_This-if00-port0",
+        "--link=never=/dev/ttyNever",
+        &format!("--link=dangling={}", env.word("dangling")),
+    ]);
+    for (sensor, says) in [
+        ("gone", "its adapter is not plugged in"),
+        ("never", "/dev/ttyNever: no such port; "),
+        ("dangling", "it points to /dev/ttyGone, which is not there"),
+    ] {
+        let info = env.await_info(sensor, |info| info["state"] == "absent");
+        assert!(info["last_error"].as_str().is_some_and(|error| error.contains(says)), "{info}");
+    }
+    assert_eq!(hub.end(TERM).code, Some(0));
+}
+
+/// The rights to a pty are taken away: from nobody if this is root, else from its owner.
+#[test]
+fn what_this_user_may_not_open() {
+    let env = TestEnv::new();
+    let _line = Line::at(&env.path("front"));
+    let device = env.path("front").canonicalize().expect("a pty");
+    let is_root = geteuid().is_root();
+    let mode = if is_root { 0o600 } else { 0o000 };
+    std::fs::set_permissions(&device, PermissionsExt::from_mode(mode)).expect("it is ours");
+    let home = env.path("home");
+    std::fs::create_dir(&home).expect("a directory");
+    let mut command = env.command_at(&home, &["run", "--json", &env.link("front")]);
+    if is_root {
+        chown(&home, Some(NOBODY), Some(NOBODY)).expect("root may");
+        if !command_can_run(NOBODY) {
+            skip("open-directory", "the program lies where only root may run it");
+            return;
+        }
+        command.uid(NOBODY).gid(NOBODY);
+    }
+    let outcome = Program::start(command).wait();
+    assert_eq!(outcome.code, Some(4), "{outcome}");
+    let text = said(&outcome.errors, "port_permission");
+    let user = if is_root { "nobody" } else { "user" };
+    let remedy = if is_root { "udev rule" } else { "chmod u+rw" };
+    for says in [&env.word("front"), "no permission", user, &format!("mode {mode:03o}"), remedy] {
+        assert!(text.contains(says), "{says:?}: {text}");
+    }
+}
+
+/// Whether another user may run the program where it lies.
+fn command_can_run(user: u32) -> bool {
+    let mut command = std::process::Command::new(env!("CARGO_BIN_EXE_scanhub"));
+    command.arg("--help").uid(user).gid(user).stdout(std::process::Stdio::null());
+    command.status().is_ok_and(|status| status.success())
+}
+
+#[test]
+fn what_another_process_has() {
+    let env = TestEnv::new();
+    let line = Line::at(&env.path("front"));
+    let hub = env.hub(&[env.link("front")]);
+    line.await_open();
+    let other = TestEnv::new();
+    let text = refused(&other, &env.word("front"), "port_busy");
+    let holder = format!("in use by process {} (scanhub)", hub.pid());
+    assert!(text.contains(&holder) && text.contains("stop it first"), "{text}");
+    // On a pty the exclusive mode outlives a close; whoever comes next finds none.
+    assert_eq!(hub.end(TERM).code, Some(0));
+    until("the line is closed", || !line.is_open());
+    let _hub = other.hub(&[env.link("front")]);
+    line.await_open();
+}

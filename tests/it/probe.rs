@@ -1,0 +1,119 @@
+//! `scanhub probe`, as somebody runs it: it tells what is there, and leaves it as it was.
+
+use crate::testkit;
+use crate::testkit::{INT, TERM, TestEnv, number};
+use serde_json::Value;
+
+#[test]
+fn a_sensor_tells_of_itself_and_is_left_as_it_was() {
+    let env = TestEnv::new();
+    let simulator = env.simulator(&["front"], &["--baud=19200", "--type=lms291", "--unit=cm"]);
+    let port = env.word("front");
+    for _ in 0..2 {
+        let outcome = env.run(&["probe", &port, "--json"]);
+        assert_eq!(outcome.code, Some(0), "{outcome}");
+        let [found] = &outcome.lines()[..] else { panic!("{outcome}") };
+        let text = String::from_utf8_lossy(&outcome.out);
+        let begin =
+            format!(r#"{{"class":"probe","port":"{port}","baud":19200,"type":"LMS291","number":"301063""#);
+        assert!(text.starts_with(&begin), "{text}");
+        assert_eq!((number(found, "operating_mode"), number(found, "unit_mm")), (0x25, 10), "{found}");
+        assert_eq!(
+            (&found["permanent_rate"], &found["defective"]),
+            (&Value::Bool(false), &Value::Bool(false))
+        );
+        assert_eq!(found["errors"], Value::Array(Vec::new()));
+        assert_eq!(found["configuration"].as_str().map(str::len), Some(68), "{found}");
+        assert_eq!(outcome.errors, "", "no progress without a terminal");
+    }
+    let outcome = env.run(&["probe", &port]);
+    let text = String::from_utf8_lossy(&outcome.out);
+    for word in ["LMS291", "19200 Bd", "values on request", "10 mm", "180 degrees", "errors"] {
+        assert!(text.contains(word), "{word}: {outcome}");
+    }
+    assert_eq!(simulator.end(TERM).code, Some(0));
+    assert_eq!(env.simulated("front").1, 0);
+}
+
+#[test]
+fn a_dirty_window_is_told_whatever_the_status_byte_says() {
+    let env = TestEnv::new();
+    let _simulator = env.simulator(&["front"], &["--type=lms291", "--pollution=20"]);
+    let port = env.word("front");
+    let found = env.run(&["probe", &port, "--json"]);
+    assert_eq!(found.lines()[0]["polluted"], true, "{found}");
+    let outcome = env.run(&["probe", &port]);
+    let text = String::from_utf8_lossy(&outcome.out);
+    assert!(text.contains("ok, window polluted"), "{outcome}");
+    assert!(text.contains("lets through 20 % of what it did when clean: clean it"), "{outcome}");
+}
+
+#[test]
+fn a_stream_goes_on() {
+    let env = TestEnv::new();
+    let simulator = env.simulator(&["front"], &["--baud=500000"]);
+    // A hub that is killed leaves its sensor streaming.
+    let hub = env.hub(&[env.link("front")]);
+    env.await_info("front", |info| info["state"] == "streaming");
+    hub.end(testkit::KILL);
+    let found = env.run(&["probe", &env.word("front"), "--json"]);
+    assert_eq!((found.code, number(&found.lines()[0], "operating_mode")), (Some(0), 0x24), "{found}");
+    let sent = env.truth("front").len();
+    testkit::until("it streams on", || env.truth("front").len() > sent + 20);
+    assert_eq!(simulator.end(TERM).code, Some(0));
+    assert_eq!(env.simulated("front").1, 0);
+}
+
+#[test]
+fn nobody_there() {
+    let env = TestEnv::new();
+    let _simulator = env.simulator(&["front"], &["--fault=mute=1"]);
+    let outcome = env.run(&["probe", &env.word("front"), "--json"]);
+    let error = &outcome.of_class("error")[0];
+    assert_eq!((outcome.code, &error["kind"]), (Some(3), &"timeout".into()), "{outcome}");
+    for (port, code, kind) in [("/dev/null", 4, "port_not_tty"), ("/no/such", 4, "port_missing")] {
+        let outcome = env.run(&["probe", port, "--json"]);
+        assert_eq!((outcome.code, &outcome.of_class("error")[0]["kind"]), (Some(code), &kind.into()));
+        assert!(
+            !outcome.of_class("error")[0].to_string().contains("file:"),
+            "no recording is asked: {outcome}"
+        );
+    }
+    let outcome = env.run(&["probe", "file:/etc/hostname", "--json"]);
+    assert_eq!((outcome.code, &outcome.of_class("error")[0]["kind"]), (Some(78), &"configuration".into()));
+}
+
+#[test]
+fn an_interrupt_ends_it() {
+    let env = TestEnv::new();
+    let _simulator = env.simulator(&["front"], &["--fault=mute=1"]);
+    let mut probe = env.command(&["probe", &env.word("front"), "--json"]);
+    probe.env("SCANHUB_LOG", "off");
+    let program = testkit::Program::start(probe);
+    testkit::until("it has the port", || {
+        let device = env.path("front").canonicalize().unwrap();
+        let open = std::fs::read_dir(format!("/proc/{}/fd", program.pid())).into_iter().flatten().flatten();
+        open.filter_map(|fd| std::fs::read_link(fd.path()).ok()).any(|target| target == device)
+    });
+    let outcome = program.end(INT);
+    assert_eq!((outcome.code, &outcome.of_class("error")[0]["kind"]), (Some(130), &"interrupted".into()));
+}
+
+#[test]
+fn without_a_port_the_candidates_are_listed() {
+    let env = TestEnv::new();
+    let outcome = env.run(&["probe", "--json"]);
+    match outcome.code {
+        // What there is depends on the machine.
+        Some(0) => {
+            for line in outcome.lines() {
+                assert_eq!(line["class"], "candidate", "{outcome}");
+                assert!(line["device"].as_str().is_some_and(|device| device.starts_with("/dev/")), "{line}");
+            }
+        }
+        code => {
+            let error = &outcome.of_class("error")[0];
+            assert_eq!((code, &error["kind"]), (Some(4), &"port_missing".into()), "{outcome}");
+        }
+    }
+}

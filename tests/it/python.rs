@@ -1,0 +1,291 @@
+//! The Python package beside a hub: its scripts check themselves what only Python can see, and what they follow is compared
+//! with what `echo` says. Skips, saying so, where there is no Python with iceoryx2 and numpy.
+
+use std::collections::BTreeMap;
+use std::io::Write;
+use std::path::Path;
+use std::process::Command;
+
+use crate::testkit::{
+    INT, KILL, Outcome, Program, Sender, TERM, TestEnv, in_a_network, is_class, number, python, until,
+};
+use schema::{Topic, Verdict, Zones};
+use serde_json::{Value, json};
+
+/// A script of the package's tests, if there is a Python for it.
+fn check(name: &str) -> Option<Command> {
+    let mut command = python("iceoryx2, numpy")?;
+    let package = Path::new(env!("CARGO_MANIFEST_DIR")).join("clients/python");
+    command.arg(package.join("tests").join(name).with_extension("py"));
+    command.env("PYTHONPATH", package).env_remove("SCANHUB_DOMAIN");
+    Some(command)
+}
+
+/// The same with the environment's domain and root as its first arguments.
+fn check_on(env: &TestEnv, name: &str) -> Option<Command> {
+    let mut command = check(name)?;
+    let place = env.place();
+    let root = place.root().parent().expect("a domain is below its base");
+    command.arg(place.name()).arg(root);
+    Some(command)
+}
+
+fn passed(command: Command) {
+    let outcome = Program::start(command).wait();
+    assert_eq!(outcome.code, Some(0), "{outcome}");
+    print!("{}", String::from_utf8_lossy(&outcome.out));
+}
+
+fn streaming(env: &TestEnv) -> (Program, Program) {
+    let simulator = env.simulator(&["front"], &["--seed=61", "--baud=500000"]);
+    let hub = env.hub(&[&env.link("front"), "--set=background.scans=20"]);
+    (simulator, hub)
+}
+
+#[test]
+fn structs_are_golden() {
+    let Some(mut command) = check("layouts") else { return };
+    command.arg(Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/vectors/v1"));
+    passed(command);
+}
+
+#[test]
+fn verdicts_grow_stale() {
+    let Some(command) = check("freshness") else { return };
+    passed(command);
+}
+
+#[test]
+fn arrays_are_views_of_shared_memory() {
+    let env = TestEnv::new();
+    let Some(command) = check_on(&env, "views") else { return };
+    let _running = streaming(&env);
+    passed(command);
+}
+
+#[test]
+fn what_cannot_be_followed_is_told_in_words() {
+    let env = TestEnv::new();
+    let Some(command) = check_on(&env, "refusals") else { return };
+    passed(command);
+}
+
+#[test]
+fn models_and_the_flow_of_data_on_request() {
+    let env = TestEnv::new();
+    let Some(command) = check_on(&env, "models") else { return };
+    let _running = streaming(&env);
+    passed(command);
+}
+
+#[test]
+fn samples_say_what_echo_says() {
+    const TOPICS: [&str; 7] = ["telegram", "scan", "marks", "zones", "foreground", "background", "status"];
+    let env = TestEnv::new();
+    let topics = TOPICS.map(|topic| format!("front/{topic}"));
+    let Some(mut command) = check_on(&env, "follow") else { return };
+    let (_simulator, hub) = streaming(&env);
+    let mut follower = Program::start({
+        command.args(&topics);
+        command
+    });
+    follower.await_line("a scan", is_class("scan"));
+    let mut echo = env.start(&[&["echo", "--json"], &topics.each_ref().map(String::as_str)[..]].concat());
+    for program in [&mut echo, &mut follower] {
+        program.await_lines(2, "a background", is_class("background"));
+        program.await_lines(40, "a scan", is_class("scan"));
+        program.await_lines(2, "a status", is_class("status"));
+    }
+    let (echo, follower) = (echo.end(INT), ended_by_interrupt(follower));
+    drop(hub);
+    for topic in TOPICS {
+        let said = echo.of_class(topic);
+        let same = follower.of_class(topic).iter().filter(|sample| said_by(&said, sample)).count();
+        let wanted = if ["background", "status"].contains(&topic) { 1 } else { 20 };
+        assert!(same >= wanted, "{topic}: {same} of {} are what echo said", said.len());
+    }
+}
+
+/// Whether `echo` said the same of the sample; what it said otherwise fails. A status and a background have no number.
+fn said_by(echo: &[Value], sample: &Value) -> bool {
+    let is_numbered = |line: &Value| line.get("topic_seq").is_some();
+    let same = |line: &&Value| line["topic_seq"] == sample["topic_seq"] && line["boot"] == sample["boot"];
+    if !echo.iter().any(is_numbered) {
+        return echo.iter().any(|line| differing(line, sample).is_empty());
+    }
+    // Whether a verdict is too old each of the two says of itself.
+    let is_stale = |line: &Value| line["stale"] == true;
+    let Some(line) = echo.iter().find(same).filter(|line| !is_stale(line) && !is_stale(sample)) else {
+        return false;
+    };
+    let differing = differing(line, sample);
+    assert!(differing.is_empty(), "{differing:?}: {line} {sample}");
+    true
+}
+
+/// The keys of `line` that `sample` has not, or otherwise.
+fn differing<'a>(line: &'a Value, sample: &Value) -> Vec<&'a String> {
+    let keys = line.as_object().expect("an object").keys();
+    // Derived from the mode: what the package offers is the mode itself.
+    keys.filter(|key| *key != "marks" || line["class"] == "marks")
+        .filter(|key| line[*key] != sample[*key])
+        .collect()
+}
+
+#[test]
+fn one_subscription_follows_several_sensors() {
+    let env = TestEnv::new();
+    let Some(mut command) = check_on(&env, "follow") else { return };
+    command.args(["front/scan", "rear/scan", "rear/status"]);
+    let _simulator = env.simulator(&["front", "rear"], &["--seed=63", "--baud=500000"]);
+    let _hub = env.hub(&[env.link("front"), env.link("rear")]);
+    let mut follower = Program::start(command);
+    for (sensor, topic, count) in [("front", "scan", 40), ("rear", "scan", 40), ("rear", "status", 2)] {
+        follower.await_lines(count, sensor, |line| line["sensor"] == sensor && line["class"] == topic);
+    }
+    ended_by_interrupt(follower);
+}
+
+#[test]
+fn a_subscription_outlives_several_hubs() {
+    let env = TestEnv::new();
+    let Some(mut command) = check_on(&env, "follow") else { return };
+    command.args(["front/scan", "front/telegram", "front/zones"]);
+    let _simulator = env.simulator(&["front"], &["--seed=62", "--baud=500000"]);
+    // It is there before its hub is.
+    let mut follower = Program::start(command);
+    let mut hub = env.hub(&[env.link("front")]);
+    follower.await_line("hub_back", |line| line["kind"] == "hub_back");
+    for how in [KILL, TERM, KILL] {
+        follower.await_lines(20, "a scan", is_class("scan"));
+        let code = hub.end(how).code;
+        assert_eq!(code, (how == TERM).then_some(0));
+        follower.await_line("hub_gone", |line| line["kind"] == "hub_gone");
+        hub = env.hub(&[env.link("front")]);
+        follower.await_line("hub_back", |line| line["kind"] == "hub_back");
+    }
+    follower.await_lines(20, "a scan", is_class("scan"));
+    let outcome = ended_by_interrupt(follower);
+    let stale: Vec<Value> =
+        outcome.of_class("zones").into_iter().filter(|line| line["stale"] == true).collect();
+    assert!(stale.iter().all(|line| line["verdict"] == "unknown" && line["zones"] == json!([])));
+    assert!(stale.len() >= 2, "killed hubs leave a silence: {stale:?}");
+    for topic in ["scan", "telegram"] {
+        let mut lives = BTreeMap::<String, Vec<Value>>::new();
+        for line in outcome.of_class(topic) {
+            let boot = line["boot"].as_str().expect("a life").to_owned();
+            let life = lives.entry(boot).or_default();
+            let python = &line["python"];
+            // Who was there before the hub got its samples from the first one on.
+            let next = life.last().map_or(0, |last| number(last, "topic_seq") + 1);
+            let is_first_hub = outcome.of_class(topic)[0]["boot"] == line["boot"];
+            assert_eq!(python["restarted"], life.is_empty() && !is_first_hub, "{line}");
+            if !life.is_empty() || !is_first_hub {
+                assert_eq!(number(&line, "topic_seq"), next + number(python, "missed"), "{line}");
+            }
+            life.push(line);
+        }
+        assert_eq!(lives.len(), 4, "{topic}");
+    }
+}
+
+/// The worst of its sensors, of which one is switched off, then the hub killed: nothing stays clear by itself.
+#[test]
+fn a_robot_is_as_unknown_as_its_worst_sensor() {
+    let env = TestEnv::new();
+    let Some(mut named) = check_on(&env, "robot") else { return };
+    named.args(["front", "rear"]);
+    let Some(all) = check_on(&env, "robot") else { return };
+    let mut followers = [named, all].map(Program::start);
+    for follower in &mut followers {
+        let first = follower.await_line("there is no hub", is_class("robot"));
+        assert_eq!((&first["verdict"], &first["nearest_mm"]), (&"unknown".into(), &Value::Null), "{first}");
+    }
+    let _front = env.simulator(&["front"], &["--seed=64", "--baud=500000"]);
+    let rear = env.start(&["simulate", "--json", "--baud=500000", &format!("--port={}", env.word("rear"))]);
+    let rear = rear.ready();
+    // All is clear: nothing in the simulated room is so near.
+    let hub = env.hub(&[&env.link("front"), &env.link("rear"), "--set=zones.radii=[0.02,0.01]"]);
+    let are = |verdict: &'static str, front: &'static str, rear: &'static str| {
+        move |line: &Value| {
+            line["verdict"] == verdict && line["sensors"] == json!({ "front": front, "rear": rear })
+        }
+    };
+    for follower in &mut followers {
+        let line = follower.await_line("all is clear", are("clear", "clear", "clear"));
+        assert!(line["worst"] == "front" && line["nearest_mm"].is_u64(), "{line}");
+        assert!(["front", "rear"].contains(&line["nearest_sensor"].as_str().unwrap_or_default()), "{line}");
+        follower
+            .await_line("by now, too", |line| line["class"] == "now" && are("clear", "clear", "clear")(line));
+    }
+    env.kill_simulator(rear, "rear");
+    for follower in &mut followers {
+        let line = follower.await_line("the rear is gone", are("unknown", "clear", "unknown"));
+        assert_eq!(line["worst"], "rear", "{line}");
+    }
+    assert_eq!(hub.end(KILL).code, None);
+    for follower in &mut followers {
+        follower.await_line("the hub is gone", are("unknown", "unknown", "unknown"));
+    }
+    for follower in followers {
+        ended_by_interrupt(follower);
+    }
+}
+
+#[test]
+fn without_a_hub_the_robot_is_of_the_sensors_of_other_machines() {
+    in_a_network("python::without_a_hub_the_robot_is_of_the_sensors_of_other_machines", || {
+        let env = TestEnv::new();
+        let Some(command) = check_on(&env, "robot") else { return };
+        let mut listener =
+            env.start(&["listen", "--json", "--publish", "--name=robot1=0000000000000001"]).ready();
+        let mut front = Sender::new(1, 7, 0, "front");
+        front.announce(&[Topic::Zones]);
+        Sender::new(1, 7, 1, "mapper").announce(&[Topic::Scan]);
+        listener.await_lines(2, "its sensors", |line| line["kind"] == "published");
+        let mut robot = Program::start(command);
+        let are = |verdict: &'static str, sensor: &'static str| {
+            move |line: &Value| line["verdict"] == verdict && line["sensors"] == json!({ sensor: verdict })
+        };
+        robot.await_line("nobody was heard", are("unknown", "robot1.front"));
+        front.send(Topic::Zones, &Zones { verdict: Verdict::Clear as u8, ..Zones::unknown() });
+        robot.await_line("clear", are("clear", "robot1.front"));
+        robot.await_line("silence", are("unknown", "robot1.front"));
+        // One who always finds something that is sent from elsewhere, too.
+        let mut command = check_on(&env, "robot").expect("as before");
+        command.arg("--asked");
+        let (stdin, mut ask) = std::io::pipe().expect("a pipe");
+        let mut busy = Program::start_with(command, stdin);
+        let mut hear = |busy: &mut Program| {
+            front.send(Topic::Zones, &Zones { verdict: Verdict::Clear as u8, ..Zones::unknown() });
+            ask.write_all(b"\n").expect("it reads");
+            busy.await_line("what it knows", is_class("now"))["sensors"].clone()
+        };
+        until("the other machine's", || hear(&mut busy).get("robot1.front").is_some());
+        // A hub has sensors of its own, and when it goes nobody stands in for them.
+        let _simulator = env.simulator(&["front"], &["--seed=65", "--baud=500000"]);
+        let hub = env.hub(&[&env.link("front"), "--set=zones.radii=[0.02,0.01]"]);
+        until("the hub's own", || hear(&mut busy) == json!({"front": "clear"}));
+        robot.await_line("all is forgotten", |line| {
+            line["sensors"] == json!({}) && line["verdict"] == "unknown"
+        });
+        robot.await_line("the hub's own", are("clear", "front"));
+        assert_eq!(hub.end(KILL).code, None);
+        robot.await_line("the hub is gone", are("unknown", "front"));
+        front.send(Topic::Zones, &Zones { verdict: Verdict::Clear as u8, ..Zones::unknown() });
+        let mut named = env.start(&["echo", "--json", "robot1.front/zones"]);
+        named.await_line("whom one names is heard", |line| line["verdict"] == "clear");
+        let outcome = ended_by_interrupt(robot);
+        let last = outcome.of_class("robot").pop().expect("a line");
+        assert!(are("unknown", "front")(&last), "{outcome}");
+        assert_eq!(listener.end(TERM).code, Some(0));
+    });
+}
+
+/// Ctrl-C ends it at once, as any program in Python.
+fn ended_by_interrupt(follower: Program) -> Outcome {
+    let outcome = follower.end(INT);
+    assert_eq!(outcome.code, Some(0), "{outcome}");
+    assert_eq!(outcome.of_class("end").len(), 1, "{outcome}");
+    outcome
+}

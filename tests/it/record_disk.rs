@@ -1,0 +1,329 @@
+//! `scanhub record` on disks that are full, gone, slow or too small: no live topic loses a sample to them, what can be held
+//! is not lost either, and what is missing is said and seen in the file.
+
+use std::collections::BTreeMap;
+use std::fs;
+use std::io::{self, Read};
+use std::path::{Path, PathBuf};
+use std::process::{Command, Stdio};
+use std::thread;
+use std::time::{Duration, Instant};
+
+use crate::testkit::{
+    INT, Kept, Outcome, Program, Recording, TestEnv, is_class, number, scan, skip, unbroken, until,
+};
+use serde_json::Value;
+
+/// A sensor that streams.
+fn sensor(env: &TestEnv) -> [Program; 2] {
+    let simulator = env.simulator(&["front"], &["--world=room"]);
+    let hub = env.hub(&[env.link("front")]);
+    env.await_info("front", |info| info["state"] == "streaming");
+    [simulator, hub]
+}
+
+fn is_kind(kind: &str) -> impl Fn(&Value) -> bool {
+    move |line| line["kind"] == kind
+}
+
+fn await_samples(recorder: &mut Program, more: u64) {
+    let samples = |recorder: &mut Program, least| {
+        let wanted = move |line: &Value| line["class"] == "recording" && number(line, "samples") >= least;
+        number(&recorder.await_line("samples", wanted), "samples")
+    };
+    let before = samples(recorder, 0);
+    samples(recorder, before + more);
+}
+
+/// The files of a run that came to its end, each in its order.
+fn files(outcome: &Outcome) -> Vec<PathBuf> {
+    assert_eq!(outcome.code, Some(0), "{outcome}");
+    let end = outcome.of_class("recorded").pop().unwrap_or_else(|| panic!("{outcome}"));
+    let files = end["files"].as_array().unwrap().iter();
+    files.map(|file| PathBuf::from(file.as_str().unwrap())).collect()
+}
+
+/// No telegram was lost on the way to the recorder.
+fn nothing_lost(outcome: &Outcome) {
+    let lines = outcome.of_class("summary");
+    let telegrams = lines.iter().find(|line| line["topic"] == "telegram").expect("a summary");
+    assert_eq!(number(telegrams, "lost"), 0, "{telegrams}");
+}
+
+/// The telegrams of several files, none of which is missing or there twice.
+fn telegrams(recordings: &[Recording]) -> Vec<&Kept> {
+    let all: Vec<_> = recordings.iter().flat_map(|recording| recording.of("front/telegram")).collect();
+    unbroken(&all);
+    all
+}
+
+#[test]
+fn a_recording_goes_on_in_files_of_which_the_last_stay() {
+    let env = TestEnv::new();
+    let _others = sensor(&env);
+    let file = env.word("walk.mcap");
+    let mut recorder = env.start(&["record", "--json", "--split=64KiB", "--keep=3", "-o", &file]);
+    for _ in 0..4 {
+        recorder.await_line("the next file", is_kind("file"));
+    }
+    await_samples(&mut recorder, 20);
+    let outcome = recorder.end(INT);
+    let files = files(&outcome);
+    assert_eq!(files[0], env.path("walk-0001.mcap"));
+    let (gone, stay) = files.split_at(files.len() - 3);
+    assert!(gone.iter().all(|file| !file.exists()), "{files:?}");
+    // A machine that has no time for the recorder makes one chunk of what came meanwhile.
+    let lengths: Vec<_> = stay.iter().map(|file| fs::metadata(file).unwrap().len()).collect();
+    assert!(lengths.iter().all(|length| *length <= 96 << 10), "{lengths:?}");
+    assert!(lengths.iter().filter(|length| **length <= 64 << 10).count() > 1, "{lengths:?}");
+    let recordings: Vec<_> = stay.iter().map(|file| Recording::whole(file)).collect();
+    let wanted = |number: usize| (files.len() - 3 + number).to_string();
+    for (number, recording) in recordings.iter().enumerate() {
+        // So that it can be played alone.
+        assert_eq!(recording.kept[0].topic, "front/status");
+        assert_eq!(recording.notes("scanhub")[0]["part"], wanted(number + 1));
+        assert_eq!(recording.notes("scanhub.life").len(), 1);
+    }
+    nothing_lost(&outcome);
+    assert!(telegrams(&recordings).len() > 20);
+}
+
+#[test]
+fn a_file_that_may_not_grow_is_followed_by_another() {
+    let env = TestEnv::new();
+    let _others = sensor(&env);
+    // 128 blocks of 512 or 1024 bytes.
+    let limited = ["sh", "-c", "ulimit -f 128; exec \"$@\"", "sh"];
+    let mut recorder = start_in(&env, &limited, &["record", "--json", "-o", &env.word("walk.mcap")]);
+    recorder.await_line("the next file", is_kind("file"));
+    recorder.await_line("the next file", is_kind("file"));
+    let outcome = recorder.end(INT);
+    let files = files(&outcome);
+    assert_eq!(files[..2], [env.path("walk.mcap"), env.path("walk-0002.mcap")]);
+    // There is no room for the index of any but the last one.
+    let recordings: Vec<_> = files.iter().map(|file| Recording::left(file)).collect();
+    nothing_lost(&outcome);
+    assert!(telegrams(&recordings).len() > 50);
+}
+
+#[test]
+fn a_directory_that_vanishes_is_waited_for() {
+    let env = TestEnv::new();
+    let _others = sensor(&env);
+    let place = env.path("usb");
+    fs::create_dir(&place).unwrap();
+    let file = place.join("walk.mcap");
+    let mut recorder = env.start(&["record", "--json", "-o", &file.display().to_string()]);
+    await_samples(&mut recorder, 20);
+    fs::rename(&place, env.path("unplugged")).unwrap();
+    let trouble = recorder.await_line("trouble", is_kind("disk_trouble"));
+    assert_eq!(trouble["file"], file.display().to_string());
+    fs::create_dir(&place).unwrap();
+    recorder.await_line("well", is_kind("disk_well"));
+    await_samples(&mut recorder, 20);
+    let outcome = recorder.end(INT);
+    assert_eq!(files(&outcome)[1], place.join("walk-0002.mcap"));
+    // What was written until it was seen is where the directory is now.
+    let places = [env.path("unplugged/walk.mcap"), place.join("walk-0002.mcap")];
+    let recordings = [Recording::left(&places[0]), Recording::whole(&places[1])];
+    nothing_lost(&outcome);
+    assert!(telegrams(&recordings).len() > 10);
+}
+
+#[test]
+fn a_full_disk_is_waited_for() {
+    let env = TestEnv::new();
+    let place = env.path("small");
+    fs::create_dir(&place).unwrap();
+    let mount = format!("mount -t tmpfs -o size=256k none {0} && echo > {0}/filler", place.display());
+    let trial = Command::new("unshare").args(["-rm", "sh", "-c", &mount]).output();
+    if !trial.is_ok_and(|outcome| outcome.status.success()) {
+        skip("mounts", "this user may not make a file system of its own (unshare -rm, mount)");
+        return;
+    }
+    let _others = sensor(&env);
+    let script = format!("{mount} && head -c 131072 /dev/zero > {}/filler && exec \"$@\"", place.display());
+    let file = place.join("walk.mcap").display().to_string();
+    let mut recorder =
+        start_in(&env, &["unshare", "-rm", "sh", "-c", &script, "sh"], &["record", "--json", "-o", &file]);
+    recorder.await_line("trouble", is_kind("disk_trouble"));
+    // As the recorder sees it.
+    let seen = PathBuf::from(format!("/proc/{}/root{}", recorder.pid(), place.display()));
+    let full = Recording::left(&seen.join("walk.mcap"));
+    assert!(!full.of("front/telegram").is_empty(), "it ends behind a whole chunk");
+    fs::remove_file(seen.join("filler")).unwrap();
+    recorder.await_line("well", is_kind("disk_well"));
+    let before = Recording::left(&seen.join("walk.mcap")).kept.len();
+    until("it goes on", || Recording::left(&seen.join("walk.mcap")).kept.len() > before);
+    // It ends with the file system that it is in.
+    let mut open = fs::File::open(seen.join("walk.mcap")).unwrap();
+    let outcome = recorder.end(INT);
+    assert_eq!(files(&outcome).len(), 1);
+    let mut bytes = Vec::new();
+    open.read_to_end(&mut bytes).unwrap();
+    nothing_lost(&outcome);
+    telegrams(&[Recording::whole(Path::new(&env.file("walk.mcap", bytes)))]);
+}
+
+#[test]
+fn what_cannot_be_held_is_left_out_and_said() {
+    let env = TestEnv::new();
+    let stream: Vec<u8> = (0..40_000_u32).flat_map(|seed| scan((seed % 8000) as u16)).collect();
+    env.file("stream", stream);
+    // A pipe that nobody reads: as slow as a disk can be. Held open so that the shell need not wait for its reader.
+    let pipe = env.path("pipe");
+    assert!(Command::new("mkfifo").arg(&pipe).status().unwrap().success());
+    let open = fs::File::options().read(true).write(true).open(&pipe).unwrap();
+    let shell = format!("exec \"$@\" 2>&1 > {}", pipe.display());
+    let topics = ["record", "--json", "-o", "-", "front/telegram", "front/scan", "front/status"];
+    let mut recorder = start_in(&env, &["sh", "-c", &shell, "sh"], &topics);
+    recorder.await_line("its begin", is_class("recording"));
+    let mut reader = fs::File::open(&pipe).unwrap();
+    drop(open);
+    let _hub = env.hub(&[format!("--link=front=file:{}?rate=max", env.word("stream"))]);
+    recorder.await_line("the gap", is_kind("gap_begins"));
+    let read = thread::spawn(move || {
+        let mut bytes = Vec::new();
+        reader.read_to_end(&mut bytes).map(|_| bytes)
+    });
+    let gap = recorder.await_line("its end", is_kind("gap_ends"));
+    let outcome = recorder.end(INT);
+    let end = outcome.of_class("recorded").pop().unwrap_or_else(|| panic!("{outcome}"));
+    let recording = Recording::read(&read.join().unwrap().unwrap(), &pipe);
+    assert!(number(&gap, "left_out") > 0 && number(&end, "left_out") >= number(&gap, "left_out"), "{end}");
+    assert_eq!(number(&end, "samples"), recording.kept.len() as u64);
+    let left_out = |gap: &&BTreeMap<String, String>| -> u64 {
+        let counts = gap.iter().filter(|(key, _)| key.contains('/'));
+        counts.map(|(_, count)| count.parse::<u64>().unwrap()).sum()
+    };
+    let told: u64 = recording.notes("scanhub.gap").iter().map(left_out).sum();
+    assert_eq!(told, number(&end, "left_out"));
+}
+
+#[test]
+fn signals_that_come_together_are_one() {
+    let env = TestEnv::new();
+    let _others = sensor(&env);
+    // So little room that it waits for who reads, also at its end.
+    let pipe = env.path("pipe");
+    assert!(Command::new("mkfifo").arg(&pipe).status().unwrap().success());
+    let open = fs::File::options().read(true).write(true).open(&pipe).unwrap();
+    rustix::pipe::fcntl_setpipe_size(&open, 4096).unwrap();
+    let shell = format!("exec \"$@\" 2>&1 > {}", pipe.display());
+    let mut recorder = start_in(&env, &["sh", "-c", &shell, "sh"], &["record", "--json", "-o", "-"]);
+    recorder.await_line("its begin", is_class("recording"));
+    let mut reader = fs::File::open(&pipe).unwrap();
+    drop(open);
+    until("it receives", || env.subscribers("front/status") > 0);
+    recorder.await_lines(2, "its progress", is_class("recording"));
+    recorder.signal(INT);
+    recorder.await_line("the last summary", |line| line["class"] == "summary" && line["topic"] == "status");
+    let together_until = Instant::now() + Duration::from_millis(300);
+    while Instant::now() < together_until {
+        recorder.signal(INT);
+        thread::yield_now();
+    }
+    let read = thread::spawn(move || {
+        let mut bytes = Vec::new();
+        reader.read_to_end(&mut bytes).map(|_| bytes)
+    });
+    let outcome = recorder.wait();
+    assert_eq!(outcome.code, Some(0), "{outcome}");
+    let bytes = read.join().unwrap().unwrap();
+    assert!(bytes.len() > 4096 && bytes.ends_with(b"\x89MCAP0\r\n"), "{} bytes", bytes.len());
+}
+
+#[test]
+fn what_cannot_be_begun_leaves_nothing_behind() {
+    let env = TestEnv::new();
+    let limited = ["sh", "-c", "ulimit -f 0; exec \"$@\"", "sh"];
+    let outcome = start_in(&env, &limited, &["record", "--json", "-o", &env.word("walk.mcap")]).wait();
+    assert_eq!(outcome.code, Some(75), "{outcome}");
+    assert_eq!(outcome.of_class("error")[0]["kind"], "short", "{outcome}");
+    assert!(!env.path("walk.mcap").exists());
+    // What is no file of its own stays.
+    std::os::unix::fs::symlink("/dev/null", env.path("nothing")).unwrap();
+    let outcome = env.run(&["record", "--json", "--force", "--for=5s", "-o", &env.word("nothing")]);
+    assert_eq!(outcome.of_class("error")[0]["kind"], "no_hub", "{outcome}");
+    assert!(fs::symlink_metadata(env.path("nothing")).is_ok());
+}
+
+#[test]
+fn a_recording_whose_reader_went_away_has_failed() {
+    let env = TestEnv::new();
+    let (reader, writer) = io::pipe().unwrap();
+    drop(reader);
+    let refused = |outcome: std::process::Output| {
+        let said = String::from_utf8_lossy(&outcome.stderr).into_owned();
+        assert_eq!(outcome.status.code(), Some(1), "{said}");
+        assert!(said.contains("whoever read the recording is gone"), "{said}");
+    };
+    let begin = env.command(&["record", "-o", "-"]).stdout(writer).stderr(Stdio::piped()).output();
+    refused(begin.unwrap());
+    // A connection that breaks in the middle of it looks the same.
+    let _others = sensor(&env);
+    let (mut reader, writer) = io::pipe().unwrap();
+    let mut command = env.command(&["record", "-o", "-", "--for=60s"]);
+    let recorder = command.stdout(writer).stderr(Stdio::piped()).spawn().unwrap();
+    drop(command);
+    reader.read_exact(&mut [0; 20_000]).unwrap();
+    drop(reader);
+    refused(recorder.wait_with_output().unwrap());
+}
+
+#[test]
+fn samples_of_a_file_that_was_removed_are_not_counted() {
+    let env = TestEnv::new();
+    let _others = sensor(&env);
+    let file = env.word("walk.mcap");
+    let mut recorder = env.start(&["record", "--json", "-o", &file]);
+    await_samples(&mut recorder, 20);
+    fs::remove_file(&file).unwrap();
+    let gone = recorder.await_line("the loss", is_kind("file_gone"));
+    assert_eq!(gone["file"], file);
+    await_samples(&mut recorder, 20);
+    let outcome = recorder.end(INT);
+    let end = outcome.of_class("recorded").pop().unwrap_or_else(|| panic!("{outcome}"));
+    assert_eq!((number(&end, "gone"), number(&gone, "samples") >= 20), (number(&gone, "samples"), true));
+    let next = Recording::whole(&env.path("walk-0002.mcap"));
+    let repeated = 1;
+    assert_eq!(number(&end, "samples") + repeated, next.kept.len() as u64, "{outcome}");
+    assert_eq!(number(&end, "bytes"), fs::metadata(env.path("walk-0002.mcap")).unwrap().len());
+    // One that is removed at the very end, too.
+    let mut recorder = env.start(&["record", "--json", "--force", "-o", &file]);
+    await_samples(&mut recorder, 20);
+    fs::remove_file(&file).unwrap();
+    let outcome = recorder.end(INT);
+    let end = outcome.of_class("recorded").pop().unwrap_or_else(|| panic!("{outcome}"));
+    assert!(number(&end, "gone") >= 20, "{end}");
+}
+
+#[test]
+fn two_recorders_do_not_write_one_file() {
+    let env = TestEnv::new();
+    let _others = sensor(&env);
+    let file = env.word("walk.mcap");
+    let mut recorder = env.start(&["record", "--json", "-o", &file]);
+    await_samples(&mut recorder, 20);
+    let second = env.run(&["record", "--json", "--force", "-o", &file]);
+    let error = &second.of_class("error")[0];
+    assert_eq!((second.code, &error["kind"]), (Some(73), &"output".into()), "{second}");
+    assert!(error["message"].as_str().unwrap().contains("another recorder writes it"), "{error}");
+    await_samples(&mut recorder, 20);
+    nothing_lost(&recorder.end(INT));
+    telegrams(&[Recording::whole(Path::new(&file))]);
+}
+
+/// The program, started by other words before its own.
+fn start_in(env: &TestEnv, before: &[&str], arguments: &[&str]) -> Program {
+    let program = env.command(arguments);
+    let mut command = Command::new(before[0]);
+    command.args(&before[1..]).arg(program.get_program()).args(program.get_args());
+    for (key, value) in program.get_envs() {
+        match value {
+            Some(value) => command.env(key, value),
+            None => command.env_remove(key),
+        };
+    }
+    Program::start(command)
+}

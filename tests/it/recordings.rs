@@ -1,0 +1,245 @@
+//! A hub whose sensor is a recording: every telegram of it is published once and in order, whatever lies between them,
+//! and the link is silent at its end.
+
+use std::path::PathBuf;
+
+use crate::testkit;
+use crate::testkit::{INT, KILL, Outcome, Program, TestEnv, bytes_of, number, sequence, skip};
+use lms::variant::{Mode, Unit};
+use serde_json::Value;
+
+/// Publishes `file` with `option` behind its name to a consumer of `topics` that was there before, so that it gets the
+/// very first sample; returns what it received up to the end of the recording.
+fn play(env: &TestEnv, file: &str, option: &str, topics: &[&str]) -> (Outcome, Value) {
+    let before = env.hub(&["--link=a=/no/such/port"]);
+    let mut consumer = env.echo(topics);
+    assert_eq!(before.end(KILL).code, None);
+    consumer.await_line("hub_gone", |line| line["kind"] == "hub_gone");
+    let hub = env.hub(&["--link", &format!("a=file:{file}{option}")]);
+    let info = at_the_end(env);
+    consumer.await_line("the end", |line| line["state"] == "silent");
+    let outcome = consumer.end(INT);
+    assert_eq!(hub.end(INT).code, Some(0));
+    (outcome, info)
+}
+
+/// What `info` says when the recording is at its end. Every byte of it is accounted for.
+fn at_the_end(env: &TestEnv) -> Value {
+    let info = env.await_info("a", |info| info["state"] == "silent");
+    assert_eq!(info["last_error"], "the recording is at its end");
+    let counter = |name: &str| number(&info["counters"], name);
+    let parts = ["bytes_in_telegrams", "bytes_acknowledge", "bytes_discarded", "bytes_buffered"].map(counter);
+    assert_eq!(counter("bytes_read"), parts.into_iter().sum::<u64>(), "{info}");
+    assert_eq!(counter("loan_failed"), 0);
+    info
+}
+
+/// Replies, scans, noise between them and one damaged scan: the bytes, and the telegrams that are to be found.
+fn stream(scans: u16) -> (Vec<u8>, Vec<Vec<u8>>) {
+    let configuration = lms::reply::configuration(0, Mode(1), Unit::Mm, 0x10).bytes().to_vec();
+    let mode = lms::reply::mode(0, true, 0x10).bytes().to_vec();
+    let mut random = fastrand::Rng::with_seed(31);
+    let mut noise = move |len: usize| -> Vec<u8> { (0..len).map(|_| random.u8(..)).collect() };
+    let (mut bytes, mut whole) = (noise(100), Vec::new());
+    for (number, telegram) in
+        [configuration, mode].into_iter().chain((0..scans).map(testkit::scan)).enumerate()
+    {
+        if number == 4 {
+            // Bytes of it are missing.
+            bytes.extend([&telegram[..300], &telegram[310..]].concat());
+            continue;
+        }
+        bytes.extend(&telegram);
+        whole.push(telegram);
+        bytes.extend(noise(if number % 3 == 0 { 57 } else { 0 }));
+    }
+    (bytes, whole)
+}
+
+fn check(outcome: &Outcome, whole: &[Vec<u8>]) {
+    assert_eq!(outcome.code, Some(0), "{}", outcome.errors);
+    let telegrams = outcome.of_class("telegram");
+    let received: Vec<_> = telegrams.iter().map(bytes_of).collect();
+    assert!(received == whole, "{} telegrams, not the {} that are there", received.len(), whole.len());
+    assert_eq!((sequence(&telegrams, "seq")[0], sequence(&telegrams, "topic_seq")[0]), (0, 0));
+}
+
+#[test]
+fn a_recording_without_its_mode_has_marks_where_the_mode_is_set() {
+    let env = TestEnv::new();
+    let bytes = (0..4).flat_map(testkit::scan).collect::<Vec<u8>>();
+    let link = format!("--link=a=file:{}", env.file("recording", &bytes));
+    let hub = env.hub(&[&link]);
+    at_the_end(&env);
+    let info = env.run(&["info", "a"]).to_string();
+    assert!(info.contains("does not tell its measuring mode; set link.a.mode"), "{info}");
+    assert_eq!(env.info("a")["marks"]["available"], Value::Null);
+    assert_eq!(hub.end(INT).code, Some(0));
+    let hub = env.hub(&[&link, "--set=link.a.mode=0x01"]);
+    at_the_end(&env);
+    let info = env.info("a");
+    assert_eq!((&info["marks"]["available"], &info["mode"]), (&Value::Bool(true), &Value::from(1)), "{info}");
+    assert_eq!(hub.end(INT).code, Some(0));
+}
+
+#[test]
+fn values_that_could_be_split_in_several_ways_are_no_scans_until_the_mode_is_told() {
+    let env = TestEnv::new();
+    // 8.6 m in 14 bits; in 13 bits it would be 0.4 m.
+    let scan = lms::measured::encode(0, Unit::Mm, &[8600; 181], 0x10);
+    let file = env.file("recording", scan.bytes().repeat(100));
+    let trouble = "the recording does not tell its measuring mode: no scans; set link.a.mode";
+    let (outcome, _) = play(&env, &file, "", &["a/telegram", "a/scan", "a/status"]);
+    assert_eq!((outcome.of_class("telegram").len(), outcome.of_class("scan").len()), (100, 0), "{outcome}");
+    assert!(outcome.of_class("status").iter().any(|line| line["last_error"] == trouble), "{outcome}");
+    let log = env.path("a.log").display().to_string();
+    let refused = env.run(&["convert", &file, &log]);
+    assert!(
+        refused.code == Some(66) && refused.errors.contains("does not tell its measuring mode"),
+        "{refused}"
+    );
+    let hub = env.hub(&[&format!("--link=a=file:{file}"), "--set=link.a.mode=0x04"]);
+    let outcome = env.run(&["echo", "--json", "a/scan", "-n", "1", "--timeout=30s"]);
+    let ranges: Vec<_> = outcome.of_class("scan").iter().map(|scan| scan["ranges"][7].clone()).collect();
+    assert_eq!(ranges, [8600], "{outcome}");
+    assert_eq!(hub.end(INT).code, Some(0));
+    // Where no value has a higher bit there is one way.
+    let plain = env.file("plain", testkit::scan(1).repeat(2));
+    let (hub, words) = (env.hub(&[&format!("--link=a=file:{plain}")]), "no value has more than 13 bits");
+    assert_eq!(at_the_end(&env)["counters"]["telegrams"], 2);
+    let outcome = hub.end(INT);
+    assert!(outcome.errors.contains(words), "{outcome}");
+}
+
+#[test]
+fn who_is_started_with_the_hub_gets_a_recording_from_its_beginning() {
+    let env = TestEnv::new();
+    let (bytes, whole) = stream(14);
+    let file = env.file("recording", &bytes);
+    let hub = env.hub(&[&format!("--link=a=file:{file}?rate=max")]);
+    // It attaches to one topic after the other, well within the second that the hub waits.
+    let outcome = env.run(&["echo", "--json", "a/telegram", "-n", &whole.len().to_string(), "--timeout=30s"]);
+    check(&outcome, &whole);
+    assert_eq!(hub.end(INT).code, Some(0));
+}
+
+#[test]
+fn a_file_without_a_telegram_does_not_stream() {
+    let env = TestEnv::new();
+    let hub = env.hub(&[&format!("--link=a=file:{}", env.file("noise", vec![0x42; 4000]))]);
+    let info = at_the_end(&env);
+    assert_eq!(info["counters"]["bytes_discarded"], 4000);
+    let outcome = hub.end(INT);
+    assert!(outcome.errors.contains("there is no telegram in the recording"), "{outcome}");
+    assert!(!outcome.errors.contains("streaming"), "{outcome}");
+}
+
+#[test]
+fn the_reflectors_of_a_recording_are_marks() {
+    let Some(data) = data() else { return };
+    let recording = data.join("captures/reflector_levels_cm_18s.bin");
+    let env = TestEnv::new();
+    let link = format!("--link=a=file:{}", recording.display());
+    let hub = env.hub(&[&link, "--set=link.a.mode=0x01"]);
+    let outcome = env.run(&["echo", "--json", "a/marks", "-n", "20"]);
+    let found = |line: &Value| line["marks"].as_array().map_or(0, Vec::len);
+    assert!(outcome.of_class("marks").iter().any(|line| found(line) == 5), "{outcome}");
+    assert_eq!(hub.end(INT).code, Some(0));
+}
+
+#[test]
+fn as_fast_as_it_can_be_read() {
+    let env = TestEnv::new();
+    // No more than a consumer's buffer holds: nobody waits for it.
+    let (bytes, whole) = stream(14);
+    let file = env.file("recording", &bytes);
+    let (outcome, info) = play(&env, &file, "?rate=max", &["a/telegram", "a/status"]);
+    check(&outcome, &whole);
+    let [read, telegrams] = ["bytes_read", "telegrams"].map(|name| number(&info["counters"], name));
+    assert_eq!((read, telegrams), (bytes.len() as u64, whole.len() as u64));
+    assert_eq!(info["port"], format!("file:{file}?rate=max"));
+}
+
+#[test]
+fn in_the_pace_of_the_sensor() {
+    let env = TestEnv::new();
+    let (bytes, whole) = stream(60);
+    let file = env.file("recording", &bytes);
+    let (outcome, _) = play(&env, &file, "", &["a/telegram", "a/scan", "a/status"]);
+    check(&outcome, &whole);
+    let scans = outcome.of_class("scan");
+    assert_eq!((scans.len(), sequence(&scans, "topic_seq")[0]), (whole.len() - 2, 0));
+    // Mode 1, as the reply at its beginning says: 13 bits of range.
+    for (scan, telegram) in scans.iter().zip(&whole[2..]) {
+        let first = u16::from_le_bytes([telegram[7], telegram[8]]);
+        assert_eq!(
+            (scan["ranges"][0].as_u64(), &scan["unit_mm"]),
+            (Some(u64::from(first & 0x1FFF)), &1.into())
+        );
+    }
+    // 59 periods of 26.64 ms, at the least: a busy machine makes it longer.
+    let stamps: Vec<_> = scans.iter().map(|scan| number(scan, "stamp_ns")).collect();
+    let span_ms = (stamps[stamps.len() - 1] - stamps[0]) / 1_000_000;
+    assert!(span_ms > 1_200, "{span_ms} ms");
+}
+
+#[test]
+fn a_carmen_log() {
+    let env = TestEnv::new();
+    let metres = |scan: usize, beam: usize| 1.0 + 0.25 * scan as f64 + 0.01 * beam as f64;
+    let line = |scan: usize| {
+        let ranges: Vec<_> = (0..181).map(|beam| format!("{:.2}", metres(scan, beam))).collect();
+        format!("FLASER 181 {} 0 0 0 0 0 0 {scan}.5 host {scan}.5\n", ranges.join(" "))
+    };
+    let log = (0..10).fold("# a log\nPARAM robot_length 0.5\n".to_owned(), |log, scan| log + &line(scan));
+    let file = env.file("log", log);
+    let (outcome, _) = play(&env, &file, "?rate=max", &["a/scan", "a/status"]);
+    let scans = outcome.of_class("scan");
+    assert_eq!(scans.len(), 10, "{outcome}");
+    for (number, scan) in scans.iter().enumerate() {
+        let expected: Vec<Value> =
+            (0..181).map(|beam| ((metres(number, beam) * 100.0).round() as u64).into()).collect();
+        assert_eq!(
+            (&scan["ranges"], &scan["step_deg"], &scan["unit_mm"]),
+            (&expected.into(), &1.0.into(), &10.into())
+        );
+    }
+}
+
+/// Recordings of real sensors, which are not part of the project: SCANHUB_DATA, or beside the project.
+fn data() -> Option<PathBuf> {
+    let beside = PathBuf::from(env!("CARGO_MANIFEST_DIR")).join("../shared/data");
+    let place = std::env::var_os("SCANHUB_DATA").map_or(beside, PathBuf::from);
+    if place.is_dir() {
+        return Some(place);
+    }
+    skip("recordings", format!("none of real sensors at {}", place.display()));
+    None
+}
+
+/// The counters of a hub that has read the file `name` of `data` to its end.
+fn counters_of(data: &std::path::Path, name: &str) -> Value {
+    let env = TestEnv::new();
+    let path = data.join(name);
+    let link = format!("--link=a=file:{}?rate=max", path.display());
+    let _hub: Program = env.hub(&[link]);
+    at_the_end(&env)["counters"].clone()
+}
+
+#[test]
+fn recordings_of_real_sensors() {
+    let Some(data) = data() else { return };
+    for (name, telegrams) in [
+        ("captures/lms200_38400.bin", Some(427)),
+        ("captures/reflector_levels_cm_18s.bin", Some(675)),
+        ("captures/scan_interrupted_by_reply.bin", Some(1)),
+        ("carmen/orebro-corrected.log.gz", Some(237)),
+        ("carmen/intel-corrected.log.gz", Some(910)),
+    ] {
+        let counters = counters_of(&data, name);
+        assert_eq!(counters["telegrams"].as_u64(), telegrams, "{name}: {counters}");
+    }
+    // What another rate makes of a sensor's bytes: no telegram is believed.
+    let counters = counters_of(&data, "captures/host19200_while_sensor_38400.bin");
+    assert_eq!((&counters["telegrams"], &counters["bytes_discarded"]), (&0.into(), &7745.into()));
+}

@@ -1,0 +1,156 @@
+//! A configuration that changes while the hub runs: zones, marks, background and pose with the next scan, without a gap in
+//! the stream; lines at the next start; and one that cannot be changes nothing. A hangup of its terminal still ends a hub.
+
+use std::process::Command;
+
+use crate::testkit::{
+    HUP, INT, MEASURED, Program, TERM, TestEnv, bytes_of, hash, is_class, number, sequence, skip, terminal,
+};
+use serde_json::Value;
+
+const STREAM: [&str; 2] = ["--seed=71", "--baud=500000"];
+
+/// The configuration of one link in a file, with `more` behind it.
+fn configure(env: &TestEnv, more: &str) -> String {
+    let port = env.word("front");
+    let text = format!("[[link]]\nname = \"front\"\nport = \"{port}\"\n{more}");
+    format!("--config={}", env.file("scanhub.toml", text))
+}
+
+/// The radii of a line of class `zones` in mm.
+fn radii(line: &Value) -> Vec<u64> {
+    line["zones"].as_array().into_iter().flatten().map(|zone| number(zone, "radius_mm")).collect()
+}
+
+fn has_radii(wanted: &'static [u64]) -> impl Fn(&Value) -> bool {
+    move |line| line["class"] == "zones" && line["stale"] != true && radii(line) == wanted
+}
+
+#[test]
+fn circles_change_in_a_stream_without_a_gap() {
+    let env = TestEnv::new();
+    let simulator = env.simulator(&["front"], &STREAM);
+    let mut supervisor = env.supervisor();
+    let flags = [configure(&env, ""), "--no-system-config".to_owned()];
+    let hub = env.service(&mut supervisor, &flags, None).ready();
+    supervisor.hear("READY=1");
+    env.await_info("front", |info| info["state"] == "streaming");
+    let mut telegrams = env.echo(&["front/telegram"]);
+    let mut zones = env.echo(&["front/zones"]);
+    zones.await_lines(10, "a verdict", has_radii(&[1000, 600]));
+    for (more, wanted) in [
+        ("pose = { x = 0.3 }\n[zones]\nradii = [2.0, 1.0, 0.5]\n", &[2000, 1000, 500][..]),
+        ("[zones]\nradii = [0.7]\n[marks]\ni_min = 3\n[background]\nmethod = \"paper\"\n", &[700]),
+        ("[background]\nmethod = \"off\"\n", &[1000, 600]),
+        ("[zones]\nradii = [3.0]\n", &[3000]),
+    ] {
+        configure(&env, more);
+        hub.signal(HUP);
+        supervisor.hear("RELOADING=1");
+        supervisor.hear("READY=1");
+        zones.await_lines(10, "a verdict of the new circles", has_radii(wanted));
+    }
+    let told = supervisor.heard.iter().filter(|line| line.starts_with("MONOTONIC_USEC="));
+    assert_eq!(told.count(), 4);
+    telegrams.await_lines(10, "a telegram", is_class("telegram"));
+    let info = env.info("front");
+    assert_eq!((number(&info["counters"], "resyncs"), number(&info["counters"], "reconnects")), (0, 0));
+    assert_eq!(info["pose"]["x_m"], 0.0);
+    let (telegrams, zones) = (telegrams.end(INT), zones.end(INT));
+    for (outcome, class) in [(&telegrams, "telegram"), (&zones, "zones")] {
+        let mut lines = outcome.of_class(class);
+        // A silence has no numbers.
+        lines.retain(|line| line["topic_seq"].is_u64());
+        sequence(&lines, "topic_seq");
+        assert_eq!(outcome.of_class("summary")[0]["lost"], 0, "{class}");
+    }
+    // The first verdict of other circles is one.
+    let mut verdicts = zones.of_class("zones");
+    verdicts.retain(|line| line["topic_seq"].is_u64());
+    let firsts: Vec<_> = verdicts.windows(2).filter(|pair| radii(&pair[0]) != radii(&pair[1])).collect();
+    assert_eq!(firsts.len(), 4);
+    assert!(firsts.iter().all(|pair| pair[1]["verdict"] != "unknown"), "{firsts:?}");
+    let ended = hub.end(TERM);
+    assert_eq!(ended.code, Some(0));
+    assert!(ended.errors.contains("front: pose, zones as configured now"), "{ended}");
+    assert!(ended.errors.contains("front: zones, marks, background as configured now"), "{ended}");
+    assert_eq!(simulator.end(TERM).code, Some(0));
+    assert_eq!(env.simulated("front").1, 0, "EEPROM");
+    // What was sent from the first to the last that was received, was received.
+    let received = telegrams.of_class("telegram");
+    let received: Vec<_> = received.iter().filter(|line| line["command"] == MEASURED).collect();
+    let received: Vec<String> = received.iter().map(|line| hash(&bytes_of(line))).collect();
+    let truth: Vec<_> = env.truth("front").into_iter().filter(|sent| sent.is_intact_scan()).collect();
+    let first = truth.iter().position(|sent| sent.hash == received[0]).expect("it was sent");
+    let sent: Vec<String> =
+        truth[first..].iter().map(|sent| sent.hash.clone()).take(received.len()).collect();
+    assert_eq!(received, sent);
+}
+
+#[test]
+fn what_cannot_be_changed_is_said_and_what_cannot_be_changes_nothing() {
+    let env = TestEnv::new();
+    let mut supervisor = env.supervisor();
+    let flags = [configure(&env, ""), "--no-system-config".to_owned()];
+    // Nothing is at the port: the topics say all the same how it is.
+    let hub = env.service(&mut supervisor, &flags, None).ready();
+    supervisor.hear("READY=1");
+    let mut zones = env.echo(&["front/zones"]);
+    let wrong = "baud = 38400\n[zones]\nradii = [0.6, 1.0]\n";
+    configure(&env, wrong);
+    hub.signal(HUP);
+    supervisor.hear("RELOADING=1");
+    supervisor.hear("READY=1");
+    let refused = supervisor.heard.iter().find(|line| line.contains("configuration refused")).cloned();
+    let place = format!("{}:6:9: radii = [0.6, 1.0]", env.word("scanhub.toml"));
+    let status = format!("STATUS=sensors: front; configuration refused: {place}");
+    assert_eq!(refused, Some(status));
+    let more = "baud = 38400\npose = { x = 0.5 }\n[zones]\nradii = [2.0]\n\n[[link]]\nname = \"side\"\nport = \"/dev/null\"\n";
+    configure(&env, more);
+    hub.signal(HUP);
+    let first =
+        zones.await_line("the new circles", |line| line["class"] == "zones" && radii(line) != [1000, 600]);
+    assert_eq!((radii(&first), &first["verdict"]), (vec![2000], &"unknown".into()));
+    env.await_info("front", |info| info["pose"]["x_m"] == 0.5);
+    assert!(!env.run(&["list", "--json"]).to_string().contains("side"));
+    let ended = hub.end(TERM);
+    assert_eq!(ended.code, Some(0));
+    for words in [
+        format!("the configuration is refused, the old one stays: {place}; the largest first"),
+        "front: pose, zones as configured now".to_owned(),
+        "front: baud: takes effect at the next start".to_owned(),
+        "side: link added: takes effect at the next start".to_owned(),
+    ] {
+        assert!(ended.errors.contains(&words), "{words}: {ended}");
+    }
+}
+
+#[test]
+fn a_hub_ends_with_its_terminal_unless_nohup_says_otherwise() {
+    if Command::new("setsid").arg("--version").output().is_err() {
+        return skip("setsid", "there is none");
+    }
+    for (nohup, survives) in [(&[][..], false), (&["nohup"], true)] {
+        let env = TestEnv::new();
+        let (keys, screen) = terminal();
+        let hub = env.command(&["run", "--json", "--no-system-config", &configure(&env, "")]);
+        // Leader of a session that has this terminal.
+        let mut command = Command::new("setsid");
+        command.arg("--ctty").args(nohup).arg(hub.get_program()).args(hub.get_args());
+        command.envs(hub.get_envs().filter_map(|(key, value)| Some((key, value?))));
+        let hub = Program::start_with(command, screen);
+        let hub = hub.ready();
+        drop(keys);
+        if survives {
+            // It is asked to read its configuration instead, and does.
+            configure(&env, "pose = { x = 0.5 }\n");
+            hub.signal(HUP);
+            env.await_info("front", |info| info["pose"]["x_m"] == 0.5);
+            let ended = hub.end(TERM);
+            assert_eq!(ended.code, Some(0));
+        } else {
+            let ended = hub.wait();
+            assert_eq!(ended.code, Some(0), "{ended}");
+        }
+    }
+}

@@ -1,0 +1,286 @@
+//! `scanhub replay`: a hub whose sensors are a recording, with its options, its keys, and its end.
+
+use std::collections::BTreeMap;
+
+use crate::testkit;
+use crate::testkit::{INT, Outcome, Program, Sitting, TERM, TestEnv, is_class, number};
+use lms::variant::{Mode, Unit};
+use schema::datagram::Packed;
+use schema::file::Writer;
+use schema::{Header, Marks, Topic};
+use serde_json::Value;
+
+/// A log with a scan every `period_ms`, from 1000 s on.
+fn log(env: &TestEnv, scans: u64, period_ms: u64) -> String {
+    let line = |scan: u64| {
+        let ranges = vec!["1.5"; 181].join(" ");
+        let at = 1000.0 + (scan * period_ms) as f64 / 1000.0;
+        format!("FLASER 181 {ranges} 0 0 0 0 0 0 {at} host {at}\n")
+    };
+    env.file("log", (0..scans).map(line).collect::<String>())
+}
+
+fn start(env: &TestEnv, words: &[&str]) -> Program {
+    env.start(&[&["replay", "--json", "--no-system-config"], words].concat()).ready()
+}
+
+/// The wall clocks of scans, in ms from the log's beginning.
+fn walls(outcome: &Outcome) -> Vec<u64> {
+    outcome.of_class("scan").iter().map(|scan| number(scan, "wall_ns") / 1_000_000 - 1_000_000).collect()
+}
+
+fn replayed(outcome: &Outcome) -> Value {
+    assert_eq!(outcome.code, Some(0), "{outcome}");
+    outcome.of_class("replayed").pop().unwrap_or_else(|| panic!("no word of what was played: {outcome}"))
+}
+
+fn resume(env: &TestEnv) {
+    assert_eq!(env.run(&["control", "front", "resume"]).code, Some(0));
+}
+
+#[test]
+fn it_waits_for_a_word_plays_everything_with_its_times_and_ends() {
+    let env = TestEnv::new();
+    let player = start(&env, &[&log(&env, 12, 80), "--paused"]);
+    let mut consumer = env.echo(&["front/scan", "front/status"]);
+    env.await_info("front", |info| info["state"] == "paused");
+    resume(&env);
+    consumer.await_line("the end", |line| line["state"] == "silent");
+    let end = replayed(&player.wait());
+    assert_eq!((number(&end, "telegrams"), number(&end, "laps")), (12, 0));
+    assert_eq!(end["position_s"], 0.88);
+    consumer.await_line("its end", |line| line["kind"] == "hub_gone");
+    let outcome = consumer.end(INT);
+    assert_eq!(walls(&outcome), (0..12).map(|scan| scan * 80).collect::<Vec<_>>());
+    let stamps: Vec<_> = outcome.of_class("scan").iter().map(|scan| number(scan, "stamp_ns")).collect();
+    assert!(stamps.windows(2).all(|pair| pair[1] - pair[0] == 80_000_000), "{stamps:?}");
+}
+
+#[test]
+fn from_here_to_there_faster() {
+    let env = TestEnv::new();
+    let player = start(&env, &[&log(&env, 60, 100), "--paused", "--start=2s", "--end=4s", "--rate=4"]);
+    let mut consumer = env.echo(&["front/scan", "front/status"]);
+    resume(&env);
+    consumer.await_line("the end", |line| line["state"] == "silent");
+    let outcome = consumer.end(INT);
+    assert_eq!(walls(&outcome), (20..40).map(|scan| scan * 100).collect::<Vec<_>>());
+    let scans = outcome.of_class("scan");
+    assert_eq!((number(&scans[0], "seq"), number(&scans[0], "topic_seq")), (0, 0));
+    let stamps: Vec<_> = scans.iter().map(|scan| number(scan, "stamp_ns")).collect();
+    assert!(stamps.windows(2).all(|pair| pair[1] - pair[0] == 25_000_000), "{stamps:?}");
+    assert_eq!(number(&replayed(&player.wait()), "telegrams"), 20);
+}
+
+#[test]
+fn a_lap_follows_another_until_somebody_ends_it() {
+    let env = TestEnv::new();
+    let player = start(&env, &[&log(&env, 5, 20), "--loop"]);
+    let mut consumer = env.echo(&["front/scan"]);
+    let scans = consumer.await_lines(12, "a scan", is_class("scan"));
+    let walls: Vec<_> = scans.iter().map(|scan| number(scan, "wall_ns") / 1_000_000 - 1_000_000).collect();
+    assert!(walls.iter().filter(|wall| **wall == 0).count() >= 2, "{walls:?}");
+    assert!(number(&replayed(&player.end(INT)), "laps") >= 2);
+}
+
+#[test]
+fn at_the_end_it_stays_if_it_is_to_and_pauses_when_asked() {
+    let env = TestEnv::new();
+    let player = start(&env, &[&log(&env, 100, 100), "--sensor=left", "--hold"]);
+    assert_eq!(env.run(&["control", "left", "pause"]).code, Some(0));
+    env.await_info("left", |info| info["state"] == "paused");
+    assert!(number(&replayed(&player.end(TERM)), "telegrams") < 100);
+    let player = start(&env, &[&log(&env, 100, 100), "--rate=max", "--hold"]);
+    let info = env.await_info("front", |info| info["state"] == "silent");
+    assert_eq!((number(&info["counters"], "telegrams"), &info["angle_deg"]), (100, &180.into()));
+    // It would have ended after a second.
+    assert_eq!(number(&replayed(&player.end(TERM)), "telegrams"), 100);
+}
+
+/// A recording of a hub of two lives, which each heard ten telegrams, of which the sixth says how values are split: marks
+/// were found from `understood` of each life on.
+fn lives(env: &TestEnv, understood: [u64; 2]) -> String {
+    let file = std::fs::File::create(env.path("lives.mcap")).expect("a file");
+    let mut writer = Writer::begin(file, "", BTreeMap::new()).expect("is written");
+    for (life, understood) in understood.into_iter().enumerate() {
+        for seq in 0..10 {
+            let reply = lms::reply::configuration(0, Mode(1), Unit::Mm, 0x10);
+            let telegram = if seq == 5 { reply.bytes().to_vec() } else { testkit::scan(seq as u16) };
+            let at = (life as u64 * 20 + seq) * 20_000_000;
+            let (stamp_first_ns, stamp_last_ns) = (1_000_000_000 + at, 1_010_000_000 + at);
+            let mut header = Header {
+                seq,
+                topic_seq: seq,
+                stamp_first_ns,
+                stamp_last_ns,
+                wall_ns: 1_700_000_000_000_000_000 + at,
+                boot: 7 + life as u64,
+                hub_pid: 1,
+                period_us: 26_640,
+                ..Header::default()
+            };
+            header.set_sent_at(stamp_last_ns + 1000);
+            writer.sample("front", Topic::Telegram, &header, &telegram).expect("is written");
+            if seq != 5 && seq >= understood {
+                let mut room = [0; 4096];
+                let len = Marks::default().pack(&mut room).expect("fits");
+                writer.sample("front", Topic::Marks, &header, &room[..len]).expect("is written");
+            }
+        }
+    }
+    writer.finish().expect("is written");
+    env.path("lives.mcap").display().to_string()
+}
+
+/// A line that loses six of ten scans, and is silent for two seconds in the middle; the last 300 of 20 s.
+fn lossy(env: &TestEnv) -> String {
+    let file = std::fs::File::create(env.path("lossy.mcap")).expect("a file");
+    let mut writer = Writer::begin(file, "", BTreeMap::new()).expect("is written");
+    let is_lost = |scan: &u64| scan % 10 > 3 || (300..375).contains(scan);
+    for (seq, scan) in (0..750).filter(|scan| !is_lost(scan)).enumerate() {
+        let at = scan * 26_640_000;
+        let seq = seq as u64;
+        let mut header = Header {
+            seq,
+            topic_seq: seq,
+            stamp_first_ns: 1_000_000_000 + at,
+            stamp_last_ns: 1_014_000_000 + at,
+            wall_ns: 1_700_000_000_000_000_000 + at,
+            boot: 7,
+            hub_pid: 1,
+            period_us: 26_640,
+            ..Header::default()
+        };
+        header.set_sent_at(header.stamp_last_ns + 1000);
+        writer.sample("front", Topic::Telegram, &header, &testkit::scan(seq as u16)).expect("is written");
+    }
+    writer.finish().expect("is written");
+    env.path("lossy.mcap").display().to_string()
+}
+
+#[test]
+fn scans_that_are_missing_are_no_silence_of_the_sensor() {
+    let env = TestEnv::new();
+    let player = start(&env, &[&lossy(&env), "--rate=2", "--set=link.front.mode=0", "--hold"]);
+    testkit::until("a rate in the list", || {
+        let listed = env.run(&["list", "--json"]);
+        assert_eq!(listed.code, Some(0), "{listed}");
+        let rate =
+            listed.lines().into_iter().find(|line| line["topic"] == "scan").map(|line| line["hz"].clone());
+        // Of 37.5 scans a second 15 come, twice as fast.
+        rate.and_then(|rate| rate.as_f64()).is_some_and(|hz| (15.0..60.0).contains(&hz))
+    });
+    env.await_info("front", |info| info["last_error"] == "the recording is at its end");
+    let outcome = player.end(INT);
+    let said = |word: &str| outcome.errors.lines().filter(|line| line.contains(word)).count();
+    // Once for the pause, and at the end.
+    assert_eq!((said("front: silent"), said("front: streaming")), (2, 2), "{outcome}");
+}
+
+#[test]
+fn what_the_hub_could_not_read_yet_is_no_scan() {
+    // One of both lives knew it from the life before.
+    for understood in [[0, 6], [6, 0]] {
+        let env = TestEnv::new();
+        let player = start(&env, &[&lives(&env, understood), "--paused"]);
+        let mut consumer = env.echo(&["front/scan", "front/status"]);
+        resume(&env);
+        consumer.await_line("the end", |line| line["last_error"] == "the recording is at its end");
+        let scans: Vec<_> =
+            consumer.end(INT).of_class("scan").iter().map(|scan| number(scan, "seq")).collect();
+        assert_eq!(number(&replayed(&player.wait()), "telegrams"), 20);
+        let of = |life: u64, from| (from..10).filter(|seq| *seq != 5).map(move |seq| 10 * life + seq);
+        assert!(scans.iter().copied().eq(of(0, understood[0]).chain(of(1, understood[1]))), "{scans:?}");
+    }
+}
+
+#[test]
+fn links_of_the_configuration_that_are_not_in_it_are_left_out() {
+    let env = TestEnv::new();
+    let text = "[[link]]\nname = \"front\"\nport = \"/dev/x\"\npose = { x = 0.25 }\n[[link]]\nname = \"rear\"\nport = \"y\"\n";
+    let config = format!("--config={}", env.file("config.toml", text));
+    let player = start(&env, &[&log(&env, 3, 100), &config, "--hold"]);
+    assert_eq!(env.info("front")["pose"]["x_m"], 0.25);
+    let outcome = player.end(INT);
+    assert_eq!(outcome.of_class("ready")[0]["sensors"], Value::from(vec!["front"]));
+    assert!(outcome.errors.contains("rear: not in the recording, left out"), "{outcome}");
+}
+
+#[test]
+fn what_cannot_be_played_is_refused() {
+    let env = TestEnv::new();
+    let log = log(&env, 3, 100);
+    let golden = concat!(env!("CARGO_MANIFEST_DIR"), "/tests/vectors/recording/v1.mcap");
+    for (words, code, message) in [
+        (&["/no/such/file"][..], 66, "cannot read recording /no/such/file"),
+        (&[&log, "--start=2s", "--end=1s"], 2, "--end 1s is not after --start 2s"),
+        (&[&log, "--end=0s"], 2, "--end 0ns is not after --start 0ns"),
+        (&[&log, "--rate=0"], 2, "--rate"),
+        (&[&log, "--loop", "--hold"], 2, "--loop"),
+        (&[&log, "--start=201ms"], 2, "which lasts 0.200 s"),
+        (&[&log, "--start=1h", "--hold"], 2, "--start 3600 s is behind the end of "),
+        (&[&log, "--sensor=Front"], 2, "sensor name \"Front\" is not possible"),
+        (&[golden, "--sensor=left"], 3, "has no sensor \"left\""),
+    ] {
+        let outcome = env.run(&[&["replay"], words].concat());
+        assert_eq!(outcome.code, Some(code), "{outcome}");
+        assert!(outcome.errors.contains(message), "{outcome}");
+    }
+}
+
+#[test]
+fn keys() {
+    let env = TestEnv::new();
+    let words = ["replay", "--no-system-config", "--paused", &log(&env, 300, 100)];
+    let mut sitting = Sitting::start(&env.command(&words), (100, 30));
+    sitting.await_words("paused; space goes on");
+    let says = |sitting: &Sitting, word: &str| {
+        let give_up_at = std::time::Instant::now() + testkit::PATIENCE;
+        while !sitting.text().contains(word) {
+            assert!(std::time::Instant::now() < give_up_at, "no {word:?}: {}", sitting.text());
+            std::thread::sleep(std::time::Duration::from_millis(10));
+        }
+    };
+    sitting.press(".");
+    says(&sitting, "  1 telegrams  paused");
+    sitting.press("\x1b[C");
+    says(&sitting, "  2 telegrams  paused");
+    sitting.press("--");
+    says(&sitting, "  x0.25  2 telegrams  paused");
+    sitting.press("+++ ");
+    says(&sitting, "  x2  ");
+    says(&sitting, "space pauses");
+    sitting.press(" ");
+    env.await_info("front", |info| info["state"] == "paused");
+    sitting.press("q");
+    let (code, text, is_as_before) = sitting.end_of_lines();
+    assert_eq!((code, is_as_before), (Some(0), true), "{text}");
+    let last = text.lines().last().unwrap_or_default();
+    assert!(last.contains("replayed ") && last.contains(" telegrams up to 0:"), "{text}");
+}
+
+#[test]
+fn a_signal_gives_the_terminal_back() {
+    for signal in [INT, TERM] {
+        let env = TestEnv::new();
+        let words = ["replay", "--no-system-config", &log(&env, 300, 100)];
+        let sitting = Sitting::start(&env.command(&words), (100, 30));
+        sitting.await_words("space pauses");
+        sitting.signal(signal);
+        let (code, text, is_as_before) = sitting.end_of_lines();
+        assert_eq!((code, is_as_before), (Some(0), true), "{text}");
+    }
+}
+
+#[test]
+fn it_ends_with_its_terminal() {
+    let env = TestEnv::new();
+    let words = ["replay", "--no-system-config", "--loop", "--paused", &log(&env, 300, 100)];
+    let errors = env.path("errors");
+    let file = std::fs::File::create(&errors).expect("a file");
+    let sitting = Sitting::start_for_hang_up(&env.command(&words), (100, 30), true, file);
+    sitting.await_words("ready ");
+    sitting.hang_up();
+    let errors = std::fs::read_to_string(errors).expect("its errors");
+    assert!(!errors.contains("panicked"), "{errors}");
+}

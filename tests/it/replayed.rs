@@ -1,0 +1,149 @@
+//! What a replay publishes of a recording is what was published when it was recorded, byte for byte, with the same
+//! parameters; and something else with others. Two sensors of simulated rooms with people, recorded in made-up time, and
+//! replayed telegram by telegram.
+
+#[path = "../../benches/support/rooms.rs"]
+mod rooms;
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use std::sync::mpsc::channel;
+use std::thread;
+use std::time::{Duration, Instant};
+
+use crate::testkit::{PATIENCE, TestEnv, in_own_process};
+use config::Sources;
+use daemon::{Play, Player, Replay};
+use rooms::{Followers, LEARNING, Published, SENSORS};
+use schema::ipc;
+use schema::{Flags, Topic};
+
+const SCANS: u64 = 400;
+/// Before this scan nothing is heard of a sensor for a second.
+const SILENCE: u64 = 300;
+
+/// Records two sensors; where, and what was published of each.
+fn record(env: &TestEnv) -> (PathBuf, Vec<Vec<Published>>) {
+    let (file, mut published) = (env.path("two.mcap"), vec![Vec::new(), Vec::new()]);
+    rooms::record(&env.place(), &file, SCANS, Some(SILENCE), |number, sample| published[number].push(sample));
+    (file, published)
+}
+
+/// Replays `file` step by step; what was published of each sensor.
+fn replay(env: &TestEnv, file: &Path, play: Play, set: &[&str]) -> Vec<Vec<Published>> {
+    let set = set.iter().map(|word| (*word).to_owned()).collect();
+    let sources = Sources { set, ..Sources::default() };
+    let replay = Replay {
+        file,
+        sensor: None,
+        sources: &sources,
+        play: Play { is_paused: true, ..play },
+        holds: false,
+    };
+    let domain = env.place();
+    let (tell, ready) = channel();
+    thread::scope(|scope| {
+        let hub = scope.spawn(|| {
+            daemon::replay(&replay, &domain, |_, player| tell.send(player.clone()).expect("waits"))
+        });
+        let player: Arc<Player> = ready.recv_timeout(PATIENCE).expect("is up");
+        let node = ipc::client_node(&domain).expect("a node");
+        let followers = SENSORS.map(|(name, _)| Followers::attach(&node, name));
+        let mut published = vec![Vec::new(), Vec::new()];
+        let mut telegrams = 0;
+        let mut take = |published: &mut Vec<Vec<Published>>| {
+            let mut taken = 0;
+            for (followers, published) in followers.iter().zip(published) {
+                let samples = followers.take();
+                taken += samples.iter().filter(|sample| sample.topic == Topic::Telegram).count() as u64;
+                published.extend(samples);
+            }
+            telegrams += taken;
+            telegrams
+        };
+        let give_up_at = Instant::now() + 3 * PATIENCE;
+        while !player.progress().is_over {
+            assert!(Instant::now() < give_up_at, "it does not come to an end");
+            let before = take(&mut published);
+            player.step();
+            // A step that is a silence brings no telegram: after a while it is followed by another.
+            let patience = Instant::now() + Duration::from_millis(50);
+            while take(&mut published) == before && !player.progress().is_over && Instant::now() < patience {
+                thread::yield_now();
+            }
+        }
+        take(&mut published);
+        player.end();
+        // What is said at the start, and what may have been said already of the silence after the end, is no telegram's.
+        let is_around =
+            |it: &Published| it.header.hub_time_ns().is_none() && [0, SCANS].contains(&it.header.seq);
+        published.iter_mut().for_each(|published| published.retain(|it| !is_around(it)));
+        hub.join().expect("ends").expect("ends well");
+        published
+    })
+}
+
+/// Topic, number, reasons and payload of all samples, those of a telegram together.
+fn said(published: &[Published]) -> Vec<(u64, Topic, u8, &[u8])> {
+    let of = |it: &'_ Published| (it.header.seq, it.topic, it.header.reasons);
+    let mut said: Vec<_> = published.iter().map(|it| (of(it), &it.payload[..])).collect();
+    said.sort();
+    said.into_iter().map(|((seq, topic, reasons), payload)| (seq, topic, reasons, payload)).collect()
+}
+
+/// The payloads of one topic.
+fn payloads(published: &[Published], topic: Topic) -> Vec<&[u8]> {
+    published.iter().filter(|it| it.topic == topic).map(|it| &it.payload[..]).collect()
+}
+
+#[test]
+fn the_same_parameters_give_the_same_bytes_and_others_give_others() {
+    in_own_process("replayed::the_same_parameters_give_the_same_bytes_and_others_give_others", || {
+        let env = TestEnv::new();
+        let (file, recorded) = record(&env);
+        let replayed = replay(&env, &file, Play::default(), &[LEARNING]);
+        for ((recorded, replayed), (name, _)) in recorded.iter().zip(&replayed).zip(SENSORS) {
+            let count = |topic| [replayed, recorded].map(|published| payloads(published, topic).len());
+            for topic in [Topic::Telegram, Topic::Scan, Topic::Marks, Topic::Foreground, Topic::Background] {
+                let [replayed, recorded] = count(topic);
+                assert_eq!(replayed, recorded, "{name}/{}", topic.name());
+            }
+            let [_, zones] = count(Topic::Zones);
+            assert_eq!(zones, SCANS as usize + 1, "one says that scans stayed out");
+            assert!(count(Topic::Background)[1] > 5, "models change");
+            assert!(said(recorded) == said(replayed), "{name} differs");
+            assert!(replayed.iter().all(|it| it.header.flags & Flags::REPLAYED != 0));
+            let walls = |published: &[Published]| -> Vec<u64> {
+                published
+                    .iter()
+                    .filter(|it| it.topic == Topic::Telegram)
+                    .map(|it| it.header.wall_ns)
+                    .collect()
+            };
+            assert_eq!(walls(recorded), walls(replayed), "{name}");
+        }
+        let others = replay(&env, &file, Play::default(), &[LEARNING, "zones.radii=[2.5,1.5]"]);
+        assert!(payloads(&others[0], Topic::Zones) != payloads(&recorded[0], Topic::Zones));
+        assert!(payloads(&others[0], Topic::Foreground) == payloads(&recorded[0], Topic::Foreground));
+    });
+}
+
+#[test]
+fn what_is_skipped_is_learned_from() {
+    in_own_process("replayed::what_is_skipped_is_learned_from", || {
+        let env = TestEnv::new();
+        let (file, recorded) = record(&env);
+        let play = Play { start_ns: 5_000_000_000, ..Play::default() };
+        let replayed = replay(&env, &file, play, &[LEARNING]);
+        for (recorded, replayed) in recorded.iter().zip(&replayed) {
+            for topic in [Topic::Scan, Topic::Marks, Topic::Zones, Topic::Foreground] {
+                let (all, late) = (payloads(recorded, topic), payloads(replayed, topic));
+                assert!(
+                    late.len() > 100 && late.len() < 300 && all.ends_with(&late),
+                    "{}: {}",
+                    topic.name(),
+                    late.len()
+                );
+            }
+        }
+    });
+}

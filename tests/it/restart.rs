@@ -1,0 +1,86 @@
+//! A hub that is killed or ended and started again while its consumers run on: they say so and go on by themselves,
+//! and the sensor is taken as it streams.
+
+use std::collections::{BTreeMap, HashSet};
+
+use crate::testkit::{INT, KILL, MEASURED, TERM, TestEnv, bytes_of, hash, is_class, number, sequence};
+use serde_json::Value;
+
+#[test]
+fn consumers_outlive_several_hubs() {
+    let env = TestEnv::new();
+    let simulator = env.simulator(&["front"], &["--seed=21"]);
+    let link = [env.link("front")];
+    let mut hub = env.hub(&link);
+    let mut telegrams = env.echo(&["front/telegram"]);
+    let mut scans = env.echo(&["front/scan", "front/status"]);
+    for how in [KILL, KILL, TERM, KILL] {
+        telegrams.await_lines(25, "a measured telegram", |line| line["command"] == MEASURED);
+        scans.await_lines(25, "a scan", is_class("scan"));
+        let code = hub.end(how).code;
+        assert_eq!(code, (how == TERM).then_some(0));
+        for consumer in [&mut telegrams, &mut scans] {
+            consumer.await_line("hub_gone", |line| line["kind"] == "hub_gone");
+        }
+        hub = env.hub(&link);
+        for consumer in [&mut telegrams, &mut scans] {
+            consumer.await_line("hub_back", |line| line["kind"] == "hub_back");
+        }
+    }
+    telegrams.await_lines(25, "a measured telegram", |line| line["command"] == MEASURED);
+    scans.await_lines(25, "a scan", is_class("scan"));
+    let info = env.info("front");
+    let (telegrams, scans) = (telegrams.end(INT), scans.end(INT));
+    assert_eq!((telegrams.code, scans.code), (Some(0), Some(0)), "{}", telegrams.errors);
+    assert_eq!(hub.end(TERM).code, Some(0));
+    assert_eq!(simulator.end(TERM).code, Some(0));
+
+    let news = telegrams.of_class("notice");
+    let news: Vec<_> = news.iter().map(|line| line["kind"].as_str().unwrap_or_default()).collect();
+    assert_eq!(news, ["hub_gone", "hub_back"].repeat(4));
+    let truth = env.truth("front");
+    let sent: HashSet<_> = truth.iter().map(|sent| &sent.hash).collect();
+    let lives = by_boot(telegrams.of_class("telegram"));
+    assert_eq!(lives.len(), 5);
+    for life in &lives {
+        // What is not torn but made of two halves would have a right checksum by chance, and be no telegram that was
+        // sent.
+        assert!(life.iter().all(|line| sent.contains(&hash(&bytes_of(line)))), "never sent");
+        sequence(life, "seq");
+        sequence(life, "topic_seq");
+    }
+    // Who was there before the hub got its samples from the first one on.
+    assert!(lives[1..].iter().all(|life| number(&life[0], "topic_seq") == 0));
+    let lives = by_boot(scans.of_class("scan"));
+    assert!(lives.len() == 5 && lives[1..].iter().all(|life| number(&life[0], "topic_seq") == 0));
+    for summary in telegrams.of_class("summary").iter().chain(&scans.of_class("summary")) {
+        assert_eq!(summary["lost"], 0);
+    }
+
+    // The first hub found the rate and set it; all others took the sensor as it was.
+    assert_eq!((&info["state"], &info["baud"]), (&"streaming".into(), &500_000.into()));
+    let states: Vec<_> = scans.of_class("status").iter().map(|line| line["state"].clone()).collect();
+    let first = states.iter().position(|state| state == "streaming").expect("streams");
+    let later: HashSet<_> = states[first..].iter().filter_map(Value::as_str).collect();
+    assert_eq!(later, HashSet::from(["probing", "streaming"]));
+    let streams = truth.iter().position(|sent| sent.is_intact_scan()).expect("streams");
+    let at_another_rate = |fault: &Option<String>| fault.as_deref() == Some("baud");
+    assert!(!truth[streams..].iter().any(|sent| at_another_rate(&sent.fault)), "the rate was changed");
+    let aborted = truth[streams..].iter().filter(|sent| sent.fault.as_deref() == Some("aborted")).count();
+    assert!(aborted <= 4 * 2, "{aborted} scans were broken off by four adoptions");
+    assert_eq!(env.simulated("front").1, 0, "EEPROM");
+}
+
+/// Lines by the life of the hub that they are from, in their order.
+fn by_boot(lines: Vec<Value>) -> Vec<Vec<Value>> {
+    let mut order = Vec::new();
+    let mut lives = BTreeMap::<String, Vec<Value>>::new();
+    for line in lines {
+        let boot = line["boot"].as_str().unwrap_or_default().to_owned();
+        if !lives.contains_key(&boot) {
+            order.push(boot.clone());
+        }
+        lives.entry(boot).or_default().push(line);
+    }
+    order.iter().filter_map(|boot| lives.remove(boot)).collect()
+}

@@ -1,0 +1,217 @@
+//! Recordings for ROS 2, made while sensors stream and later of what was recorded: other people's readers read every message
+//! of them, and what they read is what was measured, where and when.
+
+use std::collections::BTreeMap;
+use std::process::Command;
+
+use crate::testkit::{INT, MEASURED, Recording, TestEnv, is_class, number, python};
+use lms::variant::Unit;
+use schema::datagram::Packed;
+use schema::{Code, Header, Pose, Scan, file};
+use serde_json::Value;
+
+/// Two sensors with poses, of which one hangs upside down.
+const FRONT: Pose = Pose { x_m: 0.3, y_m: 0.1, yaw_rad: 0.25, upside_down: 0, reserved: [0; 7] };
+const REAR: Pose = Pose { x_m: -0.25, y_m: 0.0, yaw_rad: -2.5, upside_down: 1, reserved: [0; 7] };
+
+fn link(env: &TestEnv, name: &str, pose: &Pose) -> Vec<String> {
+    let mut words = vec![env.link(name)];
+    let numbers = [("x", pose.x_m), ("y", pose.y_m), ("yaw", pose.yaw_rad)];
+    words.extend(numbers.map(|(key, value)| format!("--set=link.{name}.pose.{key}={value:?}")));
+    words.push(format!("--set=link.{name}.pose.upside_down={}", pose.upside_down == 1));
+    words
+}
+
+/// The scans of a recording as the hub published them, by topic of ROS and wall clock.
+fn published(recording: &Recording) -> BTreeMap<(String, u64), (Header, Scan)> {
+    let of = |sensor: &str| {
+        let kept = recording.of(&format!("{sensor}/scan"));
+        let scans = kept.into_iter().map(|kept| {
+            let (header, payload) = file::parts(&kept.data).expect("a message of the hub");
+            let mut scan = Scan::default();
+            assert!(scan.unpack(payload));
+            ((format!("/{sensor}/scan"), header.wall_ns), (header, scan))
+        });
+        scans.collect::<Vec<_>>()
+    };
+    [of("front"), of("rear")].concat().into_iter().collect()
+}
+
+/// What other people's reader `verb` says of the file at `path`: all messages.
+fn said(mut python: Command, verb: &str, path: &str) -> Vec<Value> {
+    python.args(["tests/testkit/read.py", verb, path]).current_dir(env!("CARGO_MANIFEST_DIR"));
+    let outcome = python.output().expect("Python");
+    assert!(outcome.status.success(), "{verb} {path}: {}", String::from_utf8_lossy(&outcome.stderr));
+    serde_json::from_slice(&outcome.stdout).expect("a list of messages")
+}
+
+fn real(line: &Value, key: &str) -> f64 {
+    line[key].as_f64().unwrap_or_else(|| panic!("no {key}: {line}"))
+}
+
+/// A message has the very numbers of the scan that the hub published.
+fn check_scan(said: &Value, (header, scan): &(Header, Scan)) {
+    let sensor = said["topic"].as_str().and_then(|topic| topic.split('/').nth(1));
+    assert_eq!(said["frame"].as_str(), sensor);
+    assert_eq!(number(said, "stamp_ns"), header.wall_ns - scan.beam_age_ns(0));
+    let near = |key: &str, wanted: f64| assert!((real(said, key) - wanted).abs() < 1e-6, "{key}: {said}");
+    near("angle_min", (scan.angle_deg(0) - 90.0).to_radians());
+    near("angle_max", (scan.angle_deg(scan.beams() - 1) - 90.0).to_radians());
+    near("angle_increment", (f64::from(scan.step_mdeg) / 1000.0).to_radians());
+    near("scan_time", f64::from(header.period_us) / 1e6);
+    near("time_increment", 0.0);
+    let ranges = said["ranges"].as_array().expect("ranges");
+    assert_eq!((ranges.len(), &said["intensities"]), (scan.beams(), &scan.intensities().into()));
+    for (i, range) in ranges.iter().enumerate() {
+        match (scan.distance_mm(i), scan.code(i)) {
+            (Some(mm), _) => {
+                let metres = mm as f32 / 1000.0;
+                assert_eq!(range.as_f64().map(|range| range as f32), Some(metres), "beam {i}");
+                let within = real(said, "range_min") as f32..=real(said, "range_max") as f32;
+                assert!(within.contains(&metres), "beam {i}: {metres} is not in {within:?}");
+            }
+            (None, Some(Code::NO_RETURN | Code::BEYOND)) => assert_eq!(range, "inf", "beam {i}"),
+            (None, _) => assert_eq!(range, "nan", "beam {i}"),
+        }
+    }
+}
+
+/// The direction that a transform gives the beam at `angle_deg` of a scan (0 ahead), as a quaternion turns it.
+fn turned(transform: &Value, angle_deg: f64) -> [f64; 3] {
+    let [x, y, z, w] = ["qx", "qy", "qz", "qw"].map(|key| real(transform, key));
+    let (b, a) = angle_deg.to_radians().sin_cos();
+    [
+        (1.0 - 2.0 * (y * y + z * z)) * a + 2.0 * (x * y - z * w) * b,
+        2.0 * (x * y + z * w) * a + (1.0 - 2.0 * (x * x + z * z)) * b,
+        2.0 * (x * z - y * w) * a + 2.0 * (y * z + x * w) * b,
+    ]
+}
+
+/// The last message about frames knows both sensors, and each where its pose says.
+fn check_transforms(said: &[Value]) {
+    let of_frames: Vec<_> = said.iter().filter(|line| line["topic"] == "/tf_static").collect();
+    let last = of_frames.last().expect("where the sensors sit");
+    let known = last["transforms"].as_array().expect("transforms");
+    assert_eq!(known.len(), 2, "{last}");
+    for transform in known {
+        assert_eq!(
+            (&transform["frame"], number(transform, "stamp_ns")),
+            (&"base_link".into(), number(last, "log_time"))
+        );
+        let pose = if transform["child"] == "front" { FRONT } else { REAR };
+        assert_eq!(transform["child"], if pose == FRONT { "front" } else { "rear" });
+        for (key, wanted) in [("x", pose.x_m), ("y", pose.y_m), ("z", 0.0)] {
+            assert!((real(transform, key) - wanted).abs() < 1e-12, "{key}: {transform}");
+        }
+        for angle_deg in [-90.0, -10.0, 0.0, 45.0, 90.0] {
+            let [x, y, z] = turned(transform, angle_deg);
+            let (wanted_x, wanted_y) = pose.direction(((angle_deg + 90.0) * 1000.0) as i32);
+            let apart = (x - wanted_x).abs() + (y - wanted_y).abs() + z.abs();
+            assert!(apart < 1e-9, "{transform}: {angle_deg} degrees go to {x} {y} {z}");
+        }
+    }
+}
+
+#[test]
+fn others_read_every_message_made_live_and_later() {
+    let env = TestEnv::new();
+    let _simulator = env.simulator(&["front", "rear"], &["--world=room", "--seed=5", "--mode=0x01"]);
+    let _hub = env.hub(&[link(&env, "front", &FRONT), link(&env, "rear", &REAR)].concat());
+    for sensor in ["front", "rear"] {
+        env.await_info(sensor, |info| info["state"] == "streaming");
+    }
+    // What goes on around it is recorded from before until after.
+    let [all, live, later] = ["all.mcap", "live.mcap", "later.mcap"].map(|name| env.word(name));
+    let mut around = env.start(&["record", "--all", "--json", "-o", &all]);
+    around.await_line("samples", |line| is_class("recording")(line) && number(line, "samples") >= 100);
+    let outcome = env.run(&["record", "--ros2", "--json", "--for=3s", "-o", &live]);
+    assert_eq!(outcome.code, Some(0), "{outcome}");
+    assert_eq!(around.end(INT).code, Some(0));
+    let outcome = env.run(&["convert", &all, &later, "--ros2", "--json"]);
+    assert_eq!(outcome.code, Some(0), "{outcome}");
+    let account = outcome.of_class("converted").pop().expect("an account");
+    assert_eq!((&account["to"], &account["sensors"]), (&"ROS 2".into(), &Value::from(vec!["front", "rear"])));
+
+    let recording = Recording::whole(&env.path("all.mcap"));
+    let published = published(&recording);
+    let is_at_an_end = |(topic, log_time): &(String, u64)| {
+        let mut times = published.keys().filter(|(of, _)| of == topic).map(|(_, time)| time);
+        let last = times.clone().next_back();
+        Some(log_time) < times.next() || Some(log_time) > last
+    };
+    for (name, path) in [("live.mcap", &live), ("later.mcap", &later)] {
+        let ours = Recording::whole(&env.path(name));
+        assert!(ours.kept.iter().all(|kept| kept.encoding == "cdr"), "{name} has other messages");
+        let scans = ours.kept.iter().filter(|kept| kept.topic != "/tf_static").count();
+        assert!(scans > 60, "{name}: {scans} scans");
+        if name == "later.mcap" {
+            let telegrams = ["front/telegram", "rear/telegram"].map(|topic| recording.of(topic)).concat();
+            let measured = telegrams.iter().filter(|kept| u64::from(kept.payload()[4]) == MEASURED).count();
+            assert_eq!((number(&account, "scans"), scans), (scans as u64, measured));
+        }
+        for (verb, modules) in [("mcap_ros2", "mcap_ros2, mcap"), ("rosbags", "rosbags, mcap")] {
+            let Some(python) = python(modules) else { continue };
+            let said = said(python, verb, path);
+            assert_eq!(said.len(), ours.kept.len(), "{verb} of {name}");
+            let mut checked = 0;
+            for line in said.iter().filter(|line| line["topic"] != "/tf_static") {
+                let topic = line["topic"].as_str().unwrap_or_default().to_owned();
+                let key = (topic, number(line, "log_time"));
+                match published.get(&key) {
+                    Some(scan) => check_scan(line, scan),
+                    // A telegram was recorded, and its scan was not: the recorder attaches to topics one by one.
+                    None => assert!(is_at_an_end(&key), "{verb} of {name}: nobody published {key:?}"),
+                }
+                checked += usize::from(published.contains_key(&key));
+            }
+            assert!(checked > 60, "{verb} of {name}: {checked} scans were published");
+            check_transforms(&said);
+            if verb == "rosbags" {
+                let of_frames = |line: &&Value| line["topic"] == "/tf_static";
+                let all_latched =
+                    said.iter().filter(of_frames).all(|line| line["durability"] == "TRANSIENT_LOCAL");
+                assert!(all_latched, "listeners to frames would not hear them");
+            }
+        }
+    }
+}
+
+#[test]
+fn a_stream_becomes_messages_and_rows_where_its_mode_is_known() {
+    let env = TestEnv::new();
+    let words: [u16; 361] = std::array::from_fn(|beam| (beam as u16 % 8) << 13 | (500 + 11 * beam as u16));
+    let scan = lms::measured::encode(0, Unit::Mm, &words, 0x10);
+    let bytes = scan.bytes().repeat(20);
+    let stream = env.file("a.bin", &bytes);
+    let [bag, rows] = ["bag.mcap", "rows.csv"].map(|name| env.word(name));
+    for words in [&[&bag[..], "--ros2"][..], &[&rows]] {
+        let outcome = env.run(&[&["convert", &stream], words].concat());
+        assert_eq!(outcome.code, Some(78), "{outcome}");
+        assert!(outcome.errors.contains("does not tell the measuring mode of front"), "{outcome}");
+        assert!(outcome.errors.contains("--mode"), "{outcome}");
+        let outcome = env.run(&[&["convert", &stream, "--mode=0x01"], words].concat());
+        assert_eq!(outcome.code, Some(0), "{outcome}");
+    }
+    let told: Vec<_> = Recording::whole(&env.path("bag.mcap")).kept;
+    assert_eq!(told.len(), 20);
+    assert!(
+        told.iter().all(|kept| kept.topic == "/front/scan" && kept.schema == "sensor_msgs/msg/LaserScan")
+    );
+    let text = std::fs::read_to_string(&rows).expect("rows");
+    let lines: Vec<Vec<&str>> = text.lines().map(|line| line.split(',').collect()).collect();
+    assert_eq!((lines.len(), lines[0].len()), (21, 8 + 361));
+    assert_eq!(lines[0][..2], ["seq", "topic_seq"]);
+    for (number, line) in lines[1..].iter().enumerate() {
+        let words: Vec<String> = words.iter().map(|word| (word & 0x1FFF).to_string()).collect();
+        assert_eq!((line[0], line[5..8].to_vec()), (&number.to_string()[..], vec!["1", "0", "0.5"]));
+        assert_eq!(line[8..], words);
+    }
+    for (words, code, says) in [
+        (&[&rows[..], "--ros2", "--force"][..], 2, "--ros2 makes an MCAP file"),
+        (&["b.bin", "--mode=0x01"], 2, "--mode is for scans"),
+        (&["b.csv", "--mode=0x77"], 78, "none of a range"),
+    ] {
+        let outcome = env.run(&[&["convert", &stream], words].concat());
+        assert!(outcome.code == Some(code) && outcome.errors.contains(says), "{outcome}");
+    }
+}

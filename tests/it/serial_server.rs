@@ -1,0 +1,275 @@
+//! A sensor behind a serial server: the server is played here, between a socket on the loopback and the simulator's
+//! pty.
+
+use std::io::{Read, Write};
+use std::net::{TcpListener, TcpStream};
+use std::process::Stdio;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::thread::{self, JoinHandle};
+use std::time::{Duration, Instant};
+
+use crate::testkit;
+use crate::testkit::{INT, TERM, TestEnv, is_class, number, open_line, sequence, terminal};
+use rustix::process::Signal;
+use serde_json::Value;
+
+/// One connection at a time, until it is dropped.
+struct Server {
+    address: String,
+    /// Ends the connection that there is.
+    hang_up: Arc<AtomicBool>,
+    end: Arc<AtomicBool>,
+    thread: Option<JoinHandle<()>>,
+}
+
+impl Server {
+    /// A server whose serial port is the line at `place`, set to `rate` by hand.
+    fn new(env: &TestEnv, place: &str, rate: u32) -> Server {
+        let listener = TcpListener::bind("127.0.0.1:0").expect("a port of the loopback");
+        let address = listener.local_addr().expect("it has an address").to_string();
+        listener.set_nonblocking(true).expect("a socket");
+        let (hang_up, end) = (Arc::new(AtomicBool::new(false)), Arc::new(AtomicBool::new(false)));
+        let line = open_line(&env.path(place), rate);
+        let body = {
+            let (hang_up, end) = (hang_up.clone(), end.clone());
+            move || {
+                while !end.load(Ordering::Relaxed) {
+                    match listener.accept() {
+                        Ok((socket, _)) => carry(&line, &socket, &|| {
+                            hang_up.swap(false, Ordering::Relaxed) || end.load(Ordering::Relaxed)
+                        }),
+                        Err(_) => thread::sleep(Duration::from_millis(5)),
+                    }
+                }
+            }
+        };
+        Server { address, hang_up, end, thread: Some(thread::spawn(body)) }
+    }
+
+    fn link(&self) -> String {
+        format!("--link=front=tcp:{}", self.address)
+    }
+}
+
+impl Drop for Server {
+    fn drop(&mut self) {
+        self.end.store(true, Ordering::Relaxed);
+        let _ = self.thread.take().map(JoinHandle::join);
+    }
+}
+
+/// Bytes to and fro until `is_over`, or until the other end closes the connection.
+fn carry(line: &std::fs::File, socket: &TcpStream, is_over: &dyn Fn() -> bool) {
+    let (mut line, mut socket) = (line, socket);
+    let mut buffer = [0; 4096];
+    socket.set_nonblocking(true).expect("a socket");
+    socket.set_nodelay(true).expect("a socket");
+    while !is_over() {
+        let from_host = socket.read(&mut buffer);
+        match from_host {
+            Ok(0) => return,
+            Ok(len) => line.write_all(&buffer[..len]).expect("the simulator lives"),
+            Err(_) => {}
+        }
+        match line.read(&mut buffer) {
+            Ok(len) if len > 0 => {
+                if socket.write_all(&buffer[..len]).is_err() {
+                    return;
+                }
+            }
+            _ if from_host.is_ok() => {}
+            _ => thread::sleep(Duration::from_micros(200)),
+        }
+    }
+}
+
+#[test]
+fn a_sensor_behind_a_serial_server() {
+    let env = TestEnv::new();
+    let _simulator = env.simulator(&["line"], &["--baud=38400", "--seed=5"]);
+    let server = Server::new(&env, "line", 38_400);
+    let hub = env.hub(&[&server.link(), "--set=link.front.baud=38400"]);
+    let mut consumer = env.echo(&["front/telegram", "front/status"]);
+    consumer.await_lines(5, "a telegram", is_class("telegram"));
+    server.hang_up.store(true, Ordering::Relaxed);
+    let absent = consumer.await_line("absent", |line| line["state"] == "absent");
+    let error = absent["last_error"].as_str().unwrap_or_default();
+    assert!(error.contains(&server.address) && error.contains("closed by the serial server"), "{absent}");
+    consumer.await_line("streaming", |line| line["state"] == "streaming");
+    consumer.await_lines(5, "a telegram", is_class("telegram"));
+    let info = env.info("front");
+    assert_eq!(number(&info["counters"], "reconnects"), 1, "{info}");
+    assert_eq!(info["port"], format!("tcp:{}", server.address));
+    let outcome = consumer.end(INT);
+    sequence(&outcome.of_class("telegram"), "seq");
+    assert_eq!(hub.end(TERM).code, Some(0));
+}
+
+#[test]
+fn scans_that_waited_for_a_hub_at_a_standstill_say_nothing_of_now() {
+    let env = TestEnv::new();
+    let _simulator = env.simulator(&["line"], &["--baud=38400", "--seed=5"]);
+    let server = Server::new(&env, "line", 38_400);
+    let hub = env.hub(&[&server.link(), "--set=link.front.baud=38400", "--set=zones.radii=[0.02,0.01]"]);
+    let mut consumer = env.echo(&["front/zones"]);
+    consumer.await_line("a verdict", |line| line["verdict"] == "clear");
+    hub.signal(Signal::STOP);
+    // Five scans come in a second, and ten are read at once.
+    thread::sleep(Duration::from_secs(6));
+    hub.signal(Signal::CONT);
+    let first = consumer.await_line("a verdict", |line| line["verdict"] == "unknown");
+    let first = consumer.await_line("an old scan", |line| line["seq"].as_u64() > first["seq"].as_u64());
+    let last = consumer.await_line("a new scan", |line| line["verdict"] == "clear");
+    let is_estimated = |line: &Value| line["flags"].to_string().contains("stamp_estimated");
+    assert!(is_estimated(&first) && !is_estimated(&last), "{first} {last}");
+    let waited = number(&last, "seq") - number(&first, "seq");
+    eprintln!("{waited} scans were too old to tell of now");
+    // Thirty waited, and while twenty of them were read slowly twenty more did.
+    assert!(waited >= 35, "{waited}: {first} {last}");
+    consumer.end(INT);
+    assert_eq!(hub.end(TERM).code, Some(0));
+}
+
+#[test]
+fn a_serial_server_that_is_set_to_another_rate() {
+    let env = TestEnv::new();
+    let _simulator = env.simulator(&["line"], &["--baud=9600"]);
+    let server = Server::new(&env, "line", 38_400);
+    let _hub = env.hub(&[&server.link(), "--set=link.front.baud=38400"]);
+    let says = "no answer at 38400 baud, to which the serial server was set";
+    let said = |info: &Value| info["last_error"].as_str().is_some_and(|error| error.contains(says));
+    env.await_info("front", said);
+}
+
+#[test]
+fn a_serial_server_that_is_not_there() {
+    let env = TestEnv::new();
+    // The port was free a moment ago.
+    let address = TcpListener::bind("127.0.0.1:0").and_then(|socket| socket.local_addr()).expect("a port");
+    // Too long for a name: nobody is asked for it.
+    let nowhere = "x".repeat(64);
+    let hub = env.hub(&[&format!("--link=front=tcp:{address}"), &format!("--link=named=tcp:{nowhere}:4001")]);
+    for (sensor, says) in [("front", "connection refused; nothing listens there"), ("named", "no such host")]
+    {
+        let said = |info: &Value| info["last_error"].as_str().is_some_and(|error| error.contains(says));
+        let info = env.await_info(sensor, said);
+        assert_eq!(info["state"], "absent", "{info}");
+    }
+    assert_eq!(hub.end(TERM).code, Some(0));
+}
+
+#[test]
+fn a_want_of_descriptors_is_not_the_servers_fault() {
+    let env = TestEnv::new();
+    let free = TcpListener::bind("127.0.0.1:0").and_then(|socket| socket.local_addr()).expect("a port");
+    let port = format!("tcp:localhost:{}", free.port());
+    for limit in 5..16 {
+        let inner = env.command(&["probe", &port]);
+        let mut command = std::process::Command::new("sh");
+        command.args(["-c", "ulimit -n \"$0\" && exec \"$@\"", &limit.to_string()]);
+        command.arg(inner.get_program()).args(inner.get_args()).env("SCANHUB_END_WITH_PARENT", "1");
+        let outcome = testkit::Program::start(command).wait();
+        match outcome.code {
+            Some(75) => {}
+            Some(4) => assert!(outcome.errors.contains("connection refused"), "{limit}: {outcome}"),
+            _ => panic!("{limit}: {outcome}"),
+        }
+    }
+}
+
+#[test]
+fn nobody_has_to_wait_for_a_serial_server_that_does_not_answer() {
+    let env = TestEnv::new();
+    // Nobody accepts, and there is no room for one more: the kernel drops who comes.
+    let listener = TcpListener::bind("127.0.0.1:0").expect("a port of the loopback");
+    rustix::net::listen(&listener, 0).expect("a socket");
+    let address = listener.local_addr().expect("it has an address");
+    let _waiting = TcpStream::connect(address).expect("room for one");
+    let port = format!("tcp:{address}");
+    for arguments in [["probe", &port, "--json"], ["doctor", &port, "--json"]] {
+        let program = env.start(&arguments);
+        let descriptors = format!("/proc/{}/fd", program.pid());
+        let is_socket = |entry: std::fs::DirEntry| {
+            entry.path().read_link().is_ok_and(|target| target.to_string_lossy().starts_with("socket:"))
+        };
+        testkit::until("it dials", || {
+            std::fs::read_dir(&descriptors).is_ok_and(|entries| entries.flatten().any(is_socket))
+        });
+        assert_eq!(program.end(INT).code, Some(130));
+    }
+}
+
+#[test]
+fn a_serial_server_that_serves_somebody_else_is_asked_seldom_and_told_of_once() {
+    let env = TestEnv::new();
+    let listener = TcpListener::bind("127.0.0.1:0").expect("a port of the loopback");
+    let address = listener.local_addr().expect("it has an address");
+    let hub = env.hub(&[format!("--link=front=tcp:{address}")]);
+    let came = [0; 6].map(|_| {
+        let _connection = listener.accept().expect("the hub comes again");
+        Instant::now()
+    });
+    let info = env.await_info("front", |info| info["counters"]["reconnects"] == 6);
+    assert_eq!(info["state"], "absent", "{info}");
+    let outcome = hub.end(TERM);
+    let said = outcome.errors.lines().filter(|line| line.contains("closed by the serial server")).count();
+    assert_eq!(said, 1, "{outcome}");
+    assert!(outcome.errors.lines().count() < 8, "{outcome}");
+    // Never sooner than it wants to wait by then.
+    assert!(came[5] - came[4] >= Duration::from_millis(1_600), "{came:?}");
+}
+
+#[test]
+fn probe_and_doctor_ask_there_too() {
+    let env = TestEnv::new();
+    let _simulator = env.simulator(&["sensor"], &["--baud=38400"]);
+    let server = Server::new(&env, "sensor", 38_400);
+    let port = format!("tcp:{}", server.address);
+    let outcome = env.run(&["probe", &port, "--json"]);
+    assert_eq!(outcome.code, Some(0), "{outcome}");
+    let found = &outcome.lines()[0];
+    // The server has the rate; the sensor tells which it is.
+    assert_eq!((number(found, "baud"), number(found, "operating_mode")), (38_400, 0x25), "{found}");
+    let outcome = env.run(&["doctor", &port, "--no-system-config", "--json"]);
+    assert_eq!(outcome.code, Some(0), "{outcome}");
+    let findings = outcome.of_class("check");
+    let sensor = findings.iter().find(|line| line["name"] == "sensor").expect("it is asked");
+    assert!(sensor["finding"].as_str().is_some_and(|text| text.contains("38400 Bd")), "{sensor}");
+    drop(server);
+    let outcome = env.run(&["probe", &port, "--json"]);
+    assert_eq!(outcome.code, Some(4), "{outcome}");
+}
+
+/// What a person sees who runs the program with `arguments` at a terminal and answers its question by yes; its exit code.
+fn confirmed(env: &TestEnv, arguments: &[&str]) -> (String, Option<i32>) {
+    let (mut keys, screen) = terminal();
+    let mut command = env.command(arguments);
+    let screens = [0; 3].map(|_| Stdio::from(screen.try_clone().unwrap()));
+    let [stdin, stdout, stderr] = screens;
+    let mut process = command.stdin(stdin).stdout(stdout).stderr(stderr).spawn().expect("it starts");
+    drop((command, screen));
+    let (mut seen, mut byte) = (Vec::new(), [0]);
+    // A terminal that nobody has open any more ends by an error.
+    while keys.read(&mut byte).is_ok_and(|len| len > 0) {
+        seen.push(byte[0]);
+        if seen.ends_with(b"Type yes: ") {
+            keys.write_all(b"yes\n").expect("it listens");
+        }
+    }
+    (String::from_utf8_lossy(&seen).into_owned(), process.wait().expect("it ends").code())
+}
+
+#[test]
+fn a_sensor_there_can_be_configured() {
+    let env = TestEnv::new();
+    let simulator = env.simulator(&["front"], &["--baud=38400"]);
+    let server = Server::new(&env, "front", 38_400);
+    let port = format!("tcp:{}", server.address);
+    let (seen, code) = confirmed(&env, &["configure", &port, "unit=cm"]);
+    assert_eq!(code, Some(0), "{seen}");
+    assert_eq!(number(&env.run(&["probe", &port, "--json"]).lines()[0], "unit_mm"), 10);
+    drop(server);
+    assert_eq!(simulator.end(TERM).code, Some(0));
+    assert_eq!(env.simulated("front").1, 1);
+}

@@ -1,0 +1,163 @@
+//! The hub as a service: it says when it is up, feeds the watchdog with work that is done, and leaves its ports with
+//! the service manager, so that what a sensor sends while a killed hub is replaced is not lost.
+
+use std::collections::{HashMap, HashSet};
+use std::time::Duration;
+
+use crate::testkit::{
+    INT, KILL, MEASURED, Program, TERM, TestEnv, bytes_of, hash, is_class, number, sequence,
+};
+use serde_json::Value;
+
+const KILLS: usize = 6;
+
+#[test]
+fn what_is_sent_while_a_killed_hub_is_replaced_waits_in_the_line() {
+    let env = TestEnv::new();
+    let simulator = env.simulator(&["front"], &["--seed=5", "--baud=500000"]);
+    let mut supervisor = env.supervisor();
+    let flags = [env.link("front")];
+    let mut hub = env.service(&mut supervisor, &flags, None).ready();
+    supervisor.hear("FDNAME=front");
+    supervisor.hear("READY=1");
+    let mut telegrams = env.echo(&["front/telegram"]);
+    let mut boots = HashSet::new();
+    for _ in 0..KILLS {
+        live(&mut telegrams, &mut boots);
+        assert_eq!(hub.end(KILL).code, None);
+        hub = env.service(&mut supervisor, &flags, None).ready();
+        supervisor.hear("READY=1");
+    }
+    live(&mut telegrams, &mut boots);
+    // Nobody but the one who keeps it has the line, and it is still locked.
+    assert_eq!(hub.end(KILL).code, None);
+    assert_eq!(env.run(&["run", &flags[0]]).code, Some(4), "a hub of nobody's finds it busy");
+    hub = env.service(&mut supervisor, &flags, None).ready();
+    live(&mut telegrams, &mut boots);
+    assert_eq!(hub.end(TERM).code, Some(0));
+    supervisor.hear("STOPPING=1");
+    let got = telegrams.end(INT);
+    assert_eq!(simulator.end(TERM).code, Some(0));
+
+    let lines = got.of_class("telegram");
+    let mut lives = HashMap::<&str, Vec<_>>::new();
+    for line in &lines {
+        lives.entry(line["boot"].as_str().unwrap_or_default()).or_default().push(line.clone());
+    }
+    assert_eq!(lives.len(), KILLS + 2);
+    for life in lives.values() {
+        sequence(life, "seq");
+    }
+    let received: Vec<_> = lines.iter().filter(|line| line["command"] == MEASURED).collect();
+    let received: Vec<String> = received.iter().map(|line| hash(&bytes_of(line))).collect();
+    let truth: Vec<_> = env.truth("front").into_iter().filter(|sent| sent.is_intact_scan()).collect();
+    let at = |hash: &String| truth.iter().position(|sent| &sent.hash == hash).expect("it was sent");
+    let span = &truth[at(&received[0])..=at(&received[received.len() - 1])];
+    let lost = span.iter().filter(|sent| !received.contains(&sent.hash)).count();
+    // At most the telegram that the killed one was reading: it reads in the last 0.6 ms of 26.64.
+    assert!(lost <= KILLS + 1, "{lost} of {} lost by {} kills", span.len(), KILLS + 1);
+    let mut sorted: Vec<_> = received.iter().map(at).collect();
+    assert!(sorted.is_sorted(), "out of order");
+    sorted.dedup();
+    assert_eq!(sorted.len(), received.len(), "twice");
+    println!("{lost} of {} telegrams lost by {} kills", span.len(), KILLS + 1);
+    assert_eq!(env.simulated("front").1, 0, "EEPROM");
+}
+
+/// Waits for telegrams of a life of the hub that none of `boots` is: those of another one may still wait to be read.
+fn live(telegrams: &mut Program, boots: &mut HashSet<String>) {
+    let boot = |line: &Value| line["boot"].as_str().unwrap_or_default().to_owned();
+    let is_new = |line: &Value| line["command"] == MEASURED && !boots.contains(&boot(line));
+    let lines = telegrams.await_lines(20, "a measured telegram", is_new);
+    boots.insert(boot(&lines[0]));
+}
+
+#[test]
+fn scans_go_on_with_the_first_telegram_of_the_next_hub() {
+    let env = TestEnv::new();
+    let simulator = env.simulator(&["front"], &["--seed=8", "--baud=500000"]);
+    let mut supervisor = env.supervisor();
+    let flags = [env.link("front")];
+    let hub = env.service(&mut supervisor, &flags, None).ready();
+    supervisor.hear("FDNAME=front");
+    let mut samples = env.echo(&["front/telegram", "front/scan"]);
+    let scans = samples.await_lines(20, "a scan", is_class("scan"));
+    let of_next = |line: &Value| line["boot"] != scans[0]["boot"];
+    assert_eq!(hub.end(KILL).code, None);
+    let hub = env.service(&mut supervisor, &flags, None).ready();
+    let first =
+        samples.await_line("a measured telegram", |line| of_next(line) && line["command"] == MEASURED);
+    let scan = samples.await_line("its scan", |line| of_next(line) && line["class"] == "scan");
+    assert_eq!(scan["seq"], first["seq"], "{scan}");
+    assert_eq!((&scan["unit_mm"], &scan["count"]), (&scans[0]["unit_mm"], &scans[0]["count"]));
+    // Its status is asked all the same, its type is known.
+    let info = env.await_info("front", |info| info["counters"]["telegrams"].as_u64() > Some(100));
+    assert_eq!((&info["type"], &info["mode"]), (&"LMS200;301063;V02.30".into(), &1.into()), "{info}");
+    assert_eq!(hub.end(TERM).code, Some(0));
+    drop(samples);
+    assert_eq!(simulator.end(TERM).code, Some(0));
+}
+
+#[test]
+fn a_port_that_went_is_given_back_and_another_link_s_is_not_taken() {
+    let env = TestEnv::new();
+    let simulator = env.simulator(&["front"], &["--seed=6", "--baud=500000"]);
+    let mut supervisor = env.supervisor();
+    let hub = env.service(&mut supervisor, &[env.link("front")], None).ready();
+    supervisor.hear("FDNAME=front");
+    supervisor.hear("READY=1");
+    assert_eq!(hub.end(KILL).code, None);
+    // The next one has a link of another name: what was kept is nobody's.
+    let side = format!("--link=side={}", env.word("side"));
+    let hub = env.service(&mut supervisor, &[side], None).ready();
+    supervisor.hear("FDSTOREREMOVE=1");
+    supervisor.hear("STATUS=sensors: side");
+    assert_eq!(hub.end(TERM).code, Some(0));
+    // It was closed: whoever comes finds it free.
+    let hub = env.service(&mut supervisor, &[env.link("front")], None).ready();
+    supervisor.hear("FDNAME=front");
+    env.await_info("front", |info| info["state"] == "streaming");
+    env.kill_simulator(simulator, "front");
+    supervisor.hear("FDSTOREREMOVE=1");
+    let info = env.await_info("front", |info| info["state"] == "absent");
+    assert_eq!(number(&info["counters"], "reconnects"), 1);
+    assert_eq!(hub.end(TERM).code, Some(0));
+}
+
+#[test]
+fn a_link_that_got_another_name_goes_on_with_its_port() {
+    let env = TestEnv::new();
+    let simulator = env.simulator(&["front"], &["--seed=7", "--baud=500000"]);
+    let mut supervisor = env.supervisor();
+    let hub = env.service(&mut supervisor, &[env.link("front")], None).ready();
+    supervisor.hear("FDNAME=front");
+    supervisor.hear("READY=1");
+    assert_eq!(hub.end(KILL).code, None);
+    // Whoever keeps it has it locked: it cannot be opened, only taken over.
+    let side = format!("--link=side={}", env.word("front"));
+    let hub = env.service(&mut supervisor, &[side], None).ready();
+    supervisor.hear("FDSTOREREMOVE=1");
+    supervisor.hear("FDNAME=side");
+    supervisor.hear("READY=1");
+    assert_eq!(hub.end(KILL).code, None);
+    // The name has another port now: what was kept under it is not kept beside the new one.
+    let side = format!("--link=side={}", env.word("nowhere"));
+    let hub = env.service(&mut supervisor, &[side], None).ready();
+    supervisor.hear("FDSTOREREMOVE=1");
+    supervisor.hear("STATUS=sensors: side");
+    assert_eq!(hub.end(TERM).code, Some(0));
+    assert_eq!(simulator.end(TERM).code, Some(0));
+}
+
+#[test]
+fn the_watchdog_is_fed_while_links_work() {
+    let env = TestEnv::new();
+    let mut supervisor = env.supervisor();
+    // A port that is not there is no link that hangs.
+    let hub = env.service(&mut supervisor, &[env.link("front")], Some(Duration::from_secs(2))).ready();
+    for _ in 0..3 {
+        supervisor.hear("WATCHDOG=1");
+    }
+    assert_eq!(hub.end(TERM).code, Some(0));
+    supervisor.hear("STOPPING=1");
+}

@@ -1,0 +1,155 @@
+//! docs/sharing.md, tried: a hub under one user, its consumers under another one. Each test has a network, a /run, a /tmp and
+//! a /dev/shm of its own.
+
+use std::fs;
+use std::os::unix::fs::{DirBuilderExt, chown};
+use std::os::unix::process::CommandExt;
+use std::process::Command;
+
+use crate::testkit;
+use crate::testkit::{INT, Program, TERM, is_class, number, until};
+use serde_json::{Value, json};
+
+const PAGE: &str = include_str!("../../docs/sharing.md");
+/// Where the namespaces are made: the test that shall run in them.
+const INSIDE: &str = "SCANHUB_TEST_SHARING";
+/// Users that need not be known to the system.
+const HUB: u32 = 65531;
+const OTHER: u32 = 65532;
+
+/// Runs `test`, which is called `name`, where it can be two users; says so if the system does not allow that.
+fn among_users(name: &str, test: impl FnOnce()) {
+    if std::env::var_os(INSIDE).is_some() {
+        return test();
+    }
+    // Where /tmp is hidden the programs may be, too.
+    let script = "ip link set lo up && mount -t tmpfs -o mode=755 none /mnt && cp \"$1\" /mnt/test && cp \"$2\" /mnt/scanhub \
+                  && mount -t tmpfs -o mode=755 none /run && mount -t tmpfs -o mode=1777 none /tmp \
+                  && mount -t tmpfs -o mode=1777 none /dev/shm";
+    let unshare = |then: &str| {
+        let mut command = Command::new("unshare");
+        command.args(["--net", "--mount", "sh", "-c", &format!("{script} && {then}"), "sh"]);
+        command.arg(testkit::own_program()).arg(env!("CARGO_BIN_EXE_scanhub"));
+        command
+    };
+    let is_root = rustix::process::getuid().is_root();
+    if !is_root || !unshare("true").output().is_ok_and(|output| output.status.success()) {
+        testkit::skip("root", "only root can be two users, and needs namespaces and `ip` for it");
+        return;
+    }
+    let mut inside = unshare(&format!("exec /mnt/test --exact {name} --nocapture"));
+    inside.env(INSIDE, "1").current_dir("/");
+    testkit::run_again(name, inside);
+}
+
+/// A directory of `user` alone, which is there already if `path` is.
+fn own(user: u32, path: &str) {
+    fs::DirBuilder::new().recursive(true).mode(0o700).create(path).expect("a directory");
+    chown(path, Some(user), Some(user)).expect("root gives it away");
+}
+
+/// The program as a user who logged in has it; the hub's is its service, too.
+fn scanhub(user: u32, arguments: &[&str]) -> Command {
+    let mut command = Command::new("/mnt/scanhub");
+    command.args(arguments).env_clear().env("SCANHUB_END_WITH_PARENT", "1").current_dir("/");
+    command.env("XDG_RUNTIME_DIR", format!("/run/user/{user}")).env("HOME", format!("/tmp/{user}"));
+    if user == HUB {
+        command.env("RUNTIME_DIRECTORY", "/run/scanhub");
+    }
+    command.uid(user).gid(user);
+    command
+}
+
+fn start(user: u32, arguments: &[&str]) -> Program {
+    Program::start(scanhub(user, arguments))
+}
+
+/// The words of the page's line that is so, or else begins so, without the program's name.
+fn of_page(begin: &str) -> Vec<&'static str> {
+    let find = |is_it: &dyn Fn(&str) -> bool| PAGE.lines().find(|line| is_it(line));
+    let line = find(&|line| line == begin).or_else(|| find(&|line| line.starts_with(begin)));
+    line.unwrap_or_else(|| panic!("no line {begin:?}")).split(' ').skip(1).collect()
+}
+
+/// The same, with JSON and the gateway that is here in the place of the page's.
+fn followed(begin: &str, hub: &str) -> Vec<String> {
+    let words = of_page(begin).into_iter().map(|word| word.replace("5f3a12bc00d1e2f3", hub));
+    words.chain(["--json".to_owned()]).collect()
+}
+
+fn words(texts: &[String]) -> Vec<&str> {
+    texts.iter().map(String::as_str).collect()
+}
+
+#[test]
+fn consumers_under_another_user_get_what_the_page_says() {
+    among_users("sharing::consumers_under_another_user_get_what_the_page_says", || {
+        fs::create_dir("/run/user").expect("an empty /run");
+        own(HUB, "/run/scanhub");
+        for user in [HUB, OTHER] {
+            own(user, &format!("/run/user/{user}"));
+            own(user, &format!("/tmp/{user}"));
+        }
+        let port = format!("/tmp/{HUB}/front");
+        let port_flag = format!("--port={port}");
+        let _simulator =
+            start(HUB, &["simulate", "--json", &port_flag, "--seed=61", "--baud=500000"]).ready();
+        let link = format!("--link=front={port}");
+        let _hub = start(HUB, &["run", "--json", &link]).ready();
+        // The other user can do nothing with the hub's memory.
+        let alone = start(OTHER, &["echo", "front/scan", "--json", "-n", "1"]).wait();
+        assert_ne!(alone.code, Some(0), "{alone}");
+
+        let mut gateway = start(HUB, &[&of_page("scanhub gateway")[..], &["--json"]].concat());
+        let begin = gateway.await_line("its begin", is_class("gateway"));
+        let hub = begin["hub"].as_str().unwrap_or_default().to_owned();
+        let mut listener =
+            start(OTHER, &words(&followed("scanhub listen --publish --interface lo", &hub))).ready();
+        let published = listener.await_line("a sensor", |line| line["kind"] == "published");
+        assert_eq!(published["sensor"], json!(format!("{hub}.front")));
+        let listed = start(OTHER, &words(&followed("scanhub list", &hub))).wait();
+        let is_scan = |line: &&Value| line["class"] == "topic" && line["topic"] == "scan";
+        assert!(listed.lines().iter().any(|line| is_scan(&line)), "{listed}");
+        let mut there = start(HUB, &["echo", "front/scan", "--json"]);
+        there.await_line("a scan", is_class("scan"));
+        let mut echo = start(OTHER, &words(&followed("scanhub echo 5f3a", &hub)));
+        let scan = echo.await_lines(40, "scans", is_class("scan")).pop().expect("forty");
+        let same = there.await_line("the same one", |line| line["seq"] == scan["seq"]);
+        assert_eq!((&scan["ranges"], &scan["wall_ns"]), (&same["ranges"], &same["wall_ns"]));
+        drop(there.end(INT));
+        let echoed = echo.end(INT);
+        assert_eq!((echoed.code, number(&echoed.of_class("summary")[0], "lost")), (Some(0), 0), "{echoed}");
+        assert_eq!(listener.end(TERM).code, Some(0));
+
+        // Under a name of its own.
+        let named = followed("scanhub listen --publish --interface lo --name", &hub);
+        let listener = start(OTHER, &words(&named)).ready();
+        until("the name is there", || {
+            let outcome = start(OTHER, &["list", "--json"]).wait();
+            outcome.of_class("topic").iter().any(|line| line["sensor"] == "here.front")
+        });
+        let echoed =
+            start(OTHER, &[&of_page("scanhub echo here")[..], &["--json", "-n", "3"]].concat()).wait();
+        assert_eq!((echoed.code, echoed.of_class("scan").len()), (Some(0), 3), "{echoed}");
+        assert_eq!(listener.end(TERM).code, Some(0));
+        assert_eq!(gateway.end(TERM).code, Some(0));
+    });
+}
+
+/// What the page says of the service is a configuration that a gateway takes.
+#[test]
+fn the_page_s_configuration_is_one() {
+    let block = PAGE.split("```toml\n").nth(1).and_then(|rest| rest.split("```").next()).expect("a block");
+    let env = testkit::TestEnv::new();
+    let file = env.file("scanhub.toml", block);
+    let shown = env.run(&[
+        "config",
+        "show",
+        "--json",
+        "--no-system-config",
+        "--link=front=/dev/x",
+        &format!("--config={file}"),
+    ]);
+    let is_it = |line: &Value| line["key"] == "gateway.interface" && line["value"] == "lo";
+    assert!(shown.lines().iter().any(is_it), "{shown}");
+}

@@ -1,0 +1,255 @@
+//! What another user of the same machine can do to hub and clients of this one: nothing but to be named. Each test has
+//! a /tmp and a /dev/shm of its own; the user is root, whom no permission stops, and the stranger somebody else.
+
+use std::fs;
+use std::os::unix::fs::{DirBuilderExt, MetadataExt, PermissionsExt, symlink};
+use std::os::unix::process::CommandExt;
+use std::path::{Path, PathBuf};
+use std::process::Command;
+
+use crate::testkit;
+use crate::testkit::{INT, KILL, Outcome, Program, TERM, TestEnv, is_class, until};
+
+/// Where the namespace is made: the test that shall run in it.
+const INSIDE: &str = "SCANHUB_TEST_STRANGERS";
+const STRANGER: u32 = 65533;
+/// What root has and nobody may touch.
+const LETTER: &str = "not a lock";
+
+/// Runs `test`, which is called `name`, beside a stranger; says so if the system does not allow that.
+fn beside_a_stranger(name: &str, test: impl FnOnce()) {
+    if std::env::var_os(INSIDE).is_some() {
+        return test();
+    }
+    // Where /tmp is hidden the programs may be, too.
+    let script = "mount -t tmpfs -o mode=755 none /mnt && cp \"$1\" /mnt/test && cp \"$2\" /mnt/scanhub \
+                  && mount -t tmpfs -o mode=1777 none /tmp && mount -t tmpfs -o mode=1777 none /dev/shm";
+    let unshare = |then: &str| {
+        let mut command = Command::new("unshare");
+        command.args(["--mount", "sh", "-c", &format!("{script} && {then}"), "sh"]);
+        command.arg(testkit::own_program()).arg(env!("CARGO_BIN_EXE_scanhub"));
+        command
+    };
+    let is_root = rustix::process::getuid().is_root();
+    if !is_root || !unshare("true").output().is_ok_and(|output| output.status.success()) {
+        testkit::skip("root", "only root can be two users, and needs a mount namespace for it");
+        return;
+    }
+    let mut inside = unshare(&format!("exec /mnt/test --exact {name} --nocapture"));
+    inside.env(INSIDE, "1").env(testkit::PROGRAM, "/mnt/scanhub").current_dir("/");
+    testkit::run_again(name, inside);
+}
+
+/// The program with `arguments` and nothing but them, as root or as the stranger.
+fn scanhub(user: u32, arguments: &[&str]) -> Command {
+    let mut command = Command::new("/mnt/scanhub");
+    command.args(arguments).env_clear().env("SCANHUB_END_WITH_PARENT", "1").uid(user).gid(user);
+    command
+}
+
+fn run(user: u32, arguments: &[&str]) -> Outcome {
+    Program::start(scanhub(user, arguments)).wait()
+}
+
+/// What the stranger does, as a line for the shell; it has to succeed.
+fn stranger(script: &str) {
+    assert!(tried(script), "{script}");
+}
+
+/// Whether the stranger can do it.
+fn tried(script: &str) -> bool {
+    let mut shell = Command::new("sh");
+    shell.args(["-c", script]).uid(STRANGER).gid(STRANGER).current_dir("/tmp");
+    shell.output().expect("there is a shell").status.success()
+}
+
+/// A directory of root with what `doctor --clean` removes from a domain, and its owner's alone.
+fn prey() -> PathBuf {
+    let prey = PathBuf::from("/tmp/prey");
+    fs::DirBuilder::new().mode(0o700).create(&prey).expect("a directory");
+    fs::create_dir(prey.join("empty")).expect("a directory");
+    for file in ["hub.lock", "listen.lock", "front.sensor", "prefix", "letter"] {
+        fs::write(prey.join(file), LETTER).expect("a file");
+    }
+    prey
+}
+
+fn is_untouched(prey: &Path) {
+    let mut names: Vec<_> =
+        fs::read_dir(prey).expect("is there").map(|it| it.expect("a name").file_name()).collect();
+    names.sort();
+    assert_eq!(names, ["empty", "front.sensor", "hub.lock", "letter", "listen.lock", "prefix"]);
+    for file in names.iter().filter(|name| *name != "empty") {
+        assert_eq!(fs::read_to_string(prey.join(file)).expect("a file"), LETTER, "{file:?}");
+    }
+}
+
+/// Hub, clients and doctor refuse with all of `words`, and `prey` is as it was.
+fn all_refuse(prey: &Path, base: &[&str], words: &[&str]) {
+    for verb in [
+        &["run", "--no-system-config", "--link=front=/tmp/no-port"][..],
+        &["doctor", "--clean", "--no-system-config"],
+        &["list"],
+        &["echo", "front/scan", "--for=1s"],
+    ] {
+        let outcome = run(0, &[verb, base].concat());
+        let said = format!("{}{}", outcome.errors, String::from_utf8_lossy(&outcome.out));
+        assert!(matches!(outcome.code, Some(1 | 3 | 5)), "{verb:?}: {outcome}");
+        for word in words {
+            assert!(said.contains(word), "{verb:?} does not say {word:?}: {outcome}");
+        }
+        is_untouched(prey);
+    }
+}
+
+#[test]
+fn the_fallback_directory_that_a_stranger_made() {
+    beside_a_stranger("strangers::the_fallback_directory_that_a_stranger_made", || {
+        let prey = prey();
+        stranger("mkdir /tmp/scanhub-0 && ln -s /tmp/prey /tmp/scanhub-0/scanhub");
+        all_refuse(&prey, &[], &["/tmp/scanhub-0", "belongs to user 65533"]);
+        stranger("rm -r /tmp/scanhub-0 && ln -s /tmp/prey /tmp/scanhub-0");
+        all_refuse(&prey, &[], &["/tmp/scanhub-0", "is a link"]);
+        // The domain itself is root's, and its owner could put another one there.
+        stranger("rm /tmp/scanhub-0 && mkdir -m 777 /tmp/scanhub-0");
+        fs::DirBuilder::new().mode(0o700).create("/tmp/scanhub-0/scanhub").expect("a domain");
+        all_refuse(&prey, &[], &["/tmp/scanhub-0", "belongs to user 65533"]);
+    });
+}
+
+#[test]
+fn links_in_a_domain_and_on_the_way_to_it() {
+    beside_a_stranger("strangers::links_in_a_domain_and_on_the_way_to_it", || {
+        let prey = prey();
+        let base = Path::new("/tmp/base");
+        fs::DirBuilder::new().mode(0o700).create(base).expect("a base");
+        fs::create_dir(base.join("scanhub")).expect("a domain");
+        let mode =
+            |path: &Path, mode| fs::set_permissions(path, fs::Permissions::from_mode(mode)).expect("is ours");
+        mode(&base.join("scanhub"), 0o777);
+        mode(base, 0o755);
+        stranger("ln -s /tmp/prey/letter /tmp/base/scanhub/hub.lock");
+        all_refuse(&prey, &["--root=/tmp/base"], &["/tmp/base/scanhub", "mode 0777", "chmod go-w"]);
+        mode(&base.join("scanhub"), 0o700);
+        all_refuse(&prey, &["--root=/tmp/base"], &["/tmp/base/scanhub/hub.lock", "is a link"]);
+        fs::remove_file(base.join("scanhub/hub.lock")).expect("is root's to remove");
+        // Above the base: root's own link where nobody else writes is followed, in /tmp none is.
+        stranger("ln -s /tmp/base /tmp/way");
+        all_refuse(&prey, &["--root=/tmp/way/b"], &["/tmp/way", "is a link of user 65533"]);
+        symlink(base, "/mnt/way").expect("a link of root's");
+        let domain =
+            scanhub(0, &["run", "--json", "--no-system-config", "--link=front=/tmp/no", "--root=/mnt/way/b"]);
+        let hub = Program::start(domain).ready();
+        assert!(base.join("b/scanhub/hub.lock").exists());
+        assert_eq!(hub.end(INT).code, Some(0));
+    });
+}
+
+/// Segments and bells of `env`.
+fn segments(env: &TestEnv) -> Vec<PathBuf> {
+    let mut paths = testkit::shared_memory(&env.place().prefix());
+    paths.sort();
+    paths
+}
+
+#[test]
+fn shared_memory_of_strangers() {
+    beside_a_stranger("strangers::shared_memory_of_strangers", || {
+        // Both would be the names, if they could be guessed.
+        stranger("touch /dev/shm/sh_scanhub_front.bell");
+        let env = TestEnv::new();
+        let simulator = env.simulator(&["front"], &["--baud=500000"]);
+        let hub = env.hub(&[env.link("front")]);
+        let mut consumer = env.echo(&["front/scan"]);
+        consumer.await_lines(3, "a scan", is_class("scan"));
+        let own = segments(&env);
+        assert!(own.iter().any(|path| path.to_string_lossy().ends_with(".global_mgmt")), "{own:?}");
+        for path in &own {
+            let mode = fs::metadata(path).expect("is there").mode();
+            assert_eq!(mode & 0o077, 0, "{} has mode {mode:o}", path.display());
+            let path = path.display();
+            for attack in [
+                format!("echo x > {path}"),
+                format!("cat {path}"),
+                format!("truncate -s 0 {path}"),
+                format!("rm -f {path}"),
+                format!("mv {path} /dev/shm/other"),
+            ] {
+                assert!(!tried(&attack), "{attack}");
+            }
+        }
+        // A file of no use under the names, which all can see now, is in nobody's way.
+        let prefix = fs::read_to_string(env.place().root().join("prefix")).expect("the hub's");
+        let prefix = prefix.trim_end();
+        stranger(&format!("touch /dev/shm/{prefix}anything; ln -s /mnt/letter /dev/shm/{prefix}link"));
+        fs::write("/mnt/letter", LETTER).expect("a file");
+        let mut second = env.echo(&["front/zones"]);
+        second.await_line("a verdict", is_class("zones"));
+        let told = env.run(&["doctor", "--json", "--no-system-config"]);
+        let told = told.lines().into_iter().find(|line| line["name"] == "strangers").expect("a finding");
+        let text = told.to_string();
+        assert!(text.contains(&format!("{prefix}anything")) && text.contains("65533"), "{text}");
+
+        // The bell goes with the hub; who waits keeps the names, so that a stranger can occupy it meanwhile.
+        assert_eq!(hub.end(TERM).code, Some(0));
+        stranger(&format!("mkfifo /dev/shm/{prefix}front.bell"));
+        let refused = env.run(&["run", "--no-system-config", &env.link("front")]);
+        assert_eq!(refused.code, Some(1), "{refused}");
+        for word in [&format!("{prefix}front.bell belongs to user 65533"), "sudo rm"] {
+            assert!(refused.errors.contains(word), "{word}: {refused}");
+        }
+        stranger(&format!("rm /dev/shm/{prefix}front.bell"));
+        let hub = env.hub(&[env.link("front")]);
+        consumer.await_line("the next hub's", |line| line["kind"] == "hub_back");
+        consumer.await_line("a scan", is_class("scan"));
+        // Killed, it leaves all of them.
+        assert_eq!(hub.end(KILL).code, None);
+        let hub = env.hub(&[env.link("front")]);
+        consumer.await_line("the third hub's", |line| line["kind"] == "hub_back");
+        consumer.await_line("a scan", is_class("scan"));
+        for program in [consumer, second, hub] {
+            assert_eq!(program.end(INT).code, Some(0));
+        }
+        // After the last one nothing but the stranger's is there, and none of it was written to.
+        assert_eq!(
+            segments(&env),
+            [format!("/dev/shm/{prefix}anything"), format!("/dev/shm/{prefix}link")].map(PathBuf::from)
+        );
+        assert_eq!(fs::read_to_string("/mnt/letter").expect("a file"), LETTER);
+        let next = env.hub(&[env.link("front")]);
+        let others = fs::read_to_string(env.place().root().join("prefix")).expect("the hub's");
+        assert_ne!(others.trim_end(), prefix);
+        assert_eq!((next.end(INT).code, simulator.end(INT).code), (Some(0), Some(0)));
+    });
+}
+
+#[test]
+fn a_hub_of_another_user_is_told_and_not_attached_to() {
+    beside_a_stranger("strangers::a_hub_of_another_user_is_told_and_not_attached_to", || {
+        stranger("mkdir -m 755 /tmp/theirs");
+        let arguments = ["run", "--json", "--no-system-config", "--link=front=/tmp/no", "--root=/tmp/theirs"];
+        let hub = Program::start(scanhub(STRANGER, &arguments)).ready();
+        for bell in testkit::shared_memory("sh_scanhub_")
+            .iter()
+            .filter(|path| path.extension().is_some_and(|it| it == "bell"))
+        {
+            fs::remove_file(bell).expect("root may");
+        }
+        for verb in [
+            &["list"][..],
+            &["info", "front"],
+            &["echo", "front/status", "--for=1s"],
+            &["zones", "front", "mask"],
+        ] {
+            let outcome = run(0, &[verb, &["--root=/tmp/theirs"]].concat());
+            assert_eq!(outcome.code, Some(3), "{outcome}");
+            for word in ["belongs to user 65533", "gateway --interface lo", "listen --publish"] {
+                assert!(outcome.errors.contains(word), "{word}: {outcome}");
+            }
+        }
+        let theirs = run(STRANGER, &["list", "--root=/tmp/theirs"]);
+        assert_eq!(theirs.code, Some(0), "{theirs}");
+        assert_eq!(hub.end(INT).code, Some(0));
+        until("it is gone", || testkit::shared_memory("sh_scanhub_").is_empty());
+    });
+}

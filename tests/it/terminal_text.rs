@@ -1,0 +1,79 @@
+//! What stands in a file, on a line or in a name is shown, and obeyed by no terminal: control characters reach neither
+//! stdout nor stderr, in text and in JSON, which says them all the same.
+
+use std::fs;
+
+use crate::testkit::{Outcome, TERM, TestEnv};
+use lms::telegram::Writer;
+
+/// C0, DEL and C1, as a terminal takes them for a command.
+const HOSTILE: &str = "\u{1b}]0;x\u{7}\u{9b}31m\u{7f}\u{85}\u{9d}";
+
+/// There is text alone, but for the ends of lines.
+fn is_text(outcome: &Outcome) {
+    for text in [String::from_utf8_lossy(&outcome.out).into_owned(), outcome.errors.clone()] {
+        let control = text.chars().find(|&c| c.is_control() && c != '\n');
+        assert_eq!(control, None, "{:?}", text);
+    }
+}
+
+#[test]
+fn a_configuration_commands_no_terminal() {
+    let env = TestEnv::new();
+    let quoted: String = HOSTILE.chars().map(|c| format!("\\u{:04x}", c as u32)).collect();
+    let port = format!("/dev/{quoted}");
+    let sound = env.file(
+        "sound.toml",
+        format!("[[link]]\nname = \"a\"\nport = \"{port}\"\n[gateway]\ninterface = \"{quoted}\"\n"),
+    );
+    // Bytes that no TOML has, in a comment, a key and a value; C1 it may have.
+    let raw = env.file("raw.toml", "[[link]]\nname = \"a\"\npo\u{1b}[2Jrt = 1\n");
+    let value = env.file("value.toml", "[[link]]\nname = \"\u{9b}31m\"\nport = \"x\"\n");
+    let key = env.file("key.toml", "[[link]]\n\"\u{9b}31m\\u001b\" = 1\n");
+    let name = env.word(&format!("{HOSTILE}.toml"));
+    fs::write(&name, "nothing = 1\n").expect("a file of any name");
+    for json in [&[][..], &["--json"]] {
+        let with = |words: &[&str]| env.run(&[words, json].concat());
+        for (code, outcome) in [
+            (0, with(&["config", "check", &sound])),
+            (0, with(&["config", "show", "--config", &sound])),
+            (78, with(&["config", "check", &raw])),
+            (78, with(&["config", "check", &value])),
+            (78, with(&["config", "check", &key])),
+            (78, with(&["config", "check", &name])),
+            (5, with(&["doctor", "--no-system-config", "--config", &sound])),
+            (66, with(&["convert", &name, "x.mcap"])),
+            (4, with(&["probe", &name])),
+        ] {
+            assert_eq!(outcome.code, Some(code), "{outcome}");
+            is_text(&outcome);
+        }
+    }
+    // JSON says what is there.
+    let outcome = env.run(&["config", "check", &sound, "--json"]);
+    assert_eq!(outcome.lines()[0]["links"][0]["port"], format!("/dev/{HOSTILE}"), "{outcome}");
+    // The log of a hub, its status, and who shows that.
+    let hub = env.hub(&["--config", &sound]);
+    for verb in
+        [&["info", "a"][..], &["info", "a", "--json"], &["list"], &["echo", "a/status", "-n1", "--json"]]
+    {
+        let outcome = env.run(verb);
+        assert_eq!(outcome.code, Some(0), "{outcome}");
+        is_text(&outcome);
+    }
+    let outcome = hub.end(TERM);
+    assert!(outcome.errors.contains("no such port"), "{outcome}");
+    is_text(&outcome);
+}
+
+#[test]
+fn a_line_commands_no_terminal() {
+    let env = TestEnv::new();
+    let bytes = Writer::new(0x80, 0xBA).slice(HOSTILE.as_bytes()).byte(0x10).finish();
+    let file = env.file("type.bin", bytes.bytes());
+    for flags in [&[][..], &["--all"], &["--json"]] {
+        let outcome = env.run(&[&["telegram", "decode", &file], flags].concat());
+        assert_eq!(outcome.code, Some(0), "{outcome}");
+        is_text(&outcome);
+    }
+}

@@ -1,0 +1,272 @@
+//! Who may know whom: walls between the crates, read from the manifests and from what Cargo makes of them.
+
+use super::tree::{Tree, find};
+use std::collections::BTreeSet;
+use std::process::Command;
+
+/// Names of the crates of this project that a manifest names under `section`, such as `dependencies`.
+fn ours(manifest: &toml::Table, sections: &[&str]) -> BTreeSet<String> {
+    let mut found = BTreeSet::new();
+    for section in sections {
+        let names =
+            manifest.get(*section).and_then(toml::Value::as_table).into_iter().flat_map(toml::Table::keys);
+        found.extend(names.filter(|name| name.starts_with("scanhub-")).cloned());
+    }
+    found
+}
+
+const ALL: [&str; 3] = ["dependencies", "dev-dependencies", "build-dependencies"];
+const NORMAL: [&str; 1] = ["dependencies"];
+
+pub(crate) fn schema_knows_nobody(tree: &Tree) -> Vec<String> {
+    ours(&tree.members()["scanhub-schema"], &ALL).into_iter().collect()
+}
+
+/// Names of all crates that a manifest names for what is built, tests left out.
+fn built_with(manifest: &toml::Table) -> impl Iterator<Item = &String> {
+    let sections = ["dependencies", "build-dependencies"].into_iter();
+    let tables = sections.filter_map(|section| manifest.get(section).and_then(toml::Value::as_table));
+    tables.flat_map(toml::Table::keys)
+}
+
+pub(crate) fn lms_stands_alone(tree: &Tree) -> Vec<String> {
+    let manifest = &tree.members()["scanhub-lms"];
+    let mut breaches: Vec<String> = ours(manifest, &ALL).into_iter().collect();
+    breaches.extend(built_with(manifest).cloned());
+    breaches.extend(lacks(tree, "hub/lms/src/lib.rs", &["#![no_std]", "#![forbid(unsafe_code)]"]));
+    breaches
+        .extend(find(tree, &["std::", "extern crate", "alloc::"], |path| path.starts_with("hub/lms/src/")));
+    breaches
+}
+
+/// What writes the EEPROM is a part of the protocol and as plain.
+pub(crate) fn what_writes_the_eeprom_is_protocol_alone(tree: &Tree) -> Vec<String> {
+    let below = |path: &str| path.starts_with("hub/lms-configure/src/");
+    let mut breaches = built_of(tree, "scanhub-lms-configure", &["scanhub-lms"]);
+    let attributes = ["#![no_std]", "#![forbid(unsafe_code)]"];
+    breaches.extend(lacks(tree, "hub/lms-configure/src/lib.rs", &attributes));
+    breaches.extend(find(tree, &["std::", "extern crate", "alloc::"], below));
+    breaches
+}
+
+/// Cargo keeps requests that write the EEPROM from all crates but these: the one where a person is asked, and the
+/// simulator, which is the sensor. Tests of others may have them.
+pub(crate) fn few_crates_can_write_the_eeprom(tree: &Tree) -> Vec<String> {
+    const MAY: [&str; 2] = ["scanhub-tools", "scanhub-sim"];
+    let top = ("scanhub".to_owned(), tree.manifest("Cargo.toml"));
+    let others = tree.members().into_iter().chain([top]).filter(|(name, _)| !MAY.contains(&name.as_str()));
+    // The fuzzer's crate is a test.
+    let built = others.filter(|(name, _)| name != "scanhub-fuzz");
+    built
+        .filter(|(_, manifest)| built_with(manifest).any(|name| name == "scanhub-lms-configure"))
+        .map(|(name, _)| format!("{name} is built with what writes the EEPROM"))
+        .collect()
+}
+
+fn lacks(tree: &Tree, path: &str, attributes: &[&str]) -> Vec<String> {
+    let has = |attribute: &str| tree.text(path).lines().any(|line| line == attribute);
+    let missing = attributes.iter().filter(|attribute| !has(attribute));
+    missing.map(|attribute| format!("{path} lacks {attribute}")).collect()
+}
+
+/// From payloads to payloads: no telegram, no shared memory, nothing of the system, no heap.
+pub(crate) fn preprocess_only_computes(tree: &Tree) -> Vec<String> {
+    const HEAP: [&str; 12] = [
+        "Vec<",
+        "Vec::",
+        "vec!",
+        "Box<",
+        "Box::",
+        "String",
+        "format!",
+        "to_owned()",
+        "to_string()",
+        "to_vec()",
+        "collect()",
+        "collect::",
+    ];
+    // Rc, Arc, maps, clocks, threads, files: all else that std has stands under another name.
+    const HARMLESS: [&str; 5] = ["std::array", "std::error", "std::fmt", "std::mem", "std::ops"];
+    let ours = |path: &str| path.starts_with("hub/preprocess/src/");
+    let manifest = &tree.members()["scanhub-preprocess"];
+    let mut breaches: Vec<String> =
+        built_with(manifest).filter(|name| *name != "scanhub-schema").cloned().collect();
+    breaches.extend(lacks(tree, "hub/preprocess/src/lib.rs", &["#![forbid(unsafe_code)]"]));
+    breaches.extend(find(tree, &HEAP, ours));
+    breaches.extend(find(tree, &["extern crate", "ipc"], ours));
+    let mut of_std = find(tree, &["std::"], ours);
+    of_std.retain(|place| {
+        place.matches("std::").count() > HARMLESS.iter().map(|name| place.matches(name).count()).sum()
+    });
+    breaches.extend(of_std);
+    breaches
+}
+
+/// What a processor does must not depend on which others run.
+pub(crate) fn no_processor_uses_another(tree: &Tree) -> Vec<String> {
+    const BELOW: &str = "hub/preprocess/src/";
+    const PROCESSORS: [&str; 4] = ["zones", "marks", "background", "segments"];
+    let mut breaches = Vec::new();
+    for own in PROCESSORS {
+        let is_own = |path: &str| {
+            let below = path.strip_prefix(BELOW).and_then(|path| path.strip_prefix(own));
+            below.is_some_and(|rest| rest.starts_with(['.', '/']))
+        };
+        breaches.extend(find(tree, &["crate::", "super::"], is_own).into_iter().filter(|place| {
+            let (_, code) = place.split_once(": ").unwrap_or_default();
+            let mut words = code.split(|c: char| !c.is_alphanumeric() && c != '_');
+            words.any(|word| word != own && PROCESSORS.contains(&word))
+        }));
+    }
+    breaches
+}
+
+/// A consumer's program has nothing of ours below it but the library and the words. The verbs stand on it as others do; the
+/// words of ROS come with them where they record.
+pub(crate) fn clients_know_only_schema(tree: &Tree) -> Vec<String> {
+    let known: [(&str, &[&str]); 2] = [
+        ("scanhub-client", &["scanhub-schema"]),
+        ("scanhub-verbs", &["scanhub-client", "scanhub-schema", "scanhub-ros"]),
+    ];
+    let members = tree.members();
+    let others = known.iter().flat_map(|(name, known)| {
+        let names = ours(&members[*name], &ALL).into_iter().filter(|other| !known.contains(&other.as_str()));
+        names.map(move |other| format!("{name} knows {other}"))
+    });
+    others.collect()
+}
+
+/// From payloads to messages: nothing of the system, nothing of others, so that anybody can call it.
+pub(crate) fn ros_knows_only_schema(tree: &Tree) -> Vec<String> {
+    let mut breaches = built_of(tree, "scanhub-ros", &["scanhub-schema"]);
+    breaches.extend(lacks(tree, "schema/ros/src/lib.rs", &["#![forbid(unsafe_code)]"]));
+    let ours = |path: &str| path.starts_with("schema/ros/src/");
+    breaches.extend(find(tree, &["schema::ipc", "std::time", "std::net", "std::fs", "extern crate"], ours));
+    breaches
+}
+
+/// From a telegram to a scan: the protocol and the words for it, and no other crate.
+pub(crate) fn the_scanner_only_translates(tree: &Tree) -> Vec<String> {
+    let mut breaches = built_of(tree, "scanhub-scanner", &["scanhub-lms", "scanhub-schema"]);
+    breaches.extend(lacks(tree, "hub/scanner/src/lib.rs", &["#![forbid(unsafe_code)]"]));
+    breaches
+}
+
+/// What `package` is built with beside `known`.
+fn built_of(tree: &Tree, package: &str, known: &[&str]) -> Vec<String> {
+    let members = tree.members();
+    let others = built_with(&members[package]).filter(|name| !known.contains(&name.as_str()));
+    others.map(|name| format!("{package} is built with {name}")).collect()
+}
+
+/// The library for C is a face of the attach library: it knows nothing else, and nothing is built with it.
+pub(crate) fn the_library_for_c_knows_clients(tree: &Tree) -> Vec<String> {
+    const OWN: &str = "scanhub-c";
+    let members = tree.members();
+    let known = ["scanhub-client", "scanhub-schema"];
+    let mut breaches: Vec<String> =
+        built_with(&members[OWN]).filter(|name| !known.contains(&name.as_str())).cloned().collect();
+    let top = ("scanhub".to_owned(), tree.manifest("Cargo.toml"));
+    let all = members.into_iter().chain([top]);
+    breaches.extend(all.filter_map(|(name, manifest)| {
+        built_with(&manifest).any(|known| known == OWN).then(|| format!("{name} is built with it"))
+    }));
+    breaches
+}
+
+/// Nor anything that writes the EEPROM.
+pub(crate) fn the_daemon_knows_neither_clients_nor_sim(tree: &Tree) -> Vec<String> {
+    let members = tree.members();
+    let mut reached = BTreeSet::new();
+    let mut open = vec!["scanhub-daemon".to_owned()];
+    while let Some(name) = open.pop() {
+        open.extend(ours(&members[&name], &NORMAL).into_iter().filter(|name| !reached.contains(name)));
+        reached.insert(name);
+    }
+    const STRANGERS: [&str; 5] =
+        ["scanhub-client", "scanhub-verbs", "scanhub-sim", "scanhub-tools", "scanhub-lms-configure"];
+    reached.into_iter().filter(|name| STRANGERS.contains(&name.as_str())).collect()
+}
+
+/// The daemon, the clients, the simulator and the tools meet nowhere but in the program: no crate has two of them.
+pub(crate) fn only_the_program_sees_all(tree: &Tree) -> Vec<String> {
+    let ends: [&[&str]; 4] =
+        [&["scanhub-daemon"], &["scanhub-client", "scanhub-verbs"], &["scanhub-sim"], &["scanhub-tools"]];
+    let mut breaches = Vec::new();
+    for (name, manifest) in tree.members() {
+        let mut known = ours(&manifest, &NORMAL);
+        known.insert(name.clone());
+        let met = ends.iter().filter(|end| end.iter().any(|name| known.contains(*name))).count();
+        if met > 1 {
+            known.retain(|known| ends.concat().contains(&known.as_str()));
+            breaches.push(format!("{name} brings {known:?} together"));
+        }
+    }
+    breaches
+}
+
+/// Without it `cargo test` at the top would leave a crate out.
+pub(crate) fn every_crate_is_tested_from_the_top(tree: &Tree) -> Vec<String> {
+    let manifest = tree.manifest("Cargo.toml");
+    let list = |key: &str| -> BTreeSet<String> {
+        let list = manifest["workspace"].get(key).and_then(toml::Value::as_array).into_iter().flatten();
+        list.filter_map(toml::Value::as_str).map(str::to_owned).collect()
+    };
+    let mut wanted = list("members");
+    wanted.insert(".".to_owned());
+    wanted
+        .difference(&list("default-members"))
+        .map(|member| format!("{member} is no default member"))
+        .collect()
+}
+
+/// Every crate takes over the workspace's lints, which deny unsafe code.
+pub(crate) fn every_crate_obeys_the_lints(tree: &Tree) -> Vec<String> {
+    let top = tree.manifest("Cargo.toml");
+    let mut breaches = Vec::new();
+    if top["workspace"]["lints"]["rust"]["unsafe_code"].as_str() != Some("deny") {
+        breaches.push("the workspace does not deny unsafe code".to_owned());
+    }
+    let manifests = tree.members().into_iter().chain([("scanhub".to_owned(), top)]);
+    breaches.extend(manifests.filter_map(|(name, manifest)| {
+        let obeys =
+            manifest.get("lints").and_then(|lints| lints.get("workspace")).and_then(toml::Value::as_bool);
+        (obeys != Some(true)).then(|| format!("{name} has lints of its own"))
+    }));
+    breaches
+}
+
+/// Hub and clients with two versions of it refuse each other.
+pub(crate) fn shared_memory_is_pinned(tree: &Tree) -> Vec<String> {
+    let manifest = tree.manifest("Cargo.toml");
+    let version = manifest["workspace"]["dependencies"]["iceoryx2"]["version"].as_str().unwrap_or_default();
+    if version.starts_with('=') { Vec::new() } else { vec![format!("iceoryx2 {version:?}")] }
+}
+
+/// Names of the crates that `package` is built from, itself included, as Cargo resolves it on this machine.
+pub(crate) fn built_from(package: &str, features: &[&str]) -> BTreeSet<String> {
+    let output = Command::new(env!("CARGO"))
+        .current_dir(env!("CARGO_MANIFEST_DIR"))
+        .args([
+            "tree",
+            "--offline",
+            "--edges",
+            "normal",
+            "--prefix",
+            "none",
+            "--format",
+            "{p}",
+            "--package",
+            package,
+        ])
+        .args(features)
+        .output()
+        .expect("cargo can be called");
+    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+    let listing = String::from_utf8(output.stdout).expect("names are text");
+    // "name v1.2.3 (path or *)": two versions of a crate are two crates.
+    let names: BTreeSet<String> =
+        listing.lines().map(|line| line.split(' ').take(2).collect::<Vec<_>>().join(" ")).collect();
+    assert!(names.iter().any(|name| name.starts_with(package)), "{package} is built from {names:?}");
+    names
+}

@@ -1,0 +1,200 @@
+//! What may stand in which source: clocks, unsafe code, shared memory, the sensor's EEPROM, the shape of a file.
+
+use super::tree::{Tree, code, find};
+
+/// Integration tests and benches may look at a clock and do as they like with telegrams.
+fn is_test(path: &str) -> bool {
+    path.starts_with("tests/") || path.starts_with("benches/") || path.contains("/tests/")
+}
+
+pub(crate) fn clocks_are_read_in_few_places(tree: &Tree) -> Vec<String> {
+    // The last one waits for a service that another process has half created.
+    const ALLOWED: [&str; 5] =
+        ["clients/", "hub/port/src/clock.rs", "hub/sim/src/pty.rs", "hub/demo", "schema/src/ipc/trouble.rs"];
+    find(tree, &["Instant::now", "SystemTime::now", "clock_gettime"], |path| {
+        !is_test(path) && !ALLOWED.iter().any(|allowed| path.starts_with(allowed))
+    })
+}
+
+/// Files that may hold unsafe code, each for something that no safe crate offers.
+const UNSAFE: [&str; 8] = [
+    // A page that hub and consumers map.
+    "schema/src/ipc/bell.rs",
+    // The descriptors that wake consumers.
+    "schema/src/ipc/sleep.rs",
+    // The kernel's word whether nobody has a file.
+    "schema/src/ipc/unheld.rs",
+    // A handler for SIGBUS.
+    "hub/daemon/src/bus_error.rs",
+    // What the kernel knows of a UART.
+    "hub/port/src/kernel.rs",
+    // Addresses that programs in C bring.
+    "clients/c/src/boundary.rs",
+    // Names of functions as the linker of such programs looks for them; no block.
+    "clients/c/src/export.rs",
+    // An allocator that counts.
+    "hub/daemon/tests/counting/mod.rs",
+];
+/// In what is shipped: tests and benches are listed and explained like all, and not counted.
+const MOST_UNSAFE_BLOCKS: usize = 10;
+
+pub(crate) fn unsafe_code_is_rare_and_explained(tree: &Tree) -> Vec<String> {
+    let mut breaches =
+        find(tree, &["allow(unsafe_code)", "expect(unsafe_code)"], |path| !UNSAFE.contains(&path));
+    let mut blocks = 0;
+    for (path, text) in tree.sources() {
+        let lines: Vec<&str> = text.lines().collect();
+        for (number, line) in code(text) {
+            if !["unsafe {", "unsafe impl", "unsafe fn", "unsafe extern"]
+                .iter()
+                .any(|form| line.contains(form))
+            {
+                continue;
+            }
+            blocks += usize::from(!is_test(path));
+            let before = &lines[number.saturating_sub(6)..number];
+            if !UNSAFE.contains(&path) || !before.iter().any(|line| line.contains("// SAFETY:")) {
+                breaches.push(format!("{path}:{number}: {}", line.trim()));
+            }
+        }
+    }
+    if blocks > MOST_UNSAFE_BLOCKS {
+        breaches.push(format!("{blocks} unsafe blocks"));
+    }
+    breaches
+}
+
+/// Services are built in one module; the payloads elsewhere in schema derive one trait.
+pub(crate) fn shared_memory_is_built_in_one_module(tree: &Tree) -> Vec<String> {
+    // Messages longer than any payload are compared with sockets by a service that no topic has.
+    let may_build = |path: &str| path.starts_with("schema/src/ipc") || path == "benches/compare/topic.rs";
+    let mut places = find(tree, &["iceoryx2::"], |path| !may_build(path));
+    let derives =
+        |place: &String| place.starts_with("schema/src/") && place.ends_with("prelude::ZeroCopySend;");
+    places.retain(|place| !derives(place));
+    places
+}
+
+/// Words of the wire become ranges in a unit in one file, between the protocol and what consumers see.
+pub(crate) fn ranges_are_born_in_one_file(tree: &Tree) -> Vec<String> {
+    find(tree, &[".words()", "range_array", "upper_array"], |path| {
+        path.starts_with("hub/daemon/src/") || path.starts_with("hub/tools/src/")
+    })
+}
+
+/// Nobody who talks to a sensor by itself can say a request that writes its EEPROM. Requests are made in `lms` and
+/// nowhere else; those that write are a crate of their own, which most crates cannot name, and in those that can only these
+/// files may: where telegrams are written for people, and where a person is asked before one is sent. The simulator knows
+/// them, to count, to do and to refuse.
+pub(crate) fn nobody_writes_the_eeprom(tree: &Tree) -> Vec<String> {
+    const WRITES: [&str; 6] = ["0x40", "0x42", "0x46", "0x66", "0x77", "0x7C"];
+    const MAY_NAME: [&str; 4] =
+        ["hub/sim/", "hub/lms-configure/", "hub/tools/src/configure", "hub/tools/src/telegram"];
+    const MAY_SAY: [&str; 3] = ["hub/sim/", "hub/lms/src/", "hub/lms-configure/src/"];
+    /// Here requests are explained, and none is made.
+    const EXPLAINS: &str = "hub/lms/src/explain";
+    let may_name = |path: &str| is_test(path) || MAY_NAME.iter().any(|allowed| path.starts_with(allowed));
+    let mut breaches = find(tree, &["Writer::new", "EEPROM_WRITES"], |path| {
+        !is_test(path) && !MAY_SAY.iter().any(|allowed| path.starts_with(allowed))
+    });
+    breaches.extend(find(tree, &["Writer::new", ".encode("], |path| path.starts_with(EXPLAINS)));
+    // Files are written too.
+    breaches.retain(|place| !place.contains("BufWriter::new") || place.matches("Writer::new").count() > 1);
+    let named = ["lms_configure", "eeprom::", "::eeprom", "{eeprom", " eeprom,", " eeprom}"];
+    breaches.extend(find(tree, &named, |path| !may_name(path)));
+    let lms = |path: &str| path.starts_with("hub/lms/src/");
+    for (path, text) in tree.sources().filter(|(path, _)| lms(path)) {
+        for (number, line) in code(text) {
+            let constant = line.split_once(": u8 = ").map(|(_, value)| value.trim_end_matches(';'));
+            let said = line.split_once("Writer::new(").map(|(_, arguments)| arguments);
+            if constant.is_some_and(|value| WRITES.contains(&value) && !path.starts_with(EXPLAINS))
+                || said.is_some_and(|arguments| WRITES.iter().any(|command| arguments.contains(command)))
+            {
+                breaches.push(format!("{path}:{number}: {}", line.trim()));
+            }
+        }
+    }
+    breaches
+}
+
+/// Only where a person is asked is consent made, without which nothing that writes the EEPROM leaves for a port.
+pub(crate) fn consent_is_given_by_persons(tree: &Tree) -> Vec<String> {
+    const ASKS: &str = "hub/tools/src/configure/ask.rs";
+    const TAKES: &str = "hub/lms-configure/src/";
+    let mut breaches = find(tree, &["of_a_person", "Consent("], |path| {
+        !is_test(path) && path != ASKS && !path.starts_with(TAKES)
+    });
+    let asks = find(tree, &["of_a_person"], |path| path == ASKS);
+    let makers = find(tree, &["Consent("], |path| path.starts_with(TAKES));
+    if asks.len() != 1 {
+        breaches.push(format!("{ASKS} gives consent in {} places", asks.len()));
+    }
+    // The type and its one constructor.
+    if makers.len() != 2 {
+        breaches.push(format!("{TAKES} makes consent in {} places", makers.len()));
+    }
+    breaches
+}
+
+/// A file longer than so is about more than one concept.
+const MOST_LINES: usize = 400;
+
+pub(crate) fn files_are_short_and_say_what_they_are_for(tree: &Tree) -> Vec<String> {
+    let mut breaches = Vec::new();
+    for (path, text) in tree.files(".rs") {
+        let lines = text.lines().count();
+        if lines > MOST_LINES {
+            breaches.push(format!("{path} has {lines} lines"));
+        }
+        if !text.starts_with("//! ") {
+            breaches.push(format!("{path} does not begin with the problem that it solves"));
+        }
+    }
+    breaches
+}
+
+/// Names that say nothing.
+pub(crate) fn names_say_something(tree: &Tree) -> Vec<String> {
+    const EMPTY: [&str; 7] = ["manager", "util", "utils", "helper", "helpers", "common", "misc"];
+    let empty = |name: &str| {
+        let spread: String = name
+            .chars()
+            .flat_map(|c| if c.is_uppercase() { vec!['_', c.to_ascii_lowercase()] } else { vec![c] })
+            .collect();
+        spread.split('_').any(|part| EMPTY.contains(&part))
+    };
+    let mut breaches = Vec::new();
+    for (path, text) in tree.sources() {
+        if path.split(['/', '.']).any(empty) {
+            breaches.push(path.to_owned());
+        }
+        for (number, line) in code(text) {
+            let word = |c: char| !c.is_alphanumeric() && c != '_';
+            // What stands between quotes is for people.
+            let named = line.split('"').step_by(2).any(|outside| outside.split(word).any(empty));
+            if line.contains("fn get_") || named {
+                breaches.push(format!("{path}:{number}: {}", line.trim()));
+            }
+        }
+    }
+    breaches
+}
+
+/// This is no safety device, and nothing may read as if it were one. Only README says what it is not at length.
+pub(crate) fn nothing_promises_safety(tree: &Tree) -> Vec<String> {
+    let mut breaches = Vec::new();
+    for ending in [".rs", ".md", ".toml", ".service", ".rules", ".run"] {
+        for (path, text) in tree.files(ending) {
+            if path == "README.md" || path.starts_with("tests/it/tidy") {
+                continue;
+            }
+            for (number, line) in text.lines().enumerate() {
+                let line = line.replace("SAFETY:", "").to_lowercase().replace("not a safety device", "");
+                if line.contains("safety") || line.contains("protective") {
+                    breaches.push(format!("{path}:{}: {}", number + 1, line.trim()));
+                }
+            }
+        }
+    }
+    breaches
+}

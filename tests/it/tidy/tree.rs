@@ -1,0 +1,114 @@
+//! The project's own files as text, read once, and a way to plant a file that breaks a wall: a check that cannot fail
+//! is worth nothing.
+
+use std::collections::BTreeMap;
+use std::path::Path;
+
+/// Files by their path below the top, with `/` between its parts.
+#[derive(Clone)]
+pub(crate) struct Tree {
+    files: BTreeMap<String, String>,
+}
+
+/// A check: what breaks the wall, one line each.
+pub(crate) type Wall = fn(&Tree) -> Vec<String>;
+
+impl Tree {
+    /// Everything that people wrote: sources, manifests, pages, units, scripts.
+    pub(crate) fn load() -> Tree {
+        let mut tree = Tree { files: BTreeMap::new() };
+        tree.add(Path::new(env!("CARGO_MANIFEST_DIR")), "");
+        assert!(tree.files.len() > 30, "the project is not where it should be");
+        tree
+    }
+
+    /// The same with one file more, or another one in its place.
+    pub(crate) fn with(&self, path: &str, text: &str) -> Tree {
+        let mut tree = self.clone();
+        tree.files.insert(path.to_owned(), text.to_owned());
+        tree
+    }
+
+    /// The same with `line` as first line of a section of a manifest.
+    pub(crate) fn with_line(&self, path: &str, section: &str, line: &str) -> Tree {
+        let text = self.text(path);
+        let changed = if text.contains(section) {
+            text.replacen(section, &format!("{section}\n{line}"), 1)
+        } else {
+            format!("{text}\n{section}\n{line}\n")
+        };
+        self.with(path, &changed)
+    }
+
+    /// A file that must be there.
+    pub(crate) fn text(&self, path: &str) -> &str {
+        self.files.get(path).unwrap_or_else(|| panic!("{path} is missing"))
+    }
+
+    /// All files with this ending.
+    pub(crate) fn files(&self, ending: &str) -> impl Iterator<Item = (&str, &str)> {
+        self.files
+            .iter()
+            .filter(move |(path, _)| path.ends_with(ending))
+            .map(|(path, text)| (path.as_str(), text.as_str()))
+    }
+
+    /// All Rust files but this test itself, whose planted breaches would be found.
+    pub(crate) fn sources(&self) -> impl Iterator<Item = (&str, &str)> {
+        self.files(".rs").filter(|(path, _)| !path.starts_with("tests/it/tidy"))
+    }
+
+    /// A manifest, parsed.
+    pub(crate) fn manifest(&self, path: &str) -> toml::Table {
+        self.text(path).parse().unwrap_or_else(|error| panic!("{path}: {error}"))
+    }
+
+    /// Manifests of the crates below the top, by the crate's name.
+    pub(crate) fn members(&self) -> BTreeMap<String, toml::Table> {
+        self.files("/Cargo.toml")
+            .filter_map(|(path, _)| {
+                let manifest = self.manifest(path);
+                let name = manifest.get("package")?.get("name")?.as_str()?.to_owned();
+                Some((name, manifest))
+            })
+            .collect()
+    }
+
+    fn add(&mut self, directory: &Path, below: &str) {
+        for entry in std::fs::read_dir(directory).expect("a readable directory") {
+            let entry = entry.expect("an entry");
+            let name = entry.file_name().into_string().expect("a name in UTF-8");
+            let path = format!("{below}{name}");
+            let hidden = name.starts_with('.') && name != ".ci";
+            if entry.file_type().expect("a type").is_dir() {
+                if !hidden && name != "target" {
+                    self.add(&entry.path(), &format!("{path}/"));
+                }
+            } else if !hidden && let Ok(text) = std::fs::read_to_string(entry.path()) {
+                self.files.insert(path, text);
+            }
+        }
+    }
+}
+
+/// The code of a source: no comments, nothing from the unit tests at its end.
+pub(crate) fn code(text: &str) -> impl Iterator<Item = (usize, &str)> {
+    text.lines()
+        .enumerate()
+        .take_while(|(_, line)| !line.starts_with("#[cfg(test)]"))
+        .filter(|(_, line)| !line.trim_start().starts_with("//"))
+        .map(|(number, line)| (number + 1, line))
+}
+
+/// Places in the code of the sources that `select` wants where one of `needles` stands.
+pub(crate) fn find(tree: &Tree, needles: &[&str], select: impl Fn(&str) -> bool) -> Vec<String> {
+    let mut places = Vec::new();
+    for (path, text) in tree.sources().filter(|(path, _)| select(path)) {
+        for (number, line) in code(text) {
+            if needles.iter().any(|needle| line.contains(needle)) {
+                places.push(format!("{path}:{number}: {}", line.trim()));
+            }
+        }
+    }
+    places
+}

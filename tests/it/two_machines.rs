@@ -1,0 +1,189 @@
+//! A hub and its gateway on one machine, listeners on others, and what is between them: it loses, doubles and moves
+//! datagrams, and knows which.
+
+use std::collections::{BTreeMap, BTreeSet};
+
+use crate::testkit::{
+    INT, Machine, Outcome, Program, Relay, Robot, TERM, TestEnv, in_a_network, is_class, number, read, until,
+};
+use schema::Topic;
+use schema::datagram::Announce;
+use serde_json::Value;
+
+/// Passed on while the network is rough: some seconds.
+const MANY: usize = 2000;
+
+/// A sensor's number and a topic's.
+type Stream = (u8, u8);
+
+/// Sends all that two sensors have.
+fn gateway(robot: &Robot) -> Program {
+    robot.gateway(&Topic::ALL.map(|topic| format!("--topic=*/{}", topic.name())))
+}
+
+fn listener(env: &TestEnv, words: &[&str]) -> Program {
+    env.start(&[&["listen", "--json"], words].concat()).ready()
+}
+
+/// What a listener says of each stream: received, lost, duplicate, reordered.
+fn said(outcome: &Outcome, names: &BTreeMap<String, u8>) -> BTreeMap<Stream, [u64; 4]> {
+    assert_eq!(outcome.code, Some(0), "{outcome}");
+    let refused = outcome.of_class("lan_refused");
+    let counts = refused[0].as_object().expect("an object");
+    assert!(counts.values().filter_map(Value::as_u64).all(|count| count == 0), "{counts:?}");
+    let row = |line: Value| {
+        let numbers = ["received", "lost", "duplicate", "reordered"].map(|key| number(&line, key));
+        (stream(&line, names), numbers)
+    };
+    outcome.of_class("lan").into_iter().map(row).collect()
+}
+
+fn stream(line: &Value, names: &BTreeMap<String, u8>) -> Stream {
+    let text = |key: &str| line[key].as_str().unwrap_or_else(|| panic!("no {key}: {line}"));
+    let topic = Topic::parse(text("topic")).map_or(Announce::NUMBER, Topic::number);
+    (names[text("sensor")], topic)
+}
+
+/// The numbers of the sensors that are announced in `log`.
+fn names(log: &[Vec<u8>]) -> BTreeMap<String, u8> {
+    let announce = |bytes: &Vec<u8>| {
+        let datagram = read(bytes);
+        let is_one = datagram.head.topic == Announce::NUMBER;
+        let announce = is_one.then(|| Announce::unpack(datagram.payload)).flatten()?;
+        Some((announce.sensor().to_owned(), datagram.head.sensor))
+    };
+    log.iter().filter_map(announce).collect()
+}
+
+/// What one who heard `log` has to say of each stream, as docs/datagram.md defines it: with sets, and all at once.
+fn truth(log: &[Vec<u8>]) -> BTreeMap<Stream, [u64; 4]> {
+    #[derive(Default)]
+    struct Heard {
+        numbers: BTreeSet<u32>,
+        /// The next number that was announced before anything came.
+        announced_first: Option<u32>,
+        announced_last: u32,
+        duplicate: u64,
+        reordered: u64,
+    }
+    let mut streams: BTreeMap<Stream, Heard> = BTreeMap::new();
+    for bytes in log {
+        let datagram = read(bytes);
+        let (sensor, topic) = (datagram.head.sensor, datagram.head.topic);
+        let heard = streams.entry((sensor, topic)).or_default();
+        let is_overtaken = heard.numbers.last().is_some_and(|last| *last > datagram.head.sequence);
+        match heard.numbers.insert(datagram.head.sequence) {
+            true => heard.reordered += u64::from(is_overtaken),
+            false => {
+                heard.duplicate += 1;
+                continue;
+            }
+        }
+        if topic != Announce::NUMBER {
+            continue;
+        }
+        for announced in Announce::unpack(datagram.payload).expect("an announcement").topics() {
+            let heard = streams.entry((sensor, announced.topic)).or_default();
+            if heard.numbers.is_empty() {
+                heard.announced_first.get_or_insert(announced.next);
+            }
+            heard.announced_last = heard.announced_last.max(announced.next);
+        }
+    }
+    let account = |(stream, heard): (Stream, Heard)| {
+        let first = heard.announced_first.into_iter().chain(heard.numbers.first().copied()).min()?;
+        let end = heard.numbers.last().map_or(0, |last| last + 1).max(heard.announced_last);
+        let received = heard.numbers.len() as u64;
+        let lost = u64::from(end - first) - received;
+        (end > first).then_some((stream, [received, lost, heard.duplicate, heard.reordered]))
+    };
+    streams.into_iter().filter_map(account).collect()
+}
+
+#[test]
+fn every_listener_knows_exactly_what_it_missed() {
+    in_a_network("two_machines::every_listener_knows_exactly_what_it_missed", || {
+        let (second, third) = (Machine::new(2), Machine::new(3));
+        let robot = Robot::new(&["front", "rear"]);
+        let relay = Relay::new(&robot.machine, 7);
+        assert_eq!(relay.connect(&second), 0);
+        let env = TestEnv::on(&second);
+        let early = listener(&env, &["--stats"]);
+        let gateway = gateway(&robot);
+        until("all topics of both sensors", || truth(&relay.log()).len() == 2 * (Topic::ALL.len() + 1));
+        relay.set_rough(true);
+        until("half of what is rough", || relay.log().len() > MANY / 2);
+        let env = TestEnv::on(&third);
+        let late = listener(&env, &["--stats"]);
+        let before_late = relay.connect(&third);
+        until("the other half", || relay.log().len() > before_late + MANY / 2);
+        // The last announcement gets through, so that what was lost at the end is known to be.
+        relay.set_rough(false);
+        let sent = gateway.end(TERM);
+        assert_eq!(sent.code, Some(0), "{sent}");
+        let sent: BTreeMap<_, _> = last_of_class(&sent, "lan")
+            .iter()
+            .map(|line| (stream(line, &names(&relay.log())), number(line, "sent")))
+            .collect();
+        until("all that was sent", || relay.taken().len() as u64 == sent.values().sum::<u64>());
+        let (log, names) = (relay.log(), names(&relay.log()));
+        let (early, late) = (early.end(INT), late.end(INT));
+        let said_early = said(&early, &names);
+        assert_eq!(said_early, truth(&log));
+        assert_eq!(said(&late, &names), truth(&log[before_late..]), "counted from when it joined");
+        // Who was there from the begin can tell how much was sent.
+        assert_eq!(said_early.len(), sent.len());
+        for (stream, [received, lost, ..]) in &said_early {
+            assert_eq!(received + lost, sent[stream], "{stream:?}");
+        }
+        let sum = |at: usize| said_early.values().map(|numbers| numbers[at]).sum::<u64>();
+        let [received, lost, duplicate, reordered] = std::array::from_fn(sum);
+        eprintln!("{received} received, {lost} lost, {duplicate} duplicate, {reordered} reordered");
+        assert!(lost > MANY as u64 / 40 && duplicate > MANY as u64 / 100 && reordered > MANY as u64 / 100);
+    });
+}
+
+/// The last whole account: for each sensor and topic its last line.
+fn last_of_class(outcome: &Outcome, class: &str) -> Vec<Value> {
+    let key = |line: &Value| (line["sensor"].to_string(), line["topic"].to_string());
+    let lines = outcome.of_class(class);
+    let by_stream: BTreeMap<_, _> = lines.into_iter().map(|line| (key(&line), line)).collect();
+    by_stream.into_values().collect()
+}
+
+#[test]
+fn a_sensor_of_another_machine_is_followed_as_one_here() {
+    in_a_network("two_machines::a_sensor_of_another_machine_is_followed_as_one_here", || {
+        let second = Machine::new(2);
+        let mut robot = Robot::new(&["front", "rear"]);
+        let relay = Relay::new(&robot.machine, 7);
+        relay.connect(&second);
+        let gateway = gateway(&robot);
+        let env = TestEnv::on(&second);
+        let listener = listener(&env, &["--publish"]);
+        until("the first announcement", || !names(&relay.log()).is_empty());
+        let hub = format!("{:016x}", read(&relay.log()[0]).head.hub);
+        let (front, rear) = (format!("{hub}.front/scan"), format!("{hub}.rear/zones"));
+        let topics = || env.run(&["list", "--json"]).of_class("topic").len();
+        until("both sensors are published", || topics() == 2 * Topic::ALL.len());
+        let mut hz = env.start(&["hz", "--json", &front]);
+        let mut there = robot.env.echo(&["front/scan"]);
+        let mut here = env.echo(&[&front, &rear]);
+        let scan = here.await_lines(40, "a scan", is_class("scan")).pop().expect("forty");
+        let same = there.await_line("the same scan", |line| line["seq"] == scan["seq"]);
+        assert_eq!((&scan["ranges"], &scan["wall_ns"]), (&same["ranges"], &same["wall_ns"]));
+        here.await_line("a verdict", |line| line["class"] == "zones" && line["stale"] != true);
+        let rate =
+            hz.await_line("a rate", |line| line["class"] == "hz" && line["received"].as_u64() > Some(30));
+        assert_eq!(rate["lost"], 0, "{rate}");
+        // Both ends go; who follows is told.
+        drop(there.end(INT));
+        assert_eq!(robot.take_hub().end(TERM).code, Some(0));
+        here.await_line("nothing is known any more", |line| line["verdict"] == "unknown");
+        assert_eq!(gateway.end(TERM).code, Some(0));
+        assert_eq!(listener.end(TERM).code, Some(0));
+        here.await_line("the news", |line| line["kind"] == "hub_gone");
+        drop((here.end(INT), hz.end(INT)));
+        assert!(env.left_behind().is_empty(), "{:?}", env.left_behind());
+    });
+}

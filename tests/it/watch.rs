@@ -1,0 +1,227 @@
+//! The picture on a terminal, as somebody sits at it: it follows the hub, keys and the size of the window, and gives the
+//! terminal back however it ends.
+
+use std::fs::{self, File};
+use std::process::Command;
+use std::time::Duration;
+
+use crate::testkit;
+use crate::testkit::{INT, KILL, Sitting, TERM, TestEnv, Tmux, can_sit};
+use rustix::process::Signal;
+
+const SIZE: (u16, u16) = (60, 20);
+
+/// A wall ahead, a strip on it, and a post that the robot nearly touches.
+const WORLD: &str =
+    "[noise]\ntail = 0\n\n[[thing]]\nline = [[3000, -3000], [3000, 3000], [-3000, 3000], [-3000, -3000]]\n
+[[thing]]\nradius_mm = 20\npose = [0, 400]\n
+[[thing]]\nline = [[900, 2000], [1000, 2000]]\nsurface = \"reflector\"\n";
+
+fn sit(env: &TestEnv, arguments: &[&str]) -> Sitting {
+    let mut command = env.command(&[&["watch"], arguments].concat());
+    command.env_remove("NO_COLOR");
+    Sitting::start(&command, SIZE)
+}
+
+fn is_braille(sign: char) -> bool {
+    ('\u{2801}'..='\u{28ff}').contains(&sign)
+}
+
+#[test]
+fn files_and_pipes_are_refused() {
+    let env = TestEnv::new();
+    let outcome = env.run(&["watch", "front"]);
+    assert_eq!((outcome.code, &outcome.out[..]), (Some(2), &b""[..]), "{outcome}");
+    assert!(outcome.errors.contains("scanhub echo front/scan"), "{outcome}");
+    let outcome = env.run(&["watch", "--json"]);
+    assert_eq!(
+        (outcome.code, &outcome.of_class("error")[0]["kind"]),
+        (Some(2), &"usage".into()),
+        "{outcome}"
+    );
+}
+
+#[test]
+fn it_follows_the_hub_the_keys_and_the_window() {
+    if !can_sit() {
+        return;
+    }
+    let env = TestEnv::new();
+    let mut watch = sit(&env, &[]);
+    watch.await_words("no hub: waiting for it");
+    let world = format!("--world={}", env.file("world", WORLD));
+    let _sensor = env.simulator(&["front"], &["--seed=71", "--baud=500000", &world]);
+    let hub = env.hub(&[env.link("front")]);
+    watch.await_words("1 front    streaming");
+    watch.await_words(" STOP  front, nearest 0.3");
+    watch.await_words("0.60!");
+    watch.await_rows("picture with a mark", |rows| {
+        let picture = || rows[1..17].iter().flat_map(|row| row.chars());
+        picture().any(is_braille) && picture().any(|sign| sign == '*')
+    });
+    assert!(watch.text().contains("\x1b[38;5;1"), "a stop is red");
+
+    // Another window, in which all is drawn anew.
+    watch.resize((110, 30));
+    watch.await_rows("keys in the last row", |rows| rows[29].starts_with("q quit"));
+    watch.await_rows("sensor with its marks", |rows| rows[28].contains("marks 1  objects"));
+
+    // Layers, help, hold.
+    watch.press("m?");
+    watch.await_words("┌ scanhub watch ");
+    watch.press("? ");
+    watch.await_words("HELD");
+    watch.await_rows("picture without marks", |rows| !rows[1..28].concat().contains('*'));
+    watch.press(" ");
+
+    // Requests to the hub, and what came of them.
+    watch.press("F");
+    watch.await_words("front: background is held as it is");
+    watch.await_words("lost 0  frozen");
+    let model = env.run(&["background", "front", "show"]);
+    assert!(String::from_utf8_lossy(&model.out).contains("frozen"), "{model}");
+    watch.press("F");
+    watch.await_words("front: background is learned on");
+    watch.press("R");
+    watch.await_words("front: background is learned anew");
+
+    // Two lives of the hub; also while the picture is held the verdict is that of now.
+    watch.press(" ");
+    watch.await_words(" STOP  HELD  front");
+    drop(hub.end(KILL));
+    watch.await_words("no hub: waiting for it");
+    watch.await_words(" UNKNOWN  HELD  front");
+    watch.press(" ");
+    watch.await_words(" UNKNOWN  front");
+    let hub = env.hub(&[env.link("front")]);
+    watch.await_words(" STOP  front");
+    watch.await_words(&format!("hub {}", hub.pid()));
+    watch.press("q");
+    assert_eq!(watch.end(), (Some(0), String::new(), true));
+    assert_eq!(hub.end(TERM).code, Some(0));
+}
+
+#[test]
+fn the_terminal_is_given_back_however_it_ends() {
+    if !can_sit() {
+        return;
+    }
+    let env = TestEnv::new();
+    for signal in [INT, TERM, Signal::HUP, Signal::QUIT] {
+        let watch = sit(&env, &[]);
+        watch.await_words("no hub");
+        watch.signal(signal);
+        assert_eq!(watch.end(), (Some(0), String::new(), true), "{signal:?}");
+    }
+    for key in ["q", "\x1b", "\x03"] {
+        let mut watch = sit(&env, &[]);
+        watch.await_words("no hub");
+        watch.press(key);
+        assert_eq!(watch.end(), (Some(0), String::new(), true), "{key:?}");
+    }
+    // As with all that follow: bounded needs a hub.
+    let (code, below, is_whole) = sit(&env, &["--for=5s"]).end();
+    assert!(code == Some(3) && below.contains("scanhub: no hub in domain") && is_whole, "{code:?} {below:?}");
+    let _hub = env.hub(&[env.link("front")]);
+    let mut watch = sit(&env, &["front", "--for=5m"]);
+    watch.await_words("1 front");
+    watch.press("\x03");
+    let (code, _, is_whole) = watch.end();
+    assert_eq!((code, is_whole), (Some(130), true));
+    let (code, below, is_whole) = sit(&env, &["side"]).end();
+    assert!(code == Some(3) && below.contains("there are front") && is_whole, "{code:?} {below:?}");
+}
+
+#[test]
+fn without_colours_nothing_is_coloured() {
+    if !can_sit() {
+        return;
+    }
+    let env = TestEnv::new();
+    let mut command = env.command(&["watch"]);
+    command.env("NO_COLOR", "1");
+    let mut watch = Sitting::start(&command, SIZE);
+    let world = format!("--world={}", env.file("world", WORLD));
+    let _sensor = env.simulator(&["front"], &["--seed=72", "--baud=500000", &world]);
+    let _hub = env.hub(&[env.link("front")]);
+    watch.await_words(" STOP  front");
+    watch.await_words("0.60!");
+    watch.press("q");
+    let text = watch.text();
+    assert_eq!(watch.end().0, Some(0));
+    assert!(!text.contains("\x1b[38;5") && !text.contains("\x1b[48;5"), "{text:?}");
+}
+
+#[test]
+fn a_demonstration_shows_it() {
+    if !can_sit() {
+        return;
+    }
+    let mut command = Command::new(env!("CARGO_BIN_EXE_scanhub"));
+    command.args(["demo", "--for=3s"]);
+    let demo = Sitting::start(&command, (80, 30));
+    let name = format!("demo-{}", demo.pid());
+    demo.await_words("1 front    streaming");
+    demo.await_words("2 rear     streaming");
+    let (code, below, is_whole) = demo.end();
+    assert!(code == Some(0) && is_whole, "{code:?} {below:?}");
+    assert_eq!(below.matches(" 0 lost in ").count(), 2, "{below:?}");
+    assert!(!std::env::temp_dir().join(format!("scanhub-{name}")).exists(), "its directory is left");
+    assert!(testkit::shared_memory(&format!("sh_{name}_")).is_empty(), "its domain is left");
+}
+
+#[test]
+fn a_terminal_that_is_closed_is_a_quiet_end() {
+    if !can_sit() {
+        return;
+    }
+    let env = TestEnv::new();
+    let _sensor = env.simulator(&["front"], &["--seed=73", "--baud=500000"]);
+    for streams in [false, true] {
+        let _hub = streams.then(|| env.hub(&[env.link("front")]));
+        // With SIGHUP, as a shell's terminal sends it, and without anybody who tells it.
+        for told in [true, false] {
+            let errors = env.path("errors");
+            let file = File::create(&errors).expect("a file");
+            let watch = Sitting::start_for_hang_up(&env.command(&["watch"]), SIZE, told, file);
+            watch.await_words(if streams { "1 front    streaming" } else { "no hub: waiting for it" });
+            let (code, took) = watch.hang_up();
+            let errors = fs::read_to_string(errors).expect("its errors");
+            assert_eq!((code, errors.as_str()), (Some(0), ""), "told {told}, streams {streams}");
+            assert!(took < Duration::from_secs(5), "{took:?}, told {told}, streams {streams}");
+        }
+    }
+}
+
+#[test]
+fn in_tmux_it_is_what_it_is_elsewhere() {
+    let env = TestEnv::new();
+    // Should the test be killed, all of it is over after a while.
+    let program = env!("CARGO_BIN_EXE_scanhub");
+    let line = format!("{program} demo --for=60s; echo ended with $?; sleep 20");
+    let Some(tmux) = Tmux::start(&env, &line, (80, 30)) else { return };
+    let is_picture = |rows: &[String]| rows[1..].iter().flat_map(|row| row.chars()).any(is_braille);
+    let streams = |rows: &[String], sensor: &str| {
+        rows.iter().any(|row| row.starts_with(sensor) && row.contains("streaming"))
+    };
+    let both = |rows: &[String]| streams(rows, "1 front") && streams(rows, "2 rear") && is_picture(rows);
+    let rows = tmux.await_rows("picture of both sensors", both);
+    assert_eq!(rows.len(), 30);
+    tmux.press(&["?"]);
+    tmux.await_rows("help", |rows| rows.iter().any(|row| row.contains("┌ scanhub watch ")));
+    tmux.resize((60, 30));
+    let fits = |rows: &[String]| rows.iter().all(|row| row.chars().count() <= 60);
+    tmux.await_rows("help in a narrow window", |rows| {
+        fits(rows) && rows.iter().any(|row| row.contains("┌ scanhub watch "))
+    });
+    tmux.press(&["?"]);
+    let is_gone = |rows: &[String]| !rows.iter().any(|row| row.contains("┌ scanhub watch "));
+    tmux.await_rows("picture in a narrow window", |rows| fits(rows) && is_gone(rows) && both(rows));
+    tmux.resize((140, 30));
+    tmux.await_rows("a wide window", |rows| !fits(rows) && both(rows));
+    tmux.press(&["q"]);
+    // Before its time was over.
+    let rows = tmux.await_rows("end", |rows| rows.iter().any(|row| row == "ended with 130"));
+    assert!(!is_picture(&rows), "the picture is left:\n{}", rows.join("\n"));
+    assert_eq!(rows.iter().filter(|row| row.contains(" 0 lost in ")).count(), 2, "{}", rows.join("\n"));
+}

@@ -1,0 +1,295 @@
+//! Where a test of the program takes place: a domain, a directory and children of its own, gone with the test however
+//! it ends. Everything is waited for by what it says, with a deadline far beyond what it takes.
+#![allow(dead_code, unused_imports)] // Every test file takes what it needs.
+
+mod again;
+mod findings;
+mod gentle;
+mod line;
+mod machine;
+mod network;
+mod program;
+mod python;
+mod receiver;
+mod recording;
+mod relay;
+mod robot;
+mod sender;
+mod skip;
+mod supervisor;
+mod telegrams;
+mod terminal;
+mod tmux;
+
+use std::fs;
+use std::os::unix::fs::DirBuilderExt;
+use std::path::{Path, PathBuf};
+use std::process::Command;
+use std::sync::atomic::{AtomicU32, Ordering};
+use std::thread;
+use std::time::{Duration, Instant};
+
+use schema::Domain;
+use serde_json::Value;
+
+pub(crate) use again::{in_own_process, only, own_program, run_again};
+pub(crate) use findings::Findings;
+pub(crate) use gentle::{compute_gently, gentle};
+pub(crate) use line::{Line, open_line};
+pub(crate) use machine::{Machine, command_in, ip};
+pub(crate) use network::in_a_network;
+pub(crate) use program::{HUP, INT, KILL, Outcome, Program, TERM, USR1};
+pub(crate) use python::python;
+pub(crate) use receiver::{Receiver, read};
+pub(crate) use recording::{Kept, Recording, unbroken};
+pub(crate) use relay::Relay;
+pub(crate) use robot::Robot;
+pub(crate) use sender::{Sender, wall_ns};
+pub(crate) use skip::{skip, verdict as skip_verdict};
+pub(crate) use supervisor::Supervisor;
+pub(crate) use telegrams::{MEASURED, Sent, bytes_of, hash, is_class, number, scan, sequence};
+pub(crate) use terminal::{Sitting, can_sit, terminal};
+pub(crate) use tmux::Tmux;
+
+/// Far longer than anything takes on a busy machine.
+pub(crate) const PATIENCE: Duration = Duration::from_secs(20);
+
+/// Says where the program is, for a test that hides where it was built.
+pub(crate) const PROGRAM: &str = "SCANHUB_TEST_PROGRAM";
+
+/// A domain and a directory of one test.
+pub(crate) struct TestEnv {
+    directory: PathBuf,
+    domain: String,
+    /// Where its programs run, if not where the test does.
+    network: Option<PathBuf>,
+}
+
+impl TestEnv {
+    pub(crate) fn new() -> TestEnv {
+        static NEXT: AtomicU32 = AtomicU32::new(0);
+        let domain = format!("t{}-{}", std::process::id(), NEXT.fetch_add(1, Ordering::Relaxed));
+        // Not TMPDIR: root and prefix of a domain have to be short.
+        let directory = PathBuf::from(format!("/tmp/{domain}"));
+        let made = fs::DirBuilder::new().recursive(true).mode(0o755).create(&directory);
+        made.unwrap_or_else(|error| panic!("{}: {error}", directory.display()));
+        TestEnv { directory, domain, network: None }
+    }
+
+    /// One whose programs run on another machine.
+    pub(crate) fn on(machine: &Machine) -> TestEnv {
+        let mut env = TestEnv::new();
+        env.network = Some(machine.network());
+        env
+    }
+
+    /// Where its hub is, for consumers in the test itself.
+    pub(crate) fn place(&self) -> Domain {
+        Domain::at(&self.domain, &self.directory).unwrap_or_else(|failure| panic!("{failure}"))
+    }
+
+    pub(crate) fn path(&self, name: &str) -> PathBuf {
+        self.directory.join(name)
+    }
+
+    /// `path` as an argument.
+    pub(crate) fn word(&self, name: &str) -> String {
+        self.path(name).display().to_string()
+    }
+
+    /// Writes a file of this test and returns its path as an argument.
+    pub(crate) fn file(&self, name: &str, content: impl AsRef<[u8]>) -> String {
+        fs::write(self.path(name), content).unwrap_or_else(|error| panic!("{name}: {error}"));
+        self.word(name)
+    }
+
+    /// `--link NAME=PORT` for a port in this directory.
+    pub(crate) fn link(&self, name: &str) -> String {
+        format!("--link={name}={}", self.word(name))
+    }
+
+    /// The program with `arguments`, in this domain.
+    pub(crate) fn command<S: AsRef<str>>(&self, arguments: &[S]) -> Command {
+        self.command_at(&self.directory, arguments)
+    }
+
+    /// As [`TestEnv::command`], with the domain in another directory.
+    pub(crate) fn command_at<S: AsRef<str>>(&self, root: &Path, arguments: &[S]) -> Command {
+        let program = std::env::var(PROGRAM).unwrap_or_else(|_| env!("CARGO_BIN_EXE_scanhub").into());
+        let mut command = match &self.network {
+            Some(network) => command_in(network, &program),
+            None => Command::new(program),
+        };
+        command.args(arguments.iter().map(AsRef::as_ref));
+        command.args(["--domain", &self.domain, "--root"]).arg(root);
+        // Should the whole test be killed, its children end too.
+        command.env("SCANHUB_END_WITH_PARENT", "1").env("SCANHUB_LOG", "info").env_remove("SCANHUB_CONFIG");
+        // What is kept is kept here, not in the home of who runs the tests.
+        command.env("XDG_STATE_HOME", self.path("state")).env_remove("STATE_DIRECTORY");
+        command
+    }
+
+    /// Starts the program.
+    pub(crate) fn start<S: AsRef<str>>(&self, arguments: &[S]) -> Program {
+        Program::start(self.command(arguments))
+    }
+
+    /// Starts the program and lets it come to its end.
+    pub(crate) fn run<S: AsRef<str>>(&self, arguments: &[S]) -> Outcome {
+        self.start(arguments).wait()
+    }
+
+    /// A hub with these flags that is up.
+    pub(crate) fn hub<S: AsRef<str>>(&self, flags: &[S]) -> Program {
+        self.start(&with(&["run", "--json"], flags)).ready()
+    }
+
+    /// What stands in for a service manager.
+    pub(crate) fn supervisor(&self) -> Supervisor {
+        Supervisor::new(self.word("notify"))
+    }
+
+    /// Starts a hub with these flags as a service of `supervisor` and with what it keeps; it is not waited for.
+    pub(crate) fn service<S: AsRef<str>>(
+        &self,
+        supervisor: &mut Supervisor,
+        flags: &[S],
+        watchdog: Option<Duration>,
+    ) -> Program {
+        let (command, stdin) = supervisor.service(&self.command(&with(&["run", "--json"], flags)), watchdog);
+        Program::start_with(command, stdin)
+    }
+
+    /// A gateway with these flags that has begun; its number is kept in this directory.
+    pub(crate) fn gateway<S: AsRef<str>>(&self, flags: &[S]) -> Program {
+        let mut gateway = self.gateway_at(flags);
+        gateway.await_line("its begin", is_class("gateway"));
+        gateway
+    }
+
+    /// As [`TestEnv::gateway`], however it begins.
+    pub(crate) fn gateway_at<S: AsRef<str>>(&self, flags: &[S]) -> Program {
+        self.start(&with(&["gateway", "--json", "--no-system-config"], flags))
+    }
+
+    /// A simulator with a port of each of these names that is up; its truth is in the file `truth`.
+    pub(crate) fn simulator<S: AsRef<str>>(&self, ports: &[&str], flags: &[S]) -> Program {
+        let ports: Vec<_> = ports.iter().map(|port| format!("--port={}", self.word(port))).collect();
+        let truth = format!("--truth={}", self.word("truth"));
+        let words = with(&["simulate", "--json", &truth], &with(&ports, flags));
+        self.start(&words).ready()
+    }
+
+    /// Kills the simulator of one port, and takes away the name that it leaves: a hub that goes on would soon find
+    /// another test's terminal by it.
+    pub(crate) fn kill_simulator(&self, simulator: Program, port: &str) {
+        assert_eq!(simulator.end(KILL).code, None);
+        fs::remove_file(self.path(port)).unwrap_or_else(|error| panic!("{port}: {error}"));
+    }
+
+    /// `echo --json` of these topics, attached to all of them.
+    pub(crate) fn echo(&self, topics: &[&str]) -> Program {
+        let before: Vec<_> = topics.iter().map(|topic| self.subscribers(topic)).collect();
+        let program = self.start(&with(&["echo", "--json"], topics));
+        until("the consumer is attached", || {
+            topics.iter().zip(&before).all(|(topic, before)| self.subscribers(topic) > *before)
+        });
+        program
+    }
+
+    /// How many consumers `topic` has.
+    pub(crate) fn subscribers(&self, topic: &str) -> u64 {
+        let outcome = self.run(&["list", "--json"]);
+        let lines = outcome.lines();
+        let line = lines.iter().find(|line| {
+            topic.split_once('/').is_some_and(|(sensor, topic)| {
+                line["class"] == "topic" && line["sensor"] == sensor && line["topic"] == topic
+            })
+        });
+        line.map_or_else(|| panic!("no {topic}: {outcome}"), |line| number(line, "subscribers"))
+    }
+
+    /// What `info` says of `sensor`.
+    pub(crate) fn info(&self, sensor: &str) -> Value {
+        let outcome = self.run(&["info", sensor, "--json"]);
+        let [line] = &outcome.lines()[..] else { panic!("not one line: {outcome}") };
+        line.clone()
+    }
+
+    /// Waits until `info` of `sensor` says what is `wanted`, and returns it.
+    pub(crate) fn await_info(&self, sensor: &str, wanted: impl Fn(&Value) -> bool) -> Value {
+        let mut last = Value::Null;
+        until("the status", || {
+            last = self.info(sensor);
+            wanted(&last)
+        });
+        last
+    }
+
+    /// The telegrams that the simulator has sent so far, those of `port` in their order.
+    pub(crate) fn truth(&self, port: &str) -> Vec<Sent> {
+        let port = self.word(port);
+        self.truth_lines("truth").iter().filter(|line| line["port"] == port.as_str()).map(Sent::of).collect()
+    }
+
+    /// The simulator's last line about `port`: how many telegrams it sent, and how often it would have written the
+    /// sensor's EEPROM.
+    pub(crate) fn simulated(&self, port: &str) -> (u64, u64) {
+        let port = self.word(port);
+        let lines = self.truth_lines("simulated");
+        let line = lines.iter().find(|line| line["port"] == port.as_str());
+        let line = line.unwrap_or_else(|| panic!("no account of {port}"));
+        (number(line, "sent"), number(line, "eeprom_writes"))
+    }
+
+    fn truth_lines(&self, class: &str) -> Vec<Value> {
+        let text = fs::read_to_string(self.path("truth")).expect("the truth is there");
+        text.lines()
+            .map(|line| serde_json::from_str::<Value>(line).unwrap_or_else(|error| panic!("{line}: {error}")))
+            .filter(|line| line["class"] == class)
+            .collect()
+    }
+
+    /// Files of this domain's shared memory that are longer than what the library always leaves.
+    pub(crate) fn left_behind(&self) -> Vec<PathBuf> {
+        shared_memory(&format!("sh_{}_", self.domain))
+            .into_iter()
+            .filter(|path| fs::metadata(path).is_ok_and(|metadata| metadata.len() > 16))
+            .collect()
+    }
+}
+
+impl Drop for TestEnv {
+    fn drop(&mut self) {
+        let _ = fs::remove_dir_all(&self.directory);
+        for path in shared_memory(&format!("sh_{}_", self.domain)) {
+            let _ = fs::remove_file(path);
+        }
+    }
+}
+
+/// Files in shared memory whose names begin with `prefix`.
+pub(crate) fn shared_memory(prefix: &str) -> Vec<PathBuf> {
+    let entries = fs::read_dir("/dev/shm").into_iter().flatten().flatten();
+    let named = entries.filter(|entry| entry.file_name().to_string_lossy().starts_with(prefix));
+    named.map(|entry| entry.path()).collect()
+}
+
+/// Waits until `is_so`.
+pub(crate) fn until(what: &str, mut is_so: impl FnMut() -> bool) {
+    let give_up_at = Instant::now() + PATIENCE;
+    while !is_so() {
+        assert!(Instant::now() < give_up_at, "waited in vain: {what}");
+        thread::sleep(Duration::from_millis(20));
+    }
+}
+
+/// Whether anything is at `path`, be it a symlink to nothing.
+pub(crate) fn is_there(path: &Path) -> bool {
+    fs::symlink_metadata(path).is_ok()
+}
+
+fn with<S: AsRef<str>, T: AsRef<str>>(first: &[S], rest: &[T]) -> Vec<String> {
+    let first = first.iter().map(|word| word.as_ref().to_owned());
+    first.chain(rest.iter().map(|word| word.as_ref().to_owned())).collect()
+}

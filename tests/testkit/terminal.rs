@@ -1,0 +1,252 @@
+//! A terminal at which a person sits: a pty of which the test has the person's side, and what stands on its screen.
+
+use std::ffi::OsStr;
+use std::fs::File;
+use std::io::{Read, Write};
+use std::os::fd::{AsFd, OwnedFd};
+use std::os::unix::ffi::OsStrExt;
+use std::process::{Child, Command, Stdio};
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::{Arc, Mutex};
+use std::thread::{self, JoinHandle};
+use std::time::{Duration, Instant};
+
+use rustix::event::{PollFd, PollFlags, Timespec, poll};
+use rustix::fs::{Mode, OFlags};
+use rustix::process::{Pid, Signal, kill_process};
+use rustix::pty::{OpenptFlags, grantpt, openpt, ptsname, unlockpt};
+use rustix::termios::{Termios, Winsize, tcgetattr, tcsetwinsize};
+
+use super::{PATIENCE, skip};
+
+/// The person's side of a new terminal, and the program's.
+pub(crate) fn terminal() -> (File, OwnedFd) {
+    let keys = openpt(OpenptFlags::RDWR | OpenptFlags::NOCTTY | OpenptFlags::CLOEXEC).unwrap();
+    grantpt(&keys).unwrap();
+    unlockpt(&keys).unwrap();
+    let name = ptsname(&keys, Vec::new()).unwrap();
+    let flags = OFlags::RDWR | OFlags::NOCTTY | OFlags::CLOEXEC;
+    let screen: OwnedFd = rustix::fs::open(OsStr::from_bytes(name.as_bytes()), flags, Mode::empty()).unwrap();
+    (keys.into(), screen)
+}
+
+/// Whether a test can sit at a terminal of its own here; says why not.
+pub(crate) fn can_sit() -> bool {
+    let can_sit = Command::new("setsid").arg("true").status().is_ok_and(|status| status.success());
+    if !can_sit {
+        skip("setsid", "there is none (Debian: apt-get install util-linux)");
+    }
+    can_sit
+}
+
+/// A program with a terminal of its own, at which the test sits.
+pub(crate) struct Sitting {
+    process: Child,
+    /// The person's side, until it is closed.
+    keys: Option<File>,
+    screen: OwnedFd,
+    before: Termios,
+    seen: Arc<Mutex<Vec<u8>>>,
+    /// Sees what is written, until it is told that nobody looks any more.
+    eye: Option<JoinHandle<()>>,
+    closed: Arc<AtomicBool>,
+    size: (u16, u16),
+}
+
+impl Sitting {
+    /// Starts `command` on a terminal of `size`, columns and rows, which is the one of its session.
+    pub(crate) fn start(command: &Command, size: (u16, u16)) -> Sitting {
+        Sitting::begin(command, size, &["-c"], None)
+    }
+
+    /// As [`Sitting::start`], with `errors` for its stderr, and if it is not `told` on a terminal that is of no session:
+    /// nobody is sent a signal when it is closed.
+    pub(crate) fn start_for_hang_up(
+        command: &Command,
+        size: (u16, u16),
+        told: bool,
+        errors: File,
+    ) -> Sitting {
+        Sitting::begin(command, size, if told { &["-c"] } else { &[] }, Some(errors))
+    }
+
+    fn begin(command: &Command, size: (u16, u16), flags: &[&str], errors: Option<File>) -> Sitting {
+        let (keys, screen) = terminal();
+        resize(&screen, size);
+        let before = tcgetattr(&screen).unwrap();
+        let program = || Stdio::from(screen.try_clone().unwrap());
+        let mut setsid = Command::new("setsid");
+        setsid.args(flags).arg(command.get_program()).args(command.get_args());
+        for (key, value) in command.get_envs() {
+            match value {
+                Some(value) => setsid.env(key, value),
+                None => setsid.env_remove(key),
+            };
+        }
+        setsid.env("TERM", "xterm").stdin(program()).stdout(program());
+        setsid.stderr(errors.map_or_else(program, Stdio::from));
+        let process = setsid.spawn().unwrap();
+        drop(setsid);
+        let seen = Arc::new(Mutex::new(Vec::new()));
+        let closed = Arc::new(AtomicBool::new(false));
+        let (mut from, to, is_over) = (keys.try_clone().unwrap(), seen.clone(), closed.clone());
+        let eye = thread::spawn(move || {
+            let mut piece = [0; 4096];
+            while !is_over.load(Ordering::Relaxed) {
+                let mut fds = [PollFd::new(&from, PollFlags::IN)];
+                if poll(&mut fds, Some(&LOOK)).unwrap() == 0 {
+                    continue;
+                }
+                // A terminal that nobody has open any more ends by an error.
+                let Ok(len @ 1..) = from.read(&mut piece) else { return };
+                to.lock().unwrap().extend_from_slice(&piece[..len]);
+            }
+        });
+        Sitting { process, keys: Some(keys), screen, before, seen, eye: Some(eye), closed, size }
+    }
+
+    /// Its process id.
+    pub(crate) fn pid(&self) -> u32 {
+        self.process.id()
+    }
+
+    /// All that was written on it.
+    pub(crate) fn text(&self) -> String {
+        String::from_utf8_lossy(&self.seen.lock().unwrap()).into_owned()
+    }
+
+    /// The rows of its screen.
+    pub(crate) fn rows(&self) -> Vec<String> {
+        shown(&self.text(), self.size.0.into(), self.size.1.into())
+    }
+
+    /// Waits until a row has `words`.
+    pub(crate) fn await_words(&self, words: &str) {
+        self.await_rows(words, |rows| rows.iter().any(|row| row.contains(words)));
+    }
+
+    /// Waits until the rows are as `wanted`.
+    pub(crate) fn await_rows(&self, what: &str, wanted: impl Fn(&[String]) -> bool) {
+        let give_up_at = Instant::now() + PATIENCE;
+        while !wanted(&self.rows()) {
+            assert!(Instant::now() < give_up_at, "no {what}:\n{}", self.rows().join("\n"));
+            thread::sleep(Duration::from_millis(10));
+        }
+    }
+
+    /// Types.
+    pub(crate) fn press(&mut self, keys: &str) {
+        self.keys.as_mut().expect("it is open").write_all(keys.as_bytes()).unwrap();
+    }
+
+    /// Makes the terminal so large.
+    pub(crate) fn resize(&mut self, size: (u16, u16)) {
+        self.size = size;
+        resize(&self.screen, size);
+    }
+
+    /// Sends a signal.
+    pub(crate) fn signal(&self, signal: Signal) {
+        kill_process(Pid::from_child(&self.process), signal).unwrap();
+    }
+
+    /// Closes the terminal and waits for the end: the exit code, and how long that took.
+    pub(crate) fn hang_up(mut self) -> (Option<i32>, Duration) {
+        self.closed.store(true, Ordering::Relaxed);
+        self.eye.take().map(JoinHandle::join).transpose().unwrap();
+        drop(self.keys.take());
+        let closed_at = Instant::now();
+        (self.wait(), closed_at.elapsed())
+    }
+
+    fn wait(&mut self) -> Option<i32> {
+        let give_up_at = Instant::now() + PATIENCE;
+        loop {
+            if let Some(status) = self.process.try_wait().unwrap() {
+                return status.code();
+            }
+            assert!(Instant::now() < give_up_at, "it does not end:\n{}", self.rows().join("\n"));
+            thread::sleep(Duration::from_millis(10));
+        }
+    }
+
+    /// Waits for the end: the exit code, what stands below the picture, and whether the terminal is as it was.
+    pub(crate) fn end(self) -> (Option<i32>, String, bool) {
+        let (code, text, is_as_before) = self.end_of_lines();
+        let (picture, below) = text.rsplit_once("\x1b[?1049l").unwrap_or(("", &text));
+        let is_shown = below.contains("\x1b[?25h") && !below.contains("\x1b[?25l");
+        let is_whole = picture.contains("\x1b[?1049h") && is_shown && is_as_before;
+        (code, below.replace("\x1b[?25h", ""), is_whole)
+    }
+
+    /// The same of a program that draws no picture: with all that it wrote.
+    pub(crate) fn end_of_lines(mut self) -> (Option<i32>, String, bool) {
+        let code = self.wait();
+        let give_up_at = Instant::now() + PATIENCE;
+        let after = tcgetattr(&self.screen).unwrap();
+        let is_as_before = (after.input_modes, after.output_modes, after.local_modes)
+            == (self.before.input_modes, self.before.output_modes, self.before.local_modes);
+        // All of it is here once the last of it is.
+        let mark = "\u{1}end";
+        File::from(self.screen.try_clone().unwrap()).write_all(mark.as_bytes()).unwrap();
+        while !self.text().ends_with(mark) {
+            assert!(Instant::now() < give_up_at, "the terminal keeps what was written");
+            thread::sleep(Duration::from_millis(10));
+        }
+        let text = self.text();
+        (code, text.replace(mark, ""), is_as_before)
+    }
+}
+
+impl Drop for Sitting {
+    fn drop(&mut self) {
+        let _ = self.process.kill();
+        let _ = self.process.wait();
+    }
+}
+
+/// Between two looks whether anybody looks on.
+const LOOK: Timespec = Timespec { tv_sec: 0, tv_nsec: 20_000_000 };
+
+fn resize(terminal: impl AsFd, (columns, rows): (u16, u16)) {
+    tcsetwinsize(terminal, Winsize { ws_col: columns, ws_row: rows, ws_xpixel: 0, ws_ypixel: 0 }).unwrap();
+}
+
+/// What stands on a screen on which `text` was written: its rows. Knows what programs use that place each sign: cursor
+/// positions (CSI H), clearing (CSI J) and the alternate screen; colours say nothing here.
+fn shown(text: &str, columns: usize, rows: usize) -> Vec<String> {
+    let mut screen = vec![vec![' '; columns]; rows];
+    let (mut row, mut column) = (0, 0);
+    let mut signs = text.chars();
+    while let Some(sign) = signs.next() {
+        match sign {
+            '\x1b' if signs.clone().next() == Some('[') => {
+                signs.next();
+                let arguments: String =
+                    signs.clone().take_while(|sign| !sign.is_ascii_alphabetic()).collect();
+                match signs.nth(arguments.chars().count()) {
+                    Some('H') => {
+                        let mut numbers =
+                            arguments.split(';').map(|number| number.parse().unwrap_or(1_usize));
+                        row = numbers.next().unwrap_or(1).saturating_sub(1);
+                        column = numbers.next().unwrap_or(1).saturating_sub(1);
+                    }
+                    Some('J') => screen.iter_mut().for_each(|row| row.fill(' ')),
+                    Some('h' | 'l') if arguments == "?1049" => {
+                        screen.iter_mut().for_each(|row| row.fill(' '));
+                    }
+                    _ => {}
+                }
+            }
+            '\r' => column = 0,
+            '\n' => row += 1,
+            sign => {
+                if let Some(cell) = screen.get_mut(row).and_then(|row| row.get_mut(column)) {
+                    *cell = sign;
+                }
+                column += 1;
+            }
+        }
+    }
+    screen.into_iter().map(|row| row.into_iter().collect::<String>().trim_end().to_owned()).collect()
+}
