@@ -65,7 +65,7 @@ impl<'a> Diagnosis<'a> {
     }
 
     /// What is wrong, in words; empty if nothing is.
-    pub(crate) fn words(&self) -> &str {
+    pub(crate) fn explanation(&self) -> &str {
         &self.words
     }
 

@@ -139,9 +139,9 @@ impl<'a> LinkThread<'a> {
     /// As [`show`](Self::show), of a `session` that was examined: what is wrong is for [`Diagnosis`] to say.
     pub(crate) fn show_session(&mut self, session: &Session, state: State) -> bool {
         let now = clock::now();
-        let changed = self.stats.update(state, self.diagnosis.words(), now);
+        let changed = self.stats.update(state, self.diagnosis.explanation(), now);
         if changed {
-            announce(&self.link.name, state, self.diagnosis.words());
+            announce(&self.link.name, state, self.diagnosis.explanation());
         }
         self.publish_status(Some(session), state, changed, now)
     }
