@@ -7,6 +7,7 @@ pub mod clock;
 mod holder;
 mod kernel;
 mod line_errors;
+mod line_settings;
 mod port_error;
 mod rights;
 mod source;
