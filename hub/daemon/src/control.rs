@@ -20,7 +20,7 @@ pub(crate) struct ControlServer {
     links: Vec<LinkQueue>,
     outcomes: Receiver<(u64, Outcome)>,
     event: Arc<EventFd>,
-    /// Requests that a link has not taken yet, by the numbers of their orders.
+    /// Requests that a link has not taken yet, by their numbers.
     open: Vec<(u64, Asked)>,
     next: u64,
 }
@@ -28,7 +28,7 @@ pub(crate) struct ControlServer {
 /// The way to a link's thread.
 struct LinkQueue {
     sensor: String,
-    queue: SyncSender<Order>,
+    queue: SyncSender<QueuedRequest>,
     changed: Changed,
     event: Arc<EventFd>,
 }
@@ -36,14 +36,16 @@ struct LinkQueue {
 /// What a link shall make of its scans from now on, until it has taken it.
 type Changed = Arc<Mutex<Option<Box<Processing>>>>;
 
-/// What came of an order: done, with the model that was asked for, or why not.
-type Outcome = Result<Option<Box<Shown>>, Failure>;
+/// What came of a request: done, with the model that was asked for, or why not.
+pub(crate) type Outcome = Result<Option<Box<Shown>>, Failure>;
 
-struct Order {
-    number: u64,
-    verb: Verb,
+/// A request on its way to a link.
+pub(crate) struct QueuedRequest {
+    /// By which it is answered.
+    pub(crate) number: u64,
+    pub(crate) verb: Verb,
     /// What a request to load brings.
-    model: Box<Background>,
+    pub(crate) model: Box<Background>,
 }
 
 impl ControlServer {
@@ -122,14 +124,14 @@ impl ControlServer {
     }
 
     fn hand_on(&mut self, asked: Asked) {
-        match self.order(&asked) {
+        match self.queue(&asked) {
             Ok(number) => self.open.push((number, asked)),
             Err(refusal) => self.answer(asked, Err(refusal)),
         }
     }
 
     /// Puts what `asked` wants into the link's queue; the number by which its outcome will be told.
-    fn order(&mut self, asked: &Asked) -> Result<u64, Failure> {
+    fn queue(&mut self, asked: &Asked) -> Result<u64, Failure> {
         let (request, sensor) = (asked.request(), asked.request().sensor());
         let link = self.links.iter().find(|link| link.sensor == sensor).ok_or_else(|| {
             let sensors: Vec<_> = self.links.iter().map(|link| link.sensor.as_str()).collect();
@@ -140,7 +142,8 @@ impl ControlServer {
             let message = format!("request {} is not known to this hub", request.verb);
             Failure::new(Kind::Failed, message, "client and hub are of different versions")
         })?;
-        match link.queue.try_send(Order { number: self.next, verb, model: Box::new(request.model()) }) {
+        match link.queue.try_send(QueuedRequest { number: self.next, verb, model: Box::new(request.model()) })
+        {
             Ok(()) => {}
             Err(TrySendError::Full(_)) => {
                 let message = format!("{sensor} has {QUEUE} requests to do already");

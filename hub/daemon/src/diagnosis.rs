@@ -1,20 +1,129 @@
 //! What is wrong with a link, in words for its status: the session's trouble, a unit that is not the configured one,
 //! more bytes than its line can bring, consumers that get nothing. Refuses to know when a status goes out.
 
-use lms::{Session, Trouble};
+use config::Link;
+use lms::variant::Unit;
+use lms::{Notice, Session, Trouble};
+use port::Source;
+use schema::{State, Status};
 
-use crate::link::LinkThread;
+/// What is known to be wrong with one link.
+pub(crate) struct Diagnosis<'a> {
+    link: &'a Link,
+    /// What the words were made from; nothing if they have to be made.
+    facts: Option<Facts>,
+    /// What is wrong, in words; empty if nothing is.
+    words: String,
+    /// Why the port went away the last time, if it did so without a byte.
+    doubt: String,
+    /// The port brings more than its line can.
+    is_flooded: bool,
+    /// Consumers that got nothing, as of the last status.
+    unserved: usize,
+    /// Statuses in a row that said that there are some.
+    unserved_for: u32,
+    /// The measuring mode of which was said whether it has marks.
+    told_mode: u8,
+}
 
-impl LinkThread<'_> {
+/// What the words are made from.
+type Facts = (State, Option<Trouble>, Option<Unit>, Option<Notice>);
+
+impl<'a> Diagnosis<'a> {
+    /// Nothing is wrong with `link` yet.
+    pub(crate) fn new(link: &'a Link) -> Self {
+        Diagnosis {
+            link,
+            facts: None,
+            words: String::new(),
+            doubt: String::new(),
+            is_flooded: false,
+            unserved: 0,
+            unserved_for: 0,
+            told_mode: Status::MODE_UNKNOWN,
+        }
+    }
+
+    /// Looks at `session`. The state of the link, and whether anything is new since the last look.
+    pub(crate) fn examine(&mut self, session: &Session) -> (State, bool) {
+        let sensor = session.sensor();
+        let state = if self.is_doubtful(session) { State::Absent } else { state_of(session) };
+        let facts = (state, session.trouble(), sensor.unit, sensor.notices().next());
+        let is_new = self.facts != Some(facts);
+        if is_new {
+            let (.., notice) = facts;
+            // What is good to know is no error.
+            if let Some(notice) = notice.filter(|notice| !notice.is_fault())
+                && self.facts.is_none_or(|(.., before)| before != Some(notice))
+            {
+                tracing::info!("{}: {notice}", self.link.name);
+            }
+            self.facts = Some(facts);
+            self.words = self.trouble(session);
+        }
+        (state, is_new)
+    }
+
+    /// What is wrong, in words; empty if nothing is.
+    pub(crate) fn explanation(&self) -> &str {
+        &self.words
+    }
+
+    /// The session is over: what is wrong is not what was.
+    pub(crate) fn forget(&mut self) {
+        self.facts = None;
+    }
+
+    /// Why the port went away, if it did so without a byte; else empty. While it may do so again, it is not said to be
+    /// there.
+    pub(crate) fn doubt(&mut self, why: String) {
+        self.doubt = why;
+    }
+
+    /// Notes whether the port brings more than its line can.
+    pub(crate) fn watch_flood(&mut self, is_flooded: bool) {
+        if std::mem::replace(&mut self.is_flooded, is_flooded) != is_flooded {
+            self.facts = None;
+        }
+    }
+
+    /// The port is closed: what it brought is no flood any more.
+    pub(crate) fn end_flood(&mut self) {
+        self.is_flooded = false;
+    }
+
+    /// Notes how many consumers are attached and get nothing, once a status.
+    pub(crate) fn watch_unserved(&mut self, consumers: usize) {
+        let before = self.unserved_for;
+        self.unserved = consumers;
+        self.unserved_for = if consumers > 0 { before.saturating_add(1) } else { 0 };
+        if self.unserved_for == UNSERVED_LIMIT || before >= UNSERVED_LIMIT && self.unserved_for == 0 {
+            // Whoever is served shall read it in the status.
+            self.facts = None;
+        }
+        if self.unserved_for == UNSERVED_LIMIT {
+            tracing::warn!("{}: {}", self.link.name, self.unserved());
+        }
+    }
+
+    /// Says once that the measuring mode of `status` has no marks, which is no error, and what changes it.
+    pub(crate) fn tell_mode(&mut self, status: &Status) {
+        if std::mem::replace(&mut self.told_mode, status.mode) != status.mode
+            && let Some(remedy) = status.reflector_remedy()
+        {
+            let name = &self.link.name;
+            tracing::info!("{name}: marks are unavailable; after the hub's end `{remedy}` changes that");
+        }
+    }
+
     /// Whether the port may go away again before it brings anything, as it did the last time: a serial server that
-    /// serves somebody else takes each connection and closes it. Then it is not said anew that it is there.
-    pub(crate) fn is_doubtful(&self, session: &Session) -> bool {
+    /// serves somebody else takes each connection and closes it.
+    fn is_doubtful(&self, session: &Session) -> bool {
         let is_silent = session.tally().read == 0 && session.trouble().is_none();
         !self.doubt.is_empty() && is_silent && session.state() == lms::State::Probing
     }
 
-    /// What is wrong, in words; empty if nothing is.
-    pub(crate) fn trouble(&self, session: &Session) -> String {
+    fn trouble(&self, session: &Session) -> String {
         if self.is_doubtful(session) {
             return self.doubt.clone();
         }
@@ -25,9 +134,9 @@ impl LinkThread<'_> {
                 self.link.baud.rate()
             );
         }
-        let unit = session.sensor().unit;
-        match (session.trouble(), unit, self.link.unit) {
-            (Some(Trouble::NoAnswer { .. }), _, _) if self.settings(false).fixed_rate => format!(
+        let is_server = matches!(self.link.port, Source::Tcp { .. });
+        match (session.trouble(), session.sensor().unit, self.link.unit) {
+            (Some(Trouble::NoAnswer { .. }), _, _) if is_server => format!(
                 "no answer at {} baud, to which the serial server was set: power, cable, another rate?",
                 self.link.baud.rate()
             ),
@@ -38,7 +147,7 @@ impl LinkThread<'_> {
                 is.mm(),
                 expected.mm()
             ),
-            _ if self.unreached >= UNREACHED_LIMIT => self.unserved(),
+            _ if self.unserved_for >= UNSERVED_LIMIT => self.unserved(),
             _ => {
                 let fault = session.sensor().notices().find(|notice| notice.is_fault());
                 fault.map_or_else(String::new, |notice| notice.to_string())
@@ -46,48 +155,25 @@ impl LinkThread<'_> {
         }
     }
 
-    /// Says once that the measuring mode has no marks, which is no error, and what changes it.
-    pub(crate) fn tell_mode(&mut self) {
-        let status = self.account.last();
-        if std::mem::replace(&mut self.told_mode, status.mode) != status.mode
-            && let Some(remedy) = status.reflector_remedy()
-        {
-            let name = &self.link.name;
-            tracing::info!("{name}: marks are unavailable; after the hub's end `{remedy}` changes that");
-        }
-    }
-
-    /// Notices consumers that stay without samples.
-    pub(crate) fn watch_reach(&mut self) {
-        let before = self.unreached;
-        self.unreached = if self.unreached_now() > 0 { before.saturating_add(1) } else { 0 };
-        if self.unreached == UNREACHED_LIMIT || before >= UNREACHED_LIMIT && self.unreached == 0 {
-            // Whoever is served shall read it in the status.
-            self.facts = None;
-        }
-        if self.unreached == UNREACHED_LIMIT {
-            tracing::warn!("{}: {}", self.link.name, self.unserved());
-        }
-    }
-
-    /// Notices that the port brings more than its line can, or does not any more.
-    pub(crate) fn watch_flood(&mut self, is_flooded: bool) {
-        if std::mem::replace(&mut self.is_flooded, is_flooded) != is_flooded {
-            self.facts = None;
-        }
-    }
-
-    fn unreached_now(&self) -> usize {
-        self.topics.unreached(self.account.is_streaming())
-    }
-
     fn unserved(&self) -> String {
-        let count = self.unreached_now();
+        let count = self.unserved;
         format!(
             "{count} consumers are attached but get nothing: raise the limit of open descriptors (ulimit -n)"
         )
     }
 }
 
-/// Statuses after which unreached consumers are more than ones that are just attaching.
-const UNREACHED_LIMIT: u32 = 3;
+/// The word for how far `session` is.
+fn state_of(session: &Session) -> State {
+    match session.state() {
+        lms::State::Probing => State::Probing,
+        lms::State::Switching => State::Switching,
+        lms::State::Starting => State::Starting,
+        lms::State::Streaming => State::Streaming,
+        lms::State::Silent => State::Silent,
+        lms::State::Paused => State::Paused,
+    }
+}
+
+/// Statuses after which consumers without samples are more than ones that are just attaching.
+const UNSERVED_LIMIT: u32 = 3;

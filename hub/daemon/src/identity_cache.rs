@@ -11,7 +11,7 @@ use lms::{Identity, MILLIS, Nanos, Session};
 use port::clock;
 use schema::Directory;
 
-/// The memory of one link.
+/// The identity of the sensor of one link.
 pub(crate) struct IdentityCache {
     /// Stamp, identity, port; nothing where it cannot be written: then the sensor is asked.
     file: Option<File>,
@@ -45,8 +45,8 @@ impl IdentityCache {
     }
 
     /// Keeps what `session` knows `now`, if that is worth it.
-    pub(crate) fn keep(&mut self, session: Option<&Session>, now: Nanos) {
-        if let Some(identity) = session.and_then(Session::identity) {
+    pub(crate) fn keep(&mut self, session: &Session, now: Nanos) {
+        if let Some(identity) = session.identity() {
             self.write(identity, now);
         }
     }
@@ -54,7 +54,7 @@ impl IdentityCache {
     /// As soon as anything is known; then [`keep`](Self::keep) keeps it new.
     pub(crate) fn keep_first(&mut self, session: &Session) {
         if self.identity.is_none() {
-            self.keep(Some(session), clock::now());
+            self.keep(session, clock::now());
         }
     }
 
@@ -84,15 +84,15 @@ mod tests {
 
     #[test]
     fn what_was_known_just_now_of_this_port_is_known() {
-        let base = std::env::temp_dir().join(format!("scanhub-memory-{}", std::process::id()));
+        let base = std::env::temp_dir().join(format!("scanhub-cache-{}", std::process::id()));
         let root = base.join("domain");
         Directory::make(&root).unwrap();
         let identity = |byte: u8| Identity::from_bytes([byte; Identity::LEN]);
         let (now, port) = (9_000 * MILLIS, "/dev/ttyUSB0");
-        let mut memory = IdentityCache::open(&root, "front", port);
-        assert_eq!(memory.recall(now), None, "the first one");
-        memory.write(identity(1), now - 1);
-        memory.write(identity(2), now);
+        let mut cache = IdentityCache::open(&root, "front", port);
+        assert_eq!(cache.recall(now), None, "the first one");
+        cache.write(identity(1), now - 1);
+        cache.write(identity(2), now);
         let next = |name, port, now| IdentityCache::open(&root, name, port).recall(now);
         assert_eq!(next("front", port, now + FRESH - 1), Some(identity(2)));
         assert_eq!(next("front", port, now + FRESH), None, "too old");

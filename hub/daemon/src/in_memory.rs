@@ -9,7 +9,7 @@ use lms::session::Output;
 use lms::{Nanos, Session};
 use port::clock;
 use rustix::event::{EventfdFlags, eventfd};
-use schema::{Domain, Failure, Flags, HubLock, State, Wake, ipc, shortage};
+use schema::{Domain, Failure, Flags, HubLock, State, ipc, shortage};
 
 use crate::control::ControlServer;
 use crate::link::{LinkThread, Surroundings};
@@ -44,7 +44,7 @@ pub fn in_memory<T>(
     preflight::check_descriptors(config.links.len())?;
     preflight::check_memory(config.links.len())?;
     let node = ipc::hub_node(domain)?;
-    let (_control, orders) = ControlServer::open(&node, config.links.iter().map(|link| link.name.as_str()))?;
+    let (_control, queues) = ControlServer::open(&node, config.links.iter().map(|link| link.name.as_str()))?;
     let stop = eventfd(0, EventfdFlags::CLOEXEC).map_err(|error| {
         let message = format!("an eventfd cannot be had: {error}");
         Failure::new(schema::Kind::Short, message, "raise `ulimit -n`")
@@ -59,10 +59,10 @@ pub fn in_memory<T>(
         worked: &worked,
     };
     let mut links = Vec::with_capacity(config.links.len());
-    for ((number, link), orders) in config.links.iter().enumerate().zip(orders) {
+    for ((number, link), queue) in config.links.iter().enumerate().zip(queues) {
         let mut topics = Topics::new(&node, &link.name, number as u8, 0)?;
         topics.set_flags(Flags::REPLAYED);
-        let link = LinkThread::new(link, topics, around, orders);
+        let link = LinkThread::new(link, topics, around, queue);
         let session = Session::new(link.settings(true), clock::now());
         links.push(DrivenLink { link, session, stale_at: Nanos::MAX });
     }
@@ -75,13 +75,12 @@ impl DrivenLink<'_> {
     /// they did. How many telegrams that were.
     pub fn read(&mut self, now: Nanos, mut bytes: &[u8]) -> usize {
         if now > self.stale_at {
-            self.link.topics.stale(&mut self.link.pipeline, self.stale_at);
-            self.link.wake(Wake::Status);
+            self.link.output.publish_stale(self.stale_at);
             self.stale_at = Nanos::MAX;
         }
         if self.session.buffered() > 0 {
             // As a line does while the end of a telegram is near.
-            self.link.topics.prepare(&self.link.pipeline);
+            self.link.output.prepare();
         }
         let mut published = 0;
         while !bytes.is_empty() {
@@ -91,11 +90,10 @@ impl DrivenLink<'_> {
             bytes = rest;
             self.session.commit(now, piece.len());
             while let Output::Telegram(received) = self.session.poll_output() {
-                let past = RecordedContext { mode: self.link.link.mode, ..RecordedContext::default() };
-                if let Some(limit) = self.link.publish(&received, &past) {
+                let recorded = RecordedContext { mode: self.link.link.mode, ..RecordedContext::default() };
+                if let Some(limit) = self.link.publish(&received, &recorded, false) {
                     self.stale_at = now.saturating_add(limit);
                 }
-                self.link.wake(Wake::Telegram);
                 published += 1;
             }
         }

@@ -4,6 +4,7 @@
 pub mod bus_error;
 mod control;
 mod diagnosis;
+mod drive;
 mod event_fd;
 mod identity_cache;
 mod in_memory;

@@ -1,68 +1,37 @@
-//! One link: the thread that owns a port and its topics, from the first open to the hub's end. It sleeps until bytes
-//! come or a deadline passes, and does nothing twice per telegram.
+//! What a link's thread has, whatever the link's other end is: where its results go, what it reports of itself, what users
+//! ask of it, and how it waits. It sleeps until something comes or a deadline passes. Refuses to know where bytes come from.
 
-use std::io;
-use std::os::fd::{AsFd, BorrowedFd, OwnedFd};
+use std::os::fd::{BorrowedFd, OwnedFd};
 use std::path::Path;
 use std::sync::atomic::{AtomicBool, Ordering};
 
-use config::Link;
-use lms::framer::suspect;
-use lms::session::Output;
-use lms::variant::{Baud, Unit};
-use lms::{MILLIS, Nanos, Notice, Session, Settings, Trouble};
-use port::{LineErrors, Port, Source, clock};
+use config::{Link, Processing};
+use lms::session::Received;
+use lms::{Control, MILLIS, Nanos, Session, Settings};
+use port::{Source, clock};
 use rustix::event::{PollFd, PollFlags, poll};
-use schema::{Failure, Flags, State, StateDirectory, Status, Wake};
+use schema::{Shown, State, StateDirectory, Verb, Wake};
 
 use crate::control::{ControlQueue, Flow};
-use crate::identity_cache::IdentityCache;
-use crate::last_rate::LastRate;
+use crate::diagnosis::Diagnosis;
 use crate::learned::Slot;
 use crate::link_stats::LinkStats;
-use crate::pipeline::Pipeline;
-use crate::process_telegram::RecordedContext;
-use crate::replay::{self, ReplayPart};
+use crate::process_telegram::{LinkOutput, RecordedContext};
 use crate::service::Service;
 use crate::topics::Topics;
 
-/// A link with everything that belongs to its thread.
+/// The parts of a link's thread.
 pub(crate) struct LinkThread<'a> {
     pub(crate) link: &'a Link,
-    pub(crate) topics: Topics,
-    pub(crate) account: LinkStats,
     pub(crate) around: Surroundings<'a>,
-    /// What users ask for.
-    pub(crate) orders: ControlQueue,
-    /// What is made of the scans.
-    pub(crate) pipeline: Pipeline,
-    /// When the last verdict of the zones is too old to stand; `Nanos::MAX` if none stands.
-    pub(crate) stale_at: Nanos,
+    pub(crate) output: LinkOutput<'a>,
+    pub(crate) stats: LinkStats,
+    pub(crate) diagnosis: Diagnosis<'a>,
+    pub(crate) control: ControlQueue,
+    /// When late joiners get what they would else get with the next sample.
     next_greeting: Nanos,
-    pub(crate) next_status: Nanos,
-    /// Why the port went away the last time, if it did so without a byte.
-    pub(crate) doubt: String,
-    /// What `error` was made from.
-    pub(crate) facts: Option<Facts>,
-    /// What is wrong, in words; empty if nothing is.
-    error: String,
-    /// Rates that the port cannot have, as was said.
-    refused: Vec<Baud>,
-    line_errors: LineErrors,
-    /// What the next hub would like to know; nothing where there will be none.
-    pub(crate) memory: Option<IdentityCache>,
-    /// Where the sensor was found the last time; nothing on a line whose rate cannot be changed.
-    pub(crate) last_rate: Option<LastRate>,
-    /// Statuses in a row that said that consumers got nothing.
-    pub(crate) unreached: u32,
-    /// The port brings more than its line can.
-    pub(crate) is_flooded: bool,
-    /// What is read waited in the port, who knows for how long.
-    pub(crate) is_behind: bool,
-    /// The measuring mode of which was said whether it has marks.
-    pub(crate) told_mode: u8,
-    /// The sensor, as it turned out to be, sees too little of its circles.
-    pub(crate) is_blind: bool,
+    /// When a status goes out without news.
+    next_status: Nanos,
 }
 
 /// What a link has around it.
@@ -82,16 +51,13 @@ pub(crate) struct Surroundings<'a> {
     pub(crate) worked: &'a AtomicBool,
 }
 
-/// What a link's error is made from.
-type Facts = (State, Option<Trouble>, Option<Unit>, Option<Notice>);
-
 /// Why a wait is over.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Woken {
     /// The hub shall end.
     Stop,
     /// A user wants something.
-    Order,
+    Request,
     /// There is something to do at the port.
     Ready,
     /// The time is up.
@@ -99,212 +65,117 @@ pub(crate) enum Woken {
 }
 
 impl<'a> LinkThread<'a> {
-    /// The thread's values; nothing happens yet.
+    /// The thread's parts; nothing happens yet.
     pub(crate) fn new(
         link: &'a Link,
         topics: Topics,
         around: Surroundings<'a>,
-        orders: ControlQueue,
+        control: ControlQueue,
     ) -> Self {
         let now = clock::now();
-        let account = LinkStats::new(link, now);
         LinkThread {
             link,
-            topics,
-            account,
             around,
-            orders,
-            pipeline: Pipeline::new(&link.processing),
-            stale_at: Nanos::MAX,
+            output: LinkOutput::new(link, topics),
+            stats: LinkStats::new(link, now),
+            diagnosis: Diagnosis::new(link),
+            control,
             next_greeting: now,
             next_status: now,
-            doubt: String::new(),
-            facts: None,
-            error: String::new(),
-            refused: Vec::new(),
-            line_errors: LineErrors::default(),
-            memory: None,
-            last_rate: None,
-            unreached: 0,
-            is_flooded: false,
-            is_behind: false,
-            told_mode: Status::MODE_UNKNOWN,
-            is_blind: false,
         }
     }
 
-    /// Runs until the hub shall end, a recording as part of `part` or alone. `report` is called once, when it is clear whether the link can work: an absent
-    /// port can, one that is busy, forbidden or no tty cannot.
-    pub(crate) fn run(mut self, part: Option<ReplayPart<'_>>, report: impl FnOnce(Result<(), Failure>)) {
-        if let Source::File { .. } = self.link.port {
-            self.topics.set_flags(Flags::REPLAYED);
-        }
-        // Nothing is known yet but the model to begin with: that is said before anything can come.
-        let now = clock::now();
-        self.topics.stale(&mut self.pipeline, now);
-        self.topics.background(&mut self.pipeline, now);
-        match &self.link.port {
-            Source::File { path, paced } => replay::run(&mut self, part, path, *paced, report),
-            Source::Tty(_) | Source::Tcp { .. } => self.attend(report),
-        }
+    /// Publishes how it is before anything can come.
+    pub(crate) fn begin(&mut self) {
+        self.output.publish_start(clock::now());
+    }
+
+    /// The hub ends: lets be kept what was learned.
+    pub(crate) fn end(&mut self) {
         self.hand_on(true);
+    }
+
+    /// How a session with this link's sensor goes, or with a recording of one to which nobody talks.
+    pub(crate) fn settings(&self, listen_only: bool) -> Settings {
+        let fixed_rate = matches!(self.link.port, Source::Tcp { .. });
+        Settings { variant: self.link.variant, baud: self.link.baud, listen_only, fixed_rate }
+    }
+
+    /// Publishes `received` and what is made of it, and wakes the consumers. For how long the verdict on its scan stands,
+    /// where it has one.
+    pub(crate) fn publish(
+        &mut self,
+        received: &Received<'_>,
+        recorded: &RecordedContext,
+        is_behind: bool,
+    ) -> Option<Nanos> {
+        let processed = self.output.process(received, recorded, is_behind);
+        self.output.topics.wake(Wake::Telegram);
+        self.stats.note(processed);
+        processed.stands_for
+    }
+
+    /// When a status goes out without news.
+    pub(crate) fn next_status(&self) -> Nanos {
+        self.next_status
+    }
+
+    /// Whether a status or a greeting is due at `now`.
+    pub(crate) fn is_due(&self, now: Nanos) -> bool {
+        now >= self.next_status.min(self.next_greeting)
+    }
+
+    /// Publishes the status if it changed or is due, and greets late joiners; `error` is what is wrong, in words. Whether a
+    /// status went out.
+    pub(crate) fn show(&mut self, session: Option<&Session>, state: State, error: &str) -> bool {
+        let now = clock::now();
+        let changed = self.stats.update(state, error, now);
+        if changed {
+            announce(&self.link.name, state, error);
+        }
+        self.publish_status(session, state, changed, now)
+    }
+
+    /// As [`show`](Self::show), of a `session` that was examined: what is wrong is for [`Diagnosis`] to say.
+    pub(crate) fn show_session(&mut self, session: &Session, state: State) -> bool {
+        let now = clock::now();
+        let changed = self.stats.update(state, self.diagnosis.explanation(), now);
+        if changed {
+            announce(&self.link.name, state, self.diagnosis.explanation());
+        }
+        self.publish_status(Some(session), state, changed, now)
+    }
+
+    fn publish_status(&mut self, session: Option<&Session>, state: State, changed: bool, now: Nanos) -> bool {
+        let is_due = changed || now >= self.next_status;
+        if is_due {
+            self.next_status = now + STATUS_PERIOD;
+            let status = self.stats.status(session, self.output.topics.loan_failed(), now);
+            self.output.topics.status(status, now);
+            if changed || state != State::Streaming {
+                self.output.topics.wake(Wake::Status);
+            }
+            self.hand_on(false);
+            self.diagnosis.watch_unserved(self.output.topics.unreached(self.stats.is_streaming()));
+            self.diagnosis.tell_mode(self.stats.last());
+        }
+        self.greet(now);
+        is_due
+    }
+
+    fn greet(&mut self, now: Nanos) {
+        if now >= self.next_greeting {
+            self.next_greeting = now + GREETING_PERIOD;
+            self.output.topics.greet();
+        }
     }
 
     /// Lets what was learned be kept, if that is news; if this is the `last` time, whatever there is.
     fn hand_on(&mut self, last: bool) {
         if let Some(slot) = self.around.slot
-            && let Some((pose, model)) = self.pipeline.hand_on(last)
+            && let Some((pose, model)) = self.output.hand_on(last)
         {
             slot.put(pose, model);
-        }
-    }
-
-    /// Drives `session` on `tty` until the hub shall end; an error says that the port is gone.
-    pub(crate) fn stream(&mut self, port: &Port, session: &mut Session) -> io::Result<()> {
-        let mut allowance = port.allowance(self.link.baud.rate());
-        loop {
-            let (watch, until) = self.drain(port, session)?;
-            let rest = allowance.as_mut().and_then(|allowance| allowance.rest(clock::now(), until));
-            // Also while bytes are left alone the port may go away.
-            let events = if watch && rest.is_none() { PollFlags::IN } else { PollFlags::empty() };
-            match self.wait(Some((port.as_fd(), events)), rest.unwrap_or(until)) {
-                Woken::Stop => return Ok(()),
-                Woken::Order => {
-                    self.obey(Flow::Session(session));
-                    continue;
-                }
-                Woken::Ready | Woken::Timeout => {}
-            }
-            if !watch {
-                // The telegram's end is near: what can be done before it is not done after it.
-                self.topics.prepare(&self.pipeline);
-            }
-            if watch
-                && session.may_leave()
-                && let Some(waiting) = port.waiting()
-                && session.leave(clock::now(), waiting)
-            {
-                continue;
-            }
-            let mut spare = session.spare();
-            if let Some(allowance) = &allowance {
-                let most = spare.len().min(allowance.bytes(clock::now()).max(1));
-                spare = &mut spare[..most];
-            }
-            let room = spare.len();
-            let len = port.read(spare)?;
-            let now = clock::now();
-            session.commit(now, len);
-            if let Some(allowance) = &mut allowance {
-                allowance.take(len, room, now);
-                self.is_behind = allowance.is_behind(now);
-                self.watch_flood(allowance.is_flooded(now));
-            }
-            if len == 0 && now >= until {
-                session.handle_timeout(now);
-            }
-        }
-    }
-
-    /// Does what the session wants, until it wants to wait: whether for bytes, and until when.
-    fn drain(&mut self, port: &Port, session: &mut Session) -> io::Result<(bool, Nanos)> {
-        let mut published = false;
-        let (watch, until) = loop {
-            match session.poll_output() {
-                Output::SetBaud(baud) => {
-                    // The sensor is looked for at those that the port can have.
-                    if let Some(error) = port.try_baud(baud.rate())?
-                        && !self.refused.contains(&baud)
-                    {
-                        self.refused.push(baud);
-                        tracing::warn!("{}: {error}", self.link.name);
-                    }
-                }
-                Output::Transmit { byte, not_before } => {
-                    self.pause(not_before);
-                    port.write(byte)?;
-                    session.transmitted(clock::now());
-                }
-                Output::Telegram(mut received) => {
-                    let counted = port.line_errors();
-                    self.account.line_errors += counted;
-                    let is_hit = self.line_errors.note(counted);
-                    received.estimated |= self.is_behind;
-                    received.reasons |= if is_hit { suspect::LINE_ERROR } else { 0 };
-                    self.publish(&received, &RecordedContext::default());
-                    self.wake(Wake::Telegram);
-                    published = true;
-                }
-                Output::Rest(until) => break (false, until),
-                Output::Wait { until, .. } => break (true, until),
-            }
-        };
-        if published {
-            self.line_errors.wait();
-        }
-        self.memory.iter_mut().for_each(|memory| memory.keep_first(session));
-        let sensor = session.sensor();
-        let state = if self.is_doubtful(session) { State::Absent } else { state_of(session) };
-        let facts = (state, session.trouble(), sensor.unit, sensor.notices().next());
-        let (.., notice) = facts;
-        let changed = self.facts != Some(facts);
-        if changed {
-            // What is good to know is no error.
-            if let Some(notice) = notice.filter(|notice| !notice.is_fault())
-                && self.facts.is_none_or(|(.., before)| before != Some(notice))
-            {
-                tracing::info!("{}: {notice}", self.link.name);
-            }
-            self.facts = Some(facts);
-            self.error = self.trouble(session);
-            self.last_rate.iter_mut().for_each(|last| last.keep(session));
-        }
-        if changed || clock::now() >= self.next_status.min(self.next_greeting) {
-            let error = std::mem::take(&mut self.error);
-            self.show(Some(session), state, &error);
-            self.error = error;
-        }
-        // While telegrams come there is no need for wake-ups of the status' own.
-        let bound = if state == State::Streaming { Nanos::MAX } else { self.next_status };
-        Ok((watch, until.min(bound)))
-    }
-
-    /// The session is over: what is wrong is not what was.
-    pub(crate) fn forget(&mut self) {
-        self.facts = None;
-    }
-
-    /// Wakes the consumers.
-    pub(crate) fn wake(&self, why: Wake) {
-        self.topics.wake(why);
-    }
-
-    /// Publishes the status if it changed or is due, and greets late joiners.
-    pub(crate) fn show(&mut self, session: Option<&Session>, state: State, error: &str) {
-        let now = clock::now();
-        let changed = self.account.update(state, error, now);
-        if changed {
-            let name = &self.link.name;
-            match error {
-                "" => tracing::info!("{name}: {}", state.name()),
-                error => tracing::warn!("{name}: {}: {error}", state.name()),
-            }
-        }
-        if changed || now >= self.next_status {
-            self.next_status = now + STATUS_PERIOD;
-            let status = self.account.status(session, self.topics.loan_failed(), now);
-            self.topics.status(status, now);
-            if changed || state != State::Streaming {
-                self.topics.wake(Wake::Status);
-            }
-            self.memory.iter_mut().for_each(|memory| memory.keep(session, now));
-            self.hand_on(false);
-            self.watch_reach();
-            self.tell_mode();
-        }
-        if now >= self.next_greeting {
-            self.next_greeting = now + GREETING_PERIOD;
-            self.topics.greet();
         }
     }
 
@@ -313,37 +184,33 @@ impl<'a> LinkThread<'a> {
         loop {
             let now = clock::now();
             // What was due before comes first: it may be a scan.
-            if now >= self.stale_at && self.stale_at < until {
-                self.stale_at = Nanos::MAX;
-                self.topics.stale(&mut self.pipeline, now);
-                self.topics.wake(Wake::Status);
-            }
+            self.output.expire(now, until);
             // Whoever attaches to a silent sensor is greeted in time all the same.
             let mut bound =
-                if self.account.is_streaming() { until } else { until.min(self.next_greeting.max(now)) };
-            bound = bound.min(self.stale_at);
+                if self.stats.is_streaming() { until } else { until.min(self.next_greeting.max(now)) };
+            bound = bound.min(self.output.stale_at());
             if port.is_some_and(|(_, events)| events.is_empty()) {
                 // Some drivers wake nobody who waits for no bytes.
                 bound = bound.min(now + LONGEST_REST);
             }
             let span = clock::span(now, bound);
             let stop = PollFd::new(self.around.stop, PollFlags::IN);
-            let orders = PollFd::new(&self.orders, PollFlags::IN);
+            let requests = PollFd::new(&self.control, PollFlags::IN);
             let woken = match port {
                 Some((port, events)) => {
-                    let mut fds = [stop, orders, PollFd::from_borrowed_fd(port, events)];
+                    let mut fds = [stop, requests, PollFd::from_borrowed_fd(port, events)];
                     poll(&mut fds, Some(&span)).map(|_| fds.each_ref().map(is_ready))
                 }
                 None => {
-                    let mut fds = [stop, orders];
+                    let mut fds = [stop, requests];
                     poll(&mut fds, Some(&span)).map(|_| [is_ready(&fds[0]), is_ready(&fds[1]), false])
                 }
             };
-            self.account.wakeups += 1;
+            self.stats.wakeups += 1;
             self.around.worked.store(true, Ordering::Relaxed);
             match woken {
                 Ok([true, ..]) => return Woken::Stop,
-                Ok([_, true, _]) => return Woken::Order,
+                Ok([_, true, _]) => return Woken::Request,
                 Ok([.., true]) => return Woken::Ready,
                 _ => {}
             }
@@ -351,36 +218,49 @@ impl<'a> LinkThread<'a> {
             if now >= until {
                 return Woken::Timeout;
             }
-            if now >= self.next_greeting {
-                self.next_greeting = now + GREETING_PERIOD;
-                self.topics.greet();
-            }
+            self.greet(now);
         }
     }
 
-    /// Sleeps until `not_before`, too short a time to watch anything meanwhile.
-    fn pause(&self, not_before: Nanos) {
+    /// Does what users asked for, and takes over what was changed for it.
+    pub(crate) fn handle_requests(&mut self, mut flow: Flow<'_>) {
+        if let Some(processing) = self.control.changed() {
+            self.change(&processing);
+        }
+        while let Some(request) = self.control.take() {
+            let control = match request.verb {
+                Verb::Pause => Some(Control::Pause),
+                Verb::Resume => Some(Control::Resume),
+                Verb::Resync => Some(Control::Resync),
+                Verb::Show | Verb::Reset | Verb::Freeze | Verb::Thaw | Verb::Load => None,
+            };
+            let outcome = match control {
+                Some(control) => self.control.control(control, &mut flow).map(|()| None),
+                None => {
+                    let shown = self.output.handle(request.verb, &request.model);
+                    let kept_wall_ns = self.around.slot.and_then(Slot::kept_wall_ns);
+                    shown.map(|model| model.map(|model| Box::new(Shown { model: *model, kept_wall_ns })))
+                }
+            };
+            self.output.publish_background(clock::now());
+            self.control.answer(request.number, outcome);
+        }
+    }
+
+    /// From the next scan on.
+    fn change(&mut self, processing: &Processing) {
         let now = clock::now();
-        if not_before > now {
-            std::thread::sleep(std::time::Duration::from_nanos(not_before - now));
-        }
-    }
-
-    pub(crate) fn settings(&self, listen_only: bool) -> Settings {
-        let fixed_rate = matches!(self.link.port, Source::Tcp { .. });
-        Settings { variant: self.link.variant, baud: self.link.baud, listen_only, fixed_rate }
+        self.output.change(processing, now);
+        self.stats.set_pose(processing.pose);
+        self.next_status = now;
     }
 }
 
-/// The word for how far `session` is.
-pub(crate) fn state_of(session: &Session) -> State {
-    match session.state() {
-        lms::State::Probing => State::Probing,
-        lms::State::Switching => State::Switching,
-        lms::State::Starting => State::Starting,
-        lms::State::Streaming => State::Streaming,
-        lms::State::Silent => State::Silent,
-        lms::State::Paused => State::Paused,
+/// Logs a state that is new, or an error.
+fn announce(name: &str, state: State, error: &str) {
+    match error {
+        "" => tracing::info!("{name}: {}", state.name()),
+        error => tracing::warn!("{name}: {}: {error}", state.name()),
     }
 }
 

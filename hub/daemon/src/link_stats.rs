@@ -1,4 +1,4 @@
-//! What a link tells of itself: the words of a session and the hub's own counts as the payload of topic `status`.
+//! What a link reports of itself: the state of a session and the hub's own counts as the payload of topic `status`.
 
 use config::Link;
 use lms::header::Reject;
@@ -8,9 +8,10 @@ use lms::variant::{Mode, Variant};
 use lms::{Nanos, Session};
 use schema::{Counter, Counters, Pose, State, Status};
 
+use crate::process_telegram::Processed;
 use crate::recent::Recent;
 
-/// The link's account, across all sessions on its port.
+/// The link's statistics, across all sessions on its port.
 pub(crate) struct LinkStats {
     status: Status,
     /// The measuring mode while no reply has told it, as configured.
@@ -22,11 +23,11 @@ pub(crate) struct LinkStats {
     /// Counters as they were when the rate was last computed.
     measured_at: Option<(Nanos, u64)>,
     /// Scans published.
-    pub(crate) scans: u64,
+    scans: u64,
     /// Times that the thread woke up.
     pub(crate) wakeups: u64,
     /// Telegrams that were suspect.
-    pub(crate) suspect: u64,
+    suspect: u64,
     pub(crate) reconnects: u64,
     /// Errors that the line's driver counted.
     pub(crate) line_errors: u64,
@@ -90,14 +91,21 @@ impl LinkStats {
         &self.status
     }
 
-    /// A whole telegram of a recording was taken; `mode` is the one by which its values are split, if it has any.
-    pub(crate) fn recall(&mut self, telegram: Telegram<'_>, mode: Option<Mode>) {
+    /// A telegram was published.
+    pub(crate) fn note(&mut self, processed: Processed) {
+        self.suspect += u64::from(processed.is_suspect);
+        self.scans += u64::from(processed.stands_for.is_some());
+    }
+
+    /// A whole telegram of a recording was taken, which says `reply`; `mode` is the one by which its values are split, if
+    /// it has any.
+    pub(crate) fn recall(&mut self, telegram: Telegram<'_>, reply: Option<&Reply<'_>>, mode: Option<Mode>) {
         let len = telegram.bytes().len() as u64;
         self.past[Counter::BytesRead] += len;
         self.past[Counter::BytesInTelegrams] += len;
         self.past[Counter::Telegrams] += 1;
         self.status.mode = mode.map_or(Status::MODE_UNKNOWN, |mode| mode.0);
-        match Reply::decode(telegram) {
+        match reply {
             Some(Reply::Measured(measured)) => {
                 self.status.unit_mm = measured.unit().mm();
                 if let Some(variant) = Variant::of_beams(measured.count()) {

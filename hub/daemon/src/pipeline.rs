@@ -172,7 +172,7 @@ impl Pipeline {
     /// to load.
     ///
     /// [`Kind::Configuration`] if none is kept, or if `model` is another sensor's.
-    pub(crate) fn obey(
+    pub(crate) fn handle(
         &mut self,
         sensor: &str,
         verb: Verb,
@@ -300,12 +300,12 @@ mod tests {
         assert!(pipeline.is_news());
         assert_eq!((shown(&mut pipeline).generation, pipeline.is_news()), (0, false));
         for (verb, is_news) in [(Verb::Freeze, false), (Verb::Thaw, false), (Verb::Reset, true)] {
-            assert_eq!(pipeline.obey("a", verb, &Background::default()), Ok(None));
+            assert_eq!(pipeline.handle("a", verb, &Background::default()), Ok(None));
             assert_eq!(pipeline.is_news(), is_news, "{verb:?}");
         }
         assert_eq!(shown(&mut pipeline).generation, 1);
         let asked =
-            pipeline.obey("a", Verb::Show, &Background::default()).expect("is kept").expect("a model");
+            pipeline.handle("a", Verb::Show, &Background::default()).expect("is kept").expect("a model");
         assert_eq!((asked.generation, asked.count), (1, 361));
     }
 
@@ -321,7 +321,7 @@ mod tests {
         pipeline.update(&wall(361, 1, 3000), Outputs::default());
         assert!(pipeline.is_news());
         assert_eq!((shown(&mut pipeline).taught, pipeline.is_news()), (361, false));
-        pipeline.obey("a", Verb::Freeze, &Background::default()).expect("is kept");
+        pipeline.handle("a", Verb::Freeze, &Background::default()).expect("is kept");
         for _ in 0..9 {
             pipeline.update(&wall(361, 1, 3000), Outputs::default());
         }
@@ -339,7 +339,7 @@ mod tests {
         let anew = pipeline.update(&wall(361, 10, 300), Outputs::default());
         assert_eq!(anew, Some(Anew::Shape(Mismatch { model: (181, 10), sensor: (361, 10) })));
         assert!(pipeline.is_news());
-        let refusal = pipeline.obey("a", Verb::Load, &model).expect_err("another resolution");
+        let refusal = pipeline.handle("a", Verb::Load, &model).expect_err("another resolution");
         assert_eq!(refusal.kind, Kind::Configuration);
         let words = "a: the model has 181 beams in units of 10 mm, the sensor's scans have 361 beams in units of 10 mm";
         assert_eq!(refusal.message, words);
@@ -385,7 +385,7 @@ mod tests {
         let mut pipeline = Pipeline::new(&processing(|processing| processing.background.is_kept = false));
         pipeline.update(&wall(361, 1, 3000), Outputs::default());
         assert!(!pipeline.keeps_background() && !pipeline.is_news() && !pipeline.shows_every_scan());
-        let refusal = pipeline.obey("side", Verb::Show, &Background::default()).expect_err("none is kept");
+        let refusal = pipeline.handle("side", Verb::Show, &Background::default()).expect_err("none is kept");
         assert!(refusal.hint.contains("link.side.background.method=multi"), "{refusal}");
     }
 }

@@ -1,15 +1,16 @@
-//! What a link makes of a telegram: the telegram itself, its scan, and what follows from that. Refuses to know whether it
-//! came down a line or was recorded, and when the next one comes.
+//! What a link makes of a telegram: the telegram itself, its scan, and what follows from that, into the link's topics.
+//! Refuses to know whether it came down a line or was recorded, and when the next one comes.
 
+use config::{Link, Processing};
 use lms::Nanos;
 use lms::reply::Reply;
 use lms::session::Received;
-use lms::telegram::Telegram;
 use lms::variant::{Mode, Variant};
 use port::clock;
-use schema::{Flags, Scan};
+use schema::{Background, Failure, Flags, Pose, Scan, Verb, Wake, Zones};
 
-use crate::link::LinkThread;
+use crate::pipeline::Pipeline;
+use crate::topics::Topics;
 
 /// What a recording knows of a telegram and nobody could ask a line for; by default nothing.
 #[derive(Clone, Copy, Debug, Default)]
@@ -28,35 +29,67 @@ pub(crate) struct RecordedContext {
     pub(crate) flags: u16,
 }
 
-impl LinkThread<'_> {
-    /// Publishes a telegram and, if it is measured data that can be read, its scan and what is made of it. The time for
-    /// which the verdict stands, where there is one.
-    pub(crate) fn publish(&mut self, received: &Received<'_>, past: &RecordedContext) -> Option<Nanos> {
-        let measured = match Reply::decode(received.telegram) {
+/// What became of a telegram.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Processed {
+    /// It was published with a doubt.
+    pub(crate) is_suspect: bool,
+    /// For how long the verdict on its scan stands; nothing if it has no scan.
+    pub(crate) stands_for: Option<Nanos>,
+}
+
+/// The results of one link: its topics, the processors that make what is in them, and how long the last verdict stands.
+pub(crate) struct LinkOutput<'a> {
+    link: &'a Link,
+    pub(crate) topics: Topics,
+    pipeline: Pipeline,
+    /// When the last verdict of the zones is too old to stand; `Nanos::MAX` if none stands.
+    stale_at: Nanos,
+    /// The sensor, as it turned out to be, sees too little of its circles.
+    is_blind: bool,
+}
+
+impl<'a> LinkOutput<'a> {
+    /// The output of `link` into `topics`; nothing is published yet.
+    pub(crate) fn new(link: &'a Link, topics: Topics) -> Self {
+        let pipeline = Pipeline::new(&link.processing);
+        LinkOutput { link, topics, pipeline, stale_at: Nanos::MAX, is_blind: false }
+    }
+
+    /// Publishes a telegram and, if it is measured data that can be read, its scan and what is made of it. What `recorded`
+    /// knows goes before what the link knows. A telegram that `is_behind` waited in the port for an unknown time.
+    pub(crate) fn process(
+        &mut self,
+        received: &Received<'_>,
+        recorded: &RecordedContext,
+        is_behind: bool,
+    ) -> Processed {
+        let measured = match received.reply {
             Some(Reply::Measured(measured)) => Some(measured),
             _ => None,
         };
-        let mode = received.mode.or(past.mode).filter(|mode| mode.has_ranges());
+        let mode = received.mode.or(recorded.mode).filter(|mode| mode.has_ranges());
         let forbidden =
             measured.zip(mode).is_some_and(|(measured, mode)| scanner::is_forbidden(&measured, mode));
         let reasons = received.reasons | if forbidden { lms::framer::suspect::FORBIDDEN_BITS } else { 0 };
-        self.account.suspect += u64::from(reasons != 0);
         let variant = measured.and_then(|measured| Variant::of_beams(measured.count()));
         let nominal = || scanner::period_us(variant, self.link.baud.rate());
-        let period_us = past.period_us.unwrap_or_else(nominal).max(past.gap_us);
+        let period_us = recorded.period_us.unwrap_or_else(nominal).max(recorded.gap_us);
         let period_us =
-            if past.stretch > 1.0 { (f64::from(period_us) * past.stretch) as u32 } else { period_us };
-        if let Some(wall_ns) = past.wall_ns {
-            self.topics.recall(wall_ns, Flags::REPLAYED | past.flags);
+            if recorded.stretch > 1.0 { (f64::from(period_us) * recorded.stretch) as u32 } else { period_us };
+        if let Some(wall_ns) = recorded.wall_ns {
+            self.topics.recall(wall_ns, Flags::REPLAYED | recorded.flags);
         }
         self.topics.telegram(received, reasons, period_us);
+        let is_suspect = reasons != 0;
         // Better no range than a wrong one.
-        let (measured, mode) = measured.zip(mode)?;
-        self.account.scans += 1;
-        let fill = |scan: &mut Scan| scanner::decode(&measured, mode, scan);
-        // How it looks around the robot now, what waited in the port does not tell.
-        self.pipeline.zones.doubt(self.is_behind);
-        if let Some(anew) = self.topics.scan(fill, &mut self.pipeline) {
+        let Some((measured, mode)) = measured.zip(mode) else {
+            return Processed { is_suspect, stands_for: None };
+        };
+        let decode = |scan: &mut Scan| scanner::decode(&measured, mode, scan);
+        // What waited in the port does not tell how it looks around the robot now.
+        self.pipeline.zones.doubt(is_behind);
+        if let Some(anew) = self.topics.scan(decode, &mut self.pipeline) {
             tracing::warn!("{}: the background begins anew: {anew}", self.link.name);
         }
         let is_blind = self.pipeline.zones.is_blind();
@@ -66,15 +99,103 @@ impl LinkThread<'_> {
         let limit = limit(period_us);
         // Telegrams that had to wait for the hub are late, but scans do not stay out.
         self.stale_at = clock::now().saturating_add(limit);
-        Some(limit)
+        Processed { is_suspect, stands_for: Some(limit) }
     }
 
-    /// Lets all that has a memory learn from a telegram which is not published.
-    pub(crate) fn learn(&mut self, telegram: Telegram<'_>, mode: Option<Mode>) {
+    /// Takes loans for a telegram that will be complete in a moment, so that it need not wait for them.
+    pub(crate) fn prepare(&mut self) {
+        self.topics.prepare(&self.pipeline);
+    }
+
+    /// Lets all that has a memory learn from a telegram that says `reply` and is not published.
+    pub(crate) fn learn(&mut self, reply: Option<&Reply<'_>>, mode: Option<Mode>) {
         let Some(mode) = mode.filter(|mode| mode.has_ranges()) else { return };
-        if let Some(Reply::Measured(measured)) = Reply::decode(telegram) {
-            self.topics.learn(|scan| scanner::decode(&measured, mode, scan), &mut self.pipeline);
+        if let Some(Reply::Measured(measured)) = reply {
+            self.topics.learn(|scan| scanner::decode(measured, mode, scan), &mut self.pipeline);
         }
+    }
+
+    /// As [`learn`](Self::learn), of a time without scans.
+    pub(crate) fn learn_silence(&mut self) {
+        self.pipeline.stale(&mut Zones::default());
+    }
+
+    /// Publishes what is known before the first scan: nothing but the model to begin with.
+    pub(crate) fn publish_start(&mut self, now: Nanos) {
+        self.topics.stale(&mut self.pipeline, now);
+        self.topics.background(&mut self.pipeline, now);
+    }
+
+    /// Publishes that nothing is known of the zones as of `now`, and wakes the consumers.
+    pub(crate) fn publish_stale(&mut self, now: Nanos) {
+        self.topics.stale(&mut self.pipeline, now);
+        self.topics.wake(Wake::Status);
+    }
+
+    /// Publishes the background as of `now` if it is news, and wakes the consumers.
+    pub(crate) fn publish_background(&mut self, now: Nanos) {
+        if self.topics.background(&mut self.pipeline, now) {
+            self.topics.wake(Wake::Status);
+        }
+    }
+
+    /// When the last verdict is too old to stand; `Nanos::MAX` if none stands.
+    pub(crate) fn stale_at(&self) -> Nanos {
+        self.stale_at
+    }
+
+    /// Lets the last verdict stand until `until`, whatever the period of its scan says.
+    pub(crate) fn stand_until(&mut self, until: Nanos) {
+        self.stale_at = until;
+    }
+
+    /// Publishes that scans stay out if that is so at `now`, and due before `until`.
+    pub(crate) fn expire(&mut self, now: Nanos, until: Nanos) {
+        if now >= self.stale_at && self.stale_at < until {
+            self.stale_at = Nanos::MAX;
+            self.publish_stale(now);
+        }
+    }
+
+    /// Forgets all that was learned, as at the hub's start; that the zones are unknown stands until `until`.
+    pub(crate) fn restart(&mut self, now: Nanos, until: Nanos) {
+        self.forget();
+        self.stale_at = until;
+        self.publish_start(now);
+        self.topics.wake(Wake::Status);
+    }
+
+    /// As [`restart`](Self::restart), without a word to consumers.
+    pub(crate) fn forget(&mut self) {
+        self.pipeline.begin_anew();
+    }
+
+    /// Goes on as `processing` says from the next scan on. Where none come, the topics say at once how it is now.
+    pub(crate) fn change(&mut self, processing: &Processing, now: Nanos) {
+        self.pipeline.change(processing);
+        if self.stale_at == Nanos::MAX {
+            self.topics.stale(&mut self.pipeline, now);
+        }
+        self.topics.background(&mut self.pipeline, now);
+        self.topics.wake(Wake::Status);
+    }
+
+    /// Does what a user asks of the background; the model, for [`Verb::Show`].
+    ///
+    /// # Errors
+    ///
+    /// As [`Pipeline::handle`].
+    pub(crate) fn handle(
+        &mut self,
+        verb: Verb,
+        model: &Background,
+    ) -> Result<Option<Box<Background>>, Failure> {
+        self.pipeline.handle(&self.link.name, verb, model)
+    }
+
+    /// The model for the next hub, if that is news; if this is the `last` time, whatever there is.
+    pub(crate) fn hand_on(&mut self, last: bool) -> Option<(Pose, Background)> {
+        self.pipeline.hand_on(last)
     }
 }
 

@@ -1,17 +1,19 @@
-//! A link whose other end is a recording, and the player that all links of a recording share. What is recorded comes in
-//! its order and at its times to each other, or as fast as it can be read. Nobody hears what the hub would say, so
+//! A link whose other end is a recording. What is recorded comes in its order and at its times to each other, or as fast as it can be read. Nobody hears what the hub would say, so
 //! nothing is asked.
 
 mod frames;
 mod recorded;
 mod stream;
 
+use std::os::fd::AsFd;
 use std::path::Path;
 
+use lms::reply::Reply;
 use lms::variant::Variant;
 use lms::{MILLIS, Nanos, Session};
 use port::clock;
-use schema::{Failure, Flags, State, Wake};
+use rustix::event::PollFlags;
+use schema::{Failure, Flags, State};
 
 use crate::control::Flow;
 use crate::link::{LinkThread, Woken};
@@ -25,18 +27,22 @@ pub(crate) struct ReplayPart<'a> {
     pub(crate) handle: PlayerHandle<'a>,
 }
 
-/// Plays the part of `part`, or the recording at `path` alone, into the topics of `link`; then stays silent until the
-/// hub ends. `report` is called once, when it is clear whether it can be read.
+/// Plays `part`, or the recording at `path` alone, into the topics of `link`; then stays silent until the hub ends.
+/// `report` is called once, when it is clear whether it can be read.
 pub(crate) fn run(
-    link: &mut LinkThread<'_>,
+    mut link: LinkThread<'_>,
     part: Option<ReplayPart<'_>>,
     path: &Path,
     paced: bool,
     report: impl FnOnce(Result<(), Failure>),
 ) {
+    link.output.topics.set_flags(Flags::REPLAYED);
+    link.begin();
     if let Some(ReplayPart { recorded, handle }) = part {
         report(Ok(()));
-        return play(link, recorded, handle);
+        let mut replay = ReplayLink::new(link, &recorded, handle);
+        replay.play(recorded);
+        return replay.link.end();
     }
     let pace = if paced { Pace::default() } else { Pace::Max };
     let alone = || {
@@ -47,95 +53,89 @@ pub(crate) fn run(
     match alone() {
         Ok((recorded, player)) => {
             report(Ok(()));
-            let handle = PlayerHandle { player: &player, number: 0 };
-            if await_consumer(link, handle) == Woken::Stop {
-                return;
+            let mut replay = ReplayLink::new(link, &recorded, PlayerHandle { player: &player, number: 0 });
+            if replay.await_consumer() != Woken::Stop {
+                player.begin();
+                replay.play(recorded);
             }
-            player.begin();
-            play(link, recorded, handle);
+            replay.link.end();
         }
-        Err(failure) => report(Err(failure)),
-    }
-}
-
-/// Waits a moment until somebody is attached: who starts a hub and a consumer together wants the recording from its
-/// beginning.
-fn await_consumer(link: &mut LinkThread<'_>, handle: PlayerHandle<'_>) -> Woken {
-    let (mut until, mut is_heard) = (clock::now() + FIRST_CONSUMER, false);
-    while clock::now() < until {
-        if !is_heard && link.topics.is_heard() {
-            is_heard = true;
-            // One consumer follows several topics, and others are started with it.
-            until = until.min(clock::now() + OTHER_TOPICS);
-        }
-        link.show(None, State::Starting, "");
-        let next = (clock::now() + LOOK).min(until);
-        if rest(link, handle, next) == Woken::Stop {
-            return Woken::Stop;
-        }
-    }
-    Woken::Timeout
-}
-
-fn play(link: &mut LinkThread<'_>, mut recorded: Recorded, handle: PlayerHandle<'_>) {
-    let mut lap = 0;
-    let trouble = recorded.trouble(&link.link.name);
-    if let Some(wall_ns) = recorded.begin_ns() {
-        link.topics.recall(wall_ns, Flags::REPLAYED);
-    }
-    loop {
-        let ended = match &mut recorded {
-            Recorded::Stream(stream) => stream::play(link, stream, handle, &trouble),
-            Recorded::Frames(frames) => frames::play(link, frames, handle, &trouble),
-        };
-        let Some(limit) = ended else { return };
-        link.stale_at = limit.map_or(Nanos::MAX, |limit| clock::now() + limit);
-        loop {
-            if let Turn::Anew(next) = handle.end(lap, clock::now()) {
-                lap = next;
-                begin_anew(link);
-                break;
-            }
-            if rest(link, handle, clock::now() + IDLE) == Woken::Stop {
-                return;
-            }
-            link.show(None, State::Silent, "the recording is at its end");
+        Err(failure) => {
+            report(Err(failure));
+            link.end();
         }
     }
 }
 
-/// Nothing is known any more, as at the hub's start.
-fn begin_anew(link: &mut LinkThread<'_>) {
-    let now = clock::now();
-    link.pipeline.begin_anew();
-    link.stale_at = STANDS;
-    link.topics.stale(&mut link.pipeline, now);
-    link.topics.background(&mut link.pipeline, now);
-    link.topics.wake(Wake::Status);
-}
-
-/// How a link waits for its turns.
-struct Turns<'a> {
+/// A link whose other end is a recording.
+struct ReplayLink<'a> {
+    link: LinkThread<'a>,
     handle: PlayerHandle<'a>,
+    /// What is wrong with the recording, in words.
+    trouble: String,
     /// When it is looked, where nothing is waited for, whether somebody wants something.
     look_at: Nanos,
-    /// What is wrong with the recording, in words.
-    trouble: &'a str,
 }
 
-impl<'a> Turns<'a> {
-    fn new(handle: PlayerHandle<'a>, trouble: &'a str) -> Turns<'a> {
-        Turns { handle, look_at: 0, trouble }
+impl<'a> ReplayLink<'a> {
+    fn new(link: LinkThread<'a>, recorded: &Recorded, handle: PlayerHandle<'a>) -> ReplayLink<'a> {
+        let trouble = recorded.trouble(&link.link.name);
+        ReplayLink { link, handle, trouble, look_at: 0 }
+    }
+
+    /// Waits a moment until somebody is attached: who starts a hub and a consumer together wants the recording from its
+    /// beginning.
+    fn await_consumer(&mut self) -> Woken {
+        let (mut until, mut is_heard) = (clock::now() + FIRST_CONSUMER, false);
+        while clock::now() < until {
+            if !is_heard && self.link.output.topics.is_heard() {
+                is_heard = true;
+                // One consumer follows several topics, and others are started with it.
+                until = until.min(clock::now() + OTHER_TOPICS);
+            }
+            self.link.show(None, State::Starting, "");
+            let next = (clock::now() + LOOK).min(until);
+            if self.rest(next) == Woken::Stop {
+                return Woken::Stop;
+            }
+        }
+        Woken::Timeout
+    }
+
+    fn play(&mut self, mut recorded: Recorded) {
+        let mut lap = 0;
+        if let Some(wall_ns) = recorded.begin_ns() {
+            self.link.output.topics.recall(wall_ns, Flags::REPLAYED);
+        }
+        loop {
+            self.look_at = 0;
+            let ended = match &mut recorded {
+                Recorded::Stream(stream) => stream::play(self, stream),
+                Recorded::Frames(frames) => frames::play(self, frames),
+            };
+            let Some(limit) = ended else { return };
+            self.link.output.stand_until(limit.map_or(Nanos::MAX, |limit| clock::now() + limit));
+            loop {
+                if let Turn::Anew(next) = self.handle.end(lap, clock::now()) {
+                    lap = next;
+                    self.restart();
+                    break;
+                }
+                if self.rest(clock::now() + IDLE) == Woken::Stop {
+                    return;
+                }
+                self.link.show(None, State::Silent, "the recording is at its end");
+            }
+        }
+    }
+
+    /// Nothing is known any more, as at the hub's start.
+    fn restart(&mut self) {
+        self.link.output.restart(clock::now(), STANDS);
     }
 
     /// Waits for the turn of what is of `media`; meanwhile the link's state is `state`. Nothing if the hub shall end.
-    fn wait(
-        &mut self,
-        link: &mut LinkThread<'_>,
-        session: Option<&Session>,
-        media: Nanos,
-        state: State,
-    ) -> Option<Due> {
+    fn wait_turn(&mut self, session: Option<&Session>, media: Nanos, state: State) -> Option<Due> {
         loop {
             let now = clock::now();
             if self.handle.flows() && now < self.look_at {
@@ -147,38 +147,45 @@ impl<'a> Turns<'a> {
                 Turn::At(at) => at.min(now + IDLE),
                 Turn::Wait | Turn::Anew(_) | Turn::Over => now + IDLE,
             };
-            if rest(link, self.handle, until) == Woken::Stop {
+            if self.rest(until) == Woken::Stop {
                 return None;
             }
             self.look_at = clock::now() + LOOK;
             let state = if self.handle.is_paused() { State::Paused } else { state };
-            link.show(session, state, self.trouble);
+            self.link.show(session, state, &self.trouble);
         }
     }
 
-    /// As [`wait`](Self::wait) where nothing is published: whether to go on.
-    fn pass(&mut self, link: &mut LinkThread<'_>) -> bool {
+    /// As [`wait_turn`](Self::wait_turn) where nothing is published: whether to go on.
+    fn pass(&mut self) -> bool {
         let now = clock::now();
         if now < self.look_at {
             return true;
         }
         self.look_at = now + LOOK;
-        link.show(None, State::Starting, self.trouble);
-        rest(link, self.handle, 0) != Woken::Stop
+        self.link.show(None, State::Starting, &self.trouble);
+        self.rest(0) != Woken::Stop
+    }
+
+    /// Waits until `until`, the hub's end, or news of the player.
+    fn rest(&mut self, until: Nanos) -> Woken {
+        let news = self.handle.news();
+        match self.link.wait(Some((news.as_fd(), PollFlags::IN)), until) {
+            Woken::Request => self.link.handle_requests(Flow::Recording(self.handle.player)),
+            Woken::Ready => news.clear(),
+            Woken::Stop => return Woken::Stop,
+            Woken::Timeout => {}
+        }
+        Woken::Timeout
     }
 }
 
-/// Waits until `until`, the hub's end, or news of the player.
-fn rest(link: &mut LinkThread<'_>, handle: PlayerHandle<'_>, until: Nanos) -> Woken {
-    use rustix::event::PollFlags;
-    use std::os::fd::AsFd;
-    match link.wait(Some((handle.news().as_fd(), PollFlags::IN)), until) {
-        Woken::Order => link.obey(Flow::Recording(handle.player)),
-        Woken::Ready => handle.news().clear(),
-        Woken::Stop => return Woken::Stop,
-        Woken::Timeout => {}
+/// The variant of the scan that `reply` is, if it is one.
+fn variant_of(reply: Option<&Reply<'_>>) -> Option<Variant> {
+    match reply {
+        Some(Reply::Measured(measured)) => Variant::of_beams(measured.count()),
+        _ => None,
     }
-    Woken::Timeout
 }
 
 /// From one scan to the next, as streams without stamps are played.

@@ -8,7 +8,7 @@ use std::thread;
 
 use config::Config;
 use lms::{MILLIS, Nanos};
-use port::{Port, clock};
+use port::{Port, Source, clock};
 use rustix::event::{EventfdFlags, PollFd, PollFlags, Timespec, eventfd, poll};
 use schema::ipc::{self, Node};
 use schema::{Domain, Failure, HubLock, Kind, StateDirectory, shortage};
@@ -22,7 +22,7 @@ use crate::replay::{Recorded, ReplayPart};
 use crate::service::{Service, Watchdog};
 use crate::signals::{Signals, Wanted};
 use crate::topics::Topics;
-use crate::{learned, preflight};
+use crate::{learned, preflight, reconnect, replay};
 
 /// What is up.
 #[derive(Clone, Debug)]
@@ -105,7 +105,7 @@ pub(crate) fn serve(
         let owner = config.links.iter().find(|link| Port::is_at(line, &link.port));
         owner.map(|link| link.name.clone())
     });
-    let (mut control, orders) =
+    let (mut control, queues) =
         ControlServer::open(&node, config.links.iter().map(|link| link.name.as_str()))?;
     let stop = eventfd(0, EventfdFlags::CLOEXEC).map_err(|error| no_resource("an eventfd", &error))?;
     let (player, parts, holds) = match set {
@@ -117,7 +117,7 @@ pub(crate) fn serve(
     thread::scope(|scope| {
         let (report, reports) = mpsc::channel();
         let mut threads = Vec::new();
-        for ((number, link), orders) in config.links.iter().enumerate().zip(orders) {
+        for ((number, link), queue) in config.links.iter().enumerate().zip(queues) {
             let (node, report) = (&node, report.clone());
             let slot = keeper.as_ref().and_then(|keeper| keeper.slot(&link.name));
             let (root, state, worked) = (domain.root(), state.as_ref(), &worked[number]);
@@ -126,8 +126,10 @@ pub(crate) fn serve(
                 .zip(parts.next())
                 .map(|(player, recorded)| ReplayPart { recorded, handle: PlayerHandle { player, number } });
             let body = move || match Topics::new(node, &link.name, number as u8, ready.boot) {
-                Ok(topics) => LinkThread::new(link, topics, around, orders)
-                    .run(part, |outcome| drop(report.send(outcome))),
+                Ok(topics) => {
+                    let thread = LinkThread::new(link, topics, around, queue);
+                    run_link(thread, part, |outcome| drop(report.send(outcome)));
+                }
                 Err(failure) => drop(report.send(Err(failure))),
             };
             let thread = thread::Builder::new().name(link.name.clone()).spawn_scoped(scope, body);
@@ -160,6 +162,14 @@ pub(crate) fn serve(
         let ended = threads.into_iter().map(|thread| thread.join()).collect::<Result<Vec<()>, _>>();
         outcome.and(ended.map(drop).map_err(|_| broken_thread()))
     })
+}
+
+/// Runs `link` until the hub ends, with a recording as `part` of several or alone.
+fn run_link(link: LinkThread<'_>, part: Option<ReplayPart<'_>>, report: impl FnOnce(Result<(), Failure>)) {
+    match &link.link.port {
+        Source::File { path, paced } => replay::run(link, part, path, *paced, report),
+        Source::Tty(_) | Source::Tcp { .. } => reconnect::run(link, report),
+    }
 }
 
 /// Looks after the links, what users ask of them and what dead consumers left, until a signal says to end.

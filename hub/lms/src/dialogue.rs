@@ -180,11 +180,16 @@ impl Dialogue {
         }
     }
 
-    /// A telegram came whose first byte arrived at `first`.
-    pub(crate) fn on_telegram(&mut self, telegram: Telegram<'_>, first: Nanos, now: Nanos) {
+    /// A telegram came whose first byte arrived at `first`. One that cannot be read, which has no `reply`, is an answer all
+    /// the same.
+    pub(crate) fn on_telegram(
+        &mut self,
+        telegram: Telegram<'_>,
+        reply: Option<Reply<'_>>,
+        first: Nanos,
+        now: Nanos,
+    ) {
         self.quiet_since = now;
-        // What cannot be read is an answer all the same.
-        let reply = Reply::decode(telegram);
         self.sensor.learn(reply.as_ref(), telegram);
         if telegram.command() == POWER_ON {
             return self.on_power_on(now);

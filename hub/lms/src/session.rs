@@ -16,6 +16,7 @@ use crate::identity::Identity;
 use crate::measured::MEASURED;
 use crate::outgoing::SOON;
 use crate::phase::{Control, Phase, Reason, Settings};
+use crate::reply::Reply;
 use crate::sensor::{Sensor, State, Trouble};
 use crate::telegram::Telegram;
 use crate::variant::{BYTES_PER_TURN, Baud, Mode};
@@ -60,6 +61,8 @@ pub enum Why {
 pub struct Received<'a> {
     /// The telegram, in the session's buffer.
     pub telegram: Telegram<'a>,
+    /// What it says; `None` if it cannot be read.
+    pub reply: Option<Reply<'a>>,
     /// When its first byte arrived.
     pub first: Nanos,
     /// When its last byte was read.
@@ -167,7 +170,8 @@ impl Session {
         // More than a turn's bytes came while the host did not look: the read has to find out since when.
         if (1..=BYTES_PER_TURN).contains(&waiting) && self.may_leave() {
             self.arrivals.sense(now, waiting);
-            self.begin_rhythm();
+            let begun = self.next_began();
+            self.rhythm.begin(begun);
             self.left_until = self.rhythm.rest(now);
         }
         self.left_until.is_some()
@@ -187,7 +191,8 @@ impl Session {
         self.last_byte = now;
         self.dialogue.hear();
         if was_empty {
-            self.begin_rhythm();
+            let begun = self.next_began();
+            self.rhythm.begin(begun);
         }
     }
 
@@ -326,9 +331,11 @@ impl Session {
 
     fn receive(&mut self, place: Place) -> Received<'_> {
         let baud = self.dialogue.baud.rate();
-        let telegram = self.framer.view(place).telegram;
+        let framed = self.framer.view(place);
+        let telegram = framed.telegram;
+        let reply = Reply::decode(telegram);
         let (len, is_scan) = (telegram.bytes().len() as u64, telegram.command() == MEASURED);
-        let period = self.period(telegram);
+        let period = self.period(telegram, reply.as_ref());
         let mut first = self.arrivals.stamp(place.offset, baud);
         let last = self.arrivals.stamp(place.offset + len - 1, baud);
         let due = period.and(self.due(&first, place.offset, len));
@@ -341,7 +348,15 @@ impl Session {
         };
         let last = last.max(first.at);
         self.last_stamp = last;
-        self.watch_line(&first, period);
+        match period {
+            Some(period) => self.cadence.note(first.at, first.estimated, period),
+            None => self.cadence.rest(),
+        }
+        if self.is_live() {
+            self.damage.note(self.framer.tally(), self.now);
+        } else {
+            self.damage.end();
+        }
         self.last_scan = if is_scan { place.offset } else { self.last_scan };
         self.cut |= is_scan && self.tally().telegrams == 1 && self.tally().discarded > 0;
         // Replies come when they are asked for, and a recording has the pace of whoever reads it.
@@ -354,13 +369,14 @@ impl Session {
             self.rhythm.lose();
         }
         if self.framer.buffered() > 0 {
-            self.begin_rhythm();
+            let begun = self.next_began();
+            self.rhythm.begin(begun);
         }
         self.dialogue.sensor.doubt(self.damage.is_recent(self.now));
-        self.dialogue.on_telegram(self.framer.view(place).telegram, first.at, self.now);
-        let framed = self.framer.view(place);
+        self.dialogue.on_telegram(telegram, reply, first.at, self.now);
         Received {
-            telegram: framed.telegram,
+            telegram,
+            reply,
             first: first.at,
             last,
             estimated: first.estimated,
@@ -369,8 +385,9 @@ impl Session {
         }
     }
 
-    fn begin_rhythm(&mut self) {
+    /// When the first byte arrived that is in no telegram yet.
+    fn next_began(&self) -> Nanos {
         let open = self.tally().read - self.framer.buffered() as u64;
-        self.rhythm.begin(self.arrivals.stamp(open, self.dialogue.baud.rate()).at);
+        self.arrivals.stamp(open, self.dialogue.baud.rate()).at
     }
 }

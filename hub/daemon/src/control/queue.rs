@@ -1,33 +1,31 @@
-//! What users want of one link, in the link's thread: each request is taken, done and answered. What pausing does to a
-//! sensor is the session's business, what a reset does to a background the pipeline's.
+//! The requests of users to one link, in the link's thread: taken one by one, and answered. What pausing does to a sensor is
+//! the session's business. Refuses to know what a link is.
 
 use std::os::fd::{AsFd, BorrowedFd};
 use std::sync::mpsc::{Receiver, Sender};
 use std::sync::{Arc, PoisonError};
 
 use config::Processing;
-use lms::{Control, Nanos, Session};
+use lms::{Control, Session};
 use port::clock;
-use schema::{Failure, Kind, Shown, Verb, Wake};
+use schema::{Failure, Kind};
 
-use super::{Changed, Order, Outcome};
+use super::{Changed, Outcome, QueuedRequest};
 use crate::event_fd::EventFd;
-use crate::learned::Slot;
-use crate::link::LinkThread;
 use crate::player::Player;
 
-/// The link's end of the way from the server.
+/// The link's end of the queue.
 pub(crate) struct ControlQueue {
     pub(super) sensor: String,
     pub(super) paused: bool,
-    pub(super) queue: Receiver<Order>,
+    pub(super) queue: Receiver<QueuedRequest>,
     pub(super) changed: Changed,
     pub(super) event: Arc<EventFd>,
     pub(super) outcomes: Sender<(u64, Outcome)>,
     pub(super) server: Arc<EventFd>,
 }
 
-/// Who can be told to pause, to resume, to begin anew.
+/// Who can be told to pause, to resume, to resync.
 pub(crate) enum Flow<'a> {
     /// A session with a sensor.
     Session(&'a mut Session),
@@ -37,56 +35,18 @@ pub(crate) enum Flow<'a> {
     Recording(&'a Player),
 }
 
-impl LinkThread<'_> {
-    /// Does what users asked for, and takes over what was changed for it.
-    pub(crate) fn obey(&mut self, mut flow: Flow<'_>) {
-        if let Some(processing) = self.orders.changed() {
-            self.change(&processing);
-        }
-        while let Some(order) = self.orders.take() {
-            let control = match order.verb {
-                Verb::Pause => Some(Control::Pause),
-                Verb::Resume => Some(Control::Resume),
-                Verb::Resync => Some(Control::Resync),
-                Verb::Show | Verb::Reset | Verb::Freeze | Verb::Thaw | Verb::Load => None,
-            };
-            let outcome = match control {
-                Some(control) => self.orders.control(control, &mut flow).map(|()| None),
-                None => {
-                    let shown = self.pipeline.obey(&self.link.name, order.verb, &order.model);
-                    let kept_wall_ns = self.around.slot.and_then(Slot::kept_wall_ns);
-                    shown.map(|model| model.map(|model| Box::new(Shown { model: *model, kept_wall_ns })))
-                }
-            };
-            let now = clock::now();
-            if self.topics.background(&mut self.pipeline, now) {
-                self.topics.wake(Wake::Status);
-            }
-            self.orders.answer(order.number, outcome);
-        }
-    }
-
-    /// From the next scan on. Where none come, the topics say at once how it is now.
-    fn change(&mut self, processing: &Processing) {
-        self.pipeline.change(processing);
-        self.account.set_pose(processing.pose);
-        let now = clock::now();
-        if self.stale_at == Nanos::MAX {
-            self.topics.stale(&mut self.pipeline, now);
-        }
-        self.topics.background(&mut self.pipeline, now);
-        self.topics.wake(Wake::Status);
-        self.next_status = now;
-    }
-}
-
 impl ControlQueue {
     /// Whether a user wants nothing of the sensor for now: a pause outlasts an absence of the port.
     pub(crate) fn is_paused(&self) -> bool {
         self.paused
     }
 
-    fn control(&mut self, control: Control, flow: &mut Flow<'_>) -> Result<(), Failure> {
+    /// Has `flow` do what `control` says.
+    ///
+    /// # Errors
+    ///
+    /// [`Kind::Failed`] if there is nobody to do it.
+    pub(crate) fn control(&mut self, control: Control, flow: &mut Flow<'_>) -> Result<(), Failure> {
         match flow {
             Flow::Recording(player) => {
                 match control {
@@ -104,18 +64,21 @@ impl ControlQueue {
         Ok(())
     }
 
-    fn changed(&self) -> Option<Box<Processing>> {
+    /// What is to be made of scans from now on, if that was changed since it was last asked.
+    pub(crate) fn changed(&self) -> Option<Box<Processing>> {
         self.event.clear();
         self.changed.lock().unwrap_or_else(PoisonError::into_inner).take()
     }
 
-    fn take(&self) -> Option<Order> {
+    /// The next request.
+    pub(crate) fn take(&self) -> Option<QueuedRequest> {
         self.event.clear();
         self.queue.try_recv().ok()
     }
 
-    fn answer(&self, number: u64, outcome: Outcome) {
-        // A server that is closed has no client that waits.
+    /// Request `number` was done, or was not.
+    pub(crate) fn answer(&self, number: u64, outcome: Outcome) {
+        // A server that has ended has no client that waits.
         if self.outcomes.send((number, outcome)).is_ok() {
             self.server.signal();
         }
@@ -128,7 +91,7 @@ impl ControlQueue {
 }
 
 impl AsFd for ControlQueue {
-    /// Readable as long as an order waits.
+    /// Readable as long as a request waits.
     fn as_fd(&self) -> BorrowedFd<'_> {
         self.event.as_fd()
     }

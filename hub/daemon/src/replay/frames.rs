@@ -1,17 +1,16 @@
 //! Plays telegrams that are known to be whole: each comes once, in order, bit for bit, with what was known of it when it
 //! was recorded. Silences are those of the recording, however fast it is played.
 
-use lms::measured::Measured;
+use lms::reply::Reply;
 use lms::session::Received;
 use lms::telegram::Telegram;
-use lms::variant::{Mode, Variant};
+use lms::variant::Mode;
 use lms::{Nanos, SILENCE};
 use recording::Frame;
-use schema::{Flags, Header, State, Wake, Zones};
+use schema::{Flags, Header, State};
 
 use super::recorded::{Frames, told};
-use super::{LONGEST_GAP, PlayerHandle, STANDS, Turns, begin_anew, period};
-use crate::link::LinkThread;
+use super::{LONGEST_GAP, ReplayLink, STANDS, period, variant_of};
 use crate::process_telegram::{self, RecordedContext};
 
 /// What the last scan left.
@@ -24,20 +23,14 @@ struct Verdict {
     until: Nanos,
 }
 
-/// Plays `frames` into the topics of `link`. At the end, for how long the last verdict stands; nothing if the hub shall
+/// Plays `frames` into the topics of `replay`. At the end, for how long the last verdict stands; nothing if the hub shall
 /// end.
-pub(super) fn play(
-    link: &mut LinkThread<'_>,
-    frames: &Frames,
-    handle: PlayerHandle<'_>,
-    trouble: &str,
-) -> Option<Option<Nanos>> {
-    let play = handle.play();
-    let mut turns = Turns::new(handle, trouble);
+pub(super) fn play(replay: &mut ReplayLink<'_>, frames: &Frames) -> Option<Option<Nanos>> {
+    let play = replay.handle.play();
     let mut telegrams = match frames.read() {
         Ok(telegrams) => telegrams.peekable(),
         Err(failure) => {
-            tracing::warn!("{}: {}", link.link.name, failure.message);
+            tracing::warn!("{}: {}", replay.link.link.name, failure.message);
             return Some(None);
         }
     };
@@ -58,11 +51,10 @@ pub(super) fn play(
         let turn = media.saturating_add(took.min(LONGEST_GAP));
         if let Some(silence) = verdict.take_if(|verdict| is_silence(verdict, header.as_ref())) {
             if is_skipped {
-                link.pipeline.stale(&mut Zones::default());
+                replay.link.output.learn_silence();
             } else {
-                let due = turns.wait(link, None, silence.until.clamp(play.start_ns, turn), state)?;
-                link.topics.stale(&mut link.pipeline, due.at);
-                link.wake(Wake::Status);
+                let due = replay.wait_turn(None, silence.until.clamp(play.start_ns, turn), state)?;
+                replay.link.output.publish_stale(due.at);
                 // A scan that was lost on the line makes the verdict old, and the sensor not silent.
                 if turn.saturating_sub(silence.of) >= SILENCE.max(silence.until - silence.of) {
                     state = State::Silent;
@@ -73,23 +65,26 @@ pub(super) fn play(
         if let Some(header) = header.filter(|header| boot != Some(header.boot)) {
             if boot.replace(header.boot).is_some() {
                 verdict = None;
-                if is_skipped { link.pipeline.begin_anew() } else { begin_anew(link) }
+                if is_skipped { replay.link.output.forget() } else { replay.restart() }
             }
             understood_from = frames.understood_from(&header);
         }
-        told_mode = told(&frame).unwrap_or(told_mode);
+        let checked = Telegram::check(&frame.telegram);
+        let reply = checked.and_then(Reply::decode);
+        told_mode = reply.as_ref().and_then(told).unwrap_or(told_mode);
         let mode = told_mode.filter(|_| header.is_none_or(|header| header.seq >= understood_from));
-        let Some(telegram) = Telegram::check(&frame.telegram) else { continue };
+        let Some(telegram) = checked else { continue };
         if is_skipped {
-            if !turns.pass(link) {
+            if !replay.pass() {
                 return None;
             }
-            link.learn(telegram, mode);
+            replay.link.output.learn(reply.as_ref(), mode);
         } else {
-            let due = turns.wait(link, None, turn, state)?;
+            let due = replay.wait_turn(None, turn, state)?;
             let at = due.at.max(last_stamp);
             let received = Received {
                 telegram,
+                reply,
                 first: at.saturating_sub(took),
                 last: at,
                 estimated: header.is_some_and(|header| header.flags & Flags::STAMP_ESTIMATED != 0),
@@ -98,26 +93,26 @@ pub(super) fn play(
             };
             last_stamp = at;
             let gap = telegrams.peek().and_then(|next| gap(&frame, next));
-            link.account.recall(telegram, mode);
-            limit = link.publish(&received, &past(&frame, mode, gap, due.stretch)).or(limit);
-            link.stale_at = STANDS;
-            link.wake(Wake::Telegram);
-            handle.played(media);
+            replay.link.stats.recall(telegram, reply.as_ref(), mode);
+            let recorded = recorded(&frame, mode, gap, due.stretch);
+            limit = replay.link.publish(&received, &recorded, false).or(limit);
+            replay.link.output.stand_until(STANDS);
+            replay.handle.played(media);
             state = State::Streaming;
-            link.show(None, state, trouble);
+            replay.link.show(None, state, &replay.trouble);
         }
         // One whose values nobody could read had none.
         if frame.is_scan() && mode.is_some_and(Mode::has_ranges) {
             verdict = header.map(|header| stands(&header, media)).or(verdict);
         }
         if !frames.has_stamps() && frame.is_scan() {
-            timeline.pass(period(Measured::decode(telegram).and_then(|it| Variant::of_beams(it.count()))));
+            timeline.pass(period(variant_of(reply.as_ref())));
         }
     }
     Some(limit)
 }
 
-fn past(frame: &Frame, mode: Option<Mode>, gap: Option<Nanos>, stretch: f64) -> RecordedContext {
+fn recorded(frame: &Frame, mode: Option<Mode>, gap: Option<Nanos>, stretch: f64) -> RecordedContext {
     RecordedContext {
         mode,
         wall_ns: frame.wall_ns,

@@ -80,7 +80,11 @@ impl Recorded {
         frames.origin = first.peek().and_then(Origin::of);
         let begin = first.peek().and_then(|frame| frame.header).filter(is_first);
         let is_open = begin.is_some_and(|header| frames.recording.understood(header.boot).is_none());
-        frames.is_told_later = is_open && first.any(|frame| told(&frame).is_some());
+        let tells = |frame: Frame| {
+            let reply = Telegram::check(&frame.telegram).and_then(Reply::decode);
+            reply.is_some_and(|reply| told(&reply).is_some())
+        };
+        frames.is_told_later = is_open && first.any(tells);
         Ok(Recorded::Frames(frames))
     }
 
@@ -294,12 +298,9 @@ fn is_first(header: &Header) -> bool {
     header.seq == 0 && header.hub_pid != 0
 }
 
-/// What `frame` tells of how values are split: of a sensor that gets its power, that this is not known any more.
-pub(super) fn told(frame: &Frame) -> Option<Option<Mode>> {
-    if frame.is_scan() {
-        return None;
-    }
-    match Reply::decode(Telegram::check(&frame.telegram)?)? {
+/// What `reply` tells of how values are split: of a sensor that gets its power, that this is not known any more.
+pub(super) fn told(reply: &Reply<'_>) -> Option<Option<Mode>> {
+    match reply {
         Reply::Configuration(configuration) => Some(Some(configuration.mode())),
         Reply::Status(report) => Some(Some(report.mode())),
         Reply::PowerOn(_) => Some(None),

@@ -1,37 +1,29 @@
 //! Plays bytes as they came down a line: they take the way that a line's bytes take, at the pace of the scans. What is
 //! damaged in them is found out as on a line.
 
-use lms::measured::{MEASURED, Measured};
+use lms::measured::MEASURED;
 use lms::session::Output;
-use lms::variant::Variant;
 use lms::{Nanos, Session};
 use port::clock;
 use schema::State;
 
 use super::recorded::{Stream, read};
-use super::{PlayerHandle, STANDS, Turns};
-use crate::link::LinkThread;
+use super::{ReplayLink, STANDS, variant_of};
 use crate::process_telegram::RecordedContext;
 
-/// Plays `stream` into the topics of `link`. At the end, for how long the last verdict stands; nothing if the hub shall
+/// Plays `stream` into the topics of `replay`. At the end, for how long the last verdict stands; nothing if the hub shall
 /// end.
-pub(super) fn play(
-    link: &mut LinkThread<'_>,
-    stream: &Stream,
-    handle: PlayerHandle<'_>,
-    trouble: &str,
-) -> Option<Option<Nanos>> {
-    let play = handle.play();
-    let mut turns = Turns::new(handle, trouble);
+pub(super) fn play(replay: &mut ReplayLink<'_>, stream: &Stream) -> Option<Option<Nanos>> {
+    let play = replay.handle.play();
     let mut bytes = match stream.bytes() {
         Ok(bytes) => bytes,
         Err(failure) => {
-            tracing::warn!("{}: {}", link.link.name, failure.message);
+            tracing::warn!("{}: {}", replay.link.link.name, failure.message);
             return Some(None);
         }
     };
-    let mut session = Session::new(link.settings(true), clock::now());
-    let mut past = RecordedContext { mode: stream.mode, ..RecordedContext::default() };
+    let mut session = Session::new(replay.link.settings(true), clock::now());
+    let mut recorded = RecordedContext { mode: stream.mode, ..RecordedContext::default() };
     let (mut media, mut limit) = (0, None);
     let state = if stream.has_telegrams() { State::Streaming } else { State::Probing };
     loop {
@@ -40,11 +32,11 @@ pub(super) fn play(
         }
         let is_skipped = media < play.start_ns;
         if is_skipped {
-            if !turns.pass(link) {
+            if !replay.pass() {
                 return None;
             }
         } else {
-            past.stretch = turns.wait(link, Some(&session), media, state)?.stretch;
+            recorded.stretch = replay.wait_turn(Some(&session), media, state)?.stretch;
         }
         let room = session.spare();
         let piece = room.len().min(PIECE);
@@ -56,28 +48,27 @@ pub(super) fn play(
             session.handle_timeout(now + lms::framer::VETO_HOLD);
         }
         while let Output::Telegram(received) = session.poll_output() {
-            let telegram = received.telegram;
+            let (is_scan, variant) =
+                (received.telegram.command() == MEASURED, variant_of(received.reply.as_ref()));
             if is_skipped {
-                link.learn(telegram, received.mode.or(past.mode));
+                replay.link.output.learn(received.reply.as_ref(), received.mode.or(recorded.mode));
             } else {
-                limit = link.publish(&received, &past).or(limit);
-                link.stale_at = STANDS;
-                link.wake(schema::Wake::Telegram);
-                handle.played(media);
+                limit = replay.link.publish(&received, &recorded, false).or(limit);
+                replay.link.output.stand_until(STANDS);
+                replay.handle.played(media);
             }
-            if telegram.command() == MEASURED {
-                let variant = Measured::decode(telegram).and_then(|it| Variant::of_beams(it.count()));
+            if is_scan {
                 media += stream.period(variant);
             }
         }
         if !is_skipped {
-            link.show(Some(&session), state, trouble);
+            replay.link.show(Some(&session), state, &replay.trouble);
         }
         if len == 0 {
             break;
         }
     }
-    link.account.close(&session);
+    replay.link.stats.close(&session);
     Some(limit)
 }
 

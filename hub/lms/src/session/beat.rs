@@ -1,17 +1,17 @@
-//! The beat of a stream: when its scans are due, and what the line did to them. Refuses to know what a scan says.
+//! The beat of a stream: when its scans are due. Refuses to know what a scan says.
 
 use super::Session;
 use crate::Nanos;
 use crate::arrival::Stamp;
-use crate::measured::Measured;
+use crate::reply::Reply;
 use crate::sensor::State;
 use crate::telegram::Telegram;
 use crate::variant::Variant;
 
 impl Session {
-    /// Time between two scans like `telegram`, if it is one of a stream whose beat is known.
-    pub(super) fn period(&self, telegram: Telegram<'_>) -> Option<Nanos> {
-        let measured = Measured::decode(telegram).filter(|_| self.is_live())?;
+    /// Time between two scans like `telegram`, which says `reply`, if it is one of a stream whose beat is known.
+    pub(super) fn period(&self, telegram: Telegram<'_>, reply: Option<&Reply<'_>>) -> Option<Nanos> {
+        let Some(Reply::Measured(measured)) = reply.filter(|_| self.is_live()) else { return None };
         let variant = Variant::of_beams(measured.count()).filter(|_| measured.partial().is_none())?;
         Some(variant.period(telegram.bytes().len(), self.dialogue.baud.rate()))
     }
@@ -22,20 +22,6 @@ impl Session {
         let latest = first.latest?;
         let slots = (offset - self.last_scan + len / 2) / len;
         self.cadence.after(slots).map(|due| due.clamp(first.at, latest))
-    }
-
-    /// Takes account of what the line did to the stream up to a telegram that began at `first`; `period` is that of its
-    /// scans, if it is one.
-    pub(super) fn watch_line(&mut self, first: &Stamp, period: Option<Nanos>) {
-        match period {
-            Some(period) => self.cadence.note(first.at, first.estimated, period),
-            None => self.cadence.rest(),
-        }
-        if self.is_live() {
-            self.damage.note(self.framer.tally(), self.now);
-        } else {
-            self.damage.end();
-        }
     }
 
     /// Whether a sensor streams, not a recording.

@@ -1,0 +1,71 @@
+//! The walls around a sensor's EEPROM: who can name a request that writes it, who can make one, and who can consent to it.
+
+use super::{crates, holds, sources};
+
+#[test]
+fn what_writes_the_eeprom_is_protocol_alone() {
+    holds(crates::what_writes_the_eeprom_is_protocol_alone, |tree| {
+        let (manifest, lib) = ("hub/lms-configure/Cargo.toml", "hub/lms-configure/src/lib.rs");
+        vec![
+            tree.with_line(manifest, "[dependencies]", "scanhub-port.workspace = true"),
+            tree.with(lib, &tree.text(lib).replace("#![no_std]", "")),
+            tree.with("hub/lms-configure/src/planted.rs", "//! A file.\nuse std::fs;\n"),
+        ]
+    });
+}
+
+#[test]
+fn few_crates_can_write_the_eeprom() {
+    holds(crates::few_crates_can_write_the_eeprom, |tree| {
+        let line = "scanhub-lms-configure.workspace = true";
+        ["hub/port/Cargo.toml", "hub/lms/Cargo.toml", "clients/client/Cargo.toml", "Cargo.toml"]
+            .map(|manifest| tree.with_line(manifest, "[dependencies]", line))
+            .to_vec()
+    });
+}
+
+#[test]
+fn nobody_writes_the_eeprom() {
+    holds(sources::nobody_writes_the_eeprom, |tree| {
+        vec![
+            tree.with(
+                "hub/daemon/src/planted.rs",
+                "//! Writes.\nlet telegram = Writer::new(0, 0x77).finish();\n",
+            ),
+            tree.with("hub/lms/src/planted.rs", "//! Knows.\npub const CONFIGURE: u8 = 0x77;\n"),
+            tree.with("hub/lms/src/planted.rs", "//! Writes.\nlet telegram = Writer::new(address, 0x66);\n"),
+            tree.with("hub/lms/src/explain/planted.rs", "//! Writes.\nlet telegram = Writer::new(0, SET);\n"),
+            tree.with("hub/lms/src/dialogue.rs", "//! Talks.\nuse crate::eeprom::Write;\n"),
+            tree.with("hub/lms/src/session.rs", "//! Talks.\nuse crate::{Nanos, eeprom};\n"),
+            tree.with(
+                "hub/lms/src/outgoing.rs",
+                "//! Sends.\nlet request = crate::eeprom::Write::Field(&[]);\n",
+            ),
+            tree.with("hub/daemon/src/link.rs", "//! A link.\nuse lms_configure::Change;\n"),
+            tree.with("hub/tools/src/probe.rs", "//! Probes.\nuse lms_configure::{eeprom, Plan};\n"),
+            tree.with("clients/verbs/src/planted.rs", "//! Knows.\nuse lms_configure::eeprom::Write;\n"),
+        ]
+    });
+}
+
+#[test]
+fn consent_is_given_by_persons() {
+    holds(sources::consent_is_given_by_persons, |tree| {
+        let planted = "//! Writes.\nlet consent = Consent::of_a_person(plan);\n";
+        let ask = tree.text("hub/tools/src/configure/ask.rs");
+        let plan = tree.text("hub/lms-configure/src/plan.rs");
+        vec![
+            tree.with("hub/daemon/src/link.rs", planted),
+            tree.with("hub/tools/src/configure.rs", planted),
+            tree.with("hub/cli/configure.rs", planted),
+            tree.with(
+                "hub/tools/src/configure/ask.rs",
+                &ask.replace("fn person", &format!("{planted}fn person")),
+            ),
+            tree.with(
+                "hub/lms-configure/src/plan.rs",
+                &plan.replace("Consent(plan)", "Consent(plan); Consent(plan)\n Consent(plan)"),
+            ),
+        ]
+    });
+}
