@@ -155,7 +155,7 @@ fn marks_become_available_by_the_command_that_is_named() {
 
 #[test]
 fn the_way_back_brings_back_what_was_changed() {
-    let env = TestEnv::new();
+    let env = TestEnv::in_time();
     let _simulator = env.simulator(&["front"], &["--baud=38400"]);
     let port = env.word("front");
     let done = |settings: &[&str]| {

@@ -25,7 +25,7 @@ fn await_state(env: &TestEnv, sensor: &str, state: &str) -> Value {
 
 #[test]
 fn a_paused_sensor_stops_and_a_resumed_one_goes_on_without_a_gap() {
-    let env = TestEnv::new();
+    let env = TestEnv::in_time();
     let hub = env.hub(&[env.link("front"), env.link("rear")]);
     let mut consumers = ["front/telegram", "front/scan", "rear/scan"].map(|topic| env.echo(&[topic]));
     let simulator = env.simulator(&["front", "rear"], &["--seed=31", "--baud=500000"]);

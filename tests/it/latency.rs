@@ -30,7 +30,7 @@ fn count(line: &Value, span: &str) -> u64 {
 
 #[test]
 fn ages_of_a_stream_are_split_and_judged() {
-    let env = TestEnv::new();
+    let env = TestEnv::in_time();
     let simulator = env.simulator(&["front"], &["--seed=71", "--baud=500000"]);
     let hub = env.hub(&[env.link("front")]);
     env.await_info("front", |info| info["state"] == "streaming");

@@ -33,7 +33,7 @@ fn await_streaming(env: &TestEnv) {
 
 #[test]
 fn each_scan_has_its_marks_zones_and_foreground() {
-    let env = TestEnv::new();
+    let env = TestEnv::in_time();
     let hub = env.hub(&[env.link("front")]);
     let topics = ["scan", "marks", "zones", "foreground"];
     let mut consumers = topics.map(|topic| env.echo(&[&format!("front/{topic}")]));
@@ -86,7 +86,7 @@ fn last_word(env: &TestEnv) -> Value {
 
 #[test]
 fn a_silence_is_said_once_and_late_joiners_know_at_once() {
-    let env = TestEnv::new();
+    let env = TestEnv::in_time();
     let simulator = env.simulator(&["front"], &STREAM);
     let _hub = env.hub(&[env.link("front")]);
     await_streaming(&env);
@@ -123,7 +123,7 @@ fn a_silence_is_said_once_and_late_joiners_know_at_once() {
 
 #[test]
 fn a_background_is_asked_held_begun_anew_and_brought_back() {
-    let env = TestEnv::new();
+    let env = TestEnv::in_time();
     // A wall where nobody walks, learned in a second.
     let _simulator = env.simulator(&["front"], &["--seed=52", "--baud=500000", "--world=bare"]);
     let _hub = env.hub(&[env.link("front"), "--set=background.scans=20".into()]);

@@ -108,7 +108,7 @@ fn a_sensor_behind_a_serial_server() {
 
 #[test]
 fn scans_that_waited_for_a_hub_at_a_standstill_say_nothing_of_now() {
-    let env = TestEnv::new();
+    let env = TestEnv::in_time();
     let _simulator = env.simulator(&["line"], &["--baud=38400", "--seed=5"]);
     let server = Server::new(&env, "line", 38_400);
     let hub = env.hub(&[&server.link(), "--set=link.front.baud=38400", "--set=zones.radii=[0.02,0.01]"]);

@@ -13,7 +13,7 @@ const KILLS: usize = 6;
 
 #[test]
 fn what_is_sent_while_a_killed_hub_is_replaced_waits_in_the_line() {
-    let env = TestEnv::new();
+    let env = TestEnv::in_time();
     let simulator = env.simulator(&["front"], &["--seed=5", "--baud=500000"]);
     let mut supervisor = env.supervisor();
     let flags = [env.link("front")];
@@ -74,7 +74,7 @@ fn live(telegrams: &mut Program, boots: &mut HashSet<String>) {
 
 #[test]
 fn scans_go_on_with_the_first_telegram_of_the_next_hub() {
-    let env = TestEnv::new();
+    let env = TestEnv::in_time();
     let simulator = env.simulator(&["front"], &["--seed=8", "--baud=500000"]);
     let mut supervisor = env.supervisor();
     let flags = [env.link("front")];

@@ -10,7 +10,7 @@ use serde_json::Value;
 
 #[test]
 fn everything_sent_arrives_bit_for_bit_and_in_order() {
-    let env = TestEnv::new();
+    let env = TestEnv::in_time();
     let hub = env.hub(&[env.link("front"), env.link("rear")]);
     let sensors = ["front", "rear"];
     // They listen before anything is sent: nothing may be missing from the very first on.

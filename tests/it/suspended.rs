@@ -6,14 +6,21 @@ use std::thread;
 use std::time::Duration;
 
 use crate::testkit;
-use crate::testkit::{INT, Sender, TERM, TestEnv, bytes_of, hash, in_a_network, is_class, number, until};
+use crate::testkit::{
+    INT, Program, Sender, TERM, TestEnv, bytes_of, hash, in_a_network, is_class, number, until,
+};
 use rustix::process::Signal;
 use rustix::time::{ClockId, clock_gettime};
 use schema::{Topic, Verdict, Zones};
 
 #[test]
 fn a_hub_that_was_stopped() {
-    let env = TestEnv::new();
+    let is_held = (0..ATTEMPTS).any(|_| a_stopped_hub_goes_on(&TestEnv::in_time()));
+    assert!(is_held, "{BUSY}");
+}
+
+/// Whether that could be seen: nobody kept the hub waiting when it went on.
+fn a_stopped_hub_goes_on(env: &TestEnv) -> bool {
     let simulator = env.simulator(&["front"], &["--seed=31", "--baud=500000"]);
     let hub = env.hub(&[env.link("front")]);
     let mut consumer = env.echo(&["front/telegram", "front/scan", "front/zones", "front/status"]);
@@ -21,12 +28,17 @@ fn a_hub_that_was_stopped() {
     let stopped = now();
     hub.signal(Signal::STOP);
     let lost = |env: &TestEnv| env.truth("front").iter().filter(|sent| sent.fault.is_some()).count();
-    let before = lost(&env);
+    let before = lost(env);
     // The buffer is full, and more than a second passes.
-    until("telegrams are lost", || lost(&env) > before + 50);
+    until("telegrams are lost", || lost(env) > before + 50);
     let continued = now();
-    hub.signal(Signal::CONT);
-    consumer.await_lines(60, "a telegram", is_class("telegram"));
+    let is_undisturbed = undisturbed(&[&hub, &simulator], || {
+        hub.signal(Signal::CONT);
+        consumer.await_lines(60, "a telegram", is_class("telegram"));
+    });
+    if !is_undisturbed {
+        return false;
+    }
     let info = env.await_info("front", |info| number(&info["counters"], "bytes_discarded") > 0);
     assert_eq!((&info["state"], number(&info["counters"], "resyncs")), (&"streaming".into(), 0), "{info}");
     assert_eq!(hub.end(TERM).code, Some(0));
@@ -66,7 +78,20 @@ fn a_hub_that_was_stopped() {
     let ahead: Vec<u64> = ahead.collect();
     let (Some(first), Some(last)) = (ahead.first(), ahead.last()) else { panic!("no verdict came") };
     assert!(last - first < waited.len() as u64 / 2, "{ahead:?} with {} that waited", waited.len());
+    true
 }
+
+/// What is held is what a hub does that runs, not what it does that waits for a processor on a machine with more to do.
+fn undisturbed(programs: &[&Program], goes_on: impl FnOnce()) -> bool {
+    let waited = || programs.iter().map(|program| program.kept_waiting()).sum::<Duration>();
+    let before = waited();
+    goes_on();
+    waited() - before < Duration::from_millis(4)
+}
+
+/// How often that is tried.
+const ATTEMPTS: usize = 12;
+const BUSY: &str = "others kept the hub from the processor each time";
 
 /// CLOCK_MONOTONIC, as in the truth and in stamps.
 fn now() -> u64 {
@@ -78,19 +103,27 @@ fn now() -> u64 {
 /// that it is an estimate.
 #[test]
 fn a_stamp_is_right_or_says_that_it_is_an_estimate() {
-    let env = TestEnv::new();
+    let env = TestEnv::in_time();
     let simulator = env.simulator(&["front"], &["--seed=7", "--baud=500000"]);
     let hub = env.hub(&[env.link("front")]);
     let mut consumer = env.echo(&["front/telegram"]);
     consumer.await_lines(150, "a telegram", is_class("telegram"));
-    let mut stops = Vec::new();
+    let (mut stops, mut disturbed) = (Vec::new(), Vec::new());
     for span_ms in [300, 600, 1_000, 1_500, 3_000] {
-        let stopped = now();
-        hub.signal(Signal::STOP);
-        thread::sleep(Duration::from_millis(span_ms));
-        hub.signal(Signal::CONT);
-        stops.push((stopped, now(), span_ms));
-        consumer.await_lines(60, "a telegram", is_class("telegram"));
+        let is_held = (0..ATTEMPTS).any(|_| {
+            let stopped = now();
+            hub.signal(Signal::STOP);
+            thread::sleep(Duration::from_millis(span_ms));
+            let mut continued = 0;
+            let is_undisturbed = undisturbed(&[&hub, &simulator], || {
+                hub.signal(Signal::CONT);
+                continued = now();
+                consumer.await_lines(60, "a telegram", is_class("telegram"));
+            });
+            if is_undisturbed { &mut stops } else { &mut disturbed }.push((stopped, continued, span_ms));
+            is_undisturbed
+        });
+        assert!(is_held, "{BUSY}");
     }
     assert_eq!(hub.end(TERM).code, Some(0));
     assert_eq!(simulator.end(INT).code, Some(0));
@@ -99,7 +132,8 @@ fn a_stamp_is_right_or_says_that_it_is_an_estimate() {
     let mut place = 0;
     // The sensor keeps its beat from its last reply on, also where the simulator was late to write: those that it wrote
     // soonest tell when.
-    let is_answer = |sent: &testkit::Sent| sent.is_reply && sent.sent_ns < stops[0].0;
+    let first_stop = stops.iter().chain(&disturbed).map(|(from, ..)| *from).min().expect("it was stopped");
+    let is_answer = |sent: &testkit::Sent| sent.is_reply && sent.sent_ns < first_stop;
     let begin = truth.iter().rposition(is_answer).expect("it was asked") + 1;
     let beat = |place: usize| (place - begin) as u64 * PERIOD;
     let whole = (begin..truth.len()).filter(|&place| truth[place].fault.is_none());
@@ -117,7 +151,7 @@ fn a_stamp_is_right_or_says_that_it_is_an_estimate() {
             (place >= begin).then(|| (first + beat(place), number(line, "stamp_ns"), is_estimate))
         })
         .collect();
-    let waited = |sent: u64| stops.iter().any(|(from, to, _)| (*from..*to).contains(&sent));
+    let waited = |sent: u64| stops.iter().chain(&disturbed).any(|(from, to, _)| (*from..*to).contains(&sent));
     let sure = scans.iter().filter(|(sent, _, is_estimate)| !waited(*sent) && !is_estimate);
     let mut spans: Vec<i64> = sure.map(|(sent, stamp, _)| *sent as i64 - *stamp as i64).collect();
     let usual = median(&mut spans);

@@ -81,6 +81,17 @@ impl Program {
         self.process.id()
     }
 
+    /// How long its threads were ready to run and did not get a processor so far; nothing where the kernel does not count
+    /// it.
+    pub(crate) fn kept_waiting(&self) -> Duration {
+        let tasks = std::fs::read_dir(format!("/proc/{}/task", self.pid())).into_iter().flatten().flatten();
+        let counted = tasks.filter_map(|task| {
+            let text = std::fs::read_to_string(task.path().join("schedstat")).ok()?;
+            text.split(' ').nth(1)?.parse::<u64>().ok()
+        });
+        Duration::from_nanos(counted.sum())
+    }
+
     /// It has ended.
     pub(crate) fn is_over(&self) -> bool {
         let status = std::fs::read_to_string(format!("/proc/{}/stat", self.pid())).unwrap_or_default();
