@@ -2,7 +2,7 @@
 
 use std::time::{Duration, Instant};
 
-use schema::Topic;
+use schema::{Pace, Topic};
 
 use crate::line::Loss;
 
@@ -79,15 +79,13 @@ impl Account {
         true
     }
 
-    /// A status comes each second; of anything else ten may be missing before it is worth a word.
+    /// What comes each second may be late by two; of scans ten may be missing before it is worth a word.
     fn deadline(&self) -> Duration {
-        match self.topic {
-            Topic::Status => Duration::from_secs(3),
+        match self.topic.row().pace {
+            Pace::Second => Duration::from_secs(3),
             // It comes when there is a new one.
-            Topic::Background => Duration::MAX,
-            Topic::Telegram | Topic::Scan | Topic::Marks | Topic::Zones | Topic::Foreground => {
-                (self.period * 10).max(Duration::from_secs(1))
-            }
+            Pace::Change => Duration::MAX,
+            Pace::Scan => (self.period * 10).max(Duration::from_secs(1)),
         }
     }
 }

@@ -28,6 +28,7 @@ mod output;
 mod record;
 mod roll;
 mod selection;
+mod show;
 mod spare;
 mod text;
 #[cfg(feature = "tui")]

@@ -11,8 +11,9 @@ use schema::{Flags, Header, Reasons, Scan, Status, Telegram};
 use crate::account::Account;
 use crate::follow::Notice;
 use crate::names::TopicName;
+use crate::show;
 
-pub(crate) use processed::{background, foreground, marks, zones};
+pub(crate) use processed::{background, foreground, marks, robot, zones};
 
 /// Bytes as lower hex, without spaces.
 pub(crate) struct Hex<'a>(pub(crate) &'a [u8]);
@@ -26,16 +27,7 @@ impl fmt::Display for Hex<'_> {
 /// One sample.
 pub(crate) fn sample(line: &mut Vec<u8>, name: &TopicName, sample: &Sample) -> io::Result<()> {
     write!(line, "{name} ")?;
-    match sample {
-        Sample::Telegram(bytes) => telegram(line, bytes.header(), bytes),
-        Sample::Scan(found) => scan(line, found.header(), found),
-        Sample::Marks(found) => processed::marks(line, found.header(), found),
-        Sample::Zones(heard) => processed::zones(line, heard),
-        Sample::Foreground(found) => processed::foreground(line, found.header(), found),
-        Sample::Background(found) => background(line, found),
-        Sample::Status(found) => status(line, found),
-        Sample::Robot(found) => processed::robot(line, &found.robot),
-    }
+    show::text(sample, line)
 }
 
 /// One notice, for stderr; news of the hub are the same for all streams.
