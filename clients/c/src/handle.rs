@@ -9,7 +9,7 @@ use scanhub_client::{Heard, Payload, Received, RobotFollower, Subscription, Wait
 use schema::{Domain, Failure, Header, Topic, limits};
 
 use crate::boundary::Lent;
-use crate::refusal::Refusal;
+use crate::call_error::CallError;
 use crate::robot::Told;
 
 /// An open subscription.
@@ -128,12 +128,12 @@ impl Handle {
         sensor: &str,
         topic: Topic,
         wait: Wait,
-    ) -> Result<Handle, Refusal> {
+    ) -> Result<Handle, CallError> {
         Ok(Handle::of(Source::open(places, sensor, topic, wait)?))
     }
 
     /// Will follow the robot of `sensors` (none: all) in the first live one of `places`.
-    pub(crate) fn open_robot(places: Vec<Domain>, sensors: &[&str], wait: Wait) -> Result<Handle, Refusal> {
+    pub(crate) fn open_robot(places: Vec<Domain>, sensors: &[&str], wait: Wait) -> Result<Handle, CallError> {
         Ok(Handle::of(Source::Robot(RobotFollower::in_domain(places, sensors)?.wait_by(wait))))
     }
 
@@ -142,7 +142,7 @@ impl Handle {
     }
 
     /// Waits until there is a sample to take, or `timeout` is over (none: never); whether there is.
-    pub(crate) fn wait(&mut self, timeout: Option<Duration>) -> Result<bool, Refusal> {
+    pub(crate) fn wait(&mut self, timeout: Option<Duration>) -> Result<bool, CallError> {
         let until = timeout.and_then(|timeout| Instant::now().checked_add(timeout));
         loop {
             if self.found.is_none() {
@@ -160,10 +160,10 @@ impl Handle {
     }
 
     /// The next sample, lent until it is given back; nothing if none waits.
-    pub(crate) fn take(&mut self) -> Result<Option<Lent>, Refusal> {
+    pub(crate) fn take(&mut self) -> Result<Option<Lent>, CallError> {
         let place = self.lent.iter_mut().find(|place| place.is_none());
         let Some(place) = place else {
-            return Err(Refusal::Argument("four samples are lent already", "scanhub_release one of them"));
+            return Err(CallError::Argument("four samples are lent already", "scanhub_release one of them"));
         };
         let held = match self.found.take() {
             // A verdict is of now: the caller may have waited, and it has no stamp.
@@ -184,16 +184,16 @@ impl Handle {
     }
 
     /// Takes the sample back that was lent under `number`.
-    pub(crate) fn give_back(&mut self, number: u64) -> Result<(), Refusal> {
+    pub(crate) fn give_back(&mut self, number: u64) -> Result<(), CallError> {
         let is_it =
             |place: &&mut Option<(u64, Held)>| place.as_ref().is_some_and(|(lent, _)| *lent == number);
         let place = self.lent.iter_mut().find(is_it);
-        *place.ok_or(Refusal::Argument("this sample is not lent", "release each sample once"))? = None;
+        *place.ok_or(CallError::Argument("this sample is not lent", "release each sample once"))? = None;
         Ok(())
     }
 
     /// As [`Subscription::descriptor`].
-    pub(crate) fn descriptor(&mut self) -> Result<c_int, Refusal> {
+    pub(crate) fn descriptor(&mut self) -> Result<c_int, CallError> {
         Ok(self.source.descriptor()?)
     }
 

@@ -6,10 +6,10 @@ use std::sync::atomic::AtomicBool;
 use scanhub_client::streams::Sample;
 use schema::{Domain, Failure, Header, Kind, Scan, Topic, csv};
 
-use crate::account::Account;
 use crate::follow::{Bounds, Notice, Sink, follow};
 use crate::names::TopicName;
 use crate::output::{End, Output, quiet};
+use crate::receive_stats::ReceiveStats;
 use crate::selection::Selection;
 use crate::{json, show, text};
 
@@ -89,11 +89,11 @@ impl Sink for Echo<'_> {
         }
     }
 
-    fn summary(&mut self, name: &TopicName, account: &Account) -> Result<(), End> {
+    fn summary(&mut self, name: &TopicName, stats: &ReceiveStats) -> Result<(), End> {
         match self.format {
-            Format::Json => self.out.json(&json::summary(name, account)),
-            Format::Text => self.out.line(|line| text::summary(line, name, account)),
-            Format::Csv | Format::Raw => self.notes.line(|line| text::summary(line, name, account)),
+            Format::Json => self.out.json(&json::summary(name, stats)),
+            Format::Text => self.out.line(|line| text::summary(line, name, stats)),
+            Format::Csv | Format::Raw => self.notes.line(|line| text::summary(line, name, stats)),
         }
     }
 }

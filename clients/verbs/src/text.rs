@@ -8,9 +8,9 @@ use std::io::{self, Write};
 use scanhub_client::streams::Sample;
 use schema::{Flags, Header, Reasons, Scan, Status, Telegram};
 
-use crate::account::Account;
 use crate::follow::Notice;
 use crate::names::TopicName;
+use crate::receive_stats::ReceiveStats;
 use crate::show;
 
 pub(crate) use processed::{background, foreground, marks, robot, zones};
@@ -47,22 +47,16 @@ pub(crate) fn notice(line: &mut Vec<u8>, names: &[&TopicName], notice: Notice) -
 }
 
 /// The end of a run.
-pub(crate) fn summary(line: &mut Vec<u8>, name: &TopicName, account: &Account) -> io::Result<()> {
-    write!(
-        line,
-        "{name}: {} received, {} lost in {:.1} s",
-        account.received,
-        account.lost,
-        account.seconds()
-    )?;
-    if let Some(hz) = account.hz() {
+pub(crate) fn summary(line: &mut Vec<u8>, name: &TopicName, stats: &ReceiveStats) -> io::Result<()> {
+    write!(line, "{name}: {} received, {} lost in {:.1} s", stats.received, stats.lost, stats.seconds())?;
+    if let Some(hz) = stats.hz() {
         write!(line, ", {hz:.2} Hz")?;
     }
     // That nothing was is not worth a word.
-    if let Some(lost) = account.loss.lost_on_line.filter(|&lost| lost > 0) {
+    if let Some(lost) = stats.loss.lost_on_line.filter(|&lost| lost > 0) {
         write!(line, ", {lost} lost on the line")?;
     }
-    match account.loss.damaged.filter(|&share| share > 0.0) {
+    match stats.loss.damaged.filter(|&share| share > 0.0) {
         Some(share) => write!(line, ", {:.2} % of its bytes damaged", 100.0 * share),
         None => Ok(()),
     }

@@ -54,7 +54,7 @@ impl Remote<'_> {
         payload.unpack(self.datagram.payload).then_some(payload)
     }
 
-    /// A line of JSON; `sensor` is called so by [`Roll::name`](super::roll::Roll::name).
+    /// A line of JSON; `sensor` is called so by [`PeerTable::name`](super::peer_table::PeerTable::name).
     pub(super) fn json(&self, sensor: &str, out: &mut Output<'_>) -> Result<(), End> {
         // The flags come behind all that there is of a sample here.
         let header = Header { flags: 0, ..self.header() };

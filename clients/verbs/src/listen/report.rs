@@ -11,9 +11,9 @@ use serde::Serialize;
 use serde::ser::{SerializeMap, Serializer};
 
 use super::names::Names;
+use super::peer_table::PeerTable;
 use super::publish::Publication;
 use super::remote::{Remote, id};
-use super::roll::Roll;
 use crate::output::{End, Output, table};
 use classes::{Notice, Published, Ready, Sums};
 
@@ -114,35 +114,39 @@ impl<'a> Report<'a> {
     }
 
     /// The account as it stands, over the one that was drawn before.
-    pub(super) fn draw(&mut self, account: &Account, roll: &Roll) -> Result<(), End> {
+    pub(super) fn draw(&mut self, account: &Account, peers: &PeerTable) -> Result<(), End> {
         if self.drawn > 0 {
             self.out.raw(format!("\x1b[{}A\x1b[J", self.drawn).as_bytes())?;
         }
         self.drawn = account.rows().count() + 2 + usize::from(account.given_up().lives > 0);
-        self.text_account(account, roll)
+        self.text_account(account, peers)
     }
 
     /// The account as it stands, over the one that stands on the terminal, if any does.
-    pub(super) fn account(&mut self, account: &Account, roll: &Roll) -> Result<(), End> {
+    pub(super) fn account(&mut self, account: &Account, peers: &PeerTable) -> Result<(), End> {
         if !self.json {
-            return if self.drawn > 0 { self.draw(account, roll) } else { self.text_account(account, roll) };
+            return if self.drawn > 0 {
+                self.draw(account, peers)
+            } else {
+                self.text_account(account, peers)
+            };
         }
         for row in account.rows() {
-            let sensor = roll.row_name(row.hub, row.epoch, row.sensor);
+            let sensor = peers.row_name(row.hub, row.epoch, row.sensor);
             self.out.json(&Lan::new(row, &sensor))?;
         }
         self.out.json(&Sums::new(account.given_up()))?;
         self.out.json(&Refused { class: "lan_refused", reasons: account })
     }
 
-    fn text_account(&mut self, account: &Account, roll: &Roll) -> Result<(), End> {
+    fn text_account(&mut self, account: &Account, peers: &PeerTable) -> Result<(), End> {
         let titles = ["HUB", "EPOCH", "TOPIC", "RECEIVED", "LOST", "DUPLICATE", "REORDERED"];
         let mut rows = vec![titles.map(String::from).to_vec()];
         rows.extend(account.rows().map(|row| {
             vec![
                 self.names.of(row.hub),
                 row.epoch.to_string(),
-                format!("{}/{}", roll.row_name(row.hub, row.epoch, row.sensor), topic(row)),
+                format!("{}/{}", peers.row_name(row.hub, row.epoch, row.sensor), topic(row)),
                 row.received.to_string(),
                 row.lost().to_string(),
                 row.duplicate.to_string(),
