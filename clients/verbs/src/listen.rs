@@ -15,7 +15,7 @@ use std::net::SocketAddrV4;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
-use schema::datagram::{Account, Announce, Arrival, Datagram, Fresh, Head, Refusal, group};
+use schema::datagram::{Announce, Arrival, Datagram, DatagramError, Fresh, Head, StreamStats, group};
 use schema::{Domain, Failure, Kind, Topic};
 
 use self::crowd::{Crowd, Crowding};
@@ -86,7 +86,7 @@ pub fn listen(
         receiver,
         publication,
         told: Vec::new(),
-        account: Box::new(Account::new(&heard)),
+        stats: Box::new(StreamStats::new(&heard)),
         peers: PeerTable::default(),
         duplicates: DuplicateGateways::default(),
         crowd: Crowd::default(),
@@ -107,7 +107,7 @@ struct Listener<'a> {
     publication: Option<Publication>,
     /// What was told that is wrong here.
     told: Vec<String>,
-    account: Box<Account>,
+    stats: Box<StreamStats>,
     peers: PeerTable,
     duplicates: DuplicateGateways,
     crowd: Crowd,
@@ -142,7 +142,7 @@ impl Listener<'_> {
 
     /// The account so far.
     fn tell(&mut self) -> Result<(), End> {
-        self.report.account(&self.account, &self.peers)?;
+        self.report.stats(&self.stats, &self.peers)?;
         self.publication.iter().try_for_each(|publication| self.report.publication(publication))
     }
 
@@ -184,13 +184,13 @@ impl Listener<'_> {
             if !self.hubs.want(bytes) {
                 continue;
             }
-            match self.account.receive(bytes, sender(caught.from), caught.arrival_ns) {
+            match self.stats.receive(bytes, sender(caught.from), caught.arrival_ns) {
                 Ok((_, Fresh::Duplicate)) => {}
                 Ok((datagram, fresh)) => {
                     self.duplicates.taken(datagram.head.hub);
                     self.heard(datagram, fresh == Fresh::Late, &caught)?;
                 }
-                Err(Refusal::Epoch | Refusal::Twin) => self.of_another_life(bytes)?,
+                Err(DatagramError::Epoch | DatagramError::Twin) => self.of_another_life(bytes)?,
                 Err(_) => {}
             }
             if self.options.bounds.count.is_some_and(|count| self.received >= count) {
@@ -204,7 +204,7 @@ impl Listener<'_> {
     fn heard(&mut self, datagram: Datagram<'_>, late: bool, caught: &Caught<'_>) -> Result<(), End> {
         let &Caught { arrival_ns, wall_ns, .. } = caught;
         let head = datagram.head;
-        if self.account.since_ns(head.hub, head.epoch) == Some(arrival_ns) {
+        if self.stats.since_ns(head.hub, head.epoch) == Some(arrival_ns) {
             // A life began with it; if one of the same epoch went on until now, that was another sender's.
             self.publication.iter_mut().for_each(|publication| publication.begun(&head));
         }
@@ -212,7 +212,7 @@ impl Listener<'_> {
             // What it says was said again, and better, by a newer one.
             return if late { Ok(()) } else { self.announced(&datagram, caught) };
         };
-        let life = self.peers.life(&head, &self.account);
+        let life = self.peers.life(&head, &self.stats);
         let age_ns = life.age_ns(head.stamp_ns, wall_ns);
         let sensor = life.sensor(head.sensor);
         let missed = if late { 0 } else { sensor.advance(head.topic, head.sequence) };
@@ -236,7 +236,7 @@ impl Listener<'_> {
         if self.options.stats {
             return Ok(());
         }
-        let sensor = &self.peers.written(&head, &self.account);
+        let sensor = &self.peers.written(&head, &self.stats);
         if missed > 0 {
             self.report.missed(&head, sensor, topic, missed)?;
         }
@@ -246,8 +246,8 @@ impl Listener<'_> {
     fn announced(&mut self, datagram: &Datagram<'_>, caught: &Caught<'_>) -> Result<(), End> {
         let head = datagram.head;
         let Some(announce) = Announce::unpack(datagram.payload) else { return Ok(()) };
-        let behind_ns = self.peers.announce(&head, &self.account, &announce, caught.wall_ns);
-        if self.peers.life(&head, &self.account).sensor(head.sensor).take_numbered() {
+        let behind_ns = self.peers.announce(&head, &self.stats, &announce, caught.wall_ns);
+        if self.peers.life(&head, &self.stats).sensor(head.sensor).take_numbered() {
             self.report.named(&head, announce.sensor())?;
         }
         if let Some(behind_ns) = behind_ns {
@@ -276,7 +276,7 @@ impl Listener<'_> {
     /// `bytes` were refused as of a life of their gateway that is over, or of another gateway with its number.
     fn of_another_life(&mut self, bytes: &[u8]) -> Result<(), End> {
         let Ok(Datagram { head, .. }) = Datagram::read(bytes) else { return Ok(()) };
-        let is_shared = self.account.is_shared(head.hub, head.epoch);
+        let is_shared = self.stats.is_shared(head.hub, head.epoch);
         if !is_shared && !self.duplicates.refused(head.hub, Instant::now()) {
             return Ok(());
         }
@@ -308,7 +308,7 @@ impl Listener<'_> {
         }
         if self.options.stats && self.options.terminal && !self.options.json && now >= self.draw_at {
             self.draw_at = now + DRAW_EVERY;
-            self.report.draw(&self.account, &self.peers)?;
+            self.report.draw(&self.stats, &self.peers)?;
         }
         Ok(())
     }
@@ -316,8 +316,8 @@ impl Listener<'_> {
     fn crowding(&self) -> Crowding {
         let publication = self.publication.as_ref();
         Crowding {
-            gateways: self.account.given_up().displaced,
-            refused: self.account.refused(Refusal::Capacity),
+            gateways: self.stats.given_up().displaced,
+            refused: self.stats.refused(DatagramError::Capacity),
             sensors: publication.map_or(0, |publication| publication.displaced),
             samples: publication.map_or(0, |publication| publication.left_out.capacity),
         }
