@@ -16,10 +16,10 @@ use scanhub_client::streams::Sample;
 use scanhub_client::{Wait, clock};
 use schema::{Domain, Failure, Flags, Kind};
 
-use crate::account::Account;
 use crate::follow::{Bounds, Notice, Sink, follow_closely};
 use crate::names::TopicName;
 use crate::output::{End, Output, quiet};
+use crate::receive_stats::ReceiveStats;
 use crate::{json, text};
 use realtime::Realtime;
 use report::{Conditions, NOTHING_CAME, why_nothing};
@@ -176,13 +176,13 @@ impl Sink for Latency<'_> {
         Ok(())
     }
 
-    fn summary(&mut self, name: &TopicName, account: &Account) -> Result<(), End> {
+    fn summary(&mut self, name: &TopicName, stats: &ReceiveStats) -> Result<(), End> {
         let Some((_, spans)) = self.topics.iter().find(|(known, _)| known == name) else { return Ok(()) };
         if self.json {
             self.out.json(&report::json(name, spans))?;
-            return self.out.json(&json::summary(name, account));
+            return self.out.json(&json::summary(name, stats));
         }
-        self.out.line(|line| text::summary(line, name, account))?;
+        self.out.line(|line| text::summary(line, name, stats))?;
         report::full(&mut self.out, name, spans, self.terminal)
     }
 }

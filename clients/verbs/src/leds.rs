@@ -16,10 +16,10 @@ use scanhub_client::streams::{Freshness, Sample};
 use schema::{Domain, Failure, Kind, ROBOT, Status, Topic, Verdict, check_followed};
 use serde::Serialize;
 
-use crate::account::Account;
 use crate::follow::{Bounds, Notice, Sink, follow};
 use crate::names::{TopicName, as_word};
 use crate::output::{End, Output, quiet};
+use crate::receive_stats::ReceiveStats;
 use crate::{json, text};
 use device::{Device, News};
 use hold::Hold;
@@ -303,7 +303,7 @@ impl Sink for Board<'_> {
         self.verdict.changes_at()
     }
 
-    fn summary(&mut self, _: &TopicName, _: &Account) -> Result<(), End> {
+    fn summary(&mut self, _: &TopicName, _: &ReceiveStats) -> Result<(), End> {
         Ok(())
     }
 }

@@ -10,11 +10,11 @@ use scanhub_client::streams::Sample;
 use schema::{Domain, Failure, Kind, Pose, Quality, Topic, check_sensor};
 use serde::Serialize;
 
-use crate::account::Account;
 use crate::body::{Body, Mask, SLICES, Sector};
 use crate::follow::{Bounds, Notice, Sink, follow};
 use crate::names::{TopicName, as_word};
 use crate::output::{End, Output, quiet};
+use crate::receive_stats::ReceiveStats;
 use crate::text;
 
 /// What `mask` is asked for.
@@ -185,7 +185,7 @@ impl Sink for Look<'_> {
         Ok(())
     }
 
-    fn summary(&mut self, _: &TopicName, _: &Account) -> Result<(), End> {
+    fn summary(&mut self, _: &TopicName, _: &ReceiveStats) -> Result<(), End> {
         Ok(())
     }
 }

@@ -52,7 +52,7 @@ pub(crate) fn zones(line: &mut Vec<u8>, heard: &Heard) -> io::Result<()> {
 }
 
 /// The fold over all sensors.
-pub(super) fn robot(line: &mut Vec<u8>, robot: &Robot) -> io::Result<()> {
+pub(crate) fn robot(line: &mut Vec<u8>, robot: &Robot) -> io::Result<()> {
     write!(line, "{}", robot.verdict().name())?;
     match robot.nearest() {
         Some((mm, sensor)) => write!(line, " nearest {mm} mm, {sensor}:")?,
