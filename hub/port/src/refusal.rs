@@ -88,16 +88,16 @@ impl Refusal {
             Refusal::NoHost(_) => failure(Kind::PortMissing, "correct the name, or give the address instead"),
             Refusal::Refused => failure(
                 Kind::PortMissing,
-                "nothing listens there, or it serves somebody else: the server's port must be in raw TCP mode",
+                "nothing listens there, or it serves another client: the server's port must be in raw TCP mode",
             ),
             Refusal::TimedOut => failure(Kind::PortMissing, "is it switched on, and is the address right?"),
             Refusal::Network(_) => {
-                failure(Kind::PortMissing, "is the network plugged in, and is there a way to it?")
+                failure(Kind::PortMissing, "is the network plugged in, and is there a route to it?")
             }
             Refusal::Interrupted => Failure::new(Kind::Interrupted, "interrupted", ""),
             Refusal::Recording => failure(Kind::Configuration, "name a tty, or tcp:HOST:PORT"),
             Refusal::Other(_) => {
-                failure(Kind::PortNotTty, "name a tty; the kernel's log (dmesg) may tell more")
+                failure(Kind::PortNotTty, "name a tty; the kernel's log (dmesg) may show more")
             }
         }
     }
@@ -110,7 +110,7 @@ impl fmt::Display for Refusal {
             Refusal::NotTty => f.write_str("not a serial line"),
             Refusal::Denied => f.write_str("no permission"),
             Refusal::Busy => f.write_str("in use"),
-            Refusal::Dead => f.write_str("no such port: there is a name, but no line behind it"),
+            Refusal::Dead => f.write_str("no such port: the name exists, but no line behind it"),
             Refusal::Short(errno) => write!(f, "cannot be opened: {errno}"),
             Refusal::Rate { wanted, given } => {
                 write!(f, "{wanted} Bd is not possible here, the driver gives {given} Bd")
@@ -120,7 +120,7 @@ impl fmt::Display for Refusal {
             Refusal::TimedOut => f.write_str("no answer"),
             Refusal::Network(why) => write!(f, "cannot be reached: {why}"),
             Refusal::Interrupted => f.write_str("interrupted"),
-            Refusal::Recording => f.write_str("a recording, no line to a sensor"),
+            Refusal::Recording => f.write_str("a recording, not a line to a sensor"),
             Refusal::Other(errno) => write!(f, "cannot be used as a serial line: {errno}"),
         }
     }
@@ -146,7 +146,7 @@ fn missing(path: &Path, there: &[Candidate]) -> Failure {
     let what = match path.read_link() {
         Ok(target) => format!("{name}: no such port: it points to {}, which is not there", target.display()),
         Err(_) if path.starts_with("/dev/serial") => {
-            format!("{name}: no such port: its adapter is not plugged in, or another one than this was")
+            format!("{name}: no such port: its adapter is not plugged in, or it is another adapter")
         }
         Err(_) => format!("{name}: no such port"),
     };
@@ -173,7 +173,7 @@ fn busy(path: &Path, holder: Option<Holder>) -> Failure {
     let name = path.display();
     let (who, remedy) = match holder {
         None => {
-            ("another process".to_owned(), format!("stop it first; sudo fuser -v {name} tells which it is"))
+            ("another process".to_owned(), format!("stop it first; sudo fuser -v {name} shows which it is"))
         }
         Some(holder) => {
             let remedy = match holder.program.as_str() {
@@ -202,7 +202,7 @@ fn remedy_of_rate(wanted: u32) -> &'static str {
     if wanted == 500_000 {
         "adapters with an FT232R, FT232H or FT4232H do it exactly; a UART clocked with 1.8432 MHz cannot: baud = 38400"
     } else {
-        "say another rate: baud = 38400, 19200 or 9600"
+        "set another rate: baud = 38400, 19200 or 9600"
     }
 }
 
@@ -227,7 +227,7 @@ mod tests {
                 Kind::PortRate,
                 "/dev/full: 500000 Bd is not possible here, the driver gives 115200 Bd\n  adapters with an FT232R",
             ),
-            (Refusal::Rate { wanted: 9600, given: 0 }, Kind::PortRate, "say another rate"),
+            (Refusal::Rate { wanted: 9600, given: 0 }, Kind::PortRate, "set another rate"),
         ] {
             let failure = Refusal::explain(&refusal, &source);
             assert_eq!(failure.kind, kind, "{failure}");
