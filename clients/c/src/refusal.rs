@@ -35,7 +35,7 @@ impl Refusal {
         let said = match self {
             Refusal::Argument(what, hint) => format!("{what}\n  {hint}"),
             Refusal::Failure(failure) => failure.to_string(),
-            Refusal::Bug => "a bug in this library\n  stderr has its place; please report it".to_owned(),
+            Refusal::Bug => "a bug in this library\n  stderr shows where; please report it".to_owned(),
         };
         // Messages are printable: there is no 0 in them.
         let said = CString::new(said).unwrap_or_default();

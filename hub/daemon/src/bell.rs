@@ -16,7 +16,7 @@ impl Bell {
     pub(crate) fn new() -> Result<Bell, Failure> {
         let made = eventfd(0, EventfdFlags::CLOEXEC | EventfdFlags::NONBLOCK);
         made.map(Bell).map_err(|error: Errno| {
-            Failure::new(Kind::Short, format!("an eventfd cannot be had: {error}"), "raise `ulimit -n`")
+            Failure::new(Kind::Short, format!("cannot get an eventfd: {error}"), "raise `ulimit -n`")
         })
     }
 

@@ -143,7 +143,7 @@ impl Desk {
         match link.queue.try_send(Order { number: self.next, verb, model: Box::new(request.model()) }) {
             Ok(()) => {}
             Err(TrySendError::Full(_)) => {
-                let message = format!("{sensor} has {QUEUE} requests to do already");
+                let message = format!("{sensor} already has {QUEUE} waiting requests");
                 return Err(Failure::new(Kind::Short, message, "try again in a moment"));
             }
             Err(TrySendError::Disconnected(_)) => {

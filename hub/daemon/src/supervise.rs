@@ -211,7 +211,7 @@ fn broken_thread() -> Failure {
     Failure::new(
         Kind::Failed,
         "a link's thread ended",
-        "this is a bug: please report it with what stands above",
+        "this is a bug: please report it with the lines above",
     )
 }
 
@@ -220,9 +220,9 @@ fn random() -> u64 {
     RandomState::new().hash_one(std::process::id())
 }
 
-/// `what` cannot be had now.
+/// `what` is not available now.
 pub(crate) fn no_resource(what: &str, error: &dyn std::fmt::Display) -> Failure {
-    Failure::new(Kind::Short, format!("{what} cannot be had: {error}"), "try again later")
+    Failure::new(Kind::Short, format!("cannot get {what}: {error}"), "try again later")
 }
 
 /// A hub that plays a recording stays for so long after its end.

@@ -92,7 +92,7 @@ impl Orders {
                 match control {
                     Control::Pause => player.pause(),
                     Control::Resume => player.resume(),
-                    Control::Resync => return Err(self.refusal("a recording has nobody to begin anew with")),
+                    Control::Resync => return Err(self.refusal("a recording has no session to restart")),
                 }
                 return Ok(());
             }
@@ -122,7 +122,7 @@ impl Orders {
     }
 
     fn refusal(&self, why: &str) -> Failure {
-        let hint = format!("`scanhub info {}` shows how it is", self.sensor);
+        let hint = format!("`scanhub info {}` shows its state", self.sensor);
         Failure::new(Kind::Failed, format!("{}: {why}", self.sensor), hint)
     }
 }

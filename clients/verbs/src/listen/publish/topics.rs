@@ -221,7 +221,7 @@ impl RemoteTopics {
         let Some((mut status, mut header)) = self.last else { return };
         status.state = State::Silent as u8;
         status.rate_mhz = 0;
-        status.set_last_error("nothing comes over the network");
+        status.set_last_error("nothing arrives over the network");
         stamp(&mut header);
         if let Some(number) = self.status.as_mut().map(Outlet::own_number) {
             header.topic_seq = number;
