@@ -140,7 +140,7 @@ fn marks_become_available_by_the_command_that_is_named() {
     assert_eq!(told, serde_json::json!({ "available": false, "remedy": command }));
     assert_eq!(
         (&found["state"], &found["remedy"]),
-        (&"warning".into(), &format!("after the hub's end: {command}").into())
+        (&"warning".into(), &format!("stop the hub first: {command}").into())
     );
     assert!(log.contains(&command), "{log}");
 
@@ -173,7 +173,7 @@ fn the_way_back_brings_back_what_was_changed() {
     assert_eq!(probe(&env, "front")["permanent_rate"], true);
     // What was permanent before, the sensor does not tell.
     let out = done(&["power_on_baud=9600"]);
-    assert!(out.contains("cannot be brought back") && !out.contains("to go back"), "{out}");
+    assert!(out.contains("cannot be restored") && !out.contains("to go back"), "{out}");
     assert_eq!(probe(&env, "front")["permanent_rate"], false);
     let out = done(&["unit=cm", "power_on_baud=keep"]);
     assert!(out.contains(&format!("{port} configuration={hex} power_on_baud=9600\n")), "{out}");

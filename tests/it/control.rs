@@ -120,7 +120,7 @@ fn what_is_not_there_or_takes_no_requests_is_refused() {
     let _hub = env.hub(&["--link", &format!("front=file:{file}")]);
     for (sensor, code, kind, message) in [
         ("side", 3, "no_topic", "the hub has no sensor side"),
-        ("front", 1, "failed", "front: a recording has nobody to begin anew with"),
+        ("front", 1, "failed", "front: a recording has no session to restart"),
         ("Front", 2, "usage", "sensor name \"Front\" is not possible"),
     ] {
         let outcome = control(&env, sensor, "resync");

@@ -42,14 +42,14 @@ const SENSORS: [(&str, &[&str], &str, &str, &str); 10] = [
         &["--state=streaming", "--baud=38400", "--fault=overlook=1"],
         "sensor",
         "failed",
-        "the wire that goes to it",
+        "the wire to its receiver",
     ),
     (
         "noise is all that comes",
         &["--state=streaming", "--baud=500000", "--fault=flip=0.5,flip_bits=64,overlook=1"],
         "sensor",
         "failed",
-        "RS-232 against RS-422",
+        "RS-232 instead of RS-422",
     ),
 ];
 

@@ -269,7 +269,7 @@ fn a_pose_and_circles_that_cannot_be_end_the_hub_with_their_place() {
     let env = TestEnv::new();
     for (text, words) in [
         ("[link.pose]\nx = nan\n", ":5:5: x = NaN"),
-        ("[link.pose]\nx = 1.0\n", ":5:5: link front: no beam meets the circle of 1 m"),
+        ("[link.pose]\nx = 1.0\n", ":5:5: link front: no beam sees into the circle of 1 m"),
         ("[link.zones]\nradii = [0.6, 1.0]\n", ":5:9: radii = [0.6, 1.0]"),
         ("[link.zones]\nmargn = 0.1\n", ":5:1: unknown key `margn`"),
         ("[link.background]\nstart = \"/no/such/model\"\n", "/no/such/model"),

@@ -187,7 +187,7 @@ fn a_stream_becomes_messages_and_rows_where_its_mode_is_known() {
     for words in [&[&bag[..], "--ros2"][..], &[&rows]] {
         let outcome = env.run(&[&["convert", &stream], words].concat());
         assert_eq!(outcome.code, Some(78), "{outcome}");
-        assert!(outcome.errors.contains("does not tell the measuring mode of front"), "{outcome}");
+        assert!(outcome.errors.contains("does not contain the measuring mode of front"), "{outcome}");
         assert!(outcome.errors.contains("--mode"), "{outcome}");
         let outcome = env.run(&[&["convert", &stream, "--mode=0x01"], words].concat());
         assert_eq!(outcome.code, Some(0), "{outcome}");

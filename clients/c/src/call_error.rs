@@ -35,7 +35,7 @@ impl CallError {
         let said = match self {
             CallError::Argument(what, hint) => format!("{what}\n  {hint}"),
             CallError::Failure(failure) => failure.to_string(),
-            CallError::Bug => "a bug in this library\n  stderr has its place; please report it".to_owned(),
+            CallError::Bug => "a bug in this library\n  stderr shows where; please report it".to_owned(),
         };
         // Messages are printable: there is no 0 in them.
         let said = CString::new(said).unwrap_or_default();

@@ -117,7 +117,7 @@ fn check(format: Format, named: &[TopicName], of_all: &[Topic]) -> Result<(), Fa
             usage("--csv and --raw take one topic of one sensor")
         }
         (Format::Csv, [one]) if one.topic == Topic::Scan => Ok(()),
-        (Format::Csv, _) => usage("--csv takes one topic, and that a scan"),
+        (Format::Csv, _) => usage("--csv takes one topic, which must be a scan"),
         (Format::Raw, [_, _, ..]) => usage("--raw takes one topic"),
         (Format::Raw, [one]) if one.is_robot() => usage("--raw takes the topic of a sensor"),
         _ => Ok(()),

@@ -329,7 +329,7 @@ impl<'a> Run<'a> {
             let limit = self.bounds.timeout.unwrap_or_default();
             let hint =
                 if self.session.domain().is_some() { "`scanhub info` shows why" } else { "there is no hub" };
-            return Err(Failure::new(Kind::Timeout, format!("nothing came for {limit:?}"), hint).into());
+            return Err(Failure::new(Kind::Timeout, format!("nothing arrived for {limit:?}"), hint).into());
         }
         Ok(())
     }
@@ -362,7 +362,7 @@ impl<'a> Run<'a> {
 
     fn stopped(&self) -> Result<(), End> {
         if self.bounds.bounded() {
-            return Err(Failure::new(Kind::Interrupted, "interrupted before it was through", "").into());
+            return Err(Failure::new(Kind::Interrupted, "interrupted before it was done", "").into());
         }
         Ok(())
     }
@@ -370,7 +370,7 @@ impl<'a> Run<'a> {
     fn time_is_over(&self) -> Result<(), End> {
         match self.bounds.count {
             Some(count) => {
-                let what = format!("{} of {count} samples came in time", self.received);
+                let what = format!("{} of {count} samples arrived in time", self.received);
                 Err(Failure::new(Kind::Timeout, what, "`scanhub info` shows why").into())
             }
             None => Ok(()),

@@ -67,8 +67,8 @@ impl GatewayOptions {
     fn selection(&self) -> Result<Selection, Failure> {
         let selection = Selection::parse(&self.topics, self.bare)?;
         if self.bare && self.background_every.is_some() {
-            let what = "no background goes out where only telegrams do";
-            return Err(Failure::new(Kind::Configuration, what, "leave bare or background_every away"));
+            let what = "no background is sent where only telegrams are";
+            return Err(Failure::new(Kind::Configuration, what, "leave bare or background_every out"));
         }
         Ok(selection)
     }

@@ -107,7 +107,7 @@ impl Latency<'_> {
                     let (what, hint) = (format!("{name}: {NOTHING_CAME}"), why_nothing(name));
                     return Err(Failure::new(Kind::Check, what, hint));
                 }
-                let what = format!("{name}: no sample came whose age is known");
+                let what = format!("{name}: no sample with a known age arrived");
                 return Err(Failure::new(Kind::Check, what, "measure for longer: --for 10s"));
             };
             let p99 = Duration::from_nanos(age.p99_ns);
@@ -115,9 +115,9 @@ impl Latency<'_> {
                 let what = format!("{name}: p99 of the age on arrival is {p99:?}, more than {limit:?}");
                 let hint = if spans.flags & Flags::REMOTE != 0 {
                     "of a remote sensor it is the time from the datagram's arrival until it was received here: see what else \
-                     runs on this machine; `network` tells the way before"
+                     runs on this machine; `network` is the time before that"
                 } else {
-                    "hub and wake tell where the time goes"
+                    "hub and wake show where the time goes"
                 };
                 return Err(Failure::new(Kind::Check, what, hint));
             }

@@ -103,13 +103,10 @@ fn wanted<'a>(sensor: &str, leds: &'a [String]) -> Result<Vec<(Light, &'a str)>,
             return refuse(&format!("no light {light:?}: {LED_FORM}"));
         };
         if light == Light::Mark && sensor == ROBOT {
-            return refuse("marks are one sensor's: name the sensor");
+            return refuse("marks belong to one sensor: name the sensor");
         }
         if let Some((other, _)) = wanted.iter().find(|(_, taken)| *taken == name) {
-            return refuse(&format!(
-                "{name} shows {} already: each light has diodes of its own",
-                other.name()
-            ));
+            return refuse(&format!("{name} already shows {}: each light has its own LEDs", other.name()));
         }
         wanted.push((light, name));
     }

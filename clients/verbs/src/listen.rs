@@ -333,7 +333,7 @@ impl Listener<'_> {
 
     fn stopped(&self) -> Result<(), End> {
         if self.options.bounds.bounded() {
-            return Err(Failure::new(Kind::Interrupted, "interrupted before it was through", "").into());
+            return Err(Failure::new(Kind::Interrupted, "interrupted before it was done", "").into());
         }
         Ok(())
     }
@@ -341,7 +341,7 @@ impl Listener<'_> {
     fn time_is_over(&self) -> Result<(), End> {
         match self.options.bounds.count {
             Some(count) => {
-                let what = format!("{} of {count} samples came in time", self.received);
+                let what = format!("{} of {count} samples arrived in time", self.received);
                 Err(Failure::new(Kind::Timeout, what, NOTHING_CAME).into())
             }
             None => Ok(()),
@@ -355,7 +355,7 @@ fn sender(from: SocketAddrV4) -> u64 {
 }
 
 fn nothing_came(limit: Duration) -> Failure {
-    Failure::new(Kind::Timeout, format!("nothing came for {limit:?}"), NOTHING_CAME)
+    Failure::new(Kind::Timeout, format!("nothing arrived for {limit:?}"), NOTHING_CAME)
 }
 
 const NOTHING_CAME: &str = "is `scanhub gateway` running in the same network? `scanhub listen --stats` counts what is \

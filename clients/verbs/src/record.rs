@@ -147,11 +147,11 @@ fn begin(options: &RecordOptions, queue: &Arc<Queue>) -> Result<Disk, End> {
     let failed = |error: io::Error| output_error::failed(path, options.split.is_some(), &error);
     let files = match options.is_to_stdout() {
         true if options.split.is_some() => {
-            return Err(Failure::new(Kind::Usage, "stdout has no parts", "leave --split away").into());
+            return Err(Failure::new(Kind::Usage, "stdout cannot be split", "leave --split out").into());
         }
         true if io::stdout().is_terminal() => {
             let hint = "for example `scanhub record -o - | ssh host 'cat > walk.mcap'`";
-            return Err(Failure::new(Kind::Usage, "a recording is nothing for a terminal", hint).into());
+            return Err(Failure::new(Kind::Usage, "a recording cannot be written to a terminal", hint).into());
         }
         true => Err(File::from(io::stdout().as_fd().try_clone_to_owned().map_err(failed)?)),
         false => {
@@ -255,7 +255,7 @@ impl Recorder<'_> {
             if ended_at.elapsed() < SAME_WISH {
                 stop.store(false, Ordering::Relaxed);
             } else if stop.load(Ordering::Relaxed) {
-                let what = "the disk did not take the end of the recording yet, and nobody waited for it";
+                let what = "the disk had not stored the end of the recording when a second signal came";
                 return Err(Failure::new(Kind::Failed, what, REPAIR).into());
             }
             thread::sleep(LOOK_EVERY);

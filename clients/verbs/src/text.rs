@@ -42,7 +42,7 @@ pub(crate) fn notice(line: &mut Vec<u8>, names: &[&TopicName], notice: Notice) -
     }
     match notice {
         Notice::Missed(missed) => write!(line, "missed {missed}"),
-        _ => write!(line, "nothing comes any more"),
+        _ => write!(line, "nothing arrives any more"),
     }
 }
 

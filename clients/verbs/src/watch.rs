@@ -115,9 +115,7 @@ impl Watcher<'_> {
             }
             match wish {
                 Some(Wish::Interrupt) if self.options.bounds.bounded() => {
-                    return Err(
-                        Failure::new(Kind::Interrupted, "interrupted before it was through", "").into()
-                    );
+                    return Err(Failure::new(Kind::Interrupted, "interrupted before it was done", "").into());
                 }
                 Some(Wish::Quit | Wish::Interrupt) => return Err(End::ReaderGone),
                 Some(Wish::Reset) => self.order(Verb::Reset, now),

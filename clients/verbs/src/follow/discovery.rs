@@ -55,7 +55,7 @@ impl Run<'_> {
             let (what, hint) = match lives {
                 true => ("the hub has no sensors", "scanhub run --link NAME=PORT"),
                 false => {
-                    ("no sensor of another machine is published here", "`scanhub listen` says who sends")
+                    ("no sensor of another machine is published here", "`scanhub listen` shows who sends")
                 }
             };
             return Err(Failure::new(Kind::NoTopic, what, hint).into());

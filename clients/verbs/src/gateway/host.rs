@@ -49,7 +49,7 @@ impl Host {
         let name = text.to_owned();
         let found = match BackgroundTask::begin(move || resolve(&name)) {
             Some(task) => task.wait(stop).ok_or_else(|| {
-                let what = format!("interrupted before it was known where {text} is");
+                let what = format!("interrupted before {text} was resolved");
                 Failure::new(Kind::Interrupted, what, "")
             })?,
             None => resolve(text),
@@ -64,12 +64,15 @@ impl Host {
             return Err(refuse(format!("cannot send to {text}: the port is not possible"), &hint));
         }
         let address = choose(&found, None).ok_or_else(|| {
-            let hint = "the groups get everything anyway; name single hosts besides";
+            let hint = "the groups get everything anyway; name single hosts only";
             refuse(format!("cannot send to {text}: it is no host"), hint)
         })?;
         if matches!(address, SocketAddr::V6(six) if six.ip().is_unicast_link_local() && six.scope_id() == 0) {
-            let hint = "name the interface behind the address, as in [fe80::7%eth0]:22200";
-            return Err(refuse(format!("cannot send to {text}: each interface has such addresses"), hint));
+            let hint = "add the interface to the address, as in [fe80::7%eth0]:22200";
+            return Err(refuse(
+                format!("cannot send to {text}: a link-local address needs an interface"),
+                hint,
+            ));
         }
         let is_name = text.parse::<SocketAddr>().is_err();
         let asked_at = is_name.then_some(now);

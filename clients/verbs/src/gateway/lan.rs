@@ -104,8 +104,7 @@ impl Lan {
     ) -> Result<Lan, Failure> {
         if !(MTU_LEAST..=MTU_ETHERNET).contains(&longest) {
             let what = format!("datagrams of {longest} bytes are not possible");
-            let hint =
-                format!("from {MTU_LEAST} to {MTU_ETHERNET}, which is the most that an Ethernet carries");
+            let hint = format!("from {MTU_LEAST} to {MTU_ETHERNET}, the most that an Ethernet carries");
             return Err(Failure::new(Kind::Configuration, what, hint));
         }
         let (port, more) = match form {
@@ -122,7 +121,7 @@ impl Lan {
             let copy = UdpDestination::host(text, more, stop)?;
             if let Some(other) = copies.iter().find(|other| other.is_as(&copy)) {
                 let what = format!("cannot send to {text}: it is named twice");
-                let hint = format!("{} gets a copy already; name each host and port once", other.name);
+                let hint = format!("{} already gets a copy; name each host and port once", other.name);
                 return Err(Failure::new(Kind::Configuration, what, hint));
             }
             copies.push(copy);

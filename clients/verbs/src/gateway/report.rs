@@ -84,7 +84,7 @@ impl<'a> Report<'a> {
 
     /// The name of a destination has another address now, which is sent to.
     pub(super) fn moved(&mut self, destination: &str, address: SocketAddr) -> Result<(), End> {
-        self.link(destination, "moved", Some(&format!("its address is {address} now")))
+        self.link(destination, "moved", Some(&format!("its address is now {address}")))
     }
 
     /// Samples of `topic` are longer than the longest datagram.

@@ -29,8 +29,8 @@ impl Selection {
         for text in texts {
             let entry = Entry::parse(text)?;
             if bare && entry.word.topic != Some(Topic::Telegram) {
-                let hint = "without --bare all topics can go out";
-                return Err(refuse(text, "is no telegram, and nothing else goes out bare", hint));
+                let hint = "without --bare all topics can be sent";
+                return Err(refuse(text, "is not telegrams, and --bare sends nothing else", hint));
             }
             if entries.iter().any(|other| other.word == entry.word) {
                 return Err(refuse(text, "is named twice", "name each topic once"));

@@ -87,7 +87,7 @@ impl MulticastReceiver {
         let changes = Changes::watch()?;
         let socket = bind().map_err(|error| {
             let hint = "it is in use by a program that does not share it: `ss -lunp` names it";
-            Failure::new(Kind::Failed, format!("cannot hear on UDP port {PORT}: {error}"), hint)
+            Failure::new(Kind::Failed, format!("cannot listen on UDP port {PORT}: {error}"), hint)
         })?;
         let [a, b, c] = GROUPS;
         let mut receiver = MulticastReceiver {

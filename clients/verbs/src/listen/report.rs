@@ -84,7 +84,7 @@ impl<'a> Report<'a> {
         let hub = self.names.of(head.hub);
         let (ms, which) = (behind_ms.abs(), if behind_ms < 0.0 { "ahead of" } else { "behind" });
         self.notes.line(|line| {
-            write!(line, "{hub}: its clock is {ms:.0} ms {which} this machine's, so that ages are not told")
+            write!(line, "{hub}: its clock is {ms:.0} ms {which} this machine's, so ages are not shown")
         })
     }
 
@@ -93,8 +93,11 @@ impl<'a> Report<'a> {
         if self.json {
             return self.out.json(&Notice { sensor: Some(name), here, ..Notice::of("published", head) });
         }
-        let which =
-            if here { ", whose gateway is on this machine: --hub HUB hears others alone" } else { "" };
+        let which = if here {
+            ", whose gateway is on this machine: use --hub HUB to receive only others"
+        } else {
+            ""
+        };
         self.notes.line(|line| write!(line, "publishing {name}{which}"))
     }
 

@@ -115,10 +115,13 @@ impl<'a> Report<'a> {
             return self.out.json(&notice);
         }
         self.note(|line| match news {
-            News::File(path) => write!(line, "goes on in {}", path.display()),
+            News::File(path) => write!(line, "continues in {}", path.display()),
             News::Trouble(path, message) => {
                 let path = path.display();
-                write!(line, "cannot write {path}: {message}; what comes is held, and it is tried again")
+                write!(
+                    line,
+                    "cannot write {path}: {message}; samples are kept in memory, and writing is tried again"
+                )
             }
             News::Well(path, after) => {
                 write!(line, "{} is written again, after {:.1} s", path.display(), after.as_secs_f64())
@@ -136,7 +139,7 @@ impl<'a> Report<'a> {
             let (left_out, seconds) = (0, 0.0);
             return self.out.json(&Left { class: "notice", kind: "gap_begins", left_out, seconds });
         }
-        self.note(|line| write!(line, "no more can be held: samples are left out of the recording"))
+        self.note(|line| write!(line, "memory for samples is full: samples are left out of the recording"))
     }
 
     /// Nothing more is left out.

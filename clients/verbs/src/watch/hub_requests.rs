@@ -65,9 +65,9 @@ fn carry_out(places: &[Domain], sensors: &[String], verb: Verb, stop: &AtomicBoo
 
 fn outcome(verb: Verb) -> &'static str {
     match verb {
-        Verb::Reset => "is learned anew",
-        Verb::Freeze => "is held as it is",
-        Verb::Thaw => "is learned on",
+        Verb::Reset => "is learned again",
+        Verb::Freeze => "is frozen",
+        Verb::Thaw => "continues learning",
         other => other.name(),
     }
 }
