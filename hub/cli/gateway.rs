@@ -21,6 +21,8 @@ pub(crate) struct Gateway {
     /// May be given several times; without it all topics but telegrams, of all sensors
     #[arg(long = "topic", value_name = "SENSOR/TOPIC[:every=N]")]
     topics: Vec<String>,
+    // Help for people, in which brackets are no link.
+    #[allow(rustdoc::broken_intra_doc_links)]
     /// A host that gets copies, or [IPV6]:PORT; a name is asked for again while it runs. May be given
     /// several times
     #[arg(long, value_name = "HOST:PORT")]
