@@ -140,10 +140,11 @@ const LONG_ENOUGH: Duration = Duration::from_millis(1500);
 /// What is wrong with those of `lines` that can be run.
 fn wrong_with(desk: &Desk, lines: &[(String, String)]) -> Vec<String> {
     let wrong = |(place, line): &(String, String)| Some(format!("{place}: {}", desk.run(line)?));
-    // There is one spare sensor; what needs none mostly waits.
-    let (at_ports, others): (Vec<_>, Vec<_>) =
-        lines.iter().partition(|(_, line)| PORTS.iter().any(|port| line.contains(port)));
-    let rows = others.chunks(others.len().div_ceil(3).max(1)).map(<[_]>::to_vec).chain([at_ports]);
+    // There is one spare sensor, one domain for another hub, and one sensor to be told what to do; the rest mostly waits.
+    const IN_TURN: [&str; 4] = ["scanhub run", "scanhub replay", "scanhub control", "scanhub background"];
+    let (in_turn, others): (Vec<_>, Vec<_>) =
+        lines.iter().partition(|(_, line)| PORTS.iter().chain(&IN_TURN).any(|part| line.contains(part)));
+    let rows = others.chunks(others.len().div_ceil(3).max(1)).map(<[_]>::to_vec).chain([in_turn]);
     let wrong = side_by_side(rows, |row| row.into_iter().filter_map(wrong).collect::<Vec<_>>());
     wrong.concat()
 }
