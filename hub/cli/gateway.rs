@@ -21,6 +21,8 @@ pub(crate) struct Gateway {
     /// every fourth telegram. Can be repeated [default: all topics except telegrams, of all sensors]
     #[arg(long = "topic", value_name = "SENSOR/TOPIC[:every=N]")]
     topics: Vec<String>,
+    // Help for people, in which brackets are no link.
+    #[allow(rustdoc::broken_intra_doc_links)]
     /// Host that gets copies, HOST:PORT or [IPV6]:PORT; a name is resolved again while the gateway runs. Can be repeated
     #[arg(long, value_name = "HOST:PORT")]
     to: Vec<String>,

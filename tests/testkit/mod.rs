@@ -5,6 +5,7 @@
 mod again;
 mod findings;
 mod gentle;
+mod in_time;
 mod line;
 mod machine;
 mod network;
@@ -34,7 +35,8 @@ use serde_json::Value;
 
 pub(crate) use again::{in_own_process, only, own_program, run_again};
 pub(crate) use findings::Findings;
-pub(crate) use gentle::{compute_gently, gentle, wait_gently};
+pub(crate) use gentle::{compute_gently, gentle, side_by_side, wait_gently};
+pub(crate) use in_time::hold_in_time;
 pub(crate) use line::{Line, open_line};
 pub(crate) use machine::{Machine, command_in, ip};
 pub(crate) use network::in_a_network;
