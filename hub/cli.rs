@@ -1,5 +1,4 @@
-//! The command line: which verbs there are and what they take. Syntax only; what a value means is checked by whoever
-//! uses it.
+//! The command line: the verbs and their arguments. Syntax only; the code that uses a value checks what it means.
 
 mod background;
 mod complete;
@@ -46,8 +45,8 @@ pub(crate) use telegram::{Telegram, Way};
 pub(crate) use watch::Watch;
 pub(crate) use zones::Zones;
 
-/// Laser scanners on serial lines, for more than one program: a hub that publishes telegrams and scans into shared
-/// memory, and the programs that listen.
+/// Serve SICK laser scanners on serial lines to many programs: a hub that publishes telegrams and scans in shared
+/// memory, and programs that read them.
 #[derive(Debug, Parser)]
 #[command(version, max_term_width = 100)]
 pub(crate) struct Cli {
@@ -77,10 +76,10 @@ pub(crate) struct Everywhere {
     /// Domain of the hub: 1 to 16 of a-z, 0-9 and -
     #[arg(long, global = true, env = "SCANHUB_DOMAIN", default_value = DEFAULT_DOMAIN, value_name = "NAME")]
     pub(crate) domain: String,
-    /// Directory that holds the domain, instead of the usual ones
+    /// Use the domain in this directory instead of the usual ones
     #[arg(long, global = true, value_name = "DIR")]
     pub(crate) root: Option<PathBuf>,
-    /// One JSON object per line
+    /// Print one JSON object per line
     #[arg(long, global = true)]
     pub(crate) json: bool,
 }
@@ -104,75 +103,75 @@ impl Everywhere {
 
 #[derive(Debug, Subcommand)]
 pub(crate) enum Verb {
-    /// The hub, in the foreground, until SIGINT or SIGTERM
+    /// Run the hub in the foreground, until SIGINT or SIGTERM
     Run(Run),
-    /// A hub whose sensors are a recording, with the keys of a player
+    /// Run a hub that plays a recording instead of sensors, with the keys of a player
     #[command(after_help = replay::KEYS)]
     Replay(Replay),
-    /// Two simulated sensors, the hub and a consumer for each, in one terminal
+    /// Run two simulated sensors, the hub and a consumer for each in one terminal
     Demo(Demo),
-    /// Sensors at the other end of ptys
+    /// Simulate sensors at the other end of ptys
     #[command(after_help = simulate::fault_table())]
     Simulate(Box<simulate::Simulate>),
-    /// What is at the other end of a port; without one, which ports there are
+    /// Show the sensor at a port; without a port, list the ports
     Probe(probe::Probe),
-    /// Change what a sensor keeps for ever, after showing the difference and asking
+    /// Change a sensor's EEPROM settings: shows the difference and asks first
     #[command(after_help = configure::CONSENT)]
     Configure(configure::Configure),
-    /// The configuration: one to begin with, whether one is right, what is in effect and where it is said
+    /// Print a default configuration, check one, or show the values in effect and their origin
     Config(Config),
-    /// Every condition that a working set-up needs, and what to do where one is not met
+    /// Check every condition of a working setup, and say what to do if one is not met
     Doctor(doctor::Doctor),
-    /// Sensors and topics of the running hub
+    /// List the sensors and topics of the running hub
     List {
-        /// Every live domain of this user instead
+        /// List every live domain of this user instead
         #[arg(long)]
         domains: bool,
     },
-    /// State, settings and counters of sensors
+    /// Show state, settings and counters of sensors
     Info {
-        /// One sensor instead of all
+        /// Show only this sensor
         sensor: Option<String>,
     },
-    /// Samples as they come
+    /// Print samples as they arrive
     Echo(Echo),
-    /// Rate, jitter and loss of topics
+    /// Measure rate, jitter and loss of topics
     Hz(Hz),
-    /// How old samples are on arrival, and where they spent that time: percentiles
+    /// Measure how old samples are on arrival, split into line, hub and wake-up: percentiles
     #[command(after_help = latency::SPANS)]
     Latency(Latency),
-    /// The live picture in the terminal: what the sensors see, marks, zones and the verdict
+    /// Show the live picture in the terminal: what the sensors see, marks, zones and the verdict
     #[command(after_help = watch::KEYS)]
     Watch(Watch),
-    /// What the hub publishes, in MCAP files
+    /// Record what the hub publishes in MCAP files
     #[command(after_help = record::READING)]
     Record(Record),
-    /// Telegrams explained field by field, and written
+    /// Explain telegrams field by field, or write them
     Telegram(Telegram),
-    /// Stop a sensor, let it stream again, or begin anew with it
+    /// Pause a sensor, resume it, or restart its session
     Control(Control),
-    /// The background model of a sensor: look at it, learn it anew, hold it, keep it in a file
+    /// Show, reset, freeze, save or load the background model of a sensor
     Background(Background),
-    /// The zones around the robot: which part of its view the robot itself takes
+    /// Learn which part of a sensor's view is the robot itself
     Zones(Zones),
-    /// The zone verdict and the marks as lights: in the terminal, and on diodes of this machine
+    /// Show the zone verdict and the marks as lights, in the terminal and on LEDs of this machine
     #[command(after_help = leds::MEANING)]
     Leds(Leds),
-    /// What the hub publishes, as UDP datagrams on a network: one message each, to multicast groups and to hosts
+    /// Send what the hub publishes as UDP datagrams, one sample each, to multicast groups and to hosts
     #[command(after_help = gateway::GROUPS)]
     Gateway(Gateway),
-    /// What the gateways of other machines send over the network, and what of it was lost
+    /// Receive what gateways of other machines send, and show what was lost
     #[command(after_help = listen::SIGNALS)]
     Listen(Listen),
-    /// A recording in another form, or a damaged one made whole
+    /// Convert a recording to another format, or repair a damaged one
     #[command(after_help = convert::REPAIR)]
     Convert(Convert),
-    /// The completion of this command line for a shell
+    /// Print the completion script for a shell
     Completions(Completions),
-    /// Names of the running hub for those completions
+    /// Print names of the running hub for the completion scripts
     #[command(hide = true)]
     Complete(Complete),
-    /// Manual pages
+    /// Print or write the manual pages
     Man(Man),
 }
 
@@ -180,28 +179,28 @@ pub(crate) enum Verb {
 pub(crate) struct Run {
     #[command(flatten)]
     pub(crate) configured: Configured,
-    /// A link with its defaults; PORT is a tty, tcp:HOST:PORT or file:PATH[?rate=max]
+    /// Add a link with default settings; PORT is a tty, tcp:HOST:PORT or file:PATH[?rate=max]
     #[arg(long, value_name = "NAME=PORT")]
     pub(crate) link: Vec<String>,
 }
 
 impl Run {
-    /// Where the configuration is to be read from.
+    /// Where the configuration is read from.
     pub(crate) fn sources(&self) -> Sources {
         Sources { links: self.link.clone(), ..self.configured.sources() }
     }
 }
 
-/// Where a configuration is said, apart from links.
+/// Where a configuration is read from, apart from links.
 #[derive(Args, Debug, Default)]
 pub(crate) struct Configured {
-    /// TOML file, read after those in /etc/scanhub
+    /// Read this TOML file after those in /etc/scanhub
     #[arg(long, env = "SCANHUB_CONFIG", value_name = "FILE")]
     config: Option<PathBuf>,
     /// Do not read /etc/scanhub
     #[arg(long)]
     no_system_config: bool,
-    /// One value, for example link.front.angle=100
+    /// Set one value, for example link.front.angle=100
     #[arg(long, value_name = "KEY=VALUE")]
     set: Vec<String>,
 }
@@ -216,10 +215,10 @@ impl Configured {
 
 #[derive(Args, Debug)]
 pub(crate) struct Demo {
-    /// No live view: a summary line per sensor at the end, and exit 5 if a telegram was lost
+    /// Run without the live view: print a summary line per sensor at the end; exit 5 if a telegram was lost
     #[arg(long)]
     pub(crate) headless: bool,
-    /// How long, for example 10s; without it until Ctrl-C
+    /// Stop after this time, for example 10s [default: at Ctrl-C]
     #[arg(long = "for", value_name = "DURATION", value_parser = duration::parse)]
     pub(crate) run_for: Option<Duration>,
     /// Seed of rooms and people
@@ -229,13 +228,13 @@ pub(crate) struct Demo {
 
 #[derive(Args, Debug)]
 pub(crate) struct Limits {
-    /// End after so many samples
+    /// Stop after this number of samples
     #[arg(short = 'n', value_name = "COUNT", value_parser = clap::value_parser!(u64).range(1..))]
     count: Option<u64>,
-    /// End after so long, for example 10s, 250ms, 5m
+    /// Stop after this time, for example 10s, 250ms, 5m
     #[arg(long = "for", value_name = "DURATION", value_parser = duration::parse)]
     run_for: Option<Duration>,
-    /// Longest silence, before the first sample and between two; then exit 3
+    /// Exit with 3 after this time without a sample
     #[arg(long, value_name = "DURATION", value_parser = duration::parse)]
     timeout: Option<Duration>,
 }
@@ -248,13 +247,14 @@ impl Limits {
 
 #[derive(Args, Debug)]
 pub(crate) struct Echo {
-    /// What to follow: front/scan, */scan for all sensors, front/* for all topics; or robot/zones, all sensors' zones in one
+    /// Topics to follow: front/scan, */scan for all sensors, front/* for all topics; robot/zones for the verdict over all
+    /// sensors
     #[arg(required = true, value_name = "SENSOR/TOPIC")]
     pub(crate) topics: Vec<String>,
-    /// Comma-separated values
+    /// Print comma-separated values
     #[arg(long, conflicts_with_all = ["json", "raw"])]
     pub(crate) csv: bool,
-    /// The bytes themselves: telegrams, or the payload of another topic
+    /// Print raw bytes: telegrams, or the payload of another topic
     #[arg(long, conflicts_with = "json")]
     pub(crate) raw: bool,
     #[command(flatten)]
@@ -263,10 +263,10 @@ pub(crate) struct Echo {
 
 #[derive(Args, Debug)]
 pub(crate) struct Hz {
-    /// What to follow: front/scan, */scan for all sensors, front/* for all topics; without it everything
+    /// Topics to follow: front/scan, */scan for all sensors, front/* for all topics [default: all]
     #[arg(value_name = "SENSOR/TOPIC")]
     pub(crate) topics: Vec<String>,
-    /// Span of time that a line looks back on
+    /// Time span that each line covers
     #[arg(long, default_value = "10s", value_name = "DURATION", value_parser = duration::parse)]
     pub(crate) window: Duration,
     #[command(flatten)]

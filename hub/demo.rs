@@ -206,7 +206,7 @@ fn ended(of: usize) -> Failure {
         SIMULATOR => "the simulator",
         _ => "a consumer",
     };
-    Failure::new(Kind::Failed, format!("{who} ended early"), "what it said stands above")
+    Failure::new(Kind::Failed, format!("{who} ended early"), "its output is above")
 }
 
 const SENSORS: [&str; 2] = ["front", "rear"];

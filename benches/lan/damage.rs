@@ -2,7 +2,7 @@
 
 use std::process::Command;
 
-use schema::datagram::{HEAD, Head, MTU_ETHERNET, Packed, Refusal};
+use schema::datagram::{DatagramError, HEAD, Head, MTU_ETHERNET, Packed};
 use schema::{Topic, Verdict, Zones};
 
 use crate::source;
@@ -40,7 +40,7 @@ pub(crate) fn figures(count: u64) -> Outcome<Vec<Figure>> {
     let lines = listener.end()?;
     let of_class = |class| lines.iter().map(|(_, line)| line).filter(move |line| line["class"] == class);
     let refused = of_class("lan_refused").next().ok_or("no account")?;
-    let counts = Refusal::ALL.map(|reason| (reason.name(), number(refused, reason.name())));
+    let counts = DatagramError::ALL.map(|reason| (reason.name(), number(refused, reason.name())));
     let counted: u64 = counts.iter().map(|(_, count)| count).sum();
     for (name, count) in counts.iter().filter(|(_, count)| *count > 0) {
         eprintln!("refused as {name}: {count}");

@@ -19,27 +19,27 @@ pub(crate) struct Background {
 
 #[derive(Clone, Debug, Subcommand)]
 enum Order {
-    /// How many beams are known; with --json every range
+    /// Show how many beams are known; with --json, every range
     Show,
-    /// Forget it and learn it anew
+    /// Forget the model and learn it again
     Reset,
-    /// Keep it as it is: what stands there is not learned any more
+    /// Freeze the model: stop learning
     Freeze,
-    /// Learn on
+    /// Continue learning
     Thaw,
-    /// Write it to a file
+    /// Save the model to a file
     Save {
         /// The file; - is stdout
         file: PathBuf,
-        /// Replace what is there
+        /// Overwrite an existing file
         #[arg(short, long)]
         force: bool,
     },
-    /// Take a saved one for it
+    /// Load a saved model
     Load {
         /// The file; - is stdin
         file: PathBuf,
-        /// Also if it was saved from another sensor
+        /// Accept a model of another sensor
         #[arg(long)]
         any_sensor: bool,
     },

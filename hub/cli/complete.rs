@@ -1,5 +1,5 @@
-//! What the running hub adds to a completion: the names of its sensors, where the command line's definition takes one.
-//! Silent where there is nothing to add, because nobody reads errors while they type.
+//! What the running hub adds to a completion: the names of its sensors, where the command line takes one. It prints no
+//! errors, because nobody reads them while typing.
 
 use std::collections::VecDeque;
 
@@ -9,7 +9,7 @@ use schema::{Domain, Environment};
 use super::{Cli, command};
 use crate::print_own;
 
-/// Not for people: the scripts of `completions` ask it.
+/// Internal: the scripts of `completions` call it.
 #[derive(Args, Debug)]
 pub(crate) struct Complete {
     /// The words before the cursor, the program's name first
@@ -18,7 +18,7 @@ pub(crate) struct Complete {
 }
 
 impl Complete {
-    /// Prints what can stand next, a word a line.
+    /// Prints what can come next, one word a line.
     pub(crate) fn run(&self) {
         let line = Line::read(&command(), &self.words);
         let Some(name) = line.wanted else { return };
@@ -40,7 +40,7 @@ impl Complete {
     }
 }
 
-/// What of the hub's can stand somewhere.
+/// Which names of the hub can come next.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum Name {
     Sensor,
@@ -50,9 +50,9 @@ enum Name {
 /// A command line up to the cursor.
 #[derive(Debug, Default)]
 struct Line {
-    /// What stands next, if it is the hub's.
+    /// The name that comes next, if it is one of the hub.
     wanted: Option<Name>,
-    /// Whether all sensors together can stand there, too.
+    /// Whether `robot`, all sensors together, is accepted too.
     takes_robot: bool,
     values: Vec<(String, String)>,
 }
@@ -63,7 +63,7 @@ impl Line {
         let everywhere = Cli::command();
         let mut line = Line::default();
         let (mut command, mut positional) = (whole, 0);
-        // Some shells make words of their own of the signs in `--domain=robot`.
+        // Some shells split `--domain=robot` into three words.
         let mut words: VecDeque<&str> =
             words.iter().skip(1).map(String::as_str).filter(|word| *word != "=").collect();
         while let Some(word) = words.pop_front() {
@@ -105,7 +105,7 @@ impl Line {
     }
 }
 
-/// The option that `word` begins.
+/// The option that `word` starts with.
 fn option<'a>(command: &'a Command, word: &str) -> Option<&'a Arg> {
     let (bare, _) = word.split_once('=').unwrap_or((word, ""));
     let is_it = |arg: &&Arg| match (bare.strip_prefix("--"), bare.strip_prefix('-')) {
@@ -116,7 +116,7 @@ fn option<'a>(command: &'a Command, word: &str) -> Option<&'a Arg> {
     command.get_arguments().find(is_it)
 }
 
-/// What `arg` takes of a hub's: its value has that name.
+/// Which name of a hub `arg` takes; its value name tells.
 fn name(arg: &Arg) -> Option<Name> {
     let named = arg.get_value_names().and_then(|names| names.first()).map(|name| name.to_string());
     match named.unwrap_or_else(|| arg.get_id().to_string().to_uppercase()).as_str() {
@@ -126,7 +126,7 @@ fn name(arg: &Arg) -> Option<Name> {
     }
 }
 
-/// Behind bash's own script: what it knows, and what the hub knows.
+/// Appended to the script for bash: what the script knows, and what the hub knows.
 pub(super) const BASH: &str = r#"
 _scanhub_live() {
     _scanhub "$@"
@@ -138,7 +138,7 @@ _scanhub_live() {
 complete -F _scanhub_live -o bashdefault -o default scanhub
 "#;
 
-/// Behind zsh's: in place of file names.
+/// Appended to the script for zsh: replaces file names.
 pub(super) const ZSH: &str = r#"
 _scanhub_live() {
     local -a typed known
@@ -149,7 +149,7 @@ _scanhub_live() {
 }
 "#;
 
-/// Behind fish's.
+/// Appended to the script for fish.
 pub(super) const FISH: &str = r#"
 complete -c scanhub -a '(set -l typed (commandline -opc); $typed[1] complete -- $typed 2>/dev/null)'
 "#;

@@ -18,16 +18,16 @@ pub(crate) struct Config {
 
 #[derive(Debug, Subcommand)]
 enum Order {
-    /// Print a configuration to begin with, with the values that hold where nothing is said
+    /// Print a configuration to start from, with all default values
     Default,
-    /// Whether the configuration can be loaded; 78 and the place if not
+    /// Check the configuration; if it has an error, show the place and exit with 78
     Check {
-        /// This file instead of all the others
+        /// Check only this file
         file: Option<PathBuf>,
         #[command(flatten)]
         run: Run,
     },
-    /// Every value in effect, and where it is said
+    /// Show every value in effect and its origin
     Show {
         #[command(flatten)]
         run: Run,

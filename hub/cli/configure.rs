@@ -12,10 +12,10 @@ use super::probe::Progress;
 
 #[derive(Args, Debug)]
 pub(crate) struct Configure {
-    /// A tty or tcp:HOST:PORT
+    /// Port of the sensor: a tty or tcp:HOST:PORT
     #[arg(value_name = "PORT")]
     port: String,
-    /// unit=mm|cm, mode=NAME|0x01, availability=1|2|3, indices=on|off, sensitivity=standard|medium|low|high,
+    /// Settings to write: unit=mm|cm, mode=NAME|0x01, availability=1|2|3, indices=on|off, sensitivity=standard|medium|low|high,
     /// power_on_baud=9600|keep, configuration=HEX
     #[arg(value_name = "KEY=VALUE")]
     settings: Vec<String>,
@@ -24,8 +24,8 @@ pub(crate) struct Configure {
     password: String,
 }
 
-/// What the help says of who is asked.
-pub(crate) const CONSENT: &str = "A person has to confirm it: where stdin or stderr is no terminal, the difference is \
+/// Who must confirm, for the end of the help.
+pub(crate) const CONSENT: &str = "A person must confirm. If stdin or stderr is not a terminal, the difference is \
                                   shown, nothing is written, and the exit code is 2";
 
 impl Configure {
@@ -43,7 +43,7 @@ impl Configure {
             News::Difference(difference) => {
                 progress.clear();
                 crate::say(&if json { crate::line(difference) } else { difference.to_string() });
-                // Whoever is asked has to see it, wherever stdout leads.
+                // The person who confirms must see it, even if stdout is redirected.
                 if !stdout().is_terminal() && stderr().is_terminal() {
                     crate::complain(&difference.to_string());
                 }

@@ -11,7 +11,7 @@ use super::Everywhere;
 pub(crate) struct Control {
     /// The sensor
     sensor: String,
-    /// pause: the sensor stops; resume: it streams again; resync: the conversation with it begins anew
+    /// pause: stop the sensor; resume: stream again; resync: restart the session with the sensor
     #[arg(value_parser = verbs())]
     verb: Verb,
 }

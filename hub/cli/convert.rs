@@ -1,4 +1,4 @@
-//! `scanhub convert` on the command line: what it takes, and how it is told what came of it.
+//! `scanhub convert` on the command line: what it takes, and how it reports the result.
 
 use std::io::{IsTerminal, Write, stderr};
 use std::path::{Path, PathBuf};
@@ -16,26 +16,26 @@ use crate::{complain, line, print};
 
 #[derive(Args, Debug)]
 pub(crate) struct Convert {
-    /// The recording: MCAP file, telegram stream or CARMEN log, plain or gzipped, also a damaged one
+    /// Recording to read, damaged or not: MCAP file, telegram stream or CARMEN log, plain or gzipped
     #[arg(value_name = "IN")]
     input: PathBuf,
-    /// What it becomes, by its ending: .mcap, .bin (telegram stream), .log (CARMEN) or .csv (a row per scan), the last
-    /// three also with .gz; - is a telegram stream on stdout
+    /// Output file; its ending selects the format: .mcap, .bin (telegram stream), .log (CARMEN) or .csv (a row per scan),
+    /// the last three also with .gz; - is a telegram stream on stdout
     #[arg(value_name = "OUT")]
     output: PathBuf,
-    /// One sensor of the recording; of a stream or a log its name in the MCAP file [default: front]
+    /// Convert only this sensor; for a stream or a log, the name that it gets [default: front]
     #[arg(long, value_name = "NAME")]
     sensor: Option<String>,
-    /// An MCAP file of ROS 2 messages alone: scans as sensor_msgs/msg/LaserScan, and /tf_static from the poses
+    /// Write an MCAP file of ROS 2 messages only: scans as sensor_msgs/msg/LaserScan, and /tf_static from the poses
     #[arg(long)]
     ros2: bool,
-    /// With --ros2 or .csv: measuring mode of a recording that does not tell it, such as 0x01
+    /// With --ros2 or .csv: measuring mode of a recording that does not contain it, such as 0x01
     #[arg(long)]
     mode: Option<String>,
-    /// How an MCAP file is packed: zstd, lz4 or none [default: zstd]
+    /// Compression of an MCAP file: zstd, lz4 or none [default: zstd]
     #[arg(long, value_name = "NAME", value_parser = Compression::parse)]
     compression: Option<Compression>,
-    /// Overwrite what is there
+    /// Overwrite an existing file
     #[arg(short, long)]
     force: bool,
 }
@@ -94,7 +94,7 @@ impl Convert {
     }
 }
 
-/// The line that says what was converted; keys in the order of their contract.
+/// The line that reports the conversion; the order of the keys is part of the format.
 #[derive(Serialize)]
 struct Line<'a> {
     class: &'static str,
@@ -153,7 +153,7 @@ fn seconds(ns: u64) -> f64 {
     ns as f64 / 1e9
 }
 
-/// What the help says beside the flags.
+/// How a recording is repaired, for the end of the help.
 pub(crate) const REPAIR: &str = "\
-From MCAP to MCAP everything is copied, with a new index: a file that was cut or harmed becomes a whole one of all that
-could be had of it. Damage is told and is no failure: the exit code is 0 where the result is whole.";
+MCAP to MCAP copies everything and writes a new index: a cut or damaged file becomes a complete file with everything
+that could be read. Damage is reported but is not a failure: the exit code is 0 if the output is complete.";

@@ -12,10 +12,11 @@ use super::{Everywhere, Run};
 
 #[derive(Args, Debug)]
 pub(crate) struct Doctor {
-    /// A tty or tcp:HOST:PORT, or the name of a link of the running hub; without one those of the configuration, else all that there are
+    /// Ports to check: a tty or tcp:HOST:PORT, or the name of a link of the running hub; without one, the ports of the
+    /// configuration, else all ports
     #[arg(value_name = "PORT")]
     ports: Vec<String>,
-    /// First take away what dead processes left in this domain; nothing while a hub lives there
+    /// First remove what dead processes left in this domain; removes nothing while a hub runs there
     #[arg(long)]
     clean: bool,
     #[command(flatten)]

@@ -1,5 +1,5 @@
-//! An example for each verb, as its help and its manual page show it. A test reads every one of them as a command line, and
-//! so those of the pages.
+//! An example for each verb, as its help and its manual page show it. A test parses each of them as a command line, and
+//! the examples of the pages too.
 
 #[cfg(test)]
 #[path = "../../tests/it/pages/blocks.rs"]
@@ -36,7 +36,7 @@ fn below(verb: Command, lines: &[&str]) -> Command {
     verb.after_help(text)
 }
 
-/// By the way to the verb.
+/// Examples by the path to the verb.
 const EXAMPLES: &[(&str, &[&str])] = &[
     (
         "run",
@@ -145,7 +145,7 @@ mod tests {
     use super::*;
     use clap::ArgMatches;
 
-    /// What this program makes of the first command line of its in `line`.
+    /// How this program parses its first command line in `line`.
     fn read(line: &str) -> ArgMatches {
         let words = shell::of_the_program(line);
         let first = words.first().unwrap_or_else(|| panic!("nothing for this program: {line}"));
@@ -153,9 +153,9 @@ mod tests {
         read.unwrap_or_else(|error| panic!("{line}: {error}"))
     }
 
-    /// The ways to all verbs below `command`.
+    /// The paths to all verbs below `command`.
     fn paths(command: &Command, before: &str) -> Vec<String> {
-        // What nobody is told of needs no example.
+        // A hidden verb needs no example.
         let verbs = command.get_subcommands().filter(|verb| !verb.is_hide_set());
         let ways = verbs.flat_map(|verb| {
             let path = format!("{before}{}", verb.get_name());

@@ -13,28 +13,29 @@ use super::{Configured, Everywhere};
 /// Each flag is also a key of section `gateway` of the configuration, and wins over it.
 #[derive(Args, Debug, Default)]
 pub(crate) struct Gateway {
-    /// Network interface of the groups: whoever is on it can read all that is sent. Without one nothing goes to groups, and
-    /// hosts have to be named. lo is this machine alone
+    /// Network interface for the groups: everybody on that network can read what is sent. Without it, nothing is sent to
+    /// groups, and --to must name hosts. lo: this machine only
     #[arg(long, value_name = "NAME")]
     interface: Option<String>,
-    /// What goes out, front/scan, */scan for all sensors or front/* for all topics; :every=4 behind it keeps the samples of every fourth telegram.
-    /// May be given several times; without it all topics but telegrams, of all sensors
+    /// Topics to send: front/scan, */scan for all sensors or front/* for all topics. With :every=4, only the samples of
+    /// every fourth telegram. Can be repeated [default: all topics except telegrams, of all sensors]
     #[arg(long = "topic", value_name = "SENSOR/TOPIC[:every=N]")]
     topics: Vec<String>,
-    /// A host that gets copies, or [IPV6]:PORT; a name is asked for again while it runs. May be given
-    /// several times
+    // Help for people, in which brackets are no link.
+    #[allow(rustdoc::broken_intra_doc_links)]
+    /// Host that gets copies, HOST:PORT or [IPV6]:PORT; a name is resolved again while the gateway runs. Can be repeated
     #[arg(long, value_name = "HOST:PORT")]
     to: Vec<String>,
-    /// The telegrams and nothing else, without a header, each sensor's to a port of its own
+    /// Send only telegrams, without a header, each sensor on its own port
     #[arg(long, conflicts_with = "background_every")]
     bare: bool,
-    /// How many networks what goes to the groups may cross, the first one included [default: 1]
+    /// How many networks datagrams to the groups may cross, including the first one [default: 1]
     #[arg(long, value_name = "N")]
     ttl: Option<u8>,
-    /// The background goes out so often, and not only when it is a new one, for example 10s
+    /// Send the background also at this interval, not only when it is new, for example 10s
     #[arg(long, value_name = "DURATION", value_parser = duration::parse)]
     background_every: Option<Duration>,
-    /// The longest datagram in bytes, up to 1472 where no tunnel is on the way [default: 1372]
+    /// Longest datagram in bytes, up to 1472 if no tunnel is on the way [default: 1372]
     #[arg(long, value_name = "BYTES")]
     mtu: Option<usize>,
     #[command(flatten)]
@@ -45,19 +46,19 @@ impl Gateway {
     pub(crate) fn options(&self, everywhere: &Everywhere) -> Result<GatewayOptions, Failure> {
         let options = self.over(config::Gateway::load(&self.configured.sources())?, everywhere)?;
         if self.topics.is_empty() {
-            // They stand in the configuration.
+            // They come from the configuration.
             options.check().map_err(of_section)?;
         }
         Ok(options)
     }
 
-    /// Whether the section in `sources` is one that a gateway takes.
+    /// Checks that a gateway accepts the section in `sources`.
     pub(super) fn check(sources: &Sources, everywhere: &Everywhere) -> Result<(), Failure> {
         let checked = Gateway::default().over(config::Gateway::load(sources)?, everywhere)?.check();
         checked.map_err(of_section)
     }
 
-    /// These flags over what is `said` in the section.
+    /// These flags, and the values `said` in the section where a flag is missing.
     fn over(&self, said: config::Gateway, everywhere: &Everywhere) -> Result<GatewayOptions, Failure> {
         let every = background_every(&said)?;
         let or = |flags: &[String], said: Option<Vec<String>>| match flags {
@@ -86,7 +87,7 @@ fn of_section(failure: Failure) -> Failure {
     Failure::new(Kind::Configuration, format!("section gateway: {}", failure.message), failure.hint)
 }
 
-/// How often the configuration wants a background to go out.
+/// How often the configuration has the background sent.
 fn background_every(said: &config::Gateway) -> Result<Option<Duration>, Failure> {
     let every = said.background_every.as_ref().map(|(text, place)| {
         let refuse =
@@ -96,7 +97,7 @@ fn background_every(said: &config::Gateway) -> Result<Option<Duration>, Failure>
     every.transpose()
 }
 
-/// What the help says of where it sends.
+/// Where it sends, for the end of the help.
 pub(crate) const GROUPS: &str = "groups, port 22200: 239.255.76.80 announce, status; .81 zones, marks, foreground; \
 .82 scan, background; .83 telegram\nbare: 239.255.76.83, port 22201 for the first sensor, 22202 for the second ..\n\
-SIGUSR1: the account so far";
+SIGUSR1: print the counts so far";

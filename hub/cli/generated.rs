@@ -1,4 +1,4 @@
-//! What follows from the definition of the command line: completions for shells, and manual pages. Refuses to know any verb.
+//! What is generated from the definition of the command line: completions for shells, and manual pages. It knows no verb.
 
 use std::io;
 use std::path::{Path, PathBuf};
@@ -12,7 +12,7 @@ use crate::print_own;
 
 #[derive(Args, Debug)]
 pub(crate) struct Completions {
-    /// For which shell
+    /// Shell to print for
     shell: Shell,
 }
 
@@ -35,10 +35,10 @@ impl Completions {
         }
         let text = String::from_utf8_lossy(&text);
         let text = text.trim_end();
-        // What the definition cannot know is the hub's.
+        // The definition does not know the names of the hub.
         match self.shell {
             Shell::Bash => print_own(&format!("{text}\n{}", complete::BASH.trim_end())),
-            // The script's last lines call what stands before them.
+            // The last lines of the script call functions defined before them.
             Shell::Zsh => {
                 let (head, body) = text.split_once('\n').unwrap_or((text, ""));
                 let body = body.replace(":_default'", ":_scanhub_live'");
@@ -51,7 +51,7 @@ impl Completions {
 
 #[derive(Args, Debug)]
 pub(crate) struct Man {
-    /// Directory for a page of each verb, scanhub-run.1 ..; without it the page of the program, on stdout
+    /// Write one page per verb to this directory, scanhub-run.1 ..; without it, print the page of the program
     #[arg(value_name = "DIR")]
     directory: Option<PathBuf>,
 }

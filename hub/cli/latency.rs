@@ -12,16 +12,16 @@ use super::{Everywhere, Limits};
 
 #[derive(Args, Debug)]
 pub(crate) struct Latency {
-    /// What to follow: front/scan, rear/telegram, robot1.front/zones ..
+    /// Topics to follow: front/scan, rear/telegram, robot1.front/zones ..
     #[arg(required = true, value_name = "SENSOR/TOPIC")]
     topics: Vec<String>,
-    /// Exit 5 if more than one in a hundred samples of a topic is older on arrival, for example 1ms
+    /// Exit with 5 if more than one in a hundred samples of a topic is older on arrival, for example 1ms
     #[arg(long, value_name = "DURATION", value_parser = duration::parse)]
     max_p99: Option<Duration>,
     /// How to wait for samples
     #[arg(long, value_enum, default_value = "doorbell")]
     wait: By,
-    /// Neither real-time priority nor locked memory, also where they are permitted
+    /// Do not ask for real-time priority and locked memory
     #[arg(long)]
     no_realtime: bool,
     #[command(flatten)]
@@ -30,11 +30,11 @@ pub(crate) struct Latency {
 
 #[derive(Clone, Copy, Debug, ValueEnum)]
 enum By {
-    /// Asleep at a word in shared memory, at which one call of the hub wakes all
+    /// Sleep on a word in shared memory; one call of the hub wakes all
     Doorbell,
-    /// Asleep at the event that other languages listen to: one message of the hub to each consumer
+    /// Sleep on the event; the hub sends one message to each consumer
     Event,
-    /// Not asleep: takes a whole processor
+    /// Do not sleep; uses a whole processor
     Spin,
 }
 
@@ -57,8 +57,8 @@ impl Latency {
     }
 }
 
-/// What the help says of what is measured.
+/// What is measured, for the end of the help.
 pub(crate) const SPANS: &str = "line: first byte to last; network: a remote sensor's first byte to the arrival on this \
 machine, by the wall clocks of both; hub: last byte until sent; wake: sent until received; age: last byte, or arrival on \
-this machine, until received, which is what --max-p99 judges; total: all of it\n\n\
-A hundred scans a check: scanhub latency front/scan -n 100 --timeout 5s --max-p99 1ms";
+this machine, until received, which --max-p99 checks; total: all of it\n\n\
+To check a hundred scans: scanhub latency front/scan -n 100 --timeout 5s --max-p99 1ms";

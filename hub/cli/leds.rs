@@ -13,16 +13,16 @@ use super::{Everywhere, Limits};
 
 #[derive(Args, Debug)]
 pub(crate) struct Leds {
-    /// The sensor, or robot for the verdict over all of them
+    /// The sensor, or robot for the verdict over all sensors
     sensor: String,
-    /// Light-emitting diodes of this machine that show the lights as well: green=NAME, yellow=NAME, red=NAME, mark=NAME,
-    /// with commas between them; the red one is lit when nothing is known, and after the end
+    /// LEDs of this machine that show the lights too: green=NAME, yellow=NAME, red=NAME, mark=NAME, separated by commas;
+    /// red is lit when the verdict is unknown, and after the end
     #[arg(long = "led", value_name = "LIGHT=NAME", value_delimiter = ',')]
     leds: Vec<String>,
-    /// Where they are
+    /// Directory of the LEDs
     #[arg(long, default_value = "/sys/class/leds", value_name = "DIR")]
     led_root: PathBuf,
-    /// How long a better verdict has to stand until it is shown; a worse one is shown at once
+    /// How long a better verdict must last before it is shown; a worse one is shown at once
     #[arg(long, default_value = "300ms", value_name = "DURATION", value_parser = duration::parse)]
     hold: Duration,
     #[command(flatten)]
@@ -47,6 +47,6 @@ impl Leds {
     }
 }
 
-/// What the help says of how it reads.
+/// What the lights mean, for the end of the help.
 pub(crate) const MEANING: &str =
     "green: clear, yellow: slow, red: stop or unknown, mark: at least one reflector mark";

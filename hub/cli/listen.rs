@@ -10,23 +10,23 @@ use super::{Everywhere, Limits};
 
 #[derive(Args, Debug)]
 pub(crate) struct Listen {
-    /// Network interface to listen on; without it all that have a link
+    /// Network interface to listen on [default: all that have a link]
     #[arg(long, value_name = "IF")]
     interface: Option<String>,
-    /// Topic of all sensors to listen to, for example zones; all topics if none is named
+    /// Topic to listen to, of all sensors, for example zones [default: all topics]
     #[arg(long = "topic", value_name = "TOPIC")]
     topics: Vec<String>,
-    /// What to call a hub instead of its 16 hex digits, for example robot1=5f3a12bc00d1e2f3
+    /// Name a hub, instead of its 16 hex digits, for example robot1=5f3a12bc00d1e2f3
     #[arg(long = "name", value_name = "NAME=HUB")]
     names: Vec<String>,
-    /// Hub to hear, by its 16 hex digits or by the name that --name gives it; all if none is named
+    /// Hub to listen to, by its 16 hex digits or its name from --name [default: all]
     #[arg(long = "hub", value_name = "HUB")]
     hubs: Vec<String>,
-    /// Only the account: what was received, lost, doubled, out of order, refused
+    /// Print only the counts: received, lost, duplicate, reordered, refused
     #[arg(long)]
     stats: bool,
-    /// Publish what comes in the domain of this machine as HUB.SENSOR, instead of writing it, so that all programs here
-    /// follow remote sensors as they follow those of a hub
+    /// Publish the samples in this machine's domain as HUB.SENSOR instead of printing them, so that all programs here can
+    /// use them like sensors of a hub
     #[arg(long)]
     publish: bool,
     #[command(flatten)]
@@ -49,5 +49,5 @@ impl Listen {
     }
 }
 
-/// What the help says of signals.
-pub(crate) const SIGNALS: &str = "SIGUSR1: the account so far";
+/// What signals do, for the end of the help.
+pub(crate) const SIGNALS: &str = "SIGUSR1: print the counts so far";

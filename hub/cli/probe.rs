@@ -11,7 +11,7 @@ use tools::probe::{list, probe, source};
 
 #[derive(Args, Debug)]
 pub(crate) struct Probe {
-    /// A tty or tcp:HOST:PORT; without one the ports of this machine are listed
+    /// Port to look at: a tty or tcp:HOST:PORT; without one, the ports of this machine are listed
     #[arg(value_name = "PORT")]
     port: Option<String>,
 }
@@ -64,7 +64,7 @@ impl Progress {
         }
     }
 
-    /// What was done last stays, on a line of its own: it failed, and why comes next.
+    /// Keeps the last text on its own line: that step failed, and the reason is printed next.
     pub(crate) fn leave(&mut self) {
         if std::mem::take(&mut self.is_shown) {
             let _ = writeln!(stderr());
@@ -112,7 +112,7 @@ fn describe(candidate: &Candidate) -> String {
     let state = match (holder, is_permitted) {
         (Some(holder), _) => format!("in use by {holder}"),
         (None, true) => "free".to_owned(),
-        (None, false) => format!("no permission: scanhub doctor {} tells why", name.display()),
+        (None, false) => format!("no permission: scanhub doctor {} shows the reason", name.display()),
     };
     let device = (name != device).then(|| device.display().to_string());
     let facts: Vec<String> =

@@ -12,29 +12,29 @@ use super::{Everywhere, Limits};
 
 #[derive(Args, Debug)]
 pub(crate) struct Record {
-    /// What to record: front/telegram, */scan for all sensors, or front/* for all topics; without it telegram, marks, zones, foreground and status
-    /// of all sensors
+    /// Topics to record: front/telegram, */scan for all sensors, or front/* for all topics [default: telegram, marks,
+    /// zones, foreground and status of all sensors]
     #[arg(value_name = "SENSOR/TOPIC")]
     topics: Vec<String>,
-    /// Every topic of all sensors
+    /// Record every topic of all sensors
     #[arg(long, conflicts_with = "topics")]
     all: bool,
-    /// A file of ROS 2 messages alone: scans as sensor_msgs/msg/LaserScan, and /tf_static from the poses
+    /// Write ROS 2 messages only: scans as sensor_msgs/msg/LaserScan, and /tf_static from the poses
     #[arg(long)]
     ros2: bool,
-    /// How it is packed: zstd, lz4 or none
+    /// Compression: zstd, lz4 or none
     #[arg(long, value_name = "NAME", default_value = "zstd", value_parser = Compression::parse)]
     compression: Compression,
-    /// The recording; - for stdout [default: scanhub-DATE-TIME.mcap]
+    /// File to write; - for stdout [default: scanhub-DATE-TIME.mcap]
     #[arg(short, long, value_name = "FILE")]
     output: Option<PathBuf>,
-    /// Overwrite what is there; with --split go on behind the numbers that are there
+    /// Overwrite an existing file; with --split, continue after the existing numbers
     #[arg(short, long)]
     force: bool,
-    /// Go on in another file after so much or so long: 512MiB, 1h; they are called FILE-0001.mcap ..
+    /// Start another file after this size or time: 512MiB, 1h; the files are called FILE-0001.mcap ..
     #[arg(long, value_name = "SIZE|DURATION", value_parser = Split::parse)]
     split: Option<Split>,
-    /// Remove the oldest of these files when there are more
+    /// Keep this number of files; remove the oldest
     #[arg(long, value_name = "COUNT", requires = "split", value_parser = clap::value_parser!(u32).range(1..))]
     keep: Option<u32>,
     #[command(flatten)]
@@ -42,7 +42,7 @@ pub(crate) struct Record {
 }
 
 impl Record {
-    /// Stdout takes the recording, and nothing else.
+    /// Stdout carries the recording and nothing else.
     pub(crate) fn is_to_stdout(&self) -> bool {
         self.output.as_deref() == Some(Path::new(RecordOptions::STDOUT))
     }
@@ -69,7 +69,7 @@ impl Record {
     }
 }
 
-/// What the help says beside the flags.
+/// How the files are read, for the end of the help.
 pub(crate) const READING: &str = "\
-The files are MCAP: any reader of that reads them, `scanhub replay FILE` plays them. Ctrl-C finishes the file. On a full
-disk it waits and goes on; what is missing then is said, and is a gap in the file's numbers.";
+The files are MCAP: any MCAP reader opens them, `scanhub replay FILE` plays them. Ctrl-C finishes the file. On a full
+disk it waits and continues; it reports what is missing, which is a gap in the file's numbers.";

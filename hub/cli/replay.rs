@@ -12,27 +12,27 @@ use super::Configured;
 
 #[derive(Args, Debug)]
 pub(crate) struct Replay {
-    /// MCAP recording, telegram stream or CARMEN log, plain or gzipped
+    /// Recording to play: MCAP file, telegram stream or CARMEN log, plain or gzipped
     pub(crate) file: PathBuf,
-    /// How many times as fast as it was recorded, 0.015625 to 64, or max: as fast as it can be read
+    /// Speed relative to the recording, 0.015625 to 64, or max: as fast as it can be read
     #[arg(long, default_value = "1", value_name = "FACTOR|max", value_parser = pace)]
     rate: Pace,
-    /// Begin anew at the end, until Ctrl-C; what was learned is forgotten then
+    /// Start again at the end, until Ctrl-C; each lap forgets what was learned
     #[arg(long = "loop", conflicts_with = "hold")]
     is_looped: bool,
-    /// Publish from here on, for example 90s; what comes before is read and learned from
+    /// Start publishing here, for example 90s; the part before it is only learned from
     #[arg(long, value_name = "DURATION", value_parser = duration::parse)]
     start: Option<Duration>,
-    /// Publish up to here
+    /// Stop publishing here
     #[arg(long, value_name = "DURATION", value_parser = duration::parse)]
     end: Option<Duration>,
     /// Wait before the first telegram, until a key or `scanhub control SENSOR resume`
     #[arg(long)]
     paused: bool,
-    /// Stay at the end, silent, until Ctrl-C
+    /// Stay at the end, without publishing, until Ctrl-C
     #[arg(long)]
     pub(crate) hold: bool,
-    /// Of several sensors the only one; the name of the one that a stream or a log does not name [default: front]
+    /// Play only this sensor; for a stream or a log, the name that it gets [default: front]
     #[arg(long, value_name = "NAME")]
     pub(crate) sensor: Option<String>,
     #[command(flatten)]
@@ -40,7 +40,7 @@ pub(crate) struct Replay {
 }
 
 impl Replay {
-    /// What is asked of the player.
+    /// The options of the player.
     ///
     /// [`Kind::Usage`] if it ends before it starts.
     pub(crate) fn play(&self) -> Result<Play, Failure> {
@@ -75,10 +75,10 @@ fn pace(text: &str) -> Result<Pace, String> {
 /// The keys, for the end of the help.
 pub(crate) const KEYS: &str = "\
 Keys:
-  space         pause, and go on
-  . or right    one telegram, of whichever sensor has the next one, and pause
+  space         pause, and continue
+  . or right    play one telegram, of the sensor that has the next one, and pause
   + and -       twice as fast, half as fast
-  q             end";
+  q             quit";
 
 #[cfg(test)]
 mod tests {

@@ -11,20 +11,20 @@ use verbs::duration;
 
 #[derive(Args, Debug)]
 pub(crate) struct Simulate {
-    /// Where each sensor's pty shall appear, as a symlink
+    /// Where to create each sensor's pty, as a symlink
     #[arg(long, required = true, value_name = "PATH")]
     port: Vec<PathBuf>,
     /// Rate of the line: 9600, 19200, 38400 or 500000 [default: the permanent rate]
     #[arg(long, value_name = "RATE")]
     baud: Option<String>,
-    /// Rate at power-on that a former owner wrote into the sensor [default: 9600]
+    /// Rate at power-on, stored in the sensor by an earlier owner [default: 9600]
     #[arg(long, value_name = "RATE")]
     permanent_baud: Option<String>,
-    /// What a host that is gone left the sensors doing: idle, streaming, partial, means, range, mean-range, fields,
-    /// reflectivity, installation; or starting, if they get their power now
+    /// State in which an earlier host left the sensors: idle, streaming, partial, means, range, mean-range, fields,
+    /// reflectivity, installation; or starting, if power comes on now
     #[arg(long, default_value = "idle", value_name = "STATE")]
     state: String,
-    /// From power-on to the banner
+    /// Time from power-on to the banner
     #[arg(long, default_value = "2s", value_name = "DURATION", value_parser = duration::parse)]
     boot: Duration,
     /// The sensors' own address, 0 to 127; they answer to 0 too
@@ -34,13 +34,13 @@ pub(crate) struct Simulate {
     /// crowd, demo, empty, wall640 or random; or a TOML file, see docs/worlds.md
     #[arg(long, default_value = "room", value_name = "NAME|FILE", conflicts_with = "replay")]
     world: String,
-    /// A recording to send instead: MCAP file, telegram stream or CARMEN log, plain or gzipped
+    /// Recording to send instead: MCAP file, telegram stream or CARMEN log, plain or gzipped
     #[arg(long, value_name = "FILE")]
     replay: Option<PathBuf>,
     /// Which sensor of the recording, if it has several: one for all ports, or one for each in their order
     #[arg(long, value_name = "NAME")]
     sensor: Vec<String>,
-    /// Begin the recording anew at its end
+    /// Start the recording again at its end
     #[arg(long = "loop")]
     looped: bool,
     /// How many times faster than the clock everything runs, the bit time too
@@ -49,13 +49,13 @@ pub(crate) struct Simulate {
     /// Seed of worlds, delays and faults
     #[arg(long, default_value_t = 0)]
     seed: u64,
-    /// What goes wrong, for example loss=0.00135,burst=1.89; see below
+    /// Faults to inject, for example loss=0.00135,burst=1.89; see below
     #[arg(long, default_value = "", hide_default_value = true, value_name = "KEY=VALUE,..")]
     fault: String,
-    /// File for a line of JSON per telegram: what was sent, with its hash
+    /// Write one JSON line per telegram to this file: what was sent, with its hash
     #[arg(long, value_name = "FILE")]
     truth: Option<PathBuf>,
-    /// What the sensors call themselves, and what they cannot do: lms200, lms211, lms221 or lms291
+    /// Type of the sensors, which also limits what they support: lms200, lms211, lms221 or lms291
     #[arg(long = "type", default_value = "lms200", value_name = "TYPE")]
     family: String,
     /// Angle and resolution [default: the recording's, else 180/0.5, or 100/0.5 of an lms211]
@@ -67,16 +67,16 @@ pub(crate) struct Simulate {
     /// Measuring mode [default: the recording's, else 0x01]
     #[arg(long, value_name = "BYTE")]
     mode: Option<String>,
-    /// Measured values end with scan and telegram index
+    /// End measured values with scan and telegram index
     #[arg(long)]
     indices: bool,
-    /// The configuration has 32 bytes, as with older firmware
+    /// Report a configuration of 32 bytes, as older firmware does
     #[arg(long)]
     short_configuration: bool,
-    /// The byte that ends each reply: 0x10 healthy, 0x11 news, 0x12 warning, 0x13 error
+    /// Status byte that ends each reply: 0x10 healthy, 0x11 news, 0x12 warning, 0x13 error
     #[arg(long, default_value = "0x10", value_name = "BYTE")]
     status: String,
-    /// An error that the sensors tell when asked, such as 3:18, or 0x84:22 for one that is over
+    /// An error that the sensors report, such as 3:18, or 0x84:22 for a past one
     #[arg(long, value_name = "TYPE:NUMBER")]
     error: Vec<String>,
     /// Transparency of the front window in percent: a warning below 75, an error below 30

@@ -13,24 +13,24 @@ pub(crate) struct Telegram {
 
 #[derive(Debug, Subcommand)]
 pub(crate) enum Way {
-    /// Bytes to words: the telegrams in a recording, a pipe, or text such as 02 00 01 00 31 15 12
+    /// Decode bytes to text: the telegrams in a recording, a pipe, or text such as 02 00 01 00 31 15 12
     Decode(Decode),
-    /// Words to bytes, which are printed and not sent
+    /// Encode a telegram and print its bytes; nothing is sent
     #[command(after_help = tools::telegram::names())]
     Encode(Encode),
 }
 
 #[derive(Args, Debug)]
 pub(crate) struct Decode {
-    /// File with the bytes, as they came down a line or as text, or an MCAP recording; - or nothing is stdin
+    /// File with the bytes, raw or as text, or an MCAP recording; - or nothing is stdin
     file: Option<PathBuf>,
-    /// Of a recording of several sensors the one whose telegrams are meant
+    /// Decode only this sensor, if the recording has several
     #[arg(long, value_name = "NAME")]
     sensor: Option<String>,
-    /// Measuring mode of the values, for example 0x01 [default: what the telegrams tell]
+    /// Measuring mode of the values, for example 0x01 [default: the mode in the telegrams]
     #[arg(long, value_name = "BYTE")]
     mode: Option<String>,
-    /// Every value of long lists
+    /// Print every value of long lists
     #[arg(long)]
     all: bool,
 }
@@ -53,7 +53,7 @@ pub(crate) struct Encode {
     /// Status byte of a reply [default: 0x10]
     #[arg(long, value_name = "BYTE")]
     status: Option<String>,
-    /// The bytes themselves instead of hexadecimal text
+    /// Print raw bytes instead of hexadecimal text
     #[arg(long, conflicts_with = "json")]
     raw: bool,
 }

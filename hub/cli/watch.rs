@@ -10,7 +10,7 @@ use super::{Everywhere, Limits};
 
 #[derive(Args, Debug)]
 pub(crate) struct Watch {
-    /// The sensors; all of the hub if none is named
+    /// Sensors to show [default: all]
     #[arg(value_name = "SENSOR")]
     sensors: Vec<String>,
     #[command(flatten)]
@@ -35,16 +35,16 @@ impl Watch {
     }
 }
 
-/// Stdout is a terminal that can place signs.
+/// Whether stdout is a terminal with cursor control.
 pub(crate) fn can_show_pictures() -> bool {
     stdout().is_terminal() && std::env::var_os("TERM").is_none_or(|term| term != "dumb")
 }
 
-/// Nobody said that there shall be none (<https://no-color.org>: by anything but nothing).
+/// Whether colours are wanted: `NO_COLOR` is unset or empty (<https://no-color.org>).
 pub(crate) fn colours() -> bool {
     std::env::var_os("NO_COLOR").is_none_or(|value| value.is_empty())
 }
 
-/// What the help says beside the flags.
+/// The keys, for the end of the help.
 pub(crate) const KEYS: &str = "\
-Keys: q ends it, ? explains the rest. NO_COLOR=1 shows signs instead of colours. From elsewhere: ssh -t robot scanhub watch.";
+Keys: q quits, ? lists the other keys. NO_COLOR=1 shows signs instead of colours. From another machine: ssh -t robot scanhub watch.";

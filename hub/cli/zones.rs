@@ -21,14 +21,14 @@ pub(crate) struct Zones {
 
 #[derive(Debug, Subcommand)]
 enum Order {
-    /// Learn what the sensor sees of its own robot, and print it as configuration: stand the robot in the open and let
-    /// nobody come near
+    /// Learn what the sensor sees of its own robot, and print it as configuration. Place the robot in an open area with
+    /// nobody near it
     Mask {
         /// How long to look, for example 10s
         #[arg(long = "for", default_value = "10s", value_name = "DURATION", value_parser = duration::parse)]
         run_for: Duration,
-        /// What is nearer than so many metres to the robot's centre may be its body; by default the largest circle of
-        /// the zones
+        /// Only points within this distance (metres) of the robot's centre can be its body [default: the largest circle
+        /// of the zones]
         #[arg(long, value_name = "RADIUS")]
         within: Option<f64>,
     },

@@ -34,7 +34,7 @@ impl View {
         let seconds = elapsed.as_secs();
         let mut lines = vec![
             format!(
-                "scanhub demo  {:02}:{:02}   the hub uses {:.1} % of a processor   Ctrl-C ends it",
+                "scanhub demo  {:02}:{:02}   the hub uses {:.1} % of a processor   Ctrl-C quits",
                 seconds / 60,
                 seconds % 60,
                 account.hub_cpu_percent

@@ -98,9 +98,9 @@ fn text_of(progress: &Progress, brevity: u32) -> String {
         text += &format!("  lap {}", lap + 1);
     }
     let (state, keys) = match (is_over, is_paused) {
-        (true, _) => ("  at its end", "; q ends"),
-        (_, true) => ("  paused", "; space goes on, . steps, q ends"),
-        _ => ("", "  space pauses, + - rate, q ends"),
+        (true, _) => ("  at its end", "; q quits"),
+        (_, true) => ("  paused", "; space continues, . steps, q quits"),
+        _ => ("", "  space pauses, + - rate, q quits"),
     };
     text += if brevity < SHORTEST { state } else { "" };
     text + if brevity < 3 { keys } else { "" }
@@ -148,15 +148,15 @@ mod tests {
             now_ns: 2,
         };
         let begin = "1:05.2 [##########..........] 2:10.5  x0.5  7 telegrams  ";
-        assert_eq!(text(&progress, usize::MAX), format!("{begin}space pauses, + - rate, q ends"));
+        assert_eq!(text(&progress, usize::MAX), format!("{begin}space pauses, + - rate, q quits"));
         let open = Progress { length_ns: None, pace: Pace::Max, lap: 1, is_paused: true, ..progress };
         assert_eq!(
             text(&open, 200),
-            "1:05.2  x max  7 telegrams  lap 2  paused; space goes on, . steps, q ends"
+            "1:05.2  x max  7 telegrams  lap 2  paused; space continues, . steps, q quits"
         );
         for (columns, narrow) in [
-            (80, "1:05.2 [#####.....] 2:10.5  x0.5  7 telegrams  space pauses, + - rate, q ends"),
-            (70, "1:05.2 [#####.....] 2:10.5  x0.5  space pauses, + - rate, q ends"),
+            (80, "1:05.2 [#####.....] 2:10.5  x0.5  7 telegrams  space pauses, + - rate, q quits"),
+            (70, "1:05.2 [#####.....] 2:10.5  x0.5  space pauses, + - rate, q quits"),
             (64, "1:05.2 [#####.....] 2:10.5  x0.5"),
             (30, "1:05.2 of 2:10.5  x0.5"),
             (17, "1:05.2  x0.5"),
@@ -166,7 +166,7 @@ mod tests {
             assert_eq!(text(&progress, columns), narrow, "{columns}");
         }
         let paused = Progress { is_paused: true, ..progress };
-        let steps = "1:05.2 [#####.....] 2:10.5  x0.5  paused; space goes on, . steps, q ends";
+        let steps = "1:05.2 [#####.....] 2:10.5  x0.5  paused; space continues, . steps, q quits";
         assert_eq!((&text(&paused, 80)[..], &text(&paused, 15)[..]), (steps, "1:05.2  paused"));
         assert_eq!(clock(3_725_000_000_000), "1:02:05.0");
     }

@@ -14,6 +14,10 @@ pub(crate) fn failure(root: &Path, what: impl Into<String>) -> Failure {
         .or_else(|| shortage::found(root))
         .or_else(|| strangers(root).first().map(in_the_way))
         .unwrap_or_else(|| {
-            Failure::new(Kind::Failed, what, "IOX2_LOG_LEVEL=debug shows what the shared memory says")
+            Failure::new(
+                Kind::Failed,
+                what,
+                "IOX2_LOG_LEVEL=debug shows the messages of the shared-memory library",
+            )
         })
 }

@@ -1,24 +1,24 @@
 //! The LAN form of a sample: one datagram, readable without a library, checked before anything of it is believed. Refuses
 //! to know sockets, who sent it and what is missing between two of them. Needs neither shared memory nor a heap.
 
-mod account;
 mod announce;
+mod datagram_error;
 mod lives;
 mod numbers;
 mod payload;
-mod refusal;
 mod standing;
+mod stream_stats;
 mod voices;
 
 use crc::{CRC_32_ISCSI, Crc, Table};
 
-pub use account::{Account, GivenUp, ROWS};
 pub use announce::{Announce, Announced};
+pub use datagram_error::DatagramError;
 pub use lives::LIVES;
 pub use numbers::{Fresh, Row, WINDOW};
 pub use payload::{Packed, telegram};
-pub use refusal::Refusal;
 pub use standing::{Arrival, Standing};
+pub use stream_stats::{GivenUp, ROWS, StreamStats};
 
 use crate::{Telegram, Topic};
 
@@ -113,34 +113,35 @@ impl Head {
 
 impl<'a> Datagram<'a> {
     /// Checks `bytes`, a whole datagram as it was received.
-    pub fn read(bytes: &'a [u8]) -> Result<Datagram<'a>, Refusal> {
-        let (head, _) = bytes.split_first_chunk::<HEAD>().ok_or(Refusal::Short)?;
+    pub fn read(bytes: &'a [u8]) -> Result<Datagram<'a>, DatagramError> {
+        let (head, _) = bytes.split_first_chunk::<HEAD>().ok_or(DatagramError::Short)?;
         if &head[..4] != MAGIC {
-            return Err(Refusal::Magic);
+            return Err(DatagramError::Magic);
         }
         if head[4] != VERSION {
-            return Err(Refusal::Version);
+            return Err(DatagramError::Version);
         }
         let begin = usize::from(head[5]);
         if begin < HEAD || begin > bytes.len() {
-            return Err(Refusal::Header);
+            return Err(DatagramError::Header);
         }
         let two = |at: usize| u16::from_le_bytes([head[at], head[at + 1]]);
         let four = |at: usize| u32::from_le_bytes(std::array::from_fn(|i| head[at + i]));
         let eight = |at: usize| u64::from_le_bytes(std::array::from_fn(|i| head[at + i]));
         let flags = head[7];
-        let (payload, mac) = bytes[begin..].split_at_checked(usize::from(two(36))).ok_or(Refusal::Length)?;
+        let (payload, mac) =
+            bytes[begin..].split_at_checked(usize::from(two(36))).ok_or(DatagramError::Length)?;
         let mac = match (flags & LanFlags::AUTHENTICATED != 0, mac) {
             (false, []) => None,
-            (true, mac) => Some(mac.try_into().map_err(|_| Refusal::Length)?),
-            _ => return Err(Refusal::Length),
+            (true, mac) => Some(mac.try_into().map_err(|_| DatagramError::Length)?),
+            _ => return Err(DatagramError::Length),
         };
         let mut digest = CRC.digest();
         digest.update(&bytes[..CRC_AT]);
         digest.update(&[0; HEAD - CRC_AT]);
         digest.update(&bytes[HEAD..]);
         if digest.finalize() != four(CRC_AT) {
-            return Err(Refusal::Crc);
+            return Err(DatagramError::Crc);
         }
         let head = Head {
             topic: head[6],
@@ -214,16 +215,20 @@ mod tests {
             bytes[at] = byte;
             Datagram::read(&bytes).unwrap_err()
         };
-        assert_eq!(Datagram::read(&good[..47]), Err(Refusal::Short));
-        assert_eq!(with(0, b'X'), Refusal::Magic);
-        assert_eq!(with(4, 2), Refusal::Version);
-        assert_eq!((with(5, 47), with(5, 53)), (Refusal::Header, Refusal::Header));
+        assert_eq!(Datagram::read(&good[..47]), Err(DatagramError::Short));
+        assert_eq!(with(0, b'X'), DatagramError::Magic);
+        assert_eq!(with(4, 2), DatagramError::Version);
+        assert_eq!((with(5, 47), with(5, 53)), (DatagramError::Header, DatagramError::Header));
         assert_eq!(
             (with(36, 3), with(36, 5), with(7, 1)),
-            (Refusal::Length, Refusal::Length, Refusal::Length)
+            (DatagramError::Length, DatagramError::Length, DatagramError::Length)
         );
-        assert_eq!((with(44, 0), with(51, 0)), (Refusal::Crc, Refusal::Crc));
-        assert_eq!(Datagram::read(&[&good[..], &[0]].concat()), Err(Refusal::Length), "nothing may follow");
+        assert_eq!((with(44, 0), with(51, 0)), (DatagramError::Crc, DatagramError::Crc));
+        assert_eq!(
+            Datagram::read(&[&good[..], &[0]].concat()),
+            Err(DatagramError::Length),
+            "nothing may follow"
+        );
     }
 
     #[test]

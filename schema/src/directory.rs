@@ -258,7 +258,7 @@ impl Walk {
             let (path, mode) = (self.path.display(), stat.st_mode & 0o7777);
             // One that all are to write to, as /tmp, stays so.
             let hint = if mode & STICKY != 0 {
-                format!("choose a directory of your own, for example --root {path}/NAME")
+                format!("choose your own directory, for example --root {path}/NAME")
             } else {
                 format!("chmod go-w {path}, or choose another --root")
             };
@@ -300,7 +300,7 @@ fn planted(path: &Path, what: &str) -> Failure {
     let path = path.display();
     Failure::new(
         Kind::Failed,
-        format!("{path} {what}: nothing of it is opened"),
+        format!("{path} {what}: scanhub opens nothing in it"),
         format!("look at it with `ls -ld {path}` and remove it, or choose another --root"),
     )
 }

@@ -244,10 +244,10 @@ fn node(domain: &Domain, cleanup: bool) -> Result<Node, Failure> {
         None
     };
     let no_names = || {
-        let hint = "its hub is just starting or ending, or is of another version";
+        let hint = "its hub is just starting or ending, or has another version";
         Failure::new(
             Kind::NoHub,
-            format!("{} does not tell how shared memory is named", root.display()),
+            format!("{} does not contain the name of the shared memory", root.display()),
             hint,
         )
     };

@@ -96,7 +96,7 @@ impl File {
             (f64::from(first_angle_mdeg) / 1000.0, f64::from(step_mdeg) / 1000.0);
         if (self.first_angle_deg, self.step_deg) != (first_angle_deg, step_deg) {
             return Err(format!(
-                "{count} beams begin at {first_angle_deg} degrees in steps of {step_deg}, not at {} in steps of {}",
+                "{count} beams start at {first_angle_deg} degrees in steps of {step_deg}, not at {} in steps of {}",
                 self.first_angle_deg, self.step_deg
             ));
         }
@@ -228,7 +228,7 @@ mod tests {
             (
                 "\"count\":181",
                 "\"count\":361",
-                "361 beams begin at 0 degrees in steps of 0.5, not at 0 in steps",
+                "361 beams start at 0 degrees in steps of 0.5, not at 0 in steps",
             ),
             ("\"step_deg\":1.0", "\"step_deg\":null", "invalid type: null, expected f64"),
             ("\"unit_mm\":10", "\"unit_mm\":2", "unit_mm is 2, and a unit is 1, 10 or 100 mm"),

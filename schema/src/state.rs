@@ -54,7 +54,7 @@ impl StateDirectory {
             Err(error) => Err(Failure::new(
                 Kind::Failed,
                 format!("cannot use {}: {error}", path.display()),
-                "delete it; what it held is learned again",
+                "delete it; its content is learned again",
             )),
         }
     }
@@ -69,7 +69,7 @@ impl StateDirectory {
             Failure::new(
                 Kind::Failed,
                 what,
-                "let STATE_DIRECTORY or XDG_STATE_HOME name a directory of this user",
+                "set STATE_DIRECTORY or XDG_STATE_HOME to a directory of this user",
             )
         })
     }

@@ -9,7 +9,7 @@ mod values;
 mod vectors;
 
 use schema::Topic;
-use schema::datagram::{Account, Datagram, Fresh, HEAD, Head, LanFlags, MTU_SAFE, Refusal};
+use schema::datagram::{Datagram, DatagramError, Fresh, HEAD, Head, LanFlags, MTU_SAFE, StreamStats};
 use vectors::{Vector, bytes, vectors};
 
 fn vector(name: &str) -> Vec<u8> {
@@ -104,7 +104,7 @@ fn these_bytes_are_values_or_refused() {
         if says["with_key"] == true {
             continue;
         }
-        let mut account = Account::new(&Topic::ALL);
+        let mut account = StreamStats::new(&Topic::ALL);
         for before in says["after"].as_array().into_iter().flatten() {
             account.receive(&vector(before.as_str().unwrap().trim_end_matches(".hex")), 1, 0).unwrap();
         }
@@ -126,7 +126,7 @@ fn these_bytes_are_values_or_refused() {
         };
         let refused = result.map(|_| ()).unwrap_err();
         assert_eq!(refused.name(), refusal, "{file}");
-        for reason in Refusal::ALL {
+        for reason in DatagramError::ALL {
             assert_eq!(account.refused(reason), u64::from(reason == refused), "{file}, {}", reason.name());
         }
     }
@@ -135,7 +135,7 @@ fn these_bytes_are_values_or_refused() {
 #[test]
 fn every_reason_has_its_datagram() {
     let vectors = vectors();
-    for reason in Refusal::ALL {
+    for reason in DatagramError::ALL {
         assert!(vectors.iter().any(|vector| vector.says["refusal"] == reason.name()), "{}", reason.name());
     }
 }
@@ -173,7 +173,7 @@ fn the_page_shows_these_bytes() {
     assert_eq!(section("Payloads").split("```").nth(1), Some(example.as_str()));
     let reasons = rows("What a receiver refuses");
     let reasons = reasons.iter().skip(1).map(|row| row[0].trim_matches('`'));
-    assert!(reasons.eq(Refusal::ALL.map(Refusal::name)));
+    assert!(reasons.eq(DatagramError::ALL.map(DatagramError::name)));
 }
 
 fn sealed(head: Head, payload: &[u8]) -> Vec<u8> {

@@ -128,7 +128,7 @@ fn the_last_one_out_takes_the_names_along() {
     drop(listener);
     assert_eq!((prefix(), files()), (None, Vec::new()));
     let failure = ipc::client_node(&place.domain).unwrap_err();
-    assert!(failure.message.contains("does not tell how shared memory is named"), "{failure}");
+    assert!(failure.message.contains("does not contain the name of the shared memory"), "{failure}");
     let _lock = HubLock::acquire(root).unwrap();
     assert!(prefix().is_some_and(|second| second != first));
 }

@@ -1,7 +1,7 @@
 //! What has to hold whatever a network carries: datagrams are refused, or they say what can be said again.
 
 use schema::datagram::{
-    Account, Announce, Datagram, Fresh, GivenUp, HEAD, Head, MTU_ETHERNET, Packed, ROWS, Refusal,
+    Announce, Datagram, DatagramError, Fresh, GivenUp, HEAD, Head, MTU_ETHERNET, Packed, ROWS, StreamStats,
 };
 use schema::{Background, Foreground, Marks, Scan, Status, Topic, Zones};
 
@@ -11,7 +11,7 @@ use schema::{Background, Foreground, Marks, Scan, Status, Topic, Zones};
 /// A piece begins with a byte and its length in two more. Odd: a header in short and a payload, to which a checksum is
 /// made; even: a datagram as it is.
 pub(crate) fn lan(data: &[u8]) {
-    let mut account = Box::new(Account::new(&Topic::ALL));
+    let mut account = Box::new(StreamStats::new(&Topic::ALL));
     let mut rest = data;
     let (mut given, mut accepted) = (0, 0);
     while let [mode, low, high, after @ ..] = rest {
@@ -44,11 +44,11 @@ pub(crate) fn lan(data: &[u8]) {
             Err(refusal) => {
                 assert_eq!(figures(&account), before, "{refusal:?}");
                 let read = Datagram::read(bytes).map(|_| ());
-                assert!(read == Err(refusal) || read.is_ok() && refusal > Refusal::Crc, "{refusal:?}");
+                assert!(read == Err(refusal) || read.is_ok() && refusal > DatagramError::Crc, "{refusal:?}");
             }
         }
     }
-    let refused: u64 = Refusal::ALL.iter().map(|&refusal| account.refused(refusal)).sum();
+    let refused: u64 = DatagramError::ALL.iter().map(|&refusal| account.refused(refusal)).sum();
     let given_up = account.given_up();
     let in_rows: u64 = account.rows().map(|row| row.received + row.duplicate).sum();
     let counted = in_rows + given_up.received + given_up.duplicate;
@@ -57,7 +57,7 @@ pub(crate) fn lan(data: &[u8]) {
 }
 
 /// Received, lost, duplicate and reordered of each row, and what was given up.
-fn figures(account: &Account) -> (Vec<[u64; 4]>, GivenUp) {
+fn figures(account: &StreamStats) -> (Vec<[u64; 4]>, GivenUp) {
     let rows = account.rows().map(|row| [row.received, row.lost(), row.duplicate, row.reordered]);
     (rows.collect(), account.given_up())
 }

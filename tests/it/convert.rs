@@ -51,7 +51,7 @@ fn bytes_between_telegrams_are_counted_by_whoever_reads_them() {
     assert_eq!((&line["telegrams"], &line["missing"]["bytes"]), (&json!(8), &json!(31_002)));
     assert_eq!(line["sensors"], json!(["front"]));
     let outcome = env.run(&["convert", &stream, &mcap, "--force"]);
-    assert!(outcome.errors.contains("31002 bytes that are in nothing"), "{outcome}");
+    assert!(outcome.errors.contains("31002 bytes outside any telegram"), "{outcome}");
     let outcome = env.run(&["telegram", "decode", &stream, "--json"]);
     let summary = outcome.of_class("summary").pop().unwrap_or_else(|| panic!("{outcome}"));
     assert_eq!((&summary["telegrams"], &summary["bytes_discarded"]), (&json!(8), &json!(31_002)));
@@ -61,7 +61,7 @@ fn bytes_between_telegrams_are_counted_by_whoever_reads_them() {
     let counters = &info["counters"];
     assert_eq!((&counters["telegrams"], &counters["bytes_discarded"]), (&json!(8), &json!(31_002)));
     let outcome = hub.end(testkit::INT);
-    assert!(outcome.errors.contains("missing: 31002 bytes that are in nothing"), "{outcome}");
+    assert!(outcome.errors.contains("missing: 31002 bytes outside any telegram"), "{outcome}");
 }
 
 #[test]
@@ -72,7 +72,7 @@ fn what_cannot_be_converted_is_refused() {
     for (arguments, code, says) in [
         (["convert", &stream[..], &stream[..]], 73, "both read and written"),
         (["convert", &stream, &there], 73, "--force replaces it"),
-        (["convert", &stream, "x.txt"], 2, "tells no form"),
+        (["convert", &stream, "x.txt"], 2, "is not a known format"),
         (["convert", &there, "x.mcap"], 66, "no telegram in it"),
         (["convert", "/no/such/file", "x.mcap"], 66, "/no/such/file"),
     ] {

@@ -7,7 +7,7 @@ use std::os::unix::fs::{PermissionsExt, symlink};
 use std::os::unix::process::CommandExt;
 use std::process::Command;
 
-use crate::testkit::{Findings, Line, Program, TestEnv, open_line, skip};
+use crate::testkit::{Findings, Line, Program, TestEnv, open_line, side_by_side, skip};
 
 /// What a simulated sensor has, and what the doctor says of it.
 const SENSORS: [(&str, &[&str], &str, &str, &str); 10] = [
@@ -42,28 +42,28 @@ const SENSORS: [(&str, &[&str], &str, &str, &str); 10] = [
         &["--state=streaming", "--baud=38400", "--fault=overlook=1"],
         "sensor",
         "failed",
-        "the wire that goes to it",
+        "the wire to its receiver",
     ),
     (
         "noise is all that comes",
         &["--state=streaming", "--baud=500000", "--fault=flip=0.5,flip_bits=64,overlook=1"],
         "sensor",
         "failed",
-        "RS-232 against RS-422",
+        "RS-232 instead of RS-422",
     ),
 ];
 
 #[test]
 fn what_is_wrong_with_a_sensor() {
-    let env = TestEnv::new();
-    for (number, (set_up, flags, name, state, remedy)) in SENSORS.into_iter().enumerate() {
+    side_by_side(SENSORS.into_iter().enumerate(), |(number, (set_up, flags, name, state, remedy))| {
+        let env = TestEnv::new();
         let port = format!("p{number}");
         let _simulator = env.simulator(&[&port], flags);
         let (link, of) = (env.link(&port), |key: &str| format!("link.{port}.{key}"));
         let wanted = [of("unit=mm"), of("type=lms200")];
         let findings = Findings::of(&env, &[&link, "--set", &wanted[0], "--set", &wanted[1]]);
         findings.complain(set_up, name, state, remedy);
-    }
+    });
 }
 
 #[test]

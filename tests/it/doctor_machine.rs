@@ -55,7 +55,7 @@ fn well_kept(env: &TestEnv) -> Findings {
     let machine = env.path("machine");
     let put = |path: &str, text: &str| {
         let path = machine.join(path);
-        fs::create_dir_all(path.parent().expect("a directory")).expect("can be made");
+        fs::create_dir_all(path.parent().expect("a directory")).expect("can be created");
         fs::write(path, text).expect("can be written");
     };
     let dist = |name: &str| {
@@ -69,7 +69,7 @@ fn well_kept(env: &TestEnv) -> Findings {
     put("etc/systemd/system/multi-user.target.wants/scanhub.service", "");
     put("run/systemd/system/here", "");
     put("sys/fs/cgroup/system.slice/scanhub.service/cgroup.procs", "7\n");
-    fs::create_dir_all(machine.join("usr/local/bin")).expect("can be made");
+    fs::create_dir_all(machine.join("usr/local/bin")).expect("can be created");
     let _ = symlink(crate::testkit::own_program(), machine.join("usr/local/bin/scanhub"));
     laid_out(env)
 }
@@ -165,7 +165,7 @@ fn what_is_short() {
 fn what_is_wrong_with_the_domain() {
     let env = TestEnv::new();
     let root = env.place().root().to_owned();
-    fs::create_dir(&root).expect("can be made");
+    fs::create_dir(&root).expect("can be created");
     fs::set_permissions(&root, fs::Permissions::from_mode(0o777)).expect("it is ours");
     Findings::of(&env, &[]).complain("others may write in the domain", "domain", "failed", "chmod go-w");
     if std::os::unix::fs::chown(&root, Some(1), None).is_ok() {
@@ -176,7 +176,7 @@ fn what_is_wrong_with_the_domain() {
     }
     let nowhere = env.command_at(Path::new("/dev/null"), &["doctor", "--json", "--no-system-config"]);
     let findings = Findings::in_outcome(&Program::start(nowhere).wait());
-    findings.complain("no domain can be made there", "domain", "failed", "--root");
+    findings.complain("no domain can be created there", "domain", "failed", "--root");
 }
 
 #[test]

@@ -121,7 +121,7 @@ fn a_serial_server_that_sends_garbage_at_full_speed() {
     consumer.await_lines(2, "the stream", is_class("telegram"));
     receive(&mut consumer, &sent);
     consumer.end(INT);
-    let says = "more comes than a line of 500000 baud brings";
+    let says = "the server sends more than a line of 500000 baud carries";
     env.await_info("front", |info| info["last_error"].as_str().is_some_and(|error| error.starts_with(says)));
     let bytes = || number(&env.info("front")["counters"], "bytes_read");
     // The counters are as old as the last status: a second.

@@ -11,7 +11,7 @@ use rustix::event::{PollFd, PollFlags, Timespec, poll};
 use rustix::pipe::fcntl_setpipe_size;
 use rustix::process::{Pid, kill_process};
 use schema::Topic;
-use schema::datagram::{Account, Announce, Datagram, Row};
+use schema::datagram::{Announce, Datagram, Row, StreamStats};
 use serde_json::Value;
 
 const STREAM: [&str; 2] = ["--seed=62", "--baud=500000"];
@@ -61,7 +61,7 @@ fn first(heard: &[Vec<u8>], row: &Row) -> u64 {
 /// All numbers from the first one heard on were used once: what was not sent has failed.
 fn is_gap_free(heard: &[Vec<u8>], outcome: &Outcome) {
     assert_eq!(outcome.code, Some(0), "{outcome}");
-    let mut ours = Box::new(Account::new(&Topic::ALL));
+    let mut ours = Box::new(StreamStats::new(&Topic::ALL));
     heard.iter().for_each(|bytes| assert!(ours.receive(bytes, 1, 0).is_ok()));
     let lines = outcome.of_class("lan");
     for row in ours.rows() {

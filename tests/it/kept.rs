@@ -37,7 +37,7 @@ fn where_a_sensor_was_found_is_asked_first_by_the_next_hub() {
     assert_eq!(line.await_request(), (9_600, 0x3A));
     let outcome = hub.end(TERM);
     assert!(outcome.errors.contains("others can write it"), "{outcome}");
-    assert!(outcome.errors.contains("delete it; what it held is learned again"), "{outcome}");
+    assert!(outcome.errors.contains("delete it; its content is learned again"), "{outcome}");
 }
 
 #[test]

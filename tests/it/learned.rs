@@ -84,7 +84,7 @@ fn who_comes_while_the_hub_is_away_is_foreground_at_once() {
         let text = env.run(&["background", "front", "show"]);
         assert!(String::from_utf8_lossy(&text.out).contains(" beams known, 0 far, in 1 mm, kept "), "{text}");
         let log = hub.end(TERM).errors;
-        assert!(log.contains("front: begins with the background of "), "{log}");
+        assert!(log.contains("front: starts with the background saved "), "{log}");
     }
 }
 
@@ -100,7 +100,7 @@ fn what_does_not_fit_or_is_not_wanted_is_not_taken() {
         assert!(outcome.errors.contains(why), "{outcome}\n{}", outcome.errors);
         assert_eq!(fs::read(file(&env)).expect("still there"), kept, "{flags:?}");
     };
-    empty(&["--set=link.front.pose.x=0.2"], "the background begins empty: ");
+    empty(&["--set=link.front.pose.x=0.2"], "the background starts empty: ");
     empty(&["--set=link.front.pose.yaw=0.1"], "is of another pose");
     empty(
         &["--set=link.front.unit=cm"],

@@ -9,7 +9,7 @@ use std::thread;
 use std::time::Duration;
 
 use crate::testkit::{
-    INT, KILL, Program, Sender, TERM, TestEnv, in_a_network, is_class, number, terminal, until,
+    INT, KILL, Program, Sender, TERM, TestEnv, hold_in_time, in_a_network, is_class, number, terminal, until,
 };
 use rustix::process::Signal;
 use rustix::time::{ClockId, clock_gettime};
@@ -83,42 +83,44 @@ impl Diodes {
 
 #[test]
 fn the_lights_follow_the_verdict_and_stop_is_lit_when_nobody_says_anything() {
-    let env = TestEnv::new();
-    let diodes = Diodes::new(&env);
-    let [root, led] = diodes.flags();
-    // Before there is a hub.
-    let leds = env.start(&["leds", "front", "--json", &root, &led]);
-    diodes.await_lit("rd");
-    let open = world(&env, "open", STRIP);
-    let sensor = simulator(&env, &open);
-    let hub = env.hub(&[env.link("front")]);
-    diodes.await_lit("gn mk");
-    // The sensor falls silent, then the hub.
-    assert_eq!(sensor.end(TERM).code, Some(0));
-    diodes.await_lit("rd");
-    let _sensor = simulator(&env, &open);
-    diodes.await_lit("gn mk");
-    drop(hub.end(KILL));
-    diodes.await_lit("rd");
-    let hub = env.hub(&[env.link("front")]);
-    diodes.await_lit("gn mk");
-    // The reader's own end: nobody watches any more.
-    let outcome = leds.end(INT);
-    assert_eq!((outcome.code, diodes.lit().as_deref()), (Some(0), Some("rd")), "{outcome}");
-    assert_eq!(hub.end(TERM).code, Some(0));
+    hold_in_time(|| {
+        let env = TestEnv::in_time();
+        let diodes = Diodes::new(&env);
+        let [root, led] = diodes.flags();
+        // Before there is a hub.
+        let leds = env.start(&["leds", "front", "--json", &root, &led]);
+        diodes.await_lit("rd");
+        let open = world(&env, "open", STRIP);
+        let sensor = simulator(&env, &open);
+        let hub = env.hub(&[env.link("front")]);
+        diodes.await_lit("gn mk");
+        // The sensor falls silent, then the hub.
+        assert_eq!(sensor.end(TERM).code, Some(0));
+        diodes.await_lit("rd");
+        let _sensor = simulator(&env, &open);
+        diodes.await_lit("gn mk");
+        drop(hub.end(KILL));
+        diodes.await_lit("rd");
+        let hub = env.hub(&[env.link("front")]);
+        diodes.await_lit("gn mk");
+        // The reader's own end: nobody watches any more.
+        let outcome = leds.end(INT);
+        assert_eq!((outcome.code, diodes.lit().as_deref()), (Some(0), Some("rd")), "{outcome}");
+        assert_eq!(hub.end(TERM).code, Some(0));
 
-    let lines = outcome.of_class("leds");
-    let verdicts: Vec<_> = lines.iter().map(|line| line["verdict"].as_str().unwrap()).collect();
-    assert_eq!((verdicts[0], verdicts[verdicts.len() - 1]), ("unknown", "unknown"), "{outcome}");
-    for line in &lines {
-        let is_clear = line["verdict"] == "clear";
-        assert_eq!((&line["green"], &line["red"]), (&is_clear.into(), &(!is_clear).into()), "{line}");
-        assert_eq!(line["mark"], line["marks"].as_u64().is_some_and(|marks| marks > 0), "{line}");
-    }
-    for pair in lines.windows(2) {
-        let shown = |line: &Value| (line["verdict"].clone(), line["marks"].clone());
-        assert!(shown(&pair[0]) != shown(&pair[1]), "no change: {pair:#?}");
-    }
+        let lines = outcome.of_class("leds");
+        let verdicts: Vec<_> = lines.iter().map(|line| line["verdict"].as_str().unwrap()).collect();
+        assert_eq!((verdicts[0], verdicts[verdicts.len() - 1]), ("unknown", "unknown"), "{outcome}");
+        for line in &lines {
+            let is_clear = line["verdict"] == "clear";
+            assert_eq!((&line["green"], &line["red"]), (&is_clear.into(), &(!is_clear).into()), "{line}");
+            assert_eq!(line["mark"], line["marks"].as_u64().is_some_and(|marks| marks > 0), "{line}");
+        }
+        for pair in lines.windows(2) {
+            let shown = |line: &Value| (line["verdict"].clone(), line["marks"].clone());
+            assert!(shown(&pair[0]) != shown(&pair[1]), "no change: {pair:#?}");
+        }
+    });
 }
 
 #[test]

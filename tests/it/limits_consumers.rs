@@ -90,7 +90,7 @@ fn more_consumers_than_there_are_places_are_refused_with_the_limit() {
             assert_eq!((outcome.code, &error["kind"]), (Some(75), &"short".into()), "{outcome}");
             assert_eq!(
                 error["message"],
-                "scanhub/v1/front/scan has 200 consumers: there is no place for another one"
+                "scanhub/v1/front/scan has 200 consumers, the most that are possible"
             );
             // The other topics are not concerned.
             assert_eq!(env.info("front")["state"], "absent");

@@ -3,7 +3,9 @@
 
 use std::process::Command;
 
-use crate::testkit::{INT, Outcome, Program, TERM, TestEnv, in_a_network, is_class, number, sequence, until};
+use crate::testkit::{
+    INT, Outcome, Program, TERM, TestEnv, in_a_network, is_class, number, sequence, side_by_side, until,
+};
 use rustix::process::{Pid, Resource, Rlimit, getrlimit, prlimit};
 
 /// Starts the program with at most so many descriptors.
@@ -53,7 +55,7 @@ fn a_client_works_or_says_how_many_it_needs() {
         // Nor does one wait for a hub that it cannot see.
         is_short(&limited(&env, limit, &["echo", "front/status"]).wait());
     }
-    for verb in verbs {
+    side_by_side(verbs, |verb| {
         for limit in [5, 6, 8, 10, 12, 14, 16, 18, 20, 22, 24, 26, 28, 30, 32, 40] {
             let outcome = limited(&env, limit, verb).wait();
             if outcome.code != Some(0) {
@@ -61,7 +63,7 @@ fn a_client_works_or_says_how_many_it_needs() {
                 assert!(limit < 40, "{outcome}");
             }
         }
-    }
+    });
 }
 
 #[test]

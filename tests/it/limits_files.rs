@@ -141,7 +141,7 @@ fn a_chunk_that_is_too_long_is_told_and_others_are_read() {
     assert_eq!((outcome.code, outcome.errors.contains("missing")), (Some(0), false), "{outcome}");
     assert!(std::fs::metadata(&copy).expect("it was written").len() > 14 << 20);
     let long = env.file("long.mcap", mcap(&[channel(0, "t", "cdr"), chunk(20 << 20)]));
-    refused(&env, &["convert", &long, &copy, "--force"], 66, "a chunk of it has 20 MB, and at most 8");
+    refused(&env, &["convert", &long, &copy, "--force"], 66, "it has a chunk of 20 MB; at most 8");
     refused(&env, &["convert", &long, &copy, "--force"], 66, "mcap filter");
 }
 

@@ -7,7 +7,7 @@ use crate::testkit;
 use crate::testkit::{
     INT, Outcome, Program, Sender, TestEnv, in_a_network, is_class, number, skip, terminal, until, wall_ns,
 };
-use schema::datagram::{HEAD, Refusal, WINDOW};
+use schema::datagram::{DatagramError, HEAD, WINDOW};
 use schema::{Background, Foreground, Mark, Marks, Scan, State, Status, Topic, Verdict, Zones};
 use serde_json::{Value, json};
 
@@ -349,12 +349,12 @@ fn each_refusal_has_its_reason() {
         program.await_line("the last one", |line| line["verdict"] == "stop");
         let outcome = program.end(INT);
         let refused = refused(&outcome);
-        for reason in Refusal::ALL {
+        for reason in DatagramError::ALL {
             // A listener without keys has no use for two of them.
-            let expected = u64::from(!matches!(reason, Refusal::Unauthenticated | Refusal::Mac));
+            let expected = u64::from(!matches!(reason, DatagramError::Unauthenticated | DatagramError::Mac));
             assert_eq!(refused[reason.name()], expected, "{}: {outcome}", reason.name());
         }
-        let keys: Vec<_> = Refusal::ALL.iter().map(|reason| reason.name()).collect();
+        let keys: Vec<_> = DatagramError::ALL.iter().map(|reason| reason.name()).collect();
         let line = String::from_utf8_lossy(&outcome.out);
         let line = line.lines().last().unwrap_or_default();
         let places: Vec<_> = keys.iter().map(|key| line.find(&format!("\"{key}\""))).collect();

@@ -1,7 +1,7 @@
 //! `scanhub listen` against what nobody should send: damaged datagrams of every kind, and words that make no sense.
 
 use crate::testkit::{INT, Program, Sender, TestEnv, in_a_network, number};
-use schema::datagram::{HEAD, Head, MTU_ETHERNET, Packed, Refusal};
+use schema::datagram::{DatagramError, HEAD, Head, MTU_ETHERNET, Packed};
 use schema::{Foreground, Marks, Scan, Status, Topic, Verdict, Zones};
 use serde_json::Value;
 
@@ -72,7 +72,7 @@ fn nothing_damaged_is_accepted_and_memory_stays_flat() {
         assert!(grown_kb < 512, "{grown_kb} kB more");
         let outcome = program.end(INT);
         let refused = &outcome.of_class("lan_refused")[0];
-        let all: u64 = Refusal::ALL.iter().map(|reason| number(refused, reason.name())).sum();
+        let all: u64 = DatagramError::ALL.iter().map(|reason| number(refused, reason.name())).sum();
         assert_eq!(all, DAMAGED, "{refused}");
         for reason in ["short", "magic", "version", "header", "length", "crc"] {
             assert!(number(refused, reason) > 0, "{reason}: {refused}");

@@ -27,7 +27,7 @@ fn await_verdict(env: &TestEnv, verdict: &str) {
 fn no_time_at_all_is_refused() {
     let outcome = TestEnv::new().run(&["zones", "front", "mask", "--for=0s", "--json"]);
     assert_eq!(outcome.code, Some(78), "{outcome}");
-    assert_eq!(outcome.of_class("error")[0]["message"], "--for 0s sees nothing");
+    assert_eq!(outcome.of_class("error")[0]["message"], "--for 0s measures nothing");
 }
 
 #[test]

@@ -8,9 +8,7 @@ mod program;
 mod said;
 mod shell;
 
-use std::thread;
-
-use crate::testkit::{Outcome, Program, TERM, TestEnv, until};
+use crate::testkit::{Outcome, Program, TERM, TestEnv, side_by_side, until};
 use blocks::{Block, blocks};
 use program::Example;
 use rustix::time::{ClockId, clock_gettime};
@@ -155,13 +153,8 @@ fn wrong_with(blocks: &[Block], situations: &[Situation]) -> Vec<String> {
             Err(refused) => wrong.push(format!("{}: {refused}", block.place)),
         }
     }
-    let examples = &examples;
     // Each has a hub of its own, and all of them wait most of the time.
-    thread::scope(|scope| {
-        let judged: Vec<_> =
-            situations.iter().map(|situation| scope.spawn(|| situation.judge_all(examples))).collect();
-        wrong.extend(judged.into_iter().flat_map(|judged| judged.join().expect("all are judged")));
-    });
+    wrong.extend(side_by_side(situations, |situation| situation.judge_all(&examples)).concat());
     wrong
 }
 

@@ -189,19 +189,22 @@ fn what_cannot_be_recorded_is_refused() {
     };
     let hint = |arguments: &[&str]| refused(arguments, 73);
     assert!(hint(&["-o", &env.word("")]).starts_with("name a file in it: -o "));
-    assert!(hint(&["-o", "/dev/full"]).contains("--force writes over what the device holds"));
-    assert!(refused(&["-o", "/dev/full", "--force"], 75).starts_with("make room"));
+    assert!(hint(&["-o", "/dev/full"]).contains("--force overwrites the content of the device"));
+    assert!(refused(&["-o", "/dev/full", "--force"], 75).starts_with("free some space"));
     env.file("parts-0007.mcap", "somebody's");
     let earlier = hint(&["-o", &env.word("parts.mcap"), "--split=1h"]);
-    assert!(earlier.starts_with("--force goes on after the last one's number"), "{earlier}");
+    assert!(earlier.starts_with("--force continues after the last number"), "{earlier}");
     assert_eq!(kind(&["-o", "-", "--split", "1h"]), (Some(2), "usage".into()));
     assert_eq!(kind(&["--keep", "3"]), (Some(2), "usage".into()));
     assert_eq!(kind(&["--split", "3"]), (Some(2), "usage".into()));
     for words in [&["--ros2", "--all"][..], &["--ros2", "front/telegram"]] {
         let outcome = env.run(&[&["record", "-o", &env.word("new.mcap")], words].concat());
         assert_eq!(outcome.code, Some(2), "{outcome}");
-        assert!(outcome.errors.contains("messages of ROS alone, and"), "{outcome}");
-        assert!(outcome.errors.contains("--ros2` makes a file for ROS of it later"), "{outcome}");
+        assert!(outcome.errors.contains("records only ROS messages, and"), "{outcome}");
+        assert!(
+            outcome.errors.contains("convert later: `scanhub convert IN.mcap OUT.mcap --ros2`"),
+            "{outcome}"
+        );
     }
     assert_eq!(kind(&["robot/zones"]), (Some(2), "usage".into()));
     assert_eq!(kind(&["front/scam"]), (Some(2), "usage".into()));

@@ -256,7 +256,7 @@ fn a_recording_whose_reader_went_away_has_failed() {
     let refused = |outcome: std::process::Output| {
         let said = String::from_utf8_lossy(&outcome.stderr).into_owned();
         assert_eq!(outcome.status.code(), Some(1), "{said}");
-        assert!(said.contains("whoever read the recording is gone"), "{said}");
+        assert!(said.contains("the reader of the recording is gone"), "{said}");
     };
     let begin = env.command(&["record", "-o", "-"]).stdout(writer).stderr(Stdio::piped()).output();
     refused(begin.unwrap());

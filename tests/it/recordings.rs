@@ -72,7 +72,7 @@ fn a_recording_without_its_mode_has_marks_where_the_mode_is_set() {
     let hub = env.hub(&[&link]);
     at_the_end(&env);
     let info = env.run(&["info", "a"]).to_string();
-    assert!(info.contains("does not tell its measuring mode; set link.a.mode"), "{info}");
+    assert!(info.contains("does not contain its measuring mode; set link.a.mode"), "{info}");
     assert_eq!(env.info("a")["marks"]["available"], Value::Null);
     assert_eq!(hub.end(INT).code, Some(0));
     let hub = env.hub(&[&link, "--set=link.a.mode=0x01"]);
@@ -88,14 +88,14 @@ fn values_that_could_be_split_in_several_ways_are_no_scans_until_the_mode_is_tol
     // 8.6 m in 14 bits; in 13 bits it would be 0.4 m.
     let scan = lms::measured::encode(0, Unit::Mm, &[8600; 181], 0x10);
     let file = env.file("recording", scan.bytes().repeat(100));
-    let trouble = "the recording does not tell its measuring mode: no scans; set link.a.mode";
+    let trouble = "the recording does not contain its measuring mode: no scans; set link.a.mode";
     let (outcome, _) = play(&env, &file, "", &["a/telegram", "a/scan", "a/status"]);
     assert_eq!((outcome.of_class("telegram").len(), outcome.of_class("scan").len()), (100, 0), "{outcome}");
     assert!(outcome.of_class("status").iter().any(|line| line["last_error"] == trouble), "{outcome}");
     let log = env.path("a.log").display().to_string();
     let refused = env.run(&["convert", &file, &log]);
     assert!(
-        refused.code == Some(66) && refused.errors.contains("does not tell its measuring mode"),
+        refused.code == Some(66) && refused.errors.contains("does not contain its measuring mode"),
         "{refused}"
     );
     let hub = env.hub(&[&format!("--link=a=file:{file}"), "--set=link.a.mode=0x04"]);

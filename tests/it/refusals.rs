@@ -4,7 +4,7 @@
 use std::process::Command;
 
 use crate::testkit;
-use crate::testkit::{Outcome, TERM, TestEnv};
+use crate::testkit::{Outcome, TERM, TestEnv, side_by_side};
 use serde_json::Value;
 
 /// Runs the program, which must refuse with `code` and `kind` and say all of `words`, in text and in JSON.
@@ -249,9 +249,7 @@ fn no_such_sensor_or_hub() {
         let told = errors.last().map(|line| line["kind"].clone());
         assert_eq!((outcome.code, told), (Some(3), Some(kind.into())), "{verb:?}: {outcome}");
     };
-    for verb in verbs {
-        asks(verb, "no_hub");
-    }
+    side_by_side(verbs, |verb| asks(verb, "no_hub"));
     asks(&["list"], "no_hub");
     for verb in
         [&["replay", golden, "--sensor=side"][..], &["convert", golden, &env.word("x.bin"), "--sensor=side"]]
@@ -260,9 +258,7 @@ fn no_such_sensor_or_hub() {
         assert_eq!(outcome.code, Some(3), "{outcome}");
     }
     let hub = env.hub(&["--link=front=/no/such/port"]);
-    for verb in verbs {
-        asks(verb, "no_topic");
-    }
+    side_by_side(verbs, |verb| asks(verb, "no_topic"));
     assert_eq!(hub.end(TERM).code, Some(0));
 }
 

@@ -72,8 +72,8 @@ fn circles_change_in_a_stream_without_a_gap() {
     assert!(firsts.iter().all(|pair| pair[1]["verdict"] != "unknown"), "{firsts:?}");
     let ended = hub.end(TERM);
     assert_eq!(ended.code, Some(0));
-    assert!(ended.errors.contains("front: pose, zones as configured now"), "{ended}");
-    assert!(ended.errors.contains("front: zones, marks, background as configured now"), "{ended}");
+    assert!(ended.errors.contains("front: pose, zones changed as configured"), "{ended}");
+    assert!(ended.errors.contains("front: zones, marks, background changed as configured"), "{ended}");
     assert_eq!(simulator.end(TERM).code, Some(0));
     assert_eq!(env.simulated("front").1, 0, "EEPROM");
     // What was sent from the first to the last that was received, was received.
@@ -117,7 +117,7 @@ fn what_cannot_be_changed_is_said_and_what_cannot_be_changes_nothing() {
     assert_eq!(ended.code, Some(0));
     for words in [
         format!("the configuration is refused, the old one stays: {place}; the largest first"),
-        "front: pose, zones as configured now".to_owned(),
+        "front: pose, zones changed as configured".to_owned(),
         "front: baud: takes effect at the next start".to_owned(),
         "side: link added: takes effect at the next start".to_owned(),
     ] {

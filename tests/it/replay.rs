@@ -218,7 +218,7 @@ fn what_cannot_be_played_is_refused() {
         (&[&log, "--rate=0"], 2, "--rate"),
         (&[&log, "--loop", "--hold"], 2, "--loop"),
         (&[&log, "--start=201ms"], 2, "which lasts 0.200 s"),
-        (&[&log, "--start=1h", "--hold"], 2, "--start 3600 s is behind the end of "),
+        (&[&log, "--start=1h", "--hold"], 2, "--start 3600 s is after the end of "),
         (&[&log, "--sensor=Front"], 2, "sensor name \"Front\" is not possible"),
         (&[golden, "--sensor=left"], 3, "has no sensor \"left\""),
     ] {
@@ -233,7 +233,7 @@ fn keys() {
     let env = TestEnv::new();
     let words = ["replay", "--no-system-config", "--paused", &log(&env, 300, 100)];
     let mut sitting = Sitting::start(&env.command(&words), (100, 30));
-    sitting.await_words("paused; space goes on");
+    sitting.await_words("paused; space continues");
     let says = |sitting: &Sitting, word: &str| {
         let give_up_at = std::time::Instant::now() + testkit::PATIENCE;
         while !sitting.text().contains(word) {

@@ -10,7 +10,7 @@ use std::thread::{self, JoinHandle};
 use std::time::{Duration, Instant};
 
 use crate::testkit;
-use crate::testkit::{INT, TERM, TestEnv, is_class, number, open_line, sequence, terminal};
+use crate::testkit::{INT, TERM, TestEnv, hold_in_time, is_class, number, open_line, sequence, terminal};
 use rustix::process::Signal;
 use serde_json::Value;
 
@@ -108,27 +108,29 @@ fn a_sensor_behind_a_serial_server() {
 
 #[test]
 fn scans_that_waited_for_a_hub_at_a_standstill_say_nothing_of_now() {
-    let env = TestEnv::new();
-    let _simulator = env.simulator(&["line"], &["--baud=38400", "--seed=5"]);
-    let server = Server::new(&env, "line", 38_400);
-    let hub = env.hub(&[&server.link(), "--set=link.front.baud=38400", "--set=zones.radii=[0.02,0.01]"]);
-    let mut consumer = env.echo(&["front/zones"]);
-    consumer.await_line("a verdict", |line| line["verdict"] == "clear");
-    hub.signal(Signal::STOP);
-    // Five scans come in a second, and ten are read at once.
-    thread::sleep(Duration::from_secs(6));
-    hub.signal(Signal::CONT);
-    let first = consumer.await_line("a verdict", |line| line["verdict"] == "unknown");
-    let first = consumer.await_line("an old scan", |line| line["seq"].as_u64() > first["seq"].as_u64());
-    let last = consumer.await_line("a new scan", |line| line["verdict"] == "clear");
-    let is_estimated = |line: &Value| line["flags"].to_string().contains("stamp_estimated");
-    assert!(is_estimated(&first) && !is_estimated(&last), "{first} {last}");
-    let waited = number(&last, "seq") - number(&first, "seq");
-    eprintln!("{waited} scans were too old to tell of now");
-    // Thirty waited, and while twenty of them were read slowly twenty more did.
-    assert!(waited >= 35, "{waited}: {first} {last}");
-    consumer.end(INT);
-    assert_eq!(hub.end(TERM).code, Some(0));
+    hold_in_time(|| {
+        let env = TestEnv::in_time();
+        let _simulator = env.simulator(&["line"], &["--baud=38400", "--seed=5"]);
+        let server = Server::new(&env, "line", 38_400);
+        let hub = env.hub(&[&server.link(), "--set=link.front.baud=38400", "--set=zones.radii=[0.02,0.01]"]);
+        let mut consumer = env.echo(&["front/zones"]);
+        consumer.await_line("a verdict", |line| line["verdict"] == "clear");
+        hub.signal(Signal::STOP);
+        // Five scans come in a second, and ten are read at once.
+        thread::sleep(Duration::from_secs(6));
+        hub.signal(Signal::CONT);
+        let first = consumer.await_line("a verdict", |line| line["verdict"] == "unknown");
+        let first = consumer.await_line("an old scan", |line| line["seq"].as_u64() > first["seq"].as_u64());
+        let last = consumer.await_line("a new scan", |line| line["verdict"] == "clear");
+        let is_estimated = |line: &Value| line["flags"].to_string().contains("stamp_estimated");
+        assert!(is_estimated(&first) && !is_estimated(&last), "{first} {last}");
+        let waited = number(&last, "seq") - number(&first, "seq");
+        eprintln!("{waited} scans were too old to tell of now");
+        // Thirty waited, and while twenty of them were read slowly twenty more did.
+        assert!(waited >= 35, "{waited}: {first} {last}");
+        consumer.end(INT);
+        assert_eq!(hub.end(TERM).code, Some(0));
+    });
 }
 
 #[test]
@@ -137,7 +139,7 @@ fn a_serial_server_that_is_set_to_another_rate() {
     let _simulator = env.simulator(&["line"], &["--baud=9600"]);
     let server = Server::new(&env, "line", 38_400);
     let _hub = env.hub(&[&server.link(), "--set=link.front.baud=38400"]);
-    let says = "no answer at 38400 baud, to which the serial server was set";
+    let says = "no answer at 38400 baud, the rate set in the serial server";
     let said = |info: &Value| info["last_error"].as_str().is_some_and(|error| error.contains(says));
     env.await_info("front", said);
 }

@@ -241,7 +241,7 @@ fn the_telegrams_inside_a_recording_are_decoded() {
 
     for (words, input, code, told) in [
         (&["decode", golden, "--sensor=left"][..], &b""[..], 3, "has no sensor \"left\""),
-        (&["decode", "--sensor=front"], b"", 2, "stdin is none"),
+        (&["decode", "--sensor=front"], b"", 2, "stdin is not one"),
         (&["decode"], &bytes, 66, "name its file"),
     ] {
         let output = telegram(words, input);

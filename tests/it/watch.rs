@@ -76,14 +76,14 @@ fn it_follows_the_hub_the_keys_and_the_window() {
 
     // Requests to the hub, and what came of them.
     watch.press("F");
-    watch.await_words("front: background is held as it is");
+    watch.await_words("front: background is frozen");
     watch.await_words("lost 0  frozen");
     let model = env.run(&["background", "front", "show"]);
     assert!(String::from_utf8_lossy(&model.out).contains("frozen"), "{model}");
     watch.press("F");
-    watch.await_words("front: background is learned on");
+    watch.await_words("front: background continues learning");
     watch.press("R");
-    watch.await_words("front: background is learned anew");
+    watch.await_words("front: background is learned again");
 
     // Two lives of the hub; also while the picture is held the verdict is that of now.
     watch.press(" ");

@@ -5,6 +5,7 @@
 mod again;
 mod findings;
 mod gentle;
+mod in_time;
 mod line;
 mod machine;
 mod network;
@@ -34,7 +35,8 @@ use serde_json::Value;
 
 pub(crate) use again::{in_own_process, only, own_program, run_again};
 pub(crate) use findings::Findings;
-pub(crate) use gentle::{compute_gently, gentle};
+pub(crate) use gentle::{compute_gently, gentle, side_by_side, wait_gently};
+pub(crate) use in_time::hold_in_time;
 pub(crate) use line::{Line, open_line};
 pub(crate) use machine::{Machine, command_in, ip};
 pub(crate) use network::in_a_network;
@@ -66,7 +68,15 @@ pub(crate) struct TestEnv {
 }
 
 impl TestEnv {
+    /// A new one. What its programs do may take its time.
     pub(crate) fn new() -> TestEnv {
+        wait_gently();
+        TestEnv::in_time()
+    }
+
+    /// One for a test that holds something about time: how fast a line is read, what comes while nobody reads. Its programs
+    /// come before those of other tests.
+    pub(crate) fn in_time() -> TestEnv {
         static NEXT: AtomicU32 = AtomicU32::new(0);
         let domain = format!("t{}-{}", std::process::id(), NEXT.fetch_add(1, Ordering::Relaxed));
         // Not TMPDIR: root and prefix of a domain have to be short.

@@ -11,6 +11,7 @@ use rustix::process::{Pid, Signal, kill_process};
 use serde_json::Value;
 
 use super::PATIENCE;
+use super::in_time::ends_after;
 
 pub(crate) const INT: Signal = Signal::INT;
 pub(crate) const TERM: Signal = Signal::TERM;
@@ -79,6 +80,17 @@ impl Program {
 
     pub(crate) fn pid(&self) -> u32 {
         self.process.id()
+    }
+
+    /// How long its threads were ready to run and did not get a processor so far; nothing where the kernel does not count
+    /// it.
+    fn kept_waiting(&self) -> Duration {
+        let tasks = std::fs::read_dir(format!("/proc/{}/task", self.pid())).into_iter().flatten().flatten();
+        let counted = tasks.filter_map(|task| {
+            let text = std::fs::read_to_string(task.path().join("schedstat")).ok()?;
+            text.split(' ').nth(1)?.parse::<u64>().ok()
+        });
+        Duration::from_nanos(counted.sum())
     }
 
     /// It has ended.
@@ -155,6 +167,7 @@ impl Program {
 
     /// Sends a signal and waits for the end.
     pub(crate) fn end(self, signal: Signal) -> Outcome {
+        ends_after(self.kept_waiting());
         self.signal(signal);
         self.wait()
     }
@@ -204,6 +217,7 @@ impl Program {
 
 impl Drop for Program {
     fn drop(&mut self) {
+        ends_after(self.kept_waiting());
         // First the gentle way: it may have children or files of its own.
         let _ = kill_process(Pid::from_child(&self.process), Signal::TERM);
         let give_up_at = Instant::now() + Duration::from_secs(2);

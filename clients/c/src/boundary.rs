@@ -8,7 +8,7 @@ use std::ptr;
 
 use schema::Header;
 
-use crate::refusal::Refusal;
+use crate::call_error::CallError;
 use crate::table::Opaque;
 
 /// `scanhub_sample` of the header.
@@ -49,19 +49,19 @@ impl Lent {
 }
 
 /// The text at `address`; nothing for NULL.
-pub(crate) fn text<'a>(address: *const c_char) -> Result<Option<&'a str>, Refusal> {
+pub(crate) fn text<'a>(address: *const c_char) -> Result<Option<&'a str>, CallError> {
     if address.is_null() {
         return Ok(None);
     }
     // SAFETY: it is not NULL, and the header asks for a text that ends with 0 and stays as it is until the call is over;
     // no caller here keeps it longer.
     let text = unsafe { CStr::from_ptr(address) };
-    let not_text = Refusal::Argument("a name is not UTF-8", "names are made of a-z, 0-9, _ and -");
+    let not_text = CallError::Argument("a name is not UTF-8", "names are made of a-z, 0-9, _ and -");
     text.to_str().map(Some).map_err(|_| not_text)
 }
 
 /// Where an answer goes to; what lies there before may be anything.
-pub(crate) fn place<'a, T>(address: *mut T) -> Result<&'a mut MaybeUninit<T>, Refusal> {
+pub(crate) fn place<'a, T>(address: *mut T) -> Result<&'a mut MaybeUninit<T>, CallError> {
     check(address)?;
     // SAFETY: it is not NULL and aligned, and the header asks for room for one T that nobody else uses during the call; no
     // caller here keeps it longer.
@@ -69,20 +69,20 @@ pub(crate) fn place<'a, T>(address: *mut T) -> Result<&'a mut MaybeUninit<T>, Re
 }
 
 /// A sample that was filled by an earlier call.
-pub(crate) fn sample<'a>(address: *mut Lent) -> Result<&'a mut Lent, Refusal> {
+pub(crate) fn sample<'a>(address: *mut Lent) -> Result<&'a mut Lent, CallError> {
     check(address)?;
     // SAFETY: as in `place`; the header asks for a sample that was taken or zeroed, and no value of a field is impossible.
     unsafe { address.as_mut() }.ok_or(NULL)
 }
 
-fn check<T>(address: *mut T) -> Result<(), Refusal> {
+fn check<T>(address: *mut T) -> Result<(), CallError> {
     if address.is_null() {
         return Err(NULL);
     }
     match address.is_aligned() {
         true => Ok(()),
-        false => Err(Refusal::Argument("an address is not aligned", "give that of a variable of the type")),
+        false => Err(CallError::Argument("an address is not aligned", "give that of a variable of the type")),
     }
 }
 
-const NULL: Refusal = Refusal::Argument("an argument is NULL", "give the address of a variable");
+const NULL: CallError = CallError::Argument("an argument is NULL", "give the address of a variable");

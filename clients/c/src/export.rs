@@ -10,8 +10,8 @@ use scanhub_client::{Wait, places};
 use schema::Topic;
 
 use crate::boundary::{Lent, place, sample, text};
+use crate::call_error::{self, CallError};
 use crate::handle::Handle;
-use crate::refusal::{self, Refusal};
 use crate::table::{self, Opaque};
 
 /// Begins to follow a topic; answers 0.
@@ -26,9 +26,10 @@ pub extern "C" fn scanhub_open(
     answer(|| {
         let handle = place(handle)?;
         handle.write(std::ptr::null_mut());
-        let sensor = text(sensor)?.ok_or(Refusal::Argument("no sensor is named", "for example \"front\""))?;
+        let sensor =
+            text(sensor)?.ok_or(CallError::Argument("no sensor is named", "for example \"front\""))?;
         let topic = u8::try_from(topic).ok().and_then(Topic::of_number);
-        let topic = topic.ok_or(Refusal::Argument("there is no such topic", "one of SCANHUB_TOPIC_.."))?;
+        let topic = topic.ok_or(CallError::Argument("there is no such topic", "one of SCANHUB_TOPIC_.."))?;
         let opened = Handle::open(places(text(domain)?)?, sensor, topic, way(wait)?)?;
         handle.write(table::insert(opened)?);
         Ok(0)
@@ -112,7 +113,7 @@ pub extern "C" fn scanhub_hub_lives(handle: *mut Opaque) -> c_int {
 /// What the last call of this thread that was refused said.
 #[unsafe(no_mangle)]
 pub extern "C" fn scanhub_error() -> *const c_char {
-    refusal::last()
+    call_error::last()
 }
 
 /// The version of this library.
@@ -126,16 +127,16 @@ const VERSION: &CStr = match CStr::from_bytes_with_nul(concat!(env!("CARGO_PKG_V
     Err(_) => panic!("a version is no text"),
 };
 
-fn way(wait: c_int) -> Result<Wait, Refusal> {
+fn way(wait: c_int) -> Result<Wait, CallError> {
     match wait {
         0 => Ok(Wait::Doorbell),
         1 => Ok(Wait::Event),
         2 => Ok(Wait::Spin),
-        _ => Err(Refusal::Argument("there is no such way to wait", "one of SCANHUB_WAIT_..")),
+        _ => Err(CallError::Argument("there is no such way to wait", "one of SCANHUB_WAIT_..")),
     }
 }
 
-fn answer(call: impl FnOnce() -> Result<c_int, Refusal>) -> c_int {
-    let answered = catch_unwind(AssertUnwindSafe(call)).unwrap_or(Err(Refusal::Bug));
-    answered.unwrap_or_else(|refusal| refusal.keep())
+fn answer(call: impl FnOnce() -> Result<c_int, CallError>) -> c_int {
+    let answered = catch_unwind(AssertUnwindSafe(call)).unwrap_or(Err(CallError::Bug));
+    answered.unwrap_or_else(|error| error.keep())
 }

@@ -5,11 +5,11 @@ use std::os::fd::AsRawFd;
 use std::ptr;
 use std::time::{Duration, Instant};
 
-use scanhub_client::{Heard, Received, RobotFollower, Subscription, Wait, ZonesFollower};
-use schema::{Background, Domain, Failure, Foreground, Header, Marks, Scan, Status, Topic, limits};
+use scanhub_client::{Heard, Payload, Received, RobotFollower, Subscription, Wait, ZonesFollower};
+use schema::{Domain, Failure, Header, Topic, limits};
 
 use crate::boundary::Lent;
-use crate::refusal::Refusal;
+use crate::call_error::CallError;
 use crate::robot::Told;
 
 /// An open subscription.
@@ -24,50 +24,67 @@ pub(crate) struct Handle {
 /// Samples that may be lent at a time, as many as the hub has in store for each consumer.
 const LENT: usize = limits::BORROWED;
 
-/// Declares the topics once, of which all but zones are followed alike; a robot is all zones in one.
-macro_rules! topics {
-    ($($topic:ident $payload:ty;)*) => {
-        enum Source { Robot(RobotFollower), Zones(ZonesFollower), $($topic(Subscription<$payload>),)* }
+/// Zones are followed with an eye on their age, all else as it comes.
+macro_rules! follower {
+    (Zones $payload:tt) => {
+        ZonesFollower
+    };
+    ($topic:ident $payload:tt) => {
+        Subscription<schema::payload_type!($payload)>
+    };
+}
 
-        enum Held { Robot(Told), Zones(Heard), $($topic(Received<$payload>),)* }
+/// A sample of such.
+macro_rules! sample {
+    (Zones $payload:tt) => {
+        Heard
+    };
+    ($topic:ident $payload:tt) => {
+        Received<schema::payload_type!($payload)>
+    };
+}
+
+/// Declares what is followed from the table of topics; a robot is all zones in one.
+macro_rules! topics {
+    ($($topic:ident $payload:tt, $name:literal, $($column:tt),*: $about:literal;)*) => {
+        enum Source { Robot(RobotFollower), $($topic(follower!($topic $payload)),)* }
+
+        enum Held { Robot(Told), $($topic(sample!($topic $payload)),)* }
 
         impl Source {
             fn open(places: Vec<Domain>, sensor: &str, topic: Topic, wait: Wait) -> Result<Source, Failure> {
                 Ok(match topic {
-                    Topic::Zones => Source::Zones(ZonesFollower::in_domain(places, sensor)?.wait_by(wait)),
-                    $(Topic::$topic => Source::$topic(Subscription::in_domain(places, sensor)?.wait_by(wait)),)*
+                    $(Topic::$topic => {
+                        Source::$topic(<follower!($topic $payload)>::in_domain(places, sensor)?.wait_by(wait))
+                    })*
                 })
             }
 
             fn try_next(&mut self) -> Result<Option<Held>, Failure> {
                 Ok(match self {
                     Source::Robot(robot) => robot.try_next()?.map(Told::new).map(Held::Robot),
-                    Source::Zones(zones) => zones.try_next()?.map(Held::Zones),
-                    $(Source::$topic(subscription) => subscription.try_next()?.map(Held::$topic),)*
+                    $(Source::$topic(topic) => topic.try_next()?.map(Held::$topic),)*
                 })
             }
 
             fn wait(&mut self, longest: Duration) -> Result<(), Failure> {
                 match self {
                     Source::Robot(robot) => robot.wait(longest),
-                    Source::Zones(zones) => zones.wait(longest),
-                    $(Source::$topic(subscription) => subscription.wait(longest),)*
+                    $(Source::$topic(topic) => topic.wait(longest),)*
                 }
             }
 
             fn descriptor(&mut self) -> Result<c_int, Failure> {
                 Ok(match self {
                     Source::Robot(robot) => robot.descriptor()?,
-                    Source::Zones(zones) => zones.descriptor()?,
-                    $(Source::$topic(subscription) => subscription.descriptor()?,)*
+                    $(Source::$topic(topic) => topic.descriptor()?,)*
                 }.as_raw_fd())
             }
 
             fn hub_lives(&self) -> bool {
                 match self {
                     Source::Robot(robot) => robot.hub_lives(),
-                    Source::Zones(zones) => zones.hub_lives(),
-                    $(Source::$topic(subscription) => subscription.hub_lives(),)*
+                    $(Source::$topic(topic) => topic.hub_lives(),)*
                 }
             }
         }
@@ -76,29 +93,32 @@ macro_rules! topics {
             fn lend(&self) -> Lent {
                 match self {
                     Held::Robot(told) => Lent::new(None, told.verdict()),
-                    Held::Zones(heard) => Lent {
-                        missed: heard.missed,
-                        stale: heard.stale.into(),
-                        ..Lent::new(heard.header.as_ref(), &heard.zones)
-                    },
-                    $(Held::$topic(received) => Lent {
-                        missed: received.missed,
-                        restarted: received.restarted.into(),
-                        ..Lent::new(Some(received.header()), &**received)
-                    },)*
+                    $(Held::$topic(sample) => sample.lend(),)*
                 }
             }
         }
     };
 }
 
-topics! {
-    Telegram [u8];
-    Scan Scan;
-    Marks Marks;
-    Foreground Foreground;
-    Background Background;
-    Status Status;
+schema::for_each_topic!(topics);
+
+/// What a program in C sees of a sample.
+trait Lend {
+    fn lend(&self) -> Lent;
+}
+
+impl Lend for Heard {
+    fn lend(&self) -> Lent {
+        let stale = self.stale.into();
+        Lent { missed: self.missed, stale, ..Lent::new(self.header.as_ref(), &self.zones) }
+    }
+}
+
+impl<P: Payload + ?Sized> Lend for Received<P> {
+    fn lend(&self) -> Lent {
+        let restarted = self.restarted.into();
+        Lent { missed: self.missed, restarted, ..Lent::new(Some(self.header()), &**self) }
+    }
 }
 
 impl Handle {
@@ -108,12 +128,12 @@ impl Handle {
         sensor: &str,
         topic: Topic,
         wait: Wait,
-    ) -> Result<Handle, Refusal> {
+    ) -> Result<Handle, CallError> {
         Ok(Handle::of(Source::open(places, sensor, topic, wait)?))
     }
 
     /// Will follow the robot of `sensors` (none: all) in the first live one of `places`.
-    pub(crate) fn open_robot(places: Vec<Domain>, sensors: &[&str], wait: Wait) -> Result<Handle, Refusal> {
+    pub(crate) fn open_robot(places: Vec<Domain>, sensors: &[&str], wait: Wait) -> Result<Handle, CallError> {
         Ok(Handle::of(Source::Robot(RobotFollower::in_domain(places, sensors)?.wait_by(wait))))
     }
 
@@ -122,7 +142,7 @@ impl Handle {
     }
 
     /// Waits until there is a sample to take, or `timeout` is over (none: never); whether there is.
-    pub(crate) fn wait(&mut self, timeout: Option<Duration>) -> Result<bool, Refusal> {
+    pub(crate) fn wait(&mut self, timeout: Option<Duration>) -> Result<bool, CallError> {
         let until = timeout.and_then(|timeout| Instant::now().checked_add(timeout));
         loop {
             if self.found.is_none() {
@@ -140,10 +160,10 @@ impl Handle {
     }
 
     /// The next sample, lent until it is given back; nothing if none waits.
-    pub(crate) fn take(&mut self) -> Result<Option<Lent>, Refusal> {
+    pub(crate) fn take(&mut self) -> Result<Option<Lent>, CallError> {
         let place = self.lent.iter_mut().find(|place| place.is_none());
         let Some(place) = place else {
-            return Err(Refusal::Argument("four samples are lent already", "scanhub_release one of them"));
+            return Err(CallError::Argument("four samples are lent already", "scanhub_release one of them"));
         };
         let held = match self.found.take() {
             // A verdict is of now: the caller may have waited, and it has no stamp.
@@ -164,16 +184,16 @@ impl Handle {
     }
 
     /// Takes the sample back that was lent under `number`.
-    pub(crate) fn give_back(&mut self, number: u64) -> Result<(), Refusal> {
+    pub(crate) fn give_back(&mut self, number: u64) -> Result<(), CallError> {
         let is_it =
             |place: &&mut Option<(u64, Held)>| place.as_ref().is_some_and(|(lent, _)| *lent == number);
         let place = self.lent.iter_mut().find(is_it);
-        *place.ok_or(Refusal::Argument("this sample is not lent", "release each sample once"))? = None;
+        *place.ok_or(CallError::Argument("this sample is not lent", "release each sample once"))? = None;
         Ok(())
     }
 
     /// As [`Subscription::descriptor`].
-    pub(crate) fn descriptor(&mut self) -> Result<c_int, Refusal> {
+    pub(crate) fn descriptor(&mut self) -> Result<c_int, CallError> {
         Ok(self.source.descriptor()?)
     }
 

@@ -3,9 +3,9 @@
 //! Refuses to know how samples come: that is `scanhub_client`.
 
 mod boundary;
+mod call_error;
 mod export;
 mod handle;
-mod refusal;
 mod robot;
 mod table;
 

@@ -8,8 +8,8 @@ use std::ptr;
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::sync::{Mutex, PoisonError};
 
+use crate::call_error::CallError;
 use crate::handle::Handle;
-use crate::refusal::Refusal;
 
 /// `struct scanhub_attachment` of the header: there is none.
 #[repr(C)]
@@ -52,7 +52,7 @@ static OF_PARENTS: Mutex<Vec<usize>> = Mutex::new(Vec::new());
 static NEXT: AtomicUsize = AtomicUsize::new(1);
 
 /// Keeps `handle` for this thread; what C is to call it.
-pub(crate) fn insert(handle: Handle) -> Result<*mut Opaque, Refusal> {
+pub(crate) fn insert(handle: Handle) -> Result<*mut Opaque, CallError> {
     let number = NEXT.fetch_add(1, Ordering::Relaxed);
     let entry = Entry { number, process: process::id(), handle: Some(Box::new(handle)) };
     let kept = HANDLES.try_with(|handles| handles.borrow_mut().push(entry));
@@ -62,8 +62,8 @@ pub(crate) fn insert(handle: Handle) -> Result<*mut Opaque, Refusal> {
 /// Calls `use_it` with the handle called `name`.
 pub(crate) fn with<R>(
     name: *mut Opaque,
-    use_it: impl FnOnce(&mut Handle) -> Result<R, Refusal>,
-) -> Result<R, Refusal> {
+    use_it: impl FnOnce(&mut Handle) -> Result<R, CallError>,
+) -> Result<R, CallError> {
     let found = HANDLES.try_with(|handles| {
         let mut handles = handles.borrow_mut();
         let entry = handles.iter_mut().find(|entry| entry.is_named(name));
@@ -73,7 +73,7 @@ pub(crate) fn with<R>(
 }
 
 /// Ends the handle called `name`, with all that it holds.
-pub(crate) fn remove(name: *mut Opaque) -> Result<(), Refusal> {
+pub(crate) fn remove(name: *mut Opaque) -> Result<(), CallError> {
     let removed = HANDLES.try_with(|handles| {
         let mut handles = handles.borrow_mut();
         let at = handles.iter().position(|entry| entry.is_named(name));
@@ -82,7 +82,7 @@ pub(crate) fn remove(name: *mut Opaque) -> Result<(), Refusal> {
     removed.unwrap_or(Err(UNKNOWN)).map(drop)
 }
 
-const UNKNOWN: Refusal = Refusal::Argument(
+const UNKNOWN: CallError = CallError::Argument(
     "this thread has no such handle",
     "a handle is used between scanhub_open and scanhub_close, by the thread that opened it; a child opens its own",
 );

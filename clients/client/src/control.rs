@@ -51,7 +51,7 @@ fn ask(
             return response.0;
         }
         if !lives {
-            let hint = "whether it was done is not known: `scanhub info` tells how the sensor is";
+            let hint = "the result is not known: `scanhub info` shows the sensor's state";
             return Err(Failure::new(Kind::NoHub, "the hub went away before it answered", hint));
         }
         if stop.load(Ordering::Relaxed) {
@@ -61,7 +61,7 @@ fn ask(
             let message =
                 format!("the hub did not answer for {} in {} s", request.sensor(), PATIENCE.as_secs());
             let hint = format!(
-                "its log tells if it is short of something; `scanhub info {}` how it is",
+                "its log says whether something is short; `scanhub info {}` shows its state",
                 request.sensor()
             );
             return Err(Failure::new(Kind::Timeout, message, hint));

@@ -59,7 +59,7 @@ impl AsFd for Readiness {
 }
 
 fn short(error: Errno) -> Failure {
-    let what = format!("no descriptor to wait at: {error}");
+    let what = format!("no descriptor to wait on: {error}");
     Failure::new(Kind::Short, what, "`ulimit -n` may be too small")
 }
 

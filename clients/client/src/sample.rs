@@ -1,78 +1,99 @@
-//! A sample of any topic, and where such come from: for verbs that follow topics of several kinds.
+//! A sample of any topic, and where such come from: for programs that follow topics of several kinds.
 
 use std::time::Duration;
 
+use bytemuck::{Pod, bytes_of};
 use schema::datagram::Packed;
 use schema::ipc::Payload;
-use schema::{Background, Failure, Foreground, Header, Marks, ROBOT, Scan, Status, Topic};
+use schema::{Failure, Header, ROBOT, Topic};
 
 use crate::follower::{Follower, Received};
 use crate::robot::{RobotHeard, RobotSource};
 use crate::session::Session;
 use crate::zones::{Heard, ZonesSource};
 
-/// Declares once what a name may stand for: the sample, and the source that it comes from.
+/// Zones are followed with an eye on their age, all else as it comes.
+macro_rules! sample {
+    (Zones $payload:tt) => {
+        Heard
+    };
+    ($topic:ident $payload:tt) => {
+        Received<schema::payload_type!($payload)>
+    };
+}
+
+/// Where such a sample comes from.
+macro_rules! source {
+    (Zones $payload:tt) => {
+        ZonesSource
+    };
+    ($topic:ident $payload:tt) => {
+        Follower<schema::payload_type!($payload)>
+    };
+}
+
+/// Declares from the table of topics what a name may stand for: the sample, and the source that it comes from.
 macro_rules! samples {
-    ($($kind:ident $sample:ty, $source:ty;)*) => {
+    ($($topic:ident $payload:tt, $name:literal, $($column:tt),*: $about:literal;)*) => {
         /// A received sample of one of the topics, or of the fold over several.
-        pub enum Sample { $(#[doc = concat!("Of `", stringify!($kind), "`.")] $kind($sample),)* }
+        pub enum Sample {
+            $(#[doc = $about] $topic(sample!($topic $payload)),)*
+            /// The zones of a robot's sensors, folded.
+            Robot(RobotHeard),
+        }
 
         impl Sample {
-            /// Numbers, stamps and quality; nothing if nobody sent it: then it stands for a silence.
-            pub fn header(&self) -> Option<&Header> {
-                match self { $(Sample::$kind(sample) => Told::header(sample),)* }
-            }
-
-            /// Samples that were sent before this one and not received.
-            pub fn missed(&self) -> u64 {
-                match self { $(Sample::$kind(sample) => sample.missed(),)* }
+            fn any(&self) -> &dyn AnySample {
+                match self {
+                    $(Sample::$topic(sample) => sample,)*
+                    Sample::Robot(sample) => sample,
+                }
             }
         }
 
         /// Follows what one name stands for.
-        pub enum Source { $(#[doc = concat!("Of `", stringify!($kind), "`.")] $kind($source),)* }
+        pub enum Source {
+            $(#[doc = $about] $topic(source!($topic $payload)),)*
+            /// The zones of a robot's sensors, folded.
+            Robot(RobotSource),
+        }
 
         impl Source {
-            /// The topic has been there at least once.
-            pub fn subscribed(&self) -> bool {
-                match self { $(Source::$kind(source) => source.subscribed(),)* }
+            /// Will follow `topic` of `sensor`. The zones of `robot` are the fold over all sensors.
+            pub fn new(sensor: &str, topic: Topic) -> Source {
+                match topic {
+                    Topic::Zones if sensor == ROBOT => Source::Robot(RobotSource::new(&[])),
+                    $(Topic::$topic => Source::$topic(<source!($topic $payload)>::new(sensor)),)*
+                }
             }
 
-            /// The next sample that waits, or nothing; failures as [`Follower::receive`].
+            /// Returns whether the topic has been there at least once.
+            pub fn subscribed(&self) -> bool {
+                match self {
+                    $(Source::$topic(source) => source.subscribed(),)*
+                    Source::Robot(source) => source.subscribed(),
+                }
+            }
+
+            /// Returns the next sample that waits, or nothing.
+            ///
+            /// # Errors
+            ///
+            /// As [`Follower::receive`].
             pub fn receive(&mut self, session: &mut Session) -> Result<Option<Sample>, Failure> {
-                Ok(match self { $(Source::$kind(source) => source.receive(session)?.map(Sample::$kind),)* })
+                Ok(match self {
+                    $(Source::$topic(source) => source.receive(session)?.map(Sample::$topic),)*
+                    Source::Robot(source) => source.receive(session)?.map(Sample::Robot),
+                })
             }
         }
     };
 }
 
-samples! {
-    Telegram Received<[u8]>, Follower<[u8]>;
-    Scan Received<Scan>, Follower<Scan>;
-    Marks Received<Marks>, Follower<Marks>;
-    Zones Heard, ZonesSource;
-    Foreground Received<Foreground>, Follower<Foreground>;
-    Background Received<Background>, Follower<Background>;
-    Status Received<Status>, Follower<Status>;
-    Robot RobotHeard, RobotSource;
-}
+schema::for_each_topic!(samples);
 
 impl Source {
-    /// Will follow `topic` of `sensor`; the zones of `robot` are the fold over all sensors.
-    pub fn new(sensor: &str, topic: Topic) -> Source {
-        match topic {
-            Topic::Telegram => Source::Telegram(Follower::new(sensor)),
-            Topic::Scan => Source::Scan(Follower::new(sensor)),
-            Topic::Marks => Source::Marks(Follower::new(sensor)),
-            Topic::Zones if sensor == ROBOT => Source::Robot(RobotSource::new(&[])),
-            Topic::Zones => Source::Zones(ZonesSource::new(sensor)),
-            Topic::Foreground => Source::Foreground(Follower::new(sensor)),
-            Topic::Background => Source::Background(Follower::new(sensor)),
-            Topic::Status => Source::Status(Follower::new(sensor)),
-        }
-    }
-
-    /// After which time there may be something to receive although nothing was sent.
+    /// Returns after which time there may be something to receive although nothing was sent.
     pub fn left(&self) -> Option<Duration> {
         match self {
             Source::Zones(source) => source.left(),
@@ -83,58 +104,44 @@ impl Source {
 }
 
 impl Sample {
-    /// Nominal time between two scans, in us; 0 unknown.
+    /// Returns numbers, stamps and quality; nothing if nobody sent it: then it stands for a silence.
+    pub fn header(&self) -> Option<&Header> {
+        self.any().header()
+    }
+
+    /// Returns how many samples were sent before this one and not received.
+    pub fn missed(&self) -> u64 {
+        self.any().missed()
+    }
+
+    /// Returns the nominal time between two scans, in us; 0 unknown.
     pub fn period_us(&self) -> u32 {
         self.header().map_or(0, |header| header.period_us)
     }
 
-    /// It was said before `since_ns` of CLOCK_MONOTONIC: a topic keeps it for late joiners, or it waited for them.
+    /// Returns whether it was said before `since_ns` of CLOCK_MONOTONIC: a topic keeps it for late joiners, or it waited for
+    /// them.
     pub fn is_of_before(&self, since_ns: u64) -> bool {
         self.header().is_some_and(|header| header.stamp_last_ns < since_ns)
     }
 
-    /// Nobody sent it: it stands for a silence.
+    /// Returns whether nobody sent it: it stands for a silence.
     pub fn is_silence(&self) -> bool {
         self.header().is_none()
     }
 
-    /// The payload as it lies in memory; of the fold that of the sensor that was heard.
+    /// Returns the payload as it lies in memory; of the fold that of the sensor that was heard.
     pub fn bytes(&self) -> &[u8] {
-        match self {
-            Sample::Telegram(sample) => sample,
-            Sample::Scan(sample) => bytemuck::bytes_of::<Scan>(sample),
-            Sample::Marks(sample) => bytemuck::bytes_of::<Marks>(sample),
-            Sample::Zones(sample) => bytemuck::bytes_of(&sample.zones),
-            Sample::Foreground(sample) => bytemuck::bytes_of::<Foreground>(sample),
-            Sample::Background(sample) => bytemuck::bytes_of::<Background>(sample),
-            Sample::Status(sample) => bytemuck::bytes_of::<Status>(sample),
-            Sample::Robot(sample) => bytemuck::bytes_of(&sample.heard.zones),
-        }
+        self.any().bytes()
     }
-}
 
-impl Sample {
-    /// Writes the payload as it goes over a network to the beginning of `room`; answers its length, or `None` if there is
+    /// Writes the payload as it goes over a network to the beginning of `room`, and returns its length; nothing if there is
     /// too little room.
     pub fn pack(&self, room: &mut [u8]) -> Option<usize> {
-        match self {
-            Sample::Telegram(sample) => {
-                room.get_mut(..sample.len())?.copy_from_slice(sample);
-                Some(sample.len())
-            }
-            Sample::Scan(sample) => sample.pack(room),
-            Sample::Marks(sample) => sample.pack(room),
-            Sample::Zones(sample) => sample.zones.pack(room),
-            Sample::Foreground(sample) => sample.pack(room),
-            Sample::Background(sample) => sample.pack(room),
-            Sample::Status(sample) => sample.pack(room),
-            Sample::Robot(sample) => sample.heard.zones.pack(room),
-        }
+        self.any().pack(room)
     }
-}
 
-impl Sample {
-    /// As [`pack`](Self::pack), zones as the hub said them: however old they were on arrival here.
+    /// Writes it as [`pack`](Self::pack) does, zones as the hub said them: however old they were on arrival here.
     pub fn pack_said(&self, room: &mut [u8]) -> Option<usize> {
         match self {
             Sample::Zones(sample) => sample.said.pack(room),
@@ -144,12 +151,14 @@ impl Sample {
 }
 
 /// What every sample can be asked.
-trait Told {
+trait AnySample {
     fn header(&self) -> Option<&Header>;
     fn missed(&self) -> u64;
+    fn bytes(&self) -> &[u8];
+    fn pack(&self, room: &mut [u8]) -> Option<usize>;
 }
 
-impl<P: Payload + ?Sized> Told for Received<P> {
+impl<P: Payload + Packed + Pod> AnySample for Received<P> {
     fn header(&self) -> Option<&Header> {
         Some(self.header())
     }
@@ -157,9 +166,36 @@ impl<P: Payload + ?Sized> Told for Received<P> {
     fn missed(&self) -> u64 {
         self.missed
     }
+
+    fn bytes(&self) -> &[u8] {
+        bytes_of::<P>(self)
+    }
+
+    fn pack(&self, room: &mut [u8]) -> Option<usize> {
+        (**self).pack(room)
+    }
 }
 
-impl Told for Heard {
+impl AnySample for Received<[u8]> {
+    fn header(&self) -> Option<&Header> {
+        Some(self.header())
+    }
+
+    fn missed(&self) -> u64 {
+        self.missed
+    }
+
+    fn bytes(&self) -> &[u8] {
+        self
+    }
+
+    fn pack(&self, room: &mut [u8]) -> Option<usize> {
+        room.get_mut(..self.len())?.copy_from_slice(self);
+        Some(self.len())
+    }
+}
+
+impl AnySample for Heard {
     fn header(&self) -> Option<&Header> {
         self.header.as_ref()
     }
@@ -167,14 +203,30 @@ impl Told for Heard {
     fn missed(&self) -> u64 {
         self.missed
     }
+
+    fn bytes(&self) -> &[u8] {
+        bytes_of(&self.zones)
+    }
+
+    fn pack(&self, room: &mut [u8]) -> Option<usize> {
+        self.zones.pack(room)
+    }
 }
 
-impl Told for RobotHeard {
+impl AnySample for RobotHeard {
     fn header(&self) -> Option<&Header> {
         self.heard.header.as_ref()
     }
 
     fn missed(&self) -> u64 {
         self.heard.missed
+    }
+
+    fn bytes(&self) -> &[u8] {
+        bytes_of(&self.heard.zones)
+    }
+
+    fn pack(&self, room: &mut [u8]) -> Option<usize> {
+        self.heard.zones.pack(room)
     }
 }

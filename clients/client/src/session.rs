@@ -151,8 +151,8 @@ impl Session {
     /// [`Kind::Configuration`] if it is not waited by event, [`Kind::Short`] if descriptors are short.
     pub fn descriptor(&mut self) -> Result<BorrowedFd<'_>, Failure> {
         if self.wait != Wait::Event {
-            let hint = "say that it waits by event: a bell has no descriptor";
-            return Err(Failure::new(Kind::Configuration, "no descriptor to wait at", hint));
+            let hint = "make it wait by event: a bell has no descriptor";
+            return Err(Failure::new(Kind::Configuration, "no descriptor to wait on", hint));
         }
         let readiness: &Readiness = match &mut self.readiness {
             Some(readiness) => readiness,

@@ -85,11 +85,11 @@ class _Client:
             if response is not None:
                 return _read(bytes(response.payload().as_memory_view()))
             if not lives:
-                remedy = f"whether it was done is not known: `scanhub info {self._sensor}` tells how the sensor is"
+                remedy = f"the result is not known: `scanhub info {self._sensor}` shows the sensor's state"
                 raise NoHub("the hub went away before it answered", remedy)
             if time.monotonic() >= give_up_at:
                 what = f"the hub did not answer for {self._sensor} in {_PATIENCE:.0f} s"
-                raise Silent(what, "its log tells if it is short of something")
+                raise Silent(what, "its log says whether something is short")
             self._responses.timed_wait(iox2.Duration.from_millis(int(LOOK_EVERY * 1000)))
 
     def _open(self) -> tuple[Any, Any, Any]:

@@ -135,7 +135,7 @@ def _named(user: int) -> str:
 
 
 def _planted(path: str, what: str) -> Denied:
-    return Denied(f"{path} {what}: nothing of it is opened", f"look at it with `ls -ld {path}` and remove it")
+    return Denied(f"{path} {what}: scanhub opens nothing in it", f"look at it with `ls -ld {path}` and remove it")
 
 
 _ENTER = os.O_PATH | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC

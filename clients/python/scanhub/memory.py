@@ -29,8 +29,8 @@ class Membership:
         self.domain = domain
         self.prefix = _prefix(domain)
         if self.prefix is None:
-            what = f"{domain.root} does not tell how shared memory is named"
-            raise NoHub(what, "its hub is just starting or ending, or is of another version")
+            what = f"{domain.root} does not contain the name of the shared memory"
+            raise NoHub(what, "its hub is just starting or ending, or has another version")
         counter.ensure(self.prefix)
         iox2.set_log_level_from_env_or(iox2.LogLevel.Error)
         builder = iox2.NodeBuilder.new().config(_config(domain, self.prefix))

@@ -124,7 +124,7 @@ class Segment(NamedTuple):
 
 
 class Foreground(Sample):
-    """What stands before the background."""
+    """What stands in front of the background."""
 
     topic = "foreground"
     struct = layout.Foreground

@@ -162,7 +162,7 @@ class Subscription(Iterator[Any]):
             there = ", ".join(map(str, memory.topics(self._membership.domain))) or "no topics at all"
             return Silent(f"no {', '.join(sorted(missing))} in {self._timeout} s", f"the hub has {there}")
         sensor = self._followers[0].name.sensor
-        return Silent(f"nothing of {names} in {self._timeout} s", f"`scanhub info {sensor}` tells how the sensor is")
+        return Silent(f"nothing of {names} in {self._timeout} s", f"`scanhub info {sensor}` shows the sensor's state")
 
 
 class _Follower:

@@ -49,7 +49,7 @@ def broken(domain: Domain, what: str) -> Failure:
         return failure
     except OSError:
         pass
-    return Failure(what, "IOX2_LOG_LEVEL=debug shows what the shared memory says")
+    return Failure(what, "IOX2_LOG_LEVEL=debug shows the messages of the shared-memory library")
 
 
 def check_room() -> None:

@@ -150,7 +150,7 @@ fn save(
     output: &mut Output<'_>,
 ) -> Result<(), Failure> {
     if model.count == 0 {
-        let hint = format!("a scan has to come first: `scanhub info {sensor}` shows how it is");
+        let hint = format!("a scan must arrive first: `scanhub info {sensor}` shows its state");
         return Err(Failure::new(Kind::Failed, format!("{sensor} has no background model yet"), hint));
     }
     if model.taught == 0 {
@@ -159,7 +159,7 @@ fn save(
         );
         return Err(Failure::new(
             Kind::Failed,
-            format!("the background of {sensor} knows no beam yet"),
+            format!("the background of {sensor} has no known beam yet"),
             hint,
         ));
     }
@@ -217,7 +217,7 @@ pub fn saved_model(
         return Ok(saved.model);
     }
     let message = format!("{place} is the background of {}, not of {sensor}", saved.sensor);
-    Err(Failure::new(Kind::Configuration, message, "--any-sensor takes it all the same"))
+    Err(Failure::new(Kind::Configuration, message, "--any-sensor accepts it anyway"))
 }
 
 /// The file that is stdin or stdout.

@@ -6,12 +6,12 @@ use std::sync::atomic::AtomicBool;
 use scanhub_client::streams::Sample;
 use schema::{Domain, Failure, Header, Kind, Scan, Topic, csv};
 
-use crate::account::Account;
 use crate::follow::{Bounds, Notice, Sink, follow};
 use crate::names::TopicName;
 use crate::output::{End, Output, quiet};
+use crate::receive_stats::ReceiveStats;
 use crate::selection::Selection;
-use crate::{json, text};
+use crate::{json, show, text};
 
 /// What `echo` is asked for.
 #[derive(Clone, Debug)]
@@ -74,7 +74,7 @@ impl Sink for Echo<'_> {
             (Format::Raw, _) => self.out.raw(sample.bytes()),
             (Format::Csv, Sample::Scan(scan)) => self.csv(scan.header(), scan),
             (Format::Csv, _) => Ok(()),
-            (Format::Json, _) => self.json(&name.sensor, sample),
+            (Format::Json, _) => show::json(sample, &name.sensor, &mut self.out),
         }
     }
 
@@ -89,30 +89,16 @@ impl Sink for Echo<'_> {
         }
     }
 
-    fn summary(&mut self, name: &TopicName, account: &Account) -> Result<(), End> {
+    fn summary(&mut self, name: &TopicName, stats: &ReceiveStats) -> Result<(), End> {
         match self.format {
-            Format::Json => self.out.json(&json::summary(name, account)),
-            Format::Text => self.out.line(|line| text::summary(line, name, account)),
-            Format::Csv | Format::Raw => self.notes.line(|line| text::summary(line, name, account)),
+            Format::Json => self.out.json(&json::summary(name, stats)),
+            Format::Text => self.out.line(|line| text::summary(line, name, stats)),
+            Format::Csv | Format::Raw => self.notes.line(|line| text::summary(line, name, stats)),
         }
     }
 }
 
 impl Echo<'_> {
-    fn json(&mut self, sensor: &str, sample: &Sample) -> Result<(), End> {
-        let out = &mut self.out;
-        match sample {
-            Sample::Telegram(found) => out.json(&json::telegram(sensor, found.header(), found)),
-            Sample::Scan(found) => out.json(&json::scan(sensor, found.header(), found)),
-            Sample::Marks(found) => out.json(&json::marks(sensor, found.header(), found)),
-            Sample::Zones(heard) => out.json(&json::zones(sensor, heard)),
-            Sample::Foreground(found) => out.json(&json::foreground(sensor, found.header(), found)),
-            Sample::Background(found) => out.json(&json::background(sensor, found)),
-            Sample::Status(found) => out.json(&json::status(sensor, found)),
-            Sample::Robot(found) => out.json(&json::robot(&found.robot, &found.heard)),
-        }
-    }
-
     /// A line of columns; the names of the columns first, and again if their number changes.
     fn csv(&mut self, header: &Header, scan: &Scan) -> Result<(), End> {
         if self.columns != Some(scan.beams()) {
@@ -131,7 +117,7 @@ fn check(format: Format, named: &[TopicName], of_all: &[Topic]) -> Result<(), Fa
             usage("--csv and --raw take one topic of one sensor")
         }
         (Format::Csv, [one]) if one.topic == Topic::Scan => Ok(()),
-        (Format::Csv, _) => usage("--csv takes one topic, and that a scan"),
+        (Format::Csv, _) => usage("--csv takes one topic, which must be a scan"),
         (Format::Raw, [_, _, ..]) => usage("--raw takes one topic"),
         (Format::Raw, [one]) if one.is_robot() => usage("--raw takes the topic of a sensor"),
         _ => Ok(()),

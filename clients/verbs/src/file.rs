@@ -37,7 +37,7 @@ pub(crate) fn replace(path: &Path, content: &[u8]) -> Result<(), Failure> {
         old => beside(&path).and_then(|beside| exchange(&path, &beside, old.as_ref(), content)),
     };
     written.map_err(|error| {
-        let hint = "the directory has to be there, writable, and with room";
+        let hint = "the directory must exist, be writable and have free space";
         Failure::new(Kind::Output, format!("cannot write {}: {error}", path.display()), hint)
     })
 }
@@ -69,6 +69,6 @@ fn beside(path: &Path) -> io::Result<PathBuf> {
 }
 
 fn unreadable(place: &str, error: &io::Error) -> Failure {
-    let hint = "it has to be there, and readable for this user";
+    let hint = "it must exist and be readable for this user";
     Failure::new(Kind::Input, format!("cannot read {place}: {error}"), hint)
 }

@@ -1,8 +1,8 @@
 //! The loop of every verb that follows topics: receive, account, say what is wrong, end when the bounds say so.
 //! Refuses to know what becomes of a sample.
 
+mod discovery;
 mod lines;
-mod roll;
 
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
@@ -11,10 +11,10 @@ use scanhub_client::streams::{GRACE, Sample, Session, Source, Who};
 use scanhub_client::{Wait, clock};
 use schema::{Domain, Failure, Kind, Status, Topic, is_remote};
 
-use crate::account::Account;
+use crate::discovery::Discovery;
 use crate::names::TopicName;
 use crate::output::End;
-use crate::roll::Roll;
+use crate::receive_stats::ReceiveStats;
 use lines::{LineTrack, watch_parts};
 
 /// When a verb that follows ends by itself.
@@ -77,7 +77,7 @@ pub(crate) trait Sink {
         Ok(())
     }
     /// The run is over, for good or ill; nothing comes any more.
-    fn summary(&mut self, name: &TopicName, account: &Account) -> Result<(), End>;
+    fn summary(&mut self, name: &TopicName, stats: &ReceiveStats) -> Result<(), End>;
 }
 
 /// Follows `names`, and `topics` of each sensor that a hub has when it comes, in the first live one of `places` until
@@ -113,9 +113,9 @@ fn carry(mut run: Run<'_>, names: &[TopicName], stop: &AtomicBool, sink: &mut dy
     if !matches!(end, Err(End::ReaderGone)) {
         run.take_lines(sink)?;
         for track in &run.tracks {
-            let mut account = track.account.clone();
-            account.loss = run.loss(&track.name.sensor);
-            sink.summary(&track.name, &account)?;
+            let mut stats = track.stats.clone();
+            stats.loss = run.loss(&track.name.sensor);
+            sink.summary(&track.name, &stats)?;
         }
     }
     end
@@ -124,7 +124,7 @@ fn carry(mut run: Run<'_>, names: &[TopicName], stop: &AtomicBool, sink: &mut dy
 struct Track {
     name: TopicName,
     source: Source,
-    account: Account,
+    stats: ReceiveStats,
     /// CLOCK_MONOTONIC since when samples are received as they are sent, in ns.
     since_ns: u64,
 }
@@ -133,7 +133,7 @@ impl Track {
     fn new(name: TopicName) -> Track {
         Track {
             source: Source::new(&name.sensor, name.topic),
-            account: Account::new(name.topic),
+            stats: ReceiveStats::new(name.topic),
             name,
             since_ns: u64::MAX,
         }
@@ -148,7 +148,7 @@ struct Run<'a> {
     lined: usize,
     /// What is followed of each sensor that a hub has.
     topics: &'a [Topic],
-    roll: Roll,
+    discovery: Discovery,
     /// Samples come before news of the hub.
     closely: bool,
     bounds: &'a Bounds,
@@ -185,7 +185,7 @@ impl<'a> Run<'a> {
             lines: Vec::new(),
             lined: 0,
             topics,
-            roll: Roll::default(),
+            discovery: Discovery::default(),
             closely: false,
             bounds,
             started: now,
@@ -231,7 +231,7 @@ impl<'a> Run<'a> {
     fn look(&mut self, sink: &mut dyn Sink) -> Result<(), End> {
         let change = self.session.look()?;
         if let Some(who) = change.gone {
-            self.roll.end();
+            self.discovery.end();
             self.tell(sink, Notice::HubGone, |name| is_of(name, who))?;
         }
         if let Some(who) = change.back {
@@ -245,9 +245,9 @@ impl<'a> Run<'a> {
                 .iter_mut()
                 .filter(|track| track.source.subscribed())
                 .for_each(|track| track.since_ns = now_ns);
-            self.roll.begin(Instant::now());
+            self.discovery.begin(Instant::now());
         }
-        self.call_the_roll(sink)
+        self.discover(sink)
     }
 
     /// Receives what waits; true if that was all that was asked for.
@@ -281,7 +281,7 @@ impl<'a> Run<'a> {
                         continue;
                     }
                     let missed = sample.missed();
-                    track.account.count(now, missed, sample.period_us(), sample.is_of_before(track.since_ns));
+                    track.stats.count(now, missed, sample.period_us(), sample.is_of_before(track.since_ns));
                     if missed > 0 {
                         sink.notice(&[&track.name], Notice::Missed(missed))?;
                     }
@@ -307,7 +307,7 @@ impl<'a> Run<'a> {
     fn check(&mut self, sink: &mut dyn Sink, now: Instant) -> Result<(), End> {
         if self.session.domain().is_some() {
             for track in &mut self.tracks {
-                if track.account.stale(now) {
+                if track.stats.stale(now) {
                     sink.notice(&[&track.name], Notice::Stale)?;
                 }
             }
@@ -329,7 +329,7 @@ impl<'a> Run<'a> {
             let limit = self.bounds.timeout.unwrap_or_default();
             let hint =
                 if self.session.domain().is_some() { "`scanhub info` shows why" } else { "there is no hub" };
-            return Err(Failure::new(Kind::Timeout, format!("nothing came for {limit:?}"), hint).into());
+            return Err(Failure::new(Kind::Timeout, format!("nothing arrived for {limit:?}"), hint).into());
         }
         Ok(())
     }
@@ -355,14 +355,14 @@ impl<'a> Run<'a> {
         let end = self.bounds.run_for.and_then(|limit| self.started.checked_add(limit));
         let silence = self.bounds.timeout.and_then(|limit| self.last_sample.checked_add(limit));
         let left = self.tracks.iter().filter_map(|track| track.source.left()).min();
-        let left = left.into_iter().chain(self.roll.left()).min();
+        let left = left.into_iter().chain(self.discovery.left()).min();
         let unheard = left.and_then(|left| Instant::now().checked_add(left));
         [end, silence, unheard].into_iter().flatten().min()
     }
 
     fn stopped(&self) -> Result<(), End> {
         if self.bounds.bounded() {
-            return Err(Failure::new(Kind::Interrupted, "interrupted before it was through", "").into());
+            return Err(Failure::new(Kind::Interrupted, "interrupted before it was done", "").into());
         }
         Ok(())
     }
@@ -370,7 +370,7 @@ impl<'a> Run<'a> {
     fn time_is_over(&self) -> Result<(), End> {
         match self.bounds.count {
             Some(count) => {
-                let what = format!("{} of {count} samples came in time", self.received);
+                let what = format!("{} of {count} samples arrived in time", self.received);
                 Err(Failure::new(Kind::Timeout, what, "`scanhub info` shows why").into())
             }
             None => Ok(()),

@@ -5,10 +5,10 @@ mod host;
 mod lan;
 mod life;
 mod machine;
-mod outlet;
 mod report;
 mod selection;
 mod sensor;
+mod udp_destination;
 mod uplink;
 
 use std::io::Write;
@@ -21,11 +21,11 @@ use scanhub_client::clock;
 use scanhub_client::streams::{GRACE, Session};
 use schema::{Domain, Failure, Kind, check_sensor};
 
+use crate::discovery::Discovery;
 use crate::follow::Notice;
+use crate::lossy_writer::LossyWriter;
 use crate::names::no_sensor;
 use crate::output::{End, quiet};
-use crate::roll::Roll;
-use crate::spare::Spare;
 use lan::{Form, Lan};
 use life::Life;
 use report::Report;
@@ -67,8 +67,8 @@ impl GatewayOptions {
     fn selection(&self) -> Result<Selection, Failure> {
         let selection = Selection::parse(&self.topics, self.bare)?;
         if self.bare && self.background_every.is_some() {
-            let what = "no background goes out where only telegrams do";
-            return Err(Failure::new(Kind::Configuration, what, "leave bare or background_every away"));
+            let what = "no background is sent where only telegrams are";
+            return Err(Failure::new(Kind::Configuration, what, "leave bare or background_every out"));
         }
         Ok(selection)
     }
@@ -101,7 +101,7 @@ pub fn gateway(
     stop: &AtomicBool,
 ) -> Result<(), Failure> {
     let mut gateway = Gateway::open(options, stop)?;
-    let (mut out, mut notes) = (Spare::new(out, stop), Spare::new(notes, stop));
+    let (mut out, mut notes) = (LossyWriter::new(out, stop), LossyWriter::new(notes, stop));
     let mut report = Report::new(options.look, &mut out, &mut notes);
     quiet(gateway.run(&mut report, tell, stop))
 }
@@ -113,7 +113,7 @@ struct Gateway<'a> {
     sensors: Vec<Sensor>,
     lan: Lan,
     started: Instant,
-    roll: Roll,
+    discovery: Discovery,
     is_there: bool,
     /// The sensors that are named were found in a hub.
     is_checked: bool,
@@ -149,7 +149,7 @@ impl<'a> Gateway<'a> {
             session: Session::new(options.places.clone()),
             lan,
             started: Instant::now(),
-            roll: Roll::default(),
+            discovery: Discovery::default(),
             waiting_said: false,
             is_there: false,
             is_checked: false,
@@ -186,7 +186,7 @@ impl<'a> Gateway<'a> {
             }
             if !more {
                 let tick = self.tick_at.saturating_duration_since(now);
-                let left = self.sensors.iter().filter_map(Sensor::left).chain(self.roll.left());
+                let left = self.sensors.iter().filter_map(Sensor::left).chain(self.discovery.left());
                 self.session.wait_for(Some(left.fold(tick, Duration::min)))?;
             }
         }
@@ -198,28 +198,28 @@ impl<'a> Gateway<'a> {
         let change = self.session.look()?;
         if change.gone.is_some() && self.is_there {
             self.is_there = false;
-            self.roll.end();
+            self.discovery.end();
             report.hub(Notice::HubGone)?;
         }
         // Somebody else may bring the sensors of other machines, which are not sent on.
         if change.back.is_some() && self.session.hub_lives() {
-            if self.roll.has_begun() || self.waiting_said {
+            if self.discovery.has_begun() || self.waiting_said {
                 report.hub(Notice::HubBack)?;
             }
             self.is_there = true;
-            self.roll.begin(now);
+            self.discovery.begin(now);
         }
-        if !self.roll.has_begun() && !self.waiting_said && now - self.started >= GRACE {
+        if !self.discovery.has_begun() && !self.waiting_said && now - self.started >= GRACE {
             self.waiting_said = true;
             report.hub(Notice::HubGone)?;
         }
-        Ok(self.call_the_roll(now)?)
+        Ok(self.discover(now)?)
     }
 
     /// Follows the sensors of the hub if all are wanted; those that are named have to be there in the first hub.
-    fn call_the_roll(&mut self, now: Instant) -> Result<(), Failure> {
+    fn discover(&mut self, now: Instant) -> Result<(), Failure> {
         let Some(domain) = self.session.domain().filter(|_| self.is_there) else { return Ok(()) };
-        let Some(called) = self.roll.call(domain, now)? else { return Ok(()) };
+        let Some(called) = self.discovery.call(domain, now)? else { return Ok(()) };
         if self.selection.wants_all() {
             for name in &called.sensors {
                 // One that came from another machine has another name.
@@ -249,12 +249,12 @@ impl<'a> Gateway<'a> {
             self.sensors.iter_mut().for_each(|sensor| sensor.repeat(every, now, &mut self.lan));
         }
         self.announce();
-        for outlet in self.lan.outlets_mut() {
-            if let Some(address) = outlet.follow_name(now) {
-                report.moved(&outlet.name, address)?;
+        for destination in self.lan.destinations_mut() {
+            if let Some(address) = destination.follow_name(now) {
+                report.moved(&destination.name, address)?;
             }
-            if let Some(news) = outlet.news() {
-                report.destination(&outlet.name, &news)?;
+            if let Some(news) = destination.news() {
+                report.destination(&destination.name, &news)?;
             }
         }
         if let Some(what) = self.lan.misfit() {

@@ -10,10 +10,10 @@ use scanhub_client::streams::Sample;
 use schema::{Domain, Failure, Status, Topic};
 use serde::Serialize;
 
-use crate::account::Account;
 use crate::follow::{Bounds, Notice, Sink, follow};
 use crate::names::TopicName;
 use crate::output::{End, Output, quiet};
+use crate::receive_stats::ReceiveStats;
 use crate::selection::Selection;
 use crate::window::Window;
 use crate::{json, text};
@@ -140,11 +140,11 @@ impl Sink for Hz<'_> {
         Ok(())
     }
 
-    fn summary(&mut self, name: &TopicName, account: &Account) -> Result<(), End> {
+    fn summary(&mut self, name: &TopicName, stats: &ReceiveStats) -> Result<(), End> {
         if self.json {
-            return self.out.json(&json::summary(name, account));
+            return self.out.json(&json::summary(name, stats));
         }
-        self.out.line(|line| text::summary(line, name, account))
+        self.out.line(|line| text::summary(line, name, stats))
     }
 }
 

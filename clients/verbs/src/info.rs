@@ -36,7 +36,7 @@ pub fn info(options: &InfoOptions, out: &mut dyn Write, stop: &AtomicBool) -> Re
     for (sensor, status) in statuses(&domain, &sensors, stop)? {
         let Some(status) = status else {
             let hint = "the hub is there and does not publish: look at its log";
-            return Err(Failure::new(Kind::Timeout, format!("no status of {sensor} came"), hint));
+            return Err(Failure::new(Kind::Timeout, format!("no status of {sensor} arrived"), hint));
         };
         quiet(if options.json {
             output.json(&json::status(&sensor, &status))
@@ -131,7 +131,7 @@ fn line(status: &Status) -> String {
             let due = status.counters[Counter::DueOnLine];
             format!("{} of the scans lost in 10 s, {lost} of {due} in all", percent(share))
         }
-        _ => "what is lost is not known".to_owned(),
+        _ => "the loss is not known".to_owned(),
     };
     format!("{} of the bytes damaged, {lost}", percent(status.damaged()))
 }
@@ -145,7 +145,7 @@ fn pose(pose: &Pose) -> String {
 fn marks(sensor: &str, status: &Status) -> String {
     match (status.has_reflector_bits(), status.reflector_remedy()) {
         (None, _) if status.is_replayed() => {
-            format!("unavailable: the recording does not tell its measuring mode; set link.{sensor}.mode")
+            format!("unavailable: the recording does not contain its measuring mode; set link.{sensor}.mode")
         }
         (None, _) => "unknown".into(),
         (Some(true), _) => "available".into(),

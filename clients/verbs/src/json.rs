@@ -6,10 +6,10 @@ use schema::{Counters, Failure, Flags, Header, Reasons, Scan, Status, Telegram, 
 use serde::Serialize;
 use serde::ser::{SerializeMap, Serializer};
 
-use crate::account::Account;
 use crate::follow::Notice;
 use crate::names::TopicName;
 use crate::output::{End, Output};
+use crate::receive_stats::ReceiveStats;
 
 pub(crate) use processed::{foreground, marks, robot, zones};
 // A background model as a line is what a file of it is.
@@ -217,7 +217,7 @@ pub(crate) fn notices(output: &mut Output<'_>, names: &[&TopicName], notice: Not
 }
 
 /// Class `summary`.
-pub(crate) fn summary<'a>(name: &'a TopicName, account: &Account) -> impl Serialize + 'a {
+pub(crate) fn summary<'a>(name: &'a TopicName, stats: &ReceiveStats) -> impl Serialize + 'a {
     #[derive(Serialize)]
     struct Line<'a> {
         class: &'static str,
@@ -234,12 +234,12 @@ pub(crate) fn summary<'a>(name: &'a TopicName, account: &Account) -> impl Serial
         class: "summary",
         sensor: &name.sensor,
         topic: name.topic.name(),
-        received: account.received,
-        lost: account.lost,
-        seconds: account.seconds(),
-        hz: account.hz(),
-        damaged: account.loss.damaged,
-        lost_on_line: account.loss.lost_on_line,
+        received: stats.received,
+        lost: stats.lost,
+        seconds: stats.seconds(),
+        hz: stats.hz(),
+        damaged: stats.loss.damaged,
+        lost_on_line: stats.loss.lost_on_line,
     }
 }
 

@@ -16,10 +16,10 @@ use scanhub_client::streams::Sample;
 use scanhub_client::{Wait, clock};
 use schema::{Domain, Failure, Flags, Kind};
 
-use crate::account::Account;
 use crate::follow::{Bounds, Notice, Sink, follow_closely};
 use crate::names::TopicName;
 use crate::output::{End, Output, quiet};
+use crate::receive_stats::ReceiveStats;
 use crate::{json, text};
 use realtime::Realtime;
 use report::{Conditions, NOTHING_CAME, why_nothing};
@@ -107,7 +107,7 @@ impl Latency<'_> {
                     let (what, hint) = (format!("{name}: {NOTHING_CAME}"), why_nothing(name));
                     return Err(Failure::new(Kind::Check, what, hint));
                 }
-                let what = format!("{name}: no sample came whose age is known");
+                let what = format!("{name}: no sample with a known age arrived");
                 return Err(Failure::new(Kind::Check, what, "measure for longer: --for 10s"));
             };
             let p99 = Duration::from_nanos(age.p99_ns);
@@ -115,9 +115,9 @@ impl Latency<'_> {
                 let what = format!("{name}: p99 of the age on arrival is {p99:?}, more than {limit:?}");
                 let hint = if spans.flags & Flags::REMOTE != 0 {
                     "of a remote sensor it is the time from the datagram's arrival until it was received here: see what else \
-                     runs on this machine; `network` tells the way before"
+                     runs on this machine; `network` is the time before that"
                 } else {
-                    "hub and wake tell where the time goes"
+                    "hub and wake show where the time goes"
                 };
                 return Err(Failure::new(Kind::Check, what, hint));
             }
@@ -176,13 +176,13 @@ impl Sink for Latency<'_> {
         Ok(())
     }
 
-    fn summary(&mut self, name: &TopicName, account: &Account) -> Result<(), End> {
+    fn summary(&mut self, name: &TopicName, stats: &ReceiveStats) -> Result<(), End> {
         let Some((_, spans)) = self.topics.iter().find(|(known, _)| known == name) else { return Ok(()) };
         if self.json {
             self.out.json(&report::json(name, spans))?;
-            return self.out.json(&json::summary(name, account));
+            return self.out.json(&json::summary(name, stats));
         }
-        self.out.line(|line| text::summary(line, name, account))?;
+        self.out.line(|line| text::summary(line, name, stats))?;
         report::full(&mut self.out, name, spans, self.terminal)
     }
 }

@@ -16,10 +16,10 @@ use scanhub_client::streams::{Freshness, Sample};
 use schema::{Domain, Failure, Kind, ROBOT, Status, Topic, Verdict, check_followed};
 use serde::Serialize;
 
-use crate::account::Account;
 use crate::follow::{Bounds, Notice, Sink, follow};
 use crate::names::{TopicName, as_word};
 use crate::output::{End, Output, quiet};
+use crate::receive_stats::ReceiveStats;
 use crate::{json, text};
 use device::{Device, News};
 use hold::Hold;
@@ -103,13 +103,10 @@ fn wanted<'a>(sensor: &str, leds: &'a [String]) -> Result<Vec<(Light, &'a str)>,
             return refuse(&format!("no light {light:?}: {LED_FORM}"));
         };
         if light == Light::Mark && sensor == ROBOT {
-            return refuse("marks are one sensor's: name the sensor");
+            return refuse("marks belong to one sensor: name the sensor");
         }
         if let Some((other, _)) = wanted.iter().find(|(_, taken)| *taken == name) {
-            return refuse(&format!(
-                "{name} shows {} already: each light has diodes of its own",
-                other.name()
-            ));
+            return refuse(&format!("{name} already shows {}: each light has its own LEDs", other.name()));
         }
         wanted.push((light, name));
     }
@@ -303,7 +300,7 @@ impl Sink for Board<'_> {
         self.verdict.changes_at()
     }
 
-    fn summary(&mut self, _: &TopicName, _: &Account) -> Result<(), End> {
+    fn summary(&mut self, _: &TopicName, _: &ReceiveStats) -> Result<(), End> {
         Ok(())
     }
 }

@@ -2,13 +2,13 @@
 //! `scanhub_client` and never on a hub. Refuses to know command lines and signals: options come as structs, the wish to stop
 //! as a flag.
 
-mod account;
 mod background;
+mod background_task;
 mod body;
 mod control;
+mod discovery;
 pub mod duration;
 mod echo;
-mod errand;
 mod file;
 mod follow;
 mod gateway;
@@ -21,14 +21,15 @@ mod leds;
 mod line;
 mod list;
 mod listen;
+mod lossy_writer;
 mod mask;
 mod names;
 mod output;
+mod receive_stats;
 #[cfg(feature = "record")]
 mod record;
-mod roll;
 mod selection;
-mod spare;
+mod show;
 mod text;
 #[cfg(feature = "tui")]
 mod watch;

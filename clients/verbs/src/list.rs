@@ -6,7 +6,7 @@ use std::sync::atomic::AtomicBool;
 
 use scanhub_client::streams::find;
 use schema::ipc::{self, Node, Payload, PortFactory};
-use schema::{Background, Domain, Failure, Foreground, Marks, Scan, State, Status, Topic, Zones, publisher};
+use schema::{Domain, Failure, Pace, State, Status, Topic, publisher};
 use serde::{Serialize, Serializer};
 
 use crate::info::statuses;
@@ -30,16 +30,12 @@ pub fn list(options: &ListOptions, out: &mut dyn Write, stop: &AtomicBool) -> Re
     let sensors = ipc::sensors(&domain)?;
     let mut lines = Vec::new();
     for sensor in &sensors {
-        lines.extend(line::<[u8]>(&node, sensor)?);
-        lines.extend(line::<Scan>(&node, sensor)?);
-        lines.extend(line::<Marks>(&node, sensor)?);
-        lines.extend(line::<Zones>(&node, sensor)?);
-        lines.extend(line::<Foreground>(&node, sensor)?);
-        lines.extend(line::<Background>(&node, sensor)?);
-        lines.extend(line::<Status>(&node, sensor)?);
+        of_sensor(&node, sensor, &mut lines)?;
     }
     for (sensor, status) in statuses(&domain, &sensors, stop)? {
-        for line in lines.iter_mut().filter(|line| line.sensor == sensor && comes_with_scans(line.topic)) {
+        for line in
+            lines.iter_mut().filter(|line| line.sensor == sensor && line.topic.row().pace == Pace::Scan)
+        {
             line.hz = status.as_ref().and_then(rate_hz);
         }
     }
@@ -112,6 +108,18 @@ impl Line {
     }
 }
 
+macro_rules! lines {
+    ($($topic:ident $payload:tt, $name:literal, $($column:tt),*: $about:literal;)*) => {
+        /// Adds a line for each topic of `sensor`.
+        fn of_sensor(node: &Node, sensor: &str, lines: &mut Vec<Line>) -> Result<(), Failure> {
+            $(lines.extend(line::<schema::payload_type!($payload)>(node, sensor)?);)*
+            Ok(())
+        }
+    };
+}
+
+schema::for_each_topic!(lines);
+
 fn line<P: Payload + ?Sized>(node: &Node, sensor: &str) -> Result<Option<Line>, Failure> {
     let topic = P::TOPIC;
     Ok(P::open(node, sensor)?.map(|service| Line {
@@ -129,14 +137,6 @@ fn line<P: Payload + ?Sized>(node: &Node, sensor: &str) -> Result<Option<Line>, 
 fn rate_hz(status: &Status) -> Option<f64> {
     let is_unmeasured = status.rate_mhz == 0 && status.state() == Some(State::Streaming);
     (!is_unmeasured).then(|| f64::from(status.rate_mhz) / 1000.0)
-}
-
-/// Not each second or when there is something new, but scan by scan.
-fn comes_with_scans(topic: Topic) -> bool {
-    match topic {
-        Topic::Telegram | Topic::Scan | Topic::Marks | Topic::Zones | Topic::Foreground => true,
-        Topic::Background | Topic::Status => false,
-    }
 }
 
 fn name<S: Serializer>(topic: &Topic, serializer: S) -> Result<S::Ok, S::Error> {

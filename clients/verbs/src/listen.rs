@@ -2,30 +2,30 @@
 //! who sends it, and to answer.
 
 mod crowd;
-mod ear;
+mod duplicate_gateways;
+mod multicast_receiver;
 mod names;
+mod peer_table;
 mod publish;
 mod remote;
 mod report;
-mod roll;
-mod twins;
 
 use std::io::Write;
 use std::net::SocketAddrV4;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
-use schema::datagram::{Account, Announce, Arrival, Datagram, Fresh, Head, Refusal, group};
+use schema::datagram::{Announce, Arrival, Datagram, DatagramError, Fresh, Head, StreamStats, group};
 use schema::{Domain, Failure, Kind, Topic};
 
 use self::crowd::{Crowd, Crowding};
-use self::ear::{Caught, Ear, LONGEST};
+use self::duplicate_gateways::DuplicateGateways;
+use self::multicast_receiver::{Caught, LONGEST, MulticastReceiver};
 use self::names::{Hubs, Names};
+use self::peer_table::PeerTable;
 use self::publish::Publication;
 use self::remote::Remote;
 use self::report::Report;
-use self::roll::Roll;
-use self::twins::Twins;
 use crate::follow::Bounds;
 use crate::interface::is_of_this_machine;
 use crate::output::{End, Output, quiet};
@@ -76,19 +76,19 @@ pub fn listen(
     let groups = groups(&wanted);
     let now = Instant::now();
     let publication = options.publish.as_ref().map(|domain| Publication::open(domain, now)).transpose()?;
-    let ear = Ear::open(options.interface.as_deref(), &groups, now)?;
+    let receiver = MulticastReceiver::open(options.interface.as_deref(), &groups, now)?;
     // Of topics whose group is not joined announcements would tell as lost what nobody wanted.
     let heard: Vec<_> = Topic::ALL.into_iter().filter(|&topic| groups.contains(&group(topic))).collect();
     let mut listener = Listener {
         options,
         wanted,
         hubs,
-        ear,
+        receiver,
         publication,
         told: Vec::new(),
-        account: Box::new(Account::new(&heard)),
-        roll: Roll::default(),
-        twins: Twins::default(),
+        stats: Box::new(StreamStats::new(&heard)),
+        peers: PeerTable::default(),
+        duplicates: DuplicateGateways::default(),
         crowd: Crowd::default(),
         report: Report::new(options.json, Output::new(out), Output::new(notes), names),
         started: now,
@@ -103,13 +103,13 @@ struct Listener<'a> {
     options: &'a ListenOptions,
     wanted: Vec<Topic>,
     hubs: Hubs,
-    ear: Ear,
+    receiver: MulticastReceiver,
     publication: Option<Publication>,
     /// What was told that is wrong here.
     told: Vec<String>,
-    account: Box<Account>,
-    roll: Roll,
-    twins: Twins,
+    stats: Box<StreamStats>,
+    peers: PeerTable,
+    duplicates: DuplicateGateways,
     crowd: Crowd,
     report: Report<'a>,
     started: Instant,
@@ -132,7 +132,7 @@ const DRAW_EVERY: Duration = Duration::from_secs(1);
 
 impl Listener<'_> {
     fn listen(&mut self, tell: &AtomicBool, stop: &AtomicBool) -> Result<(), End> {
-        self.report.ready(&self.ear.interfaces(), self.options.publish.as_ref())?;
+        self.report.ready(&self.receiver.interfaces(), self.options.publish.as_ref())?;
         let end = self.run(tell, stop);
         if !matches!(end, Err(End::ReaderGone)) {
             self.tell()?;
@@ -142,7 +142,7 @@ impl Listener<'_> {
 
     /// The account so far.
     fn tell(&mut self) -> Result<(), End> {
-        self.report.account(&self.account, &self.roll)?;
+        self.report.stats(&self.stats, &self.peers)?;
         self.publication.iter().try_for_each(|publication| self.report.publication(publication))
     }
 
@@ -171,7 +171,7 @@ impl Listener<'_> {
                 self.tell()?;
             }
             if !more {
-                self.ear.wait(self.left(now));
+                self.receiver.wait(self.left(now));
             }
         }
     }
@@ -179,18 +179,18 @@ impl Listener<'_> {
     /// Takes what waits, up to a turn; whether there may be more.
     fn take(&mut self, buffer: &mut [u8]) -> Result<bool, End> {
         for _ in 0..TURN {
-            let Some(caught) = self.ear.receive(buffer)? else { return Ok(false) };
+            let Some(caught) = self.receiver.receive(buffer)? else { return Ok(false) };
             let bytes = caught.bytes;
             if !self.hubs.want(bytes) {
                 continue;
             }
-            match self.account.receive(bytes, sender(caught.from), caught.arrival_ns) {
+            match self.stats.receive(bytes, sender(caught.from), caught.arrival_ns) {
                 Ok((_, Fresh::Duplicate)) => {}
                 Ok((datagram, fresh)) => {
-                    self.twins.taken(datagram.head.hub);
+                    self.duplicates.taken(datagram.head.hub);
                     self.heard(datagram, fresh == Fresh::Late, &caught)?;
                 }
-                Err(Refusal::Epoch | Refusal::Twin) => self.of_another_life(bytes)?,
+                Err(DatagramError::Epoch | DatagramError::Twin) => self.of_another_life(bytes)?,
                 Err(_) => {}
             }
             if self.options.bounds.count.is_some_and(|count| self.received >= count) {
@@ -204,7 +204,7 @@ impl Listener<'_> {
     fn heard(&mut self, datagram: Datagram<'_>, late: bool, caught: &Caught<'_>) -> Result<(), End> {
         let &Caught { arrival_ns, wall_ns, .. } = caught;
         let head = datagram.head;
-        if self.account.since_ns(head.hub, head.epoch) == Some(arrival_ns) {
+        if self.stats.since_ns(head.hub, head.epoch) == Some(arrival_ns) {
             // A life began with it; if one of the same epoch went on until now, that was another sender's.
             self.publication.iter_mut().for_each(|publication| publication.begun(&head));
         }
@@ -212,7 +212,7 @@ impl Listener<'_> {
             // What it says was said again, and better, by a newer one.
             return if late { Ok(()) } else { self.announced(&datagram, caught) };
         };
-        let life = self.roll.life(&head, &self.account);
+        let life = self.peers.life(&head, &self.stats);
         let age_ns = life.age_ns(head.stamp_ns, wall_ns);
         let sensor = life.sensor(head.sensor);
         let missed = if late { 0 } else { sensor.advance(head.topic, head.sequence) };
@@ -236,7 +236,7 @@ impl Listener<'_> {
         if self.options.stats {
             return Ok(());
         }
-        let sensor = &self.roll.written(&head, &self.account);
+        let sensor = &self.peers.written(&head, &self.stats);
         if missed > 0 {
             self.report.missed(&head, sensor, topic, missed)?;
         }
@@ -246,8 +246,8 @@ impl Listener<'_> {
     fn announced(&mut self, datagram: &Datagram<'_>, caught: &Caught<'_>) -> Result<(), End> {
         let head = datagram.head;
         let Some(announce) = Announce::unpack(datagram.payload) else { return Ok(()) };
-        let behind_ns = self.roll.announce(&head, &self.account, &announce, caught.wall_ns);
-        if self.roll.life(&head, &self.account).sensor(head.sensor).take_numbered() {
+        let behind_ns = self.peers.announce(&head, &self.stats, &announce, caught.wall_ns);
+        if self.peers.life(&head, &self.stats).sensor(head.sensor).take_numbered() {
             self.report.named(&head, announce.sensor())?;
         }
         if let Some(behind_ns) = behind_ns {
@@ -276,11 +276,11 @@ impl Listener<'_> {
     /// `bytes` were refused as of a life of their gateway that is over, or of another gateway with its number.
     fn of_another_life(&mut self, bytes: &[u8]) -> Result<(), End> {
         let Ok(Datagram { head, .. }) = Datagram::read(bytes) else { return Ok(()) };
-        let is_shared = self.account.is_shared(head.hub, head.epoch);
-        if !is_shared && !self.twins.refused(head.hub, Instant::now()) {
+        let is_shared = self.stats.is_shared(head.hub, head.epoch);
+        if !is_shared && !self.duplicates.refused(head.hub, Instant::now()) {
             return Ok(());
         }
-        let what = twins::remedy(&self.report.names.of(head.hub));
+        let what = duplicate_gateways::remedy(&self.report.names.of(head.hub));
         self.trouble(&what)
     }
 
@@ -295,8 +295,8 @@ impl Listener<'_> {
 
     /// What is due now and then.
     fn look(&mut self, now: Instant) -> Result<(), End> {
-        self.ear.look(now);
-        if let Some(what) = self.ear.take_trouble() {
+        self.receiver.look(now);
+        if let Some(what) = self.receiver.take_trouble() {
             self.trouble(&what)?;
         }
         if let Some(publication) = &mut self.publication {
@@ -308,7 +308,7 @@ impl Listener<'_> {
         }
         if self.options.stats && self.options.terminal && !self.options.json && now >= self.draw_at {
             self.draw_at = now + DRAW_EVERY;
-            self.report.draw(&self.account, &self.roll)?;
+            self.report.draw(&self.stats, &self.peers)?;
         }
         Ok(())
     }
@@ -316,8 +316,8 @@ impl Listener<'_> {
     fn crowding(&self) -> Crowding {
         let publication = self.publication.as_ref();
         Crowding {
-            gateways: self.account.given_up().displaced,
-            refused: self.account.refused(Refusal::Capacity),
+            gateways: self.stats.given_up().displaced,
+            refused: self.stats.refused(DatagramError::Capacity),
             sensors: publication.map_or(0, |publication| publication.displaced),
             samples: publication.map_or(0, |publication| publication.left_out.capacity),
         }
@@ -333,7 +333,7 @@ impl Listener<'_> {
 
     fn stopped(&self) -> Result<(), End> {
         if self.options.bounds.bounded() {
-            return Err(Failure::new(Kind::Interrupted, "interrupted before it was through", "").into());
+            return Err(Failure::new(Kind::Interrupted, "interrupted before it was done", "").into());
         }
         Ok(())
     }
@@ -341,7 +341,7 @@ impl Listener<'_> {
     fn time_is_over(&self) -> Result<(), End> {
         match self.options.bounds.count {
             Some(count) => {
-                let what = format!("{} of {count} samples came in time", self.received);
+                let what = format!("{} of {count} samples arrived in time", self.received);
                 Err(Failure::new(Kind::Timeout, what, NOTHING_CAME).into())
             }
             None => Ok(()),
@@ -355,7 +355,7 @@ fn sender(from: SocketAddrV4) -> u64 {
 }
 
 fn nothing_came(limit: Duration) -> Failure {
-    Failure::new(Kind::Timeout, format!("nothing came for {limit:?}"), NOTHING_CAME)
+    Failure::new(Kind::Timeout, format!("nothing arrived for {limit:?}"), NOTHING_CAME)
 }
 
 const NOTHING_CAME: &str = "is `scanhub gateway` running in the same network? `scanhub listen --stats` counts what is \

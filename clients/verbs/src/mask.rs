@@ -10,11 +10,11 @@ use scanhub_client::streams::Sample;
 use schema::{Domain, Failure, Kind, Pose, Quality, Topic, check_sensor};
 use serde::Serialize;
 
-use crate::account::Account;
 use crate::body::{Body, Mask, SLICES, Sector};
 use crate::follow::{Bounds, Notice, Sink, follow};
 use crate::names::{TopicName, as_word};
 use crate::output::{End, Output, quiet};
+use crate::receive_stats::ReceiveStats;
 use crate::text;
 
 /// What `mask` is asked for.
@@ -54,8 +54,8 @@ pub fn mask(
         return Err(Failure::new(Kind::Configuration, message, "metres from the robot's centre, at most 65"));
     }
     if run_for.is_zero() {
-        let message = "--for 0s sees nothing";
-        return Err(Failure::new(Kind::Configuration, message, "--for 10s, which is what it is without it"));
+        let message = "--for 0s measures nothing";
+        return Err(Failure::new(Kind::Configuration, message, "--for 10s is the default"));
     }
     let topics = [Topic::Status, Topic::Zones, Topic::Scan];
     let names: Vec<_> = topics.into_iter().map(|topic| TopicName { sensor: sensor.clone(), topic }).collect();
@@ -109,21 +109,19 @@ impl Look<'_> {
     /// What was seen, if it is enough to tell a body from noise.
     fn seen(&self, sensor: &str) -> Result<(&Body, f64), Failure> {
         let few = |message: String, hint: String| Err(Failure::new(Kind::Timeout, message, hint));
-        let see = format!("`scanhub info {sensor}` shows how it is");
+        let see = format!("`scanhub info {sensor}` shows its state");
         if self.pose.is_none() {
-            return few(format!("no status of {sensor} came"), see);
+            return few(format!("no status of {sensor} arrived"), see);
         }
         let Some(within_mm) = self.within_mm else {
-            return few(
-                format!("no zones of {sensor} came"),
-                "--within RADIUS says how large they are".into(),
-            );
+            return few(format!("no zones of {sensor} arrived"), "--within RADIUS sets their size".into());
         };
         match &self.body {
-            None => few(format!("no scan of {sensor} came in {:?}", self.run_for), see),
+            None => few(format!("no scan of {sensor} arrived in {:?}", self.run_for), see),
             Some(body) if body.scans() < LEAST_SCANS || 2 * body.seen_slices() < SLICES => {
-                let message = format!("only {} scans of {sensor} came in {:?}", body.scans(), self.run_for);
-                few(message, format!("{LEAST_SCANS} are needed, over all of the time: a longer --for"))
+                let message =
+                    format!("only {} scans of {sensor} arrived in {:?}", body.scans(), self.run_for);
+                few(message, format!("{LEAST_SCANS} are needed, spread over the time: use a longer --for"))
             }
             Some(body) => Ok((body, within_mm)),
         }
@@ -168,7 +166,7 @@ impl Sink for Look<'_> {
 
     fn notice(&mut self, names: &[&TopicName], notice: Notice) -> Result<(), End> {
         if notice == Notice::HubGone {
-            return Err(Failure::new(Kind::Failed, "the hub went away", "look again when it is back").into());
+            return Err(Failure::new(Kind::Failed, "the hub went away", "try again when it is back").into());
         }
         (self.progress)(None);
         self.notes.line(|line| text::notice(line, names, notice))
@@ -185,7 +183,7 @@ impl Sink for Look<'_> {
         Ok(())
     }
 
-    fn summary(&mut self, _: &TopicName, _: &Account) -> Result<(), End> {
+    fn summary(&mut self, _: &TopicName, _: &ReceiveStats) -> Result<(), End> {
         Ok(())
     }
 }
@@ -209,7 +207,7 @@ impl Found<'_> {
         if self.mask.sectors.is_empty() {
             let so = if self.is_violated {
                 // The hub adds zones.margin to its circles, and keeps it to itself.
-                "but the largest circle is violated all the while. If by the robot, look farther: --within RADIUS, \
+                "but the largest circle is violated all the time. If by the robot, look farther: --within RADIUS, \
                  at least the circle's and zones.margin"
             } else {
                 "no mask is needed"
@@ -219,13 +217,13 @@ impl Found<'_> {
         for Sector { from_mdeg, to_mdeg, range_mm, .. } in &self.mask.moving {
             let (from, to) = (degrees(*from_mdeg), degrees(*to_mdeg));
             doubts.push(format!(
-                "from {from} to {to} degrees something moved, at {} m and farther: left out. Look again with nobody near",
+                "from {from} to {to} degrees something moved, at {} m and farther: left out. Try again with nobody near",
                 metres(*range_mm)
             ));
         }
         if self.beams() * MOST_SHARE > self.mask.of_beams {
             doubts.push(format!(
-                "{} of {} beams are hidden: the hub will be blind there. Look in the open, with nothing else within {within} m",
+                "{} of {} beams are hidden: the hub will be blind there. Try in an open area, with nothing else within {within} m",
                 self.beams(),
                 self.mask.of_beams
             ));
@@ -246,7 +244,7 @@ impl Found<'_> {
             self.beams(),
             mask.of_beams
         );
-        text += "# In a file of its own it goes to /etc/scanhub/conf.d; beside the link's other keys without its first lines.\n";
+        text += "# As its own file in /etc/scanhub/conf.d, or without the first lines among the link's other keys.\n";
         let _ = writeln!(text, "[[link]]\nname = \"{sensor}\"\n\n[link.zones]");
         if mask.sectors.is_empty() {
             return text + "self_min = []\n";

@@ -26,7 +26,8 @@ impl TopicName {
         let topic = Topic::parse(word).ok_or_else(|| unknown(nearest(sensor, word)))?;
         let name = TopicName { sensor: sensor.to_owned(), topic };
         if sensor == ROBOT && topic != Topic::Zones {
-            let hint = format!("{ROBOT} stands for all sensors, and only their zones add up: {ROBOT}/zones");
+            let hint =
+                format!("{ROBOT} stands for all sensors, and only zones can be combined: {ROBOT}/zones");
             return Err(Failure::new(Kind::Usage, format!("no topic {text:?}"), hint));
         }
         if !name.is_robot() {

@@ -4,12 +4,12 @@
 mod disk;
 mod files;
 mod lock;
+mod output_error;
 mod part;
 mod queue;
-mod refusal;
 mod report;
 mod selection;
-mod told;
+mod writer_progress;
 
 use std::collections::BTreeMap;
 use std::fs::{self, File};
@@ -26,11 +26,11 @@ use scanhub_client::streams::Sample;
 use schema::file::Compression;
 use schema::{Domain, Failure, Header, Kind};
 
-use crate::account::Account;
 use crate::follow::{Bounds, Notice, Sink, follow};
+use crate::lossy_writer::LossyWriter;
 use crate::names::TopicName;
 use crate::output::{End, quiet};
-use crate::spare::Spare;
+use crate::receive_stats::ReceiveStats;
 use disk::Disk;
 use files::Files;
 pub use files::Split;
@@ -38,7 +38,7 @@ use part::{Form, Style};
 use queue::{Entry, Gap, Queue};
 use report::Report;
 use selection::Selection;
-use told::{News, Told};
+use writer_progress::{News, WriterProgress};
 
 /// What `record` is asked for.
 #[derive(Clone, Debug)]
@@ -109,11 +109,11 @@ pub fn record(
     let first = disk.path();
     let over = AtomicBool::new(false);
     let terminal = out.as_fd().try_clone_to_owned().ok();
-    let (mut out, mut notes) = (Spare::new(out, &over), Spare::new(notes, &over));
+    let (mut out, mut notes) = (LossyWriter::new(out, &over), LossyWriter::new(notes, &over));
     let mut report = Report::new(options.look, &mut out, &mut notes, terminal);
     let begun = report.begin(&first);
     let mut recorder = Recorder {
-        told: disk.told(),
+        progress: disk.progress(),
         tracks: Vec::new(),
         queue: queue.clone(),
         pushed: 0,
@@ -144,18 +144,18 @@ fn begin(options: &RecordOptions, queue: &Arc<Queue>) -> Result<Disk, End> {
     let wall_ns = clock::wall_ns();
     let usual = files::usual_name(wall_ns);
     let path = options.file.as_deref().unwrap_or(&usual);
-    let failed = |error: io::Error| refusal::failed(path, options.split.is_some(), &error);
+    let failed = |error: io::Error| output_error::failed(path, options.split.is_some(), &error);
     let files = match options.is_to_stdout() {
         true if options.split.is_some() => {
-            return Err(Failure::new(Kind::Usage, "stdout has no parts", "leave --split away").into());
+            return Err(Failure::new(Kind::Usage, "stdout cannot be split", "leave --split out").into());
         }
         true if io::stdout().is_terminal() => {
             let hint = "for example `scanhub record -o - | ssh host 'cat > walk.mcap'`";
-            return Err(Failure::new(Kind::Usage, "a recording is nothing for a terminal", hint).into());
+            return Err(Failure::new(Kind::Usage, "a recording cannot be written to a terminal", hint).into());
         }
         true => Err(File::from(io::stdout().as_fd().try_clone_to_owned().map_err(failed)?)),
         false => {
-            refusal::check(path, options.force)?;
+            output_error::check(path, options.force)?;
             Ok(Files::new(path, options.split.is_some(), options.force, options.keep))
         }
     };
@@ -163,7 +163,7 @@ fn begin(options: &RecordOptions, queue: &Arc<Queue>) -> Result<Disk, End> {
     let style = Style { form, compression: options.compression };
     let begun = Disk::begin(queue.clone(), files, options.split, style, facts(options, wall_ns));
     begun.map_err(|error| match error.kind() {
-        ErrorKind::BrokenPipe => refusal::reader_gone(0).into(),
+        ErrorKind::BrokenPipe => output_error::reader_gone(0).into(),
         _ => failed(error).into(),
     })
 }
@@ -191,7 +191,7 @@ struct Kept {
 
 struct Recorder<'a> {
     queue: Arc<Queue>,
-    told: Arc<Told>,
+    progress: Arc<WriterProgress>,
     tracks: Vec<TopicName>,
     /// Samples handed to the writing thread.
     pushed: u64,
@@ -229,14 +229,14 @@ impl Recorder<'_> {
     }
 
     fn look(&mut self) -> Result<(), End> {
-        let account = self.told.look();
-        for news in account.news.iter() {
+        let stats = self.progress.look();
+        for news in stats.news.iter() {
             if *news == News::ReaderGone {
-                return Err(refusal::reader_gone(account.samples).into());
+                return Err(output_error::reader_gone(stats.samples).into());
             }
             self.report.disk(news)?;
         }
-        self.report.progress(&account, self.left_out)
+        self.report.progress(&stats, self.left_out)
     }
 
     /// Waits until all of it is written, and says what came of it, if it `stays`. A second wish to stop ends that, too.
@@ -255,24 +255,24 @@ impl Recorder<'_> {
             if ended_at.elapsed() < SAME_WISH {
                 stop.store(false, Ordering::Relaxed);
             } else if stop.load(Ordering::Relaxed) {
-                let what = "the disk did not take the end of the recording yet, and nobody waited for it";
+                let what = "the disk had not stored the end of the recording when a second signal came";
                 return Err(Failure::new(Kind::Failed, what, REPAIR).into());
             }
             thread::sleep(LOOK_EVERY);
         }
         let written = writing.join().unwrap_or_else(|_| Err(io::Error::other("the writing thread panicked")));
-        let account = self.told.look();
+        let stats = self.progress.look();
         if let Err(error) = written {
             if error.kind() == ErrorKind::BrokenPipe {
-                return Err(refusal::reader_gone(account.samples).into());
+                return Err(output_error::reader_gone(stats.samples).into());
             }
-            let missing = self.pushed - account.samples;
+            let missing = self.pushed - stats.samples;
             let what =
                 format!("the end of the recording cannot be written: {error}; {missing} samples are missing");
-            return Err(Failure::new(refusal::kind(&error), what, REPAIR).into());
+            return Err(Failure::new(output_error::kind(&error), what, REPAIR).into());
         }
-        told.and_then(|()| account.news.iter().try_for_each(|news| self.report.disk(news)))?;
-        if stays { self.report.end(&account, self.left_out) } else { Ok(()) }
+        told.and_then(|()| stats.news.iter().try_for_each(|news| self.report.disk(news)))?;
+        if stays { self.report.end(&stats, self.left_out) } else { Ok(()) }
     }
 }
 
@@ -314,9 +314,9 @@ impl Sink for Recorder<'_> {
         self.look()
     }
 
-    fn summary(&mut self, name: &TopicName, account: &Account) -> Result<(), End> {
+    fn summary(&mut self, name: &TopicName, stats: &ReceiveStats) -> Result<(), End> {
         self.over.store(true, Ordering::Relaxed);
-        self.report.topic(name, account)
+        self.report.topic(name, stats)
     }
 }
 

@@ -30,7 +30,9 @@ impl Word {
                 }
             },
             (ROBOT, ALL) => {
-                let hint = format!("all sensors' topics are */*, and their zones in one {ROBOT}/zones");
+                let hint = format!(
+                    "*/* names all topics of all sensors, {ROBOT}/zones the verdict over all sensors"
+                );
                 Err(Failure::new(Kind::Usage, format!("{text} is not possible"), hint))
             }
             (sensor, ALL) => {

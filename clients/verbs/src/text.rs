@@ -8,11 +8,12 @@ use std::io::{self, Write};
 use scanhub_client::streams::Sample;
 use schema::{Flags, Header, Reasons, Scan, Status, Telegram};
 
-use crate::account::Account;
 use crate::follow::Notice;
 use crate::names::TopicName;
+use crate::receive_stats::ReceiveStats;
+use crate::show;
 
-pub(crate) use processed::{background, foreground, marks, zones};
+pub(crate) use processed::{background, foreground, marks, robot, zones};
 
 /// Bytes as lower hex, without spaces.
 pub(crate) struct Hex<'a>(pub(crate) &'a [u8]);
@@ -26,16 +27,7 @@ impl fmt::Display for Hex<'_> {
 /// One sample.
 pub(crate) fn sample(line: &mut Vec<u8>, name: &TopicName, sample: &Sample) -> io::Result<()> {
     write!(line, "{name} ")?;
-    match sample {
-        Sample::Telegram(bytes) => telegram(line, bytes.header(), bytes),
-        Sample::Scan(found) => scan(line, found.header(), found),
-        Sample::Marks(found) => processed::marks(line, found.header(), found),
-        Sample::Zones(heard) => processed::zones(line, heard),
-        Sample::Foreground(found) => processed::foreground(line, found.header(), found),
-        Sample::Background(found) => background(line, found),
-        Sample::Status(found) => status(line, found),
-        Sample::Robot(found) => processed::robot(line, &found.robot),
-    }
+    show::text(sample, line)
 }
 
 /// One notice, for stderr; news of the hub are the same for all streams.
@@ -50,27 +42,21 @@ pub(crate) fn notice(line: &mut Vec<u8>, names: &[&TopicName], notice: Notice) -
     }
     match notice {
         Notice::Missed(missed) => write!(line, "missed {missed}"),
-        _ => write!(line, "nothing comes any more"),
+        _ => write!(line, "nothing arrives any more"),
     }
 }
 
 /// The end of a run.
-pub(crate) fn summary(line: &mut Vec<u8>, name: &TopicName, account: &Account) -> io::Result<()> {
-    write!(
-        line,
-        "{name}: {} received, {} lost in {:.1} s",
-        account.received,
-        account.lost,
-        account.seconds()
-    )?;
-    if let Some(hz) = account.hz() {
+pub(crate) fn summary(line: &mut Vec<u8>, name: &TopicName, stats: &ReceiveStats) -> io::Result<()> {
+    write!(line, "{name}: {} received, {} lost in {:.1} s", stats.received, stats.lost, stats.seconds())?;
+    if let Some(hz) = stats.hz() {
         write!(line, ", {hz:.2} Hz")?;
     }
     // That nothing was is not worth a word.
-    if let Some(lost) = account.loss.lost_on_line.filter(|&lost| lost > 0) {
+    if let Some(lost) = stats.loss.lost_on_line.filter(|&lost| lost > 0) {
         write!(line, ", {lost} lost on the line")?;
     }
-    match account.loss.damaged.filter(|&share| share > 0.0) {
+    match stats.loss.damaged.filter(|&share| share > 0.0) {
         Some(share) => write!(line, ", {:.2} % of its bytes damaged", 100.0 * share),
         None => Ok(()),
     }

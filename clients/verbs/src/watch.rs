@@ -4,10 +4,10 @@
 mod draw;
 #[cfg(test)]
 mod golden;
+mod hub_requests;
 mod keys;
 mod map;
 mod meter;
-mod orders;
 mod scene;
 mod screen;
 mod view;
@@ -21,11 +21,11 @@ use scanhub_client::clock;
 use scanhub_client::streams::Sample;
 use schema::{Domain, Failure, Kind, Topic, Verb, check_followed, is_remote};
 
-use crate::account::Account;
 use crate::follow::{Bounds, Notice, Sink, follow};
 use crate::names::{TopicName, as_word};
 use crate::output::{End, quiet};
-use orders::Orders;
+use crate::receive_stats::ReceiveStats;
+use hub_requests::HubRequests;
 use scene::Scene;
 use screen::{News, Screen};
 use view::{View, Wish};
@@ -61,7 +61,7 @@ pub fn watch(options: &WatchOptions, out: &mut dyn Write, stop: &AtomicBool) -> 
             held: None,
             view: View { note: options.note.clone(), ..View::new(options.colours) },
             screen,
-            orders: Orders::default(),
+            requests: HubRequests::default(),
             work: Work::default(),
             changed: true,
             draw_at: Instant::now(),
@@ -84,7 +84,7 @@ struct Watcher<'a> {
     held: Option<Scene>,
     view: View,
     screen: Screen<'a>,
-    orders: Orders,
+    requests: HubRequests,
     work: Work,
     /// The screen does not show what is known.
     changed: bool,
@@ -115,9 +115,7 @@ impl Watcher<'_> {
             }
             match wish {
                 Some(Wish::Interrupt) if self.options.bounds.bounded() => {
-                    return Err(
-                        Failure::new(Kind::Interrupted, "interrupted before it was through", "").into()
-                    );
+                    return Err(Failure::new(Kind::Interrupted, "interrupted before it was done", "").into());
                 }
                 Some(Wish::Quit | Wish::Interrupt) => return Err(End::ReaderGone),
                 Some(Wish::Reset) => self.order(Verb::Reset, now),
@@ -138,7 +136,7 @@ impl Watcher<'_> {
             return self.tell("no sensor of this machine is shown".into(), now);
         }
         let verb = if verb == Verb::Freeze && is_frozen { Verb::Thaw } else { verb };
-        if !self.orders.give(&self.options.places, sensors, verb) {
+        if !self.requests.give(&self.options.places, sensors, verb) {
             self.tell("the hub still works on the last request".into(), now);
         }
     }
@@ -196,7 +194,7 @@ impl Sink for Watcher<'_> {
 
     fn tick(&mut self, now: Instant) -> Result<(), End> {
         self.listen(now)?;
-        if let Some(done) = self.orders.done() {
+        if let Some(done) = self.requests.done() {
             for (sensor, model) in done.models {
                 self.scene.sensor(&sensor).background = Some(model);
             }
@@ -223,7 +221,7 @@ impl Sink for Watcher<'_> {
         self.changed.then_some(self.draw_at)
     }
 
-    fn summary(&mut self, _: &TopicName, _: &Account) -> Result<(), End> {
+    fn summary(&mut self, _: &TopicName, _: &ReceiveStats) -> Result<(), End> {
         Ok(())
     }
 }

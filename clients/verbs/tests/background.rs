@@ -235,7 +235,7 @@ fn a_model_that_knows_nothing_takes_no_others_place() {
     for to in [file.clone(), "-".into()] {
         let (end, out) = say(ModelOrder::Save { file: to, force: true });
         let failure = end.unwrap_err();
-        assert_eq!(failure.message, "the background of front knows no beam yet");
+        assert_eq!(failure.message, "the background of front has no known beam yet");
         assert_eq!((failure.kind, out.as_str()), (Kind::Failed, ""));
     }
     assert_eq!(saved_model(&file, "front", false, &mut &b""[..]).unwrap().taught, 3);

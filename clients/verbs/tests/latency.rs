@@ -101,7 +101,7 @@ fn what_was_sent_before_is_no_latency() {
     let (end, out, _) = verb.join();
     let failure = end.expect_err("no age is known");
     assert_eq!((failure.kind, failure.kind.exit_code()), (Kind::Check, 5));
-    assert!(failure.message.contains("no sample came whose age is known"), "{failure}");
+    assert!(failure.message.contains("no sample with a known age arrived"), "{failure}");
     let line = told(&out, "scan");
     assert!(line.contains(r#""received":5,"before":5,"ahead":0,"flags":[],"age":null,"#), "{line}");
     assert_eq!(out.matches(r#""class":"summary""#).count(), 1, "a topic that is named twice is one");

@@ -111,11 +111,11 @@ impl Draft {
         };
         let port = port.ok_or_else(|| refuse(&place, "no port".into(), "add port = \"/dev/ttyUSB0\""))?;
         if let Some(mode) = mode.as_ref().filter(|_| !matches!(port, Source::File { .. })) {
-            let what = format!("the mode of {} is asked of the sensor", port.name());
+            let what = format!("the mode of {} is read from the sensor", port.name());
             return Err(refuse(
                 &mode.place,
                 what,
-                "mode is a key for recordings, port = \"file:PATH\"; leave it out",
+                "mode is only for recordings, port = \"file:PATH\"; leave it out",
             ));
         }
         // The place of what clashes, or of what implies it.
@@ -128,7 +128,8 @@ impl Draft {
         let resolution_cdeg = resolution_cdeg.as_ref().map_or(factory.resolution_cdeg, |said| said.value);
         if family == Some(Family::Fast) {
             // Its 181 values look like those of 180 degrees at 1.
-            let what = "the beams of version S14 look elsewhere: 90 degrees at 0.5, which no telegram tells";
+            let what =
+                "the beams of version S14 have other angles: 90 degrees at 0.5, which no telegram reports";
             return Err(refuse(
                 type_place,
                 what.into(),
@@ -179,7 +180,7 @@ fn merge(
             return Err(origin.refuse(
                 span,
                 format!("a second link {name}"),
-                "give each link a name of its own, or put its keys beside those of the first one",
+                "give each link its own name, or put its keys into the section of the first one",
             ));
         }
         seen.push(name.clone());
@@ -187,7 +188,8 @@ fn merge(
         let at = match known {
             Some(at) => at,
             None if may_add && links.len() >= MAX_LINKS => {
-                let what = format!("more than {MAX_LINKS} links: a sample names its sensor in one byte");
+                let what =
+                    format!("more than {MAX_LINKS} links: a sample stores its sensor's number in one byte");
                 return Err(origin.refuse(span, what, format!("{MAX_LINKS} links for one hub")));
             }
             None if may_add => {
@@ -219,7 +221,7 @@ fn merge(
                 origin.refuse(
                     port_span,
                     what,
-                    "name a tty, tcp:HOST:PORT, or file:PATH with ?rate=max if you like",
+                    "name a tty, tcp:HOST:PORT, or file:PATH, which may end with ?rate=max",
                 )
             })?);
         }

@@ -218,7 +218,7 @@ mod tests {
         let error =
             load("[[link]]\nname = \"a\"\nport = \"x\"\n[[link]]\nname = \"a\"\n").unwrap_err().to_string();
         assert!(
-            error.contains(":5:8: a second link a") && error.contains("beside those of the first"),
+            error.contains(":5:8: a second link a") && error.contains("into the section of the first"),
             "{error}"
         );
         let text = "[[link]]\nname = \"a\"\nport = \"x\"\ntype = \"lms211\"\nangle = 180\n";

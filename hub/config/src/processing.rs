@@ -125,7 +125,7 @@ impl Background {
                  {unit_mm} mm",
                 model.count, model.unit_mm
             );
-            return refuse(what, "begin with \"empty\", and save a model of the sensor as it is now");
+            return refuse(what, "use \"empty\", and save a new model of the sensor");
         }
         self.model = Some(Box::new(model));
         Ok(())

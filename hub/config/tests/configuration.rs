@@ -107,7 +107,7 @@ fn what_cannot_be_is_refused_with_place_value_and_remedy() {
         ("link.front.pose.x=left", "x = \"left\" is not a number\n  see docs"),
         ("link.front.zones.radi=[1]", "unknown key `radi`\n  did you mean `radii`?"),
         ("zones.radii=[0.6,1.0]", "radii = [0.6, 1.0]\n  the largest first"),
-        ("zones.radii=[1.0,1.0]", "the largest first, none twice"),
+        ("zones.radii=[1.0,1.0]", "the largest first, each once"),
         ("zones.radii=[]", "1 to 8 radii"),
         ("zones.radii=[9,8,7,6,5,4,3,2,1]", "1 to 8 radii"),
         ("zones.radii=[1.0,0]", "more than 0 and at most 65"),
@@ -171,7 +171,7 @@ fn a_circle_that_the_sensor_cannot_see_is_refused() {
     assert_eq!(set(&["link.front.zones.min_beams=361"]), Ok(()));
     refused(
         &["zones.min_beams=362"],
-        "--set zones.min_beams=362: link front: min_beams = 362, and a scan has 361 beams\n  a few beams",
+        "--set zones.min_beams=362: link front: min_beams = 362, and a scan has 361 beams\n  the default is one beam",
     );
     refused(
         &["zones.min_beams=300", "link.rear.resolution=1"],
@@ -181,7 +181,7 @@ fn a_circle_that_the_sensor_cannot_see_is_refused() {
     let away = "link.front.pose.x=2";
     refused(
         &[away, "link.front.pose.y=0"],
-        "--set link.front.pose.y=0: link front: no beam meets the circle of 1 m\n  correct the sensor's pose, or give it \
+        "--set link.front.pose.y=0: link front: no beam sees into the circle of 1 m\n  correct the sensor's pose, or give it \
          a circle that it sees: link.front.zones.radii",
     );
     assert_eq!(set(&[away, "link.front.zones.radii=[2.5,1]"]), Ok(()));
@@ -194,7 +194,7 @@ fn a_circle_that_the_sensor_cannot_see_is_refused() {
     // The farthest reading in mm is 32 m.
     let far = ["link.front.pose.x=40", "link.front.pose.yaw=3.1416"];
     assert_eq!(set(&far), Ok(()));
-    refused(&[&far[..], &["link.front.unit=mm"]].concat(), "no beam meets the circle of 1 m");
+    refused(&[&far[..], &["link.front.unit=mm"]].concat(), "no beam sees into the circle of 1 m");
     let body = |range: &str| format!("link.rear.zones.self_min=[{{from=0,to=180,range={range}}}]");
     assert_eq!(set(&[&body("0.99")]), Ok(()));
     refused(
@@ -204,7 +204,7 @@ fn a_circle_that_the_sensor_cannot_see_is_refused() {
     let file =
         Scratch::new("away.toml", "[[link]]\nname = \"a\"\nport = \"x\"\n[link.pose]\nyaw = 0.1\nx = 2\n");
     let refusal = load(&[&file], &[]).unwrap_err();
-    assert!(refusal.contains("away.toml:6:5: link a: no beam meets the circle of 1 m"), "{refusal}");
+    assert!(refusal.contains("away.toml:6:5: link a: no beam sees into the circle of 1 m"), "{refusal}");
 }
 
 #[test]

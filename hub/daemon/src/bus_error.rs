@@ -22,7 +22,7 @@ pub fn explain(json: bool, taken: bool) {
     };
     // SAFETY: the handler does nothing but write(2) and _exit(2), both async-signal-safe.
     if let Err(error) = unsafe { low_level::register(SIGBUS, handler) } {
-        tracing::warn!(%error, "a full /dev/shm will end this process without a word");
+        tracing::warn!(%error, "if /dev/shm is full, this process will end without a message");
     }
 }
 

@@ -146,7 +146,7 @@ impl ControlServer {
         {
             Ok(()) => {}
             Err(TrySendError::Full(_)) => {
-                let message = format!("{sensor} has {QUEUE} requests to do already");
+                let message = format!("{sensor} already has {QUEUE} waiting requests");
                 return Err(Failure::new(Kind::Short, message, "try again in a moment"));
             }
             Err(TrySendError::Disconnected(_)) => {

@@ -112,7 +112,7 @@ impl<'a> Diagnosis<'a> {
             && let Some(remedy) = status.reflector_remedy()
         {
             let name = &self.link.name;
-            tracing::info!("{name}: marks are unavailable; after the hub's end `{remedy}` changes that");
+            tracing::info!("{name}: marks are unavailable; stop the hub and run `{remedy}`");
         }
     }
 
@@ -129,15 +129,15 @@ impl<'a> Diagnosis<'a> {
         }
         if self.is_flooded {
             return format!(
-                "more comes than a line of {} baud brings, and no more than twice that is read; the serial server has to \
-                 be in raw mode at that rate",
+                "the server sends more than a line of {} baud carries; the hub reads at most twice that; the serial \
+                 server must be in raw mode at that rate",
                 self.link.baud.rate()
             );
         }
         let is_server = matches!(self.link.port, Source::Tcp { .. });
         match (session.trouble(), session.sensor().unit, self.link.unit) {
             (Some(Trouble::NoAnswer { .. }), _, _) if is_server => format!(
-                "no answer at {} baud, to which the serial server was set: power, cable, another rate?",
+                "no answer at {} baud, the rate set in the serial server: check power, cable, rate",
                 self.link.baud.rate()
             ),
             (Some(trouble), _, _) => trouble.to_string(),

@@ -16,7 +16,7 @@ impl EventFd {
     pub(crate) fn new() -> Result<EventFd, Failure> {
         let made = eventfd(0, EventfdFlags::CLOEXEC | EventfdFlags::NONBLOCK);
         made.map(EventFd).map_err(|error: Errno| {
-            Failure::new(Kind::Short, format!("an eventfd cannot be had: {error}"), "raise `ulimit -n`")
+            Failure::new(Kind::Short, format!("cannot get an eventfd: {error}"), "raise `ulimit -n`")
         })
     }
 

@@ -29,7 +29,8 @@ impl IdentityCache {
             Ok(Some(directory)) => directory.file_or_new(&format!("{name}.sensor")).map(Some),
             nowhere => nowhere.map(|_| None),
         };
-        let file = file.inspect_err(|error| tracing::debug!(%error, "{name}: what is known cannot be kept"));
+        let file =
+            file.inspect_err(|error| tracing::debug!(%error, "{name}: the learned state cannot be saved"));
         IdentityCache { file: file.ok().flatten(), port: port.to_owned(), record: Vec::new(), identity: None }
     }
 

@@ -46,7 +46,7 @@ pub fn in_memory<T>(
     let node = ipc::hub_node(domain)?;
     let (_control, queues) = ControlServer::open(&node, config.links.iter().map(|link| link.name.as_str()))?;
     let stop = eventfd(0, EventfdFlags::CLOEXEC).map_err(|error| {
-        let message = format!("an eventfd cannot be had: {error}");
+        let message = format!("cannot get an eventfd: {error}");
         Failure::new(schema::Kind::Short, message, "raise `ulimit -n`")
     })?;
     let (service, worked) = (Service::default(), AtomicBool::new(false));

@@ -87,7 +87,7 @@ fn recall(link: &mut Link, state: &StateDirectory) -> u64 {
         Ok(Some(text)) => text,
         Ok(None) => return 0,
         Err(failure) => {
-            tracing::warn!("{name}: the background begins empty: {}; {}", failure.message, failure.hint);
+            tracing::warn!("{name}: the background starts empty: {}; {}", failure.message, failure.hint);
             return 0;
         }
     };
@@ -97,14 +97,14 @@ fn recall(link: &mut Link, state: &StateDirectory) -> u64 {
             let age = Age(Duration::from_nanos(clock::wall(now, now).saturating_sub(wall_ns)));
             let Background { taught, count, .. } = model;
             tracing::info!(
-                "{}: begins with the background of {age} ago, {taught} of {count} beams",
+                "{}: starts with the background saved {age} ago, {taught} of {count} beams known",
                 link.name
             );
             link.processing.background.model = Some(Box::new(model));
             wall_ns
         }
         Err(why) => {
-            tracing::warn!("{name}: the background begins empty: {why}");
+            tracing::warn!("{name}: the background starts empty: {why}");
             0
         }
     }
@@ -210,7 +210,7 @@ impl Shared {
 fn remove(path: &Path) -> Result<(), Failure> {
     match std::fs::remove_file(path) {
         Err(error) if error.kind() != io::ErrorKind::NotFound => {
-            let message = format!("{}: an old background stays: {error}", path.display());
+            let message = format!("{}: an old background file stays: {error}", path.display());
             Err(Failure::new(Kind::Failed, message, "remove the file"))
         }
         _ => Ok(()),

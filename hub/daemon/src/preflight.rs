@@ -26,9 +26,9 @@ pub(crate) fn check_descriptors(links: usize) -> Result<(), Failure> {
     shortage::check_descriptors(needs::descriptors(links))
 }
 
-/// `what` cannot be had now.
+/// `what` is not available now.
 pub(crate) fn no_resource(what: &str, error: &dyn std::fmt::Display) -> Failure {
-    Failure::new(Kind::Short, format!("{what} cannot be had: {error}"), "try again later")
+    Failure::new(Kind::Short, format!("cannot get {what}: {error}"), "try again later")
 }
 
 /// Address space of a link's thread: its stack, its heap, and what it maps beside its segments.

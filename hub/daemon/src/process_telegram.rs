@@ -90,11 +90,11 @@ impl<'a> LinkOutput<'a> {
         // What waited in the port does not tell how it looks around the robot now.
         self.pipeline.zones.doubt(is_behind);
         if let Some(anew) = self.topics.scan(decode, &mut self.pipeline) {
-            tracing::warn!("{}: the background begins anew: {anew}", self.link.name);
+            tracing::warn!("{}: the background is learned again: {anew}", self.link.name);
         }
         let is_blind = self.pipeline.zones.is_blind();
         if std::mem::replace(&mut self.is_blind, is_blind) != is_blind && is_blind {
-            tracing::warn!("{}: zones unknown: too few beams meet the largest circle", self.link.name);
+            tracing::warn!("{}: zones unknown: too few beams see into the largest circle", self.link.name);
         }
         let limit = limit(period_us);
         // Telegrams that had to wait for the hub are late, but scans do not stay out.

@@ -78,7 +78,11 @@ fn take_over(link: &LinkThread<'_>) -> Result<(Port, bool), Failure> {
         }
     }
     if let Some(port) = adopted {
-        tracing::info!("{}: goes on with {}, which was kept", link.name, link.port.name());
+        tracing::info!(
+            "{}: continues with {}, which the service manager kept open",
+            link.name,
+            link.port.name()
+        );
         return Ok((port, true));
     }
     Port::open(&link.port, link.baud.rate(), &AtomicBool::new(false)).map(|port| (port, false))

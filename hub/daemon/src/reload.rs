@@ -57,10 +57,10 @@ impl<'a> Reload<'a> {
     fn take(&mut self, read: Config, control: &ControlServer) {
         let Differences { now, later } = Differences::between(&self.running, &read);
         if now.is_empty() && later.is_empty() {
-            tracing::info!("the configuration is as it was");
+            tracing::info!("the configuration has not changed");
         }
         for (name, processing, sections) in now {
-            tracing::info!("{name}: {} as configured now", sections.join(", "));
+            tracing::info!("{name}: {} changed as configured", sections.join(", "));
             control.change(&name, &processing);
             if let Some(link) = self.running.links.iter_mut().find(|link| link.name == name) {
                 link.processing = processing;

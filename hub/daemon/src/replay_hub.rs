@@ -85,7 +85,7 @@ pub fn replay(
 fn behind_the_end(file: &Path, start_ns: Nanos, end_ns: Nanos) -> Failure {
     let [start_s, end_s] = [start_ns, end_ns].map(|ns| ns as f64 / 1e9);
     let message =
-        format!("--start {start_s} s is behind the end of {}, which lasts {end_s:.3} s", file.display());
+        format!("--start {start_s} s is after the end of {}, which lasts {end_s:.3} s", file.display());
     Failure::new(Kind::Usage, message, "it counts from the first telegram")
 }
 
@@ -113,7 +113,7 @@ fn sensors(recording: &Recording, wanted: Option<&str>) -> Result<Vec<Sensor>, F
     for (at, sensor) in sensors.iter().enumerate() {
         check_sensor(&sensor.link)?;
         if sensors[..at].iter().any(|other| other.link == sensor.link) {
-            let message = format!("two sensors of the recording would be called {}", sensor.link);
+            let message = format!("two sensors of the recording would get the name {}", sensor.link);
             return Err(Failure::new(Kind::Usage, message, "play one of them: --sensor NAME"));
         }
     }

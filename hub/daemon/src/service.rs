@@ -23,7 +23,7 @@ impl Service {
     /// That of this process, as its environment tells. To be called once, before anything else is opened.
     pub(crate) fn of_process() -> Service {
         let passed = sd_listen_fds::get().unwrap_or_else(|error| {
-            tracing::warn!(%error, "what the service manager kept cannot be taken");
+            tracing::warn!(%error, "ports that the service manager kept cannot be taken over");
             Vec::new()
         });
         let named = passed.into_iter().filter_map(|(name, line)| Some((name?, line.into_std())));
@@ -120,7 +120,7 @@ impl<'a> Watchdog<'a> {
 /// That it cannot be told is no reason to stop: it will see for itself.
 fn told(outcome: std::io::Result<()>) {
     if let Err(error) = outcome {
-        tracing::debug!(%error, "the service manager cannot be told");
+        tracing::debug!(%error, "the service manager cannot be notified");
     }
 }
 

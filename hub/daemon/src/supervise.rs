@@ -225,7 +225,7 @@ fn broken_thread() -> Failure {
     Failure::new(
         Kind::Failed,
         "a link's thread ended",
-        "this is a bug: please report it with what stands above",
+        "this is a bug: please report it with the lines above",
     )
 }
 

@@ -27,12 +27,12 @@ impl Notice {
 impl fmt::Display for Notice {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         f.write_str(match self {
-            Notice::Defective => "the sensor calls itself defective; it streams, but its scans may be wrong",
+            Notice::Defective => "the sensor reports that it is defective; it streams, but its scans may be wrong",
             Notice::Fatal => "the sensor reports a fatal error; it streams, but its scans may be wrong",
             Notice::Error => "the sensor reports an error; it streams, but its scans may be wrong",
             Notice::Dirty => "the sensor's window is dirty: clean it",
             Notice::PermanentBaud => {
-                "a rate for power-on that is not the factory's is in the sensor's EEPROM; it is worked with as it is"
+                "the rate after power-on in the sensor's EEPROM is not the factory's; the hub works with it as it is"
             }
         })
     }

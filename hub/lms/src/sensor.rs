@@ -73,7 +73,7 @@ impl fmt::Display for Trouble {
             Trouble::Unanswered(request) => write!(f, "no reply to {request:?} in several tries"),
             Trouble::Refused(request) => write!(f, "the sensor refused {request:?}"),
             Trouble::VariantRefused => f.write_str("the sensor keeps its own angle and resolution"),
-            Trouble::ModeUnknown => f.write_str("the sensor does not tell its measuring mode: no scans"),
+            Trouble::ModeUnknown => f.write_str("the sensor does not report its measuring mode: no scans"),
             Trouble::AnglesUnknown => {
                 f.write_str("the sensor is a version S14, whose angles are not known here: no scans")
             }

@@ -90,16 +90,16 @@ impl PortError {
             }
             PortError::Refused => failure(
                 Kind::PortMissing,
-                "nothing listens there, or it serves somebody else: the server's port must be in raw TCP mode",
+                "nothing listens there, or it serves another client: the server's port must be in raw TCP mode",
             ),
             PortError::TimedOut => failure(Kind::PortMissing, "is it switched on, and is the address right?"),
             PortError::Network(_) => {
-                failure(Kind::PortMissing, "is the network plugged in, and is there a way to it?")
+                failure(Kind::PortMissing, "is the network plugged in, and is there a route to it?")
             }
             PortError::Interrupted => Failure::new(Kind::Interrupted, "interrupted", ""),
             PortError::Recording => failure(Kind::Configuration, "name a tty, or tcp:HOST:PORT"),
             PortError::Other(_) => {
-                failure(Kind::PortNotTty, "name a tty; the kernel's log (dmesg) may tell more")
+                failure(Kind::PortNotTty, "name a tty; the kernel's log (dmesg) may show more")
             }
         }
     }
@@ -112,7 +112,7 @@ impl fmt::Display for PortError {
             PortError::NotTty => f.write_str("not a serial line"),
             PortError::Denied => f.write_str("no permission"),
             PortError::Busy => f.write_str("in use"),
-            PortError::Dead => f.write_str("no such port: there is a name, but no line behind it"),
+            PortError::Dead => f.write_str("no such port: the name exists, but no line behind it"),
             PortError::Short(errno) => write!(f, "cannot be opened: {errno}"),
             PortError::Rate { wanted, given } => {
                 write!(f, "{wanted} Bd is not possible here, the driver gives {given} Bd")
@@ -122,7 +122,7 @@ impl fmt::Display for PortError {
             PortError::TimedOut => f.write_str("no answer"),
             PortError::Network(why) => write!(f, "cannot be reached: {why}"),
             PortError::Interrupted => f.write_str("interrupted"),
-            PortError::Recording => f.write_str("a recording, no line to a sensor"),
+            PortError::Recording => f.write_str("a recording, not a line to a sensor"),
             PortError::Other(errno) => write!(f, "cannot be used as a serial line: {errno}"),
         }
     }
@@ -148,7 +148,7 @@ fn missing(path: &Path, there: &[Candidate]) -> Failure {
     let what = match path.read_link() {
         Ok(target) => format!("{name}: no such port: it points to {}, which is not there", target.display()),
         Err(_) if path.starts_with("/dev/serial") => {
-            format!("{name}: no such port: its adapter is not plugged in, or another one than this was")
+            format!("{name}: no such port: its adapter is not plugged in, or it is another adapter")
         }
         Err(_) => format!("{name}: no such port"),
     };
@@ -175,7 +175,7 @@ fn busy(path: &Path, holder: Option<Holder>) -> Failure {
     let name = path.display();
     let (who, remedy) = match holder {
         None => {
-            ("another process".to_owned(), format!("stop it first; sudo fuser -v {name} tells which it is"))
+            ("another process".to_owned(), format!("stop it first; sudo fuser -v {name} shows which it is"))
         }
         Some(holder) => {
             let remedy = match holder.program.as_str() {
@@ -204,7 +204,7 @@ fn remedy_of_rate(wanted: u32) -> &'static str {
     if wanted == 500_000 {
         "adapters with an FT232R, FT232H or FT4232H do it exactly; a UART clocked with 1.8432 MHz cannot: baud = 38400"
     } else {
-        "say another rate: baud = 38400, 19200 or 9600"
+        "set another rate: baud = 38400, 19200 or 9600"
     }
 }
 
@@ -229,7 +229,7 @@ mod tests {
                 Kind::PortRate,
                 "/dev/full: 500000 Bd is not possible here, the driver gives 115200 Bd\n  adapters with an FT232R",
             ),
-            (PortError::Rate { wanted: 9600, given: 0 }, Kind::PortRate, "say another rate"),
+            (PortError::Rate { wanted: 9600, given: 0 }, Kind::PortRate, "set another rate"),
         ] {
             let failure = PortError::explain(&refusal, &source);
             assert_eq!(failure.kind, kind, "{failure}");

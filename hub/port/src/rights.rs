@@ -63,12 +63,12 @@ impl Rights {
         let Rights { user, group, .. } = self;
         let path = path.display();
         let Some(Ownership { uid, gid, mode }) = self.port else {
-            let remedy = "a directory on the way to it is closed: ls -ld its parents".to_owned();
-            return (format!("{path}: user {user} may not even look at it"), remedy);
+            let remedy = "a directory above it is closed: check its parents with ls -ld".to_owned();
+            return (format!("{path}: no permission for user {user} to look at it"), remedy);
         };
         let what = format!("{path}: no permission for user {user}: group {group}, mode {mode:03o}");
         let remedy = if uid == self.uid && mode & RW << 6 != RW << 6 {
-            format!("it is your own, but closed: chmod u+rw {path}")
+            format!("you own it, but its mode denies access: chmod u+rw {path}")
         } else if uid == self.uid
             || mode & RW == RW
             || (self.groups.contains(&gid) && mode & RW << 3 == RW << 3)
@@ -79,7 +79,7 @@ impl Rights {
             "no group may use it; a udev rule gives it to one: SUBSYSTEM==\"tty\", GROUP=\"dialout\", MODE=\"0660\""
                 .to_owned()
         } else if self.is_listed {
-            format!("user {user} is in group {group}, but was not when this session began: log in again")
+            format!("user {user} is in group {group}, but was not when this session started: log in again")
         } else {
             format!("sudo usermod -aG {group} {user}, then log in again")
         };
@@ -121,7 +121,7 @@ mod tests {
             (port(0, 20, 0o640), "udev rule"),
             (port(1000, 20, 0o440), "chmod u+rw /dev/ttyUSB0"),
             (port(1000, 20, 0o660), "getfacl"),
-            (Rights { port: None, ..robot.clone() }, "directory on the way"),
+            (Rights { port: None, ..robot.clone() }, "directory above it"),
         ] {
             let (what, remedy) = rights.explain(Path::new("/dev/ttyUSB0"));
             assert!(remedy.contains(says), "{rights:?}: {remedy}");

@@ -274,7 +274,7 @@ fn write_view(
     })?;
     if is_empty {
         let message = format!("there is no scan in {}", recording.path().display());
-        let hint = "scans are made of topic telegram, or taken from topic scan";
+        let hint = "scans are decoded from topic telegram, or taken from topic scan";
         return Err(Failure::new(Kind::Input, message, hint));
     }
     view.finish().map_err(failed)
@@ -294,7 +294,7 @@ fn encoding(recording: &Recording, target: Target) -> Result<Encoding, Failure> 
     }
     let mode = contents.readable();
     if mode.is_none() && target == Target::Recording(Form::Carmen) {
-        let message = format!("{} does not tell its measuring mode", recording.path().display());
+        let message = format!("{} does not contain its measuring mode", recording.path().display());
         let hint = "`scanhub replay --set link.front.mode=0x04` plays it, and `scanhub record` records it with its mode";
         return Err(Failure::new(Kind::Input, message, hint));
     }
@@ -322,11 +322,11 @@ fn target_of(options: &ConvertOptions) -> Result<Target, Failure> {
         (Target::Csv | Target::Recording(Form::Telegrams | Form::Carmen), _)
             if options.compression.is_some() =>
         {
-            usage("--compression is for MCAP files", "name another OUT with .gz, which packs it")
+            usage("--compression is for MCAP files", "add .gz to OUT, which compresses it")
         }
         (_, true) => usage("--ros2 makes an MCAP file", "scanhub convert IN OUT.mcap --ros2"),
         (Target::Recording(_), _) if options.mode.is_some() => {
-            usage("--mode is for scans, and telegrams are kept as they are", "with --ros2, or OUT.csv")
+            usage("--mode is for scans; telegrams are copied as they are", "with --ros2, or OUT.csv")
         }
         (target, false) => Ok(target),
     }
@@ -343,7 +343,7 @@ fn ending(path: &Path) -> Result<Target, Failure> {
         Some((_, "bin" | "raw")) => Ok(Target::Recording(Form::Telegrams)),
         Some((_, "csv")) => Ok(Target::Csv),
         _ => {
-            let message = format!("the ending of {} tells no form", path.display());
+            let message = format!("the ending of {} is not a known format", path.display());
             let hint = ".mcap; .log (CARMEN), .bin (telegram stream), .csv, also with .gz; or - for stdout";
             Err(Failure::new(Kind::Usage, message, hint))
         }

@@ -38,7 +38,7 @@ impl fmt::Display for Damage {
         };
         let parts = [
             counted(self.telegrams, "telegram", "telegrams"),
-            counted(self.bytes, "byte that is in nothing", "bytes that are in nothing"),
+            counted(self.bytes, "byte outside any telegram", "bytes outside any telegram"),
             counted(self.chunks, "packed chunk", "packed chunks"),
             counted(self.estimated, "stamp, which is estimated", "stamps, which are estimated"),
             self.is_headless.then(|| "the beginning of the file".to_owned()),

@@ -103,7 +103,7 @@ impl Recording {
     #[cfg(not(feature = "mcap"))]
     fn open_mcap(path: PathBuf, _: bool) -> Result<Recording, Failure> {
         let message = format!("recording {} is an MCAP file, which this build does not read", path.display());
-        Err(Failure::new(Kind::Input, message, "build it with the feature mcap of scanhub-recording"))
+        Err(Failure::new(Kind::Input, message, "build it with feature mcap of scanhub-recording"))
     }
 
     /// Whether a file that begins with `head` has its telegrams inside something else, MCAP's framing or gzip's.
@@ -118,7 +118,7 @@ impl Recording {
         let place = self.path.display();
         if self.contents.sensors.is_empty() {
             let message = format!("recording {place} does not name its sensor, so {sensor} cannot be chosen");
-            return Err(Failure::new(Kind::Usage, message, "leave the sensor away"));
+            return Err(Failure::new(Kind::Usage, message, "leave the sensor out"));
         }
         if !self.contents.sensors.iter().any(|name| name == sensor) {
             let message = format!("recording {place} has no sensor {sensor:?}");

@@ -31,7 +31,8 @@ impl<R: BufRead> Read for Packed<R> {
         self.unpacked += len as u64;
         let most = self.decoder.get_ref().read.saturating_mul(MOST_TIMES).max(ALWAYS);
         if self.unpacked > most {
-            let what = format!("it unpacks to more than {MOST_TIMES} times its length, as no recording does");
+            let what =
+                format!("it unpacks to more than {MOST_TIMES} times its length, which no recording does");
             return Err(io::Error::new(ErrorKind::FileTooLarge, what));
         }
         Ok(len)

@@ -166,8 +166,8 @@ fn what_cannot_be_done_is_refused_and_leaves_nothing() {
         ("there.bin", Some("front"), "exists"),
         ("out.bin", None, "several sensors"),
         ("out.log", Some("left"), "no sensor \"left\""),
-        ("out.txt", None, "tells no form"),
-        ("out.mcap.gz", None, "tells no form"),
+        ("out.txt", None, "is not a known format"),
+        ("out.mcap.gz", None, "is not a known format"),
         ("no/such/out.mcap", None, "cannot write"),
     ] {
         let failure = converted(&input, &folder.0.join(output), sensor).unwrap_err();

@@ -160,7 +160,7 @@ fn a_log_that_no_sensor_could_have_sent_is_refused_with_the_reason() {
     for (name, ranges, says) in [
         ("fine", &["1.23456", "2"][..], "ranges are finer"),
         ("far", &["1.234", "2", "81.91"], "ranges are finer"),
-        ("farther", &["1.5", "1000.0"], "too far"),
+        ("farther", &["1.5", "1000.0"], "too long"),
     ] {
         let input = folder.file(&format!("{name}.log"), log(361, ranges).as_bytes());
         for output in ["out.mcap", "out.bin", "out.log"] {

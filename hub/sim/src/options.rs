@@ -84,7 +84,7 @@ impl Default for SimulateOptions {
             pollution: 100,
             indices: false,
             short_configuration: false,
-            world: "room".parse().expect("a scene that the program brings along"),
+            world: "room".parse().expect("a built-in scene"),
             replay: None,
             sensors: Vec::new(),
             looped: false,

@@ -26,7 +26,7 @@ impl Place {
             Ok(there) if there.is_symlink() && is_terminal(path) => {
                 return Err(Failure::new(
                     Kind::PortBusy,
-                    format!("port {} is another simulator's, which still runs", path.display()),
+                    format!("port {} belongs to another simulator, which still runs", path.display()),
                     "name another path, or end that one first",
                 ));
             }

@@ -184,7 +184,7 @@ fn check(options: &SimulateOptions) -> Result<(), Failure> {
         if options.ports[..number].contains(port) {
             return wrong(
                 format!("port {} is named twice", port.display()),
-                "each sensor needs a path of its own",
+                "each sensor needs its own path",
             );
         }
     }
@@ -211,8 +211,8 @@ fn check(options: &SimulateOptions) -> Result<(), Failure> {
     };
     if options.replay.is_some() && !tells_all(&options.state) {
         return wrong(
-            "a recording is told in whole scans only".into(),
-            "leave --state away, or say idle, streaming, installation or starting",
+            "a recording is sent in whole scans only".into(),
+            "leave --state out, or use idle, streaming, installation or starting",
         );
     }
     if !options.sensors.is_empty() && options.replay.is_none() {

@@ -60,8 +60,8 @@ pub fn configure(order: &Order, stop: &AtomicBool, tell: &mut dyn FnMut(News<'_>
     let Some(mut plan) = Plan::of(&report) else {
         return Err(Failure::new(
             Kind::Timeout,
-            format!("{name}: the sensor does not tell its configuration"),
-            "nothing was written; power it off and on, then begin again",
+            format!("{name}: the sensor does not report its configuration"),
+            "nothing was written; power it off and on, then try again",
         ));
     };
     plan.password = password;
@@ -108,14 +108,14 @@ fn password(text: &str) -> Result<Password, Failure> {
 
 fn words(step: Step) -> &'static str {
     match step {
-        Step::Compare => "looking whether it is still the same",
+        Step::Compare => "checking that nothing has changed",
         Step::Enter => "entering installation mode",
         Step::Write => "writing, which takes up to 15 s",
-        Step::Check => "looking whether it was written",
+        Step::Check => "checking what was written",
         Step::PowerOn => "setting the rate after power-on",
         Step::Leave => "leaving installation mode",
         Step::ReadBack | Step::ReadStatus => "reading back",
-        Step::Restore => "starting the stream again",
+        Step::Restore => "restarting the stream",
         Step::Done => "done",
     }
 }

@@ -101,8 +101,12 @@ pub fn examine(
     }
     match failed {
         0 => Ok(()),
-        1 => Err(Failure::new(Kind::Check, "1 check failed", "do what stands below it")),
-        _ => Err(Failure::new(Kind::Check, format!("{failed} checks failed"), "do what stands below each")),
+        1 => Err(Failure::new(Kind::Check, "1 check failed", "its remedy is printed below it")),
+        _ => Err(Failure::new(
+            Kind::Check,
+            format!("{failed} checks failed"),
+            "each remedy is printed below its check",
+        )),
     }
 }
 

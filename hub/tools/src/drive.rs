@@ -65,7 +65,7 @@ fn gone(error: &std::io::Error) -> Failure {
     Failure::new(
         Kind::PortMissing,
         format!("the port went away: {error}"),
-        "was it unplugged? plug it in and begin again",
+        "was it unplugged? plug it in and try again",
     )
 }
 

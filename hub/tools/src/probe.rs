@@ -95,8 +95,8 @@ pub(crate) fn ask(
 fn silence(source: &Source, first: Baud, report: &Report) -> Failure {
     let name = source.name();
     let came = match report.bytes {
-        0 => "not a byte came".to_owned(),
-        bytes => format!("{bytes} bytes came, no telegram in them"),
+        0 => "no byte arrived".to_owned(),
+        bytes => format!("{bytes} bytes arrived, without a telegram"),
     };
     let rates = match first {
         Baud::B500000 => "9600, 19200, 38400 or 500000 Bd",
@@ -104,24 +104,24 @@ fn silence(source: &Source, first: Baud, report: &Report) -> Failure {
     };
     let (what, remedy) = match (report.baud, source) {
         (Some(_), Source::Tcp { .. }) => (
-            format!("{name}: a sensor streams and answers nothing"),
-            "it does not hear the serial server: look at the wire that goes to it",
+            format!("{name}: a sensor streams but does not answer"),
+            "it does not receive from the serial server: check the wire to its receiver",
         ),
         (Some(baud), _) => (
-            format!("{name}: a sensor streams at {} Bd and answers nothing", baud.rate()),
-            "it does not hear this port: look at the wire that goes to it",
+            format!("{name}: a sensor streams at {} Bd but does not answer", baud.rate()),
+            "it does not receive from this port: check the wire to its receiver",
         ),
         (None, Source::Tcp { .. }) => (
             format!("{name}: connected, but no answer; {came}"),
-            "set the serial server to the sensor's rate, 8 bits, no parity; power, cable?",
+            "set the serial server to the sensor's rate, 8 bits, no parity; check power and cable",
         ),
         (None, _) if report.bytes == 0 => (
             format!("{name}: no answer at {rates}; {came}"),
-            "power, cable, jumper 7-8 for RS-422? after power-on a sensor takes up to a minute",
+            "check power, cable, jumper 7-8 for RS-422; after power-on a sensor takes up to a minute",
         ),
         (None, _) => (
             format!("{name}: no answer at {rates}; {came}"),
-            "another device, RS-232 against RS-422, or a wire too few?",
+            "another device, RS-232 instead of RS-422, or a missing wire?",
         ),
     };
     Failure::new(Kind::Timeout, what, remedy)

@@ -53,7 +53,11 @@ pub fn decode(options: &DecodeOptions, out: &mut dyn Write) -> Result<(), Failur
         (None, None) => (Box::new(io::stdin()), None),
         (None, Some(_)) => {
             let hint = "for example `scanhub telegram decode walk.mcap --sensor front`";
-            return Err(Failure::new(Kind::Usage, "--sensor is one of a recording, and stdin is none", hint));
+            return Err(Failure::new(
+                Kind::Usage,
+                "--sensor selects a sensor of a recording, and stdin is not one",
+                hint,
+            ));
         }
     };
     let mode = said.or(told);
@@ -80,7 +84,7 @@ pub fn decode(options: &DecodeOptions, out: &mut dyn Write) -> Result<(), Failur
         Err(error) => Err(Failure::new(Kind::Failed, format!("cannot write: {error}"), "")),
         Ok(()) if show.telegrams() == 0 => {
             let message = format!("{name}: no telegram in {} bytes", show.bytes());
-            let hint = "the bytes of a line as they came, or as text: 02 00 01 00 31 15 12";
+            let hint = "expected: raw bytes of a line, or text such as 02 00 01 00 31 15 12";
             Err(Failure::new(Kind::Check, message, hint))
         }
         Ok(()) => Ok(()),

@@ -3,7 +3,7 @@
 
 use bytemuck::{Pod, bytes_of, bytes_of_mut, cast_slice, cast_slice_mut};
 
-use super::{Announce, Datagram, Refusal};
+use super::{Announce, Datagram, DatagramError};
 use crate::{
     BEAMS, Background, CONTENTS_UPPER, Foreground, MARKS, Marks, SEGMENTS, Scan, Segment, Status, Telegram,
     Topic, ZONES, Zones,
@@ -29,13 +29,13 @@ pub fn telegram(payload: &[u8]) -> Option<Telegram<'_>> {
 
 impl Datagram<'_> {
     /// Checks what stands after the header: its topic is known, and the payload is one of that topic.
-    pub fn check_payload(&self) -> Result<(), Refusal> {
+    pub fn check_payload(&self) -> Result<(), DatagramError> {
         let is_sound = match Topic::of_number(self.head.topic) {
             None if self.head.topic == Announce::NUMBER => Announce::unpack(self.payload).is_some(),
-            None => return Err(Refusal::Skipped),
+            None => return Err(DatagramError::Skipped),
             Some(topic) => is_sound(topic, self.payload),
         };
-        if is_sound && self.head.revision > 0 { Ok(()) } else { Err(Refusal::Payload) }
+        if is_sound && self.head.revision > 0 { Ok(()) } else { Err(DatagramError::Payload) }
     }
 }
 

@@ -42,7 +42,7 @@ impl Ringer {
             Ok(page) => Ok(Ringer { page, path }),
             Err(Refused::Foreign(segment)) => Err(in_the_way(&segment)),
             Err(Refused::System(error)) if Errno::from_io_error(&error) == Some(Errno::NOSPC) => {
-                Err(memory(&format!("{} kB for {} cannot be had", PAGE / 1024, path.display())))
+                Err(memory(&format!("no room for {}: {} kB", path.display(), PAGE / 1024)))
             }
             Err(Refused::System(error)) => {
                 let what = format!("{}: {error}", path.display());

@@ -54,7 +54,7 @@ fn make(path: &Path) -> Result<(), Failure> {
         });
     let _ = std::fs::remove_file(&beside);
     placed.map_err(|error| match Errno::from_io_error(&error) {
-        Some(Errno::NOSPC) => memory(&format!("16 bytes for {} cannot be had", path.display())),
+        Some(Errno::NOSPC) => memory(&format!("no room for {}: 16 bytes", path.display())),
         _ => Failure::new(Kind::Failed, format!("{}: {error}", path.display()), "scanhub doctor --clean"),
     })
 }

@@ -39,7 +39,7 @@ impl From<ServiceOpenError> for Trouble {
             E::ExceedsMaxNumberOfNodes => Trouble::Full,
             E::VersionMismatch => Trouble::Broken("the hub has another version of iceoryx2".into()),
             E::IncompatiblePayload | E::IncompatibleMessagingPattern => {
-                Trouble::Broken("the hub has another layout of it".into())
+                Trouble::Broken("the hub uses another layout".into())
             }
             other => Trouble::Broken(format!("{other:?}")),
         }
@@ -146,7 +146,7 @@ pub(super) fn no_publisher(service: &ServiceName, error: PublisherCreateError) -
 pub(super) fn full(service: &ServiceName, limit: usize) -> Failure {
     Failure::new(
         Kind::Short,
-        format!("{service} has {limit} consumers: there is no place for another one"),
+        format!("{service} has {limit} consumers, the most that are possible"),
         "stop some of them; the places of those that crashed are free again within seconds",
     )
 }
@@ -166,11 +166,9 @@ fn failure(node: &Node, service: &ServiceName, trouble: Trouble) -> Failure {
             format!("{service} has no place for another process"),
             "stop some consumers",
         ),
-        Trouble::Absent => Failure::new(
-            Kind::Failed,
-            format!("{service} does not come into being"),
-            "remove what is left of it",
-        ),
+        Trouble::Absent => {
+            Failure::new(Kind::Failed, format!("{service} cannot be created"), "remove what is left of it")
+        }
         Trouble::Broken(what) => {
             let root = node.config().global.root_path().to_string();
             access::failure(Path::new(&root), format!("{service}: {what}"))

@@ -12,7 +12,7 @@ use crate::{Domain, Failure, Topic, limits, prefix};
 
 /// Allocates what the segments of `domain` have promised so far.
 ///
-/// [`Kind::Short`](crate::Kind) if it cannot be had.
+/// [`Kind::Short`](crate::Kind) if there is no room.
 pub fn allocate(domain: &Domain) -> Result<(), Failure> {
     let Some(prefix) = prefix::of(domain.root())? else { return Ok(()) };
     let user = rustix::process::geteuid().as_raw();
@@ -33,7 +33,7 @@ pub fn allocate(domain: &Domain) -> Result<(), Failure> {
         // For any other reason it may be had later all the same.
         if fallocate(&segment, FallocateFlags::empty(), 0, metadata.len()) == Err(Errno::NOSPC) {
             let name = entry.file_name().to_string_lossy().into_owned();
-            return Err(memory(&format!("{} kB for {name} cannot be had", metadata.len() / 1024)));
+            return Err(memory(&format!("no room for {name}: {} kB", metadata.len() / 1024)));
         }
     }
     Ok(())

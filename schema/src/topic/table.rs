@@ -20,7 +20,7 @@ macro_rules! for_each_topic {
     ($each:ident) => {
         $each! {
             Telegram [u8], "telegram", "u8[]", 83, Scan, 32, 16, 0:
-                "The telegrams' bytes, replies too.";
+                "The bytes of telegrams, replies too.";
             Scan Scan, "scan", "scanhub.Scan.v1", 82, Scan, 200, 16, 0:
                 "Decoded measurements.";
             Marks Marks, "marks", "scanhub.Marks.v1", 81, Scan, 32, 16, 0:
@@ -28,7 +28,7 @@ macro_rules! for_each_topic {
             Zones Zones, "zones", "scanhub.Zones.v1", 81, Scan, 200, 16, 1:
                 "What is near the robot.";
             Foreground Foreground, "foreground", "scanhub.Foreground.v1", 81, Scan, 32, 16, 0:
-                "What stands before the background.";
+                "What stands in front of the background.";
             Background Background, "background", "scanhub.Background.v1", 82, Change, 32, 4, 1:
                 "The background model.";
             Status Status, "status", "scanhub.Status.v1", 80, Second, 64, 4, 1:

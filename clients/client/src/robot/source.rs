@@ -121,7 +121,7 @@ impl RobotSource {
             }
         }
         // Last, because it takes longer than all the rest.
-        self.call_the_roll(session)?;
+        self.discover(session)?;
         let silence = self.parts.is_empty() && self.nobody.silence(clock::now());
         Ok(silence.then(Heard::nothing))
     }
@@ -139,7 +139,7 @@ impl RobotSource {
 
     /// Adds the sensors that there are and that are not followed yet. One that is, stays: that it is missing is to be
     /// seen.
-    fn call_the_roll(&mut self, session: &Session) -> Result<(), Failure> {
+    fn discover(&mut self, session: &Session) -> Result<(), Failure> {
         let (Whose::All(whose), Some(domain)) = (self.whose, session.domain()) else {
             self.call_at = None;
             return Ok(());

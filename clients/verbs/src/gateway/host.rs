@@ -8,7 +8,7 @@ use std::time::{Duration, Instant};
 
 use schema::{Failure, Kind};
 
-use crate::errand::Errand;
+use crate::background_task::BackgroundTask;
 
 /// A host and port.
 #[derive(Debug)]
@@ -17,7 +17,7 @@ pub(super) struct Host {
     address: SocketAddr,
     /// When its name was last asked for; never, if it is an address.
     asked_at: Option<Instant>,
-    errand: Option<Errand<Option<SocketAddr>>>,
+    task: Option<BackgroundTask<Option<SocketAddr>>>,
     resolve: Resolve,
 }
 
@@ -47,9 +47,9 @@ impl Host {
     ) -> Result<Host, Failure> {
         let refuse = |what: String, hint: &str| Failure::new(Kind::Configuration, what, hint);
         let name = text.to_owned();
-        let found = match Errand::begin(move || resolve(&name)) {
-            Some(errand) => errand.wait(stop).ok_or_else(|| {
-                let what = format!("interrupted before it was known where {text} is");
+        let found = match BackgroundTask::begin(move || resolve(&name)) {
+            Some(task) => task.wait(stop).ok_or_else(|| {
+                let what = format!("interrupted before {text} was resolved");
                 Failure::new(Kind::Interrupted, what, "")
             })?,
             None => resolve(text),
@@ -64,16 +64,19 @@ impl Host {
             return Err(refuse(format!("cannot send to {text}: the port is not possible"), &hint));
         }
         let address = choose(&found, None).ok_or_else(|| {
-            let hint = "the groups get everything anyway; name single hosts besides";
+            let hint = "the groups get everything anyway; name single hosts only";
             refuse(format!("cannot send to {text}: it is no host"), hint)
         })?;
         if matches!(address, SocketAddr::V6(six) if six.ip().is_unicast_link_local() && six.scope_id() == 0) {
-            let hint = "name the interface behind the address, as in [fe80::7%eth0]:22200";
-            return Err(refuse(format!("cannot send to {text}: each interface has such addresses"), hint));
+            let hint = "add the interface to the address, as in [fe80::7%eth0]:22200";
+            return Err(refuse(
+                format!("cannot send to {text}: a link-local address needs an interface"),
+                hint,
+            ));
         }
         let is_name = text.parse::<SocketAddr>().is_err();
         let asked_at = is_name.then_some(now);
-        Ok(Host { text: text.to_owned(), address, asked_at, errand: None, resolve })
+        Ok(Host { text: text.to_owned(), address, asked_at, task: None, resolve })
     }
 
     /// Where it is.
@@ -89,16 +92,16 @@ impl Host {
     /// Another address that it has now, if that was answered since the last call. Its name is asked for once a minute, and
     /// more often if it is `in_trouble`; one question at a time.
     pub(super) fn look(&mut self, in_trouble: bool, now: Instant) -> Option<SocketAddr> {
-        if let Some(errand) = &self.errand {
-            let found = errand.result()?;
-            self.errand = None;
+        if let Some(task) = &self.task {
+            let found = task.result()?;
+            self.task = None;
             return found.filter(|address| *address != self.address);
         }
         let every = if in_trouble { EVERY_IN_TROUBLE } else { EVERY };
         if self.asked_at.is_some_and(|at| now - at >= every) {
             let (resolve, text, address) = (self.resolve, self.text.clone(), self.address);
             let question = move || resolve(&text).ok().and_then(|found| choose(&found, Some(address)));
-            self.errand = Errand::begin(question);
+            self.task = BackgroundTask::begin(question);
             self.asked_at = Some(now);
         }
         None
@@ -209,7 +212,7 @@ mod tests {
         }
         fn answer(host: &mut Host, now: Instant) -> Option<SocketAddr> {
             let give_up_at = Instant::now() + Duration::from_secs(30);
-            while host.errand.is_some() {
+            while host.task.is_some() {
                 if let Some(address) = host.look(false, now) {
                     return Some(address);
                 }
@@ -224,12 +227,12 @@ mod tests {
         assert!((0..60).all(|s| host.look(false, at(s)).is_none()));
         assert_eq!(ASKED.load(Ordering::SeqCst), 1);
         assert_eq!((host.look(false, at(60)), answer(&mut host, at(61))), (None, None), "the same");
-        assert!(host.look(true, at(64)).is_none() && host.errand.is_none(), "not so soon");
+        assert!(host.look(true, at(64)).is_none() && host.task.is_none(), "not so soon");
         assert_eq!(host.look(true, at(65)), None);
         let moved = answer(&mut host, at(66)).unwrap();
         assert_eq!((moved.to_string().as_str(), ASKED.load(Ordering::SeqCst)), ("10.0.0.1:7", 3));
         // An address is no name.
         let mut fixed = Host::by(resolve, "10.0.0.9:7", 0, &GO_ON, begin).unwrap();
-        assert!(fixed.look(true, at(1000)).is_none() && fixed.errand.is_none());
+        assert!(fixed.look(true, at(1000)).is_none() && fixed.task.is_none());
     }
 }

@@ -7,7 +7,7 @@ use schema::datagram::{Announce, HEAD, Head, MTU_ETHERNET, MTU_LEAST, PORT, grou
 use schema::{Failure, Kind, Topic};
 
 use super::life::Life;
-use super::outlet::Outlet;
+use super::udp_destination::UdpDestination;
 use super::uplink::Uplink;
 
 /// What goes out, and the account of it.
@@ -16,7 +16,7 @@ pub(super) struct Lan {
     /// The groups, if an interface was named for them.
     pub(super) groups: Option<Groups>,
     /// Hosts that get copies.
-    pub(super) copies: Vec<Outlet>,
+    pub(super) copies: Vec<UdpDestination>,
     sensors: Vec<Rows>,
     form: Form,
     longest: usize,
@@ -28,7 +28,7 @@ pub(super) struct Lan {
 /// The groups on an interface.
 pub(super) struct Groups {
     pub(super) interface: Uplink,
-    outlet: Outlet,
+    destination: UdpDestination,
 }
 
 /// How a payload becomes a datagram.
@@ -104,8 +104,7 @@ impl Lan {
     ) -> Result<Lan, Failure> {
         if !(MTU_LEAST..=MTU_ETHERNET).contains(&longest) {
             let what = format!("datagrams of {longest} bytes are not possible");
-            let hint =
-                format!("from {MTU_LEAST} to {MTU_ETHERNET}, which is the most that an Ethernet carries");
+            let hint = format!("from {MTU_LEAST} to {MTU_ETHERNET}, the most that an Ethernet carries");
             return Err(Failure::new(Kind::Configuration, what, hint));
         }
         let (port, more) = match form {
@@ -113,16 +112,16 @@ impl Lan {
             Form::Bare => (BARE_PORT, u16::from(u8::MAX)),
         };
         let groups = interface.map(|interface| {
-            let outlet = Outlet::groups(interface.name(), port, ttl)?;
-            Ok(Groups { interface, outlet })
+            let destination = UdpDestination::groups(interface.name(), port, ttl)?;
+            Ok(Groups { interface, destination })
         });
         let groups = groups.transpose()?;
-        let mut copies: Vec<Outlet> = Vec::new();
+        let mut copies: Vec<UdpDestination> = Vec::new();
         for text in to {
-            let copy = Outlet::host(text, more, stop)?;
+            let copy = UdpDestination::host(text, more, stop)?;
             if let Some(other) = copies.iter().find(|other| other.is_as(&copy)) {
                 let what = format!("cannot send to {text}: it is named twice");
-                let hint = format!("{} gets a copy already; name each host and port once", other.name);
+                let hint = format!("{} already gets a copy; name each host and port once", other.name);
                 return Err(Failure::new(Kind::Configuration, what, hint));
             }
             copies.push(copy);
@@ -131,7 +130,7 @@ impl Lan {
         let mut lan = Lan { life, groups, copies, sensors, form, longest, unfit: 0, buffer };
         let room = lan.groups.as_mut().and_then(|groups| {
             groups.use_interface();
-            groups.outlet.room(groups.interface.index()?)
+            groups.destination.room(groups.interface.index()?)
         });
         lan.longest = longest.min(room.unwrap_or(longest)).max(HEAD);
         Ok(lan)
@@ -143,13 +142,13 @@ impl Lan {
     }
 
     /// All destinations, the groups first.
-    pub(super) fn outlets(&self) -> impl Iterator<Item = &Outlet> {
-        self.groups.iter().map(|groups| &groups.outlet).chain(&self.copies)
+    pub(super) fn destinations(&self) -> impl Iterator<Item = &UdpDestination> {
+        self.groups.iter().map(|groups| &groups.destination).chain(&self.copies)
     }
 
-    /// As [`outlets`](Lan::outlets).
-    pub(super) fn outlets_mut(&mut self) -> impl Iterator<Item = &mut Outlet> {
-        self.groups.iter_mut().map(|groups| &mut groups.outlet).chain(&mut self.copies)
+    /// As [`destinations`](Lan::destinations).
+    pub(super) fn destinations_mut(&mut self) -> impl Iterator<Item = &mut UdpDestination> {
+        self.groups.iter_mut().map(|groups| &mut groups.destination).chain(&mut self.copies)
     }
 
     /// Goes on where the interface is now; whether its state is another one than before.
@@ -211,7 +210,8 @@ impl Lan {
         let group = Topic::of_number(head.topic).map_or(Announce::GROUP, group);
         let mut taken = None;
         if let Some(datagram) = datagram {
-            let of_groups = self.groups.as_mut().map(|groups| groups.outlet.send(datagram, group, above));
+            let of_groups =
+                self.groups.as_mut().map(|groups| groups.destination.send(datagram, group, above));
             let mut of_copies = false;
             for copy in &mut self.copies {
                 of_copies |= copy.send(datagram, group, above);
@@ -250,9 +250,9 @@ impl Lan {
 
 impl Groups {
     fn use_interface(&mut self) {
-        self.outlet.is_cut = !self.interface.is_up();
+        self.destination.is_cut = !self.interface.is_up();
         if let Some(index) = self.interface.index() {
-            self.outlet.use_interface(index);
+            self.destination.use_interface(index);
         }
     }
 }

@@ -37,7 +37,7 @@ impl Life {
     ) -> Result<Life, Failure> {
         let unusable = |path: &Path, error: &io::Error| {
             let what = format!("cannot keep the gateway's number in {}: {error}", path.display());
-            Failure::new(Kind::Configuration, what, "let XDG_STATE_HOME name a directory that can be written")
+            Failure::new(Kind::Configuration, what, "set XDG_STATE_HOME to a directory that can be written")
         };
         DirBuilder::new()
             .recursive(true)
@@ -110,7 +110,7 @@ impl Kept {
 pub(super) fn directory() -> Result<PathBuf, Failure> {
     StateDirectory::base().ok_or_else(|| {
         let what = "no place for the gateway's number: neither XDG_STATE_HOME nor HOME is set";
-        Failure::new(Kind::Configuration, what, "let XDG_STATE_HOME name a directory that can be written")
+        Failure::new(Kind::Configuration, what, "set XDG_STATE_HOME to a directory that can be written")
     })
 }
 

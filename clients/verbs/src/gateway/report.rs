@@ -8,7 +8,7 @@ use serde::Serialize;
 
 use super::GatewayLook;
 use super::lan::{Groups, Lan};
-use super::outlet::{News, Outlet};
+use super::udp_destination::{News, UdpDestination};
 use crate::follow::Notice;
 use crate::output::{End, Output};
 use crate::{json, text};
@@ -75,16 +75,16 @@ impl<'a> Report<'a> {
     }
 
     /// What became of a destination.
-    pub(super) fn destination(&mut self, outlet: &str, news: &News) -> Result<(), End> {
+    pub(super) fn destination(&mut self, destination: &str, news: &News) -> Result<(), End> {
         match news {
-            News::Failing(why) => self.link(outlet, "failing", Some(why)),
-            News::Well => self.link(outlet, "well", None),
+            News::Failing(why) => self.link(destination, "failing", Some(why)),
+            News::Well => self.link(destination, "well", None),
         }
     }
 
     /// The name of a destination has another address now, which is sent to.
-    pub(super) fn moved(&mut self, outlet: &str, address: SocketAddr) -> Result<(), End> {
-        self.link(outlet, "moved", Some(&format!("its address is {address} now")))
+    pub(super) fn moved(&mut self, destination: &str, address: SocketAddr) -> Result<(), End> {
+        self.link(destination, "moved", Some(&format!("its address is now {address}")))
     }
 
     /// Samples of `topic` are longer than the longest datagram.
@@ -134,11 +134,11 @@ impl<'a> Report<'a> {
             let longest = lan.longest();
             self.out.line(|line| write!(line, "too long for {longest} bytes: {}, see --mtu", lan.unfit))?;
         }
-        lan.outlets().try_for_each(|outlet| self.outlet(lan, outlet))
+        lan.destinations().try_for_each(|destination| self.write_destination(lan, destination))
     }
 
-    fn outlet(&mut self, lan: &Lan, outlet: &Outlet) -> Result<(), End> {
-        let Outlet { name, sent, failed, reported, .. } = outlet;
+    fn write_destination(&mut self, lan: &Lan, destination: &UdpDestination) -> Result<(), End> {
+        let UdpDestination { name, sent, failed, reported, .. } = destination;
         if self.look == GatewayLook::Json {
             return self.out.json(&To {
                 class: "lan_to",
@@ -187,8 +187,8 @@ fn status(line: &mut Vec<u8>, lan: &Lan, hub_lives: bool, sent_before: u64) -> i
     let hub = if hub_lives { "" } else { "no hub, " };
     let (sent, name) = first(lan);
     write!(line, "{hub}{name}{state}: {}/s", sent - sent_before)?;
-    for (number, outlet) in lan.outlets().enumerate() {
-        let Outlet { name, sent, failed, .. } = outlet;
+    for (number, destination) in lan.destinations().enumerate() {
+        let UdpDestination { name, sent, failed, .. } = destination;
         match number {
             0 => write!(line, ", {sent} sent")?,
             _ => write!(line, "; {name}: {sent} sent")?,
@@ -206,7 +206,7 @@ fn status(line: &mut Vec<u8>, lan: &Lan, hub_lives: bool, sent_before: u64) -> i
 
 /// How many datagrams went to the first destination, which there always is, and its name.
 fn first(lan: &Lan) -> (u64, &str) {
-    lan.outlets().next().map_or((0, ""), |outlet| (outlet.sent, &outlet.name))
+    lan.destinations().next().map_or((0, ""), |destination| (destination.sent, &destination.name))
 }
 
 fn id(lan: &Lan) -> String {

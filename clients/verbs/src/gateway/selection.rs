@@ -2,7 +2,7 @@
 
 use std::num::NonZeroU64;
 
-use schema::{Failure, Kind, ROBOT, Topic, is_remote};
+use schema::{Failure, Kind, Pace, ROBOT, Topic, is_remote};
 
 use crate::selection::Word;
 
@@ -29,8 +29,8 @@ impl Selection {
         for text in texts {
             let entry = Entry::parse(text)?;
             if bare && entry.word.topic != Some(Topic::Telegram) {
-                let hint = "without --bare all topics can go out";
-                return Err(refuse(text, "is no telegram, and nothing else goes out bare", hint));
+                let hint = "without --bare all topics can be sent";
+                return Err(refuse(text, "is not telegrams, and --bare sends nothing else", hint));
             }
             if entries.iter().any(|other| other.word == entry.word) {
                 return Err(refuse(text, "is named twice", "name each topic once"));
@@ -88,7 +88,7 @@ impl Entry {
             let hint = "a gateway sends what the hub of its own machine publishes";
             return Err(refuse(text, "is another machine's", hint));
         }
-        if every > NonZeroU64::MIN && matches!(word.topic, None | Some(Topic::Background | Topic::Status)) {
+        if every > NonZeroU64::MIN && word.topic.is_none_or(|topic| topic.row().pace != Pace::Scan) {
             return Err(refuse(text, "is not only of each telegram, and cannot be thinned", name));
         }
         Ok(Entry { word, every })

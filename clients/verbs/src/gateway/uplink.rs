@@ -145,8 +145,8 @@ fn choose_one(all: &[Interface]) -> Failure {
     };
     let list = all.iter().map(tell).collect::<Vec<_>>().join(", ");
     let hint = format!(
-        "whoever is on the interface can read what is sent there: name one by --interface, or as `interface` under \
-         [gateway]; there are {list}; or name hosts by --to"
+        "everybody on the interface can read what is sent there: name one with --interface, or as `interface` under \
+         [gateway]; there are {list}; or name hosts with --to"
     );
     Failure::new(Kind::Configuration, "no interface is named for the groups, and no host", hint)
 }

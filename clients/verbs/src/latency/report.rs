@@ -155,7 +155,7 @@ fn remarks(name: &TopicName, spans: &Spans) -> Vec<String> {
     remarks
 }
 
-pub(super) const NOTHING_CAME: &str = "no sample came";
+pub(super) const NOTHING_CAME: &str = "no sample arrived";
 
 /// Where it stands why nothing comes.
 pub(super) fn why_nothing(name: &TopicName) -> String {
@@ -234,7 +234,7 @@ mod tests {
             let (mut line, mut text) = (Vec::new(), Vec::new());
             brief(&mut line, &name, &spans).expect("written");
             full(&mut Output::new(&mut text), &name, &spans, false).expect("written");
-            let why = format!("no sample came; `scanhub {verb}` shows why");
+            let why = format!("no sample arrived; `scanhub {verb}` shows why");
             assert_eq!(String::from_utf8_lossy(&line), format!("{topic:<16}       - age, {why}"));
             assert_eq!(String::from_utf8_lossy(&text), format!("{topic}: {why}\n"));
         }

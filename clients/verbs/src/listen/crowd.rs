@@ -49,7 +49,7 @@ impl Crowd {
         self.told_at = Some(now);
         Some(format!(
             "more is sent than there is room for ({LIVES} gateways, {ROWS} of their sensors and topics; {SENSORS} published \
-             sensors): {}; what is known to deliver stays. If somebody invents them, --hub hears those that it names alone",
+             sensors): {}; gateways that are known to deliver stay. If somebody invents them, use --hub to receive only those that it names",
             parts.join(", ")
         ))
     }

@@ -2,13 +2,13 @@
 
 use std::io::{self, Write};
 
-use scanhub_client::Heard;
 use schema::datagram::{Datagram, Head, LanFlags, Packed, telegram};
-use schema::{Background, Flags, Foreground, Header, Marks, Quality, Scan, Status, Topic, Zones};
+use schema::{Flags, Header, Pace, Quality, Topic};
 use serde::{Serialize, Serializer};
 
+use crate::json;
 use crate::output::{End, Output};
-use crate::{json, text};
+use crate::show::{Keys, Show};
 
 /// A sample of another machine.
 pub(super) struct Remote<'a> {
@@ -54,55 +54,87 @@ impl Remote<'_> {
         payload.unpack(self.datagram.payload).then_some(payload)
     }
 
-    /// A line of JSON; `sensor` is called so by [`Roll::name`](super::roll::Roll::name).
+    /// A line of JSON; `sensor` is called so by [`PeerTable::name`](super::peer_table::PeerTable::name).
     pub(super) fn json(&self, sensor: &str, out: &mut Output<'_>) -> Result<(), End> {
         // The flags come behind all that there is of a sample here.
-        let header = &Header { flags: 0, ..self.header() };
-        let payload = self.datagram.payload;
-        match self.topic {
-            Topic::Telegram => {
-                telegram(payload).map(|it| self.line(out, json::telegram(sensor, header, it.0)))
-            }
-            Topic::Scan => self.payload().map(|it: Scan| self.line(out, json::scan(sensor, header, &it))),
-            Topic::Marks => self.payload().map(|it: Marks| self.line(out, json::marks(sensor, header, &it))),
-            Topic::Zones => self.payload().map(|it| self.line(out, json::zones(sensor, &heard(it, header)))),
-            Topic::Foreground => {
-                self.payload().map(|it: Foreground| self.line(out, json::foreground(sensor, header, &it)))
-            }
-            Topic::Background => {
-                self.payload().map(|it: Background| self.line(out, json::background(sensor, &it)))
-            }
-            Topic::Status => self.payload().map(|it: Status| self.line(out, json::status(sensor, &it))),
-        }
-        .unwrap_or(Ok(()))
+        let header = Header { flags: 0, ..self.header() };
+        self.show(Line { remote: self, sensor, header: &header, out })
     }
 
     /// A line for people; `hub` is what the gateway is called, `sensor` as above.
     pub(super) fn text(&self, hub: &str, sensor: &str, line: &mut Vec<u8>) -> io::Result<()> {
         write!(line, "{hub}.{sensor}/{} ", self.topic.name())?;
-        let header = &self.header();
-        match self.topic {
-            Topic::Telegram => telegram(self.datagram.payload).map(|it| text::telegram(line, header, it.0)),
-            Topic::Scan => self.payload().map(|it| text::scan(line, header, &it)),
-            Topic::Marks => self.payload().map(|it| text::marks(line, header, &it)),
-            Topic::Zones => self.payload().map(|it| text::zones(line, &heard(it, header))),
-            Topic::Foreground => self.payload().map(|it| text::foreground(line, header, &it)),
-            Topic::Background => self.payload().map(|it| text::background(line, &it)),
-            Topic::Status => self.payload().map(|it| text::status(line, &it)),
-        }
-        .unwrap_or(Ok(()))?;
+        self.show(ForPeople { header: &self.header(), line })?;
         if let Some(age_ms) = self.age_ms() {
             write!(line, ", {age_ms:.1} ms old")?;
         }
         if self.late { write!(line, ", late") } else { Ok(()) }
     }
 
-    /// What every class has here, behind its own keys.
-    fn line(&self, out: &mut Output<'_>, sample: impl Serialize) -> Result<(), End> {
+    fn age_ms(&self) -> Option<f64> {
+        self.age_ns.map(|age_ns| (age_ns / 1000) as f64 / 1000.0)
+    }
+}
+
+/// Declares how a payload of any topic is had, from the table of topics.
+macro_rules! payloads {
+    ($($topic:ident $payload:tt, $name:literal, $($column:tt),*: $about:literal;)*) => {
+        impl Remote<'_> {
+            /// Has the payload shown by `how`; nothing becomes of one that cannot be had.
+            fn show<E>(&self, how: impl Way<E>) -> Result<(), E> {
+                match self.topic {
+                    $(Topic::$topic => payloads!($payload, self, how),)*
+                }
+            }
+        }
+    };
+    ([u8], $remote:ident, $how:ident) => {
+        telegram($remote.datagram.payload).map_or(Ok(()), |telegram| $how.show(telegram.0))
+    };
+    ($payload:ident, $remote:ident, $how:ident) => {
+        $remote.payload::<schema::$payload>().map_or(Ok(()), |payload| $how.show(&payload))
+    };
+}
+
+schema::for_each_topic!(payloads);
+
+/// What becomes of a payload.
+trait Way<E> {
+    fn show<P: Show + ?Sized>(self, payload: &P) -> Result<(), E>;
+}
+
+struct ForPeople<'a> {
+    header: &'a Header,
+    line: &'a mut Vec<u8>,
+}
+
+impl Way<io::Error> for ForPeople<'_> {
+    fn show<P: Show + ?Sized>(self, payload: &P) -> io::Result<()> {
+        payload.text(self.header, self.line)
+    }
+}
+
+struct Line<'a, 'out> {
+    remote: &'a Remote<'a>,
+    sensor: &'a str,
+    header: &'a Header,
+    out: &'a mut Output<'out>,
+}
+
+impl Way<End> for Line<'_, '_> {
+    fn show<P: Show + ?Sized>(self, payload: &P) -> Result<(), End> {
+        let (sensor, header) = (self.sensor, self.header);
+        payload.json(sensor, header, self)
+    }
+}
+
+impl Keys for Line<'_, '_> {
+    /// With what every class has here, behind its own keys.
+    fn take(self, keys: impl Serialize) -> Result<(), End> {
         #[derive(Serialize)]
-        struct Line<T: Serialize> {
+        struct WithOrigin<T: Serialize> {
             #[serde(flatten)]
-            sample: T,
+            keys: T,
             #[serde(serialize_with = "id")]
             hub: u64,
             epoch: u32,
@@ -113,24 +145,18 @@ impl Remote<'_> {
             #[serde(flatten)]
             flags: Option<json::Words>,
         }
-        let Head { hub, epoch, .. } = self.datagram.head;
+        let Remote { topic, datagram, late, .. } = self.remote;
+        let Head { hub, epoch, .. } = datagram.head;
         // Nobody has keys yet: what is flagged may be as false as what is not.
         let authenticated = false;
-        let has_head = !matches!(self.topic, Topic::Background | Topic::Status);
-        let flags = has_head.then(|| json::Words::of(&self.header()));
-        out.json(&Line { sample, hub, epoch, authenticated, age_ms: self.age_ms(), late: self.late, flags })
-    }
-
-    fn age_ms(&self) -> Option<f64> {
-        self.age_ns.map(|age_ns| (age_ns / 1000) as f64 / 1000.0)
+        let has_head = topic.row().pace == Pace::Scan;
+        let flags = has_head.then(|| json::Words::of(&self.remote.header()));
+        let age_ms = self.remote.age_ms();
+        self.out.json(&WithOrigin { keys, hub, epoch, authenticated, age_ms, late: *late, flags })
     }
 }
 
 /// A hub's id, as in all output.
 pub(super) fn id<S: Serializer>(id: &u64, serializer: S) -> Result<S::Ok, S::Error> {
     serializer.collect_str(&format_args!("{id:016x}"))
-}
-
-fn heard(zones: Zones, header: &Header) -> Heard {
-    Heard { zones, header: Some(*header), missed: 0, stale: false, said: zones }
 }

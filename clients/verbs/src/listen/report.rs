@@ -5,15 +5,15 @@ mod classes;
 
 use std::io::Write;
 
-use schema::datagram::{Account, Announce, Head, Refusal, Row};
+use schema::datagram::{Announce, DatagramError, Head, Row, StreamStats};
 use schema::{Domain, Topic};
 use serde::Serialize;
 use serde::ser::{SerializeMap, Serializer};
 
 use super::names::Names;
+use super::peer_table::PeerTable;
 use super::publish::Publication;
 use super::remote::{Remote, id};
-use super::roll::Roll;
 use crate::output::{End, Output, table};
 use classes::{Notice, Published, Ready, Sums};
 
@@ -84,7 +84,7 @@ impl<'a> Report<'a> {
         let hub = self.names.of(head.hub);
         let (ms, which) = (behind_ms.abs(), if behind_ms < 0.0 { "ahead of" } else { "behind" });
         self.notes.line(|line| {
-            write!(line, "{hub}: its clock is {ms:.0} ms {which} this machine's, so that ages are not told")
+            write!(line, "{hub}: its clock is {ms:.0} ms {which} this machine's, so ages are not shown")
         })
     }
 
@@ -93,8 +93,11 @@ impl<'a> Report<'a> {
         if self.json {
             return self.out.json(&Notice { sensor: Some(name), here, ..Notice::of("published", head) });
         }
-        let which =
-            if here { ", whose gateway is on this machine: --hub HUB hears others alone" } else { "" };
+        let which = if here {
+            ", whose gateway is on this machine: use --hub HUB to receive only others"
+        } else {
+            ""
+        };
         self.notes.line(|line| write!(line, "publishing {name}{which}"))
     }
 
@@ -114,35 +117,35 @@ impl<'a> Report<'a> {
     }
 
     /// The account as it stands, over the one that was drawn before.
-    pub(super) fn draw(&mut self, account: &Account, roll: &Roll) -> Result<(), End> {
+    pub(super) fn draw(&mut self, stats: &StreamStats, peers: &PeerTable) -> Result<(), End> {
         if self.drawn > 0 {
             self.out.raw(format!("\x1b[{}A\x1b[J", self.drawn).as_bytes())?;
         }
-        self.drawn = account.rows().count() + 2 + usize::from(account.given_up().lives > 0);
-        self.text_account(account, roll)
+        self.drawn = stats.rows().count() + 2 + usize::from(stats.given_up().lives > 0);
+        self.text_account(stats, peers)
     }
 
     /// The account as it stands, over the one that stands on the terminal, if any does.
-    pub(super) fn account(&mut self, account: &Account, roll: &Roll) -> Result<(), End> {
+    pub(super) fn stats(&mut self, stats: &StreamStats, peers: &PeerTable) -> Result<(), End> {
         if !self.json {
-            return if self.drawn > 0 { self.draw(account, roll) } else { self.text_account(account, roll) };
+            return if self.drawn > 0 { self.draw(stats, peers) } else { self.text_account(stats, peers) };
         }
-        for row in account.rows() {
-            let sensor = roll.row_name(row.hub, row.epoch, row.sensor);
+        for row in stats.rows() {
+            let sensor = peers.row_name(row.hub, row.epoch, row.sensor);
             self.out.json(&Lan::new(row, &sensor))?;
         }
-        self.out.json(&Sums::new(account.given_up()))?;
-        self.out.json(&Refused { class: "lan_refused", reasons: account })
+        self.out.json(&Sums::new(stats.given_up()))?;
+        self.out.json(&Refused { class: "lan_refused", reasons: stats })
     }
 
-    fn text_account(&mut self, account: &Account, roll: &Roll) -> Result<(), End> {
+    fn text_account(&mut self, stats: &StreamStats, peers: &PeerTable) -> Result<(), End> {
         let titles = ["HUB", "EPOCH", "TOPIC", "RECEIVED", "LOST", "DUPLICATE", "REORDERED"];
         let mut rows = vec![titles.map(String::from).to_vec()];
-        rows.extend(account.rows().map(|row| {
+        rows.extend(stats.rows().map(|row| {
             vec![
                 self.names.of(row.hub),
                 row.epoch.to_string(),
-                format!("{}/{}", roll.row_name(row.hub, row.epoch, row.sensor), topic(row)),
+                format!("{}/{}", peers.row_name(row.hub, row.epoch, row.sensor), topic(row)),
                 row.received.to_string(),
                 row.lost().to_string(),
                 row.duplicate.to_string(),
@@ -150,16 +153,16 @@ impl<'a> Report<'a> {
             ]
         }));
         table(&mut self.out, &rows)?;
-        let given_up = account.given_up();
+        let given_up = stats.given_up();
         if given_up.lives > 0 {
             self.out.line(|line| Sums::new(given_up).text(line))?;
         }
         self.out.line(|line| {
             write!(line, "refused:")?;
-            for (reason, count) in refused(account).filter(|(_, count)| *count > 0) {
+            for (reason, count) in refused(stats).filter(|(_, count)| *count > 0) {
                 write!(line, " {} {count}", reason.name())?;
             }
-            let any = refused(account).any(|(_, count)| count > 0);
+            let any = refused(stats).any(|(_, count)| count > 0);
             if any { Ok(()) } else { write!(line, " none") }
         })
     }
@@ -203,19 +206,19 @@ impl<'a> Lan<'a> {
 struct Refused<'a> {
     class: &'static str,
     #[serde(flatten, serialize_with = "reasons")]
-    reasons: &'a Account,
+    reasons: &'a StreamStats,
 }
 
-fn reasons<S: Serializer>(account: &&Account, serializer: S) -> Result<S::Ok, S::Error> {
+fn reasons<S: Serializer>(stats: &&StreamStats, serializer: S) -> Result<S::Ok, S::Error> {
     let mut map = serializer.serialize_map(None)?;
-    for (reason, count) in refused(account) {
+    for (reason, count) in refused(stats) {
         map.serialize_entry(reason.name(), &count)?;
     }
     map.end()
 }
 
-fn refused(account: &Account) -> impl Iterator<Item = (Refusal, u64)> {
-    Refusal::ALL.into_iter().map(|refusal| (refusal, account.refused(refusal)))
+fn refused(stats: &StreamStats) -> impl Iterator<Item = (DatagramError, u64)> {
+    DatagramError::ALL.into_iter().map(|refusal| (refusal, stats.refused(refusal)))
 }
 
 /// The topic's name; an account has no other ones.

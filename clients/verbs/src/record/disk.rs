@@ -14,13 +14,13 @@ use super::Kept;
 use super::files::{Files, Split, discard};
 use super::part::{Part, Place, Style};
 use super::queue::{Batch, EVERY, Entry, Queue};
-use super::told::{News, Told};
+use super::writer_progress::{News, WriterProgress};
 use crate::names::TopicName;
 
 /// The writing of one run.
 pub(super) struct Disk {
     queue: Arc<Queue>,
-    told: Arc<Told>,
+    progress: Arc<WriterProgress>,
     files: Option<Files>,
     split: Option<Split>,
     facts: BTreeMap<String, String>,
@@ -65,11 +65,11 @@ impl Disk {
         let mut part = Part::begin(place, style, numbered(&facts, files.as_ref()))?;
         // What could not even be begun is not in the way of the next try.
         part.write().inspect_err(|_| part.path().into_iter().for_each(discard))?;
-        let told = Told::default();
-        told.account().bytes = part.written;
+        let progress = WriterProgress::default();
+        progress.stats().bytes = part.written;
         Ok(Disk {
             queue,
-            told: Arc::new(told),
+            progress: Arc::new(progress),
             files,
             split,
             facts,
@@ -86,8 +86,8 @@ impl Disk {
     }
 
     /// Where it says how far it came.
-    pub(super) fn told(&self) -> Arc<Told> {
-        self.told.clone()
+    pub(super) fn progress(&self) -> Arc<WriterProgress> {
+        self.progress.clone()
     }
 
     /// The name of the file that is being written.
@@ -113,7 +113,7 @@ impl Disk {
                     }
                 }
                 Err(error) if error.kind() == ErrorKind::BrokenPipe => {
-                    self.told.account().news.push(News::ReaderGone);
+                    self.progress.stats().news.push(News::ReaderGone);
                     return Err(error);
                 }
                 Err(error) if is_over && (self.trouble.is_some() || self.part.is_doubtful) => {
@@ -180,9 +180,9 @@ impl Disk {
     fn write(&mut self) -> io::Result<()> {
         self.part.write()?;
         self.remember();
-        let mut account = self.told.account();
-        account.bytes = self.bytes + self.part.written;
-        account.samples += self.batch.count();
+        let mut stats = self.progress.stats();
+        stats.bytes = self.bytes + self.part.written;
+        stats.samples += self.batch.count();
         self.part.samples += self.batch.count();
         self.batch.clear();
         Ok(())
@@ -206,7 +206,7 @@ impl Disk {
         self.count_gone();
         self.bytes += self.part.written;
         self.part = part;
-        self.told.account().news.push(News::File(path));
+        self.progress.stats().news.push(News::File(path));
         Ok(())
     }
 
@@ -215,9 +215,9 @@ impl Disk {
         let Some(path) = self.part.path().filter(|_| self.part.is_gone()).map(PathBuf::from) else { return };
         let samples = std::mem::take(&mut self.part.samples);
         self.part.written = 0;
-        let mut account = self.told.account();
-        (account.bytes, account.samples) = (self.bytes, account.samples - samples);
-        account.news.push(News::Gone(path, samples));
+        let mut stats = self.progress.stats();
+        (stats.bytes, stats.samples) = (self.bytes, stats.samples - samples);
+        stats.news.push(News::Gone(path, samples));
     }
 
     /// Keeps the tracks of the batch.
@@ -247,7 +247,7 @@ impl Disk {
     fn troubled(&mut self, error: &io::Error, now: Instant) {
         let is_too_large = error.kind() == ErrorKind::FileTooLarge;
         if self.trouble.is_none() {
-            self.told.account().news.push(News::Trouble(self.path(), error.to_string()));
+            self.progress.stats().news.push(News::Trouble(self.path(), error.to_string()));
         }
         // What another file may help is tried at once.
         let is_first = self.trouble.is_none();
@@ -261,7 +261,7 @@ impl Disk {
 
     fn recovered(&mut self) {
         if let Some(trouble) = self.trouble.take() {
-            self.told.account().news.push(News::Well(self.path(), trouble.since.elapsed()));
+            self.progress.stats().news.push(News::Well(self.path(), trouble.since.elapsed()));
         }
     }
 }

@@ -85,7 +85,7 @@ impl Files {
         let last = if self.is_split { self.last() } else { 0 };
         if last > 0 && !self.overwrites {
             let name = self.name(last);
-            let what = format!("files of an earlier run are there, the last one is {}", name.display());
+            let what = format!("files of an earlier run exist, the last one is {}", name.display());
             return Err(io::Error::new(ErrorKind::AlreadyExists, what));
         }
         self.make(last + 1, self.overwrites && !self.is_split)

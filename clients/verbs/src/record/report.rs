@@ -9,11 +9,11 @@ use serde::Serialize;
 
 use super::RecordLook;
 use super::queue::Gap;
-use super::told::{Account as Written, News};
-use crate::account::Account;
+use super::writer_progress::{News, RecordStats};
 use crate::follow::Notice;
 use crate::names::TopicName;
 use crate::output::{End, Output, columns, fitting};
+use crate::receive_stats::ReceiveStats;
 use crate::{json, text};
 
 /// Where it is told.
@@ -66,7 +66,7 @@ impl<'a> Report<'a> {
     pub(super) fn begin(&mut self, path: &Path) -> Result<(), End> {
         self.files.push(path.to_owned());
         if self.look == RecordLook::Json {
-            return self.recording(&Written::default(), 0);
+            return self.recording(&RecordStats::default(), 0);
         }
         self.out.line(|line| write!(line, "records into {}", path.display()))
     }
@@ -115,10 +115,13 @@ impl<'a> Report<'a> {
             return self.out.json(&notice);
         }
         self.note(|line| match news {
-            News::File(path) => write!(line, "goes on in {}", path.display()),
+            News::File(path) => write!(line, "continues in {}", path.display()),
             News::Trouble(path, message) => {
                 let path = path.display();
-                write!(line, "cannot write {path}: {message}; what comes is held, and it is tried again")
+                write!(
+                    line,
+                    "cannot write {path}: {message}; samples are kept in memory, and writing is tried again"
+                )
             }
             News::Well(path, after) => {
                 write!(line, "{} is written again, after {:.1} s", path.display(), after.as_secs_f64())
@@ -136,7 +139,7 @@ impl<'a> Report<'a> {
             let (left_out, seconds) = (0, 0.0);
             return self.out.json(&Left { class: "notice", kind: "gap_begins", left_out, seconds });
         }
-        self.note(|line| write!(line, "no more can be held: samples are left out of the recording"))
+        self.note(|line| write!(line, "memory for samples is full: samples are left out of the recording"))
     }
 
     /// Nothing more is left out.
@@ -156,7 +159,7 @@ impl<'a> Report<'a> {
     }
 
     /// How far it is, once a second, to who looks or reads objects.
-    pub(super) fn progress(&mut self, written: &Written, left_out: u64) -> Result<(), End> {
+    pub(super) fn progress(&mut self, written: &RecordStats, left_out: u64) -> Result<(), End> {
         if Instant::now() < self.next {
             return Ok(());
         }
@@ -176,7 +179,7 @@ impl<'a> Report<'a> {
     }
 
     /// What was received of a topic.
-    pub(super) fn topic(&mut self, name: &TopicName, account: &Account) -> Result<(), End> {
+    pub(super) fn topic(&mut self, name: &TopicName, account: &ReceiveStats) -> Result<(), End> {
         if self.look == RecordLook::Json {
             return self.out.json(&json::summary(name, account));
         }
@@ -185,8 +188,8 @@ impl<'a> Report<'a> {
     }
 
     /// All of it is written.
-    pub(super) fn end(&mut self, written: &Written, left_out: u64) -> Result<(), End> {
-        let Written { bytes, samples, .. } = *written;
+    pub(super) fn end(&mut self, written: &RecordStats, left_out: u64) -> Result<(), End> {
+        let RecordStats { bytes, samples, .. } = *written;
         if self.look == RecordLook::Json {
             return self.out.json(&Recorded {
                 class: "recorded",
@@ -218,7 +221,7 @@ impl<'a> Report<'a> {
         })
     }
 
-    fn recording(&mut self, written: &Written, left_out: u64) -> Result<(), End> {
+    fn recording(&mut self, written: &RecordStats, left_out: u64) -> Result<(), End> {
         self.out.json(&Progress {
             class: "recording",
             file: self.files.last().map(|file| file.display().to_string()),
@@ -231,7 +234,7 @@ impl<'a> Report<'a> {
     }
 
     /// How far it is, each part with its rank: what is lost is wanted longest.
-    fn status(&self, written: &Written, left_out: u64) -> Vec<(u8, String)> {
+    fn status(&self, written: &RecordStats, left_out: u64) -> Vec<(u8, String)> {
         let seconds = self.begun.elapsed().as_secs();
         let rate = written.bytes.saturating_sub(self.bytes) / EVERY.as_secs();
         let trouble = self.is_in_trouble.then(|| (4, "disk trouble".to_owned()));

@@ -32,7 +32,7 @@ impl Selection {
         }
         if let Some(fold) = chosen.named.iter().find(|name| name.is_robot()) {
             let hint = "`*/zones` records the zones of each sensor";
-            return Err(Failure::new(Kind::Usage, format!("{fold} is made by who listens"), hint));
+            return Err(Failure::new(Kind::Usage, format!("{fold} is computed by the consumer"), hint));
         }
         if ros2 {
             let named = chosen.named.iter().map(|name| name.topic);
@@ -68,8 +68,8 @@ impl Selection {
 
 /// `what` cannot be in a recording for ROS 2.
 fn no_message(what: &str) -> Failure {
-    let message = format!("--ros2 records messages of ROS alone, and {what} has others: only scans are such");
-    let hint = "record without --ros2, and `scanhub convert IN.mcap OUT.mcap --ros2` makes a file for ROS of it later";
+    let message = format!("--ros2 records only ROS messages, and {what} is not one: only scans are");
+    let hint = "record without --ros2, and convert later: `scanhub convert IN.mcap OUT.mcap --ros2`";
     Failure::new(Kind::Usage, message, hint)
 }
 

@@ -14,7 +14,7 @@ pub(crate) fn marks(line: &mut Vec<u8>, header: &Header, marks: &Marks) -> io::R
         return if header.flags & Flags::REPLAYED != 0 {
             write!(
                 line,
-                " unavailable: the recording has no reflector bits, or does not tell its measuring mode: "
+                " unavailable: the recording has no reflector bits, or does not contain its measuring mode: "
             )?;
             write!(line, "then set link.NAME.mode")
         } else {
@@ -33,7 +33,7 @@ pub(crate) fn marks(line: &mut Vec<u8>, header: &Header, marks: &Marks) -> io::R
 pub(crate) fn zones(line: &mut Vec<u8>, heard: &Heard) -> io::Result<()> {
     let Heard { zones, header, .. } = heard;
     let Some(header) = header else {
-        return write!(line, "unknown: nothing new is heard");
+        return write!(line, "unknown: no recent data");
     };
     numbers(line, header)?;
     if heard.stale {
@@ -52,7 +52,7 @@ pub(crate) fn zones(line: &mut Vec<u8>, heard: &Heard) -> io::Result<()> {
 }
 
 /// The fold over all sensors.
-pub(super) fn robot(line: &mut Vec<u8>, robot: &Robot) -> io::Result<()> {
+pub(crate) fn robot(line: &mut Vec<u8>, robot: &Robot) -> io::Result<()> {
     write!(line, "{}", robot.verdict().name())?;
     match robot.nearest() {
         Some((mm, sensor)) => write!(line, " nearest {mm} mm, {sensor}:")?,

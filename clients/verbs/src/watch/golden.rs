@@ -258,7 +258,7 @@ fn no_screen_is_too_small() {
 /// The picture in the documents is what is drawn now.
 #[test]
 fn the_documents_show_it() {
-    compare("../docs/watch.svg", &svg(&screen(&scene(), &View::new(true), (80, 30))));
+    compare("../../docs/watch.svg", &svg(&screen(&scene(), &View::new(true), (80, 30))));
 }
 
 /// A screen as SVG: letters where they stand, the dots of Braille as dots, because fonts have them at odd places.

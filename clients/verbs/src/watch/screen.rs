@@ -53,8 +53,8 @@ impl<'a> Screen<'a> {
         let mut sheet =
             Sheet { out, buffer: Vec::new(), written: written.clone(), given_back: given_back.clone() };
         let no_terminal = |error| {
-            let message = format!("the terminal cannot be taken over: {error}");
-            Failure::new(Kind::Failed, message, "keys come from stdin or /dev/tty; `ssh -t` gives one")
+            let message = format!("cannot use the terminal: {error}");
+            Failure::new(Kind::Failed, message, "keys are read from stdin or /dev/tty; `ssh -t` provides one")
         };
         let keys = Keys::open().map_err(no_terminal)?;
         enable_raw_mode().map_err(no_terminal)?;

@@ -290,14 +290,14 @@ fn radii(origin: &Origin, value: Spanned<Vec<f64>>) -> Result<Vec<u16>, Failure>
     if radii.is_sorted_by(|one, next| one > next) {
         Ok(radii)
     } else {
-        refuse("the largest first, none twice")
+        refuse("the largest first, each once")
     }
 }
 
 fn sectors(origin: &Origin, value: Spanned<Vec<Spanned<SectorLayer>>>) -> Result<Vec<Sector>, Failure> {
     if value.get_ref().len() > SECTORS {
         let what = format!("self_min has {} sectors", value.get_ref().len());
-        return Err(origin.refuse(Some(value.span()), what, format!("at most {SECTORS}: join neighbours")));
+        return Err(origin.refuse(Some(value.span()), what, format!("at most {SECTORS}: merge neighbours")));
     }
     value.into_inner().into_iter().map(|sector| in_sector(origin, sector)).collect()
 }

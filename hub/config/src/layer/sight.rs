@@ -30,7 +30,7 @@ impl Sight<'_> {
         let (beams, min_beams) = (self.variant.beams(), settings.min_beams);
         if usize::from(min_beams) > beams {
             let what = format!("min_beams = {min_beams}, and a scan has {beams} beams");
-            return Err(self.refuse(Sections::min_beams, what, "a few beams: one is enough by default"));
+            return Err(self.refuse(Sections::min_beams, what, "the default is one beam"));
         }
         let telling = self.telling(processing, &settings);
         if telling >= min_beams {
@@ -41,18 +41,18 @@ impl Sight<'_> {
         let (place, what, remedy): (Place, _, _) = match (meeting, telling) {
             (0, _) => (
                 Sections::pose,
-                format!("no beam meets the circle of {circle_m} m"),
-                "correct the sensor's pose, or give it a circle that it sees: link.NAME.zones.radii",
+                format!("no beam sees into the circle of {circle_m} m"),
+                "correct the sensor's pose, or set a circle that it sees: link.NAME.zones.radii",
             ),
             (_, 0) => (
                 Sections::self_min,
                 format!("self_min covers every beam up to the circle of {circle_m} m"),
-                "shorten self_min: it is for the robot's own body",
+                "shorten self_min: it is only for the robot's own body",
             ),
             _ => (
                 Sections::min_beams,
                 format!("min_beams = {min_beams}, and {telling} can see the circle of {circle_m} m"),
-                "fewer beams, a larger circle, or another pose or self_min",
+                "set fewer beams, a larger circle, or another pose or self_min",
             ),
         };
         Err(self.refuse(place, what, remedy))

@@ -52,7 +52,7 @@ impl ControlQueue {
                 match control {
                     Control::Pause => player.pause(),
                     Control::Resume => player.resume(),
-                    Control::Resync => return Err(self.refusal("a recording has nobody to begin anew with")),
+                    Control::Resync => return Err(self.refusal("a recording has no session to restart")),
                 }
                 return Ok(());
             }
@@ -85,7 +85,7 @@ impl ControlQueue {
     }
 
     fn refusal(&self, why: &str) -> Failure {
-        let hint = format!("`scanhub info {}` shows how it is", self.sensor);
+        let hint = format!("`scanhub info {}` shows its state", self.sensor);
         Failure::new(Kind::Failed, format!("{}: {why}", self.sensor), hint)
     }
 }

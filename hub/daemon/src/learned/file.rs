@@ -51,8 +51,8 @@ impl Learned {
     /// What `text`, found at `place`, says of the sensor of `link`; or why that is not one to begin with.
     pub(super) fn read(text: &str, place: &str, link: &Link) -> Result<Learned, String> {
         let saved = SavedModel::parse(text.as_bytes(), place).map_err(|failure| failure.message)?;
-        let Place { pose, wall_ns } =
-            serde_json::from_str(text).map_err(|error| format!("{place} does not say of when: {error}"))?;
+        let Place { pose, wall_ns } = serde_json::from_str(text)
+            .map_err(|error| format!("{place} does not contain its time: {error}"))?;
         let (model, beams) = (saved.model, link.variant.beams());
         let unit_mm = link.unit.map_or(model.unit_mm, Unit::mm);
         if saved.sensor != link.name {

@@ -118,7 +118,7 @@ impl Recorded {
         if mode.is_some() || recording.contents().scans == 0 {
             return String::new();
         }
-        format!("the recording does not tell its measuring mode: no scans; set link.{name}.mode")
+        format!("the recording does not contain its measuring mode: no scans; set link.{name}.mode")
     }
 
     /// Media time of its end, as far as that is known.
@@ -270,7 +270,7 @@ fn tell_of_mode(recording: &Recording, link: &Link) {
     if contents.mode.or(link.mode).is_none() && contents.scans > 0 && contents.readable().is_some() {
         let name = &link.name;
         tracing::info!(
-            "{name}: no measuring mode is told, and no value has more than 13 bits: read as ranges of 13"
+            "{name}: the recording does not contain a measuring mode, and no value has more than 13 bits: read as ranges of 13"
         );
     }
 }

@@ -84,8 +84,8 @@ impl fmt::Display for Unfit {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let counted = |count: u64, what: &str| (count > 0).then(|| format!("{count} {what}"));
         let parts = [
-            counted(self.rounded, "ranges are finer than the values of an LMS 2xx that reach as far"),
-            counted(self.beyond, "ranges are too far for a value of an LMS 2xx"),
+            counted(self.rounded, "ranges are finer than the unit in which an LMS 2xx reaches that far"),
+            counted(self.beyond, "ranges are too long for a value of an LMS 2xx"),
         ];
         f.write_str(&parts.into_iter().flatten().collect::<Vec<_>>().join(", "))
     }

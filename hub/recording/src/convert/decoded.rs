@@ -116,8 +116,8 @@ impl Sensor {
         if self.mode.is_some() || !self.is_decoded {
             return Ok(());
         }
-        let message = format!("{} does not tell the measuring mode of {name}", recording.path().display());
-        let hint = "--mode says it, such as --mode 0x01; `scanhub doctor PORT` asks the sensor for it";
+        let message = format!("{} does not contain the measuring mode of {name}", recording.path().display());
+        let hint = "set it with --mode, such as --mode 0x01; `scanhub doctor PORT` asks the sensor for it";
         Err(Failure::new(Kind::Configuration, message, hint))
     }
 

@@ -36,7 +36,7 @@ impl Place {
             }
         }
         let Some(name) = path.file_name() else {
-            return refuse(format!("{} is no file's name", path.display()), "name a file, or - for stdout");
+            return refuse(format!("{} is not a file name", path.display()), "name a file, or - for stdout");
         };
         let mut hidden = OsString::from(".");
         hidden.push(name);
@@ -85,7 +85,7 @@ impl Drop for Place {
 }
 
 pub(super) fn unwritable(path: &Path, error: &io::Error) -> Failure {
-    let hint = "the directory has to be there, writable, and with room";
+    let hint = "the directory must exist, be writable and have free space";
     Failure::new(Kind::Output, format!("cannot write {}: {error}", path.display()), hint)
 }
 

@@ -119,7 +119,7 @@ impl<R: Read> Salvage<R> {
         self.at += 1;
         if let Some(length) = exact::long_chunk(bytes) {
             let (megabytes, most) = (length >> 20, exact::LONGEST >> 20);
-            let what = format!("a chunk of it has {megabytes} MB, and at most {most} are read at a time");
+            let what = format!("it has a chunk of {megabytes} MB; at most {most} MB are read at a time");
             return Err(io::Error::new(io::ErrorKind::FileTooLarge, what));
         }
         let Some(length) = exact::length(bytes) else { return Ok(None) };

@@ -196,7 +196,7 @@ impl ThingFile {
                 Ok(feet[..4].iter().map(|&foot| Shape::Post { centre: point(foot), radius }).collect())
             }
             (None, None, None, Some(_)) => Ok(vec![Shape::Post { centre: (0.0, 0.0), radius }]),
-            _ => Err(origin.refuse(span, "a thing without a shape, or with too many", REMEDY)),
+            _ => Err(origin.refuse(span, "a thing with no shape, or with more than one", REMEDY)),
         }
     }
 }
@@ -221,7 +221,7 @@ impl PersonFile {
             (Some(path), None, None, speed) => (path, speed),
             _ => {
                 let remedy = "path = [[x, y], ..], or centre = [x, y] with reach = [x, y] and no speed";
-                return Err(origin.refuse(span, "a person without a way, or with two", remedy));
+                return Err(origin.refuse(span, "a person with no path, or with two", remedy));
             }
         };
         let corner = |values: &Vec<Number>| match values[..] {
@@ -232,7 +232,7 @@ impl PersonFile {
         let corners = path.get_ref().iter().map(corner).collect::<Option<Vec<_>>>();
         let Some(corners) = corners.filter(|corners| !corners.is_empty()) else {
             let remedy = "path = [[x, y], [x, y, seconds of rest], ..] in millimetres";
-            return Err(origin.refuse(path.span(), "a path that is none", remedy));
+            return Err(origin.refuse(path.span(), "a path without points", remedy));
         };
         let rest_s: f64 = corners.iter().map(|corner| corner.1).sum();
         if corners.len() > 1 && rest_s >= until_s - from_s {

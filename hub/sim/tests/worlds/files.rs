@@ -131,7 +131,11 @@ fn what_is_no_world_is_refused_by_name_place_and_remedy() {
             "while it is there",
         ),
         ("\n[[person]]\nfrom_s = 3", "w.toml:2:1: a person without a way", "path = "),
-        ("[[person]]\npath = []\nuntil_s = 3", "w.toml:2:8: a path that is none", "[x, y, seconds of rest]"),
+        (
+            "[[person]]\npath = []\nuntil_s = 3",
+            "w.toml:2:8: a path without points",
+            "[x, y, seconds of rest]",
+        ),
         ("[[person]]\npath = [[0, 0], [1, 1]]", "w.toml:2:8: nothing says when", "speed_mm_s or until_s"),
         (
             "[[person]]\npath = [[0, 0, 2], [1, 1, 3]]\nfrom_s = 1\nuntil_s = 6",

@@ -18,13 +18,13 @@ pub(crate) fn person(plan: Plan, stop: &AtomicBool) -> Result<Consent, Failure> 
     if !input.is_terminal() || !stderr().is_terminal() {
         return Err(Failure::new(
             Kind::Usage,
-            "nothing was written: a person has to confirm it",
-            "run the same at a terminal, with stdin and stderr not redirected",
+            "nothing was written: a person must confirm it",
+            "run the same command in a terminal, with stdin and stderr not redirected",
         ));
     }
     // What was typed before the question is no answer to it.
     let _ = tcflush(&input, QueueSelector::IFlush);
-    let question = "The EEPROM wears out after a few thousand writes. Write this into it? Type yes: ";
+    let question = "The EEPROM wears out after a few thousand writes. Write this? Type yes: ";
     let _ = stderr().write_all(question.as_bytes());
     loop {
         if stop.load(Ordering::Relaxed) {
@@ -46,7 +46,7 @@ pub(crate) fn person(plan: Plan, stop: &AtomicBool) -> Result<Consent, Failure> 
     if read.is_ok() && answer.trim() == "yes" {
         return Ok(Consent::of_a_person(plan));
     }
-    Err(Failure::new(Kind::Failed, "not confirmed: nothing was written", "the answer that writes is: yes"))
+    Err(Failure::new(Kind::Failed, "not confirmed: nothing was written", "to write, answer: yes"))
 }
 
 /// Between two looks whether somebody interrupts.

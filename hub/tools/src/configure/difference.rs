@@ -57,8 +57,8 @@ pub(crate) fn between(
     found.extend(plan.power_on.map(|power_on| {
         let before = match was_permanent {
             Some(false) => "9600 Bd",
-            Some(true) => "not 9600 Bd, which rate the sensor does not tell",
-            None => "not told by the sensor",
+            Some(true) => "not 9600 Bd; the sensor does not report the rate",
+            None => "not reported by the sensor",
         };
         let after = match power_on {
             PowerOn::KeepBaud => {

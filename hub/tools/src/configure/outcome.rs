@@ -95,7 +95,7 @@ impl fmt::Display for Configured {
             return write!(f, "{port}: nothing to change, nothing was written");
         }
         let now = operating::name(self.operating_mode);
-        write!(f, "{port}: written, read back, and as it should be; now at: {now}")?;
+        write!(f, "{port}: written, read back and correct; now at: {now}")?;
         if self.operating_mode != self.found_mode {
             write!(f, "\n  it was found at: {}", operating::name(self.found_mode))?;
         }
@@ -104,7 +104,7 @@ impl fmt::Display for Configured {
         }
         if back.is_rate_lost {
             f.write_str(
-                "\n  the former rate after power-on cannot be brought back: the sensor did not tell it",
+                "\n  the earlier rate after power-on cannot be restored: the sensor did not report it",
             )?;
         }
         Ok(())
@@ -115,9 +115,9 @@ fn failure(port: &str, plan: &Plan, outcome: &Outcome, step: Step, failing: Fail
     let what = match (step, failing) {
         (Step::Enter, Failing::Refused) => "the sensor refuses the installation mode: wrong password?".into(),
         (Step::Compare, Failing::Differs) => {
-            "it does not keep what it did when it was asked: is this another sensor?".into()
+            "its settings changed since you confirmed: is this another sensor?".into()
         }
-        (_, Failing::Differs) => "what was read back is not what was to be written".into(),
+        (_, Failing::Differs) => "the settings read back differ from those written".into(),
         (step, Failing::Refused) => format!("{}: the sensor refuses", words(step)),
         (step, Failing::Unanswered) => format!("{}: no answer", words(step)),
     };
@@ -126,10 +126,12 @@ fn failure(port: &str, plan: &Plan, outcome: &Outcome, step: Step, failing: Fail
     }
     let kept = match outcome.configuration {
         _ if !outcome.written => "nothing was written".into(),
-        None => format!("what it keeps now is not known; before it was {}", hex(plan.old.bytes())),
-        Some(kept) if kept == plan.old && plan.old != plan.new => "it keeps the old configuration".into(),
-        Some(kept) if kept == plan.new => "it keeps the new configuration".into(),
-        Some(kept) => format!("it keeps {}, before it was {}", hex(kept.bytes()), hex(plan.old.bytes())),
+        None => format!("the settings in the EEPROM are not known now; before: {}", hex(plan.old.bytes())),
+        Some(kept) if kept == plan.old && plan.old != plan.new => {
+            "the EEPROM has the old configuration".into()
+        }
+        Some(kept) if kept == plan.new => "the EEPROM has the new configuration".into(),
+        Some(kept) => format!("the EEPROM has {}; before: {}", hex(kept.bytes()), hex(plan.old.bytes())),
     };
     let mode = match outcome.operating_mode {
         Some(mode) => format!("it is at: {}", operating::name(mode)),
@@ -146,7 +148,7 @@ pub(crate) fn untouched(port: &str, error: &std::io::Error) -> Failure {
 /// The port went away in the middle of `change`.
 pub(crate) fn gone(port: &str, change: &Change, failure: &Failure) -> Failure {
     let kept = if change.outcome().written {
-        "whether it was written is not known: scanhub probe tells"
+        "whether it was written is not known: scanhub probe shows it"
     } else {
         "nothing was written"
     };

@@ -11,7 +11,7 @@ const NAME: &str = "line-errors";
 /// Judges what an open line's driver counted since it was loaded, if it counts, and how many errors of it came `now`, while
 /// a sensor answered at its rate.
 pub(crate) fn line_errors(counts: Option<Counts>, now: u64) -> Finding {
-    let Some(counts) = counts else { return Finding::skipped(NAME, "the driver counts none") };
+    let Some(counts) = counts else { return Finding::skipped(NAME, "the driver does not count errors") };
     let Counts { received, framing, overrun, parity, breaks, buffer } = counts;
     let text = format!(
         "framing {framing}, parity {parity}, breaks {breaks}, overruns {} in {received} bytes since its driver was loaded",
@@ -37,7 +37,7 @@ pub(crate) fn line_errors(counts: Option<Counts>, now: u64) -> Finding {
 /// Judges what the hub says of a port that it has.
 pub(crate) fn as_the_hub_counts(status: &Status) -> Finding {
     let (errors, bytes) = (status.counters[Counter::LineErrors], status.counters[Counter::BytesRead]);
-    let text = format!("the hub was told of {errors} in {bytes} bytes");
+    let text = format!("the hub counted {errors} in {bytes} bytes");
     if is_large(errors, bytes) {
         Finding::warning(NAME, text, remedy(false))
     } else {

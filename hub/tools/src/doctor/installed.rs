@@ -36,7 +36,7 @@ pub(crate) fn service(system: &System, hub: Option<u32>) -> Finding {
                 format!("{INSTALL}, then sudo systemctl restart scanhub"),
             );
         }
-        Ok(Build::Other(None)) => "a program that does not tell its version".to_owned(),
+        Ok(Build::Other(None)) => "a program that does not report its version".to_owned(),
         Err(error) if error.kind() == ErrorKind::NotFound => {
             let text = format!("{at} starts {}, which is not there", program.display());
             return Finding::failed(NAME, text, INSTALL);
@@ -52,11 +52,11 @@ pub(crate) fn service(system: &System, hub: Option<u32>) -> Finding {
         (true, false, None) if is_booted => Finding::failed(
             NAME,
             format!("{text}; enabled, and does not run"),
-            "systemctl status scanhub tells why; sudo systemctl start scanhub",
+            "systemctl status scanhub shows the reason; sudo systemctl start scanhub",
         ),
         (true, false, _) => Finding::ok(NAME, format!("{text}; enabled, does not run")),
         (false, false, _) => {
-            Finding::ok(NAME, format!("{text}; not enabled: sudo systemctl enable --now scanhub does that"))
+            Finding::ok(NAME, format!("{text}; not enabled: sudo systemctl enable --now scanhub enables it"))
         }
     }
 }
@@ -71,12 +71,8 @@ pub(crate) fn rules(system: &System, there: &[Candidate]) -> Finding {
     match regular::read_text(&path, regular::LONGEST) {
         Ok(text) if text == TEXT => {}
         Ok(_) => {
-            let text = format!("{at} is not that of this version");
-            return Finding::warning(
-                NAME,
-                text,
-                format!("{INSTALL}; a rule of your own needs a name of its own"),
-            );
+            let text = format!("{at} belongs to another version");
+            return Finding::warning(NAME, text, format!("{INSTALL}; give your own rule another name"));
         }
         Err(error) => return Finding::warning(NAME, format!("{at}: {error}"), INSTALL),
     }

@@ -23,7 +23,7 @@ pub(crate) fn leftovers(facts: &Facts) -> Finding {
     match (facts.lives(), nodes.dead, nodes.alive) {
         (Some(_), 0, _) => Finding::ok(NAME, "none"),
         (Some(_), dead, _) => {
-            Finding::ok(NAME, format!("{} died; the hub is tidying up", plural(dead as u64, "process")))
+            Finding::ok(NAME, format!("{} died; the hub is cleaning up", plural(dead as u64, "process")))
         }
         (None, 0, 0) if facts.segments.is_empty() => match &facts.lock {
             None => Finding::ok(NAME, "none"),
@@ -35,16 +35,14 @@ pub(crate) fn leftovers(facts: &Facts) -> Finding {
         (None, 0, alive) if alive > 0 => {
             Finding::ok(NAME, format!("none; {} waiting for a hub", plural(alive as u64, "consumer")))
         }
-        (None, 0, _) => Finding::warning(
-            NAME,
-            format!("no process holds {left}"),
-            "scanhub doctor --clean takes them away",
-        ),
+        (None, 0, _) => {
+            Finding::warning(NAME, format!("no process holds {left}"), "scanhub doctor --clean removes them")
+        }
         (None, dead, _) => Finding::warning(
             NAME,
-            format!("{} died without a hub to tidy up; {left}", plural(dead as u64, "process")),
+            format!("{} died without a hub to clean up; {left}", plural(dead as u64, "process")),
             format!(
-                "scanhub doctor --clean takes it away; so does the next `scanhub run` at {}",
+                "scanhub doctor --clean removes it; so does the next `scanhub run` at {}",
                 facts.root.display()
             ),
         ),
@@ -61,7 +59,7 @@ pub(crate) fn clean(places: &[&Domain], user: u32) -> Finding {
     for place in places {
         if let Ok(Some(pid)) = schema::publisher(place.root()) {
             let why =
-                format!("{}: process {pid} publishes there, and tidies up itself", place.root().display());
+                format!("{}: process {pid} publishes there, and cleans up itself", place.root().display());
             return Finding::skipped(NAME, why);
         }
     }

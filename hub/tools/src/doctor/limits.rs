@@ -11,7 +11,7 @@ pub(crate) fn descriptors(facts: &Facts) -> Finding {
     const NAME: &str = "descriptors";
     let Some(limit) = facts.descriptors else { return Finding::ok(NAME, "no limit") };
     let own = facts.open + DESCRIPTORS_AT_START + needs::descriptors(facts.links);
-    let remedy = "raise the hard limit: of this shell sudo prlimit --pid $$ --nofile=65536:65536, of a service LimitNOFILE=65536, \
+    let remedy = "raise the hard limit: for this shell sudo prlimit --pid $$ --nofile=65536:65536, of a service LimitNOFILE=65536, \
          of a container --ulimit nofile=65536";
     let Some(rest) = limit.checked_sub(own) else {
         let text = format!("{limit} at most, the hub needs {own}");

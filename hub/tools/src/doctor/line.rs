@@ -35,7 +35,7 @@ pub(crate) fn examine(
     };
     let candidate = candidate(path, there);
     if hub.is_some_and(|hub| hub.is_mute_link(&subject.source)) {
-        tell(Finding::skipped("port", "a link of the hub, which does not say what port it has"));
+        tell(Finding::skipped("port", "a link of the hub, which does not report its port"));
         return Ok(());
     }
     if path.exists() && !is_tty(path) {
@@ -79,7 +79,7 @@ pub(crate) fn examine(
             refused(PortError::Denied.explain(&subject.source))
         });
         let name = subject.source.name();
-        let why = format!("not asked: nobody said that it is a sensor's port; scanhub doctor {name} asks");
+        let why = format!("not opened, because the port was not named; scanhub doctor {name} checks it");
         tell(Finding::skipped("sensor", why));
         return Ok(());
     }
@@ -159,8 +159,8 @@ fn held(holders: &[Holder], hub: u32) -> Finding {
         None => Finding::ok(NAME, format!("the hub has it, {}", words.join(", "))),
         Some(other) => Finding::warning(
             NAME,
-            format!("the hub is not alone: {}", words.join(", ")),
-            format!("end {other}: what it reads the hub does not get"),
+            format!("another process reads the port: {}", words.join(", ")),
+            format!("end {other}: the hub loses every byte that it reads"),
         ),
     }
 }
@@ -197,8 +197,12 @@ fn presence(source: &Source, path: &Path, candidate: Option<&Candidate>) -> Find
     };
     let text = candidate.map(describe).unwrap_or_default();
     if name != device && path == device {
-        let remedy = format!("name {}, which is the same wherever it is plugged in", name.display());
-        return Finding::warning(NAME, format!("{text}; the name may be another one's tomorrow"), remedy);
+        let remedy = format!("use the name {}, which does not change", name.display());
+        return Finding::warning(
+            NAME,
+            format!("{text}; this name may belong to another adapter after a restart"),
+            remedy,
+        );
     }
     Finding::ok(NAME, text)
 }
@@ -226,17 +230,21 @@ fn refused(failure: Failure) -> Finding {
 /// Whether the adapter of an open port collects bytes, for so many milliseconds, before it hands them over.
 fn latency(path: &Path, ms: Option<u8>) -> Finding {
     const NAME: &str = "latency";
-    let Some(ms) = ms else { return Finding::skipped(NAME, "the driver has no timer to look at") };
+    let Some(ms) = ms else { return Finding::skipped(NAME, "the driver has no latency timer") };
     if ms <= PROMPT_MS {
         return Finding::ok(NAME, format!("the adapter hands over bytes after {ms} ms"));
     }
     let device = path.canonicalize().unwrap_or_else(|_| path.to_owned());
     let name = device.file_name().unwrap_or_default().to_string_lossy();
     let remedy = format!(
-        "echo 1 | sudo tee /sys/class/tty/{name}/device/latency_timer; for good by udev: \
+        "echo 1 | sudo tee /sys/class/tty/{name}/device/latency_timer; permanently by udev: \
          SUBSYSTEM==\"usb-serial\", DRIVER==\"ftdi_sio\", ATTR{{latency_timer}}=\"1\""
     );
-    Finding::warning(NAME, format!("the adapter collects bytes for {ms} ms: scans are late by that"), remedy)
+    Finding::warning(
+        NAME,
+        format!("the adapter collects bytes for {ms} ms: scans are late by as much"),
+        remedy,
+    )
 }
 
 /// Whether it can have the rate to stream at.
@@ -250,14 +258,14 @@ fn rate(subject: &Subject, port: &Port, first: Baud) -> Finding {
     match (outcome, &subject.link) {
         (Ok(()), _) => {
             let near =
-                given.map_or(String::new(), |given| format!(": the driver gives {given} Bd, near enough"));
+                given.map_or(String::new(), |given| format!(": the driver sets {given} Bd, close enough"));
             Finding::ok(NAME, format!("{} Bd is possible{near}", wanted.rate()))
         }
         (Err(error), Some(link)) => Finding::failed(
             NAME,
             error.to_string(),
             format!(
-                "a rate that it can: --set link.{}.baud=38400; or take an adapter with an FT232R or newer",
+                "use a rate that it can set: --set link.{}.baud=38400; or an adapter with an FT232R or newer",
                 link.name
             ),
         ),
@@ -265,7 +273,7 @@ fn rate(subject: &Subject, port: &Port, first: Baud) -> Finding {
             NAME,
             error.to_string(),
             "at 38400 Bd (--set link.NAME.baud=38400) a sensor sends 5 scans a second instead of 37; an adapter with an \
-             FT232R or newer does it",
+             FT232R or newer can set 500 kBd",
         ),
     }
 }

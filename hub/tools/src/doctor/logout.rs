@@ -12,10 +12,10 @@ const NAME: &str = "logout";
 pub(crate) fn logout(system: &System, user: u32) -> Finding {
     let name = system.name_of(user);
     if user <= LAST_SYSTEM_USER {
-        return Finding::ok(NAME, format!("user {name} is none who logs out: shared memory stays"));
+        return Finding::ok(NAME, format!("user {name} is a system user: shared memory stays at logout"));
     }
     if !system.path("run/systemd/users").is_dir() {
-        return Finding::ok(NAME, "no logind here that would take shared memory away");
+        return Finding::ok(NAME, "there is no logind that could remove shared memory");
     }
     let (removes, place) = removes_ipc(system);
     if !removes {
@@ -27,10 +27,10 @@ pub(crate) fn logout(system: &System, user: u32) -> Finding {
     Finding::warning(
         NAME,
         format!(
-            "RemoveIPC=yes ({place}): when user {name} logs out, shared memory goes, under a hub that runs"
+            "RemoveIPC=yes ({place}): when user {name} logs out, shared memory is removed, even while a hub uses it"
         ),
         format!(
-            "sudo loginctl enable-linger {name}; or the service, whose user does not log out; or RemoveIPC=no under \
+            "sudo loginctl enable-linger {name}; or run the service, whose user does not log out; or set RemoveIPC=no under \
              [Login] in /etc/systemd/logind.conf.d/scanhub.conf, then restart the machine"
         ),
     )

@@ -151,7 +151,7 @@ pub(crate) fn memory(facts: &Facts) -> Finding {
     const NAME: &str = "memory";
     let Some(Memory { size, free, free_files, is_read_only }) = facts.memory else {
         let remedy = format!("mount a tmpfs there: sudo mount -t tmpfs -o size=64M tmpfs {SHARED_MEMORY}");
-        return Finding::failed(NAME, format!("{SHARED_MEMORY} cannot be looked at"), remedy);
+        return Finding::failed(NAME, format!("{SHARED_MEMORY} cannot be read"), remedy);
     };
     if is_read_only {
         let text = format!("{SHARED_MEMORY} cannot be written to");
@@ -193,26 +193,27 @@ pub(crate) fn domain(facts: &Facts) -> Finding {
         Err(failure) => return Finding::failed(NAME, failure.message.clone(), failure.hint.clone()),
         Ok(Some(pid)) if facts.is_stopped => {
             let text = format!("{root}: the hub is stopped, process {pid}");
-            return Finding::failed(NAME, text, format!("let it go on: kill -CONT {pid}"));
+            return Finding::failed(NAME, text, format!("continue it: kill -CONT {pid}"));
         }
         Ok(Some(pid)) if !facts.mute.is_empty() => {
             let links = facts.mute.join(", ");
-            let text = format!("{root}: the hub, process {pid}, does not publish: no status of {links} came");
-            return Finding::failed(NAME, text, format!("look at its log, then start it anew: kill {pid}"));
+            let text =
+                format!("{root}: the hub, process {pid}, does not publish: no status of {links} arrived");
+            return Finding::failed(NAME, text, format!("look at its log, then restart it: kill {pid}"));
         }
         Ok(Some(pid)) => return Finding::ok(NAME, format!("{root}: a hub runs, process {pid}")),
         Ok(None) => {}
     }
     if place.path != facts.root {
         return if place.writable {
-            Finding::ok(NAME, format!("{root}: not there yet, can be made"))
+            Finding::ok(NAME, format!("{root}: does not exist yet, can be created"))
         } else {
-            let text = format!("{root} cannot be made: nothing can be made in {at}");
+            let text = format!("{root} cannot be created: nothing can be created in {at}");
             Finding::failed(NAME, text, "name another place with --root")
         };
     }
     if !place.writable {
-        let text = format!("{at}: nothing can be made there, mode {:04o}", place.mode);
+        let text = format!("{at}: nothing can be created there, mode {:04o}", place.mode);
         return Finding::failed(NAME, text, format!("chmod 700 {at}, or name another place with --root"));
     }
     Finding::ok(NAME, format!("{root}: free, yours, mode {:04o}", place.mode))
@@ -228,7 +229,7 @@ pub(crate) fn hubs(facts: &Facts, name_of: impl Fn(u32) -> String) -> Finding {
         for (root, owner) in &facts.closed {
             let (root, owner) = (root.display(), name_of(*owner));
             text += &format!(
-                "; who is at {root} only user {owner} sees: sudo -u {owner} scanhub doctor; {SHARING}"
+                "; only user {owner} can see what runs at {root}: sudo -u {owner} scanhub doctor; {SHARING}"
             );
         }
         return Finding::ok(NAME, text);
@@ -236,7 +237,7 @@ pub(crate) fn hubs(facts: &Facts, name_of: impl Fn(u32) -> String) -> Finding {
     Finding::warning(
         NAME,
         format!(
-            "domain {} has another hub at {}; clients take the first that lives",
+            "domain {} has another hub at {}; clients use the first one that runs",
             facts.name,
             others.join(", ")
         ),
@@ -323,7 +324,7 @@ pub(super) mod tests {
             place: Place { path: root.clone(), mode, writable: mode & 0o200 != 0 },
             ..facts()
         };
-        says(&domain(&facts()), State::Ok, &["not there yet"]);
+        says(&domain(&facts()), State::Ok, &["does not exist yet"]);
         says(&domain(&there(0o700)), State::Ok, &["free", "0700"]);
         says(&domain(&there(0o500)), State::Failed, &["0500", "chmod 700"]);
         says(&domain(&Facts { hub: Ok(Some(41)), ..facts() }), State::Ok, &["process 41"]);

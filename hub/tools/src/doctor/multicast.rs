@@ -10,7 +10,7 @@ const NAME: &str = "multicast";
 pub(crate) fn multicast(system: &System, interface: Option<&str>) -> Finding {
     match interface {
         Some(name) => named(system, name),
-        None => Finding::skipped(NAME, "no gateway.interface is named, so that nothing goes to groups"),
+        None => Finding::skipped(NAME, "no gateway.interface is named, so nothing is sent to groups"),
     }
 }
 

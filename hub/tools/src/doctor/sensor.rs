@@ -28,7 +28,7 @@ pub(crate) fn as_the_hub_says(link: Option<(&str, &Status)>, why_unknown: &str) 
     match link {
         None => vec![Finding::skipped("sensor", why_unknown)],
         Some((name, status)) => {
-            let marks = marks(status, "after the hub's end: ");
+            let marks = marks(status, "stop the hub first: ");
             std::iter::once(link_of_the_hub(name, status)).chain(marks).collect()
         }
     }
@@ -75,7 +75,8 @@ fn answer(report: &Report) -> Finding {
     const NAME: &str = "sensor";
     let kind = report.kind().map(|kind| String::from_utf8_lossy(kind).into_owned());
     let rate = report.baud.map_or(0, |baud| baud.rate());
-    let text = format!("{} at {rate} Bd", kind.as_deref().unwrap_or("a sensor that does not tell its type"));
+    let text =
+        format!("{} at {rate} Bd", kind.as_deref().unwrap_or("a sensor that does not report its type"));
     Finding::ok(NAME, text)
 }
 
@@ -83,7 +84,7 @@ fn answer(report: &Report) -> Finding {
 fn settings(port: &str, report: &Report, link: Option<&Link>) -> Vec<Finding> {
     const NAME: &str = "settings";
     let Some(status) = report.status() else {
-        return vec![Finding::warning(NAME, "it does not tell its settings", "power it off and on again")];
+        return vec![Finding::warning(NAME, "it does not report its settings", "power it off and on again")];
     };
     let text = format!(
         "{}, {}, measuring mode {:02x}h",
@@ -123,17 +124,17 @@ fn power_on(port: &str, report: &Report) -> Finding {
     let status = report.status();
     let (mut whats, mut remedies) = (Vec::new(), Vec::new());
     if status.is_some_and(|status| status.has_permanent_baud()) {
-        whats.push("it comes up at another rate than 9600 Bd, as somebody has set it");
+        whats.push("it starts at another rate than 9600 Bd, which an earlier owner has set");
         remedies.push(format!(
-            "the hub finds it all the same, other programs may not: scanhub configure {port} power_on_baud=9600"
+            "the hub finds it anyway, other programs may not: scanhub configure {port} power_on_baud=9600"
         ));
     }
     if status.is_some_and(|status| status.operating_mode() == INSTALLATION) {
-        whats.push("somebody left it in installation mode, in which its field outputs are blocked");
+        whats.push("an earlier owner left it in installation mode, in which its field outputs are blocked");
         remedies.push("scanhub run leaves it by itself; or power it off and on again".to_owned());
     }
     if whats.is_empty() {
-        return Finding::ok(NAME, "comes up at 9600 Bd");
+        return Finding::ok(NAME, "starts at 9600 Bd");
     }
     Finding::warning(NAME, whats.join("; "), remedies.join("; "))
 }
@@ -161,8 +162,8 @@ fn health(report: &Report) -> Finding {
         complaints.insert(0, format!("its window is dirty{percent}"));
     }
     if status.is_some_and(|status| status.is_defective()) {
-        complaints.insert(0, "it calls itself defective".to_owned());
-        return Finding::failed(NAME, complaints.join("; "), "a repair: no setting changes that");
+        complaints.insert(0, "it reports that it is defective".to_owned());
+        return Finding::failed(NAME, complaints.join("; "), "it needs a repair: no setting changes that");
     }
     let past = match faults.iter().filter(|fault| fault.is_past()).count() {
         0 => String::new(),
@@ -171,7 +172,7 @@ fn health(report: &Report) -> Finding {
     if complaints.is_empty() {
         return Finding::ok(NAME, format!("no complaint{past}"));
     }
-    let look = "clean its window, look at what is before it";
+    let look = "clean its window, check what is in front of it";
     if worst >= Some(Severity::Error) {
         let remedy = format!("{look}, power it off and on again; if it stays, a repair{past}");
         return Finding::failed(NAME, complaints.join("; "), remedy);
@@ -347,7 +348,7 @@ mod tests {
         status.set_port("/dev/ttyUSB0");
         let [_, marks] = &told(&status)[..] else { panic!("of marks nothing") };
         assert_eq!(marks.state, Verdict::Warning);
-        assert_eq!(marks.remedy, "after the hub's end: scanhub configure /dev/ttyUSB0 mode=0x01");
+        assert_eq!(marks.remedy, "stop the hub first: scanhub configure /dev/ttyUSB0 mode=0x01");
         status.set_last_error("the window is dirty");
         let dirty = &told(&status)[0];
         assert!(dirty.state == Verdict::Warning && dirty.finding.contains("window"), "{dirty}");

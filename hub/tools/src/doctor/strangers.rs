@@ -20,7 +20,7 @@ pub(crate) fn strangers(found: &[Segment], name_of: impl Fn(u32) -> String) -> F
     let more = if found.len() > MOST { format!(" and {} more", found.len() - MOST) } else { String::new() };
     Finding::warning(
         NAME,
-        format!("{}{more}: never opened, and may keep hub and clients from making theirs", told.join(", ")),
+        format!("{}{more}: never opened, and may keep hub and clients from creating theirs", told.join(", ")),
         format!("let their owner or an administrator remove them: sudo rm {}", paths[..told.len()].join(" ")),
     )
 }

@@ -32,11 +32,11 @@ pub(crate) fn version(system: &System, hub: Option<u32>) -> Finding {
 }
 
 fn judge(own: String, hub: Option<(u32, Option<Running>)>) -> Finding {
-    let restart = "end the hub and start it anew: sudo systemctl restart scanhub, if it is the service";
+    let restart = "restart the hub: sudo systemctl restart scanhub, if it is the service";
     match hub {
         None => Finding::ok(NAME, own),
         Some((_, None)) => {
-            Finding::ok(NAME, format!("{own}; which program the hub runs this user may not see"))
+            Finding::ok(NAME, format!("{own}; this user may not see which program the hub runs"))
         }
         Some((pid, Some(Running { build: Build::Other(Some(version)), .. }))) if version != VERSION => {
             let text = format!("{own}; the hub, process {pid}, is scanhub {version}: they refuse each other");
@@ -47,7 +47,7 @@ fn judge(own: String, hub: Option<(u32, Option<Running>)>) -> Finding {
             Finding::warning(NAME, text, restart)
         }
         Some((_, Some(Running { is_gone: true, .. }))) => {
-            Finding::ok(NAME, format!("{own}; the hub runs the same, whose file is gone"))
+            Finding::ok(NAME, format!("{own}; the hub runs the same program, whose file is gone"))
         }
         Some((_, Some(Running { build: Build::Same, .. }))) => {
             Finding::ok(NAME, format!("{own}; the hub runs the same program"))

@@ -113,7 +113,7 @@ impl fmt::Display for Description {
         row("type", kind.map(|kind| format!("{kind}, number {}", number.unwrap_or("not told"))))?;
         row("firmware", self.firmware.clone())?;
         row("rate", self.baud.map(|baud| format!("{baud} Bd")))?;
-        let power_on = |permanent| if permanent { "as it was set, not 9600 Bd" } else { "9600 Bd" };
+        let power_on = |permanent| if permanent { "as set in its EEPROM, not 9600 Bd" } else { "9600 Bd" };
         row("after power-on", self.permanent_rate.map(|permanent| power_on(permanent).to_owned()))?;
         row("address", self.address.map(|address| address.to_string()))?;
         row(
@@ -125,7 +125,7 @@ impl fmt::Display for Description {
         let view = self.angle_deg.zip(self.step_deg);
         row("view", view.map(|(angle, step)| format!("{angle} degrees in steps of {step}")))?;
         row("availability", self.availability.map(|byte| availability_words(byte).to_owned()))?;
-        let told = if self.defective == Some(true) { "calls itself defective; " } else { "" };
+        let told = if self.defective == Some(true) { "reports that it is defective; " } else { "" };
         let dirty = self.polluted == Some(true);
         let condition = |condition: &String| {
             let unsaid = if dirty && !condition.contains("polluted") { ", window polluted" } else { "" };
@@ -157,7 +157,7 @@ pub(crate) fn measuring(mode: Mode) -> String {
         (0x02, _) => "fields A, B and C",
         (0x04, _) => "fields A and B",
         (0x06, _) => "field A",
-        (0x0F, _) => "nothing beside it",
+        (0x0F, _) => "no other bits",
         (0x3F, _) => return "energy instead of ranges".to_owned(),
         (_, 3) => "8 levels of reflectors",
         (_, 2) => "4 levels of reflectors",

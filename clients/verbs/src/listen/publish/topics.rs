@@ -187,7 +187,7 @@ impl RemoteTopics {
         let Some((mut status, mut header)) = self.last else { return };
         status.state = State::Silent as u8;
         status.rate_mhz = 0;
-        status.set_last_error("nothing comes over the network");
+        status.set_last_error("nothing arrives over the network");
         stamp(&mut header);
         if self.has(Topic::Status) {
             self.tell(status, &header);

@@ -112,7 +112,7 @@ impl<'a> Published<'a> {
         let Published { unnamed, unannounced, late, capacity, shortage, loan_failed, .. } = self;
         write!(line, "published: {}; left out: {unnamed} unnamed, ", self.sensors.join(", "))?;
         write!(line, "{unannounced} unannounced, {late} late, {capacity} beyond capacity, ")?;
-        write!(line, "{shortage} for want of room, {loan_failed} without memory")
+        write!(line, "{shortage} for lack of room, {loan_failed} without memory")
     }
 }
 

@@ -1,9 +1,9 @@
 //! Why datagrams are refused: one list for all receivers and all output.
 
 /// Why a datagram is refused, in the order of the checks: the first that fails names the reason. [`super::Datagram::read`] knows
-/// those up to the checksum; the others are an [`super::Account`]'s.
+/// those up to the checksum; the others are those of [`super::StreamStats`].
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
-pub enum Refusal {
+pub enum DatagramError {
     /// Fewer bytes than a header.
     Short,
     /// It does not begin with `SHUB`.
@@ -35,42 +35,42 @@ pub enum Refusal {
     Payload,
 }
 
-impl Refusal {
+impl DatagramError {
     /// All reasons, in the order of the checks.
-    pub const ALL: [Refusal; 14] = [
-        Refusal::Short,
-        Refusal::Magic,
-        Refusal::Version,
-        Refusal::Header,
-        Refusal::Length,
-        Refusal::Crc,
-        Refusal::Unauthenticated,
-        Refusal::Mac,
-        Refusal::Epoch,
-        Refusal::Twin,
-        Refusal::Stale,
-        Refusal::Capacity,
-        Refusal::Skipped,
-        Refusal::Payload,
+    pub const ALL: [DatagramError; 14] = [
+        DatagramError::Short,
+        DatagramError::Magic,
+        DatagramError::Version,
+        DatagramError::Header,
+        DatagramError::Length,
+        DatagramError::Crc,
+        DatagramError::Unauthenticated,
+        DatagramError::Mac,
+        DatagramError::Epoch,
+        DatagramError::Twin,
+        DatagramError::Stale,
+        DatagramError::Capacity,
+        DatagramError::Skipped,
+        DatagramError::Payload,
     ];
 
     /// The reason's name in all output.
     pub fn name(self) -> &'static str {
         match self {
-            Refusal::Short => "short",
-            Refusal::Magic => "magic",
-            Refusal::Version => "version",
-            Refusal::Header => "header",
-            Refusal::Length => "length",
-            Refusal::Crc => "crc",
-            Refusal::Unauthenticated => "unauthenticated",
-            Refusal::Mac => "mac",
-            Refusal::Epoch => "epoch",
-            Refusal::Twin => "twin",
-            Refusal::Stale => "stale",
-            Refusal::Capacity => "capacity",
-            Refusal::Skipped => "skipped",
-            Refusal::Payload => "payload",
+            DatagramError::Short => "short",
+            DatagramError::Magic => "magic",
+            DatagramError::Version => "version",
+            DatagramError::Header => "header",
+            DatagramError::Length => "length",
+            DatagramError::Crc => "crc",
+            DatagramError::Unauthenticated => "unauthenticated",
+            DatagramError::Mac => "mac",
+            DatagramError::Epoch => "epoch",
+            DatagramError::Twin => "twin",
+            DatagramError::Stale => "stale",
+            DatagramError::Capacity => "capacity",
+            DatagramError::Skipped => "skipped",
+            DatagramError::Payload => "payload",
         }
     }
 }

@@ -9,9 +9,9 @@ use schema::datagram::LIVES;
 
 /// The gateways of which something was refused as of a life that is over.
 #[derive(Default)]
-pub(super) struct Twins(Vec<Twin>);
+pub(super) struct DuplicateGateways(Vec<Duplicate>);
 
-struct Twin {
+struct Duplicate {
     hub: u64,
     since: Instant,
     /// Refused datagrams behind one that was taken.
@@ -27,36 +27,36 @@ const SPAN: Duration = Duration::from_secs(3);
 /// Turns are counted anew after so long: each start of a gateway may give some.
 const WINDOW: Duration = Duration::from_secs(30);
 
-impl Twins {
+impl DuplicateGateways {
     /// A datagram of `hub` was taken.
     pub(super) fn taken(&mut self, hub: u64) {
-        if let Some(twin) = self.of(hub) {
-            twin.is_taken = true;
+        if let Some(duplicate) = self.of(hub) {
+            duplicate.is_taken = true;
         }
     }
 
     /// A datagram of `hub` was refused as of a life that is over; whether it is known now that there are two of it, which
     /// is said once.
     pub(super) fn refused(&mut self, hub: u64, now: Instant) -> bool {
-        let Some(twin) = self.of(hub) else {
+        let Some(duplicate) = self.of(hub) else {
             // Whoever can send can invent hubs: the oldest makes room.
             if self.0.len() == LIVES {
                 self.0.remove(0);
             }
-            self.0.push(Twin { hub, since: now, turns: 0, is_taken: false, is_told: false });
+            self.0.push(Duplicate { hub, since: now, turns: 0, is_taken: false, is_told: false });
             return false;
         };
-        if now - twin.since >= WINDOW {
-            (twin.since, twin.turns) = (now, 0);
+        if now - duplicate.since >= WINDOW {
+            (duplicate.since, duplicate.turns) = (now, 0);
         }
-        twin.turns += u32::from(std::mem::take(&mut twin.is_taken));
-        let is_new = twin.turns >= TURNS && now - twin.since >= SPAN && !twin.is_told;
-        twin.is_told |= is_new;
+        duplicate.turns += u32::from(std::mem::take(&mut duplicate.is_taken));
+        let is_new = duplicate.turns >= TURNS && now - duplicate.since >= SPAN && !duplicate.is_told;
+        duplicate.is_told |= is_new;
         is_new
     }
 
-    fn of(&mut self, hub: u64) -> Option<&mut Twin> {
-        self.0.iter_mut().find(|twin| twin.hub == hub)
+    fn of(&mut self, hub: u64) -> Option<&mut Duplicate> {
+        self.0.iter_mut().find(|duplicate| duplicate.hub == hub)
     }
 }
 
@@ -75,31 +75,31 @@ mod tests {
 
     /// Each datagram of hub 7 that is taken is followed by one that is refused, `every` so long, `count` times; when that
     /// was told.
-    fn told(twins: &mut Twins, begin: Instant, every: Duration, count: u32) -> Vec<u32> {
+    fn told(duplicates: &mut DuplicateGateways, begin: Instant, every: Duration, count: u32) -> Vec<u32> {
         let turn = |n: &u32| {
-            twins.taken(7);
-            twins.taken(8);
-            twins.refused(7, begin + every * *n)
+            duplicates.taken(7);
+            duplicates.taken(8);
+            duplicates.refused(7, begin + every * *n)
         };
         (0..count).filter(turn).collect()
     }
 
     #[test]
     fn two_gateways_are_told_once() {
-        let (mut twins, begin) = (Twins::default(), Instant::now());
-        assert_eq!(told(&mut twins, begin, Duration::from_millis(100), 1000), [30]);
-        let mut seldom = Twins::default();
+        let (mut duplicates, begin) = (DuplicateGateways::default(), Instant::now());
+        assert_eq!(told(&mut duplicates, begin, Duration::from_millis(100), 1000), [30]);
+        let mut seldom = DuplicateGateways::default();
         assert_eq!(told(&mut seldom, begin, Duration::from_secs(1), 1000), [8]);
     }
 
     #[test]
     fn what_comes_late_of_a_life_that_is_over_is_not_another_gateway() {
-        let (mut twins, begin) = (Twins::default(), Instant::now());
-        assert!(told(&mut twins, begin, Duration::from_millis(1), 1000).is_empty(), "a start anew");
+        let (mut duplicates, begin) = (DuplicateGateways::default(), Instant::now());
+        assert!(told(&mut duplicates, begin, Duration::from_millis(1), 1000).is_empty(), "a start anew");
         let later = begin + Duration::from_secs(3600);
-        assert!(told(&mut twins, later, Duration::from_millis(1), 1000).is_empty(), "and another one");
+        assert!(told(&mut duplicates, later, Duration::from_millis(1), 1000).is_empty(), "and another one");
         // One that was sent back in time, and is alone.
-        let mut alone = Twins::default();
+        let mut alone = DuplicateGateways::default();
         assert!((0..1000).all(|n| !alone.refused(7, begin + Duration::from_millis(100) * n)));
     }
 }

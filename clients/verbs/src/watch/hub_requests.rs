@@ -10,7 +10,7 @@ use schema::{Background, Domain, Failure, Request, Verb};
 
 /// At most one order at a time.
 #[derive(Default)]
-pub(crate) struct Orders {
+pub(crate) struct HubRequests {
     running: Option<JoinHandle<Done>>,
     stop: Arc<AtomicBool>,
 }
@@ -23,7 +23,7 @@ pub(crate) struct Done {
     pub(crate) models: Vec<(String, Background)>,
 }
 
-impl Orders {
+impl HubRequests {
     /// Gives `verb` to the hub at `places` for each of `sensors`; not if it still works on the last one.
     pub(crate) fn give(&mut self, places: &[Domain], sensors: Vec<String>, verb: Verb) -> bool {
         if self.running.is_some() {
@@ -40,7 +40,7 @@ impl Orders {
     }
 }
 
-impl Drop for Orders {
+impl Drop for HubRequests {
     fn drop(&mut self) {
         self.stop.store(true, Ordering::Relaxed);
         // It holds a place in the domain, which is to be given back.
@@ -65,9 +65,9 @@ fn carry_out(places: &[Domain], sensors: &[String], verb: Verb, stop: &AtomicBoo
 
 fn outcome(verb: Verb) -> &'static str {
     match verb {
-        Verb::Reset => "is learned anew",
-        Verb::Freeze => "is held as it is",
-        Verb::Thaw => "is learned on",
+        Verb::Reset => "is learned again",
+        Verb::Freeze => "is frozen",
+        Verb::Thaw => "continues learning",
         other => other.name(),
     }
 }

@@ -8,7 +8,7 @@ use std::time::{Duration, Instant};
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
 
 /// Writes each piece at once or not at all.
-pub(crate) struct Spare<'a, W> {
+pub(crate) struct LossyWriter<'a, W> {
     to: &'a mut W,
     /// There is nothing left to send: then who reads is waited for, for a while.
     stop: &'a AtomicBool,
@@ -18,10 +18,10 @@ pub(crate) struct Spare<'a, W> {
 /// The most that a reader delays the end, over all lines: enough for one that reads at all.
 const PATIENCE: Duration = Duration::from_secs(1);
 
-impl<'a, W: Write + AsFd> Spare<'a, W> {
+impl<'a, W: Write + AsFd> LossyWriter<'a, W> {
     /// Pieces to `to`; not waited for before `stop` is set.
-    pub(crate) fn new(to: &'a mut W, stop: &'a AtomicBool) -> Spare<'a, W> {
-        Spare { to, stop, left: PATIENCE }
+    pub(crate) fn new(to: &'a mut W, stop: &'a AtomicBool) -> LossyWriter<'a, W> {
+        LossyWriter { to, stop, left: PATIENCE }
     }
 
     /// Whether a piece can be written without waiting: the system says so if a page is free in a pipe, which is more than
@@ -38,7 +38,7 @@ impl<'a, W: Write + AsFd> Spare<'a, W> {
     }
 }
 
-impl<W: Write + AsFd> Write for Spare<'_, W> {
+impl<W: Write + AsFd> Write for LossyWriter<'_, W> {
     fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
         if !self.has_room() {
             return Ok(bytes.len());
@@ -69,17 +69,17 @@ mod tests {
     fn what_finds_no_room_is_left_out_whole() {
         let (mut reader, mut writer) = io::pipe().unwrap();
         let stop = AtomicBool::new(false);
-        let mut spare = Spare::new(&mut writer, &stop);
+        let mut lossy = LossyWriter::new(&mut writer, &stop);
         let line = [b'x'; 1000];
         for _ in 0..1000 {
-            spare.write_all(&line).unwrap();
+            lossy.write_all(&line).unwrap();
         }
         // At the end it is waited for a while, once.
         stop.store(true, Ordering::Relaxed);
         for _ in 0..1000 {
-            spare.write_all(&line).unwrap();
+            lossy.write_all(&line).unwrap();
         }
-        assert_eq!(spare.left, Duration::ZERO);
+        assert_eq!(lossy.left, Duration::ZERO);
         drop(writer);
         let mut all = Vec::new();
         reader.read_to_end(&mut all).unwrap();
@@ -91,10 +91,10 @@ mod tests {
     fn a_log_on_a_full_disk_is_told_at_the_end() {
         let mut full = std::fs::File::options().write(true).open("/dev/full").unwrap();
         let stop = AtomicBool::new(false);
-        let mut spare = Spare::new(&mut full, &stop);
-        spare.write_all(b"x").unwrap();
+        let mut lossy = LossyWriter::new(&mut full, &stop);
+        lossy.write_all(b"x").unwrap();
         stop.store(true, Ordering::Relaxed);
-        assert_eq!(spare.write_all(b"x").unwrap_err().kind(), ErrorKind::StorageFull);
+        assert_eq!(lossy.write_all(b"x").unwrap_err().kind(), ErrorKind::StorageFull);
     }
 
     #[test]
@@ -102,7 +102,7 @@ mod tests {
         let (reader, mut writer) = io::pipe().unwrap();
         drop(reader);
         let stop = AtomicBool::new(false);
-        let error = Spare::new(&mut writer, &stop).write_all(b"x").unwrap_err();
+        let error = LossyWriter::new(&mut writer, &stop).write_all(b"x").unwrap_err();
         assert_eq!(error.kind(), ErrorKind::BrokenPipe);
     }
 }

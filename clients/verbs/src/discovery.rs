@@ -5,15 +5,15 @@ use std::time::{Duration, Instant};
 
 use schema::{Domain, Failure, ipc};
 
-use crate::errand::Errand;
+use crate::background_task::BackgroundTask;
 
 /// The calls of the sensors of a hub that came.
 #[derive(Default)]
-pub(crate) struct Roll {
+pub(crate) struct Discovery {
     /// When the hub came, and how often its sensors were called.
     hub: Option<(Instant, usize)>,
     /// The call that is under way, and how long after the hub it began.
-    call: Option<(Errand<Answer>, Duration)>,
+    call: Option<(BackgroundTask<Answer>, Duration)>,
 }
 
 type Answer = Result<Vec<String>, Failure>;
@@ -32,10 +32,10 @@ const CALLS: [Duration; 4] =
 /// So often an answer is looked for.
 const LOOK_EVERY: Duration = Duration::from_millis(5);
 
-impl Roll {
+impl Discovery {
     /// A hub came; answers about the one before are of no use.
     pub(crate) fn begin(&mut self, now: Instant) {
-        *self = Roll { hub: Some((now, 0)), call: None };
+        *self = Discovery { hub: Some((now, 0)), call: None };
     }
 
     /// The hub is gone: nobody waits for what it has.
@@ -52,8 +52,8 @@ impl Roll {
     ///
     /// [`Kind::Failed`](schema::Kind) if the domain cannot be read.
     pub(crate) fn call(&mut self, domain: &Domain, now: Instant) -> Result<Option<Called>, Failure> {
-        if let Some((errand, age)) = &self.call {
-            let Some(sensors) = errand.result() else { return Ok(None) };
+        if let Some((task, age)) = &self.call {
+            let Some(sensors) = task.result() else { return Ok(None) };
             let called = Called { sensors: sensors?, age: *age };
             self.call = None;
             return Ok(Some(called));
@@ -62,7 +62,7 @@ impl Roll {
         let age = now - *came;
         if CALLS.get(*calls).is_some_and(|after| age >= *after) {
             let domain = domain.clone();
-            self.call = Errand::begin(move || ipc::sensors(&domain)).map(|errand| (errand, age));
+            self.call = BackgroundTask::begin(move || ipc::sensors(&domain)).map(|task| (task, age));
             *calls += usize::from(self.call.is_some());
         }
         Ok(None)
@@ -80,12 +80,12 @@ mod tests {
 
     #[test]
     fn nobody_looks_for_an_answer_about_a_hub_that_is_gone() {
-        let mut roll = Roll::default();
-        roll.begin(Instant::now());
-        assert_eq!(roll.left(), None);
-        roll.call = Errand::begin(|| Ok(Vec::new())).map(|errand| (errand, Duration::ZERO));
-        assert_eq!(roll.left(), Some(LOOK_EVERY));
-        roll.end();
-        assert!(roll.left().is_none() && roll.has_begun());
+        let mut discovery = Discovery::default();
+        discovery.begin(Instant::now());
+        assert_eq!(discovery.left(), None);
+        discovery.call = BackgroundTask::begin(|| Ok(Vec::new())).map(|task| (task, Duration::ZERO));
+        assert_eq!(discovery.left(), Some(LOOK_EVERY));
+        discovery.end();
+        assert!(discovery.left().is_none() && discovery.has_begun());
     }
 }

@@ -5,7 +5,7 @@ use super::lives::{Found, Gone, Lives};
 use super::numbers::{Fresh, Key, Row};
 use super::standing::Arrival;
 use super::voices::Whose;
-use super::{Announce, Datagram, Refusal};
+use super::{Announce, Datagram, DatagramError};
 use crate::Topic;
 
 /// The most sensors and topics of all lives that are told apart.
@@ -18,7 +18,7 @@ pub const ROWS: usize = 1024;
 /// was before it, and what comes late from before the beginning moves the beginning there.
 ///
 /// A greater epoch of a gateway retires the one before, whose rows stay. Where there is no room, the life that has been
-/// retired longest is given up, and its rows are added to [`given_up`](Account::given_up): so rows and that together
+/// retired longest is given up, and its rows are added to [`given_up`](StreamStats::given_up): so rows and that together
 /// always are everything that was taken. If none is retired, one that goes on makes room: what never delivered a sample or
 /// is silent for 3 s, whatever was not heard for longest first; for a sample also what delivered for less than a second.
 /// One that is known to deliver is kept for a minute of silence longer, and is never put out while it delivers; what has no
@@ -27,16 +27,16 @@ pub const ROWS: usize = 1024;
 /// Two gateways with one number and one epoch are told apart by their senders and by what they announce: only one of them
 /// is taken, the first that was heard. After 3 s of its silence another sender is taken, as a new life; but never once two
 /// are known to send.
-pub struct Account {
+pub struct StreamStats {
     /// Bit n: topic number n is listened to.
-    followed: u8,
+    followed: u64,
     lives: Lives,
     rows: [Row; ROWS],
     /// Positions in `rows`: of those in use, sorted by key, then of the others.
     order: [u16; ROWS],
     row_count: usize,
     given_up: GivenUp,
-    refused: [u64; Refusal::ALL.len()],
+    refused: [u64; DatagramError::ALL.len()],
 }
 
 /// The sums of the rows that an account has given up.
@@ -56,18 +56,18 @@ pub struct GivenUp {
     pub reordered: u64,
 }
 
-impl Account {
+impl StreamStats {
     /// Nothing received yet. Announcements are believed for `topics` only: those whose groups were joined. Of the
     /// others they would tell as lost what nobody wanted.
-    pub fn new(topics: &[Topic]) -> Account {
-        Account {
+    pub fn new(topics: &[Topic]) -> StreamStats {
+        StreamStats {
             followed: topics.iter().fold(0, |bits, topic| bits | 1 << topic.number()),
             lives: Lives::new(),
             rows: [Row::EMPTY; ROWS],
             order: core::array::from_fn(|at| at as u16),
             row_count: 0,
             given_up: GivenUp::default(),
-            refused: [0; Refusal::ALL.len()],
+            refused: [0; DatagramError::ALL.len()],
         }
     }
 
@@ -79,7 +79,7 @@ impl Account {
         bytes: &'a [u8],
         from: u64,
         now_ns: u64,
-    ) -> Result<(Datagram<'a>, Fresh), Refusal> {
+    ) -> Result<(Datagram<'a>, Fresh), DatagramError> {
         let read = Datagram::read(bytes);
         let result = read.and_then(|datagram| Ok((datagram, self.take(&datagram, from, now_ns)?)));
         if let Err(refusal) = result {
@@ -89,7 +89,7 @@ impl Account {
     }
 
     /// How many datagrams were refused for this reason.
-    pub fn refused(&self, refusal: Refusal) -> u64 {
+    pub fn refused(&self, refusal: DatagramError) -> u64 {
         self.refused[refusal as usize]
     }
 
@@ -105,7 +105,7 @@ impl Account {
     }
 
     /// Two gateways are known to send under this number and epoch. Of one of them everything is refused as
-    /// [`Refusal::Twin`].
+    /// [`DatagramError::Twin`].
     pub fn is_shared(&self, hub: u64, epoch: u32) -> bool {
         match self.lives.find((hub, epoch)) {
             Found::At(slot) => self.lives.record(slot).voices.is_shared(),
@@ -121,11 +121,11 @@ impl Account {
             .filter(|row| row.received + row.lost() > 0)
     }
 
-    fn take(&mut self, datagram: &Datagram<'_>, from: u64, now_ns: u64) -> Result<Fresh, Refusal> {
+    fn take(&mut self, datagram: &Datagram<'_>, from: u64, now_ns: u64) -> Result<Fresh, DatagramError> {
         let head = datagram.head;
         let life = (head.hub, head.epoch);
         let known = match self.lives.find(life) {
-            Found::Over => return Err(Refusal::Epoch),
+            Found::Over => return Err(DatagramError::Epoch),
             Found::At(slot) => Some(slot),
             Found::New => None,
         };
@@ -138,7 +138,7 @@ impl Account {
             if let Some(slot) = known.filter(|_| datagram.check_payload().is_ok()) {
                 self.lives.record_mut(slot).voices.note(from, boot, now_ns);
             }
-            return Err(Refusal::Twin);
+            return Err(DatagramError::Twin);
         }
         let known = known.filter(|_| whose == Whose::Own);
         let arrival = Arrival { delivers: !is_announce, now_ns };
@@ -147,8 +147,8 @@ impl Account {
         match self.find(key) {
             // All of the one that is silent makes room.
             _ if whose == Whose::Next => datagram.check_payload()?,
-            Some(at) if self.rows[at].is_stale(head.sequence) => return Err(Refusal::Stale),
-            None if is_full && !self.lives.can_give_up(life, arrival) => return Err(Refusal::Capacity),
+            Some(at) if self.rows[at].is_stale(head.sequence) => return Err(DatagramError::Stale),
+            None if is_full && !self.lives.can_give_up(life, arrival) => return Err(DatagramError::Capacity),
             _ => datagram.check_payload()?,
         }
         if whose == Whose::Next {
@@ -175,7 +175,7 @@ impl Account {
     /// What has no room is not noted: it begins with its first datagram, if there is room then.
     fn note(&mut self, (hub, epoch, sensor, _): Key, announce: &Announce, arrival: Arrival) {
         let followed = self.followed;
-        let is_followed = |number: u8| number < 8 && followed >> number & 1 == 1;
+        let is_followed = |number: u8| number < 64 && followed >> number & 1 == 1;
         for announced in announce.topics().iter().filter(|announced| is_followed(announced.topic)) {
             if let Some(row) = self.row((hub, epoch, sensor, announced.topic), announced.next, arrival) {
                 row.announce(announced.next);

@@ -25,21 +25,21 @@ fn announce(hub: u64, next: u32) -> Vec<u8> {
     Head { topic: 0, ..head(hub, 1, 0) }.seal(&mut buffer, len).unwrap().to_vec()
 }
 
-fn fresh(account: &mut Account, bytes: &[u8]) -> Result<Fresh, Refusal> {
+fn fresh(account: &mut StreamStats, bytes: &[u8]) -> Result<Fresh, DatagramError> {
     at(account, bytes, 0)
 }
 
-fn at(account: &mut Account, bytes: &[u8], now_ms: u64) -> Result<Fresh, Refusal> {
+fn at(account: &mut StreamStats, bytes: &[u8], now_ms: u64) -> Result<Fresh, DatagramError> {
     account.receive(bytes, 1, now_ms * 1_000_000).map(|(_, fresh)| fresh)
 }
 
-fn knows(account: &Account, hub: u64, epoch: u32) -> bool {
+fn knows(account: &StreamStats, hub: u64, epoch: u32) -> bool {
     account.since_ns(hub, epoch).is_some()
 }
 
 /// 64 gateways that are known to deliver.
-fn full() -> Account {
-    let mut account = Account::new(&Topic::ALL);
+fn full() -> StreamStats {
+    let mut account = StreamStats::new(&Topic::ALL);
     for (number, now_ms) in [(0, 0), (1, 1000)] {
         for hub in 0..64 {
             assert_eq!(at(&mut account, &zones(head(hub, 1, number)), now_ms), Ok(Fresh::New));
@@ -50,46 +50,46 @@ fn full() -> Account {
 
 #[test]
 fn a_greater_epoch_retires_the_older_one_of_its_hub() {
-    let mut account = Account::new(&Topic::ALL);
+    let mut account = StreamStats::new(&Topic::ALL);
     for (hub, epoch, expected) in [
         (1, 7, Ok(Fresh::New)),
         (2, 3, Ok(Fresh::New)),
-        (1, 6, Err(Refusal::Epoch)),
+        (1, 6, Err(DatagramError::Epoch)),
         (1, 8, Ok(Fresh::New)),
-        (1, 7, Err(Refusal::Epoch)),
+        (1, 7, Err(DatagramError::Epoch)),
         (2, 3, Ok(Fresh::Duplicate)),
     ] {
         assert_eq!(fresh(&mut account, &zones(head(hub, epoch, 0))), expected, "{hub} {epoch}");
     }
     let rows: Vec<_> = account.rows().map(|row| (row.hub, row.epoch, row.received)).collect();
     assert_eq!(rows, [(1, 7, 1), (1, 8, 1), (2, 3, 1)]);
-    assert_eq!(account.refused(Refusal::Epoch), 2);
+    assert_eq!(account.refused(DatagramError::Epoch), 2);
 }
 
 #[test]
 fn what_is_refused_changes_nothing() {
-    let mut account = Account::new(&Topic::ALL);
+    let mut account = StreamStats::new(&Topic::ALL);
     let damaged = |head: Head| {
         let mut buffer = [0; 60];
         head.seal(&mut buffer, 3).unwrap().to_vec()
     };
     let refused = [
-        (Refusal::Payload, damaged(head(1, 2, 0))),
-        (Refusal::Payload, zones(Head { revision: 0, ..head(1, 2, 0) })),
-        (Refusal::Skipped, zones(Head { topic: 8, revision: 0, ..head(1, 2, 0) })),
+        (DatagramError::Payload, damaged(head(1, 2, 0))),
+        (DatagramError::Payload, zones(Head { revision: 0, ..head(1, 2, 0) })),
+        (DatagramError::Skipped, zones(Head { topic: 8, revision: 0, ..head(1, 2, 0) })),
     ];
     for (refusal, bytes) in &refused {
         assert_eq!(fresh(&mut account, bytes), Err(*refusal));
     }
     assert_eq!(account.rows().count(), 0);
     assert_eq!(fresh(&mut account, &zones(head(1, 1, 0))), Ok(Fresh::New), "epoch 2 was not believed");
-    assert_eq!(account.refused(Refusal::Payload), 2);
+    assert_eq!(account.refused(DatagramError::Payload), 2);
 }
 
 #[test]
 fn memory_is_bounded() {
     let mut account = full();
-    assert_eq!(at(&mut account, &zones(head(64, 1, 0)), 1000), Err(Refusal::Capacity));
+    assert_eq!(at(&mut account, &zones(head(64, 1, 0)), 1000), Err(DatagramError::Capacity));
     assert_eq!(at(&mut account, &zones(head(1, 1, 2)), 1000), Ok(Fresh::New), "all go on");
     for sensor in 1..=240 {
         for hub in 0..4 {
@@ -98,8 +98,8 @@ fn memory_is_bounded() {
         }
     }
     let more = zones(Head { sensor: 241, ..head(1, 1, 0) });
-    assert_eq!(at(&mut account, &more, 3999), Err(Refusal::Capacity));
-    assert_eq!((account.rows().count(), account.refused(Refusal::Capacity)), (ROWS, 2));
+    assert_eq!(at(&mut account, &more, 3999), Err(DatagramError::Capacity));
+    assert_eq!((account.rows().count(), account.refused(DatagramError::Capacity)), (ROWS, 2));
     assert_eq!(account.given_up(), GivenUp::default());
     // Those that were silent for three seconds make room; what was received of them stays in the sum.
     assert_eq!(at(&mut account, &more, 4000), Ok(Fresh::New));
@@ -112,7 +112,7 @@ fn memory_is_bounded() {
 
 #[test]
 fn a_true_gateway_is_heard_at_once_after_any_number_of_invented_ones() {
-    let mut account = Account::new(&Topic::ALL);
+    let mut account = StreamStats::new(&Topic::ALL);
     for number in 0..2 {
         assert_eq!(at(&mut account, &zones(head(9999, 1, number)), 1000 * u64::from(number)), Ok(Fresh::New));
     }
@@ -134,7 +134,7 @@ fn a_true_gateway_is_heard_at_once_after_any_number_of_invented_ones() {
 
 #[test]
 fn two_gateways_with_one_number_and_one_epoch_are_never_mixed() {
-    let mut account = Account::new(&Topic::ALL);
+    let mut account = StreamStats::new(&Topic::ALL);
     let mut hear = |from: u64, bytes: &[u8], now_ms: u64| {
         account.receive(bytes, from, now_ms * 1_000_000).map(|(_, fresh)| fresh)
     };
@@ -147,22 +147,22 @@ fn two_gateways_with_one_number_and_one_epoch_are_never_mixed() {
         let now_ms = 100 * u64::from(n);
         if n % 10 == 0 {
             assert_eq!(hear(1, &announce(7, n / 10), now_ms), Ok(Fresh::New));
-            assert_eq!(hear(2, &announce(8, n / 10), now_ms), Err(Refusal::Twin));
+            assert_eq!(hear(2, &announce(8, n / 10), now_ms), Err(DatagramError::Twin));
         }
         assert_eq!(hear(1, &zones(head(5, 1, n)), now_ms), Ok(Fresh::New));
-        assert_eq!(hear(2, &zones(head(5, 1, 500 + n)), now_ms + 50), Err(Refusal::Twin));
+        assert_eq!(hear(2, &zones(head(5, 1, 500 + n)), now_ms + 50), Err(DatagramError::Twin));
     }
     // The other one goes on alone: it never stands in for the first one.
-    assert_eq!(hear(2, &zones(head(5, 1, 100)), 5899), Err(Refusal::Twin));
-    assert_eq!(hear(2, &zones(head(5, 1, 101)), 60_000), Err(Refusal::Twin));
+    assert_eq!(hear(2, &zones(head(5, 1, 100)), 5899), Err(DatagramError::Twin));
+    assert_eq!(hear(2, &zones(head(5, 1, 101)), 60_000), Err(DatagramError::Twin));
     assert_eq!(hear(1, &zones(head(5, 1, 30)), 60_001), Ok(Fresh::New));
     assert!(account.is_shared(5, 1));
-    assert_eq!(account.refused(Refusal::Twin), 35);
+    assert_eq!(account.refused(DatagramError::Twin), 35);
 }
 
 #[test]
 fn whoever_follows_a_silent_gateway_begins_anew() {
-    let mut account = Account::new(&Topic::ALL);
+    let mut account = StreamStats::new(&Topic::ALL);
     let mut hear = |from: u64, bytes: &[u8], now_ms: u64| {
         account.receive(bytes, from, now_ms * 1_000_000).map(|(_, fresh)| fresh)
     };
@@ -170,31 +170,35 @@ fn whoever_follows_a_silent_gateway_begins_anew() {
         assert_eq!(hear(1, &zones(head(5, 1, 200 + n)), 100 * u64::from(n)), Ok(Fresh::New));
     }
     // Its numbers begin anew, and none of the first one's count as lost.
-    assert_eq!(hear(2, &zones(head(5, 1, 100)), 5899), Err(Refusal::Twin));
+    assert_eq!(hear(2, &zones(head(5, 1, 100)), 5899), Err(DatagramError::Twin));
     assert_eq!(hear(2, &zones(head(5, 1, 101)), 5900), Ok(Fresh::New));
     assert!(!account.is_shared(5, 1), "a new life");
     let rows: Vec<_> = account.rows().map(|row| (row.received, row.lost())).collect();
     assert_eq!(rows, [(1, 0)]);
     let given_up = account.given_up();
     assert_eq!((given_up.lives, given_up.displaced, given_up.received, given_up.lost), (1, 0, 30, 0));
-    assert_eq!(account.refused(Refusal::Twin), 1);
+    assert_eq!(account.refused(DatagramError::Twin), 1);
 }
 
 #[test]
 fn what_is_retired_makes_room_and_stays_in_the_sum() {
     let mut account = full();
-    let fresh = |account: &mut Account, bytes: &[u8]| at(account, bytes, 1000);
+    let fresh = |account: &mut StreamStats, bytes: &[u8]| at(account, bytes, 1000);
     assert_eq!(fresh(&mut account, &zones(head(5, 1, 4))), Ok(Fresh::New));
     // A gateway that starts again is heard, though all places are taken.
     assert_eq!(fresh(&mut account, &zones(head(5, 2, 0))), Ok(Fresh::New));
     let mut given_up = GivenUp { lives: 1, received: 3, lost: 2, ..GivenUp::default() };
     assert_eq!((account.given_up(), account.rows().count()), (given_up, 64));
-    assert_eq!(fresh(&mut account, &zones(head(5, 1, 5))), Err(Refusal::Epoch), "given up is not forgotten");
+    assert_eq!(
+        fresh(&mut account, &zones(head(5, 1, 5))),
+        Err(DatagramError::Epoch),
+        "given up is not forgotten"
+    );
     assert!(knows(&account, 5, 2) && !knows(&account, 5, 1));
     // A damaged one gives up nothing.
     let mut buffer = [0; 60];
     let damaged = head(5, 3, 0).seal(&mut buffer, 3).unwrap();
-    assert_eq!(fresh(&mut account, damaged), Err(Refusal::Payload));
+    assert_eq!(fresh(&mut account, damaged), Err(DatagramError::Payload));
     assert!(knows(&account, 5, 2) && !knows(&account, 5, 3));
     // As many sensors as there is room for, in a life that is retired then: one row more, and it goes.
     for sensor in 1..=240 {
@@ -212,7 +216,7 @@ fn what_is_retired_makes_room_and_stays_in_the_sum() {
 
 #[test]
 fn announcements_count_for_topics_that_are_listened_to() {
-    let mut account = Account::new(&[Topic::Zones]);
+    let mut account = StreamStats::new(&[Topic::Zones]);
     assert_eq!(fresh(&mut account, &announce(1, 10)), Ok(Fresh::New));
     assert_eq!(account.rows().map(|row| row.topic).collect::<Vec<_>>(), [0], "nothing sent, nothing to tell");
     assert_eq!(fresh(&mut account, &announce(1, 12)), Ok(Fresh::Duplicate));

@@ -4,7 +4,7 @@ use std::collections::{BTreeMap, BTreeSet};
 
 use fastrand::Rng;
 use schema::datagram::{
-    Account, Announce, Announced, Fresh, GivenUp, HEAD, Head, LIVES, Packed, ROWS, Refusal, WINDOW,
+    Announce, Announced, DatagramError, Fresh, GivenUp, HEAD, Head, LIVES, Packed, ROWS, StreamStats, WINDOW,
 };
 use schema::{Background, Marks, Topic, Zones};
 
@@ -68,7 +68,7 @@ struct Model {
 }
 
 impl Model {
-    fn receive(&mut self, sent: &Sent, now_ms: u64) -> Result<Fresh, Refusal> {
+    fn receive(&mut self, sent: &Sent, now_ms: u64) -> Result<Fresh, DatagramError> {
         let result = self.take(sent, now_ms);
         if let Err(refusal) = result {
             *self.refused.entry(refusal.name()).or_default() += 1;
@@ -76,16 +76,16 @@ impl Model {
         result
     }
 
-    fn take(&mut self, sent: &Sent, now_ms: u64) -> Result<Fresh, Refusal> {
+    fn take(&mut self, sent: &Sent, now_ms: u64) -> Result<Fresh, DatagramError> {
         let (hub, epoch, sensor, topic) = sent.key;
         let delivers = topic != Announce::NUMBER;
         let before = self.living.get(&hub).copied();
         if before.is_some_and(|greatest| greatest > epoch) {
-            return Err(Refusal::Epoch);
+            return Err(DatagramError::Epoch);
         }
         let highest = self.rows.get(&sent.key).and_then(|row| row.came.last().copied());
         if highest.is_some_and(|highest| highest >= sent.number + WINDOW as u64) {
-            return Err(Refusal::Stale);
+            return Err(DatagramError::Stale);
         }
         let is_new = before != Some(epoch);
         let lives = self.living.len() + self.retired.len();
@@ -93,7 +93,7 @@ impl Model {
         let has_retired = !self.retired.is_empty() || before.is_some_and(|older| older < epoch);
         let can_give_up = has_retired || self.least(hub, delivers, now_ms).is_some();
         if !self.rows.contains_key(&sent.key) && is_full && !can_give_up {
-            return Err(Refusal::Capacity);
+            return Err(DatagramError::Capacity);
         }
         if is_new {
             self.retired.extend(before.map(|older| (hub, older)));
@@ -203,7 +203,7 @@ impl Numbers {
     }
 }
 
-fn figures(account: &Account) -> BTreeMap<Key, [u64; 4]> {
+fn figures(account: &StreamStats) -> BTreeMap<Key, [u64; 4]> {
     let rows = account.rows();
     rows.map(|row| {
         let key = (row.hub, row.epoch, row.sensor, row.topic);
@@ -293,7 +293,7 @@ fn it_says_what_a_model_says_that_keeps_everything() {
     let (mut refused, mut full, mut given_up, mut displaced) = (BTreeMap::new(), 0, 0, 0);
     for seed in 0..20 {
         let mut world = World::new(seed);
-        let (mut account, mut model) = (Account::new(&Topic::ALL), Model::default());
+        let (mut account, mut model) = (StreamStats::new(&Topic::ALL), Model::default());
         // All that deliver are busy, or hardly any is.
         let (mut ticks, tick_ms) = (0, [1, 40][seed as usize % 2]);
         for step in 0..16_000 {
@@ -317,7 +317,7 @@ fn it_says_what_a_model_says_that_keeps_everything() {
         given_up += model.given_up.lives;
         displaced += model.given_up.displaced;
         assert_eq!((figures(&account), account.given_up()), (model.figures(), model.given_up), "seed {seed}");
-        for refusal in Refusal::ALL {
+        for refusal in DatagramError::ALL {
             let count = model.refused.get(refusal.name()).copied().unwrap_or_default();
             assert_eq!(account.refused(refusal), count, "seed {seed}, {}", refusal.name());
             *refused.entry(refusal.name()).or_insert(0) += count;
@@ -326,7 +326,7 @@ fn it_says_what_a_model_says_that_keeps_everything() {
     // The network did what it was made for.
     assert!(full > 0 && given_up > 100, "{full} full, {given_up} lives given up");
     assert!(displaced > 100 && given_up > displaced, "{displaced} of them not over");
-    for refusal in [Refusal::Epoch, Refusal::Stale, Refusal::Capacity] {
+    for refusal in [DatagramError::Epoch, DatagramError::Stale, DatagramError::Capacity] {
         assert!(refused[refusal.name()] > 0, "nothing was ever {}", refusal.name());
     }
 }
@@ -356,7 +356,7 @@ fn it_is_the_log_of_a_relay() {
             }
         }
         arrivals.sort_by_key(|&(at, _)| at);
-        let mut account = Account::new(&Topic::ALL);
+        let mut account = StreamStats::new(&Topic::ALL);
         let (mut highest, mut below, mut came) = (0, 0, BTreeSet::new());
         account.receive(&announce(0, first).bytes, 1, 0).unwrap();
         for (_, sent) in &arrivals {

@@ -20,7 +20,7 @@ use socket2::{Domain, InterfaceIndexOrAddress, Protocol, SockRef, Socket, Type};
 use crate::interface::{Changes, Interface, interfaces, named};
 
 /// Hears groups.
-pub(super) struct Ear {
+pub(super) struct MulticastReceiver {
     socket: UdpSocket,
     groups: Vec<Ipv4Addr>,
     /// The one interface to hear on; none: all that can.
@@ -66,12 +66,16 @@ const BUFFER: usize = 4 << 20;
 /// The longest datagram that there can be.
 pub(super) const LONGEST: usize = 65_536;
 
-impl Ear {
+impl MulticastReceiver {
     /// Binds the port and joins the `groups` (last bytes) on the interface `only`, or wherever there is a link. If there
     /// is none yet, it is waited for.
     ///
     /// [`Kind::Configuration`] if there is no such interface, [`Kind::Failed`] if the port cannot be had.
-    pub(super) fn open(only: Option<&str>, groups: &[u8], now: Instant) -> Result<Ear, Failure> {
+    pub(super) fn open(
+        only: Option<&str>,
+        groups: &[u8],
+        now: Instant,
+    ) -> Result<MulticastReceiver, Failure> {
         if let Some(name) = only {
             let interface = named(name)?;
             if !interface.multicast {
@@ -83,10 +87,10 @@ impl Ear {
         let changes = Changes::watch()?;
         let socket = bind().map_err(|error| {
             let hint = "it is in use by a program that does not share it: `ss -lunp` names it";
-            Failure::new(Kind::Failed, format!("cannot hear on UDP port {PORT}: {error}"), hint)
+            Failure::new(Kind::Failed, format!("cannot listen on UDP port {PORT}: {error}"), hint)
         })?;
         let [a, b, c] = GROUPS;
-        let mut ear = Ear {
+        let mut receiver = MulticastReceiver {
             socket,
             groups: groups.iter().map(|&last| Ipv4Addr::new(a, b, c, last)).collect(),
             only: only.map(str::to_owned),
@@ -98,8 +102,8 @@ impl Ear {
             stamp: cmsg_space!(TimeSpec),
             empty_ns: clock::now_ns(),
         };
-        ear.look(now);
-        Ok(ear)
+        receiver.look(now);
+        Ok(receiver)
     }
 
     /// Joins the groups where a link came or came back, if the kernel has said that something changed, or the last look is

@@ -8,19 +8,19 @@ use std::time::Duration;
 
 /// Work in a thread of its own. Dropped, nobody waits for its result any more.
 #[derive(Debug)]
-pub(crate) struct Errand<T>(Receiver<T>);
+pub(crate) struct BackgroundTask<T>(Receiver<T>);
 
 /// So often it is seen that nobody wants to wait any more.
 const LOOK_EVERY: Duration = Duration::from_millis(50);
 
-impl<T: Send + 'static> Errand<T> {
+impl<T: Send + 'static> BackgroundTask<T> {
     /// Begins it; nothing if there is no thread to be had: then it is to be tried again.
-    pub(crate) fn begin(work: impl FnOnce() -> T + Send + 'static) -> Option<Errand<T>> {
+    pub(crate) fn begin(work: impl FnOnce() -> T + Send + 'static) -> Option<BackgroundTask<T>> {
         let (done, result) = channel();
         let thread = thread::Builder::new().name("errand".into()).spawn(move || {
             let _ = done.send(work());
         });
-        thread.ok().map(|_| Errand(result))
+        thread.ok().map(|_| BackgroundTask(result))
     }
 
     /// Its result, once, as soon as there is one.
@@ -49,26 +49,26 @@ mod tests {
     #[test]
     fn nobody_waits_for_it() {
         let (go, hold) = channel();
-        let errand = Errand::begin(move || hold.recv()).unwrap();
-        assert_eq!(errand.result(), None);
+        let task = BackgroundTask::begin(move || hold.recv()).unwrap();
+        assert_eq!(task.result(), None);
         go.send(7).unwrap();
         let give_up_at = Instant::now() + Duration::from_secs(30);
         let result = loop {
-            match errand.result() {
+            match task.result() {
                 Some(result) => break result,
                 None => assert!(Instant::now() < give_up_at),
             }
             thread::yield_now();
         };
-        assert_eq!((result, errand.result()), (Ok(7), None));
+        assert_eq!((result, task.result()), (Ok(7), None));
     }
 
     #[test]
     fn who_waits_for_it_can_be_stopped() {
         let (go, hold) = channel();
-        let errand = Errand::begin(move || hold.recv()).unwrap();
-        assert_eq!(errand.wait(&AtomicBool::new(true)), None);
+        let task = BackgroundTask::begin(move || hold.recv()).unwrap();
+        assert_eq!(task.wait(&AtomicBool::new(true)), None);
         go.send(7).unwrap();
-        assert_eq!(errand.wait(&AtomicBool::new(false)), Some(Ok(7)));
+        assert_eq!(task.wait(&AtomicBool::new(false)), Some(Ok(7)));
     }
 }

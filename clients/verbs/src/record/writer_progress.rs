@@ -6,11 +6,11 @@ use std::time::Duration;
 
 /// What the writing thread says to the other one.
 #[derive(Default)]
-pub(super) struct Told(Mutex<Account>);
+pub(super) struct WriterProgress(Mutex<RecordStats>);
 
 /// How far it came.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
-pub(super) struct Account {
+pub(super) struct RecordStats {
     /// Bytes in all files, as far as these are still there.
     pub(super) bytes: u64,
     /// Samples in all files, as far as these are still there.
@@ -34,16 +34,16 @@ pub(super) enum News {
     ReaderGone,
 }
 
-impl Told {
+impl WriterProgress {
     /// How far it came; news are told once.
-    pub(super) fn look(&self) -> Account {
-        let mut account = self.account();
-        let news = std::mem::take(&mut account.news);
-        Account { news, ..account.clone() }
+    pub(super) fn look(&self) -> RecordStats {
+        let mut stats = self.stats();
+        let news = std::mem::take(&mut stats.news);
+        RecordStats { news, ..stats.clone() }
     }
 
     /// For who writes.
-    pub(super) fn account(&self) -> MutexGuard<'_, Account> {
+    pub(super) fn stats(&self) -> MutexGuard<'_, RecordStats> {
         self.0.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }

@@ -7,7 +7,7 @@ use std::ffi::{CString, c_char, c_int};
 use schema::{Failure, Kind};
 
 /// A call that did not succeed.
-pub(crate) enum Refusal {
+pub(crate) enum CallError {
     /// The caller's fault: what is wrong with an argument, and what would be right.
     Argument(&'static str, &'static str),
     /// What the client library says.
@@ -16,26 +16,26 @@ pub(crate) enum Refusal {
     Bug,
 }
 
-impl Refusal {
+impl CallError {
     /// The number in the header, `SCANHUB_REFUSED_` .. .
     fn number(&self) -> c_int {
         match self {
-            Refusal::Argument(..) => -1,
-            Refusal::Failure(failure) => match failure.kind {
+            CallError::Argument(..) => -1,
+            CallError::Failure(failure) => match failure.kind {
                 Kind::Configuration => -2,
                 Kind::Short => -3,
                 _ => -4,
             },
-            Refusal::Bug => -5,
+            CallError::Bug => -5,
         }
     }
 
     /// Keeps what it says for [`last`], and answers its number.
     pub(crate) fn keep(&self) -> c_int {
         let said = match self {
-            Refusal::Argument(what, hint) => format!("{what}\n  {hint}"),
-            Refusal::Failure(failure) => failure.to_string(),
-            Refusal::Bug => "a bug in this library\n  stderr has its place; please report it".to_owned(),
+            CallError::Argument(what, hint) => format!("{what}\n  {hint}"),
+            CallError::Failure(failure) => failure.to_string(),
+            CallError::Bug => "a bug in this library\n  stderr shows where; please report it".to_owned(),
         };
         // Messages are printable: there is no 0 in them.
         let said = CString::new(said).unwrap_or_default();
@@ -45,9 +45,9 @@ impl Refusal {
     }
 }
 
-impl From<Failure> for Refusal {
-    fn from(failure: Failure) -> Refusal {
-        Refusal::Failure(failure)
+impl From<Failure> for CallError {
+    fn from(failure: Failure) -> CallError {
+        CallError::Failure(failure)
     }
 }
 

@@ -17,9 +17,9 @@ const ASK_EVERY: Duration = Duration::from_millis(500);
 
 impl Run<'_> {
     /// Follows the sensors of the hub that are not followed yet, if all are wanted.
-    pub(super) fn call_the_roll(&mut self, sink: &mut dyn Sink) -> Result<(), End> {
+    pub(super) fn discover(&mut self, sink: &mut dyn Sink) -> Result<(), End> {
         let Some(domain) = self.session.domain().filter(|_| !self.topics.is_empty()) else { return Ok(()) };
-        let Some(called) = self.roll.call(domain, Instant::now())? else { return Ok(()) };
+        let Some(called) = self.discovery.call(domain, Instant::now())? else { return Ok(()) };
         for sensor in called.sensors {
             for &topic in self.topics {
                 let name = TopicName { sensor: sensor.clone(), topic };
@@ -55,7 +55,7 @@ impl Run<'_> {
             let (what, hint) = match lives {
                 true => ("the hub has no sensors", "scanhub run --link NAME=PORT"),
                 false => {
-                    ("no sensor of another machine is published here", "`scanhub listen` says who sends")
+                    ("no sensor of another machine is published here", "`scanhub listen` shows who sends")
                 }
             };
             return Err(Failure::new(Kind::NoTopic, what, hint).into());

@@ -22,7 +22,7 @@ use schema::{Failure, Kind};
 use super::host::Host;
 
 /// A destination.
-pub(super) struct Outlet {
+pub(super) struct UdpDestination {
     /// The interface, or the host as the user wrote it.
     pub(super) name: String,
     /// Datagrams that the kernel took.
@@ -57,24 +57,25 @@ pub(super) enum News {
     Well,
 }
 
-impl Outlet {
+impl UdpDestination {
     /// The groups, on the interface called `name`; routers pass `ttl` of them on.
     ///
     /// [`Kind::Failed`] if the system has no such socket.
-    pub(super) fn groups(name: &str, port: u16, ttl: u8) -> Result<Outlet, Failure> {
-        let outlet = Outlet::new(name, To::Groups { port })?;
-        let set = outlet.socket.set_multicast_ttl_v4(ttl.into());
-        set.and_then(|()| outlet.socket.set_multicast_loop_v4(true)).map_err(|error| no_socket(&error))?;
-        Ok(outlet)
+    pub(super) fn groups(name: &str, port: u16, ttl: u8) -> Result<UdpDestination, Failure> {
+        let destination = UdpDestination::new(name, To::Groups { port })?;
+        let set = destination.socket.set_multicast_ttl_v4(ttl.into());
+        set.and_then(|()| destination.socket.set_multicast_loop_v4(true))
+            .map_err(|error| no_socket(&error))?;
+        Ok(destination)
     }
 
     /// A host and port, and up to `more` ports above it. Failures as [`Host::parse`], and [`Kind::Failed`] as above.
-    pub(super) fn host(text: &str, more: u16, stop: &AtomicBool) -> Result<Outlet, Failure> {
-        Outlet::new(text, To::Host(Host::parse(text, more, stop)?))
+    pub(super) fn host(text: &str, more: u16, stop: &AtomicBool) -> Result<UdpDestination, Failure> {
+        UdpDestination::new(text, To::Host(Host::parse(text, more, stop)?))
     }
 
     /// What is sent to `other` gets to the same place.
-    pub(super) fn is_as(&self, other: &Outlet) -> bool {
+    pub(super) fn is_as(&self, other: &UdpDestination) -> bool {
         match (&self.to, &other.to) {
             (To::Groups { .. }, To::Groups { .. }) => true,
             (To::Host(one), To::Host(other)) => one.address() == other.address(),
@@ -161,12 +162,12 @@ impl Outlet {
         }
     }
 
-    fn new(name: &str, to: To) -> Result<Outlet, Failure> {
+    fn new(name: &str, to: To) -> Result<UdpDestination, Failure> {
         let ip = match &to {
             To::Groups { .. } => Ipv4Addr::UNSPECIFIED.into(),
             To::Host(host) => host.address().ip(),
         };
-        Ok(Outlet {
+        Ok(UdpDestination {
             name: name.to_owned(),
             sent: 0,
             failed: 0,
@@ -255,19 +256,19 @@ mod tests {
         PORT.store(there.local_addr().unwrap().port(), Ordering::SeqCst);
         let begin = Instant::now();
         let host = Host::by(resolve, "robot:7", 0, &AtomicBool::new(false), begin).unwrap();
-        let mut outlet = Outlet::new("robot:7", To::Host(host)).unwrap();
+        let mut destination = UdpDestination::new("robot:7", To::Host(host)).unwrap();
         let later = begin + Duration::from_secs(60);
-        assert_eq!(outlet.follow_name(begin), None);
+        assert_eq!(destination.follow_name(begin), None);
         HAS_MOVED.store(true, Ordering::SeqCst);
         let moved = loop {
             assert!(begin.elapsed() < Duration::from_secs(30));
-            match outlet.follow_name(later) {
+            match destination.follow_name(later) {
                 Some(address) => break address,
                 None => std::thread::yield_now(),
             }
         };
         assert_eq!(moved, there.local_addr().unwrap());
-        assert!(outlet.send(b"there", 0, 0));
+        assert!(destination.send(b"there", 0, 0));
         let mut bytes = [0; 9];
         assert_eq!(there.recv(&mut bytes).unwrap(), 5);
     }
@@ -283,18 +284,23 @@ mod tests {
 
     fn nobody_listens(receiver: UdpSocket) {
         let text = receiver.local_addr().unwrap().to_string();
-        let mut outlet = Outlet::host(&text, 0, &AtomicBool::new(false)).unwrap();
-        assert!(outlet.send(b"one", 0, 0) && outlet.news().is_none());
+        let mut destination = UdpDestination::host(&text, 0, &AtomicBool::new(false)).unwrap();
+        assert!(destination.send(b"one", 0, 0) && destination.news().is_none());
         drop(receiver);
         for _ in 0..4 {
-            outlet.send(b"two", 0, 0);
+            destination.send(b"two", 0, 0);
         }
-        assert!(outlet.failed + outlet.reported >= 2, "{} and {}", outlet.failed, outlet.reported);
-        assert_eq!(outlet.sent + outlet.failed, 5);
-        assert!(matches!(outlet.news(), Some(News::Failing(_))) && outlet.news().is_none());
+        assert!(
+            destination.failed + destination.reported >= 2,
+            "{} and {}",
+            destination.failed,
+            destination.reported
+        );
+        assert_eq!(destination.sent + destination.failed, 5);
+        assert!(matches!(destination.news(), Some(News::Failing(_))) && destination.news().is_none());
         let receiver = UdpSocket::bind(&text).unwrap();
-        assert_eq!((outlet.news(), outlet.news()), (None, Some(News::Well)));
-        assert!(outlet.send(b"three", 0, 0));
+        assert_eq!((destination.news(), destination.news()), (None, Some(News::Well)));
+        assert!(destination.send(b"three", 0, 0));
         let mut bytes = [0; 9];
         assert_eq!(receiver.recv(&mut bytes).unwrap(), 5);
     }

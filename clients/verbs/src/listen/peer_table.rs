@@ -3,11 +3,11 @@
 
 use std::collections::{HashMap, HashSet};
 
-use schema::datagram::{Account, Announce, Head, LIVES};
+use schema::datagram::{Announce, Head, LIVES, StreamStats};
 
 /// All lives of gateways that were heard, as long as the account keeps them apart.
 #[derive(Default)]
-pub(super) struct Roll {
+pub(super) struct PeerTable {
     lives: HashMap<(u64, u32), Life>,
     /// The gateways of which it was told that their clocks differ, the first ones: whoever can send can invent more.
     told: HashSet<u64>,
@@ -38,13 +38,13 @@ pub(super) struct Sensor {
 /// More than there are topics.
 const TOPICS: usize = 8;
 
-impl Roll {
+impl PeerTable {
     /// The life that sent `head`, which `account` has taken.
-    pub(super) fn life(&mut self, head: &Head, account: &Account) -> &mut Life {
+    pub(super) fn life(&mut self, head: &Head, stats: &StreamStats) -> &mut Life {
         let life = (head.hub, head.epoch);
-        let since_ns = account.since_ns(head.hub, head.epoch);
+        let since_ns = stats.since_ns(head.hub, head.epoch);
         if self.lives.get(&life).is_none_or(|known| known.since_ns != since_ns) {
-            self.lives.retain(|&(hub, epoch), known| account.since_ns(hub, epoch) == known.since_ns);
+            self.lives.retain(|&(hub, epoch), known| stats.since_ns(hub, epoch) == known.since_ns);
         }
         self.lives.entry(life).or_insert_with(|| Life { since_ns, ..Life::default() })
     }
@@ -54,12 +54,11 @@ impl Roll {
     pub(super) fn announce(
         &mut self,
         head: &Head,
-        account: &Account,
+        stats: &StreamStats,
         announce: &Announce,
         wall_ns: u64,
     ) -> Option<i64> {
-        let difference_ns =
-            self.life(head, account).announce(head.sensor, announce, head.stamp_ns, wall_ns)?;
+        let difference_ns = self.life(head, stats).announce(head.sensor, announce, head.stamp_ns, wall_ns)?;
         let is_new = self.told.len() < LIVES && self.told.insert(head.hub);
         is_new.then_some(difference_ns)
     }
@@ -71,8 +70,8 @@ impl Roll {
     }
 
     /// What the sensor that sent `head` is called, to be written now.
-    pub(super) fn written(&mut self, head: &Head, account: &Account) -> String {
-        let sensor = self.life(head, account).sensor(head.sensor);
+    pub(super) fn written(&mut self, head: &Head, stats: &StreamStats) -> String {
+        let sensor = self.life(head, stats).sensor(head.sensor);
         sensor.is_numbered |= sensor.announced.is_none();
         self.name(head.hub, head.epoch, head.sensor)
     }
@@ -176,22 +175,22 @@ mod tests {
 
     #[test]
     fn names_come_with_announcements() {
-        let (mut roll, account) = (Roll::default(), Box::new(Account::new(&Topic::ALL)));
+        let (mut peers, stats) = (PeerTable::default(), Box::new(StreamStats::new(&Topic::ALL)));
         let head = Head { hub: 5, epoch: 9, sensor: 1, ..Head::default() };
-        roll.life(&head, &account).sensor(1);
-        assert_eq!(roll.name(5, 9, 1), "#1");
-        roll.life(&head, &account).announce(1, &Announce::new(3, "rear", ""), MS, MS);
-        assert_eq!((roll.name(5, 9, 1).as_str(), roll.name(5, 8, 1).as_str()), ("rear", "#1"));
-        assert_eq!(roll.row_name(5, 9, 1), "rear");
+        peers.life(&head, &stats).sensor(1);
+        assert_eq!(peers.name(5, 9, 1), "#1");
+        peers.life(&head, &stats).announce(1, &Announce::new(3, "rear", ""), MS, MS);
+        assert_eq!((peers.name(5, 9, 1).as_str(), peers.name(5, 8, 1).as_str()), ("rear", "#1"));
+        assert_eq!(peers.row_name(5, 9, 1), "rear");
     }
 
     #[test]
     fn a_row_of_two_sensors_has_the_name_of_neither() {
-        let (mut roll, account) = (Roll::default(), Box::new(Account::new(&Topic::ALL)));
+        let (mut peers, stats) = (PeerTable::default(), Box::new(StreamStats::new(&Topic::ALL)));
         let head = Head { hub: 5, epoch: 9, ..Head::default() };
         let mut announce = |boot, name| {
-            roll.life(&head, &account).announce(0, &Announce::new(boot, name, ""), MS, MS);
-            (roll.name(5, 9, 0), roll.row_name(5, 9, 0))
+            peers.life(&head, &stats).announce(0, &Announce::new(boot, name, ""), MS, MS);
+            (peers.name(5, 9, 0), peers.row_name(5, 9, 0))
         };
         assert_eq!(announce(3, "front"), ("front".into(), "front".into()));
         assert_eq!(announce(4, "front"), ("front".into(), "front".into()), "the hub's next life");
@@ -201,16 +200,16 @@ mod tests {
 
     #[test]
     fn who_is_given_up_is_forgotten() {
-        let (mut roll, mut account) = (Roll::default(), Box::new(Account::new(&Topic::ALL)));
+        let (mut peers, mut stats) = (PeerTable::default(), Box::new(StreamStats::new(&Topic::ALL)));
         for epoch in 1..300 {
             let head = Head { topic: 4, revision: 1, hub: 5, epoch, ..Head::default() };
             let mut buffer = [0; 100];
             let len = Zones::unknown().pack(&mut buffer[HEAD..]).unwrap();
-            account.receive(head.seal(&mut buffer, len).unwrap(), 1, 0).unwrap();
-            roll.life(&head, &account).announce(0, &Announce::new(3, "rear", ""), MS, MS);
+            stats.receive(head.seal(&mut buffer, len).unwrap(), 1, 0).unwrap();
+            peers.life(&head, &stats).announce(0, &Announce::new(3, "rear", ""), MS, MS);
         }
-        assert_eq!((roll.lives.len(), account.given_up().lives), (LIVES, 299 - LIVES as u64));
-        assert_eq!((roll.name(5, 299, 0).as_str(), roll.name(5, 1, 0).as_str()), ("rear", "#0"));
+        assert_eq!((peers.lives.len(), stats.given_up().lives), (LIVES, 299 - LIVES as u64));
+        assert_eq!((peers.name(5, 299, 0).as_str(), peers.name(5, 1, 0).as_str()), ("rear", "#0"));
     }
 
     #[test]
@@ -232,22 +231,22 @@ mod tests {
 
     #[test]
     fn clocks_that_differ_give_no_age_and_are_told_once() {
-        let (mut roll, account) = (Roll::default(), Box::new(Account::new(&Topic::ALL)));
+        let (mut peers, stats) = (PeerTable::default(), Box::new(StreamStats::new(&Topic::ALL)));
         let head = |epoch, stamp_ms| Head { hub: 5, epoch, stamp_ns: stamp_ms * MS, ..Head::default() };
-        let age_ns = |roll: &mut Roll, stamp_ms, wall_ms| {
-            roll.life(&head(1, 0), &account).age_ns(stamp_ms * MS, wall_ms * MS)
+        let age_ns = |peers: &mut PeerTable, stamp_ms, wall_ms| {
+            peers.life(&head(1, 0), &stats).age_ns(stamp_ms * MS, wall_ms * MS)
         };
-        let announce = |roll: &mut Roll, epoch, stamp_ms, wall_ms| {
+        let announce = |peers: &mut PeerTable, epoch, stamp_ms, wall_ms| {
             let announce = Announce::new(1, "front", "");
-            roll.announce(&head(epoch, stamp_ms), &account, &announce, wall_ms * MS)
+            peers.announce(&head(epoch, stamp_ms), &stats, &announce, wall_ms * MS)
         };
-        assert_eq!(age_ns(&mut roll, 1, 2), None, "not known yet");
-        assert_eq!(announce(&mut roll, 1, 100, 101), None);
-        assert_eq!((age_ns(&mut roll, 200, 230), age_ns(&mut roll, 200, 199)), (Some(30 * MS), None));
-        assert_eq!(announce(&mut roll, 1, 100, 900), None, "one that waited");
-        assert_eq!(announce(&mut roll, 1, 3000, 1000), Some(-2000 * MS as i64));
-        assert_eq!(announce(&mut roll, 1, 4000, 2000), None);
-        assert_eq!(age_ns(&mut roll, 5000, 3030), None);
-        assert!((2..1000).all(|epoch| announce(&mut roll, epoch, 3000, 1000).is_none()), "the same gateway");
+        assert_eq!(age_ns(&mut peers, 1, 2), None, "not known yet");
+        assert_eq!(announce(&mut peers, 1, 100, 101), None);
+        assert_eq!((age_ns(&mut peers, 200, 230), age_ns(&mut peers, 200, 199)), (Some(30 * MS), None));
+        assert_eq!(announce(&mut peers, 1, 100, 900), None, "one that waited");
+        assert_eq!(announce(&mut peers, 1, 3000, 1000), Some(-2000 * MS as i64));
+        assert_eq!(announce(&mut peers, 1, 4000, 2000), None);
+        assert_eq!(age_ns(&mut peers, 5000, 3030), None);
+        assert!((2..1000).all(|epoch| announce(&mut peers, epoch, 3000, 1000).is_none()), "the same gateway");
     }
 }

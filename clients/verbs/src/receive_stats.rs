@@ -2,13 +2,13 @@
 
 use std::time::{Duration, Instant};
 
-use schema::Topic;
+use schema::{Pace, Topic};
 
 use crate::line::Loss;
 
 /// The account of one topic in one run.
 #[derive(Clone, Debug)]
-pub(crate) struct Account {
+pub(crate) struct ReceiveStats {
     topic: Topic,
     /// Samples received.
     pub(crate) received: u64,
@@ -24,10 +24,10 @@ pub(crate) struct Account {
     stale_said: bool,
 }
 
-impl Account {
+impl ReceiveStats {
     /// Nothing received yet.
-    pub(crate) fn new(topic: Topic) -> Account {
-        Account {
+    pub(crate) fn new(topic: Topic) -> ReceiveStats {
+        ReceiveStats {
             topic,
             received: 0,
             lost: 0,
@@ -79,15 +79,13 @@ impl Account {
         true
     }
 
-    /// A status comes each second; of anything else ten may be missing before it is worth a word.
+    /// What comes each second may be late by two; of scans ten may be missing before it is worth a word.
     fn deadline(&self) -> Duration {
-        match self.topic {
-            Topic::Status => Duration::from_secs(3),
+        match self.topic.row().pace {
+            Pace::Second => Duration::from_secs(3),
             // It comes when there is a new one.
-            Topic::Background => Duration::MAX,
-            Topic::Telegram | Topic::Scan | Topic::Marks | Topic::Zones | Topic::Foreground => {
-                (self.period * 10).max(Duration::from_secs(1))
-            }
+            Pace::Change => Duration::MAX,
+            Pace::Scan => (self.period * 10).max(Duration::from_secs(1)),
         }
     }
 }
@@ -98,31 +96,28 @@ mod tests {
 
     #[test]
     fn rate_and_silence() {
-        let mut account = Account::new(Topic::Scan);
+        let mut stats = ReceiveStats::new(Topic::Scan);
         let start = Instant::now();
-        assert!(!account.stale(start + Duration::from_secs(9)));
+        assert!(!stats.stale(start + Duration::from_secs(9)));
         for i in 0..5 {
-            account.count(start + Duration::from_millis(500 * i), i, 0, false);
+            stats.count(start + Duration::from_millis(500 * i), i, 0, false);
         }
-        assert_eq!(
-            (account.received, account.lost, account.seconds(), account.hz()),
-            (5, 10, 2.0, Some(2.0))
-        );
-        assert!(!account.stale(start + Duration::from_millis(2900)));
-        assert!(account.stale(start + Duration::from_millis(3000)));
-        assert!(!account.stale(start + Duration::from_millis(9000)));
+        assert_eq!((stats.received, stats.lost, stats.seconds(), stats.hz()), (5, 10, 2.0, Some(2.0)));
+        assert!(!stats.stale(start + Duration::from_millis(2900)));
+        assert!(stats.stale(start + Duration::from_millis(3000)));
+        assert!(!stats.stale(start + Duration::from_millis(9000)));
     }
 
     #[test]
     fn what_a_topic_keeps_for_late_joiners_has_no_rate() {
-        let mut account = Account::new(Topic::Status);
+        let mut stats = ReceiveStats::new(Topic::Status);
         let start = Instant::now();
-        account.count(start, 0, 0, true);
-        account.count(start + Duration::from_micros(2), 0, 0, true);
-        assert_eq!((account.received, account.hz()), (2, None));
-        account.count(start + Duration::from_millis(10), 0, 0, false);
-        assert_eq!((account.received, account.hz()), (3, None));
-        account.count(start + Duration::from_millis(1010), 0, 0, false);
-        assert_eq!((account.received, account.hz()), (4, Some(1.0)));
+        stats.count(start, 0, 0, true);
+        stats.count(start + Duration::from_micros(2), 0, 0, true);
+        assert_eq!((stats.received, stats.hz()), (2, None));
+        stats.count(start + Duration::from_millis(10), 0, 0, false);
+        assert_eq!((stats.received, stats.hz()), (3, None));
+        stats.count(start + Duration::from_millis(1010), 0, 0, false);
+        assert_eq!((stats.received, stats.hz()), (4, Some(1.0)));
     }
 }

@@ -21,7 +21,7 @@ pub(super) fn check(path: &Path, force: bool) -> Result<(), Failure> {
     } else if place.is_socket() {
         ("socket", "-o FILE names a file".to_owned())
     } else if (place.is_char_device() || place.is_block_device()) && !force {
-        ("device", "-o FILE names a file; --force writes over what the device holds".to_owned())
+        ("device", "-o FILE names a file; --force overwrites the content of the device".to_owned())
     } else {
         return Ok(());
     };
@@ -41,13 +41,15 @@ pub(super) fn kind(error: &io::Error) -> Kind {
 pub(super) fn failed(path: &Path, is_split: bool, error: &io::Error) -> Failure {
     let hint = match error.kind() {
         ErrorKind::AlreadyExists if is_split => {
-            "--force goes on after the last one's number; -o FILE names others"
+            "--force continues after the last number; -o FILE names others"
         }
-        ErrorKind::AlreadyExists => "--force overwrites it; -o FILE names another one",
-        ErrorKind::ResourceBusy => "end that one first, or name another file: -o FILE",
-        ErrorKind::StorageFull | ErrorKind::QuotaExceeded => "make room, or name another place: -o FILE",
+        ErrorKind::AlreadyExists => "--force overwrites it; -o FILE names another",
+        ErrorKind::ResourceBusy => "stop it first, or name another file: -o FILE",
+        ErrorKind::StorageFull | ErrorKind::QuotaExceeded => {
+            "free some space, or name another place: -o FILE"
+        }
         ErrorKind::FileTooLarge => "raise the limit: `ulimit -f unlimited`, for a service LimitFSIZE",
-        _ => "the directory has to be there and writable; -o FILE names another place",
+        _ => "the directory must exist and be writable; -o FILE names another place",
     };
     let kind = match kind(error) {
         Kind::Failed => Kind::Output,
@@ -59,7 +61,7 @@ pub(super) fn failed(path: &Path, is_split: bool, error: &io::Error) -> Failure 
 /// Who read the recording went away after `samples`. That it goes through a pipe makes it no less a recording: what was to
 /// come is missing.
 pub(super) fn reader_gone(samples: u64) -> Failure {
-    let what = format!("whoever read the recording is gone: it ends after {samples} samples at most");
-    let hint = "see why the program or the connection behind the pipe ended; `scanhub convert` gives what it has an index";
+    let what = format!("the reader of the recording is gone: it has at most {samples} samples");
+    let hint = "see why the program or the connection behind the pipe ended; `scanhub convert` writes a copy with an index";
     Failure::new(Kind::Failed, what, hint)
 }

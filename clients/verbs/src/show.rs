@@ -1,0 +1,132 @@
+//! How the payload of each topic is shown: as a line of JSON and as a line for people, whether it came from shared memory or
+//! from a network. A new payload has its words here; all else is made from the table of topics.
+
+use std::io;
+
+use scanhub_client::streams::{RobotHeard, Sample};
+use scanhub_client::{Heard, Received};
+use schema::ipc::Payload;
+use schema::{Background, Foreground, Header, Marks, Scan, Status, Zones};
+use serde::Serialize;
+
+use crate::output::{End, Output};
+use crate::{json, text};
+
+/// Takes the keys of one line.
+pub(crate) trait Keys {
+    /// Writes them.
+    fn take(self, keys: impl Serialize) -> Result<(), End>;
+}
+
+impl Keys for &mut Output<'_> {
+    fn take(self, keys: impl Serialize) -> Result<(), End> {
+        self.json(&keys)
+    }
+}
+
+/// The payload of a topic.
+pub(crate) trait Show {
+    /// The line of JSON, given to `to`.
+    fn json(&self, sensor: &str, header: &Header, to: impl Keys) -> Result<(), End>;
+
+    /// What stands behind the topic's name on a line for people.
+    fn text(&self, header: &Header, line: &mut Vec<u8>) -> io::Result<()>;
+}
+
+/// Declares how payloads are shown: functions of `json` and `text`, most with the header of the sample.
+macro_rules! shown {
+    ($($payload:ty, $function:ident $(($header:ident))?;)*) => {$(
+        impl Show for $payload {
+            fn json(&self, sensor: &str, _header: &Header, to: impl Keys) -> Result<(), End> {
+                to.take(json::$function(sensor, $(shown!($header _header),)? self))
+            }
+
+            fn text(&self, _header: &Header, line: &mut Vec<u8>) -> io::Result<()> {
+                text::$function(line, $(shown!($header _header),)? self)
+            }
+        }
+    )*};
+    (header $header:ident) => { $header };
+}
+
+shown! {
+    [u8], telegram(header);
+    Scan, scan(header);
+    Marks, marks(header);
+    Foreground, foreground(header);
+    Background, background;
+    Status, status;
+}
+
+/// As they came: how old they are was seen to before.
+impl Show for Zones {
+    fn json(&self, sensor: &str, header: &Header, to: impl Keys) -> Result<(), End> {
+        to.take(json::zones(sensor, &heard(self, header)))
+    }
+
+    fn text(&self, header: &Header, line: &mut Vec<u8>) -> io::Result<()> {
+        text::zones(line, &heard(self, header))
+    }
+}
+
+fn heard(zones: &Zones, header: &Header) -> Heard {
+    Heard { zones: *zones, header: Some(*header), missed: 0, stale: false, said: *zones }
+}
+
+/// What was received.
+trait ShowSample {
+    fn json(&self, sensor: &str, to: impl Keys) -> Result<(), End>;
+    fn text(&self, line: &mut Vec<u8>) -> io::Result<()>;
+}
+
+impl<P: Payload + Show + ?Sized> ShowSample for Received<P> {
+    fn json(&self, sensor: &str, to: impl Keys) -> Result<(), End> {
+        Show::json(&**self, sensor, self.header(), to)
+    }
+
+    fn text(&self, line: &mut Vec<u8>) -> io::Result<()> {
+        Show::text(&**self, self.header(), line)
+    }
+}
+
+impl ShowSample for Heard {
+    fn json(&self, sensor: &str, to: impl Keys) -> Result<(), End> {
+        to.take(json::zones(sensor, self))
+    }
+
+    fn text(&self, line: &mut Vec<u8>) -> io::Result<()> {
+        text::zones(line, self)
+    }
+}
+
+impl ShowSample for RobotHeard {
+    fn json(&self, _sensor: &str, to: impl Keys) -> Result<(), End> {
+        to.take(json::robot(&self.robot, &self.heard))
+    }
+
+    fn text(&self, line: &mut Vec<u8>) -> io::Result<()> {
+        text::robot(line, &self.robot)
+    }
+}
+
+macro_rules! samples {
+    ($($topic:ident $payload:tt, $name:literal, $($column:tt),*: $about:literal;)*) => {
+        /// The line of JSON of a sample of `sensor`.
+        pub(crate) fn json(sample: &Sample, sensor: &str, to: impl Keys) -> Result<(), End> {
+            match sample {
+                $(Sample::$topic(sample) => sample.json(sensor, to),)*
+                Sample::Robot(sample) => sample.json(sensor, to),
+            }
+        }
+
+        /// What stands behind the topic's name on a line for people.
+        pub(crate) fn text(sample: &Sample, line: &mut Vec<u8>) -> io::Result<()> {
+            match sample {
+                $(Sample::$topic(sample) => sample.text(line),)*
+                Sample::Robot(sample) => sample.text(line),
+            }
+        }
+    };
+}
+
+schema::for_each_topic!(samples);

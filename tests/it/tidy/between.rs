@@ -1,0 +1,211 @@
+//! The walls between the crates: who knows whom, and of what each is built.
+
+use super::{crates, holds};
+
+#[test]
+fn schema_knows_nobody() {
+    holds(crates::schema_knows_nobody, |tree| {
+        vec![
+            tree.with_line("schema/Cargo.toml", "[dependencies]", "scanhub-lms.workspace = true"),
+            tree.with_line("schema/Cargo.toml", "[dev-dependencies]", "scanhub-lms.workspace = true"),
+        ]
+    });
+}
+
+#[test]
+fn schema_without_ipc_needs_no_shared_memory() {
+    let lan = crates::built_from("scanhub-schema", &["--no-default-features"]);
+    assert!(!lan.iter().any(|name| name.starts_with("iceoryx2")), "{lan:?}");
+    let ipc = crates::built_from("scanhub-schema", &["--no-default-features", "--features", "ipc"]);
+    assert!(ipc.iter().any(|name| name.starts_with("iceoryx2")), "{ipc:?}");
+}
+
+#[test]
+fn lms_stands_alone() {
+    holds(crates::lms_stands_alone, |tree| {
+        let lib = tree.text("hub/lms/src/lib.rs");
+        vec![
+            tree.with_line("hub/lms/Cargo.toml", "[dependencies]", "serialport.workspace = true"),
+            tree.with("hub/lms/src/lib.rs", &lib.replace("#![no_std]", "")),
+            tree.with("hub/lms/src/lib.rs", &lib.replace("#![forbid(unsafe_code)]", "")),
+            tree.with("hub/lms/src/planted.rs", "//! A heap.\nextern crate alloc;\n"),
+            tree.with("hub/lms/src/planted.rs", "//! A thread.\nuse std::thread;\n"),
+        ]
+    });
+}
+
+#[test]
+fn preprocess_only_computes() {
+    holds(crates::preprocess_only_computes, |tree| {
+        let planted = |code: &str| tree.with("hub/preprocess/src/planted.rs", &format!("//! So.\n{code}\n"));
+        let lib = tree.text("hub/preprocess/src/lib.rs");
+        vec![
+            tree.with_line("hub/preprocess/Cargo.toml", "[dependencies]", "scanhub-lms.workspace = true"),
+            tree.with_line("hub/preprocess/Cargo.toml", "[dependencies]", "iceoryx2.workspace = true"),
+            tree.with("hub/preprocess/src/lib.rs", &lib.replace("#![forbid(unsafe_code)]", "")),
+            planted("use std::time::Instant;"),
+            planted("use std::{array, thread};"),
+            planted("let ends = ranges.iter().collect::<Vec<_>>();"),
+            planted("let ranges = vec![0; 401];"),
+            planted("let name = format!(\"{i}\");"),
+            planted("use schema::ipc::Payload;"),
+        ]
+    });
+}
+
+#[test]
+fn no_processor_uses_another() {
+    holds(crates::no_processor_uses_another, |tree| {
+        let planted = |path: &str, code: &str| tree.with(path, &format!("//! So.\n{code}\n"));
+        vec![
+            planted("hub/preprocess/src/zones.rs", "use crate::marks::MarkDetector;"),
+            planted("hub/preprocess/src/zones/table.rs", "use crate::{background, Reading};"),
+            planted("hub/preprocess/src/segments.rs", "let class = super::background::Class::Unknown;"),
+        ]
+    });
+}
+
+#[test]
+fn clients_know_only_schema() {
+    holds(crates::clients_know_only_schema, |tree| {
+        let (client, verbs) = ("clients/client/Cargo.toml", "clients/verbs/Cargo.toml");
+        vec![
+            tree.with_line(client, "[dependencies]", "scanhub-lms.workspace = true"),
+            tree.with_line(client, "[dependencies]", "scanhub-verbs.workspace = true"),
+            tree.with_line(client, "[dev-dependencies]", "scanhub-ros.workspace = true"),
+            tree.with_line(verbs, "[dependencies]", "scanhub-lms.workspace = true"),
+        ]
+    });
+}
+
+#[test]
+fn ros_knows_only_schema() {
+    holds(crates::ros_knows_only_schema, |tree| {
+        let (manifest, lib) = ("schema/ros/Cargo.toml", "schema/ros/src/lib.rs");
+        vec![
+            tree.with_line(manifest, "[dependencies]", "scanhub-client.workspace = true"),
+            tree.with_line(manifest, "[dependencies]", "mcap.workspace = true"),
+            tree.with(lib, &tree.text(lib).replace("#![forbid(unsafe_code)]", "")),
+            tree.with("schema/ros/src/planted.rs", "//! A clock.\nuse std::time::SystemTime;\n"),
+        ]
+    });
+}
+
+#[test]
+fn the_scanner_only_translates() {
+    holds(crates::the_scanner_only_translates, |tree| {
+        let (manifest, lib) = ("hub/scanner/Cargo.toml", "hub/scanner/src/lib.rs");
+        vec![
+            tree.with_line(manifest, "[dependencies]", "scanhub-recording.workspace = true"),
+            tree.with(lib, &tree.text(lib).replace("#![forbid(unsafe_code)]", "")),
+        ]
+    });
+}
+
+#[test]
+fn the_library_for_c_knows_clients() {
+    holds(crates::the_library_for_c_knows_clients, |tree| {
+        vec![
+            tree.with_line("clients/c/Cargo.toml", "[dependencies]", "scanhub-lms.workspace = true"),
+            tree.with_line("clients/c/Cargo.toml", "[dependencies]", "iceoryx2.workspace = true"),
+            tree.with_line("clients/c/Cargo.toml", "[dependencies]", "scanhub-verbs.workspace = true"),
+            tree.with_line("clients/verbs/Cargo.toml", "[dependencies]", "scanhub-c.workspace = true"),
+            tree.with_line("Cargo.toml", "[dependencies]", "scanhub-c.workspace = true"),
+        ]
+    });
+}
+
+#[test]
+fn the_daemon_knows_neither_clients_nor_sim() {
+    holds(crates::the_daemon_knows_neither_clients_nor_sim, |tree| {
+        vec![
+            tree.with_line("hub/daemon/Cargo.toml", "[dependencies]", "scanhub-client.workspace = true"),
+            tree.with_line("hub/daemon/Cargo.toml", "[dependencies]", "scanhub-verbs.workspace = true"),
+            tree.with_line("hub/recording/Cargo.toml", "[dependencies]", "scanhub-sim.workspace = true"),
+            tree.with_line("hub/port/Cargo.toml", "[dependencies]", "scanhub-lms-configure.workspace = true"),
+            tree.with_line("hub/daemon/Cargo.toml", "[dependencies]", "scanhub-tools.workspace = true"),
+        ]
+    });
+}
+
+#[test]
+fn only_the_program_sees_all() {
+    holds(crates::only_the_program_sees_all, |tree| {
+        vec![
+            tree.with_line("hub/sim/Cargo.toml", "[dependencies]", "scanhub-daemon.workspace = true"),
+            tree.with_line("hub/sim/Cargo.toml", "[dependencies]", "scanhub-client.workspace = true"),
+        ]
+    });
+}
+
+#[test]
+fn every_crate_is_tested_from_the_top() {
+    holds(crates::every_crate_is_tested_from_the_top, |tree| {
+        let manifest = tree.text("Cargo.toml");
+        vec![tree.with("Cargo.toml", &manifest.replacen("members = [", "members = [\"new\", ", 1))]
+    });
+}
+
+#[test]
+fn every_crate_obeys_the_lints() {
+    holds(crates::every_crate_obeys_the_lints, |tree| {
+        let (top, sim) = (tree.text("Cargo.toml"), tree.text("hub/sim/Cargo.toml"));
+        vec![
+            tree.with("Cargo.toml", &top.replace("unsafe_code = \"deny\"", "unsafe_code = \"warn\"")),
+            tree.with("hub/sim/Cargo.toml", &sim.replace("[lints]\nworkspace = true", "")),
+        ]
+    });
+}
+
+#[test]
+fn shared_memory_is_pinned() {
+    holds(crates::shared_memory_is_pinned, |tree| {
+        vec![tree.with("Cargo.toml", &tree.text("Cargo.toml").replace("version = \"=0.", "version = \"0."))]
+    });
+}
+
+/// A hub is small: most of its crates come with shared memory; serialport brings three.
+#[test]
+fn the_daemon_is_built_from_few_crates() {
+    let mut crates = crates::built_from("scanhub-daemon", &[]);
+    crates.retain(|name| !name.starts_with("scanhub-"));
+    eprintln!("daemon: {} crates of others", crates.len());
+    assert!(crates.len() <= 82, "{} crates: {crates:#?}", crates.len());
+}
+
+/// A consumer pays for shared memory, and for little else: for no verb, nor for what verbs need.
+#[test]
+fn the_client_is_built_from_few_crates() {
+    let mut crates = crates::built_from("scanhub-client", &[]);
+    let shared_memory = crates::built_from("iceoryx2", &[]);
+    crates.retain(|name| !shared_memory.contains(name));
+    eprintln!("client: {} crates beside those of iceoryx2", crates.len());
+    assert!(crates.len() <= 15, "{} crates: {crates:#?}", crates.len());
+    const OF_VERBS: [&str; 8] = [
+        "scanhub-verbs",
+        "ratatui",
+        "hdrhistogram",
+        "serde_json",
+        "mcap",
+        "socket2",
+        "strsim",
+        "thread-priority",
+    ];
+    let of_verbs = |name: &&String| OF_VERBS.iter().any(|verb| name.split(' ').next() == Some(verb));
+    assert_eq!(crates.iter().find(of_verbs), None);
+    assert!(crates::built_from("scanhub-verbs", &[]).iter().any(|name| of_verbs(&name)));
+}
+
+/// What needs a C compiler comes with recordings alone.
+#[test]
+fn clients_that_do_not_record_need_no_c_compiler() {
+    let in_c = |features: &[&str]| {
+        let crates = crates::built_from("scanhub-verbs", features);
+        // The exception is the kernel's interface in Rust.
+        let is_in_c = |name: &String| name.contains("-sys ") && !name.starts_with("linux-raw-sys");
+        crates.into_iter().filter(is_in_c).collect::<Vec<_>>()
+    };
+    assert_eq!(in_c(&["--no-default-features", "--features", "tui"]), Vec::<String>::new());
+    let recording = in_c(&["--no-default-features", "--features", "record"]);
+    assert!(recording.iter().any(|name| name.starts_with("zstd-sys")), "{recording:?}");
+}

@@ -1,0 +1,120 @@
+//! The walls within the sources and the pages: what may stand where.
+
+use super::{holds, sources, written};
+
+#[test]
+fn clocks_are_read_in_few_places() {
+    holds(sources::clocks_are_read_in_few_places, |tree| {
+        vec![
+            tree.with("hub/daemon/src/link.rs", "//! A link.\nlet now = std::time::Instant::now();\n"),
+            tree.with("hub/sim/src/room.rs", "//! A room.\nlet now = SystemTime::now();\n"),
+            tree.with(
+                "hub/lms/src/session.rs",
+                "//! A session.\nlet now = rustix::time::clock_gettime(id);\n",
+            ),
+        ]
+    });
+}
+
+#[test]
+fn unsafe_code_is_rare_and_explained() {
+    holds(sources::unsafe_code_is_rare_and_explained, |tree| {
+        let listed = "hub/daemon/src/bus_error.rs";
+        let explained = "// SAFETY: so it is.\nunsafe { call() };\n";
+        vec![
+            tree.with(listed, "//! A handler.\nunsafe { call() };\n"),
+            tree.with(listed, &format!("//! Many.\n{}", explained.repeat(11))),
+            tree.with("hub/daemon/tests/planted.rs", &format!("//! A test.\n{explained}")),
+            tree.with("hub/daemon/tests/counting/mod.rs", "//! An allocator.\nunsafe { call() };\n"),
+            tree.with("hub/daemon/src/link.rs", &format!("//! A link.\n{explained}")),
+            tree.with("hub/daemon/src/link.rs", "//! A link.\n#![allow(unsafe_code)]\n"),
+        ]
+    });
+}
+
+#[test]
+fn shared_memory_is_built_in_one_module() {
+    holds(sources::shared_memory_is_built_in_one_module, |tree| {
+        vec![
+            tree.with("clients/verbs/src/planted.rs", "//! A client.\nuse iceoryx2::prelude::*;\n"),
+            tree.with("schema/src/scan.rs", "//! A scan.\nuse iceoryx2::node::NodeBuilder;\n"),
+        ]
+    });
+}
+
+#[test]
+fn ranges_are_born_in_one_file() {
+    holds(sources::ranges_are_born_in_one_file, |tree| {
+        vec![
+            tree.with("hub/daemon/src/link.rs", "//! A link.\nfor word in measured.words() {}\n"),
+            tree.with("hub/tools/src/probe.rs", "//! Probes.\nfor word in measured.words() {}\n"),
+        ]
+    });
+}
+
+#[test]
+fn files_are_short_and_say_what_they_are_for() {
+    holds(sources::files_are_short_and_say_what_they_are_for, |tree| {
+        vec![
+            tree.with(
+                "clients/verbs/src/planted.rs",
+                &format!("//! Long.\n{}", "const N: u8 = 0;\n".repeat(400)),
+            ),
+            tree.with("clients/verbs/src/planted.rs", "use std::fmt;\n"),
+        ]
+    });
+}
+
+#[test]
+fn names_say_something() {
+    holds(sources::names_say_something, |tree| {
+        vec![
+            tree.with("clients/verbs/src/utils.rs", "//! Things.\n"),
+            tree.with("clients/verbs/src/planted.rs", "//! Things.\nstruct LinkManager;\n"),
+            tree.with("clients/verbs/src/planted.rs", "//! Things.\nmod common;\n"),
+            tree.with("clients/verbs/src/planted.rs", "//! Things.\nfn get_range() {}\n"),
+        ]
+    });
+}
+
+#[test]
+fn nothing_promises_safety() {
+    holds(sources::nothing_promises_safety, |tree| {
+        vec![
+            tree.with("clients/verbs/src/planted.rs", "//! A protective field.\n"),
+            tree.with("CHANGELOG.md", "- A safety function for robots.\n"),
+        ]
+    });
+}
+
+#[test]
+fn tables_are_of_the_last_runs() {
+    let planted =
+        "{\"class\":\"measurement\",\"bench\":\"planted\",\"name\":\"nobody measured\",\"runs\":1}\n";
+    holds(written::tables_are_of_the_last_runs, |tree| {
+        let page = tree.text("benches/README.md");
+        vec![
+            tree.with("benches/last/planted.jsonl", planted),
+            tree.with("benches/last/planted.jsonl", "no line\n"),
+            tree.with(
+                "benches/README.md",
+                &page.replace("<!-- Until here. -->", "0 by hand\n<!-- Until here. -->"),
+            ),
+            tree.with("benches/README.md", &page.replace("<!-- Until here. -->", "")),
+        ]
+    });
+}
+
+#[test]
+fn the_first_consumer_is_compiled() {
+    holds(written::the_first_consumer_is_compiled, |tree| {
+        let (page, example) = ("docs/first-consumer.md", "clients/examples/first.rs");
+        let (shown, compiled) = (tree.text(page), tree.text(example));
+        vec![
+            tree.with(page, &shown.replace("from_millis(500)", "from_secs(5)")),
+            tree.with(page, &shown.replace("```rust", "```")),
+            tree.with(page, &format!("{shown}\n```rust\nlet more = 1;\n```\n")),
+            tree.with(example, &compiled.replace("continue;", "break;")),
+        ]
+    });
+}
