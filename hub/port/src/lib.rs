@@ -108,7 +108,7 @@ impl Port {
     }
 
     /// Forgets what came in, at `baud` from now on; where a serial server has the rate, at the one that it has.
-    pub fn begin_anew(&self, baud: u32) -> io::Result<()> {
+    pub fn discard_input(&self, baud: u32) -> io::Result<()> {
         match self {
             Port::Tty(tty) => tty.set_baud(baud),
             Port::Tcp(tcp) => tcp.forget(),
