@@ -3,7 +3,7 @@
 //!
 //! The last two steps, base and domain, must belong to this user and be writable by nobody else; a link is never
 //! followed there. Above them a link is followed if root or this user made it where nobody else can make one: `/home` or
-//! `/var/run` may be links. Who owns the directories above the base is not looked at.
+//! `/var/run` may be links. The owners of the directories above the base are not checked.
 
 use std::ffi::{OsStr, OsString};
 use std::fs::File;
@@ -38,11 +38,11 @@ impl Directory {
         Walk::to(root, user(), false)
     }
 
-    /// As [`open`](Self::open); what is missing is made for this user alone.
+    /// As [`open`](Self::open); what is missing is created, only for this user.
     ///
     /// # Errors
     ///
-    /// As [`open`](Self::open), and [`Kind::Failed`] if it cannot be made.
+    /// As [`open`](Self::open), and [`Kind::Failed`] if it cannot be created.
     pub fn make(root: &Path) -> Result<Directory, Failure> {
         let made = Walk::to(root, user(), true)?;
         made.ok_or_else(|| unusable(root, Errno::NOENT))

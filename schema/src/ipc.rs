@@ -76,7 +76,7 @@ pub type Notifier = port::notifier::Notifier<Service>;
 /// Sleeps until it is woken.
 pub type Listener = port::listener::Listener<Service>;
 
-/// The node of a hub or listener in `domain`, for who holds its [`HubLock`](crate::HubLock) or
+/// The node of a hub or listener in `domain`; the caller holds its [`HubLock`](crate::HubLock) or
 /// [`ListenLock`](crate::ListenLock). Cleans up what dead ones and consumers left.
 ///
 /// [`Kind::Failed`] with owner, mode and remedy if the directory is another user's.
@@ -201,7 +201,7 @@ pub fn sensors(domain: &Domain) -> Result<Vec<String>, Failure> {
     Ok(sensors)
 }
 
-/// The sensors that have zones in `domain`, sorted, as [`sensors`]: those that a robot's verdict is made of.
+/// The sensors that have zones in `domain`, sorted, as [`sensors`]: those that make a robot's verdict.
 pub fn sensors_with_zones(domain: &Domain) -> Result<Vec<String>, Failure> {
     let with_zones = topics(domain)?.into_iter().filter(|(_, topic)| *topic == Topic::Zones);
     Ok(with_zones.map(|(sensor, _)| sensor).collect())

@@ -1,4 +1,4 @@
-//! Where a sensor sits on the robot, and where its beams point. Refuses to know what they meet.
+//! Where a sensor is mounted on the robot, and where its beams point. Refuses to know what they hit.
 
 use bytemuck::{Pod, Zeroable};
 #[cfg(feature = "ipc")]

@@ -1,6 +1,6 @@
-//! How the names of a domain's shared memory begin: `sh_DOMAIN_`, then a word that nobody can guess. /dev/shm is
-//! open to all users; without the word another one could occupy the names before the hub starts. The word is kept in the
-//! file `prefix` of the domain's directory, which only this user can read, and lives as long as anybody uses it.
+//! The prefix of the names of a domain's shared memory: `sh_DOMAIN_`, then a random word that nobody can guess. /dev/shm
+//! is open to all users; without the word, another user could occupy the names before the hub starts. The word is stored
+//! in the file `prefix` of the domain's directory, which only this user can read, and stays as long as anybody uses it.
 
 use std::hash::{BuildHasher, RandomState};
 use std::io::Read;

@@ -1,5 +1,5 @@
-//! Files that somebody names: regular ones alone, and no more of them than is expected. A pipe may have no writer and a
-//! device no end, so neither is waited for. Refuses to know what is in them.
+//! Reads files named by a user: only regular ones, and only up to an expected length. A pipe may have no writer and a
+//! device no end, so neither is read. Refuses to know what is in them.
 
 use std::fs::{File, OpenOptions};
 use std::io::{self, ErrorKind, Read};

@@ -1,5 +1,5 @@
-//! A background model as one JSON object: the line that shows it, and the file that it is saved to and loaded from. What
-//! is read was written by anybody and is believed in nothing. Refuses to know where the text lies.
+//! A background model as one JSON object: the line that shows it, and the file that it is saved to and loaded from. Input
+//! may come from anybody, so all of it is checked. Refuses to know where the text is stored.
 
 use serde::{Deserialize, Serialize, Serializer};
 

@@ -18,9 +18,9 @@ pub struct Waker {
 }
 
 impl Waker {
-    /// That of `sensor`, to be made before its topics: who finds those sleeps at it.
+    /// The waker of `sensor`. Create it before its topics: consumers that find those sleep on it.
     ///
-    /// [`Kind::Short`] if memory is, [`Kind::Failed`] if the service is of another layout.
+    /// [`Kind::Short`] if memory is, [`Kind::Failed`] if the service has another layout.
     pub fn new(node: &Node, sensor: &str) -> Result<Waker, Failure> {
         let ringer = Ringer::hang(node, sensor)?;
         let service = create_service(node, sensor)?;
@@ -32,9 +32,9 @@ impl Waker {
         Ok(Waker { ringer, notifier, service })
     }
 
-    /// Wakes all consumers for `why`: those at the bell with one call, then those that listen to the event.
+    /// Wakes all consumers for `why`: those that sleep on the bell with one call, then those that listen to the event.
     ///
-    /// [`Kind::Failed`] if some of the latter were not told.
+    /// [`Kind::Failed`] if some of the latter were not woken.
     pub fn wake(&self, why: Wake) -> Result<(), Failure> {
         self.ringer.ring();
         if self.service.dynamic_config().number_of_listeners() == 0 {
