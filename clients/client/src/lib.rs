@@ -1,5 +1,5 @@
-//! The library of every program that follows a hub, or publishes topics of its own beside it. A program depends on this
-//! crate alone. Knows only `schema`: a hub is a lock that is held and topics that are there. Prints nothing; refuses to know
+//! The library of every program that follows a hub, or publishes its own topics beside it. A program depends only on this
+//! crate. Knows only `schema`: to it, a hub is a lock that is held and topics that exist. Prints nothing; refuses to know
 //! verbs.
 
 pub mod clock;

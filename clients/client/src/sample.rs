@@ -1,4 +1,4 @@
-//! A sample of any topic, and where such come from: for verbs that follow topics of several kinds.
+//! A sample of any topic, and its source: for verbs that follow topics of several kinds.
 
 use std::time::Duration;
 
@@ -18,7 +18,7 @@ macro_rules! samples {
         pub enum Sample { $(#[doc = concat!("Of `", stringify!($kind), "`.")] $kind($sample),)* }
 
         impl Sample {
-            /// Numbers, stamps and quality; nothing if nobody sent it: then it stands for a silence.
+            /// Numbers, stamps and quality; nothing if it was not sent but marks a silence.
             pub fn header(&self) -> Option<&Header> {
                 match self { $(Sample::$kind(sample) => Told::header(sample),)* }
             }
@@ -88,17 +88,17 @@ impl Sample {
         self.header().map_or(0, |header| header.period_us)
     }
 
-    /// It was said before `since_ns` of CLOCK_MONOTONIC: a topic keeps it for late joiners, or it waited for them.
+    /// It was sent before `since_ns` of CLOCK_MONOTONIC: the topic keeps it for late consumers, or it waited.
     pub fn is_of_before(&self, since_ns: u64) -> bool {
         self.header().is_some_and(|header| header.stamp_last_ns < since_ns)
     }
 
-    /// Nobody sent it: it stands for a silence.
+    /// It was not sent: it marks a silence.
     pub fn is_silence(&self) -> bool {
         self.header().is_none()
     }
 
-    /// The payload as it lies in memory; of the fold that of the sensor that was heard.
+    /// The payload as it is in memory; for the verdict over several sensors, that of the sensor whose data arrived.
     pub fn bytes(&self) -> &[u8] {
         match self {
             Sample::Telegram(sample) => sample,
@@ -114,7 +114,7 @@ impl Sample {
 }
 
 impl Sample {
-    /// Writes the payload as it goes over a network to the beginning of `room`; answers its length, or `None` if there is
+    /// Writes the payload as it is sent over a network to the start of `room`; returns its length, or `None` if there is
     /// too little room.
     pub fn pack(&self, room: &mut [u8]) -> Option<usize> {
         match self {
@@ -134,7 +134,7 @@ impl Sample {
 }
 
 impl Sample {
-    /// As [`pack`](Self::pack), zones as the hub said them: however old they were on arrival here.
+    /// As [`pack`](Self::pack), but zones as the hub sent them, however old they were on arrival here.
     pub fn pack_said(&self, room: &mut [u8]) -> Option<usize> {
         match self {
             Sample::Zones(sample) => sample.said.pack(room),

@@ -1,5 +1,5 @@
-//! A process's stay in a domain, over several lives of its hub: membership, what wakes it, and the news that a hub went or
-//! came. Refuses to know what is followed.
+//! A process in a domain, across restarts of its hub: membership, what wakes the process, and the news that a hub started
+//! or ended. Refuses to know what is followed.
 
 use std::os::fd::{AsFd, BorrowedFd};
 use std::time::{Duration, Instant};
@@ -50,14 +50,14 @@ impl Session {
         }
     }
 
-    /// Will be woken by `wait`; to be said before anything is followed.
+    /// Sets how it is woken; call it before anything is followed.
     pub fn by(self, wait: Wait) -> Session {
         Session { wait, ..self }
     }
 
-    /// Looks whether the hub is there, and joins its domain if it is a new place.
+    /// Looks whether a hub runs, and joins its domain if it is at a new place.
     ///
-    /// [`Kind::Short`](schema::Kind) if memory or descriptors are; who has joined already goes on without a look.
+    /// [`Kind::Short`](schema::Kind) if memory or descriptors are; a session that has joined continues without a look.
     pub fn look(&mut self) -> Result<Change, Failure> {
         if self.joined.as_mut().is_some_and(|joined| joined.wakeups.take_rang()) {
             self.presence.heard();
@@ -96,7 +96,7 @@ impl Session {
         Ok(change)
     }
 
-    /// Where the hub lives, if there is one.
+    /// Where the hub runs, if there is one.
     pub fn domain(&self) -> Option<&Domain> {
         self.presence.domain()
     }
@@ -106,23 +106,23 @@ impl Session {
         self.presence.who()
     }
 
-    /// There is a hub, and not only a listener that stands for those of other machines.
+    /// A hub runs, not only a listener that publishes sensors of other machines.
     pub fn hub_lives(&self) -> bool {
         self.domain().is_some_and(|domain| matches!(holder(domain.root()), Ok(Some(_))))
     }
 
-    /// What to tell who cannot wait for a hub.
+    /// The failure for callers that cannot wait for a hub.
     pub fn no_hub(&self) -> Failure {
         self.presence.no_hub()
     }
 
-    /// Counts the domains joined: ports of an earlier one are to be opened again.
+    /// Counts the domains joined: ports of an earlier one must be opened again.
     pub fn number(&self) -> u32 {
         self.number
     }
 
-    /// A subscriber of `sensor`, or nothing as long as its hub or topic is not there. What wakes it comes first, so that
-    /// nothing is sent unheard between the two.
+    /// A subscriber of `sensor`, or nothing as long as its hub or topic does not exist. What wakes it is opened first, so
+    /// that no wake-up is missed between the two.
     pub fn subscribe<P: Payload + ?Sized>(&mut self, sensor: &str) -> Result<Option<Subscriber<P>>, Failure> {
         let (Some(_), Some(joined)) = (self.presence.domain(), &mut self.joined) else {
             return Ok(None);
@@ -138,8 +138,8 @@ impl Session {
         Ok(subscriber)
     }
 
-    /// A moment in the life of `sensor`'s topics: as long as it is the same, nothing new was sent. Nothing where that is not
-    /// known. What late joiners get comes without a word, so a moment ends with the next look for the hub, too.
+    /// A moment of `sensor`'s topics: as long as it is the same, nothing new was sent. Nothing if that is not known. Late
+    /// consumers get samples without a wake-up, so a moment also ends with the next look for the hub.
     pub fn moment(&self, sensor: &str) -> Option<(u32, Instant)> {
         let rung = self.joined.as_ref()?.wakeups.rung(sensor)?;
         Some((rung, self.presence.looked_at()?))

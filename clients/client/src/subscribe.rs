@@ -1,5 +1,5 @@
-//! The client library: one topic of one sensor, in place, for as long as you like. Waits for a hub that is not there
-//! yet and goes on after one that was killed. Hides what it is woken by.
+//! One topic of one sensor, without copies, for as long as you like. Waits for a hub that does not run yet and continues
+//! after one that was killed. Hides what wakes it.
 
 use std::os::fd::BorrowedFd;
 use std::time::{Duration, Instant};
@@ -12,7 +12,7 @@ use crate::session::Session;
 use crate::wait::Wait;
 
 /// Follows the topic of `sensor` that carries `P` (`[u8]`: telegram, `Scan`, `Marks` ..), in the domain that
-/// SCANHUB_DOMAIN names. There need not be a hub yet. Who acts on zones follows them by [`zones`](crate::zones).
+/// SCANHUB_DOMAIN names. The hub may start later. To act on zones, follow them with [`zones`](crate::zones).
 ///
 /// [`Kind::Configuration`](schema::Kind) if a name is not possible.
 pub fn subscribe<P: Payload + ?Sized>(sensor: &str) -> Result<Subscription<P>, Failure> {
@@ -55,7 +55,7 @@ impl<P: Payload + ?Sized> Subscription<P> {
         self
     }
 
-    /// Waits by `wait`, to be said before the first sample is asked for; without it by [`Wait::Doorbell`].
+    /// Sets how it waits; call it before the first sample is requested. Default: [`Wait::Doorbell`].
     pub fn wait_by(self, wait: Wait) -> Self {
         Subscription { session: self.session.by(wait), ..self }
     }
@@ -91,18 +91,19 @@ impl<P: Payload + ?Sized> Subscription<P> {
         }
     }
 
-    /// Sleeps until there may be a sample; for `longest` at most, and a tenth of a second at most, so that whoever wants to
-    /// stop can. Hold no sample meanwhile.
+    /// Sleeps until there may be a sample, but at most for `longest` and a tenth of a second, so that the caller can stop.
+    /// Hold no sample meanwhile.
     ///
     /// [`Kind::Short`](schema::Kind) if the system cannot wait.
     pub fn wait(&mut self, longest: Duration) -> Result<(), Failure> {
         self.session.wait_for(Some(longest))
     }
 
-    /// What is readable while there may be a sample, for who waits for other things as well: to be polled, never read. It
-    /// is the same for as long as the subscription lives, whatever becomes of the hub. [`try_next`](Self::try_next) makes it
-    /// unreadable by answering `None`; until then poll does not sleep. It also gets readable when there is nothing: each
-    /// second, ten times a second while there is no hub, and when other topics of the sensor have something.
+    /// A descriptor that is readable while there may be a sample, for programs that also wait for other things: poll it,
+    /// never read it. It stays the same as long as the subscription exists, also if the hub restarts. When
+    /// [`try_next`](Self::try_next) returns `None`, it is not readable any more; until then poll does not sleep. It also
+    /// becomes readable without a sample: each second, ten times a second while there is no hub, and when other topics of
+    /// the sensor have something.
     ///
     /// [`Kind::Configuration`](schema::Kind) without [`Wait::Event`], [`Kind::Short`](schema::Kind) if descriptors are.
     pub fn descriptor(&mut self) -> Result<BorrowedFd<'_>, Failure> {

@@ -8,7 +8,7 @@ use schema::ipc::{self, Bell, Listener, Node, Unsupported};
 
 use crate::clock;
 
-/// What a consumer sleeps at, or whether at all.
+/// What a consumer sleeps on, or that it does not sleep.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum Wait {
     /// A word in the hub's memory, at which one call wakes all. Where the system cannot wait for the words of several
