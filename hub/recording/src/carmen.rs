@@ -1,5 +1,5 @@
 //! CARMEN logs: text lines of which `FLASER n r1 .. rn ..`, `ROBOTLASER1` and `RAWLASER1` are scans in metres. They become
-//! the telegrams that an LMS 2xx would have sent. Poses and all other lines are passed over.
+//! the telegrams that an LMS 2xx would have sent. Poses and all other lines are skipped.
 
 mod census;
 mod log;
