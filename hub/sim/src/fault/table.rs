@@ -1,5 +1,5 @@
-//! The faults as they are written, `loss=0.00135,burst=1.89`: one table says what there is, what it means and between
-//! which values; parsing, printing and the help follow it.
+//! The faults as they are written, `loss=0.00135,burst=1.89`: one table has the keys, their meaning and their range;
+//! parsing, printing and the help follow it.
 
 use std::fmt;
 use std::str::FromStr;

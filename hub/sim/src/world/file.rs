@@ -1,5 +1,5 @@
-//! A scene from TOML: the keys there are, and what each value can be. Every value is checked where it stands, so that a
-//! failure names file, line and column. The page is `docs/worlds.md`.
+//! A scene from TOML: the keys and their valid values. Every value is checked where it is written, so that a failure names
+//! file, line and column. Described in `docs/worlds.md`.
 
 use std::ops::Range;
 
