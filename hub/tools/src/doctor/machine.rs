@@ -1,4 +1,4 @@
-//! What a hub needs of the machine, whatever its sensors are: shared memory, a domain of its own. Each check judges facts
+//! What a hub needs from the machine, whatever its sensors are: shared memory, and its own domain. Each check judges facts
 //! that were gathered before, so that every verdict can be tested.
 
 use std::fs;

@@ -1,5 +1,5 @@
-//! Whether what a gateway sends to groups gets out by the interface that the configuration names for them. Without one
-//! nothing goes to groups, and a listener hears on every interface that has a link. Sends nothing.
+//! Whether the interface that the configuration names for groups can send what a gateway sends to them. Without a name
+//! nothing is sent to groups, and a listener receives on every interface that has a link. Sends nothing.
 
 use super::finding::Finding;
 use super::system::System;
