@@ -36,7 +36,7 @@ pub(crate) fn settle(root: &Path, _making: &MakingLock) -> Result<String, Failur
     let mut words = (0..).map(|number: u32| word(RandomState::new().hash_one(number)));
     let prefixes = words.by_ref().map(|word| format!("{}{word}_", start(root)));
     let prefix = prefixes.take(TRIES).find(|prefix| is_free(prefix)).ok_or_else(|| {
-        let what = format!("{SHARED_MEMORY} is full of files that begin with {}", start(root));
+        let what = format!("{SHARED_MEMORY} is full of files that start with {}", start(root));
         Failure::new(Kind::Failed, what, "have them removed, or choose another --domain")
     })?;
     directory.replace(FILE, format!("{prefix}\n").as_bytes())?;

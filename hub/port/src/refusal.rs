@@ -185,9 +185,7 @@ fn busy(path: &Path, holder: Option<Holder>) -> Failure {
                 "agetty" | "getty" => {
                     "a login waits there: stop it first (sudo systemctl stop serial-getty@...)"
                 }
-                "systemd" => {
-                    "the service manager keeps it for a service that is to go on with it: sudo systemctl stop scanhub"
-                }
+                "systemd" => "the service manager keeps it open for a service: sudo systemctl stop scanhub",
                 "gpsd" => "stop it first (sudo systemctl stop gpsd.socket gpsd)",
                 "scanhub" => "stop it first, or listen to it: scanhub list --domains",
                 _ => "stop it first",

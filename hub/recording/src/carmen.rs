@@ -69,7 +69,7 @@ impl Sweep {
         }
         let ranges_m = (0..count)
             .map(|beam| {
-                let field = fields.next().ok_or_else(|| format!("{beam} ranges where it says {count}"))?;
+                let field = fields.next().ok_or_else(|| format!("{beam} ranges instead of {count}"))?;
                 field.parse().map_err(|_| format!("range {field:?} is not a number"))
             })
             .collect::<Result<Vec<f64>, String>>()?;

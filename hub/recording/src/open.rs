@@ -325,7 +325,7 @@ fn unreadable(path: &Path, error: &io::Error) -> Failure {
         io::ErrorKind::Unsupported => "`mcap compress --compression none IN -o OUT` (of mcap.dev) unpacks it",
         io::ErrorKind::FileTooLarge => {
             "`zcat FILE > WHOLE` unpacks a packed file; `mcap filter --output-compression none IN -o OUT` (of mcap.dev) \
-             writes short chunks, and with -y TOPIC some topics alone"
+             writes short chunks, and with -y TOPIC only some topics"
         }
         _ => FORMS,
     };

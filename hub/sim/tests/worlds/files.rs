@@ -136,7 +136,11 @@ fn what_is_no_world_is_refused_by_name_place_and_remedy() {
             "w.toml:2:8: a path without points",
             "[x, y, seconds of rest]",
         ),
-        ("[[person]]\npath = [[0, 0], [1, 1]]", "w.toml:2:8: nothing says when", "speed_mm_s or until_s"),
+        (
+            "[[person]]\npath = [[0, 0], [1, 1]]",
+            "w.toml:2:8: the person's speed is not set",
+            "speed_mm_s or until_s",
+        ),
         (
             "[[person]]\npath = [[0, 0, 2], [1, 1, 3]]\nfrom_s = 1\nuntil_s = 6",
             "w.toml:2:8: 5 s of rest from 1 s until 6 s",

@@ -241,7 +241,7 @@ pub(crate) fn hubs(facts: &Facts, name_of: impl Fn(u32) -> String) -> Finding {
             facts.name,
             others.join(", ")
         ),
-        "end one of them, or give it a --domain of its own",
+        "end one of them, or give it its own --domain",
     )
 }
 

@@ -34,11 +34,11 @@ fn named(system: &System, name: &str) -> Finding {
     let Some(flags) = number("flags") else {
         return Finding::ok(
             NAME,
-            format!("by {name}, as gateway.interface says; its state is not shown here"),
+            format!("by {name}, as set in gateway.interface; its state is not shown here"),
         );
     };
     if flags & LOOPBACK != 0 {
-        return Finding::ok(NAME, format!("by {name}, as gateway.interface says: for this machine alone"));
+        return Finding::ok(NAME, format!("by {name}, as set in gateway.interface: this machine only"));
     }
     if flags & MULTICAST == 0 {
         let text = format!("gateway.interface: {name} carries no multicast");
@@ -50,7 +50,7 @@ fn named(system: &System, name: &str) -> Finding {
     if number("carrier") != Some(1) {
         return Finding::warning(NAME, format!("{name} is up and has no link"), "plug its cable in");
     }
-    Finding::ok(NAME, format!("by {name}, as gateway.interface says; it is up"))
+    Finding::ok(NAME, format!("by {name}, as set in gateway.interface; it is up"))
 }
 
 /// Flags of an interface (linux/if.h).
