@@ -52,7 +52,7 @@ pub use iceoryx2::port::{LoanError, ReceiveError, SendError};
 pub use iceoryx2::prelude::ipc::Service;
 pub use iceoryx2::prelude::{PortFactory, ZeroCopySend};
 
-/// The version of the shared-memory library: one of another version is not spoken with.
+/// The version of the shared-memory library: processes with another version are refused.
 pub const LIBRARY: &str = "iceoryx2 0.10.0";
 
 /// The membership of a process in a domain.
@@ -96,10 +96,10 @@ pub trait Payload: IceoryxSend + Debug + 'static {
     /// The topic that carries it.
     const TOPIC: Topic;
 
-    /// The topic of `sensor`, made if it is not there: for the hub. What a dead hub's consumers keep alive is reused.
+    /// The topic of `sensor`, created if it does not exist: for the hub. What a dead hub's consumers keep alive is reused.
     fn create(node: &Node, sensor: &str) -> Result<TopicService<Self>, Failure>;
 
-    /// The topic of `sensor`, or nothing as long as no hub has made it: for consumers.
+    /// The topic of `sensor`, or nothing as long as no hub has created it: for consumers.
     fn open(node: &Node, sensor: &str) -> Result<Option<TopicService<Self>>, Failure>;
 
     /// The publisher of a topic. A sample is loaned, written in place, and sent with `send()`, which returns how many
@@ -113,7 +113,7 @@ pub trait Payload: IceoryxSend + Debug + 'static {
     /// [`Kind::Short`] if memory, descriptors or places for consumers are.
     fn subscriber(topic: &TopicService<Self>) -> Result<Subscriber<Self>, Failure>;
 
-    /// The oldest sample that waits, or nothing.
+    /// The oldest waiting sample, or nothing.
     fn receive(subscriber: &Subscriber<Self>) -> Result<Option<Sample<Self>>, ReceiveError>;
 
     /// The payload of a sample, in shared memory.
@@ -222,7 +222,7 @@ fn topics(domain: &Domain) -> Result<Vec<(String, Topic)>, Failure> {
     Ok(topics)
 }
 
-/// The payload's revision that the maker of a service wrote into its `attributes`; 0 if it wrote none.
+/// The payload's revision that the creator of a service wrote into its `attributes`; 0 if it wrote none.
 pub fn payload_revision(attributes: &AttributeSet) -> u32 {
     let revision = attributes.iter().find(|attribute| attribute.key().as_bytes() == REVISION.as_bytes());
     revision.and_then(|attribute| attribute.value().to_string().parse().ok()).unwrap_or_default()

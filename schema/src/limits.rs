@@ -18,7 +18,7 @@ pub const NOTIFIERS: usize = 4;
 /// The greatest event id of a wake service.
 pub const EVENT_ID: usize = 7;
 
-/// Clients that ask something of the hub at the same time.
+/// Clients that send requests to the hub at the same time.
 pub const CONTROL_CLIENTS: usize = 16;
 /// Processes that have the control service open, dead ones that are not cleaned up yet among them.
 pub const CONTROL_NODES: usize = 32;

@@ -14,8 +14,8 @@ use nix::libc::{self, flock};
 
 use crate::{Directory, Failure, Kind, ipc, prefix, shortage};
 
-/// The lock of a hub on its domain; it ends with the value or with the process, however that ends. To be dropped after
-/// the hub's node.
+/// The lock of a hub on its domain; it ends with the value or with the process, however that ends. Drop it after the hub's
+/// node.
 #[derive(Debug)]
 pub struct HubLock {
     _publishing: Publishing,
@@ -128,8 +128,7 @@ impl Drop for Held {
     }
 }
 
-/// The process that holds the domain in `root`, if a hub lives there; 0 in the moment in which it has not yet written
-/// its pid.
+/// The process that holds the domain in `root`, if a hub runs there; 0 while it has not yet written its pid.
 ///
 /// [`Kind::Failed`] if the directory is another user's.
 pub fn holder(root: &Path) -> Result<Option<u32>, Failure> {

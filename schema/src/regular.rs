@@ -8,8 +8,8 @@ use std::path::Path;
 
 use rustix::fs::OFlags;
 
-/// Bytes of a configuration, a world or a model, at most: many times what people write. Taken to pieces it is a hundred
-/// times as long.
+/// Most bytes of a configuration, a world or a model: many times what people write. Parsed, it is a hundred times as
+/// long.
 pub const LONGEST: u64 = 512 << 10;
 
 /// Opens the regular file at `path`; never waits.

@@ -36,7 +36,7 @@ impl<P: Payload + ?Sized> Deref for Received<P> {
 }
 
 impl Received<Scan> {
-    /// CLOCK_MONOTONIC when beam `i` was measured, in ns: stamps are of bytes on the wire, the measurement is older.
+    /// CLOCK_MONOTONIC when beam `i` was measured, in ns: stamps are times of bytes on the line, the measurement is older.
     pub fn beam_time_ns(&self, i: usize) -> u64 {
         self.header().stamp_first_ns.saturating_sub(self.beam_age_ns(i))
     }
@@ -79,7 +79,7 @@ impl<P: Payload + ?Sized> Follower<P> {
         self.port.is_some()
     }
 
-    /// The next sample that waits, or nothing.
+    /// The next waiting sample, or nothing.
     ///
     /// [`Kind::Short`] if descriptors or memory are short, [`Kind::Failed`] if more than four samples are held or the
     /// topic has another layout.

@@ -25,7 +25,7 @@ pub use subscribe::{Subscription, places, subscribe};
 pub use wait::Wait;
 pub use zones::{Heard, ZonesFollower, zones};
 
-/// What topics carry, and the words for it: a program needs no second dependency.
+/// The types of topics and payloads: a program needs no second dependency.
 pub use schema::{
     Age, BEAMS, Background, Code, Counter, Counters, DEFAULT_DOMAIN, Domain, Environment, Failure, Flags,
     Foreground, Header, Kind, MARKS, Mark, Marks, Pose, Quality, ROBOT, Reasons, Request, SEGMENTS, Scan,

@@ -55,7 +55,7 @@ impl Robot {
         self.parts.iter().map(|(sensor, zones)| (sensor.as_str(), zones))
     }
 
-    /// Counts `sensor` as unknown until it is heard.
+    /// Counts `sensor` as unknown until its data arrives.
     fn expect(&mut self, sensor: &str) {
         self.parts.push((sensor.to_owned(), Zones::unknown()));
     }
@@ -68,7 +68,7 @@ pub struct RobotFollower {
 }
 
 impl RobotFollower {
-    /// As [`robot`], in the first live one of `places`.
+    /// As [`robot`], at the first of `places` where a hub runs.
     ///
     /// [`Kind::Configuration`](schema::Kind) if a sensor's name is not possible.
     pub fn in_domain(places: Vec<Domain>, sensors: &[&str]) -> Result<RobotFollower, Failure> {
@@ -127,7 +127,7 @@ impl RobotFollower {
         self.session.domain().is_some()
     }
 
-    /// Takes all that waits; whether there was anything.
+    /// Takes all waiting samples; returns whether there were any.
     fn hear(&mut self) -> Result<bool, Failure> {
         // As with one sensor's zones what is there comes first; but who always finds something has to see a hub come, too.
         let heard = self.source.drain(&mut self.session)?;

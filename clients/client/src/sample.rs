@@ -14,7 +14,7 @@ use crate::zones::{Heard, ZonesSource};
 /// Declares once what a name may stand for: the sample, and the source that it comes from.
 macro_rules! samples {
     ($($kind:ident $sample:ty, $source:ty;)*) => {
-        /// A received sample of one of the topics, or of the fold over several.
+        /// A received sample of one of the topics, or of several sensors combined.
         pub enum Sample { $(#[doc = concat!("Of `", stringify!($kind), "`.")] $kind($sample),)* }
 
         impl Sample {
@@ -33,12 +33,12 @@ macro_rules! samples {
         pub enum Source { $(#[doc = concat!("Of `", stringify!($kind), "`.")] $kind($source),)* }
 
         impl Source {
-            /// The topic has been there at least once.
+            /// The topic has existed at least once.
             pub fn subscribed(&self) -> bool {
                 match self { $(Source::$kind(source) => source.subscribed(),)* }
             }
 
-            /// The next sample that waits, or nothing; failures as [`Follower::receive`].
+            /// The next waiting sample, or nothing; failures as [`Follower::receive`].
             pub fn receive(&mut self, session: &mut Session) -> Result<Option<Sample>, Failure> {
                 Ok(match self { $(Source::$kind(source) => source.receive(session)?.map(Sample::$kind),)* })
             }
@@ -58,7 +58,7 @@ samples! {
 }
 
 impl Source {
-    /// Will follow `topic` of `sensor`; the zones of `robot` are the fold over all sensors.
+    /// Follows `topic` of `sensor`; the zones of `robot` are those of all sensors combined.
     pub fn new(sensor: &str, topic: Topic) -> Source {
         match topic {
             Topic::Telegram => Source::Telegram(Follower::new(sensor)),
@@ -72,7 +72,7 @@ impl Source {
         }
     }
 
-    /// After which time there may be something to receive although nothing was sent.
+    /// After this time there may be something to receive although nothing was sent.
     pub fn left(&self) -> Option<Duration> {
         match self {
             Source::Zones(source) => source.left(),
@@ -143,7 +143,7 @@ impl Sample {
     }
 }
 
-/// What every sample can be asked.
+/// What every sample provides.
 trait Told {
     fn header(&self) -> Option<&Header>;
     fn missed(&self) -> u64;

@@ -17,7 +17,7 @@ const LONGEST_WAIT: Duration = Duration::from_millis(100);
 /// How often whoever waits at the descriptor looks for a hub that lives: an event tells of the next one.
 const MAKE_SURE_EVERY: Duration = Duration::from_secs(1);
 
-/// Membership in the first live one of several domains.
+/// Membership in the first of several domains where a hub runs.
 pub struct Session {
     presence: Presence,
     joined: Option<Joined>,
@@ -37,7 +37,7 @@ struct Joined {
 }
 
 impl Session {
-    /// Will join the first live one of `places`, as soon as one is.
+    /// Joins the first of `places` where a hub runs, as soon as there is one.
     pub fn new(places: Vec<Domain>) -> Session {
         Session {
             presence: Presence::new(places),
@@ -145,8 +145,8 @@ impl Session {
         Some((rung, self.presence.looked_at()?))
     }
 
-    /// Readable while there may be something to receive or to see to, the same over all lives of the hub; from the first
-    /// call on it takes [`settle`](Self::settle) to make it unreadable.
+    /// A descriptor that is readable while there may be something to receive or to check; it stays the same across
+    /// restarts of the hub. After the first call, [`settle`](Self::settle) is needed to make it unreadable.
     ///
     /// [`Kind::Configuration`] if it is not waited by event, [`Kind::Short`] if descriptors are short.
     pub fn descriptor(&mut self) -> Result<BorrowedFd<'_>, Failure> {
@@ -167,8 +167,8 @@ impl Session {
         Ok(readiness.as_fd())
     }
 
-    /// Nothing waits, and nothing will have to be looked for before `left`: the descriptor, if it is used, is not readable
-    /// before. Whether something was sent meanwhile: then look again first.
+    /// Call this when nothing waits and nothing must be checked before `left`: the descriptor, if it is used, is not
+    /// readable before. Returns whether something was sent meanwhile: then look again first.
     pub fn settle(&mut self, left: Option<Duration>) -> Result<bool, Failure> {
         let Some(readiness) = &self.readiness else { return Ok(false) };
         // What a late joiner is handed comes without an event.

@@ -19,7 +19,7 @@ pub fn subscribe<P: Payload + ?Sized>(sensor: &str) -> Result<Subscription<P>, F
     Subscription::in_domain(places(None)?, sensor)
 }
 
-/// Where `domain` may be, or if none is named that which SCANHUB_DOMAIN names.
+/// The possible places of `domain`; if none is named, of the one that SCANHUB_DOMAIN names.
 ///
 /// [`Kind::Configuration`](schema::Kind) if the name is not possible.
 pub fn places(domain: Option<&str>) -> Result<Vec<Domain>, Failure> {
@@ -41,7 +41,7 @@ pub struct Subscription<P: Payload + ?Sized> {
 }
 
 impl<P: Payload + ?Sized> Subscription<P> {
-    /// As [`subscribe`], in the first live one of `places`.
+    /// As [`subscribe`], at the first of `places` where a hub runs.
     ///
     /// [`Kind::Configuration`](schema::Kind) if the sensor's name is not possible.
     pub fn in_domain(places: Vec<Domain>, sensor: &str) -> Result<Self, Failure> {
@@ -49,7 +49,7 @@ impl<P: Payload + ?Sized> Subscription<P> {
         Ok(Subscription { session: Session::new(places), follower: Follower::new(sensor), timeout: None })
     }
 
-    /// Lets [`next`](Self::next) answer `None` after a silence of `timeout`; without it waits forever.
+    /// Lets [`next`](Self::next) return `None` after a silence of `timeout`; without it, waits forever.
     pub fn timeout(mut self, timeout: Duration) -> Self {
         self.timeout = Some(timeout);
         self
@@ -121,7 +121,7 @@ impl<P: Payload + ?Sized> Subscription<P> {
         self.follower.receive(&mut self.session)
     }
 
-    /// A hub lives in the domain, as of the last call of [`next`](Self::next) or [`try_next`](Self::try_next) that found
+    /// A hub runs in the domain, as of the last call of [`next`](Self::next) or [`try_next`](Self::try_next) that found
     /// no sample waiting.
     pub fn hub_lives(&self) -> bool {
         self.session.domain().is_some()

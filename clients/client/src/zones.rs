@@ -13,21 +13,21 @@ use crate::session::Session;
 use crate::subscribe::places;
 use crate::wait::Wait;
 
-/// Follows the zones of `sensor` in the domain that SCANHUB_DOMAIN names. There need not be a hub yet.
+/// Follows the zones of `sensor` in the domain that SCANHUB_DOMAIN names. The hub may start later.
 ///
 /// [`Kind::Configuration`](schema::Kind) if a name is not possible.
 pub fn zones(sensor: &str) -> Result<ZonesFollower, Failure> {
     ZonesFollower::in_domain(places(None)?, sensor)
 }
 
-/// What was heard of a sensor's zones, or that nothing was.
+/// New data of a sensor's zones, or the news that none arrives.
 #[derive(Clone, Copy, Debug)]
 pub struct Heard {
     /// The zones of the sample; [`Zones::unknown`] if it was too old on arrival, and in a silence.
     pub zones: Zones,
-    /// Of the sample; nothing in a silence.
+    /// The header of the sample; nothing in a silence.
     pub header: Option<Header>,
-    /// Samples that were sent since the one heard before and are not handed out.
+    /// Samples that were sent since the previous one and were skipped.
     pub missed: u64,
     /// The zones are unknown because no recent data arrived, not because the hub reports it.
     pub stale: bool,
@@ -49,7 +49,7 @@ pub struct ZonesFollower {
 }
 
 impl ZonesFollower {
-    /// As [`zones`], in the first live one of `places`.
+    /// As [`zones`], at the first of `places` where a hub runs.
     ///
     /// [`Kind::Configuration`](schema::Kind) if the sensor's name is not possible.
     pub fn in_domain(places: Vec<Domain>, sensor: &str) -> Result<ZonesFollower, Failure> {
@@ -82,13 +82,13 @@ impl ZonesFollower {
         self.session.wait_for(Some(self.source.left().map_or(longest, |left| left.min(longest))))
     }
 
-    /// As [`Subscription::descriptor`](crate::Subscription::descriptor), with [`try_next`](Self::try_next) of the zones; it gets
-    /// readable also when the verdict becomes too old.
+    /// As [`Subscription::descriptor`](crate::Subscription::descriptor), with [`try_next`](Self::try_next) of the zones; it
+    /// also becomes readable when the verdict becomes too old.
     pub fn descriptor(&mut self) -> Result<BorrowedFd<'_>, Failure> {
         self.session.descriptor()
     }
 
-    /// A hub lives in the domain, as of the last call of [`next`](Self::next) or [`try_next`](Self::try_next) that found
+    /// A hub runs in the domain, as of the last call of [`next`](Self::next) or [`try_next`](Self::try_next) that found
     /// no news.
     pub fn hub_lives(&self) -> bool {
         self.session.domain().is_some()
@@ -118,7 +118,7 @@ impl ZonesFollower {
     }
 }
 
-/// The zones of a sensor, sample by sample and silence by silence, in a session of the caller's.
+/// The zones of a sensor, sample by sample and silence by silence, in the caller's session.
 pub struct ZonesSource {
     follower: Follower<Zones>,
     freshness: Freshness,
@@ -126,7 +126,7 @@ pub struct ZonesSource {
 }
 
 impl ZonesSource {
-    /// Will follow the zones of `sensor`.
+    /// Follows the zones of `sensor`.
     pub fn new(sensor: &str) -> ZonesSource {
         ZonesSource {
             follower: Follower::new(sensor),
@@ -135,7 +135,7 @@ impl ZonesSource {
         }
     }
 
-    /// The topic has been there at least once.
+    /// The topic has existed at least once.
     pub fn subscribed(&self) -> bool {
         self.follower.subscribed()
     }
@@ -169,7 +169,7 @@ impl ZonesSource {
         Ok(heard)
     }
 
-    /// The last of all that waits: what stands now. What it supersedes counts as missed.
+    /// The last of all waiting samples. The skipped ones count as missed.
     fn newest(&mut self, session: &mut Session) -> Result<Option<Heard>, Failure> {
         let mut newest: Option<Heard> = None;
         while let Some(mut heard) = self.receive(session)? {

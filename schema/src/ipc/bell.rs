@@ -84,7 +84,7 @@ impl Drop for Ringer {
 pub struct Bell(Page);
 
 impl Bell {
-    /// The bell of `sensor`, or nothing as long as no hub has hung it.
+    /// The bell of `sensor`, or nothing as long as no hub has created it.
     ///
     /// [`Kind::Short`] if memory or descriptors are, [`Kind::Failed`] if it is another user's.
     pub fn open(node: &Node, sensor: &str) -> Result<Option<Bell>, Failure> {

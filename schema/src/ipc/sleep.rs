@@ -37,8 +37,8 @@ pub fn descriptor(listener: &Listener) -> BorrowedFd<'_> {
     unsafe { BorrowedFd::borrow_raw(listener.file_descriptor().native_handle()) }
 }
 
-/// Takes all wake-ups of `listeners` that are pending; returns whether there were any. What was sent before this call
-/// has to be looked for after it.
+/// Takes all pending wake-ups of `listeners`; returns whether there were any. Look for samples that were sent before this
+/// call after it.
 ///
 /// [`Kind::Short`] if a listener does not work.
 pub fn take_wakeups(listeners: &[&Listener]) -> Result<bool, Failure> {

@@ -14,7 +14,7 @@ use crate::{Failure, Kind, prefix};
 pub struct Segment {
     /// Where it is.
     pub path: PathBuf,
-    /// The user's number whose it is.
+    /// The number of its owner.
     pub owner: u32,
     /// Permission bits.
     pub mode: u32,

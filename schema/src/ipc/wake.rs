@@ -10,7 +10,7 @@ use super::{Listener, Node, Notifier, PortFactory, WakeService, name};
 use crate::shortage::check_client;
 use crate::{Failure, Kind, Wake, limits};
 
-/// The hub's end. Made, it wakes consumers by [`Wake::HubUp`]; dropped, by [`Wake::HubDown`].
+/// The hub's end. When created, it wakes consumers with [`Wake::HubUp`]; when dropped, with [`Wake::HubDown`].
 pub struct Waker {
     ringer: Ringer,
     notifier: Notifier,
@@ -68,7 +68,7 @@ fn create_service(node: &Node, sensor: &str) -> Result<WakeService, Failure> {
     })
 }
 
-/// The event service of `sensor`, or nothing as long as no hub has made it: for consumers.
+/// The event service of `sensor`, or nothing as long as no hub has created it: for consumers.
 pub fn open_wake(node: &Node, sensor: &str) -> Result<Option<WakeService>, Failure> {
     let service = name(&Wake::service(sensor))?;
     open(node, &service, node.service_builder(&service).event().open())

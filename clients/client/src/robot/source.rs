@@ -77,12 +77,12 @@ impl RobotSource {
         &self.robot
     }
 
-    /// The topic of each sensor has been there at least once.
+    /// The topic of each sensor has existed at least once.
     pub fn subscribed(&self) -> bool {
         !self.parts.is_empty() && self.parts.iter().all(ZonesSource::subscribed)
     }
 
-    /// The next sample of any sensor, or a silence, once each has spoken; failures as [`ZonesSource::receive`].
+    /// The next sample of any sensor, or a silence, once each has sent something; failures as [`ZonesSource::receive`].
     pub fn receive(&mut self, session: &mut Session) -> Result<Option<RobotHeard>, Failure> {
         let heard = self.hear(session)?;
         Ok(heard.map(|heard| RobotHeard { robot: self.robot.clone(), heard }))
@@ -96,7 +96,7 @@ impl RobotSource {
         }
     }
 
-    /// Takes all that waits; whether there was anything.
+    /// Takes all waiting samples; returns whether there were any.
     pub fn drain(&mut self, session: &mut Session) -> Result<bool, Failure> {
         let mut any = false;
         while self.hear(session)?.is_some() {
