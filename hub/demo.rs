@@ -180,7 +180,7 @@ fn play(
             return Err(Failure::new(
                 Kind::Timeout,
                 "not every sensor streams after ten seconds",
-                "run with SCANHUB_LOG=debug to see what the hub says",
+                "run with SCANHUB_LOG=debug to see the hub's log",
             ));
         }
         let over = options.run_for.zip(first_sample).is_some_and(|(limit, first)| first.elapsed() >= limit);

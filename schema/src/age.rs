@@ -1,4 +1,4 @@
-//! How long ago something was, for people: in the unit that tells enough.
+//! How long ago something was, for people: in one suitable unit.
 
 use std::fmt;
 use std::time::Duration;

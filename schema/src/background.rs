@@ -8,7 +8,7 @@ use iceoryx2::prelude::ZeroCopySend;
 use crate::BEAMS;
 use crate::datagram::Packed;
 
-/// The payload of topic `background`, 816 bytes: when a new generation begins, and with every scan if so configured.
+/// The payload of topic `background`, 816 bytes: sent when a new generation starts, and with every scan if so configured.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Pod, Zeroable)]
 #[cfg_attr(feature = "ipc", derive(ZeroCopySend), type_name("scanhub.Background.v1"))]
 #[repr(C)]
@@ -77,7 +77,7 @@ impl Background {
         &bytemuck::bytes_of(self)[..Self::HEAD + 2 * self.ranges().len()]
     }
 
-    /// The model in `bytes`, if they are as many as its count says.
+    /// The model in `bytes`, if their number matches its count.
     pub fn unpack(bytes: &[u8]) -> Option<Background> {
         let mut background = Background::default();
         (Packed::unpack(&mut background, bytes) && background.packed().len() == bytes.len())

@@ -1,5 +1,5 @@
-//! What may be asked of a running hub, and how it answers: the payloads of the control service. Refuses to know who
-//! carries a request out.
+//! Requests to a running hub, and its answers: the payloads of the control service. Refuses to know who carries out a
+//! request.
 
 use bytemuck::{Pod, Zeroable};
 #[cfg(feature = "ipc")]
@@ -7,32 +7,32 @@ use iceoryx2::prelude::ZeroCopySend;
 
 use crate::{BEAMS, Background, Failure, Kind, text};
 
-/// What is asked for.
+/// What a request asks for.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[repr(u16)]
 pub enum Verb {
-    /// The sensor shall stop; its link stays.
+    /// Stop the sensor; its link stays.
     Pause = 1,
-    /// The sensor shall stream again.
+    /// Let the sensor stream again.
     Resume = 2,
-    /// The conversation with the sensor shall begin anew.
+    /// Restart the session with the sensor.
     Resync = 3,
-    /// The background model is wanted.
+    /// Return the background model.
     Show = 16,
-    /// The background model shall be learned anew.
+    /// Forget the background model and learn it again.
     Reset = 17,
-    /// The background model shall stay as it is.
+    /// Freeze the background model.
     Freeze = 18,
-    /// The background model shall be learned on.
+    /// Continue learning the background model.
     Thaw = 19,
-    /// The ranges of the request shall be the background model.
+    /// Use the ranges of the request as the background model.
     Load = 20,
 }
 
 impl Verb {
-    /// What may be asked of the flow of data, in the order of all output.
+    /// Requests about the flow of data, in the order of all output.
     pub const FLOW: [Verb; 3] = [Verb::Pause, Verb::Resume, Verb::Resync];
-    /// What may be asked of the background model, in the order of all output.
+    /// Requests about the background model, in the order of all output.
     pub const BACKGROUND: [Verb; 5] = [Verb::Show, Verb::Reset, Verb::Freeze, Verb::Thaw, Verb::Load];
 
     /// All verbs.
@@ -60,7 +60,7 @@ impl Verb {
     }
 }
 
-/// A request, 848 bytes. What a verb has no use for is 0.
+/// A request, 848 bytes. Fields that a verb does not use are 0.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Pod, Zeroable)]
 #[cfg_attr(feature = "ipc", derive(ZeroCopySend), type_name("scanhub.Request.v1"))]
 #[repr(C)]
@@ -89,7 +89,7 @@ impl Request {
         request
     }
 
-    /// Asks `sensor` to take the ranges of `model` as its background.
+    /// Asks `sensor` to use the ranges of `model` as its background.
     pub fn load(sensor: &str, model: &Background) -> Request {
         let mut request = Request::new(sensor, Verb::Load);
         request.count = model.count;
@@ -98,7 +98,7 @@ impl Request {
         request
     }
 
-    /// The model that it brings, for [`Verb::Load`]: generation and flags are 0.
+    /// The model that it contains, for [`Verb::Load`]: generation and flags are 0.
     pub fn model(&self) -> Background {
         let mut model = Background {
             count: self.count.min(BEAMS as u16),
@@ -122,25 +122,25 @@ impl Request {
     }
 }
 
-/// A model that was asked for.
+/// A background model in a response.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Shown {
     /// As it is now.
     pub model: Background,
-    /// When the one was written that the next hub would begin with, in nanoseconds since 1970; nothing if there is none.
+    /// When the model was saved that the next hub starts with, in nanoseconds since 1970; nothing if there is none.
     pub kept_wall_ns: Option<u64>,
 }
 
 impl From<Background> for Shown {
-    /// One that is not kept.
+    /// A model that is not saved.
     fn from(model: Background) -> Shown {
         Shown { model, kept_wall_ns: None }
     }
 }
 
-/// An answer: done, with the model that was asked for, or why not. Its bytes are exit code and message length, two bytes
-/// each and the lower one first, then the message, then the packed model. The second line of a message that says why not is a
-/// remedy; that of a model is the time in decimal digits at which one was kept.
+/// An answer: success, with the requested model if there is one, or a failure. Its bytes are exit code and message length
+/// (two bytes each, little-endian), then the message, then the packed model. The second line of the message of a failure
+/// is the remedy; with a model, it is the time at which a model was saved, in decimal digits.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Response(pub Result<Option<Shown>, Failure>);
 

@@ -1,5 +1,5 @@
-//! The LAN form of a sample: one datagram, readable without a library, checked before anything of it is believed. Refuses
-//! to know sockets, who sent it and what is missing between two of them. Needs neither shared memory nor a heap.
+//! A sample on a network: one datagram, readable without a library, checked before any of it is used. Refuses to know
+//! sockets, senders and what is missing between two datagrams. Needs neither shared memory nor a heap.
 
 mod announce;
 mod datagram_error;
@@ -24,7 +24,7 @@ use crate::{Telegram, Topic};
 
 /// Bytes before the payload.
 pub const HEAD: usize = 48;
-/// Bytes of a MAC behind the payload, if [`LanFlags::AUTHENTICATED`] is set.
+/// Bytes of a MAC after the payload, if [`LanFlags::AUTHENTICATED`] is set.
 pub const MAC: usize = 16;
 /// The longest datagram that is never fragmented where tunnels leave an MTU of 1400.
 pub const MTU_SAFE: usize = 1372;
@@ -53,7 +53,7 @@ impl LanFlags {
     pub const SUSPECT: u8 = 16;
 }
 
-/// What stands before the payload.
+/// The header, before the payload.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Head {
     /// [`Announce::NUMBER`], or a topic's [`Topic::number`].
@@ -72,25 +72,25 @@ pub struct Head {
     pub sensor: u8,
     /// Revision of the payload: a greater one only appends.
     pub revision: u16,
-    /// The lower half of the sample's `seq`: joins what came from one telegram.
+    /// The lower half of the sample's `seq`: joins the samples of one telegram.
     pub counter: u32,
 }
 
 /// A datagram whose header, lengths and checksum are right.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Datagram<'a> {
-    /// What stands before the payload.
+    /// The header, before the payload.
     pub head: Head,
-    /// The payload; what it says is checked by [`Packed::unpack`].
+    /// The payload; [`Packed::unpack`] checks its content.
     pub payload: &'a [u8],
-    /// The MAC, if there is one. Nothing here can tell whether it is right.
+    /// The MAC, if there is one. It is not checked here.
     pub mac: Option<&'a [u8; MAC]>,
 }
 
 impl Head {
-    /// Writes the header before a payload of `len` bytes that stands in `buffer` from [`HEAD`] on, and the checksum;
-    /// answers the whole datagram. `None` if the buffer ends before the payload or the payload has no length of two
-    /// bytes. There is no MAC behind it.
+    /// Writes the header before a payload of `len` bytes that starts at [`HEAD`] in `buffer`, and the checksum; returns
+    /// the whole datagram, without a MAC. `None` if the buffer ends before the payload does, or if the length does not
+    /// fit into two bytes.
     pub fn seal<'a>(&self, buffer: &'a mut [u8], len: usize) -> Option<&'a [u8]> {
         let datagram = buffer.get_mut(..HEAD + len)?;
         let (head, _) = datagram.split_first_chunk_mut::<HEAD>()?;

@@ -3,7 +3,7 @@
 //!
 //! The last two steps, base and domain, must belong to this user and be writable by nobody else; a link is never
 //! followed there. Above them a link is followed if root or this user made it where nobody else can make one: `/home` or
-//! `/var/run` may be links. Who owns the directories above the base is not looked at.
+//! `/var/run` may be links. The owners of the directories above the base are not checked.
 
 use std::ffi::{OsStr, OsString};
 use std::fs::File;
@@ -38,11 +38,11 @@ impl Directory {
         Walk::to(root, user(), false)
     }
 
-    /// As [`open`](Self::open); what is missing is made for this user alone.
+    /// As [`open`](Self::open); what is missing is created, only for this user.
     ///
     /// # Errors
     ///
-    /// As [`open`](Self::open), and [`Kind::Failed`] if it cannot be made.
+    /// As [`open`](Self::open), and [`Kind::Failed`] if it cannot be created.
     pub fn make(root: &Path) -> Result<Directory, Failure> {
         let made = Walk::to(root, user(), true)?;
         made.ok_or_else(|| unusable(root, Errno::NOENT))
@@ -60,17 +60,17 @@ impl Directory {
         }
     }
 
-    /// The file `name` to read and write, made with mode 0600 if there is none.
+    /// The file `name` to read and write, created with mode 0600 if there is none.
     ///
     /// # Errors
     ///
-    /// As [`file`](Self::file), and if it cannot be made.
+    /// As [`file`](Self::file), and if it cannot be created.
     pub fn file_or_new(&self, name: &str) -> Result<File, Failure> {
         let opened = self.open_file(name, OFlags::RDWR | OFlags::CREATE);
         self.checked(name, opened)
     }
 
-    /// Puts `content` in the place of the file `name` in one step: a reader sees the old or the new one.
+    /// Replaces the file `name` by `content` in one step: a reader sees the old or the new one.
     ///
     /// # Errors
     ///
@@ -84,7 +84,7 @@ impl Directory {
         renameat(&self.fd, &beside, &self.fd, name).map_err(|error| unusable(&self.path.join(name), error))
     }
 
-    /// Removes the file `name`; one that is not there, or cannot be removed, stays so.
+    /// Removes the file `name`; does nothing if it does not exist or cannot be removed.
     pub(crate) fn remove(&self, name: &OsStr) {
         let _ = unlinkat(&self.fd, name, AtFlags::empty());
     }
@@ -94,7 +94,7 @@ impl Directory {
         let _ = unlinkat(&self.fd, name, AtFlags::REMOVEDIR);
     }
 
-    /// What is in it: names and what they are, links as links.
+    /// Its entries: names and types, links as links.
     pub(crate) fn entries(&self) -> Vec<(OsString, Stat)> {
         let Ok(entries) = Dir::read_from(&self.fd) else { return Vec::new() };
         let names = entries.filter_map(|entry| {
@@ -114,7 +114,7 @@ impl Directory {
         is_own.then(|| Directory { fd, path: self.path.join(name) })
     }
 
-    /// Removes it, if it is empty and still at its place; whether it is gone.
+    /// Removes it, if it is empty and still at its place; returns whether it is gone.
     pub(crate) fn remove_itself(&self) -> bool {
         let there = self.path.symlink_metadata().map(|it| (it.dev(), it.ino()));
         let is_here =

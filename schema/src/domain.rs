@@ -1,11 +1,11 @@
-//! Where the shared memory of one hub lives: a root directory and a prefix that no other hub shares. Pure: which
-//! places there are, in which order; refuses to look whether a hub lives there.
+//! Where the shared memory of one hub is: a root directory and a prefix that no other hub shares. Pure: it lists the
+//! possible places in their order; refuses to check whether a hub runs there.
 
 use std::path::{Path, PathBuf};
 
 use crate::{Failure, Kind};
 
-/// The domain of those who name none.
+/// The default domain.
 pub const DEFAULT_DOMAIN: &str = "scanhub";
 
 /// Root and prefix, with its random part, stay below this many bytes: the path of a listener's socket, 107 bytes at most
@@ -63,7 +63,7 @@ impl Domain {
     }
 
     /// Where a client looks for domain `name`: below `base` only if given, else every place that a hub may have
-    /// chosen, in order; the first one that is live is taken. Places that are too long for a hub are left out.
+    /// chosen, in order; the first one where a hub runs is used. Places that are too long for a hub are left out.
     ///
     /// [`Kind::Configuration`] as [`Domain::at`].
     pub fn candidates(
@@ -95,18 +95,18 @@ impl Domain {
         &self.root
     }
 
-    /// How the names of its shared memory begin; what follows is in the directory's file `prefix`.
+    /// The start of the names of its shared memory; the rest is in the directory's file `prefix`.
     pub fn prefix(&self) -> String {
         format!("sh_{}_", self.name)
     }
 }
 
-/// What the process's environment says about places.
+/// The variables of the process's environment that name places.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct Environment {
     /// RUNTIME_DIRECTORY: set for the service, by systemd.
     pub runtime_directory: Option<PathBuf>,
-    /// XDG_RUNTIME_DIR: set for a user who logged in.
+    /// XDG_RUNTIME_DIR: set for a user who has logged in.
     pub xdg_runtime_dir: Option<PathBuf>,
     /// The user's number.
     pub uid: u32,

@@ -100,7 +100,7 @@ pub struct Failure {
 }
 
 impl Failure {
-    /// A failure of `kind` that says `message`, with the remedy `hint`.
+    /// A failure of `kind` with `message` and the remedy `hint`.
     pub fn new(kind: Kind, message: impl Into<String>, hint: impl Into<String>) -> Self {
         Failure { kind, message: message.into(), hint: hint.into() }
     }

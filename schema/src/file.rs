@@ -1,5 +1,5 @@
-//! The form of a recording: samples as messages of an MCAP file, a channel for each sensor's topic. A message is the
-//! header of shared memory and, behind it, the payload as it goes over a network (docs/recording.md). Refuses to know
+//! The format of a recording: samples as messages of an MCAP file, a channel for each sensor's topic. A message is the
+//! header of shared memory, followed by the payload as it is sent over a network (docs/recording.md). Refuses to know
 //! where samples come from, when a chunk is full, and what a disk does.
 
 mod compression;
@@ -17,11 +17,11 @@ pub use compression::Compression;
 
 /// Encoding of the messages, and of the text that describes them.
 pub const ENCODING: &str = "scanhub";
-/// Name of the metadata record that a recording begins with: who recorded what, where.
+/// Name of the metadata record at the start of a recording: who recorded what, where.
 pub const METADATA: &str = "scanhub";
 
-/// Writes a recording into `W`. Whatever was written up to [`close_chunk`](Self::close_chunk) can be read even if nothing
-/// follows; until then it lies in memory.
+/// Writes a recording into `W`. Everything written up to [`close_chunk`](Self::close_chunk) can be read even if nothing
+/// follows; until then it is only in memory.
 pub struct Writer<W: Write> {
     mcap: mcap::Writer<NoSeek<BufWriter<W>>>,
     /// Of each sensor, few enough to be looked through.
@@ -29,7 +29,7 @@ pub struct Writer<W: Write> {
     message: Vec<u8>,
 }
 
-/// What a file needs to be told of a channel that is none of the hub's topics.
+/// The description of a channel that is not one of the hub's topics.
 #[derive(Clone, Copy, Debug)]
 pub struct Foreign<'a> {
     /// Name of the channel.
@@ -38,12 +38,12 @@ pub struct Foreign<'a> {
     pub encoding: &'a str,
     /// Name of their type, its description, and in what language that is written, such as `ros2msg`.
     pub schema: (&'a str, &'a str, &'a str),
-    /// What else is told of the channel: keys and values.
+    /// Metadata of the channel: keys and values.
     pub metadata: &'a [(&'a str, &'a str)],
 }
 
 impl<W: Write> Writer<W> {
-    /// Begins a recording of `profile` (empty, or `ros2`), of which `facts` are told; its chunks are not packed.
+    /// Starts a recording of `profile` (empty, or `ros2`) with the metadata `facts`; its chunks are not compressed.
     pub fn begin(out: W, profile: &str, facts: BTreeMap<String, String>) -> io::Result<Self> {
         Writer::packed(out, profile, Compression::None, facts)
     }
@@ -132,12 +132,12 @@ impl<W: Write> Writer<W> {
         self.mcap.write_to_known_channel(header, data).map_err(io_error)
     }
 
-    /// Writes a file within the file, as another one has it, behind a chunk that this closes.
+    /// Copies an attachment of another file, after the chunk, which this closes.
     pub fn copied_attachment(&mut self, attachment: &Attachment<'_>) -> io::Result<()> {
         self.mcap.attach(attachment).map_err(io_error)
     }
 
-    /// Writes a metadata record called `name`, behind a chunk that this closes.
+    /// Writes a metadata record called `name`, after the chunk, which this closes.
     pub fn note(&mut self, name: &str, facts: BTreeMap<String, String>) -> io::Result<()> {
         self.mcap.write_metadata(&Metadata { name: name.to_owned(), metadata: facts }).map_err(io_error)
     }

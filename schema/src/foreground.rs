@@ -1,4 +1,4 @@
-//! What stands before the background, in one scan. Refuses to know how a background is learned.
+//! What is in front of the background, in one scan. Refuses to know how a background is learned.
 
 use bytemuck::{Pod, Zeroable};
 #[cfg(feature = "ipc")]

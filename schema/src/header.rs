@@ -1,4 +1,4 @@
-//! What every sample carries besides its payload: numbers that show loss, stamps that join topics, the hub's life.
+//! What every sample carries besides its payload: numbers that show loss, stamps that join topics, the run of the hub.
 //! Refuses to know what the payload is.
 
 use bytemuck::{Pod, Zeroable};
@@ -10,8 +10,8 @@ use iceoryx2::prelude::ZeroCopySend;
 #[cfg_attr(feature = "ipc", derive(ZeroCopySend), type_name("scanhub.Header.v1"))]
 #[repr(C)]
 pub struct Header {
-    /// Number of the telegram that the sample came from: per sensor and hub life, from 0. In a status it is the last
-    /// telegram's.
+    /// Number of the telegram that the sample was made from: per sensor and run of the hub, from 0. In a status, the
+    /// number of the last telegram.
     pub seq: u64,
     /// Number of the sample in its topic, from 0, gap-free as sent: a gap is what a consumer missed.
     pub topic_seq: u64,
@@ -35,22 +35,22 @@ pub struct Header {
     pub hub_pid: u32,
     /// Why the telegram is suspect: bits of [`Reasons`]; 0 if it is clean.
     pub reasons: u8,
-    /// From the telegram's last byte until the sample was sent, in units of 256 ns, rounded up; little-endian. FFFFFFh is
-    /// that or more, 0 not told: of what was said without a telegram, and of other machines. See
+    /// From the telegram's last byte until the sample was sent, in units of 256 ns, rounded up; little-endian. FFFFFFh:
+    /// that or more; 0: not known, for samples without a telegram and those of other machines. See
     /// [`hub_time_ns`](Self::hub_time_ns).
     pub hub_time: [u8; 3],
 }
 
 impl Header {
     /// Time from the telegram's last byte until the sample was sent, in ns, at most 256 too much; nothing if it is not
-    /// told, or was more than four seconds.
+    /// known, or was more than four seconds.
     pub fn hub_time_ns(&self) -> Option<u64> {
         let [low, middle, high] = self.hub_time;
         let units = u32::from_le_bytes([low, middle, high, 0]);
         (1..HUB_TIME_MORE).contains(&units).then(|| u64::from(units) * HUB_TIME_UNIT_NS)
     }
 
-    /// Takes `now_ns` of CLOCK_MONOTONIC for the moment at which the sample is sent; the telegram's stamps are there already.
+    /// Sets the moment at which the sample is sent to `now_ns` of CLOCK_MONOTONIC; the telegram's stamps must be set.
     pub fn set_sent_at(&mut self, now_ns: u64) {
         let units = now_ns.saturating_sub(self.stamp_last_ns).div_ceil(HUB_TIME_UNIT_NS);
         let units = units.clamp(1, HUB_TIME_MORE.into()) as u32;
@@ -123,7 +123,7 @@ impl Flags {
     pub const SIMULATED: u16 = 2;
     /// The link is a recording.
     pub const REPLAYED: u16 = 4;
-    /// The stamps were computed, not taken when the bytes came.
+    /// The stamps were computed, not taken when the bytes arrived.
     pub const STAMP_ESTIMATED: u16 = 8;
     /// The sample came from another machine.
     pub const REMOTE: u16 = 32;

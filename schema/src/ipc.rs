@@ -54,7 +54,7 @@ pub use iceoryx2::port::{LoanError, ReceiveError, SendError};
 pub use iceoryx2::prelude::ipc::Service;
 pub use iceoryx2::prelude::{PortFactory, ZeroCopySend};
 
-/// The version of the shared-memory library: one of another version is not spoken with.
+/// The version of the shared-memory library: processes with another version are refused.
 pub const LIBRARY: &str = "iceoryx2 0.10.0";
 
 /// The membership of a process in a domain.
@@ -78,7 +78,7 @@ pub type Notifier = port::notifier::Notifier<Service>;
 /// Sleeps until it is woken.
 pub type Listener = port::listener::Listener<Service>;
 
-/// The node of a hub or listener in `domain`, for who holds its [`HubLock`](crate::HubLock) or
+/// The node of a hub or listener in `domain`; the caller holds its [`HubLock`](crate::HubLock) or
 /// [`ListenLock`](crate::ListenLock). Cleans up what dead ones and consumers left.
 ///
 /// [`Kind::Failed`] with owner, mode and remedy if the directory is another user's.
@@ -98,10 +98,10 @@ pub trait Payload: IceoryxSend + Debug + 'static {
     /// The topic that carries it.
     const TOPIC: Topic;
 
-    /// The topic of `sensor`, made if it is not there: for the hub. What a dead hub's consumers keep alive is reused.
+    /// The topic of `sensor`, created if it does not exist: for the hub. What a dead hub's consumers keep alive is reused.
     fn create(node: &Node, sensor: &str) -> Result<TopicService<Self>, Failure>;
 
-    /// The topic of `sensor`, or nothing as long as no hub has made it: for consumers.
+    /// The topic of `sensor`, or nothing as long as no hub has created it: for consumers.
     fn open(node: &Node, sensor: &str) -> Result<Option<TopicService<Self>>, Failure>;
 
     /// The publisher of a topic. A sample is loaned, written in place, and sent with `send()`, which returns how many
@@ -115,7 +115,7 @@ pub trait Payload: IceoryxSend + Debug + 'static {
     /// [`Kind::Short`] if memory, descriptors or places for consumers are.
     fn subscriber(topic: &TopicService<Self>) -> Result<Subscriber<Self>, Failure>;
 
-    /// The oldest sample that waits, or nothing.
+    /// The oldest waiting sample, or nothing.
     fn receive(subscriber: &Subscriber<Self>) -> Result<Option<Sample<Self>>, ReceiveError>;
 
     /// The payload of a sample, in shared memory.
@@ -203,7 +203,7 @@ pub fn sensors(domain: &Domain) -> Result<Vec<String>, Failure> {
     Ok(sensors)
 }
 
-/// The sensors that have zones in `domain`, sorted, as [`sensors`]: those that a robot's verdict is made of.
+/// The sensors that have zones in `domain`, sorted, as [`sensors`]: those that make a robot's verdict.
 pub fn sensors_with_zones(domain: &Domain) -> Result<Vec<String>, Failure> {
     let with_zones = topics(domain)?.into_iter().filter(|(_, topic)| *topic == Topic::Zones);
     Ok(with_zones.map(|(sensor, _)| sensor).collect())
@@ -224,7 +224,7 @@ fn topics(domain: &Domain) -> Result<Vec<(String, Topic)>, Failure> {
     Ok(topics)
 }
 
-/// The payload's revision that the maker of a service wrote into its `attributes`; 0 if it wrote none.
+/// The payload's revision that the creator of a service wrote into its `attributes`; 0 if it wrote none.
 pub fn payload_revision(attributes: &AttributeSet) -> u32 {
     let revision = attributes.iter().find(|attribute| attribute.key().as_bytes() == REVISION.as_bytes());
     revision.and_then(|attribute| attribute.value().to_string().parse().ok()).unwrap_or_default()

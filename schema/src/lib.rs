@@ -1,5 +1,5 @@
-//! The words everyone speaks: what the hub publishes, and the names under which it does. Knows nobody: no serial line,
-//! no configuration, no verb. Without feature `ipc` it is plain bytes and names, enough for a receiver on the LAN.
+//! What hub and clients share: what the hub publishes, and under which names. Knows no serial line, no configuration and
+//! no verb. Without feature `ipc` it is plain bytes and names, enough for a receiver on a network.
 
 mod age;
 mod background;

@@ -11,14 +11,14 @@ pub const NODES: usize = 260;
 pub const BORROWED: usize = 4;
 /// Samples that the publisher may have in work at a time.
 pub const LOANED: usize = 2;
-/// Consumers asleep at a wake service: those of all topics of a sensor, and who looks at its status beside 200 of one.
+/// Consumers that sleep on a wake service: those of all topics of a sensor, and others besides 200 of one topic.
 pub const LISTENERS: usize = 250;
 /// Notifiers of a wake service: the hub's link, and those of dead hubs that are not cleaned up yet.
 pub const NOTIFIERS: usize = 4;
 /// The greatest event id of a wake service.
 pub const EVENT_ID: usize = 7;
 
-/// Clients that ask something of the hub at the same time.
+/// Clients that send requests to the hub at the same time.
 pub const CONTROL_CLIENTS: usize = 16;
 /// Processes that have the control service open, dead ones that are not cleaned up yet among them.
 pub const CONTROL_NODES: usize = 32;
@@ -33,7 +33,7 @@ pub const fn buffer(topic: Topic) -> usize {
     topic.row().waiting
 }
 
-/// Samples that a consumer of `topic` gets which comes later.
+/// Samples that a late consumer of `topic` gets.
 pub const fn history(topic: Topic) -> usize {
     topic.row().kept
 }

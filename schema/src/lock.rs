@@ -1,5 +1,5 @@
-//! Who publishes in a domain: one hub at most, and one listener that brings topics of other machines. Each holds a lock
-//! that dies with its process. Consumers ask who holds them and never hold one themselves. Refuses to know what is
+//! Who publishes in a domain: at most one hub, and one listener that publishes topics of other machines. Each holds a lock
+//! that ends with its process. Consumers ask who holds the locks and never hold one themselves. Refuses to know what is
 //! published.
 
 use std::fs::File;
@@ -14,24 +14,24 @@ use nix::libc::{self, flock};
 
 use crate::{Directory, Failure, Kind, ipc, prefix, shortage};
 
-/// The lock of a hub on its domain; it ends with the value or with the process, however that ends. To be dropped after
-/// the hub's node.
+/// The lock of a hub on its domain; it ends with the value or with the process, however that ends. Drop it after the hub's
+/// node.
 #[derive(Debug)]
 pub struct HubLock {
     _publishing: Publishing,
 }
 
 impl HubLock {
-    /// Makes the directory `root` for this user alone, takes the lock and writes this process's id into it.
+    /// Creates the directory `root` for this user only, takes the lock and writes this process's id into it.
     ///
     /// [`Kind::DomainHeld`] if another hub has it (the message names its pid), [`Kind::Failed`] if the directory is
-    /// another user's or cannot be made.
+    /// another user's or cannot be created.
     pub fn acquire(root: &Path) -> Result<HubLock, Failure> {
         Ok(HubLock { _publishing: Publishing::acquire(root, HUB, "hub")? })
     }
 }
 
-/// The lock of who publishes in a domain what other machines send. It stands beside a hub's and ends as that does.
+/// The lock of the listener that publishes what other machines send. It exists beside a hub's lock and ends like it.
 #[derive(Debug)]
 pub struct ListenLock {
     _publishing: Publishing,
@@ -128,8 +128,7 @@ impl Drop for Held {
     }
 }
 
-/// The process that holds the domain in `root`, if a hub lives there; 0 in the moment in which it has not yet written
-/// its pid.
+/// The process that holds the domain in `root`, if a hub runs there; 0 while it has not yet written its pid.
 ///
 /// [`Kind::Failed`] if the directory is another user's.
 pub fn holder(root: &Path) -> Result<Option<u32>, Failure> {

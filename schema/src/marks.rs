@@ -35,7 +35,7 @@ pub struct Mark {
     pub weight: u16,
     /// The greatest intensity.
     pub peak: u8,
-    /// 1: the mark touches the first or the last beam, so a part of it may lie outside.
+    /// 1: the mark touches the first or the last beam, so a part of it may be outside.
     pub edge: u8,
     /// Its first beam.
     pub first_beam: u16,
@@ -60,7 +60,7 @@ impl Marks {
         &self.mark_array[..usize::from(self.count).min(MARKS)]
     }
 
-    /// The sensor sends what marks are found by: without it an empty list says nothing.
+    /// The sensor sends reflector bits: without them, an empty list means nothing.
     pub fn is_available(&self) -> bool {
         self.flags & Marks::UNAVAILABLE == 0
     }

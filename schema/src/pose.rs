@@ -1,10 +1,10 @@
-//! Where a sensor sits on the robot, and where its beams point. Refuses to know what they meet.
+//! Where a sensor is mounted on the robot, and where its beams point. Refuses to know what they hit.
 
 use bytemuck::{Pod, Zeroable};
 #[cfg(feature = "ipc")]
 use iceoryx2::prelude::ZeroCopySend;
 
-/// A sensor's place in the robot's frame: x ahead, y left, the origin at the robot's centre. 32 bytes.
+/// A sensor's pose in the robot's frame: x ahead, y left, the origin at the robot's centre. 32 bytes.
 ///
 /// The default is a sensor at the centre that looks ahead.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Pod, Zeroable)]

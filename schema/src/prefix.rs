@@ -1,6 +1,6 @@
-//! How the names of a domain's shared memory begin: `sh_DOMAIN_`, then a word that nobody can guess. /dev/shm is
-//! open to all users; without the word another one could occupy the names before the hub starts. The word is kept in the
-//! file `prefix` of the domain's directory, which only this user can read, and lives as long as anybody uses it.
+//! The prefix of the names of a domain's shared memory: `sh_DOMAIN_`, then a random word that nobody can guess. /dev/shm
+//! is open to all users; without the word, another user could occupy the names before the hub starts. The word is stored
+//! in the file `prefix` of the domain's directory, which only this user can read, and stays as long as anybody uses it.
 
 use std::hash::{BuildHasher, RandomState};
 use std::io::Read;
@@ -36,7 +36,7 @@ pub(crate) fn settle(root: &Path, _making: &MakingLock) -> Result<String, Failur
     let mut words = (0..).map(|number: u32| word(RandomState::new().hash_one(number)));
     let prefixes = words.by_ref().map(|word| format!("{}{word}_", start(root)));
     let prefix = prefixes.take(TRIES).find(|prefix| is_free(prefix)).ok_or_else(|| {
-        let what = format!("{SHARED_MEMORY} is full of files that begin with {}", start(root));
+        let what = format!("{SHARED_MEMORY} is full of files that start with {}", start(root));
         Failure::new(Kind::Failed, what, "have them removed, or choose another --domain")
     })?;
     directory.replace(FILE, format!("{prefix}\n").as_bytes())?;

@@ -1,5 +1,5 @@
-//! Text of whatever origin for a terminal: names and errors may come from another machine, and must not move its cursor
-//! or change its colours. Every place that writes lines writes them so. Refuses to know what is text of ours.
+//! Text of any origin for a terminal: names and errors may come from another machine, and must not move the cursor or
+//! change colours. Every line is written through this. Refuses to know which text is our own.
 
 use std::fmt::{self, Write};
 
@@ -13,8 +13,8 @@ impl fmt::Display for Printable<'_> {
     }
 }
 
-/// Writes in a line of JSON what JSON leaves as it is and a terminal obeys, DEL and C1, as `\u` and four digits: it says
-/// the same then. C0 is written so anyway.
+/// Replaces control characters that JSON allows but a terminal would obey, DEL and C1, by `\u` and four digits, which has
+/// the same meaning in JSON. C0 is always written like this.
 pub fn escape_json(line: &mut Vec<u8>) {
     let code = |at: usize, line: &[u8]| match line[at] {
         0x7f => Some((1, 0x7f)),

@@ -1,5 +1,5 @@
-//! Files that somebody names: regular ones alone, and no more of them than is expected. A pipe may have no writer and a
-//! device no end, so neither is waited for. Refuses to know what is in them.
+//! Reads files named by a user: only regular ones, and only up to an expected length. A pipe may have no writer and a
+//! device no end, so neither is read. Refuses to know what is in them.
 
 use std::fs::{File, OpenOptions};
 use std::io::{self, ErrorKind, Read};
@@ -8,8 +8,8 @@ use std::path::Path;
 
 use rustix::fs::OFlags;
 
-/// Bytes of a configuration, a world or a model, at most: many times what people write. Taken to pieces it is a hundred
-/// times as long.
+/// Most bytes of a configuration, a world or a model: many times what people write. Parsed, it is a hundred times as
+/// long.
 pub const LONGEST: u64 = 512 << 10;
 
 /// Opens the regular file at `path`; never waits.

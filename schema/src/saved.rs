@@ -1,11 +1,11 @@
-//! A background model as one JSON object: the line that shows it, and the file that it is saved to and loaded from. What
-//! is read was written by anybody and is believed in nothing. Refuses to know where the text lies.
+//! A background model as one JSON object: the line that shows it, and the file that it is saved to and loaded from. Input
+//! may come from anybody, so all of it is checked. Refuses to know where the text is stored.
 
 use serde::{Deserialize, Serialize, Serializer};
 
 use crate::{Background, Failure, Kind};
 
-/// A model that was read, and whose it was.
+/// A model that was read, and its sensor.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct SavedModel {
     /// The sensor that it was saved from.
@@ -50,10 +50,10 @@ pub fn as_json<'a>(sensor: &'a str, model: &'a Background) -> impl Serialize + '
 }
 
 impl SavedModel {
-    /// The model in `text`, which was found at `place`. Keys that this program does not know are passed over.
+    /// The model in `text`, which was found at `place`. Keys that this program does not know are ignored.
     ///
-    /// [`Kind::Configuration`] with place and reason if it is no whole model: cut short, no JSON, of another class, or
-    /// with numbers that are impossible or contradict each other.
+    /// [`Kind::Configuration`] with place and reason if it is not a complete model: cut short, not JSON, of another class,
+    /// or with numbers that are impossible or contradict each other.
     pub fn parse(text: &[u8], place: &str) -> Result<SavedModel, Failure> {
         let head: Head = read(text, place)?;
         if head.class != CLASS {

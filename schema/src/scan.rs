@@ -1,5 +1,5 @@
 //! One scan, as the sensor sent it: ranges in device units with their codes, and the bits above the range. Refuses to
-//! know the sensor's modes: the few numbers that tell how to read a range come with it.
+//! know the sensor's modes: each scan contains the few numbers that are needed to read a range.
 
 use bytemuck::{Pod, Zeroable};
 #[cfg(feature = "ipc")]
@@ -8,7 +8,7 @@ use iceoryx2::prelude::ZeroCopySend;
 /// The most beams a scan has: 100 degrees in quarters.
 pub const BEAMS: usize = 401;
 
-/// Bit of [`Scan::contents`]: the upper bits are there.
+/// Bit of [`Scan::contents`]: the upper bits are present.
 pub const CONTENTS_UPPER: u8 = 1;
 
 /// One turn of the mirror, in ns (75 Hz).
@@ -85,7 +85,7 @@ impl Scan {
         if self.classify(value).is_none() { Some(value) } else { None }
     }
 
-    /// Why beam `i` has no valid reading; nothing if it has one or is not there.
+    /// Why beam `i` has no valid reading; nothing if it has one or does not exist.
     #[inline]
     pub fn code(&self, i: usize) -> Option<Code> {
         self.classify(*self.ranges().get(i)?)
@@ -131,7 +131,7 @@ impl Scan {
 pub struct Code(pub u16);
 
 impl Code {
-    /// Nothing came back.
+    /// No echo.
     pub const NO_RETURN: Code = Code(0);
     /// The receiver was dazzled.
     pub const DAZZLE: Code = Code(1);
@@ -141,7 +141,7 @@ impl Code {
     pub const NOISE: Code = Code(4);
     /// The sensor could not read its own measurement.
     pub const READ_ERROR: Code = Code(5);
-    /// Something came back from beyond the range limit.
+    /// An echo from beyond the range limit.
     pub const BEYOND: Code = Code(8);
 }
 

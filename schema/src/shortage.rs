@@ -1,6 +1,6 @@
 //! What is short on this machine: shared memory, descriptors, room for a domain's files. The shared-memory library
-//! promises segments without allocating them, so that at a full /dev/shm the first touch ends the process by SIGBUS;
-//! of anything else that is short it says no more than "internal error". Refuses to know for what something is needed.
+//! reserves segments without allocating them, so with a full /dev/shm the first access ends the process with SIGBUS; for
+//! any other shortage it only says "internal error". Refuses to know what something is needed for.
 
 mod segments;
 
@@ -29,7 +29,7 @@ const PORT_DESCRIPTORS: u64 = 8;
 /// Descriptors that a client of the control service takes.
 pub(crate) const CONTROL_DESCRIPTORS: u64 = 24;
 
-/// Refuses to go on where fewer than `needed` bytes of shared memory are free, or may not be had by this process.
+/// Fails if fewer than `needed` bytes of shared memory are free or allowed for this process.
 ///
 /// [`Kind::Short`] with what is free and what is needed.
 pub fn check_memory(needed: u64) -> Result<(), Failure> {
@@ -38,7 +38,7 @@ pub fn check_memory(needed: u64) -> Result<(), Failure> {
     check_address_space(needed)
 }
 
-/// Refuses to go on where this process may not make files of `needed` bytes, which segments are.
+/// Fails if this process may not create files of `needed` bytes, because segments are files.
 ///
 /// [`Kind::Short`] with the limit and what is needed.
 fn check_file_size(needed: u64) -> Result<(), Failure> {
@@ -54,8 +54,8 @@ fn check_file_size(needed: u64) -> Result<(), Failure> {
     Err(Failure::new(Kind::Short, what, "raise the limit: `ulimit -f unlimited`, for a service LimitFSIZE"))
 }
 
-/// Refuses to go on where this process may not map `needed` more bytes, and what making them takes: one that cannot be
-/// mapped is left behind by the library.
+/// Fails if this process may not map `needed` more bytes and what creating them takes: the library would leave behind a
+/// segment that it cannot map.
 ///
 /// [`Kind::Short`] with the limit and what is needed.
 pub fn check_address_space(needed: u64) -> Result<(), Failure> {
@@ -76,7 +76,7 @@ pub fn check_address_space(needed: u64) -> Result<(), Failure> {
     ))
 }
 
-/// Refuses to go on where fewer than `needed` more descriptors can be opened.
+/// Fails if fewer than `needed` more descriptors can be opened.
 ///
 /// [`Kind::Short`] with the limit and what is needed.
 pub fn check_descriptors(needed: u64) -> Result<(), Failure> {
@@ -96,10 +96,9 @@ pub fn check_descriptors(needed: u64) -> Result<(), Failure> {
     ))
 }
 
-/// Lets the process have as many descriptors as its hard limit allows: who publishes needs about four for each consumer
-/// of a topic.
+/// Raises the limit of descriptors to the hard limit: a publisher needs about four for each consumer of a topic.
 ///
-/// The system's error if it does not let it.
+/// The system's error if that fails.
 pub fn raise_descriptor_limit() -> io::Result<()> {
     let mut limit = getrlimit(Resource::Nofile);
     limit.current = limit.maximum;

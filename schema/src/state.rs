@@ -1,6 +1,6 @@
-//! What a domain keeps over restarts: small text files that are replaced whole, for this user alone. A crash leaves the old
-//! file or the new one. Whoever reads one checks what it says: it may be from another version, or missing. Refuses to
-//! know what the files are about; losing them loses nothing but time.
+//! What a domain keeps across restarts: small text files that are replaced as a whole, only for this user. A crash leaves
+//! the old file or the new one. The reader checks the content: it may come from another version, or be missing. Refuses to
+//! know what the files contain; losing them only costs time.
 
 use std::ffi::OsString;
 use std::fs::{self, DirBuilder, File, OpenOptions};
@@ -21,18 +21,18 @@ pub struct StateDirectory {
 }
 
 impl StateDirectory {
-    /// Where the directories of all domains are, as the environment of this process says: what systemd made for the service,
-    /// else the user's own. `None` if it names no place.
+    /// Where the directories of all domains are, according to the environment of this process: the one that systemd created
+    /// for the service, else the user's own. `None` if it names none.
     pub fn base() -> Option<PathBuf> {
         base_in(|name| std::env::var_os(name))
     }
 
-    /// The directory of `domain`; `None` as for [`base`](Self::base). It need not be there.
+    /// The directory of `domain`, which need not exist; `None` as for [`base`](Self::base).
     pub fn of_domain(domain: &str) -> Option<StateDirectory> {
         Some(StateDirectory::at(StateDirectory::base()?.join(domain)))
     }
 
-    /// The directory `path`, which need not be there.
+    /// The directory `path`, which need not exist.
     pub fn at(path: impl Into<PathBuf>) -> StateDirectory {
         StateDirectory { path: path.into() }
     }
@@ -42,10 +42,10 @@ impl StateDirectory {
         self.path.join(name)
     }
 
-    /// What file `name` holds; `None` if there is none.
+    /// The content of file `name`; `None` if there is none.
     ///
     /// [`Kind::Failed`] if it cannot be read, is not a plain file of this user that nobody else can write, has more than
-    /// `most` bytes, or is no UTF-8.
+    /// `most` bytes, or is not UTF-8.
     pub fn read(&self, name: &str, most: u64) -> Result<Option<String>, Failure> {
         let path = self.path(name);
         match read(&path, most) {
@@ -59,10 +59,10 @@ impl StateDirectory {
         }
     }
 
-    /// Puts `text` into file `name`, mode 0600, in place of what it held; makes the directory, mode 0700, if it is not there.
-    /// It takes as long as the disk does: not for a thread that has a line to read.
+    /// Replaces the content of file `name`, mode 0600, by `text`; creates the directory, mode 0700, if it does not exist.
+    /// It waits for the disk, so do not call it in a thread that reads a line.
     ///
-    /// [`Kind::Failed`] if that is not possible; then what the file held is still there.
+    /// [`Kind::Failed`] if that is not possible; then the file keeps its content.
     pub fn write(&self, name: &str, text: &str) -> Result<(), Failure> {
         self.replace(name, text).map_err(|error| {
             let what = format!("cannot keep {}: {error}", self.path(name).display());

@@ -1,5 +1,5 @@
-//! How a link and its sensor are: the state, what was found out, and counters that only grow. Refuses to know how a
-//! state is reached.
+//! The state of a link and its sensor: the state itself, what is known about the sensor, and counters that only grow.
+//! Refuses to know how a state is reached.
 
 use std::ops::{Index, IndexMut};
 
@@ -43,7 +43,7 @@ pub struct Status {
     pub last_error_text: [u8; 160],
     /// See [`Counter`].
     pub counters: Counters,
-    /// Where the sensor sits, as configured.
+    /// The pose of the sensor, as configured.
     pub pose: Pose,
 }
 
@@ -54,7 +54,7 @@ impl Default for Status {
 }
 
 impl Status {
-    /// The measuring mode as long as the sensor has not told it.
+    /// The measuring mode as long as the sensor has not reported it.
     pub const MODE_UNKNOWN: u8 = 0xFF;
 
     /// The state as a word; nothing if a newer hub has one that this program does not know.
@@ -68,20 +68,20 @@ impl Status {
         (self.mode != Status::MODE_UNKNOWN).then_some(matches!(self.mode, 0x01 | 0x03 | 0x05))
     }
 
-    /// The command that gives the sensor reflector bits, if it has none and is no recording: they live in its EEPROM,
+    /// The command that gives the sensor reflector bits, if it has none and is not a recording: the mode is in its EEPROM,
     /// which only a person changes.
     pub fn reflector_remedy(&self) -> Option<String> {
         let is_wanted = self.has_reflector_bits() == Some(false) && !self.is_replayed();
         is_wanted.then(|| format!("scanhub configure {} mode=0x01", self.port()))
     }
 
-    /// Share of the line's bytes that were in nothing over the last 10 s, 0 to 1: those of a stream, without scans that the
-    /// sensor broke off to answer.
+    /// Share of the line's bytes outside any telegram over the last 10 s, 0 to 1: only those of a stream, without scans that
+    /// the sensor broke off to answer.
     pub fn damaged(&self) -> f64 {
         self.counters[Counter::DamagedPpm] as f64 / 1e6
     }
 
-    /// Scans that must have been sent, by the sensor's period, and did not arrive; nothing where that cannot be known.
+    /// Scans that must have been sent, by the sensor's period, and did not arrive; nothing if that is not known.
     pub fn lost_on_line(&self) -> Option<u64> {
         (self.counters[Counter::DueOnLine] > 0).then_some(self.counters[Counter::LostOnLine])
     }
@@ -91,8 +91,7 @@ impl Status {
         self.lost_on_line().map(|_| self.counters[Counter::LostPpm] as f64 / 1e6)
     }
 
-    /// What the line takes away, in words such as `41 % lost on the line`, if that is more than a thousandth in the last
-    /// 10 s.
+    /// The loss on the line, in words such as `41 % lost on the line`, if it was more than a thousandth in the last 10 s.
     pub fn line_loss(&self) -> Option<String> {
         let lost = self.lost_share().filter(|&share| share > WELL);
         let damaged = Some(self.damaged()).filter(|&share| share > WELL);
@@ -106,7 +105,7 @@ impl Status {
         self.port().starts_with("file:")
     }
 
-    /// What the sensor calls itself; empty if unknown.
+    /// The sensor's type, as it reports it; empty if unknown.
     pub fn sensor_type(&self) -> &str {
         text::read(&self.type_text)
     }
@@ -144,7 +143,7 @@ const WELL: f64 = 0.001;
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[repr(u8)]
 pub enum State {
-    /// The port is not there.
+    /// The port does not exist.
     Absent = 0,
     /// Looking for the sensor and its baud rate.
     Probing = 1,
@@ -152,9 +151,9 @@ pub enum State {
     Switching = 2,
     /// Asking what the sensor is and switching its stream on.
     Starting = 3,
-    /// Telegrams come.
+    /// Telegrams arrive.
     Streaming = 4,
-    /// Telegrams came and stopped.
+    /// Telegrams arrived and stopped.
     Silent = 5,
     /// Stopped on request.
     Paused = 6,

@@ -1,5 +1,5 @@
-//! The payload of topic `telegram`: one telegram's bytes, STX to CRC, and where its fields lie. Refuses to check or to
-//! interpret them: what is published had a right CRC.
+//! The payload of topic `telegram`: one telegram's bytes, STX to CRC, and the positions of its fields. Refuses to check or
+//! interpret them: every published telegram had a correct CRC.
 
 /// A telegram's bytes with names for its fields.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -27,7 +27,7 @@ impl<'a> Telegram<'a> {
         self.0.get(4).copied().unwrap_or_default()
     }
 
-    /// What lies between command and CRC: the data and, last, the status byte.
+    /// The bytes between command and CRC: the data and, last, the status byte.
     pub fn data(self) -> &'a [u8] {
         self.0.get(5..self.0.len().saturating_sub(2)).unwrap_or_default()
     }

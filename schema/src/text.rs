@@ -1,4 +1,4 @@
-//! Text in a fixed field of bytes: UTF-8, unused end 0, cut at a character where it is too long.
+//! Text in a fixed field of bytes: UTF-8, padded with 0, cut at a character boundary if it is too long.
 
 /// Writes `text` into `field` and clears the rest.
 pub(crate) fn write(field: &mut [u8], text: &str) {

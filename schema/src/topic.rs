@@ -1,4 +1,4 @@
-//! The names: topics, their services, sensors. Refuses to know how a service is made.
+//! The names of topics, their services and sensors. Refuses to know how a service is created.
 
 mod table;
 
@@ -7,7 +7,7 @@ use crate::{Failure, Kind};
 pub use table::{Pace, Row, Topic};
 
 impl Topic {
-    /// What the table says of the topic.
+    /// The topic's row in the table.
     pub const fn row(self) -> &'static Row {
         &table::ROWS[self as usize]
     }
@@ -64,12 +64,11 @@ pub const WAKE: &str = "wake";
 pub enum Wake {
     /// All samples of a telegram are sent.
     Telegram = 1,
-    /// The status changed, or something else was said without a telegram: that nothing is known of the zones, a new
-    /// background.
+    /// The status changed, or something else was published without a telegram: zones that became unknown, a new background.
     Status = 2,
-    /// The hub is up; sent by itself when the notifier is created.
+    /// The hub is up; sent automatically when the notifier is created.
     HubUp = 3,
-    /// The hub is down; sent by itself when the notifier is dropped or its process is found dead.
+    /// The hub is down; sent automatically when the notifier is dropped or its process is found dead.
     HubDown = 4,
 }
 
@@ -80,14 +79,14 @@ impl Wake {
     }
 }
 
-/// The sensor and topic that a service's name stands for, if it is one of ours: the other direction of
+/// The sensor and topic of a service's name, if it is one of ours: the inverse of
 /// [`Topic::service`]; the wake service has no topic.
 pub fn of_service(name: &str) -> Option<(&str, Option<Topic>)> {
     let (sensor, topic) = name.strip_prefix("scanhub/v1/")?.split_once('/')?;
     if topic == WAKE { Some((sensor, None)) } else { Some((sensor, Some(Topic::parse(topic)?))) }
 }
 
-/// Stands for all sensors of a hub where one is named, and so is no name of a sensor.
+/// Means all sensors of a hub, wherever a sensor's name is expected; so it cannot be a sensor's name.
 pub const ROBOT: &str = "robot";
 
 /// Refuses a sensor's name that is not `[a-z0-9_-]`, 1 to 24 of them, or [`ROBOT`]: [`Kind::Configuration`].
@@ -116,7 +115,7 @@ pub fn check_followed(name: &str) -> Result<(), Failure> {
     }
 }
 
-/// The sensor is another machine's; a listener brings its topics here.
+/// The sensor belongs to another machine; a listener publishes its topics here.
 pub fn is_remote(sensor: &str) -> bool {
     sensor.contains('.')
 }

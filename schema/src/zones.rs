@@ -1,4 +1,4 @@
-//! What is near the robot: circles around its centre, and the verdict. Refuses to know how beams meet circles.
+//! What is near the robot: circles around its centre, and the verdict. Refuses to know how beams and circles intersect.
 
 use bytemuck::{Pod, Zeroable};
 #[cfg(feature = "ipc")]
@@ -7,7 +7,7 @@ use iceoryx2::prelude::ZeroCopySend;
 /// The most circles of a sensor.
 pub const ZONES: usize = 8;
 
-/// The payload of topic `zones`, 76 bytes: one sample per scan, and one of verdict unknown when scans stay out.
+/// The payload of topic `zones`, 76 bytes: one sample per scan, and one with verdict unknown when scans stop.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Pod, Zeroable)]
 #[cfg_attr(feature = "ipc", derive(ZeroCopySend), type_name("scanhub.Zones.v1"))]
 #[repr(C)]
@@ -37,7 +37,7 @@ pub struct Zones {
 pub struct Zone {
     /// Radius around the robot's centre in mm.
     pub radius_mm: u16,
-    /// Beams that met something inside, in this scan.
+    /// Beams that hit something inside, in this scan.
     pub beams: u16,
     /// 1: there were enough of them in enough scans.
     pub violated: u8,
@@ -85,7 +85,7 @@ impl Zones {
     }
 }
 
-/// What to make of the circles.
+/// The result for all circles.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[repr(u8)]
 pub enum Verdict {
@@ -95,7 +95,7 @@ pub enum Verdict {
     Slow = 1,
     /// Something is inside the smallest circle.
     Stop = 2,
-    /// It is not known: too many beams without a reading, or no scans. To be taken as stop.
+    /// Not known: too many beams without a reading, or no scans. Treat it as stop.
     Unknown = 3,
 }
 
@@ -113,7 +113,7 @@ impl Verdict {
         }
     }
 
-    /// The worse of two: stop, then unknown, then slow, then clear. What is seen inside outweighs what is not known.
+    /// The worse of two: stop, then unknown, then slow, then clear. An object seen inside counts more than an unknown.
     pub fn worse(self, other: Verdict) -> Verdict {
         let rank = |verdict| match verdict {
             Verdict::Clear => 0,

@@ -229,7 +229,7 @@ fn what_cannot_be_is_refused() {
             let (message, found) = (error["message"].to_string(), error["hint"].to_string());
             assert!(message.contains(said) && found.contains(hint), "{flags:?}: {error}");
         };
-        refused(&[], 78, "no interface is named", "lo (127.0.0.1, this machine alone)");
+        refused(&[], 78, "no interface is named", "lo (127.0.0.1, this machine only)");
         refused(&["--interface=eth7"], 78, "eth7", "lo");
         refused(&["--interface=lo", "--to=127.0.0.1"], 78, "127.0.0.1", "HOST:PORT");
         refused(&["--interface=lo", "--to=239.255.76.80:22200"], 78, "no host", "hosts");

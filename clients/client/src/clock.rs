@@ -1,13 +1,13 @@
-//! What time it is, on the clocks that matter here.
+//! The clocks that the client library uses.
 
 use rustix::time::{ClockId, Timespec, clock_gettime};
 
 /// One moment on two clocks, in ns.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Moment {
-    /// CLOCK_MONOTONIC, the clock of all stamps; it stands still while the machine is suspended.
+    /// CLOCK_MONOTONIC, the clock of all stamps; it stops while the machine is suspended.
     pub monotonic_ns: u64,
-    /// CLOCK_BOOTTIME: the same, and it goes on.
+    /// CLOCK_BOOTTIME: the same, but it continues then.
     pub boottime_ns: u64,
 }
 
@@ -16,7 +16,7 @@ pub fn now() -> Moment {
     Moment { monotonic_ns: read(ClockId::Monotonic), boottime_ns: read(ClockId::Boottime) }
 }
 
-/// CLOCK_MONOTONIC alone, in ns.
+/// CLOCK_MONOTONIC, in ns.
 pub fn now_ns() -> u64 {
     read(ClockId::Monotonic)
 }

@@ -1,4 +1,4 @@
-//! A request to the hub: asked, and waited for until the link has taken it.
+//! A request to the hub: sends it, and waits until the link has accepted it.
 
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::thread::sleep;
@@ -9,10 +9,10 @@ use schema::{Domain, Failure, Kind, Request, Shown, holder};
 
 use crate::presence::{GRACE, find};
 
-/// Asks the hub at the first live one of `places` for `request`, and answers what it answered.
+/// Sends `request` to the hub at the first of `places` where one runs, and returns its answer.
 ///
 /// [`Kind::NoHub`] within a second if there is none, or if it ends before it answers; [`Kind::NoTopic`] with the sensors
-/// that there are; [`Kind::Short`] if too much is asked at a time; [`Kind::Failed`] if the link cannot do it;
+/// that exist; [`Kind::Short`] if there are too many requests at a time; [`Kind::Failed`] if the link cannot do it;
 /// [`Kind::Timeout`] if the hub does not answer: it is short of something, or the link is busy;
 /// [`Kind::Interrupted`] if `stop` is set.
 pub fn request(places: &[Domain], request: &Request, stop: &AtomicBool) -> Result<Option<Shown>, Failure> {
@@ -21,7 +21,7 @@ pub fn request(places: &[Domain], request: &Request, stop: &AtomicBool) -> Resul
     ask(&open(&node)?, &domain, request, stop)
 }
 
-/// The control service; that of a hub that is just starting is waited for.
+/// The control service; waits for the service of a hub that is just starting.
 fn open(node: &Node) -> Result<ControlClient, Failure> {
     let give_up_at = Instant::now() + GRACE;
     loop {

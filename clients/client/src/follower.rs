@@ -1,5 +1,5 @@
-//! One topic of one sensor, sample by sample, with the account of what was missed. Goes on by itself when the hub is
-//! replaced. Refuses to wait: that is the session's.
+//! One topic of one sensor, sample by sample, with a count of missed samples. Continues by itself when the hub is
+//! replaced. Never waits: the session does that.
 
 use std::ops::Deref;
 use std::time::{Duration, Instant};
@@ -9,14 +9,14 @@ use schema::{Failure, Flags, Header, Kind, Scan};
 
 use crate::session::Session;
 
-/// A sample in shared memory: the payload by `*`, read-only, without a copy. At most four are held at a time, and none
-/// over a wait.
+/// A sample in shared memory: `*` gives the payload, read-only, without a copy. Hold at most four at a time, and none
+/// during a wait.
 #[derive(Debug)]
 pub struct Received<P: Payload + ?Sized> {
     sample: Sample<P>,
     /// Samples of this topic that were sent before this one and not received.
     pub missed: u64,
-    /// The hub was started anew since the last sample: its numbers begin again.
+    /// The hub was restarted since the last sample: its numbers start again at 0.
     pub restarted: bool,
 }
 
@@ -36,13 +36,13 @@ impl<P: Payload + ?Sized> Deref for Received<P> {
 }
 
 impl Received<Scan> {
-    /// CLOCK_MONOTONIC when beam `i` was measured, in ns: stamps are of bytes on the wire, the measurement is older.
+    /// CLOCK_MONOTONIC when beam `i` was measured, in ns: stamps are times of bytes on the line, the measurement is older.
     pub fn beam_time_ns(&self, i: usize) -> u64 {
         self.header().stamp_first_ns.saturating_sub(self.beam_age_ns(i))
     }
 }
 
-/// Follows one topic through all lives of the hub.
+/// Follows one topic, also across restarts of the hub.
 pub struct Follower<P: Payload + ?Sized> {
     sensor: String,
     port: Option<(u32, Subscriber<P>)>,
@@ -61,7 +61,7 @@ const ASK_EVERY: Duration = Duration::from_millis(50);
 const UNCONNECTED_LIMIT: Duration = Duration::from_secs(3);
 
 impl<P: Payload + ?Sized> Follower<P> {
-    /// Will follow the topic of `sensor`, as soon as it is there.
+    /// Follows the topic of `sensor` as soon as it exists.
     pub fn new(sensor: &str) -> Follower<P> {
         Follower {
             sensor: sensor.to_owned(),
@@ -74,12 +74,12 @@ impl<P: Payload + ?Sized> Follower<P> {
         }
     }
 
-    /// The topic has been there at least once.
+    /// The topic has existed at least once.
     pub fn subscribed(&self) -> bool {
         self.port.is_some()
     }
 
-    /// The next sample that waits, or nothing.
+    /// The next waiting sample, or nothing.
     ///
     /// [`Kind::Short`] if descriptors or memory are short, [`Kind::Failed`] if more than four samples are held or the
     /// topic has another layout.

@@ -1,5 +1,5 @@
-//! Until when what was heard of a sensor, its zones above all, may be believed. Time is an argument; refuses to know
-//! where that comes from and what becomes of it.
+//! How long what was received from a sensor, above all its zones, is valid. Time is an argument; this file does not know
+//! where the data comes from and how it is used.
 
 use std::time::Duration;
 
@@ -30,14 +30,14 @@ const NO_PERIOD_NS: u64 = 500_000_000;
 const FIRST_WORD_NS: u64 = 1_000_000_000;
 
 impl Freshness {
-    /// Nothing was heard yet, and nobody listened before `now`.
+    /// Nothing was received yet; listening starts at `now`.
     pub fn new(now: Moment) -> Freshness {
         Freshness { until: later(now, FIRST_WORD_NS), said: false }
     }
 
-    /// A sample with `header` and `verdict` came in at `now`; whether it may be believed. Its age counts as well as the
-    /// silence after it: what waited for long is no news, and a stamp in the future keeps nothing fresh. An `unknown` stands
-    /// however old it is.
+    /// A sample with `header` and `verdict` arrived at `now`; returns whether it is valid. Its age counts as well as the
+    /// silence after it: a sample that waited for long is not new, and a stamp in the future does not make it newer. An
+    /// `unknown` is valid at any age.
     pub fn heard(&mut self, header: &Header, verdict: Verdict, now: Moment) -> bool {
         let limit_ns = match header.period_us {
             0 => NO_PERIOD_NS,
@@ -54,7 +54,7 @@ impl Freshness {
         is_unknown || fresh
     }
 
-    /// Whether a verdict became too old just now; said once per silence.
+    /// Whether a verdict became too old just now; true once per silence.
     pub fn silence(&mut self, now: Moment) -> bool {
         let over = now.monotonic_ns >= self.until.monotonic_ns || now.boottime_ns >= self.until.boottime_ns;
         if self.said || !over {

@@ -1,5 +1,5 @@
-//! The library of every program that follows a hub, or publishes topics of its own beside it. A program depends on this
-//! crate alone. Knows only `schema`: a hub is a lock that is held and topics that are there. Prints nothing; refuses to know
+//! The library of every program that follows a hub, or publishes its own topics beside it. A program depends only on this
+//! crate. Knows only `schema`: to it, a hub is a lock that is held and topics that exist. Prints nothing; refuses to know
 //! verbs.
 
 pub mod clock;
@@ -27,7 +27,7 @@ pub use subscribe::{Subscription, places, subscribe};
 pub use wait::Wait;
 pub use zones::{Heard, ZonesFollower, zones};
 
-/// What topics carry, and the words for it: a program needs no second dependency.
+/// The types of topics and payloads: a program needs no second dependency.
 pub use schema::{
     Age, BEAMS, Background, Code, Counter, Counters, DEFAULT_DOMAIN, Domain, Environment, Failure, Flags,
     Foreground, Header, Kind, MARKS, Mark, Marks, Pose, Quality, ROBOT, Reasons, Request, SEGMENTS, Scan,

@@ -1,8 +1,8 @@
-//! Which sensors and topics there are at this moment, for who wants no failure and does not wait.
+//! Which sensors and topics exist at this moment, for callers that want no failure and do not wait.
 
 use schema::{Domain, Topic, ipc, publisher};
 
-/// The sensors of the hub at the first live one of `places`, for who wants no failure; never waits.
+/// The sensors of the hub at the first of `places` where one runs; empty if there is none; never waits.
 pub fn live_sensors(places: &[Domain]) -> Vec<String> {
     let lives = |domain: &&Domain| matches!(publisher(domain.root()), Ok(Some(_)));
     places.iter().find(lives).and_then(|domain| ipc::sensors(domain).ok()).unwrap_or_default()

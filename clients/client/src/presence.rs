@@ -1,4 +1,5 @@
-//! Is there a hub, or a listener that stands for hubs of other machines, and where? Asks the locks of the places that a domain may be at; refuses to open anything there.
+//! Whether a hub runs, or a listener that publishes the sensors of other machines, and where. Asks the locks at the places
+//! of a domain; opens nothing else there.
 
 use std::time::{Duration, Instant};
 
@@ -21,12 +22,12 @@ pub(crate) struct Presence {
     denied: Option<Failure>,
 }
 
-/// Who publishes in a domain. Where both are there the hub counts.
+/// Who publishes in a domain. If both run, the hub counts.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Who {
     /// A hub.
     Hub,
-    /// A listener that brings the sensors of other machines.
+    /// A listener that publishes the sensors of other machines.
     Listener,
 }
 
@@ -37,12 +38,12 @@ struct Holder {
     who: Who,
 }
 
-/// What became different since the last look. Both: one was replaced in between.
+/// What changed since the last look. Both: one was replaced in between.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Change {
-    /// Who was there is not there any more.
+    /// The publisher that is not there any more.
     pub gone: Option<Who>,
-    /// Somebody is there who was not there before.
+    /// The publisher that was not there before.
     pub back: Option<Who>,
 }
 
@@ -60,7 +61,7 @@ impl Change {
 }
 
 impl Presence {
-    /// Watches for a hub at `places`; the first live one is taken.
+    /// Watches for a hub at `places`; uses the first place where one runs.
     pub(crate) fn new(places: Vec<Domain>) -> Presence {
         Presence { places, hub: None, looked_at: None, asked_at: None, heard_at: None, denied: None }
     }
@@ -106,7 +107,7 @@ impl Presence {
         self.hub.as_ref().map(|holder| holder.who)
     }
 
-    /// What to tell who cannot wait for a hub.
+    /// The failure for callers that cannot wait for a hub.
     pub(crate) fn no_hub(&self) -> Failure {
         if let Some(short) = self.short() {
             return short;
@@ -166,7 +167,7 @@ pub fn find(places: &[Domain]) -> Result<Domain, Failure> {
     }
 }
 
-/// How long what has to be there may take to appear while a hub is starting: a verb without a hub ends within a second.
+/// How long a hub that is starting may take to become visible: a verb without a hub ends within a second.
 pub const GRACE: Duration = Duration::from_millis(500);
 
 #[cfg(test)]

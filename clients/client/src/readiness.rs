@@ -1,5 +1,5 @@
-//! One descriptor for who waits for other things as well: readable while there may be something to receive, or something
-//! to see to. Hides that what it is woken by changes with the hub; refuses to know what is received.
+//! One descriptor for programs that also wait for other things: readable while there may be something to receive or to
+//! check. Hides that the event behind it changes with each hub; refuses to know what is received.
 
 use std::os::fd::{AsFd, BorrowedFd, OwnedFd};
 use std::time::Duration;

@@ -1,4 +1,4 @@
-//! The robot's verdict: the fold over its sensors' zones, in which a sensor that is not heard counts as unknown.
+//! The robot's verdict: its sensors' zones combined; a sensor without recent data counts as unknown.
 
 mod source;
 
@@ -12,15 +12,15 @@ use crate::subscribe::places;
 use crate::wait::Wait;
 pub use source::{RobotHeard, RobotSource};
 
-/// Follows the zones of `sensors` in the domain that SCANHUB_DOMAIN names. None: all sensors of the hub there; in a domain
-/// without a hub those of other machines that are published there. There need not be a hub yet.
+/// Follows the zones of `sensors` in the domain that SCANHUB_DOMAIN names. If empty: all sensors of the hub there; in a
+/// domain without a hub, the sensors of other machines that are published there. The hub may start later.
 ///
 /// [`Kind::Configuration`](schema::Kind) if a name is not possible.
 pub fn robot(sensors: &[&str]) -> Result<RobotFollower, Failure> {
     RobotFollower::in_domain(places(None)?, sensors)
 }
 
-/// What is known of the robot's surroundings: one sensor's zones each.
+/// What is known of the robot's surroundings: the zones of each sensor.
 #[derive(Clone, Debug, Default)]
 pub struct Robot {
     parts: Vec<(String, Zones)>,
@@ -39,23 +39,23 @@ impl Robot {
         self.sensors().find(|(_, of_sensor)| *of_sensor == verdict).map(|(sensor, _)| sensor)
     }
 
-    /// Distance from the robot's centre, in mm, of what is nearest to it, and the sensor that sees it there. Sensors
-    /// that are unknown may see nothing at all.
+    /// Distance from the robot's centre, in mm, of the nearest object, and the sensor that sees it. Unknown sensors may
+    /// see nothing at all.
     pub fn nearest(&self) -> Option<(u32, &str)> {
         self.parts.iter().filter_map(|(sensor, zones)| Some((zones.nearest()?.1, sensor.as_str()))).min()
     }
 
-    /// Each sensor's verdict; unknown where it was not heard lately, or never.
+    /// Each sensor's verdict; unknown without recent data.
     pub fn sensors(&self) -> impl Iterator<Item = (&str, Verdict)> {
         self.parts.iter().map(|(sensor, zones)| (sensor.as_str(), zones.verdict()))
     }
 
-    /// Each sensor's zones; unknown where it was not heard lately, or never.
+    /// Each sensor's zones; unknown without recent data.
     pub fn zones(&self) -> impl Iterator<Item = (&str, &Zones)> {
         self.parts.iter().map(|(sensor, zones)| (sensor.as_str(), zones))
     }
 
-    /// Counts `sensor` as unknown until it is heard.
+    /// Counts `sensor` as unknown until its data arrives.
     fn expect(&mut self, sensor: &str) {
         self.parts.push((sensor.to_owned(), Zones::unknown()));
     }
@@ -68,7 +68,7 @@ pub struct RobotFollower {
 }
 
 impl RobotFollower {
-    /// As [`robot`], in the first live one of `places`.
+    /// As [`robot`], at the first of `places` where a hub runs.
     ///
     /// [`Kind::Configuration`](schema::Kind) if a sensor's name is not possible.
     pub fn in_domain(places: Vec<Domain>, sensors: &[&str]) -> Result<RobotFollower, Failure> {
@@ -81,9 +81,9 @@ impl RobotFollower {
         RobotFollower { session: self.session.by(wait), ..self }
     }
 
-    /// Waits until any of the sensors is heard, or any is heard no more; what is known then. The first time it waits for
-    /// a word of each. A sensor becomes unknown as with [`ZonesFollower::next`](crate::ZonesFollower::next), and this
-    /// fails likewise.
+    /// Waits until data from any sensor arrives, or stops; returns what is known then. The first time it waits for each
+    /// sensor. A sensor becomes unknown as with [`ZonesFollower::next`](crate::ZonesFollower::next), and this fails in
+    /// the same way.
     #[allow(clippy::should_implement_trait)] // There is no end that an iterator would have.
     pub fn next(&mut self) -> Result<&Robot, Failure> {
         while !self.hear()? {
@@ -98,7 +98,7 @@ impl RobotFollower {
         Ok(self.source.robot())
     }
 
-    /// What is known now, if anything was heard, or became too old, since the last call; never waits. Failures as
+    /// What is known now, if data arrived or became too old since the last call; never waits. Failures as
     /// [`next`](Self::next).
     pub fn try_next(&mut self) -> Result<Option<&Robot>, Failure> {
         loop {
@@ -127,7 +127,7 @@ impl RobotFollower {
         self.session.domain().is_some()
     }
 
-    /// Takes all that waits; whether there was anything.
+    /// Takes all waiting samples; returns whether there were any.
     fn hear(&mut self) -> Result<bool, Failure> {
         // As with one sensor's zones what is there comes first; but who always finds something has to see a hub come, too.
         let heard = self.source.drain(&mut self.session)?;

@@ -1,5 +1,5 @@
-//! A process's stay in a domain, over several lives of its hub: membership, what wakes it, and the news that a hub went or
-//! came. Refuses to know what is followed.
+//! A process in a domain, across restarts of its hub: membership, what wakes the process, and the news that a hub started
+//! or ended. Refuses to know what is followed.
 
 use std::os::fd::{AsFd, BorrowedFd};
 use std::time::{Duration, Instant};
@@ -17,7 +17,7 @@ const LONGEST_WAIT: Duration = Duration::from_millis(100);
 /// How often whoever waits at the descriptor looks for a hub that lives: an event tells of the next one.
 const MAKE_SURE_EVERY: Duration = Duration::from_secs(1);
 
-/// Membership in the first live one of several domains.
+/// Membership in the first of several domains where a hub runs.
 pub struct Session {
     presence: Presence,
     joined: Option<Joined>,
@@ -37,7 +37,7 @@ struct Joined {
 }
 
 impl Session {
-    /// Will join the first live one of `places`, as soon as one is.
+    /// Joins the first of `places` where a hub runs, as soon as there is one.
     pub fn new(places: Vec<Domain>) -> Session {
         Session {
             presence: Presence::new(places),
@@ -50,14 +50,14 @@ impl Session {
         }
     }
 
-    /// Will be woken by `wait`; to be said before anything is followed.
+    /// Sets how it is woken; call it before anything is followed.
     pub fn by(self, wait: Wait) -> Session {
         Session { wait, ..self }
     }
 
-    /// Looks whether the hub is there, and joins its domain if it is a new place.
+    /// Looks whether a hub runs, and joins its domain if it is at a new place.
     ///
-    /// [`Kind::Short`](schema::Kind) if memory or descriptors are; who has joined already goes on without a look.
+    /// [`Kind::Short`](schema::Kind) if memory or descriptors are; a session that has joined continues without a look.
     pub fn look(&mut self) -> Result<Change, Failure> {
         if self.joined.as_mut().is_some_and(|joined| joined.wakeups.take_rang()) {
             self.presence.heard();
@@ -96,7 +96,7 @@ impl Session {
         Ok(change)
     }
 
-    /// Where the hub lives, if there is one.
+    /// Where the hub runs, if there is one.
     pub fn domain(&self) -> Option<&Domain> {
         self.presence.domain()
     }
@@ -106,23 +106,23 @@ impl Session {
         self.presence.who()
     }
 
-    /// There is a hub, and not only a listener that stands for those of other machines.
+    /// A hub runs, not only a listener that publishes sensors of other machines.
     pub fn hub_lives(&self) -> bool {
         self.domain().is_some_and(|domain| matches!(holder(domain.root()), Ok(Some(_))))
     }
 
-    /// What to tell who cannot wait for a hub.
+    /// The failure for callers that cannot wait for a hub.
     pub fn no_hub(&self) -> Failure {
         self.presence.no_hub()
     }
 
-    /// Counts the domains joined: ports of an earlier one are to be opened again.
+    /// Counts the domains joined: ports of an earlier one must be opened again.
     pub fn number(&self) -> u32 {
         self.number
     }
 
-    /// A subscriber of `sensor`, or nothing as long as its hub or topic is not there. What wakes it comes first, so that
-    /// nothing is sent unheard between the two.
+    /// A subscriber of `sensor`, or nothing as long as its hub or topic does not exist. What wakes it is opened first, so
+    /// that no wake-up is missed between the two.
     pub fn subscribe<P: Payload + ?Sized>(&mut self, sensor: &str) -> Result<Option<Subscriber<P>>, Failure> {
         let (Some(_), Some(joined)) = (self.presence.domain(), &mut self.joined) else {
             return Ok(None);
@@ -138,15 +138,15 @@ impl Session {
         Ok(subscriber)
     }
 
-    /// A moment in the life of `sensor`'s topics: as long as it is the same, nothing new was sent. Nothing where that is not
-    /// known. What late joiners get comes without a word, so a moment ends with the next look for the hub, too.
+    /// A moment of `sensor`'s topics: as long as it is the same, nothing new was sent. Nothing if that is not known. Late
+    /// consumers get samples without a wake-up, so a moment also ends with the next look for the hub.
     pub fn moment(&self, sensor: &str) -> Option<(u32, Instant)> {
         let rung = self.joined.as_ref()?.wakeups.rung(sensor)?;
         Some((rung, self.presence.looked_at()?))
     }
 
-    /// Readable while there may be something to receive or to see to, the same over all lives of the hub; from the first
-    /// call on it takes [`settle`](Self::settle) to make it unreadable.
+    /// A descriptor that is readable while there may be something to receive or to check; it stays the same across
+    /// restarts of the hub. After the first call, [`settle`](Self::settle) is needed to make it unreadable.
     ///
     /// [`Kind::Configuration`] if it is not waited by event, [`Kind::Short`] if descriptors are short.
     pub fn descriptor(&mut self) -> Result<BorrowedFd<'_>, Failure> {
@@ -167,8 +167,8 @@ impl Session {
         Ok(readiness.as_fd())
     }
 
-    /// Nothing waits, and nothing will have to be looked for before `left`: the descriptor, if it is used, is not readable
-    /// before. Whether something was sent meanwhile: then look again first.
+    /// Call this when nothing waits and nothing must be checked before `left`: the descriptor, if it is used, is not
+    /// readable before. Returns whether something was sent meanwhile: then look again first.
     pub fn settle(&mut self, left: Option<Duration>) -> Result<bool, Failure> {
         let Some(readiness) = &self.readiness else { return Ok(false) };
         // What a late joiner is handed comes without an event.

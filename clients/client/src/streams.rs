@@ -1,5 +1,5 @@
-//! Many topics in one thread: a session in a domain, what follows topics in it, and whether a hub is there. For programs
-//! for which one [`Subscription`](crate::Subscription) is too little.
+//! Many topics in one thread: a session in a domain, the followers of its topics, and whether a hub runs. For programs
+//! that need more than one [`Subscription`](crate::Subscription).
 
 pub use crate::follower::Follower;
 pub use crate::freshness::Freshness;

@@ -1,5 +1,5 @@
-//! The client library: one topic of one sensor, in place, for as long as you like. Waits for a hub that is not there
-//! yet and goes on after one that was killed. Hides what it is woken by.
+//! One topic of one sensor, without copies, for as long as you like. Waits for a hub that does not run yet and continues
+//! after one that was killed. Hides what wakes it.
 
 use std::os::fd::BorrowedFd;
 use std::time::{Duration, Instant};
@@ -12,14 +12,14 @@ use crate::session::Session;
 use crate::wait::Wait;
 
 /// Follows the topic of `sensor` that carries `P` (`[u8]`: telegram, `Scan`, `Marks` ..), in the domain that
-/// SCANHUB_DOMAIN names. There need not be a hub yet. Who acts on zones follows them by [`zones`](crate::zones).
+/// SCANHUB_DOMAIN names. The hub may start later. To act on zones, follow them with [`zones`](crate::zones).
 ///
 /// [`Kind::Configuration`](schema::Kind) if a name is not possible.
 pub fn subscribe<P: Payload + ?Sized>(sensor: &str) -> Result<Subscription<P>, Failure> {
     Subscription::in_domain(places(None)?, sensor)
 }
 
-/// Where `domain` may be, or if none is named that which SCANHUB_DOMAIN names.
+/// The possible places of `domain`; if none is named, of the one that SCANHUB_DOMAIN names.
 ///
 /// [`Kind::Configuration`](schema::Kind) if the name is not possible.
 pub fn places(domain: Option<&str>) -> Result<Vec<Domain>, Failure> {
@@ -41,7 +41,7 @@ pub struct Subscription<P: Payload + ?Sized> {
 }
 
 impl<P: Payload + ?Sized> Subscription<P> {
-    /// As [`subscribe`], in the first live one of `places`.
+    /// As [`subscribe`], at the first of `places` where a hub runs.
     ///
     /// [`Kind::Configuration`](schema::Kind) if the sensor's name is not possible.
     pub fn in_domain(places: Vec<Domain>, sensor: &str) -> Result<Self, Failure> {
@@ -49,13 +49,13 @@ impl<P: Payload + ?Sized> Subscription<P> {
         Ok(Subscription { session: Session::new(places), follower: Follower::new(sensor), timeout: None })
     }
 
-    /// Lets [`next`](Self::next) answer `None` after a silence of `timeout`; without it waits forever.
+    /// Lets [`next`](Self::next) return `None` after a silence of `timeout`; without it, waits forever.
     pub fn timeout(mut self, timeout: Duration) -> Self {
         self.timeout = Some(timeout);
         self
     }
 
-    /// Waits by `wait`, to be said before the first sample is asked for; without it by [`Wait::Doorbell`].
+    /// Sets how it waits; call it before the first sample is requested. Default: [`Wait::Doorbell`].
     pub fn wait_by(self, wait: Wait) -> Self {
         Subscription { session: self.session.by(wait), ..self }
     }
@@ -91,18 +91,19 @@ impl<P: Payload + ?Sized> Subscription<P> {
         }
     }
 
-    /// Sleeps until there may be a sample; for `longest` at most, and a tenth of a second at most, so that whoever wants to
-    /// stop can. Hold no sample meanwhile.
+    /// Sleeps until there may be a sample, but at most for `longest` and a tenth of a second, so that the caller can stop.
+    /// Hold no sample meanwhile.
     ///
     /// [`Kind::Short`](schema::Kind) if the system cannot wait.
     pub fn wait(&mut self, longest: Duration) -> Result<(), Failure> {
         self.session.wait_for(Some(longest))
     }
 
-    /// What is readable while there may be a sample, for who waits for other things as well: to be polled, never read. It
-    /// is the same for as long as the subscription lives, whatever becomes of the hub. [`try_next`](Self::try_next) makes it
-    /// unreadable by answering `None`; until then poll does not sleep. It also gets readable when there is nothing: each
-    /// second, ten times a second while there is no hub, and when other topics of the sensor have something.
+    /// A descriptor that is readable while there may be a sample, for programs that also wait for other things: poll it,
+    /// never read it. It stays the same as long as the subscription exists, also if the hub restarts. When
+    /// [`try_next`](Self::try_next) returns `None`, it is not readable any more; until then poll does not sleep. It also
+    /// becomes readable without a sample: each second, ten times a second while there is no hub, and when other topics of
+    /// the sensor have something.
     ///
     /// [`Kind::Configuration`](schema::Kind) without [`Wait::Event`], [`Kind::Short`](schema::Kind) if descriptors are.
     pub fn descriptor(&mut self) -> Result<BorrowedFd<'_>, Failure> {
@@ -120,7 +121,7 @@ impl<P: Payload + ?Sized> Subscription<P> {
         self.follower.receive(&mut self.session)
     }
 
-    /// A hub lives in the domain, as of the last call of [`next`](Self::next) or [`try_next`](Self::try_next) that found
+    /// A hub runs in the domain, as of the last call of [`next`](Self::next) or [`try_next`](Self::try_next) that found
     /// no sample waiting.
     pub fn hub_lives(&self) -> bool {
         self.session.domain().is_some()

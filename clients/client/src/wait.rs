@@ -8,16 +8,16 @@ use schema::ipc::{self, Bell, Listener, Node, Unsupported};
 
 use crate::clock;
 
-/// What a consumer sleeps at, or whether at all.
+/// What a consumer sleeps on, or that it does not sleep.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum Wait {
-    /// A word in the hub's memory, at which one call wakes all. Where the system cannot wait for the words of several
-    /// sensors at once, the event.
+    /// Sleep on a word in shared memory; one call of the hub wakes all. If the system cannot wait for the words of several
+    /// sensors at once, it uses the event.
     #[default]
     Doorbell,
-    /// The event that other languages listen to: one message of the hub to each consumer.
+    /// Sleep on the event, which other languages use; the hub sends one message to each consumer.
     Event,
-    /// Not asleep: looks at the words all the time, and takes a whole processor for the shortest latency there is.
+    /// Do not sleep: reads the words all the time, which uses a whole processor, for the shortest latency.
     Spin,
 }
 

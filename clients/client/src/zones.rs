@@ -1,5 +1,5 @@
-//! The zones of one sensor, by value and never staler than they look: a verdict that is too old becomes `unknown` here,
-//! whether the sensor, the hub or the machine stood still. So nobody who acts on it has to think of silence.
+//! The zones of one sensor, by value, never older than they appear: a verdict that is too old becomes `unknown` here,
+//! whether the sensor, the hub or the machine stopped. A program that acts on it needs no timeout of its own.
 
 use std::os::fd::BorrowedFd;
 use std::time::Duration;
@@ -13,25 +13,25 @@ use crate::session::Session;
 use crate::subscribe::places;
 use crate::wait::Wait;
 
-/// Follows the zones of `sensor` in the domain that SCANHUB_DOMAIN names. There need not be a hub yet.
+/// Follows the zones of `sensor` in the domain that SCANHUB_DOMAIN names. The hub may start later.
 ///
 /// [`Kind::Configuration`](schema::Kind) if a name is not possible.
 pub fn zones(sensor: &str) -> Result<ZonesFollower, Failure> {
     ZonesFollower::in_domain(places(None)?, sensor)
 }
 
-/// What was heard of a sensor's zones, or that nothing was.
+/// New data of a sensor's zones, or the news that none arrives.
 #[derive(Clone, Copy, Debug)]
 pub struct Heard {
-    /// The zones of the sample, [`Zones::unknown`] if it was too old when it came, and in a silence.
+    /// The zones of the sample; [`Zones::unknown`] if it was too old on arrival, and in a silence.
     pub zones: Zones,
-    /// Of the sample; nothing in a silence.
+    /// The header of the sample; nothing in a silence.
     pub header: Option<Header>,
-    /// Samples that were sent since the one heard before and are not handed out.
+    /// Samples that were sent since the previous one and were skipped.
     pub missed: u64,
-    /// The zones are unknown because nothing was heard that is new enough, not because the hub says so.
+    /// The zones are unknown because no recent data arrived, not because the hub reports it.
     pub stale: bool,
-    /// What the hub said, however old it was when it came: for who keeps it, and does not act on it.
+    /// What the hub sent, however old it was on arrival: to store it, not to act on it.
     pub said: Zones,
 }
 
@@ -49,7 +49,7 @@ pub struct ZonesFollower {
 }
 
 impl ZonesFollower {
-    /// As [`zones`], in the first live one of `places`.
+    /// As [`zones`], at the first of `places` where a hub runs.
     ///
     /// [`Kind::Configuration`](schema::Kind) if the sensor's name is not possible.
     pub fn in_domain(places: Vec<Domain>, sensor: &str) -> Result<ZonesFollower, Failure> {
@@ -62,11 +62,11 @@ impl ZonesFollower {
         ZonesFollower { session: self.session.by(wait), ..self }
     }
 
-    /// Waits for news: the newest sample, or the one `unknown` of a silence. That comes two scan periods and 40 ms
-    /// after the last sample (of another machine not before half a second), a second after the start if there was none, and
-    /// with a hub as without one.
+    /// Waits for news: the newest sample, or one `unknown` per silence. That is returned two scan periods and 40 ms
+    /// after the last sample (for another machine not before half a second), or a second after the start if there was
+    /// none, with or without a hub.
     ///
-    /// Failures as [`Subscription::next`](crate::Subscription::next): nothing is known then either.
+    /// Failures as [`Subscription::next`](crate::Subscription::next): the zones are not known then.
     #[allow(clippy::should_implement_trait)] // There is no end that an iterator would have.
     pub fn next(&mut self) -> Result<Heard, Failure> {
         loop {
@@ -82,13 +82,13 @@ impl ZonesFollower {
         self.session.wait_for(Some(self.source.left().map_or(longest, |left| left.min(longest))))
     }
 
-    /// As [`Subscription::descriptor`](crate::Subscription::descriptor), with [`try_next`](Self::try_next) of the zones; it gets
-    /// readable also when the verdict becomes too old.
+    /// As [`Subscription::descriptor`](crate::Subscription::descriptor), with [`try_next`](Self::try_next) of the zones; it
+    /// also becomes readable when the verdict becomes too old.
     pub fn descriptor(&mut self) -> Result<BorrowedFd<'_>, Failure> {
         self.session.descriptor()
     }
 
-    /// A hub lives in the domain, as of the last call of [`next`](Self::next) or [`try_next`](Self::try_next) that found
+    /// A hub runs in the domain, as of the last call of [`next`](Self::next) or [`try_next`](Self::try_next) that found
     /// no news.
     pub fn hub_lives(&self) -> bool {
         self.session.domain().is_some()
@@ -118,7 +118,7 @@ impl ZonesFollower {
     }
 }
 
-/// The zones of a sensor, sample by sample and silence by silence, in a session of the caller's.
+/// The zones of a sensor, sample by sample and silence by silence, in the caller's session.
 pub struct ZonesSource {
     follower: Follower<Zones>,
     freshness: Freshness,
@@ -126,7 +126,7 @@ pub struct ZonesSource {
 }
 
 impl ZonesSource {
-    /// Will follow the zones of `sensor`.
+    /// Follows the zones of `sensor`.
     pub fn new(sensor: &str) -> ZonesSource {
         ZonesSource {
             follower: Follower::new(sensor),
@@ -135,17 +135,17 @@ impl ZonesSource {
         }
     }
 
-    /// The topic has been there at least once.
+    /// The topic has existed at least once.
     pub fn subscribed(&self) -> bool {
         self.follower.subscribed()
     }
 
-    /// There was a sample, or the silence of one that does not come.
+    /// There was a sample, or it was reported that none arrives.
     pub fn has_spoken(&self) -> bool {
         self.spoken
     }
 
-    /// The next sample that waits; if there is none and the last one became too old just now, that. Failures as
+    /// The next waiting sample; if there is none and the last one became too old just now, an `unknown`. Failures as
     /// [`Follower::receive`].
     pub fn receive(&mut self, session: &mut Session) -> Result<Option<Heard>, Failure> {
         let sample = self.follower.receive(session)?;
@@ -169,7 +169,7 @@ impl ZonesSource {
         Ok(heard)
     }
 
-    /// The last of all that waits: what stands now. What it supersedes counts as missed.
+    /// The last of all waiting samples. The skipped ones count as missed.
     fn newest(&mut self, session: &mut Session) -> Result<Option<Heard>, Failure> {
         let mut newest: Option<Heard> = None;
         while let Some(mut heard) = self.receive(session)? {
@@ -179,7 +179,7 @@ impl ZonesSource {
         Ok(newest)
     }
 
-    /// After which time [`receive`](Self::receive) has something to say even if no sample comes.
+    /// After this time [`receive`](Self::receive) returns something even if no sample arrives.
     pub fn left(&self) -> Option<Duration> {
         self.freshness.left(clock::now())
     }

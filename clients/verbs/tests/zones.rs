@@ -112,7 +112,7 @@ fn echo_says_the_silence_too() {
     hub.front().zones.await_subscribers(4);
     hub.front().zones(Verdict::Stop, 420);
     verbs[0].out.await_lines(r#""stale":true"#, 1);
-    verbs[1].out.await_lines("nothing new", 1);
+    verbs[1].out.await_lines("no recent data", 1);
     until("bytes", || verbs[2].out.bytes().len() == 2 * 76);
     verbs.iter().chain([&rate]).for_each(Verb::stop);
     let [json, text, raw] = verbs;

@@ -1,5 +1,5 @@
-//! The configuration as it is in effect, value by value, each with the place that it has it from. Refuses to know how it
-//! is read: what is shown is what the hub would work with.
+//! The configuration in effect, value by value, each with the place where it was set. Refuses to know how it is read: it
+//! shows the values that the hub would use.
 
 use std::fmt;
 
@@ -23,11 +23,11 @@ pub struct Value {
     pub key: String,
     /// What it is, in the words and units of the configuration; null if there is nothing without a word.
     pub value: Json,
-    /// Where it is said, `FILE:LINE:COLUMN` or a flag; else `default`, possibly with what that follows from.
+    /// Where it is set, `FILE:LINE:COLUMN` or a flag; else `default`, possibly with the value that it depends on.
     pub origin: String,
 }
 
-/// All values of the links and of the gateway, as `sources` say them.
+/// All values of the links and of the gateway from `sources`.
 ///
 /// [`schema::Kind::Configuration`] with place, value and remedy.
 pub fn values(sources: &Sources) -> Result<Vec<Value>, Failure> {

@@ -1,8 +1,8 @@
-//! Section `gateway` over all sources. Refuses to know what a gateway is: who makes one reads what only it understands.
+//! Section `gateway` from all sources. Refuses to know what a gateway is: the gateway reads what only it understands.
 
 use schema::datagram::MTU_SAFE;
 
-/// What is said of the gateway; what is not said is nothing.
+/// The settings of the gateway; `None` for what is not set.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct Gateway {
     /// Name of the network interface.
@@ -15,15 +15,15 @@ pub struct Gateway {
     pub bare: Option<bool>,
     /// How many routers pass a datagram on.
     pub ttl: Option<u8>,
-    /// A duration, and where it is said.
+    /// A duration, and where it is set.
     pub background_every: Option<(String, String)>,
     /// The longest datagram in bytes.
     pub mtu: Option<usize>,
 }
 
 impl Gateway {
-    /// Networks that a datagram crosses if nobody says how many.
+    /// Networks that a datagram crosses by default.
     pub const TTL: u8 = 1;
-    /// The longest datagram in bytes if nobody says it.
+    /// The longest datagram in bytes by default.
     pub const MTU: usize = MTU_SAFE;
 }

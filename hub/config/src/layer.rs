@@ -1,4 +1,4 @@
-//! One source of configuration laid over the others: every value is checked where it stands, so that an error names
+//! One source of configuration on top of the others. Every value is checked in its own source, so that an error names
 //! file, line and column, or the flag.
 
 mod gateway;

@@ -1,4 +1,5 @@
-//! What the hub is told: links with their ports and what to ask of their sensors. Several sources, the last one wins.
+//! The configuration of the hub: links with their ports, and the settings of their sensors. Several sources; the last one
+//! wins.
 
 mod effective;
 mod gateway;
@@ -17,5 +18,5 @@ pub use link::{Config, Link};
 pub use processing::{Background, Processing, Zones};
 pub use sources::Sources;
 
-/// A configuration to begin with; its values are those that hold where nothing is said.
+/// A configuration to start from, with the default values.
 pub const DEFAULT: &str = include_str!("default.toml");

@@ -1,5 +1,5 @@
-//! The links of a hub, each with its port and what to ask of its sensor: values in effect. Refuses to know where they were
-//! written.
+//! The links of a hub, each with its port and the settings of its sensor: values in effect. Refuses to know where they
+//! were set.
 
 use lms::family::Family;
 use lms::variant::{Baud, Mode, Unit, Variant};
@@ -19,19 +19,19 @@ pub struct Config {
 pub struct Link {
     /// The sensor's name in topics.
     pub name: String,
-    /// Where its bytes come from.
+    /// The source of its bytes.
     pub port: Source,
-    /// What the sensor is expected to be, if the user said it: nothing is asked for that it cannot do.
+    /// The expected type of the sensor, if it is set: settings that the type does not support are refused.
     pub family: Option<Family>,
     /// Angle and resolution.
     pub variant: Variant,
-    /// Unit that the sensor is expected to measure in, if the user said one; it is compared, never written.
+    /// The expected unit of the sensor, if it is set; it is compared, never written.
     pub unit: Option<Unit>,
-    /// Measuring mode of a recording that does not tell it; a sensor is asked.
+    /// Measuring mode of a recording that does not contain it; a sensor is asked.
     pub mode: Option<Mode>,
     /// Rate to stream at.
     pub baud: Baud,
-    /// What is made of its scans.
+    /// How its scans are processed.
     pub processing: Processing,
 }
 

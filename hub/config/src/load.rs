@@ -11,7 +11,7 @@ use crate::sources::Sources;
 impl Config {
     /// Reads all sources.
     ///
-    /// [`schema::Kind::Configuration`] with place, value and remedy; also without any link: no port is opened that nobody named.
+    /// [`schema::Kind::Configuration`] with place, value and remedy; also without any link: only named ports are opened.
     pub fn load(sources: &Sources) -> Result<Config, Failure> {
         let mut drafts = Drafts::default();
         for layer in sources.files().chain(sources.links()) {
@@ -56,7 +56,7 @@ fn check_ports(links: &[Link]) -> Result<(), Failure> {
 }
 
 impl Gateway {
-    /// Reads the section in all sources, the last one wins. Links need not be there.
+    /// Reads the section in all sources; the last one wins. Links are not required.
     ///
     /// [`schema::Kind::Configuration`] with place, value and remedy.
     pub fn load(sources: &Sources) -> Result<Gateway, Failure> {
@@ -157,7 +157,9 @@ mod tests {
         assert_eq!(config.links[0].mode, Some(Mode(1)));
         let live = refusal(&["link.front.mode=0x01"], &["front=/dev/x"]);
         assert!(
-            live.contains("--set link.front.mode=0x01: link front: the mode of /dev/x is asked"),
+            live.contains(
+                "--set link.front.mode=0x01: link front: the mode of /dev/x is read from the sensor"
+            ),
             "{live}"
         );
         for mode in ["0x07", "-1", "257"] {

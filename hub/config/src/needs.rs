@@ -1,4 +1,4 @@
-//! What the links of a configuration take of the machine: shared memory and descriptors. Refuses to know what there is.
+//! What the links of a configuration need: shared memory and descriptors. Refuses to know what the machine has.
 
 use schema::Topic;
 use schema::shortage::sensor_bytes;
@@ -8,7 +8,7 @@ pub fn memory(links: usize) -> u64 {
     links as u64 * sensor_bytes(&Topic::ALL) + REST
 }
 
-/// Descriptors for `links` links and a first consumer of each, beside those open from the start.
+/// Descriptors for `links` links and a first consumer of each, besides those open from the start.
 pub fn descriptors(links: usize) -> u64 {
     BASE_DESCRIPTORS + links as u64 * LINK_DESCRIPTORS
 }

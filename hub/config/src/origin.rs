@@ -1,4 +1,4 @@
-//! Where a configuration value comes from, so that an error can say it: a file with line and column, or a flag.
+//! Where a configuration value comes from, so that an error can name it: a file with line and column, or a flag.
 
 use std::ops::Range;
 use std::path::{Path, PathBuf};

@@ -1,5 +1,5 @@
-//! Where each value is said: the sources once more, key by key, and the last one that says a key is its place. Refuses to
-//! know which keys there are, and what their values mean.
+//! Where each value is set: reads the sources again, key by key; the last source that has a key is its place. Refuses to
+//! know the valid keys, and what their values mean.
 
 use std::collections::BTreeMap;
 

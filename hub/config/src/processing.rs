@@ -1,5 +1,5 @@
-//! What the hub makes of the scans of a link, and by which numbers: the effective values of sections pose, zones, marks
-//! and background. Refuses to know where they were written.
+//! How the hub processes the scans of a link: the effective values of sections pose, zones, marks and background. Refuses
+//! to know where they were set.
 
 use std::path::PathBuf;
 
@@ -8,10 +8,10 @@ use preprocess::background::Settings as Learning;
 use preprocess::{marks, zones};
 use schema::{Failure, Kind, Pose, SavedModel, regular};
 
-/// What is made of the scans of one link.
+/// How the scans of one link are processed.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Processing {
-    /// Where the sensor sits.
+    /// The pose of the sensor.
     pub pose: Pose,
     /// What is near the robot.
     pub zones: Zones,
@@ -36,9 +36,9 @@ pub struct Zones {
     pub min_scans: u16,
     /// Share of the beams through the largest circle that may be without a reading.
     pub max_invalid: f64,
-    /// What lies before the near side of a circle that the sensor stands outside of is not in it.
+    /// If the sensor is outside a circle, points in front of the circle's near side are not inside it.
     pub exact: bool,
-    /// That nothing came back means that nothing is near.
+    /// A beam without an echo means that nothing is near.
     pub no_return_is_far: bool,
 }
 
@@ -82,21 +82,21 @@ pub struct Background {
     pub is_kept: bool,
     /// How it is learned.
     pub learning: Learning,
-    /// The file that it begins with.
+    /// The file that it starts with.
     pub file: Option<PathBuf>,
-    /// What it begins with was said, by whatever word: what an earlier hub learned is left where it is.
+    /// The start was set explicitly: what an earlier hub learned is not used.
     pub start_is_said: bool,
-    /// What is learned is kept for the next hub, which begins with it.
+    /// What is learned is kept for the next hub, which starts with it.
     pub is_handed_on: bool,
-    /// What it begins with: what stands in the file, or what an earlier hub learned.
+    /// What it starts with: the content of the file, or what an earlier hub learned.
     pub model: Option<Box<schema::Background>>,
     /// The model is published with every scan, not only with a new generation and whenever it has learned for a while.
     pub every_scan: bool,
 }
 
 impl Background {
-    /// Reads the file that the background of `sensor` begins with, if there is one, and compares it with what is
-    /// configured for that sensor.
+    /// Reads the file that the background of `sensor` starts with, if there is one, and compares it with the
+    /// configuration of that sensor.
     ///
     /// [`Kind::Configuration`] with file and reason.
     pub(crate) fn read(&mut self, sensor: &str, variant: Variant, unit: Option<Unit>) -> Result<(), Failure> {

@@ -1,4 +1,4 @@
-//! Where a configuration is said: files and flags, one layer each. Refuses to know what the layers make together.
+//! The sources of a configuration: files and flags, one layer each. Refuses to know how the layers are combined.
 
 use std::path::{Path, PathBuf};
 
@@ -10,10 +10,10 @@ use crate::origin::Origin;
 /// A layer, and where it is said.
 type Said = Result<(Origin, Layer), Failure>;
 
-/// Where to look for values, besides the defaults.
+/// Where values are read from, besides the defaults.
 #[derive(Clone, Debug, Default)]
 pub struct Sources {
-    /// Files in their order; each must be there.
+    /// Files in their order; each must exist.
     pub files: Vec<PathBuf>,
     /// `--set KEY=VALUE`, as given.
     pub set: Vec<String>,
@@ -22,7 +22,7 @@ pub struct Sources {
 }
 
 impl Sources {
-    /// The system's files as far as they are there: `/etc/scanhub/scanhub.toml`, then `/etc/scanhub/conf.d/*.toml`
+    /// The system's files that exist: `/etc/scanhub/scanhub.toml`, then `/etc/scanhub/conf.d/*.toml`
     /// in the order of their names.
     pub fn system() -> Vec<PathBuf> {
         let base = Path::new("/etc/scanhub");

@@ -181,15 +181,15 @@ fn a_circle_that_the_sensor_cannot_see_is_refused() {
     let away = "link.front.pose.x=2";
     refused(
         &[away, "link.front.pose.y=0"],
-        "--set link.front.pose.y=0: link front: no beam sees into the circle of 1 m\n  correct the sensor's pose, or give it \
-         a circle that it sees: link.front.zones.radii",
+        "--set link.front.pose.y=0: link front: no beam sees into the circle of 1 m\n  correct the sensor's pose, or set a \
+         circle that it sees: link.front.zones.radii",
     );
     assert_eq!(set(&[away, "link.front.zones.radii=[2.5,1]"]), Ok(()));
     let back = [away, "link.front.pose.yaw=3.1416", "link.front.zones.min_beams=100"];
     assert_eq!(set(&back), Ok(()));
     refused(
         &[&back[..], &["zones.radii=[0.5]"]].concat(),
-        "min_beams = 100, and 57 can see the circle of 0.5 m\n  fewer",
+        "min_beams = 100, and 57 can see the circle of 0.5 m\n  set fewer",
     );
     // The farthest reading in mm is 32 m.
     let far = ["link.front.pose.x=40", "link.front.pose.yaw=3.1416"];

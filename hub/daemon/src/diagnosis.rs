@@ -142,7 +142,7 @@ impl<'a> Diagnosis<'a> {
             ),
             (Some(trouble), _, _) => trouble.to_string(),
             (None, Some(is), Some(expected)) if is != expected => format!(
-                "the sensor measures in units of {} mm, the configuration says {} mm; the unit lives in its EEPROM, \
+                "the sensor measures in units of {} mm, the configuration says {} mm; the unit is stored in its EEPROM, \
                  which the hub never writes",
                 is.mm(),
                 expected.mm()

@@ -1,10 +1,10 @@
-//! How much may be read from a connection that can bring more than any line: twice what the line brings, and a second of
-//! that at once, since a network holds back and catches up. What is more waits in the connection, and is older than it
-//! seems when it is read. Refuses to know a clock, and what the bytes are.
+//! How much may be read from a connection that can deliver more than any line: twice what the line carries, and up to one
+//! second of that at once, because a network holds data back and catches up. The rest waits in the connection, and is
+//! older than it seems when it is read. Refuses to know a clock, and what the bytes are.
 
 use lms::{MILLIS, Nanos, line_time};
 
-/// What may be read, and for how long there was more.
+/// What may be read, and for how long there has been more.
 #[derive(Clone, Debug)]
 pub struct Allowance {
     /// Time that a byte takes.
@@ -29,7 +29,7 @@ impl Allowance {
         (now.saturating_sub(self.begin(now)) / self.byte_ns) as usize
     }
 
-    /// `len` bytes were read at `now`, where there was room for `room`.
+    /// `len` bytes were read at `now` into a buffer of `room` bytes.
     pub fn take(&mut self, len: usize, room: usize, now: Nanos) {
         self.is_full = len > 0 && len == room;
         self.spent = self.begin(now) + len as Nanos * self.byte_ns;
@@ -48,13 +48,13 @@ impl Allowance {
         Some(if until > now { until.clamp(any_at, enough_at) } else { enough_at })
     }
 
-    /// Whether more came for a while, as of `now`.
+    /// Whether more than that has been arriving for a while, as of `now`.
     pub fn is_flooded(&self, now: Nanos) -> bool {
         self.short.is_some_and(|(since, last)| now < last + CALM && last >= since + PATIENCE)
     }
 
-    /// Whether what was read last may have waited in the connection, as of `now`: more was there than could be read, or has
-    /// been a moment ago.
+    /// Whether the last bytes read may have waited in the connection, as of `now`: there was more than could be read, or
+    /// there was a moment ago.
     pub fn is_behind(&self, now: Nanos) -> bool {
         self.is_full || self.short.is_some_and(|(_, last)| now < last + SETTLED)
     }

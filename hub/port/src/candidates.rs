@@ -1,4 +1,4 @@
-//! The serial lines of this machine: the name of each that stays, and what the kernel knows of it without opening it.
+//! The serial lines of this machine: the permanent name of each, and what the kernel knows about it without opening it.
 
 use std::fmt;
 use std::fs;
@@ -13,15 +13,15 @@ use super::holder::{Holder, holders};
 /// A serial line of this machine.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Candidate {
-    /// The name that stays when things are plugged elsewhere, if there is one: below `/dev/serial`, else the device.
+    /// The permanent name, if there is one: below `/dev/serial`, else the device.
     pub name: PathBuf,
     /// The device itself.
     pub device: PathBuf,
     /// Its driver, such as `ftdi_sio`.
     pub driver: Option<String>,
-    /// What its adapter says it is: maker and product.
+    /// Maker and product, as its adapter reports them.
     pub product: Option<String>,
-    /// Who has it open, as far as this user may see.
+    /// The process that has it open, as far as this user may see.
     pub holder: Option<Holder>,
     /// Whether this user may open it.
     pub is_permitted: bool,
@@ -49,7 +49,7 @@ pub fn candidates() -> Vec<Candidate> {
     found
 }
 
-/// What `sys` and `dev` below `root` tell.
+/// The serial lines in `sys` and `dev` below `root`.
 pub fn found_in(root: &Path) -> Vec<Candidate> {
     let stable: Vec<(PathBuf, PathBuf)> = ["by-id", "by-path"]
         .iter()
@@ -80,8 +80,8 @@ pub fn found_in(root: &Path) -> Vec<Candidate> {
     found
 }
 
-/// Whether `path` is a terminal, by what the kernel says of its device; opening others can do harm: a watchdog, a pipe
-/// that waits for its other end.
+/// Whether `path` is a terminal, according to the kernel. It is not opened, because opening other devices can do harm: a
+/// watchdog, a pipe that waits for its other end.
 pub fn is_tty(path: &Path) -> bool {
     let Ok(metadata) = path.metadata() else { return false };
     if !metadata.file_type().is_char_device() {
@@ -96,7 +96,7 @@ pub fn is_tty(path: &Path) -> bool {
     }
 }
 
-/// How long the adapter at `path` collects bytes before it hands them over, in milliseconds, if it says so.
+/// How long the adapter at `path` collects bytes before it hands them over, in milliseconds, if it reports that.
 pub fn latency_ms(path: &Path) -> Option<u8> {
     let device = path.canonicalize().ok()?;
     latency_of(&Path::new("/sys/class/tty").join(device.file_name()?).join("device"))

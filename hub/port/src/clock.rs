@@ -1,4 +1,4 @@
-//! The only place of the hub that asks what time it is.
+//! The only place in the hub that reads the clock.
 
 use lms::Nanos;
 use rustix::event::Timespec;

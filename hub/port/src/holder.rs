@@ -1,5 +1,5 @@
-//! Who has a port open. It reads the descriptors of all processes, so it is asked once when something went wrong, not
-//! again and again.
+//! Which process has a port open. This reads the descriptors of all processes, so it is called once after an error, not
+//! repeatedly.
 
 use std::fmt;
 use std::fs;
@@ -31,7 +31,7 @@ pub fn all_holders(path: &Path) -> Vec<Holder> {
     device.and_then(|device| holders(&[&device]).pop()).unwrap_or_default()
 }
 
-/// Whether this process itself has `path` open, other than from whoever started it.
+/// Whether this process itself has `path` open, not counting what it inherited from its parent.
 pub(super) fn is_own(path: &Path) -> bool {
     let open = fs::read_dir("/proc/self/fd").into_iter().flatten().flatten();
     let given = |entry: &fs::DirEntry| ["0", "1", "2"].iter().any(|number| entry.file_name() == *number);

@@ -1,6 +1,6 @@
-//! What the kernel knows of a UART beyond its rate, which no safe crate asks for: how many errors the line had, and
-//! whether the driver may collect bytes before it hands them over. A driver that does not have these, as that of a pty,
-//! says so, and nothing follows from it.
+//! What the kernel knows about a UART besides its rate, and no safe crate provides: how many errors the line had, and
+//! whether the driver may collect bytes before it hands them over. A driver without these, such as a pty's, reports that,
+//! which is not an error.
 #![allow(unsafe_code)]
 
 use std::os::fd::{AsFd, BorrowedFd};
@@ -19,7 +19,7 @@ pub struct Counts {
     pub overrun: u32,
     /// Bytes of the wrong parity.
     pub parity: u32,
-    /// Times that the line was held low for longer than a byte.
+    /// How often the line was held low for longer than a byte.
     pub breaks: u32,
     /// Bytes for which the kernel's buffer had no room.
     pub buffer: u32,

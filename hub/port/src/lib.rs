@@ -1,5 +1,5 @@
-//! Where a link's bytes come from: a serial line, here or behind a serial server. Above this file nobody knows how it is
-//! opened, and what may go wrong then.
+//! Where a link's bytes come from: a serial line, on this machine or behind a serial server. No caller knows how it is
+//! opened, or what can go wrong then.
 
 mod allowance;
 mod candidates;
@@ -40,7 +40,7 @@ pub enum Port {
 }
 
 impl Port {
-    /// Opens `source` at `baud`. A serial server is waited for, some seconds at most, or until `stop` is set.
+    /// Opens `source` at `baud`. Waits for a serial server, some seconds at most, or until `stop` is set.
     ///
     /// A failure of one of the port kinds, with its remedy; of kind `short` without descriptors, of kind
     /// `configuration` if it is a recording, of kind `interrupted` if `stop` is set.
@@ -48,7 +48,7 @@ impl Port {
         Port::attempt(source, baud, stop).map_err(|refusal| refusal.explain(source))
     }
 
-    /// As [`Port::open`], for who tries again and again: the reason alone, without looking for its circumstances.
+    /// As [`Port::open`], for repeated tries: only the reason, without looking up its circumstances.
     pub fn attempt(source: &Source, baud: u32, stop: &AtomicBool) -> Result<Port, PortError> {
         match source {
             Source::Tty(path) => Tty::open(path, baud).map(Port::Tty),
@@ -57,7 +57,7 @@ impl Port {
         }
     }
 
-    /// Goes on with `line`, which a hub before this one had opened, if it still is what `source` names.
+    /// Continues with `line`, which an earlier hub had opened, if it still is what `source` names.
     pub fn adopt(line: OwnedFd, source: &Source, baud: u32) -> Option<Port> {
         match source {
             Source::Tty(path) => Tty::adopt(line, path, baud).ok().map(Port::Tty),
@@ -71,7 +71,7 @@ impl Port {
         matches!(source, Source::Tty(path) if Tty::is_at(line, path))
     }
 
-    /// Whether another program plays the sensor.
+    /// Whether another program simulates the sensor.
     pub fn simulated(&self) -> bool {
         match self {
             Port::Tty(tty) => tty.simulated,
@@ -79,7 +79,7 @@ impl Port {
         }
     }
 
-    /// Begins to open `source` if that takes its time; nothing if [`Port::attempt`] is over at once.
+    /// Starts to open `source` if that takes time; nothing if [`Port::attempt`] returns at once.
     pub fn dial(source: &Source) -> Option<Result<Dial, PortError>> {
         match source {
             Source::Tcp { host, port } => Some(Dial::start(host, *port)),
@@ -87,8 +87,8 @@ impl Port {
         }
     }
 
-    /// Changes the rate, and forgets what came in at the old one. An error of kind `Unsupported` says that the driver
-    /// refused it or made another rate of it, or that it cannot be changed from here.
+    /// Changes the rate, and discards what arrived at the old one. An error of kind `Unsupported` means that the driver
+    /// refused it or set another rate, or that it cannot be changed from here.
     pub fn set_baud(&self, baud: u32) -> io::Result<()> {
         match self {
             Port::Tty(tty) => tty.set_baud(baud),
@@ -99,7 +99,7 @@ impl Port {
         }
     }
 
-    /// As [`Port::set_baud`], for who has other rates to try: what is said of one that cannot be had, if it cannot.
+    /// As [`Port::set_baud`], for callers with other rates to try: returns the error if this rate is not possible.
     pub fn try_baud(&self, baud: u32) -> io::Result<Option<io::Error>> {
         match self.set_baud(baud) {
             Err(error) if error.kind() == io::ErrorKind::Unsupported => Ok(Some(error)),
@@ -107,7 +107,7 @@ impl Port {
         }
     }
 
-    /// Forgets what came in, at `baud` from now on; where a serial server has the rate, at the one that it has.
+    /// Discards what arrived, and uses `baud` from now on; a serial server keeps its own rate.
     pub fn discard_input(&self, baud: u32) -> io::Result<()> {
         match self {
             Port::Tty(tty) => tty.set_baud(baud),
@@ -115,7 +115,7 @@ impl Port {
         }
     }
 
-    /// How many bytes there are to read; nothing where that is not worth a question.
+    /// How many bytes there are to read; nothing if asking is not worth it.
     pub fn waiting(&self) -> Option<usize> {
         match self {
             Port::Tty(tty) => tty.waiting(),
@@ -149,7 +149,7 @@ impl Port {
 }
 
 impl Port {
-    /// Errors that the driver counted on the line since this was last asked; 0 where it counts none, without asking it.
+    /// Errors that the driver counted on the line since the last call; 0, without asking it, if it counts none.
     pub fn line_errors(&self) -> u64 {
         match self {
             Port::Tty(tty) => tty.line_errors(),
@@ -165,7 +165,7 @@ impl Port {
         }
     }
 
-    /// The rate that the driver says it has; nothing where it is set elsewhere.
+    /// The rate that the driver reports; nothing if the rate is set elsewhere.
     pub fn baud(&self) -> Option<u32> {
         match self {
             Port::Tty(tty) => tty.baud(),

@@ -1,8 +1,8 @@
-//! Which telegrams an error on the line may have hit. The driver counts errors as bytes reach it and does not say which
-//! they were: when a telegram has been read, they may lie in it, in another one of the same read, or in what is on the
-//! line since, the beginning of the next one.
+//! Which telegrams an error on the line may have hit. The driver counts errors when bytes reach it, but not which bytes
+//! they were. When a telegram has been read, an error may be in it, in another telegram of the same read, or in bytes that
+//! arrived since: the start of the next telegram.
 
-/// Whether errors are to be put down to what is read.
+/// Whether errors may belong to the bytes read.
 #[derive(Debug, Default)]
 pub struct LineErrors {
     /// The count moved since the last wait for bytes.
@@ -12,8 +12,7 @@ pub struct LineErrors {
 }
 
 impl LineErrors {
-    /// A telegram was read, and the driver counted so many errors since the one before; returns whether they may lie in
-    /// it.
+    /// A telegram was read, and the driver counted `errors` since the one before; returns whether they may be in it.
     pub fn note(&mut self, errors: u64) -> bool {
         self.moved |= errors > 0;
         self.moved || self.before

@@ -1,5 +1,5 @@
-//! Why a port cannot be opened, and what to do about it. The reason is found by trying; its circumstances (who has it,
-//! what is there instead) are looked for once, when somebody is to be told.
+//! Why a port cannot be opened, and what to do about it. The reason is found by trying; its circumstances (which process
+//! has it open, which other ports exist) are looked up once, when the failure is reported.
 
 use std::fmt;
 use std::io;
@@ -13,41 +13,41 @@ use super::holder::{Holder, holder, is_own};
 use super::rights::Rights;
 use crate::Source;
 
-/// The reason alone; equal as long as nothing changed.
+/// Only the reason; equal as long as nothing changes.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum PortError {
-    /// There is nothing at that path.
+    /// Nothing exists at that path.
     Missing,
-    /// There is, but no terminal.
+    /// Something exists, but it is not a terminal.
     NotTty,
-    /// This user may not.
+    /// This user has no permission.
     Denied,
     /// Another process has it.
     Busy,
-    /// There is a name and nothing behind it.
+    /// The name exists, but no device behind it.
     Dead,
     /// This process has no descriptor or thread left, or the kernel no memory.
     Short(Errno),
-    /// The driver made another rate of the one that was wanted.
+    /// The driver sets another rate than the wanted one.
     Rate {
-        /// What was wanted, in Bd.
+        /// The wanted rate, in Bd.
         wanted: u32,
-        /// What the driver has instead.
+        /// The rate that the driver sets instead.
         given: u32,
     },
     /// The serial server's name cannot be looked up.
     NoHost(String),
-    /// The serial server is there, and takes no connection at this port.
+    /// The serial server runs, but accepts no connection at this port.
     Refused,
     /// The serial server does not answer.
     TimedOut,
-    /// The network does not reach it.
+    /// The network has no route to it.
     Network(String),
-    /// Somebody wanted to stop.
+    /// The caller wanted to stop.
     Interrupted,
-    /// It is no line at all.
+    /// It is a recording, not a line.
     Recording,
-    /// Whatever else the kernel says.
+    /// Any other error of the kernel.
     Other(Errno),
 }
 
@@ -187,9 +187,7 @@ fn busy(path: &Path, holder: Option<Holder>) -> Failure {
                 "agetty" | "getty" => {
                     "a login waits there: stop it first (sudo systemctl stop serial-getty@...)"
                 }
-                "systemd" => {
-                    "the service manager keeps it for a service that is to go on with it: sudo systemctl stop scanhub"
-                }
+                "systemd" => "the service manager keeps it open for a service: sudo systemctl stop scanhub",
                 "gpsd" => "stop it first (sudo systemctl stop gpsd.socket gpsd)",
                 "scanhub" => "stop it first, or listen to it: scanhub list --domains",
                 _ => "stop it first",

@@ -1,5 +1,5 @@
-//! Who may open a port: its owner, its group and its mode beside the user and the groups of this process, and what is
-//! missing between them, in words. Looks into files only; what a directory service knows of users it does not see.
+//! Who may open a port: compares its owner, group and mode with the user and the groups of this process, and says what is
+//! missing. Reads only files; users of a directory service are not seen.
 
 use std::fs;
 use std::os::unix::fs::MetadataExt;

@@ -1,14 +1,14 @@
-//! What names the place that a link's bytes come from, as a configuration has it: a serial line, a serial server or a recording.
-//! Refuses to know whether it is there.
+//! The name of a link's source, as it is written in a configuration: a serial line, a serial server or a recording.
+//! Refuses to know whether it exists.
 
 use std::path::PathBuf;
 
-/// What stands behind a link.
+/// Where the bytes of a link come from.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum Source {
     /// A serial line.
     Tty(PathBuf),
-    /// A line behind a serial server (`tcp:HOST:PORT`), which was set to the link's rate by hand.
+    /// A line behind a serial server (`tcp:HOST:PORT`), which must be set to the link's rate.
     Tcp {
         /// Name or address, an IPv6 address without its brackets.
         host: String,

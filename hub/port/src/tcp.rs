@@ -1,6 +1,6 @@
-//! A serial line behind a serial server on the network, as a plain stream of bytes. Its rate was set there by hand and
-//! cannot be changed from here. Looking up a name and connecting block for as long as the network likes: a thread of
-//! its own does both, and ends by itself.
+//! A serial line behind a serial server on the network, as a plain stream of bytes. Its rate is set in the server and
+//! cannot be changed from here. Resolving a name and connecting can block for an unknown time: a separate thread does
+//! both, and ends by itself.
 
 use std::io::{self, ErrorKind, PipeReader, PipeWriter};
 use std::net::{SocketAddr, TcpStream, ToSocketAddrs};
@@ -46,7 +46,7 @@ impl Tcp {
         }
     }
 
-    /// Throws away what came in.
+    /// Discards what arrived.
     pub(crate) fn forget(&self) -> io::Result<()> {
         let mut buffer = [0; 4096];
         // Bounded, for somebody may send as fast as this reads.
@@ -85,7 +85,7 @@ impl AsFd for Tcp {
     }
 }
 
-/// A connection that is being made. Its descriptor is ready when the outcome is there.
+/// A connection attempt. Its descriptor is ready when the attempt has ended.
 pub struct Dial {
     outcome: Receiver<Result<Tcp, PortError>>,
     /// Ready once its other end is gone.
@@ -108,7 +108,7 @@ impl Dial {
         Ok(Dial { outcome, ready })
     }
 
-    /// What came of it; a refusal if it is not over.
+    /// The result; a refusal if it has not ended.
     pub fn finish(self) -> Result<Port, PortError> {
         self.outcome.try_recv().unwrap_or(Err(PortError::TimedOut)).map(Port::Tcp)
     }

@@ -1,4 +1,4 @@
-//! A serial line: opened for us alone, raw, and at a rate that the driver was seen to take.
+//! A serial line: opened exclusively, raw, and at a rate that the driver has confirmed.
 
 use std::cell::Cell;
 use std::io::{self, ErrorKind};

@@ -1,5 +1,5 @@
 //! CARMEN logs: text lines of which `FLASER n r1 .. rn ..`, `ROBOTLASER1` and `RAWLASER1` are scans in metres. They become
-//! the telegrams that an LMS 2xx would have sent. Poses and all other lines are passed over.
+//! the telegrams that an LMS 2xx would have sent. Poses and all other lines are skipped.
 
 mod census;
 mod log;
@@ -69,7 +69,7 @@ impl Sweep {
         }
         let ranges_m = (0..count)
             .map(|beam| {
-                let field = fields.next().ok_or_else(|| format!("{beam} ranges where it says {count}"))?;
+                let field = fields.next().ok_or_else(|| format!("{beam} ranges instead of {count}"))?;
                 field.parse().map_err(|_| format!("range {field:?} is not a number"))
             })
             .collect::<Result<Vec<f64>, String>>()?;

@@ -1,4 +1,4 @@
-//! What a recording holds, and what it says of the sensor. Refuses to know how it is read.
+//! What a recording contains, and what it says about the sensor. Refuses to know how it is read.
 
 use lms::measured::Measured;
 use lms::reply::Reply;
@@ -18,37 +18,37 @@ pub enum Form {
     Mcap,
 }
 
-/// What a recording holds, and what it says of the sensor.
+/// What a recording contains, and what it says about the sensor.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Contents {
     /// Its form.
     pub form: Form,
-    /// Names of the sensors in it, in the order in which they come; a stream and a log name none.
+    /// Names of the sensors in it, in order of appearance; a stream and a log name none.
     pub sensors: Vec<String>,
     /// Number of whole telegrams; of a log, of scans.
     pub telegrams: u64,
     /// How many of them are measured values (B0h).
     pub scans: u64,
-    /// Wall clock of the first telegram and of the latest one, ns since 1970, where there are stamps.
+    /// Wall clock of the first and the last telegram, ns since 1970, if there are stamps.
     pub span: Option<(u64, u64)>,
     /// Variant of the first scan.
     pub variant: Option<Variant>,
     /// Unit of the first scan; of a log the one in which its ranges are whole values.
     pub unit: Option<Unit>,
-    /// Measuring mode, where a configuration reply (F4h) or a status tells it; of a log one whose values reach as far as
+    /// Measuring mode, if a configuration reply (F4h) or a status contains it; for a log, a mode whose values reach as far as
     /// its ranges.
     pub mode: Option<Mode>,
     /// Bits that are set in any value of its scans; of a log none.
     pub bits: u16,
     /// Ranges of a log that its unit and mode cannot say.
     pub unfit: Unfit,
-    /// What is missing of the file. Telegrams that follow are those that are there.
+    /// What is missing in the file; [`telegrams`](crate::Recording::telegrams) returns those that are present.
     pub damage: Damage,
 }
 
 impl Contents {
-    /// The measuring mode by which the values are read: the one that is told, else that of 13 bits where no value has a
-    /// higher bit, which then says nothing in any mode. Nothing where the values could be split in several ways.
+    /// The measuring mode for reading the values: the one in the recording, else the mode of 13 bits if no value has a
+    /// higher bit, because then no mode assigns it a meaning. Nothing if the values could be split in several ways.
     pub fn readable(&self) -> Option<Mode> {
         let plain = Mode(0x00);
         self.mode.or((self.bits <= plain.max_value()).then_some(plain))

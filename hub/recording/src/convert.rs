@@ -1,5 +1,5 @@
-//! Writes a recording anew, in the same form or another one. A file that is damaged becomes one that is not, with all
-//! that was found in it. Refuses to know who asks, and how progress looks.
+//! Writes a recording again, in the same format or another. A damaged file becomes an intact one with everything that
+//! could be read from it. Refuses to know who calls it, and how progress is shown.
 
 mod copy;
 mod decoded;
@@ -33,11 +33,11 @@ pub struct ConvertOptions {
     pub output: PathBuf,
     /// Which sensor of the recording; of a stream or a log the name that it gets in an MCAP file.
     pub sensor: Option<String>,
-    /// Overwrite what is there.
+    /// Overwrite an existing file.
     pub force: bool,
-    /// An MCAP file of messages of ROS 2 alone.
+    /// An MCAP file with only messages of ROS 2.
     pub ros2: bool,
-    /// For scans: the measuring mode of a recording that does not tell it.
+    /// For scans: the measuring mode of a recording that does not contain it.
     pub mode: Option<Mode>,
     /// How an MCAP file is packed, if not as usual.
     pub compression: Option<Compression>,
@@ -48,7 +48,7 @@ pub struct ConvertOptions {
 pub enum Target {
     /// A recording again, of this form.
     Recording(Form),
-    /// An MCAP file of messages of ROS 2 alone.
+    /// An MCAP file with only messages of ROS 2.
     Ros2,
     /// A row of columns for each scan.
     Csv,
@@ -68,7 +68,7 @@ impl Target {
 /// What was converted.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Converted {
-    /// Form of the recording, and of what it became.
+    /// Formats of the input and of the output.
     pub forms: (Form, Target),
     /// How the ranges of a log are values; nothing of another form.
     pub encoding: Option<Encoding>,
@@ -89,13 +89,12 @@ pub struct Converted {
     pub is_closed: bool,
 }
 
-/// Converts as `options` say until `stop` is set; calls `progress` with the telegrams that were written and how many there
-/// are. Whoever closes stdout has enough.
+/// Converts according to `options` until `stop` is set; calls `progress` with the telegrams written and their total. A
+/// closed stdout is not an error.
 ///
-/// [`Kind::Input`] if the recording cannot be read, or not become that without loss, [`Kind::NoTopic`] if it has no such
-/// sensor, [`Kind::Usage`] if what it
-/// shall become cannot be said or options contradict each other, [`Kind::Output`] if that is there or cannot be written, [`Kind::Interrupted`] if it was
-/// stopped. Nothing is left then.
+/// [`Kind::Input`] if the recording cannot be read, or not be converted without loss, [`Kind::NoTopic`] if it has no such
+/// sensor, [`Kind::Usage`] if the output format is not known or options contradict each other, [`Kind::Output`] if the
+/// output exists or cannot be written, [`Kind::Interrupted`] if it was stopped. No output is left then.
 pub fn convert(
     options: &ConvertOptions,
     stop: &AtomicBool,

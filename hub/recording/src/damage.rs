@@ -1,4 +1,4 @@
-//! What is missing of a recording, counted and in words. Refuses to know how that was found out.
+//! What is missing in a recording, as counts and as text. Refuses to know how that was found.
 
 use std::fmt;
 
@@ -11,13 +11,13 @@ pub struct Damage {
     pub bytes: u64,
     /// Packed chunks of which nothing could be read.
     pub chunks: u64,
-    /// Telegrams that are there, but what the hub knew of them is not: their stamps are estimated.
+    /// Telegrams whose header is missing: their stamps are estimated.
     pub estimated: u64,
-    /// The beginning of the file is missing, be it by a byte: what it said of itself may be gone.
+    /// The start of the file is missing, even if only a byte: its description of itself may be gone.
     pub is_headless: bool,
     /// The file ends without its index, as after a kill.
     pub is_cut: bool,
-    /// What the file says of itself is wrong somewhere: a checksum, a length, an order.
+    /// The structure of the file is wrong somewhere: a checksum, a length, an order.
     pub is_harmed: bool,
 }
 

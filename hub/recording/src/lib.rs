@@ -1,8 +1,8 @@
-//! Reads what was recorded: MCAP files of the hub (feature `mcap`), streams of telegrams as they came down a line, and
-//! CARMEN logs, each plain or gzipped.
+//! Reads recordings: MCAP files of the hub (feature `mcap`), streams of telegrams as they arrived on a line, and CARMEN
+//! logs, each plain or gzipped.
 //!
-//! All come out as whole telegrams, so that the simulator can send them and a hub can read them. Which sensor it was
-//! and what its words mean is told as far as the file says it ([`Contents`]); nothing here keeps time or opens a port.
+//! All of them yield whole telegrams, so that the simulator can send them and a hub can read them. [`Contents`] says which
+//! sensor it was and what its values mean, as far as the file contains that; nothing here reads a clock or opens a port.
 
 mod carmen;
 mod contents;
@@ -27,7 +27,7 @@ use lms::measured::MEASURED;
 pub struct Frame {
     /// The whole telegram, STX to checksum; of a telegram stream bit for bit as it was received.
     pub telegram: Vec<u8>,
-    /// When it was measured, in nanoseconds since 1970, where the recording says so.
+    /// When it was measured, in nanoseconds since 1970, if the recording contains that.
     pub wall_ns: Option<u64>,
     /// What the hub knew of it when it was recorded: numbers, stamps, quality. Streams and logs have none.
     pub header: Option<schema::Header>,

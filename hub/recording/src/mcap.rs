@@ -1,5 +1,5 @@
-//! Recordings of the hub: what an MCAP file holds of each sensor, and its telegrams. Refuses to know how samples got
-//! into the file, and what other programs have put there.
+//! Recordings of the hub: what an MCAP file contains about each sensor, and its telegrams. Refuses to know how samples
+//! were written, and what other programs have added.
 
 mod channels;
 mod chunk;

@@ -1,5 +1,5 @@
-//! Opens a recording by what is in it, not by its name, and reads it through once: what it holds is known, and what
-//! is wrong with it is said, before anything is sent from it. Nothing is kept in memory.
+//! Opens a recording by its content, not by its name, and reads all of it once: its content is known, and what is wrong
+//! with it is reported, before anything is sent from it. Nothing is kept in memory.
 
 use std::fmt;
 use std::io::{self, BufRead, BufReader, Read};
@@ -56,7 +56,7 @@ impl Recording {
         Ok(recording)
     }
 
-    /// The same, but also of bytes without a telegram: what came down a line that only brings noise.
+    /// The same, but also for bytes without a telegram: a line with only noise.
     ///
     /// [`Kind::Input`] as of [`open`](Self::open).
     pub fn open_line(path: impl Into<PathBuf>) -> Result<Recording, Failure> {
@@ -106,14 +106,14 @@ impl Recording {
         Err(Failure::new(Kind::Input, message, "build it with feature mcap of scanhub-recording"))
     }
 
-    /// Whether a file that begins with `head` has its telegrams inside something else, MCAP's framing or gzip's.
+    /// Whether a file that starts with `head` is a container, MCAP or gzip, with telegrams inside.
     pub fn is_framed(head: &[u8]) -> bool {
         head.starts_with(MCAP) || head.starts_with(GZIP)
     }
 
-    /// The part of it that is `sensor`'s.
+    /// The part of it that belongs to `sensor`.
     ///
-    /// [`Kind::NoTopic`] if it has no such sensor; says which it has. [`Kind::Usage`] if it names none.
+    /// [`Kind::NoTopic`] with the existing ones if it has no such sensor. [`Kind::Usage`] if it names none.
     pub fn of(&self, sensor: &str) -> Result<Recording, Failure> {
         let place = self.path.display();
         if self.contents.sensors.is_empty() {
@@ -133,14 +133,14 @@ impl Recording {
         Ok(chosen)
     }
 
-    /// Number of the first telegram of its one sensor of which the hub with this `boot` made something: from it on, the hub
-    /// knew what the values mean. Nothing if the recording does not tell.
+    /// Number of the first telegram of its only sensor that the hub with this `boot` processed: from there on, the hub knew
+    /// the meaning of the values. Nothing if the recording does not contain it.
     #[cfg(feature = "mcap")]
     pub fn understood(&self, boot: u64) -> Option<u64> {
         self.survey.understood(self.contents.sensors.first()?, boot)
     }
 
-    /// Nothing: no form but MCAP tells.
+    /// Nothing: only MCAP contains it.
     #[cfg(not(feature = "mcap"))]
     pub fn understood(&self, _: u64) -> Option<u64> {
         None
@@ -156,18 +156,18 @@ impl Recording {
         &self.contents
     }
 
-    /// The file's bytes, unpacked, from the beginning; of a telegram stream what a hub would have read from the line.
+    /// The file's bytes, unpacked, from the start; for a telegram stream, what a hub would have read from the line.
     pub fn bytes(&self) -> Result<Box<dyn Read + Send>, Failure> {
         Ok(reader(&self.path)?)
     }
 
-    /// How the values are encoded, as far as it says so; of a log, how its ranges are whole values.
+    /// How the values are encoded, if the recording contains that; for a log, the encoding in which its ranges are whole values.
     pub fn encoding(&self) -> Option<Encoding> {
         Some(Encoding { unit: self.contents.unit?, mode: self.contents.mode? })
     }
 
-    /// Its telegrams in order, replies too; a log's scans as `encoding` says: without loss if that is its own. Should the file become unreadable in the
-    /// meantime, they end there.
+    /// Its telegrams in order, replies too; a log's scans encoded as `encoding`: without loss if that is its own. If the
+    /// file becomes unreadable meanwhile, they end there.
     ///
     /// [`Kind::Usage`] if it has several sensors and none was chosen by [`of`](Self::of).
     pub fn telegrams(&self, encoding: Encoding) -> Result<Box<dyn Iterator<Item = Frame> + Send>, Failure> {
@@ -325,7 +325,7 @@ fn unreadable(path: &Path, error: &io::Error) -> Failure {
         io::ErrorKind::Unsupported => "`mcap compress --compression none IN -o OUT` (of mcap.dev) unpacks it",
         io::ErrorKind::FileTooLarge => {
             "`zcat FILE > WHOLE` unpacks a packed file; `mcap filter --output-compression none IN -o OUT` (of mcap.dev) \
-             writes short chunks, and with -y TOPIC some topics alone"
+             writes short chunks, and with -y TOPIC only some topics"
         }
         _ => FORMS,
     };

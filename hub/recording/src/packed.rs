@@ -1,5 +1,5 @@
-//! A gzip file as the bytes that it unpacks to. A kilobyte may say a megabyte of the same byte: what no recording
-//! unpacks to is refused while little of it was read. Refuses to know what the bytes are.
+//! A gzip file as the bytes that it unpacks to. A kilobyte can unpack to a megabyte of the same byte: what cannot be a
+//! recording is refused early. Refuses to know what the bytes are.
 
 use std::io::{self, BufRead, ErrorKind, Read};
 

@@ -1,5 +1,5 @@
-//! Telegrams out of a stream of bytes as they came down a line, with whatever else came: bytes that are in no telegram
-//! are passed over, and counted. A stream has no stamps.
+//! Telegrams from a stream of bytes as they arrived on a line: bytes outside any telegram are skipped and counted. A
+//! stream has no stamps.
 
 use std::io::Read;
 

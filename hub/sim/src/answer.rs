@@ -1,9 +1,9 @@
-//! What the sensor answers to a request, and what the request changes in it. Knows no times but how long the sensor
-//! thinks, and nothing of the line.
+//! What the sensor answers to a request, and what the request changes in it. Knows only one time, how long the sensor
+//! takes to answer, and nothing about the line.
 //!
-//! It can what the path to a stream needs, every mode that sends measured values, and as much of the installation mode
-//! as changing the configuration and the permanent rate needs. Every other well-formed request is refused with 92h, as
-//! the sensor does with what it cannot.
+//! It supports everything on the way to a stream, every mode that sends measured values, and the part of the installation
+//! mode that changes the configuration and the permanent rate. Every other well-formed request is refused with 92h, as the
+//! sensor does with requests that it does not support.
 
 use std::ops::Range;
 

@@ -16,8 +16,8 @@ pub(crate) use lateness::Lateness;
 pub(crate) use schedule::{Extra, Schedule, Window};
 pub(crate) use telegrams::Blemishes;
 
-/// Why a telegram did not reach the host as it should have, as the truth names it: the first cause, and only if one
-/// of its own bytes did not arrive as sent and next to its neighbours.
+/// Why a telegram did not reach the host intact, as the truth names it: the first cause, and only if one of its own bytes
+/// did not arrive as sent and next to its neighbours.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Fault {
     /// The sensor broke it off, for a request or of itself.

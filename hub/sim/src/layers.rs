@@ -1,6 +1,5 @@
-//! What makes a measured range different from the true one, layer by layer, each with its own switch. Two layers have
-//! no switch of their own: ranges are told in whole units, and what is beyond the greatest of them is told as such.
-//! Knows no shapes.
+//! What makes a measured range different from the true one, layer by layer, each with its own switch. Two layers have no
+//! switch: ranges are sent in whole units, and a range beyond the greatest value is sent as a code. Knows no shapes.
 
 use lms::Nanos;
 
@@ -15,10 +14,10 @@ pub struct Layers {
     /// stood still 316 of 348 beams were never off by 30 mm, and 22 more often than in one scan of a hundred: the tail
     /// belongs to a few beams.
     pub tail: f64,
-    /// Whether a beam is as wide as a real one: where it meets two surfaces it tells one, the other or something between,
-    /// or too weak a signal if they are far apart. Else it is a line without width.
+    /// Whether a beam is as wide as a real one: on two surfaces it reports one, the other or a value between, or too weak a
+    /// signal if they are far apart. Else it is a line without width.
     pub spot: bool,
-    /// Share of the beams that tell a code although they could tell a range.
+    /// Share of the beams that report a code although they could report a range.
     pub errors: f64,
     /// Whether dark or oblique surfaces that are far give too weak a signal.
     pub weak: bool,

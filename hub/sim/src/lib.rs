@@ -1,8 +1,8 @@
 //! The sensor at the other end of the wire: a simulated SICK LMS 2xx on a pty, for tests, demonstrations and
 //! measurements without hardware.
 //!
-//! [`machine`] is the sensor itself, without I/O and clock; [`world`] is what there is to see, [`room`] how it is
-//! measured, [`look`] the truth beside it; [`wire`], [`fault`] and [`noise`] are what happens on the line; [`pty`] is the
+//! [`machine`] is the sensor itself, without I/O and clock; [`world`] is what it sees, [`room`] how that is measured,
+//! [`look`] the true values; [`wire`], [`fault`] and [`noise`] are what happens on the line; [`pty`] is the
 //! only file that knows real time and ports; [`simulate()`] is the verb. It uses the protocol crate's other direction and
 //! knows nothing of the hub.
 

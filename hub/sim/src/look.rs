@@ -1,9 +1,9 @@
-//! One look at a world: the words that the sensor would send, and beside each what its beam really met. Knows neither
-//! shapes nor noise.
+//! One scan of a world: the values that the sensor would send, and for each the object that its beam really hit. Knows
+//! neither shapes nor noise.
 
 use lms::Nanos;
 
-/// What a scan says, and what is true.
+/// A scan, and the truth for it.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Look {
     /// A value word for each beam.
@@ -12,10 +12,10 @@ pub struct Look {
     pub truth: Vec<Met>,
 }
 
-/// What a beam met with all of its spot.
+/// What a beam hit with all of its spot.
 ///
-/// A world does not know what a consumer has learned, it knows since when things are as they are. So whatever has come,
-/// gone or moved carries the time of that, and a bench decides how long after it the thing counts as foreground.
+/// A world does not know what a consumer has learned, only since when things are as they are. So each object that has
+/// appeared, disappeared or moved has the time of that, and a bench decides how long afterwards it counts as foreground.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Met {
     /// What stood there when the world began, and everything that people do not carry away.

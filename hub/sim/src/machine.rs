@@ -1,9 +1,9 @@
-//! The sensor's side of the conversation, without a line and without a clock: host bytes and times go in, chunks of
-//! bytes with the time at which they are through come out. What it measures comes from [`Source`], what it answers is
-//! said in `answer.rs`; what is lost on the way is not its affair.
+//! The sensor's side of the conversation, without a line and without a clock: host bytes and times go in, chunks of bytes
+//! with the time at which they have been sent come out. [`Source`] provides what it measures, `answer.rs` what it answers;
+//! it does not know what is lost on the way.
 //!
-//! Drive it like this: call [`Machine::poll_transmit`] until it answers `None`, hear the host's bytes, and come back
-//! at [`Machine::poll_timeout`].
+//! To drive it, call [`Machine::poll_transmit`] until it returns `None`, pass the host's bytes, and call again at
+//! [`Machine::poll_timeout`].
 
 use std::collections::VecDeque;
 
@@ -33,7 +33,7 @@ pub struct Chunk {
     pub part: Part,
 }
 
-/// Where a chunk stands.
+/// The position of a chunk in its telegram.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum Part {
     /// A single ACK or NAK.
@@ -140,9 +140,9 @@ impl Machine {
         self.settings.habits = habits;
     }
 
-    /// The power goes and comes back: what is on the line ends with the byte in the transmitter, everything that the
-    /// EEPROM does not hold is forgotten, and after the time of a start-up the banner 90h comes, at the permanent rate
-    /// or at 9600. Returns whether a telegram was broken off.
+    /// The power goes off and on: transmission ends with the byte in the transmitter, everything that is not in the EEPROM
+    /// is forgotten, and after the start-up time the banner 90h is sent, at the permanent rate or at 9600. Returns whether
+    /// a telegram was broken off.
     pub fn power_cycle(&mut self, now: Nanos) -> bool {
         self.queue.retain(|transmission| transmission.start_ns() <= now);
         self.queue.truncate(1);
@@ -158,7 +158,7 @@ impl Machine {
         broken
     }
 
-    /// Breaks off what it is sending, as for a request that it then took for none; a stream goes on with a whole scan.
+    /// Breaks off what it is sending, as if for a request that it then ignored; a stream continues with a whole scan.
     pub fn break_off(&mut self, now: Nanos) {
         if self.queue.front().is_some_and(|front| front.start_ns() <= now) {
             self.interrupt(now);
@@ -195,7 +195,7 @@ impl Machine {
         }
     }
 
-    /// The last request that it dropped for its gaps, told once.
+    /// The last request that it dropped because of its gaps; returned once.
     pub fn take_dropped(&mut self) -> Option<Dropped> {
         self.decoder.take_dropped()
     }

@@ -1,6 +1,6 @@
-//! What a host reads whose port runs at another rate than the line: bytes turned into bits at the sender's rate and
-//! sampled at the receiver's. An ideal UART whose samples come a little early agrees with recordings of real ones;
-//! bytes with a wrong stop bit are delivered, as Linux does. It does not know what the bytes were.
+//! What a host reads if its port runs at another rate than the line: bytes become bits at the sender's rate and are
+//! sampled at the receiver's. An ideal UART that samples a little early agrees with recordings of real ones; bytes with a
+//! wrong stop bit are delivered, as Linux does. Refuses to know what the bytes were.
 
 use std::collections::VecDeque;
 
@@ -15,7 +15,7 @@ pub struct Receiver {
     state: State,
 }
 
-/// A port that may run at another rate than the line, whose rate changes too: begins anew with each pair of rates.
+/// A port that may run at another rate than the line, whose rate also changes: starts again with each new pair of rates.
 #[derive(Clone, Debug, Default)]
 pub struct Mistuned(Option<((u32, u32), Receiver)>);
 

@@ -1,5 +1,5 @@
-//! The operating modes: what a sensor sends unasked after a request 20h, or once after one of its own kind, and how
-//! such a telegram is laid out (Telegram listing, 20h, 30h to 3Fh and 75h). Knows nothing of the line.
+//! The operating modes: what a sensor sends continuously after a request 20h, or once after the request for one value, and
+//! the layout of such a telegram (Telegram listing, 20h, 30h to 3Fh and 75h). Knows nothing about the line.
 
 use lms::command::Request;
 use lms::measured::{Frame, encode_with};
@@ -64,7 +64,7 @@ impl Operating {
         }
     }
 
-    /// Whether telegrams come unasked.
+    /// Whether telegrams are sent continuously.
     pub fn streams(&self) -> bool {
         !matches!(self, Operating::Installation | Operating::OnRequest)
     }

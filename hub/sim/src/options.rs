@@ -1,5 +1,4 @@
-//! What can be said to `simulate`, and the forms in which it is written. Whether the values fit together is seen by
-//! [`crate::simulate`].
+//! The options of `simulate`, and how they are written. [`crate::simulate`] checks that the values fit together.
 
 use std::path::PathBuf;
 use std::str::FromStr;
@@ -46,7 +45,7 @@ pub struct SimulateOptions {
     pub replay: Option<PathBuf>,
     /// Which of the recording's sensors each port is; one for all, none if the recording has but one.
     pub sensors: Vec<String>,
-    /// Whether the recording begins anew at its end.
+    /// Whether the recording starts again at its end.
     pub looped: bool,
     /// How many times faster than the clock the sensor's time runs, the bit time too; 0.01 to 100.
     pub speed: f64,
@@ -101,12 +100,12 @@ impl Default for SimulateOptions {
     }
 }
 
-/// Type, number and firmware as a sensor of `family` says them: 21 characters (Telegram listing, BAh).
+/// Type, number and firmware as a sensor of `family` reports them: 21 characters (Telegram listing, BAh).
 pub fn type_name(family: Family) -> String {
     format!("{};301063;V02.30 ", family.name().to_uppercase())
 }
 
-/// `lms200` and the other types that can scan what a [`Variant`] says.
+/// `lms200` and the other types that support the values of [`Variant`].
 pub fn parse_type(text: &str) -> Result<Family, Failure> {
     let families = Family::ALL.into_iter().filter(|family| family.factory_variant().is_some());
     one_of("type", text, &families.map(|family| (family.name(), family)).collect::<Vec<_>>())
@@ -130,7 +129,7 @@ pub fn parse_state(text: &str) -> Result<Start, Failure> {
     one_of("state", text, &known)
 }
 
-/// An error as 32h tells it: type and number, `0x84:22`.
+/// An error as in a reply to 32h: type and number, `0x84:22`.
 pub fn parse_error(text: &str) -> Result<(u8, u8), Failure> {
     let pair = text.split_once(':').and_then(|(kind, number)| Some((byte(kind)?, byte(number)?)));
     pair.ok_or_else(|| {

@@ -1,5 +1,5 @@
-//! Where a simulated port is found: a symlink from the path that the user names to the pty, which has a number that
-//! nobody can know. Refuses to touch anything but such a symlink.
+//! Where a simulated port is found: a symlink from the path that the user names to the pty, whose number is not known
+//! before. Refuses to touch anything but such a symlink.
 
 use std::fs::{self, Metadata};
 use std::io;

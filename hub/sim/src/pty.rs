@@ -1,9 +1,9 @@
 //! The port: a pty that behaves like a serial line as far as a pty can, and the clock. The only file of this crate that
-//! asks the kernel what time it is. Knows nothing of telegrams.
+//! reads the kernel's clock. Knows nothing about telegrams.
 //!
-//! What a pty does otherwise than a line, and what is done about it: it keeps what nobody reads (so nothing is written
-//! while the host's side is closed, and what is left is thrown away then); its exclusive mode outlives the last close
-//! (so it is cleared); before the first open it does not say that it is closed (so it is opened and closed once).
+//! Differences between a pty and a line, and what is done about them: a pty keeps what nobody reads (so nothing is written
+//! while the host's side is closed, and the rest is discarded then); its exclusive mode survives the last close (so it is
+//! cleared); before the first open it does not report that it is closed (so it is opened and closed once).
 
 use std::ffi::OsStr;
 use std::os::fd::{AsFd, BorrowedFd, OwnedFd};
@@ -94,8 +94,8 @@ impl Pty {
         }
     }
 
-    /// Gives `bytes` to the host; returns whether its buffer had room for all. What has no room is lost, as it is in
-    /// a UART that nobody empties.
+    /// Gives `bytes` to the host; returns whether its buffer had room for all. What has no room is lost, as in a UART
+    /// that nobody reads.
     pub fn write(&self, bytes: &[u8]) -> Result<bool, Failure> {
         let mut rest = bytes;
         while !rest.is_empty() {

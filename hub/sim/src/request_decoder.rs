@@ -1,7 +1,6 @@
-//! Host bytes to requests, the way the sensor hears them. What a host writes at once leaves its UART one byte after the
-//! other, which a pty does not imitate: so each byte is heard when the line would have carried it. A request with a gap
-//! that is too long is dropped, and one with gaps that are too short by a sensor that is strict. What a request means is
-//! [`crate::machine`]'s affair.
+//! Host bytes to requests, as the sensor receives them. What a host writes at once leaves its UART byte by byte, which a
+//! pty does not imitate: so each byte is received when the line would have carried it. A request with too long a gap is
+//! dropped; a strict sensor also drops one with too short gaps. [`crate::machine`] knows what a request means.
 
 use std::fmt;
 

@@ -48,8 +48,8 @@ impl Room {
         Room { seed: seed ^ sensor.wrapping_mul(0xD1B5_4A32_D192_ED03), sight }
     }
 
-    /// The value words of the scan whose last mirror turn ended at `end_ns`: as many as `variant` has beams, in `unit`,
-    /// split as `mode` says. The same arguments give the same words.
+    /// The values of the scan whose last mirror turn ended at `end_ns`: as many as `variant` has beams, in `unit`, split
+    /// according to `mode`. The same arguments give the same values.
     pub fn scan(&self, variant: Variant, unit: Unit, mode: Mode, end_ns: Nanos) -> Vec<u16> {
         self.look(variant, unit, mode, end_ns).words
     }

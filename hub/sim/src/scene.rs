@@ -1,5 +1,5 @@
-//! A world as data: what stands where, from when until when, and where it moves. Everything in the world's own frame,
-//! in millimetres and seconds. Knows neither files nor beams.
+//! A world as data: which objects are where, from when until when, and how they move. All in the world's frame, in
+//! millimetres and seconds. Knows neither files nor beams.
 
 use crate::layers::Layers;
 use crate::people::Plan;

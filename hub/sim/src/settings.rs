@@ -1,5 +1,5 @@
-//! What a sensor is when a simulation begins: its type and EEPROM, what a host that is gone left it in, and its bad
-//! habits. Plain values; what follows from them is [`crate::machine`]'s affair.
+//! The sensor at the start of a simulation: its type and EEPROM, the state in which an earlier host left it, and its bad
+//! habits. Plain values; [`crate::machine`] acts on them.
 
 use lms::variant::{Baud, Mode, Unit, Variant};
 use lms::{MILLIS, Nanos};
@@ -12,11 +12,11 @@ use crate::transmission::ChunkSize;
 pub struct Settings {
     /// The sensor's own address, 0 to 127; it answers to this one and to 0.
     pub address: u8,
-    /// What it says of itself to 3Ah: 21 ASCII characters by custom. An LMS 211 sees 100 degrees only.
+    /// Its reply to 3Ah: by convention 21 ASCII characters. An LMS 211 sees only 100 degrees.
     pub type_name: String,
     /// Rate of the line. [`Settings::permanent_baud`] and 9600 are what a power cycle brings.
     pub baud: Baud,
-    /// Rate at power-on that somebody wrote into the EEPROM with 66h; `None`: 9600.
+    /// Rate at power-on in the EEPROM, written with 66h; `None`: 9600.
     pub permanent_baud: Option<Baud>,
     /// Angle and resolution at power-on.
     pub variant: Variant,
@@ -34,13 +34,13 @@ pub struct Settings {
     pub boot_ns: Nanos,
     /// The byte that ends each reply: 10h for a healthy sensor, 11h after some news (Telegram listing 8).
     pub status: u8,
-    /// Pairs of type and number, as 32h tells them (Telegram listing, B2h).
+    /// Pairs of type and number, as in the reply to 32h (Telegram listing, B2h).
     pub errors: Vec<(u8, u8)>,
     /// Transparency of the front window in percent of what it was when clean: a warning below 75, an error below 30.
     pub pollution_percent: u16,
-    /// What it does otherwise than the listing says.
+    /// How it deviates from the listing.
     pub habits: Habits,
-    /// How many bytes come at once.
+    /// How many bytes arrive at once.
     pub chunk: ChunkSize,
     /// How many times faster the machine's time runs than the host's, which keeps the gaps of its requests by its own
     /// clock.
@@ -84,34 +84,34 @@ pub enum Start {
     PowerOn,
 }
 
-/// What a sensor does otherwise than the listing says; real ones do it now and then.
+/// How a sensor deviates from the listing; real ones do so occasionally.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Habits {
     /// Share of the requests that it overlooks while its mirror turns.
     pub overlooks: f64,
-    /// Share of the requests that it answers with NAK, though they arrived well.
+    /// Share of the requests that it answers with NAK although they arrived intact.
     pub naks: f64,
     /// Share of the replies that it sends twice.
     pub doubles: f64,
-    /// How much later than usual its ACK comes.
+    /// How much later than usual its ACK is sent.
     pub late_acknowledge_ns: Nanos,
-    /// How much later than usual its reply comes; such a reply comes even if the next request is there before it.
+    /// How much later than usual its reply is sent; it is sent even if the next request arrives before.
     pub late_reply_ns: Nanos,
-    /// How much longer than usual a change of mode, rate or variant takes: up to 3 s by the listing. A request that comes
-    /// before it is over is answered at once, and the reply to the change never comes.
+    /// How much longer than usual a change of mode, rate or variant takes: up to 3 s by the listing. A request that arrives
+    /// before it is done is answered at once, and the reply to the change is never sent.
     pub late_mode_ns: Nanos,
     /// How much longer than usual a write to the EEPROM takes; SICK's quick manual allows 7 s.
     pub late_write_ns: Nanos,
-    /// Whether it refuses in installation mode to measure, with 92h: the monitoring mode is wanted first (Telegram listing
-    /// 6.3.2; its table 7-1 allows it).
+    /// Whether it refuses to measure in installation mode, with 92h: it must first enter the monitoring mode (Telegram
+    /// listing 6.3.2; its table 7-1 allows measuring).
     pub strict: bool,
-    /// Whether it drops requests whose bytes come less than 55 us apart (Telegram listing 4.3), which most hosts leave to
-    /// their UART.
+    /// Whether it drops requests whose bytes arrive less than 55 us apart (Telegram listing 4.3); most hosts ignore that
+    /// limit.
     pub strict_gap: bool,
     /// How long it thinks between each ACK and its reply; 0: as long as real ones did, by chance.
     pub answer_ns: Nanos,
     /// Commands that it refuses with 92h.
     pub refuses: Vec<u8>,
-    /// Whether it answers nothing at all. A stream goes on.
+    /// Whether it does not answer at all. A stream continues.
     pub mute: bool,
 }

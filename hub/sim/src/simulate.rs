@@ -1,5 +1,5 @@
-//! The verb `simulate`: sensors on ptys until it is told to stop. Builds them from the options, gives each a thread,
-//! and writes the truth. Printing and signals are the program's affair.
+//! The verb `simulate`: sensors on ptys until it is stopped. Builds them from the options, gives each a thread, and writes
+//! the truth. Refuses to print and to handle signals: the program does.
 
 use std::os::fd::{AsFd, BorrowedFd, OwnedFd};
 use std::path::PathBuf;
@@ -20,7 +20,7 @@ use crate::source::Source;
 use crate::truth::{Record, Summary, Truth};
 use crate::wire::Wire;
 
-/// A port that is there to be opened.
+/// A port that is ready to be opened.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Ready {
     /// The symlink as the user named it.
@@ -29,9 +29,9 @@ pub struct Ready {
     pub pty: PathBuf,
 }
 
-/// Simulates the sensors of `options` until `stop` is readable, and says what each port sent. `on_ready` is called once
-/// all ports are there, `tell` with each telegram sent, from the port's thread and in its pace. The symlinks are gone
-/// when this returns.
+/// Simulates the sensors of `options` until `stop` is readable, and returns what each port sent. `on_ready` is called once
+/// all ports exist, `tell` with each telegram sent, from the port's thread and at its pace. The symlinks are removed when
+/// this returns.
 pub fn simulate(
     options: &SimulateOptions,
     stop: impl AsFd,

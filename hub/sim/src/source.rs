@@ -1,5 +1,5 @@
-//! Where the sensor's scans come from: a room that is measured anew each time, or a recording that is told once from
-//! its beginning to its end. Knows neither requests nor the line.
+//! Where the sensor's scans come from: a room that is measured for each scan, or a recording that is played from start to
+//! end. Knows neither requests nor the line.
 
 use lms::variant::Variant;
 

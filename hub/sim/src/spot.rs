@@ -1,5 +1,5 @@
-//! What one beam makes of the rays that its spot covers: an echo from one surface, or from two of which it tells one,
-//! the other or something between. Knows neither units nor words.
+//! What one beam measures from the rays that its spot covers: an echo from one surface, or from two, of which it reports
+//! one, the other or a value between. Knows neither units nor codes.
 
 use crate::layers::Dice;
 use crate::look::Met;

@@ -1,5 +1,5 @@
-//! One telegram (or single byte) on its way out: which of its bytes are through the line at a given time, and in which
-//! chunks the receiver's hardware hands them over. It does not know what the bytes mean or who asked for them.
+//! One telegram (or single byte) on its way out: which of its bytes have passed the line at a given time, and in which
+//! chunks the receiver's hardware hands them over. Refuses to know what the bytes mean and who asked for them.
 
 use lms::variant::{BYTES_PER_TURN, Baud, MIRROR_TURN};
 use lms::{Nanos, line_time};

@@ -1,5 +1,5 @@
 //! What was really sent: one record per telegram and one per port at the end, as lines for a file. Knows neither the
-//! sensor nor the port; nothing here is ever told to the hub.
+//! sensor nor the port; the hub never sees any of it.
 
 use std::fs::File;
 use std::io::Write;

@@ -1,5 +1,5 @@
-//! What lies in each direction from a sensor at one moment, as a row of narrow rays: drawn shape by shape, the nearest
-//! wins. Knows neither beams nor noise.
+//! What is in each direction from a sensor at one moment, as a row of narrow rays: drawn shape by shape, the nearest wins.
+//! Knows neither beams nor noise.
 
 use std::sync::LazyLock;
 

@@ -1,8 +1,8 @@
-//! The line between sensor and port with everything that goes wrong on it, in a time that is an argument: the sensor's
-//! chunks go in, what arrives and why it differs comes out. One implementation for ptys and for tests in virtual time.
+//! The line between sensor and port with all its faults; time is an argument: the sensor's chunks go in, what arrives and
+//! why it differs comes out. One implementation for ptys and for tests in virtual time.
 //!
-//! Drive it like a [`Machine`]: [`Wire::poll_transmit`] until it answers `None`, hear the host's bytes, come back at
-//! [`Wire::poll_timeout`]. What the host's port does (another rate, nobody there) comes after it.
+//! Drive it like a [`Machine`]: call [`Wire::poll_transmit`] until it returns `None`, pass the host's bytes, call again at
+//! [`Wire::poll_timeout`]. What the host's port does (another rate, no reader) comes after it.
 
 use std::collections::VecDeque;
 
@@ -16,7 +16,7 @@ use crate::request_decoder::Arrival;
 /// What arrives at once.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Carried {
-    /// The bytes, with what came between them; none if all of them were lost.
+    /// The bytes, with what arrived between them; none if all of them were lost.
     pub bytes: Vec<u8>,
     /// The rate they were sent at.
     pub baud: Baud,
@@ -73,7 +73,7 @@ impl Wire {
         }
     }
 
-    /// From now on other things go wrong, drawn anew; what is under way stays as it is.
+    /// Uses other faults from now on, with new random numbers; what is on its way does not change.
     pub fn set_faults(&mut self, faults: &Faults, seed: u64) {
         let fresh = Wire::new(faults, seed);
         let lateness = fresh.lateness.behind(&self.lateness);

@@ -1,5 +1,5 @@
-//! The worlds there are: some that a sensor's tests need, made of code, and scenes as data: those that the program
-//! brings along, and files. Knows where a world comes from, not what is in it.
+//! The available worlds: some for tests of the sensor, made in code, and scenes as data: built-in ones, and files. Knows
+//! where a world comes from, not what is in it.
 
 mod file;
 mod origin;

@@ -1,5 +1,5 @@
-//! A scene as a seed makes it, from the place of one sensor: what lies around it at a given time. Knows neither units nor
-//! words.
+//! A scene with its random parts drawn from a seed, seen by one sensor: what is around it at a given time. Knows neither
+//! units nor codes.
 
 use lms::Nanos;
 

@@ -1,5 +1,5 @@
-//! `scanhub configure`: changes what a sensor keeps for ever. Asks the sensor what it keeps, shows the difference, asks a
-//! person, writes, reads back, and says in which state the sensor is, however it went.
+//! `scanhub configure`: changes a sensor's EEPROM settings. Reads the settings, shows the difference, asks a person,
+//! writes, reads back, and reports the state of the sensor, also after a failure.
 
 mod ask;
 mod difference;
@@ -31,7 +31,7 @@ pub struct Order {
     pub password: String,
 }
 
-/// What there is to tell on the way.
+/// Progress and results to report.
 #[derive(Debug)]
 pub enum News<'a> {
     /// The sensor is looked for at this rate.
@@ -46,7 +46,7 @@ pub enum News<'a> {
     Configured(&'a Configured),
 }
 
-/// Carries out `order`; `tell` is told everything that happens.
+/// Carries out `order`; calls `tell` with everything that happens.
 ///
 /// [`Kind::Configuration`] for a key, a value, or what this type of sensor cannot do, before anything is written;
 /// [`Kind::Usage`] if no person is at a terminal; the port kinds, [`Kind::Timeout`] if nobody answers,

@@ -1,7 +1,7 @@
-//! `scanhub doctor`: every condition that a working set-up needs, one after the other, with what was found and what to
-//! do. Changes no sensor, no file and no process, unless it is told to take away what dead ones left. A port that somebody
-//! named, and nobody holds, it opens as the hub would: it stays raw at the rate of the last question, and its driver hands
-//! over bytes at once.
+//! `scanhub doctor`: checks every condition of a working setup, and reports what was found and what to do. Changes no
+//! sensor, no file and no process, unless asked to remove what dead processes left. It opens a port that was named and that
+//! nobody holds, as the hub would: the port stays raw at the rate of the last question, and its driver hands over bytes at
+//! once.
 
 mod counts;
 mod finding;
@@ -36,9 +36,9 @@ pub use system::System;
 pub struct Subjects {
     /// Ports as the user named them, or by the name of a link of the running hub; none: those of the configuration.
     pub ports: Vec<Source>,
-    /// The configuration, or why there is none; nothing if nobody wrote one.
+    /// The configuration, or why it is refused; nothing if there is none.
     pub config: Option<Result<Config, Failure>>,
-    /// What the configuration says of a gateway.
+    /// The gateway's section of the configuration.
     pub gateway: Gateway,
     /// Where a hub would put its domain.
     pub domain: Domain,
@@ -46,7 +46,7 @@ pub struct Subjects {
     pub places: Vec<Domain>,
     /// The machine's files.
     pub system: System,
-    /// Whether what dead processes left in the domain is to be taken away first.
+    /// Whether to first remove what dead processes left in the domain.
     pub clean: bool,
 }
 
@@ -58,7 +58,7 @@ pub(crate) struct Subject {
     pub(crate) named: bool,
 }
 
-/// Examines everything, telling each finding as soon as it is there.
+/// Examines everything, and calls `tell` with each finding as soon as it is known.
 ///
 /// [`Kind::Check`] with the number of checks that failed, [`Kind::Interrupted`] if `stop` is set.
 pub fn examine(

@@ -1,5 +1,5 @@
-//! Drives a conversation on an open port until it is over. What a link's thread does for ever and for consumers, this
-//! does once and for somebody who waits at a terminal.
+//! Drives a conversation on an open port until it is over. A link's thread does the same forever and for consumers; this
+//! does it once, for a person at a terminal.
 
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;

@@ -1,5 +1,5 @@
-//! The verbs that deal with a port or with telegrams and are no hub: `probe`, `doctor`, `configure` and `telegram`. Each does
-//! its work once and ends; who waits at a terminal is told of it.
+//! The verbs that open a port or explain telegrams, without a hub: `probe`, `doctor`, `configure` and `telegram`. Each does
+//! its work once and ends, and reports progress to the person at the terminal.
 
 pub mod configure;
 pub mod doctor;

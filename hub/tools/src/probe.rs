@@ -1,4 +1,4 @@
-//! `scanhub probe`: what is at the other end of a port. Opens it, lets the sensor tell of itself, and leaves it as it was.
+//! `scanhub probe`: what is at the other end of a port. Opens it, asks the sensor, and leaves the sensor as it was.
 
 mod description;
 
@@ -28,7 +28,7 @@ pub fn list() -> Result<Vec<Candidate>, Failure> {
     Ok(found)
 }
 
-/// Asks the sensor at `source` what it is. `look` is told the rate at which it is looked for, whenever that changes.
+/// Asks the sensor at `source` what it is. Calls `look` with each rate at which it searches.
 ///
 /// The port kinds if the port cannot be used, [`Kind::Timeout`] if nobody answers, [`Kind::Interrupted`] if `stop` is
 /// set.
@@ -135,7 +135,7 @@ mod tests {
     fn rates_that_the_port_does_not_have_were_not_tried() {
         let report = Inquiry::new(Baud::B38400, 0).report().clone();
         let said = |first| silence(&Source::Tty("/dev/ttyS0".into()), first, &report).message;
-        assert!(said(Baud::B500000).contains("38400 or 500000 Bd; not a byte"));
-        assert!(said(Baud::B38400).contains("no answer at 9600, 19200 or 38400 Bd; not a byte"));
+        assert!(said(Baud::B500000).contains("38400 or 500000 Bd; no byte"));
+        assert!(said(Baud::B38400).contains("no answer at 9600, 19200 or 38400 Bd; no byte"));
     }
 }

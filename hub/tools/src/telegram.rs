@@ -1,5 +1,5 @@
-//! `scanhub telegram`: bytes of a line, or written down, to words for people; and names to bytes. Touches no port: what
-//! is encoded here is printed, not sent.
+//! `scanhub telegram`: explains bytes of a line or of a text, and encodes telegrams by name. Touches no port: what is
+//! encoded here is printed, not sent.
 
 mod arguments;
 mod encode;
@@ -21,14 +21,14 @@ use find::Finder;
 use input::Input;
 use show::{Form, Show};
 
-/// What `telegram decode` is asked for.
+/// Options of `telegram decode`.
 #[derive(Clone, Debug, Default)]
 pub struct DecodeOptions {
     /// The file to read; `None` or `-` is stdin.
     pub file: Option<PathBuf>,
     /// Of a recording of several sensors the one whose telegrams are meant.
     pub sensor: Option<String>,
-    /// The measuring mode, as `0x01` or `1`; without it the one that the telegrams tell is taken.
+    /// The measuring mode, as `0x01` or `1`; without it, the mode in the telegrams.
     pub mode: Option<String>,
     /// Every value instead of a summary.
     pub all: bool,
@@ -37,7 +37,7 @@ pub struct DecodeOptions {
 }
 
 /// Explains all telegrams in a stream of bytes, in hexadecimal text or inside an MCAP recording, and accounts for the bytes
-/// between them. Bytes of a recording are those of its telegrams, one after the other.
+/// between them. Bytes of a recording are those of its telegrams, in order.
 ///
 /// [`Kind::Check`] if there is no telegram in it, [`Kind::Input`] if it cannot be read; [`Kind::NoTopic`] and
 /// [`Kind::Usage`] if it has no such sensor, or several and none is chosen.

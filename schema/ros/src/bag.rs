@@ -8,7 +8,7 @@ use schema::{Header, Pose, Scan};
 
 use crate::{LASER_SCAN, TF_MESSAGE, TF_STATIC, Type, frame, laser_scan, scan_topic, static_transforms};
 
-/// The profile of a file that has messages of ROS 2 alone.
+/// The profile of a file that has only messages of ROS 2.
 pub const PROFILE: &str = "ros2";
 
 /// What is in a file, as far as the next message depends on it.
@@ -52,8 +52,8 @@ impl Bag {
         writer.message(channel, header.topic_seq as u32, header.wall_ns, &self.message)
     }
 
-    /// Writes where all sensors that are known sit, if it is new that `sensor` sits at `pose`; log time and stamp are
-    /// `wall_ns` (since 1970), or right behind the message before.
+    /// Writes the poses of all known sensors if `pose` of `sensor` is new; log time and stamp are `wall_ns` (since 1970), or
+    /// just after the message before.
     pub fn pose<W: Write>(
         &mut self,
         writer: &mut Writer<W>,

@@ -1,5 +1,5 @@
-//! Little-endian CDR (OMG XCDR1): values one after the other, each at a multiple of its size from where the body begins.
-//! Refuses to know types.
+//! Little-endian CDR (OMG XCDR1): values in order, each at a multiple of its size from the start of the body. Refuses to
+//! know types.
 
 /// Writes a message.
 pub(crate) struct Cdr<'a> {

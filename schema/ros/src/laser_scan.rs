@@ -7,9 +7,9 @@ use schema::{Code, Header, Scan, TURN_NS};
 use crate::cdr::Cdr;
 
 /// Writes `scan`, of the frame `frame`, to the end of `message`: x ahead, angles in radians counter-clockwise from there as
-/// the sensor itself counts them, also where it hangs upside down; ranges in metres (REP 103), each the float that is
-/// nearest to what the sensor said. +inf where nothing came back from as far as the sensor sees, -inf where something is
-/// too near, NaN where nothing can be said (REP 117). Stamped when its first beam was measured.
+/// the sensor itself counts them, also if it is mounted upside down; ranges in metres (REP 103), each the float nearest to
+/// the sensor's value. +inf: no echo within the sensor's range; -inf: something is too near; NaN: not known (REP 117).
+/// Stamped when its first beam was measured.
 pub fn laser_scan(message: &mut Vec<u8>, frame: &str, header: &Header, scan: &Scan) {
     let mut cdr = Cdr::begin(message);
     cdr.header(header.wall_ns.saturating_sub(scan.beam_age_ns(0)), frame);

@@ -1,5 +1,5 @@
 //! What the hub publishes, as messages of ROS 2: their bytes, the names of their topics and frames, and the texts from
-//! which a reader that has no ROS learns them. Whoever brings scans to users of ROS calls this crate. Refuses to know shared
+//! which a reader without ROS learns them. All code that writes scans for ROS calls this crate. Refuses to know shared
 //! memory, networks and clocks.
 #![forbid(unsafe_code)]
 

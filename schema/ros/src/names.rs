@@ -11,8 +11,8 @@ pub fn frame(sensor: &str) -> &str {
     sensor
 }
 
-/// The topic of `sensor`'s scans: letters, digits and `_` in words that begin with none of the digits
-/// (<https://design.ros2.org/articles/topic_and_service_names.html>), and another machine's in a space of its own.
+/// The topic of `sensor`'s scans: letters, digits and `_` in words that do not start with a digit
+/// (<https://design.ros2.org/articles/topic_and_service_names.html>). A sensor of another machine has its own namespace.
 pub fn scan_topic(sensor: &str) -> String {
     let mut topic = String::new();
     for word in sensor.split('.') {

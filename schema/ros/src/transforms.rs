@@ -1,15 +1,15 @@
-//! Where sensors sit, as `tf2_msgs/msg/TFMessage`. Refuses to know scans.
+//! The poses of sensors, as `tf2_msgs/msg/TFMessage`. Refuses to know scans.
 
 use schema::Pose;
 
 use crate::cdr::Cdr;
 use crate::{BASE_FRAME, frame};
 
-/// Writes where the sensors `poses` sit on the robot to the end of `message`, stamped `stamp_ns` (since 1970). All of them:
-/// who comes late hears the last message of its topic alone.
+/// Appends the `poses` of the sensors on the robot to `message`, stamped `stamp_ns` (since 1970). It contains all of them,
+/// because a late subscriber gets only the last message of its topic.
 ///
-/// A sensor that hangs upside down is turned by half a turn around its x axis, then by its yaw around the robot's z: so the
-/// angles of its scans, which it counts as ever, run the other way round.
+/// A sensor that is mounted upside down is rotated by half a turn around its x axis, then by its yaw around the robot's z:
+/// so the angles of its scans, which it counts as usual, run in the other direction.
 pub fn static_transforms(message: &mut Vec<u8>, stamp_ns: u64, poses: &[(String, Pose)]) {
     let mut cdr = Cdr::begin(message);
     cdr.u32(poses.len() as u32);

@@ -5,7 +5,7 @@
 pub struct Type {
     /// Its name, such as `sensor_msgs/msg/LaserScan`.
     pub name: &'static str,
-    /// Its fields, in the language `ros2msg`; the types it is made of follow, each behind a line, as rosbag2 keeps them.
+    /// Its fields, in the language `ros2msg`; the types that it contains follow, each after a line, as rosbag2 stores them.
     pub text: &'static str,
 }
 

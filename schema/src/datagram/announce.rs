@@ -1,5 +1,5 @@
-//! What a gateway says of a sensor once a second: who it is, what goes out where, and the next number of each topic, from
-//! which a listener knows what it lost before the first and after the last datagram.
+//! What a gateway announces about a sensor once a second: its name and type, which topic is sent where, and the next
+//! number of each topic, from which a listener knows what it lost before the first and after the last datagram.
 
 use crate::{Topic, check_sensor, text};
 
@@ -47,7 +47,7 @@ impl Announce {
         announce
     }
 
-    /// Adds a topic; beyond 16 there is no room and it is left away.
+    /// Adds a topic; beyond 16 there is no room and it is left out.
     pub fn add(&mut self, topic: Announced) {
         if let Some(place) = self.topics.get_mut(self.count) {
             *place = topic;
@@ -70,7 +70,7 @@ impl Announce {
         &self.topics[..self.count]
     }
 
-    /// Writes the payload to the beginning of `room`; answers its length, or `None` if there is too little room.
+    /// Writes the payload to the start of `room`; returns its length, or `None` if there is too little room.
     pub fn pack(&self, room: &mut [u8]) -> Option<usize> {
         let room = room.get_mut(..TOPICS + EACH * self.count)?;
         room[..8].copy_from_slice(&self.boot.to_le_bytes());
@@ -86,7 +86,7 @@ impl Announce {
     }
 
     /// The announcement in `payload`; `None` if it is shorter than its own count says, or if its sensor has no possible
-    /// name. Topics beyond the 16th are left away.
+    /// name. Topics beyond the 16th are left out.
     pub fn unpack(payload: &[u8]) -> Option<Announce> {
         let (head, rest) = payload.split_first_chunk::<TOPICS>()?;
         let rest = rest.get(..EACH * usize::from(head[64]))?;

@@ -1,12 +1,12 @@
-//! The lives of gateways that are told apart: which of them go on, and which one is given up when there is no room for
-//! another. Refuses to know what came in them.
+//! The runs ("lives") of gateways that are distinguished: which of them continue, and which one is dropped when there is
+//! no room for another. Refuses to know what they sent.
 
 use core::cmp::Ordering;
 
 use super::standing::{Arrival, Standing};
 use super::voices::Voices;
 
-/// The most lives of gateways that are told apart.
+/// The most lives of gateways that are distinguished.
 pub const LIVES: usize = 64;
 
 /// Gateway and epoch.

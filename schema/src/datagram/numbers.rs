@@ -1,7 +1,7 @@
-//! Which numbers of one sensor and topic came and which did not. Refuses to know where they came from: it sees 32 bits
+//! Which numbers of one sensor and topic arrived and which did not. Refuses to know where they come from: it sees 32 bits
 //! that wrap, in any order, some twice.
 
-/// Numbers below the highest that are still told apart; what is older is stale.
+/// Numbers below the highest that are still distinguished; older ones are stale.
 pub const WINDOW: usize = 1024;
 
 /// The account of one sensor and topic in one life of a gateway.
@@ -15,11 +15,11 @@ pub struct Row {
     pub sensor: u8,
     /// The topic's number; 0 is announce.
     pub topic: u8,
-    /// Distinct numbers that came.
+    /// Distinct numbers that arrived.
     pub received: u64,
-    /// Numbers that came again, within the window.
+    /// Numbers that arrived again, within the window.
     pub duplicate: u64,
-    /// Numbers among `received` that came after a higher one.
+    /// Numbers among `received` that arrived after a higher one.
     pub reordered: u64,
     /// The first number that is known to have been sent to us, without wrapping.
     lowest: i64,
@@ -31,7 +31,7 @@ pub struct Row {
     seen: [u64; WINDOW / 64],
 }
 
-/// What a datagram is beside those that came before.
+/// What a datagram is compared with those before it.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Fresh {
     /// The newest of its topic.
@@ -68,9 +68,9 @@ impl Row {
         Row { hub, epoch, sensor, topic, lowest: first, next: first, ..Row::EMPTY }
     }
 
-    /// Numbers that were sent since the first one known and did not come, or not yet. The first one known is the lowest
-    /// that came, or the next one of an announcement that came before; the last one is the highest that came, or the one
-    /// before the next one of an announcement.
+    /// Numbers that were sent since the first known one and did not arrive, or not yet. The first known one is the lowest
+    /// that arrived, or the next number of an earlier announcement; the last one is the highest that arrived, or the one
+    /// before the next number of an announcement.
     pub fn lost(&self) -> u64 {
         (self.next - self.lowest) as u64 - self.received
     }

@@ -1,5 +1,5 @@
-//! The payloads as they go over a network: the fields of shared memory in their order, without what is unused. What comes
-//! back is checked against its own counts before it is believed.
+//! The payloads as they are sent over a network: the fields of shared memory in their order, without unused parts. A
+//! received payload is checked against its own counts before it is used.
 
 use bytemuck::{Pod, bytes_of, bytes_of_mut, cast_slice, cast_slice_mut};
 
@@ -20,7 +20,7 @@ pub trait Packed {
     fn unpack(&mut self, payload: &[u8]) -> bool;
 }
 
-/// The telegram that a payload begins with: STX, two bytes with the length of what lies between them and the CRC.
+/// The telegram at the start of a payload: STX, then two bytes with the length of what is between them and the CRC.
 pub fn telegram(payload: &[u8]) -> Option<Telegram<'_>> {
     let [STX, _, low, high, ..] = payload else { return None };
     let len = usize::from(u16::from_le_bytes([*low, *high])) + AROUND_DATA;

@@ -1,10 +1,10 @@
-//! What somebody who sends is worth when there is no room for another. Whoever can send can invent senders, so that one
-//! that is known to deliver is never put out by one that only announces itself, and the longest silence goes first.
+//! The rank of a sender when there is no room for another one. Anybody who can send can invent senders: so a sender that
+//! is known to deliver is never replaced by one that only announces itself, and the one silent for longest goes first.
 //! Refuses to know who it is. Time is an argument.
 
 use super::voices::SILENT_NS;
 
-/// Something came.
+/// What arrived.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Arrival {
     /// It is a sample, not an announcement.
@@ -13,7 +13,7 @@ pub struct Arrival {
     pub now_ns: u64,
 }
 
-/// What came of one sender, as far as it matters for making room.
+/// What arrived from one sender, as far as it matters for making room.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Standing {
     heard_ns: u64,
@@ -27,10 +27,10 @@ const PROVEN_NS: u64 = 1_000_000_000;
 const KEPT_NS: u64 = 60_000_000_000;
 
 impl Standing {
-    /// Nothing came.
+    /// Nothing arrived.
     pub const NONE: Standing = Standing { heard_ns: 0, delivered_ns: None };
 
-    /// Something of it was taken.
+    /// Something from it was accepted.
     pub fn take(&mut self, arrival: Arrival) {
         let now_ns = arrival.now_ns;
         self.heard_ns = now_ns;
@@ -39,8 +39,8 @@ impl Standing {
         }
     }
 
-    /// It may be put out for another of which this came: it did not deliver for 3 s, or for a sample, it has not done so for
-    /// a second yet.
+    /// Whether it may be dropped for another sender from which `arrival` came: it has not delivered for 3 s, or, if it is a
+    /// sample, it has delivered for less than a second.
     pub fn may_go(&self, arrival: Arrival) -> bool {
         let silent_ns = |(_, last_ns): (u64, u64)| arrival.now_ns.saturating_sub(last_ns);
         let is_busy = self.delivered_ns.is_some_and(|delivered_ns| silent_ns(delivered_ns) < SILENT_NS);

@@ -1,5 +1,5 @@
-//! The receiver's account: what came, what did not, and why something was refused, exactly and in bounded memory, whoever
-//! sends. Refuses to know sockets, time and keys; it has no heap.
+//! The receiver's counts: what arrived, what did not, and why something was refused, exactly and in bounded memory, no
+//! matter who sends. Refuses to know sockets, time and keys; it has no heap.
 
 use super::lives::{Found, Gone, Lives};
 use super::numbers::{Fresh, Key, Row};
@@ -8,25 +8,25 @@ use super::voices::Whose;
 use super::{Announce, Datagram, DatagramError};
 use crate::Topic;
 
-/// The most sensors and topics of all lives that are told apart.
+/// The most sensors and topics of all lives that are counted separately.
 pub const ROWS: usize = 1024;
 
-/// What was received, by hub, epoch, sensor and topic. 200 kB, wherever its owner puts it.
+/// What was received, by hub, epoch, sensor and topic. 200 kB, stored inline.
 ///
-/// A topic's account begins with its first datagram, or with the first announcement that came before that: what was sent
-/// before neither is not ours. An announcement that is overtaken by the first datagram therefore says nothing about what
-/// was before it, and what comes late from before the beginning moves the beginning there.
+/// Counting for a topic starts with its first datagram, or with an announcement that arrived before it: what was sent
+/// before that is not counted. An announcement that arrives after the first datagram therefore says nothing about earlier
+/// ones, and a late datagram from before the start moves the start back to it.
 ///
-/// A greater epoch of a gateway retires the one before, whose rows stay. Where there is no room, the life that has been
-/// retired longest is given up, and its rows are added to [`given_up`](StreamStats::given_up): so rows and that together
-/// always are everything that was taken. If none is retired, one that goes on makes room: what never delivered a sample or
-/// is silent for 3 s, whatever was not heard for longest first; for a sample also what delivered for less than a second.
-/// One that is known to deliver is kept for a minute of silence longer, and is never put out while it delivers; what has no
-/// room beside those is refused.
+/// A greater epoch of a gateway retires the one before, whose rows stay. If there is no room, the life that was retired
+/// first is given up, and its rows are added to [`given_up`](StreamStats::given_up): so the rows and that together always are
+/// everything that was accepted. If none is retired, an active life makes room: one that never delivered a sample or is
+/// silent for 3 s, the one silent for longest first; for a sample also one that has delivered for less than a second. A
+/// life that is known to deliver is kept for one more minute of silence, and is never given up while it delivers; what
+/// finds no room beside those is refused.
 ///
-/// Two gateways with one number and one epoch are told apart by their senders and by what they announce: only one of them
-/// is taken, the first that was heard. After 3 s of its silence another sender is taken, as a new life; but never once two
-/// are known to send.
+/// Two gateways with the same number and epoch are distinguished by their senders and by what they announce: only one of
+/// them is accepted, the first that was heard. After 3 s of its silence another sender is accepted, as a new life; but not
+/// after two are known to send.
 pub struct StreamStats {
     /// Bit n: topic number n is listened to.
     followed: u64,
@@ -46,19 +46,19 @@ pub struct GivenUp {
     pub lives: u64,
     /// Of them those that were not known to be over: they made room for others.
     pub displaced: u64,
-    /// Distinct numbers that came.
+    /// Distinct numbers that arrived.
     pub received: u64,
-    /// Numbers that did not come, and now never will: their epoch is over.
+    /// Numbers that did not arrive, and cannot any more: their epoch is over.
     pub lost: u64,
-    /// Numbers that came again.
+    /// Numbers that arrived again.
     pub duplicate: u64,
-    /// Numbers among `received` that came after a higher one.
+    /// Numbers among `received` that arrived after a higher one.
     pub reordered: u64,
 }
 
 impl StreamStats {
-    /// Nothing received yet. Announcements are believed for `topics` only: those whose groups were joined. Of the
-    /// others they would tell as lost what nobody wanted.
+    /// Nothing received yet. Announcements count only for `topics`, those whose groups were joined: for the others,
+    /// they would count as lost what was never wanted.
     pub fn new(topics: &[Topic]) -> StreamStats {
         StreamStats {
             followed: topics.iter().fold(0, |bits, topic| bits | 1 << topic.number()),
@@ -98,13 +98,13 @@ impl StreamStats {
         self.given_up
     }
 
-    /// When the first datagram of this life of `hub` was taken, if it was not given up since. Another time of the same life
-    /// is another gateway, or one that was forgotten meanwhile.
+    /// When the first datagram of this life of `hub` was accepted, if the life was not given up since. Another time for
+    /// the same life means another gateway, or one that was given up in between.
     pub fn since_ns(&self, hub: u64, epoch: u32) -> Option<u64> {
         self.lives.since_ns((hub, epoch))
     }
 
-    /// Two gateways are known to send under this number and epoch. Of one of them everything is refused as
+    /// Two gateways are known to send under this number and epoch. Everything of one of them is refused as
     /// [`DatagramError::Twin`].
     pub fn is_shared(&self, hub: u64, epoch: u32) -> bool {
         match self.lives.find((hub, epoch)) {

@@ -1,6 +1,6 @@
-//! Who sends under one hub and epoch. One gateway has one number, so a second one with the same is a copy of it, as after a
-//! disk was copied: what both send must not become one stream. Told apart by their senders and by the hub's life (`boot`)
-//! that they announce. Refuses to know what a sender is: any number that tells two of them apart will do.
+//! Who sends under one hub and epoch. Each gateway has its own number, so a second one with the same number is a copy, for
+//! example of its disk: what both send must not become one stream. They are distinguished by their senders and by the
+//! hub's run (`boot`) that they announce. Refuses to know what a sender is: any number that differs between two of them.
 
 /// The senders of one life of a gateway.
 #[derive(Clone, Copy)]

@@ -1,4 +1,4 @@
-//! How the chunks of a recording are packed. Refuses to know what is in them.
+//! How the chunks of a recording are compressed. Refuses to know what is in them.
 
 use crate::{Failure, Kind};
 

@@ -1,8 +1,8 @@
-//! A word in shared memory at which all consumers of a sensor sleep: one call of the hub wakes them all, however many
-//! they are, where an event is one message to each. Refuses to know what was sent, and who sleeps.
+//! A word in shared memory on which all consumers of a sensor sleep: one call of the hub wakes them all, however many
+//! they are; an event needs one message for each. Refuses to know what was sent, and who sleeps.
 //!
-//! The page lies in /dev/shm under the domain's prefix. Consumers map it read-only. A hub that is killed leaves it, and the
-//! next one goes on with it, so that who sleeps meanwhile is woken; a hub that ends closes it for good.
+//! The page is in /dev/shm under the domain's prefix. Consumers map it read-only. A killed hub leaves it, and the next hub
+//! continues with it, so that consumers that sleep meanwhile are woken; a hub that ends normally closes it.
 #![allow(unsafe_code)]
 
 mod words;
@@ -84,7 +84,7 @@ impl Drop for Ringer {
 pub struct Bell(Page);
 
 impl Bell {
-    /// The bell of `sensor`, or nothing as long as no hub has hung it.
+    /// The bell of `sensor`, or nothing as long as no hub has created it.
     ///
     /// [`Kind::Short`] if memory or descriptors are, [`Kind::Failed`] if it is another user's.
     pub fn open(node: &Node, sensor: &str) -> Result<Option<Bell>, Failure> {
@@ -124,8 +124,8 @@ impl Bell {
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Unsupported;
 
-/// Sleeps until one of `bells` was rung more often than the number beside it says, a signal comes, or CLOCK_MONOTONIC is
-/// at `until_ns`.
+/// Sleeps until one of `bells` was rung more often than its number says, a signal arrives, or CLOCK_MONOTONIC reaches
+/// `until_ns`.
 pub fn sleep_at_bells(bells: &[(&Bell, u32)], until_ns: u64) -> Result<(), Unsupported> {
     let until =
         Timespec { tv_sec: (until_ns / 1_000_000_000) as i64, tv_nsec: (until_ns % 1_000_000_000) as i64 };

@@ -1,5 +1,5 @@
-//! What dead processes left in a domain, taken away without a hub: their places in it, and the directory itself once
-//! nobody is there. Files in shared memory that no dead process is known to have had are not looked at.
+//! Removes what dead processes left in a domain, without a hub: their places in it, and the directory itself once nobody
+//! uses it. Files in shared memory that did not belong to a known dead process are not touched.
 
 use std::path::Path;
 use std::time::Duration;
@@ -9,21 +9,21 @@ use rustix::fs::FileType;
 use super::{forget, hub_node, nodes};
 use crate::{Directory, Domain, Failure, HubLock, ListenLock};
 
-/// What was taken away.
+/// What was removed.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Cleaned {
     /// Processes that had ended without leaving.
     pub dead: usize,
-    /// Not taken away: processes that are there.
+    /// Processes that still run; nothing of theirs was removed.
     pub alive: usize,
     /// The domain's directory.
     pub root: bool,
 }
 
-/// Takes away what dead processes left in `domain`. What living ones share with them stays, and so does the directory as
-/// long as one of them is there.
+/// Removes what dead processes left in `domain`. What running ones share with them stays, and so does the directory as
+/// long as one of them runs.
 ///
-/// [`Kind::DomainHeld`](crate::Kind) if a hub or a listener publishes there, which tidies up by itself;
+/// [`Kind::DomainHeld`](crate::Kind) if a hub or a listener publishes there, which cleans up by itself;
 /// [`Kind::Failed`](crate::Kind) if the directory is another user's.
 pub fn clean(domain: &Domain) -> Result<Cleaned, Failure> {
     let root = domain.root();

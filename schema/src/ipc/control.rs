@@ -1,4 +1,4 @@
-//! The control service: a client's request, the hub's response, and the two events that wake the one for the other.
+//! The control service: a client's request, the hub's response, and the two events that wake each of them for the other.
 //! Refuses to know what a request means.
 
 use iceoryx2::active_request::ActiveRequest;
@@ -13,7 +13,7 @@ use super::{Listener, Node, Notifier, Service, WakeService, listener, name, take
 use crate::shortage::{CONTROL_DESCRIPTORS, check_descriptors};
 use crate::{Failure, Kind, Request, Response, limits, topic};
 
-/// The hub's end. Wakes its [`requests`](Self::requests) when somebody asked.
+/// The hub's end. Its [`requests`](Self::requests) wake when a request was sent.
 pub struct ControlServer {
     server: server::Server<Service, Request, (), [u8], ()>,
     requests: Listener,
@@ -34,13 +34,13 @@ pub struct ControlClient {
     _bells: [WakeService; 2],
 }
 
-/// A request that was sent; who drops it gives it up.
+/// A request that was sent; dropping it cancels it.
 pub struct Pending(PendingResponse<Service, Request, (), [u8], ()>);
 
 type ControlService = request_response::PortFactory<Service, Request, (), [u8], ()>;
 
 impl ControlServer {
-    /// The hub's end of the service, made if it is not there.
+    /// The hub's end of the service, created if it does not exist.
     ///
     /// [`Kind::DomainHeld`] if another hub has it, [`Kind::Short`] if there is no memory for it.
     pub fn create(node: &Node) -> Result<ControlServer, Failure> {
@@ -82,7 +82,7 @@ impl ControlServer {
         received.map(|asked| asked.map(Asked)).map_err(|error| no_port(self.control.name(), &error))
     }
 
-    /// Answers `asked`. A client that does not wait any more is no failure, one that cannot be told is.
+    /// Answers `asked`. It is not a failure if the client does not wait any more, but if it cannot be reached.
     pub fn answer(&self, asked: Asked, response: &Response) -> Result<(), Failure> {
         if !asked.is_waited_for() {
             return Ok(());
@@ -104,7 +104,7 @@ impl Asked {
         self.0.payload()
     }
 
-    /// Whether the client is still there to be told.
+    /// Whether the client still waits for the answer.
     pub fn is_waited_for(&self) -> bool {
         self.0.is_connected()
     }
@@ -136,7 +136,7 @@ impl ControlClient {
 
     /// Sends `request` and wakes the hub.
     ///
-    /// [`Kind::Short`] if it cannot be sent; [`Kind::NoHub`] if nobody took it.
+    /// [`Kind::Short`] if it cannot be sent; [`Kind::NoHub`] if no hub accepted it.
     pub fn ask(&self, request: &Request) -> Result<Pending, Failure> {
         let unsent = |error: &dyn std::fmt::Debug| {
             Failure::new(Kind::Short, format!("cannot ask the hub: {error:?}"), "try again later")

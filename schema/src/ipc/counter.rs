@@ -1,6 +1,6 @@
-//! The one segment that the shared-memory library opens to all users of the machine: its counter of nodes. Whoever can
-//! write to it can keep every later process out, so it is made here, for this user alone, before the library looks for it.
-//! The library takes what it finds.
+//! The one segment that the shared-memory library opens to all users of the machine: its counter of nodes. Anybody who can
+//! write to it can keep every later process out. So it is created here, for this user only, before the library looks for
+//! it; the library uses what it finds.
 
 use std::fs::{File, OpenOptions};
 use std::io::Write;

@@ -1,5 +1,5 @@
-//! What a hub leaves that is killed while it makes a service: a description that was never finished. The library waits
-//! for it forever and cleans up finished ones only, so that no later hub could make that service again.
+//! What a hub leaves if it is killed while it creates a service: an unfinished description. The library waits for it
+//! forever and cleans up only finished ones, so no later hub could create that service again.
 
 use std::path::Path;
 

@@ -1,4 +1,4 @@
-//! Who has joined a domain, living and dead. Only counts: what a dead process left is cleaned up by the next hub.
+//! The processes that have joined a domain, running and dead. Only counts them: the next hub cleans up after dead ones.
 
 use std::path::Path;
 

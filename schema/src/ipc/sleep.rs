@@ -1,8 +1,7 @@
-//! Sleeping at the wake services of several sensors at once. Hides what consumers are woken by; refuses to know why
-//! they wait.
+//! Sleeps on the wake services of several sensors at once. Hides what wakes consumers; refuses to know why they wait.
 //!
-//! Being woken and taking the wake-ups are two calls, because what was sent shall be received between them: a wake-up
-//! that is left pending loses nothing, and taking it costs several system calls.
+//! Waking up and taking the wake-ups are two calls, so that samples can be received between them: a pending wake-up loses
+//! nothing, and taking it costs several system calls.
 #![allow(unsafe_code)]
 
 use std::os::fd::BorrowedFd;
@@ -16,7 +15,7 @@ use rustix::io::Errno;
 use super::Listener;
 use crate::{Failure, Kind};
 
-/// Sleeps until one of `listeners` is woken, a signal comes or `timeout` is over. Wake-ups stay pending: take them by
+/// Sleeps until one of `listeners` is woken, a signal arrives or `timeout` is over. Wake-ups stay pending: take them with
 /// [`take_wakeups`], then look once more for samples, before the next sleep.
 ///
 /// [`Kind::Short`] if the system cannot wait.
@@ -32,14 +31,14 @@ pub fn sleep(listeners: &[&Listener], timeout: Duration) -> Result<(), Failure> 
     }
 }
 
-/// What is readable while wake-ups of `listener` are pending: for who waits for other things as well.
+/// A descriptor that is readable while wake-ups of `listener` are pending, for programs that also wait for other things.
 pub fn descriptor(listener: &Listener) -> BorrowedFd<'_> {
     // SAFETY: the descriptor is open as long as the listener lives, which is borrowed as long as the result.
     unsafe { BorrowedFd::borrow_raw(listener.file_descriptor().native_handle()) }
 }
 
-/// Takes all wake-ups of `listeners` that are pending; returns whether there were any. What was sent before this call
-/// has to be looked for after it.
+/// Takes all pending wake-ups of `listeners`; returns whether there were any. Look for samples that were sent before this
+/// call after it.
 ///
 /// [`Kind::Short`] if a listener does not work.
 pub fn take_wakeups(listeners: &[&Listener]) -> Result<bool, Failure> {

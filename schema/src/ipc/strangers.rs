@@ -1,5 +1,5 @@
-//! Files in shared memory that carry a domain's names and are not this user's alone. Looks at names, owners and modes;
-//! opens nothing. Who else's they are is told to the user, who can have them removed.
+//! Files in shared memory that have a domain's names but belong to other users, or can be written by others. Looks at
+//! names, owners and modes; opens nothing. The owner is reported to the user, who can have them removed.
 
 use std::fs::Metadata;
 use std::os::unix::fs::MetadataExt;
@@ -9,12 +9,12 @@ use crate::directory::named;
 use crate::shortage::SHARED_MEMORY;
 use crate::{Failure, Kind, prefix};
 
-/// A file in shared memory, as it stands there: a link is a link.
+/// A file in shared memory as it is: links are not followed.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Segment {
     /// Where it is.
     pub path: PathBuf,
-    /// The user's number whose it is.
+    /// The number of its owner.
     pub owner: u32,
     /// Permission bits.
     pub mode: u32,
@@ -54,8 +54,8 @@ impl Segment {
     }
 }
 
-/// What stands under the names of the domain in `root` and is not this user's alone, sorted; nothing where the domain
-/// has no names.
+/// Files under the names of the domain in `root` that others own or can write to, sorted; none if the domain has no
+/// names.
 pub fn strangers(root: &Path) -> Vec<Segment> {
     let Ok(Some(prefix)) = prefix::of(root) else { return Vec::new() };
     let entries = std::fs::read_dir(SHARED_MEMORY).into_iter().flatten().flatten();

@@ -1,4 +1,4 @@
-//! What goes wrong when a service is made or opened, sorted by what there is to do: wait, come back later, or tell the
+//! What can fail when a service is created or opened, sorted by what to do: wait, try again later, or report it to the
 //! user. Refuses to know which service it is.
 
 use std::fmt::Debug;

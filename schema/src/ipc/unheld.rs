@@ -1,5 +1,5 @@
-//! Whether nobody has a file in shared memory any more, as only the kernel knows it: a process that cannot be looked at, or
-//! one in a container that shares the memory, has it all the same. Refuses to know whose file it was.
+//! Whether no process has a file in shared memory open any more. Only the kernel knows: a process that is not visible, or
+//! one in a container that shares the memory, counts too. Refuses to know whose file it was.
 #![allow(unsafe_code)]
 
 use std::fs::OpenOptions;
@@ -11,8 +11,8 @@ use nix::libc::{self, c_int};
 use rustix::fs::OFlags;
 
 /// Whether no process has the file at `path` open or mapped: the kernel grants a lease for writing only then (fcntl(2)).
-/// Not where it cannot be told, as of another user's file. Who opens it in the moment of the question waits until it is
-/// answered.
+/// False if that is not known, for example for another user's file. A process that opens the file at this moment waits
+/// until this returns.
 pub fn is_unheld(path: &Path) -> bool {
     let flags = OFlags::NOFOLLOW | OFlags::NONBLOCK;
     let opened = OpenOptions::new().read(true).custom_flags(flags.bits() as i32).open(path);

@@ -10,7 +10,7 @@ use super::{Listener, Node, Notifier, PortFactory, WakeService, name};
 use crate::shortage::check_client;
 use crate::{Failure, Kind, Wake, limits};
 
-/// The hub's end. Made, it wakes consumers by [`Wake::HubUp`]; dropped, by [`Wake::HubDown`].
+/// The hub's end. When created, it wakes consumers with [`Wake::HubUp`]; when dropped, with [`Wake::HubDown`].
 pub struct Waker {
     ringer: Ringer,
     notifier: Notifier,
@@ -18,9 +18,9 @@ pub struct Waker {
 }
 
 impl Waker {
-    /// That of `sensor`, to be made before its topics: who finds those sleeps at it.
+    /// The waker of `sensor`. Create it before its topics: consumers that find those sleep on it.
     ///
-    /// [`Kind::Short`] if memory is, [`Kind::Failed`] if the service is of another layout.
+    /// [`Kind::Short`] if memory is, [`Kind::Failed`] if the service has another layout.
     pub fn new(node: &Node, sensor: &str) -> Result<Waker, Failure> {
         let ringer = Ringer::hang(node, sensor)?;
         let service = create_service(node, sensor)?;
@@ -32,9 +32,9 @@ impl Waker {
         Ok(Waker { ringer, notifier, service })
     }
 
-    /// Wakes all consumers for `why`: those at the bell with one call, then those that listen to the event.
+    /// Wakes all consumers for `why`: those that sleep on the bell with one call, then those that listen to the event.
     ///
-    /// [`Kind::Failed`] if some of the latter were not told.
+    /// [`Kind::Failed`] if some of the latter were not woken.
     pub fn wake(&self, why: Wake) -> Result<(), Failure> {
         self.ringer.ring();
         if self.service.dynamic_config().number_of_listeners() == 0 {
@@ -68,7 +68,7 @@ fn create_service(node: &Node, sensor: &str) -> Result<WakeService, Failure> {
     })
 }
 
-/// The event service of `sensor`, or nothing as long as no hub has made it: for consumers.
+/// The event service of `sensor`, or nothing as long as no hub has created it: for consumers.
 pub fn open_wake(node: &Node, sensor: &str) -> Result<Option<WakeService>, Failure> {
     let service = name(&Wake::service(sensor))?;
     open(node, &service, node.service_builder(&service).event().open())

@@ -1,5 +1,5 @@
-//! The memory of who publishes: how much of it the topics of a sensor take, and that it is really there. A sparse segment
-//! that finds /dev/shm full would end the process later.
+//! The memory of a publisher: how much the topics of a sensor need, and that it is really allocated. A sparse segment
+//! would end the process later if /dev/shm is full then.
 
 use std::fs::{self, OpenOptions};
 use std::os::unix::fs::{MetadataExt, OpenOptionsExt};
@@ -39,7 +39,7 @@ pub fn allocate(domain: &Domain) -> Result<(), Failure> {
     Ok(())
 }
 
-/// Bytes of the segments of one sensor's `topics`: the payloads with their headers, and who is at each service.
+/// Bytes of the segments of one sensor's `topics`: the payloads with their headers, and the list of users of each service.
 pub fn sensor_bytes(topics: &[Topic]) -> u64 {
     let chunk = |&topic: &Topic| limits::samples(topic) * (topic.row().bytes + CHUNK_HEADER);
     let services = (topics.len() + 1) as u64 * SERVICE;

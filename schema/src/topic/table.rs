@@ -1,5 +1,5 @@
-//! The table of topics: one row has all that differs between them. Everything that is made for each topic, here and in
-//! other crates, is made from this table, so that a new topic is a new row.
+//! The table of topics: one row has everything that differs between them. All code for each topic, here and in other
+//! crates, is generated from this table, so a new topic is a new row.
 
 use crate::{Header, Telegram};
 
@@ -64,21 +64,21 @@ pub struct Row {
     pub payload: &'static str,
     /// The last byte of the multicast group that it goes to.
     pub group: u8,
-    /// How often a sample comes.
+    /// How often a sample is sent.
     pub pace: Pace,
-    /// Consumers at a time. For each sample the shared-memory library looks at all places that there are, three times, and
-    /// they are far apart: where few programs follow, many places cost more than the sample.
+    /// Consumers at a time. For each sample the shared-memory library looks at all places three times, and they are far apart
+    /// in memory: if only few programs follow, many places cost more than the sample.
     pub consumers: usize,
-    /// Samples that wait for a consumer; with one more the oldest is dropped. Of what comes with each scan it is 0.4 s: a
-    /// recorder on a machine that is full gets no processor for longer than four scans.
+    /// Samples that wait for a consumer; with one more, the oldest is dropped. For topics sent with each scan this is 0.4 s: a
+    /// recorder on a loaded machine can be without a processor for longer than four scans.
     pub waiting: usize,
-    /// Samples that a consumer gets which comes later.
+    /// Samples that a late consumer gets.
     pub kept: usize,
     /// Bytes of the longest payload and its header.
     pub bytes: usize,
 }
 
-/// How often a sample of a topic comes.
+/// How often a sample of a topic is sent.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Pace {
     /// With each scan.

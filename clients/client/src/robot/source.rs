@@ -1,5 +1,5 @@
-//! The zones of a robot's sensors, sample by sample, folded as they come, in a session of the caller's; and which sensors
-//! these are where none is named: those of the hub, or where only other machines' are published, these. Refuses to wait.
+//! The zones of a robot's sensors, combined sample by sample, in the caller's session. If no sensor is named, it follows
+//! those of the hub, or those of other machines if only they are published. Never waits.
 
 use std::time::{Duration, Instant};
 
@@ -57,7 +57,7 @@ const OTHERS: &str = "others...";
 const CALL_EVERY: Duration = Duration::from_secs(1);
 
 impl RobotSource {
-    /// Will follow the zones of `sensors`; none: all, as [`robot`](super::robot()) says.
+    /// Follows the zones of `sensors`; if empty: all, as in [`robot`](super::robot()).
     pub fn new(sensors: &[&str]) -> RobotSource {
         let mut source = RobotSource {
             robot: Robot::default(),
@@ -77,18 +77,18 @@ impl RobotSource {
         &self.robot
     }
 
-    /// The topic of each sensor has been there at least once.
+    /// The topic of each sensor has existed at least once.
     pub fn subscribed(&self) -> bool {
         !self.parts.is_empty() && self.parts.iter().all(ZonesSource::subscribed)
     }
 
-    /// The next sample of any sensor, or a silence, once each has spoken; failures as [`ZonesSource::receive`].
+    /// The next sample of any sensor, or a silence, once each has sent something; failures as [`ZonesSource::receive`].
     pub fn receive(&mut self, session: &mut Session) -> Result<Option<RobotHeard>, Failure> {
         let heard = self.hear(session)?;
         Ok(heard.map(|heard| RobotHeard { robot: self.robot.clone(), heard }))
     }
 
-    /// After which time [`receive`](Self::receive) has something to say even if no sample comes.
+    /// After this time [`receive`](Self::receive) returns something even if no sample arrives.
     pub fn left(&self) -> Option<Duration> {
         match &self.parts[..] {
             [] => self.nobody.left(clock::now()),
@@ -96,7 +96,7 @@ impl RobotSource {
         }
     }
 
-    /// Takes all that waits; whether there was anything.
+    /// Takes all waiting samples; returns whether there were any.
     pub fn drain(&mut self, session: &mut Session) -> Result<bool, Failure> {
         let mut any = false;
         while self.hear(session)?.is_some() {

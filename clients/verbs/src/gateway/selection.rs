@@ -30,7 +30,7 @@ impl Selection {
             let entry = Entry::parse(text)?;
             if bare && entry.word.topic != Some(Topic::Telegram) {
                 let hint = "without --bare all topics can be sent";
-                return Err(refuse(text, "is not telegrams, and --bare sends nothing else", hint));
+                return Err(refuse(text, "has no telegrams, and --bare sends nothing else", hint));
             }
             if entries.iter().any(|other| other.word == entry.word) {
                 return Err(refuse(text, "is named twice", "name each topic once"));

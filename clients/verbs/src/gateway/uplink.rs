@@ -140,7 +140,7 @@ fn choose_one(all: &[Interface]) -> Failure {
         (false, ..) => format!("{} (down)", one.name),
         (_, false, _) => format!("{} (no multicast)", one.name),
         (.., None) => format!("{} (no IPv4 address)", one.name),
-        (.., Some(address)) if one.loopback => format!("{} ({address}, this machine alone)", one.name),
+        (.., Some(address)) if one.loopback => format!("{} ({address}, this machine only)", one.name),
         (.., Some(address)) => format!("{} ({address})", one.name),
     };
     let list = all.iter().map(tell).collect::<Vec<_>>().join(", ");
@@ -171,7 +171,7 @@ mod tests {
         let failure = choose_one(&[lo, eth0, wlan0, down]);
         assert_eq!(failure.kind, Kind::Configuration);
         let list =
-            "lo (127.0.0.1, this machine alone), eth0 (127.0.0.1), wlan0 (no IPv4 address), eth1 (down)";
+            "lo (127.0.0.1, this machine only), eth0 (127.0.0.1), wlan0 (no IPv4 address), eth1 (down)";
         assert!(failure.hint.contains(list), "{failure}");
     }
 

@@ -141,7 +141,7 @@ fn remarks(name: &TopicName, spans: &Spans) -> Vec<String> {
     }
     if spans.flags & Flags::REMOTE != 0 {
         remarks.push(format!(
-            "{name}: the network's time is told by the wall clocks of two machines, with all that they differ"
+            "{name}: the network's time is measured with the wall clocks of two machines, and contains their difference"
         ));
     }
     if spans.ahead > 0 {

@@ -234,7 +234,7 @@ impl Part {
             return Err(io::Error::new(ErrorKind::NotFound, "another file has its name"));
         }
         if here.is_file() && here.len() < self.written {
-            return Err(io::Error::new(ErrorKind::NotFound, "somebody cut it"));
+            return Err(io::Error::new(ErrorKind::NotFound, "another program cut it"));
         }
         Ok(())
     }
@@ -294,7 +294,7 @@ impl Part {
 }
 
 fn nothing_behind() -> io::Error {
-    io::Error::other("nothing comes behind the index")
+    io::Error::other("nothing follows the index")
 }
 
 /// A status stands for so long, while others come: they do each second.

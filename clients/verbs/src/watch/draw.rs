@@ -203,11 +203,11 @@ const HELP: &str = "\
 tab  0 1 2 ..         next sensor, all, one of them
 f b m z               foreground, background, marks, zones
 space                 hold the picture
-R  F                  background: learn anew; hold, go on
-? q Esc Ctrl-C        this help, the end
+R  F                  background: reset; freeze, thaw
+? q Esc Ctrl-C        this help, quit
 
-dots  what a beam met, small grey ones the background
-o     what stands before it (coloured: without the o)
+dots  where a beam ends; small grey ones the background
+o     foreground (coloured: without the o)
 *     reflector mark   ^ 1 2 robot, sensors; ahead is up
 0.60! circle around the robot, in m, with something inside";
 

@@ -1,4 +1,4 @@
-//! The keys of section `gateway`, and which values they may have. A value is checked where it stands.
+//! The keys of section `gateway`, and their valid values. A value is checked in its own source.
 
 use schema::Failure;
 use schema::datagram::{MTU_ETHERNET, MTU_LEAST};

@@ -1,5 +1,5 @@
-//! The keys of sections pose, zones, marks and background, and which values they may have. Metres, radians and degrees
-//! become what the processors count in. Each value is checked where it stands; it refuses to know which source wins.
+//! The keys of sections pose, zones, marks and background, and their valid values. Metres, radians and degrees become the
+//! units of the processors. Each value is checked in its own source; this file refuses to know which source wins.
 
 use std::ops::{Range, RangeInclusive};
 

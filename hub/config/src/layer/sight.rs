@@ -1,5 +1,5 @@
-//! Whether a sensor sees enough of its largest circle to ever find something inside: a zone that nothing can violate is a
-//! mistake of the configuration. Refuses to know what the sensor turns out to be; the hub looks again at its scans.
+//! Whether a sensor sees enough of its largest circle to ever find something inside: a zone that nothing can violate is an
+//! error of the configuration. Refuses to know the real sensor; the hub checks again with its scans.
 
 use std::rc::Rc;
 

@@ -1,6 +1,6 @@
-//! How the metres of a log become values without loss: all ranges are looked at first, and the unit and the bits are those
-//! in which each of them is a whole value. What a sensor sends as a code stands in a log as the greatest of these ranges.
-//! Refuses to know lines.
+//! How the metres of a log become values without loss: it reads all ranges first, and chooses the unit and the bits in
+//! which each range is a whole value. A code of the sensor appears in a log as the greatest of these ranges. Refuses to
+//! know lines.
 
 use std::fmt;
 
@@ -130,7 +130,7 @@ mod tests {
         let unfit = Unfit { rounded: 2, beyond: 1 };
         assert!(
             unfit.to_string().contains("2 ranges are finer")
-                && unfit.to_string().contains("1 ranges are too far")
+                && unfit.to_string().contains("1 ranges are too long")
         );
     }
 

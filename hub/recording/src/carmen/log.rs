@@ -1,5 +1,5 @@
-//! The scans of a log one after the other, and what it says of how they are encoded. Where scans are written in several
-//! ways, each is there as often: those of the first way are taken. Refuses to know what a scan becomes.
+//! The scans of a log in their order, and how they are encoded. If a log contains each scan in several message types, only
+//! those of the first type are used. Refuses to know what a scan becomes.
 
 use std::io::{self, BufRead, Read};
 

@@ -1,5 +1,5 @@
-//! An MCAP file written anew: every message that could be had, all channels, also of others, with a new index. Refuses to
-//! know what the messages mean, but for telegrams, whose headers may have been estimated.
+//! Copies an MCAP file: every readable message, all channels, also those of other programs, and a new index. Refuses to
+//! know what the messages mean, except for telegrams, whose headers may have been estimated.
 
 use std::collections::BTreeMap;
 use std::io::{self, Write};

@@ -1,6 +1,5 @@
-//! What others want of a recording: its scans, and where their sensors sat. Scans are made of the telegrams, as the hub
-//! makes them; of a sensor whose telegrams were not recorded they are those that the hub published. Refuses to know what
-//! becomes of them.
+//! What other programs need from a recording: its scans, and the poses of their sensors. Scans are decoded from telegrams
+//! as in the hub; if a sensor's telegrams were not recorded, its published scans are used. Refuses to know the output.
 
 use std::collections::BTreeMap;
 

@@ -1,4 +1,4 @@
-//! The file that a conversion makes: it appears whole, or not at all. Refuses to know what is in it.
+//! The output file of a conversion: it appears complete, or not at all. Refuses to know what is in it.
 
 use std::ffi::OsString;
 use std::fs::{self, File};

@@ -1,5 +1,5 @@
-//! A scan as a line of a CARMEN log. Lost are what the log has no place for: reflector levels and field bits, address and
-//! status of the sensor. Refuses to know when it was.
+//! A scan as a line of a CARMEN log. The log has no place for reflector levels, field bits, and address and status of the
+//! sensor: they are lost. Refuses to know the time of the scan.
 
 use lms::measured::Measured;
 use lms::telegram::Telegram;

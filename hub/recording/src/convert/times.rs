@@ -1,5 +1,5 @@
-//! Times for telegrams that have none: one scan period after the other, so that the last one ends when the file was last
-//! written. Refuses to know what is done with them.
+//! Times for telegrams that have none: one scan period apart, so that the last one ends when the file was last written.
+//! Refuses to know how they are used.
 
 use lms::variant::{Baud, Variant};
 use schema::{Flags, Header};

@@ -1,5 +1,4 @@
-//! Scans for programs that know nothing of ours: messages of ROS 2, and lines of columns. Refuses to know how scans are
-//! found.
+//! Scans for other programs: messages of ROS 2, and lines of CSV. Refuses to know how scans are found.
 
 use std::io::{self, Write};
 

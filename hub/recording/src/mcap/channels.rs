@@ -1,5 +1,5 @@
-//! Which channel of a file has which sensor's topic, as the records of the channels say. Of a file that is harmed they
-//! may contradict each other: then a checksum decides, else how often a sensor is named. Refuses to know messages.
+//! Which channel of a file has which sensor's topic, according to the channel records. In a damaged file they may
+//! contradict each other: then a checksum decides, else how often a sensor is named. Refuses to know messages.
 
 use std::collections::{BTreeMap, HashMap, HashSet};
 use std::io;

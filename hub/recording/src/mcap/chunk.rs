@@ -1,5 +1,5 @@
-//! Opens a chunk: its records, all of them or none, since one checksum vouches for all. They are handed out one after the
-//! other, because there may be a million of them. Refuses to know what is in them.
+//! Opens a chunk: all of its records or none, because one checksum covers all. They are returned one by one, because there
+//! may be a million of them. Refuses to know what is in them.
 
 use flate2::Crc;
 use mcap::McapError;

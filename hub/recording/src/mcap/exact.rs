@@ -1,5 +1,5 @@
-//! Which bytes are a record that is exactly as long as its own fields say: what can be believed where no checksum
-//! helps. Messages have no such fields, chunks have a checksum. Refuses to know what records mean.
+//! Which bytes are a record that is exactly as long as its own fields say: the only evidence where there is no checksum.
+//! Messages have no such fields, chunks have a checksum. Refuses to know what records mean.
 
 use std::str;
 

@@ -1,5 +1,5 @@
-//! Whether a file without its beginning is an MCAP file: its end says so, a chunk that is sound does, and messages of the hub
-//! do, each with a telegram that proves itself. Refuses to know what is in them.
+//! Whether a file without its start is an MCAP file. Its end shows it, or an intact chunk, or messages of the hub, each
+//! with a telegram whose own CRC is right. Refuses to know what is in them.
 
 use std::io::{self, Read};
 

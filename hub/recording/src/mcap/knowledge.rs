@@ -1,5 +1,5 @@
-//! What a file says of itself beside its telegrams, as far as checksums vouch for it: channels, numbers of sensors,
-//! lives of the hub. With it is judged what no checksum vouches for. Refuses to know where telegrams come from.
+//! What a file says about itself besides its telegrams, as far as checksums confirm it: channels, numbers of sensors,
+//! runs of the hub. Data without a checksum is checked against it. Refuses to know where telegrams come from.
 
 use std::collections::BTreeMap;
 use std::collections::btree_map::Entry;

@@ -1,5 +1,5 @@
-//! What a file says of itself, kept as it stands there, for whoever writes it anew: profile, schemas, channels. Refuses to
-//! know what the hub makes of it.
+//! What a file says about itself, kept unchanged for the copy: profile, schemas, channels. Refuses to know how the hub
+//! interprets it.
 
 use std::collections::BTreeMap;
 

@@ -1,6 +1,6 @@
-//! A file's telegrams, each with its sensor and its header, between all else that is in it. In a file that is harmed a
-//! header that cannot be right is replaced by an estimate, and what is there twice is taken once. Refuses to know what
-//! is made of it.
+//! A file's telegrams, each with its sensor and its header, among everything else in the file. In a damaged file, a header
+//! that cannot be right is replaced by an estimate, and a telegram that occurs twice is used once. Refuses to know how
+//! telegrams are used.
 
 use std::collections::BTreeMap;
 use std::io::{self, Read};

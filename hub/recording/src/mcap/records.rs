@@ -1,5 +1,4 @@
-//! The records of an MCAP file that is sound, one after the other, also those in chunks. Refuses to know what is in
-//! them.
+//! The records of an intact MCAP file in their order, also those in chunks. Refuses to know what is in them.
 
 use std::io::{self, Read};
 

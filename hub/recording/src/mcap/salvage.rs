@@ -1,6 +1,6 @@
-//! What can be had of a file that is not sound: every byte of it may be wrong, also lengths. Two things prove
-//! themselves, wherever they are: a chunk by its CRC-32, and a telegram by its own length and CRC. Everything else is
-//! looked at byte by byte, so what is harmed never hides what is not. Refuses to know which sensor a telegram is of.
+//! What can be read from a damaged file: every byte of it may be wrong, also lengths. Two things can be verified wherever
+//! they are: a chunk by its CRC-32, and a telegram by its own length and CRC. Everything else is searched byte by byte, so
+//! damaged data never hides intact data. Refuses to know which sensor a telegram belongs to.
 
 use std::io::{self, Read};
 

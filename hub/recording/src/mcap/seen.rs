@@ -1,4 +1,4 @@
-//! Remembers what was there, for as long as a harmed file may repeat it. Refuses to know what it is.
+//! Remembers what was read, as long as a damaged file may repeat it. Refuses to know what it is.
 
 use std::collections::hash_map::DefaultHasher;
 use std::collections::{HashSet, VecDeque};

@@ -1,4 +1,4 @@
-//! Where what is in a file comes from: record after record if it is sound, else by a search. Refuses to know what it is.
+//! How the content of a file is found: record by record if it is intact, else by a search. Refuses to know what it is.
 
 use std::io::{self, Read};
 

@@ -1,5 +1,5 @@
-//! A view of a file of any length that moves on and holds only what lies around it. A file that breaks off, also within
-//! its packing, ends there. Refuses to know what the bytes are.
+//! A moving window over a file of any length, which holds only a part of it in memory. A file that is cut, also inside its
+//! compression, ends there. Refuses to know what the bytes are.
 
 use std::io::{self, Read};
 

@@ -1,5 +1,5 @@
-//! Faults of single bytes: lost, flipped, doubled, or with foreign ones before them. Every byte that the sensor sends
-//! draws its fate, whatever else happens to it, so that the same seed hits the same bytes in every run.
+//! Faults of single bytes: lost, flipped, doubled, or with random bytes before them. The random numbers of each byte are
+//! drawn whatever else happens to it, so that the same seed hits the same bytes in every run.
 
 use super::{Faults, random};
 

@@ -1,5 +1,5 @@
-//! What comes late but comes: a line that is stuck for a while, and pieces that are each late by chance. Nothing
-//! overtakes.
+//! What arrives late but arrives: a line that is stuck for a while, and pieces that are each late by a random time. The
+//! order never changes.
 
 use lms::Nanos;
 

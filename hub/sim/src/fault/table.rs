@@ -1,5 +1,5 @@
-//! The faults as they are written, `loss=0.00135,burst=1.89`: one table says what there is, what it means and between
-//! which values; parsing, printing and the help follow it.
+//! The faults as they are written, `loss=0.00135,burst=1.89`: one table has the keys, their meaning and their range;
+//! parsing, printing and the help follow it.
 
 use std::fmt;
 use std::str::FromStr;
@@ -83,7 +83,7 @@ faults! {
     late_mode, 0.0 to 60.0, 0.0, "extra seconds that a change of mode, rate or variant takes";
     late_write, 0.0 to 60.0, 0.0, "extra seconds that a write to the EEPROM takes";
     strict, 0.0 to 1.0, 0.0, "1: in installation mode it refuses to measure";
-    strict_gap, 0.0 to 1.0, 0.0, "1: it drops requests whose bytes come less than 55 us apart";
+    strict_gap, 0.0 to 1.0, 0.0, "1: it drops requests whose bytes arrive less than 55 us apart";
     answer, 0.0 to 10.0, 0.0, "seconds from each ACK to its reply; 0: by chance 0.055 to 0.145";
     refuse, 0.0 to 255.0, 0.0, "command that it refuses, such as 0x3B";
     mute, 0.0 to 1.0, 0.0, "1: it does not answer";

@@ -1,5 +1,5 @@
-//! Faults of whole telegrams: cut off, with another length field, sent again, broken off. Every telegram draws for all
-//! of them when it begins.
+//! Faults of whole telegrams: cut off, with another length field, sent again, broken off. The random numbers for all of
+//! them are drawn when a telegram starts.
 
 use super::bytes::happens;
 use super::{Fault, Faults, random};

@@ -1,5 +1,5 @@
-//! A scene from TOML: the keys there are, and what each value can be. Every value is checked where it stands, so that a
-//! failure names file, line and column. The page is `docs/worlds.md`.
+//! A scene from TOML: the keys and their valid values. Every value is checked where it is written, so that a failure names
+//! file, line and column. Described in `docs/worlds.md`.
 
 use std::ops::Range;
 
@@ -254,8 +254,8 @@ impl PersonFile {
                 Speed::Between(slowest, fastest)
             }
             _ => {
-                let what = "nothing says when the person is where, or two keys do";
-                let remedy = "give a path speed_mm_s or until_s; who only stands has no speed";
+                let what = "the person's speed is not set, or set by two keys";
+                let remedy = "give a path speed_mm_s or until_s; a person at one point has no speed";
                 return Err(origin.refuse(path.span(), what, remedy));
             }
         };

@@ -1,4 +1,4 @@
-//! Where a value of a world's file stands, so that a failure can say it: file, line and column. Knows no keys.
+//! Where a value is in the file of a world, so that a failure can name it: file, line and column. Knows no keys.
 
 use std::ops::{Range, RangeInclusive};
 

@@ -108,7 +108,7 @@ fn what_is_no_world_is_refused_by_name_place_and_remedy() {
         ("[noise]\nspot = 1", "w.toml:2:8: ", "docs/worlds.md"),
         ("[[sensor]]\npose = [1]", "w.toml:2:8: 1 numbers are no pose", "[x, y] in millimetres"),
         ("[[sensor]]\npose = [nan, 2]", "w.toml:2:8: NaN is not between", "docs/worlds.md"),
-        ("\n[[thing]]\npose = [1, 2]", "w.toml:2:1: a thing without a shape", "one of: line"),
+        ("\n[[thing]]\npose = [1, 2]", "w.toml:2:1: a thing with no shape", "one of: line"),
         ("[[thing]]\nline = [[0, 0]]", "w.toml:1:1: a thing", "one of: line"),
         ("[[thing]]\nline = [[0, 0], [1, 1]]\nbox = [1, 1]", "w.toml:1:1: a thing", "one of: line"),
         ("[[thing]]\nbox = [1, -1]", "w.toml:2:7: -1 is not between 1", "docs/worlds.md"),
@@ -130,13 +130,17 @@ fn what_is_no_world_is_refused_by_name_place_and_remedy() {
             "w.toml:4:34: a move until 4 s of what is taken away at 3 s",
             "while it is there",
         ),
-        ("\n[[person]]\nfrom_s = 3", "w.toml:2:1: a person without a way", "path = "),
+        ("\n[[person]]\nfrom_s = 3", "w.toml:2:1: a person with no path", "path = "),
         (
             "[[person]]\npath = []\nuntil_s = 3",
             "w.toml:2:8: a path without points",
             "[x, y, seconds of rest]",
         ),
-        ("[[person]]\npath = [[0, 0], [1, 1]]", "w.toml:2:8: nothing says when", "speed_mm_s or until_s"),
+        (
+            "[[person]]\npath = [[0, 0], [1, 1]]",
+            "w.toml:2:8: the person's speed is not set",
+            "speed_mm_s or until_s",
+        ),
         (
             "[[person]]\npath = [[0, 0, 2], [1, 1, 3]]\nfrom_s = 1\nuntil_s = 6",
             "w.toml:2:8: 5 s of rest from 1 s until 6 s",

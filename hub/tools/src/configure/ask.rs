@@ -1,5 +1,5 @@
-//! Asks a person at a terminal whether a plan shall be carried out. The one place where consent is made: what no person
-//! has typed `yes` to is not written into any sensor.
+//! Asks a person at a terminal whether to carry out a plan. The only place that creates consent: nothing is written into a
+//! sensor unless a person has typed `yes`.
 
 use std::io::{IsTerminal, Write, stderr, stdin};
 use std::sync::atomic::{AtomicBool, Ordering};

@@ -1,4 +1,4 @@
-//! What became of a change, in words: what the sensor keeps now and what it does now, above all when something failed.
+//! The result of a change, in words: the sensor's settings and state now, above all after a failure.
 
 use std::fmt;
 

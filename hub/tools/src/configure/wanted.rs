@@ -1,5 +1,5 @@
-//! `KEY=VALUE` of the command line: which settings there are, what each may be, and what it does to a configuration. What
-//! the sensor's type cannot do is refused with the reason.
+//! `KEY=VALUE` of the command line: the settings, their valid values, and what each changes in a configuration. What the
+//! sensor's type does not support is refused with the reason.
 
 use lms::family::Family;
 use lms::inquiry::Report;

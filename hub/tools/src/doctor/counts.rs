@@ -1,5 +1,5 @@
-//! What the driver of a line counted: bytes that came damaged, or were lost before anybody could read them. At a wrong rate
-//! every byte is an error, and whoever looks for a sensor tries wrong ones: a few in all are no finding.
+//! What the driver of a line counted: bytes that arrived damaged, or were lost before they could be read. At a wrong rate
+//! every byte is an error, and a search for a sensor tries wrong rates: a few errors are no finding.
 
 use port::Counts;
 use schema::{Counter, Status};

@@ -1,4 +1,4 @@
-//! What one check found: its state, what is there, and what to do about it.
+//! The result of one check: its state, what was found, and what to do about it.
 
 use std::fmt;
 
@@ -58,7 +58,7 @@ pub struct Finding {
     pub name: &'static str,
     /// How it ended.
     pub state: State,
-    /// What is there.
+    /// What was found.
     pub finding: String,
     /// What to do; empty if nothing.
     pub remedy: String,

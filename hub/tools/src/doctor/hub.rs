@@ -1,4 +1,4 @@
-//! What a running hub says of its links: a port that it holds cannot be asked by anybody else.
+//! What a running hub reports about its links: nobody else can ask a sensor at a port that the hub holds.
 
 use std::time::Duration;
 

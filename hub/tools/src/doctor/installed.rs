@@ -1,5 +1,5 @@
-//! What `hub/dist/install.sh` puts in place: the service with its program, and the udev rule. Reads files only; that none
-//! of it is there is no fault, a hub that somebody starts by hand needs neither.
+//! What `hub/dist/install.sh` installs: the service with its program, and the udev rule. Reads only files. It is not a
+//! fault if nothing is installed: a hub that is started by hand needs neither.
 
 use std::fs;
 use std::io::ErrorKind;

@@ -1,5 +1,5 @@
-//! What processes left that ended without tidying up: whether there is any, and taking it away. The next hub does that
-//! too, for what it can know to be its own; who never starts one in that place again is left with it.
+//! What processes left that ended without cleaning up: finds it, and removes it. The next hub does that too, for what it
+//! knows to be its own; if no hub starts in that place again, only this removes it.
 
 use std::fs;
 use std::os::unix::fs::MetadataExt;
@@ -145,7 +145,7 @@ mod tests {
         ];
         says(&leftovers(&nodes(0, 1)), State::Warning, &words);
         says(&leftovers(&nodes(0, 0)), State::Warning, &["no process", "2 files", "doctor --clean"]);
-        says(&leftovers(&Facts { hub: Ok(Some(5)), ..nodes(3, 2) }), State::Ok, &["2 processes", "tidying"]);
+        says(&leftovers(&Facts { hub: Ok(Some(5)), ..nodes(3, 2) }), State::Ok, &["2 processes", "cleaning"]);
     }
 
     #[test]

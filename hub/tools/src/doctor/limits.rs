@@ -1,4 +1,4 @@
-//! What the system lets a process have: descriptors, and files as long as the hub's segments.
+//! The limits of a process: descriptors, and the length of files, which must allow the hub's segments.
 
 use config::needs;
 use schema::shortage::longest_segment;

@@ -1,5 +1,5 @@
-//! One port from the outside in: is it there, may it be used, by whom is it, what can it do; and then who is at its other
-//! end.
+//! One port from the outside in: whether it exists, who holds it, whether this user may open it, what it can do; then the
+//! sensor at its other end.
 
 use std::path::Path;
 use std::sync::atomic::AtomicBool;

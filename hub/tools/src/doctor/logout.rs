@@ -1,5 +1,5 @@
-//! Whether the hub's shared memory outlives its user's logging out: logind takes what an ordinary user has in /dev/shm
-//! away with the last session, under the feet of a hub that goes on (logind.conf(5), RemoveIPC=).
+//! Whether the hub's shared memory survives the logout of its user: logind removes what an ordinary user has in /dev/shm
+//! with the last session, even while a hub uses it (logind.conf(5), RemoveIPC=).
 
 use schema::regular;
 

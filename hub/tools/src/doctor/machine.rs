@@ -1,4 +1,4 @@
-//! What a hub needs of the machine, whatever its sensors are: shared memory, a domain of its own. Each check judges facts
+//! What a hub needs from the machine, whatever its sensors are: shared memory, and its own domain. Each check judges facts
 //! that were gathered before, so that every verdict can be tested.
 
 use std::fs;
@@ -241,7 +241,7 @@ pub(crate) fn hubs(facts: &Facts, name_of: impl Fn(u32) -> String) -> Finding {
             facts.name,
             others.join(", ")
         ),
-        "end one of them, or give it a --domain of its own",
+        "end one of them, or give it its own --domain",
     )
 }
 

@@ -1,5 +1,5 @@
-//! Whether what a gateway sends to groups gets out by the interface that the configuration names for them. Without one
-//! nothing goes to groups, and a listener hears on every interface that has a link. Sends nothing.
+//! Whether the interface that the configuration names for groups can send what a gateway sends to them. Without a name
+//! nothing is sent to groups, and a listener receives on every interface that has a link. Sends nothing.
 
 use super::finding::Finding;
 use super::system::System;
@@ -34,11 +34,11 @@ fn named(system: &System, name: &str) -> Finding {
     let Some(flags) = number("flags") else {
         return Finding::ok(
             NAME,
-            format!("by {name}, as gateway.interface says; its state is not shown here"),
+            format!("by {name}, as set in gateway.interface; its state is not shown here"),
         );
     };
     if flags & LOOPBACK != 0 {
-        return Finding::ok(NAME, format!("by {name}, as gateway.interface says: for this machine alone"));
+        return Finding::ok(NAME, format!("by {name}, as set in gateway.interface: this machine only"));
     }
     if flags & MULTICAST == 0 {
         let text = format!("gateway.interface: {name} carries no multicast");
@@ -50,7 +50,7 @@ fn named(system: &System, name: &str) -> Finding {
     if number("carrier") != Some(1) {
         return Finding::warning(NAME, format!("{name} is up and has no link"), "plug its cable in");
     }
-    Finding::ok(NAME, format!("by {name}, as gateway.interface says; it is up"))
+    Finding::ok(NAME, format!("by {name}, as set in gateway.interface; it is up"))
 }
 
 /// Flags of an interface (linux/if.h).

@@ -1,4 +1,4 @@
-//! Whether a program on this machine is the one that asks: by its bytes, else by what it says of its version. Hub and
+//! Whether a program on this machine is the same as this one: by its bytes, else by the version that it reports. Hub and
 //! clients of two versions refuse each other.
 
 use std::fs::{File, Metadata};

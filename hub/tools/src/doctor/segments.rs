@@ -1,5 +1,5 @@
-//! Files in shared memory that nobody uses any more. Their names tell only a domain's name, and a hub below another root
-//! may have the same: what somebody still holds is never counted.
+//! Files in shared memory that nobody uses any more. Their names contain only a domain's name, and a hub at another root
+//! may have the same: a file that a process still holds is never counted.
 
 use std::fs;
 use std::os::unix::fs::MetadataExt;

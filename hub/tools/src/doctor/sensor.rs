@@ -1,5 +1,5 @@
-//! The sensor at the other end: does it answer, is it set as the configuration wants it, is it well. Judges what it said;
-//! refuses to ask.
+//! The sensor at the other end: whether it answers, is set as configured, and is healthy. Judges its answers; refuses to
+//! ask.
 
 use config::Link;
 use lms::condition::{Condition, Severity};

@@ -1,5 +1,5 @@
-//! Files of other users under the domain's names in shared memory: none is ever opened, but one that takes a name which the
-//! hub needs keeps it from starting.
+//! Files of other users under the domain's names in shared memory: none is ever opened, but one that occupies a name which
+//! the hub needs prevents its start.
 
 use schema::ipc::Segment;
 

@@ -1,5 +1,5 @@
 //! The machine's own files, as the doctor reads them: below a directory that need not be the root of this machine, so that
-//! what an administrator may have written there can be laid out and tried. Refuses to know what stands in them.
+//! tests can provide what an administrator may have written. Refuses to know what is in them.
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -7,7 +7,7 @@ use std::path::{Path, PathBuf};
 use rustix::process::getuid;
 use schema::regular;
 
-/// The files of a machine, and who looks at them.
+/// The files of a machine, and the user that reads them.
 #[derive(Clone, Debug)]
 pub struct System {
     root: PathBuf,

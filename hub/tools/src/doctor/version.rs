@@ -1,5 +1,5 @@
-//! Which versions meet here: this program, the shared-memory library, the kernel, and the hub that lives. Hub and clients
-//! of two versions refuse each other.
+//! The versions: this program, the shared-memory library, the kernel, and the running hub. Hub and clients of two versions
+//! refuse each other.
 
 use std::fs;
 use std::path::PathBuf;

@@ -1,4 +1,4 @@
-//! What a sensor said of itself, for people and for programs: class `probe`. Words and keys; refuses to ask anything.
+//! What a sensor reports about itself, for people and for programs: class `probe`. Text and keys; refuses to ask anything.
 
 use std::fmt;
 
@@ -11,7 +11,7 @@ use lms::reply::Reply;
 use lms::variant::Mode;
 use serde::Serialize;
 
-/// A sensor; what it did not tell is null.
+/// A sensor; what it did not report is null.
 #[derive(Clone, Debug, Serialize)]
 pub struct Description {
     class: &'static str,
@@ -53,7 +53,7 @@ struct Fault {
 }
 
 impl Description {
-    /// Of the sensor at `port`, which said what is in `report`.
+    /// The description of the sensor at `port`, from its `report`.
     pub fn new(port: String, report: &Report) -> Description {
         let kind = report.kind().map(|kind| String::from_utf8_lossy(kind).into_owned());
         let mut words = kind.iter().flat_map(|kind| kind.split(';')).map(|word| word.trim().to_owned());

@@ -1,4 +1,4 @@
-//! The words after a telegram's name as values, each refusal with what would be right. Knows no telegrams.
+//! The words after a telegram's name as values; each refusal names what would be valid. Knows no telegrams.
 
 use lms::configuration::{ITEMS, LEN, factory};
 use lms::parameters::{Password, Raw, Span, Spans};

@@ -1,5 +1,5 @@
-//! Names and values to telegrams: every request, also those that write a sensor's EEPROM, and the replies that are
-//! simple enough to be written in words. The bytes are printed; nothing here can send them.
+//! Names and values to telegrams: every request, also those that write a sensor's EEPROM, and the simpler replies. The
+//! bytes are printed; nothing here can send them.
 
 use std::io::{ErrorKind, Write};
 
@@ -23,7 +23,7 @@ use super::arguments::{
     unit, word,
 };
 
-/// What `telegram encode` is asked for.
+/// Options of `telegram encode`.
 #[derive(Clone, Debug, Default)]
 pub struct EncodeOptions {
     /// Name and values.
@@ -40,7 +40,7 @@ pub struct EncodeOptions {
 
 /// Writes the telegram that the options name.
 ///
-/// [`Kind::Configuration`] if it cannot be said, with what can.
+/// [`Kind::Configuration`] if the name or a value is not valid, with what is.
 pub fn encode(options: &EncodeOptions, out: &mut dyn Write) -> Result<(), Failure> {
     if options.address > 0x7F {
         return Err(refuse(format!("address {}", options.address), "0 for all sensors, or 1 to 127"));

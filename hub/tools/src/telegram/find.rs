@@ -1,6 +1,6 @@
-//! Everything in a stream of bytes, in both directions: the sensor's telegrams as the framer finds them, and what lies
-//! between them: requests, acknowledgements, telegrams that are damaged or broken off, and bytes that are nothing. Every
-//! byte is in exactly one item.
+//! Everything in a stream of bytes, in both directions: the sensor's telegrams as the framer finds them, and what is
+//! between them: requests, acknowledgements, damaged and incomplete telegrams, and other bytes. Every byte is in exactly
+//! one item.
 
 use std::io;
 

@@ -1,5 +1,5 @@
-//! Bytes as they came down a line, or written down in hexadecimal: seen from the first of them, because a line's bytes
-//! are hardly ever all letters. Knows no telegrams.
+//! Raw bytes of a line, or bytes written in hexadecimal: detected from the first bytes, because raw bytes are hardly ever
+//! all letters. Knows no telegrams.
 
 use std::io::{self, ErrorKind, Read};
 

@@ -1,4 +1,4 @@
-//! What was found, as text for people or as lines of JSON. Each item is written with one call.
+//! The items found, as text for people or as lines of JSON. Each item is written with one call.
 
 use std::fmt::Write as _;
 use std::io::{self, Write};

@@ -1,4 +1,4 @@
-//! The telegrams of a file that has them inside something else, as the bytes of a line. Refuses to know what they say.
+//! The telegrams of a container file, as the bytes of a line. Refuses to know what they mean.
 
 use std::collections::VecDeque;
 use std::fs::File;

@@ -1,5 +1,5 @@
-//! What is done with the two words of a bell, and in which order: the part of it that must be right in all interleavings of
-//! hub and consumers, and is tried in all of them below. Refuses to know where the words lie and how threads sleep.
+//! The operations on the two words of a bell, and their order: the part that must be right in all interleavings of hub and
+//! consumers, and is tested in all of them below. Refuses to know where the words are and how threads sleep.
 
 use std::sync::atomic::{AtomicU32, Ordering, fence};
 
