@@ -31,6 +31,8 @@ pub(crate) const CONTROL_DESCRIPTORS: u64 = 24;
 
 /// Refuses to go on where fewer than `needed` bytes of shared memory are free, or may not be had by this process.
 ///
+/// # Errors
+///
 /// [`Kind::Short`] with what is free and what is needed.
 pub fn check_memory(needed: u64) -> Result<(), Failure> {
     check_place(Path::new(SHARED_MEMORY), needed).map_err(|what| memory(&what))?;
@@ -57,6 +59,8 @@ fn check_file_size(needed: u64) -> Result<(), Failure> {
 /// Refuses to go on where this process may not map `needed` more bytes, and what making them takes: one that cannot be
 /// mapped is left behind by the library.
 ///
+/// # Errors
+///
 /// [`Kind::Short`] with the limit and what is needed.
 pub fn check_address_space(needed: u64) -> Result<(), Failure> {
     let Some(limit) = getrlimit(Resource::As).current else { return Ok(()) };
@@ -77,6 +81,8 @@ pub fn check_address_space(needed: u64) -> Result<(), Failure> {
 }
 
 /// Refuses to go on where fewer than `needed` more descriptors can be opened.
+///
+/// # Errors
 ///
 /// [`Kind::Short`] with the limit and what is needed.
 pub fn check_descriptors(needed: u64) -> Result<(), Failure> {
@@ -99,6 +105,8 @@ pub fn check_descriptors(needed: u64) -> Result<(), Failure> {
 /// Lets the process have as many descriptors as its hard limit allows: who publishes needs about four for each consumer
 /// of a topic.
 ///
+/// # Errors
+///
 /// The system's error if it does not let it.
 pub fn raise_descriptor_limit() -> io::Result<()> {
     let mut limit = getrlimit(Resource::Nofile);
@@ -106,7 +114,7 @@ pub fn raise_descriptor_limit() -> io::Result<()> {
     Ok(setrlimit(Resource::Nofile, limit)?)
 }
 
-/// Shared memory is short, in the words of `what`.
+/// Returns the failure that shared memory is short, in the words of `what`.
 pub fn memory(what: &str) -> Failure {
     Failure::new(
         Kind::Short,

@@ -21,28 +21,30 @@ pub struct StateDirectory {
 }
 
 impl StateDirectory {
-    /// Where the directories of all domains are, as the environment of this process says: what systemd made for the service,
-    /// else the user's own. `None` if it names no place.
+    /// Returns where the directories of all domains are, as the environment of this process says: what systemd made for the
+    /// service, else the user's own. `None` if it names no place.
     pub fn base() -> Option<PathBuf> {
         base_in(|name| std::env::var_os(name))
     }
 
-    /// The directory of `domain`; `None` as for [`base`](Self::base). It need not be there.
+    /// Returns the directory of `domain`; `None` as for [`base`](Self::base). It need not be there.
     pub fn of_domain(domain: &str) -> Option<StateDirectory> {
         Some(StateDirectory::at(StateDirectory::base()?.join(domain)))
     }
 
-    /// The directory `path`, which need not be there.
+    /// Returns the directory `path`, which need not be there.
     pub fn at(path: impl Into<PathBuf>) -> StateDirectory {
         StateDirectory { path: path.into() }
     }
 
-    /// Where file `name` is, or would be.
+    /// Returns where file `name` is, or would be.
     pub fn path(&self, name: &str) -> PathBuf {
         self.path.join(name)
     }
 
-    /// What file `name` holds; `None` if there is none.
+    /// Returns what file `name` holds; `None` if there is none.
+    ///
+    /// # Errors
     ///
     /// [`Kind::Failed`] if it cannot be read, is not a plain file of this user that nobody else can write, has more than
     /// `most` bytes, or is no UTF-8.
@@ -61,6 +63,8 @@ impl StateDirectory {
 
     /// Puts `text` into file `name`, mode 0600, in place of what it held; makes the directory, mode 0700, if it is not there.
     /// It takes as long as the disk does: not for a thread that has a line to read.
+    ///
+    /// # Errors
     ///
     /// [`Kind::Failed`] if that is not possible; then what the file held is still there.
     pub fn write(&self, name: &str, text: &str) -> Result<(), Failure> {

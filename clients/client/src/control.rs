@@ -11,6 +11,23 @@ use crate::presence::{GRACE, find};
 
 /// Asks the hub at the first live one of `places` for `request`, and answers what it answered.
 ///
+/// # Examples
+///
+/// ```no_run
+/// use std::sync::atomic::AtomicBool;
+///
+/// use scanhub_client::{Failure, Request, Verb, places, request};
+///
+/// fn main() -> Result<(), Failure> {
+///     // Set by a signal, for example.
+///     let stop = AtomicBool::new(false);
+///     request(&places(None)?, &Request::new("front", Verb::Reset), &stop)?;
+///     Ok(())
+/// }
+/// ```
+///
+/// # Errors
+///
 /// [`Kind::NoHub`] within a second if there is none, or if it ends before it answers; [`Kind::NoTopic`] with the sensors
 /// that there are; [`Kind::Short`] if too much is asked at a time; [`Kind::Failed`] if the link cannot do it;
 /// [`Kind::Timeout`] if the hub does not answer: it is short of something, or the link is busy;

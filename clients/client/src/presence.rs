@@ -148,7 +148,9 @@ impl Presence {
     }
 }
 
-/// The hub at the first live one of `places`, waiting a moment for one that is just starting.
+/// Returns the hub at the first live one of `places`, waiting a moment for one that is just starting.
+///
+/// # Errors
 ///
 /// [`Kind::NoHub`] after half a second.
 pub fn find(places: &[Domain]) -> Result<Domain, Failure> {

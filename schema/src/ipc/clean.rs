@@ -23,6 +23,8 @@ pub struct Cleaned {
 /// Takes away what dead processes left in `domain`. What living ones share with them stays, and so does the directory as
 /// long as one of them is there.
 ///
+/// # Errors
+///
 /// [`Kind::DomainHeld`](crate::Kind) if a hub or a listener publishes there, which tidies up by itself;
 /// [`Kind::Failed`](crate::Kind) if the directory is another user's.
 pub fn clean(domain: &Domain) -> Result<Cleaned, Failure> {

@@ -19,6 +19,8 @@ use crate::{Failure, Kind};
 /// Sleeps until one of `listeners` is woken, a signal comes or `timeout` is over. Wake-ups stay pending: take them by
 /// [`take_wakeups`], then look once more for samples, before the next sleep.
 ///
+/// # Errors
+///
 /// [`Kind::Short`] if the system cannot wait.
 pub fn sleep(listeners: &[&Listener], timeout: Duration) -> Result<(), Failure> {
     let mut fds: Vec<PollFd<'_>> = listeners
@@ -32,7 +34,7 @@ pub fn sleep(listeners: &[&Listener], timeout: Duration) -> Result<(), Failure> 
     }
 }
 
-/// What is readable while wake-ups of `listener` are pending: for who waits for other things as well.
+/// Returns what is readable while wake-ups of `listener` are pending: for who waits for other things as well.
 pub fn descriptor(listener: &Listener) -> BorrowedFd<'_> {
     // SAFETY: the descriptor is open as long as the listener lives, which is borrowed as long as the result.
     unsafe { BorrowedFd::borrow_raw(listener.file_descriptor().native_handle()) }
@@ -40,6 +42,8 @@ pub fn descriptor(listener: &Listener) -> BorrowedFd<'_> {
 
 /// Takes all wake-ups of `listeners` that are pending; returns whether there were any. What was sent before this call
 /// has to be looked for after it.
+///
+/// # Errors
 ///
 /// [`Kind::Short`] if a listener does not work.
 pub fn take_wakeups(listeners: &[&Listener]) -> Result<bool, Failure> {

@@ -24,7 +24,7 @@ pub struct Segment {
 }
 
 impl Segment {
-    /// A file at `path` with these properties.
+    /// Returns a file at `path` with these properties.
     pub fn new(path: impl Into<PathBuf>, owner: u32, mode: u32, bytes: u64) -> Segment {
         Segment { path: path.into(), owner, mode, bytes, is_file: true }
     }
@@ -54,7 +54,7 @@ impl Segment {
     }
 }
 
-/// What stands under the names of the domain in `root` and is not this user's alone, sorted; nothing where the domain
+/// Returns what stands under the names of the domain in `root` and is not this user's alone, sorted; nothing where the domain
 /// has no names.
 pub fn strangers(root: &Path) -> Vec<Segment> {
     let Ok(Some(prefix)) = prefix::of(root) else { return Vec::new() };
