@@ -54,8 +54,8 @@ impl Background {
         &self.range_array[..usize::from(self.count).min(BEAMS)]
     }
 
-    /// Returns the angle of the first beam and between two, in 1/1000 degree; nothing if no variant has this many beams (Telegram
-    /// listing, 3Bh: 180 degrees in steps of 1 or 0.5, 100 degrees ahead in steps of 1, 0.5 or 0.25).
+    /// Returns the angle of the first beam and between two, in 1/1000 degree; nothing if no variant has this many beams
+    /// (Telegram listing, 3Bh: 180 degrees in steps of 1 or 0.5, 100 degrees ahead in steps of 1, 0.5 or 0.25).
     pub fn angles_mdeg(&self) -> Option<(i32, u16)> {
         match self.count {
             181 => Some((0, 1000)),

@@ -42,8 +42,8 @@ pub struct Header {
 }
 
 impl Header {
-    /// Returns the time from the telegram's last byte until the sample was sent, in ns, at most 256 too much; nothing if it is not
-    /// told, or was more than four seconds.
+    /// Returns the time from the telegram's last byte until the sample was sent, in ns, at most 256 too much; nothing if it
+    /// is not told, or was more than four seconds.
     pub fn hub_time_ns(&self) -> Option<u64> {
         let [low, middle, high] = self.hub_time;
         let units = u32::from_le_bytes([low, middle, high, 0]);

@@ -295,7 +295,8 @@ fn node(domain: &Domain, cleanup: bool) -> Result<Node, Failure> {
         .map_err(|error| access::failure(root, format!("cannot join {}: {error:?}", domain.name())))
 }
 
-/// Returns whether the names of shared memory of the domain in `root` are those that `node` has. They are others after all have gone.
+/// Returns whether the names of shared memory of the domain in `root` are those that `node` has. They are others after all
+/// have gone.
 ///
 /// # Errors
 ///

@@ -38,7 +38,8 @@ pub const fn history(topic: Topic) -> usize {
     topic.row().kept
 }
 
-/// Returns the number of samples to reserve memory for. All queues hold the same latest samples, so that their number does not count.
+/// Returns the number of samples to reserve memory for. All queues hold the same latest samples, so that their number does
+/// not count.
 pub const fn samples(topic: Topic) -> usize {
     buffer(topic) + subscribers(topic) * BORROWED + history(topic) + LOANED
 }

@@ -75,8 +75,8 @@ impl Status {
         is_wanted.then(|| format!("scanhub configure {} mode=0x01", self.port()))
     }
 
-    /// Returns the share of the line's bytes that were in nothing over the last 10 s, 0 to 1: those of a stream, without scans that the
-    /// sensor broke off to answer.
+    /// Returns the share of the line's bytes that were in nothing over the last 10 s, 0 to 1: those of a stream, without
+    /// scans that the sensor broke off to answer.
     pub fn damaged(&self) -> f64 {
         self.counters[Counter::DamagedPpm] as f64 / 1e6
     }

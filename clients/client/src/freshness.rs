@@ -35,9 +35,9 @@ impl Freshness {
         Freshness { until: later(now, FIRST_WORD_NS), said: false }
     }
 
-    /// Takes a sample with `header` and `verdict` that came in at `now`. Returns whether it may be believed. Its age counts as well as the
-    /// silence after it: what waited for long is no news, and a stamp in the future keeps nothing fresh. An `unknown` stands
-    /// however old it is.
+    /// Takes a sample with `header` and `verdict` that came in at `now`. Returns whether it may be believed. Its age counts
+    /// as well as the silence after it: what waited for long is no news, and a stamp in the future keeps nothing fresh. An
+    /// `unknown` stands however old it is.
     pub fn heard(&mut self, header: &Header, verdict: Verdict, now: Moment) -> bool {
         let limit_ns = match header.period_us {
             0 => NO_PERIOD_NS,

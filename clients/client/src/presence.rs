@@ -1,4 +1,5 @@
-//! Is there a hub, or a listener that stands for hubs of other machines, and where? Asks the locks of the places that a domain may be at; refuses to open anything there.
+//! Is there a hub, or a listener that stands for hubs of other machines, and where? Asks the locks of the places that a
+//! domain may be at; refuses to open anything there.
 
 use std::time::{Duration, Instant};
 

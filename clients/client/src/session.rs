@@ -152,8 +152,8 @@ impl Session {
         Some((rung, self.presence.looked_at()?))
     }
 
-    /// Returns what is readable while there may be something to receive or to see to, the same over all lives of the hub; from the first
-    /// call on it takes [`settle`](Self::settle) to make it unreadable.
+    /// Returns what is readable while there may be something to receive or to see to, the same over all lives of the hub;
+    /// from the first call on it takes [`settle`](Self::settle) to make it unreadable.
     ///
     /// # Errors
     ///

@@ -108,14 +108,18 @@ impl ZonesFollower {
         self.session.wait_for(Some(self.source.left().map_or(longest, |left| left.min(longest))))
     }
 
-    /// As [`Subscription::descriptor`](crate::Subscription::descriptor), with [`try_next`](Self::try_next) of the zones; it
-    /// gets readable also when the verdict becomes too old.
+    /// Returns a descriptor to poll, as [`Subscription::descriptor`](crate::Subscription::descriptor), with
+    /// [`try_next`](Self::try_next) of the zones; it gets readable also when the verdict becomes too old.
+    ///
+    /// # Errors
+    ///
+    /// As [`Subscription::descriptor`](crate::Subscription::descriptor).
     pub fn descriptor(&mut self) -> Result<BorrowedFd<'_>, Failure> {
         self.session.descriptor()
     }
 
-    /// Returns whether a hub lives in the domain, as of the last call of [`next`](Self::next) or [`try_next`](Self::try_next) that
-    /// found no news.
+    /// Returns whether a hub lives in the domain, as of the last call of [`next`](Self::next) or
+    /// [`try_next`](Self::try_next) that found no news.
     pub fn hub_lives(&self) -> bool {
         self.session.domain().is_some()
     }

@@ -39,8 +39,8 @@ impl Standing {
         }
     }
 
-    /// Returns whether it may be put out for another of which this came: it did not deliver for 3 s, or for a sample, it has not done so for
-    /// a second yet.
+    /// Returns whether it may be put out for another of which this came: it did not deliver for 3 s, or for a sample, it
+    /// has not done so for a second yet.
     pub fn may_go(&self, arrival: Arrival) -> bool {
         let silent_ns = |(_, last_ns): (u64, u64)| arrival.now_ns.saturating_sub(last_ns);
         let is_busy = self.delivered_ns.is_some_and(|delivered_ns| silent_ns(delivered_ns) < SILENT_NS);

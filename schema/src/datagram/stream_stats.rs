@@ -57,8 +57,8 @@ pub struct GivenUp {
 }
 
 impl StreamStats {
-    /// Makes statistics with nothing received yet. Announcements are believed for `topics` only: those whose groups were joined. Of the
-    /// others they would tell as lost what nobody wanted.
+    /// Makes statistics with nothing received yet. Announcements are believed for `topics` only: those whose groups were
+    /// joined. Of the others they would tell as lost what nobody wanted.
     pub fn new(topics: &[Topic]) -> StreamStats {
         StreamStats {
             followed: topics.iter().fold(0, |bits, topic| bits | 1 << topic.number()),
