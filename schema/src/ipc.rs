@@ -33,10 +33,7 @@ use iceoryx2::service::port_factory::{event, publish_subscribe};
 use self::trouble::{Trouble, create, full, no_port, no_publisher, open};
 use crate::lock::MakingLock;
 use crate::shortage::check_client;
-use crate::{
-    Background, Directory, Domain, Failure, Foreground, Header, Kind, Marks, Scan, Status, Topic, Zones,
-    access, limits, of_service, prefix,
-};
+use crate::{Directory, Domain, Failure, Header, Kind, Topic, access, limits, of_service, prefix};
 
 pub use self::bell::{Bell, Unsupported, sleep_at_bells};
 pub use self::clean::{Cleaned, clean};
@@ -211,7 +208,7 @@ macro_rules! payloads {
         payload!([u8], Topic::$topic, |builder| builder.initial_max_slice_len(crate::Telegram::MAX));
     };
     ($payload:tt, $topic:ident) => {
-        payload!($payload, Topic::$topic, |builder| builder);
+        payload!(crate::$payload, Topic::$topic, |builder| builder);
     };
 }
 

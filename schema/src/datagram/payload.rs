@@ -58,7 +58,7 @@ macro_rules! read {
         telegram($bytes).is_some()
     };
     ($payload:tt, $bytes:ident) => {
-        $payload::default().unpack($bytes)
+        crate::$payload::default().unpack($bytes)
     };
 }
 
