@@ -49,13 +49,13 @@ impl Background {
     /// Bytes of the longest packed model.
     pub const MAX_PACKED: usize = Self::HEAD + 2 * BEAMS;
 
-    /// The ranges that are used.
+    /// Returns the ranges that are used.
     pub fn ranges(&self) -> &[u16] {
         &self.range_array[..usize::from(self.count).min(BEAMS)]
     }
 
-    /// Angle of the first beam and between two, in 1/1000 degree; nothing if no variant has this many beams (Telegram
-    /// listing, 3Bh: 180 degrees in steps of 1 or 0.5, 100 degrees ahead in steps of 1, 0.5 or 0.25).
+    /// Returns the angle of the first beam and between two, in 1/1000 degree; nothing if no variant has this many beams
+    /// (Telegram listing, 3Bh: 180 degrees in steps of 1 or 0.5, 100 degrees ahead in steps of 1, 0.5 or 0.25).
     pub fn angles_mdeg(&self) -> Option<(i32, u16)> {
         match self.count {
             181 => Some((0, 1000)),
@@ -67,17 +67,17 @@ impl Background {
         }
     }
 
-    /// Nothing is learned until it is thawed.
+    /// Returns whether nothing is learned until it is thawed.
     pub fn is_frozen(&self) -> bool {
         self.flags & Background::FROZEN != 0
     }
 
-    /// The model without what is unused: as it goes over a network.
+    /// Returns the model without what is unused: as it goes over a network.
     pub fn packed(&self) -> &[u8] {
         &bytemuck::bytes_of(self)[..Self::HEAD + 2 * self.ranges().len()]
     }
 
-    /// The model in `bytes`, if their number matches its count.
+    /// Returns the model in `bytes`, if they are as many as its count says.
     pub fn unpack(bytes: &[u8]) -> Option<Background> {
         let mut background = Background::default();
         (Packed::unpack(&mut background, bytes) && background.packed().len() == bytes.len())

@@ -35,12 +35,12 @@ impl Verb {
     /// Requests about the background model, in the order of all output.
     pub const BACKGROUND: [Verb; 5] = [Verb::Show, Verb::Reset, Verb::Freeze, Verb::Thaw, Verb::Load];
 
-    /// All verbs.
+    /// Returns all verbs.
     pub fn all() -> impl Iterator<Item = Verb> {
         Verb::FLOW.into_iter().chain(Verb::BACKGROUND)
     }
 
-    /// The verb's name on the command line and in all output.
+    /// Returns the verb's name on the command line and in all output.
     pub fn name(self) -> &'static str {
         match self {
             Verb::Pause => "pause",
@@ -54,7 +54,7 @@ impl Verb {
         }
     }
 
-    /// The verb called `name`.
+    /// Returns the verb called `name`.
     pub fn parse(name: &str) -> Option<Verb> {
         Verb::all().find(|verb| verb.name() == name)
     }
@@ -98,7 +98,7 @@ impl Request {
         request
     }
 
-    /// The model that it contains, for [`Verb::Load`]: generation and flags are 0.
+    /// Returns the model that it brings, for [`Verb::Load`]: generation and flags are 0.
     pub fn model(&self) -> Background {
         let mut model = Background {
             count: self.count.min(BEAMS as u16),
@@ -111,12 +111,12 @@ impl Request {
         model
     }
 
-    /// The sensor that is meant.
+    /// Returns the sensor that is meant.
     pub fn sensor(&self) -> &str {
         text::read(&self.sensor_text)
     }
 
-    /// The verb; nothing if a newer client has one that this program does not know.
+    /// Returns the verb; nothing if a newer client has one that this program does not know.
     pub fn verb(&self) -> Option<Verb> {
         Verb::all().find(|verb| *verb as u16 == self.verb)
     }
@@ -148,7 +148,7 @@ impl Response {
     /// The longest response in bytes; a message beyond it is cut.
     pub const MAX: usize = 1024;
 
-    /// The response as bytes.
+    /// Returns the response as bytes.
     pub fn encode(&self) -> Vec<u8> {
         let (code, said) = match &self.0 {
             Ok(shown) => {
@@ -165,7 +165,7 @@ impl Response {
         [head.as_flattened(), &message, model].concat()
     }
 
-    /// The response in `bytes`, if that is one. A code that no kind of failure has is [`Kind::Failed`].
+    /// Returns the response in `bytes`, if that is one. A code that no kind of failure has is [`Kind::Failed`].
     pub fn decode(bytes: &[u8]) -> Option<Response> {
         let (&[code_low, code_high, low, high], rest) = bytes.split_first_chunk()?;
         let (message, model) = rest.split_at_checked(usize::from(u16::from_le_bytes([low, high])))?;

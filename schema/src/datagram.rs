@@ -113,6 +113,18 @@ impl Head {
 
 impl<'a> Datagram<'a> {
     /// Checks `bytes`, a whole datagram as it was received.
+    ///
+    /// # Examples
+    ///
+    /// ```
+    /// use schema::datagram::{Datagram, DatagramError};
+    ///
+    /// assert_eq!(Datagram::read(b"SHUB"), Err(DatagramError::Short));
+    /// ```
+    ///
+    /// # Errors
+    ///
+    /// The reason of the first check that fails, in the order of [`DatagramError`].
     pub fn read(bytes: &'a [u8]) -> Result<Datagram<'a>, DatagramError> {
         let (head, _) = bytes.split_first_chunk::<HEAD>().ok_or(DatagramError::Short)?;
         if &head[..4] != MAGIC {
@@ -158,7 +170,7 @@ impl<'a> Datagram<'a> {
     }
 }
 
-/// The last byte of the group that `topic` goes to: a group for each class of traffic, because switches filter by
+/// Returns the last byte of the group that `topic` goes to: a group for each class of traffic, because switches filter by
 /// group and not by port. That of announcements is [`Announce::GROUP`].
 pub fn group(topic: Topic) -> u8 {
     topic.row().group

@@ -28,7 +28,7 @@ pub struct Directory {
 }
 
 impl Directory {
-    /// The directory `root` of a domain, or nothing if there is none.
+    /// Returns the directory `root` of a domain, or nothing if there is none.
     ///
     /// # Errors
     ///
@@ -38,7 +38,7 @@ impl Directory {
         Walk::to(root, user(), false)
     }
 
-    /// As [`open`](Self::open); what is missing is created, only for this user.
+    /// Opens it as [`open`](Self::open) does; what is missing is made for this user alone.
     ///
     /// # Errors
     ///
@@ -48,7 +48,7 @@ impl Directory {
         made.ok_or_else(|| unusable(root, Errno::NOENT))
     }
 
-    /// The file `name`, or nothing if there is none.
+    /// Returns the file `name`, or nothing if there is none.
     ///
     /// # Errors
     ///
@@ -60,7 +60,7 @@ impl Directory {
         }
     }
 
-    /// The file `name` to read and write, created with mode 0600 if there is none.
+    /// Returns the file `name` to read and write, made with mode 0600 if there is none.
     ///
     /// # Errors
     ///

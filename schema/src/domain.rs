@@ -26,7 +26,9 @@ pub struct Domain {
 }
 
 impl Domain {
-    /// Domain `name` below the directory `base` (`--root`); a relative one counts from the working directory.
+    /// Returns domain `name` below the directory `base` (`--root`); a relative one counts from the working directory.
+    ///
+    /// # Errors
     ///
     /// [`Kind::Configuration`] if the name is not possible, or root and prefix are too long together.
     pub fn at(name: &str, base: &Path) -> Result<Domain, Failure> {
@@ -49,7 +51,9 @@ impl Domain {
         ))
     }
 
-    /// Where a hub puts domain `name`: below `base` if given, else the first place that the environment offers.
+    /// Returns where a hub puts domain `name`: below `base` if given, else the first place that the environment offers.
+    ///
+    /// # Errors
     ///
     /// [`Kind::Configuration`] as [`Domain::at`].
     pub fn of_hub(name: &str, base: Option<&Path>, environment: &Environment) -> Result<Domain, Failure> {
@@ -62,8 +66,10 @@ impl Domain {
         Domain::at(name, &base)
     }
 
-    /// Where a client looks for domain `name`: below `base` only if given, else every place that a hub may have
-    /// chosen, in order; the first one where a hub runs is used. Places that are too long for a hub are left out.
+    /// Returns where a client looks for domain `name`: below `base` only if given, else every place that a hub may have
+    /// chosen, in order; the first one that is live is taken. Places that are too long for a hub are left out.
+    ///
+    /// # Errors
     ///
     /// [`Kind::Configuration`] as [`Domain::at`].
     pub fn candidates(
@@ -85,17 +91,17 @@ impl Domain {
         Ok(domains)
     }
 
-    /// The domain's name.
+    /// Returns the domain's name.
     pub fn name(&self) -> &str {
         &self.name
     }
 
-    /// The directory of all its files, the lock among them.
+    /// Returns the directory of all its files, the lock among them.
     pub fn root(&self) -> &Path {
         &self.root
     }
 
-    /// The start of the names of its shared memory; the rest is in the directory's file `prefix`.
+    /// Returns how the names of its shared memory begin; what follows is in the directory's file `prefix`.
     pub fn prefix(&self) -> String {
         format!("sh_{}_", self.name)
     }
@@ -113,7 +119,7 @@ pub struct Environment {
 }
 
 impl Environment {
-    /// The environment of this process.
+    /// Returns the environment of this process.
     #[cfg(feature = "ipc")]
     pub fn of_process() -> Environment {
         let path = |name| std::env::var_os(name).and_then(first_path);
@@ -124,7 +130,7 @@ impl Environment {
         }
     }
 
-    /// Every directory that may hold domains, in the order in which clients look.
+    /// Returns every directory that may hold domains, in the order in which clients look.
     pub fn bases(&self) -> Vec<PathBuf> {
         let mut bases: Vec<PathBuf> = self.runtime_directory.iter().cloned().collect();
         bases.push(SERVICE_BASE.into());

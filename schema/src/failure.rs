@@ -46,7 +46,7 @@ pub enum Kind {
 }
 
 impl Kind {
-    /// The value of key `kind` in an `error` line.
+    /// Returns the value of key `kind` in an `error` line.
     pub fn name(self) -> &'static str {
         match self {
             Kind::Failed => "failed",
@@ -69,7 +69,7 @@ impl Kind {
         }
     }
 
-    /// The process's exit code.
+    /// Returns the process's exit code.
     pub fn exit_code(self) -> u8 {
         match self {
             Kind::Failed | Kind::DomainHeld => 1,
@@ -100,7 +100,7 @@ pub struct Failure {
 }
 
 impl Failure {
-    /// A failure of `kind` with `message` and the remedy `hint`.
+    /// Returns a failure of `kind` that says `message`, with the remedy `hint`.
     pub fn new(kind: Kind, message: impl Into<String>, hint: impl Into<String>) -> Self {
         Failure { kind, message: message.into(), hint: hint.into() }
     }

@@ -43,12 +43,20 @@ pub struct Foreign<'a> {
 }
 
 impl<W: Write> Writer<W> {
-    /// Starts a recording of `profile` (empty, or `ros2`) with the metadata `facts`; its chunks are not compressed.
+    /// Begins a recording of `profile` (empty, or `ros2`), of which `facts` are told; its chunks are not packed.
+    ///
+    /// # Errors
+    ///
+    /// The error of what it is written to.
     pub fn begin(out: W, profile: &str, facts: BTreeMap<String, String>) -> io::Result<Self> {
         Writer::packed(out, profile, Compression::None, facts)
     }
 
-    /// The same with chunks that are packed by `compression`.
+    /// Returns the same with chunks that are packed by `compression`.
+    ///
+    /// # Errors
+    ///
+    /// The error of what it is written to.
     pub fn packed(
         out: W,
         profile: &str,
@@ -74,6 +82,10 @@ impl<W: Write> Writer<W> {
 
     /// Writes a sample of `sensor`'s `topic`; `payload` is packed as for a network
     /// ([`Packed`](crate::datagram::Packed)).
+    ///
+    /// # Errors
+    ///
+    /// The error of what it is written to.
     pub fn sample(&mut self, sensor: &str, topic: Topic, header: &Header, payload: &[u8]) -> io::Result<()> {
         let known = self.channels.get(sensor).and_then(|its| its.iter().find(|(its, _)| *its == topic));
         let channel = match known {
@@ -97,6 +109,10 @@ impl<W: Write> Writer<W> {
     }
 
     /// Makes a channel, or finds the one made before.
+    ///
+    /// # Errors
+    ///
+    /// The error of what it is written to.
     pub fn channel(&mut self, foreign: &Foreign<'_>) -> io::Result<u16> {
         let (name, text, language) = foreign.schema;
         let schema = self.mcap.add_schema(name, language, text.as_bytes()).map_err(io_error)?;
@@ -106,12 +122,20 @@ impl<W: Write> Writer<W> {
     }
 
     /// Writes a message of `time_ns` since 1970 into a channel.
+    ///
+    /// # Errors
+    ///
+    /// The error of what it is written to.
     pub fn message(&mut self, channel_id: u16, sequence: u32, time_ns: u64, data: &[u8]) -> io::Result<()> {
         let header = MessageHeader { channel_id, sequence, log_time: time_ns, publish_time: time_ns };
         self.mcap.write_to_known_channel(&header, data).map_err(io_error)
     }
 
     /// Makes a channel as another file has it, with name, language and text of its messages' type, if it has one.
+    ///
+    /// # Errors
+    ///
+    /// The error of what it is written to.
     pub fn copied_channel(
         &mut self,
         channel: &Channel,
@@ -128,39 +152,59 @@ impl<W: Write> Writer<W> {
     }
 
     /// Writes a message as another file has it, into the channel that `header` names.
+    ///
+    /// # Errors
+    ///
+    /// The error of what it is written to.
     pub fn copied_message(&mut self, header: &MessageHeader, data: &[u8]) -> io::Result<()> {
         self.mcap.write_to_known_channel(header, data).map_err(io_error)
     }
 
-    /// Copies an attachment of another file, after the chunk, which this closes.
+    /// Writes a file within the file, as another one has it, behind a chunk that this closes.
+    ///
+    /// # Errors
+    ///
+    /// The error of what it is written to.
     pub fn copied_attachment(&mut self, attachment: &Attachment<'_>) -> io::Result<()> {
         self.mcap.attach(attachment).map_err(io_error)
     }
 
-    /// Writes a metadata record called `name`, after the chunk, which this closes.
+    /// Writes a metadata record called `name`, behind a chunk that this closes.
+    ///
+    /// # Errors
+    ///
+    /// The error of what it is written to.
     pub fn note(&mut self, name: &str, facts: BTreeMap<String, String>) -> io::Result<()> {
         self.mcap.write_metadata(&Metadata { name: name.to_owned(), metadata: facts }).map_err(io_error)
     }
 
     /// Hands all that was written to `W`.
+    ///
+    /// # Errors
+    ///
+    /// The error of what it is written to.
     pub fn close_chunk(&mut self) -> io::Result<()> {
         self.mcap.flush().map_err(io_error)
     }
 
     /// Writes the index, without which a reader must read the whole file, and gives `W` back.
+    ///
+    /// # Errors
+    ///
+    /// The error of what it is written to.
     pub fn finish(mut self) -> io::Result<W> {
         self.mcap.finish().map_err(io_error)?;
         self.mcap.into_inner().into_inner().into_inner().map_err(io::IntoInnerError::into_error)
     }
 }
 
-/// Header and payload of a message of a recording; `None` if it is shorter than a header.
+/// Returns header and payload of a message of a recording; `None` if it is shorter than a header.
 pub fn parts(message: &[u8]) -> Option<(Header, &[u8])> {
     let (header, payload) = message.split_at_checked(size_of::<Header>())?;
     Some((bytemuck::pod_read_unaligned(header), payload))
 }
 
-/// Name of the type of `topic`'s messages.
+/// Returns the name of the type of `topic`'s messages.
 pub fn schema(topic: Topic) -> &'static str {
     match topic {
         Topic::Telegram => "scanhub.Telegram.v1",

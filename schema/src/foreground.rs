@@ -66,22 +66,22 @@ impl Default for Foreground {
 }
 
 impl Foreground {
-    /// Beam `i` is in the foreground.
+    /// Returns whether beam `i` is in the foreground.
     pub fn contains(&self, i: usize) -> bool {
         i < BEAMS && self.bit_array[i / 8] >> (i % 8) & 1 == 1
     }
 
-    /// The beams in the foreground with their ranges in device units, in the order of the beams.
+    /// Returns the beams in the foreground with their ranges in device units, in the order of the beams.
     pub fn readings(&self) -> impl Iterator<Item = (usize, u16)> + '_ {
         (0..BEAMS).filter(|&i| self.contains(i)).zip(self.ranges().iter().copied())
     }
 
-    /// The ranges of the foreground beams in device units.
+    /// Returns the ranges of the foreground beams in device units.
     pub fn ranges(&self) -> &[u16] {
         &self.range_array[..usize::from(self.beams).min(BEAMS)]
     }
 
-    /// The segments that are used.
+    /// Returns the segments that are used.
     pub fn segments(&self) -> &[Segment] {
         &self.segment_array[..usize::from(self.segments).min(SEGMENTS)]
     }

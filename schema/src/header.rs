@@ -42,8 +42,8 @@ pub struct Header {
 }
 
 impl Header {
-    /// Time from the telegram's last byte until the sample was sent, in ns, at most 256 too much; nothing if it is not
-    /// known, or was more than four seconds.
+    /// Returns the time from the telegram's last byte until the sample was sent, in ns, at most 256 too much; nothing if it
+    /// is not told, or was more than four seconds.
     pub fn hub_time_ns(&self) -> Option<u64> {
         let [low, middle, high] = self.hub_time;
         let units = u32::from_le_bytes([low, middle, high, 0]);
@@ -58,7 +58,17 @@ impl Header {
         self.hub_time = [low, middle, high];
     }
 
-    /// The quality as a word; unknown values are suspect.
+    /// Returns the quality as a word; unknown values are suspect.
+    ///
+    /// # Examples
+    ///
+    /// ```
+    /// use schema::{Header, Quality, Reasons};
+    ///
+    /// let header = Header { quality: 1, reasons: Reasons::SLOW, ..Header::default() };
+    /// assert_eq!(header.quality(), Quality::Suspect);
+    /// assert_eq!(Reasons::names(header.reasons).collect::<Vec<_>>(), ["slow"]);
+    /// ```
     pub fn quality(&self) -> Quality {
         if self.quality == Quality::Clean as u8 { Quality::Clean } else { Quality::Suspect }
     }
@@ -78,7 +88,7 @@ pub enum Quality {
 }
 
 impl Quality {
-    /// `clean` or `suspect`.
+    /// Returns `clean` or `suspect`.
     pub fn name(self) -> &'static str {
         match self {
             Quality::Clean => "clean",
@@ -102,7 +112,7 @@ impl Reasons {
     /// The header of another telegram began inside.
     pub const HEADER_INSIDE: u8 = 16;
 
-    /// The names of the bits that are set, as in all output.
+    /// Returns the names of the bits that are set, as in all output.
     pub fn names(reasons: u8) -> impl Iterator<Item = &'static str> {
         let named = [
             (Reasons::LINE_ERROR, "line_error"),
@@ -128,7 +138,7 @@ impl Flags {
     /// The sample came from another machine.
     pub const REMOTE: u16 = 32;
 
-    /// The names of the bits that are set, as in all output.
+    /// Returns the names of the bits that are set, as in all output.
     pub fn names(flags: u16) -> impl Iterator<Item = &'static str> {
         let named = [
             (Flags::SIMULATED, "simulated"),

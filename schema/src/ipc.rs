@@ -33,10 +33,7 @@ use iceoryx2::service::port_factory::{event, publish_subscribe};
 use self::trouble::{Trouble, create, full, no_port, no_publisher, open};
 use crate::lock::MakingLock;
 use crate::shortage::check_client;
-use crate::{
-    Background, Directory, Domain, Failure, Foreground, Header, Kind, Marks, Scan, Status, Topic, Zones,
-    access, limits, of_service, prefix,
-};
+use crate::{Directory, Domain, Failure, Header, Kind, Topic, access, limits, of_service, prefix};
 
 pub use self::bell::{Bell, Unsupported, sleep_at_bells};
 pub use self::clean::{Cleaned, clean};
@@ -78,15 +75,19 @@ pub type Notifier = port::notifier::Notifier<Service>;
 /// Sleeps until it is woken.
 pub type Listener = port::listener::Listener<Service>;
 
-/// The node of a hub or listener in `domain`; the caller holds its [`HubLock`](crate::HubLock) or
+/// Returns the node of a hub or listener in `domain`, for who holds its [`HubLock`](crate::HubLock) or
 /// [`ListenLock`](crate::ListenLock). Cleans up what dead ones and consumers left.
+///
+/// # Errors
 ///
 /// [`Kind::Failed`] with owner, mode and remedy if the directory is another user's.
 pub fn hub_node(domain: &Domain) -> Result<Node, Failure> {
     node(domain, true)
 }
 
-/// A consumer's node in `domain`; cleaning up is the hub's business.
+/// Returns a consumer's node in `domain`; cleaning up is the hub's business.
+///
+/// # Errors
 ///
 /// [`Kind::Failed`] with owner, mode and remedy if the directory is another user's.
 pub fn client_node(domain: &Domain) -> Result<Node, Failure> {
@@ -98,27 +99,44 @@ pub trait Payload: IceoryxSend + Debug + 'static {
     /// The topic that carries it.
     const TOPIC: Topic;
 
-    /// The topic of `sensor`, created if it does not exist: for the hub. What a dead hub's consumers keep alive is reused.
+    /// Returns the topic of `sensor`, made if it is not there: for the hub. What a dead hub's consumers keep alive is reused.
+    ///
+    /// # Errors
+    ///
+    /// [`Kind::Short`] if memory or descriptors are short, [`Kind::Failed`] if it is there with another layout.
     fn create(node: &Node, sensor: &str) -> Result<TopicService<Self>, Failure>;
 
-    /// The topic of `sensor`, or nothing as long as no hub has created it: for consumers.
+    /// Returns the topic of `sensor`, or nothing as long as no hub has made it: for consumers.
+    ///
+    /// # Errors
+    ///
+    /// [`Kind::Short`] if memory or descriptors are short, [`Kind::Failed`] if it has another layout.
     fn open(node: &Node, sensor: &str) -> Result<Option<TopicService<Self>>, Failure>;
 
-    /// The publisher of a topic. A sample is loaned, written in place, and sent with `send()`, which returns how many
+    /// Returns the publisher of a topic. A sample is loaned, written in place, and sent with `send()`, which returns how many
     /// consumers got it: `loan_slice_uninit(n)` + `write_from_slice` for a telegram, `loan()` for all else.
+    ///
+    /// # Errors
     ///
     /// [`Kind::DomainHeld`] if the topic has a publisher already.
     fn publisher(topic: &TopicService<Self>) -> Result<Publisher<Self>, Failure>;
 
-    /// A consumer's end of a topic.
+    /// Returns a consumer's end of a topic.
+    ///
+    /// # Errors
     ///
     /// [`Kind::Short`] if memory, descriptors or places for consumers are.
     fn subscriber(topic: &TopicService<Self>) -> Result<Subscriber<Self>, Failure>;
 
-    /// The oldest waiting sample, or nothing.
+    /// Returns the oldest sample that waits, or nothing.
+    ///
+    /// # Errors
+    ///
+    /// [`ReceiveError::ExceedsMaxBorrows`] if [`limits::BORROWED`] samples are held; [`ReceiveError::ConnectionFailure`] if
+    /// the publisher's memory cannot be mapped.
     fn receive(subscriber: &Subscriber<Self>) -> Result<Option<Sample<Self>>, ReceiveError>;
 
-    /// The payload of a sample, in shared memory.
+    /// Returns the payload of a sample, in shared memory.
     fn read(sample: &Sample<Self>) -> &Self;
 }
 
@@ -190,20 +208,28 @@ macro_rules! payloads {
         payload!([u8], Topic::$topic, |builder| builder.initial_max_slice_len(crate::Telegram::MAX));
     };
     ($payload:tt, $topic:ident) => {
-        payload!($payload, Topic::$topic, |builder| builder);
+        payload!(crate::$payload, Topic::$topic, |builder| builder);
     };
 }
 
 crate::for_each_topic!(payloads);
 
-/// The sensors that have topics in `domain`, sorted. Those of a dead hub stay as long as a consumer keeps them.
+/// Returns the sensors that have topics in `domain`, sorted. Those of a dead hub stay as long as a consumer keeps them.
+///
+/// # Errors
+///
+/// [`Kind::Failed`] with owner, mode and remedy if the directory is another user's.
 pub fn sensors(domain: &Domain) -> Result<Vec<String>, Failure> {
     let mut sensors: Vec<String> = topics(domain)?.into_iter().map(|(sensor, _)| sensor).collect();
     sensors.dedup();
     Ok(sensors)
 }
 
-/// The sensors that have zones in `domain`, sorted, as [`sensors`]: those that make a robot's verdict.
+/// Returns the sensors that have zones in `domain`, sorted, as [`sensors`]: those that a robot's verdict is made of.
+///
+/// # Errors
+///
+/// As [`sensors`].
 pub fn sensors_with_zones(domain: &Domain) -> Result<Vec<String>, Failure> {
     let with_zones = topics(domain)?.into_iter().filter(|(_, topic)| *topic == Topic::Zones);
     Ok(with_zones.map(|(sensor, _)| sensor).collect())
@@ -224,7 +250,7 @@ fn topics(domain: &Domain) -> Result<Vec<(String, Topic)>, Failure> {
     Ok(topics)
 }
 
-/// The payload's revision that the creator of a service wrote into its `attributes`; 0 if it wrote none.
+/// Returns the payload's revision that the maker of a service wrote into its `attributes`; 0 if it wrote none.
 pub fn payload_revision(attributes: &AttributeSet) -> u32 {
     let revision = attributes.iter().find(|attribute| attribute.key().as_bytes() == REVISION.as_bytes());
     revision.and_then(|attribute| attribute.value().to_string().parse().ok()).unwrap_or_default()
@@ -266,7 +292,8 @@ fn node(domain: &Domain, cleanup: bool) -> Result<Node, Failure> {
         .map_err(|error| access::failure(root, format!("cannot join {}: {error:?}", domain.name())))
 }
 
-/// The names of shared memory of the domain in `root` are those that `node` has; they are others after all have gone.
+/// Returns whether the names of shared memory of the domain in `root` are those that `node` has. They are others after all
+/// have gone.
 ///
 /// # Errors
 ///

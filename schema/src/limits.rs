@@ -23,22 +23,23 @@ pub const CONTROL_CLIENTS: usize = 16;
 /// Processes that have the control service open, dead ones that are not cleaned up yet among them.
 pub const CONTROL_NODES: usize = 32;
 
-/// Consumers of `topic` at a time.
+/// Returns the number of consumers of `topic` at a time.
 pub const fn subscribers(topic: Topic) -> usize {
     topic.row().consumers
 }
 
-/// Samples that wait for a consumer of `topic`.
+/// Returns the number of samples that wait for a consumer of `topic`.
 pub const fn buffer(topic: Topic) -> usize {
     topic.row().waiting
 }
 
-/// Samples that a late consumer of `topic` gets.
+/// Returns the number of samples that a consumer of `topic` gets which comes later.
 pub const fn history(topic: Topic) -> usize {
     topic.row().kept
 }
 
-/// Samples to reserve memory for. All queues hold the same latest samples, so that their number does not count.
+/// Returns the number of samples to reserve memory for. All queues hold the same latest samples, so that their number does
+/// not count.
 pub const fn samples(topic: Topic) -> usize {
     buffer(topic) + subscribers(topic) * BORROWED + history(topic) + LOANED
 }

@@ -24,6 +24,8 @@ pub struct HubLock {
 impl HubLock {
     /// Creates the directory `root` for this user only, takes the lock and writes this process's id into it.
     ///
+    /// # Errors
+    ///
     /// [`Kind::DomainHeld`] if another hub has it (the message names its pid), [`Kind::Failed`] if the directory is
     /// another user's or cannot be created.
     pub fn acquire(root: &Path) -> Result<HubLock, Failure> {
@@ -38,7 +40,11 @@ pub struct ListenLock {
 }
 
 impl ListenLock {
-    /// As [`HubLock::acquire`].
+    /// Takes the lock as [`HubLock::acquire`] does.
+    ///
+    /// # Errors
+    ///
+    /// As [`HubLock::acquire`], with another listener.
     pub fn acquire(root: &Path) -> Result<ListenLock, Failure> {
         Ok(ListenLock { _publishing: Publishing::acquire(root, LISTENER, "listener")? })
     }
@@ -128,14 +134,21 @@ impl Drop for Held {
     }
 }
 
-/// The process that holds the domain in `root`, if a hub runs there; 0 while it has not yet written its pid.
+/// Returns the process that holds the domain in `root`, if a hub lives there; 0 in the moment in which it has not yet written
+/// its pid.
+///
+/// # Errors
 ///
 /// [`Kind::Failed`] if the directory is another user's.
 pub fn holder(root: &Path) -> Result<Option<u32>, Failure> {
     holder_of(root, HUB)
 }
 
-/// The process that publishes in `root`: the hub, or else a listener; failures and 0 as with [`holder`].
+/// Returns the process that publishes in `root`: the hub, or else a listener; failures and 0 as with [`holder`].
+///
+/// # Errors
+///
+/// As [`holder`].
 pub fn publisher(root: &Path) -> Result<Option<u32>, Failure> {
     match holder_of(root, HUB)? {
         None => holder_of(root, LISTENER),

@@ -55,17 +55,17 @@ impl Marks {
     /// Flag: the sensor's measuring mode has no reflector bits, so that nothing is known of marks.
     pub const UNAVAILABLE: u8 = 2;
 
-    /// The marks that are used.
+    /// Returns the marks that are used.
     pub fn marks(&self) -> &[Mark] {
         &self.mark_array[..usize::from(self.count).min(MARKS)]
     }
 
-    /// The sensor sends reflector bits: without them, an empty list means nothing.
+    /// Returns whether the sensor sends what marks are found by: without it an empty list says nothing.
     pub fn is_available(&self) -> bool {
         self.flags & Marks::UNAVAILABLE == 0
     }
 
-    /// There were more marks than fit.
+    /// Returns whether there were more marks than fit.
     pub fn is_overflow(&self) -> bool {
         self.flags & Marks::OVERFLOW != 0
     }

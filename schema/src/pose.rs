@@ -24,8 +24,8 @@ pub struct Pose {
 }
 
 impl Pose {
-    /// Direction of the beam at sensor angle `angle_mdeg` (1/1000 degree; 0 right, 90 ahead, as an upright sensor sees
-    /// it) in the robot's frame: a unit vector.
+    /// Returns the direction of the beam at sensor angle `angle_mdeg` (1/1000 degree; 0 right, 90 ahead, as an upright
+    /// sensor sees it) in the robot's frame: a unit vector.
     pub fn direction(&self, angle_mdeg: i32) -> (f64, f64) {
         let ahead_deg = f64::from(angle_mdeg) / 1000.0 - 90.0;
         let aside_deg = if self.upside_down == 0 { ahead_deg } else { -ahead_deg };
@@ -33,7 +33,7 @@ impl Pose {
         (cos, sin)
     }
 
-    /// The point at `range_mm` on that beam in the robot's frame, in mm.
+    /// Returns the point at `range_mm` on that beam in the robot's frame, in mm.
     pub fn point_mm(&self, angle_mdeg: i32, range_mm: f64) -> (f64, f64) {
         let (x, y) = self.direction(angle_mdeg);
         (1000.0 * self.x_m + range_mm * x, 1000.0 * self.y_m + range_mm * y)

@@ -33,7 +33,7 @@ pub fn escape_json(line: &mut Vec<u8>) {
     }
 }
 
-/// `line` of JSON with [`escape_json`].
+/// Returns `line` of JSON with [`escape_json`].
 pub fn json_line(line: String) -> String {
     let mut line = line.into_bytes();
     escape_json(&mut line);

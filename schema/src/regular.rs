@@ -14,6 +14,8 @@ pub const LONGEST: u64 = 512 << 10;
 
 /// Opens the regular file at `path`; never waits.
 ///
+/// # Errors
+///
 /// [`ErrorKind::InvalidInput`] with what it is instead, else the system's error.
 pub fn open(path: &Path) -> io::Result<File> {
     let flags = OFlags::NONBLOCK | OFlags::NOCTTY;
@@ -28,20 +30,30 @@ pub fn open(path: &Path) -> io::Result<File> {
     Err(io::Error::new(ErrorKind::InvalidInput, format!("it is {what}, not a regular file")))
 }
 
-/// All of the regular file at `path`, which has at most `longest` bytes.
+/// Returns all of the regular file at `path`, which has at most `longest` bytes.
+///
+/// # Errors
 ///
 /// As [`open`]; [`ErrorKind::FileTooLarge`] if it is longer.
 pub fn read(path: &Path, longest: u64) -> io::Result<Vec<u8>> {
     read_all(&mut open(path)?, longest)
 }
 
-/// The same as text; [`ErrorKind::InvalidData`] if it is not UTF-8.
+/// Returns the same as text; [`ErrorKind::InvalidData`] if it is not UTF-8.
+///
+/// # Errors
+///
+/// As [`read`]; [`ErrorKind::InvalidData`] if it is not UTF-8.
 pub fn read_text(path: &Path, longest: u64) -> io::Result<String> {
     String::from_utf8(read(path, longest)?)
         .map_err(|_| io::Error::new(ErrorKind::InvalidData, "it is no text in UTF-8"))
 }
 
-/// All of `input`, which has at most `longest` bytes; [`ErrorKind::FileTooLarge`] if it has more.
+/// Returns all of `input`, which has at most `longest` bytes; [`ErrorKind::FileTooLarge`] if it has more.
+///
+/// # Errors
+///
+/// [`ErrorKind::FileTooLarge`] if it has more, else the system's error.
 pub fn read_all(input: &mut dyn Read, longest: u64) -> io::Result<Vec<u8>> {
     let mut content = Vec::new();
     input.take(longest + 1).read_to_end(&mut content)?;

@@ -14,7 +14,7 @@ pub struct SavedModel {
     pub model: Background,
 }
 
-/// `model` of `sensor` as an object of class `background`: what [`SavedModel::parse`] reads. Angles are null as long as
+/// Returns `model` of `sensor` as an object of class `background`: what [`SavedModel::parse`] reads. Angles are null as long as
 /// there was no scan.
 pub fn as_json<'a>(sensor: &'a str, model: &'a Background) -> impl Serialize + 'a {
     #[derive(Serialize)]
@@ -50,7 +50,9 @@ pub fn as_json<'a>(sensor: &'a str, model: &'a Background) -> impl Serialize + '
 }
 
 impl SavedModel {
-    /// The model in `text`, which was found at `place`. Keys that this program does not know are ignored.
+    /// Returns the model in `text`, which was found at `place`. Keys that this program does not know are passed over.
+    ///
+    /// # Errors
     ///
     /// [`Kind::Configuration`] with place and reason if it is not a complete model: cut short, not JSON, of another class,
     /// or with numbers that are impossible or contradict each other.

@@ -15,6 +15,18 @@ pub const CONTENTS_UPPER: u8 = 1;
 pub const TURN_NS: u64 = 13_320_000;
 
 /// The payload of topic `scan`, 1216 bytes. The hub's decoder writes it in place.
+///
+/// # Examples
+///
+/// ```
+/// use schema::Scan;
+///
+/// let mut scan = Scan { count: 2, unit_mm: 10, range_bits: 13, first_angle_mdeg: 0, step_mdeg: 500, ..Scan::default() };
+/// scan.range_array[..2].copy_from_slice(&[123, 8191]);
+/// assert_eq!((scan.distance_mm(0), scan.angle_deg(1)), (Some(1230), 0.5));
+/// // The largest values are codes: there is no distance.
+/// assert!(scan.distance_mm(1).is_none() && scan.code(1).is_some());
+/// ```
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Pod, Zeroable)]
 #[cfg_attr(feature = "ipc", derive(ZeroCopySend), type_name("scanhub.Scan.v1"))]
 #[repr(C)]
@@ -48,66 +60,66 @@ impl Default for Scan {
 }
 
 impl Scan {
-    /// The ranges that are used, in device units, codes included.
+    /// Returns the ranges that are used, in device units, codes included.
     #[inline]
     pub fn ranges(&self) -> &[u16] {
         &self.range_array[..self.beams()]
     }
 
-    /// The upper bits of the beams, as many as ranges, or none if the mode does not send them.
+    /// Returns the upper bits of the beams, as many as ranges, or none if the mode does not send them.
     #[inline]
     pub fn upper(&self) -> &[u8] {
         if self.contents & CONTENTS_UPPER == 0 { &[] } else { &self.upper_array[..self.beams()] }
     }
 
-    /// The intensities of the beams, or none if the mode has no reflector bits.
+    /// Returns the intensities of the beams, or none if the mode has no reflector bits.
     #[inline]
     pub fn intensities(&self) -> &[u8] {
         if self.intensity_bits == 0 { &[] } else { self.upper() }
     }
 
-    /// Beams used: `count`, never more than [`BEAMS`].
+    /// Returns the number of beams used: `count`, never more than [`BEAMS`].
     #[inline]
     pub fn beams(&self) -> usize {
         usize::from(self.count).min(BEAMS)
     }
 
-    /// The largest value that the range's bits hold; codes are counted down from it.
+    /// Returns the largest value that the range's bits hold; codes are counted down from it.
     #[inline]
     pub fn max(&self) -> u16 {
         ((1_u32 << u32::from(self.range_bits).min(16)) - 1) as u16
     }
 
-    /// The range of beam `i` in device units, if it is a valid reading.
+    /// Returns the range of beam `i` in device units, if it is a valid reading.
     #[inline]
     pub fn range(&self, i: usize) -> Option<u16> {
         let value = *self.ranges().get(i)?;
         if self.classify(value).is_none() { Some(value) } else { None }
     }
 
-    /// Why beam `i` has no valid reading; nothing if it has one or does not exist.
+    /// Returns why beam `i` has no valid reading; nothing if it has one or is not there.
     #[inline]
     pub fn code(&self, i: usize) -> Option<Code> {
         self.classify(*self.ranges().get(i)?)
     }
 
-    /// The range of beam `i` in mm, if it is a valid reading.
+    /// Returns the range of beam `i` in mm, if it is a valid reading.
     #[inline]
     pub fn distance_mm(&self, i: usize) -> Option<u32> {
         Some(u32::from(self.range(i)?) * u32::from(self.unit_mm))
     }
 
-    /// Angle of beam `i` in 1/1000 degree.
+    /// Returns the angle of beam `i` in 1/1000 degree.
     pub fn angle_mdeg(&self, i: usize) -> i32 {
         self.first_angle_mdeg.saturating_add(i as i32 * i32::from(self.step_mdeg))
     }
 
-    /// Angle of beam `i` in degrees.
+    /// Returns the angle of beam `i` in degrees.
     pub fn angle_deg(&self, i: usize) -> f64 {
         f64::from(self.angle_mdeg(i)) / 1000.0
     }
 
-    /// How long before the telegram's first byte beam `i` was measured, in ns. A degree is measured in as many turns
+    /// Returns how long before the telegram's first byte beam `i` was measured, in ns. A degree is measured in as many turns
     /// as it has steps, beam i in turn i mod n; the sensor sends after the last beam of the last turn.
     pub fn beam_age_ns(&self, i: usize) -> u64 {
         let turns = (1000 / u64::from(self.step_mdeg.max(1))).max(1);

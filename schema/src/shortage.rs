@@ -31,6 +31,8 @@ pub(crate) const CONTROL_DESCRIPTORS: u64 = 24;
 
 /// Fails if fewer than `needed` bytes of shared memory are free or allowed for this process.
 ///
+/// # Errors
+///
 /// [`Kind::Short`] with what is free and what is needed.
 pub fn check_memory(needed: u64) -> Result<(), Failure> {
     check_place(Path::new(SHARED_MEMORY), needed).map_err(|what| memory(&what))?;
@@ -57,6 +59,8 @@ fn check_file_size(needed: u64) -> Result<(), Failure> {
 /// Fails if this process may not map `needed` more bytes and what creating them takes: the library would leave behind a
 /// segment that it cannot map.
 ///
+/// # Errors
+///
 /// [`Kind::Short`] with the limit and what is needed.
 pub fn check_address_space(needed: u64) -> Result<(), Failure> {
     let Some(limit) = getrlimit(Resource::As).current else { return Ok(()) };
@@ -78,6 +82,8 @@ pub fn check_address_space(needed: u64) -> Result<(), Failure> {
 
 /// Fails if fewer than `needed` more descriptors can be opened.
 ///
+/// # Errors
+///
 /// [`Kind::Short`] with the limit and what is needed.
 pub fn check_descriptors(needed: u64) -> Result<(), Failure> {
     let limit = getrlimit(Resource::Nofile).current.unwrap_or(u64::MAX);
@@ -98,14 +104,16 @@ pub fn check_descriptors(needed: u64) -> Result<(), Failure> {
 
 /// Raises the limit of descriptors to the hard limit: a publisher needs about four for each consumer of a topic.
 ///
-/// The system's error if that fails.
+/// # Errors
+///
+/// The system's error if it does not let it.
 pub fn raise_descriptor_limit() -> io::Result<()> {
     let mut limit = getrlimit(Resource::Nofile);
     limit.current = limit.maximum;
     Ok(setrlimit(Resource::Nofile, limit)?)
 }
 
-/// Shared memory is short, in the words of `what`.
+/// Returns the failure that shared memory is short, in the words of `what`.
 pub fn memory(what: &str) -> Failure {
     Failure::new(
         Kind::Short,

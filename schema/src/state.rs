@@ -21,28 +21,30 @@ pub struct StateDirectory {
 }
 
 impl StateDirectory {
-    /// Where the directories of all domains are, according to the environment of this process: the one that systemd created
-    /// for the service, else the user's own. `None` if it names none.
+    /// Returns where the directories of all domains are, as the environment of this process says: what systemd made for the
+    /// service, else the user's own. `None` if it names no place.
     pub fn base() -> Option<PathBuf> {
         base_in(|name| std::env::var_os(name))
     }
 
-    /// The directory of `domain`, which need not exist; `None` as for [`base`](Self::base).
+    /// Returns the directory of `domain`; `None` as for [`base`](Self::base). It need not be there.
     pub fn of_domain(domain: &str) -> Option<StateDirectory> {
         Some(StateDirectory::at(StateDirectory::base()?.join(domain)))
     }
 
-    /// The directory `path`, which need not exist.
+    /// Returns the directory `path`, which need not be there.
     pub fn at(path: impl Into<PathBuf>) -> StateDirectory {
         StateDirectory { path: path.into() }
     }
 
-    /// Where file `name` is, or would be.
+    /// Returns where file `name` is, or would be.
     pub fn path(&self, name: &str) -> PathBuf {
         self.path.join(name)
     }
 
-    /// The content of file `name`; `None` if there is none.
+    /// Returns what file `name` holds; `None` if there is none.
+    ///
+    /// # Errors
     ///
     /// [`Kind::Failed`] if it cannot be read, is not a plain file of this user that nobody else can write, has more than
     /// `most` bytes, or is not UTF-8.
@@ -62,7 +64,9 @@ impl StateDirectory {
     /// Replaces the content of file `name`, mode 0600, by `text`; creates the directory, mode 0700, if it does not exist.
     /// It waits for the disk, so do not call it in a thread that reads a line.
     ///
-    /// [`Kind::Failed`] if that is not possible; then the file keeps its content.
+    /// # Errors
+    ///
+    /// [`Kind::Failed`] if that is not possible; then what the file held is still there.
     pub fn write(&self, name: &str, text: &str) -> Result<(), Failure> {
         self.replace(name, text).map_err(|error| {
             let what = format!("cannot keep {}: {error}", self.path(name).display());

@@ -57,26 +57,26 @@ impl Status {
     /// The measuring mode as long as the sensor has not reported it.
     pub const MODE_UNKNOWN: u8 = 0xFF;
 
-    /// The state as a word; nothing if a newer hub has one that this program does not know.
+    /// Returns the state as a word; nothing if a newer hub has one that this program does not know.
     pub fn state(&self) -> Option<State> {
         State::ALL.get(usize::from(self.state)).copied()
     }
 
-    /// Whether the measuring mode has reflector bits, without which there are no marks (Telegram listing, 77h block D);
+    /// Returns whether the measuring mode has reflector bits, without which there are no marks (Telegram listing, 77h block D);
     /// nothing as long as the mode is not known.
     pub fn has_reflector_bits(&self) -> Option<bool> {
         (self.mode != Status::MODE_UNKNOWN).then_some(matches!(self.mode, 0x01 | 0x03 | 0x05))
     }
 
-    /// The command that gives the sensor reflector bits, if it has none and is not a recording: the mode is in its EEPROM,
+    /// Returns the command that gives the sensor reflector bits, if it has none and is no recording: they live in its EEPROM,
     /// which only a person changes.
     pub fn reflector_remedy(&self) -> Option<String> {
         let is_wanted = self.has_reflector_bits() == Some(false) && !self.is_replayed();
         is_wanted.then(|| format!("scanhub configure {} mode=0x01", self.port()))
     }
 
-    /// Share of the line's bytes outside any telegram over the last 10 s, 0 to 1: only those of a stream, without scans that
-    /// the sensor broke off to answer.
+    /// Returns the share of the line's bytes that were in nothing over the last 10 s, 0 to 1: those of a stream, without
+    /// scans that the sensor broke off to answer.
     pub fn damaged(&self) -> f64 {
         self.counters[Counter::DamagedPpm] as f64 / 1e6
     }
@@ -86,12 +86,13 @@ impl Status {
         (self.counters[Counter::DueOnLine] > 0).then_some(self.counters[Counter::LostOnLine])
     }
 
-    /// Their share of the scans that were due in the last 10 s, 0 to 1.
+    /// Returns their share of the scans that were due in the last 10 s, 0 to 1.
     pub fn lost_share(&self) -> Option<f64> {
         self.lost_on_line().map(|_| self.counters[Counter::LostPpm] as f64 / 1e6)
     }
 
-    /// The loss on the line, in words such as `41 % lost on the line`, if it was more than a thousandth in the last 10 s.
+    /// Returns what the line takes away, in words such as `41 % lost on the line`, if that is more than a thousandth in the
+    /// last 10 s.
     pub fn line_loss(&self) -> Option<String> {
         let lost = self.lost_share().filter(|&share| share > WELL);
         let damaged = Some(self.damaged()).filter(|&share| share > WELL);
@@ -100,12 +101,12 @@ impl Status {
         Some(format!("{percent:.digits$} % {word} on the line"))
     }
 
-    /// Whether the sensor is a recording, of which nothing can be asked.
+    /// Returns whether the sensor is a recording, of which nothing can be asked.
     pub fn is_replayed(&self) -> bool {
         self.port().starts_with("file:")
     }
 
-    /// The sensor's type, as it reports it; empty if unknown.
+    /// Returns what the sensor calls itself; empty if unknown.
     pub fn sensor_type(&self) -> &str {
         text::read(&self.type_text)
     }
@@ -115,7 +116,7 @@ impl Status {
         text::write(&mut self.type_text, value);
     }
 
-    /// The port that the link is configured for.
+    /// Returns the port that the link is configured for.
     pub fn port(&self) -> &str {
         text::read(&self.port_text)
     }
@@ -125,7 +126,7 @@ impl Status {
         text::write(&mut self.port_text, value);
     }
 
-    /// The last error in words; empty if there was none.
+    /// Returns the last error in words; empty if there was none.
     pub fn last_error(&self) -> &str {
         text::read(&self.last_error_text)
     }
@@ -171,7 +172,7 @@ impl State {
         State::Paused,
     ];
 
-    /// The state's name in all output.
+    /// Returns the state's name in all output.
     pub fn name(self) -> &'static str {
         match self {
             State::Absent => "absent",
@@ -192,7 +193,7 @@ impl State {
 pub struct Counters(pub [u64; COUNTERS]);
 
 impl Counters {
-    /// Name and value of every counter that has a name, in their order.
+    /// Returns name and value of every counter that has a name, in their order.
     pub fn named(&self) -> impl Iterator<Item = (&'static str, u64)> + '_ {
         Counter::ALL.iter().map(|&counter| (counter.name(), self[counter]))
     }
@@ -224,7 +225,7 @@ macro_rules! counters {
             /// All counters, in the order of the output.
             pub const ALL: &'static [Counter] = &[$(Counter::$variant,)*];
 
-            /// The counter's key in all output.
+            /// Returns the counter's key in all output.
             pub fn name(self) -> &'static str {
                 match self { $(Counter::$variant => $name,)* }
             }

@@ -9,12 +9,12 @@ impl<'a> Telegram<'a> {
     /// The longest telegram there is, in bytes: STX to CRC (Telegram listing: 812 and its two bytes of CRC).
     pub const MAX: usize = 814;
 
-    /// The address byte (to the sensor, or its answer's 80h + address); 0 if the bytes end before.
+    /// Returns the address byte (to the sensor, or its answer's 80h + address); 0 if the bytes end before.
     pub fn address(self) -> u8 {
         self.0.get(1).copied().unwrap_or_default()
     }
 
-    /// The length field: bytes from the command to the status, both included.
+    /// Returns the length field: bytes from the command to the status, both included.
     pub fn length(self) -> u16 {
         match self.0.get(2..4) {
             Some(bytes) => u16::from_le_bytes([bytes[0], bytes[1]]),
@@ -22,12 +22,12 @@ impl<'a> Telegram<'a> {
         }
     }
 
-    /// The command or answer byte; 0 if the bytes end before.
+    /// Returns the command or answer byte; 0 if the bytes end before.
     pub fn command(self) -> u8 {
         self.0.get(4).copied().unwrap_or_default()
     }
 
-    /// The bytes between command and CRC: the data and, last, the status byte.
+    /// Returns what lies between command and CRC: the data and, last, the status byte.
     pub fn data(self) -> &'a [u8] {
         self.0.get(5..self.0.len().saturating_sub(2)).unwrap_or_default()
     }

@@ -7,42 +7,51 @@ use crate::{Failure, Kind};
 pub use table::{Pace, Row, Topic};
 
 impl Topic {
-    /// The topic's row in the table.
+    /// Returns what the table says of the topic.
     pub const fn row(self) -> &'static Row {
         &table::ROWS[self as usize]
     }
 
-    /// The topic's name, as in `front/scan`.
+    /// Returns the topic's name, as in `front/scan`.
     pub fn name(self) -> &'static str {
         self.row().name
     }
 
-    /// The topic called `name`.
+    /// Returns the topic called `name`.
+    ///
+    /// # Examples
+    ///
+    /// ```
+    /// use schema::Topic;
+    ///
+    /// assert_eq!(Topic::parse("scan"), Some(Topic::Scan));
+    /// assert_eq!(Topic::Scan.service("front"), "scanhub/v1/front/scan");
+    /// ```
     pub fn parse(name: &str) -> Option<Topic> {
         Topic::ALL.into_iter().find(|topic| topic.name() == name)
     }
 
-    /// The topic's number on a network: from 1.
+    /// Returns the topic's number on a network: from 1.
     pub fn number(self) -> u8 {
         self as u8 + 1
     }
 
-    /// The topic with this number.
+    /// Returns the topic with this number.
     pub fn of_number(number: u8) -> Option<Topic> {
         Topic::ALL.into_iter().find(|topic| topic.number() == number)
     }
 
-    /// The payload's type, the same in all languages.
+    /// Returns the payload's type, the same in all languages.
     pub fn payload(self) -> &'static str {
         self.row().payload
     }
 
-    /// The payload's revision: a greater one only appends.
+    /// Returns the payload's revision: a greater one only appends.
     pub fn revision(self) -> u32 {
         1
     }
 
-    /// Name of the topic's service for `sensor`.
+    /// Returns the name of the topic's service for `sensor`.
     pub fn service(self, sensor: &str) -> String {
         service(sensor, self.name())
     }
@@ -73,13 +82,13 @@ pub enum Wake {
 }
 
 impl Wake {
-    /// Name of the wake service of `sensor`.
+    /// Returns the name of the wake service of `sensor`.
     pub fn service(sensor: &str) -> String {
         service(sensor, WAKE)
     }
 }
 
-/// The sensor and topic of a service's name, if it is one of ours: the inverse of
+/// Returns the sensor and topic that a service's name stands for, if it is one of ours: the other direction of
 /// [`Topic::service`]; the wake service has no topic.
 pub fn of_service(name: &str) -> Option<(&str, Option<Topic>)> {
     let (sensor, topic) = name.strip_prefix("scanhub/v1/")?.split_once('/')?;
@@ -89,7 +98,11 @@ pub fn of_service(name: &str) -> Option<(&str, Option<Topic>)> {
 /// Means all sensors of a hub, wherever a sensor's name is expected; so it cannot be a sensor's name.
 pub const ROBOT: &str = "robot";
 
-/// Refuses a sensor's name that is not `[a-z0-9_-]`, 1 to 24 of them, or [`ROBOT`]: [`Kind::Configuration`].
+/// Refuses a sensor's name that is not `[a-z0-9_-]`, 1 to 24 of them, or [`ROBOT`].
+///
+/// # Errors
+///
+/// [`Kind::Configuration`] with an example.
 pub fn check_sensor(name: &str) -> Result<(), Failure> {
     if name == ROBOT {
         let what = format!("sensor name {ROBOT:?} is not possible: it stands for all sensors");
@@ -108,6 +121,10 @@ pub fn check_sensor(name: &str) -> Result<(), Failure> {
 
 /// Refuses what no consumer can follow: neither a sensor's name nor that of a remote one, `HUB.SENSOR`, of which each
 /// half is as a sensor's name: [`Kind::Configuration`].
+///
+/// # Errors
+///
+/// [`Kind::Configuration`] with an example.
 pub fn check_followed(name: &str) -> Result<(), Failure> {
     match name.split_once('.') {
         Some((hub, sensor)) => check_sensor(hub).and_then(|()| check_sensor(sensor)),
@@ -115,7 +132,7 @@ pub fn check_followed(name: &str) -> Result<(), Failure> {
     }
 }
 
-/// The sensor belongs to another machine; a listener publishes its topics here.
+/// Returns whether the sensor is another machine's; a listener brings its topics here.
 pub fn is_remote(sensor: &str) -> bool {
     sensor.contains('.')
 }

@@ -59,7 +59,17 @@ impl Zones {
     /// Flag: fewer scans were seen than a violation takes, so that nothing can be violated yet.
     pub const PROVISIONAL: u8 = 1;
 
-    /// Nothing is known: no circles, verdict unknown.
+    /// Returns zones of which nothing is known: no circles, verdict unknown.
+    ///
+    /// # Examples
+    ///
+    /// ```
+    /// use schema::{Verdict, Zones};
+    ///
+    /// assert_eq!(Zones::unknown().verdict(), Verdict::Unknown);
+    /// // What is seen inside outweighs what is not known.
+    /// assert_eq!(Verdict::Unknown.worse(Verdict::Stop), Verdict::Stop);
+    /// ```
     pub fn unknown() -> Zones {
         Zones {
             verdict: Verdict::Unknown as u8,
@@ -69,17 +79,17 @@ impl Zones {
         }
     }
 
-    /// The circles that are used, the largest first.
+    /// Returns the circles that are used, the largest first.
     pub fn zones(&self) -> &[Zone] {
         &self.zone_array[..usize::from(self.count).min(ZONES)]
     }
 
-    /// The verdict; what this program does not know is unknown.
+    /// Returns the verdict; what this program does not know is unknown.
     pub fn verdict(&self) -> Verdict {
         Verdict::ALL.into_iter().find(|verdict| *verdict as u8 == self.verdict).unwrap_or(Verdict::Unknown)
     }
 
-    /// Beam and distance from the robot's centre, in mm, of what is nearest to it.
+    /// Returns beam and distance from the robot's centre, in mm, of what is nearest to it.
     pub fn nearest(&self) -> Option<(u16, u32)> {
         (self.nearest_beam != Zones::NO_BEAM).then_some((self.nearest_beam, self.nearest_mm))
     }
@@ -103,7 +113,7 @@ impl Verdict {
     /// All verdicts, by their number.
     pub const ALL: [Verdict; 4] = [Verdict::Clear, Verdict::Slow, Verdict::Stop, Verdict::Unknown];
 
-    /// The verdict's name in all output.
+    /// Returns the verdict's name in all output.
     pub fn name(self) -> &'static str {
         match self {
             Verdict::Clear => "clear",
@@ -113,7 +123,7 @@ impl Verdict {
         }
     }
 
-    /// The worse of two: stop, then unknown, then slow, then clear. An object seen inside counts more than an unknown.
+    /// Returns the worse of two: stop, then unknown, then slow, then clear. What is seen inside outweighs what is not known.
     pub fn worse(self, other: Verdict) -> Verdict {
         let rank = |verdict| match verdict {
             Verdict::Clear => 0,

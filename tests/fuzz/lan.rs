@@ -1,9 +1,9 @@
 //! What has to hold whatever a network carries: datagrams are refused, or they say what can be said again.
 
+use schema::Topic;
 use schema::datagram::{
     Announce, Datagram, DatagramError, Fresh, GivenUp, HEAD, Head, MTU_ETHERNET, Packed, ROWS, StreamStats,
 };
-use schema::{Background, Foreground, Marks, Scan, Status, Topic, Zones};
 
 /// Any datagrams, one after the other: each is counted once, what is refused changes nothing, and what is not, can be
 /// said again.
@@ -91,24 +91,25 @@ fn can_be_said_again(datagram: &Datagram<'_>) {
         assert_eq!(first, second);
     }
     let payload = datagram.payload;
-    match Topic::of_number(datagram.head.topic) {
-        None => {
-            let announce = Announce::unpack(payload).expect("an announcement");
-            let mut room = [0; 2_000];
-            let len = announce.pack(&mut room).expect("room");
-            assert_eq!(Announce::unpack(&room[..len]), Some(announce));
-        }
-        Some(Topic::Telegram) => {
+    let Some(topic) = Topic::of_number(datagram.head.topic) else {
+        let announce = Announce::unpack(payload).expect("an announcement");
+        let mut room = [0; 2_000];
+        let len = announce.pack(&mut room).expect("room");
+        return assert_eq!(Announce::unpack(&room[..len]), Some(announce));
+    };
+    macro_rules! by_topic {
+        ($($topic:ident $payload:tt, $name:literal, $($column:tt),*: $about:literal;)*) => {
+            match topic { $(Topic::$topic => by_topic!($payload),)* }
+        };
+        ([u8]) => {{
             let telegram = schema::datagram::telegram(payload).expect("a telegram").0;
             assert_eq!(schema::datagram::telegram(telegram).map(|again| again.0), Some(telegram));
-        }
-        Some(Topic::Scan) => again(Scan::default(), payload),
-        Some(Topic::Marks) => again(Marks::default(), payload),
-        Some(Topic::Zones) => again(Zones::unknown(), payload),
-        Some(Topic::Foreground) => again(Foreground::default(), payload),
-        Some(Topic::Background) => again(Background::default(), payload),
-        Some(Topic::Status) => again(Status::default(), payload),
+        }};
+        ($payload:ident) => {
+            again(schema::$payload::default(), payload)
+        };
     }
+    schema::for_each_topic!(by_topic);
 }
 
 /// The checksum sees one to three changed bits, wherever they are (its Hamming distance at these lengths is 4).

@@ -11,17 +11,17 @@ pub struct Moment {
     pub boottime_ns: u64,
 }
 
-/// This moment.
+/// Returns this moment.
 pub fn now() -> Moment {
     Moment { monotonic_ns: read(ClockId::Monotonic), boottime_ns: read(ClockId::Boottime) }
 }
 
-/// CLOCK_MONOTONIC, in ns.
+/// Returns CLOCK_MONOTONIC alone, in ns.
 pub fn now_ns() -> u64 {
     read(ClockId::Monotonic)
 }
 
-/// The wall clock, ns since 1970.
+/// Returns the wall clock, ns since 1970.
 pub fn wall_ns() -> u64 {
     read(ClockId::Realtime)
 }

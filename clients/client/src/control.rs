@@ -11,6 +11,23 @@ use crate::presence::{GRACE, find};
 
 /// Sends `request` to the hub at the first of `places` where one runs, and returns its answer.
 ///
+/// # Examples
+///
+/// ```no_run
+/// use std::sync::atomic::AtomicBool;
+///
+/// use scanhub_client::{Failure, Request, Verb, places, request};
+///
+/// fn main() -> Result<(), Failure> {
+///     // Set by a signal, for example.
+///     let stop = AtomicBool::new(false);
+///     request(&places(None)?, &Request::new("front", Verb::Reset), &stop)?;
+///     Ok(())
+/// }
+/// ```
+///
+/// # Errors
+///
 /// [`Kind::NoHub`] within a second if there is none, or if it ends before it answers; [`Kind::NoTopic`] with the sensors
 /// that exist; [`Kind::Short`] if there are too many requests at a time; [`Kind::Failed`] if the link cannot do it;
 /// [`Kind::Timeout`] if the hub does not answer: it is short of something, or the link is busy;

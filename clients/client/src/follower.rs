@@ -21,7 +21,7 @@ pub struct Received<P: Payload + ?Sized> {
 }
 
 impl<P: Payload + ?Sized> Received<P> {
-    /// Numbers, stamps and quality of the sample.
+    /// Returns numbers, stamps and quality of the sample.
     pub fn header(&self) -> &Header {
         self.sample.user_header()
     }
@@ -36,7 +36,7 @@ impl<P: Payload + ?Sized> Deref for Received<P> {
 }
 
 impl Received<Scan> {
-    /// CLOCK_MONOTONIC when beam `i` was measured, in ns: stamps are times of bytes on the line, the measurement is older.
+    /// Returns CLOCK_MONOTONIC when beam `i` was measured, in ns: stamps are of bytes on the wire, the measurement is older.
     pub fn beam_time_ns(&self, i: usize) -> u64 {
         self.header().stamp_first_ns.saturating_sub(self.beam_age_ns(i))
     }
@@ -61,7 +61,7 @@ const ASK_EVERY: Duration = Duration::from_millis(50);
 const UNCONNECTED_LIMIT: Duration = Duration::from_secs(3);
 
 impl<P: Payload + ?Sized> Follower<P> {
-    /// Follows the topic of `sensor` as soon as it exists.
+    /// Makes what will follow the topic of `sensor`, as soon as it is there.
     pub fn new(sensor: &str) -> Follower<P> {
         Follower {
             sensor: sensor.to_owned(),
@@ -74,12 +74,14 @@ impl<P: Payload + ?Sized> Follower<P> {
         }
     }
 
-    /// The topic has existed at least once.
+    /// Returns whether the topic has been there at least once.
     pub fn subscribed(&self) -> bool {
         self.port.is_some()
     }
 
-    /// The next waiting sample, or nothing.
+    /// Returns the next sample that waits, or nothing.
+    ///
+    /// # Errors
     ///
     /// [`Kind::Short`] if descriptors or memory are short, [`Kind::Failed`] if more than four samples are held or the
     /// topic has another layout.

@@ -30,14 +30,14 @@ const NO_PERIOD_NS: u64 = 500_000_000;
 const FIRST_WORD_NS: u64 = 1_000_000_000;
 
 impl Freshness {
-    /// Nothing was received yet; listening starts at `now`.
+    /// Makes the deadline of a sensor of which nothing was heard yet, and nobody listened before `now`.
     pub fn new(now: Moment) -> Freshness {
         Freshness { until: later(now, FIRST_WORD_NS), said: false }
     }
 
-    /// A sample with `header` and `verdict` arrived at `now`; returns whether it is valid. Its age counts as well as the
-    /// silence after it: a sample that waited for long is not new, and a stamp in the future does not make it newer. An
-    /// `unknown` is valid at any age.
+    /// Takes a sample with `header` and `verdict` that came in at `now`. Returns whether it may be believed. Its age counts
+    /// as well as the silence after it: what waited for long is no news, and a stamp in the future keeps nothing fresh. An
+    /// `unknown` stands however old it is.
     pub fn heard(&mut self, header: &Header, verdict: Verdict, now: Moment) -> bool {
         let limit_ns = match header.period_us {
             0 => NO_PERIOD_NS,
@@ -54,7 +54,7 @@ impl Freshness {
         is_unknown || fresh
     }
 
-    /// Whether a verdict became too old just now; true once per silence.
+    /// Returns whether a verdict became too old just now; said once per silence.
     pub fn silence(&mut self, now: Moment) -> bool {
         let over = now.monotonic_ns >= self.until.monotonic_ns || now.boottime_ns >= self.until.boottime_ns;
         if self.said || !over {
@@ -64,7 +64,7 @@ impl Freshness {
         true
     }
 
-    /// How long [`silence`](Self::silence) need not be asked; nothing if only a sample can change anything.
+    /// Returns how long [`silence`](Self::silence) need not be asked; nothing if only a sample can change anything.
     pub fn left(&self, now: Moment) -> Option<Duration> {
         let left_ns = self.until.monotonic_ns.saturating_sub(now.monotonic_ns);
         let awake_ns = self.until.boottime_ns.saturating_sub(now.boottime_ns);

@@ -1,6 +1,33 @@
-//! The library of every program that follows a hub, or publishes its own topics beside it. A program depends only on this
-//! crate. Knows only `schema`: to it, a hub is a lock that is held and topics that exist. Prints nothing; refuses to know
-//! verbs.
+//! The library of every program that follows a hub of scanhub, or publishes topics of its own beside it. A program depends on
+//! this crate alone.
+//!
+//! - [`subscribe`] follows one topic of one sensor in shared memory, without a copy, over restarts of the hub.
+//! - [`zones`] and [`robot`] follow the verdict of one sensor and of all: a silence becomes [`Verdict::Unknown`] by itself.
+//! - [`publish`] makes a topic that others follow.
+//! - [`request`] asks the hub for something, [`live_sensors`] says which sensors it has.
+//! - [`streams`] is for programs that follow many topics in one thread.
+//!
+//! Hub and programs must be of the same version: they share memory.
+//!
+//! # Examples
+//!
+//! ```no_run
+//! use scanhub_client::{Failure, Scan, subscribe};
+//!
+//! fn main() -> Result<(), Failure> {
+//!     let mut scans = subscribe::<Scan>("front")?;
+//!     while let Some(scan) = scans.next()? {
+//!         let distances = (0..scan.beams()).filter_map(|i| Some((scan.distance_mm(i)?, i)));
+//!         if let Some((mm, i)) = distances.min() {
+//!             println!("{mm} mm at {} degrees", scan.angle_deg(i));
+//!         }
+//!     }
+//!     Ok(())
+//! }
+//! ```
+//!
+//! The crate knows only `schema`: a hub is a lock that is held and topics that are there. It prints nothing and refuses to
+//! know verbs.
 
 pub mod clock;
 mod control;
@@ -33,3 +60,7 @@ pub use schema::{
     Foreground, Header, Kind, MARKS, Mark, Marks, Pose, Quality, ROBOT, Reasons, Request, SEGMENTS, Scan,
     Segment, Shown, State, Status, Telegram, Topic, Verb, Verdict, Wake, ZONES, Zone, Zones, ipc::Payload,
 };
+
+#[cfg(doctest)]
+#[doc = include_str!("../README.md")]
+struct Readme;

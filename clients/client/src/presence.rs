@@ -1,5 +1,5 @@
-//! Whether a hub runs, or a listener that publishes the sensors of other machines, and where. Asks the locks at the places
-//! of a domain; opens nothing else there.
+//! Is there a hub, or a listener that stands for hubs of other machines, and where? Asks the locks of the places that a
+//! domain may be at; refuses to open anything there.
 
 use std::time::{Duration, Instant};
 
@@ -149,7 +149,9 @@ impl Presence {
     }
 }
 
-/// The hub at the first live one of `places`, waiting a moment for one that is just starting.
+/// Returns the hub at the first live one of `places`, waiting a moment for one that is just starting.
+///
+/// # Errors
 ///
 /// [`Kind::NoHub`] after half a second.
 pub fn find(places: &[Domain]) -> Result<Domain, Failure> {

@@ -15,6 +15,22 @@ pub use source::{RobotHeard, RobotSource};
 /// Follows the zones of `sensors` in the domain that SCANHUB_DOMAIN names. If empty: all sensors of the hub there; in a
 /// domain without a hub, the sensors of other machines that are published there. The hub may start later.
 ///
+/// # Examples
+///
+/// ```no_run
+/// use scanhub_client::{Failure, robot};
+///
+/// fn main() -> Result<(), Failure> {
+///     let mut robot = robot(&[])?;
+///     loop {
+///         let now = robot.next()?;
+///         println!("{}, {}", now.verdict().name(), now.worst().unwrap_or("no sensor"));
+///     }
+/// }
+/// ```
+///
+/// # Errors
+///
 /// [`Kind::Configuration`](schema::Kind) if a name is not possible.
 pub fn robot(sensors: &[&str]) -> Result<RobotFollower, Failure> {
     RobotFollower::in_domain(places(None)?, sensors)
@@ -27,30 +43,30 @@ pub struct Robot {
 }
 
 impl Robot {
-    /// The worst verdict of all sensors; unknown as long as there are none.
+    /// Returns the worst verdict of all sensors; unknown as long as there are none.
     pub fn verdict(&self) -> Verdict {
         let verdicts = self.sensors().map(|(_, verdict)| verdict);
         verdicts.reduce(Verdict::worse).unwrap_or(Verdict::Unknown)
     }
 
-    /// The first sensor with the worst verdict.
+    /// Returns the first sensor with the worst verdict.
     pub fn worst(&self) -> Option<&str> {
         let verdict = self.verdict();
         self.sensors().find(|(_, of_sensor)| *of_sensor == verdict).map(|(sensor, _)| sensor)
     }
 
-    /// Distance from the robot's centre, in mm, of the nearest object, and the sensor that sees it. Unknown sensors may
-    /// see nothing at all.
+    /// Returns the distance from the robot's centre, in mm, of what is nearest to it, and the sensor that sees it there. Sensors
+    /// that are unknown may see nothing at all.
     pub fn nearest(&self) -> Option<(u32, &str)> {
         self.parts.iter().filter_map(|(sensor, zones)| Some((zones.nearest()?.1, sensor.as_str()))).min()
     }
 
-    /// Each sensor's verdict; unknown without recent data.
+    /// Returns each sensor's verdict; unknown where it was not heard lately, or never.
     pub fn sensors(&self) -> impl Iterator<Item = (&str, Verdict)> {
         self.parts.iter().map(|(sensor, zones)| (sensor.as_str(), zones.verdict()))
     }
 
-    /// Each sensor's zones; unknown without recent data.
+    /// Returns each sensor's zones; unknown where it was not heard lately, or never.
     pub fn zones(&self) -> impl Iterator<Item = (&str, &Zones)> {
         self.parts.iter().map(|(sensor, zones)| (sensor.as_str(), zones))
     }
@@ -68,7 +84,9 @@ pub struct RobotFollower {
 }
 
 impl RobotFollower {
-    /// As [`robot`], at the first of `places` where a hub runs.
+    /// Follows as [`robot`] does, in the first live one of `places`.
+    ///
+    /// # Errors
     ///
     /// [`Kind::Configuration`](schema::Kind) if a sensor's name is not possible.
     pub fn in_domain(places: Vec<Domain>, sensors: &[&str]) -> Result<RobotFollower, Failure> {
@@ -76,14 +94,17 @@ impl RobotFollower {
         Ok(RobotFollower { session: Session::new(places), source: RobotSource::new(sensors) })
     }
 
-    /// As [`Subscription::wait_by`](crate::Subscription::wait_by).
+    /// Waits by `wait`, as [`Subscription::wait_by`](crate::Subscription::wait_by).
     pub fn wait_by(self, wait: Wait) -> RobotFollower {
         RobotFollower { session: self.session.by(wait), ..self }
     }
 
-    /// Waits until data from any sensor arrives, or stops; returns what is known then. The first time it waits for each
-    /// sensor. A sensor becomes unknown as with [`ZonesFollower::next`](crate::ZonesFollower::next), and this fails in
-    /// the same way.
+    /// Waits until any of the sensors is heard, or any is heard no more; what is known then. The first time it waits for
+    /// a word of each. A sensor becomes unknown as with [`ZonesFollower::next`](crate::ZonesFollower::next).
+    ///
+    /// # Errors
+    ///
+    /// As [`Subscription::next`](crate::Subscription::next): nothing is known then either.
     #[allow(clippy::should_implement_trait)] // There is no end that an iterator would have.
     pub fn next(&mut self) -> Result<&Robot, Failure> {
         while !self.hear()? {
@@ -92,14 +113,21 @@ impl RobotFollower {
         Ok(self.source.robot())
     }
 
-    /// What is known now; never waits. Failures as [`next`](Self::next).
+    /// Returns what is known now; never waits.
+    ///
+    /// # Errors
+    ///
+    /// As [`next`](Self::next).
     pub fn now(&mut self) -> Result<&Robot, Failure> {
         self.hear()?;
         Ok(self.source.robot())
     }
 
-    /// What is known now, if data arrived or became too old since the last call; never waits. Failures as
-    /// [`next`](Self::next).
+    /// Returns what is known now, if anything was heard, or became too old, since the last call; never waits.
+    ///
+    /// # Errors
+    ///
+    /// As [`next`](Self::next).
     pub fn try_next(&mut self) -> Result<Option<&Robot>, Failure> {
         loop {
             if self.hear()? {
@@ -111,17 +139,25 @@ impl RobotFollower {
         }
     }
 
-    /// As [`Subscription::wait`](crate::Subscription::wait); it is also over when a verdict becomes too old.
+    /// Sleeps as [`Subscription::wait`](crate::Subscription::wait) does, or until a verdict becomes too old.
+    ///
+    /// # Errors
+    ///
+    /// [`Kind::Short`](schema::Kind) if the system cannot wait.
     pub fn wait(&mut self, longest: Duration) -> Result<(), Failure> {
         self.session.wait_for(Some(self.source.left().map_or(longest, |left| left.min(longest))))
     }
 
-    /// As [`ZonesFollower::descriptor`](crate::ZonesFollower::descriptor).
+    /// Returns a descriptor to poll, as [`ZonesFollower::descriptor`](crate::ZonesFollower::descriptor).
+    ///
+    /// # Errors
+    ///
+    /// As [`Subscription::descriptor`](crate::Subscription::descriptor).
     pub fn descriptor(&mut self) -> Result<BorrowedFd<'_>, Failure> {
         self.session.descriptor()
     }
 
-    /// Somebody publishes in the domain, a hub or a listener, as of the last call of [`next`](Self::next),
+    /// Returns whether somebody publishes in the domain, a hub or a listener, as of the last call of [`next`](Self::next),
     /// [`now`](Self::now) or [`try_next`](Self::try_next) that found no news.
     pub fn hub_lives(&self) -> bool {
         self.session.domain().is_some()

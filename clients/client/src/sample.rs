@@ -59,7 +59,7 @@ macro_rules! samples {
         }
 
         impl Source {
-            /// Will follow `topic` of `sensor`. The zones of `robot` are the fold over all sensors.
+            /// Makes what will follow `topic` of `sensor`. The zones of `robot` are the fold over all sensors.
             pub fn new(sensor: &str, topic: Topic) -> Source {
                 match topic {
                     Topic::Zones if sensor == ROBOT => Source::Robot(RobotSource::new(&[])),

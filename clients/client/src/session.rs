@@ -37,7 +37,7 @@ struct Joined {
 }
 
 impl Session {
-    /// Joins the first of `places` where a hub runs, as soon as there is one.
+    /// Makes a session that will join the first live one of `places`, as soon as one is.
     pub fn new(places: Vec<Domain>) -> Session {
         Session {
             presence: Presence::new(places),
@@ -50,14 +50,16 @@ impl Session {
         }
     }
 
-    /// Sets how it is woken; call it before anything is followed.
+    /// Has the session woken by `wait`; to be said before anything is followed.
     pub fn by(self, wait: Wait) -> Session {
         Session { wait, ..self }
     }
 
     /// Looks whether a hub runs, and joins its domain if it is at a new place.
     ///
-    /// [`Kind::Short`](schema::Kind) if memory or descriptors are; a session that has joined continues without a look.
+    /// # Errors
+    ///
+    /// [`Kind::Short`](schema::Kind) if memory or descriptors are; who has joined already goes on without a look.
     pub fn look(&mut self) -> Result<Change, Failure> {
         if self.joined.as_mut().is_some_and(|joined| joined.wakeups.take_rang()) {
             self.presence.heard();
@@ -96,22 +98,22 @@ impl Session {
         Ok(change)
     }
 
-    /// Where the hub runs, if there is one.
+    /// Returns where the hub lives, if there is one.
     pub fn domain(&self) -> Option<&Domain> {
         self.presence.domain()
     }
 
-    /// Who publishes there, as of the last look.
+    /// Returns who publishes there, as of the last look.
     pub fn publishes(&self) -> Option<Who> {
         self.presence.who()
     }
 
-    /// A hub runs, not only a listener that publishes sensors of other machines.
+    /// Returns whether there is a hub, and not only a listener that stands for those of other machines.
     pub fn hub_lives(&self) -> bool {
         self.domain().is_some_and(|domain| matches!(holder(domain.root()), Ok(Some(_))))
     }
 
-    /// The failure for callers that cannot wait for a hub.
+    /// Returns what to tell who cannot wait for a hub.
     pub fn no_hub(&self) -> Failure {
         self.presence.no_hub()
     }
@@ -121,8 +123,13 @@ impl Session {
         self.number
     }
 
-    /// A subscriber of `sensor`, or nothing as long as its hub or topic does not exist. What wakes it is opened first, so
-    /// that no wake-up is missed between the two.
+    /// Returns a subscriber of `sensor`, or nothing as long as its hub or topic is not there. What wakes it comes first, so
+    /// that nothing is sent unheard between the two.
+    ///
+    /// # Errors
+    ///
+    /// [`Kind::Short`] if memory, descriptors or places for consumers are short; [`Kind::Failed`] if the topic has another
+    /// layout.
     pub fn subscribe<P: Payload + ?Sized>(&mut self, sensor: &str) -> Result<Option<Subscriber<P>>, Failure> {
         let (Some(_), Some(joined)) = (self.presence.domain(), &mut self.joined) else {
             return Ok(None);
@@ -138,15 +145,17 @@ impl Session {
         Ok(subscriber)
     }
 
-    /// A moment of `sensor`'s topics: as long as it is the same, nothing new was sent. Nothing if that is not known. Late
-    /// consumers get samples without a wake-up, so a moment also ends with the next look for the hub.
+    /// Returns a moment in the life of `sensor`'s topics: as long as it is the same, nothing new was sent. Nothing where
+    /// that is not known. What late joiners get comes without a word, so a moment ends with the next look for the hub, too.
     pub fn moment(&self, sensor: &str) -> Option<(u32, Instant)> {
         let rung = self.joined.as_ref()?.wakeups.rung(sensor)?;
         Some((rung, self.presence.looked_at()?))
     }
 
-    /// A descriptor that is readable while there may be something to receive or to check; it stays the same across
-    /// restarts of the hub. After the first call, [`settle`](Self::settle) is needed to make it unreadable.
+    /// Returns what is readable while there may be something to receive or to see to, the same over all lives of the hub;
+    /// from the first call on it takes [`settle`](Self::settle) to make it unreadable.
+    ///
+    /// # Errors
     ///
     /// [`Kind::Configuration`] if it is not waited by event, [`Kind::Short`] if descriptors are short.
     pub fn descriptor(&mut self) -> Result<BorrowedFd<'_>, Failure> {
@@ -167,8 +176,12 @@ impl Session {
         Ok(readiness.as_fd())
     }
 
-    /// Call this when nothing waits and nothing must be checked before `left`: the descriptor, if it is used, is not
-    /// readable before. Returns whether something was sent meanwhile: then look again first.
+    /// Takes note that nothing waits, and that nothing will have to be looked for before `left`: the descriptor, if it is used,
+    /// is not readable before. Returns whether something was sent meanwhile: then look again first.
+    ///
+    /// # Errors
+    ///
+    /// [`Kind::Short`] if the system cannot wait.
     pub fn settle(&mut self, left: Option<Duration>) -> Result<bool, Failure> {
         let Some(readiness) = &self.readiness else { return Ok(false) };
         // What a late joiner is handed comes without an event.
@@ -181,11 +194,19 @@ impl Session {
 
     /// Sleeps until something was sent, at the latest until `until`, and 100 ms at most; returns at once if something
     /// may have been sent since the caller looked. Hold no sample meanwhile.
+    ///
+    /// # Errors
+    ///
+    /// [`Kind::Short`] if the system cannot wait.
     pub fn wait(&mut self, until: Option<Instant>) -> Result<(), Failure> {
         self.wait_for(until.map(|until| until.saturating_duration_since(Instant::now())))
     }
 
-    /// As [`wait`](Self::wait), for a time instead of until one.
+    /// Sleeps as [`wait`](Self::wait) does, for a time instead of until one.
+    ///
+    /// # Errors
+    ///
+    /// As [`wait`](Self::wait).
     pub fn wait_for(&mut self, left: Option<Duration>) -> Result<(), Failure> {
         let left = left.map_or(LONGEST_WAIT, |left| left.min(LONGEST_WAIT));
         // This takes events that whoever polls has not seen: for him it is readable until it is settled.

@@ -1,5 +1,26 @@
-//! Many topics in one thread: a session in a domain, the followers of its topics, and whether a hub runs. For programs
-//! that need more than one [`Subscription`](crate::Subscription).
+//! Many topics in one thread: a session in a domain, what follows topics in it, and whether a hub is there. For programs
+//! for which one [`Subscription`](crate::Subscription) is too little.
+//!
+//! # Examples
+//!
+//! ```no_run
+//! use scanhub_client::streams::{Session, Source};
+//! use scanhub_client::{Failure, Topic, places};
+//!
+//! fn main() -> Result<(), Failure> {
+//!     let mut session = Session::new(places(None)?);
+//!     let mut sources = [Source::new("front", Topic::Scan), Source::new("rear", Topic::Scan)];
+//!     loop {
+//!         session.look()?;
+//!         for source in &mut sources {
+//!             while let Some(sample) = source.receive(&mut session)? {
+//!                 println!("{} bytes", sample.bytes().len());
+//!             }
+//!         }
+//!         session.wait(None)?;
+//!     }
+//! }
+//! ```
 
 pub use crate::follower::Follower;
 pub use crate::freshness::Freshness;

@@ -14,12 +14,30 @@ use crate::wait::Wait;
 /// Follows the topic of `sensor` that carries `P` (`[u8]`: telegram, `Scan`, `Marks` ..), in the domain that
 /// SCANHUB_DOMAIN names. The hub may start later. To act on zones, follow them with [`zones`](crate::zones).
 ///
+/// # Examples
+///
+/// ```no_run
+/// use scanhub_client::{Failure, Scan, subscribe};
+///
+/// fn main() -> Result<(), Failure> {
+///     let mut scans = subscribe::<Scan>("front")?;
+///     while let Some(scan) = scans.next()? {
+///         println!("{} beams, beam 0 at {} degrees: {:?} mm", scan.beams(), scan.angle_deg(0), scan.distance_mm(0));
+///     }
+///     Ok(())
+/// }
+/// ```
+///
+/// # Errors
+///
 /// [`Kind::Configuration`](schema::Kind) if a name is not possible.
 pub fn subscribe<P: Payload + ?Sized>(sensor: &str) -> Result<Subscription<P>, Failure> {
     Subscription::in_domain(places(None)?, sensor)
 }
 
-/// The possible places of `domain`; if none is named, of the one that SCANHUB_DOMAIN names.
+/// Returns where `domain` may be, or if none is named that which SCANHUB_DOMAIN names.
+///
+/// # Errors
 ///
 /// [`Kind::Configuration`](schema::Kind) if the name is not possible.
 pub fn places(domain: Option<&str>) -> Result<Vec<Domain>, Failure> {
@@ -41,7 +59,9 @@ pub struct Subscription<P: Payload + ?Sized> {
 }
 
 impl<P: Payload + ?Sized> Subscription<P> {
-    /// As [`subscribe`], at the first of `places` where a hub runs.
+    /// Follows as [`subscribe`] does, in the first live one of `places`.
+    ///
+    /// # Errors
     ///
     /// [`Kind::Configuration`](schema::Kind) if the sensor's name is not possible.
     pub fn in_domain(places: Vec<Domain>, sensor: &str) -> Result<Self, Failure> {
@@ -62,6 +82,8 @@ impl<P: Payload + ?Sized> Subscription<P> {
 
     /// Waits for the next sample; `None` only after the timeout. Drop the sample before the next call.
     ///
+    /// # Errors
+    ///
     /// [`Kind::Short`](schema::Kind) if descriptors or places are short, [`Kind::Failed`](schema::Kind) if the domain
     /// is another user's or the topic has another layout.
     #[allow(clippy::should_implement_trait)] // An iterator would have to hold samples over waits.
@@ -79,7 +101,11 @@ impl<P: Payload + ?Sized> Subscription<P> {
         }
     }
 
-    /// The next sample if one waits; never waits itself. Failures as [`next`](Self::next).
+    /// Returns the next sample if one waits; never waits itself.
+    ///
+    /// # Errors
+    ///
+    /// As [`next`](Self::next).
     pub fn try_next(&mut self) -> Result<Option<Received<P>>, Failure> {
         loop {
             if let Some(received) = self.look()? {
@@ -94,16 +120,20 @@ impl<P: Payload + ?Sized> Subscription<P> {
     /// Sleeps until there may be a sample, but at most for `longest` and a tenth of a second, so that the caller can stop.
     /// Hold no sample meanwhile.
     ///
+    /// # Errors
+    ///
     /// [`Kind::Short`](schema::Kind) if the system cannot wait.
     pub fn wait(&mut self, longest: Duration) -> Result<(), Failure> {
         self.session.wait_for(Some(longest))
     }
 
-    /// A descriptor that is readable while there may be a sample, for programs that also wait for other things: poll it,
-    /// never read it. It stays the same as long as the subscription exists, also if the hub restarts. When
-    /// [`try_next`](Self::try_next) returns `None`, it is not readable any more; until then poll does not sleep. It also
-    /// becomes readable without a sample: each second, ten times a second while there is no hub, and when other topics of
-    /// the sensor have something.
+    /// Returns what is readable while there may be a sample, for who waits for other things as well: to be polled, never
+    /// read. It is the same for as long as the subscription lives, whatever becomes of the hub.
+    /// [`try_next`](Self::try_next) makes it unreadable by answering `None`; until then poll does not sleep. It also gets
+    /// readable when there is nothing: each second, ten times a second while there is no hub, and when other topics of the
+    /// sensor have something.
+    ///
+    /// # Errors
     ///
     /// [`Kind::Configuration`](schema::Kind) without [`Wait::Event`], [`Kind::Short`](schema::Kind) if descriptors are.
     pub fn descriptor(&mut self) -> Result<BorrowedFd<'_>, Failure> {
@@ -121,8 +151,8 @@ impl<P: Payload + ?Sized> Subscription<P> {
         self.follower.receive(&mut self.session)
     }
 
-    /// A hub runs in the domain, as of the last call of [`next`](Self::next) or [`try_next`](Self::try_next) that found
-    /// no sample waiting.
+    /// Returns whether a hub lives in the domain, as of the last call of [`next`](Self::next) or [`try_next`](Self::try_next) that
+    /// found no sample waiting.
     pub fn hub_lives(&self) -> bool {
         self.session.domain().is_some()
     }

@@ -15,6 +15,24 @@ use crate::wait::Wait;
 
 /// Follows the zones of `sensor` in the domain that SCANHUB_DOMAIN names. The hub may start later.
 ///
+/// # Examples
+///
+/// ```no_run
+/// use scanhub_client::{Failure, Verdict, zones};
+///
+/// fn main() -> Result<(), Failure> {
+///     let mut front = zones("front")?;
+///     loop {
+///         let heard = front.next()?;
+///         // Nothing known is taken for a stop.
+///         let may_go = matches!(heard.zones.verdict(), Verdict::Clear | Verdict::Slow);
+///         println!("may go: {may_go}");
+///     }
+/// }
+/// ```
+///
+/// # Errors
+///
 /// [`Kind::Configuration`](schema::Kind) if a name is not possible.
 pub fn zones(sensor: &str) -> Result<ZonesFollower, Failure> {
     ZonesFollower::in_domain(places(None)?, sensor)
@@ -49,7 +67,9 @@ pub struct ZonesFollower {
 }
 
 impl ZonesFollower {
-    /// As [`zones`], at the first of `places` where a hub runs.
+    /// Follows as [`zones`] does, in the first live one of `places`.
+    ///
+    /// # Errors
     ///
     /// [`Kind::Configuration`](schema::Kind) if the sensor's name is not possible.
     pub fn in_domain(places: Vec<Domain>, sensor: &str) -> Result<ZonesFollower, Failure> {
@@ -57,7 +77,7 @@ impl ZonesFollower {
         Ok(ZonesFollower { session: Session::new(places), source: ZonesSource::new(sensor) })
     }
 
-    /// As [`Subscription::wait_by`](crate::Subscription::wait_by).
+    /// Waits by `wait`, as [`Subscription::wait_by`](crate::Subscription::wait_by).
     pub fn wait_by(self, wait: Wait) -> ZonesFollower {
         ZonesFollower { session: self.session.by(wait), ..self }
     }
@@ -66,7 +86,9 @@ impl ZonesFollower {
     /// after the last sample (for another machine not before half a second), or a second after the start if there was
     /// none, with or without a hub.
     ///
-    /// Failures as [`Subscription::next`](crate::Subscription::next): the zones are not known then.
+    /// # Errors
+    ///
+    /// As [`Subscription::next`](crate::Subscription::next): nothing is known then either.
     #[allow(clippy::should_implement_trait)] // There is no end that an iterator would have.
     pub fn next(&mut self) -> Result<Heard, Failure> {
         loop {
@@ -77,24 +99,36 @@ impl ZonesFollower {
         }
     }
 
-    /// As [`Subscription::wait`](crate::Subscription::wait); it is also over when the verdict becomes too old.
+    /// Sleeps as [`Subscription::wait`](crate::Subscription::wait) does, or until the verdict becomes too old.
+    ///
+    /// # Errors
+    ///
+    /// [`Kind::Short`](schema::Kind) if the system cannot wait.
     pub fn wait(&mut self, longest: Duration) -> Result<(), Failure> {
         self.session.wait_for(Some(self.source.left().map_or(longest, |left| left.min(longest))))
     }
 
-    /// As [`Subscription::descriptor`](crate::Subscription::descriptor), with [`try_next`](Self::try_next) of the zones; it
-    /// also becomes readable when the verdict becomes too old.
+    /// Returns a descriptor to poll, as [`Subscription::descriptor`](crate::Subscription::descriptor), with
+    /// [`try_next`](Self::try_next) of the zones; it gets readable also when the verdict becomes too old.
+    ///
+    /// # Errors
+    ///
+    /// As [`Subscription::descriptor`](crate::Subscription::descriptor).
     pub fn descriptor(&mut self) -> Result<BorrowedFd<'_>, Failure> {
         self.session.descriptor()
     }
 
-    /// A hub runs in the domain, as of the last call of [`next`](Self::next) or [`try_next`](Self::try_next) that found
-    /// no news.
+    /// Returns whether a hub lives in the domain, as of the last call of [`next`](Self::next) or
+    /// [`try_next`](Self::try_next) that found no news.
     pub fn hub_lives(&self) -> bool {
         self.session.domain().is_some()
     }
 
-    /// The news, if there are any since the last call; never waits. Failures as [`next`](Self::next).
+    /// Returns the news, if there are any since the last call; never waits.
+    ///
+    /// # Errors
+    ///
+    /// As [`next`](Self::next).
     pub fn try_next(&mut self) -> Result<Option<Heard>, Failure> {
         loop {
             if let Some(heard) = self.look()? {
@@ -126,7 +160,7 @@ pub struct ZonesSource {
 }
 
 impl ZonesSource {
-    /// Follows the zones of `sensor`.
+    /// Makes what will follow the zones of `sensor`.
     pub fn new(sensor: &str) -> ZonesSource {
         ZonesSource {
             follower: Follower::new(sensor),
@@ -135,18 +169,21 @@ impl ZonesSource {
         }
     }
 
-    /// The topic has existed at least once.
+    /// Returns whether the topic has been there at least once.
     pub fn subscribed(&self) -> bool {
         self.follower.subscribed()
     }
 
-    /// There was a sample, or it was reported that none arrives.
+    /// Returns whether there was a sample, or the silence of one that does not come.
     pub fn has_spoken(&self) -> bool {
         self.spoken
     }
 
-    /// The next waiting sample; if there is none and the last one became too old just now, an `unknown`. Failures as
-    /// [`Follower::receive`].
+    /// Returns the next sample that waits; if there is none and the last one became too old just now, that.
+    ///
+    /// # Errors
+    ///
+    /// As [`Follower::receive`].
     pub fn receive(&mut self, session: &mut Session) -> Result<Option<Heard>, Failure> {
         let sample = self.follower.receive(session)?;
         let now = clock::now();
@@ -179,7 +216,7 @@ impl ZonesSource {
         Ok(newest)
     }
 
-    /// After this time [`receive`](Self::receive) returns something even if no sample arrives.
+    /// Returns after which time [`receive`](Self::receive) has something to say even if no sample comes.
     pub fn left(&self) -> Option<Duration> {
         self.freshness.left(clock::now())
     }

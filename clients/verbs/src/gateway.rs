@@ -101,7 +101,7 @@ pub fn gateway(
     stop: &AtomicBool,
 ) -> Result<(), Failure> {
     let mut gateway = Gateway::open(options, stop)?;
-    let (mut out, mut notes) = (LossyWriter::new(out, stop), LossyWriter::new(notes, stop));
+    let (mut out, mut notes) = (LossyWriter::around(out, stop), LossyWriter::around(notes, stop));
     let mut report = Report::new(options.look, &mut out, &mut notes);
     quiet(gateway.run(&mut report, tell, stop))
 }

@@ -20,7 +20,7 @@ const PATIENCE: Duration = Duration::from_secs(1);
 
 impl<'a, W: Write + AsFd> LossyWriter<'a, W> {
     /// Pieces to `to`; not waited for before `stop` is set.
-    pub(crate) fn new(to: &'a mut W, stop: &'a AtomicBool) -> LossyWriter<'a, W> {
+    pub(crate) fn around(to: &'a mut W, stop: &'a AtomicBool) -> LossyWriter<'a, W> {
         LossyWriter { to, stop, left: PATIENCE }
     }
 
@@ -69,7 +69,7 @@ mod tests {
     fn what_finds_no_room_is_left_out_whole() {
         let (mut reader, mut writer) = io::pipe().unwrap();
         let stop = AtomicBool::new(false);
-        let mut lossy = LossyWriter::new(&mut writer, &stop);
+        let mut lossy = LossyWriter::around(&mut writer, &stop);
         let line = [b'x'; 1000];
         for _ in 0..1000 {
             lossy.write_all(&line).unwrap();
@@ -91,7 +91,7 @@ mod tests {
     fn a_log_on_a_full_disk_is_told_at_the_end() {
         let mut full = std::fs::File::options().write(true).open("/dev/full").unwrap();
         let stop = AtomicBool::new(false);
-        let mut lossy = LossyWriter::new(&mut full, &stop);
+        let mut lossy = LossyWriter::around(&mut full, &stop);
         lossy.write_all(b"x").unwrap();
         stop.store(true, Ordering::Relaxed);
         assert_eq!(lossy.write_all(b"x").unwrap_err().kind(), ErrorKind::StorageFull);
@@ -102,7 +102,7 @@ mod tests {
         let (reader, mut writer) = io::pipe().unwrap();
         drop(reader);
         let stop = AtomicBool::new(false);
-        let error = LossyWriter::new(&mut writer, &stop).write_all(b"x").unwrap_err();
+        let error = LossyWriter::around(&mut writer, &stop).write_all(b"x").unwrap_err();
         assert_eq!(error.kind(), ErrorKind::BrokenPipe);
     }
 }

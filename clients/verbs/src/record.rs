@@ -109,7 +109,7 @@ pub fn record(
     let first = disk.path();
     let over = AtomicBool::new(false);
     let terminal = out.as_fd().try_clone_to_owned().ok();
-    let (mut out, mut notes) = (LossyWriter::new(out, &over), LossyWriter::new(notes, &over));
+    let (mut out, mut notes) = (LossyWriter::around(out, &over), LossyWriter::around(notes, &over));
     let mut report = Report::new(options.look, &mut out, &mut notes, terminal);
     let begun = report.begin(&first);
     let mut recorder = Recorder {

@@ -33,7 +33,7 @@ impl Announce {
     /// The last byte of their group.
     pub const GROUP: u8 = 80;
 
-    /// For `sensor`, a sensor of type `kind`, without topics.
+    /// Makes one for `sensor`, a sensor of type `kind`, without topics.
     pub fn new(boot: u64, sensor: &str, kind: &str) -> Announce {
         let mut announce = Announce {
             boot,
@@ -55,17 +55,17 @@ impl Announce {
         }
     }
 
-    /// The sensor's name.
+    /// Returns the sensor's name.
     pub fn sensor(&self) -> &str {
         text::read(&self.name)
     }
 
-    /// The sensor's type; empty if unknown.
+    /// Returns the sensor's type; empty if unknown.
     pub fn kind(&self) -> &str {
         text::read(&self.kind)
     }
 
-    /// The topics that go out.
+    /// Returns the topics that go out.
     pub fn topics(&self) -> &[Announced] {
         &self.topics[..self.count]
     }
@@ -85,8 +85,8 @@ impl Announce {
         Some(room.len())
     }
 
-    /// The announcement in `payload`; `None` if it is shorter than its own count says, or if its sensor has no possible
-    /// name. Topics beyond the 16th are left out.
+    /// Returns the announcement in `payload`; `None` if it is shorter than its own count says, or if its sensor has no possible
+    /// name. Topics beyond the 16th are left away.
     pub fn unpack(payload: &[u8]) -> Option<Announce> {
         let (head, rest) = payload.split_first_chunk::<TOPICS>()?;
         let rest = rest.get(..EACH * usize::from(head[64]))?;

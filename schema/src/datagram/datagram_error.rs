@@ -54,7 +54,7 @@ impl DatagramError {
         DatagramError::Payload,
     ];
 
-    /// The reason's name in all output.
+    /// Returns the reason's name in all output.
     pub fn name(self) -> &'static str {
         match self {
             DatagramError::Short => "short",

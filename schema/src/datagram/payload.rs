@@ -20,7 +20,7 @@ pub trait Packed {
     fn unpack(&mut self, payload: &[u8]) -> bool;
 }
 
-/// The telegram at the start of a payload: STX, then two bytes with the length of what is between them and the CRC.
+/// Returns the telegram that a payload begins with: STX, two bytes with the length of what lies between them and the CRC.
 pub fn telegram(payload: &[u8]) -> Option<Telegram<'_>> {
     let [STX, _, low, high, ..] = payload else { return None };
     let len = usize::from(u16::from_le_bytes([*low, *high])) + AROUND_DATA;
@@ -29,6 +29,11 @@ pub fn telegram(payload: &[u8]) -> Option<Telegram<'_>> {
 
 impl Datagram<'_> {
     /// Checks what stands after the header: its topic is known, and the payload is one of that topic.
+    ///
+    /// # Errors
+    ///
+    /// [`DatagramError::Skipped`] if the topic is not known here, [`DatagramError::Payload`] if the payload is not one of
+    /// it.
     pub fn check_payload(&self) -> Result<(), DatagramError> {
         let is_sound = match Topic::of_number(self.head.topic) {
             None if self.head.topic == Announce::NUMBER => Announce::unpack(self.payload).is_some(),
@@ -41,7 +46,7 @@ impl Datagram<'_> {
 
 macro_rules! check {
     ($($topic:ident $payload:tt, $name:literal, $($column:tt),*: $about:literal;)*) => {
-        /// The payload is one of `topic`.
+        /// Returns whether the payload is one of `topic`.
         fn is_sound(topic: Topic, payload: &[u8]) -> bool {
             match topic { $(Topic::$topic => read!($payload, payload),)* }
         }
@@ -53,7 +58,7 @@ macro_rules! read {
         telegram($bytes).is_some()
     };
     ($payload:tt, $bytes:ident) => {
-        $payload::default().unpack($bytes)
+        crate::$payload::default().unpack($bytes)
     };
 }
 

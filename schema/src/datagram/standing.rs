@@ -30,7 +30,7 @@ impl Standing {
     /// Nothing arrived.
     pub const NONE: Standing = Standing { heard_ns: 0, delivered_ns: None };
 
-    /// Something from it was accepted.
+    /// Takes note that something of it was taken.
     pub fn take(&mut self, arrival: Arrival) {
         let now_ns = arrival.now_ns;
         self.heard_ns = now_ns;
@@ -39,15 +39,15 @@ impl Standing {
         }
     }
 
-    /// Whether it may be dropped for another sender from which `arrival` came: it has not delivered for 3 s, or, if it is a
-    /// sample, it has delivered for less than a second.
+    /// Returns whether it may be put out for another of which this came: it did not deliver for 3 s, or for a sample, it
+    /// has not done so for a second yet.
     pub fn may_go(&self, arrival: Arrival) -> bool {
         let silent_ns = |(_, last_ns): (u64, u64)| arrival.now_ns.saturating_sub(last_ns);
         let is_busy = self.delivered_ns.is_some_and(|delivered_ns| silent_ns(delivered_ns) < SILENT_NS);
         !is_busy || arrival.delivers && !self.is_proven()
     }
 
-    /// Until when it counts as heard: of those that may go, the least goes first.
+    /// Returns until when it counts as heard: of those that may go, the least goes first.
     pub fn worth_ns(&self) -> u64 {
         match self.delivered_ns {
             None => self.heard_ns,

@@ -57,8 +57,8 @@ pub struct GivenUp {
 }
 
 impl StreamStats {
-    /// Nothing received yet. Announcements count only for `topics`, those whose groups were joined: for the others,
-    /// they would count as lost what was never wanted.
+    /// Makes statistics with nothing received yet. Announcements are believed for `topics` only: those whose groups were
+    /// joined. Of the others they would tell as lost what nobody wanted.
     pub fn new(topics: &[Topic]) -> StreamStats {
         StreamStats {
             followed: topics.iter().fold(0, |bits, topic| bits | 1 << topic.number()),
@@ -74,6 +74,10 @@ impl StreamStats {
     /// Checks and counts `bytes`, a whole datagram as it was received `from` a sender, at `now_ns` of any clock that is
     /// never set. A sender is any number that others do not have, for example its address and port. What is refused is
     /// counted by its reason and changes nothing else; what is not, can be unpacked.
+    ///
+    /// # Errors
+    ///
+    /// The reason for which it is refused; it is counted, and changes nothing else.
     pub fn receive<'a>(
         &mut self,
         bytes: &'a [u8],
@@ -88,23 +92,23 @@ impl StreamStats {
         result
     }
 
-    /// How many datagrams were refused for this reason.
+    /// Returns how many datagrams were refused for this reason.
     pub fn refused(&self, refusal: DatagramError) -> u64 {
         self.refused[refusal as usize]
     }
 
-    /// What was given up to make room.
+    /// Returns what was given up to make room.
     pub fn given_up(&self) -> GivenUp {
         self.given_up
     }
 
-    /// When the first datagram of this life of `hub` was accepted, if the life was not given up since. Another time for
-    /// the same life means another gateway, or one that was given up in between.
+    /// Returns when the first datagram of this life of `hub` was taken, if it was not given up since. Another time of the
+    /// same life is another gateway, or one that was forgotten meanwhile.
     pub fn since_ns(&self, hub: u64, epoch: u32) -> Option<u64> {
         self.lives.since_ns((hub, epoch))
     }
 
-    /// Two gateways are known to send under this number and epoch. Everything of one of them is refused as
+    /// Returns whether two gateways are known to send under this number and epoch. Of one of them everything is refused as
     /// [`DatagramError::Twin`].
     pub fn is_shared(&self, hub: u64, epoch: u32) -> bool {
         match self.lives.find((hub, epoch)) {
@@ -113,7 +117,7 @@ impl StreamStats {
         }
     }
 
-    /// What is known of every sensor and topic of which anything was sent, by hub, epoch, sensor and topic.
+    /// Returns what is known of every sensor and topic of which anything was sent, by hub, epoch, sensor and topic.
     pub fn rows(&self) -> impl Iterator<Item = &Row> {
         self.order[..self.row_count]
             .iter()

@@ -15,7 +15,9 @@ pub enum Compression {
 }
 
 impl Compression {
-    /// What `text` names: `zstd`, `lz4` or `none`.
+    /// Returns what `text` names: `zstd`, `lz4` or `none`.
+    ///
+    /// # Errors
     ///
     /// [`Kind::Usage`] if it is none of them.
     pub fn parse(text: &str) -> Result<Compression, Failure> {

@@ -84,7 +84,9 @@ impl Drop for Ringer {
 pub struct Bell(Page);
 
 impl Bell {
-    /// The bell of `sensor`, or nothing as long as no hub has created it.
+    /// Returns the bell of `sensor`, or nothing as long as no hub has hung it.
+    ///
+    /// # Errors
     ///
     /// [`Kind::Short`] if memory or descriptors are, [`Kind::Failed`] if it is another user's.
     pub fn open(node: &Node, sensor: &str) -> Result<Option<Bell>, Failure> {
@@ -108,12 +110,12 @@ impl Bell {
         }
     }
 
-    /// How often it was rung, modulo 2^32. What was sent before that can be received after this.
+    /// Returns how often it was rung, modulo 2^32. What was sent before that can be received after this.
     pub fn rung(&self) -> u32 {
         words::rung(&self.0.words().rung)
     }
 
-    /// Its hub has ended: nobody rings it any more.
+    /// Returns whether its hub has ended: nobody rings it any more.
     pub fn is_closed(&self) -> bool {
         self.0.words().closed.load(Ordering::Relaxed) != 0
     }
@@ -124,8 +126,12 @@ impl Bell {
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Unsupported;
 
-/// Sleeps until one of `bells` was rung more often than its number says, a signal arrives, or CLOCK_MONOTONIC reaches
-/// `until_ns`.
+/// Sleeps until one of `bells` was rung more often than the number beside it says, a signal comes, or CLOCK_MONOTONIC is
+/// at `until_ns`.
+///
+/// # Errors
+///
+/// [`Unsupported`] if the system cannot wait for several words at once.
 pub fn sleep_at_bells(bells: &[(&Bell, u32)], until_ns: u64) -> Result<(), Unsupported> {
     let until =
         Timespec { tv_sec: (until_ns / 1_000_000_000) as i64, tv_nsec: (until_ns % 1_000_000_000) as i64 };

@@ -23,7 +23,9 @@ pub struct Cleaned {
 /// Removes what dead processes left in `domain`. What running ones share with them stays, and so does the directory as
 /// long as one of them runs.
 ///
-/// [`Kind::DomainHeld`](crate::Kind) if a hub or a listener publishes there, which cleans up by itself;
+/// # Errors
+///
+/// [`Kind::DomainHeld`](crate::Kind) if a hub or a listener publishes there, which tidies up by itself;
 /// [`Kind::Failed`](crate::Kind) if the directory is another user's.
 pub fn clean(domain: &Domain) -> Result<Cleaned, Failure> {
     let root = domain.root();

@@ -40,7 +40,9 @@ pub struct Pending(PendingResponse<Service, Request, (), [u8], ()>);
 type ControlService = request_response::PortFactory<Service, Request, (), [u8], ()>;
 
 impl ControlServer {
-    /// The hub's end of the service, created if it does not exist.
+    /// Returns the hub's end of the service, made if it is not there.
+    ///
+    /// # Errors
     ///
     /// [`Kind::DomainHeld`] if another hub has it, [`Kind::Short`] if there is no memory for it.
     pub fn create(node: &Node) -> Result<ControlServer, Failure> {
@@ -68,12 +70,14 @@ impl ControlServer {
         Ok(ControlServer { server, requests, responses, control, _bells: [asked, answered] })
     }
 
-    /// What is woken by requests.
+    /// Returns what is woken by requests.
     pub fn requests(&self) -> &Listener {
         &self.requests
     }
 
-    /// The next request whose client still waits, or nothing. Takes the wake-ups that are pending.
+    /// Returns the next request whose client still waits, or nothing. Takes the wake-ups that are pending.
+    ///
+    /// # Errors
     ///
     /// [`Kind::Short`] if the client cannot be connected.
     pub fn receive(&self) -> Result<Option<Asked>, Failure> {
@@ -82,7 +86,11 @@ impl ControlServer {
         received.map(|asked| asked.map(Asked)).map_err(|error| no_port(self.control.name(), &error))
     }
 
-    /// Answers `asked`. It is not a failure if the client does not wait any more, but if it cannot be reached.
+    /// Answers `asked`. A client that does not wait any more is no failure, one that cannot be told is.
+    ///
+    /// # Errors
+    ///
+    /// [`Kind::Failed`] if a client that waits cannot be told.
     pub fn answer(&self, asked: Asked, response: &Response) -> Result<(), Failure> {
         if !asked.is_waited_for() {
             return Ok(());
@@ -99,19 +107,21 @@ impl ControlServer {
 }
 
 impl Asked {
-    /// What was asked.
+    /// Returns what was asked.
     pub fn request(&self) -> &Request {
         self.0.payload()
     }
 
-    /// Whether the client still waits for the answer.
+    /// Returns whether the client is still there to be told.
     pub fn is_waited_for(&self) -> bool {
         self.0.is_connected()
     }
 }
 
 impl ControlClient {
-    /// A client's end of the service, or nothing as long as no hub has made it.
+    /// Returns a client's end of the service, or nothing as long as no hub has made it.
+    ///
+    /// # Errors
     ///
     /// [`Kind::Short`] if too many clients ask at once, or descriptors are short.
     pub fn open(node: &Node) -> Result<Option<ControlClient>, Failure> {
@@ -136,7 +146,9 @@ impl ControlClient {
 
     /// Sends `request` and wakes the hub.
     ///
-    /// [`Kind::Short`] if it cannot be sent; [`Kind::NoHub`] if no hub accepted it.
+    /// # Errors
+    ///
+    /// [`Kind::Short`] if it cannot be sent; [`Kind::NoHub`] if nobody took it.
     pub fn ask(&self, request: &Request) -> Result<Pending, Failure> {
         let unsent = |error: &dyn std::fmt::Debug| {
             Failure::new(Kind::Short, format!("cannot ask the hub: {error:?}"), "try again later")
@@ -149,14 +161,16 @@ impl ControlClient {
         Ok(Pending(pending))
     }
 
-    /// What is woken by responses, also by those to others.
+    /// Returns what is woken by responses, also by those to others.
     pub fn responses(&self) -> &Listener {
         &self.responses
     }
 }
 
 impl Pending {
-    /// The response, or nothing as long as there is none.
+    /// Returns the response, or nothing as long as there is none.
+    ///
+    /// # Errors
     ///
     /// [`Kind::Failed`] if it cannot be received or is none.
     pub fn response(&self) -> Result<Option<Response>, Failure> {
@@ -167,7 +181,7 @@ impl Pending {
         Response::decode(received.payload()).map(Some).ok_or_else(|| garbled(&received.payload()))
     }
 
-    /// Whether the hub still has the request: it is alive and has not dropped it.
+    /// Returns whether the hub still has the request: it is alive and has not dropped it.
     pub fn is_open(&self) -> bool {
         self.0.is_connected()
     }

@@ -17,7 +17,9 @@ pub struct Nodes {
     pub dead: usize,
 }
 
-/// The processes in `domain`; none if there is no such domain.
+/// Returns the processes in `domain`; none if there is no such domain.
+///
+/// # Errors
 ///
 /// [`Kind::Failed`](crate::Kind) with owner, mode and remedy if the directory is another user's.
 pub fn nodes(domain: &Domain) -> Result<Nodes, Failure> {

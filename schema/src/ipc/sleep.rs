@@ -18,6 +18,8 @@ use crate::{Failure, Kind};
 /// Sleeps until one of `listeners` is woken, a signal arrives or `timeout` is over. Wake-ups stay pending: take them with
 /// [`take_wakeups`], then look once more for samples, before the next sleep.
 ///
+/// # Errors
+///
 /// [`Kind::Short`] if the system cannot wait.
 pub fn sleep(listeners: &[&Listener], timeout: Duration) -> Result<(), Failure> {
     let mut fds: Vec<PollFd<'_>> = listeners
@@ -31,7 +33,7 @@ pub fn sleep(listeners: &[&Listener], timeout: Duration) -> Result<(), Failure> 
     }
 }
 
-/// A descriptor that is readable while wake-ups of `listener` are pending, for programs that also wait for other things.
+/// Returns what is readable while wake-ups of `listener` are pending: for who waits for other things as well.
 pub fn descriptor(listener: &Listener) -> BorrowedFd<'_> {
     // SAFETY: the descriptor is open as long as the listener lives, which is borrowed as long as the result.
     unsafe { BorrowedFd::borrow_raw(listener.file_descriptor().native_handle()) }
@@ -39,6 +41,8 @@ pub fn descriptor(listener: &Listener) -> BorrowedFd<'_> {
 
 /// Takes all pending wake-ups of `listeners`; returns whether there were any. Look for samples that were sent before this
 /// call after it.
+///
+/// # Errors
 ///
 /// [`Kind::Short`] if a listener does not work.
 pub fn take_wakeups(listeners: &[&Listener]) -> Result<bool, Failure> {

@@ -24,7 +24,7 @@ pub struct Segment {
 }
 
 impl Segment {
-    /// A file at `path` with these properties.
+    /// Returns a file at `path` with these properties.
     pub fn new(path: impl Into<PathBuf>, owner: u32, mode: u32, bytes: u64) -> Segment {
         Segment { path: path.into(), owner, mode, bytes, is_file: true }
     }
@@ -54,8 +54,8 @@ impl Segment {
     }
 }
 
-/// Files under the names of the domain in `root` that others own or can write to, sorted; none if the domain has no
-/// names.
+/// Returns what stands under the names of the domain in `root` and is not this user's alone, sorted; nothing where the domain
+/// has no names.
 pub fn strangers(root: &Path) -> Vec<Segment> {
     let Ok(Some(prefix)) = prefix::of(root) else { return Vec::new() };
     let entries = std::fs::read_dir(SHARED_MEMORY).into_iter().flatten().flatten();

@@ -10,9 +10,9 @@ use std::path::Path;
 use nix::libc::{self, c_int};
 use rustix::fs::OFlags;
 
-/// Whether no process has the file at `path` open or mapped: the kernel grants a lease for writing only then (fcntl(2)).
-/// False if that is not known, for example for another user's file. A process that opens the file at this moment waits
-/// until this returns.
+/// Returns whether no process has the file at `path` open or mapped: the kernel grants a lease for writing only then
+/// (fcntl(2)). Not where it cannot be told, as of another user's file. Who opens it in the moment of the question waits
+/// until it is answered.
 pub fn is_unheld(path: &Path) -> bool {
     let flags = OFlags::NOFOLLOW | OFlags::NONBLOCK;
     let opened = OpenOptions::new().read(true).custom_flags(flags.bits() as i32).open(path);

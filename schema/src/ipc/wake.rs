@@ -18,7 +18,9 @@ pub struct Waker {
 }
 
 impl Waker {
-    /// The waker of `sensor`. Create it before its topics: consumers that find those sleep on it.
+    /// Makes that of `sensor`, to be made before its topics: who finds those sleeps at it.
+    ///
+    /// # Errors
     ///
     /// [`Kind::Short`] if memory is, [`Kind::Failed`] if the service has another layout.
     pub fn new(node: &Node, sensor: &str) -> Result<Waker, Failure> {
@@ -34,7 +36,9 @@ impl Waker {
 
     /// Wakes all consumers for `why`: those that sleep on the bell with one call, then those that listen to the event.
     ///
-    /// [`Kind::Failed`] if some of the latter were not woken.
+    /// # Errors
+    ///
+    /// [`Kind::Failed`] if some of the latter were not told.
     pub fn wake(&self, why: Wake) -> Result<(), Failure> {
         self.ringer.ring();
         if self.service.dynamic_config().number_of_listeners() == 0 {
@@ -45,7 +49,7 @@ impl Waker {
             .map_err(|error| Failure::new(Kind::Failed, format!("cannot wake consumers: {error:?}"), ""))
     }
 
-    /// The event service.
+    /// Returns the event service.
     pub fn service(&self) -> &WakeService {
         &self.service
     }
@@ -68,13 +72,19 @@ fn create_service(node: &Node, sensor: &str) -> Result<WakeService, Failure> {
     })
 }
 
-/// The event service of `sensor`, or nothing as long as no hub has created it: for consumers.
+/// Returns the event service of `sensor`, or nothing as long as no hub has made it: for consumers.
+///
+/// # Errors
+///
+/// [`Kind::Short`] if memory or descriptors are short, [`Kind::Failed`] if the service is of another layout.
 pub fn open_wake(node: &Node, sensor: &str) -> Result<Option<WakeService>, Failure> {
     let service = name(&Wake::service(sensor))?;
     open(node, &service, node.service_builder(&service).event().open())
 }
 
-/// A consumer's end of the event.
+/// Returns a consumer's end of the event.
+///
+/// # Errors
 ///
 /// [`Kind::Short`] if memory, descriptors or places for consumers are.
 pub fn listener(wake: &WakeService) -> Result<Listener, Failure> {

@@ -12,7 +12,9 @@ use crate::{Domain, Failure, Topic, limits, prefix};
 
 /// Allocates what the segments of `domain` have promised so far.
 ///
-/// [`Kind::Short`](crate::Kind) if there is no room.
+/// # Errors
+///
+/// [`Kind::Short`](crate::Kind) if it cannot be had.
 pub fn allocate(domain: &Domain) -> Result<(), Failure> {
     let Some(prefix) = prefix::of(domain.root())? else { return Ok(()) };
     let user = rustix::process::geteuid().as_raw();
@@ -39,14 +41,14 @@ pub fn allocate(domain: &Domain) -> Result<(), Failure> {
     Ok(())
 }
 
-/// Bytes of the segments of one sensor's `topics`: the payloads with their headers, and the list of users of each service.
+/// Returns the bytes of the segments of one sensor's `topics`: the payloads with their headers, and who is at each service.
 pub fn sensor_bytes(topics: &[Topic]) -> u64 {
     let chunk = |&topic: &Topic| limits::samples(topic) * (topic.row().bytes + CHUNK_HEADER);
     let services = (topics.len() + 1) as u64 * SERVICE;
     topics.iter().map(chunk).sum::<usize>() as u64 + services
 }
 
-/// Bytes of the longest segment of any topic.
+/// Returns the bytes of the longest segment of any topic.
 pub fn longest_segment() -> u64 {
     Topic::ALL.iter().map(|&topic| sensor_bytes(&[topic])).max().unwrap_or_default()
 }

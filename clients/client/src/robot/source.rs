@@ -57,7 +57,7 @@ const OTHERS: &str = "others...";
 const CALL_EVERY: Duration = Duration::from_secs(1);
 
 impl RobotSource {
-    /// Follows the zones of `sensors`; if empty: all, as in [`robot`](super::robot()).
+    /// Makes what will follow the zones of `sensors`; none: all, as [`robot`](super::robot()) says.
     pub fn new(sensors: &[&str]) -> RobotSource {
         let mut source = RobotSource {
             robot: Robot::default(),
@@ -72,23 +72,27 @@ impl RobotSource {
         source
     }
 
-    /// What is known.
+    /// Returns what is known.
     pub fn robot(&self) -> &Robot {
         &self.robot
     }
 
-    /// The topic of each sensor has existed at least once.
+    /// Returns whether the topic of each sensor has been there at least once.
     pub fn subscribed(&self) -> bool {
         !self.parts.is_empty() && self.parts.iter().all(ZonesSource::subscribed)
     }
 
-    /// The next sample of any sensor, or a silence, once each has sent something; failures as [`ZonesSource::receive`].
+    /// Returns the next sample of any sensor, or a silence, once each has spoken.
+    ///
+    /// # Errors
+    ///
+    /// As [`ZonesSource::receive`].
     pub fn receive(&mut self, session: &mut Session) -> Result<Option<RobotHeard>, Failure> {
         let heard = self.hear(session)?;
         Ok(heard.map(|heard| RobotHeard { robot: self.robot.clone(), heard }))
     }
 
-    /// After this time [`receive`](Self::receive) returns something even if no sample arrives.
+    /// Returns after which time [`receive`](Self::receive) has something to say even if no sample comes.
     pub fn left(&self) -> Option<Duration> {
         match &self.parts[..] {
             [] => self.nobody.left(clock::now()),
@@ -96,7 +100,11 @@ impl RobotSource {
         }
     }
 
-    /// Takes all waiting samples; returns whether there were any.
+    /// Takes all that waits; whether there was anything.
+    ///
+    /// # Errors
+    ///
+    /// As [`ZonesSource::receive`].
     pub fn drain(&mut self, session: &mut Session) -> Result<bool, Failure> {
         let mut any = false;
         while self.hear(session)?.is_some() {
