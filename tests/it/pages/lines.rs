@@ -140,8 +140,10 @@ const LONG_ENOUGH: Duration = Duration::from_millis(1500);
 /// What is wrong with those of `lines` that can be run.
 fn wrong_with(desk: &Desk, lines: &[(String, String)]) -> Vec<String> {
     let wrong = |(place, line): &(String, String)| Some(format!("{place}: {}", desk.run(line)?));
-    // There is one spare sensor, one domain for another hub, and one sensor to be told what to do; the rest mostly waits.
-    const IN_TURN: [&str; 4] = ["scanhub run", "scanhub replay", "scanhub control", "scanhub background"];
+    // There is one spare sensor, one domain for another hub or for who publishes beside it, and one sensor to be told what to
+    // do; the rest mostly waits.
+    const IN_TURN: [&str; 5] =
+        ["scanhub run", "scanhub replay", "scanhub control", "scanhub background", "listen --publish"];
     let (in_turn, others): (Vec<_>, Vec<_>) =
         lines.iter().partition(|(_, line)| PORTS.iter().chain(&IN_TURN).any(|part| line.contains(part)));
     let rows = others.chunks(others.len().div_ceil(3).max(1)).map(<[_]>::to_vec).chain([in_turn]);
