@@ -43,20 +43,20 @@ struct Spare {
     foreground: Box<Foreground>,
 }
 
-/// Why a background began anew with a scan.
+/// Why a background is learned again from a scan on.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(crate) enum Anew {
+pub(crate) enum Relearned {
     /// The model was one of other beams or another unit.
     Shape(Mismatch),
     /// Its beams look elsewhere.
     Angles,
 }
 
-impl fmt::Display for Anew {
+impl fmt::Display for Relearned {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
-            Anew::Shape(mismatch) => mismatch.fmt(f),
-            Anew::Angles => f.write_str("the sensor's beams have other angles than before"),
+            Relearned::Shape(mismatch) => mismatch.fmt(f),
+            Relearned::Angles => f.write_str("the sensor's beams have other angles than before"),
         }
     }
 }
@@ -83,7 +83,7 @@ impl Pipeline {
     }
 
     /// Forgets all that was learned, as at the start.
-    pub(crate) fn begin_anew(&mut self) {
+    pub(crate) fn reset(&mut self) {
         *self = Pipeline::new(&self.processing);
     }
 
@@ -108,9 +108,9 @@ impl Pipeline {
         }
     }
 
-    /// Reads `scan`. What has a memory learns from it, whoever wants to know. A model that does not fit the scan begins
-    /// anew; then it is told why.
-    pub(crate) fn update(&mut self, scan: &Scan, out: Outputs<'_>) -> Option<Anew> {
+    /// Reads `scan`. What has a memory learns from it, whoever wants to know. A model that does not fit the scan starts
+    /// again; then the reason is returned.
+    pub(crate) fn update(&mut self, scan: &Scan, out: Outputs<'_>) -> Option<Relearned> {
         self.zones.update(scan, out.zones.unwrap_or(&mut self.spare.zones));
         if let Some(marks) = out.marks {
             self.marks.update(scan, marks);
@@ -230,7 +230,12 @@ impl BackgroundStage {
         Ok(())
     }
 
-    fn update(&mut self, scan: &Scan, out: Option<&mut Foreground>, spare: &mut Foreground) -> Option<Anew> {
+    fn update(
+        &mut self,
+        scan: &Scan,
+        out: Option<&mut Foreground>,
+        spare: &mut Foreground,
+    ) -> Option<Relearned> {
         let before = self.model.generation();
         match out {
             Some(out) => {
@@ -244,8 +249,8 @@ impl BackgroundStage {
         self.handed_on.1 = self.handed_on.1.saturating_add(scans);
         let sensor = (scan.beams() as u16, scan.unit_mm);
         let model = self.shape.replace(sensor).filter(|shape| *shape != sensor);
-        let anew = model.map_or(Anew::Angles, |model| Anew::Shape(Mismatch { model, sensor }));
-        (self.model.generation() != before).then_some(anew)
+        let reason = model.map_or(Relearned::Angles, |model| Relearned::Shape(Mismatch { model, sensor }));
+        (self.model.generation() != before).then_some(reason)
     }
 }
 
@@ -336,8 +341,8 @@ mod tests {
             Pipeline::new(&processing(|processing| processing.background.model = Some(Box::new(model))));
         let (first, is_news) = (shown(&mut pipeline), pipeline.is_news());
         assert_eq!((first.generation, first.taught, first.ranges()[180], is_news), (1, 181, 300, false));
-        let anew = pipeline.update(&wall(361, 10, 300), Outputs::default());
-        assert_eq!(anew, Some(Anew::Shape(Mismatch { model: (181, 10), sensor: (361, 10) })));
+        let reason = pipeline.update(&wall(361, 10, 300), Outputs::default());
+        assert_eq!(reason, Some(Relearned::Shape(Mismatch { model: (181, 10), sensor: (361, 10) })));
         assert!(pipeline.is_news());
         let refusal = pipeline.handle("a", Verb::Load, &model).expect_err("another resolution");
         assert_eq!(refusal.kind, Kind::Configuration);
@@ -346,7 +351,7 @@ mod tests {
         assert!(pipeline.update(&wall(361, 1, 3000), Outputs::default()).is_some(), "another unit");
         let turned = Scan { first_angle_mdeg: 40_000, ..wall(361, 1, 3000) };
         shown(&mut pipeline);
-        assert_eq!(pipeline.update(&turned, Outputs::default()), Some(Anew::Angles));
+        assert_eq!(pipeline.update(&turned, Outputs::default()), Some(Relearned::Angles));
         assert_eq!((pipeline.is_news(), pipeline.update(&turned, Outputs::default())), (true, None));
     }
 

@@ -65,7 +65,7 @@ pub struct Progress {
     pub is_paused: bool,
     /// Whether everything was played.
     pub is_over: bool,
-    /// Times that it began anew.
+    /// Times that it started again.
     pub lap: u32,
     /// Telegrams published, of all links and laps.
     pub telegrams: u64,
@@ -253,7 +253,7 @@ impl PlayerHandle<'_> {
     pub(crate) fn end(self, lap: u32, now: Nanos) -> Turn {
         self.place().has_ended.store(true, Ordering::Relaxed);
         let turn = self.ask(|playback| playback.end(self.number, lap, now));
-        if let Turn::Anew(_) = turn {
+        if let Turn::Restart(_) = turn {
             self.place().media.store(0, Ordering::Relaxed);
             self.place().has_ended.store(false, Ordering::Relaxed);
         }

@@ -89,8 +89,8 @@ impl<'a> LinkOutput<'a> {
         let decode = |scan: &mut Scan| scanner::decode(&measured, mode, scan);
         // What waited in the port does not tell how it looks around the robot now.
         self.pipeline.zones.doubt(is_behind);
-        if let Some(anew) = self.topics.scan(decode, &mut self.pipeline) {
-            tracing::warn!("{}: the background is learned again: {anew}", self.link.name);
+        if let Some(reason) = self.topics.scan(decode, &mut self.pipeline) {
+            tracing::warn!("{}: the background is learned again: {reason}", self.link.name);
         }
         let is_blind = self.pipeline.zones.is_blind();
         if std::mem::replace(&mut self.is_blind, is_blind) != is_blind && is_blind {
@@ -167,7 +167,7 @@ impl<'a> LinkOutput<'a> {
 
     /// As [`restart`](Self::restart), without a word to consumers.
     pub(crate) fn forget(&mut self) {
-        self.pipeline.begin_anew();
+        self.pipeline.reset();
     }
 
     /// Goes on as `processing` says from the next scan on. Where none come, the topics say at once how it is now.

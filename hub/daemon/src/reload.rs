@@ -1,4 +1,4 @@
-//! The configuration read anew while the hub runs: what is made of scans changes with the next scan, and nothing of the
+//! The configuration read again while the hub runs: what is made of scans changes with the next scan, and nothing of the
 //! stream is lost for it; what belongs to a line waits for the next start, which is said. One that cannot be changes nothing.
 
 use config::{Background, Config, Link, Processing};

@@ -116,7 +116,7 @@ impl<'a> ReplayLink<'a> {
             let Some(limit) = ended else { return };
             self.link.output.stand_until(limit.map_or(Nanos::MAX, |limit| clock::now() + limit));
             loop {
-                if let Turn::Anew(next) = self.handle.end(lap, clock::now()) {
+                if let Turn::Restart(next) = self.handle.end(lap, clock::now()) {
                     lap = next;
                     self.restart();
                     break;
@@ -145,7 +145,7 @@ impl<'a> ReplayLink<'a> {
                 Turn::Now(due) if now < self.look_at => return Some(due),
                 Turn::Now(_) => 0,
                 Turn::At(at) => at.min(now + IDLE),
-                Turn::Wait | Turn::Anew(_) | Turn::Over => now + IDLE,
+                Turn::Wait | Turn::Restart(_) | Turn::Over => now + IDLE,
             };
             if self.rest(until) == Woken::Stop {
                 return None;

@@ -35,7 +35,7 @@ impl Service {
     }
 
     /// Puts what was kept under the name of the link that it is of now, whoever had it before; what is of none is not kept
-    /// any longer. To be called before anything is kept anew: names are forgotten with all that is kept under them.
+    /// any longer. To be called before anything is kept again: names are forgotten with all that is kept under them.
     pub(crate) fn assign(&self, owner: impl Fn(&OwnedFd) -> Option<String>) {
         let mut kept = self.kept.lock().unwrap_or_else(PoisonError::into_inner);
         for (name, line) in std::mem::take(&mut *kept) {
@@ -65,13 +65,13 @@ impl Service {
         told(sd_notify::notify(&[NotifyState::FdStoreRemove, NotifyState::FdName(name)]));
     }
 
-    /// The configuration is read anew, as of `now`; [`ready`](Self::ready) follows in any case.
+    /// The configuration is read again, as of `now`; [`ready`](Self::ready) follows in any case.
     pub(crate) fn reloading(&self, now: Nanos) {
         let micros = NotifyState::MonotonicUsec(i128::from(now / 1_000));
         told(sd_notify::notify(&[NotifyState::Reloading, micros]));
     }
 
-    /// The hub is up with `sensors`, at its start or with a configuration that it read anew; or that was `refused`, and it is
+    /// The hub is up with `sensors`, at its start or with a configuration that it read again; or that was `refused`, and it is
     /// as it was.
     pub(crate) fn ready(&self, sensors: &[String], refused: Option<&str>) {
         let refused = refused.map(|why| format!("; configuration refused: {why}")).unwrap_or_default();

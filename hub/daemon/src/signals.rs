@@ -1,4 +1,4 @@
-//! What a signal wants of the hub: SIGINT and SIGTERM its end, SIGHUP the configuration read anew, unless it says that the
+//! What a signal wants of the hub: SIGINT and SIGTERM its end, SIGHUP the configuration read again, unless it says that the
 //! terminal of the hub is gone. Refuses to know how either is done.
 
 use std::io::Read;

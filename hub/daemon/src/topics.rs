@@ -8,7 +8,7 @@ use port::clock;
 use schema::ipc::{BytesMut, Node, Waker};
 use schema::{Background, Failure, Flags, Foreground, Header, Marks, Quality, Scan, Status, Wake, Zones};
 
-use crate::pipeline::{Anew, Outputs, Pipeline};
+use crate::pipeline::{Outputs, Pipeline, Relearned};
 use publisher::{Loan, TopicPublisher};
 
 /// The publishing end of one sensor; stays in its link's thread.
@@ -122,14 +122,18 @@ impl Topics {
     }
 
     /// Publishes a scan of the last telegram, which `fill` writes in place, and what `pipeline` makes of it there. Marks
-    /// and foreground that nobody wants are not made. A background that does not fit the scan begins anew; then it is
+    /// and foreground that nobody wants are not made. A background that does not fit the scan starts again; then it is
     /// told why.
-    pub(crate) fn scan(&mut self, fill: impl FnOnce(&mut Scan), pipeline: &mut Pipeline) -> Option<Anew> {
+    pub(crate) fn scan(
+        &mut self,
+        fill: impl FnOnce(&mut Scan),
+        pipeline: &mut Pipeline,
+    ) -> Option<Relearned> {
         let (mut scan, mut zones, mut marks) = (self.scan.loan(), self.zones.loan(), self.marks.loan());
         let mut foreground = pipeline.keeps_background().then(|| self.foreground.loan());
         let decoded = scan.payload_mut().unwrap_or(&mut self.spare_scan);
         fill(decoded);
-        let anew = pipeline.update(
+        let relearned = pipeline.update(
             decoded,
             Outputs {
                 zones: zones.payload_mut(),
@@ -148,7 +152,7 @@ impl Topics {
         if pipeline.shows_every_scan() || pipeline.is_news() {
             self.show(pipeline, &header);
         }
-        anew
+        relearned
     }
 
     /// Lets `pipeline` learn from a scan that is not published, and that `fill` writes.

@@ -7,6 +7,7 @@ pub mod clock;
 mod holder;
 mod kernel;
 mod line_errors;
+mod line_settings;
 mod port_error;
 mod rights;
 mod source;
@@ -107,7 +108,7 @@ impl Port {
     }
 
     /// Forgets what came in, at `baud` from now on; where a serial server has the rate, at the one that it has.
-    pub fn begin_anew(&self, baud: u32) -> io::Result<()> {
+    pub fn discard_input(&self, baud: u32) -> io::Result<()> {
         match self {
             Port::Tty(tty) => tty.set_baud(baud),
             Port::Tcp(tcp) => tcp.forget(),

@@ -89,23 +89,23 @@ impl AsFd for Tcp {
 pub struct Dial {
     outcome: Receiver<Result<Tcp, PortError>>,
     /// Ready once its other end is gone.
-    bell: PipeReader,
+    ready: PipeReader,
 }
 
 impl Dial {
     /// Begins.
     pub(crate) fn start(host: &str, port: u16) -> Result<Dial, PortError> {
-        let (bell, rope) = io::pipe().map_err(|error| PortError::of_io(&error))?;
+        let (ready, open_end) = io::pipe().map_err(|error| PortError::of_io(&error))?;
         let (send, outcome) = channel();
         let host = host.to_owned();
-        let body = move || tell(connect(&host, port), &send, rope);
+        let body = move || tell(connect(&host, port), &send, open_end);
         // A thread is refused by AGAIN.
         let refuse = |error: io::Error| match PortError::of_io(&error) {
             PortError::Other(Errno::AGAIN) => PortError::Short(Errno::AGAIN),
             refusal => refusal,
         };
         thread::Builder::new().name("dial".to_owned()).spawn(body).map_err(refuse)?;
-        Ok(Dial { outcome, bell })
+        Ok(Dial { outcome, ready })
     }
 
     /// What came of it; a refusal if it is not over.
@@ -116,14 +116,14 @@ impl Dial {
 
 impl AsFd for Dial {
     fn as_fd(&self) -> BorrowedFd<'_> {
-        self.bell.as_fd()
+        self.ready.as_fd()
     }
 }
 
-fn tell(outcome: Result<Tcp, PortError>, send: &Sender<Result<Tcp, PortError>>, rope: PipeWriter) {
+fn tell(outcome: Result<Tcp, PortError>, send: &Sender<Result<Tcp, PortError>>, open_end: PipeWriter) {
     // Whoever gave up waiting wants no outcome.
     let _ = send.send(outcome);
-    drop(rope);
+    drop(open_end);
 }
 
 fn connect(host: &str, port: u16) -> Result<Tcp, PortError> {

@@ -9,13 +9,13 @@ use std::path::Path;
 use rustix::fs::{FlockOperation, Mode, OFlags, flock, fstat, open};
 use rustix::io::Errno;
 use rustix::termios::{
-    ControlModes, InputModes, OptionalActions, QueueSelector, Termios, ioctl_tiocexcl, ioctl_tiocnxcl,
-    tcflush, tcgetattr, tcsetattr,
+    ControlModes, InputModes, OptionalActions, ioctl_tiocexcl, ioctl_tiocnxcl, tcgetattr, tcsetattr,
 };
 
 use super::PortError;
 use super::candidates::{PROMPT_MS, is_tty, latency_ms};
 use super::kernel::{self, Counts};
+use super::line_settings;
 
 /// An open serial line, exclusive and raw; reads and writes never block.
 pub struct Tty {
@@ -65,13 +65,12 @@ impl Tty {
         if let Err(error) = kernel::hand_over_at_once(&tty.line) {
             tracing::debug!(%error, "{}: no low latency", path.display());
         }
+        // No parity, and no byte is dropped or doubled for its errors; the modem's lines mean nothing here.
         termios.make_raw();
         termios.input_modes.remove(InputModes::IXOFF | InputModes::IXANY | InputModes::INPCK);
-        // 8N1 without handshake (Telegram listing 4); the modem's lines mean nothing here.
-        termios.control_modes.remove(ControlModes::CSTOPB | ControlModes::CRTSCTS);
         termios.control_modes.insert(ControlModes::CREAD | ControlModes::CLOCAL);
-        termios.set_speed(baud)?;
-        tty.apply(&termios)?;
+        tcsetattr(&tty.line, OptionalActions::Now, &termios)?;
+        tty.check(line_settings::apply(&tty.line, baud), baud)?;
         if let Some(ms) = latency_ms(path).filter(|&ms| ms > PROMPT_MS) {
             tracing::warn!(
                 "{}: the adapter collects bytes for {ms} ms, so stamps are off by as much; a udev rule ends that: \
@@ -102,10 +101,8 @@ impl Tty {
     }
 
     pub(crate) fn set_baud(&self, baud: u32) -> io::Result<()> {
-        let mut termios = tcgetattr(&self.line)?;
-        termios.set_speed(baud)?;
-        let applied = self.apply(&termios);
-        tcflush(&self.line, QueueSelector::IFlush)?;
+        let applied = self.check(line_settings::apply_baud(&self.line, baud), baud);
+        line_settings::clear_input(&self.line).map_err(|_| self.gone())?;
         // At a wrong rate every byte is an error.
         self.line_errors();
         applied.map_err(|refusal| match refusal {
@@ -135,11 +132,16 @@ impl Tty {
         }
     }
 
-    /// Tells the driver its settings, and looks which rate it made of the one that was wanted.
-    fn apply(&self, termios: &Termios) -> Result<(), PortError> {
-        let told = tcsetattr(&self.line, OptionalActions::Now, termios);
+    /// What came of the settings, by the rate that the driver made of the one that was `wanted`. A line that is gone says so
+    /// when it is asked; else the driver refused, and the library does not keep its error's number.
+    fn check(&self, told: serialport::Result<()>, wanted: u32) -> Result<(), PortError> {
         let given = tcgetattr(&self.line)?.output_speed();
-        judge(told, given, termios.output_speed())
+        judge(told.map_err(|_| Errno::INVAL), given, wanted)
+    }
+
+    /// Why nothing can be asked of the line.
+    fn gone(&self) -> io::Error {
+        tcgetattr(&self.line).err().unwrap_or(Errno::IO).into()
     }
 }
 

@@ -78,7 +78,7 @@ pub fn configure(order: &Order, stop: &AtomicBool, tell: &mut dyn FnMut(News<'_>
     tell(News::Asking);
     let consent = ask::person(plan, stop)?;
     // What a stream has sent meanwhile is not looked at.
-    port.begin_anew(plan.baud.rate()).map_err(|error| outcome::untouched(&name, &error))?;
+    port.discard_input(plan.baud.rate()).map_err(|error| outcome::untouched(&name, &error))?;
     let mut change = Change::new(consent, clock::now());
     if let Source::Tcp { .. } = order.source {
         change = change.behind_server();

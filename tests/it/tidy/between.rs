@@ -164,13 +164,13 @@ fn shared_memory_is_pinned() {
     });
 }
 
-/// A hub is small: most of its crates come with shared memory.
+/// A hub is small: most of its crates come with shared memory; serialport brings three.
 #[test]
 fn the_daemon_is_built_from_few_crates() {
     let mut crates = crates::built_from("scanhub-daemon", &[]);
     crates.retain(|name| !name.starts_with("scanhub-"));
     eprintln!("daemon: {} crates of others", crates.len());
-    assert!(crates.len() <= 79, "{} crates: {crates:#?}", crates.len());
+    assert!(crates.len() <= 82, "{} crates: {crates:#?}", crates.len());
 }
 
 /// A consumer pays for shared memory, and for little else: for no verb, nor for what verbs need.

@@ -1,5 +1,5 @@
 //! The clock of a player: when it is whose turn, so that all links of a recording keep their times to each other
-//! while it is paused, stepped, played faster, slower, and anew. Refuses to know files and threads; what time it is, is
+//! while it is paused, stepped, played faster, slower, and again. Refuses to know files and threads; what time it is, is
 //! an argument.
 //!
 //! Media time is counted from the recording's first telegram, in nanoseconds.
@@ -17,7 +17,7 @@ pub struct Play {
     pub start_ns: Nanos,
     /// Media time, in ns, from which on nothing is published.
     pub end_ns: Option<Nanos>,
-    /// Whether it begins anew at its end.
+    /// Whether it starts again at its end.
     pub is_looped: bool,
     /// Whether it waits to be resumed before the first telegram.
     pub is_paused: bool,
@@ -32,7 +32,7 @@ pub(super) struct Playback {
     /// When, and what media time it was then; nothing until every link has said what it has first.
     anchor: Option<(Nanos, Nanos)>,
     links: Vec<Next>,
-    /// Times that it began anew.
+    /// Times that it started again.
     lap: u32,
     /// Whether this lap had a telegram.
     has_played: bool,
@@ -64,8 +64,8 @@ pub(crate) enum Turn {
     At(Nanos),
     /// It is to ask again when something has changed.
     Wait,
-    /// It begins anew, with this lap.
-    Anew(u32),
+    /// It starts again, with this lap.
+    Restart(u32),
     /// Nothing comes any more, for nobody.
     Over,
 }
@@ -124,7 +124,7 @@ impl Playback {
     /// `link`, which plays lap number `lap`, has nothing more in it.
     pub(super) fn end(&mut self, link: usize, lap: u32, now: Nanos) -> Turn {
         if self.lap != lap {
-            return Turn::Anew(self.lap);
+            return Turn::Restart(self.lap);
         }
         if self.is_over() {
             return Turn::Over;
@@ -136,7 +136,7 @@ impl Playback {
             return Turn::Wait;
         }
         self.is_news = true;
-        // What has nothing in it would begin anew for ever.
+        // What has nothing in it would start again for ever.
         if !(self.play.is_looped && self.has_played) {
             self.over_at = Some(now);
             return Turn::Over;
@@ -144,7 +144,7 @@ impl Playback {
         self.lap += 1;
         self.links.fill(Next::Unknown);
         (self.anchor, self.has_played) = (None, false);
-        Turn::Anew(self.lap)
+        Turn::Restart(self.lap)
     }
 
     /// Plays, or waits; `position` is the media time where nothing is waited for.
@@ -368,10 +368,10 @@ mod tests {
         assert_eq!(playback.turn(0, SECOND, 100 * SECOND), Turn::Wait);
         assert_eq!(playback.end(1, 0, 100 * SECOND), Turn::Wait, "it has nothing");
         assert!(is_now(playback.turn(0, SECOND, 100 * SECOND), 100 * SECOND));
-        assert_eq!(playback.end(0, 0, 101 * SECOND), Turn::Anew(1));
+        assert_eq!(playback.end(0, 0, 101 * SECOND), Turn::Restart(1));
         assert!(playback.take_news());
         assert_eq!(playback.turn(0, SECOND, 102 * SECOND), Turn::Wait);
-        assert_eq!(playback.end(1, 0, 102 * SECOND), Turn::Anew(1));
+        assert_eq!(playback.end(1, 0, 102 * SECOND), Turn::Restart(1));
         assert_eq!(playback.end(1, 1, 103 * SECOND), Turn::Wait);
         assert!(is_now(playback.turn(0, SECOND, 104 * SECOND), 103 * SECOND));
         let mut empty = begun(1, Play { is_looped: true, ..Play::default() });
