@@ -12,7 +12,10 @@ use rustix::process::{Pid, Resource, Rlimit, getrlimit, prlimit};
 fn limited<S: AsRef<str>>(env: &TestEnv, limit: u64, arguments: &[S]) -> Program {
     let inner = env.command(arguments);
     let mut command = Command::new("sh");
-    command.args(["-c", "ulimit -n \"$0\" && exec \"$@\"", &limit.to_string()]);
+    // Whoever runs the tests may have left some open.
+    let closed = "exec 3<&- 4<&- 5<&- 6<&- 7<&- 8<&- 9<&-";
+    let script = format!("{closed} && ulimit -n \"$0\" && exec \"$@\"");
+    command.args(["-c", &script, &limit.to_string()]);
     command.arg(inner.get_program()).args(inner.get_args());
     command.envs(inner.get_envs().filter_map(|(key, value)| Some((key, value?))));
     command.env_remove("SCANHUB_CONFIG");

@@ -8,7 +8,7 @@ mod program;
 mod said;
 mod shell;
 
-use crate::testkit::{Outcome, Program, TERM, TestEnv, side_by_side, until};
+use crate::testkit::{INT, Outcome, Program, TERM, TestEnv, is_class, side_by_side, until};
 use blocks::{Block, blocks};
 use program::Example;
 use rustix::time::{ClockId, clock_gettime};
@@ -52,7 +52,10 @@ impl Situation {
     fn judge_all(&self, examples: &[Example]) -> Vec<String> {
         let env = TestEnv::new();
         let _running = self.begin(&env);
-        let recorded = env.run(&["record", "--ros2", "-o", &env.word("ros.mcap"), "--for=1s"]);
+        let mut recorder = env.start(&["record", "--ros2", "--json", "-o", &env.word("ros.mcap")]);
+        recorder
+            .await_line("scans", |line| is_class("recording")(line) && line["samples"].as_u64() > Some(20));
+        let recorded = recorder.end(INT);
         assert_eq!(recorded.code, Some(0), "{recorded}");
         let mut verdicts = env.echo(&["front/zones"]);
         let mut run = |example| run(example, &env, &mut verdicts, self.wants_words(example));

@@ -12,7 +12,7 @@ use rustix::process::{Pid, Signal, kill_process_group};
 
 use super::blocks::blocks;
 use super::shell::{commands, lines};
-use crate::testkit::{Program, Sender, TestEnv, in_a_network, is_class, side_by_side};
+use crate::testkit::{PATIENCE, Program, Sender, TestEnv, in_a_network, is_class, side_by_side};
 use schema::Topic;
 
 /// Commands that are not run, by how their line begins or what is in it, and what makes sure of them. Those of the program
@@ -115,7 +115,9 @@ impl Desk {
         shell.env("SCANHUB_END_WITH_PARENT", "1").env("SCANHUB_LOG", "error").env_remove("SCANHUB_CONFIG");
         let program = Program::start(shell);
         let group = Pid::from_raw(program.pid() as i32).expect("a process");
-        let end_at = Instant::now() + LONG_ENOUGH;
+        // A doctor looks at everything and then ends, however long that takes.
+        let patience = if line.starts_with("scanhub doctor") { PATIENCE } else { LONG_ENOUGH };
+        let end_at = Instant::now() + patience;
         while !program.is_over() && Instant::now() < end_at {
             thread::sleep(Duration::from_millis(20));
         }
@@ -140,10 +142,16 @@ const LONG_ENOUGH: Duration = Duration::from_millis(1500);
 /// What is wrong with those of `lines` that can be run.
 fn wrong_with(desk: &Desk, lines: &[(String, String)]) -> Vec<String> {
     let wrong = |(place, line): &(String, String)| Some(format!("{place}: {}", desk.run(line)?));
-    // There is one spare sensor, one domain for another hub or for who publishes beside it, and one sensor to be told what to
-    // do; the rest mostly waits.
-    const IN_TURN: [&str; 5] =
-        ["scanhub run", "scanhub replay", "scanhub control", "scanhub background", "listen --publish"];
+    // There is one spare sensor, one domain for another hub, one place for a listener, and one sensor to be told what to do;
+    // the rest mostly waits.
+    const IN_TURN: [&str; 6] = [
+        "scanhub run",
+        "scanhub replay",
+        "scanhub control",
+        "scanhub background",
+        "scanhub listen",
+        "scanhub gateway",
+    ];
     let (in_turn, others): (Vec<_>, Vec<_>) =
         lines.iter().partition(|(_, line)| PORTS.iter().chain(&IN_TURN).any(|part| line.contains(part)));
     let rows = others.chunks(others.len().div_ceil(3).max(1)).map(<[_]>::to_vec).chain([in_turn]);
