@@ -156,10 +156,10 @@ fn several_sensors_wake_one_echo() {
     for sensor in &hub.sensors {
         sensor.scan.await_subscribers(1);
     }
-    for _ in 0..20 {
+    for sent in 1..=20 {
         hub.sensors[0].scan(&[1]);
         hub.sensors[1].scan(&[2]);
-        std::thread::sleep(Duration::from_millis(1));
+        verb.out.await_lines("\"class\":\"scan\"", 2 * sent);
     }
     let (end, out, _) = verb.join();
     assert_eq!(end, Ok(()));
