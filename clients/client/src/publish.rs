@@ -210,7 +210,8 @@ impl<P: Payload + ?Sized> Publication<P> {
     /// Connects consumers that came since the last sample, and hands them what the topic keeps for late joiners. Of a topic
     /// that is seldom sent, call it ten times a second.
     pub fn connect(&self) {
-        self.topic.connect();
+        // One that cannot be connected now is tried again with the next sample.
+        let _ = self.topic.connect();
     }
 
     /// Returns the number of samples that were not sent for lack of memory.

@@ -1,29 +1,25 @@
 //! The topics of one link: numbers every sample, fills it in place, sends it, wakes the consumers. A sample for which
 //! there is no memory is counted and its number used up, so that consumers see the gap; nothing ever waits for one.
 
-mod publisher;
+mod prepared_publisher;
 
 use lms::session::Received;
 use port::clock;
-use schema::ipc::{BytesMut, Node, Waker};
+use schema::ipc::{Node, Waker};
 use schema::{Background, Failure, Flags, Foreground, Header, Marks, Quality, Scan, Status, Wake, Zones};
 
 use crate::pipeline::{Outputs, Pipeline, Relearned};
-use publisher::{Loan, TopicPublisher};
+use prepared_publisher::{Loan, PreparedPublisher, TelegramPublisher};
 
 /// The publishing end of one sensor; stays in its link's thread.
 pub(crate) struct Topics {
-    telegram: TopicPublisher<[u8]>,
-    scan: TopicPublisher<Scan>,
-    zones: TopicPublisher<Zones>,
-    marks: TopicPublisher<Marks>,
-    foreground: TopicPublisher<Foreground>,
-    background: TopicPublisher<Background>,
-    status: TopicPublisher<Status>,
-    /// Loaned while there was time, for the telegram that is coming.
-    next_telegram: Option<BytesMut>,
-    /// Length of the last telegram.
-    last_len: usize,
+    telegram: TelegramPublisher,
+    scan: PreparedPublisher<Scan>,
+    zones: PreparedPublisher<Zones>,
+    marks: PreparedPublisher<Marks>,
+    foreground: PreparedPublisher<Foreground>,
+    background: PreparedPublisher<Background>,
+    status: PreparedPublisher<Status>,
     /// Where a scan is decoded that nobody wants, or for which there is no memory: what is made of it is published all the
     /// same.
     spare_scan: Box<Scan>,
@@ -41,15 +37,13 @@ impl Topics {
         let waker = Waker::new(node, sensor)?;
         let header = Header { sensor: number, boot, hub_pid: std::process::id(), ..Header::default() };
         Ok(Topics {
-            telegram: TopicPublisher::new(node, sensor)?,
-            scan: TopicPublisher::new(node, sensor)?,
-            zones: TopicPublisher::new(node, sensor)?,
-            marks: TopicPublisher::new(node, sensor)?,
-            foreground: TopicPublisher::new(node, sensor)?,
-            background: TopicPublisher::new(node, sensor)?,
-            status: TopicPublisher::new(node, sensor)?,
-            next_telegram: None,
-            last_len: 0,
+            telegram: TelegramPublisher::new(node, sensor)?,
+            scan: PreparedPublisher::new(node, sensor)?,
+            zones: PreparedPublisher::new(node, sensor)?,
+            marks: PreparedPublisher::new(node, sensor)?,
+            foreground: PreparedPublisher::new(node, sensor)?,
+            background: PreparedPublisher::new(node, sensor)?,
+            status: PreparedPublisher::new(node, sensor)?,
             spare_scan: Box::default(),
             waker,
             header,
@@ -71,10 +65,7 @@ impl Topics {
     /// Takes loans for a telegram as long as the last one and for what `pipeline` makes of its scan, which will be there
     /// in a moment.
     pub(crate) fn prepare(&mut self, pipeline: &Pipeline) {
-        if self.next_telegram.is_none() && self.telegram.is_wanted() {
-            self.next_telegram = self.telegram.publisher.loan_slice_uninit(self.last_len).ok();
-        }
-        self.telegram.connect();
+        self.telegram.prepare();
         self.scan.prepare();
         self.zones.prepare();
         self.marks.prepare();
@@ -104,21 +95,7 @@ impl Topics {
         self.header.reasons = reasons;
         self.header.flags &= !Flags::STAMP_ESTIMATED;
         self.header.flags |= if received.estimated { Flags::STAMP_ESTIMATED } else { 0 };
-        let bytes = received.telegram.bytes();
-        self.last_len = bytes.len();
-        if !self.telegram.is_wanted() {
-            return self.telegram.skip();
-        }
-        let header = Header { topic_seq: self.telegram.take_number(), ..self.header };
-        let prepared = self.next_telegram.take().filter(|loan| loan.payload().len() == bytes.len());
-        let Some(loan) = prepared.or_else(|| self.telegram.publisher.loan_slice_uninit(bytes.len()).ok())
-        else {
-            self.telegram.failed += 1;
-            return;
-        };
-        let mut sample = loan.write_from_slice(bytes);
-        *sample.user_header_mut() = header;
-        self.telegram.note(sample.send());
+        self.telegram.send(received.telegram.bytes(), &self.header);
     }
 
     /// Publishes a scan of the last telegram, which `fill` writes in place, and what `pipeline` makes of it there. Marks
@@ -202,16 +179,17 @@ impl Topics {
 
     /// Whether anybody is attached to anything.
     pub(crate) fn is_heard(&self) -> bool {
-        let of_telegrams = self.telegram.is_heard() || self.scan.is_heard() || self.zones.is_heard();
+        let of_telegrams =
+            self.telegram.telegrams.is_heard() || self.scan.is_heard() || self.zones.is_heard();
         let of_wanted = self.marks.is_heard() || self.foreground.is_heard() || self.background.is_heard();
         of_telegrams || of_wanted || self.status.is_heard()
     }
 
     /// Samples without memory.
     pub(crate) fn loan_failed(&self) -> u64 {
-        let of_scans = self.scan.failed + self.zones.failed + self.marks.failed;
-        let of_models = self.foreground.failed + self.background.failed;
-        self.telegram.failed + of_scans + of_models + self.status.failed
+        let of_scans = self.scan.failed() + self.zones.failed() + self.marks.failed();
+        let of_models = self.foreground.failed() + self.background.failed();
+        self.telegram.telegrams.failed() + of_scans + of_models + self.status.failed()
     }
 
     /// Consumers that got nothing although they are attached: their descriptors or ours ran out, and sending says Ok
@@ -222,7 +200,7 @@ impl Topics {
             return self.status.missed_out();
         }
         let of_telegrams =
-            self.telegram.missed_out().max(self.scan.missed_out()).max(self.zones.missed_out());
+            self.telegram.telegrams.missed_out().max(self.scan.missed_out()).max(self.zones.missed_out());
         let of_wanted = self.marks.missed_out().max(self.foreground.missed_out());
         of_telegrams.max(of_wanted).max(self.status.missed_out())
     }

@@ -1,10 +1,13 @@
 //! The publishing end of one topic: numbers its samples, writes them in place, counts those without memory. Refuses to know
 //! what is in a sample, and when its consumers are woken.
 
+use std::fmt::Debug;
+
 use super::{
-    LoanError, Node, Payload, PortFactory, Publisher, TopicService, UpdateConnections, ZeroCopySend,
+    BytesMut, LoanError, Node, Payload, PortFactory, Publisher, SampleMut, SendError, TopicService,
+    UpdateConnections, ZeroCopySend,
 };
-use crate::{Failure, Header, Kind};
+use crate::{Failure, Header, Kind, Topic};
 
 /// Publishes the samples of one topic of one sensor. Their numbers begin at 0 and have a gap where samples were lost before
 /// they could be sent.
@@ -46,8 +49,12 @@ impl<P: Payload + ?Sized> TopicPublisher<P> {
 
     /// Connects consumers that came since the last sample, and hands them what the topic keeps for late joiners. One that
     /// cannot be connected now is tried again with the next sample.
-    pub fn connect(&self) {
-        let _ = self.publisher.update_connections();
+    ///
+    /// # Errors
+    ///
+    /// Why one of them could not be connected.
+    pub fn connect(&self) -> Result<(), impl Debug + use<P>> {
+        self.publisher.update_connections()
     }
 
     /// Returns the number of samples that were not sent for lack of memory.
@@ -55,52 +62,77 @@ impl<P: Payload + ?Sized> TopicPublisher<P> {
         self.failed
     }
 
-    /// Takes the next number for a sample with `header`.
-    fn number(&mut self, header: &Header) -> Header {
+    /// Sends a written `sample` with `header` but for its number in the topic, which is the next one. Returns how many
+    /// consumers got it.
+    ///
+    /// # Errors
+    ///
+    /// The library's. The number is used up, and the sample counts as failed.
+    pub fn send_loan(&mut self, mut sample: SampleMut<P>, header: &Header) -> Result<usize, SendError> {
+        *sample.user_header_mut() = Header { topic_seq: self.next, ..*header };
         self.next += 1;
-        Header { topic_seq: self.next - 1, ..*header }
+        sample.send().inspect_err(|_| self.failed += 1)
     }
 
-    fn short(&mut self, error: &dyn std::fmt::Debug) -> Failure {
+    /// Uses up a number for a sample that there is no memory for.
+    pub fn fail(&mut self) {
+        self.next += 1;
         self.failed += 1;
-        let what = format!("a sample of {} was not sent: {error:?}", P::TOPIC.name());
-        Failure::new(Kind::Short, what, "drop samples that are held, or free some of /dev/shm")
     }
 }
 
 impl<P: Payload + ZeroCopySend + Default> TopicPublisher<P> {
-    /// Sends a sample that `fill` writes in place, beginning with a payload's default. It has `header` but for its number in
-    /// the topic, which is the next one. Returns how many consumers got it.
+    /// Returns the memory of a sample, with a payload's default in it.
+    ///
+    /// # Errors
+    ///
+    /// The library's, if there is none.
+    pub fn loan(&self) -> Result<SampleMut<P>, LoanError> {
+        self.publisher.loan()
+    }
+
+    /// Sends a sample that `fill` writes in place, beginning with a payload's default; else as
+    /// [`send_loan`](TopicPublisher::send_loan).
     ///
     /// # Errors
     ///
     /// [`Kind::Short`] if there is no memory for it. Its number is used up.
     pub fn send(&mut self, header: &Header, fill: impl FnOnce(&mut P)) -> Result<usize, Failure> {
-        let header = self.number(header);
-        let mut sample = match self.publisher.loan() {
-            Ok(sample) => sample,
-            Err(error) => return Err(self.short(&error)),
-        };
-        *sample.user_header_mut() = header;
+        let mut sample = self.loan().map_err(|error| self.short(&error))?;
         fill(sample.payload_mut());
-        sample.send().map_err(|error| self.short(&error))
+        self.send_loan(sample, header).map_err(|error| short(P::TOPIC, &error))
     }
 }
 
 impl TopicPublisher<[u8]> {
+    /// Returns the memory of a sample of `len` bytes.
+    ///
+    /// # Errors
+    ///
+    /// The library's, if there is none, or if that is more than [`Telegram::MAX`](crate::Telegram::MAX).
+    pub fn loan_bytes(&self, len: usize) -> Result<BytesMut, LoanError> {
+        self.publisher.loan_slice_uninit(len)
+    }
+
     /// Sends `bytes` as a sample; else as [`send`](TopicPublisher::send).
     ///
     /// # Errors
     ///
     /// [`Kind::Short`] if there is no memory for it, or it is longer than [`Telegram::MAX`](crate::Telegram::MAX).
     pub fn send_bytes(&mut self, header: &Header, bytes: &[u8]) -> Result<usize, Failure> {
-        let header = self.number(header);
-        let loan: Result<_, LoanError> = self.publisher.loan_slice_uninit(bytes.len());
-        let mut sample = match loan {
-            Ok(loan) => loan.write_from_slice(bytes),
-            Err(error) => return Err(self.short(&error)),
-        };
-        *sample.user_header_mut() = header;
-        sample.send().map_err(|error| self.short(&error))
+        let loan = self.loan_bytes(bytes.len()).map_err(|error| self.short(&error))?;
+        self.send_loan(loan.write_from_slice(bytes), header).map_err(|error| short(<[u8]>::TOPIC, &error))
     }
+}
+
+impl<P: Payload + ?Sized> TopicPublisher<P> {
+    fn short(&mut self, error: &LoanError) -> Failure {
+        self.fail();
+        short(P::TOPIC, error)
+    }
+}
+
+fn short(topic: Topic, error: &dyn Debug) -> Failure {
+    let what = format!("a sample of {} was not sent: {error:?}", topic.name());
+    Failure::new(Kind::Short, what, "drop samples that are held, or free some of /dev/shm")
 }
