@@ -1,5 +1,5 @@
-//! Tests beside each other: what waits is waited for together, and who only computes makes room for who has to be in time: beside tests with a sensor, which sends whether or not somebody
-//! reads, others compile or search for seconds.
+//! How tests share two cores. A simulated sensor sends whether or not its reader gets a processor, so tests that compile or
+//! compute for seconds run at a lower priority; tests that mostly wait run side by side.
 
 use std::ffi::OsStr;
 use std::panic::resume_unwind;
@@ -8,33 +8,33 @@ use std::thread;
 
 use rustix::process::{getpriority_process, setpriority_process};
 
-/// As far behind as a process can stand.
+/// The lowest priority of a process.
 const LAST: i32 = 19;
-/// Behind what is about time, and before what only computes.
+/// Below tests that measure time, above those that only compute.
 const BEHIND: i32 = 5;
 
-/// Lets this thread, and what it starts from now on, stand behind all others. For tests that do nothing but compute.
+/// Gives this thread, and what it starts from now on, the lowest priority: for tests that only compute.
 pub(crate) fn compute_gently() {
     stand_at(LAST);
 }
 
-/// Lets this thread, and what it starts from now on, stand behind those tests that hold something about time.
+/// Gives this thread, and what it starts from now on, a lower priority than tests that measure time have.
 pub(crate) fn wait_gently() {
     stand_at(BEHIND);
 }
 
-/// Of this thread alone, as Linux has it; none comes forward again, which root alone may.
+/// Linux sets it for this thread alone. It is never raised again: only root may.
 fn stand_at(place: i32) {
     let now = getpriority_process(None).unwrap_or_else(|error| panic!("no priority: {error}"));
     let done = setpriority_process(None, place.max(now));
     done.unwrap_or_else(|error| panic!("anybody may stand behind: {error}"));
 }
 
-/// Does `each` of these with every one of `items`, all of them side by side: what mostly waits is waited for once.
+/// Calls `each` for every one of `items`, all at the same time, each in a thread of its own.
 ///
 /// # Panics
 ///
-/// As the first one does that panics.
+/// With the panic of the first call that panicked.
 pub(crate) fn side_by_side<T: Send, R: Send>(
     items: impl IntoIterator<Item = T>,
     each: impl Fn(T) -> R + Sync,
@@ -47,7 +47,7 @@ pub(crate) fn side_by_side<T: Send, R: Send>(
     })
 }
 
-/// A command that starts `program` behind all others; its arguments may follow.
+/// A command that starts `program` at the lowest priority; its arguments may follow.
 pub(crate) fn gentle(program: impl AsRef<OsStr>) -> Command {
     let mut command = Command::new("nice");
     command.arg("-n").arg(LAST.to_string()).arg(program);

@@ -1,5 +1,5 @@
-//! A test about time, on a machine that has other things to do: what it holds is what programs do that get a processor
-//! when they want one. Refuses to excuse anything else.
+//! Tests about time, on a machine that is busy: they hold for programs that get a processor when they want one, so a failure
+//! counts unless the kernel says that the test's programs had to wait for one. Refuses to excuse anything else.
 
 use std::cell::Cell;
 use std::panic::{AssertUnwindSafe, catch_unwind, resume_unwind};

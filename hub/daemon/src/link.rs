@@ -129,20 +129,14 @@ impl<'a> LinkThread<'a> {
     /// status went out.
     pub(crate) fn show(&mut self, session: Option<&Session>, state: State, error: &str) -> bool {
         let now = clock::now();
-        let changed = self.stats.update(state, error, now);
-        if changed {
-            announce(&self.link.name, state, error);
-        }
+        let changed = update(&mut self.stats, self.link, state, error, now);
         self.publish_status(session, state, changed, now)
     }
 
     /// As [`show`](Self::show), of a `session` that was examined: what is wrong is for [`Diagnosis`] to say.
     pub(crate) fn show_session(&mut self, session: &Session, state: State) -> bool {
         let now = clock::now();
-        let changed = self.stats.update(state, self.diagnosis.explanation(), now);
-        if changed {
-            announce(&self.link.name, state, self.diagnosis.explanation());
-        }
+        let changed = update(&mut self.stats, self.link, state, self.diagnosis.explanation(), now);
         self.publish_status(Some(session), state, changed, now)
     }
 
@@ -256,12 +250,15 @@ impl<'a> LinkThread<'a> {
     }
 }
 
-/// Logs a state that is new, or an error.
-fn announce(name: &str, state: State, error: &str) {
+/// Takes over `state` and `error`, and logs them if they are new; whether they are.
+fn update(stats: &mut LinkStats, link: &Link, state: State, error: &str, now: Nanos) -> bool {
+    let (changed, name) = (stats.update(state, error, now), &link.name);
     match error {
+        _ if !changed => {}
         "" => tracing::info!("{name}: {}", state.name()),
         error => tracing::warn!("{name}: {}: {error}", state.name()),
     }
+    changed
 }
 
 fn is_ready(fd: &PollFd<'_>) -> bool {
