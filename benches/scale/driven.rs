@@ -6,7 +6,6 @@ use std::path::Path;
 use std::time::Duration;
 
 use config::{Config, Sources};
-use daemon::DrivenLink;
 use lms::Nanos;
 use lms::measured;
 use lms::telegram::STX;
@@ -18,6 +17,7 @@ use sim::room::Room;
 
 use crate::support::stage::{PATIENCE, Stage};
 use crate::support::{Outcome, clock};
+use crate::virtual_hub::{VirtualLink, virtual_hub};
 
 /// Drives `sensors` whose scans have `beams` beams, until all have learned their background; says `ready`, and once there is a
 /// file `begin` has at least `telegrams` more. Prints `cost NS PUBLISHED RECEIVED DESCRIPTORS`. All topics are followed if
@@ -32,7 +32,7 @@ pub(crate) fn drive(
     let variant = Variant::of_beams(beams).ok_or("no variant has so many beams")?;
     let stage = Stage::new()?;
     let config = config(sensors, variant)?;
-    daemon::in_memory(&config, &stage.domain, |links| {
+    virtual_hub(&config, &stage.domain, |links| {
         let node = ipc::client_node(&stage.domain)?;
         let followed = config.links.iter().filter(|_| followed);
         let followers: Vec<Followers> =
@@ -40,7 +40,7 @@ pub(crate) fn drive(
         let descriptors = std::fs::read_dir("/proc/self/fd")?.count();
         let mut stream = Stream::new(variant);
         let learning = (LEARNED_NS / stream.period) as usize / TOGETHER;
-        let mut turn = |links: &mut [DrivenLink<'_>]| -> Outcome<Turn> {
+        let mut turn = |links: &mut [VirtualLink<'_>]| -> Outcome<Turn> {
             let before = processor_ns();
             let published = stream.turn(links);
             let busy_ns = processor_ns() - before;
@@ -100,7 +100,7 @@ impl Stream {
     }
 
     /// The next telegrams of each sensor, as the hub reads them: the first bytes, most of it, the end. How many were published.
-    fn turn(&mut self, links: &mut [DrivenLink<'_>]) -> usize {
+    fn turn(&mut self, links: &mut [VirtualLink<'_>]) -> usize {
         let mut published = 0;
         for _ in 0..TOGETHER {
             for piece in 0..3 {

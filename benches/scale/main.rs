@@ -11,6 +11,8 @@ mod memory;
 #[path = "../support/mod.rs"]
 mod support;
 mod sweep;
+#[path = "../support/virtual_hub.rs"]
+mod virtual_hub;
 
 use std::process::ExitCode;
 

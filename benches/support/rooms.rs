@@ -1,5 +1,8 @@
 //! A recording of two sensors in simulated rooms with people: a hub in made-up time, of which every topic is followed and
-//! written into a file. A file by itself, for benches and tests that need no stage.
+//! written into a file. For benches and tests that need no stage.
+
+#[path = "virtual_hub.rs"]
+mod virtual_hub;
 
 use std::collections::BTreeMap;
 use std::fs::File;
@@ -43,7 +46,7 @@ pub(crate) fn record(
     let config = Config::load(&sources).expect("a configuration");
     let rooms = SENSORS.map(|(_, name)| Room::new(&name.parse::<World>().expect("a world"), 7));
     let mut writer = Writer::begin(File::create(file).expect("a file"), "", BTreeMap::new()).expect("begins");
-    let driven = daemon::in_memory(&config, domain, |links| {
+    let driven = virtual_hub::virtual_hub(&config, domain, |links| {
         let node = ipc::client_node(domain).expect("a node");
         let followers = SENSORS.map(|(name, _)| Followers::attach(&node, name));
         for scan in 0..=scans {

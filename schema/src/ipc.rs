@@ -14,8 +14,8 @@ mod trouble;
 mod unheld;
 mod wake;
 
+use std::borrow::BorrowMut;
 use std::fmt::Debug;
-use std::mem::MaybeUninit;
 use std::os::unix::ffi::OsStrExt;
 use std::path::Path;
 use std::time::Duration;
@@ -42,7 +42,7 @@ pub use self::nodes::{Nodes, nodes};
 pub use self::sleep::{descriptor, sleep, take_wakeups};
 pub(crate) use self::strangers::in_the_way;
 pub use self::strangers::{Segment, strangers};
-pub use self::topic_publisher::TopicPublisher;
+pub use self::topic_publisher::{Medium, SharedMemory, TopicPublisher};
 pub use self::unheld::is_unheld;
 pub use self::wake::{Waker, listener, open_wake};
 pub use iceoryx2::port::update_connections::UpdateConnections;
@@ -66,8 +66,6 @@ pub type Subscriber<P> = port::subscriber::Subscriber<Service, P, Header>;
 pub type Sample<P> = iceoryx2::sample::Sample<Service, P, Header>;
 /// A loaned sample that is not sent yet.
 pub type SampleMut<P> = iceoryx2::sample_mut::SampleMut<Service, P, Header>;
-/// A loaned slice of bytes that is not written yet.
-pub type BytesMut = iceoryx2::sample_mut_uninit::SampleMutUninit<Service, [MaybeUninit<u8>], Header>;
 /// What wakes the consumers of one sensor.
 pub type WakeService = event::PortFactory<Service>;
 /// Wakes consumers.
@@ -138,11 +136,27 @@ pub trait Payload: IceoryxSend + Debug + 'static {
 
     /// Returns the payload of a sample, in shared memory.
     fn read(sample: &Sample<Self>) -> &Self;
+
+    /// Returns the memory of a sample, with a payload's default in it; bytes are `len`.
+    ///
+    /// # Errors
+    ///
+    /// The library's, if there is none.
+    fn loan(publisher: &Publisher<Self>, len: usize) -> Result<SampleMut<Self>, LoanError>;
+
+    /// Returns the payload of a sample that is not sent yet.
+    fn write(loan: &mut SampleMut<Self>) -> &mut Self;
+
+    /// A payload in the memory of this process.
+    type Owned: BorrowMut<Self>;
+
+    /// Returns a payload's default in the memory of this process; bytes are `len`.
+    fn owned(len: usize) -> Self::Owned;
 }
 
 /// iceoryx2 has a slice and a value behind two impl blocks of the same words; this says them once.
 macro_rules! payload {
-    ($payload:ty, $topic:expr, |$builder:ident| $sized:expr) => {
+    ($payload:ty, $topic:expr, $len:ident, $owned:ty, $make:expr, |$builder:ident| $sized:expr, |$publisher:ident| $loan:expr) => {
         impl Payload for $payload {
             const TOPIC: Topic = $topic;
 
@@ -195,6 +209,20 @@ macro_rules! payload {
             fn read(sample: &Sample<Self>) -> &Self {
                 sample
             }
+
+            fn loan($publisher: &Publisher<Self>, $len: usize) -> Result<SampleMut<Self>, LoanError> {
+                $loan
+            }
+
+            fn write(loan: &mut SampleMut<Self>) -> &mut Self {
+                loan.payload_mut()
+            }
+
+            type Owned = $owned;
+
+            fn owned($len: usize) -> $owned {
+                $make
+            }
         }
     };
 }
@@ -205,10 +233,18 @@ macro_rules! payloads {
         $(payloads!($payload, $topic);)*
     };
     ([u8], $topic:ident) => {
-        payload!([u8], Topic::$topic, |builder| builder.initial_max_slice_len(crate::Telegram::MAX));
+        payload!(
+            [u8], Topic::$topic, len, Vec<u8>, vec![0; len],
+            |builder| builder.initial_max_slice_len(crate::Telegram::MAX),
+            |publisher| publisher.loan_slice(len)
+        );
     };
     ($payload:tt, $topic:ident) => {
-        payload!(crate::$payload, Topic::$topic, |builder| builder);
+        payload!(
+            crate::$payload, Topic::$topic, _len, Box<crate::$payload>, Box::default(),
+            |builder| builder,
+            |publisher| publisher.loan()
+        );
     };
 }
 

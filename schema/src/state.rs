@@ -78,6 +78,22 @@ impl StateDirectory {
         })
     }
 
+    /// Removes file `name`, if it is there.
+    ///
+    /// # Errors
+    ///
+    /// [`Kind::Failed`] if it stays.
+    pub fn remove(&self, name: &str) -> Result<(), Failure> {
+        let path = self.path(name);
+        match fs::remove_file(&path) {
+            Err(error) if !matches!(error.kind(), ErrorKind::NotFound | ErrorKind::NotADirectory) => {
+                let message = format!("{}: an old file stays: {error}", path.display());
+                Err(Failure::new(Kind::Failed, message, "remove the file"))
+            }
+            _ => Ok(()),
+        }
+    }
+
     fn replace(&self, name: &str, text: &str) -> io::Result<()> {
         DirBuilder::new().recursive(true).mode(0o700).create(&self.path)?;
         let beside = self.path(&format!("{name}.new"));

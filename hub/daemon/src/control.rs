@@ -12,16 +12,22 @@ use schema::ipc::{self, Asked, Node};
 use schema::{Background, Failure, Kind, Response, Shown, Verb, shortage};
 
 use crate::event_fd::EventFd;
-pub(crate) use queue::{ControlQueue, Flow};
+pub use queue::ControlQueue;
+pub(crate) use queue::Flow;
 
 /// Where requests come in; stays in the supervising thread.
 pub(crate) struct ControlServer {
     server: ipc::ControlServer,
+    pub(crate) orders: Orders,
+    /// Requests that a link has not taken yet, by their numbers.
+    open: Vec<(u64, Asked)>,
+}
+
+/// What users want of links, on its way to them and back.
+pub struct Orders {
     links: Vec<LinkQueue>,
     outcomes: Receiver<(u64, Outcome)>,
     event: Arc<EventFd>,
-    /// Requests that a link has not taken yet, by their numbers.
-    open: Vec<(u64, Asked)>,
     next: u64,
 }
 
@@ -37,7 +43,7 @@ struct LinkQueue {
 type Changed = Arc<Mutex<Option<Box<Processing>>>>;
 
 /// What came of a request: done, with the model that was asked for, or why not.
-pub(crate) type Outcome = Result<Option<Box<Shown>>, Failure>;
+pub type Outcome = Result<Option<Box<Shown>>, Failure>;
 
 /// A request on its way to a link.
 pub(crate) struct QueuedRequest {
@@ -48,15 +54,13 @@ pub(crate) struct QueuedRequest {
     pub(crate) model: Box<Background>,
 }
 
-impl ControlServer {
-    /// Opens the control service, for a link of each of `sensors`; what comes for them arrives at the second value.
+impl Orders {
+    /// For a link of each of `sensors`; what comes for them arrives at the second value.
     ///
-    /// [`Kind::Short`] if memory or descriptors are.
-    pub(crate) fn open<'a>(
-        node: &Node,
-        sensors: impl Iterator<Item = &'a str>,
-    ) -> Result<(ControlServer, Vec<ControlQueue>), Failure> {
-        let server = ipc::ControlServer::create(node)?;
+    /// # Errors
+    ///
+    /// [`Kind::Short`] if descriptors are.
+    pub fn new<'a>(sensors: impl Iterator<Item = &'a str>) -> Result<(Orders, Vec<ControlQueue>), Failure> {
         let event = Arc::new(EventFd::new()?);
         let (told, outcomes) = channel();
         let (mut links, mut ends) = (Vec::new(), Vec::new());
@@ -79,16 +83,11 @@ impl ControlServer {
                 server: event.clone(),
             });
         }
-        Ok((ControlServer { server, links, outcomes, event, open: Vec::new(), next: 0 }, ends))
-    }
-
-    /// What becomes readable when there is something to [`serve`](Self::serve).
-    pub(crate) fn descriptors(&self) -> [BorrowedFd<'_>; 2] {
-        [ipc::descriptor(self.server.requests()), self.event.as_fd()]
+        Ok((Orders { links, outcomes, event, next: 0 }, ends))
     }
 
     /// Lets the link of `sensor` make of its scans what `processing` says, as soon as it looks; the last word holds.
-    pub(crate) fn change(&self, sensor: &str, processing: &Processing) {
+    pub fn change(&self, sensor: &str, processing: &Processing) {
         if let Some(link) = self.links.iter().find(|link| link.sensor == sensor) {
             let mut changed = link.changed.lock().unwrap_or_else(PoisonError::into_inner);
             *changed = Some(Box::new(processing.clone()));
@@ -96,10 +95,62 @@ impl ControlServer {
         }
     }
 
+    /// Puts `verb`, with the `model` of a request to load, into the queue of the link of `sensor`. The number by which its
+    /// [`outcome`](Self::outcome) will be told.
+    ///
+    /// # Errors
+    ///
+    /// [`Kind::NoTopic`] if there is no such link, [`Kind::Short`] if too many requests wait for it, [`Kind::Failed`] if it
+    /// has ended.
+    pub fn ask(&mut self, sensor: &str, verb: Verb, model: Box<Background>) -> Result<u64, Failure> {
+        let link = self.links.iter().find(|link| link.sensor == sensor).ok_or_else(|| {
+            let sensors: Vec<_> = self.links.iter().map(|link| link.sensor.as_str()).collect();
+            let there_are = format!("there are {}", sensors.join(", "));
+            Failure::new(Kind::NoTopic, format!("the hub has no sensor {sensor}"), there_are)
+        })?;
+        match link.queue.try_send(QueuedRequest { number: self.next, verb, model }) {
+            Ok(()) => {}
+            Err(TrySendError::Full(_)) => {
+                let message = format!("{sensor} already has {QUEUE} waiting requests");
+                return Err(Failure::new(Kind::Short, message, "try again in a moment"));
+            }
+            Err(TrySendError::Disconnected(_)) => {
+                return Err(Failure::new(Kind::Failed, format!("the link {sensor} has ended"), ""));
+            }
+        }
+        link.event.signal();
+        self.next += 1;
+        Ok(self.next - 1)
+    }
+
+    /// What came of a request that a link has taken, and its number.
+    pub fn outcome(&self) -> Option<(u64, Outcome)> {
+        self.outcomes.try_recv().ok()
+    }
+}
+
+impl ControlServer {
+    /// Opens the control service, for a link of each of `sensors`; what comes for them arrives at the second value.
+    ///
+    /// [`Kind::Short`] if memory or descriptors are.
+    pub(crate) fn open<'a>(
+        node: &Node,
+        sensors: impl Iterator<Item = &'a str>,
+    ) -> Result<(ControlServer, Vec<ControlQueue>), Failure> {
+        let server = ipc::ControlServer::create(node)?;
+        let (orders, queues) = Orders::new(sensors)?;
+        Ok((ControlServer { server, orders, open: Vec::new() }, queues))
+    }
+
+    /// What becomes readable when there is something to [`serve`](Self::serve).
+    pub(crate) fn descriptors(&self) -> [BorrowedFd<'_>; 2] {
+        [ipc::descriptor(self.server.requests()), self.orders.event.as_fd()]
+    }
+
     /// Answers what the links have taken, and hands on what came in.
     pub(crate) fn serve(&mut self) {
-        self.event.clear();
-        while let Ok((number, outcome)) = self.outcomes.try_recv() {
+        self.orders.event.clear();
+        while let Some((number, outcome)) = self.orders.outcome() {
             if let Some(at) = self.open.iter().position(|(open, _)| *open == number) {
                 let (_, asked) = self.open.swap_remove(at);
                 self.answer(asked, outcome);
@@ -132,30 +183,12 @@ impl ControlServer {
 
     /// Puts what `asked` wants into the link's queue; the number by which its outcome will be told.
     fn queue(&mut self, asked: &Asked) -> Result<u64, Failure> {
-        let (request, sensor) = (asked.request(), asked.request().sensor());
-        let link = self.links.iter().find(|link| link.sensor == sensor).ok_or_else(|| {
-            let sensors: Vec<_> = self.links.iter().map(|link| link.sensor.as_str()).collect();
-            let there_are = format!("there are {}", sensors.join(", "));
-            Failure::new(Kind::NoTopic, format!("the hub has no sensor {sensor}"), there_are)
-        })?;
+        let request = asked.request();
         let verb = request.verb().ok_or_else(|| {
             let message = format!("request {} is not known to this hub", request.verb);
             Failure::new(Kind::Failed, message, "client and hub are of different versions")
         })?;
-        match link.queue.try_send(QueuedRequest { number: self.next, verb, model: Box::new(request.model()) })
-        {
-            Ok(()) => {}
-            Err(TrySendError::Full(_)) => {
-                let message = format!("{sensor} already has {QUEUE} waiting requests");
-                return Err(Failure::new(Kind::Short, message, "try again in a moment"));
-            }
-            Err(TrySendError::Disconnected(_)) => {
-                return Err(Failure::new(Kind::Failed, format!("the link {sensor} has ended"), ""));
-            }
-        }
-        link.event.signal();
-        self.next += 1;
-        Ok(self.next - 1)
+        self.orders.ask(request.sensor(), verb, Box::new(request.model()))
     }
 
     fn answer(&self, asked: Asked, outcome: Outcome) {

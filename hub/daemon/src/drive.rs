@@ -1,38 +1,33 @@
-//! Drives a session with a sensor on an open port, until the hub ends or the port is gone. The way of a scan, from the line
+//! Drives a session with a sensor on an open port, until that is gone. The way of a scan, from the line
 //! to whoever sleeps for it, is here:
 //!
-//! - **read**: [`Driver::stream`] waits for the port and reads into the session's buffer;
+//! - **read**: [`Driver::turn`] reads into the session's buffer once the port is ready;
 //! - **frame**: [`Driver::drain`] asks the session what the bytes are, and gets a telegram in that buffer, decoded once;
 //! - **loan**, **decode**, **process**, **send**: [`LinkOutput::process`](crate::process_telegram::LinkOutput::process)
 //!   sends the telegram, then takes loans of shared memory, writes the scan and what the processors make of it in place, and
 //!   sends them (`topics.rs`, `pipeline.rs`);
-//! - **ring**: [`LinkThread::publish`] wakes the consumers, once a telegram.
+//! - **ring**: [`LinkCore::publish`] wakes the consumers, once a telegram.
 //!
 //! Nothing on this way allocates, locks or logs. Refuses to know how the port came to be open.
 
 use std::io;
-use std::os::fd::AsFd;
 
 use lms::framer::suspect;
 use lms::session::Output;
 use lms::variant::Baud;
 use lms::{Identity, Nanos, Session};
-use port::{LineErrors, Port, Source, clock};
-use rustix::event::PollFlags;
+use port::{Allowance, LineErrors, Source};
 use schema::State;
 
 use crate::control::Flow;
 use crate::identity_cache::IdentityCache;
-use crate::last_rate::LastRate;
-use crate::link::{LinkThread, Woken};
-use crate::process_telegram::RecordedContext;
+use crate::link::LinkCore;
+use crate::surroundings::{Learned, Line, On, Surroundings, Woken};
 
 /// What outlives a session on a port, for the next one.
-pub(crate) struct Driver {
+pub(crate) struct Driver<'a, S: Surroundings> {
     /// What the next hub would like to know.
-    identity: IdentityCache,
-    /// Where the sensor was found the last time; nothing on a line whose rate cannot be changed.
-    last_rate: Option<LastRate>,
+    identity: IdentityCache<'a, S>,
     /// Rates that the port cannot have, as was said.
     refused: Vec<Baud>,
     line_errors: LineErrors,
@@ -40,108 +35,123 @@ pub(crate) struct Driver {
     is_behind: bool,
 }
 
-impl Driver {
-    /// For the port of `link`.
-    pub(crate) fn new(link: &LinkThread<'_>) -> Driver {
-        let (name, port) = (&link.link.name, link.link.port.name());
-        let identity = IdentityCache::open(link.around.root, name, &port);
-        let is_tty = matches!(link.link.port, Source::Tty(_));
-        let last_rate = is_tty.then(|| LastRate::open(link.around.state, name, &port));
-        Driver {
-            identity,
-            last_rate,
-            refused: Vec::new(),
-            line_errors: LineErrors::default(),
-            is_behind: false,
-        }
+/// A session on an open line, and what it waits for.
+pub(crate) struct Open<L> {
+    pub(crate) line: L,
+    pub(crate) session: Session,
+    /// What may be read; nothing where all may.
+    allowance: Option<Allowance>,
+    /// Whether bytes are waited for.
+    watch: bool,
+    /// Until when the session waits.
+    until: Nanos,
+    /// Until when nothing may be read, whatever the session waits for.
+    rest: Option<Nanos>,
+}
+
+impl<L: Line> Open<L> {
+    /// `session` on `line`, at whose nominal `baud` it brings no more than twice that.
+    pub(crate) fn new(line: L, session: Session, baud: u32) -> Open<L> {
+        let allowance = line.allowance(baud);
+        Open { line, session, allowance, watch: true, until: 0, rest: None }
+    }
+
+    /// What to wait for, and until when. Also while bytes are left alone the port may go away.
+    pub(crate) fn wait(&self) -> (On<'_, L>, Nanos) {
+        let watch = self.watch && self.rest.is_none();
+        let on = if watch { On::Bytes(&self.line) } else { On::Loss(&self.line) };
+        (on, self.rest.unwrap_or(self.until))
+    }
+}
+
+impl<'a, S: Surroundings> Driver<'a, S> {
+    /// For the port of `core`.
+    pub(crate) fn new(core: &LinkCore<'a, S>) -> Driver<'a, S> {
+        let identity = IdentityCache::new(core.around, &core.link.name, core.link.port.name());
+        Driver { identity, refused: Vec::new(), line_errors: LineErrors::default(), is_behind: false }
     }
 
     /// What the hub before this one knew of the sensor, if that was just now.
-    pub(crate) fn recall(&self) -> Option<Identity> {
-        self.identity.recall(clock::now())
+    pub(crate) fn recall(&self, now: Nanos) -> Option<Identity> {
+        self.identity.recall(now)
     }
 
-    /// The rate to begin with where the sensor has to be sought.
-    pub(crate) fn last_rate(&self) -> Option<Baud> {
-        self.last_rate.as_ref().and_then(LastRate::baud)
-    }
-
-    /// Drives `session` on `port` until the hub shall end; an error says that the port is gone.
-    pub(crate) fn stream(
-        &mut self,
-        link: &mut LinkThread<'_>,
-        port: &Port,
-        session: &mut Session,
-    ) -> io::Result<()> {
+    /// Begins on a line that was just opened; an error says that it is gone.
+    pub(crate) fn begin(&mut self, core: &mut LinkCore<'a, S>, open: &mut Open<S::Line>) -> io::Result<()> {
         self.is_behind = false;
-        let mut allowance = port.allowance(link.link.baud.rate());
-        loop {
-            let (watch, until) = self.drain(link, port, session)?;
-            let rest = allowance.as_mut().and_then(|allowance| allowance.rest(clock::now(), until));
-            // Also while bytes are left alone the port may go away.
-            let events = if watch && rest.is_none() { PollFlags::IN } else { PollFlags::empty() };
-            match link.wait(Some((port.as_fd(), events)), rest.unwrap_or(until)) {
-                Woken::Stop => return Ok(()),
-                Woken::Request => {
-                    link.handle_requests(Flow::Session(session));
-                    continue;
-                }
-                Woken::Ready | Woken::Timeout => {}
-            }
-            if !watch {
-                // The telegram's end is near: what can be done before it is not done after it.
-                link.output.prepare();
-            }
-            if watch
-                && session.may_leave()
-                && let Some(waiting) = port.waiting()
-                && session.leave(clock::now(), waiting)
-            {
-                continue;
-            }
-            let mut spare = session.spare();
-            if let Some(allowance) = &allowance {
-                let most = spare.len().min(allowance.bytes(clock::now()).max(1));
-                spare = &mut spare[..most];
-            }
-            let room = spare.len();
-            let len = port.read(spare)?;
-            let now = clock::now();
-            session.commit(now, len);
-            if let Some(allowance) = &mut allowance {
-                allowance.take(len, room, now);
-                self.is_behind = allowance.is_behind(now);
-                link.diagnosis.watch_flood(allowance.is_flooded(now));
-            }
-            if len == 0 && now >= until {
-                session.handle_timeout(now);
-            }
-        }
+        self.drain(core, open)
     }
 
-    /// Does what the session wants, until it wants to wait: whether for bytes, and until when.
-    fn drain(
+    /// Goes on after a wait that ended as `woken` says; an error says that the line is gone.
+    pub(crate) fn turn(
         &mut self,
-        link: &mut LinkThread<'_>,
-        port: &Port,
-        session: &mut Session,
-    ) -> io::Result<(bool, Nanos)> {
+        core: &mut LinkCore<'a, S>,
+        open: &mut Open<S::Line>,
+        woken: Woken,
+    ) -> io::Result<()> {
+        if woken == Woken::Request {
+            core.handle_requests(Flow::Session(&mut open.session));
+        } else {
+            self.read(core, open)?;
+        }
+        self.drain(core, open)
+    }
+
+    fn read(&mut self, core: &mut LinkCore<'a, S>, open: &mut Open<S::Line>) -> io::Result<()> {
+        let Open { line, session, allowance, watch, until, .. } = open;
+        let around = core.around;
+        if !*watch {
+            // The telegram's end is near: what can be done before it is not done after it.
+            core.output.prepare();
+        }
+        if *watch
+            && session.may_leave()
+            && let Some(waiting) = line.waiting()
+            && session.leave(around.now(), waiting)
+        {
+            return Ok(());
+        }
+        let mut spare = session.spare();
+        if let Some(allowance) = &allowance {
+            let most = spare.len().min(allowance.bytes(around.now()).max(1));
+            spare = &mut spare[..most];
+        }
+        let room = spare.len();
+        let len = line.read(spare)?;
+        let now = around.now();
+        session.commit(now, len);
+        if let Some(allowance) = allowance {
+            allowance.take(len, room, now);
+            self.is_behind = allowance.is_behind(now);
+            core.diagnosis.watch_flood(allowance.is_flooded(now));
+        }
+        if len == 0 && now >= *until {
+            session.handle_timeout(now);
+        }
+        Ok(())
+    }
+
+    /// Does what the session wants, until it wants to wait.
+    fn drain(&mut self, core: &mut LinkCore<'a, S>, open: &mut Open<S::Line>) -> io::Result<()> {
+        let Open { line, session, .. } = open;
+        let around = core.around;
+        let recorded = core.recorded();
         let mut published = false;
-        let (watch, until) = loop {
+        (open.watch, open.until) = loop {
             match session.poll_output() {
-                Output::SetBaud(baud) => self.set_baud(link, port, baud)?,
+                Output::SetBaud(baud) => self.set_baud(core, line, baud)?,
                 Output::Transmit { byte, not_before } => {
-                    pause(not_before);
-                    port.write(byte)?;
-                    session.transmitted(clock::now());
+                    around.pause(not_before);
+                    line.write(byte)?;
+                    session.transmitted(around.now());
                 }
                 Output::Telegram(mut received) => {
-                    let counted = port.line_errors();
-                    link.stats.line_errors += counted;
+                    let counted = line.line_errors();
+                    core.stats.line_errors += counted;
                     let is_hit = self.line_errors.note(counted);
                     received.estimated |= self.is_behind;
                     received.reasons |= if is_hit { suspect::LINE_ERROR } else { 0 };
-                    link.publish(&received, &RecordedContext::default(), self.is_behind);
+                    core.publish(&received, &recorded, self.is_behind);
                     published = true;
                 }
                 Output::Rest(until) => break (false, until),
@@ -152,34 +162,42 @@ impl Driver {
             self.line_errors.wait();
         }
         self.identity.keep_first(session);
-        let (state, is_new) = link.diagnosis.examine(session);
-        if is_new {
-            self.last_rate.iter_mut().for_each(|last| last.keep(session));
+        let (state, is_new) = core.diagnosis.examine(session);
+        if is_new
+            && let Some(found) = session.found_at()
+            && let Some(learned) = rates(core)
+        {
+            learned.keep_rate(&core.link.port.name(), found.rate());
         }
-        if (is_new || link.is_due(clock::now())) && link.show_session(session, state) {
-            self.identity.keep(session, clock::now());
+        if (is_new || core.is_due(around.now())) && core.show_session(session, state) {
+            self.identity.keep(session, around.now());
         }
         // While telegrams come there is no need for wake-ups of the status' own.
-        let bound = if state == State::Streaming { Nanos::MAX } else { link.next_status() };
-        Ok((watch, until.min(bound)))
+        let bound = if state == State::Streaming { Nanos::MAX } else { core.next_status() };
+        open.until = open.until.min(bound);
+        open.rest = open.allowance.as_mut().and_then(|allowance| allowance.rest(around.now(), open.until));
+        Ok(())
     }
 
     /// The sensor is looked for at those rates that the port can have; of another one it is said once that it cannot.
-    fn set_baud(&mut self, link: &LinkThread<'_>, port: &Port, baud: Baud) -> io::Result<()> {
-        if let Some(error) = port.try_baud(baud.rate())?
+    fn set_baud(&mut self, core: &LinkCore<'a, S>, line: &S::Line, baud: Baud) -> io::Result<()> {
+        if let Some(error) = line.set_baud(baud.rate())?
             && !self.refused.contains(&baud)
         {
             self.refused.push(baud);
-            tracing::warn!("{}: {error}", link.link.name);
+            tracing::warn!("{}: {error}", core.link.name);
         }
         Ok(())
     }
 }
 
-/// Sleeps until `not_before`, too short a time to watch anything meanwhile.
-fn pause(not_before: Nanos) {
-    let now = clock::now();
-    if not_before > now {
-        std::thread::sleep(std::time::Duration::from_nanos(not_before - now));
-    }
+/// The rate to begin with where the sensor of `core` has to be sought.
+pub(crate) fn last_rate<S: Surroundings>(core: &LinkCore<'_, S>) -> Option<Baud> {
+    let rate = rates(core)?.rate(&core.link.port.name())?;
+    Baud::ALL.into_iter().find(|baud| baud.rate() == rate)
+}
+
+/// Where rates are kept; nothing on a line whose rate cannot be changed.
+fn rates<'a, S: Surroundings>(core: &LinkCore<'a, S>) -> Option<&'a dyn Learned> {
+    core.around.learned().filter(|_| matches!(core.link.port, Source::Tty(_)))
 }

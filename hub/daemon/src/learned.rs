@@ -1,89 +1,247 @@
-//! What a hub has learned of the backgrounds of its sensors, kept for the next one: without it whoever stands there while that
-//! one starts is background, and for seconds nobody is foreground. Links hand their models on between two scans; a thread
-//! that may wait for a disk writes them. Refuses to know how a background is learned.
+//! What a hub has learned of its sensors, kept for the next one: their backgrounds, without which whoever stands there while
+//! that one starts is background, and for seconds nobody is foreground; and the rates at which they were found. Links hand it
+//! on between two scans; it is written when it is worth it. Time is an argument. Refuses to know how a background is learned,
+//! and how long a disk takes.
 
 mod file;
+mod rate;
+mod writer;
 
-use std::io;
-use std::path::Path;
-use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
-use std::sync::{Arc, Mutex, PoisonError};
-use std::thread::{self, JoinHandle};
+use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
 use config::{Config, Link};
 use lms::{MILLIS, Nanos};
-use port::{Source, clock};
-use rustix::event::{PollFd, PollFlags, poll};
-use schema::{Age, Background, Failure, Kind, Pose, StateDirectory};
+use port::Source;
+use schema::{Age, Background, Failure, Pose, StateDirectory};
 
 use crate::event_fd::EventFd;
-use crate::preflight::no_resource;
+use crate::surroundings;
 use file::Learned;
+pub(crate) use writer::Writer;
 
-/// The thread that writes; ends when this is dropped, after what was handed on until then.
-pub(crate) struct Keeper {
-    shared: Arc<Shared>,
-    thread: Option<JoinHandle<()>>,
+/// Where texts are kept under names between two hubs.
+pub trait Files {
+    /// Returns what `name` holds; nothing if there is none.
+    ///
+    /// # Errors
+    ///
+    /// It cannot be read, or has more than `most` bytes.
+    fn read(&self, name: &str, most: u64) -> Result<Option<String>, Failure>;
+
+    /// Replaces what `name` holds by `text`, whole or not at all.
+    ///
+    /// # Errors
+    ///
+    /// It cannot be written; what it held is still there.
+    fn write(&self, name: &str, text: &str) -> Result<(), Failure>;
+
+    /// Removes `name`, if it is there.
+    ///
+    /// # Errors
+    ///
+    /// It stays.
+    fn remove(&self, name: &str) -> Result<(), Failure>;
+
+    /// Returns where `name` is, in words.
+    fn place(&self, name: &str) -> String;
 }
 
-struct Shared {
-    state: StateDirectory,
+impl Files for StateDirectory {
+    fn read(&self, name: &str, most: u64) -> Result<Option<String>, Failure> {
+        self.read(name, most)
+    }
+
+    fn write(&self, name: &str, text: &str) -> Result<(), Failure> {
+        self.write(name, text)
+    }
+
+    fn remove(&self, name: &str) -> Result<(), Failure> {
+        self.remove(name)
+    }
+
+    fn place(&self, name: &str) -> String {
+        self.path(name).display().to_string()
+    }
+}
+
+/// Writes what was handed on into files, when it is due.
+pub struct Keeper<F> {
+    files: F,
+    slots: Arc<Slots>,
+    written: Vec<Written>,
+}
+
+/// The ways of all sensors to their files.
+pub struct Slots {
     slots: Vec<Slot>,
-    event: Arc<EventFd>,
-    is_over: AtomicBool,
+    /// Rings when something was handed on.
+    event: EventFd,
 }
 
-/// The way of one sensor's models to their file.
-pub(crate) struct Slot {
+/// What one link hands on.
+struct Slot {
     sensor: String,
     /// The last one that was not taken.
     model: Mutex<Option<(Pose, Background)>>,
     /// 0 if none is kept.
     kept_wall_ns: AtomicU64,
-    event: Arc<EventFd>,
+    /// Rate and port, and whether that is to be written.
+    rate: Mutex<(Option<(u32, String)>, bool)>,
 }
 
-/// Gives the links of `config` the models to begin with that `state` has for them, and whoever writes theirs there.
-///
-/// [`Kind::Short`](schema::Kind) if descriptors are, or threads.
-pub(crate) fn begin(
-    mut config: Config,
-    state: Option<&StateDirectory>,
-) -> Result<(Config, Option<Keeper>), Failure> {
-    let is_live = |link: &&mut Link| !matches!(link.port, Source::File { .. });
-    let Some(state) = state else { return Ok((config, None)) };
-    let event = Arc::new(EventFd::new()?);
-    let mut slots = Vec::new();
-    for link in config.links.iter_mut().filter(is_live) {
-        let kept_wall_ns = AtomicU64::new(recall(link, state));
-        slots.push(Slot {
+/// The slot of one link.
+#[derive(Clone, Copy)]
+pub struct Handle<'a> {
+    slots: &'a Slots,
+    slot: &'a Slot,
+}
+
+/// What is known of one file of a background.
+#[derive(Default)]
+struct Written {
+    /// The generation that was written last, by this hub.
+    generation: Option<u32>,
+    /// What is to be written, and not before then.
+    waiting: Option<(Pose, Background)>,
+    due: Nanos,
+    /// That it cannot be written was said.
+    is_told: bool,
+}
+
+impl<F: Files> Keeper<F> {
+    /// Gives the links of `config` the models to begin with that `files` has for them, and whoever writes theirs there;
+    /// nothing if no link learns of a live sensor. `wall_ns` is the time.
+    ///
+    /// # Errors
+    ///
+    /// [`Kind::Short`](schema::Kind) if descriptors are.
+    pub fn begin(mut config: Config, files: F, wall_ns: u64) -> Result<(Config, Option<Keeper<F>>), Failure> {
+        let is_live = |link: &&mut Link| !matches!(link.port, Source::File { .. });
+        let slot = |link: &mut Link| Slot {
             sensor: link.name.clone(),
             model: Mutex::default(),
-            kept_wall_ns,
-            event: event.clone(),
-        });
+            kept_wall_ns: AtomicU64::new(recall(link, &files, wall_ns)),
+            rate: Mutex::new((known_rate(link, &files), false)),
+        };
+        let slots: Vec<_> = config.links.iter_mut().filter(is_live).map(slot).collect();
+        if slots.is_empty() {
+            return Ok((config, None));
+        }
+        let written = slots.iter().map(|_| Written::default()).collect();
+        let slots = Arc::new(Slots { slots, event: EventFd::new()? });
+        Ok((config, Some(Keeper { files, slots, written })))
     }
-    if slots.is_empty() {
-        return Ok((config, None));
+
+    /// What the links share with it.
+    pub fn slots(&self) -> Arc<Slots> {
+        self.slots.clone()
     }
-    let shared = Arc::new(Shared { state: state.clone(), slots, event, is_over: AtomicBool::new(false) });
-    let body = shared.clone();
-    let thread = thread::Builder::new().name(THREAD.into()).spawn(move || body.write());
-    let thread = thread.map_err(|error| no_resource("a thread", &error))?;
-    Ok((config, Some(Keeper { shared, thread: Some(thread) })))
+
+    /// Writes what is due at `now`: the first model of a generation at once, later ones once a minute; if this is the
+    /// `last` time, all. When something is due again; `Nanos::MAX` if nothing waits.
+    pub fn turn(&mut self, now: Nanos, wall_ns: u64, is_last: bool) -> Nanos {
+        let mut until = Nanos::MAX;
+        for (slot, file) in self.slots.slots.iter().zip(&mut self.written) {
+            slot.write_rate(&self.files);
+            file.waiting = held(&slot.model).take().or(file.waiting.take());
+            let Some((pose, model)) = &file.waiting else { continue };
+            if !is_last && file.generation == Some(model.generation) && now < file.due {
+                until = until.min(file.due);
+                continue;
+            }
+            if let Err(failure) = slot.write_model(&self.files, *pose, model, wall_ns)
+                && !std::mem::replace(&mut file.is_told, true)
+            {
+                tracing::warn!("{}: {}; {}", slot.sensor, failure.message, failure.hint);
+            }
+            (file.generation, file.due) = (Some(model.generation), now + INTERVAL);
+            file.waiting = None;
+        }
+        until
+    }
+}
+
+impl Slots {
+    /// That of `sensor`.
+    pub fn of(&self, sensor: &str) -> Option<Handle<'_>> {
+        let slot = self.slots.iter().find(|slot| slot.sensor == sensor)?;
+        Some(Handle { slots: self, slot })
+    }
+}
+
+impl surroundings::Learned for Handle<'_> {
+    fn keep_background(&self, pose: Pose, model: Background) {
+        *held(&self.slot.model) = Some((pose, model));
+        self.slots.event.signal();
+    }
+
+    fn kept_wall_ns(&self) -> Option<u64> {
+        Some(self.slot.kept_wall_ns.load(Ordering::Relaxed)).filter(|&wall_ns| wall_ns != 0)
+    }
+
+    fn rate(&self, port: &str) -> Option<u32> {
+        let (known, _) = &*held(&self.slot.rate);
+        known.as_ref().filter(|(_, of)| of == port).map(|(rate, _)| *rate)
+    }
+
+    fn keep_rate(&self, port: &str, rate: u32) {
+        let news = (Some((rate, port.to_owned())), true);
+        let mut known = held(&self.slot.rate);
+        if known.0 != news.0 {
+            *known = news;
+            self.slots.event.signal();
+        }
+    }
+}
+
+impl Slot {
+    /// Makes the file say `model`. One that knows nothing has no file: what was known before is not true any more.
+    fn write_model(
+        &self,
+        files: &impl Files,
+        pose: Pose,
+        model: &Background,
+        wall_ns: u64,
+    ) -> Result<(), Failure> {
+        let file = background_of(&self.sensor);
+        if model.taught == 0 {
+            // A hub that did not begin with it has something to say of it once its own was forgotten.
+            let was_kept = self.kept_wall_ns.swap(0, Ordering::Relaxed) != 0;
+            let is_forgotten = was_kept || model.generation > 0;
+            return if is_forgotten { files.remove(&file) } else { Ok(()) };
+        }
+        let text = Learned { model: *model, pose, wall_ns }.text(&self.sensor)?;
+        files.write(&file, &text)?;
+        self.kept_wall_ns.store(wall_ns, Ordering::Relaxed);
+        Ok(())
+    }
+
+    /// Writes the rate, if that is news; the disk is waited for while nobody holds the slot.
+    fn write_rate(&self, files: &impl Files) {
+        let text = {
+            let mut known = held(&self.rate);
+            let is_news = std::mem::take(&mut known.1);
+            known.0.as_ref().filter(|_| is_news).map(|(rate, port)| rate::text(*rate, port))
+        };
+        if let Some(text) = text
+            && let Err(failure) = files.write(&rate_of(&self.sensor), &text)
+        {
+            tracing::warn!("{}: {}; {}", self.sensor, failure.message, failure.hint);
+        }
+    }
 }
 
 /// Lets `link` begin with what is kept for it, if it fits and nothing else was said; when that was written, else 0.
-fn recall(link: &mut Link, state: &StateDirectory) -> u64 {
+fn recall(link: &mut Link, files: &impl Files, now_wall_ns: u64) -> u64 {
     let name = &link.name;
     let background = &mut link.processing.background;
     if !background.is_kept || !background.is_handed_on || background.start_is_said {
         return 0;
     }
-    let file = file_of(name);
-    let place = state.path(&file).display().to_string();
-    let text = match state.read(&file, LONGEST) {
+    let file = background_of(name);
+    let text = match files.read(&file, LONGEST) {
         Ok(Some(text)) => text,
         Ok(None) => return 0,
         Err(failure) => {
@@ -91,10 +249,9 @@ fn recall(link: &mut Link, state: &StateDirectory) -> u64 {
             return 0;
         }
     };
-    match Learned::read(&text, &place, link) {
+    match Learned::read(&text, &files.place(&file), link) {
         Ok(Learned { model, wall_ns, .. }) => {
-            let now = clock::now();
-            let age = Age(Duration::from_nanos(clock::wall(now, now).saturating_sub(wall_ns)));
+            let age = Age(Duration::from_nanos(now_wall_ns.saturating_sub(wall_ns)));
             let Background { taught, count, .. } = model;
             tracing::info!(
                 "{}: starts with the background saved {age} ago, {taught} of {count} beams known",
@@ -110,120 +267,74 @@ fn recall(link: &mut Link, state: &StateDirectory) -> u64 {
     }
 }
 
-impl Keeper {
-    /// The way of the models of `sensor`.
-    pub(crate) fn slot(&self, sensor: &str) -> Option<&Slot> {
-        self.shared.slots.iter().find(|slot| slot.sensor == sensor)
-    }
+/// The rate that is known of the sensor of `link`, and its port. On a line whose rate cannot be changed none is sought.
+fn known_rate(link: &Link, files: &impl Files) -> Option<(u32, String)> {
+    let Source::Tty(_) = link.port else { return None };
+    let text = files.read(&rate_of(&link.name), rate::LONGEST).unwrap_or_else(|failure| {
+        tracing::warn!("{}: {}; {}", link.name, failure.message, failure.hint);
+        None
+    })?;
+    rate::read(&text).map(|(rate, port)| (rate, port.to_owned()))
 }
 
-impl Drop for Keeper {
-    fn drop(&mut self) {
-        self.shared.is_over.store(true, Ordering::Relaxed);
-        self.shared.event.signal();
-        // One that panicked has said so.
-        let _ = self.thread.take().map(JoinHandle::join);
-    }
+/// What a thread that panicked held is whole: each is replaced at once.
+fn held<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
+    mutex.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
-impl Slot {
-    /// Lets `model` be written, of a sensor that sits at `pose`. Waits for nothing but a copy of it.
-    pub(crate) fn put(&self, pose: Pose, model: Background) {
-        *self.model.lock().unwrap_or_else(PoisonError::into_inner) = Some((pose, model));
-        self.event.signal();
-    }
-
-    /// When the one was written that the next hub would begin with, in nanoseconds since 1970.
-    pub(crate) fn kept_wall_ns(&self) -> Option<u64> {
-        Some(self.kept_wall_ns.load(Ordering::Relaxed)).filter(|&wall_ns| wall_ns != 0)
-    }
-
-    fn take(&self) -> Option<(Pose, Background)> {
-        self.model.lock().unwrap_or_else(PoisonError::into_inner).take()
-    }
-}
-
-/// What is known of one file.
-#[derive(Default)]
-struct Written {
-    /// The generation that was written last, by this hub.
-    generation: Option<u32>,
-    /// What is to be written, and not before then.
-    waiting: Option<(Pose, Background)>,
-    due: Nanos,
-    /// That it cannot be written was said.
-    is_told: bool,
-}
-
-impl Shared {
-    /// Writes what comes until it is over: the first model of a generation at once, later ones every [`INTERVAL`].
-    fn write(&self) {
-        let mut files: Vec<Written> = self.slots.iter().map(|_| Written::default()).collect();
-        loop {
-            self.event.clear();
-            let is_over = self.is_over.load(Ordering::Relaxed);
-            let now = clock::now();
-            let mut until = Nanos::MAX;
-            for (slot, file) in self.slots.iter().zip(&mut files) {
-                file.waiting = slot.take().or(file.waiting.take());
-                let Some((pose, model)) = &file.waiting else { continue };
-                if !is_over && file.generation == Some(model.generation) && now < file.due {
-                    until = until.min(file.due);
-                    continue;
-                }
-                if let Err(failure) = self.put(slot, *pose, model)
-                    && !std::mem::replace(&mut file.is_told, true)
-                {
-                    tracing::warn!("{}: {}; {}", slot.sensor, failure.message, failure.hint);
-                }
-                (file.generation, file.due) = (Some(model.generation), now + INTERVAL);
-                file.waiting = None;
-            }
-            if is_over {
-                return;
-            }
-            let span = (until != Nanos::MAX).then(|| clock::span(now, until));
-            // Whatever ends the wait, it is looked what there is.
-            let _ = poll(&mut [PollFd::new(&*self.event, PollFlags::IN)], span.as_ref());
-        }
-    }
-
-    /// Makes the file of `slot` say `model`. One that knows nothing has no file: what was known before is not true any more.
-    fn put(&self, slot: &Slot, pose: Pose, model: &Background) -> Result<(), Failure> {
-        let file = file_of(&slot.sensor);
-        if model.taught == 0 {
-            // A hub that did not begin with it has something to say of it once its own was forgotten.
-            let was_kept = slot.kept_wall_ns.swap(0, Ordering::Relaxed) != 0;
-            let is_forgotten = was_kept || model.generation > 0;
-            return if is_forgotten { remove(&self.state.path(&file)) } else { Ok(()) };
-        }
-        let now = clock::now();
-        let wall_ns = clock::wall(now, now);
-        let text = Learned { model: *model, pose, wall_ns }.text(&slot.sensor)?;
-        self.state.write(&file, &text)?;
-        slot.kept_wall_ns.store(wall_ns, Ordering::Relaxed);
-        Ok(())
-    }
-}
-
-/// Removes the file at `path`, if there is one.
-fn remove(path: &Path) -> Result<(), Failure> {
-    match std::fs::remove_file(path) {
-        Err(error) if error.kind() != io::ErrorKind::NotFound => {
-            let message = format!("{}: an old background file stays: {error}", path.display());
-            Err(Failure::new(Kind::Failed, message, "remove the file"))
-        }
-        _ => Ok(()),
-    }
-}
-
-fn file_of(sensor: &str) -> String {
+fn background_of(sensor: &str) -> String {
     format!("{sensor}.background.json")
 }
 
-/// The writing thread's name.
-const THREAD: &str = "learned";
+fn rate_of(sensor: &str) -> String {
+    format!("{sensor}.rate")
+}
+
 /// Between two writes of a generation: what a hub that is killed had learned since is learned again.
 const INTERVAL: Nanos = 60_000 * MILLIS;
 /// Far more bytes than a model has as text.
 const LONGEST: u64 = 1 << 20;
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::surroundings::Learned as _;
+    use config::Sources;
+
+    #[test]
+    fn the_rate_is_known_of_this_link_at_this_port() {
+        let root = std::env::temp_dir().join(format!("scanhub-learned-{}", std::process::id()));
+        let state = StateDirectory::at(root.join("state"));
+        let port = "/dev/serial/by-id/usb-FTDI 1";
+        let begin = |link: &str| {
+            let sources = Sources { links: vec![link.to_owned()], ..Sources::default() };
+            let config = Config::load(&sources).expect("a configuration");
+            Keeper::begin(config, state.clone(), 0).expect("descriptors").1.expect("a live link")
+        };
+        let known = |name: &str, port: &str| {
+            let keeper = begin(&format!("{name}={port}"));
+            keeper.slots().of(name).and_then(|slot| slot.rate(port))
+        };
+        assert_eq!(known("front", port), None, "the first one");
+        for rate in [9_600, 500_000] {
+            let mut keeper = begin(&format!("front={port}"));
+            let slots = keeper.slots();
+            slots.of("front").expect("a slot").keep_rate(port, rate);
+            assert_eq!(keeper.turn(1, 1, true), Nanos::MAX);
+            assert_eq!(known("front", port), Some(rate));
+            assert_eq!((known("rear", port), known("front", "/dev/ttyUSB0")), (None, None));
+        }
+        // What cannot be believed is as good as nothing.
+        state.write("front.rate", &"9".repeat(10_000)).unwrap();
+        assert_eq!(known("front", port), None);
+        std::fs::remove_dir_all(&root).unwrap();
+    }
+
+    #[test]
+    fn a_recording_is_learned_of_by_nobody() {
+        let sources = Sources { links: vec!["front=file:x".into()], ..Sources::default() };
+        let config = Config::load(&sources).expect("a configuration");
+        let (_, keeper) = Keeper::begin(config, StateDirectory::at("/nowhere"), 0).expect("descriptors");
+        assert!(keeper.is_none());
+    }
+}

@@ -1,30 +1,24 @@
-//! What a link's thread has, whatever the link's other end is: where its results go, what it reports of itself, what users
-//! ask of it, and how it waits. It sleeps until something comes or a deadline passes. Refuses to know where bytes come from.
-
-use std::os::fd::{BorrowedFd, OwnedFd};
-use std::path::Path;
-use std::sync::atomic::{AtomicBool, Ordering};
+//! What a link has, whatever its other end is: where its results go, what it reports of itself, what users ask of it, and
+//! when it has to do something although nothing came. Refuses to know where bytes come from, and how a wait is done.
 
 use config::{Link, Processing};
 use lms::session::Received;
 use lms::{Control, MILLIS, Nanos, Session, Settings};
-use port::{Source, clock};
-use rustix::event::{PollFd, PollFlags, poll};
-use schema::{Shown, State, StateDirectory, Verb, Wake};
+use port::Source;
+use schema::{Failure, Shown, State, Verb, Wake};
 
 use crate::control::{ControlQueue, Flow};
 use crate::diagnosis::Diagnosis;
-use crate::learned::Slot;
 use crate::link_stats::LinkStats;
 use crate::process_telegram::{LinkOutput, RecordedContext};
-use crate::service::Service;
+use crate::surroundings::{Learned, Surroundings, Woken};
 use crate::topics::Topics;
 
-/// The parts of a link's thread.
-pub(crate) struct LinkThread<'a> {
+/// The parts of a link.
+pub(crate) struct LinkCore<'a, S: Surroundings> {
     pub(crate) link: &'a Link,
-    pub(crate) around: Surroundings<'a>,
-    pub(crate) output: LinkOutput<'a>,
+    pub(crate) around: &'a S,
+    pub(crate) output: LinkOutput<'a, S>,
     pub(crate) stats: LinkStats,
     pub(crate) diagnosis: Diagnosis<'a>,
     pub(crate) control: ControlQueue,
@@ -34,60 +28,37 @@ pub(crate) struct LinkThread<'a> {
     next_status: Nanos,
 }
 
-/// What a link has around it.
-#[derive(Clone, Copy)]
-pub(crate) struct Surroundings<'a> {
-    /// Readable once the hub shall end.
-    pub(crate) stop: &'a OwnedFd,
-    /// Keeps the port when the hub is killed.
-    pub(crate) service: &'a Service,
-    /// The domain's directory.
-    pub(crate) root: &'a Path,
-    /// Where what was learned goes, for the next hub; nothing where that is not wanted.
-    pub(crate) slot: Option<&'a Slot>,
-    /// What outlives the machine's power; nothing where that is not wanted.
-    pub(crate) state: Option<&'a StateDirectory>,
-    /// Set whenever the link finished something.
-    pub(crate) worked: &'a AtomicBool,
-}
-
-/// Why a wait is over.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(crate) enum Woken {
-    /// The hub shall end.
-    Stop,
-    /// A user wants something.
-    Request,
-    /// There is something to do at the port.
-    Ready,
-    /// The time is up.
-    Timeout,
-}
-
-impl<'a> LinkThread<'a> {
-    /// The thread's parts; nothing happens yet.
+impl<'a, S: Surroundings> LinkCore<'a, S> {
+    /// The parts of `link`, number `number` in the configuration, for the hub's life `boot`. Makes its topics; nothing is
+    /// published yet.
+    ///
+    /// # Errors
+    ///
+    /// As [`Surroundings::medium`].
     pub(crate) fn new(
         link: &'a Link,
-        topics: Topics,
-        around: Surroundings<'a>,
+        number: u8,
+        boot: u64,
+        around: &'a S,
         control: ControlQueue,
-    ) -> Self {
-        let now = clock::now();
-        LinkThread {
+    ) -> Result<Self, Failure> {
+        let now = around.now();
+        let topics = Topics::new(around, &link.name, number, boot)?;
+        Ok(LinkCore {
             link,
             around,
-            output: LinkOutput::new(link, topics),
+            output: LinkOutput::new(link, around, topics),
             stats: LinkStats::new(link, now),
             diagnosis: Diagnosis::new(link),
             control,
             next_greeting: now,
             next_status: now,
-        }
+        })
     }
 
     /// Publishes how it is before anything can come.
     pub(crate) fn begin(&mut self) {
-        self.output.publish_start(clock::now());
+        self.output.publish_start(self.around.now());
     }
 
     /// The hub ends: lets be kept what was learned.
@@ -95,10 +66,22 @@ impl<'a> LinkThread<'a> {
         self.hand_on(true);
     }
 
+    /// The `session` on the port is over.
+    pub(crate) fn close(&mut self, session: &Session) {
+        self.diagnosis.end_flood();
+        self.stats.close(session);
+    }
+
     /// How a session with this link's sensor goes, or with a recording of one to which nobody talks.
     pub(crate) fn settings(&self, listen_only: bool) -> Settings {
         let fixed_rate = matches!(self.link.port, Source::Tcp { .. });
         Settings { variant: self.link.variant, baud: self.link.baud, listen_only, fixed_rate }
+    }
+
+    /// What is known beside the sensor: nothing of one that can be asked.
+    pub(crate) fn recorded(&self) -> RecordedContext {
+        let is_recording = matches!(self.link.port, Source::File { .. });
+        RecordedContext { mode: self.link.mode.filter(|_| is_recording), ..RecordedContext::default() }
     }
 
     /// Publishes `received` and what is made of it, and wakes the consumers. For how long the verdict on its scan stands,
@@ -128,14 +111,14 @@ impl<'a> LinkThread<'a> {
     /// Publishes the status if it changed or is due, and greets late joiners; `error` is what is wrong, in words. Whether a
     /// status went out.
     pub(crate) fn show(&mut self, session: Option<&Session>, state: State, error: &str) -> bool {
-        let now = clock::now();
+        let now = self.around.now();
         let changed = update(&mut self.stats, self.link, state, error, now);
         self.publish_status(session, state, changed, now)
     }
 
     /// As [`show`](Self::show), of a `session` that was examined: what is wrong is for [`Diagnosis`] to say.
     pub(crate) fn show_session(&mut self, session: &Session, state: State) -> bool {
-        let now = clock::now();
+        let now = self.around.now();
         let changed = update(&mut self.stats, self.link, state, self.diagnosis.explanation(), now);
         self.publish_status(Some(session), state, changed, now)
     }
@@ -166,54 +149,34 @@ impl<'a> LinkThread<'a> {
 
     /// Lets what was learned be kept, if that is news; if this is the `last` time, whatever there is.
     fn hand_on(&mut self, last: bool) {
-        if let Some(slot) = self.around.slot
+        if let Some(learned) = self.around.learned()
             && let Some((pose, model)) = self.output.hand_on(last)
         {
-            slot.put(pose, model);
+            learned.keep_background(pose, model);
         }
     }
 
-    /// Sleeps until the port has one of these events or is gone, `until`, or the hub's end.
-    pub(crate) fn wait(&mut self, port: Option<(BorrowedFd<'_>, PollFlags)>, until: Nanos) -> Woken {
-        loop {
-            let now = clock::now();
-            // What was due before comes first: it may be a scan.
-            self.output.expire(now, until);
-            // Whoever attaches to a silent sensor is greeted in time all the same.
-            let mut bound =
-                if self.stats.is_streaming() { until } else { until.min(self.next_greeting.max(now)) };
-            bound = bound.min(self.output.stale_at());
-            if port.is_some_and(|(_, events)| events.is_empty()) {
-                // Some drivers wake nobody who waits for no bytes.
-                bound = bound.min(now + LONGEST_REST);
-            }
-            let span = clock::span(now, bound);
-            let stop = PollFd::new(self.around.stop, PollFlags::IN);
-            let requests = PollFd::new(&self.control, PollFlags::IN);
-            let woken = match port {
-                Some((port, events)) => {
-                    let mut fds = [stop, requests, PollFd::from_borrowed_fd(port, events)];
-                    poll(&mut fds, Some(&span)).map(|_| fds.each_ref().map(is_ready))
-                }
-                None => {
-                    let mut fds = [stop, requests];
-                    poll(&mut fds, Some(&span)).map(|_| [is_ready(&fds[0]), is_ready(&fds[1]), false])
-                }
-            };
-            self.stats.wakeups += 1;
-            self.around.worked.store(true, Ordering::Relaxed);
-            match woken {
-                Ok([true, ..]) => return Woken::Stop,
-                Ok([_, true, _]) => return Woken::Request,
-                Ok([.., true]) => return Woken::Ready,
-                _ => {}
-            }
-            let now = clock::now();
-            if now >= until {
-                return Woken::Timeout;
-            }
+    /// Publishes what is due before a wait `until`; until when to wait instead, because something of the link's own is due
+    /// earlier. Some drivers wake nobody who waits for no bytes: a line whose bytes are `left_alone` is looked at now and then.
+    pub(crate) fn bound(&mut self, until: Nanos, left_alone: bool) -> Nanos {
+        let now = self.around.now();
+        // What was due before comes first: it may be a scan.
+        self.output.expire(now, until);
+        // Whoever attaches to a silent sensor is greeted in time all the same.
+        let greeting = if self.stats.is_streaming() { until } else { self.next_greeting.max(now) };
+        let look = if left_alone { now + LONGEST_REST } else { until };
+        until.min(greeting).min(self.output.stale_at()).min(look)
+    }
+
+    /// Whether a wait `until` is over now that it ended as `woken` says; else only late joiners were due.
+    pub(crate) fn is_over(&mut self, woken: Woken, until: Nanos) -> bool {
+        self.stats.wakeups += 1;
+        let now = self.around.now();
+        let is_over = woken != Woken::Timeout || now >= until;
+        if !is_over {
             self.greet(now);
         }
+        is_over
     }
 
     /// Does what users asked for, and takes over what was changed for it.
@@ -222,6 +185,7 @@ impl<'a> LinkThread<'a> {
             self.change(&processing);
         }
         while let Some(request) = self.control.take() {
+            let now = self.around.now();
             let control = match request.verb {
                 Verb::Pause => Some(Control::Pause),
                 Verb::Resume => Some(Control::Resume),
@@ -229,21 +193,21 @@ impl<'a> LinkThread<'a> {
                 Verb::Show | Verb::Reset | Verb::Freeze | Verb::Thaw | Verb::Load => None,
             };
             let outcome = match control {
-                Some(control) => self.control.control(control, &mut flow).map(|()| None),
+                Some(control) => self.control.control(control, &mut flow, now).map(|()| None),
                 None => {
                     let shown = self.output.handle(request.verb, &request.model);
-                    let kept_wall_ns = self.around.slot.and_then(Slot::kept_wall_ns);
+                    let kept_wall_ns = self.around.learned().and_then(Learned::kept_wall_ns);
                     shown.map(|model| model.map(|model| Box::new(Shown { model: *model, kept_wall_ns })))
                 }
             };
-            self.output.publish_background(clock::now());
+            self.output.publish_background(now);
             self.control.answer(request.number, outcome);
         }
     }
 
     /// From the next scan on.
     fn change(&mut self, processing: &Processing) {
-        let now = clock::now();
+        let now = self.around.now();
         self.output.change(processing, now);
         self.stats.set_pose(processing.pose);
         self.next_status = now;
@@ -259,10 +223,6 @@ fn update(stats: &mut LinkStats, link: &Link, state: State, error: &str, now: Na
         error => tracing::warn!("{name}: {}: {error}", state.name()),
     }
     changed
-}
-
-fn is_ready(fd: &PollFd<'_>) -> bool {
-    !fd.revents().is_empty()
 }
 
 /// A port that is left alone is looked at so often whether it is still there; at the highest rate no rest is as long.

@@ -6,10 +6,10 @@ use lms::Nanos;
 use lms::reply::Reply;
 use lms::session::Received;
 use lms::variant::{Mode, Variant};
-use port::clock;
 use schema::{Background, Failure, Flags, Pose, Scan, Verb, Wake, Zones};
 
 use crate::pipeline::Pipeline;
+use crate::surroundings::Surroundings;
 use crate::topics::Topics;
 
 /// What a recording knows of a telegram and nobody could ask a line for; by default nothing.
@@ -39,9 +39,10 @@ pub(crate) struct Processed {
 }
 
 /// The results of one link: its topics, the processors that make what is in them, and how long the last verdict stands.
-pub(crate) struct LinkOutput<'a> {
+pub(crate) struct LinkOutput<'a, S: Surroundings> {
     link: &'a Link,
-    pub(crate) topics: Topics,
+    around: &'a S,
+    pub(crate) topics: Topics<'a, S>,
     pipeline: Pipeline,
     /// When the last verdict of the zones is too old to stand; `Nanos::MAX` if none stands.
     stale_at: Nanos,
@@ -49,11 +50,11 @@ pub(crate) struct LinkOutput<'a> {
     is_blind: bool,
 }
 
-impl<'a> LinkOutput<'a> {
+impl<'a, S: Surroundings> LinkOutput<'a, S> {
     /// The output of `link` into `topics`; nothing is published yet.
-    pub(crate) fn new(link: &'a Link, topics: Topics) -> Self {
+    pub(crate) fn new(link: &'a Link, around: &'a S, topics: Topics<'a, S>) -> Self {
         let pipeline = Pipeline::new(&link.processing);
-        LinkOutput { link, topics, pipeline, stale_at: Nanos::MAX, is_blind: false }
+        LinkOutput { link, around, topics, pipeline, stale_at: Nanos::MAX, is_blind: false }
     }
 
     /// Publishes a telegram and, if it is measured data that can be read, its scan and what is made of it. What `recorded`
@@ -98,7 +99,7 @@ impl<'a> LinkOutput<'a> {
         }
         let limit = limit(period_us);
         // Telegrams that had to wait for the hub are late, but scans do not stay out.
-        self.stale_at = clock::now().saturating_add(limit);
+        self.stale_at = self.around.now().saturating_add(limit);
         Processed { is_suspect, stands_for: Some(limit) }
     }
 

@@ -1,178 +1,236 @@
 //! The life of a port: streamed from while it is there, looked for while it is away, taken back when it returns under
 //! its name, whatever device that is then. Looking costs next to nothing; why it is away is said once, not at each look.
 
-use std::os::fd::AsFd;
-use std::sync::atomic::AtomicBool;
+use std::io;
 
 use lms::{Control, Identity, MILLIS, Nanos, Session};
-use port::{Port, PortError, Source, clock};
-use rustix::event::PollFlags;
+use port::{PortError, Source};
 use schema::{Failure, Flags, Kind, State};
 
-use crate::control::Flow;
-use crate::drive::Driver;
-use crate::link::{LinkThread, Woken};
+use crate::control::{ControlQueue, Flow};
+use crate::drive::{Driver, Open, last_rate};
+use crate::link::LinkCore;
+use crate::surroundings::{Line, On, Surroundings, Wait, Woken};
 
-/// Streams from the port of `link`, and takes it back whenever it was away, until the hub ends. `report` is called once, when
-/// it is clear whether the link can work: an absent port can, one that is busy, forbidden or no tty cannot.
-pub(crate) fn run(mut link: LinkThread<'_>, report: impl FnOnce(Result<(), Failure>)) {
-    link.begin();
-    match first_port(&link) {
-        Ok(found) => {
-            report(Ok(()));
-            let driver = Driver::new(&link);
-            let mut reconnect = Reconnect { link, driver };
-            reconnect.run(found);
-            reconnect.link.end();
-        }
-        Err(failure) => {
-            report(Err(failure));
-            link.end();
-        }
-    }
+/// A link whose other end is a port that comes and goes: told why a wait is over, it says for what to wait next.
+pub struct LiveLink<'a, S: Surroundings> {
+    core: LinkCore<'a, S>,
+    driver: Driver<'a, S>,
+    phase: Phase<S::Line>,
+    /// Times in a row that the port was there and went without a byte.
+    futile: u32,
 }
 
-/// The port at the hub's start.
-enum Found {
-    Open {
-        port: Port,
-        /// It is the one that a killed hub had and somebody kept, with what lies in it.
-        is_kept: bool,
-    },
-    Away(Away),
+/// Where the port is.
+enum Phase<L> {
+    /// There.
+    Open(Box<Open<L>>),
+    /// Away until it is looked for again, and what to wait for until then.
+    Away { away: Away, look_at: Nanos, until: Nanos },
+    /// Being opened.
+    Opening { away: Away, until: Nanos },
 }
 
-/// A link whose other end is a port that comes and goes.
-struct Reconnect<'a> {
-    link: LinkThread<'a>,
-    driver: Driver,
-}
-
-/// The port of `link` as it is now; a connection is not made yet.
-fn first_port(link: &LinkThread<'_>) -> Result<Found, Failure> {
-    if let Source::Tcp { .. } = link.link.port {
-        let words = format!("{}: not connected yet", link.link.port.name());
-        return Ok(Found::Away(Away::for_lack_of_a_port(words)));
-    }
-    match take_over(link) {
-        Ok((port, is_kept)) => Ok(Found::Open { port, is_kept }),
-        // Only a hub plays recordings.
-        Err(failure) if failure.kind == Kind::PortNotTty => {
-            let hint = format!("{}, or file:PATH for a recording", failure.hint);
-            Err(Failure { hint, ..failure })
-        }
-        Err(failure) if failure.kind != Kind::PortMissing => Err(failure),
-        Err(failure) => Ok(Found::Away(Away::for_lack_of_a_port(said(failure)))),
-    }
-}
-
-/// The tty of `link`, and whether it was kept for this hub.
-fn take_over(link: &LinkThread<'_>) -> Result<(Port, bool), Failure> {
-    let (service, link) = (link.around.service, link.link);
-    let mut adopted = None;
-    while let Some(line) = service.take(&link.name) {
-        match Port::adopt(line, &link.port, link.baud.rate()).filter(|_| adopted.is_none()) {
-            Some(port) => adopted = Some(port),
-            // One that hung up: whoever keeps it would have it handed over again.
-            None => service.forget(&link.name),
-        }
-    }
-    if let Some(port) = adopted {
-        tracing::info!(
-            "{}: continues with {}, which the service manager kept open",
-            link.name,
-            link.port.name()
-        );
-        return Ok((port, true));
-    }
-    Port::open(&link.port, link.baud.rate(), &AtomicBool::new(false)).map(|port| (port, false))
-}
-
-impl Reconnect<'_> {
-    /// Streams from the port, and takes it back whenever it was away.
-    fn run(&mut self, found: Found) {
-        let (mut opened, mut away, is_kept) = match found {
-            Found::Open { port, is_kept } => (Some(port), Away::default(), is_kept),
-            Found::Away(away) => (None, away, false),
-        };
-        let source = &self.link.link.port;
-        // On a line that was closed meanwhile it may be another sensor, or the same in another mode.
-        let mut known = self.driver.recall().filter(|_| is_kept);
-        // Times in a row that it was there and went without a byte.
-        let mut futile = 0;
-        loop {
-            if let Some(port) = opened.take() {
-                if let Port::Tty(_) = port {
-                    self.link.around.service.keep(&self.link.link.name, &port);
-                }
-                let (heard, end) = self.stay(&port, known.take());
-                let Err(error) = end else { return };
-                self.link.around.service.forget(&self.link.link.name);
-                self.link.stats.reconnects += 1;
-                futile = if heard { 0 } else { futile + 1 };
-                let words = format!("{} went away: {error}", source.name());
-                self.link.diagnosis.doubt(if heard { String::new() } else { words.clone() });
-                away = Away { refused: futile, ..Away::for_lack_of_a_port(words) };
+impl<'a, S: Surroundings> LiveLink<'a, S> {
+    /// Makes the topics of `link`, number `number` in the configuration, for the hub's life `boot`, publishes how it is
+    /// before anything can come, and looks for the port. Then [`turn`](Self::turn) is to be called with a timeout.
+    ///
+    /// # Errors
+    ///
+    /// The link cannot work: an absent port can, one that is busy, forbidden or no tty cannot; as
+    /// [`Surroundings::medium`].
+    pub fn new(
+        link: &'a config::Link,
+        number: u8,
+        boot: u64,
+        around: &'a S,
+        control: ControlQueue,
+    ) -> Result<Self, Failure> {
+        let mut core = LinkCore::new(link, number, boot, around, control)?;
+        core.begin();
+        let driver = Driver::new(&core);
+        let mut live = LiveLink { core, driver, phase: Phase::away(Away::default(), 0), futile: 0 };
+        match live.first_line() {
+            Ok(Some((line, is_kept))) => {
+                // On a line that was closed meanwhile it may be another sensor, or the same in another mode.
+                let known = live.driver.recall(around.now()).filter(|_| is_kept);
+                live.stay(line, known);
+                Ok(live)
             }
-            self.link.diagnosis.forget();
-            self.link.show(None, State::Absent, &away.words);
-            let look_at = clock::now() + away.pause();
-            while clock::now() < look_at {
-                match self.link.wait(None, look_at.min(self.link.next_status())) {
-                    Woken::Stop => return,
-                    Woken::Request => self.link.handle_requests(Flow::Away),
-                    Woken::Ready | Woken::Timeout => {
-                        self.link.show(None, State::Absent, &away.words);
+            Ok(None) => {
+                let words = format!("{}: not connected yet", link.port.name());
+                live.leave(Away::for_lack_of_a_port(words));
+                Ok(live)
+            }
+            Err(failure) if failure.kind == Kind::PortMissing => {
+                live.leave(Away::for_lack_of_a_port(said(failure)));
+                Ok(live)
+            }
+            // Only a hub plays recordings.
+            Err(failure) if failure.kind == Kind::PortNotTty => {
+                let hint = format!("{}, or file:PATH for a recording", failure.hint);
+                Err(Failure { hint, ..failure })
+            }
+            Err(failure) => Err(failure),
+        }
+    }
+
+    /// Does what there is to do after a wait that ended as `woken` says, and returns what to wait for next.
+    pub fn turn(&mut self, woken: Woken) -> Wait<'_, S::Line> {
+        let (_, until) = self.phase.wait();
+        if self.core.is_over(woken, until) {
+            match &mut self.phase {
+                Phase::Open(open) => {
+                    if let Err(error) = self.driver.turn(&mut self.core, open, woken) {
+                        self.lose(&error);
                     }
                 }
-            }
-            match self.reach(&away.words) {
-                None => return,
-                Some(Ok(port)) => opened = Some(port),
-                Some(Err(error)) => away.learn(error, source, clock::now()),
-            }
-        }
-    }
-
-    /// Tries to open the port, however long that takes; nothing if the hub shall end meanwhile.
-    fn reach(&mut self, words: &str) -> Option<Result<Port, PortError>> {
-        let link = self.link.link;
-        let dial = match Port::dial(&link.port) {
-            None => return Some(Port::attempt(&link.port, link.baud.rate(), &AtomicBool::new(false))),
-            Some(Err(error)) => return Some(Err(error)),
-            Some(Ok(dial)) => dial,
-        };
-        loop {
-            match self.link.wait(Some((dial.as_fd(), PollFlags::IN)), clock::now() + STILL_AWAY) {
-                Woken::Stop => return None,
-                Woken::Request => self.link.handle_requests(Flow::Away),
-                Woken::Ready => return Some(dial.finish()),
-                Woken::Timeout => {
-                    self.link.show(None, State::Absent, words);
+                Phase::Away { look_at, .. } => {
+                    let look_at = *look_at;
+                    self.pass(woken);
+                    if self.core.around.now() >= look_at {
+                        self.reach();
+                    }
                 }
+                Phase::Opening { .. } if woken == Woken::Ready => self.reach(),
+                Phase::Opening { .. } => self.pass(woken),
             }
+        }
+        let (on, until) = self.phase.wait();
+        let bound = self.core.bound(until, matches!(on, On::Loss(_)));
+        Wait { requests: &self.core.control, on, until: bound }
+    }
+
+    /// The hub ends: hands on what was learned.
+    pub fn end(mut self) {
+        if let Phase::Open(open) = &self.phase {
+            self.core.close(&open.session);
+        }
+        self.core.end();
+    }
+
+    /// The line at the hub's start, and whether it is the one that a killed hub had and somebody kept, with what lies in it;
+    /// nothing if a connection has to be made.
+    fn first_line(&self) -> Result<Option<(S::Line, bool)>, Failure> {
+        let (link, around) = (self.core.link, self.core.around);
+        let (name, source, baud) = (&link.name, &link.port, link.baud.rate());
+        if let Source::Tcp { .. } = source {
+            return Ok(None);
+        }
+        if let Some(line) = around.take_kept(name, source, baud) {
+            tracing::info!("{name}: continues with {}, which the service manager kept open", source.name());
+            return Ok(Some((line, true)));
+        }
+        match around.open(source, baud) {
+            Some(Ok(line)) => Ok(Some((line, false))),
+            Some(Err(error)) => Err(around.explain(&error, source)),
+            None => Ok(None),
         }
     }
 
-    /// A session on `port`, until the hub shall end; an error says that the port is gone. Whether a byte came.
-    /// It may go on with a stream of a sensor of which something is `known`.
-    fn stay(&mut self, port: &Port, known: Option<Identity>) -> (bool, std::io::Result<()>) {
-        let link = &mut self.link;
-        link.output.topics.set_flags(if port.simulated() { Flags::SIMULATED } else { 0 });
-        let mut session = Session::new(link.settings(false), clock::now());
+    /// Tries to open the port; what becomes of it is known at once, or when the wait for it is over.
+    fn reach(&mut self) {
+        let (link, around) = (self.core.link, self.core.around);
+        let mut away = self.phase.take_away();
+        match around.open(&link.port, link.baud.rate()) {
+            Some(Ok(line)) => self.stay(line, None),
+            Some(Err(error)) => {
+                away.learn(&error, around.now(), |error| said(around.explain(error, &link.port)));
+                self.leave(away);
+            }
+            None => self.phase = Phase::Opening { away, until: around.now() + STILL_AWAY },
+        }
+    }
+
+    /// A session on `line` begins; it may go on with a stream of a sensor of which something is `known`.
+    fn stay(&mut self, line: S::Line, known: Option<Identity>) {
+        let core = &mut self.core;
+        let now = core.around.now();
+        core.around.keep(&core.link.name, &line);
+        core.output.topics.set_flags(if line.is_simulated() { Flags::SIMULATED } else { 0 });
+        let is_recording = matches!(core.link.port, Source::File { .. });
+        let mut session = Session::new(core.settings(is_recording), now);
         if let Some(known) = known {
             session.recall(known);
         }
-        if let Some(baud) = self.driver.last_rate() {
+        if let Some(baud) = last_rate(core) {
             session.seek_first(baud);
         }
-        if link.control.is_paused() {
-            session.control(Control::Pause, clock::now());
+        if core.control.is_paused() {
+            session.control(Control::Pause, now);
         }
-        let end = self.driver.stream(link, port, &mut session);
-        link.diagnosis.end_flood();
-        link.stats.close(&session);
-        (session.tally().read > 0, end)
+        let mut open = Box::new(Open::new(line, session, core.link.baud.rate()));
+        let begun = self.driver.begin(core, &mut open);
+        self.phase = Phase::Open(open);
+        if let Err(error) = begun {
+            self.lose(&error);
+        }
+    }
+
+    /// The line is gone, as `error` says.
+    fn lose(&mut self, error: &io::Error) {
+        let source = &self.core.link.port;
+        let Phase::Open(open) = std::mem::replace(&mut self.phase, Phase::away(Away::default(), 0)) else {
+            return;
+        };
+        self.core.close(&open.session);
+        let heard = open.session.tally().read > 0;
+        // Before the port is looked for: it could not be opened while this holds it.
+        drop(open);
+        self.core.around.release(&self.core.link.name);
+        self.core.stats.reconnects += 1;
+        self.futile = if heard { 0 } else { self.futile + 1 };
+        let words = format!("{} went away: {error}", source.name());
+        self.core.diagnosis.doubt(if heard { String::new() } else { words.clone() });
+        self.leave(Away { refused: self.futile, ..Away::for_lack_of_a_port(words) });
+    }
+
+    /// The port is away: says so, and looks for it later.
+    fn leave(&mut self, away: Away) {
+        self.core.diagnosis.forget();
+        self.core.show(None, State::Absent, &away.words);
+        let look_at = self.core.around.now() + away.pause();
+        let until = look_at.min(self.core.next_status());
+        self.phase = Phase::Away { away, look_at, until };
+    }
+
+    /// A wait without a port is over.
+    fn pass(&mut self, woken: Woken) {
+        let core = &mut self.core;
+        let (Phase::Away { away, .. } | Phase::Opening { away, .. }) = &self.phase else { return };
+        if woken == Woken::Request {
+            core.handle_requests(Flow::Away);
+        } else {
+            core.show(None, State::Absent, &away.words);
+        }
+        match &mut self.phase {
+            Phase::Open(_) => {}
+            Phase::Away { look_at, until, .. } => *until = (*look_at).min(core.next_status()),
+            Phase::Opening { until, .. } => *until = core.around.now() + STILL_AWAY,
+        }
+    }
+}
+
+impl<L: Line> Phase<L> {
+    fn away(away: Away, at: Nanos) -> Phase<L> {
+        Phase::Away { away, look_at: at, until: at }
+    }
+
+    /// What to wait for, and until when.
+    fn wait(&self) -> (On<'_, L>, Nanos) {
+        match self {
+            Phase::Open(open) => open.wait(),
+            Phase::Away { until, .. } => (On::Nothing, *until),
+            Phase::Opening { until, .. } => (On::Opening, *until),
+        }
+    }
+
+    /// Why the port was away until now.
+    fn take_away(&mut self) -> Away {
+        match self {
+            Phase::Open(_) => Away::default(),
+            Phase::Away { away, .. } | Phase::Opening { away, .. } => std::mem::take(away),
+        }
     }
 }
 
@@ -193,17 +251,17 @@ impl Away {
         Away { error: Some(PortError::Missing), words, ..Away::default() }
     }
 
-    /// The port cannot be opened because of `error`.
-    fn learn(&mut self, error: PortError, source: &Source, now: Nanos) {
-        let is_missing = error == PortError::Missing;
+    /// The port cannot be opened because of `error`, which `explain` says in words.
+    fn learn(&mut self, error: &PortError, now: Nanos, explain: impl FnOnce(&PortError) -> String) {
+        let is_missing = *error == PortError::Missing;
         self.refused = if is_missing { 0 } else { self.refused + 1 };
-        let is_news = self.error.as_ref() != Some(&error);
+        let is_news = self.error.as_ref() != Some(error);
         // Another process may hold it now than the one that was named.
         if is_news || (!is_missing && now >= self.since + STALE) {
-            self.words = said(error.explain(source));
+            self.words = explain(error);
             self.since = now;
         }
-        self.error = Some(error);
+        self.error = Some(error.clone());
     }
 
     /// How long to wait before the next look: what is not there is looked for by name only, what is there and cannot be
@@ -234,19 +292,20 @@ mod tests {
     #[test]
     fn why_it_is_away_is_looked_for_once_per_change() {
         let source = Source::Tty("/dev/no-such-port".into());
+        let explain = |error: &PortError| said(error.explain(&source));
         let mut away = Away::for_lack_of_a_port("it went".to_owned());
-        away.learn(PortError::Missing, &source, 1);
+        away.learn(&PortError::Missing, 1, explain);
         assert_eq!((away.words.as_str(), away.pause()), ("it went", LOOK));
-        away.learn(PortError::Busy, &source, 2);
+        away.learn(&PortError::Busy, 2, explain);
         assert!(away.words.contains("in use by another process; stop it first"), "{}", away.words);
         assert_eq!((away.since, away.pause()), (2, LOOK));
         for look in 3..20 {
-            away.learn(PortError::Busy, &source, look);
+            away.learn(&PortError::Busy, look, explain);
         }
         assert_eq!((away.since, away.pause()), (2, 16 * LOOK));
-        away.learn(PortError::Busy, &source, 2 + STALE);
+        away.learn(&PortError::Busy, 2 + STALE, explain);
         assert_eq!(away.since, 2 + STALE);
-        away.learn(PortError::Missing, &source, 3 + STALE);
+        away.learn(&PortError::Missing, 3 + STALE, explain);
         assert!(away.words.contains("no such port"), "{}", away.words);
         assert_eq!(away.pause(), LOOK);
     }

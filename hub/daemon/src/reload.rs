@@ -2,17 +2,17 @@
 //! stream is lost for it; what belongs to a line waits for the next start, which is said. One that cannot be changes nothing.
 
 use config::{Background, Config, Link, Processing};
-use port::clock;
+use lms::Nanos;
 use schema::Failure;
 
-use crate::control::ControlServer;
+use crate::control::Orders;
 use crate::service::Service;
 
 /// How the configuration is read.
-pub(crate) type Read<'a> = &'a dyn Fn() -> Result<Config, Failure>;
+pub type Read<'a> = &'a dyn Fn() -> Result<Config, Failure>;
 
 /// What the hub works with, and where it looks whether that is still so.
-pub(crate) struct Reload<'a> {
+pub struct Reload<'a> {
     running: Config,
     read: Read<'a>,
     service: &'a Service,
@@ -29,16 +29,16 @@ struct Differences {
 
 impl<'a> Reload<'a> {
     /// For a hub that runs with `running`.
-    pub(crate) fn new(running: &Config, read: Read<'a>, service: &'a Service) -> Reload<'a> {
+    pub fn new(running: &Config, read: Read<'a>, service: &'a Service) -> Reload<'a> {
         Reload { running: running.clone(), read, service }
     }
 
-    /// Reads the configuration, tells the links by `control` what concerns them, and the log what came of it.
-    pub(crate) fn reload(&mut self, control: &ControlServer) {
-        self.service.reloading(clock::now());
+    /// Reads the configuration at `now`, tells the links by `orders` what concerns them, and the log what came of it.
+    pub fn reload(&mut self, orders: &Orders, now: Nanos) {
+        self.service.reloading(now);
         let refused = match (self.read)() {
             Ok(read) => {
-                self.take(read, control);
+                self.take(read, orders);
                 None
             }
             Err(failure) => {
@@ -54,14 +54,14 @@ impl<'a> Reload<'a> {
         self.service.ready(&sensors, refused.as_deref());
     }
 
-    fn take(&mut self, read: Config, control: &ControlServer) {
+    fn take(&mut self, read: Config, orders: &Orders) {
         let Differences { now, later } = Differences::between(&self.running, &read);
         if now.is_empty() && later.is_empty() {
             tracing::info!("the configuration has not changed");
         }
         for (name, processing, sections) in now {
             tracing::info!("{name}: {} changed as configured", sections.join(", "));
-            control.change(&name, &processing);
+            orders.change(&name, &processing);
             if let Some(link) = self.running.links.iter_mut().find(|link| link.name == name) {
                 link.processing = processing;
             }

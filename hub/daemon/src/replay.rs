@@ -12,12 +12,13 @@ use lms::reply::Reply;
 use lms::variant::Variant;
 use lms::{MILLIS, Nanos, Session};
 use port::clock;
-use rustix::event::PollFlags;
 use schema::{Failure, Flags, State};
 
 use crate::control::Flow;
-use crate::link::{LinkThread, Woken};
+use crate::link::LinkCore;
 use crate::player::{Due, Pace, Play, Player, PlayerHandle, Turn};
+use crate::surroundings::Woken;
+use crate::system::System;
 
 pub(crate) use recorded::{Origin, Recorded, tell_of_damage};
 
@@ -29,8 +30,8 @@ pub(crate) struct ReplayPart<'a> {
 
 /// Plays `part`, or the recording at `path` alone, into the topics of `link`; then stays silent until the hub ends.
 /// `report` is called once, when it is clear whether it can be read.
-pub(crate) fn run(
-    mut link: LinkThread<'_>,
+pub(crate) fn run<'a>(
+    mut link: LinkCore<'a, System<'a>>,
     part: Option<ReplayPart<'_>>,
     path: &Path,
     paced: bool,
@@ -68,17 +69,17 @@ pub(crate) fn run(
 }
 
 /// A link whose other end is a recording.
-struct ReplayLink<'a> {
-    link: LinkThread<'a>,
-    handle: PlayerHandle<'a>,
+struct ReplayLink<'a, 'p> {
+    link: LinkCore<'a, System<'a>>,
+    handle: PlayerHandle<'p>,
     /// What is wrong with the recording, in words.
     trouble: String,
     /// When it is looked, where nothing is waited for, whether somebody wants something.
     look_at: Nanos,
 }
 
-impl<'a> ReplayLink<'a> {
-    fn new(link: LinkThread<'a>, recorded: &Recorded, handle: PlayerHandle<'a>) -> ReplayLink<'a> {
+impl<'a, 'p> ReplayLink<'a, 'p> {
+    fn new(link: LinkCore<'a, System<'a>>, recorded: &Recorded, handle: PlayerHandle<'p>) -> Self {
         let trouble = recorded.trouble(&link.link.name);
         ReplayLink { link, handle, trouble, look_at: 0 }
     }
@@ -170,7 +171,7 @@ impl<'a> ReplayLink<'a> {
     /// Waits until `until`, the hub's end, or news of the player.
     fn rest(&mut self, until: Nanos) -> Woken {
         let news = self.handle.news();
-        match self.link.wait(Some((news.as_fd(), PollFlags::IN)), until) {
+        match self.link.wait(news.as_fd(), until) {
             Woken::Request => self.link.handle_requests(Flow::Recording(self.handle.player)),
             Woken::Ready => news.clear(),
             Woken::Stop => return Woken::Stop,

@@ -12,7 +12,7 @@ use sd_notify::NotifyState;
 
 /// The service manager; without one, as by default, nothing of this does anything.
 #[derive(Default)]
-pub(crate) struct Service {
+pub struct Service {
     /// What the one before this hub gave it to keep, by name.
     kept: Mutex<Vec<(String, OwnedFd)>>,
     /// So often it wants to hear that the hub works.

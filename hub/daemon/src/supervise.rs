@@ -6,23 +6,25 @@ use std::sync::atomic::AtomicBool;
 use std::sync::mpsc;
 use std::thread;
 
-use config::Config;
+use config::{Config, Link};
 use lms::{MILLIS, Nanos};
 use port::{Port, Source, clock};
 use rustix::event::{EventfdFlags, PollFd, PollFlags, Timespec, eventfd, poll};
 use schema::ipc::{self, Node};
 use schema::{Domain, Failure, HubLock, Kind, StateDirectory, shortage};
 
-use crate::control::ControlServer;
-use crate::link::{LinkThread, Surroundings};
+use crate::control::{ControlQueue, ControlServer};
+use crate::learned::{Keeper, Writer};
+use crate::link::LinkCore;
 use crate::player::{Player, PlayerHandle};
 use crate::preflight::no_resource;
+use crate::reconnect::LiveLink;
 use crate::reload::{Read, Reload};
 use crate::replay::{Recorded, ReplayPart};
 use crate::service::{Service, Watchdog};
 use crate::signals::{Signals, Wanted};
-use crate::topics::Topics;
-use crate::{learned, preflight, reconnect, replay};
+use crate::system::{Hub, System};
+use crate::{preflight, replay};
 
 /// What is up.
 #[derive(Clone, Debug)]
@@ -94,7 +96,8 @@ pub(crate) fn serve(
     preflight::check_descriptors(config.links.len())?;
     preflight::check_memory(config.links.len())?;
     // Ends after the links: it writes what they had learned last.
-    let (config, keeper) = learned::begin(config, state.as_ref())?;
+    let (config, keeper) = begin(config, state)?;
+    let writer = keeper.map(Writer::start).transpose()?;
     let config = &config;
     let node = ipc::hub_node(domain)?;
     node.try_cleanup_dead_nodes();
@@ -118,19 +121,18 @@ pub(crate) fn serve(
         let (report, reports) = mpsc::channel();
         let mut threads = Vec::new();
         for ((number, link), queue) in config.links.iter().enumerate().zip(queues) {
-            let (node, report) = (&node, report.clone());
-            let slot = keeper.as_ref().and_then(|keeper| keeper.slot(&link.name));
-            let (root, state, worked) = (domain.root(), state.as_ref(), &worked[number]);
-            let around = Surroundings { stop: &stop, service: &service, root, slot, state, worked };
+            let hub = Hub { node: &node, stop: &stop, service: &service, root: domain.root() };
+            let (report, worked) = (report.clone(), &worked[number]);
+            let learned = writer.as_ref().and_then(|writer| writer.slots().of(&link.name));
             let part = player
                 .zip(parts.next())
                 .map(|(player, recorded)| ReplayPart { recorded, handle: PlayerHandle { player, number } });
-            let body = move || match Topics::new(node, &link.name, number as u8, ready.boot) {
-                Ok(topics) => {
-                    let thread = LinkThread::new(link, topics, around, queue);
-                    run_link(thread, part, |outcome| drop(report.send(outcome)));
+            let body = move || {
+                let report = |outcome| drop(report.send(outcome));
+                match System::new(hub, &link.name, worked, learned) {
+                    Ok(system) => run_link(link, number as u8, ready.boot, &system, queue, part, report),
+                    Err(failure) => report(Err(failure)),
                 }
-                Err(failure) => drop(report.send(Err(failure))),
             };
             let thread = thread::Builder::new().name(link.name.clone()).spawn_scoped(scope, body);
             match thread {
@@ -164,11 +166,40 @@ pub(crate) fn serve(
     })
 }
 
-/// Runs `link` until the hub ends, with a recording as `part` of several or alone.
-fn run_link(link: LinkThread<'_>, part: Option<ReplayPart<'_>>, report: impl FnOnce(Result<(), Failure>)) {
-    match &link.link.port {
-        Source::File { path, paced } => replay::run(link, part, path, *paced, report),
-        Source::Tty(_) | Source::Tcp { .. } => reconnect::run(link, report),
+/// The configuration with what is kept for its links, and whoever keeps what they learn.
+fn begin(
+    config: Config,
+    state: Option<StateDirectory>,
+) -> Result<(Config, Option<Keeper<StateDirectory>>), Failure> {
+    match state {
+        Some(state) => Keeper::begin(config, state, clock::wall_ns()),
+        None => Ok((config, None)),
+    }
+}
+
+/// Runs `link`, number `number` in the hub's life `boot`, until the hub ends, with a recording as `part` of several or alone.
+/// `report` is called once, when it is clear whether the link can work.
+fn run_link(
+    link: &Link,
+    number: u8,
+    boot: u64,
+    system: &System<'_>,
+    queue: ControlQueue,
+    part: Option<ReplayPart<'_>>,
+    report: impl FnOnce(Result<(), Failure>),
+) {
+    match &link.port {
+        Source::File { path, paced } => match LinkCore::new(link, number, boot, system, queue) {
+            Ok(core) => replay::run(core, part, path, *paced, report),
+            Err(failure) => report(Err(failure)),
+        },
+        Source::Tty(_) | Source::Tcp { .. } => match LiveLink::new(link, number, boot, system, queue) {
+            Ok(live) => {
+                report(Ok(()));
+                system.drive(live);
+            }
+            Err(failure) => report(Err(failure)),
+        },
     }
 }
 
@@ -196,7 +227,7 @@ fn keep_up(
         let _ = poll(&mut fds, Some(&look));
         match signals.take() {
             Some(Wanted::End) => return Ok(()),
-            Some(Wanted::Reload) => reload.reload(control),
+            Some(Wanted::Reload) => reload.reload(&control.orders, clock::now()),
             None => {}
         }
         // Without a wake-up too: what is behind a request that could not be received has been announced already.

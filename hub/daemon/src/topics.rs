@@ -3,27 +3,30 @@
 
 mod prepared_publisher;
 
+use lms::Nanos;
 use lms::session::Received;
-use port::clock;
-use schema::ipc::{Node, Waker};
 use schema::{Background, Failure, Flags, Foreground, Header, Marks, Quality, Scan, Status, Wake, Zones};
 
 use crate::pipeline::{Outputs, Pipeline, Relearned};
-use prepared_publisher::{Loan, PreparedPublisher, TelegramPublisher};
+use crate::surroundings::Surroundings;
+use prepared_publisher::PreparedPublisher;
+
+/// A topic in the surroundings of a link.
+type Publisher<P, S> = PreparedPublisher<P, <S as Surroundings>::Medium<P>>;
 
 /// The publishing end of one sensor; stays in its link's thread.
-pub(crate) struct Topics {
-    telegram: TelegramPublisher,
-    scan: PreparedPublisher<Scan>,
-    zones: PreparedPublisher<Zones>,
-    marks: PreparedPublisher<Marks>,
-    foreground: PreparedPublisher<Foreground>,
-    background: PreparedPublisher<Background>,
-    status: PreparedPublisher<Status>,
+pub(crate) struct Topics<'a, S: Surroundings> {
+    around: &'a S,
+    telegram: Publisher<[u8], S>,
+    scan: Publisher<Scan, S>,
+    zones: Publisher<Zones, S>,
+    marks: Publisher<Marks, S>,
+    foreground: Publisher<Foreground, S>,
+    background: Publisher<Background, S>,
+    status: Publisher<Status, S>,
     /// Where a scan is decoded that nobody wants, or for which there is no memory: what is made of it is published all the
     /// same.
     spare_scan: Box<Scan>,
-    waker: Waker,
     /// What the next sample's header begins with.
     header: Header,
     /// Its wall clock is that of a recording.
@@ -31,21 +34,20 @@ pub(crate) struct Topics {
     next_seq: u64,
 }
 
-impl Topics {
+impl<'a, S: Surroundings> Topics<'a, S> {
     /// Makes the topics of `sensor`, number `number` in the configuration, for the hub's life `boot`.
-    pub(crate) fn new(node: &Node, sensor: &str, number: u8, boot: u64) -> Result<Self, Failure> {
-        let waker = Waker::new(node, sensor)?;
+    pub(crate) fn new(around: &'a S, sensor: &str, number: u8, boot: u64) -> Result<Self, Failure> {
         let header = Header { sensor: number, boot, hub_pid: std::process::id(), ..Header::default() };
         Ok(Topics {
-            telegram: TelegramPublisher::new(node, sensor)?,
-            scan: PreparedPublisher::new(node, sensor)?,
-            zones: PreparedPublisher::new(node, sensor)?,
-            marks: PreparedPublisher::new(node, sensor)?,
-            foreground: PreparedPublisher::new(node, sensor)?,
-            background: PreparedPublisher::new(node, sensor)?,
-            status: PreparedPublisher::new(node, sensor)?,
+            around,
+            telegram: PreparedPublisher::new(around, sensor)?,
+            scan: PreparedPublisher::new(around, sensor)?,
+            zones: PreparedPublisher::new(around, sensor)?,
+            marks: PreparedPublisher::new(around, sensor)?,
+            foreground: PreparedPublisher::new(around, sensor)?,
+            background: PreparedPublisher::new(around, sensor)?,
+            status: PreparedPublisher::new(around, sensor)?,
             spare_scan: Box::default(),
-            waker,
             header,
             is_recalled: false,
             next_seq: 0,
@@ -80,13 +82,13 @@ impl Topics {
     /// Publishes the telegram and takes its number and stamps for all that follows from it.
     /// `reasons` are why it is suspect.
     pub(crate) fn telegram(&mut self, received: &Received<'_>, reasons: u8, period_us: u32) {
-        let now = clock::now();
+        let now = self.around.now();
         self.header.seq = self.next_seq;
         self.next_seq += 1;
         self.header.stamp_first_ns = received.first;
         self.header.stamp_last_ns = received.last;
         if !self.is_recalled {
-            self.header.wall_ns = clock::wall(received.first, now);
+            self.header.wall_ns = wall(self.around, received.first, now);
         }
         self.header.set_sent_at(now);
         self.header.period_us = period_us;
@@ -95,7 +97,7 @@ impl Topics {
         self.header.reasons = reasons;
         self.header.flags &= !Flags::STAMP_ESTIMATED;
         self.header.flags |= if received.estimated { Flags::STAMP_ESTIMATED } else { 0 };
-        self.telegram.send(received.telegram.bytes(), &self.header);
+        self.telegram.send_bytes(received.telegram.bytes(), &self.header);
     }
 
     /// Publishes a scan of the last telegram, which `fill` writes in place, and what `pipeline` makes of it there. Marks
@@ -108,17 +110,17 @@ impl Topics {
     ) -> Option<Relearned> {
         let (mut scan, mut zones, mut marks) = (self.scan.loan(), self.zones.loan(), self.marks.loan());
         let mut foreground = pipeline.keeps_background().then(|| self.foreground.loan());
-        let decoded = scan.payload_mut().unwrap_or(&mut self.spare_scan);
+        let decoded = Publisher::<Scan, S>::payload_mut(&mut scan).unwrap_or(&mut self.spare_scan);
         fill(decoded);
         let relearned = pipeline.update(
             decoded,
             Outputs {
-                zones: zones.payload_mut(),
-                marks: marks.payload_mut(),
-                foreground: foreground.as_mut().and_then(Loan::payload_mut),
+                zones: Publisher::<Zones, S>::payload_mut(&mut zones),
+                marks: Publisher::<Marks, S>::payload_mut(&mut marks),
+                foreground: foreground.as_mut().and_then(Publisher::<Foreground, S>::payload_mut),
             },
         );
-        self.header.set_sent_at(clock::now());
+        self.header.set_sent_at(self.around.now());
         let header = self.header;
         self.scan.send(scan, &header);
         self.zones.send(zones, &header);
@@ -141,7 +143,7 @@ impl Topics {
     /// Publishes that nothing is known of the zones as of `now`, for scans stay out.
     pub(crate) fn stale(&mut self, pipeline: &mut Pipeline, now: u64) {
         let mut loan = self.zones.loan();
-        pipeline.stale(loan.payload_mut().unwrap_or(&mut Zones::default()));
+        pipeline.stale(Publisher::<Zones, S>::payload_mut(&mut loan).unwrap_or(&mut Zones::default()));
         self.zones.send(loan, &self.of_moment(now));
     }
 
@@ -157,7 +159,7 @@ impl Topics {
     /// Publishes the status as of `now`.
     pub(crate) fn status(&mut self, status: &Status, now: u64) {
         let mut loan = self.status.loan();
-        if let Some(payload) = loan.payload_mut() {
+        if let Some(payload) = Publisher::<Status, S>::payload_mut(&mut loan) {
             *payload = *status;
         }
         self.status.send(loan, &self.of_moment(now));
@@ -165,9 +167,7 @@ impl Topics {
 
     /// Wakes whoever sleeps; once per telegram, after its last sample.
     pub(crate) fn wake(&self, why: Wake) {
-        if let Err(failure) = self.waker.wake(why) {
-            tracing::debug!(%failure, "some consumers were not woken");
-        }
+        self.around.wake(why);
     }
 
     /// Gives late joiners what they would else get with the next sample.
@@ -179,8 +179,7 @@ impl Topics {
 
     /// Whether anybody is attached to anything.
     pub(crate) fn is_heard(&self) -> bool {
-        let of_telegrams =
-            self.telegram.telegrams.is_heard() || self.scan.is_heard() || self.zones.is_heard();
+        let of_telegrams = self.telegram.is_heard() || self.scan.is_heard() || self.zones.is_heard();
         let of_wanted = self.marks.is_heard() || self.foreground.is_heard() || self.background.is_heard();
         of_telegrams || of_wanted || self.status.is_heard()
     }
@@ -189,7 +188,7 @@ impl Topics {
     pub(crate) fn loan_failed(&self) -> u64 {
         let of_scans = self.scan.failed() + self.zones.failed() + self.marks.failed();
         let of_models = self.foreground.failed() + self.background.failed();
-        self.telegram.telegrams.failed() + of_scans + of_models + self.status.failed()
+        self.telegram.failed() + of_scans + of_models + self.status.failed()
     }
 
     /// Consumers that got nothing although they are attached: their descriptors or ours ran out, and sending says Ok
@@ -200,21 +199,28 @@ impl Topics {
             return self.status.missed_out();
         }
         let of_telegrams =
-            self.telegram.telegrams.missed_out().max(self.scan.missed_out()).max(self.zones.missed_out());
+            self.telegram.missed_out().max(self.scan.missed_out()).max(self.zones.missed_out());
         let of_wanted = self.marks.missed_out().max(self.foreground.missed_out());
         of_telegrams.max(of_wanted).max(self.status.missed_out())
     }
 
     fn of_moment(&self, now: u64) -> Header {
-        let wall_ns = if self.is_recalled { self.header.wall_ns } else { clock::wall(now, clock::now()) };
+        let wall_ns =
+            if self.is_recalled { self.header.wall_ns } else { wall(self.around, now, self.around.now()) };
         of_moment(&self.header, now, wall_ns)
     }
 
     fn show(&mut self, pipeline: &mut Pipeline, header: &Header) {
         let mut loan = self.background.loan();
-        pipeline.show(loan.payload_mut().unwrap_or(&mut Background::default()));
+        pipeline
+            .show(Publisher::<Background, S>::payload_mut(&mut loan).unwrap_or(&mut Background::default()));
         self.background.send(loan, header);
     }
+}
+
+/// Nanoseconds since 1970 of the moment that the clock of `around` called `stamp`; it says `now`.
+fn wall(around: &impl Surroundings, stamp: Nanos, now: Nanos) -> u64 {
+    around.wall_ns().saturating_sub(now.saturating_sub(stamp))
 }
 
 /// The header of what is said at `now` without a telegram: its number is that of `last`, the last one's.

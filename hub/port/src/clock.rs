@@ -9,9 +9,14 @@ pub fn now() -> Nanos {
     nanos(clock_gettime(ClockId::Monotonic))
 }
 
+/// The wall clock, in nanoseconds since 1970.
+pub fn wall_ns() -> u64 {
+    nanos(clock_gettime(ClockId::Realtime))
+}
+
 /// Nanoseconds since 1970 of the moment that CLOCK_MONOTONIC called `stamp`; `now` was read just now.
 pub fn wall(stamp: Nanos, now: Nanos) -> u64 {
-    nanos(clock_gettime(ClockId::Realtime)).saturating_sub(now.saturating_sub(stamp))
+    wall_ns().saturating_sub(now.saturating_sub(stamp))
 }
 
 /// The time from `now` to `until` as poll wants it; nothing if `until` is past, at least a nanosecond otherwise.

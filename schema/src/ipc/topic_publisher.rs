@@ -2,24 +2,54 @@
 //! what is in a sample, and when its consumers are woken.
 
 use std::fmt::Debug;
+use std::marker::PhantomData;
 
 use super::{
-    BytesMut, LoanError, Node, Payload, PortFactory, Publisher, SampleMut, SendError, TopicService,
-    UpdateConnections, ZeroCopySend,
+    LoanError, Node, Payload, PortFactory, Publisher, SampleMut, SendError, TopicService, UpdateConnections,
 };
 use crate::{Failure, Header, Kind, Topic};
 
-/// Publishes the samples of one topic of one sensor. Their numbers begin at 0 and have a gap where samples were lost before
-/// they could be sent.
-#[derive(Debug)]
-pub struct TopicPublisher<P: Payload + ?Sized> {
-    publisher: Publisher<P>,
-    service: TopicService<P>,
-    next: u64,
-    failed: u64,
+/// What carries the samples of a topic: [`SharedMemory`], or in a simulation the memory of its own process.
+pub trait Medium<P: Payload + ?Sized> {
+    /// A sample that is not sent yet.
+    type Loan;
+
+    /// Returns the number of consumers that follow the topic.
+    fn subscribers(&self) -> usize;
+
+    /// Connects consumers that came since the last sample, and hands them what the topic keeps for late joiners.
+    ///
+    /// # Errors
+    ///
+    /// Why one of them could not be connected.
+    fn connect(&self) -> Result<(), impl Debug + use<Self, P>>;
+
+    /// Returns the memory of a sample, with a payload's default in it; bytes are `len`.
+    ///
+    /// # Errors
+    ///
+    /// The library's, if there is none.
+    fn loan(&self, len: usize) -> Result<Self::Loan, LoanError>;
+
+    /// Returns the payload of `loan`, to be written in place.
+    fn payload_mut(loan: &mut Self::Loan) -> &mut P;
+
+    /// Sends `loan` with `header`. Returns how many consumers got it.
+    ///
+    /// # Errors
+    ///
+    /// The library's.
+    fn send(&self, loan: Self::Loan, header: &Header) -> Result<usize, SendError>;
 }
 
-impl<P: Payload + ?Sized> TopicPublisher<P> {
+/// A topic in the shared memory of a domain.
+#[derive(Debug)]
+pub struct SharedMemory<P: Payload + ?Sized> {
+    publisher: Publisher<P>,
+    service: TopicService<P>,
+}
+
+impl<P: Payload + ?Sized> SharedMemory<P> {
     /// Makes the topic of `sensor` that carries `P`, or takes over that of a dead process. What wakes its consumers
     /// ([`Waker`](super::Waker)) is made before it.
     ///
@@ -29,7 +59,60 @@ impl<P: Payload + ?Sized> TopicPublisher<P> {
     /// [`Kind::Failed`] if the topic is there with another layout.
     pub fn new(node: &Node, sensor: &str) -> Result<Self, Failure> {
         let service = P::create(node, sensor)?;
-        Ok(TopicPublisher { publisher: P::publisher(&service)?, service, next: 0, failed: 0 })
+        Ok(SharedMemory { publisher: P::publisher(&service)?, service })
+    }
+}
+
+impl<P: Payload + ?Sized> Medium<P> for SharedMemory<P> {
+    type Loan = SampleMut<P>;
+
+    fn subscribers(&self) -> usize {
+        self.service.dynamic_config().number_of_subscribers()
+    }
+
+    fn connect(&self) -> Result<(), impl Debug + use<P>> {
+        self.publisher.update_connections()
+    }
+
+    fn loan(&self, len: usize) -> Result<SampleMut<P>, LoanError> {
+        P::loan(&self.publisher, len)
+    }
+
+    fn payload_mut(loan: &mut SampleMut<P>) -> &mut P {
+        P::write(loan)
+    }
+
+    fn send(&self, mut loan: SampleMut<P>, header: &Header) -> Result<usize, SendError> {
+        *loan.user_header_mut() = *header;
+        loan.send()
+    }
+}
+
+/// Publishes the samples of one topic of one sensor. Their numbers begin at 0 and have a gap where samples were lost before
+/// they could be sent.
+#[derive(Debug)]
+pub struct TopicPublisher<P: Payload + ?Sized, M = SharedMemory<P>> {
+    medium: M,
+    next: u64,
+    failed: u64,
+    payload: PhantomData<fn(&P)>,
+}
+
+impl<P: Payload + ?Sized> TopicPublisher<P> {
+    /// Publishes into shared memory, else as [`over`](TopicPublisher::over).
+    ///
+    /// # Errors
+    ///
+    /// As [`SharedMemory::new`].
+    pub fn new(node: &Node, sensor: &str) -> Result<Self, Failure> {
+        SharedMemory::new(node, sensor).map(TopicPublisher::over)
+    }
+}
+
+impl<P: Payload + ?Sized, M: Medium<P>> TopicPublisher<P, M> {
+    /// Publishes over `medium`; the first sample has number 0.
+    pub fn over(medium: M) -> Self {
+        TopicPublisher { medium, next: 0, failed: 0, payload: PhantomData }
     }
 
     /// Returns the number that the next sample will have.
@@ -44,7 +127,7 @@ impl<P: Payload + ?Sized> TopicPublisher<P> {
 
     /// Returns the number of consumers that follow the topic.
     pub fn subscribers(&self) -> usize {
-        self.service.dynamic_config().number_of_subscribers()
+        self.medium.subscribers()
     }
 
     /// Connects consumers that came since the last sample, and hands them what the topic keeps for late joiners. One that
@@ -53,8 +136,8 @@ impl<P: Payload + ?Sized> TopicPublisher<P> {
     /// # Errors
     ///
     /// Why one of them could not be connected.
-    pub fn connect(&self) -> Result<(), impl Debug + use<P>> {
-        self.publisher.update_connections()
+    pub fn connect(&self) -> Result<(), impl Debug + use<P, M>> {
+        self.medium.connect()
     }
 
     /// Returns the number of samples that were not sent for lack of memory.
@@ -62,16 +145,26 @@ impl<P: Payload + ?Sized> TopicPublisher<P> {
         self.failed
     }
 
-    /// Sends a written `sample` with `header` but for its number in the topic, which is the next one. Returns how many
+    /// Returns the memory of a sample, with a payload's default in it; bytes are `len`, any other payload has its own
+    /// length.
+    ///
+    /// # Errors
+    ///
+    /// The library's, if there is none, or if bytes are more than [`Telegram::MAX`](crate::Telegram::MAX).
+    pub fn loan(&self, len: usize) -> Result<M::Loan, LoanError> {
+        self.medium.loan(len)
+    }
+
+    /// Sends a written `loan` with `header` but for its number in the topic, which is the next one. Returns how many
     /// consumers got it.
     ///
     /// # Errors
     ///
     /// The library's. The number is used up, and the sample counts as failed.
-    pub fn send_loan(&mut self, mut sample: SampleMut<P>, header: &Header) -> Result<usize, SendError> {
-        *sample.user_header_mut() = Header { topic_seq: self.next, ..*header };
+    pub fn send_loan(&mut self, loan: M::Loan, header: &Header) -> Result<usize, SendError> {
+        let header = Header { topic_seq: self.next, ..*header };
         self.next += 1;
-        sample.send().inspect_err(|_| self.failed += 1)
+        self.medium.send(loan, &header).inspect_err(|_| self.failed += 1)
     }
 
     /// Uses up a number for a sample that there is no memory for.
@@ -79,18 +172,29 @@ impl<P: Payload + ?Sized> TopicPublisher<P> {
         self.next += 1;
         self.failed += 1;
     }
-}
 
-impl<P: Payload + ZeroCopySend + Default> TopicPublisher<P> {
-    /// Returns the memory of a sample, with a payload's default in it.
+    /// Sends a sample of `len` bytes, or of the payload's own length, that `fill` writes in place, beginning with a payload's
+    /// default; else as [`send_loan`](TopicPublisher::send_loan).
     ///
     /// # Errors
     ///
-    /// The library's, if there is none.
-    pub fn loan(&self) -> Result<SampleMut<P>, LoanError> {
-        self.publisher.loan()
+    /// [`Kind::Short`] if there is no memory for it. Its number is used up.
+    fn send_written(
+        &mut self,
+        len: usize,
+        header: &Header,
+        fill: impl FnOnce(&mut P),
+    ) -> Result<usize, Failure> {
+        let mut loan = self.loan(len).map_err(|error| {
+            self.fail();
+            short(P::TOPIC, &error)
+        })?;
+        fill(M::payload_mut(&mut loan));
+        self.send_loan(loan, header).map_err(|error| short(P::TOPIC, &error))
     }
+}
 
+impl<P: Payload, M: Medium<P>> TopicPublisher<P, M> {
     /// Sends a sample that `fill` writes in place, beginning with a payload's default; else as
     /// [`send_loan`](TopicPublisher::send_loan).
     ///
@@ -98,37 +202,18 @@ impl<P: Payload + ZeroCopySend + Default> TopicPublisher<P> {
     ///
     /// [`Kind::Short`] if there is no memory for it. Its number is used up.
     pub fn send(&mut self, header: &Header, fill: impl FnOnce(&mut P)) -> Result<usize, Failure> {
-        let mut sample = self.loan().map_err(|error| self.short(&error))?;
-        fill(sample.payload_mut());
-        self.send_loan(sample, header).map_err(|error| short(P::TOPIC, &error))
+        self.send_written(0, header, fill)
     }
 }
 
-impl TopicPublisher<[u8]> {
-    /// Returns the memory of a sample of `len` bytes.
-    ///
-    /// # Errors
-    ///
-    /// The library's, if there is none, or if that is more than [`Telegram::MAX`](crate::Telegram::MAX).
-    pub fn loan_bytes(&self, len: usize) -> Result<BytesMut, LoanError> {
-        self.publisher.loan_slice_uninit(len)
-    }
-
+impl<M: Medium<[u8]>> TopicPublisher<[u8], M> {
     /// Sends `bytes` as a sample; else as [`send`](TopicPublisher::send).
     ///
     /// # Errors
     ///
     /// [`Kind::Short`] if there is no memory for it, or it is longer than [`Telegram::MAX`](crate::Telegram::MAX).
     pub fn send_bytes(&mut self, header: &Header, bytes: &[u8]) -> Result<usize, Failure> {
-        let loan = self.loan_bytes(bytes.len()).map_err(|error| self.short(&error))?;
-        self.send_loan(loan.write_from_slice(bytes), header).map_err(|error| short(<[u8]>::TOPIC, &error))
-    }
-}
-
-impl<P: Payload + ?Sized> TopicPublisher<P> {
-    fn short(&mut self, error: &LoanError) -> Failure {
-        self.fail();
-        short(P::TOPIC, error)
+        self.send_written(bytes.len(), header, |sample| sample.copy_from_slice(bytes))
     }
 }
 

@@ -6,8 +6,7 @@ use std::sync::mpsc::{Receiver, Sender};
 use std::sync::{Arc, PoisonError};
 
 use config::Processing;
-use lms::{Control, Session};
-use port::clock;
+use lms::{Control, Nanos, Session};
 use schema::{Failure, Kind};
 
 use super::{Changed, Outcome, QueuedRequest};
@@ -15,7 +14,7 @@ use crate::event_fd::EventFd;
 use crate::player::Player;
 
 /// The link's end of the queue.
-pub(crate) struct ControlQueue {
+pub struct ControlQueue {
     pub(super) sensor: String,
     pub(super) paused: bool,
     pub(super) queue: Receiver<QueuedRequest>,
@@ -41,12 +40,17 @@ impl ControlQueue {
         self.paused
     }
 
-    /// Has `flow` do what `control` says.
+    /// Has `flow` do what `control` says, at `now`.
     ///
     /// # Errors
     ///
     /// [`Kind::Failed`] if there is nobody to do it.
-    pub(crate) fn control(&mut self, control: Control, flow: &mut Flow<'_>) -> Result<(), Failure> {
+    pub(crate) fn control(
+        &mut self,
+        control: Control,
+        flow: &mut Flow<'_>,
+        now: Nanos,
+    ) -> Result<(), Failure> {
         match flow {
             Flow::Recording(player) => {
                 match control {
@@ -58,7 +62,7 @@ impl ControlQueue {
             }
             Flow::Away if control == Control::Resync => return Err(self.refusal("the port is away")),
             Flow::Away => {}
-            Flow::Session(session) => session.control(control, clock::now()),
+            Flow::Session(session) => session.control(control, now),
         }
         self.paused = control == Control::Pause;
         Ok(())

@@ -25,7 +25,7 @@ struct Verdict {
 
 /// Plays `frames` into the topics of `replay`. At the end, for how long the last verdict stands; nothing if the hub shall
 /// end.
-pub(super) fn play(replay: &mut ReplayLink<'_>, frames: &Frames) -> Option<Option<Nanos>> {
+pub(super) fn play(replay: &mut ReplayLink<'_, '_>, frames: &Frames) -> Option<Option<Nanos>> {
     let play = replay.handle.play();
     let mut telegrams = match frames.read() {
         Ok(telegrams) => telegrams.peekable(),

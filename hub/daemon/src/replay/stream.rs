@@ -13,7 +13,7 @@ use crate::process_telegram::RecordedContext;
 
 /// Plays `stream` into the topics of `replay`. At the end, for how long the last verdict stands; nothing if the hub shall
 /// end.
-pub(super) fn play(replay: &mut ReplayLink<'_>, stream: &Stream) -> Option<Option<Nanos>> {
+pub(super) fn play(replay: &mut ReplayLink<'_, '_>, stream: &Stream) -> Option<Option<Nanos>> {
     let play = replay.handle.play();
     let mut bytes = match stream.bytes() {
         Ok(bytes) => bytes,

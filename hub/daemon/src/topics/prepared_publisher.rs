@@ -4,35 +4,70 @@
 //! What a topic does not keep for late joiners is not sent while nobody is attached; its number is used up. Sending looks
 //! at the places of all consumers that there may be, and no processor has them at hand after a pause.
 
-use schema::ipc::{BytesMut, Node, Payload, SampleMut, TopicPublisher, ZeroCopySend};
+use schema::ipc::{Medium, Payload, TopicPublisher};
 use schema::limits::history;
 use schema::{Failure, Header};
 
+use crate::surroundings::Surroundings;
+
 /// One topic of one sensor.
-pub(super) struct PreparedPublisher<P: Payload + ?Sized> {
-    topic: TopicPublisher<P>,
+pub(super) struct PreparedPublisher<P: Payload + ?Sized, M: Medium<P>> {
+    topic: TopicPublisher<P, M>,
     /// Consumers that got the last sample.
     reached: usize,
-    /// Loaned while there was time, for the sample that is coming.
-    prepared: Option<SampleMut<P>>,
+    /// Loaned while there was time, for the sample that is coming: bytes as long as the last ones.
+    prepared: Option<M::Loan>,
+    last_len: usize,
 }
 
-impl<P: Payload + ?Sized> PreparedPublisher<P> {
+impl<P: Payload + ?Sized, M: Medium<P>> PreparedPublisher<P, M> {
     /// The topic of `sensor`.
-    pub(super) fn new(node: &Node, sensor: &str) -> Result<Self, Failure> {
-        Ok(PreparedPublisher { topic: TopicPublisher::new(node, sensor)?, reached: 0, prepared: None })
+    pub(super) fn new(around: &impl Surroundings<Medium<P> = M>, sensor: &str) -> Result<Self, Failure> {
+        let topic = TopicPublisher::over(around.medium::<P>(sensor)?);
+        Ok(PreparedPublisher { topic, reached: 0, prepared: None, last_len: 0 })
     }
 
-    /// Uses up a number without a sample: nobody is there to miss it.
-    fn skip(&mut self) {
-        self.topic.skip(1);
-        self.reached = 0;
+    /// Takes a loan for the sample that will be there in a moment, and connects who came.
+    pub(super) fn prepare(&mut self) {
+        if self.prepared.is_none() && self.is_wanted() {
+            self.prepared = self.topic.loan(self.last_len).ok();
+        }
+        // Now, not while the telegram waits; and what sending looks at is near the processor.
+        self.connect();
     }
 
-    /// Sends a written sample; one that fails is counted.
-    fn send_loan(&mut self, sample: SampleMut<P>, header: &Header) {
-        if let Ok(reached) = self.topic.send_loan(sample, header) {
-            self.reached = reached;
+    /// The next sample.
+    pub(super) fn loan(&mut self) -> Loan<M::Loan> {
+        if !self.is_wanted() {
+            return Loan::Unwanted;
+        }
+        let len = self.last_len;
+        self.prepared.take().or_else(|| self.topic.loan(len).ok()).map_or(Loan::Lacking, Loan::Taken)
+    }
+
+    /// Where to write `loan`, if anywhere.
+    pub(super) fn payload_mut(loan: &mut Loan<M::Loan>) -> Option<&mut P> {
+        match loan {
+            Loan::Taken(loan) => Some(M::payload_mut(loan)),
+            Loan::Lacking | Loan::Unwanted => None,
+        }
+    }
+
+    /// Ends the sample that [`loan`](Self::loan) began, under its number.
+    pub(super) fn send(&mut self, loan: Loan<M::Loan>, header: &Header) {
+        match loan {
+            Loan::Taken(loan) => {
+                // One that fails is counted by the topic.
+                if let Ok(reached) = self.topic.send_loan(loan, header) {
+                    self.reached = reached;
+                }
+            }
+            Loan::Lacking => self.topic.fail(),
+            // Its number is used up: nobody is there to miss it.
+            Loan::Unwanted => {
+                self.topic.skip(1);
+                self.reached = 0;
+            }
         }
     }
 
@@ -65,87 +100,27 @@ impl<P: Payload + ?Sized> PreparedPublisher<P> {
     }
 }
 
-impl<P: Payload + ZeroCopySend + Default> PreparedPublisher<P> {
-    /// Takes a loan for the sample that will be there in a moment, and connects who came.
-    pub(super) fn prepare(&mut self) {
-        if self.prepared.is_none() && self.is_wanted() {
-            self.prepared = self.topic.loan().ok();
-        }
-        // Now, not while the telegram waits; and what sending looks at is near the processor.
-        self.connect();
-    }
-
-    /// The next sample.
-    pub(super) fn loan(&mut self) -> Loan<P> {
-        if !self.is_wanted() {
-            return Loan::Unwanted;
-        }
-        self.prepared.take().or_else(|| self.topic.loan().ok()).map_or(Loan::Lacking, Loan::Taken)
-    }
-
-    /// Ends the sample that [`loan`](Self::loan) began, under its number.
-    pub(super) fn send(&mut self, loan: Loan<P>, header: &Header) {
-        match loan {
-            Loan::Taken(sample) => self.send_loan(sample, header),
-            Loan::Lacking => self.topic.fail(),
-            Loan::Unwanted => self.skip(),
-        }
-    }
-}
-
-/// The same for telegrams, whose length is known when they are there.
-pub(super) struct TelegramPublisher {
-    pub(super) telegrams: PreparedPublisher<[u8]>,
-    /// Loaned while there was time, as long as the last telegram.
-    prepared: Option<BytesMut>,
-    last_len: usize,
-}
-
-impl TelegramPublisher {
-    /// The topic of `sensor`.
-    pub(super) fn new(node: &Node, sensor: &str) -> Result<Self, Failure> {
-        let telegrams = PreparedPublisher::new(node, sensor)?;
-        Ok(TelegramPublisher { telegrams, prepared: None, last_len: 0 })
-    }
-
-    /// Takes a loan for a telegram as long as the last one, and connects who came.
-    pub(super) fn prepare(&mut self) {
-        if self.prepared.is_none() && self.telegrams.is_wanted() {
-            self.prepared = self.telegrams.topic.loan_bytes(self.last_len).ok();
-        }
-        self.telegrams.connect();
-    }
-
+impl<M: Medium<[u8]>> PreparedPublisher<[u8], M> {
     /// Publishes `bytes`, if anybody is attached.
-    pub(super) fn send(&mut self, bytes: &[u8], header: &Header) {
-        self.last_len = bytes.len();
-        if !self.telegrams.is_wanted() {
-            return self.telegrams.skip();
+    pub(super) fn send_bytes(&mut self, bytes: &[u8], header: &Header) {
+        if self.last_len != bytes.len() {
+            self.last_len = bytes.len();
+            self.prepared = None;
         }
-        let prepared = self.prepared.take().filter(|loan| loan.payload().len() == bytes.len());
-        match prepared.or_else(|| self.telegrams.topic.loan_bytes(bytes.len()).ok()) {
-            Some(loan) => self.telegrams.send_loan(loan.write_from_slice(bytes), header),
-            None => self.telegrams.topic.fail(),
+        let mut loan = self.loan();
+        if let Some(payload) = Self::payload_mut(&mut loan) {
+            payload.copy_from_slice(bytes);
         }
+        self.send(loan, header);
     }
 }
 
 /// A sample in the making.
-pub(super) enum Loan<P: Payload> {
+pub(super) enum Loan<L> {
     /// It is written in place.
-    Taken(SampleMut<P>),
+    Taken(L),
     /// There is no memory for it.
     Lacking,
     /// Nobody would get it.
     Unwanted,
-}
-
-impl<P: Payload + ZeroCopySend> Loan<P> {
-    /// Where to write it, if anywhere.
-    pub(super) fn payload_mut(&mut self) -> Option<&mut P> {
-        match self {
-            Loan::Taken(sample) => Some(sample.payload_mut()),
-            Loan::Lacking | Loan::Unwanted => None,
-        }
-    }
 }

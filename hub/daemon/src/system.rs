@@ -1,0 +1,255 @@
+//! This machine as the surroundings of a link: its clocks, ports, shared memory, files, and service manager. Decides nothing.
+
+use std::cell::{OnceCell, RefCell};
+use std::fs::File;
+use std::io;
+use std::os::fd::{AsFd, BorrowedFd, OwnedFd};
+use std::os::unix::fs::FileExt;
+use std::path::Path;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::Duration;
+
+use lms::Nanos;
+use port::{Allowance, Dial, Port, PortError, Source, clock};
+use rustix::event::{PollFd, PollFlags, poll};
+use schema::ipc::{Node, Payload, SharedMemory, Waker};
+use schema::{Directory, Failure, Wake};
+
+use crate::control::ControlQueue;
+use crate::learned::Handle;
+use crate::link::LinkCore;
+use crate::reconnect::LiveLink;
+use crate::service::Service;
+use crate::surroundings::{Learned, Line, On, Surroundings, Wait, Woken};
+
+/// What the machine has for one link; stays in the link's thread.
+pub(crate) struct System<'a> {
+    hub: Hub<'a>,
+    waker: Waker,
+    /// Set whenever the link finished something.
+    worked: &'a AtomicBool,
+    learned: Option<Handle<'a>>,
+    /// The connection that is being made.
+    dial: RefCell<Option<Dial>>,
+    /// What outlives a killed hub; nothing where it cannot be written: then the sensor is asked.
+    record: OnceCell<Option<File>>,
+}
+
+/// What all links of a hub have in common.
+#[derive(Clone, Copy)]
+pub(crate) struct Hub<'a> {
+    pub(crate) node: &'a Node,
+    /// Readable once the hub shall end.
+    pub(crate) stop: &'a OwnedFd,
+    /// Keeps the ports when the hub is killed.
+    pub(crate) service: &'a Service,
+    /// The domain's directory.
+    pub(crate) root: &'a Path,
+}
+
+impl<'a> System<'a> {
+    /// What `hub` has for the link of `sensor`, which sets `worked` whenever it finished something; `learned` is where it hands
+    /// on what it learned.
+    ///
+    /// # Errors
+    ///
+    /// As [`Waker::new`].
+    pub(crate) fn new(
+        hub: Hub<'a>,
+        sensor: &str,
+        worked: &'a AtomicBool,
+        learned: Option<Handle<'a>>,
+    ) -> Result<System<'a>, Failure> {
+        let waker = Waker::new(hub.node, sensor)?;
+        Ok(System { hub, waker, worked, learned, dial: RefCell::default(), record: OnceCell::new() })
+    }
+
+    /// Drives `link` until the hub shall end.
+    pub(crate) fn drive(&self, mut link: LiveLink<'_, Self>) {
+        let mut woken = Woken::Timeout;
+        while woken != Woken::Stop {
+            let Wait { requests, on, until } = link.turn(woken);
+            let dial = self.dial.borrow();
+            let port = match on {
+                On::Nothing => None,
+                On::Opening => dial.as_ref().map(|dial| (dial.as_fd(), PollFlags::IN)),
+                On::Bytes(line) => Some((line.as_fd(), PollFlags::IN)),
+                On::Loss(line) => Some((line.as_fd(), PollFlags::empty())),
+            };
+            woken = self.wait(requests, port, until);
+        }
+        link.end();
+    }
+
+    /// Waits until one of the events at the descriptor, `until`, a request, or the hub's end.
+    fn wait(
+        &self,
+        requests: &ControlQueue,
+        port: Option<(BorrowedFd<'_>, PollFlags)>,
+        until: Nanos,
+    ) -> Woken {
+        let span = clock::span(clock::now(), until);
+        let [stop, requests] =
+            [self.hub.stop.as_fd(), requests.as_fd()].map(|fd| PollFd::from_borrowed_fd(fd, PollFlags::IN));
+        let woken = match port {
+            Some((port, events)) => {
+                let mut fds = [stop, requests, PollFd::from_borrowed_fd(port, events)];
+                poll(&mut fds, Some(&span)).map(|_| fds.each_ref().map(is_ready))
+            }
+            None => {
+                let mut fds = [stop, requests];
+                poll(&mut fds, Some(&span)).map(|_| [is_ready(&fds[0]), is_ready(&fds[1]), false])
+            }
+        };
+        self.worked.store(true, Ordering::Relaxed);
+        match woken {
+            Ok([true, ..]) => Woken::Stop,
+            Ok([_, true, _]) => Woken::Request,
+            Ok([.., true]) => Woken::Ready,
+            _ => Woken::Timeout,
+        }
+    }
+
+    fn record(&self, name: &str) -> Option<&File> {
+        let open = || {
+            let file = match Directory::open(self.hub.root) {
+                Ok(Some(directory)) => directory.file_or_new(&format!("{name}.sensor")).map(Some),
+                nowhere => nowhere.map(|_| None),
+            };
+            let told = |error: &_| tracing::debug!(%error, "{name}: the learned state cannot be saved");
+            file.inspect_err(told).ok().flatten()
+        };
+        self.record.get_or_init(open).as_ref()
+    }
+}
+
+impl<'a> LinkCore<'a, System<'a>> {
+    /// Waits until `news` is readable, a request, `until`, or the hub's end; meanwhile what is due goes out.
+    pub(crate) fn wait(&mut self, news: BorrowedFd<'_>, until: Nanos) -> Woken {
+        loop {
+            let bound = self.bound(until, false);
+            let woken = self.around.wait(&self.control, Some((news, PollFlags::IN)), bound);
+            if self.is_over(woken, until) {
+                return woken;
+            }
+        }
+    }
+}
+
+impl Surroundings for System<'_> {
+    type Line = Port;
+    type Medium<P: Payload + ?Sized> = SharedMemory<P>;
+
+    fn now(&self) -> Nanos {
+        clock::now()
+    }
+
+    fn wall_ns(&self) -> u64 {
+        clock::wall_ns()
+    }
+
+    fn pause(&self, until: Nanos) {
+        let now = clock::now();
+        if until > now {
+            std::thread::sleep(Duration::from_nanos(until - now));
+        }
+    }
+
+    fn open(&self, source: &Source, baud: u32) -> Option<Result<Port, PortError>> {
+        if let Some(dial) = self.dial.take() {
+            return Some(dial.finish());
+        }
+        match Port::dial(source) {
+            None => Some(Port::attempt(source, baud, &AtomicBool::new(false))),
+            Some(Err(error)) => Some(Err(error)),
+            Some(Ok(dial)) => {
+                self.dial.replace(Some(dial));
+                None
+            }
+        }
+    }
+
+    fn explain(&self, error: &PortError, source: &Source) -> Failure {
+        error.explain(source)
+    }
+
+    fn take_kept(&self, name: &str, source: &Source, baud: u32) -> Option<Port> {
+        let mut adopted = None;
+        while let Some(line) = self.hub.service.take(name) {
+            match Port::adopt(line, source, baud).filter(|_| adopted.is_none()) {
+                Some(port) => adopted = Some(port),
+                // One that hung up: whoever keeps it would have it handed over again.
+                None => self.hub.service.forget(name),
+            }
+        }
+        adopted
+    }
+
+    fn keep(&self, name: &str, line: &Port) {
+        if let Port::Tty(_) = line {
+            self.hub.service.keep(name, line);
+        }
+    }
+
+    fn release(&self, name: &str) {
+        self.hub.service.forget(name);
+    }
+
+    fn medium<P: Payload + ?Sized>(&self, sensor: &str) -> Result<SharedMemory<P>, Failure> {
+        SharedMemory::new(self.hub.node, sensor)
+    }
+
+    fn wake(&self, why: Wake) {
+        if let Err(failure) = self.waker.wake(why) {
+            tracing::debug!(%failure, "some consumers were not woken");
+        }
+    }
+
+    fn recall(&self, name: &str, record: &mut [u8]) -> Option<usize> {
+        self.record(name)?.read_at(record, 0).ok()
+    }
+
+    fn remember(&self, name: &str, record: &[u8]) {
+        let Some(file) = self.record(name) else { return };
+        // One that cannot be written is too old soon; behind a shorter one nothing of a longer one stays.
+        let _ = file.write_all_at(record, 0).and_then(|()| file.set_len(record.len() as u64));
+    }
+
+    fn learned(&self) -> Option<&dyn Learned> {
+        self.learned.as_ref().map(|learned| learned as &dyn Learned)
+    }
+}
+
+impl Line for Port {
+    fn read(&self, buffer: &mut [u8]) -> io::Result<usize> {
+        self.read(buffer)
+    }
+
+    fn write(&self, byte: u8) -> io::Result<()> {
+        self.write(byte)
+    }
+
+    fn set_baud(&self, baud: u32) -> io::Result<Option<io::Error>> {
+        self.try_baud(baud)
+    }
+
+    fn waiting(&self) -> Option<usize> {
+        self.waiting()
+    }
+
+    fn allowance(&self, baud: u32) -> Option<Allowance> {
+        self.allowance(baud)
+    }
+
+    fn line_errors(&self) -> u64 {
+        self.line_errors()
+    }
+
+    fn is_simulated(&self) -> bool {
+        self.simulated()
+    }
+}
+
+fn is_ready(fd: &PollFd<'_>) -> bool {
+    !fd.revents().is_empty()
+}
