@@ -144,6 +144,11 @@ impl World {
         self.now() >= self.end
     }
 
+    /// How long things may still go wrong.
+    pub(crate) fn until_healed(&self) -> Nanos {
+        self.heals_at.saturating_sub(self.now())
+    }
+
     /// When something is due that is not the hub's.
     pub(crate) fn next_ns(&self) -> Nanos {
         let action = self.actions.front().map(|action| action.at_ms * MILLIS);

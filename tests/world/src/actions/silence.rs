@@ -1,5 +1,6 @@
 //! Nothing arrives for a while, or everything arrives late.
 
+use lms::MILLIS;
 use sim::fault::Faults;
 
 use super::{Key, Kind, SENSOR};
@@ -14,7 +15,9 @@ pub(crate) const KIND: Kind = Kind {
 };
 
 fn act(world: &mut World, action: &Action) {
-    let (span, at) = (action.value("span_ms") as f64 / 1e3, world.now() as f64 / 1e9 + 1e-3);
+    // What is held back when everything is made well again would still be.
+    let span_ms = action.value("span_ms").min(world.until_healed() / MILLIS);
+    let (span, at) = (span_ms as f64 / 1e3, world.now() as f64 / 1e9 + 1e-3);
     let faults = match action.value("is_late") {
         0 => Faults { silence: span, silence_at: at, ..Faults::default() },
         _ => Faults { stall: span, stall_at: at, ..Faults::default() },
