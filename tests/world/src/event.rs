@@ -2,7 +2,7 @@
 
 use lms::Nanos;
 use lms::measured::MEASURED;
-use schema::{Header, Status, Topic, Verdict};
+use schema::{Header, Status, Topic, Verdict, Zones};
 
 use crate::consumer::Number;
 use crate::hash::History;
@@ -64,6 +64,17 @@ pub(crate) struct Telegram<'a> {
     pub(crate) damage: Option<&'static str>,
     /// The sensor did not send all of it.
     pub(crate) aborted: bool,
+}
+
+/// How much of what happens is told to standard error.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
+pub enum Detail {
+    /// Nothing.
+    Nothing,
+    /// What does not happen with each telegram.
+    News,
+    /// Verdicts, too.
+    All,
 }
 
 /// What a judge says.
@@ -128,8 +139,8 @@ impl Event<'_> {
         }
     }
 
-    /// What to say of it to whoever wants to see how it went; nothing of what happens with each telegram.
-    pub(crate) fn words(&self) -> Option<String> {
+    /// What to say of it to whoever wants to see so much of it.
+    pub(crate) fn words(&self, detail: Detail) -> Option<String> {
         match self {
             Event::Sent { telegram: Telegram { bytes, damage: None, aborted: false, .. }, .. }
                 if bytes[4] == MEASURED =>
@@ -143,16 +154,12 @@ impl Event<'_> {
             Event::Published { sensor, sample } => {
                 let Sample { topic, header, bytes, .. } = sample;
                 match topic {
-                    Topic::Zones if std::env::var_os("WORLD_ALL").is_some() => {
-                        let zones: schema::Zones = bytemuck::pod_read_unaligned(bytes);
+                    Topic::Zones if detail == Detail::All => {
+                        let zones: Zones = bytemuck::pod_read_unaligned(bytes);
+                        let Header { seq, stamp_last_ns, flags, reasons, .. } = header;
+                        let (verdict, ms) = (zones.verdict(), stamp_last_ns / 1_000_000);
                         Some(format!(
-                            "{sensor} zones {:?} seq {} stamps {:.6} {:.6} flags {} reasons {}",
-                            zones.verdict(),
-                            header.seq,
-                            header.stamp_first_ns as f64 / 1e9,
-                            header.stamp_last_ns as f64 / 1e9,
-                            header.flags,
-                            header.reasons
+                            "{sensor} zones {verdict:?} seq {seq} of {ms} ms, flags {flags} reasons {reasons}"
                         ))
                     }
                     Topic::Status => {
