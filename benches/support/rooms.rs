@@ -60,7 +60,9 @@ pub(crate) fn record(
                     lms::measured::encode(0, Unit::Mm, &look.words, 0x10)
                 };
                 links[number].read(at, telegram.bytes());
-                for sample in followers[number].take() {
+                // What is said at the start is no telegram's.
+                let is_of_one = |sample: &Published| scan > 0 || sample.header.hub_time_ns().is_some();
+                for sample in followers[number].take().into_iter().filter(is_of_one) {
                     let (name, _) = SENSORS[number];
                     writer.sample(name, sample.topic, &sample.header, &sample.payload).expect("is written");
                     keep(number, sample);
