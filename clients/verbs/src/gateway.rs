@@ -2,9 +2,9 @@
 //! ordinary client of the hub that outlives it, its links and its own network. Takes nothing from the network.
 
 mod host;
-mod lan;
 mod life;
 mod machine;
+mod network;
 mod report;
 mod selection;
 mod sensor;
@@ -26,8 +26,8 @@ use crate::follow::Notice;
 use crate::lossy_writer::LossyWriter;
 use crate::names::no_sensor;
 use crate::output::{End, quiet};
-use lan::{Form, Lan};
 use life::Life;
+use network::{Form, Lan};
 use report::Report;
 use selection::Selection;
 use sensor::Sensor;

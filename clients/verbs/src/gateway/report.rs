@@ -7,7 +7,7 @@ use schema::Topic;
 use serde::Serialize;
 
 use super::GatewayLook;
-use super::lan::{Groups, Lan};
+use super::network::{Groups, Lan};
 use super::udp_destination::{News, UdpDestination};
 use crate::follow::Notice;
 use crate::output::{End, Output};

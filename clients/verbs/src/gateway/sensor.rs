@@ -9,7 +9,7 @@ use scanhub_client::streams::{Sample, Session, Source};
 use schema::datagram::{Announce, Announced, Head, LanFlags, PORT, Packed, group};
 use schema::{Background, Failure, Flags, Header, Quality, Topic, Verdict};
 
-use super::lan::Lan;
+use super::network::Lan;
 use super::selection::Selection;
 
 /// A sensor that is being followed.
