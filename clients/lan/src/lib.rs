@@ -3,7 +3,9 @@
 //! shared memory and clocks.
 #![forbid(unsafe_code)]
 
+pub mod incoming;
 pub mod outgoing;
+pub mod republish;
 mod stamp;
 
 pub use stamp::Stamp;
