@@ -117,7 +117,7 @@ impl Incoming {
     /// A datagram that was not there before.
     fn accepted<'a>(&mut self, datagram: Datagram<'a>, late: bool, arrival: Stamp) -> Arrived<'a> {
         let head = datagram.head;
-        let begins = self.stats.since_ns(head.hub, head.epoch) == Some(arrival.monotonic_ns);
+        let begins = self.peers.is_new(&head, &self.stats);
         let Some(topic) = Topic::of_number(head.topic) else {
             // What it says was said again, and better, by a newer one.
             return if late { Arrived::Known } else { self.announced(&datagram, begins, arrival) };
@@ -156,5 +156,36 @@ impl Incoming {
         let is_shared =
             self.stats.is_shared(hub, epoch) || self.duplicates.refused(hub, arrival.monotonic_ns);
         is_shared.then_some(hub)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    use schema::Zones;
+    use schema::datagram::{HEAD, Packed};
+
+    /// A datagram with zones, of gateway 5.
+    fn zones(epoch: u32, sequence: u32) -> Vec<u8> {
+        let mut buffer = [0; 100];
+        let len = Zones::unknown().pack(&mut buffer[HEAD..]).unwrap();
+        let topic = Topic::Zones.number();
+        let head = Head { topic, revision: 1, hub: 5, epoch, sequence, ..Head::default() };
+        head.seal(&mut buffer, len).unwrap().to_vec()
+    }
+
+    #[test]
+    fn a_life_begins_once_also_where_datagrams_come_in_one_moment() {
+        let mut incoming = Incoming::new(&Topic::ALL);
+        let mut begins = |epoch, sequence, from, ms: u64| {
+            let arrival = Stamp { monotonic_ns: ms * 1_000_000, wall_ns: 0 };
+            let bytes = zones(epoch, sequence);
+            let arrived = incoming.receive(&bytes, from, arrival);
+            arrived.begins().map(|head| head.epoch)
+        };
+        assert_eq!([begins(7, 0, 1, 10), begins(7, 1, 1, 10), begins(7, 2, 1, 11)], [Some(7), None, None]);
+        assert_eq!([begins(8, 0, 1, 11), begins(8, 1, 1, 11), begins(7, 3, 1, 11)], [Some(8), None, None]);
+        assert_eq!([begins(8, 0, 2, 3000), begins(8, 0, 2, 3011)], [None, Some(8)], "another one's");
     }
 }

@@ -39,11 +39,17 @@ pub(super) struct Sensor {
 const TOPICS: usize = 8;
 
 impl PeerTable {
+    /// Whether nothing of the life that sent `head`, which `account` has taken, came before.
+    pub(super) fn is_new(&self, head: &Head, stats: &StreamStats) -> bool {
+        let since_ns = stats.since_ns(head.hub, head.epoch);
+        self.lives.get(&(head.hub, head.epoch)).is_none_or(|known| known.since_ns != since_ns)
+    }
+
     /// The life that sent `head`, which `account` has taken.
     pub(super) fn life(&mut self, head: &Head, stats: &StreamStats) -> &mut Life {
         let life = (head.hub, head.epoch);
         let since_ns = stats.since_ns(head.hub, head.epoch);
-        if self.lives.get(&life).is_none_or(|known| known.since_ns != since_ns) {
+        if self.is_new(head, stats) {
             self.lives.retain(|&(hub, epoch), known| stats.since_ns(hub, epoch) == known.since_ns);
         }
         self.lives.entry(life).or_insert_with(|| Life { since_ns, ..Life::default() })
