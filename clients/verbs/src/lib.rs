@@ -30,6 +30,7 @@ mod receive_stats;
 mod record;
 mod selection;
 mod show;
+mod stamp;
 mod text;
 #[cfg(feature = "tui")]
 mod watch;

@@ -1,17 +1,16 @@
-//! The topics of one remote sensor in shared memory: which there are, and what is said of it when nothing comes. Refuses to
-//! know how a sample gets there.
+//! The topics of one remote sensor: which there are, and what is said of it when nothing comes. Refuses to know how a sample
+//! gets to its consumers.
 
-use std::time::{Duration, Instant};
-
-use scanhub_client::{PublishSession, SensorPublisher, clock};
-use schema::datagram::{Announce, Arrival, Head, Standing};
+use schema::datagram::{Announce, Arrival, Head, MTU_ETHERNET, Packed, Standing};
 use schema::{Failure, Header, State, Status, Topic, Wake, Zones};
 
-use super::super::remote::Remote;
-use super::remote_publisher::{AnyPublisher, RemotePublisher};
+use super::store::SensorTopics;
+use super::stream::{Placed, Stream};
+use crate::Stamp;
+use crate::incoming::Remote;
 
 /// One sensor of another machine.
-pub(super) struct RemoteTopics {
+pub(super) struct RemoteSensor<T: SensorTopics> {
     /// Its name here, `HUB.SENSOR`.
     pub(super) name: String,
     /// Gateway, its life, and the sensor's number in it, as last announced.
@@ -23,67 +22,58 @@ pub(super) struct RemoteTopics {
     /// It has all that was announced, and that was told.
     pub(super) is_told: bool,
     /// One for each of [`Topic::ALL`].
-    topics: [Option<AnyPublisher>; Topic::ALL.len()],
+    streams: [Option<Stream>; Topic::ALL.len()],
     /// The last status, and the header it came with.
     last: Option<(Status, Header)>,
     /// The header of the last zones.
     zoned: Option<Header>,
-    heard_at: Option<Instant>,
+    /// CLOCK_MONOTONIC in ns.
+    heard_ns: Option<u64>,
     /// Why consumers are to be woken.
     news: Option<Wake>,
-    // Behind the topics: it wakes their consumers.
-    sensor: SensorPublisher,
+    /// The process that publishes it here.
+    pid: u32,
+    topics: T,
 }
 
 /// So long nothing comes before the sensor counts as silent: three announcements.
-const SILENT_AFTER: Duration = Duration::from_secs(3);
+const SILENT_AFTER_NS: u64 = 3_000_000_000;
 
-impl RemoteTopics {
-    /// The sensor `name`, without topics.
-    pub(super) fn new(session: &PublishSession, name: &str) -> Result<RemoteTopics, Failure> {
-        Ok(RemoteTopics {
+impl<T: SensorTopics> RemoteSensor<T> {
+    /// The sensor `name`, with no `topics` yet, which process `pid` publishes.
+    pub(super) fn new(name: &str, topics: T, pid: u32) -> RemoteSensor<T> {
+        RemoteSensor {
             name: name.to_owned(),
             source: None,
             announced: 0,
             standing: Standing::NONE,
             is_told: false,
-            topics: [const { None }; Topic::ALL.len()],
+            streams: [const { None }; Topic::ALL.len()],
             last: None,
             zoned: None,
-            heard_at: None,
+            heard_ns: None,
             news: None,
-            sensor: session.sensor(name)?,
-        })
+            pid,
+            topics,
+        }
     }
 
     /// It has this topic.
     pub(super) fn has(&self, topic: Topic) -> bool {
-        self.topics[topic as usize].is_some()
+        self.streams[topic as usize].is_some()
     }
 
     /// Makes `topic`, which it does not have.
     pub(super) fn add(&mut self, topic: Topic) -> Result<(), Failure> {
-        self.topics[topic as usize] = Some(AnyPublisher::new(topic, &self.sensor)?);
+        self.topics.add(topic)?;
+        self.streams[topic as usize] = Some(Stream::default());
         Ok(())
     }
 
     /// Takes `topic` away.
     pub(super) fn remove(&mut self, topic: Topic) {
-        self.topics[topic as usize] = None;
-    }
-
-    fn zones(&mut self) -> Option<&mut RemotePublisher<Zones>> {
-        match &mut self.topics[Topic::Zones as usize] {
-            Some(AnyPublisher::Zones(zones)) => Some(zones),
-            _ => None,
-        }
-    }
-
-    fn status(&mut self) -> Option<&mut RemotePublisher<Status>> {
-        match &mut self.topics[Topic::Status as usize] {
-            Some(AnyPublisher::Status(status)) => Some(status),
-            _ => None,
-        }
+        self.topics.remove(topic);
+        self.streams[topic as usize] = None;
     }
 
     /// `announce` came with `head`: it is this one.
@@ -95,15 +85,14 @@ impl RemoteTopics {
     }
 
     /// Another sensor has the number or the place that this one had: nothing comes of it any more, which is said at once.
-    pub(super) fn replaced(&mut self) {
+    pub(super) fn replaced(&mut self, now: Stamp) {
         self.source = None;
-        self.heard_at = None;
-        if let (Some(mut header), Some(zones)) = (self.zoned.take(), self.zones()) {
-            stamp(&mut header);
-            zones.send(&header, |sample| *sample = Zones::unknown());
+        self.heard_ns = None;
+        if let Some(header) = self.zoned.take().filter(|_| self.has(Topic::Zones)) {
+            self.say(Topic::Zones, &stamped(header, now), &Zones::unknown());
             self.news = Some(Wake::Telegram);
         }
-        self.silent();
+        self.silent(now);
         self.wake();
     }
 
@@ -122,22 +111,23 @@ impl RemoteTopics {
         self.source.is_some_and(|source| (source.0, source.1) == (hub, epoch))
     }
 
-    /// Publishes `remote`; `false` if it has no such topic. A payload cannot fail to be read: the account has checked it.
-    pub(super) fn publish(&mut self, remote: &Remote<'_>, now: Instant) -> bool {
-        self.heard_at = Some(now);
+    /// Publishes `remote` at `now_ns`; `false` if it has no such topic. A payload cannot fail to be read: the account has
+    /// checked it.
+    pub(super) fn publish(&mut self, remote: &Remote<'_>, now_ns: u64) -> bool {
+        self.heard_ns = Some(now_ns);
         self.standing.take(Arrival { delivers: true, now_ns: remote.arrival_ns });
-        if remote.topic == Topic::Status {
-            let Some(status) = remote.payload::<Status>() else { return true };
-            let Some(header) = self.status().map(|topic| topic.header(remote)) else { return false };
-            self.tell(status, &header);
-        } else {
-            let Some(topic) = &mut self.topics[remote.topic as usize] else { return false };
-            topic.publish(remote);
+        let topic = remote.topic;
+        let Some(stream) = &mut self.streams[topic as usize] else { return false };
+        let Placed { left_out, header } = stream.place(remote, self.pid);
+        self.topics.skip(topic, left_out);
+        match remote.payload::<Status>().filter(|_| topic == Topic::Status) {
+            Some(status) => self.tell(status, &header),
+            None => self.topics.send(topic, &header, remote.datagram.payload),
         }
-        if remote.topic == Topic::Zones {
-            self.zoned = Some(remote.header());
+        if topic == Topic::Zones {
+            self.zoned = Some(remote.header(self.pid));
         }
-        let why = if remote.topic == Topic::Status { Wake::Status } else { Wake::Telegram };
+        let why = if topic == Topic::Status { Wake::Status } else { Wake::Telegram };
         self.news = match self.news {
             Some(Wake::Telegram) => Some(Wake::Telegram),
             _ => Some(why),
@@ -148,27 +138,25 @@ impl RemoteTopics {
     /// Wakes the consumers, if something was published since the last call.
     pub(super) fn wake(&mut self) {
         if let Some(why) = self.news.take() {
-            // Those that cannot be woken look by themselves ten times a second.
-            let _ = self.sensor.wake(why);
+            self.topics.wake(why);
         }
     }
 
     /// Says that the sensor is silent, once per silence, and gives late joiners what they would else get with the next
     /// sample.
-    pub(super) fn look(&mut self, now: Instant) {
-        if self.heard_at.is_some_and(|at| now - at >= SILENT_AFTER) {
-            self.heard_at = None;
-            self.silent();
+    pub(super) fn look(&mut self, now: Stamp) {
+        if self.heard_ns.is_some_and(|at_ns| now.monotonic_ns.saturating_sub(at_ns) >= SILENT_AFTER_NS) {
+            self.heard_ns = None;
+            self.silent(now);
             self.wake();
         }
-        let keeps = |(topic, publisher)| Some(publisher).filter(|_| Topic::row(topic).kept > 0);
-        let kept = Topic::ALL.into_iter().zip(&self.topics).filter_map(keeps).flatten();
-        kept.for_each(AnyPublisher::connect);
+        let keeps = |topic: &Topic| topic.row().kept > 0 && self.has(*topic);
+        Topic::ALL.into_iter().filter(keeps).for_each(|topic| self.topics.connect(topic));
     }
 
     /// Samples for which there was no memory.
-    pub(super) fn loan_failed(&self) -> u64 {
-        self.topics.iter().flatten().map(AnyPublisher::failed).sum()
+    pub(super) fn failed(&self) -> u64 {
+        self.topics.failed()
     }
 
     /// Publishes a status as it came, but for the beginning of its state: that is on a clock of another machine. Here the
@@ -177,27 +165,34 @@ impl RemoteTopics {
         let same = self.last.filter(|(last, _)| last.state == status.state);
         status.since_ns = same.map_or(header.stamp_first_ns, |(last, _)| last.since_ns);
         self.last = Some((status, *header));
-        if let Some(topic) = self.status() {
-            topic.send(header, |sample| *sample = status);
+        if self.has(Topic::Status) {
+            self.say(Topic::Status, header, &status);
         }
     }
 
     /// Nothing comes any more: what was last said would stand for ever.
-    fn silent(&mut self) {
-        let Some((mut status, mut header)) = self.last else { return };
+    fn silent(&mut self, now: Stamp) {
+        let Some((mut status, header)) = self.last else { return };
         status.state = State::Silent as u8;
         status.rate_mhz = 0;
         status.set_last_error("nothing arrives over the network");
-        stamp(&mut header);
         if self.has(Topic::Status) {
-            self.tell(status, &header);
+            self.tell(status, &stamped(header, now));
             self.news = self.news.or(Some(Wake::Status));
+        }
+    }
+
+    /// Publishes what did not come so.
+    fn say(&mut self, topic: Topic, header: &Header, payload: &impl Packed) {
+        let mut room = [0; MTU_ETHERNET];
+        if let Some(len) = payload.pack(&mut room) {
+            self.topics.send(topic, header, &room[..len]);
         }
     }
 }
 
-/// What is said now, although nothing came.
-fn stamp(header: &mut Header) {
-    (header.stamp_first_ns, header.wall_ns) = (clock::now().monotonic_ns, clock::wall_ns());
-    header.stamp_last_ns = header.stamp_first_ns;
+/// The header of what is said now, although nothing came.
+fn stamped(header: Header, now: Stamp) -> Header {
+    let Stamp { monotonic_ns, wall_ns } = now;
+    Header { stamp_first_ns: monotonic_ns, stamp_last_ns: monotonic_ns, wall_ns, ..header }
 }

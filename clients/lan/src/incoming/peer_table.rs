@@ -7,7 +7,7 @@ use schema::datagram::{Announce, Head, LIVES, StreamStats};
 
 /// All lives of gateways that were heard, as long as the account keeps them apart.
 #[derive(Default)]
-pub(super) struct PeerTable {
+pub struct PeerTable {
     lives: HashMap<(u64, u32), Life>,
     /// The gateways of which it was told that their clocks differ, the first ones: whoever can send can invent more.
     told: HashSet<u64>,
@@ -39,11 +39,17 @@ pub(super) struct Sensor {
 const TOPICS: usize = 8;
 
 impl PeerTable {
+    /// Whether nothing of the life that sent `head`, which `account` has taken, came before.
+    pub(super) fn is_new(&self, head: &Head, stats: &StreamStats) -> bool {
+        let since_ns = stats.since_ns(head.hub, head.epoch);
+        self.lives.get(&(head.hub, head.epoch)).is_none_or(|known| known.since_ns != since_ns)
+    }
+
     /// The life that sent `head`, which `account` has taken.
     pub(super) fn life(&mut self, head: &Head, stats: &StreamStats) -> &mut Life {
         let life = (head.hub, head.epoch);
         let since_ns = stats.since_ns(head.hub, head.epoch);
-        if self.lives.get(&life).is_none_or(|known| known.since_ns != since_ns) {
+        if self.is_new(head, stats) {
             self.lives.retain(|&(hub, epoch), known| stats.since_ns(hub, epoch) == known.since_ns);
         }
         self.lives.entry(life).or_insert_with(|| Life { since_ns, ..Life::default() })
@@ -63,8 +69,8 @@ impl PeerTable {
         is_new.then_some(difference_ns)
     }
 
-    /// What the sensor is called: its name, or `#` and its number as long as nobody announced it.
-    pub(super) fn name(&self, hub: u64, epoch: u32, sensor: u8) -> String {
+    /// Returns what the sensor is called: its name, or `#` and its number as long as nobody announced it.
+    pub fn name(&self, hub: u64, epoch: u32, sensor: u8) -> String {
         let announced = self.sensor(hub, epoch, sensor).and_then(|sensor| sensor.announced.as_ref());
         announced.map_or_else(|| format!("#{sensor}"), |announced| announced.sensor().to_owned())
     }
@@ -76,9 +82,9 @@ impl PeerTable {
         self.name(head.hub, head.epoch, head.sensor)
     }
 
-    /// Of whom a row of the account is: as [`name`](Self::name), but `#` and the number also where it had several names,
+    /// Returns of whom a row of the account is: as [`name`](Self::name), but `#` and the number also where it had several names,
     /// for the row counts what was sent under each of them.
-    pub(super) fn row_name(&self, hub: u64, epoch: u32, sensor: u8) -> String {
+    pub fn row_name(&self, hub: u64, epoch: u32, sensor: u8) -> String {
         match self.sensor(hub, epoch, sensor) {
             Some(known) if known.is_renamed => format!("#{sensor}"),
             _ => self.name(hub, epoch, sensor),
