@@ -152,11 +152,14 @@ pub trait Payload: IceoryxSend + Debug + 'static {
 
     /// Returns a payload's default in the memory of this process; bytes are `len`.
     fn owned(len: usize) -> Self::Owned;
+
+    /// Returns the payload as it lies in memory.
+    fn bytes(&self) -> &[u8];
 }
 
 /// iceoryx2 has a slice and a value behind two impl blocks of the same words; this says them once.
 macro_rules! payload {
-    ($payload:ty, $topic:expr, $len:ident, $owned:ty, $make:expr, |$builder:ident| $sized:expr, |$publisher:ident| $loan:expr) => {
+    ($payload:ty, $topic:expr, $len:ident, $owned:ty, $make:expr, |$builder:ident| $sized:expr, |$publisher:ident| $loan:expr, $bytes:path) => {
         impl Payload for $payload {
             const TOPIC: Topic = $topic;
 
@@ -223,6 +226,10 @@ macro_rules! payload {
             fn owned($len: usize) -> $owned {
                 $make
             }
+
+            fn bytes(&self) -> &[u8] {
+                $bytes(self)
+            }
         }
     };
 }
@@ -236,14 +243,16 @@ macro_rules! payloads {
         payload!(
             [u8], Topic::$topic, len, Vec<u8>, vec![0; len],
             |builder| builder.initial_max_slice_len(crate::Telegram::MAX),
-            |publisher| publisher.loan_slice(len)
+            |publisher| publisher.loan_slice(len),
+            std::convert::identity
         );
     };
     ($payload:tt, $topic:ident) => {
         payload!(
             crate::$payload, Topic::$topic, _len, Box<crate::$payload>, Box::default(),
             |builder| builder,
-            |publisher| publisher.loan()
+            |publisher| publisher.loan(),
+            bytemuck::bytes_of
         );
     };
 }

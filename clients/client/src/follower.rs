@@ -5,8 +5,9 @@ use std::ops::Deref;
 use std::time::{Duration, Instant};
 
 use schema::ipc::{Payload, ReceiveError, Sample, Subscriber};
-use schema::{Failure, Flags, Header, Kind, Scan};
+use schema::{Failure, Header, Kind, Scan};
 
+use crate::numbers::{Noted, Numbers};
 use crate::session::Session;
 
 /// A sample in shared memory: `*` gives the payload, read-only, without a copy. Hold at most four at a time, and none
@@ -47,8 +48,7 @@ pub struct Follower<P: Payload + ?Sized> {
     sensor: String,
     port: Option<(u32, Subscriber<P>)>,
     asked_at: Option<Instant>,
-    boot: Option<u64>,
-    expected: Option<u64>,
+    numbers: Numbers,
     unconnected_since: Option<Instant>,
     /// In this moment there was nothing.
     nothing_at: Option<(u32, Instant)>,
@@ -67,8 +67,7 @@ impl<P: Payload + ?Sized> Follower<P> {
             sensor: sensor.to_owned(),
             port: None,
             asked_at: None,
-            boot: None,
-            expected: None,
+            numbers: Numbers::default(),
             unconnected_since: None,
             nothing_at: None,
         }
@@ -131,23 +130,13 @@ impl<P: Payload + ?Sized> Follower<P> {
             return Ok(false);
         };
         self.port = Some((session.number(), subscriber));
-        self.expected = None;
+        self.numbers.begin_anew();
         self.nothing_at = None;
         Ok(true)
     }
 
-    /// A port that outlived its hub got everything of the next hub from number 0; a new one begins where it is.
     fn account(&mut self, sample: Sample<P>) -> Received<P> {
-        let header = sample.user_header();
-        let restarted = self.boot.is_some_and(|boot| boot != header.boot);
-        // A network's numbers go on, whatever becomes of the hub at its other end.
-        let is_remote = header.flags & Flags::REMOTE != 0;
-        if restarted && !is_remote && self.expected.is_some() {
-            self.expected = Some(0);
-        }
-        let missed = self.expected.map_or(0, |expected| header.topic_seq.saturating_sub(expected));
-        self.boot = Some(header.boot);
-        self.expected = Some(header.topic_seq + 1);
+        let Noted { missed, restarted } = self.numbers.note(sample.user_header());
         Received { sample, missed, restarted }
     }
 }

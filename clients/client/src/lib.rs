@@ -34,6 +34,7 @@ mod control;
 mod follower;
 mod freshness;
 mod live;
+mod numbers;
 mod presence;
 mod publish;
 mod readiness;

@@ -22,6 +22,7 @@ pub mod pty;
 mod request_decoder;
 pub mod room;
 mod scene;
+pub mod series;
 mod settings;
 mod shape;
 mod simulate;

@@ -1,11 +1,14 @@
 //! What the sensor sees: a world, measured the way an LMS 2xx measures it. A pure function of world, seed and time;
 //! knows neither telegrams nor the line.
 
+use std::sync::Arc;
+
 use lms::Nanos;
 use lms::variant::{Mode, Unit, Variant};
 
 use crate::layers::{self, Dice};
 use crate::look::{Look, Mark, Met};
+use crate::series::{Changes, Series};
 use crate::spot::{Echo, echo};
 use crate::view::View;
 use crate::world::World;
@@ -26,6 +29,8 @@ enum Sight {
     Value(u16),
     Random,
     Scene(Box<WorldView>),
+    /// Measured before.
+    Series(Arc<Series>, Changes),
 }
 
 impl Room {
@@ -48,10 +53,18 @@ impl Room {
         Room { seed: seed ^ sensor.wrapping_mul(0xD1B5_4A32_D192_ED03), sight }
     }
 
+    /// What a sensor sees for which scans were measured before.
+    pub fn of_series(series: Arc<Series>, changes: Changes) -> Self {
+        Room { seed: 0, sight: Sight::Series(series, changes) }
+    }
+
     /// The values of the scan whose last mirror turn ended at `end_ns`: as many as `variant` has beams, in `unit`, split
     /// according to `mode`. The same arguments give the same values.
     pub fn scan(&self, variant: Variant, unit: Unit, mode: Mode, end_ns: Nanos) -> Vec<u16> {
-        self.look(variant, unit, mode, end_ns).words
+        match &self.sight {
+            Sight::Series(series, changes) => series.scan(changes, (variant, unit, mode), end_ns),
+            _ => self.look(variant, unit, mode, end_ns).words,
+        }
     }
 
     /// The words of [`Room::scan`] with their truth.
@@ -88,6 +101,9 @@ impl Room {
             Sight::Random => (0..beams).map(|_| random.u16(..) & !mode.forbidden()).collect(),
             Sight::Scene(stage) => {
                 return measure(stage, &angles_mdeg, turns, unit, mode, end_ns, &mut random);
+            }
+            Sight::Series(series, changes) => {
+                return series.room(changes, end_ns).measure(angles_mdeg, turns, unit, mode, end_ns);
             }
         };
         let truth = words.iter().map(|&word| truth(word, Met::Static { since_ns: 0 }, mode)).collect();

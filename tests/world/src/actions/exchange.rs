@@ -1,0 +1,23 @@
+//! Another sensor is at the line, at some rate, idle or streaming already.
+
+use lms::variant::Baud;
+
+use super::{Key, Kind, SENSOR};
+use crate::plan::Action;
+use crate::world::World;
+
+pub(crate) const KIND: Kind = Kind {
+    name: "exchange",
+    per_minute: 1.5,
+    keys: &[SENSOR, Key::new("rate", 0, 3), Key::new("streams", 0, 1)],
+    act,
+};
+
+fn act(world: &mut World, action: &Action) {
+    let baud = Baud::ALL[action.value("rate") as usize % Baud::ALL.len()];
+    let streams = action.value("streams") > 0;
+    world.port(world.sensor(action), |tty, log, now| {
+        tty.advance(now, log);
+        tty.sensor.exchange(baud, streams);
+    });
+}

@@ -1,0 +1,134 @@
+//! The surroundings of one link in a world: what [`daemon::surroundings::Surroundings`] asks, of simulated ports, topics and
+//! files. Decides nothing.
+
+use std::rc::Rc;
+use std::sync::Arc;
+
+use daemon::Slots;
+use daemon::surroundings::{Learned, Surroundings};
+use lms::{MICROS, Nanos};
+use port::{PortError, Source};
+use rustix::io::Errno;
+use schema::ipc::Payload;
+use schema::{Failure, Kind, Wake};
+
+use crate::line::{Handle, LinkClock, OpenLine};
+use crate::shared::Shared;
+use crate::topics::Carrier;
+
+/// What link number `number` has around it; its sensor is the one of this number, too.
+pub(crate) struct Around<'a> {
+    pub(crate) shared: Rc<Shared>,
+    pub(crate) number: usize,
+    pub(crate) clock: Rc<LinkClock>,
+    pub(crate) learned: Option<daemon::Handle<'a>>,
+}
+
+impl<'a> Around<'a> {
+    /// Of a hub that began at the world's present time.
+    pub(crate) fn new(
+        shared: &Rc<Shared>,
+        number: usize,
+        sensor: &str,
+        slots: Option<&'a Arc<Slots>>,
+    ) -> Self {
+        let clock = Rc::new(LinkClock::default());
+        clock.pass(shared.clock.get());
+        let learned = slots.and_then(|slots| slots.of(sensor));
+        Around { shared: shared.clone(), number, clock, learned }
+    }
+
+    fn line(&self, device: u64) -> OpenLine {
+        let (shared, port) = (self.shared.clone(), self.number);
+        shared.handles.set(shared.handles.get() + 1);
+        OpenLine { handle: Rc::new(Handle { shared, port, device }), clock: self.clock.clone() }
+    }
+}
+
+impl Surroundings for Around<'_> {
+    type Line = OpenLine;
+    type Medium<P: Payload + ?Sized> = Carrier<P>;
+
+    fn now(&self) -> Nanos {
+        self.clock.now()
+    }
+
+    fn wall_ns(&self) -> u64 {
+        self.clock.now() + self.shared.wall_ahead.get()
+    }
+
+    fn pause(&self, until: Nanos) {
+        // A sleeping thread is late by about so much.
+        self.clock.pass(until + 50 * MICROS);
+    }
+
+    fn open(&self, _: &Source, baud: u32) -> Option<Result<OpenLine, PortError>> {
+        if self.shared.lacks_descriptors.get() {
+            return Some(Err(PortError::Short(Errno::MFILE)));
+        }
+        let mut tty = self.shared.ports[self.number].borrow_mut();
+        let opened = tty.open(baud, &self.shared.log, self.clock.now());
+        Some(opened.map(|device| self.line(device)))
+    }
+
+    fn explain(&self, error: &PortError, source: &Source) -> Failure {
+        let kind = match error {
+            PortError::Missing | PortError::Dead => Kind::PortMissing,
+            PortError::Denied => Kind::PortPermission,
+            PortError::Busy => Kind::PortBusy,
+            PortError::Short(_) => Kind::Short,
+            _ => Kind::PortNotTty,
+        };
+        Failure::new(kind, format!("{}: {error}", source.name()), "")
+    }
+
+    fn take_kept(&self, name: &str, _: &Source, baud: u32) -> Option<OpenLine> {
+        let handle = self.shared.kept.borrow().get(name).cloned()?;
+        let mut tty = self.shared.ports[handle.port].borrow_mut();
+        let is_same = tty.adopt(handle.device, baud, &self.shared.log, self.clock.now());
+        drop(tty);
+        if !is_same {
+            self.release(name);
+        }
+        is_same.then(|| OpenLine { handle, clock: self.clock.clone() })
+    }
+
+    fn keep(&self, name: &str, line: &OpenLine) {
+        if self.shared.keeps_ports {
+            self.shared.kept.borrow_mut().insert(name.to_owned(), line.handle.clone());
+        }
+    }
+
+    fn release(&self, name: &str) {
+        // Not while it is borrowed: the port may be closed with it.
+        let kept = self.shared.kept.borrow_mut().remove(name);
+        drop(kept);
+    }
+
+    fn medium<P: Payload + ?Sized>(&self, _: &str) -> Result<Carrier<P>, Failure> {
+        Ok(Carrier::new(&self.shared, &self.clock, self.number))
+    }
+
+    fn wake(&self, _: Wake) {
+        self.shared.woken.borrow_mut().push((self.number, self.clock.now()));
+    }
+
+    fn recall(&self, name: &str, record: &mut [u8]) -> Option<usize> {
+        let records = self.shared.records.borrow();
+        let known = records.get(name)?;
+        let len = known.len().min(record.len());
+        record[..len].copy_from_slice(&known[..len]);
+        Some(len)
+    }
+
+    fn remember(&self, name: &str, record: &[u8]) {
+        let mut records = self.shared.records.borrow_mut();
+        let kept = records.entry(name.to_owned()).or_default();
+        kept.clear();
+        kept.extend_from_slice(record);
+    }
+
+    fn learned(&self) -> Option<&dyn Learned> {
+        self.learned.as_ref().map(|learned| learned as &dyn Learned)
+    }
+}

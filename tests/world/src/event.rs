@@ -1,0 +1,159 @@
+//! Everything that happens in a world, as the judges see it and as its hash has it. Refuses to know what is right.
+
+use lms::Nanos;
+use lms::measured::MEASURED;
+use schema::{Header, Status, Topic, Verdict};
+
+use crate::consumer::Number;
+use crate::hash::History;
+use crate::topics::Sample;
+
+/// Something that happened, at a time that is told beside it.
+#[derive(Clone, Copy, Debug)]
+pub(crate) enum Event<'a> {
+    /// Hub number so many begins; its links have these names.
+    HubBegins { life: u64, boot: u64 },
+    /// It is gone, because it was killed or ended in order.
+    HubEnds { life: u64, killed: bool },
+    /// The process of the hub does not run until then.
+    Stalled { until: Nanos },
+    /// The hub opened the line to a sensor, whose port had taken so many bytes before that nobody gets any more.
+    Opened { sensor: usize, offset: u64 },
+    /// The line has no owner any more.
+    Closed { sensor: usize },
+    /// The last byte of a telegram went into the port, or did not.
+    Sent { sensor: usize, telegram: &'a Telegram<'a> },
+    /// Bytes that were in the port are gone, those from one to the other.
+    Flushed { sensor: usize, from: u64, to: u64 },
+    /// The port has another rate: what a session knew of bytes before is void.
+    Retuned { sensor: usize },
+    /// The hub has read so many bytes, up to this one.
+    Read { sensor: usize, len: usize, to: u64 },
+    /// A sample went to whoever is attached.
+    Published { sensor: usize, sample: &'a Sample },
+    /// A sample got no memory.
+    Lacking { sensor: usize, topic: Topic },
+    /// A consumer came.
+    Attached { consumer: Number, sensor: usize, topic: Topic, is_prompt: bool },
+    /// It took a sample, of which it was told by its number that it missed so many before.
+    Taken { consumer: Number, sample: &'a Sample, missed: u64 },
+    /// A sample fell out of its full queue.
+    Dropped { consumer: Number, sample: &'a Sample },
+    /// It is gone, after it took all that waited, or not.
+    Left { consumer: Number, is_drained: bool },
+    /// A robot believes this of a sensor's zones from now on.
+    Believes { sensor: usize, verdict: Verdict },
+    /// An action.
+    Acted { text: &'a str },
+    /// From now on nothing goes wrong.
+    Healed,
+    /// It is over, and the last hub has ended.
+    Over { eeprom_writes: u64, handles: usize, loans: usize, held: usize },
+}
+
+/// A telegram that left a sensor.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Telegram<'a> {
+    /// As it should have been.
+    pub(crate) bytes: &'a [u8],
+    /// Place of its first byte, and of the one behind its last, among all bytes that went into the port.
+    pub(crate) span: (u64, u64),
+    /// Why it did not go into the port as it should have been.
+    pub(crate) damage: Option<&'static str>,
+    /// The sensor did not send all of it.
+    pub(crate) aborted: bool,
+}
+
+/// What a judge says.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Violation {
+    /// The judge.
+    pub judge: &'static str,
+    /// When, in virtual nanoseconds.
+    pub at_ns: Nanos,
+    /// What is not as it should be.
+    pub words: String,
+}
+
+impl std::fmt::Display for Violation {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        write!(f, "{:.3} s, {}: {}", self.at_ns as f64 / 1e9, self.judge, self.words)
+    }
+}
+
+impl Event<'_> {
+    /// Takes it into the hash of everything.
+    pub(crate) fn hash(&self, at: Nanos, history: &mut History) {
+        history.number(at);
+        let mut numbers = |numbers: &[u64]| numbers.iter().for_each(|&number| history.number(number));
+        match *self {
+            Event::HubBegins { life, boot } => numbers(&[1, life, boot]),
+            Event::HubEnds { life, killed } => numbers(&[2, life, killed.into()]),
+            Event::Stalled { until } => numbers(&[3, until]),
+            Event::Opened { sensor, offset } => numbers(&[4, sensor as u64, offset]),
+            Event::Closed { sensor } => numbers(&[5, sensor as u64]),
+            Event::Sent { sensor, telegram } => {
+                numbers(&[6, sensor as u64, telegram.span.0, telegram.span.1, telegram.aborted.into()]);
+                history.bytes(telegram.bytes);
+            }
+            Event::Flushed { sensor, from, to } => numbers(&[7, sensor as u64, from, to]),
+            Event::Retuned { sensor } => numbers(&[8, sensor as u64]),
+            Event::Read { sensor, to, .. } => numbers(&[9, sensor as u64, to]),
+            Event::Published { sensor, sample } => {
+                numbers(&[10, sensor as u64, sample.topic as u64]);
+                // The process is another one in each run.
+                history.bytes(bytemuck::bytes_of(&Header { hub_pid: 0, ..sample.header }));
+                history.bytes(&sample.bytes);
+            }
+            Event::Lacking { sensor, topic } => numbers(&[11, sensor as u64, topic as u64]),
+            Event::Attached { consumer, sensor, topic, .. } => {
+                numbers(&[12, consumer.0.into(), sensor as u64, topic as u64]);
+            }
+            Event::Taken { consumer, sample, missed } => {
+                numbers(&[13, consumer.0.into(), sample.header.topic_seq, missed]);
+            }
+            Event::Dropped { consumer, sample } => {
+                numbers(&[14, consumer.0.into(), sample.header.topic_seq]);
+            }
+            Event::Left { consumer, is_drained } => numbers(&[15, consumer.0.into(), is_drained.into()]),
+            Event::Believes { sensor, verdict } => numbers(&[16, sensor as u64, verdict as u64]),
+            Event::Acted { text } => history.bytes(text.as_bytes()),
+            Event::Healed => numbers(&[18]),
+            Event::Over { eeprom_writes, handles, loans, held } => {
+                numbers(&[19, eeprom_writes, handles as u64, loans as u64, held as u64]);
+            }
+        }
+    }
+
+    /// What to say of it to whoever wants to see how it went; nothing of what happens with each telegram.
+    pub(crate) fn words(&self) -> Option<String> {
+        match self {
+            Event::Sent { telegram: Telegram { bytes, damage: None, aborted: false, .. }, .. }
+                if bytes[4] == MEASURED =>
+            {
+                None
+            }
+            Event::Sent { sensor, telegram } => {
+                let Telegram { bytes, span, damage, aborted } = telegram;
+                Some(format!("{sensor} sent {:02X} {span:?} {damage:?} aborted {aborted}", bytes[4]))
+            }
+            Event::Published { sensor, sample } => {
+                let Sample { topic, header, bytes, .. } = sample;
+                match topic {
+                    Topic::Status => {
+                        let status: Status = bytemuck::pod_read_unaligned(bytes);
+                        let (state, error) = (status.state()?.name(), status.last_error());
+                        Some(format!("{sensor} status {state} {} {error}", status.baud))
+                    }
+                    Topic::Telegram if header.reasons != 0 || bytes[4] != MEASURED => {
+                        let Header { seq, reasons, .. } = header;
+                        Some(format!("{sensor} published {:02X} seq {seq} reasons {reasons}", bytes[4]))
+                    }
+                    _ => None,
+                }
+            }
+            Event::Taken { .. } | Event::Read { .. } | Event::Dropped { .. } | Event::Lacking { .. } => None,
+            other => Some(format!("{other:?}")),
+        }
+    }
+}

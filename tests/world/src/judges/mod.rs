@@ -1,0 +1,65 @@
+//! The judges: each watches everything that happens for one promise, and says when it is broken. None knows another, nor what a
+//! plan wants.
+
+mod accounts;
+mod bytes;
+mod eeprom;
+mod liveness;
+mod nothing_invented;
+mod nothing_lost;
+mod numbers;
+mod prompt;
+mod resources;
+mod verdict;
+
+use lms::Nanos;
+
+use crate::event::{Event, Violation};
+use crate::plan::Plan;
+use crate::setup::Setup;
+
+/// One promise.
+pub(crate) trait Judge {
+    /// Its name in what is said.
+    fn name(&self) -> &'static str;
+
+    /// `event` happened at `at`.
+    fn note(&mut self, at: Nanos, event: &Event<'_>, say: &mut Say<'_>);
+}
+
+/// Where a judge says what is broken.
+pub(crate) struct Say<'a> {
+    pub(crate) judge: &'static str,
+    pub(crate) at_ns: Nanos,
+    pub(crate) violations: &'a mut Vec<Violation>,
+}
+
+impl Say<'_> {
+    /// `words` say what is not as it should be.
+    pub(crate) fn broken(&mut self, words: String) {
+        // What is broken once is often broken with each sample.
+        if self.violations.len() < MOST {
+            self.violations.push(Violation { judge: self.judge, at_ns: self.at_ns, words });
+        }
+    }
+}
+
+/// All judges, for a world that begins with `setup`.
+pub(crate) fn all(setup: &Setup, plan: &Plan) -> Vec<Box<dyn Judge>> {
+    let sensors = setup.sensors.len();
+    vec![
+        Box::new(bytes::Bytes::new(sensors)),
+        Box::new(accounts::Accounts::default()),
+        Box::new(numbers::Numbers::default()),
+        Box::new(nothing_invented::NothingInvented::new(sensors)),
+        Box::new(nothing_lost::NothingLost::new(sensors)),
+        Box::new(prompt::Prompt::default()),
+        Box::new(verdict::OfRobot::new(setup, plan)),
+        Box::new(liveness::Liveness::new(sensors)),
+        Box::new(resources::Resources),
+        Box::new(eeprom::Eeprom),
+    ]
+}
+
+/// More are not said of one world.
+const MOST: usize = 20;

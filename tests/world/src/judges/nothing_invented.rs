@@ -1,0 +1,81 @@
+//! Nothing is delivered that no sensor sent, unless it is marked suspect: each telegram byte by byte, as often as it was sent,
+//! and each scan value by value.
+
+use std::collections::HashMap;
+
+use lms::Nanos;
+use lms::measured::MEASURED;
+use schema::{Scan, Topic};
+
+use super::{Judge, Say};
+use crate::event::Event;
+use crate::hash::History;
+
+/// What each sensor sent.
+pub(crate) struct NothingInvented {
+    sensors: Vec<OfSensor>,
+}
+
+#[derive(Default)]
+struct OfSensor {
+    /// How often a telegram was sent and not published.
+    open: HashMap<u64, u32>,
+    /// Number, life and bytes of the last published telegram.
+    last: (u64, u64, Vec<u8>),
+}
+
+impl NothingInvented {
+    pub(crate) fn new(sensors: usize) -> NothingInvented {
+        NothingInvented { sensors: (0..sensors).map(|_| OfSensor::default()).collect() }
+    }
+}
+
+impl Judge for NothingInvented {
+    fn name(&self) -> &'static str {
+        "nothing_invented"
+    }
+
+    fn note(&mut self, _: Nanos, event: &Event<'_>, say: &mut Say<'_>) {
+        match *event {
+            Event::Sent { sensor, telegram } => {
+                *self.sensors[sensor].open.entry(key(telegram.bytes)).or_default() += 1;
+            }
+            Event::Published { sensor, sample } if sample.topic == Topic::Telegram => {
+                let of = &mut self.sensors[sensor];
+                let open = of.open.get_mut(&key(&sample.bytes)).filter(|count| **count > 0);
+                let is_known = open.map(|count| *count -= 1).is_some();
+                if !is_known && sample.header.reasons == 0 {
+                    let (command, len) = (sample.bytes[4], sample.bytes.len());
+                    say.broken(format!("sensor {sensor} did not send this {command:02X} of {len} bytes"));
+                }
+                (of.last.0, of.last.1) = (sample.header.seq, sample.header.boot);
+                of.last.2.clear();
+                of.last.2.extend_from_slice(&sample.bytes);
+            }
+            Event::Published { sensor, sample } if sample.topic == Topic::Scan => {
+                let (seq, boot, telegram) = &self.sensors[sensor].last;
+                let scan: Scan = bytemuck::pod_read_unaligned(&sample.bytes);
+                if (*seq, *boot) == (sample.header.seq, sample.header.boot) && !is_scan_of(&scan, telegram) {
+                    say.broken(format!("sensor {sensor}: a scan that is not that of telegram {seq}"));
+                }
+            }
+            _ => {}
+        }
+    }
+}
+
+/// Whether `scan` has the values of `telegram`.
+fn is_scan_of(scan: &Scan, telegram: &[u8]) -> bool {
+    let [_, _, _, _, MEASURED, low, high, values @ ..] = telegram else { return false };
+    let count = usize::from(u16::from_le_bytes([*low, *high]) & 0x01FF);
+    let (words, _) = values.as_chunks::<2>();
+    let mask = ((1u32 << scan.range_bits) - 1) as u16;
+    let same = |(range, word): (&u16, &[u8; 2])| *range == u16::from_le_bytes(*word) & mask;
+    scan.beams() == count && words.len() >= count && scan.range_array.iter().zip(&words[..count]).all(same)
+}
+
+fn key(bytes: &[u8]) -> u64 {
+    let mut history = History::new();
+    history.bytes(bytes);
+    history.value()
+}

@@ -1,0 +1,146 @@
+//! Nothing intact is lost while the hub lives: a telegram all of whose bytes the port handed out as they were sent, while the
+//! hub said that it streams, is published once and in order, unless there was no memory for it.
+
+use std::collections::VecDeque;
+
+use lms::{MILLIS, Nanos};
+use schema::{State, Status, Topic};
+
+use super::{Judge, Say};
+use crate::event::{Event, Telegram};
+
+/// What is due of each sensor.
+pub(crate) struct NothingLost {
+    sensors: Vec<OfSensor>,
+}
+
+#[derive(Default)]
+struct OfSensor {
+    sent: VecDeque<Sent>,
+    /// Place of the first byte that the session on the line can know.
+    valid_from: u64,
+    /// Place behind the last byte that the hub had read when it began to say that it streams, if it still says so.
+    streams_from: Option<u64>,
+    read: u64,
+    /// Telegrams for which there was no memory.
+    holes: usize,
+}
+
+struct Sent {
+    bytes: Vec<u8>,
+    span: (u64, u64),
+    is_whole: bool,
+    is_read: bool,
+    /// When the hub had all of it, if it has to be published.
+    due_at: Option<Nanos>,
+}
+
+impl NothingLost {
+    pub(crate) fn new(sensors: usize) -> NothingLost {
+        NothingLost { sensors: (0..sensors).map(|_| OfSensor::default()).collect() }
+    }
+}
+
+impl Judge for NothingLost {
+    fn name(&self) -> &'static str {
+        "nothing_lost"
+    }
+
+    fn note(&mut self, at: Nanos, event: &Event<'_>, say: &mut Say<'_>) {
+        match *event {
+            Event::Sent { sensor, telegram } => self.sensors[sensor].send(telegram),
+            Event::Flushed { sensor, from, .. } => self.sensors[sensor].flush(from),
+            Event::Opened { sensor, offset } => {
+                let of = &mut self.sensors[sensor];
+                (of.valid_from, of.read, of.streams_from) = (offset, offset, None);
+            }
+            Event::Retuned { sensor } => {
+                let of = &mut self.sensors[sensor];
+                of.valid_from = of.read;
+            }
+            Event::Closed { sensor } => self.sensors[sensor].end(at),
+            Event::HubEnds { .. } => self.sensors.iter_mut().for_each(|of| of.end(at)),
+            Event::Read { sensor, to, .. } => self.sensors[sensor].read(at, to),
+            Event::Lacking { sensor, topic: Topic::Telegram } => self.sensors[sensor].holes += 1,
+            Event::Published { sensor, sample } if sample.topic == Topic::Telegram => {
+                if let Some(lost) = self.sensors[sensor].publish(&sample.bytes) {
+                    say.broken(format!("sensor {sensor}: {lost}"));
+                }
+            }
+            Event::Published { sensor, sample } if sample.topic == Topic::Status => {
+                let status: Status = bytemuck::pod_read_unaligned(&sample.bytes);
+                let of = &mut self.sensors[sensor];
+                if status.state() != Some(State::Streaming) {
+                    of.streams_from = None;
+                    of.end(at);
+                } else if of.streams_from.is_none() {
+                    of.streams_from = Some(of.read);
+                }
+            }
+            Event::Over { .. } => {
+                for (sensor, of) in self.sensors.iter().enumerate() {
+                    let is_lost = |sent: &&Sent| sent.due_at.is_some_and(|due| due + HELD < at);
+                    let lost = of.sent.iter().filter(is_lost).count();
+                    if lost > of.holes {
+                        say.broken(format!("sensor {sensor}: {lost} lost at the end"));
+                    }
+                }
+            }
+            _ => {}
+        }
+    }
+}
+
+impl OfSensor {
+    fn send(&mut self, telegram: &Telegram<'_>) {
+        let Telegram { bytes, span, damage, aborted } = *telegram;
+        let is_whole = damage.is_none() && !aborted;
+        self.sent.push_back(Sent { bytes: bytes.to_vec(), span, is_whole, is_read: false, due_at: None });
+        while self.sent.len() > MOST && self.sent[0].due_at.is_none() {
+            self.sent.pop_front();
+        }
+    }
+
+    fn flush(&mut self, from: u64) {
+        for sent in self.sent.iter_mut().rev().take_while(|sent| sent.span.1 > from) {
+            sent.is_whole = false;
+        }
+    }
+
+    fn read(&mut self, at: Nanos, to: u64) {
+        self.read = to;
+        for sent in self.sent.iter_mut().rev().take_while(|sent| !sent.is_read) {
+            if sent.span.1 <= to {
+                sent.is_read = true;
+                let is_known = |from: u64| sent.span.0 >= from;
+                let is_due = sent.is_whole && is_known(self.valid_from);
+                sent.due_at = (is_due && self.streams_from.is_some_and(is_known)).then_some(at);
+            }
+        }
+    }
+
+    /// The stream ends: what came just before may still have been held back, to see what follows.
+    fn end(&mut self, at: Nanos) {
+        for sent in self.sent.iter_mut().filter(|sent| sent.due_at.is_some_and(|due| due + HELD > at)) {
+            sent.due_at = None;
+        }
+    }
+
+    /// A telegram is published. What was lost before it.
+    fn publish(&mut self, bytes: &[u8]) -> Option<String> {
+        let found = self.sent.iter().position(|sent| sent.is_read && sent.bytes == bytes)?;
+        let passed = self.sent.drain(..=found).take(found);
+        let lost: Vec<Sent> = passed.filter(|sent| sent.due_at.is_some()).collect();
+        let (count, holes) = (lost.len(), self.holes);
+        self.holes = holes.saturating_sub(count);
+        (count > holes).then(|| {
+            let Sent { bytes, span, .. } = &lost[0];
+            format!("{count} lost, first {:02X} at {span:?}", bytes[4])
+        })
+    }
+}
+
+/// A telegram is held back no longer than so.
+const HELD: Nanos = 100 * MILLIS;
+/// So many that were never due are remembered.
+const MOST: usize = 64;

@@ -1,0 +1,56 @@
+//! What headers say fits together: numbers grow, stamps are neither of the future nor go back, and what was made of a telegram
+//! has its number, its stamps and its quality.
+
+use std::collections::BTreeMap;
+
+use lms::Nanos;
+use schema::{Header, Topic};
+
+use super::{Judge, Say};
+use crate::event::Event;
+use crate::topics::Sample;
+
+/// The last headers.
+#[derive(Default)]
+pub(crate) struct Numbers {
+    last: BTreeMap<(usize, Topic), Header>,
+}
+
+impl Judge for Numbers {
+    fn name(&self) -> &'static str {
+        "numbers"
+    }
+
+    fn note(&mut self, at: Nanos, event: &Event<'_>, say: &mut Say<'_>) {
+        let Event::Published { sensor, sample } = *event else { return };
+        let Sample { topic, header, .. } = sample;
+        let before = self.last.insert((sensor, *topic), *header);
+        let mut broken = |what: &str| say.broken(format!("sensor {sensor}, {topic:?}: {what}: {header:?}"));
+        if header.stamp_first_ns > header.stamp_last_ns || header.stamp_last_ns > at {
+            broken("a stamp of the future");
+        }
+        if usize::from(header.sensor) != sensor {
+            broken("the number of another sensor");
+        }
+        if let Some(before) = before.filter(|before| before.boot == header.boot) {
+            if header.topic_seq <= before.topic_seq || header.seq < before.seq {
+                broken("a number that does not grow");
+            }
+            if *topic == Topic::Telegram && header.stamp_last_ns < before.stamp_last_ns {
+                broken("a stamp that goes back");
+            }
+        }
+        // What has no telegram does not say when it was sent.
+        if *topic != Topic::Telegram && header.hub_time_ns().is_some() {
+            let of = |header: &Header| {
+                let Header { seq, boot, stamp_first_ns, stamp_last_ns, wall_ns, reasons, .. } = *header;
+                (seq, boot, stamp_first_ns, stamp_last_ns, wall_ns, reasons)
+            };
+            // A telegram without memory was not published.
+            let telegram = self.last.get(&(sensor, Topic::Telegram));
+            if telegram.is_some_and(|telegram| telegram.seq >= header.seq && of(telegram) != of(header)) {
+                broken("not that of its telegram");
+            }
+        }
+    }
+}

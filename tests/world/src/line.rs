@@ -1,0 +1,110 @@
+//! A hub's end of a port: what [`daemon::surroundings::Line`] asks, of a tty that is simulated. Decides nothing.
+
+use std::cell::Cell;
+use std::io;
+use std::rc::Rc;
+
+use daemon::surroundings::Line;
+use lms::Nanos;
+use port::Allowance;
+
+use crate::shared::Shared;
+
+/// The time of one link: its thread may be ahead of the others' while it writes a request byte by byte.
+#[derive(Default)]
+pub(crate) struct LinkClock(Cell<Nanos>);
+
+impl LinkClock {
+    /// Each look at the clock takes a moment.
+    pub(crate) fn now(&self) -> Nanos {
+        self.0.set(self.0.get() + LOOK);
+        self.0.get()
+    }
+
+    /// The time, without a look.
+    pub(crate) fn read(&self) -> Nanos {
+        self.0.get()
+    }
+
+    /// It is at least `time`.
+    pub(crate) fn pass(&self, time: Nanos) {
+        self.0.set(self.0.get().max(time));
+    }
+}
+
+/// What it takes to look at a clock.
+const LOOK: Nanos = 40;
+
+/// An open descriptor of a port; the port is closed with the last one.
+pub(crate) struct Handle {
+    pub(crate) shared: Rc<Shared>,
+    pub(crate) port: usize,
+    pub(crate) device: u64,
+}
+
+impl Drop for Handle {
+    fn drop(&mut self) {
+        let Shared { handles, ports, log, clock, .. } = &*self.shared;
+        handles.set(handles.get() - 1);
+        ports[self.port].borrow_mut().close(self.device, log, clock.get());
+    }
+}
+
+/// An open line of a link.
+pub(crate) struct OpenLine {
+    pub(crate) handle: Rc<Handle>,
+    pub(crate) clock: Rc<LinkClock>,
+}
+
+impl OpenLine {
+    fn check(&self, is_there: bool) -> io::Result<()> {
+        if is_there { Ok(()) } else { Err(io::Error::new(io::ErrorKind::UnexpectedEof, "the line hung up")) }
+    }
+}
+
+impl Line for OpenLine {
+    fn read(&self, buffer: &mut [u8]) -> io::Result<usize> {
+        let Handle { shared, port, device } = &*self.handle;
+        let (mut tty, now) = (shared.ports[*port].borrow_mut(), self.clock.now());
+        tty.advance(now, &shared.log);
+        self.check(tty.is_there(*device))?;
+        Ok(tty.read(buffer, &shared.log, now))
+    }
+
+    fn write(&self, byte: u8) -> io::Result<()> {
+        let Handle { shared, port, device } = &*self.handle;
+        let (mut tty, now) = (shared.ports[*port].borrow_mut(), self.clock.now());
+        tty.advance(now, &shared.log);
+        self.check(tty.is_there(*device))?;
+        tty.write(byte, now);
+        Ok(())
+    }
+
+    fn set_baud(&self, baud: u32) -> io::Result<Option<io::Error>> {
+        let Handle { shared, port, device } = &*self.handle;
+        let (mut tty, now) = (shared.ports[*port].borrow_mut(), self.clock.now());
+        tty.advance(now, &shared.log);
+        self.check(tty.is_there(*device))?;
+        tty.set_rate(baud, &shared.log, now);
+        Ok(None)
+    }
+
+    fn waiting(&self) -> Option<usize> {
+        let Handle { shared, port, .. } = &*self.handle;
+        let mut tty = shared.ports[*port].borrow_mut();
+        tty.advance(self.clock.now(), &shared.log);
+        Some(tty.waiting())
+    }
+
+    fn allowance(&self, _: u32) -> Option<Allowance> {
+        None
+    }
+
+    fn line_errors(&self) -> u64 {
+        0
+    }
+
+    fn is_simulated(&self) -> bool {
+        false
+    }
+}

@@ -1,0 +1,155 @@
+//! Runs worlds: `cargo run --release -p scanhub-world -- --seeds 0..200`. A violation is printed with its seed and with the
+//! shortest list of actions that still shows it.
+
+use std::io::{IsTerminal, Write};
+use std::process::{Command, ExitCode};
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::Instant;
+
+use clap::Parser;
+use world::{Outcome, Plan, Runner, Totals, corpus, run, shrink};
+
+/// Simulates whole hubs in made-up time, and watches what they promise.
+#[derive(Debug, Parser)]
+struct Arguments {
+    /// The seeds of the worlds, such as 0..200.
+    #[arg(long, value_parser = range, default_value = "0..200")]
+    seeds: (u64, u64),
+    /// One seed, with everything that happens.
+    #[arg(long)]
+    seed: Option<u64>,
+    /// How long each world lasts.
+    #[arg(long, default_value_t = 60)]
+    virtual_seconds: u64,
+    /// So many of the first worlds are run twice, and must be equal.
+    #[arg(long, default_value_t = 0)]
+    twice: usize,
+    /// Worlds at a time.
+    #[arg(long, default_value_t = 2)]
+    threads: usize,
+    /// The plan in this file instead.
+    #[arg(long)]
+    plan: Option<std::path::PathBuf>,
+    /// The plans that once failed instead.
+    #[arg(long)]
+    corpus: bool,
+    /// Totals as a line of JSON.
+    #[arg(long)]
+    json: bool,
+    /// Leaves plans that fail as long as they are.
+    #[arg(long)]
+    no_shrink: bool,
+}
+
+fn range(text: &str) -> Result<(u64, u64), String> {
+    let ends = text.split_once("..").and_then(|(from, to)| Some((from.parse().ok()?, to.parse().ok()?)));
+    ends.filter(|(from, to)| from < to).ok_or_else(|| "write FROM..TO, such as 0..200".to_owned())
+}
+
+fn main() -> ExitCode {
+    let arguments = Arguments::parse();
+    let is_over = Arc::new(AtomicBool::new(false));
+    for signal in [signal_hook::consts::SIGINT, signal_hook::consts::SIGTERM] {
+        // Without it the first signal ends the program.
+        let _ = signal_hook::flag::register_conditional_shutdown(signal, 130, is_over.clone());
+        let _ = signal_hook::flag::register(signal, is_over.clone());
+    }
+    let plans = match plans(&arguments) {
+        Ok(plans) => plans,
+        Err(error) => {
+            eprintln!("{error}");
+            return ExitCode::from(2);
+        }
+    };
+    if let ([plan], true) = (&plans[..], arguments.seed.is_some() || arguments.plan.is_some()) {
+        print!("{plan}");
+        let outcome = run(plan, true);
+        outcome.violations.iter().for_each(|violation| println!("{violation}"));
+        println!("hash {:016x}", outcome.hash);
+        return ExitCode::from(u8::from(!outcome.violations.is_empty()));
+    }
+    let before = descriptors();
+    let begun = Instant::now();
+    let (count, is_terminal) = (plans.len(), std::io::stderr().is_terminal());
+    let runner = Runner { plans, twice: arguments.twice, threads: arguments.threads };
+    let totals = runner.run(&is_over, |totals| {
+        if is_terminal {
+            eprint!("\r{} of {count} worlds, {} failed ", totals.worlds, totals.failed.len());
+            let _ = std::io::stderr().flush();
+        }
+    });
+    if is_terminal {
+        eprintln!();
+    }
+    for (plan, outcome, is_same) in &totals.failed {
+        report(plan, outcome, *is_same, arguments.no_shrink || is_over.load(Ordering::Relaxed));
+    }
+    let left = descriptors().saturating_sub(before);
+    if left > 0 {
+        println!("{left} descriptors were not given back");
+    }
+    conclude(&totals, begun.elapsed().as_secs_f64(), arguments.json);
+    let is_well = totals.failed.is_empty() && left == 0 && !is_over.load(Ordering::Relaxed);
+    ExitCode::from(u8::from(!is_well))
+}
+
+fn plans(arguments: &Arguments) -> Result<Vec<Plan>, String> {
+    let of_seed = |seed| Plan::of_seed(seed, arguments.virtual_seconds);
+    if let Some(path) = &arguments.plan {
+        let text = std::fs::read_to_string(path).map_err(|error| format!("{}: {error}", path.display()))?;
+        return Ok(vec![text.parse()?]);
+    }
+    if arguments.corpus {
+        return Ok(corpus::corpus().into_iter().map(|(_, plan)| plan).collect());
+    }
+    Ok(match arguments.seed {
+        Some(seed) => vec![of_seed(seed)],
+        None => (arguments.seeds.0..arguments.seeds.1).map(of_seed).collect(),
+    })
+}
+
+/// Says what failed, and the shortest plan that still does.
+fn report(plan: &Plan, outcome: &Outcome, is_same: bool, is_long: bool) {
+    println!("SEED={} COMMIT={}", plan.seed, commit());
+    if !is_same {
+        println!("the second run was another one than the first");
+    }
+    outcome.violations.iter().take(5).for_each(|violation| println!("  {violation}"));
+    let judge = |plan: &Plan| run(plan, false).violations.first().map(|violation| violation.judge);
+    let shortest = if is_long { plan.clone() } else { shrink::shrink(plan, judge) };
+    println!("{shortest}");
+}
+
+fn conclude(totals: &Totals, took_s: f64, is_json: bool) {
+    let Totals { worlds, sensor_seconds, samples, busy, failed } = totals;
+    let per_core = *sensor_seconds as f64 / busy.as_secs_f64().max(1e-9);
+    if is_json {
+        let line = serde_json::json!({
+            "worlds": worlds,
+            "failed": failed.len(),
+            "sensor_seconds": sensor_seconds,
+            "samples": samples,
+            "seconds": took_s,
+            "sensor_seconds_per_second_of_a_core": per_core,
+        });
+        println!("{line}");
+    } else {
+        println!(
+            "{worlds} worlds, {} failed; {sensor_seconds} sensor-seconds and {samples} samples in {took_s:.1} s: \
+             {per_core:.0} sensor-seconds a second of a core",
+            failed.len()
+        );
+    }
+}
+
+/// Descriptors that this process has open.
+fn descriptors() -> usize {
+    std::fs::read_dir("/proc/self/fd").map_or(0, Iterator::count)
+}
+
+fn commit() -> String {
+    let asked = Command::new("git").args(["rev-parse", "--short", "HEAD"]).output();
+    let text = asked.ok().filter(|output| output.status.success()).map(|output| output.stdout);
+    String::from_utf8_lossy(&text.unwrap_or_default()).trim().to_owned()
+}

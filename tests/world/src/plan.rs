@@ -1,0 +1,157 @@
+//! What shall happen in a world, as data: a seed, a time, and a list of timed actions. A list can be drawn by the seed, printed,
+//! parsed and cut, so that a failure can be played again with fewer actions. Refuses to know what an action does.
+
+use std::fmt;
+use std::str::FromStr;
+
+use lms::{MILLIS, Nanos};
+
+use crate::actions::{KINDS, Kind};
+
+/// What shall happen. Everything else (how many sensors, their rates, the consumers) follows from the seed.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Plan {
+    /// Of all random numbers.
+    pub seed: u64,
+    /// How long it lasts, in virtual seconds.
+    pub seconds: u64,
+    /// In the order of time.
+    pub actions: Vec<Action>,
+}
+
+/// Something that happens at a time.
+#[derive(Clone, Debug)]
+pub struct Action {
+    /// When, in milliseconds since the beginning.
+    pub at_ms: u64,
+    pub(crate) kind: &'static Kind,
+    /// A value for each key of the kind.
+    pub(crate) values: Vec<u64>,
+}
+
+impl Plan {
+    /// What `seed` draws for `seconds`: of the kinds of action about half (swarm testing: many faults hide each other), each
+    /// of the others some times, and nothing in the last [`REST`].
+    pub fn of_seed(seed: u64, seconds: u64) -> Plan {
+        let mut random = fastrand::Rng::with_seed(seed ^ 0x5EED_0F1A_C710_0000);
+        let end_ms = (seconds * 1_000).saturating_sub(REST / MILLIS);
+        let mut actions = Vec::new();
+        for kind in KINDS {
+            // Drawn for each kind, so that a new kind changes little of what the old ones do.
+            let mut random = random.fork();
+            if random.bool() || end_ms <= BEGIN_MS {
+                continue;
+            }
+            let mean = kind.per_minute * (end_ms - BEGIN_MS) as f64 / 60_000.0;
+            for _ in 0..1 + (random.f64() * 2.0 * mean) as u64 {
+                let at_ms = random.u64(BEGIN_MS..end_ms);
+                actions.push(Action { at_ms, kind, values: kind.draw(&mut random) });
+            }
+        }
+        actions.sort_by_key(|action| action.at_ms);
+        Plan { seed, seconds, actions }
+    }
+
+    /// When everything is made well again: what is to be seen then has [`REST`].
+    pub(crate) fn heals_at(&self) -> Nanos {
+        (self.seconds * 1_000 * MILLIS).saturating_sub(REST)
+    }
+}
+
+/// Without actions at the end, in which everything has to come back.
+pub(crate) const REST: Nanos = 8_000 * MILLIS;
+/// Nothing happens in the first moment: a hub has to be there first.
+const BEGIN_MS: u64 = 200;
+
+impl Action {
+    /// The value of the key called `name`.
+    pub(crate) fn value(&self, name: &str) -> u64 {
+        let at = self.kind.keys.iter().position(|key| key.name == name);
+        at.and_then(|at| self.values.get(at)).copied().unwrap_or_default()
+    }
+
+    /// The name of its kind.
+    pub fn name(&self) -> &'static str {
+        self.kind.name
+    }
+}
+
+impl PartialEq for Action {
+    fn eq(&self, other: &Action) -> bool {
+        (self.at_ms, self.kind.name, &self.values) == (other.at_ms, other.kind.name, &other.values)
+    }
+}
+
+impl fmt::Display for Action {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "{} {}", self.at_ms, self.kind.name)?;
+        let mut keys = self.kind.keys.iter().zip(&self.values);
+        keys.try_for_each(|(key, value)| write!(f, " {}={value}", key.name))
+    }
+}
+
+impl FromStr for Action {
+    type Err = String;
+
+    fn from_str(text: &str) -> Result<Action, String> {
+        let wrong = || format!("{text:?} is no action");
+        let mut words = text.split_whitespace();
+        let at_ms = words.next().and_then(|word| word.parse().ok()).ok_or_else(wrong)?;
+        let name = words.next().ok_or_else(wrong)?;
+        let kind = KINDS.iter().find(|kind| kind.name == name).ok_or_else(wrong)?;
+        let mut values = Vec::new();
+        for (key, word) in kind.keys.iter().zip(words.by_ref()) {
+            let value = word.split_once('=').filter(|(name, _)| *name == key.name);
+            values.push(value.and_then(|(_, value)| value.parse().ok()).ok_or_else(wrong)?);
+        }
+        if values.len() < kind.keys.len() || words.next().is_some() {
+            return Err(wrong());
+        }
+        Ok(Action { at_ms, kind, values })
+    }
+}
+
+impl fmt::Display for Plan {
+    /// A line for the seed, and one for each action.
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        writeln!(f, "seed {} seconds {}", self.seed, self.seconds)?;
+        self.actions.iter().try_for_each(|action| writeln!(f, "{action}"))
+    }
+}
+
+impl FromStr for Plan {
+    type Err = String;
+
+    fn from_str(text: &str) -> Result<Plan, String> {
+        let mut lines = text.lines().map(str::trim).filter(|line| !line.is_empty());
+        let head = lines.next().unwrap_or_default();
+        let words: Vec<&str> = head.split_whitespace().collect();
+        let ["seed", seed, "seconds", seconds] = words[..] else {
+            return Err(format!("{head:?} is not the first line of a plan"));
+        };
+        let number = |word: &str| word.parse().map_err(|_| format!("{word:?} is no number"));
+        let (seed, seconds) = (number(seed)?, number(seconds)?);
+        Ok(Plan { seed, seconds, actions: lines.map(str::parse).collect::<Result<_, _>>()? })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_plan_is_the_same_as_text() {
+        let mut met = std::collections::HashSet::new();
+        for seed in 0..50 {
+            let plan = Plan::of_seed(seed, 60);
+            assert_eq!(plan.to_string().parse(), Ok(plan.clone()));
+            assert_eq!(plan, Plan::of_seed(seed, 60));
+            assert!(plan.actions.iter().all(|action| action.at_ms * MILLIS < plan.heals_at()));
+            met.extend(plan.actions.iter().map(Action::name));
+        }
+        assert_eq!(met.len(), KINDS.len(), "{met:?}");
+        for wrong in ["", "seed x seconds 1", "seed 1 seconds 2\nfoo", "seed 1 seconds 2\n5 fly sensor=1"] {
+            assert!(wrong.parse::<Plan>().is_err(), "{wrong:?}");
+        }
+    }
+}

@@ -1,0 +1,88 @@
+//! What all parts of a world have in common: the clock, the ports, the topics, the files, and the log that everything is told
+//! to. Lives in one thread.
+
+use std::cell::{Cell, RefCell};
+use std::collections::BTreeMap;
+use std::rc::Rc;
+
+use lms::Nanos;
+
+use crate::event::{Event, Violation};
+use crate::hash::History;
+use crate::judges::{Judge, Say};
+use crate::line::Handle;
+use crate::topics::Board;
+use crate::tty::Tty;
+
+/// The parts of a world that a hub can reach.
+pub(crate) struct Shared {
+    /// Nanoseconds since the machine was started.
+    pub(crate) clock: Cell<Nanos>,
+    /// From the clock to 1970.
+    pub(crate) wall_ahead: Cell<u64>,
+    pub(crate) ports: Vec<RefCell<Tty>>,
+    pub(crate) board: RefCell<Board>,
+    pub(crate) log: Log,
+    /// The directory in which what was learned is kept, and whether its disk is full.
+    pub(crate) files: RefCell<BTreeMap<String, String>>,
+    pub(crate) disk_is_full: Cell<bool>,
+    /// The little files in the domain's directory.
+    pub(crate) records: RefCell<BTreeMap<String, Vec<u8>>>,
+    /// A service manager keeps ports of a killed hub.
+    pub(crate) keeps_ports: bool,
+    pub(crate) kept: RefCell<BTreeMap<String, Rc<Handle>>>,
+    /// Lines that are open, kept ones too.
+    pub(crate) handles: Cell<usize>,
+    /// Nobody can open anything.
+    pub(crate) lacks_descriptors: Cell<bool>,
+    /// Sensors whose consumers were woken, and when.
+    pub(crate) woken: RefCell<Vec<(usize, Nanos)>>,
+}
+
+impl Shared {
+    pub(crate) fn tell(&self, event: &Event<'_>) {
+        self.log.tell(self.clock.get(), event);
+    }
+}
+
+/// Everything that happens goes through here: into the hash, and to the judges.
+pub(crate) struct Log {
+    inner: RefCell<Inner>,
+    is_verbose: bool,
+}
+
+struct Inner {
+    history: History,
+    judges: Vec<Box<dyn Judge>>,
+    violations: Vec<Violation>,
+    published: u64,
+}
+
+impl Log {
+    pub(crate) fn new(judges: Vec<Box<dyn Judge>>, is_verbose: bool) -> Log {
+        let inner = Inner { history: History::new(), judges, violations: Vec::new(), published: 0 };
+        Log { inner: RefCell::new(inner), is_verbose }
+    }
+
+    /// `event` happened at `at`.
+    pub(crate) fn tell(&self, at: Nanos, event: &Event<'_>) {
+        let Inner { history, judges, violations, published } = &mut *self.inner.borrow_mut();
+        if self.is_verbose
+            && let Some(words) = event.words()
+        {
+            eprintln!("{:>12.6} {words}", at as f64 / 1e9);
+        }
+        event.hash(at, history);
+        *published += u64::from(matches!(event, Event::Published { .. }));
+        for judge in judges {
+            let name = judge.name();
+            judge.note(at, event, &mut Say { judge: name, at_ns: at, violations });
+        }
+    }
+
+    /// What the judges said, the hash of everything, and how many samples were published.
+    pub(crate) fn end(&self) -> (Vec<Violation>, u64, u64) {
+        let mut inner = self.inner.borrow_mut();
+        (std::mem::take(&mut inner.violations), inner.history.value(), inner.published)
+    }
+}
