@@ -35,6 +35,7 @@ pub mod wire;
 pub mod world;
 mod world_view;
 
+pub use line::Event;
 pub use request_decoder::{Arrival, Dropped};
-pub use simulate::{Ready, simulate};
+pub use simulate::{Ready, simulate, simulate_with};
 pub use transmission::ChunkSize;
