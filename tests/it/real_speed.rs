@@ -7,8 +7,8 @@ mod sensors;
 mod stage;
 
 use lms::MILLIS;
-use scanhub_world::Plan;
 use stage::Stage;
+use world::Plan;
 
 /// The list that is played if none is named.
 const SEED: u64 = 7;

@@ -45,8 +45,7 @@ pub(super) fn nothing_is_invented(taken: &[Value], sent: &[Record]) {
 
 /// While nothing goes wrong every telegram comes.
 pub(super) fn nothing_is_lost(taken: &[Value], sent: &[Record]) {
-    let calm: Vec<_> =
-        taken[taken.len() - CALM..].iter().map(|line| Record::hash(&bytes_of(line))).collect();
+    let calm: Vec<_> = taken[taken.len() - CALM..].iter().map(|line| Record::hash(&bytes_of(line))).collect();
     let hashes: Vec<_> = sent.iter().map(|record| record.sha256).collect();
     assert!(hashes.windows(CALM).any(|window| window == calm), "not all of the last telegrams came");
 }

@@ -4,10 +4,9 @@ use std::time::{Duration, Instant};
 
 use lms::{MILLIS, Nanos};
 use rustix::process::Signal;
-use scanhub_world::Action;
 use schema::Topic;
 use sim::Event;
-use sim::fault::Faults;
+use world::Action;
 
 use super::judges;
 use super::sensors::{SENSORS, Sensors};
