@@ -8,14 +8,14 @@
 
 use lms::command::{self, Request};
 use lms::exchange::{Conversation, Exchange, Heard, MODE_TIMEOUT, MORE_TRIES, Output, Say, TRIES};
-use lms::framer::Place;
+use lms::framer::TelegramSpan;
 use lms::operating::{ON_REQUEST, Operating, PARTIAL, STREAM};
 use lms::reply::Reply;
 use lms::telegram::Encoded;
 use lms::{MILLIS, Nanos};
 
 use crate::eeprom::{PowerOn, Write};
-use crate::plan::{Consent, Kept, Plan};
+use crate::plan::{Consent, OwnedConfiguration, Plan};
 
 /// A change under way; it cannot be copied, as consent is to one.
 #[derive(Debug)]
@@ -63,7 +63,7 @@ pub struct Outcome {
     /// Whether a write may have reached the sensor.
     pub written: bool,
     /// The configuration as it was read back.
-    pub configuration: Option<Kept>,
+    pub configuration: Option<OwnedConfiguration>,
     /// Whether a rate other than 9600 comes after power-on, if that was to change and could be read back.
     pub permanent_baud: Option<bool>,
     /// The operating mode in which the sensor is now; `None` if it may still be in installation mode.
@@ -84,7 +84,7 @@ pub enum Failing {
 #[derive(Clone, Debug)]
 enum Saying {
     Ask(Request),
-    Keep(Kept),
+    Keep(OwnedConfiguration),
     PowerOn(PowerOn),
 }
 
@@ -93,7 +93,7 @@ impl Saying {
     fn write(&self) -> Option<Write<'_>> {
         match self {
             Saying::Ask(_) => None,
-            Saying::Keep(kept) => Some(Write::Configuration(kept.bytes())),
+            Saying::Keep(new) => Some(Write::Configuration(new.bytes())),
             Saying::PowerOn(power_on) => Some(Write::PowerOn(*power_on)),
         }
     }
@@ -113,7 +113,7 @@ impl Say for Saying {
     fn command(&self) -> u8 {
         match self {
             Saying::Ask(request) => request.command(),
-            Saying::Keep(kept) => Write::Configuration(kept.bytes()).command(),
+            Saying::Keep(new) => Write::Configuration(new.bytes()).command(),
             Saying::PowerOn(power_on) => Write::PowerOn(*power_on).command(),
         }
     }
@@ -202,12 +202,12 @@ impl Change {
         }
     }
 
-    fn on_telegram(&mut self, place: Place) {
-        let telegram = self.exchange.view(place);
+    fn on_telegram(&mut self, span: TelegramSpan) {
+        let telegram = self.exchange.view(span);
         let reply = Reply::decode(telegram);
-        let kept = match &reply {
+        let configuration = match &reply {
             Some(Reply::Configuration(it) | Reply::ConfigurationWritten { configuration: it, .. }) => {
-                Kept::new(it.bytes())
+                OwnedConfiguration::new(it.bytes())
             }
             _ => None,
         };
@@ -233,8 +233,8 @@ impl Change {
             // An answer that cannot be read says no more than none.
             Step::Write if done.is_none() => self.ask_what_is_kept(),
             _ if done.is_none() => self.fail(Failing::Unanswered),
-            Step::Compare if kept != Some(self.plan.old) => self.fail(Failing::Differs),
-            Step::Check if kept == Some(self.plan.new) => self.begin(Step::PowerOn),
+            Step::Compare if configuration != Some(self.plan.old) => self.fail(Failing::Differs),
+            Step::Check if configuration == Some(self.plan.new) => self.begin(Step::PowerOn),
             Step::Check if self.writes_left > 0 => self.begin(Step::Write),
             Step::Check => {
                 self.step = Step::Write;
@@ -245,8 +245,8 @@ impl Change {
                 self.begin(Step::ReadBack);
             }
             Step::ReadBack => {
-                self.outcome.configuration = kept;
-                if kept != Some(self.plan.new) {
+                self.outcome.configuration = configuration;
+                if configuration != Some(self.plan.new) {
                     self.note(Failing::Differs);
                 }
                 self.begin(Step::ReadStatus);
@@ -329,7 +329,7 @@ impl Conversation for Change {
     fn poll_output(&mut self) -> Output {
         while let Some(heard) = self.exchange.advance() {
             match heard {
-                Heard::Telegram(place) => self.on_telegram(place),
+                Heard::Telegram(span) => self.on_telegram(span),
                 // While it may be writing, only time says no: noise is not worth a second write.
                 Heard::Nak if !self.is_quiet || matches!(self.step, Step::Write | Step::PowerOn) => {}
                 Heard::Nak => {

@@ -8,7 +8,7 @@ use lms::parameters::Password;
 use lms::telegram::{FRAME, Telegram, Writer};
 use lms::variant::{Baud, Mode, Unit};
 use lms::{Inquiry, MILLIS, Nanos};
-use lms_configure::{Change, Consent, Kept, Plan};
+use lms_configure::{Change, Consent, OwnedConfiguration, Plan};
 
 /// Drives `talk` until it is over, by what comes to mind; returns the telegrams that it said.
 fn drive<C: Conversation>(talk: &mut C, seed: u64) -> Vec<Vec<u8>> {
@@ -95,7 +95,7 @@ fn an_inquiry_ends_and_only_asks() {
 
 #[test]
 fn a_change_ends_writes_what_was_shown_and_leaves_the_installation_mode() {
-    let old = Kept::new(&factory(Mode(1), Unit::Mm)).expect("34 bytes");
+    let old = OwnedConfiguration::new(&factory(Mode(1), Unit::Mm)).expect("34 bytes");
     let mut new = old;
     new.set(6, 0);
     let mut most = 0;

@@ -5,7 +5,7 @@ use std::collections::BTreeSet;
 use lms::variant::{Mode, Unit, Variant};
 use proptest::prelude::*;
 use schema::Failure;
-use sim::look::Met;
+use sim::labeled_scan::Met;
 use sim::room::Room;
 use sim::world::World;
 

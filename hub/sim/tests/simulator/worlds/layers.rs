@@ -1,8 +1,8 @@
 //! Each layer of noise is seen to act, and to be off when it is switched off.
 
 use lms::variant::{Mode, Unit, Variant};
+use sim::labeled_scan::Met;
 use sim::layers::Layers;
-use sim::look::Met;
 use sim::room::Room;
 use sim::world::World;
 

@@ -7,7 +7,7 @@ mod truth;
 
 use lms::Nanos;
 use lms::variant::{Mode, Unit, Variant};
-use sim::look::Look;
+use sim::labeled_scan::LabeledScan;
 use sim::room::Room;
 use sim::world::World;
 
@@ -27,8 +27,8 @@ fn world(text: &str) -> World {
 }
 
 /// 361 beams in millimetres with levels.
-fn look(room: &Room, end_ns: Nanos) -> Look {
-    room.look(Variant::HALF, Unit::Mm, Mode(1), end_ns)
+fn look(room: &Room, end_ns: Nanos) -> LabeledScan {
+    room.labeled_scan(Variant::HALF, Unit::Mm, Mode(1), end_ns)
 }
 
 /// A text of the directory.

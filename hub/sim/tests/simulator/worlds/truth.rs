@@ -1,8 +1,8 @@
 //! The truth beside the words, against a world that lacks the thing or the person in question.
 
 use lms::Nanos;
+use sim::labeled_scan::{LabeledScan, Met};
 use sim::layers::Layers;
-use sim::look::{Look, Met};
 use sim::room::Room;
 
 use super::{look, text, world};
@@ -12,7 +12,7 @@ const SECOND: Nanos = 1_000_000_000;
 const WIDE: Layers = Layers { spot: true, ..Layers::NONE };
 
 /// The looks at `text` with and without everything from `cut` on, which stands at its end.
-fn beside(text: &str, cut: &str, end_ns: Nanos) -> (Look, Look) {
+fn beside(text: &str, cut: &str, end_ns: Nanos) -> (LabeledScan, LabeledScan) {
     let (without, _) = text.split_once(cut).expect("what is to be cut");
     let look_at = |text: &str| look(&Room::new(&world(text).with_layers(WIDE), 4), end_ns);
     (look_at(text), look_at(without))

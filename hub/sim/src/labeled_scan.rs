@@ -5,7 +5,7 @@ use lms::Nanos;
 
 /// A scan, and the truth for it.
 #[derive(Clone, Debug, PartialEq)]
-pub struct Look {
+pub struct LabeledScan {
     /// A value word for each beam.
     pub words: Vec<u16>,
     /// What each of these beams met, in the same order.
