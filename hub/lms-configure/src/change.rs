@@ -1,10 +1,9 @@
-//! Changes what a sensor keeps for ever. It looks whether the sensor still keeps what it did, goes into installation
-//! mode, writes, leaves it again, reads back what is in force now, and brings back the operating mode in which the
-//! sensor was. Whatever goes wrong on the way, it tries to leave the installation mode, and says in the end what it
-//! knows of the sensor's state.
+//! Changes a sensor's EEPROM settings. It checks that the settings are still those of the plan, enters installation
+//! mode, writes, leaves that mode, reads the settings back, and restores the earlier operating mode. After any failure
+//! it tries to leave installation mode, and its outcome says what is known of the sensor's state.
 //!
-//! The only code that sends a request of [`crate::eeprom`], and it needs [`Consent`]. A write that was not acknowledged
-//! is not simply said again: first the configuration tells whether it was done.
+//! The only code that sends a request of [`crate::eeprom`], and it needs [`Consent`]. A write that was not
+//! acknowledged is not simply repeated: first the configuration is read, to see whether it was done.
 
 use lms::command::{self, Request};
 use lms::exchange::{Conversation, Exchange, Heard, MODE_TIMEOUT, MORE_TRIES, Output, Say, TRIES};
@@ -75,9 +74,9 @@ pub struct Outcome {
 pub enum Failing {
     /// No reply, or none that can be read.
     Unanswered,
-    /// The sensor said no; to [`Step::Enter`]: the password is wrong.
+    /// The sensor refused; at [`Step::Enter`]: the password is wrong.
     Refused,
-    /// What was read back is not what was to be written; to [`Step::Compare`]: not what was there before.
+    /// The settings read back differ from those written; at [`Step::Compare`]: from those of the plan.
     Differs,
 }
 
@@ -213,7 +212,7 @@ impl Change {
         };
         let done = match &reply {
             Some(Reply::Mode { done } | Reply::ConfigurationWritten { done, .. }) => Some(*done),
-            // What its first byte says is told in no two ways alike: the status tells it afterwards.
+            // The documents disagree about its first byte: the status has the result afterwards.
             Some(Reply::PowerOnSet { .. } | Reply::Status(_) | Reply::Configuration(_)) => Some(true),
             Some(Reply::Refused) => Some(false),
             _ => None,

@@ -1,5 +1,5 @@
-//! What is to be changed for ever, and somebody's consent to it. A plan is values; only with consent can it be carried
-//! out, and consent is to one plan as it was shown.
+//! A planned change of the EEPROM settings, and a person's consent to it. A plan is only values. It can be carried out
+//! only with consent, which is for one plan as it was shown.
 
 use lms::configuration::{Configuration, ITEMS, Item, LEN};
 use lms::inquiry::Report;
@@ -85,8 +85,8 @@ impl Plan {
     }
 }
 
-/// Somebody saw a plan and said yes. Whoever has one can write a sensor's EEPROM, so it is made where a person is asked,
-/// and nowhere else.
+/// A person saw a plan and confirmed it. Code that has a consent can write a sensor's EEPROM, so it is made where a
+/// person is asked, and nowhere else.
 #[derive(Debug)]
 pub struct Consent(Plan);
 

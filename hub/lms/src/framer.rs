@@ -6,7 +6,7 @@
 //! *held* while another header begins inside it, or might begin with its last bytes: if that one succeeds, the frame
 //! was wrong. A gap in time may release a held frame; it never drops a byte.
 //!
-//! Knows no clock and no meaning beyond the header; answers for every byte: [`Tally`] obeys
+//! Knows no clock and no meaning beyond the header; accounts for every byte: in [`Tally`] always
 //! `read == in_telegrams + acknowledge + discarded + buffered`.
 
 use crate::candidates::{Candidate, Candidates};

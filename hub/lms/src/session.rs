@@ -69,8 +69,8 @@ pub struct Received<'a> {
     pub last: Nanos,
     /// Whether `first` is an estimate from bytes that came in one read.
     pub estimated: bool,
-    /// How measured values are split; `None` while the sensor has not told it, or if nobody knows at which angles they
-    /// were measured.
+    /// How measured values are split; `None` while the sensor has not reported it, or if the angles of the values are
+    /// not known.
     pub mode: Option<Mode>,
     /// Why it is suspect, bits of [`suspect`]; 0 is clean.
     pub reasons: u8,
@@ -246,7 +246,7 @@ impl Session {
         self.framer.await_acknowledge(self.dialogue.awaits_acknowledge());
         let next_byte = self.dialogue.outgoing().and_then(|outgoing| outgoing.byte());
         if let Some((byte, not_before)) = next_byte.filter(|&(_, at)| at <= self.now + SOON) {
-            // Whoever answers lets scans out.
+            // The sensor skips scans while it answers.
             self.cadence.rest();
             return Output::Transmit { byte, not_before };
         }
@@ -318,8 +318,8 @@ impl Session {
         self.damage.damaged(self.framer.tally())
     }
 
-    /// How often everything began anew: measured data stayed out for a second, the sensor said that it had just got its
-    /// power, or a user asked for it.
+    /// How often the session restarted: no measured data came for a second, the sensor reported power-on, or a user
+    /// asked for it.
     pub fn resyncs(&self) -> u64 {
         self.dialogue.resyncs
     }
@@ -359,7 +359,7 @@ impl Session {
         }
         self.last_scan = if is_scan { span.offset } else { self.last_scan };
         self.cut |= is_scan && self.tally().telegrams == 1 && self.tally().discarded > 0;
-        // Replies come when they are asked for, and a recording has the pace of whoever reads it.
+        // Replies follow requests, and a recording has the pace of its reader.
         let has_rhythm = is_scan && self.is_live() && !first.estimated;
         let took = last.saturating_sub(first.at);
         let slow = has_rhythm && self.rhythm.is_slow(took);
