@@ -77,7 +77,8 @@ def subscribe(
     """Follows `topics`, each `SENSOR/TOPIC` as in `front/scan`, in the domain (None: what SCANHUB_DOMAIN says, else
     `scanhub`) below the directory `root` (None: wherever a hub may have put it).
 
-    Iterate over what is returned, for ever. With `timeout`, a silence of so many seconds raises NoHub or Silent.
+    Iterate over the result; the iteration does not end. With `timeout`, a silence of that many seconds raises NoHub or
+    Silent.
     `on_notice` is called with `hub_gone` and `hub_back`. NoTopic or Impossible at once if a name is.
     """
     if not topics:
@@ -89,8 +90,8 @@ def robot(*sensors: str, domain: str | None = None, root: str | os.PathLike[str]
     """Follows the verdict over the zones of `sensors`. None: all sensors of the hub; in a domain without a hub those of
     other machines that are published there.
 
-    Iterate over what is returned, for ever, or ask `now()` in a loop of your own. What is not heard lately is `unknown`
-    by itself, with a hub or without one. Impossible at once if a name is.
+    Iterate over the result, which does not end, or call `now()` in a loop of your own. The verdict becomes `unknown` by
+    itself when no recent data arrived, with a hub or without one. Raises Impossible at once if a name is invalid.
     """
     for sensor in sensors:
         check_sensor(sensor)

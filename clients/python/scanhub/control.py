@@ -26,7 +26,7 @@ FLOW_ORDERS = {"pause": 1, "resume": 2, "resync": 3}
 def background(
     sensor: str, order: str = "show", *, domain: str | None = None, root: str | os.PathLike[str] | None = None
 ) -> Shown:
-    """The background model of `sensor`, after `order` was done: `show`, `reset` (learn anew), `freeze` or `thaw`.
+    """The background model of `sensor`, after `order` was done: `show`, `reset` (learn again), `freeze` or `thaw`.
 
     Refused if the hub does not do it, NoTopic if it has no such sensor; NoHub, Silent, Short.
     """
@@ -38,7 +38,10 @@ def background(
 
 
 def control(sensor: str, order: str, *, domain: str | None = None, root: str | os.PathLike[str] | None = None) -> None:
-    """Lets the hub `pause` a sensor, `resume` its stream, or begin anew with it: `resync`. Raises as `background`."""
+    """Asks the hub to `pause` a sensor, to `resume` its stream, or to restart the session with it (`resync`).
+
+    Raises as `background`.
+    """
     code = _code(FLOW_ORDERS, order)
     _Client(sensor, domain, root).ask(code)
 

@@ -66,6 +66,6 @@ _HUB_LIMIT_NS = 20_000_000
 _AFTER_HUB_NS = 20_000_000
 """So much longer a client waits: where the hub lives its own word comes first."""
 _NO_PERIOD_NS = 500_000_000
-"""The limit where no period is told, and the least one for what came over a network."""
+"""The limit if no period is known, and the least limit for samples from a network."""
 _FIRST_WORD_NS = 1_000_000_000
 """How long the first word may take."""

@@ -77,7 +77,7 @@ class Membership:
 
 
 class Received:
-    """A sample in shared memory. Its place is not written anew as long as this, or what was made of it, is in use."""
+    """A sample in shared memory. The hub does not reuse its memory while this object, or an array of it, is in use."""
 
     __slots__ = ("_sample", "_size", "header")
 
@@ -87,7 +87,7 @@ class Received:
         self.header = _header_at(sample.user_header_ptr)
 
     def data(self) -> Any:
-        """The payload as an array of bytes; made when it is asked for, because whoever waits for a sample has haste."""
+        """The payload as an array of bytes; made on first use, because a program that waits for a sample is in a hurry."""
         size = self._size or self._sample.payload().len()
         data: Any = (ctypes.c_uint8 * size).from_address(self._sample.payload_ptr)
         data.sample = self._sample
@@ -140,7 +140,7 @@ class Wakeups:
 
     def wait(self, seconds: float) -> None:
         """Sleeps until one of them is notified, a signal comes, or the time is over; returns at once if one was since
-        the caller looked. Other threads run meanwhile."""
+        the caller looked. Other threads run during the wait."""
         try:
             # What was notified stays so until it is taken, and that after receiving, which has more haste.
             if any([listener.try_wait() for listener in self._listeners]):

@@ -252,7 +252,7 @@ struct scanhub_sample {
     const void *payload;                    /* where the hub wrote it, for reading */
     size_t length;                          /* its bytes */
     uint64_t missed;                        /* samples that were sent before it and not received */
-    int restarted;                          /* 1: the hub was started anew, seq and topic_seq begin again */
+    int restarted;                          /* 1: the hub restarted, seq and topic_seq start again */
     int stale;                              /* 1: zones that are unknown because nothing new enough was heard */
     struct scanhub_attachment *of;                     /* the library's */
     uint64_t number;                        /* the library's */
@@ -281,7 +281,7 @@ int scanhub_open_robot(struct scanhub_attachment **handle, const char *domain, c
 int scanhub_fd(struct scanhub_attachment *handle);
 
 /*
- * Sleeps until there is a sample to take: 1; or until `timeout_ms` are over: 0. Negative: waits for ever. A signal whose
+ * Sleeps until there is a sample to take: 1; or until `timeout_ms` are over: 0. Negative: waits without limit. A signal whose
  * handler returns does not end it: wait for as long as your program may take to see the handler's flag.
  */
 int scanhub_wait(struct scanhub_attachment *handle, int timeout_ms);
