@@ -163,7 +163,8 @@ impl Stage {
                 let guest = stage.guests.swap_remove(at);
                 guest.signal(Signal::CONT);
                 let outcome = guest.end(signal);
-                assert_eq!(outcome.code, (signal == INT).then_some(0), "{outcome}");
+                // One that just began may not have got so far as to end in order.
+                assert!(matches!(outcome.code, None | Some(0)), "{outcome}");
             }
         });
     }

@@ -91,7 +91,8 @@ pub(crate) fn faults(action: &Action, now: Nanos) -> Option<Faults> {
     if name == silence::KIND.name {
         return Some(silence::faults(action, now));
     }
-    let of: [(&Kind, fn(&Action) -> Faults); 3] = [
+    type Of = (&'static Kind, fn(&Action) -> Faults);
+    let of: [Of; 3] = [
         (&garbage::KIND, garbage::faults),
         (&noise::KIND, noise::faults),
         (&telegrams::KIND, telegrams::faults),
