@@ -21,6 +21,8 @@ pub(crate) enum Event<'a> {
     Opened { sensor: usize, offset: u64 },
     /// The line has no owner any more.
     Closed { sensor: usize },
+    /// Another sensor is there instead of the one that was.
+    Exchanged { sensor: usize },
     /// The last byte of a telegram went into the port, or did not.
     Sent { sensor: usize, telegram: &'a Telegram<'a> },
     /// Bytes that were in the port are gone, those from one to the other.
@@ -92,6 +94,7 @@ impl Event<'_> {
             Event::Stalled { until } => numbers(&[3, until]),
             Event::Opened { sensor, offset } => numbers(&[4, sensor as u64, offset]),
             Event::Closed { sensor } => numbers(&[5, sensor as u64]),
+            Event::Exchanged { sensor } => numbers(&[20, sensor as u64]),
             Event::Sent { sensor, telegram } => {
                 numbers(&[6, sensor as u64, telegram.span.0, telegram.span.1, telegram.aborted.into()]);
                 history.bytes(telegram.bytes);
@@ -140,6 +143,18 @@ impl Event<'_> {
             Event::Published { sensor, sample } => {
                 let Sample { topic, header, bytes, .. } = sample;
                 match topic {
+                    Topic::Zones if std::env::var_os("WORLD_ALL").is_some() => {
+                        let zones: schema::Zones = bytemuck::pod_read_unaligned(bytes);
+                        Some(format!(
+                            "{sensor} zones {:?} seq {} stamps {:.6} {:.6} flags {} reasons {}",
+                            zones.verdict(),
+                            header.seq,
+                            header.stamp_first_ns as f64 / 1e9,
+                            header.stamp_last_ns as f64 / 1e9,
+                            header.flags,
+                            header.reasons
+                        ))
+                    }
                     Topic::Status => {
                         let status: Status = bytemuck::pod_read_unaligned(bytes);
                         let (state, error) = (status.state()?.name(), status.last_error());

@@ -60,7 +60,7 @@ impl Plan {
 }
 
 /// Without actions at the end, in which everything has to come back.
-pub(crate) const REST: Nanos = 8_000 * MILLIS;
+pub(crate) const REST: Nanos = 12_000 * MILLIS;
 /// Nothing happens in the first moment: a hub has to be there first.
 const BEGIN_MS: u64 = 200;
 

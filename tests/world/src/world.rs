@@ -144,6 +144,11 @@ impl World {
         self.now() >= self.end
     }
 
+    /// How long things may still go wrong.
+    pub(crate) fn until_healed(&self) -> Nanos {
+        self.heals_at.saturating_sub(self.now())
+    }
+
     /// When something is due that is not the hub's.
     pub(crate) fn next_ns(&self) -> Nanos {
         let action = self.actions.front().map(|action| action.at_ms * MILLIS);
@@ -271,6 +276,7 @@ impl World {
         let kept = self.shared.kept.take();
         drop(kept);
         self.shared.board.borrow_mut().end();
+        self.shared.board.borrow_mut().clean();
         let (loans, held) = self.shared.board.borrow().in_use();
         let eeprom_writes = self.shared.ports.iter().map(|port| port.borrow().sensor.eeprom_writes()).sum();
         let handles = self.shared.handles.get();

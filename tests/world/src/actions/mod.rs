@@ -89,7 +89,7 @@ pub(crate) const KINDS: &[Kind] = &[
 pub(crate) fn faults(action: &Action, now: Nanos) -> Option<Faults> {
     let name = action.name();
     if name == silence::KIND.name {
-        return Some(silence::faults(action, now));
+        return Some(silence::faults(action, now, Nanos::MAX));
     }
     type Of = (&'static Kind, fn(&Action) -> Faults);
     let of: [Of; 3] = [
