@@ -235,7 +235,7 @@ pub(crate) fn only_the_program_sees_all(tree: &Tree) -> Vec<String> {
             breaches.push(format!("{name} brings {known:?} together"));
         }
     }
-    let all = tree.members().into_iter().map(|(_, manifest)| manifest).chain([tree.manifest("Cargo.toml")]);
+    let all = tree.members().into_values().chain([tree.manifest("Cargo.toml")]);
     if all.into_iter().any(|manifest| ours(&manifest, &NORMAL).contains(WORLD)) {
         breaches.push(format!("{WORLD} is for tests alone"));
     }
