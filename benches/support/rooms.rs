@@ -56,11 +56,13 @@ pub(crate) fn record(
                 let telegram = if scan == 0 {
                     lms::reply::configuration(0, Mode(1), Unit::Mm, 0x10)
                 } else {
-                    let look = room.look(Variant::HALF, Unit::Mm, Mode(1), at);
+                    let look = room.labeled_scan(Variant::HALF, Unit::Mm, Mode(1), at);
                     lms::measured::encode(0, Unit::Mm, &look.words, 0x10)
                 };
                 links[number].read(at, telegram.bytes());
-                for sample in followers[number].take() {
+                // What is said at the start is no telegram's.
+                let is_of_one = |sample: &Published| scan > 0 || sample.header.hub_time_ns().is_some();
+                for sample in followers[number].take().into_iter().filter(is_of_one) {
                     let (name, _) = SENSORS[number];
                     writer.sample(name, sample.topic, &sample.header, &sample.payload).expect("is written");
                     keep(number, sample);

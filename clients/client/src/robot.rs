@@ -71,9 +71,20 @@ impl Robot {
         self.parts.iter().map(|(sensor, zones)| (sensor.as_str(), zones))
     }
 
-    /// Counts `sensor` as unknown until its data arrives.
-    fn expect(&mut self, sensor: &str) {
+    /// Counts `sensor` as unknown until its data arrives; returns its position. [`robot`](robot()) does that by itself: it is
+    /// for programs that get samples another way.
+    pub fn expect(&mut self, sensor: &str) -> usize {
         self.parts.push((sensor.to_owned(), Zones::unknown()));
+        self.parts.len() - 1
+    }
+
+    /// Takes what is known now of the zones of the sensor at this position.
+    ///
+    /// # Panics
+    ///
+    /// If no sensor has this position.
+    pub fn hear(&mut self, position: usize, zones: Zones) {
+        self.parts[position].1 = zones;
     }
 }
 

@@ -29,4 +29,4 @@ pub use crate::presence::{Change, GRACE, Who, find};
 pub use crate::robot::{RobotHeard, RobotSource};
 pub use crate::sample::{Sample, Source};
 pub use crate::session::Session;
-pub use crate::zones::ZonesSource;
+pub use crate::zones::{ZonesSource, ZonesState};

@@ -1,6 +1,8 @@
 //! The zones of one sensor, by value, never older than they appear: a verdict that is too old becomes `unknown` here,
 //! whether the sensor, the hub or the machine stopped. A program that acts on it needs no timeout of its own.
 
+mod state;
+
 use std::os::fd::BorrowedFd;
 use std::time::Duration;
 
@@ -8,10 +10,10 @@ use schema::{Domain, Failure, Header, Zones, check_followed};
 
 use crate::clock;
 use crate::follower::Follower;
-use crate::freshness::Freshness;
 use crate::session::Session;
 use crate::subscribe::places;
 use crate::wait::Wait;
+pub use state::ZonesState;
 
 /// Follows the zones of `sensor` in the domain that SCANHUB_DOMAIN names. The hub may start later.
 ///
@@ -155,18 +157,13 @@ impl ZonesFollower {
 /// The zones of a sensor, sample by sample and silence by silence, in the caller's session.
 pub struct ZonesSource {
     follower: Follower<Zones>,
-    freshness: Freshness,
-    spoken: bool,
+    state: ZonesState,
 }
 
 impl ZonesSource {
     /// Makes what will follow the zones of `sensor`.
     pub fn new(sensor: &str) -> ZonesSource {
-        ZonesSource {
-            follower: Follower::new(sensor),
-            freshness: Freshness::new(clock::now()),
-            spoken: false,
-        }
+        ZonesSource { follower: Follower::new(sensor), state: ZonesState::new(clock::now()) }
     }
 
     /// Returns whether the topic has been there at least once.
@@ -176,7 +173,7 @@ impl ZonesSource {
 
     /// Returns whether there was a sample, or the silence of one that does not come.
     pub fn has_spoken(&self) -> bool {
-        self.spoken
+        self.state.has_spoken()
     }
 
     /// Returns the next sample that waits; if there is none and the last one became too old just now, that.
@@ -187,23 +184,10 @@ impl ZonesSource {
     pub fn receive(&mut self, session: &mut Session) -> Result<Option<Heard>, Failure> {
         let sample = self.follower.receive(session)?;
         let now = clock::now();
-        let heard = match sample {
-            Some(sample) => {
-                let header = *sample.header();
-                let fresh = self.freshness.heard(&header, sample.verdict(), now);
-                let zones = if fresh { *sample } else { Zones::unknown() };
-                Some(Heard {
-                    zones,
-                    header: Some(header),
-                    missed: sample.missed,
-                    stale: !fresh,
-                    said: *sample,
-                })
-            }
-            None => self.freshness.silence(now).then(Heard::nothing),
-        };
-        self.spoken |= heard.is_some();
-        Ok(heard)
+        Ok(match sample {
+            Some(sample) => Some(self.state.take(sample.header(), &sample, sample.missed, now)),
+            None => self.state.silence(now),
+        })
     }
 
     /// The last of all waiting samples. The skipped ones count as missed.
@@ -218,6 +202,6 @@ impl ZonesSource {
 
     /// Returns after which time [`receive`](Self::receive) has something to say even if no sample comes.
     pub fn left(&self) -> Option<Duration> {
-        self.freshness.left(clock::now())
+        self.state.left(clock::now())
     }
 }

@@ -2,9 +2,9 @@
 //! ordinary client of the hub that outlives it, its links and its own network. Takes nothing from the network.
 
 mod host;
-mod lan;
 mod life;
 mod machine;
+mod network;
 mod report;
 mod selection;
 mod sensor;
@@ -17,6 +17,7 @@ use std::path::Path;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
+use lan::outgoing::{ANNOUNCE_EVERY, Form};
 use scanhub_client::clock;
 use scanhub_client::streams::{GRACE, Session};
 use schema::{Domain, Failure, Kind, check_sensor};
@@ -26,8 +27,9 @@ use crate::follow::Notice;
 use crate::lossy_writer::LossyWriter;
 use crate::names::no_sensor;
 use crate::output::{End, quiet};
-use lan::{Form, Lan};
+use crate::stamp;
 use life::Life;
+use network::Network;
 use report::Report;
 use selection::Selection;
 use sensor::Sensor;
@@ -111,7 +113,7 @@ struct Gateway<'a> {
     selection: Selection,
     session: Session,
     sensors: Vec<Sensor>,
-    lan: Lan,
+    network: Network,
     started: Instant,
     discovery: Discovery,
     is_there: bool,
@@ -124,8 +126,8 @@ struct Gateway<'a> {
 /// In the place of an interface, in the name of the file that keeps a gateway's number: it sends to no group.
 const HOSTS: &str = "hosts";
 
-/// Between two announcements, and between two lines of the account.
-const TICK: Duration = Duration::from_secs(1);
+/// Between two lines of the account, which come with the announcements.
+const TICK: Duration = ANNOUNCE_EVERY;
 
 impl<'a> Gateway<'a> {
     fn open(options: &'a GatewayOptions, stop: &AtomicBool) -> Result<Gateway<'a>, Failure> {
@@ -140,14 +142,16 @@ impl<'a> Gateway<'a> {
         let way = interface.as_ref().map_or(HOSTS, Uplink::name);
         let life = Life::begin(&life::directory()?, domain, way, now_s, machine)?;
         let form = if options.bare { Form::Bare } else { Form::Sealed };
-        let lan = Lan::open(life, interface, &options.to, form, options.ttl, options.longest, stop)?;
-        let sensor = |name: &&str| Sensor::new(name, &selection, !options.bare);
+        let mut network =
+            Network::open(life, interface, &options.to, form, options.ttl, options.longest, stop)?;
+        let named = selection.named();
+        let sensors = named.iter().map(|name| Sensor::new(name, &selection, &mut network)).collect();
         Ok(Gateway {
             options,
-            sensors: selection.named().iter().map(sensor).collect(),
+            sensors,
             selection,
             session: Session::new(options.places.clone()),
-            lan,
+            network,
             started: Instant::now(),
             discovery: Discovery::default(),
             waiting_said: false,
@@ -158,31 +162,31 @@ impl<'a> Gateway<'a> {
     }
 
     fn run(&mut self, report: &mut Report<'_>, tell: &AtomicBool, stop: &AtomicBool) -> Result<(), End> {
-        report.begin(&self.lan, self.options.bare)?;
-        if self.lan.groups.as_ref().is_some_and(|groups| !groups.interface.is_up()) {
-            report.interface(&self.lan)?;
+        report.begin(&self.network, self.options.bare)?;
+        if self.network.destinations.groups.as_ref().is_some_and(|groups| !groups.interface.is_up()) {
+            report.interface(&self.network)?;
         }
         let end = self.go_on(report, tell, stop);
         // However it ends: how many were sent is the last word.
         self.announce();
-        end.and_then(|()| report.account(&self.lan))
+        end.and_then(|()| report.account(&self.network))
     }
 
     fn go_on(&mut self, report: &mut Report<'_>, tell: &AtomicBool, stop: &AtomicBool) -> Result<(), End> {
         while !stop.load(Ordering::Relaxed) {
-            if self.lan.look() {
-                report.interface(&self.lan)?;
+            if self.network.destinations.look() {
+                report.interface(&self.network)?;
             }
             // What is there comes before the question whether the hub still is: that takes longer than sending.
             let (mut more, mut subscribed) = (false, false);
             for sensor in &mut self.sensors {
-                more |= sensor.forward(&mut self.session, &mut self.lan, &mut subscribed)?;
+                more |= sensor.forward(&mut self.session, &mut self.network, &mut subscribed)?;
             }
             let now = Instant::now();
             self.look(report, now)?;
             self.tick(report, now)?;
             if tell.swap(false, Ordering::Relaxed) {
-                report.account(&self.lan)?;
+                report.account(&self.network)?;
             }
             if !more {
                 let tick = self.tick_at.saturating_duration_since(now);
@@ -225,7 +229,7 @@ impl<'a> Gateway<'a> {
                 // One that came from another machine has another name.
                 let is_known = self.sensors.iter().any(|sensor| sensor.name == *name);
                 if !is_known && check_sensor(name).is_ok() {
-                    self.sensors.push(Sensor::new(name, &self.selection, !self.options.bare));
+                    self.sensors.push(Sensor::new(name, &self.selection, &mut self.network));
                 }
             }
         }
@@ -246,10 +250,11 @@ impl<'a> Gateway<'a> {
         }
         self.tick_at = now + TICK;
         if let Some(every) = self.options.background_every {
-            self.sensors.iter_mut().for_each(|sensor| sensor.repeat(every, now, &mut self.lan));
+            let Network { outgoing, destinations, .. } = &mut self.network;
+            outgoing.repeat(every, stamp::now(), destinations);
         }
         self.announce();
-        for destination in self.lan.destinations_mut() {
+        for destination in self.network.destinations.all_mut() {
             if let Some(address) = destination.follow_name(now) {
                 report.moved(&destination.name, address)?;
             }
@@ -257,13 +262,14 @@ impl<'a> Gateway<'a> {
                 report.destination(&destination.name, &news)?;
             }
         }
-        if let Some(what) = self.lan.misfit() {
-            report.misfit(&what, self.lan.longest())?;
+        if let Some(what) = self.network.outgoing.misfit() {
+            report.misfit(&what, self.network.outgoing.longest())?;
         }
-        report.periodic(&self.lan, self.is_there)
+        report.periodic(&self.network, self.is_there)
     }
 
     fn announce(&mut self) {
-        self.sensors.iter().for_each(|sensor| sensor.announce(&mut self.lan));
+        let Network { outgoing, destinations, .. } = &mut self.network;
+        outgoing.announce(stamp::now(), destinations);
     }
 }

@@ -5,7 +5,6 @@ mod crowd;
 mod duplicate_gateways;
 mod multicast_receiver;
 mod names;
-mod peer_table;
 mod publish;
 mod remote;
 mod report;
@@ -15,20 +14,20 @@ use std::net::SocketAddrV4;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
-use schema::datagram::{Announce, Arrival, Datagram, DatagramError, Fresh, Head, StreamStats, group};
+use lan::Stamp;
+use lan::incoming::{Announcement, Arrived, Incoming, RemoteSample};
+use schema::datagram::{Announce, DatagramError, Head, group};
 use schema::{Domain, Failure, Kind, Topic};
 
 use self::crowd::{Crowd, Crowding};
-use self::duplicate_gateways::DuplicateGateways;
-use self::multicast_receiver::{Caught, LONGEST, MulticastReceiver};
+use self::multicast_receiver::{LONGEST, MulticastReceiver};
 use self::names::{Hubs, Names};
-use self::peer_table::PeerTable;
 use self::publish::Publication;
-use self::remote::Remote;
 use self::report::Report;
 use crate::follow::Bounds;
 use crate::interface::is_of_this_machine;
 use crate::output::{End, Output, quiet};
+use crate::stamp;
 
 /// What `listen` is asked for.
 #[derive(Clone, Debug)]
@@ -75,7 +74,7 @@ pub fn listen(
     let hubs = Hubs::parse(&options.hubs, &names)?;
     let groups = groups(&wanted);
     let now = Instant::now();
-    let publication = options.publish.as_ref().map(|domain| Publication::open(domain, now)).transpose()?;
+    let publication = options.publish.as_ref().map(publish::open).transpose()?;
     let receiver = MulticastReceiver::open(options.interface.as_deref(), &groups, now)?;
     // Of topics whose group is not joined announcements would tell as lost what nobody wanted.
     let heard: Vec<_> = Topic::ALL.into_iter().filter(|&topic| groups.contains(&group(topic))).collect();
@@ -86,9 +85,7 @@ pub fn listen(
         receiver,
         publication,
         told: Vec::new(),
-        stats: Box::new(StreamStats::new(&heard)),
-        peers: PeerTable::default(),
-        duplicates: DuplicateGateways::default(),
+        incoming: Incoming::new(&heard),
         crowd: Crowd::default(),
         report: Report::new(options.json, Output::new(out), Output::new(notes), names),
         started: now,
@@ -107,9 +104,7 @@ struct Listener<'a> {
     publication: Option<Publication>,
     /// What was told that is wrong here.
     told: Vec<String>,
-    stats: Box<StreamStats>,
-    peers: PeerTable,
-    duplicates: DuplicateGateways,
+    incoming: Incoming,
     crowd: Crowd,
     report: Report<'a>,
     started: Instant,
@@ -142,7 +137,7 @@ impl Listener<'_> {
 
     /// The account so far.
     fn tell(&mut self) -> Result<(), End> {
-        self.report.stats(&self.stats, &self.peers)?;
+        self.report.stats(self.incoming.stats(), self.incoming.peers())?;
         self.publication.iter().try_for_each(|publication| self.report.publication(publication))
     }
 
@@ -184,14 +179,17 @@ impl Listener<'_> {
             if !self.hubs.want(bytes) {
                 continue;
             }
-            match self.stats.receive(bytes, sender(caught.from), caught.arrival_ns) {
-                Ok((_, Fresh::Duplicate)) => {}
-                Ok((datagram, fresh)) => {
-                    self.duplicates.taken(datagram.head.hub);
-                    self.heard(datagram, fresh == Fresh::Late, &caught)?;
-                }
-                Err(DatagramError::Epoch | DatagramError::Twin) => self.of_another_life(bytes)?,
-                Err(_) => {}
+            let arrival = Stamp { monotonic_ns: caught.arrival_ns, wall_ns: caught.wall_ns };
+            let arrived = self.incoming.receive(bytes, sender(caught.from), arrival);
+            if let (Some(head), Some(publication)) = (arrived.begins(), &mut self.publication) {
+                // If a life of the same epoch went on until now, that was another sender's.
+                publication.begun(head, stamp::now());
+            }
+            match arrived {
+                Arrived::Sample(sample) => self.sample(&sample, caught.from)?,
+                Arrived::Announced(announcement) => self.announced(&announcement, caught.from)?,
+                Arrived::Refused { shared: Some(hub), .. } => self.is_shared(hub)?,
+                Arrived::Refused { shared: None, .. } | Arrived::Known => {}
             }
             if self.options.bounds.count.is_some_and(|count| self.received >= count) {
                 return Ok(true);
@@ -200,87 +198,60 @@ impl Listener<'_> {
         Ok(true)
     }
 
-    /// A datagram that was not there before, as it was `caught`.
-    fn heard(&mut self, datagram: Datagram<'_>, late: bool, caught: &Caught<'_>) -> Result<(), End> {
-        let &Caught { arrival_ns, wall_ns, .. } = caught;
-        let head = datagram.head;
-        if self.stats.since_ns(head.hub, head.epoch) == Some(arrival_ns) {
-            // A life began with it; if one of the same epoch went on until now, that was another sender's.
-            self.publication.iter_mut().for_each(|publication| publication.begun(&head));
-        }
-        let Some(topic) = Topic::of_number(head.topic) else {
-            // What it says was said again, and better, by a newer one.
-            return if late { Ok(()) } else { self.announced(&datagram, caught) };
-        };
-        let life = self.peers.life(&head, &self.stats);
-        let age_ns = life.age_ns(head.stamp_ns, wall_ns);
-        let sensor = life.sensor(head.sensor);
-        let missed = if late { 0 } else { sensor.advance(head.topic, head.sequence) };
-        let announced = sensor.announced;
-        let boot = announced.map_or(0, |announced| announced.boot);
+    /// A sample that was not there before.
+    fn sample(&mut self, sample: &RemoteSample<'_>, from: SocketAddrV4) -> Result<(), End> {
+        let RemoteSample { remote, missed, .. } = sample;
+        let (head, topic) = (&remote.datagram.head, remote.topic);
         if !self.wanted.contains(&topic) {
             return Ok(());
         }
         self.received += 1;
         self.last_sample = Instant::now();
-        let remote = Remote { topic, datagram, boot, arrival_ns, age_ns, late };
-        if let Some(publication) = &self.publication {
-            if let Some(announce) = announced.filter(|_| publication.may_make_room(&head)) {
-                self.publish(&head, &announce, Arrival { delivers: true, now_ns: arrival_ns }, caught.from)?;
-            }
-            if let Some(publication) = &mut self.publication {
-                publication.sample(&remote, self.last_sample);
-            }
-            return Ok(());
+        if let Some(publication) = &mut self.publication {
+            let made = publication.sample(sample, || self.report.names.of(head.hub), stamp::now());
+            return self.made(head, made, from);
         }
         if self.options.stats {
             return Ok(());
         }
-        let sensor = &self.peers.written(&head, &self.stats);
-        if missed > 0 {
-            self.report.missed(&head, sensor, topic, missed)?;
+        let sensor = &self.incoming.written(head);
+        if *missed > 0 {
+            self.report.missed(head, sensor, topic, *missed)?;
         }
-        self.report.sample(sensor, &remote)
+        self.report.sample(sensor, remote)
     }
 
-    fn announced(&mut self, datagram: &Datagram<'_>, caught: &Caught<'_>) -> Result<(), End> {
-        let head = datagram.head;
-        let Some(announce) = Announce::unpack(datagram.payload) else { return Ok(()) };
-        let behind_ns = self.peers.announce(&head, &self.stats, &announce, caught.wall_ns);
-        if self.peers.life(&head, &self.stats).sensor(head.sensor).take_numbered() {
-            self.report.named(&head, announce.sensor())?;
+    /// A sensor was announced, in newer words than before.
+    fn announced(&mut self, announcement: &Announcement, from: SocketAddrV4) -> Result<(), End> {
+        let Announcement { head, announce, is_named, behind_ns, .. } = announcement;
+        if *is_named {
+            self.report.named(head, announce.sensor())?;
         }
         if let Some(behind_ns) = behind_ns {
-            self.report.clocks_differ(&head, behind_ns)?;
+            self.report.clocks_differ(head, *behind_ns)?;
         }
-        let arrival = Arrival { delivers: false, now_ns: caught.arrival_ns };
-        self.publish(&head, &announce, arrival, caught.from)
+        let Some(publication) = &mut self.publication else { return Ok(()) };
+        let made = publication.announced(announcement, &self.report.names.of(head.hub), stamp::now());
+        self.made(head, made, from)
     }
 
-    /// Makes the topics of the sensor that is `announced` so, if it is to be published and there is room.
-    fn publish(
+    /// What became of the topics of the sensor that sent `head`: they may have been `made` just now.
+    fn made(
         &mut self,
         head: &Head,
-        announced: &Announce,
-        arrival: Arrival,
+        made: Result<Option<String>, Failure>,
         from: SocketAddrV4,
     ) -> Result<(), End> {
-        let Some(publication) = &mut self.publication else { return Ok(()) };
-        match publication.announced(head, &self.report.names.of(head.hub), announced, arrival) {
+        match made {
             Ok(Some(name)) => self.report.published(head, &name, is_of_this_machine((*from.ip()).into())),
             Ok(None) => Ok(()),
             Err(failure) => self.trouble(&failure.to_string()),
         }
     }
 
-    /// `bytes` were refused as of a life of their gateway that is over, or of another gateway with its number.
-    fn of_another_life(&mut self, bytes: &[u8]) -> Result<(), End> {
-        let Ok(Datagram { head, .. }) = Datagram::read(bytes) else { return Ok(()) };
-        let is_shared = self.stats.is_shared(head.hub, head.epoch);
-        if !is_shared && !self.duplicates.refused(head.hub, Instant::now()) {
-            return Ok(());
-        }
-        let what = duplicate_gateways::remedy(&self.report.names.of(head.hub));
+    /// Two gateways send as `hub`, and what one of them sends is refused.
+    fn is_shared(&mut self, hub: u64) -> Result<(), End> {
+        let what = duplicate_gateways::remedy(&self.report.names.of(hub));
         self.trouble(&what)
     }
 
@@ -300,7 +271,7 @@ impl Listener<'_> {
             self.trouble(&what)?;
         }
         if let Some(publication) = &mut self.publication {
-            publication.look(now);
+            publication.look(stamp::now());
         }
         let so_far = self.crowding();
         if let Some(what) = self.crowd.look(so_far, now) {
@@ -308,7 +279,7 @@ impl Listener<'_> {
         }
         if self.options.stats && self.options.terminal && !self.options.json && now >= self.draw_at {
             self.draw_at = now + DRAW_EVERY;
-            self.report.draw(&self.stats, &self.peers)?;
+            self.report.draw(self.incoming.stats(), self.incoming.peers())?;
         }
         Ok(())
     }
@@ -316,8 +287,8 @@ impl Listener<'_> {
     fn crowding(&self) -> Crowding {
         let publication = self.publication.as_ref();
         Crowding {
-            gateways: self.stats.given_up().displaced,
-            refused: self.stats.refused(DatagramError::Capacity),
+            gateways: self.incoming.stats().given_up().displaced,
+            refused: self.incoming.stats().refused(DatagramError::Capacity),
             sensors: publication.map_or(0, |publication| publication.displaced),
             samples: publication.map_or(0, |publication| publication.left_out.capacity),
         }

@@ -122,11 +122,11 @@ pub(crate) fn no_processor_uses_another(tree: &Tree) -> Vec<String> {
 }
 
 /// A consumer's program has nothing of ours below it but the library and the words. The verbs stand on it as others do; the
-/// words of ROS come with them where they record.
+/// words of ROS come with them where they record, the ends of a network where they send and listen.
 pub(crate) fn clients_know_only_schema(tree: &Tree) -> Vec<String> {
     let known: [(&str, &[&str]); 2] = [
         ("scanhub-client", &["scanhub-schema"]),
-        ("scanhub-verbs", &["scanhub-client", "scanhub-schema", "scanhub-ros"]),
+        ("scanhub-verbs", &["scanhub-client", "scanhub-lan", "scanhub-schema", "scanhub-ros"]),
     ];
     let members = tree.members();
     let others = known.iter().flat_map(|(name, known)| {
@@ -142,6 +142,26 @@ pub(crate) fn ros_knows_only_schema(tree: &Tree) -> Vec<String> {
     breaches.extend(lacks(tree, "schema/ros/src/lib.rs", &["#![forbid(unsafe_code)]"]));
     let ours = |path: &str| path.starts_with("schema/ros/src/");
     breaches.extend(find(tree, &["schema::ipc", "std::time", "std::net", "std::fs", "extern crate"], ours));
+    breaches
+}
+
+/// From samples to datagrams and back: bytes and time are arguments, so that a simulation runs what sockets run.
+pub(crate) fn the_ends_of_a_network_only_compute(tree: &Tree) -> Vec<String> {
+    const OUTSIDE: [&str; 10] = [
+        "schema::ipc",
+        "Instant",
+        "SystemTime",
+        "std::env",
+        "std::fs",
+        "std::io",
+        "std::net",
+        "std::process",
+        "std::thread",
+        "extern crate",
+    ];
+    let mut breaches = built_of(tree, "scanhub-lan", &["scanhub-schema"]);
+    breaches.extend(lacks(tree, "clients/lan/src/lib.rs", &["#![forbid(unsafe_code)]"]));
+    breaches.extend(find(tree, &OUTSIDE, |path| path.starts_with("clients/lan/src/")));
     breaches
 }
 
@@ -183,18 +203,31 @@ pub(crate) fn the_daemon_knows_neither_clients_nor_sim(tree: &Tree) -> Vec<Strin
         open.extend(ours(&members[&name], &NORMAL).into_iter().filter(|name| !reached.contains(name)));
         reached.insert(name);
     }
-    const STRANGERS: [&str; 5] =
-        ["scanhub-client", "scanhub-verbs", "scanhub-sim", "scanhub-tools", "scanhub-lms-configure"];
+    const STRANGERS: [&str; 6] = [
+        "scanhub-client",
+        "scanhub-lan",
+        "scanhub-verbs",
+        "scanhub-sim",
+        "scanhub-tools",
+        "scanhub-lms-configure",
+    ];
     reached.into_iter().filter(|name| STRANGERS.contains(&name.as_str())).collect()
 }
 
 /// The daemon, the clients, the simulator and the tools meet nowhere but in the program: no crate has two of them.
 pub(crate) fn only_the_program_sees_all(tree: &Tree) -> Vec<String> {
-    let ends: [&[&str]; 4] =
-        [&["scanhub-daemon"], &["scanhub-client", "scanhub-verbs"], &["scanhub-sim"], &["scanhub-tools"]];
+    let ends: [&[&str]; 4] = [
+        &["scanhub-daemon"],
+        &["scanhub-client", "scanhub-lan", "scanhub-verbs"],
+        &["scanhub-sim"],
+        &["scanhub-tools"],
+    ];
     let mut breaches = Vec::new();
     for (name, manifest) in tree.members() {
         let mut known = ours(&manifest, &NORMAL);
+        if name == WORLD {
+            continue;
+        }
         known.insert(name.clone());
         let met = ends.iter().filter(|end| end.iter().any(|name| known.contains(*name))).count();
         if met > 1 {
@@ -202,8 +235,15 @@ pub(crate) fn only_the_program_sees_all(tree: &Tree) -> Vec<String> {
             breaches.push(format!("{name} brings {known:?} together"));
         }
     }
+    let all = tree.members().into_values().chain([tree.manifest("Cargo.toml")]);
+    if all.into_iter().any(|manifest| ours(&manifest, &NORMAL).contains(WORLD)) {
+        breaches.push(format!("{WORLD} is for tests alone"));
+    }
     breaches
 }
+
+/// All ends in one thread, and in no program.
+const WORLD: &str = "scanhub-world";
 
 /// Without it `cargo test` at the top would leave a crate out.
 pub(crate) fn every_crate_is_tested_from_the_top(tree: &Tree) -> Vec<String> {

@@ -121,7 +121,7 @@ impl RobotSource {
             let turn = self.turn;
             self.turn = (turn + 1) % self.parts.len();
             if let Some(heard) = self.parts[turn].receive(session)? {
-                self.robot.parts[turn].1 = heard.zones;
+                self.robot.hear(turn, heard.zones);
                 self.begun = self.begun || self.parts.iter().all(ZonesSource::has_spoken);
                 if self.begun {
                     return Ok(Some(heard));

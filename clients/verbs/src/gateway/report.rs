@@ -7,7 +7,7 @@ use schema::Topic;
 use serde::Serialize;
 
 use super::GatewayLook;
-use super::lan::{Groups, Lan};
+use super::network::{Groups, Network};
 use super::udp_destination::{News, UdpDestination};
 use crate::follow::Notice;
 use crate::output::{End, Output};
@@ -29,30 +29,30 @@ impl<'a> Report<'a> {
     }
 
     /// Who it is and where it sends.
-    pub(super) fn begin(&mut self, lan: &Lan, bare: bool) -> Result<(), End> {
-        let to: Vec<_> = lan.copies.iter().map(|copy| copy.name.as_str()).collect();
+    pub(super) fn begin(&mut self, network: &Network, bare: bool) -> Result<(), End> {
+        let to: Vec<_> = network.destinations.copies.iter().map(|copy| copy.name.as_str()).collect();
         if self.look == GatewayLook::Json {
             return self.out.json(&Begin {
                 class: "gateway",
-                hub: id(lan),
-                epoch: lan.life.epoch,
-                interface: lan.groups.as_ref().map(|groups| groups.interface.name()),
+                hub: id(network),
+                epoch: network.life.epoch,
+                interface: network.destinations.groups.as_ref().map(|groups| groups.interface.name()),
                 to,
                 bare,
-                longest: lan.longest(),
-                renumbered: lan.life.is_renumbered,
+                longest: network.outgoing.longest(),
+                renumbered: network.life.is_renumbered,
             });
         }
-        if lan.life.is_renumbered {
-            self.notes.line(|line| write!(line, "{}: {RENUMBERED}", id(lan)))?;
+        if network.life.is_renumbered {
+            self.notes.line(|line| write!(line, "{}: {RENUMBERED}", id(network)))?;
         }
         self.out.line(|line| {
-            write!(line, "gateway {} epoch {}", id(lan), lan.life.epoch)?;
-            if let Some(groups) = &lan.groups {
+            write!(line, "gateway {} epoch {}", id(network), network.life.epoch)?;
+            if let Some(groups) = &network.destinations.groups {
                 write!(line, " on {}", groups.interface.name())?;
             }
             to.iter().try_for_each(|to| write!(line, ", copies to {to}"))?;
-            write!(line, ", datagrams of {} bytes at most", lan.longest())
+            write!(line, ", datagrams of {} bytes at most", network.outgoing.longest())
         })
     }
 
@@ -66,8 +66,8 @@ impl<'a> Report<'a> {
     }
 
     /// The state of the interface became another one.
-    pub(super) fn interface(&mut self, lan: &Lan) -> Result<(), End> {
-        let Some(Groups { interface, .. }) = &lan.groups else { return Ok(()) };
+    pub(super) fn interface(&mut self, network: &Network) -> Result<(), End> {
+        let Some(Groups { interface, .. }) = &network.destinations.groups else { return Ok(()) };
         match interface.is_up() {
             true => self.link(interface.name(), "up", None),
             false => self.link(interface.name(), "down", Some("no carrier, no IPv4 address, or not there")),
@@ -95,25 +95,25 @@ impl<'a> Report<'a> {
     }
 
     /// The periodic word: an object for each sensor and topic and each destination, or one line on a terminal.
-    pub(super) fn periodic(&mut self, lan: &Lan, hub_lives: bool) -> Result<(), End> {
+    pub(super) fn periodic(&mut self, network: &Network, hub_lives: bool) -> Result<(), End> {
         match self.look {
-            GatewayLook::Json => self.account(lan),
+            GatewayLook::Json => self.account(network),
             GatewayLook::Lines => Ok(()),
-            GatewayLook::Terminal => self.draw(lan, hub_lives),
+            GatewayLook::Terminal => self.draw(network, hub_lives),
         }
     }
 
     /// The whole account.
-    pub(super) fn account(&mut self, lan: &Lan) -> Result<(), End> {
+    pub(super) fn account(&mut self, network: &Network) -> Result<(), End> {
         self.wipe()?;
-        for sensor in lan.sensors() {
+        for sensor in network.outgoing.account() {
             for (topic, row) in sensor.used() {
                 let name = topic.map_or("announce", Topic::name);
                 if self.look == GatewayLook::Json {
                     self.out.json(&Line {
                         class: "lan",
-                        hub: id(lan),
-                        epoch: lan.life.epoch,
+                        hub: id(network),
+                        epoch: network.life.epoch,
                         sensor: &sensor.name,
                         topic: name,
                         sent: row.sent,
@@ -130,20 +130,22 @@ impl<'a> Report<'a> {
                 }
             }
         }
-        if lan.unfit > 0 && self.look != GatewayLook::Json {
-            let longest = lan.longest();
-            self.out.line(|line| write!(line, "too long for {longest} bytes: {}, see --mtu", lan.unfit))?;
+        if network.outgoing.unfit() > 0 && self.look != GatewayLook::Json {
+            let longest = network.outgoing.longest();
+            self.out.line(|line| {
+                write!(line, "too long for {longest} bytes: {}, see --mtu", network.outgoing.unfit())
+            })?;
         }
-        lan.destinations().try_for_each(|destination| self.write_destination(lan, destination))
+        network.destinations.all().try_for_each(|destination| self.write_destination(network, destination))
     }
 
-    fn write_destination(&mut self, lan: &Lan, destination: &UdpDestination) -> Result<(), End> {
+    fn write_destination(&mut self, network: &Network, destination: &UdpDestination) -> Result<(), End> {
         let UdpDestination { name, sent, failed, reported, .. } = destination;
         if self.look == GatewayLook::Json {
             return self.out.json(&To {
                 class: "lan_to",
-                hub: id(lan),
-                epoch: lan.life.epoch,
+                hub: id(network),
+                epoch: network.life.epoch,
                 to: name,
                 sent: *sent,
                 send_failed: *failed,
@@ -164,12 +166,12 @@ impl<'a> Report<'a> {
         })
     }
 
-    fn draw(&mut self, lan: &Lan, hub_lives: bool) -> Result<(), End> {
+    fn draw(&mut self, network: &Network, hub_lives: bool) -> Result<(), End> {
         // A line that wraps would not be drawn over: it is cut.
         let mut line = [WIPE, b"\x1b[?7l"].concat();
-        status(&mut line, lan, hub_lives, self.sent)?;
+        status(&mut line, network, hub_lives, self.sent)?;
         line.extend(b"\x1b[?7h");
-        self.sent = first(lan).0;
+        self.sent = first(network).0;
         self.out.raw(&line)
     }
 
@@ -181,13 +183,13 @@ impl<'a> Report<'a> {
     }
 }
 
-fn status(line: &mut Vec<u8>, lan: &Lan, hub_lives: bool, sent_before: u64) -> io::Result<()> {
-    let is_down = lan.groups.as_ref().is_some_and(|groups| !groups.interface.is_up());
+fn status(line: &mut Vec<u8>, network: &Network, hub_lives: bool, sent_before: u64) -> io::Result<()> {
+    let is_down = network.destinations.groups.as_ref().is_some_and(|groups| !groups.interface.is_up());
     let state = if is_down { " down" } else { "" };
     let hub = if hub_lives { "" } else { "no hub, " };
-    let (sent, name) = first(lan);
+    let (sent, name) = first(network);
     write!(line, "{hub}{name}{state}: {}/s", sent - sent_before)?;
-    for (number, destination) in lan.destinations().enumerate() {
+    for (number, destination) in network.destinations.all().enumerate() {
         let UdpDestination { name, sent, failed, .. } = destination;
         match number {
             0 => write!(line, ", {sent} sent")?,
@@ -197,20 +199,25 @@ fn status(line: &mut Vec<u8>, lan: &Lan, hub_lives: bool, sent_before: u64) -> i
             write!(line, ", {failed} failed")?;
         }
     }
-    let missed: u64 = lan.sensors().flat_map(|sensor| sensor.used()).map(|(_, row)| row.missed).sum();
+    let missed: u64 =
+        network.outgoing.account().flat_map(|sensor| sensor.used()).map(|(_, row)| row.missed).sum();
     if missed > 0 {
         write!(line, "; {missed} missed")?;
     }
-    if lan.unfit > 0 { write!(line, "; {} too long", lan.unfit) } else { Ok(()) }
+    if network.outgoing.unfit() > 0 {
+        write!(line, "; {} too long", network.outgoing.unfit())
+    } else {
+        Ok(())
+    }
 }
 
 /// How many datagrams went to the first destination, which there always is, and its name.
-fn first(lan: &Lan) -> (u64, &str) {
-    lan.destinations().next().map_or((0, ""), |destination| (destination.sent, &destination.name))
+fn first(network: &Network) -> (u64, &str) {
+    network.destinations.all().next().map_or((0, ""), |destination| (destination.sent, &destination.name))
 }
 
-fn id(lan: &Lan) -> String {
-    format!("{:016x}", lan.life.hub)
+fn id(network: &Network) -> String {
+    format!("{:016x}", network.life.hub)
 }
 
 /// Class `gateway`.

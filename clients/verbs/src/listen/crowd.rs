@@ -3,9 +3,8 @@
 
 use std::time::{Duration, Instant};
 
+use lan::republish::SENSORS;
 use schema::datagram::{LIVES, ROWS};
-
-use super::publish::SENSORS;
 
 /// How often there was no room, since the begin.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]

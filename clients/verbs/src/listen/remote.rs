@@ -1,90 +1,44 @@
-//! A datagram that was accepted, as a sample: its header in the words of shared memory, and its line of output.
+//! A sample of another machine as a line of output, for programs and for people. Refuses to know where it came from.
 
 use std::io::{self, Write};
 
-use schema::datagram::{Datagram, Head, LanFlags, Packed, telegram};
-use schema::{Flags, Header, Pace, Quality, Topic};
+use lan::incoming::Remote;
+use schema::datagram::{Head, telegram};
+use schema::{Header, Pace, Topic};
 use serde::{Serialize, Serializer};
 
 use crate::json;
 use crate::output::{End, Output};
 use crate::show::{Keys, Show};
 
-/// A sample of another machine.
-pub(super) struct Remote<'a> {
-    /// Of which topic.
-    pub(super) topic: Topic,
-    /// What came.
-    pub(super) datagram: Datagram<'a>,
-    /// Life of its hub, 0 unknown.
-    pub(super) boot: u64,
-    /// CLOCK_MONOTONIC of this machine when it came, in ns.
-    pub(super) arrival_ns: u64,
-    /// How old it was then, if the clocks agree.
-    pub(super) age_ns: Option<u64>,
-    /// It came after a newer one.
-    pub(super) late: bool,
+/// A line of JSON; `sensor` is called so by [`PeerTable::name`](lan::incoming::PeerTable::name).
+pub(super) fn json(remote: &Remote<'_>, sensor: &str, out: &mut Output<'_>) -> Result<(), End> {
+    // The flags come behind all that there is of a sample here.
+    let header = Header { flags: 0, ..remote.header(std::process::id()) };
+    show(remote, Line { remote, sensor, header: &header, out })
 }
 
-impl Remote<'_> {
-    /// The header that the sample has here: stamps are those of its arrival, the sensor's is in `wall_ns`. It says no
-    /// period, for a gateway may send every so many samples only.
-    pub(super) fn header(&self) -> Header {
-        let head: &Head = &self.datagram.head;
-        let quality = if head.flags & LanFlags::SUSPECT != 0 { Quality::Suspect } else { Quality::Clean };
-        let same = LanFlags::SIMULATED | LanFlags::REPLAYED | LanFlags::STAMP_ESTIMATED;
-        Header {
-            seq: head.counter.into(),
-            topic_seq: head.sequence.into(),
-            stamp_first_ns: self.arrival_ns,
-            stamp_last_ns: self.arrival_ns,
-            wall_ns: head.stamp_ns,
-            boot: self.boot,
-            sensor: head.sensor,
-            quality: quality as u8,
-            flags: u16::from(head.flags & same) | Flags::REMOTE,
-            hub_pid: std::process::id(),
-            ..Header::default()
-        }
+/// A line for people; `hub` is what the gateway is called, `sensor` as above.
+pub(super) fn text(remote: &Remote<'_>, hub: &str, sensor: &str, line: &mut Vec<u8>) -> io::Result<()> {
+    write!(line, "{hub}.{sensor}/{} ", remote.topic.name())?;
+    show(remote, ForPeople { header: &remote.header(std::process::id()), line })?;
+    if let Some(age_ms) = age_ms(remote) {
+        write!(line, ", {age_ms:.1} ms old")?;
     }
+    if remote.late { write!(line, ", late") } else { Ok(()) }
+}
 
-    /// The payload, in full length. An account accepts none that cannot be had.
-    pub(super) fn payload<P: Packed + Default>(&self) -> Option<P> {
-        let mut payload = P::default();
-        payload.unpack(self.datagram.payload).then_some(payload)
-    }
-
-    /// A line of JSON; `sensor` is called so by [`PeerTable::name`](super::peer_table::PeerTable::name).
-    pub(super) fn json(&self, sensor: &str, out: &mut Output<'_>) -> Result<(), End> {
-        // The flags come behind all that there is of a sample here.
-        let header = Header { flags: 0, ..self.header() };
-        self.show(Line { remote: self, sensor, header: &header, out })
-    }
-
-    /// A line for people; `hub` is what the gateway is called, `sensor` as above.
-    pub(super) fn text(&self, hub: &str, sensor: &str, line: &mut Vec<u8>) -> io::Result<()> {
-        write!(line, "{hub}.{sensor}/{} ", self.topic.name())?;
-        self.show(ForPeople { header: &self.header(), line })?;
-        if let Some(age_ms) = self.age_ms() {
-            write!(line, ", {age_ms:.1} ms old")?;
-        }
-        if self.late { write!(line, ", late") } else { Ok(()) }
-    }
-
-    fn age_ms(&self) -> Option<f64> {
-        self.age_ns.map(|age_ns| (age_ns / 1000) as f64 / 1000.0)
-    }
+fn age_ms(remote: &Remote<'_>) -> Option<f64> {
+    remote.age_ns.map(|age_ns| (age_ns / 1000) as f64 / 1000.0)
 }
 
 /// Declares how a payload of any topic is had, from the table of topics.
 macro_rules! payloads {
     ($($topic:ident $payload:tt, $name:literal, $($column:tt),*: $about:literal;)*) => {
-        impl Remote<'_> {
-            /// Has the payload shown by `how`; nothing becomes of one that cannot be had.
-            fn show<E>(&self, how: impl Way<E>) -> Result<(), E> {
-                match self.topic {
-                    $(Topic::$topic => payloads!($payload, self, how),)*
-                }
+        /// Has the payload shown by `how`; nothing becomes of one that cannot be had.
+        fn show<E>(remote: &Remote<'_>, how: impl Way<E>) -> Result<(), E> {
+            match remote.topic {
+                $(Topic::$topic => payloads!($payload, remote, how),)*
             }
         }
     };
@@ -150,8 +104,8 @@ impl Keys for Line<'_, '_> {
         // Nobody has keys yet: what is flagged may be as false as what is not.
         let authenticated = false;
         let has_head = topic.row().pace == Pace::Scan;
-        let flags = has_head.then(|| json::Words::of(&self.remote.header()));
-        let age_ms = self.remote.age_ms();
+        let flags = has_head.then(|| json::Words::of(&self.remote.header(std::process::id())));
+        let age_ms = age_ms(self.remote);
         self.out.json(&WithOrigin { keys, hub, epoch, authenticated, age_ms, late: *late, flags })
     }
 }

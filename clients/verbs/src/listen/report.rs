@@ -5,15 +5,15 @@ mod classes;
 
 use std::io::Write;
 
+use lan::incoming::{PeerTable, Remote};
 use schema::datagram::{Announce, DatagramError, Head, Row, StreamStats};
 use schema::{Domain, Topic};
 use serde::Serialize;
 use serde::ser::{SerializeMap, Serializer};
 
 use super::names::Names;
-use super::peer_table::PeerTable;
 use super::publish::Publication;
-use super::remote::{Remote, id};
+use super::remote::{self, id};
 use crate::output::{End, Output, table};
 use classes::{Notice, Published, Ready, Sums};
 
@@ -47,10 +47,10 @@ impl<'a> Report<'a> {
     /// A sample of the sensor that is called so.
     pub(super) fn sample(&mut self, sensor: &str, remote: &Remote<'_>) -> Result<(), End> {
         if self.json {
-            return remote.json(sensor, &mut self.out);
+            return remote::json(remote, sensor, &mut self.out);
         }
         let hub = self.names.of(remote.datagram.head.hub);
-        self.out.line(|line| remote.text(&hub, sensor, line))
+        self.out.line(|line| remote::text(remote, &hub, sensor, line))
     }
 
     /// Samples of `topic` of `sensor` were sent before the one with `head` and did not come, or not yet.

@@ -103,7 +103,7 @@ impl<'a> Published<'a> {
             late: left_out.late,
             capacity: left_out.capacity,
             shortage: left_out.shortage,
-            loan_failed: publication.loan_failed(),
+            loan_failed: publication.failed(),
         }
     }
 

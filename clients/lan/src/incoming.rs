@@ -1,0 +1,191 @@
+//! What a listener makes of datagrams: each is refused or counted, and a sample that is new comes out with all that is known
+//! of it. Refuses to know sockets and clocks, and what becomes of samples.
+
+mod duplicate_gateways;
+mod peer_table;
+mod remote;
+
+use schema::Topic;
+use schema::datagram::{Announce, Datagram, DatagramError, Fresh, Head, StreamStats};
+
+use crate::Stamp;
+use duplicate_gateways::DuplicateGateways;
+pub use peer_table::PeerTable;
+pub use remote::Remote;
+
+/// The incoming end: everything that was heard of any gateway.
+pub struct Incoming {
+    stats: Box<StreamStats>,
+    peers: PeerTable,
+    duplicates: DuplicateGateways,
+}
+
+/// What a datagram is to who received it.
+pub enum Arrived<'a> {
+    /// It was refused.
+    Refused {
+        /// The reason, under which it is counted.
+        why: DatagramError,
+        /// The gateway's number, if two are known to send under it.
+        shared: Option<u64>,
+    },
+    /// It came before, or announces what a newer one has announced.
+    Known,
+    /// It says who a sensor is.
+    Announced(Announcement),
+    /// It is a sample that did not come before.
+    Sample(RemoteSample<'a>),
+}
+
+/// The newest announcement of a sensor.
+pub struct Announcement {
+    /// What it came with.
+    pub head: Head,
+    /// What it says.
+    pub announce: Announce,
+    /// CLOCK_MONOTONIC of this machine when it came, in ns.
+    pub arrival_ns: u64,
+    /// A life of its gateway begins with it.
+    pub begins: bool,
+    /// [`Incoming::written`] called the sensor by its number before, and now it has this name.
+    pub is_named: bool,
+    /// How much the gateway's clock is behind this one's, in ns, if they differ; said once of each gateway.
+    pub behind_ns: Option<i64>,
+}
+
+/// A sample, and what is known of who sent it.
+pub struct RemoteSample<'a> {
+    /// The sample.
+    pub remote: Remote<'a>,
+    /// What was announced last of its sensor.
+    pub announced: Option<Announce>,
+    /// A life of its gateway begins with it.
+    pub begins: bool,
+    /// Samples of its topic that were sent before it and did not come, or not yet; 0 if it is late.
+    pub missed: u32,
+}
+
+impl Arrived<'_> {
+    /// Returns the header of a datagram with which a life of its gateway begins.
+    pub fn begins(&self) -> Option<&Head> {
+        match self {
+            Arrived::Announced(announced) if announced.begins => Some(&announced.head),
+            Arrived::Sample(sample) if sample.begins => Some(&sample.remote.datagram.head),
+            _ => None,
+        }
+    }
+}
+
+impl Incoming {
+    /// Makes an end that heard nothing yet. Announcements are believed for `topics` only, as [`StreamStats::new`] says.
+    pub fn new(topics: &[Topic]) -> Incoming {
+        Incoming {
+            stats: Box::new(StreamStats::new(topics)),
+            peers: PeerTable::default(),
+            duplicates: DuplicateGateways::default(),
+        }
+    }
+
+    /// Takes `bytes`, a whole datagram that came `from` a sender at `arrival`. A sender is any number that others do not
+    /// have, for example its address and port.
+    pub fn receive<'a>(&mut self, bytes: &'a [u8], from: u64, arrival: Stamp) -> Arrived<'a> {
+        match self.stats.receive(bytes, from, arrival.monotonic_ns) {
+            Ok((_, Fresh::Duplicate)) => Arrived::Known,
+            Ok((datagram, fresh)) => {
+                self.duplicates.taken(datagram.head.hub);
+                self.accepted(datagram, fresh == Fresh::Late, arrival)
+            }
+            Err(why) => Arrived::Refused { why, shared: self.shared(why, bytes, arrival) },
+        }
+    }
+
+    /// Returns the account of all that came and did not.
+    pub fn stats(&self) -> &StreamStats {
+        &self.stats
+    }
+
+    /// Returns what sensors are called.
+    pub fn peers(&self) -> &PeerTable {
+        &self.peers
+    }
+
+    /// Returns what the sensor that sent `head` is called, to be written now: its name, or `#` and its number.
+    pub fn written(&mut self, head: &Head) -> String {
+        self.peers.written(head, &self.stats)
+    }
+
+    /// A datagram that was not there before.
+    fn accepted<'a>(&mut self, datagram: Datagram<'a>, late: bool, arrival: Stamp) -> Arrived<'a> {
+        let head = datagram.head;
+        let begins = self.peers.is_new(&head, &self.stats);
+        let Some(topic) = Topic::of_number(head.topic) else {
+            // What it says was said again, and better, by a newer one.
+            return if late { Arrived::Known } else { self.announced(&datagram, begins, arrival) };
+        };
+        let life = self.peers.life(&head, &self.stats);
+        let age_ns = life.age_ns(head.stamp_ns, arrival.wall_ns);
+        let sensor = life.sensor(head.sensor);
+        let missed = if late { 0 } else { sensor.advance(head.topic, head.sequence) };
+        let announced = sensor.announced;
+        let boot = announced.map_or(0, |announced| announced.boot);
+        let remote = Remote { topic, datagram, boot, arrival_ns: arrival.monotonic_ns, age_ns, late };
+        Arrived::Sample(RemoteSample { remote, announced, begins, missed })
+    }
+
+    fn announced<'a>(&mut self, datagram: &Datagram<'a>, begins: bool, arrival: Stamp) -> Arrived<'a> {
+        let head = datagram.head;
+        let Some(announce) = Announce::unpack(datagram.payload) else { return Arrived::Known };
+        let behind_ns = self.peers.announce(&head, &self.stats, &announce, arrival.wall_ns);
+        let is_named = self.peers.life(&head, &self.stats).sensor(head.sensor).take_numbered();
+        Arrived::Announced(Announcement {
+            head,
+            announce,
+            arrival_ns: arrival.monotonic_ns,
+            begins,
+            is_named,
+            behind_ns,
+        })
+    }
+
+    /// Whose number it is, if these `bytes`, that were refused, show that two gateways have it.
+    fn shared(&mut self, why: DatagramError, bytes: &[u8], arrival: Stamp) -> Option<u64> {
+        if !matches!(why, DatagramError::Epoch | DatagramError::Twin) {
+            return None;
+        }
+        let Head { hub, epoch, .. } = Datagram::read(bytes).ok()?.head;
+        let is_shared =
+            self.stats.is_shared(hub, epoch) || self.duplicates.refused(hub, arrival.monotonic_ns);
+        is_shared.then_some(hub)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    use schema::Zones;
+    use schema::datagram::{HEAD, Packed};
+
+    /// A datagram with zones, of gateway 5.
+    fn zones(epoch: u32, sequence: u32) -> Vec<u8> {
+        let mut buffer = [0; 100];
+        let len = Zones::unknown().pack(&mut buffer[HEAD..]).unwrap();
+        let topic = Topic::Zones.number();
+        let head = Head { topic, revision: 1, hub: 5, epoch, sequence, ..Head::default() };
+        head.seal(&mut buffer, len).unwrap().to_vec()
+    }
+
+    #[test]
+    fn a_life_begins_once_also_where_datagrams_come_in_one_moment() {
+        let mut incoming = Incoming::new(&Topic::ALL);
+        let mut begins = |epoch, sequence, from, ms: u64| {
+            let arrival = Stamp { monotonic_ns: ms * 1_000_000, wall_ns: 0 };
+            let bytes = zones(epoch, sequence);
+            let arrived = incoming.receive(&bytes, from, arrival);
+            arrived.begins().map(|head| head.epoch)
+        };
+        assert_eq!([begins(7, 0, 1, 10), begins(7, 1, 1, 10), begins(7, 2, 1, 11)], [Some(7), None, None]);
+        assert_eq!([begins(8, 0, 1, 11), begins(8, 1, 1, 11), begins(7, 3, 1, 11)], [Some(8), None, None]);
+        assert_eq!([begins(8, 0, 2, 3000), begins(8, 0, 2, 3011)], [None, Some(8)], "another one's");
+    }
+}

@@ -1,0 +1,185 @@
+//! The datagrams of a gateway: each is numbered, sealed and handed over once, in a buffer that is always the same. Refuses
+//! to know where samples come from and where datagrams go.
+
+use schema::Topic;
+use schema::datagram::{Announce, HEAD, Head, MTU_ETHERNET, group};
+
+/// What takes datagrams: sockets, or a model of a network.
+pub trait Transmit {
+    /// Takes a whole datagram for the group with this last byte, and for the port so much `above` the usual one. Returns
+    /// whether it was sent: a number that was not is counted as failed, and is lost to who receives.
+    fn transmit(&mut self, datagram: &[u8], group: u8, above: u8) -> bool;
+}
+
+/// How a payload becomes a datagram.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Form {
+    /// Behind a header.
+    Sealed,
+    /// By itself, to a port of its sensor.
+    Bare,
+}
+
+/// Numbers what goes out, and keeps the account of it.
+pub(super) struct Numbering {
+    hub: u64,
+    epoch: u32,
+    sensors: Vec<Rows>,
+    form: Form,
+    longest: usize,
+    /// What did not fit into a datagram.
+    unfit: u64,
+    buffer: [u8; MTU_ETHERNET],
+}
+
+/// The account of one sensor.
+#[derive(Default)]
+pub struct Rows {
+    /// Who had this number last.
+    pub name: String,
+    rows: [Row; KINDS],
+}
+
+/// The account of one sensor and topic.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Row {
+    /// Datagrams that were sent.
+    pub sent: u64,
+    /// Datagrams that have a number and were not sent.
+    pub failed: u64,
+    /// Bytes in what was sent.
+    pub bytes: u64,
+    /// Samples that the hub sent and the gateway did not receive; they have no number.
+    pub missed: u64,
+    fit: Fit,
+}
+
+/// Whether all samples of a topic fit into datagrams.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+enum Fit {
+    #[default]
+    All,
+    NotAll,
+    /// And that is told.
+    Told,
+}
+
+impl Row {
+    /// Returns the number of the next datagram.
+    pub fn next(&self) -> u32 {
+        (self.sent + self.failed) as u32
+    }
+}
+
+impl Rows {
+    /// Returns all topics of which anything was sent or ought to have been, announcements as nothing.
+    pub fn used(&self) -> impl Iterator<Item = (Option<Topic>, &Row)> {
+        let numbered = self.rows.iter().enumerate().filter(|(_, row)| **row != Row::default());
+        numbered.map(|(number, row)| (Topic::of_number(number as u8), row))
+    }
+}
+
+impl Numbering {
+    /// Datagrams of at most `longest` bytes, as gateway `hub` in this `epoch`.
+    pub(super) fn new(hub: u64, epoch: u32, form: Form, longest: usize) -> Numbering {
+        let longest = longest.clamp(HEAD, MTU_ETHERNET);
+        Numbering { hub, epoch, sensors: Vec::new(), form, longest, unfit: 0, buffer: [0; MTU_ETHERNET] }
+    }
+
+    pub(super) fn form(&self) -> Form {
+        self.form
+    }
+
+    pub(super) fn longest(&self) -> usize {
+        self.longest
+    }
+
+    pub(super) fn unfit(&self) -> u64 {
+        self.unfit
+    }
+
+    /// Sensor number `number` is called `name`.
+    pub(super) fn claim(&mut self, number: u8, name: &str) {
+        let at = usize::from(number);
+        if self.sensors.len() <= at {
+            self.sensors.resize_with(at + 1, Rows::default);
+        }
+        if self.sensors[at].name != name {
+            name.clone_into(&mut self.sensors[at].name);
+        }
+    }
+
+    /// Whether `name` was the last to claim `number`: a hub that is started anew may number its sensors otherwise.
+    pub(super) fn is_claimed(&self, number: u8, name: &str) -> bool {
+        self.sensors.get(usize::from(number)).is_some_and(|rows| rows.name == name)
+    }
+
+    /// The number of the next datagram of this sensor and topic.
+    pub(super) fn next(&self, number: u8, topic: Topic) -> u32 {
+        let rows = self.sensors.get(usize::from(number));
+        rows.map_or(0, |rows| rows.rows[usize::from(topic.number())].next())
+    }
+
+    /// The hub sent so many samples that did not come here.
+    pub(super) fn miss(&mut self, number: u8, topic: Topic, missed: u64) {
+        if let Some(row) = self.row(number, topic.number()) {
+            row.missed += missed;
+        }
+    }
+
+    /// The account, by the sensors' numbers.
+    pub(super) fn sensors(&self) -> impl Iterator<Item = &Rows> {
+        self.sensors.iter()
+    }
+
+    /// Sends what `pack` writes, under the next number of this sensor and topic; `head` lacks hub, epoch and sequence. A
+    /// failure uses the number up.
+    pub(super) fn send(
+        &mut self,
+        head: Head,
+        to: &mut impl Transmit,
+        pack: impl FnOnce(&mut [u8]) -> Option<usize>,
+    ) {
+        let (hub, epoch) = (self.hub, self.epoch);
+        let Some(row) = self.row(head.sensor, head.topic) else { return };
+        let head = Head { hub, epoch, sequence: row.next(), ..head };
+        let payload = pack(&mut self.buffer[HEAD..self.longest]);
+        let (datagram, above) = match (self.form, payload) {
+            (_, None) => (None, 0),
+            (Form::Sealed, Some(len)) => (head.seal(&mut self.buffer, len), 0),
+            (Form::Bare, Some(len)) => (self.buffer.get(HEAD..HEAD + len), head.sensor),
+        };
+        let group = Topic::of_number(head.topic).map_or(Announce::GROUP, group);
+        let taken = datagram.filter(|datagram| to.transmit(datagram, group, above)).map(<[u8]>::len);
+        if let Some(row) = self.row(head.sensor, head.topic) {
+            match taken {
+                Some(len) => {
+                    row.sent += 1;
+                    row.bytes += len as u64;
+                }
+                None => row.failed += 1,
+            }
+            if payload.is_none() && row.fit == Fit::All {
+                row.fit = Fit::NotAll;
+            }
+        }
+        self.unfit += u64::from(payload.is_none());
+    }
+
+    /// `SENSOR/TOPIC` of which something did not fit into a datagram; each is told once.
+    pub(super) fn misfit(&mut self) -> Option<String> {
+        self.sensors.iter_mut().find_map(|Rows { name, rows }| {
+            let (number, row) = rows.iter_mut().enumerate().find(|(_, row)| row.fit == Fit::NotAll)?;
+            row.fit = Fit::Told;
+            let topic = Topic::of_number(number as u8).map_or("announce", Topic::name);
+            Some(format!("{name}/{topic}"))
+        })
+    }
+
+    fn row(&mut self, number: u8, topic: u8) -> Option<&mut Row> {
+        self.sensors.get_mut(usize::from(number))?.rows.get_mut(usize::from(topic))
+    }
+}
+
+/// Announcements, and the topics by their numbers.
+const KINDS: usize = 1 + Topic::ALL.len();

@@ -1,0 +1,194 @@
+//! What goes out of which samples.
+
+use std::num::NonZeroU64;
+use std::time::Duration;
+
+use schema::datagram::{Announce, Datagram, Head, MTU_SAFE};
+use schema::{Background, Flags, Header, Status, Topic, Verdict, Zones};
+
+use super::{Form, Outgoing, PayloadRef, Sample, Transmit};
+use crate::Stamp;
+
+/// What went out, and whether it is taken.
+#[derive(Default)]
+struct Taken {
+    datagrams: Vec<(Vec<u8>, u8, u8)>,
+    is_cut: bool,
+}
+
+impl Transmit for Taken {
+    fn transmit(&mut self, datagram: &[u8], group: u8, above: u8) -> bool {
+        self.datagrams.push((datagram.to_vec(), group, above));
+        !self.is_cut
+    }
+}
+
+impl Taken {
+    /// The headers of what went out since the last call.
+    fn heads(&mut self) -> Vec<Head> {
+        let all = std::mem::take(&mut self.datagrams);
+        all.iter().map(|(bytes, ..)| Datagram::read(bytes).expect("a datagram").head).collect()
+    }
+
+    /// Topic's number and sequence of what went out since the last call.
+    fn numbers(&mut self) -> Vec<(u8, u32)> {
+        self.heads().iter().map(|head| (head.topic, head.sequence)).collect()
+    }
+}
+
+const ZONES: u8 = Topic::Zones as u8 + 1;
+const BACKGROUND: u8 = Topic::Background as u8 + 1;
+
+fn outgoing(form: Form) -> Outgoing {
+    Outgoing::new(7, 9, form, MTU_SAFE)
+}
+
+fn each(_: Topic) -> Option<NonZeroU64> {
+    Some(NonZeroU64::MIN)
+}
+
+fn at(ms: u64) -> Stamp {
+    Stamp { monotonic_ns: ms * 1_000_000, wall_ns: 5_000_000_000 + ms * 1_000_000 }
+}
+
+fn header(boot: u64, sensor: u8, seq: u64) -> Header {
+    Header { boot, sensor, seq, wall_ns: 4_000_000_000 + seq, ..Header::default() }
+}
+
+fn zones(verdict: Verdict) -> Zones {
+    Zones { verdict: verdict as u8, ..Zones::unknown() }
+}
+
+/// Sends zones; topics and numbers of what went out.
+fn send(out: &mut Outgoing, sensor: usize, header: Option<Header>, verdict: Verdict) -> Vec<(u8, u32)> {
+    let (mut taken, zones) = (Taken::default(), zones(verdict));
+    let sample = Sample { header: header.as_ref(), missed: 0, payload: PayloadRef::Zones(&zones) };
+    out.sample(sensor, &sample, at(0), &mut taken);
+    taken.numbers()
+}
+
+#[test]
+fn each_life_of_the_hub_is_announced_before_its_first_sample() {
+    let mut out = outgoing(Form::Sealed);
+    let front = out.follow("front", each);
+    assert_eq!((out.position("front"), out.position("rear")), (Some(front), None));
+    let mut send = |boot, seq| send(&mut out, front, Some(header(boot, 3, seq)), Verdict::Clear);
+    assert_eq!(send(1, 0), [(Announce::NUMBER, 0), (ZONES, 0)]);
+    assert_eq!(send(1, 1), [(ZONES, 1)]);
+    assert_eq!(send(2, 0), [(Announce::NUMBER, 1), (ZONES, 2)]);
+    let mut taken = Taken::default();
+    out.announce(at(1000), &mut taken);
+    let (bytes, group, above) = &taken.datagrams[0];
+    let Datagram { head, payload, .. } = Datagram::read(bytes).unwrap();
+    let announce = Announce::unpack(payload).unwrap();
+    assert_eq!((announce.sensor(), announce.boot, announce.topics().len()), ("front", 2, Topic::ALL.len()));
+    assert_eq!(announce.topics()[Topic::Zones as usize].next, 3);
+    assert_eq!((head.hub, head.epoch, head.sensor, head.stamp_ns), (7, 9, 3, 6_000_000_000));
+    assert_eq!((*group, *above), (Announce::GROUP, 0));
+}
+
+#[test]
+fn what_is_thinned_has_no_number_and_what_is_unknown_is_not_thinned() {
+    let mut out = outgoing(Form::Sealed);
+    let front = out.follow("front", |topic| NonZeroU64::new(4).filter(|_| topic == Topic::Zones));
+    let mut send = |seq, verdict| send(&mut out, front, Some(header(1, 0, seq)), verdict);
+    assert_eq!(send(0, Verdict::Clear), [(Announce::NUMBER, 0), (ZONES, 0)]);
+    assert_eq!(send(1, Verdict::Stop), []);
+    assert_eq!(send(2, Verdict::Unknown), [(ZONES, 1)]);
+    assert_eq!(send(3, Verdict::Unknown), []);
+    assert_eq!(send(4, Verdict::Clear), [(ZONES, 2)]);
+    assert!(out.wants(front, Topic::Zones) && out.wants(front, Topic::Status), "its status says its type");
+    assert!(!out.wants(front, Topic::Scan));
+}
+
+#[test]
+fn a_silence_is_unknown_zones_of_the_last_sensor() {
+    let mut out = outgoing(Form::Sealed);
+    let (front, rear) = (out.follow("front", each), out.follow("rear", each));
+    assert_eq!(send(&mut out, front, None, Verdict::Unknown), [], "nobody spoke yet");
+    assert_eq!(send(&mut out, front, Some(header(1, 0, 0)), Verdict::Clear).len(), 2);
+    assert_eq!(send(&mut out, front, None, Verdict::Unknown), [(ZONES, 1)]);
+    // The hub starts again with its sensors in another order: what is left of before is of nobody.
+    assert_eq!(send(&mut out, rear, Some(header(2, 0, 0)), Verdict::Clear), [(0, 1), (ZONES, 2)]);
+    assert_eq!(send(&mut out, front, None, Verdict::Unknown), []);
+    assert_eq!(send(&mut out, front, Some(header(1, 0, 1)), Verdict::Clear), []);
+    let names: Vec<_> = out.account().map(|rows| rows.name.as_str()).collect();
+    assert_eq!(names, ["rear"]);
+}
+
+#[test]
+fn what_came_from_another_machine_is_not_sent_on() {
+    let mut out = outgoing(Form::Sealed);
+    let front = out.follow("front", each);
+    let remote = Header { flags: Flags::REMOTE, ..header(1, 0, 0) };
+    assert_eq!(send(&mut out, front, Some(remote), Verdict::Clear), []);
+}
+
+#[test]
+fn a_background_goes_out_when_it_is_new_and_when_it_is_to_be_repeated() {
+    let mut out = outgoing(Form::Sealed);
+    let front = out.follow("front", each);
+    let mut taken = Taken::default();
+    let mut send = |out: &mut Outgoing, seq, generation, ms| {
+        let background = Background { generation, ..Background::default() };
+        let header = header(1, 0, seq);
+        let payload = PayloadRef::Background(&background);
+        out.sample(front, &Sample { header: Some(&header), missed: 0, payload }, at(ms), &mut taken);
+        taken.numbers()
+    };
+    assert_eq!(send(&mut out, 0, 1, 0), [(Announce::NUMBER, 0), (BACKGROUND, 0)]);
+    assert_eq!(send(&mut out, 1, 1, 900), [], "to a late joiner");
+    assert_eq!(send(&mut out, 2, 2, 1000), [(BACKGROUND, 1)]);
+    let mut repeat = |ms| {
+        out.repeat(Duration::from_secs(1), at(ms), &mut taken);
+        taken.numbers()
+    };
+    assert_eq!(repeat(1999), []);
+    assert_eq!(repeat(2000), [(BACKGROUND, 2)]);
+    assert_eq!(repeat(2500), []);
+}
+
+#[test]
+fn a_status_is_stamped_when_it_is_sent_and_tells_the_type() {
+    let (mut out, mut taken) = (outgoing(Form::Sealed), Taken::default());
+    let front = out.follow("front", each);
+    let (header, mut status) = (header(1, 0, 0), Status::default());
+    status.set_sensor_type("LMS200");
+    let sample = Sample { header: Some(&header), missed: 3, payload: PayloadRef::Status(&status) };
+    out.sample(front, &sample, at(70), &mut taken);
+    let kind = Announce::unpack(Datagram::read(&taken.datagrams[0].0).unwrap().payload).unwrap();
+    assert_eq!(kind.kind(), "LMS200");
+    let stamps: Vec<_> = taken.heads().iter().map(|head| head.stamp_ns).collect();
+    assert_eq!(stamps, [5_070_000_000, 5_070_000_000]);
+    let missed: Vec<_> = out.account().flat_map(|rows| rows.used()).map(|(_, row)| row.missed).collect();
+    assert_eq!(missed, [0, 3]);
+}
+
+#[test]
+fn a_failure_uses_the_number_up_and_what_does_not_fit_is_told_once() {
+    let mut out = Outgoing::new(7, 9, Form::Sealed, 200);
+    let front = out.follow("front", each);
+    let mut taken = Taken { is_cut: true, ..Taken::default() };
+    let (header, zones, status) = (header(1, 0, 0), Zones::unknown(), Status::default());
+    for payload in [PayloadRef::Zones(&zones), PayloadRef::Status(&status), PayloadRef::Zones(&zones)] {
+        out.sample(front, &Sample { header: Some(&header), missed: 0, payload }, at(0), &mut taken);
+        taken.is_cut = false;
+    }
+    assert_eq!(taken.numbers(), [(Announce::NUMBER, 0), (ZONES, 0), (ZONES, 1)]);
+    let counts: Vec<_> = out.account().flat_map(|rows| rows.used()).map(|(_, row)| row).collect();
+    let counts: Vec<_> = counts.iter().map(|row| (row.sent, row.failed, row.next())).collect();
+    assert_eq!(counts, [(0, 1, 1), (1, 1, 2), (0, 1, 1)]);
+    assert_eq!((out.misfit().as_deref(), out.misfit(), out.unfit()), (Some("front/status"), None, 1));
+}
+
+#[test]
+fn bare_telegrams_go_to_a_port_of_their_sensor() {
+    let (mut out, mut taken) = (outgoing(Form::Bare), Taken::default());
+    let front = out.follow("front", |topic| NonZeroU64::new(1).filter(|_| topic == Topic::Telegram));
+    assert!(!out.wants(front, Topic::Status));
+    let header = header(1, 5, 0);
+    let sample = Sample { header: Some(&header), missed: 0, payload: PayloadRef::Telegram(b"\x02bytes") };
+    out.sample(front, &sample, at(0), &mut taken);
+    out.announce(at(1000), &mut taken);
+    assert_eq!(taken.datagrams, [(b"\x02bytes".to_vec(), 83, 5)]);
+}

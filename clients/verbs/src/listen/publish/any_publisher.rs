@@ -1,0 +1,66 @@
+//! A topic of a remote sensor in shared memory, of whichever kind. Refuses to know what is in a sample.
+
+use scanhub_client::{Publication, SensorPublisher};
+use schema::datagram::{Packed, telegram};
+use schema::ipc::{Payload, ZeroCopySend};
+use schema::{Failure, Header, Topic};
+
+/// What is published from a payload as it stands in a datagram.
+trait Unpacked {
+    /// Publishes the `payload`, which was checked. What fails is counted by the topic.
+    fn publish(&mut self, header: &Header, payload: &[u8]);
+}
+
+impl Unpacked for Publication<[u8]> {
+    fn publish(&mut self, header: &Header, payload: &[u8]) {
+        match telegram(payload) {
+            Some(telegram) => _ = self.send_bytes_with(header, telegram.0),
+            None => self.skip(1),
+        }
+    }
+}
+
+impl<P: Payload + ZeroCopySend + Default + Packed> Unpacked for Publication<P> {
+    fn publish(&mut self, header: &Header, payload: &[u8]) {
+        let _ = self.send_with(header, |sample| {
+            let _ = sample.unpack(payload);
+        });
+    }
+}
+
+/// Declares the publisher of any topic from the table of topics.
+macro_rules! publishers {
+    ($($topic:ident $payload:tt, $name:literal, $($column:tt),*: $about:literal;)*) => {
+        /// A topic of any kind.
+        pub(super) enum AnyPublisher { $($topic(Publication<schema::payload_type!($payload)>),)* }
+
+        impl AnyPublisher {
+            /// `topic` of `sensor`.
+            pub(super) fn new(topic: Topic, sensor: &SensorPublisher) -> Result<AnyPublisher, Failure> {
+                Ok(match topic { $(Topic::$topic => AnyPublisher::$topic(sensor.topic()?),)* })
+            }
+
+            /// Publishes the `payload` of this topic, as it stands in a datagram.
+            pub(super) fn publish(&mut self, header: &Header, payload: &[u8]) {
+                match self { $(AnyPublisher::$topic(topic) => Unpacked::publish(topic, header, payload),)* }
+            }
+
+            /// Uses up `count` numbers without a sample.
+            pub(super) fn skip(&mut self, count: u64) {
+                match self { $(AnyPublisher::$topic(topic) => topic.skip(count),)* }
+            }
+
+            /// Connects who came since, and gives them what the topic keeps for late joiners.
+            pub(super) fn connect(&self) {
+                match self { $(AnyPublisher::$topic(topic) => topic.connect(),)* }
+            }
+
+            /// Samples for which there was no memory.
+            pub(super) fn failed(&self) -> u64 {
+                match self { $(AnyPublisher::$topic(topic) => topic.failed(),)* }
+            }
+        }
+    };
+}
+
+schema::for_each_topic!(publishers);
