@@ -14,6 +14,7 @@ mod hub;
 mod judges;
 mod line;
 mod plan;
+mod planted;
 mod runner;
 mod sensor;
 mod setup;
@@ -25,5 +26,6 @@ mod world;
 
 pub use event::{Detail, Violation};
 pub use plan::{Action, Plan};
+pub use planted::Defect;
 pub use runner::{Runner, Totals};
-pub use world::{Outcome, run};
+pub use world::{Outcome, run, run_with};
