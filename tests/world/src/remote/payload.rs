@@ -1,0 +1,43 @@
+//! The payload of a sample as it goes over a network. Refuses to know what becomes of it.
+
+use lan::outgoing::PayloadRef;
+use schema::datagram::MTU_ETHERNET;
+
+use crate::topics::Sample;
+
+/// Declares from the table of topics how the bytes of a sample are read.
+macro_rules! payloads {
+    ($($topic:ident $payload:tt, $name:literal, $($column:tt),*: $about:literal;)*) => {
+        /// Hands what `sample` says to `to`.
+        pub(super) fn lend<R>(sample: &Sample, to: impl FnOnce(PayloadRef<'_>) -> R) -> R {
+            match sample.topic {
+                $(schema::Topic::$topic => to(PayloadRef::$topic(payloads!($payload sample))),)*
+            }
+        }
+    };
+    ([u8] $sample:ident) => {
+        &$sample.bytes
+    };
+    ($payload:ident $sample:ident) => {
+        &bytemuck::pod_read_unaligned::<schema::$payload>(&$sample.bytes)
+    };
+}
+
+schema::for_each_topic!(payloads);
+
+/// Room for a payload as in a datagram.
+pub(crate) struct Packet {
+    room: [u8; MTU_ETHERNET],
+}
+
+impl Packet {
+    pub(crate) fn new() -> Packet {
+        Packet { room: [0; MTU_ETHERNET] }
+    }
+
+    /// What `sample` is in a datagram; nothing if none is long enough.
+    pub(crate) fn of(&mut self, sample: &Sample) -> Option<&[u8]> {
+        let len = lend(sample, |payload| payload.pack(&mut self.room))?;
+        self.room.get(..len)
+    }
+}
