@@ -247,6 +247,8 @@ impl Remote {
             now = now.max(at);
             self.deliver(shared, now);
         }
+        now += WAKES;
+        self.deliver(shared, now);
         self.robot.run(shared, &self.terms, &self.memory, now);
         if let Some(listener) = self.listener.take() {
             listener.end(shared, now);
