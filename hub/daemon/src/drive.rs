@@ -41,6 +41,8 @@ pub(crate) struct Open<L> {
     pub(crate) session: Session,
     /// What may be read; nothing where all may.
     allowance: Option<Allowance>,
+    /// So many of the first bytes waited in the port when it was opened: nobody knows since when.
+    waited: u64,
     /// Whether bytes are waited for.
     watch: bool,
     /// Until when the session waits.
@@ -53,7 +55,8 @@ impl<L: Line> Open<L> {
     /// `session` on `line`, at whose nominal `baud` it brings no more than twice that.
     pub(crate) fn new(line: L, session: Session, baud: u32) -> Open<L> {
         let allowance = line.allowance(baud);
-        Open { line, session, allowance, watch: true, until: 0, rest: None }
+        let waited = line.waiting().unwrap_or(0) as u64;
+        Open { line, session, allowance, waited, watch: true, until: 0, rest: None }
     }
 
     /// What to wait for, and until when. Also while bytes are left alone the port may go away.
@@ -98,8 +101,8 @@ impl<'a, S: Surroundings> Driver<'a, S> {
     }
 
     fn read(&mut self, core: &mut LinkCore<'a, S>, open: &mut Open<S::Line>) -> io::Result<()> {
-        let Open { line, session, allowance, watch, until, .. } = open;
-        let around = core.around;
+        let Open { line, session, allowance, waited, watch, until, .. } = open;
+        let (around, already) = (core.around, session.tally().read);
         if !*watch {
             // The telegram's end is near: what can be done before it is not done after it.
             core.output.prepare();
@@ -116,9 +119,15 @@ impl<'a, S: Surroundings> Driver<'a, S> {
             let most = spare.len().min(allowance.bytes(around.now()).max(1));
             spare = &mut spare[..most];
         }
+        if let Some(left @ 1..) = waited.checked_sub(already) {
+            // So that what comes now is not taken for what waited.
+            let most = spare.len().min(left as usize);
+            spare = &mut spare[..most];
+        }
         let room = spare.len();
         let len = line.read(spare)?;
         let now = around.now();
+        self.is_behind = len > 0 && already < *waited;
         session.commit(now, len);
         if let Some(allowance) = allowance {
             allowance.take(len, room, now);
@@ -139,7 +148,11 @@ impl<'a, S: Surroundings> Driver<'a, S> {
         let mut published = false;
         (open.watch, open.until) = loop {
             match session.poll_output() {
-                Output::SetBaud(baud) => self.set_baud(core, line, baud)?,
+                Output::SetBaud(baud) => {
+                    self.set_baud(core, line, baud)?;
+                    // What waited is discarded.
+                    open.waited = 0;
+                }
                 Output::Transmit { byte, not_before } => {
                     around.pause(not_before);
                     line.write(byte)?;

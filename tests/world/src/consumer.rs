@@ -91,9 +91,12 @@ impl Consumer {
         self.habit == Habit::Prompt
     }
 
-    /// It does not run until then.
-    pub(crate) fn stop(&mut self, until: Nanos) {
+    /// It does not run until then. A robot that does not run believes nothing.
+    pub(crate) fn stop(&mut self, shared: &Shared, until: Nanos) {
         self.stopped_until = until;
+        if let Some((_, verdict)) = &mut self.belief {
+            believe(shared, self.sensor, verdict, Verdict::Unknown);
+        }
     }
 
     /// When it does something next.

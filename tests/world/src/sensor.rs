@@ -9,7 +9,8 @@ use lms::variant::{Baud, Mode, Unit, Variant};
 use lms::{MICROS, Nanos, line_time};
 use sim::Arrival;
 use sim::fault::Faults;
-use sim::machine::{Habits, Machine, Settings};
+use sim::machine::{Habits, Machine, Settings, Start};
+use sim::operating::Operating;
 use sim::room::Room;
 use sim::series::{Changes, Series};
 use sim::source::Source;
@@ -90,7 +91,9 @@ impl Sensor {
     /// Another one is there instead, at `baud`; it streams if somebody made it.
     pub(crate) fn exchange(&mut self, baud: Baud, streams: bool) {
         self.eeprom_writes += self.machine.eeprom_writes();
-        let settings = Settings { baud, seed: self.settings.seed + 1, ..self.settings.clone() };
+        let seed = self.settings.seed.wrapping_add(1);
+        let start = Start::In(Operating::OnRequest);
+        let settings = Settings { baud, seed, start, ..self.settings.clone() };
         let room = Room::of_series(self.series.clone(), self.changes.clone());
         self.machine = Machine::new(settings.clone(), Source::Room(room));
         self.settings = settings;

@@ -89,10 +89,16 @@ impl Board {
 
     /// A hub begins to publish: what dead ones left is cleaned up, and everybody has to connect anew.
     fn begin(&mut self, sensor: usize, topic: Topic) {
+        self.clean();
         let channel = &mut self.sensors[sensor][topic as usize];
         channel.kept.clear();
-        channel.places.retain(|place| !place.is_dead);
         channel.places.iter_mut().for_each(|place| place.is_connected = false);
+    }
+
+    /// What killed consumers left is removed.
+    pub(crate) fn clean(&mut self) {
+        let channels = self.sensors.iter_mut().flatten();
+        channels.for_each(|channel| channel.places.retain(|place| !place.is_dead));
     }
 
     /// The hub is gone: nobody keeps anything for late joiners any more.

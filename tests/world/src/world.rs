@@ -282,6 +282,7 @@ impl World {
         let kept = self.shared.kept.take();
         drop(kept);
         self.shared.board.borrow_mut().end();
+        self.shared.board.borrow_mut().clean();
         let (loans, held) = self.shared.board.borrow().in_use();
         let eeprom_writes = self.shared.ports.iter().map(|port| port.borrow().sensor.eeprom_writes()).sum();
         let handles = self.shared.handles.get();

@@ -51,6 +51,6 @@ fn stop(world: &mut World, action: &Action) {
     let mut slow: Vec<_> = world.consumers.iter_mut().filter(|consumer| !consumer.is_prompt()).collect();
     let which = action.value("which") as usize % slow.len().max(1);
     if let Some(consumer) = slow.get_mut(which) {
-        consumer.stop(until);
+        consumer.stop(&world.shared, until);
     }
 }
