@@ -197,7 +197,15 @@ impl Event<'_> {
                 match topic {
                     Topic::Zones if std::env::var_os("WORLD_ALL").is_some() => {
                         let zones: schema::Zones = bytemuck::pod_read_unaligned(bytes);
-                        Some(format!("{sensor} zones {:?} seq {} stamps {:.6} {:.6} flags {} reasons {}", zones.verdict(), header.seq, header.stamp_first_ns as f64/1e9, header.stamp_last_ns as f64/1e9, header.flags, header.reasons))
+                        Some(format!(
+                            "{sensor} zones {:?} seq {} stamps {:.6} {:.6} flags {} reasons {}",
+                            zones.verdict(),
+                            header.seq,
+                            header.stamp_first_ns as f64 / 1e9,
+                            header.stamp_last_ns as f64 / 1e9,
+                            header.flags,
+                            header.reasons
+                        ))
                     }
                     Topic::Status => {
                         let status: Status = bytemuck::pod_read_unaligned(bytes);

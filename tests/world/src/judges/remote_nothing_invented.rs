@@ -25,7 +25,9 @@ pub(crate) struct RemoteNothingInvented {
     sent: BTreeMap<(u32, u8, u8, u32), u64>,
     /// The greatest epoch that the listener took.
     epoch: u32,
-    /// When the listener last took a sample of each sensor that was not late.
+    /// Epoch and sensor of the announcements that the listener took: before it nobody knows whose samples are.
+    named: HashSet<(u32, u8)>,
+    /// When the listener last took a sample of each sensor that it knew and that was not late.
     heard_at: BTreeMap<usize, Nanos>,
     packet: Packet,
     /// What everybody may say.
@@ -42,6 +44,7 @@ impl Default for RemoteNothingInvented {
             boots: HashSet::new(),
             sent: BTreeMap::new(),
             epoch: 0,
+            named: HashSet::new(),
             heard_at: BTreeMap::new(),
             packet: Packet::new(),
             unknown,
@@ -65,6 +68,7 @@ impl Judge for RemoteNothingInvented {
             Event::Transmitted { datagram, bytes, .. } => _ = self.sent.insert(place(datagram), hash(bytes)),
             Event::ListenerBegins { .. } => {
                 self.epoch = 0;
+                self.named.clear();
                 self.heard_at.clear();
             }
             Event::Arrived { datagram, bytes, outcome, .. } => {
@@ -79,9 +83,15 @@ impl Judge for RemoteNothingInvented {
                     }
                     (Arrival::Refused(_), _) => {}
                     (_, Some(datagram)) if is_sent => {
-                        self.epoch = self.epoch.max(datagram.head.epoch);
-                        if outcome == (Arrival::Sample { late: false }) {
-                            self.heard_at.insert(datagram.head.sensor.into(), at);
+                        let head = &datagram.head;
+                        self.epoch = self.epoch.max(head.epoch);
+                        let life = (head.epoch, head.sensor);
+                        match outcome {
+                            Arrival::Announced => _ = self.named.insert(life),
+                            Arrival::Sample { late: false } if self.named.contains(&life) => {
+                                self.heard_at.insert(head.sensor.into(), at);
+                            }
+                            _ => {}
                         }
                     }
                     _ => say.broken(format!("{} bytes that nobody sent so", bytes.len())),
