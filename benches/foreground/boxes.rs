@@ -2,7 +2,7 @@
 //! first one is foreground still after N scans, and how much of the second one is background still after N and 2N.
 
 use schema::Scan;
-use sim::look::Met;
+use sim::labeled_scan::Met;
 
 use super::method::Method;
 use super::play::Frame;

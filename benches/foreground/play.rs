@@ -3,7 +3,7 @@
 
 use lms::variant::{Unit, Variant};
 use schema::Scan;
-use sim::look::Met;
+use sim::labeled_scan::Met;
 use sim::room::Room;
 use sim::world::World;
 
@@ -59,7 +59,7 @@ pub(crate) fn play(scene: &Scene, seed: u64) -> Vec<Frame> {
 
 fn frame(room: &Room, unit: Unit, number: u64) -> Frame {
     let end_ns = number * Variant::HALF.turns() * lms::variant::MIRROR_TURN;
-    let look = room.look(Variant::HALF, unit, seen::MODE, end_ns);
+    let look = room.labeled_scan(Variant::HALF, unit, seen::MODE, end_ns);
     let scan = seen::scan(&look.words, unit);
     let due = (0..look.truth.len()).map(|i| due(&scan, i, look.truth[i], end_ns)).collect();
     Frame { scan, due, met: look.truth }

@@ -56,7 +56,7 @@ pub(crate) fn record(
                 let telegram = if scan == 0 {
                     lms::reply::configuration(0, Mode(1), Unit::Mm, 0x10)
                 } else {
-                    let look = room.look(Variant::HALF, Unit::Mm, Mode(1), at);
+                    let look = room.labeled_scan(Variant::HALF, Unit::Mm, Mode(1), at);
                     lms::measured::encode(0, Unit::Mm, &look.words, 0x10)
                 };
                 links[number].read(at, telegram.bytes());

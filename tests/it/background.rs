@@ -38,7 +38,7 @@ fn learned(env: &TestEnv) -> Value {
 #[test]
 fn what_was_saved_comes_back() {
     let env = TestEnv::new();
-    let _simulator = simulator(&env);
+    let simulator_of_first = simulator(&env);
     let hub = env.hub(&[&env.link("front"), SOON]);
     let mut consumer = env.echo(&["front/background"]);
     let model = learned(&env);
@@ -79,10 +79,19 @@ fn what_was_saved_comes_back() {
     drop(consumer);
     assert_eq!(hub.end(TERM).code, Some(0));
 
-    // A hub that begins with the file knows at once what that one had learned.
+    // A hub that begins with the file knows at once what that one had learned, before there is a scan that changes it.
+    drop(simulator_of_first);
     let begin = format!("--set=link.front.background.start={file}");
     let _hub = env.hub(&[&env.link("front"), SOON, &begin]);
-    assert_eq!(told(&env, &["show"])["ranges"], model["ranges"]);
+    let begun = told(&env, &["show"]);
+    assert_eq!(begun["ranges"], model["ranges"]);
+    // The sensor's scans fit it: they go on with it.
+    let _simulator = simulator(&env);
+    let mut scans = env.echo(&["front/scan"]);
+    scans.await_lines(5, "a scan", |line| line["class"] == "scan");
+    let after = told(&env, &["show"]);
+    assert_eq!(after["generation"], begun["generation"]);
+    assert!(number(&after, "taught") >= number(&begun, "taught"), "{after}");
 }
 
 #[test]

@@ -1,7 +1,9 @@
 //! What users ask of a running hub: a sensor is stopped, streams again, is begun anew with; and what is refused.
 
 use crate::testkit;
-use crate::testkit::{INT, Outcome, TERM, TestEnv, hold_in_time, is_class, number, sequence, until};
+use crate::testkit::{
+    INT, Outcome, REAL_ANSWERS, TERM, TestEnv, hold_in_time, is_class, number, sequence, until,
+};
 use serde_json::Value;
 
 fn control(env: &TestEnv, sensor: &str, verb: &str) -> Outcome {
@@ -29,7 +31,7 @@ fn a_paused_sensor_stops_and_a_resumed_one_goes_on_without_a_gap() {
         let env = TestEnv::in_time();
         let hub = env.hub(&[env.link("front"), env.link("rear")]);
         let mut consumers = ["front/telegram", "front/scan", "rear/scan"].map(|topic| env.echo(&[topic]));
-        let simulator = env.simulator(&["front", "rear"], &["--seed=31", "--baud=500000"]);
+        let simulator = env.simulator(&["front", "rear"], &["--seed=31", "--baud=500000", REAL_ANSWERS]);
         for consumer in &mut consumers[1..] {
             consumer.await_lines(20, "a scan", is_class("scan"));
         }

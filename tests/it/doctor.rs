@@ -3,7 +3,7 @@
 
 use std::path::Path;
 
-use crate::testkit::{KILL, Outcome, Program, TERM, TestEnv};
+use crate::testkit::{KILL, Outcome, Program, REAL_ANSWERS, TERM, TestEnv};
 use rustix::fs::inotify::{self, CreateFlags, WatchFlags};
 use rustix::io::Errno;
 use rustix::process::Signal;
@@ -40,7 +40,7 @@ fn the_page_has_a_line_for_each_check() {
 #[test]
 fn a_set_up_that_works() {
     let env = TestEnv::new();
-    let simulator = env.simulator(&["front"], &["--baud=38400"]);
+    let simulator = env.simulator(&["front"], &["--baud=38400", REAL_ANSWERS]);
     let port = env.word("front");
     let (findings, _) = doctor(&env, &[&port], 0);
     for name in ["memory", "domain", "leftovers", "descriptors"] {

@@ -184,6 +184,10 @@ fn a_hub_and_two_remote_ones_live_in_one_domain() {
         other.send(Topic::Status, &Status::default());
         let second = publisher_refused(&env);
         assert!(second.contains(&format!("pid {}", listener.pid())), "{second}");
+        until("the second one is published", || {
+            let topics = env.run(&["list", "--json"]).lines();
+            topics.iter().any(|line| line["sensor"] == "00000000000000ab.front" && line["topic"] == "zones")
+        });
         let mut echo = env.echo(&["front/scan", "robot1.front/zones", "00000000000000ab.front/zones"]);
         one.send(Topic::Zones, &zones(Verdict::Stop));
         other.send(Topic::Zones, &zones(Verdict::Slow));

@@ -48,6 +48,7 @@ mod ports;
 mod probe;
 mod processed;
 mod python;
+mod real_speed;
 mod reconnect;
 mod record;
 mod record_disk;

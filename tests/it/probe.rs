@@ -1,13 +1,13 @@
 //! `scanhub probe`, as somebody runs it: it tells what is there, and leaves it as it was.
 
 use crate::testkit;
-use crate::testkit::{INT, TERM, TestEnv, number};
+use crate::testkit::{INT, REAL_ANSWERS, TERM, TestEnv, number};
 use serde_json::Value;
 
 #[test]
 fn a_sensor_tells_of_itself_and_is_left_as_it_was() {
     let env = TestEnv::new();
-    let simulator = env.simulator(&["front"], &["--baud=19200", "--type=lms291", "--unit=cm"]);
+    let simulator = env.simulator(&["front"], &["--baud=19200", "--type=lms291", "--unit=cm", REAL_ANSWERS]);
     let port = env.word("front");
     for _ in 0..2 {
         let outcome = env.run(&["probe", &port, "--json"]);

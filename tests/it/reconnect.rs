@@ -1,7 +1,8 @@
 //! A port that goes away and comes back under its name while the hub and its consumers run on.
 
 use crate::testkit::{
-    INT, Line, Program, TERM, TestEnv, bytes_of, hash, is_class, is_there, number, scan, sequence,
+    INT, Line, Program, REAL_ANSWERS, TERM, TestEnv, bytes_of, hash, is_class, is_there, number, scan,
+    sequence,
 };
 use rustix::fs::{FlockOperation, flock};
 use serde_json::Value;
@@ -9,7 +10,7 @@ use serde_json::Value;
 #[test]
 fn a_sensor_that_goes_and_comes_back() {
     let env = TestEnv::new();
-    let simulator = env.simulator(&["front"], &["--seed=22"]);
+    let simulator = env.simulator(&["front"], &["--seed=22", REAL_ANSWERS]);
     let hub = env.hub(&[env.link("front")]);
     let mut consumer = env.echo(&["front/scan", "front/status"]);
     consumer.await_lines(10, "a scan", is_class("scan"));
@@ -17,7 +18,7 @@ fn a_sensor_that_goes_and_comes_back() {
     assert!(!is_there(&env.path("front")));
     let absent = consumer.await_line("absent", |line| line["state"] == "absent");
     assert!(absent["last_error"].as_str().is_some_and(|error| error.contains("front")), "{absent}");
-    let _simulator = env.simulator(&["front"], &["--seed=23"]);
+    let _simulator = env.simulator(&["front"], &["--seed=23", REAL_ANSWERS]);
     consumer.await_line("streaming", |line| line["state"] == "streaming");
     consumer.await_lines(10, "a scan", is_class("scan"));
     let info = env.info("front");

@@ -165,7 +165,7 @@ fn shared_memory_of_strangers() {
         let mut own = Vec::new();
         until("nobody comes or goes", || {
             let before = std::mem::replace(&mut own, segments(&env));
-            consumer.await_lines(3, "a scan", is_class("scan"));
+            consumer.await_lines(10, "a scan", is_class("scan"));
             own == before
         });
         assert!(own.iter().any(|path| path.to_string_lossy().ends_with(".global_mgmt")), "{own:?}");

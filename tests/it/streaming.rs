@@ -2,7 +2,7 @@
 //! arrives, bit for bit and in order, and all verbs tell the same of it.
 
 use crate::testkit::{
-    INT, MEASURED, TERM, TestEnv, bytes_of, hash, hold_in_time, is_class, number, sequence,
+    INT, MEASURED, REAL_ANSWERS, TERM, TestEnv, bytes_of, hash, hold_in_time, is_class, number, sequence,
 };
 use lms::framer::{Found, Framer};
 use lms::measured::Measured;
@@ -19,7 +19,7 @@ fn everything_sent_arrives_bit_for_bit_and_in_order() {
         // They listen before anything is sent: nothing may be missing from the very first on.
         let mut consumers =
             sensors.map(|sensor| ["telegram", "scan"].map(|topic| env.echo(&[&format!("{sensor}/{topic}")])));
-        let simulator = env.simulator(&sensors, &["--seed=11"]);
+        let simulator = env.simulator(&sensors, &["--seed=11", REAL_ANSWERS]);
         for [telegrams, scans] in &mut consumers {
             telegrams.await_lines(300, "a measured telegram", |line| line["command"] == MEASURED);
             scans.await_lines(300, "a scan", is_class("scan"));

@@ -56,6 +56,11 @@ pub(crate) use tmux::Tmux;
 /// Far longer than anything takes on a busy machine.
 pub(crate) const PATIENCE: Duration = Duration::from_secs(20);
 
+/// Flag of a simulator whose sensors take as long to answer as real ones do.
+pub(crate) const REAL_ANSWERS: &str = "--fault=answer=0";
+/// Flag of one whose sensors answer after 5 ms.
+const QUICK_ANSWERS: &str = "--fault=answer=0.005";
+
 /// Says where the program is, for a test that hides where it was built.
 pub(crate) const PROGRAM: &str = "SCANHUB_TEST_PROGRAM";
 
@@ -182,11 +187,14 @@ impl TestEnv {
         self.start(&with(&["gateway", "--json", "--no-system-config"], flags))
     }
 
-    /// A simulator with a port of each of these names that is up; its truth is in the file `truth`.
+    /// A simulator with a port of each of these names that is up; its truth is in the file `truth`. Its sensors answer soon
+    /// unless `flags` have faults or [`REAL_ANSWERS`]: few tests are about that wait, and all would wait.
     pub(crate) fn simulator<S: AsRef<str>>(&self, ports: &[&str], flags: &[S]) -> Program {
         let ports: Vec<_> = ports.iter().map(|port| format!("--port={}", self.word(port))).collect();
         let truth = format!("--truth={}", self.word("truth"));
-        let words = with(&["simulate", "--json", &truth], &with(&ports, flags));
+        let has_faults = flags.iter().any(|flag| flag.as_ref().starts_with("--fault"));
+        let soon: &[&str] = if has_faults { &[] } else { &[QUICK_ANSWERS] };
+        let words = with(&with(&["simulate", "--json", &truth], soon), &with(&ports, flags));
         self.start(&words).ready()
     }
 
@@ -199,24 +207,31 @@ impl TestEnv {
 
     /// `echo --json` of these topics, attached to all of them.
     pub(crate) fn echo(&self, topics: &[&str]) -> Program {
-        let before: Vec<_> = topics.iter().map(|topic| self.subscribers(topic)).collect();
+        let before = self.all_subscribers(topics);
         let program = self.start(&with(&["echo", "--json"], topics));
         until("the consumer is attached", || {
-            topics.iter().zip(&before).all(|(topic, before)| self.subscribers(topic) > *before)
+            self.all_subscribers(topics).iter().zip(&before).all(|(now, before)| now > before)
         });
         program
     }
 
     /// How many consumers `topic` has.
     pub(crate) fn subscribers(&self, topic: &str) -> u64 {
+        self.all_subscribers(&[topic])[0]
+    }
+
+    /// How many consumers each of `topics` has, all of them at one time.
+    fn all_subscribers(&self, topics: &[&str]) -> Vec<u64> {
         let outcome = self.run(&["list", "--json"]);
         let lines = outcome.lines();
-        let line = lines.iter().find(|line| {
-            topic.split_once('/').is_some_and(|(sensor, topic)| {
-                line["class"] == "topic" && line["sensor"] == sensor && line["topic"] == topic
-            })
-        });
-        line.map_or_else(|| panic!("no {topic}: {outcome}"), |line| number(line, "subscribers"))
+        let subscribers = |topic: &&str| {
+            let (sensor, name) = topic.split_once('/').unwrap_or_else(|| panic!("{topic} has no sensor"));
+            let is_it =
+                |line: &&Value| line["class"] == "topic" && line["sensor"] == sensor && line["topic"] == name;
+            let line = lines.iter().find(is_it).unwrap_or_else(|| panic!("no {topic}: {outcome}"));
+            number(line, "subscribers")
+        };
+        topics.iter().map(subscribers).collect()
     }
 
     /// What `info` says of `sensor`.

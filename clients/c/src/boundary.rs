@@ -22,7 +22,7 @@ pub struct Lent {
     pub length: usize,
     /// Samples of this topic that were sent before it and not received.
     pub missed: u64,
-    /// 1: the hub was started anew since the last one.
+    /// 1: the hub restarted since the last sample.
     pub restarted: c_int,
     /// 1: zones that are unknown because nothing was heard.
     pub stale: c_int,

@@ -74,11 +74,12 @@ def subscribe(
     timeout: float | None = None,
     on_notice: Callable[[str], object] | None = None,
 ) -> Subscription:
-    """Follows `topics`, each `SENSOR/TOPIC` as in `front/scan`, in the domain (None: what SCANHUB_DOMAIN says, else
-    `scanhub`) below the directory `root` (None: wherever a hub may have put it).
+    """Follows `topics`, each `SENSOR/TOPIC` as in `front/scan`, in `domain` (None: the value of SCANHUB_DOMAIN, else
+    `scanhub`), which is looked for below the directory `root` (None: in all places where a hub may put it).
 
-    Iterate over what is returned, for ever. With `timeout`, a silence of so many seconds raises NoHub or Silent.
-    `on_notice` is called with `hub_gone` and `hub_back`. NoTopic or Impossible at once if a name is.
+    Iterate over the result; the iteration does not end. With `timeout`, a silence of that many seconds raises NoHub or
+    Silent.
+    `on_notice` is called with `hub_gone` and `hub_back`. Raises NoTopic or Impossible at once if a name is invalid.
     """
     if not topics:
         raise NoTopic("no topic is named", "write SENSOR/TOPIC, as front/scan")
@@ -86,11 +87,11 @@ def subscribe(
 
 
 def robot(*sensors: str, domain: str | None = None, root: str | os.PathLike[str] | None = None) -> RobotFollower:
-    """Follows the verdict over the zones of `sensors`. None: all sensors of the hub; in a domain without a hub those of
-    other machines that are published there.
+    """Follows the verdict over the zones of `sensors`. Without names: all sensors of the hub; in a domain without a hub
+    the sensors of other machines that are published there.
 
-    Iterate over what is returned, for ever, or ask `now()` in a loop of your own. What is not heard lately is `unknown`
-    by itself, with a hub or without one. Impossible at once if a name is.
+    Iterate over the result, which does not end, or call `now()` in a loop of your own. The verdict becomes `unknown` by
+    itself when no recent data arrived, with a hub or without one. Raises Impossible at once if a name is invalid.
     """
     for sensor in sensors:
         check_sensor(sensor)
@@ -98,10 +99,10 @@ def robot(*sensors: str, domain: str | None = None, root: str | os.PathLike[str]
 
 
 def topics(*, domain: str | None = None, root: str | os.PathLike[str] | None = None) -> list[TopicName]:
-    """The topics of the running hub, sorted; NoHub after half a second."""
+    """The topics of the running hub, sorted. Raises NoHub after half a second."""
     return memory.topics(find(candidates(domain, root)))
 
 
 def sensors(*, domain: str | None = None, root: str | os.PathLike[str] | None = None) -> list[str]:
-    """The sensors of the running hub, sorted; NoHub after half a second."""
+    """The sensors of the running hub, sorted. Raises NoHub after half a second."""
     return sorted({topic.sensor for topic in topics(domain=domain, root=root)})

@@ -1,4 +1,4 @@
-"""What may be asked of a running hub: its background models, and the flow of data. Done is what the link has taken."""
+"""Requests to a running hub: background models, and the flow of data. They return when the link has accepted them."""
 
 from __future__ import annotations
 
@@ -18,15 +18,15 @@ from .names import CONTROL, candidates, check_sensor
 from .presence import GRACE, LOOK_EVERY, Presence, find
 
 MODEL_ORDERS = {"show": 16, "reset": 17, "freeze": 18, "thaw": 19}
-"""What may be asked of a background model."""
+"""Requests about a background model."""
 FLOW_ORDERS = {"pause": 1, "resume": 2, "resync": 3}
-"""What may be asked of the flow of data."""
+"""Requests about the flow of data."""
 
 
 def background(
     sensor: str, order: str = "show", *, domain: str | None = None, root: str | os.PathLike[str] | None = None
 ) -> Shown:
-    """The background model of `sensor`, after `order` was done: `show`, `reset` (learn anew), `freeze` or `thaw`.
+    """The background model of `sensor`, after `order` was done: `show`, `reset` (learn again), `freeze` or `thaw`.
 
     Refused if the hub does not do it, NoTopic if it has no such sensor; NoHub, Silent, Short.
     """
@@ -38,7 +38,10 @@ def background(
 
 
 def control(sensor: str, order: str, *, domain: str | None = None, root: str | os.PathLike[str] | None = None) -> None:
-    """Lets the hub `pause` a sensor, `resume` its stream, or begin anew with it: `resync`. Raises as `background`."""
+    """Asks the hub to `pause` a sensor, to `resume` its stream, or to restart the session with it (`resync`).
+
+    Raises as `background`.
+    """
     code = _code(FLOW_ORDERS, order)
     _Client(sensor, domain, root).ask(code)
 
@@ -61,7 +64,7 @@ class _Client:
         self._client, self._requests, self._responses = self._open()
 
     def ask(self, verb: int) -> bytes:
-        """What the hub answers, without its head."""
+        """The answer of the hub, without its header."""
         request = layout.Request(verb=verb)
         # The hub has none with a longer name.
         name = self._sensor.encode()[: len(request.sensor_text)]
@@ -122,6 +125,6 @@ def _read(answer: bytes) -> bytes:
 
 
 _KINDS: dict[int, type[Failure]] = {3: NoTopic, 75: Short}
-"""What exit codes stand for; all else is refused."""
+"""The errors for exit codes; every other code is Refused."""
 _PATIENCE = 5.0
 """Seconds: a link takes a request within milliseconds; one that opens its port may need longer."""

@@ -1,10 +1,10 @@
-"""What goes wrong, in the words of who has to do something about it: a message and a remedy."""
+"""The errors: each has a message, and a remedy for the user."""
 
 from __future__ import annotations
 
 
 class Failure(Exception):
-    """What happened, and in `remedy` what would be right; the remedy may be empty."""
+    """What happened, and in `remedy` how to fix it; the remedy may be empty."""
 
     def __init__(self, message: str, remedy: str = "") -> None:
         super().__init__(message)
@@ -20,15 +20,15 @@ class NoHub(Failure):
 
 
 class NoTopic(Failure):
-    """What was named is no topic, or the hub has no such sensor."""
+    """The name is not a topic, or the hub has no such sensor."""
 
 
 class Silent(Failure, TimeoutError):
-    """There is a hub, and nothing came within the time allowed."""
+    """There is a hub, but no sample came within the timeout."""
 
 
 class Mismatch(Failure):
-    """The hub speaks of something else: another layout, or another version of iceoryx2."""
+    """The hub uses another layout, or another version of iceoryx2."""
 
 
 class Denied(Failure):
@@ -40,12 +40,12 @@ class Short(Failure):
 
 
 class Held(Failure):
-    """More samples of a topic are kept than a consumer may have at a time."""
+    """The program keeps more samples of a topic than a consumer may have at a time."""
 
 
 class Impossible(Failure, ValueError):
-    """A name or a value that cannot be right."""
+    """A name or a value is invalid."""
 
 
 class Refused(Failure):
-    """The hub does not do what it was asked for."""
+    """The hub refused the request."""

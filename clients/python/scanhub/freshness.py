@@ -1,4 +1,4 @@
-"""Until when a verdict may be believed. Time is an argument; refuses to know what becomes of it."""
+"""How long a verdict is valid. Time is an argument; refuses to know how the verdict is used."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ class Moment(NamedTuple):
     boottime_ns: int
 
     def later(self, by_ns: int) -> Moment:
-        """So much after this."""
+        """The time this long after it."""
         return Moment(self.monotonic_ns + by_ns, self.boottime_ns + by_ns)
 
 
 def now() -> Moment:
-    """This moment."""
+    """The present time."""
     return Moment(time.monotonic_ns(), time.clock_gettime_ns(time.CLOCK_BOOTTIME))
 
 
@@ -45,7 +45,7 @@ class Freshness:
         return is_unknown or is_fresh
 
     def silence(self, now: Moment) -> bool:
-        """Whether a verdict became too old just now; said once per silence."""
+        """Whether a verdict became too old just now; true once per silence."""
         if self._said or self.left(now):
             return False
         self._said = True
@@ -64,8 +64,8 @@ REMOTE = 32
 _HUB_LIMIT_NS = 20_000_000
 """The hub says `unknown` two periods and this long after the last scan (docs/topics.md)."""
 _AFTER_HUB_NS = 20_000_000
-"""So much longer a client waits: where the hub lives its own word comes first."""
+"""A client waits this much longer: if the hub runs, its own `unknown` comes first."""
 _NO_PERIOD_NS = 500_000_000
-"""The limit where no period is told, and the least one for what came over a network."""
+"""The limit if no period is known, and the least limit for samples from a network."""
 _FIRST_WORD_NS = 1_000_000_000
-"""How long the first word may take."""
+"""How long the first verdict may take."""

@@ -1,5 +1,5 @@
-"""From a topic to its service in shared memory. Who follows topics gets ports and never sees iceoryx2. Refuses to know
-why somebody waits, and what a sample says."""
+"""From a topic to its service in shared memory. Other modules get ports and never see iceoryx2. Refuses to know why a
+program waits, and what a sample means."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ class Membership:
             raise trouble.broken(domain, f"cannot join {domain.name}: {error}") from None
 
     def is_current(self) -> bool:
-        """The names of shared memory are still those; after all had gone a hub has others."""
+        """Whether the names of shared memory are still valid: after everything ended, a new hub has others."""
         return _prefix(self.domain) == self.prefix
 
     def service(self, name: str) -> Any:
@@ -49,12 +49,12 @@ class Membership:
         return self._node.service_builder(iox2.ServiceName.new(name))
 
     def listen(self, event: str) -> Any | None:
-        """The end of an event at which one sleeps, or nothing as long as no hub has made it; Failure, Short."""
+        """The listener of an event, or None until a hub has made it. Raises Failure, Short."""
         factory = self.open(event, self.service(event).event(), "an event")
         return factory and self.port(event, factory.listener_builder())
 
     def subscribe(self, name: TopicName, kind: type[Sample]) -> Port | None:
-        """A consumer's end of a topic, or nothing as long as no hub has made it; Mismatch, Short, Failure."""
+        """The subscriber of a topic, or None until a hub has made it. Raises Mismatch, Short, Failure."""
         builder = self.service(name.service).publish_subscribe(_payload(kind)).user_header(layout.Header)
         factory = self.open(name.service, builder, trouble.types(kind.struct))
         return factory and Port(name, kind, self.port(name.service, factory.subscriber_builder()))
@@ -68,7 +68,7 @@ class Membership:
             return None
 
     def port(self, name: str, builder: Any) -> Any:
-        """Makes a port; Short if memory, descriptors or places are."""
+        """Makes a port. Raises Short if memory, descriptors or places are short."""
         trouble.check_room()
         try:
             return builder.create()
@@ -77,7 +77,7 @@ class Membership:
 
 
 class Received:
-    """A sample in shared memory. Its place is not written anew as long as this, or what was made of it, is in use."""
+    """A sample in shared memory. The hub does not reuse its memory while this object, or an array of it, is in use."""
 
     __slots__ = ("_sample", "_size", "header")
 
@@ -87,7 +87,7 @@ class Received:
         self.header = _header_at(sample.user_header_ptr)
 
     def data(self) -> Any:
-        """The payload as an array of bytes; made when it is asked for, because whoever waits for a sample has haste."""
+        """The payload as an array of bytes; made on first use, because a program that waits for a sample is in a hurry."""
         size = self._size or self._sample.payload().len()
         data: Any = (ctypes.c_uint8 * size).from_address(self._sample.payload_ptr)
         data.sample = self._sample
@@ -104,7 +104,7 @@ class Port:
         self._unconnected_since: float | None = None
 
     def receive(self) -> Received | None:
-        """The oldest sample that waits, or nothing; Held if too many are kept, Short if there is no connection."""
+        """The oldest waiting sample, or None. Raises Held if too many are kept, Short if there is no connection."""
         try:
             sample = self._subscriber.receive()
         except iox2.ReceiveError as error:
@@ -134,13 +134,13 @@ class Wakeups:
         self._guards: list[Any] = []
 
     def add(self, listener: Any) -> None:
-        """Is woken by this one, too."""
+        """Adds a sensor that wakes it."""
         self._guards.append(self._set.attach_notification(listener))
         self._listeners.append(listener)
 
     def wait(self, seconds: float) -> None:
         """Sleeps until one of them is notified, a signal comes, or the time is over; returns at once if one was since
-        the caller looked. Other threads run meanwhile."""
+        the caller looked. Other threads run during the wait."""
         try:
             # What was notified stays so until it is taken, and that after receiving, which has more haste.
             if any([listener.try_wait() for listener in self._listeners]):

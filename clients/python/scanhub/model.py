@@ -1,4 +1,4 @@
-"""The background of a sensor: where each beam ends when nobody is there."""
+"""The background of a sensor: the range of each beam when nobody is there."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from .scan import angles_rad
 
 
 class Model:
-    """The ranges that were learned, and of which scans: beams, angles and unit are theirs."""
+    """The learned ranges, with beams, angles and unit of the scans that they were learned from."""
 
     sensor: str
     _data: Any
@@ -59,17 +59,17 @@ class Model:
 
     @property
     def first_angle_deg(self) -> float | None:
-        """Where beam 0 looks; None if no scan has this many beams."""
+        """The angle of beam 0; None if no scan has this many beams."""
         return _VARIANTS[self.count][0] / 1000 if self.count in _VARIANTS else None
 
     @property
     def step_deg(self) -> float | None:
-        """Between two beams; None as before."""
+        """The angle between two beams; None if no scan has this many beams."""
         return _VARIANTS[self.count][1] / 1000 if self.count in _VARIANTS else None
 
     @property
     def angles_rad(self) -> NDArray[np.float64] | None:
-        """Where each beam looks, as in a scan: computed; None if no scan has this many beams."""
+        """The angle of each beam, as in a scan: computed; None if no scan has this many beams."""
         first_mdeg, step_mdeg = _VARIANTS.get(self.count, (0, 0))
         return angles_rad(first_mdeg, step_mdeg, self.count) if step_mdeg else None
 

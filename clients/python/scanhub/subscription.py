@@ -24,7 +24,7 @@ KINDS: dict[str, type[Sample]] = {
 
 
 class Subscription(Iterator[Any]):
-    """Iterates over the samples of its topics, for ever. Made by `scanhub.subscribe`."""
+    """Iterates over the samples of its topics, without end. Made by `scanhub.subscribe`."""
 
     def __init__(
         self,

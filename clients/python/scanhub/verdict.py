@@ -31,7 +31,7 @@ class Robot:
 
 
 class RobotFollower(Subscription):
-    """Iterates over what is known of the robot, for ever. Made by `scanhub.robot`."""
+    """Iterates over the verdicts of the robot, without end. Made by `scanhub.robot`."""
 
     def __init__(self, sensors: list[str], places: list[Domain]) -> None:
         super().__init__([TopicName(sensor, Zones.topic) for sensor in sensors], places, None, None)

@@ -1,5 +1,5 @@
-//! `scanhub background`: shows the background model of a sensor, lets it be learned anew, held or learned on, and keeps
-//! it in a file. Files are this side's business; the hub sees models only.
+//! `scanhub background`: shows, resets, freezes, thaws, saves and loads the background model of a sensor. Files are
+//! handled here; the hub gets models only.
 
 use std::io::{Read, Write};
 use std::path::{Path, PathBuf};
@@ -34,7 +34,7 @@ pub struct BackgroundOptions {
 pub enum ModelOrder {
     /// Show it.
     Show,
-    /// Forget it and learn anew.
+    /// Forget it and learn it again.
     Reset,
     /// Keep it as it is.
     Freeze,

@@ -1,5 +1,5 @@
-//! Work that may take its time, done beside the sending, which waits for nothing but samples. Refuses to know what is
-//! done.
+//! Slow work in a thread of its own, so that the sending thread waits only for samples. Refuses to know what the work
+//! is.
 
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::mpsc::{Receiver, RecvTimeoutError, channel};

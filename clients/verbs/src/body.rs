@@ -1,8 +1,9 @@
-//! Which readings of a sensor are the robot's own body: what stands within a circle around the robot's centre for as
-//! long as one looks. Scans in, sectors out; refuses to know where scans come from and how sectors are written down.
+//! Decides which readings of a sensor are the robot's own body: what stays within a circle around the robot's centre
+//! during the whole observation. Scans in, sectors out; refuses to know where scans come from and how sectors are
+//! written.
 //!
-//! The time is looked at in slices. What is met in all of them at about the same range is body; what is met in some
-//! only came and went, and is left out.
+//! The observation is divided into slices of time. What is seen in all slices at about the same range is body; what is
+//! seen in only some of them came and went, and is left out.
 
 use schema::{Pose, Scan};
 

@@ -1,5 +1,5 @@
-//! `scanhub control`: asks the hub to stop a sensor, to let it stream again, or to begin anew with it. Done is what the
-//! link has taken; `info` tells how far it is.
+//! `scanhub control`: asks the hub to pause a sensor, to resume its stream, or to restart the session with it. It ends
+//! when the link has accepted the request; `info` shows the progress.
 
 use std::io::Write;
 use std::sync::atomic::AtomicBool;

@@ -1,5 +1,5 @@
-//! Which sensors the hub has, asked beside the sending: the answer takes milliseconds where a datagram takes
-//! microseconds. Refuses to know which of them are wanted.
+//! Asks in a thread of its own which sensors the hub has: the answer takes milliseconds, a datagram only microseconds.
+//! Refuses to know which sensors are wanted.
 
 use std::time::{Duration, Instant};
 

@@ -1,5 +1,5 @@
-//! Files that are whole or not there: read with a bound, written beside their place and then put there. Refuses to know
-//! what is in them.
+//! Files that are complete or absent: read up to a maximum size, written under a temporary name and then renamed.
+//! Refuses to know what is in them.
 
 use std::ffi::OsString;
 use std::fs::{self, File, Metadata};
@@ -22,8 +22,8 @@ pub(crate) fn read_all(input: &mut dyn Read, place: &str, longest: u64) -> Resul
     regular::read_all(input, longest).map_err(|error| unreadable(place, &error))
 }
 
-/// Puts a file of `content` at `path`. Whoever reads meanwhile, and whatever happens, finds the old one or the new one
-/// whole; who may read it stays as it was. What is there and no file, a device or a pipe, is written to.
+/// Puts a file of `content` at `path`. A reader always finds the old one or the new one, whatever happens, whole; who
+/// may read it stays as it was. What is there and no file, a device or a pipe, is written to.
 ///
 /// [`Kind::Output`] if it cannot be written; nothing is left then.
 pub(crate) fn replace(path: &Path, content: &[u8]) -> Result<(), Failure> {

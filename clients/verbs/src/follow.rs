@@ -1,5 +1,5 @@
-//! The loop of every verb that follows topics: receive, account, say what is wrong, end when the bounds say so.
-//! Refuses to know what becomes of a sample.
+//! The loop of every verb that follows topics: receives, counts, reports problems, and ends at the bounds. Refuses to
+//! know how samples are used.
 
 mod discovery;
 mod lines;
@@ -168,7 +168,7 @@ fn brings(sensor: &str) -> Who {
     if is_remote(sensor) { Who::Listener } else { Who::Hub }
 }
 
-/// Whether `name` is brought by `who`; a robot's sensors are of whoever is there.
+/// Whether `who` publishes `name`; the sensors of a robot may come from any publisher.
 fn is_of(name: &TopicName, who: Who) -> bool {
     name.is_robot() || brings(&name.sensor) == who
 }

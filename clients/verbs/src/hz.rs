@@ -163,7 +163,7 @@ impl LineWindow {
     }
 
     fn note(&mut self, now: Instant, status: &Status, length: Duration) {
-        // A hub that began anew counts from 0.
+        // A restarted hub counts from 0.
         if self.lost.back().is_some_and(|(_, lost)| *lost > status.lost_on_line()) {
             self.lost.clear();
         }

@@ -1,4 +1,4 @@
-//! `scanhub info`: how the links and their sensors are, from the last status that each has published.
+//! `scanhub info`: the state of the links and their sensors, from the last status that each has published.
 
 use std::io::Write;
 use std::sync::atomic::{AtomicBool, Ordering};

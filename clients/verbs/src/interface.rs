@@ -1,4 +1,4 @@
-//! The network interfaces of this machine, for who joins groups on them or sends to them. Refuses to know sockets.
+//! The network interfaces of this machine, for joining groups on them and sending to them. Refuses to know sockets.
 
 mod changes;
 

@@ -1,5 +1,5 @@
-//! `scanhub latency`: how old samples are when they are received here, and where they spent that time. What is seen is
-//! what a consumer of the client library sees that waits in the same way.
+//! `scanhub latency`: how old samples are when they are received here, and where they spent that time. The figures are
+//! those of any consumer of the client library that waits in the same way.
 
 mod ages;
 mod grain;

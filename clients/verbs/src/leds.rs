@@ -1,6 +1,6 @@
-//! `scanhub leds`: the zone verdict and the mark count of a sensor as lights, in the terminal and on light-emitting diodes
-//! of the machine. What is lit never is more cheerful than what is known: it begins and ends with the stop light, and
-//! shows it when the hub falls silent.
+//! `scanhub leds`: the zone verdict and the mark count of a sensor as lights, in the terminal and on light-emitting
+//! diodes of the machine. The lights never show a better state than is known: the verb starts and ends with the stop
+//! light, and shows it when the hub is silent.
 
 mod device;
 mod hold;
@@ -61,8 +61,9 @@ pub enum LedsLook {
 /// Shows the lights on `out` and on the diodes until the bounds are reached or `stop` is set; what is no light goes to
 /// `notes` (stderr) if `out` is not JSON. However it ends, the stop light is on then: nobody watches any more.
 ///
-/// [`Kind::Configuration`] if a diode is not there or stands for no light; [`Kind::Failed`] if one may not be switched;
-/// else as [`echo`](crate::echo()). A diode that fails later is told and tried again, the others go on.
+/// [`Kind::Configuration`] if a diode is not there or stands for no light; [`Kind::Failed`] if one may not be
+/// switched; else as [`echo`](crate::echo()). An LED that fails later is reported and tried again; the others
+/// continue.
 pub fn leds(
     options: &LedsOptions,
     out: &mut dyn Write,
@@ -259,7 +260,7 @@ impl Sink for Board<'_> {
         true
     }
 
-    /// A line that begins or ends to lose something is told; how much it is from second to second is not.
+    /// Reported when a line starts or stops losing data; the changing amount is not.
     fn line(&mut self, sensor: &str, status: &Status) -> Result<(), End> {
         let known = self.losses.iter().position(|(name, _)| name == sensor);
         let loss = status.line_loss();

@@ -1,6 +1,6 @@
-//! The verbs that follow a hub and show, keep or pass on what it publishes: everything that prints. Each stands on
-//! `scanhub_client` and never on a hub. Refuses to know command lines and signals: options come as structs, the wish to stop
-//! as a flag.
+//! The verbs that follow a hub and show, record or forward what it publishes: everything that prints. Each uses
+//! `scanhub_client`, never the hub itself. Refuses to know command lines and signals: options are structs, the request
+//! to stop is a flag.
 
 mod background;
 mod background_task;

@@ -1,5 +1,5 @@
-//! What the line of one sensor took away while a verb ran, by the counters of its statuses. They begin anew with each life
-//! of the hub. Refuses to know where statuses come from.
+//! What the line of one sensor lost while a verb ran, from the counters of its statuses. The counters start at 0 when
+//! the hub restarts. Refuses to know where statuses come from.
 
 use schema::{Counter, Counters};
 

@@ -1,4 +1,5 @@
-//! A writer that lets a line go rather than wait for who reads it: sending comes first. Refuses to know what is written.
+//! A writer that drops a line instead of waiting for a slow reader: sending comes first. Refuses to know what is
+//! written.
 
 use std::io::{self, ErrorKind, Write};
 use std::os::fd::AsFd;

@@ -1,5 +1,5 @@
-//! `scanhub zones SENSOR mask`: looks at what a sensor sees of its own robot, and prints it as the configuration that
-//! makes the hub look past it. What is body is decided by `body`; what is printed changes nothing by itself.
+//! `scanhub zones SENSOR mask`: learns what a sensor sees of its own robot, and prints a configuration with which the
+//! hub ignores it. `body` decides what belongs to the robot. Printing changes nothing by itself.
 
 use std::fmt::Write as _;
 use std::io::Write;
@@ -200,7 +200,7 @@ struct Found<'a> {
 }
 
 impl Found<'_> {
-    /// What a person should look at before the hub is told.
+    /// What a person should check before using the mask.
     fn doubts(&self) -> Vec<String> {
         let within = metres(self.within_mm as u32);
         let mut doubts = Vec::new();

@@ -1,4 +1,4 @@
-//! `SENSOR/TOPIC` on the command line, and what to say if there is no such thing.
+//! `SENSOR/TOPIC` on the command line, and the error if it does not exist.
 
 use std::fmt;
 
@@ -70,7 +70,7 @@ fn near<'a>(word: &str, known: impl Iterator<Item = &'a str>) -> Option<&'a str>
     known.max_by(|a, b| near(a).total_cmp(&near(b))).filter(|known| near(known) > NEAR)
 }
 
-/// From here on a word may be meant for another: 1 is the same, 0 has nothing of it.
+/// From this similarity on, a word may be a misspelling of another: 1 is equal, 0 has nothing in common.
 const NEAR: f64 = 0.8;
 
 /// The hub has no `sensor`, but `sensors`.

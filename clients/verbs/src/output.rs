@@ -1,5 +1,5 @@
-//! Lines to whoever reads: each is written with one call, so that a killed verb loses none, and a reader that went
-//! away is a quiet end. Refuses to know what the lines say.
+//! Lines on stdout and stderr: each is written with one call, so that a killed verb loses none. A closed reader ends
+//! the verb quietly. Refuses to know what the lines say.
 
 use std::io::{self, ErrorKind, Write};
 
@@ -9,7 +9,7 @@ use serde::Serialize;
 /// Why a verb ended early.
 #[derive(Debug)]
 pub(crate) enum End {
-    /// Whoever read the output does not any more.
+    /// The reader of the output closed it.
     ReaderGone,
     /// It failed.
     Failure(Failure),

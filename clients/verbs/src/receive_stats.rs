@@ -1,4 +1,4 @@
-//! What was received of one topic and what was not, and how long its silence may be.
+//! Counts of received and missed samples of one topic, and how long it may be silent.
 
 use std::time::{Duration, Instant};
 
@@ -41,7 +41,7 @@ impl ReceiveStats {
     }
 
     /// A sample came, `missed` before it did not; scans are `period_us` apart. One that `is_of_before` was sent before
-    /// anybody waited for it here, and its arrival says nothing of the rate.
+    /// anybody waited for it here, and its arrival says nothing about the rate.
     pub(crate) fn count(&mut self, now: Instant, missed: u64, period_us: u32, is_of_before: bool) {
         self.received += 1;
         if !is_of_before {

@@ -1,5 +1,6 @@
-//! `scanhub record`: what the hub publishes, in MCAP files. The thread that receives never touches the disk, so that a slow,
-//! full or vanished one costs no live topic a sample; what it costs the recording is counted, told, and seen in the file.
+//! `scanhub record`: what the hub publishes, in MCAP files. The thread that receives never touches the disk, so that a
+//! slow, full or missing disk costs no live topic a sample. What is missing in the recording is counted, reported, and
+//! visible in the file.
 
 mod disk;
 mod files;
@@ -129,7 +130,7 @@ pub fn record(
     let (names, topics) = (selection.names(), selection.topics());
     let end =
         begun.and_then(|()| follow(&names, &topics, &options.places, &options.bounds, stop, &mut recorder));
-    // Whoever went away, the hub or the reader of these lines: what is recorded is kept.
+    // If the hub or the reader of these lines went away, the recording is kept.
     let stays = recorder.pushed > 0 || !matches!(end, Err(End::Failure(_)));
     let finished = recorder.finish(writing, stays, stop);
     if !stays && !options.is_to_stdout() {

@@ -1,4 +1,4 @@
-//! The one grammar of the verbs that take several topics: `SENSOR/TOPIC`, `*/TOPIC` and `SENSOR/*`. Refuses to know which
+//! The syntax for verbs that take several topics: `SENSOR/TOPIC`, `*/TOPIC` and `SENSOR/*`. Refuses to know which
 //! sensors there are.
 
 use schema::{Failure, Kind, ROBOT, Topic};

@@ -1,5 +1,5 @@
-//! How the payload of each topic is shown: as a line of JSON and as a line for people, whether it came from shared memory or
-//! from a network. A new payload has its words here; all else is made from the table of topics.
+//! How the payload of each topic is shown: as a line of JSON and as a line for people, whether it came from shared
+//! memory or from a network. A new payload is described here; everything else follows from the table of topics.
 
 use std::io;
 

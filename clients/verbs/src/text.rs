@@ -1,4 +1,4 @@
-//! The same as the classes of `--json`, for people on a terminal: a line a sample, what matters first. No contract.
+//! The classes of `--json` as text for people: one line per sample, the most important values first. Not a contract.
 
 mod processed;
 

@@ -1,5 +1,5 @@
-//! `scanhub watch`: what the sensors see, live, as a picture in the terminal. It sleeps until there is something new, draws
-//! no more frames than an eye needs and a slow line carries, and gives the terminal back however it ends.
+//! `scanhub watch`: what the sensors see, live, as a picture in the terminal. It sleeps until there is new data,
+//! limits the frame rate so that a slow line can carry it, and restores the terminal however it ends.
 
 mod draw;
 #[cfg(test)]
@@ -100,11 +100,11 @@ impl Watcher<'_> {
         self.changed = true;
     }
 
-    /// Does what was typed; a window of another size is drawn anew.
+    /// Does what was typed; a resized window is redrawn.
     fn listen(&mut self, now: Instant) -> Result<(), End> {
         while let Some(news) = self.screen.news()? {
             self.changed = true;
-            // Whoever types waits for the answer.
+            // A person who types waits for the answer.
             self.draw_at = now;
             let News::Key(key) = news else { continue };
             let wish = self.view.key(key, &self.scene);

@@ -1,4 +1,4 @@
-//! Rate and regularity of what came lately: a sliding window of arrivals. Knows nothing but their times.
+//! Rate and jitter over a sliding window of arrivals. Knows only their times.
 
 use std::collections::VecDeque;
 use std::time::{Duration, Instant};

@@ -107,7 +107,7 @@ impl List {
             (None, Start::FirstScan) => "first-scan".to_owned(),
         };
         let publish = if background.every_scan { "every-scan" } else { "on-demand" };
-        // What follows from unit, resolution and method where nothing is said (docs/configuration.md) is null.
+        // A value that is not set and follows from unit, resolution and method (docs/configuration.md) is null.
         self.put((link, "background.method"), json!(method), DEFAULT);
         self.put((link, "background.threshold_mm"), json!(learning.threshold_mm), DEFAULT);
         self.put((link, "background.candidate_mm"), json!(learning.candidate_mm), DEFAULT);

@@ -26,12 +26,12 @@ impl Places {
         Ok(places)
     }
 
-    /// Where `key` of the link `link` is said last, if it is: what is said for one link wins.
+    /// Where `key` of the link `link` is set last, if it is: a value for one link wins over one for all.
     pub(crate) fn of_link(&self, link: &str, key: &str) -> Option<&str> {
         self.of_key(&format!("link.{link}.{key}")).or_else(|| self.of_key(key))
     }
 
-    /// Where `key` is said last, if it is.
+    /// Where `key` is set last, if it is.
     pub(crate) fn of_key(&self, key: &str) -> Option<&str> {
         self.0.get(key).map(String::as_str)
     }

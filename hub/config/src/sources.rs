@@ -7,7 +7,7 @@ use schema::Failure;
 use crate::layer::{Layer, parse, quoted, setting};
 use crate::origin::Origin;
 
-/// A layer, and where it is said.
+/// A layer, and where it comes from.
 type Said = Result<(Origin, Layer), Failure>;
 
 /// Where values are read from, besides the defaults.

@@ -101,8 +101,12 @@ impl<'a, S: Surroundings> LinkOutput<'a, S> {
         let limit = limit(period_us);
         // A hub that did not run did not hear the silence between what waited for it and what came later.
         let follows_by = std::mem::replace(&mut self.follows_by, received.last.saturating_add(limit));
-        if received.last > follows_by {
+        if received.last > follows_by && !is_behind {
             self.learn_silence();
+        }
+        if is_behind {
+            // Nobody knows how long before the next one it was.
+            self.follows_by = 0;
         }
         // What waited in the port does not tell how it looks around the robot now.
         self.pipeline.zones.doubt(is_behind);

@@ -1,21 +1,20 @@
-//! Changes what a sensor keeps for ever. It looks whether the sensor still keeps what it did, goes into installation
-//! mode, writes, leaves it again, reads back what is in force now, and brings back the operating mode in which the
-//! sensor was. Whatever goes wrong on the way, it tries to leave the installation mode, and says in the end what it
-//! knows of the sensor's state.
+//! Changes a sensor's EEPROM settings. It checks that the settings are still those of the plan, enters installation
+//! mode, writes, leaves that mode, reads the settings back, and restores the earlier operating mode. After any failure
+//! it tries to leave installation mode, and its outcome says what is known of the sensor's state.
 //!
-//! The only code that sends a request of [`crate::eeprom`], and it needs [`Consent`]. A write that was not acknowledged
-//! is not simply said again: first the configuration tells whether it was done.
+//! The only code that sends a request of [`crate::eeprom`], and it needs [`Consent`]. A write that was not
+//! acknowledged is not simply repeated: first the configuration is read, to see whether it was done.
 
 use lms::command::{self, Request};
 use lms::exchange::{Conversation, Exchange, Heard, MODE_TIMEOUT, MORE_TRIES, Output, Say, TRIES};
-use lms::framer::Place;
+use lms::framer::TelegramSpan;
 use lms::operating::{ON_REQUEST, Operating, PARTIAL, STREAM};
 use lms::reply::Reply;
 use lms::telegram::Encoded;
 use lms::{MILLIS, Nanos};
 
 use crate::eeprom::{PowerOn, Write};
-use crate::plan::{Consent, Kept, Plan};
+use crate::plan::{Consent, OwnedConfiguration, Plan};
 
 /// A change under way; it cannot be copied, as consent is to one.
 #[derive(Debug)]
@@ -63,7 +62,7 @@ pub struct Outcome {
     /// Whether a write may have reached the sensor.
     pub written: bool,
     /// The configuration as it was read back.
-    pub configuration: Option<Kept>,
+    pub configuration: Option<OwnedConfiguration>,
     /// Whether a rate other than 9600 comes after power-on, if that was to change and could be read back.
     pub permanent_baud: Option<bool>,
     /// The operating mode in which the sensor is now; `None` if it may still be in installation mode.
@@ -75,16 +74,16 @@ pub struct Outcome {
 pub enum Failing {
     /// No reply, or none that can be read.
     Unanswered,
-    /// The sensor said no; to [`Step::Enter`]: the password is wrong.
+    /// The sensor refused; at [`Step::Enter`]: the password is wrong.
     Refused,
-    /// What was read back is not what was to be written; to [`Step::Compare`]: not what was there before.
+    /// The settings read back differ from those written; at [`Step::Compare`]: from those of the plan.
     Differs,
 }
 
 #[derive(Clone, Debug)]
 enum Saying {
     Ask(Request),
-    Keep(Kept),
+    Keep(OwnedConfiguration),
     PowerOn(PowerOn),
 }
 
@@ -93,7 +92,7 @@ impl Saying {
     fn write(&self) -> Option<Write<'_>> {
         match self {
             Saying::Ask(_) => None,
-            Saying::Keep(kept) => Some(Write::Configuration(kept.bytes())),
+            Saying::Keep(new) => Some(Write::Configuration(new.bytes())),
             Saying::PowerOn(power_on) => Some(Write::PowerOn(*power_on)),
         }
     }
@@ -113,7 +112,7 @@ impl Say for Saying {
     fn command(&self) -> u8 {
         match self {
             Saying::Ask(request) => request.command(),
-            Saying::Keep(kept) => Write::Configuration(kept.bytes()).command(),
+            Saying::Keep(new) => Write::Configuration(new.bytes()).command(),
             Saying::PowerOn(power_on) => Write::PowerOn(*power_on).command(),
         }
     }
@@ -202,18 +201,18 @@ impl Change {
         }
     }
 
-    fn on_telegram(&mut self, place: Place) {
-        let telegram = self.exchange.view(place);
+    fn on_telegram(&mut self, span: TelegramSpan) {
+        let telegram = self.exchange.view(span);
         let reply = Reply::decode(telegram);
-        let kept = match &reply {
+        let configuration = match &reply {
             Some(Reply::Configuration(it) | Reply::ConfigurationWritten { configuration: it, .. }) => {
-                Kept::new(it.bytes())
+                OwnedConfiguration::new(it.bytes())
             }
             _ => None,
         };
         let done = match &reply {
             Some(Reply::Mode { done } | Reply::ConfigurationWritten { done, .. }) => Some(*done),
-            // What its first byte says is told in no two ways alike: the status tells it afterwards.
+            // The documents disagree about its first byte: the status has the result afterwards.
             Some(Reply::PowerOnSet { .. } | Reply::Status(_) | Reply::Configuration(_)) => Some(true),
             Some(Reply::Refused) => Some(false),
             _ => None,
@@ -233,8 +232,8 @@ impl Change {
             // An answer that cannot be read says no more than none.
             Step::Write if done.is_none() => self.ask_what_is_kept(),
             _ if done.is_none() => self.fail(Failing::Unanswered),
-            Step::Compare if kept != Some(self.plan.old) => self.fail(Failing::Differs),
-            Step::Check if kept == Some(self.plan.new) => self.begin(Step::PowerOn),
+            Step::Compare if configuration != Some(self.plan.old) => self.fail(Failing::Differs),
+            Step::Check if configuration == Some(self.plan.new) => self.begin(Step::PowerOn),
             Step::Check if self.writes_left > 0 => self.begin(Step::Write),
             Step::Check => {
                 self.step = Step::Write;
@@ -245,8 +244,8 @@ impl Change {
                 self.begin(Step::ReadBack);
             }
             Step::ReadBack => {
-                self.outcome.configuration = kept;
-                if kept != Some(self.plan.new) {
+                self.outcome.configuration = configuration;
+                if configuration != Some(self.plan.new) {
                     self.note(Failing::Differs);
                 }
                 self.begin(Step::ReadStatus);
@@ -329,7 +328,7 @@ impl Conversation for Change {
     fn poll_output(&mut self) -> Output {
         while let Some(heard) = self.exchange.advance() {
             match heard {
-                Heard::Telegram(place) => self.on_telegram(place),
+                Heard::Telegram(span) => self.on_telegram(span),
                 // While it may be writing, only time says no: noise is not worth a second write.
                 Heard::Nak if !self.is_quiet || matches!(self.step, Step::Write | Step::PowerOn) => {}
                 Heard::Nak => {

@@ -1,6 +1,5 @@
-//! Requests that a sensor keeps for ever: they write its EEPROM, which wears out after a few thousand writes, and they are
-//! done in installation mode only (Telegram listing 7-1). Here they are made and read: for people, for the simulator.
-//! Nothing here sends one.
+//! Requests that write a sensor's EEPROM, which wears out after a few thousand writes. They work in installation mode
+//! only (Telegram listing 7-1). This module encodes and decodes them, and sends none.
 
 use lms::telegram::{Encoded, MAX_LENGTH, Telegram, Writer};
 

@@ -11,4 +11,4 @@ pub mod eeprom;
 mod plan;
 
 pub use change::{Change, Failing, Outcome, Step};
-pub use plan::{Consent, Kept, Plan};
+pub use plan::{Consent, OwnedConfiguration, Plan};

@@ -1,5 +1,5 @@
-//! What is to be changed for ever, and somebody's consent to it. A plan is values; only with consent can it be carried
-//! out, and consent is to one plan as it was shown.
+//! A planned change of the EEPROM settings, and a person's consent to it. A plan is only values. It can be carried out
+//! only with consent, which is for one plan as it was shown.
 
 use lms::configuration::{Configuration, ITEMS, Item, LEN};
 use lms::inquiry::Report;
@@ -10,18 +10,18 @@ use crate::eeprom::PowerOn;
 
 /// The first part of a configuration with its own storage: 34 bytes, 32 with older firmware.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct Kept {
+pub struct OwnedConfiguration {
     bytes: [u8; LEN],
     len: usize,
 }
 
-impl Kept {
+impl OwnedConfiguration {
     /// A copy of `bytes`; `None` if they are no configuration.
-    pub fn new(bytes: &[u8]) -> Option<Kept> {
+    pub fn new(bytes: &[u8]) -> Option<OwnedConfiguration> {
         Configuration::new(bytes)?;
-        let mut kept = Kept { bytes: [0; LEN], len: bytes.len() };
-        kept.bytes.get_mut(..bytes.len())?.copy_from_slice(bytes);
-        Some(kept)
+        let mut configuration = OwnedConfiguration { bytes: [0; LEN], len: bytes.len() };
+        configuration.bytes.get_mut(..bytes.len())?.copy_from_slice(bytes);
+        Some(configuration)
     }
 
     /// The bytes as the sensor keeps them.
@@ -37,8 +37,10 @@ impl Kept {
     }
 
     /// The items in which `self` and `other` differ.
-    pub fn differences<'a>(&'a self, other: &'a Kept) -> impl Iterator<Item = Item> + 'a {
-        let of = |kept: &'a Kept, item: &Item| kept.bytes().get(item.at..item.at + item.len);
+    pub fn differences<'a>(&'a self, other: &'a OwnedConfiguration) -> impl Iterator<Item = Item> + 'a {
+        let of = |configuration: &'a OwnedConfiguration, item: &Item| {
+            configuration.bytes().get(item.at..item.at + item.len)
+        };
         ITEMS.into_iter().filter(move |item| of(self, item) != of(other, item))
     }
 }
@@ -53,9 +55,9 @@ pub struct Plan {
     /// The operating mode in which it was found.
     pub operating_mode: u8,
     /// Its configuration.
-    pub old: Kept,
+    pub old: OwnedConfiguration,
     /// What its configuration shall be.
-    pub new: Kept,
+    pub new: OwnedConfiguration,
     /// What the rate after power-on shall be, if that shall change.
     pub power_on: Option<PowerOn>,
     /// The password of the installation mode.
@@ -65,7 +67,7 @@ pub struct Plan {
 impl Plan {
     /// No change of the sensor that told `report`; `None` if it did not tell all that is needed.
     pub fn of(report: &Report) -> Option<Plan> {
-        let old = Kept::new(report.configuration()?.bytes())?;
+        let old = OwnedConfiguration::new(report.configuration()?.bytes())?;
         Some(Plan {
             baud: report.baud?,
             address: report.address?,
@@ -83,8 +85,8 @@ impl Plan {
     }
 }
 
-/// Somebody saw a plan and said yes. Whoever has one can write a sensor's EEPROM, so it is made where a person is asked,
-/// and nowhere else.
+/// A person saw a plan and confirmed it. Code that has a consent can write a sensor's EEPROM, so it is made where a
+/// person is asked, and nowhere else.
 #[derive(Debug)]
 pub struct Consent(Plan);
 
@@ -109,7 +111,7 @@ mod tests {
 
     #[test]
     fn differences_are_told_by_item() {
-        let old = Kept::new(&factory(Mode(1), Unit::Mm)).unwrap();
+        let old = OwnedConfiguration::new(&factory(Mode(1), Unit::Mm)).unwrap();
         let mut new = old;
         assert_eq!(old.differences(&new).count(), 0);
         new.set(5, 4);
@@ -118,8 +120,11 @@ mod tests {
         let names: Vec<_> = old.differences(&new).map(|item| item.name).collect();
         assert_eq!(names, ["blanking", "measuring mode"]);
         assert_eq!(new.bytes().len(), LEN);
-        assert_eq!(Kept::new(&old.bytes()[..32]).map(|kept| kept.bytes().len()), Some(32));
-        assert_eq!(Kept::new(&[0; 35]), None);
-        assert_eq!(Kept::new(&[0; 31]), None);
+        assert_eq!(
+            OwnedConfiguration::new(&old.bytes()[..32]).map(|configuration| configuration.bytes().len()),
+            Some(32)
+        );
+        assert_eq!(OwnedConfiguration::new(&[0; 35]), None);
+        assert_eq!(OwnedConfiguration::new(&[0; 31]), None);
     }
 }

@@ -23,8 +23,8 @@ struct Read {
     backlog: Option<Backlog>,
 }
 
-/// Bytes that came while the host did not run: how old each is nobody knows, but the line's buffer keeps the oldest
-/// ones, so they came as fast as the line is from the last look on.
+/// Bytes that came while the host did not run. Their age is not known; but the line's buffer keeps the oldest ones, so
+/// they arrived at the speed of the line, starting at the last read.
 #[derive(Clone, Copy, Debug)]
 struct Backlog {
     /// Number of its first byte.
@@ -95,9 +95,9 @@ impl Arrivals {
         }
     }
 
-    /// When byte number `offset` arrived at the latest: whatever came behind it, in the same read or in one right after
-    /// it, took its time on the line. Of a backlog it is the earliest time that is possible: whoever looks at the age of
-    /// what was measured shall not take it for new. Where the beat of the stream is known, [`crate::cadence`] knows better.
+    /// When byte number `offset` arrived at the latest: whatever came behind it, in the same read or in one right
+    /// after it, took its time on the line. Of a backlog it is the earliest time that is possible: old values must not
+    /// look new. Where the beat of the stream is known, [`crate::cadence`] knows better.
     pub(crate) fn stamp(&self, offset: u64, baud: u32) -> Stamp {
         let oldest = self.next.saturating_sub(Arrivals::CAPACITY);
         let (mut at, mut own, mut own_behind) = (Nanos::MAX, Nanos::MAX, ESTIMATED + 1);

@@ -1,6 +1,7 @@
-//! When the scans of a stream are due. A sensor sends them one period apart, whatever becomes of them on the way: so those
-//! that never came can be counted, and one that waited while the host did not run can be dated. Knows no bytes. A sensor
-//! that is silent for longer than the session waits for it is no line that loses: then the stream begins anew.
+//! When the scans of a stream are due. A sensor sends them one period apart, whatever becomes of them on the way: so
+//! those that never came can be counted, and one that waited while the host did not run can be dated. Knows no bytes.
+//! If a sensor is silent for longer than the session waits, that is not counted as loss on the line: the stream starts
+//! again.
 
 use crate::{MILLIS, Nanos};
 
@@ -65,7 +66,7 @@ impl Cadence {
         self.last.filter(|_| self.is_steady).map(|last| last + slots * self.period)
     }
 
-    /// The stream ended, or the sensor was asked something, for which it lets scans out: the next scan begins anew.
+    /// The stream ended, or a request was sent, for which the sensor skips scans: the next scan starts a new cadence.
     pub(crate) fn rest(&mut self) {
         if self.last.take().is_some() {
             self.lost = self.lost.max(self.due.saturating_sub(self.came));

@@ -1,6 +1,5 @@
-//! Requests that leave no trace: what a host says to a sensor and a power cycle undoes. Encoded by whoever asks, decoded
-//! by the simulator and for people. What the sensor would keep for ever is not here but in `lms_configure`, so code
-//! that has only a [`Request`] cannot write the EEPROM.
+//! Requests whose effect ends with a power cycle. Hosts encode them; the simulator and the verbs for people decode
+//! them. Requests that write the EEPROM are in `lms_configure`, so code that has only a [`Request`] cannot write it.
 
 use crate::operating::{self, Operating};
 use crate::parameters::{Password, Raw, Span, Spans};
@@ -10,7 +9,7 @@ use crate::variant::{Baud, Variant};
 /// A request that is forgotten at power-off.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Request {
-    /// 10h: begin anew, as after power-on; clears the fault memory.
+    /// 10h: restart, as after power-on; clears the fault memory.
     Reset,
     /// 20h 24h: send all values of every scan from now on.
     Stream,
@@ -163,7 +162,7 @@ impl Request {
     }
 }
 
-/// Command: begin anew.
+/// Command: restart.
 pub const RESET: u8 = 0x10;
 /// Command: change the operating mode.
 pub const MODE: u8 = 0x20;

@@ -1,5 +1,6 @@
-//! How much of a stream the line damages: bytes that were in nothing although nobody broke off what they belonged to.
-//! Bytes of another rate, or of a stream that is being stopped, say nothing of the line and do not count.
+//! How much of a stream the line damages: bytes that are in no telegram although neither side broke off a
+//! transmission. Bytes of another rate, or of a stream that is being stopped, do not count: they say nothing about the
+//! line.
 
 use crate::framer::Tally;
 use crate::{MILLIS, Nanos};

@@ -26,9 +26,9 @@ pub(crate) struct Dialogue {
     change_baud: Option<Baud>,
     pub(crate) baud: Baud,
     pub(crate) sensor: Sensor,
-    /// What was known of it before this session, until anything is said to it.
+    /// What an earlier session knew of it; used until the first request is sent.
     pub(crate) recalled: Option<Identity>,
-    /// The rate at which a sensor most likely is that does not stream when a session begins.
+    /// The most likely rate of a sensor that does not stream when a session begins.
     pub(crate) rest_at: Baud,
     /// The rate that is asked first.
     pub(crate) first: Baud,
@@ -36,7 +36,7 @@ pub(crate) struct Dialogue {
     pub(crate) found_at: Option<Baud>,
     /// What is in the way now; [`Dialogue::trouble`] is what is shown.
     pub(crate) trouble: Option<Trouble>,
-    /// A user wants nothing of the sensor.
+    /// A user paused the sensor.
     pub(crate) is_paused: bool,
     /// The sensor keeps another variant than the wanted one.
     pub(crate) variant_refused: bool,
@@ -263,7 +263,7 @@ impl Dialogue {
     }
 
     fn on_reply(&mut self, request: Request, reply: Option<Reply<'_>>, now: Nanos) {
-        // Whoever does not tell what it does may be doing anything: it is stopped, but not for ever.
+        // A sensor that does not report its state may be streaming: it is stopped, a limited number of times.
         self.sensor.streams |= request == Request::Status && !matches!(reply, Some(Reply::Status(_)));
         match self.phase {
             Phase::Probing { .. } if self.is_paused => self.stop(now),

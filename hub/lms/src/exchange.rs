@@ -2,7 +2,7 @@
 //! pace, tries and bytes; refuses to know what is asked, and why.
 
 use crate::Nanos;
-use crate::framer::{Advance, Framer, Place, Tally};
+use crate::framer::{Advance, Framer, Tally, TelegramSpan};
 pub use crate::outgoing::{MODE_TIMEOUT, Say};
 use crate::outgoing::{NAK_PAUSE, Outgoing, SOON};
 pub use crate::phase::{MORE_TRIES, TRIES};
@@ -155,7 +155,7 @@ impl<R: Say> Exchange<R> {
         // Another rate is about to be set: what came at the old one is not looked at.
         while !self.change_baud {
             match self.framer.advance()? {
-                Advance::Telegram(place) => return Some(Heard::Telegram(place)),
+                Advance::Telegram(span) => return Some(Heard::Telegram(span)),
                 Advance::Nak => return Some(Heard::Nak),
                 Advance::Ack => {
                     if let Some(open) = self.open.as_mut().filter(|open| open.is_out()) {
@@ -168,8 +168,8 @@ impl<R: Say> Exchange<R> {
     }
 
     /// The telegram that was found last.
-    pub fn view(&self, place: Place) -> Telegram<'_> {
-        self.framer.view(place).telegram
+    pub fn view(&self, span: TelegramSpan) -> Telegram<'_> {
+        self.framer.view(span).telegram
     }
 
     /// What it wants, with a deadline of its user's own.
@@ -205,7 +205,7 @@ impl<R: Say> Exchange<R> {
 #[derive(Clone, Copy, Debug)]
 pub enum Heard {
     /// A telegram, to be seen by [`Exchange::view`].
-    Telegram(Place),
+    Telegram(TelegramSpan),
     /// A NAK.
     Nak,
 }

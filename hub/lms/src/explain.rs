@@ -24,7 +24,7 @@ use walk::{Walk, said};
 /// are taken for the range.
 pub fn explain(telegram: Telegram<'_>, mode: Option<Mode>, visit: &mut dyn FnMut(&Field<'_>)) {
     let mut walk = Walk::new(telegram.bytes(), visit);
-    // What is short of its layout ends early, and its rest is told as bytes.
+    // A telegram that is shorter than its layout ends early; the rest is shown as bytes.
     let _ = fields(&mut walk, telegram, mode);
     walk.leave(2 + usize::from(telegram.status().is_some()));
     if telegram.status().is_some() {

@@ -6,7 +6,7 @@
 //! *held* while another header begins inside it, or might begin with its last bytes: if that one succeeds, the frame
 //! was wrong. A gap in time may release a held frame; it never drops a byte.
 //!
-//! Knows no clock and no meaning beyond the header; answers for every byte: [`Tally`] obeys
+//! Knows no clock and no meaning beyond the header; accounts for every byte: in [`Tally`] always
 //! `read == in_telegrams + acknowledge + discarded + buffered`.
 
 use crate::candidates::{Candidate, Candidates};
@@ -77,14 +77,14 @@ pub enum Found<'a> {
 /// [`Found`] without the bytes.
 #[derive(Clone, Copy, Debug)]
 pub(crate) enum Advance {
-    Telegram(Place),
+    Telegram(TelegramSpan),
     Ack,
     Nak,
 }
 
 /// Where in the buffer a telegram lies, until the next bytes come.
 #[derive(Clone, Copy, Debug)]
-pub struct Place {
+pub struct TelegramSpan {
     at: usize,
     end: usize,
     pub(crate) offset: u64,
@@ -168,15 +168,15 @@ impl Framer {
     /// The next telegram or acknowledgement in the bytes committed so far, or `None` until more come.
     pub fn poll(&mut self) -> Option<Found<'_>> {
         Some(match self.advance()? {
-            Advance::Telegram(place) => Found::Telegram(self.view(place)),
+            Advance::Telegram(span) => Found::Telegram(self.view(span)),
             Advance::Ack => Found::Ack,
             Advance::Nak => Found::Nak,
         })
     }
 
-    /// The telegram at a place that [`Framer::advance`] answered last.
-    pub(crate) fn view(&self, place: Place) -> Framed<'_> {
-        let Place { at, end, offset, reasons } = place;
+    /// The telegram at a span that [`Framer::advance`] answered last.
+    pub(crate) fn view(&self, span: TelegramSpan) -> Framed<'_> {
+        let TelegramSpan { at, end, offset, reasons } = span;
         Framed { telegram: Telegram::checked(&self.buffer[at..end]), offset, reasons }
     }
 
@@ -298,7 +298,7 @@ impl Framer {
         }
     }
 
-    fn deliver(&mut self, held: Held) -> Place {
+    fn deliver(&mut self, held: Held) -> TelegramSpan {
         let Held { at, end, header_inside } = held;
         self.give_up_before(held);
         self.held = None;
@@ -311,7 +311,7 @@ impl Framer {
         let reasons = if damage { suspect::NEIGHBOUR } else { 0 }
             | if header_inside { suspect::HEADER_INSIDE } else { 0 };
         let offset = self.tally.read - (self.end - at) as u64;
-        Place { at, end, offset, reasons }
+        TelegramSpan { at, end, offset, reasons }
     }
 
     /// Whatever becomes of `held`, what came before it is in nothing.

@@ -181,8 +181,8 @@ pub(crate) fn is_data(command: u8) -> bool {
 /// All values, means, a sub-range, with field values, means of a sub-range, with reflectivity, ranges and
 /// reflectivity, Cartesian (Telegram listing, 20h).
 const STREAMED: [u8; 8] = [MEASURED, 0xB6, 0xB7, 0xBE, 0xBF, 0xC4, 0xF5, 0xF6];
-/// Replies to what a session asks, the refusal, and what is said at power-on, each with its LENGTH: names have 20 or 21
-/// characters, configurations 32 or 34 bytes. Without their length they would be found in scans.
+/// Replies to the requests of a session, the refusal, and the banner at power-on, each with its LENGTH: names have 20
+/// or 21 characters, configurations 32 or 34 bytes. Without their length they would be found in scans.
 const BESIDE_A_STREAM: [(u8, core::ops::RangeInclusive<usize>); 7] = [
     (crate::reply::POWER_ON, 20..=26),
     (crate::reply::REFUSED, 2..=2),

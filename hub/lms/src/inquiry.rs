@@ -9,7 +9,7 @@ mod report;
 use crate::command::Request;
 use crate::exchange::{Conversation, Exchange, Heard, Output};
 use crate::family::Family;
-use crate::framer::{Place, Tally};
+use crate::framer::{Tally, TelegramSpan};
 use crate::header::is_data;
 use crate::phase::{LISTEN, SETTLE, TRIES};
 use crate::reply::Reply;
@@ -98,8 +98,8 @@ impl Inquiry {
         self.exchange.tally()
     }
 
-    fn on_telegram(&mut self, place: Place) {
-        let telegram = self.exchange.view(place);
+    fn on_telegram(&mut self, span: TelegramSpan) {
+        let telegram = self.exchange.view(span);
         let (command, address, status) = (telegram.command(), telegram.address() & !REPLY, telegram.status());
         let is_status = matches!(Reply::decode(telegram), Some(Reply::Status(_)));
         let reply = Encoded::of(telegram);
@@ -223,7 +223,7 @@ impl Conversation for Inquiry {
     fn poll_output(&mut self) -> Output {
         while let Some(heard) = self.exchange.advance() {
             match heard {
-                Heard::Telegram(place) => self.on_telegram(place),
+                Heard::Telegram(span) => self.on_telegram(span),
                 // While the rate is sought, noise has such bytes too.
                 Heard::Nak if matches!(self.phase, Phase::Asking { .. }) => {
                     if self.exchange.refused_checksum() == Some(false) {

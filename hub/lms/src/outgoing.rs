@@ -172,7 +172,7 @@ pub(crate) const SOON: Nanos = 5 * MILLIS;
 /// for adapters.
 const ACKNOWLEDGE_TIMEOUT: Nanos = 150 * MILLIS;
 /// The reply to a stop was captured to take 94 ms, and its acknowledgement is hidden where it is needed. Waiting is
-/// cheap: whoever overlooked the stop shows it by streaming on.
+/// cheap: a sensor that overlooked the stop continues to stream.
 const STOP_TIMEOUT: Nanos = 300 * MILLIS;
 /// Type, status and configuration were captured to take up to 158 ms.
 pub(crate) const REPLY_TIMEOUT: Nanos = 500 * MILLIS;

@@ -1,5 +1,6 @@
-//! How a user's wishes are met while a session runs, above all the pause: the sensor is found if it must be, told to
-//! stop, and told again while it goes on. Whether it stopped is known in the end, or it is said that it is not.
+//! Handles a user's requests while a session runs, above all the pause: finds the sensor if necessary, stops it, and
+//! repeats the stop while it continues to stream. In the end it reports whether the sensor stopped, or that this is
+//! not known.
 
 use crate::Nanos;
 use crate::command::Request;
@@ -39,7 +40,7 @@ impl Dialogue {
         self.ask(Request::Stop, now, TRIES);
     }
 
-    /// The sensor goes on, or said nothing of which it could be known that it does not.
+    /// The sensor continues, or nothing that it sent shows that it stopped.
     pub(crate) fn stop_again(&mut self, now: Nanos) {
         match self.phase {
             // Nobody is there, or a sensor at rest.

@@ -38,8 +38,8 @@ pub enum Reason {
 
 #[derive(Clone, Copy, Debug)]
 pub(crate) enum Phase {
-    /// Without a word: whoever streams is heard. Meanwhile the state is as `shown`, afterwards comes `attempt`: at
-    /// `quiet_at` if no byte came.
+    /// Listening without sending, for a sensor that streams. The state is `shown` during this time; afterwards comes
+    /// `attempt`, already at `quiet_at` if no byte came.
     Listening { give_up_at: Nanos, quiet_at: Nanos, shown: State, attempt: usize },
     /// A question at one rate after the other.
     Probing { attempt: usize },
@@ -118,7 +118,7 @@ pub enum Control {
     Pause,
     /// End the pause: begin as a new session does.
     Resume,
-    /// Begin anew, whatever the state is; ends a pause too.
+    /// Restart the session, whatever the state is; ends a pause too.
     Resync,
 }
 

@@ -80,7 +80,7 @@ pub enum Reply<'a> {
     Reflectivity(Reflectivity<'a>),
     /// E6h: to the change of the rate after power-on.
     PowerOnSet {
-        /// What came of it; the present state is told by [`StatusReport::has_permanent_baud`].
+        /// The result; [`StatusReport::has_permanent_baud`] has the present state.
         outcome: u8,
         /// The byte that was set.
         set: u8,

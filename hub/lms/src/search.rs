@@ -1,5 +1,5 @@
-//! How a sensor is found whose rate nobody knows: first by listening, then by a question at one rate after the other,
-//! in rounds that become rarer while the line is dead. What it says then is for [`crate::dialogue`].
+//! Finds a sensor whose rate is not known: first by listening, then by a request at one rate after the other, in
+//! rounds that become rarer while the line is dead. [`crate::dialogue`] handles what the sensor answers.
 
 use crate::command::Request;
 use crate::dialogue::Dialogue;
@@ -9,11 +9,11 @@ use crate::variant::Baud;
 use crate::{MILLIS, Nanos};
 
 impl Dialogue {
-    /// As a new session does: at the wanted rate, without a word.
+    /// Starts like a new session: listens at the wanted rate and sends nothing.
     pub(crate) fn begin(&mut self, now: Nanos) {
         self.first = self.rest_at;
         if core::mem::take(&mut self.is_paused) {
-            // Whoever is not asked does not answer.
+            // A sensor that gets no request does not answer.
             self.quiet_since = now;
             // It was stopped at this rate.
             self.first = self.settings.baud;
@@ -25,7 +25,7 @@ impl Dialogue {
         self.listen(now, State::Probing);
     }
 
-    /// Whoever streams at this rate is heard.
+    /// Listens for a stream at this rate.
     pub(crate) fn listen(&mut self, now: Nanos, shown: State) {
         self.open = None;
         self.heard = false;
@@ -92,7 +92,7 @@ impl Dialogue {
     }
 }
 
-/// Seconds as they are told: rarely another number, so that nobody is told every second.
+/// Seconds as they are reported: in coarse steps, so that the report does not change every second.
 fn coarse(seconds: u64) -> u32 {
     let step = STEPS.into_iter().rev().find(|&step| u64::from(step) <= seconds).unwrap_or(0);
     if step < HOUR { step } else { (seconds / u64::from(HOUR)) as u32 * HOUR }

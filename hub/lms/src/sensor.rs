@@ -52,9 +52,9 @@ pub enum Trouble {
     NotStopped,
     /// The sensor calls itself a version S14, which scans 90 degrees with as many values as others 180.
     AnglesUnknown,
-    /// The sensor is set to a measuring mode whose values are no ranges, or are split as nobody knows.
+    /// The sensor is set to a measuring mode whose values are not ranges, or whose layout is not documented.
     NoRanges(Mode),
-    /// The sensor does not tell its measuring mode, so nobody knows where a range ends in its 16 bits.
+    /// The sensor does not report its measuring mode, so it is not known how many of the 16 bits are the range.
     ModeUnknown,
 }
 
@@ -168,8 +168,8 @@ impl Sensor {
         .filter_map(|(is_so, notice)| is_so.then_some(notice))
     }
 
-    /// Who speaks next may be another sensor, or the same with another configuration: who it is and how its values are
-    /// split is not known any more. What each scan tells anew may stay.
+    /// The next sensor at this port may be another one, or the same with another configuration: its identity and the
+    /// layout of its values are unknown again. What each scan repeats may stay.
     pub(crate) fn forget(&mut self) {
         self.mode = None;
         self.kind_len = 0;

@@ -11,7 +11,7 @@ use crate::arrival::{Arrivals, Rhythm};
 use crate::cadence::Cadence;
 use crate::damage::Damage;
 use crate::dialogue::Dialogue;
-use crate::framer::{Advance, Framer, Place, Tally, suspect};
+use crate::framer::{Advance, Framer, Tally, TelegramSpan, suspect};
 use crate::identity::Identity;
 use crate::measured::MEASURED;
 use crate::outgoing::SOON;
@@ -69,8 +69,8 @@ pub struct Received<'a> {
     pub last: Nanos,
     /// Whether `first` is an estimate from bytes that came in one read.
     pub estimated: bool,
-    /// How measured values are split; `None` while the sensor has not told it, or if nobody knows at which angles they
-    /// were measured.
+    /// How measured values are split; `None` while the sensor has not reported it, or if the angles of the values are
+    /// not known.
     pub mode: Option<Mode>,
     /// Why it is suspect, bits of [`suspect`]; 0 is clean.
     pub reasons: u8,
@@ -232,7 +232,7 @@ impl Session {
     pub fn poll_output(&mut self) -> Output<'_> {
         while let Some(found) = self.framer.advance() {
             match found {
-                Advance::Telegram(place) => return Output::Telegram(self.receive(place)),
+                Advance::Telegram(span) => return Output::Telegram(self.receive(span)),
                 Advance::Ack => self.dialogue.on_acknowledge(self.now),
                 Advance::Nak => self.dialogue.on_nak(self.now),
             }
@@ -246,7 +246,7 @@ impl Session {
         self.framer.await_acknowledge(self.dialogue.awaits_acknowledge());
         let next_byte = self.dialogue.outgoing().and_then(|outgoing| outgoing.byte());
         if let Some((byte, not_before)) = next_byte.filter(|&(_, at)| at <= self.now + SOON) {
-            // Whoever answers lets scans out.
+            // The sensor skips scans while it answers.
             self.cadence.rest();
             return Output::Transmit { byte, not_before };
         }
@@ -318,8 +318,8 @@ impl Session {
         self.damage.damaged(self.framer.tally())
     }
 
-    /// How often everything began anew: measured data stayed out for a second, the sensor said that it had just got its
-    /// power, or a user asked for it.
+    /// How often the session restarted: no measured data came for a second, the sensor reported power-on, or a user
+    /// asked for it.
     pub fn resyncs(&self) -> u64 {
         self.dialogue.resyncs
     }
@@ -329,16 +329,16 @@ impl Session {
         self.cut
     }
 
-    fn receive(&mut self, place: Place) -> Received<'_> {
+    fn receive(&mut self, span: TelegramSpan) -> Received<'_> {
         let baud = self.dialogue.baud.rate();
-        let framed = self.framer.view(place);
+        let framed = self.framer.view(span);
         let telegram = framed.telegram;
         let reply = Reply::decode(telegram);
         let (len, is_scan) = (telegram.bytes().len() as u64, telegram.command() == MEASURED);
         let period = self.period(telegram, reply.as_ref());
-        let mut first = self.arrivals.stamp(place.offset, baud);
-        let last = self.arrivals.stamp(place.offset + len - 1, baud);
-        let due = period.and(self.due(&first, place.offset, len));
+        let mut first = self.arrivals.stamp(span.offset, baud);
+        let last = self.arrivals.stamp(span.offset + len - 1, baud);
+        let due = period.and(self.due(&first, span.offset, len));
         // What is read later may tell that bytes were older than was thought; those before them were older still, but
         // that has been said.
         first.at = due.unwrap_or(first.at).max(self.last_stamp);
@@ -357,9 +357,9 @@ impl Session {
         } else {
             self.damage.end();
         }
-        self.last_scan = if is_scan { place.offset } else { self.last_scan };
+        self.last_scan = if is_scan { span.offset } else { self.last_scan };
         self.cut |= is_scan && self.tally().telegrams == 1 && self.tally().discarded > 0;
-        // Replies come when they are asked for, and a recording has the pace of whoever reads it.
+        // Replies follow requests, and a recording has the pace of its reader.
         let has_rhythm = is_scan && self.is_live() && !first.estimated;
         let took = last.saturating_sub(first.at);
         let slow = has_rhythm && self.rhythm.is_slow(took);

@@ -165,7 +165,7 @@ pub enum Kind {
     Number,
     /// Several words.
     Words,
-    /// Nobody knows.
+    /// Bytes without a known meaning.
     Bytes,
 }
 

@@ -9,8 +9,8 @@ use core::fmt;
 pub struct Value {
     /// The range in device units, or why there is none.
     pub range: Result<u16, Code>,
-    /// The bits above the range, moved down: a reflector level or field bits, as [`Mode::intensity_bits`] says. Which
-    /// of the field bits is dazzle and which is field A is told in two ways that contradict each other, so they stay bits.
+    /// The bits above the range, moved down: a reflector level or field bits, as [`Mode::intensity_bits`] says. The
+    /// documents contradict each other about which field bit is dazzle and which is field A, so they stay bits.
     pub upper: u8,
 }
 

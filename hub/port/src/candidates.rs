@@ -182,7 +182,7 @@ mod tests {
         let pty = openpt(OpenptFlags::RDWR | OpenptFlags::NOCTTY).unwrap();
         grantpt(&pty).unwrap();
         let name = ptsname(&pty, Vec::new()).unwrap();
-        // Locked still: whoever opened it would be refused.
+        // Still locked: opening it would be refused.
         assert!(is_tty(Path::new(name.to_str().unwrap())));
         assert!(is_tty(Path::new("/dev/tty")));
         for other in ["/dev/null", "/dev/zero", "/dev", "/etc/hostname", "/dev/no-such-port"] {

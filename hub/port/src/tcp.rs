@@ -121,7 +121,7 @@ impl AsFd for Dial {
 }
 
 fn tell(outcome: Result<Tcp, PortError>, send: &Sender<Result<Tcp, PortError>>, open_end: PipeWriter) {
-    // Whoever gave up waiting wants no outcome.
+    // A caller that gave up waiting does not need the result.
     let _ = send.send(outcome);
     drop(open_end);
 }

@@ -1,6 +1,6 @@
-//! Which beams of a scan end on what always stands there, and which on something before it. One model of a sensor's
-//! surroundings, learned from its scans beam by beam, by one of two methods. Refuses to know what stands there, and
-//! where the sensor is: ranges are all it compares.
+//! Decides which beams of a scan hit the permanent surroundings, and which hit something in front of them. The model
+//! of the surroundings is learned from the scans, beam by beam, by one of two methods. It compares ranges only: it
+//! refuses to know what objects there are, and where the sensor is.
 
 mod multi;
 mod paper;

@@ -1,5 +1,5 @@
-//! From a scan to something shorter. Each processor is a small struct that reads a scan and fills a payload, with
-//! arrays of fixed size and nothing else: no heap, no clock, no telegram. No processor uses another.
+//! Results computed from a scan. Each processor is a small struct that reads a scan and fills a payload, with arrays
+//! of fixed size: no heap, no clock, no telegrams. No processor uses another.
 
 #![forbid(unsafe_code)]
 

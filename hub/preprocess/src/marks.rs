@@ -1,5 +1,5 @@
-//! Where reflectors are: neighbouring beams whose intensity stands out become one mark, at their average weighted with
-//! the intensity (paper III.B.2). Refuses to know what a mark is part of, and where the robot is.
+//! Finds reflectors: neighbouring beams with a raised intensity become one mark, at their average weighted by
+//! intensity (paper III.B.2). Refuses to know what a mark belongs to, and where the robot is.
 
 use schema::{MARKS, Mark, Marks, Scan};
 

@@ -1,4 +1,5 @@
-//! What one beam tells, written as the design says it: what tests hold the background's own reading of whole scans against.
+//! The meaning of one beam's value, written as the design states it. Tests compare the background's faster code for
+//! whole scans with it.
 
 use schema::{Code, Scan};
 

@@ -1,5 +1,5 @@
-//! Which foreground beams belong together, and where what they see is. Refuses to know why a beam is in the
-//! foreground, and what a segment is.
+//! Groups neighbouring foreground beams into segments, and computes where each segment is. Refuses to know why a beam
+//! is in the foreground, and what object a segment is.
 
 use schema::{BEAMS, Foreground, Pose, Scan, Segment};
 

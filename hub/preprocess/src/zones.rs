@@ -1,5 +1,6 @@
-//! Is something near the robot: the paper's minimal distance check, with circles around the robot's centre. Refuses to
-//! know how beams meet circles, which the table tells in device units, so that a scan costs comparisons of integers.
+//! Checks whether something is near the robot: the paper's minimal distance check, with circles around the robot's
+//! centre. Refuses to know where beams cross circles: the table has that in device units, so a scan costs only
+//! comparisons of integers.
 
 mod nearest;
 mod spans;

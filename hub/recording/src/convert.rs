@@ -70,7 +70,7 @@ impl Target {
 pub struct Converted {
     /// Formats of the input and of the output.
     pub forms: (Form, Target),
-    /// How the ranges of a log are values; nothing of another form.
+    /// How the ranges of a log are encoded as values; `None` for other formats.
     pub encoding: Option<Encoding>,
     /// Its sensors; of one that names none the name that it gets in an MCAP file.
     pub sensors: Vec<String>,
@@ -85,7 +85,7 @@ pub struct Converted {
     pub took_ns: Option<u64>,
     /// What was missing of the recording.
     pub damage: Damage,
-    /// Whoever read stdout had enough before the end.
+    /// The reader of stdout closed it before the end.
     pub is_closed: bool,
 }
 
@@ -393,5 +393,5 @@ impl<W: Write> Packing<W> {
 const SENSOR: &str = "front";
 /// Bytes of telegrams in a chunk.
 const CHUNK: usize = 256 * 1024;
-/// Progress is told so often.
+/// How often progress is reported.
 const STEP: u64 = 512;

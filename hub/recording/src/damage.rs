@@ -2,7 +2,7 @@
 
 use std::fmt;
 
-/// What is missing; nothing of it if the file is whole.
+/// What is missing; all zero if the file is intact.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Damage {
     /// Telegrams whose numbers are missing between others: the file lost them, or the recorder did.

@@ -224,7 +224,7 @@ impl Recording {
         self.sensor.as_ref()
     }
 
-    /// When the file was last written, ns since 1970; 0 if nobody knows.
+    /// When the file was last written, ns since 1970; 0 if not known.
     #[cfg(feature = "mcap")]
     pub(crate) fn written_ns(&self) -> u64 {
         let written = std::fs::metadata(&self.path).and_then(|metadata| metadata.modified()).ok();

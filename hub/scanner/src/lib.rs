@@ -1,5 +1,5 @@
-//! From a telegram of the sensor's to a scan of ours: the one file that knows both. Ranges are born here, for the hub in
-//! the shared memory that consumers read.
+//! Decodes a telegram of the sensor into a scan: the only file that knows both. Here raw words become ranges; the hub
+//! lets it write them directly into the shared memory that consumers read.
 #![forbid(unsafe_code)]
 
 use lms::framer::suspect;

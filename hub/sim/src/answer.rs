@@ -33,7 +33,7 @@ pub(crate) enum After {
     Nothing,
     /// The line has another rate.
     Baud(Baud),
-    /// The sensor starts anew.
+    /// The sensor restarts.
     Reset,
 }
 

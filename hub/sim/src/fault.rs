@@ -1,5 +1,5 @@
 //! What goes wrong on purpose. Faults are data: a table of keys, a seed, and the same damage in every run, however the
-//! bytes are cut into chunks. [`crate::wire`] applies them between the sensor and the port; the sensor knows nothing of
+//! bytes are cut into chunks. [`crate::wire`] applies them between the sensor and the port; the sensor does not know
 //! them, except for its own bad habits.
 
 mod bytes;

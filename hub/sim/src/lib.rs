@@ -2,16 +2,16 @@
 //! measurements without hardware.
 //!
 //! [`machine`] is the sensor itself, without I/O and clock; [`world`] is what it sees, [`room`] how that is measured,
-//! [`look`] the true values; [`wire`], [`fault`] and [`noise`] are what happens on the line; [`pty`] is the
+//! [`labeled_scan`] the true values; [`wire`], [`fault`] and [`noise`] are what happens on the line; [`pty`] is the
 //! only file that knows real time and ports; [`simulate()`] is the verb. It uses the protocol crate's other direction and
 //! knows nothing of the hub.
 
 mod answer;
 mod eeprom;
 pub mod fault;
+pub mod labeled_scan;
 pub mod layers;
 mod line;
-pub mod look;
 pub mod machine;
 pub mod noise;
 pub mod operating;
@@ -35,6 +35,7 @@ pub mod wire;
 pub mod world;
 mod world_view;
 
+pub use line::Event;
 pub use request_decoder::{Arrival, Dropped};
-pub use simulate::{Ready, simulate};
+pub use simulate::{Ready, simulate, simulate_with};
 pub use transmission::ChunkSize;

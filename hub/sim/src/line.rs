@@ -7,7 +7,7 @@ use std::path::{Path, PathBuf};
 use lms::{MILLIS, Nanos};
 use schema::Failure;
 
-use crate::fault::Fault;
+use crate::fault::{Fault, Faults};
 use crate::machine::{Machine, Part};
 use crate::noise::Mistuned;
 use crate::place::Place;
@@ -27,6 +27,19 @@ pub(crate) struct Line<'a> {
     pub(crate) time: Time,
     /// Where the truth goes.
     pub(crate) tell: &'a (dyn Fn(&Record) -> Result<(), Failure> + Sync),
+    /// What is done to it next from outside, if anything.
+    pub(crate) event: &'a (dyn Fn(&Path) -> Option<Event> + Sync),
+}
+
+/// Something that is done to a simulated sensor from outside while it runs.
+#[derive(Clone, Debug)]
+pub enum Event {
+    /// Its power goes off and on.
+    PowerCycle,
+    /// The host's adapter is pulled out for so long, in nanoseconds; then it is another terminal under the same name.
+    Unplug(Nanos),
+    /// The line does this to bytes from now on, with random numbers of this seed; times count from now.
+    Faults(Box<Faults>, u64),
 }
 
 /// A pty and where it is found. Dropped, it is gone as an adapter is that was pulled out: first the name, then the
@@ -86,6 +99,9 @@ impl Line<'_> {
             let now_ns = now_ns();
             self.slip(now_ns);
             let machine_ns = self.time.of_machine(now_ns);
+            while let Some(event) = (self.event)(&self.port) {
+                self.suffer(event, machine_ns);
+            }
             while let Some(carried) = self.wire.poll_transmit(&mut self.machine, machine_ns) {
                 self.hand_over(carried, &mut way)?;
             }
@@ -117,6 +133,19 @@ impl Line<'_> {
             if wait(stops, watched, due_ns.min(look_ns)) == Wake::Stop {
                 let eeprom_writes = self.machine.eeprom_writes();
                 return Ok(Summary { port: self.port, sent: way.sent, eeprom_writes });
+            }
+        }
+    }
+
+    fn suffer(&mut self, event: Event, machine_ns: Nanos) {
+        match event {
+            Event::PowerCycle => self.wire.cycle_power(&mut self.machine, machine_ns),
+            Event::Unplug(span_ns) => self.wire.unplug(machine_ns, span_ns),
+            Event::Faults(mut faults, seed) => {
+                let now_s = machine_ns as f64 / 1e9;
+                let times = [&mut faults.silence_at, &mut faults.stall_at, &mut faults.power_at];
+                times.into_iter().filter(|at| **at > 0.0).for_each(|at| *at += now_s);
+                self.wire.set_faults(&faults, seed);
             }
         }
     }

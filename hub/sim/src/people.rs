@@ -1,5 +1,5 @@
 //! People in a world: where their legs are at a given time. A pure function of time and seed, so that two sensors, a
-//! test and a bench see the same person. Knows nothing of sensors.
+//! test and a bench see the same person. Refuses to know sensors.
 
 use std::f64::consts::TAU;
 
@@ -132,7 +132,7 @@ impl Course {
                 let next = knots.partition_point(|knot| knot.0 <= time_s).clamp(1, knots.len() - 1);
                 let ((t0, a, s0), (t1, b, s1)) = (knots[next - 1], knots[next]);
                 let share = if t1 > t0 { ((time_s - t0) / (t1 - t0)).min(1.0) } else { 1.0 };
-                // Whoever rests looks where the way goes on, and at its end where it came from.
+                // A person who rests looks along the path, and at its end back to where the path came from.
                 let mut legs = knots[next - 1..].windows(2).chain(knots.windows(2).rev());
                 let ahead = legs.find(|pair| pair[0].1 != pair[1].1);
                 let ahead =

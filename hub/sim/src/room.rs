@@ -6,8 +6,8 @@ use std::sync::Arc;
 use lms::Nanos;
 use lms::variant::{Mode, Unit, Variant};
 
+use crate::labeled_scan::{LabeledScan, Mark, Met};
 use crate::layers::{self, Dice};
-use crate::look::{Look, Mark, Met};
 use crate::series::{Changes, Series};
 use crate::spot::{Echo, echo};
 use crate::view::View;
@@ -63,12 +63,12 @@ impl Room {
     pub fn scan(&self, variant: Variant, unit: Unit, mode: Mode, end_ns: Nanos) -> Vec<u16> {
         match &self.sight {
             Sight::Series(series, changes) => series.scan(changes, (variant, unit, mode), end_ns),
-            _ => self.look(variant, unit, mode, end_ns).words,
+            _ => self.labeled_scan(variant, unit, mode, end_ns).words,
         }
     }
 
     /// The words of [`Room::scan`] with their truth.
-    pub fn look(&self, variant: Variant, unit: Unit, mode: Mode, end_ns: Nanos) -> Look {
+    pub fn labeled_scan(&self, variant: Variant, unit: Unit, mode: Mode, end_ns: Nanos) -> LabeledScan {
         let step_mdeg = 10 * i32::from(variant.resolution_cdeg);
         let angles_mdeg =
             (0..variant.beams() as i32).map(|beam| variant.first_angle_mdeg() + beam * step_mdeg).collect();
@@ -92,7 +92,14 @@ impl Room {
     }
 
     /// What the beams at `angles_mdeg` tell, every one after the other measured in the next of `turns` mirror turns.
-    fn measure(&self, angles_mdeg: Vec<i32>, turns: u64, unit: Unit, mode: Mode, end_ns: Nanos) -> Look {
+    fn measure(
+        &self,
+        angles_mdeg: Vec<i32>,
+        turns: u64,
+        unit: Unit,
+        mode: Mode,
+        end_ns: Nanos,
+    ) -> LabeledScan {
         let mut random = fastrand::Rng::with_seed(self.seed ^ end_ns.wrapping_mul(0x9E37_79B9_7F4A_7C15));
         let beams = angles_mdeg.len();
         let words = match &self.sight {
@@ -107,7 +114,7 @@ impl Room {
             }
         };
         let truth = words.iter().map(|&word| truth(word, Met::Static { since_ns: 0 }, mode)).collect();
-        Look { words, truth }
+        LabeledScan { words, truth }
     }
 }
 
@@ -120,10 +127,10 @@ fn measure(
     mode: Mode,
     end_ns: Nanos,
     random: &mut fastrand::Rng,
-) -> Look {
+) -> LabeledScan {
     let times: Vec<Nanos> = (0..turns).map(|turn| stage.layers.turn_ns(turn, turns, end_ns)).collect();
     let views: Vec<View> = times.iter().map(|&time_ns| stage.view(time_ns)).collect();
-    let mut look = Look { words: Vec::new(), truth: Vec::new() };
+    let mut look = LabeledScan { words: Vec::new(), truth: Vec::new() };
     for (beam, &angle_mdeg) in angles_mdeg.iter().enumerate() {
         // The beams between whole degrees are measured in the turns after the first.
         let turn = beam % turns as usize;
@@ -197,7 +204,7 @@ mod tests {
     #[test]
     fn the_same_seed_and_time_give_the_same_scan_and_truth() {
         let (a, b) = (room("room", 7), room("room", 7));
-        let look = |room: &Room, end_ns| room.look(MM.0, MM.1, MM.2, end_ns);
+        let look = |room: &Room, end_ns| room.labeled_scan(MM.0, MM.1, MM.2, end_ns);
         assert_eq!(look(&a, 5_000_000_000), look(&b, 5_000_000_000));
         assert_ne!(scan(&a, 5_000_000_000), scan(&room("room", 8), 5_000_000_000));
         assert_ne!(scan(&a, 5_000_000_000), scan(&a, 5_026_640_000));
@@ -237,7 +244,7 @@ mod tests {
             for variant in Variant::ALL {
                 for mode in [0, 1, 3, 4, 5, 6, 0x0F].map(Mode) {
                     for unit in [Unit::Cm, Unit::Mm, Unit::Dm] {
-                        let look = room.look(variant, unit, mode, 1_000_000_000);
+                        let look = room.labeled_scan(variant, unit, mode, 1_000_000_000);
                         assert_eq!((look.words.len(), look.truth.len()), (variant.beams(), variant.beams()));
                         assert!(look.words.iter().all(|word| word & mode.forbidden() == 0));
                     }

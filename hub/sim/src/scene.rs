@@ -69,7 +69,7 @@ pub(crate) struct Spell {
 }
 
 impl Thing {
-    /// Whether it is the same for ever.
+    /// Whether it never changes.
     pub(crate) fn is_still(&self) -> bool {
         self.from_s <= 0.0 && self.until_s.is_infinite() && self.moves.is_empty()
     }

@@ -2,7 +2,7 @@
 //! the truth. Refuses to print and to handle signals: the program does.
 
 use std::os::fd::{AsFd, BorrowedFd, OwnedFd};
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use lms::Nanos;
 use lms::variant::{Baud, Mode, Variant};
@@ -10,7 +10,7 @@ use recording::{Encoding, Frame, Recording};
 use rustix::event::{EventfdFlags, eventfd};
 use schema::{Failure, Kind};
 
-use crate::line::{Line, Socket, Time};
+use crate::line::{Event, Line, Socket, Time};
 use crate::machine::{Machine, Settings, Start};
 use crate::operating::Operating;
 use crate::options::{SimulateOptions, type_name};
@@ -38,6 +38,17 @@ pub fn simulate(
     on_ready: impl FnOnce(&[Ready]),
     tell: impl Fn(&Record) + Sync,
 ) -> Result<Vec<Summary>, Failure> {
+    simulate_with(options, stop, on_ready, tell, |_| None)
+}
+
+/// As [`simulate()`]; `event` is asked again and again, from the thread of each port, what is done to that sensor now.
+pub fn simulate_with(
+    options: &SimulateOptions,
+    stop: impl AsFd,
+    on_ready: impl FnOnce(&[Ready]),
+    tell: impl Fn(&Record) + Sync,
+    event: impl Fn(&Path) -> Option<Event> + Sync,
+) -> Result<Vec<Summary>, Failure> {
     check(options)?;
     let recording = options.replay.as_ref().map(Recording::open).transpose()?;
     let truth = options.truth.as_deref().map(Truth::create).transpose()?;
@@ -56,7 +67,8 @@ pub fn simulate(
         let socket = Socket::new(port)?;
         ready.push(Ready { port: port.clone(), pty: socket.pty.name().to_owned() });
         let wire = Wire::new(&options.faults, seed);
-        lines.push(Line { port: port.clone(), socket: Some(socket), machine, wire, time, tell: &tell });
+        let (port, socket) = (port.clone(), Some(socket));
+        lines.push(Line { port, socket, machine, wire, time, tell: &tell, event: &event });
     }
     on_ready(&ready);
     let summaries = run(lines, stop.as_fd())?;

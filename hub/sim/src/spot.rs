@@ -1,8 +1,8 @@
 //! What one beam measures from the rays that its spot covers: an echo from one surface, or from two, of which it reports
 //! one, the other or a value between. Knows neither units nor codes.
 
+use crate::labeled_scan::Met;
 use crate::layers::Dice;
-use crate::look::Met;
 use crate::scene::Surface;
 use crate::shape::Shape;
 use crate::view::{Face, Hit, Kind, RAY_STEP, REACH, View};

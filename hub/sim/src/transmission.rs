@@ -59,7 +59,7 @@ impl<T> Transmission<T> {
         self.start_ns
     }
 
-    /// Begins at `at_ns` if it would have begun before; only as long as nothing of it was taken.
+    /// Starts at `at_ns` if it would have started earlier; only before its first byte was taken.
     pub(crate) fn start_no_earlier(&mut self, at_ns: Nanos) {
         self.start_ns = self.start_ns.max(at_ns);
     }

@@ -82,6 +82,16 @@ impl Wire {
         *self = Wire { lateness, position, last, fault, power_broke, queue, header, ..fresh };
     }
 
+    /// The host's adapter is out of its socket from `now` on for `span`, whatever the faults say of it.
+    pub fn unplug(&mut self, now: Nanos, span: Nanos) {
+        self.unplug = Window::once(now, span);
+    }
+
+    /// The power of `machine` goes off and on at `now`.
+    pub fn cycle_power(&mut self, machine: &mut Machine, now: Nanos) {
+        self.power_broke |= machine.power_cycle(now);
+    }
+
     /// Whether the host's adapter is in its socket, as of the last poll.
     pub fn is_plugged(&self) -> bool {
         self.plugged
@@ -98,7 +108,7 @@ impl Wire {
     pub fn poll_transmit(&mut self, machine: &mut Machine, now: Nanos) -> Option<Carried> {
         self.plugged = !self.unplug.holds(now);
         if self.power.take(now).is_some() {
-            self.power_broke |= machine.power_cycle(now);
+            self.cycle_power(machine, now);
         }
         loop {
             if self.queue.front().is_some_and(|(at, _)| *at <= now)

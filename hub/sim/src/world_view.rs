@@ -3,8 +3,8 @@
 
 use lms::Nanos;
 
+use crate::labeled_scan::Mark;
 use crate::layers::Layers;
-use crate::look::Mark;
 use crate::people::{Person, jittered};
 use crate::scene::{Scene, Sun, Surface, Thing};
 use crate::shape::{Pose, Shape};

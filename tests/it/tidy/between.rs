@@ -155,6 +155,7 @@ fn only_the_program_sees_all() {
             tree.with_line("hub/sim/Cargo.toml", "[dependencies]", "scanhub-daemon.workspace = true"),
             tree.with_line("hub/sim/Cargo.toml", "[dependencies]", "scanhub-client.workspace = true"),
             tree.with_line("hub/sim/Cargo.toml", "[dependencies]", "scanhub-lan.workspace = true"),
+            tree.with_line("Cargo.toml", "[dependencies]", "scanhub-world.workspace = true"),
         ]
     });
 }

@@ -3,7 +3,7 @@
 use lms::Nanos;
 use lms::measured::MEASURED;
 use schema::datagram::{Datagram, DatagramError, Row};
-use schema::{Header, Status, Topic, Verdict};
+use schema::{Header, Status, Topic, Verdict, Zones};
 
 use crate::consumer::Number;
 use crate::hash::History;
@@ -22,6 +22,8 @@ pub(crate) enum Event<'a> {
     Opened { sensor: usize, offset: u64 },
     /// The line has no owner any more.
     Closed { sensor: usize },
+    /// Another sensor is there instead of the one that was.
+    Exchanged { sensor: usize },
     /// The last byte of a telegram went into the port, or did not.
     Sent { sensor: usize, telegram: &'a Telegram<'a> },
     /// Bytes that were in the port are gone, those from one to the other.
@@ -96,6 +98,17 @@ pub(crate) struct Telegram<'a> {
     pub(crate) aborted: bool,
 }
 
+/// How much of what happens is told to standard error.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
+pub enum Detail {
+    /// Nothing.
+    Nothing,
+    /// What does not happen with each telegram.
+    News,
+    /// Verdicts, too.
+    All,
+}
+
 /// What a judge says.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Violation {
@@ -124,6 +137,7 @@ impl Event<'_> {
             Event::Stalled { until } => numbers(&[3, until]),
             Event::Opened { sensor, offset } => numbers(&[4, sensor as u64, offset]),
             Event::Closed { sensor } => numbers(&[5, sensor as u64]),
+            Event::Exchanged { sensor } => numbers(&[20, sensor as u64]),
             Event::Sent { sensor, telegram } => {
                 numbers(&[6, sensor as u64, telegram.span.0, telegram.span.1, telegram.aborted.into()]);
                 history.bytes(telegram.bytes);
@@ -180,8 +194,8 @@ impl Event<'_> {
         }
     }
 
-    /// What to say of it to whoever wants to see how it went; nothing of what happens with each telegram.
-    pub(crate) fn words(&self) -> Option<String> {
+    /// What to say of it to whoever wants to see so much of it.
+    pub(crate) fn words(&self, detail: Detail) -> Option<String> {
         match self {
             Event::Sent { telegram: Telegram { bytes, damage: None, aborted: false, .. }, .. }
                 if bytes[4] == MEASURED =>
@@ -195,16 +209,12 @@ impl Event<'_> {
             Event::Published { sensor, sample } => {
                 let Sample { topic, header, bytes, .. } = sample;
                 match topic {
-                    Topic::Zones if std::env::var_os("WORLD_ALL").is_some() => {
-                        let zones: schema::Zones = bytemuck::pod_read_unaligned(bytes);
+                    Topic::Zones if detail == Detail::All => {
+                        let zones: Zones = bytemuck::pod_read_unaligned(bytes);
+                        let Header { seq, stamp_last_ns, flags, reasons, .. } = header;
+                        let (verdict, ms) = (zones.verdict(), stamp_last_ns / 1_000_000);
                         Some(format!(
-                            "{sensor} zones {:?} seq {} stamps {:.6} {:.6} flags {} reasons {}",
-                            zones.verdict(),
-                            header.seq,
-                            header.stamp_first_ns as f64 / 1e9,
-                            header.stamp_last_ns as f64 / 1e9,
-                            header.flags,
-                            header.reasons
+                            "{sensor} zones {verdict:?} seq {seq} of {ms} ms, flags {flags} reasons {reasons}"
                         ))
                     }
                     Topic::Status => {

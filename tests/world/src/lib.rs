@@ -25,7 +25,7 @@ mod topics;
 mod tty;
 mod world;
 
-pub use event::Violation;
+pub use event::{Detail, Violation};
 pub use plan::{Action, Plan};
 pub use runner::{Runner, Totals};
 pub use world::{Outcome, run};

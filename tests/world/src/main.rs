@@ -8,7 +8,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Instant;
 
 use clap::Parser;
-use world::{Outcome, Plan, Runner, Totals, corpus, run, shrink};
+use world::{Detail, Outcome, Plan, Runner, Totals, corpus, run, shrink};
 
 /// Simulates whole hubs in made-up time, and watches what they promise.
 #[derive(Debug, Parser)]
@@ -19,6 +19,9 @@ struct Arguments {
     /// One seed, with everything that happens.
     #[arg(long)]
     seed: Option<u64>,
+    /// With one seed or plan: every verdict, too.
+    #[arg(long)]
+    all: bool,
     /// How long each world lasts.
     #[arg(long, default_value_t = 60)]
     virtual_seconds: u64,
@@ -64,7 +67,7 @@ fn main() -> ExitCode {
     };
     if let ([plan], true) = (&plans[..], arguments.seed.is_some() || arguments.plan.is_some()) {
         print!("{plan}");
-        let outcome = run(plan, true);
+        let outcome = run(plan, if arguments.all { Detail::All } else { Detail::News });
         outcome.violations.iter().for_each(|violation| println!("{violation}"));
         println!("hash {:016x}", outcome.hash);
         return ExitCode::from(u8::from(!outcome.violations.is_empty()));
@@ -116,7 +119,7 @@ fn report(plan: &Plan, outcome: &Outcome, is_same: bool, is_long: bool) {
         println!("the second run was another one than the first");
     }
     outcome.violations.iter().take(5).for_each(|violation| println!("  {violation}"));
-    let judge = |plan: &Plan| run(plan, false).violations.first().map(|violation| violation.judge);
+    let judge = |plan: &Plan| run(plan, Detail::Nothing).violations.first().map(|violation| violation.judge);
     let shortest = if is_long { plan.clone() } else { shrink::shrink(plan, judge) };
     println!("{shortest}");
 }

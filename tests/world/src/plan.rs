@@ -5,8 +5,9 @@ use std::fmt;
 use std::str::FromStr;
 
 use lms::{MILLIS, Nanos};
+use sim::fault::Faults;
 
-use crate::actions::{KINDS, Kind};
+use crate::actions::{self, KINDS, Kind};
 
 /// What shall happen. Everything else (how many sensors, their rates, the consumers) follows from the seed.
 #[derive(Clone, Debug, PartialEq)]
@@ -53,21 +54,26 @@ impl Plan {
     }
 
     /// When everything is made well again: what is to be seen then has [`REST`].
-    pub(crate) fn heals_at(&self) -> Nanos {
+    pub fn heals_at(&self) -> Nanos {
         (self.seconds * 1_000 * MILLIS).saturating_sub(REST)
     }
 }
 
 /// Without actions at the end, in which everything has to come back.
-pub(crate) const REST: Nanos = 8_000 * MILLIS;
+pub(crate) const REST: Nanos = 12_000 * MILLIS;
 /// Nothing happens in the first moment: a hub has to be there first.
 const BEGIN_MS: u64 = 200;
 
 impl Action {
     /// The value of the key called `name`.
-    pub(crate) fn value(&self, name: &str) -> u64 {
+    pub fn value(&self, name: &str) -> u64 {
         let at = self.kind.keys.iter().position(|key| key.name == name);
         at.and_then(|at| self.values.get(at)).copied().unwrap_or_default()
+    }
+
+    /// What it does to the bytes on a line from `now` on, if it is of such a kind.
+    pub fn faults(&self, now: Nanos) -> Option<Faults> {
+        actions::faults(self, now)
     }
 
     /// The name of its kind.

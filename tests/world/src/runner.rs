@@ -5,6 +5,7 @@ use std::sync::mpsc;
 use std::thread;
 use std::time::{Duration, Instant};
 
+use crate::event::Detail;
 use crate::plan::Plan;
 use crate::world::{Outcome, run};
 
@@ -48,8 +49,8 @@ impl Runner {
                         let at = next.fetch_add(1, Ordering::Relaxed) as usize;
                         let Some(plan) = self.plans.get(at) else { return };
                         let begun = Instant::now();
-                        let outcome = run(plan, false);
-                        let is_same = at >= self.twice || run(plan, false).hash == outcome.hash;
+                        let outcome = run(plan, Detail::Nothing);
+                        let is_same = at >= self.twice || run(plan, Detail::Nothing).hash == outcome.hash;
                         // Nobody hears it who has ended.
                         let _ = told.send((at, outcome, is_same, begun.elapsed()));
                     }

@@ -7,7 +7,7 @@ use std::rc::Rc;
 
 use lms::Nanos;
 
-use crate::event::{Event, Violation};
+use crate::event::{Detail, Event, Violation};
 use crate::hash::History;
 use crate::judges::{Judge, Say};
 use crate::line::Handle;
@@ -48,7 +48,7 @@ impl Shared {
 /// Everything that happens goes through here: into the hash, and to the judges.
 pub(crate) struct Log {
     inner: RefCell<Inner>,
-    is_verbose: bool,
+    detail: Detail,
 }
 
 struct Inner {
@@ -59,16 +59,16 @@ struct Inner {
 }
 
 impl Log {
-    pub(crate) fn new(judges: Vec<Box<dyn Judge>>, is_verbose: bool) -> Log {
+    pub(crate) fn new(judges: Vec<Box<dyn Judge>>, detail: Detail) -> Log {
         let inner = Inner { history: History::new(), judges, violations: Vec::new(), published: 0 };
-        Log { inner: RefCell::new(inner), is_verbose }
+        Log { inner: RefCell::new(inner), detail }
     }
 
     /// `event` happened at `at`.
     pub(crate) fn tell(&self, at: Nanos, event: &Event<'_>) {
         let Inner { history, judges, violations, published } = &mut *self.inner.borrow_mut();
-        if self.is_verbose
-            && let Some(words) = event.words()
+        if self.detail > Detail::Nothing
+            && let Some(words) = event.words(self.detail)
         {
             eprintln!("{:>12.6} {words}", at as f64 / 1e9);
         }

@@ -12,7 +12,7 @@ use sim::fault::Faults;
 
 use crate::actions::object;
 use crate::consumer::{Consumer, Habit, Number};
-use crate::event::{Event, Violation};
+use crate::event::{Detail, Event, Violation};
 use crate::hub;
 use crate::judges;
 use crate::plan::{Action, Plan};
@@ -35,9 +35,9 @@ pub struct Outcome {
     pub samples: u64,
 }
 
-/// Lets happen what `plan` says; if `is_verbose`, tells standard error what happens.
-pub fn run(plan: &Plan, is_verbose: bool) -> Outcome {
-    let mut world = World::new(plan, is_verbose);
+/// Lets happen what `plan` says, and tells standard error so much of it.
+pub fn run(plan: &Plan, detail: Detail) -> Outcome {
+    let mut world = World::new(plan, detail);
     while world.now() < world.end {
         world.rest_without_hub();
         if world.now() < world.end {
@@ -94,7 +94,7 @@ pub(crate) struct World {
 }
 
 impl World {
-    fn new(plan: &Plan, is_verbose: bool) -> World {
+    fn new(plan: &Plan, detail: Detail) -> World {
         let setup = Rc::new(Setup::of_seed(plan.seed));
         let sensors = setup.sensors(|sensor| object::changes(plan, sensor, setup.sensors.len()));
         let ports =
@@ -104,7 +104,7 @@ impl World {
             wall_ahead: Cell::new(WALL_NS),
             ports: ports.collect(),
             board: RefCell::new(Board::new(setup.sensors.len())),
-            log: Log::new(judges::all(&setup, plan), is_verbose),
+            log: Log::new(judges::all(&setup, plan), detail),
             files: RefCell::default(),
             disk_is_full: Cell::new(false),
             records: RefCell::default(),
@@ -148,6 +148,11 @@ impl World {
     /// Whether it is over.
     pub(crate) fn is_over(&self) -> bool {
         self.now() >= self.end
+    }
+
+    /// How long things may still go wrong.
+    pub(crate) fn until_healed(&self) -> Nanos {
+        self.heals_at.saturating_sub(self.now())
     }
 
     /// When something is due that is not the hub's.

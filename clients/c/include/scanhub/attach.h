@@ -13,14 +13,14 @@
  *     }
  *     scanhub_close(scans);
  *
- * There need not be a hub: it is waited for, and so is the next one when it is killed or ends. What is too slow misses
- * samples, and is told how many; it never slows the hub.
+ * The hub need not run yet: the library waits for it, and for the next one after it ends or is killed. A program that is too
+ * slow misses samples and sees how many; it never slows the hub.
  *
  * A handle belongs to the thread that opened it; other threads open handles of their own. All functions may be called with
  * a handle that was closed, or with NULL: they refuse it. A child after fork() opens its own, and may end as it likes.
  *
- * Functions answer 0 or more; a negative number is one of SCANHUB_REFUSED_.., and scanhub_error() says what and what to do.
- * Signals are never an error.
+ * Functions return 0 or more. A negative number is one of SCANHUB_REFUSED_..; scanhub_error() then has the message and the
+ * remedy. Signals are never an error.
  */
 #ifndef SCANHUB_ATTACH_H
 #define SCANHUB_ATTACH_H
@@ -34,9 +34,9 @@ extern "C" {
 
 /* Why a call was refused. */
 #define SCANHUB_REFUSED_ARGUMENT (-1)      /* NULL, an unknown handle or number, a fifth sample */
-#define SCANHUB_REFUSED_CONFIGURATION (-2) /* a name that is not possible, a descriptor without SCANHUB_WAIT_EVENT */
+#define SCANHUB_REFUSED_CONFIGURATION (-2) /* an invalid name, a descriptor without SCANHUB_WAIT_EVENT */
 #define SCANHUB_REFUSED_SHORT (-3)         /* shared memory, descriptors or places for consumers are short: try later */
-#define SCANHUB_REFUSED_FAILED (-4)        /* another user's domain, another version's topic, and what has no name */
+#define SCANHUB_REFUSED_FAILED (-4)        /* another user's domain, another version's topic, or another failure */
 #define SCANHUB_REFUSED_BUG (-5)           /* in this library; close the handle */
 
 /* What the hub publishes for each sensor, and what a payload is. */
@@ -248,41 +248,41 @@ struct scanhub_robot {
 
 /* A sample that is lent: scanhub_take fills it, scanhub_release empties it. */
 struct scanhub_sample {
-    const struct scanhub_header_v1 *header; /* NULL: nobody sent it, see stale; of a robot */
+    const struct scanhub_header_v1 *header; /* NULL: no hub sent it, see stale; or a robot's verdict */
     const void *payload;                    /* where the hub wrote it, for reading */
     size_t length;                          /* its bytes */
     uint64_t missed;                        /* samples that were sent before it and not received */
-    int restarted;                          /* 1: the hub was started anew, seq and topic_seq begin again */
-    int stale;                              /* 1: zones that are unknown because nothing new enough was heard */
+    int restarted;                          /* 1: the hub restarted, seq and topic_seq start again */
+    int stale;                              /* 1: zones that are unknown because no recent data arrived */
     struct scanhub_attachment *of;                     /* the library's */
     uint64_t number;                        /* the library's */
 };
 
 /*
- * Begins to follow a topic of `sensor` ("front", "robot1.front") in `domain` (NULL: the one that SCANHUB_DOMAIN names). It
- * does not wait for a hub. Answers 0; *handle is NULL after a refusal.
+ * Starts to follow a topic of `sensor` ("front", "robot1.front") in `domain` (NULL: the one that SCANHUB_DOMAIN names). It
+ * does not wait for a hub. Returns 0; *handle is NULL after a refusal.
  */
 int scanhub_open(struct scanhub_attachment **handle, const char *domain, const char *sensor, int topic, int wait);
 
 /*
- * Begins to follow the verdict over the zones of `sensors`: names with blanks between them, "front rear". NULL: all sensors of
- * the hub; in a domain without a hub those of other machines that are published there. scanhub_take lends what is known then
- * (struct scanhub_robot, a copy without header), once there was a word of each sensor, whenever one is heard, and when one is
- * heard no more: its verdict is unknown then, by itself. All else is as with scanhub_open.
+ * Starts to follow the verdict over the zones of `sensors`: names with blanks between them, "front rear". NULL: all sensors of
+ * the hub; in a domain without a hub the sensors of other machines that are published there. scanhub_take then lends a struct
+ * scanhub_robot (a copy without header): once every sensor has a verdict, whenever one gets a new verdict, and when one is
+ * silent for too long, whose verdict then becomes unknown by itself. Everything else is as with scanhub_open.
  */
 int scanhub_open_robot(struct scanhub_attachment **handle, const char *domain, const char *sensors, int wait);
 
 /*
  * A descriptor that is readable while there may be a sample, for poll, select and epoll: never read, written or closed. It
- * stays the same until scanhub_close, also over restarts of the hub. It is readable until scanhub_take has answered 0: take
- * all, then poll. That it is readable does not promise a sample: it also is once a second, ten times a second while there is
- * no hub, and when other topics of the sensor have something. Only with SCANHUB_WAIT_EVENT.
+ * stays the same until scanhub_close, also over restarts of the hub. It is readable until scanhub_take has returned 0: take
+ * all, then poll. A readable descriptor does not promise a sample: it also becomes readable once a second, ten times a second
+ * while there is no hub, and when other topics of the sensor have a sample. Only with SCANHUB_WAIT_EVENT.
  */
 int scanhub_fd(struct scanhub_attachment *handle);
 
 /*
- * Sleeps until there is a sample to take: 1; or until `timeout_ms` are over: 0. Negative: waits for ever. A signal whose
- * handler returns does not end it: wait for as long as your program may take to see the handler's flag.
+ * Sleeps until there is a sample to take: 1; or until `timeout_ms` are over: 0. Negative: waits without limit. A signal whose
+ * handler returns does not end the wait: choose a timeout within which your program must see the handler's flag.
  */
 int scanhub_wait(struct scanhub_attachment *handle, int timeout_ms);
 
@@ -290,27 +290,27 @@ int scanhub_wait(struct scanhub_attachment *handle, int timeout_ms);
  * Lends the next sample: 1; or there is none: 0, and *sample is empty. Never waits. Four samples can be lent at a time; what
  * a sample points to lives until it is released.
  *
- * Of zones it is the last one that stands, as a copy: once it is too old to be believed, because sensor, hub or machine stood
- * still, there is one more, without header, whose verdict is unknown (`stale`). Nobody who acts on zones needs a clock.
+ * Of zones it is the latest one, as a copy. When that becomes too old, because sensor, hub or machine stopped, there is one
+ * more sample, without header, whose verdict is unknown (`stale`). A program that acts on zones needs no clock of its own.
  */
 int scanhub_take(struct scanhub_attachment *handle, struct scanhub_sample *sample);
 
-/* Gives a sample back and empties it: 0, also if it is empty. One that is refused stays as it is. */
+/* Returns a sample and empties it: 0, also if it is empty. A refused sample stays as it is. */
 int scanhub_release(struct scanhub_sample *sample);
 
-/* Ends it all, lent samples too: 0, also for NULL. */
+/* Closes the handle; its lent samples become invalid too: 0, also for NULL. */
 int scanhub_close(struct scanhub_attachment *handle);
 
 /* 1 if a hub lives in the domain, 0 if not, as of the last call that found no sample. */
 int scanhub_hub_lives(struct scanhub_attachment *handle);
 
-/* What the last refused call of this thread said: a line, and often a second one with the remedy. Valid until the next. */
+/* The message of this thread's last refused call: a line, and often a second one with the remedy. Valid until the next. */
 const char *scanhub_error(void);
 
 /* The version of the library, "0.1.0". */
 const char *scanhub_version(void);
 
-/* Millimetres that beam i measured; -1 if it has no valid reading, or is not there. */
+/* The distance of beam i in mm; -1 if it has no valid reading, or does not exist. */
 static inline int32_t scanhub_distance_mm(const struct scanhub_scan_v1 *scan, unsigned i)
 {
     if (i >= scan->count || i >= 401 || scan->range_bits > 16)
@@ -319,7 +319,7 @@ static inline int32_t scanhub_distance_mm(const struct scanhub_scan_v1 *scan, un
     return range + 8 < (INT32_C(1) << scan->range_bits) - 1 ? range * scan->unit_mm : -1;
 }
 
-/* Where beam i looks, in 1/1000 degree: counter-clockwise seen from above, 0 right, 90000 ahead. */
+/* The angle of beam i in 1/1000 degree: counter-clockwise seen from above, 0 right, 90000 ahead. */
 static inline int32_t scanhub_angle_mdeg(const struct scanhub_scan_v1 *scan, unsigned i)
 {
     return scan->first_angle_mdeg + (int32_t)i * scan->step_mdeg;

@@ -1,5 +1,5 @@
-//! Which sensors there are: those of a hub that came are followed where all are wanted, and who follows one that is not
-//! there is told. Refuses to receive.
+//! Finds the sensors to follow: all sensors of a new hub where all are wanted; a notice where a named one is missing.
+//! Refuses to receive samples.
 
 use std::time::{Duration, Instant};
 

@@ -1,5 +1,5 @@
-//! The lines of the sensors that are followed: their statuses, beside whatever was asked for. They are no samples of the
-//! run: they count for no bound, and that there are none is nobody's failure.
+//! The serial lines of the followed sensors: their statuses, in addition to the requested topics. These are not
+//! samples of the run: they count for no bound, and it is no failure if there are none.
 
 use scanhub_client::streams::{Follower, Sample};
 use schema::Status;

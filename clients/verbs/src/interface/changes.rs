@@ -1,6 +1,6 @@
-//! The kernel's word that network interfaces or their addresses changed (rtnetlink(7)), and which of them were away since,
-//! however short that was: two looks at what there is may both find a link that was gone between them. Refuses to know
-//! who cares.
+//! Notifications of the kernel that network interfaces or their addresses changed (rtnetlink(7)), and which interfaces
+//! were down in between, however short: polling could miss a link that went down and came back. Refuses to know who
+//! uses them.
 
 use std::os::fd::{AsFd, BorrowedFd, OwnedFd};
 
@@ -23,7 +23,7 @@ pub(crate) struct Changes {
 pub(crate) enum Away {
     /// The interface with this number.
     One(u32),
-    /// Nobody knows which: the kernel had more to say than could wait.
+    /// It is not known which: the queue of notifications overflowed.
     Any,
 }
 

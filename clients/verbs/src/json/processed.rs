@@ -1,4 +1,5 @@
-//! The classes of what the hub makes of a scan: marks, zones, foreground. A contract, as its parent.
+//! The classes of the results that the hub computes from a scan: marks, zones, foreground. A contract, like its parent
+//! module.
 
 use scanhub_client::{Heard, Robot};
 use schema::{Foreground, Header, Mark, Marks, ROBOT, Segment, Verdict, Zone, Zones};

@@ -1,4 +1,4 @@
-//! How many samples were how old: a histogram of times that keeps three digits of each. Refuses to know what they are times of.
+//! A histogram of times with three significant digits. Refuses to know what is timed.
 
 use hdrhistogram::Histogram;
 use serde::Serialize;

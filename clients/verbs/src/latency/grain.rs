@@ -1,4 +1,4 @@
-//! How finely this machine can tell the time, which no latency can be measured better than.
+//! The resolution of the clock of this machine: no latency can be measured more finely.
 
 use rustix::time::{ClockId, Timespec, clock_getres};
 use scanhub_client::clock::now_ns;

@@ -1,5 +1,5 @@
-//! Real-time priority and locked memory for whoever measures, as far as the system permits: another program that is busy
-//! shall not be taken for latency. Refuses to know what is measured.
+//! Real-time priority and locked memory for a measurement, as far as the system permits: the load of other programs
+//! must not count as latency. Refuses to know what is measured.
 
 use scanhub_client::Wait;
 use std::io;

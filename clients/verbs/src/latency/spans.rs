@@ -1,5 +1,5 @@
-//! Where the age of a sample came from, as far as its stamps tell: the line, the hub, the way to the consumer, another
-//! machine. Time is an argument; refuses to know how samples come and how the result is shown.
+//! Divides the age of a sample, as far as its stamps allow: time on the line, in the hub, on the way to the consumer,
+//! on another machine. Time is an argument; refuses to know how samples arrive and how the result is shown.
 
 use schema::{Flags, Header};
 
@@ -127,7 +127,7 @@ impl Spans {
 /// network, which takes longer than that.
 const OWN_WORD_NS: u64 = 10_000;
 
-/// Both stamps were taken from a telegram: they are one and the same where something is said without one.
+/// Both stamps come from a telegram; they are equal in a sample that was published without one.
 fn is_of_bytes(header: &Header) -> bool {
     header.flags & Flags::STAMP_ESTIMATED == 0 && header.stamp_first_ns < header.stamp_last_ns
 }

@@ -1,5 +1,5 @@
-//! A light of the machine that Linux offers as a directory of files (Documentation/leds/leds-class.rst): switched on and
-//! off where it changed, taken up again when it comes back. Refuses to know what it stands for; time is an argument.
+//! An LED of the machine, which Linux offers as a directory of files (Documentation/leds/leds-class.rst): written only
+//! when its state changes, and used again when it comes back. Refuses to know what it stands for; time is an argument.
 
 use std::fs::{self, File};
 use std::io::{self, Write};
@@ -122,7 +122,7 @@ impl Device {
     }
 }
 
-/// Writes to a file that is there; one that went away is not made anew.
+/// Writes to an existing file; never creates one.
 fn write(path: &Path, content: &[u8]) -> io::Result<()> {
     File::options().write(true).truncate(true).open(path)?.write_all(content)
 }

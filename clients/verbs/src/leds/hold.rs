@@ -1,5 +1,5 @@
-//! How long a light stays: what is shown is the worst verdict of the last moments. A worse one is shown at once, a better
-//! one once it has stood, so that nobody has to read a light that flickers. Time is an argument; refuses to know lights.
+//! How long a verdict is shown: always the worst one of the last moments. A worse one is shown at once, a better one
+//! after it has lasted, so that the light does not flicker. Time is an argument; refuses to know lights.
 
 use std::time::{Duration, Instant};
 
@@ -41,7 +41,7 @@ impl Hold {
         said.fold(&self.now, |worst, said| if worst.0.worse(said.0) == said.0 { said } else { worst })
     }
 
-    /// When that may change although nothing is said.
+    /// When that may change without a new verdict.
     pub(crate) fn changes_at(&self) -> Option<Instant> {
         self.before.iter().filter_map(|(_, until)| until.checked_add(self.moments)).min()
     }

@@ -1,4 +1,4 @@
-//! Which lights are on: what a verdict and a number of marks look like on the unit's housing, and in a line of text.
+//! Which lights are on for a verdict and a number of marks, as LEDs and as a line of text.
 
 use std::io::{self, Write};
 

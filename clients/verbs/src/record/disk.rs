@@ -1,5 +1,5 @@
-//! The thread that writes: takes what waits ten times a second, makes a chunk of it and has it written. A disk that is
-//! full, slow or gone is told and tried again; meanwhile what comes waits in the queue. Refuses to know who receives.
+//! The thread that writes: takes the queue ten times a second, makes a chunk and writes it. If the disk is full, slow
+//! or missing, it reports that and tries again, while new samples wait in the queue. Refuses to know who receives.
 
 use std::collections::BTreeMap;
 use std::fs::File;
@@ -266,7 +266,7 @@ impl Disk {
     }
 }
 
-/// What is told of a run, with the number of the file among those of the run.
+/// The report of a run, with the number of the file within the run.
 fn numbered(facts: &BTreeMap<String, String>, files: Option<&Files>) -> BTreeMap<String, String> {
     let mut facts = facts.clone();
     facts.insert("part".to_owned(), files.map_or(1, Files::count).to_string());

@@ -1,4 +1,5 @@
-//! The files of a run: their names, when the next one is due, and which of them are kept. Refuses to know what is in them.
+//! The files of a run: their names, when the next one starts, and which of them are kept. Refuses to know what is in
+//! them.
 
 use std::fs::{self, File};
 use std::io::{self, ErrorKind};

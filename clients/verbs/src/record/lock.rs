@@ -1,5 +1,5 @@
-//! One writer a file: two would each write over what the other wrote, and both would say that all is well. Refuses to know
-//! what is written.
+//! Allows one writer per file: two would overwrite each other, and neither would notice. Refuses to know what is
+//! written.
 
 use std::fs::{self, File, TryLockError};
 use std::io::{self, ErrorKind};

@@ -1,4 +1,4 @@
-//! Where nothing can be recorded, and what helps. Refuses to open anything.
+//! Why a path cannot hold a recording, and what helps. Refuses to open anything.
 
 use std::fs;
 use std::io::{self, ErrorKind};
@@ -7,7 +7,7 @@ use std::path::Path;
 
 use schema::{Failure, Kind};
 
-/// What stands at `path` is no place for a recording, whoever may write there; `force` takes a device all the same.
+/// The file at `path` cannot hold a recording, whatever its permissions; `force` accepts a device all the same.
 ///
 /// [`Kind::Output`] with what would be one.
 pub(super) fn check(path: &Path, force: bool) -> Result<(), Failure> {

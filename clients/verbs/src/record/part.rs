@@ -1,5 +1,5 @@
-//! One file of a recording. It is made in memory, chunk by chunk, and then written: a disk that refuses a chunk gets it
-//! again, and what stands there is always a whole number of them. Refuses to know why and when.
+//! One file of a recording. Each chunk is made in memory and then written: if the disk refuses it, it is written
+//! again, so the file always has a whole number of chunks. Refuses to know when to write.
 
 use std::collections::BTreeMap;
 use std::fs::{self, File};

@@ -1,5 +1,6 @@
-//! What was received and is in no file yet: bounded, so that a disk that stands still costs samples and never memory, and
-//! handed over whole, so that who receives waits for nobody. Refuses to know disks and forms of files.
+//! Samples that were received and are in no file yet. The queue is bounded, so that a stalled disk costs samples and
+//! not memory; the writer takes all of it at once, so that the receiver never waits. Refuses to know disks and file
+//! formats.
 
 use std::sync::{Condvar, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};

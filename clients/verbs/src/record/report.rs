@@ -1,4 +1,5 @@
-//! What a recorder tells of itself: lines of JSON, or text and one line that is drawn over itself. Refuses to know why.
+//! The reports of a recorder: lines of JSON, or text with one progress line that is redrawn. Refuses to know the
+//! reasons.
 
 use std::io::{self, Write};
 use std::os::fd::OwnedFd;
@@ -16,7 +17,7 @@ use crate::output::{End, Output, columns, fitting};
 use crate::receive_stats::ReceiveStats;
 use crate::{json, text};
 
-/// Where it is told.
+/// Where the reports go.
 pub(super) struct Report<'a> {
     look: RecordLook,
     out: Output<'a>,

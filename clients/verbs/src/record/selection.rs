@@ -1,4 +1,4 @@
-//! What is recorded: topics that are named, and topics of all sensors. Refuses to know which sensors there are.
+//! Which topics are recorded: named ones, and topics of all sensors. Refuses to know which sensors there are.
 
 use schema::{Failure, Kind, Topic};
 

@@ -1,4 +1,4 @@
-//! What the writing thread says to the one that receives: how far it came, and what happened. Refuses to know how it is told.
+//! Progress and events that the writing thread passes to the receiving thread. Refuses to know how they are shown.
 
 use std::path::PathBuf;
 use std::sync::{Mutex, MutexGuard, PoisonError};

@@ -1,4 +1,4 @@
-//! The lines of what the hub makes of a scan. No contract, as its parent.
+//! The lines of the results that the hub computes from a scan. Not a contract, like its parent module.
 
 use std::io::{self, Write};
 

@@ -1,5 +1,5 @@
-//! A scene as a screen: the verdict in words, the picture, a line for each sensor, and the keys. Pure: the same scene and
-//! view give the same cells. Refuses to know what is on the screen already.
+//! Draws a scene: the verdict in words, the picture, a line per sensor, and the keys. Pure: the same scene and view
+//! give the same cells. Refuses to know what is on the screen.
 
 use ratatui::Frame;
 use ratatui::layout::Rect;

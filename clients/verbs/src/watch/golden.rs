@@ -1,6 +1,6 @@
 //! Whole screens of a scene that is made up here, cell by cell, as they stand in `tests/watch`, and the picture of the
-//! documents. Where one changes and shall,
-//! `SCANHUB_GOLDEN=write cargo test -p scanhub-verbs --features tui golden` writes them anew.
+//! documents. To accept a change, `SCANHUB_GOLDEN=write cargo test -p scanhub-verbs --features tui golden` writes them
+//! again.
 
 use std::f64::consts::PI;
 use std::path::Path;

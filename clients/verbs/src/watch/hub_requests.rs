@@ -1,5 +1,5 @@
-//! What a person asks of the hub while watching: the background learned anew, held, or learned on. In a thread of its
-//! own, because a hub may take its time and the picture shall not.
+//! Requests to the hub while watching: reset, freeze or thaw the background. They run in a thread of their own,
+//! because a slow hub must not delay the picture.
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};

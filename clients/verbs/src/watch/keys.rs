@@ -1,5 +1,5 @@
-//! What is typed at a terminal, taken from it as it is there: never waits, and tells a terminal that was closed from one at
-//! which nobody types. Refuses to know what a key means.
+//! Reads keys from the terminal without waiting, and distinguishes a closed terminal from one where nobody types.
+//! Refuses to know what a key means.
 
 use std::collections::VecDeque;
 use std::fs::File;
@@ -46,7 +46,7 @@ impl Keys {
     pub(crate) fn next(&mut self) -> io::Result<Option<Key>> {
         if self.typed.is_empty() {
             let mut fds = [PollFd::new(&self.terminal, PollFlags::IN)];
-            // A signal that came meanwhile is looked at by who is told of it.
+            // The caller handles a signal that came during the read.
             let is_there = poll(&mut fds, Some(&Timespec::default())).is_ok_and(|count| count > 0);
             if is_there {
                 let mut piece = [0; 256];

@@ -1,5 +1,5 @@
-//! The robot from above: what its sensors see, as points in Braille, ahead is up. What has a colour has another sign too
-//! where there are none.
+//! The robot from above: what its sensors see, as Braille dots; ahead is up. Without colours, another sign replaces
+//! each colour.
 
 use ratatui::style::Color;
 use ratatui::symbols::Marker;

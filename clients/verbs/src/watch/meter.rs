@@ -1,4 +1,4 @@
-//! How often the scans of a sensor come, and how old they are on arrival, over the last moments. Time is an argument.
+//! Rate of the scans of a sensor and their age on arrival, over a short window. Time is an argument.
 
 use std::collections::VecDeque;
 

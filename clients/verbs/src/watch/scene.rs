@@ -1,5 +1,5 @@
-//! What is known of the robot and its surroundings: the last of every topic of every sensor. Refuses to know a terminal;
-//! time is an argument.
+//! What is known of the robot and its surroundings: the last sample of each topic of each sensor. Refuses to know the
+//! terminal; time is an argument.
 
 use schema::{
     Background, Counter, Foreground, Header, Marks, Pose, Scan, State, Status, Verdict, Zones, is_remote,
@@ -71,7 +71,7 @@ impl Scene {
         any
     }
 
-    /// The hub went: nothing of what it said stands any more but the background, which nobody acts on.
+    /// The hub is gone: all of its data is discarded except for the background, which is only drawn.
     pub(crate) fn hub_gone(&mut self) {
         (self.hub_lives, self.hub_pid, self.hub_percent) = (false, 0, None);
         for sensor in &mut self.sensors {

@@ -1,5 +1,5 @@
-//! The terminal as a sheet: taken over at the start, and given back as it was however it ends. A frame is one write.
-//! Refuses to know what is drawn.
+//! The terminal: taken over at the start, and restored however the program ends. A frame is one write. Refuses to know
+//! what is drawn.
 
 use std::cell::Cell;
 use std::io::{self, ErrorKind, Write};
@@ -116,7 +116,7 @@ fn size() -> Option<(u16, u16)> {
     tcgetwinsize(io::stdout()).ok().map(|size| (size.ws_col, size.ws_row))
 }
 
-/// Whether the terminal was closed: whoever draws nothing would not notice, and not everybody is sent a signal.
+/// Whether the terminal was closed: a program that draws nothing would not notice, and not every one gets a signal.
 fn hung_up() -> bool {
     let stdout = io::stdout();
     let mut ends = [PollFd::new(&stdout, PollFlags::empty())];

@@ -1,4 +1,5 @@
-//! What of a scene is shown, and how large; and what keys make of that. Refuses to know a terminal but for its keys.
+//! Which part of a scene is shown and at which scale, and how keys change that. Of the terminal it knows only the
+//! keys.
 
 use super::keys::Key;
 use super::scene::{Scene, Sensor};
@@ -36,7 +37,7 @@ pub(crate) enum Wish {
     Quit,
     /// To end, as by a signal.
     Interrupt,
-    /// To learn the background anew.
+    /// To learn the background again.
     Reset,
     /// To hold the background, or to let it be learned on.
     Freeze,
@@ -163,7 +164,7 @@ const FARTHEST_M: f64 = 200.0;
 /// At least so much around the robot.
 const LEAST_M: f64 = 0.5;
 const MARGIN: f64 = 1.1;
-/// A picture that would be enough at this share of its size is drawn anew.
+/// A picture that would be enough at this share of its size is redrawn.
 const TOO_SMALL: f64 = 0.6;
 /// One of so many points, at either end, is not worth a smaller picture.
 const OUTLIERS: usize = 50;

@@ -1,4 +1,4 @@
-//! The processor time that the hub takes, as the kernel counts it. Refuses to know what the hub does with it.
+//! The processor time of the hub, as the kernel counts it. Refuses to know what the hub does.
 
 use std::collections::VecDeque;
 use std::time::{Duration, Instant};

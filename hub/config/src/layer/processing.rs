@@ -137,23 +137,23 @@ impl Sections {
         Ok(())
     }
 
-    /// Where the sensor's place is said, if it is.
+    /// Where the sensor's pose is set, if it is.
     pub(super) fn pose(&self) -> Option<Range<usize>> {
         let PoseLayer { x, y, yaw, .. } = self.pose.as_ref()?;
         [x, y, yaw].into_iter().flatten().map(Spanned::span).next()
     }
 
-    /// Where it is said what the background begins with, if it is.
+    /// Where the initial background is set, if it is.
     pub(super) fn start(&self) -> Option<Range<usize>> {
         self.background.as_ref()?.start.as_ref().map(Spanned::span)
     }
 
-    /// Where the robot's own body is said, if it is.
+    /// Where the robot's own body is set, if it is.
     pub(super) fn self_min(&self) -> Option<Range<usize>> {
         self.zones.as_ref()?.self_min.as_ref().map(Spanned::span)
     }
 
-    /// Where it is said how many beams violate a circle, if it is.
+    /// Where the number of beams that violate a circle is set, if it is.
     pub(super) fn min_beams(&self) -> Option<Range<usize>> {
         self.zones.as_ref()?.min_beams.as_ref().map(Spanned::span)
     }
@@ -323,5 +323,5 @@ fn in_sector(origin: &Origin, sector: Spanned<SectorLayer>) -> Result<Sector, Fa
 const FARTHEST_M: f64 = 100.0;
 /// A radius in mm fits 16 bits.
 const LARGEST_M: f64 = 65.0;
-/// A full turn either way: whoever writes degrees is told.
+/// A full turn either way: a larger value was written in degrees by mistake, and is refused.
 const TURN: f64 = 2.0 * std::f64::consts::PI;

@@ -1,8 +1,8 @@
 //! A background with several surfaces a beam: at edges a beam flips between two of them, and both are learned. Refuses
-//! to know how many beams something has to cover until it is believed: that is for the runs.
+//! to know how many neighbouring beams make an object: `runs` decides that.
 //!
-//! All beams take the same steps, whatever they meet, so that a processor does several of them at once. The constants
-//! were found on seeds 0 to 9 of the simulated scenes, by `benches/foreground`.
+//! All beams take the same steps, whatever they hit, so that the compiler can vectorise them. The constants were found
+//! on seeds 0 to 9 of the simulated scenes, by `benches/foreground`.
 
 use super::runs::Runs;
 use super::settings::Limits;
@@ -129,8 +129,8 @@ impl Multi {
         self.slots[0].weight[i] = u16::MAX;
     }
 
-    /// The best known background of beam `i`, of equals the nearer one; a surface before nothing, however often nothing comes
-    /// back from it: whoever begins with that alone would take the surface for somebody.
+    /// The best known background of beam `i`, of equals the nearer one; a surface before nothing, however often
+    /// nothing comes back from it: a model that starts with that range alone would report the surface as foreground.
     pub(super) fn background(&self, i: usize, limits: &Limits) -> u16 {
         let known = |slots: &&Slots| slots.weight[i] >= Bounds::of(limits).known;
         let rank = |s: &&Slots| (s.range[i] != Background::FAR, s.weight[i], u16::MAX - s.range[i]);
@@ -210,7 +210,7 @@ const RETURNED_OF: u16 = 16;
 /// of the scans that are set, and what is met in more than a third of the scans becomes one in the end.
 const PASSED: u16 = 4;
 /// Weight lost in a scan that saw something before the surface, which may still be there. Not 0: else all slots could
-/// be taken by what is hidden for ever.
+/// be taken by a surface that stays hidden.
 const HIDDEN: u16 = 1;
 /// Weight per scan that is set, from which on a surface is background: 5/8 of the full weight, so that readings may be
 /// missing.

@@ -1,7 +1,7 @@
-//! The paper's background, value for value: one range a beam, replaced by what was read so many times in a row. A beam
-//! that flips between two surfaces never learns either.
+//! The paper's background, value for value: one range per beam, replaced by a new range once that was read a number of
+//! times in a row. A beam that flips between two surfaces never learns either.
 //!
-//! All beams take the same steps, whatever they meet, so that a processor does several of them at once.
+//! All beams take the same steps, whatever they hit, so that the compiler can vectorise them.
 
 use super::settings::Limits;
 use super::{Class, INVALID};

@@ -1,5 +1,5 @@
-//! How many neighbouring beams, and how often, until it is believed that something is there: noise and mixed readings
-//! at edges are lone beams, people are not, but for those far away. Knows nothing of backgrounds.
+//! Decides how many neighbouring beams, in how many scans, count as an object. Noise and mixed readings at edges are
+//! single beams; people cover several, unless they are far away. Refuses to know backgrounds.
 
 use super::settings::Limits;
 use super::{Class, INVALID};

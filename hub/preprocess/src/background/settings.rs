@@ -1,5 +1,5 @@
-//! How a background is learned, and what that means for scans of one shape. Refuses to know where the settings come
-//! from.
+//! The settings of a background, and the limits that follow from them for scans of one resolution and unit. Refuses to
+//! know where the settings come from.
 
 use schema::Scan;
 

@@ -1,5 +1,5 @@
-//! Which reading is nearest to the robot's centre: exact to the floored millimetre, although few beams are looked at one
-//! by one. Refuses to know circles.
+//! Finds the reading that is nearest to the robot's centre, exact to the millimetre (rounded down), while only a few
+//! beams are computed one by one. Refuses to know circles.
 
 use super::spans::{Ranges, Spans};
 use schema::BEAMS;

@@ -1,4 +1,5 @@
-//! For each beam the values that count, as one comparison of integers in device units. Refuses to know what for.
+//! The values of each beam that lie within a span, tested by one comparison of integers in device units. Refuses to
+//! know what the span is for.
 
 use schema::BEAMS;
 

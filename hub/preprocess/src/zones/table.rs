@@ -1,5 +1,5 @@
-//! Where the beams of a sensor meet circles around the robot's centre. Made once for a layout of beams, in floating point
-//! and millimetres; read with every scan, in device units. Refuses to know verdicts.
+//! Where the beams of a sensor cross the circles around the robot's centre. Computed once per beam layout, in floating
+//! point and millimetres; used for every scan, in device units. Refuses to know verdicts.
 
 use super::nearest::Nearest;
 use super::spans::{Ranges, Spans};
@@ -106,7 +106,7 @@ impl Table {
         self.layout
     }
 
-    /// Makes the table anew.
+    /// Computes the table again.
     pub(super) fn make(&mut self, layout: Layout) {
         let scan = layout.scan();
         self.layout = layout;

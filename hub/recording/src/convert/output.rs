@@ -44,7 +44,7 @@ impl Place {
         Ok(Place { path: path.to_owned(), beside: Some(path.with_file_name(hidden)) })
     }
 
-    /// Whether `error` says that whoever reads stdout has had enough.
+    /// Whether `error` says that the reader of stdout closed it.
     pub(super) fn is_closed(&self, error: &io::Error) -> bool {
         self.beside.is_none() && error.kind() == io::ErrorKind::BrokenPipe
     }
@@ -58,7 +58,7 @@ impl Place {
         Ok(BufWriter::with_capacity(BUFFER, file))
     }
 
-    /// What was written is whole now. `false` if whoever reads stdout has had enough before that.
+    /// Completes the output. `false` if the reader of stdout closed it before that.
     pub(super) fn put(mut self, mut file: BufWriter<Box<dyn Write>>) -> Result<bool, Failure> {
         let put = || {
             file.flush()?;

@@ -99,7 +99,7 @@ impl Channels {
     }
 }
 
-/// What a channel is said to be in a file that is harmed: a few bytes of a name may be others, or more.
+/// What a damaged file says about a channel: some bytes of a name may be wrong.
 const MOST_LIKELY: usize = 4;
 /// Of sixteen hubs with as many sensors as one can have.
 const MOST_SENSORS: usize = 4096;

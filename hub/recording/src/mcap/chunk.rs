@@ -51,7 +51,7 @@ fn check(head: &exact::ChunkHead<'_>) -> Result<(), McapError> {
     let mut sum = Crc::new();
     sum.update(head.content);
     let (saved, calculated) = (head.checksum, sum.sum());
-    // 0: whoever wrote it did not say.
+    // 0: the writer did not set it.
     if saved != 0 && saved != calculated {
         return Err(McapError::BadChunkCrc { saved, calculated });
     }

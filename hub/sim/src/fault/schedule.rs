@@ -73,6 +73,12 @@ impl Window {
         Window { begins, span_ns: nanos(span_s), until_ns: 0 }
     }
 
+    /// One span, which begins at `begin_ns`.
+    pub(crate) fn once(begin_ns: Nanos, span_ns: Nanos) -> Window {
+        let begins = Schedule { next_ns: begin_ns, ..Schedule::never() };
+        Window { begins, span_ns, until_ns: 0 }
+    }
+
     /// When nothing arrives.
     pub(crate) fn silences(faults: &Faults, seed: u64) -> Window {
         Window::new(faults.silence, faults.silence_at, faults.silence_every, random(seed, 8))

@@ -3,7 +3,7 @@
 use std::fmt;
 
 use lms::operating;
-use lms_configure::{Change, Failing, Kept, Outcome, Plan, Step};
+use lms_configure::{Change, Failing, Outcome, OwnedConfiguration, Plan, Step};
 use schema::{Failure, Kind};
 use serde::Serialize;
 
@@ -80,7 +80,7 @@ impl Configured {
         }
         Ok(Configured {
             written: true,
-            after: hex(outcome.configuration.as_ref().map_or(&[], Kept::bytes)),
+            after: hex(outcome.configuration.as_ref().map_or(&[], OwnedConfiguration::bytes)),
             operating_mode: outcome.operating_mode.unwrap_or_default(),
             back: Back::of(plan, was_permanent),
             ..Configured::nothing(port, plan)

@@ -4,7 +4,7 @@
 use lms::family::Family;
 use lms::inquiry::Report;
 use lms::variant::{Mode, Unit};
-use lms_configure::{Kept, Plan, eeprom::PowerOn};
+use lms_configure::{OwnedConfiguration, Plan, eeprom::PowerOn};
 use schema::{Failure, Kind};
 
 /// Everything that is wanted.
@@ -20,7 +20,7 @@ enum Setting {
     Indices(bool),
     Sensitivity(u8),
     PowerOn(PowerOn),
-    Configuration(Kept),
+    Configuration(OwnedConfiguration),
 }
 
 impl Wanted {
@@ -70,11 +70,11 @@ impl Wanted {
                     let needed = power_on == PowerOn::KeepBaud || is_set;
                     plan.power_on = needed.then_some(power_on);
                 }
-                Setting::Configuration(kept) if kept.bytes().len() != plan.old.bytes().len() => {
-                    let (is, given) = (plan.old.bytes().len(), kept.bytes().len());
+                Setting::Configuration(given) if given.bytes().len() != plan.old.bytes().len() => {
+                    let (is, given) = (plan.old.bytes().len(), given.bytes().len());
                     return Err(refused("configuration", &format!("it has {is} bytes, not {given}")));
                 }
-                Setting::Configuration(kept) => plan.new = kept,
+                Setting::Configuration(given) => plan.new = given,
             }
         }
         Ok(())
@@ -140,7 +140,12 @@ const KEYS: [(&str, &str, Parse); 7] = [
         let digits: Vec<u8> = value.chars().map(|c| Some(c.to_digit(16)? as u8)).collect::<Option<_>>()?;
         let bytes: Vec<u8> =
             digits.chunks(2).map(|pair| pair.iter().fold(0, |sum, d| sum << 4 | d)).collect();
-        digits.len().is_multiple_of(2).then(|| Kept::new(&bytes)).flatten().map(Setting::Configuration)
+        digits
+            .len()
+            .is_multiple_of(2)
+            .then(|| OwnedConfiguration::new(&bytes))
+            .flatten()
+            .map(Setting::Configuration)
     }),
 ];
 
@@ -190,7 +195,7 @@ mod tests {
     use lms::variant::Baud;
 
     fn plan() -> Plan {
-        let old = Kept::new(&factory(Mode(1), Unit::Mm)).unwrap();
+        let old = OwnedConfiguration::new(&factory(Mode(1), Unit::Mm)).unwrap();
         Plan {
             baud: Baud::B9600,
             address: 0,

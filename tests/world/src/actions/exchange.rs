@@ -3,6 +3,7 @@
 use lms::variant::Baud;
 
 use super::{Key, Kind, SENSOR};
+use crate::event::Event;
 use crate::plan::Action;
 use crate::world::World;
 
@@ -16,8 +17,10 @@ pub(crate) const KIND: Kind = Kind {
 fn act(world: &mut World, action: &Action) {
     let baud = Baud::ALL[action.value("rate") as usize % Baud::ALL.len()];
     let streams = action.value("streams") > 0;
-    world.port(world.sensor(action), |tty, log, now| {
+    let sensor = world.sensor(action);
+    world.port(sensor, |tty, log, now| {
         tty.advance(now, log);
         tty.sensor.exchange(baud, streams);
     });
+    world.shared.tell(&Event::Exchanged { sensor });
 }

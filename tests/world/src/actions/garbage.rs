@@ -20,8 +20,12 @@ pub(crate) const KIND: Kind = Kind {
 };
 
 fn act(world: &mut World, action: &Action) {
+    world.fault(action, &faults(action));
+}
+
+/// What it does to the bytes on the line.
+pub(super) fn faults(action: &Action) -> Faults {
     let every = action.value("every_ms") as f64 / 1e3;
     let (flood, wall) = (action.value("flood") as f64, action.value("wall") as f64);
-    let faults = Faults { flood, flood_every: every, wall, wall_every: every, ..Faults::default() };
-    world.fault(action, &faults);
+    Faults { flood, flood_every: every, wall, wall_every: every, ..Faults::default() }
 }

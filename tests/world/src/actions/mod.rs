@@ -29,6 +29,9 @@ mod telegrams;
 mod unplug;
 mod wall_step;
 
+use lms::Nanos;
+use sim::fault::Faults;
+
 use crate::plan::Action;
 use crate::world::World;
 
@@ -91,6 +94,21 @@ pub(crate) const KINDS: &[Kind] = &[
     gateway_killed::KIND,
     listener_killed::KIND,
 ];
+
+/// What `action` does to the bytes on a line from `now` on, if it is of such a kind.
+pub(crate) fn faults(action: &Action, now: Nanos) -> Option<Faults> {
+    let name = action.name();
+    if name == silence::KIND.name {
+        return Some(silence::faults(action, now, Nanos::MAX));
+    }
+    type Of = (&'static Kind, fn(&Action) -> Faults);
+    let of: [Of; 3] = [
+        (&garbage::KIND, garbage::faults),
+        (&noise::KIND, noise::faults),
+        (&telegrams::KIND, telegrams::faults),
+    ];
+    of.into_iter().find(|(kind, _)| kind.name == name).map(|(_, faults)| faults(action))
+}
 
 impl Kind {
     /// Values for its keys: small ones as often as great ones where the range is wide.

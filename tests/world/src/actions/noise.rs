@@ -23,9 +23,14 @@ pub(crate) const KIND: Kind = Kind {
 };
 
 fn act(world: &mut World, action: &Action) {
+    world.fault(action, &faults(action));
+}
+
+/// What it does to the bytes on the line.
+pub(super) fn faults(action: &Action) -> Faults {
     let share = |name| action.value(name) as f64 / 1e5;
     let burst = action.value("burst") as f64;
-    let faults = Faults {
+    Faults {
         loss: share("loss"),
         flip: share("flip"),
         insert: share("insert"),
@@ -34,6 +39,5 @@ fn act(world: &mut World, action: &Action) {
         flip_bits: burst,
         insert_burst: burst,
         ..Faults::default()
-    };
-    world.fault(action, &faults);
+    }
 }

@@ -1,5 +1,6 @@
 //! Nothing arrives for a while, or everything arrives late.
 
+use lms::{MILLIS, Nanos};
 use sim::fault::Faults;
 
 use super::{Key, Kind, SENSOR};
@@ -14,10 +15,17 @@ pub(crate) const KIND: Kind = Kind {
 };
 
 fn act(world: &mut World, action: &Action) {
-    let (span, at) = (action.value("span_ms") as f64 / 1e3, world.now() as f64 / 1e9 + 1e-3);
-    let faults = match action.value("is_late") {
+    // What is held back when everything is made well again would still be.
+    let faults = faults(action, world.now(), world.until_healed());
+    world.fault(action, &faults);
+}
+
+/// What it does to the bytes on the line from `now` on, for so long at the `most`.
+pub(super) fn faults(action: &Action, now: Nanos, most: Nanos) -> Faults {
+    let span = (action.value("span_ms") * MILLIS).min(most) as f64 / 1e9;
+    let at = now as f64 / 1e9 + 1e-3;
+    match action.value("is_late") {
         0 => Faults { silence: span, silence_at: at, ..Faults::default() },
         _ => Faults { stall: span, stall_at: at, ..Faults::default() },
-    };
-    world.fault(action, &faults);
+    }
 }

@@ -23,13 +23,17 @@ pub(crate) const KIND: Kind = Kind {
 };
 
 fn act(world: &mut World, action: &Action) {
+    world.fault(action, &faults(action));
+}
+
+/// What it does to the bytes on the line.
+pub(super) fn faults(action: &Action) -> Faults {
     let share = |name| action.value(name) as f64 / 1e2;
-    let faults = Faults {
+    Faults {
         truncate: share("truncate"),
         length: share("length"),
         repeat: share("repeat"),
         abort: share("abort"),
         ..Faults::default()
-    };
-    world.fault(action, &faults);
+    }
 }

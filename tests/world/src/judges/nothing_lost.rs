@@ -22,6 +22,8 @@ struct OfSensor {
     /// Place behind the last byte that the hub had read when it began to say that it streams, if it still says so.
     streams_from: Option<u64>,
     read: u64,
+    /// The hub streams from a sensor that is not there any more: one with other scans is met anew.
+    is_other: bool,
     /// Telegrams for which there was no memory.
     holes: usize,
 }
@@ -58,6 +60,11 @@ impl Judge for NothingLost {
                 let of = &mut self.sensors[sensor];
                 of.valid_from = of.read;
             }
+            Event::Exchanged { sensor } => {
+                let of = &mut self.sensors[sensor];
+                (of.streams_from, of.is_other) = (None, true);
+                of.end(at);
+            }
             Event::Closed { sensor } => self.sensors[sensor].end(at),
             Event::HubEnds { .. } => self.sensors.iter_mut().for_each(|of| of.end(at)),
             Event::Read { sensor, to, .. } => self.sensors[sensor].read(at, to),
@@ -71,9 +78,9 @@ impl Judge for NothingLost {
                 let status: Status = bytemuck::pod_read_unaligned(&sample.bytes);
                 let of = &mut self.sensors[sensor];
                 if status.state() != Some(State::Streaming) {
-                    of.streams_from = None;
+                    (of.streams_from, of.is_other) = (None, false);
                     of.end(at);
-                } else if of.streams_from.is_none() {
+                } else if of.streams_from.is_none() && !of.is_other {
                     of.streams_from = Some(of.read);
                 }
             }
@@ -128,7 +135,10 @@ impl OfSensor {
 
     /// A telegram is published. What was lost before it.
     fn publish(&mut self, bytes: &[u8]) -> Option<String> {
-        let found = self.sent.iter().position(|sent| sent.is_read && sent.bytes == bytes)?;
+        let is_it = |sent: &Sent| sent.is_read && sent.bytes == bytes;
+        // Replies are often the same, and of those that are, the whole one came.
+        let whole = self.sent.iter().position(|sent| sent.is_whole && is_it(sent));
+        let found = whole.or_else(|| self.sent.iter().position(is_it))?;
         let passed = self.sent.drain(..=found).take(found);
         let lost: Vec<Sent> = passed.filter(|sent| sent.due_at.is_some()).collect();
         let (count, holes) = (lost.len(), self.holes);

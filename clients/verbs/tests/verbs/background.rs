@@ -1,0 +1,249 @@
+//! `background` against a hub that keeps a model and nothing else.
+
+use std::fs;
+use std::os::unix::fs::{MetadataExt, PermissionsExt, chown};
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::thread::JoinHandle;
+use std::time::Duration;
+
+use crate::fake::Place;
+use schema::ipc::{self, ControlServer};
+use schema::{Background, Domain, Failure, HubLock, Kind, Response, Shown, Verb};
+use verbs::{BackgroundOptions, ModelOrder, background, saved_model};
+
+/// A hub that answers for the background of `front`.
+struct Keeper {
+    stop: Arc<AtomicBool>,
+    thread: Option<JoinHandle<()>>,
+}
+
+impl Keeper {
+    fn new(domain: &Domain, mut model: Background) -> Keeper {
+        let (stop, domain) = (Arc::new(AtomicBool::new(false)), domain.clone());
+        let lock = HubLock::acquire(domain.root()).unwrap();
+        let flag = stop.clone();
+        let (ready, is_ready) = std::sync::mpsc::channel();
+        let thread = std::thread::spawn(move || {
+            let _lock = lock;
+            let server = ControlServer::create(&ipc::hub_node(&domain).unwrap()).unwrap();
+            ready.send(()).unwrap();
+            while !flag.load(Ordering::Relaxed) {
+                while let Some(asked) = server.receive().unwrap() {
+                    let request = *asked.request();
+                    let answer = match (request.sensor(), request.verb()) {
+                        ("front", Some(verb)) => obey(&mut model, verb, &request.model()),
+                        (other, _) => Err(Failure::new(
+                            Kind::NoTopic,
+                            format!("the hub has no sensor {other}"),
+                            "there are front",
+                        )),
+                    };
+                    server.answer(asked, &Response(answer.map(|model| model.map(Shown::from)))).unwrap();
+                }
+                ipc::sleep(&[server.requests()], Duration::from_millis(5)).unwrap();
+            }
+        });
+        is_ready.recv().unwrap();
+        Keeper { stop, thread: Some(thread) }
+    }
+}
+
+impl Drop for Keeper {
+    fn drop(&mut self) {
+        self.stop.store(true, Ordering::Relaxed);
+        let _ = self.thread.take().map(JoinHandle::join);
+    }
+}
+
+fn obey(model: &mut Background, verb: Verb, wanted: &Background) -> Result<Option<Background>, Failure> {
+    match verb {
+        Verb::Reset => {
+            let Background { generation, count, unit_mm, flags, .. } = *model;
+            *model =
+                Background { generation: generation + 1, count, unit_mm, flags, ..Background::default() };
+        }
+        Verb::Freeze => model.flags = Background::FROZEN,
+        Verb::Thaw => model.flags = 0,
+        Verb::Load if (wanted.count, wanted.unit_mm) != (model.count, model.unit_mm) => {
+            let message = format!("front has {} beams, the model {}", model.count, wanted.count);
+            return Err(Failure::new(Kind::Configuration, message, "save one of this resolution"));
+        }
+        Verb::Load => *model = Background { generation: model.generation + 1, ..*wanted },
+        _ => return Ok(Some(*model)),
+    }
+    Ok(None)
+}
+
+fn model() -> Background {
+    let mut model = Background { generation: 4, taught: 3, count: 181, unit_mm: 10, ..Background::default() };
+    model.range_array[..4].copy_from_slice(&[400, 0, Background::FAR, 120]);
+    model
+}
+
+fn ask(place: &Place, sensor: &str, order: ModelOrder, json: bool) -> (Result<(), Failure>, String) {
+    let options = BackgroundOptions { sensor: sensor.into(), order, json, places: place.places() };
+    let mut out = Vec::new();
+    let end = background(&options, &mut out, &AtomicBool::new(false));
+    (end, String::from_utf8(out).unwrap())
+}
+
+/// To save a model where nothing is yet.
+fn keep(file: &Path) -> ModelOrder {
+    ModelOrder::Save { file: file.to_owned(), force: false }
+}
+
+#[test]
+fn a_model_is_saved_forgotten_and_loaded_again() {
+    let place = Place::new();
+    let _keeper = Keeper::new(&place.domain, model());
+    let file = place.base.join("model.json");
+    let say = |order| {
+        let (end, out) = ask(&place, "front", order, false);
+        assert_eq!(end, Ok(()));
+        out
+    };
+    assert_eq!(say(ModelOrder::Show), "front: generation 4: 3 of 181 beams known, 1 far, in 10 mm\n");
+    let saved = format!("front: 3 of 181 beams saved to {}\n", file.display());
+    assert_eq!(say(keep(&file)), saved);
+    assert_eq!(say(ModelOrder::Freeze), "front: freeze taken\n");
+    assert!(say(ModelOrder::Show).ends_with(", frozen\n"));
+    assert_eq!(say(ModelOrder::Thaw), "front: thaw taken\n");
+    assert_eq!(say(ModelOrder::Reset), "front: reset taken\n");
+    assert_eq!(say(ModelOrder::Show), "front: generation 5: 0 of 181 beams known, 0 far, in 10 mm\n");
+    let loaded = saved_model(&file, "front", false, &mut &b""[..]).unwrap();
+    assert_eq!(loaded, model());
+    assert_eq!(say(ModelOrder::Load(Box::new(loaded))), "front: load taken\n");
+    let (end, out) = ask(&place, "front", ModelOrder::Show, true);
+    assert_eq!(end, Ok(()));
+    assert_eq!(
+        out.split_at(160).0,
+        r#"{"class":"background","sensor":"front","generation":6,"taught":3,"unit_mm":10,"count":181,"first_angle_deg":0.0,"step_deg":1.0,"frozen":false,"ranges":[400,null,"#
+            .split_at(160)
+            .0
+    );
+    // What is shown is what a file is.
+    let (_, piped) = ask(&place, "front", keep(Path::new("-")), false);
+    assert_eq!(piped, out);
+    assert!(saved_model("-".as_ref(), "front", false, &mut out.as_bytes()).is_ok());
+    let (_, out) = ask(&place, "front", ModelOrder::Save { file: file.clone(), force: true }, true);
+    assert_eq!(
+        out,
+        format!(
+            "{{\"class\":\"saved\",\"sensor\":\"front\",\"file\":{:?},\"generation\":6,\"taught\":3,\"count\":181}}\n",
+            file.display().to_string()
+        )
+    );
+    let (_, out) = ask(&place, "front", ModelOrder::Thaw, true);
+    assert_eq!(out, "{\"class\":\"control\",\"sensor\":\"front\",\"verb\":\"thaw\",\"outcome\":\"taken\"}\n");
+}
+
+#[test]
+fn what_does_not_go_with_the_sensor_is_refused() {
+    let place = Place::new();
+    let _keeper = Keeper::new(&place.domain, Background { count: 361, ..model() });
+    let file = place.base.join("model.json");
+    ask(&place, "front", keep(&file), false).0.unwrap();
+
+    let foreign = saved_model(&file, "rear", false, &mut &b""[..]).unwrap_err();
+    let message = format!("{} is the background of front, not of rear", file.display());
+    assert_eq!((foreign.kind, foreign.message), (Kind::Configuration, message));
+    assert!(foreign.hint.contains("--any-sensor"));
+    assert!(saved_model(&file, "rear", true, &mut &b""[..]).is_ok());
+
+    // The hub says what it has; here it is another resolution.
+    let refused = ask(&place, "front", ModelOrder::Load(Box::new(model())), false).0.unwrap_err();
+    assert_eq!(
+        (refused.kind, refused.message.as_str()),
+        (Kind::Configuration, "front has 361 beams, the model 181")
+    );
+    let unknown = ask(&place, "rear", ModelOrder::Show, false).0.unwrap_err();
+    assert_eq!((unknown.kind, unknown.hint.as_str()), (Kind::NoTopic, "there are front"));
+    assert_eq!(ask(&place, "Front", ModelOrder::Show, false).0.unwrap_err().kind, Kind::Usage);
+
+    let text = fs::read(&file).unwrap();
+    fs::write(&file, &text[..text.len() / 2]).unwrap();
+    let cut = saved_model(&file, "front", false, &mut &b""[..]).unwrap_err();
+    assert!(cut.kind == Kind::Input && cut.message.contains("cut short"), "{cut}");
+    for unreadable in ["/dev/zero", "/nowhere/model.json", "/"] {
+        let failure = saved_model(unreadable.as_ref(), "front", false, &mut &b""[..]).unwrap_err();
+        assert!(failure.kind == Kind::Input && failure.message.contains(unreadable), "{failure}");
+    }
+}
+
+#[test]
+fn nothing_is_saved_by_halves() {
+    let place = Place::new();
+    let _keeper = Keeper::new(&place.domain, model());
+    let save = |file: PathBuf| ask(&place, "front", ModelOrder::Save { file, force: true }, false);
+    for impossible in ["/nowhere/model.json", "/"] {
+        let (end, out) = save(impossible.into());
+        let failure = end.unwrap_err();
+        assert!(failure.kind == Kind::Output && failure.message.contains(impossible), "{failure}");
+        assert_eq!(out, "");
+    }
+    // A link stays one, a device too, and nothing lies about.
+    let (file, link) = (place.base.join("model.json"), place.base.join("link"));
+    fs::write(&file, "old").unwrap();
+    std::os::unix::fs::symlink(&file, &link).unwrap();
+    save(link.clone()).0.unwrap();
+    assert!(fs::symlink_metadata(&link).unwrap().is_symlink());
+    assert!(saved_model(&file, "front", false, &mut &b""[..]).is_ok());
+    // Who may read it stays as it was.
+    let _ = chown(&file, Some(12_345), Some(12_345));
+    fs::set_permissions(&file, fs::Permissions::from_mode(0o640)).unwrap();
+    let rights = || fs::metadata(&file).map(|found| (found.mode(), found.uid(), found.gid())).unwrap();
+    let before = rights();
+    save(file.clone()).0.unwrap();
+    assert_eq!(rights(), before);
+    save("/dev/null".into()).0.unwrap();
+    assert!(!fs::metadata("/dev/null").unwrap().is_file());
+    let left: Vec<_> = fs::read_dir(&place.base).unwrap().map(|entry| entry.unwrap().file_name()).collect();
+    assert!(left.iter().all(|name| !name.to_string_lossy().starts_with('.')), "{left:?}");
+}
+
+#[test]
+fn what_is_there_is_replaced_only_if_it_may_be() {
+    let place = Place::new();
+    let _keeper = Keeper::new(&place.domain, model());
+    let file = place.base.join("model.json");
+    let save = |force| ask(&place, "front", ModelOrder::Save { file: file.clone(), force }, false).0;
+    save(false).unwrap();
+    fs::write(&file, "mine").unwrap();
+    let failure = save(false).unwrap_err();
+    assert_eq!((failure.kind, failure.hint.as_str()), (Kind::Output, "--force replaces it"));
+    assert_eq!(fs::read(&file).unwrap(), b"mine");
+    save(true).unwrap();
+    assert!(saved_model(&file, "front", false, &mut &b""[..]).is_ok());
+}
+
+#[test]
+fn a_model_that_knows_nothing_takes_no_others_place() {
+    let place = Place::new();
+    let _keeper = Keeper::new(&place.domain, model());
+    let file = place.base.join("model.json");
+    let say = |order| ask(&place, "front", order, false);
+    say(keep(&file)).0.unwrap();
+    say(ModelOrder::Freeze).0.unwrap();
+    let (_, out) = say(ModelOrder::Reset);
+    let hint = "it is frozen: nothing is learned until `scanhub background front thaw`";
+    assert_eq!(out, format!("front: reset taken\n{hint}\n"));
+    for to in [file.clone(), "-".into()] {
+        let (end, out) = say(ModelOrder::Save { file: to, force: true });
+        let failure = end.unwrap_err();
+        assert_eq!(failure.message, "the background of front has no known beam yet");
+        assert_eq!((failure.kind, out.as_str()), (Kind::Failed, ""));
+    }
+    assert_eq!(saved_model(&file, "front", false, &mut &b""[..]).unwrap().taught, 3);
+}
+
+#[test]
+fn before_the_first_scan_there_is_nothing_to_save() {
+    let place = Place::new();
+    let _keeper = Keeper::new(&place.domain, Background::default());
+    let file = place.base.join("model.json");
+    let failure = ask(&place, "front", keep(&file), false).0.unwrap_err();
+    assert_eq!((failure.kind, failure.message.as_str()), (Kind::Failed, "front has no background model yet"));
+    assert!(!file.exists());
+}

@@ -1,0 +1,321 @@
+//! `echo` to the letter: lines, notices, bounds and ends.
+
+use std::io::{self, Write};
+use std::sync::atomic::AtomicBool;
+use std::time::{Duration, Instant};
+
+use crate::fake::{FakeHub, Place, Verb};
+use schema::{Counter, Flags, Kind, Verdict};
+use verbs::{Bounds, EchoOptions, Format, echo};
+
+const ANSWER: [u8; 9] = [0x02, 0x80, 0x03, 0x00, 0xA0, 0x00, 0x10, 0x16, 0x0A];
+
+fn options(place: &Place, topics: &[&str], format: Format, bounds: Bounds) -> EchoOptions {
+    EchoOptions {
+        topics: topics.iter().map(|&it| it.into()).collect(),
+        format,
+        bounds,
+        places: place.places(),
+    }
+}
+
+fn start(place: &Place, topics: &[&str], format: Format, bounds: Bounds) -> Verb {
+    let options = options(place, topics, format, bounds);
+    Verb::start(move |out, notes, stop| echo(&options, out, notes, stop))
+}
+
+fn count(count: u64) -> Bounds {
+    Bounds { count: Some(count), ..Bounds::default() }
+}
+
+/// Without the last line, which carries times.
+fn but_last(text: &str) -> Vec<&str> {
+    let mut lines: Vec<_> = text.lines().collect();
+    lines.pop();
+    lines
+}
+
+#[test]
+fn scans_as_json() {
+    let place = Place::new();
+    let mut hub = FakeHub::new(&place.domain, &["front"], 0xAB);
+    let verb = start(&place, &["front/scan"], Format::Json, count(2));
+    hub.front().scan.await_subscribers(1);
+    hub.front().scan(&[1000, 0x1FFF, 0x1FF7, 7]);
+    hub.front().scan(&[]);
+    let (end, out, notes) = verb.join();
+    assert_eq!((end, notes.as_str()), (Ok(()), ""));
+    assert_eq!(
+        but_last(&out),
+        [
+            r#"{"class":"scan","sensor":"front","seq":0,"topic_seq":0,"stamp_ns":1000000000,"wall_ns":1700000000000000000,"boot":"00000000000000ab","quality":"clean","unit_mm":10,"first_angle_deg":0.0,"step_deg":0.5,"count":4,"ranges":[1000,null,null,7],"codes":[[1,0],[2,8]]}"#,
+            r#"{"class":"scan","sensor":"front","seq":1,"topic_seq":1,"stamp_ns":1000000001,"wall_ns":1700000000000000001,"boot":"00000000000000ab","quality":"clean","unit_mm":10,"first_angle_deg":0.0,"step_deg":0.5,"count":0,"ranges":[],"codes":[]}"#,
+        ]
+    );
+    let summary = out.lines().last().unwrap();
+    let begin = r#"{"class":"summary","sensor":"front","topic":"scan","received":2,"lost":0,"seconds":"#;
+    assert!(summary.starts_with(begin) && summary.contains(r#","hz":"#), "{summary}");
+}
+
+#[test]
+fn telegrams_and_status_as_json() {
+    let place = Place::new();
+    let mut hub = FakeHub::new(&place.domain, &["front"], 1);
+    let verb = start(&place, &["front/telegram", "front/status"], Format::Json, count(2));
+    hub.front().telegram.await_subscribers(1);
+    // What was asked for, and the state of the line beside it.
+    hub.front().status.await_subscribers(2);
+    hub.front().telegram(&ANSWER);
+    verb.out.await_lines("telegram", 1);
+    hub.front().status(|status| {
+        status.baud = 500_000;
+        status.set_port("/dev/ttyUSB0");
+        status.counters[Counter::RejectedCrc] = 3;
+    });
+    let (end, out, _) = verb.join();
+    assert_eq!(end, Ok(()));
+    assert_eq!(
+        out.lines().take(2).collect::<Vec<_>>(),
+        [
+            r#"{"class":"telegram","sensor":"front","seq":0,"topic_seq":0,"stamp_ns":1000000000,"wall_ns":1700000000000000000,"boot":"0000000000000001","quality":"clean","address":128,"command":160,"length":3,"data":"02800300a00010160a"}"#,
+            r#"{"class":"status","sensor":"front","state":"streaming","baud":500000,"mode":null,"type":"","unit_mm":null,"angle_deg":null,"step_deg":null,"hz":0.0,"port":"/dev/ttyUSB0","since_ns":0,"counters":{"bytes_read":0,"bytes_in_telegrams":0,"bytes_acknowledge":0,"bytes_discarded":0,"bytes_buffered":0,"telegrams":0,"suspect":0,"aborted":0,"resyncs":0,"reconnects":0,"lost_in_restart":0,"wakeups":0,"loan_failed":0,"rejected_address":0,"rejected_length":0,"rejected_command":0,"rejected_count":0,"rejected_crc":3,"rejected_vetoed":0,"rejected_superseded":0,"line_errors":0,"bytes_damaged":0,"damaged_ppm":0,"due_on_line":0,"lost_on_line":0,"lost_ppm":0},"last_error":"","pose":{"x_m":0.0,"y_m":0.0,"yaw_rad":0.0,"upside_down":false},"marks":{"available":null,"remedy":null},"damaged":0.0,"lost_on_line":null}"#,
+        ]
+    );
+    assert_eq!(out.lines().filter(|line| line.contains("summary")).count(), 2);
+}
+
+#[test]
+fn scans_as_columns_and_as_bytes() {
+    let place = Place::new();
+    let mut hub = FakeHub::new(&place.domain, &["front"], 1);
+    let csv = start(&place, &["front/scan"], Format::Csv, count(2));
+    let raw = start(&place, &["front/scan"], Format::Raw, count(1));
+    hub.front().scan.await_subscribers(2);
+    hub.front().scan(&[1000, 0x1FFF]);
+    hub.front().scan(&[5, 6]);
+    let (end, out, notes) = csv.join();
+    assert_eq!(end, Ok(()));
+    assert_eq!(
+        out.lines().collect::<Vec<_>>(),
+        [
+            "seq,topic_seq,stamp_ns,wall_ns,quality,unit_mm,first_angle_deg,step_deg,range_0,range_1",
+            "0,0,1000000000,1700000000000000000,clean,10,0,0.5,1000,",
+            "1,1,1000000001,1700000000000000001,clean,10,0,0.5,5,6",
+        ]
+    );
+    assert!(notes.starts_with("front/scan: 2 received, 0 lost"), "{notes}");
+    crate::fake::until("bytes", || raw.finished());
+    let bytes = raw.out.bytes();
+    assert_eq!((bytes.len(), &bytes[..4], &bytes[12..14]), (1216, &[2, 0, 10, 13][..], &[0xE8, 0x03][..]));
+}
+
+#[test]
+fn samples_as_text() {
+    let place = Place::new();
+    let mut hub = FakeHub::new(&place.domain, &["front"], 1);
+    let verb = start(&place, &["front/scan", "front/telegram"], Format::Text, count(2));
+    hub.front().scan.await_subscribers(1);
+    hub.front().telegram.await_subscribers(1);
+    hub.front().scan(&[1000, 900, 0x1FFF]);
+    verb.out.await_lines("front/scan", 1);
+    hub.front().telegram(&ANSWER);
+    let (_, out, _) = verb.join();
+    assert_eq!(
+        out.lines().take(2).collect::<Vec<_>>(),
+        [
+            "front/scan seq 0 topic_seq 0 at 1.000000 clean 3 beams 0 to 1 deg 2 valid nearest 9000 mm at 0.5 deg",
+            "front/telegram seq 1 topic_seq 0 at 1.000000 clean address 80 command a0 9 bytes 02800300a00010160a",
+        ]
+    );
+}
+
+#[test]
+fn a_gap_in_the_numbers_is_missed() {
+    let place = Place::new();
+    let mut hub = FakeHub::new(&place.domain, &["front"], 1);
+    let verb = start(&place, &["front/scan"], Format::Json, count(2));
+    hub.front().scan.await_subscribers(1);
+    hub.front().scan.topic_seq = 5;
+    hub.front().scan(&[1]);
+    hub.front().scan.topic_seq = 9;
+    hub.front().scan(&[1]);
+    let (_, out, _) = verb.join();
+    let lines: Vec<_> = out.lines().collect();
+    assert_eq!(lines[1], r#"{"class":"notice","kind":"missed","sensor":"front","topic":"scan","missed":3}"#);
+    assert!(lines[3].contains(r#""received":2,"lost":3"#), "{out}");
+}
+
+#[test]
+fn several_sensors_wake_one_echo() {
+    let place = Place::new();
+    let mut hub = FakeHub::new(&place.domain, &["front", "rear"], 1);
+    let verb = start(&place, &["front/scan", "rear/scan"], Format::Json, count(40));
+    for sensor in &hub.sensors {
+        sensor.scan.await_subscribers(1);
+    }
+    for sent in 1..=20 {
+        hub.sensors[0].scan(&[1]);
+        hub.sensors[1].scan(&[2]);
+        verb.out.await_lines("\"class\":\"scan\"", 2 * sent);
+    }
+    let (end, out, _) = verb.join();
+    assert_eq!(end, Ok(()));
+    for sensor in ["front", "rear"] {
+        let summary =
+            format!(r#""class":"summary","sensor":"{sensor}","topic":"scan","received":20,"lost":0"#);
+        assert!(out.contains(&summary), "{out}");
+    }
+}
+
+#[test]
+fn no_hub() {
+    let place = Place::new();
+    let began = Instant::now();
+    let (end, out, _) = start(&place, &["front/scan"], Format::Json, count(1)).join();
+    assert_eq!((end.unwrap_err().kind, began.elapsed() < Duration::from_secs(1)), (Kind::NoHub, true));
+    assert!(out.lines().all(|line| line.contains("summary")), "{out}");
+
+    let waiting = start(&place, &["front/scan"], Format::Json, Bounds::default());
+    waiting.out.await_lines("hub_gone", 1);
+    let mut hub = FakeHub::new(&place.domain, &["front"], 1);
+    waiting.out.await_lines("hub_back", 1);
+    hub.front().scan.await_subscribers(1);
+    hub.front().scan(&[1]);
+    waiting.out.await_lines(r#""class":"scan""#, 1);
+    waiting.stop();
+    let (end, out, _) = waiting.join();
+    assert_eq!((end, out.matches("hub_gone").count()), (Ok(()), 1));
+    assert!(out.lines().last().unwrap().contains("summary"), "{out}");
+}
+
+#[test]
+fn bounds_that_are_not_met() {
+    let place = Place::new();
+    let _hub = FakeHub::new(&place.domain, &["front"], 1);
+    let short = Some(Duration::from_millis(50));
+    let kind = |bounds| start(&place, &["front/scan"], Format::Json, bounds).join().0.map_err(|it| it.kind);
+    assert_eq!(kind(Bounds { timeout: short, ..Bounds::default() }), Err(Kind::Timeout));
+    assert_eq!(kind(Bounds { run_for: short, ..count(1) }), Err(Kind::Timeout));
+    assert_eq!(kind(Bounds { run_for: short, ..Bounds::default() }), Ok(()));
+    assert_eq!(kind(count(0)), Ok(()));
+    let interrupted = start(&place, &["front/scan"], Format::Json, count(1));
+    interrupted.stop();
+    assert_eq!(interrupted.join().0.map_err(|it| it.kind), Err(Kind::Interrupted));
+}
+
+#[test]
+fn all_sensors_and_all_topics() {
+    let place = Place::new();
+    let mut hub = FakeHub::new(&place.domain, &["front", "rear"], 1);
+    let verb = start(&place, &["*/scan", "rear/*"], Format::Json, count(3));
+    for sensor in &hub.sensors {
+        sensor.scan.await_subscribers(1);
+    }
+    hub.sensors[1].telegram.await_subscribers(1);
+    hub.sensors[0].scan(&[1]);
+    hub.sensors[1].scan(&[2]);
+    hub.sensors[1].telegram(&[2, 0x80, 0, 0]);
+    let (end, out, _) = verb.join();
+    assert_eq!(end, Ok(()));
+    for begin in [
+        r#"{"class":"scan","sensor":"front","#,
+        r#"{"class":"scan","sensor":"rear","#,
+        r#"{"class":"telegram","sensor":"rear","#,
+    ] {
+        assert_eq!(out.matches(begin).count(), 1, "{out}");
+    }
+    // One of the front's, all of the rear's, each once.
+    assert_eq!(out.matches(r#"{"class":"summary""#).count(), 1 + 7, "{out}");
+}
+
+#[test]
+fn what_the_hub_does_not_have() {
+    let place = Place::new();
+    let _hub = FakeHub::new(&place.domain, &["front", "rear"], 1);
+    let failure = start(&place, &["left/scan"], Format::Text, Bounds::default()).join().0.unwrap_err();
+    assert_eq!((failure.kind, failure.hint.as_str()), (Kind::NoTopic, "there are front, rear"));
+    for (topics, format, kind) in [
+        (&["front/zone"][..], Format::Text, Kind::Usage),
+        (&["front/status"], Format::Csv, Kind::Usage),
+        (&["front/scan", "rear/scan"], Format::Raw, Kind::Usage),
+        (&[], Format::Text, Kind::Usage),
+    ] {
+        let failure = start(&place, topics, format, Bounds::default()).join().0.unwrap_err();
+        assert_eq!(failure.kind, kind, "{topics:?}");
+    }
+}
+
+/// A pipe whose reader went away.
+struct Closed;
+
+impl Write for Closed {
+    fn write(&mut self, _: &[u8]) -> io::Result<usize> {
+        Err(io::ErrorKind::BrokenPipe.into())
+    }
+
+    fn flush(&mut self) -> io::Result<()> {
+        Ok(())
+    }
+}
+
+#[test]
+fn a_reader_that_goes_away_is_a_quiet_end() {
+    let place = Place::new();
+    let mut hub = FakeHub::new(&place.domain, &["front"], 1);
+    let options = options(&place, &["front/scan"], Format::Json, count(5));
+    let verb = Verb::start(move |_, notes, _| echo(&options, &mut Closed, notes, &AtomicBool::new(false)));
+    hub.front().scan.await_subscribers(1);
+    hub.front().scan(&[1]);
+    assert_eq!(verb.join().0, Ok(()));
+}
+
+#[test]
+fn flags_are_the_last_key_of_a_line_with_a_head() {
+    let place = Place::new();
+    let mut hub = FakeHub::new(&place.domain, &["front"], 1);
+    let verb = start(&place, &["front/scan", "front/zones", "front/telegram"], Format::Json, count(4));
+    hub.front().scan.await_subscribers(1);
+    hub.front().zones.await_subscribers(1);
+    hub.front().telegram.await_subscribers(1);
+    hub.front().flags = Flags::SIMULATED | Flags::REPLAYED | Flags::STAMP_ESTIMATED;
+    hub.front().scan(&[1000]);
+    hub.front().zones(Verdict::Clear, 1000);
+    hub.front().telegram(&ANSWER);
+    verb.out.await_lines("stamp_estimated", 3);
+    hub.front().flags = 0;
+    hub.front().telegram(&ANSWER);
+    let (end, out, _) = verb.join();
+    assert_eq!(end, Ok(()));
+    let flagged: Vec<_> = out.lines().filter(|line| line.contains("flags")).collect();
+    let last = r#","flags":["simulated","replayed","stamp_estimated"]}"#;
+    assert!(flagged.len() == 3 && flagged.iter().all(|line| line.ends_with(last)), "{out}");
+}
+
+#[test]
+fn what_the_line_took_away_meanwhile_is_in_the_summary() {
+    let place = Place::new();
+    let mut hub = FakeHub::new(&place.domain, &["front"], 1);
+    let verb = start(&place, &["front/scan"], Format::Json, Bounds::default());
+    hub.front().scan.await_subscribers(1);
+    hub.front().status.await_subscribers(1);
+    for n in 1..=3 {
+        hub.front().status(|status| {
+            status.counters[Counter::BytesRead] = 1000 * n;
+            status.counters[Counter::BytesDamaged] = 250 * n;
+            status.counters[Counter::DueOnLine] = 100 * n;
+            status.counters[Counter::LostOnLine] = 40 * n;
+        });
+    }
+    hub.front().scan(&[1000]);
+    verb.out.await_lines("ranges", 1);
+    verb.stop();
+    let (end, out, _) = verb.join();
+    assert_eq!(end, Ok(()));
+    let summary = out.lines().last().unwrap();
+    assert!(
+        summary.starts_with(r#"{"class":"summary","sensor":"front","topic":"scan","received":1,"#),
+        "{out}"
+    );
+    assert!(summary.ends_with(r#""damaged":0.25,"lost_on_line":80}"#), "{out}");
+    assert!(!out.contains(r#""class":"status""#), "{out}");
+}

@@ -1,0 +1,155 @@
+//! `latency`: what counts as an age, what ends in exit 5, and that every way of waiting measures the same things.
+
+use std::time::Duration;
+
+use crate::fake::{FakeHub, Place, Verb};
+use scanhub_client::Wait;
+use schema::{Failure, Kind, Verdict};
+use verbs::{Bounds, LatencyOptions, latency};
+
+fn options(place: &Place, topics: &[&str], count: u64) -> LatencyOptions {
+    LatencyOptions {
+        topics: topics.iter().map(|topic| (*topic).to_owned()).collect(),
+        json: true,
+        terminal: false,
+        wait: Wait::default(),
+        realtime: false,
+        max_p99: None,
+        bounds: Bounds { count: Some(count), ..Bounds::default() },
+        places: place.places(),
+    }
+}
+
+fn start(options: LatencyOptions) -> Verb {
+    Verb::start(move |out, notes, stop| latency(&options, out, notes, stop))
+}
+
+/// Three zones, stamped when they are sent, to a consumer that listens.
+fn three_zones(place: &Place, options: LatencyOptions) -> (Result<(), Failure>, String, String) {
+    let mut hub = FakeHub::new(&place.domain, &["front"], 1);
+    let verb = start(options);
+    hub.front().zones.await_subscribers(1);
+    // It has to be past its subscription, which is told by nothing but what it receives.
+    while !verb.finished() {
+        hub.front().zones(Verdict::Clear, 700);
+        std::thread::sleep(Duration::from_millis(5));
+    }
+    verb.join()
+}
+
+/// The line of what came of `topic`.
+fn told<'a>(out: &'a str, topic: &str) -> &'a str {
+    let named = format!(r#""class":"latency","sensor":"front","topic":"{topic}""#);
+    out.lines().rfind(|line| line.contains(&named)).unwrap_or_else(|| panic!("no {topic}: {out}"))
+}
+
+#[test]
+fn each_wait_tells_ages() {
+    for (wait, name) in [(Wait::Doorbell, "doorbell"), (Wait::Event, "event"), (Wait::Spin, "spin")] {
+        let place = Place::new();
+        let (end, out, _) =
+            three_zones(&place, LatencyOptions { wait, ..options(&place, &["front/zones"], 40) });
+        assert_eq!(end, Ok(()), "{name}: {out}");
+        let begin =
+            format!(r#"{{"class":"conditions","wait":"{name}","realtime":false,"memory_locked":false,"#);
+        assert!(out.starts_with(&begin), "{out}");
+        assert!(out.lines().next().is_some_and(|line| line.ends_with(r#","refused":[]}"#)), "{out}");
+        let line = told(&out, "zones");
+        assert!(
+            line.contains(r#""received":40,"#) && line.contains(r#""ahead":0,"flags":[],"age":{"count":"#)
+        );
+        assert!(
+            line.ends_with(r#""line":null,"hub":null,"wake":null,"total":null,"network":null}"#),
+            "{line}"
+        );
+        assert!(
+            out.lines()
+                .last()
+                .is_some_and(|line| line.starts_with(r#"{"class":"summary","sensor":"front","#))
+        );
+    }
+}
+
+#[test]
+fn a_limit_is_kept_or_is_a_failed_check() {
+    let place = Place::new();
+    let with = |limit| LatencyOptions { max_p99: Some(limit), ..options(&place, &["front/zones"], 20) };
+    assert_eq!(three_zones(&place, with(Duration::from_secs(60))).0, Ok(()));
+    let (end, out, _) = three_zones(&place, with(Duration::from_nanos(1)));
+    let failure = end.expect_err("nobody is that fast");
+    assert_eq!(failure.kind, Kind::Check);
+    assert!(failure.message.starts_with("front/zones: p99 of the age on arrival is "), "{failure}");
+    assert!(failure.message.ends_with("more than 1ns"), "{failure}");
+    assert!(told(&out, "zones").contains(r#""received":20,"#), "it is told all the same");
+}
+
+#[test]
+fn what_was_sent_before_is_no_latency() {
+    let place = Place::new();
+    let mut hub = FakeHub::new(&place.domain, &["front"], 1);
+    let limit = Some(Duration::from_secs(60));
+    let verb = start(LatencyOptions { max_p99: limit, ..options(&place, &["front/scan", "front/scan"], 5) });
+    hub.front().scan.await_subscribers(1);
+    // Stamps of the first seconds after the machine's start.
+    while !verb.finished() {
+        hub.front().scan(&[100]);
+        std::thread::sleep(Duration::from_millis(5));
+    }
+    let (end, out, _) = verb.join();
+    let failure = end.expect_err("no age is known");
+    assert_eq!((failure.kind, failure.kind.exit_code()), (Kind::Check, 5));
+    assert!(failure.message.contains("no sample with a known age arrived"), "{failure}");
+    let line = told(&out, "scan");
+    assert!(line.contains(r#""received":5,"before":5,"ahead":0,"flags":[],"age":null,"#), "{line}");
+    assert_eq!(out.matches(r#""class":"summary""#).count(), 1, "a topic that is named twice is one");
+}
+
+#[test]
+fn as_text() {
+    let place = Place::new();
+    let (end, out, notes) = three_zones(
+        &place,
+        LatencyOptions { json: false, terminal: true, ..options(&place, &["front/zones"], 20) },
+    );
+    assert_eq!(end, Ok(()));
+    assert!(
+        notes.starts_with("wait by doorbell, normal priority, memory not locked; the clock takes "),
+        "{notes}"
+    );
+    assert!(out.starts_with("front/zones: 20 received, 0 lost in "), "{out}");
+    assert!(out.contains("\nus   count  ") && out.contains("\nage "), "{out}");
+    assert!(out.contains(" us ") && out.contains(" ##"), "no bars: {out}");
+}
+
+#[test]
+fn a_line_each_second_and_a_hub_that_is_replaced() {
+    let place = Place::new();
+    let verb = start(LatencyOptions { bounds: Bounds::default(), ..options(&place, &["front/zones"], 0) });
+    let tell = |boot, lines| {
+        let mut hub = FakeHub::new(&place.domain, &["front"], boot);
+        hub.front().zones.await_subscribers(1);
+        while verb.out.text().matches(r#""topic":"zones","received":"#).count() < lines {
+            hub.front().zones(Verdict::Clear, 700);
+            std::thread::sleep(Duration::from_millis(5));
+        }
+    };
+    tell(1, 1);
+    verb.out.await_lines(r#""kind":"hub_gone""#, 1);
+    // Told while the new one is here.
+    let lines = verb.out.text().matches(r#""class":"latency""#).count();
+    tell(2, lines + 1);
+    verb.out.await_lines(r#""kind":"hub_back""#, 1);
+    verb.stop();
+    let (end, out, _) = verb.join();
+    assert_eq!(end, Ok(()), "{out}");
+    assert!(told(&out, "zones").contains(r#""age":{"count":"#), "{out}");
+}
+
+#[test]
+fn without_a_hub_it_ends_within_a_second() {
+    let place = Place::new();
+    let failure = start(options(&place, &["front/scan"], 1)).join().0.expect_err("no hub");
+    assert_eq!(failure.kind, Kind::NoHub);
+    let failure = start(options(&place, &["front"], 1)).join().0.expect_err("no topic");
+    assert_eq!(failure.kind, Kind::Usage);
+}

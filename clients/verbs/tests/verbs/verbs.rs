@@ -1,0 +1,161 @@
+//! `list`, `info` and `hz` with a hub and without one.
+
+use std::time::{Duration, Instant};
+
+use crate::fake::{FakeHub, Place, Verb};
+use schema::{Counter, Kind, Pose};
+use verbs::{Bounds, HzOptions, InfoOptions, ListOptions, hz, info, list, list_domains};
+
+fn start_list(place: &Place, json: bool) -> Verb {
+    let options = ListOptions { json, places: place.places() };
+    Verb::start(move |out, _, stop| list(&options, out, stop))
+}
+
+fn start_info(place: &Place, sensor: Option<&str>, json: bool) -> Verb {
+    let options = InfoOptions { sensor: sensor.map(Into::into), json, places: place.places() };
+    Verb::start(move |out, _, stop| info(&options, out, stop))
+}
+
+#[test]
+fn without_a_hub_they_end_within_a_second() {
+    let place = Place::new();
+    let began = Instant::now();
+    let verbs = [start_list(&place, true), start_info(&place, None, true)];
+    for verb in verbs {
+        assert_eq!(verb.join().0.unwrap_err().kind, Kind::NoHub);
+    }
+    assert!(began.elapsed() < Duration::from_secs(1), "{:?}", began.elapsed());
+}
+
+#[test]
+fn topics_of_a_hub() {
+    let place = Place::new();
+    let mut hub = FakeHub::new(&place.domain, &["rear", "front"], 1);
+    for sensor in &mut hub.sensors {
+        sensor.status(|status| status.rate_mhz = 37_540);
+    }
+    let verb = start_list(&place, true);
+    hub.serve_history(|| verb.finished());
+    let (end, out, _) = verb.join();
+    assert_eq!(end, Ok(()));
+    const SHOWN: [&str; 3] = [r#""topic":"telegram""#, r#""topic":"scan""#, r#""topic":"status""#];
+    assert_eq!(
+        out.lines().filter(|line| SHOWN.iter().any(|it| line.contains(it))).take(3).collect::<Vec<_>>(),
+        [
+            r#"{"class":"topic","sensor":"front","topic":"telegram","payload":"u8[]","revision":1,"hz":37.54,"subscribers":0}"#,
+            r#"{"class":"topic","sensor":"front","topic":"scan","payload":"scanhub.Scan.v1","revision":1,"hz":37.54,"subscribers":0}"#,
+            r#"{"class":"topic","sensor":"front","topic":"status","payload":"scanhub.Status.v1","revision":1,"hz":null,"subscribers":0}"#,
+        ]
+    );
+    let rates: Vec<_> = out.lines().map(|line| line.contains(r#""hz":37.54"#)).collect();
+    let of_one = [true, true, true, true, true, false, false];
+    assert_eq!(rates, [of_one, of_one].concat(), "background and status come at their own time");
+    let verb = start_list(&place, false);
+    hub.serve_history(|| verb.finished());
+    let (_, out, _) = verb.join();
+    assert_eq!(
+        out.lines().nth(2),
+        Some("front/scan        37.54          0  scanhub.Scan.v1               1"),
+        "{out}"
+    );
+}
+
+#[test]
+fn live_domains() {
+    let place = Place::new();
+    let mut out = Vec::new();
+    list_domains(std::slice::from_ref(&place.base), true, &mut out).unwrap();
+    assert!(out.is_empty());
+    let _hub = FakeHub::new(&place.domain, &[], 1);
+    list_domains(std::slice::from_ref(&place.base), true, &mut out).unwrap();
+    let (name, root, pid) = (place.domain.name(), place.domain.root().display(), std::process::id());
+    let expected =
+        format!("{{\"class\":\"domain\",\"domain\":\"{name}\",\"root\":\"{root}\",\"pid\":{pid}}}\n");
+    assert_eq!(String::from_utf8(out).unwrap(), expected);
+}
+
+#[test]
+fn info_of_a_sensor() {
+    let place = Place::new();
+    let mut hub = FakeHub::new(&place.domain, &["front", "rear"], 1);
+    for sensor in &mut hub.sensors {
+        sensor.status(|status| {
+            status.set_sensor_type("LMS200");
+            status.set_port("/dev/ttyUSB1");
+            status.mode = 0;
+            status.pose = Pose { x_m: 0.3, yaw_rad: std::f64::consts::PI, upside_down: 1, ..Pose::default() };
+            status.counters[Counter::Telegrams] = 12;
+        });
+    }
+    let verb = start_info(&place, Some("rear"), true);
+    hub.serve_history(|| verb.finished());
+    let (end, out, _) = verb.join();
+    assert_eq!((end, out.lines().count()), (Ok(()), 1));
+    assert!(out.starts_with(r#"{"class":"status","sensor":"rear","state":"streaming""#), "{out}");
+    let verb = start_info(&place, None, false);
+    hub.serve_history(|| verb.finished());
+    let (_, out, _) = verb.join();
+    assert!(out.starts_with("front                  streaming for"), "{out}");
+    assert!(out.contains("  telegrams            12\n"), "{out}");
+    assert!(out.contains("  pose                 x 0.3 m, y 0 m, yaw 180.0 deg, upside down\n"), "{out}");
+    assert!(out.contains("`scanhub configure /dev/ttyUSB1 mode=0x01`\n"), "{out}");
+    let failure = start_info(&place, Some("left"), true).join().0.unwrap_err();
+    assert_eq!((failure.kind, failure.hint.as_str()), (Kind::NoTopic, "there are front, rear"));
+}
+
+#[test]
+fn a_hub_that_says_nothing() {
+    let place = Place::new();
+    let _hub = FakeHub::new(&place.domain, &["front"], 1);
+    assert_eq!(start_info(&place, None, true).join().0.unwrap_err().kind, Kind::Timeout);
+    let (end, out, _) = start_list(&place, true).join();
+    assert_eq!((end, out.matches(r#""hz":null"#).count()), (Ok(()), 7));
+}
+
+#[test]
+fn rates_of_all_topics() {
+    let place = Place::new();
+    let mut hub = FakeHub::new(&place.domain, &["front"], 1);
+    let options = HzOptions {
+        topics: Vec::new(),
+        json: true,
+        window: Duration::from_secs(10),
+        bounds: Bounds::default(),
+        places: place.places(),
+    };
+    // Statuses from before anybody followed them wait for whoever comes.
+    hub.front().status(|_| {});
+    let verb = Verb::start(move |out, notes, stop| hz(&options, out, notes, stop));
+    hub.front().scan.await_subscribers(1);
+    // It follows the state of the line, too.
+    hub.front().status.await_subscribers(2);
+    hub.front().status(|_| {});
+    // From here on they are sent to who is there: after all that was.
+    hub.front().begun_ns = u64::MAX / 2;
+    while !verb.out.text().contains(r#""topic":"scan","hz":"#) {
+        hub.front().scan(&[1]);
+        hub.serve_history(|| true);
+        std::thread::sleep(Duration::from_millis(10));
+    }
+    verb.stop();
+    let (end, out, _) = verb.join();
+    assert_eq!(end, Ok(()));
+    let line = out.lines().find(|line| line.contains(r#""topic":"scan""#)).unwrap();
+    let keys: Vec<_> =
+        line.split("\"").skip(1).step_by(2).filter(|it| !["hz", "front", "scan"].contains(it)).collect();
+    assert_eq!(
+        keys.join(" "),
+        "class sensor topic jitter_ms min_ms max_ms received lost window_s damaged lost_on_line",
+        "{line}"
+    );
+    assert!(
+        out.lines().any(|line| line.contains(r#""topic":"telegram","hz":null,"jitter_ms":null"#)),
+        "{out}"
+    );
+    assert_eq!(out.lines().filter(|line| line.contains("summary")).count(), 7);
+    let statuses: Vec<_> = out.lines().filter(|line| line.contains(r#""topic":"status""#)).collect();
+    let (summary, lines) = statuses.split_last().unwrap();
+    // What is handed over at once would be hundreds of thousands a second.
+    assert!(lines.iter().all(|line| line.contains(r#""hz":null"#)), "{statuses:?}");
+    assert!(summary.contains(r#""received":2,"#) && summary.contains(r#""hz":null"#), "{statuses:?}");
+}

@@ -1,0 +1,201 @@
+//! Zones that go silent, as those see it who act on them.
+
+use std::time::{Duration, Instant};
+
+use crate::fake::{FakeHub, FakeSensor, Place, Verb, until};
+use scanhub_client::{RobotFollower, ZonesFollower};
+use schema::{Kind, Verdict};
+use verbs::{Bounds, EchoOptions, Format, HzOptions, echo, hz};
+
+/// Slow scans, so that a busy machine is no silence: two of them and 40 ms are.
+const PERIOD_US: u32 = 300_000;
+
+/// A hub of such scans.
+fn slow_hub(place: &Place, sensors: &[&str], boot: u64) -> FakeHub {
+    let mut hub = FakeHub::new(&place.domain, sensors, boot);
+    hub.sensors.iter_mut().for_each(|sensor| sensor.period_us = PERIOD_US);
+    hub
+}
+
+/// Publishes zones until a consumer that came late has heard them, too.
+fn until_heard(sensor: &mut FakeSensor, verdict: Verdict, mut heard: impl FnMut() -> bool) {
+    until("a sample", || {
+        sensor.zones(verdict, 1234);
+        heard()
+    });
+}
+
+#[test]
+fn a_silence_is_unknown_once() {
+    let place = Place::new();
+    let mut hub = slow_hub(&place, &["front"], 7);
+    let mut zones = ZonesFollower::in_domain(place.places(), "front").unwrap();
+    until_heard(hub.front(), Verdict::Clear, || {
+        zones.try_next().unwrap().is_some_and(|heard| heard.zones.verdict() == Verdict::Clear)
+    });
+    while zones.try_next().unwrap().is_some() {}
+    hub.front().zones(Verdict::Slow, 700);
+    let heard = zones.next().unwrap();
+    assert_eq!((heard.zones.verdict(), heard.zones.nearest_mm, heard.stale), (Verdict::Slow, 700, false));
+    assert_eq!(heard.header.map(|header| (header.boot, header.period_us)), Some((7, PERIOD_US)));
+    let heard = zones.next().unwrap();
+    assert_eq!((heard.zones.verdict(), heard.header, heard.stale), (Verdict::Unknown, None, true));
+    let quiet_until = Instant::now() + Duration::from_millis(700);
+    while Instant::now() < quiet_until {
+        assert!(zones.try_next().unwrap().is_none(), "said already");
+        std::thread::sleep(Duration::from_millis(5));
+    }
+    hub.front().zones(Verdict::Clear, 5000);
+    assert_eq!(zones.next().unwrap().zones.verdict(), Verdict::Clear);
+    hub.front().zones(Verdict::Unknown, 0);
+    let heard = zones.next().unwrap();
+    assert_eq!((heard.zones.verdict(), heard.stale), (Verdict::Unknown, false), "the hub's own word");
+}
+
+#[test]
+fn without_a_hub_and_after_one() {
+    let place = Place::new();
+    let mut zones = ZonesFollower::in_domain(place.places(), "front").unwrap();
+    let heard = zones.next().unwrap();
+    assert_eq!((heard.zones.verdict(), heard.stale, heard.header), (Verdict::Unknown, true, None));
+    let mut hub = slow_hub(&place, &["front"], 1);
+    until_heard(hub.front(), Verdict::Clear, || zones.try_next().unwrap().is_some());
+    drop(hub);
+    let last = std::iter::from_fn(|| zones.next().ok()).find(|heard| heard.stale);
+    assert_eq!(last.map(|heard| heard.zones.verdict()), Some(Verdict::Unknown));
+}
+
+#[test]
+fn the_newest_counts_and_what_waited_is_no_news() {
+    let place = Place::new();
+    let mut hub = slow_hub(&place, &["front"], 1);
+    let mut zones = ZonesFollower::in_domain(place.places(), "front").unwrap();
+    until_heard(hub.front(), Verdict::Clear, || zones.try_next().unwrap().is_some());
+    while zones.try_next().unwrap().is_some() {}
+    for nearest_mm in [300, 200, 100] {
+        hub.front().zones(Verdict::Stop, nearest_mm);
+    }
+    let heard = zones.next().unwrap();
+    assert_eq!((heard.zones.nearest_mm, heard.missed, heard.stale), (100, 2, false));
+    // A second after the machine started.
+    hub.front().zones_of(Verdict::Clear, 9000, 1_000_000_000);
+    let heard = zones.next().unwrap();
+    assert_eq!((heard.zones.verdict(), heard.zones.nearest(), heard.stale), (Verdict::Unknown, None, true));
+    assert!(heard.header.is_some_and(|header| header.stamp_last_ns == 1_000_000_000));
+}
+
+#[test]
+fn echo_says_the_silence_too() {
+    let place = Place::new();
+    let mut hub = slow_hub(&place, &["front"], 0xAB);
+    let start = |topic: &str, format| {
+        let bounds = Bounds::default();
+        let options = EchoOptions { topics: vec![topic.into()], format, bounds, places: place.places() };
+        Verb::start(move |out, notes, stop| echo(&options, out, notes, stop))
+    };
+    let verbs = [
+        start("front/zones", Format::Json),
+        start("front/zones", Format::Text),
+        start("front/zones", Format::Raw),
+    ];
+    let rate = HzOptions {
+        topics: vec!["front/zones".into()],
+        json: true,
+        window: Duration::from_secs(10),
+        bounds: Bounds::default(),
+        places: place.places(),
+    };
+    let rate = Verb::start(move |out, notes, stop| hz(&rate, out, notes, stop));
+    hub.front().zones.await_subscribers(4);
+    hub.front().zones(Verdict::Stop, 420);
+    verbs[0].out.await_lines(r#""stale":true"#, 1);
+    verbs[1].out.await_lines("no recent data", 1);
+    until("bytes", || verbs[2].out.bytes().len() == 2 * 76);
+    verbs.iter().chain([&rate]).for_each(Verb::stop);
+    let [json, text, raw] = verbs;
+    let (end, out, _) = json.join();
+    assert_eq!((end, out.lines().count()), (Ok(()), 3), "{out}");
+    let lines: Vec<_> = out.lines().collect();
+    assert!(lines[0].starts_with(r#"{"class":"zones","sensor":"front","seq":0,"topic_seq":0,"stamp_ns":"#));
+    let told = r#""quality":"clean","verdict":"stop","nearest_mm":420,"nearest_beam":180,"zones":[],"invalid_beams":0}"#;
+    assert!(lines[0].ends_with(told), "{out}");
+    let silence = r#"{"class":"zones","sensor":"front","seq":null,"topic_seq":null,"stamp_ns":null,"wall_ns":null,"boot":null,"quality":null,"verdict":"unknown","nearest_mm":null,"nearest_beam":null,"zones":[],"invalid_beams":0,"stale":true}"#;
+    assert_eq!(lines[1], silence);
+    assert!(
+        lines[2].contains(r#""class":"summary""#) && lines[2].contains(r#""received":1,"lost":0"#),
+        "{out}"
+    );
+    let (_, out, _) = text.join();
+    assert!(out.lines().nth(1).is_some_and(|line| line == "front/zones unknown: no recent data"), "{out}");
+    let bytes = raw.out.bytes();
+    assert_eq!((bytes[0], bytes[76]), (Verdict::Stop as u8, Verdict::Unknown as u8));
+    let (_, out, _) = rate.join();
+    assert!(out.lines().last().is_some_and(|line| line.contains(r#""received":1,"lost":0"#)), "{out}");
+}
+
+#[test]
+fn the_robot_is_the_worst_of_its_sensors() {
+    let place = Place::new();
+    let mut hub = slow_hub(&place, &["front", "rear"], 1);
+    let mut all = RobotFollower::in_domain(place.places(), &[]).unwrap();
+    assert_eq!((all.now().unwrap().verdict(), all.now().unwrap().worst()), (Verdict::Unknown, None));
+    let mut publish = |front: Verdict, rear: Option<Verdict>| {
+        hub.sensors[0].zones(front, 900);
+        if let Some(rear) = rear {
+            hub.sensors[1].zones(rear, 800);
+        }
+    };
+    until("both", || {
+        publish(Verdict::Clear, Some(Verdict::Slow));
+        all.now().unwrap().verdict() == Verdict::Slow
+    });
+    let robot = all.now().unwrap();
+    assert_eq!((robot.worst(), robot.nearest()), (Some("rear"), Some((800, "rear"))));
+    until("one falls silent", || {
+        publish(Verdict::Clear, None);
+        all.now().unwrap().verdict() == Verdict::Unknown
+    });
+    let robot = all.now().unwrap();
+    let verdicts: Vec<_> = robot.sensors().collect();
+    assert_eq!(verdicts, [("front", Verdict::Clear), ("rear", Verdict::Unknown)]);
+    assert_eq!((robot.worst(), robot.nearest()), (Some("rear"), Some((900, "front"))));
+
+    let mut named = RobotFollower::in_domain(place.places(), &["front", "left"]).unwrap();
+    until("the one that is there", || {
+        publish(Verdict::Stop, Some(Verdict::Clear));
+        named.next().unwrap().verdict() == Verdict::Stop
+    });
+    let verdicts: Vec<_> = named.now().unwrap().sensors().map(|(_, verdict)| verdict).collect();
+    assert_eq!(verdicts, [Verdict::Stop, Verdict::Unknown], "never heard");
+    let refused = RobotFollower::in_domain(place.places(), &["robot"]).err();
+    assert_eq!(refused.map(|failure| failure.kind), Some(Kind::Configuration));
+}
+
+#[test]
+fn echo_of_the_robot() {
+    let place = Place::new();
+    let mut hub = slow_hub(&place, &["rear", "front"], 1);
+    let options = EchoOptions {
+        topics: vec!["robot/zones".into()],
+        format: Format::Json,
+        bounds: Bounds { count: Some(3), ..Bounds::default() },
+        places: place.places(),
+    };
+    let verb = Verb::start(move |out, notes, stop| echo(&options, out, notes, stop));
+    hub.sensors.iter().for_each(|sensor| sensor.zones.await_subscribers(1));
+    // There is nothing to say of all of them until each was heard.
+    hub.sensors[1].zones(Verdict::Stop, 500);
+    hub.sensors[0].zones(Verdict::Slow, 700);
+    verb.out.await_lines(r#""verdict":"stop","nearest_mm":500,"nearest_sensor":"front""#, 1);
+    hub.sensors[1].zones(Verdict::Clear, 900);
+    let told = r#""verdict":"slow","nearest_mm":700,"nearest_sensor":"rear","sensors":[{"sensor":"front","verdict":"clear"},{"sensor":"rear","verdict":"slow"}]}"#;
+    verb.out.await_lines(told, 1);
+    verb.out.await_lines(r#""stale":true"#, 2);
+    hub.sensors[0].zones(Verdict::Stop, 300);
+    let (end, out, _) = verb.join();
+    assert_eq!(end, Ok(()));
+    assert!(out.lines().all(|line| line.starts_with(r#"{"class":"zones","sensor":"robot","stamp_ns":"#)
+        || line.starts_with(r#"{"class":"summary","sensor":"robot","topic":"zones","received":3,"lost":0"#)));
+    let told = r#""verdict":"stop","nearest_mm":300,"nearest_sensor":"rear","sensors":[{"sensor":"front","verdict":"unknown"},{"sensor":"rear","verdict":"stop"}]}"#;
+    assert!(out.lines().nth_back(1).is_some_and(|line| line.ends_with(told)), "{out}");
+}

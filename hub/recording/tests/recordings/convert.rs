@@ -1,0 +1,176 @@
+//! Recordings written anew: what a form can hold is the same afterwards, a damaged file is whole, and what fails leaves
+//! nothing behind.
+
+use std::fs;
+use std::path::{Path, PathBuf};
+use std::sync::atomic::AtomicBool;
+
+use crate::folder::{Folder, converted};
+use crate::skip::skip;
+use lms::measured;
+use lms::reply;
+use lms::variant::{Mode, Unit};
+use recording::convert::{ConvertOptions, Target, convert};
+use recording::{Encoding, Form, Frame, Recording};
+use schema::Flags;
+
+const CM: Encoding = Encoding { unit: Unit::Cm, mode: Mode(0) };
+
+/// Names of all files in `folder`.
+fn names(folder: &Folder) -> Vec<String> {
+    let mut names: Vec<_> = fs::read_dir(&folder.0)
+        .unwrap()
+        .map(|entry| entry.unwrap().file_name().into_string().unwrap())
+        .collect();
+    names.sort();
+    names
+}
+
+fn frames(path: &Path, encoding: Encoding) -> Vec<Frame> {
+    Recording::open(path).unwrap().telegrams(encoding).unwrap().collect()
+}
+
+fn telegrams(path: &Path) -> Vec<Vec<u8>> {
+    frames(path, CM).into_iter().map(|frame| frame.telegram).collect()
+}
+
+/// Channel, sequence, times and data of all messages, as the library of the format reads them.
+fn messages(bytes: &[u8]) -> Vec<(String, u32, u64, u64, Vec<u8>)> {
+    let all = mcap::MessageStream::new(bytes).unwrap().map(Result::unwrap);
+    all.map(|m| (m.channel.topic.clone(), m.sequence, m.log_time, m.publish_time, m.data.to_vec())).collect()
+}
+
+#[test]
+fn an_mcap_file_keeps_all_messages_of_all_channels() {
+    let folder = Folder::new("copy");
+    let written = crate::written::recording(20, 11);
+    let (whole, copy) = (folder.file("whole.mcap", &written.bytes), folder.0.join("copy.mcap"));
+    let account = converted(&whole, &copy, None).unwrap();
+    assert_eq!((account.telegrams, account.scans, account.left_out), (40, 36, 0));
+    assert_eq!(account.telegrams, written.telegrams.len() as u64);
+    assert!(account.damage.is_none(), "{}", account.damage);
+    let bytes = fs::read(&copy).unwrap();
+    assert!(messages(&bytes) == messages(&written.bytes));
+    let told = |bytes: &[u8]| mcap::Summary::read(bytes).unwrap().unwrap().metadata_indexes.len();
+    assert_eq!(told(&bytes), 1);
+    let rear = folder.0.join("rear.mcap");
+    assert_eq!(converted(&whole, &rear, Some("rear")).unwrap().telegrams, 20);
+    let only = messages(&fs::read(&rear).unwrap());
+    assert!(only.len() == 140 && only.iter().all(|(topic, ..)| topic.starts_with("rear/")));
+}
+
+#[test]
+fn a_file_that_was_cut_or_harmed_is_whole_afterwards() {
+    let folder = Folder::new("repair");
+    let written = crate::written::recording(20, 12);
+    let all = messages(&written.bytes);
+    let mut harmed = written.bytes.clone();
+    let middle = harmed.len() / 3;
+    harmed[middle] ^= 0x10;
+    let cut = &written.bytes[..written.bytes.len() * 2 / 3];
+    let rest = &written.bytes[written.bytes.len() / 3..];
+    for (name, bytes) in [("cut", cut), ("harmed", &harmed), ("headless", rest)] {
+        let broken = folder.file(&format!("{name}-in.mcap"), bytes);
+        let whole = folder.0.join(format!("{name}-out.mcap"));
+        let account = converted(&broken, &whole, None).unwrap();
+        assert!(!account.damage.is_none(), "{name}");
+        assert_eq!(account.damage.is_cut, name == "cut");
+        assert_eq!(account.damage.is_headless, name == "headless");
+        assert_eq!(account.forms.0, Form::Mcap);
+        let recording = Recording::open(&whole).unwrap();
+        assert_eq!(recording.contents().telegrams, account.telegrams);
+        assert_eq!(account.telegrams, Recording::open(&broken).unwrap().contents().telegrams);
+        let damage = recording.contents().damage;
+        assert!(damage.bytes == 0 && !damage.is_cut && !damage.is_harmed, "{damage}");
+        let kept = messages(&fs::read(&whole).unwrap());
+        assert!(kept.len() > all.len() / 2 && kept.iter().all(|message| all.contains(message)), "{name}");
+        // Channels of others come along.
+        assert!(kept.iter().any(|(topic, ..)| topic == "/imu"), "{name}");
+    }
+}
+
+#[test]
+fn a_stream_gets_times_and_loses_none_of_its_telegrams() {
+    let folder = Folder::new("stream");
+    let mut scans: Vec<Vec<u8>> = vec![reply::configuration(0, Mode(4), Unit::Mm, 0x10).bytes().to_vec()];
+    scans.extend((0..30).map(|first| {
+        let words: Vec<u16> = (0..361).map(|i| 500 + first + i).collect();
+        measured::encode(0, Unit::Mm, &words, 0x10).bytes().to_vec()
+    }));
+    let stream = folder.file("a.bin", &[b"noise", &scans.concat()[..]].concat());
+    let (mcap, again, log) = (folder.0.join("a.mcap"), folder.0.join("b.bin.gz"), folder.0.join("a.log.gz"));
+    let account = converted(&stream, &mcap, Some("left")).unwrap();
+    assert_eq!((account.forms, account.telegrams), ((Form::Telegrams, Target::Recording(Form::Mcap)), 31));
+    // As the stamps say that it gets: a reply takes its time on the line.
+    assert!(
+        account.took_ns.is_some_and(|ns| (29 * 26_640_000..30 * 26_640_000).contains(&ns)),
+        "{account:?}"
+    );
+    assert_eq!(converted(&stream, &folder.0.join("c.bin"), None).unwrap().took_ns, None);
+    let recording = Recording::open(&mcap).unwrap();
+    assert_eq!(
+        (&recording.contents().sensors[..], recording.contents().mode),
+        (&["left".into()][..], Some(Mode(4)))
+    );
+    assert_eq!(telegrams(&mcap), scans);
+    let headers: Vec<_> = frames(&mcap, CM).into_iter().map(|frame| frame.header.unwrap()).collect();
+    assert!(headers.iter().all(|header| header.flags == Flags::STAMP_ESTIMATED));
+    assert!(headers.windows(2).all(|pair| pair[1].topic_seq == pair[0].topic_seq + 1));
+    assert_eq!(headers[30].wall_ns - headers[1].wall_ns, 29 * 26_640_000);
+    converted(&mcap, &again, None).unwrap();
+    assert_eq!(telegrams(&again), scans);
+    // A reply is no scan.
+    let account = converted(&mcap, &log, None).unwrap();
+    assert_eq!((account.telegrams, account.left_out), (30, 1));
+    let read = frames(&log, Encoding { unit: Unit::Mm, mode: Mode(4) });
+    assert!(read.iter().map(|frame| &frame.telegram).eq(&scans[1..]));
+}
+
+#[test]
+fn a_stream_of_a_real_sensor_comes_back() {
+    let data = std::env::var_os("SCANHUB_DATA").map_or_else(
+        || PathBuf::from(concat!(env!("CARGO_MANIFEST_DIR"), "/../../../shared/data")),
+        PathBuf::from,
+    );
+    if !data.is_dir() {
+        skip("recordings", format!("none at {}", data.display()));
+        return;
+    }
+    let folder = Folder::new("real");
+    let capture = data.join("captures/lms200_38400.bin");
+    let (mcap, again) = (folder.0.join("capture.mcap"), folder.0.join("capture.bin"));
+    converted(&capture, &mcap, None).unwrap();
+    converted(&mcap, &again, None).unwrap();
+    assert!(fs::read(&capture).unwrap() == fs::read(&again).unwrap());
+}
+
+#[test]
+fn what_cannot_be_done_is_refused_and_leaves_nothing() {
+    let folder = Folder::new("refused");
+    let noise = folder.file("noise.mcap", &[0x42; 900]);
+    let failure = converted(&noise, &folder.0.join("out.mcap"), None).unwrap_err();
+    assert!(failure.kind.exit_code() == 66 && failure.message.contains("no telegram"), "{failure}");
+    fs::remove_file(noise).unwrap();
+    let input = folder.file("in.mcap", &crate::written::recording(8, 13).bytes);
+    let there = folder.file("there.bin", b"mine");
+    std::os::unix::fs::symlink(&input, folder.0.join("link.mcap")).unwrap();
+    for (output, sensor, says) in [
+        ("in.mcap", None, "both read and written"),
+        ("link.mcap", None, "both read and written"),
+        ("there.bin", Some("front"), "exists"),
+        ("out.bin", None, "several sensors"),
+        ("out.log", Some("left"), "no sensor \"left\""),
+        ("out.txt", None, "is not a known format"),
+        ("out.mcap.gz", None, "is not a known format"),
+        ("no/such/out.mcap", None, "cannot write"),
+    ] {
+        let failure = converted(&input, &folder.0.join(output), sensor).unwrap_err();
+        assert!(failure.message.contains(says) && !failure.hint.is_empty(), "{output}: {failure}");
+    }
+    let options =
+        ConvertOptions { input, output: folder.0.join("stopped.mcap"), ..ConvertOptions::default() };
+    let failure = convert(&options, &AtomicBool::new(true), |_, _| {}).unwrap_err();
+    assert_eq!(failure.kind.exit_code(), 130);
+    assert_eq!(names(&folder), ["in.mcap", "link.mcap", "there.bin"]);
+    assert_eq!(fs::read(there).unwrap(), b"mine");
+}

@@ -1,0 +1,182 @@
+//! Recordings as files: what they are is told by their bytes, and what comes out of them is what went in.
+
+use std::fs;
+use std::io::{Read, Write};
+use std::path::PathBuf;
+
+use crate::skip::skip;
+use flate2::Compression;
+use flate2::write::GzEncoder;
+use lms::command::Request;
+use lms::measured::{self, Measured};
+use lms::reply;
+use lms::telegram::Telegram;
+use lms::variant::{Mode, Unit, Variant};
+use recording::{Encoding, Form, Recording};
+
+const MM: Encoding = Encoding { unit: Unit::Mm, mode: Mode(1) };
+
+/// A file of this test run that is gone with it.
+struct File(PathBuf);
+
+impl File {
+    fn new(name: &str, bytes: &[u8]) -> File {
+        let path = std::env::temp_dir().join(format!("scanhub-{}-{name}", std::process::id()));
+        fs::write(&path, bytes).unwrap();
+        File(path)
+    }
+}
+
+impl Drop for File {
+    fn drop(&mut self) {
+        let _ = fs::remove_file(&self.0);
+    }
+}
+
+fn gzip(bytes: &[u8]) -> Vec<u8> {
+    let mut encoder = GzEncoder::new(Vec::new(), Compression::default());
+    encoder.write_all(bytes).unwrap();
+    encoder.finish().unwrap()
+}
+
+fn scan(first: u16) -> Vec<u8> {
+    let words: Vec<u16> = (0..361).map(|i| (first + i) & 0x1FFF).collect();
+    measured::encode(0, Unit::Cm, &words, 0x10).bytes().to_vec()
+}
+
+#[test]
+fn a_stream_gives_its_telegrams_bit_for_bit_and_says_what_the_sensor_was() {
+    let telegrams =
+        [scan(700), reply::configuration(0, Mode(4), Unit::Cm, 0x11).bytes().to_vec(), scan(1700)];
+    let mut bytes = b"\x06\x02\x80noise".to_vec();
+    bytes.extend_from_slice(&telegrams.concat());
+    // A scan that broke off for a reply, at the very end.
+    bytes.extend_from_slice(&scan(5)[..40]);
+    let last = reply::mode(0, true, 0x10);
+    bytes.extend_from_slice(&[&[0x06], last.bytes()].concat());
+    for (name, stored) in [("stream.bin", bytes.clone()), ("stream.bin.gz", gzip(&bytes))] {
+        let file = File::new(name, &stored);
+        let recording = Recording::open(&file.0).unwrap();
+        let contents = recording.contents();
+        assert_eq!((contents.form, contents.telegrams, contents.scans), (Form::Telegrams, 4, 2));
+        assert_eq!(contents.variant, Some(Variant::HALF));
+        assert_eq!((contents.unit, contents.mode), (Some(Unit::Cm), Some(Mode(4))));
+        let read: Vec<_> = recording.telegrams(MM).unwrap().map(|frame| frame.telegram).collect();
+        assert_eq!(read[..3], telegrams);
+        assert_eq!(read[3], last.bytes());
+        let mut unpacked = Vec::new();
+        recording.bytes().unwrap().read_to_end(&mut unpacked).unwrap();
+        assert_eq!(unpacked, bytes);
+    }
+}
+
+#[test]
+fn a_log_becomes_telegrams() {
+    let mut log = String::from("# message formats defined: PARAM FLASER\nODOM 0 0 0 0 0 0 1.5 host 1.5\n");
+    for count in [360, 361] {
+        log += &format!("FLASER {count} {} 0 0 0 0 0 0 12.25 host 1\n", vec!["1.234"; count].join(" "));
+    }
+    // Where the recording broke off.
+    log += "FLASER 361 1.0 1.0";
+    let file = File::new("log.gz", &gzip(log.as_bytes()));
+    let recording = Recording::open(&file.0).unwrap();
+    assert_eq!((recording.contents().form, recording.contents().scans), (Form::Carmen, 2));
+    assert_eq!(recording.contents().variant, Some(Variant::HALF));
+    assert_eq!(recording.encoding(), Some(Encoding { unit: Unit::Mm, mode: Mode(0) }));
+    let frames: Vec<_> = recording.telegrams(MM).unwrap().collect();
+    let last = |i: usize| {
+        let telegram = Telegram::check(&frames[i].telegram).unwrap();
+        let words: Vec<u16> = Measured::decode(telegram).unwrap().words().collect();
+        (words.len(), words[0], words[360])
+    };
+    assert_eq!((last(0), last(1)), ((361, 1234, 8184), (361, 1234, 1234)));
+    assert_eq!((frames[0].wall_ns, frames[0].header), (Some(12_250_000_000), None));
+    let contents = recording.contents();
+    assert_eq!(contents.span, Some((12_250_000_000, 12_250_000_000)));
+    assert!(contents.sensors.is_empty() && contents.damage.is_none());
+    let refused = recording.of("front").unwrap_err();
+    assert!(refused.message.contains("does not name its sensor"), "{refused}");
+}
+
+#[test]
+fn what_is_no_recording_is_refused_with_place_value_and_remedy() {
+    let missing = Recording::open("/nonexistent/a.bin").unwrap_err();
+    assert_eq!(missing.kind.exit_code(), 66);
+    assert!(missing.message.contains("/nonexistent/a.bin") && !missing.hint.is_empty(), "{missing}");
+    for (name, bytes, says) in [
+        ("empty", Vec::new(), "is empty"),
+        ("noise", vec![0x42; 9000], "no telegram in it"),
+        ("program.py", b"#!/usr/bin/env python3\nprint('\x02\x80')\n".to_vec(), "no telegram in it"),
+        ("request", Request::Stop.encode(0).bytes().to_vec(), "no telegram in it"),
+        ("poses.log", b"PARAM a b\nODOM 0 0 0 0 0 0 1.5 host 1.5\n".to_vec(), "without a scan"),
+        ("wrong.log", b"PARAM a b\nFLASER 12 1 2\n".to_vec(), "wrong.log:2: 12 beams"),
+        #[cfg(not(feature = "mcap"))]
+        ("a.mcap", b"\x89MCAP0\r\nmore".to_vec(), "which this build does not read"),
+        ("cut.gz", gzip(&scan(7))[..40].to_vec(), "cannot read"),
+    ] {
+        let file = File::new(name, &bytes);
+        let failure = Recording::open(&file.0).unwrap_err();
+        assert!(failure.message.contains(says), "{failure}");
+        // A line may bring nothing but noise.
+        let line = Recording::open_line(&file.0).ok();
+        assert_eq!(line.map(|line| line.contents().telegrams), (says == "no telegram in it").then_some(0));
+    }
+}
+
+#[test]
+fn what_is_there_of_a_packed_file_that_is_cut_is_read() {
+    // So much that what is cut off is not all of it, and different enough not to be packed to nothing.
+    let telegrams: Vec<Vec<u8>> = (0..400).map(scan).collect();
+    let packed = gzip(&telegrams.concat());
+    let file = File::new("cut.bin.gz", &packed[..packed.len() * 2 / 3]);
+    let recording = Recording::open(&file.0).unwrap();
+    let contents = recording.contents();
+    assert!(contents.damage.is_cut && (1..400).contains(&contents.telegrams), "{contents:?}");
+    let read: Vec<_> = recording.telegrams(MM).unwrap().map(|frame| frame.telegram).collect();
+    assert_eq!(read[..], telegrams[..contents.telegrams as usize]);
+}
+
+#[test]
+fn a_log_with_harmed_lines_gives_the_others() {
+    let line = |at: u32, range: &str| {
+        format!("FLASER 181 {} 0 0 0 0 0 0 {at} host {at}\n", vec![range; 181].join(" "))
+    };
+    let log: String = (1..4000).map(|at| line(at, if at == 7 { "1.\0" } else { "1.5" })).collect();
+    let file = File::new("harmed.log", log.as_bytes());
+    let recording = Recording::open(&file.0).unwrap();
+    let damage = recording.contents().damage;
+    assert_eq!((recording.contents().scans, damage.telegrams, damage.is_harmed), (3998, 1, true));
+    let walls: Vec<_> =
+        recording.telegrams(MM).unwrap().map(|frame| frame.wall_ns.unwrap() / 1_000_000_000).collect();
+    assert!(walls.iter().copied().eq((1..4000).filter(|at| *at != 7)));
+    let packed = gzip(log.as_bytes());
+    let cut = File::new("cut.log.gz", &packed[..packed.len() * 2 / 3]);
+    let recording = Recording::open(&cut.0).unwrap();
+    let contents = recording.contents();
+    assert!(contents.damage.is_cut && contents.scans > 0, "{contents:?}");
+    assert_eq!(recording.telegrams(MM).unwrap().count() as u64, contents.telegrams);
+}
+
+#[test]
+fn recordings_of_real_sensors() {
+    let data = std::env::var_os("SCANHUB_DATA").map_or_else(
+        || PathBuf::from(concat!(env!("CARGO_MANIFEST_DIR"), "/../../../shared/data")),
+        PathBuf::from,
+    );
+    if !data.is_dir() {
+        skip("recordings", format!("none at {}", data.display()));
+        return;
+    }
+    let capture = Recording::open(data.join("captures/lms200_38400.bin")).unwrap();
+    assert_eq!((capture.contents().telegrams, capture.contents().scans), (427, 354));
+    assert_eq!((capture.contents().unit, capture.contents().mode), (Some(Unit::Mm), Some(Mode(4))));
+    let bytes: Vec<u8> = capture.telegrams(MM).unwrap().flat_map(|frame| frame.telegram).collect();
+    assert_eq!(bytes, fs::read(data.join("captures/lms200_38400.bin")).unwrap());
+    for (name, scans, beams) in
+        [("intel", 910, 181), ("freiburg-079", 4791, 361), ("aces", 440, 181), ("orebro", 237, 181)]
+    {
+        let log = Recording::open(data.join(format!("carmen/{name}-corrected.log.gz"))).unwrap();
+        assert_eq!((log.contents().form, log.contents().scans), (Form::Carmen, scans), "{name}");
+        assert_eq!(log.contents().variant.map(Variant::beams), Some(beams), "{name}");
+    }
+}

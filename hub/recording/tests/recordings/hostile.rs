@@ -1,0 +1,153 @@
+//! Records that are shorter, longer or otherwise than they say: whatever stands in attachments, metadata and indices, a
+//! file is read, its telegrams are had, and it is written anew without a panic.
+
+use std::fs;
+use std::path::{Path, PathBuf};
+use std::sync::atomic::AtomicBool;
+
+use fastrand::Rng;
+use mcap::records::op;
+use recording::convert::{ConvertOptions, Converted, convert};
+use schema::{Failure, Kind};
+
+/// A directory of this test.
+struct Scratch(PathBuf);
+
+impl Scratch {
+    fn new(name: &str) -> Scratch {
+        let path = std::env::temp_dir().join(format!("scanhub-hostile-{name}-{}", std::process::id()));
+        fs::create_dir_all(&path).unwrap();
+        Scratch(path)
+    }
+
+    /// Writes `bytes` anew as MCAP.
+    fn convert(&self, bytes: &[u8]) -> Result<Converted, Failure> {
+        let (input, output) = (self.0.join("in.mcap"), self.0.join("out.mcap"));
+        fs::write(&input, bytes).unwrap();
+        let options = ConvertOptions { input, output, force: true, ..ConvertOptions::default() };
+        convert(&options, &AtomicBool::new(false), |_, _| {})
+    }
+
+    fn copy(&self) -> PathBuf {
+        self.0.join("out.mcap")
+    }
+}
+
+impl Drop for Scratch {
+    fn drop(&mut self) {
+        let _ = fs::remove_dir_all(&self.0);
+    }
+}
+
+fn record(opcode: u8, body: &[u8]) -> Vec<u8> {
+    [&[opcode][..], &(body.len() as u64).to_le_bytes(), body].concat()
+}
+
+fn text(text: &str) -> Vec<u8> {
+    [&(text.len() as u32).to_le_bytes()[..], text.as_bytes()].concat()
+}
+
+fn attachment(data: &[u8]) -> Vec<u8> {
+    let len = (data.len() as u64).to_le_bytes();
+    [&[7; 16][..], &text("map.pgm"), &text("image/pgm"), &len, data, &[0; 4]].concat()
+}
+
+/// Bodies of one record of each kind that a file has beside its messages.
+fn others() -> Vec<(u8, Vec<u8>)> {
+    let pairs = [text("robot"), text("r1"), text("place"), text("hall 3")].concat();
+    let map = [&(pairs.len() as u32).to_le_bytes()[..], &pairs].concat();
+    let counted = |entries: &[u8]| [&(entries.len() as u32).to_le_bytes()[..], entries].concat();
+    vec![
+        (op::ATTACHMENT, attachment(b"")),
+        (op::ATTACHMENT, attachment(b"P5 2 2 255 abcd")),
+        (op::METADATA, [text("walk"), map].concat()),
+        (op::MESSAGE_INDEX, [&[1, 0][..], &counted(&[0; 32])].concat()),
+        (op::CHUNK_INDEX, [&[0; 32][..], &counted(&[1; 20]), &[0; 8], &text(""), &[0; 16]].concat()),
+        (op::ATTACHMENT_INDEX, [&[0; 40][..], &text("map.pgm"), &text("image/pgm")].concat()),
+        (op::METADATA_INDEX, [&[0; 16][..], &text("walk")].concat()),
+        (op::STATISTICS, [&[0; 42][..], &counted(&[1; 20])].concat()),
+        (op::SUMMARY_OFFSET, vec![op::STATISTICS; 17]),
+    ]
+}
+
+/// A recording with this record behind its first records, and checksums that do not say anything.
+fn with_record(whole: &[u8], record: &[u8]) -> Vec<u8> {
+    let (mut at, mut file) = (MAGIC, whole[..MAGIC].to_vec());
+    let mut is_in = false;
+    while at + 9 < whole.len() - MAGIC {
+        let len = u64::from_le_bytes(*whole[at + 1..].first_chunk().unwrap()) as usize;
+        let (opcode, end) = (whole[at], at + 9 + len);
+        if opcode == op::CHUNK && !is_in {
+            file.extend_from_slice(record);
+            is_in = true;
+        }
+        file.extend_from_slice(&whole[at..end]);
+        let place = file.len();
+        match opcode {
+            op::DATA_END => file[place - 4..].fill(0),
+            op::FOOTER => file[place - 20..].fill(0),
+            _ => {}
+        }
+        at = end;
+    }
+    file.extend_from_slice(&whole[at..]);
+    file
+}
+
+const MAGIC: usize = 8;
+
+#[test]
+fn an_attachment_that_is_too_short_is_told_and_left_out() {
+    let scratch = Scratch::new("short");
+    let whole = crate::written::recording(8, 1);
+    let telegrams = whole.telegrams.len() as u64;
+    let sound =
+        scratch.convert(&with_record(&whole.bytes, &record(op::ATTACHMENT, &attachment(b"abc")))).unwrap();
+    assert!(sound.damage.is_none() && sound.telegrams == telegrams, "{sound:?}");
+    assert_eq!(attachments(&scratch.copy()), 1);
+    // Each length that it may have had before somebody cut it: 1 to 4 bytes less lack a part of its checksum.
+    for data in [&b""[..], b"abc"] {
+        let body = attachment(data);
+        for len in 0..body.len() {
+            let cut = record(op::ATTACHMENT, &body[..len]);
+            let converted = scratch.convert(&with_record(&whole.bytes, &cut)).unwrap();
+            assert_eq!(converted.telegrams, telegrams, "{len}: {converted:?}");
+            assert!(converted.damage.bytes > 0 && converted.damage.is_harmed, "{len}: {converted:?}");
+            assert_eq!(attachments(&scratch.copy()), 0, "{len}");
+        }
+    }
+}
+
+fn attachments(path: &Path) -> u32 {
+    let file = fs::read(path).unwrap();
+    mcap::Summary::read(&file).unwrap().unwrap().stats.unwrap().attachment_count
+}
+
+#[test]
+fn whatever_stands_in_a_record_nobody_panics_and_no_telegram_is_lost() {
+    let scratch = Scratch::new("any");
+    let whole = crate::written::recording(4, 2);
+    let telegrams = whole.telegrams.len() as u64;
+    let (mut random, others) = (Rng::with_seed(3), others());
+    for round in 0..400 {
+        let (opcode, mut body) = others[random.usize(..others.len())].clone();
+        for _ in 0..random.usize(1..4) {
+            let at = random.usize(..=body.len());
+            match random.u8(..4) {
+                0 => body.truncate(at),
+                1 => body.insert(at, random.u8(..)),
+                // A length, as a rule.
+                2 if at + 4 <= body.len() => {
+                    body[at..at + 4].copy_from_slice(&random.u32(..64).to_le_bytes())
+                }
+                _ if at < body.len() => body[at] = random.u8(..),
+                _ => {}
+            }
+        }
+        let file = with_record(&whole.bytes, &record(opcode, &body));
+        match scratch.convert(&file) {
+            Ok(converted) => assert_eq!(converted.telegrams, telegrams, "{round}: {opcode} {body:?}"),
+            Err(failure) => assert_eq!(failure.kind, Kind::Configuration, "{round}: {opcode} {body:?}"),
+        }
+    }
+}

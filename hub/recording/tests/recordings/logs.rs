@@ -1,0 +1,214 @@
+//! CARMEN logs written anew: every range and every code of a log comes back from what it was converted to, or it is
+//! refused.
+
+use std::fs;
+use std::io::Read;
+use std::path::{Path, PathBuf};
+
+use crate::folder::{Folder, converted};
+use crate::skip::skip;
+use lms::measured;
+use lms::reply;
+use lms::variant::{Mode, Unit};
+use recording::{Encoding, Frame, Recording};
+
+#[test]
+fn a_log_comes_back_from_an_mcap_file() {
+    let folder = Folder::new("log");
+    let log: String = (0..5)
+        .map(|scan| {
+            let ranges: Vec<_> =
+                (0..181).map(|i| format!("{:.3}", 0.5 + 0.011 * f64::from(i * scan))).collect();
+            format!("FLASER 181 {} 1 2 3 4 5 6 12{scan}.25 host 1\n", ranges.join(" "))
+        })
+        .collect();
+    let log = folder.file("a.log", log.as_bytes());
+    let (mcap, again) = (folder.0.join("a.mcap"), folder.0.join("b.log"));
+    converted(&log, &mcap, None).unwrap();
+    // Millimetres up to 8.4 m do not go into 13 bits.
+    let contents = Recording::open(&mcap).unwrap().contents().clone();
+    assert_eq!(
+        (contents.unit, contents.mode, &contents.sensors[0][..]),
+        (Some(Unit::Mm), Some(Mode(4)), "front")
+    );
+    converted(&mcap, &again, None).unwrap();
+    assert_eq!(sweeps(&again), sweeps(&log));
+}
+
+/// Ranges as they are written, in micrometres, and the time in microseconds, of each scan.
+fn sweeps(log: &Path) -> Vec<(Vec<i64>, i64)> {
+    let mut text = String::new();
+    flate2::read::MultiGzDecoder::new(fs::File::open(log).unwrap()).read_to_string(&mut text).unwrap_or_else(
+        |_| {
+            text = fs::read_to_string(log).unwrap();
+            0
+        },
+    );
+    let micros = |field: &str| (field.parse::<f64>().unwrap() * 1e6).round() as i64;
+    let sweep = |line: &str| {
+        let fields: Vec<&str> = line.split(' ').filter(|field| !field.is_empty()).collect();
+        // The ranges of the other lines stand behind seven numbers of the sensor.
+        let at = if fields[0] == "FLASER" { 1 } else { 8 };
+        let count: usize = fields[at].parse().unwrap();
+        (
+            fields[at + 1..at + 1 + count].iter().map(|field| micros(field)).collect(),
+            micros(fields[fields.len() - 3]),
+        )
+    };
+    text.lines().filter(|line| line.contains("LASER") && !line.starts_with('#')).map(sweep).collect()
+}
+
+/// Converts `log` to MCAP and back, to a stream and back, and to one by the other: the same ranges everywhere, the same
+/// codes, and the same times where there are any.
+fn assert_comes_back(folder: &Folder, name: &str, log: &Path) {
+    let there = |ending: &str| folder.0.join(format!("{name}{ending}"));
+    let (mcap, stream, both) = (there(".mcap"), there(".bin.gz"), there("-mcap.bin"));
+    converted(log, &mcap, None).unwrap();
+    converted(log, &stream, None).unwrap();
+    converted(&mcap, &both, None).unwrap();
+    let original = sweeps(log);
+    let own = Recording::open(log).unwrap();
+    for (way, has_times) in [(&mcap, true), (&stream, false), (&both, false)] {
+        let again = there(&format!("-{}.log.gz", way.extension().unwrap().display()));
+        let _ = fs::remove_file(&again);
+        converted(way, &again, None).unwrap();
+        let back = sweeps(&again);
+        assert_eq!(back.len(), original.len(), "{}", way.display());
+        for (number, (one, other)) in original.iter().zip(&back).enumerate() {
+            assert!(one.0 == other.0, "{}, scan {number}", way.display());
+            assert!(
+                !has_times || one.1 == 0 || one.1.abs_diff(other.1) <= 1,
+                "{}, scan {number}",
+                way.display()
+            );
+        }
+        // And the way there has the words and codes that the log itself is read as.
+        let recording = Recording::open(way).unwrap();
+        assert_eq!(recording.encoding(), own.encoding());
+        let words = |recording: &Recording| -> Vec<_> {
+            let frames = recording.telegrams(recording.encoding().unwrap()).unwrap();
+            frames.filter(Frame::is_scan).map(|frame| frame.telegram).collect()
+        };
+        assert!(words(&recording) == words(&own) && words(&own) == words(&Recording::open(&again).unwrap()));
+    }
+}
+
+/// A log of three scans of `count` beams: the ranges in turn, two seconds apart.
+fn log(count: usize, ranges: &[&str]) -> String {
+    let line = |scan: usize| {
+        let ranges: Vec<_> = (0..count).map(|beam| ranges[(beam + scan) % ranges.len()]).collect();
+        format!("FLASER {count} {} 1 2 3 4 5 6 {}.25 host 1\n", ranges.join(" "), 1000 + 2 * scan)
+    };
+    (0..3).map(line).collect()
+}
+
+#[test]
+fn ranges_and_codes_of_every_kind_of_log_come_back() {
+    let folder = Folder::new("kinds");
+    for (name, count, ranges) in [
+        ("cm-far", 180, &["20.00", "81.91", "81.90", "81.87", "81.83", "81.82", "0.00"][..]),
+        ("cm-near", 361, &["1.23", "7.00"]),
+        ("cm-50", 360, &["50", "49.91", "1"]),
+        ("mm-13", 181, &["1.234", "8.191", "8.183", "8.182"]),
+        ("mm-14", 401, &["1.234", "9.001", "16.383", "16.379"]),
+        ("mm-15", 181, &["1.234", "32.767", "32.759", "32.763", "20.001"]),
+    ] {
+        let log = folder.file(&format!("{name}.log"), log(count, ranges).as_bytes());
+        assert_comes_back(&folder, name, &log);
+    }
+    let sensor = "0 -1.570796 3.141593 0.017453 81.91 0.01 0";
+    let both: String = (0..3)
+        .map(|scan| {
+            let ranges = vec![format!("1{scan}.05"); 180].join(" ");
+            format!(
+                "RAWLASER1 {sensor} 180 {ranges} 0 {scan}.5 host 1\nODOM 1\n\
+                     ROBOTLASER1 {sensor} 180 {ranges} 0 1 2 3 1 2 3 0 0 0 0 0 {scan}.7 host 1\n"
+            )
+        })
+        .collect();
+    let recording = Recording::open(folder.file("both.log", both.as_bytes())).unwrap();
+    assert_eq!(recording.contents().scans, 3, "each scan stands there twice");
+    for word in ["RAWLASER1", "ROBOTLASER1"] {
+        let lines: String =
+            both.lines().filter(|line| line.starts_with(word)).map(|line| format!("{line}\n")).collect();
+        assert_comes_back(&folder, word, &folder.file(&format!("{word}.log"), lines.as_bytes()));
+    }
+}
+
+#[test]
+fn a_range_where_others_have_codes_stays_a_range_on_its_way_through_a_log() {
+    let folder = Folder::new("told");
+    // 8.185 m in 14 bits; in 13 bits it would be a code.
+    let scan = measured::encode(0, Unit::Mm, &[8185; 181], 0x10);
+    let told = reply::configuration(0, Mode(4), Unit::Mm, 0x10);
+    let stream = folder.file("a.bin", &[told.bytes(), scan.bytes()].concat());
+    let log = folder.0.join("a.log");
+    converted(&stream, &log, None).unwrap();
+    let recording = Recording::open(&log).unwrap();
+    assert_eq!(recording.encoding(), Some(Encoding { unit: Unit::Mm, mode: Mode(4) }));
+    assert_comes_back(&folder, "b", &log);
+}
+
+#[test]
+fn a_log_that_no_sensor_could_have_sent_is_refused_with_the_reason() {
+    let folder = Folder::new("unfit");
+    for (name, ranges, says) in [
+        ("fine", &["1.23456", "2"][..], "ranges are finer"),
+        ("far", &["1.234", "2", "81.91"], "ranges are finer"),
+        ("farther", &["1.5", "1000.0"], "too long"),
+    ] {
+        let input = folder.file(&format!("{name}.log"), log(361, ranges).as_bytes());
+        for output in ["out.mcap", "out.bin", "out.log"] {
+            let failure = converted(&input, &folder.0.join(output), None).unwrap_err();
+            assert_eq!(failure.kind.exit_code(), 66);
+            let all = format!("{failure} {}", failure.hint);
+            assert!(all.contains("cannot become telegrams without loss"), "{name}: {all}");
+            assert!(all.contains(says), "{name}: {all}");
+        }
+        // It can be played all the same.
+        let recording = Recording::open(&input).unwrap();
+        assert_eq!(recording.telegrams(recording.encoding().unwrap()).unwrap().count(), 3);
+    }
+    assert_eq!(fs::read_dir(&folder.0).unwrap().count(), 3);
+}
+
+#[test]
+fn a_log_in_an_mcap_file_says_how_long_each_scan_stands() {
+    let folder = Folder::new("gaps");
+    let log = folder.file("a.log", log(181, &["1.5"]).as_bytes());
+    let mcap = folder.0.join("a.mcap");
+    converted(&log, &mcap, None).unwrap();
+    let recording = Recording::open(&mcap).unwrap();
+    let frames: Vec<Frame> = recording.telegrams(recording.encoding().unwrap()).unwrap().collect();
+    let periods: Vec<_> = frames.iter().map(|frame| frame.header.unwrap().period_us).collect();
+    assert_eq!(periods[1..], [2_000_000, 2_000_000, 13_320]);
+    assert!(
+        frames
+            .windows(2)
+            .all(|pair| { pair[0].header.unwrap().stamp_last_ns <= pair[1].header.unwrap().stamp_first_ns })
+    );
+}
+
+#[test]
+fn logs_of_real_sensors_come_back() {
+    let data = std::env::var_os("SCANHUB_DATA").map_or_else(
+        || PathBuf::from(concat!(env!("CARGO_MANIFEST_DIR"), "/../../../shared/data")),
+        PathBuf::from,
+    );
+    if !data.is_dir() {
+        skip("recordings", format!("none at {}", data.display()));
+        return;
+    }
+    let folder = Folder::new("real-logs");
+    for name in ["aces", "freiburg-079", "intel", "orebro"] {
+        assert_comes_back(&folder, name, &data.join(format!("carmen/{name}-corrected.log.gz")));
+        let (scans, own) = (sweeps(&data.join(format!("carmen/{name}-corrected.log.gz"))), {
+            Recording::open(data.join(format!("carmen/{name}-corrected.log.gz"))).unwrap().encoding()
+        });
+        println!(
+            "{name}: {} scans, {} ranges, {own:?}",
+            scans.len(),
+            scans.iter().map(|scan| scan.0.len()).sum::<usize>()
+        );
+    }
+}

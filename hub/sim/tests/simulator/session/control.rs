@@ -1,0 +1,166 @@
+//! What a user may ask of a running session: pause, resume, resync.
+
+use lms::variant::Baud;
+use lms::{Control, MILLIS, Nanos, State, Trouble};
+use sim::operating::Operating;
+
+use super::bench::{Bench, make_stream, sensor};
+
+impl Bench {
+    fn control(&mut self, control: Control) {
+        self.session.control(control, self.now);
+    }
+}
+
+/// Bytes of the sensor that came after `since`.
+fn sent_after(bench: &Bench, since: Nanos) -> usize {
+    bench.sent.iter().filter(|sent| sent.at > since).count()
+}
+
+#[test]
+fn a_pause_stops_the_stream_and_a_resume_starts_it() {
+    let mut bench = Bench::new(sensor(Baud::B9600), 0);
+    bench.until("streaming", 3_000 * MILLIS, Bench::is_streaming);
+    bench.run(500 * MILLIS);
+    for round in 1..4 {
+        bench.control(Control::Pause);
+        bench.control(Control::Pause);
+        bench.run(200 * MILLIS);
+        let (quiet, said) = (bench.now, bench.said.len());
+        bench.run(20_000 * MILLIS);
+        assert_eq!((bench.session.state(), bench.said.len()), (State::Paused, said), "{bench}");
+        assert_eq!(sent_after(&bench, quiet), 0, "the sensor streams on: {bench}");
+        assert_eq!((bench.session.trouble(), bench.session.resyncs()), (None, 0));
+        bench.control(Control::Resume);
+        bench.control(Control::Resume);
+        bench.until("streaming", 2_000 * MILLIS, Bench::is_streaming);
+        bench.run(200 * MILLIS);
+        assert!(bench.is_streaming(), "{round}: {bench}");
+    }
+    // The scans that the three stops broke off are the only ones that were not delivered.
+    let mut intact = bench.intact_scans(0);
+    intact.truncate(bench.received_scans(0).len());
+    assert_eq!(bench.received_scans(0), intact, "{bench}");
+}
+
+#[test]
+fn a_pause_may_come_at_any_moment() {
+    for baud in [Baud::B9600, Baud::B38400, Baud::B500000] {
+        for streams in [false, true] {
+            for at in 0..60 {
+                let mut machine = sensor(baud);
+                let begun = if streams { make_stream(&mut machine) } else { 0 };
+                let mut bench = Bench::new(machine, begun);
+                bench.run(at * 23 * MILLIS);
+                bench.control(Control::Pause);
+                assert_eq!(bench.session.state(), State::Paused);
+                bench.run(5_000 * MILLIS);
+                let (quiet, said) = (bench.now, bench.said.len());
+                bench.run(2_000 * MILLIS);
+                assert_eq!((bench.session.state(), bench.said.len()), (State::Paused, said), "{bench}");
+                assert_eq!(sent_after(&bench, quiet), 0, "{at}: the sensor streams on: {bench}");
+                assert_eq!(bench.machine.operating(), &Operating::OnRequest, "{at}: {bench}");
+                assert_eq!(bench.session.trouble(), None, "{at}: {bench}");
+                bench.control(Control::Resume);
+                bench.until("streaming", 5_000 * MILLIS, Bench::is_streaming);
+                bench.run(200 * MILLIS);
+                assert!(bench.is_streaming() && bench.session.trouble().is_none(), "{at}: {bench}");
+            }
+        }
+    }
+}
+
+#[test]
+fn an_absent_sensor_is_paused_in_peace() {
+    let mut bench = Bench::new(sensor(Baud::B500000), 0);
+    bench.to_sensor = Box::new(|_, _| None);
+    bench.control(Control::Pause);
+    bench.run(10_000 * MILLIS);
+    let said = bench.said.len();
+    assert!(said <= 8 * 8, "{said} bytes to nobody");
+    bench.run(60_000 * MILLIS);
+    assert_eq!((bench.session.state(), bench.said.len()), (State::Paused, said));
+    assert_eq!(bench.session.trouble(), None);
+    // A pause does not count as time in which it did not answer.
+    bench.control(Control::Resume);
+    bench.until("said", 3_000 * MILLIS, |bench| bench.session.trouble().is_some());
+    assert!(matches!(bench.session.trouble(), Some(Trouble::NoAnswer { seconds: 0..=3, .. })), "{bench}");
+}
+
+#[test]
+fn what_sends_at_another_rate_and_does_not_listen_is_no_pause() {
+    let mut machine = sensor(Baud::B38400);
+    let begun = make_stream(&mut machine);
+    let mut bench = Bench::new(machine, begun);
+    bench.to_sensor = Box::new(|_, _| None);
+    bench.run(300 * MILLIS);
+    bench.control(Control::Pause);
+    bench.run(20_000 * MILLIS);
+    let said = bench.said.len();
+    bench.run(60_000 * MILLIS);
+    assert_eq!((bench.session.state(), bench.said.len()), (State::Paused, said));
+    assert_eq!(bench.session.trouble(), Some(Trouble::NotStopped), "{bench}");
+}
+
+#[test]
+fn what_streams_on_is_delivered_and_told_to_stop_some_times() {
+    let mut machine = sensor(Baud::B500000);
+    let begun = make_stream(&mut machine);
+    let mut bench = Bench::new(machine, begun);
+    bench.until("streaming", 100 * MILLIS, Bench::is_streaming);
+    bench.run(300 * MILLIS);
+    // The line to the sensor breaks, the line back does not.
+    bench.to_sensor = Box::new(|_, _| None);
+    let paused = bench.now;
+    bench.control(Control::Pause);
+    bench.run(30_000 * MILLIS);
+    let said = bench.said.len();
+    bench.run(10_000 * MILLIS);
+    assert_eq!((bench.session.state(), bench.said.len()), (State::Paused, said), "{bench}");
+    assert_eq!(bench.session.trouble(), Some(Trouble::NotStopped), "{bench}");
+    let mut intact = bench.intact_scans(paused);
+    assert!(intact.len() > 1400);
+    intact.truncate(bench.received_scans(paused).len());
+    assert_eq!(bench.received_scans(paused), intact);
+    bench.control(Control::Resume);
+    bench.until("streaming", 100 * MILLIS, Bench::is_streaming);
+    bench.run(5_000 * MILLIS);
+    // It is asked who it is, as often as any other.
+    assert!(bench.is_streaming() && bench.said.len() <= said + 15 * 7, "{bench}");
+}
+
+#[test]
+fn a_resync_begins_anew_and_is_counted() {
+    let mut bench = Bench::new(sensor(Baud::B500000), 0);
+    bench.until("streaming", 3_000 * MILLIS, Bench::is_streaming);
+    bench.run(500 * MILLIS);
+    let (said, begun) = (bench.said.len(), bench.now);
+    bench.control(Control::Resync);
+    assert_eq!((bench.session.state(), bench.session.resyncs()), (State::Probing, 1));
+    bench.until("streaming", 60 * MILLIS, Bench::is_streaming);
+    bench.run(1_000 * MILLIS);
+    assert_eq!(bench.said.len(), said + 2 * 7, "an adopted stream costs two questions");
+    let mut intact = bench.intact_scans(begun);
+    intact.truncate(bench.received_scans(begun).len());
+    assert_eq!(bench.received_scans(begun), intact, "{bench}");
+    // From a pause too.
+    bench.control(Control::Pause);
+    bench.run(500 * MILLIS);
+    bench.control(Control::Resync);
+    bench.until("streaming", 2_000 * MILLIS, Bench::is_streaming);
+    assert_eq!(bench.session.resyncs(), 2);
+}
+
+#[test]
+fn a_recording_is_not_controlled() {
+    let wanted = lms::Settings { listen_only: true, ..super::bench::WANTED };
+    let mut machine = sensor(Baud::B500000);
+    let begun = make_stream(&mut machine);
+    let mut bench = Bench::wanting(wanted, machine, begun);
+    for control in [Control::Pause, Control::Resume, Control::Resync] {
+        bench.control(control);
+        bench.run(200 * MILLIS);
+        assert_eq!((bench.session.state(), bench.session.resyncs()), (State::Streaming, 0));
+    }
+    assert!(bench.said.is_empty());
+}

@@ -1,0 +1,149 @@
+//! A sensor whose power goes and comes: in the middle of a scan, in the middle of the conversation, and one that needs
+//! a minute to start.
+
+use lms::command::Request;
+use lms::variant::Baud;
+use lms::{Control, MILLIS, Nanos, State, Trouble};
+use sim::machine::{Habits, Settings, Start};
+
+use super::bench::{Bench, sensor_with};
+
+/// What a session has to stream within after the banner.
+const LIMIT: Nanos = 5_000 * MILLIS;
+
+/// The same where the change of a mode is waited for that the sensor has forgotten, and then the rate is sought.
+const SEARCHING: Nanos = 6_000 * MILLIS;
+
+fn booting(boot_ns: Nanos) -> Settings {
+    Settings { boot_ns, ..Settings::default() }
+}
+
+#[test]
+fn in_the_middle_of_a_scan() {
+    let mut slowest = 0;
+    for boot in [50, 300, 1_000, 1_500, 2_000, 3_333, 7_777, 20_000, 59_000] {
+        for phase in [0, 5, 14, 22] {
+            let mut bench = Bench::new(sensor_with(booting(boot * MILLIS)), 0);
+            bench.until("streaming", 3_000 * MILLIS, Bench::is_streaming);
+            bench.run((500 + phase) * MILLIS);
+            let off = bench.now;
+            bench.machine.power_cycle(off);
+            bench.run(boot * MILLIS);
+            let took = bench.until("streaming", LIMIT, |bench| {
+                bench.is_streaming() && bench.received.last().is_some_and(|got| got.at > off + boot * MILLIS)
+            });
+            slowest = slowest.max(took);
+            bench.run(500 * MILLIS);
+            assert!(bench.is_streaming() && bench.session.baud() == Baud::B500000, "{bench}");
+            assert_eq!((bench.session.resyncs(), bench.session.trouble()), (1, None), "{boot} {phase}");
+        }
+    }
+    println!("streaming within {} ms of the banner", slowest / MILLIS);
+}
+
+#[test]
+fn at_any_moment_of_the_conversation() {
+    let mut slowest = 0;
+    for baud in [Baud::B9600, Baud::B500000] {
+        for at in 0..20 {
+            for boot in [20, 3_100] {
+                let mut bench = Bench::new(sensor_with(Settings { baud, ..booting(boot * MILLIS) }), 0);
+                bench.run(at * 63 * MILLIS);
+                let off = bench.now;
+                bench.machine.power_cycle(off);
+                bench.run(boot * MILLIS);
+                let took = bench.until("streaming", SEARCHING, |bench| {
+                    bench.is_streaming()
+                        && bench.received.last().is_some_and(|got| got.at > off + boot * MILLIS)
+                });
+                slowest = slowest.max(took);
+                bench.run(300 * MILLIS);
+                assert!(bench.is_streaming(), "{baud:?} {at} {boot} after {took} ns: {bench}");
+            }
+        }
+    }
+    println!("streaming within {} ms", slowest / MILLIS);
+}
+
+#[test]
+fn a_banner_that_is_heard_is_answered_at_once() {
+    // In a stream at 9600, and in the search, where the pauses between its rounds are spent at 9600.
+    let wanted = lms::Settings { baud: Baud::B9600, ..super::bench::WANTED };
+    let mut bench = Bench::wanting(wanted, sensor_with(booting(300 * MILLIS)), 0);
+    bench.until("streaming", 5_000 * MILLIS, Bench::is_streaming);
+    bench.run(1_000 * MILLIS);
+    let (now, said) = (bench.now, bench.said.len());
+    bench.machine.power_cycle(now);
+    bench.run(300 * MILLIS);
+    bench.until("asked", 100 * MILLIS, |bench| bench.said.len() > said);
+    assert_eq!(bench.session.resyncs(), 1);
+    bench.until("streaming", 3_000 * MILLIS, |bench| bench.is_streaming());
+
+    let settings = Settings { start: Start::PowerOn, ..booting(60_000 * MILLIS) };
+    let mut bench = Bench::new(sensor_with(settings), 0);
+    bench.run(59_990 * MILLIS);
+    assert_eq!(bench.states, [State::Probing]);
+    assert!(
+        matches!(bench.session.trouble(), Some(Trouble::NoAnswer { seconds: 30..=59, baud: None })),
+        "{bench}"
+    );
+    bench.until("streaming", LIMIT, Bench::is_streaming);
+    assert_eq!(bench.session.trouble(), None);
+}
+
+#[test]
+fn a_mute_line_is_asked_rarely_and_for_ever() {
+    let settings = Settings { habits: Habits { mute: true, ..Habits::default() }, ..Settings::default() };
+    let mut bench = Bench::new(sensor_with(settings), 0);
+    let mut told = Vec::new();
+    for _ in 0..7_300 {
+        bench.run(1_000 * MILLIS);
+        if told.last() != Some(&bench.session.trouble()) {
+            told.push(bench.session.trouble());
+        }
+    }
+    let seconds: Vec<u32> = told
+        .iter()
+        .filter_map(|trouble| match trouble {
+            Some(Trouble::NoAnswer { seconds, .. }) => Some(*seconds),
+            _ => None,
+        })
+        .collect();
+    assert_eq!(seconds, [1, 3, 10, 30, 60, 300, 600, 1_800, 3_600, 7_200]);
+    let requests = bench.said.len() as u64 / 7;
+    assert!((7_300..4 * 7_300).contains(&requests), "{requests} requests in 7300 s");
+    bench.machine.set_habits(Habits::default());
+    bench.until("streaming", LIMIT, Bench::is_streaming);
+}
+
+#[test]
+fn a_pause_outlasts_the_power() {
+    let wanted = lms::Settings { baud: Baud::B9600, ..super::bench::WANTED };
+    let mut bench = Bench::wanting(wanted, sensor_with(booting(300 * MILLIS)), 0);
+    bench.until("streaming", 5_000 * MILLIS, Bench::is_streaming);
+    bench.session.control(Control::Pause, bench.now);
+    bench.run(2_000 * MILLIS);
+    let (now, said) = (bench.now, bench.said.len());
+    bench.machine.power_cycle(now);
+    bench.run(5_000 * MILLIS);
+    assert_eq!((bench.session.state(), bench.said.len()), (State::Paused, said));
+    bench.session.control(Control::Resume, bench.now);
+    bench.until("streaming", LIMIT, Bench::is_streaming);
+}
+
+#[test]
+fn a_reset_by_somebody_else_is_a_power_cycle() {
+    let wanted = lms::Settings { baud: Baud::B9600, ..super::bench::WANTED };
+    let mut bench = Bench::wanting(wanted, sensor_with(booting(500 * MILLIS)), 0);
+    bench.until("streaming", 5_000 * MILLIS, Bench::is_streaming);
+    bench.run(100 * MILLIS);
+    let now = bench.now;
+    for (i, &byte) in Request::Reset.encode(0).bytes().iter().enumerate() {
+        bench.machine.receive(byte, sim::Arrival::at(now + 1_200_000 * i as u64));
+    }
+    bench.run(1_000 * MILLIS);
+    bench.until("streaming", LIMIT, |bench| bench.is_streaming());
+    let scans = bench.received.len();
+    bench.run(2_000 * MILLIS);
+    assert!(bench.is_streaming() && bench.received.len() > scans, "{bench}");
+}

@@ -1,0 +1,257 @@
+//! Each layer of noise is seen to act, and to be off when it is switched off.
+
+use lms::variant::{Mode, Unit, Variant};
+use sim::labeled_scan::Met;
+use sim::layers::Layers;
+use sim::room::Room;
+use sim::world::World;
+
+use super::{SCAN_NS, look, text, world};
+
+/// A wall 3 m ahead, a post before it, a dark board and a far wall.
+const WORLD: &str = "
+[[thing]]
+line = [[-3000, 3000], [3000, 3000]]
+[[thing]]
+radius_mm = 60
+pose = [500, 1500]
+[[thing]]
+line = [[-3000, 2900], [-2000, 2900]]
+surface = \"dark\"
+[[thing]]
+line = [[6000, 9000], [9000, 2000]]
+";
+
+const NONE: Layers = Layers::NONE;
+
+/// The words of `count` scans with these layers.
+fn words(layers: Layers, seed: u64, count: u64) -> Vec<Vec<u16>> {
+    let room = Room::new(&world(WORLD).with_layers(layers), seed);
+    (1..=count).map(|scan| look(&room, scan * SCAN_NS).words).collect()
+}
+
+/// What `words` deviate from the truth, of all beams that tell a range in both.
+fn deviations_mm(words: &[Vec<u16>]) -> Vec<f64> {
+    let exact = &self::words(NONE, 0, 1)[0];
+    let pairs = words.iter().flat_map(|words| words.iter().zip(exact));
+    pairs
+        .filter(|(word, exact)| **word < 8183 && **exact < 8183)
+        .map(|(word, exact)| f64::from(*word) - f64::from(*exact))
+        .collect()
+}
+
+fn share(values: &[f64], is: impl Fn(f64) -> bool) -> f64 {
+    values.iter().filter(|&&value| is(value)).count() as f64 / values.len() as f64
+}
+
+#[test]
+fn without_layers_a_word_is_the_true_range_in_its_unit() {
+    let room = Room::new(&world(WORLD).with_layers(NONE), 9);
+    for (unit, mm) in [(Unit::Mm, 1.0), (Unit::Cm, 10.0), (Unit::Dm, 100.0)] {
+        let words = room.scan(Variant::HALF, unit, Mode(1), SCAN_NS);
+        for beam in 180..200 {
+            let angle = (f64::from(beam) / 2.0).to_radians();
+            assert_eq!(f64::from(words[beam as usize]), (3000.0 / angle.sin() / mm).round(), "beam {beam}");
+        }
+    }
+    assert_eq!(words(NONE, 1, 3)[0], words(NONE, 2, 3)[2]);
+}
+
+#[test]
+fn sigma_spreads_ranges() {
+    let deviations = deviations_mm(&words(Layers { sigma_mm: 5.0, ..NONE }, 1, 100));
+    let mean = deviations.iter().sum::<f64>() / deviations.len() as f64;
+    let variance = deviations.iter().map(|d| (d - mean).powi(2)).sum::<f64>() / deviations.len() as f64;
+    assert!(mean.abs() < 0.2 && (4.8..5.2).contains(&variance.sqrt()), "{mean} {variance}");
+    assert!(share(&deviations, |d| d.abs() > 30.0) == 0.0);
+}
+
+#[test]
+fn bias_is_one_for_a_device_and_another_for_the_next() {
+    let mut met: Vec<i32> = Vec::new();
+    for seed in 0..20 {
+        let deviations = deviations_mm(&words(Layers { bias_mm: 15.0, ..NONE }, seed, 2));
+        let bias = deviations[0].round();
+        assert!(bias.abs() <= 15.0 && deviations.iter().all(|d| (d - bias).abs() <= 1.0), "seed {seed}");
+        met.push(bias as i32);
+    }
+    met.sort_unstable();
+    met.dedup();
+    assert!(met.len() > 10 && met[0] < -5 && met[met.len() - 1] > 5, "{met:?}");
+}
+
+#[test]
+fn the_tail_is_heavy_and_belongs_to_edges() {
+    let exact = &words(NONE, 1, 1)[0];
+    let scans = words(Layers { tail: 0.5, ..NONE }, 1, 400);
+    let ranges = (0..361).filter(|&beam| exact[beam] < 8183);
+    let (mut at_edges, mut readings) = (0, Vec::new());
+    for beam in ranges {
+        let off = |words: &Vec<u16>| f64::from(words[beam]) - f64::from(exact[beam]);
+        let off: Vec<f64> = scans.iter().map(off).collect();
+        if off.iter().all(|&mm| mm == 0.0) {
+            continue;
+        }
+        let around = beam.saturating_sub(1)..(beam + 2).min(361);
+        assert!(
+            around.clone().any(|other| exact[other].abs_diff(exact[beam]) > 40),
+            "beam {beam} is at no edge"
+        );
+        at_edges += 1;
+        readings.extend(off);
+    }
+    assert!((4..30).contains(&at_edges), "{at_edges} beams");
+    // Half of a normal distribution of 60 mm, of which 62 % lie beyond 30 mm.
+    let far = share(&readings, |mm| mm.abs() > 30.0);
+    assert!((0.2..0.33).contains(&far), "{far}");
+}
+
+#[test]
+fn in_scenes_with_many_edges_readings_are_off_as_often_as_in_recordings() {
+    let world: World = "fig8".parse().unwrap();
+    let (mut off, mut count) = (0, 0);
+    for seed in 0..3 {
+        let room = Room::new(&world, seed);
+        // Before anybody or anything moves.
+        let looks: Vec<_> = (1..300).map(|scan| look(&room, scan * SCAN_NS)).collect();
+        for beam in 0..361 {
+            let told = looks.iter().filter(|look| look.truth[beam] != Met::Invalid);
+            let mut ranges: Vec<i32> = told.map(|look| i32::from(look.words[beam] & 8191)).collect();
+            ranges.sort_unstable();
+            let Some(&middle) = ranges.get(ranges.len() / 2) else { continue };
+            off += ranges.iter().filter(|range| (*range - middle).abs() > 30).count();
+            count += ranges.len();
+        }
+    }
+    let share = off as f64 / f64::from(count as u32);
+    assert!((0.010..0.022).contains(&share), "{share}");
+}
+
+#[test]
+fn a_spot_on_two_surfaces_tells_one_the_other_or_between() {
+    let behind_post = |range: f64| (2_700.0..3_300.0).contains(&range);
+    let on_post = |range: f64| (1_480.0..1_640.0).contains(&range);
+    let kinds = |layers| {
+        let scans = words(layers, 1, 200);
+        // Both edges of the post, which covers 69.1 to 74.0 degrees.
+        let beams = (136..151).filter(|beam| *beam != 143);
+        let told: Vec<f64> = beams
+            .flat_map(|beam| scans.iter().map(move |words| f64::from(words[beam])))
+            .filter(|&range| range < 8183.0)
+            .collect();
+        share(&told, |range| !behind_post(range) && !on_post(range))
+    };
+    assert_eq!(kinds(NONE), 0.0);
+    let mixed = kinds(Layers { spot: true, ..NONE });
+    assert!((0.002..0.1).contains(&mixed), "{mixed}");
+}
+
+#[test]
+fn errors_are_codes_in_place_of_ranges_and_change_nothing_else() {
+    let (with, without) = (words(Layers { errors: 0.005, ..NONE }, 1, 200), words(NONE, 1, 200));
+    let (mut codes, mut ranges) = (0, 0);
+    for (with, without) in with.iter().flatten().zip(without.iter().flatten()) {
+        if *without < 8183 {
+            ranges += 1;
+            codes += usize::from(with != without);
+            assert!(with == without || [8191, 8187, 8189].contains(with), "{with} for {without}");
+        }
+    }
+    let share = codes as f64 / f64::from(ranges);
+    assert!((0.004..0.006).contains(&share), "{share}");
+}
+
+#[test]
+fn what_is_beyond_the_greatest_value_says_so() {
+    let room = Room::new(&world(WORLD).with_layers(NONE), 1);
+    // The far wall: 8.5 m at 40 degrees.
+    assert_eq!(look(&room, SCAN_NS).words[80], 8191 - 8);
+    let cm = room.scan(Variant::HALF, Unit::Cm, Mode(1), SCAN_NS);
+    assert!((800..950).contains(&cm[80]), "{}", cm[80]);
+}
+
+#[test]
+fn dark_and_oblique_surfaces_far_away_are_too_weak() {
+    let board = (0..361).filter(|beam| (250..265).contains(beam));
+    let far = "[[thing]]\nline = [[-20000, 900], [20000, 900]]";
+    let told = |weak: bool, beam: usize| {
+        let world = world(&format!("{WORLD}{far}")).with_layers(Layers { weak, ..NONE });
+        Room::new(&world, 1).scan(Variant::HALF, Unit::Cm, Mode(1), SCAN_NS)[beam]
+    };
+    // The wall at 0.9 m, seen from 4 degrees: 12.9 m away.
+    assert_eq!((told(true, 8), told(false, 8)), (8187, 1290));
+    let dark = "[[thing]]\nline = [[-3000, 7900], [3000, 7900]]\nsurface = \"dark\"";
+    let told = |weak: bool| {
+        let world = world(dark).with_layers(Layers { weak, ..NONE });
+        look(&Room::new(&world, 1), SCAN_NS).words[180]
+    };
+    assert_eq!((told(true), told(false)), (7900 + 287, 7900));
+    // Three metres away the dark board is seen.
+    let near = words(Layers { weak: true, ..NONE }, 1, 1);
+    assert!(board.into_iter().all(|beam| near[0][beam] < 8183));
+}
+
+#[test]
+fn the_sun_dazzles_a_sector_for_a_time() {
+    let text = format!("{WORLD}[[sun]]\nsector_deg = [90, 95]\nfrom_s = 2\nuntil_s = 4\nshare = 0.5\n");
+    let dazzled = |dazzle, end_s: u64, beams: std::ops::RangeInclusive<usize>| {
+        let room = Room::new(&world(&text).with_layers(Layers { dazzle, ..NONE }), 1);
+        let codes = (0..40).flat_map(|scan| {
+            look(&room, end_s * 1_000_000_000 + scan * SCAN_NS).words[beams.clone()].to_vec()
+        });
+        codes.filter(|&word| word == 8190).count() as f64 / (40.0 * beams.count() as f64)
+    };
+    assert!((0.4..0.6).contains(&dazzled(true, 2, 180..=190)));
+    assert_eq!(dazzled(false, 2, 180..=190), 0.0);
+    assert_eq!(
+        (dazzled(true, 2, 170..=179), dazzled(true, 0, 180..=190), dazzled(true, 5, 180..=190)),
+        (0.0, 0.0, 0.0)
+    );
+}
+
+/// Even beams belong to the first of the two mirror turns, odd ones to the second.
+#[test]
+fn half_degrees_are_measured_one_mirror_turn_later() {
+    let (comb, straight) = [true, false]
+        .map(|comb| Room::new(&"approach".parse::<World>().unwrap().with_layers(Layers { comb, ..NONE }), 1))
+        .into();
+    let half_scan_ns = SCAN_NS / 2;
+    let mut moved = 0;
+    for end_ns in (15..25).map(|second| second * 1_000_000_000) {
+        let combed = look(&comb, end_ns).words;
+        let (last, before) = (look(&straight, end_ns).words, look(&straight, end_ns - half_scan_ns).words);
+        for beam in 0..361 {
+            assert_eq!(combed[beam], if beam % 2 == 0 { before[beam] } else { last[beam] }, "beam {beam}");
+        }
+        moved += (0..361).filter(|&beam| last[beam] != before[beam]).count();
+    }
+    assert!(moved > 20, "{moved}");
+}
+
+/// A mark from levels lies where the reflector is: the light on neighbouring beams grades them.
+#[test]
+fn reflectors_have_graded_levels_around_their_middle() {
+    let strips = text("strips");
+    let mut errors = Vec::new();
+    for seed in 0..20 {
+        let room = Room::new(&world(&strips), seed);
+        let marks = room.marks(SCAN_NS);
+        assert_eq!(marks.len(), 12);
+        let words = look(&room, SCAN_NS).words;
+        for mark in marks {
+            let near = |beam: &usize| (*beam as f64 / 2.0 - mark.angle_deg).abs() < 3.0;
+            let bright: Vec<usize> = (0..361)
+                .filter(near)
+                .filter(|&beam| words[beam] >> 13 > 0 && words[beam] & 8191 < 8183)
+                .collect();
+            let weight: f64 = bright.iter().map(|&beam| f64::from(words[beam] >> 13)).sum();
+            let sum: f64 = bright.iter().map(|&beam| f64::from(words[beam] >> 13) * beam as f64 / 2.0).sum();
+            assert!(weight > 0.0, "seed {seed}: nothing of {mark:?}");
+            assert!(bright.iter().all(|&beam| (f64::from(words[beam] & 8191) - mark.range_mm).abs() < 60.0));
+            errors.push(sum / weight - mark.angle_deg);
+        }
+    }
+    let rms = (errors.iter().map(|error| error * error).sum::<f64>() / errors.len() as f64).sqrt();
+    assert!(rms < 0.15, "{rms} degrees");
+    eprintln!("strips of 5 cm: {rms:.3} degrees RMS");
+}

@@ -1,0 +1,51 @@
+//! What holds after any list of actions, as far as it can be seen from outside the program.
+
+use std::collections::HashSet;
+
+use serde_json::Value;
+use sim::truth::Record;
+
+use crate::testkit::{Outcome, bytes_of, number};
+
+/// So many telegrams come at the end, while nothing goes wrong.
+pub(super) const CALM: usize = 60;
+
+/// Every byte that was read is something by now.
+pub(super) fn bytes_are_conserved(info: &Value) {
+    let count = |name: &str| number(&info["counters"], name);
+    let known = ["bytes_in_telegrams", "bytes_acknowledge", "bytes_discarded", "bytes_buffered"].map(count);
+    assert_eq!(count("bytes_read"), known.iter().sum::<u64>(), "{info}");
+}
+
+/// What was published was taken, or counted as missed; each life of the hub begins its numbers at 0.
+pub(super) fn all_is_accounted_for(taken: &[Value], outcome: &Outcome) {
+    let [summary] = &outcome.of_class("summary")[..] else { panic!("{outcome}") };
+    let mut published = 0;
+    for life in taken.chunk_by(|one, next| one["boot"] == next["boot"]) {
+        let numbers: Vec<u64> = life.iter().map(|line| number(line, "topic_seq")).collect();
+        assert!(numbers.windows(2).all(|pair| pair[0] < pair[1]), "out of order: {numbers:?}");
+        // Who is there before the hub gets all of it, but of the first one, which was there before.
+        let first = if published == 0 { numbers[0] } else { 0 };
+        published += numbers[numbers.len() - 1] - first + 1;
+    }
+    let boots: HashSet<_> = taken.iter().map(|line| line["boot"].as_str()).collect();
+    let lives = taken.chunk_by(|one, next| one["boot"] == next["boot"]).count();
+    assert_eq!(boots.len(), lives, "a hub's life came back");
+    assert_eq!(taken.len() as u64 + number(summary, "lost"), published, "{summary}");
+}
+
+/// Telegrams without a doubt are those that the sensor sent, in its order, each once.
+pub(super) fn nothing_is_invented(taken: &[Value], sent: &[Record]) {
+    let mut rest = sent.iter();
+    for line in taken.iter().filter(|line| line["quality"] == "clean") {
+        let hash = Record::hash(&bytes_of(line));
+        assert!(rest.any(|record| record.sha256 == hash), "never sent, or sent before the last one: {line}");
+    }
+}
+
+/// While nothing goes wrong every telegram comes.
+pub(super) fn nothing_is_lost(taken: &[Value], sent: &[Record]) {
+    let calm: Vec<_> = taken[taken.len() - CALM..].iter().map(|line| Record::hash(&bytes_of(line))).collect();
+    let hashes: Vec<_> = sent.iter().map(|record| record.sha256).collect();
+    assert!(hashes.windows(CALM).any(|window| window == calm), "not all of the last telegrams came");
+}

@@ -1,0 +1,75 @@
+//! The simulated sensors of a stage, in threads of the test: what is done to them while they run, and what they sent.
+
+use std::collections::{HashMap, VecDeque};
+use std::os::unix::net::UnixStream;
+use std::path::PathBuf;
+use std::sync::mpsc::{Receiver, channel};
+use std::sync::{Arc, Mutex};
+use std::thread::{self, JoinHandle};
+
+use schema::Failure;
+use sim::options::SimulateOptions;
+use sim::truth::{Record, Summary};
+use sim::{Event, simulate_with};
+
+use crate::testkit::{PATIENCE, TestEnv};
+
+/// The names of sensors and their ports.
+pub(super) const SENSORS: [&str; 2] = ["s0", "s1"];
+
+/// The simulator.
+pub(super) struct Sensors {
+    stop: UnixStream,
+    events: Events,
+    thread: JoinHandle<Result<Vec<Summary>, Failure>>,
+    records: Receiver<Record>,
+}
+
+/// What is done to each port next.
+type Events = Arc<Mutex<HashMap<PathBuf, VecDeque<Event>>>>;
+
+impl Sensors {
+    /// Sensors that have just been powered, whose ports can be opened.
+    pub(super) fn start(env: &TestEnv, seed: u64) -> Sensors {
+        let ports = SENSORS.map(|name| env.path(name));
+        let options = SimulateOptions { ports: ports.to_vec(), seed, ..SimulateOptions::default() };
+        let (stop, stopped) = UnixStream::pair().expect("a pair of sockets");
+        let events: Events = Arc::new(Mutex::new(ports.map(|port| (port, VecDeque::new())).into()));
+        let (told, records) = channel();
+        let (say_ready, is_ready) = channel();
+        let asked = events.clone();
+        let thread = thread::spawn(move || {
+            let told = Mutex::new(told);
+            simulate_with(
+                &options,
+                &stopped,
+                |_| say_ready.send(()).expect("somebody waits"),
+                |record| {
+                    // Who has enough of them has ended.
+                    let _ = told.lock().expect("whole").send(record.clone());
+                },
+                |port| asked.lock().expect("whole").get_mut(port)?.pop_front(),
+            )
+        });
+        is_ready.recv_timeout(PATIENCE).expect("ports can be opened");
+        Sensors { stop, events, thread, records }
+    }
+
+    /// Does `event` to sensor number `sensor`.
+    pub(super) fn suffer(&self, env: &TestEnv, sensor: usize, event: Event) {
+        let mut events = self.events.lock().expect("whole");
+        events.get_mut(&env.path(SENSORS[sensor])).expect("a sensor").push_back(event);
+    }
+
+    /// Ends them; what each sent in its order, and in all.
+    pub(super) fn end(self, env: &TestEnv) -> ([Vec<Record>; 2], Vec<Summary>) {
+        drop(self.stop);
+        let summaries = self.thread.join().expect("no panic").expect("ends well");
+        let records: Vec<Record> = self.records.into_iter().collect();
+        let of = |name| {
+            let port = env.path(name);
+            records.iter().filter(|record| record.port == port).cloned().collect()
+        };
+        (SENSORS.map(of), summaries)
+    }
+}

@@ -1,0 +1,40 @@
+//! What once went wrong stays mended, and a world depends on nothing but its plan.
+
+use world::{Detail, Plan, Runner, corpus, run};
+
+#[test]
+fn what_was_mended_stays_so() {
+    for (why, plan) in corpus::corpus() {
+        let outcome = run(&plan, Detail::Nothing);
+        assert_eq!(outcome.violations, [], "{why}\n{plan}");
+    }
+}
+
+#[test]
+fn the_same_seed_has_the_same_hash() {
+    let plans: Vec<Plan> = (0..20).map(|seed| Plan::of_seed(seed, 20)).collect();
+    let hashes =
+        |plans: &[Plan]| -> Vec<u64> { plans.iter().map(|plan| run(plan, Detail::Nothing).hash).collect() };
+    let first = hashes(&plans);
+    assert_eq!(first, hashes(&plans));
+    let different: std::collections::HashSet<_> = first.iter().collect();
+    assert_eq!(different.len(), plans.len());
+}
+
+/// Debug and release, this machine and others.
+#[test]
+fn the_hash_of_a_world_is_known() {
+    let plan: Plan = "seed 5 seconds 15\n1000 kill_hub away_ms=500\n".parse().unwrap();
+    assert_eq!(run(&plan, Detail::Nothing).hash, 0x6113_c7e8_01b3_21b0);
+}
+
+#[test]
+fn two_hundred_worlds_are_well() {
+    let plans = (0..200).map(|seed| Plan::of_seed(seed, 60)).collect();
+    let runner = Runner { plans, twice: 10, threads: 2 };
+    let totals = runner.run(&std::sync::atomic::AtomicBool::new(false), |_| ());
+    for (plan, outcome, is_same) in &totals.failed {
+        println!("the same twice: {is_same}; {:#?}\n{plan}", outcome.violations);
+    }
+    assert_eq!((totals.worlds, totals.failed.len()), (200, 0));
+}
