@@ -33,7 +33,7 @@ pub(crate) struct Terms {
     /// Telegrams go out too.
     sends_telegrams: bool,
     /// The longest datagram, in bytes.
-    pub(crate) longest: usize,
+    longest: usize,
     /// Between two times that a background goes out.
     repeat: Option<Duration>,
     /// The shortest way.

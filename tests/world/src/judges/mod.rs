@@ -64,7 +64,7 @@ pub(crate) fn all(setup: &Setup, plan: &Plan) -> Vec<Box<dyn Judge>> {
         Box::new(liveness::Liveness::new(sensors)),
         Box::new(resources::Resources),
         Box::new(eeprom::Eeprom),
-        Box::new(remote_nothing_invented::RemoteNothingInvented::default()),
+        Box::new(remote_nothing_invented::RemoteNothingInvented::new(&terms)),
         Box::new(remote_accounts::RemoteAccounts::default()),
         Box::new(remote_numbers::RemoteNumbers::new(terms)),
         Box::new(remote_verdict::RemoteVerdict::new(setup, plan, &terms)),

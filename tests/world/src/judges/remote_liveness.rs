@@ -1,5 +1,6 @@
 //! When nothing goes wrong any more, a remote robot knows soon what the hub knows: at the next announcement its sensor has a
-//! name, and the next zones that are due go out.
+//! name, and the next zones that are due go out. It knows it from then on, unless the zones come so seldom that the first ones,
+//! which do not say their period yet, are too old before the second ones come (`docs/topics.md`).
 
 use lms::{MILLIS, Nanos};
 use schema::{Topic, Verdict, Zones};
@@ -18,17 +19,22 @@ pub(crate) struct RemoteLiveness {
 struct OfSensor {
     /// From known zones in the hub to known ones here, at most.
     soon: Nanos,
+    /// Zones come less often than a verdict stands whose period is not known.
+    is_slow: bool,
     /// Since when the hub says what it knows, if it does.
     said_since: Option<Nanos>,
     is_known: bool,
+    /// It was known since all was well.
+    came: bool,
 }
 
 impl RemoteLiveness {
     pub(crate) fn new(setup: &Setup, terms: &Terms) -> RemoteLiveness {
         let sensor = |of: usize| {
             let (period, _) = setup.sensors[of].times();
-            let soon = ANNOUNCED + (terms.every.get() + 1) * period + terms.delay_ns + SLACK;
-            OfSensor { soon, said_since: None, is_known: false }
+            let every = terms.every.get() * period;
+            let soon = ANNOUNCED + every + period + terms.delay_ns + SLACK;
+            OfSensor { soon, is_slow: every > OFTEN, said_since: None, is_known: false, came: false }
         };
         RemoteLiveness { is_healed: false, sensors: (0..setup.sensors.len()).map(sensor).collect() }
     }
@@ -43,7 +49,7 @@ impl Judge for RemoteLiveness {
         match *event {
             Event::Healed => {
                 self.is_healed = true;
-                self.sensors.iter_mut().for_each(|of| of.said_since = None);
+                self.sensors.iter_mut().for_each(|of| (of.said_since, of.came) = (None, of.is_known));
             }
             Event::Published { sensor, sample } if sample.topic == Topic::Zones => {
                 let zones: Zones = bytemuck::pod_read_unaligned(&sample.bytes);
@@ -58,6 +64,7 @@ impl Judge for RemoteLiveness {
                 let of = &mut self.sensors[sensor];
                 of.check(sensor, at, self.is_healed, say);
                 of.is_known = verdict != Verdict::Unknown;
+                of.came |= of.is_known;
             }
             Event::Over { .. } => {
                 for (sensor, of) in self.sensors.iter().enumerate() {
@@ -77,7 +84,7 @@ impl Judge for RemoteLiveness {
 impl OfSensor {
     fn check(&self, sensor: usize, at: Nanos, is_healed: bool, say: &mut Say<'_>) {
         if is_healed
-            && !self.is_known
+            && !(self.is_known || self.is_slow && self.came)
             && let Some(since) = self.said_since.filter(|since| at > since + self.soon)
         {
             let (ms, soon) = ((at - since) / MILLIS, self.soon / MILLIS);
@@ -86,6 +93,8 @@ impl OfSensor {
     }
 }
 
+/// Zones that are sent at least so often are always known.
+const OFTEN: Nanos = 230 * MILLIS;
 /// Between two announcements.
 const ANNOUNCED: Nanos = 1_000 * MILLIS;
 /// Threads and timers are late by no more than this, all together.

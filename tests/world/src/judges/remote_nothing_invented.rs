@@ -14,7 +14,7 @@ use schema::{Flags, Header, Quality, State, Status, Topic, Zones};
 use super::{Judge, Say};
 use crate::event::{Arrival, Event};
 use crate::hash::History;
-use crate::remote::Packet;
+use crate::remote::{Packet, Terms};
 
 /// What was published and sent.
 pub(crate) struct RemoteNothingInvented {
@@ -34,8 +34,8 @@ pub(crate) struct RemoteNothingInvented {
     unknown: Vec<u8>,
 }
 
-impl Default for RemoteNothingInvented {
-    fn default() -> Self {
+impl RemoteNothingInvented {
+    pub(crate) fn new(terms: &Terms) -> Self {
         let mut unknown = vec![0; size_of::<Zones>()];
         let len = Zones::unknown().pack(&mut unknown).unwrap_or_default();
         unknown.truncate(len);
@@ -46,7 +46,7 @@ impl Default for RemoteNothingInvented {
             epoch: 0,
             named: HashSet::new(),
             heard_at: BTreeMap::new(),
-            packet: Packet::new(),
+            packet: Packet::new(terms),
             unknown,
         }
     }

@@ -1,8 +1,9 @@
 //! The payload of a sample as it goes over a network. Refuses to know what becomes of it.
 
 use lan::outgoing::PayloadRef;
-use schema::datagram::MTU_ETHERNET;
+use schema::datagram::HEAD;
 
+use super::Terms;
 use crate::topics::Sample;
 
 /// Declares from the table of topics how the bytes of a sample are read.
@@ -25,17 +26,17 @@ macro_rules! payloads {
 
 schema::for_each_topic!(payloads);
 
-/// Room for a payload as in a datagram.
+/// Room for a payload as in a datagram: of some payloads it says how much goes into it.
 pub(crate) struct Packet {
-    room: [u8; MTU_ETHERNET],
+    room: Vec<u8>,
 }
 
 impl Packet {
-    pub(crate) fn new() -> Packet {
-        Packet { room: [0; MTU_ETHERNET] }
+    pub(crate) fn new(terms: &Terms) -> Packet {
+        Packet { room: vec![0; terms.longest - HEAD] }
     }
 
-    /// What `sample` is in a datagram; nothing if none is long enough.
+    /// What `sample` is in a datagram; nothing if it does not fit.
     pub(crate) fn of(&mut self, sample: &Sample) -> Option<&[u8]> {
         let len = lend(sample, |payload| payload.pack(&mut self.room))?;
         self.room.get(..len)
