@@ -19,6 +19,7 @@ use lms::{Identity, Nanos, Session};
 use port::{Allowance, LineErrors, Source};
 use schema::State;
 
+use crate::backlog::Backlog;
 use crate::control::Flow;
 use crate::identity_cache::IdentityCache;
 use crate::link::LinkCore;
@@ -31,8 +32,12 @@ pub(crate) struct Driver<'a, S: Surroundings> {
     /// Rates that the port cannot have, as was said.
     refused: Vec<Baud>,
     line_errors: LineErrors,
-    /// What is read waited in the port for an unknown time.
-    is_behind: bool,
+    /// When something was read last that had waited in the port for an unknown time.
+    behind_at: Option<Nanos>,
+    /// When the next scan has to be here to follow the last one without a silence, by the stamps of scans.
+    follows_by: Nanos,
+    /// Where the sensor was found the last time that it had to be sought.
+    found: Option<Baud>,
 }
 
 /// A session on an open line, and what it waits for.
@@ -41,8 +46,8 @@ pub(crate) struct Open<L> {
     pub(crate) session: Session,
     /// What may be read; nothing where all may.
     allowance: Option<Allowance>,
-    /// So many of the first bytes waited in the port when it was opened: nobody knows since when.
-    waited: u64,
+    /// What waited in the port when it was opened, until all of it was read.
+    backlog: Option<Backlog>,
     /// Whether bytes are waited for.
     watch: bool,
     /// Until when the session waits.
@@ -52,11 +57,11 @@ pub(crate) struct Open<L> {
 }
 
 impl<L: Line> Open<L> {
-    /// `session` on `line`, at whose nominal `baud` it brings no more than twice that.
-    pub(crate) fn new(line: L, session: Session, baud: u32) -> Open<L> {
+    /// `session` on `line`, which was opened at `now`; at its nominal `baud` it brings no more than twice that.
+    pub(crate) fn new(line: L, session: Session, baud: u32, now: Nanos) -> Open<L> {
         let allowance = line.allowance(baud);
-        let waited = line.waiting().unwrap_or(0) as u64;
-        Open { line, session, allowance, waited, watch: true, until: 0, rest: None }
+        let backlog = Backlog::new(line.waiting().unwrap_or(0), now);
+        Open { line, session, allowance, backlog, watch: true, until: 0, rest: None }
     }
 
     /// What to wait for, and until when. Also while bytes are left alone the port may go away.
@@ -70,8 +75,14 @@ impl<L: Line> Open<L> {
 impl<'a, S: Surroundings> Driver<'a, S> {
     /// For the port of `core`.
     pub(crate) fn new(core: &LinkCore<'a, S>) -> Driver<'a, S> {
-        let identity = IdentityCache::new(core.around, &core.link.name, core.link.port.name());
-        Driver { identity, refused: Vec::new(), line_errors: LineErrors::default(), is_behind: false }
+        Driver {
+            identity: IdentityCache::new(core.around, &core.link.name, core.link.port.name()),
+            refused: Vec::new(),
+            line_errors: LineErrors::default(),
+            behind_at: None,
+            follows_by: Nanos::MAX,
+            found: None,
+        }
     }
 
     /// What the hub before this one knew of the sensor, if that was just now.
@@ -81,8 +92,15 @@ impl<'a, S: Surroundings> Driver<'a, S> {
 
     /// Begins on a line that was just opened; an error says that it is gone.
     pub(crate) fn begin(&mut self, core: &mut LinkCore<'a, S>, open: &mut Open<S::Line>) -> io::Result<()> {
-        self.is_behind = false;
+        self.behind_at = None;
         self.drain(core, open)
+    }
+
+    /// The rate to begin with where the sensor of `core` has to be sought.
+    pub(crate) fn last_rate(&self, core: &LinkCore<'a, S>) -> Option<Baud> {
+        let kept = || rates(core)?.rate(&core.link.port.name());
+        let kept = || Baud::ALL.into_iter().find(|baud| Some(baud.rate()) == kept());
+        self.found.or_else(kept).filter(|_| is_tty(core))
     }
 
     /// Goes on after a wait that ended as `woken` says; an error says that the line is gone.
@@ -101,8 +119,8 @@ impl<'a, S: Surroundings> Driver<'a, S> {
     }
 
     fn read(&mut self, core: &mut LinkCore<'a, S>, open: &mut Open<S::Line>) -> io::Result<()> {
-        let Open { line, session, allowance, waited, watch, until, .. } = open;
-        let (around, already) = (core.around, session.tally().read);
+        let Open { line, session, allowance, backlog, watch, until, .. } = open;
+        let around = core.around;
         if !*watch {
             // The telegram's end is near: what can be done before it is not done after it.
             core.output.prepare();
@@ -119,19 +137,20 @@ impl<'a, S: Surroundings> Driver<'a, S> {
             let most = spare.len().min(allowance.bytes(around.now()).max(1));
             spare = &mut spare[..most];
         }
-        if let Some(left @ 1..) = waited.checked_sub(already) {
-            // So that what comes now is not taken for what waited.
-            let most = spare.len().min(left as usize);
-            spare = &mut spare[..most];
-        }
         let room = spare.len();
         let len = line.read(spare)?;
         let now = around.now();
-        self.is_behind = len > 0 && already < *waited;
         session.commit(now, len);
+        if let Some(waited) = backlog {
+            if waited.take(len, session.baud().rate(), now) {
+                self.behind_at = Some(now);
+            } else {
+                *backlog = None;
+            }
+        }
         if let Some(allowance) = allowance {
             allowance.take(len, room, now);
-            self.is_behind = allowance.is_behind(now);
+            self.behind_at = allowance.is_behind(now).then_some(now);
             core.diagnosis.watch_flood(allowance.is_flooded(now));
         }
         if len == 0 && now >= *until {
@@ -151,7 +170,7 @@ impl<'a, S: Surroundings> Driver<'a, S> {
                 Output::SetBaud(baud) => {
                     self.set_baud(core, line, baud)?;
                     // What waited is discarded.
-                    open.waited = 0;
+                    open.backlog = None;
                 }
                 Output::Transmit { byte, not_before } => {
                     around.pause(not_before);
@@ -162,9 +181,18 @@ impl<'a, S: Surroundings> Driver<'a, S> {
                     let counted = line.line_errors();
                     core.stats.line_errors += counted;
                     let is_hit = self.line_errors.note(counted);
-                    received.estimated |= self.is_behind;
+                    let is_behind = self.behind_at.is_some_and(|at| received.last <= at);
+                    received.estimated |= is_behind;
                     received.reasons |= if is_hit { suspect::LINE_ERROR } else { 0 };
-                    core.publish(&received, &recorded, self.is_behind);
+                    // A hub that did not run did not hear the silence between what waited for it and what came later.
+                    if !is_behind && received.last > self.follows_by {
+                        core.output.learn_silence();
+                    }
+                    if let Some(limit) = core.publish(&received, &recorded, is_behind) {
+                        // How long before the next one what waited was measured is not known; a network says it by its stamps.
+                        let is_of_backlog = is_behind && open.allowance.is_none();
+                        self.follows_by = if is_of_backlog { 0 } else { received.last.saturating_add(limit) };
+                    }
                     published = true;
                 }
                 Output::Rest(until) => break (false, until),
@@ -176,11 +204,9 @@ impl<'a, S: Surroundings> Driver<'a, S> {
         }
         self.identity.keep_first(session);
         let (state, is_new) = core.diagnosis.examine(session);
-        if is_new
-            && let Some(found) = session.found_at()
-            && let Some(learned) = rates(core)
-        {
-            learned.keep_rate(&core.link.port.name(), found.rate());
+        if is_new && let Some(found) = session.found_at() {
+            self.found = Some(found);
+            rates(core).iter().for_each(|rates| rates.keep_rate(&core.link.port.name(), found.rate()));
         }
         if (is_new || core.is_due(around.now())) && core.show_session(session, state) {
             self.identity.keep(session, around.now());
@@ -204,13 +230,12 @@ impl<'a, S: Surroundings> Driver<'a, S> {
     }
 }
 
-/// The rate to begin with where the sensor of `core` has to be sought.
-pub(crate) fn last_rate<S: Surroundings>(core: &LinkCore<'_, S>) -> Option<Baud> {
-    let rate = rates(core)?.rate(&core.link.port.name())?;
-    Baud::ALL.into_iter().find(|baud| baud.rate() == rate)
+/// Where rates are kept, if anywhere.
+fn rates<'a, S: Surroundings>(core: &LinkCore<'a, S>) -> Option<&'a dyn Learned> {
+    core.around.learned().filter(|_| is_tty(core))
 }
 
-/// Where rates are kept; nothing on a line whose rate cannot be changed.
-fn rates<'a, S: Surroundings>(core: &LinkCore<'a, S>) -> Option<&'a dyn Learned> {
-    core.around.learned().filter(|_| matches!(core.link.port, Source::Tty(_)))
+/// Whether the rate of the line can be changed.
+fn is_tty<S: Surroundings>(core: &LinkCore<'_, S>) -> bool {
+    matches!(core.link.port, Source::Tty(_))
 }

@@ -17,8 +17,8 @@ use port::Source;
 use schema::{Age, Background, Failure, Pose, StateDirectory};
 
 use crate::event_fd::EventFd;
-use crate::surroundings;
-use file::Learned;
+use crate::surroundings::Learned;
+use file::KeptBackground;
 pub(crate) use writer::Writer;
 
 /// Where texts are kept under names between two hubs.
@@ -171,7 +171,7 @@ impl Slots {
     }
 }
 
-impl surroundings::Learned for Handle<'_> {
+impl Learned for Handle<'_> {
     fn keep_background(&self, pose: Pose, model: Background) {
         *held(&self.slot.model) = Some((pose, model));
         self.slots.event.signal();
@@ -212,7 +212,7 @@ impl Slot {
             let is_forgotten = was_kept || model.generation > 0;
             return if is_forgotten { files.remove(&file) } else { Ok(()) };
         }
-        let text = Learned { model: *model, pose, wall_ns }.text(&self.sensor)?;
+        let text = KeptBackground { model: *model, pose, wall_ns }.text(&self.sensor)?;
         files.write(&file, &text)?;
         self.kept_wall_ns.store(wall_ns, Ordering::Relaxed);
         Ok(())
@@ -249,8 +249,8 @@ fn recall(link: &mut Link, files: &impl Files, now_wall_ns: u64) -> u64 {
             return 0;
         }
     };
-    match Learned::read(&text, &files.place(&file), link) {
-        Ok(Learned { model, wall_ns, .. }) => {
+    match KeptBackground::read(&text, &files.place(&file), link) {
+        Ok(KeptBackground { model, wall_ns, .. }) => {
             let age = Age(Duration::from_nanos(now_wall_ns.saturating_sub(wall_ns)));
             let Background { taught, count, .. } = model;
             tracing::info!(
@@ -298,7 +298,6 @@ const LONGEST: u64 = 1 << 20;
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::surroundings::Learned as _;
     use config::Sources;
 
     #[test]

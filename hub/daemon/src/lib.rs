@@ -1,6 +1,7 @@
 //! The hub: all the I/O there is. It owns the serial links, one thread each, and publishes what they say into shared
 //! memory; who listens is not its business.
 
+mod backlog;
 pub mod bus_error;
 mod control;
 mod diagnosis;

@@ -46,8 +46,6 @@ pub(crate) struct LinkOutput<'a, S: Surroundings> {
     pipeline: Pipeline,
     /// When the last verdict of the zones is too old to stand; `Nanos::MAX` if none stands.
     stale_at: Nanos,
-    /// When the next scan has to be here to follow the last one without a silence, by the stamps of scans.
-    follows_by: Nanos,
     /// The sensor, as it turned out to be, sees too little of its circles.
     is_blind: bool,
 }
@@ -56,15 +54,7 @@ impl<'a, S: Surroundings> LinkOutput<'a, S> {
     /// The output of `link` into `topics`; nothing is published yet.
     pub(crate) fn new(link: &'a Link, around: &'a S, topics: Topics<'a, S>) -> Self {
         let pipeline = Pipeline::new(&link.processing);
-        LinkOutput {
-            link,
-            around,
-            topics,
-            pipeline,
-            stale_at: Nanos::MAX,
-            follows_by: Nanos::MAX,
-            is_blind: false,
-        }
+        LinkOutput { link, around, topics, pipeline, stale_at: Nanos::MAX, is_blind: false }
     }
 
     /// Publishes a telegram and, if it is measured data that can be read, its scan and what is made of it. What `recorded`
@@ -99,15 +89,6 @@ impl<'a, S: Surroundings> LinkOutput<'a, S> {
         };
         let decode = |scan: &mut Scan| scanner::decode(&measured, mode, scan);
         let limit = limit(period_us);
-        // A hub that did not run did not hear the silence between what waited for it and what came later.
-        let follows_by = std::mem::replace(&mut self.follows_by, received.last.saturating_add(limit));
-        if received.last > follows_by && !is_behind {
-            self.learn_silence();
-        }
-        if is_behind {
-            // Nobody knows how long before the next one it was.
-            self.follows_by = 0;
-        }
         // What waited in the port does not tell how it looks around the robot now.
         self.pipeline.zones.doubt(is_behind);
         if let Some(reason) = self.topics.scan(decode, &mut self.pipeline) {

@@ -8,7 +8,7 @@ use port::{PortError, Source};
 use schema::{Failure, Flags, Kind, State};
 
 use crate::control::{ControlQueue, Flow};
-use crate::drive::{Driver, Open, last_rate};
+use crate::drive::{Driver, Open};
 use crate::link::LinkCore;
 use crate::surroundings::{Line, On, Surroundings, Wait, Woken};
 
@@ -19,6 +19,7 @@ pub struct LiveLink<'a, S: Surroundings> {
     phase: Phase<S::Line>,
     /// Times in a row that the port was there and went without a byte.
     futile: u32,
+    has_begun: bool,
 }
 
 /// Where the port is.
@@ -49,12 +50,13 @@ impl<'a, S: Surroundings> LiveLink<'a, S> {
         let mut core = LinkCore::new(link, number, boot, around, control)?;
         core.begin();
         let driver = Driver::new(&core);
-        let mut live = LiveLink { core, driver, phase: Phase::away(Away::default(), 0), futile: 0 };
+        let known = driver.recall(around.now());
+        let mut live =
+            LiveLink { core, driver, phase: Phase::away(Away::default(), 0), futile: 0, has_begun: false };
         match live.first_line() {
             Ok(Some((line, is_kept))) => {
                 // On a line that was closed meanwhile it may be another sensor, or the same in another mode.
-                let known = live.driver.recall(around.now()).filter(|_| is_kept);
-                live.stay(line, known);
+                live.open(line, known.filter(|_| is_kept));
                 Ok(live)
             }
             Ok(None) => {
@@ -78,7 +80,9 @@ impl<'a, S: Surroundings> LiveLink<'a, S> {
     /// Does what there is to do after a wait that ended as `woken` says, and returns what to wait for next.
     pub fn turn(&mut self, woken: Woken) -> Wait<'_, S::Line> {
         let (_, until) = self.phase.wait();
-        if self.core.is_over(woken, until) {
+        if !std::mem::replace(&mut self.has_begun, true) {
+            self.begin();
+        } else if self.core.is_over(woken, until) {
             match &mut self.phase {
                 Phase::Open(open) => {
                     if let Err(error) = self.driver.turn(&mut self.core, open, woken) {
@@ -133,7 +137,10 @@ impl<'a, S: Surroundings> LiveLink<'a, S> {
         let (link, around) = (self.core.link, self.core.around);
         let mut away = self.phase.take_away();
         match around.open(&link.port, link.baud.rate()) {
-            Some(Ok(line)) => self.stay(line, None),
+            Some(Ok(line)) => {
+                self.open(line, None);
+                self.begin();
+            }
             Some(Err(error)) => {
                 away.learn(&error, around.now(), |error| said(around.explain(error, &link.port)));
                 self.leave(away);
@@ -142,8 +149,8 @@ impl<'a, S: Surroundings> LiveLink<'a, S> {
         }
     }
 
-    /// A session on `line` begins; it may go on with a stream of a sensor of which something is `known`.
-    fn stay(&mut self, line: S::Line, known: Option<Identity>) {
+    /// There is a `line`; a session on it may go on with a stream of a sensor of which something is `known`.
+    fn open(&mut self, line: S::Line, known: Option<Identity>) {
         let core = &mut self.core;
         let now = core.around.now();
         core.around.keep(&core.link.name, &line);
@@ -153,16 +160,20 @@ impl<'a, S: Surroundings> LiveLink<'a, S> {
         if let Some(known) = known {
             session.recall(known);
         }
-        if let Some(baud) = last_rate(core) {
+        if let Some(baud) = self.driver.last_rate(core) {
             session.seek_first(baud);
         }
         if core.control.is_paused() {
             session.control(Control::Pause, now);
         }
-        let mut open = Box::new(Open::new(line, session, core.link.baud.rate()));
-        let begun = self.driver.begin(core, &mut open);
-        self.phase = Phase::Open(open);
-        if let Err(error) = begun {
+        self.phase = Phase::Open(Box::new(Open::new(line, session, core.link.baud.rate(), now)));
+    }
+
+    /// A session begins, if there is a line.
+    fn begin(&mut self) {
+        if let Phase::Open(open) = &mut self.phase
+            && let Err(error) = self.driver.begin(&mut self.core, open)
+        {
             self.lose(&error);
         }
     }

@@ -35,8 +35,10 @@ pub(crate) struct Tty {
     begun: Option<(u64, Option<&'static str>)>,
 }
 
-/// Bytes that a tty holds; more are lost.
-const ROOM: usize = 4_095;
+/// Bytes that a tty holds, as a pty of Linux does; more are lost.
+const ROOM: usize = 17_024;
+/// Those of them of which it tells; the rest waits in the driver's buffers.
+const LINE_DISCIPLINE: usize = 4_095;
 
 impl Tty {
     pub(crate) fn new(number: usize, sensor: Sensor) -> Tty {
@@ -136,9 +138,9 @@ impl Tty {
         self.device == Some(device)
     }
 
-    /// Bytes that wait to be read.
+    /// Bytes that wait to be read, as far as a driver tells: those of its line discipline.
     pub(crate) fn waiting(&self) -> usize {
-        self.buffer.len()
+        self.buffer.len().min(LINE_DISCIPLINE)
     }
 
     /// Reads what there is into `into`.

@@ -39,13 +39,13 @@ pub(super) struct Sensor {
 const TOPICS: usize = 8;
 
 impl PeerTable {
-    /// Whether nothing of the life that sent `head`, which `account` has taken, came before.
+    /// Whether nothing of the life that sent `head`, which `stats` has taken, came before.
     pub(super) fn is_new(&self, head: &Head, stats: &StreamStats) -> bool {
         let since_ns = stats.since_ns(head.hub, head.epoch);
         self.lives.get(&(head.hub, head.epoch)).is_none_or(|known| known.since_ns != since_ns)
     }
 
-    /// The life that sent `head`, which `account` has taken.
+    /// The life that sent `head`, which `stats` has taken.
     pub(super) fn life(&mut self, head: &Head, stats: &StreamStats) -> &mut Life {
         let life = (head.hub, head.epoch);
         let since_ns = stats.since_ns(head.hub, head.epoch);
@@ -55,7 +55,7 @@ impl PeerTable {
         self.lives.entry(life).or_insert_with(|| Life { since_ns, ..Life::default() })
     }
 
-    /// An announcement that came with `head`, which `account` has taken, at `wall_ns`. If it tells that the clocks differ, how
+    /// An announcement that came with `head`, which `stats` has taken, at `wall_ns`. If it tells that the clocks differ, how
     /// much ours is ahead of theirs, in ns; said once of each gateway, however often that is started anew.
     pub(super) fn announce(
         &mut self,

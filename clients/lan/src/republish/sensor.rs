@@ -120,9 +120,10 @@ impl<T: SensorTopics> RemoteSensor<T> {
         let Some(stream) = &mut self.streams[topic as usize] else { return false };
         let Placed { left_out, header } = stream.place(remote, self.pid);
         self.topics.skip(topic, left_out);
-        match remote.payload::<Status>().filter(|_| topic == Topic::Status) {
-            Some(status) => self.tell(status, &header),
-            None => self.topics.send(topic, &header, remote.datagram.payload),
+        if topic != Topic::Status {
+            self.topics.send(topic, &header, remote.datagram.payload);
+        } else if let Some(status) = remote.payload::<Status>() {
+            self.tell(status, &header);
         }
         if topic == Topic::Zones {
             self.zoned = Some(remote.header(self.pid));

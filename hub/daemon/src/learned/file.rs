@@ -8,7 +8,7 @@ use serde::{Deserialize, Serialize};
 
 /// A model, where its sensor sat, and when it was written, in nanoseconds since 1970.
 #[derive(Clone, Debug, PartialEq)]
-pub(super) struct Learned {
+pub(super) struct KeptBackground {
     pub(super) model: Background,
     pub(super) pose: Pose,
     pub(super) wall_ns: u64,
@@ -36,7 +36,7 @@ struct File<M> {
     place: Place,
 }
 
-impl Learned {
+impl KeptBackground {
     /// The text for `sensor`, a line.
     pub(super) fn text(&self, sensor: &str) -> Result<String, Failure> {
         let Pose { x_m: x, y_m: y, yaw_rad: yaw, upside_down, .. } = self.pose;
@@ -49,7 +49,7 @@ impl Learned {
     }
 
     /// What `text`, found at `place`, says of the sensor of `link`; or why that is not one to begin with.
-    pub(super) fn read(text: &str, place: &str, link: &Link) -> Result<Learned, String> {
+    pub(super) fn read(text: &str, place: &str, link: &Link) -> Result<KeptBackground, String> {
         let saved = SavedModel::parse(text.as_bytes(), place).map_err(|failure| failure.message)?;
         let Place { pose, wall_ns } = serde_json::from_str(text)
             .map_err(|error| format!("{place} does not contain its time: {error}"))?;
@@ -70,7 +70,7 @@ impl Learned {
         if !is_there || pose.upside_down != (upside_down != 0) {
             return Err(format!("{place} is of another pose: the sensor was moved"));
         }
-        Ok(Learned { model, pose: link.processing.pose, wall_ns })
+        Ok(KeptBackground { model, pose: link.processing.pose, wall_ns })
     }
 }
 
@@ -88,11 +88,11 @@ mod tests {
         Config::load(&sources).unwrap().links.remove(0)
     }
 
-    fn learned(pose: Pose) -> Learned {
+    fn learned(pose: Pose) -> KeptBackground {
         let mut model =
             Background { generation: 3, count: 361, unit_mm: 1, taught: 2, ..Background::default() };
         model.range_array[..2].copy_from_slice(&[4000, Background::FAR]);
-        Learned { model, pose, wall_ns: 1_790_000_000_123_456_789 }
+        KeptBackground { model, pose, wall_ns: 1_790_000_000_123_456_789 }
     }
 
     #[test]
@@ -102,7 +102,7 @@ mod tests {
         let own = link(&set);
         let kept = learned(own.processing.pose);
         let text = kept.text("front").unwrap();
-        assert_eq!(Learned::read(&text, "f", &own), Ok(kept));
+        assert_eq!(KeptBackground::read(&text, "f", &own), Ok(kept));
         let saved = SavedModel::parse(text.as_bytes(), "f").unwrap();
         assert_eq!((saved.sensor.as_str(), saved.model.taught), ("front", 2), "it can be loaded as any");
         for (change, why) in [
@@ -113,7 +113,7 @@ mod tests {
             ("link.front.unit=cm", "the link is configured for 361 in units of 10 mm"),
         ] {
             let other = link(&[&set[..], &[change]].concat());
-            let refusal = Learned::read(&text, "f", &other).unwrap_err();
+            let refusal = KeptBackground::read(&text, "f", &other).unwrap_err();
             assert!(refusal.contains(why), "{change}: {refusal}");
         }
     }
@@ -129,8 +129,8 @@ mod tests {
             ("\"yaw\":0.0", "\"yaw\":null"),
         ] {
             assert!(text.contains(from), "{from}");
-            assert!(Learned::read(&text.replacen(from, to, 1), "f", &own).is_err(), "{from}");
+            assert!(KeptBackground::read(&text.replacen(from, to, 1), "f", &own).is_err(), "{from}");
         }
-        assert!((0..text.len() - 1).all(|length| Learned::read(&text[..length], "f", &own).is_err()));
+        assert!((0..text.len() - 1).all(|length| KeptBackground::read(&text[..length], "f", &own).is_err()));
     }
 }
