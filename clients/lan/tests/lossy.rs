@@ -1,8 +1,11 @@
 //! Both ends of a network that loses, doubles, damages, delays and reorders datagrams, over lives of sensors, hub and
 //! gateway, in virtual time: what comes was sent, what does not is counted, and no verdict outlives its time.
 
+#[path = "../../../tests/world/src/network.rs"]
 mod network;
 mod receiving;
+#[path = "../../../tests/world/src/remote/topics.rs"]
+mod remote_topics;
 mod sending;
 
 use std::collections::{BTreeMap, BTreeSet};

@@ -2,6 +2,7 @@
 
 use lms::Nanos;
 use lms::measured::MEASURED;
+use schema::datagram::{Datagram, DatagramError, Row};
 use schema::{Header, Status, Topic, Verdict, Zones};
 
 use crate::consumer::Number;
@@ -45,12 +46,43 @@ pub(crate) enum Event<'a> {
     Left { consumer: Number, is_drained: bool },
     /// A robot believes this of a sensor's zones from now on.
     Believes { sensor: usize, verdict: Verdict },
+    /// A gateway begins, as a consumer of the hub's topics.
+    GatewayBegins { epoch: u32 },
+    /// It is gone.
+    GatewayEnds { epoch: u32, is_killed: bool },
+    /// It made a datagram, which its sockets took or not.
+    Transmitted { datagram: &'a Datagram<'a>, bytes: &'a [u8], is_taken: bool },
+    /// A listener begins.
+    ListenerBegins { life: u64 },
+    /// It took what had come to its machine, which may be a datagram, at some time before.
+    Arrived { came: Nanos, datagram: Option<&'a Datagram<'a>>, bytes: &'a [u8], outcome: Arrival },
+    /// A consumer of remote sensors got a sample; the payload is as in a datagram.
+    Republished { sensor: usize, topic: Topic, header: &'a Header, payload: &'a [u8] },
+    /// A remote robot believes this of a sensor's zones from now on.
+    RemoteBelieves { sensor: usize, verdict: Verdict },
+    /// A row of the account of a listener that ends.
+    Counted { row: &'a Row },
+    /// It is gone: what it refused, the lives of gateways that it gave up, and how many sensors it published.
+    ListenerEnds { life: u64, refused: u64, given_up: u64, sensors: usize },
     /// An action.
     Acted { text: &'a str },
     /// From now on nothing goes wrong.
     Healed,
     /// It is over, and the last hub has ended.
     Over { eeprom_writes: u64, handles: usize, loans: usize, held: usize },
+}
+
+/// What a listener makes of what came.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Arrival {
+    /// It is refused.
+    Refused(DatagramError),
+    /// It came before, or is an announcement that a newer one overtook.
+    Known,
+    /// An announcement.
+    Announced,
+    /// A sample, before all newer ones or not.
+    Sample { late: bool },
 }
 
 /// A telegram that left a sensor.
@@ -136,6 +168,29 @@ impl Event<'_> {
             Event::Over { eeprom_writes, handles, loans, held } => {
                 numbers(&[19, eeprom_writes, handles as u64, loans as u64, held as u64]);
             }
+            Event::GatewayBegins { epoch } => numbers(&[20, epoch.into()]),
+            Event::GatewayEnds { epoch, is_killed } => numbers(&[21, epoch.into(), is_killed.into()]),
+            Event::Transmitted { bytes, is_taken, .. } => {
+                numbers(&[22, is_taken.into()]);
+                history.bytes(bytes);
+            }
+            Event::ListenerBegins { life } => numbers(&[23, life]),
+            Event::Arrived { came, bytes, outcome, .. } => {
+                numbers(&[24, came, bytes.len() as u64, outcome.number()])
+            }
+            Event::Republished { sensor, topic, header, payload } => {
+                numbers(&[25, sensor as u64, topic as u64]);
+                history.bytes(bytemuck::bytes_of(header));
+                history.bytes(payload);
+            }
+            Event::RemoteBelieves { sensor, verdict } => numbers(&[26, sensor as u64, verdict as u64]),
+            Event::Counted { row } => {
+                numbers(&[27, row.epoch.into(), row.sensor.into(), row.topic.into()]);
+                numbers(&[row.received, row.lost(), row.duplicate, row.reordered]);
+            }
+            Event::ListenerEnds { life, refused, given_up, sensors } => {
+                numbers(&[28, life, refused, given_up, sensors as u64]);
+            }
         }
     }
 
@@ -175,7 +230,21 @@ impl Event<'_> {
                 }
             }
             Event::Taken { .. } | Event::Read { .. } | Event::Dropped { .. } | Event::Lacking { .. } => None,
+            Event::Transmitted { .. } | Event::Republished { .. } | Event::Counted { .. } => None,
+            Event::Arrived { outcome: Arrival::Refused(why), .. } => Some(format!("refused: {why:?}")),
+            Event::Arrived { .. } => None,
             other => Some(format!("{other:?}")),
+        }
+    }
+}
+
+impl Arrival {
+    fn number(self) -> u64 {
+        match self {
+            Arrival::Refused(why) => 10 + why as u64,
+            Arrival::Known => 0,
+            Arrival::Announced => 1,
+            Arrival::Sample { late } => 2 + u64::from(late),
         }
     }
 }

@@ -3,7 +3,9 @@
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::sync::mpsc;
 use std::thread;
-use std::time::{Duration, Instant};
+use std::time::Duration;
+
+use rustix::time::{ClockId, clock_gettime};
 
 use crate::event::Detail;
 use crate::plan::Plan;
@@ -29,7 +31,7 @@ pub struct Totals {
     pub sensor_seconds: u64,
     /// Samples that hubs published.
     pub samples: u64,
-    /// Time that threads worked.
+    /// Time that threads had a core.
     pub busy: Duration,
     /// Plans that ended in violations, or differently the second time.
     pub failed: Vec<(Plan, Outcome, bool)>,
@@ -48,11 +50,11 @@ impl Runner {
                     while !is_over.load(Ordering::Relaxed) {
                         let at = next.fetch_add(1, Ordering::Relaxed) as usize;
                         let Some(plan) = self.plans.get(at) else { return };
-                        let begun = Instant::now();
+                        let begun = on_core();
                         let outcome = run(plan, Detail::Nothing);
                         let is_same = at >= self.twice || run(plan, Detail::Nothing).hash == outcome.hash;
                         // Nobody hears it who has ended.
-                        let _ = told.send((at, outcome, is_same, begun.elapsed()));
+                        let _ = told.send((at, outcome, is_same, on_core().saturating_sub(begun)));
                     }
                 });
             }
@@ -72,4 +74,10 @@ impl Runner {
         totals.failed.sort_by_key(|(plan, ..)| plan.seed);
         totals
     }
+}
+
+/// How long this thread has had a core: others may want it, too.
+fn on_core() -> Duration {
+    let time = clock_gettime(ClockId::ThreadCPUTime);
+    Duration::new(time.tv_sec.unsigned_abs(), time.tv_nsec as u32)
 }

@@ -17,6 +17,7 @@ use crate::hub;
 use crate::judges;
 use crate::plan::{Action, Plan};
 use crate::planted::{Defect, Planted};
+use crate::remote::Remote;
 use crate::setup::Setup;
 use crate::shared::{Log, Shared};
 use crate::topics::Board;
@@ -94,6 +95,8 @@ pub(crate) struct World {
     /// Until when its process does not run.
     pub(crate) stalled_until: Nanos,
     pub(crate) orders: Option<Orders>,
+    /// What is behind the hub's topics in another machine.
+    pub(crate) remote: Remote,
 }
 
 impl World {
@@ -135,10 +138,13 @@ impl World {
             begins_at: 0,
             stalled_until: 0,
             orders: None,
+            remote: Remote::new(plan.seed, &setup),
         };
         for &(sensor, topic, habit, holds) in &setup.cast {
             world.attach(sensor, topic, habit, holds);
         }
+        world.remote.begin_gateway(&world.shared);
+        world.remote.begin_listener(&world.shared);
         world
     }
 
@@ -162,7 +168,7 @@ impl World {
         let later = self.later.first_key_value().map(|((at, _), _)| *at);
         let consumers = self.consumers.iter().map(|consumer| consumer.next_ns(self.now()));
         let all = action.into_iter().chain(later).chain(consumers);
-        all.chain([self.heals_at, self.end]).min().unwrap_or(self.end)
+        all.chain([self.remote.next_ns(self.now()), self.heals_at, self.end]).min().unwrap_or(self.end)
     }
 
     /// The time is `now`: does what is due.
@@ -185,6 +191,7 @@ impl World {
                 consumer.run(&self.shared, now);
             }
         }
+        self.remote.pass(&self.shared, now);
     }
 
     /// Lets consumers know that they were woken.
@@ -192,6 +199,7 @@ impl World {
         for (sensor, at) in self.shared.woken.borrow_mut().drain(..) {
             let its = self.consumers.iter_mut().filter(|consumer| consumer.sensor == sensor);
             its.for_each(|consumer| consumer.wake(at));
+            self.remote.wake(at);
         }
     }
 
@@ -199,6 +207,7 @@ impl World {
     pub(crate) fn greet(&mut self) {
         let at = self.now() + LOOKS;
         self.consumers.iter_mut().for_each(|consumer| consumer.wake(at));
+        self.remote.wake(at);
     }
 
     /// Does `what` in `span_ms`, or when everything is made well again.
@@ -262,6 +271,7 @@ impl World {
         }
         self.begins_at = self.begins_at.min(self.now());
         self.stalled_until = 0;
+        self.remote.heal();
         self.shared.tell(&Event::Healed);
     }
 
@@ -280,6 +290,7 @@ impl World {
         for consumer in std::mem::take(&mut self.consumers) {
             consumer.leave(&self.shared, false, true);
         }
+        self.remote.close(&self.shared);
         let kept = self.shared.kept.take();
         drop(kept);
         self.shared.board.borrow_mut().end();

@@ -1,20 +1,19 @@
 //! A machine with a listener that publishes, and a robot's verdict of what it publishes, in virtual time. Topics are queues in
 //! memory. Refuses to know what was sent.
 
-use std::cell::RefCell;
-use std::collections::{BTreeMap, VecDeque};
-use std::rc::Rc;
+use std::collections::VecDeque;
 
 use lan::Stamp;
 use lan::incoming::{Arrived, Incoming};
-use lan::republish::{Republisher, SensorTopics, TopicStore};
+use lan::republish::Republisher;
 use scanhub_client::Robot;
 use scanhub_client::clock::Moment;
 use scanhub_client::streams::ZonesState;
 use schema::datagram::Packed;
-use schema::{Failure, Header, Topic, Verdict, Wake, Zones};
+use schema::{Header, Topic, Verdict, Zones};
 
 use crate::network::Nanos;
+use crate::remote_topics::{self, Memory};
 
 /// The machine.
 pub(crate) struct Receiving {
@@ -45,21 +44,6 @@ pub(crate) struct Published {
 pub(crate) enum Seen<'a> {
     Datagram { came: Nanos, bytes: &'a [u8], arrived: &'a Arrived<'a> },
     Published(Published),
-}
-
-/// What waits of one sensor for its consumer: topic, header and payload.
-type Waiting = VecDeque<(Topic, Header, Vec<u8>)>;
-
-/// Topics in memory, by their sensors' names.
-#[derive(Clone, Default)]
-pub(crate) struct Memory(Rc<RefCell<BTreeMap<String, Waiting>>>);
-
-/// Those of one sensor.
-pub(crate) struct MemoryTopics {
-    name: String,
-    /// The next number of each topic that is there.
-    next: [Option<u64>; Topic::ALL.len()],
-    memory: Memory,
 }
 
 /// The process that publishes.
@@ -138,12 +122,12 @@ impl Receiving {
     fn follow(&mut self, now: Nanos, mut seen: impl FnMut(Seen<'_>)) {
         let moment = self.moment(now);
         for (position, (name, state)) in self.followed.iter_mut().enumerate() {
-            let waiting = self.memory.0.borrow_mut().get_mut(name).map(std::mem::take);
-            for (_, header, bytes) in
-                waiting.into_iter().flatten().filter(|(topic, ..)| *topic == Topic::Zones)
+            let waiting = self.memory.take(name).into_iter();
+            for remote_topics::Published { header, payload, .. } in
+                waiting.filter(|published| published.topic == Topic::Zones)
             {
                 let mut zones = Zones::default();
-                assert!(zones.unpack(&bytes));
+                assert!(zones.unpack(&payload));
                 seen(Seen::Published(Published { position, header, zones }));
                 self.robot.hear(position, state.take(&header, &zones, 0, moment).zones);
             }
@@ -170,52 +154,5 @@ impl Receiving {
     fn moment(&self, now: Nanos) -> Moment {
         let monotonic_ns = self.stamp(now).monotonic_ns;
         Moment { monotonic_ns, boottime_ns: monotonic_ns }
-    }
-}
-
-impl TopicStore for Memory {
-    type Sensor = MemoryTopics;
-
-    fn check_room(&self, _topics: &[Topic]) -> Result<(), Failure> {
-        Ok(())
-    }
-
-    fn sensor(&self, name: &str) -> Result<MemoryTopics, Failure> {
-        self.0.borrow_mut().entry(name.to_owned()).or_default();
-        Ok(MemoryTopics { name: name.to_owned(), next: Default::default(), memory: self.clone() })
-    }
-
-    fn clean_up(&self) {}
-}
-
-impl SensorTopics for MemoryTopics {
-    fn add(&mut self, topic: Topic) -> Result<(), Failure> {
-        assert_eq!(self.next[topic as usize].replace(0), None, "{topic:?} is there");
-        Ok(())
-    }
-
-    fn remove(&mut self, topic: Topic) {
-        self.next[topic as usize] = None;
-    }
-
-    fn skip(&mut self, topic: Topic, count: u64) {
-        *self.next[topic as usize].as_mut().expect("it is there") += count;
-    }
-
-    fn send(&mut self, topic: Topic, header: &Header, payload: &[u8]) {
-        let next = self.next[topic as usize].as_mut().expect("it is there");
-        let header = Header { topic_seq: *next, ..*header };
-        *next += 1;
-        let mut memory = self.memory.0.borrow_mut();
-        let queue = memory.get_mut(&self.name).expect("it was made");
-        queue.push_back((topic, header, payload.to_vec()));
-    }
-
-    fn connect(&self, _topic: Topic) {}
-
-    fn wake(&self, _why: Wake) {}
-
-    fn failed(&self) -> u64 {
-        0
     }
 }

@@ -7,12 +7,17 @@ mod disk_full;
 mod end_hub;
 mod exchange;
 mod garbage;
+mod gateway_killed;
 mod habits;
 mod kill_hub;
+mod listener_killed;
+mod network_loss;
+mod network_stall;
 mod no_descriptors;
 mod no_memory;
 mod noise;
 pub(crate) mod object;
+mod partition;
 mod pause;
 mod power_cycle;
 mod reload;
@@ -83,6 +88,11 @@ pub(crate) const KINDS: &[Kind] = &[
     consumers::STOPS,
     pause::KIND,
     resync::KIND,
+    network_loss::KIND,
+    partition::KIND,
+    network_stall::KIND,
+    gateway_killed::KIND,
+    listener_killed::KIND,
 ];
 
 /// What `action` does to the bytes on a line from `now` on, if it is of such a kind.

@@ -10,6 +10,11 @@ mod nothing_lost;
 mod numbers;
 mod prompt;
 mod recording;
+mod remote_accounts;
+mod remote_liveness;
+mod remote_nothing_invented;
+mod remote_numbers;
+mod remote_verdict;
 mod resources;
 mod verdict;
 
@@ -17,6 +22,7 @@ use lms::Nanos;
 
 use crate::event::{Event, Violation};
 use crate::plan::Plan;
+use crate::remote::Terms;
 use crate::setup::Setup;
 
 /// One promise.
@@ -47,7 +53,7 @@ impl Say<'_> {
 
 /// All judges, for a world that begins with `setup`.
 pub(crate) fn all(setup: &Setup, plan: &Plan) -> Vec<Box<dyn Judge>> {
-    let sensors = setup.sensors.len();
+    let (sensors, terms) = (setup.sensors.len(), Terms::of_seed(plan.seed));
     vec![
         Box::new(bytes::Bytes::new(sensors)),
         Box::new(accounts::Accounts::default()),
@@ -60,6 +66,11 @@ pub(crate) fn all(setup: &Setup, plan: &Plan) -> Vec<Box<dyn Judge>> {
         Box::new(liveness::Liveness::new(sensors)),
         Box::new(resources::Resources),
         Box::new(eeprom::Eeprom),
+        Box::new(remote_nothing_invented::RemoteNothingInvented::new(&terms)),
+        Box::new(remote_accounts::RemoteAccounts::default()),
+        Box::new(remote_numbers::RemoteNumbers::new(terms)),
+        Box::new(remote_verdict::RemoteVerdict::new(setup, plan, &terms)),
+        Box::new(remote_liveness::RemoteLiveness::new(setup, &terms)),
     ]
 }
 

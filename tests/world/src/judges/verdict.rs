@@ -29,9 +29,7 @@ struct OfSensor {
 impl OfRobot {
     pub(crate) fn new(setup: &Setup, plan: &Plan) -> OfRobot {
         let sensor = |number: usize| {
-            let (period, on_line) = setup.sensors[number].times();
-            let in_hub = 2 * period + GRACE;
-            let bound = period + on_line + setup.min_scans * in_hub + GRACE + SLACK;
+            let bound = bound(setup, number);
             let inside = object::inside(plan, number, setup.sensors.len());
             OfSensor { inside, bound, clear_since: None }
         };
@@ -73,6 +71,13 @@ impl OfSensor {
             }
         }
     }
+}
+
+/// For so long it may be believed that nothing is inside a circle of sensor `number`, although something is.
+pub(super) fn bound(setup: &Setup, number: usize) -> Nanos {
+    let (period, on_line) = setup.sensors[number].times();
+    let in_hub = 2 * period + GRACE;
+    period + on_line + setup.min_scans * in_hub + GRACE + SLACK
 }
 
 /// What is added to the two periods in the hub, and once more with a consumer.

@@ -1,0 +1,160 @@
+//! Nothing comes over the network that the hub did not publish: no datagram is taken that was not sent like this bit by bit,
+//! none is refused that came as it was sent, unless its gateway's life is over, and what a listener publishes is byte by byte
+//! what the hub published, with its number, time and quality.
+//!
+//! Two things nobody published (`docs/topics.md`): zones that are unknown, because nothing came, and that a sensor is silent,
+//! after 3 s of it.
+
+use std::collections::{BTreeMap, HashSet};
+
+use lms::{MILLIS, Nanos};
+use schema::datagram::{Datagram, DatagramError, Packed};
+use schema::{Flags, Header, Quality, State, Status, Topic, Zones};
+
+use super::{Judge, Say};
+use crate::event::{Arrival, Event};
+use crate::hash::History;
+use crate::remote::{Packet, Terms};
+
+/// What was published and sent.
+pub(crate) struct RemoteNothingInvented {
+    published: HashSet<u64>,
+    /// Lives of the hub.
+    boots: HashSet<u64>,
+    /// By epoch, sensor, topic and number.
+    sent: BTreeMap<(u32, u8, u8, u32), u64>,
+    /// The greatest epoch that the listener took.
+    epoch: u32,
+    /// Epoch and sensor of the announcements that the listener took: before it nobody knows whose samples are.
+    named: HashSet<(u32, u8)>,
+    /// When the listener last took a sample of each sensor that it knew and that was not late.
+    heard_at: BTreeMap<usize, Nanos>,
+    packet: Packet,
+    /// What everybody may say.
+    unknown: Vec<u8>,
+}
+
+impl RemoteNothingInvented {
+    pub(crate) fn new(terms: &Terms) -> Self {
+        let mut unknown = vec![0; size_of::<Zones>()];
+        let len = Zones::unknown().pack(&mut unknown).unwrap_or_default();
+        unknown.truncate(len);
+        RemoteNothingInvented {
+            published: HashSet::new(),
+            boots: HashSet::new(),
+            sent: BTreeMap::new(),
+            epoch: 0,
+            named: HashSet::new(),
+            heard_at: BTreeMap::new(),
+            packet: Packet::new(terms),
+            unknown,
+        }
+    }
+}
+
+impl Judge for RemoteNothingInvented {
+    fn name(&self) -> &'static str {
+        "remote_nothing_invented"
+    }
+
+    fn note(&mut self, at: Nanos, event: &Event<'_>, say: &mut Say<'_>) {
+        match *event {
+            Event::HubBegins { boot, .. } => _ = self.boots.insert(boot),
+            Event::Published { sensor, sample } => {
+                if let Some(payload) = self.packet.of(sample) {
+                    self.published.insert(key(sensor, sample.topic, &sample.header, payload));
+                }
+            }
+            Event::Transmitted { datagram, bytes, .. } => _ = self.sent.insert(place(datagram), hash(bytes)),
+            Event::ListenerBegins { .. } => {
+                self.epoch = 0;
+                self.named.clear();
+                self.heard_at.clear();
+            }
+            Event::Arrived { datagram, bytes, outcome, .. } => {
+                let sent = datagram.and_then(|datagram| self.sent.get(&place(datagram)).copied());
+                let is_sent = sent == Some(hash(bytes));
+                match (outcome, datagram) {
+                    (Arrival::Refused(why), Some(datagram)) if is_sent => {
+                        let is_over = datagram.head.epoch < self.epoch;
+                        if !(is_over && why == DatagramError::Epoch) {
+                            say.broken(format!("{why:?}: {:?}", datagram.head));
+                        }
+                    }
+                    (Arrival::Refused(_), _) => {}
+                    (_, Some(datagram)) if is_sent => {
+                        let head = &datagram.head;
+                        self.epoch = self.epoch.max(head.epoch);
+                        let life = (head.epoch, head.sensor);
+                        match outcome {
+                            Arrival::Announced => _ = self.named.insert(life),
+                            Arrival::Sample { late: false } if self.named.contains(&life) => {
+                                self.heard_at.insert(head.sensor.into(), at);
+                            }
+                            _ => {}
+                        }
+                    }
+                    _ => say.broken(format!("{} bytes that nobody sent so", bytes.len())),
+                }
+            }
+            Event::Republished { sensor, topic, header, payload } => {
+                let is_published = self.published.contains(&key(sensor, topic, header, payload));
+                let is_said = match topic {
+                    Topic::Zones => payload == self.unknown,
+                    Topic::Status => {
+                        let heard = self.heard_at.get(&sensor);
+                        let is_silent = heard.is_none_or(|&heard| at >= heard + SILENT);
+                        is_silent && status(payload).state() == Some(State::Silent)
+                    }
+                    _ => false,
+                };
+                if !is_published && !is_said {
+                    say.broken(format!("sensor {sensor}: nobody published this {topic:?}: {header:?}"));
+                }
+                if usize::from(header.sensor) != sensor || !self.boots.contains(&header.boot) {
+                    say.broken(format!("sensor {sensor}: of no sensor or hub: {header:?}"));
+                }
+            }
+            _ => {}
+        }
+    }
+}
+
+/// What of a sample stays the same over the network. A status is stamped when it is sent, and the beginning of its state when
+/// it is first heard of.
+fn key(sensor: usize, topic: Topic, header: &Header, payload: &[u8]) -> u64 {
+    let flags = header.flags & (Flags::SIMULATED | Flags::REPLAYED | Flags::STAMP_ESTIMATED);
+    let is_suspect = header.quality() == Quality::Suspect;
+    let mut history = History::new();
+    history.number(sensor as u64);
+    history.number(topic as u64);
+    history.number(u64::from(header.seq as u32));
+    history.number(u64::from(flags) << 1 | u64::from(is_suspect));
+    if topic == Topic::Status {
+        history.bytes(bytemuck::bytes_of(&Status { since_ns: 0, ..status(payload) }));
+    } else {
+        history.number(header.wall_ns);
+        history.bytes(payload);
+    }
+    history.value()
+}
+
+fn status(payload: &[u8]) -> Status {
+    let mut status = Status::default();
+    let _ = status.unpack(payload);
+    status
+}
+
+fn place(datagram: &Datagram<'_>) -> (u32, u8, u8, u32) {
+    let head = &datagram.head;
+    (head.epoch, head.sensor, head.topic, head.sequence)
+}
+
+fn hash(bytes: &[u8]) -> u64 {
+    let mut history = History::new();
+    history.bytes(bytes);
+    history.value()
+}
+
+/// So long nothing came of a sensor that is silent.
+const SILENT: Nanos = 3_000 * MILLIS;

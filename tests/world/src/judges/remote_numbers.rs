@@ -1,0 +1,130 @@
+//! What a listener publishes has the number, the stamps and the period that `docs/topics.md` says: the number is the datagram's
+//! and goes on over lives of the gateway, both stamps are the arrival, the period is the median of the last five times between
+//! two samples as sent. Nothing that came in time is left out once its topic is there.
+
+use std::collections::{BTreeMap, VecDeque};
+
+use lms::{MILLIS, Nanos};
+use schema::datagram::Head;
+use schema::{Flags, Header, Topic};
+
+use super::{Judge, Say};
+use crate::event::{Arrival, Event};
+use crate::remote::Terms;
+
+/// What the listener that lives took and published.
+pub(crate) struct RemoteNumbers {
+    terms: Terms,
+    topics: BTreeMap<(usize, Topic), OfTopic>,
+}
+
+#[derive(Default)]
+struct OfTopic {
+    /// What came in time and was not published yet: when it came, and its header.
+    taken: VecDeque<(Nanos, Head)>,
+    /// The last one that was published of them.
+    last: Option<(Nanos, Head)>,
+    /// The last number here.
+    number: Option<u64>,
+    distances_ns: VecDeque<Nanos>,
+}
+
+impl RemoteNumbers {
+    pub(crate) fn new(terms: Terms) -> RemoteNumbers {
+        RemoteNumbers { terms, topics: BTreeMap::new() }
+    }
+}
+
+impl Judge for RemoteNumbers {
+    fn name(&self) -> &'static str {
+        "remote_numbers"
+    }
+
+    fn note(&mut self, _: Nanos, event: &Event<'_>, say: &mut Say<'_>) {
+        match *event {
+            Event::ListenerBegins { .. } => self.topics.clear(),
+            Event::Arrived {
+                came,
+                datagram: Some(datagram),
+                outcome: Arrival::Sample { late: false },
+                ..
+            } => {
+                let head = datagram.head;
+                if let Some(topic) = Topic::of_number(head.topic) {
+                    let of = self.topics.entry((head.sensor.into(), topic)).or_default();
+                    of.taken.push_back((came, head));
+                }
+            }
+            Event::Republished { sensor, topic, header, .. } => {
+                let of = self.topics.entry((sensor, topic)).or_default();
+                if let Err(words) = of.publish(header, self.terms.clocks.monotonic_ns) {
+                    say.broken(format!("sensor {sensor}, {topic:?}: {words}: {header:?}"));
+                }
+            }
+            _ => {}
+        }
+    }
+}
+
+impl OfTopic {
+    /// `header` was published; what is wrong with it.
+    fn publish(&mut self, header: &Header, begin_ns: u64) -> Result<(), String> {
+        let before = self.number.replace(header.topic_seq);
+        if header.flags & Flags::REMOTE == 0 || header.stamp_first_ns != header.stamp_last_ns {
+            return Err("not as a remote one".to_owned());
+        }
+        let is_it = |(came, head): &(Nanos, Head)| {
+            let Head { counter, stamp_ns, .. } = *head;
+            let of = (begin_ns + came, u64::from(counter), stamp_ns);
+            of == (header.stamp_last_ns, header.seq, header.wall_ns)
+        };
+        let Some(at) = self.taken.iter().position(is_it) else {
+            // It stands for a silence.
+            let due = before.map_or(0, |before| before + 1);
+            return if header.topic_seq == due {
+                Ok(())
+            } else {
+                Err(format!("{due} is the number of a silence"))
+            };
+        };
+        let passed: Vec<_> = self.taken.drain(..at).collect();
+        let Some((came, head)) = self.taken.pop_front() else { return Ok(()) };
+        let last = self.last.replace((came, head));
+        let left_out =
+            passed.iter().filter(|(_, passed)| last.is_some_and(|(_, last)| last.epoch == passed.epoch));
+        let left_out = left_out.count();
+        let steps =
+            last.filter(|(_, last)| last.epoch == head.epoch).map(|(_, last)| head.sequence - last.sequence);
+        if let (Some(steps), Some((last_came, _))) = (steps.filter(|steps| *steps > 0), last) {
+            let distance_ns = (came - last_came) / u64::from(steps);
+            if distance_ns <= LONGEST {
+                self.distances_ns.push_back(distance_ns);
+            }
+            if self.distances_ns.len() > KEPT {
+                self.distances_ns.pop_front();
+            }
+        }
+        let mut known: Vec<_> = self.distances_ns.iter().copied().collect();
+        known.sort_unstable();
+        let period_us = known.get(known.len().saturating_sub(1) / 2).map_or(0, |period_ns| period_ns / 1000);
+        // The first number of a life of the listener is the datagram's; those that are not heard of another gateway count.
+        let due = match (before, steps) {
+            (Some(before), Some(steps)) => before + u64::from(steps),
+            (Some(before), None) => before + 1 + u64::from(head.sequence),
+            (None, _) => head.sequence.into(),
+        };
+        if header.topic_seq != due {
+            Err(format!("{due} is its number"))
+        } else if u64::from(header.period_us) != period_us {
+            Err(format!("{period_us} us is its period"))
+        } else if left_out > 0 {
+            Err(format!("{left_out} that came were left out before it"))
+        } else {
+            Ok(())
+        }
+    }
+}
+
+/// So many times between two samples tell the period, but none that is longer.
+const KEPT: usize = 5;
+const LONGEST: Nanos = 2_500 * MILLIS;

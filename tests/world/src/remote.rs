@@ -1,0 +1,267 @@
+//! What is behind the hub's topics in another machine: a gateway, a network, a listener that publishes, and a robot that
+//! believes. Each ends and begins by itself. Refuses to know what goes wrong, and when.
+
+mod gateway;
+mod listener;
+mod payload;
+mod robot;
+mod topics;
+
+use std::num::NonZeroU64;
+use std::time::Duration;
+
+use lan::Stamp;
+use lms::{MICROS, MILLIS, Nanos};
+use scanhub_client::clock::Moment;
+use schema::Topic;
+use schema::datagram::{MTU_ETHERNET, MTU_LEAST, MTU_SAFE};
+
+use crate::network::{Faults, Network};
+use crate::setup::Setup;
+use crate::shared::Shared;
+use gateway::Gateway;
+use listener::Listener;
+pub(crate) use payload::Packet;
+use robot::RemoteRobot;
+use topics::Memory;
+
+/// How gateway, network and listener are, as the seed has it.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Terms {
+    /// Of what comes with each scan every so many go out.
+    pub(crate) every: NonZeroU64,
+    /// Telegrams go out too.
+    sends_telegrams: bool,
+    /// The longest datagram, in bytes.
+    longest: usize,
+    /// Between two times that a background goes out.
+    repeat: Option<Duration>,
+    /// The shortest way.
+    pub(crate) delay_ns: Nanos,
+    /// The clocks of the machine that listens, when a world begins.
+    pub(crate) clocks: Stamp,
+}
+
+impl Terms {
+    pub(crate) fn of_seed(seed: u64) -> Terms {
+        let mut random = fastrand::Rng::with_seed(seed ^ 0x001A_0000_1A00);
+        let every = NonZeroU64::MIN.saturating_add([0, 0, 1, 3, 7][random.usize(..5)]);
+        Terms {
+            every,
+            sends_telegrams: random.bool(),
+            longest: [MTU_LEAST, MTU_SAFE, MTU_SAFE, MTU_ETHERNET][random.usize(..4)],
+            repeat: random.bool().then(|| Duration::from_secs(random.u64(1..20))),
+            delay_ns: random.u64(50..20_000) * MICROS,
+            clocks: Stamp { monotonic_ns: random.u64(1..1 << 50), wall_ns: random.u64(1 << 60..1 << 61) },
+        }
+    }
+
+    /// Every how manieth sample of `topic` goes out, if any do.
+    pub(crate) fn every(&self, topic: Topic) -> Option<NonZeroU64> {
+        match topic {
+            Topic::Telegram if !self.sends_telegrams => None,
+            Topic::Background | Topic::Status => Some(NonZeroU64::MIN),
+            _ => Some(self.every),
+        }
+    }
+
+    /// A moment on the clocks of the machine that listens.
+    fn stamp(&self, now: Nanos) -> Stamp {
+        let Stamp { monotonic_ns, wall_ns } = self.clocks;
+        Stamp { monotonic_ns: monotonic_ns + now, wall_ns: wall_ns + now }
+    }
+
+    /// That machine is never suspended.
+    fn moment(&self, now: Nanos) -> Moment {
+        let Stamp { monotonic_ns, .. } = self.stamp(now);
+        Moment { monotonic_ns, boottime_ns: monotonic_ns }
+    }
+}
+
+/// Everything from the gateway on.
+pub(crate) struct Remote {
+    terms: Terms,
+    sensors: usize,
+    gateway: Option<Gateway>,
+    /// How many there were.
+    gateways: u32,
+    /// The gateway's process does not run until then, and the listener's.
+    gateway_stalled_until: Nanos,
+    listener_stalled_until: Nanos,
+    network: Network,
+    faults: Faults,
+    /// So many partitions last.
+    partitions: usize,
+    /// The sockets of the gateway take so many datagrams of what is sent less, from 0 to 1.
+    pub(crate) refusal: f64,
+    random: fastrand::Rng,
+    listener: Option<Listener>,
+    listeners: u64,
+    memory: Memory,
+    robot: RemoteRobot,
+}
+
+impl Remote {
+    pub(crate) fn new(seed: u64, setup: &Setup) -> Remote {
+        let terms = Terms::of_seed(seed);
+        let faults = Faults { delay_ns: terms.delay_ns, ..Faults::default() };
+        let sensors = setup.sensors.len();
+        Remote {
+            terms,
+            sensors,
+            gateway: None,
+            gateways: 0,
+            gateway_stalled_until: 0,
+            listener_stalled_until: 0,
+            network: Network::new(seed, faults),
+            faults,
+            partitions: 0,
+            refusal: 0.0,
+            random: fastrand::Rng::with_seed(seed ^ 0x5E4D),
+            listener: None,
+            listeners: 0,
+            memory: Memory::default(),
+            robot: RemoteRobot::new(&terms, sensors),
+        }
+    }
+
+    /// A gateway begins, if there is none.
+    pub(crate) fn begin_gateway(&mut self, shared: &Shared) {
+        if self.gateway.is_none() {
+            self.gateways += 1;
+            self.gateway = Some(Gateway::begin(shared, &self.terms, self.gateways, self.sensors));
+        }
+    }
+
+    /// The gateway is killed, or ends in order: then it has a last word.
+    pub(crate) fn end_gateway(&mut self, shared: &Shared, is_killed: bool) {
+        let Some(mut gateway) = self.gateway.take() else { return };
+        let now = shared.clock.get();
+        if !is_killed {
+            gateway.announce(shared, now, &mut self.uplink(shared, now));
+        }
+        gateway.leave(shared, is_killed, false);
+    }
+
+    /// A listener begins, if there is none.
+    pub(crate) fn begin_listener(&mut self, shared: &Shared) {
+        if self.listener.is_none() {
+            self.listeners += 1;
+            let now = shared.clock.get();
+            self.listener =
+                Some(Listener::begin(shared, &self.terms, self.listeners, self.memory.clone(), now));
+        }
+    }
+
+    /// The listener is killed: what waits in its sockets is lost.
+    pub(crate) fn kill_listener(&mut self, shared: &Shared) {
+        if let Some(listener) = self.listener.take() {
+            listener.end(shared, shared.clock.get());
+        }
+    }
+
+    /// The process of the gateway, or of the listener, does not run until then.
+    pub(crate) fn stall(&mut self, is_listener: bool, until: Nanos) {
+        let Remote { gateway_stalled_until, listener_stalled_until, .. } = self;
+        let stalled = if is_listener { listener_stalled_until } else { gateway_stalled_until };
+        *stalled = until.max(*stalled);
+    }
+
+    /// All processes run.
+    pub(crate) fn heal(&mut self) {
+        (self.gateway_stalled_until, self.listener_stalled_until) = (0, 0);
+    }
+
+    /// The network has these faults from now on, besides its delay.
+    pub(crate) fn set_faults(&mut self, faults: Faults, now: Nanos) {
+        self.faults = Faults { delay_ns: self.terms.delay_ns + faults.delay_ns, ..faults };
+        self.tell_network(now);
+    }
+
+    /// One partition more begins, or one ends.
+    pub(crate) fn part(&mut self, begins: bool, now: Nanos) {
+        self.partitions = if begins { self.partitions + 1 } else { self.partitions.saturating_sub(1) };
+        self.tell_network(now);
+    }
+
+    fn tell_network(&mut self, now: Nanos) {
+        let loss = if self.partitions > 0 { 1.0 } else { self.faults.loss };
+        self.network.set_faults(Faults { loss, ..self.faults }, now);
+    }
+
+    /// The hub woke the consumers of a sensor at `at`.
+    pub(crate) fn wake(&mut self, at: Nanos) {
+        if let Some(gateway) = &mut self.gateway {
+            gateway.wake(at);
+        }
+    }
+
+    /// When something is due.
+    pub(crate) fn next_ns(&self, now: Nanos) -> Nanos {
+        let gateway =
+            self.gateway.as_ref().map(|gateway| gateway.next_ns(now).max(self.gateway_stalled_until));
+        let listener =
+            self.listener.as_ref().map(|listener| listener.next_ns().max(self.listener_stalled_until));
+        let all = gateway.into_iter().chain(listener).chain(self.network.next());
+        all.fold(self.robot.next_ns(&self.terms, now), Nanos::min)
+    }
+
+    /// Does what is due at `now`.
+    pub(crate) fn pass(&mut self, shared: &Shared, now: Nanos) {
+        if now >= self.gateway_stalled_until
+            && let Some(mut gateway) = self.gateway.take()
+        {
+            if gateway.next_ns(now) <= now {
+                gateway.run(shared, now, &mut self.uplink(shared, now));
+            }
+            self.gateway = Some(gateway);
+        }
+        self.deliver(shared, now);
+        self.robot.run(shared, &self.terms, &self.memory, now);
+    }
+
+    /// What came until `now` is the listener's.
+    fn deliver(&mut self, shared: &Shared, now: Nanos) {
+        while let Some(bytes) = self.network.poll(now) {
+            if let Some(listener) = &mut self.listener {
+                listener.catch(now, bytes);
+            }
+        }
+        if let Some(listener) = self.listener.as_mut().filter(|_| now >= self.listener_stalled_until)
+            && listener.next_ns() <= now
+        {
+            listener.run(shared, &self.terms, now);
+        }
+    }
+
+    /// Takes all that waits and that is on its way, and ends.
+    pub(crate) fn close(&mut self, shared: &Shared) {
+        let mut now = shared.clock.get();
+        if let Some(mut gateway) = self.gateway.take() {
+            let uplink = &mut self.uplink(shared, now);
+            gateway.run(shared, now, uplink);
+            gateway.announce(shared, now, uplink);
+            gateway.leave(shared, false, true);
+        }
+        while let Some(at) = self.network.next() {
+            now = now.max(at);
+            self.deliver(shared, now);
+        }
+        now += WAKES;
+        self.deliver(shared, now);
+        self.robot.run(shared, &self.terms, &self.memory, now);
+        if let Some(listener) = self.listener.take() {
+            listener.end(shared, now);
+        }
+    }
+
+    fn uplink<'a>(&'a mut self, shared: &'a Shared, now: Nanos) -> gateway::Uplink<'a> {
+        let Remote { network, random, refusal, .. } = self;
+        gateway::Uplink { shared, now, random, refusal: *refusal, network }
+    }
+}
+
+/// From a datagram or a ring to a process that runs.
+const WAKES: Nanos = 60 * MICROS;
+/// A listener sleeps no longer than so.
+const LOOKS: Nanos = 100 * MILLIS;

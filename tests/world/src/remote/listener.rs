@@ -1,0 +1,122 @@
+//! A life of a listener: it takes datagrams in the order in which they came, and publishes what they say. Refuses to know who
+//! follows that.
+
+use std::collections::VecDeque;
+
+use lan::incoming::{Arrived, Incoming};
+use lan::republish::Republisher;
+use lms::Nanos;
+use schema::Topic;
+use schema::datagram::{Datagram, DatagramError};
+
+use super::robot::GATEWAY;
+use super::topics::Memory;
+use super::{LOOKS, Terms, WAKES};
+use crate::event::{Arrival, Event};
+use crate::shared::Shared;
+
+/// The listener.
+pub(super) struct Listener {
+    life: u64,
+    incoming: Incoming,
+    republisher: Republisher<Memory>,
+    /// Datagrams that the kernel has, with the time at which they came.
+    queue: VecDeque<(Nanos, Vec<u8>)>,
+    queued: usize,
+    /// When it looks at its sockets, and at what is due now and then.
+    next_at: Nanos,
+    look_at: Nanos,
+}
+
+impl Listener {
+    /// Number `life` of all listeners publishes in `memory`.
+    pub(super) fn begin(shared: &Shared, terms: &Terms, life: u64, memory: Memory, now: Nanos) -> Listener {
+        shared.log.tell(now, &Event::ListenerBegins { life });
+        Listener {
+            life,
+            incoming: Incoming::new(&Topic::ALL),
+            republisher: Republisher::new(memory, PID, terms.stamp(now).monotonic_ns),
+            queue: VecDeque::new(),
+            queued: 0,
+            next_at: Nanos::MAX,
+            look_at: now,
+        }
+    }
+
+    /// A datagram came, if there is room for it.
+    pub(super) fn catch(&mut self, now: Nanos, bytes: Vec<u8>) {
+        if self.queued + bytes.len() <= ROOM {
+            self.queued += bytes.len();
+            self.queue.push_back((now, bytes));
+            self.next_at = self.next_at.min(now + WAKES);
+        }
+    }
+
+    /// When it has something to do.
+    pub(super) fn next_ns(&self) -> Nanos {
+        self.next_at.min(self.look_at)
+    }
+
+    /// Takes what waits.
+    pub(super) fn run(&mut self, shared: &Shared, terms: &Terms, now: Nanos) {
+        self.next_at = Nanos::MAX;
+        let wall = terms.stamp(now);
+        loop {
+            for _ in 0..TURN.min(self.queue.len()) {
+                let Some((came, bytes)) = self.queue.pop_front() else { break };
+                self.queued -= bytes.len();
+                self.take(shared, terms, came, &bytes, now);
+            }
+            self.republisher.wake();
+            if now >= self.look_at {
+                self.look_at = now + LOOKS;
+                self.republisher.look(wall);
+            }
+            if self.queue.is_empty() {
+                return;
+            }
+        }
+    }
+
+    fn take(&mut self, shared: &Shared, terms: &Terms, came: Nanos, bytes: &[u8], now: Nanos) {
+        let wall = terms.stamp(now);
+        let arrived = self.incoming.receive(bytes, 1, terms.stamp(came));
+        let outcome = match &arrived {
+            Arrived::Refused { why, .. } => Arrival::Refused(*why),
+            Arrived::Known => Arrival::Known,
+            Arrived::Announced(_) => Arrival::Announced,
+            Arrived::Sample(sample) => Arrival::Sample { late: sample.remote.late },
+        };
+        let datagram = Datagram::read(bytes).ok();
+        shared.log.tell(now, &Event::Arrived { came, datagram: datagram.as_ref(), bytes, outcome });
+        if let Some(head) = arrived.begins() {
+            self.republisher.begun(head, wall);
+        }
+        let made = match &arrived {
+            Arrived::Sample(sample) => self.republisher.sample(sample, || GATEWAY.to_owned(), wall),
+            Arrived::Announced(announced) => self.republisher.announced(announced, GATEWAY, wall),
+            Arrived::Refused { .. } | Arrived::Known => Ok(None),
+        };
+        if let Err(failure) = made {
+            shared.log.tell(now, &Event::Acted { text: &format!("a listener says {failure}") });
+        }
+    }
+
+    /// It is gone; its account is what it would have told.
+    pub(super) fn end(self, shared: &Shared, now: Nanos) {
+        let stats = self.incoming.stats();
+        for row in stats.rows() {
+            shared.log.tell(now, &Event::Counted { row });
+        }
+        let refused = DatagramError::ALL.iter().map(|&why| stats.refused(why)).sum();
+        let (given_up, sensors) = (stats.given_up().lives, self.republisher.names().len());
+        shared.log.tell(now, &Event::ListenerEnds { life: self.life, refused, given_up, sensors });
+    }
+}
+
+/// The process that publishes.
+const PID: u32 = 77;
+/// Datagrams that are taken before anything else has its turn.
+const TURN: usize = 64;
+/// Bytes that wait in the kernel.
+const ROOM: usize = 1 << 20;

@@ -1,0 +1,44 @@
+//! The payload of a sample as it goes over a network. Refuses to know what becomes of it.
+
+use lan::outgoing::PayloadRef;
+use schema::datagram::HEAD;
+
+use super::Terms;
+use crate::topics::Sample;
+
+/// Declares from the table of topics how the bytes of a sample are read.
+macro_rules! payloads {
+    ($($topic:ident $payload:tt, $name:literal, $($column:tt),*: $about:literal;)*) => {
+        /// Hands what `sample` says to `to`.
+        pub(super) fn lend<R>(sample: &Sample, to: impl FnOnce(PayloadRef<'_>) -> R) -> R {
+            match sample.topic {
+                $(schema::Topic::$topic => to(PayloadRef::$topic(payloads!($payload sample))),)*
+            }
+        }
+    };
+    ([u8] $sample:ident) => {
+        &$sample.bytes
+    };
+    ($payload:ident $sample:ident) => {
+        &bytemuck::pod_read_unaligned::<schema::$payload>(&$sample.bytes)
+    };
+}
+
+schema::for_each_topic!(payloads);
+
+/// Room for a payload as in a datagram: of some payloads it says how much goes into it.
+pub(crate) struct Packet {
+    room: Vec<u8>,
+}
+
+impl Packet {
+    pub(crate) fn new(terms: &Terms) -> Packet {
+        Packet { room: vec![0; terms.longest - HEAD] }
+    }
+
+    /// What `sample` is in a datagram; nothing if it does not fit.
+    pub(crate) fn of(&mut self, sample: &Sample) -> Option<&[u8]> {
+        let len = lend(sample, |payload| payload.pack(&mut self.room))?;
+        self.room.get(..len)
+    }
+}

@@ -1,0 +1,98 @@
+//! The topics of remote sensors as queues in memory, which their consumers look at when they are woken. Refuses to know who
+//! publishes and who takes.
+
+use std::cell::RefCell;
+use std::collections::{BTreeMap, VecDeque};
+use std::rc::Rc;
+
+use lan::republish::{SensorTopics, TopicStore};
+use schema::{Failure, Header, Topic, Wake};
+
+/// Topics in memory, by their sensors' names. They stay when who publishes is gone.
+#[derive(Clone, Default)]
+pub(crate) struct Memory(Rc<RefCell<BTreeMap<String, Waiting>>>);
+
+/// What waits of one sensor for its consumer.
+#[derive(Default)]
+struct Waiting {
+    samples: VecDeque<Published>,
+    is_woken: bool,
+}
+
+/// A sample that was published.
+pub(crate) struct Published {
+    pub(crate) topic: Topic,
+    pub(crate) header: Header,
+    /// As in a datagram.
+    pub(crate) payload: Vec<u8>,
+}
+
+/// The topics of one sensor.
+pub(crate) struct MemoryTopics {
+    name: String,
+    /// The next number of each topic that is there.
+    next: [Option<u64>; Topic::ALL.len()],
+    memory: Memory,
+}
+
+impl Memory {
+    /// What waits of the sensor called `name`, if its consumer was woken since the last call.
+    pub(crate) fn take(&self, name: &str) -> VecDeque<Published> {
+        let mut all = self.0.borrow_mut();
+        let Some(waiting) = all.get_mut(name) else { return VecDeque::new() };
+        if std::mem::take(&mut waiting.is_woken) {
+            std::mem::take(&mut waiting.samples)
+        } else {
+            VecDeque::new()
+        }
+    }
+}
+
+impl TopicStore for Memory {
+    type Sensor = MemoryTopics;
+
+    fn check_room(&self, _topics: &[Topic]) -> Result<(), Failure> {
+        Ok(())
+    }
+
+    fn sensor(&self, name: &str) -> Result<MemoryTopics, Failure> {
+        self.0.borrow_mut().entry(name.to_owned()).or_default();
+        Ok(MemoryTopics { name: name.to_owned(), next: Default::default(), memory: self.clone() })
+    }
+
+    fn clean_up(&self) {}
+}
+
+impl SensorTopics for MemoryTopics {
+    fn add(&mut self, topic: Topic) -> Result<(), Failure> {
+        assert_eq!(self.next[topic as usize].replace(0), None, "{topic:?} is there");
+        Ok(())
+    }
+
+    fn remove(&mut self, topic: Topic) {
+        self.next[topic as usize] = None;
+    }
+
+    fn skip(&mut self, topic: Topic, count: u64) {
+        *self.next[topic as usize].as_mut().expect("it is there") += count;
+    }
+
+    fn send(&mut self, topic: Topic, header: &Header, payload: &[u8]) {
+        let next = self.next[topic as usize].as_mut().expect("it is there");
+        let header = Header { topic_seq: *next, ..*header };
+        *next += 1;
+        let mut all = self.memory.0.borrow_mut();
+        let waiting = all.get_mut(&self.name).expect("it was made");
+        waiting.samples.push_back(Published { topic, header, payload: payload.to_vec() });
+    }
+
+    fn connect(&self, _topic: Topic) {}
+
+    fn wake(&self, _why: Wake) {
+        self.memory.0.borrow_mut().get_mut(&self.name).expect("it was made").is_woken = true;
+    }
+
+    fn failed(&self) -> u64 {
+        0
+    }
+}
