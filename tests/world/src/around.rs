@@ -13,6 +13,7 @@ use schema::ipc::Payload;
 use schema::{Failure, Kind, Wake};
 
 use crate::line::{Handle, LinkClock, OpenLine};
+use crate::planted::Defect;
 use crate::shared::Shared;
 use crate::topics::Carrier;
 
@@ -68,7 +69,14 @@ impl Surroundings for Around<'_> {
         }
         let mut tty = self.shared.ports[self.number].borrow_mut();
         let opened = tty.open(baud, &self.shared.log, self.clock.now());
-        Some(opened.map(|device| self.line(device)))
+        drop(tty);
+        Some(opened.map(|device| {
+            let line = self.line(device);
+            if self.shared.planted.is(Defect::UnreleasedHandle) {
+                std::mem::forget(line.handle.clone());
+            }
+            line
+        }))
     }
 
     fn explain(&self, error: &PortError, source: &Source) -> Failure {
@@ -110,7 +118,9 @@ impl Surroundings for Around<'_> {
     }
 
     fn wake(&self, _: Wake) {
-        self.shared.woken.borrow_mut().push((self.number, self.clock.now()));
+        if !self.shared.planted.strikes(Defect::LostWake, 200) {
+            self.shared.woken.borrow_mut().push((self.number, self.clock.now()));
+        }
     }
 
     fn recall(&self, name: &str, record: &mut [u8]) -> Option<usize> {

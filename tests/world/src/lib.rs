@@ -15,6 +15,7 @@ mod judges;
 mod line;
 mod network;
 mod plan;
+mod planted;
 mod remote;
 mod runner;
 mod sensor;
@@ -27,5 +28,6 @@ mod world;
 
 pub use event::{Detail, Violation};
 pub use plan::{Action, Plan};
+pub use planted::Defect;
 pub use runner::{Runner, Totals};
-pub use world::{Outcome, run};
+pub use world::{Outcome, run, run_with};

@@ -8,6 +8,7 @@ use daemon::surroundings::Line;
 use lms::Nanos;
 use port::Allowance;
 
+use crate::planted::{Defect, eeprom_request};
 use crate::shared::Shared;
 
 /// The time of one link: its thread may be ahead of the others' while it writes a request byte by byte.
@@ -57,8 +58,14 @@ pub(crate) struct OpenLine {
 }
 
 impl OpenLine {
-    fn check(&self, is_there: bool) -> io::Result<()> {
-        if is_there { Ok(()) } else { Err(io::Error::new(io::ErrorKind::UnexpectedEof, "the line hung up")) }
+    /// Whether it is there; an error if it is not, as the kernel tells it.
+    fn check(&self, is_there: bool) -> io::Result<bool> {
+        let is_told = !self.handle.shared.planted.is(Defect::SwallowedHangUp);
+        if is_there || !is_told {
+            Ok(is_there)
+        } else {
+            Err(io::Error::new(io::ErrorKind::UnexpectedEof, "the line hung up"))
+        }
     }
 }
 
@@ -67,16 +74,27 @@ impl Line for OpenLine {
         let Handle { shared, port, device } = &*self.handle;
         let (mut tty, now) = (shared.ports[*port].borrow_mut(), self.clock.now());
         tty.advance(now, &shared.log);
-        self.check(tty.is_there(*device))?;
-        Ok(tty.read(buffer, &shared.log, now))
+        let planted = &shared.planted;
+        if !self.check(tty.is_there(*device))? {
+            return Ok(0);
+        }
+        let len = tty.read(buffer, &shared.log, now);
+        if len > 0 && planted.strikes(Defect::FlippedBit, 100) {
+            buffer[len / 2] ^= 4;
+        }
+        if planted.strikes(Defect::EepromWrite, 500) {
+            eeprom_request().into_iter().for_each(|byte| tty.write(byte, now));
+        }
+        Ok(if len > 1 && planted.strikes(Defect::LostByte, 100) { len - 1 } else { len })
     }
 
     fn write(&self, byte: u8) -> io::Result<()> {
         let Handle { shared, port, device } = &*self.handle;
         let (mut tty, now) = (shared.ports[*port].borrow_mut(), self.clock.now());
         tty.advance(now, &shared.log);
-        self.check(tty.is_there(*device))?;
-        tty.write(byte, now);
+        if self.check(tty.is_there(*device))? {
+            tty.write(byte, now);
+        }
         Ok(())
     }
 
@@ -84,16 +102,17 @@ impl Line for OpenLine {
         let Handle { shared, port, device } = &*self.handle;
         let (mut tty, now) = (shared.ports[*port].borrow_mut(), self.clock.now());
         tty.advance(now, &shared.log);
-        self.check(tty.is_there(*device))?;
-        tty.set_rate(baud, &shared.log, now);
+        if self.check(tty.is_there(*device))? {
+            tty.set_rate(baud, &shared.log, now);
+        }
         Ok(None)
     }
 
     fn waiting(&self) -> Option<usize> {
-        let Handle { shared, port, .. } = &*self.handle;
+        let Handle { shared, port, device } = &*self.handle;
         let mut tty = shared.ports[*port].borrow_mut();
         tty.advance(self.clock.now(), &shared.log);
-        Some(tty.waiting())
+        tty.is_there(*device).then(|| tty.waiting())
     }
 
     fn allowance(&self, _: u32) -> Option<Allowance> {

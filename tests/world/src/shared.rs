@@ -11,6 +11,7 @@ use crate::event::{Detail, Event, Violation};
 use crate::hash::History;
 use crate::judges::{Judge, Say};
 use crate::line::Handle;
+use crate::planted::Planted;
 use crate::topics::Board;
 use crate::tty::Tty;
 
@@ -23,6 +24,7 @@ pub(crate) struct Shared {
     pub(crate) ports: Vec<RefCell<Tty>>,
     pub(crate) board: RefCell<Board>,
     pub(crate) log: Log,
+    pub(crate) planted: Planted,
     /// The directory in which what was learned is kept, and whether its disk is full.
     pub(crate) files: RefCell<BTreeMap<String, String>>,
     pub(crate) disk_is_full: Cell<bool>,

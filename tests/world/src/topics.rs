@@ -2,7 +2,7 @@
 //! sample when it is full, the history for late joiners, the loans of a publisher. Refuses to know what a sample means.
 
 use std::borrow::{Borrow, BorrowMut};
-use std::cell::Cell;
+use std::cell::{Cell, RefCell};
 use std::collections::VecDeque;
 use std::convert::Infallible;
 use std::fmt::Debug;
@@ -11,11 +11,12 @@ use std::rc::Rc;
 
 use lms::Nanos;
 use schema::ipc::{LoanError, Medium, Payload, SendError};
-use schema::{Header, Topic, limits};
+use schema::{Header, Topic, Verdict, limits};
 
 use crate::consumer::Number;
 use crate::event::Event;
 use crate::line::LinkClock;
+use crate::planted::Defect;
 use crate::shared::{Log, Shared};
 
 /// A sample that was sent.
@@ -173,6 +174,8 @@ pub(crate) struct Carrier<P: ?Sized> {
     /// Loans of this publisher that were not sent.
     loaned: Rc<Cell<usize>>,
     sent: Cell<u64>,
+    /// A sample that a planted defect holds back.
+    late: RefCell<Option<Rc<Sample>>>,
     payload: PhantomData<fn(&P)>,
 }
 
@@ -186,7 +189,15 @@ impl<P: Payload + ?Sized> Carrier<P> {
     pub(crate) fn new(shared: &Rc<Shared>, clock: &Rc<LinkClock>, sensor: usize) -> Self {
         shared.board.borrow_mut().begin(sensor, P::TOPIC);
         let (shared, clock) = (shared.clone(), clock.clone());
-        Carrier { shared, clock, sensor, loaned: Rc::default(), sent: Cell::new(0), payload: PhantomData }
+        Carrier {
+            shared,
+            clock,
+            sensor,
+            loaned: Rc::default(),
+            sent: Cell::new(0),
+            late: RefCell::default(),
+            payload: PhantomData,
+        }
     }
 }
 
@@ -223,13 +234,45 @@ impl<P: Payload + ?Sized> Medium<P> for Carrier<P> {
 
     fn send(&self, loan: Loan<P>, header: &Header) -> Result<usize, SendError> {
         let now = self.clock.now();
-        let mut board = self.shared.board.borrow_mut();
+        let Shared { board, log, planted, .. } = &*self.shared;
+        let mut board = board.borrow_mut();
         let payload: &P = loan.payload.borrow();
-        let bytes = payload.bytes().to_vec();
+        let mut bytes = payload.bytes().to_vec();
         let _counted = Counted::new(&board.samples);
+        let mut header = *header;
+        let topic = P::TOPIC;
+        if topic == Topic::Telegram && planted.strikes(Defect::UnsentTelegram, 100) {
+            return Ok(0);
+        }
+        if topic == Topic::Zones && planted.is(Defect::SurvivingVerdict) && bytes[0] == UNKNOWN {
+            bytes[0] = Verdict::Clear as u8;
+        }
+        if header.topic_seq > 0 && planted.strikes(Defect::Renumbered, 100) {
+            header.topic_seq -= 1;
+        }
         let index = self.sent.replace(self.sent.get() + 1);
-        let sample = Rc::new(Sample { topic: P::TOPIC, header: *header, bytes, at: now, index, _counted });
-        self.shared.log.tell(now, &Event::Published { sensor: self.sensor, sample: &sample });
-        Ok(board.send(self.sensor, &sample, &self.shared.log, now))
+        let sample = Rc::new(Sample { topic, header, bytes, at: now, index, _counted });
+        log.tell(now, &Event::Published { sensor: self.sensor, sample: &sample });
+        if planted.strikes(Defect::LeakedLoan, 1_000) {
+            std::mem::forget(loan);
+        }
+        if planted.strikes(Defect::Delayed, 100) || planted.strikes(Defect::Reordered, 100) {
+            return Ok(self
+                .late
+                .replace(Some(sample))
+                .map_or(1, |late| board.send(self.sensor, &late, log, now)));
+        }
+        let late = self.late.take();
+        let is_behind = late.is_some() && planted.is(Defect::Reordered);
+        let (first, second) = if is_behind { (Some(sample), late) } else { (late, Some(sample)) };
+        let mut reached = 0;
+        for sample in first.into_iter().chain(second) {
+            let times = if planted.strikes(Defect::SentTwice, 100) { 2 } else { 1 };
+            (0..times).for_each(|_| reached = board.send(self.sensor, &sample, log, now));
+        }
+        Ok(reached)
     }
 }
+
+/// The first byte of zones of which nothing is known.
+const UNKNOWN: u8 = Verdict::Unknown as u8;

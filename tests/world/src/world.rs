@@ -16,6 +16,7 @@ use crate::event::{Detail, Event, Violation};
 use crate::hub;
 use crate::judges;
 use crate::plan::{Action, Plan};
+use crate::planted::{Defect, Planted};
 use crate::remote::Remote;
 use crate::setup::Setup;
 use crate::shared::{Log, Shared};
@@ -37,7 +38,12 @@ pub struct Outcome {
 
 /// Lets happen what `plan` says, and tells standard error so much of it.
 pub fn run(plan: &Plan, detail: Detail) -> Outcome {
-    let mut world = World::new(plan, detail);
+    run_with(plan, detail, None)
+}
+
+/// As [`run`], with `defect` around the hub.
+pub fn run_with(plan: &Plan, detail: Detail, defect: Option<Defect>) -> Outcome {
+    let mut world = World::new(plan, detail, defect);
     while world.now() < world.end {
         world.rest_without_hub();
         if world.now() < world.end {
@@ -94,7 +100,7 @@ pub(crate) struct World {
 }
 
 impl World {
-    fn new(plan: &Plan, detail: Detail) -> World {
+    fn new(plan: &Plan, detail: Detail, defect: Option<Defect>) -> World {
         let setup = Rc::new(Setup::of_seed(plan.seed));
         let sensors = setup.sensors(|sensor| object::changes(plan, sensor, setup.sensors.len()));
         let ports =
@@ -105,6 +111,7 @@ impl World {
             ports: ports.collect(),
             board: RefCell::new(Board::new(setup.sensors.len())),
             log: Log::new(judges::all(&setup, plan), detail),
+            planted: Planted::new(defect),
             files: RefCell::default(),
             disk_is_full: Cell::new(false),
             records: RefCell::default(),

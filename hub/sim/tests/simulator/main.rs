@@ -1,8 +1,8 @@
-//! The simulated sensor: one binary with a module for each thing that is held, so that what they all link is linked once.
+//! The simulated sensor in virtual time: one binary with a module for each thing that is held, so that what they all link
+//! is linked once. The tests on ptys are in `tests/port`: they must not wait for processors that these tests use.
 
 mod faults;
 mod inquiry;
 mod machine;
-mod port;
 mod session;
 mod worlds;

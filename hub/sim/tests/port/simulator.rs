@@ -15,7 +15,7 @@ use sim::options::SimulateOptions;
 use sim::truth::{Record, Summary};
 use sim::{Ready, simulate};
 
-use super::PATIENCE;
+use crate::PATIENCE;
 
 /// A directory of this test that is gone with it.
 pub(crate) struct Folder(PathBuf);
