@@ -13,6 +13,7 @@ use super::robot::GATEWAY;
 use super::topics::Memory;
 use super::{LOOKS, Terms, WAKES};
 use crate::event::{Arrival, Event};
+use crate::planted::Defect;
 use crate::shared::Shared;
 
 /// The listener.
@@ -80,7 +81,11 @@ impl Listener {
 
     fn take(&mut self, shared: &Shared, terms: &Terms, came: Nanos, bytes: &[u8], now: Nanos) {
         let wall = terms.stamp(now);
-        let arrived = self.incoming.receive(bytes, 1, terms.stamp(came));
+        if shared.planted.strikes(Defect::RemoteCountedTwice, 100) {
+            self.incoming.receive(bytes, 1, terms.stamp(came));
+        }
+        let stamped = if shared.planted.is(Defect::RemoteStampedLate) { now } else { came };
+        let arrived = self.incoming.receive(bytes, 1, terms.stamp(stamped));
         let outcome = match &arrived {
             Arrived::Refused { why, .. } => Arrival::Refused(*why),
             Arrived::Known => Arrival::Known,
