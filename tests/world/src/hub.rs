@@ -57,6 +57,8 @@ fn begin(world: &mut World, shared: &Rc<Shared>, boot: u64) -> Result<Ending, Fa
     }
     let mut writes_at = world.now();
     world.greet();
+    // Its process is another one than that which stood still.
+    world.stalled_until = 0;
     let ending = loop {
         world.ring();
         let links_at = links.iter().map(|link| link.next_ns().max(world.stalled_until));
@@ -78,7 +80,11 @@ fn begin(world: &mut World, shared: &Rc<Shared>, boot: u64) -> Result<Ending, Fa
         for (sensor, verb) in std::mem::take(&mut world.wants.asks) {
             let model = Box::<Background>::default();
             let asked = world.orders.as_mut().map(|orders| orders.ask(&names[sensor], verb, model));
-            links[sensor].is_wanted |= asked.is_some_and(|asked| asked.is_ok());
+            match asked {
+                Some(Ok(_)) => links[sensor].is_wanted = true,
+                // Too many wait: whoever asks tries again.
+                _ => world.wants.asks.push((sensor, verb)),
+            }
         }
         for link in &mut links {
             link.look(now);

@@ -9,6 +9,7 @@ mod nothing_invented;
 mod nothing_lost;
 mod numbers;
 mod prompt;
+mod recording;
 mod remote_accounts;
 mod remote_liveness;
 mod remote_nothing_invented;
@@ -60,6 +61,7 @@ pub(crate) fn all(setup: &Setup, plan: &Plan) -> Vec<Box<dyn Judge>> {
         Box::new(nothing_invented::NothingInvented::new(sensors)),
         Box::new(nothing_lost::NothingLost::new(sensors)),
         Box::new(prompt::Prompt::default()),
+        Box::new(recording::Recording::new(plan.seed)),
         Box::new(verdict::OfRobot::new(setup, plan)),
         Box::new(liveness::Liveness::new(sensors)),
         Box::new(resources::Resources),

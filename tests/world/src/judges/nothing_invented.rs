@@ -36,9 +36,16 @@ impl OfSensor {
     /// Whether the line made of a telegram another one as long with a right checksum: one of 65,536 damaged ones, which nobody
     /// can know.
     fn is_collision(&self, bytes: &[u8]) -> bool {
-        self.damaged.iter().any(|sent| {
-            let others = sent.iter().zip(bytes).filter(|(sent, got)| sent != got).count();
-            sent.len() == bytes.len() && others <= MOST_OTHERS
+        let others = |sent: &[u8], got: &[u8]| sent.iter().zip(got).filter(|(sent, got)| sent != got).count();
+        self.damaged.iter().filter(|sent| sent.len() == bytes.len()).any(|sent| {
+            let Some(first) = sent.iter().zip(bytes).position(|(sent, got)| sent != got) else {
+                return false;
+            };
+            let last = sent.iter().zip(bytes).rposition(|(sent, got)| sent != got).unwrap_or(first);
+            let (sent, got) = (&sent[first..=last], &bytes[first..=last]);
+            // A byte too many and one too few shift what is between.
+            let shifted = [others(&sent[1..], got), others(sent, &got[1..])];
+            others(sent, got).min(shifted[0]).min(shifted[1]) <= MOST_OTHERS
         })
     }
 }

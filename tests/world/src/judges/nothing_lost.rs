@@ -3,6 +3,7 @@
 
 use std::collections::VecDeque;
 
+use lms::measured::MEASURED;
 use lms::{MILLIS, Nanos};
 use schema::{State, Status, Topic};
 
@@ -22,7 +23,9 @@ struct OfSensor {
     /// Place behind the last byte that the hub had read when it began to say that it streams, if it still says so.
     streams_from: Option<u64>,
     read: u64,
-    /// The hub streams from a sensor that is not there any more: one with other scans is met anew.
+    /// Sensors that were there before this one, and whether the hub has heard a scan of this one: one whose scans are others
+    /// is met only after a silence.
+    exchanged: u32,
     is_other: bool,
     /// Telegrams for which there was no memory.
     holes: usize,
@@ -31,6 +34,8 @@ struct OfSensor {
 struct Sent {
     bytes: Vec<u8>,
     span: (u64, u64),
+    /// Of which sensor.
+    exchanged: u32,
     is_whole: bool,
     is_read: bool,
     /// When the hub had all of it, if it has to be published.
@@ -63,6 +68,7 @@ impl Judge for NothingLost {
             Event::Exchanged { sensor } => {
                 let of = &mut self.sensors[sensor];
                 (of.streams_from, of.is_other) = (None, true);
+                of.exchanged += 1;
                 of.end(at);
             }
             Event::Closed { sensor } => self.sensors[sensor].end(at),
@@ -78,7 +84,7 @@ impl Judge for NothingLost {
                 let status: Status = bytemuck::pod_read_unaligned(&sample.bytes);
                 let of = &mut self.sensors[sensor];
                 if status.state() != Some(State::Streaming) {
-                    (of.streams_from, of.is_other) = (None, false);
+                    of.streams_from = None;
                     of.end(at);
                 } else if of.streams_from.is_none() && !of.is_other {
                     of.streams_from = Some(of.read);
@@ -102,7 +108,8 @@ impl OfSensor {
     fn send(&mut self, telegram: &Telegram<'_>) {
         let Telegram { bytes, span, damage, aborted } = *telegram;
         let is_whole = damage.is_none() && !aborted;
-        self.sent.push_back(Sent { bytes: bytes.to_vec(), span, is_whole, is_read: false, due_at: None });
+        let (bytes, exchanged) = (bytes.to_vec(), self.exchanged);
+        self.sent.push_back(Sent { bytes, span, exchanged, is_whole, is_read: false, due_at: None });
         while self.sent.len() > MOST && self.sent[0].due_at.is_none() {
             self.sent.pop_front();
         }
@@ -139,6 +146,7 @@ impl OfSensor {
         // Replies are often the same, and of those that are, the whole one came.
         let whole = self.sent.iter().position(|sent| sent.is_whole && is_it(sent));
         let found = whole.or_else(|| self.sent.iter().position(is_it))?;
+        self.is_other &= bytes[4] != MEASURED || self.sent[found].exchanged != self.exchanged;
         let passed = self.sent.drain(..=found).take(found);
         let lost: Vec<Sent> = passed.filter(|sent| sent.due_at.is_some()).collect();
         let (count, holes) = (lost.len(), self.holes);
