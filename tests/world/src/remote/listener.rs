@@ -63,15 +63,18 @@ impl Listener {
         self.next_at = Nanos::MAX;
         let wall = terms.stamp(now);
         loop {
+            let mut read = None;
             for _ in 0..TURN.min(self.queue.len()) {
                 let Some((came, bytes)) = self.queue.pop_front() else { break };
                 self.queued -= bytes.len();
                 self.take(shared, terms, came, &bytes, now);
+                read = Some(came);
             }
+            let read = read.filter(|_| !self.queue.is_empty()).unwrap_or(now);
             self.republisher.wake();
             if now >= self.look_at {
                 self.look_at = now + LOOKS;
-                self.republisher.look(wall);
+                self.republisher.look(wall, terms.stamp(read).monotonic_ns);
             }
             if self.queue.is_empty() {
                 return;
