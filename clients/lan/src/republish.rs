@@ -120,7 +120,7 @@ impl<S: TopicStore> Republisher<S> {
             }
             _ => Ok(None),
         };
-        self.publish(remote, now.monotonic_ns);
+        self.publish(remote);
         made
     }
 
@@ -129,12 +129,13 @@ impl<S: TopicStore> Republisher<S> {
         self.sensors.iter_mut().for_each(RemoteSensor::wake);
     }
 
-    /// What is due now and then: sensors that are silent, consumers that came or died.
-    pub fn look(&mut self, now: Stamp) {
+    /// What is due now and then: sensors that are silent, consumers that came or died. Everything that came until `read_ns` was
+    /// taken, by the clock of arrivals: of what still waits nobody is silent.
+    pub fn look(&mut self, now: Stamp, read_ns: u64) {
         let now_ns = now.monotonic_ns;
         if now_ns >= self.greet_ns {
             self.greet_ns = now_ns + GREET_EVERY_NS;
-            self.sensors.iter_mut().for_each(|sensor| sensor.look(now));
+            self.sensors.iter_mut().for_each(|sensor| sensor.look(now, read_ns));
         }
         if now_ns >= self.allow_ns {
             self.allow_ns = now_ns + ALLOW_EVERY_NS;
@@ -218,13 +219,13 @@ impl<S: TopicStore> Republisher<S> {
     }
 
     /// Publishes `remote`, if it can be.
-    fn publish(&mut self, remote: &Remote<'_>, now_ns: u64) {
+    fn publish(&mut self, remote: &Remote<'_>) {
         let head = &remote.datagram.head;
         let left_out = &mut self.left_out;
         if remote.late {
             left_out.late += 1;
         } else if let Some(sensor) = self.sensors.iter_mut().find(|sensor| sensor.is(head)) {
-            match sensor.publish(remote, now_ns) {
+            match sensor.publish(remote) {
                 true => {}
                 false if sensor.is_announced(remote.topic) => left_out.shortage += 1,
                 false => left_out.unannounced += 1,

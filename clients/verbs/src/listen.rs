@@ -90,6 +90,7 @@ pub fn listen(
         report: Report::new(options.json, Output::new(out), Output::new(notes), names),
         started: now,
         last_sample: now,
+        taken_ns: 0,
         draw_at: now,
         received: 0,
     };
@@ -109,6 +110,8 @@ struct Listener<'a> {
     report: Report<'a>,
     started: Instant,
     last_sample: Instant,
+    /// When the last datagram came that was taken, by the kernel: CLOCK_MONOTONIC in ns.
+    taken_ns: u64,
     draw_at: Instant,
     received: u64,
 }
@@ -161,7 +164,7 @@ impl Listener<'_> {
             if let Some(limit) = bounds.timeout.filter(|&limit| now - self.last_sample >= limit) {
                 return Err(nothing_came(limit).into());
             }
-            self.look(now)?;
+            self.look(now, more)?;
             if tell.swap(false, Ordering::Relaxed) {
                 self.tell()?;
             }
@@ -176,6 +179,7 @@ impl Listener<'_> {
         for _ in 0..TURN {
             let Some(caught) = self.receiver.receive(buffer)? else { return Ok(false) };
             let bytes = caught.bytes;
+            self.taken_ns = caught.arrival_ns;
             if !self.hubs.want(bytes) {
                 continue;
             }
@@ -264,14 +268,16 @@ impl Listener<'_> {
         self.report.trouble(what)
     }
 
-    /// What is due now and then.
-    fn look(&mut self, now: Instant) -> Result<(), End> {
+    /// What is due now and then; `more` may wait.
+    fn look(&mut self, now: Instant, more: bool) -> Result<(), End> {
         self.receiver.look(now);
         if let Some(what) = self.receiver.take_trouble() {
             self.trouble(&what)?;
         }
         if let Some(publication) = &mut self.publication {
-            publication.look(stamp::now());
+            let stamp = stamp::now();
+            let read_ns = if more { self.taken_ns } else { stamp.monotonic_ns };
+            publication.look(stamp, read_ns);
         }
         let so_far = self.crowding();
         if let Some(what) = self.crowd.look(so_far, now) {

@@ -1,4 +1,4 @@
-//! Defects that are built into the models around the hub on purpose, to see that the judges find them. None is in the hub's
+//! Defects that are built into the models around the hub and its network on purpose, to see that the judges find them. None is in the hub's
 //! own code, so that nothing has to be built twice. Refuses to know who notices.
 
 use std::cell::Cell;
@@ -34,11 +34,21 @@ pub enum Defect {
     Delayed,
     /// Now and then two samples come in the wrong order.
     Reordered,
+    /// Now and then a byte of a remote sample is another one.
+    RemoteAltered,
+    /// Now and then a listener takes one datagram twice.
+    RemoteCountedTwice,
+    /// A datagram has the time at which it was read, not that at which it came.
+    RemoteStampedLate,
+    /// A remote robot does not see that nothing comes.
+    RemoteSurvivingVerdict,
+    /// A gateway says only once who its sensors are.
+    Unannounced,
 }
 
 impl Defect {
     /// All of them.
-    pub const ALL: [Defect; 13] = [
+    pub const ALL: [Defect; 18] = [
         Defect::LostWake,
         Defect::LostByte,
         Defect::FlippedBit,
@@ -52,6 +62,11 @@ impl Defect {
         Defect::SwallowedHangUp,
         Defect::Delayed,
         Defect::Reordered,
+        Defect::RemoteAltered,
+        Defect::RemoteCountedTwice,
+        Defect::RemoteStampedLate,
+        Defect::RemoteSurvivingVerdict,
+        Defect::Unannounced,
     ];
 }
 

@@ -14,6 +14,11 @@ fn judge(defect: Defect) -> &'static [&'static str] {
         Defect::Renumbered => &["numbers"],
         Defect::EepromWrite => &["eeprom"],
         Defect::SwallowedHangUp => &["liveness"],
+        Defect::RemoteAltered => &["remote_nothing_invented"],
+        Defect::RemoteCountedTwice => &["remote_accounts"],
+        Defect::RemoteStampedLate => &["remote_numbers"],
+        Defect::RemoteSurvivingVerdict => &["remote_verdict"],
+        Defect::Unannounced => &["remote_liveness"],
     }
 }
 

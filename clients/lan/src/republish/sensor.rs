@@ -27,7 +27,7 @@ pub(super) struct RemoteSensor<T: SensorTopics> {
     last: Option<(Status, Header)>,
     /// The header of the last zones.
     zoned: Option<Header>,
-    /// CLOCK_MONOTONIC in ns.
+    /// When the last sample came: CLOCK_MONOTONIC in ns.
     heard_ns: Option<u64>,
     /// Why consumers are to be woken.
     news: Option<Wake>,
@@ -111,10 +111,10 @@ impl<T: SensorTopics> RemoteSensor<T> {
         self.source.is_some_and(|source| (source.0, source.1) == (hub, epoch))
     }
 
-    /// Publishes `remote` at `now_ns`; `false` if it has no such topic. A payload cannot fail to be read: the account has
+    /// Publishes `remote`; `false` if it has no such topic. A payload cannot fail to be read: the account has
     /// checked it.
-    pub(super) fn publish(&mut self, remote: &Remote<'_>, now_ns: u64) -> bool {
-        self.heard_ns = Some(now_ns);
+    pub(super) fn publish(&mut self, remote: &Remote<'_>) -> bool {
+        self.heard_ns = Some(remote.arrival_ns);
         self.standing.take(Arrival { delivers: true, now_ns: remote.arrival_ns });
         let topic = remote.topic;
         let Some(stream) = &mut self.streams[topic as usize] else { return false };
@@ -145,8 +145,8 @@ impl<T: SensorTopics> RemoteSensor<T> {
 
     /// Says that the sensor is silent, once per silence, and gives late joiners what they would else get with the next
     /// sample.
-    pub(super) fn look(&mut self, now: Stamp) {
-        if self.heard_ns.is_some_and(|at_ns| now.monotonic_ns.saturating_sub(at_ns) >= SILENT_AFTER_NS) {
+    pub(super) fn look(&mut self, now: Stamp, read_ns: u64) {
+        if self.heard_ns.is_some_and(|at_ns| read_ns.saturating_sub(at_ns) >= SILENT_AFTER_NS) {
             self.heard_ns = None;
             self.silent(now);
             self.wake();

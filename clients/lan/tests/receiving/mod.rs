@@ -112,7 +112,7 @@ impl Receiving {
             self.republisher.wake();
             if now >= self.look_at {
                 self.look_at = now + LOOK_EVERY_NS;
-                self.republisher.look(wall);
+                self.republisher.look(wall, wall.monotonic_ns);
             }
         }
         self.follow(now, seen);

@@ -27,7 +27,7 @@ pub(crate) struct RemoteNothingInvented {
     epoch: u32,
     /// Epoch and sensor of the announcements that the listener took: before it nobody knows whose samples are.
     named: HashSet<(u32, u8)>,
-    /// When the listener last took a sample of each sensor that it knew and that was not late.
+    /// When the last sample of each sensor came that the listener took, knew and did not find late.
     heard_at: BTreeMap<usize, Nanos>,
     packet: Packet,
     /// What everybody may say.
@@ -71,7 +71,7 @@ impl Judge for RemoteNothingInvented {
                 self.named.clear();
                 self.heard_at.clear();
             }
-            Event::Arrived { datagram, bytes, outcome, .. } => {
+            Event::Arrived { came, datagram, bytes, outcome } => {
                 let sent = datagram.and_then(|datagram| self.sent.get(&place(datagram)).copied());
                 let is_sent = sent == Some(hash(bytes));
                 match (outcome, datagram) {
@@ -89,7 +89,7 @@ impl Judge for RemoteNothingInvented {
                         match outcome {
                             Arrival::Announced => _ = self.named.insert(life),
                             Arrival::Sample { late: false } if self.named.contains(&life) => {
-                                self.heard_at.insert(head.sensor.into(), at);
+                                self.heard_at.insert(head.sensor.into(), came);
                             }
                             _ => {}
                         }

@@ -14,6 +14,7 @@ use super::{Terms, WAKES};
 use crate::consumer::Number;
 use crate::event::Event;
 use crate::network::Network;
+use crate::planted::Defect;
 use crate::setup::Setup;
 use crate::shared::Shared;
 use crate::topics::Sample;
@@ -108,7 +109,9 @@ impl Gateway {
             if let Some(every) = self.repeat {
                 self.outgoing.repeat(every, stamp, uplink);
             }
-            self.announce(shared, now, uplink);
+            if !shared.planted.is(Defect::Unannounced) {
+                self.announce(shared, now, uplink);
+            }
         }
     }
 

@@ -13,6 +13,7 @@ use super::robot::GATEWAY;
 use super::topics::Memory;
 use super::{LOOKS, Terms, WAKES};
 use crate::event::{Arrival, Event};
+use crate::planted::Defect;
 use crate::shared::Shared;
 
 /// The listener.
@@ -62,15 +63,18 @@ impl Listener {
         self.next_at = Nanos::MAX;
         let wall = terms.stamp(now);
         loop {
+            let mut read = None;
             for _ in 0..TURN.min(self.queue.len()) {
                 let Some((came, bytes)) = self.queue.pop_front() else { break };
                 self.queued -= bytes.len();
                 self.take(shared, terms, came, &bytes, now);
+                read = Some(came);
             }
+            let read = read.filter(|_| !self.queue.is_empty()).unwrap_or(now);
             self.republisher.wake();
             if now >= self.look_at {
                 self.look_at = now + LOOKS;
-                self.republisher.look(wall);
+                self.republisher.look(wall, terms.stamp(read).monotonic_ns);
             }
             if self.queue.is_empty() {
                 return;
@@ -80,7 +84,11 @@ impl Listener {
 
     fn take(&mut self, shared: &Shared, terms: &Terms, came: Nanos, bytes: &[u8], now: Nanos) {
         let wall = terms.stamp(now);
-        let arrived = self.incoming.receive(bytes, 1, terms.stamp(came));
+        if shared.planted.strikes(Defect::RemoteCountedTwice, 100) {
+            self.incoming.receive(bytes, 1, terms.stamp(came));
+        }
+        let stamped = if shared.planted.is(Defect::RemoteStampedLate) { now } else { came };
+        let arrived = self.incoming.receive(bytes, 1, terms.stamp(stamped));
         let outcome = match &arrived {
             Arrived::Refused { why, .. } => Arrival::Refused(*why),
             Arrived::Known => Arrival::Known,

@@ -9,6 +9,7 @@ use schema::{Topic, Verdict, Zones};
 use super::Terms;
 use super::topics::{Memory, Published};
 use crate::event::Event;
+use crate::planted::Defect;
 use crate::setup::Setup;
 use crate::shared::Shared;
 
@@ -41,7 +42,10 @@ impl RemoteRobot {
     pub(super) fn run(&mut self, shared: &Shared, terms: &Terms, memory: &Memory, now: Nanos) {
         let moment = terms.moment(now);
         for (sensor, (name, state, believed)) in self.sensors.iter_mut().enumerate() {
-            for Published { topic, header, payload } in memory.take(name) {
+            for Published { topic, header, mut payload } in memory.take(name) {
+                if shared.planted.strikes(Defect::RemoteAltered, 100) {
+                    payload[0] ^= 1;
+                }
                 let republished = Event::Republished { sensor, topic, header: &header, payload: &payload };
                 shared.log.tell(now, &republished);
                 let mut zones = Zones::default();
@@ -50,7 +54,9 @@ impl RemoteRobot {
                     believe(shared, now, sensor, believed, &self.robot);
                 }
             }
-            if let Some(silence) = state.silence(moment) {
+            if let Some(silence) = state.silence(moment)
+                && !shared.planted.is(Defect::RemoteSurvivingVerdict)
+            {
                 self.robot.hear(sensor, silence.zones);
                 believe(shared, now, sensor, believed, &self.robot);
             }
