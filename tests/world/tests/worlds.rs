@@ -28,13 +28,14 @@ fn the_hash_of_a_world_is_known() {
     assert_eq!(run(&plan, Detail::Nothing).hash, 0x8b1e_98d0_4a9e_b435);
 }
 
+/// The first of those that `.ci/run` has.
 #[test]
-fn two_hundred_worlds_are_well() {
-    let plans = (0..200).map(|seed| Plan::of_seed(seed, 60)).collect();
-    let runner = Runner { plans, twice: 10, threads: 2 };
+fn worlds_are_well() {
+    let plans = (0..40).map(|seed| Plan::of_seed(seed, 60)).collect();
+    let runner = Runner { plans, twice: 0, threads: 2 };
     let totals = runner.run(&std::sync::atomic::AtomicBool::new(false), |_| ());
     for (plan, outcome, is_same) in &totals.failed {
         println!("the same twice: {is_same}; {:#?}\n{plan}", outcome.violations);
     }
-    assert_eq!((totals.worlds, totals.failed.len()), (200, 0));
+    assert_eq!((totals.worlds, totals.failed.len()), (40, 0));
 }
