@@ -27,6 +27,8 @@ struct OfSensor {
     /// is met only after a silence.
     exchanged: u32,
     is_other: bool,
+    /// Until when something of the sensor before this one may still be on the line.
+    mixed_until: Nanos,
     /// Telegrams for which there was no memory.
     holes: usize,
 }
@@ -69,6 +71,7 @@ impl Judge for NothingLost {
                 let of = &mut self.sensors[sensor];
                 (of.streams_from, of.is_other) = (None, true);
                 of.exchanged += 1;
+                of.mixed_until = at + HELD_BACK;
                 of.end(at);
             }
             Event::Closed { sensor } => self.sensors[sensor].end(at),
@@ -76,7 +79,7 @@ impl Judge for NothingLost {
             Event::Read { sensor, to, .. } => self.sensors[sensor].read(at, to),
             Event::Lacking { sensor, topic: Topic::Telegram } => self.sensors[sensor].holes += 1,
             Event::Published { sensor, sample } if sample.topic == Topic::Telegram => {
-                if let Some(lost) = self.sensors[sensor].publish(&sample.bytes) {
+                if let Some(lost) = self.sensors[sensor].publish(at, &sample.bytes) {
                     say.broken(format!("sensor {sensor}: {lost}"));
                 }
             }
@@ -141,12 +144,13 @@ impl OfSensor {
     }
 
     /// A telegram is published. What was lost before it.
-    fn publish(&mut self, bytes: &[u8]) -> Option<String> {
+    fn publish(&mut self, at: Nanos, bytes: &[u8]) -> Option<String> {
         let is_it = |sent: &Sent| sent.is_read && sent.bytes == bytes;
         // Replies are often the same, and of those that are, the whole one came.
         let whole = self.sent.iter().position(|sent| sent.is_whole && is_it(sent));
         let found = whole.or_else(|| self.sent.iter().position(is_it))?;
-        self.is_other &= bytes[4] != MEASURED || self.sent[found].exchanged != self.exchanged;
+        let is_of_this = bytes[4] == MEASURED && self.sent[found].exchanged == self.exchanged;
+        self.is_other &= !is_of_this || at < self.mixed_until;
         let passed = self.sent.drain(..=found).take(found);
         let lost: Vec<Sent> = passed.filter(|sent| sent.due_at.is_some()).collect();
         let (count, holes) = (lost.len(), self.holes);
@@ -160,5 +164,7 @@ impl OfSensor {
 
 /// A telegram is held back no longer than so.
 const HELD: Nanos = 100 * MILLIS;
+/// A line holds bytes back for no longer than so (action `silence`).
+const HELD_BACK: Nanos = 4_000 * MILLIS;
 /// So many that were never due are remembered.
 const MOST: usize = 64;
