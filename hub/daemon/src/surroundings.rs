@@ -1,5 +1,5 @@
 //! What a link asks of its surroundings: the time, a line to its sensor, topics for its results, files that outlive it.
-//! Nothing here decides anything: [`System`](crate::system::System) is this machine, and a simulation brings another one, so
+//! Nothing here decides anything: `system.rs` is this machine, and a simulation brings another one, so
 //! that the same hub runs in made-up time. Refuses to know what is read and published.
 
 use std::io;

@@ -32,7 +32,7 @@ pub struct Action {
 
 impl Plan {
     /// What `seed` draws for `seconds`: of the kinds of action about half (swarm testing: many faults hide each other), each
-    /// of the others some times, and nothing in the last [`REST`].
+    /// of the others some times, and nothing in the last eight seconds.
     pub fn of_seed(seed: u64, seconds: u64) -> Plan {
         let mut random = fastrand::Rng::with_seed(seed ^ 0x5EED_0F1A_C710_0000);
         let end_ms = (seconds * 1_000).saturating_sub(REST / MILLIS);
@@ -53,7 +53,7 @@ impl Plan {
         Plan { seed, seconds, actions }
     }
 
-    /// When everything is made well again: what is to be seen then has [`REST`].
+    /// When everything is made well again: what is to be seen then has eight seconds.
     pub fn heals_at(&self) -> Nanos {
         (self.seconds * 1_000 * MILLIS).saturating_sub(REST)
     }
