@@ -26,7 +26,12 @@ pub(super) struct Stage {
     /// What users ask of sensors.
     asked: Vec<Program>,
     edition: u64,
+    /// When a consumer was killed last.
+    killed_at: Option<Instant>,
 }
+
+/// A hub looks every five seconds what killed consumers left; one that ends earlier leaves it to the next.
+const UPKEEP: Duration = Duration::from_secs(9);
 
 /// What follows from an action.
 type Later = Box<dyn FnOnce(&mut Stage)>;
@@ -46,6 +51,7 @@ impl Stage {
             guests: Vec::new(),
             asked: Vec::new(),
             edition: 0,
+            killed_at: None,
         };
         stage.start_hub();
         stage.telegrams = SENSORS.map(|name| stage.env.echo(&[&format!("{name}/telegram")])).into();
@@ -163,6 +169,9 @@ impl Stage {
                 let guest = stage.guests.swap_remove(at);
                 guest.signal(Signal::CONT);
                 let outcome = guest.end(signal);
+                if signal == KILL {
+                    stage.killed_at = Some(Instant::now());
+                }
                 // One that just began may not have got so far as to end in order.
                 assert!(matches!(outcome.code, None | Some(0)), "{outcome}");
             }
@@ -215,6 +224,9 @@ impl Stage {
         }
         let infos = SENSORS.map(|name| self.env.info(name));
         let outcomes: Vec<_> = self.telegrams.drain(..).map(|consumer| consumer.end(INT)).collect();
+        if let Some(killed_at) = self.killed_at {
+            std::thread::sleep(UPKEEP.saturating_sub(killed_at.elapsed()));
+        }
         let hub = self.hub.take().expect("a hub lives").end(TERM);
         assert_eq!(hub.code, Some(0), "{hub}");
         assert_eq!(self.env.left_behind(), Vec::<std::path::PathBuf>::new());
