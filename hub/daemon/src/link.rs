@@ -72,6 +72,11 @@ impl<'a, S: Surroundings> LinkCore<'a, S> {
         self.stats.close(session);
     }
 
+    /// Whether the other end is a recording, to which nobody talks.
+    pub(crate) fn is_recording(&self) -> bool {
+        matches!(self.link.port, Source::File { .. })
+    }
+
     /// How a session with this link's sensor goes, or with a recording of one to which nobody talks.
     pub(crate) fn settings(&self, listen_only: bool) -> Settings {
         let fixed_rate = matches!(self.link.port, Source::Tcp { .. });
@@ -80,8 +85,8 @@ impl<'a, S: Surroundings> LinkCore<'a, S> {
 
     /// What is known beside the sensor: nothing of one that can be asked.
     pub(crate) fn recorded(&self) -> RecordedContext {
-        let is_recording = matches!(self.link.port, Source::File { .. });
-        RecordedContext { mode: self.link.mode.filter(|_| is_recording), ..RecordedContext::default() }
+        let mode = self.link.mode.filter(|_| self.is_recording());
+        RecordedContext { mode, ..RecordedContext::default() }
     }
 
     /// Publishes `received` and what is made of it, and wakes the consumers. For how long the verdict on its scan stands,

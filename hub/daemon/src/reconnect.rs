@@ -155,8 +155,7 @@ impl<'a, S: Surroundings> LiveLink<'a, S> {
         let now = core.around.now();
         core.around.keep(&core.link.name, &line);
         core.output.topics.set_flags(if line.is_simulated() { Flags::SIMULATED } else { 0 });
-        let is_recording = matches!(core.link.port, Source::File { .. });
-        let mut session = Session::new(core.settings(is_recording), now);
+        let mut session = Session::new(core.settings(core.is_recording()), now);
         if let Some(known) = known {
             session.recall(known);
         }

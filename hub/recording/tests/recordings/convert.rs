@@ -2,11 +2,11 @@
 //! nothing behind.
 
 use std::fs;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 use std::sync::atomic::AtomicBool;
 
 use crate::folder::{Folder, converted};
-use crate::skip::skip;
+use crate::real;
 use lms::measured;
 use lms::reply;
 use lms::variant::{Mode, Unit};
@@ -128,14 +128,7 @@ fn a_stream_gets_times_and_loses_none_of_its_telegrams() {
 
 #[test]
 fn a_stream_of_a_real_sensor_comes_back() {
-    let data = std::env::var_os("SCANHUB_DATA").map_or_else(
-        || PathBuf::from(concat!(env!("CARGO_MANIFEST_DIR"), "/../../../shared/data")),
-        PathBuf::from,
-    );
-    if !data.is_dir() {
-        skip("recordings", format!("none at {}", data.display()));
-        return;
-    }
+    let Some(data) = real::recordings() else { return };
     let folder = Folder::new("real");
     let capture = data.join("captures/lms200_38400.bin");
     let (mcap, again) = (folder.0.join("capture.mcap"), folder.0.join("capture.bin"));

@@ -4,7 +4,7 @@ use std::fs;
 use std::io::{Read, Write};
 use std::path::PathBuf;
 
-use crate::skip::skip;
+use crate::real;
 use flate2::Compression;
 use flate2::write::GzEncoder;
 use lms::command::Request;
@@ -159,14 +159,7 @@ fn a_log_with_harmed_lines_gives_the_others() {
 
 #[test]
 fn recordings_of_real_sensors() {
-    let data = std::env::var_os("SCANHUB_DATA").map_or_else(
-        || PathBuf::from(concat!(env!("CARGO_MANIFEST_DIR"), "/../../../shared/data")),
-        PathBuf::from,
-    );
-    if !data.is_dir() {
-        skip("recordings", format!("none at {}", data.display()));
-        return;
-    }
+    let Some(data) = real::recordings() else { return };
     let capture = Recording::open(data.join("captures/lms200_38400.bin")).unwrap();
     assert_eq!((capture.contents().telegrams, capture.contents().scans), (427, 354));
     assert_eq!((capture.contents().unit, capture.contents().mode), (Some(Unit::Mm), Some(Mode(4))));

@@ -3,10 +3,10 @@
 
 use std::fs;
 use std::io::Read;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
 use crate::folder::{Folder, converted};
-use crate::skip::skip;
+use crate::real;
 use lms::measured;
 use lms::reply;
 use lms::variant::{Mode, Unit};
@@ -191,14 +191,7 @@ fn a_log_in_an_mcap_file_says_how_long_each_scan_stands() {
 
 #[test]
 fn logs_of_real_sensors_come_back() {
-    let data = std::env::var_os("SCANHUB_DATA").map_or_else(
-        || PathBuf::from(concat!(env!("CARGO_MANIFEST_DIR"), "/../../../shared/data")),
-        PathBuf::from,
-    );
-    if !data.is_dir() {
-        skip("recordings", format!("none at {}", data.display()));
-        return;
-    }
+    let Some(data) = real::recordings() else { return };
     let folder = Folder::new("real-logs");
     for name in ["aces", "freiburg-079", "intel", "orebro"] {
         assert_comes_back(&folder, name, &data.join(format!("carmen/{name}-corrected.log.gz")));

@@ -18,3 +18,4 @@ mod hostile;
 mod logs;
 #[cfg(feature = "mcap")]
 mod mcap;
+mod real;
