@@ -11,6 +11,7 @@ pub(crate) struct Arrivals {
     reads: [Read; Arrivals::CAPACITY],
     next: usize,
     total: u64,
+    /// When the line was last seen to bring something: one that holds its bytes back looks empty.
     last_look: Nanos,
     /// What waited while the host did not look.
     backlog: Option<Backlog>,
@@ -23,13 +24,13 @@ struct Read {
     backlog: Option<Backlog>,
 }
 
-/// Bytes that came while the host did not run. Their age is not known; but the line's buffer keeps the oldest ones, so
+/// Bytes that came while the host did not run, or that the line held back. Their age is not known; but the line's buffer keeps the oldest ones, so
 /// they arrived at the speed of the line, starting at the last read.
 #[derive(Clone, Copy, Debug)]
 struct Backlog {
     /// Number of its first byte.
     begin: u64,
-    /// The last look before it.
+    /// The last look before it that found something.
     since: Nanos,
     /// The last read that brought more than can have come since the one before it, and the bytes read after it.
     hurried: Nanos,
@@ -58,7 +59,10 @@ impl Arrivals {
 
     /// A read at `now` brought `len` bytes, of a line of `pace` bits per second if it was one.
     pub(crate) fn note(&mut self, now: Nanos, len: usize, pace: Option<u32>) {
-        let since = core::mem::replace(&mut self.last_look, now);
+        let since = self.last_look;
+        if len > 0 {
+            self.last_look = now;
+        }
         if len > BYTES_PER_TURN && now.saturating_sub(since) > LATE {
             self.backlog = pace.map(|_| Backlog { begin: self.total, since, hurried: now, read_since: 0 });
         } else if let (Some(backlog), Some(baud)) = (&mut self.backlog, pace) {
@@ -181,7 +185,7 @@ impl Rhythm {
 
 /// More bytes than so behind a stamped one in the same read make the stamp an estimate: an adapter's chunk of 62.
 const ESTIMATED: usize = 64;
-/// A host that did not look for so long, beyond any rest at the highest rate, was stopped or starved.
+/// A host that found nothing for so long, beyond any rest at the highest rate, was stopped or starved, or the line was.
 const LATE: Nanos = 50 * MILLIS;
 /// A line that brings no more than it can for so long has no backlog any more: less than a telegram takes, more than the
 /// kernel needs to move what it kept from one buffer to the next.
@@ -255,6 +259,15 @@ mod tests {
         arrivals.note(5_762 * MILLIS, 730, Some(9600));
         let stamp = arrivals.stamp(8_110 + 729, 9600);
         assert!(stamp.at > 5_760 * MILLIS && !stamp.estimated, "{stamp:?}");
+    }
+
+    #[test]
+    fn what_a_line_held_back_is_not_new_though_the_host_looked() {
+        let mut arrivals = Arrivals::new(0);
+        arrivals.note(1_000 * MILLIS, 16, Some(500_000));
+        arrivals.note(1_500 * MILLIS, 0, Some(500_000));
+        arrivals.note(1_850 * MILLIS, 16_000, Some(500_000));
+        assert_eq!(seen(&arrivals, 16), (1_000 * MILLIS + 20_000, true));
     }
 
     #[test]
