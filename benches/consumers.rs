@@ -26,7 +26,7 @@ fn main() -> ExitCode {
 fn measure(options: &Options) -> Outcome<()> {
     let stage = Stage::new()?;
     let _simulator = stage.simulate(&[SENSOR], 500_000)?;
-    let hub = stage.hub(&[SENSOR])?;
+    let hub = stage.hub_for_crowd(&[SENSOR])?;
     hub.await_line("ready", PATIENCE)?;
     let mut figures = crowd(&stage, &hub, options.count(100), options.seconds(20))?;
     figures.extend(kills(&stage, &hub)?);

@@ -127,4 +127,4 @@ const STARTS: [(u32, &str, &str); 4] = [
 ];
 const ONE: [&str; 1] = ["front"];
 /// 180 degrees in halves: two turns of the mirror.
-const NOMINAL_HZ: f64 = 1e9 / (2.0 * schema::TURN_NS as f64);
+const NOMINAL_HZ: f64 = 1e9 / (2.0 * lms::variant::MIRROR_TURN as f64);

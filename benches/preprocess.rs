@@ -18,13 +18,15 @@ use schema::{Foreground, Marks, Pose, Scan, Zones};
 use sim::room::Room;
 
 const POSE: Pose = Pose { x_m: 0.3, y_m: -0.1, yaw_rad: 0.2, upside_down: 0, reserved: [0; 7] };
+/// Of each scan.
+const BEAMS: usize = 361;
 /// Somebody walks through the room, and its background has been learned.
 const FIRST: u64 = 800;
 /// Scans that take turns.
 const COUNT: u64 = 64;
 
 /// Scans of a world from the first one.
-fn scans(world: &str, count: u64) -> Vec<Scan> {
+fn scans(world: &str, count: u64) -> Vec<Box<Scan>> {
     let room = Room::new(&world.parse().expect("a world that the program brings along"), 1);
     let scan = |number| {
         let end_ns = number * Variant::HALF.turns() * MIRROR_TURN;
@@ -34,15 +36,15 @@ fn scans(world: &str, count: u64) -> Vec<Scan> {
 }
 
 /// A model that has learned from what came before, and the scans that come then.
-fn model(method: Method, scans: &[Scan]) -> (Model, &[Scan]) {
-    let mut model = Model::new(background::Settings { method, ..background::Settings::default() });
+fn model(method: Method, scans: &[Box<Scan>]) -> (Model, &[Box<Scan>]) {
+    let mut model = Model::new(background::Settings { method, ..background::Settings::default() }, BEAMS);
     let (past, present) = scans.split_at(FIRST as usize);
-    past.iter().for_each(|scan| model.update(scan, &mut Foreground::default()));
+    past.iter().for_each(|scan| model.update(scan, &mut Foreground::of(BEAMS)));
     (model, present)
 }
 
 /// Times `update` over `scans` in turn.
-fn bench(c: &mut Criterion, name: &str, scans: &[Scan], mut update: impl FnMut(&Scan)) {
+fn bench(c: &mut Criterion, name: &str, scans: &[Box<Scan>], mut update: impl FnMut(&Scan)) {
     let mut next = scans.iter().cycle();
     c.bench_function(name, |b| b.iter(|| update(black_box(next.next().expect("a cycle")))));
 }
@@ -56,7 +58,8 @@ fn check(c: &mut Criterion) {
         ("zones, 8 circles, off the centre", POSE, &eight),
     ];
     for (name, pose, radii_mm) in cases {
-        let mut check = zones::Check::new(pose, &zones::Settings { radii_mm, ..zones::Settings::default() });
+        let settings = zones::Settings { radii_mm, ..zones::Settings::default() };
+        let mut check = zones::Check::new(pose, &settings, BEAMS);
         let mut out = Zones::default();
         bench(c, name, &scans, |scan| check.update(scan, black_box(&mut out)));
     }
@@ -74,13 +77,13 @@ fn learn(c: &mut Criterion) {
     let scans = scans("fig8", FIRST + COUNT);
     for (name, method) in [("background, paper", Method::Paper), ("background, multi", Method::Multi)] {
         let (mut model, scans) = model(method, &scans);
-        let mut out = Foreground::default();
+        let mut out = Foreground::of(BEAMS);
         bench(c, name, scans, |scan| model.update(scan, black_box(&mut out)));
     }
     let (mut model, scans) = model(Method::Multi, &scans);
-    let mut cutter = Segmenter::new(POSE);
+    let mut cutter = Segmenter::new(POSE, BEAMS);
     // What stands before the background is found once, and cut again and again.
-    let mut foreground = Foreground::default();
+    let mut foreground = Foreground::of(BEAMS);
     model.update(&scans[0], &mut foreground);
     bench(c, "segments", &scans[..1], |scan| cutter.update(scan, black_box(&mut foreground)));
 }
@@ -93,12 +96,12 @@ fn all(c: &mut Criterion) {
         ("zones, marks, background multi, segments", Method::Multi, true),
     ];
     for (name, method, with_segments) in cases {
-        let mut check = zones::Check::new(POSE, &zones::Settings::default());
+        let mut check = zones::Check::new(POSE, &zones::Settings::default(), BEAMS);
         let mut finder = marks::MarkDetector::new(marks::Settings::default());
         let (mut model, scans) = model(method, &scans);
-        let mut cutter = Segmenter::new(POSE);
+        let mut cutter = Segmenter::new(POSE, BEAMS);
         let (mut zones, mut marks) = (Zones::default(), Marks::default());
-        let mut foreground = Foreground::default();
+        let mut foreground = Foreground::of(BEAMS);
         bench(c, name, scans, |scan| {
             check.update(scan, black_box(&mut zones));
             finder.update(scan, black_box(&mut marks));

@@ -12,7 +12,7 @@ use lms::header::Expect;
 use lms::measured::{self, Measured};
 use lms::telegram::Telegram;
 use lms::variant::{Mode, Unit};
-use schema::Scan;
+use schema::{Contents, Scan};
 use std::hint::black_box;
 
 /// Lengths of the reads for one telegram: as the hub reads, late on purpose, and as a UART hands bytes over.
@@ -69,7 +69,7 @@ fn framing(c: &mut Criterion) {
 fn decoding(c: &mut Criterion) {
     let telegrams = telegrams();
     let telegram = Telegram::check(&telegrams[0]).expect("a telegram");
-    let mut scan = Scan::default();
+    let mut scan = Scan::zeroed(Scan::len(361, Contents::UPPER));
     c.bench_function("decode of 361 beams", |b| {
         b.iter(|| {
             let measured = Measured::decode(black_box(telegram)).expect("a scan");

@@ -18,7 +18,7 @@ use criterion::{BenchmarkId, Criterion, criterion_group, criterion_main};
 use rustix::time::{ClockId, clock_gettime};
 use schema::datagram::{Datagram, HEAD, Head, MTU_ETHERNET, Packed};
 use schema::ipc::{self, Bell, Node, Payload};
-use schema::{Foreground, Marks, Scan, Topic, Zones};
+use schema::{Foreground, Marks, Ring, Scan, Topic, Zones};
 use source::{SENSOR, Source};
 use support::stage::{PATIENCE, Stage};
 use support::{Outcome, clock};
@@ -109,7 +109,7 @@ fn follow(node: &Node, rest: Rest, crowd: &Crowd) -> Outcome<()> {
     };
     crowd.ready.fetch_add(1, Ordering::Release);
     while !crowd.is_over.load(Ordering::Acquire) {
-        let rung = bell.rung();
+        let rung = bell.rung(Ring::First);
         if let Some(listener) = &listener {
             ipc::take_wakeups(&[listener])?;
         }
@@ -118,7 +118,7 @@ fn follow(node: &Node, rest: Rest, crowd: &Crowd) -> Outcome<()> {
         }
         match &listener {
             Some(listener) => ipc::sleep(&[listener], LOOK)?,
-            None => ipc::sleep_at_bells(&[(&bell, rung)], clock::now() + LOOK.as_nanos() as u64)
+            None => ipc::sleep_at_bells(&[(&bell, Ring::First, rung)], clock::now() + LOOK.as_nanos() as u64)
                 .map_err(|_| "no bells on this system")?,
         }
     }
@@ -145,31 +145,34 @@ fn processor_time() -> Duration {
 
 fn datagram(c: &mut Criterion) {
     let mut group = c.benchmark_group("datagram");
-    payload(&mut group, Topic::Scan, source::scan());
-    payload(&mut group, Topic::Zones, Zones::unknown());
-    payload(&mut group, Topic::Marks, Marks::default());
-    payload(&mut group, Topic::Foreground, Foreground::default());
+    payload(&mut group, Topic::Scan, &*source::scan());
+    payload(&mut group, Topic::Zones, &Zones::unknown());
+    payload(&mut group, Topic::Marks, &Marks::default());
+    payload(&mut group, Topic::Foreground, &*Foreground::of(361));
     group.finish();
 }
 
 type Group<'a> = criterion::BenchmarkGroup<'a, criterion::measurement::WallTime>;
 
-fn payload<P: Packed + Default>(group: &mut Group<'_>, topic: Topic, sent: P) {
+fn payload<P: Packed + ?Sized>(group: &mut Group<'_>, topic: Topic, sent: &P)
+where
+    Box<P>: Default,
+{
     let head = Head { topic: topic.number(), revision: 1, ..Head::default() };
     let mut buffer = [0; MTU_ETHERNET];
     group.bench_function(format!("{}, pack and seal", topic.name()), |b| {
         b.iter(|| {
-            let len = black_box(&sent).pack(&mut buffer[HEAD..]).expect("fits");
+            let len = black_box(sent).pack(&mut buffer[HEAD..]).expect("fits");
             black_box(head.seal(&mut buffer, len).expect("fits"));
         });
     });
     let len = sent.pack(&mut buffer[HEAD..]).expect("fits");
     let sealed = head.seal(&mut buffer, len).expect("fits").to_vec();
-    let mut received = P::default();
+    let mut received = Box::default();
     group.bench_function(format!("{}, read, check and unpack", topic.name()), |b| {
         b.iter(|| {
             let datagram = Datagram::read(black_box(&sealed)).expect("is whole");
-            assert!(received.unpack(datagram.payload));
+            assert!(P::unpack_into(&mut received, datagram.payload));
             black_box(&mut received);
         });
     });

@@ -13,6 +13,7 @@ use lms::telegram::Telegram;
 use lms::variant::{Mode, Unit};
 use preprocess::{background, marks, segments, zones};
 use recording::{Encoding, Frame, Recording};
+use schema::limits::TopicLimits;
 use schema::{Background, Foreground, Mark, Marks, Pose, Scan, Verdict, Zones};
 
 fn main() -> ExitCode {
@@ -65,12 +66,15 @@ fn run(path: &Path, fallback: Mode) -> Result<Account, Box<dyn std::error::Error
     let recording = Recording::open(path)?;
     let unit = recording.contents().unit.unwrap_or(Unit::Mm);
     let mode = recording.contents().mode.unwrap_or(fallback);
-    let mut zones = zones::Check::new(Pose::default(), &zones::Settings::default());
+    let TopicLimits { beams, contents, .. } = TopicLimits::default();
+    let mut zones = zones::Check::new(Pose::default(), &zones::Settings::default(), beams);
     let mut marks = marks::MarkDetector::new(marks::Settings::default());
-    let mut model = background::Model::new(background::Settings::default());
-    let mut cutter = segments::Segmenter::new(Pose::default());
-    let (mut scan, mut found, mut near) = (Scan::default(), Marks::default(), Zones::default());
-    let (mut foreground, mut shown) = (Foreground::default(), Background::default());
+    let mut model = background::Model::new(background::Settings::default(), beams);
+    let mut cutter = segments::Segmenter::new(Pose::default(), beams);
+    let mut scan = Scan::zeroed(Scan::len(beams, contents));
+    let (mut found, mut near) = (Marks::default(), Zones::default());
+    let mut foreground = Foreground::of(beams);
+    let mut shown = Background::zeroed(Background::len(beams));
     let mut account = Account::default();
     for frame in recording.telegrams(Encoding { unit, mode })?.filter(Frame::is_scan) {
         let telegram = Telegram::check(&frame.telegram).ok_or("a telegram with a wrong CRC")?;

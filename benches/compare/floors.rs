@@ -13,7 +13,7 @@ use rustix::net::{
     SendFlags, recvmsg, sendmsg,
 };
 use schema::ipc::{self, Bell, Node, Waker};
-use schema::{Domain, Environment, HubLock, Wake};
+use schema::{Domain, Environment, HubLock, Ring, Wake};
 
 use super::message::Label;
 use super::receiver::Inlet;
@@ -50,7 +50,8 @@ impl Outlet for Word {
     }
 
     fn send(&mut self) -> Outcome<()> {
-        Ok(self.waker.wake(Wake::Telegram)?)
+        self.waker.ring(Ring::First);
+        Ok(self.waker.tell(Wake::Telegram)?)
     }
 }
 
@@ -67,7 +68,7 @@ impl WordInlet {
     pub(crate) fn new(task: &Task) -> Outcome<WordInlet> {
         let node = ipc::client_node(&Domain::of_hub(task.domain, None, &Environment::of_process())?)?;
         let bell = Bell::open(&node, SENSOR)?.ok_or("no bell")?;
-        let rung = bell.rung();
+        let rung = bell.rung(Ring::First);
         Ok(WordInlet {
             bell,
             rung,
@@ -81,7 +82,7 @@ impl WordInlet {
 impl Inlet for WordInlet {
     fn next(&mut self) -> Outcome<Label> {
         while !self.counted.is_waiting() {
-            let rung = self.bell.rung();
+            let rung = self.bell.rung(Ring::First);
             if rung != self.rung {
                 self.counted.add(u64::from(rung.wrapping_sub(self.rung)));
                 self.rung = rung;
@@ -89,7 +90,8 @@ impl Inlet for WordInlet {
                 std::hint::spin_loop();
             } else {
                 let until = clock::now() + LONG_NS;
-                ipc::sleep_at_bells(&[(&self.bell, rung)], until).map_err(|error| format!("{error:?}"))?;
+                ipc::sleep_at_bells(&[(&self.bell, Ring::First, rung)], until)
+                    .map_err(|error| format!("{error:?}"))?;
             }
         }
         Ok(self.counted.take())

@@ -137,5 +137,5 @@ fn tell(progress: &str) {
 /// A telegram of 361 values.
 const TELEGRAM: usize = 732;
 const MEBIBYTE: usize = 1 << 20;
-const PAYLOADS: [usize; 4] = [TELEGRAM, size_of::<schema::Scan>(), 1 << 16, MEBIBYTE];
+const PAYLOADS: [usize; 4] = [TELEGRAM, message::SCAN, 1 << 16, MEBIBYTE];
 const RECEIVERS: [usize; 4] = [1, 4, 16, 64];

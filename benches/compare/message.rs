@@ -2,6 +2,8 @@
 
 use std::hint::black_box;
 
+use schema::{Contents, Scan};
+
 use crate::support::Outcome;
 
 /// What a message says of itself.
@@ -78,6 +80,10 @@ pub(crate) fn contents(len: usize) -> Vec<u8> {
     (0..len).map(|i| i as u8).collect()
 }
 
+/// Beams of the hub's own messages: 180 degrees in halves.
+pub(crate) const BEAMS: usize = 361;
+/// Length of a scan of so many.
+pub(crate) const SCAN: usize = Scan::len(BEAMS, Contents::UPPER);
 /// Length of the shortest message.
 pub(crate) const SHORT: usize = HEAD + NUMBER;
 const NUMBER: usize = size_of::<u64>();

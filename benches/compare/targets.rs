@@ -3,6 +3,7 @@
 
 use serde_json::json;
 
+use super::message::SCAN;
 use super::table::{Of, values};
 use super::way::Way;
 use super::{Cell, MEBIBYTE};
@@ -188,4 +189,4 @@ fn middle(mut values: Vec<f64>) -> Option<f64> {
 const SENDER: [(&str, Of); 2] =
     [("sender's processor time", |run| Some(run.sender_us)), ("sending alone", |run| run.sending_us)];
 /// The hub's own messages are not longer.
-const SHORT: usize = size_of::<schema::Scan>();
+const SHORT: usize = SCAN;

@@ -6,9 +6,10 @@ use scanhub_client::Subscription;
 use schema::ipc::{
     self, Bell, Listener, Node, Payload, Publisher, SampleMut, Subscriber, TopicService, Waker,
 };
-use schema::{Domain, Environment, Header, HubLock, Scan, Topic, Wake, limits};
+use schema::limits::TopicLimits;
+use schema::{Domain, Environment, Header, HubLock, Ring, Scan, ScanHead, Topic, Wake, limits};
 
-use super::message::{Label, SHORT, contents};
+use super::message::{BEAMS, Label, SCAN, SHORT, contents};
 use super::receiver::Inlet;
 use super::sender::{Outlet, Task};
 use super::way::Way;
@@ -33,7 +34,8 @@ impl Hub {
     fn send<P: Payload + ?Sized>(&self, written: Option<SampleMut<P>>) -> Outcome<()> {
         let sample = written.ok_or("nothing was written")?;
         sample.send().map_err(|error| format!("not sent: {error:?}"))?;
-        Ok(self.waker.wake(Wake::Telegram)?)
+        self.waker.ring(Ring::First);
+        Ok(self.waker.tell(Wake::Telegram)?)
     }
 }
 
@@ -55,7 +57,7 @@ impl Bytes {
             .publish_subscribe::<[u8]>()
             .user_header::<Header>()
             .max_publishers(limits::PUBLISHERS)
-            .max_subscribers(limits::subscribers(Topic::Scan))
+            .max_subscribers(TopicLimits::default().consumers)
             .max_nodes(limits::NODES)
             .subscriber_max_buffer_size(limits::buffer(Topic::Scan))
             .subscriber_max_borrowed_samples(limits::BORROWED)
@@ -65,7 +67,7 @@ impl Bytes {
         let publisher = service
             .publisher_builder()
             .max_loaned_samples(limits::LOANED)
-            .override_sample_preallocation(|_| limits::samples(Topic::Scan))
+            .override_sample_preallocation(|_| limits::samples(Topic::Scan, TopicLimits::default().consumers))
             .initial_max_slice_len(task.payload)
             .create()?;
         Ok(Bytes { written: None, publisher, _service: service, contents: contents(task.payload), hub })
@@ -90,7 +92,7 @@ impl Outlet for Bytes {
     }
 
     fn send(&mut self) -> Outcome<()> {
-        self.hub.send(self.written.take())
+        self.hub.send::<[u8]>(self.written.take())
     }
 
     fn end(&mut self, label: Label) -> Outcome<()> {
@@ -122,7 +124,7 @@ impl BytesInlet {
             Wait::Event(Box::new(ipc::listener(&event)?), false)
         } else {
             let bell = Bell::open(&node, SENSOR)?.ok_or("no bell")?;
-            let rung = bell.rung();
+            let rung = bell.rung(Ring::First);
             Wait::Bell(bell, rung, task.way == Way::Doorbell)
         };
         let service = node
@@ -150,14 +152,15 @@ impl Wait {
     fn wait(&mut self) -> Outcome<()> {
         match self {
             Wait::Bell(bell, rung, sleeps) => {
-                if bell.rung() == *rung && *sleeps {
+                if bell.rung(Ring::First) == *rung && *sleeps {
                     let until = clock::now() + LONG_NS;
-                    ipc::sleep_at_bells(&[(bell, *rung)], until).map_err(|error| format!("{error:?}"))?;
+                    ipc::sleep_at_bells(&[(bell, Ring::First, *rung)], until)
+                        .map_err(|error| format!("{error:?}"))?;
                 }
-                while bell.rung() == *rung && !*sleeps {
+                while bell.rung(Ring::First) == *rung && !*sleeps {
                     std::hint::spin_loop();
                 }
-                *rung = bell.rung();
+                *rung = bell.rung(Ring::First);
                 Ok(())
             }
             Wait::Event(listener, taken) => {
@@ -183,8 +186,10 @@ pub(crate) struct Scans {
 impl Scans {
     pub(crate) fn new(task: &Task) -> Outcome<Scans> {
         let hub = Hub::new(task)?;
-        let service = Scan::create(&hub.node, SENSOR)?;
-        Ok(Scans { written: None, publisher: Scan::publisher(&service)?, _service: service, next: 0, hub })
+        let limits = TopicLimits::default();
+        let service = Scan::create(&hub.node, SENSOR, &limits)?;
+        let publisher = Scan::publisher(&service, &limits)?;
+        Ok(Scans { written: None, publisher, _service: service, next: 0, hub })
     }
 }
 
@@ -194,18 +199,19 @@ impl Outlet for Scans {
     }
 
     fn write(&mut self, label: Label) -> Outcome<()> {
-        let loan = self.publisher.loan().map_err(|error| format!("no loan: {error:?}"))?;
+        let loan = Scan::loan(&self.publisher, SCAN).map_err(|error| format!("no loan: {error:?}"))?;
         let sample = self.written.insert(loan);
         let kind = label.phase as u64 * 2 + u64::from(label.is_end);
         *sample.user_header_mut() =
             Header { seq: label.number, topic_seq: self.next, boot: 1, wall_ns: kind, ..Header::default() };
-        sample.payload_mut().range_array.fill(label.number as u16);
+        let arrays = Scan::write(sample).begin(ScanHead::lms(BEAMS, -90_000, 500, 1, 13));
+        arrays.ranges.fill(label.number as u16);
         self.next += 1;
         Ok(())
     }
 
     fn send(&mut self) -> Outcome<()> {
-        self.hub.send(self.written.take())
+        self.hub.send::<Scan>(self.written.take())
     }
 }
 
@@ -225,7 +231,7 @@ impl Inlet for ScansInlet {
     fn next(&mut self) -> Outcome<Label> {
         let scan = self.0.next()?.ok_or("no scan")?;
         let Header { seq: number, wall_ns: kind, .. } = *scan.header();
-        let ends = [scan.range_array.first(), scan.range_array.last()];
+        let ends = [scan.ranges().first(), scan.ranges().last()];
         if ends != [Some(&(number as u16)); 2] {
             return Err(format!("scan {number} is torn").into());
         }

@@ -1,5 +1,6 @@
 //! The ways from one process to others that are compared, and for which cells each is run. Refuses to know how they work.
 
+use super::message::SCAN;
 use crate::support::Outcome;
 
 /// How a message gets to its receivers, and what those wait at.
@@ -93,7 +94,7 @@ impl Way {
             Way::Spin => receivers < processors,
             Way::SpinFloor => receivers == 1 && processors > 1,
             Way::FutexFloor | Way::EventfdFloor => receivers == 1,
-            Way::Subscription => receivers == 1 && payload == size_of::<schema::Scan>(),
+            Way::Subscription => receivers == 1 && payload == SCAN,
             _ => true,
         }
     }

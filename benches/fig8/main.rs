@@ -69,17 +69,19 @@ struct Run {
     foreground: Vec<Place>,
     before: Vec<u16>,
     after: Vec<u16>,
-    snapshot: Option<(Vec<u16>, Foreground)>,
+    snapshot: Option<(Vec<u16>, Box<Foreground>)>,
     /// The shape of all scans.
-    scan: Scan,
+    scan: Box<Scan>,
 }
 
 impl Run {
     fn new(options: &Options) -> Run {
         let mut run = Run::default();
-        let mut model = Model::new(Settings { method: options.method, ..Settings::default() });
-        let mut cutter = Segmenter::new(Pose::default());
-        let (mut foreground, mut background) = (Foreground::default(), Background::default());
+        let beams = Variant::HALF.beams();
+        let mut model = Model::new(Settings { method: options.method, ..Settings::default() }, beams);
+        let mut cutter = Segmenter::new(Pose::default(), beams);
+        let mut foreground = Foreground::of(beams);
+        let mut background = Background::zeroed(Background::len(beams));
         let room = Room::new(&"fig8".parse().expect("a world that the program brings along"), options.seed);
         for end_ns in (1..=SCANS).map(|number| number * SCAN_NS) {
             let scan = scan(&room, end_ns);
@@ -96,7 +98,7 @@ impl Run {
                 run.before.clone_from(&run.after);
             }
             if end_ns >= SNAPSHOT_NS && run.snapshot.is_none() {
-                run.snapshot = Some((run.after.clone(), foreground));
+                run.snapshot = Some((run.after.clone(), foreground.clone()));
             }
             run.scan = scan;
         }
@@ -145,7 +147,7 @@ impl Run {
 }
 
 /// What the hub publishes of the scan that ended at `end_ns`.
-fn scan(room: &Room, end_ns: Nanos) -> Scan {
+fn scan(room: &Room, end_ns: Nanos) -> Box<Scan> {
     seen::scan(&room.scan(Variant::HALF, Unit::Mm, seen::MODE, end_ns), Unit::Mm)
 }
 

@@ -17,9 +17,9 @@ pub(crate) struct Place {
 impl Place {
     /// Where beam `i` of `scan` ends if it has this range, in device units.
     pub(crate) fn of(scan: &Scan, i: usize, range: u16) -> Place {
-        let mm = f64::from(range) * f64::from(scan.unit_mm);
-        let (sin, cos) = scan.angle_deg(i).to_radians().sin_cos();
-        Place { right_mm: (mm * cos).round() as i32, ahead_mm: (mm * sin).round() as i32 }
+        let mm = f64::from(range) * f64::from(scan.unit_um) / 1000.0;
+        let (left, ahead) = scan.angle(i).sin_cos();
+        Place { right_mm: (-mm * left).round() as i32, ahead_mm: (mm * ahead).round() as i32 }
     }
 
     /// On the page: a pixel is a centimetre.

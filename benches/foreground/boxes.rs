@@ -57,9 +57,9 @@ impl Boxes {
             // At its edges a beam may have told what stood behind it.
             let inside = |i: &usize| now.met[i - 1..=i + 1].iter().all(is_bare);
             let beams: Vec<usize> = (1..stood.met.len() - 1).filter(inside).collect();
-            let mut scan = now.scan;
+            let mut scan = now.scan.clone();
             let span = beams[0]..=beams[beams.len() - 1];
-            scan.range_array[span.clone()].copy_from_slice(&stood.scan.range_array[span]);
+            scan.arrays().ranges[span.clone()].copy_from_slice(&stood.scan.ranges()[span]);
             let told = self::told(&mut *make(), &frames[..at], &scan);
             let met_box = beams.into_iter().filter(|&i| is_still(&stood.met[i]));
             met_box.for_each(|i| gone.count(!told[i]));

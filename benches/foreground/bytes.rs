@@ -1,8 +1,9 @@
 //! How many bytes a second go over a network: all scans, or the foreground alone.
 
+use lms::variant::Variant;
 use preprocess::background::{Model, Settings};
 use preprocess::segments::Segmenter;
-use schema::{Foreground, Pose};
+use schema::{Foreground, Pose, Scan};
 
 use super::play::Frame;
 
@@ -19,16 +20,17 @@ pub(crate) struct Bytes {
 impl Bytes {
     /// Adds a run of `frames`, compared by the method of `settings`.
     pub(crate) fn add(&mut self, settings: Settings, frames: &[Frame]) {
-        let mut model = Model::new(settings);
-        let mut cutter = Segmenter::new(Pose::default());
-        let mut out = Foreground::default();
+        let beams = Variant::HALF.beams();
+        let mut model = Model::new(settings, beams);
+        let mut cutter = Segmenter::new(Pose::default(), beams);
+        let mut out = Foreground::of(beams);
         for frame in frames {
             model.update(&frame.scan, &mut out);
             cutter.update(&frame.scan, &mut out);
-            let beams = frame.scan.beams();
-            let foreground = 12 + beams.div_ceil(8) + 2 * out.ranges().len() + 16 * out.segments().len();
+            let foreground =
+                Foreground::HEAD + beams.div_ceil(8) + 2 * out.ranges().len() + 16 * out.segments().len();
             self.scans += 1;
-            self.scan += 12 + 2 * beams as u64;
+            self.scan += Scan::len(beams, 0) as u64;
             self.foreground += foreground as u64;
             if out.beams == 0 {
                 self.empty = (self.empty.0 + 1, self.empty.1 + foreground as u64);

@@ -22,7 +22,7 @@ mod seen;
 use std::ops::Range;
 use std::process::ExitCode;
 
-use lms::variant::Unit;
+use lms::variant::{Unit, Variant};
 use preprocess::background::{Method as Kind, Settings, Start};
 
 use boxes::Boxes;
@@ -83,8 +83,8 @@ fn settings(name: &str) -> Option<Settings> {
 fn method(name: &str) -> Box<dyn Method> {
     match settings(name) {
         Some(settings) => Box::new(Hub::new(settings)),
-        None if name == "teach-in" => Box::new(TeachIn::new(schema::BEAMS)),
-        None => Box::new(Mixtures::new(schema::BEAMS)),
+        None if name == "teach-in" => Box::new(TeachIn::new(Variant::HALF.beams())),
+        None => Box::new(Mixtures::new(Variant::HALF.beams())),
     }
 }
 

@@ -1,5 +1,6 @@
 //! What is measured: something that tells the foreground of scan after scan, and the hub's methods as such.
 
+use lms::variant::Variant;
 use preprocess::background::{Class, Model, Settings};
 use schema::{Foreground, Scan};
 
@@ -12,12 +13,13 @@ pub(crate) trait Method {
 /// A method of the hub.
 pub(crate) struct Hub {
     model: Model,
-    out: Foreground,
+    out: Box<Foreground>,
 }
 
 impl Hub {
     pub(crate) fn new(settings: Settings) -> Hub {
-        Hub { model: Model::new(settings), out: Foreground::default() }
+        let beams = Variant::HALF.beams();
+        Hub { model: Model::new(settings, beams), out: Foreground::of(beams) }
     }
 }
 

@@ -43,7 +43,7 @@ const OLD_S: f64 = 20.0;
 
 /// One scan and what is due.
 pub(crate) struct Frame {
-    pub(crate) scan: Scan,
+    pub(crate) scan: Box<Scan>,
     pub(crate) due: Vec<Due>,
     pub(crate) met: Vec<Met>,
 }

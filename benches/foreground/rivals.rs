@@ -25,7 +25,7 @@ impl TeachIn {
 impl Method for TeachIn {
     fn update(&mut self, scan: &Scan, foreground: &mut [bool]) {
         self.scans += 1;
-        let threshold_mm = if scan.unit_mm == 10 { 60 } else { 30 };
+        let threshold_mm = if scan.unit_um == 10_000 { 60 } else { 30 };
         for (i, is_foreground) in foreground.iter_mut().enumerate() {
             let reading = scan.distance_mm(i);
             *is_foreground =
@@ -68,7 +68,7 @@ impl Method for Mixtures {
     fn update(&mut self, scan: &Scan, foreground: &mut [bool]) {
         self.scans += 1.0;
         let rate = (1.0 / self.scans).max(1.0 / 375.0);
-        let scale = if scan.unit_mm == 10 { 2.0 } else { 1.0 };
+        let scale = if scan.unit_um == 10_000 { 2.0 } else { 1.0 };
         for (i, is_foreground) in foreground.iter_mut().enumerate() {
             let Some(mm) = scan.distance_mm(i).map(f64::from) else {
                 *is_foreground = false;

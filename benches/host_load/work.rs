@@ -8,6 +8,7 @@ use lms::measured::Measured;
 use lms::telegram::Telegram;
 use lms::variant::Mode;
 use preprocess::{background, marks, segments, zones};
+use schema::limits::TopicLimits;
 use schema::{Foreground, Marks, Pose, Scan, Zones};
 
 /// Everything that is made of the scans of one sensor.
@@ -16,23 +17,24 @@ pub(crate) struct Work {
     marks: marks::MarkDetector,
     model: background::Model,
     cutter: segments::Segmenter,
-    scan: Scan,
+    scan: Box<Scan>,
     near: Zones,
     found: Marks,
-    foreground: Foreground,
+    foreground: Box<Foreground>,
 }
 
 impl Work {
     pub(crate) fn new() -> Box<Work> {
+        let TopicLimits { beams, contents, .. } = TopicLimits::default();
         Box::new(Work {
-            zones: zones::Check::new(Pose::default(), &zones::Settings::default()),
+            zones: zones::Check::new(Pose::default(), &zones::Settings::default(), beams),
             marks: marks::MarkDetector::new(marks::Settings::default()),
-            model: background::Model::new(background::Settings::default()),
-            cutter: segments::Segmenter::new(Pose::default()),
-            scan: Scan::default(),
+            model: background::Model::new(background::Settings::default(), beams),
+            cutter: segments::Segmenter::new(Pose::default(), beams),
+            scan: Scan::zeroed(Scan::len(beams, contents)),
             near: Zones::default(),
             found: Marks::default(),
-            foreground: Foreground::default(),
+            foreground: Foreground::of(beams),
         })
     }
 

@@ -21,7 +21,7 @@ pub(crate) fn figures(count: u64) -> Outcome<Vec<Figure>> {
     let (mouth, to) = (wire::mouth()?, wire::address(Topic::Zones));
     let mut random = fastrand::Rng::with_seed(6);
     let mut buffer = [0; MTU_ETHERNET];
-    let scan = sealed(&mut buffer, Topic::Scan, 0, &source::scan())?;
+    let scan = sealed(&mut buffer, Topic::Scan, 0, &*source::scan())?;
     let whole = [scan, sealed(&mut buffer, Topic::Zones, 0, &Zones::unknown())?];
     let (mut sequence, mut begin_kb) = (0, 0);
     for n in 1..=count {
@@ -57,7 +57,12 @@ pub(crate) fn figures(count: u64) -> Outcome<Vec<Figure>> {
     ])
 }
 
-fn sealed(buffer: &mut [u8], topic: Topic, sequence: u32, payload: &impl Packed) -> Outcome<Vec<u8>> {
+fn sealed(
+    buffer: &mut [u8],
+    topic: Topic,
+    sequence: u32,
+    payload: &(impl Packed + ?Sized),
+) -> Outcome<Vec<u8>> {
     let len = payload.pack(&mut buffer[HEAD..]).ok_or("it does not fit")?;
     let head = Head { topic: topic.number(), hub: 1, epoch: 1, sequence, revision: 1, ..Head::default() };
     Ok(head.seal(buffer, len).ok_or("it does not fit")?.to_vec())

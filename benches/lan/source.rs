@@ -1,7 +1,8 @@
 //! A hub without sensors: publishes one scan again and again, when it is told to.
 
 use schema::ipc::{self, Node, Payload, Publisher, TopicService, Waker};
-use schema::{Domain, Header, HubLock, Scan, Status, Wake};
+use schema::limits::TopicLimits;
+use schema::{Domain, Header, HubLock, Ring, Scan, ScanHead, Status, Wake};
 
 use crate::support::Outcome;
 
@@ -24,14 +25,16 @@ impl Source {
     pub(crate) fn open(domain: &Domain) -> Outcome<Source> {
         let lock = HubLock::acquire(domain.root())?;
         let node = ipc::hub_node(domain)?;
+        // The most that any bench follows it with.
+        let limits = TopicLimits { consumers: 200, ..TopicLimits::default() };
         let waker = Waker::new(&node, SENSOR)?;
-        let service = Scan::create(&node, SENSOR)?;
+        let service = Scan::create(&node, SENSOR, &limits)?;
         Ok(Source {
-            publisher: Scan::publisher(&service)?,
+            publisher: Scan::publisher(&service, &limits)?,
             waker,
             next: 0,
             _service: service,
-            _status: Status::create(&node, SENSOR)?,
+            _status: Status::create(&node, SENSOR, &limits)?,
             _node: node,
             _lock: lock,
         })
@@ -39,20 +42,23 @@ impl Source {
 
     /// Publishes a scan with this stamp of the wall clock, and wakes who follows.
     pub(crate) fn publish(&mut self, wall_ns: u64) -> Outcome<()> {
-        let mut sample = self.publisher.loan().map_err(|error| format!("no loan: {error:?}"))?;
+        let scan = scan();
+        let loan = Scan::loan(&self.publisher, scan.bytes().len());
+        let mut sample = loan.map_err(|error| format!("no loan: {error:?}"))?;
         let header = Header { seq: self.next, topic_seq: self.next, boot: 1, wall_ns, ..Header::default() };
         self.next += 1;
         *sample.user_header_mut() = header;
-        *sample.payload_mut() = scan();
+        let to = Scan::write(&mut sample).begin(**scan);
+        to.ranges.copy_from_slice(scan.ranges());
         sample.send().map_err(|error| format!("not sent: {error:?}"))?;
-        self.waker.wake(Wake::Telegram)?;
+        self.waker.ring(Ring::First);
+        self.waker.tell(Wake::Telegram)?;
         Ok(())
     }
 }
 
 /// 361 beams in mm, as sensors leave the factory.
-pub(crate) fn scan() -> Scan {
-    let mut scan = Scan { count: 361, unit_mm: 1, range_bits: 13, step_mdeg: 500, ..Scan::default() };
-    scan.range_array[..361].iter_mut().enumerate().for_each(|(beam, range)| *range = 1000 + beam as u16);
-    scan
+pub(crate) fn scan() -> Box<Scan> {
+    let ranges: [u16; 361] = std::array::from_fn(|beam| 1000 + beam as u16);
+    Scan::of(ScanHead::lms(ranges.len(), -90_000, 500, 1, 13), &ranges)
 }

@@ -39,7 +39,7 @@ pub(crate) fn consumers(options: &Options) -> Outcome<()> {
             Sweep::new(&format!("consumers of one sensor, asleep at the {wait}"), "consumers", quantities);
         for _ in 0..options.pairs().min(3) {
             // One hub for all numbers: what leaves gives its memory back.
-            let hub = stage.hub(&[SENSOR])?;
+            let hub = stage.hub_for_crowd(&[SENSOR])?;
             hub.await_line("ready", PATIENCE)?;
             let mut runs = Vec::new();
             for count in CONSUMERS {

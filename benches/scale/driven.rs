@@ -131,27 +131,27 @@ struct Followers {
 impl Followers {
     fn attach(node: &Node, sensor: &str) -> Result<Followers, Failure> {
         Ok(Followers {
-            telegram: subscriber(node, sensor)?,
-            scan: subscriber(node, sensor)?,
-            marks: subscriber(node, sensor)?,
-            zones: subscriber(node, sensor)?,
-            foreground: subscriber(node, sensor)?,
-            background: subscriber(node, sensor)?,
-            status: subscriber(node, sensor)?,
+            telegram: subscriber::<[u8]>(node, sensor)?,
+            scan: subscriber::<Scan>(node, sensor)?,
+            marks: subscriber::<Marks>(node, sensor)?,
+            zones: subscriber::<Zones>(node, sensor)?,
+            foreground: subscriber::<Foreground>(node, sensor)?,
+            background: subscriber::<Background>(node, sensor)?,
+            status: subscriber::<Status>(node, sensor)?,
         })
     }
 
     /// Takes all that waits; how many scans with all that belongs to them.
     fn take(&self) -> Outcome<usize> {
         let counts = [
-            take(&self.scan)?,
-            take(&self.telegram)?,
-            take(&self.marks)?,
-            take(&self.zones)?,
-            take(&self.foreground)?,
+            take::<Scan>(&self.scan)?,
+            take::<[u8]>(&self.telegram)?,
+            take::<Marks>(&self.marks)?,
+            take::<Zones>(&self.zones)?,
+            take::<Foreground>(&self.foreground)?,
         ];
-        take(&self.background)?;
-        take(&self.status)?;
+        take::<Background>(&self.background)?;
+        take::<Status>(&self.status)?;
         Ok(counts.into_iter().min().unwrap_or_default())
     }
 }

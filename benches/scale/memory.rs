@@ -19,7 +19,7 @@ type Kinds = BTreeMap<String, (usize, f64)>;
 pub(crate) fn two_links(options: &Options) -> Outcome<()> {
     let stage = Stage::new()?;
     let _simulator = stage.simulate(&SENSORS, 500_000)?;
-    let hub = stage.hub(&SENSORS)?;
+    let hub = stage.hub_for_crowd(&SENSORS)?;
     hub.await_line("ready", PATIENCE)?;
     let alone = segments(&stage.domain)?;
     // They stay until they are ended: the first ones, too, while the last come.

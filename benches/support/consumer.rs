@@ -73,7 +73,7 @@ pub(crate) fn ages(topic: &str, domain: &str, sensor: &str, count: usize) -> Out
     Ok(())
 }
 
-fn collect_ages<P: Payload>(domain: &str, sensor: &str, count: usize) -> Outcome<Vec<u64>> {
+fn collect_ages<P: Payload + ?Sized>(domain: &str, sensor: &str, count: usize) -> Outcome<Vec<u64>> {
     let mut samples = subscribe::<P>(domain, sensor)?;
     let mut ages = Vec::with_capacity(count);
     println!("attaching {sensor}");

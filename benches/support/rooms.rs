@@ -98,24 +98,24 @@ pub(crate) struct Followers {
 impl Followers {
     pub(crate) fn attach(node: &Node, sensor: &str) -> Followers {
         Followers {
-            telegram: attach(node, sensor),
-            scan: attach(node, sensor),
-            marks: attach(node, sensor),
-            zones: attach(node, sensor),
-            foreground: attach(node, sensor),
-            background: attach(node, sensor),
+            telegram: attach::<[u8]>(node, sensor),
+            scan: attach::<Scan>(node, sensor),
+            marks: attach::<Marks>(node, sensor),
+            zones: attach::<Zones>(node, sensor),
+            foreground: attach::<Foreground>(node, sensor),
+            background: attach::<Background>(node, sensor),
         }
     }
 
     /// What has come since, topic by topic.
     pub(crate) fn take(&self) -> Vec<Published> {
         let mut taken = Vec::new();
-        drain(&self.telegram, &mut taken, |telegram| telegram.to_vec());
-        drain(&self.scan, &mut taken, packed);
-        drain(&self.marks, &mut taken, packed);
-        drain(&self.zones, &mut taken, packed);
-        drain(&self.foreground, &mut taken, packed);
-        drain(&self.background, &mut taken, packed);
+        drain::<[u8]>(&self.telegram, &mut taken, |telegram| telegram.to_vec());
+        drain::<Scan>(&self.scan, &mut taken, packed);
+        drain::<Marks>(&self.marks, &mut taken, packed);
+        drain::<Zones>(&self.zones, &mut taken, packed);
+        drain::<Foreground>(&self.foreground, &mut taken, packed);
+        drain::<Background>(&self.background, &mut taken, packed);
         taken
     }
 }
@@ -135,7 +135,7 @@ fn drain<P: Payload + ?Sized>(from: &Subscriber<P>, to: &mut Vec<Published>, byt
     }
 }
 
-fn packed(payload: &impl Packed) -> Vec<u8> {
+fn packed(payload: &(impl Packed + ?Sized)) -> Vec<u8> {
     let mut room = vec![0; 4096];
     let len = payload.pack(&mut room).expect("there is room");
     room.truncate(len);

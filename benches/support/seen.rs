@@ -10,10 +10,10 @@ use schema::Scan;
 pub(crate) const MODE: Mode = Mode(1);
 
 /// The scan of `words` in `unit` and [`MODE`].
-pub(crate) fn scan(words: &[u16], unit: Unit) -> Scan {
+pub(crate) fn scan(words: &[u16], unit: Unit) -> Box<Scan> {
     let telegram = measured::encode(0, unit, words, 0x10);
-    let mut scan = Scan::default();
     let measured = Measured::decode(telegram.telegram()).expect("as many words as a variant has");
+    let mut scan = Scan::zeroed(scanner::len(&measured));
     scanner::decode(&measured, MODE, &mut scan);
     scan
 }

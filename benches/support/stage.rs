@@ -94,6 +94,13 @@ impl Stage {
         self.hub_of(PROGRAM, sensors)
     }
 
+    /// The hub with places for a crowd.
+    pub(crate) fn hub_for_crowd(&self, sensors: &[&str]) -> Outcome<Child> {
+        let mut command = self.hub_command(PROGRAM, sensors);
+        command.arg(format!("--set=limits.consumers={CROWD}"));
+        Child::of(command, Stdio::null())
+    }
+
     /// The hub of another build of the program.
     pub(crate) fn hub_of(&self, program: &str, sensors: &[&str]) -> Outcome<Child> {
         Child::of(self.hub_command(program, sensors), Stdio::null())
@@ -147,6 +154,8 @@ impl Drop for Stage {
 
 /// The two sensors of a vehicle.
 pub(crate) const SENSORS: [&str; 2] = ["front", "rear"];
+/// Consumers of a topic that [`Stage::hub_for_crowd`] has places for.
+pub(crate) const CROWD: usize = 200;
 /// Far longer than anything takes.
 pub(crate) const PATIENCE: Duration = Duration::from_secs(20);
 /// The program of this build.

@@ -13,7 +13,8 @@ use daemon::{LiveLink, Orders};
 use lms::Nanos;
 use port::{Allowance, PortError, Source, clock};
 use schema::ipc::{self, Node, Payload, SharedMemory, Waker};
-use schema::{Domain, Failure, HubLock, Wake, shortage};
+use schema::limits::TopicLimits;
+use schema::{Domain, Failure, HubLock, Ring, Wake, shortage};
 
 /// A link in virtual time. Its port is to be a recording in the configuration: it streams from the start, and its scans are
 /// read in the mode that is configured.
@@ -129,14 +130,18 @@ impl Surroundings for Around<'_> {
     fn release(&self, _: &str) {}
 
     fn medium<P: Payload + ?Sized>(&self, sensor: &str) -> Result<SharedMemory<P>, Failure> {
-        SharedMemory::new(self.node, sensor)
+        SharedMemory::new(self.node, sensor, &TopicLimits::default())
     }
 
-    fn wake(&self, why: Wake) {
+    fn ring(&self, ring: Ring) {
+        self.waker.ring(ring);
+    }
+
+    fn tell(&self, why: Wake) {
         if why == Wake::Telegram {
             self.telegrams.set(self.telegrams.get() + 1);
         }
-        self.waker.wake(why).expect("consumers can be woken");
+        self.waker.tell(why).expect("consumers can be woken");
     }
 
     fn recall(&self, _: &str, _: &mut [u8]) -> Option<usize> {

@@ -6,7 +6,7 @@
  *     struct scanhub_scan scan;
  *     if (scanhub_read(bytes, len, &datagram) == SCANHUB_OK && scanhub_read_scan(&datagram, &scan) == SCANHUB_OK)
  *         for (unsigned i = 0; i < scan.count; i++)
- *             use(scanhub_scan_mm(&scan, i));
+ *             use(scanhub_scan_m(&scan, i), scanhub_scan_angle(&scan, i));
  *
  * What is read points into the datagram and lives as long as its bytes do. They are hostile input: nothing that a function
  * here answers with SCANHUB_OK leads outside of them, as long as an index is below the count that came with it.
@@ -14,6 +14,7 @@
 #ifndef SCANHUB_H
 #define SCANHUB_H
 
+#include <math.h>
 #include <stddef.h>
 #include <stdint.h>
 #include <string.h>
@@ -54,11 +55,11 @@ enum scanhub_result {
     SCANHUB_BAD_SHORT,   /* fewer bytes than a header */
     SCANHUB_BAD_MAGIC,   /* it does not begin with SHUB */
     SCANHUB_BAD_VERSION, /* another version */
-    SCANHUB_BAD_HEADER,  /* the header is too short, or longer than the datagram */
-    SCANHUB_BAD_LENGTH,  /* the lengths do not add up to the datagram's */
+    SCANHUB_BAD_HEADER,  /* the header is too short, or longer than the datagram, or the part is none of the parts */
+    SCANHUB_BAD_LENGTH,  /* the lengths do not add up to the datagram's, or a part is too long */
     SCANHUB_BAD_CRC,     /* the checksum is wrong */
     SCANHUB_SKIPPED,     /* another topic than the one asked for */
-    SCANHUB_BAD_PAYLOAD  /* shorter than its own counts say, in contradiction to itself, or without revision */
+    SCANHUB_BAD_PAYLOAD  /* shorter than its own counts say, in contradiction to itself, without revision, or a part */
 };
 
 /* A datagram whose header, lengths and checksum are right. Whether a MAC is, this header cannot tell. */
@@ -67,13 +68,16 @@ struct scanhub_datagram {
     uint8_t flags;
     uint64_t hub;       /* the gateway, a random number */
     uint32_t epoch;     /* its life: a greater one ends the one before */
-    uint32_t sequence;  /* number among those of this sensor and topic, wrapping: a gap is what was lost */
+    uint32_t sequence;  /* the sample's number among those of this sensor and topic, wrapping: a gap is what was lost */
     uint64_t stamp_ns;  /* wall clock of the telegram's first byte, ns since 1970; of announce and status that of sending */
     uint8_t sensor;     /* its position in the hub's configuration */
+    uint8_t part;       /* which part of the sample this is, from 0 */
+    uint8_t parts;      /* in how many it comes: 1 for most. To read one that comes in more, put `payload` of all parts of
+                         * one sequence behind each other, point `payload` of one of them to that, and set `parts` to 1 */
     uint16_t revision;  /* of the payload: a greater one only appends */
     uint32_t counter;   /* the same in all datagrams that came from one telegram */
     const uint8_t *payload;
-    uint16_t payload_len;
+    uint32_t payload_len;
     const uint8_t *mac; /* 16 bytes, or NULL */
 };
 
@@ -84,6 +88,13 @@ static inline int32_t scanhub_i32(const uint8_t *at)
 {
     uint32_t bits = scanhub_u32(at);
     int32_t value;
+    memcpy(&value, &bits, sizeof value);
+    return value;
+}
+static inline float scanhub_f32(const uint8_t *at)
+{
+    uint32_t bits = scanhub_u32(at);
+    float value;
     memcpy(&value, &bits, sizeof value);
     return value;
 }
@@ -121,14 +132,14 @@ static inline enum scanhub_result scanhub_read(const void *bytes, size_t len, st
         return SCANHUB_BAD_SHORT;
     if (memcmp(at, "SHUB", 4) != 0)
         return SCANHUB_BAD_MAGIC;
-    if (at[4] != 1)
+    if (at[4] != 2)
         return SCANHUB_BAD_VERSION;
     header = at[5];
-    if (header < 48 || header > len)
+    if (header < 48 || header > len || at[33] >= at[34])
         return SCANHUB_BAD_HEADER;
     payload = scanhub_u16(at + 36);
     mac = at[7] & SCANHUB_AUTHENTICATED ? 16 : 0;
-    if (header + payload + mac != len)
+    if (header + payload + mac != len || (at[34] > 1 && payload > 1424))
         return SCANHUB_BAD_LENGTH;
     crc = scanhub_crc(0xFFFFFFFFu, at, 44);
     crc = scanhub_crc(crc, no_crc, 4);
@@ -142,20 +153,24 @@ static inline enum scanhub_result scanhub_read(const void *bytes, size_t len, st
     out->sequence = scanhub_u32(at + 20);
     out->stamp_ns = scanhub_u64(at + 24);
     out->sensor = at[32];
+    out->part = at[33];
+    out->parts = at[34];
     out->revision = scanhub_u16(at + 38);
     out->counter = scanhub_u32(at + 40);
     out->payload = at + header;
-    out->payload_len = (uint16_t)payload;
+    out->payload_len = (uint32_t)payload;
     out->mac = mac ? at + header + payload : NULL;
     return SCANHUB_OK;
 }
 
-/* The topic is the one asked for, and the payload has a revision and at least `least` bytes. */
+/* The topic is the one asked for, and the payload is whole, has a revision and at least `least` bytes. */
 static inline enum scanhub_result scanhub_expect(const struct scanhub_datagram *datagram, uint8_t topic, size_t least)
 {
     if (datagram->topic != topic)
         return SCANHUB_SKIPPED;
-    return datagram->revision == 0 || datagram->payload_len < least ? SCANHUB_BAD_PAYLOAD : SCANHUB_OK;
+    if (datagram->revision == 0 || datagram->parts != 1)
+        return SCANHUB_BAD_PAYLOAD;
+    return datagram->payload_len < least ? SCANHUB_BAD_PAYLOAD : SCANHUB_OK;
 }
 
 /* Copies text that may fill its field; `out` has a byte more than the field. */
@@ -216,7 +231,7 @@ static inline struct scanhub_announced scanhub_announced(const struct scanhub_an
     return out;
 }
 
-/* A telegram of the sensor, STX to CRC, as it came. */
+/* A telegram of the sensor as it came: of an LMS STX to CRC, of other families whole packets. */
 struct scanhub_telegram {
     const uint8_t *bytes;
     uint16_t len;
@@ -225,59 +240,121 @@ static inline enum scanhub_result scanhub_read_telegram(const struct scanhub_dat
                                                         struct scanhub_telegram *out)
 {
     const uint8_t *at = datagram->payload;
-    enum scanhub_result result = scanhub_expect(datagram, SCANHUB_TELEGRAM, 4);
+    enum scanhub_result result = scanhub_expect(datagram, SCANHUB_TELEGRAM, 1);
     size_t len;
     if (result != SCANHUB_OK)
         return result;
-    len = scanhub_u16(at + 2) + (size_t)6;
-    if (at[0] != 0x02 || len > 814 || len > datagram->payload_len)
+    len = datagram->payload_len;
+    if (at[0] == 0x02)
+        len = len < 4 ? 815 : scanhub_u16(at + 2) + (size_t)6;
+    if (len > 814 || len > datagram->payload_len)
         return SCANHUB_BAD_PAYLOAD;
     out->bytes = at;
     out->len = (uint16_t)len;
     return SCANHUB_OK;
 }
 
-/* A scan: at most 401 beams, counter-clockwise seen from above, 0 right, 90 degrees ahead. */
+/* A scan: at most 8192 beams in the order of their measuring. Angles are in radians: 0 is the sensor's own ahead,
+ * counter-clockwise positive seen from above. */
+enum scanhub_family { SCANHUB_LMS = 0, SCANHUB_LD = 1 };
 struct scanhub_scan {
+    double first_angle;    /* of beam 0 */
+    double step;           /* from one beam to the next; negative for a scanner that turns clockwise */
+    float spacing;         /* between two points that the sensor itself measures */
+    uint32_t beam_time_ns; /* from one beam to the next */
+    int32_t first_beam_ns; /* when beam 0 was measured, after the datagram's stamp: mostly before it */
+    uint32_t unit_um;      /* micrometres per device unit */
     uint16_t count;
-    uint8_t unit_mm;          /* millimetres per device unit: 1, 10 or 100 */
-    uint8_t range_bits;       /* 13, 14 or 15 */
-    int32_t first_angle_mdeg; /* 1/1000 degree */
-    uint16_t step_mdeg;
-    uint8_t intensity_bits;   /* 0: the upper bits are field bits */
-    const uint8_t *ranges;    /* count x u16, see below */
-    const uint8_t *upper;     /* count bytes, or NULL: the bits above the range are all 0 */
+    uint16_t valid_to;     /* the greatest value that is a range; all above are codes */
+    uint16_t no_return, beyond;
+    uint16_t collapsed;    /* points that found their beam taken by a nearer one */
+    uint8_t family;
+    uint8_t incomplete;    /* 1: packets of the turn are missing; what was in them is not measured */
+    uint8_t intensity_bits;
+    uint8_t turns;         /* beam i was measured in turn i modulo this; 0 is 1 */
+    uint32_t turn_ns;      /* time of one of several turns */
+    const uint8_t *angles; /* exact ones, count x f32, or NULL */
+    const uint8_t *ranges; /* count x u16, see below */
+    const uint8_t *wide;   /* intensities of more than 8 bits, count x u16, or NULL */
+    const uint8_t *upper;  /* intensities or field bits, count bytes, or NULL */
 };
 static inline enum scanhub_result scanhub_read_scan(const struct scanhub_datagram *datagram, struct scanhub_scan *out)
 {
     const uint8_t *at = datagram->payload;
-    enum scanhub_result result = scanhub_expect(datagram, SCANHUB_SCAN, 12);
-    size_t count;
+    enum scanhub_result result = scanhub_expect(datagram, SCANHUB_SCAN, 64);
+    size_t n, of_beam;
     if (result != SCANHUB_OK)
         return result;
-    count = scanhub_u16(at);
-    if (count > 401 || datagram->payload_len < 12 + (at[11] & 1 ? 3 : 2) * count || at[3] > 16)
+    n = scanhub_u16(at + 32);
+    of_beam = 2 + (at[44] & 4 ? (size_t)4 : 0) + (at[44] & 2 ? 2 : 0) + (at[44] & 1);
+    out->first_angle = scanhub_f64(at);
+    out->step = scanhub_f64(at + 8);
+    out->spacing = scanhub_f32(at + 16);
+    if (n > 8192 || at[44] > 7 || datagram->payload_len < 64 + n * of_beam || !isfinite(out->first_angle)
+        || !isfinite(out->step) || !isfinite(out->spacing))
         return SCANHUB_BAD_PAYLOAD;
-    out->count = (uint16_t)count;
-    out->unit_mm = at[2];
-    out->range_bits = at[3];
-    out->first_angle_mdeg = scanhub_i32(at + 4);
-    out->step_mdeg = scanhub_u16(at + 8);
-    out->intensity_bits = at[10];
-    out->ranges = at + 12;
-    out->upper = at[11] & 1 ? at + 12 + 2 * count : NULL;
+    out->beam_time_ns = scanhub_u32(at + 20);
+    out->first_beam_ns = scanhub_i32(at + 24);
+    out->unit_um = scanhub_u32(at + 28);
+    out->count = (uint16_t)n;
+    out->valid_to = scanhub_u16(at + 34);
+    out->no_return = scanhub_u16(at + 36);
+    out->beyond = scanhub_u16(at + 38);
+    out->collapsed = scanhub_u16(at + 40);
+    out->family = at[42];
+    out->incomplete = at[43] & 1;
+    out->intensity_bits = at[45];
+    out->turns = at[46];
+    out->turn_ns = scanhub_u32(at + 48);
+    out->angles = at[44] & 4 ? at + 64 : NULL;
+    out->ranges = at + 64 + (at[44] & 4 ? 4 * n : 0);
+    out->wide = at[44] & 2 ? out->ranges + 2 * n : NULL;
+    out->upper = at[44] & 1 ? out->ranges + (at[44] & 2 ? 4 : 2) * n : NULL;
     return SCANHUB_OK;
 }
-/* The range of beam i in device units as it was sent, i below `count`: the nine greatest values are codes. */
+/* The range of beam i in device units, i below `count`, as here everywhere: what is above `valid_to` is no range. */
 static inline uint16_t scanhub_scan_range(const struct scanhub_scan *scan, unsigned i)
 {
     return scanhub_u16(scan->ranges + 2 * (size_t)i);
 }
-/* The range of beam i in mm, or -1 if it has no valid reading. */
-static inline int32_t scanhub_scan_mm(const struct scanhub_scan *scan, unsigned i)
+/* The range of beam i in metres; NAN if it has no reading, whatever the reason. */
+static inline double scanhub_scan_m(const struct scanhub_scan *scan, unsigned i)
 {
-    int32_t greatest = (int32_t)((1ul << scan->range_bits) - 1), range = scanhub_scan_range(scan, i);
-    return range > greatest - 9 ? -1 : range * scan->unit_mm;
+    uint16_t range = scanhub_scan_range(scan, i);
+    return range <= scan->valid_to ? (double)range * scan->unit_um / 1e6 : NAN;
+}
+/* The angle of beam i in radians, exact where the sensor says so. */
+static inline double scanhub_scan_angle(const struct scanhub_scan *scan, unsigned i)
+{
+    double exact = scan->angles ? (double)scanhub_f32(scan->angles + 4 * (size_t)i) : NAN;
+    return isnan(exact) ? scan->first_angle + i * scan->step : exact;
+}
+/* Why beam i has no reading; NULL if it has one. */
+static inline const char *scanhub_scan_code(const struct scanhub_scan *scan, unsigned i)
+{
+    static const char *const words[8] = {
+        "not_measured", "no_return", "beyond", "too_near", "too_bright", "weak", "overflow", "error"};
+    /* Those of an LMS, from the greatest value of its measuring mode down. */
+    static const uint8_t lms[9] = {1, 4, 6, 6, 5, 7, 6, 6, 2};
+    unsigned range = scanhub_scan_range(scan, i), greatest = scan->no_return;
+    if (range <= scan->valid_to)
+        return NULL;
+    if (range != 0xFFFF && scan->family == SCANHUB_LMS)
+        return words[range <= greatest && greatest - range < 9 ? lms[greatest - range] : 6];
+    return words[0xFFFFu - range < 7 ? 0xFFFFu - range : 7];
+}
+/* The intensity of beam i, or -1 if there are none. */
+static inline int32_t scanhub_scan_intensity(const struct scanhub_scan *scan, unsigned i)
+{
+    if (scan->intensity_bits == 0)
+        return -1;
+    return scan->wide ? scanhub_u16(scan->wide + 2 * (size_t)i) : scan->upper ? scan->upper[i] : -1;
+}
+/* When beam i was measured, in ns after the datagram's stamp. */
+static inline int64_t scanhub_scan_beam_ns(const struct scanhub_scan *scan, unsigned i)
+{
+    int64_t turn = i % (scan->turns ? scan->turns : 1u);
+    return scan->first_beam_ns + (int64_t)i * scan->beam_time_ns + turn * scan->turn_ns;
 }
 
 /* Reflector marks of a scan: at most 64. */
@@ -373,11 +450,11 @@ static inline struct scanhub_zone scanhub_zone(const struct scanhub_zones *zones
 /* What stands before the background, in one scan. */
 struct scanhub_foreground {
     uint32_t generation;     /* of the background model */
-    uint16_t count;          /* beams of the scan, at most 401 */
+    uint32_t unit_um;        /* micrometres per device unit */
+    uint16_t count;          /* beams of the scan, at most 8192 */
     uint16_t beams;          /* beams in the foreground */
-    uint8_t unit_mm;
-    uint8_t left_out;        /* segments for which there was no room; 255: or more */
     uint16_t segment_count;
+    uint16_t left_out;       /* segments for which there was no room */
     const uint8_t *bits;     /* beam i is bit i % 8 of byte i / 8 */
     const uint8_t *ranges;   /* of the foreground beams, in their order, beams x u16 */
     const uint8_t *segments;
@@ -414,26 +491,26 @@ static inline enum scanhub_result scanhub_read_foreground(const struct scanhub_d
                                                           struct scanhub_foreground *out)
 {
     const uint8_t *at = datagram->payload;
-    enum scanhub_result result = scanhub_expect(datagram, SCANHUB_FOREGROUND, 12);
+    enum scanhub_result result = scanhub_expect(datagram, SCANHUB_FOREGROUND, 16);
     size_t count, beams, segments, set;
     unsigned i, members = 0;
     if (result != SCANHUB_OK)
         return result;
-    count = scanhub_u16(at + 4);
-    beams = scanhub_u16(at + 6);
-    segments = scanhub_u16(at + 10);
+    count = scanhub_u16(at + 8);
+    beams = scanhub_u16(at + 10);
+    segments = scanhub_u16(at + 12);
     set = (count + 7) / 8;
-    if (count > 401 || beams > count || segments > 64 || datagram->payload_len < 12 + set + 2 * beams + 16 * segments)
+    if (count > 8192 || beams > count || segments > 64 || datagram->payload_len < 16 + set + 2 * beams + 16 * segments)
         return SCANHUB_BAD_PAYLOAD;
     out->generation = scanhub_u32(at);
     out->count = (uint16_t)count;
     out->beams = (uint16_t)beams;
-    out->unit_mm = at[8];
-    out->left_out = at[9];
+    out->unit_um = scanhub_u32(at + 4);
+    out->left_out = scanhub_u16(at + 14);
     out->segment_count = (uint16_t)segments;
-    out->bits = at + 12;
-    out->ranges = at + 12 + set;
-    out->segments = at + 12 + set + 2 * beams;
+    out->bits = at + 16;
+    out->ranges = at + 16 + set;
+    out->segments = at + 16 + set + 2 * beams;
     /* As many beams as ranges, and none beyond the scan. */
     for (i = 0; i < 8 * set; i++) {
         if (scanhub_is_foreground(out, i)) {
@@ -452,10 +529,12 @@ static inline enum scanhub_result scanhub_read_foreground(const struct scanhub_d
 
 /* The background model: where each beam ends when nobody is there. */
 struct scanhub_background {
+    double first_angle;    /* as of a scan */
+    double step;           /* 0 before the first scan */
     uint32_t generation;
+    uint32_t unit_um;      /* micrometres per device unit */
     uint16_t taught;       /* beams whose background is known */
-    uint16_t count;        /* at most 401 */
-    uint8_t unit_mm;
+    uint16_t count;        /* at most 8192 */
     uint8_t frozen;        /* 1: nothing is learned */
     const uint8_t *ranges; /* count x u16 */
 };
@@ -463,16 +542,20 @@ static inline enum scanhub_result scanhub_read_background(const struct scanhub_d
                                                           struct scanhub_background *out)
 {
     const uint8_t *at = datagram->payload;
-    enum scanhub_result result = scanhub_expect(datagram, SCANHUB_BACKGROUND, 12);
+    enum scanhub_result result = scanhub_expect(datagram, SCANHUB_BACKGROUND, 32);
     if (result != SCANHUB_OK)
         return result;
-    out->generation = scanhub_u32(at);
-    out->taught = scanhub_u16(at + 4);
-    out->count = scanhub_u16(at + 6);
-    out->unit_mm = at[8];
-    out->frozen = at[9] & 1;
-    out->ranges = at + 12;
-    return out->count > 401 || datagram->payload_len < 12 + 2 * (size_t)out->count ? SCANHUB_BAD_PAYLOAD : SCANHUB_OK;
+    out->first_angle = scanhub_f64(at);
+    out->step = scanhub_f64(at + 8);
+    out->generation = scanhub_u32(at + 16);
+    out->unit_um = scanhub_u32(at + 20);
+    out->taught = scanhub_u16(at + 24);
+    out->count = scanhub_u16(at + 26);
+    out->frozen = at[28] & 1;
+    out->ranges = at + 32;
+    if (out->count > 8192 || datagram->payload_len < 32 + 2 * (size_t)out->count)
+        return SCANHUB_BAD_PAYLOAD;
+    return isfinite(out->first_angle) && isfinite(out->step) ? SCANHUB_OK : SCANHUB_BAD_PAYLOAD;
 }
 /* The range of beam i in device units, i below `count`: 0 not learned, FFFFh beyond what the sensor measures. */
 static inline uint16_t scanhub_background_range(const struct scanhub_background *background, unsigned i)

@@ -10,26 +10,34 @@ ranges of a scan are a view into the datagram. docs/datagram.md has the bytes.
     listener.bind(("", scanhub_lan.PORT))
     group = socket.inet_aton(scanhub_lan.group("scan"))
     listener.setsockopt(socket.IPPROTO_IP, socket.IP_ADD_MEMBERSHIP, group + socket.inet_aton("0.0.0.0"))
+    parts = scanhub_lan.Parts()
     while True:
         try:
-            datagram = scanhub_lan.read(listener.recv(2048))
+            datagram = parts.take(scanhub_lan.read(listener.recv(2048)))
+            if datagram is None or datagram.topic != "scan":
+                continue
             scan = datagram.unpack()
         except scanhub_lan.Refused:
             continue
         if datagram.topic == "scan":
-            print(datagram.sensor, datagram.sequence, min(filter(None, scan.ranges_mm()), default=None))
+            print(datagram.sensor, datagram.sequence, min(filter(None, scan.ranges_m()), default=None), "m")
 """
 
 import hashlib
 import hmac
+import math
 import struct
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Optional, Union
 
 PORT = 22200
 TOPICS = ("announce", "telegram", "scan", "marks", "zones", "foreground", "background", "status")
 VERDICTS = ("clear", "slow", "stop", "unknown")
 STATES = ("absent", "probing", "switching", "starting", "streaming", "silent", "paused")
+FAMILIES = ("lms", "ld")
+CODES = ("not_measured", "no_return", "beyond", "too_near", "too_bright", "weak", "overflow", "error")
+"""Why a beam has no reading, from the greatest value down; those of an LMS count from that of its measuring mode."""
+_OF_LMS = {0: "no_return", 1: "too_bright", 4: "weak", 5: "error", 8: "beyond"}
 COUNTERS = (
     "bytes_read", "bytes_in_telegrams", "bytes_acknowledge", "bytes_discarded", "bytes_buffered", "telegrams",
     "suspect", "aborted", "resyncs", "reconnects", "lost_in_restart", "wakeups", "loan_failed", "rejected_address",
@@ -82,44 +90,77 @@ class Announce:
 
 @dataclass(frozen=True)
 class Telegram:
-    """A telegram of the sensor, STX to CRC, as it came."""
+    """A telegram of the sensor as it came: of an LMS STX to CRC, of other families whole packets."""
 
     telegram: bytes
 
 
 @dataclass(frozen=True)
 class Scan:
-    """Ranges in device units (x `unit_mm` = mm) as they were sent: the nine greatest values are codes.
+    """One turn of a scanner, its beams in the order of their measuring.
 
-    Beam i looks to first_angle_mdeg + i * step_mdeg (1/1000 degree): counter-clockwise seen from above, 0 right, 90
-    degrees ahead. `upper` are the bits above the range, empty if all are 0: intensities if `intensity_bits` is not 0.
+    `ranges` are in device units (x `unit_um` = micrometres); those above `valid_to` are codes, which are no ranges:
+    `ranges_m()` is what to calculate with. Angles are in radians: 0 is the sensor's own ahead, counter-clockwise positive
+    seen from above; `exact` has those of a scanner whose points fall where they like, NaN where nothing was measured.
+    `upper` is the byte beside each range, intensities or field bits. `collapsed` points found their beam taken by a nearer
+    one; `incomplete`: packets of the turn are missing. `family` is None if it is not known here.
     """
 
+    family: Optional[str]
+    unit_um: int
     count: int
-    unit_mm: int
-    range_bits: int
-    first_angle_mdeg: int
-    step_mdeg: int
+    first_angle: float
+    step: float
+    spacing: float
+    beam_time_ns: int
+    first_beam_ns: int
+    turns: int
+    turn_ns: int
+    valid_to: int
+    no_return: int
+    beyond: int
+    collapsed: int
+    incomplete: bool
     intensity_bits: int
+    exact: "tuple[float, ...]"
     ranges: "tuple[int, ...]"
+    intensities: "tuple[int, ...]"
     upper: bytes
     payload: bytes
 
-    def ranges_mm(self) -> "list[Optional[int]]":
-        """The ranges in mm, None where there is no valid reading."""
-        codes = (1 << self.range_bits) - 9
-        return [value * self.unit_mm if value < codes else None for value in self.ranges]
+    def ranges_m(self) -> "list[Optional[float]]":
+        """The ranges in metres, None where there is no reading."""
+        return [value * self.unit_um / 1e6 if value <= self.valid_to else None for value in self.ranges]
+
+    def angles(self) -> "list[float]":
+        """Where each beam looks, exact where the sensor says so."""
+        grid = [self.first_angle + i * self.step for i in range(self.count)]
+        return [known if angle != angle else angle for known, angle in zip(grid, self.exact)] if self.exact else grid
+
+    def codes(self) -> "list[Optional[str]]":
+        """Why each beam has no reading, None where it has one."""
+        return [self._code(value) if value > self.valid_to else None for value in self.ranges]
+
+    def times_ns(self) -> "list[int]":
+        """When each beam was measured, in ns after the datagram's stamp."""
+        step, turns = self.beam_time_ns, max(self.turns, 1)
+        return [self.first_beam_ns + i * step + i % turns * self.turn_ns for i in range(self.count)]
 
     def view(self):
-        """The ranges as a numpy array of the device's u16: a view into the datagram, not a copy."""
+        """The ranges as a numpy array of the device's u16, codes included: a view into the datagram, not a copy."""
         import numpy
 
-        return numpy.frombuffer(self.payload, dtype="<u2", count=self.count, offset=12)
+        return numpy.frombuffer(self.payload, dtype="<u2", count=self.count, offset=64 + 4 * len(self.exact))
+
+    def _code(self, value: int) -> str:
+        if value != 0xFFFF and self.family == "lms":
+            return _OF_LMS.get(self.no_return - value, "overflow")
+        return CODES[min(0xFFFF - value, len(CODES) - 1)]
 
 
 @dataclass(frozen=True)
 class Mark:
-    """A reflector: angle in 1/1000 degree, range in 1/10 mm, sum and greatest of its intensities, its beams; `edge` is
+    """A reflector: angle in 1/1000 degree (0 ahead), range in 1/10 mm, sum and greatest of its intensities, its beams; `edge` is
     1 if a part of it may lie outside of the scan."""
 
     angle_mdeg: int
@@ -179,7 +220,7 @@ class Foreground:
 
     generation: int
     count: int
-    unit_mm: int
+    unit_um: int
     left_out: int
     beams: "tuple[int, ...]"
     ranges: "tuple[int, ...]"
@@ -188,12 +229,15 @@ class Foreground:
 
 @dataclass(frozen=True)
 class Background:
-    """Where each beam ends when nobody is there, in device units: 0 not learned, 65535 beyond the sensor's range."""
+    """Where each beam ends when nobody is there, in device units: 0 not learned, 65535 beyond the sensor's range; angles as
+    in a scan, `step` is 0 before the first."""
 
     generation: int
     taught: int
     count: int
-    unit_mm: int
+    unit_um: int
+    first_angle: float
+    step: float
     frozen: bool
     ranges: "tuple[int, ...]"
 
@@ -234,9 +278,10 @@ Payload = Union[Announce, Telegram, Scan, Marks, Zones, Foreground, Background, 
 class Datagram:
     """A datagram whose header, lengths and checksum are right.
 
-    `hub` is the gateway, `epoch` its life (a greater one ends the one before), `sequence` the number among those of
-    this sensor and topic (modulo 2^32: a gap is what was lost), `counter` the same in all that came from one telegram,
-    `stamp_ns` the wall clock of the telegram's first byte. `authenticated`: a key was given, and the MAC is of it.
+    `hub` is the gateway, `epoch` its life (a greater one ends the one before), `sequence` the number of the sample among
+    those of this sensor and topic (modulo 2^32: a gap is what was lost), `counter` the same in all that came from one
+    telegram, `stamp_ns` the wall clock of the telegram's first byte. `part` of `parts`, from 0: a sample that is longer
+    than a datagram comes in several, see `Parts`. `authenticated`: a key was given, and the MAC is of it.
     """
 
     number: int
@@ -246,6 +291,8 @@ class Datagram:
     sequence: int
     stamp_ns: int
     sensor: int
+    part: int
+    parts: int
     revision: int
     counter: int
     payload: bytes
@@ -257,10 +304,11 @@ class Datagram:
         return TOPICS[self.number] if self.number < len(TOPICS) else None
 
     def unpack(self) -> Payload:
-        """What the payload says; Refused: `skipped` if the topic is not known, `payload` if it contradicts itself."""
+        """What the payload says; Refused: `skipped` if the topic is not known, `payload` if it contradicts itself or is a
+        part by itself."""
         if self.number >= len(TOPICS):
             raise Refused("skipped")
-        if self.revision == 0:
+        if self.revision == 0 or self.parts != 1:
             raise Refused("payload")
         try:
             return _UNPACK[self.number](self.payload)
@@ -276,13 +324,14 @@ def read(data: bytes, key: Optional[bytes] = None) -> Datagram:
     magic, version, header, number, flags = struct.unpack_from("<4sBBBB", data)
     if magic != b"SHUB":
         raise Refused("magic")
-    if version != 1:
+    if version != 2:
         raise Refused("version")
-    if not 48 <= header <= len(data):
+    fields = struct.unpack_from("<QIIQBBBxHHII", data, 8)
+    hub, epoch, sequence, stamp_ns, sensor, part, parts, length, revision, counter, crc = fields
+    if not 48 <= header <= len(data) or part >= parts:
         raise Refused("header")
-    hub, epoch, sequence, stamp_ns, sensor, length, revision, counter, crc = struct.unpack_from("<QIIQB3xHHII", data, 8)
     end = header + length
-    if end + (16 if flags & AUTHENTICATED else 0) != len(data):
+    if end + (16 if flags & AUTHENTICATED else 0) != len(data) or (parts > 1 and length > 1424):
         raise Refused("length")
     without = data[:44] + bytes(4) + data[48:]
     if crc32c(without) != crc:
@@ -294,8 +343,38 @@ def read(data: bytes, key: Optional[bytes] = None) -> Datagram:
             raise Refused("mac")
     payload, authenticated = data[header:end], key is not None
     return Datagram(
-        number, flags, hub, epoch, sequence, stamp_ns, sensor, revision, counter, payload, authenticated
+        number, flags, hub, epoch, sequence, stamp_ns, sensor, part, parts, revision, counter, payload, authenticated
     )
+
+
+class Parts:
+    """Puts together what comes in parts, of one sender: of each hub, sensor and topic at most four samples wait for parts
+    that did not come, and no more than 64 in all; the oldest make room."""
+
+    def __init__(self):
+        self._unfinished: "dict[tuple[Datagram, int], dict[int, bytes]]" = {}
+
+    def take(self, datagram: Datagram) -> Optional[Datagram]:
+        """The sample that is whole with this datagram; None as long as parts of it are missing."""
+        if datagram.parts == 1:
+            return datagram
+        head = replace(datagram, part=0, parts=1, payload=b"")
+        # What waits for longest stands first.
+        parts = self._unfinished.pop((head, datagram.parts), {})
+        parts[datagram.part] = datagram.payload
+        if len(parts) == datagram.parts:
+            return replace(head, payload=b"".join(parts[i] for i in range(datagram.parts)))
+
+        def topic(of):
+            return of.hub, of.epoch, of.sensor, of.number
+
+        others = [key for key in self._unfinished if topic(key[0]) == topic(head)]
+        same = [key for key in others if key[0].sequence == head.sequence]
+        oldest = others if len(others) >= 4 else list(self._unfinished) if len(self._unfinished) >= 64 else []
+        for key in same or oldest[:1]:
+            del self._unfinished[key]
+        self._unfinished[head, datagram.parts] = parts
+        return None
 
 
 def crc32c(data: bytes) -> int:
@@ -345,20 +424,48 @@ _OF_NAMES = b"abcdefghijklmnopqrstuvwxyz0123456789_-"
 
 
 def _telegram(payload: bytes) -> Telegram:
-    stx, length = struct.unpack_from("<BxH", payload)
-    _limit(stx == 0x02 and length + 6 <= min(len(payload), 814))
+    if payload[:1] not in (b"", b"\x02"):
+        _limit(len(payload) <= 814)
+        return Telegram(payload)
+    (length,) = struct.unpack_from("<2xH", payload)
+    _limit(length + 6 <= min(len(payload), 814))
     return Telegram(payload[: length + 6])
 
 
 def _scan(payload: bytes) -> Scan:
-    count, unit_mm, range_bits, first, step, intensity_bits, contents = struct.unpack_from("<HBBiHBB", payload)
-    _limit(count <= 401 and range_bits <= 16)
-    ranges = struct.unpack_from(f"<{count}H", payload, 12)
-    upper = b""
-    if contents & 1:
-        (upper,) = struct.unpack_from(f"<{count}s", payload, 12 + 2 * count)
-    upper = upper if any(upper) else b""
-    return Scan(count, unit_mm, range_bits, first, step, intensity_bits, ranges, upper, payload)
+    first, step, spacing, *numbers = struct.unpack_from("<ddfIiIHHHHHBBBBBxI12x", payload)
+    beam_time_ns, first_beam_ns, unit_um, count, valid_to, no_return, beyond, collapsed = numbers[:8]
+    family, flags, contents, intensity_bits, turns, turn_ns = numbers[8:]
+    _limit(count <= 8192 and contents <= 7 and all(map(math.isfinite, (first, step, spacing))))
+    # Exact angles, ranges, wide intensities, upper bits: those that there are.
+    form = f"<{count * (contents >> 2 & 1)}f{count}H{count * (contents >> 1 & 1)}H{count * (contents & 1)}s"
+    *values, upper = struct.unpack_from(form, payload, 64)
+    exact = tuple(values[: count * (contents >> 2 & 1)])
+    ranges = tuple(values[len(exact) : len(exact) + count])
+    wide = tuple(values[len(exact) + count :]) if contents & 2 else tuple(upper)
+    return Scan(
+        FAMILIES[family] if family < len(FAMILIES) else None,
+        unit_um,
+        count,
+        first,
+        step,
+        spacing,
+        beam_time_ns,
+        first_beam_ns,
+        turns,
+        turn_ns,
+        valid_to,
+        no_return,
+        beyond,
+        collapsed,
+        bool(flags & 1),
+        intensity_bits,
+        exact,
+        ranges,
+        wide if intensity_bits else (),
+        upper,
+        payload,
+    )
 
 
 def _marks(payload: bytes) -> Marks:
@@ -376,22 +483,22 @@ def _zones(payload: bytes) -> Zones:
 
 
 def _foreground(payload: bytes) -> Foreground:
-    generation, count, number, unit_mm, left_out, segments = struct.unpack_from("<IHHBBH", payload)
-    _limit(number <= count <= 401 and segments <= 64)
+    generation, unit_um, count, number, segments, left_out = struct.unpack_from("<IIHHHH", payload)
+    _limit(number <= count <= 8192 and segments <= 64)
     size = (count + 7) // 8
-    bits, *ranges = struct.unpack_from(f"<{size}s{number}H", payload, 12)
+    bits, *ranges = struct.unpack_from(f"<{size}s{number}H", payload, 16)
     beams = tuple(i for i in range(8 * size) if bits[i // 8] >> i % 8 & 1)
-    items = _items(Segment, "<HHHHii", payload, 12 + size + 2 * number, segments)
+    items = _items(Segment, "<HHHHii", payload, 16 + size + 2 * number, segments)
     _limit(len(beams) == number and all(beam < count for beam in beams))
     _limit(all(item.first <= item.last < count for item in items))
-    return Foreground(generation, count, unit_mm, left_out, beams, tuple(ranges), items)
+    return Foreground(generation, count, unit_um, left_out, beams, tuple(ranges), items)
 
 
 def _background(payload: bytes) -> Background:
-    generation, taught, count, unit_mm, flags = struct.unpack_from("<IHHBB2x", payload)
-    _limit(count <= 401)
-    ranges = struct.unpack_from(f"<{count}H", payload, 12)
-    return Background(generation, taught, count, unit_mm, bool(flags & 1), ranges)
+    first, step, generation, unit_um, taught, count, flags = struct.unpack_from("<ddIIHHB3x", payload)
+    _limit(count <= 8192 and math.isfinite(first) and math.isfinite(step))
+    ranges = struct.unpack_from(f"<{count}H", payload, 32)
+    return Background(generation, taught, count, unit_um, first, step, bool(flags & 1), ranges)
 
 
 def _status(payload: bytes) -> Status:

@@ -16,6 +16,10 @@ local TOPICS = {
 }
 local VERDICTS = { [0] = "clear", "slow", "stop", "unknown" }
 local STATES = { [0] = "absent", "probing", "switching", "starting", "streaming", "silent", "paused" }
+local FAMILIES = { [0] = "lms", "ld" }
+local CODES = { [0] = "not_measured", "no_return", "beyond", "too_near", "too_bright", "weak", "overflow", "error" }
+-- From the greatest value of an LMS's measuring mode down.
+local OF_LMS = { [0] = "no_return", [1] = "too_bright", [4] = "weak", [5] = "error", [8] = "beyond" }
 local COUNTERS = {
     "bytes_read", "bytes_in_telegrams", "bytes_acknowledge", "bytes_discarded", "bytes_buffered", "telegrams",
     "suspect", "aborted", "resyncs", "reconnects", "lost_in_restart", "wakeups", "loan_failed", "rejected_address",
@@ -48,6 +52,8 @@ field("sequence", "uint32", "Sequence")
 field("stamp_ns", "uint64", "Stamp, ns since 1970")
 field("stamp", "absolute_time", "Stamp", base.UTC)
 field("sensor", "uint8", "Sensor")
+field("part", "uint8", "Part, from 0")
+field("parts", "uint8", "Parts of the sample")
 field("sensor_name", "string", "Sensor's name")
 field("payload_length", "uint16", "Payload length")
 field("revision", "uint16", "Payload revision")
@@ -73,20 +79,33 @@ field("announce.next", "uint32", "Next sequence")
 
 field("telegram", "bytes", "Telegram")
 
+field("scan.first_angle", "double", "First angle, rad, 0 ahead")
+field("scan.step", "double", "Step, rad")
+field("scan.spacing", "float", "Between two points of the sensor, rad")
+field("scan.beam_time_ns", "uint32", "From beam to beam, ns")
+field("scan.first_beam_ns", "int32", "First beam after the stamp, ns")
+field("scan.unit_um", "uint32", "Micrometres per unit")
 field("scan.count", "uint16", "Beams")
-field("scan.unit_mm", "uint8", "Millimetres per unit")
-field("scan.range_bits", "uint8", "Bits of a range")
-field("scan.first_angle_mdeg", "int32", "First angle, 1/1000 degree")
-field("scan.step_mdeg", "uint16", "Step, 1/1000 degree")
+field("scan.valid_to", "uint16", "Greatest range")
+field("scan.no_return", "uint16", "Code of no return")
+field("scan.beyond", "uint16", "Code of beyond the range limit")
+field("scan.collapsed", "uint16", "Points that found their beam taken")
+field("scan.family", "uint8", "Family", base.DEC, FAMILIES)
+field("scan.incomplete", "uint8", "Incomplete", base.DEC, nil, 1)
+field("scan.contents", "uint8", "Arrays", base.HEX)
 field("scan.intensity_bits", "uint8", "Bits of intensity")
-field("scan.contents", "uint8", "Contents", base.HEX)
+field("scan.turns", "uint8", "Turns")
+field("scan.turn_ns", "uint32", "Time of a turn, ns")
+field("scan.angle", "float", "Exact angle, rad")
 field("scan.range", "uint16", "Range, device units")
+field("scan.code", "string", "No reading")
+field("scan.intensity", "uint16", "Intensity")
 field("scan.upper", "uint8", "Upper bits")
 
 field("marks.count", "uint8", "Marks")
 field("marks.overflow", "uint8", "Overflow", base.DEC, nil, 1)
 field("marks.unavailable", "uint8", "Unavailable", base.DEC, nil, 2)
-field("marks.angle_mdeg", "int32", "Angle, 1/1000 degree")
+field("marks.angle_mdeg", "int32", "Angle, 1/1000 degree, 0 ahead")
 field("marks.range_dmm", "uint32", "Range, 1/10 mm")
 field("marks.weight", "uint16", "Weight")
 field("marks.peak", "uint8", "Peak")
@@ -107,8 +126,8 @@ field("zones.violated", "uint8", "Violated")
 field("foreground.generation", "uint32", "Generation")
 field("foreground.count", "uint16", "Beams of the scan")
 field("foreground.beams", "uint16", "Beams in the foreground")
-field("foreground.unit_mm", "uint8", "Millimetres per unit")
-field("foreground.left_out", "uint8", "Segments left out")
+field("foreground.unit_um", "uint32", "Micrometres per unit")
+field("foreground.left_out", "uint16", "Segments left out")
 field("foreground.segments", "uint16", "Segments")
 field("foreground.set", "bytes", "Beams, a bit each")
 field("foreground.beam", "uint16", "Beam")
@@ -120,10 +139,12 @@ field("foreground.width", "uint16", "Width, device units")
 field("foreground.x_mm", "int32", "x, mm")
 field("foreground.y_mm", "int32", "y, mm")
 
+field("background.first_angle", "double", "First angle, rad, 0 ahead")
+field("background.step", "double", "Step, rad")
 field("background.generation", "uint32", "Generation")
 field("background.taught", "uint16", "Beams taught")
 field("background.count", "uint16", "Beams")
-field("background.unit_mm", "uint8", "Millimetres per unit")
+field("background.unit_um", "uint32", "Micrometres per unit")
 field("background.frozen", "uint8", "Frozen", base.DEC, nil, 1)
 field("background.range", "uint16", "Range, device units")
 
@@ -273,33 +294,78 @@ unpack_payload[0] = function(payload, tree, hub, sensor)
 end
 
 unpack_payload[1] = function(payload, tree)
-    if payload:len() < 4 or payload(0, 1):uint() ~= 2 then return nil end
-    local len = payload(2, 2):le_uint() + 6
-    if len > payload:len() or len > 814 then return nil end
+    local len = payload:len()
+    -- Of an LMS it says its length; of other families it is all of the payload.
+    if len > 0 and payload(0, 1):uint() == 2 then
+        if len < 4 then return nil end
+        len = payload(2, 2):le_uint() + 6
+    end
+    if len == 0 or len > payload:len() or len > 814 then return nil end
     tree:add(f["telegram"], payload(0, len))
     return len .. " bytes"
 end
 
+local function is_finite(number)
+    return number == number and math.abs(number) < math.huge
+end
+
+-- What a value stands for that is no range.
+local function code_of(value, family, no_return)
+    if value ~= 0xFFFF and family == 0 then return OF_LMS[no_return - value] or "overflow" end
+    return CODES[math.min(0xFFFF - value, 7)]
+end
+
 unpack_payload[2] = function(payload, tree)
     local len = payload:len()
-    if len < 12 then return nil end
-    local count, contents = payload(0, 2):le_uint(), payload(11, 1):uint()
-    local has_upper = contents % 2 == 1
-    if count > 401 or payload(3, 1):uint() > 16 or len < 12 + (has_upper and 3 or 2) * count then return nil end
-    add_fields(tree, payload, 0, "scan.count", 2, "scan.unit_mm", 1, "scan.range_bits", 1, "scan.first_angle_mdeg", 4,
-        "scan.step_mdeg", 2, "scan.intensity_bits", 1, "scan.contents", 1)
-    if count > 0 then
-        local ranges = tree:add(payload(12, 2 * count), "Ranges")
-        for i = 0, count - 1 do
-            ranges:add_le(f["scan.range"], payload(12 + 2 * i, 2)):prepend_text("Beam " .. i .. ": ")
-        end
-        if has_upper then
-            local upper = tree:add(payload(12 + 2 * count, count), "Upper bits")
-            for i = 0, count - 1 do
-                upper:add(f["scan.upper"], payload(12 + 2 * count + i, 1)):prepend_text("Beam " .. i .. ": ")
-            end
-        end
+    if len < 64 then return nil end
+    local count, valid_to, no_return = payload(32, 2):le_uint(), payload(34, 2):le_uint(), payload(36, 2):le_uint()
+    local family, contents, intensity_bits = payload(42, 1):uint(), payload(44, 1):uint(), payload(45, 1):uint()
+    local sizes = {
+        angle = contents >= 4 and 4 or 0,
+        range = 2,
+        wide = contents % 4 >= 2 and 2 or 0,
+        upper = contents % 2,
+    }
+    local of_beam = sizes.angle + sizes.range + sizes.wide + sizes.upper
+    if count > 8192 or contents > 7 or len < 64 + of_beam * count then return nil end
+    if not (is_finite(payload(0, 8):le_float()) and is_finite(payload(8, 8):le_float())
+        and is_finite(payload(16, 4):le_float())) then
+        return nil
     end
+    add_fields(tree, payload, 0, "scan.first_angle", 8, "scan.step", 8, "scan.spacing", 4, "scan.beam_time_ns", 4,
+        "scan.first_beam_ns", 4, "scan.unit_um", 4, "scan.count", 2, "scan.valid_to", 2, "scan.no_return", 2,
+        "scan.beyond", 2, "scan.collapsed", 2, "scan.family", 1, "scan.incomplete", 1, "scan.contents", 1,
+        "scan.intensity_bits", 1, "scan.turns", 1)
+    add_fields(tree, payload, 48, "scan.turn_ns", 4)
+    if count == 0 then return "0 beams" end
+    local at = 64
+    -- Calls `each` with the number and the bytes of each beam in the next array.
+    local function array(name, size, each)
+        if size == 0 then return end
+        local branch = tree:add(payload(at, size * count), name)
+        for i = 0, count - 1 do
+            each(branch, i, payload(at + size * i, size))
+        end
+        at = at + size * count
+    end
+    local function add(branch, name, i, bytes)
+        return branch:add_le(f[name], bytes):prepend_text("Beam " .. i .. ": ")
+    end
+    array("Exact angles", sizes.angle, function(branch, i, bytes)
+        local angle = bytes:le_float()
+        if angle == angle then add(branch, "scan.angle", i, bytes) end
+    end)
+    array("Ranges", sizes.range, function(branch, i, bytes)
+        local item, value = add(branch, "scan.range", i, bytes), bytes:le_uint()
+        if value > valid_to then item:add(f["scan.code"], bytes, code_of(value, family, no_return)) end
+    end)
+    array("Intensities", sizes.wide, function(branch, i, bytes)
+        if intensity_bits > 0 then add(branch, "scan.intensity", i, bytes) end
+    end)
+    array("Upper bits", sizes.upper, function(branch, i, bytes)
+        local item = add(branch, "scan.upper", i, bytes)
+        if intensity_bits > 0 and sizes.wide == 0 then item:add_le(f["scan.intensity"], bytes) end
+    end)
     return count .. " beams"
 end
 
@@ -335,30 +401,30 @@ end
 
 unpack_payload[5] = function(payload, tree)
     local len = payload:len()
-    if len < 12 then return nil end
-    local count, beams, segments = payload(4, 2):le_uint(), payload(6, 2):le_uint(), payload(10, 2):le_uint()
+    if len < 16 then return nil end
+    local count, beams, segments = payload(8, 2):le_uint(), payload(10, 2):le_uint(), payload(12, 2):le_uint()
     local set = math.floor((count + 7) / 8)
-    if count > 401 or beams > count or segments > 64 or len < 12 + set + 2 * beams + 16 * segments then return nil end
+    if count > 8192 or beams > count or segments > 64 or len < 16 + set + 2 * beams + 16 * segments then return nil end
     local members = {}
     for i = 0, 8 * set - 1 do
-        if bits.band(bits.rshift(payload(12 + math.floor(i / 8), 1):uint(), i % 8), 1) == 1 then
+        if bits.band(bits.rshift(payload(16 + math.floor(i / 8), 1):uint(), i % 8), 1) == 1 then
             if i >= count then return nil end
             table.insert(members, i)
         end
     end
     if #members ~= beams then return nil end
-    local begin = 12 + set + 2 * beams
+    local begin = 16 + set + 2 * beams
     for at = begin, begin + 16 * segments - 1, 16 do
         local first, last = payload(at, 2):le_uint(), payload(at + 2, 2):le_uint()
         if first > last or last >= count then return nil end
     end
-    add_fields(tree, payload, 0, "foreground.generation", 4, "foreground.count", 2, "foreground.beams", 2,
-        "foreground.unit_mm", 1, "foreground.left_out", 1, "foreground.segments", 2)
-    if set > 0 then tree:add(f["foreground.set"], payload(12, set)) end
+    add_fields(tree, payload, 0, "foreground.generation", 4, "foreground.unit_um", 4, "foreground.count", 2,
+        "foreground.beams", 2, "foreground.segments", 2, "foreground.left_out", 2)
+    if set > 0 then tree:add(f["foreground.set"], payload(16, set)) end
     for n, beam in ipairs(members) do
-        local range = payload(12 + set + 2 * (n - 1), 2)
+        local range = payload(16 + set + 2 * (n - 1), 2)
         local item = tree:add(range, "Beam " .. beam)
-        item:add(f["foreground.beam"], payload(12 + math.floor(beam / 8), 1), beam)
+        item:add(f["foreground.beam"], payload(16 + math.floor(beam / 8), 1), beam)
         item:add_le(f["foreground.range"], range)
     end
     for i = 0, segments - 1 do
@@ -371,15 +437,16 @@ end
 
 unpack_payload[6] = function(payload, tree)
     local len = payload:len()
-    if len < 12 then return nil end
-    local count = payload(6, 2):le_uint()
-    if count > 401 or len < 12 + 2 * count then return nil end
-    add_fields(tree, payload, 0, "background.generation", 4, "background.taught", 2, "background.count", 2,
-        "background.unit_mm", 1, "background.frozen", 1)
+    if len < 32 then return nil end
+    local count = payload(26, 2):le_uint()
+    if count > 8192 or len < 32 + 2 * count then return nil end
+    if not (is_finite(payload(0, 8):le_float()) and is_finite(payload(8, 8):le_float())) then return nil end
+    add_fields(tree, payload, 0, "background.first_angle", 8, "background.step", 8, "background.generation", 4,
+        "background.unit_um", 4, "background.taught", 2, "background.count", 2, "background.frozen", 1)
     for i = 0, count - 1 do
-        tree:add_le(f["background.range"], payload(12 + 2 * i, 2)):prepend_text("Beam " .. i .. ": ")
+        tree:add_le(f["background.range"], payload(32 + 2 * i, 2)):prepend_text("Beam " .. i .. ": ")
     end
-    return payload(4, 2):le_uint() .. " of " .. count .. " beams taught"
+    return payload(24, 2):le_uint() .. " of " .. count .. " beams taught"
 end
 
 unpack_payload[7] = function(payload, tree)
@@ -407,11 +474,13 @@ local function refusal(tvb)
     local len = tvb:len()
     if len < 48 then return "short" end
     if tvb(0, 4):string() ~= "SHUB" then return "magic" end
-    if tvb(4, 1):uint() ~= 1 then return "version" end
+    if tvb(4, 1):uint() ~= 2 then return "version" end
     local header = tvb(5, 1):uint()
-    if header < 48 or header > len then return "header" end
+    local part, parts = tvb(33, 1):uint(), tvb(34, 1):uint()
+    if header < 48 or header > len or part >= parts then return "header" end
     local mac = tvb(7, 1):uint() % 2 * 16
     if header + tvb(36, 2):le_uint() + mac ~= len then return "length" end
+    if parts > 1 and tvb(36, 2):le_uint() > 1424 then return "length" end
     if scanhub.prefs.crc and crc_of(tvb) ~= tvb(44, 4):le_uint() then return "crc" end
     return nil
 end
@@ -427,7 +496,7 @@ local function add_header(tvb, tree)
     local stamp_ns = tvb(24, 8):le_uint64()
     local stamp = NSTime.new((stamp_ns / 1000000000):tonumber(), (stamp_ns % 1000000000):tonumber())
     tree:add(f["stamp"], tvb(24, 8), stamp):set_generated()
-    tree:add(f["sensor"], tvb(32, 1))
+    add_fields(tree, tvb, 32, "sensor", 1, "part", 1, "parts", 1)
     add_fields(tree, tvb, 36, "payload_length", 2, "revision", 2, "counter", 4)
 end
 
@@ -463,14 +532,18 @@ function scanhub.dissector(tvb, pinfo, root)
 
     local unpack = unpack_payload[topic]
     local words
-    if unpack and length > 0 and tvb(38, 2):le_uint() > 0 then
+    local part, parts = tvb(33, 1):uint(), tvb(34, 1):uint()
+    if unpack and parts > 1 then
+        words = string.format("part %d of %d, %d bytes", part + 1, parts, length)
+    elseif unpack and length > 0 and tvb(38, 2):le_uint() > 0 then
         local payload = tvb(header, length)
         words = unpack(payload:tvb(), tree:add(payload, "Payload: " .. TOPICS[topic]), hub, sensor)
     end
     if not words then
         return add_refusal(tree, pinfo, unpack and "payload" or "skipped")
     end
-    if not pinfo.visited then
+    -- A number is that of the whole sample: its first part stands for it.
+    if not pinfo.visited and part == 0 then
         findings[pinfo.number] = judge(hub, epoch, sensor, topic, sequence)
     end
     local name = names[hub .. "/" .. sensor]

@@ -55,7 +55,7 @@ impl Background {
             Order::Save { file, force } => ModelOrder::Save { file: file.clone(), force: *force },
             Order::Load { file, any_sensor } => {
                 let model = saved_model(file, &self.sensor, *any_sensor, &mut stdin())?;
-                ModelOrder::Load(Box::new(model))
+                ModelOrder::Load(model)
             }
         };
         Ok(BackgroundOptions {

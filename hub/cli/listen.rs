@@ -4,6 +4,7 @@ use std::io::{IsTerminal, stdout};
 
 use clap::Args;
 use schema::Failure;
+use schema::limits::TopicLimits;
 use verbs::ListenOptions;
 
 use super::{Everywhere, Limits};
@@ -29,6 +30,9 @@ pub(crate) struct Listen {
     /// use them like sensors of a hub
     #[arg(long)]
     publish: bool,
+    /// Places for consumers of each published topic, 1 to 250
+    #[arg(long, value_name = "N", requires = "publish", default_value_t = 32, value_parser = clap::value_parser!(u16).range(1..=250))]
+    consumers: u16,
     #[command(flatten)]
     limits: Limits,
 }
@@ -42,6 +46,7 @@ impl Listen {
             hubs: self.hubs.clone(),
             stats: self.stats,
             publish: if self.publish { Some(everywhere.hub_domain()?) } else { None },
+            limits: TopicLimits { consumers: self.consumers.into(), ..TopicLimits::default() },
             json: everywhere.json,
             terminal: stdout().is_terminal(),
             bounds: self.limits.bounds(),

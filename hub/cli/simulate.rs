@@ -34,7 +34,8 @@ pub(crate) struct Simulate {
     /// crowd, demo, empty, wall640 or random; or a TOML file, see docs/worlds.md
     #[arg(long, default_value = "room", value_name = "NAME|FILE", conflicts_with = "replay")]
     world: String,
-    /// Recording to send instead: MCAP file, telegram stream or CARMEN log, plain or gzipped
+    /// Recording to send instead: MCAP file, telegram stream or CARMEN log, plain or gzipped; of family ld the bytes that
+    /// one sent
     #[arg(long, value_name = "FILE")]
     replay: Option<PathBuf>,
     /// Which sensor of the recording, if it has several: one for all ports, or one for each in their order
@@ -55,9 +56,15 @@ pub(crate) struct Simulate {
     /// Write one JSON line per telegram to this file: what was sent, with its hash
     #[arg(long, value_name = "FILE")]
     truth: Option<PathBuf>,
-    /// Type of the sensors, which also limits what they support: lms200, lms211, lms221 or lms291
-    #[arg(long = "type", default_value = "lms200", value_name = "TYPE")]
+    /// Family of the sensors: lms (SICK LMS 2xx) or ld (LDROBOT)
+    #[arg(long, default_value = "lms", value_name = "FAMILY")]
     family: String,
+    /// Model, of family ld: ld06, ld19, stl19p, stl27l or ld14p [default: ld19]
+    #[arg(long, value_name = "NAME")]
+    model: Option<String>,
+    /// Type of the sensors of family lms, which also limits what they support: lms200, lms211, lms221 or lms291
+    #[arg(long = "type", default_value = "lms200", value_name = "TYPE")]
+    lms_type: String,
     /// Angle and resolution [default: the recording's, else 180/0.5, or 100/0.5 of an lms211]
     #[arg(long, value_name = "DEGREES/STEP")]
     variant: Option<String>,
@@ -104,7 +111,7 @@ impl Simulate {
             seed: self.seed,
             faults: self.fault.parse()?,
             truth: self.truth.clone(),
-            family: options::parse_type(&self.family)?,
+            family: options::parse_type(&self.lms_type)?,
             variant: self.variant.as_deref().map(options::parse_variant).transpose()?,
             unit: self.unit.as_deref().map(options::parse_unit).transpose()?,
             mode: self.mode.as_deref().map(options::parse_mode).transpose()?,
@@ -114,6 +121,7 @@ impl Simulate {
             errors: self.error.iter().map(|text| options::parse_error(text)).collect::<Result<_, _>>()?,
             pollution: self.pollution,
             chunk: self.chunk.parse()?,
+            model: options::parse_family(&self.family, self.model.as_deref())?,
         })
     }
 }

@@ -292,9 +292,9 @@ mod tests {
     #[test]
     fn a_single_beam_is_not_the_nearest() {
         let mut sensor = Sensor::default();
-        let scan = |ranges: Value| serde_json::json!({ "unit_mm": 10, "first_angle_deg": 0.0, "step_deg": 0.5, "ranges": ranges });
+        let scan = |ranges: Value| serde_json::json!({ "unit_mm": 10, "first_angle_deg": -90.0, "step_deg": 0.5, "ranges": ranges });
         sensor.take_scan(&scan(serde_json::json!([400, 400, 3, 400, null, 7, null, 120, 110, 300])));
-        assert_eq!((sensor.nearest_mm, sensor.nearest_deg), (Some(1200), 3.5));
+        assert_eq!((sensor.nearest_mm, sensor.nearest_deg), (Some(1200), -86.5));
         sensor.take_scan(&scan(serde_json::json!([null, 3, null])));
         assert_eq!(sensor.nearest_mm, None);
     }

@@ -1,11 +1,7 @@
 //! Requests to a running hub, and its answers: the payloads of the control service. Refuses to know who carries out a
 //! request.
 
-use bytemuck::{Pod, Zeroable};
-#[cfg(feature = "ipc")]
-use iceoryx2::prelude::ZeroCopySend;
-
-use crate::{BEAMS, Background, Failure, Kind, text};
+use crate::{Background, Failure, Kind, text};
 
 /// What a request asks for.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -60,65 +56,48 @@ impl Verb {
     }
 }
 
-/// A request, 848 bytes. Fields that a verb does not use are 0.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Pod, Zeroable)]
-#[cfg_attr(feature = "ipc", derive(ZeroCopySend), type_name("scanhub.Request.v1"))]
-#[repr(C)]
+/// A request. Its bytes are the sensor's name in 32, the verb in two, little-endian, six of 0, and the model for
+/// [`Verb::Load`].
+#[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Request {
-    /// See [`Request::sensor`].
-    pub sensor_text: [u8; 32],
-    /// See [`Request::verb`].
-    pub verb: u16,
-    /// Ranges used, at most [`BEAMS`].
-    pub count: u16,
-    /// Millimetres per unit of the ranges.
-    pub unit_mm: u8,
-    /// 0.
-    pub reserved: [u8; 3],
-    /// Ranges in device units; 0 beyond `count`.
-    pub range_array: [u16; BEAMS],
-    /// 0.
-    pub pad: [u8; 6],
+    /// The sensor that is meant.
+    pub sensor: String,
+    /// Nothing if a newer client has one that this program does not know.
+    pub verb: Option<Verb>,
+    /// The model to load.
+    pub model: Option<Box<Background>>,
 }
 
 impl Request {
     /// Asks for `verb` at `sensor`, a name of at most 32 bytes.
     pub fn new(sensor: &str, verb: Verb) -> Request {
-        let mut request = Request { verb: verb as u16, ..Zeroable::zeroed() };
-        text::write(&mut request.sensor_text, sensor);
-        request
+        Request { sensor: sensor.to_owned(), verb: Some(verb), model: None }
     }
 
     /// Asks `sensor` to use the ranges of `model` as its background.
     pub fn load(sensor: &str, model: &Background) -> Request {
-        let mut request = Request::new(sensor, Verb::Load);
-        request.count = model.count;
-        request.unit_mm = model.unit_mm;
-        request.range_array = model.range_array;
-        request
+        Request { model: Some(model.boxed()), ..Request::new(sensor, Verb::Load) }
     }
 
-    /// Returns the model that it brings, for [`Verb::Load`]: generation and flags are 0.
-    pub fn model(&self) -> Background {
-        let mut model = Background {
-            count: self.count.min(BEAMS as u16),
-            unit_mm: self.unit_mm,
-            ..Background::default()
-        };
-        let used = usize::from(model.count);
-        model.range_array[..used].copy_from_slice(&self.range_array[..used]);
-        model.taught = model.ranges().iter().filter(|&&range| range != Background::UNTAUGHT).count() as u16;
-        model
+    /// Returns the request as bytes.
+    pub fn encode(&self) -> Vec<u8> {
+        let mut bytes = vec![0; REQUEST_HEAD];
+        text::write(&mut bytes[..SENSOR], &self.sensor);
+        let verb = self.verb.map_or(0, |verb| verb as u16);
+        bytes[SENSOR..SENSOR + 2].copy_from_slice(&verb.to_le_bytes());
+        bytes.extend_from_slice(self.model.as_ref().map_or(&[], |model| model.bytes()));
+        bytes
     }
 
-    /// Returns the sensor that is meant.
-    pub fn sensor(&self) -> &str {
-        text::read(&self.sensor_text)
-    }
-
-    /// Returns the verb; nothing if a newer client has one that this program does not know.
-    pub fn verb(&self) -> Option<Verb> {
-        Verb::all().find(|verb| *verb as u16 == self.verb)
+    /// Returns the request in `bytes`, if that is one.
+    pub fn decode(bytes: &[u8]) -> Option<Request> {
+        let (head, model) = bytes.split_at_checked(REQUEST_HEAD)?;
+        let verb = u16::from_le_bytes([head[SENSOR], head[SENSOR + 1]]);
+        Some(Request {
+            sensor: text::read(&head[..SENSOR]).to_owned(),
+            verb: Verb::all().find(|known| *known as u16 == verb),
+            model: if model.is_empty() { None } else { Some(Background::read(model)?) },
+        })
     }
 }
 
@@ -126,26 +105,26 @@ impl Request {
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Shown {
     /// As it is now.
-    pub model: Background,
+    pub model: Box<Background>,
     /// When the model was saved that the next hub starts with, in nanoseconds since 1970; nothing if there is none.
     pub kept_wall_ns: Option<u64>,
 }
 
-impl From<Background> for Shown {
+impl From<Box<Background>> for Shown {
     /// A model that is not saved.
-    fn from(model: Background) -> Shown {
+    fn from(model: Box<Background>) -> Shown {
         Shown { model, kept_wall_ns: None }
     }
 }
 
 /// An answer: success, with the requested model if there is one, or a failure. Its bytes are exit code and message length
-/// (two bytes each, little-endian), then the message, then the packed model. The second line of the message of a failure
+/// (two bytes each, little-endian), then the message, then the model. The second line of the message of a failure
 /// is the remedy; with a model, it is the time at which a model was saved, in decimal digits.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Response(pub Result<Option<Shown>, Failure>);
 
 impl Response {
-    /// The longest response in bytes; a message beyond it is cut.
+    /// Bytes of a response without a model; a message beyond it is cut.
     pub const MAX: usize = 1024;
 
     /// Returns the response as bytes.
@@ -161,7 +140,7 @@ impl Response {
         text::write(&mut message, said.trim_end());
         let head = [u16::from(code), message.len() as u16].map(u16::to_le_bytes);
         let model = self.0.as_ref().ok().and_then(Option::as_ref);
-        let model = model.map_or(&[][..], |shown| shown.model.packed());
+        let model = model.map_or(&[][..], |shown| shown.model.bytes());
         [head.as_flattened(), &message, model].concat()
     }
 
@@ -174,7 +153,7 @@ impl Response {
             let kept_wall_ns = message.parse().ok();
             return Some(Response(Ok(match model {
                 [] => None,
-                model => Some(Shown { model: Background::unpack(model)?, kept_wall_ns }),
+                model => Some(Shown { model: Background::read(model)?, kept_wall_ns }),
             })));
         }
         let kind = ANSWERS.into_iter().find(|kind| u16::from(kind.exit_code()) == code);
@@ -186,33 +165,45 @@ impl Response {
 /// Exit code and message length.
 const HEAD: usize = 4;
 
+/// Bytes of a request for the sensor's name, and before the model.
+const SENSOR: usize = 32;
+const REQUEST_HEAD: usize = 40;
+
 /// The failures that a hub answers with; each exit code stands for one of them.
 const ANSWERS: [Kind; 4] = [Kind::Failed, Kind::NoTopic, Kind::Short, Kind::Configuration];
-
-const _: () = assert!(HEAD + Background::MAX_PACKED <= Response::MAX);
 
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::BackgroundHead;
 
     #[test]
     fn verbs_go_there_and_back() {
         for verb in Verb::all() {
             assert_eq!(Verb::parse(verb.name()), Some(verb));
             let request = Request::new("front", verb);
-            assert_eq!((request.sensor(), request.verb()), ("front", Some(verb)));
+            assert_eq!(Request::decode(&request.encode()), Some(request));
         }
-        let unknown = Request { verb: 99, ..Request::new("front", Verb::Pause) };
-        assert_eq!((unknown.verb(), Verb::parse("stop")), (None, None));
+        let request = Request::load("front", &Background::of(BackgroundHead::default(), &[7; 8192]));
+        let bytes = request.encode();
+        assert_eq!(Request::decode(&bytes), Some(request));
+        for cut in [0, 39, 41, bytes.len() - 1] {
+            assert_eq!(Request::decode(&bytes[..cut]), None, "{cut}");
+        }
+        let mut unknown = Request::new("front", Verb::Pause).encode();
+        unknown[32] = 99;
+        let verb = Request::decode(&unknown).map(|request| request.verb);
+        assert_eq!((verb, Verb::parse("stop")), (Some(None), None));
     }
 
     #[test]
     fn responses_go_there_and_back() {
         let failure = |kind, hint: &str| Response(Err(Failure::new(kind, "front: no", hint)));
-        let model = Background { count: 361, generation: 7, ..Background::default() };
+        let head = BackgroundHead { generation: 7, ..BackgroundHead::default() };
+        let model = Background::of(head, &[0; 361]);
         for response in [
             Response(Ok(None)),
-            Response(Ok(Some(model.into()))),
+            Response(Ok(Some(model.clone().into()))),
             Response(Ok(Some(Shown { model, kept_wall_ns: Some(u64::MAX) }))),
             failure(Kind::Failed, ""),
             failure(Kind::Short, "later"),

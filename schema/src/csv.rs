@@ -2,7 +2,7 @@
 
 use std::io::{self, Write};
 
-use crate::{Header, Scan};
+use crate::{Header, Scan, in_degrees};
 
 /// Writes the names of the columns of scans with so many beams, without a line's end.
 ///
@@ -10,7 +10,7 @@ use crate::{Header, Scan};
 ///
 /// The error of `out`, or of what it writes to.
 pub fn columns(line: &mut impl Write, beams: usize) -> io::Result<()> {
-    write!(line, "seq,topic_seq,stamp_ns,wall_ns,quality,unit_mm,first_angle_deg,step_deg")?;
+    write!(line, "seq,topic_seq,stamp_ns,wall_ns,quality,unit_um,first_angle_deg,step_deg")?;
     (0..beams).try_for_each(|i| write!(line, ",range_{i}"))
 }
 
@@ -22,7 +22,7 @@ pub fn columns(line: &mut impl Write, beams: usize) -> io::Result<()> {
 pub fn row(line: &mut impl Write, header: &Header, scan: &Scan) -> io::Result<()> {
     let (stamp_ns, wall_ns) = (header.stamp_first_ns, header.wall_ns);
     write!(line, "{},{},{stamp_ns},{wall_ns},{}", header.seq, header.topic_seq, header.quality().name())?;
-    write!(line, ",{},{},{}", scan.unit_mm, scan.angle_deg(0), f64::from(scan.step_mdeg) / 1000.0)?;
+    write!(line, ",{},{},{}", scan.unit_um, in_degrees(scan.first_angle), in_degrees(scan.step))?;
     (0..scan.beams()).try_for_each(|i| match scan.range(i) {
         Some(range) => write!(line, ",{range}"),
         None => write!(line, ","),

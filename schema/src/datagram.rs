@@ -1,4 +1,4 @@
-//! A sample on a network: one datagram, readable without a library, checked before any of it is used. Refuses to know
+//! A sample on a network: a datagram, or several if it is longer, readable without a library, checked before any of it is used. Refuses to know
 //! sockets, senders and what is missing between two datagrams. Needs neither shared memory nor a heap.
 
 mod announce;
@@ -20,7 +20,7 @@ pub use payload::{Packed, telegram};
 pub use standing::{Arrival, Standing};
 pub use stream_stats::{GivenUp, ROWS, StreamStats};
 
-use crate::{Telegram, Topic};
+use crate::Topic;
 
 /// Bytes before the payload.
 pub const HEAD: usize = 48;
@@ -28,10 +28,14 @@ pub const HEAD: usize = 48;
 pub const MAC: usize = 16;
 /// The longest datagram that is never fragmented where tunnels leave an MTU of 1400.
 pub const MTU_SAFE: usize = 1372;
-/// The longest telegram with its header: a gateway that sends shorter datagrams could not send it.
-pub const MTU_LEAST: usize = HEAD + Telegram::MAX;
+/// The shortest limit that a gateway can be given: what every network has to carry. Longer samples go in parts.
+pub const MTU_LEAST: usize = 576;
 /// The longest datagram on an Ethernet.
 pub const MTU_ETHERNET: usize = 1472;
+/// The longest payload of a part.
+pub const PART_LONGEST: usize = MTU_ETHERNET - HEAD;
+/// The most parts of a sample.
+pub const PARTS: usize = 255;
 /// Port of all groups.
 pub const PORT: u16 = 22_200;
 /// The first three bytes of all groups, of which [`group`] is the last.
@@ -54,7 +58,7 @@ impl LanFlags {
 }
 
 /// The header, before the payload.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Head {
     /// [`Announce::NUMBER`], or a topic's [`Topic::number`].
     pub topic: u8,
@@ -64,16 +68,39 @@ pub struct Head {
     pub hub: u64,
     /// The gateway's life: seconds since 1970 at its start, or one more than the last one.
     pub epoch: u32,
-    /// Number of the datagram among those of this sensor and topic, from 0, wrapping.
+    /// Number of the sample among those of this sensor and topic, from 0, wrapping.
     pub sequence: u32,
     /// The wall clock of the telegram's first byte, ns since 1970; of announce and status that of sending.
     pub stamp_ns: u64,
     /// Position of the sensor's link in the hub's configuration.
     pub sensor: u8,
+    /// Which part of the sample this is, from 0.
+    pub part: u8,
+    /// In how many parts the sample comes; 1 for most.
+    pub parts: u8,
     /// Revision of the payload: a greater one only appends.
     pub revision: u16,
     /// The lower half of the sample's `seq`: joins the samples of one telegram.
     pub counter: u32,
+}
+
+impl Default for Head {
+    /// All 0, and the only part.
+    fn default() -> Self {
+        Head {
+            topic: 0,
+            flags: 0,
+            hub: 0,
+            epoch: 0,
+            sequence: 0,
+            stamp_ns: 0,
+            sensor: 0,
+            part: 0,
+            parts: 1,
+            revision: 0,
+            counter: 0,
+        }
+    }
 }
 
 /// A datagram whose header, lengths and checksum are right.
@@ -81,7 +108,7 @@ pub struct Head {
 pub struct Datagram<'a> {
     /// The header, before the payload.
     pub head: Head,
-    /// The payload; [`Packed::unpack`] checks its content.
+    /// The payload, or a part of it; [`Packed::unpack`] checks the content of a whole one.
     pub payload: &'a [u8],
     /// The MAC, if there is one. It is not checked here.
     pub mac: Option<&'a [u8; MAC]>,
@@ -100,7 +127,7 @@ impl Head {
         head[16..20].copy_from_slice(&self.epoch.to_le_bytes());
         head[20..24].copy_from_slice(&self.sequence.to_le_bytes());
         head[24..32].copy_from_slice(&self.stamp_ns.to_le_bytes());
-        head[32..36].copy_from_slice(&[self.sensor, 0, 0, 0]);
+        head[32..36].copy_from_slice(&[self.sensor, self.part, self.parts, 0]);
         head[36..38].copy_from_slice(&u16::try_from(len).ok()?.to_le_bytes());
         head[38..40].copy_from_slice(&self.revision.to_le_bytes());
         head[40..44].copy_from_slice(&self.counter.to_le_bytes());
@@ -134,7 +161,8 @@ impl<'a> Datagram<'a> {
             return Err(DatagramError::Version);
         }
         let begin = usize::from(head[5]);
-        if begin < HEAD || begin > bytes.len() {
+        let (part, parts) = (head[33], head[34]);
+        if begin < HEAD || begin > bytes.len() || part >= parts {
             return Err(DatagramError::Header);
         }
         let two = |at: usize| u16::from_le_bytes([head[at], head[at + 1]]);
@@ -143,6 +171,9 @@ impl<'a> Datagram<'a> {
         let flags = head[7];
         let (payload, mac) =
             bytes[begin..].split_at_checked(usize::from(two(36))).ok_or(DatagramError::Length)?;
+        if parts > 1 && payload.len() > PART_LONGEST {
+            return Err(DatagramError::Length);
+        }
         let mac = match (flags & LanFlags::AUTHENTICATED != 0, mac) {
             (false, []) => None,
             (true, mac) => Some(mac.try_into().map_err(|_| DatagramError::Length)?),
@@ -163,6 +194,8 @@ impl<'a> Datagram<'a> {
             sequence: four(20),
             stamp_ns: eight(24),
             sensor: head[32],
+            part,
+            parts,
             revision: two(38),
             counter: four(40),
         };
@@ -177,7 +210,7 @@ pub fn group(topic: Topic) -> u8 {
 }
 
 const MAGIC: &[u8; 4] = b"SHUB";
-const VERSION: u8 = 1;
+const VERSION: u8 = 2;
 /// Where the checksum stands; it is taken over the datagram with these four bytes as 0.
 const CRC_AT: usize = 44;
 const CRC: Crc<u32, Table<16>> = Crc::<u32, Table<16>>::new(&CRC_32_ISCSI);
@@ -210,6 +243,8 @@ mod tests {
             sequence: 3,
             stamp_ns: 4,
             sensor: 5,
+            part: 1,
+            parts: 255,
             revision: 6,
             counter: 7,
         };
@@ -229,7 +264,8 @@ mod tests {
         };
         assert_eq!(Datagram::read(&good[..47]), Err(DatagramError::Short));
         assert_eq!(with(0, b'X'), DatagramError::Magic);
-        assert_eq!(with(4, 2), DatagramError::Version);
+        assert_eq!((with(4, 1), with(4, 3)), (DatagramError::Version, DatagramError::Version));
+        assert_eq!((with(33, 1), with(34, 0)), (DatagramError::Header, DatagramError::Header));
         assert_eq!((with(5, 47), with(5, 53)), (DatagramError::Header, DatagramError::Header));
         assert_eq!(
             (with(36, 3), with(36, 5), with(7, 1)),
@@ -241,6 +277,16 @@ mod tests {
             Err(DatagramError::Length),
             "nothing may follow"
         );
+    }
+
+    #[test]
+    fn a_part_is_no_longer_than_a_datagram_on_an_ethernet() {
+        let of = |parts, len| {
+            let (head, mut buffer) = (Head { parts, ..Head::default() }, vec![0; 2000]);
+            Datagram::read(head.seal(&mut buffer, len).unwrap()).map(|datagram| datagram.payload.len())
+        };
+        assert_eq!((of(2, PART_LONGEST), of(1, 1900)), (Ok(PART_LONGEST), Ok(1900)));
+        assert_eq!(of(2, PART_LONGEST + 1), Err(DatagramError::Length));
     }
 
     #[test]

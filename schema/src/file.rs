@@ -16,7 +16,9 @@ use crate::{Header, Topic};
 pub use compression::Compression;
 
 /// Encoding of the messages, and of the text that describes them.
-pub const ENCODING: &str = "scanhub";
+pub const ENCODING: &str = "scanhub.v2";
+/// That of recordings of version 1: header, telegrams, marks, zones and statuses are as they are now, the others are not.
+pub const ENCODING_V1: &str = "scanhub";
 /// Name of the metadata record at the start of a recording: who recorded what, where.
 pub const METADATA: &str = "scanhub";
 
@@ -207,7 +209,7 @@ pub fn parts(message: &[u8]) -> Option<(Header, &[u8])> {
 /// Returns the name of the type of `topic`'s messages.
 pub fn schema(topic: Topic) -> &'static str {
     match topic {
-        Topic::Telegram => "scanhub.Telegram.v1",
+        Topic::Telegram => "scanhub.Telegram.v2",
         other => other.payload(),
     }
 }

@@ -1,48 +1,46 @@
-//! What is in front of the background, in one scan. Refuses to know how a background is learned.
+//! What stands before the background in one scan: its beams with their ranges, and the segments that they form. Refuses
+//! to know how they are found.
 
-use bytemuck::{Pod, Zeroable};
+use std::fmt;
+
+use bytemuck::{Pod, Zeroable, cast_slice, cast_slice_mut};
 #[cfg(feature = "ipc")]
 use iceoryx2::prelude::ZeroCopySend;
 
-use crate::BEAMS;
+use crate::sliced::sliced;
 
 /// The most segments of a scan.
 pub const SEGMENTS: usize = 64;
-/// Bytes of a set of beams.
-const SET: usize = BEAMS.div_ceil(8);
 
-/// The payload of topic `foreground`, 1892 bytes: one sample per scan, an empty one too.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Pod, Zeroable)]
-#[cfg_attr(feature = "ipc", derive(ZeroCopySend), type_name("scanhub.Foreground.v1"))]
+/// What stands before the arrays of a [`Foreground`]. 16 bytes.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Pod, Zeroable)]
 #[repr(C)]
-pub struct Foreground {
+pub struct ForegroundHead {
     /// Generation of the background model that the scan was compared with.
     pub generation: u32,
-    /// Beams of the scan, at most [`BEAMS`].
+    /// Micrometres per device unit.
+    pub unit_um: u32,
+    /// Beams of the scan.
     pub count: u16,
     /// Beams in the foreground.
     pub beams: u16,
-    /// Millimetres per device unit: 1, 10 or 100.
-    pub unit_mm: u8,
-    /// Segments that did not fit; 255: or more.
-    pub left_out: u8,
     /// Segments used, at most [`SEGMENTS`].
     pub segments: u16,
-    /// The beams in the foreground: beam i is bit i % 8 of byte i / 8.
-    pub bit_array: [u8; SET],
+    /// Segments that did not fit.
+    pub left_out: u16,
+}
+
+sliced! {
+    /// The payload of topic `foreground`, one sample per scan, an empty one too: a [`ForegroundHead`], which its fields are
+    /// read through, and behind it [`SEGMENTS`] segments of 16 bytes, a bit for every beam of the scan in pairs of bytes, and
+    /// a range of two bytes for every beam of the scan. Of segments and ranges those that are used come first, the others are
     /// 0.
-    pub pad: [u8; 1],
-    /// Their ranges in device units, as many as beams, in their order; 0 beyond.
-    pub range_array: [u16; BEAMS],
-    /// 0.
-    pub pad2: [u8; 2],
-    /// The segments in the order of their beams; 0 beyond `segments`.
-    pub segment_array: [Segment; SEGMENTS],
+    Foreground, ForegroundWord, "scanhub.Foreground.v2", ForegroundHead
 }
 
 /// Neighbouring foreground beams that belong together.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Pod, Zeroable)]
-#[cfg_attr(feature = "ipc", derive(ZeroCopySend), type_name("scanhub.Segment.v1"))]
+#[cfg_attr(feature = "ipc", derive(ZeroCopySend), type_name("scanhub.Segment.v2"))]
 #[repr(C)]
 pub struct Segment {
     /// Its first beam.
@@ -59,32 +57,107 @@ pub struct Segment {
     pub y_mm: i32,
 }
 
-impl Default for Foreground {
-    fn default() -> Self {
-        Zeroable::zeroed()
-    }
+/// The arrays of a foreground that is written.
+#[derive(Debug)]
+pub struct ForegroundArrays<'a> {
+    /// All places for segments.
+    pub segments: &'a mut [Segment],
+    /// The beams in the foreground: beam i is bit i % 8 of byte i / 8.
+    pub bits: &'a mut [u8],
+    /// Their ranges in device units, in the order of the beams: places for all beams of the scan.
+    pub ranges: &'a mut [u16],
 }
 
 impl Foreground {
+    /// Returns the bytes of the foreground of a scan of so many beams.
+    pub const fn len(beams: usize) -> usize {
+        BITS + set(beams) + 2 * beams
+    }
+
+    /// Returns an empty foreground of a scan of `beams` beams.
+    pub fn of(beams: usize) -> Box<Foreground> {
+        let mut foreground = Foreground::zeroed(Foreground::len(beams));
+        foreground.count = beams as u16;
+        foreground
+    }
+
+    /// Writes `head` and returns the arrays, which have to be filled.
+    ///
+    /// # Panics
+    ///
+    /// If the memory is too short for them.
+    pub fn begin(&mut self, head: ForegroundHead) -> ForegroundArrays<'_> {
+        **self = head;
+        let n = usize::from(head.count);
+        let (segments, rest) = self.memory_mut()[Foreground::HEAD..].split_at_mut(BITS - Foreground::HEAD);
+        let (bits, rest) = rest.split_at_mut(set(n));
+        ForegroundArrays {
+            segments: cast_slice_mut(segments),
+            bits: &mut bits[..n.div_ceil(8)],
+            ranges: cast_slice_mut(&mut rest[..2 * n]),
+        }
+    }
+
     /// Returns whether beam `i` is in the foreground.
     pub fn contains(&self, i: usize) -> bool {
-        i < BEAMS && self.bit_array[i / 8] >> (i % 8) & 1 == 1
+        self.bits().get(i / 8).is_some_and(|byte| byte >> (i % 8) & 1 == 1)
     }
 
     /// Returns the beams in the foreground with their ranges in device units, in the order of the beams.
     pub fn readings(&self) -> impl Iterator<Item = (usize, u16)> + '_ {
-        (0..BEAMS).filter(|&i| self.contains(i)).zip(self.ranges().iter().copied())
+        (0..self.scan_beams()).filter(|&i| self.contains(i)).zip(self.ranges().iter().copied())
     }
 
     /// Returns the ranges of the foreground beams in device units.
     pub fn ranges(&self) -> &[u16] {
-        &self.range_array[..usize::from(self.beams).min(BEAMS)]
+        let (n, begin) = (usize::from(self.beams).min(self.scan_beams()), BITS + set(self.scan_beams()));
+        self.memory().get(begin..begin + 2 * n).map_or(&[], cast_slice)
     }
 
     /// Returns the segments that are used.
     pub fn segments(&self) -> &[Segment] {
-        &self.segment_array[..usize::from(self.segments).min(SEGMENTS)]
+        let all: &[Segment] = self.memory().get(Foreground::HEAD..BITS).map_or(&[], cast_slice);
+        &all[..usize::from(self.segments).min(all.len())]
     }
+
+    /// Returns a bit for every beam of the scan, as [`ForegroundArrays::bits`].
+    pub(crate) fn bits(&self) -> &[u8] {
+        self.memory().get(BITS..BITS + self.scan_beams().div_ceil(8)).unwrap_or_default()
+    }
+
+    /// Writes 0 to the first `len` bytes; `false` if there is too little memory.
+    pub(crate) fn clear(&mut self, len: usize) -> bool {
+        self.memory_mut().get_mut(..len).map(|memory| memory.fill(0)).is_some()
+    }
+
+    /// Beams of the scan, as far as there is memory for them.
+    fn scan_beams(&self) -> usize {
+        let n = usize::from(self.count);
+        if Foreground::len(n) <= self.memory().len() { n } else { 0 }
+    }
+
+    fn used(&self) -> usize {
+        Foreground::len(self.scan_beams())
+    }
+}
+
+impl fmt::Debug for Foreground {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let readings: Vec<_> = self.readings().collect();
+        f.debug_struct("Foreground")
+            .field("head", &**self)
+            .field("readings", &readings)
+            .field("segments", &self.segments())
+            .finish()
+    }
+}
+
+/// Where the bits begin.
+const BITS: usize = Foreground::HEAD + SEGMENTS * size_of::<Segment>();
+
+/// Bytes of a bit for every beam; the ranges behind them take two each.
+const fn set(beams: usize) -> usize {
+    2 * beams.div_ceil(16)
 }
 
 #[cfg(test)]
@@ -92,12 +165,14 @@ mod tests {
     use super::*;
 
     #[test]
-    fn readings_pair_beams_with_packed_ranges() {
-        let mut foreground = Foreground { beams: 2, ..Foreground::default() };
-        foreground.bit_array[0] = 0x80;
-        foreground.bit_array[50] = 1;
-        foreground.range_array[..2].copy_from_slice(&[700, 800]);
+    fn readings_pair_beams_with_ranges() {
+        let mut foreground = Foreground::of(401);
+        let arrays = foreground.begin(ForegroundHead { count: 401, beams: 2, ..ForegroundHead::default() });
+        (arrays.bits[0], arrays.bits[50]) = (0x80, 1);
+        arrays.ranges[..2].copy_from_slice(&[700, 800]);
         assert_eq!(foreground.readings().collect::<Vec<_>>(), [(7, 700), (400, 800)]);
-        assert!(!foreground.contains(401));
+        assert!(!foreground.contains(401) && !foreground.contains(10_000));
+        foreground.count = 2000;
+        assert_eq!(foreground.readings().count(), 0, "there is no memory for so many");
     }
 }

@@ -7,7 +7,7 @@ use iceoryx2::prelude::ZeroCopySend;
 
 /// The user header of every topic, 64 bytes, the same for all.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Pod, Zeroable)]
-#[cfg_attr(feature = "ipc", derive(ZeroCopySend), type_name("scanhub.Header.v1"))]
+#[cfg_attr(feature = "ipc", derive(ZeroCopySend), type_name("scanhub.Header.v2"))]
 #[repr(C)]
 pub struct Header {
     /// Number of the telegram that the sample was made from: per sensor and run of the hub, from 0. In a status, the

@@ -1,4 +1,4 @@
-//! From a topic to its service in shared memory, with all limits. The only file that names the builders of iceoryx2:
+//! From a topic to its service in shared memory, with all limits. Nobody but this module names the builders of iceoryx2:
 //! everybody else gets ports. Refuses to know when something is sent and who reads it.
 
 mod bell;
@@ -7,6 +7,7 @@ mod control;
 mod counter;
 mod leftover;
 mod nodes;
+mod payload;
 mod sleep;
 mod strangers;
 mod topic_publisher;
@@ -14,37 +15,33 @@ mod trouble;
 mod unheld;
 mod wake;
 
-use std::borrow::BorrowMut;
-use std::fmt::Debug;
 use std::os::unix::ffi::OsStrExt;
 use std::path::Path;
 use std::time::Duration;
 
 use iceoryx2::config::Config;
 use iceoryx2::port;
-use iceoryx2::port::subscriber::SubscriberCreateError;
 use iceoryx2::prelude::{
-    AttributeSet, AttributeVerifier, CallbackProgression, FileName, IceoryxSend, LogLevel, NodeBuilder,
-    SemanticString, ServiceName, SignalHandlingMode, set_log_level_from_env_or,
+    AttributeSet, CallbackProgression, FileName, LogLevel, NodeBuilder, SemanticString, ServiceName,
+    SignalHandlingMode, set_log_level_from_env_or,
 };
 use iceoryx2::service::Service as _;
 use iceoryx2::service::port_factory::{event, publish_subscribe};
 
-use self::trouble::{Trouble, create, full, no_port, no_publisher, open};
 use crate::lock::MakingLock;
-use crate::shortage::check_client;
-use crate::{Directory, Domain, Failure, Header, Kind, Topic, access, limits, of_service, prefix};
+use crate::{Directory, Domain, Failure, Header, Kind, Topic, access, of_service, prefix};
 
 pub use self::bell::{Bell, Unsupported, sleep_at_bells};
 pub use self::clean::{Cleaned, clean};
 pub use self::control::{Asked, ControlClient, ControlServer, Pending};
 pub use self::nodes::{Nodes, nodes};
+pub use self::payload::Payload;
 pub use self::sleep::{descriptor, sleep, take_wakeups};
 pub(crate) use self::strangers::in_the_way;
 pub use self::strangers::{Segment, strangers};
 pub use self::topic_publisher::{Medium, SharedMemory, TopicPublisher};
 pub use self::unheld::is_unheld;
-pub use self::wake::{Waker, listener, open_wake};
+pub use self::wake::{DueRings, Waker, listener, open_wake};
 pub use iceoryx2::port::update_connections::UpdateConnections;
 pub use iceoryx2::port::{LoanError, ReceiveError, SendError};
 /// Shared memory between processes; ports of it stay in their thread, nodes and services may move.
@@ -57,15 +54,15 @@ pub const LIBRARY: &str = "iceoryx2 0.10.0";
 /// The membership of a process in a domain.
 pub type Node = iceoryx2::node::Node<Service>;
 /// A topic of one sensor.
-pub type TopicService<P> = publish_subscribe::PortFactory<Service, P, Header>;
+pub type TopicService<P> = publish_subscribe::PortFactory<Service, <P as Payload>::Memory, Header>;
 /// Sends the samples of a topic.
-pub type Publisher<P> = port::publisher::Publisher<Service, P, Header>;
+pub type Publisher<P> = port::publisher::Publisher<Service, <P as Payload>::Memory, Header>;
 /// Receives the samples of a topic.
-pub type Subscriber<P> = port::subscriber::Subscriber<Service, P, Header>;
+pub type Subscriber<P> = port::subscriber::Subscriber<Service, <P as Payload>::Memory, Header>;
 /// A received sample: the payload by `*`, read-only, in shared memory; the header by `user_header()`.
-pub type Sample<P> = iceoryx2::sample::Sample<Service, P, Header>;
+pub type Sample<P> = iceoryx2::sample::Sample<Service, <P as Payload>::Memory, Header>;
 /// A loaned sample that is not sent yet.
-pub type SampleMut<P> = iceoryx2::sample_mut::SampleMut<Service, P, Header>;
+pub type SampleMut<P> = iceoryx2::sample_mut::SampleMut<Service, <P as Payload>::Memory, Header>;
 /// What wakes the consumers of one sensor.
 pub type WakeService = event::PortFactory<Service>;
 /// Wakes consumers.
@@ -92,172 +89,10 @@ pub fn client_node(domain: &Domain) -> Result<Node, Failure> {
     node(domain, false)
 }
 
-/// What a topic carries; implemented by `[u8]` (telegram) and the payloads of the other topics.
-pub trait Payload: IceoryxSend + Debug + 'static {
-    /// The topic that carries it.
-    const TOPIC: Topic;
-
-    /// Returns the topic of `sensor`, made if it is not there: for the hub. What a dead hub's consumers keep alive is reused.
-    ///
-    /// # Errors
-    ///
-    /// [`Kind::Short`] if memory or descriptors are short, [`Kind::Failed`] if it is there with another layout.
-    fn create(node: &Node, sensor: &str) -> Result<TopicService<Self>, Failure>;
-
-    /// Returns the topic of `sensor`, or nothing as long as no hub has made it: for consumers.
-    ///
-    /// # Errors
-    ///
-    /// [`Kind::Short`] if memory or descriptors are short, [`Kind::Failed`] if it has another layout.
-    fn open(node: &Node, sensor: &str) -> Result<Option<TopicService<Self>>, Failure>;
-
-    /// Returns the publisher of a topic. A sample is loaned, written in place, and sent with `send()`, which returns how many
-    /// consumers got it: `loan_slice_uninit(n)` + `write_from_slice` for a telegram, `loan()` for all else.
-    ///
-    /// # Errors
-    ///
-    /// [`Kind::DomainHeld`] if the topic has a publisher already.
-    fn publisher(topic: &TopicService<Self>) -> Result<Publisher<Self>, Failure>;
-
-    /// Returns a consumer's end of a topic.
-    ///
-    /// # Errors
-    ///
-    /// [`Kind::Short`] if memory, descriptors or places for consumers are.
-    fn subscriber(topic: &TopicService<Self>) -> Result<Subscriber<Self>, Failure>;
-
-    /// Returns the oldest sample that waits, or nothing.
-    ///
-    /// # Errors
-    ///
-    /// [`ReceiveError::ExceedsMaxBorrows`] if [`limits::BORROWED`] samples are held; [`ReceiveError::ConnectionFailure`] if
-    /// the publisher's memory cannot be mapped.
-    fn receive(subscriber: &Subscriber<Self>) -> Result<Option<Sample<Self>>, ReceiveError>;
-
-    /// Returns the payload of a sample, in shared memory.
-    fn read(sample: &Sample<Self>) -> &Self;
-
-    /// Returns the memory of a sample, with a payload's default in it; bytes are `len`.
-    ///
-    /// # Errors
-    ///
-    /// The library's, if there is none.
-    fn loan(publisher: &Publisher<Self>, len: usize) -> Result<SampleMut<Self>, LoanError>;
-
-    /// Returns the payload of a sample that is not sent yet.
-    fn write(loan: &mut SampleMut<Self>) -> &mut Self;
-
-    /// A payload in the memory of this process.
-    type Owned: BorrowMut<Self>;
-
-    /// Returns a payload's default in the memory of this process; bytes are `len`.
-    fn owned(len: usize) -> Self::Owned;
-
-    /// Returns the payload as it lies in memory.
-    fn bytes(&self) -> &[u8];
+/// Returns the number of consumers that `topic` was made for.
+pub fn places<P: Payload + ?Sized>(topic: &TopicService<P>) -> usize {
+    topic.static_config().max_subscribers()
 }
-
-/// iceoryx2 has a slice and a value behind two impl blocks of the same words; this says them once.
-macro_rules! payload {
-    ($payload:ty, $topic:expr, $len:ident, $owned:ty, $make:expr, |$builder:ident| $sized:expr, |$publisher:ident| $loan:expr, $bytes:path) => {
-        impl Payload for $payload {
-            const TOPIC: Topic = $topic;
-
-            fn create(node: &Node, sensor: &str) -> Result<TopicService<Self>, Failure> {
-                let (service, revision) = (name(&$topic.service(sensor))?, revision($topic)?);
-                create(node, &service, || {
-                    let builder = node.service_builder(&service).publish_subscribe::<$payload>();
-                    builder
-                        .user_header::<Header>()
-                        .max_publishers(limits::PUBLISHERS)
-                        .max_subscribers(limits::subscribers($topic))
-                        .max_nodes(limits::NODES)
-                        .subscriber_max_buffer_size(limits::buffer($topic))
-                        .subscriber_max_borrowed_samples(limits::BORROWED)
-                        .history_size(limits::history($topic))
-                        .enable_safe_overflow(true)
-                        .open_or_create_with_attributes(&revision)
-                        .map_err(Trouble::from)
-                })
-            }
-
-            fn open(node: &Node, sensor: &str) -> Result<Option<TopicService<Self>>, Failure> {
-                let service = name(&$topic.service(sensor))?;
-                let builder = node.service_builder(&service).publish_subscribe::<$payload>();
-                open(node, &service, builder.user_header::<Header>().open())
-            }
-
-            fn publisher(topic: &TopicService<Self>) -> Result<Publisher<Self>, Failure> {
-                let $builder = topic
-                    .publisher_builder()
-                    .max_loaned_samples(limits::LOANED)
-                    .override_sample_preallocation(|_| limits::samples($topic));
-                $sized.create().map_err(|error| no_publisher(topic.name(), error))
-            }
-
-            fn subscriber(topic: &TopicService<Self>) -> Result<Subscriber<Self>, Failure> {
-                check_client()?;
-                topic.subscriber_builder().create().map_err(|error| match error {
-                    SubscriberCreateError::ExceedsMaxSupportedSubscribers => {
-                        full(topic.name(), limits::subscribers($topic))
-                    }
-                    other => no_port(topic.name(), &other),
-                })
-            }
-
-            fn receive(subscriber: &Subscriber<Self>) -> Result<Option<Sample<Self>>, ReceiveError> {
-                subscriber.receive()
-            }
-
-            fn read(sample: &Sample<Self>) -> &Self {
-                sample
-            }
-
-            fn loan($publisher: &Publisher<Self>, $len: usize) -> Result<SampleMut<Self>, LoanError> {
-                $loan
-            }
-
-            fn write(loan: &mut SampleMut<Self>) -> &mut Self {
-                loan.payload_mut()
-            }
-
-            type Owned = $owned;
-
-            fn owned($len: usize) -> $owned {
-                $make
-            }
-
-            fn bytes(&self) -> &[u8] {
-                $bytes(self)
-            }
-        }
-    };
-}
-
-/// A payload without a size of its own is loaned in the length of the longest.
-macro_rules! payloads {
-    ($($topic:ident $payload:tt, $name:literal, $($column:tt),*: $about:literal;)*) => {
-        $(payloads!($payload, $topic);)*
-    };
-    ([u8], $topic:ident) => {
-        payload!(
-            [u8], Topic::$topic, len, Vec<u8>, vec![0; len],
-            |builder| builder.initial_max_slice_len(crate::Telegram::MAX),
-            |publisher| publisher.loan_slice(len),
-            std::convert::identity
-        );
-    };
-    ($payload:tt, $topic:ident) => {
-        payload!(
-            crate::$payload, Topic::$topic, _len, Box<crate::$payload>, Box::default(),
-            |builder| builder,
-            |publisher| publisher.loan(),
-            bytemuck::bytes_of
-        );
-    };
-}
-
-crate::for_each_topic!(payloads);
 
 /// Returns the sensors that have topics in `domain`, sorted. Those of a dead hub stay as long as a consumer keeps them.
 ///
@@ -380,12 +215,4 @@ fn name(service: &str) -> Result<ServiceName, Failure> {
     ServiceName::new(service).map_err(|error| {
         Failure::new(Kind::Configuration, format!("{service:?} is no service: {error:?}"), "")
     })
-}
-
-fn revision(topic: Topic) -> Result<AttributeVerifier, Failure> {
-    let impossible = |_| Failure::new(Kind::Failed, "the payload's revision is no attribute", "");
-    let value = topic.revision().to_string();
-    let key = REVISION.try_into().map_err(|_| impossible(()))?;
-    let value = value.as_str().try_into().map_err(|_| impossible(()))?;
-    AttributeVerifier::new().require(&key, &value).map_err(|_| impossible(()))
 }

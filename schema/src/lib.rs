@@ -16,6 +16,7 @@ mod marks;
 mod pose;
 mod printable;
 mod scan;
+mod sliced;
 mod status;
 mod telegram;
 mod text;
@@ -43,20 +44,22 @@ pub mod shortage;
 mod state;
 
 pub use age::Age;
-pub use background::Background;
+pub use background::{Background, BackgroundHead, BackgroundWord};
 pub use control::{Request, Response, Shown, Verb};
 pub use domain::{DEFAULT_DOMAIN, Domain, Environment};
 pub use failure::{Failure, Kind};
-pub use foreground::{Foreground, SEGMENTS, Segment};
+pub use foreground::{Foreground, ForegroundArrays, ForegroundHead, ForegroundWord, SEGMENTS, Segment};
 pub use header::{Flags, Header, Quality, Reasons};
 pub use marks::{MARKS, Mark, Marks};
 pub use pose::Pose;
 pub use printable::{Printable, escape_json, json_line};
-pub use scan::{BEAMS, CONTENTS_UPPER, Code, Scan, TURN_NS};
+pub use scan::{
+    BEAMS, Code, Contents, Family, Intensities, Scan, ScanArrays, ScanHead, ScanWord, in_degrees,
+};
 pub use status::{COUNTERS, Counter, Counters, State, Status};
 pub use telegram::Telegram;
 pub use topic::{
-    CONTROL, CONTROL_REQUEST, CONTROL_RESPONSE, Pace, ROBOT, Row, Topic, WAKE, Wake, check_followed,
+    CONTROL, CONTROL_REQUEST, CONTROL_RESPONSE, Pace, ROBOT, Ring, Row, Topic, WAKE, Wake, check_followed,
     check_sensor, is_remote, of_service,
 };
 pub use zones::{Verdict, ZONES, Zone, Zones};
@@ -66,6 +69,6 @@ pub use directory::Directory;
 #[cfg(feature = "ipc")]
 pub use lock::{HubLock, ListenLock, holder, publisher};
 #[cfg(feature = "json")]
-pub use saved::{SavedModel, as_json};
+pub use saved::{SavedModel, as_json, unit_in_mm};
 #[cfg(feature = "ipc")]
 pub use state::StateDirectory;

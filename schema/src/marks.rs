@@ -9,7 +9,7 @@ pub const MARKS: usize = 64;
 
 /// The payload of topic `marks`, 1028 bytes: one sample per scan.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Pod, Zeroable)]
-#[cfg_attr(feature = "ipc", derive(ZeroCopySend), type_name("scanhub.Marks.v1"))]
+#[cfg_attr(feature = "ipc", derive(ZeroCopySend), type_name("scanhub.Marks.v2"))]
 #[repr(C)]
 pub struct Marks {
     /// Marks used, at most [`MARKS`].
@@ -24,10 +24,10 @@ pub struct Marks {
 
 /// One mark: neighbouring beams that a reflector answered.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Pod, Zeroable)]
-#[cfg_attr(feature = "ipc", derive(ZeroCopySend), type_name("scanhub.Mark.v1"))]
+#[cfg_attr(feature = "ipc", derive(ZeroCopySend), type_name("scanhub.Mark.v2"))]
 #[repr(C)]
 pub struct Mark {
-    /// Sensor angle in 1/1000 degree: 0 right, 90 ahead.
+    /// Sensor angle in 1/1000 degree, as in the scan: 0 ahead, counter-clockwise.
     pub angle_mdeg: i32,
     /// Range in 1/10 mm.
     pub range_dmm: u32,

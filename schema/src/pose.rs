@@ -8,7 +8,7 @@ use iceoryx2::prelude::ZeroCopySend;
 ///
 /// The default is a sensor at the centre that looks ahead.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Pod, Zeroable)]
-#[cfg_attr(feature = "ipc", derive(ZeroCopySend), type_name("scanhub.Pose.v1"))]
+#[cfg_attr(feature = "ipc", derive(ZeroCopySend), type_name("scanhub.Pose.v2"))]
 #[repr(C)]
 pub struct Pose {
     /// Metres ahead of the centre.
@@ -24,18 +24,17 @@ pub struct Pose {
 }
 
 impl Pose {
-    /// Returns the direction of the beam at sensor angle `angle_mdeg` (1/1000 degree; 0 right, 90 ahead, as an upright
-    /// sensor sees it) in the robot's frame: a unit vector.
-    pub fn direction(&self, angle_mdeg: i32) -> (f64, f64) {
-        let ahead_deg = f64::from(angle_mdeg) / 1000.0 - 90.0;
-        let aside_deg = if self.upside_down == 0 { ahead_deg } else { -ahead_deg };
-        let (sin, cos) = (self.yaw_rad + aside_deg.to_radians()).sin_cos();
+    /// Returns the direction of the beam at sensor angle `angle` (radians; 0 ahead, counter-clockwise as an upright sensor
+    /// sees it) in the robot's frame: a unit vector.
+    pub fn direction(&self, angle: f64) -> (f64, f64) {
+        let turned = if self.upside_down == 0 { angle } else { -angle };
+        let (sin, cos) = (self.yaw_rad + turned).sin_cos();
         (cos, sin)
     }
 
     /// Returns the point at `range_mm` on that beam in the robot's frame, in mm.
-    pub fn point_mm(&self, angle_mdeg: i32, range_mm: f64) -> (f64, f64) {
-        let (x, y) = self.direction(angle_mdeg);
+    pub fn point_mm(&self, angle: f64, range_mm: f64) -> (f64, f64) {
+        let (x, y) = self.direction(angle);
         (1000.0 * self.x_m + range_mm * x, 1000.0 * self.y_m + range_mm * y)
     }
 }
@@ -49,12 +48,15 @@ mod tests {
     fn beams_point_where_the_sensor_is_turned_and_mounted() {
         let near = |(x, y): (f64, f64), (a, b): (f64, f64)| (x - a).abs() < 1e-9 && (y - b).abs() < 1e-9;
         let ahead = Pose { x_m: 0.3, y_m: -0.1, ..Pose::default() };
-        assert!(near(ahead.point_mm(90_000, 500.0), (800.0, -100.0)));
-        assert!(near(ahead.point_mm(0, 500.0), (300.0, -600.0)), "the first beam looks right");
+        assert!(near(ahead.point_mm(0.0, 500.0), (800.0, -100.0)));
+        assert!(near(ahead.point_mm(-FRAC_PI_2, 500.0), (300.0, -600.0)), "the first beam looks right");
         let rear = Pose { yaw_rad: 2.0 * FRAC_PI_2, ..Pose::default() };
-        assert!(near(rear.direction(0), (0.0, 1.0)), "behind, right is left");
+        assert!(near(rear.direction(-FRAC_PI_2), (0.0, 1.0)), "behind, right is left");
         let turned_over = Pose { yaw_rad: FRAC_PI_2, upside_down: 1, ..Pose::default() };
-        assert!(near(turned_over.direction(90_000), (0.0, 1.0)));
-        assert!(near(turned_over.direction(0), (-1.0, 0.0)), "upside down, the first beam looks left");
+        assert!(near(turned_over.direction(0.0), (0.0, 1.0)));
+        assert!(
+            near(turned_over.direction(-FRAC_PI_2), (-1.0, 0.0)),
+            "upside down, the first beam looks left"
+        );
     }
 }

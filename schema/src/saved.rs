@@ -3,7 +3,7 @@
 
 use serde::{Deserialize, Serialize, Serializer};
 
-use crate::{Background, Failure, Kind};
+use crate::{BEAMS, Background, BackgroundHead, Failure, Kind, in_degrees};
 
 /// A model that was read, and its sensor.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -11,7 +11,7 @@ pub struct SavedModel {
     /// The sensor that it was saved from.
     pub sensor: String,
     /// The model, with the generation and flags that it had.
-    pub model: Background,
+    pub model: Box<Background>,
 }
 
 /// Returns `model` of `sensor` as an object of class `background`: what [`SavedModel::parse`] reads. Angles are null as long as
@@ -23,7 +23,8 @@ pub fn as_json<'a>(sensor: &'a str, model: &'a Background) -> impl Serialize + '
         sensor: &'a str,
         generation: u32,
         taught: u16,
-        unit_mm: u8,
+        #[serde(serialize_with = "unit_in_mm")]
+        unit_mm: u32,
         count: u16,
         first_angle_deg: Option<f64>,
         step_deg: Option<f64>,
@@ -33,16 +34,16 @@ pub fn as_json<'a>(sensor: &'a str, model: &'a Background) -> impl Serialize + '
         #[serde(serialize_with = "far_beams")]
         far: &'a [u16],
     }
-    let (first_angle_mdeg, step_mdeg) = model.angles_mdeg().unzip();
+    let in_degrees = |angle| (model.step != 0.0).then(|| in_degrees(angle));
     Line {
         class: CLASS,
         sensor,
         generation: model.generation,
         taught: model.taught,
-        unit_mm: model.unit_mm,
+        unit_mm: model.unit_um,
         count: model.count,
-        first_angle_deg: first_angle_mdeg.map(|mdeg| f64::from(mdeg) / 1000.0),
-        step_deg: step_mdeg.map(|mdeg| f64::from(mdeg) / 1000.0),
+        first_angle_deg: in_degrees(model.first_angle),
+        step_deg: in_degrees(model.step),
         frozen: model.is_frozen(),
         ranges: model.ranges(),
         far: model.ranges(),
@@ -77,7 +78,7 @@ struct File {
     sensor: String,
     generation: u32,
     taught: usize,
-    unit_mm: u8,
+    unit_mm: f64,
     count: u16,
     first_angle_deg: f64,
     step_deg: f64,
@@ -88,27 +89,38 @@ struct File {
 }
 
 impl File {
-    fn model(&self) -> Result<Background, String> {
-        let File { generation, unit_mm, count, .. } = *self;
-        let mut model = Background { generation, count, unit_mm, ..Background::default() };
-        let Some((first_angle_mdeg, step_mdeg)) = model.angles_mdeg() else {
-            return Err(format!("no sensor has {count} beams"));
-        };
-        let (first_angle_deg, step_deg) =
-            (f64::from(first_angle_mdeg) / 1000.0, f64::from(step_mdeg) / 1000.0);
-        if (self.first_angle_deg, self.step_deg) != (first_angle_deg, step_deg) {
+    fn model(&self) -> Result<Box<Background>, String> {
+        let count = self.count;
+        if !(1..=BEAMS).contains(&count.into()) {
+            return Err(format!("it has {count} beams, and 1 to {BEAMS} are possible"));
+        }
+        let (first_angle_deg, step_deg) = (self.first_angle_deg, self.step_deg);
+        if first_angle_deg.abs() > 360.0 || step_deg == 0.0 || step_deg.abs() > 360.0 {
             return Err(format!(
-                "{count} beams start at {first_angle_deg} degrees in steps of {step_deg}, not at {} in steps of {}",
-                self.first_angle_deg, self.step_deg
+                "beams from {first_angle_deg} degrees in steps of {step_deg} are not possible"
             ));
         }
-        if ![1, 10, 100].contains(&unit_mm) {
-            return Err(format!("unit_mm is {unit_mm}, and a unit is 1, 10 or 100 mm"));
+        let unit_um = (1000.0 * self.unit_mm).round();
+        if !(1.0..=1e6).contains(&unit_um) {
+            return Err(format!("unit_mm is {}, and 0.001 to 1000 are possible", self.unit_mm));
         }
+        let first_angle_deg = first_angle_deg - if self.is_of_version_1() { 90.0 } else { 0.0 };
+        let mut model = Background::of(
+            BackgroundHead {
+                first_angle: first_angle_deg.to_radians(),
+                step: step_deg.to_radians(),
+                generation: self.generation,
+                unit_um: unit_um as u32,
+                flags: if self.frozen { Background::FROZEN } else { 0 },
+                ..BackgroundHead::default()
+            },
+            &vec![Background::UNTAUGHT; count.into()],
+        );
+        let slots = model.ranges_mut();
         if self.ranges.len() != usize::from(count) {
             return Err(format!("{} ranges of {count} beams", self.ranges.len()));
         }
-        for (beam, (slot, range)) in model.range_array.iter_mut().zip(&self.ranges).enumerate() {
+        for (beam, (slot, range)) in slots.iter_mut().zip(&self.ranges).enumerate() {
             let Some(range) = *range else { continue };
             *slot =
                 u16::try_from(range).ok().filter(|range| (1..=LONGEST).contains(range)).ok_or_else(|| {
@@ -116,7 +128,7 @@ impl File {
                 })?;
         }
         for &beam in &self.far {
-            match model.range_array[..usize::from(count)].get_mut(beam) {
+            match slots.get_mut(beam) {
                 Some(slot @ &mut Background::UNTAUGHT) => *slot = Background::FAR,
                 Some(_) => return Err(format!("beam {beam} is far twice, or has a range")),
                 None => return Err(format!("beam {beam} is far, and there are {count}")),
@@ -129,8 +141,15 @@ impl File {
         if taught == 0 {
             return Err("it knows no beam".to_owned());
         }
-        (model.taught, model.flags) = (taught as u16, if self.frozen { Background::FROZEN } else { 0 });
+        model.taught = taught as u16;
         Ok(model)
+    }
+
+    /// In version 1, which knew the LMS alone, 0 was right, and ahead was 90.
+    fn is_of_version_1(&self) -> bool {
+        let layouts =
+            [(181, 0.0, 1.0), (361, 0.0, 0.5), (101, 40.0, 1.0), (201, 40.0, 0.5), (401, 40.0, 0.25)];
+        layouts.contains(&(self.count, self.first_angle_deg, self.step_deg))
     }
 }
 
@@ -151,6 +170,18 @@ fn broken(place: &str, why: &str) -> Failure {
     Failure::new(Kind::Input, format!("{place} is no background model: {why}"), hint)
 }
 
+/// Writes a unit of so many micrometres in mm, a whole number where it is one.
+///
+/// # Errors
+///
+/// The serializer's.
+pub fn unit_in_mm<S: Serializer>(unit_um: &u32, serializer: S) -> Result<S::Ok, S::Error> {
+    match unit_um % 1000 {
+        0 => serializer.serialize_u32(unit_um / 1000),
+        _ => serializer.serialize_f64(f64::from(*unit_um) / 1000.0),
+    }
+}
+
 fn known_ranges<S: Serializer>(ranges: &[u16], serializer: S) -> Result<S::Ok, S::Error> {
     let is_known = |range: &u16| *range != Background::UNTAUGHT && *range != Background::FAR;
     serializer.collect_seq(ranges.iter().map(|range| Some(*range).filter(is_known)))
@@ -162,18 +193,34 @@ fn far_beams<S: Serializer>(ranges: &[u16], serializer: S) -> Result<S::Ok, S::E
 }
 
 const CLASS: &str = "background";
-/// The greatest reading of 15 bits that is no code.
-const LONGEST: u16 = 0x7FFF - 9;
+/// The greatest reading that is no code, in any family.
+const LONGEST: u16 = 0xFFEF;
 
 #[cfg(test)]
 mod tests {
     use super::*;
 
-    fn model(count: u16) -> Background {
-        let mut model = Background { generation: 3, count, unit_mm: 10, ..Background::default() };
-        model.range_array[..4].copy_from_slice(&[400, 0, Background::FAR, LONGEST]);
-        model.taught = 3;
-        model
+    fn model(count: u16, first_angle_deg: f64, step_deg: f64) -> Box<Background> {
+        let mut ranges = vec![0; count.into()];
+        ranges[..4].copy_from_slice(&[400, 0, Background::FAR, LONGEST]);
+        let head = BackgroundHead {
+            first_angle: first_angle_deg.to_radians(),
+            step: step_deg.to_radians(),
+            generation: 3,
+            taught: 3,
+            unit_um: 10_000,
+            ..BackgroundHead::default()
+        };
+        Background::of(head, &ranges)
+    }
+
+    /// As in the saved models of version 1 but for the angle of the first beam.
+    fn lms(count: u16) -> Box<Background> {
+        match count {
+            181 => model(181, -90.0, 1.0),
+            361 => model(361, -90.0, 0.5),
+            count => model(count, -50.0, 100.0 / f64::from(count - 1)),
+        }
     }
 
     fn text(model: &Background) -> String {
@@ -182,25 +229,39 @@ mod tests {
 
     #[test]
     fn models_go_there_and_back() {
-        for (count, unit_mm) in [(101, 1), (181, 10), (201, 100), (361, 1), (401, 10)] {
+        for (count, unit_um) in [(101, 1_000), (181, 10_000), (201, 100_000), (361, 1_000), (401, 250)] {
             for flags in [0, Background::FROZEN] {
-                let model = Background { flags, unit_mm, ..model(count) };
+                let mut model = lms(count);
+                (model.flags, model.unit_um) = (flags, unit_um);
+                let text = text(&model);
                 let saved = SavedModel { sensor: "front".into(), model };
-                assert_eq!(SavedModel::parse(text(&model).as_bytes(), "m"), Ok(saved), "{count}");
+                assert_eq!(SavedModel::parse(text.as_bytes(), "m"), Ok(saved), "{count}");
             }
         }
+        let turning = model(450, 0.0, -0.8);
+        assert_eq!(SavedModel::parse(text(&turning).as_bytes(), "m").unwrap().model, turning);
         let begin =
             r#"{"class":"background","sensor":"front","generation":3,"taught":3,"unit_mm":10,"count":101,"#;
         let then =
-            r#""first_angle_deg":40.0,"step_deg":1.0,"frozen":false,"ranges":[400,null,null,32758,null,"#;
-        assert!(text(&model(101)).starts_with(&[begin, then].concat()));
-        assert!(text(&model(101)).ends_with(r#"null],"far":[2]}"#));
-        assert!(text(&Background::default()).contains(r#""first_angle_deg":null,"#), "before the first scan");
+            r#""first_angle_deg":-50.0,"step_deg":1.0,"frozen":false,"ranges":[400,null,null,65519,null,"#;
+        assert!(text(&lms(101)).starts_with(&[begin, then].concat()));
+        assert!(text(&lms(101)).ends_with(r#"null],"far":[2]}"#));
+        assert!(text(&Box::default()).contains(r#""first_angle_deg":null,"#), "before the first scan");
+    }
+
+    #[test]
+    fn models_of_version_1_look_ahead_too() {
+        for count in [101, 181, 201, 361, 401] {
+            let before = text(&lms(count)).replace(":-90.0", ":0.0").replace(":-50.0", ":40.0");
+            assert_eq!(SavedModel::parse(before.as_bytes(), "m").unwrap().model, lms(count), "{count}");
+        }
     }
 
     #[test]
     fn a_model_that_knows_nothing_is_none() {
-        let empty = Background { count: 361, unit_mm: 1, ..Background::default() };
+        let mut empty = lms(361);
+        empty.ranges_mut().fill(Background::UNTAUGHT);
+        empty.taught = 0;
         let failure = SavedModel::parse(text(&empty).as_bytes(), "m").unwrap_err();
         let expected = "m is no background model: it knows no beam";
         assert_eq!((failure.kind, failure.message.as_str()), (Kind::Input, expected));
@@ -208,7 +269,7 @@ mod tests {
 
     #[test]
     fn a_file_that_is_cut_short_anywhere_is_refused() {
-        let whole = text(&model(361));
+        let whole = text(&lms(361));
         for length in 0..whole.len() {
             let failure = SavedModel::parse(&whole.as_bytes()[..length], "/m.json").unwrap_err();
             assert_eq!(failure.kind, Kind::Input);
@@ -220,23 +281,20 @@ mod tests {
 
     #[test]
     fn what_is_no_model_is_refused_with_the_reason() {
-        let whole = text(&model(181));
+        let whole = text(&lms(181));
         for (from, to, why) in [
             ("{", "no", "expected ident at line 1 column 2"),
             ("\"background\"", "\"scan\"", "its class is \"scan\", not \"background\""),
             ("\"class\"", "\"kind\"", "missing field `class`"),
             ("\"count\":181,", "", "missing field `count`"),
-            ("\"count\":181", "\"count\":200", "no sensor has 200 beams"),
-            (
-                "\"count\":181",
-                "\"count\":361",
-                "361 beams start at 0 degrees in steps of 0.5, not at 0 in steps",
-            ),
+            ("\"count\":181", "\"count\":9000", "it has 9000 beams, and 1 to 8192 are possible"),
+            ("\"count\":181", "\"count\":361", "181 ranges of 361 beams"),
+            ("\"step_deg\":1.0", "\"step_deg\":0", "beams from -90 degrees in steps of 0 are not possible"),
             ("\"step_deg\":1.0", "\"step_deg\":null", "invalid type: null, expected f64"),
-            ("\"unit_mm\":10", "\"unit_mm\":2", "unit_mm is 2, and a unit is 1, 10 or 100 mm"),
+            ("\"unit_mm\":10", "\"unit_mm\":0", "unit_mm is 0, and 0.001 to 1000 are possible"),
             ("[400,", "[", "180 ranges of 181 beams"),
-            ("[400", "[0", "the range of beam 0 is 0, and 1 to 32758 are possible"),
-            ("32758", "65535", "the range of beam 3 is 65535"),
+            ("[400", "[0", "the range of beam 0 is 0, and 1 to 65519 are possible"),
+            ("65519", "65535", "the range of beam 3 is 65535"),
             ("[400", "[-1", "the range of beam 0 is -1"),
             ("[400", "[400.5", "invalid type: floating point `400.5`, expected i64"),
             ("[2]", "[181]", "beam 181 is far, and there are 181"),

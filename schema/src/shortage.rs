@@ -29,14 +29,14 @@ const PORT_DESCRIPTORS: u64 = 8;
 /// Descriptors that a client of the control service takes.
 pub(crate) const CONTROL_DESCRIPTORS: u64 = 24;
 
-/// Fails if fewer than `needed` bytes of shared memory are free or allowed for this process.
+/// Fails if fewer than `needed` bytes of shared memory, in segments of at most `longest`, are free or allowed for this process.
 ///
 /// # Errors
 ///
 /// [`Kind::Short`] with what is free and what is needed.
-pub fn check_memory(needed: u64) -> Result<(), Failure> {
+pub fn check_memory(needed: u64, longest: u64) -> Result<(), Failure> {
     check_place(Path::new(SHARED_MEMORY), needed).map_err(|what| memory(&what))?;
-    check_file_size(needed.min(longest_segment()))?;
+    check_file_size(longest)?;
     check_address_space(needed)
 }
 
@@ -125,7 +125,7 @@ pub fn memory(what: &str) -> Failure {
 /// Refuses to make one more of a consumer's ports where there is no room for it: the library would make one that gets
 /// nothing, or end the process.
 pub(crate) fn check_client() -> Result<(), Failure> {
-    check_descriptors(PORT_DESCRIPTORS).and_then(|()| check_memory(CLIENT_BYTES))
+    check_descriptors(PORT_DESCRIPTORS).and_then(|()| check_memory(CLIENT_BYTES, CLIENT_BYTES))
 }
 
 /// What is so short that it may be why something failed in the domain at `root`.
@@ -137,7 +137,7 @@ pub(crate) fn found(root: &Path) -> Option<Failure> {
             .map_err(|what| Failure::new(Kind::Short, format!("{}: {what}", root.display()), hint))
     };
     check_descriptors(2 * PORT_DESCRIPTORS)
-        .and_then(|()| check_memory(CLIENT_BYTES))
+        .and_then(|()| check_memory(CLIENT_BYTES, CLIENT_BYTES))
         .and_then(|()| files())
         .err()
 }
@@ -181,8 +181,8 @@ mod tests {
 
     #[test]
     fn what_is_more_than_there_is_is_refused() {
-        assert_eq!((check_memory(0), check_descriptors(0)), (Ok(()), Ok(())));
-        let memory = check_memory(1 << 60).unwrap_err();
+        assert_eq!((check_memory(0, 0), check_descriptors(0)), (Ok(()), Ok(())));
+        let memory = check_memory(1 << 60, 0).unwrap_err();
         assert_eq!(memory.kind, Kind::Short);
         assert!(memory.message.contains(&format!("{} kB needed", 1_u64 << 50)), "{memory}");
         let descriptors = check_descriptors(1 << 60).unwrap_err();

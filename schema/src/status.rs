@@ -14,7 +14,7 @@ pub const COUNTERS: usize = 28;
 
 /// The payload of topic `status`, 592 bytes: published each second and on every change.
 #[derive(Clone, Copy, Debug, PartialEq, Pod, Zeroable)]
-#[cfg_attr(feature = "ipc", derive(ZeroCopySend), type_name("scanhub.Status.v1"))]
+#[cfg_attr(feature = "ipc", derive(ZeroCopySend), type_name("scanhub.Status.v2"))]
 #[repr(C)]
 pub struct Status {
     /// See [`Status::state`].
@@ -188,7 +188,7 @@ impl State {
 
 /// The counters of a link. All grow only, except the gauges: `bytes_buffered`, `damaged_ppm` and `lost_ppm`.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Pod, Zeroable)]
-#[cfg_attr(feature = "ipc", derive(ZeroCopySend), type_name("scanhub.Counters.v1"))]
+#[cfg_attr(feature = "ipc", derive(ZeroCopySend), type_name("scanhub.Counters.v2"))]
 #[repr(C)]
 pub struct Counters(pub [u64; COUNTERS]);
 

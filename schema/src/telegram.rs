@@ -1,5 +1,5 @@
-//! The payload of topic `telegram`: one telegram's bytes, STX to CRC, and the positions of its fields. Refuses to check or
-//! interpret them: every published telegram had a correct CRC.
+//! The payload of topic `telegram`: one telegram's bytes, of an LMS STX to CRC, and the positions of its fields. Refuses to
+//! check or interpret them: every published telegram had a correct checksum.
 
 /// A telegram's bytes with names for its fields.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -8,6 +8,12 @@ pub struct Telegram<'a>(pub &'a [u8]);
 impl<'a> Telegram<'a> {
     /// The longest telegram there is, in bytes: STX to CRC (Telegram listing: 812 and its two bytes of CRC).
     pub const MAX: usize = 814;
+
+    /// Returns whether they are a telegram of an LMS, which has the fields below. Of other families they are whole packets, as
+    /// many as arrived together.
+    pub fn is_lms(self) -> bool {
+        self.0.first() == Some(&STX)
+    }
 
     /// Returns the address byte (to the sensor, or its answer's 80h + address); 0 if the bytes end before.
     pub fn address(self) -> u8 {
@@ -32,6 +38,9 @@ impl<'a> Telegram<'a> {
         self.0.get(5..self.0.len().saturating_sub(2)).unwrap_or_default()
     }
 }
+
+/// Begins every telegram of an LMS (Telegram listing 4), and no packet of another family.
+pub(crate) const STX: u8 = 0x02;
 
 #[cfg(test)]
 mod tests {

@@ -2,9 +2,10 @@
 
 mod table;
 
+use crate::limits::TopicLimits;
 use crate::{Failure, Kind};
 
-pub use table::{Pace, Row, Topic};
+pub use table::{Pace, Ring, Row, Topic};
 
 impl Topic {
     /// Returns what the table says of the topic.
@@ -25,7 +26,7 @@ impl Topic {
     /// use schema::Topic;
     ///
     /// assert_eq!(Topic::parse("scan"), Some(Topic::Scan));
-    /// assert_eq!(Topic::Scan.service("front"), "scanhub/v1/front/scan");
+    /// assert_eq!(Topic::Scan.service("front"), "scanhub/v2/front/scan");
     /// ```
     pub fn parse(name: &str) -> Option<Topic> {
         Topic::ALL.into_iter().find(|topic| topic.name() == name)
@@ -46,6 +47,11 @@ impl Topic {
         self.row().payload
     }
 
+    /// Returns the bytes of the longest payload where the topic is made as `limits` say.
+    pub fn longest(self, limits: &TopicLimits) -> usize {
+        (self.row().longest)(limits)
+    }
+
     /// Returns the payload's revision: a greater one only appends.
     pub fn revision(self) -> u32 {
         1
@@ -58,11 +64,11 @@ impl Topic {
 }
 
 /// Name of the service that takes requests for the hub's links.
-pub const CONTROL: &str = "scanhub/v1/control";
+pub const CONTROL: &str = "scanhub/v2/control";
 /// Name of the event that wakes the hub for a request.
-pub const CONTROL_REQUEST: &str = "scanhub/v1/control/request";
+pub const CONTROL_REQUEST: &str = "scanhub/v2/control/request";
 /// Name of the event that wakes clients for a response.
-pub const CONTROL_RESPONSE: &str = "scanhub/v1/control/response";
+pub const CONTROL_RESPONSE: &str = "scanhub/v2/control/response";
 
 /// Name of the service that wakes the consumers of a sensor, beside its topics.
 pub const WAKE: &str = "wake";
@@ -91,7 +97,7 @@ impl Wake {
 /// Returns the sensor and topic that a service's name stands for, if it is one of ours: the other direction of
 /// [`Topic::service`]; the wake service has no topic.
 pub fn of_service(name: &str) -> Option<(&str, Option<Topic>)> {
-    let (sensor, topic) = name.strip_prefix("scanhub/v1/")?.split_once('/')?;
+    let (sensor, topic) = name.strip_prefix("scanhub/v2/")?.split_once('/')?;
     if topic == WAKE { Some((sensor, None)) } else { Some((sensor, Some(Topic::parse(topic)?))) }
 }
 
@@ -138,7 +144,7 @@ pub fn is_remote(sensor: &str) -> bool {
 }
 
 fn service(sensor: &str, topic: &str) -> String {
-    format!("scanhub/v1/{sensor}/{topic}")
+    format!("scanhub/v2/{sensor}/{topic}")
 }
 
 #[cfg(test)]
@@ -147,14 +153,14 @@ mod tests {
 
     #[test]
     fn service_names_go_there_and_back() {
-        assert_eq!(Topic::Scan.service("front"), "scanhub/v1/front/scan");
+        assert_eq!(Topic::Scan.service("front"), "scanhub/v2/front/scan");
         for topic in Topic::ALL {
             assert_eq!(of_service(&topic.service("rear")), Some(("rear", Some(topic))));
             assert_eq!(Topic::parse(topic.name()), Some(topic));
             assert_eq!(Topic::of_number(topic.number()), Some(topic));
         }
         assert_eq!(of_service(&Wake::service("rear")), Some(("rear", None)));
-        assert_eq!(of_service("scanhub/v2/rear/scan"), None);
+        assert_eq!(of_service("scanhub/v1/rear/scan"), None);
         for control in [CONTROL, CONTROL_REQUEST, CONTROL_RESPONSE] {
             assert_eq!(of_service(control), None);
         }

@@ -9,7 +9,7 @@ pub const ZONES: usize = 8;
 
 /// The payload of topic `zones`, 76 bytes: one sample per scan, and one with verdict unknown when scans stop.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Pod, Zeroable)]
-#[cfg_attr(feature = "ipc", derive(ZeroCopySend), type_name("scanhub.Zones.v1"))]
+#[cfg_attr(feature = "ipc", derive(ZeroCopySend), type_name("scanhub.Zones.v2"))]
 #[repr(C)]
 pub struct Zones {
     /// See [`Zones::verdict`].
@@ -32,7 +32,7 @@ pub struct Zones {
 
 /// One circle.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Pod, Zeroable)]
-#[cfg_attr(feature = "ipc", derive(ZeroCopySend), type_name("scanhub.Zone.v1"))]
+#[cfg_attr(feature = "ipc", derive(ZeroCopySend), type_name("scanhub.Zone.v2"))]
 #[repr(C)]
 pub struct Zone {
     /// Radius around the robot's centre in mm.

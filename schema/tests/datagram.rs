@@ -1,4 +1,4 @@
-//! Golden datagrams of version 1, in `tests/vectors/datagram`: built from values they are these bytes, read they are these
+//! Golden datagrams of version 2, in `tests/vectors/datagram`: built from values they are these bytes, read they are these
 //! values. Do not change these tests: another form is another version. `docs/datagram.md` explains the bytes.
 
 #[path = "datagram/says.rs"]
@@ -9,7 +9,9 @@ mod values;
 mod vectors;
 
 use schema::Topic;
-use schema::datagram::{Datagram, DatagramError, Fresh, HEAD, Head, LanFlags, MTU_SAFE, StreamStats};
+use schema::datagram::{
+    Datagram, DatagramError, Fresh, HEAD, Head, LanFlags, MTU_LEAST, MTU_SAFE, StreamStats,
+};
 use vectors::{Vector, bytes, vectors};
 
 fn vector(name: &str) -> Vec<u8> {
@@ -36,7 +38,7 @@ fn values_are_these_bytes() {
         assert_eq!(datagram, vector(name), "{name}");
         built += 1;
     }
-    assert_eq!(built, 10);
+    assert_eq!(built, 11);
 }
 
 #[test]
@@ -57,7 +59,7 @@ fn a_later_hub_appends() {
 #[test]
 fn the_mac_stands_behind_the_payload() {
     const OF_KEY: [u8; 16] =
-        [0x0E, 0x49, 0x37, 0x39, 0xDA, 0x1B, 0xC5, 0x5C, 0xE8, 0xD2, 0x9A, 0xAD, 0x96, 0x15, 0x10, 0xF3];
+        [0x1F, 0xA1, 0xF0, 0x6A, 0x94, 0xBD, 0x5B, 0x68, 0xBA, 0xC5, 0xCD, 0x71, 0xBC, 0x76, 0x3E, 0x48];
     let plain = sealed(Head { sequence: 5002, ..values::ZONES }, &vector("zones")[HEAD..]);
     for (name, mac) in [("authenticated", OF_KEY), ("mac", [0; 16])] {
         let datagram = with(&plain, |bytes| {
@@ -69,6 +71,19 @@ fn the_mac_stands_behind_the_payload() {
     }
 }
 
+/// Each part by itself is no payload; what they are together is in the crate of both ends of a network.
+#[test]
+fn parts_of_a_scan_are_these_bytes() {
+    let scan = vector("scan");
+    let whole = Datagram::read(&scan).unwrap();
+    let parts: Vec<&[u8]> = whole.payload.chunks(MTU_LEAST - HEAD).collect();
+    for (part, payload) in parts.iter().enumerate() {
+        let head = Head { part: part as u8, parts: parts.len() as u8, ..whole.head };
+        assert_eq!(sealed(head, payload), vector(&format!("scan_part_{part}")));
+    }
+    assert_eq!(parts.len(), 3);
+}
+
 #[test]
 fn refusals_are_these_bytes() {
     let zones = vector("zones");
@@ -76,9 +91,10 @@ fn refusals_are_these_bytes() {
     let expected = [
         ("short", zones[..47].to_vec()),
         ("magic", with(&zones, |bytes| bytes[3] = b'P')),
-        ("version", with(&zones, |bytes| bytes[4] = 2)),
+        ("version", with(&zones, |bytes| bytes[4] = 1)),
         ("header", with(&zones, |bytes| bytes[5] = 47)),
         ("header_beyond", with(&zones, |bytes| bytes[5] = 77)),
+        ("header_part", with(&zones, |bytes| bytes[33..35].fill(2))),
         ("length", with(&zones, |bytes| bytes.push(0))),
         ("unauthenticated", zones.clone()),
         ("epoch", numbered(Head { sequence: 5001, epoch: values::ZONES.epoch - 1, ..values::ZONES })),

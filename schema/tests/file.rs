@@ -1,4 +1,4 @@
-//! The golden recording of version 1: built from values it is these bytes. Do not change this test: another form is
+//! The golden recording of version 2: built from values it is these bytes. Do not change this test: another form is
 //! another version. `docs/recording.md` explains it.
 #![cfg(feature = "mcap")]
 
@@ -42,7 +42,7 @@ fn recording() -> Vec<u8> {
 
 #[test]
 fn values_are_these_bytes() {
-    let path = concat!(env!("CARGO_MANIFEST_DIR"), "/../tests/vectors/recording/v1.mcap");
+    let path = concat!(env!("CARGO_MANIFEST_DIR"), "/../tests/vectors/recording/v2.mcap");
     let golden = std::fs::read(path).unwrap_or_else(|error| panic!("{path}: {error}"));
     assert!(recording() == golden, "another form is another version");
 }
@@ -58,7 +58,7 @@ fn others_read_it() {
     assert_eq!(parts(&messages[0].data), Some((header(40, 40), &TELEGRAM[..])));
     assert_eq!(parts(&messages[0].data[..63]), None);
     let schema = messages[1].channel.schema.as_ref().unwrap();
-    assert_eq!((schema.name.as_str(), schema.encoding.as_str()), ("scanhub.Zones.v1", "scanhub"));
+    assert_eq!((schema.name.as_str(), schema.encoding.as_str()), ("scanhub.Zones.v2", "scanhub.v2"));
 }
 
 /// What was closed is there although nothing follows, as after a kill.

@@ -6,38 +6,40 @@ mod place;
 use std::time::Duration;
 
 use place::Place;
-use schema::ipc::{self, Payload, PortFactory, Waker};
+use schema::ipc::{self, Payload, PortFactory, SharedMemory, Waker};
+use schema::limits::TopicLimits;
 use schema::{
-    Failure, Header, HubLock, Kind, ListenLock, Request, Response, Scan, Status, Topic, Verb, Wake, holder,
-    limits, publisher,
+    Contents, Failure, Header, HubLock, Kind, ListenLock, Request, Response, Scan, ScanHead, Status,
+    Telegram, Topic, Verb, Wake, holder, limits, publisher,
 };
 
 #[test]
 fn a_scan_is_written_and_read_in_place() {
     let place = Place::new();
     let hub = ipc::hub_node(&place.domain).unwrap();
-    let topic = Scan::create(&hub, "front").unwrap();
-    let publisher = Scan::publisher(&topic).unwrap();
+    let topic = Scan::create(&hub, "front", &LIMITS).unwrap();
+    let publisher = Scan::publisher(&topic, &LIMITS).unwrap();
 
     let client = ipc::client_node(&place.domain).unwrap();
     let seen = Scan::open(&client, "front").unwrap().expect("the hub made it");
     let subscriber = Scan::subscriber(&seen).unwrap();
 
-    let mut sample = publisher.loan().unwrap();
+    let head = ScanHead { count: 2, valid_to: 12, ..ScanHead::default() };
+    let mut sample = Scan::loan(&publisher, Scan::len(2, 0)).unwrap();
     *sample.user_header_mut() = Header { seq: 7, topic_seq: 3, ..Header::default() };
-    let scan = sample.payload_mut();
-    scan.count = 2;
-    scan.range_array[..2].copy_from_slice(&[11, 12]);
+    Scan::write(&mut sample).begin(head).ranges.copy_from_slice(&[11, 12]);
     assert_eq!(sample.send().unwrap(), 1);
 
     let received = Scan::receive(&subscriber).unwrap().expect("one was sent");
     assert_eq!((received.user_header().seq, received.user_header().topic_seq), (7, 3));
-    assert_eq!(received.ranges(), [11, 12]);
+    assert_eq!((Scan::read(&received).ranges(), received.payload().len()), (&[11, 12][..], 9));
     assert!(Scan::receive(&subscriber).unwrap().is_none());
     let types = seen.static_config().message_type_details();
-    assert_eq!((types.payload.size(), types.user_header.size()), (1216, 64));
+    assert_eq!((types.payload.size(), types.user_header.size()), (8, 64));
+    let variant = format!("{:?}", types.payload.variant());
+    assert_eq!((types.payload.alignment(), variant.as_str()), (8, "Dynamic"));
     assert_eq!(types.payload.type_name().to_string(), Topic::Scan.payload());
-    assert_eq!(types.user_header.type_name().to_string(), "scanhub.Header.v1");
+    assert_eq!(types.user_header.type_name().to_string(), "scanhub.Header.v2");
     let revision = seen.attributes().iter().next().map(|it| (it.key().to_string(), it.value().to_string()));
     assert_eq!(revision, Some(("revision".into(), "1".into())));
 }
@@ -46,8 +48,8 @@ fn a_scan_is_written_and_read_in_place() {
 fn a_telegram_is_as_long_as_it_is() {
     let place = Place::new();
     let hub = ipc::hub_node(&place.domain).unwrap();
-    let topic = <[u8]>::create(&hub, "front").unwrap();
-    let publisher = <[u8]>::publisher(&topic).unwrap();
+    let topic = <[u8]>::create(&hub, "front", &LIMITS).unwrap();
+    let publisher = <[u8]>::publisher(&topic, &LIMITS).unwrap();
     let subscriber = <[u8]>::subscriber(&topic).unwrap();
     for length in [9, 814] {
         let bytes: Vec<u8> = (0..length).map(|i| i as u8).collect();
@@ -61,8 +63,8 @@ fn a_telegram_is_as_long_as_it_is() {
 fn a_late_consumer_gets_the_last_status() {
     let place = Place::new();
     let hub = ipc::hub_node(&place.domain).unwrap();
-    let topic = Status::create(&hub, "front").unwrap();
-    let publisher = Status::publisher(&topic).unwrap();
+    let topic = Status::create(&hub, "front", &LIMITS).unwrap();
+    let publisher = Status::publisher(&topic, &LIMITS).unwrap();
     for baud in [9600, 38400] {
         let mut sample = publisher.loan().unwrap();
         sample.payload_mut().baud = baud;
@@ -78,48 +80,92 @@ fn a_late_consumer_gets_the_last_status() {
 fn a_full_queue_drops_the_oldest_and_nobody_waits() {
     let place = Place::new();
     let hub = ipc::hub_node(&place.domain).unwrap();
-    let topic = Scan::create(&hub, "front").unwrap();
-    let publisher = Scan::publisher(&topic).unwrap();
+    let topic = Scan::create(&hub, "front", &LIMITS).unwrap();
+    let publisher = Scan::publisher(&topic, &LIMITS).unwrap();
     let subscriber = Scan::subscriber(&topic).unwrap();
     for seq in 0..100 {
-        let mut sample = publisher.loan().unwrap();
+        let mut sample = Scan::loan(&publisher, 0).unwrap();
         sample.user_header_mut().seq = seq;
         sample.send().unwrap();
     }
     let held: Vec<_> =
         (0..4).map(|_| Scan::receive(&subscriber).unwrap().unwrap().user_header().seq).collect();
-    assert_eq!(held, [84, 85, 86, 87]);
+    assert_eq!(held, [36, 37, 38, 39]);
 }
 
 #[test]
 fn a_second_publisher_is_refused() {
     let place = Place::new();
     let hub = ipc::hub_node(&place.domain).unwrap();
-    let topic = Scan::create(&hub, "front").unwrap();
-    let _first = Scan::publisher(&topic).unwrap();
+    let topic = Scan::create(&hub, "front", &LIMITS).unwrap();
+    let _first = Scan::publisher(&topic, &LIMITS).unwrap();
     let other = ipc::hub_node(&place.domain).unwrap();
-    let again = Scan::create(&other, "front").unwrap();
-    assert_eq!(Scan::publisher(&again).unwrap_err().kind, Kind::DomainHeld);
+    let again = Scan::create(&other, "front", &LIMITS).unwrap();
+    assert_eq!(Scan::publisher(&again, &LIMITS).unwrap_err().kind, Kind::DomainHeld);
 }
 
 #[test]
 fn limits_are_those_of_the_contract() {
     let place = Place::new();
     let hub = ipc::hub_node(&place.domain).unwrap();
-    let scan = Scan::create(&hub, "front").unwrap();
+    let scan = Scan::create(&hub, "front", &LIMITS).unwrap();
     let config = scan.static_config();
-    assert_eq!((config.max_publishers(), config.max_subscribers(), config.max_nodes()), (1, 200, 260));
-    assert_eq!((config.subscriber_max_buffer_size(), config.subscriber_max_borrowed_samples()), (16, 4));
+    assert_eq!((config.max_publishers(), config.max_subscribers(), config.max_nodes()), (1, 32, 260));
+    assert_eq!((config.subscriber_max_buffer_size(), config.subscriber_max_borrowed_samples()), (64, 4));
     assert_eq!((config.history_size(), config.has_safe_overflow()), (0, true));
-    let status = Status::create(&hub, "front").unwrap();
+    let status = Status::create(&hub, "front", &LIMITS).unwrap();
     let config = status.static_config();
     assert_eq!((config.subscriber_max_buffer_size(), config.history_size()), (4, 1));
     let waker = Waker::new(&hub, "front").unwrap();
     let config = waker.service().static_config();
     assert_eq!((config.max_listeners(), config.max_nodes(), config.event_id_max_value()), (250, 260, 7));
-    assert_eq!(limits::samples(Topic::Scan), 16 + 800 + 2);
-    assert_eq!(Topic::ALL.map(limits::subscribers), [32, 200, 32, 200, 32, 32, 64]);
+    assert_eq!(limits::samples(Topic::Scan, 32), 64 + 128 + 2);
+    assert_eq!(Topic::ALL.map(limits::buffer), [64, 64, 16, 16, 16, 4, 4]);
+    for consumers in [0, 251] {
+        assert_eq!(TopicLimits { consumers, ..LIMITS }.check().unwrap_err().kind, Kind::Configuration);
+    }
+    let most = TopicLimits { consumers: 250, ..LIMITS };
+    assert_eq!(most.check(), Ok(()));
+    let crowded = Scan::create(&hub, "rear", &most).unwrap();
+    let publisher = Scan::publisher(&crowded, &most).unwrap();
+    let all: Vec<_> = (0..250).map(|_| Scan::subscriber(&crowded).unwrap()).collect();
+    Scan::loan(&publisher, 0).unwrap().send().unwrap();
+    assert!(all.iter().all(|subscriber| Scan::receive(subscriber).unwrap().is_some()));
+    assert_eq!(Scan::subscriber(&crowded).unwrap_err().kind, Kind::Short);
 }
+
+#[test]
+fn a_topic_has_a_place_for_each_of_its_consumers_and_the_next_is_told_the_key() {
+    let place = Place::new();
+    let hub = ipc::hub_node(&place.domain).unwrap();
+    let two = TopicLimits { consumers: 2, ..LIMITS };
+    for (sensor, key) in [("front", "limits.consumers"), ("robot1.front", "--consumers")] {
+        let topic = Scan::create(&hub, sensor, &two).unwrap();
+        let first = [Scan::subscriber(&topic).unwrap(), Scan::subscriber(&topic).unwrap()];
+        let refused = Scan::subscriber(&topic).unwrap_err();
+        assert_eq!(refused.kind, Kind::Short);
+        assert!(refused.message.contains("has 2 consumers") && refused.hint.contains(key), "{refused}");
+        drop(first);
+        Scan::subscriber(&topic).unwrap();
+    }
+}
+
+#[test]
+fn a_topic_that_consumers_keep_alive_keeps_its_places() {
+    let place = Place::new();
+    let hub = ipc::hub_node(&place.domain).unwrap();
+    let kept = Scan::create(&hub, "front", &TopicLimits { consumers: 2, ..LIMITS }).unwrap();
+    for consumers in [1, 3] {
+        let again = SharedMemory::<Scan>::new(&hub, "front", &TopicLimits { consumers, ..LIMITS }).unwrap();
+        assert_eq!(again.places(), 2, "made for {consumers}");
+    }
+    drop(kept);
+    let new = SharedMemory::<Scan>::new(&hub, "front", &TopicLimits { consumers: 3, ..LIMITS }).unwrap();
+    assert_eq!(new.places(), 3);
+}
+
+const LIMITS: TopicLimits =
+    TopicLimits { consumers: 32, beams: 401, contents: Contents::UPPER, telegram: Telegram::MAX };
 
 #[test]
 fn consumers_wake_for_every_reason() {
@@ -150,8 +196,9 @@ fn what_is_not_there_is_nothing_and_sensors_are_listed() {
     assert!(Scan::open(&hub, "front").unwrap().is_none());
     assert!(ipc::open_wake(&hub, "front").unwrap().is_none());
     assert!(ipc::sensors(&place.domain).unwrap().is_empty());
-    let _topics = (Scan::create(&hub, "rear").unwrap(), Status::create(&hub, "rear").unwrap());
-    let _other = <[u8]>::create(&hub, "front").unwrap();
+    let _topics =
+        (Scan::create(&hub, "rear", &LIMITS).unwrap(), Status::create(&hub, "rear", &LIMITS).unwrap());
+    let _other = <[u8]>::create(&hub, "front", &LIMITS).unwrap();
     assert_eq!(ipc::sensors(&place.domain).unwrap(), ["front", "rear"]);
 }
 
@@ -179,7 +226,7 @@ fn one_hub_holds_a_domain() {
 fn a_hub_that_was_killed_while_making_a_topic_leaves_no_obstacle() {
     let place = Place::new();
     let hub = ipc::hub_node(&place.domain).unwrap();
-    let topic = Scan::create(&hub, "front").unwrap();
+    let topic = Scan::create(&hub, "front", &LIMITS).unwrap();
     let services = place.domain.root().join("services");
     let description = std::fs::read_dir(&services).unwrap().next().unwrap().unwrap().path();
     let text = std::fs::read(&description).unwrap();
@@ -188,7 +235,7 @@ fn a_hub_that_was_killed_while_making_a_topic_leaves_no_obstacle() {
     // Written, but not yet made read-only.
     std::fs::write(&description, text).unwrap();
     let hub = ipc::hub_node(&place.domain).unwrap();
-    Scan::create(&hub, "front").unwrap();
+    Scan::create(&hub, "front", &LIMITS).unwrap();
 }
 
 #[test]
@@ -202,7 +249,7 @@ fn a_request_is_answered_and_both_are_woken() {
     let pending = client.ask(&Request::new("front", Verb::Pause)).unwrap();
     ipc::sleep(&[server.requests()], Duration::from_secs(20)).unwrap();
     let asked = server.receive().unwrap().expect("was asked");
-    assert_eq!((asked.request().sensor(), asked.request().verb()), ("front", Some(Verb::Pause)));
+    assert_eq!(asked.request(), Some(Request::new("front", Verb::Pause)));
     assert!(server.receive().unwrap().is_none() && !ipc::take_wakeups(&[server.requests()]).unwrap());
     assert!(pending.response().unwrap().is_none() && pending.is_open());
     let refusal = Response(Err(Failure::new(Kind::Short, "busy", "wait")));

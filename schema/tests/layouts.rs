@@ -1,11 +1,11 @@
-//! The layouts of version 1 as text, for all languages: `tests/vectors/v1/layouts.txt` has a line for each struct, its type
-//! name, size and alignment, and one for each of its fields, name and offset. What `v1.rs` holds fast is what stands there.
+//! The layouts of version 2 as text, for all languages: `tests/vectors/v2/layouts.txt` has a line for each struct, its type
+//! name, size and alignment, and one for each of its fields, name and offset. What `v2.rs` holds fast is what stands there.
 
 use std::fmt::Write as _;
 use std::mem::{offset_of, size_of};
 
 use schema::{
-    Background, Foreground, Header, Mark, Marks, Pose, Request, Scan, Segment, Status, Zone, Zones,
+    BackgroundHead, ForegroundHead, Header, Mark, Marks, Pose, ScanHead, Segment, Status, Zone, Zones,
 };
 
 /// The lines of one struct.
@@ -13,7 +13,7 @@ macro_rules! layout {
     ($text:ident, $type:ident: $($field:ident)*) => {
         writeln!(
             $text,
-            concat!("scanhub.", stringify!($type), ".v1 {} {}"),
+            concat!("scanhub.", stringify!($type), ".v2 {} {}"),
             size_of::<$type>(),
             align_of::<$type>()
         )
@@ -30,20 +30,18 @@ fn the_text_says_what_the_structs_are() {
     let mut text = String::new();
     layout!(text, Header: seq topic_seq stamp_first_ns stamp_last_ns wall_ns boot sensor quality flags period_us
         hub_pid reasons hub_time);
-    layout!(text, Scan: count unit_mm range_bits first_angle_mdeg step_mdeg intensity_bits contents range_array
-        upper_array pad);
+    layout!(text, ScanHead: first_angle step spacing beam_time_ns first_beam_ns unit_um count valid_to no_return beyond
+        collapsed family flags contents intensity_bits turns reserved turn_ns reserved2);
     layout!(text, Mark: angle_mdeg range_dmm weight peak edge first_beam last_beam);
     layout!(text, Marks: count flags reserved mark_array);
     layout!(text, Zone: radius_mm beams violated reserved);
     layout!(text, Zones: verdict count nearest_beam nearest_mm invalid_beams flags reserved zone_array);
     layout!(text, Segment: first last nearest width x_mm y_mm);
-    layout!(text, Foreground: generation count beams unit_mm left_out segments bit_array pad range_array pad2
-        segment_array);
-    layout!(text, Background: generation taught count unit_mm flags reserved range_array pad);
+    layout!(text, ForegroundHead: generation unit_um count beams segments left_out);
+    layout!(text, BackgroundHead: first_angle step generation unit_um taught count flags reserved);
     layout!(text, Pose: x_m y_m yaw_rad upside_down reserved);
     layout!(text, Status: state mode unit_mm reserved baud since_ns rate_mhz angle_deg resolution_cdeg type_text
         port_text last_error_text counters pose);
-    layout!(text, Request: sensor_text verb count unit_mm reserved range_array pad);
-    let golden = include_str!("../../tests/vectors/v1/layouts.txt");
+    let golden = include_str!("../../tests/vectors/v2/layouts.txt");
     assert_eq!(text, golden);
 }

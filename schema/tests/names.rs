@@ -10,7 +10,8 @@ use place::Place;
 use rustix::fs::{FileType, Mode};
 use rustix::time::{ClockId, clock_gettime};
 use schema::ipc::{self, Bell, Payload, Waker, sleep_at_bells};
-use schema::{Domain, HubLock, Kind, ListenLock, Scan, Wake};
+use schema::limits::TopicLimits;
+use schema::{Domain, HubLock, Kind, ListenLock, Ring, Scan, Wake};
 
 #[test]
 fn one_ring_wakes_all_who_sleep_at_a_bell() {
@@ -20,17 +21,17 @@ fn one_ring_wakes_all_who_sleep_at_a_bell() {
     assert!(Bell::open(&client, "front").unwrap().is_none());
     let (front, rear) = (Waker::new(&hub, "front").unwrap(), Waker::new(&hub, "rear").unwrap());
     let bell = |sensor| Bell::open(&client, sensor).unwrap().expect("the hub hung it");
-    let (heard, end) = (bell("front").rung(), in_seconds(20));
+    let (heard, end) = (bell("front").rung(Ring::First), in_seconds(20));
     let sleepers: Vec<_> = (0..8)
         .map(|number| {
             let (front, rear) = (bell("front"), bell("rear"));
             thread::spawn(move || {
-                let both = [(&front, front.rung()), (&rear, heard)];
+                let both = [(&front, Ring::First, front.rung(Ring::First)), (&rear, Ring::First, heard)];
                 let bells = if number % 2 == 0 { &both[..] } else { &both[1..] };
-                while rear.rung() == heard && in_seconds(0) < end {
+                while rear.rung(Ring::First) == heard && in_seconds(0) < end {
                     sleep_at_bells(bells, end).expect("this system can wait for two words");
                 }
-                rear.rung()
+                rear.rung(Ring::First)
             })
         })
         .collect();
@@ -39,7 +40,7 @@ fn one_ring_wakes_all_who_sleep_at_a_bell() {
     rear.wake(Wake::Telegram).unwrap();
     assert!(sleepers.into_iter().all(|sleeper| sleeper.join().unwrap() == heard + 1));
     assert!(in_seconds(0) < end, "somebody slept to the end");
-    assert_eq!((bell("front").rung(), bell("rear").is_closed()), (heard + 1, false));
+    assert_eq!((bell("front").rung(Ring::First), bell("rear").is_closed()), (heard + 1, false));
     let last = bell("rear");
     drop(rear);
     assert!(last.is_closed() && Bell::open(&client, "rear").unwrap().is_none());
@@ -52,14 +53,14 @@ fn hubs_of_one_name_below_two_roots_have_bells_of_their_own() {
     let [here, there] = [&place.domain, &other].map(|domain| ipc::hub_node(domain).unwrap());
     let mine = Waker::new(&here, "front").unwrap();
     let bell = Bell::open(&here, "front").unwrap().expect("the hub hung it");
-    let rung = bell.rung();
+    let rung = bell.rung(Ring::First);
     assert!(Bell::open(&there, "front").unwrap().is_none(), "nobody hung one there");
     let theirs = Waker::new(&there, "front").unwrap();
     theirs.wake(Wake::Telegram).unwrap();
     drop(theirs);
-    assert!(bell.rung() == rung && !bell.is_closed(), "another hub's end is none of ours");
+    assert!(bell.rung(Ring::First) == rung && !bell.is_closed(), "another hub's end is none of ours");
     mine.wake(Wake::Telegram).unwrap();
-    assert_ne!(bell.rung(), rung);
+    assert_ne!(bell.rung(Ring::First), rung);
     assert!(Bell::open(&here, "front").unwrap().is_some());
 }
 
@@ -72,11 +73,11 @@ fn the_bell_of_a_killed_hub_is_rung_by_the_next_one() {
     // A process that is killed closes nothing.
     std::mem::forget(killed);
     let next = Waker::new(&hub, "front").unwrap();
-    let heard = bell.rung();
+    let heard = bell.rung(Ring::First);
     next.wake(Wake::Telegram).unwrap();
-    assert_eq!((bell.rung(), bell.is_closed()), (heard + 1, false));
+    assert_eq!((bell.rung(Ring::First), bell.is_closed()), (heard + 1, false));
     let end = in_seconds(20);
-    sleep_at_bells(&[(&bell, heard)], end).unwrap();
+    sleep_at_bells(&[(&bell, Ring::First, heard)], end).unwrap();
     assert!(in_seconds(10) < end, "what was rung before is no reason to sleep");
 }
 
@@ -143,12 +144,13 @@ fn at_the_longest_place_all_works() {
     let domain = longest.take_while(Result::is_ok).last().expect("one is possible").unwrap();
     let hub = ipc::hub_node(&domain).unwrap();
     let waker = Waker::new(&hub, &"s".repeat(24)).unwrap();
-    let topic = Scan::create(&hub, "front").unwrap();
-    let (publisher, subscriber) = (Scan::publisher(&topic).unwrap(), Scan::subscriber(&topic).unwrap());
+    let topic = Scan::create(&hub, "front", &TopicLimits::default()).unwrap();
+    let (publisher, subscriber) =
+        (Scan::publisher(&topic, &TopicLimits::default()).unwrap(), Scan::subscriber(&topic).unwrap());
     let listener = ipc::listener(waker.service()).unwrap();
     waker.wake(Wake::Telegram).unwrap();
     assert!(ipc::take_wakeups(&[&listener]).unwrap());
-    assert_eq!(publisher.loan().unwrap().send().unwrap(), 1);
+    assert_eq!(Scan::loan(&publisher, 0).unwrap().send().unwrap(), 1);
     assert!(Scan::receive(&subscriber).unwrap().is_some());
 }
 

@@ -35,7 +35,7 @@ impl Sent {
                 announce.pack(room)
             }
             Some(Topic::Marks) => Marks::default().pack(room),
-            Some(Topic::Background) => Background::default().pack(room),
+            Some(Topic::Background) => Box::<Background>::default().pack(room),
             Some(_) => Zones::unknown().pack(room),
         };
         let head =

@@ -3,11 +3,17 @@
 use preprocess::background::{Candidate, Method, Model, Settings, Start};
 use preprocess::segments::Segmenter;
 use preprocess::{marks, zones};
-use schema::{BEAMS, Background, Foreground, Marks, Pose, Scan, Verdict, ZONES, Zones};
+use schema::limits::TopicLimits;
+use schema::{
+    BEAMS, Background, Contents, Family, Foreground, Marks, Pose, Scan, ScanArrays, ScanHead, Verdict, ZONES,
+    Zones,
+};
 
 /// Read as settings, then as one scan after the other until nothing is left.
 pub(super) fn processors(data: &[u8]) {
     let mut bytes = Bytes(data);
+    // Now and then a scan has more beams than that.
+    let most = TopicLimits::default().beams;
     let pose = Pose {
         x_m: bytes.number(),
         y_m: bytes.number(),
@@ -33,6 +39,7 @@ pub(super) fn processors(data: &[u8]) {
             exact: is(0),
             no_return_is_far: is(1),
         },
+        most,
     );
     let max_gap = u16::from(bytes.u8());
     let mut finder = marks::MarkDetector::new(marks::Settings {
@@ -40,7 +47,7 @@ pub(super) fn processors(data: &[u8]) {
         max_range_step_mm: bytes.u16(),
         max_gap,
     });
-    let mut model = Model::new(Settings {
+    let settings = Settings {
         method: if is(2) { Method::Paper } else { Method::Multi },
         threshold_mm: is(3).then(|| bytes.u16()),
         candidate_mm: is(4).then(|| bytes.u16()),
@@ -48,11 +55,13 @@ pub(super) fn processors(data: &[u8]) {
         candidate: if is(6) { Candidate::First } else { Candidate::Latest },
         start: if is(7) { Start::FirstScan } else { Start::Empty },
         no_return_is_far: Some(is(1)),
-    });
-    let mut cutter = Segmenter::new(pose);
+    };
+    let mut model = Model::new(settings, most);
+    let mut cutter = Segmenter::new(pose, most);
     let (mut zones, mut marks) = (Zones::unknown(), Marks::default());
-    let (mut foreground, mut background) = (Foreground::default(), Background::default());
-    let mut scan = Scan::default();
+    let mut foreground = Foreground::of(most);
+    let mut background = Background::zeroed(Background::len(most));
+    let mut scan = Scan::zeroed(Scan::len(BEAMS, Contents::ALL));
     while !bytes.0.is_empty() {
         match bytes.u8() {
             0..=3 => model.reset(),
@@ -76,8 +85,8 @@ pub(super) fn processors(data: &[u8]) {
         assert_marks(&scan, &marks, max_gap);
         model.update(&scan, &mut foreground);
         cutter.update(&scan, &mut foreground);
-        assert_foreground(&scan, &foreground);
-        assert_eq!(model.classes().len(), scan.beams());
+        assert_foreground(&scan, &foreground, most);
+        assert_eq!(model.classes().len(), scan.beams().min(most));
     }
 }
 
@@ -101,13 +110,13 @@ fn assert_marks(scan: &Scan, marks: &Marks, max_gap: u16) {
     assert!(used.is_sorted_by(|one, next| one.last_beam < next.first_beam));
     assert!(used.last().is_none_or(|mark| usize::from(mark.last_beam) < scan.beams()));
     assert!(marks.is_available() || used.is_empty());
-    let lit = scan.intensities().iter().filter(|intensity| **intensity > 0).count();
+    let lit = scan.intensities().iter().filter(|intensity| *intensity > 0).count();
     let covered: usize = used.iter().map(|mark| usize::from(mark.last_beam - mark.first_beam) + 1).sum();
     assert!(covered <= lit * (usize::from(max_gap) + 1));
 }
 
-fn assert_foreground(scan: &Scan, foreground: &Foreground) {
-    assert_eq!(usize::from(foreground.count), scan.beams());
+fn assert_foreground(scan: &Scan, foreground: &Foreground, most: usize) {
+    assert_eq!(usize::from(foreground.count), scan.beams().min(most));
     let mut beams = 0;
     for (beam, range) in foreground.readings() {
         assert_eq!(scan.range(beam), Some(range), "beam {beam}");
@@ -120,22 +129,45 @@ fn assert_foreground(scan: &Scan, foreground: &Foreground) {
 }
 
 /// Another sensor, or the same one set otherwise; now and then one that there is.
-fn layout(bytes: &mut Bytes, scan: &mut Scan) {
-    let variant = [(361, 0, 500), (181, 0, 1000), (401, 40_000, 250)].get(usize::from(bytes.u8()));
-    (scan.count, scan.first_angle_mdeg, scan.step_mdeg) =
-        variant.copied().unwrap_or_else(|| (bytes.u16(), bytes.i32(), bytes.u16()));
-    (scan.unit_mm, scan.range_bits) = (bytes.u8(), bytes.u8());
-    (scan.intensity_bits, scan.contents) = (bytes.u8(), bytes.u8());
+fn layout(bytes: &mut Bytes<'_>, scan: &mut Scan) {
+    let variant =
+        [(361, -90_000, 500), (181, -90_000, 1000), (401, -50_000, 250)].get(usize::from(bytes.u8()));
+    let (count, first_angle_mdeg, step_mdeg) =
+        variant.copied().unwrap_or_else(|| (bytes.u16(), bytes.i32(), bytes.u16() as i16));
+    let in_radians = |mdeg: i32| (f64::from(mdeg) / 1000.0).to_radians();
+    let (unit_mm, range_bits) = (bytes.u8(), bytes.u8());
+    let greatest = ((1_u32 << (range_bits % 17)) - 1) as u16;
+    let head = ScanHead {
+        first_angle: in_radians(first_angle_mdeg),
+        step: in_radians(step_mdeg.into()),
+        unit_um: 1000 * u32::from(unit_mm),
+        count: count.min(BEAMS as u16),
+        valid_to: greatest.saturating_sub(9),
+        no_return: greatest,
+        beyond: greatest.saturating_sub(8),
+        family: if range_bits & 0x80 == 0 { Family::Lms } else { Family::Ld } as u8,
+        intensity_bits: bytes.u8(),
+        contents: bytes.u8() & Contents::ALL,
+        ..ScanHead::default()
+    };
+    scan.begin(head);
 }
 
 /// Stretches of beams with the same reading, until they are enough or nothing is left.
-fn fill(bytes: &mut Bytes, scan: &mut Scan) {
+fn fill(bytes: &mut Bytes<'_>, scan: &mut Scan) {
+    let ScanArrays { angles, ranges, wide, upper } = scan.arrays();
     let mut end = 0;
-    while end < BEAMS && !bytes.0.is_empty() {
+    while end < ranges.len() && !bytes.0.is_empty() {
         let start = end;
-        end = (start + 1 + usize::from(bytes.u8())).min(BEAMS);
-        scan.range_array[start..end].fill(bytes.u16());
-        scan.upper_array[start..end].fill(bytes.u8());
+        end = (start + 1 + usize::from(bytes.u8())).min(ranges.len());
+        ranges[start..end].fill(bytes.u16());
+        upper.get_mut(start..end).unwrap_or_default().fill(bytes.u8());
+        if let Some(wide) = wide.get_mut(start..end) {
+            wide.fill(bytes.u16());
+        }
+        if let Some(angles) = angles.get_mut(start..end) {
+            angles.fill(bytes.number() as f32);
+        }
     }
 }
 

@@ -5,16 +5,18 @@ mod lan;
 mod processors;
 mod recording;
 
+use line::Control;
+use line::{Output, Session as _};
+use lms::Session;
 use lms::command::Request;
 use lms::explain::explain;
 use lms::framer::{Found, Framer, SUFFIX_HOLD, Tally, VETO_HOLD};
 use lms::header::Expect;
 use lms::measured::Measured;
 use lms::reply::Reply;
-use lms::session::{Output, Session};
 use lms::telegram::{FRAME, MAX_LENGTH, STX, Telegram, Writer};
 use lms::variant::{Baud, Variant};
-use lms::{Control, MILLIS, Nanos, Settings};
+use lms::{MILLIS, Nanos, Settings};
 use lms_configure::eeprom::Write;
 
 /// A target by its name.
@@ -136,9 +138,9 @@ pub fn session(data: &[u8]) {
                     session.transmitted(now);
                 }
                 Output::Transmit { .. } => break,
-                Output::SetBaud(baud) => assert!(baud == settings.baud || !settings.fixed_rate),
-                Output::Telegram(received) => {
-                    assert!(Telegram::check(received.telegram.bytes()).is_some());
+                Output::SetRate(baud) => assert!(baud == settings.baud.rate() || !settings.fixed_rate),
+                Output::Heard(received) => {
+                    assert!(Telegram::check(received.message.telegram.bytes()).is_some());
                     assert!(received.first <= received.last && received.last <= now);
                 }
                 Output::Rest(at) | Output::Wait { until: at, .. } => {
@@ -148,7 +150,7 @@ pub fn session(data: &[u8]) {
             }
         }
         let tally = session.tally();
-        let known = tally.in_telegrams + tally.acknowledge + tally.discarded + session.buffered() as u64;
+        let known = tally.in_telegrams + tally.acknowledge + tally.discarded + session.account().buffered;
         assert_eq!((tally.read, known), (read, read), "bytes vanished");
         match what & 3 {
             // Bytes of the program itself.

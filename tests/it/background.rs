@@ -48,7 +48,7 @@ fn what_was_saved_comes_back() {
     );
     assert_eq!(
         (number(&model, "count"), &model["first_angle_deg"], &model["step_deg"]),
-        (361, &0.0.into(), &0.5.into())
+        (361, &(-90.0).into(), &0.5.into())
     );
     assert_eq!(model["ranges"].as_array().map(Vec::len), Some(361));
 

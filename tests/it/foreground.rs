@@ -73,12 +73,12 @@ fn a_model_taken_back_is_right_at_once() {
         let frames = play(&Scene { name: world, world, unit: Unit::Mm, mixed: true }, SEED);
         // Before the walker, and while somebody is there.
         for at in [LEARNED, 800] {
-            let mut model = Model::new(Settings::default());
-            let mut out = Foreground::default();
+            let mut model = Model::new(Settings::default(), BEAMS);
+            let mut out = Foreground::of(BEAMS);
             frames[..at].iter().for_each(|frame| model.update(&frame.scan, &mut out));
-            let mut shown = Background::default();
+            let mut shown = Background::zeroed(Background::len(BEAMS));
             model.show(&mut shown);
-            let mut next = Model::new(Settings::default());
+            let mut next = Model::new(Settings::default(), BEAMS);
             next.load(&shown).expect("it fits");
             let [on, anew] = [model, next].map(|mut model| {
                 let (mut found, mut wrong) = (0, 0);
@@ -99,5 +99,7 @@ fn a_model_taken_back_is_right_at_once() {
     }
 }
 
+/// Of each scan.
+const BEAMS: usize = 361;
 /// Scans after which everything in these rooms is known.
 const LEARNED: usize = 560;

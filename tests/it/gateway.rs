@@ -1,6 +1,7 @@
 //! The hub on a network: everything that is sent is heard, checked and counted by a receiver that knows nothing of the
 //! gateway. Each test has a network of its own.
 
+use std::collections::BTreeMap;
 use std::net::{Ipv4Addr, UdpSocket};
 
 use crate::testkit::{
@@ -91,8 +92,8 @@ fn two_sensors_go_out_whole() {
         for line in &lines {
             let of_line = |it: &&Datagram<'_>| u64::from(it.head.counter) == number(line, "seq");
             let Some(datagram) = scans.iter().find(of_line) else { continue };
-            let mut scan = Scan::default();
-            assert!(scan.unpack(datagram.payload));
+            let mut scan = Box::default();
+            assert!(Scan::unpack_into(&mut scan, datagram.payload));
             let ranges: Vec<_> = (0..scan.beams()).map(|i| Value::from(scan.range(i))).collect();
             assert_eq!(line["ranges"], Value::from(ranges));
             assert_eq!(datagram.head.stamp_ns, number(line, "wall_ns"));
@@ -280,26 +281,63 @@ fn announced(bytes: &[u8]) -> Option<Announce> {
 fn what_does_not_fit_is_told_and_counted() {
     in_a_network("gateway::what_does_not_fit_is_told_and_counted", || {
         let env = TestEnv::new();
-        let receiver = Receiver::new(LO);
         let _simulator = env.simulator(&["front"], &STREAM);
         let _hub = env.hub(&[env.link("front")]);
-        // The room's scans have intensities: 1143 bytes.
-        let mut gateway =
-            env.gateway(&["--interface=lo", "--mtu=1000", "--topic=*/scan", "--topic=*/telegram"]);
+        // Telegrams by themselves cannot go in parts: those of scans have 732 bytes, replies are shorter.
+        let mut gateway = env.gateway(&["--interface=lo", "--mtu=700", "--bare"]);
         let told = gateway.await_line("what does not fit", is_class("lan_link"));
-        assert_eq!((&told["to"], &told["state"]), (&"front/scan".into(), &"failing".into()));
-        receiver.await_more(20, of_topic(Topic::Telegram));
+        assert_eq!((&told["to"], &told["state"]), (&"front/telegram".into(), &"failing".into()));
+        gateway.await_line("an account", |line| line["class"] == "lan" && number(line, "send_failed") >= 20);
         let outcome = gateway.end(TERM);
         assert_eq!((outcome.code, outcome.of_class("lan_link").len()), (Some(0), 1), "{outcome}");
-        let heard = receiver.finish();
-        assert!(heard.iter().all(|bytes| bytes.len() <= 1000 && !of_topic(Topic::Scan)(&read(bytes))));
         let lines = account(&outcome);
-        let scans = lines.iter().find(|line| line["topic"] == "scan").expect("its account");
-        assert!(number(scans, "sent") == 0 && number(scans, "send_failed") >= 20, "{scans}");
-        // Listeners know from the announcement that these are missing.
-        let last = heard.iter().rev().find_map(|bytes| announced(bytes)).expect("an announcement");
-        let next = last.topics().iter().find(|it| it.topic == Topic::Scan.number()).map(|it| it.next);
-        assert_eq!(next.map(u64::from), Some(number(scans, "send_failed")));
+        let telegrams = lines.iter().find(|line| line["topic"] == "telegram").expect("its account");
+        assert!(number(telegrams, "bytes") <= 700 * number(telegrams, "sent"), "{telegrams}");
+    });
+}
+
+#[test]
+fn what_is_longer_than_a_datagram_comes_in_parts_and_is_shown_whole() {
+    in_a_network("gateway::what_is_longer_than_a_datagram_comes_in_parts_and_is_shown_whole", || {
+        let env = TestEnv::new();
+        let receiver = Receiver::at(LO, 30_000);
+        let _simulator = env.simulator(&["front"], &STREAM);
+        let _hub = env.hub(&[env.link("front")]);
+        let mut echo = env.echo(&["front/scan"]);
+        let mut listener = env.start(&["listen", "--json", "--topic=scan", "--topic=telegram"]).ready();
+        let topics = ["--topic=*/scan", "--topic=*/telegram"];
+        let gateway =
+            env.gateway(&[&["--interface=lo", "--to=127.0.0.1:30000", "--mtu=576"], &topics[..]].concat());
+        listener.await_lines(20, "a scan", is_class("scan"));
+        let last = listener.await_line("a scan", is_class("scan"))["seq"].clone();
+        echo.await_line("the last of them", |line| number(line, "seq") >= last.as_u64().unwrap_or_default());
+        let (remote, own) = (listener.end(INT), echo.end(INT));
+        assert_eq!(gateway.end(TERM).code, Some(0));
+        let own: BTreeMap<_, _> = own
+            .of_class("scan")
+            .into_iter()
+            .map(|scan| (number(&scan, "seq"), scan["ranges"].clone()))
+            .collect();
+        let scans = remote.of_class("scan");
+        let known: Vec<_> =
+            scans.iter().filter_map(|scan| Some((scan, own.get(&number(scan, "seq"))?))).collect();
+        assert!(
+            known.len() >= 20 && known.iter().all(|(scan, ranges)| scan["ranges"] == **ranges),
+            "{remote}"
+        );
+        assert!(remote.of_class("lan_refused").iter().all(|line| line["payload"] == 0), "{remote}");
+        // The room's scans have intensities: 1095 bytes of payload.
+        let heard = receiver.finish();
+        assert!(heard.iter().all(|bytes| bytes.len() <= 576));
+        let parts = |topic: Topic| {
+            heard
+                .iter()
+                .filter_map(|bytes| Datagram::read(bytes).ok())
+                .filter(of_topic(topic))
+                .map(|it| it.head.parts)
+                .max()
+        };
+        assert_eq!([Topic::Scan, Topic::Telegram].map(parts), [Some(3), Some(2)]);
     });
 }
 

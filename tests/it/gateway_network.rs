@@ -10,8 +10,8 @@ use crate::testkit::{
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
 use rustix::pipe::fcntl_setpipe_size;
 use rustix::process::{Pid, kill_process};
-use schema::Topic;
 use schema::datagram::{Announce, Datagram, Row, StreamStats};
+use schema::{Background, Topic};
 use serde_json::Value;
 
 const STREAM: [&str; 2] = ["--seed=62", "--baud=500000"];
@@ -197,7 +197,8 @@ fn the_account_is_told_when_asked_for() {
         let generation = |bytes: &[u8]| {
             let datagram = read(bytes);
             let is_one = is_background(&datagram);
-            is_one.then(|| datagram.payload[..4].to_vec())
+            let model = is_one.then(|| Background::read(datagram.payload).expect("a model"))?;
+            Some(model.generation)
         };
         assert_eq!(env.run(&["background", "front", "reset"]).code, Some(0));
         until("another generation", || {
@@ -242,7 +243,7 @@ fn what_cannot_be_is_refused() {
         refused(&["--interface=lo", "--topic=front/scan:every=0"], 2, "every=0", "every=4");
         refused(&["--interface=lo", "--topic=front/scan", "--bare"], 2, "no telegram", "--bare");
         refused(&["--interface=lo", "--mtu=1500"], 78, "1500", "1472");
-        refused(&["--interface=lo", "--mtu=100"], 78, "100", "862");
+        refused(&["--interface=lo", "--mtu=100"], 78, "100", "576");
         refused(&["--ttl=300"], 2, "300", "");
         refused(&["--background-every=ten"], 2, "ten", "");
         refused(&[&config("[gateway]\nmtu = 9000\n")], 78, "gateway.toml:2:7: mtu = 9000", "1472");

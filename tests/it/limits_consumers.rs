@@ -6,11 +6,14 @@ use std::thread;
 use std::time::Duration;
 
 use crate::testkit;
-use crate::testkit::{INT, KILL, Program, TERM, TestEnv, in_own_process, is_class, number, sequence, until};
+use crate::testkit::{
+    INT, KILL, Program, Sender, TERM, TestEnv, in_a_network, in_own_process, is_class, number, sequence,
+    until,
+};
 use rustix::process::Signal;
 use scanhub_client::Subscription;
 use schema::ipc::{self, Payload};
-use schema::{Domain, Scan, limits};
+use schema::{Domain, Scan, Topic, Zones, limits};
 use serde_json::Value;
 
 /// What a consumer that is killed holds its samples of: the domain's name and where it is.
@@ -18,13 +21,13 @@ const HOLD: [&str; 2] = ["SCANHUB_TEST_DOMAIN", "SCANHUB_TEST_BASE"];
 
 /// A hub with a recording of many minutes that has a scan every `period_ms`: slow enough that whoever loses one was not
 /// just kept waiting by a busy machine.
-fn streaming(env: &TestEnv, period_ms: u32) -> Program {
+fn streaming(env: &TestEnv, period_ms: u32, flags: &[&str]) -> Program {
     let line = |scan: u32| {
         let (ranges, at) = (vec!["1.5"; 181].join(" "), f64::from(scan * period_ms) / 1000.0);
         format!("FLASER 181 {ranges} 0 0 0 0 0 0 {at} host {at}\n")
     };
     let file = env.file("log", (1..3000).map(line).collect::<String>());
-    env.hub(&["--link", &format!("front=file:{file}")])
+    env.hub(&[&["--link", &format!("front=file:{file}")], flags].concat())
 }
 
 fn subscribe(place: &Domain) -> Subscription<Scan> {
@@ -53,7 +56,7 @@ fn follow(place: &Domain, count: usize, wanted: usize) -> u64 {
 fn forty_consumers_lose_nothing() {
     in_own_process("limits_consumers::forty_consumers_lose_nothing", || {
         let env = TestEnv::new();
-        let hub = streaming(&env, 100);
+        let hub = streaming(&env, 100, &["--set=limits.consumers=41"]);
         let mut echo = env.echo(&["front/scan"]);
         let place = env.place();
         let threads: Vec<_> = (0..4)
@@ -78,20 +81,16 @@ fn more_consumers_than_there_are_places_are_refused_with_the_limit() {
         "limits_consumers::more_consumers_than_there_are_places_are_refused_with_the_limit",
         || {
             let env = TestEnv::new();
-            let hub = env.hub(&[env.link("front")]);
+            let hub = env.hub(&[env.link("front"), "--set=limits.consumers=3".to_owned()]);
             let node = ipc::client_node(&env.place()).expect("joins");
             let topic = Scan::open(&node, "front").expect("works").expect("is there");
-            let subscribers: Vec<_> = (0..limits::subscribers(Scan::TOPIC))
-                .map(|_| Scan::subscriber(&topic).expect("a place"))
-                .collect();
-            assert_eq!(env.subscribers("front/scan"), 200);
+            let subscribers: Vec<_> = (0..3).map(|_| Scan::subscriber(&topic).expect("a place")).collect();
+            assert_eq!(env.subscribers("front/scan"), 3);
             let outcome = env.run(&["echo", "front/scan", "--json"]);
             let error = &outcome.of_class("error")[0];
             assert_eq!((outcome.code, &error["kind"]), (Some(75), &"short".into()), "{outcome}");
-            assert_eq!(
-                error["message"],
-                "scanhub/v1/front/scan has 200 consumers, the most that are possible"
-            );
+            assert_eq!(error["message"], "scanhub/v2/front/scan has 3 consumers, the most that are possible");
+            assert!(error["hint"].to_string().contains("limits.consumers, up to 250"), "{error}");
             // The other topics are not concerned.
             assert_eq!(env.info("front")["state"], "absent");
             drop(subscribers);
@@ -103,14 +102,36 @@ fn more_consumers_than_there_are_places_are_refused_with_the_limit() {
 }
 
 #[test]
+fn a_consumer_without_a_place_is_told_the_flag() {
+    in_a_network("limits_consumers::a_consumer_without_a_place_is_told_the_flag", || {
+        let env = TestEnv::new();
+        let mut sender = Sender::new(0x5f3a_12bc_00d1_e2f3, 7, 3, "front");
+        let flags = ["listen", "--json", "--publish", "--consumers=2", "--name=robot1=5f3a12bc00d1e2f3"];
+        let mut program = env.start(&flags).ready();
+        sender.announce(&[Topic::Zones, Topic::Status]);
+        program.await_line("a sensor", |line| line["kind"] == "published");
+        let node = ipc::client_node(&env.place()).expect("joins");
+        let topic = Zones::open(&node, "robot1.front").expect("works").expect("is there");
+        let subscribers = [(); 2].map(|()| Zones::subscriber(&topic).expect("a place"));
+        let outcome = env.run(&["echo", "robot1.front/zones", "--json"]);
+        let error = &outcome.of_class("error")[0];
+        assert_eq!((outcome.code, &error["kind"]), (Some(75), &"short".into()), "{outcome}");
+        assert!(error["message"].as_str().is_some_and(|text| text.contains("has 2 consumers")), "{error}");
+        assert!(error["hint"].as_str().is_some_and(|text| text.contains("greater --consumers")), "{error}");
+        drop((subscribers, topic, node));
+        assert_eq!(program.end(TERM).code, Some(0));
+    });
+}
+
+#[test]
 fn a_stopped_consumer_knows_what_it_missed_and_nobody_else_misses_anything() {
     let env = TestEnv::new();
-    let hub = streaming(&env, 50);
+    let hub = streaming(&env, 50, &[]);
     let (mut stopped, mut other) = (env.echo(&["front/scan"]), env.echo(&["front/scan"]));
     stopped.await_lines(10, "a scan", is_class("scan"));
     stopped.signal(Signal::STOP);
     let first = number(&other.await_line("a scan", is_class("scan")), "topic_seq");
-    other.await_line("many scans", |line| line["class"] == "scan" && number(line, "topic_seq") > first + 60);
+    other.await_line("many scans", |line| line["class"] == "scan" && number(line, "topic_seq") > first + 100);
     stopped.signal(Signal::CONT);
     stopped.await_line("what it missed", |line| line["kind"] == "missed");
     stopped.await_lines(20, "a scan", is_class("scan"));
@@ -133,14 +154,14 @@ fn killed_consumers_that_held_samples_leave_nothing() {
         return hold(&Domain::at(&domain, base.as_ref()).expect("a place"));
     }
     let env = TestEnv::new();
-    let hub = streaming(&env, 50);
+    let hub = streaming(&env, 50, &[]);
     let mut echo = env.echo(&["front/scan"]);
     let descriptors = || fs::read_dir(format!("/proc/{}/fd", hub.pid())).expect("lives").count();
     let place = env.place();
     let segments = || testkit::shared_memory(&place.prefix()).len();
     let (open_before, segments_before) = (descriptors(), segments());
     // Were their samples lost, the hub would have none left.
-    const { assert!(KILLS * HELD * limits::BORROWED > limits::samples(schema::Topic::Scan)) };
+    const { assert!(KILLS * HELD * limits::BORROWED > limits::samples(Topic::Scan, 32)) };
     for _ in 0..KILLS {
         let mut holder = std::process::Command::new(testkit::own_program());
         holder.args(testkit::only("limits_consumers::killed_consumers_that_held_samples_leave_nothing"));

@@ -9,6 +9,7 @@ use crate::testkit::{Outcome, Program, TestEnv};
 use flate2::Compression;
 use flate2::write::GzEncoder;
 use rustix::fs::{CWD, FileType, Mode, mknodat};
+use schema::file::ENCODING;
 
 /// Runs the program with all its address space in 90 MB, of which some 23 are itself, and in two seconds of processor
 /// time, which a program that is not optimized needs for what takes a second.
@@ -157,13 +158,13 @@ fn as_many_channels_as_there_are_numbers_are_read_at_once() {
             file.truncate(file.len() - if is_whole { 0 } else { 30 });
             file
         };
-        let ours = env.file(name, cut(mcap(&channels(|id| format!("s{id}/telegram"), "scanhub"))));
+        let ours = env.file(name, cut(mcap(&channels(|id| format!("s{id}/telegram"), ENCODING))));
         refused(&env, &["convert", &ours, &copy, "--force"], 66, "it names more than 4096 sensors");
         refused(&env, &["replay", &ours], 66, "it names more than 4096 sensors");
         let others = env.file(name, cut(mcap(&channels(|id| format!("t{id}"), "cdr"))));
         let outcome = bounded(&env, &["convert", &others, &copy, "--force", "--compression", "none"]);
         assert_eq!(outcome.code, Some(0), "{outcome}");
-        let some = channels(|id| format!("s{}/telegram", id % 4000), "scanhub");
+        let some = channels(|id| format!("s{}/telegram", id % 4000), ENCODING);
         let some = env.file(name, cut(mcap(&some)));
         let outcome = bounded(&env, &["convert", &some, &copy, "--force", "--compression", "none"]);
         assert_eq!(outcome.code, Some(0), "{outcome}");
@@ -185,7 +186,7 @@ fn more_links_than_a_hub_can_have_are_refused_at_the_first_of_them() {
     let far_more = env.file("far-more.toml", links(20_000));
     refused(&env, &["config", "check", &far_more], 66, "it is longer than 524288 bytes");
     // Values of which each has a place of its own.
-    let sectors = "{ from = 1.0, to = 2.0, range = 0.1 }, ".repeat(13_000);
+    let sectors = "{from_deg=1.0,to_deg=2.0,range=0.1},".repeat(13_000);
     let sectors = format!("{}[zones]\nself_min = [{sectors}]\n", links(2));
     let outcome = bounded(&env, &["config", "check", &env.file("sectors.toml", sectors)]);
     assert!(matches!(outcome.code, Some(0 | 78)), "{outcome}");

@@ -63,7 +63,7 @@ fn a_hub_without_address_space_leaves_no_segment_behind() {
 fn files_that_may_not_be_as_long_as_a_segment_are_told() {
     let env = TestEnv::new();
     let words = "files are too short: ";
-    for limit in ["1", "64", "1000"] {
+    for limit in ["1", "64", "250"] {
         let limit = format!("-f {limit}");
         is_short(&limited(&env, &limit, &["run", "--json", &env.link("front")]).wait(), words);
         assert_eq!(env.left_behind(), Vec::<PathBuf>::new());

@@ -8,7 +8,9 @@ use crate::testkit::{
     INT, Outcome, Program, Sender, TestEnv, in_a_network, is_class, number, skip, terminal, until, wall_ns,
 };
 use schema::datagram::{DatagramError, HEAD, WINDOW};
-use schema::{Background, Foreground, Mark, Marks, Scan, State, Status, Topic, Verdict, Zones};
+use schema::{
+    Background, BackgroundHead, Foreground, Mark, Marks, Scan, ScanHead, State, Status, Topic, Verdict, Zones,
+};
 use serde_json::{Value, json};
 
 const HUB: u64 = 0x5f3a_12bc_00d1_e2f3;
@@ -16,10 +18,8 @@ const HUB: u64 = 0x5f3a_12bc_00d1_e2f3;
 /// A reply with the shortest status there is; its checksum is nobody's business here.
 const TELEGRAM: [u8; 9] = [0x02, 0x80, 0x03, 0x00, 0xA0, 0x00, 0x10, 0x16, 0x0A];
 
-fn scan() -> Scan {
-    let mut scan = Scan { count: 3, unit_mm: 10, range_bits: 13, step_mdeg: 500, ..Scan::default() };
-    scan.range_array[..3].copy_from_slice(&[100, 0x1FFF, 300]);
-    scan
+fn scan() -> Box<Scan> {
+    Scan::of(ScanHead::lms(3, 0, 500, 10, 13), &[100, 0x1FFF, 300])
 }
 
 fn zones(verdict: Verdict) -> Zones {
@@ -62,16 +62,19 @@ fn every_topic_is_a_line() {
         sender.counter = 77;
         sender.stamp_ns = wall_ns() - 5_000_000;
         let mut marks = Marks { count: 1, ..Marks::default() };
-        marks.mark_array[0] = Mark { angle_mdeg: 90_000, range_dmm: 12_345, ..Mark::default() };
+        marks.mark_array[0] = Mark { angle_mdeg: 0, range_dmm: 12_345, ..Mark::default() };
         let mut status = Status { state: State::Streaming as u8, baud: 500_000, ..Status::default() };
         status.set_port("/dev/ttyUSB0");
+        let mut foreground = Foreground::of(0);
+        foreground.generation = 4;
+        let background = Background::of(BackgroundHead { generation: 5, ..BackgroundHead::default() }, &[]);
         let telegram = sender.telegram(&TELEGRAM);
         sender.throw(Topic::Telegram, &telegram);
-        sender.send(Topic::Scan, &scan());
+        sender.send(Topic::Scan, &*scan());
         sender.send(Topic::Marks, &marks);
         sender.send(Topic::Zones, &zones(Verdict::Slow));
-        sender.send(Topic::Foreground, &Foreground { generation: 4, ..Foreground::default() });
-        sender.send(Topic::Background, &Background { generation: 5, ..Background::default() });
+        sender.send(Topic::Foreground, &*foreground);
+        sender.send(Topic::Background, &*background);
         sender.send(Topic::Status, &status);
         program.await_line("the last one", is_class("status"));
         let outcome = program.end(INT);
@@ -227,11 +230,11 @@ fn the_account_is_exact() {
             sender.throw(Topic::Zones, &datagrams[n]);
         }
         // Two scans are lost before an announcement tells of them, and nobody asked for telegrams.
-        sender.send(Topic::Scan, &scan());
+        sender.send(Topic::Scan, &*scan());
         sender.next[usize::from(Topic::Scan.number())] += 2;
         sender.next[usize::from(Topic::Telegram.number())] += 9;
         sender.announce(&[Topic::Zones, Topic::Scan, Topic::Telegram]);
-        sender.send(Topic::Scan, &scan());
+        sender.send(Topic::Scan, &*scan());
         program.await_lines(2, "scans", is_class("scan"));
         let outcome = program.end(INT);
         assert_eq!(account(&outcome, 7, "zones"), [97, 3, 1, 2], "{outcome}");
@@ -324,7 +327,7 @@ fn each_refusal_has_its_reason() {
             bytes
         };
         for bad in
-            [&good[..HEAD - 1], &with(0, b'X'), &with(4, 2), &with(5, 47), &with(36, 0), &with(HEAD, 9)]
+            [&good[..HEAD - 1], &with(0, b'X'), &with(4, 1), &with(5, 47), &with(36, 0), &with(HEAD, 9)]
         {
             sender.throw(Topic::Zones, bad);
         }

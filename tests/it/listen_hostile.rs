@@ -2,7 +2,7 @@
 
 use crate::testkit::{INT, Program, Sender, TestEnv, in_a_network, number};
 use schema::datagram::{DatagramError, HEAD, Head, MTU_ETHERNET, Packed};
-use schema::{Foreground, Marks, Scan, Status, Topic, Verdict, Zones};
+use schema::{Foreground, Marks, Scan, ScanHead, Status, Topic, Verdict, Zones};
 use serde_json::Value;
 
 const DAMAGED: u64 = 100_000;
@@ -19,12 +19,12 @@ fn resident_kb(program: &Program) -> u64 {
 
 /// A datagram of each of these topics, whole.
 fn whole(sender: &mut Sender) -> Vec<Vec<u8>> {
-    let scan = Scan { count: 361, unit_mm: 1, range_bits: 13, ..Scan::default() };
+    let scan = Scan::of(ScanHead::lms(361, -90_000, 500, 1, 13), &[0; 361]);
     vec![
-        sender.make(Topic::Scan, &scan),
+        sender.make(Topic::Scan, &*scan),
         sender.make(Topic::Marks, &Marks { count: 5, ..Marks::default() }),
         sender.make(Topic::Zones, &Zones::unknown()),
-        sender.make(Topic::Foreground, &Foreground { count: 361, ..Foreground::default() }),
+        sender.make(Topic::Foreground, &*Foreground::of(361)),
         sender.make(Topic::Status, &Status::default()),
         sender.telegram(&[0x02, 0x80, 0x03, 0x00, 0xA0, 0x00, 0x10, 0x16, 0x0A]),
     ]
@@ -104,6 +104,9 @@ fn sealed_nonsense_neither_ends_it_nor_fills_memory() {
                 let _ = Zones::unknown().pack(&mut buffer[HEAD..]);
             }
             let head = Head {
+                // One in three says that it is a part.
+                part: [0, 0, random.u8(..4)][n as usize % 3],
+                parts: [1, 1, 3][n as usize % 3],
                 topic: random.u8(..9),
                 flags: random.u8(..) & !1,
                 hub: random.u64(..100),

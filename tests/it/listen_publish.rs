@@ -4,7 +4,7 @@
 use crate::testkit::{INT, KILL, Program, Sender, TERM, TestEnv, in_a_network, number, until};
 use rustix::process::{Pid, Resource, Rlimit, getrlimit, prlimit};
 use schema::datagram::Announce;
-use schema::{Marks, Scan, State, Status, Topic, Verdict, Zones};
+use schema::{Marks, Scan, ScanHead, State, Status, Topic, Verdict, Zones};
 use serde_json::{Value, json};
 
 const HUB: u64 = 0x5f3a_12bc_00d1_e2f3;
@@ -43,14 +43,13 @@ fn a_remote_sensor_is_as_a_local_one() {
         let mut echo = env.echo(&["robot1.front/zones", "robot1.front/scan", "robot1.front/telegram"]);
         let mut hz = env.start(&["hz", "--json", "robot1.front/zones"]);
         until("hz is attached", || env.subscribers("robot1.front/zones") == 2);
-        let mut scan = Scan { count: 2, unit_mm: 10, range_bits: 13, ..Scan::default() };
-        scan.range_array[..2].copy_from_slice(&[11, 12]);
+        let scan = Scan::of(ScanHead::lms(2, -90_000, 500, 10, 13), &[11, 12]);
         let mut status = Status { state: State::Streaming as u8, since_ns: 5, ..Status::default() };
         status.set_port("/dev/ttyUSB7");
         sender.counter = 40;
         let telegram = sender.telegram(&[0x02, 0x80, 0x03, 0x00, 0xA0, 0x00, 0x10, 0x16, 0x0A]);
         sender.throw(Topic::Telegram, &telegram);
-        sender.send(Topic::Scan, &scan);
+        sender.send(Topic::Scan, &*scan);
         sender.send(Topic::Zones, &zones(Verdict::Slow));
         sender.send(Topic::Status, &status);
         let line = echo.await_line("zones", is_zones);
@@ -350,7 +349,7 @@ fn what_has_no_room_is_counted_as_such() {
         front.announce(&[Topic::Zones, Topic::Scan]);
         let line = program.await_line("a shortage", |line| line["kind"] == "trouble");
         assert!(line["message"].to_string().contains("descriptors"), "{line}");
-        front.send(Topic::Scan, &Scan::default());
+        front.send(Topic::Scan, &*Box::<Scan>::default());
         front.send(Topic::Marks, &Marks::default());
         let mut rear = Sender::new(HUB, 7, 4, "rear");
         rear.announce(&[Topic::Zones]);

@@ -34,14 +34,14 @@ fn a_log_is_read_as_it_reaches_and_says_so_first() {
             10,
             13,
             json!([2000, null, null, 8182]),
-            json!([[1, 1], [2, 8]]),
+            json!([[1, "too_bright"], [2, "beyond"]]),
         ),
         (
             ["9.001", "16.383", "16.379", "8.190"],
             1,
             14,
             json!([9001, null, null, 8190]),
-            json!([[1, 0], [2, 4]]),
+            json!([[1, "no_return"], [2, "weak"]]),
         ),
     ] {
         let env = TestEnv::new();
@@ -58,7 +58,7 @@ fn a_log_is_read_as_it_reaches_and_says_so_first() {
             for scan in scans {
                 let first: Vec<_> =
                     scan["ranges"].as_array().into_iter().flatten().take(4).cloned().collect();
-                assert_eq!((&scan["unit_mm"], Value::from(first)), (&unit_mm.into(), units.clone()));
+                assert_eq!((&scan["unit_um"], Value::from(first)), (&(1000 * unit_mm).into(), units.clone()));
                 assert_eq!(scan["codes"], codes);
             }
         }

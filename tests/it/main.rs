@@ -25,6 +25,7 @@ mod gateway_network;
 mod kept;
 mod lan;
 mod latency;
+mod ld;
 mod learned;
 mod leds;
 mod limits_consumers;

@@ -46,9 +46,9 @@ fn a_robot_that_knows_its_own_post_goes_on() {
     let sectors = table["link"][0]["zones"]["self_min"].as_array().unwrap();
     let key = |sector: &toml::Value, key: &str| sector[key].as_float().unwrap();
     // The post is 6 degrees wide, and a beam or two beside it meet its edge.
-    let first = sectors.iter().map(|sector| key(sector, "from")).fold(180.0, f64::min);
-    let last = sectors.iter().map(|sector| key(sector, "to")).fold(0.0, f64::max);
-    assert!((85.0..=87.5).contains(&first) && (92.5..=95.0).contains(&last), "{outcome}");
+    let first = sectors.iter().map(|sector| key(sector, "from_deg")).fold(90.0, f64::min);
+    let last = sectors.iter().map(|sector| key(sector, "to_deg")).fold(-90.0, f64::max);
+    assert!((-5.0..=-2.5).contains(&first) && (2.5..=5.0).contains(&last), "{outcome}");
     assert!(sectors.iter().all(|sector| key(sector, "range") > 0.38), "{outcome}");
 
     let file = env.file("mask.toml", &text);

@@ -171,7 +171,10 @@ fn a_program_that_takes_codes_for_distances_is_found() {
     };
     let follow = "import scanhub\nfor scan in scanhub.subscribe('front/scan'):\n    ";
     let planted = [
-        (block("python", &format!("{follow}print(scan.ranges.min() * scan.unit_mm, 'mm')\n")), "it says"),
+        (
+            block("python", &format!("{follow}print(scan.ranges.min() * (scan.unit_um / 1000), 'mm')\n")),
+            "it says",
+        ),
         (block("python", &format!("{follow}print(scan.ranges_m[scan.valid].min(), 'm')\n")), "it failed"),
         (block("python", &format!("{follow}print(scan.ranges[180])\n")), "no distance with its unit"),
         (

@@ -45,7 +45,7 @@ fn streaming(env: &TestEnv) -> (Program, Program) {
 #[test]
 fn structs_are_golden() {
     let Some(mut command) = check("layouts") else { return };
-    command.arg(Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/vectors/v1"));
+    command.arg(Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/vectors/v2"));
     passed(command);
 }
 

@@ -56,7 +56,7 @@ fn what_was_sent_is_in_the_file_once() {
     assert_eq!(number(&end, "samples"), recording.kept.len() as u64);
     assert_eq!(number(&end, "bytes"), std::fs::metadata(&file).unwrap().len());
     assert_eq!(number(&end, "left_out"), 0);
-    assert!(recording.kept.iter().all(|kept| kept.encoding == "scanhub"));
+    assert!(recording.kept.iter().all(|kept| kept.encoding == "scanhub.v2"));
     for line in outcome.of_class("summary") {
         let topic = format!("{}/{}", line["sensor"].as_str().unwrap(), line["topic"].as_str().unwrap());
         assert_eq!(number(&line, "received"), recording.of(&topic).len() as u64, "{line}");
@@ -71,7 +71,7 @@ fn what_was_sent_is_in_the_file_once() {
         for kept in &telegrams {
             assert_eq!(
                 (kept.sequence, kept.schema.as_str()),
-                (kept.topic_seq() as u32, "scanhub.Telegram.v1")
+                (kept.topic_seq() as u32, "scanhub.Telegram.v2")
             );
         }
         // What came from one telegram has its time.

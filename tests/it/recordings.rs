@@ -173,8 +173,8 @@ fn in_the_pace_of_the_sensor() {
     for (scan, telegram) in scans.iter().zip(&whole[2..]) {
         let first = u16::from_le_bytes([telegram[7], telegram[8]]);
         assert_eq!(
-            (scan["ranges"][0].as_u64(), &scan["unit_mm"]),
-            (Some(u64::from(first & 0x1FFF)), &1.into())
+            (scan["ranges"][0].as_u64(), &scan["unit_um"]),
+            (Some(u64::from(first & 0x1FFF)), &1000.into())
         );
     }
     // 59 periods of 26.64 ms, at the least: a busy machine makes it longer.
@@ -200,8 +200,8 @@ fn a_carmen_log() {
         let expected: Vec<Value> =
             (0..181).map(|beam| ((metres(number, beam) * 100.0).round() as u64).into()).collect();
         assert_eq!(
-            (&scan["ranges"], &scan["step_deg"], &scan["unit_mm"]),
-            (&expected.into(), &1.0.into(), &10.into())
+            (&scan["ranges"], &scan["step_deg"], &scan["unit_um"]),
+            (&expected.into(), &1.0.into(), &10_000.into())
         );
     }
 }

@@ -127,6 +127,8 @@ fn no_topic_is_called_so_whoever_is_asked() {
         (&["record", "front/scam"], &["front/scam", "front/scan"]),
         (&["gateway", "--topic=front/scam"], &["front/scam", "front/scan"]),
         (&["listen", "--topic=scam"], &["scam", "scan"]),
+        (&["listen", "--publish", "--consumers=251"], &["251", "1..=250"]),
+        (&["listen", "--consumers=3"], &["--publish"]),
         (&["echo", "*/scam"], &["*/scam", "*/scan"]),
         (&["echo", "*"], &["topics are"]),
         (&["record", "*/scam"], &["*/scam", "*/scan"]),

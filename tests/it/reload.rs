@@ -68,7 +68,7 @@ fn circles_change_in_a_stream_without_a_gap() {
     let mut verdicts = zones.of_class("zones");
     verdicts.retain(|line| line["topic_seq"].is_u64());
     let firsts: Vec<_> = verdicts.windows(2).filter(|pair| radii(&pair[0]) != radii(&pair[1])).collect();
-    assert_eq!(firsts.len(), 4);
+    assert_eq!(firsts.len(), 4, "{firsts:?}");
     assert!(firsts.iter().all(|pair| pair[1]["verdict"] != "unknown"), "{firsts:?}");
     let ended = hub.end(TERM);
     assert_eq!(ended.code, Some(0));

@@ -92,7 +92,10 @@ fn scans_go_on_with_the_first_telegram_of_the_next_hub() {
             samples.await_line("a measured telegram", |line| of_next(line) && line["command"] == MEASURED);
         let scan = samples.await_line("its scan", |line| of_next(line) && line["class"] == "scan");
         assert_eq!(scan["seq"], first["seq"], "{scan}");
-        assert_eq!((&scan["unit_mm"], &scan["count"]), (&scans[0]["unit_mm"], &scans[0]["count"]));
+        assert_eq!(
+            ["unit_um", "count"].map(|key| number(&scan, key)),
+            ["unit_um", "count"].map(|key| number(&scans[0], key))
+        );
         // Its status is asked all the same, its type is known.
         let info = env.await_info("front", |info| info["counters"]["telegrams"].as_u64() > Some(100));
         assert_eq!((&info["type"], &info["mode"]), (&"LMS200;301063;V02.30".into(), &1.into()), "{info}");

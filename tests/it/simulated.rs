@@ -50,6 +50,36 @@ fn faults_are_named_in_the_truth() {
     assert_eq!(simulator.end(TERM).code, Some(0));
 }
 
+#[test]
+fn a_scanner_that_never_listens_speaks_at_once_and_others_are_refused() {
+    let env = TestEnv::new();
+    let simulator = env.simulator(&["front"], &["--family=ld", "--model=stl27l", "--world=room"]);
+    let mut port = open_line(&env.path("front"), 921_600);
+    let mut bytes: Vec<u8> = Vec::new();
+    until("packets", || {
+        let mut buffer = [0; 4_096];
+        let len = port.read(&mut buffer).unwrap_or(0);
+        bytes.extend(&buffer[..len]);
+        bytes.windows(49).any(|packet| packet[..2] == [0x54, 0x2C] && packet[47..] == [0x54, 0x2C])
+    });
+    assert_eq!(simulator.end(TERM).code, Some(0));
+    assert_eq!(env.simulated("front").1, 0);
+    let truth = std::fs::read_to_string(env.path("truth")).expect("a truth");
+    assert!(truth.lines().next().is_some_and(|line| line.contains(r#""length":47"#)), "{truth}");
+    let refused = |flags: &[&str], says: &str| {
+        let port = format!("--port={}", env.word("none"));
+        let outcome = env.run(&[&["simulate", &port], flags].concat());
+        assert_eq!(outcome.code, Some(78), "{outcome}");
+        assert!(outcome.errors.contains(says), "{outcome}");
+    };
+    for family in ["scip", "cola", "rplidar"] {
+        refused(&[&format!("--family={family}")], "one of: lms, ld");
+    }
+    refused(&["--family=ld", "--model=ld20"], "one of: ld06, ld19, stl19p, stl27l, ld14p");
+    refused(&["--model=ld19"], "--type says which LMS");
+    refused(&["--family=ld", "--unit=cm"], "has no unit to choose");
+}
+
 /// A host that stopped in the middle of a request and finds no answer is told why.
 #[test]
 fn a_request_that_is_dropped_is_said() {

@@ -61,14 +61,14 @@ fn check_scan(scan: &Value, telegram: &[u8]) {
     let values = |key: &str| scan[key].as_array().unwrap_or_else(|| panic!("no {key}: {scan}")).clone();
     let (ranges, levels, mut codes) = (values("ranges"), values("intensities"), values("codes").into_iter());
     assert_eq!((ranges.len(), levels.len()), (measured.count(), measured.count()));
-    assert_eq!((number(scan, "count"), number(scan, "unit_mm")), (361, 1));
-    assert_eq!((scan["first_angle_deg"].as_f64(), scan["step_deg"].as_f64()), (Some(0.0), Some(0.5)));
+    assert_eq!((number(scan, "count"), number(scan, "unit_um")), (361, 1000));
+    assert_eq!((scan["first_angle_deg"].as_f64(), scan["step_deg"].as_f64()), (Some(-90.0), Some(0.5)));
     for (beam, word) in measured.words().enumerate() {
         let range = u64::from(word & 0x1FFF);
         assert_eq!(levels[beam], word >> 13, "level of beam {beam}");
         if range > LARGEST_RANGE {
             assert_eq!(ranges[beam], Value::Null, "beam {beam}");
-            assert_eq!(codes.next(), Some(serde_json::json!([beam, 8191 - range])));
+            assert_eq!(codes.next(), Some(serde_json::json!([beam, CODES[8191 - range as usize]])));
         } else {
             assert_eq!(ranges[beam], range, "beam {beam}");
         }
@@ -139,3 +139,6 @@ fn frame(mut bytes: &[u8]) -> (u64, u64) {
 
 /// In 13 bits; larger values are codes (Telegram listing, table 6-9).
 const LARGEST_RANGE: u64 = 8183 - 1;
+/// From the greatest value down.
+const CODES: [&str; 9] =
+    ["no_return", "too_bright", "overflow", "overflow", "weak", "error", "overflow", "overflow", "beyond"];

@@ -33,7 +33,7 @@ impl Sender {
     }
 
     /// The next datagram of `topic`.
-    pub(crate) fn make(&mut self, topic: Topic, payload: &impl Packed) -> Vec<u8> {
+    pub(crate) fn make(&mut self, topic: Topic, payload: &(impl Packed + ?Sized)) -> Vec<u8> {
         let mut buffer = [0; MTU_ETHERNET];
         let len = payload.pack(&mut buffer[HEAD..]).expect("it fits");
         self.seal(topic.number(), &mut buffer, len)
@@ -47,7 +47,7 @@ impl Sender {
     }
 
     /// Sends the next datagram of `topic`.
-    pub(crate) fn send(&mut self, topic: Topic, payload: &impl Packed) {
+    pub(crate) fn send(&mut self, topic: Topic, payload: &(impl Packed + ?Sized)) {
         let datagram = self.make(topic, payload);
         self.throw(topic, &datagram);
     }
@@ -94,6 +94,8 @@ impl Sender {
     fn seal(&mut self, topic: u8, buffer: &mut [u8], len: usize) -> Vec<u8> {
         let next = &mut self.next[usize::from(topic)];
         let head = Head {
+            part: 0,
+            parts: 1,
             topic,
             flags: LanFlags::SIMULATED,
             hub: self.hub,

@@ -17,18 +17,18 @@ int main(int argc, char **argv)
             answer = scanhub_take(scans, &sample);
         if (answer != 1)
             continue;
-        const struct scanhub_scan_v1 *scan = sample.payload;
-        int32_t nearest_mm = -1;
+        double nearest_m = INFINITY;
         unsigned at = 0;
-        for (unsigned i = 0; i < scan->count; i++) {
-            int32_t mm = scanhub_distance_mm(scan, i);
-            if (mm >= 0 && (nearest_mm < 0 || mm < nearest_mm)) {
-                nearest_mm = mm;
+        for (unsigned i = 0; i < scanhub_count(&sample); i++) {
+            const double range_m = scanhub_range_m(&sample, i);
+            /* No comparison with NAN is true. */
+            if (range_m < nearest_m) {
+                nearest_m = range_m;
                 at = i;
             }
         }
-        if (nearest_mm >= 0)
-            printf("%d mm at %.1f degrees\n", (int)nearest_mm, scanhub_angle_mdeg(scan, at) / 1000.0);
+        if (nearest_m < INFINITY)
+            printf("%.3f m at %.1f degrees\n", nearest_m, scanhub_angle(&sample, at) * 180 / 3.14159265358979);
         fflush(stdout);
         if (left > 0)
             left--;

@@ -92,7 +92,7 @@ macro_rules! topics {
         impl Held {
             fn lend(&self) -> Lent {
                 match self {
-                    Held::Robot(told) => Lent::new(None, told.verdict()),
+                    Held::Robot(told) => Lent::new(None, told.verdict(), size_of_val(told.verdict())),
                     $(Held::$topic(sample) => sample.lend(),)*
                 }
             }
@@ -110,14 +110,19 @@ trait Lend {
 impl Lend for Heard {
     fn lend(&self) -> Lent {
         let stale = self.stale.into();
-        Lent { missed: self.missed, stale, ..Lent::new(self.header.as_ref(), &self.zones) }
+        Lent {
+            missed: self.missed,
+            stale,
+            ..Lent::new(self.header.as_ref(), &self.zones, size_of_val(&self.zones))
+        }
     }
 }
 
 impl<P: Payload + ?Sized> Lend for Received<P> {
     fn lend(&self) -> Lent {
         let restarted = self.restarted.into();
-        Lent { missed: self.missed, restarted, ..Lent::new(Some(self.header()), &**self) }
+        let length = self.bytes().len();
+        Lent { missed: self.missed, restarted, ..Lent::new(Some(self.header()), &**self, length) }
     }
 }
 
@@ -204,11 +209,11 @@ impl Handle {
 }
 
 impl Lent {
-    fn new<P: ?Sized>(header: Option<&Header>, payload: &P) -> Lent {
+    fn new<P: ?Sized>(header: Option<&Header>, payload: &P, length: usize) -> Lent {
         Lent {
             header: header.map_or(ptr::null(), ptr::from_ref),
             payload: ptr::from_ref(payload).cast(),
-            length: size_of_val(payload),
+            length,
             ..Lent::none()
         }
     }

@@ -76,10 +76,10 @@ fn ask(
         }
         if Instant::now() >= give_up_at {
             let message =
-                format!("the hub did not answer for {} in {} s", request.sensor(), PATIENCE.as_secs());
+                format!("the hub did not answer for {} in {} s", request.sensor, PATIENCE.as_secs());
             let hint = format!(
                 "its log says whether something is short; `scanhub info {}` shows its state",
-                request.sensor()
+                request.sensor
             );
             return Err(Failure::new(Kind::Timeout, message, hint));
         }

@@ -39,7 +39,7 @@ impl<P: Payload + ?Sized> Deref for Received<P> {
 impl Received<Scan> {
     /// Returns CLOCK_MONOTONIC when beam `i` was measured, in ns: stamps are of bytes on the wire, the measurement is older.
     pub fn beam_time_ns(&self, i: usize) -> u64 {
-        self.header().stamp_first_ns.saturating_sub(self.beam_age_ns(i))
+        self.header().stamp_first_ns.saturating_add_signed(self.beam_ns(i))
     }
 }
 
@@ -91,7 +91,7 @@ impl<P: Payload + ?Sized> Follower<P> {
         let Some((_, subscriber)) = &self.port else {
             return Ok(None);
         };
-        let moment = session.moment(&self.sensor);
+        let moment = session.moment(&self.sensor, P::TOPIC);
         if moment.is_some() && moment == self.nothing_at {
             return Ok(None);
         }

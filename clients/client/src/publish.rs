@@ -2,15 +2,16 @@
 //! by name, in every language, see what they missed, and are woken. One process of a domain publishes beside its hub; its
 //! lock says that it lives. Refuses to know what is published.
 
-use std::cell::RefCell;
+use std::cell::{Cell, RefCell};
 use std::hash::{BuildHasher, RandomState};
 use std::rc::{Rc, Weak};
 
-use schema::ipc::{self, Node, Payload, TopicPublisher, Waker, ZeroCopySend};
-use schema::shortage::{allocate, check_descriptors, check_memory, sensor_bytes};
+use schema::ipc::{self, DueRings, Node, Payload, TopicPublisher, Waker};
+use schema::limits::TopicLimits;
+use schema::shortage::{allocate, check_descriptors, check_memory, longest_segment, sensor_bytes};
 use schema::{
-    DEFAULT_DOMAIN, Domain, Environment, Failure, Header, Kind, ListenLock, Topic, Wake, check_followed,
-    is_remote, publisher,
+    DEFAULT_DOMAIN, Domain, Environment, Failure, Header, Kind, ListenLock, Ring, Topic, Wake,
+    check_followed, is_remote, publisher,
 };
 
 use crate::clock;
@@ -20,7 +21,7 @@ use crate::subscribe::places;
 /// [`subscribe::<P>(name)`](crate::subscribe). There need not be a hub. A name is `OWNER.NAME`, as `tracker.near`: those
 /// without a dot are the hub's.
 ///
-/// A process that publishes more than one topic opens one [`PublishSession`] for all of them.
+/// A process that publishes more than one topic, or for more than 32 consumers, opens one [`PublishSession`] for all of them.
 ///
 /// # Errors
 ///
@@ -41,7 +42,7 @@ use crate::subscribe::places;
 /// }
 /// ```
 pub fn publish<P: Payload + ?Sized>(name: &str) -> Result<Publication<P>, Failure> {
-    PublishSession::open(&own_domain()?, &[P::TOPIC])?.sensor(name)?.topic()
+    PublishSession::open(&own_domain()?, &[P::TOPIC], TopicLimits::default())?.sensor(name)?.topic()
 }
 
 /// Returns the first live place of the domain that SCANHUB_DOMAIN names, or that which a hub would take.
@@ -60,6 +61,7 @@ pub struct PublishSession(Rc<Membership>);
 
 struct Membership {
     domain: Domain,
+    limits: TopicLimits,
     boot: u64,
     /// A second waker of the same name would take the first one's consumers along at its end.
     sensors: RefCell<Vec<Weak<Awakener>>>,
@@ -68,26 +70,36 @@ struct Membership {
     _lock: ListenLock,
 }
 
+/// Whether there is memory for `topics` of one sensor.
+fn check_topics(topics: &[Topic], limits: &TopicLimits) -> Result<(), Failure> {
+    let needed = sensor_bytes(topics, limits);
+    check_memory(needed, needed.min(longest_segment(limits)))
+}
+
 /// Descriptors of a service, and of its first consumer.
 const SERVICE_DESCRIPTORS: u64 = 8;
 
 impl PublishSession {
     /// Takes the domain's one place for a process that publishes beside its hub, and cleans up what dead ones left. There
-    /// has to be memory for one sensor with `topics`.
+    /// has to be memory for one sensor with `topics`. All topics of the session will be made as `limits` say; one that
+    /// consumers kept alive has the places that it was made with.
     ///
     /// # Errors
     ///
     /// [`Kind::DomainHeld`](schema::Kind) if another process (or another session of this one) has it: the message has its
-    /// number; [`Kind::Short`](schema::Kind) if memory or descriptors are short; [`Kind::Failed`](schema::Kind) if the
-    /// directory is another user's.
-    pub fn open(domain: &Domain, topics: &[Topic]) -> Result<PublishSession, Failure> {
+    /// number; [`Kind::Configuration`](schema::Kind) if the limits are none of those that can be;
+    /// [`Kind::Short`](schema::Kind) if memory or descriptors are short; [`Kind::Failed`](schema::Kind) if the directory is
+    /// another user's.
+    pub fn open(domain: &Domain, topics: &[Topic], limits: TopicLimits) -> Result<PublishSession, Failure> {
+        limits.check()?;
         let lock = ListenLock::acquire(domain.root())?;
-        check_memory(sensor_bytes(topics))?;
+        check_topics(topics, &limits)?;
         let node = ipc::hub_node(domain)?;
         node.try_cleanup_dead_nodes();
         let boot = RandomState::new().hash_one(std::process::id());
         let sensors = RefCell::default();
-        Ok(PublishSession(Rc::new(Membership { domain: domain.clone(), boot, sensors, node, _lock: lock })))
+        let domain = domain.clone();
+        Ok(PublishSession(Rc::new(Membership { domain, limits, boot, sensors, node, _lock: lock })))
     }
 
     /// Checks that there is memory for `topics` of one sensor, and descriptors for their first consumers.
@@ -96,7 +108,7 @@ impl PublishSession {
     ///
     /// [`Kind::Short`](schema::Kind) with what is free and what is needed.
     pub fn check_room(&self, topics: &[Topic]) -> Result<(), Failure> {
-        check_memory(sensor_bytes(topics))?;
+        check_topics(topics, &self.0.limits)?;
         check_descriptors((topics.len() as u64 + 1) * SERVICE_DESCRIPTORS)
     }
 
@@ -120,7 +132,8 @@ impl PublishSession {
         }
         self.check_room(&[])?;
         let waker = Waker::new(&self.0.node, name)?;
-        let sensor = Rc::new(Awakener { name: name.to_owned(), waker, membership: self.0.clone() });
+        let (name, due) = (name.to_owned(), Cell::default());
+        let sensor = Rc::new(Awakener { name, waker, due, membership: self.0.clone() });
         sensors.push(Rc::downgrade(&sensor));
         Ok(SensorPublisher(sensor))
     }
@@ -137,6 +150,8 @@ pub struct SensorPublisher(Rc<Awakener>);
 struct Awakener {
     name: String,
     waker: Waker,
+    /// What was sent and not rung for.
+    due: Cell<DueRings>,
     membership: Rc<Membership>,
 }
 
@@ -148,22 +163,32 @@ impl SensorPublisher {
     /// [`Kind::DomainHeld`](schema::Kind) if this process publishes it already; [`Kind::Short`](schema::Kind) if memory or
     /// descriptors are short; [`Kind::Failed`](schema::Kind) if the topic is there with another layout.
     pub fn topic<P: Payload + ?Sized>(&self) -> Result<Publication<P>, Failure> {
-        let Membership { domain, node, .. } = &*self.0.membership;
-        check_memory(sensor_bytes(&[P::TOPIC]))?;
+        let Membership { domain, node, limits, .. } = &*self.0.membership;
+        check_topics(&[P::TOPIC], limits)?;
         check_descriptors(SERVICE_DESCRIPTORS)?;
-        let topic = TopicPublisher::new(node, &self.0.name)?;
+        let topic = TopicPublisher::new(node, &self.0.name, limits)?;
         // To write into what has no memory behind it would end the process.
         allocate(domain)?;
         Ok(Publication { topic, sensor: SensorPublisher(self.0.clone()) })
     }
 
-    /// Wakes the consumers of all topics of this name, for `why`. Once is enough for samples that are sent together.
+    /// Wakes the consumers that got samples of any topic of this name since the last call, for `why`. Once is enough for
+    /// samples that are sent together.
     ///
     /// # Errors
     ///
     /// [`Kind::Failed`](schema::Kind) if some were not woken; these look by themselves ten times a second.
     pub fn wake(&self, why: Wake) -> Result<(), Failure> {
-        self.0.waker.wake(why)
+        let mut due = self.0.due.take();
+        Ring::ALL.into_iter().filter(|&ring| due.take(ring)).for_each(|ring| self.0.waker.ring(ring));
+        self.0.waker.tell(why)
+    }
+
+    /// `reached` consumers got a sample of `topic`.
+    fn note(&self, topic: Topic, reached: usize) {
+        let mut due = self.0.due.get();
+        due.note(topic, reached);
+        self.0.due.set(due);
     }
 }
 
@@ -220,7 +245,37 @@ impl<P: Payload + ?Sized> Publication<P> {
     }
 }
 
-impl<P: Payload + ZeroCopySend + Default> Publication<P> {
+impl<P: Payload + ?Sized> Publication<P> {
+    /// Sends a sample of `len` bytes that `fill` writes in place, beginning with all of them 0, and wakes the consumers: for
+    /// payloads without a size of their own, such as a scan.
+    ///
+    /// # Errors
+    ///
+    /// As [`send`](Publication::send); also [`Kind::Short`](schema::Kind) if it is longer than the topic was made for.
+    pub fn send_len(&mut self, len: usize, fill: impl FnOnce(&mut P)) -> Result<(), Failure> {
+        let header = self.header();
+        self.send_len_with(&header, len, fill)?;
+        self.sensor.wake(Wake::Telegram)
+    }
+
+    /// Sends as [`send_len`](Self::send_len), with `header` but for the sample's number in the topic, and wakes nobody. Returns
+    /// how many consumers got it.
+    ///
+    /// # Errors
+    ///
+    /// [`Kind::Short`](schema::Kind) if there is no memory for it, or it is longer than the topic was made for: its number is
+    /// used up.
+    pub fn send_len_with(
+        &mut self,
+        header: &Header,
+        len: usize,
+        fill: impl FnOnce(&mut P),
+    ) -> Result<usize, Failure> {
+        self.topic.send_len(header, len, fill)
+    }
+}
+
+impl<P: Payload> Publication<P> {
     /// Sends a sample that `fill` writes in place, beginning with the payload's default, and wakes the consumers.
     ///
     /// # Errors
@@ -240,7 +295,7 @@ impl<P: Payload + ZeroCopySend + Default> Publication<P> {
     ///
     /// [`Kind::Short`](schema::Kind) if there is no memory for it: its number is used up.
     pub fn send_with(&mut self, header: &Header, fill: impl FnOnce(&mut P)) -> Result<usize, Failure> {
-        self.topic.send(header, fill)
+        self.topic.send(header, fill).inspect(|&reached| self.sensor.note(P::TOPIC, reached))
     }
 }
 
@@ -264,6 +319,6 @@ impl Publication<[u8]> {
     /// [`Kind::Short`](schema::Kind) if there is no memory for it, or it is longer than
     /// [`Telegram::MAX`](schema::Telegram::MAX).
     pub fn send_bytes_with(&mut self, header: &Header, bytes: &[u8]) -> Result<usize, Failure> {
-        self.topic.send_bytes(header, bytes)
+        self.topic.send_bytes(header, bytes).inspect(|&reached| self.sensor.note(Topic::Telegram, reached))
     }
 }

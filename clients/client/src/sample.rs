@@ -2,7 +2,7 @@
 
 use std::time::Duration;
 
-use bytemuck::{Pod, bytes_of};
+use bytemuck::bytes_of;
 use schema::datagram::Packed;
 use schema::ipc::Payload;
 use schema::{Failure, Header, ROBOT, Topic};
@@ -158,7 +158,7 @@ trait AnySample {
     fn pack(&self, room: &mut [u8]) -> Option<usize>;
 }
 
-impl<P: Payload + Packed + Pod> AnySample for Received<P> {
+impl<P: Payload + Packed + ?Sized> AnySample for Received<P> {
     fn header(&self) -> Option<&Header> {
         Some(self.header())
     }
@@ -168,30 +168,11 @@ impl<P: Payload + Packed + Pod> AnySample for Received<P> {
     }
 
     fn bytes(&self) -> &[u8] {
-        bytes_of::<P>(self)
+        Payload::bytes(&**self)
     }
 
     fn pack(&self, room: &mut [u8]) -> Option<usize> {
         (**self).pack(room)
-    }
-}
-
-impl AnySample for Received<[u8]> {
-    fn header(&self) -> Option<&Header> {
-        Some(self.header())
-    }
-
-    fn missed(&self) -> u64 {
-        self.missed
-    }
-
-    fn bytes(&self) -> &[u8] {
-        self
-    }
-
-    fn pack(&self, room: &mut [u8]) -> Option<usize> {
-        room.get_mut(..self.len())?.copy_from_slice(self);
-        Some(self.len())
     }
 }
 

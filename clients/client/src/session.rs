@@ -5,7 +5,7 @@ use std::os::fd::{AsFd, BorrowedFd};
 use std::time::{Duration, Instant};
 
 use schema::ipc::{self, Node, Payload, Subscriber};
-use schema::{Domain, Failure, Kind, holder};
+use schema::{Domain, Failure, Kind, Topic, holder};
 
 use crate::presence::{Change, Presence, Who};
 use crate::readiness::Readiness;
@@ -134,7 +134,7 @@ impl Session {
         let (Some(_), Some(joined)) = (self.presence.domain(), &mut self.joined) else {
             return Ok(None);
         };
-        if !joined.wakeups.add(&joined.node, sensor)? {
+        if !joined.wakeups.add(&joined.node, sensor, P::TOPIC)? {
             return Ok(None);
         }
         if let Some(readiness) = &self.readiness {
@@ -145,10 +145,10 @@ impl Session {
         Ok(subscriber)
     }
 
-    /// Returns a moment in the life of `sensor`'s topics: as long as it is the same, nothing new was sent. Nothing where
+    /// Returns a moment in the life of a `sensor`'s `topic`: as long as it is the same, nothing new was sent. Nothing where
     /// that is not known. What late joiners get comes without a word, so a moment ends with the next look for the hub, too.
-    pub fn moment(&self, sensor: &str) -> Option<(u32, Instant)> {
-        let rung = self.joined.as_ref()?.wakeups.rung(sensor)?;
+    pub fn moment(&self, sensor: &str, topic: Topic) -> Option<(u32, Instant)> {
+        let rung = self.joined.as_ref()?.wakeups.rung(sensor, topic)?;
         Some((rung, self.presence.looked_at()?))
     }
 

@@ -3,8 +3,8 @@
 use std::os::fd::BorrowedFd;
 use std::time::Duration;
 
-use schema::Failure;
 use schema::ipc::{self, Bell, Listener, Node, Unsupported};
+use schema::{Failure, Ring, Topic};
 
 use crate::clock;
 
@@ -34,8 +34,9 @@ pub(crate) struct Wakeups {
 struct Sensor {
     name: String,
     bell: Option<Bell>,
-    /// How often the bell had been rung when its samples were last looked for.
-    rung: u32,
+    /// For each ring that tells of a topic that is followed how often the bell had been rung so when samples were last looked
+    /// for.
+    rung: [Option<u32>; Ring::ALL.len()],
     listener: Option<Listener>,
 }
 
@@ -45,14 +46,18 @@ impl Wakeups {
         Wakeups { wait, sensors: Vec::new(), rang: false, taken: false }
     }
 
-    /// Those of the sensor `name` too; whether they are there already.
+    /// Those of `topic` of the sensor `name` too; whether they are there already.
     ///
     /// [`Kind::Short`](schema::Kind) if memory, descriptors or places for consumers are.
-    pub(crate) fn add(&mut self, node: &Node, name: &str) -> Result<bool, Failure> {
-        if self.sensors.iter().any(|sensor| sensor.name == name) {
+    pub(crate) fn add(&mut self, node: &Node, name: &str, topic: Topic) -> Result<bool, Failure> {
+        let ring = topic.row().ring;
+        if let Some(known) = self.sensors.iter_mut().find(|sensor| sensor.name == name) {
+            known.hear(ring);
             return Ok(true);
         }
-        let mut sensor = Sensor { name: name.to_owned(), bell: None, rung: 0, listener: None };
+        let mut sensor =
+            Sensor { name: name.to_owned(), bell: None, rung: Default::default(), listener: None };
+        sensor.hear(ring);
         let is_there = match self.wait {
             Wait::Event => sensor.listen(node)?,
             Wait::Doorbell | Wait::Spin => sensor.go_to_bell(node)?,
@@ -83,7 +88,7 @@ impl Wakeups {
         if self.heard() {
             return Ok(());
         }
-        let bells: Vec<_> = self.sensors.iter().filter_map(Sensor::bell).collect();
+        let bells: Vec<_> = self.sensors.iter().flat_map(Sensor::bells).collect();
         let until_ns = clock::now_ns().saturating_add(left.as_nanos() as u64);
         let slept = match self.wait {
             _ if bells.is_empty() => {
@@ -110,18 +115,24 @@ impl Wakeups {
         std::mem::take(&mut self.rang)
     }
 
-    /// How often the bell of the sensor `name` was rung by now; nothing where that does not tell whether something was sent.
-    pub(crate) fn rung(&self, name: &str) -> Option<u32> {
+    /// How often the bell of the sensor `name` was rung for `topic` by now; nothing where that does not tell whether something
+    /// was sent.
+    pub(crate) fn rung(&self, name: &str, topic: Topic) -> Option<u32> {
         let sensor = self.sensors.iter().find(|sensor| sensor.name == name)?;
-        sensor.bell.as_ref().filter(|bell| !bell.is_closed()).map(Bell::rung)
+        let bell = sensor.bell.as_ref().filter(|bell| !bell.is_closed())?;
+        Some(bell.rung(topic.row().ring))
     }
 
     /// Whether a bell was rung since samples were last looked for; what was sent before can be received now.
     fn heard(&mut self) -> bool {
         let mut any = false;
-        for sensor in &mut self.sensors {
-            let rung = sensor.bell.as_ref().map_or(sensor.rung, Bell::rung);
-            any |= std::mem::replace(&mut sensor.rung, rung) != rung;
+        for Sensor { bell, rung, .. } in &mut self.sensors {
+            let Some(bell) = bell else { continue };
+            for (ring, seen) in Ring::ALL.into_iter().zip(rung) {
+                let Some(seen) = seen else { continue };
+                let rung = bell.rung(ring);
+                any |= std::mem::replace(seen, rung) != rung;
+            }
         }
         self.rang |= any;
         any
@@ -186,20 +197,35 @@ impl Sensor {
         if self.bell.as_ref().is_none_or(Bell::is_closed) {
             self.bell = Bell::open(node, &self.name)?.filter(|bell| !bell.is_closed());
             // Another bell, another count: samples may have been sent at it before.
-            self.rung = self.bell.as_ref().map_or(self.rung, |bell| bell.rung().wrapping_sub(1));
+            for ring in Ring::ALL {
+                self.rung[ring as usize] = self.rung[ring as usize].map(|_| self.not_yet(ring));
+            }
         }
         Ok(self.bell.is_some())
     }
 
-    fn bell(&self) -> Option<(&Bell, u32)> {
-        self.bell.as_ref().map(|bell| (bell, self.rung))
+    /// It follows a topic of which `ring` tells. Samples may have been sent before.
+    fn hear(&mut self, ring: Ring) {
+        if self.rung[ring as usize].is_none() {
+            self.rung[ring as usize] = Some(self.not_yet(ring));
+        }
+    }
+
+    /// A number that the bell does not have now.
+    fn not_yet(&self, ring: Ring) -> u32 {
+        self.bell.as_ref().map_or(0, |bell| bell.rung(ring).wrapping_sub(1))
+    }
+
+    fn bells(&self) -> impl Iterator<Item = (&Bell, Ring, u32)> {
+        let heard = Ring::ALL.into_iter().zip(self.rung).filter_map(|(ring, rung)| Some((ring, rung?)));
+        self.bell.iter().flat_map(move |bell| heard.clone().map(move |(ring, rung)| (bell, ring, rung)))
     }
 }
 
-fn spin(bells: &[(&Bell, u32)], until_ns: u64) {
+fn spin(bells: &[(&Bell, Ring, u32)], until_ns: u64) {
     while clock::now_ns() < until_ns {
         for _ in 0..LOOKS {
-            if bells.iter().any(|(bell, rung)| bell.rung() != *rung) {
+            if bells.iter().any(|(bell, ring, rung)| bell.rung(*ring) != *rung) {
                 return;
             }
             std::hint::spin_loop();
@@ -214,160 +240,4 @@ const LOOKS: u32 = 100;
 const WITHOUT_BELL: Duration = Duration::from_millis(20);
 
 #[cfg(test)]
-mod tests {
-    use super::*;
-    use schema::ipc::Waker;
-    use schema::{Domain, Wake};
-    use std::path::PathBuf;
-    use std::sync::mpsc;
-    use std::thread;
-    use std::time::Instant;
-
-    /// A domain that goes with the test.
-    struct Place(PathBuf, Domain);
-
-    impl Place {
-        fn new(name: &str) -> Place {
-            let name = format!("w{}-{name}", std::process::id());
-            let base = PathBuf::from(format!("/tmp/sh{name}"));
-            Place(base.clone(), Domain::at(&name, &base).unwrap())
-        }
-    }
-
-    impl Drop for Place {
-        fn drop(&mut self) {
-            let _ = std::fs::remove_dir_all(&self.0);
-            for entry in std::fs::read_dir("/dev/shm").into_iter().flatten().flatten() {
-                if entry.file_name().to_string_lossy().starts_with(&self.1.prefix()) {
-                    let _ = std::fs::remove_file(entry.path());
-                }
-            }
-        }
-    }
-
-    /// Far longer than any wait here may last.
-    const LONG: Duration = Duration::from_secs(20);
-
-    /// Waits that are over before this time were woken.
-    fn woken(started: Instant) -> bool {
-        started.elapsed() < LONG
-    }
-
-    /// A hub's end in a thread of its own, where its ports have to stay; wakes each time it is told.
-    fn hub(domain: &Domain, sensor: &'static str) -> mpsc::Sender<()> {
-        let (tell, told) = mpsc::channel();
-        let (say, said) = mpsc::channel();
-        let node = ipc::hub_node(domain).unwrap();
-        thread::spawn(move || {
-            let waker = Waker::new(&node, sensor).unwrap();
-            say.send(()).unwrap();
-            while let Ok(()) = told.recv() {
-                waker.wake(Wake::Telegram).unwrap();
-            }
-        });
-        said.recv().unwrap();
-        tell
-    }
-
-    #[test]
-    fn each_way_wakes_for_every_sensor() {
-        for (wait, name) in [(Wait::Doorbell, "bell"), (Wait::Event, "event"), (Wait::Spin, "spin")] {
-            let place = Place::new(name);
-            let mut wakeups = Wakeups::by(wait);
-            let hubs = ["front", "rear"].map(|sensor| hub(&place.1, sensor));
-            let node = ipc::client_node(&place.1).unwrap();
-            assert!(!wakeups.add(&node, "left").unwrap(), "there is no such sensor");
-            for (at, sensor) in ["front", "rear"].into_iter().enumerate() {
-                assert!(wakeups.add(&node, sensor).unwrap());
-                for hub in &hubs[..=at] {
-                    // What came before it was listened to may be told once more.
-                    wakeups.wait(&node, Duration::ZERO).unwrap();
-                    wakeups.wait(&node, Duration::ZERO).unwrap();
-                    let started = Instant::now();
-                    hub.send(()).unwrap();
-                    wakeups.wait(&node, LONG).unwrap();
-                    assert!(woken(started), "{wait:?}");
-                }
-            }
-        }
-    }
-
-    #[test]
-    fn the_bell_of_a_hub_that_ended_is_exchanged() {
-        let place = Place::new("ended");
-        let hub = ipc::hub_node(&place.1).unwrap();
-        let node = ipc::client_node(&place.1).unwrap();
-        let mut wakeups = Wakeups::by(Wait::Doorbell);
-        let first = Waker::new(&hub, "front").unwrap();
-        assert!(wakeups.add(&node, "front").unwrap());
-        wakeups.wait(&node, Duration::ZERO).unwrap();
-        let started = Instant::now();
-        drop(first);
-        wakeups.wait(&node, LONG).unwrap();
-        assert!(wakeups.sensors[0].bell.is_none(), "nobody rings it any more");
-        wakeups.wait(&node, Duration::ZERO).unwrap();
-        let second = Waker::new(&hub, "front").unwrap();
-        wakeups.wait(&node, LONG).unwrap();
-        second.wake(Wake::Telegram).unwrap();
-        wakeups.wait(&node, LONG).unwrap();
-        assert!(woken(started));
-        assert!(wakeups.sensors[0].bell.as_ref().is_some_and(|bell| !bell.is_closed()));
-    }
-
-    #[test]
-    fn a_bell_that_somebody_removed_while_there_was_no_hub_is_exchanged() {
-        let place = Place::new("removed");
-        let hub = ipc::hub_node(&place.1).unwrap();
-        let node = ipc::client_node(&place.1).unwrap();
-        let mut wakeups = Wakeups::by(Wait::Doorbell);
-        // A hub that is killed closes nothing.
-        std::mem::forget(Waker::new(&hub, "front").unwrap());
-        assert!(wakeups.add(&node, "front").unwrap());
-        for entry in std::fs::read_dir("/dev/shm").unwrap().flatten() {
-            let name = entry.file_name().to_string_lossy().into_owned();
-            if name.starts_with(&place.1.prefix()) && name.ends_with(".bell") {
-                std::fs::remove_file(entry.path()).unwrap();
-            }
-        }
-        let next = Waker::new(&hub, "front").unwrap();
-        wakeups.renew();
-        wakeups.wait(&node, Duration::ZERO).unwrap();
-        let before = wakeups.rung("front").expect("it has a bell");
-        next.wake(Wake::Telegram).unwrap();
-        assert_eq!(wakeups.rung("front"), Some(before + 1));
-    }
-
-    #[test]
-    fn an_event_that_is_made_later_is_listened_to() {
-        let place = Place::new("later");
-        let hub = ipc::hub_node(&place.1).unwrap();
-        let node = ipc::client_node(&place.1).unwrap();
-        let mut wakeups = Wakeups::by(Wait::Doorbell);
-        let first = Waker::new(&hub, "front").unwrap();
-        assert!(wakeups.add(&node, "front").unwrap());
-        drop(first);
-        wakeups.turn_to_events(&node).unwrap();
-        assert!(wakeups.sensors[0].listener.is_none());
-        let waker = Waker::new(&hub, "front").unwrap();
-        wakeups.wait(&node, LONG).unwrap();
-        let started = Instant::now();
-        waker.wake(Wake::Telegram).unwrap();
-        wakeups.wait(&node, LONG).unwrap();
-        assert!(woken(started) && wakeups.sensors[0].listener.is_some());
-    }
-
-    #[test]
-    fn where_words_cannot_be_waited_for_the_event_wakes() {
-        let place = Place::new("turn");
-        let hub = ipc::hub_node(&place.1).unwrap();
-        let node = ipc::client_node(&place.1).unwrap();
-        let waker = Waker::new(&hub, "front").unwrap();
-        let mut wakeups = Wakeups::by(Wait::Doorbell);
-        assert!(wakeups.add(&node, "front").unwrap());
-        wakeups.turn_to_events(&node).unwrap();
-        let started = Instant::now();
-        waker.wake(Wake::Telegram).unwrap();
-        wakeups.wait(&node, LONG).unwrap();
-        assert!(woken(started) && wakeups.wait == Wait::Event);
-    }
-}
+mod tests;

@@ -6,6 +6,7 @@ use std::time::Duration;
 
 use fake::{FakeHub, Place, until};
 use scanhub_client::{Kind, Marks, PublishSession, Scan, Subscription, Topic, Verdict, Wait, Wake, Zones};
+use schema::limits::TopicLimits;
 use schema::publisher;
 
 fn marks(count: u8) -> Marks {
@@ -26,7 +27,7 @@ fn follow(place: &Place, sensor: &str) -> Subscription<Marks> {
 fn it_is_followed_without_a_hub_and_what_is_skipped_is_missed() {
     let place = Place::new();
     for wait in [Wait::Doorbell, Wait::Event] {
-        let session = PublishSession::open(&place.domain, &[Topic::Marks]).unwrap();
+        let session = PublishSession::open(&place.domain, &[Topic::Marks], TopicLimits::default()).unwrap();
         assert_eq!(publisher(place.domain.root()), Ok(Some(std::process::id())));
         let mut near = session.sensor("tracker.near").unwrap().topic::<Marks>().unwrap();
         let mut followed = follow(&place, "tracker.near").wait_by(wait);
@@ -51,7 +52,7 @@ fn it_is_followed_without_a_hub_and_what_is_skipped_is_missed() {
 #[test]
 fn samples_that_are_sent_together_wake_once() {
     let place = Place::new();
-    let session = PublishSession::open(&place.domain, &[Topic::Marks]).unwrap();
+    let session = PublishSession::open(&place.domain, &[Topic::Marks], TopicLimits::default()).unwrap();
     let sensor = session.sensor("tracker.near").unwrap();
     let (mut near, mut zones) = (sensor.topic::<Marks>().unwrap(), sensor.topic::<Zones>().unwrap());
     let mut followed = follow(&place, "tracker.near");
@@ -73,7 +74,7 @@ fn samples_that_are_sent_together_wake_once() {
 fn another_life_begins_again() {
     let place = Place::new();
     let open = || {
-        PublishSession::open(&place.domain, &[Topic::Marks])
+        PublishSession::open(&place.domain, &[Topic::Marks], TopicLimits::default())
             .unwrap()
             .sensor("tracker.near")
             .unwrap()
@@ -99,7 +100,7 @@ fn another_life_begins_again() {
 #[test]
 fn a_name_that_is_made_twice_wakes_its_consumers_all_the_same() {
     let place = Place::new();
-    let session = PublishSession::open(&place.domain, &[Topic::Marks]).unwrap();
+    let session = PublishSession::open(&place.domain, &[Topic::Marks], TopicLimits::default()).unwrap();
     let mut near = session.sensor("tracker.near").unwrap().topic::<Marks>().unwrap();
     let zones = session.sensor("tracker.near").unwrap().topic::<Zones>().unwrap();
     let again = session.sensor("tracker.near").and_then(|sensor| sensor.topic::<Marks>()).map(drop);
@@ -114,7 +115,7 @@ fn a_name_that_is_made_twice_wakes_its_consumers_all_the_same() {
 #[test]
 fn telegrams_have_the_length_that_they_have() {
     let place = Place::new();
-    let session = PublishSession::open(&place.domain, &[Topic::Marks]).unwrap();
+    let session = PublishSession::open(&place.domain, &[Topic::Marks], TopicLimits::default()).unwrap();
     let mut bytes = session.sensor("tracker.near").unwrap().topic::<[u8]>().unwrap();
     let mut followed = Subscription::<[u8]>::in_domain(place.places(), "tracker.near")
         .unwrap()
@@ -130,9 +131,12 @@ fn telegrams_have_the_length_that_they_have() {
 fn one_process_publishes_beside_the_hub_and_no_name_of_its_sensors() {
     let place = Place::new();
     let mut hub = FakeHub::new(&place.domain, &["front"], 1);
-    let session = PublishSession::open(&place.domain, &[Topic::Marks]).unwrap();
+    let session = PublishSession::open(&place.domain, &[Topic::Marks], TopicLimits::default()).unwrap();
     assert_eq!(
-        PublishSession::open(&place.domain, &[Topic::Marks]).map(drop).unwrap_err().kind,
+        PublishSession::open(&place.domain, &[Topic::Marks], TopicLimits::default())
+            .map(drop)
+            .unwrap_err()
+            .kind,
         Kind::DomainHeld
     );
     let topic = |name: &str| session.sensor(name).and_then(|sensor| sensor.topic::<Scan>()).map(drop);

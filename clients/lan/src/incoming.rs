@@ -2,6 +2,7 @@
 //! of it. Refuses to know sockets and clocks, and what becomes of samples.
 
 mod duplicate_gateways;
+mod parts;
 mod peer_table;
 mod remote;
 
@@ -10,6 +11,7 @@ use schema::datagram::{Announce, Datagram, DatagramError, Fresh, Head, StreamSta
 
 use crate::Stamp;
 use duplicate_gateways::DuplicateGateways;
+use parts::Parts;
 pub use peer_table::PeerTable;
 pub use remote::Remote;
 
@@ -18,6 +20,7 @@ pub struct Incoming {
     stats: Box<StreamStats>,
     peers: PeerTable,
     duplicates: DuplicateGateways,
+    parts: Parts,
 }
 
 /// What a datagram is to who received it.
@@ -29,6 +32,8 @@ pub enum Arrived<'a> {
         /// The gateway's number, if two are known to send under it.
         shared: Option<u64>,
     },
+    /// It is a part of a sample that is not whole yet.
+    Part,
     /// It came before, or announces what a newer one has announced.
     Known,
     /// It says who a sensor is.
@@ -83,19 +88,34 @@ impl Incoming {
             stats: Box::new(StreamStats::new(topics)),
             peers: PeerTable::default(),
             duplicates: DuplicateGateways::default(),
+            parts: Parts::default(),
         }
     }
 
     /// Takes `bytes`, a whole datagram that came `from` a sender at `arrival`. A sender is any number that others do not
-    /// have, for example its address and port.
-    pub fn receive<'a>(&mut self, bytes: &'a [u8], from: u64, arrival: Stamp) -> Arrived<'a> {
-        match self.stats.receive(bytes, from, arrival.monotonic_ns) {
-            Ok((_, Fresh::Duplicate)) => Arrived::Known,
-            Ok((datagram, fresh)) => {
+    /// have, for example its address and port. Where a sample came in parts, it is in `whole` once the last of them is there.
+    pub fn receive<'a>(
+        &mut self,
+        bytes: &'a [u8],
+        from: u64,
+        arrival: Stamp,
+        whole: &'a mut Vec<u8>,
+    ) -> Arrived<'a> {
+        let mut datagram = match self.stats.read(bytes) {
+            Ok(datagram) => datagram,
+            Err(why) => return Arrived::Refused { why, shared: None },
+        };
+        if datagram.head.parts > 1 {
+            let Some(head) = self.parts.take(&datagram, from, whole) else { return Arrived::Part };
+            datagram = Datagram { head, payload: whole, mac: None };
+        }
+        match self.stats.take(&datagram, from, arrival.monotonic_ns) {
+            Ok(Fresh::Duplicate) => Arrived::Known,
+            Ok(fresh) => {
                 self.duplicates.taken(datagram.head.hub);
                 self.accepted(datagram, fresh == Fresh::Late, arrival)
             }
-            Err(why) => Arrived::Refused { why, shared: self.shared(why, bytes, arrival) },
+            Err(why) => Arrived::Refused { why, shared: self.shared(why, &datagram.head, arrival) },
         }
     }
 
@@ -147,12 +167,12 @@ impl Incoming {
         })
     }
 
-    /// Whose number it is, if these `bytes`, that were refused, show that two gateways have it.
-    fn shared(&mut self, why: DatagramError, bytes: &[u8], arrival: Stamp) -> Option<u64> {
+    /// Whose number it is, if a sample with this `head`, that was refused, shows that two gateways have it.
+    fn shared(&mut self, why: DatagramError, head: &Head, arrival: Stamp) -> Option<u64> {
         if !matches!(why, DatagramError::Epoch | DatagramError::Twin) {
             return None;
         }
-        let Head { hub, epoch, .. } = Datagram::read(bytes).ok()?.head;
+        let Head { hub, epoch, .. } = *head;
         let is_shared =
             self.stats.is_shared(hub, epoch) || self.duplicates.refused(hub, arrival.monotonic_ns);
         is_shared.then_some(hub)
@@ -181,7 +201,8 @@ mod tests {
         let mut begins = |epoch, sequence, from, ms: u64| {
             let arrival = Stamp { monotonic_ns: ms * 1_000_000, wall_ns: 0 };
             let bytes = zones(epoch, sequence);
-            let arrived = incoming.receive(&bytes, from, arrival);
+            let mut whole = Vec::new();
+            let arrived = incoming.receive(&bytes, from, arrival, &mut whole);
             arrived.begins().map(|head| head.epoch)
         };
         assert_eq!([begins(7, 0, 1, 10), begins(7, 1, 1, 10), begins(7, 2, 1, 11)], [Some(7), None, None]);

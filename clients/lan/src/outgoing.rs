@@ -77,7 +77,7 @@ impl Outgoing {
         self.numbering.sensors()
     }
 
-    /// Returns the number of samples that did not fit into a datagram.
+    /// Returns the number of samples that did not fit into as many datagrams as one may have.
     pub fn unfit(&self) -> u64 {
         self.numbering.unfit()
     }

@@ -129,13 +129,12 @@ impl<S: TopicStore> Republisher<S> {
         self.sensors.iter_mut().for_each(RemoteSensor::wake);
     }
 
-    /// What is due now and then: sensors that are silent, consumers that came or died. Everything that came until `read_ns` was
-    /// taken, by the clock of arrivals: of what still waits nobody is silent.
-    pub fn look(&mut self, now: Stamp, read_ns: u64) {
-        let now_ns = now.monotonic_ns;
+    /// What is due at `now_ns`: sensors that are silent, consumers that came or died. Everything that came before `read` was
+    /// taken, by the clocks of arrivals. A silence is said as of then: nobody knows yet what still waits.
+    pub fn look(&mut self, now_ns: u64, read: Stamp) {
         if now_ns >= self.greet_ns {
             self.greet_ns = now_ns + GREET_EVERY_NS;
-            self.sensors.iter_mut().for_each(|sensor| sensor.look(now, read_ns));
+            self.sensors.iter_mut().for_each(|sensor| sensor.look(read));
         }
         if now_ns >= self.allow_ns {
             self.allow_ns = now_ns + ALLOW_EVERY_NS;

@@ -16,7 +16,7 @@ use lan::incoming::Arrived;
 use lan::republish::LeftOut;
 use network::{Faults, Nanos, Network};
 use receiving::{Published, Receiving, Seen};
-use schema::datagram::{Datagram, DatagramError};
+use schema::datagram::{Datagram, DatagramError, HEAD, MTU_LEAST, MTU_SAFE};
 use schema::{Header, Topic, Verdict, Zones};
 use sending::{HUB, Key, Mishaps, NAMES, PERIOD_NS, Sending, Sent};
 
@@ -33,6 +33,8 @@ struct Run {
     faults: Faults,
     mishaps: Mishaps,
     every: u64,
+    /// The longest datagram: of some runs so short that all samples go in parts.
+    longest: usize,
     /// The listener does not run at times.
     stalls: bool,
 }
@@ -50,7 +52,9 @@ impl Run {
         flags[2] &= flags[1];
         let [silence, hub, order, gateway, stalls] = flags;
         let mishaps = Mishaps { silence, hub, order, gateway, refusal };
-        Run { seed, faults, mishaps, every: 1 << rng.u32(0..4), stalls }
+        let every = 1 << rng.u32(0..4);
+        let longest = [HEAD + 5, MTU_LEAST, MTU_SAFE][rng.usize(..3)];
+        Run { seed, faults, mishaps, every, longest, stalls }
     }
 
     /// What `docs/topics.md` promises: two periods as sent and 40 ms, half a second at least, 5.04 s at most. The period is told
@@ -79,6 +83,8 @@ fn limit_ns(period_ns: Nanos) -> Nanos {
 struct Judged {
     delivered: u64,
     refused: u64,
+    /// Parts that made no sample whole.
+    parts: u64,
     /// Numbers that were taken.
     taken: BTreeMap<Key, BTreeSet<u32>>,
     again: u64,
@@ -118,12 +124,18 @@ impl Judged {
         let head = Datagram::read(bytes).expect("what is not refused can be read").head;
         let key = (head.epoch, head.sensor, head.topic);
         let was_sent = &sent.datagrams[&key][head.sequence as usize];
-        assert_eq!(was_sent.as_deref(), Some(bytes), "what is taken was sent");
+        assert_eq!(was_sent[usize::from(head.part)].as_deref(), Some(bytes), "what is taken was sent");
+        if let Arrived::Part = arrived {
+            self.parts += 1;
+            return;
+        }
         let is_new = self.taken.entry(key).or_default().insert(head.sequence);
         self.again += u64::from(!is_new);
         match arrived {
             Arrived::Sample(sample) => {
                 assert!(is_new, "no sample comes twice");
+                let sent = was_sent.iter().flatten().flat_map(|part| &part[HEAD..]);
+                assert!(sent.eq(sample.remote.datagram.payload), "no sample is half of one");
                 let zones = sample.remote.payload::<Zones>();
                 let is_zones = sample.remote.topic == Topic::Zones && !sample.remote.late;
                 if let Some(zones) = zones.filter(|_| is_zones) {
@@ -178,7 +190,7 @@ impl Judged {
 fn play(run: &Run) -> Judged {
     let mut rng = Rng::with_seed(run.seed ^ 0x5eed);
     let mut network = Network::new(run.seed, run.faults);
-    let mut sending = Sending::new(run.seed, run.mishaps, run.every);
+    let mut sending = Sending::new(run.seed, run.mishaps, run.every, run.longest);
     let clocks = Stamp { monotonic_ns: rng.u64(1..1 << 50), wall_ns: rng.u64(1 << 60..1 << 61) };
     let mut receiving = Receiving::new(clocks, NAME, &NAMES);
     let mut judged = Judged::default();
@@ -249,7 +261,7 @@ fn judge_account(judged: &Judged, sent: &Sent, receiving: &Receiving) {
     assert_eq!((stats.given_up().lives, stats.refused(DatagramError::Stale)), (0, 0));
     let refused: u64 = DatagramError::ALL.iter().map(|&why| stats.refused(why)).sum();
     assert_eq!((duplicate, refused), (judged.again, judged.refused));
-    assert_eq!(received + duplicate + refused, judged.delivered, "each is counted once");
+    assert_eq!(received + duplicate + refused + judged.parts, judged.delivered, "each is counted once");
 }
 
 #[test]
@@ -282,7 +294,9 @@ fn what_comes_was_sent_and_what_does_not_is_counted() {
 fn a_network_without_faults_carries_everything() {
     for every in [1, 4] {
         let faults = Faults { delay_ns: MS, ..Faults::default() };
-        let judged = play(&Run { seed: 1, faults, mishaps: Mishaps::default(), every, stalls: false });
+        let mishaps = Mishaps::default();
+        let judged = play(&Run { seed: 1, faults, mishaps, every, longest: HEAD + 5, stalls: false });
+        assert!(judged.parts > judged.sent);
         assert_eq!((judged.left_out, judged.refused, judged.again), ([0; 5], 0, 0));
         assert_eq!(judged.count, judged.sent);
         assert!(judged.longest_ns <= every * PERIOD_NS, "{} ms", judged.longest_ns / MS);

@@ -20,8 +20,8 @@ except ImportError:
 
 def points_m(scan: scanhub.Scan) -> "tuple[np.ndarray, np.ndarray]":
     """Where the beams ended, from the sensor: ahead and to the left."""
-    angles, ranges = scan.angles_rad, scan.ranges_m
-    return ranges * np.sin(angles), -ranges * np.cos(angles)
+    angles, ranges = scan.angles, scan.ranges_m
+    return ranges * np.cos(angles), ranges * np.sin(angles)
 
 
 def main() -> None:

@@ -10,7 +10,6 @@ from typing import Any
 
 import iceoryx2 as iox2
 
-from . import layout, trouble
 from .errors import Failure, Impossible, NoHub, NoTopic, Refused, Short, Silent
 from .memory import Membership
 from .model import Shown
@@ -65,12 +64,12 @@ class _Client:
 
     def ask(self, verb: int) -> bytes:
         """The answer of the hub, without its header."""
-        request = layout.Request(verb=verb)
         # The hub has none with a longer name.
-        name = self._sensor.encode()[: len(request.sensor_text)]
-        request.sensor_text[: len(name)] = name
+        request = struct.pack("<32sH6x", self._sensor.encode(), verb)
         try:
-            pending = self._client.send_copy(request)
+            loan = self._client.loan_slice_uninit(len(request))
+            ctypes.memmove(loan.payload_ptr, request, len(request))
+            pending = loan.assume_init().send()
             if pending.number_of_server_connections == 0:
                 raise NoHub("no hub takes requests", "start one with `scanhub run`")
             self._requests.notify()
@@ -99,13 +98,13 @@ class _Client:
         """Waits a moment for the service of a hub that is just starting."""
         join, give_up_at = self._membership, time.monotonic() + GRACE
         while True:
-            builder = join.service(CONTROL).request_response(layout.Request, iox2.Slice[ctypes.c_uint8])
-            control = join.open(CONTROL, builder, trouble.types(layout.Request))
+            builder = join.service(CONTROL).request_response(_BYTES, _BYTES)
+            control = join.open(CONTROL, builder, "bytes")
             asked = join.open(f"{CONTROL}/request", join.service(f"{CONTROL}/request").event(), "an event")
             answers = join.listen(f"{CONTROL}/response")
             if control and asked and answers:
                 requests = asked.notifier_builder().default_event_id(iox2.EventId.new(1))
-                client = join.port(CONTROL, control.client_builder())
+                client = join.port(CONTROL, control.client_builder().initial_max_slice_len(_REQUEST))
                 return client, join.port(f"{CONTROL}/request", requests), answers
             if time.monotonic() >= give_up_at:
                 raise NoHub("the hub takes no requests", "it may be an older one")
@@ -128,3 +127,6 @@ _KINDS: dict[int, type[Failure]] = {3: NoTopic, 75: Short}
 """The errors for exit codes; every other code is Refused."""
 _PATIENCE = 5.0
 """Seconds: a link takes a request within milliseconds; one that opens its port may need longer."""
+_BYTES: Any = iox2.Slice[ctypes.c_uint8]
+_REQUEST = 40
+"""Bytes of a request without a model."""

@@ -1,23 +1,20 @@
-"""The structs of docs/topics.md, version 1, field by field, as they lie in shared memory. Refuses to know what they
+"""The structs of docs/topics.md, version 2, field by field, as they lie in shared memory. Refuses to know what they
 mean."""
 
 from __future__ import annotations
 
 import ctypes
-from ctypes import c_double, c_int32, c_uint8, c_uint16, c_uint32, c_uint64
+from ctypes import c_double, c_float, c_int32, c_uint8, c_uint16, c_uint32, c_uint64
 
-BEAMS = 401
+BEAMS = 8192
 """The most beams of a scan."""
-
-REVISION = 1
-"""Of all payloads: a greater one of the hub only appends."""
 
 
 class _Struct(ctypes.LittleEndianStructure):
     @classmethod
     def type_name(cls) -> str:
         """The name that both sides of a service compare."""
-        return f"scanhub.{cls.__name__}.v1"
+        return f"scanhub.{cls.__name__.removesuffix('Word')}.v2"
 
 
 class Header(_Struct):
@@ -38,19 +35,36 @@ class Header(_Struct):
     ]
 
 
-class Scan(_Struct):
+class ScanHead(_Struct):
+    """Behind it `count` values of each array that there is: exact angles, ranges, wide intensities, upper bits."""
+
     _fields_ = [
+        ("first_angle", c_double),
+        ("step", c_double),
+        ("spacing", c_float),
+        ("beam_time_ns", c_uint32),
+        ("first_beam_ns", c_int32),
+        ("unit_um", c_uint32),
         ("count", c_uint16),
-        ("unit_mm", c_uint8),
-        ("range_bits", c_uint8),
-        ("first_angle_mdeg", c_int32),
-        ("step_mdeg", c_uint16),
-        ("intensity_bits", c_uint8),
+        ("valid_to", c_uint16),
+        ("no_return", c_uint16),
+        ("beyond", c_uint16),
+        ("collapsed", c_uint16),
+        ("family", c_uint8),
+        ("flags", c_uint8),
         ("contents", c_uint8),
-        ("range_array", c_uint16 * BEAMS),
-        ("upper_array", c_uint8 * BEAMS),
-        ("pad", c_uint8),
+        ("intensity_bits", c_uint8),
+        ("turns", c_uint8),
+        ("reserved", c_uint8),
+        ("turn_ns", c_uint32),
+        ("reserved2", c_uint8 * 12),
     ]
+
+
+class ScanWord(_Struct):
+    """Eight bytes of a scan: in shared memory it is a slice of them."""
+
+    _fields_ = [("word", c_uint64)]
 
 
 class Mark(_Struct):
@@ -97,33 +111,44 @@ class Segment(_Struct):
     ]
 
 
-class Foreground(_Struct):
+class ForegroundHead(_Struct):
+    """Behind it 64 segments, a bit for every beam of the scan in pairs of bytes, and a range for every beam."""
+
     _fields_ = [
         ("generation", c_uint32),
+        ("unit_um", c_uint32),
         ("count", c_uint16),
         ("beams", c_uint16),
-        ("unit_mm", c_uint8),
-        ("left_out", c_uint8),
         ("segments", c_uint16),
-        ("bit_array", c_uint8 * 51),
-        ("pad", c_uint8),
-        ("range_array", c_uint16 * BEAMS),
-        ("pad2", c_uint8 * 2),
-        ("segment_array", Segment * 64),
+        ("left_out", c_uint16),
     ]
 
 
-class Background(_Struct):
+class ForegroundWord(_Struct):
+    """Eight bytes of a foreground."""
+
+    _fields_ = [("word", c_uint64)]
+
+
+class BackgroundHead(_Struct):
+    """Behind it a range for every beam."""
+
     _fields_ = [
+        ("first_angle", c_double),
+        ("step", c_double),
         ("generation", c_uint32),
+        ("unit_um", c_uint32),
         ("taught", c_uint16),
         ("count", c_uint16),
-        ("unit_mm", c_uint8),
         ("flags", c_uint8),
-        ("reserved", c_uint8 * 2),
-        ("range_array", c_uint16 * BEAMS),
-        ("pad", c_uint8 * 2),
+        ("reserved", c_uint8 * 3),
     ]
+
+
+class BackgroundWord(_Struct):
+    """Eight bytes of a background."""
+
+    _fields_ = [("word", c_uint64)]
 
 
 class Pose(_Struct):
@@ -152,18 +177,6 @@ class Status(_Struct):
         ("last_error_text", c_uint8 * 160),
         ("counters", c_uint64 * 28),
         ("pose", Pose),
-    ]
-
-
-class Request(_Struct):
-    _fields_ = [
-        ("sensor_text", c_uint8 * 32),
-        ("verb", c_uint16),
-        ("count", c_uint16),
-        ("unit_mm", c_uint8),
-        ("reserved", c_uint8 * 3),
-        ("range_array", c_uint16 * BEAMS),
-        ("pad", c_uint8 * 6),
     ]
 
 

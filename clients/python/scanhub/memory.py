@@ -56,7 +56,7 @@ class Membership:
     def subscribe(self, name: TopicName, kind: type[Sample]) -> Port | None:
         """The subscriber of a topic, or None until a hub has made it. Raises Mismatch, Short, Failure."""
         builder = self.service(name.service).publish_subscribe(_payload(kind)).user_header(layout.Header)
-        factory = self.open(name.service, builder, trouble.types(kind.struct))
+        factory = self.open(name.service, builder, trouble.types(kind.element or kind.struct))
         return factory and Port(name, kind, self.port(name.service, factory.subscriber_builder()))
 
     def open(self, name: str, builder: Any, ours: str) -> Any | None:
@@ -79,19 +79,22 @@ class Membership:
 class Received:
     """A sample in shared memory. The hub does not reuse its memory while this object, or an array of it, is in use."""
 
-    __slots__ = ("_sample", "_size", "header")
+    __slots__ = ("_sample", "_kind", "_data", "header")
 
-    def __init__(self, sample: Any, size: int | None) -> None:
+    def __init__(self, sample: Any, kind: type[Sample]) -> None:
         self._sample = sample
-        self._size = size
+        self._kind = kind
+        self._data: Any = None
         self.header = _header_at(sample.user_header_ptr)
 
     def data(self) -> Any:
         """The payload as an array of bytes; made on first use, because a program that waits for a sample is in a hurry."""
-        size = self._size or self._sample.payload().len()
-        data: Any = (ctypes.c_uint8 * size).from_address(self._sample.payload_ptr)
-        data.sample = self._sample
-        return data
+        if self._data is None:
+            kind, sample = self._kind, self._sample
+            size = ctypes.sizeof(kind.element) * sample.payload().len() if kind.element else ctypes.sizeof(kind.struct)
+            self._data = (ctypes.c_uint8 * size).from_address(sample.payload_ptr)
+            self._data.sample = sample
+        return self._data
 
 
 class Port:
@@ -99,7 +102,7 @@ class Port:
 
     def __init__(self, name: TopicName, kind: type[Sample], subscriber: Any) -> None:
         self._name = name
-        self._size = None if kind.topic == "telegram" else ctypes.sizeof(kind.struct)
+        self._kind = kind
         self._subscriber = subscriber
         self._unconnected_since: float | None = None
 
@@ -111,7 +114,7 @@ class Port:
             self._refused(str(error))
             return None
         self._unconnected_since = None
-        return None if sample is None else Received(sample, self._size)
+        return None if sample is None else Received(sample, self._kind)
 
     def _refused(self, what: str) -> None:
         if what == "ExceedsMaxBorrows":
@@ -204,7 +207,7 @@ def _config(domain: Domain, prefix: str) -> Any:
 
 
 def _payload(kind: type[Sample]) -> Any:
-    return iox2.Slice[ctypes.c_uint8] if kind.topic == "telegram" else kind.struct
+    return iox2.Slice[kind.element] if kind.element else kind.struct
 
 
 _header_at = layout.Header.from_address

@@ -9,8 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from . import layout
-from .sample import Sample, view
-from .scan import angles_rad
+from .sample import Sample, in_mm, view
 
 
 class Model:
@@ -33,12 +32,12 @@ class Model:
     @property
     def count(self) -> int:
         """Beams; 0 before the first scan."""
-        return min(self._fields.count, layout.BEAMS)
+        return self.ranges.size
 
     @property
-    def unit_mm(self) -> int:
+    def unit_mm(self) -> float:
         """Millimetres per device unit."""
-        return self._fields.unit_mm
+        return in_mm(self._fields.unit_um)
 
     @property
     def frozen(self) -> bool:
@@ -48,37 +47,38 @@ class Model:
     @property
     def ranges(self) -> NDArray[np.uint16]:
         """Device units, 0 not known, 65535 beyond what the sensor measures: a view."""
-        return view(self._data, layout.Background.range_array, "<u2", self.count)
+        return view(self._data, "<u2", _HEAD, self._fields.count)
 
     @property
     def ranges_m(self) -> NDArray[np.float64]:
         """Metres, NaN where it is not known, infinite beyond what the sensor measures: computed, a copy."""
         ranges = self.ranges
-        metres = np.where(ranges == _UNTAUGHT, np.nan, ranges * (self.unit_mm / 1000))
+        metres = np.where(ranges == _UNTAUGHT, np.nan, ranges * (self._fields.unit_um / 1e6))
         return np.where(ranges == _FAR, np.inf, metres)
 
     @property
-    def first_angle_deg(self) -> float | None:
-        """The angle of beam 0; None if no scan has this many beams."""
-        return _VARIANTS[self.count][0] / 1000 if self.count in _VARIANTS else None
+    def first_angle(self) -> float | None:
+        """Where beam 0 looks, radians, as in a scan; None before the first scan."""
+        return self._fields.first_angle if self._fields.step else None
 
     @property
-    def step_deg(self) -> float | None:
-        """The angle between two beams; None if no scan has this many beams."""
-        return _VARIANTS[self.count][1] / 1000 if self.count in _VARIANTS else None
+    def step(self) -> float | None:
+        """From one beam to the next; None before the first scan."""
+        return self._fields.step or None
 
     @property
-    def angles_rad(self) -> NDArray[np.float64] | None:
-        """The angle of each beam, as in a scan: computed; None if no scan has this many beams."""
-        first_mdeg, step_mdeg = _VARIANTS.get(self.count, (0, 0))
-        return angles_rad(first_mdeg, step_mdeg, self.count) if step_mdeg else None
+    def angles(self) -> NDArray[np.float64] | None:
+        """Where each beam looks: computed; None before the first scan."""
+        step = self._fields.step
+        return self._fields.first_angle + np.arange(self.count) * step if step else None
 
 
 class Background(Model, Sample):
     """A model as a sample of its topic."""
 
     topic = "background"
-    struct = layout.Background
+    struct = layout.BackgroundHead
+    element = layout.BackgroundWord
 
 
 class Shown(Model):
@@ -86,14 +86,12 @@ class Shown(Model):
 
     def __init__(self, sensor: str, packed: bytes) -> None:
         self.sensor = sensor
-        size = ctypes.sizeof(layout.Background)
-        self._data = (ctypes.c_uint8 * size).from_buffer_copy(packed[:size].ljust(size, b"\0"))
-        self._fields = layout.Background.from_buffer(self._data)
+        self._data = (ctypes.c_uint8 * max(len(packed), _HEAD)).from_buffer_copy(packed.ljust(_HEAD, b"\0"))
+        self._fields = layout.BackgroundHead.from_buffer(self._data)
 
     def __repr__(self) -> str:
         return f"<background of {self.sensor}, generation {self.generation}: {self.taught} of {self.count} beams>"
 
 
 _UNTAUGHT, _FAR = 0, 0xFFFF
-_VARIANTS = {181: (0, 1000), 361: (0, 500), 101: (40_000, 1000), 201: (40_000, 500), 401: (40_000, 250)}
-"""First angle and step of each variant of the sensor, in 1/1000 degree, by its beams."""
+_HEAD = ctypes.sizeof(layout.BackgroundHead)

@@ -11,7 +11,7 @@ from .errors import Impossible, NoTopic
 TOPICS = ("telegram", "scan", "marks", "zones", "foreground", "background", "status")
 """What the hub publishes for each sensor."""
 
-CONTROL = "scanhub/v1/control"
+CONTROL = "scanhub/v2/control"
 """The service that takes requests; beside it are the events that wake the hub and its clients."""
 
 
@@ -32,13 +32,13 @@ class TopicName(NamedTuple):
 
 def service(sensor: str, word: str) -> str:
     """The name of a service of `sensor`: a topic, or `wake`."""
-    return f"scanhub/v1/{sensor}/{word}"
+    return f"scanhub/v2/{sensor}/{word}"
 
 
 def of_service(name: str) -> TopicName | None:
     """The topic whose service has this name; nothing if it is none."""
     head, version, sensor, topic = (name.split("/") + 4 * [""])[:4]
-    is_ours = (head, version) == ("scanhub", "v1") and topic in TOPICS
+    is_ours = (head, version) == ("scanhub", "v2") and topic in TOPICS
     return TopicName(sensor, topic) if is_ours else None
 
 

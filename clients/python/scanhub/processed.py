@@ -9,11 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from . import layout
-from .sample import Copied, Sample, view
+from .sample import Copied, Sample, in_mm, view
 
 
 class Mark(NamedTuple):
-    """A reflector: the sum and the greatest of its intensities, its beams; `edge`: a part of it may be outside."""
+    """A reflector: where it is, as angles of a scan are (0 ahead), the sum and the greatest of its intensities, its beams;
+    `edge`: a part of it may be outside."""
 
     angle_deg: float
     range_mm: float
@@ -127,7 +128,8 @@ class Foreground(Sample):
     """What stands in front of the background."""
 
     topic = "foreground"
-    struct = layout.Foreground
+    struct = layout.ForegroundHead
+    element = layout.ForegroundWord
 
     @property
     def generation(self) -> int:
@@ -137,38 +139,45 @@ class Foreground(Sample):
     @property
     def count(self) -> int:
         """Beams of the scan."""
-        return min(self._fields.count, layout.BEAMS)
+        count = self._fields.count
+        return count if _BITS + 2 * (-(-count // 16)) + 2 * count <= len(self._data) else 0
 
     @property
-    def unit_mm(self) -> int:
+    def unit_mm(self) -> float:
         """Millimetres per device unit."""
-        return self._fields.unit_mm
+        return in_mm(self._fields.unit_um)
 
     @property
     def beams(self) -> NDArray[np.intp]:
         """The beams in the foreground: computed."""
-        bits = np.unpackbits(view(self._data, layout.Foreground.bit_array, "u1", 51), bitorder="little")
-        return np.flatnonzero(bits[: layout.BEAMS])
+        count = self.count
+        bits = np.unpackbits(view(self._data, "u1", _BITS, -(-count // 8)), bitorder="little")
+        return np.flatnonzero(bits[:count])
 
     @property
     def ranges(self) -> NDArray[np.uint16]:
         """Of these beams, in their order, device units: a view."""
-        return view(self._data, layout.Foreground.range_array, "<u2", self._fields.beams)
+        count = self.count
+        return view(self._data, "<u2", _BITS + 2 * (-(-count // 16)), min(self._fields.beams, count))
 
     @property
     def segments(self) -> tuple[Segment, ...]:
         """In the order of their beams: copied."""
-        unit = self._fields.unit_mm
+        unit_um = self._fields.unit_um
+        places = (layout.Segment * 64).from_buffer(self._data, _HEAD) if len(self._data) >= _BITS else ()
         return tuple(
-            Segment(s.first, s.last, s.nearest * unit, s.width * unit, s.x_mm, s.y_mm)
-            for s in self._fields.segment_array[: self._fields.segments]
+            Segment(s.first, s.last, s.nearest * unit_um // 1000, s.width * unit_um // 1000, s.x_mm, s.y_mm)
+            for s in places[: self._fields.segments]
         )
 
     @property
     def left_out(self) -> int:
-        """Segments that did not fit; 255: or more."""
+        """Segments that did not fit."""
         return self._fields.left_out
 
 
 VERDICTS = ("clear", "slow", "stop", "unknown")
 _NO_BEAM = 0xFFFF
+_HEAD = ctypes.sizeof(layout.ForegroundHead)
+_BITS = _HEAD + ctypes.sizeof(layout.Segment * 64)
+"""Where the bits of the beams begin."""

@@ -7,6 +7,7 @@ them for each topic that is followed; `copy()` makes one that needs none.
 
 from __future__ import annotations
 
+import ctypes
 from typing import Any, ClassVar, Protocol, TypeVar
 
 import numpy as np
@@ -46,6 +47,9 @@ class Sample:
 
     topic: ClassVar[str]
     struct: ClassVar[Any]
+    """What is at the beginning."""
+    element: ClassVar[Any] = None
+    """What a slice of it is made of; None: every sample is a `struct`, and nothing else."""
     _read: Any = None
 
     def __init__(self, sensor: str, chunk: Chunk, missed: int = 0, restarted: bool = False) -> None:
@@ -70,7 +74,9 @@ class Sample:
     @property
     def _fields(self) -> Any:
         if self._read is None:
-            self._read = self.struct.from_buffer(self._data)
+            data = self._data
+            # A stranger's may be shorter: then there is nothing.
+            self._read = self.struct.from_buffer(data) if len(data) >= ctypes.sizeof(self.struct) else self.struct()
         return self._read
 
     @property
@@ -133,10 +139,15 @@ class Sample:
         return f"<{self.sensor}/{self.topic} {self.topic_seq}, {self.quality}>"
 
 
-def view(data: Any, field: Any, kind: str, count: int) -> NDArray[Any]:
-    """The first `count` items of the array `field` in `data`: cannot be written, and keeps what `data` keeps."""
-    room = field.size // np.dtype(kind).itemsize
-    return np.frombuffer(memoryview(data).toreadonly(), kind, min(count, room), field.offset)
+def view(data: Any, kind: str, offset: int, count: int) -> NDArray[Any]:
+    """The `count` items at `offset` in `data`, as far as they are there: cannot be written, and keeps what `data` keeps."""
+    room = max(len(data) - offset, 0) // np.dtype(kind).itemsize
+    return np.frombuffer(memoryview(data).toreadonly(), kind, min(count, room), min(offset, len(data)))
+
+
+def in_mm(micrometres: int) -> float:
+    """A whole number where it is one."""
+    return micrometres / 1000 if micrometres % 1000 else micrometres // 1000
 
 
 _REASONS = ("line_error", "neighbour", "slow", "forbidden_bits", "header_inside")

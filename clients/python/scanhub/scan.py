@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,7 +16,7 @@ class Telegram(Sample):
     """A telegram, replies too."""
 
     topic = "telegram"
-    struct = ctypes.c_uint8
+    struct = element = ctypes.c_uint8
 
     @property
     def data(self) -> NDArray[np.uint8]:
@@ -39,99 +40,143 @@ class Telegram(Sample):
 
 
 class Scan(Sample):
-    """Ranges as the sensor sent them. Beam i looks to `first_angle_deg + i * step_deg`, counter-clockwise seen from
-    above, 0 right and 90 degrees ahead."""
+    """One turn of a scanner: beams in the order of their measuring. Angles are in radians: 0 is the sensor's own ahead,
+    counter-clockwise positive seen from above."""
 
     topic = "scan"
-    struct = layout.Scan
+    struct = layout.ScanHead
+    element = layout.ScanWord
+
+    @property
+    def family(self) -> str | None:
+        """What the sensor speaks, such as `lms`; None if it is not known here."""
+        number = self._fields.family
+        return FAMILIES[number] if number < len(FAMILIES) else None
 
     @property
     def count(self) -> int:
-        """Beams, at most 401."""
-        return min(self._fields.count, layout.BEAMS)
+        """Beams: the same number in all scans of a sensor and its settings."""
+        room = max(len(self._data) - _HEAD, 0) // _width(self._fields.contents | _RANGES)
+        return min(self._fields.count, room)
 
     @property
-    def unit_mm(self) -> int:
-        """Millimetres per device unit: 1, 10 or 100."""
-        return self._fields.unit_mm
+    def unit_um(self) -> int:
+        """Micrometres per device unit."""
+        return self._fields.unit_um
 
     @property
-    def range_bits(self) -> int:
-        """Bits of a range; its nine greatest values are codes."""
-        return self._fields.range_bits
-
-    @property
-    def first_angle_deg(self) -> float:
+    def first_angle(self) -> float:
         """Where beam 0 looks."""
-        return self._fields.first_angle_mdeg / 1000
+        return self._fields.first_angle
 
     @property
-    def step_deg(self) -> float:
-        """Between two beams."""
-        return self._fields.step_mdeg / 1000
+    def step(self) -> float:
+        """From one beam to the next; negative for a scanner that turns clockwise."""
+        return self._fields.step
+
+    @property
+    def spacing(self) -> float:
+        """Between two points that the sensor itself measures: not that of the grid that they are put on."""
+        return self._fields.spacing
+
+    @property
+    def beam_time_ns(self) -> int:
+        """Time from one beam to the next."""
+        return self._fields.beam_time_ns
 
     @property
     def intensity_bits(self) -> int:
-        """Bits of intensity among the upper ones; 0: they are field bits."""
+        """Bits of an intensity; 0: there are none."""
         return self._fields.intensity_bits
 
     @property
-    def ranges(self) -> NDArray[np.uint16]:
-        """Device units with codes: a view."""
-        return view(self._data, layout.Scan.range_array, "<u2", self._fields.count)
+    def collapsed(self) -> int:
+        """Points that found their beam taken by a nearer one."""
+        return self._fields.collapsed
 
     @property
-    def upper(self) -> NDArray[np.uint8]:
-        """The bits above each range: a view; empty if the mode does not send them."""
-        return view(self._data, layout.Scan.upper_array, "u1", self._fields.count if self._fields.contents & 1 else 0)
+    def incomplete(self) -> bool:
+        """Packets of the turn are missing: what was in them is not measured."""
+        return bool(self._fields.flags & 1)
 
     @property
-    def intensities(self) -> NDArray[np.uint8]:
-        """Of each beam: a view; empty if the mode has no reflector bits."""
-        upper = self.upper
-        return upper if self._fields.intensity_bits else upper[:0]
+    def ranges_m(self) -> NDArray[np.float64]:
+        """Metres, NaN where there is no reading, whatever the reason: computed, a copy."""
+        return np.where(self.valid, self.ranges * (self.unit_um / 1e6), np.nan)
+
+    @property
+    def angles(self) -> NDArray[np.float64]:
+        """Where each beam looks, exact where the sensor says so: computed, a copy."""
+        grid, exact = self.first_angle + np.arange(self.count) * self.step, self.exact_angles
+        return grid if exact is None else np.where(np.isnan(exact), grid, exact)
 
     @property
     def valid(self) -> NDArray[np.bool_]:
         """Whether each beam has a reading: computed."""
-        return self.ranges < self._first_code
+        return self.ranges <= self._fields.valid_to
 
     @property
-    def codes(self) -> list[tuple[int, int]]:
-        """Beam and code of all without a reading: 0 nothing came back, 1 dazzled, 2 overflow, 8 beyond the range."""
+    def codes(self) -> list[tuple[int, str]]:
+        """Beam and reason of all without a reading: `not_measured`, `no_return`, `beyond` the range limit, `too_near`,
+        `too_bright`, `weak`, `overflow`, `error`."""
         ranges = self.ranges
-        beams = np.flatnonzero(ranges >= self._first_code)
-        greatest = self._first_code + 8
-        # What is beyond all codes overflowed.
-        return [(int(beam), 2 if ranges[beam] > greatest else greatest - int(ranges[beam])) for beam in beams]
+        beams = np.flatnonzero(ranges > self._fields.valid_to)
+        return [(int(beam), self._code(int(ranges[beam]))) for beam in beams]
 
     @property
-    def ranges_m(self) -> NDArray[np.float64]:
-        """Metres, NaN where there is no reading: computed, a copy."""
-        return np.where(self.valid, self.ranges * (self.unit_mm / 1000), np.nan)
-
-    @property
-    def angles_rad(self) -> NDArray[np.float64]:
-        """Where each beam looks: computed."""
-        return angles_rad(self._fields.first_angle_mdeg, self._fields.step_mdeg, self.count)
-
-    @property
-    def beam_times_ns(self) -> NDArray[np.int64]:
+    def times_ns(self) -> NDArray[np.int64]:
         """When each beam was measured, CLOCK_MONOTONIC: computed. Stamps are of bytes on the wire, which is later."""
-        beams, step = np.arange(self.count), self._fields.step_mdeg
-        turns = max(1000 // max(step, 1), 1)
-        later = (turns - 1 - beams % turns) * _TURN_NS
-        return self.stamp_ns - later - (self.count - 1 - beams) * step * _TURN_NS // 360_000
+        beams, fields = np.arange(self.count), self._fields
+        turn = beams % max(fields.turns, 1)
+        return self.stamp_ns + fields.first_beam_ns + beams * fields.beam_time_ns + turn * fields.turn_ns
 
     @property
-    def _first_code(self) -> int:
-        return (1 << min(self._fields.range_bits, 16)) - 9
+    def ranges(self) -> NDArray[np.uint16]:
+        """Device units with codes, which are no ranges: a view. `ranges_m` is what to calculate with."""
+        return self._array("<u2", _ANGLES)
+
+    @property
+    def exact_angles(self) -> NDArray[np.float32] | None:
+        """Of a scanner whose points fall where they like, NaN where nothing was measured: a view; None of all others."""
+        return self._array("<f4", 0) if self._fields.contents & _ANGLES else None
+
+    @property
+    def intensities(self) -> NDArray[np.uint8] | NDArray[np.uint16] | None:
+        """Of each beam, one or two bytes: a view; None if the sensor does not send them."""
+        if not self._fields.intensity_bits:
+            return None
+        return self._array("<u2", _ANGLES | _RANGES) if self._fields.contents & _WIDE else self.upper
+
+    @property
+    def upper(self) -> NDArray[np.uint8] | None:
+        """The byte beside each range, intensities or field bits: a view; None if the sensor does not send them."""
+        return self._array("u1", _ANGLES | _RANGES | _WIDE) if self._fields.contents & _UPPER else None
+
+    def _array(self, kind: str, before: int) -> NDArray[Any]:
+        """The array behind those of `before`."""
+        count = self.count
+        offset = _HEAD + count * _width(before & (self._fields.contents | _RANGES))
+        return view(self._data, kind, offset, count)
+
+    def _code(self, value: int) -> str:
+        if value != _NOT_MEASURED and self._fields.family == FAMILIES.index("lms"):
+            return _OF_LMS.get(self._fields.no_return - value, "overflow")
+        return _CODES[min(_NOT_MEASURED - value, len(_CODES) - 1)]
 
 
-def angles_rad(first_mdeg: int, step_mdeg: int, count: int) -> NDArray[np.float64]:
-    """Where `count` beams look that begin at `first_mdeg`, both in 1/1000 degree."""
-    return np.deg2rad((first_mdeg + np.arange(count) * step_mdeg) / 1000)
+def _width(contents: int) -> int:
+    """Bytes of a beam in these arrays."""
+    return sum(size for bit, size in _SIZES.items() if contents & bit)
 
 
-_TURN_NS = 13_320_000
-"""One turn of the mirror."""
+FAMILIES = ("lms", "ld")
+"""By their numbers."""
+_HEAD = ctypes.sizeof(layout.ScanHead)
+_UPPER, _WIDE, _ANGLES, _RANGES = 1, 2, 4, 0x80
+_SIZES = {_UPPER: 1, _WIDE: 2, _ANGLES: 4, _RANGES: 2}
+"""Arrays beside the ranges, which are always there, and the bytes of a beam in each."""
+_NOT_MEASURED = 0xFFFF
+_CODES = ("not_measured", "no_return", "beyond", "too_near", "too_bright", "weak", "overflow", "error")
+"""From the greatest value down, in all families but the LMS."""
+_OF_LMS = {0: "no_return", 1: "too_bright", 4: "weak", 5: "error", 8: "beyond"}
+"""From the greatest value of its measuring mode down."""

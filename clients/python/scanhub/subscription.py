@@ -7,7 +7,7 @@ import time
 from typing import Any, Callable, Iterator
 
 from . import freshness, layout, memory
-from .errors import Silent
+from .errors import NoHub, Silent
 from .freshness import REMOTE
 from .model import Background
 from .names import Domain, TopicName, service

@@ -2,6 +2,7 @@
 Ends by Ctrl-C, and says so."""
 
 import json
+import math
 import os
 import sys
 
@@ -34,13 +35,22 @@ def telegram(sample: scanhub.Telegram) -> dict:
     return {**{name: getattr(sample, name) for name in fields}, "data": sample.data.tobytes().hex()}
 
 
+def in_degrees(angle: "float | None") -> "float | None":
+    return None if angle is None else round(math.degrees(angle) * 1e6) / 1e6
+
+
 def scan(sample: scanhub.Scan) -> dict:
-    said = {name: getattr(sample, name) for name in ("unit_mm", "first_angle_deg", "step_deg", "count")}
+    said = {name: getattr(sample, name) for name in ("family", "unit_um", "count", "beam_time_ns")}
+    said["first_angle_deg"], said["step_deg"] = in_degrees(sample.first_angle), in_degrees(sample.step)
     said["ranges"] = [int(range) if valid else None for range, valid in zip(sample.ranges, sample.valid)]
-    said["codes"] = [list(pair) for pair in sample.codes]
-    if sample.intensities.size:
+    said["codes"] = [[beam, word] for beam, word in sample.codes if word != "not_measured"]
+    if sample.intensities is not None:
         said["intensities"] = sample.intensities.tolist()
-    return said
+    if sample.exact_angles is not None:
+        pairs = zip(sample.angles, sample.valid)
+        said["angles_deg"] = [round(math.degrees(angle), 4) if valid else None for angle, valid in pairs]
+        said["collapsed"] = sample.collapsed
+    return {**said, **({"incomplete": True} if sample.incomplete else {})}
 
 
 def marks(sample: scanhub.Marks) -> dict:
@@ -62,8 +72,8 @@ def foreground(sample: scanhub.Foreground) -> dict:
 
 
 def background(sample: scanhub.Background) -> dict:
-    names = ("generation", "taught", "unit_mm", "count", "first_angle_deg", "step_deg", "frozen")
-    said = {name: getattr(sample, name) for name in names}
+    said = {name: getattr(sample, name) for name in ("generation", "taught", "unit_mm", "count", "frozen")}
+    said["first_angle_deg"], said["step_deg"] = in_degrees(sample.first_angle), in_degrees(sample.step)
     said["ranges"] = [None if range in (0, 65535) else int(range) for range in sample.ranges]
     said["far"] = [beam for beam, range in enumerate(sample.ranges) if range == 65535]
     return said

@@ -1,6 +1,7 @@
 """The structs against the golden layouts and bytes of `schema`: arguments are the directory with them."""
 
 import ctypes
+import struct
 import sys
 from pathlib import Path
 
@@ -31,20 +32,20 @@ def offsets_are_golden() -> None:
     for line in (GOLDEN / "layouts.txt").read_text().splitlines():
         words = line.split()
         if line[0] != " ":
-            struct = getattr(layout, words[0].split(".")[1])
-            assert (struct.type_name(), ctypes.sizeof(struct), ctypes.alignment(struct)) == (
+            its = getattr(layout, words[0].split(".")[1])
+            assert (its.type_name(), ctypes.sizeof(its), ctypes.alignment(its)) == (
                 words[0],
                 int(words[1]),
                 int(words[2]),
             ), line
             said.append((words[0], []))
         else:
-            assert getattr(struct, words[0]).offset == int(words[1]), (struct, line)
+            assert getattr(its, words[0]).offset == int(words[1]), (its, line)
             said[-1][1].append(words[0])
-    assert len(said) == 12
+    assert len(said) == 11
     for name, fields in said:
-        struct = getattr(layout, name.split(".")[1])
-        assert [field[0] for field in struct._fields_] == fields, name
+        its = getattr(layout, name.split(".")[1])
+        assert [field[0] for field in its._fields_] == fields, name
 
 
 def headers_say_what_they_are() -> None:
@@ -57,11 +58,24 @@ def headers_say_what_they_are() -> None:
 
 def payloads_say_what_they_are() -> None:
     of = scan.Scan("front", Chunk("scan"))
-    assert (of.count, of.unit_mm, of.range_bits, of.first_angle_deg, of.step_deg) == (401, 10, 13, -40.0, 0.25)
+    assert (of.family, of.count, of.unit_um, of.beam_time_ns, of.collapsed) == ("lms", 401, 10_000, 9250, 0)
+    assert (of.first_angle, of.step, of.incomplete) == (np.deg2rad(-50), np.deg2rad(0.25), False)
     assert (of.intensity_bits, list(of.upper[[0, 400]]), list(of.intensities[[0, 400]])) == (3, [7, 6], [7, 6])
     assert (of.ranges[0], of.ranges[400], of.ranges.shape) == (0x1234, 0x1FFF, (401,))
-    assert of.codes == [(400, 0)] and np.isnan(of.ranges_m[400]) and of.ranges_m[0] == 46.6
-    assert of.angles_rad[400] == np.deg2rad(60)
+    assert of.codes == [(400, "no_return")] and np.isnan(of.ranges_m[400]) and of.ranges_m[0] == 46.6
+    assert np.isclose(of.angles[400], np.deg2rad(50), atol=1e-12) and of.exact_angles is None
+    # The first beam three turns before the last, whose stamp is 3.
+    assert (of.times_ns[400], of.times_ns[3]) == (3 - 3 * 13_320_000, 3 - 397 * 9250)
+
+    of = scan.Scan("front", Chunk("scan_turn"))
+    assert (of.family, of.count, of.unit_um, of.beam_time_ns, of.collapsed) == ("ld", 5, 250, 0x1020304, 0x506)
+    assert (of.first_angle, of.step, of.spacing, of.incomplete) == (-0.25, -1.5, 0.75, True)
+    assert of.ranges_m[:2].tolist() == [1.165, 0xFFEF / 4000] and np.isnan(of.ranges_m[2:]).all()
+    assert of.codes == [(2, "no_return"), (3, "not_measured"), (4, "beyond")]
+    assert of.angles.tolist() == [-0.125, -1.5, -3.25, -0.25 - 3 * 1.5, -6.5]
+    assert np.isnan(of.exact_angles[3]) and of.exact_angles.dtype == np.float32
+    assert (of.intensities.tolist(), of.intensities.dtype, of.upper) == ([0xABC, 1, 0, 0, 0xFFF], np.uint16, None)
+    assert of.times_ns[4] == 3 - 2 + 4 * 0x1020304
 
     of = processed.Marks("front", Chunk("marks"))
     assert (len(of.marks), of.available, of.overflow) == (64, False, True)
@@ -72,7 +86,7 @@ def payloads_say_what_they_are() -> None:
     assert of.provisional and of.zones == ((0, False, 0), (600, True, 0x107))
 
     of = processed.Foreground("front", Chunk("foreground"))
-    assert (of.generation, of.count, of.unit_mm, of.left_out) == (0x10203, 401, 10, 255)
+    assert (of.generation, of.count, of.unit_mm, of.left_out) == (0x10203, 401, 10, 0x104)
     assert (list(of.beams), list(of.ranges), len(of.segments)) == ([400], [0x1234], 64)
     assert of.segments[63] == (400, 0x105, 60, 70, -2, 8)
 
@@ -80,7 +94,8 @@ def payloads_say_what_they_are() -> None:
     assert (of.generation, of.taught, of.count, of.unit_mm, of.frozen) == (0x10203, 0x104, 401, 10, True)
     assert list(of.ranges[[0, 1, 400]]) == [0x1234, 0, 0xFFFF]
     assert of.ranges_m[0] == 46.6 and np.isnan(of.ranges_m[1]) and np.isinf(of.ranges_m[400])
-    shown = model.Shown("front", golden("background")[:814])
+    assert (of.first_angle, of.step, of.angles[400]) == (-0.25, -1.5, -0.25 - 400 * 1.5)
+    shown = model.Shown("front", golden("background"))
     assert np.array_equal(shown.ranges, of.ranges) and shown.generation == of.generation
 
     of = status.Status("front", Chunk("status"))
@@ -93,6 +108,36 @@ def payloads_say_what_they_are() -> None:
     assert (of.damaged, of.lost_on_line) == (0.0, None)
 
 
+def what_is_cut_short_has_no_beams() -> None:
+    for kind, name in (
+        (scan.Scan, "scan_turn"),
+        (processed.Foreground, "foreground"),
+        (model.Background, "background"),
+    ):
+        for size in (0, 8, 40, 72):
+            chunk = Chunk(name)
+            chunk._bytes = (ctypes.c_uint8 * size).from_buffer_copy(golden(name)[:size])
+            of = kind("front", chunk)
+            assert of.ranges.size <= max(size - 32, 0) // 2 and of.count >= of.ranges.size, (kind, size)
+    whole = scan.Scan("front", Chunk("scan_turn"))
+    whole._fields.count = 0xFFFF
+    assert whole.ranges.tolist()[:1] != [] and whole.count == 5, "as far as there is memory"
+
+
+def codes_of_all_families() -> None:
+    words = "no_return too_bright overflow overflow weak error overflow overflow beyond"
+    of = scan.Scan("front", Chunk("scan")).copy()
+    of._data[64 : 64 + 18] = struct.pack("<9H", *range(8191, 8182, -1))
+    assert [code for beam, code in of.codes if beam < 9] == words.split()
+    words = "not_measured no_return beyond too_near too_bright weak overflow error error"
+    of = scan.Scan("front", Chunk("scan_turn")).copy()
+    found = []
+    for value in range(0xFFFF, 0xFFF6, -1):
+        of._data[84:86] = struct.pack("<H", value)
+        found.append(dict(of.codes)[0])
+    assert found == words.split()
+
+
 def copies_are_the_same() -> None:
     of = scan.Scan("front", Chunk("scan"), 5, True)
     kept = of.copy()
@@ -103,4 +148,6 @@ def copies_are_the_same() -> None:
 offsets_are_golden()
 headers_say_what_they_are()
 payloads_say_what_they_are()
+what_is_cut_short_has_no_beams()
+codes_of_all_families()
 copies_are_the_same()

@@ -75,7 +75,7 @@ def somebody_elses_domain() -> None:
 
 
 class Scan(ctypes.Structure):
-    """One beam more than a scan has."""
+    """One value, as in version 1, and not a slice."""
 
     _fields_ = [("ranges", ctypes.c_uint16 * 610)]
 
@@ -93,9 +93,9 @@ def hub_of_another_layout() -> list:
     with open(f"{place.root}/prefix", "w", encoding="ascii") as names_begin:
         names_begin.write(f"{place.prefix}01234_\n")
     hub = memory.Membership(place)
-    wake = hub.service("scanhub/v1/front/wake").event().open_or_create()
-    scan = hub.service("scanhub/v1/front/scan").publish_subscribe(Scan).user_header(layout.Header)
-    zones = hub.service("scanhub/v1/front/zones").publish_subscribe(iox2.Slice[ctypes.c_uint8])
+    wake = hub.service("scanhub/v2/front/wake").event().open_or_create()
+    scan = hub.service("scanhub/v2/front/scan").publish_subscribe(Scan).user_header(layout.Header)
+    zones = hub.service("scanhub/v2/front/zones").publish_subscribe(iox2.Slice[ctypes.c_uint8])
     return [lock, hub, wake, scan.open_or_create(), zones.open_or_create()]
 
 
@@ -103,11 +103,11 @@ def other_layouts() -> None:
     held = hub_of_another_layout()
     assert scanhub.sensors(domain=domain, root=root) == ["front"]
     said = refusal(scanhub.Mismatch, lambda: follow("front/scan"))
-    theirs, ours = "scanhub.Scan.v1 of 1220 bytes", "scanhub.Scan.v1 of 1216 bytes"
+    theirs, ours = "scanhub.Scan.v1 of 1220 bytes", "scanhub.Scan.v2 of 8 bytes"
     assert theirs in said.message and ours in said.message and "iceoryx2 0.10.0" in said.message, said
     assert said.message.index(theirs) < said.message.index(ours)
     said = refusal(scanhub.Mismatch, lambda: follow("front/zones"))
-    assert "u8 of 1 bytes under ()" in said.message and "scanhub.Zones.v1 of 76 bytes" in said.message, said
+    assert "u8 of 1 bytes under ()" in said.message and "scanhub.Zones.v2 of 76 bytes" in said.message, said
     said = refusal(scanhub.Silent, lambda: follow("front/marks", "rear/scan", timeout=0.3))
     assert "front/marks, rear/scan" in said.message and "front/scan" in said.remedy, said
     said = refusal(scanhub.NoHub, lambda: scanhub.background("front", domain=domain, root=root))

@@ -8,7 +8,8 @@ use std::time::{Duration, SystemTime};
 
 use scanhub_client::request;
 use schema::{
-    Age, Background, Domain, Failure, Kind, Request, SavedModel, Shown, Verb, as_json, check_sensor,
+    Age, Background, BackgroundHead, Domain, Failure, Kind, Request, SavedModel, Shown, Verb, as_json,
+    check_sensor,
 };
 use serde::Serialize;
 
@@ -171,16 +172,9 @@ fn save(
         .map_err(|error| Failure::new(Kind::Failed, format!("the model is no JSON: {error}"), ""))?;
     content.push(b'\n');
     file::replace(file, &content)?;
-    let (Background { taught, count, generation, .. }, place) = (model, file.display());
+    let (BackgroundHead { taught, count, generation, .. }, place) = (**model, file.display());
     quiet(if json {
-        output.json(&Saved {
-            class: "saved",
-            sensor,
-            file: place.to_string(),
-            generation: *generation,
-            taught: *taught,
-            count: *count,
-        })
+        output.json(&Saved { class: "saved", sensor, file: place.to_string(), generation, taught, count })
     } else {
         output.line(|line| write!(line, "{sensor}: {taught} of {count} beams saved to {place}"))
     })
@@ -206,7 +200,7 @@ pub fn saved_model(
     sensor: &str,
     any_sensor: bool,
     input: &mut dyn Read,
-) -> Result<Background, Failure> {
+) -> Result<Box<Background>, Failure> {
     let (text, place) = if file == Path::new(STANDARD) {
         (file::read_all(input, "stdin", LONGEST)?, "stdin".to_owned())
     } else {

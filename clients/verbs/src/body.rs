@@ -5,7 +5,7 @@
 //! The observation is divided into slices of time. What is seen in all slices at about the same range is body; what is
 //! seen in only some of them came and went, and is left out.
 
-use schema::{Pose, Scan};
+use schema::{Pose, Scan, in_degrees};
 
 /// Slices of the time.
 pub(crate) const SLICES: usize = 10;
@@ -29,9 +29,9 @@ const PASSING: usize = 5;
 /// How much the nearest readings of a body differ from slice to slice: noise and a robot that trembles. What is alive
 /// moves more.
 const STEADY_MM: u32 = 100;
-/// So near to an edge, in 1/1000 degree, a beam may tell something between the body and what is behind: half a spot of
+/// So near to an edge, in degrees, a beam may tell something between the body and what is behind: half a spot of
 /// 12 mm at 0.4 m.
-const EDGE_MDEG: u16 = 1000;
+const EDGE_DEG: f64 = 1.0;
 /// Neighbouring beams whose ranges differ by less make one sector: what it hides more than needed is no wider than that.
 const ALIKE_MM: u32 = 50;
 /// Beams between two that moved, and belong together all the same.
@@ -48,7 +48,7 @@ pub(crate) struct Body {
 }
 
 /// Count, first angle, step and unit of a scan.
-type Shape = (u16, i32, u16, u8);
+type Shape = (u16, f64, f64, u32);
 
 struct Beam {
     /// In the robot's frame.
@@ -101,12 +101,13 @@ impl Body {
 
     /// Looks at `scan`, which was made in slice `slice`; false if it is shaped otherwise than those before.
     pub(crate) fn look(&mut self, slice: usize, scan: &Scan) -> bool {
-        let shape = (scan.count, scan.first_angle_mdeg, scan.step_mdeg, scan.unit_mm);
+        let shape = (scan.count, scan.first_angle, scan.step, scan.unit_um);
         if *self.shape.get_or_insert(shape) != shape {
             return false;
         }
         if self.beams.is_empty() {
-            self.beams = (0..scan.beams()).map(|i| self.beam(scan.angle_mdeg(i))).collect();
+            self.beams =
+                (0..scan.beams()).map(|i| self.beam(scan.first_angle + i as f64 * scan.step)).collect();
         }
         let slice = slice.min(SLICES - 1);
         self.scans[slice] += 1;
@@ -141,8 +142,9 @@ impl Body {
         let met: Vec<Met> = self.beams.iter().map(|beam| Met::of(beam, &self.scans)).collect();
         let slices = self.seen_slices();
         let is_body: Vec<bool> = met.iter().map(|met| met.is_body(slices)).collect();
-        let edge = self.shape.map_or(1, |(_, _, step_mdeg, _)| EDGE_MDEG / step_mdeg.clamp(1, EDGE_MDEG));
-        let range = |beam: usize| range_mm(&met, &is_body, beam, edge.into(), slices).min(FARTHEST_MM);
+        let edge =
+            self.shape.map_or(1, |(_, _, step, _)| (EDGE_DEG / in_degrees(step.abs())).max(1.0) as usize);
+        let range = |beam: usize| range_mm(&met, &is_body, beam, edge, slices).min(FARTHEST_MM);
         let ranges_mm: Vec<u32> = (0..met.len()).map(range).collect();
         let moving_mm: Vec<u32> = met.iter().zip(&ranges_mm).map(|(met, range)| met.beyond(*range)).collect();
         Mask {
@@ -152,8 +154,11 @@ impl Body {
         }
     }
 
-    fn beam(&self, angle_mdeg: i32) -> Beam {
-        let direction = self.pose.direction(angle_mdeg);
+    fn beam(&self, angle: f64) -> Beam {
+        let direction = self.pose.direction(angle);
+        // As sectors are given, from -180 to 180 degrees.
+        let angle_deg = (in_degrees(angle) + 180.0).rem_euclid(360.0) - 180.0;
+        let angle_mdeg = (1000.0 * angle_deg).round() as i32;
         let (x_mm, y_mm) = (1000.0 * self.pose.x_m, 1000.0 * self.pose.y_m);
         // The greater root of |sensor + range * direction| = circle; none is not a number, and so becomes 0.
         let along = x_mm * direction.0 + y_mm * direction.1;
@@ -164,13 +169,18 @@ impl Body {
     }
 
     fn sectors(&self, runs: Vec<Run>, range_mm: impl Fn(&Run) -> u32) -> Vec<Sector> {
-        let sector = |run: &Run| Sector {
-            from_mdeg: self.beams[run.first].angle_mdeg,
-            to_mdeg: self.beams[run.last].angle_mdeg,
-            beams: run.beams(),
-            range_mm: range_mm(run),
-        };
-        runs.iter().map(sector).collect()
+        // The lesser angle first, whichever way the beams turn; what goes across 180 degrees is two sectors.
+        let is_clockwise = self.shape.is_some_and(|(_, _, step, _)| step < 0.0);
+        let mut sectors: Vec<Sector> = Vec::new();
+        for run in &runs {
+            let beams = &self.beams[run.first..=run.last];
+            for beams in beams.chunk_by(|a, b| (a.angle_mdeg > b.angle_mdeg) == is_clockwise) {
+                let (first, last) = (beams[0].angle_mdeg, beams[beams.len() - 1].angle_mdeg);
+                let (from_mdeg, to_mdeg) = (first.min(last), first.max(last));
+                sectors.push(Sector { from_mdeg, to_mdeg, beams: beams.len(), range_mm: range_mm(run) });
+            }
+        }
+        sectors
     }
 }
 
@@ -237,7 +247,7 @@ impl Met {
 /// the body and what is behind. What is lost by that is a strip that no leg fits into.
 fn range_mm(met: &[Met], is_body: &[bool], beam: usize, edge: usize, slices: usize) -> u32 {
     let near = |distance: usize| {
-        let (first, last) = (beam.saturating_sub(distance), (beam + distance).min(met.len() - 1));
+        let (first, last) = (beam.saturating_sub(distance), beam.saturating_add(distance).min(met.len() - 1));
         &is_body[first..=last]
     };
     match &met[beam] {

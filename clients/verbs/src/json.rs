@@ -2,7 +2,10 @@
 
 mod processed;
 
-use schema::{Counters, Failure, Flags, Header, Reasons, Scan, Status, Telegram, Verb};
+use schema::{
+    Code, Counters, Failure, Family, Flags, Header, Intensities, Reasons, Scan, Status, Telegram, Verb,
+    in_degrees,
+};
 use serde::Serialize;
 use serde::ser::{SerializeMap, Serializer};
 
@@ -72,9 +75,15 @@ pub(crate) fn telegram<'a>(sensor: &'a str, header: &Header, bytes: &'a [u8]) ->
     struct Line<'a> {
         #[serde(flatten)]
         stamp: Stamp<'a>,
-        address: u8,
-        command: u8,
-        length: u16,
+        #[serde(skip_serializing_if = "Option::is_none")]
+        address: Option<u8>,
+        #[serde(skip_serializing_if = "Option::is_none")]
+        command: Option<u8>,
+        #[serde(skip_serializing_if = "Option::is_none")]
+        kind: Option<&'static str>,
+        #[serde(skip_serializing_if = "Option::is_none")]
+        checked: Option<bool>,
+        length: usize,
         #[serde(serialize_with = "hex")]
         data: &'a [u8],
         #[serde(flatten)]
@@ -83,9 +92,12 @@ pub(crate) fn telegram<'a>(sensor: &'a str, header: &Header, bytes: &'a [u8]) ->
     let telegram = Telegram(bytes);
     Line {
         stamp: Stamp::new("telegram", sensor, header),
-        address: telegram.address(),
-        command: telegram.command(),
-        length: telegram.length(),
+        address: telegram.is_lms().then(|| telegram.address()),
+        command: telegram.is_lms().then(|| telegram.command()),
+        // Of a scanner that only speaks; and what is published had a checksum that was right.
+        kind: (!telegram.is_lms()).then_some("data"),
+        checked: (!telegram.is_lms()).then_some(true),
+        length: if telegram.is_lms() { telegram.length().into() } else { bytes.len() },
         data: bytes,
         flags: Words::of(header),
     }
@@ -97,28 +109,42 @@ pub(crate) fn scan<'a>(sensor: &'a str, header: &Header, scan: &'a Scan) -> impl
     struct Line<'a> {
         #[serde(flatten)]
         stamp: Stamp<'a>,
-        unit_mm: u8,
+        family: &'static str,
+        unit_um: u32,
+        count: usize,
         first_angle_deg: f64,
         step_deg: f64,
-        count: usize,
+        beam_time_ns: u32,
         #[serde(serialize_with = "ranges")]
         ranges: &'a Scan,
         #[serde(serialize_with = "codes")]
         codes: &'a Scan,
-        #[serde(skip_serializing_if = "<[u8]>::is_empty")]
-        intensities: &'a [u8],
+        #[serde(serialize_with = "intensities", skip_serializing_if = "Intensities::is_empty")]
+        intensities: Intensities<'a>,
+        #[serde(serialize_with = "angles", skip_serializing_if = "has_grid_only")]
+        angles_deg: &'a Scan,
+        #[serde(skip_serializing_if = "Option::is_none")]
+        collapsed: Option<u16>,
+        #[serde(skip_serializing_if = "std::ops::Not::not")]
+        incomplete: bool,
         #[serde(flatten)]
         flags: Words,
     }
     Line {
         stamp: Stamp::new("scan", sensor, header),
-        unit_mm: scan.unit_mm,
-        first_angle_deg: scan.angle_deg(0),
-        step_deg: f64::from(scan.step_mdeg) / 1000.0,
+        family: Family::of_number(scan.family).map_or("unknown", Family::name),
+        unit_um: scan.unit_um,
         count: scan.beams(),
+        first_angle_deg: in_degrees(scan.first_angle),
+        step_deg: in_degrees(scan.step),
+        beam_time_ns: scan.beam_time_ns,
         ranges: scan,
         codes: scan,
         intensities: scan.intensities(),
+        angles_deg: scan,
+        // What comes without exact angles was on no grid.
+        collapsed: (!has_grid_only(scan)).then_some(scan.collapsed),
+        incomplete: scan.is_incomplete(),
         flags: Words::of(header),
     }
 }
@@ -289,7 +315,22 @@ fn ranges<S: Serializer>(scan: &Scan, serializer: S) -> Result<S::Ok, S::Error> 
 }
 
 fn codes<S: Serializer>(scan: &Scan, serializer: S) -> Result<S::Ok, S::Error> {
-    serializer.collect_seq((0..scan.beams()).filter_map(|i| Some((i, scan.code(i)?.0))))
+    let told = |i| Some((i, scan.code(i).filter(|code| *code != Code::NotMeasured)?.name()));
+    serializer.collect_seq((0..scan.beams()).filter_map(told))
+}
+
+fn intensities<S: Serializer>(intensities: &Intensities<'_>, serializer: S) -> Result<S::Ok, S::Error> {
+    serializer.collect_seq(intensities.iter())
+}
+
+/// Exact angles, where there is a range.
+fn angles<S: Serializer>(scan: &Scan, serializer: S) -> Result<S::Ok, S::Error> {
+    let angle = |i| scan.range(i).map(|_| (scan.angle_deg(i) * 1e4).round() / 1e4);
+    serializer.collect_seq((0..scan.beams()).map(angle))
+}
+
+fn has_grid_only(scan: &Scan) -> bool {
+    scan.exact_angles().is_empty()
 }
 
 fn counters<S: Serializer>(counters: &Counters, serializer: S) -> Result<S::Ok, S::Error> {
@@ -299,3 +340,6 @@ fn counters<S: Serializer>(counters: &Counters, serializer: S) -> Result<S::Ok, 
     }
     map.end()
 }
+
+#[cfg(test)]
+mod tests;

@@ -17,6 +17,7 @@ use std::time::{Duration, Instant};
 use lan::Stamp;
 use lan::incoming::{Announcement, Arrived, Incoming, RemoteSample};
 use schema::datagram::{Announce, DatagramError, Head, group};
+use schema::limits::TopicLimits;
 use schema::{Domain, Failure, Kind, Topic};
 
 use self::crowd::{Crowd, Crowding};
@@ -45,6 +46,8 @@ pub struct ListenOptions {
     pub stats: bool,
     /// Instead of writing samples, publish them in this domain, as `HUB.SENSOR`.
     pub publish: Option<Domain>,
+    /// What the topics are made for that are published.
+    pub limits: TopicLimits,
     /// Objects instead of text.
     pub json: bool,
     /// `out` is a terminal: the account is shown each second.
@@ -74,7 +77,8 @@ pub fn listen(
     let hubs = Hubs::parse(&options.hubs, &names)?;
     let groups = groups(&wanted);
     let now = Instant::now();
-    let publication = options.publish.as_ref().map(publish::open).transpose()?;
+    let publication =
+        options.publish.as_ref().map(|domain| publish::open(domain, options.limits)).transpose()?;
     let receiver = MulticastReceiver::open(options.interface.as_deref(), &groups, now)?;
     // Of topics whose group is not joined announcements would tell as lost what nobody wanted.
     let heard: Vec<_> = Topic::ALL.into_iter().filter(|&topic| groups.contains(&group(topic))).collect();
@@ -90,7 +94,7 @@ pub fn listen(
         report: Report::new(options.json, Output::new(out), Output::new(notes), names),
         started: now,
         last_sample: now,
-        taken_ns: 0,
+        taken: Stamp::default(),
         draw_at: now,
         received: 0,
     };
@@ -110,8 +114,8 @@ struct Listener<'a> {
     report: Report<'a>,
     started: Instant,
     last_sample: Instant,
-    /// When the last datagram came that was taken, by the kernel: CLOCK_MONOTONIC in ns.
-    taken_ns: u64,
+    /// When the last datagram came that was taken, by the kernel.
+    taken: Stamp,
     draw_at: Instant,
     received: u64,
 }
@@ -145,9 +149,9 @@ impl Listener<'_> {
     }
 
     fn run(&mut self, tell: &AtomicBool, stop: &AtomicBool) -> Result<(), End> {
-        let mut buffer = vec![0; LONGEST];
+        let (mut buffer, mut whole) = (vec![0; LONGEST], Vec::new());
         loop {
-            let more = self.take(&mut buffer)?;
+            let more = self.take(&mut buffer, &mut whole)?;
             if let Some(publication) = &mut self.publication {
                 publication.wake();
             }
@@ -174,17 +178,17 @@ impl Listener<'_> {
         }
     }
 
-    /// Takes what waits, up to a turn; whether there may be more.
-    fn take(&mut self, buffer: &mut [u8]) -> Result<bool, End> {
+    /// Takes what waits, up to a turn; whether there may be more. What comes in parts becomes `whole`.
+    fn take(&mut self, buffer: &mut [u8], whole: &mut Vec<u8>) -> Result<bool, End> {
         for _ in 0..TURN {
             let Some(caught) = self.receiver.receive(buffer)? else { return Ok(false) };
             let bytes = caught.bytes;
-            self.taken_ns = caught.arrival_ns;
+            let arrival = Stamp { monotonic_ns: caught.arrival_ns, wall_ns: caught.wall_ns };
+            self.taken = arrival;
             if !self.hubs.want(bytes) {
                 continue;
             }
-            let arrival = Stamp { monotonic_ns: caught.arrival_ns, wall_ns: caught.wall_ns };
-            let arrived = self.incoming.receive(bytes, sender(caught.from), arrival);
+            let arrived = self.incoming.receive(bytes, sender(caught.from), arrival, whole);
             if let (Some(head), Some(publication)) = (arrived.begins(), &mut self.publication) {
                 // If a life of the same epoch went on until now, that was another sender's.
                 publication.begun(head, stamp::now());
@@ -193,7 +197,7 @@ impl Listener<'_> {
                 Arrived::Sample(sample) => self.sample(&sample, caught.from)?,
                 Arrived::Announced(announcement) => self.announced(&announcement, caught.from)?,
                 Arrived::Refused { shared: Some(hub), .. } => self.is_shared(hub)?,
-                Arrived::Refused { shared: None, .. } | Arrived::Known => {}
+                Arrived::Refused { shared: None, .. } | Arrived::Part | Arrived::Known => {}
             }
             if self.options.bounds.count.is_some_and(|count| self.received >= count) {
                 return Ok(true);
@@ -275,9 +279,8 @@ impl Listener<'_> {
             self.trouble(&what)?;
         }
         if let Some(publication) = &mut self.publication {
-            let stamp = stamp::now();
-            let read_ns = if more { self.taken_ns } else { stamp.monotonic_ns };
-            publication.look(stamp, read_ns);
+            let now = stamp::now();
+            publication.look(now.monotonic_ns, if more { self.taken } else { now });
         }
         let so_far = self.crowding();
         if let Some(what) = self.crowd.look(so_far, now) {

@@ -252,7 +252,7 @@ impl Found<'_> {
         text += "self_min = [\n";
         for Sector { from_mdeg, to_mdeg, range_mm, .. } in &mask.sectors {
             let (from, to, range) = (degrees(*from_mdeg), degrees(*to_mdeg), metres(*range_mm));
-            let _ = writeln!(text, "    {{ from = {from}, to = {to}, range = {range} }},");
+            let _ = writeln!(text, "    {{ from_deg = {from}, to_deg = {to}, range = {range} }},");
         }
         text + "]\n"
     }
@@ -274,13 +274,13 @@ impl Found<'_> {
         /// As in the configuration: degrees and metres.
         #[derive(Serialize)]
         struct Part {
-            from: f64,
-            to: f64,
+            from_deg: f64,
+            to_deg: f64,
             range: f64,
         }
         let part = |sector: &Sector| Part {
-            from: f64::from(sector.from_mdeg) / 1000.0,
-            to: f64::from(sector.to_mdeg) / 1000.0,
+            from_deg: f64::from(sector.from_mdeg) / 1000.0,
+            to_deg: f64::from(sector.to_mdeg) / 1000.0,
             range: f64::from(sector.range_mm) / 1000.0,
         };
         Line {

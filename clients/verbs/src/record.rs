@@ -292,7 +292,7 @@ impl Sink for Recorder<'_> {
             self.end_gap()?;
         }
         let Some(track) = self.tracks.iter().position(|track| track == name) else { return Ok(()) };
-        if !self.queue.push(track, header, |room| sample.pack_said(room)) {
+        if !self.queue.push(track, header, sample.bytes().len(), |room| sample.pack_said(room)) {
             return self.leave_out(name);
         }
         self.pushed += 1;

@@ -82,13 +82,10 @@ pub(crate) fn telegram(line: &mut Vec<u8>, header: &Header, bytes: &[u8]) -> io:
     const SHOWN: usize = 16;
     numbers(line, header)?;
     let telegram = Telegram(bytes);
-    write!(
-        line,
-        " address {:02x} command {:02x} {} bytes ",
-        telegram.address(),
-        telegram.command(),
-        bytes.len()
-    )?;
+    if telegram.is_lms() {
+        write!(line, " address {:02x} command {:02x}", telegram.address(), telegram.command())?;
+    }
+    write!(line, " {} bytes ", bytes.len())?;
     write!(line, "{}", Hex(&bytes[..bytes.len().min(SHOWN)]))?;
     if bytes.len() > SHOWN { write!(line, "...") } else { Ok(()) }
 }

@@ -170,8 +170,8 @@ impl Sink for Watcher<'_> {
             Sample::Scan(scan) => sensor.take_scan(scan.header(), scan, clock::now_ns()),
             Sample::Marks(marks) => sensor.marks = marks.is_available().then_some(**marks),
             Sample::Zones(heard) => sensor.zones = heard.zones,
-            Sample::Foreground(foreground) => sensor.foreground = Some(**foreground),
-            Sample::Background(model) => sensor.background = Some(**model),
+            Sample::Foreground(foreground) => sensor.foreground = Some(foreground.boxed()),
+            Sample::Background(model) => sensor.background = Some(model.boxed()),
             Sample::Status(status) => sensor.take_status(status),
             // The picture does not show it.
             _ => return Ok(()),

@@ -5,12 +5,13 @@ use std::fmt;
 
 use preprocess::background::{Candidate, Method, Start};
 use preprocess::{marks, zones};
+use schema::limits::TopicLimits;
 use schema::{Failure, Pose};
 use serde::Serialize;
 use serde_json::{Value as Json, json};
 
 use crate::gateway::Gateway;
-use crate::link::{Config, Link};
+use crate::link::{Config, Link, Scanner};
 use crate::places::Places;
 use crate::processing::{Background, Zones};
 use crate::sources::Sources;
@@ -27,7 +28,7 @@ pub struct Value {
     pub origin: String,
 }
 
-/// All values of the links and of the gateway from `sources`.
+/// All values of the links, of their limits and of the gateway from `sources`.
 ///
 /// [`schema::Kind::Configuration`] with place, value and remedy.
 pub fn values(sources: &Sources) -> Result<Vec<Value>, Failure> {
@@ -36,6 +37,8 @@ pub fn values(sources: &Sources) -> Result<Vec<Value>, Failure> {
     for link in &config.links {
         list.link(link);
     }
+    let TopicLimits { consumers, .. } = config.limits;
+    list.put_general("limits.consumers", json!(consumers));
     list.gateway(&gateway);
     Ok(list.values)
 }
@@ -47,19 +50,17 @@ struct List {
 
 impl List {
     fn link(&mut self, link: &Link) {
-        let Link { name, port, family, variant, unit, mode, baud, processing } = link;
+        let Link { name, port, scanner, processing, .. } = link;
         let of = |key: &'static str| (name.as_str(), key);
-        let by_type = match family {
-            Some(family) => format!("default of {}", family.name()),
-            None => DEFAULT.to_owned(),
-        };
         self.put(of("port"), json!(port.name()), DEFAULT);
-        self.put(of("type"), json!(family.map(|family| family.name())), DEFAULT);
-        self.put(of("angle"), json!(variant.angle_deg), &by_type);
-        self.put(of("resolution"), json!(f64::from(variant.resolution_cdeg) / 100.0), &by_type);
-        self.put(of("unit"), json!(unit.map(|unit| if unit.mm() == 1 { "mm" } else { "cm" })), DEFAULT);
-        self.put(of("mode"), json!(mode.map(|mode| mode.0)), DEFAULT);
-        self.put(of("baud"), json!(baud.rate()), DEFAULT);
+        self.put(of("family"), json!(link.family().name()), DEFAULT);
+        match scanner {
+            Scanner::Lms => self.lms(link),
+            Scanner::Ld { model, beams } => {
+                self.put(of("model"), json!(model.map_or("auto", |model| model.name())), DEFAULT);
+                self.put(of("beams"), json!(beams), DEFAULT);
+            }
+        }
         let Pose { x_m, y_m, yaw_rad, upside_down, .. } = processing.pose;
         self.put(of("pose.x"), json!(x_m), DEFAULT);
         self.put(of("pose.y"), json!(y_m), DEFAULT);
@@ -73,11 +74,26 @@ impl List {
         self.background(name, &processing.background);
     }
 
+    fn lms(&mut self, link: &Link) {
+        let Link { name, family, variant, unit, mode, baud, .. } = link;
+        let of = |key: &'static str| (name.as_str(), key);
+        let by_type = match family {
+            Some(family) => format!("default of {}", family.name()),
+            None => DEFAULT.to_owned(),
+        };
+        self.put(of("type"), json!(family.map(|family| family.name())), DEFAULT);
+        self.put(of("angle"), json!(variant.angle_deg), &by_type);
+        self.put(of("resolution"), json!(f64::from(variant.resolution_cdeg) / 100.0), &by_type);
+        self.put(of("unit"), json!(unit.map(|unit| if unit.mm() == 1 { "mm" } else { "cm" })), DEFAULT);
+        self.put(of("mode"), json!(mode.map(|mode| mode.0)), DEFAULT);
+        self.put(of("baud"), json!(baud.rate()), DEFAULT);
+    }
+
     fn zones(&mut self, link: &str, zones: &Zones) {
         let radii: Vec<f64> = zones.radii_mm.iter().copied().map(metres).collect();
         let sector = |sector: &zones::Sector| {
             let [from, to] = [sector.from_mdeg, sector.to_mdeg].map(|mdeg| f64::from(mdeg) / 1000.0);
-            json!({ "from": from, "to": to, "range": metres(sector.range_mm) })
+            json!({ "from_deg": from, "to_deg": to, "range": metres(sector.range_mm) })
         };
         let self_min: Vec<Json> = zones.self_min.iter().map(sector).collect();
         self.put((link, "zones.radii"), json!(radii), DEFAULT);
@@ -133,9 +149,14 @@ impl List {
             ("gateway.background_every", json!(every)),
             ("gateway.mtu", json!(mtu.unwrap_or(Gateway::MTU))),
         ] {
-            let place = self.places.of_key(key).unwrap_or(DEFAULT).to_owned();
-            self.values.push(Value { class: CLASS, key: key.to_owned(), value, origin: place });
+            self.put_general(key, value);
         }
+    }
+
+    /// A value that belongs to no link.
+    fn put_general(&mut self, key: &str, value: Json) {
+        let origin = self.places.of_key(key).unwrap_or(DEFAULT).to_owned();
+        self.values.push(Value { class: CLASS, key: key.to_owned(), value, origin });
     }
 
     /// A value of a link; `default` is what to say where nobody says it.
@@ -189,7 +210,10 @@ mod tests {
         let written = |value: Json| Written(&value).to_string();
         assert_eq!(written(json!("a \"b\"")), "\"a \\\"b\\\"\"");
         assert_eq!(written(json!([1.0, 0.6])), "[1.0, 0.6]");
-        assert_eq!(written(json!([{ "from": 1.5, "to": 2.0 }])), "[{ from = 1.5, to = 2.0 }]");
+        assert_eq!(
+            written(json!([{ "from_deg": -1.5, "to_deg": 2.0 }])),
+            "[{ from_deg = -1.5, to_deg = 2.0 }]"
+        );
         assert_eq!((written(json!(null)), written(json!(true))), ("-".to_owned(), "true".to_owned()));
     }
 }

@@ -2,7 +2,9 @@
 //! file, line and column, or the flag.
 
 mod gateway;
+mod limits;
 mod processing;
+mod scanner;
 mod sight;
 
 use std::rc::Rc;
@@ -10,15 +12,18 @@ use std::rc::Rc;
 use lms::family::Family;
 use lms::variant::{Baud, Mode, Unit, Variant};
 use port::Source;
+use schema::limits::TopicLimits;
 use schema::{Failure, Kind, check_sensor};
 use serde::Deserialize;
 use toml::Spanned;
 
-use crate::link::{Link, MAX_LINKS};
+use crate::link::{Link, MAX_LINKS, Scanner};
 use crate::origin::Origin;
 use crate::processing::Processing;
 use gateway::GatewayLayer;
+use limits::LimitsLayer;
 use processing::{BackgroundLayer, MarksLayer, PoseLayer, Sections, ZonesLayer};
+use scanner::{ScannerDraft, ScannerLayer};
 use sight::Sight;
 
 /// What one source says. Knows the keys; what is not here is an unknown key.
@@ -30,6 +35,7 @@ pub(crate) struct Layer {
     zones: Option<ZonesLayer>,
     marks: Option<MarksLayer>,
     background: Option<BackgroundLayer>,
+    limits: Option<LimitsLayer>,
     /// The hub's own configuration may be that of its gateway, too.
     pub(crate) gateway: Option<GatewayLayer>,
 }
@@ -40,7 +46,10 @@ struct LinkLayer {
     name: Spanned<String>,
     port: Option<Spanned<String>>,
     #[serde(rename = "type")]
+    lms_type: Option<Spanned<String>>,
     family: Option<Spanned<String>>,
+    model: Option<Spanned<String>>,
+    beams: Option<Spanned<i64>>,
     angle: Option<Spanned<f64>>,
     resolution: Option<Spanned<f64>>,
     unit: Option<Spanned<String>>,
@@ -58,6 +67,7 @@ pub(crate) struct Drafts {
     links: Vec<Draft>,
     /// What was said for all links, in the order of the sources.
     general: Vec<(Rc<Origin>, Sections)>,
+    limits: TopicLimits,
 }
 
 /// A link while sources are merged.
@@ -65,12 +75,13 @@ struct Draft {
     name: String,
     place: String,
     port: Option<Source>,
+    scanner: ScannerDraft,
     family: Option<Said<Family>>,
     angle_deg: Option<Said<u16>>,
     resolution_cdeg: Option<Said<u16>>,
-    unit: Option<Unit>,
+    unit: Option<Said<Unit>>,
     mode: Option<Said<Mode>>,
-    baud: Baud,
+    baud: Option<Said<Baud>>,
     /// What was said for this link, in the order of the sources.
     own: Vec<(Rc<Origin>, Sections)>,
 }
@@ -88,28 +99,50 @@ impl Drafts {
 
     /// Lays `layer` over the others; only where `may_add` may it bring links that were not there.
     pub(crate) fn merge(&mut self, layer: Layer, origin: Origin, may_add: bool) -> Result<(), Failure> {
-        let Layer { link, zones, marks, background, gateway: _ } = layer;
+        let Layer { link, zones, marks, background, limits, gateway: _ } = layer;
+        if let Some(section) = limits {
+            section.lay(&origin, &mut self.limits)?;
+        }
         let origin = Rc::new(origin);
         merge(&mut self.links, link, &origin, may_add)?;
         self.general.push((origin, Sections { pose: None, zones, marks, background }));
         Ok(())
     }
 
-    /// The links as they are when all has been said.
-    pub(crate) fn finish(self) -> Result<Vec<Link>, Failure> {
-        let Drafts { links, general } = self;
-        links.into_iter().map(|draft| draft.finish(&general)).collect()
+    /// The links as they are when all has been said, and the limits of their topics.
+    pub(crate) fn finish(self) -> Result<(Vec<Link>, TopicLimits), Failure> {
+        let Drafts { links, general, limits } = self;
+        let links: Result<_, _> = links.into_iter().map(|draft| draft.finish(&general)).collect();
+        Ok((links?, limits))
     }
 }
 
 impl Draft {
     /// What was said for the link wins over what was said for all, wherever either stands.
     fn finish(self, general: &[(Rc<Origin>, Sections)]) -> Result<Link, Failure> {
-        let Draft { name, place, port, family, angle_deg, resolution_cdeg, unit, mode, baud, own } = self;
+        let Draft { name, place, port, scanner, family, angle_deg, resolution_cdeg, unit, mode, baud, own } =
+            self;
         let refuse = |place: &str, what: String, remedy: &str| {
             Failure::new(Kind::Configuration, format!("{place}: link {name}: {what}"), remedy)
         };
         let port = port.ok_or_else(|| refuse(&place, "no port".into(), "add port = \"/dev/ttyUSB0\""))?;
+        let scanner = scanner.finish(refuse)?;
+        if scanner != Scanner::Lms {
+            let said = |place: Option<&String>, key| place.map(|place| (place.clone(), key));
+            let of_lms = [
+                said(family.as_ref().map(|said| &said.place), "type"),
+                said(angle_deg.as_ref().map(|said| &said.place), "angle"),
+                said(resolution_cdeg.as_ref().map(|said| &said.place), "resolution"),
+                said(unit.as_ref().map(|said| &said.place), "unit"),
+                said(mode.as_ref().map(|said| &said.place), "mode"),
+                said(baud.as_ref().map(|said| &said.place), "baud"),
+            ];
+            if let Some((place, key)) = of_lms.into_iter().flatten().next() {
+                let what = format!("{key} is of family lms; a scanner of another family has no such setting");
+                return Err(refuse(&place, what, "leave it out, or set family = \"lms\""));
+            }
+        }
+        let (unit, baud) = (unit.map(|said| said.value), baud.map_or(Baud::B500000, |said| said.value));
         if let Some(mode) = mode.as_ref().filter(|_| !matches!(port, Source::File { .. })) {
             let what = format!("the mode of {} is read from the sensor", port.name());
             return Err(refuse(
@@ -152,12 +185,16 @@ impl Draft {
         }
         let start =
             said.iter().rev().find_map(|(origin, sections)| Some(origin.place(Some(sections.start()?))));
-        Sight { name: &name, place: &place, variant, unit, said }.check(&processing)?;
-        processing.background.read(&name, variant, unit).map_err(|failure| {
+        let mode = mode.map(|said| said.value);
+        let mut link = Link { name, port, scanner, family, variant, unit, mode, baud, processing };
+        Sight { link: &link, place: &place, said }.check()?;
+        let mut background = std::mem::take(&mut link.processing.background);
+        background.read(&link).map_err(|failure| {
             let place = start.unwrap_or_default();
             Failure::new(failure.kind, format!("{place}: {}", failure.message), failure.hint)
         })?;
-        Ok(Link { name, port, family, variant, unit, mode: mode.map(|said| said.value), baud, processing })
+        link.processing.background = background;
+        Ok(link)
     }
 }
 
@@ -197,12 +234,13 @@ fn merge(
                     name: name.clone(),
                     place: origin.place(span),
                     port: None,
+                    scanner: ScannerDraft::default(),
                     family: None,
                     angle_deg: None,
                     resolution_cdeg: None,
                     unit: None,
                     mode: None,
-                    baud: Baud::B500000,
+                    baud: None,
                     own: Vec::new(),
                 });
                 links.len() - 1
@@ -225,7 +263,9 @@ fn merge(
                 )
             })?);
         }
-        if let Some(family) = link.family {
+        let scanner = ScannerLayer { family: link.family, model: link.model, beams: link.beams };
+        draft.scanner.lay(scanner, origin)?;
+        if let Some(family) = link.lms_type {
             let value = Family::of_name(family.get_ref()).ok_or_else(|| {
                 let what = format!("type = \"{}\"", family.get_ref());
                 origin.refuse(Some(family.span()), what, "lms200, lms211, lms221 or lms291")
@@ -241,14 +281,15 @@ fn merge(
             draft.resolution_cdeg = Some(Said { value, place: origin.place(Some(step.span())) });
         }
         if let Some(unit) = link.unit {
-            draft.unit = Some(match unit.get_ref().as_str() {
+            let value = match unit.get_ref().as_str() {
                 "mm" => Unit::Mm,
                 "cm" => Unit::Cm,
                 other => {
                     let what = format!("unit = \"{other}\"");
                     return Err(origin.refuse(Some(unit.span()), what, "\"mm\" or \"cm\""));
                 }
-            });
+            };
+            draft.unit = Some(Said { value, place: origin.place(Some(unit.span())) });
         }
         if let Some(mode) = link.mode {
             let known = u8::try_from(*mode.get_ref()).ok().map(Mode).filter(|mode| mode.has_ranges());
@@ -259,10 +300,11 @@ fn merge(
             draft.mode = Some(Said { value, place: origin.place(Some(mode.span())) });
         }
         if let Some(baud) = link.baud {
-            draft.baud = Baud::of_rate(*baud.get_ref()).ok_or_else(|| {
+            let value = Baud::of_rate(*baud.get_ref()).ok_or_else(|| {
                 let what = format!("baud = {}", baud.get_ref());
                 origin.refuse(Some(baud.span()), what, "500000, 38400, 19200 or 9600")
             })?;
+            draft.baud = Some(Said { value, place: origin.place(Some(baud.span())) });
         }
         let LinkLayer { pose, zones, marks, background, .. } = link;
         draft.own.push((origin.clone(), Sections { pose, zones, marks, background }));

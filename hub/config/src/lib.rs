@@ -14,7 +14,7 @@ mod sources;
 
 pub use effective::{Value, values};
 pub use gateway::Gateway;
-pub use link::{Config, Link};
+pub use link::{Config, Link, Scanner};
 pub use processing::{Background, Processing, Zones};
 pub use sources::Sources;
 

@@ -2,8 +2,10 @@
 //! were set.
 
 use lms::family::Family;
-use lms::variant::{Baud, Mode, Unit, Variant};
+use lms::variant::{Baud, MAX_BEAMS, Mode, Unit, Variant};
 use port::Source;
+use schema::limits::TopicLimits;
+use schema::{Background, Contents};
 
 use crate::processing::Processing;
 
@@ -12,6 +14,15 @@ use crate::processing::Processing;
 pub struct Config {
     /// The links in their order: a sensor's number is its place here.
     pub links: Vec<Link>,
+    /// What the topics of a link are made for, but for what its scanner needs.
+    pub limits: TopicLimits,
+}
+
+impl Config {
+    /// Returns what the topics of each link are made for.
+    pub fn topic_limits(&self) -> Vec<TopicLimits> {
+        self.links.iter().map(|link| link.limits(&self.limits)).collect()
+    }
 }
 
 /// One link and what to ask of its sensor.
@@ -21,6 +32,8 @@ pub struct Link {
     pub name: String,
     /// The source of its bytes.
     pub port: Source,
+    /// Of which family its scanner is.
+    pub scanner: Scanner,
     /// The expected type of the sensor, if it is set: settings that the type does not support are refused.
     pub family: Option<Family>,
     /// Angle and resolution.
@@ -34,6 +47,94 @@ pub struct Link {
     /// How its scans are processed.
     pub processing: Processing,
 }
+
+/// A family of scanners, with what is set for one of them. What is set for an LMS is in its [`Link`].
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Scanner {
+    /// SICK LMS 2xx.
+    Lms,
+    /// LDROBOT.
+    Ld {
+        /// The model, if it is not to be found out.
+        model: Option<ld::Model>,
+        /// Beams of a scan; the model's, if they are not set.
+        beams: Option<usize>,
+    },
+}
+
+impl Link {
+    /// Returns the rate at which its port is opened, in bits per second.
+    pub fn rate(&self) -> u32 {
+        match self.scanner {
+            Scanner::Lms => self.baud.rate(),
+            Scanner::Ld { .. } => self.ld_settings().baud(),
+        }
+    }
+
+    /// Returns the most beams of a scan of its sensor.
+    pub fn beams(&self) -> usize {
+        match self.scanner {
+            Scanner::Lms => MAX_BEAMS,
+            Scanner::Ld { model, beams } => {
+                beams.or(model.map(|model| model.beams())).unwrap_or(LD_AUTO_BEAMS)
+            }
+        }
+    }
+
+    /// Returns what its topics are made for, where those of all links are made as `all` says.
+    pub fn limits(&self, all: &TopicLimits) -> TopicLimits {
+        match self.scanner {
+            Scanner::Lms => *all,
+            Scanner::Ld { .. } => {
+                TopicLimits { beams: self.beams(), contents: Contents::UPPER | Contents::ANGLES, ..*all }
+            }
+        }
+    }
+
+    /// Returns the family of its scanner.
+    pub fn family(&self) -> schema::Family {
+        match self.scanner {
+            Scanner::Lms => schema::Family::Lms,
+            Scanner::Ld { .. } => schema::Family::Ld,
+        }
+    }
+
+    /// Whether `model` may be of its sensor, as far as that is known.
+    ///
+    /// # Errors
+    ///
+    /// The beams and the unit that such a model has, in words.
+    pub fn fits(&self, model: &Background) -> Result<(), String> {
+        let (fits, beams, unit_mm) = match self.scanner {
+            Scanner::Lms => {
+                let (beams, unit) = (self.variant.beams(), self.unit.map(|unit| u32::from(unit.mm())));
+                let unit_mm = unit.unwrap_or(model.unit_um / 1000);
+                (usize::from(model.count) == beams, beams.to_string(), unit_mm)
+            }
+            Scanner::Ld { model: None, beams: None } => {
+                (usize::from(model.count) <= self.beams(), format!("at most {}", self.beams()), 1)
+            }
+            Scanner::Ld { .. } => (usize::from(model.count) == self.beams(), self.beams().to_string(), 1),
+        };
+        if fits && model.unit_um == 1000 * unit_mm {
+            return Ok(());
+        }
+        Err(format!("{beams} beams in units of {unit_mm} mm"))
+    }
+
+    /// Returns what a session with a scanner of LDROBOT at its port needs; of other families what means nothing.
+    pub fn ld_settings(&self) -> ld::Settings {
+        let fixed_rate = !matches!(self.port, Source::Tty(_));
+        let (model, beams) = match self.scanner {
+            Scanner::Lms => (None, None),
+            Scanner::Ld { model, beams } => (model, beams),
+        };
+        ld::Settings { model, beams, most_beams: Some(self.beams()), fixed_rate }
+    }
+}
+
+/// Beams for which there is room where the model is to be found out: those of all but the STL27L.
+const LD_AUTO_BEAMS: usize = 720;
 
 /// Links of one hub.
 pub(crate) const MAX_LINKS: usize = 256;

@@ -27,9 +27,9 @@ impl Config {
         for (origin, layer) in settings {
             drafts.merge(layer, origin, false)?;
         }
-        let links = drafts.finish()?;
+        let (links, limits) = drafts.finish()?;
         check_ports(&links)?;
-        Ok(Config { links })
+        Ok(Config { links, limits })
     }
 }
 

@@ -1,11 +1,17 @@
 //! What the links of a configuration need: shared memory and descriptors. Refuses to know what the machine has.
 
 use schema::Topic;
-use schema::shortage::sensor_bytes;
+use schema::limits::TopicLimits;
+use schema::shortage::{self, sensor_bytes};
 
-/// Bytes of shared memory for `links` links and the first consumers.
-pub fn memory(links: usize) -> u64 {
-    links as u64 * sensor_bytes(&Topic::ALL) + REST
+/// Bytes of shared memory for links with topics made as `limits` say of each, and the first consumers.
+pub fn memory(limits: &[TopicLimits]) -> u64 {
+    limits.iter().map(|limits| sensor_bytes(&Topic::ALL, limits)).sum::<u64>() + REST
+}
+
+/// Bytes of the longest segment of any of them.
+pub fn longest_segment(limits: &[TopicLimits]) -> u64 {
+    limits.iter().map(shortage::longest_segment).max().unwrap_or_default()
 }
 
 /// Descriptors for `links` links and a first consumer of each, besides those open from the start.

@@ -3,7 +3,7 @@
 
 use std::path::PathBuf;
 
-use lms::variant::{Unit, Variant};
+use crate::link::Link;
 use preprocess::background::Settings as Learning;
 use preprocess::{marks, zones};
 use schema::{Failure, Kind, Pose, SavedModel, regular};
@@ -95,11 +95,12 @@ pub struct Background {
 }
 
 impl Background {
-    /// Reads the file that the background of `sensor` starts with, if there is one, and compares it with the
+    /// Reads the file that the background of the sensor of `link` starts with, if there is one, and compares it with the
     /// configuration of that sensor.
     ///
     /// [`Kind::Configuration`] with file and reason.
-    pub(crate) fn read(&mut self, sensor: &str, variant: Variant, unit: Option<Unit>) -> Result<(), Failure> {
+    pub(crate) fn read(&mut self, link: &Link) -> Result<(), Failure> {
+        let sensor = &link.name;
         let Some(file) = self.file.as_ref().filter(|_| self.is_kept) else { return Ok(()) };
         let place = file.display().to_string();
         let refuse = |what: String, hint: &str| {
@@ -114,20 +115,18 @@ impl Background {
             let message = format!("link {sensor}: background.start: {}", failure.message);
             Failure::new(Kind::Configuration, message, failure.hint)
         })?;
-        if of != sensor {
+        if of != *sensor {
             let hint = "name the file of each sensor by background.start of its link";
             return refuse(format!("the model is that of sensor {of}"), hint);
         }
-        let (beams, unit_mm) = (variant.beams(), unit.map_or(model.unit_mm, |unit| unit.mm()));
-        if usize::from(model.count) != beams || model.unit_mm != unit_mm {
+        if let Err(wanted) = link.fits(&model) {
+            let (beams, unit_mm) = (model.count, model.unit_um / 1000);
             let what = format!(
-                "the model has {} beams in units of {} mm, the link is configured for {beams} beams in units of \
-                 {unit_mm} mm",
-                model.count, model.unit_mm
+                "the model has {beams} beams in units of {unit_mm} mm, the link is configured for {wanted}"
             );
             return refuse(what, "use \"empty\", and save a new model of the sensor");
         }
-        self.model = Some(Box::new(model));
+        self.model = Some(model);
         Ok(())
     }
 }

@@ -4,10 +4,10 @@
 use std::fs;
 use std::path::PathBuf;
 
-use config::{Config, Gateway, Processing, Sources};
+use config::{Config, Gateway, Link, Processing, Scanner, Sources};
 use preprocess::background::{Candidate, Method, Start};
 use preprocess::zones::Sector;
-use schema::{Background, Kind, as_json};
+use schema::{Background, BackgroundHead, Kind, as_json};
 
 /// A file that goes with the test.
 struct Scratch(PathBuf);
@@ -52,10 +52,11 @@ fn the_page_holds() {
         page.split("```toml\n").nth(1).and_then(|rest| rest.split("```").next()).expect("an example");
     let file = Scratch::new("page.toml", example);
     let config = load(&[&file], &[]).unwrap();
-    let [front, rear] = &config.links[..] else { panic!("{config:?}") };
+    let [front, rear, side] = &config.links[..] else { panic!("{config:?}") };
     assert_eq!((front.processing.pose.x_m, rear.processing.pose.upside_down), (0.3, 1));
     assert_eq!(front.processing.zones.self_min.len(), 1);
     assert_eq!(front.processing.zones.margin_mm, 50);
+    assert_eq!(side.scanner, Scanner::Ld { model: Some(ld::Model::Ld19), beams: Some(450) });
     // What the page shows as the values without a word are those: the front's are changed in these sections.
     let Processing { zones, marks, background, .. } = Processing::default();
     let shown = &rear.processing;
@@ -71,7 +72,7 @@ fn a_link_wins_over_all_links_and_the_later_source_over_the_earlier() {
     );
     let second = Scratch::new(
         "second.toml",
-        "[zones]\nmargin = 0.01\nradii = [2.0]\nself_min = [{ from = 12.5, to = 30, range = 0.42 }]\n\
+        "[zones]\nmargin = 0.01\nradii = [2.0]\nself_min = [{ from_deg = -77.5, to_deg = -60, range = 0.42 }]\n\
          [background]\nmethod = \"paper\"\ncandidate = \"latest\"\nthreshold_mm = 40\nscans = 100\n\
          publish = \"every-scan\"\nstart = \"first-scan\"\n[marks]\nmax_range_step = 0.2\ni_min = 2\nmax_gap = 1\n",
     );
@@ -81,7 +82,7 @@ fn a_link_wins_over_all_links_and_the_later_source_over_the_earlier() {
     assert_eq!((a.pose.x_m, a.pose.y_m, a.pose.yaw_rad, a.pose.upside_down), (-0.25, 0.0, 1.5, 1));
     assert_eq!((a.zones.margin_mm, b.zones.margin_mm), (50, 10));
     assert_eq!((&a.zones.radii_mm, &b.zones.radii_mm), (&vec![1200, 700], &vec![1200, 700]));
-    assert_eq!(a.zones.self_min, [Sector { from_mdeg: 12_500, to_mdeg: 30_000, range_mm: 420 }]);
+    assert_eq!(a.zones.self_min, [Sector { from_mdeg: -77_500, to_mdeg: -60_000, range_mm: 420 }]);
     assert_eq!((a.zones.exact, b.zones.exact), (true, false));
     let learning = a.background.learning;
     assert_eq!(
@@ -116,12 +117,24 @@ fn what_cannot_be_is_refused_with_place_value_and_remedy() {
         ("zones.margin=-0.1", "margin = -0.1\n  metres, from 0 to 10"),
         ("zones.max_invalid=10", "max_invalid = 10\n  a share from 0 to 1"),
         ("zones.max_invalid=nan", "max_invalid = NaN"),
-        ("zones.min_beams=0", "min_beams = 0\n  a whole number from 1 to 401"),
+        ("zones.min_beams=0", "min_beams = 0\n  a whole number from 1 to 8192"),
         ("zones.min_scans=1.5", "min_scans = 1.5 is not a whole number\n  see docs"),
-        ("zones.self_min=[{from=30,to=12,range=0.4}]", "from before to"),
-        ("zones.self_min=[{from=-1,to=12,range=0.4}]", "self_min = { from = -1, to = 12, range = 0.4 }"),
-        ("zones.self_min=[{from=1,to=12,range=0}]", "range in metres"),
-        ("zones.self_min=[{from=1,to=12,rang=1}]", "unknown key `rang`\n  did you mean `range`?"),
+        ("zones.self_min=[{from_deg=30,to_deg=12,range=0.4}]", "from before to"),
+        (
+            "zones.self_min=[{from_deg=-181,to_deg=12,range=0.4}]",
+            "self_min = { from_deg = -181, to_deg = 12, range = 0.4 }\n  from_deg and to_deg are",
+        ),
+        ("zones.self_min=[{from_deg=-1,to_deg=180.5,range=0.4}]", "0 ahead, 90 left, -90 right"),
+        (
+            "zones.self_min=[{from=100.1,to=120,range=0.4}]",
+            "self_min = { from = 100.1, to = 120, range = 0.4 } counts angles from the right\n  angles are counted from \
+             ahead now: { from_deg = 10.1, to_deg = 30.0, range = 0.4 }",
+        ),
+        ("zones.self_min=[{from=0,to=20,range=1}]", "{ from_deg = -90.0, to_deg = -70.0, range = 1.0 }"),
+        ("zones.self_min=[{from_deg=1,to=20,range=1}]", "without its two angles\n  give it both"),
+        ("zones.self_min=[{range=1}]", "without its two angles"),
+        ("zones.self_min=[{from_deg=1,to_deg=12,range=0}]", "range in metres"),
+        ("zones.self_min=[{from_deg=1,to_deg=12,rang=1}]", "unknown key `rang`\n  did you mean `range`?"),
         ("zonse.margin=1", "unknown key `zonse`\n  did you mean `zones`?"),
         ("marks.i_min=8", "i_min = 8\n  a whole number from 1 to 7"),
         ("marks.max_range_step=100", "max_range_step = 100\n  metres"),
@@ -140,7 +153,7 @@ fn what_cannot_be_is_refused_with_place_value_and_remedy() {
         assert!(refusal.contains(words), "{setting}: {refusal}");
         assert!(refusal.starts_with(&format!("--set {setting}: ")), "{refusal}");
     }
-    let many = vec!["{ from = 1, to = 2, range = 1 }"; 65].join(",");
+    let many = vec!["{ from_deg = 1, to_deg = 2, range = 1 }"; 65].join(",");
     let refusal = load(&[], &[&format!("zones.self_min=[{many}]")]).unwrap_err();
     assert!(refusal.contains("self_min has 65 sectors\n  at most 64"), "{refusal}");
     let deep = Scratch::new("deep.toml", "[[link]]\nname = \"a\"\nport = \"x\"\n[link.marks]\ni_mni = 1\n");
@@ -159,6 +172,79 @@ fn what_cannot_be_is_refused_with_place_value_and_remedy() {
     );
     let refusal = load(&[&place], &[]).unwrap_err();
     assert!(refusal.contains("place.toml:6:9: radii = [0.6, 1.0]"), "{refusal}");
+}
+
+#[test]
+fn a_link_has_a_family_and_what_its_family_needs() {
+    let front = |set: &[&str]| load(&[], set).map(|mut config| config.links.swap_remove(0));
+    let known = |link: &Link| (link.scanner, link.rate(), link.beams());
+    let (family, ld19) = ("link.front.family=ld", Some(ld::Model::Ld19));
+    for (set, scanner, rate, beams) in [
+        (&[][..], Scanner::Lms, 500_000, 401),
+        (&["link.front.family=lms", "link.front.model=auto"], Scanner::Lms, 500_000, 401),
+        (&[family, "link.front.model=ld19"], Scanner::Ld { model: ld19, beams: None }, 230_400, 450),
+        (
+            &[family, "link.front.model=stl27l"],
+            Scanner::Ld { model: Some(ld::Model::Stl27l), beams: None },
+            921_600,
+            2160,
+        ),
+        (
+            &[family, "link.front.model=ld14p", "link.front.beams=8192"],
+            Scanner::Ld { model: Some(ld::Model::Ld14p), beams: Some(8192) },
+            230_400,
+            8192,
+        ),
+        (&[family, "link.front.beams=2"], Scanner::Ld { model: None, beams: Some(2) }, 230_400, 2),
+        // Room for every model but the one that the remedy of a status names.
+        (&[family, "link.front.model=auto"], Scanner::Ld { model: None, beams: None }, 230_400, 720),
+    ] {
+        let link = front(set).unwrap();
+        assert_eq!(known(&link), (scanner, rate, beams), "{set:?}");
+    }
+    // The other link is what it was.
+    assert_eq!(load(&[], &[family]).unwrap().links[1].scanner, Scanner::Lms);
+
+    let lms = "is of family lms; a scanner of another family has no such setting\n  leave it out, or set family = \"lms\"";
+    for (others, setting, words) in [
+        (&[][..], "family=sick", "family = \"sick\"\n  one of: lms, ld"),
+        (&[], "famly=ld", "unknown key `famly`\n  did you mean `family`?"),
+        (
+            &[],
+            "model=ld19",
+            "link front: model = \"ld19\", and an lms says itself what it is\n  leave it out; `type`",
+        ),
+        (
+            &[],
+            "beams=450",
+            "link front: beams = 450, and an lms has its own\n  leave it out; `angle` and `resolution`",
+        ),
+        (&[], "beams=1", "beams = 1\n  a whole number from 2 to 8192"),
+        (&[family], "beams=8193", "beams = 8193\n  a whole number from 2 to 8192"),
+        (&[family], "beams=-450", "beams = -450\n  a whole number"),
+        (
+            &[family],
+            "model=LD19",
+            "link front: model = \"LD19\"\n  auto, or one of: ld06, ld19, stl19p, stl27l, ld14p",
+        ),
+        (&[family], "type=lms200", &format!("link front: type {lms}")),
+        (&[family], "angle=180", &format!("link front: angle {lms}")),
+        (&[family], "resolution=1", &format!("link front: resolution {lms}")),
+        (&[family], "unit=mm", &format!("link front: unit {lms}")),
+        (&[family], "mode=0x01", &format!("link front: mode {lms}")),
+        (&[family], "baud=38400", &format!("link front: baud {lms}")),
+    ] {
+        let setting = format!("link.front.{setting}");
+        let refusal = front(&[others, &[setting.as_str()]].concat()).expect_err(&setting);
+        assert!(refusal.starts_with(&format!("--set {setting}: ")), "{refusal}");
+        assert!(refusal.contains(words), "{setting}: {refusal}");
+    }
+    let file = Scratch::new(
+        "family.toml",
+        "[[link]]\nname = \"a\"\nport = \"x\"\nfamily = \"ld\"\nmodel = \"ld20\"\n",
+    );
+    let refusal = load(&[&file], &[]).unwrap_err();
+    assert!(refusal.contains("family.toml:5:9: link a: model = \"ld20\""), "{refusal}");
 }
 
 #[test]
@@ -195,7 +281,7 @@ fn a_circle_that_the_sensor_cannot_see_is_refused() {
     let far = ["link.front.pose.x=40", "link.front.pose.yaw=3.1416"];
     assert_eq!(set(&far), Ok(()));
     refused(&[&far[..], &["link.front.unit=mm"]].concat(), "no beam sees into the circle of 1 m");
-    let body = |range: &str| format!("link.rear.zones.self_min=[{{from=0,to=180,range={range}}}]");
+    let body = |range: &str| format!("link.rear.zones.self_min=[{{from_deg=-90,to_deg=90,range={range}}}]");
     assert_eq!(set(&[&body("0.99")]), Ok(()));
     refused(
         &[&body("1.0")],
@@ -209,13 +295,20 @@ fn a_circle_that_the_sensor_cannot_see_is_refused() {
 
 #[test]
 fn a_background_begins_with_a_model_of_its_own_sensor() {
-    let mut model = Background { count: 361, unit_mm: 1, taught: 1, ..Background::default() };
-    model.range_array[7] = 1234;
+    let head = BackgroundHead {
+        first_angle: -90_f64.to_radians(),
+        step: 0.5_f64.to_radians(),
+        unit_um: 1000,
+        taught: 1,
+        ..BackgroundHead::default()
+    };
+    let mut model = Background::of(head, &[0; 361]);
+    model.ranges_mut()[7] = 1234;
     let text = serde_json::to_string(&as_json("front", &model)).unwrap();
     let file = Scratch::new("model.json", &text);
     let start = format!("link.front.background.start={}", file.0.display());
     let begun = processing(&[], &[&start], 0).background;
-    assert_eq!((begun.model.as_deref(), begun.learning.start), (Some(&model), Start::Empty));
+    assert_eq!((begun.model.as_deref(), begun.learning.start), (Some(&*model), Start::Empty));
     assert_eq!(processing(&[], &[&start, "link.front.background.start=empty"], 0).background.model, None);
     // Of no use to who keeps none.
     assert!(load(&[], &[&start, "background.method=off"]).is_ok());
@@ -232,6 +325,28 @@ fn a_background_begins_with_a_model_of_its_own_sensor() {
     let refusal = load(&[], &[&format!("link.front.background.start={}", cut.0.display())]).unwrap_err();
     assert!(refusal.contains(": link front: background.start: "), "{refusal}");
     assert!(refusal.contains("cut.json is no background model: it is cut short"), "{refusal}");
+}
+
+#[test]
+fn topics_have_places_for_as_many_consumers_as_are_configured() {
+    let places = |set: &[&str]| load(&[], set).map(|config| config.limits.consumers);
+    assert_eq!(places(&[]), Ok(32));
+    for (set, consumers) in [("limits.consumers=1", 1), ("limits.consumers=250", 250)] {
+        assert_eq!(places(&[set]), Ok(consumers));
+    }
+    let file =
+        Scratch::new("limits.toml", "[limits]\nconsumers = 40\n[[link]]\nname = \"a\"\nport = \"x\"\n");
+    let of_file = |set: &[&str]| load(&[&file], set).map(|config| config.limits.consumers);
+    assert_eq!((of_file(&[]), of_file(&["limits.consumers=50"])), (Ok(40), Ok(50)));
+    for (set, said) in [
+        ("limits.consumers=0", "consumers = 0\n  1 to 250"),
+        ("limits.consumers=251", "consumers = 251\n  1 to 250"),
+        ("limits.consumers=-1", "consumers = -1\n  1 to 250"),
+        ("limits.consumer=1", "did you mean `consumers`?"),
+    ] {
+        let error = places(&[set]).unwrap_err();
+        assert!(error.starts_with(&format!("--set {set}: ")) && error.contains(said), "{error}");
+    }
 }
 
 #[test]
@@ -266,7 +381,7 @@ fn the_gateway_has_a_section_that_needs_no_links() {
     assert_eq!(load(&[&first, &links], &[]).unwrap().links.len(), 1);
     for (set, said) in [
         ("gateway.ttl=256", "ttl = 256\n  0 to 255"),
-        ("gateway.mtu=861", "mtu = 861\n  862 to 1472"),
+        ("gateway.mtu=575", "mtu = 575\n  576 to 1472"),
         ("gateway.mtu=-1", "mtu = -1"),
         ("gateway.tll=1", "did you mean `ttl`?"),
     ] {

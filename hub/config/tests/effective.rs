@@ -52,7 +52,7 @@ fn each_value_has_the_place_where_it_is_said_last() {
     );
     let second = Scratch::new(
         "second.toml",
-        "[zones]\nmargin = 0.01\nself_min = [{ from = 12.5, to = 30, range = 0.42 }]\n\n[background]\n\
+        "[zones]\nmargin = 0.01\nself_min = [{ from_deg = -77.5, to_deg = -60, range = 0.42 }]\n\n[background]\n\
          method = \"off\"\nscans = 100\nstart = \"first-scan\"\n[[link]]\nname = \"a\"\nbaud = 38400\n",
     );
     let links = ["c=file:/tmp/x?rate=max"];
@@ -69,7 +69,11 @@ fn each_value_has_the_place_where_it_is_said_last() {
         ("link.a.zones.margin", json!(0.05), first.place("6:10")),
         ("link.b.zones.margin", json!(0.01), second.place("2:10")),
         ("link.b.zones.radii", json!([1.2, 0.7]), "--set zones.radii=[1.2,0.7]".to_owned()),
-        ("link.a.zones.self_min", json!([{ "from": 12.5, "to": 30.0, "range": 0.42 }]), second.place("3:12")),
+        (
+            "link.a.zones.self_min",
+            json!([{ "from_deg": -77.5, "to_deg": -60.0, "range": 0.42 }]),
+            second.place("3:12"),
+        ),
         ("link.b.unit", json!("cm"), first.place("11:8")),
         ("link.a.unit", Json::Null, "default".to_owned()),
         ("link.c.port", json!("file:/tmp/x?rate=max"), "--link c=file:/tmp/x?rate=max".to_owned()),
@@ -80,6 +84,7 @@ fn each_value_has_the_place_where_it_is_said_last() {
         ("link.a.background.threshold_mm", Json::Null, "default".to_owned()),
         ("link.a.background.start", json!("first-scan"), second.place("8:9")),
         ("link.a.marks.max_range_step", json!(0.1), "default".to_owned()),
+        ("limits.consumers", json!(32), "default".to_owned()),
         ("gateway.ttl", json!(2), first.place("14:7")),
         ("gateway.to", json!(["10.0.0.7:22200"]), first.place("15:6")),
         ("gateway.mtu", json!(1372), "default".to_owned()),
@@ -89,8 +94,41 @@ fn each_value_has_the_place_where_it_is_said_last() {
 }
 
 #[test]
+fn a_link_shows_the_keys_of_its_own_family() {
+    let said = ["link.front.family=ld", "link.front.model=ld19", "link.front.beams=300"];
+    let values = |set: &[&str]| values(&sources(&[], &LINKS, set)).unwrap();
+    let (all, auto) = (values(&said), values(&said[..1]));
+    for (values, key, value, origin) in [
+        (&all, "link.front.family", json!("ld"), "--set link.front.family=ld"),
+        (&all, "link.front.model", json!("ld19"), "--set link.front.model=ld19"),
+        (&all, "link.front.beams", json!(300), "--set link.front.beams=300"),
+        (&auto, "link.front.model", json!("auto"), "default"),
+        (&auto, "link.front.beams", Json::Null, "default"),
+        (&all, "link.rear.family", json!("lms"), "default"),
+        (&all, "link.rear.baud", json!(500_000), "default"),
+    ] {
+        assert_eq!(shown(values, key), (&value, origin), "{key}");
+    }
+    let lms = ["type", "angle", "resolution", "unit", "mode", "baud"].map(|key| format!("link.front.{key}"));
+    let ld = ["model", "beams"].map(|key| format!("link.rear.{key}"));
+    assert!(all.iter().all(|value| !lms.contains(&value.key) && !ld.contains(&value.key)));
+    let set: Vec<String> = all
+        .iter()
+        .filter(|value| !value.value.is_null())
+        .map(|value| format!("{}={}", value.key, value.text()))
+        .collect();
+    let set: Vec<&str> = set.iter().map(String::as_str).collect();
+    assert_eq!(Config::load(&sources(&[], &LINKS, &set)), Config::load(&sources(&[], &LINKS, &said)));
+}
+
+#[test]
 fn what_is_shown_can_be_set() {
-    let said = ["link.front.zones.self_min=[{from=1,to=2,range=0.4}]", "link.front.unit=cm", "gateway.ttl=3"];
+    let said = [
+        "link.front.zones.self_min=[{from_deg=-1,to_deg=2,range=0.4}]",
+        "link.front.unit=cm",
+        "limits.consumers=200",
+        "gateway.ttl=3",
+    ];
     let of = |set: &[&str]| sources(&[], &LINKS, set);
     let values = values(&of(&said)).unwrap();
     let set: Vec<String> = values

@@ -183,12 +183,13 @@ impl ControlServer {
 
     /// Puts what `asked` wants into the link's queue; the number by which its outcome will be told.
     fn queue(&mut self, asked: &Asked) -> Result<u64, Failure> {
-        let request = asked.request();
-        let verb = request.verb().ok_or_else(|| {
-            let message = format!("request {} is not known to this hub", request.verb);
-            Failure::new(Kind::Failed, message, "client and hub are of different versions")
+        let request =
+            asked.request().and_then(|request| Some((request.sensor, request.verb?, request.model)));
+        let (sensor, verb, model) = request.ok_or_else(|| {
+            let hint = "client and hub are of different versions";
+            Failure::new(Kind::Failed, "the request is not known to this hub", hint)
         })?;
-        self.orders.ask(request.sensor(), verb, Box::new(request.model()))
+        self.orders.ask(&sensor, verb, model.unwrap_or_default())
     }
 
     fn answer(&self, asked: Asked, outcome: Outcome) {

@@ -1,11 +1,14 @@
 //! What is wrong with a link, in words for its status: the session's trouble, a unit that is not the configured one,
 //! more bytes than its line can bring, consumers that get nothing. Refuses to know when a status goes out.
 
-use config::Link;
+use config::{Link, Scanner};
+use line::Session as _;
+use lms::Notice;
 use lms::variant::Unit;
-use lms::{Notice, Session, Trouble};
 use port::Source;
 use schema::{State, Status};
+
+use crate::driver::Driver;
 
 /// What is known to be wrong with one link.
 pub(crate) struct Diagnosis<'a> {
@@ -27,7 +30,20 @@ pub(crate) struct Diagnosis<'a> {
 }
 
 /// What the words are made from.
-type Facts = (State, Option<Trouble>, Option<Unit>, Option<Notice>);
+#[derive(Clone, Copy, PartialEq, Eq)]
+struct Facts {
+    state: State,
+    trouble: Option<Trouble>,
+    unit: Option<Unit>,
+    notice: Option<Notice>,
+}
+
+/// The trouble of a session of any family.
+#[derive(Clone, Copy, PartialEq, Eq)]
+enum Trouble {
+    Lms(lms::Trouble),
+    Ld(ld::Trouble),
+}
 
 impl<'a> Diagnosis<'a> {
     /// Nothing is wrong with `link` yet.
@@ -45,21 +61,29 @@ impl<'a> Diagnosis<'a> {
     }
 
     /// Looks at `session`. The state of the link, and whether anything is new since the last look.
-    pub(crate) fn examine(&mut self, session: &Session) -> (State, bool) {
-        let sensor = session.sensor();
-        let state = if self.is_doubtful(session) { State::Absent } else { state_of(session) };
-        let facts = (state, session.trouble(), sensor.unit, sensor.notices().next());
+    pub(crate) fn examine(&mut self, driver: &Driver) -> (State, bool) {
+        let state = if self.is_doubtful(driver) { State::Absent } else { state_of(driver) };
+        let facts = match driver {
+            Driver::Lms(session) => {
+                let sensor = session.sensor();
+                let trouble = session.trouble().map(Trouble::Lms);
+                Facts { state, trouble, unit: sensor.unit, notice: sensor.notices().next() }
+            }
+            Driver::Ld(session) => {
+                let trouble = session.trouble().map(Trouble::Ld);
+                Facts { state, trouble, unit: None, notice: None }
+            }
+        };
         let is_new = self.facts != Some(facts);
         if is_new {
-            let (.., notice) = facts;
             // What is good to know is no error.
-            if let Some(notice) = notice.filter(|notice| !notice.is_fault())
-                && self.facts.is_none_or(|(.., before)| before != Some(notice))
+            if let Some(notice) = facts.notice.filter(|notice| !notice.is_fault())
+                && self.facts.is_none_or(|before| before.notice != Some(notice))
             {
                 tracing::info!("{}: {notice}", self.link.name);
             }
             self.facts = Some(facts);
-            self.words = self.trouble(session);
+            self.words = self.trouble(driver);
         }
         (state, is_new)
     }
@@ -118,25 +142,33 @@ impl<'a> Diagnosis<'a> {
 
     /// Whether the port may go away again before it brings anything, as it did the last time: a serial server that
     /// serves somebody else takes each connection and closes it.
-    fn is_doubtful(&self, session: &Session) -> bool {
-        let is_silent = session.tally().read == 0 && session.trouble().is_none();
-        !self.doubt.is_empty() && is_silent && session.state() == lms::State::Probing
+    fn is_doubtful(&self, driver: &Driver) -> bool {
+        let has_trouble = match driver {
+            Driver::Lms(session) => session.trouble().is_some(),
+            Driver::Ld(session) => session.trouble().is_some(),
+        };
+        let is_silent = driver.account().read == 0 && !has_trouble;
+        !self.doubt.is_empty() && is_silent && driver.state() == line::State::Probing
     }
 
-    fn trouble(&self, session: &Session) -> String {
-        if self.is_doubtful(session) {
+    fn trouble(&self, driver: &Driver) -> String {
+        if self.is_doubtful(driver) {
             return self.doubt.clone();
         }
         if self.is_flooded {
             return format!(
                 "the server sends more than a line of {} baud carries; the hub reads at most twice that; the serial \
                  server must be in raw mode at that rate",
-                self.link.baud.rate()
+                self.link.rate()
             );
         }
+        let session = match driver {
+            Driver::Lms(session) => session,
+            Driver::Ld(session) => return self.trouble_of_ld(session),
+        };
         let is_server = matches!(self.link.port, Source::Tcp { .. });
         match (session.trouble(), session.sensor().unit, self.link.unit) {
-            (Some(Trouble::NoAnswer { .. }), _, _) if is_server => format!(
+            (Some(lms::Trouble::NoAnswer { .. }), _, _) if is_server => format!(
                 "no answer at {} baud, the rate set in the serial server: check power, cable, rate",
                 self.link.baud.rate()
             ),
@@ -155,6 +187,26 @@ impl<'a> Diagnosis<'a> {
         }
     }
 
+    fn trouble_of_ld(&self, session: &ld::Session) -> String {
+        let needed = session.model().map_or(0, |model| model.beams());
+        match session.trouble() {
+            Some(trouble) => trouble.to_string(),
+            None if session.beams().is_some_and(|beams| beams < needed) && self.is_auto() => format!(
+                "its turns have {needed} points, and there is room for {}: set link.{}.model or link.{}.beams",
+                self.link.beams(),
+                self.link.name,
+                self.link.name
+            ),
+            None if self.unserved_for >= UNSERVED_LIMIT => self.unserved(),
+            None => String::new(),
+        }
+    }
+
+    /// Whether the number of beams is left to the model, and that to be found out.
+    fn is_auto(&self) -> bool {
+        matches!(self.link.scanner, Scanner::Ld { model: None, beams: None })
+    }
+
     fn unserved(&self) -> String {
         let count = self.unserved;
         format!(
@@ -164,14 +216,14 @@ impl<'a> Diagnosis<'a> {
 }
 
 /// The word for how far `session` is.
-fn state_of(session: &Session) -> State {
+fn state_of(session: &Driver) -> State {
     match session.state() {
-        lms::State::Probing => State::Probing,
-        lms::State::Switching => State::Switching,
-        lms::State::Starting => State::Starting,
-        lms::State::Streaming => State::Streaming,
-        lms::State::Silent => State::Silent,
-        lms::State::Paused => State::Paused,
+        line::State::Probing => State::Probing,
+        line::State::Switching => State::Switching,
+        line::State::Starting => State::Starting,
+        line::State::Streaming => State::Streaming,
+        line::State::Silent => State::Silent,
+        line::State::Paused => State::Paused,
     }
 }
 

@@ -1,49 +1,49 @@
 //! Drives a session with a sensor on an open port, until that is gone. The way of a scan, from the line
 //! to whoever sleeps for it, is here:
 //!
-//! - **read**: [`Driver::turn`] reads into the session's buffer once the port is ready;
-//! - **frame**: [`Driver::drain`] asks the session what the bytes are, and gets a telegram in that buffer, decoded once;
+//! - **read**: [`Drive::turn`] reads into the session's buffer once the port is ready;
+//! - **frame**: [`Drive::drain`] asks the session what the bytes are, and gets a telegram in that buffer, decoded once;
 //! - **loan**, **decode**, **process**, **send**: [`LinkOutput::process`](crate::process_telegram::LinkOutput::process)
 //!   sends the telegram, then takes loans of shared memory, writes the scan and what the processors make of it in place, and
 //!   sends them (`topics.rs`, `pipeline.rs`);
-//! - **ring**: [`LinkCore::publish`] wakes the consumers, once a telegram.
+//! - **ring**: [`LinkCore::publish`] wakes the consumers, once a telegram: those of telegram, scan and zones before marks and
+//!   foreground are made.
 //!
 //! Nothing on this way allocates, locks or logs. Refuses to know how the port came to be open.
 
 use std::io;
 
-use lms::framer::suspect;
-use lms::session::Output;
-use lms::variant::Baud;
-use lms::{Identity, Nanos, Session};
+use line::{Nanos, Output, Session as _, suspect};
+use lms::Identity;
 use port::{Allowance, LineErrors, Source};
 use schema::State;
 
 use crate::backlog::Backlog;
 use crate::control::Flow;
+use crate::driver::{Driver, Heard};
 use crate::identity_cache::IdentityCache;
 use crate::link::LinkCore;
 use crate::surroundings::{Learned, Line, On, Surroundings, Woken};
 
 /// What outlives a session on a port, for the next one.
-pub(crate) struct Driver<'a, S: Surroundings> {
+pub(crate) struct Drive<'a, S: Surroundings> {
     /// What the next hub would like to know.
     identity: IdentityCache<'a, S>,
     /// Rates that the port cannot have, as was said.
-    refused: Vec<Baud>,
+    refused: Vec<u32>,
     line_errors: LineErrors,
     /// When something was read last that had waited in the port for an unknown time.
     behind_at: Option<Nanos>,
     /// When the next scan has to be here to follow the last one without a silence, by the stamps of scans.
     follows_by: Nanos,
     /// Where the sensor was found the last time that it had to be sought.
-    found: Option<Baud>,
+    found: Option<u32>,
 }
 
 /// A session on an open line, and what it waits for.
 pub(crate) struct Open<L> {
     pub(crate) line: L,
-    pub(crate) session: Session,
+    pub(crate) session: Driver,
     /// What may be read; nothing where all may.
     allowance: Option<Allowance>,
     /// What waited in the port when it was opened, until all of it was read.
@@ -58,7 +58,7 @@ pub(crate) struct Open<L> {
 
 impl<L: Line> Open<L> {
     /// `session` on `line`, which was opened at `now`; at its nominal `baud` it brings no more than twice that.
-    pub(crate) fn new(line: L, session: Session, baud: u32, now: Nanos) -> Open<L> {
+    pub(crate) fn new(line: L, session: Driver, baud: u32, now: Nanos) -> Open<L> {
         let allowance = line.allowance(baud);
         let backlog = Backlog::new(line.waiting().unwrap_or(0), now);
         Open { line, session, allowance, backlog, watch: true, until: 0, rest: None }
@@ -72,10 +72,10 @@ impl<L: Line> Open<L> {
     }
 }
 
-impl<'a, S: Surroundings> Driver<'a, S> {
+impl<'a, S: Surroundings> Drive<'a, S> {
     /// For the port of `core`.
-    pub(crate) fn new(core: &LinkCore<'a, S>) -> Driver<'a, S> {
-        Driver {
+    pub(crate) fn new(core: &LinkCore<'a, S>) -> Drive<'a, S> {
+        Drive {
             identity: IdentityCache::new(core.around, &core.link.name, core.link.port.name()),
             refused: Vec::new(),
             line_errors: LineErrors::default(),
@@ -97,9 +97,8 @@ impl<'a, S: Surroundings> Driver<'a, S> {
     }
 
     /// The rate to begin with where the sensor of `core` has to be sought.
-    pub(crate) fn last_rate(&self, core: &LinkCore<'a, S>) -> Option<Baud> {
+    pub(crate) fn last_rate(&self, core: &LinkCore<'a, S>) -> Option<u32> {
         let kept = || rates(core)?.rate(&core.link.port.name());
-        let kept = || Baud::ALL.into_iter().find(|baud| Some(baud.rate()) == kept());
         self.found.or_else(kept).filter(|_| is_tty(core))
     }
 
@@ -142,7 +141,7 @@ impl<'a, S: Surroundings> Driver<'a, S> {
         let now = around.now();
         session.commit(now, len);
         if let Some(waited) = backlog {
-            if waited.take(len, session.baud().rate(), now) {
+            if waited.take(len, session.rate(), now) {
                 self.behind_at = Some(now);
             } else {
                 *backlog = None;
@@ -167,7 +166,7 @@ impl<'a, S: Surroundings> Driver<'a, S> {
         let mut published = false;
         (open.watch, open.until) = loop {
             match session.poll_output() {
-                Output::SetBaud(baud) => {
+                Output::SetRate(baud) => {
                     self.set_baud(core, line, baud)?;
                     // What waited is discarded.
                     open.backlog = None;
@@ -177,7 +176,7 @@ impl<'a, S: Surroundings> Driver<'a, S> {
                     line.write(byte)?;
                     session.transmitted(around.now());
                 }
-                Output::Telegram(mut received) => {
+                Output::Heard(Heard::Lms(mut received)) => {
                     let counted = line.line_errors();
                     core.stats.line_errors += counted;
                     let is_hit = self.line_errors.note(counted);
@@ -195,6 +194,25 @@ impl<'a, S: Surroundings> Driver<'a, S> {
                     }
                     published = true;
                 }
+                Output::Heard(Heard::Ld(ld::Heard::Packets(mut received))) => {
+                    let counted = line.line_errors();
+                    core.stats.line_errors += counted;
+                    let is_hit = self.line_errors.note(counted);
+                    received.estimated |= self.behind_at.is_some_and(|at| received.last <= at);
+                    received.reasons |= if is_hit { suspect::LINE_ERROR } else { 0 };
+                    core.publish_packets(&received);
+                    published = true;
+                }
+                Output::Heard(Heard::Ld(ld::Heard::Turn(turn))) => {
+                    let is_behind = self.behind_at.is_some_and(|at| turn.last <= at);
+                    if !is_behind && turn.last > self.follows_by {
+                        core.output.learn_silence();
+                    }
+                    if let Some(limit) = core.publish_turn(&turn, is_behind) {
+                        self.follows_by = if is_behind { 0 } else { turn.last.saturating_add(limit) };
+                    }
+                    published = true;
+                }
                 Output::Rest(until) => break (false, until),
                 Output::Wait { until, .. } => break (true, until),
             }
@@ -206,7 +224,7 @@ impl<'a, S: Surroundings> Driver<'a, S> {
         let (state, is_new) = core.diagnosis.examine(session);
         if is_new && let Some(found) = session.found_at() {
             self.found = Some(found);
-            rates(core).iter().for_each(|rates| rates.keep_rate(&core.link.port.name(), found.rate()));
+            rates(core).iter().for_each(|rates| rates.keep_rate(&core.link.port.name(), found));
         }
         if (is_new || core.is_due(around.now())) && core.show_session(session, state) {
             self.identity.keep(session, around.now());
@@ -219,8 +237,8 @@ impl<'a, S: Surroundings> Driver<'a, S> {
     }
 
     /// The sensor is looked for at those rates that the port can have; of another one it is said once that it cannot.
-    fn set_baud(&mut self, core: &LinkCore<'a, S>, line: &S::Line, baud: Baud) -> io::Result<()> {
-        if let Some(error) = line.set_baud(baud.rate())?
+    fn set_baud(&mut self, core: &LinkCore<'a, S>, line: &S::Line, baud: u32) -> io::Result<()> {
+        if let Some(error) = line.set_baud(baud)?
             && !self.refused.contains(&baud)
         {
             self.refused.push(baud);

@@ -3,8 +3,9 @@
 //! once a second while the sensor streams. Refuses to know what of a sensor is worth to be known, where the record lies, and
 //! whether the line was its own all the while.
 
-use lms::{Identity, MILLIS, Nanos, Session};
+use lms::{Identity, MILLIS, Nanos};
 
+use crate::driver::Driver;
 use crate::surroundings::Surroundings;
 
 /// The identity of the sensor of one link.
@@ -34,14 +35,14 @@ impl<'a, S: Surroundings> IdentityCache<'a, S> {
     }
 
     /// Keeps what `session` knows `now`, if that is worth it.
-    pub(crate) fn keep(&mut self, session: &Session, now: Nanos) {
+    pub(crate) fn keep(&mut self, session: &Driver, now: Nanos) {
         if let Some(identity) = session.identity() {
             self.write(identity, now);
         }
     }
 
     /// As soon as anything is known; then [`keep`](Self::keep) keeps it new.
-    pub(crate) fn keep_first(&mut self, session: &Session) {
+    pub(crate) fn keep_first(&mut self, session: &Driver) {
         if self.identity.is_none() {
             self.keep(session, self.around.now());
         }

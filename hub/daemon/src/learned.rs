@@ -84,7 +84,7 @@ pub struct Slots {
 struct Slot {
     sensor: String,
     /// The last one that was not taken.
-    model: Mutex<Option<(Pose, Background)>>,
+    model: Mutex<Option<(Pose, Box<Background>)>>,
     /// 0 if none is kept.
     kept_wall_ns: AtomicU64,
     /// Rate and port, and whether that is to be written.
@@ -104,7 +104,7 @@ struct Written {
     /// The generation that was written last, by this hub.
     generation: Option<u32>,
     /// What is to be written, and not before then.
-    waiting: Option<(Pose, Background)>,
+    waiting: Option<(Pose, Box<Background>)>,
     due: Nanos,
     /// That it cannot be written was said.
     is_told: bool,
@@ -172,7 +172,7 @@ impl Slots {
 }
 
 impl Learned for Handle<'_> {
-    fn keep_background(&self, pose: Pose, model: Background) {
+    fn keep_background(&self, pose: Pose, model: Box<Background>) {
         *held(&self.slot.model) = Some((pose, model));
         self.slots.event.signal();
     }
@@ -212,7 +212,7 @@ impl Slot {
             let is_forgotten = was_kept || model.generation > 0;
             return if is_forgotten { files.remove(&file) } else { Ok(()) };
         }
-        let text = KeptBackground { model: *model, pose, wall_ns }.text(&self.sensor)?;
+        let text = KeptBackground { model: model.boxed(), pose, wall_ns }.text(&self.sensor)?;
         files.write(&file, &text)?;
         self.kept_wall_ns.store(wall_ns, Ordering::Relaxed);
         Ok(())
@@ -252,12 +252,12 @@ fn recall(link: &mut Link, files: &impl Files, now_wall_ns: u64) -> u64 {
     match KeptBackground::read(&text, &files.place(&file), link) {
         Ok(KeptBackground { model, wall_ns, .. }) => {
             let age = Age(Duration::from_nanos(now_wall_ns.saturating_sub(wall_ns)));
-            let Background { taught, count, .. } = model;
+            let (taught, count) = (model.taught, model.count);
             tracing::info!(
                 "{}: starts with the background saved {age} ago, {taught} of {count} beams known",
                 link.name
             );
-            link.processing.background.model = Some(Box::new(model));
+            link.processing.background.model = Some(model);
             wall_ns
         }
         Err(why) => {

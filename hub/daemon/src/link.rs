@@ -2,13 +2,15 @@
 //! when it has to do something although nothing came. Refuses to know where bytes come from, and how a wait is done.
 
 use config::{Link, Processing};
+use line::Control;
 use lms::session::Received;
-use lms::{Control, MILLIS, Nanos, Session, Settings};
+use lms::{MILLIS, Nanos};
 use port::Source;
 use schema::{Failure, Shown, State, Verb, Wake};
 
 use crate::control::{ControlQueue, Flow};
 use crate::diagnosis::Diagnosis;
+use crate::driver::Driver;
 use crate::link_stats::LinkStats;
 use crate::process_telegram::{LinkOutput, RecordedContext};
 use crate::surroundings::{Learned, Surroundings, Woken};
@@ -67,7 +69,7 @@ impl<'a, S: Surroundings> LinkCore<'a, S> {
     }
 
     /// The `session` on the port is over.
-    pub(crate) fn close(&mut self, session: &Session) {
+    pub(crate) fn close(&mut self, session: &Driver) {
         self.diagnosis.end_flood();
         self.stats.close(session);
     }
@@ -75,12 +77,6 @@ impl<'a, S: Surroundings> LinkCore<'a, S> {
     /// Whether the other end is a recording, to which nobody talks.
     pub(crate) fn is_recording(&self) -> bool {
         matches!(self.link.port, Source::File { .. })
-    }
-
-    /// How a session with this link's sensor goes, or with a recording of one to which nobody talks.
-    pub(crate) fn settings(&self, listen_only: bool) -> Settings {
-        let fixed_rate = matches!(self.link.port, Source::Tcp { .. });
-        Settings { variant: self.link.variant, baud: self.link.baud, listen_only, fixed_rate }
     }
 
     /// What is known beside the sensor: nothing of one that can be asked.
@@ -103,6 +99,21 @@ impl<'a, S: Surroundings> LinkCore<'a, S> {
         processed.stands_for
     }
 
+    /// Publishes packets of a scanner whose head turns, and wakes the consumers.
+    pub(crate) fn publish_packets(&mut self, received: &line::Received<'_, ld::Packets>) {
+        let processed = self.output.process_packets(received);
+        self.output.topics.wake(Wake::Telegram);
+        self.stats.note(processed);
+    }
+
+    /// Publishes what is made of `turn`, and wakes the consumers. For how long the verdict on it stands.
+    pub(crate) fn publish_turn(&mut self, turn: &ld::Turn<'_>, is_behind: bool) -> Option<Nanos> {
+        let processed = self.output.process_turn(turn, is_behind);
+        self.output.topics.wake(Wake::Telegram);
+        self.stats.note(processed);
+        processed.stands_for
+    }
+
     /// When a status goes out without news.
     pub(crate) fn next_status(&self) -> Nanos {
         self.next_status
@@ -115,20 +126,20 @@ impl<'a, S: Surroundings> LinkCore<'a, S> {
 
     /// Publishes the status if it changed or is due, and greets late joiners; `error` is what is wrong, in words. Whether a
     /// status went out.
-    pub(crate) fn show(&mut self, session: Option<&Session>, state: State, error: &str) -> bool {
+    pub(crate) fn show(&mut self, session: Option<&Driver>, state: State, error: &str) -> bool {
         let now = self.around.now();
         let changed = update(&mut self.stats, self.link, state, error, now);
         self.publish_status(session, state, changed, now)
     }
 
     /// As [`show`](Self::show), of a `session` that was examined: what is wrong is for [`Diagnosis`] to say.
-    pub(crate) fn show_session(&mut self, session: &Session, state: State) -> bool {
+    pub(crate) fn show_session(&mut self, session: &Driver, state: State) -> bool {
         let now = self.around.now();
         let changed = update(&mut self.stats, self.link, state, self.diagnosis.explanation(), now);
         self.publish_status(Some(session), state, changed, now)
     }
 
-    fn publish_status(&mut self, session: Option<&Session>, state: State, changed: bool, now: Nanos) -> bool {
+    fn publish_status(&mut self, session: Option<&Driver>, state: State, changed: bool, now: Nanos) -> bool {
         let is_due = changed || now >= self.next_status;
         if is_due {
             self.next_status = now + STATUS_PERIOD;
@@ -202,7 +213,7 @@ impl<'a, S: Surroundings> LinkCore<'a, S> {
                 None => {
                     let shown = self.output.handle(request.verb, &request.model);
                     let kept_wall_ns = self.around.learned().and_then(Learned::kept_wall_ns);
-                    shown.map(|model| model.map(|model| Box::new(Shown { model: *model, kept_wall_ns })))
+                    shown.map(|model| model.map(|model| Box::new(Shown { model, kept_wall_ns })))
                 }
             };
             self.output.publish_background(now);

@@ -1,13 +1,15 @@
 //! What a link reports of itself: the state of a session and the hub's own counts as the payload of topic `status`.
 
 use config::Link;
+use line::Session as _;
+use lms::Nanos;
 use lms::header::Reject;
 use lms::reply::Reply;
 use lms::telegram::Telegram;
 use lms::variant::{Mode, Variant};
-use lms::{Nanos, Session};
 use schema::{Counter, Counters, Pose, State, Status};
 
+use crate::driver::Driver;
 use crate::process_telegram::Processed;
 use crate::recent::Recent;
 
@@ -65,7 +67,7 @@ impl LinkStats {
     }
 
     /// The status with everything that `session`, if there is one, knows.
-    pub(crate) fn status(&mut self, session: Option<&Session>, loan_failed: u64, now: Nanos) -> &Status {
+    pub(crate) fn status(&mut self, session: Option<&Driver>, loan_failed: u64, now: Nanos) -> &Status {
         let mut counters = self.past;
         match session {
             Some(session) => {
@@ -134,17 +136,21 @@ impl LinkStats {
     }
 
     /// The session is over: its counters stay.
-    pub(crate) fn close(&mut self, session: &Session) {
+    pub(crate) fn close(&mut self, session: &Driver) {
         self.describe(session);
         add(&mut self.past, session);
-        self.past[Counter::BytesDiscarded] += session.buffered() as u64;
+        self.past[Counter::BytesDiscarded] += session.account().buffered;
         self.past[Counter::BytesBuffered] = 0;
     }
 
-    fn describe(&mut self, session: &Session) {
-        let sensor = session.sensor();
+    fn describe(&mut self, driver: &Driver) {
         let known_rate = matches!(self.status.state(), Some(State::Streaming | State::Starting));
-        self.status.baud = if known_rate { session.baud().rate() } else { 0 };
+        self.status.baud = if known_rate { driver.rate() } else { 0 };
+        let session = match driver {
+            Driver::Lms(session) => session,
+            Driver::Ld(session) => return self.describe_ld(session),
+        };
+        let sensor = session.sensor();
         self.status.mode = sensor.mode.or(self.mode).map_or(Status::MODE_UNKNOWN, |mode| mode.0);
         self.status.unit_mm = sensor.unit.map_or(0, |unit| unit.mm());
         let Variant { angle_deg, resolution_cdeg } =
@@ -153,22 +159,38 @@ impl LinkStats {
         self.status.resolution_cdeg = resolution_cdeg;
         self.status.set_sensor_type(&String::from_utf8_lossy(sensor.kind()));
     }
+
+    fn describe_ld(&mut self, session: &ld::Session) {
+        let Some((model, beams)) = session.model().zip(session.beams()) else { return };
+        self.status.unit_mm = 1;
+        self.status.angle_deg = 360;
+        self.status.resolution_cdeg = (36_000.0 / beams as f64).round() as u16;
+        self.status.set_sensor_type(&model.name().to_uppercase());
+    }
 }
 
-fn add(counters: &mut Counters, session: &Session) {
+fn add(counters: &mut Counters, driver: &Driver) {
+    let account = driver.account();
+    counters[Counter::BytesRead] += account.read;
+    counters[Counter::BytesInTelegrams] += account.in_telegrams;
+    counters[Counter::BytesAcknowledge] += account.acknowledge;
+    counters[Counter::BytesDiscarded] += account.discarded;
+    counters[Counter::BytesBuffered] = account.buffered;
+    counters[Counter::Telegrams] += account.telegrams;
+    counters[Counter::Resyncs] += account.resyncs;
+    counters[Counter::BytesDamaged] += account.damaged;
+    counters[Counter::DueOnLine] += account.due;
+    counters[Counter::LostOnLine] += account.lost;
+    counters[Counter::LostInRestart] += u64::from(account.began_with_a_cut);
+    let session = match driver {
+        Driver::Lms(session) => session,
+        Driver::Ld(session) => {
+            counters[Counter::RejectedCrc] += session.tally().rejected_checksum;
+            return;
+        }
+    };
     let tally = session.tally();
-    counters[Counter::BytesRead] += tally.read;
-    counters[Counter::BytesInTelegrams] += tally.in_telegrams;
-    counters[Counter::BytesAcknowledge] += tally.acknowledge;
-    counters[Counter::BytesDiscarded] += tally.discarded;
-    counters[Counter::BytesBuffered] = session.buffered() as u64;
-    counters[Counter::Telegrams] += tally.telegrams;
     counters[Counter::Aborted] += tally.aborted;
-    counters[Counter::Resyncs] += session.resyncs();
-    counters[Counter::BytesDamaged] += session.bytes_damaged();
-    counters[Counter::DueOnLine] += session.scans_due();
-    counters[Counter::LostOnLine] += session.scans_lost();
-    counters[Counter::LostInRestart] += u64::from(session.began_with_a_cut());
     for (reject, counter) in REJECTS {
         counters[counter] += tally.rejected[reject as usize];
     }

@@ -2,6 +2,7 @@
 //! segment of its own. A sparse segment that finds /dev/shm full would kill the hub later.
 
 use config::needs;
+use schema::limits::TopicLimits;
 use schema::{Failure, Kind, shortage};
 
 /// Lets the process have as many descriptors as its hard limit allows.
@@ -11,12 +12,14 @@ pub(crate) fn raise_descriptor_limit() {
     }
 }
 
-/// Whether /dev/shm has room for `links` links and the first consumers, and the process may map it beside its threads.
+/// Whether /dev/shm has room for links with topics made as `limits` say of each and the first consumers, and the process may
+/// map it beside its threads.
 ///
 /// [`Kind::Short`](schema::Kind) with what is free and what is needed.
-pub(crate) fn check_memory(links: usize) -> Result<(), Failure> {
-    shortage::check_address_space(needs::memory(links) + links as u64 * THREAD)?;
-    shortage::check_memory(needs::memory(links))
+pub(crate) fn check_memory(limits: &[TopicLimits]) -> Result<(), Failure> {
+    let needed = needs::memory(limits);
+    shortage::check_address_space(needed + limits.len() as u64 * THREAD)?;
+    shortage::check_memory(needed, needs::longest_segment(limits))
 }
 
 /// Whether `links` links, and a first consumer of each, have descriptors enough.
@@ -40,8 +43,9 @@ mod tests {
 
     #[test]
     fn more_links_than_memory_are_refused() {
-        assert!(check_memory(2).is_ok());
-        let failure = check_memory(1 << 40).unwrap_err();
+        assert!(check_memory(&[TopicLimits::default(); 2]).is_ok());
+        let huge = TopicLimits { telegram: 1 << 50, ..TopicLimits::default() };
+        let failure = check_memory(&[huge]).unwrap_err();
         assert_eq!(failure.kind, Kind::Short);
         assert!(failure.message.contains("kB needed"), "{failure}");
     }

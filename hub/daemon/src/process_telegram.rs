@@ -53,7 +53,7 @@ pub(crate) struct LinkOutput<'a, S: Surroundings> {
 impl<'a, S: Surroundings> LinkOutput<'a, S> {
     /// The output of `link` into `topics`; nothing is published yet.
     pub(crate) fn new(link: &'a Link, around: &'a S, topics: Topics<'a, S>) -> Self {
-        let pipeline = Pipeline::new(&link.processing);
+        let pipeline = Pipeline::new(&link.processing, link.beams());
         LinkOutput { link, around, topics, pipeline, stale_at: Nanos::MAX, is_blind: false }
     }
 
@@ -65,14 +65,14 @@ impl<'a, S: Surroundings> LinkOutput<'a, S> {
         recorded: &RecordedContext,
         is_behind: bool,
     ) -> Processed {
-        let measured = match received.reply {
+        let measured = match received.message.reply {
             Some(Reply::Measured(measured)) => Some(measured),
             _ => None,
         };
-        let mode = received.mode.or(recorded.mode).filter(|mode| mode.has_ranges());
+        let mode = received.message.mode.or(recorded.mode).filter(|mode| mode.has_ranges());
         let forbidden =
             measured.zip(mode).is_some_and(|(measured, mode)| scanner::is_forbidden(&measured, mode));
-        let reasons = received.reasons | if forbidden { lms::framer::suspect::FORBIDDEN_BITS } else { 0 };
+        let reasons = received.reasons | if forbidden { line::suspect::FORBIDDEN_BITS } else { 0 };
         let variant = measured.and_then(|measured| Variant::of_beams(measured.count()));
         let nominal = || scanner::period_us(variant, self.link.baud.rate());
         let period_us = recorded.period_us.unwrap_or_else(nominal).max(recorded.gap_us);
@@ -88,10 +88,24 @@ impl<'a, S: Surroundings> LinkOutput<'a, S> {
             return Processed { is_suspect, stands_for: None };
         };
         let decode = |scan: &mut Scan| scanner::decode(&measured, mode, scan);
-        let limit = limit(period_us);
+        let stands_for = limit(period_us);
+        self.publish_scan(measured.count(), scanner::len(&measured), decode, stands_for, is_behind);
+        Processed { is_suspect, stands_for: Some(stands_for) }
+    }
+
+    /// Publishes the scan of `beams` beams and `len` bytes that `decode` writes, and what is made of it. The verdict on it
+    /// stands for `stands_for`; of one that `is_behind`, it is not known.
+    pub(crate) fn publish_scan(
+        &mut self,
+        beams: usize,
+        len: usize,
+        decode: impl FnOnce(&mut Scan),
+        stands_for: Nanos,
+        is_behind: bool,
+    ) {
         // What waited in the port does not tell how it looks around the robot now.
         self.pipeline.zones.doubt(is_behind);
-        if let Some(reason) = self.topics.scan(decode, &mut self.pipeline) {
+        if let Some(reason) = self.topics.scan(beams, len, decode, &mut self.pipeline) {
             tracing::warn!("{}: the background is learned again: {reason}", self.link.name);
         }
         let is_blind = self.pipeline.zones.is_blind();
@@ -99,8 +113,7 @@ impl<'a, S: Surroundings> LinkOutput<'a, S> {
             tracing::warn!("{}: zones unknown: too few beams see into the largest circle", self.link.name);
         }
         // Telegrams that had to wait for the hub are late, but scans do not stay out.
-        self.stale_at = self.around.now().saturating_add(limit);
-        Processed { is_suspect, stands_for: Some(limit) }
+        self.stale_at = self.around.now().saturating_add(stands_for);
     }
 
     /// Takes loans for a telegram that will be complete in a moment, so that it need not wait for them.
@@ -112,7 +125,8 @@ impl<'a, S: Surroundings> LinkOutput<'a, S> {
     pub(crate) fn learn(&mut self, reply: Option<&Reply<'_>>, mode: Option<Mode>) {
         let Some(mode) = mode.filter(|mode| mode.has_ranges()) else { return };
         if let Some(Reply::Measured(measured)) = reply {
-            self.topics.learn(|scan| scanner::decode(measured, mode, scan), &mut self.pipeline);
+            let decode = |scan: &mut Scan| scanner::decode(measured, mode, scan);
+            self.topics.learn(scanner::len(measured), decode, &mut self.pipeline);
         }
     }
 
@@ -195,7 +209,7 @@ impl<'a, S: Surroundings> LinkOutput<'a, S> {
     }
 
     /// The model for the next hub, if that is news; if this is the `last` time, whatever there is.
-    pub(crate) fn hand_on(&mut self, last: bool) -> Option<(Pose, Background)> {
+    pub(crate) fn hand_on(&mut self, last: bool) -> Option<(Pose, Box<Background>)> {
         self.pipeline.hand_on(last)
     }
 }

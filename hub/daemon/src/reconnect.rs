@@ -3,19 +3,21 @@
 
 use std::io;
 
-use lms::{Control, Identity, MILLIS, Nanos, Session};
+use line::{Control, Session as _};
+use lms::{Identity, MILLIS, Nanos};
 use port::{PortError, Source};
 use schema::{Failure, Flags, Kind, State};
 
 use crate::control::{ControlQueue, Flow};
-use crate::drive::{Driver, Open};
+use crate::drive::{Drive, Open};
+use crate::driver::Driver;
 use crate::link::LinkCore;
 use crate::surroundings::{Line, On, Surroundings, Wait, Woken};
 
 /// A link whose other end is a port that comes and goes: told why a wait is over, it says for what to wait next.
 pub struct LiveLink<'a, S: Surroundings> {
     core: LinkCore<'a, S>,
-    driver: Driver<'a, S>,
+    drive: Drive<'a, S>,
     phase: Phase<S::Line>,
     /// Times in a row that the port was there and went without a byte.
     futile: u32,
@@ -49,10 +51,10 @@ impl<'a, S: Surroundings> LiveLink<'a, S> {
     ) -> Result<Self, Failure> {
         let mut core = LinkCore::new(link, number, boot, around, control)?;
         core.begin();
-        let driver = Driver::new(&core);
-        let known = driver.recall(around.now());
+        let drive = Drive::new(&core);
+        let known = drive.recall(around.now());
         let mut live =
-            LiveLink { core, driver, phase: Phase::away(Away::default(), 0), futile: 0, has_begun: false };
+            LiveLink { core, drive, phase: Phase::away(Away::default(), 0), futile: 0, has_begun: false };
         match live.first_line() {
             Ok(Some((line, is_kept))) => {
                 // On a line that was closed meanwhile it may be another sensor, or the same in another mode.
@@ -85,7 +87,7 @@ impl<'a, S: Surroundings> LiveLink<'a, S> {
         } else if self.core.is_over(woken, until) {
             match &mut self.phase {
                 Phase::Open(open) => {
-                    if let Err(error) = self.driver.turn(&mut self.core, open, woken) {
+                    if let Err(error) = self.drive.turn(&mut self.core, open, woken) {
                         self.lose(&error);
                     }
                 }
@@ -117,7 +119,7 @@ impl<'a, S: Surroundings> LiveLink<'a, S> {
     /// nothing if a connection has to be made.
     fn first_line(&self) -> Result<Option<(S::Line, bool)>, Failure> {
         let (link, around) = (self.core.link, self.core.around);
-        let (name, source, baud) = (&link.name, &link.port, link.baud.rate());
+        let (name, source, baud) = (&link.name, &link.port, link.rate());
         if let Source::Tcp { .. } = source {
             return Ok(None);
         }
@@ -136,7 +138,7 @@ impl<'a, S: Surroundings> LiveLink<'a, S> {
     fn reach(&mut self) {
         let (link, around) = (self.core.link, self.core.around);
         let mut away = self.phase.take_away();
-        match around.open(&link.port, link.baud.rate()) {
+        match around.open(&link.port, link.rate()) {
             Some(Ok(line)) => {
                 self.open(line, None);
                 self.begin();
@@ -155,23 +157,23 @@ impl<'a, S: Surroundings> LiveLink<'a, S> {
         let now = core.around.now();
         core.around.keep(&core.link.name, &line);
         core.output.topics.set_flags(if line.is_simulated() { Flags::SIMULATED } else { 0 });
-        let mut session = Session::new(core.settings(core.is_recording()), now);
+        let mut session = Driver::new(core.link, core.is_recording(), now);
         if let Some(known) = known {
             session.recall(known);
         }
-        if let Some(baud) = self.driver.last_rate(core) {
-            session.seek_first(baud);
+        if let Some(rate) = self.drive.last_rate(core) {
+            session.seek_first(rate);
         }
         if core.control.is_paused() {
             session.control(Control::Pause, now);
         }
-        self.phase = Phase::Open(Box::new(Open::new(line, session, core.link.baud.rate(), now)));
+        self.phase = Phase::Open(Box::new(Open::new(line, session, core.link.rate(), now)));
     }
 
     /// A session begins, if there is a line.
     fn begin(&mut self) {
         if let Phase::Open(open) = &mut self.phase
-            && let Err(error) = self.driver.begin(&mut self.core, open)
+            && let Err(error) = self.drive.begin(&mut self.core, open)
         {
             self.lose(&error);
         }
@@ -184,7 +186,7 @@ impl<'a, S: Surroundings> LiveLink<'a, S> {
             return;
         };
         self.core.close(&open.session);
-        let heard = open.session.tally().read > 0;
+        let heard = open.session.account().read > 0;
         // Before the port is looked for: it could not be opened while this holds it.
         drop(open);
         self.core.around.release(&self.core.link.name);

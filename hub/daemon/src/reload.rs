@@ -1,7 +1,7 @@
 //! The configuration read again while the hub runs: what is made of scans changes with the next scan, and nothing of the
 //! stream is lost for it; what belongs to a line waits for the next start, which is said. One that cannot be changes nothing.
 
-use config::{Background, Config, Link, Processing};
+use config::{Background, Config, Link, Processing, Scanner};
 use lms::Nanos;
 use schema::Failure;
 
@@ -83,6 +83,9 @@ impl Differences {
             }
         }
         let added = read.links.iter().filter(|link| named(running, &link.name).is_none());
+        if running.limits != read.limits {
+            differences.later.push(("limits".to_owned(), vec!["consumers"]));
+        }
         differences.later.extend(added.map(|link| (link.name.clone(), vec!["link added"])));
         differences
     }
@@ -100,9 +103,20 @@ impl Differences {
             let background = &link.processing.background;
             (background.learning.start, background.file.clone())
         };
+        let model = |link: &Link| match link.scanner {
+            Scanner::Lms => None,
+            Scanner::Ld { model, .. } => model,
+        };
+        let beams = |link: &Link| match link.scanner {
+            Scanner::Lms => None,
+            Scanner::Ld { beams, .. } => beams,
+        };
         let is_begun = before.background.is_kept && new.processing.background.is_kept;
         let waiting = of_others([
             ("port", old.port != new.port),
+            ("family", old.family() != new.family()),
+            ("model", model(old) != model(new)),
+            ("beams", beams(old) != beams(new)),
             ("type", old.family != new.family),
             ("angle", old.variant.angle_deg != new.variant.angle_deg),
             ("resolution", old.variant.resolution_cdeg != new.variant.resolution_cdeg),
@@ -150,6 +164,20 @@ mod tests {
     }
 
     #[test]
+    fn which_scanner_it_is_changes_at_the_next_start() {
+        let of = |set: &[&str]| config(&["a=/dev/x"], set);
+        let (lms, auto) = (of(&[]), of(&["link.a.family=ld"]));
+        let named = of(&["link.a.family=ld", "link.a.model=ld19", "link.a.beams=300"]);
+        for (old, new, what) in
+            [(&lms, &auto, "family"), (&auto, &named, "model beams"), (&named, &lms, "family model beams")]
+        {
+            let Differences { now, later } = Differences::between(old, new);
+            let later: Vec<_> = later.iter().map(|(name, what)| (name.as_str(), what.join(" "))).collect();
+            assert_eq!((now.len(), later), (0, vec![("a", what.to_owned())]));
+        }
+    }
+
+    #[test]
     fn what_is_made_of_scans_changes_now_and_lines_at_the_next_start() {
         let old = config(&["a=/dev/x", "b=/dev/y", "c=/dev/z"], &[]);
         let same = Differences::between(&old, &old);
@@ -165,6 +193,7 @@ mod tests {
                 "link.b.unit=cm",
                 "link.b.baud=38400",
                 "link.b.type=lms200",
+                "limits.consumers=33",
             ],
         );
         let Differences { now, later } = Differences::between(&old, &new);
@@ -179,6 +208,7 @@ mod tests {
             [
                 ("b", "port type angle resolution unit baud".to_owned()),
                 ("c", "link removed".to_owned()),
+                ("limits", "consumers".to_owned()),
                 ("d", "link added".to_owned()),
             ]
         );

@@ -10,11 +10,12 @@ use std::path::Path;
 
 use lms::reply::Reply;
 use lms::variant::Variant;
-use lms::{MILLIS, Nanos, Session};
+use lms::{MILLIS, Nanos};
 use port::clock;
 use schema::{Failure, Flags, State};
 
 use crate::control::Flow;
+use crate::driver::Driver;
 use crate::link::LinkCore;
 use crate::player::{Due, Pace, Play, Player, PlayerHandle, Turn};
 use crate::surroundings::Woken;
@@ -136,7 +137,7 @@ impl<'a, 'p> ReplayLink<'a, 'p> {
     }
 
     /// Waits for the turn of what is of `media`; meanwhile the link's state is `state`. Nothing if the hub shall end.
-    fn wait_turn(&mut self, session: Option<&Session>, media: Nanos, state: State) -> Option<Due> {
+    fn wait_turn(&mut self, session: Option<&Driver>, media: Nanos, state: State) -> Option<Due> {
         loop {
             let now = clock::now();
             if self.handle.flows() && now < self.look_at {

@@ -94,7 +94,7 @@ pub(crate) fn serve(
     // What is known of sensors is no recording's.
     let state = StateDirectory::of_domain(domain.name()).filter(|_| set.is_none());
     preflight::check_descriptors(config.links.len())?;
-    preflight::check_memory(config.links.len())?;
+    preflight::check_memory(&config.topic_limits())?;
     // Ends after the links: it writes what they had learned last.
     let (config, keeper) = begin(config, state)?;
     let writer = keeper.map(Writer::start).transpose()?;
@@ -121,7 +121,13 @@ pub(crate) fn serve(
         let (report, reports) = mpsc::channel();
         let mut threads = Vec::new();
         for ((number, link), queue) in config.links.iter().enumerate().zip(queues) {
-            let hub = Hub { node: &node, stop: &stop, service: &service, root: domain.root() };
+            let hub = Hub {
+                node: &node,
+                limits: link.limits(&config.limits),
+                stop: &stop,
+                service: &service,
+                root: domain.root(),
+            };
             let (report, worked) = (report.clone(), &worked[number]);
             let learned = writer.as_ref().and_then(|writer| writer.slots().of(&link.name));
             let part = player

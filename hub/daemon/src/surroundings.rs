@@ -7,7 +7,7 @@ use std::io;
 use lms::Nanos;
 use port::{Allowance, PortError, Source};
 use schema::ipc::{Medium, Payload};
-use schema::{Background, Failure, Pose, Wake};
+use schema::{Background, Failure, Pose, Ring, Wake};
 
 use crate::control::ControlQueue;
 
@@ -54,8 +54,11 @@ pub trait Surroundings {
     /// As [`SharedMemory::new`](schema::ipc::SharedMemory::new).
     fn medium<P: Payload + ?Sized>(&self, sensor: &str) -> Result<Self::Medium<P>, Failure>;
 
-    /// Wakes the consumers of the link's topics.
-    fn wake(&self, why: Wake);
+    /// Wakes the consumers that sleep at the link's bell for topics of `ring`.
+    fn ring(&self, ring: Ring);
+
+    /// Wakes the consumers that listen to the link's event.
+    fn tell(&self, why: Wake);
 
     /// Reads into `record` what [`remember`](Self::remember) was last told of link `name`, by this hub or the one before it;
     /// returns its length, nothing if there is none. It outlives a killed hub, and not the machine.
@@ -71,7 +74,7 @@ pub trait Surroundings {
 /// Where a link hands on what it has learned, for the next hub. Waits for no disk.
 pub trait Learned {
     /// The background of a sensor that sits at the pose.
-    fn keep_background(&self, pose: Pose, model: Background);
+    fn keep_background(&self, pose: Pose, model: Box<Background>);
 
     /// Returns when the background was written that the next hub would begin with, in ns since 1970; nothing if there is none.
     fn kept_wall_ns(&self) -> Option<u64>;

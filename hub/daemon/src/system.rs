@@ -13,7 +13,8 @@ use lms::Nanos;
 use port::{Allowance, Dial, Port, PortError, Source, clock};
 use rustix::event::{PollFd, PollFlags, poll};
 use schema::ipc::{Node, Payload, SharedMemory, Waker};
-use schema::{Directory, Failure, Wake};
+use schema::limits::TopicLimits;
+use schema::{Directory, Failure, Ring, Wake};
 
 use crate::control::ControlQueue;
 use crate::learned::Handle;
@@ -35,10 +36,12 @@ pub(crate) struct System<'a> {
     record: OnceCell<Option<File>>,
 }
 
-/// What all links of a hub have in common.
+/// What a hub has for a link.
 #[derive(Clone, Copy)]
 pub(crate) struct Hub<'a> {
     pub(crate) node: &'a Node,
+    /// What the link's topics are made for.
+    pub(crate) limits: TopicLimits,
     /// Readable once the hub shall end.
     pub(crate) stop: &'a OwnedFd,
     /// Keeps the ports when the hub is killed.
@@ -196,11 +199,24 @@ impl Surroundings for System<'_> {
     }
 
     fn medium<P: Payload + ?Sized>(&self, sensor: &str) -> Result<SharedMemory<P>, Failure> {
-        SharedMemory::new(self.hub.node, sensor)
+        let (wanted, topic) = (self.hub.limits.consumers, P::TOPIC.name());
+        let medium = SharedMemory::new(self.hub.node, sensor, &self.hub.limits)?;
+        let places = medium.places();
+        if places < wanted {
+            tracing::warn!(
+                "{sensor}/{topic} has places for {places} consumers, not for {wanted}: those of an earlier hub keep it; stop \
+                 them, then start the hub again"
+            );
+        }
+        Ok(medium)
     }
 
-    fn wake(&self, why: Wake) {
-        if let Err(failure) = self.waker.wake(why) {
+    fn ring(&self, ring: Ring) {
+        self.waker.ring(ring);
+    }
+
+    fn tell(&self, why: Wake) {
+        if let Err(failure) = self.waker.tell(why) {
             tracing::debug!(%failure, "some consumers were not woken");
         }
     }

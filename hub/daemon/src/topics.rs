@@ -3,9 +3,12 @@
 
 mod prepared_publisher;
 
+use line::Received;
 use lms::Nanos;
-use lms::session::Received;
-use schema::{Background, Failure, Flags, Foreground, Header, Marks, Quality, Scan, Status, Wake, Zones};
+use schema::ipc::DueRings;
+use schema::{
+    Background, Failure, Flags, Foreground, Header, Marks, Quality, Ring, Scan, Status, Wake, Zones,
+};
 
 use crate::pipeline::{Outputs, Pipeline, Relearned};
 use crate::surroundings::Surroundings;
@@ -24,9 +27,10 @@ pub(crate) struct Topics<'a, S: Surroundings> {
     foreground: Publisher<Foreground, S>,
     background: Publisher<Background, S>,
     status: Publisher<Status, S>,
-    /// Where a scan is decoded that nobody wants, or for which there is no memory: what is made of it is published all the
-    /// same.
-    spare_scan: Box<Scan>,
+    /// The last scan, which is read while others have its sample already.
+    decoded: Box<Scan>,
+    /// What was sent and not rung for.
+    due: DueRings,
     /// What the next sample's header begins with.
     header: Header,
     /// Its wall clock is that of a recording.
@@ -47,7 +51,8 @@ impl<'a, S: Surroundings> Topics<'a, S> {
             foreground: PreparedPublisher::new(around, sensor)?,
             background: PreparedPublisher::new(around, sensor)?,
             status: PreparedPublisher::new(around, sensor)?,
-            spare_scan: Box::default(),
+            decoded: Box::default(),
+            due: DueRings::default(),
             header,
             is_recalled: false,
             next_seq: 0,
@@ -81,14 +86,21 @@ impl<'a, S: Surroundings> Topics<'a, S> {
 
     /// Publishes the telegram and takes its number and stamps for all that follows from it.
     /// `reasons` are why it is suspect.
-    pub(crate) fn telegram(&mut self, received: &Received<'_>, reasons: u8, period_us: u32) {
-        let now = self.around.now();
+    pub(crate) fn telegram<M>(&mut self, received: &Received<'_, M>, reasons: u8, period_us: u32) {
         self.header.seq = self.next_seq;
         self.next_seq += 1;
-        self.header.stamp_first_ns = received.first;
-        self.header.stamp_last_ns = received.last;
+        self.begin_scan(received.first, received.last, reasons, period_us);
+        self.header.flags |= if received.estimated { Flags::STAMP_ESTIMATED } else { 0 };
+        self.telegram.send_bytes(received.bytes, &self.header, &mut self.due);
+    }
+
+    /// Takes over when a scan that the last telegram completed was measured, from its first beam to its last, and why it is
+    /// suspect, for all that follows from it.
+    pub(crate) fn begin_scan(&mut self, first: Nanos, last: Nanos, reasons: u8, period_us: u32) {
+        let now = self.around.now();
+        (self.header.stamp_first_ns, self.header.stamp_last_ns) = (first, last);
         if !self.is_recalled {
-            self.header.wall_ns = wall(self.around, received.first, now);
+            self.header.wall_ns = wall(self.around, first, now);
         }
         self.header.set_sent_at(now);
         self.header.period_us = period_us;
@@ -96,37 +108,43 @@ impl<'a, S: Surroundings> Topics<'a, S> {
         self.header.quality = quality as u8;
         self.header.reasons = reasons;
         self.header.flags &= !Flags::STAMP_ESTIMATED;
-        self.header.flags |= if received.estimated { Flags::STAMP_ESTIMATED } else { 0 };
-        self.telegram.send_bytes(received.telegram.bytes(), &self.header);
     }
 
-    /// Publishes a scan of the last telegram, which `fill` writes in place, and what `pipeline` makes of it there. Marks
-    /// and foreground that nobody wants are not made. A background that does not fit the scan starts again; then it is
-    /// told why.
+    /// Publishes a scan of the last telegram, of `beams` beams and `len` bytes, which `fill` writes, and its zones, and wakes
+    /// those who wait for these; then whatever else `pipeline` makes of it. Marks and foreground that nobody wants are not
+    /// made. A background that does not fit the scan starts again; then it is told why.
     pub(crate) fn scan(
         &mut self,
+        beams: usize,
+        len: usize,
         fill: impl FnOnce(&mut Scan),
         pipeline: &mut Pipeline,
     ) -> Option<Relearned> {
-        let (mut scan, mut zones, mut marks) = (self.scan.loan(), self.zones.loan(), self.marks.loan());
-        let mut foreground = pipeline.keeps_background().then(|| self.foreground.loan());
-        let decoded = Publisher::<Scan, S>::payload_mut(&mut scan).unwrap_or(&mut self.spare_scan);
+        let (mut scan, mut zones) = (self.scan.loan(len), self.zones.loan(0));
+        let decoded = with_room(&mut self.decoded, len);
         fill(decoded);
-        let relearned = pipeline.update(
-            decoded,
+        if let Some(sample) = Publisher::<Scan, S>::payload_mut(&mut scan) {
+            sample.copy_from(decoded.bytes());
+        }
+        pipeline.watch(decoded, Publisher::<Zones, S>::payload_mut(&mut zones));
+        self.header.set_sent_at(self.around.now());
+        let header = self.header;
+        self.scan.send(scan, &header, &mut self.due);
+        self.zones.send(zones, &header, &mut self.due);
+        self.ring(Ring::First);
+        let mut marks = self.marks.loan(0);
+        let mut foreground =
+            pipeline.keeps_background().then(|| self.foreground.loan(Foreground::len(beams)));
+        let relearned = pipeline.examine(
+            &self.decoded,
             Outputs {
-                zones: Publisher::<Zones, S>::payload_mut(&mut zones),
                 marks: Publisher::<Marks, S>::payload_mut(&mut marks),
                 foreground: foreground.as_mut().and_then(Publisher::<Foreground, S>::payload_mut),
             },
         );
-        self.header.set_sent_at(self.around.now());
-        let header = self.header;
-        self.scan.send(scan, &header);
-        self.zones.send(zones, &header);
-        self.marks.send(marks, &header);
+        self.marks.send(marks, &header, &mut self.due);
         if let Some(foreground) = foreground {
-            self.foreground.send(foreground, &header);
+            self.foreground.send(foreground, &header, &mut self.due);
         }
         if pipeline.shows_every_scan() || pipeline.is_news() {
             self.show(pipeline, &header);
@@ -134,17 +152,20 @@ impl<'a, S: Surroundings> Topics<'a, S> {
         relearned
     }
 
-    /// Lets `pipeline` learn from a scan that is not published, and that `fill` writes.
-    pub(crate) fn learn(&mut self, fill: impl FnOnce(&mut Scan), pipeline: &mut Pipeline) {
-        fill(&mut self.spare_scan);
-        pipeline.update(&self.spare_scan, Outputs::default());
+    /// Lets `pipeline` learn from a scan of `len` bytes that is not published, and that `fill` writes.
+    pub(crate) fn learn(&mut self, len: usize, fill: impl FnOnce(&mut Scan), pipeline: &mut Pipeline) {
+        let scan = with_room(&mut self.decoded, len);
+        fill(scan);
+        pipeline.watch(scan, None);
+        pipeline.examine(scan, Outputs::default());
     }
 
     /// Publishes that nothing is known of the zones as of `now`, for scans stay out.
     pub(crate) fn stale(&mut self, pipeline: &mut Pipeline, now: u64) {
-        let mut loan = self.zones.loan();
+        let mut loan = self.zones.loan(0);
         pipeline.stale(Publisher::<Zones, S>::payload_mut(&mut loan).unwrap_or(&mut Zones::default()));
-        self.zones.send(loan, &self.of_moment(now));
+        let header = self.of_moment(now);
+        self.zones.send(loan, &header, &mut self.due);
     }
 
     /// Publishes the background as of `now`, if it is one that was not published; whether it was.
@@ -158,16 +179,25 @@ impl<'a, S: Surroundings> Topics<'a, S> {
 
     /// Publishes the status as of `now`.
     pub(crate) fn status(&mut self, status: &Status, now: u64) {
-        let mut loan = self.status.loan();
+        let mut loan = self.status.loan(0);
         if let Some(payload) = Publisher::<Status, S>::payload_mut(&mut loan) {
             *payload = *status;
         }
-        self.status.send(loan, &self.of_moment(now));
+        let header = self.of_moment(now);
+        self.status.send(loan, &header, &mut self.due);
     }
 
-    /// Wakes whoever sleeps; once per telegram, after its last sample.
-    pub(crate) fn wake(&self, why: Wake) {
-        self.around.wake(why);
+    /// Wakes whoever sleeps and was not woken since a sample came for him; once per telegram, after its last sample.
+    pub(crate) fn wake(&mut self, why: Wake) {
+        Ring::ALL.into_iter().for_each(|ring| self.ring(ring));
+        self.around.tell(why);
+    }
+
+    /// Wakes who sleeps at the bell, if that is due: a call of the system that nobody needs is not made.
+    fn ring(&mut self, ring: Ring) {
+        if self.due.take(ring) {
+            self.around.ring(ring);
+        }
     }
 
     /// Gives late joiners what they would else get with the next sample.
@@ -211,11 +241,20 @@ impl<'a, S: Surroundings> Topics<'a, S> {
     }
 
     fn show(&mut self, pipeline: &mut Pipeline, header: &Header) {
-        let mut loan = self.background.loan();
-        pipeline
-            .show(Publisher::<Background, S>::payload_mut(&mut loan).unwrap_or(&mut Background::default()));
-        self.background.send(loan, header);
+        let len = pipeline.model_len();
+        let mut loan = self.background.loan(len);
+        match Publisher::<Background, S>::payload_mut(&mut loan) {
+            Some(model) => pipeline.show(model),
+            None => pipeline.show(&mut Background::zeroed(len)),
+        }
+        self.background.send(loan, header, &mut self.due);
     }
+}
+
+/// Memory for a scan of `len` bytes, which is made longer once where it is too short.
+fn with_room(scan: &mut Box<Scan>, len: usize) -> &mut Scan {
+    Scan::grow(scan, len);
+    scan
 }
 
 /// Nanoseconds since 1970 of the moment that the clock of `around` called `stamp`; it says `now`.

@@ -60,7 +60,12 @@ fn bytes_with_times_become_samples_with_stamps() {
             assert_eq!(links[0].read(at, &[0x55; 5]), 0);
             while let Ok(Some(scan)) = Scan::receive(&subscriber) {
                 let header = scan.user_header();
-                received.push((header.sensor, header.seq, header.stamp_last_ns, scan.ranges()[360]));
+                received.push((
+                    header.sensor,
+                    header.seq,
+                    header.stamp_last_ns,
+                    Scan::read(&scan).ranges()[360],
+                ));
             }
         }
         received

@@ -14,16 +14,17 @@ use crate::phase::{
 };
 use crate::reply::{POWER_ON, Reply};
 use crate::search::POWER_ON_BAUD;
-use crate::sensor::{Sensor, State, Trouble};
+use crate::sensor::{Sensor, Trouble};
 use crate::telegram::{REPLY, Telegram};
 use crate::variant::Baud;
+use line::State;
 
 #[derive(Clone, Debug)]
 pub(crate) struct Dialogue {
     pub(crate) settings: Settings,
     pub(crate) phase: Phase,
     pub(crate) open: Option<Outgoing>,
-    change_baud: Option<Baud>,
+    pub(crate) change_baud: Option<Baud>,
     pub(crate) baud: Baud,
     pub(crate) sensor: Sensor,
     /// What an earlier session knew of it; used until the first request is sent.
@@ -213,6 +214,8 @@ impl Dialogue {
         let at_rate = self.baud == self.settings.baud;
         let next_silence = self.silent_at(now);
         match self.phase {
+            // It came at the rate that is left now.
+            _ if self.change_baud.is_some() => return,
             Phase::Streaming { header, silent_at: ref mut at, .. } => {
                 // One of another kind was judged before this stream was known.
                 if telegram.bytes().starts_with(&header) {

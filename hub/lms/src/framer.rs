@@ -14,6 +14,7 @@ use crate::header::{Expect, Judgement, MAX_HEADER, Reject, State, judge};
 use crate::measured::MEASURED;
 use crate::telegram::{ACK, MAX_TELEGRAM, NAK, STX, Telegram};
 use crate::{MILLIS, Nanos};
+use line::suspect;
 
 /// What became of the bytes; every field only grows.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
@@ -36,20 +37,6 @@ pub struct Tally {
     pub held: u64,
     /// Refused start bytes among the discarded, by [`Reject`].
     pub rejected: [u64; Reject::COUNT],
-}
-
-/// Why a delivered telegram deserves less trust; bits of `reasons`.
-pub mod suspect {
-    /// The line's error counters moved.
-    pub const LINE_ERROR: u8 = 1;
-    /// Bytes before it belonged to nothing: its neighbour was damaged.
-    pub const NEIGHBOUR: u8 = 2;
-    /// It took longer than usual.
-    pub const SLOW: u8 = 4;
-    /// Bits are set that the measuring mode never sets.
-    pub const FORBIDDEN_BITS: u8 = 8;
-    /// Another acceptable header began inside.
-    pub const HEADER_INSIDE: u8 = 16;
 }
 
 /// A telegram as it was found.

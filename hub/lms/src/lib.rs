@@ -44,19 +44,9 @@ pub mod variant;
 pub use identity::Identity;
 pub use inquiry::Inquiry;
 pub use notice::Notice;
-pub use phase::{Control, Reason, SILENCE, Settings};
-pub use sensor::{Sensor, State, Trouble};
+pub use phase::{Reason, SILENCE, Settings};
+pub use sensor::{Sensor, Trouble};
 pub use session::Session;
 
-/// A point in time or a span, in nanoseconds of one monotonic clock that the caller chooses.
-pub type Nanos = u64;
-
-/// One millisecond in [`Nanos`].
-pub const MILLIS: Nanos = 1_000_000;
-/// One microsecond in [`Nanos`].
-pub const MICROS: Nanos = 1_000;
-
-/// Time of `bytes` bytes on a line of `baud` bits per second: 8N1 is 10 bits a byte (Telegram listing 4).
-pub const fn line_time(bytes: usize, baud: u32) -> Nanos {
-    bytes as u64 * 10 * 1_000_000_000 / baud as u64
-}
+// Everything here speaks of time.
+pub use line::{MICROS, MILLIS, Nanos, line_time};

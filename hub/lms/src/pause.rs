@@ -5,9 +5,10 @@
 use crate::Nanos;
 use crate::command::Request;
 use crate::dialogue::Dialogue;
-use crate::phase::{Control, Phase, STOPS, Step, TRIES};
+use crate::phase::{Phase, STOPS, Step, TRIES};
 use crate::reply::Reply;
-use crate::sensor::{State, Trouble};
+use crate::sensor::Trouble;
+use line::{Control, State};
 
 impl Dialogue {
     pub(crate) fn control(&mut self, control: Control, now: Nanos) {

@@ -4,9 +4,9 @@
 use crate::command::Request;
 use crate::header::StreamHeader;
 use crate::reply::Reply;
-use crate::sensor::State;
 use crate::variant::{Baud, Variant};
 use crate::{MILLIS, Nanos};
+use line::State;
 
 /// What a session shall do.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -109,17 +109,6 @@ impl Progress {
             ..self
         }
     }
-}
-
-/// What a user may ask of a running session.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Control {
-    /// Stop the stream, then say nothing and expect nothing.
-    Pause,
-    /// End the pause: begin as a new session does.
-    Resume,
-    /// Restart the session, whatever the state is; ends a pause too.
-    Resync,
 }
 
 /// Two scans of the slowest variant, and some; longer where the line is slower than the scans.

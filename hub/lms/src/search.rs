@@ -4,9 +4,10 @@
 use crate::command::Request;
 use crate::dialogue::Dialogue;
 use crate::phase::{LISTEN, PATIENCE, PAUSE_ROUNDS, PAUSES, Phase, QUIET, SETTLE};
-use crate::sensor::{State, Trouble};
+use crate::sensor::Trouble;
 use crate::variant::Baud;
 use crate::{MILLIS, Nanos};
+use line::State;
 
 impl Dialogue {
     /// Starts like a new session: listens at the wanted rate and sends nothing.

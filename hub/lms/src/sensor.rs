@@ -13,23 +13,6 @@ use crate::telegram::Telegram;
 use crate::variant::{Baud, Mode, Unit, Variant};
 use core::fmt;
 
-/// How far a session is.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum State {
-    /// Listening for a stream, or looking for the rate.
-    Probing,
-    /// Changing the rate.
-    Switching,
-    /// Changing settings and starting the stream.
-    Starting,
-    /// Measured data come.
-    Streaming,
-    /// They stopped coming.
-    Silent,
-    /// Nothing is wanted of the sensor.
-    Paused,
-}
-
 /// Why a session is not where it should be.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Trouble {

@@ -1,8 +1,5 @@
-//! A sensor behind a line, driven from outside: bytes and the time go in, bytes and telegrams and the next deadline
-//! come out. It never waits, reads or writes itself.
-//!
-//! After every call that changes it, drain [`Session::poll_output`] until it answers [`Output::Wait`] or
-//! [`Output::Rest`].
+//! A sensor behind a line, driven from outside as [`line::Session`] says: bytes and the time go in, bytes and telegrams and
+//! the next deadline come out.
 
 mod beat;
 
@@ -11,41 +8,16 @@ use crate::arrival::{Arrivals, Rhythm};
 use crate::cadence::Cadence;
 use crate::damage::Damage;
 use crate::dialogue::Dialogue;
-use crate::framer::{Advance, Framer, Tally, TelegramSpan, suspect};
+use crate::framer::{Advance, Framer, Tally, TelegramSpan};
 use crate::identity::Identity;
 use crate::measured::MEASURED;
 use crate::outgoing::SOON;
-use crate::phase::{Control, Phase, Reason, Settings};
+use crate::phase::{Phase, Reason, Settings};
 use crate::reply::Reply;
-use crate::sensor::{Sensor, State, Trouble};
+use crate::sensor::{Sensor, Trouble};
 use crate::telegram::Telegram;
 use crate::variant::{BYTES_PER_TURN, Baud, Mode};
-
-/// What the session wants, in the order in which it wants it.
-#[derive(Debug)]
-pub enum Output<'a> {
-    /// Set the port to this rate and forget what it had received, then go on draining.
-    SetBaud(Baud),
-    /// Write this byte, not before the time given, then say so by [`Session::transmitted`]. Do nothing else meanwhile:
-    /// the sensor drops a request whose bytes are more than 6 ms apart.
-    Transmit {
-        /// The byte.
-        byte: u8,
-        /// Earliest time to write it.
-        not_before: Nanos,
-    },
-    /// A telegram arrived.
-    Telegram(Received<'a>),
-    /// Leave the port alone until then: nothing can be complete before.
-    Rest(Nanos),
-    /// Read when the port has bytes; at the deadline, if a read finds none, call [`Session::handle_timeout`].
-    Wait {
-        /// The deadline; [`Nanos::MAX`] is none.
-        until: Nanos,
-        /// What it is for.
-        reason: Why,
-    },
-}
+use line::{Account, Control, Output, State, suspect};
 
 /// What a deadline is for.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -56,25 +28,20 @@ pub enum Why {
     Held,
 }
 
-/// A telegram with its stamps.
+/// What a telegram says.
 #[derive(Clone, Copy, Debug)]
-pub struct Received<'a> {
+pub struct Message<'a> {
     /// The telegram, in the session's buffer.
     pub telegram: Telegram<'a>,
     /// What it says; `None` if it cannot be read.
     pub reply: Option<Reply<'a>>,
-    /// When its first byte arrived.
-    pub first: Nanos,
-    /// When its last byte was read.
-    pub last: Nanos,
-    /// Whether `first` is an estimate from bytes that came in one read.
-    pub estimated: bool,
-    /// How measured values are split; `None` while the sensor has not reported it, or if the angles of the values are
-    /// not known.
+    /// How measured values are split; `None` while the sensor has not reported it, if the angles of the values are not
+    /// known, or if they came at another rate than the wanted one, by which their period and their age are judged.
     pub mode: Option<Mode>,
-    /// Why it is suspect, bits of [`suspect`]; 0 is clean.
-    pub reasons: u8,
 }
+
+/// A telegram with its stamps.
+pub type Received<'a> = line::Received<'a, Message<'a>>;
 
 /// One sensor's session. A sensor that is exchanged within a second for one that streams already, with the same number
 /// of values and the same address, is taken for the same one.
@@ -148,134 +115,6 @@ impl Session {
         }
     }
 
-    /// Room for the next read; never empty once the outputs are drained.
-    pub fn spare(&mut self) -> &mut [u8] {
-        let spare = self.framer.spare();
-        self.room = spare.len();
-        spare
-    }
-
-    /// Whether it is worth a look how many bytes the line has, to [`leave`](Self::leave) them there.
-    pub fn may_leave(&self) -> bool {
-        let begins = self.framer.buffered() == 0 && !self.has_more && self.left_until.is_none();
-        // An answer takes less time than a scan.
-        let is_silent = self.dialogue.open.is_none();
-        begins && is_silent && self.rhythm.duration().is_some() && self.has_pace() && self.is_live()
-    }
-
-    /// The line has `waiting` bytes at `now` that were not read. Whether they may stay there until the telegram that they
-    /// begin is nearly complete: what a host has not read, one that is killed does not lose.
-    pub fn leave(&mut self, now: Nanos, waiting: usize) -> bool {
-        self.now = now;
-        // More than a turn's bytes came while the host did not look: the read has to find out since when.
-        if (1..=BYTES_PER_TURN).contains(&waiting) && self.may_leave() {
-            self.arrivals.sense(now, waiting);
-            let begun = self.next_began();
-            self.rhythm.begin(begun);
-            self.left_until = self.rhythm.rest(now);
-        }
-        self.left_until.is_some()
-    }
-
-    /// A read returned at `now` and brought `len` bytes into [`Session::spare`].
-    pub fn commit(&mut self, now: Nanos, len: usize) {
-        self.now = now;
-        self.has_more = len > 0 && len == self.room;
-        self.left_until = None;
-        self.arrivals.note(now, len, self.has_pace().then_some(self.dialogue.baud.rate()));
-        if len == 0 {
-            return;
-        }
-        let was_empty = self.framer.buffered() == 0;
-        self.framer.commit(len);
-        self.last_byte = now;
-        self.dialogue.hear();
-        if was_empty {
-            let begun = self.next_began();
-            self.rhythm.begin(begun);
-        }
-    }
-
-    /// The deadline passed, and a read found nothing.
-    pub fn handle_timeout(&mut self, now: Nanos) {
-        self.now = now;
-        self.framer.release(now.saturating_sub(self.last_byte));
-        if self.is_live() {
-            // The stream may be over now.
-            self.damage.note(self.framer.tally(), now);
-        }
-        self.dialogue.handle_timeout(now);
-    }
-
-    /// A user wants this from now on. Asking twice changes nothing, but a [`Control::Resync`] counts each time. A
-    /// recording cannot be controlled.
-    pub fn control(&mut self, control: Control, now: Nanos) {
-        self.now = now;
-        self.left_until = None;
-        self.dialogue.control(control, now);
-    }
-
-    /// The byte of [`Output::Transmit`] was written at `now`.
-    pub fn transmitted(&mut self, now: Nanos) {
-        self.now = now;
-        let (baud, is_fixed) = (self.dialogue.baud, self.dialogue.settings.fixed_rate);
-        if let Some(outgoing) = self.dialogue.outgoing() {
-            outgoing.transmitted(now, baud);
-            if is_fixed {
-                // From a network the first sign of a reply may be all of it.
-                outgoing.hear(baud);
-            }
-        }
-    }
-
-    /// What the session wants next.
-    pub fn poll_output(&mut self) -> Output<'_> {
-        while let Some(found) = self.framer.advance() {
-            match found {
-                Advance::Telegram(span) => return Output::Telegram(self.receive(span)),
-                Advance::Ack => self.dialogue.on_acknowledge(self.now),
-                Advance::Nak => self.dialogue.on_nak(self.now),
-            }
-        }
-        if let Some(baud) = self.dialogue.take_change_baud() {
-            self.framer.clear();
-            self.rhythm.lose();
-            return Output::SetBaud(baud);
-        }
-        self.framer.expect(self.dialogue.expect());
-        self.framer.await_acknowledge(self.dialogue.awaits_acknowledge());
-        let next_byte = self.dialogue.outgoing().and_then(|outgoing| outgoing.byte());
-        if let Some((byte, not_before)) = next_byte.filter(|&(_, at)| at <= self.now + SOON) {
-            // The sensor skips scans while it answers.
-            self.cadence.rest();
-            return Output::Transmit { byte, not_before };
-        }
-        if let Some(until) = self.left_until {
-            return Output::Rest(until);
-        }
-        if self.framer.buffered() == 0 {
-            self.rhythm.lose();
-        } else if self.is_live()
-            && self.dialogue.open.is_none()
-            && !self.has_more
-            && let Some(until) = self.rhythm.rest(self.now)
-        {
-            return Output::Rest(until);
-        }
-        let (until, reason) = self.dialogue.deadline();
-        match self.framer.hold() {
-            Some(hold) if self.last_byte + hold < until => {
-                Output::Wait { until: self.last_byte + hold, reason: Why::Held }
-            }
-            _ => Output::Wait { until, reason: Why::Dialogue(reason) },
-        }
-    }
-
-    /// How far it is.
-    pub fn state(&self) -> State {
-        self.dialogue.state()
-    }
-
     /// The rate at which it listens and talks.
     pub fn baud(&self) -> Baud {
         self.dialogue.baud
@@ -294,39 +133,6 @@ impl Session {
     /// What became of the bytes.
     pub fn tally(&self) -> &Tally {
         self.framer.tally()
-    }
-
-    /// Bytes read whose fate is open.
-    pub fn buffered(&self) -> usize {
-        self.framer.buffered()
-    }
-
-    /// Scans that a streaming sensor must have sent, by its period, after the first one of each stream. A stream ends when
-    /// scans stay out for a second, and where the sensor is asked something; of one whose period is not known, of parts of
-    /// scans and of a recording there are none.
-    pub fn scans_due(&self) -> u64 {
-        self.cadence.due()
-    }
-
-    /// Those of [`scans_due`](Self::scans_due) that did not arrive; known a second later.
-    pub fn scans_lost(&self) -> u64 {
-        self.cadence.lost()
-    }
-
-    /// Bytes of streams that were in nothing, without those of scans that the sensor broke off to answer.
-    pub fn bytes_damaged(&self) -> u64 {
-        self.damage.damaged(self.framer.tally())
-    }
-
-    /// How often the session restarted: no measured data came for a second, the sensor reported power-on, or a user
-    /// asked for it.
-    pub fn resyncs(&self) -> u64 {
-        self.dialogue.resyncs
-    }
-
-    /// Whether the first telegram came after a piece of one: what was in flight when the port was opened.
-    pub fn began_with_a_cut(&self) -> bool {
-        self.cut
     }
 
     fn receive(&mut self, span: TelegramSpan) -> Received<'_> {
@@ -373,14 +179,15 @@ impl Session {
             self.rhythm.begin(begun);
         }
         self.dialogue.sensor.doubt(self.damage.is_recent(self.now));
+        let is_at_rate = self.is_at_rate();
         self.dialogue.on_telegram(telegram, reply, first.at, self.now);
+        let mode = self.dialogue.sensor.mode_of_scans().filter(|_| is_at_rate);
         Received {
-            telegram,
-            reply,
+            bytes: telegram.bytes(),
+            message: Message { telegram, reply, mode },
             first: first.at,
             last,
             estimated: first.estimated,
-            mode: self.dialogue.sensor.mode_of_scans(),
             reasons: framed.reasons | if slow { suspect::SLOW } else { 0 },
         }
     }
@@ -389,5 +196,153 @@ impl Session {
     fn next_began(&self) -> Nanos {
         let open = self.tally().read - self.framer.buffered() as u64;
         self.arrivals.stamp(open, self.dialogue.baud.rate()).at
+    }
+}
+
+impl line::Session for Session {
+    type Heard<'a> = Received<'a>;
+    type Why = Why;
+
+    fn spare(&mut self) -> &mut [u8] {
+        let spare = self.framer.spare();
+        self.room = spare.len();
+        spare
+    }
+
+    fn commit(&mut self, now: Nanos, len: usize) {
+        self.now = now;
+        self.has_more = len > 0 && len == self.room;
+        self.left_until = None;
+        self.arrivals.note(now, len, self.has_pace().then_some(self.dialogue.baud.rate()));
+        if len == 0 {
+            return;
+        }
+        let was_empty = self.framer.buffered() == 0;
+        self.framer.commit(len);
+        self.last_byte = now;
+        self.dialogue.hear();
+        if was_empty {
+            let begun = self.next_began();
+            self.rhythm.begin(begun);
+        }
+    }
+
+    fn may_leave(&self) -> bool {
+        let begins = self.framer.buffered() == 0 && !self.has_more && self.left_until.is_none();
+        // An answer takes less time than a scan.
+        let is_silent = self.dialogue.open.is_none();
+        begins && is_silent && self.rhythm.duration().is_some() && self.has_pace() && self.is_live()
+    }
+
+    fn leave(&mut self, now: Nanos, waiting: usize) -> bool {
+        self.now = now;
+        // More than a turn's bytes came while the host did not look: the read has to find out since when.
+        if (1..=BYTES_PER_TURN).contains(&waiting) && self.may_leave() {
+            self.arrivals.sense(now, waiting);
+            let begun = self.next_began();
+            self.rhythm.begin(begun);
+            self.left_until = self.rhythm.rest(now);
+        }
+        self.left_until.is_some()
+    }
+
+    fn handle_timeout(&mut self, now: Nanos) {
+        self.now = now;
+        self.framer.release(now.saturating_sub(self.last_byte));
+        if self.is_live() {
+            // The stream may be over now.
+            self.damage.note(self.framer.tally(), now);
+        }
+        self.dialogue.handle_timeout(now);
+    }
+
+    fn control(&mut self, control: Control, now: Nanos) {
+        self.now = now;
+        self.left_until = None;
+        self.dialogue.control(control, now);
+    }
+
+    fn transmitted(&mut self, now: Nanos) {
+        self.now = now;
+        let (baud, is_fixed) = (self.dialogue.baud, self.dialogue.settings.fixed_rate);
+        if let Some(outgoing) = self.dialogue.outgoing() {
+            outgoing.transmitted(now, baud);
+            if is_fixed {
+                // From a network the first sign of a reply may be all of it.
+                outgoing.hear(baud);
+            }
+        }
+    }
+
+    fn poll_output(&mut self) -> Output<Received<'_>, Why> {
+        while let Some(found) = self.framer.advance() {
+            match found {
+                Advance::Telegram(span) => return Output::Heard(self.receive(span)),
+                Advance::Ack => self.dialogue.on_acknowledge(self.now),
+                Advance::Nak => self.dialogue.on_nak(self.now),
+            }
+        }
+        if let Some(baud) = self.dialogue.take_change_baud() {
+            self.framer.clear();
+            self.rhythm.lose();
+            return Output::SetRate(baud.rate());
+        }
+        self.framer.expect(self.dialogue.expect());
+        self.framer.await_acknowledge(self.dialogue.awaits_acknowledge());
+        let next_byte = self.dialogue.outgoing().and_then(|outgoing| outgoing.byte());
+        if let Some((byte, not_before)) = next_byte.filter(|&(_, at)| at <= self.now + SOON) {
+            // The sensor skips scans while it answers.
+            self.cadence.rest();
+            return Output::Transmit { byte, not_before };
+        }
+        if let Some(until) = self.left_until {
+            return Output::Rest(until);
+        }
+        if self.framer.buffered() == 0 {
+            self.rhythm.lose();
+        } else if self.is_live()
+            && self.dialogue.open.is_none()
+            && !self.has_more
+            && let Some(until) = self.rhythm.rest(self.now)
+        {
+            return Output::Rest(until);
+        }
+        let (until, reason) = self.dialogue.deadline();
+        match self.framer.hold() {
+            Some(hold) if self.last_byte + hold < until => {
+                Output::Wait { until: self.last_byte + hold, reason: Why::Held }
+            }
+            _ => Output::Wait { until, reason: Why::Dialogue(reason) },
+        }
+    }
+
+    fn state(&self) -> State {
+        self.dialogue.state()
+    }
+
+    fn rate(&self) -> u32 {
+        self.dialogue.baud.rate()
+    }
+
+    /// What the sensor must have sent is known by its period, after the first scan of each stream. A stream ends when scans
+    /// stay out for a second, and where the sensor is asked something; of one whose period is not known, of parts of scans
+    /// and of a recording nothing was due. What is lost is known a second later. What the sensor breaks off to answer is no
+    /// damage. The session begins again when no measured data came for a second, when the sensor reported power-on, or when
+    /// a user asked for it.
+    fn account(&self) -> Account {
+        let tally = self.framer.tally();
+        Account {
+            read: tally.read,
+            in_telegrams: tally.in_telegrams,
+            acknowledge: tally.acknowledge,
+            discarded: tally.discarded,
+            buffered: self.framer.buffered() as u64,
+            telegrams: tally.telegrams,
+            due: self.cadence.due(),
+            lost: self.cadence.lost(),
+            damaged: self.damage.damaged(tally),
+            resyncs: self.dialogue.resyncs,
+            began_with_a_cut: self.cut,
+        }
     }
 }

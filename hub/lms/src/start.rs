@@ -6,7 +6,8 @@ use crate::command::Request;
 use crate::dialogue::Dialogue;
 use crate::phase::{MORE_TRIES, Phase, Progress, SETTLE, STOPS, Step, TRIES};
 use crate::reply::Reply;
-use crate::sensor::{State, Trouble};
+use crate::sensor::Trouble;
+use line::State;
 
 impl Dialogue {
     /// What the sensor does now is known: goes on from there.

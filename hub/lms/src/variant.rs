@@ -52,10 +52,9 @@ impl Variant {
         u64::from(100 / self.resolution_cdeg)
     }
 
-    /// Angle of the first beam in 1/1000 degree, counter-clockwise, 0 to the right: the 100-degree variants look at
-    /// 40 to 140 degrees.
+    /// Angle of the first beam in 1/1000 degree, counter-clockwise, 0 ahead: beams lie evenly to both sides of it.
     pub fn first_angle_mdeg(self) -> i32 {
-        (180 - i32::from(self.angle_deg)) * 500
+        -500 * i32::from(self.angle_deg)
     }
 
     /// Time between telegrams of `telegram_len` bytes at `baud`: whole scans, as many as the line needs (Telegram
@@ -189,7 +188,7 @@ mod tests {
         let scans = Baud::ALL.map(|b| Variant::HALF.period(732, b.rate()) / (2 * MIRROR_TURN));
         assert_eq!(scans, [29, 15, 8, 1]);
         assert_eq!(Variant::new(100, 25).unwrap().period(812, 9_600) / MIRROR_TURN, 64);
-        assert_eq!(Variant::new(100, 25).unwrap().first_angle_mdeg(), 40_000);
+        assert_eq!(Variant::new(100, 25).unwrap().first_angle_mdeg(), -50_000);
     }
 
     #[test]

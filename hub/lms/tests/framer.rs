@@ -1,7 +1,8 @@
 //! The framer, situation by situation, then against everything: any content, any damage, any way the bytes are cut
 //! into reads.
 
-use lms::framer::{Found, Framer, SUFFIX_HOLD, Tally, VETO_HOLD, suspect};
+use line::suspect;
+use lms::framer::{Found, Framer, SUFFIX_HOLD, Tally, VETO_HOLD};
 use lms::header::{Expect, Reject, State};
 use lms::measured;
 use lms::reply;

@@ -9,7 +9,7 @@ mod settings;
 
 use std::fmt;
 
-use schema::{BEAMS, Background, Code, Foreground, Scan};
+use schema::{Background, BackgroundHead, Foreground, ForegroundArrays, ForegroundHead, Scan, ScanHead};
 
 use multi::Multi;
 use paper::Paper;
@@ -41,19 +41,24 @@ pub struct Model {
     settings: Settings,
     limits: Limits,
     learner: Learner,
-    /// Beams and unit of the model: of the last scan or of what was loaded; (0, 0) before both.
-    shape: (u16, u8),
-    /// First angle and step of the last scan: a file does not tell them.
-    angles: Option<(i32, u16)>,
+    /// The most beams of a scan; those beyond are passed over.
+    most: usize,
+    /// Beams and unit in micrometres of the model: of the last scan or of what was loaded; (0, 0) before both.
+    shape: (u16, u32),
+    /// First angle and step: of the last scan or of what was loaded; 0 before both.
+    angles: (f64, f64),
+    /// There was a scan, by which the settings are those of its units.
+    is_fitted: bool,
     generation: u32,
     frozen: bool,
     /// Nothing has been learned or loaded since the last reset.
     fresh: bool,
-    classes: [Class; BEAMS],
+    classes: Box<[Class]>,
+    /// What the beams tell, while a scan is looked at.
+    readings: Box<[u16]>,
 }
 
 /// What is learned, by method.
-#[expect(clippy::large_enum_variant, reason = "there is one per sensor, and no heap")]
 #[derive(Clone)]
 enum Learner {
     Paper(Paper),
@@ -64,30 +69,35 @@ enum Learner {
 const INVALID: u16 = Background::FAR - 1;
 
 impl Model {
-    /// A model that knows nothing.
-    pub fn new(settings: Settings) -> Model {
-        let limits = Limits::of(&settings, &Scan::default());
+    /// A model that knows nothing, for scans of at most `beams` beams: all the memory that it ever needs.
+    pub fn new(settings: Settings, beams: usize) -> Model {
         Model {
             settings,
-            limits,
-            learner: Learner::new(settings.method),
+            limits: Limits::of(&settings, &ScanHead::default()),
+            learner: Learner::new(settings.method, beams),
+            most: beams,
             shape: (0, 0),
-            angles: None,
+            angles: (0.0, 0.0),
+            is_fitted: false,
             generation: 0,
             frozen: false,
             fresh: true,
-            classes: [Class::Invalid; BEAMS],
+            classes: vec![Class::Invalid; beams].into(),
+            readings: vec![INVALID; beams].into(),
         }
     }
 
     /// Compares `scan` with the model as it is, writes what stands before it to `out`, then learns from it. Writes
     /// every byte of `out` but those of the segments.
+    ///
+    /// # Panics
+    ///
+    /// If `out` has no memory for as many beams.
     pub fn update(&mut self, scan: &Scan, out: &mut Foreground) {
         self.fit(scan);
-        let mut readings = [INVALID; BEAMS];
-        measure(scan, self.limits.no_return_is_far, &mut readings);
-        let count = scan.beams();
-        let (readings, classes) = (&readings[..count], &mut self.classes[..count]);
+        let count = scan.beams().min(self.most);
+        measure(scan, self.limits.no_return_is_far, &mut self.readings[..count]);
+        let (readings, classes) = (&self.readings[..count], &mut self.classes[..count]);
         let learn = !self.frozen;
         match &mut self.learner {
             Learner::Paper(paper) => paper.update(readings, &self.limits, learn, classes),
@@ -99,29 +109,40 @@ impl Model {
             }
             self.fresh = false;
         }
-        out.generation = self.generation;
-        write(scan, &self.classes, out);
+        write(scan, self.generation, &self.classes[..count], out);
     }
 
     /// What the beams of the last scan are; empty before the first one.
     pub fn classes(&self) -> &[Class] {
-        if self.angles.is_some() { &self.classes[..usize::from(self.shape.0)] } else { &[] }
+        if self.is_fitted { &self.classes[..usize::from(self.shape.0)] } else { &[] }
+    }
+
+    /// Returns the number of beams of the model: those of the last scan or of what was loaded.
+    pub fn beams(&self) -> usize {
+        self.shape.0.into()
     }
 
     /// Writes the model to `out`, every byte of it.
+    ///
+    /// # Panics
+    ///
+    /// If `out` has no memory for as many beams.
     pub fn show(&self, out: &mut Background) {
-        *out = Background {
+        let ranges = out.begin(BackgroundHead {
+            first_angle: self.angles.0,
+            step: self.angles.1,
             generation: self.generation,
+            unit_um: self.shape.1,
             count: self.shape.0,
-            unit_mm: self.shape.1,
             flags: if self.frozen { Background::FROZEN } else { 0 },
-            ..Background::default()
-        };
-        let count = usize::from(self.shape.0);
-        for (i, range) in out.range_array[..count].iter_mut().enumerate() {
+            ..BackgroundHead::default()
+        });
+        let mut taught = 0;
+        for (i, range) in ranges.iter_mut().enumerate() {
             *range = self.learner.background(i, &self.limits);
+            taught += u16::from(*range != Background::UNTAUGHT);
         }
-        out.taught = out.ranges().iter().filter(|&&range| range != Background::UNTAUGHT).count() as u16;
+        out.taught = taught;
     }
 
     /// Counts the models: one more after a reset, a load, and a change of the scan's shape.
@@ -141,7 +162,11 @@ impl Model {
 
     /// Forgets everything. A frozen model stays frozen and then knows nothing until it is thawed.
     pub fn reset(&mut self) {
-        self.learner = Learner::new(self.settings.method);
+        match &mut self.learner {
+            Learner::Paper(paper) if self.settings.method == Method::Paper => paper.forget(),
+            Learner::Multi(multi) if self.settings.method == Method::Multi => multi.forget(),
+            other => *other = Learner::new(self.settings.method, self.most),
+        }
         self.generation = self.generation.wrapping_add(1);
         self.fresh = true;
     }
@@ -163,11 +188,14 @@ impl Model {
     /// beams or unit resets it as any change does.
     pub fn load(&mut self, model: &Background) -> Result<(), Mismatch> {
         let ranges = model.ranges();
-        let shape = (ranges.len() as u16, model.unit_mm);
-        if self.angles.is_some() && shape != self.shape {
-            return Err(Mismatch { model: (model.count, model.unit_mm), sensor: self.shape });
+        let shape = (ranges.len() as u16, model.unit_um);
+        if self.is_fitted && shape != self.shape || ranges.len() > self.most {
+            return Err(Mismatch { model: shape, sensor: self.shape });
         }
         self.shape = shape;
+        if !self.is_fitted {
+            self.angles = (model.first_angle, model.step);
+        }
         self.reset();
         self.learner.adopt(ranges);
         self.fresh = false;
@@ -177,41 +205,42 @@ impl Model {
     /// Learns by `settings` from the next scan on. What is background stays background, as well known as can be; what was
     /// about to be learned is forgotten, and the generation is the next one, as after [`load`](Self::load).
     pub fn change(&mut self, settings: Settings) {
-        let mut ranges = [Background::UNTAUGHT; BEAMS];
-        let ranges = &mut ranges[..usize::from(self.shape.0)];
-        for (i, range) in ranges.iter_mut().enumerate() {
+        // Between two scans there are no readings.
+        let beams = self.beams();
+        for (i, range) in self.readings[..beams].iter_mut().enumerate() {
             *range = self.learner.background(i, &self.limits);
         }
         let was_fresh = self.fresh;
         self.settings = settings;
         self.reset();
-        self.learner.adopt(ranges);
+        self.learner.adopt(&self.readings[..beams]);
         self.fresh = was_fresh;
         // The next scan tells what the settings mean in its units.
-        self.angles = None;
+        self.is_fitted = false;
     }
 
     /// Makes the model one for scans such as `scan`.
     fn fit(&mut self, scan: &Scan) {
-        let shape = (scan.beams() as u16, scan.unit_mm);
-        let angles = Some((scan.first_angle_mdeg, scan.step_mdeg));
-        if (shape, angles) == (self.shape, self.angles) {
+        let shape = (scan.beams().min(self.most) as u16, scan.unit_um);
+        let angles = (scan.first_angle, scan.step);
+        if self.is_fitted && (shape, angles) == (self.shape, self.angles) {
             return;
         }
-        if shape != self.shape && self.shape != (0, 0) || self.angles.is_some() && angles != self.angles {
+        if shape != self.shape && self.shape != (0, 0) || self.is_fitted && angles != self.angles {
             self.reset();
         }
         self.shape = shape;
         self.angles = angles;
+        self.is_fitted = true;
         self.limits = Limits::of(&self.settings, scan);
     }
 }
 
 impl Learner {
-    fn new(method: Method) -> Learner {
+    fn new(method: Method, beams: usize) -> Learner {
         match method {
-            Method::Paper => Learner::Paper(Paper::new()),
-            Method::Multi => Learner::Multi(Multi::new()),
+            Method::Paper => Learner::Paper(Paper::new(beams)),
+            Method::Multi => Learner::Multi(Multi::new(beams)),
         }
     }
 
@@ -238,60 +267,57 @@ impl Learner {
 
 /// The readings of `scan` in device units, [`Background::FAR`] or [`INVALID`]. The values
 /// themselves are compared: they are many.
-fn measure(scan: &Scan, no_return_is_far: bool, readings: &mut [u16; BEAMS]) {
-    let max = scan.max();
-    let no_return = if no_return_is_far { Background::FAR } else { INVALID };
-    let beyond = max.saturating_sub(Code::BEYOND.0);
-    let far = if max > Code::BEYOND.0 { Background::FAR } else { INVALID };
+fn measure(scan: &Scan, no_return_is_far: bool, readings: &mut [u16]) {
+    let ScanHead { valid_to, no_return, beyond, .. } = **scan;
+    let valid_to = valid_to.min(INVALID - 1);
+    let of_no_return = if no_return_is_far { Background::FAR } else { INVALID };
     for (reading, &value) in readings.iter_mut().zip(scan.ranges()) {
-        *reading = if value < beyond {
-            value
-        } else if value == max {
-            no_return
-        } else if value == beyond {
-            far
-        } else {
-            INVALID
-        };
+        let code = if value == beyond { Background::FAR } else { INVALID };
+        let code = if value == no_return { of_no_return } else { code };
+        *reading = if value <= valid_to { value } else { code };
     }
 }
 
-/// Writes everything but generation and segments.
-fn write(scan: &Scan, classes: &[Class; BEAMS], out: &mut Foreground) {
-    let count = scan.beams();
-    out.count = count as u16;
-    out.unit_mm = scan.unit_mm;
-    (out.pad, out.pad2) = ([0; 1], [0; 2]);
-    out.bit_array.fill(0);
+/// Writes everything but the segments.
+fn write(scan: &Scan, generation: u32, classes: &[Class], out: &mut Foreground) {
+    let head = ForegroundHead {
+        generation,
+        unit_um: scan.unit_um,
+        count: classes.len() as u16,
+        ..ForegroundHead::default()
+    };
+    let ForegroundArrays { bits, ranges, .. } = out.begin(head);
+    bits.fill(0);
     let mut beams = 0;
-    for (byte, (classes, values)) in classes[..count].chunks(8).zip(scan.ranges().chunks(8)).enumerate() {
+    for ((byte, classes), values) in bits.iter_mut().zip(classes.chunks(8)).zip(scan.ranges().chunks(8)) {
         if !classes.iter().fold(false, |any, &class| any | (class == Class::Foreground)) {
             continue;
         }
         for (bit, (&class, &value)) in classes.iter().zip(values).enumerate() {
             if class == Class::Foreground {
-                out.bit_array[byte] |= 1 << bit;
-                out.range_array[beams] = value;
+                *byte |= 1 << bit;
+                ranges[beams] = value;
                 beams += 1;
             }
         }
     }
-    out.range_array[beams..].fill(0);
+    ranges[beams..].fill(0);
     out.beams = beams as u16;
 }
 
 /// A model that does not fit the sensor.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Mismatch {
-    /// Beams and mm per device unit of the model.
-    pub model: (u16, u8),
+    /// Beams and micrometres per device unit of the model.
+    pub model: (u16, u32),
     /// Those of the sensor's scans.
-    pub sensor: (u16, u8),
+    pub sensor: (u16, u32),
 }
 
 impl fmt::Display for Mismatch {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let ((beams, unit), (sensor_beams, sensor_unit)) = (self.model, self.sensor);
+        let [unit, sensor_unit] = [unit, sensor_unit].map(|unit_um| f64::from(unit_um) / 1000.0);
         write!(
             f,
             "the model has {beams} beams in units of {unit} mm, the sensor's scans have {sensor_beams} beams in \
@@ -309,14 +335,17 @@ mod tests {
 
     #[test]
     fn readings_are_those_of_every_processor() {
-        for range_bits in 0..=u8::MAX {
-            let mut scan = Scan { count: 32, unit_mm: 1, range_bits, ..Scan::default() };
-            for (i, value) in scan.range_array.iter_mut().enumerate() {
-                *value =
-                    [0, 1, 2, 0x1FFF, 0x3FFF, 0x7FFF, 0xFFFF, i as u16][i % 8].wrapping_sub(i as u16 / 2);
-            }
+        for valid_to in [0_u16, 1, 0x1FF6, 0x3FF6, 0x7FF6, 0xFFEF] {
+            let values: [u16; 32] = std::array::from_fn(|i| {
+                [0, 1, 2, 0x1FFF, 0x3FFF, 0x7FFF, 0xFFFF, i as u16][i % 8].wrapping_sub(i as u16 / 2)
+            });
+            let (no_return, beyond) = (valid_to.saturating_add(9), valid_to + 1);
+            let scan = Scan::of(
+                ScanHead { unit_um: 1000, valid_to, no_return, beyond, ..ScanHead::default() },
+                &values,
+            );
             for far in [false, true] {
-                let mut readings = [INVALID; BEAMS];
+                let mut readings = [INVALID; 32];
                 measure(&scan, far, &mut readings);
                 for (i, &reading) in readings.iter().enumerate() {
                     let expected = match Reading::of(&scan, i, far) {
@@ -324,7 +353,7 @@ mod tests {
                         Reading::Far => Background::FAR,
                         Reading::Invalid => INVALID,
                     };
-                    assert_eq!(reading, expected, "beam {i} of {range_bits} bits");
+                    assert_eq!(reading, expected, "beam {i} of {valid_to}");
                 }
             }
         }

@@ -1,7 +1,7 @@
 //! Finds reflectors: neighbouring beams with a raised intensity become one mark, at their average weighted by
 //! intensity (paper III.B.2). Refuses to know what a mark belongs to, and where the robot is.
 
-use schema::{MARKS, Mark, Marks, Scan};
+use schema::{Contents, MARKS, Mark, Marks, Scan, in_degrees};
 
 /// What makes a mark.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -40,15 +40,15 @@ impl MarkDetector {
     pub fn update(&mut self, scan: &Scan, out: &mut Marks) {
         let intensities = scan.intensities();
         let mut list = List { scan, out, count: 0, overflow: false };
-        let unit_mm = u32::from(scan.unit_mm);
-        let i_min = self.settings.i_min.max(1);
+        let unit_um = scan.unit_um;
+        let i_min = u16::from(self.settings.i_min.max(1));
         let mut open: Option<Open> = None;
-        for (i, &intensity) in intensities.iter().enumerate() {
+        for (i, intensity) in intensities.iter().enumerate() {
             if intensity < i_min && open.is_none() {
                 continue;
             }
             match (scan.range(i).filter(|_| intensity >= i_min), &mut open) {
-                (Some(value), Some(mark)) if mark.is_near(value, unit_mm, &self.settings) => {
+                (Some(value), Some(mark)) if mark.is_near(value, unit_um, &self.settings) => {
                     mark.join(i, value, intensity);
                 }
                 (Some(value), _) => {
@@ -75,7 +75,7 @@ impl MarkDetector {
 
 /// The sensor's mode has reflector bits, and they came.
 fn is_available(scan: &Scan) -> bool {
-    scan.intensity_bits != 0 && scan.contents & schema::CONTENTS_UPPER != 0
+    scan.intensity_bits != 0 && scan.contents & (Contents::UPPER | Contents::WIDE) != 0
 }
 
 /// The marks that were closed.
@@ -108,14 +108,14 @@ struct Open {
     /// Sum of w * r in device units.
     ranges: u64,
     last_range: u16,
-    peak: u8,
+    peak: u16,
     gap: u32,
     first_beam: usize,
     last_beam: usize,
 }
 
 impl Open {
-    fn at(i: usize, range: u16, intensity: u8) -> Open {
+    fn at(i: usize, range: u16, intensity: u16) -> Open {
         let mut open = Open {
             weight: 0,
             beams: 0,
@@ -130,11 +130,12 @@ impl Open {
         open
     }
 
-    fn is_near(&self, range: u16, unit_mm: u32, settings: &Settings) -> bool {
-        u32::from(range.abs_diff(self.last_range)) * unit_mm <= u32::from(settings.max_range_step_mm)
+    fn is_near(&self, range: u16, unit_um: u32, settings: &Settings) -> bool {
+        let apart_um = u64::from(range.abs_diff(self.last_range)) * u64::from(unit_um);
+        apart_um <= 1000 * u64::from(settings.max_range_step_mm)
     }
 
-    fn join(&mut self, i: usize, range: u16, intensity: u8) {
+    fn join(&mut self, i: usize, range: u16, intensity: u16) {
         let weight = u64::from(intensity);
         self.weight += weight;
         self.beams += weight * i as u64;
@@ -144,14 +145,18 @@ impl Open {
     }
 
     fn mark(&self, scan: &Scan) -> Mark {
-        let angle_mdeg = half_up(u64::from(scan.step_mdeg) * self.beams, self.weight);
+        // In integers, so that halves are rounded the same way on every machine; so long that nothing overflows, whatever the
+        // scan says.
+        let [first_udeg, step_udeg] =
+            [scan.first_angle, scan.step].map(|angle| (1e6 * in_degrees(angle)).round() as i128);
+        let weight = 1000 * i128::from(self.weight);
+        let angle = 2 * (first_udeg * i128::from(self.weight) + step_udeg * i128::from(self.beams)) + weight;
         let last = scan.beams() - 1;
         Mark {
-            angle_mdeg: scan.first_angle_mdeg.saturating_add(angle_mdeg as i32),
-            range_dmm: half_up(10 * u64::from(scan.unit_mm) * self.ranges, self.weight) as u32,
-            // Intensities have three bits: only what no sensor sends does not fit.
+            angle_mdeg: angle.div_euclid(2 * weight) as i32,
+            range_dmm: half_up(u128::from(scan.unit_um) * u128::from(self.ranges), 100 * self.weight) as u32,
             weight: u16::try_from(self.weight).unwrap_or(u16::MAX),
-            peak: self.peak,
+            peak: u8::try_from(self.peak).unwrap_or(u8::MAX),
             edge: u8::from(self.first_beam == 0 || self.last_beam == last),
             first_beam: self.first_beam as u16,
             last_beam: self.last_beam as u16,
@@ -160,7 +165,8 @@ impl Open {
 }
 
 /// The whole number next to `sum / weight`, the greater of two.
-fn half_up(sum: u64, weight: u64) -> u64 {
+fn half_up(sum: u128, weight: u64) -> u128 {
+    let weight = u128::from(weight);
     (2 * sum + weight) / (2 * weight)
 }
 

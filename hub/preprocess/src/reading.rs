@@ -20,8 +20,8 @@ impl Reading {
     pub(crate) fn of(scan: &Scan, i: usize, no_return_is_far: bool) -> Reading {
         match (scan.distance_mm(i), scan.code(i)) {
             (Some(range_mm), _) => Reading::Valid(range_mm),
-            (None, Some(Code::BEYOND)) => Reading::Far,
-            (None, Some(Code::NO_RETURN)) if no_return_is_far => Reading::Far,
+            (None, Some(Code::Beyond)) => Reading::Far,
+            (None, Some(Code::NoReturn)) if no_return_is_far => Reading::Far,
             _ => Reading::Invalid,
         }
     }
@@ -30,13 +30,13 @@ impl Reading {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use schema::ScanHead;
 
     #[test]
     fn codes_and_ranges() {
-        let mut scan = Scan { count: 11, unit_mm: 10, range_bits: 13, ..Scan::default() };
-        for code in 0..10 {
-            scan.range_array[usize::from(code)] = 0x1FFF - code;
-        }
+        let mut ranges: Vec<u16> = (0..10).map(|code| 0x1FFF - code).collect();
+        ranges.push(0);
+        let scan = Scan::of(ScanHead::lms(11, 0, 500, 10, 13), &ranges);
         let all = |far| (0..12).map(|i| Reading::of(&scan, i, far)).collect::<Vec<_>>();
         let mut expected = vec![Reading::Invalid; 12];
         expected[8] = Reading::Far;

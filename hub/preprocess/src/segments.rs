@@ -1,7 +1,7 @@
 //! Groups neighbouring foreground beams into segments, and computes where each segment is. Refuses to know why a beam
 //! is in the foreground, and what object a segment is.
 
-use schema::{BEAMS, Foreground, Pose, Scan, Segment};
+use schema::{Foreground, ForegroundArrays, Pose, Scan, Segment};
 
 /// Cuts the foreground of one sensor into segments.
 ///
@@ -10,9 +10,9 @@ use schema::{BEAMS, Foreground, Pose, Scan, Segment};
 pub struct Segmenter {
     pose: Pose,
     /// First angle and step of the scans that the tables below are for.
-    angles: Option<(i32, u16)>,
+    angles: Option<(f64, f64)>,
     /// Where each beam points in the robot's frame: a unit vector.
-    directions: [(f64, f64); BEAMS],
+    directions: Box<[(f64, f64)]>,
     /// 2 (1 - cos step): what the law of cosines says of two neighbouring beams.
     spread: f64,
     /// How far apart two neighbouring points of one surface are at most, per mm of range.
@@ -25,9 +25,10 @@ const FLATTEST_DEG: f64 = 10.0;
 const NOISE_MM: f64 = 15.0;
 
 impl Segmenter {
-    /// For a sensor that sits at `pose`.
-    pub fn new(pose: Pose) -> Segmenter {
-        Segmenter { pose, angles: None, directions: [(0.0, 0.0); BEAMS], spread: 0.0, slope: 0.0 }
+    /// For a sensor that sits at `pose` and has at most `beams` beams.
+    pub fn new(pose: Pose, beams: usize) -> Segmenter {
+        let directions = vec![(0.0, 0.0); beams].into();
+        Segmenter { pose, angles: None, directions, spread: 0.0, slope: 0.0 }
     }
 
     /// Fills in the segments of `foreground`, which was made from `scan`, and writes every byte of them.
@@ -36,9 +37,11 @@ impl Segmenter {
     /// of a surface seen at 10 degrees: r sin(step) / sin(10 degrees - step) + 15 mm, r being the first one's range.
     pub fn update(&mut self, scan: &Scan, foreground: &mut Foreground) {
         self.point(scan);
-        let unit_mm = f64::from(scan.unit_mm);
-        let (mut segments, mut left_out) = (0, 0_u8);
-        let mut put = |open: &Open, pose: &Pose| match foreground.segment_array.get_mut(segments) {
+        let unit_mm = f64::from(scan.unit_um) / 1000.0;
+        let head = **foreground;
+        let ForegroundArrays { segments: places, bits, ranges } = foreground.begin(head);
+        let (mut segments, mut left_out) = (0, 0_u16);
+        let mut put = |open: &Open, pose: &Pose| match places.get_mut(segments) {
             Some(segment) => {
                 *segment = open.close(pose, unit_mm);
                 segments += 1;
@@ -46,8 +49,8 @@ impl Segmenter {
             None => left_out = left_out.saturating_add(1),
         };
         let mut open: Option<Open> = None;
-        let mut ranges = foreground.range_array.iter();
-        for (byte, &bits) in foreground.bit_array.iter().enumerate() {
+        let mut ranges = ranges.iter();
+        for (byte, &bits) in bits.iter().enumerate() {
             let mut rest = bits;
             while rest != 0 {
                 let beam = 8 * byte + rest.trailing_zeros() as usize;
@@ -70,9 +73,9 @@ impl Segmenter {
         if let Some(done) = open {
             put(&done, &self.pose);
         }
+        places[segments..].fill(Segment::default());
         foreground.segments = segments as u16;
         foreground.left_out = left_out;
-        foreground.segment_array[segments..].fill(Segment::default());
     }
 
     /// A point at `next_mm` on the next beam belongs to one at `range_mm`.
@@ -83,16 +86,15 @@ impl Segmenter {
 
     /// Makes the tables for scans with the angles of `scan`.
     fn point(&mut self, scan: &Scan) {
-        let angles = Some((scan.first_angle_mdeg, scan.step_mdeg));
+        let angles = Some((scan.first_angle, scan.step));
         if self.angles == angles {
             return;
         }
         self.angles = angles;
         for (i, direction) in self.directions.iter_mut().enumerate() {
-            let angle_mdeg = i64::from(scan.first_angle_mdeg) + i as i64 * i64::from(scan.step_mdeg);
-            *direction = self.pose.direction((angle_mdeg % 360_000) as i32);
+            *direction = self.pose.direction(scan.first_angle + i as f64 * scan.step);
         }
-        let step = (f64::from(scan.step_mdeg) / 1000.0).to_radians();
+        let step = scan.step.abs();
         self.spread = 2.0 * (1.0 - step.cos());
         // Steps of 10 degrees and more are no scanner's; nothing but the noise joins them.
         let flattest = FLATTEST_DEG.to_radians();

@@ -12,30 +12,30 @@ use preprocess::background::{self, Method, Model};
 use preprocess::segments::Segmenter;
 use preprocess::{marks, zones};
 use rustix::thread::gettid;
-use schema::{Background, CONTENTS_UPPER, Foreground, Marks, Pose, Scan, Zones};
-use surroundings::{Shape, Surroundings};
+use schema::{Background, Foreground, Marks, Pose, Scan, Zones};
+use surroundings::{BEAMS, Shape, Surroundings};
 
 #[test]
 fn a_scan_takes_nothing_from_the_heap() {
     let mut random = fastrand::Rng::with_seed(1);
-    let mut scans: Vec<Scan> = Vec::new();
+    let mut scans: Vec<Box<Scan>> = Vec::new();
     for seed in 0..20 {
         let mut surroundings = Surroundings::new(Shape::any(&mut random), seed);
         scans.extend((0..50).map(|_| surroundings.next()));
     }
     for scan in &mut scans {
         scan.intensity_bits = 3;
-        scan.contents = CONTENTS_UPPER;
-        scan.upper_array.iter_mut().for_each(|intensity| *intensity = random.u8(..8));
+        scan.arrays().upper.iter_mut().for_each(|intensity| *intensity = random.u8(..8));
     }
     let pose = Pose { x_m: 0.3, yaw_rad: 1.0, ..Pose::default() };
-    let mut check = zones::Check::new(pose, &zones::Settings::default());
+    let mut check = zones::Check::new(pose, &zones::Settings::default(), BEAMS);
     let mut finder = marks::MarkDetector::new(marks::Settings::default());
-    let mut models = [Method::Paper, Method::Multi]
-        .map(|method| Model::new(background::Settings { method, scans: Some(10), ..Default::default() }));
-    let mut cutter = Segmenter::new(pose);
+    let settings = |method| background::Settings { method, scans: Some(10), ..Default::default() };
+    let mut models = [Method::Paper, Method::Multi].map(|method| Model::new(settings(method), BEAMS));
+    let mut cutter = Segmenter::new(pose, BEAMS);
     let (mut zones, mut marks) = (Zones::default(), Marks::default());
-    let (mut foreground, mut background) = (Foreground::default(), Background::default());
+    let mut foreground = Foreground::of(BEAMS);
+    let mut background = Background::zeroed(Background::len(BEAMS));
     let mut segments = 0;
 
     WATCHED.store(gettid().as_raw_nonzero().get(), Relaxed);

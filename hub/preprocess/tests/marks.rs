@@ -4,7 +4,7 @@ mod scans;
 
 use fastrand::Rng;
 use preprocess::marks::{MarkDetector, Settings};
-use schema::{CONTENTS_UPPER, MARKS, Mark, Marks, Scan};
+use schema::{MARKS, Mark, Marks, Scan, ScanHead};
 
 /// A beam that belongs to a mark: its index, range in mm and intensity.
 #[derive(Clone, Copy)]
@@ -18,12 +18,12 @@ struct Hit {
 fn groups(scan: &Scan, settings: Settings) -> Vec<Vec<Hit>> {
     let mut groups: Vec<Vec<Hit>> = Vec::new();
     for beam in 0..usize::from(scan.count) {
-        let (value, intensity) = (scan.range_array[beam], scan.upper_array[beam]);
-        let is_code = i32::from(value) >= (1 << scan.range_bits) - 9;
+        let (value, intensity) = (scan.ranges()[beam], scan.upper()[beam]);
+        let is_code = value > scan.no_return - 9;
         if is_code || intensity < settings.i_min.max(1) {
             continue;
         }
-        let hit = Hit { beam, range_mm: f64::from(value) * f64::from(scan.unit_mm), intensity };
+        let hit = Hit { beam, range_mm: f64::from(value) * scans::unit_mm(scan), intensity };
         let joins = groups.last().and_then(|group| group.last()).is_some_and(|last| {
             let step_mm = (hit.range_mm - last.range_mm).abs();
             beam - last.beam - 1 <= usize::from(settings.max_gap)
@@ -40,8 +40,7 @@ fn groups(scan: &Scan, settings: Settings) -> Vec<Vec<Hit>> {
 fn assert_mark(scan: &Scan, group: &[Hit], mark: &Mark) {
     let sum = |of: &dyn Fn(&Hit) -> f64| group.iter().map(|hit| f64::from(hit.intensity) * of(hit)).sum();
     let weight: f64 = sum(&|_| 1.0);
-    let angle: f64 =
-        sum(&|hit| f64::from(scan.first_angle_mdeg) + hit.beam as f64 * f64::from(scan.step_mdeg));
+    let angle: f64 = sum(&|hit| 1000.0 * (scan.first_angle + hit.beam as f64 * scan.step).to_degrees());
     let range: f64 = sum(&|hit| hit.range_mm);
     // The nearest thousandth of a degree and tenth of a millimetre; halves go up.
     let nearest = |exact: f64, said: f64| (-0.5 - 1e-6..0.5 + 1e-6).contains(&(exact - said));
@@ -56,7 +55,8 @@ fn assert_mark(scan: &Scan, group: &[Hit], mark: &Mark) {
 
 /// A wall with steps in it, reflectors here and there.
 fn fill(random: &mut Rng, scan: &mut Scan) {
-    let max = (1 << scan.range_bits) - 1;
+    let max = scan.no_return;
+    let unit_mm = scans::unit_mm(scan) as u16;
     let seldom = [2, 10, 40][random.usize(..3)];
     let mut wall = random.u16(..max - 1000);
     let mut lit = 0;
@@ -67,11 +67,13 @@ fn fill(random: &mut Rng, scan: &mut Scan) {
         if lit == 0 && random.u8(..seldom) == 0 {
             lit = random.u8(1..8);
         }
-        scan.range_array[i] = match random.u8(..15) {
+        let range = match random.u8(..15) {
             0 => scans::code(random, scan),
-            _ => (wall + random.u16(..150 / u16::from(scan.unit_mm))).min(max - 9),
+            _ => (wall + random.u16(..150 / unit_mm)).min(max - 9),
         };
-        scan.upper_array[i] = if lit > 0 { random.u8(..1 << scan.intensity_bits) } else { 0 };
+        scan.arrays().ranges[i] = range;
+        let bits = scan.intensity_bits;
+        scan.arrays().upper[i] = if lit > 0 { random.u8(..1 << bits) } else { 0 };
         lit = lit.saturating_sub(1);
     }
 }
@@ -107,20 +109,11 @@ fn marks_are_those_of_the_definition() {
 }
 
 /// Eleven beams at 1 m, a degree apart.
-fn lit(intensities: &[(usize, u8)]) -> Scan {
-    let mut scan = Scan {
-        count: 11,
-        unit_mm: 1,
-        range_bits: 13,
-        first_angle_mdeg: -1000,
-        step_mdeg: 1000,
-        intensity_bits: 3,
-        contents: CONTENTS_UPPER,
-        ..Scan::default()
-    };
-    scan.range_array[..11].fill(1000);
+fn lit(intensities: &[(usize, u8)]) -> Box<Scan> {
+    let head = ScanHead { intensity_bits: 3, ..ScanHead::lms(11, -1000, 1000, 1, 13) };
+    let mut scan = Scan::of(head, &[1000; 11]);
     for &(i, intensity) in intensities {
-        scan.upper_array[i] = intensity;
+        scan.arrays().upper[i] = intensity;
     }
     scan
 }
@@ -134,8 +127,8 @@ fn find(scan: &Scan, settings: Settings) -> Marks {
 #[test]
 fn halves_are_rounded_up() {
     let mut scan = lit(&[(4, 1), (5, 1)]);
-    scan.range_array[4] = 1001;
-    scan.step_mdeg = 1;
+    scan.arrays().ranges[4] = 1001;
+    scan.step = 0.001_f64.to_radians();
     let mark = find(&scan, Settings::default()).mark_array[0];
     assert_eq!((mark.angle_mdeg, mark.range_dmm), (-1000 + 5, 10_005));
     // 8/3 and 7/3 degrees after the first.

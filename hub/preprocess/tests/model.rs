@@ -2,29 +2,37 @@
 
 use preprocess::background::{Class, Method, Mismatch, Model, Settings, Start};
 use preprocess::segments::Segmenter;
-use schema::{Background, Foreground, Pose, Scan};
+use schema::{Background, BackgroundHead, Foreground, Pose, Scan, ScanHead};
+
+/// The most beams of a scan.
+const BEAMS: usize = 401;
 
 const METHODS: [Method; 2] = [Method::Paper, Method::Multi];
 
-fn scan(count: u16, unit_mm: u8, range: u16) -> Scan {
-    let mut scan = Scan { count, unit_mm, range_bits: 13, step_mdeg: 500, ..Scan::default() };
-    scan.range_array[..usize::from(count)].fill(range);
-    scan
+fn scan(count: usize, unit_mm: u32, range: u16) -> Box<Scan> {
+    Scan::of(ScanHead::lms(count, 0, 500, unit_mm, 13), &vec![range; count])
 }
 
 fn model(method: Method) -> Model {
-    Model::new(Settings { method, scans: Some(8), ..Settings::default() })
+    Model::new(Settings { method, scans: Some(8), ..Settings::default() }, BEAMS)
 }
 
-fn shown(model: &Model) -> Background {
-    let mut background = bytemuck::pod_read_unaligned(&[0xA5; size_of::<Background>()]);
+fn shown(model: &Model) -> Box<Background> {
+    let mut background = Background::of_bytes(&[0xA5; Background::len(BEAMS)]);
     model.show(&mut background);
     background
 }
 
+/// `model` with another head.
+fn with(model: &Background, change: impl FnOnce(&mut BackgroundHead)) -> Box<Background> {
+    let mut other = model.boxed();
+    change(&mut other);
+    other
+}
+
 /// Shows `scan` to `model` so many times; the last foreground.
-fn look(model: &mut Model, scan: &Scan, times: usize) -> Foreground {
-    let mut out = Foreground::default();
+fn look(model: &mut Model, scan: &Scan, times: usize) -> Box<Foreground> {
+    let mut out = Foreground::of(scan.beams());
     (0..times).for_each(|_| model.update(scan, &mut out));
     out
 }
@@ -33,16 +41,16 @@ fn look(model: &mut Model, scan: &Scan, times: usize) -> Foreground {
 fn learned_compared_frozen_thawed_and_reset() {
     for method in METHODS {
         let mut model = model(method);
-        assert_eq!((model.classes(), shown(&model)), (&[][..], Background::default()));
+        assert_eq!((model.classes(), shown(&model)), (&[][..], Box::default()));
         look(&mut model, &scan(361, 1, 3_000), 8);
         let known = shown(&model);
-        assert_eq!((known.count, known.taught, known.generation, known.unit_mm), (361, 361, 0, 1));
-        assert!(known.ranges().iter().all(|&range| range == 3_000) && known.range_array[361] == 0);
+        assert_eq!((known.count, known.taught, known.generation, known.unit_um), (361, 361, 0, 1000));
+        assert!(known.ranges().iter().all(|&range| range == 3_000) && known.ranges().len() == 361);
 
         model.freeze();
         let out = look(&mut model, &scan(361, 1, 2_000), 100);
-        assert_eq!((out.beams, out.ranges()[360], out.range_array[361]), (361, 2_000, 0));
-        assert_eq!(shown(&model), Background { flags: Background::FROZEN, ..known });
+        assert_eq!((out.beams, out.ranges()[360], out.ranges().len()), (361, 2_000, 361));
+        assert_eq!(shown(&model), with(&known, |head| head.flags = Background::FROZEN));
         look(&mut model, &scan(361, 1, 4_000), 1);
         assert!(model.is_frozen() && model.classes().iter().all(|&class| class == Class::Behind));
         model.thaw();
@@ -62,8 +70,10 @@ fn another_shape_begins_anew() {
         let mut model = model(method);
         look(&mut model, &scan(361, 1, 3_000), 20);
         let mut generation = 0;
-        let finer = Scan { step_mdeg: 250, ..scan(361, 1, 3_000) };
-        let turned = Scan { first_angle_mdeg: 40_000, ..finer };
+        let mut finer = scan(361, 1, 3_000);
+        finer.step /= 2.0;
+        let mut turned = finer.clone();
+        turned.first_angle = -1.0;
         for other in [scan(181, 1, 3_000), scan(181, 10, 300), scan(361, 1, 3_000), finer, turned] {
             generation += 1;
             assert_eq!(look(&mut model, &other, 1).generation, generation);
@@ -77,14 +87,15 @@ fn another_shape_begins_anew() {
 #[test]
 fn a_saved_model_is_taken_if_it_fits() {
     for method in METHODS {
-        let mut saved = Background { count: 361, unit_mm: 1, generation: 77, ..Background::default() };
-        saved.range_array[..361].fill(3_000);
-        saved.range_array[..3].copy_from_slice(&[0, Background::FAR, 2_500]);
+        let head = BackgroundHead { unit_um: 1000, generation: 77, ..BackgroundHead::default() };
+        let mut saved = Background::of(head, &[3_000; 361]);
+        saved.ranges_mut()[..3].copy_from_slice(&[0, Background::FAR, 2_500]);
+        let short = |unit_um| Background::of(BackgroundHead { unit_um, ..head }, &saved.ranges()[..181]);
 
         // Before the first scan.
         let mut early = model(method);
         early.load(&saved).unwrap();
-        assert_eq!(shown(&early), Background { generation: 1, taught: 360, ..saved });
+        assert_eq!(shown(&early), with(&saved, |head| (head.generation, head.taught) = (1, 360)));
         let out = look(&mut early, &scan(361, 1, 1_000), 1);
         assert_eq!((out.generation, out.beams), (1, 360));
 
@@ -97,14 +108,13 @@ fn a_saved_model_is_taken_if_it_fits() {
         // Later it is refused, and the model stays what it was.
         let before = shown(&wrong);
         let refusal = wrong.load(&saved).unwrap_err();
-        assert_eq!(refusal, Mismatch { model: (361, 1), sensor: (181, 1) });
-        let cm = Background { unit_mm: 10, count: 181, ..saved };
+        assert_eq!(refusal, Mismatch { model: (361, 1000), sensor: (181, 1000) });
         assert_eq!(
-            wrong.load(&cm).unwrap_err().to_string(),
+            wrong.load(&short(10_000)).unwrap_err().to_string(),
             "the model has 181 beams in units of 10 mm, the sensor's scans have 181 beams in units of 1 mm"
         );
         assert_eq!(shown(&wrong), before);
-        wrong.load(&Background { count: 181, ..saved }).unwrap();
+        wrong.load(&short(1000)).unwrap();
         assert_eq!((wrong.generation(), shown(&wrong).taught), (3, 180));
     }
 }
@@ -112,7 +122,8 @@ fn a_saved_model_is_taken_if_it_fits() {
 #[test]
 fn the_first_scan_may_be_the_background() {
     for method in METHODS {
-        let mut model = Model::new(Settings { method, start: Start::FirstScan, ..Settings::default() });
+        let mut model =
+            Model::new(Settings { method, start: Start::FirstScan, ..Settings::default() }, BEAMS);
         look(&mut model, &scan(361, 1, 3_000), 1);
         assert!(
             model.classes().iter().all(|&class| class == Class::Unknown),
@@ -134,18 +145,18 @@ fn a_wall_seldom_seen_is_learned_and_who_stands_there_is_not() {
     let mut random = fastrand::Rng::with_seed(3);
     let mut some = |share: f64, range: u16| {
         let mut scan = scan(361, 1, 8191);
-        for value in &mut scan.range_array[..361] {
+        for value in scan.arrays().ranges {
             *value = if random.f64() < share { range } else { 8191 };
         }
         scan
     };
-    let mut model = Model::new(Settings::default());
+    let mut model = Model::new(Settings::default(), BEAMS);
     (0..750).for_each(|_| _ = look(&mut model, &some(0.15, 5_000), 1));
     let wall = look(&mut model, &some(1.0, 5_000), 1).beams;
     let before_it = look(&mut model, &some(1.0, 3_000), 1).beams;
     assert!(wall < 10 && before_it == 361, "{wall} beams of the wall, {before_it} before it");
 
-    let mut model = Model::new(Settings::default());
+    let mut model = Model::new(Settings::default(), BEAMS);
     look(&mut model, &some(0.0, 0), 600);
     (0..187).for_each(|_| _ = look(&mut model, &some(0.97, 3_000), 1));
     let standing = look(&mut model, &some(1.0, 3_000), 1).beams;
@@ -168,23 +179,24 @@ fn no_scan_makes_it_panic() {
                 no_return_is_far: Some(random.bool()),
                 ..Settings::default()
             };
-            let mut model = Model::new(settings);
-            let mut cutter = Segmenter::new(Pose { x_m: f64::NAN, y_m: f64::MAX, ..Pose::default() });
-            let mut bytes = [0_u8; size_of::<Scan>()];
+            let mut model = Model::new(settings, BEAMS);
+            let mut cutter = Segmenter::new(Pose { x_m: f64::NAN, y_m: f64::MAX, ..Pose::default() }, BEAMS);
+            let mut bytes = [0_u8; Scan::len(BEAMS + 20, 1)];
             for _ in 0..40 {
                 // A sensor keeps the shape of its scans for a while, however odd it is.
-                let from = if random.u8(..8) == 0 { 0 } else { 12 };
+                let from = if random.u8(..8) == 0 { 0 } else { Scan::HEAD };
                 random.fill(&mut bytes[from..]);
-                let scan: Scan = bytemuck::pod_read_unaligned(&bytes);
-                let mut out: Foreground = bytemuck::pod_read_unaligned(&[0xFF; size_of::<Foreground>()]);
+                let scan = Scan::of_bytes(&bytes);
+                let dirty = || Foreground::of_bytes(&[0xFF; Foreground::len(BEAMS)]);
+                let mut out = dirty();
                 model.update(&scan, &mut out);
-                assert_eq!(model.classes().len(), scan.beams());
+                assert_eq!(model.classes().len(), scan.beams().min(BEAMS));
                 assert_eq!(out.readings().count(), usize::from(out.beams));
                 cutter.update(&scan, &mut out);
-                let mut foreign: Foreground = bytemuck::pod_read_unaligned(&[0xFF; size_of::<Foreground>()]);
+                let mut foreign = dirty();
+                foreign.count = BEAMS as u16;
                 cutter.update(&scan, &mut foreign);
-                let saved = bytemuck::pod_read_unaligned(&bytes[..size_of::<Background>()]);
-                let _ = model.load(&saved);
+                let _ = model.load(&Background::of_bytes(&bytes));
                 shown(&model);
             }
         }

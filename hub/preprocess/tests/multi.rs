@@ -6,7 +6,8 @@ mod surroundings;
 use preprocess::background::{Class, Method, Model, Settings, Start};
 use schema::{Background, Scan};
 use surroundings::{
-    Shape, Surroundings, any_choice, any_model, apart_at_most_mm, check_scan, ranges_mm, reading_mm,
+    BEAMS, Shape, Surroundings, any_choice, any_model, apart_at_most_mm, check_scan, ranges_mm, reading_mm,
+    unit_mm,
 };
 
 /// A surface as a beam remembers it.
@@ -55,7 +56,7 @@ impl Slow {
 
     fn load(&mut self, model: &Background) {
         self.reset(model.count);
-        let far = |mm: f64| if mm.is_infinite() { FAR } else { mm / f64::from(model.unit_mm) };
+        let far = |mm: f64| if mm.is_infinite() { FAR } else { mm / unit_mm(model.unit_um) };
         ranges_mm(model).into_iter().enumerate().for_each(|(i, mm)| self.adopt(i, far(mm)));
         self.fresh = false;
     }
@@ -72,17 +73,17 @@ impl Slow {
     }
 
     fn update(&mut self, scan: &Scan) -> Vec<Class> {
-        let unit_mm = f64::from(scan.unit_mm);
+        let unit_mm = unit_mm(scan.unit_um);
         let far = self.settings.no_return_is_far.unwrap_or(true);
         let threshold = (apart_at_most_mm(self.settings.threshold_mm, scan) / unit_mm).floor();
-        let scans = (750.0 * f64::from(scan.step_mdeg) / 1000.0).ceil();
+        let scans = (750.0 * (1000.0 * scan.step.to_degrees()).round() / 1000.0).ceil();
         let scans = self.settings.scans.map_or(scans, f64::from);
         self.scans = scans;
         let readings: Vec<Option<f64>> =
             (0..self.beams.len()).map(|i| Some((reading_mm(scan, i, far)? / unit_mm).min(FAR))).collect();
         let mut classes: Vec<Class> =
             (0..readings.len()).map(|i| self.class(i, readings[i], threshold, scans)).collect();
-        self.believe(&mut classes, &readings, unit_mm, f64::from(scan.step_mdeg));
+        self.believe(&mut classes, &readings, unit_mm, (1000.0 * scan.step.to_degrees()).round());
         if !self.frozen {
             for (i, reading) in readings.iter().enumerate() {
                 let Some(reading) = *reading else { continue };
@@ -188,7 +189,7 @@ fn identical_beam_by_beam() {
             ..Settings::default()
         };
         let mut surroundings = Surroundings::new(Shape::any(&mut random), seed);
-        let mut model = Model::new(settings);
+        let mut model = Model::new(settings, BEAMS);
         let mut slow = Slow::new(settings, surroundings.shape.count);
         let mut generation = 0;
         for number in 0..2_000 {
@@ -221,7 +222,7 @@ fn identical_beam_by_beam() {
             check_scan(&mut model, &scan, &classes, generation, dirt, place);
             classes.iter().for_each(|&class| seen[class as usize] += 1);
         }
-        let mut shown = Background::default();
+        let mut shown = Background::zeroed(Background::len(BEAMS));
         model.show(&mut shown);
         for (i, &range) in shown.ranges().iter().enumerate() {
             let known: Vec<f64> =

@@ -6,7 +6,7 @@ mod surroundings;
 use preprocess::background::{Candidate, Class, Method, Model, Settings, Start};
 use schema::{Background, Scan};
 use surroundings::{
-    Shape, Surroundings, any_choice, any_model, apart_at_most_mm, check_scan, ranges_mm, reading_mm,
+    BEAMS, Shape, Surroundings, any_choice, any_model, apart_at_most_mm, check_scan, ranges_mm, reading_mm,
 };
 
 /// One beam as the paper has it.
@@ -49,7 +49,7 @@ impl Slow {
         let far = self.settings.no_return_is_far.unwrap_or(false);
         let threshold_mm = apart_at_most_mm(self.settings.threshold_mm, scan);
         let candidate_mm = apart_at_most_mm(self.settings.candidate_mm, scan);
-        let ten_seconds = (10.0 * 75.0 * f64::from(scan.step_mdeg) / 1000.0).ceil();
+        let ten_seconds = (10.0 * 75.0 * (1000.0 * scan.step.to_degrees()).round() / 1000.0).ceil();
         let scans = self.settings.scans.map_or(ten_seconds, f64::from);
         let classes = self
             .beams
@@ -117,7 +117,7 @@ fn identical_beam_by_beam() {
         let mut random = fastrand::Rng::with_seed(seed);
         let settings = any_settings(&mut random);
         let mut surroundings = Surroundings::new(Shape::any(&mut random), seed);
-        let mut model = Model::new(settings);
+        let mut model = Model::new(settings, BEAMS);
         let mut slow = Slow::new(settings, surroundings.shape.count);
         let mut generation = 0;
         for number in 0..2_000 {
@@ -160,7 +160,7 @@ fn identical_beam_by_beam() {
             check_scan(&mut model, &scan, &classes, generation, dirt, place);
             classes.iter().for_each(|&class| seen[class as usize] += 1);
         }
-        let mut shown = Background::default();
+        let mut shown = Background::zeroed(Background::len(BEAMS));
         model.show(&mut shown);
         assert_eq!(ranges_mm(&shown), slow.beams.iter().map(|b| b.background_mm).collect::<Vec<_>>());
         assert_eq!((shown.generation, shown.is_frozen()), (generation, slow.frozen));

@@ -1,27 +1,32 @@
 //! Segments against a slow version of them: every point by sine and cosine, every distance from two points.
 
 use preprocess::segments::Segmenter;
-use schema::{BEAMS, Foreground, Pose, SEGMENTS, Scan, Segment};
+use schema::{Foreground, ForegroundHead, Pose, SEGMENTS, Scan, ScanHead, Segment};
+
+/// Beams of every scan here.
+const BEAMS: usize = 401;
 
 /// A foreground with the beams `ranges`, in the order of the beams.
-fn foreground(ranges: &[(usize, u16)]) -> Foreground {
-    let mut foreground: Foreground = bytemuck::pod_read_unaligned(&[0xA5; size_of::<Foreground>()]);
-    foreground.bit_array.fill(0);
-    foreground.range_array.fill(0);
+fn foreground(ranges: &[(usize, u16)]) -> Box<Foreground> {
+    let mut foreground = Foreground::of_bytes(&vec![0xA5; Foreground::len(BEAMS)]);
+    let head =
+        ForegroundHead { count: BEAMS as u16, beams: ranges.len() as u16, ..ForegroundHead::default() };
+    let arrays = foreground.begin(head);
+    arrays.bits.fill(0);
+    arrays.ranges.fill(0);
     for (place, &(beam, range)) in ranges.iter().enumerate() {
-        foreground.bit_array[beam / 8] |= 1 << (beam % 8);
-        foreground.range_array[place] = range;
+        arrays.bits[beam / 8] |= 1 << (beam % 8);
+        arrays.ranges[place] = range;
     }
-    foreground.beams = ranges.len() as u16;
     foreground
 }
 
 /// Where beam `i` of `scan` ends in the robot's frame, in mm.
 fn point(scan: &Scan, pose: &Pose, i: usize, range: u16) -> (f64, f64) {
-    let turned = (f64::from(scan.first_angle_mdeg) + i as f64 * f64::from(scan.step_mdeg)) / 1000.0 - 90.0;
+    let turned = scan.first_angle + i as f64 * scan.step;
     let turned = if pose.upside_down == 1 { -turned } else { turned };
-    let angle = pose.yaw_rad + turned.to_radians();
-    let range_mm = f64::from(range) * f64::from(scan.unit_mm);
+    let angle = pose.yaw_rad + turned;
+    let range_mm = f64::from(range) * f64::from(scan.unit_um) / 1000.0;
     (1000.0 * pose.x_m + range_mm * angle.cos(), 1000.0 * pose.y_m + range_mm * angle.sin())
 }
 
@@ -36,13 +41,8 @@ fn segments_are_those_of_the_formula() {
     for round in 0..3_000 {
         let step_mdeg = [250, 500, 1000][random.usize(..3)];
         let unit_mm = [1, 10, 100][random.usize(..3)];
-        let scan = Scan {
-            count: 361,
-            unit_mm,
-            step_mdeg,
-            first_angle_mdeg: random.i32(..90_000),
-            ..Scan::default()
-        };
+        let head = ScanHead::lms(BEAMS, random.i32(-180_000..0), step_mdeg, unit_mm, 13);
+        let scan = Scan::of(head, &[0; BEAMS]);
         let pose = Pose {
             x_m: random.f64() - 0.5,
             y_m: random.f64() - 0.5,
@@ -70,10 +70,11 @@ fn segments_are_those_of_the_formula() {
         most = most.max(expected.len());
 
         let mut out = foreground(&ranges);
-        Segmenter::new(pose).update(&scan, &mut out);
+        Segmenter::new(pose, BEAMS).update(&scan, &mut out);
         assert_eq!(usize::from(out.segments), expected.len().min(SEGMENTS), "round {round}");
         assert_eq!(usize::from(out.left_out), expected.len().saturating_sub(SEGMENTS));
-        assert!(out.segment_array[out.segments().len()..].iter().all(|rest| *rest == Segment::default()));
+        let (used, head) = (out.segments().len(), **out);
+        assert!(out.clone().begin(head).segments[used..].iter().all(|rest| *rest == Segment::default()));
         for (segment, beams) in out.segments().iter().zip(expected) {
             let ((first, a), (last, b)) = (beams[0], beams[beams.len() - 1]);
             assert_eq!((usize::from(segment.first), usize::from(segment.last)), (first, last));
@@ -96,14 +97,14 @@ fn segments_are_those_of_the_formula() {
 
 #[test]
 fn other_angles_are_pointed_anew() {
-    let mut cutter = Segmenter::new(Pose::default());
+    let mut cutter = Segmenter::new(Pose::default(), BEAMS);
     let mut x_mm = |first_angle_mdeg, step_mdeg| {
-        let scan = Scan { count: 361, unit_mm: 1, first_angle_mdeg, step_mdeg, ..Scan::default() };
+        let scan = Scan::of(ScanHead::lms(BEAMS, first_angle_mdeg, step_mdeg, 1, 13), &[0; BEAMS]);
         let mut out = foreground(&[(180, 1_000)]);
         cutter.update(&scan, &mut out);
         (out.segments()[0].x_mm, out.segments()[0].y_mm)
     };
-    assert_eq!(x_mm(0, 500), (1_000, 0));
-    assert_eq!(x_mm(0, 1000), (0, 1_000));
-    assert_eq!(x_mm(-90_000, 1000), (1_000, 0));
+    assert_eq!(x_mm(-90_000, 500), (1_000, 0));
+    assert_eq!(x_mm(-90_000, 1000), (0, 1_000));
+    assert_eq!(x_mm(-180_000, 1000), (1_000, 0));
 }

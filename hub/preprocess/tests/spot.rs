@@ -3,11 +3,11 @@
 //!
 //! The model: a Gaussian spot, 10 mm wide and 4.5 mm more per metre, where the light is down to 1/e^2; the level of
 //! intensity is the share of its light that falls on the strip, of 7, with noise; a range has its own noise. The strip
-//! stands squarely to its beam anywhere between 20 and 160 degrees. A constant error of a device is left out.
+//! stands squarely to its beam anywhere between -70 and 70 degrees. A constant error of a device is left out.
 
 use fastrand::Rng;
 use preprocess::marks::{MarkDetector, Settings};
-use schema::{CONTENTS_UPPER, Marks, Scan};
+use schema::{Marks, Scan, ScanHead};
 
 const RANGE_SIGMA_MM: f64 = 5.0;
 const LEVEL_SIGMA: f64 = 0.3;
@@ -31,20 +31,12 @@ fn share(width_mm: f64, aside_mm: f64, sigma_mm: f64) -> f64 {
 }
 
 /// A scan at half degrees of one strip before nothing.
-fn look(random: &mut Rng, width_mm: f64, range_mm: f64, angle_deg: f64) -> Scan {
-    let mut scan = Scan {
-        count: 361,
-        unit_mm: 1,
-        range_bits: 13,
-        step_mdeg: 500,
-        intensity_bits: 3,
-        contents: CONTENTS_UPPER,
-        ..Scan::default()
-    };
+fn look(random: &mut Rng, width_mm: f64, range_mm: f64, angle_deg: f64) -> Box<Scan> {
+    let head = ScanHead { intensity_bits: 3, ..ScanHead::lms(361, -90_000, 500, 1, 13) };
+    let mut scan = Scan::of(head, &[0x1FFF; 361]);
     let sigma_mm = (10.0 + 4.5 * range_mm / 1000.0) / 4.0;
     for i in 0..361 {
         let off = (scan.angle_deg(i) - angle_deg).to_radians();
-        scan.range_array[i] = 0x1FFF;
         if off.abs() > 0.2 {
             continue;
         }
@@ -52,7 +44,8 @@ fn look(random: &mut Rng, width_mm: f64, range_mm: f64, angle_deg: f64) -> Scan 
         let level = (7.0 * share + LEVEL_SIGMA * normal(random)).round().clamp(0.0, 7.0);
         if share > 0.01 {
             let range_mm = range_mm / off.cos() + RANGE_SIGMA_MM * normal(random);
-            (scan.range_array[i], scan.upper_array[i]) = (range_mm.round() as u16, level as u8);
+            let arrays = scan.arrays();
+            (arrays.ranges[i], arrays.upper[i]) = (range_mm.round() as u16, level as u8);
         }
     }
     scan
@@ -64,7 +57,7 @@ fn errors(width_mm: f64, range_mm: f64, random: &mut Rng) -> (f64, f64) {
     let mut marks = Marks::default();
     let (mut of_angle, mut of_range) = (0.0, 0.0);
     for _ in 0..TRIALS {
-        let angle_deg = 20.0 + 140.0 * random.f64();
+        let angle_deg = -70.0 + 140.0 * random.f64();
         finder.update(&look(random, width_mm, range_mm, angle_deg), &mut marks);
         let [mark] = marks.marks() else { panic!("{} marks at {range_mm} mm", marks.count) };
         of_angle += (f64::from(mark.angle_mdeg) / 1000.0 - angle_deg).powi(2);

@@ -6,7 +6,7 @@ mod scans;
 
 use fastrand::Rng;
 use preprocess::zones::{Check, Sector, Settings};
-use schema::{Pose, Scan, Verdict, Zones};
+use schema::{Pose, Scan, ScanHead, Verdict, Zones};
 
 /// One random configuration.
 struct Case {
@@ -21,7 +21,7 @@ impl Case {
         let mut radii: Vec<u16> = (0..random.usize(1..=8)).map(|_| random.u16(50..3000)).collect();
         radii.sort_unstable_by(|a, b| b.cmp(a));
         let sectors = (0..random.usize(..4)).map(|_| {
-            let from_mdeg = 250 * random.i32(0..720);
+            let from_mdeg = 250 * random.i32(-360..360);
             Sector { from_mdeg, to_mdeg: from_mdeg + 250 * random.i32(0..80), range_mm: random.u16(..2000) }
         });
         let sectors = sectors.collect();
@@ -39,14 +39,14 @@ impl Case {
 
     fn check(&self) -> Check {
         let (radii_mm, self_min) = (&self.radii[..], &self.sectors[..]);
-        Check::new(self.pose, &Settings { radii_mm, self_min, ..self.settings })
+        Check::new(self.pose, &Settings { radii_mm, self_min, ..self.settings }, 401)
     }
 
     /// Direction of a beam and what the robot's own body takes of it, in mm.
     fn beam(&self, scan: &Scan, i: usize) -> ([f64; 2], f64) {
-        let mdeg = scan.first_angle_mdeg + i as i32 * i32::from(scan.step_mdeg);
+        let mdeg = (1000.0 * (scan.first_angle + i as f64 * scan.step).to_degrees()).round() as i32;
         let sense = if self.pose.upside_down == 1 { -1.0 } else { 1.0 };
-        let angle = self.pose.yaw_rad + sense * (f64::from(mdeg) / 1000.0 - 90.0).to_radians();
+        let angle = self.pose.yaw_rad + sense * (f64::from(mdeg) / 1000.0).to_radians();
         let covers = |sector: &&Sector| sector.from_mdeg <= mdeg && mdeg <= sector.to_mdeg;
         let own = self.sectors.iter().filter(covers).map(|sector| sector.range_mm).max().unwrap_or(0);
         ([angle.cos(), angle.sin()], f64::from(own))
@@ -81,7 +81,7 @@ impl Case {
     /// There is a reading of the scan's kind that would be inside the largest circle: the shortest one beyond the robot's
     /// own body and the circle's near side, if any.
     fn tells(&self, scan: &Scan, u: [f64; 2], own: f64) -> bool {
-        let (unit, radius) = (f64::from(scan.unit_mm), f64::from(self.radii[0]));
+        let (unit, radius) = (scans::unit_mm(scan), f64::from(self.radii[0]));
         let shortest = (own.max(self.chord(u, radius).0) / unit).floor();
         let values = [shortest, shortest + 1.0].into_iter().filter(|value| *value < f64::from(max(scan) - 8));
         values.into_iter().any(|value| self.violates(u, own, value * unit, radius))
@@ -105,22 +105,23 @@ impl Case {
         for i in 0..usize::from(scan.count) {
             let (u, own) = self.beam(scan, i);
             let (lo, hi) = self.chord(u, f64::from(self.radii[random.usize(..self.radii.len())]));
-            let near = [lo, hi, own][random.usize(..3)] / f64::from(scan.unit_mm) + 2.0;
+            let near = [lo, hi, own][random.usize(..3)] / scans::unit_mm(scan) + 2.0;
             let anywhere = random.u16(..max - 8);
             let value = match random.u8(..4) {
                 0 if crowded => (near as u16).saturating_sub(random.u16(..5)),
                 1 if crowded => (near as u16).saturating_add(random.u16(..50)),
-                _ => anywhere.max(4000 / u16::from(scan.unit_mm)),
+                _ => anywhere.max((4_000_000 / scan.unit_um) as u16),
             };
-            scan.range_array[i] =
+            let value =
                 if random.u8(..200) < broken { scans::code(random, scan) } else { value.min(max - 9) };
+            scan.arrays().ranges[i] = value;
         }
     }
 }
 
 /// The greatest value of a range.
 fn max(scan: &Scan) -> u16 {
-    (1 << scan.range_bits) - 1
+    scan.no_return
 }
 
 /// What a beam tells, from its word: a range in mm, that nothing is near, or nothing.
@@ -131,11 +132,11 @@ enum Told {
 }
 
 fn told(scan: &Scan, i: usize, no_return_is_far: bool) -> Told {
-    match max(scan) - scan.range_array[i] {
+    match max(scan) - scan.ranges()[i] {
         8 => Told::Far,
         0 if no_return_is_far => Told::Far,
         0..8 => Told::Nothing,
-        _ => Told::Range(f64::from(scan.range_array[i]) * f64::from(scan.unit_mm)),
+        _ => Told::Range(f64::from(scan.ranges()[i]) * scans::unit_mm(scan)),
     }
 }
 
@@ -187,7 +188,7 @@ fn compare(case: &Case, scan: &Scan, out: &Zones) -> Tally {
             assert_eq!(f64::from(said), (distance + 1e-6).floor(), "nearest");
             let [x, y] = case.sensor_mm();
             let (u, _) = case.beam(scan, usize::from(beam));
-            let range = f64::from(scan.range_array[usize::from(beam)]) * f64::from(scan.unit_mm);
+            let range = f64::from(scan.ranges()[usize::from(beam)]) * scans::unit_mm(scan);
             let there = (x + range * u[0]).hypot(y + range * u[1]);
             assert!((there - distance).abs() < 1e-6, "beam {beam} at {there}, beam {i} at {distance}");
         }
@@ -276,20 +277,20 @@ fn on_a_circle_is_outside_wherever_it_is_seen_from() {
                 upside_down: turn as u8 & 1,
                 ..Pose::default()
             };
-            let mut check = Check::new(pose, &Settings { radii_mm: &[1000], ..Settings::default() });
-            let mut is_inside = |unit_mm: u8, range_mm: u16| {
-                let mut scan = Scan { unit_mm, range_bits: 13, count: 1, ..Scan::default() };
-                scan.first_angle_mdeg = 90_000;
-                scan.range_array[0] = range_mm / u16::from(unit_mm);
+            let mut check = Check::new(pose, &Settings { radii_mm: &[1000], ..Settings::default() }, 1);
+            let mut is_inside = |unit_mm: u16, range_mm: u16| {
+                let scan = Scan::of(ScanHead::lms(1, 0, 500, unit_mm.into(), 13), &[range_mm / unit_mm]);
                 let mut out = dirty();
                 check.update(&scan, &mut out);
                 assert_eq!(out.zones()[0].beams == 1, out.verdict() == Verdict::Stop);
                 out.zones()[0].beams == 1
             };
             for unit_mm in [1, 10] {
-                let unit = u16::from(unit_mm);
-                assert!(!is_inside(unit_mm, hi_mm) && is_inside(unit_mm, hi_mm - unit), "{place:?} {turn}");
-                assert!(is_inside(unit_mm, lo_mm + unit), "{place:?} {turn}");
+                assert!(
+                    !is_inside(unit_mm, hi_mm) && is_inside(unit_mm, hi_mm - unit_mm),
+                    "{place:?} {turn}"
+                );
+                assert!(is_inside(unit_mm, lo_mm + unit_mm), "{place:?} {turn}");
                 assert!(lo_mm == 0 || !is_inside(unit_mm, lo_mm), "{place:?} {turn}");
             }
         }

@@ -2,39 +2,51 @@
 //! lets it write them directly into the shared memory that consumers read.
 #![forbid(unsafe_code)]
 
-use lms::framer::suspect;
-use lms::measured::Measured;
-use lms::variant::{MAX_BEAMS, MIRROR_TURN, Mode, Variant};
-use schema::{BEAMS, CONTENTS_UPPER, Reasons, Scan};
+mod turning;
 
-/// Writes `measured` into `scan`, every byte of it, with its values split as `mode` says.
+use line::suspect;
+use lms::measured::Measured;
+use lms::variant::{Mode, Variant};
+use schema::{Contents, Reasons, Scan, ScanArrays, ScanHead};
+
+pub use turning::Turning;
+
+/// Bytes of the scan that `measured` makes.
+pub fn len(measured: &Measured<'_>) -> usize {
+    Scan::len(measured.count(), Contents::UPPER)
+}
+
+/// Writes `measured` into `scan`, every byte that it uses, with its values split as `mode` says.
 ///
-/// Beams come as the sensor sends them: counter-clockwise seen from above, the first one right.
+/// Beams come as the sensor sends them: counter-clockwise seen from above, the first one right. Their angles are counted
+/// from ahead (REP 103); what other code knows of angles follows from here.
+///
+/// # Panics
+///
+/// If `scan` has less memory than [`len`] says.
 pub fn decode(measured: &Measured<'_>, mode: Mode, scan: &mut Scan) {
-    let count = measured.count();
-    let variant = Variant::of_beams(count);
-    let mask = mode.max_value();
-    let bits = mode.range_bits();
-    scan.count = count as u16;
-    scan.unit_mm = measured.unit().mm();
-    scan.range_bits = bits;
-    scan.first_angle_mdeg = variant.map_or(0, Variant::first_angle_mdeg);
-    // A partial scan has 180 or 181 beams, a degree apart.
-    scan.step_mdeg = variant.map_or(1000, |variant| variant.resolution_cdeg * 10);
-    if let (None, Some(quarters)) = (variant, measured.partial()) {
-        scan.first_angle_mdeg = i32::from(quarters) * 250;
-    }
-    scan.intensity_bits = mode.intensity_bits();
-    scan.contents = CONTENTS_UPPER;
-    scan.pad = [0];
-    let (ranges, unused_ranges) = scan.range_array.split_at_mut(count);
-    let (upper, unused_upper) = scan.upper_array.split_at_mut(count);
+    let (mask, bits) = (mode.max_value(), mode.range_bits());
+    let ScanArrays { ranges, upper, .. } = scan.begin(head(measured, mode));
     for ((range, upper), word) in ranges.iter_mut().zip(upper).zip(measured.words()) {
         *range = word & mask;
         *upper = (word >> bits) as u8;
     }
-    unused_ranges.fill(0);
-    unused_upper.fill(0);
+}
+
+fn head(measured: &Measured<'_>, mode: Mode) -> ScanHead {
+    let count = measured.count();
+    let variant = Variant::of_beams(count);
+    // A partial scan has 180 or 181 beams, a degree apart.
+    let step_mdeg = variant.map_or(1000, |variant| variant.resolution_cdeg * 10);
+    let first_angle_mdeg = match (variant, measured.partial()) {
+        (None, Some(quarters)) => i32::from(quarters) * 250 - 90_000,
+        (variant, _) => variant.map_or(-90_000, Variant::first_angle_mdeg),
+    };
+    let unit_mm = measured.unit().mm().into();
+    ScanHead {
+        intensity_bits: mode.intensity_bits(),
+        ..ScanHead::lms(count, first_angle_mdeg, step_mdeg.into(), unit_mm, mode.range_bits())
+    }
 }
 
 /// Whether a value of `measured` has bits set that `mode` never sets.
@@ -48,7 +60,6 @@ pub fn period_us(variant: Option<Variant>, baud: u32) -> u32 {
     variant.map_or(0, |variant| (variant.period(2 * variant.beams() + 10, baud) / 1000) as u32)
 }
 
-const _: () = assert!(MAX_BEAMS == BEAMS && MIRROR_TURN == schema::TURN_NS);
 const _: () = assert!(lms::telegram::MAX_TELEGRAM == schema::Telegram::MAX);
 const _: () = assert!(
     suspect::LINE_ERROR == Reasons::LINE_ERROR
@@ -68,14 +79,16 @@ mod tests {
         let words: Vec<u16> = (0..181).map(|i| (i % 8) << 13 | (1000 + i)).collect();
         let encoded = lms::measured::encode(0, Unit::Cm, &words, 0x10);
         let measured = Measured::decode(encoded.telegram()).unwrap();
-        let mut scan = Scan { range_array: [7; BEAMS], upper_array: [7; BEAMS], ..Scan::default() };
+        let mut scan = Scan::zeroed(len(&measured));
         decode(&measured, Mode(1), &mut scan);
-        assert_eq!((scan.count, scan.unit_mm, scan.range_bits, scan.intensity_bits), (181, 10, 13, 3));
-        assert_eq!((scan.first_angle_mdeg, scan.step_mdeg), (0, 1000));
-        assert_eq!((scan.ranges()[5], scan.intensities()[5]), (1005, 5));
-        assert_eq!((scan.range_array[181], scan.upper_array[400]), (0, 0));
+        assert_eq!(
+            (scan.beams(), scan.unit_um, scan.valid_to, scan.intensity_bits),
+            (181, 10_000, 0x1FF6, 3)
+        );
+        assert_eq!((scan.angle_deg(0), scan.angle_deg(90), scan.angle_deg(180)), (-90.0, 0.0, 90.0));
+        assert_eq!((scan.ranges()[5], scan.intensities().get(5)), (1005, Some(5)));
         decode(&measured, Mode(4), &mut scan);
-        assert_eq!((scan.range_bits, scan.intensity_bits), (14, 0));
+        assert_eq!((scan.no_return, scan.intensity_bits), (0x3FFF, 0));
         assert_eq!((scan.ranges()[3], scan.upper()[3]), ((3 << 13 | 1003) & 0x3FFF, 1));
         assert!(is_forbidden(&measured, Mode(0x0F)) && !is_forbidden(&measured, Mode(4)));
     }

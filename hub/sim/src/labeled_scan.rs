@@ -42,7 +42,7 @@ pub enum Met {
 /// The place of a reflector as geometry has it.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Mark {
-    /// Angle of its middle in degrees, counter-clockwise, 0 to the right of the sensor.
+    /// Angle of its middle in degrees, counter-clockwise, 0 ahead of the sensor.
     pub angle_deg: f64,
     /// Range of its middle in millimetres.
     pub range_mm: f64,

@@ -7,10 +7,12 @@
 //! knows nothing of the hub.
 
 mod answer;
+pub mod device;
 mod eeprom;
 pub mod fault;
 pub mod labeled_scan;
 pub mod layers;
+pub mod ld;
 mod line;
 pub mod machine;
 pub mod noise;

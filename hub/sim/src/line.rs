@@ -7,8 +7,8 @@ use std::path::{Path, PathBuf};
 use lms::{MILLIS, Nanos};
 use schema::Failure;
 
+use crate::device::{Device, Part};
 use crate::fault::{Fault, Faults};
-use crate::machine::{Machine, Part};
 use crate::noise::Mistuned;
 use crate::place::Place;
 use crate::pty::{Pty, Wake, now_ns, wait};
@@ -22,7 +22,7 @@ pub(crate) struct Line<'a> {
     pub(crate) port: PathBuf,
     /// What is there to be opened; nothing while the adapter is unplugged.
     pub(crate) socket: Option<Socket>,
-    pub(crate) machine: Machine,
+    pub(crate) machine: Box<dyn Device + Send>,
     pub(crate) wire: Wire,
     pub(crate) time: Time,
     /// Where the truth goes.
@@ -102,16 +102,16 @@ impl Line<'_> {
             while let Some(event) = (self.event)(&self.port) {
                 self.suffer(event, machine_ns);
             }
-            while let Some(carried) = self.wire.poll_transmit(&mut self.machine, machine_ns) {
+            while let Some(carried) = self.wire.poll_transmit(&mut *self.machine, machine_ns) {
                 self.hand_over(carried, &mut way)?;
             }
-            if count > 0 && same_rate(self.rate(), self.machine.baud().rate()) {
+            if count > 0 && same_rate(self.rate(), self.machine.rate()) {
                 let arrival = Arrival {
                     not_before: self.time.of_machine(quiet_ns.saturating_sub(PTY_DELAY_NS)),
                     not_after: self.time.of_machine(now_ns),
                 };
                 for &byte in &buffer[..count] {
-                    self.wire.receive(&mut self.machine, byte, arrival);
+                    self.wire.receive(&mut *self.machine, byte, arrival);
                     if let Some(dropped) = self.machine.take_dropped() {
                         tracing::warn!("{}: {dropped}", self.port.display());
                     }
@@ -125,7 +125,7 @@ impl Line<'_> {
                 way.is_open = false;
                 self.socket = self.wire.is_plugged().then(|| Socket::new(&self.port)).transpose()?;
             }
-            let due = self.wire.poll_timeout(&self.machine, machine_ns);
+            let due = self.wire.poll_timeout(&*self.machine, machine_ns);
             let due_ns = due.map_or(Nanos::MAX, |at| self.time.of_clock(at));
             let pty = self.socket.as_ref().map(|socket| &socket.pty);
             let look_ns = if pty.is_some() { now_ns + LOOK_NS } else { Nanos::MAX };
@@ -139,7 +139,7 @@ impl Line<'_> {
 
     fn suffer(&mut self, event: Event, machine_ns: Nanos) {
         match event {
-            Event::PowerCycle => self.wire.cycle_power(&mut self.machine, machine_ns),
+            Event::PowerCycle => self.wire.cycle_power(&mut *self.machine, machine_ns),
             Event::Unplug(span_ns) => self.wire.unplug(machine_ns, span_ns),
             Event::Faults(mut faults, seed) => {
                 let now_s = machine_ns as f64 / 1e9;
@@ -169,17 +169,17 @@ impl Line<'_> {
     /// sensor's time stood still too.
     fn slip(&mut self, now_ns: Nanos) {
         let machine_ns = self.time.of_machine(now_ns);
-        let Some(due_ns) = self.wire.poll_timeout(&self.machine, machine_ns) else { return };
+        let Some(due_ns) = self.wire.poll_timeout(&*self.machine, machine_ns) else { return };
         let latest_ns = self.time.of_clock(due_ns + MOST_LATE_NS);
         self.time.zero_ns += now_ns.saturating_sub(latest_ns);
     }
 
     fn hand_over(&mut self, carried: Carried, way: &mut Way) -> Result<(), Failure> {
         let is_telegram = carried.is_telegram();
-        let Carried { mut bytes, baud, idle_after, part, mut fault } = carried;
+        let Carried { mut bytes, rate, idle_after, part, mut fault } = carried;
         match self.socket.as_ref().filter(|_| way.is_open) {
             Some(Socket { pty, .. }) => {
-                let rates = (baud.rate(), pty.rate());
+                let rates = (rate, pty.rate());
                 if same_rate(rates.1, rates.0) {
                     way.mistuned.tune();
                 } else {

@@ -2,8 +2,7 @@
 //! with the time at which they have been sent come out. [`Source`] provides what it measures, `answer.rs` what it answers;
 //! it does not know what is lost on the way.
 //!
-//! To drive it, call [`Machine::poll_transmit`] until it returns `None`, pass the host's bytes, and call again at
-//! [`Machine::poll_timeout`].
+//! It is driven as a [`Device`].
 
 use std::collections::VecDeque;
 
@@ -12,6 +11,7 @@ use lms::variant::{Baud, MIRROR_TURN, Variant};
 use lms::{MILLIS, Nanos};
 
 use crate::answer::{After, Answer};
+use crate::device::{Chunk, Device, Part, Sent};
 use crate::eeprom::Eeprom;
 use crate::operating::{Operating, Shot};
 use crate::request_decoder::{Arrival, Dropped, Heard, RequestDecoder};
@@ -19,41 +19,6 @@ use crate::source::Source;
 use crate::transmission::Transmission;
 
 pub use crate::settings::{Habits, Settings, Start};
-
-/// Bytes that the host's hardware hands over at once.
-#[derive(Clone, Debug, PartialEq, Eq)]
-pub struct Chunk {
-    /// Up to 62 bytes; none at the end of a telegram that was broken off between two bursts.
-    pub bytes: Vec<u8>,
-    /// The rate they were sent at.
-    pub baud: Baud,
-    /// Whether the line is idle after them.
-    pub idle_after: bool,
-    /// What they are part of.
-    pub part: Part,
-}
-
-/// The position of a chunk in its telegram.
-#[derive(Clone, Debug, PartialEq, Eq)]
-pub enum Part {
-    /// A single ACK or NAK.
-    Acknowledge,
-    /// Bytes of a telegram, not its last ones.
-    Telegram,
-    /// The last bytes of a telegram that leave.
-    End(Sent),
-}
-
-/// A telegram that has left.
-#[derive(Clone, Debug, PartialEq, Eq)]
-pub struct Sent {
-    /// Measured values of the stream, or a reply.
-    pub is_reply: bool,
-    /// The telegram as it should have been.
-    pub telegram: Vec<u8>,
-    /// Whether it was broken off, by a request or by the power.
-    pub aborted: bool,
-}
 
 /// The sensor.
 pub struct Machine {
@@ -129,97 +94,10 @@ impl Machine {
         &self.operating
     }
 
-    /// Requests heard that would write its EEPROM (40 42 46 66 77 7C), done or refused.
-    pub fn eeprom_writes(&self) -> u64 {
-        self.eeprom.writes
-    }
-
     /// From now on it behaves like this.
     pub fn set_habits(&mut self, habits: Habits) {
         self.decoder.is_strict = habits.strict_gap;
         self.settings.habits = habits;
-    }
-
-    /// The power goes off and on: transmission ends with the byte in the transmitter, everything that is not in the EEPROM
-    /// is forgotten, and after the start-up time the banner 90h is sent, at the permanent rate or at 9600. Returns whether
-    /// a telegram was broken off.
-    pub fn power_cycle(&mut self, now: Nanos) -> bool {
-        self.queue.retain(|transmission| transmission.start_ns() <= now);
-        self.queue.truncate(1);
-        let mut broken = false;
-        if let Some(front) = self.queue.front_mut() {
-            front.break_off(now);
-            broken = front.is_broken();
-            if let Tag::Reply { after, .. } = &mut front.tag {
-                *after = After::Nothing;
-            }
-        }
-        self.boot(now);
-        broken
-    }
-
-    /// Breaks off what it is sending, as if for a request that it then ignored; a stream continues with a whole scan.
-    pub fn break_off(&mut self, now: Nanos) {
-        if self.queue.front().is_some_and(|front| front.start_ns() <= now) {
-            self.interrupt(now);
-        }
-    }
-
-    /// Hears a byte of the host. Call it after [`Machine::poll_transmit`] answered `None` for `arrival.not_after`.
-    pub fn receive(&mut self, byte: u8, arrival: Arrival) {
-        if arrival.not_after < self.started_ns {
-            return;
-        }
-        let Some(Heard { bytes, at }) = self.decoder.hear(byte, arrival, self.baud.rate()) else { return };
-        let is_mine = bytes[1] == 0 || bytes[1] == self.settings.address;
-        if !is_mine || self.settings.habits.mute || self.chance(self.settings.habits.overlooks) {
-            return;
-        }
-        let free_ns = self.interrupt(at);
-        let late_ns = self.settings.habits.late_acknowledge_ns;
-        let first_ns = free_ns + late_ns + self.random.u64(2 * MILLIS..8 * MILLIS);
-        let request = Telegram::check(&bytes).filter(|_| !self.chance(self.settings.habits.naks));
-        let Some(request) = request else {
-            self.send(vec![NAK], first_ns, Tag::Acknowledge);
-            return;
-        };
-        let Answer { reply, delay_ns, after } = self.answer(request, first_ns);
-        let acknowledged_ns = self.send(vec![ACK], first_ns, Tag::Acknowledge);
-        let late_ns = self.settings.habits.late_reply_ns;
-        let reply_ns = acknowledged_ns + delay_ns + late_ns;
-        let late = late_ns > 0;
-        let end_ns = self.send(reply.clone(), reply_ns, Tag::Reply { late, after });
-        if self.chance(self.settings.habits.doubles) {
-            let again_ns = end_ns + self.habits.u64(..20 * MILLIS);
-            self.send(reply, again_ns, Tag::Reply { late, after: After::Nothing });
-        }
-    }
-
-    /// The last request that it dropped because of its gaps; returned once.
-    pub fn take_dropped(&mut self) -> Option<Dropped> {
-        self.decoder.take_dropped()
-    }
-
-    /// The next bytes that are through at `now`.
-    pub fn poll_transmit(&mut self, now: Nanos) -> Option<Chunk> {
-        if self.queue.is_empty() {
-            self.start_scan(now);
-        }
-        let front = self.queue.front_mut()?;
-        let baud = front.baud();
-        let (bytes, idle_after) = front.take_chunk(now)?;
-        let bytes = bytes.to_vec();
-        let part = match front.tag {
-            Tag::Acknowledge => Part::Acknowledge,
-            Tag::Scan | Tag::Reply { .. } => Part::Telegram,
-        };
-        let part = if front.is_done() { self.finish_front(part) } else { part };
-        Some(Chunk { bytes, baud, idle_after, part })
-    }
-
-    /// When there will be something to transmit.
-    pub fn poll_timeout(&self) -> Option<Nanos> {
-        self.queue.front().map(Transmission::next_chunk_ns).or(self.next_scan_ns)
     }
 
     /// A telegram of measured values of a sensor in `operating`, the scan of which ended at `at_ns`.
@@ -300,7 +178,7 @@ impl Machine {
 
     /// Queues `bytes` from `start_ns` on, before what starts later; returns when the last one is through.
     fn send(&mut self, bytes: Vec<u8>, start_ns: Nanos, tag: Tag) -> Nanos {
-        let transmission = Transmission::new(bytes, start_ns, self.baud, self.settings.chunk, tag);
+        let transmission = Transmission::new(bytes, start_ns, self.baud.rate(), self.settings.chunk, tag);
         let end_ns = transmission.end_ns();
         let place = self.queue.partition_point(|other| other.start_ns() <= start_ns);
         self.queue.insert(place, transmission);
@@ -314,6 +192,103 @@ impl Machine {
     /// Address byte of what it sends.
     pub(crate) fn reply_address(&self) -> u8 {
         self.settings.address | REPLY
+    }
+}
+
+impl Device for Machine {
+    fn poll_transmit(&mut self, now: Nanos) -> Option<Chunk> {
+        if self.queue.is_empty() {
+            self.start_scan(now);
+        }
+        let front = self.queue.front_mut()?;
+        let rate = front.rate();
+        let (bytes, idle_after) = front.take_chunk(now)?;
+        let bytes = bytes.to_vec();
+        let part = match front.tag {
+            Tag::Acknowledge => Part::Acknowledge,
+            Tag::Scan | Tag::Reply { .. } => Part::Telegram,
+        };
+        let part = if front.is_done() { self.finish_front(part) } else { part };
+        Some(Chunk { bytes, rate, idle_after, part })
+    }
+
+    fn poll_timeout(&self) -> Option<Nanos> {
+        self.queue.front().map(Transmission::next_chunk_ns).or(self.next_scan_ns)
+    }
+
+    fn receive(&mut self, byte: u8, arrival: Arrival) {
+        if arrival.not_after < self.started_ns {
+            return;
+        }
+        let Some(Heard { bytes, at }) = self.decoder.hear(byte, arrival, self.baud.rate()) else { return };
+        let is_mine = bytes[1] == 0 || bytes[1] == self.settings.address;
+        if !is_mine || self.settings.habits.mute || self.chance(self.settings.habits.overlooks) {
+            return;
+        }
+        let free_ns = self.interrupt(at);
+        let late_ns = self.settings.habits.late_acknowledge_ns;
+        let first_ns = free_ns + late_ns + self.random.u64(2 * MILLIS..8 * MILLIS);
+        let request = Telegram::check(&bytes).filter(|_| !self.chance(self.settings.habits.naks));
+        let Some(request) = request else {
+            self.send(vec![NAK], first_ns, Tag::Acknowledge);
+            return;
+        };
+        let Answer { reply, delay_ns, after } = self.answer(request, first_ns);
+        let acknowledged_ns = self.send(vec![ACK], first_ns, Tag::Acknowledge);
+        let late_ns = self.settings.habits.late_reply_ns;
+        let reply_ns = acknowledged_ns + delay_ns + late_ns;
+        let late = late_ns > 0;
+        let end_ns = self.send(reply.clone(), reply_ns, Tag::Reply { late, after });
+        if self.chance(self.settings.habits.doubles) {
+            let again_ns = end_ns + self.habits.u64(..20 * MILLIS);
+            self.send(reply, again_ns, Tag::Reply { late, after: After::Nothing });
+        }
+    }
+
+    /// The power goes off and on: transmission ends with the byte in the transmitter, everything that is not in the EEPROM
+    /// is forgotten, and after the start-up time the banner 90h is sent, at the permanent rate or at 9600. Returns whether
+    /// a telegram was broken off.
+    fn power_cycle(&mut self, now: Nanos) -> bool {
+        self.queue.retain(|transmission| transmission.start_ns() <= now);
+        self.queue.truncate(1);
+        let mut broken = false;
+        if let Some(front) = self.queue.front_mut() {
+            front.break_off(now);
+            broken = front.is_broken();
+            if let Tag::Reply { after, .. } = &mut front.tag {
+                *after = After::Nothing;
+            }
+        }
+        self.boot(now);
+        broken
+    }
+
+    /// Breaks off what it is sending, as if for a request that it then ignored; a stream continues with a whole scan.
+    fn break_off(&mut self, now: Nanos) {
+        if self.queue.front().is_some_and(|front| front.start_ns() <= now) {
+            self.interrupt(now);
+        }
+    }
+
+    /// Requests heard that would write its EEPROM (40 42 46 66 77 7C), done or refused.
+    fn eeprom_writes(&self) -> u64 {
+        self.eeprom.writes
+    }
+
+    fn take_dropped(&mut self) -> Option<Dropped> {
+        self.decoder.take_dropped()
+    }
+
+    fn rate(&self) -> u32 {
+        self.baud.rate()
+    }
+
+    fn streams(&self) -> bool {
+        self.operating.streams()
+    }
+
+    fn telegram_len(&self) -> Option<usize> {
+        None
     }
 }
 

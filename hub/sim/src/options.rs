@@ -4,6 +4,7 @@ use std::path::PathBuf;
 use std::str::FromStr;
 use std::time::Duration;
 
+use ld::Model;
 use lms::family::Family;
 use lms::variant::{Baud, Mode, Unit, Variant};
 use schema::{Failure, Kind};
@@ -66,6 +67,8 @@ pub struct SimulateOptions {
     pub mode: Option<Mode>,
     /// How many bytes the host's hardware hands over at once.
     pub chunk: ChunkSize,
+    /// Which scanner of LDROBOT the ports are in place of an LMS; then what only an LMS has must be left as it is.
+    pub model: Option<Model>,
 }
 
 impl Default for SimulateOptions {
@@ -96,6 +99,7 @@ impl Default for SimulateOptions {
             unit: None,
             mode: None,
             chunk: ChunkSize::Uart,
+            model: None,
         }
     }
 }
@@ -103,6 +107,21 @@ impl Default for SimulateOptions {
 /// Type, number and firmware as a sensor of `family` reports them: 21 characters (Telegram listing, BAh).
 pub fn type_name(family: Family) -> String {
     format!("{};301063;V02.30 ", family.name().to_uppercase())
+}
+
+/// Which scanner of LDROBOT `family` and `model` say, `None` for an LMS: its models are types.
+pub fn parse_family(family: &str, model: Option<&str>) -> Result<Option<Model>, Failure> {
+    match (one_of("family", family, &[("lms", false), ("ld", true)])?, model) {
+        (false, None) => Ok(None),
+        (false, Some(model)) => {
+            let message = format!("model {model:?} of family \"lms\"");
+            Err(Failure::new(Kind::Configuration, message, "--type says which LMS; --family ld has models"))
+        }
+        (true, model) => {
+            let models = Model::ALL.map(|model| (model.name(), Some(model)));
+            one_of("model", model.unwrap_or(Model::Ld19.name()), &models)
+        }
+    }
 }
 
 /// `lms200` and the other types that support the values of [`Variant`].
@@ -212,6 +231,10 @@ mod tests {
         assert_eq!((parse_mode("0x0F").unwrap(), parse_mode("1").unwrap()), (Mode(15), Mode(1)));
         assert_eq!(parse_unit("cm").unwrap(), Unit::Cm);
         assert_eq!(parse_baud("500000").unwrap().rate(), 500_000);
+        let model = |family, model| parse_family(family, model).unwrap();
+        assert_eq!((model("lms", None), model("ld", None)), (None, Some(Model::Ld19)));
+        assert_eq!(model("ld", Some("stl27l")), Some(Model::Stl27l));
+        assert!(parse_family("lms", Some("ld19")).unwrap_err().hint.contains("--type"));
         assert_eq!("usb".parse::<ChunkSize>().unwrap().bytes(), 62);
         for family in [Family::Lms200, Family::Lms211, Family::Lms221, Family::Lms291] {
             let name = type_name(family);
@@ -232,6 +255,8 @@ mod tests {
             parse_type("s300").unwrap_err(),
             parse_type("s14").unwrap_err(),
             parse_state("asleep").unwrap_err(),
+            parse_family("velodyne", None).unwrap_err(),
+            parse_family("ld", Some("ld20")).unwrap_err(),
         ] {
             assert!(failure.hint.starts_with("one of: ") && failure.kind.exit_code() == 78, "{failure}");
         }

@@ -1,6 +1,8 @@
 //! What the sensor sees: a world, measured the way an LMS 2xx measures it. A pure function of world, seed and time;
 //! knows neither telegrams nor the line.
 
+mod beam;
+
 use std::sync::Arc;
 
 use lms::Nanos;
@@ -13,6 +15,8 @@ use crate::spot::{Echo, echo};
 use crate::view::View;
 use crate::world::World;
 use crate::world_view::WorldView;
+
+pub(crate) use beam::Beams;
 
 /// A world with its furniture in place, as one sensor in it sees it.
 #[derive(Clone, Debug)]
@@ -79,7 +83,7 @@ impl Room {
     /// degrees, or 180 that lie `quarter` quarters of a degree behind them.
     pub(crate) fn partial(&self, quarter: u8, unit: Unit, mode: Mode, end_ns: Nanos) -> Vec<u16> {
         let beams = if quarter > 0 { 180 } else { 181 };
-        let angles_mdeg = (0..beams).map(|beam| 1_000 * beam + 250 * i32::from(quarter)).collect();
+        let angles_mdeg = (0..beams).map(|beam| 1_000 * beam + 250 * i32::from(quarter) - 90_000).collect();
         self.measure(angles_mdeg, 1, unit, mode, end_ns).words
     }
 
@@ -147,18 +151,27 @@ fn measure(
 
 /// What a beam says that got `echo`, while the sun dazzles `sun` of its like.
 fn word(stage: &WorldView, echo: &Echo, sun: f64, unit: Unit, mode: Mode, dice: &Dice) -> u16 {
-    let code = |code: u16| mode.max_value() - code;
+    match told(stage, echo, sun, dice) {
+        Err(code) => mode.max_value() - code,
+        Ok(range_mm) => {
+            let range = range_value(range_mm / f64::from(unit.mm()), mode);
+            range | level(echo, mode, dice) << mode.range_bits()
+        }
+    }
+}
+
+/// The range that a beam tells that got `echo`, in millimetres, or why it tells none: a code counted from the greatest value.
+fn told(stage: &WorldView, echo: &Echo, sun: f64, dice: &Dice) -> Result<f64, u16> {
     if stage.layers.dazzles(sun, dice) {
-        code(layers::DAZZLE)
+        Err(layers::DAZZLE)
     } else if echo.range_mm.is_infinite() || dice.code >= echo.returns {
-        code(layers::NO_RETURN)
+        Err(layers::NO_RETURN)
     } else if stage.layers.loses(echo.signal, echo.torn, dice) {
-        code(layers::TOO_WEAK)
+        Err(layers::TOO_WEAK)
     } else if let Some(error) = stage.layers.error(dice) {
-        code(error)
+        Err(error)
     } else {
-        let range_mm = echo.range_mm + stage.bias_mm + stage.layers.deviation_mm(echo.edge, dice);
-        range_value(range_mm / f64::from(unit.mm()), mode) | level(echo, mode, dice) << mode.range_bits()
+        Ok(echo.range_mm + stage.bias_mm + stage.layers.deviation_mm(echo.edge, dice))
     }
 }
 

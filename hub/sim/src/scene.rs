@@ -8,7 +8,7 @@ use crate::shape::{Pose, Shape};
 /// A world that was read.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Scene {
-    /// The sensors that look at it. The beam at 90 degrees looks where the pose is turned to: 0 is along x.
+    /// The sensors that look at it. The beam ahead looks where the pose is turned to: 0 is along x.
     pub(crate) sensors: Vec<Pose>,
     pub(crate) layers: Layers,
     pub(crate) things: Vec<Thing>,
@@ -54,6 +54,7 @@ pub(crate) struct Move {
 /// The sun dazzles a sector of a sensor.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(crate) struct Sun {
+    /// Angles of the sensor.
     pub(crate) from_deg: f64,
     pub(crate) to_deg: f64,
     pub(crate) from_s: f64,

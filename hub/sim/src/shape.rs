@@ -1,5 +1,5 @@
 //! Flat geometry seen from a point: how far a ray goes until it meets a wall or a post, and between which angles it
-//! can. Millimetres; the eye is at the origin, 0 degrees is to its right (x), 90 degrees ahead (y). Knows nothing of
+//! can. Millimetres; the eye is at the origin, x is to its right and y ahead, angles are those of x. Knows nothing of
 //! beams, noise or time.
 
 /// A point or a way in millimetres.

@@ -10,6 +10,8 @@ use recording::{Encoding, Frame, Recording};
 use rustix::event::{EventfdFlags, eventfd};
 use schema::{Failure, Kind};
 
+use crate::device::Device;
+use crate::ld::{Head, HeadSettings, Packets, recorded};
 use crate::line::{Event, Line, Socket, Time};
 use crate::machine::{Machine, Settings, Start};
 use crate::operating::Operating;
@@ -50,7 +52,8 @@ pub fn simulate_with(
     event: impl Fn(&Path) -> Option<Event> + Sync,
 ) -> Result<Vec<Summary>, Failure> {
     check(options)?;
-    let recording = options.replay.as_ref().map(Recording::open).transpose()?;
+    let recording = options.replay.as_ref().filter(|_| options.model.is_none());
+    let recording = recording.map(Recording::open).transpose()?;
     let truth = options.truth.as_deref().map(Truth::create).transpose()?;
     let tell = |record: &Record| {
         tell(record);
@@ -61,9 +64,7 @@ pub fn simulate_with(
     let time = Time { zero_ns: now_ns(), speed: options.speed };
     for (number, port) in options.ports.iter().enumerate() {
         let seed = options.seed.wrapping_add(number as u64);
-        let chosen = chosen(options, recording.as_ref(), number)?;
-        let (settings, source) = sensor(options, chosen.as_ref(), number)?;
-        let machine = Machine::new(settings, source);
+        let machine = device(options, recording.as_ref(), number)?;
         let socket = Socket::new(port)?;
         ready.push(Ready { port: port.clone(), pty: socket.pty.name().to_owned() });
         let wire = Wire::new(&options.faults, seed);
@@ -104,6 +105,30 @@ fn run(lines: Vec<Line<'_>>, stop: BorrowedFd<'_>) -> Result<Vec<Summary>, Failu
         };
         threads.into_iter().map(join).collect()
     })
+}
+
+/// The sensor of the port with this number.
+fn device(
+    options: &SimulateOptions,
+    recording: Option<&Recording>,
+    number: usize,
+) -> Result<Box<dyn Device + Send>, Failure> {
+    let Some(model) = options.model else {
+        let chosen = chosen(options, recording, number)?;
+        let (settings, source) = sensor(options, chosen.as_ref(), number)?;
+        return Ok(Box::new(Machine::new(settings, source)));
+    };
+    let packets = match &options.replay {
+        Some(path) => Packets::Recorded { packets: recorded(path)?, looped: options.looped },
+        None => Packets::Room(Box::new(Room::of_port(&options.world, options.seed, number as u64))),
+    };
+    let settings = HeadSettings {
+        chunk: options.chunk,
+        boot_ns: options.boot.as_nanos() as Nanos,
+        seed: options.seed.wrapping_add(number as u64),
+        ..HeadSettings::of(model)
+    };
+    Ok(Box::new(Head::new(settings, packets)))
 }
 
 /// The recording that the port with this number plays: of several sensors the one that was named for it.
@@ -208,6 +233,22 @@ fn check(options: &SimulateOptions) -> Result<(), Failure> {
     }
     if options.pollution > 100 {
         return wrong(format!("pollution {} is out of range", options.pollution), "percent, 0 to 100");
+    }
+    if let Some(model) = options.model {
+        let lms = [
+            ("baud", options.baud.is_some() || options.permanent_baud.is_some()),
+            ("variant", options.variant.is_some()),
+            ("unit", options.unit.is_some()),
+            ("mode", options.mode.is_some()),
+            ("state", options.state != Start::In(Operating::OnRequest)),
+            ("sensor", !options.sensors.is_empty()),
+            ("error", !options.errors.is_empty()),
+            ("indices", options.indices || options.short_configuration),
+        ];
+        if let Some((name, _)) = lms.into_iter().find(|(_, is_said)| *is_said) {
+            let message = format!("an {} has no {name} to choose", model.name());
+            return wrong(message, "leave it out, or use --family lms");
+        }
     }
     if let (Some(variant), family) = (options.variant, options.family)
         && let Some(reason) = family.refuses_variant(variant)

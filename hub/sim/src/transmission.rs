@@ -1,7 +1,7 @@
 //! One telegram (or single byte) on its way out: which of its bytes have passed the line at a given time, and in which
 //! chunks the receiver's hardware hands them over. Refuses to know what the bytes mean and who asked for them.
 
-use lms::variant::{BYTES_PER_TURN, Baud, MIRROR_TURN};
+use lms::variant::{BYTES_PER_TURN, MIRROR_TURN};
 use lms::{Nanos, line_time};
 
 /// How many bytes the receiving hardware collects before its driver sees them.
@@ -31,7 +31,7 @@ pub(crate) struct Transmission<T> {
     leaving: usize,
     handed: usize,
     start_ns: Nanos,
-    baud: Baud,
+    rate: u32,
     chunk: usize,
     /// What the sender wants to know at its end.
     pub(crate) tag: T,
@@ -39,9 +39,9 @@ pub(crate) struct Transmission<T> {
 
 impl<T> Transmission<T> {
     /// `bytes` (at least one) from `start_ns` on.
-    pub(crate) fn new(bytes: Vec<u8>, start_ns: Nanos, baud: Baud, chunk: ChunkSize, tag: T) -> Self {
+    pub(crate) fn new(bytes: Vec<u8>, start_ns: Nanos, rate: u32, chunk: ChunkSize, tag: T) -> Self {
         let leaving = bytes.len();
-        Transmission { bytes, leaving, handed: 0, start_ns, baud, chunk: chunk.bytes(), tag }
+        Transmission { bytes, leaving, handed: 0, start_ns, rate, chunk: chunk.bytes(), tag }
     }
 
     /// When the next chunk is complete.
@@ -65,8 +65,8 @@ impl<T> Transmission<T> {
     }
 
     /// Rate of the line.
-    pub(crate) fn baud(&self) -> Baud {
-        self.baud
+    pub(crate) fn rate(&self) -> u32 {
+        self.rate
     }
 
     /// The next chunk, if it is complete at `now`, and whether the line is idle after it. It is empty where everything
@@ -92,7 +92,7 @@ impl<T> Transmission<T> {
 
     /// Ends it with the byte that is in the transmitter at `now`.
     pub(crate) fn break_off(&mut self, now: Nanos) {
-        let byte_ns = line_time(1, self.baud.rate());
+        let byte_ns = line_time(1, self.rate);
         let begun = (0..self.leaving).take_while(|&i| self.through_ns(i + 1) - byte_ns <= now).count();
         self.leaving = begun.max(self.handed).max(1);
     }
@@ -105,7 +105,7 @@ impl<T> Transmission<T> {
     /// When `count` (at least 1) bytes are through. Where 508 bytes need less than a mirror turn, the rest waits for
     /// the next turn.
     fn through_ns(&self, count: usize) -> Nanos {
-        let rate = self.baud.rate();
+        let rate = self.rate;
         let turns = (count - 1) / BYTES_PER_TURN;
         let turn_ns = MIRROR_TURN.max(line_time(BYTES_PER_TURN, rate));
         self.start_ns + turns as Nanos * turn_ns + line_time(count - turns * BYTES_PER_TURN, rate)
@@ -135,19 +135,19 @@ mod tests {
 
     #[test]
     fn half_degree_at_500k_comes_in_two_bursts() {
-        let chunks = times(Transmission::new(vec![7; 732], 0, Baud::B500000, ChunkSize::Uart, ()));
+        let chunks = times(Transmission::new(vec![7; 732], 0, 500_000, ChunkSize::Uart, ()));
         assert_eq!(chunks.iter().map(|c| c.0).sum::<usize>(), 732);
         assert_eq!(chunks[0], (16, 320 * MICROS, false));
         assert_eq!(chunks[31], (12, 10_160 * MICROS, true));
         assert_eq!(chunks[32], (16, 13_640 * MICROS, false));
         assert_eq!(*chunks.last().unwrap(), (16, 17_800 * MICROS, true));
-        let usb = times(Transmission::new(vec![7; 732], 0, Baud::B500000, ChunkSize::Usb, ()));
+        let usb = times(Transmission::new(vec![7; 732], 0, 500_000, ChunkSize::Usb, ()));
         assert_eq!(usb.len(), 13);
     }
 
     #[test]
     fn a_slow_line_does_not_pause() {
-        let chunks = times(Transmission::new(vec![7; 732], 5, Baud::B38400, ChunkSize::Uart, ()));
+        let chunks = times(Transmission::new(vec![7; 732], 5, 38_400, ChunkSize::Uart, ()));
         let longest = chunks.windows(2).map(|w| w[1].1 - w[0].1).max().unwrap();
         assert!(longest <= line_time(16, 38_400) + 1);
         assert_eq!(chunks.last().unwrap().1, 5 + line_time(508, 38_400) + line_time(224, 38_400));
@@ -155,7 +155,7 @@ mod tests {
 
     #[test]
     fn broken_off_after_the_byte_in_the_transmitter() {
-        let mut transmission = Transmission::new(vec![7; 732], 0, Baud::B500000, ChunkSize::Uart, ());
+        let mut transmission = Transmission::new(vec![7; 732], 0, 500_000, ChunkSize::Uart, ());
         assert!(transmission.take_chunk(320 * MICROS).is_some());
         transmission.break_off(405 * MICROS);
         // Byte 20 began at 400 us.

@@ -1,16 +1,15 @@
 //! The line between sensor and port with all its faults; time is an argument: the sensor's chunks go in, what arrives and
 //! why it differs comes out. One implementation for ptys and for tests in virtual time.
 //!
-//! Drive it like a [`Machine`]: call [`Wire::poll_transmit`] until it returns `None`, pass the host's bytes, call again at
+//! Drive it like a [`Device`]: call [`Wire::poll_transmit`] until it returns `None`, pass the host's bytes, call again at
 //! [`Wire::poll_timeout`]. What the host's port does (another rate, no reader) comes after it.
 
 use std::collections::VecDeque;
 
 use lms::Nanos;
-use lms::variant::Baud;
 
+use crate::device::{Chunk, Device, Part, Sent};
 use crate::fault::{Blemishes, Extra, Fate, Fault, Faults, Lateness, Noise, Schedule, Window};
-use crate::machine::{Chunk, Machine, Part, Sent};
 use crate::request_decoder::Arrival;
 
 /// What arrives at once.
@@ -18,8 +17,8 @@ use crate::request_decoder::Arrival;
 pub struct Carried {
     /// The bytes, with what arrived between them; none if all of them were lost.
     pub bytes: Vec<u8>,
-    /// The rate they were sent at.
-    pub baud: Baud,
+    /// The rate they were sent at, in bits per second.
+    pub rate: u32,
     /// Whether the line is idle after them.
     pub idle_after: bool,
     /// What was sent; `None` where nothing was.
@@ -46,6 +45,8 @@ pub struct Wire {
     fault: Option<Fault>,
     /// Whether the power broke it off.
     power_broke: bool,
+    /// Bytes of each telegram, if they all have as many.
+    telegram_len: Option<usize>,
     /// How the last telegram of measured values began.
     header: Vec<u8>,
     /// What has not arrived yet, with the time at which it does.
@@ -68,6 +69,7 @@ impl Wire {
             last: 0,
             fault: None,
             power_broke: false,
+            telegram_len: None,
             header: Vec::new(),
             queue: VecDeque::new(),
         }
@@ -88,7 +90,7 @@ impl Wire {
     }
 
     /// The power of `machine` goes off and on at `now`.
-    pub fn cycle_power(&mut self, machine: &mut Machine, now: Nanos) {
+    pub fn cycle_power(&mut self, machine: &mut dyn Device, now: Nanos) {
         self.power_broke |= machine.power_cycle(now);
     }
 
@@ -98,14 +100,14 @@ impl Wire {
     }
 
     /// A byte of the host, if it gets through. Call it after [`Wire::poll_transmit`] answered `None`.
-    pub fn receive(&mut self, machine: &mut Machine, byte: u8, arrival: Arrival) {
+    pub fn receive(&mut self, machine: &mut dyn Device, byte: u8, arrival: Arrival) {
         if self.plugged {
             machine.receive(byte, arrival);
         }
     }
 
     /// The next bytes that arrive at `now`.
-    pub fn poll_transmit(&mut self, machine: &mut Machine, now: Nanos) -> Option<Carried> {
+    pub fn poll_transmit(&mut self, machine: &mut dyn Device, now: Nanos) -> Option<Carried> {
         self.plugged = !self.unplug.holds(now);
         if self.power.take(now).is_some() {
             self.cycle_power(machine, now);
@@ -127,15 +129,15 @@ impl Wire {
                     }
                     let bytes = Some(self.garbage(now, false)?.0);
                     let bytes = bytes.filter(|_| !self.silence.holds(now)).unwrap_or_default();
-                    let baud = machine.baud();
-                    self.push(now, Carried { bytes, baud, idle_after: true, part: None, fault: None });
+                    let rate = machine.rate();
+                    self.push(now, Carried { bytes, rate, idle_after: true, part: None, fault: None });
                 }
             }
         }
     }
 
     /// When there will be something to poll, seen from `now`.
-    pub fn poll_timeout(&self, machine: &Machine, now: Nanos) -> Option<Nanos> {
+    pub fn poll_timeout(&self, machine: &dyn Device, now: Nanos) -> Option<Nanos> {
         let extras = self.extras.iter().filter(|_| self.position == 0).map(|extra| extra.due_ns(false));
         extras
             .chain(machine.poll_timeout())
@@ -146,9 +148,10 @@ impl Wire {
     }
 
     /// Puts what becomes of a chunk that is through on its way to the host.
-    fn carry(&mut self, machine: &mut Machine, chunk: Chunk, now: Nanos) {
-        let Chunk { bytes, baud, idle_after, part } = chunk;
+    fn carry(&mut self, machine: &mut dyn Device, chunk: Chunk, now: Nanos) {
+        let Chunk { bytes, rate, idle_after, part } = chunk;
         let is_silent = self.silence.holds(now);
+        self.telegram_len = machine.telegram_len();
         let (arrived, mut fault) = match &part {
             Part::Acknowledge => (self.carry_acknowledge(&bytes), None),
             Part::Telegram => self.carry_telegram(&bytes, usize::MAX, is_silent, now),
@@ -160,13 +163,13 @@ impl Wire {
             let cause = if std::mem::take(&mut self.power_broke) { Fault::Power } else { Fault::Aborted };
             fault = fault.or(sent.aborted.then_some(cause));
             copy = self.end(sent, fault);
-        } else if machine.operating().streams() && self.blemishes.breaks_at(self.position) {
+        } else if machine.streams() && self.blemishes.breaks_at(self.position) {
             machine.break_off(now);
         }
-        self.push(now, Carried { bytes: arrived, baud, idle_after, part: Some(part), fault });
+        self.push(now, Carried { bytes: arrived, rate, idle_after, part: Some(part), fault });
         if let Some(sent) = copy {
             let bytes = sent.telegram.clone();
-            self.push(now, Carried { bytes, baud, idle_after, part: Some(Part::End(sent)), fault: None });
+            self.push(now, Carried { bytes, rate, idle_after, part: Some(Part::End(sent)), fault: None });
         }
     }
 
@@ -195,7 +198,7 @@ impl Wire {
             let position = self.position;
             self.position += 1;
             if position == 0 {
-                self.blemishes.begin();
+                self.blemishes.begin(self.telegram_len);
                 self.fault = None;
                 self.last = byte;
             }

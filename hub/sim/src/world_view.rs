@@ -64,7 +64,7 @@ impl WorldView {
         thing.shapes.iter().map(|shape| shape.placed(place)).collect()
     }
 
-    /// A point of the world in the frame of the sensor: 0 degrees to its right, 90 ahead.
+    /// A point of the world in the frame of the sensor: x to its right, y ahead.
     fn eye(&self, point: (f64, f64)) -> (f64, f64) {
         let (ahead, left) = self.sensor.inward(point);
         (-left, ahead)
@@ -96,7 +96,23 @@ impl WorldView {
 
     /// What lies in each direction at `time_ns`.
     pub(crate) fn view(&self, time_ns: Nanos) -> View {
-        let mut view = self.still.clone();
+        let mut view = self.still.ahead();
+        self.draw(&mut view, time_ns);
+        view
+    }
+
+    /// What never changes, all around.
+    pub(crate) fn still(&self) -> &View {
+        &self.still
+    }
+
+    /// Makes `view`, which began as what never changes, what lies around the one beam at `angle_deg` at `time_ns`.
+    pub(crate) fn look_along(&self, view: &mut View, angle_deg: f64, time_ns: Nanos) {
+        view.narrow(&self.still, angle_deg);
+        self.draw(view, time_ns);
+    }
+
+    fn draw(&self, view: &mut View, time_ns: Nanos) {
         for face in self.faces(time_ns) {
             view.draw(face);
         }
@@ -107,7 +123,6 @@ impl WorldView {
                 }
             }
         }
-        view
     }
 
     /// The middle of each reflector that can be seen at `time_ns`.
@@ -116,8 +131,8 @@ impl WorldView {
         let moving = self.faces(time_ns).into_iter().filter(|face| face.surface == Surface::Reflector);
         let fronts = self.still_reflectors.iter().copied().chain(moving.map(|face| face.shape));
         let marks = fronts.map(|shape| {
-            let (x, y) = shape.front();
-            Mark { angle_deg: y.atan2(x).to_degrees(), range_mm: x.hypot(y) }
+            let (right, ahead) = shape.front();
+            Mark { angle_deg: (-right).atan2(ahead).to_degrees(), range_mm: right.hypot(ahead) }
         });
         marks.filter(|mark| view.reaches(mark.angle_deg, mark.range_mm)).collect()
     }

@@ -23,6 +23,7 @@ mod version;
 use std::sync::atomic::AtomicBool;
 
 use port::{Candidate, Source, candidates};
+use schema::limits::TopicLimits;
 use schema::{Domain, Failure, Kind, ipc};
 
 use config::{Config, Gateway, Link};
@@ -85,7 +86,11 @@ pub fn examine(
     tell(version::version(system, pid));
     tell(installed::service(system, pid));
     tell(installed::rules(system, &there));
-    let facts = Facts::gather(domain, &subjects.places, ports.len().max(1), hub.as_ref());
+    let limits = match &subjects.config {
+        Some(Ok(config)) => config.topic_limits(),
+        _ => vec![TopicLimits::default(); ports.len().max(1)],
+    };
+    let facts = Facts::gather(domain, &subjects.places, limits, hub.as_ref());
     tell(machine::memory(&facts));
     tell(machine::domain(&facts));
     tell(machine::hubs(&facts, |user| system.name_of(user)));

@@ -1,8 +1,6 @@
 //! A scan as `sensor_msgs/msg/LaserScan`. Refuses to know where the sensor sits.
 
-use std::f64::consts::FRAC_PI_2;
-
-use schema::{Code, Header, Scan, TURN_NS};
+use schema::{Code, Header, Scan};
 
 use crate::cdr::Cdr;
 
@@ -12,56 +10,46 @@ use crate::cdr::Cdr;
 /// Stamped when its first beam was measured.
 pub fn laser_scan(message: &mut Vec<u8>, frame: &str, header: &Header, scan: &Scan) {
     let mut cdr = Cdr::begin(message);
-    cdr.header(header.wall_ns.saturating_sub(scan.beam_age_ns(0)), frame);
-    let ahead = |i: usize| (scan.angle_deg(i).to_radians() - FRAC_PI_2) as f32;
-    let step_deg = f64::from(scan.step_mdeg) / 1000.0;
+    cdr.header(header.wall_ns.saturating_add_signed(scan.beam_ns(0)), frame);
     // Beams that stand between others are measured a turn later: then no one time lies between two.
-    let beam_ns = if scan.step_mdeg >= 1000 { step_deg / 360.0 * TURN_NS as f64 } else { 0.0 };
-    let greatest = u32::from(scan.max().saturating_sub(Code::BEYOND.0 + 1));
+    let beam_ns = if scan.turns > 1 { 0 } else { scan.beam_time_ns };
     for value in [
-        ahead(0),
-        ahead(scan.beams().saturating_sub(1)),
-        step_deg.to_radians() as f32,
-        (beam_ns / 1e9) as f32,
+        scan.first_angle as f32,
+        (scan.first_angle + scan.beams().saturating_sub(1) as f64 * scan.step) as f32,
+        scan.step as f32,
+        (f64::from(beam_ns) / 1e9) as f32,
         (f64::from(header.period_us) / 1e6) as f32,
-        metres(scan.unit_mm.into()),
-        metres(greatest * u32::from(scan.unit_mm)),
+        metres(1, scan),
+        metres(scan.valid_to, scan),
     ] {
         cdr.f32(value);
     }
     cdr.floats((0..scan.beams()).map(|i| range_m(scan, i)));
-    cdr.floats(scan.intensities().iter().map(|&value| f32::from(value)));
+    let intensities = scan.intensities();
+    cdr.floats((0..intensities.len()).map(|i| f32::from(intensities.get(i).unwrap_or_default())));
 }
 
 fn range_m(scan: &Scan, i: usize) -> f32 {
-    match (scan.distance_mm(i), scan.code(i)) {
-        (Some(0), _) => f32::NEG_INFINITY,
-        (Some(mm), _) => metres(mm),
-        (None, Some(Code::NO_RETURN | Code::BEYOND)) => f32::INFINITY,
+    match (scan.range(i), scan.code(i)) {
+        (Some(0), _) | (None, Some(Code::TooNear)) => f32::NEG_INFINITY,
+        (Some(range), _) => metres(range, scan),
+        (None, Some(Code::NoReturn | Code::Beyond)) => f32::INFINITY,
         (None, _) => f32::NAN,
     }
 }
 
-/// The nearest float: both numbers are exact in one, and a division is rounded once.
-fn metres(mm: u32) -> f32 {
-    mm as f32 / 1000.0
+/// The nearest float.
+fn metres(range: u16, scan: &Scan) -> f32 {
+    (f64::from(range) * f64::from(scan.unit_um) / 1e6) as f32
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
+    use schema::ScanHead;
 
-    fn scan(ranges: &[u16]) -> Scan {
-        let mut scan = Scan {
-            count: ranges.len() as u16,
-            unit_mm: 10,
-            range_bits: 13,
-            step_mdeg: 1000,
-            first_angle_mdeg: 0,
-            ..Scan::default()
-        };
-        scan.range_array[..ranges.len()].copy_from_slice(ranges);
-        scan
+    fn scan(ranges: &[u16], step_mdeg: u32) -> Box<Scan> {
+        Scan::of(ScanHead::lms(ranges.len(), -90_000, step_mdeg, 10, 13), ranges)
     }
 
     /// The numbers behind a frame of four letters, whose end makes three bytes of padding.
@@ -75,14 +63,13 @@ mod tests {
     fn a_scan_is_these_numbers() {
         let header = Header { wall_ns: 1_700_000_001_000_000_000, period_us: 13_320, ..Header::default() };
         let mut message = Vec::new();
-        let mut it = scan(&[100, 0x1FFF, 0x1FF7, 0x1FFE, 0, 0x1FF6]);
-        it.contents = 1;
+        let mut it = scan(&[100, 0x1FFF, 0x1FF7, 0x1FFE, 0, 0x1FF6], 1000);
         it.intensity_bits = 3;
-        it.upper_array[1] = 7;
+        it.arrays().upper[1] = 7;
         laser_scan(&mut message, "rear", &header, &it);
         assert_eq!(message[..4], [0, 1, 0, 0]);
         // The first of six beams of a degree each was measured five 360ths of a turn before the last, which stamps.
-        let nanosec = 1_000_000_000 - 5 * TURN_NS / 360;
+        let nanosec = 1_000_000_000 - 5 * 37_000;
         assert_eq!(message[4..8], 1_700_000_000_i32.to_le_bytes());
         assert_eq!(message[8..12], (nanosec as u32).to_le_bytes());
         let told = numbers(&message);
@@ -104,7 +91,7 @@ mod tests {
     #[test]
     fn beams_of_several_turns_have_no_one_time_between_them() {
         let mut message = Vec::new();
-        let between = Scan { step_mdeg: 500, ..scan(&[100; 9]) };
+        let between = scan(&[100; 9], 500);
         laser_scan(&mut message, "rear", &Header { wall_ns: 1 << 60, ..Header::default() }, &between);
         let told = numbers(&message);
         assert_eq!((told[3], told[7].to_bits(), told[17].to_bits(), told.len()), (0.0, 9, 0, 18));

@@ -47,11 +47,10 @@ mod tests {
     fn a_beam_points_where_its_pose_says() {
         for (yaw_rad, upside_down) in [(0.0, 0), (0.7, 0), (2.9, 1), (-1.2, 1), (0.0, 1)] {
             let pose = Pose { yaw_rad, upside_down, ..Pose::default() };
-            for angle_deg in [0, 30, 90, 145, 180] {
-                // As the scan has it: 0 ahead.
-                let (sin, cos) = f64::from(angle_deg - 90).to_radians().sin_cos();
+            for angle_deg in [-90.0_f64, -60.0, 0.0, 55.0, 90.0] {
+                let (sin, cos) = angle_deg.to_radians().sin_cos();
                 let [x, y, z] = turned(rotation(&pose), [cos, sin, 0.0]);
-                let (wanted_x, wanted_y) = pose.direction(angle_deg * 1000);
+                let (wanted_x, wanted_y) = pose.direction(angle_deg.to_radians());
                 let apart = (x - wanted_x).abs() + (y - wanted_y).abs() + z.abs();
                 assert!(apart < 1e-12, "{pose:?} {angle_deg}: {x} {y} {z}, not {wanted_x} {wanted_y}");
             }

@@ -10,9 +10,9 @@ pub enum DatagramError {
     Magic,
     /// Another version.
     Version,
-    /// The header is shorter than this version's, or longer than the datagram.
+    /// The header is shorter than this version's, or longer than the datagram, or its part is none of the sample's parts.
     Header,
-    /// The lengths do not add up to the datagram's.
+    /// The lengths do not add up to the datagram's, or a part is longer than one can be.
     Length,
     /// The checksum is wrong.
     Crc,
@@ -31,7 +31,7 @@ pub enum DatagramError {
     Capacity,
     /// A topic that is not known here.
     Skipped,
-    /// The payload is shorter than its own counts say, contradicts itself or has no revision.
+    /// The payload is shorter than its own counts say, contradicts itself or has no revision, or it is a part by itself.
     Payload,
 }
 

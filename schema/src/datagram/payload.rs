@@ -1,12 +1,13 @@
 //! The payloads as they are sent over a network: the fields of shared memory in their order, without unused parts. A
 //! received payload is checked against its own counts before it is used.
 
-use bytemuck::{Pod, bytes_of, bytes_of_mut, cast_slice, cast_slice_mut};
+use bytemuck::{Pod, bytes_of, bytes_of_mut, cast_slice, cast_slice_mut, pod_read_unaligned};
 
 use super::{Announce, Datagram, DatagramError};
+use crate::telegram::STX;
 use crate::{
-    BEAMS, Background, CONTENTS_UPPER, Foreground, MARKS, Marks, SEGMENTS, Scan, Segment, Status, Telegram,
-    Topic, ZONES, Zones,
+    BEAMS, Background, BackgroundHead, Contents, Foreground, ForegroundArrays, ForegroundHead, MARKS, Marks,
+    SEGMENTS, Scan, ScanHead, Segment, Status, Telegram, Topic, ZONES, Zones,
 };
 
 /// A payload that can go over a network.
@@ -14,14 +15,27 @@ pub trait Packed {
     /// Writes the payload to the beginning of `room`; answers its length, or `None` if there is too little room.
     fn pack(&self, room: &mut [u8]) -> Option<usize>;
 
-    /// Takes over what `payload` says, every byte of it; what follows behind it is a later revision's. `false` if it is
-    /// shorter than its own counts say or contradicts itself: then the value is of no use.
+    /// Returns the bytes of memory that `payload` fills; `None` if it is shorter than its own counts say or contradicts
+    /// itself. What follows behind it is a later revision's.
+    fn room(payload: &[u8]) -> Option<usize>;
+
+    /// Takes over what `payload` says, every byte of it. `false` if it has no [`room`](Self::room), or there is too little
+    /// here: then the value is of no use.
     #[must_use]
     fn unpack(&mut self, payload: &[u8]) -> bool;
+
+    /// Takes over what `payload` says into `place`, which is made longer where it is too short; else as
+    /// [`unpack`](Self::unpack).
+    #[must_use]
+    fn unpack_into(place: &mut Box<Self>, payload: &[u8]) -> bool;
 }
 
-/// Returns the telegram that a payload begins with: STX, two bytes with the length of what lies between them and the CRC.
+/// Returns the telegram that a payload is: of an LMS it has STX, two bytes with the length of what lies between them and the
+/// CRC, and what follows is a later revision's; of another family it is all of the payload.
 pub fn telegram(payload: &[u8]) -> Option<Telegram<'_>> {
+    if !payload.is_empty() && !Telegram(payload).is_lms() {
+        return Some(Telegram(payload)).filter(|telegram| telegram.0.len() <= Telegram::MAX);
+    }
     let [STX, _, low, high, ..] = payload else { return None };
     let len = usize::from(u16::from_le_bytes([*low, *high])) + AROUND_DATA;
     payload.get(..len).filter(|bytes| bytes.len() <= Telegram::MAX).map(Telegram)
@@ -40,7 +54,11 @@ impl Datagram<'_> {
             None => return Err(DatagramError::Skipped),
             Some(topic) => is_sound(topic, self.payload),
         };
-        if is_sound && self.head.revision > 0 { Ok(()) } else { Err(DatagramError::Payload) }
+        if is_sound && self.head.revision > 0 && self.head.parts == 1 {
+            Ok(())
+        } else {
+            Err(DatagramError::Payload)
+        }
     }
 }
 
@@ -48,49 +66,55 @@ macro_rules! check {
     ($($topic:ident $payload:tt, $name:literal, $($column:tt),*: $about:literal;)*) => {
         /// Returns whether the payload is one of `topic`.
         fn is_sound(topic: Topic, payload: &[u8]) -> bool {
-            match topic { $(Topic::$topic => read!($payload, payload),)* }
+            match topic { $(Topic::$topic => <crate::payload_type!($payload)>::room(payload).is_some(),)* }
         }
-    };
-}
-
-macro_rules! read {
-    ([u8], $bytes:ident) => {
-        telegram($bytes).is_some()
-    };
-    ($payload:tt, $bytes:ident) => {
-        crate::$payload::default().unpack($bytes)
     };
 }
 
 crate::for_each_topic!(check);
 
-impl Packed for Scan {
-    /// Without the upper bits where all of them are 0: they were sent, and say nothing.
+impl Packed for [u8] {
     fn pack(&self, room: &mut [u8]) -> Option<usize> {
-        let (head, ranges) = (&bytes_of(self)[..SCAN_HEAD], cast_slice::<u16, u8>(self.ranges()));
-        let says_nothing = self.intensity_bits == 0 && self.upper().iter().all(|&upper| upper == 0);
-        let upper = if says_nothing { &[] } else { self.upper() };
-        let len = write(room, &[head, ranges, upper])?;
-        room[SCAN_CONTENTS] = if upper.is_empty() { 0 } else { CONTENTS_UPPER };
-        Some(len)
+        write(room, &[self])
+    }
+
+    fn room(payload: &[u8]) -> Option<usize> {
+        telegram(payload).map(|telegram| telegram.0.len())
     }
 
     fn unpack(&mut self, payload: &[u8]) -> bool {
-        *self = Scan::default();
-        let Some((head, rest)) = payload.split_at_checked(SCAN_HEAD) else { return false };
-        bytes_of_mut(self)[..SCAN_HEAD].copy_from_slice(head);
-        let count = usize::from(self.count);
-        let has_upper = self.contents & CONTENTS_UPPER != 0;
-        if count > BEAMS || rest.len() < 2 * count + usize::from(has_upper) * count || self.range_bits > 16 {
-            return false;
-        }
-        let (ranges, upper) = rest.split_at(2 * count);
-        cast_slice_mut(&mut self.range_array[..count]).copy_from_slice(ranges);
-        if has_upper {
-            self.upper_array[..count].copy_from_slice(&upper[..count]);
-        }
-        self.contents = CONTENTS_UPPER;
-        true
+        let Some(telegram) = telegram(payload) else { return false };
+        let memory = self.get_mut(..telegram.0.len());
+        memory.map(|memory| memory.copy_from_slice(telegram.0)).is_some()
+    }
+
+    fn unpack_into(place: &mut Box<[u8]>, payload: &[u8]) -> bool {
+        telegram(payload).map(|telegram| *place = telegram.0.into()).is_some()
+    }
+}
+
+impl Packed for Scan {
+    fn pack(&self, room: &mut [u8]) -> Option<usize> {
+        write(room, &[self.bytes()])
+    }
+
+    fn room(payload: &[u8]) -> Option<usize> {
+        let head: ScanHead = pod_read_unaligned(payload.get(..Scan::HEAD)?);
+        let len = Scan::len(head.count.into(), head.contents);
+        let is_known = usize::from(head.count) <= BEAMS && head.contents & !Contents::ALL == 0;
+        let is_finite = head.first_angle.is_finite() && head.step.is_finite() && head.spacing.is_finite();
+        (is_known && is_finite && len <= payload.len()).then_some(len)
+    }
+
+    fn unpack(&mut self, payload: &[u8]) -> bool {
+        Scan::room(payload).is_some_and(|len| self.copy_from(&payload[..len]))
+    }
+
+    fn unpack_into(place: &mut Box<Self>, payload: &[u8]) -> bool {
+        Scan::room(payload).is_some_and(|len| {
+            Scan::grow(place, len);
+            place.unpack(payload)
+        })
     }
 }
 
@@ -99,9 +123,17 @@ impl Packed for Marks {
         write(room, &[&bytes_of(self)[..MARKS_HEAD + 16 * self.marks().len()]])
     }
 
+    fn room(payload: &[u8]) -> Option<usize> {
+        let count = usize::from(*payload.first()?);
+        fits(payload, MARKS_HEAD + 16 * count).filter(|_| count <= MARKS)
+    }
+
     fn unpack(&mut self, payload: &[u8]) -> bool {
-        let used = payload.first().map(|&count| (usize::from(count), MARKS, MARKS_HEAD, 16));
-        take(self, payload, used)
+        take(self, payload)
+    }
+
+    fn unpack_into(place: &mut Box<Self>, payload: &[u8]) -> bool {
+        place.unpack(payload)
     }
 }
 
@@ -110,20 +142,17 @@ impl Packed for Zones {
         write(room, &[&bytes_of(self)[..ZONES_HEAD + 8 * self.zones().len()]])
     }
 
-    fn unpack(&mut self, payload: &[u8]) -> bool {
-        let used = payload.get(1).map(|&count| (usize::from(count), ZONES, ZONES_HEAD, 8));
-        take(self, payload, used)
-    }
-}
-
-impl Packed for Background {
-    fn pack(&self, room: &mut [u8]) -> Option<usize> {
-        write(room, &[self.packed()])
+    fn room(payload: &[u8]) -> Option<usize> {
+        let count = usize::from(*payload.get(1)?);
+        fits(payload, ZONES_HEAD + 8 * count).filter(|_| count <= ZONES)
     }
 
     fn unpack(&mut self, payload: &[u8]) -> bool {
-        let count = payload.get(6..8).map(|count| usize::from(u16::from_le_bytes([count[0], count[1]])));
-        take(self, payload, count.map(|count| (count, BEAMS, Background::HEAD, 2)))
+        take(self, payload)
+    }
+
+    fn unpack_into(place: &mut Box<Self>, payload: &[u8]) -> bool {
+        place.unpack(payload)
     }
 }
 
@@ -132,66 +161,124 @@ impl Packed for Status {
         write(room, &[bytes_of(self)])
     }
 
+    fn room(payload: &[u8]) -> Option<usize> {
+        fits(payload, size_of::<Status>())
+    }
+
     fn unpack(&mut self, payload: &[u8]) -> bool {
-        take(self, payload, Some((1, 1, size_of::<Status>(), 0)))
+        take(self, payload)
+    }
+
+    fn unpack_into(place: &mut Box<Self>, payload: &[u8]) -> bool {
+        place.unpack(payload)
+    }
+}
+
+impl Packed for Background {
+    fn pack(&self, room: &mut [u8]) -> Option<usize> {
+        write(room, &[self.bytes()])
+    }
+
+    fn room(payload: &[u8]) -> Option<usize> {
+        let head: BackgroundHead = pod_read_unaligned(payload.get(..Background::HEAD)?);
+        let is_finite = head.first_angle.is_finite() && head.step.is_finite();
+        let is_known = usize::from(head.count) <= BEAMS && is_finite;
+        fits(payload, Background::len(head.count.into())).filter(|_| is_known)
+    }
+
+    fn unpack(&mut self, payload: &[u8]) -> bool {
+        Background::room(payload).is_some_and(|len| self.copy_from(&payload[..len]))
+    }
+
+    fn unpack_into(place: &mut Box<Self>, payload: &[u8]) -> bool {
+        Background::room(payload).is_some_and(|len| {
+            Background::grow(place, len);
+            place.unpack(payload)
+        })
     }
 }
 
 impl Packed for Foreground {
-    /// With as many segments as there is room for; the others are left out and counted.
+    /// Head, bits, the ranges that are used, and as many segments as there is room for; the others are left out and counted.
     fn pack(&self, room: &mut [u8]) -> Option<usize> {
-        let count = usize::from(self.count).min(BEAMS);
-        let fixed = [
-            &bytes_of(self)[..FOREGROUND_HEAD],
-            &self.bit_array[..count.div_ceil(8)],
-            cast_slice::<u16, u8>(self.ranges()),
-        ];
-        let used = write(room, &fixed)?;
+        let fixed = |head: &ForegroundHead, room: &mut [u8]| {
+            write(room, &[bytes_of(head), self.bits(), cast_slice::<u16, u8>(self.ranges())])
+        };
+        let used = fixed(self, room)?;
         let fit = self.segments().len().min((room.len() - used) / size_of::<Segment>());
         let left_out = usize::from(self.left_out) + self.segments().len() - fit;
-        room[FOREGROUND_LEFT_OUT] = left_out.min(usize::from(u8::MAX)) as u8;
-        room[FOREGROUND_SEGMENTS..FOREGROUND_HEAD].copy_from_slice(&(fit as u16).to_le_bytes());
+        let left_out = left_out.min(usize::from(u16::MAX)) as u16;
+        let used = fixed(&ForegroundHead { segments: fit as u16, left_out, ..**self }, room)?;
         Some(used + write(&mut room[used..], &[cast_slice(&self.segments()[..fit])])?)
     }
 
+    fn room(payload: &[u8]) -> Option<usize> {
+        let (head, parts) = foreground_parts(payload)?;
+        let inside = |segment: &Segment| segment.first <= segment.last && segment.last < head.count;
+        let segments_inside = parts.segments.chunks_exact(size_of::<Segment>()).map(pod_read_unaligned);
+        let members: u32 = parts.bits.iter().map(|byte| byte.count_ones()).sum();
+        let unused = parts.bits.last().map_or(0, |last| match head.count % 8 {
+            0 => 0,
+            used => last >> used,
+        });
+        let is_sound = segments_inside.into_iter().all(|segment| inside(&segment))
+            && members == u32::from(head.beams)
+            && unused == 0;
+        is_sound.then_some(Foreground::len(head.count.into()))
+    }
+
     fn unpack(&mut self, payload: &[u8]) -> bool {
-        *self = Foreground::default();
-        let Some((head, rest)) = payload.split_at_checked(FOREGROUND_HEAD) else { return false };
-        bytes_of_mut(self)[..FOREGROUND_HEAD].copy_from_slice(head);
-        let (count, beams) = (usize::from(self.count), usize::from(self.beams));
-        let segments = usize::from(self.segments);
-        if count > BEAMS || beams > count || segments > SEGMENTS {
+        if Foreground::room(payload).is_none_or(|room| !self.clear(room)) {
             return false;
         }
-        let set = count.div_ceil(8);
-        if rest.len() < set + 2 * beams + size_of::<Segment>() * segments {
-            return false;
-        }
-        let (bits, rest) = rest.split_at(set);
-        let (ranges, rest) = rest.split_at(2 * beams);
-        self.bit_array[..set].copy_from_slice(bits);
-        cast_slice_mut(&mut self.range_array[..beams]).copy_from_slice(ranges);
-        let segment_bytes = &rest[..size_of::<Segment>() * segments];
-        cast_slice_mut(&mut self.segment_array[..segments]).copy_from_slice(segment_bytes);
-        let members = (0..BEAMS).filter(|&i| self.contains(i));
-        let inside =
-            self.segments().iter().all(|segment| segment.first <= segment.last && segment.last < self.count);
-        inside && members.clone().all(|i| i < count) && members.count() == beams
+        let Some((head, parts)) = foreground_parts(payload) else { return false };
+        let ForegroundArrays { segments, bits, ranges } = self.begin(head);
+        bits.copy_from_slice(parts.bits);
+        cast_slice_mut(&mut ranges[..head.beams.into()]).copy_from_slice(parts.ranges);
+        cast_slice_mut(&mut segments[..head.segments.into()]).copy_from_slice(parts.segments);
+        true
+    }
+
+    fn unpack_into(place: &mut Box<Self>, payload: &[u8]) -> bool {
+        Foreground::room(payload).is_some_and(|len| {
+            Foreground::grow(place, len);
+            place.unpack(payload)
+        })
     }
 }
 
-/// Takes the beginning of `payload` for the beginning of `value` and 0 for the rest. `used`: items, the most there may
-/// be, bytes before them and of each.
-fn take<T: Pod>(value: &mut T, payload: &[u8], used: Option<(usize, usize, usize, usize)>) -> bool {
-    *value = T::zeroed();
-    let Some((items, most, head, each)) = used else { return false };
-    match payload.get(..head + items * each) {
-        Some(bytes) if items <= most => {
-            bytes_of_mut(value)[..bytes.len()].copy_from_slice(bytes);
-            true
-        }
-        _ => false,
+/// What stands behind the head of a packed foreground.
+struct ForegroundParts<'a> {
+    bits: &'a [u8],
+    ranges: &'a [u8],
+    segments: &'a [u8],
+}
+
+/// Head and arrays of a packed foreground, if they are there.
+fn foreground_parts(payload: &[u8]) -> Option<(ForegroundHead, ForegroundParts<'_>)> {
+    let (head, rest) = payload.split_at_checked(Foreground::HEAD)?;
+    let head: ForegroundHead = pod_read_unaligned(head);
+    let (count, beams, most) = (usize::from(head.count), usize::from(head.beams), usize::from(head.segments));
+    if count > BEAMS || beams > count || most > SEGMENTS {
+        return None;
     }
+    let (bits, rest) = rest.split_at_checked(count.div_ceil(8))?;
+    let (ranges, rest) = rest.split_at_checked(2 * beams)?;
+    let segments = rest.get(..most * size_of::<Segment>())?;
+    Some((head, ForegroundParts { bits, ranges, segments }))
+}
+
+/// `len`, if there are so many bytes.
+fn fits(payload: &[u8], len: usize) -> Option<usize> {
+    (len <= payload.len()).then_some(len)
+}
+
+/// Takes the beginning of `payload` for the beginning of `value` and 0 for the rest.
+fn take<T: Pod + Packed>(value: &mut T, payload: &[u8]) -> bool {
+    let Some(len) = T::room(payload) else { return false };
+    *value = T::zeroed();
+    bytes_of_mut(value)[..len].copy_from_slice(&payload[..len]);
+    true
 }
 
 /// Writes `parts` one behind the other; answers their length.
@@ -204,26 +291,20 @@ fn write(room: &mut [u8], parts: &[&[u8]]) -> Option<usize> {
     Some(end)
 }
 
-const STX: u8 = 0x02;
 /// STX, address, length and CRC (Telegram listing 4).
 const AROUND_DATA: usize = 6;
-const SCAN_HEAD: usize = 12;
-const SCAN_CONTENTS: usize = 11;
 const MARKS_HEAD: usize = 4;
 const ZONES_HEAD: usize = 12;
-const FOREGROUND_HEAD: usize = 12;
-const FOREGROUND_LEFT_OUT: usize = 9;
-const FOREGROUND_SEGMENTS: usize = 10;
 
 #[cfg(test)]
 mod tests {
     use super::*;
     use crate::{Mark, Zone};
 
-    fn there_and_back<T: Packed + Pod + PartialEq + std::fmt::Debug>(value: T, len: usize) {
+    /// `value`, which is packed into `len` bytes and back into `back`.
+    fn there_and_back<T: Packed + PartialEq + std::fmt::Debug + ?Sized>(value: &T, back: &mut T, len: usize) {
         let mut room = [0xAA; 2000];
         assert_eq!(value.pack(&mut room), Some(len));
-        let mut back = T::zeroed();
         assert!(back.unpack(&room[..len + 7]), "what follows is a later revision's");
         assert_eq!(back, value);
         for short in 0..len {
@@ -234,62 +315,69 @@ mod tests {
 
     #[test]
     fn payloads_go_there_and_back() {
-        let mut scan = Scan { count: 361, unit_mm: 1, range_bits: 13, contents: 1, ..Scan::default() };
-        scan.range_array[360] = 0x1234;
-        there_and_back(scan, 12 + 722);
-        (scan.intensity_bits, scan.upper_array[360]) = (3, 7);
-        there_and_back(scan, 12 + 3 * 361);
+        let head =
+            ScanHead { unit_um: 1000, valid_to: 8182, contents: Contents::UPPER, ..ScanHead::default() };
+        let mut scan = Scan::of(head, &[0; 361]);
+        scan.arrays().ranges[360] = 0x1234;
+        let mut room = Scan::zeroed(64 + 3 * 361);
+        there_and_back(&*scan, &mut room, 64 + 3 * 361);
+        assert!(!Scan::zeroed(64 + 3 * 360).unpack(scan.bytes()), "there is too little memory");
         let mut marks = Marks { count: 2, flags: 1, ..Marks::default() };
         marks.mark_array[1] = Mark { angle_mdeg: -1, ..Mark::default() };
-        there_and_back(marks, 4 + 32);
+        there_and_back(&marks, &mut Marks::default(), 4 + 32);
         let mut zones = Zones { count: 2, ..Zones::unknown() };
         zones.zone_array[1] = Zone { radius_mm: 600, ..Zone::default() };
-        there_and_back(zones, 12 + 16);
-        let mut model = Background { count: 3, ..Background::default() };
-        model.range_array[2] = 7;
-        there_and_back(model, 12 + 6);
-        there_and_back(Status { baud: 500_000, ..Status::default() }, 592);
+        there_and_back(&zones, &mut Zones::default(), 12 + 16);
+        let model = Background::of(BackgroundHead::default(), &[0, 0, 7]);
+        there_and_back(&*model, &mut Background::zeroed(38), 32 + 6);
+        there_and_back(&Status { baud: 500_000, ..Status::default() }, &mut Status::default(), 592);
+    }
+
+    /// 64 beams in the foreground of 361, and as many segments.
+    fn foreground() -> Box<Foreground> {
+        let mut foreground = Foreground::of(361);
+        let head =
+            ForegroundHead { count: 361, beams: 64, segments: 64, left_out: 3, ..ForegroundHead::default() };
+        let arrays = foreground.begin(head);
+        for i in 0..64 {
+            arrays.bits[i / 2] |= if i % 2 == 0 { 1 } else { 16 };
+            arrays.ranges[i] = i as u16;
+            let beam = 4 * i as u16;
+            arrays.segments[i] = Segment { first: beam, last: beam, ..Segment::default() };
+        }
+        foreground
     }
 
     #[test]
     fn a_foreground_leaves_out_the_segments_without_room() {
-        let mut foreground =
-            Foreground { count: 361, beams: 64, segments: 64, left_out: 3, ..Foreground::default() };
-        for i in 0..64 {
-            foreground.bit_array[i / 2] |= if i % 2 == 0 { 1 } else { 16 };
-            foreground.range_array[i] = i as u16;
-            let beam = 4 * i as u16;
-            foreground.segment_array[i] = Segment { first: beam, last: beam, ..Segment::default() };
-        }
-        let mut room = [0; 12 + 46 + 128 + 16 * 10 + 15];
-        assert_eq!(foreground.pack(&mut room), Some(12 + 46 + 128 + 160));
-        let mut back = Foreground::default();
+        let foreground = foreground();
+        let mut room = [0; 16 + 46 + 128 + 16 * 10 + 15];
+        assert_eq!(foreground.pack(&mut room), Some(16 + 46 + 128 + 160));
+        let mut back = Foreground::zeroed(Foreground::len(361));
         assert!(back.unpack(&room));
         assert_eq!((back.segments, back.left_out), (10, 57));
         assert_eq!(back.segments(), &foreground.segments()[..10]);
         assert!(back.readings().eq(foreground.readings()));
-        there_and_back(Foreground { segments: 0, ..back }.cut(), 12 + 46 + 128);
-    }
-
-    impl Foreground {
-        fn cut(mut self) -> Self {
-            self.segment_array.fill(Segment::default());
-            self
-        }
+        let mut whole = [0; 2000];
+        let len = foreground.pack(&mut whole).unwrap();
+        assert!(back.unpack(&whole[..len]));
+        assert_eq!((len, back), (16 + 46 + 128 + 1024, foreground));
     }
 
     #[test]
     fn what_contradicts_itself_is_refused() {
-        let refused = |payload: &[u8]| !Foreground::default().unpack(payload);
-        let mut good = [0; 12 + 1 + 2];
-        (good[4], good[6], good[12]) = (3, 1, 4);
-        assert!(Foreground::default().unpack(&good));
-        for (at, byte) in [(12, 8), (12, 3), (12, 0), (6, 4), (5, 2), (11, 1)] {
+        let refused = |payload: &[u8]| !Foreground::of(3).unpack(payload);
+        let mut good = [0; 16 + 1 + 2];
+        (good[8], good[10], good[16]) = (3, 1, 4);
+        assert!(!refused(&good));
+        for (at, byte) in [(16, 8), (16, 3), (16, 0), (10, 4), (9, 2), (12, 1)] {
             let mut bad = good;
             bad[at] = byte;
             assert!(refused(&bad), "{byte} at {at}");
         }
-        assert!(!Marks::default().unpack(&[65; 2000]) && !Zones::default().unpack(&[9; 2000]));
-        assert!(!Scan::default().unpack(&[0xFF; 2000]) && !Background::default().unpack(&[0xFF; 2000]));
+        let other = Scan::of(ScanHead { step: f64::NAN, ..ScanHead::default() }, &[1]);
+        assert_eq!(Scan::room(other.bytes()), None, "no angle is known");
+        assert_eq!((Marks::room(&[65; 2000]), Zones::room(&[9; 2000])), (None, None));
+        assert_eq!((Scan::room(&[0xFF; 2000]), Background::room(&[0xFF; 2000])), (None, None));
     }
 }

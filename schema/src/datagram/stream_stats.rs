@@ -71,8 +71,8 @@ impl StreamStats {
         }
     }
 
-    /// Checks and counts `bytes`, a whole datagram as it was received `from` a sender, at `now_ns` of any clock that is
-    /// never set. A sender is any number that others do not have, for example its address and port. What is refused is
+    /// Checks and counts `bytes`, a datagram with a whole sample as it was received `from` a sender, at `now_ns` of any clock
+    /// that is never set: [`read`](StreamStats::read), then [`take`](StreamStats::take). A sender is any number that others do not have, for example its address and port. What is refused is
     /// counted by its reason and changes nothing else; what is not, can be unpacked.
     ///
     /// # Errors
@@ -84,12 +84,37 @@ impl StreamStats {
         from: u64,
         now_ns: u64,
     ) -> Result<(Datagram<'a>, Fresh), DatagramError> {
+        let datagram = self.read(bytes)?;
+        Ok((datagram, self.take(&datagram, from, now_ns)?))
+    }
+
+    /// Checks `bytes`, a datagram as it was received.
+    ///
+    /// # Errors
+    ///
+    /// The reason for which it is refused; it is counted.
+    pub fn read<'a>(&mut self, bytes: &'a [u8]) -> Result<Datagram<'a>, DatagramError> {
         let read = Datagram::read(bytes);
-        let result = read.and_then(|datagram| Ok((datagram, self.take(&datagram, from, now_ns)?)));
-        if let Err(refusal) = result {
+        self.count(read.err());
+        read
+    }
+
+    /// Checks and counts a sample that is whole, be it that it came in one datagram, or that it was put together of parts,
+    /// with the header of one that came so.
+    ///
+    /// # Errors
+    ///
+    /// As [`receive`](StreamStats::receive).
+    pub fn take(&mut self, datagram: &Datagram<'_>, from: u64, now_ns: u64) -> Result<Fresh, DatagramError> {
+        let taken = self.place(datagram, from, now_ns);
+        self.count(taken.err());
+        taken
+    }
+
+    fn count(&mut self, refusal: Option<DatagramError>) {
+        if let Some(refusal) = refusal {
             self.refused[refusal as usize] += 1;
         }
-        result
     }
 
     /// Returns how many datagrams were refused for this reason.
@@ -125,7 +150,7 @@ impl StreamStats {
             .filter(|row| row.received + row.lost() > 0)
     }
 
-    fn take(&mut self, datagram: &Datagram<'_>, from: u64, now_ns: u64) -> Result<Fresh, DatagramError> {
+    fn place(&mut self, datagram: &Datagram<'_>, from: u64, now_ns: u64) -> Result<Fresh, DatagramError> {
         let head = datagram.head;
         let life = (head.hub, head.epoch);
         let known = match self.lives.find(life) {

@@ -1,5 +1,6 @@
-//! A word in shared memory on which all consumers of a sensor sleep: one call of the hub wakes them all, however many
-//! they are; an event needs one message for each. Refuses to know what was sent, and who sleeps.
+//! Two words in shared memory on which all consumers of a sensor sleep, one for each ring: one call of the hub wakes all that
+//! sleep at a word, however many they are; an event needs one message for each. Refuses to know what was sent, and who
+//! sleeps.
 //!
 //! The page is in /dev/shm under the domain's prefix. Consumers map it read-only. A killed hub leaves it, and the next hub
 //! continues with it, so that consumers that sleep meanwhile are woken; a hub that ends normally closes it.
@@ -23,7 +24,7 @@ use rustix::time::{ClockId, Timespec};
 use super::Node;
 use super::strangers::{Segment, in_the_way};
 use crate::shortage::{SHARED_MEMORY, memory};
-use crate::{Failure, Kind};
+use crate::{Failure, Kind, Ring};
 
 /// The hub's end; dropped it closes the bell and wakes all once more.
 #[derive(Debug)]
@@ -51,9 +52,9 @@ impl Ringer {
         }
     }
 
-    /// Wakes all who sleep.
-    pub(super) fn ring(&self) {
-        words::ring(&self.page.words().rung);
+    /// Wakes all who sleep at the word of `ring`.
+    pub(super) fn ring(&self, ring: Ring) {
+        words::ring(self.page.words().of(ring));
     }
 
     fn open(path: &Path) -> Result<Page, Refused> {
@@ -74,7 +75,9 @@ impl Ringer {
 impl Drop for Ringer {
     fn drop(&mut self) {
         // In this order: a hub that is killed in between leaves no page that looks alive and that nobody can find.
-        words::close(&self.page.words().closed, &self.page.words().rung);
+        let words = self.page.words();
+        words::close(&words.closed, words.of(Ring::First));
+        words::ring(words.of(Ring::Last));
         let _ = std::fs::remove_file(&self.path);
     }
 }
@@ -110,9 +113,9 @@ impl Bell {
         }
     }
 
-    /// Returns how often it was rung, modulo 2^32. What was sent before that can be received after this.
-    pub fn rung(&self) -> u32 {
-        words::rung(&self.0.words().rung)
+    /// Returns how often it was rung so, modulo 2^32. What was sent before that can be received after this.
+    pub fn rung(&self, ring: Ring) -> u32 {
+        words::rung(self.0.words().of(ring))
     }
 
     /// Returns whether its hub has ended: nobody rings it any more.
@@ -126,25 +129,25 @@ impl Bell {
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Unsupported;
 
-/// Sleeps until one of `bells` was rung more often than the number beside it says, a signal comes, or CLOCK_MONOTONIC is
-/// at `until_ns`.
+/// Sleeps until one of `bells` was rung, by the ring beside it, more often than the number there says, a signal comes, or
+/// CLOCK_MONOTONIC is at `until_ns`.
 ///
 /// # Errors
 ///
 /// [`Unsupported`] if the system cannot wait for several words at once.
-pub fn sleep_at_bells(bells: &[(&Bell, u32)], until_ns: u64) -> Result<(), Unsupported> {
+pub fn sleep_at_bells(bells: &[(&Bell, Ring, u32)], until_ns: u64) -> Result<(), Unsupported> {
     let until =
         Timespec { tv_sec: (until_ns / 1_000_000_000) as i64, tv_nsec: (until_ns % 1_000_000_000) as i64 };
     let woken = match bells {
-        [(bell, rung)] => {
-            let word = &bell.0.words().rung;
+        [(bell, ring, rung)] => {
+            let word = bell.0.words().of(*ring);
             futex::wait_bitset(word, futex::Flags::empty(), *rung, Some(&until), NonZeroU32::MAX)
         }
         _ => {
-            let wait = |(bell, rung): &(&Bell, u32)| {
+            let wait = |(bell, ring, rung): &(&Bell, Ring, u32)| {
                 let mut wait = futex::Wait::new();
                 wait.val = u64::from(*rung);
-                wait.uaddr = WaitPtr::new(bell.0.words().rung.as_ptr().cast());
+                wait.uaddr = WaitPtr::new(bell.0.words().of(*ring).as_ptr().cast());
                 wait.flags = WaitFlags::SIZE_U32;
                 wait
             };
@@ -161,9 +164,20 @@ pub fn sleep_at_bells(bells: &[(&Bell, u32)], until_ns: u64) -> Result<(), Unsup
 /// What lies in the page, each on a cache line of its own.
 #[repr(C)]
 struct Words {
-    rung: AtomicU32,
+    first: AtomicU32,
     _apart: [u32; 15],
     closed: AtomicU32,
+    _far: [u32; 15],
+    last: AtomicU32,
+}
+
+impl Words {
+    fn of(&self, ring: Ring) -> &AtomicU32 {
+        match ring {
+            Ring::First => &self.first,
+            Ring::Last => &self.last,
+        }
+    }
 }
 
 /// The page, as long as it is mapped here.

@@ -4,7 +4,7 @@
 use iceoryx2::active_request::ActiveRequest;
 use iceoryx2::pending_response::PendingResponse;
 use iceoryx2::port::{client, server};
-use iceoryx2::prelude::{EventId, PortFactory as _};
+use iceoryx2::prelude::{AllocationStrategy, EventId, PortFactory as _};
 use iceoryx2::service::port_factory::client::ClientCreateError;
 use iceoryx2::service::port_factory::request_response;
 
@@ -15,7 +15,7 @@ use crate::{Failure, Kind, Request, Response, limits, topic};
 
 /// The hub's end. Its [`requests`](Self::requests) wake when a request was sent.
 pub struct ControlServer {
-    server: server::Server<Service, Request, (), [u8], ()>,
+    server: server::Server<Service, [u8], (), [u8], ()>,
     requests: Listener,
     responses: Notifier,
     control: ControlService,
@@ -23,11 +23,11 @@ pub struct ControlServer {
 }
 
 /// A request that was received and not answered yet; one that is dropped stays without an answer.
-pub struct Asked(ActiveRequest<Service, Request, (), [u8], ()>);
+pub struct Asked(ActiveRequest<Service, [u8], (), [u8], ()>);
 
 /// A client's end.
 pub struct ControlClient {
-    client: client::Client<Service, Request, (), [u8], ()>,
+    client: client::Client<Service, [u8], (), [u8], ()>,
     requests: Notifier,
     responses: Listener,
     _control: ControlService,
@@ -35,9 +35,9 @@ pub struct ControlClient {
 }
 
 /// A request that was sent; dropping it cancels it.
-pub struct Pending(PendingResponse<Service, Request, (), [u8], ()>);
+pub struct Pending(PendingResponse<Service, [u8], (), [u8], ()>);
 
-type ControlService = request_response::PortFactory<Service, Request, (), [u8], ()>;
+type ControlService = request_response::PortFactory<Service, [u8], (), [u8], ()>;
 
 impl ControlServer {
     /// Returns the hub's end of the service, made if it is not there.
@@ -48,7 +48,7 @@ impl ControlServer {
     pub fn create(node: &Node) -> Result<ControlServer, Failure> {
         let service = name(topic::CONTROL)?;
         let control = create(node, &service, || {
-            let builder = node.service_builder(&service).request_response::<Request, [u8]>();
+            let builder = node.service_builder(&service).request_response::<[u8], [u8]>();
             builder
                 .max_servers(limits::PUBLISHERS)
                 .max_clients(limits::CONTROL_CLIENTS)
@@ -64,6 +64,7 @@ impl ControlServer {
         let server = control
             .server_builder()
             .initial_max_slice_len(Response::MAX)
+            .allocation_strategy(AllocationStrategy::PowerOfTwo)
             .create()
             .map_err(|error| no_port(&service, &error))?;
         let (requests, responses) = (listener(&asked)?, notifier(&answered)?);
@@ -107,9 +108,9 @@ impl ControlServer {
 }
 
 impl Asked {
-    /// Returns what was asked.
-    pub fn request(&self) -> &Request {
-        self.0.payload()
+    /// Returns what was asked; nothing if it cannot be read.
+    pub fn request(&self) -> Option<Request> {
+        Request::decode(self.0.payload())
     }
 
     /// Returns whether the client is still there to be told.
@@ -131,13 +132,15 @@ impl ControlClient {
             open(node, &service, node.service_builder(&service).event().open())
         };
         let service = name(topic::CONTROL)?;
-        let builder = node.service_builder(&service).request_response::<Request, [u8]>();
+        let builder = node.service_builder(&service).request_response::<[u8], [u8]>();
         let Some(control) = open(node, &service, builder.open())? else { return Ok(None) };
         let Some(asked) = event(topic::CONTROL_REQUEST)? else { return Ok(None) };
         let Some(answered) = event(topic::CONTROL_RESPONSE)? else { return Ok(None) };
         let responses = listener(&answered)?;
         let requests = notifier(&asked)?;
-        let client = control.client_builder().create().map_err(|error| match error {
+        let builder = control.client_builder().initial_max_slice_len(REQUEST);
+        let builder = builder.allocation_strategy(AllocationStrategy::PowerOfTwo);
+        let client = builder.create().map_err(|error| match error {
             ClientCreateError::ExceedsMaxSupportedClients => full(&service, limits::CONTROL_CLIENTS),
             other => no_port(&service, &other),
         })?;
@@ -153,7 +156,9 @@ impl ControlClient {
         let unsent = |error: &dyn std::fmt::Debug| {
             Failure::new(Kind::Short, format!("cannot ask the hub: {error:?}"), "try again later")
         };
-        let pending = self.client.send_copy(*request).map_err(|error| unsent(&error))?;
+        let bytes = request.encode();
+        let loan = self.client.loan_slice_uninit(bytes.len()).map_err(|error| unsent(&error))?;
+        let pending = loan.write_from_slice(&bytes).send().map_err(|error| unsent(&error))?;
         if pending.number_of_server_connections() == 0 {
             return Err(Failure::new(Kind::NoHub, "no hub takes requests", "start one with `scanhub run`"));
         }
@@ -207,5 +212,7 @@ fn notifier(bell: &WakeService) -> Result<Notifier, Failure> {
     builder.create().map_err(|error| no_port(bell.name(), &error))
 }
 
+/// Bytes that are kept ready for a request: most have no model.
+const REQUEST: usize = 64;
 /// The id of both events.
 const EVENT: usize = 1;

@@ -6,7 +6,9 @@ use std::marker::PhantomData;
 
 use super::{
     LoanError, Node, Payload, PortFactory, Publisher, SampleMut, SendError, TopicService, UpdateConnections,
+    places,
 };
+use crate::limits::TopicLimits;
 use crate::{Failure, Header, Kind, Topic};
 
 /// What carries the samples of a topic: [`SharedMemory`], or in a simulation the memory of its own process.
@@ -50,16 +52,21 @@ pub struct SharedMemory<P: Payload + ?Sized> {
 }
 
 impl<P: Payload + ?Sized> SharedMemory<P> {
-    /// Makes the topic of `sensor` that carries `P`, or takes over that of a dead process. What wakes its consumers
+    /// Makes the topic of `sensor` that carries `P`, as `limits` say, or takes over that of a dead process. What wakes its consumers
     /// ([`Waker`](super::Waker)) is made before it.
     ///
     /// # Errors
     ///
     /// [`Kind::DomainHeld`] if somebody publishes the topic, [`Kind::Short`] if memory or descriptors are short,
     /// [`Kind::Failed`] if the topic is there with another layout.
-    pub fn new(node: &Node, sensor: &str) -> Result<Self, Failure> {
-        let service = P::create(node, sensor)?;
-        Ok(SharedMemory { publisher: P::publisher(&service)?, service })
+    pub fn new(node: &Node, sensor: &str, limits: &TopicLimits) -> Result<Self, Failure> {
+        let service = P::create(node, sensor, limits)?;
+        Ok(SharedMemory { publisher: P::publisher(&service, limits)?, service })
+    }
+
+    /// Returns the number of consumers that there are places for. It is not that of the limits where the topic was taken over.
+    pub fn places(&self) -> usize {
+        places::<P>(&self.service)
     }
 }
 
@@ -104,8 +111,8 @@ impl<P: Payload + ?Sized> TopicPublisher<P> {
     /// # Errors
     ///
     /// As [`SharedMemory::new`].
-    pub fn new(node: &Node, sensor: &str) -> Result<Self, Failure> {
-        SharedMemory::new(node, sensor).map(TopicPublisher::over)
+    pub fn new(node: &Node, sensor: &str, limits: &TopicLimits) -> Result<Self, Failure> {
+        SharedMemory::new(node, sensor, limits).map(TopicPublisher::over)
     }
 }
 
@@ -178,11 +185,11 @@ impl<P: Payload + ?Sized, M: Medium<P>> TopicPublisher<P, M> {
     ///
     /// # Errors
     ///
-    /// [`Kind::Short`] if there is no memory for it. Its number is used up.
-    fn send_written(
+    /// [`Kind::Short`] if there is no memory for it, or it is longer than the topic was made for. Its number is used up.
+    pub fn send_len(
         &mut self,
-        len: usize,
         header: &Header,
+        len: usize,
         fill: impl FnOnce(&mut P),
     ) -> Result<usize, Failure> {
         let mut loan = self.loan(len).map_err(|error| {
@@ -202,7 +209,7 @@ impl<P: Payload, M: Medium<P>> TopicPublisher<P, M> {
     ///
     /// [`Kind::Short`] if there is no memory for it. Its number is used up.
     pub fn send(&mut self, header: &Header, fill: impl FnOnce(&mut P)) -> Result<usize, Failure> {
-        self.send_written(0, header, fill)
+        self.send_len(header, 0, fill)
     }
 }
 
@@ -213,7 +220,7 @@ impl<M: Medium<[u8]>> TopicPublisher<[u8], M> {
     ///
     /// [`Kind::Short`] if there is no memory for it, or it is longer than [`Telegram::MAX`](crate::Telegram::MAX).
     pub fn send_bytes(&mut self, header: &Header, bytes: &[u8]) -> Result<usize, Failure> {
-        self.send_written(bytes.len(), header, |sample| sample.copy_from_slice(bytes))
+        self.send_len(header, bytes.len(), |sample| sample.copy_from_slice(bytes))
     }
 }
 

@@ -8,14 +8,17 @@ use std::time::{Duration, Instant};
 
 use iceoryx2::port::publisher::PublisherCreateError;
 use iceoryx2::service::builder::event::EventOpenOrCreateError as EventError;
-use iceoryx2::service::builder::publish_subscribe::PublishSubscribeOpenOrCreateError as TopicError;
+use iceoryx2::service::builder::publish_subscribe::{
+    PublishSubscribeOpenError, PublishSubscribeOpenOrCreateError as TopicError,
+};
 use iceoryx2::service::builder::request_response::RequestResponseOpenOrCreateError as ControlError;
 use iceoryx2::service::builder::{ServiceCreateError, ServiceOpenError};
 use iceoryx2::service::service_name::ServiceName;
 
 use super::Node;
+use crate::limits::TopicLimits;
 use crate::lock::MakingLock;
-use crate::{Failure, Kind, access, shortage};
+use crate::{Failure, Kind, access, is_remote, of_service, shortage};
 
 /// What there is to do about an error.
 pub(super) enum Trouble {
@@ -62,10 +65,16 @@ impl From<ServiceCreateError> for Trouble {
 impl From<TopicError> for Trouble {
     fn from(error: TopicError) -> Trouble {
         match error {
-            TopicError::PublishSubscribeOpenError(error) => ServiceOpenError::from(error).into(),
+            TopicError::PublishSubscribeOpenError(error) => error.into(),
             TopicError::PublishSubscribeCreateError(error) => ServiceCreateError::from(error).into(),
             TopicError::SystemInFlux => Trouble::Absent,
         }
+    }
+}
+
+impl From<PublishSubscribeOpenError> for Trouble {
+    fn from(error: PublishSubscribeOpenError) -> Trouble {
+        ServiceOpenError::from(error).into()
     }
 }
 
@@ -140,6 +149,20 @@ pub(super) fn no_publisher(service: &ServiceName, error: PublisherCreateError) -
         ),
         other => no_port(service, &other),
     }
+}
+
+/// Why there is no place for one more consumer of the topic `service`, which was made for `limit` of them.
+pub(super) fn no_place(service: &ServiceName, limit: usize) -> Failure {
+    let (start, key) = match of_service(service.as_str()) {
+        Some((sensor, _)) if is_remote(sensor) => ("start what publishes it", "--consumers"),
+        _ => ("configure the hub", "limits.consumers"),
+    };
+    let most = TopicLimits::CONSUMERS.end();
+    let hint = format!(
+        "{start} with a greater {key}, up to {most}, or stop some; the places of those that crashed are free again within \
+         seconds"
+    );
+    Failure { hint, ..full(service, limit) }
 }
 
 /// Why there is no place for one more consumer or client at `service`, of which there can be `limit`.

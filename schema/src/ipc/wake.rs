@@ -8,7 +8,7 @@ use super::bell::Ringer;
 use super::trouble::{Trouble, create, full, no_port, open};
 use super::{Listener, Node, Notifier, PortFactory, WakeService, name};
 use crate::shortage::check_client;
-use crate::{Failure, Kind, Wake, limits};
+use crate::{Failure, Kind, Ring, Topic, Wake, limits};
 
 /// The hub's end. When created, it wakes consumers with [`Wake::HubUp`]; when dropped, with [`Wake::HubDown`].
 pub struct Waker {
@@ -34,13 +34,17 @@ impl Waker {
         Ok(Waker { ringer, notifier, service })
     }
 
-    /// Wakes all consumers for `why`: those that sleep on the bell with one call, then those that listen to the event.
+    /// Wakes those who sleep at the bell for topics of `ring`, with one call.
+    pub fn ring(&self, ring: Ring) {
+        self.ringer.ring(ring);
+    }
+
+    /// Tells those who listen to the event `why`.
     ///
     /// # Errors
     ///
-    /// [`Kind::Failed`] if some of the latter were not told.
-    pub fn wake(&self, why: Wake) -> Result<(), Failure> {
-        self.ringer.ring();
+    /// [`Kind::Failed`] if some were not told.
+    pub fn tell(&self, why: Wake) -> Result<(), Failure> {
         if self.service.dynamic_config().number_of_listeners() == 0 {
             return Ok(());
         }
@@ -49,9 +53,35 @@ impl Waker {
             .map_err(|error| Failure::new(Kind::Failed, format!("cannot wake consumers: {error:?}"), ""))
     }
 
+    /// Wakes all consumers for `why`, whatever they follow.
+    ///
+    /// # Errors
+    ///
+    /// As [`tell`](Waker::tell).
+    pub fn wake(&self, why: Wake) -> Result<(), Failure> {
+        Ring::ALL.into_iter().for_each(|ring| self.ring(ring));
+        self.tell(why)
+    }
+
     /// Returns the event service.
     pub fn service(&self) -> &WakeService {
         &self.service
+    }
+}
+
+/// The rings that are due: since they were last rung, somebody got a sample of which they tell.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct DueRings([bool; Ring::ALL.len()]);
+
+impl DueRings {
+    /// Takes note that `reached` consumers got a sample of `topic`.
+    pub fn note(&mut self, topic: Topic, reached: usize) {
+        self.0[topic.row().ring as usize] |= reached > 0;
+    }
+
+    /// Returns whether `ring` is due, and takes it as rung.
+    pub fn take(&mut self, ring: Ring) -> bool {
+        std::mem::take(&mut self.0[ring as usize])
     }
 }
 

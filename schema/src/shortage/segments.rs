@@ -8,7 +8,8 @@ use rustix::fs::{FallocateFlags, OFlags, fallocate};
 use rustix::io::Errno;
 
 use super::{SHARED_MEMORY, memory};
-use crate::{Domain, Failure, Topic, limits, prefix};
+use crate::limits::TopicLimits;
+use crate::{Domain, Failure, Header, Topic, limits, prefix};
 
 /// Allocates what the segments of `domain` have promised so far.
 ///
@@ -41,19 +42,21 @@ pub fn allocate(domain: &Domain) -> Result<(), Failure> {
     Ok(())
 }
 
-/// Returns the bytes of the segments of one sensor's `topics`: the payloads with their headers, and who is at each service.
-pub fn sensor_bytes(topics: &[Topic]) -> u64 {
-    let chunk = |&topic: &Topic| limits::samples(topic) * (topic.row().bytes + CHUNK_HEADER);
+/// Returns the bytes of the segments of one sensor's `topics` made as `limits` say: the payloads with their headers, and who
+/// is at each service.
+pub fn sensor_bytes(topics: &[Topic], limits: &TopicLimits) -> u64 {
+    let chunk =
+        |&topic: &Topic| limits::samples(topic, limits.consumers) * (topic.longest(limits) + CHUNK_HEADER);
     let services = (topics.len() + 1) as u64 * SERVICE;
     topics.iter().map(chunk).sum::<usize>() as u64 + services
 }
 
-/// Returns the bytes of the longest segment of any topic.
-pub fn longest_segment() -> u64 {
-    Topic::ALL.iter().map(|&topic| sensor_bytes(&[topic])).max().unwrap_or_default()
+/// Returns the bytes of the longest segment of any topic made as `limits` say.
+pub fn longest_segment(limits: &TopicLimits) -> u64 {
+    Topic::ALL.iter().map(|&topic| sensor_bytes(&[topic], limits)).max().unwrap_or_default()
 }
 
-/// What the shared-memory library puts before each sample, rounded up.
-const CHUNK_HEADER: usize = 64;
+/// What stands before each sample, rounded up: the header, and what the shared-memory library puts there.
+const CHUNK_HEADER: usize = size_of::<Header>() + 64;
 /// The list of ports and processes of one service, rounded up.
 const SERVICE: u64 = 48 * 1024;

@@ -1,9 +1,9 @@
 //! The table of topics: one row has everything that differs between them. All code for each topic, here and in other
 //! crates, is generated from this table, so a new topic is a new row.
 
-use crate::{Header, Telegram};
+use crate::limits::TopicLimits;
 
-/// Calls the macro `$each` with all rows of the table. A row is `VARIANT PAYLOAD, name, type, group, pace, consumers,
+/// Calls the macro `$each` with all rows of the table. A row is `VARIANT PAYLOAD, name, type, group, pace, ring,
 /// waiting, kept: description;`, its columns those of [`Row`]; a payload other than `[u8]` is a type of this crate.
 ///
 /// # Examples
@@ -19,19 +19,19 @@ use crate::{Header, Telegram};
 macro_rules! for_each_topic {
     ($each:ident) => {
         $each! {
-            Telegram [u8], "telegram", "u8[]", 83, Scan, 32, 16, 0:
+            Telegram [u8], "telegram", "u8[]", 83, Scan, First, 64, 0:
                 "The bytes of telegrams, replies too.";
-            Scan Scan, "scan", "scanhub.Scan.v1", 82, Scan, 200, 16, 0:
+            Scan Scan, "scan", "scanhub.Scan.v2", 82, Scan, First, 64, 0:
                 "Decoded measurements.";
-            Marks Marks, "marks", "scanhub.Marks.v1", 81, Scan, 32, 16, 0:
+            Marks Marks, "marks", "scanhub.Marks.v2", 81, Scan, Last, 16, 0:
                 "Reflector marks.";
-            Zones Zones, "zones", "scanhub.Zones.v1", 81, Scan, 200, 16, 1:
+            Zones Zones, "zones", "scanhub.Zones.v2", 81, Scan, First, 16, 1:
                 "What is near the robot.";
-            Foreground Foreground, "foreground", "scanhub.Foreground.v1", 81, Scan, 32, 16, 0:
+            Foreground Foreground, "foreground", "scanhub.Foreground.v2", 81, Scan, Last, 16, 0:
                 "What stands in front of the background.";
-            Background Background, "background", "scanhub.Background.v1", 82, Change, 32, 4, 1:
+            Background Background, "background", "scanhub.Background.v2", 82, Change, Last, 4, 1:
                 "The background model.";
-            Status Status, "status", "scanhub.Status.v1", 80, Second, 64, 4, 1:
+            Status Status, "status", "scanhub.Status.v2", 80, Second, Last, 4, 1:
                 "State, properties and counters of the link.";
         }
     };
@@ -42,7 +42,7 @@ macro_rules! for_each_topic {
 /// # Examples
 ///
 /// ```
-/// assert_eq!(size_of::<schema::payload_type!(Scan)>(), 1216);
+/// assert_eq!(size_of::<schema::payload_type!(Marks)>(), 1028);
 /// let telegram: &schema::payload_type!([u8]) = &[2, 0x80];
 /// ```
 #[macro_export]
@@ -66,16 +66,15 @@ pub struct Row {
     pub group: u8,
     /// How often a sample is sent.
     pub pace: Pace,
-    /// Consumers at a time. For each sample the shared-memory library looks at all places three times, and they are far apart
-    /// in memory: if only few programs follow, many places cost more than the sample.
-    pub consumers: usize,
-    /// Samples that wait for a consumer; with one more, the oldest is dropped. For topics sent with each scan this is 0.4 s: a
-    /// recorder on a loaded machine can be without a processor for longer than four scans.
+    /// Which ring of the bell tells of its samples.
+    pub ring: Ring,
+    /// Samples that wait for a consumer; with one more, the oldest is dropped. What a recorder must not lose waits for 1.7 s:
+    /// on a machine that stood still for 0.6 s, one lost 7 scans of 16 that could wait.
     pub waiting: usize,
     /// Samples that a late consumer gets.
     pub kept: usize,
-    /// Bytes of the longest payload and its header.
-    pub bytes: usize,
+    /// Returns the bytes of the longest payload of a topic that is made as is said.
+    pub longest: fn(&TopicLimits) -> usize,
 }
 
 /// How often a sample of a topic is sent.
@@ -89,9 +88,23 @@ pub enum Pace {
     Change,
 }
 
+/// The two rings of a sensor's bell for a telegram: nobody waits for the marks of a scan whose zones he wants.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Ring {
+    /// As soon as telegram, scan and zones are sent.
+    First,
+    /// When all is sent.
+    Last,
+}
+
+impl Ring {
+    /// Both, in their order.
+    pub const ALL: [Ring; 2] = [Ring::First, Ring::Last];
+}
+
 macro_rules! rows {
     ($($topic:ident $payload:tt, $name:literal, $kind:literal, $group:literal, $pace:ident,
-        $consumers:literal, $waiting:literal, $kept:literal: $about:literal;)*) => {
+        $ring:ident, $waiting:literal, $kept:literal: $about:literal;)*) => {
         /// What the hub publishes for each sensor.
         #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
         pub enum Topic {
@@ -109,20 +122,29 @@ macro_rules! rows {
             payload: $kind,
             group: $group,
             pace: Pace::$pace,
-            consumers: $consumers,
+            ring: Ring::$ring,
             waiting: $waiting,
             kept: $kept,
-            bytes: size_of::<Header>() + longest!($payload),
+            longest: longest!($payload),
         },)*];
     };
 }
 
 macro_rules! longest {
     ([u8]) => {
-        Telegram::MAX
+        |limits| limits.telegram
+    };
+    (Scan) => {
+        |limits| crate::Scan::len(limits.beams, limits.contents)
+    };
+    (Foreground) => {
+        |limits| crate::Foreground::len(limits.beams)
+    };
+    (Background) => {
+        |limits| crate::Background::len(limits.beams)
     };
     ($payload:tt) => {
-        size_of::<crate::$payload>()
+        |_| size_of::<crate::$payload>()
     };
 }
 
@@ -132,12 +154,11 @@ crate::for_each_topic!(rows);
 mod tests {
     #[allow(unreachable_pub)]
     mod with_one_more {
-        use super::super::{Pace, Row, Telegram};
-        use crate::Header;
+        use super::super::{Pace, Ring, Row};
 
         rows! {
-            Telegram [u8], "telegram", "u8[]", 83, Scan, 32, 16, 0: "Bytes.";
-            Beat Marks, "beat", "scanhub.Beat.v1", 82, Change, 8, 2, 1: "A throw-away topic.";
+            Telegram [u8], "telegram", "u8[]", 83, Scan, First, 16, 0: "Bytes.";
+            Beat Marks, "beat", "scanhub.Beat.v1", 82, Change, Last, 2, 1: "A throw-away topic.";
         }
     }
 
@@ -146,8 +167,11 @@ mod tests {
         use with_one_more::{ROWS, Topic};
         assert_eq!(Topic::ALL, [Topic::Telegram, Topic::Beat]);
         let row = &ROWS[Topic::Beat as usize];
-        assert_eq!((row.name, row.pace, row.consumers, row.kept), ("beat", super::Pace::Change, 8, 1));
-        assert_eq!(row.bytes, size_of::<crate::Header>() + size_of::<crate::Marks>());
+        assert_eq!((row.name, row.pace, row.ring), ("beat", super::Pace::Change, super::Ring::Last));
+        assert_eq!((row.waiting, row.kept), (2, 1));
+        let limits = crate::limits::TopicLimits::default();
+        assert_eq!((row.longest)(&limits), size_of::<crate::Marks>());
+        assert_eq!((ROWS[0].longest)(&limits), crate::Telegram::MAX);
     }
 
     #[test]

@@ -1,14 +1,15 @@
 //! What a datagram says, in the words of the list of golden datagrams.
 
-use schema::datagram::{Announce, Datagram, Packed, telegram};
-use schema::{Background, Foreground, Marks, Scan, Status, Topic, Zones};
+use schema::datagram::{Announce, Datagram, MTU_SAFE, Packed, telegram};
+use schema::{BEAMS, Background, Code, Family, Foreground, Marks, Scan, Status, Topic, Zones};
 use serde_json::{Map, Value, json};
 
 pub(crate) fn head(datagram: &Datagram<'_>) -> Value {
     let head = datagram.head;
     json!({
         "topic": head.topic, "flags": head.flags, "hub": id(head.hub), "epoch": head.epoch,
-        "sequence": head.sequence, "stamp_ns": head.stamp_ns, "sensor": head.sensor, "revision": head.revision,
+        "sequence": head.sequence, "stamp_ns": head.stamp_ns, "sensor": head.sensor, "part": head.part,
+        "parts": head.parts, "revision": head.revision,
         "counter": head.counter, "payload_len": datagram.payload.len(),
     })
 }
@@ -21,16 +22,16 @@ pub(crate) fn payload(datagram: &Datagram<'_>) -> Value {
             let bytes = telegram(payload).expect("a telegram").0;
             json!({ "telegram": bytes.iter().map(|byte| format!("{byte:02x}")).collect::<String>() })
         }
-        Some(Topic::Scan) => scan(&unpacked(Scan::default(), payload)),
-        Some(Topic::Marks) => marks(&unpacked(Marks::default(), payload)),
-        Some(Topic::Zones) => zones(&unpacked(Zones::unknown(), payload)),
-        Some(Topic::Foreground) => foreground(&unpacked(Foreground::default(), payload)),
-        Some(Topic::Background) => background(&unpacked(Background::default(), payload)),
-        Some(Topic::Status) => status(&unpacked(Status::default(), payload)),
+        Some(Topic::Scan) => scan(&unpacked(Scan::zeroed(MTU_SAFE), payload)),
+        Some(Topic::Marks) => marks(&unpacked(Box::<Marks>::default(), payload)),
+        Some(Topic::Zones) => zones(&unpacked(Box::<Zones>::default(), payload)),
+        Some(Topic::Foreground) => foreground(&unpacked(Foreground::of(BEAMS), payload)),
+        Some(Topic::Background) => background(&unpacked(Background::zeroed(MTU_SAFE), payload)),
+        Some(Topic::Status) => status(&unpacked(Box::<Status>::default(), payload)),
     }
 }
 
-fn unpacked<T: Packed>(mut value: T, payload: &[u8]) -> T {
+fn unpacked<T: Packed + ?Sized>(mut value: Box<T>, payload: &[u8]) -> Box<T> {
     assert!(value.unpack(payload));
     value
 }
@@ -50,12 +51,17 @@ fn announce(announce: Announce) -> Value {
 }
 
 fn scan(scan: &Scan) -> Value {
-    // A scan without upper bits comes back with upper bits of 0.
-    let upper = if scan.upper().iter().all(|&upper| upper == 0) { &[] } else { scan.upper() };
+    let each = |value: &dyn Fn(usize) -> Value| (0..scan.beams()).map(value).collect::<Vec<_>>();
     json!({
-        "count": scan.count, "unit_mm": scan.unit_mm, "range_bits": scan.range_bits,
-        "first_angle_mdeg": scan.first_angle_mdeg, "step_mdeg": scan.step_mdeg,
-        "intensity_bits": scan.intensity_bits, "ranges": scan.ranges(), "upper": upper,
+        "family": Family::of_number(scan.family).map(Family::name), "unit_um": scan.unit_um, "count": scan.count,
+        "first_angle": scan.first_angle, "step": scan.step, "spacing": scan.spacing, "beam_time_ns": scan.beam_time_ns, "valid_to": scan.valid_to,
+        "no_return": scan.no_return, "beyond": scan.beyond, "collapsed": scan.collapsed,
+        "incomplete": scan.is_incomplete(), "intensity_bits": scan.intensity_bits,
+        "ranges": scan.ranges(), "codes": each(&|i| scan.code(i).map(Code::name).into()),
+        "times_ns": each(&|i| scan.beam_ns(i).into()),
+        // JSON has no nan.
+        "angles": scan.exact_angles().iter().map(|&exact| Some(exact).filter(|exact| !exact.is_nan())).collect::<Vec<_>>(),
+        "intensities": scan.intensities().iter().collect::<Vec<_>>(), "upper": scan.upper(),
     })
 }
 
@@ -94,7 +100,7 @@ fn foreground(foreground: &Foreground) -> Value {
         })
     });
     json!({
-        "generation": foreground.generation, "count": foreground.count, "unit_mm": foreground.unit_mm,
+        "generation": foreground.generation, "count": foreground.count, "unit_um": foreground.unit_um,
         "left_out": foreground.left_out,
         "beams": foreground.readings().map(|(beam, _)| beam).collect::<Vec<_>>(),
         "ranges": foreground.ranges(), "segments": segments.collect::<Vec<_>>(),
@@ -104,7 +110,7 @@ fn foreground(foreground: &Foreground) -> Value {
 fn background(model: &Background) -> Value {
     json!({
         "generation": model.generation, "taught": model.taught, "count": model.count,
-        "unit_mm": model.unit_mm, "frozen": model.is_frozen(), "ranges": model.ranges(),
+        "unit_um": model.unit_um, "first_angle": model.first_angle, "step": model.step, "frozen": model.is_frozen(), "ranges": model.ranges(),
     })
 }
 

@@ -3,25 +3,26 @@
 use bytemuck::Zeroable;
 use schema::datagram::{Announce, Announced, Head, LanFlags, Packed};
 use schema::{
-    Background, CONTENTS_UPPER, COUNTERS, Counter, Counters, Foreground, Mark, Marks, Pose, Scan, Segment,
-    State, Status, Topic, Verdict, Zone, Zones,
+    Background, BackgroundHead, COUNTERS, Code, Contents, Counter, Counters, Family, Foreground,
+    ForegroundHead, Mark, Marks, Pose, Scan, ScanHead, Segment, State, Status, Topic, Verdict, Zone, Zones,
 };
 
 /// Name of the file, header, and what writes the payload.
 pub(crate) type Golden = (&'static str, Head, fn(&mut [u8]) -> Option<usize>);
 
 /// Those that a gateway of this version sends.
-pub(crate) const ALL: [Golden; 10] = [
+pub(crate) const ALL: [Golden; 11] = [
     ("announce", Head { sequence: 7, counter: 0, ..head(None) }, announce),
     ("telegram", Head { sequence: u32::MAX, ..head(Some(Topic::Telegram)) }, telegram),
     ("scan", Head { flags: LanFlags::SUSPECT, ..head(Some(Topic::Scan)) }, |room| {
-        scan(361, 0, 500, 0).pack(room)
+        scan(361, -90_000, 500, 0).pack(room)
     }),
     (
         "scan_intensities",
         Head { flags: LanFlags::SIMULATED, sequence: 2, ..head(Some(Topic::Scan)) },
-        |room| scan(401, 40_000, 250, 3).pack(room),
+        |room| scan(401, -50_000, 250, 3).pack(room),
     ),
+    ("scan_turn", Head { sequence: 3, ..head(Some(Topic::Scan)) }, |room| turn().pack(room)),
     ("marks", head(Some(Topic::Marks)), |room| marks().pack(room)),
     ("zones", ZONES, |room| zones().pack(room)),
     ("zones_unknown", Head { sequence: 5001, ..ZONES }, |room| {
@@ -43,6 +44,8 @@ pub(crate) const ZONES: Head = Head { sequence: 5000, ..head(Some(Topic::Zones))
 
 const fn head(topic: Option<Topic>) -> Head {
     Head {
+        part: 0,
+        parts: 1,
         topic: match topic {
             Some(topic) => topic as u8 + 1,
             None => Announce::NUMBER,
@@ -76,21 +79,46 @@ fn telegram(room: &mut [u8]) -> Option<usize> {
 }
 
 /// Every 60th beam has a code. All upper bits are 0 where there are no intensities.
-fn scan(count: u16, first_angle_mdeg: i32, step_mdeg: u16, intensity_bits: u8) -> Scan {
-    let mut scan = Scan {
-        count,
-        unit_mm: 1,
-        range_bits: 13,
-        first_angle_mdeg,
-        step_mdeg,
-        intensity_bits,
-        contents: CONTENTS_UPPER,
-        ..Scan::default()
+fn scan(count: u16, first_angle_mdeg: i32, step_mdeg: u32, intensity_bits: u8) -> Box<Scan> {
+    let head = ScanHead::lms(count.into(), first_angle_mdeg, step_mdeg, 1, 13);
+    let range = |i| if i % 60 == 0 { 0x1FFF - i / 60 } else { 1000 + 37 * i % 7000 };
+    let ranges: Vec<u16> = (0..count).map(range).collect();
+    let mut scan = Scan::of(ScanHead { intensity_bits, ..head }, &ranges);
+    for (i, upper) in scan.arrays().upper.iter_mut().enumerate() {
+        *upper = if intensity_bits > 0 { (i % 8) as u8 } else { 0 };
+    }
+    scan
+}
+
+/// Eight bins of a clockwise turn with all arrays: a code in each second, the first of them not measured.
+fn turn() -> Box<Scan> {
+    let head = ScanHead {
+        first_angle: -0.375,
+        step: -0.75,
+        spacing: 0.0625,
+        beam_time_ns: 12_500_000,
+        first_beam_ns: -3,
+        unit_um: 250,
+        valid_to: 0xFFEF,
+        no_return: Code::NoReturn.value(),
+        beyond: Code::NoReturn.value(),
+        collapsed: 5,
+        family: Family::Ld as u8,
+        flags: Scan::INCOMPLETE,
+        contents: Contents::ALL,
+        intensity_bits: 16,
+        turns: 1,
+        ..ScanHead::default()
     };
-    for i in 0..count {
-        let range = if i % 60 == 0 { 0x1FFF - i / 60 } else { 1000 + 37 * i % 7000 };
-        scan.range_array[usize::from(i)] = range;
-        scan.upper_array[usize::from(i)] = if intensity_bits > 0 { (i % 8) as u8 } else { 0 };
+    let code = [Scan::NOT_MEASURED, Code::NoReturn.value(), Code::Weak.value(), Code::Error.value()];
+    let ranges: Vec<u16> = (0..8).map(|i| if i % 2 == 0 { code[i / 2] } else { 4000 + i as u16 }).collect();
+    let mut scan = Scan::of(head, &ranges);
+    let arrays = scan.arrays();
+    for i in 0..8_u8 {
+        let of = usize::from(i);
+        arrays.angles[of] = if i == 0 { f32::NAN } else { -0.375 - 0.6875 * f32::from(i) };
+        arrays.wide[of] = 1000 * u16::from(i);
+        arrays.upper[of] = i;
     }
     scan
 }
@@ -98,7 +126,7 @@ fn scan(count: u16, first_angle_mdeg: i32, step_mdeg: u16, intensity_bits: u8) -
 fn marks() -> Marks {
     let mut marks = Marks { count: 2, flags: Marks::OVERFLOW, ..Marks::default() };
     marks.mark_array[0] = Mark {
-        angle_mdeg: -250,
+        angle_mdeg: -89_750,
         range_dmm: 12_345,
         weight: 11,
         peak: 5,
@@ -107,7 +135,7 @@ fn marks() -> Marks {
         last_beam: 2,
     };
     marks.mark_array[1] = Mark {
-        angle_mdeg: 90_000,
+        angle_mdeg: 0,
         range_dmm: 79_999,
         weight: 7,
         peak: 7,
@@ -132,17 +160,19 @@ fn zones() -> Zones {
     zones
 }
 
-/// 64 segments of three beams, of which 55 fit.
-fn foreground() -> Foreground {
-    let mut foreground =
-        Foreground { generation: 9, count: 361, unit_mm: 1, segments: 64, ..Foreground::default() };
+/// 64 segments of three beams, of which 54 fit.
+fn foreground() -> Box<Foreground> {
+    let mut foreground = Foreground::of(361);
+    let head =
+        ForegroundHead { generation: 9, unit_um: 1000, count: 361, beams: 192, segments: 64, left_out: 0 };
+    let arrays = foreground.begin(head);
     for s in 0..64_u16 {
-        for beam in [5 * s, 5 * s + 1, 5 * s + 2] {
-            foreground.bit_array[usize::from(beam) / 8] |= 1 << (beam % 8);
-            foreground.range_array[usize::from(foreground.beams)] = 2000 + beam;
-            foreground.beams += 1;
+        for k in 0..3 {
+            let (at, beam) = (usize::from(3 * s + k), 5 * s + k);
+            arrays.bits[usize::from(beam) / 8] |= 1 << (beam % 8);
+            arrays.ranges[at] = 2000 + beam;
         }
-        foreground.segment_array[usize::from(s)] = Segment {
+        arrays.segments[usize::from(s)] = Segment {
             first: 5 * s,
             last: 5 * s + 2,
             nearest: 2000 + 5 * s,
@@ -154,23 +184,22 @@ fn foreground() -> Foreground {
     foreground
 }
 
-fn background() -> Background {
-    let mut model = Background {
+fn background() -> Box<Background> {
+    let head = BackgroundHead {
+        first_angle: -90_f64.to_radians(),
+        step: 1_f64.to_radians(),
         generation: 9,
+        unit_um: 10_000,
         taught: 162,
-        count: 181,
-        unit_mm: 10,
         flags: Background::FROZEN,
-        ..Background::default()
+        ..BackgroundHead::default()
     };
-    for i in 0..181_u16 {
-        model.range_array[usize::from(i)] = match i % 10 {
-            0 => Background::UNTAUGHT,
-            1 => Background::FAR,
-            _ => 3000 + i,
-        };
-    }
-    model
+    let range = |i: u16| match i % 10 {
+        0 => Background::UNTAUGHT,
+        1 => Background::FAR,
+        _ => 3000 + i,
+    };
+    Background::of(head, &(0..181).map(range).collect::<Vec<_>>())
 }
 
 fn status() -> Status {

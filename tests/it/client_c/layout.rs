@@ -4,7 +4,8 @@
 use std::mem::{offset_of, size_of};
 
 use schema::{
-    Background, Counter, Foreground, Header, Mark, Marks, Pose, Scan, Segment, Status, Zone, Zones,
+    BackgroundHead, Contents, Counter, Family, ForegroundHead, Header, Mark, Marks, Pose, Scan, ScanHead,
+    Segment, Status, Zone, Zones,
 };
 
 struct Layout {
@@ -35,20 +36,19 @@ macro_rules! layouts {
 
 fn layouts() -> Vec<Layout> {
     let layouts = layouts! {
-        "scanhub_header_v1" Header: seq topic_seq stamp_first_ns stamp_last_ns wall_ns boot sensor quality flags
+        "scanhub_header_v2" Header: seq topic_seq stamp_first_ns stamp_last_ns wall_ns boot sensor quality flags
             period_us hub_pid reasons hub_time;
-        "scanhub_scan_v1" Scan: count unit_mm range_bits first_angle_mdeg step_mdeg intensity_bits contents
-            range_array upper_array pad;
-        "scanhub_mark_v1" Mark: angle_mdeg range_dmm weight peak edge first_beam last_beam;
-        "scanhub_marks_v1" Marks: count flags reserved mark_array;
-        "scanhub_zone_v1" Zone: radius_mm beams violated reserved;
-        "scanhub_zones_v1" Zones: verdict count nearest_beam nearest_mm invalid_beams flags reserved zone_array;
-        "scanhub_segment_v1" Segment: first last nearest width x_mm y_mm;
-        "scanhub_foreground_v1" Foreground: generation count beams unit_mm left_out segments bit_array pad
-            range_array pad2 segment_array;
-        "scanhub_background_v1" Background: generation taught count unit_mm flags reserved range_array pad;
-        "scanhub_pose_v1" Pose: x_m y_m yaw_rad upside_down reserved;
-        "scanhub_status_v1" Status: state mode unit_mm reserved baud since_ns rate_mhz angle_deg resolution_cdeg
+        "scanhub_scan_v2" ScanHead: first_angle step spacing beam_time_ns first_beam_ns unit_um count valid_to no_return
+            beyond collapsed family flags contents intensity_bits turns reserved turn_ns reserved2;
+        "scanhub_mark_v2" Mark: angle_mdeg range_dmm weight peak edge first_beam last_beam;
+        "scanhub_marks_v2" Marks: count flags reserved mark_array;
+        "scanhub_zone_v2" Zone: radius_mm beams violated reserved;
+        "scanhub_zones_v2" Zones: verdict count nearest_beam nearest_mm invalid_beams flags reserved zone_array;
+        "scanhub_segment_v2" Segment: first last nearest width x_mm y_mm;
+        "scanhub_foreground_v2" ForegroundHead: generation unit_um count beams segments left_out;
+        "scanhub_background_v2" BackgroundHead: first_angle step generation unit_um taught count flags reserved;
+        "scanhub_pose_v2" Pose: x_m y_m yaw_rad upside_down reserved;
+        "scanhub_status_v2" Status: state mode unit_mm reserved baud since_ns rate_mhz angle_deg resolution_cdeg
             type_text port_text last_error_text counters pose;
     };
     for layout in &layouts {
@@ -94,25 +94,75 @@ pub(crate) fn program() -> String {
     format!("#include <scanhub/attach.h>\n#include <stdio.h>\nint main(void) {{\n{says}return 0;\n}}\n")
 }
 
-/// A program that computes what the header does, of 405 beams of `scan`: distance, angle, time.
+/// Scans of all forms: of an LMS in each of its modes, of a turn with all arrays, without any, and none.
+pub(crate) fn scans() -> Vec<Box<Scan>> {
+    let ranges = |count: u32, greatest: u32| -> Vec<u16> {
+        (0..count).map(|i| (greatest - (i * 3) % 40) as u16).collect()
+    };
+    let lms = |count: u16, bits, step_mdeg, unit_mm| {
+        let head = ScanHead::lms(count.into(), -50_000, step_mdeg, unit_mm, bits);
+        Scan::of(ScanHead { intensity_bits: bits - 13, ..head }, &ranges(count.into(), (1 << bits) - 1))
+    };
+    let mut scans = vec![lms(361, 13, 500, 1), lms(181, 14, 1000, 10), lms(401, 15, 250, 100)];
+    for contents in [0, Contents::UPPER, Contents::WIDE, Contents::ANGLES | Contents::WIDE, Contents::ALL] {
+        let head = ScanHead {
+            first_angle: 3.0,
+            step: -0.0125,
+            beam_time_ns: 222_222,
+            first_beam_ns: -99_999_999,
+            unit_um: 250,
+            valid_to: 0xFFEF,
+            collapsed: 7,
+            family: Family::Ld as u8,
+            flags: Scan::INCOMPLETE,
+            contents,
+            intensity_bits: 8,
+            ..ScanHead::default()
+        };
+        let mut scan = Scan::of(head, &ranges(450, 0xFFFF));
+        let arrays = scan.arrays();
+        for (i, angle) in arrays.angles.iter_mut().enumerate() {
+            *angle = if i % 9 == 0 { f32::NAN } else { i as f32 / 100.0 };
+        }
+        arrays.wide.iter_mut().zip(1..).for_each(|(wide, i)| *wide = 100 * i);
+        arrays.upper.iter_mut().zip(1..).for_each(|(upper, i): (_, u16)| *upper = (i % 251) as u8);
+        scans.push(scan);
+    }
+    scans.push(Scan::of(ScanHead::default(), &[]));
+    scans
+}
+
+/// A program that computes what the header does, of all beams of `scan` and three more; and of a sample that is none, and of
+/// one that is cut short, that nothing leads outside of it.
 pub(crate) fn computes(header: &Header, scan: &Scan) -> String {
-    let ranges: Vec<String> = scan.range_array.iter().map(u16::to_string).collect();
-    let Scan { count, unit_mm, range_bits, first_angle_mdeg, step_mdeg, .. } = scan;
+    let bytes = scan.bytes();
+    let list: Vec<String> = bytes.iter().map(u8::to_string).collect();
     format!(
-        "#include <scanhub/attach.h>\n#include <inttypes.h>\n#include <stdio.h>\n\
-         static const uint16_t ranges[401] = {{{}}};\n\
+        "#include <scanhub/attach.h>\n#include <inttypes.h>\n#include <stdio.h>\n#include <stdlib.h>\n#include <string.h>\n\
+         static const unsigned char bytes[] = {{{}}};\n\
          int main(void) {{\n\
-         struct scanhub_header_v1 header = {{0}};\n\
-         struct scanhub_scan_v1 scan = {{0}};\n\
+         struct scanhub_header_v2 header = {{0}};\n\
+         struct scanhub_sample sample = {{0}};\n\
+         void *memory = malloc(sizeof bytes);\n\
+         if (scanhub_count(&sample) != 0 || !isnan(scanhub_range_m(&sample, 0)) || scanhub_code(&sample, 0) != NULL\n\
+             || scanhub_beam_stamp_ns(&sample, 0) != 0 || scanhub_background_ranges(&sample) != NULL\n\
+             || scanhub_segments(&sample) != NULL || scanhub_in_foreground(&sample, 0)) return 1;\n\
+         memcpy(memory, bytes, sizeof bytes);\n\
          header.stamp_first_ns = {};\n\
-         scan.count = {count}; scan.unit_mm = {unit_mm}; scan.range_bits = {range_bits};\n\
-         scan.first_angle_mdeg = {first_angle_mdeg}; scan.step_mdeg = {step_mdeg};\n\
-         for (unsigned i = 0; i < 401; i++) scan.range_array[i] = ranges[i];\n\
-         for (unsigned i = 0; i < 405; i++)\n\
-         printf(\"%d %d %\" PRIu64 \"\\n\", (int)scanhub_distance_mm(&scan, i), (int)scanhub_angle_mdeg(&scan, i),\n\
-         scanhub_beam_time_ns(&header, &scan, i));\n\
+         sample.header = &header; sample.payload = memory;\n\
+         sample.length = 64 + (sizeof bytes - 64) / 2;\n\
+         if (scanhub_count(&sample) > {} / 2) return 2;\n\
+         sample.length = sizeof bytes;\n\
+         printf(\"%u %u %d\\n\", scanhub_count(&sample), scanhub_collapsed(&sample), scanhub_is_incomplete(&sample));\n\
+         for (unsigned i = 0; i < scanhub_count(&sample) + 3; i++) {{\n\
+         const char *code = scanhub_code(&sample, i);\n\
+         printf(\"%.17g %.17g %s %d %\" PRIu64 \"\\n\", scanhub_range_m(&sample, i), scanhub_angle(&sample, i),\n\
+         code == NULL ? \"reading\" : code, (int)scanhub_intensity(&sample, i), scanhub_beam_stamp_ns(&sample, i));\n\
+         }}\n\
+         free(memory);\n\
          return 0;\n}}\n",
-        ranges.join(","),
-        header.stamp_first_ns
+        list.join(","),
+        header.stamp_first_ns,
+        scan.beams()
     )
 }

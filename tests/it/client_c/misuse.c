@@ -166,7 +166,7 @@ static void samples(const char *sensor)
     struct scanhub_sample lent[4], fifth, copy;
     for (int i = 0; i < 4; i++) {
         MUST(scanhub_wait(handle, 20000) == 1);
-        MUST(scanhub_take(handle, &lent[i]) == 1 && lent[i].length == sizeof(struct scanhub_scan_v1));
+        MUST(scanhub_take(handle, &lent[i]) == 1 && lent[i].length == sizeof(struct scanhub_scan_v2) + 3 * 361);
         MUST(i == 0 || lent[i].header->topic_seq == lent[i - 1].header->topic_seq + 1 + lent[i].missed);
     }
     MUST(scanhub_hub_lives(handle) == 1);

@@ -45,7 +45,7 @@ fn damage(random: &mut Rng, datagram: &Datagram<'_>) -> Vec<u8> {
     };
     for _ in 0..random.usize(..4) {
         // The beginning has the counts.
-        let end = if random.bool() { payload.len() } else { payload.len().min(20) };
+        let end = if random.bool() { payload.len() } else { payload.len().min(48) };
         let at = random.usize(..end.max(1));
         if at < payload.len() && !is_spared(at) {
             payload[at] = match random.u8(..4) {

@@ -32,6 +32,29 @@ fn the_module_reads_what_schema_reads() {
 }
 
 #[test]
+fn the_module_puts_parts_together() {
+    if reader().is_none() {
+        return;
+    }
+    let hex = |file: &str| vectors::bytes(file).iter().map(|byte| format!("{byte:02x}")).collect::<String>();
+    let [scan, first, second, last] =
+        ["scan.hex", "scan_part_0.hex", "scan_part_1.hex", "scan_part_2.hex"].map(hex);
+    for (order, whole) in [
+        (&[&first, &second, &last][..], &scan[96..]),
+        (&[&last, &first, &second], &scan[96..]),
+        (&[&last, &last, &second, &first], &scan[96..]),
+        (&[&first, &second, &first], ""),
+        (&[&scan], &scan[96..]),
+    ] {
+        let top = Path::new(env!("CARGO_MANIFEST_DIR"));
+        let mut command = Command::new(std::env::var("SCANHUB_PYTHON").unwrap_or("python3".to_owned()));
+        command.arg("-B").arg(top.join("tests/it/lan/reader.py")).args(order);
+        let output = command.env("PYTHONPATH", top.join("clients/python")).output().expect("runs");
+        assert_eq!(String::from_utf8_lossy(&output.stdout).trim(), whole, "{output:?}");
+    }
+}
+
+#[test]
 fn the_module_knows_keys() {
     let Some(mut reader) = reader() else { return };
     let list = vectors::list();

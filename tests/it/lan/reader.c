@@ -29,21 +29,55 @@ static void telegram(const struct scanhub_telegram *t)
     printf("\"}");
 }
 
+/* With as few digits as say the number and no other, and a point; JSON has neither nan nor infinity. */
+static void number(const char *before, double value)
+{
+    char digits[32];
+    int precision = 0;
+    do
+        snprintf(digits, sizeof digits, "%.*g", ++precision, value);
+    while (precision < 17 && strtod(digits, NULL) != value);
+    printf("%s%s%s", before, isfinite(value) ? digits : "null",
+           digits[strspn(digits, "-0123456789")] == 0 ? ".0" : "");
+}
+
 static void scan(const struct scanhub_scan *s)
 {
-    int says_something = 0;
-    printf("{\"count\":%u,\"unit_mm\":%u,\"range_bits\":%u,\"first_angle_mdeg\":%ld,\"step_mdeg\":%u,\"intensity_bits\":%u",
-           s->count, s->unit_mm, s->range_bits, (long)s->first_angle_mdeg, s->step_mdeg, s->intensity_bits);
-    printf(",\"ranges\":[");
+    static const char *const families[] = {"lms", "ld"};
+    printf("{\"family\":%s%s%s", s->family < 2 ? "\"" : "", s->family < 2 ? families[s->family] : "null",
+           s->family < 2 ? "\"" : "");
+    printf(",\"unit_um\":%lu,\"count\":%u", (unsigned long)s->unit_um, s->count);
+    number(",\"first_angle\":", s->first_angle);
+    number(",\"step\":", s->step);
+    number(",\"spacing\":", s->spacing);
+    printf(",\"beam_time_ns\":%lu,\"valid_to\":%u,\"no_return\":%u,\"beyond\":%u,\"collapsed\":%u,\"incomplete\":%s",
+           (unsigned long)s->beam_time_ns, s->valid_to, s->no_return, s->beyond, s->collapsed, boolean(s->incomplete));
+    printf(",\"intensity_bits\":%u,\"ranges\":[", s->intensity_bits);
     for (unsigned i = 0; i < s->count; i++)
         printf("%s%u", i ? "," : "", scanhub_scan_range(s, i));
-    printf("],\"mm\":[");
+    printf("],\"m\":[");
     for (unsigned i = 0; i < s->count; i++)
-        printf("%s%ld", i ? "," : "", (long)scanhub_scan_mm(s, i));
+        number(i ? "," : "", scanhub_scan_m(s, i));
+    printf("],\"codes\":[");
+    for (unsigned i = 0; i < s->count; i++) {
+        const char *code = scanhub_scan_code(s, i);
+        printf("%s%s%s%s", i ? "," : "", code ? "\"" : "", code ? code : "null", code ? "\"" : "");
+    }
+    printf("],\"times_ns\":[");
+    for (unsigned i = 0; i < s->count; i++)
+        printf("%s%lld", i ? "," : "", (long long)scanhub_scan_beam_ns(s, i));
+    printf("],\"angles\":[");
+    for (unsigned i = 0; s->angles && i < s->count; i++) {
+        double exact = scanhub_f32(s->angles + 4 * (size_t)i), angle = scanhub_scan_angle(s, i);
+        if (isnan(exact) ? angle != s->first_angle + i * s->step : angle != exact)
+            abort();
+        number(i ? "," : "", exact);
+    }
+    printf("],\"intensities\":[");
+    for (unsigned i = 0; i < s->count && scanhub_scan_intensity(s, i) >= 0; i++)
+        printf("%s%ld", i ? "," : "", (long)scanhub_scan_intensity(s, i));
     printf("],\"upper\":[");
     for (unsigned i = 0; s->upper && i < s->count; i++)
-        says_something |= s->upper[i];
-    for (unsigned i = 0; says_something && i < s->count; i++)
         printf("%s%u", i ? "," : "", s->upper[i]);
     printf("]}");
 }
@@ -81,8 +115,8 @@ static void zones(const struct scanhub_zones *z)
 static void foreground(const struct scanhub_foreground *f)
 {
     unsigned n = 0;
-    printf("{\"generation\":%lu,\"count\":%u,\"unit_mm\":%u,\"left_out\":%u,\"beams\":[", (unsigned long)f->generation,
-           f->count, f->unit_mm, f->left_out);
+    printf("{\"generation\":%lu,\"count\":%u,\"unit_um\":%lu,\"left_out\":%u,\"beams\":[", (unsigned long)f->generation,
+           f->count, (unsigned long)f->unit_um, f->left_out);
     for (unsigned i = 0; i < f->count; i++)
         if (scanhub_is_foreground(f, i))
             printf("%s%u", n++ ? "," : "", i);
@@ -100,8 +134,11 @@ static void foreground(const struct scanhub_foreground *f)
 
 static void background(const struct scanhub_background *b)
 {
-    printf("{\"generation\":%lu,\"taught\":%u,\"count\":%u,\"unit_mm\":%u,\"frozen\":%s,\"ranges\":[",
-           (unsigned long)b->generation, b->taught, b->count, b->unit_mm, boolean(b->frozen));
+    printf("{\"generation\":%lu,\"taught\":%u,\"count\":%u,\"unit_um\":%lu", (unsigned long)b->generation, b->taught,
+           b->count, (unsigned long)b->unit_um);
+    number(",\"first_angle\":", b->first_angle);
+    number(",\"step\":", b->step);
+    printf(",\"frozen\":%s,\"ranges\":[", boolean(b->frozen));
     for (unsigned i = 0; i < b->count; i++)
         printf("%s%u", i ? "," : "", scanhub_background_range(b, i));
     printf("]}");
@@ -141,8 +178,9 @@ static void head(const struct scanhub_datagram *d)
     printf("{\"head\":{\"topic\":%u,\"flags\":%u,\"hub\":\"%016llx\",\"epoch\":%lu,\"sequence\":%lu,\"stamp_ns\":%llu,",
            d->topic, d->flags, (unsigned long long)d->hub, (unsigned long)d->epoch, (unsigned long)d->sequence,
            (unsigned long long)d->stamp_ns);
-    printf("\"sensor\":%u,\"revision\":%u,\"counter\":%lu,\"payload_len\":%u},\"mac\":%s,\"payload\":", d->sensor,
-           d->revision, (unsigned long)d->counter, d->payload_len, boolean(d->mac != NULL));
+    printf("\"sensor\":%u,\"part\":%u,\"parts\":%u,\"revision\":%u,\"counter\":%lu,\"payload_len\":%lu},", d->sensor, d->part,
+           d->parts, d->revision, (unsigned long)d->counter, (unsigned long)d->payload_len);
+    printf("\"mac\":%s,\"payload\":", boolean(d->mac != NULL));
 }
 
 static enum scanhub_result payload(const struct scanhub_datagram *d)

@@ -3,6 +3,7 @@ where there is one, a line of JSON out, in the words of the list of golden datag
 
 import dataclasses
 import json
+import math
 import sys
 
 import scanhub_lan
@@ -25,19 +26,37 @@ def says(datagram):
     if datagram.topic == "announce":
         out["boot"] = f"{payload.boot:016x}"
     if datagram.topic == "scan":
-        del out["payload"]
-        out["upper"] = list(payload.upper)
-        out["mm"] = [-1 if range_mm is None else range_mm for range_mm in payload.ranges_mm()]
+        # The list has what is computed of these.
+        for name in ("payload", "first_beam_ns", "turns", "turn_ns", "exact"):
+            del out[name]
+        out["codes"], out["times_ns"], out["upper"] = payload.codes(), payload.times_ns(), list(payload.upper)
+        # JSON has neither nan nor infinity.
+        out["angles"] = [angle if math.isfinite(angle) else None for angle in payload.exact]
+        out["m"] = payload.ranges_m()
+        assert all(math.isnan(known) or known == angle for known, angle in zip(payload.exact, payload.angles()))
+        grid = [payload.first_angle + i * payload.step for i in range(payload.count)]
+        assert payload.exact or payload.angles() == grid
         if numpy is not None:
             view = payload.view()
             assert view.dtype == numpy.uint16 and not view.flags.writeable and not view.flags.owndata
             assert tuple(view.tolist()) == payload.ranges
-    head = {name: getattr(datagram, name) for name in "flags epoch sequence stamp_ns sensor revision counter".split()}
+    head = {name: getattr(datagram, name) for name in "flags epoch sequence stamp_ns sensor part parts revision counter".split()}
     head.update(topic=datagram.number, hub=f"{datagram.hub:016x}", payload_len=len(datagram.payload))
     return {"head": head, "authenticated": datagram.authenticated, "payload": out}
 
 
+def whole(datagrams):
+    """The payload that comes of these datagrams, if any does."""
+    parts = scanhub_lan.Parts()
+    taken = [parts.take(scanhub_lan.read(datagram)) for datagram in datagrams]
+    assert taken[:-1] == [None] * (len(taken) - 1)
+    return taken[-1] and taken[-1].payload
+
+
 assert scanhub_lan.crc32c(b"123456789") == 0xE3069283
+if len(sys.argv) > 1:
+    print((whole([bytes.fromhex(digits) for digits in sys.argv[1:]]) or b"").hex())
+    sys.exit()
 for line in sys.stdin:
     key, _, digits = line.strip().rpartition(":")
     try:

@@ -135,6 +135,6 @@ fn build_library() -> PathBuf {
 
 /// What stands before each example in C that is a part of a program.
 const C: &str = "#include <errno.h>\n#include <poll.h>\n#include <scanhub/attach.h>\n#include <stdio.h>\n#include <unistd.h>\n";
-const CPP: &str = "#include <cstdio>\n#include <scanhub/attach.hpp>\n";
+const CPP: &str = "#include <cmath>\n#include <cstdio>\n#include <scanhub/attach.hpp>\n";
 /// What is printed is to be seen by a test, too.
 const LINES: &str = "setvbuf(stdout, NULL, _IOLBF, BUFSIZ);\n";

@@ -21,15 +21,34 @@ fn schema_without_ipc_needs_no_shared_memory() {
 }
 
 #[test]
-fn lms_stands_alone() {
-    holds(crates::lms_stands_alone, |tree| {
-        let lib = tree.text("hub/lms/src/lib.rs");
+fn families_know_the_line_alone() {
+    holds(crates::families_know_the_line_alone, |tree| {
+        let planted = |family: &str| {
+            let (manifest, lib) = (format!("hub/{family}/Cargo.toml"), format!("hub/{family}/src/lib.rs"));
+            let (text, code) = (tree.text(&lib), format!("hub/{family}/src/planted.rs"));
+            vec![
+                tree.with_line(&manifest, "[dependencies]", "serialport.workspace = true"),
+                tree.with_line(&manifest, "[dev-dependencies]", "scanhub-sim.workspace = true"),
+                tree.with(&lib, &text.replace("#![no_std]", "")),
+                tree.with(&lib, &text.replace("#![forbid(unsafe_code)]", "")),
+                tree.with(&code, "//! A heap.\nextern crate alloc;\n"),
+                tree.with(&code, "//! A thread.\nuse std::thread;\n"),
+            ]
+        };
+        let another = tree.with_line("hub/ld/Cargo.toml", "[dependencies]", "scanhub-lms.workspace = true");
+        ["lms", "ld"].into_iter().flat_map(planted).chain([another]).collect()
+    });
+}
+
+#[test]
+fn the_line_knows_no_family() {
+    holds(crates::the_line_knows_no_family, |tree| {
+        let lib = tree.text("hub/line/src/lib.rs");
         vec![
-            tree.with_line("hub/lms/Cargo.toml", "[dependencies]", "serialport.workspace = true"),
-            tree.with("hub/lms/src/lib.rs", &lib.replace("#![no_std]", "")),
-            tree.with("hub/lms/src/lib.rs", &lib.replace("#![forbid(unsafe_code)]", "")),
-            tree.with("hub/lms/src/planted.rs", "//! A heap.\nextern crate alloc;\n"),
-            tree.with("hub/lms/src/planted.rs", "//! A thread.\nuse std::thread;\n"),
+            tree.with_line("hub/line/Cargo.toml", "[dependencies]", "scanhub-lms.workspace = true"),
+            tree.with_line("hub/line/Cargo.toml", "[dev-dependencies]", "scanhub-ld.workspace = true"),
+            tree.with("hub/line/src/lib.rs", &lib.replace("#![no_std]", "")),
+            tree.with("hub/line/src/planted.rs", "//! A thread.\nuse std::thread;\n"),
         ]
     });
 }
@@ -47,6 +66,9 @@ fn preprocess_only_computes() {
             planted("use std::{array, thread};"),
             planted("let ends = ranges.iter().collect::<Vec<_>>();"),
             planted("let ranges = vec![0; 401];"),
+            planted("fn boxed(scan: &Scan) -> Box<Scan> {"),
+            planted("let ranges: Vec<u16> = vec![0; beams];"),
+            tree.with("hub/preprocess/src/marks/tests.rs", "//! So.\nlet ranges = Vec::new();\n"),
             planted("let name = format!(\"{i}\");"),
             planted("use schema::ipc::Payload;"),
         ]

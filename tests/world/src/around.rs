@@ -1,6 +1,7 @@
 //! The surroundings of one link in a world: what [`daemon::surroundings::Surroundings`] asks, of simulated ports, topics and
 //! files. Decides nothing.
 
+use std::cell::Cell;
 use std::rc::Rc;
 use std::sync::Arc;
 
@@ -10,8 +11,9 @@ use lms::{MICROS, Nanos};
 use port::{PortError, Source};
 use rustix::io::Errno;
 use schema::ipc::Payload;
-use schema::{Failure, Kind, Wake};
+use schema::{Failure, Kind, Ring, Wake};
 
+use crate::event::Event;
 use crate::line::{Handle, LinkClock, OpenLine};
 use crate::planted::Defect;
 use crate::shared::Shared;
@@ -23,6 +25,8 @@ pub(crate) struct Around<'a> {
     pub(crate) number: usize,
     pub(crate) clock: Rc<LinkClock>,
     pub(crate) learned: Option<daemon::Handle<'a>>,
+    /// A planted defect owes the first ring.
+    is_owed: Cell<bool>,
 }
 
 impl<'a> Around<'a> {
@@ -36,7 +40,16 @@ impl<'a> Around<'a> {
         let clock = Rc::new(LinkClock::default());
         clock.pass(shared.clock.get());
         let learned = slots.and_then(|slots| slots.of(sensor));
-        Around { shared: shared.clone(), number, clock, learned }
+        Around { shared: shared.clone(), number, clock, learned, is_owed: Cell::default() }
+    }
+
+    /// Whoever sleeps for topics of `ring` will hear it.
+    fn rouse(&self, ring: Ring) {
+        let (now, Shared { planted, woken, log, .. }) = (self.clock.now(), &*self.shared);
+        if !planted.strikes(Defect::LostWake, 200) {
+            log.tell(now, &Event::Rung { sensor: self.number, ring });
+            woken.borrow_mut().push((self.number, ring, now));
+        }
     }
 
     fn line(&self, device: u64) -> OpenLine {
@@ -117,9 +130,18 @@ impl Surroundings for Around<'_> {
         Ok(Carrier::new(&self.shared, &self.clock, self.number))
     }
 
-    fn wake(&self, _: Wake) {
-        if !self.shared.planted.strikes(Defect::LostWake, 200) {
-            self.shared.woken.borrow_mut().push((self.number, self.clock.now()));
+    fn ring(&self, ring: Ring) {
+        if ring == Ring::First && self.shared.planted.is(Defect::OneRing) {
+            self.is_owed.set(true);
+        } else {
+            self.rouse(ring);
+        }
+    }
+
+    fn tell(&self, _: Wake) {
+        // Nobody here listens to the event.
+        if self.is_owed.take() {
+            self.rouse(Ring::First);
         }
     }
 

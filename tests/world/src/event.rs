@@ -3,7 +3,7 @@
 use lms::Nanos;
 use lms::measured::MEASURED;
 use schema::datagram::{Datagram, DatagramError, Row};
-use schema::{Header, Status, Topic, Verdict, Zones};
+use schema::{Header, Ring, Status, Topic, Verdict, Zones};
 
 use crate::consumer::Number;
 use crate::hash::History;
@@ -34,6 +34,8 @@ pub(crate) enum Event<'a> {
     Read { sensor: usize, len: usize, to: u64 },
     /// A sample went to whoever is attached.
     Published { sensor: usize, sample: &'a Sample },
+    /// Whoever sleeps at the bell of a sensor for topics of this ring is woken.
+    Rung { sensor: usize, ring: Ring },
     /// A sample got no memory.
     Lacking { sensor: usize, topic: Topic },
     /// A consumer came.
@@ -77,6 +79,8 @@ pub(crate) enum Event<'a> {
 pub(crate) enum Arrival {
     /// It is refused.
     Refused(DatagramError),
+    /// A part of a sample that is not whole yet.
+    Part,
     /// It came before, or is an announcement that a newer one overtook.
     Known,
     /// An announcement.
@@ -151,6 +155,7 @@ impl Event<'_> {
                 history.bytes(bytemuck::bytes_of(&Header { hub_pid: 0, ..sample.header }));
                 history.bytes(&sample.bytes);
             }
+            Event::Rung { sensor, ring } => numbers(&[29, sensor as u64, ring as u64]),
             Event::Lacking { sensor, topic } => numbers(&[11, sensor as u64, topic as u64]),
             Event::Attached { consumer, sensor, topic, .. } => {
                 numbers(&[12, consumer.0.into(), sensor as u64, topic as u64]);
@@ -230,6 +235,7 @@ impl Event<'_> {
                 }
             }
             Event::Taken { .. } | Event::Read { .. } | Event::Dropped { .. } | Event::Lacking { .. } => None,
+            Event::Rung { .. } => None,
             Event::Transmitted { .. } | Event::Republished { .. } | Event::Counted { .. } => None,
             Event::Arrived { outcome: Arrival::Refused(why), .. } => Some(format!("refused: {why:?}")),
             Event::Arrived { .. } => None,
@@ -243,6 +249,7 @@ impl Arrival {
         match self {
             Arrival::Refused(why) => 10 + why as u64,
             Arrival::Known => 0,
+            Arrival::Part => 4,
             Arrival::Announced => 1,
             Arrival::Sample { late } => 2 + u64::from(late),
         }

@@ -10,6 +10,8 @@ use lms::telegram::Writer;
 pub enum Defect {
     /// Now and then nobody is woken.
     LostWake,
+    /// Whoever waits for zones is woken only when all is sent.
+    OneRing,
     /// Now and then the last byte of a read is lost.
     LostByte,
     /// Now and then a bit of what is read is another one.
@@ -36,6 +38,8 @@ pub enum Defect {
     Reordered,
     /// Now and then a byte of a remote sample is another one.
     RemoteAltered,
+    /// Now and then a listener takes a part for the whole sample.
+    RemoteHalf,
     /// Now and then a listener takes one datagram twice.
     RemoteCountedTwice,
     /// A datagram has the time at which it was read, not that at which it came.
@@ -48,8 +52,9 @@ pub enum Defect {
 
 impl Defect {
     /// All of them.
-    pub const ALL: [Defect; 18] = [
+    pub const ALL: [Defect; 20] = [
         Defect::LostWake,
+        Defect::OneRing,
         Defect::LostByte,
         Defect::FlippedBit,
         Defect::SurvivingVerdict,
@@ -63,6 +68,7 @@ impl Defect {
         Defect::Delayed,
         Defect::Reordered,
         Defect::RemoteAltered,
+        Defect::RemoteHalf,
         Defect::RemoteCountedTwice,
         Defect::RemoteStampedLate,
         Defect::RemoteSurvivingVerdict,

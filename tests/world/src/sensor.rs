@@ -1,6 +1,7 @@
 //! A simulated sensor and the line to a port, in the order of time: what a host writes goes in, what arrives comes out. Refuses
 //! to know what a port does with it.
 
+use sim::device::Device as _;
 use std::collections::VecDeque;
 use std::sync::Arc;
 

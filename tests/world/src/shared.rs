@@ -6,6 +6,7 @@ use std::collections::BTreeMap;
 use std::rc::Rc;
 
 use lms::Nanos;
+use schema::Ring;
 
 use crate::event::{Detail, Event, Violation};
 use crate::hash::History;
@@ -37,8 +38,8 @@ pub(crate) struct Shared {
     pub(crate) handles: Cell<usize>,
     /// Nobody can open anything.
     pub(crate) lacks_descriptors: Cell<bool>,
-    /// Sensors whose consumers were woken, and when.
-    pub(crate) woken: RefCell<Vec<(usize, Nanos)>>,
+    /// Sensors whose consumers were woken, of which topics, and when.
+    pub(crate) woken: RefCell<Vec<(usize, Ring, Nanos)>>,
 }
 
 impl Shared {

@@ -11,6 +11,7 @@ use std::rc::Rc;
 
 use lms::Nanos;
 use schema::ipc::{LoanError, Medium, Payload, SendError};
+use schema::limits::TopicLimits;
 use schema::{Header, Topic, Verdict, limits};
 
 use crate::consumer::Number;
@@ -110,7 +111,7 @@ impl Board {
     /// A place for `consumer`, if there is one.
     pub(crate) fn attach(&mut self, sensor: usize, topic: Topic, consumer: Number) -> bool {
         let places = &mut self.sensors[sensor][topic as usize].places;
-        let has_room = places.len() < limits::subscribers(topic);
+        let has_room = places.len() < TopicLimits::default().consumers;
         if has_room {
             places.push(Place { consumer, queue: VecDeque::new(), is_connected: false, is_dead: false });
         }

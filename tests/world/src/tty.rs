@@ -5,7 +5,7 @@ use std::collections::VecDeque;
 
 use lms::Nanos;
 use port::PortError;
-use sim::machine::{Part, Sent};
+use sim::device::{Part, Sent};
 use sim::noise::Mistuned;
 use sim::wire::Carried;
 
@@ -63,15 +63,15 @@ impl Tty {
         // The sensor is lent out, so that what arrives can go into the buffer.
         let Tty { number, sensor, device, is_open, rate, mistuned, buffer, put, begun, .. } = self;
         sensor.advance(to, |at, carried| {
-            let Carried { bytes, baud, idle_after, part, fault } = carried;
+            let Carried { bytes, rate: sent_at, idle_after, part, fault } = carried;
             let mut damage = fault.map(|fault| fault.name());
             let mut bytes = bytes;
             if device.is_none() || !*is_open {
                 damage = damage.or(Some("unread"));
                 bytes.clear();
-            } else if baud.rate() != *rate {
+            } else if sent_at != *rate {
                 damage = damage.or(Some("baud"));
-                bytes = mistuned.receive((baud.rate(), *rate), &bytes, idle_after);
+                bytes = mistuned.receive((sent_at, *rate), &bytes, idle_after);
             } else {
                 mistuned.tune();
             }

@@ -196,9 +196,9 @@ impl World {
 
     /// Lets consumers know that they were woken.
     pub(crate) fn ring(&mut self) {
-        for (sensor, at) in self.shared.woken.borrow_mut().drain(..) {
+        for (sensor, ring, at) in self.shared.woken.borrow_mut().drain(..) {
             let its = self.consumers.iter_mut().filter(|consumer| consumer.sensor == sensor);
-            its.for_each(|consumer| consumer.wake(at));
+            its.filter(|consumer| consumer.topic.row().ring == ring).for_each(|consumer| consumer.wake(at));
             self.remote.wake(at);
         }
     }

@@ -5,7 +5,7 @@ use world::{Defect, Detail, Plan, run_with};
 
 fn judge(defect: Defect) -> &'static [&'static str] {
     match defect {
-        Defect::LostWake | Defect::Delayed => &["prompt"],
+        Defect::LostWake | Defect::OneRing | Defect::Delayed => &["prompt"],
         Defect::LostByte => &["bytes"],
         Defect::FlippedBit | Defect::UnsentTelegram => &["nothing_lost"],
         Defect::SurvivingVerdict => &["verdict"],
@@ -14,7 +14,7 @@ fn judge(defect: Defect) -> &'static [&'static str] {
         Defect::Renumbered => &["numbers"],
         Defect::EepromWrite => &["eeprom"],
         Defect::SwallowedHangUp => &["liveness"],
-        Defect::RemoteAltered => &["remote_nothing_invented"],
+        Defect::RemoteAltered | Defect::RemoteHalf => &["remote_nothing_invented"],
         Defect::RemoteCountedTwice => &["remote_accounts"],
         Defect::RemoteStampedLate => &["remote_numbers"],
         Defect::RemoteSurvivingVerdict => &["remote_verdict"],

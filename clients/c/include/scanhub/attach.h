@@ -7,8 +7,8 @@
  *     if (scanhub_open(&scans, NULL, "front", SCANHUB_TOPIC_SCAN, SCANHUB_WAIT_DOORBELL) < 0)
  *         fprintf(stderr, "%s\n", scanhub_error());
  *     while (scanhub_wait(scans, -1) == 1 && scanhub_take(scans, &sample) == 1) {
- *         const struct scanhub_scan_v1 *scan = sample.payload;
- *         use(scan);
+ *         for (unsigned i = 0; i < scanhub_count(&sample); i++)
+ *             use(scanhub_range_m(&sample, i), scanhub_angle(&sample, i));
  *         scanhub_release(&sample);
  *     }
  *     scanhub_close(scans);
@@ -25,6 +25,7 @@
 #ifndef SCANHUB_ATTACH_H
 #define SCANHUB_ATTACH_H
 
+#include <math.h>
 #include <stddef.h>
 #include <stdint.h>
 
@@ -39,14 +40,14 @@ extern "C" {
 #define SCANHUB_REFUSED_FAILED (-4)        /* another user's domain, another version's topic, or another failure */
 #define SCANHUB_REFUSED_BUG (-5)           /* in this library; close the handle */
 
-/* What the hub publishes for each sensor, and what a payload is. */
+/* What the hub publishes for each sensor, and what a payload is, or begins with. */
 #define SCANHUB_TOPIC_TELEGRAM 1   /* length bytes, STX to CRC */
-#define SCANHUB_TOPIC_SCAN 2       /* struct scanhub_scan_v1 */
-#define SCANHUB_TOPIC_MARKS 3      /* struct scanhub_marks_v1 */
-#define SCANHUB_TOPIC_ZONES 4      /* struct scanhub_zones_v1 */
-#define SCANHUB_TOPIC_FOREGROUND 5 /* struct scanhub_foreground_v1 */
-#define SCANHUB_TOPIC_BACKGROUND 6 /* struct scanhub_background_v1 */
-#define SCANHUB_TOPIC_STATUS 7     /* struct scanhub_status_v1 */
+#define SCANHUB_TOPIC_SCAN 2       /* struct scanhub_scan_v2 */
+#define SCANHUB_TOPIC_MARKS 3      /* struct scanhub_marks_v2 */
+#define SCANHUB_TOPIC_ZONES 4      /* struct scanhub_zones_v2 */
+#define SCANHUB_TOPIC_FOREGROUND 5 /* struct scanhub_foreground_v2 */
+#define SCANHUB_TOPIC_BACKGROUND 6 /* struct scanhub_background_v2 */
+#define SCANHUB_TOPIC_STATUS 7     /* struct scanhub_status_v2 */
 
 /* How scanhub_wait waits. */
 #define SCANHUB_WAIT_DOORBELL 0 /* at a word in the hub's memory, at which one call wakes all: what to take if in doubt */
@@ -57,7 +58,7 @@ extern "C" {
 struct scanhub_attachment;
 
 /* Of every sample, 64 bytes. Stamps are nanoseconds of CLOCK_MONOTONIC. */
-struct scanhub_header_v1 {
+struct scanhub_header_v2 {
     uint64_t seq;            /* number of the telegram, per sensor and hub life; the same in all that was made of it */
     uint64_t topic_seq;      /* number of the sample in its topic */
     uint64_t stamp_first_ns; /* of the telegram's first byte */
@@ -73,20 +74,43 @@ struct scanhub_header_v1 {
     uint8_t hub_time[3];     /* from the last byte until it was sent, in 256 ns, the low byte first */
 };
 
-struct scanhub_scan_v1 {
-    uint16_t count;           /* beams used, at most 401 */
-    uint8_t unit_mm;          /* millimetres per unit: 1, 10 or 100 */
-    uint8_t range_bits;       /* 13, 14 or 15; the nine greatest values are codes: see scanhub_distance_mm */
-    int32_t first_angle_mdeg; /* of beam 0: counter-clockwise seen from above, 0 right, 90000 ahead */
-    uint16_t step_mdeg;
-    uint8_t intensity_bits;   /* in the upper bits; 0: they are field bits */
-    uint8_t contents;         /* 1: the upper bits are there */
-    uint16_t range_array[401];
-    uint8_t upper_array[401];
-    uint8_t pad[1];
+/* Families of scanners. */
+#define SCANHUB_FAMILY_LMS 0
+#define SCANHUB_FAMILY_LD 1
+
+/* The arrays of a scan, beside its ranges. */
+#define SCANHUB_SCAN_UPPER 1  /* a byte: intensities, or of some modes of an LMS field bits */
+#define SCANHUB_SCAN_WIDE 2   /* two bytes: intensities */
+#define SCANHUB_SCAN_ANGLES 4 /* exact angles */
+
+/*
+ * A scan begins with this; behind it are exact angles (float), ranges (uint16_t), wide intensities (uint16_t), upper bits
+ * (uint8_t), of each array that there is one value for every beam. Read them by the functions below. Angles are in radians: 0
+ * is the sensor's own ahead, counter-clockwise positive seen from above.
+ */
+struct scanhub_scan_v2 {
+    double first_angle;     /* of beam 0 */
+    double step;            /* from one beam to the next; negative for a scanner that turns clockwise */
+    float spacing;          /* between two points that the sensor itself measures */
+    uint32_t beam_time_ns;  /* from one beam to the next */
+    int32_t first_beam_ns;  /* when beam 0 was measured, after the sample's stamp: mostly before it */
+    uint32_t unit_um;       /* micrometres per device unit */
+    uint16_t count;         /* beams, in the order of their measuring, at most 8192 */
+    uint16_t valid_to;      /* the greatest value that is a range; all above are codes */
+    uint16_t no_return;     /* the code of a beam that nothing returned to */
+    uint16_t beyond;        /* the code of an echo from beyond the range limit */
+    uint16_t collapsed;     /* points that found their beam taken by a nearer one */
+    uint8_t family;         /* SCANHUB_FAMILY_.. */
+    uint8_t flags;          /* 1: packets of the turn are missing */
+    uint8_t contents;       /* SCANHUB_SCAN_.. */
+    uint8_t intensity_bits; /* of an intensity; 0: there are none */
+    uint8_t turns;          /* beam i was measured in turn i modulo this; 0 is 1 */
+    uint8_t reserved;
+    uint32_t turn_ns;       /* time of one of several turns */
+    uint8_t reserved2[12];
 };
 
-struct scanhub_mark_v1 {
+struct scanhub_mark_v2 {
     int32_t angle_mdeg;
     uint32_t range_dmm; /* 1/10 mm */
     uint16_t weight;    /* sum of intensities */
@@ -96,14 +120,14 @@ struct scanhub_mark_v1 {
     uint16_t last_beam;
 };
 
-struct scanhub_marks_v1 {
+struct scanhub_marks_v2 {
     uint8_t count; /* at most 64 */
     uint8_t flags; /* 1 there were more, 2 unavailable: the measuring mode has no reflector bits */
     uint16_t reserved;
-    struct scanhub_mark_v1 mark_array[64];
+    struct scanhub_mark_v2 mark_array[64];
 };
 
-struct scanhub_zone_v1 {
+struct scanhub_zone_v2 {
     uint16_t radius_mm;
     uint16_t beams;   /* that met something inside */
     uint8_t violated; /* 1: enough of them, in enough scans */
@@ -116,7 +140,7 @@ struct scanhub_zone_v1 {
 #define SCANHUB_VERDICT_STOP 2
 #define SCANHUB_VERDICT_UNKNOWN 3 /* to be taken as stop, and so is every other number */
 
-struct scanhub_zones_v1 {
+struct scanhub_zones_v2 {
     uint8_t verdict;
     uint8_t count;         /* circles, at most 8 */
     uint16_t nearest_beam; /* 65535: none */
@@ -124,10 +148,10 @@ struct scanhub_zones_v1 {
     uint16_t invalid_beams;
     uint8_t flags;         /* 1: fewer scans were seen than a violation takes */
     uint8_t reserved;
-    struct scanhub_zone_v1 zone_array[8]; /* the largest first */
+    struct scanhub_zone_v2 zone_array[8]; /* the largest first */
 };
 
-struct scanhub_segment_v1 {
+struct scanhub_segment_v2 {
     uint16_t first; /* beam */
     uint16_t last;
     uint16_t nearest; /* device units */
@@ -136,29 +160,26 @@ struct scanhub_segment_v1 {
     int32_t y_mm;
 };
 
-struct scanhub_foreground_v1 {
+/* A foreground begins with this; behind it are 64 places for segments, a bit for every beam, and ranges: see below. */
+struct scanhub_foreground_v2 {
     uint32_t generation; /* of the background that the scan was compared with */
+    uint32_t unit_um;
     uint16_t count;      /* beams of the scan */
     uint16_t beams;      /* of them in the foreground */
-    uint8_t unit_mm;
-    uint8_t left_out;    /* segments that did not fit */
     uint16_t segments;   /* at most 64 */
-    uint8_t bit_array[51]; /* beam i is bit i % 8 of byte i / 8 */
-    uint8_t pad[1];
-    uint16_t range_array[401]; /* of the beams in the foreground, in their order */
-    uint8_t pad2[2];
-    struct scanhub_segment_v1 segment_array[64];
+    uint16_t left_out;   /* segments that did not fit */
 };
 
-struct scanhub_background_v1 {
+/* A background begins with this; behind it is a range for every beam: see scanhub_background_ranges. */
+struct scanhub_background_v2 {
+    double first_angle; /* as of a scan */
+    double step;        /* 0 before the first scan */
     uint32_t generation;
+    uint32_t unit_um;
     uint16_t taught; /* beams whose background is known */
     uint16_t count;  /* beams of the model, 0 before the first scan */
-    uint8_t unit_mm;
     uint8_t flags;   /* 1 frozen */
-    uint8_t reserved[2];
-    uint16_t range_array[401]; /* 0 not known, 65535 beyond what the sensor measures */
-    uint8_t pad[2];
+    uint8_t reserved[3];
 };
 
 /* Where the counters of a status stand. */
@@ -191,7 +212,7 @@ enum scanhub_counter {
     SCANHUB_COUNTER_LOST_PPM /* of the last 10 s, in millionths */
 };
 
-struct scanhub_pose_v1 {
+struct scanhub_pose_v2 {
     double x_m; /* ahead of the robot's centre */
     double y_m; /* to the left of it */
     double yaw_rad;
@@ -209,7 +230,7 @@ struct scanhub_pose_v1 {
 #define SCANHUB_STATE_PAUSED 6
 
 /* Texts are UTF-8 and end with 0 only where they do not fill their array: print them by "%.128s". */
-struct scanhub_status_v1 {
+struct scanhub_status_v2 {
     uint8_t state;
     uint8_t mode;    /* measuring mode, 255 unknown */
     uint8_t unit_mm; /* 0 unknown */
@@ -223,7 +244,7 @@ struct scanhub_status_v1 {
     char port_text[128];
     char last_error_text[160];
     uint64_t counters[28]; /* by enum scanhub_counter */
-    struct scanhub_pose_v1 pose;
+    struct scanhub_pose_v2 pose;
 };
 
 /* No beam has a valid reading. */
@@ -248,9 +269,9 @@ struct scanhub_robot {
 
 /* A sample that is lent: scanhub_take fills it, scanhub_release empties it. */
 struct scanhub_sample {
-    const struct scanhub_header_v1 *header; /* NULL: no hub sent it, see stale; or a robot's verdict */
+    const struct scanhub_header_v2 *header; /* NULL: no hub sent it, see stale; or a robot's verdict */
     const void *payload;                    /* where the hub wrote it, for reading */
-    size_t length;                          /* its bytes */
+    size_t length;                          /* its bytes, as far as they are used */
     uint64_t missed;                        /* samples that were sent before it and not received */
     int restarted;                          /* 1: the hub restarted, seq and topic_seq start again */
     int stale;                              /* 1: zones that are unknown because no recent data arrived */
@@ -310,32 +331,185 @@ const char *scanhub_error(void);
 /* The version of the library, "0.1.0". */
 const char *scanhub_version(void);
 
-/* The distance of beam i in mm; -1 if it has no valid reading, or does not exist. */
-static inline int32_t scanhub_distance_mm(const struct scanhub_scan_v1 *scan, unsigned i)
+/*
+ * Samples of SCANHUB_TOPIC_SCAN. Beams are numbered from 0; one that does not exist has no reading.
+ */
+
+/* The head of a scan; NULL if the sample is none. */
+static inline const struct scanhub_scan_v2 *scanhub_scan_head(const struct scanhub_sample *scan)
 {
-    if (i >= scan->count || i >= 401 || scan->range_bits > 16)
+    const size_t head = sizeof(struct scanhub_scan_v2);
+    return scan->length < head ? NULL : (const struct scanhub_scan_v2 *)scan->payload;
+}
+
+/* Bytes of a beam in the arrays of `contents`; 8 stands for the ranges. */
+static inline size_t scanhub_scan_width(unsigned contents)
+{
+    return (contents & SCANHUB_SCAN_ANGLES ? 4u : 0u) + (contents & 8u ? 2u : 0u) + (contents & SCANHUB_SCAN_WIDE ? 2u : 0u)
+        + (contents & SCANHUB_SCAN_UPPER ? 1u : 0u);
+}
+
+/* Beams of a scan: the same number in all scans of a sensor and its settings. */
+static inline unsigned scanhub_count(const struct scanhub_sample *scan)
+{
+    const struct scanhub_scan_v2 *head = scanhub_scan_head(scan);
+    if (head == NULL)
+        return 0;
+    const size_t room = (scan->length - sizeof *head) / scanhub_scan_width(head->contents | 8u);
+    return head->count < room ? head->count : (unsigned)room;
+}
+
+/* Where the array behind those of `before` begins. */
+static inline const void *scanhub_scan_array(const struct scanhub_sample *scan, unsigned before)
+{
+    const struct scanhub_scan_v2 *head = scanhub_scan_head(scan);
+    if (head == NULL)
+        return NULL;
+    const size_t offset = scanhub_count(scan) * scanhub_scan_width(before & (head->contents | 8u));
+    return (const unsigned char *)scan->payload + sizeof *head + offset;
+}
+
+/* The ranges in device units, scanhub_count of them, for who reads many: those above `valid_to` are codes, which are no ranges. */
+static inline const uint16_t *scanhub_ranges(const struct scanhub_sample *scan)
+{
+    return (const uint16_t *)scanhub_scan_array(scan, SCANHUB_SCAN_ANGLES);
+}
+
+/* The range of beam i in metres; NAN if it has no reading, whatever the reason. */
+static inline double scanhub_range_m(const struct scanhub_sample *scan, unsigned i)
+{
+    if (i >= scanhub_count(scan))
+        return NAN;
+    const uint16_t range = scanhub_ranges(scan)[i];
+    const struct scanhub_scan_v2 *head = scanhub_scan_head(scan);
+    return range <= head->valid_to ? (double)range * head->unit_um / 1e6 : NAN;
+}
+
+/* The angle of beam i in radians, exact where the sensor says so; NAN for a sample that is none. */
+static inline double scanhub_angle(const struct scanhub_sample *scan, unsigned i)
+{
+    const struct scanhub_scan_v2 *head = scanhub_scan_head(scan);
+    if (head == NULL)
+        return NAN;
+    if (head->contents & SCANHUB_SCAN_ANGLES && i < scanhub_count(scan)) {
+        const double exact = (double)((const float *)scanhub_scan_array(scan, 0))[i];
+        if (!isnan(exact))
+            return exact;
+    }
+    return head->first_angle + i * head->step;
+}
+
+/*
+ * Why beam i has no reading: "not_measured", "no_return", "beyond" the range limit, "too_near", "too_bright", "weak",
+ * "overflow", "error"; NULL if it has one, or does not exist.
+ */
+static inline const char *scanhub_code(const struct scanhub_sample *scan, unsigned i)
+{
+    static const char *const words[] = {"not_measured", "no_return", "beyond", "too_near", "too_bright", "weak", "overflow", "error"};
+    /* Those of an LMS, from the greatest value of its measuring mode down. */
+    static const unsigned char lms[] = {1, 4, 6, 6, 5, 7, 6, 6, 2};
+    if (i >= scanhub_count(scan))
+        return NULL;
+    const struct scanhub_scan_v2 *head = scanhub_scan_head(scan);
+    const unsigned range = scanhub_ranges(scan)[i];
+    if (range <= head->valid_to)
+        return NULL;
+    if (range != 0xFFFF && head->family == SCANHUB_FAMILY_LMS)
+        return words[range <= head->no_return && head->no_return - range < 9u ? lms[head->no_return - range] : 6];
+    return words[0xFFFFu - range < 7u ? 0xFFFFu - range : 7];
+}
+
+/* The intensity of beam i; -1 if the sensor does not send it, or the beam does not exist. */
+static inline int32_t scanhub_intensity(const struct scanhub_sample *scan, unsigned i)
+{
+    const struct scanhub_scan_v2 *head = scanhub_scan_head(scan);
+    if (i >= scanhub_count(scan) || head->intensity_bits == 0)
         return -1;
-    const int32_t range = scan->range_array[i];
-    return range + 8 < (INT32_C(1) << scan->range_bits) - 1 ? range * scan->unit_mm : -1;
+    if (head->contents & SCANHUB_SCAN_WIDE)
+        return ((const uint16_t *)scanhub_scan_array(scan, SCANHUB_SCAN_ANGLES | 8))[i];
+    if (head->contents & SCANHUB_SCAN_UPPER)
+        return ((const uint8_t *)scanhub_scan_array(scan, SCANHUB_SCAN_ANGLES | 8 | SCANHUB_SCAN_WIDE))[i];
+    return -1;
 }
 
-/* The angle of beam i in 1/1000 degree: counter-clockwise seen from above, 0 right, 90000 ahead. */
-static inline int32_t scanhub_angle_mdeg(const struct scanhub_scan_v1 *scan, unsigned i)
+/* Points that found their beam taken by a nearer one. */
+static inline unsigned scanhub_collapsed(const struct scanhub_sample *scan)
 {
-    return scan->first_angle_mdeg + (int32_t)i * scan->step_mdeg;
+    const struct scanhub_scan_v2 *head = scanhub_scan_head(scan);
+    return head == NULL ? 0 : head->collapsed;
 }
 
-/* When beam i was measured, in ns of CLOCK_MONOTONIC: before the telegram was sent, the last beam in the last turn. */
-static inline uint64_t scanhub_beam_time_ns(const struct scanhub_header_v1 *header, const struct scanhub_scan_v1 *scan,
-                                            unsigned i)
+/* 1: packets of the turn are missing; what was in them is not measured. */
+static inline int scanhub_is_incomplete(const struct scanhub_sample *scan)
 {
-    const uint64_t turn_ns = 13320000;
-    const uint64_t step = scan->step_mdeg == 0 ? 1 : scan->step_mdeg;
-    const uint64_t turns = step >= 1000 ? 1 : 1000 / step;
-    const uint64_t beams = scan->count < 401 ? scan->count : 401;
-    const uint64_t later_beams = (uint64_t)i + 1 < beams ? beams - 1 - i : 0;
-    const uint64_t age_ns = (turns - 1 - i % turns) * turn_ns + later_beams * scan->step_mdeg * turn_ns / 360000;
-    return header->stamp_first_ns > age_ns ? header->stamp_first_ns - age_ns : 0;
+    const struct scanhub_scan_v2 *head = scanhub_scan_head(scan);
+    return head != NULL && (head->flags & 1) != 0;
+}
+
+/* When beam i was measured, in ns of CLOCK_MONOTONIC; 0 for a sample that is none. */
+static inline uint64_t scanhub_beam_stamp_ns(const struct scanhub_sample *scan, unsigned i)
+{
+    const struct scanhub_scan_v2 *head = scanhub_scan_head(scan);
+    if (head == NULL || scan->header == NULL)
+        return 0;
+    const unsigned turns = head->turns == 0 ? 1 : head->turns;
+    const int64_t later_ns = (int64_t)i * head->beam_time_ns + (int64_t)(i % turns) * head->turn_ns;
+    const int64_t at_ns = (int64_t)scan->header->stamp_first_ns + head->first_beam_ns + later_ns;
+    return at_ns < 0 ? 0 : (uint64_t)at_ns;
+}
+
+/*
+ * Samples of SCANHUB_TOPIC_FOREGROUND and SCANHUB_TOPIC_BACKGROUND.
+ */
+
+/* Whether there is all that the head of a foreground says. */
+static inline int scanhub_foreground_is_whole(const struct scanhub_sample *foreground)
+{
+    const struct scanhub_foreground_v2 *head = (const struct scanhub_foreground_v2 *)foreground->payload;
+    const size_t before = sizeof *head + 64 * sizeof(struct scanhub_segment_v2);
+    if (foreground->length < before || head->segments > 64 || head->beams > head->count)
+        return 0;
+    return foreground->length >= before + 2 * (((size_t)head->count + 15) / 16) + 2 * (size_t)head->count;
+}
+
+/* The segments, as many as `segments`; NULL if the sample is none. */
+static inline const struct scanhub_segment_v2 *scanhub_segments(const struct scanhub_sample *foreground)
+{
+    if (!scanhub_foreground_is_whole(foreground))
+        return NULL;
+    const void *at = (const unsigned char *)foreground->payload + sizeof(struct scanhub_foreground_v2);
+    return (const struct scanhub_segment_v2 *)at;
+}
+
+/* 1: beam i of the scan is in the foreground. */
+static inline int scanhub_in_foreground(const struct scanhub_sample *foreground, unsigned i)
+{
+    const struct scanhub_segment_v2 *segments = scanhub_segments(foreground);
+    if (segments == NULL || i >= ((const struct scanhub_foreground_v2 *)foreground->payload)->count)
+        return 0;
+    return ((const uint8_t *)(const void *)(segments + 64))[i / 8] >> (i % 8) & 1;
+}
+
+/* The ranges of the beams in the foreground, in their order, as many as `beams`, in device units; NULL if the sample is none. */
+static inline const uint16_t *scanhub_foreground_ranges(const struct scanhub_sample *foreground)
+{
+    const struct scanhub_segment_v2 *segments = scanhub_segments(foreground);
+    if (segments == NULL)
+        return NULL;
+    const size_t pairs = ((size_t)((const struct scanhub_foreground_v2 *)foreground->payload)->count + 15) / 16;
+    return (const uint16_t *)(const void *)(segments + 64) + pairs;
+}
+
+/*
+ * The ranges of a background, as many as `count`, in device units: 0 not known, 65535 beyond what the sensor measures; NULL if
+ * the sample is none.
+ */
+static inline const uint16_t *scanhub_background_ranges(const struct scanhub_sample *background)
+{
+    const struct scanhub_background_v2 *head = (const struct scanhub_background_v2 *)background->payload;
+    if (background->length < sizeof *head || background->length < sizeof *head + 2 * (size_t)head->count)
+        return NULL;
+    return (const uint16_t *)(const void *)(head + 1);
 }
 
 /* A compiler with another layout than the hub's stops here. */
@@ -348,27 +522,25 @@ static inline uint64_t scanhub_beam_time_ns(const struct scanhub_header_v1 *head
 #endif
 #define SCANHUB_SIZE(type, size) SCANHUB_MUST(type, sizeof(struct type) == (size))
 #define SCANHUB_AT(type, field, at) SCANHUB_MUST(type##_##field, offsetof(struct type, field) == (at))
-SCANHUB_SIZE(scanhub_header_v1, 64);
-SCANHUB_AT(scanhub_header_v1, sensor, 48);
-SCANHUB_AT(scanhub_header_v1, hub_time, 61);
-SCANHUB_SIZE(scanhub_scan_v1, 1216);
-SCANHUB_AT(scanhub_scan_v1, range_array, 12);
-SCANHUB_AT(scanhub_scan_v1, upper_array, 814);
-SCANHUB_SIZE(scanhub_mark_v1, 16);
-SCANHUB_SIZE(scanhub_marks_v1, 1028);
-SCANHUB_AT(scanhub_marks_v1, mark_array, 4);
-SCANHUB_SIZE(scanhub_zone_v1, 8);
-SCANHUB_SIZE(scanhub_zones_v1, 76);
-SCANHUB_AT(scanhub_zones_v1, zone_array, 12);
-SCANHUB_SIZE(scanhub_segment_v1, 16);
-SCANHUB_SIZE(scanhub_foreground_v1, 1892);
-SCANHUB_AT(scanhub_foreground_v1, range_array, 64);
-SCANHUB_AT(scanhub_foreground_v1, segment_array, 868);
-SCANHUB_SIZE(scanhub_background_v1, 816);
-SCANHUB_AT(scanhub_background_v1, range_array, 12);
-SCANHUB_SIZE(scanhub_status_v1, 592);
-SCANHUB_AT(scanhub_status_v1, counters, 336);
-SCANHUB_AT(scanhub_status_v1, pose, 560);
+SCANHUB_SIZE(scanhub_header_v2, 64);
+SCANHUB_AT(scanhub_header_v2, sensor, 48);
+SCANHUB_AT(scanhub_header_v2, hub_time, 61);
+SCANHUB_SIZE(scanhub_scan_v2, 64);
+SCANHUB_AT(scanhub_scan_v2, count, 32);
+SCANHUB_AT(scanhub_scan_v2, turn_ns, 48);
+SCANHUB_SIZE(scanhub_mark_v2, 16);
+SCANHUB_SIZE(scanhub_marks_v2, 1028);
+SCANHUB_AT(scanhub_marks_v2, mark_array, 4);
+SCANHUB_SIZE(scanhub_zone_v2, 8);
+SCANHUB_SIZE(scanhub_zones_v2, 76);
+SCANHUB_AT(scanhub_zones_v2, zone_array, 12);
+SCANHUB_SIZE(scanhub_segment_v2, 16);
+SCANHUB_SIZE(scanhub_foreground_v2, 16);
+SCANHUB_SIZE(scanhub_background_v2, 32);
+SCANHUB_AT(scanhub_background_v2, count, 26);
+SCANHUB_SIZE(scanhub_status_v2, 592);
+SCANHUB_AT(scanhub_status_v2, counters, 336);
+SCANHUB_AT(scanhub_status_v2, pose, 560);
 #undef SCANHUB_AT
 #undef SCANHUB_SIZE
 #undef SCANHUB_MUST

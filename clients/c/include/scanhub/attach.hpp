@@ -4,7 +4,7 @@
  *
  *     scanhub::Attachment scans("front", SCANHUB_TOPIC_SCAN);
  *     while (scanhub::Sample sample = scans.next())
- *         use(sample.as<scanhub_scan_v1>());
+ *         use(scanhub_range_m(&*sample, 180), sample.as<scanhub_scan_v2>().collapsed);
  */
 #ifndef SCANHUB_ATTACH_HPP
 #define SCANHUB_ATTACH_HPP
@@ -34,14 +34,25 @@ inline int check(int answer)
     return answer;
 }
 
+/* The topic that a payload belongs to; 0 is a robot's verdict. */
+template <typename Payload> struct TopicOf;
+template <> struct TopicOf<scanhub_scan_v2> { enum { number = SCANHUB_TOPIC_SCAN }; };
+template <> struct TopicOf<scanhub_marks_v2> { enum { number = SCANHUB_TOPIC_MARKS }; };
+template <> struct TopicOf<scanhub_zones_v2> { enum { number = SCANHUB_TOPIC_ZONES }; };
+template <> struct TopicOf<scanhub_foreground_v2> { enum { number = SCANHUB_TOPIC_FOREGROUND }; };
+template <> struct TopicOf<scanhub_background_v2> { enum { number = SCANHUB_TOPIC_BACKGROUND }; };
+template <> struct TopicOf<scanhub_status_v2> { enum { number = SCANHUB_TOPIC_STATUS }; };
+template <> struct TopicOf<scanhub_robot> { enum { number = 0 }; };
+
 /* A sample, or none; given back when it goes out of scope. */
 class Sample {
 public:
-    Sample() : sample_() {}
-    Sample(Sample &&other) noexcept : sample_(other.sample_) { other.sample_ = scanhub_sample(); }
+    Sample() : sample_(), topic_() {}
+    Sample(Sample &&other) noexcept : sample_(other.sample_), topic_(other.topic_) { other.sample_ = scanhub_sample(); }
     Sample &operator=(Sample &&other) noexcept
     {
         std::swap(sample_, other.sample_);
+        std::swap(topic_, other.topic_);
         return *this;
     }
     Sample(const Sample &) = delete;
@@ -51,10 +62,11 @@ public:
     explicit operator bool() const { return sample_.payload != nullptr; }
     /* Its fields: header, length, missed, restarted, stale. */
     const scanhub_sample *operator->() const { return &sample_; }
-    /* The payload, of the type that belongs to the topic. */
+    const scanhub_sample &operator*() const { return sample_; }
+    /* The payload, or what it begins with, of the type that belongs to the topic. */
     template <typename Payload> const Payload &as() const
     {
-        if (sample_.payload == nullptr || sample_.length != sizeof(Payload))
+        if (sample_.length < sizeof(Payload) || topic_ != TopicOf<Payload>::number)
             throw std::logic_error("the sample is none, or of another topic");
         return *static_cast<const Payload *>(sample_.payload);
     }
@@ -62,13 +74,14 @@ public:
 private:
     friend class Attachment;
     scanhub_sample sample_;
+    int topic_;
 };
 
 /* A topic that is followed, in the thread that made it. */
 class Attachment {
 public:
     explicit Attachment(const char *sensor, int topic, int wait = SCANHUB_WAIT_DOORBELL, const char *domain = nullptr)
-        : handle_(nullptr)
+        : handle_(nullptr), topic_(topic)
     {
         check(scanhub_open(&handle_, domain, sensor, topic, wait));
     }
@@ -79,10 +92,11 @@ public:
         check(scanhub_open_robot(&all.handle_, domain, sensors, wait));
         return all;
     }
-    Attachment(Attachment &&other) noexcept : handle_(other.handle_) { other.handle_ = nullptr; }
+    Attachment(Attachment &&other) noexcept : handle_(other.handle_), topic_(other.topic_) { other.handle_ = nullptr; }
     Attachment &operator=(Attachment &&other) noexcept
     {
         std::swap(handle_, other.handle_);
+        std::swap(topic_, other.topic_);
         return *this;
     }
     Attachment(const Attachment &) = delete;
@@ -94,6 +108,7 @@ public:
     Sample take()
     {
         Sample sample;
+        sample.topic_ = topic_;
         check(scanhub_take(handle_, &sample.sample_));
         return sample;
     }
@@ -108,8 +123,9 @@ public:
     bool hub_lives() { return check(scanhub_hub_lives(handle_)) == 1; }
 
 private:
-    Attachment() : handle_(nullptr) {}
+    Attachment() : handle_(nullptr), topic_(0) {}
     scanhub_attachment *handle_;
+    int topic_;
 };
 
 } // namespace scanhub

@@ -11,9 +11,10 @@ use std::time::{Duration, Instant};
 
 use rustix::time::{ClockId, clock_gettime};
 use schema::ipc::{self, Node, Payload, PortFactory, Publisher, TopicService, UpdateConnections, Waker};
+use schema::limits::TopicLimits;
 use schema::{
-    Background, Domain, Failure, Foreground, Header, HubLock, Marks, Scan, State, Status, Verdict, Wake,
-    Zones,
+    Background, Domain, Failure, Foreground, Header, HubLock, Marks, Scan, ScanHead, State, Status, Verdict,
+    Wake, Zones,
 };
 
 /// A domain that goes with the test.
@@ -56,8 +57,9 @@ pub(crate) struct Port<P: Payload + ?Sized> {
 
 impl<P: Payload + ?Sized> Port<P> {
     fn new(node: &Node, sensor: &str) -> Port<P> {
-        let service = P::create(node, sensor).unwrap();
-        Port { publisher: P::publisher(&service).unwrap(), service, topic_seq: 0 }
+        let limits = TopicLimits::default();
+        let service = P::create(node, sensor, &limits).unwrap();
+        Port { publisher: P::publisher(&service, &limits).unwrap(), service, topic_seq: 0 }
     }
 
     /// Waits until `count` consumers are there.
@@ -105,12 +107,11 @@ impl FakeSensor {
     /// Publishes a scan of these ranges and wakes the consumers.
     pub(crate) fn scan(&mut self, ranges: &[u16]) {
         let header = self.header(self.scan.topic_seq);
-        let mut sample = self.scan.publisher.loan().unwrap();
+        let head = ScanHead::lms(ranges.len(), -90_000, 500, 10, 13);
+        let len = Scan::len(ranges.len(), head.contents);
+        let mut sample = Scan::loan(&self.scan.publisher, len).unwrap();
         *sample.user_header_mut() = header;
-        let scan = sample.payload_mut();
-        (scan.count, scan.unit_mm, scan.range_bits) = (ranges.len() as u16, 10, 13);
-        scan.step_mdeg = 500;
-        scan.range_array[..ranges.len()].copy_from_slice(ranges);
+        Scan::write(&mut sample).begin(head).ranges.copy_from_slice(ranges);
         sample.send().unwrap();
         self.scan.topic_seq += 1;
         self.seq += 1;

@@ -43,8 +43,11 @@ impl Remote<'_> {
     }
 
     /// Returns the payload, in full length. An account accepts none that cannot be had.
-    pub fn payload<P: Packed + Default>(&self) -> Option<P> {
-        let mut payload = P::default();
-        payload.unpack(self.datagram.payload).then_some(payload)
+    pub fn payload<P: Packed + ?Sized>(&self) -> Option<Box<P>>
+    where
+        Box<P>: Default,
+    {
+        let mut payload = Box::default();
+        P::unpack_into(&mut payload, self.datagram.payload).then_some(payload)
     }
 }

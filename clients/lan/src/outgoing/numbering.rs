@@ -1,8 +1,8 @@
-//! The datagrams of a gateway: each is numbered, sealed and handed over once, in a buffer that is always the same. Refuses
-//! to know where samples come from and where datagrams go.
+//! The datagrams of a gateway: each sample is numbered, sealed in one datagram or in parts, and handed over once, in a
+//! buffer that is always the same. Refuses to know where samples come from and where datagrams go.
 
 use schema::Topic;
-use schema::datagram::{Announce, HEAD, Head, MTU_ETHERNET, group};
+use schema::datagram::{Announce, HEAD, Head, MTU_ETHERNET, PARTS, group};
 
 /// What takes datagrams: sockets, or a model of a network.
 pub trait Transmit {
@@ -29,7 +29,8 @@ pub(super) struct Numbering {
     longest: usize,
     /// What did not fit into a datagram.
     unfit: u64,
-    buffer: [u8; MTU_ETHERNET],
+    /// A header, and the longest payload that can go out.
+    buffer: Vec<u8>,
 }
 
 /// The account of one sensor.
@@ -43,9 +44,9 @@ pub struct Rows {
 /// The account of one sensor and topic.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Row {
-    /// Datagrams that were sent.
+    /// Samples that were sent.
     pub sent: u64,
-    /// Datagrams that have a number and were not sent.
+    /// Samples that have a number and were not sent, or not all parts of them.
     pub failed: u64,
     /// Bytes in what was sent.
     pub bytes: u64,
@@ -65,7 +66,7 @@ enum Fit {
 }
 
 impl Row {
-    /// Returns the number of the next datagram.
+    /// Returns the number of the next sample.
     pub fn next(&self) -> u32 {
         (self.sent + self.failed) as u32
     }
@@ -82,8 +83,11 @@ impl Rows {
 impl Numbering {
     /// Datagrams of at most `longest` bytes, as gateway `hub` in this `epoch`.
     pub(super) fn new(hub: u64, epoch: u32, form: Form, longest: usize) -> Numbering {
-        let longest = longest.clamp(HEAD, MTU_ETHERNET);
-        Numbering { hub, epoch, sensors: Vec::new(), form, longest, unfit: 0, buffer: [0; MTU_ETHERNET] }
+        let longest = longest.clamp(HEAD + 1, MTU_ETHERNET);
+        // Telegrams by themselves have no header that could say which part one is.
+        let parts = if form == Form::Sealed { PARTS } else { 1 };
+        let buffer = vec![0; HEAD + parts * (longest - HEAD)];
+        Numbering { hub, epoch, sensors: Vec::new(), form, longest, unfit: 0, buffer }
     }
 
     pub(super) fn form(&self) -> Form {
@@ -114,7 +118,7 @@ impl Numbering {
         self.sensors.get(usize::from(number)).is_some_and(|rows| rows.name == name)
     }
 
-    /// The number of the next datagram of this sensor and topic.
+    /// The number of the next sample of this sensor and topic.
     pub(super) fn next(&self, number: u8, topic: Topic) -> u32 {
         let rows = self.sensors.get(usize::from(number));
         rows.map_or(0, |rows| rows.rows[usize::from(topic.number())].next())
@@ -143,14 +147,12 @@ impl Numbering {
         let (hub, epoch) = (self.hub, self.epoch);
         let Some(row) = self.row(head.sensor, head.topic) else { return };
         let head = Head { hub, epoch, sequence: row.next(), ..head };
-        let payload = pack(&mut self.buffer[HEAD..self.longest]);
-        let (datagram, above) = match (self.form, payload) {
-            (_, None) => (None, 0),
-            (Form::Sealed, Some(len)) => (head.seal(&mut self.buffer, len), 0),
-            (Form::Bare, Some(len)) => (self.buffer.get(HEAD..HEAD + len), head.sensor),
-        };
+        let payload = pack(&mut self.buffer[HEAD..]);
         let group = Topic::of_number(head.topic).map_or(Announce::GROUP, group);
-        let taken = datagram.filter(|datagram| to.transmit(datagram, group, above)).map(<[u8]>::len);
+        let taken = payload.and_then(|len| match self.form {
+            Form::Sealed => self.send_sealed(head, len, group, to),
+            Form::Bare => to.transmit(&self.buffer[HEAD..HEAD + len], group, head.sensor).then_some(len),
+        });
         if let Some(row) = self.row(head.sensor, head.topic) {
             match taken {
                 Some(len) => {
@@ -164,6 +166,23 @@ impl Numbering {
             }
         }
         self.unfit += u64::from(payload.is_none());
+    }
+
+    /// Sends the payload of `len` bytes that lies in the buffer, in as few parts as possible; the bytes of all datagrams if all
+    /// were taken. The header of each part but the first is written over the end of the part before it, which is sent.
+    fn send_sealed(&mut self, head: Head, len: usize, group: u8, to: &mut impl Transmit) -> Option<usize> {
+        let room = self.longest - HEAD;
+        let parts = len.div_ceil(room).max(1);
+        let mut bytes = Some(0);
+        for part in 0..parts {
+            let begin = part * room;
+            let head = Head { part: part as u8, parts: parts as u8, ..head };
+            let datagram = head.seal(&mut self.buffer[begin..], room.min(len - begin))?;
+            // Whoever else it goes to may get all of it, although one did not get this part.
+            let is_taken = to.transmit(datagram, group, 0);
+            bytes = bytes.filter(|_| is_taken).map(|bytes| bytes + datagram.len());
+        }
+        bytes
     }
 
     /// `SENSOR/TOPIC` of which something did not fit into a datagram; each is told once.

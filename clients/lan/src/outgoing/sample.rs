@@ -32,19 +32,9 @@ macro_rules! payloads {
             /// Writes it as it goes over a network to the beginning of `room`, and returns its length; nothing if there is
             /// too little room.
             pub fn pack(self, room: &mut [u8]) -> Option<usize> {
-                match self { $(PayloadRef::$topic(payload) => pack!($payload, payload, room),)* }
+                match self { $(PayloadRef::$topic(payload) => payload.pack(room),)* }
             }
         }
-    };
-}
-
-macro_rules! pack {
-    ([u8], $bytes:ident, $room:ident) => {{
-        $room.get_mut(..$bytes.len())?.copy_from_slice($bytes);
-        Some($bytes.len())
-    }};
-    ($payload:ident, $value:ident, $room:ident) => {
-        $value.pack($room)
     };
 }
 

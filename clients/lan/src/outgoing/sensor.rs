@@ -34,7 +34,7 @@ struct Track {
 
 /// The background as it went out last.
 struct Model {
-    background: Background,
+    background: Box<Background>,
     header: Header,
     /// CLOCK_MONOTONIC, in ns.
     sent_ns: u64,
@@ -156,7 +156,7 @@ impl Sensor {
                 is_due = !model.as_ref().is_some_and(same);
                 let sent_ns =
                     model.as_ref().filter(|_| !is_due).map_or(now.monotonic_ns, |model| model.sent_ns);
-                *model = Some(Model { background: *background, header, sent_ns });
+                *model = Some(Model { background: background.boxed(), header, sent_ns });
             }
             _ => {}
         }

@@ -3,8 +3,8 @@
 use std::num::NonZeroU64;
 use std::time::Duration;
 
-use schema::datagram::{Announce, Datagram, Head, MTU_SAFE};
-use schema::{Background, Flags, Header, Status, Topic, Verdict, Zones};
+use schema::datagram::{Announce, Datagram, HEAD, Head, MTU_LEAST, MTU_SAFE};
+use schema::{Background, BackgroundHead, Flags, Header, Status, Topic, Verdict, Zones};
 
 use super::{Form, Outgoing, PayloadRef, Sample, Transmit};
 use crate::Stamp;
@@ -130,7 +130,7 @@ fn a_background_goes_out_when_it_is_new_and_when_it_is_to_be_repeated() {
     let front = out.follow("front", each);
     let mut taken = Taken::default();
     let mut send = |out: &mut Outgoing, seq, generation, ms| {
-        let background = Background { generation, ..Background::default() };
+        let background = Background::of(BackgroundHead { generation, ..BackgroundHead::default() }, &[]);
         let header = header(1, 0, seq);
         let payload = PayloadRef::Background(&background);
         out.sample(front, &Sample { header: Some(&header), missed: 0, payload }, at(ms), &mut taken);
@@ -166,19 +166,61 @@ fn a_status_is_stamped_when_it_is_sent_and_tells_the_type() {
 
 #[test]
 fn a_failure_uses_the_number_up_and_what_does_not_fit_is_told_once() {
-    let mut out = Outgoing::new(7, 9, Form::Sealed, 200);
-    let front = out.follow("front", each);
+    // Of the telegram 255 parts are not enough.
+    let mut out = Outgoing::new(7, 9, Form::Sealed, HEAD + 2);
+    let front = out.follow("front", |topic| NonZeroU64::new(1).filter(|_| topic != Topic::Status));
     let mut taken = Taken { is_cut: true, ..Taken::default() };
-    let (header, zones, status) = (header(1, 0, 0), Zones::unknown(), Status::default());
-    for payload in [PayloadRef::Zones(&zones), PayloadRef::Status(&status), PayloadRef::Zones(&zones)] {
+    let (header, zones, telegram) = (header(1, 0, 0), Zones::unknown(), [2; 511]);
+    for payload in [PayloadRef::Zones(&zones), PayloadRef::Telegram(&telegram), PayloadRef::Zones(&zones)] {
         out.sample(front, &Sample { header: Some(&header), missed: 0, payload }, at(0), &mut taken);
         taken.is_cut = false;
     }
-    assert_eq!(taken.numbers(), [(Announce::NUMBER, 0), (ZONES, 0), (ZONES, 1)]);
+    let mut numbers = taken.numbers();
+    numbers.dedup();
+    assert_eq!(numbers, [(Announce::NUMBER, 0), (ZONES, 0), (ZONES, 1)]);
     let counts: Vec<_> = out.account().flat_map(|rows| rows.used()).map(|(_, row)| row).collect();
     let counts: Vec<_> = counts.iter().map(|row| (row.sent, row.failed, row.next())).collect();
-    assert_eq!(counts, [(0, 1, 1), (1, 1, 2), (0, 1, 1)]);
-    assert_eq!((out.misfit().as_deref(), out.misfit(), out.unfit()), (Some("front/status"), None, 1));
+    assert_eq!(counts, [(0, 1, 1), (0, 1, 1), (1, 1, 2)]);
+    assert_eq!((out.misfit().as_deref(), out.misfit(), out.unfit()), (Some("front/telegram"), None, 1));
+}
+
+#[test]
+fn what_is_longer_than_a_datagram_goes_in_parts() {
+    let telegram: Vec<u8> = (0..814).map(|i| i as u8).collect();
+    for (longest, lengths) in [(MTU_SAFE, &[814][..]), (MTU_LEAST, &[528, 286]), (HEAD + 407, &[407, 407])] {
+        let mut out = Outgoing::new(7, 9, Form::Sealed, longest);
+        let front = out.follow("front", |topic| NonZeroU64::new(1).filter(|_| topic == Topic::Telegram));
+        let mut taken = Taken::default();
+        let payload = PayloadRef::Telegram(&telegram);
+        for seq in 0..2 {
+            let header = header(1, 5, seq);
+            taken.datagrams.clear();
+            out.sample(front, &Sample { header: Some(&header), missed: 0, payload }, at(0), &mut taken);
+            taken.datagrams.retain(|(bytes, ..)| bytes[6] == Topic::Telegram.number());
+            let parts: Vec<_> =
+                taken.datagrams.iter().map(|(bytes, ..)| Datagram::read(bytes).unwrap()).collect();
+            let numbers: Vec<_> = parts.iter().map(|it| (it.head.sequence, it.head.part)).collect();
+            assert_eq!(numbers, (0..lengths.len()).map(|part| (seq as u32, part as u8)).collect::<Vec<_>>());
+            assert!(parts.iter().all(|it| usize::from(it.head.parts) == lengths.len()));
+            assert!(parts.iter().map(|it| it.payload.len()).eq(lengths.iter().copied()));
+            assert_eq!(parts.iter().flat_map(|it| it.payload).copied().collect::<Vec<_>>(), telegram);
+        }
+        let (_, row) = out.account().flat_map(|rows| rows.used()).last().unwrap();
+        assert_eq!((row.sent, row.failed, row.bytes), (2, 0, 2 * (814 + HEAD * lengths.len()) as u64));
+    }
+}
+
+#[test]
+fn a_sample_of_which_a_part_was_not_sent_is_a_failure_and_the_rest_goes_out() {
+    let mut out = Outgoing::new(7, 9, Form::Sealed, MTU_LEAST);
+    let front = out.follow("front", |topic| NonZeroU64::new(1).filter(|_| topic == Topic::Telegram));
+    let (mut taken, header, payload) =
+        (Taken { is_cut: true, ..Taken::default() }, header(1, 5, 0), [2; 814]);
+    let sample = Sample { header: Some(&header), missed: 0, payload: PayloadRef::Telegram(&payload) };
+    out.sample(front, &sample, at(0), &mut taken);
+    assert_eq!(taken.numbers(), [(Announce::NUMBER, 0), (1, 0), (1, 0)]);
+    let (_, row) = out.account().flat_map(|rows| rows.used()).last().unwrap();
+    assert_eq!((row.sent, row.failed, row.bytes), (0, 1, 0));
 }
 
 #[test]

@@ -123,7 +123,7 @@ impl<T: SensorTopics> RemoteSensor<T> {
         if topic != Topic::Status {
             self.topics.send(topic, &header, remote.datagram.payload);
         } else if let Some(status) = remote.payload::<Status>() {
-            self.tell(status, &header);
+            self.tell(*status, &header);
         }
         if topic == Topic::Zones {
             self.zoned = Some(remote.header(self.pid));
@@ -143,12 +143,12 @@ impl<T: SensorTopics> RemoteSensor<T> {
         }
     }
 
-    /// Says that the sensor is silent, once per silence, and gives late joiners what they would else get with the next
-    /// sample.
-    pub(super) fn look(&mut self, now: Stamp, read_ns: u64) {
-        if self.heard_ns.is_some_and(|at_ns| read_ns.saturating_sub(at_ns) >= SILENT_AFTER_NS) {
+    /// Says that the sensor is silent, once per silence, if it was so at `read`: what came before that was taken. Gives late
+    /// joiners what they would else get with the next sample.
+    pub(super) fn look(&mut self, read: Stamp) {
+        if self.heard_ns.is_some_and(|at_ns| read.monotonic_ns.saturating_sub(at_ns) >= SILENT_AFTER_NS) {
             self.heard_ns = None;
-            self.silent(now);
+            self.silent(read);
             self.wake();
         }
         let keeps = |topic: &Topic| topic.row().kept > 0 && self.has(*topic);
@@ -196,4 +196,71 @@ impl<T: SensorTopics> RemoteSensor<T> {
 fn stamped(header: Header, now: Stamp) -> Header {
     let Stamp { monotonic_ns, wall_ns } = now;
     Header { stamp_first_ns: monotonic_ns, stamp_last_ns: monotonic_ns, wall_ns, ..header }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    use schema::datagram::{Datagram, HEAD};
+
+    /// What was said of a sensor's status: the state, and its stamps in ms.
+    #[derive(Default)]
+    struct Said(Vec<(Option<State>, u64, u64)>);
+
+    impl SensorTopics for Said {
+        fn add(&mut self, _: Topic) -> Result<(), Failure> {
+            Ok(())
+        }
+
+        fn remove(&mut self, _: Topic) {}
+
+        fn skip(&mut self, _: Topic, _: u64) {}
+
+        fn send(&mut self, _: Topic, header: &Header, payload: &[u8]) {
+            let mut status = Status::default();
+            assert!(status.unpack(payload));
+            self.0.push((status.state(), header.stamp_last_ns / MS, status.since_ns / MS));
+        }
+
+        fn connect(&self, _: Topic) {}
+
+        fn wake(&self, _: Wake) {}
+
+        fn failed(&self) -> u64 {
+            0
+        }
+    }
+
+    const MS: u64 = 1_000_000;
+
+    #[test]
+    fn a_silence_is_said_as_of_when_everything_was_read() {
+        let mut sensor = RemoteSensor::new("robot1.front", Said::default(), 1);
+        sensor.add(Topic::Status).unwrap();
+        let mut bytes = [0; MTU_ETHERNET];
+        let status = Status { state: State::Streaming as u8, ..Status::default() };
+        let len = status.pack(&mut bytes[HEAD..]).unwrap();
+        let head = Head { topic: Topic::Status.number(), revision: 1, hub: 5, epoch: 1, ..Head::default() };
+        let datagram = Datagram::read(head.seal(&mut bytes, len).unwrap()).unwrap();
+        let came = |ms| Remote {
+            topic: Topic::Status,
+            datagram,
+            boot: 1,
+            arrival_ns: ms * MS,
+            age_ns: None,
+            late: false,
+        };
+        let read = |ms| Stamp { monotonic_ns: ms * MS, wall_ns: ms * MS };
+        assert!(sensor.publish(&came(1_000)));
+        // The listener is behind: what came at 4.6 s is the next that it will read.
+        [3_999, 4_500, 4_550].into_iter().for_each(|ms| sensor.look(read(ms)));
+        assert!(sensor.publish(&came(4_600)));
+        sensor.look(read(5_000));
+        let (streams, silent) = (Some(State::Streaming), Some(State::Silent));
+        assert_eq!(
+            sensor.topics.0,
+            [(streams, 1_000, 1_000), (silent, 4_500, 4_500), (streams, 4_600, 4_600)]
+        );
+    }
 }

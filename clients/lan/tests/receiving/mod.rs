@@ -97,7 +97,8 @@ impl Receiving {
         if now >= self.stalled_until {
             let wall = self.stamp(now);
             while let Some((came, bytes)) = self.queue.pop_front() {
-                let arrived = self.incoming.receive(&bytes, 1, self.stamp(came));
+                let (arrival, mut whole) = (self.stamp(came), Vec::new());
+                let arrived = self.incoming.receive(&bytes, 1, arrival, &mut whole);
                 seen(Seen::Datagram { came, bytes: &bytes, arrived: &arrived });
                 if let Some(head) = arrived.begins() {
                     self.republisher.begun(head, wall);
@@ -105,14 +106,14 @@ impl Receiving {
                 let made = match &arrived {
                     Arrived::Sample(sample) => self.republisher.sample(sample, || hub.to_owned(), wall),
                     Arrived::Announced(announced) => self.republisher.announced(announced, hub, wall),
-                    Arrived::Refused { .. } | Arrived::Known => Ok(None),
+                    Arrived::Refused { .. } | Arrived::Part | Arrived::Known => Ok(None),
                 };
                 made.expect("memory is not short");
             }
             self.republisher.wake();
             if now >= self.look_at {
                 self.look_at = now + LOOK_EVERY_NS;
-                self.republisher.look(wall, wall.monotonic_ns);
+                self.republisher.look(wall.monotonic_ns, wall);
             }
         }
         self.follow(now, seen);

@@ -9,7 +9,7 @@ use lan::Stamp;
 use lan::outgoing::{Form, Outgoing, PayloadRef, Sample, Transmit};
 use scanhub_client::clock::Moment;
 use scanhub_client::streams::ZonesState;
-use schema::datagram::{Datagram, MTU_SAFE};
+use schema::datagram::Datagram;
 use schema::{Header, Status, Topic, Verdict, Zones};
 
 use crate::network::{Nanos, Network};
@@ -46,6 +46,7 @@ pub(crate) struct Sending {
     mishaps: Mishaps,
     /// Every how manieth sample goes out.
     every: u64,
+    longest: usize,
     /// CLOCK_MONOTONIC and the wall clock at the begin: they are not those of others.
     clocks: Stamp,
     boot: u64,
@@ -78,12 +79,14 @@ struct Sensor {
 
 /// Epoch, sensor's number and topic's.
 pub(crate) type Key = (u32, u8, u8);
+/// The datagrams of a sample: what was handed to the network, or nothing where the kernel did not take it.
+pub(crate) type Parts = Vec<Option<Vec<u8>>>;
 
 /// Everything that was sent.
 #[derive(Default)]
 pub(crate) struct Sent {
-    /// By its number: what was handed to the network, or nothing where the kernel did not take it.
-    pub(crate) datagrams: BTreeMap<Key, Vec<Option<Vec<u8>>>>,
+    /// The samples by their numbers.
+    pub(crate) datagrams: BTreeMap<Key, Vec<Parts>>,
     /// The life of the hub in which zones were made that have this number in `nearest_mm`.
     pub(crate) boots: Vec<u64>,
 }
@@ -101,9 +104,14 @@ impl Transmit for Uplink<'_> {
     fn transmit(&mut self, datagram: &[u8], _group: u8, _above: u8) -> bool {
         let head = Datagram::read(datagram).expect("a whole datagram").head;
         let numbers = self.sent.datagrams.entry((head.epoch, head.sensor, head.topic)).or_default();
-        assert_eq!(numbers.len(), head.sequence as usize, "numbers are without gaps");
+        if head.part == 0 {
+            assert_eq!(numbers.len(), head.sequence as usize, "numbers are without gaps");
+            numbers.push(Vec::new());
+        }
         let is_taken = self.rng.f64() >= self.refusal;
-        numbers.push(is_taken.then(|| datagram.to_vec()));
+        let parts = numbers.last_mut().expect("the first part goes out first");
+        assert_eq!(parts.len(), usize::from(head.part));
+        parts.push(is_taken.then(|| datagram.to_vec()));
         if is_taken {
             self.network.send(self.now, datagram);
         }
@@ -113,7 +121,8 @@ impl Transmit for Uplink<'_> {
 
 impl Sending {
     /// Of zones every so many go out.
-    pub(crate) fn new(seed: u64, mishaps: Mishaps, every: u64) -> Sending {
+    /// In datagrams of `longest` bytes at most.
+    pub(crate) fn new(seed: u64, mishaps: Mishaps, every: u64, longest: usize) -> Sending {
         let mut rng = Rng::with_seed(seed);
         let clocks = Stamp { monotonic_ns: rng.u64(1..1 << 50), wall_ns: rng.u64(1 << 60..1 << 61) };
         let epoch = 1_700_000_000;
@@ -125,7 +134,8 @@ impl Sending {
             hub: Turns { runs: false, at: 0 },
             gateway: Turns { runs: false, at: 0 },
             sensors: [0, 1].map(|number| Sensor::new(number, moment(clocks, 0))),
-            outgoing: gateway(epoch, every),
+            outgoing: gateway(epoch, every, longest),
+            longest,
             epoch,
             announce_at: SECOND_NS,
             sent: Sent::default(),
@@ -221,7 +231,7 @@ impl Sending {
         self.gateway.at =
             if self.mishaps.gateway { now + self.rng.u64(SECOND_NS..9 * SECOND_NS) } else { NEVER };
         self.epoch += 1;
-        self.outgoing = gateway(self.epoch, self.every);
+        self.outgoing = gateway(self.epoch, self.every, self.longest);
         self.announce_at = now + SECOND_NS;
         let moment = moment(self.clocks, now);
         self.sensors.iter_mut().for_each(|sensor| sensor.state = ZonesState::new(moment));
@@ -321,8 +331,8 @@ impl Sensor {
     }
 }
 
-fn gateway(epoch: u32, every: u64) -> Outgoing {
-    let mut outgoing = Outgoing::new(HUB, epoch, Form::Sealed, MTU_SAFE);
+fn gateway(epoch: u32, every: u64, longest: usize) -> Outgoing {
+    let mut outgoing = Outgoing::new(HUB, epoch, Form::Sealed, longest);
     for name in NAMES {
         outgoing.follow(name, |topic| match topic {
             Topic::Zones => NonZeroU64::new(every),

@@ -1,6 +1,7 @@
 //! Bodies and people in front of a sensor that sees a wall at five metres, by ranges that are written here.
 
 use super::*;
+use schema::ScanHead;
 
 const COUNT: usize = 361;
 const WALL_MM: u16 = 5000;
@@ -13,13 +14,12 @@ fn mask(range_mm: impl Fn(usize, usize, usize) -> Option<u16>) -> Mask {
 
 fn learn(pose: Pose, within_mm: f64, range_mm: impl Fn(usize, usize, usize) -> Option<u16>) -> Mask {
     let mut body = Body::new(pose, within_mm);
-    let mut scan =
-        Scan { count: COUNT as u16, unit_mm: 1, range_bits: 13, step_mdeg: 500, ..Scan::default() };
+    let mut scan = Scan::of(ScanHead::lms(COUNT, angle_mdeg(0), 500, 1, 13), &[0; COUNT]);
+    let code = scan.no_return;
     for slice in 0..SLICES {
         for number in 0..SCANS {
             for beam in 0..COUNT {
-                let code = scan.max();
-                scan.range_array[beam] = range_mm(beam, slice, number).unwrap_or(code);
+                scan.arrays().ranges[beam] = range_mm(beam, slice, number).unwrap_or(code);
             }
             assert!(body.look(slice, &scan));
         }
@@ -29,8 +29,12 @@ fn learn(pose: Pose, within_mm: f64, range_mm: impl Fn(usize, usize, usize) -> O
 }
 
 fn sector(first: usize, last: usize, range_mm: u32) -> Sector {
-    let angle = |beam: usize| beam as i32 * 500;
-    Sector { from_mdeg: angle(first), to_mdeg: angle(last), beams: last - first + 1, range_mm }
+    Sector { from_mdeg: angle_mdeg(first), to_mdeg: angle_mdeg(last), beams: last - first + 1, range_mm }
+}
+
+/// Half degrees, of which beam 180 looks ahead.
+fn angle_mdeg(beam: usize) -> i32 {
+    beam as i32 * 500 - 90_000
 }
 
 /// A body from beam `first` to `last`, as far as `range_mm`, in a circle of a metre: two beams of it and one beside it are
@@ -114,7 +118,7 @@ fn a_cable_is_body_although_it_is_met_seldom_and_never_at_one_range() {
         _ => Some(WALL_MM),
     });
     assert_eq!((found.sectors.len(), found.moving.len()), (1, 0), "{found:?}");
-    assert_eq!((found.sectors[0].from_mdeg, found.sectors[0].to_mdeg), (99_500, 101_500));
+    assert_eq!((found.sectors[0].from_mdeg, found.sectors[0].to_mdeg), (9_500, 11_500));
 }
 
 #[test]
@@ -152,8 +156,7 @@ fn a_slope_becomes_steps_and_a_fence_no_more_than_a_hub_takes() {
     let fence = mask(|beam, _, _| if beam % 4 == 0 { Some(300 + beam as u16) } else { Some(WALL_MM) });
     assert_eq!(fence.sectors.len(), SECTORS);
     let hidden = |beam: usize| {
-        let angle = beam as i32 * 500;
-        let of = |sector: &&Sector| (sector.from_mdeg..=sector.to_mdeg).contains(&angle);
+        let of = |sector: &&Sector| (sector.from_mdeg..=sector.to_mdeg).contains(&angle_mdeg(beam));
         fence.sectors.iter().find(of).map_or(0, |sector| sector.range_mm)
     };
     assert!((0..COUNT).step_by(4).all(|beam| hidden(beam) > 300 + beam as u32), "every post is still hidden");
@@ -162,7 +165,39 @@ fn a_slope_becomes_steps_and_a_fence_no_more_than_a_hub_takes() {
 #[test]
 fn a_sensor_that_is_set_otherwise_meanwhile_is_noticed() {
     let mut body = Body::new(Pose::default(), 1000.0);
-    let scan = Scan { count: 181, unit_mm: 1, range_bits: 13, step_mdeg: 1000, ..Scan::default() };
-    assert!(body.look(0, &scan) && !body.look(0, &Scan { unit_mm: 10, ..scan }));
-    assert!(!body.look(0, &Scan { count: 180, ..scan }) && body.look(SLICES, &scan));
+    let scan = |count, unit_mm| Scan::of(ScanHead::lms(count, -90_000, 1000, unit_mm, 13), &vec![0; count]);
+    assert!(body.look(0, &scan(181, 1)) && !body.look(0, &scan(181, 10)));
+    assert!(!body.look(0, &scan(180, 1)) && body.look(SLICES, &scan(181, 1)));
+}
+
+#[test]
+fn a_scan_of_impossible_angles_does_no_harm() {
+    for (first_angle, step) in [(1e300, 0.5), (0.0, 0.0), (-1e300, -1e-300)] {
+        let mut body = Body::new(Pose::default(), 1000.0);
+        let head = ScanHead { first_angle, step, ..ScanHead::lms(3, 0, 1000, 1, 13) };
+        for slice in 0..SLICES {
+            assert!(body.look(slice, &Scan::of(head, &[400, 8191, 5000])));
+        }
+        assert_eq!(body.mask().of_beams, 3);
+    }
+}
+
+#[test]
+fn a_head_that_turns_clockwise_has_sectors_from_the_lesser_angle_on() {
+    let mut body = Body::new(Pose::default(), 1000.0);
+    let mut scan = Scan::of(ScanHead::turning(schema::Family::Ld, 360), &[WALL_MM; 360]);
+    // A post on the right, and one behind, across 180 degrees.
+    scan.arrays().ranges[85..=95].fill(400);
+    scan.arrays().ranges[175..=185].fill(400);
+    for slice in 0..SLICES {
+        (0..SCANS).for_each(|_| assert!(body.look(slice, &scan)));
+    }
+    let sectors = body.mask().sectors;
+    let seen: Vec<_> =
+        sectors.iter().map(|sector| (sector.from_mdeg / 1000, sector.to_mdeg / 1000)).collect();
+    assert!(seen.iter().all(|(from, to)| from <= to && to - from <= 12), "{seen:?}");
+    for angle in [-95, -90, -85, -175, -180, 179, 175] {
+        assert!(seen.iter().any(|(from, to)| (*from..=*to).contains(&angle)), "{angle}: {seen:?}");
+    }
+    assert!(!seen.iter().any(|(from, to)| (*from..=*to).contains(&0)), "{seen:?}");
 }

@@ -108,20 +108,21 @@ pub(crate) fn foreground<'a>(
         #[serde(flatten)]
         stamp: Stamp<'a>,
         generation: u32,
-        unit_mm: u8,
+        #[serde(serialize_with = "schema::unit_in_mm")]
+        unit_mm: u32,
         #[serde(serialize_with = "beams")]
         beams: &'a Foreground,
         ranges: &'a [u16],
         #[serde(serialize_with = "segment_list")]
         segments: &'a Foreground,
-        left_out: u8,
+        left_out: u16,
         #[serde(flatten)]
         flags: Words,
     }
     Line {
         stamp: Stamp::new("foreground", sensor, header),
         generation: foreground.generation,
-        unit_mm: foreground.unit_mm,
+        unit_mm: foreground.unit_um,
         beams: foreground,
         ranges: foreground.ranges(),
         segments: foreground,
@@ -181,17 +182,17 @@ fn segment_list<S: Serializer>(foreground: &Foreground, serializer: S) -> Result
     struct Item {
         first: u16,
         last: u16,
-        nearest_mm: u32,
-        width_mm: u32,
+        nearest_mm: u64,
+        width_mm: u64,
         x_mm: i32,
         y_mm: i32,
     }
-    let unit_mm = u32::from(foreground.unit_mm);
+    let in_mm = |range: u16| u64::from(range) * u64::from(foreground.unit_um) / 1000;
     let item = |segment: &Segment| Item {
         first: segment.first,
         last: segment.last,
-        nearest_mm: u32::from(segment.nearest) * unit_mm,
-        width_mm: u32::from(segment.width) * unit_mm,
+        nearest_mm: in_mm(segment.nearest),
+        width_mm: in_mm(segment.width),
         x_mm: segment.x_mm,
         y_mm: segment.y_mm,
     };

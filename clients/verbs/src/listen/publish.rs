@@ -4,6 +4,7 @@ mod any_publisher;
 
 use lan::republish::{Republisher, SensorTopics, TopicStore};
 use scanhub_client::{PublishSession, SensorPublisher, clock};
+use schema::limits::TopicLimits;
 use schema::shortage::raise_descriptor_limit;
 use schema::{Domain, Failure, Header, Topic, Wake};
 
@@ -23,14 +24,14 @@ pub(super) struct SharedTopics {
     sensor: SensorPublisher,
 }
 
-/// Takes the domain's place for a listener, beside its hub if there is one.
+/// Takes the domain's place for a listener, beside its hub if there is one. All topics are made as `limits` say.
 ///
 /// [`Kind::DomainHeld`](schema::Kind) if another listener has it, [`Kind::Short`](schema::Kind) if there is no memory
 /// for even one sensor, [`Kind::Failed`](schema::Kind) if shared memory refuses.
-pub(super) fn open(domain: &Domain) -> Result<Publication, Failure> {
+pub(super) fn open(domain: &Domain, limits: TopicLimits) -> Result<Publication, Failure> {
     // With fewer, fewer consumers can attach.
     let _ = raise_descriptor_limit();
-    let session = PublishSession::open(domain, &Topic::ALL)?;
+    let session = PublishSession::open(domain, &Topic::ALL, limits)?;
     Ok(Republisher::new(SharedMemory(session), std::process::id(), clock::now_ns()))
 }
 

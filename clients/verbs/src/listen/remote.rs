@@ -3,7 +3,7 @@
 use std::io::{self, Write};
 
 use lan::incoming::Remote;
-use schema::datagram::{Head, telegram};
+use schema::datagram::Head;
 use schema::{Header, Pace, Topic};
 use serde::{Serialize, Serializer};
 
@@ -38,15 +38,11 @@ macro_rules! payloads {
         /// Has the payload shown by `how`; nothing becomes of one that cannot be had.
         fn show<E>(remote: &Remote<'_>, how: impl Way<E>) -> Result<(), E> {
             match remote.topic {
-                $(Topic::$topic => payloads!($payload, remote, how),)*
+                $(Topic::$topic => remote
+                    .payload::<schema::payload_type!($payload)>()
+                    .map_or(Ok(()), |payload| how.show(&*payload)),)*
             }
         }
-    };
-    ([u8], $remote:ident, $how:ident) => {
-        telegram($remote.datagram.payload).map_or(Ok(()), |telegram| $how.show(telegram.0))
-    };
-    ($payload:ident, $remote:ident, $how:ident) => {
-        $remote.payload::<schema::$payload>().map_or(Ok(()), |payload| $how.show(&payload))
     };
 }
 

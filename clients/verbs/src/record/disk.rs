@@ -306,9 +306,8 @@ mod tests {
     }
 
     fn push(disk: &Disk, track: usize) {
-        let pushed = disk
-            .queue
-            .push(track, &Header::default(), |room| schema::datagram::Packed::pack(&Status::default(), room));
+        let pack = |room: &mut [u8]| schema::datagram::Packed::pack(&Status::default(), room);
+        let pushed = disk.queue.push(track, &Header::default(), size_of::<Status>(), pack);
         assert!(pushed);
     }
 

@@ -46,7 +46,7 @@ pub(super) struct Part {
     met: Vec<usize>,
     /// Of a recording for ROS 2.
     bag: Option<Bag>,
-    scan: Scan,
+    scan: Box<Scan>,
 }
 
 /// How a file is written.
@@ -118,7 +118,7 @@ impl Part {
             topics: Vec::new(),
             met: Vec::new(),
             bag: (style.form == Form::Ros2).then(Bag::default),
-            scan: Scan::default(),
+            scan: Box::default(),
         })
     }
 
@@ -271,7 +271,7 @@ impl Part {
         let Some(writer) = &mut self.writer else { return Err(nothing_behind()) };
         match (&mut self.bag, name.topic) {
             (None, topic) => writer.sample(&name.sensor, topic, header, payload),
-            (Some(bag), Topic::Scan) if self.scan.unpack(payload) => {
+            (Some(bag), Topic::Scan) if Scan::unpack_into(&mut self.scan, payload) => {
                 bag.scan(writer, &name.sensor, header, &self.scan)
             }
             (Some(bag), Topic::Status) => {

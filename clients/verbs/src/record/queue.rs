@@ -58,19 +58,20 @@ impl Queue {
         self.lock().batch.entries.push(entry);
     }
 
-    /// Adds a sample of `track`, whose payload `pack` writes; false if there is no room.
+    /// Adds a sample of `track`, whose payload of at most `longest` bytes `pack` writes; false if there is no room.
     pub(super) fn push(
         &self,
         track: usize,
         header: &Header,
+        longest: usize,
         pack: impl FnOnce(&mut [u8]) -> Option<usize>,
     ) -> bool {
         let Batch { entries, bytes } = &mut self.lock().batch;
         let begin = bytes.len();
-        if entries.len() >= MOST_ENTRIES || begin + LONGEST > MOST_BYTES {
+        if entries.len() >= MOST_ENTRIES || begin + longest > MOST_BYTES {
             return false;
         }
-        bytes.resize(begin + LONGEST, 0);
+        bytes.resize(begin + longest, 0);
         let len = pack(&mut bytes[begin..]);
         bytes.truncate(begin + len.unwrap_or(0));
         if let Some(len) = len {
@@ -143,19 +144,15 @@ impl Batch {
 /// Of payloads, in bytes: 20 seconds of all topics of two sensors at their fastest.
 const MOST_BYTES: usize = 8 << 20;
 const MOST_ENTRIES: usize = 1 << 15;
-/// No payload is longer, in bytes.
-const LONGEST: usize = 2048;
 /// So often what waits is written and a chunk is closed: what a kill costs is not older.
 pub(super) const EVERY: Duration = Duration::from_millis(100);
-
-const _: () = assert!(LONGEST >= size_of::<schema::Foreground>() && LONGEST >= schema::Telegram::MAX);
 
 #[cfg(test)]
 mod tests {
     use super::*;
 
     fn push(queue: &Queue, byte: u8, len: usize) -> bool {
-        queue.push(0, &Header::default(), |room| {
+        queue.push(0, &Header::default(), 2 * len, |room| {
             room[..len].fill(byte);
             Some(len)
         })
@@ -165,7 +162,7 @@ mod tests {
     fn what_waits_is_bounded_and_comes_in_its_order() {
         let queue = Queue::new();
         let pushed = (0..).take_while(|&i| push(&queue, i as u8, 1000)).count();
-        assert_eq!(pushed, (MOST_BYTES - LONGEST) / 1000 + 1);
+        assert_eq!(pushed, (MOST_BYTES - 2000) / 1000 + 1);
         assert!(!queue.is_roomy());
         let mut batch = Batch::new();
         queue.take(&mut batch);

@@ -3,7 +3,7 @@
 use std::io::{self, Write};
 
 use scanhub_client::{Heard, Robot};
-use schema::{Background, Flags, Foreground, Header, Marks, Verdict};
+use schema::{Background, BackgroundHead, Flags, Foreground, Header, Marks, Verdict};
 
 use super::numbers;
 
@@ -72,9 +72,8 @@ fn without_nearest(verdict: Verdict) -> &'static str {
 pub(crate) fn foreground(line: &mut Vec<u8>, header: &Header, foreground: &Foreground) -> io::Result<()> {
     numbers(line, header)?;
     write!(line, " {} beams, {} segments", foreground.beams, foreground.segments)?;
-    let unit_mm = u32::from(foreground.unit_mm);
     for segment in foreground.segments() {
-        let width_mm = u32::from(segment.width) * unit_mm;
+        let width_mm = u64::from(segment.width) * u64::from(foreground.unit_um) / 1000;
         write!(line, ", {width_mm} mm wide at ({}, {})", segment.x_mm, segment.y_mm)?;
     }
     Ok(())
@@ -83,7 +82,8 @@ pub(crate) fn foreground(line: &mut Vec<u8>, header: &Header, foreground: &Foreg
 pub(crate) fn background(line: &mut Vec<u8>, model: &Background) -> io::Result<()> {
     let far = model.ranges().iter().filter(|&&range| range == Background::FAR).count();
     let frozen = if model.is_frozen() { ", frozen" } else { "" };
-    let Background { generation, taught, count, unit_mm, .. } = model;
+    let BackgroundHead { generation, taught, count, unit_um, .. } = **model;
+    let unit_mm = f64::from(unit_um) / 1000.0;
     write!(
         line,
         "generation {generation}: {taught} of {count} beams known, {far} far, in {unit_mm} mm{frozen}"

@@ -140,9 +140,10 @@ fn line(number: usize, sensor: &Sensor, view: &View, width: u16) -> Line<'static
         }
         fields.push(format!("  suspect {}", sensor.count(Counter::Suspect)));
         if width >= WIDE {
-            let taught = sensor.background.map_or(0, |model| model.taught);
+            let taught = sensor.background.as_ref().map_or(0, |model| model.taught);
             let marks = sensor.marks.map(|marks| marks.marks().len().to_string());
-            let objects = sensor.foreground.map(|foreground| foreground.segments().len().to_string());
+            let objects =
+                sensor.foreground.as_ref().map(|foreground| foreground.segments().len().to_string());
             fields.extend([format!("  max {greatest} ms"), format!("  marks {}", dash(marks))]);
             fields.extend([format!("  objects {}", dash(objects)), format!("  background {taught}")]);
         }

@@ -10,8 +10,8 @@ use ratatui::backend::TestBackend;
 use ratatui::buffer::Buffer;
 use ratatui::style::{Color, Modifier};
 use schema::{
-    Background, Counter, Foreground, Header, Mark, Marks, Pose, Scan, Segment, State, Status, Verdict, Zone,
-    Zones,
+    Background, BackgroundHead, Counter, Foreground, ForegroundHead, Header, Mark, Marks, Pose, Scan,
+    ScanHead, Segment, State, Status, Verdict, Zone, Zones,
 };
 
 use super::draw::{dots, draw};
@@ -42,32 +42,36 @@ fn meets(pose: &Pose, (dx, dy): (f64, f64), legs: &[(f64, f64, f64)]) -> f64 {
 
 /// Fills in what a sensor at `pose` sees.
 fn see(sensor: &mut Sensor, pose: Pose) {
-    let mut scan = Scan {
-        count: 361,
-        unit_mm: 1,
-        range_bits: 13,
-        step_mdeg: 500,
-        first_angle_mdeg: 0,
-        ..Scan::default()
+    let mut scan = Scan::of(ScanHead::lms(361, -90_000, 500, 1, 13), &[0; 361]);
+    let ScanHead { first_angle, step, unit_um, .. } = **scan;
+    let head = BackgroundHead {
+        first_angle,
+        step,
+        unit_um,
+        taught: 361,
+        generation: 1,
+        ..BackgroundHead::default()
     };
-    let mut background =
-        Background { taught: 361, count: 361, unit_mm: 1, generation: 1, ..Background::default() };
-    let mut foreground = Foreground { generation: 1, count: 361, unit_mm: 1, ..Foreground::default() };
+    let mut background = Background::of(head, &[0; 361]);
+    let mut foreground = Foreground::of(361);
+    let mut head = ForegroundHead { generation: 1, count: 361, unit_um, ..ForegroundHead::default() };
+    let arrays = foreground.begin(head);
     for i in 0..361 {
-        let direction = pose.direction(scan.angle_mdeg(i));
+        let direction = pose.direction(scan.angle(i));
         let (now, empty) = (meets(&pose, direction, &LEGS), meets(&pose, direction, &[]));
-        scan.range_array[i] = (1000.0 * now) as u16;
-        background.range_array[i] = (1000.0 * empty) as u16;
+        let range = (1000.0 * now) as u16;
+        scan.arrays().ranges[i] = range;
+        background.ranges_mut()[i] = (1000.0 * empty) as u16;
         if now < empty - 0.05 {
-            foreground.bit_array[i / 8] |= 1 << (i % 8);
-            foreground.range_array[usize::from(foreground.beams)] = scan.range_array[i];
-            foreground.beams += 1;
+            arrays.bits[i / 8] |= 1 << (i % 8);
+            arrays.ranges[usize::from(head.beams)] = range;
+            head.beams += 1;
         }
     }
-    foreground.segments = 1;
-    foreground.segment_array[0] = Segment { first: 1, last: 2, ..Segment::default() };
+    arrays.segments[0] = Segment { first: 1, last: 2, ..Segment::default() };
+    **foreground = ForegroundHead { segments: 1, ..head };
     let mut marks = Marks { count: 1, ..Marks::default() };
-    marks.mark_array[0] = Mark { angle_mdeg: 70_000, range_dmm: 32_000, ..Mark::default() };
+    marks.mark_array[0] = Mark { angle_mdeg: -20_000, range_dmm: 32_000, ..Mark::default() };
     let mut status = Status { state: State::Streaming as u8, baud: 500_000, pose, ..Status::default() };
     status.counters[Counter::Suspect] = 3;
     for n in 0..76 {

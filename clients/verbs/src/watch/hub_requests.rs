@@ -20,7 +20,7 @@ pub(crate) struct Done {
     /// In words.
     pub(crate) news: String,
     /// The models afterwards, with their sensors.
-    pub(crate) models: Vec<(String, Background)>,
+    pub(crate) models: Vec<(String, Box<Background>)>,
 }
 
 impl HubRequests {

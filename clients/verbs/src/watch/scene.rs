@@ -2,7 +2,8 @@
 //! terminal; time is an argument.
 
 use schema::{
-    Background, Counter, Foreground, Header, Marks, Pose, Scan, State, Status, Verdict, Zones, is_remote,
+    Background, Counter, Foreground, Header, Mark, Marks, Pose, Scan, State, Status, Verdict, Zones,
+    is_remote,
 };
 
 use super::meter::Meter;
@@ -28,10 +29,10 @@ pub(crate) struct Sensor {
     /// Where it sits; at the robot's centre as long as that is not told.
     pub(crate) pose: Pose,
     /// The last scan, as long as it is new.
-    pub(crate) scan: Option<Scan>,
-    pub(crate) foreground: Option<Foreground>,
+    pub(crate) scan: Option<Box<Scan>>,
+    pub(crate) foreground: Option<Box<Foreground>>,
     pub(crate) marks: Option<Marks>,
-    pub(crate) background: Option<Background>,
+    pub(crate) background: Option<Box<Background>>,
     /// Unknown in a silence.
     pub(crate) zones: Zones,
     pub(crate) meter: Meter,
@@ -75,8 +76,9 @@ impl Scene {
     pub(crate) fn hub_gone(&mut self) {
         (self.hub_lives, self.hub_pid, self.hub_percent) = (false, 0, None);
         for sensor in &mut self.sensors {
-            let Sensor { name, pose, background, lost, .. } = sensor;
-            *sensor = Sensor { pose: *pose, background: *background, lost: *lost, ..Sensor::new(name) };
+            let background = sensor.background.take();
+            *sensor =
+                Sensor { pose: sensor.pose, background, lost: sensor.lost, ..Sensor::new(&sensor.name) };
         }
     }
 }
@@ -100,7 +102,7 @@ impl Sensor {
 
     /// Takes a scan that arrived at `now_ns`.
     pub(crate) fn take_scan(&mut self, header: &Header, scan: &Scan, now_ns: u64) {
-        self.scan = Some(*scan);
+        self.scan = Some(scan.boxed());
         self.meter.scan(header, now_ns);
         self.old_at_ns = now_ns + OLD_NS.max(3000 * u64::from(header.period_us));
     }
@@ -125,7 +127,7 @@ impl Sensor {
 
     /// Its background model is held.
     pub(crate) fn is_frozen(&self) -> bool {
-        self.background.is_some_and(|model| model.is_frozen())
+        self.background.as_ref().is_some_and(|model| model.is_frozen())
     }
 
     /// The points of the last scan in metres in the robot's frame, and whether each is in the foreground.
@@ -133,7 +135,7 @@ impl Sensor {
         let Some(scan) = &self.scan else { return Vec::new() };
         let pose = self.pose;
         let point = |i| {
-            let (x, y) = point_m(&pose, scan.angle_mdeg(i), f64::from(scan.distance_mm(i)?));
+            let (x, y) = point_m(&pose, scan.angle(i), f64::from(scan.distance_mm(i)?));
             Some((x, y, self.foreground.as_ref().is_some_and(|foreground| foreground.contains(i))))
         };
         (0..scan.beams()).filter_map(point).collect()
@@ -143,21 +145,19 @@ impl Sensor {
     pub(crate) fn mark_points(&self) -> Vec<(f64, f64)> {
         let pose = self.pose;
         let marks = self.marks.iter().flat_map(|marks| marks.marks());
-        marks.map(|mark| point_m(&pose, mark.angle_mdeg, f64::from(mark.range_dmm) / 10.0)).collect()
+        let angle = |mark: &Mark| (f64::from(mark.angle_mdeg) / 1000.0).to_radians();
+        marks.map(|mark| point_m(&pose, angle(mark), f64::from(mark.range_dmm) / 10.0)).collect()
     }
 
     /// Where its background ends, in metres in the robot's frame.
     pub(crate) fn background_points(&self) -> Vec<(f64, f64)> {
-        let Some((model, (first, step))) = self.background.and_then(|it| Some((it, it.angles_mdeg()?)))
-        else {
-            return Vec::new();
-        };
+        let Some(model) = &self.background else { return Vec::new() };
         let pose = self.pose;
         let taught = |range: &&u16| ![Background::UNTAUGHT, Background::FAR].contains(range);
         let ranges = model.ranges().iter().enumerate().filter(|(_, range)| taught(range));
         let points = ranges.map(|(i, range)| {
-            let angle = first + i as i32 * i32::from(step);
-            point_m(&pose, angle, f64::from(*range) * f64::from(model.unit_mm))
+            let angle = model.first_angle + i as f64 * model.step;
+            point_m(&pose, angle, f64::from(*range) * f64::from(model.unit_um) / 1000.0)
         });
         points.collect()
     }
@@ -180,8 +180,8 @@ pub(crate) fn verdict<'a>(
     (worst.map_or(Verdict::Unknown, |(verdict, _)| verdict), worst.map(|(_, name)| name), nearest)
 }
 
-fn point_m(pose: &Pose, angle_mdeg: i32, range_mm: f64) -> (f64, f64) {
-    let (x, y) = pose.point_mm(angle_mdeg, range_mm);
+fn point_m(pose: &Pose, angle: f64, range_mm: f64) -> (f64, f64) {
+    let (x, y) = pose.point_mm(angle, range_mm);
     (x / 1000.0, y / 1000.0)
 }
 
@@ -196,7 +196,7 @@ mod tests {
     fn old_scans_are_forgotten_and_a_hub_that_goes_leaves_nothing_to_act_on() {
         let mut scene = Scene { hub_lives: true, ..Scene::default() };
         let sensor = scene.sensor("front");
-        sensor.take_scan(&Header { period_us: 500_000, ..Header::default() }, &Scan::default(), 7);
+        sensor.take_scan(&Header { period_us: 500_000, ..Header::default() }, &Box::<Scan>::default(), 7);
         sensor.zones = Zones { verdict: Verdict::Clear as u8, ..Zones::unknown() };
         assert!(!scene.age(1_500_000_006) && scene.age(1_500_000_007) && !scene.age(u64::MAX));
         assert!(scene.sensors[0].scan.is_none());

@@ -172,7 +172,7 @@ const OUTLIERS: usize = 50;
 #[cfg(test)]
 mod tests {
     use super::*;
-    use schema::{Header, Scan};
+    use schema::{Header, Scan, ScanHead};
 
     fn press(view: &mut View, scene: &Scene, keys: &str) -> Option<Wish> {
         keys.chars().map(|key| view.key(Key::Sign(key), scene)).last().flatten()
@@ -181,9 +181,7 @@ mod tests {
     fn two() -> Scene {
         let mut scene = Scene::default();
         for name in ["front", "rear"] {
-            let mut scan =
-                Scan { count: 181, unit_mm: 1, range_bits: 13, step_mdeg: 1000, ..Scan::default() };
-            scan.range_array[..181].fill(4000);
+            let scan = Scan::of(ScanHead::lms(181, -90_000, 1000, 1, 13), &[4000; 181]);
             scene.sensor(name).take_scan(&Header::default(), &scan, 0);
         }
         scene

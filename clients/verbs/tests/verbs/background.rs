@@ -10,7 +10,7 @@ use std::time::Duration;
 
 use crate::fake::Place;
 use schema::ipc::{self, ControlServer};
-use schema::{Background, Domain, Failure, HubLock, Kind, Response, Shown, Verb};
+use schema::{Background, BackgroundHead, Domain, Failure, HubLock, Kind, Response, Shown, Verb};
 use verbs::{BackgroundOptions, ModelOrder, background, saved_model};
 
 /// A hub that answers for the background of `front`.
@@ -20,7 +20,7 @@ struct Keeper {
 }
 
 impl Keeper {
-    fn new(domain: &Domain, mut model: Background) -> Keeper {
+    fn new(domain: &Domain, mut model: Box<Background>) -> Keeper {
         let (stop, domain) = (Arc::new(AtomicBool::new(false)), domain.clone());
         let lock = HubLock::acquire(domain.root()).unwrap();
         let flag = stop.clone();
@@ -31,9 +31,9 @@ impl Keeper {
             ready.send(()).unwrap();
             while !flag.load(Ordering::Relaxed) {
                 while let Some(asked) = server.receive().unwrap() {
-                    let request = *asked.request();
-                    let answer = match (request.sensor(), request.verb()) {
-                        ("front", Some(verb)) => obey(&mut model, verb, &request.model()),
+                    let request = asked.request().expect("requests of this version");
+                    let answer = match (request.sensor.as_str(), request.verb) {
+                        ("front", Some(verb)) => obey(&mut model, verb, request.model),
                         (other, _) => Err(Failure::new(
                             Kind::NoTopic,
                             format!("the hub has no sensor {other}"),
@@ -57,28 +57,47 @@ impl Drop for Keeper {
     }
 }
 
-fn obey(model: &mut Background, verb: Verb, wanted: &Background) -> Result<Option<Background>, Failure> {
-    match verb {
-        Verb::Reset => {
-            let Background { generation, count, unit_mm, flags, .. } = *model;
-            *model =
-                Background { generation: generation + 1, count, unit_mm, flags, ..Background::default() };
+fn obey(
+    model: &mut Box<Background>,
+    verb: Verb,
+    wanted: Option<Box<Background>>,
+) -> Result<Option<Box<Background>>, Failure> {
+    let generation = model.generation + 1;
+    match (verb, wanted) {
+        (Verb::Reset, _) => {
+            model.ranges_mut().fill(Background::UNTAUGHT);
+            (model.generation, model.taught) = (generation, 0);
         }
-        Verb::Freeze => model.flags = Background::FROZEN,
-        Verb::Thaw => model.flags = 0,
-        Verb::Load if (wanted.count, wanted.unit_mm) != (model.count, model.unit_mm) => {
+        (Verb::Freeze, _) => model.flags = Background::FROZEN,
+        (Verb::Thaw, _) => model.flags = 0,
+        (Verb::Load, Some(wanted)) if (wanted.count, wanted.unit_um) != (model.count, model.unit_um) => {
             let message = format!("front has {} beams, the model {}", model.count, wanted.count);
             return Err(Failure::new(Kind::Configuration, message, "save one of this resolution"));
         }
-        Verb::Load => *model = Background { generation: model.generation + 1, ..*wanted },
-        _ => return Ok(Some(*model)),
+        (Verb::Load, Some(wanted)) => {
+            *model = wanted;
+            model.generation = generation;
+        }
+        _ => return Ok(Some(model.clone())),
     }
     Ok(None)
 }
 
-fn model() -> Background {
-    let mut model = Background { generation: 4, taught: 3, count: 181, unit_mm: 10, ..Background::default() };
-    model.range_array[..4].copy_from_slice(&[400, 0, Background::FAR, 120]);
+fn model() -> Box<Background> {
+    of_beams(181, 1.0)
+}
+
+fn of_beams(count: usize, step_deg: f64) -> Box<Background> {
+    let head = BackgroundHead {
+        first_angle: (-90_f64).to_radians(),
+        step: step_deg.to_radians(),
+        generation: 4,
+        taught: 3,
+        unit_um: 10_000,
+        ..BackgroundHead::default()
+    };
+    let mut model = Background::of(head, &vec![Background::UNTAUGHT; count]);
+    model.ranges_mut()[..4].copy_from_slice(&[400, 0, Background::FAR, 120]);
     model
 }
 
@@ -114,12 +133,12 @@ fn a_model_is_saved_forgotten_and_loaded_again() {
     assert_eq!(say(ModelOrder::Show), "front: generation 5: 0 of 181 beams known, 0 far, in 10 mm\n");
     let loaded = saved_model(&file, "front", false, &mut &b""[..]).unwrap();
     assert_eq!(loaded, model());
-    assert_eq!(say(ModelOrder::Load(Box::new(loaded))), "front: load taken\n");
+    assert_eq!(say(ModelOrder::Load(loaded)), "front: load taken\n");
     let (end, out) = ask(&place, "front", ModelOrder::Show, true);
     assert_eq!(end, Ok(()));
     assert_eq!(
         out.split_at(160).0,
-        r#"{"class":"background","sensor":"front","generation":6,"taught":3,"unit_mm":10,"count":181,"first_angle_deg":0.0,"step_deg":1.0,"frozen":false,"ranges":[400,null,"#
+        r#"{"class":"background","sensor":"front","generation":6,"taught":3,"unit_mm":10,"count":181,"first_angle_deg":-90.0,"step_deg":1.0,"frozen":false,"ranges":[400,null,"#
             .split_at(160)
             .0
     );
@@ -142,7 +161,7 @@ fn a_model_is_saved_forgotten_and_loaded_again() {
 #[test]
 fn what_does_not_go_with_the_sensor_is_refused() {
     let place = Place::new();
-    let _keeper = Keeper::new(&place.domain, Background { count: 361, ..model() });
+    let _keeper = Keeper::new(&place.domain, of_beams(361, 0.5));
     let file = place.base.join("model.json");
     ask(&place, "front", keep(&file), false).0.unwrap();
 
@@ -153,7 +172,7 @@ fn what_does_not_go_with_the_sensor_is_refused() {
     assert!(saved_model(&file, "rear", true, &mut &b""[..]).is_ok());
 
     // The hub says what it has; here it is another resolution.
-    let refused = ask(&place, "front", ModelOrder::Load(Box::new(model())), false).0.unwrap_err();
+    let refused = ask(&place, "front", ModelOrder::Load(model()), false).0.unwrap_err();
     assert_eq!(
         (refused.kind, refused.message.as_str()),
         (Kind::Configuration, "front has 361 beams, the model 181")
@@ -241,7 +260,7 @@ fn a_model_that_knows_nothing_takes_no_others_place() {
 #[test]
 fn before_the_first_scan_there_is_nothing_to_save() {
     let place = Place::new();
-    let _keeper = Keeper::new(&place.domain, Background::default());
+    let _keeper = Keeper::new(&place.domain, Box::default());
     let file = place.base.join("model.json");
     let failure = ask(&place, "front", keep(&file), false).0.unwrap_err();
     assert_eq!((failure.kind, failure.message.as_str()), (Kind::Failed, "front has no background model yet"));

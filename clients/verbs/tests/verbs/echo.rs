@@ -48,8 +48,8 @@ fn scans_as_json() {
     assert_eq!(
         but_last(&out),
         [
-            r#"{"class":"scan","sensor":"front","seq":0,"topic_seq":0,"stamp_ns":1000000000,"wall_ns":1700000000000000000,"boot":"00000000000000ab","quality":"clean","unit_mm":10,"first_angle_deg":0.0,"step_deg":0.5,"count":4,"ranges":[1000,null,null,7],"codes":[[1,0],[2,8]]}"#,
-            r#"{"class":"scan","sensor":"front","seq":1,"topic_seq":1,"stamp_ns":1000000001,"wall_ns":1700000000000000001,"boot":"00000000000000ab","quality":"clean","unit_mm":10,"first_angle_deg":0.0,"step_deg":0.5,"count":0,"ranges":[],"codes":[]}"#,
+            r#"{"class":"scan","sensor":"front","seq":0,"topic_seq":0,"stamp_ns":1000000000,"wall_ns":1700000000000000000,"boot":"00000000000000ab","quality":"clean","family":"lms","unit_um":10000,"count":4,"first_angle_deg":-90.0,"step_deg":0.5,"beam_time_ns":18500,"ranges":[1000,null,null,7],"codes":[[1,"no_return"],[2,"beyond"]]}"#,
+            r#"{"class":"scan","sensor":"front","seq":1,"topic_seq":1,"stamp_ns":1000000001,"wall_ns":1700000000000000001,"boot":"00000000000000ab","quality":"clean","family":"lms","unit_um":10000,"count":0,"first_angle_deg":-90.0,"step_deg":0.5,"beam_time_ns":18500,"ranges":[],"codes":[]}"#,
         ]
     );
     let summary = out.lines().last().unwrap();
@@ -98,15 +98,17 @@ fn scans_as_columns_and_as_bytes() {
     assert_eq!(
         out.lines().collect::<Vec<_>>(),
         [
-            "seq,topic_seq,stamp_ns,wall_ns,quality,unit_mm,first_angle_deg,step_deg,range_0,range_1",
-            "0,0,1000000000,1700000000000000000,clean,10,0,0.5,1000,",
-            "1,1,1000000001,1700000000000000001,clean,10,0,0.5,5,6",
+            "seq,topic_seq,stamp_ns,wall_ns,quality,unit_um,first_angle_deg,step_deg,range_0,range_1",
+            "0,0,1000000000,1700000000000000000,clean,10000,-90,0.5,1000,",
+            "1,1,1000000001,1700000000000000001,clean,10000,-90,0.5,5,6",
         ]
     );
     assert!(notes.starts_with("front/scan: 2 received, 0 lost"), "{notes}");
     crate::fake::until("bytes", || raw.finished());
     let bytes = raw.out.bytes();
-    assert_eq!((bytes.len(), &bytes[..4], &bytes[12..14]), (1216, &[2, 0, 10, 13][..], &[0xE8, 0x03][..]));
+    // The head up to the unit, unit, count, the greatest range and the code above it; the ranges behind the head.
+    let field = |at: usize| u16::from_le_bytes([bytes[at], bytes[at + 1]]);
+    assert_eq!((bytes.len(), [28, 32, 34, 36, 64].map(field)), (70, [10_000, 2, 0x1FF6, 0x1FFF, 1000]));
 }
 
 #[test]
@@ -123,7 +125,7 @@ fn samples_as_text() {
     assert_eq!(
         out.lines().take(2).collect::<Vec<_>>(),
         [
-            "front/scan seq 0 topic_seq 0 at 1.000000 clean 3 beams 0 to 1 deg 2 valid nearest 9000 mm at 0.5 deg",
+            "front/scan seq 0 topic_seq 0 at 1.000000 clean 3 beams -90 to -89 deg 2 valid nearest 9000 mm at -89.5 deg",
             "front/telegram seq 1 topic_seq 0 at 1.000000 clean address 80 command a0 9 bytes 02800300a00010160a",
         ]
     );

@@ -9,6 +9,9 @@ use schema::ipc::PortFactory;
 use schema::{Domain, Scan, holder};
 use verbs::{Bounds, EchoOptions, Format, echo};
 
+/// One turn of an LMS's mirror (75 Hz); it measures the half degrees one turn later.
+const TURN_NS: u64 = 13_320_000;
+
 /// The hub of these tests when it has to be a process of its own: run by them, ignored otherwise.
 #[test]
 #[ignore = "a helper process of the tests here"]
@@ -107,7 +110,7 @@ fn a_subscription_times_out_and_goes_on() {
     hub.front().scan(&[7; 361]);
     let scan = scans.next().unwrap().expect("one was sent");
     assert_eq!((scan.beams(), scan.missed, scan.restarted), (361, 0, false));
-    assert_eq!(scan.beam_time_ns(360), scan.header().stamp_first_ns - schema::TURN_NS);
+    assert_eq!(scan.beam_time_ns(360), scan.header().stamp_first_ns - TURN_NS);
 }
 
 #[test]

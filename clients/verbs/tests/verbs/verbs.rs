@@ -43,8 +43,8 @@ fn topics_of_a_hub() {
         out.lines().filter(|line| SHOWN.iter().any(|it| line.contains(it))).take(3).collect::<Vec<_>>(),
         [
             r#"{"class":"topic","sensor":"front","topic":"telegram","payload":"u8[]","revision":1,"hz":37.54,"subscribers":0}"#,
-            r#"{"class":"topic","sensor":"front","topic":"scan","payload":"scanhub.Scan.v1","revision":1,"hz":37.54,"subscribers":0}"#,
-            r#"{"class":"topic","sensor":"front","topic":"status","payload":"scanhub.Status.v1","revision":1,"hz":null,"subscribers":0}"#,
+            r#"{"class":"topic","sensor":"front","topic":"scan","payload":"scanhub.Scan.v2","revision":1,"hz":37.54,"subscribers":0}"#,
+            r#"{"class":"topic","sensor":"front","topic":"status","payload":"scanhub.Status.v2","revision":1,"hz":null,"subscribers":0}"#,
         ]
     );
     let rates: Vec<_> = out.lines().map(|line| line.contains(r#""hz":37.54"#)).collect();
@@ -55,7 +55,7 @@ fn topics_of_a_hub() {
     let (_, out, _) = verb.join();
     assert_eq!(
         out.lines().nth(2),
-        Some("front/scan        37.54          0  scanhub.Scan.v1               1"),
+        Some("front/scan        37.54          0  scanhub.Scan.v2               1"),
         "{out}"
     );
 }

@@ -37,11 +37,14 @@ pub(super) struct ZonesLayer {
 }
 
 #[derive(Clone, Deserialize)]
-#[serde(deny_unknown_fields, expecting = "a sector, as { from = 12.5, to = 30.0, range = 0.42 }")]
+#[serde(deny_unknown_fields, expecting = "a sector, as { from_deg = -77.5, to_deg = -60.0, range = 0.42 }")]
 struct SectorLayer {
-    from: f64,
-    to: f64,
+    from_deg: Option<f64>,
+    to_deg: Option<f64>,
     range: f64,
+    /// The keys of when 0 was right. Many of their values are possible in both frames, so none is taken.
+    from: Option<f64>,
+    to: Option<f64>,
 }
 
 /// Section `marks`.
@@ -304,13 +307,33 @@ fn sectors(origin: &Origin, value: Spanned<Vec<Spanned<SectorLayer>>>) -> Result
 
 fn in_sector(origin: &Origin, sector: Spanned<SectorLayer>) -> Result<Sector, Failure> {
     let span = Some(sector.span());
-    let SectorLayer { from, to, range } = sector.into_inner();
+    let (from, to, range) = match sector.into_inner() {
+        SectorLayer { from_deg: Some(from), to_deg: Some(to), range, from: None, to: None } => {
+            (from, to, range)
+        }
+        SectorLayer { from_deg: None, to_deg: None, range, from: Some(from), to: Some(to) } => {
+            let [now_from, now_to] = [from, to].map(|deg| (deg * 1000.0 - 90_000.0).round() / 1000.0);
+            let what = format!(
+                "self_min = {{ from = {from}, to = {to}, range = {range} }} counts angles from the right"
+            );
+            let remedy = format!(
+                "angles are counted from ahead now: {{ from_deg = {now_from:?}, to_deg = {now_to:?}, range = {range:?} }}"
+            );
+            return Err(origin.refuse(span, what, remedy));
+        }
+        _ => {
+            let remedy = "give it both angles, as { from_deg = -77.5, to_deg = -60.0, range = 0.42 }";
+            return Err(origin.refuse(span, "self_min has a sector without its two angles", remedy));
+        }
+    };
     let refuse = |remedy: &str| {
-        let what = format!("self_min = {{ from = {from}, to = {to}, range = {range} }}");
+        let what = format!("self_min = {{ from_deg = {from}, to_deg = {to}, range = {range} }}");
         Err(origin.refuse(span.clone(), what, remedy))
     };
-    if !(0.0..=180.0).contains(&from) || !(from..=180.0).contains(&to) {
-        return refuse("from and to are the sensor's angles in degrees: 0 right, 180 left, from before to");
+    if !(-180.0..=180.0).contains(&from) || !(from..=180.0).contains(&to) {
+        return refuse(
+            "from_deg and to_deg are the sensor's angles in degrees: 0 ahead, 90 left, -90 right, from before to",
+        );
     }
     if !(0.001..=LARGEST_M).contains(&range) {
         return refuse("range in metres: readings that are nearer are the robot's own body");

@@ -3,21 +3,20 @@
 
 use std::rc::Rc;
 
-use lms::variant::{Unit, Variant};
+use lms::variant::Unit;
 use preprocess::zones::{Check, Settings};
-use schema::{Failure, Kind, Scan, Zones};
+use schema::{Failure, Family, Kind, Scan, ScanHead, Zones};
 
 use super::processing::Sections;
+use crate::link::{Link, Scanner};
 use crate::origin::Origin;
 use crate::processing::Processing;
 
 /// A link with what was said about it.
 pub(super) struct Sight<'a> {
-    pub(super) name: &'a str,
+    pub(super) link: &'a Link,
     /// Where the link was begun.
     pub(super) place: &'a str,
-    pub(super) variant: Variant,
-    pub(super) unit: Option<Unit>,
     /// What was said for all links, then for this one, in the order of the sources.
     pub(super) said: Vec<&'a (Rc<Origin>, Sections)>,
 }
@@ -25,9 +24,10 @@ pub(super) struct Sight<'a> {
 impl Sight<'_> {
     /// [`Kind::Configuration`] with the place of what hinders it if `processing` leaves fewer beams to the largest circle
     /// than a violation takes.
-    pub(super) fn check(&self, processing: &Processing) -> Result<(), Failure> {
+    pub(super) fn check(&self) -> Result<(), Failure> {
+        let processing = &self.link.processing;
         let settings = processing.zones.settings();
-        let (beams, min_beams) = (self.variant.beams(), settings.min_beams);
+        let (beams, min_beams) = (self.heads()[0].count.into(), settings.min_beams);
         if usize::from(min_beams) > beams {
             let what = format!("min_beams = {min_beams}, and a scan has {beams} beams");
             return Err(self.refuse(Sections::min_beams, what, "the default is one beam"));
@@ -58,32 +58,39 @@ impl Sight<'_> {
         Err(self.refuse(place, what, remedy))
     }
 
-    /// Beams that can tell something of the largest circle, in the best of cases: the measuring mode is not known here,
-    /// nor the unit if none is expected.
+    /// Beams that can tell something of the largest circle, in the best of cases.
     fn telling(&self, processing: &Processing, settings: &Settings<'_>) -> u16 {
-        let units = [Unit::Mm, Unit::Cm].into_iter().filter(|unit| self.unit.is_none_or(|is| is == *unit));
-        let of_unit = |unit: Unit| {
-            let mut check = Check::new(processing.pose, settings);
-            let scan = Scan {
-                count: self.variant.beams() as u16,
-                unit_mm: unit.mm(),
-                range_bits: MOST_RANGE_BITS,
-                first_angle_mdeg: self.variant.first_angle_mdeg(),
-                step_mdeg: self.variant.resolution_cdeg * 10,
-                ..Scan::default()
-            };
-            check.update(&scan, &mut Zones::unknown());
+        let of_head = |head: &ScanHead| {
+            let beams = usize::from(head.count);
+            let mut check = Check::new(processing.pose, settings, beams);
+            check.update(&Scan::of(*head, &vec![0; beams]), &mut Zones::unknown());
             check.telling()
         };
-        units.map(of_unit).max().unwrap_or_default()
+        self.heads().iter().map(of_head).max().unwrap_or_default()
+    }
+
+    /// What its scans may be like: the measuring mode of an LMS is not known here, nor its unit if none is expected.
+    fn heads(&self) -> Vec<ScanHead> {
+        let &Link { scanner, variant, unit, .. } = self.link;
+        match scanner {
+            Scanner::Lms => {
+                let units = [Unit::Mm, Unit::Cm].into_iter().filter(|of| unit.is_none_or(|is| is == *of));
+                let step_mdeg = u32::from(variant.resolution_cdeg) * 10;
+                let (beams, first) = (variant.beams(), variant.first_angle_mdeg());
+                units
+                    .map(|unit| ScanHead::lms(beams, first, step_mdeg, unit.mm().into(), MOST_RANGE_BITS))
+                    .collect()
+            }
+            Scanner::Ld { .. } => vec![ScanHead::turning(Family::Ld, self.link.beams())],
+        }
     }
 
     /// The place is where `place` was said last; where the link was begun if nobody said it.
     fn refuse(&self, place: Place, what: String, remedy: &str) -> Failure {
         let at = |(origin, sections): &&(Rc<Origin>, Sections)| Some(origin.place(Some(place(sections)?)));
         let place = self.said.iter().rev().find_map(at).unwrap_or_else(|| self.place.to_owned());
-        let message = format!("{place}: link {}: {what}", self.name);
-        Failure::new(Kind::Configuration, message, remedy.replace("NAME", self.name))
+        let message = format!("{place}: link {}: {what}", self.link.name);
+        Failure::new(Kind::Configuration, message, remedy.replace("NAME", &self.link.name))
     }
 }
 

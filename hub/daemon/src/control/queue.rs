@@ -6,10 +6,12 @@ use std::sync::mpsc::{Receiver, Sender};
 use std::sync::{Arc, PoisonError};
 
 use config::Processing;
-use lms::{Control, Nanos, Session};
+use line::{Control, Session as _};
+use lms::Nanos;
 use schema::{Failure, Kind};
 
 use super::{Changed, Outcome, QueuedRequest};
+use crate::driver::Driver;
 use crate::event_fd::EventFd;
 use crate::player::Player;
 
@@ -27,7 +29,7 @@ pub struct ControlQueue {
 /// Who can be told to pause, to resume, to resync.
 pub(crate) enum Flow<'a> {
     /// A session with a sensor.
-    Session(&'a mut Session),
+    Session(&'a mut Driver),
     /// Nobody, for now.
     Away,
     /// The player of a recording.

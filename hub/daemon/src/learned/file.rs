@@ -2,14 +2,13 @@
 //! written. What is read is checked against the link that would begin with it. Refuses to know where files lie.
 
 use config::Link;
-use lms::variant::Unit;
 use schema::{Background, Failure, Kind, Pose, SavedModel, as_json};
 use serde::{Deserialize, Serialize};
 
 /// A model, where its sensor sat, and when it was written, in nanoseconds since 1970.
 #[derive(Clone, Debug, PartialEq)]
 pub(super) struct KeptBackground {
-    pub(super) model: Background,
+    pub(super) model: Box<Background>,
     pub(super) pose: Pose,
     pub(super) wall_ns: u64,
 }
@@ -54,12 +53,12 @@ impl KeptBackground {
         let Place { pose, wall_ns } = serde_json::from_str(text)
             .map_err(|error| format!("{place} does not contain its time: {error}"))?;
         let (model, beams) = (saved.model, link.variant.beams());
-        let unit_mm = link.unit.map_or(model.unit_mm, Unit::mm);
+        let unit_mm = link.unit.map_or(model.unit_um / 1000, |unit| unit.mm().into());
         if saved.sensor != link.name {
             return Err(format!("{place} is the background of {}", saved.sensor));
         }
-        if usize::from(model.count) != beams || model.unit_mm != unit_mm {
-            let Background { count, unit_mm: of, .. } = model;
+        if usize::from(model.count) != beams || model.unit_um != 1000 * unit_mm {
+            let (count, of) = (model.count, model.unit_um / 1000);
             return Err(format!(
                 "{place} has {count} beams in units of {of} mm, the link is configured for {beams} in units of {unit_mm} mm"
             ));
@@ -81,6 +80,7 @@ const SAME: f64 = 1e-9;
 mod tests {
     use super::*;
     use config::{Config, Sources};
+    use schema::BackgroundHead;
 
     fn link(set: &[&str]) -> Link {
         let set = set.iter().map(|flag| (*flag).to_owned()).collect();
@@ -89,9 +89,16 @@ mod tests {
     }
 
     fn learned(pose: Pose) -> KeptBackground {
-        let mut model =
-            Background { generation: 3, count: 361, unit_mm: 1, taught: 2, ..Background::default() };
-        model.range_array[..2].copy_from_slice(&[4000, Background::FAR]);
+        let head = BackgroundHead {
+            first_angle: -90_f64.to_radians(),
+            step: 0.5_f64.to_radians(),
+            generation: 3,
+            unit_um: 1000,
+            taught: 2,
+            ..BackgroundHead::default()
+        };
+        let mut model = Background::of(head, &[0; 361]);
+        model.ranges_mut()[..2].copy_from_slice(&[4000, Background::FAR]);
         KeptBackground { model, pose, wall_ns: 1_790_000_000_123_456_789 }
     }
 

@@ -2,7 +2,7 @@
 //! was recorded. Silences are those of the recording, however fast it is played.
 
 use lms::reply::Reply;
-use lms::session::Received;
+use lms::session::{Message, Received};
 use lms::telegram::Telegram;
 use lms::variant::Mode;
 use lms::{Nanos, SILENCE};
@@ -83,12 +83,11 @@ pub(super) fn play(replay: &mut ReplayLink<'_, '_>, frames: &Frames) -> Option<O
             let due = replay.wait_turn(None, turn, state)?;
             let at = due.at.max(last_stamp);
             let received = Received {
-                telegram,
-                reply,
+                bytes: telegram.bytes(),
+                message: Message { telegram, reply, mode },
                 first: at.saturating_sub(took),
                 last: at,
                 estimated: header.is_some_and(|header| header.flags & Flags::STAMP_ESTIMATED != 0),
-                mode,
                 reasons: header.map_or(0, |header| header.reasons),
             };
             last_stamp = at;

@@ -1,14 +1,15 @@
 //! Plays bytes as they came down a line: they take the way that a line's bytes take, at the pace of the scans. What is
 //! damaged in them is found out as on a line.
 
+use line::{Output, Session as _};
+use lms::Nanos;
 use lms::measured::MEASURED;
-use lms::session::Output;
-use lms::{Nanos, Session};
 use port::clock;
 use schema::State;
 
 use super::recorded::{Stream, read};
 use super::{ReplayLink, STANDS, variant_of};
+use crate::driver::{Driver, Heard};
 use crate::process_telegram::RecordedContext;
 
 /// Plays `stream` into the topics of `replay`. At the end, for how long the last verdict stands; nothing if the hub shall
@@ -22,7 +23,7 @@ pub(super) fn play(replay: &mut ReplayLink<'_, '_>, stream: &Stream) -> Option<O
             return Some(None);
         }
     };
-    let mut session = Session::new(replay.link.settings(true), clock::now());
+    let mut session = Driver::new(replay.link.link, true, clock::now());
     let mut recorded = RecordedContext { mode: stream.mode, ..RecordedContext::default() };
     let (mut media, mut limit) = (0, None);
     let state = if stream.has_telegrams() { State::Streaming } else { State::Probing };
@@ -47,11 +48,16 @@ pub(super) fn play(replay: &mut ReplayLink<'_, '_>, stream: &Stream) -> Option<O
             // Nothing will come that could refute a telegram held back.
             session.handle_timeout(now + lms::framer::VETO_HOLD);
         }
-        while let Output::Telegram(received) = session.poll_output() {
-            let (is_scan, variant) =
-                (received.telegram.command() == MEASURED, variant_of(received.reply.as_ref()));
+        while let Output::Heard(Heard::Lms(received)) = session.poll_output() {
+            let (is_scan, variant) = (
+                received.message.telegram.command() == MEASURED,
+                variant_of(received.message.reply.as_ref()),
+            );
             if is_skipped {
-                replay.link.output.learn(received.reply.as_ref(), received.mode.or(recorded.mode));
+                replay
+                    .link
+                    .output
+                    .learn(received.message.reply.as_ref(), received.message.mode.or(recorded.mode));
             } else {
                 limit = replay.link.publish(&received, &recorded, false).or(limit);
                 replay.link.output.stand_until(STANDS);

@@ -4,7 +4,7 @@
 //! What a topic does not keep for late joiners is not sent while nobody is attached; its number is used up. Sending looks
 //! at the places of all consumers that there may be, and no processor has them at hand after a pause.
 
-use schema::ipc::{Medium, Payload, TopicPublisher};
+use schema::ipc::{DueRings, Medium, Payload, TopicPublisher};
 use schema::limits::history;
 use schema::{Failure, Header};
 
@@ -15,7 +15,7 @@ pub(super) struct PreparedPublisher<P: Payload + ?Sized, M: Medium<P>> {
     topic: TopicPublisher<P, M>,
     /// Consumers that got the last sample.
     reached: usize,
-    /// Loaned while there was time, for the sample that is coming: bytes as long as the last ones.
+    /// Loaned while there was time, for the sample that is coming: as long as the last one.
     prepared: Option<M::Loan>,
     last_len: usize,
 }
@@ -36,12 +36,15 @@ impl<P: Payload + ?Sized, M: Medium<P>> PreparedPublisher<P, M> {
         self.connect();
     }
 
-    /// The next sample.
-    pub(super) fn loan(&mut self) -> Loan<M::Loan> {
+    /// The next sample; one without a size of its own is `len` bytes.
+    pub(super) fn loan(&mut self, len: usize) -> Loan<M::Loan> {
         if !self.is_wanted() {
             return Loan::Unwanted;
         }
-        let len = self.last_len;
+        if self.last_len != len {
+            self.last_len = len;
+            self.prepared = None;
+        }
         self.prepared.take().or_else(|| self.topic.loan(len).ok()).map_or(Loan::Lacking, Loan::Taken)
     }
 
@@ -53,13 +56,14 @@ impl<P: Payload + ?Sized, M: Medium<P>> PreparedPublisher<P, M> {
         }
     }
 
-    /// Ends the sample that [`loan`](Self::loan) began, under its number.
-    pub(super) fn send(&mut self, loan: Loan<M::Loan>, header: &Header) {
+    /// Ends the sample that [`loan`](Self::loan) began, under its number. Who has to be woken for it is noted in `due`.
+    pub(super) fn send(&mut self, loan: Loan<M::Loan>, header: &Header, due: &mut DueRings) {
         match loan {
             Loan::Taken(loan) => {
                 // One that fails is counted by the topic.
                 if let Ok(reached) = self.topic.send_loan(loan, header) {
                     self.reached = reached;
+                    due.note(P::TOPIC, reached);
                 }
             }
             Loan::Lacking => self.topic.fail(),
@@ -102,16 +106,12 @@ impl<P: Payload + ?Sized, M: Medium<P>> PreparedPublisher<P, M> {
 
 impl<M: Medium<[u8]>> PreparedPublisher<[u8], M> {
     /// Publishes `bytes`, if anybody is attached.
-    pub(super) fn send_bytes(&mut self, bytes: &[u8], header: &Header) {
-        if self.last_len != bytes.len() {
-            self.last_len = bytes.len();
-            self.prepared = None;
-        }
-        let mut loan = self.loan();
+    pub(super) fn send_bytes(&mut self, bytes: &[u8], header: &Header, due: &mut DueRings) {
+        let mut loan = self.loan(bytes.len());
         if let Some(payload) = Self::payload_mut(&mut loan) {
             payload.copy_from_slice(bytes);
         }
-        self.send(loan, header);
+        self.send(loan, header, due);
     }
 }
 

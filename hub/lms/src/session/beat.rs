@@ -4,9 +4,9 @@ use super::Session;
 use crate::Nanos;
 use crate::arrival::Stamp;
 use crate::reply::Reply;
-use crate::sensor::State;
 use crate::telegram::Telegram;
 use crate::variant::Variant;
+use line::{Session as _, State};
 
 impl Session {
     /// Time between two scans like `telegram`, which says `reply`, if it is one of a stream whose beat is known.
@@ -27,6 +27,12 @@ impl Session {
     /// Whether a sensor streams, not a recording.
     pub(super) fn is_live(&self) -> bool {
         self.state() == State::Streaming && !self.dialogue.settings.listen_only
+    }
+
+    /// Whether what is read comes as often, and is on the line for as long, as the wanted rate says.
+    pub(super) fn is_at_rate(&self) -> bool {
+        // What was read before a change came at the rate before it.
+        self.dialogue.change_baud.is_none() && self.dialogue.baud == self.dialogue.settings.baud
     }
 
     /// Neither a recording nor a network has the pace of a line.

@@ -1,7 +1,8 @@
 //! Drives a parser along a [`Line`] on the virtual clock and counts what became of each telegram.
 
 use super::{Line, TELEGRAM, sent_at};
-use lms::framer::{Found, Framer, suspect};
+use line::suspect;
+use lms::framer::{Found, Framer};
 use lms::header::Expect;
 use lms::{MILLIS, Nanos};
 

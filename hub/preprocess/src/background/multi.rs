@@ -7,24 +7,27 @@
 use super::runs::Runs;
 use super::settings::Limits;
 use super::{Class, INVALID};
-use schema::{BEAMS, Background};
+use schema::Background;
 
 /// State of the method with several surfaces.
 #[derive(Clone)]
 pub(super) struct Multi {
     slots: [Slots; SLOTS],
     /// What a surface weighs that the beam meets next: more where nothing came back from it before.
-    gain: [u16; BEAMS],
+    gain: Box<[u16]>,
     runs: Runs,
+    /// The nearest background of each beam, and what the surface that it meets gains, while a scan is looked at.
+    nearest: Box<[u16]>,
+    gains: Box<[u16]>,
 }
 
 /// A surface of each beam, if it has one.
-#[derive(Clone, Copy)]
+#[derive(Clone)]
 struct Slots {
     /// In device units.
-    range: [u16; BEAMS],
+    range: Box<[u16]>,
     /// How well it is known: grows with each scan in which it was met, and leaks in others. 0: there is none.
-    weight: [u16; BEAMS],
+    weight: Box<[u16]>,
 }
 
 /// What the steps are about, in units of ranges and of weights.
@@ -38,18 +41,34 @@ struct Bounds {
 }
 
 impl Multi {
-    pub(super) fn new() -> Multi {
-        let slots = [Slots { range: [0; BEAMS], weight: [0; BEAMS] }; SLOTS];
-        Multi { slots, gain: [MET; BEAMS], runs: Runs::new() }
+    /// For so many beams at most.
+    pub(super) fn new(beams: usize) -> Multi {
+        let all = |value: u16| vec![value; beams].into_boxed_slice();
+        Multi {
+            slots: std::array::from_fn(|_| Slots { range: all(0), weight: all(0) }),
+            gain: all(MET),
+            runs: Runs::new(beams),
+            nearest: all(INVALID),
+            gains: all(MET),
+        }
+    }
+
+    /// As it was when it was new.
+    pub(super) fn forget(&mut self) {
+        self.slots.iter_mut().for_each(|slots| {
+            slots.range.fill(0);
+            slots.weight.fill(0);
+        });
+        self.gain.fill(MET);
+        self.runs.forget();
     }
 
     /// Compares all beams with the state before this scan, then learns from them.
     pub(super) fn update(&mut self, readings: &[u16], limits: &Limits, learn: bool, classes: &mut [Class]) {
         let bounds = Bounds::of(limits);
-        let mut nearest = [INVALID; BEAMS];
-        self.compare(readings, bounds, classes, &mut nearest);
-        let nearest = &nearest[..readings.len()];
-        for i in (0..readings.len()).filter(|&i| nearest[i] == INVALID) {
+        self.compare(readings, bounds, classes);
+        for i in (0..readings.len()).filter(|&i| self.nearest[i] == INVALID) {
+            let nearest = &self.nearest[..readings.len()];
             if readings[i] != INVALID && self.is_before_its_neighbours(i, readings[i], nearest, bounds) {
                 classes[i] = Class::Foreground;
             }
@@ -61,14 +80,18 @@ impl Multi {
     }
 
     /// What each beam is beside its own background, and the nearest one of these; [`INVALID`] if there is none.
-    fn compare(&self, readings: &[u16], bounds: Bounds, classes: &mut [Class], nearest: &mut [u16; BEAMS]) {
+    fn compare(&mut self, readings: &[u16], bounds: Bounds, classes: &mut [Class]) {
+        let n = readings.len();
+        // Of one length, so that the loop needs no look at it.
+        let slots = self.slots.each_ref().map(|slots| (&slots.range[..n], &slots.weight[..n]));
+        let (classes, nearest) = (&mut classes[..n], &mut self.nearest[..n]);
         for (i, ((&reading, class), nearest)) in readings.iter().zip(classes).zip(nearest).enumerate() {
             let (mut ends, mut known, mut range) = (false, false, Background::FAR);
-            for slots in &self.slots {
-                let is_known = slots.weight[i] >= bounds.known;
+            for (ranges, weights) in &slots {
+                let is_known = weights[i] >= bounds.known;
                 known |= is_known;
-                ends |= is_known & (slots.range[i].abs_diff(reading) <= bounds.threshold);
-                range = if is_known & (slots.range[i] < range) { slots.range[i] } else { range };
+                ends |= is_known & (ranges[i].abs_diff(reading) <= bounds.threshold);
+                range = if is_known & (ranges[i] < range) { ranges[i] } else { range };
             }
             *nearest = if known { range } else { INVALID };
             let aside = if reading < range { Class::Foreground } else { Class::Behind };
@@ -95,31 +118,32 @@ impl Multi {
     /// went more than those that may be hidden. What is none of them takes the place of the least known one, unless all
     /// are known too well.
     fn learn(&mut self, readings: &[u16], bounds: Bounds) {
-        let gains = self.gains(readings, bounds);
+        self.gain(readings, bounds);
+        let n = readings.len();
+        let gains = &self.gains[..n];
+        let mut slots = self.slots.each_mut().map(|slots| (&mut slots.range[..n], &mut slots.weight[..n]));
         for (i, &reading) in readings.iter().enumerate() {
-            let range = self.slots.each_ref().map(|slots| slots.range[i]);
-            let weight = self.slots.each_ref().map(|slots| slots.weight[i]);
+            let range = slots.each_ref().map(|(ranges, _)| ranges[i]);
+            let weight = slots.each_ref().map(|(_, weights)| weights[i]);
             let (new_range, new_weight) = learned(range, weight, reading, gains[i], bounds);
             let valid = reading != INVALID;
-            for (k, slots) in self.slots.iter_mut().enumerate() {
-                slots.range[i] = if valid { new_range[k] } else { range[k] };
-                slots.weight[i] = if valid { new_weight[k] } else { weight[k] };
+            for (k, (ranges, weights)) in slots.iter_mut().enumerate() {
+                ranges[i] = if valid { new_range[k] } else { range[k] };
+                weights[i] = if valid { new_weight[k] } else { weight[k] };
             }
         }
     }
 
     /// What the surface that each beam meets gains in this scan. By themselves: the processor does not do so many things at
     /// once in the loop over the surfaces.
-    fn gains(&mut self, readings: &[u16], bounds: Bounds) -> [u16; BEAMS] {
-        let mut gains = [MET; BEAMS];
-        for ((gain, next), &reading) in gains.iter_mut().zip(&mut self.gain).zip(readings) {
+    fn gain(&mut self, readings: &[u16], bounds: Bounds) {
+        for ((gain, next), &reading) in self.gains.iter_mut().zip(&mut self.gain).zip(readings) {
             let is_far = reading == Background::FAR;
             *gain = if is_far { MET } else { *next };
             let more = (*next + MET).min(bounds.returned);
             let after = if is_far { more } else { MET };
             *next = if reading == INVALID { *next } else { after };
         }
-        gains
     }
 
     /// Takes `range` for the only background of beam `i`, as well known as can be.

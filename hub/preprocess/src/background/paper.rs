@@ -5,22 +5,30 @@
 
 use super::settings::Limits;
 use super::{Class, INVALID};
-use schema::{BEAMS, Background};
+use schema::Background;
 
 /// State of the paper's method.
 #[derive(Clone)]
 pub(super) struct Paper {
     /// Ranges in device units, [`Background::UNTAUGHT`] or [`Background::FAR`].
-    background: [u16; BEAMS],
+    background: Box<[u16]>,
     /// What may become the background, where `run` is not 0.
-    candidate: [u16; BEAMS],
+    candidate: Box<[u16]>,
     /// Readings in a row that were the candidate's.
-    run: [u16; BEAMS],
+    run: Box<[u16]>,
 }
 
 impl Paper {
-    pub(super) fn new() -> Paper {
-        Paper { background: [Background::UNTAUGHT; BEAMS], candidate: [0; BEAMS], run: [0; BEAMS] }
+    /// For so many beams at most.
+    pub(super) fn new(beams: usize) -> Paper {
+        let none = || vec![0; beams].into_boxed_slice();
+        Paper { background: vec![Background::UNTAUGHT; beams].into(), candidate: none(), run: none() }
+    }
+
+    /// As it was when it was new.
+    pub(super) fn forget(&mut self) {
+        self.background.fill(Background::UNTAUGHT);
+        self.run.fill(0);
     }
 
     /// Compares and learns (paper III.B.3). Readings without a range neither count nor end a run; farther ones count,

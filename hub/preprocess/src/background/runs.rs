@@ -3,20 +3,29 @@
 
 use super::settings::Limits;
 use super::{Class, INVALID};
-use schema::BEAMS;
 
 /// What the last scan had in the foreground, believed or not.
 #[derive(Clone)]
 pub(super) struct Runs {
     /// Readings of the beams that were nearer than their background; [`INVALID`] for the others.
-    seen: [u16; BEAMS],
+    seen: Box<[u16]>,
     /// Those of them that were believed.
-    told: [u16; BEAMS],
+    told: Box<[u16]>,
+    /// Those of the scan that is looked at.
+    next: [Box<[u16]>; 2],
 }
 
 impl Runs {
-    pub(super) fn new() -> Runs {
-        Runs { seen: [INVALID; BEAMS], told: [INVALID; BEAMS] }
+    /// For so many beams at most.
+    pub(super) fn new(beams: usize) -> Runs {
+        let none = || vec![INVALID; beams].into_boxed_slice();
+        Runs { seen: none(), told: none(), next: [none(), none()] }
+    }
+
+    /// As it was when it was new.
+    pub(super) fn forget(&mut self) {
+        self.seen.fill(INVALID);
+        self.told.fill(INVALID);
     }
 
     /// Leaves those runs of foreground beams in `classes` that are believed; the beams of others become unknown. Beams
@@ -26,8 +35,10 @@ impl Runs {
     /// it is as long as a leg is wide at its range, and the last scan had such a beam there, believed or not. There:
     /// among its own beams or beside them, within 200 mm of its nearest range.
     pub(super) fn keep(&mut self, readings: &[u16], limits: &Limits, classes: &mut [Class]) {
-        let mut seen = [INVALID; BEAMS];
-        let mut told = [INVALID; BEAMS];
+        let most = self.seen.len();
+        let [seen, told] = &mut self.next;
+        seen.fill(INVALID);
+        told.fill(INVALID);
         let mut begin = 0;
         while let Some(ahead) = classes[begin..].iter().position(|&class| class == Class::Foreground) {
             let first = begin + ahead;
@@ -42,9 +53,9 @@ impl Runs {
                     _ => break,
                 }
             }
-            let around = first.saturating_sub(1)..(behind + 1).min(BEAMS);
-            let reach = REACH_MM / limits.unit_mm;
-            let there = |before: &[u16; BEAMS]| {
+            let around = first.saturating_sub(1)..(behind + 1).min(most);
+            let reach = (1000 * REACH_MM / limits.unit_um).min(u16::MAX.into()) as u16;
+            let there = |before: &[u16]| {
                 let mut before = before[around.clone()].iter();
                 before.any(|&range| range != INVALID && range.abs_diff(nearest) <= reach)
             };
@@ -56,14 +67,16 @@ impl Runs {
             }
             begin = behind;
         }
-        (self.seen, self.told) = (seen, told);
+        std::mem::swap(&mut self.seen, seen);
+        std::mem::swap(&mut self.told, told);
     }
 }
 
 /// Beams that a leg covers at `range`, at most [`ENOUGH`] and at least one.
 fn leg(range: u16, limits: &Limits) -> u64 {
-    let apart = u64::from(range) * u64::from(limits.unit_mm) * u64::from(limits.step_mdeg);
-    (LEG_MM * MDEG_PER_RADIAN).checked_div(apart).map_or(ENOUGH, |beams| beams.clamp(1, ENOUGH))
+    let apart_um = u64::from(range) * u64::from(limits.unit_um);
+    let apart = apart_um.saturating_mul(limits.step_mdeg.into());
+    (1000 * LEG_MM * MDEG_PER_RADIAN).checked_div(apart).map_or(ENOUGH, |beams| beams.clamp(1, ENOUGH))
 }
 
 /// Beams that are never noise: no more are asked for, however near.
@@ -73,4 +86,4 @@ const ENOUGH: u64 = 3;
 const LEG_MM: u64 = 135;
 const MDEG_PER_RADIAN: u64 = 57_296;
 /// How far something gets from scan to scan at most, and how deep it is: 5 m/s at 37.5 Hz is 133 mm.
-const REACH_MM: u16 = 200;
+const REACH_MM: u32 = 200;

@@ -1,7 +1,9 @@
 //! The settings of a background, and the limits that follow from them for scans of one resolution and unit. Refuses to
 //! know where the settings come from.
 
-use schema::Scan;
+use std::f64::consts::TAU;
+
+use schema::ScanHead;
 
 /// How a background is learned.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
@@ -67,10 +69,10 @@ pub(super) struct Limits {
     pub(super) scans: u16,
     pub(super) latest: bool,
     pub(super) no_return_is_far: bool,
-    /// Angle between two beams in 1/1000 degree.
-    pub(super) step_mdeg: u16,
-    /// Millimetres per device unit, at least 1.
-    pub(super) unit_mm: u16,
+    /// Angle between two beams in 1/1000 degree, whichever way they turn.
+    pub(super) step_mdeg: u32,
+    /// Micrometres per device unit, at least 1.
+    pub(super) unit_um: u32,
 }
 
 /// Default of both thresholds: six standard deviations of a range (the paper names no value).
@@ -79,32 +81,39 @@ const THRESHOLD_MM: u16 = 30;
 const THRESHOLD_CM_MODE_MM: u16 = 60;
 /// In dm mode: what lies 30 mm apart is read as at most one unit apart.
 const THRESHOLD_DM_MODE_MM: u16 = 100;
-/// Mirror turns in 10 s (75 Hz): as many scans at 1 degree, half of them at half degrees.
-const TURNS: u32 = 750;
+/// 750 mirror turns of an LMS: as many scans at 1 degree, half of them at half degrees.
+const TEN_SECONDS_NS: f64 = 9.99e9;
 /// What the weights of `multi` have room for: eight a scan in 16 bits.
 const MOST_SCANS: u32 = 8191;
 /// No two ranges are farther apart; [`schema::Background::FAR`] is, from all of them.
-const FARTHEST: u16 = 0x7FFF;
+const FARTHEST: u32 = 0x7FFF;
+/// What a quotient may lose: a whole number stays that number.
+const ROUNDING: f64 = 1e-6;
 
 impl Limits {
-    pub(super) fn of(settings: &Settings, scan: &Scan) -> Limits {
-        let unit_mm = u16::from(scan.unit_mm.max(1));
-        let default_mm = match unit_mm {
-            ..10 => THRESHOLD_MM,
-            10..100 => THRESHOLD_CM_MODE_MM,
-            100.. => THRESHOLD_DM_MODE_MM,
+    pub(super) fn of(settings: &Settings, scan: &ScanHead) -> Limits {
+        let unit_um = scan.unit_um.max(1);
+        let default_mm = match unit_um {
+            ..10_000 => THRESHOLD_MM,
+            10_000..100_000 => THRESHOLD_CM_MODE_MM,
+            100_000.. => THRESHOLD_DM_MODE_MM,
         };
         // With less than a unit a reading between two of them would be of no surface.
-        let units = |mm: Option<u16>| (mm.unwrap_or(default_mm) / unit_mm).clamp(1, FARTHEST);
-        let ten_seconds = (TURNS * u32::from(scan.step_mdeg)).div_ceil(1000);
+        let units = |mm: Option<u16>| {
+            (1000 * u32::from(mm.unwrap_or(default_mm)) / unit_um).clamp(1, FARTHEST) as u16
+        };
+        let turn_ns = f64::from(scan.beam_time_ns) * TAU / scan.step.abs();
+        // What has no turn has none of 10 s either.
+        let ten_seconds =
+            (TEN_SECONDS_NS / (turn_ns * f64::from(scan.turns.max(1))) - ROUNDING).ceil() as u32;
         Limits {
             threshold: units(settings.threshold_mm),
             candidate: units(settings.candidate_mm),
             scans: settings.scans.unwrap_or(ten_seconds).clamp(1, MOST_SCANS) as u16,
             latest: settings.candidate == Candidate::Latest,
             no_return_is_far: settings.no_return_is_far.unwrap_or(settings.method == Method::Multi),
-            step_mdeg: scan.step_mdeg,
-            unit_mm,
+            step_mdeg: (scan.step.abs().to_degrees() * 1000.0).round() as u32,
+            unit_um,
         }
     }
 }
@@ -115,19 +124,35 @@ mod tests {
 
     #[test]
     fn defaults_go_by_unit_and_resolution() {
-        let limits = |settings, unit_mm, step_mdeg| {
-            let limits = Limits::of(&settings, &Scan { unit_mm, step_mdeg, ..Scan::default() });
+        let limits = |settings, unit_mm: u32, turns| {
+            let step_deg = 1.0 / f64::from(turns);
+            let head = ScanHead {
+                unit_um: 1000 * unit_mm,
+                step: step_deg.to_radians(),
+                beam_time_ns: (37_000.0 * step_deg) as u32,
+                turns,
+                ..ScanHead::default()
+            };
+            let limits = Limits::of(&settings, &head);
             (limits.threshold, limits.candidate, limits.scans)
         };
         let paper = Settings { method: Method::Paper, ..Settings::default() };
-        assert_eq!(limits(paper, 1, 500), (30, 30, 375));
-        assert_eq!(limits(paper, 10, 1000), (6, 6, 750));
-        assert_eq!(limits(paper, 1, 250), (30, 30, 188));
-        assert_eq!(limits(paper, 100, 500), (1, 1, 375));
+        assert_eq!(limits(paper, 1, 2), (30, 30, 375));
+        assert_eq!(limits(paper, 10, 1), (6, 6, 750));
+        assert_eq!(limits(paper, 1, 4), (30, 30, 188));
+        assert_eq!(limits(paper, 100, 2), (1, 1, 375));
         let own = Settings { threshold_mm: Some(45), candidate_mm: Some(u16::MAX), scans: Some(0), ..paper };
-        assert_eq!(limits(own, 10, 500), (4, 6553, 1));
-        assert_eq!(limits(own, 0, 0), (45, FARTHEST, 1));
-        assert_eq!(limits(own, 100, 500), (1, 655, 1), "less than a unit is one");
-        assert_eq!(limits(Settings { scans: Some(u32::MAX), ..paper }, 1, 500).2, 8191);
+        assert_eq!(limits(own, 10, 2), (4, 6553, 1));
+        assert_eq!(limits(own, 0, 2), (32_767, 32_767, 1));
+        let turning = ScanHead {
+            unit_um: 1000,
+            step: -0.8_f64.to_radians(),
+            beam_time_ns: 222_222,
+            ..ScanHead::default()
+        };
+        assert_eq!(Limits::of(&paper, &turning).scans, 100, "10 Hz");
+        assert_eq!(Limits::of(&paper, &ScanHead::default()).scans, 1);
+        assert_eq!(limits(own, 100, 2), (1, 655, 1), "less than a unit is one");
+        assert_eq!(limits(Settings { scans: Some(u32::MAX), ..paper }, 1, 2).2, 8191);
     }
 }

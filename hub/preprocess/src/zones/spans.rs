@@ -1,22 +1,25 @@
 //! The values of each beam that lie within a span, tested by one comparison of integers in device units. Refuses to
 //! know what the span is for.
 
-use schema::BEAMS;
-
-/// Ranges as they lie in a scan: the whole array, so that loops have a length that the compiler knows.
-pub(super) type Ranges = [u16; BEAMS];
-
 /// The values `from..from + len` of each beam.
-#[derive(Clone, Copy)]
+#[derive(Clone)]
 pub(super) struct Spans {
     /// The least value; the greatest there is for beams that there are not.
-    pub(super) from: [u16; BEAMS],
-    len: [u16; BEAMS],
+    pub(super) from: Box<[u16]>,
+    len: Box<[u16]>,
 }
 
 impl Spans {
+    /// No value of any of so many beams.
+    pub(super) fn none(beams: usize) -> Spans {
+        Spans { from: vec![u16::MAX; beams].into(), len: vec![0; beams].into() }
+    }
+
     /// No value of any beam.
-    pub(super) const NONE: Spans = Spans { from: [u16::MAX; BEAMS], len: [0; BEAMS] };
+    pub(super) fn clear(&mut self) {
+        self.from.fill(u16::MAX);
+        self.len.fill(0);
+    }
 
     /// Values of beam `i` that count: from `from`, below `below`.
     pub(super) fn set(&mut self, i: usize, from: u64, below: u16) {
@@ -36,7 +39,8 @@ impl Spans {
     }
 
     /// Beams whose value counts.
-    pub(super) fn count(&self, ranges: &Ranges) -> u16 {
-        (0..BEAMS).map(|i| u16::from(self.has(i, ranges[i]))).sum()
+    pub(super) fn count(&self, ranges: &[u16]) -> u16 {
+        let spans = self.from.iter().zip(&self.len);
+        spans.zip(ranges).map(|((&from, &len), &value)| u16::from(value.wrapping_sub(from) < len)).sum()
     }
 }

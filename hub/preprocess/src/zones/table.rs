@@ -1,36 +1,37 @@
 //! Where the beams of a sensor cross the circles around the robot's centre. Computed once per beam layout, in floating
 //! point and millimetres; used for every scan, in device units. Refuses to know verdicts.
 
+use std::f64::consts::TAU;
+
 use super::nearest::Nearest;
-use super::spans::{Ranges, Spans};
+use super::spans::Spans;
 use super::{SECTORS, Sector, Settings};
-use schema::{BEAMS, Code, Pose, Scan, ZONES};
+use schema::{Pose, Scan, ScanHead, ZONES, in_degrees};
 
 /// What of a scan the table depends on.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub(super) struct Layout {
-    count: u16,
-    unit_mm: u8,
-    range_bits: u8,
-    first_angle_mdeg: i32,
-    step_mdeg: u16,
+    count: usize,
+    unit_um: u32,
+    valid_to: u16,
+    no_return: u16,
+    beyond: u16,
+    first_angle: f64,
+    step: f64,
+    spacing: f32,
 }
 
 impl Layout {
-    pub(super) fn of(scan: &Scan) -> Layout {
-        let &Scan { count, unit_mm, range_bits, first_angle_mdeg, step_mdeg, .. } = scan;
-        Layout { count, unit_mm, range_bits, first_angle_mdeg, step_mdeg }
-    }
-
-    /// A scan of this layout without readings.
-    fn scan(self) -> Scan {
-        let Layout { count, unit_mm, range_bits, first_angle_mdeg, step_mdeg } = self;
-        Scan { count, unit_mm, range_bits, first_angle_mdeg, step_mdeg, ..Scan::default() }
+    /// That of `scan`, of which at most `most` beams are looked at.
+    pub(super) fn of(scan: &Scan, most: usize) -> Layout {
+        let ScanHead { unit_um, valid_to, no_return, beyond, first_angle, step, spacing, .. } = **scan;
+        let count = scan.beams().min(most);
+        Layout { count, unit_um, valid_to, no_return, beyond, first_angle, step, spacing }
     }
 
     /// Millimetres per device unit; no sensor has a unit of 0.
-    fn unit_mm(self) -> u64 {
-        u64::from(self.unit_mm.max(1))
+    fn unit_mm(&self) -> f64 {
+        f64::from(self.unit_um.max(1)) / 1000.0
     }
 }
 
@@ -50,18 +51,24 @@ pub(super) struct Table {
     inside: [Spans; ZONES],
     nearest: Nearest,
     /// 1 for beams of which a reading may lie inside the largest circle.
-    tells: [u16; BEAMS],
+    tells: Box<[u16]>,
     /// How many these are.
     telling: u16,
     most_invalid: u16,
-    /// The first value that is a code.
-    codes_from: u16,
-    /// The largest value, code 0.
-    max: u16,
+}
+
+/// What the beams of a scan met.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub(super) struct Met {
+    /// Beams that met something inside each circle.
+    pub(super) inside: [u16; ZONES],
+    /// The beam whose point is nearest to the robot's centre, the first of several, and its distance in mm, rounded down.
+    pub(super) nearest: Option<(u16, u32)>,
 }
 
 impl Table {
-    pub(super) fn new(pose: Pose, settings: &Settings<'_>) -> Table {
+    /// For a sensor of at most `beams` beams.
+    pub(super) fn new(pose: Pose, settings: &Settings<'_>, beams: usize) -> Table {
         let circles = settings.radii_mm.len().min(ZONES);
         let mut radii_mm = [0; ZONES];
         radii_mm[..circles].copy_from_slice(&settings.radii_mm[..circles]);
@@ -79,13 +86,11 @@ impl Table {
             no_return_is_far: settings.no_return_is_far,
             max_invalid: settings.max_invalid,
             layout: Layout::default(),
-            inside: [Spans::NONE; ZONES],
-            nearest: Nearest::NONE,
-            tells: [0; BEAMS],
+            inside: std::array::from_fn(|zone| Spans::none(if zone < circles { beams } else { 0 })),
+            nearest: Nearest::none(beams),
+            tells: vec![0; beams].into(),
             telling: 0,
             most_invalid: 0,
-            codes_from: 0,
-            max: 0,
         };
         table.make(Layout::default());
         table
@@ -101,6 +106,11 @@ impl Table {
         self.radii_mm[zone]
     }
 
+    /// The most beams of a scan.
+    pub(super) fn most(&self) -> usize {
+        self.tells.len()
+    }
+
     /// What the table was made for.
     pub(super) fn layout(&self) -> Layout {
         self.layout
@@ -108,37 +118,47 @@ impl Table {
 
     /// Computes the table again.
     pub(super) fn make(&mut self, layout: Layout) {
-        let scan = layout.scan();
         self.layout = layout;
-        self.max = scan.max();
-        self.codes_from = self.max.saturating_sub(Code::BEYOND.0);
-        self.inside = [Spans::NONE; ZONES];
-        self.nearest = Nearest::NONE;
-        self.tells = [0; BEAMS];
-        for i in 0..scan.beams() {
-            self.make_beam(i, scan.angle_mdeg(i));
+        self.inside.iter_mut().for_each(Spans::clear);
+        self.nearest.seen.clear();
+        self.nearest.twice_q.fill(0.0);
+        self.tells.fill(0);
+        for i in 0..layout.count {
+            self.make_beam(i, layout.first_angle + i as f64 * layout.step);
         }
         self.nearest.finish();
         self.telling = self.tells.iter().sum();
         self.most_invalid = floor(self.max_invalid * f64::from(self.telling)) as u16;
     }
 
-    fn make_beam(&mut self, i: usize, angle_mdeg: i32) {
-        let unit_mm = self.layout.unit_mm();
-        let ((sx, sy), (ux, uy)) = (self.sensor_mm(), self.pose.direction(angle_mdeg));
-        let (q, square) = (sx * ux + sy * uy, sx * sx + sy * sy);
-        let own = self.self_min_mm(angle_mdeg).div_ceil(unit_mm);
-        self.nearest.seen.set(i, own, self.codes_from);
-        self.nearest.twice_q[i] = 2.0 * q / unit_mm as f64;
+    fn make_beam(&mut self, i: usize, angle: f64) {
+        let beam = self.beam(angle);
+        let beyond_ranges = self.layout.valid_to.saturating_add(1);
+        self.nearest.seen.set(i, beam.own, beyond_ranges);
+        self.nearest.twice_q[i] = 2.0 * beam.q / self.layout.unit_mm();
         for zone in 0..self.circles {
-            let (lo_mm, hi_mm) = self.chord_mm(q, square, f64::from(self.radii_mm[zone]));
-            let from = if self.exact && lo_mm > 0 { lo_mm / unit_mm + 1 } else { 0 };
-            let below = hi_mm.div_ceil(unit_mm).min(u64::from(self.codes_from));
-            self.inside[zone].set(i, from.max(own), below as u16);
+            let (from, below) = self.span(&beam, zone);
+            self.inside[zone].set(i, from, below.min(u64::from(beyond_ranges)) as u16);
             if zone == 0 {
                 self.tells[i] = u16::from(self.inside[zone].has_any(i));
             }
         }
+    }
+
+    /// The beam at a sensor angle.
+    fn beam(&self, angle: f64) -> Beam {
+        let ((sx, sy), (ux, uy)) = (self.sensor_mm(), self.pose.direction(angle));
+        let own = in_units(self.self_min_mm(angle) as f64, self.layout.unit_mm());
+        Beam { q: sx * ux + sy * uy, own }
+    }
+
+    /// The readings of `beam` inside circle `zone`: from the first, below the second.
+    fn span(&self, beam: &Beam, zone: usize) -> (u64, u64) {
+        let unit_mm = self.layout.unit_mm();
+        let (sx, sy) = self.sensor_mm();
+        let (lo_mm, hi_mm) = self.chord_mm(beam.q, sx * sx + sy * sy, f64::from(self.radii_mm[zone]));
+        let from = if self.exact && lo_mm > 0 { floor(lo_mm as f64 / unit_mm) as u64 + 1 } else { 0 };
+        (from.max(beam.own), in_units(hi_mm as f64, unit_mm))
     }
 
     /// Beams that can tell something of the largest circle.
@@ -146,35 +166,105 @@ impl Table {
         self.telling
     }
 
-    /// Beams that met something inside circle `zone`.
-    pub(super) fn inside(&self, zone: usize, ranges: &Ranges) -> u16 {
-        self.inside[zone].count(ranges)
-    }
-
     /// Of so many invalid beams or fewer the verdict does not become unknown.
     pub(super) fn most_invalid(&self) -> u16 {
         self.most_invalid
     }
 
-    /// Beams without a reading among those that can tell something of the largest circle.
-    pub(super) fn invalid(&self, ranges: &Ranges) -> u16 {
-        let has_beyond = self.max >= Code::BEYOND.0;
+    /// Beams without a reading among those that can tell something of the largest circle. One that was not measured counts
+    /// where nothing was over more than two spacings of the sensor's own points.
+    pub(super) fn invalid(&self, ranges: &[u16]) -> u16 {
+        let Layout { valid_to, no_return, beyond, .. } = self.layout;
         let is_invalid = |value: u16| {
-            let is_beyond = has_beyond & (value == self.codes_from);
-            let is_no_return = self.no_return_is_far & (value == self.max);
-            (value >= self.codes_from) & !is_beyond & !is_no_return
+            let is_no_return = self.no_return_is_far & (value == no_return);
+            let is_beyond = (value == beyond) & (beyond != no_return);
+            (value > valid_to) & !is_beyond & !is_no_return
         };
-        (0..BEAMS).map(|i| u16::from(is_invalid(ranges[i])) & self.tells[i]).sum()
+        let beams = ranges.iter().zip(&self.tells);
+        let invalid: u16 = beams.map(|(&value, &tells)| u16::from(is_invalid(value)) & tells).sum();
+        if invalid == 0 { 0 } else { invalid - self.looked_past(ranges) }
     }
 
-    /// The beam whose point is nearest to the robot's centre, the first of several, and its distance in mm, rounded
-    /// down.
-    pub(super) fn nearest(&self, ranges: &Ranges) -> Option<(u16, u32)> {
-        let (beam, square) = self.nearest.find(ranges)?;
-        let unit_mm = self.layout.unit_mm() as f64;
+    /// Of the beams that can tell something, those that were not measured and have measured ones near enough on both sides.
+    fn looked_past(&self, ranges: &[u16]) -> u16 {
+        let is_measured = |value: &u16| *value != Scan::NOT_MEASURED;
+        let (Some(first), Some(last)) =
+            (ranges.iter().position(is_measured), ranges.iter().rposition(is_measured))
+        else {
+            return 0;
+        };
+        let step = self.layout.step.abs();
+        let most = (2.0 * f64::from(self.layout.spacing) / step * (1.0 + ROUNDING)) as usize;
+        // Where beams go all around, the first follows the last.
+        let is_whole_turn = (ranges.len() as f64 * step - TAU).abs() < step / 2.0;
+        let across = if is_whole_turn { first + ranges.len() - 1 - last } else { usize::MAX - 1 };
+        let told = |run: &[u16], tells: &[u16]| -> u16 { tells[..run.len()].iter().sum() };
+        let mut past = 0;
+        if across < most {
+            past += told(&ranges[..first], &self.tells) + told(&ranges[last + 1..], &self.tells[last + 1..]);
+        }
+        let mut begin = first;
+        while begin < last {
+            let behind = begin + 1 + ranges[begin + 1..].iter().position(is_measured).unwrap_or(0);
+            if behind - begin - 1 < most {
+                past += told(&ranges[begin + 1..behind], &self.tells[begin + 1..]);
+            }
+            begin = behind;
+        }
+        past
+    }
+
+    /// What the beams of `scan` met, which is of the table's layout: the exact point counts where there is one.
+    pub(super) fn met(&mut self, scan: &Scan) -> Met {
+        let ranges = &scan.ranges()[..self.layout.count];
+        match scan.exact_angles() {
+            [] => {
+                let inside = std::array::from_fn(|zone| self.inside[zone].count(ranges));
+                let nearest = self.nearest.find(ranges).map(|(beam, square)| self.at_distance(beam, square));
+                Met { inside, nearest }
+            }
+            angles => self.met_exactly(ranges, angles),
+        }
+    }
+
+    /// Only what is near enough to be inside a circle, or the nearest, is computed.
+    fn met_exactly(&self, ranges: &[u16], angles: &[f32]) -> Met {
+        let unit_mm = self.layout.unit_mm();
+        let (sx, sy) = self.sensor_mm();
+        let away = (sx * sx + sy * sy).sqrt();
+        let radius_mm = self.radii_mm[..self.circles].iter().max().map_or(0.0, |&radius| f64::from(radius));
+        let reach = (away + radius_mm + f64::from(self.margin_mm) + 1.0) / unit_mm;
+        let (mut met, mut best) = (Met::default(), (f64::INFINITY, None));
+        for (i, (&range, &angle)) in ranges.iter().zip(angles).enumerate() {
+            let value = f64::from(range);
+            let may_be_nearest = value * unit_mm - away <= best.0;
+            if range > self.layout.valid_to || !(may_be_nearest || value <= reach) {
+                continue;
+            }
+            let beam = self.beam(f64::from(angle));
+            if u64::from(range) < beam.own {
+                continue;
+            }
+            let square = value * (value + 2.0 * beam.q / unit_mm);
+            let distance_mm = (square * unit_mm * unit_mm + away * away).max(0.0).sqrt();
+            if distance_mm < best.0 {
+                best = (distance_mm, Some((i, square)));
+            }
+            for (zone, inside) in met.inside.iter_mut().enumerate().take(self.circles) {
+                let (from, below) = self.span(&beam, zone);
+                *inside += u16::from((from..below).contains(&u64::from(range)));
+            }
+        }
+        met.nearest = best.1.map(|(beam, square)| self.at_distance(beam, square));
+        met
+    }
+
+    /// Beam and distance in mm of a point, by the square of its distance without that of the sensor, in device units.
+    fn at_distance(&self, beam: usize, square: f64) -> (u16, u32) {
+        let unit_mm = self.layout.unit_mm();
         let (sx, sy) = self.sensor_mm();
         let distance_mm = (square * unit_mm * unit_mm + sx * sx + sy * sy).max(0.0).sqrt();
-        Some((beam as u16, floor(distance_mm) as u32))
+        (beam as u16, floor(distance_mm) as u32)
     }
 
     /// The sensor's place in the robot's frame.
@@ -183,7 +273,10 @@ impl Table {
     }
 
     /// Where the robot's own body ends along a beam.
-    fn self_min_mm(&self, angle_mdeg: i32) -> u64 {
+    fn self_min_mm(&self, angle: f64) -> u64 {
+        // From -180 to 180 degrees, as sectors are given.
+        let angle_mdeg = (1000.0 * in_degrees(angle)).round() as i64 % 360_000;
+        let angle_mdeg = ((angle_mdeg + 180_000).rem_euclid(360_000) - 180_000) as i32;
         let here = |sector: &&Sector| (sector.from_mdeg..=sector.to_mdeg).contains(&angle_mdeg);
         self.sectors.iter().filter(here).map(|sector| u64::from(sector.range_mm)).max().unwrap_or(0)
     }
@@ -205,6 +298,20 @@ impl Table {
         (floor(lo - margin) as u64, ceil(hi + margin) as u64)
     }
 }
+
+/// A beam: s.u, with s the sensor's place and u its direction, in mm, and where the robot's own body ends, in device units.
+struct Beam {
+    q: f64,
+    own: u64,
+}
+
+/// The least number of device units that are no less than `mm`.
+fn in_units(mm: f64, unit_mm: f64) -> u64 {
+    ceil(mm / unit_mm) as u64
+}
+
+/// What a quotient may lose.
+const ROUNDING: f64 = 1e-6;
 
 /// Values within so many mm of a whole number are that number: rounding is never towards clear, but what stands
 /// exactly on a circle is outside, whatever sine and cosine lose.

@@ -4,33 +4,35 @@
 use std::f64::consts::PI;
 
 use fastrand::Rng;
-use schema::{CONTENTS_UPPER, Pose, Scan};
+use schema::{Pose, Scan, ScanHead};
 
 /// Beams, first angle and step of the five variants.
-pub(crate) const VARIANTS: [(u16, i32, u16); 5] =
-    [(181, 0, 1000), (361, 0, 500), (101, 40_000, 1000), (201, 40_000, 500), (401, 40_000, 250)];
+pub(crate) const VARIANTS: [(usize, i32, u32); 5] = [
+    (181, -90_000, 1000),
+    (361, -90_000, 500),
+    (101, -50_000, 1000),
+    (201, -50_000, 500),
+    (401, -50_000, 250),
+];
 
 /// A scan in `unit_mm` without readings yet: any variant, 13, 14 or 15 bits of range.
-pub(crate) fn layout(random: &mut Rng, unit_mm: u8) -> Scan {
+pub(crate) fn layout(random: &mut Rng, unit_mm: u32) -> Box<Scan> {
     let (count, first_angle_mdeg, step_mdeg) = VARIANTS[random.usize(..VARIANTS.len())];
     let range_bits = random.u8(13..=15);
-    Scan {
-        count,
-        unit_mm,
-        range_bits,
-        first_angle_mdeg,
-        step_mdeg,
-        intensity_bits: 16 - range_bits,
-        contents: CONTENTS_UPPER,
-        ..Scan::default()
-    }
+    let head = ScanHead::lms(count, first_angle_mdeg, step_mdeg, unit_mm, range_bits);
+    Scan::of(ScanHead { intensity_bits: 16 - range_bits, ..head }, &vec![0; count])
 }
 
 /// A code, or now and then one that is reserved.
 pub(crate) fn code(random: &mut Rng, scan: &Scan) -> u16 {
     const CODES: [u16; 9] = [0, 0, 0, 1, 2, 4, 5, 8, 8];
     let code = if random.u8(..20) == 0 { random.u16(..9) } else { CODES[random.usize(..CODES.len())] };
-    ((1 << scan.range_bits) - 1) - code
+    scan.no_return - code
+}
+
+/// Millimetres per device unit.
+pub(crate) fn unit_mm(scan: &Scan) -> f64 {
+    f64::from(scan.unit_um) / 1000.0
 }
 
 /// A sensor on the robot or off it, turned anyhow, upside down or not.

@@ -5,24 +5,31 @@
 use std::fmt;
 
 use preprocess::background::{Class, Model};
-use schema::{BEAMS, Background, Foreground, Scan};
+use schema::{Background, BackgroundHead, Foreground, ForegroundHead, Scan, ScanHead};
+
+/// The most beams of a scan.
+pub(crate) const BEAMS: usize = 401;
 
 /// Angles, unit and bits of a scan.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(crate) struct Shape {
     pub(crate) count: u16,
     pub(crate) first_angle_mdeg: i32,
-    pub(crate) step_mdeg: u16,
-    pub(crate) unit_mm: u8,
+    pub(crate) step_mdeg: u32,
+    pub(crate) unit_mm: u16,
     pub(crate) range_bits: u8,
 }
 
 impl Shape {
     /// One of those that the sensors have.
     pub(crate) fn any(random: &mut fastrand::Rng) -> Shape {
-        let (count, first_angle_mdeg, step_mdeg) =
-            [(181, 0, 1000), (361, 0, 500), (101, 40_000, 1000), (201, 40_000, 500), (401, 40_000, 250)]
-                [random.usize(..5)];
+        let (count, first_angle_mdeg, step_mdeg) = [
+            (181, -90_000, 1000),
+            (361, -90_000, 500),
+            (101, -50_000, 1000),
+            (201, -50_000, 500),
+            (401, -50_000, 250),
+        ][random.usize(..5)];
         let (unit_mm, range_bits) = (*random.choice(&[1, 10, 100]).unwrap(), random.u8(13..=15));
         Shape { count, first_angle_mdeg, step_mdeg, unit_mm, range_bits }
     }
@@ -53,16 +60,11 @@ impl Surroundings {
     }
 
     /// The next scan.
-    pub(crate) fn next(&mut self) -> Scan {
+    pub(crate) fn next(&mut self) -> Box<Scan> {
         let Surroundings { shape, random, beams, body } = self;
-        let mut scan = Scan {
-            count: shape.count,
-            unit_mm: shape.unit_mm,
-            range_bits: shape.range_bits,
-            first_angle_mdeg: shape.first_angle_mdeg,
-            step_mdeg: shape.step_mdeg,
-            ..Scan::default()
-        };
+        let &mut Shape { count, first_angle_mdeg, step_mdeg, unit_mm, range_bits } = shape;
+        let head = ScanHead::lms(count.into(), first_angle_mdeg, step_mdeg, unit_mm.into(), range_bits);
+        let mut scan = Scan::of(head, &vec![0; count.into()]);
         body.0 = (body.0 + random.f64() - 0.3).rem_euclid(BEAMS as f64);
         body.2 = (body.2 + 30.0 * (random.f64() - 0.5)).clamp(100.0, 3_200.0);
         if random.u16(..200) == 0 {
@@ -76,7 +78,7 @@ impl Surroundings {
             let range_mm = if before { body.2 } else { *random.choice(surfaces.iter()).unwrap() };
             let noise_mm = (0..4).map(|_| random.f64() - 0.5).sum::<f64>() * 14.0;
             let max = ((1_u32 << shape.range_bits) - 1) as u16;
-            scan.range_array[i] = match random.u16(..1_000) {
+            scan.arrays().ranges[i] = match random.u16(..1_000) {
                 0..10 => max - random.u16(..9),
                 10..16 => 0,
                 16..40 => (range_mm / f64::from(shape.unit_mm)) as u16 + random.u16(..90),
@@ -91,21 +93,22 @@ impl Surroundings {
 
 /// What a scan says of a beam: its range in mm, that nothing is near (infinite), or nothing.
 pub(crate) fn reading_mm(scan: &Scan, i: usize, no_return_is_far: bool) -> Option<f64> {
-    let max = 2_f64.powi(i32::from(scan.range_bits)) - 1.0;
-    let value = f64::from(scan.range_array[i]);
+    let max = f64::from(scan.no_return);
+    let value = f64::from(scan.ranges()[i]);
     if value == max - 8.0 || value == max && no_return_is_far {
         Some(f64::INFINITY)
     } else if value > max - 8.0 {
         None
     } else {
-        Some(value * f64::from(scan.unit_mm))
+        Some(value * unit_mm(scan.unit_um))
     }
 }
 
 /// A model as somebody might have saved it.
-pub(crate) fn any_model(random: &mut fastrand::Rng, shape: Shape) -> Background {
-    let mut model = Background { count: shape.count, unit_mm: shape.unit_mm, ..Background::default() };
-    for range in &mut model.range_array[..usize::from(shape.count)] {
+pub(crate) fn any_model(random: &mut fastrand::Rng, shape: Shape) -> Box<Background> {
+    let head = BackgroundHead { unit_um: 1000 * u32::from(shape.unit_mm), ..BackgroundHead::default() };
+    let mut model = Background::of(head, &vec![0; shape.count.into()]);
+    for range in model.ranges_mut() {
         *range = match random.u8(..8) {
             0 => Background::UNTAUGHT,
             1 => Background::FAR,
@@ -119,7 +122,7 @@ pub(crate) fn any_model(random: &mut fastrand::Rng, shape: Shape) -> Background 
 pub(crate) fn ranges_mm(model: &Background) -> Vec<f64> {
     let mm = |&range: &u16| match range {
         Background::FAR => f64::INFINITY,
-        range => f64::from(range) * f64::from(model.unit_mm),
+        range => f64::from(range) * unit_mm(model.unit_um),
     };
     model.ranges().iter().map(mm).collect()
 }
@@ -134,40 +137,50 @@ pub(crate) fn check_scan(
     dirt: u8,
     place: &fmt::Arguments<'_>,
 ) {
-    let dirty: Foreground = bytemuck::pod_read_unaligned(&[dirt; size_of::<Foreground>()]);
-    let mut out = dirty;
+    let dirty = || Foreground::of_bytes(&vec![dirt; Foreground::len(scan.beams())]);
+    let mut out = dirty();
     model.update(scan, &mut out);
     assert_eq!(model.classes(), classes, "{place}");
-    let mut expected = foreground(scan, classes, &dirty);
-    expected.generation = generation;
-    assert_eq!(out, expected, "{place}");
+    assert_eq!(out, foreground(scan, classes, generation, dirty()), "{place}");
 }
 
-/// The foreground that belongs to `classes`, but for its segments and generation, which are as in `like`.
-fn foreground(scan: &Scan, classes: &[Class], like: &Foreground) -> Foreground {
-    let mut expected = *like;
-    expected.count = scan.count;
-    expected.unit_mm = scan.unit_mm;
-    (expected.pad, expected.pad2) = ([0], [0, 0]);
-    expected.bit_array.fill(0);
-    expected.range_array.fill(0);
+/// The foreground that belongs to `classes`, but for its segments, which stay as they are in `expected`.
+fn foreground(
+    scan: &Scan,
+    classes: &[Class],
+    generation: u32,
+    mut expected: Box<Foreground>,
+) -> Box<Foreground> {
     let beams: Vec<usize> = (0..classes.len()).filter(|&i| classes[i] == Class::Foreground).collect();
+    let arrays = expected.begin(ForegroundHead {
+        generation,
+        unit_um: scan.unit_um,
+        count: scan.count,
+        beams: beams.len() as u16,
+        ..ForegroundHead::default()
+    });
+    arrays.bits.fill(0);
+    arrays.ranges.fill(0);
     for (place, &i) in beams.iter().enumerate() {
-        expected.bit_array[i / 8] |= 1 << (i % 8);
-        expected.range_array[place] = scan.range_array[i];
+        arrays.bits[i / 8] |= 1 << (i % 8);
+        arrays.ranges[place] = scan.ranges()[i];
     }
-    expected.beams = beams.len() as u16;
     expected
+}
+
+/// Millimetres per device unit.
+pub(crate) fn unit_mm(unit_um: u32) -> f64 {
+    f64::from(unit_um) / 1000.0
 }
 
 /// How far apart readings of one surface may be: as it is set, else by the unit, and never less than the unit.
 pub(crate) fn apart_at_most_mm(set_mm: Option<u16>, scan: &Scan) -> f64 {
-    let default_mm = match scan.unit_mm {
-        1 => 30,
-        10 => 60,
+    let default_mm = match scan.unit_um {
+        1_000 => 30,
+        10_000 => 60,
         _ => 100,
     };
-    f64::from(set_mm.unwrap_or(default_mm)).max(f64::from(scan.unit_mm))
+    f64::from(set_mm.unwrap_or(default_mm)).max(unit_mm(scan.unit_um))
 }
 
 /// Yes, no, or whatever is the default.

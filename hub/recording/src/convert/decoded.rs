@@ -51,7 +51,7 @@ pub(super) fn each(
             let mut sensor = Sensor { mode, is_decoded: true };
             sensor.check(recording, name)?;
             let mut times = Times::of(recording);
-            let mut scan = Scan::default();
+            let mut scan = Box::<Scan>::default();
             let mut frames = recording.telegrams(encoding)?.enumerate().peekable();
             while let Some((number, frame)) = frames.next() {
                 let next_ns = frames.peek().and_then(|(_, next)| next.wall_ns);
@@ -76,12 +76,12 @@ fn each_of_mcap(
     for name in &recording.contents().sensors {
         let contents = recording.of(name)?.contents().clone();
         let mode = contents.mode.or(mode).or(contents.readable());
-        let is_decoded = contents.scans > 0 && (mode.is_some() || !known.channels.has(name, Topic::Scan));
+        let is_decoded = contents.scans > 0 && (mode.is_some() || !known.channels.has_scans(name));
         let sensor = Sensor { mode, is_decoded };
         sensor.check(recording, name)?;
         sensors.insert(name.clone(), sensor);
     }
-    let mut scan = Scan::default();
+    let mut scan = Box::<Scan>::default();
     while let Some(item) = reader.next().map_err(|error| recording.broken(&error))? {
         match item {
             Item::Telegram(sighting) => {
@@ -94,7 +94,7 @@ fn each_of_mcap(
             Item::Record(record) => {
                 let Some((place, header, payload)) = known.message(&record) else { continue };
                 let Some(sensor) = sensors.get_mut(&place.sensor) else { continue };
-                if place.topic == Topic::Scan && !sensor.is_decoded && scan.unpack(payload) {
+                if place.has_scans() && !sensor.is_decoded && Scan::unpack_into(&mut scan, payload) {
                     tell(Sight::Scan(&place.sensor, header, &scan))?;
                 }
                 let mut status = Status::default();
@@ -121,13 +121,16 @@ impl Sensor {
     }
 
     /// Makes `scan` of a telegram; `false` if it is none, or nothing says how to read it.
-    fn decode(&mut self, telegram: &[u8], scan: &mut Scan) -> bool {
+    fn decode(&mut self, telegram: &[u8], scan: &mut Box<Scan>) -> bool {
         let Some(telegram) = Telegram::check(telegram) else { return false };
         if let Some(Reply::Configuration(configuration)) = Reply::decode(telegram) {
             self.mode = Some(configuration.mode());
         }
         match (Measured::decode(telegram), self.mode) {
-            (Some(measured), Some(mode)) => scanner::decode(&measured, mode, scan),
+            (Some(measured), Some(mode)) => {
+                Scan::grow(scan, scanner::len(&measured));
+                scanner::decode(&measured, mode, scan);
+            }
             _ => return false,
         }
         true

@@ -5,7 +5,7 @@ use std::collections::{BTreeMap, HashMap, HashSet};
 use std::io;
 
 use mcap::records::Channel;
-use schema::file::ENCODING;
+use schema::file::{ENCODING, ENCODING_V1};
 use schema::{Topic, check_followed};
 
 /// What a channel is.
@@ -13,15 +13,23 @@ use schema::{Topic, check_followed};
 pub(crate) struct Place {
     pub(crate) sensor: String,
     pub(crate) topic: Topic,
+    /// It is of version 1.
+    is_old: bool,
 }
 
 impl Place {
     /// What `channel` is; nothing if it is somebody else's.
     fn of(channel: &Channel) -> Option<Place> {
         let (sensor, topic) = channel.topic.rsplit_once('/')?;
-        let is_ours = channel.message_encoding == ENCODING && check_followed(sensor).is_ok();
+        let is_old = channel.message_encoding == ENCODING_V1;
+        let is_ours = (is_old || channel.message_encoding == ENCODING) && check_followed(sensor).is_ok();
         let topic = Topic::parse(topic).filter(|_| is_ours)?;
-        Some(Place { sensor: sensor.to_owned(), topic })
+        Some(Place { sensor: sensor.to_owned(), topic, is_old })
+    }
+
+    /// Whether its messages are scans as they are now.
+    pub(crate) fn has_scans(&self) -> bool {
+        self.topic == Topic::Scan && !self.is_old
     }
 }
 
@@ -87,10 +95,10 @@ impl Channels {
         sensors.filter(|sensor| seen.insert(*sensor)).cloned().collect()
     }
 
-    /// Whether a channel of the file is `sensor`'s `topic`.
-    pub(crate) fn has(&self, sensor: &str, topic: Topic) -> bool {
+    /// Whether a channel of the file has `sensor`'s scans.
+    pub(crate) fn has_scans(&self, sensor: &str) -> bool {
         let mut places = self.proven.values().flatten().chain(self.likely.values().flatten());
-        places.any(|place| place.sensor == sensor && place.topic == topic)
+        places.any(|place| place.sensor == sensor && place.has_scans())
     }
 
     /// The first sensor that is named.
@@ -126,5 +134,8 @@ mod tests {
         assert_eq!(channels.place(3).unwrap().unwrap().sensor, "rear");
         assert_eq!((channels.place(4), channels.place(5)), (Some(None), None));
         assert_eq!(channels.sensors(), ["front", "rear"]);
+        let old = Channel { message_encoding: ENCODING_V1.to_owned(), ..channel(5, "rear/scan") };
+        channels.note(&old, true);
+        assert!(channels.has_scans("front") && !channels.has_scans("rear"), "scans of version 1 are others");
     }
 }

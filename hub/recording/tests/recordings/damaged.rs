@@ -3,14 +3,16 @@
 
 use std::collections::BTreeMap;
 use std::fs;
+use std::ops::Range;
 use std::path::PathBuf;
 use std::time::{Duration, Instant};
 
-use crate::written::Written;
+use crate::written::{SENSORS, Written};
 use fastrand::Rng;
 use lms::variant::{Mode, Unit};
 use recording::{Encoding, Frame, Recording};
 use schema::Flags;
+use schema::file::ENCODING;
 
 const MM: Encoding = Encoding { unit: Unit::Mm, mode: Mode(1) };
 
@@ -153,10 +155,25 @@ fn read(path: &PathBuf) -> Option<(Recording, BTreeMap<String, Vec<Frame>>)> {
     Some((recording, by_sensor))
 }
 
+/// Where it is said which channel has the telegrams of `sensor`: at its first one, and in the index.
+fn channels(written: &Written, sensor: &str) -> Vec<Range<usize>> {
+    let name = format!("{sensor}/telegram");
+    let named = |&at: &usize| written.bytes[at..].starts_with(name.as_bytes());
+    let end = name.len() + 4 + ENCODING.len() + 4;
+    (0..written.bytes.len()).filter(named).map(|at| at - CHANNEL..at + end).collect()
+}
+
 #[test]
 fn every_intact_telegram_is_found() {
     let written = crate::written::recording(100, 7);
     let positions = positions(&written);
+    let channels = SENSORS.map(|sensor| (sensor, channels(&written, sensor)));
+    let summary = mcap::Summary::read(&written.bytes).unwrap().unwrap();
+    let chunk = |index: &mcap::records::ChunkIndex| {
+        let begin = index.chunk_start_offset as usize;
+        begin..begin + index.chunk_length as usize
+    };
+    let chunks: Vec<_> = summary.chunk_indexes.iter().map(chunk).collect();
     let path = std::env::temp_dir().join(format!("scanhub-damaged-{}", std::process::id()));
     let (mut intact, mut estimated, mut unreadable, mut bare) = (0, 0, 0, 0);
     let started = Instant::now();
@@ -181,6 +198,11 @@ fn every_intact_telegram_is_found() {
             bare += 1;
             continue;
         }
+        let is_any_there = |parts: &[Range<usize>]| parts.iter().any(|part| is_there(part.start, part.len()));
+        // Other channels of the sensor have its name, and only a chunk that is whole says that they have its number.
+        let is_chunk_there = is_any_there(&chunks);
+        let told = channels.each_ref().map(|(sensor, its)| (*sensor, is_chunk_there || is_any_there(its)));
+        let is_told = |sensor: &str| told.contains(&(sensor, true));
         let mut left = by_sensor;
         for (known, at) in written.telegrams.iter().zip(&positions) {
             // Cut from all but three bytes of its header, a second one cannot be told from another that is alike.
@@ -199,7 +221,8 @@ fn every_intact_telegram_is_found() {
             let message = at - BEFORE;
             let is_message_whole = mutation.has(places[message], message, at + known.telegram.len());
             // In the order of the file: what stands before it in its list was there before.
-            let is_named = recording.contents().sensors.iter().any(|sensor| sensor == known.sensor);
+            let is_named = recording.contents().sensors.iter().any(|sensor| sensor == known.sensor)
+                && is_told(known.sensor);
             let number = format!("sensor{}", known.header.sensor);
             let called = if is_named { known.sensor } else { &number };
             let (own, others): (Vec<_>, Vec<_>) = left.iter_mut().partition(|(sensor, _)| *sensor == called);
@@ -231,6 +254,8 @@ fn every_intact_telegram_is_found() {
 }
 
 const MUTATIONS: u64 = 1_000;
+/// Opcode, length, numbers of channel and schema, and length of the name.
+const CHANNEL: usize = 1 + 8 + 2 + 2 + 4;
 /// Opcode, length, channel, sequence and times.
 const MESSAGE: usize = 1 + 8 + 2 + 4 + 8 + 8;
 const HEADER: usize = 64;

@@ -19,3 +19,5 @@ mod logs;
 #[cfg(feature = "mcap")]
 mod mcap;
 mod real;
+#[cfg(feature = "mcap")]
+mod version_1;

@@ -159,8 +159,9 @@ impl Extra {
         if self.fault == Fault::Flood {
             return Some((0..self.len).map(|_| self.random.u8(..)).collect());
         }
-        let bricks: [&[u8]; 3] =
-            [&[0x02], &[0x02, 0x80], if header.is_empty() { &[0x02, 0x80] } else { header }];
+        // Before the stream began, those of the LMS.
+        let header = if header.len() < 2 { &[0x02, 0x80] } else { header };
+        let bricks: [&[u8]; 3] = [&header[..1], &header[..2], header];
         let brick = bricks[self.random.usize(..3)];
         Some(brick.iter().copied().cycle().take(self.len).collect())
     }

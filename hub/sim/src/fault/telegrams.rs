@@ -19,8 +19,9 @@ pub(crate) struct Blemishes {
     repeats: bool,
     /// Share of its bytes after which the sensor breaks it off.
     breaks: Option<f64>,
-    /// Its length field as it was sent, as far as it is known.
-    announced: usize,
+    /// Its length, as far as it is known: all have as many bytes, or it announces it.
+    len: usize,
+    announces: bool,
 }
 
 impl Blemishes {
@@ -35,12 +36,13 @@ impl Blemishes {
             mask: 0,
             repeats: false,
             breaks: None,
-            announced: 0,
+            len: 0,
+            announces: true,
         }
     }
 
-    /// A telegram begins.
-    pub(crate) fn begin(&mut self) {
+    /// A telegram begins; `len` if it does not announce its length.
+    pub(crate) fn begin(&mut self, len: Option<usize>) {
         let shares = [self.random.f64(), self.random.f64()];
         // Half of the lengths are such that a telegram could have them.
         let masks = [self.random.u16(1..0x0400), self.random.u16(1..)];
@@ -49,20 +51,22 @@ impl Blemishes {
         self.mask = if happens(&mut self.random, self.length) { mask } else { 0 };
         self.repeats = happens(&mut self.random, self.repeat);
         self.breaks = happens(&mut self.random, self.abort).then_some(shares[1]);
-        self.announced = 0;
+        self.len = len.unwrap_or(lms::telegram::FRAME);
+        self.announces = len.is_none();
     }
 
     /// What becomes of `byte` at `position`: another one, or nothing.
     pub(crate) fn apply(&mut self, position: usize, byte: u8) -> (Option<u8>, Option<Fault>) {
         let [low, high] = self.mask.to_le_bytes();
-        let flipped = match position {
-            2 => low,
-            3 => high,
+        // Where all are of one length, a byte behind the first one says it.
+        let flipped = match (self.announces, position) {
+            (true, 2) | (false, 1) => low,
+            (true, 3) => high,
             _ => 0,
         };
         match position {
-            2 => self.announced = usize::from(byte),
-            3 => self.announced |= usize::from(byte) << 8,
+            2 if self.announces => self.len += usize::from(byte),
+            3 if self.announces => self.len += usize::from(byte) << 8,
             _ => {}
         }
         if position > 3 && self.arrives.is_some_and(|share| position >= self.place(share)) {
@@ -83,8 +87,7 @@ impl Blemishes {
 
     /// The byte at `share` of its length, neither the first nor one behind the last.
     fn place(&self, share: f64) -> usize {
-        let len = self.announced + lms::telegram::FRAME;
-        1 + (share * (len - 1) as f64) as usize
+        1 + (share * (self.len - 1) as f64) as usize
     }
 }
 
@@ -98,7 +101,7 @@ mod tests {
         let mut cuts = std::collections::HashSet::new();
         let mut blemishes = Blemishes::new(&Faults { truncate: 1.0, ..Faults::default() }, 3);
         for _ in 0..200 {
-            blemishes.begin();
+            blemishes.begin(None);
             let arrived: Vec<u8> =
                 telegram.iter().enumerate().filter_map(|(at, &byte)| blemishes.apply(at, byte).0).collect();
             assert!(arrived.len() < telegram.len() && telegram.starts_with(&arrived));
@@ -107,7 +110,7 @@ mod tests {
         assert_eq!(cuts.len(), 5, "{cuts:?}");
         let mut blemishes = Blemishes::new(&Faults { length: 1.0, ..Faults::default() }, 3);
         for _ in 0..200 {
-            blemishes.begin();
+            blemishes.begin(None);
             let arrived: Vec<u8> =
                 telegram.iter().enumerate().filter_map(|(at, &byte)| blemishes.apply(at, byte).0).collect();
             assert!(arrived[2..4] != telegram[2..4] && arrived[4..] == telegram[4..]);

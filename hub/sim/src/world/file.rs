@@ -123,7 +123,10 @@ enum SpeedFile {
 #[derive(Deserialize)]
 #[serde(deny_unknown_fields)]
 struct SunFile {
-    sector_deg: Spanned<(Number, Number)>,
+    from_deg: Option<Spanned<f64>>,
+    to_deg: Option<Spanned<f64>>,
+    /// The key of when 0 was right: refused, because its values are possible in both frames.
+    sector_deg: Option<Spanned<(Number, Number)>>,
     from_s: Option<Spanned<f64>>,
     until_s: Option<Spanned<f64>>,
     share: Option<Spanned<f64>>,
@@ -265,14 +268,18 @@ impl PersonFile {
 
 impl SunFile {
     fn sun(&self, origin: &Origin) -> Result<Sun, Failure> {
-        let (from_deg, to_deg) = point(*self.sector_deg.get_ref());
-        if from_deg > to_deg {
-            let what = format!("sector_deg = [{from_deg}, {to_deg}]");
-            return Err(origin.refuse(
-                self.sector_deg.span(),
-                what,
-                "angles of the sensor, the smaller one first",
-            ));
+        if let Some(sector) = &self.sector_deg {
+            let (from, to) = point(*sector.get_ref());
+            let what = format!("sector_deg = [{from}, {to}] counts angles from the right");
+            let [from, to] = [from, to].map(|deg| (deg * 1000.0 - 90_000.0).round() / 1000.0);
+            let remedy = format!("angles are counted from ahead now: from_deg = {from:?}, to_deg = {to:?}");
+            return Err(origin.refuse(sector.span(), what, remedy));
+        }
+        let from_deg = origin.number(&self.from_deg, -180.0, -180.0..=180.0)?;
+        let to_deg = origin.number(&self.to_deg, 180.0, -180.0..=180.0)?;
+        if let Some(to) = self.to_deg.as_ref().filter(|_| from_deg > to_deg) {
+            let what = format!("from_deg = {from_deg}, to_deg = {to_deg}");
+            return Err(origin.refuse(to.span(), what, "angles of the sensor, the smaller one first"));
         }
         let (from_s, until_s) = origin.interval(&self.from_s, &self.until_s)?;
         let share = origin.number(&self.share, 1.0, 0.0..=1.0)?;

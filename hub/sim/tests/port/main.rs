@@ -1,6 +1,7 @@
 //! The verb on real ptys: a host opens the port, asks, and reads; what it got is compared with the truth. Every wait
 //! is for something, with a deadline far beyond what it takes.
 
+mod head;
 mod host;
 mod simulator;
 

@@ -2,6 +2,7 @@
 //! is linked once. The tests on ptys are in `tests/port`: they must not wait for processors that these tests use.
 
 mod faults;
+mod head;
 mod inquiry;
 mod machine;
 mod session;

@@ -1,7 +1,6 @@
 //! The limits of a process: descriptors, and the length of files, which must allow the hub's segments.
 
 use config::needs;
-use schema::shortage::longest_segment;
 
 use super::finding::Finding;
 use super::machine::Facts;
@@ -26,7 +25,7 @@ pub(crate) fn descriptors(facts: &Facts) -> Finding {
 pub(crate) fn file_size(facts: &Facts) -> Finding {
     const NAME: &str = "file-size";
     let Some(limit) = facts.file_size else { return Finding::ok(NAME, "no limit") };
-    let longest = longest_segment();
+    let longest = needs::longest_segment(&facts.limits);
     let text = format!("{} kB at most; the longest segment has {} kB", limit / 1024, longest / 1024);
     if limit >= longest {
         return Finding::ok(NAME, text);

@@ -9,6 +9,7 @@ use config::needs;
 use rustix::fs::{Access, access, statvfs};
 use rustix::process::{Resource, getrlimit, getuid};
 use schema::ipc::Nodes;
+use schema::limits::TopicLimits;
 use schema::shortage::SHARED_MEMORY;
 use schema::{Domain, Failure};
 
@@ -21,6 +22,8 @@ use super::segments::{self, Segment};
 #[derive(Clone, Debug)]
 pub(crate) struct Facts {
     pub(crate) links: usize,
+    /// What the topics of each are made for.
+    pub(crate) limits: Vec<TopicLimits>,
     /// None: it cannot be looked at.
     pub(crate) memory: Option<Memory>,
     /// The domain's name.
@@ -76,7 +79,12 @@ pub(crate) struct Place {
 
 impl Facts {
     /// Looks at everything; changes nothing.
-    pub(crate) fn gather(domain: &Domain, places: &[Domain], links: usize, hub: Option<&Hub>) -> Facts {
+    pub(crate) fn gather(
+        domain: &Domain,
+        places: &[Domain],
+        limits: Vec<TopicLimits>,
+        hub: Option<&Hub>,
+    ) -> Facts {
         let root = domain.root();
         let elsewhere = || places.iter().filter(|place| place.root() != root);
         let held = |place: &Domain| schema::holder(place.root()).ok().flatten();
@@ -93,7 +101,8 @@ impl Facts {
         Facts {
             // To list them needs one too.
             open: fs::read_dir("/proc/self/fd").map_or(0, |entries| entries.count() as u64 - 1),
-            links,
+            links: limits.len(),
+            limits,
             memory: Memory::of_machine(),
             name: domain.name().to_owned(),
             root: root.to_owned(),
@@ -165,7 +174,7 @@ pub(crate) fn memory(facts: &Facts) -> Finding {
     if size == 0 {
         return Finding::ok(NAME, format!("{SHARED_MEMORY} has no limit"));
     }
-    let needed = needs::memory(facts.links);
+    let needed = needs::memory(&facts.limits);
     let has = format!("{SHARED_MEMORY} has {} kB, {} kB of them free", size / 1024, free / 1024);
     if facts.lives().is_some() {
         return Finding::ok(NAME, format!("{has}; the hub has what it needs"));
@@ -273,6 +282,7 @@ pub(super) mod tests {
     pub(crate) fn facts() -> Facts {
         Facts {
             links: 2,
+            limits: vec![TopicLimits::default(); 2],
             memory: Some(ROOMY),
             name: "scanhub".into(),
             root: "/run/user/7/scanhub/scanhub".into(),

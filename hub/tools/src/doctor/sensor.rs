@@ -324,6 +324,7 @@ mod tests {
         let link = Link {
             name: "front".into(),
             port: port::Source::Tty("/dev/ttyUSB0".into()),
+            scanner: config::Scanner::Lms,
             family: Some(Family::Lms291),
             variant: Variant::HALF,
             unit: Some(Unit::Cm),

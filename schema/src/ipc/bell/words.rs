@@ -1,4 +1,4 @@
-//! The operations on the two words of a bell, and their order: the part that must be right in all interleavings of hub and
+//! The operations on the words of a bell, and their order: the part that must be right in all interleavings of hub and
 //! consumers, and is tested in all of them below. Refuses to know where the words are and how threads sleep.
 
 use std::sync::atomic::{AtomicU32, Ordering, fence};

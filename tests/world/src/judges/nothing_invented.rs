@@ -5,6 +5,7 @@ use std::collections::{HashMap, VecDeque};
 
 use lms::Nanos;
 use lms::measured::MEASURED;
+use schema::datagram::Packed;
 use schema::{Scan, Topic};
 
 use super::{Judge, Say};
@@ -79,7 +80,10 @@ impl Judge for NothingInvented {
             }
             Event::Published { sensor, sample } if sample.topic == Topic::Scan => {
                 let (seq, boot, telegram) = &self.sensors[sensor].last;
-                let scan: Scan = bytemuck::pod_read_unaligned(&sample.bytes);
+                let mut scan = Box::<Scan>::default();
+                if !Scan::unpack_into(&mut scan, &sample.bytes) {
+                    say.broken(format!("sensor {sensor}: what is no scan"));
+                }
                 if (*seq, *boot) == (sample.header.seq, sample.header.boot) && !is_scan_of(&scan, telegram) {
                     say.broken(format!("sensor {sensor}: a scan that is not that of telegram {seq}"));
                 }
@@ -94,9 +98,9 @@ fn is_scan_of(scan: &Scan, telegram: &[u8]) -> bool {
     let [_, _, _, _, MEASURED, low, high, values @ ..] = telegram else { return false };
     let count = usize::from(u16::from_le_bytes([*low, *high]) & 0x01FF);
     let (words, _) = values.as_chunks::<2>();
-    let mask = ((1u32 << scan.range_bits) - 1) as u16;
+    let mask = scan.no_return;
     let same = |(range, word): (&u16, &[u8; 2])| *range == u16::from_le_bytes(*word) & mask;
-    scan.beams() == count && words.len() >= count && scan.range_array.iter().zip(&words[..count]).all(same)
+    scan.beams() == count && words.len() >= count && scan.ranges().iter().zip(&words[..count]).all(same)
 }
 
 fn key(bytes: &[u8]) -> u64 {

@@ -1,11 +1,12 @@
 //! Nothing comes over the network that the hub did not publish: no datagram is taken that was not sent like this bit by bit,
 //! none is refused that came as it was sent, unless its gateway's life is over, and what a listener publishes is byte by byte
-//! what the hub published, with its number, time and quality.
+//! what the hub published, with its number, time and quality, and never a half of it.
 //!
 //! Two things nobody published (`docs/topics.md`): zones that are unknown, because nothing came, and that a sensor is silent,
-//! after 3 s of it.
+//! after 3 s of it. A listener that is behind may say so of a time that is over: what counts is the stamp, by which nothing
+//! came in the 3 s before.
 
-use std::collections::{BTreeMap, HashSet};
+use std::collections::{BTreeMap, BTreeSet, HashSet};
 
 use lms::{MILLIS, Nanos};
 use schema::datagram::{Datagram, DatagramError, Packed};
@@ -21,14 +22,16 @@ pub(crate) struct RemoteNothingInvented {
     published: HashSet<u64>,
     /// Lives of the hub.
     boots: HashSet<u64>,
-    /// By epoch, sensor, topic and number.
-    sent: BTreeMap<(u32, u8, u8, u32), u64>,
+    /// By epoch, sensor, topic, number and part.
+    sent: BTreeMap<(u32, u8, u8, u32, u8), u64>,
     /// The greatest epoch that the listener took.
     epoch: u32,
     /// Epoch and sensor of the announcements that the listener took: before it nobody knows whose samples are.
     named: HashSet<(u32, u8)>,
-    /// When the last sample of each sensor came that the listener took, knew and did not find late.
-    heard_at: BTreeMap<usize, Nanos>,
+    /// When samples of each sensor came that the listener took, knew and did not find late.
+    heard_at: BTreeSet<(usize, Nanos)>,
+    /// CLOCK_MONOTONIC of the listener's machine when the world began.
+    clock: Nanos,
     packet: Packet,
     /// What everybody may say.
     unknown: Vec<u8>,
@@ -45,7 +48,8 @@ impl RemoteNothingInvented {
             sent: BTreeMap::new(),
             epoch: 0,
             named: HashSet::new(),
-            heard_at: BTreeMap::new(),
+            heard_at: BTreeSet::new(),
+            clock: terms.clocks.monotonic_ns,
             packet: Packet::new(terms),
             unknown,
         }
@@ -82,6 +86,7 @@ impl Judge for RemoteNothingInvented {
                         }
                     }
                     (Arrival::Refused(_), _) => {}
+                    (Arrival::Part, Some(_)) if is_sent => {}
                     (_, Some(datagram)) if is_sent => {
                         let head = &datagram.head;
                         self.epoch = self.epoch.max(head.epoch);
@@ -89,7 +94,7 @@ impl Judge for RemoteNothingInvented {
                         match outcome {
                             Arrival::Announced => _ = self.named.insert(life),
                             Arrival::Sample { late: false } if self.named.contains(&life) => {
-                                self.heard_at.insert(head.sensor.into(), came);
+                                self.heard_at.insert((head.sensor.into(), came));
                             }
                             _ => {}
                         }
@@ -102,8 +107,9 @@ impl Judge for RemoteNothingInvented {
                 let is_said = match topic {
                     Topic::Zones => payload == self.unknown,
                     Topic::Status => {
-                        let heard = self.heard_at.get(&sensor);
-                        let is_silent = heard.is_none_or(|&heard| at >= heard + SILENT);
+                        let said = header.stamp_last_ns.saturating_sub(self.clock);
+                        let before = (sensor, (said + 1).saturating_sub(SILENT))..(sensor, said);
+                        let is_silent = said <= at && self.heard_at.range(before).next().is_none();
                         is_silent && status(payload).state() == Some(State::Silent)
                     }
                     _ => false,
@@ -145,9 +151,9 @@ fn status(payload: &[u8]) -> Status {
     status
 }
 
-fn place(datagram: &Datagram<'_>) -> (u32, u8, u8, u32) {
+fn place(datagram: &Datagram<'_>) -> (u32, u8, u8, u32, u8) {
     let head = &datagram.head;
-    (head.epoch, head.sensor, head.topic, head.sequence)
+    (head.epoch, head.sensor, head.topic, head.sequence, head.part)
 }
 
 fn hash(bytes: &[u8]) -> u64 {

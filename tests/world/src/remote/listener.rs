@@ -7,7 +7,7 @@ use lan::incoming::{Arrived, Incoming};
 use lan::republish::Republisher;
 use lms::Nanos;
 use schema::Topic;
-use schema::datagram::{Datagram, DatagramError};
+use schema::datagram::{Datagram, DatagramError, HEAD, Head};
 
 use super::robot::GATEWAY;
 use super::topics::Memory;
@@ -61,7 +61,6 @@ impl Listener {
     /// Takes what waits.
     pub(super) fn run(&mut self, shared: &Shared, terms: &Terms, now: Nanos) {
         self.next_at = Nanos::MAX;
-        let wall = terms.stamp(now);
         loop {
             let mut read = None;
             for _ in 0..TURN.min(self.queue.len()) {
@@ -74,7 +73,7 @@ impl Listener {
             self.republisher.wake();
             if now >= self.look_at {
                 self.look_at = now + LOOKS;
-                self.republisher.look(wall, terms.stamp(read).monotonic_ns);
+                self.republisher.look(terms.stamp(now).monotonic_ns, terms.stamp(read));
             }
             if self.queue.is_empty() {
                 return;
@@ -85,12 +84,16 @@ impl Listener {
     fn take(&mut self, shared: &Shared, terms: &Terms, came: Nanos, bytes: &[u8], now: Nanos) {
         let wall = terms.stamp(now);
         if shared.planted.strikes(Defect::RemoteCountedTwice, 100) {
-            self.incoming.receive(bytes, 1, terms.stamp(came));
+            self.incoming.receive(bytes, 1, terms.stamp(came), &mut Vec::new());
         }
         let stamped = if shared.planted.is(Defect::RemoteStampedLate) { now } else { came };
-        let arrived = self.incoming.receive(bytes, 1, terms.stamp(stamped));
+        let mut whole = Vec::new();
+        let half = shared.planted.strikes(Defect::RemoteHalf, 10).then(|| half(bytes)).flatten();
+        let taken = half.as_deref().unwrap_or(bytes);
+        let arrived = self.incoming.receive(taken, 1, terms.stamp(stamped), &mut whole);
         let outcome = match &arrived {
             Arrived::Refused { why, .. } => Arrival::Refused(*why),
+            Arrived::Part => Arrival::Part,
             Arrived::Known => Arrival::Known,
             Arrived::Announced(_) => Arrival::Announced,
             Arrived::Sample(sample) => Arrival::Sample { late: sample.remote.late },
@@ -103,7 +106,7 @@ impl Listener {
         let made = match &arrived {
             Arrived::Sample(sample) => self.republisher.sample(sample, || GATEWAY.to_owned(), wall),
             Arrived::Announced(announced) => self.republisher.announced(announced, GATEWAY, wall),
-            Arrived::Refused { .. } | Arrived::Known => Ok(None),
+            Arrived::Refused { .. } | Arrived::Part | Arrived::Known => Ok(None),
         };
         if let Err(failure) = made {
             shared.log.tell(now, &Event::Acted { text: &format!("a listener says {failure}") });
@@ -120,6 +123,16 @@ impl Listener {
         let (given_up, sensors) = (stats.given_up().lives, self.republisher.names().len());
         shared.log.tell(now, &Event::ListenerEnds { life: self.life, refused, given_up, sensors });
     }
+}
+
+/// What a listener that does not wait for the other parts would make of one: a sample that has nothing where these belong.
+fn half(bytes: &[u8]) -> Option<Vec<u8>> {
+    let Datagram { head, payload, .. } = Datagram::read(bytes).ok().filter(|it| it.head.parts > 1)?;
+    let begin = HEAD + payload.len() * usize::from(head.part);
+    let mut buffer = vec![0; HEAD + payload.len() * usize::from(head.parts)];
+    buffer[begin..begin + payload.len()].copy_from_slice(payload);
+    let len = buffer.len() - HEAD;
+    Some(Head { part: 0, parts: 1, ..head }.seal(&mut buffer, len)?.to_vec())
 }
 
 /// The process that publishes.

@@ -1,7 +1,7 @@
 //! The payload of a sample as it goes over a network. Refuses to know what becomes of it.
 
 use lan::outgoing::PayloadRef;
-use schema::datagram::HEAD;
+use schema::datagram::{HEAD, PARTS};
 
 use super::Terms;
 use crate::topics::Sample;
@@ -19,6 +19,15 @@ macro_rules! payloads {
     ([u8] $sample:ident) => {
         &$sample.bytes
     };
+    (Scan $sample:ident) => {
+        &schema::Scan::of_bytes(&$sample.bytes)
+    };
+    (Foreground $sample:ident) => {
+        &schema::Foreground::of_bytes(&$sample.bytes)
+    };
+    (Background $sample:ident) => {
+        &schema::Background::of_bytes(&$sample.bytes)
+    };
     ($payload:ident $sample:ident) => {
         &bytemuck::pod_read_unaligned::<schema::$payload>(&$sample.bytes)
     };
@@ -26,17 +35,17 @@ macro_rules! payloads {
 
 schema::for_each_topic!(payloads);
 
-/// Room for a payload as in a datagram: of some payloads it says how much goes into it.
+/// Room for a payload as in datagrams: of some payloads it says how much goes into it.
 pub(crate) struct Packet {
     room: Vec<u8>,
 }
 
 impl Packet {
     pub(crate) fn new(terms: &Terms) -> Packet {
-        Packet { room: vec![0; terms.longest - HEAD] }
+        Packet { room: vec![0; PARTS * (terms.longest - HEAD)] }
     }
 
-    /// What `sample` is in a datagram; nothing if it does not fit.
+    /// What `sample` is in datagrams; nothing if it does not fit.
     pub(crate) fn of(&mut self, sample: &Sample) -> Option<&[u8]> {
         let len = lend(sample, |payload| payload.pack(&mut self.room))?;
         self.room.get(..len)

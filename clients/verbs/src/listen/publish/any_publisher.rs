@@ -1,8 +1,8 @@
 //! A topic of a remote sensor in shared memory, of whichever kind. Refuses to know what is in a sample.
 
 use scanhub_client::{Publication, SensorPublisher};
-use schema::datagram::{Packed, telegram};
-use schema::ipc::{Payload, ZeroCopySend};
+use schema::datagram::Packed;
+use schema::ipc::Payload;
 use schema::{Failure, Header, Topic};
 
 /// What is published from a payload as it stands in a datagram.
@@ -11,18 +11,10 @@ trait Unpacked {
     fn publish(&mut self, header: &Header, payload: &[u8]);
 }
 
-impl Unpacked for Publication<[u8]> {
+impl<P: Payload + Packed + ?Sized> Unpacked for Publication<P> {
     fn publish(&mut self, header: &Header, payload: &[u8]) {
-        match telegram(payload) {
-            Some(telegram) => _ = self.send_bytes_with(header, telegram.0),
-            None => self.skip(1),
-        }
-    }
-}
-
-impl<P: Payload + ZeroCopySend + Default + Packed> Unpacked for Publication<P> {
-    fn publish(&mut self, header: &Header, payload: &[u8]) {
-        let _ = self.send_with(header, |sample| {
+        let Some(len) = P::room(payload) else { return self.skip(1) };
+        let _ = self.send_len_with(header, len, |sample| {
             let _ = sample.unpack(payload);
         });
     }

@@ -2,12 +2,13 @@
 
 use std::collections::BTreeMap;
 
+use bytemuck::bytes_of;
 use fastrand::Rng;
 use lms::measured;
 use lms::reply;
 use lms::variant::{Mode, Unit};
 use schema::datagram::Packed;
-use schema::file::{Compression, Foreign, Writer};
+use schema::file::{self, Compression, ENCODING_V1, Foreign, Writer};
 use schema::{Background, Flags, Foreground, Header, Marks, Scan, Status, Topic, Zones};
 
 /// A telegram that was written.
@@ -32,6 +33,52 @@ pub(crate) fn recording(rounds: u64, seed: u64) -> Written {
 
 /// The same with packed chunks.
 pub(crate) fn packed(rounds: u64, seed: u64, compression: Compression) -> Written {
+    written(rounds, seed, compression, |writer, sensor, topic, header, payload| {
+        writer.sample(sensor, topic, header, payload).unwrap();
+    })
+}
+
+/// The same as version 1 wrote it, with only some of its topics.
+pub(crate) fn of_version_1(rounds: u64, seed: u64, topics: &[Topic]) -> Written {
+    written(rounds, seed, Compression::None, |writer, sensor, topic, header, payload| {
+        if !topics.contains(&topic) {
+            return;
+        }
+        let payload = match topic {
+            Topic::Scan => scan_of_version_1(),
+            // Generation, counts, unit and flags, all 0.
+            Topic::Foreground | Topic::Background => vec![0; 12],
+            _ => payload.to_vec(),
+        };
+        let channel = Foreign {
+            topic: &format!("{sensor}/{}", topic.name()),
+            encoding: ENCODING_V1,
+            schema: (&file::schema(topic).replace(".v2", ".v1"), "as it was", ENCODING_V1),
+            metadata: &[],
+        };
+        let channel = writer.channel(&channel).unwrap();
+        let message = [bytes_of(header), &payload].concat();
+        writer.message(channel, header.topic_seq as u32, header.wall_ns, &message).unwrap();
+    })
+}
+
+/// A scan of 361 beams as version 1 has it, of ranges that happen to be what a scan of today may be too.
+pub(crate) fn scan_of_version_1() -> Vec<u8> {
+    let mut payload = vec![0x69, 0x01, 10, 13];
+    payload.extend(0_i32.to_le_bytes());
+    payload.extend([500_u16.to_le_bytes(), [0, 1]].concat());
+    payload.extend([256_u16; 361].map(u16::to_le_bytes).concat());
+    payload.extend([0; 361]);
+    payload
+}
+
+/// A recording whose samples `write` writes.
+fn written(
+    rounds: u64,
+    seed: u64,
+    compression: Compression,
+    mut write: impl FnMut(&mut Writer<Vec<u8>>, &str, Topic, &Header, &[u8]),
+) -> Written {
     let mut random = Rng::with_seed(seed);
     let facts = BTreeMap::from([("domain".to_owned(), "test".to_owned())]);
     let mut writer = Writer::packed(Vec::new(), "", compression, facts).unwrap();
@@ -52,9 +99,9 @@ pub(crate) fn packed(rounds: u64, seed: u64, compression: Compression) -> Writte
                 _ => scan(&mut random),
             };
             let header = header(round, number as u8, &mut random);
-            writer.sample(sensor, Topic::Telegram, &header, &telegram).unwrap();
+            write(&mut writer, sensor, Topic::Telegram, &header, &telegram);
             for (topic, payload) in results(&telegram, &mut random) {
-                writer.sample(sensor, topic, &header, &payload).unwrap();
+                write(&mut writer, sensor, topic, &header, &payload);
             }
             telegrams.push(Known { sensor, header, telegram });
         }
@@ -98,15 +145,15 @@ fn results(telegram: &[u8], random: &mut Rng) -> Vec<(Topic, Vec<u8>)> {
         room[..len].to_vec()
     };
     let status = Status { mode: 4, unit_mm: 1, baud: 500_000, since_ns: random.u64(..), ..Status::default() };
-    let mut scan = packed(&|room| Scan::default().pack(room));
+    let mut scan = packed(&|room| Scan::zeroed(0).pack(room));
     // The ranges are there once more, as they came.
     scan.extend_from_slice(&telegram[5..telegram.len() - 3]);
     vec![
         (Topic::Scan, scan),
         (Topic::Marks, packed(&|room| Marks::default().pack(room))),
         (Topic::Zones, packed(&|room| Zones::unknown().pack(room))),
-        (Topic::Foreground, packed(&|room| Foreground::default().pack(room))),
-        (Topic::Background, packed(&|room| Background::default().pack(room))),
+        (Topic::Foreground, packed(&|room| Foreground::zeroed(0).pack(room))),
+        (Topic::Background, packed(&|room| Background::zeroed(0).pack(room))),
         (Topic::Status, packed(&|room| status.pack(room))),
     ]
 }

@@ -1,5 +1,6 @@
 //! One run: a sensor that streams, a wire with faults, a session; then a while without faults, and the account.
 
+use line::Session as _;
 use lms::variant::Baud;
 use lms::{MILLIS, Nanos};
 use sim::fault::Faults;
@@ -76,7 +77,7 @@ impl Scene {
         bench.run(40 * MILLIS);
         let verdict = self.account(&bench, seed);
         let effects = Effects::of(&bench);
-        Verdict { effects, resyncs: bench.session.resyncs(), back_ms: back / MILLIS, ..verdict }
+        Verdict { effects, resyncs: bench.session.account().resyncs, back_ms: back / MILLIS, ..verdict }
     }
 
     /// Holds what was delivered against what was sent.

@@ -9,8 +9,9 @@ use lms::telegram::{Encoded, FRAME};
 use lms::variant::Baud;
 use lms::{MICROS, MILLIS, Nanos, line_time};
 use sim::Arrival;
+use sim::device::{Device as _, Part};
 use sim::fault::Faults;
-use sim::machine::{Machine, Part, Settings};
+use sim::machine::{Machine, Settings};
 use sim::noise::Mistuned;
 use sim::room::Room;
 use sim::source::Source;
@@ -176,10 +177,10 @@ impl<C: Conversation> Bench<C> {
     }
 
     fn carry(&mut self, carried: Carried) {
-        let Carried { bytes, baud, idle_after, .. } = carried;
+        let Carried { bytes, rate, idle_after, .. } = carried;
         let mut bytes = (self.to_host)(bytes);
-        if baud != self.port {
-            bytes = self.mistuned.receive((baud.rate(), self.port.rate()), &bytes, idle_after);
+        if rate != self.port.rate() {
+            bytes = self.mistuned.receive((rate, self.port.rate()), &bytes, idle_after);
         }
         self.inbox.extend(bytes);
     }

@@ -7,6 +7,7 @@ use lms::telegram::{NAK, Writer};
 use lms::variant::{Baud, Mode, Unit};
 use lms::{Inquiry, MILLIS, Nanos};
 use lms_configure::{Change, Consent, Failing, Outcome, Plan, Step, eeprom::PowerOn};
+use sim::device::Device as _;
 use sim::machine::{Habits, Machine, Settings};
 use sim::operating::Operating;
 

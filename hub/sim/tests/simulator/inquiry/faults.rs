@@ -4,6 +4,7 @@
 use lms::variant::Baud;
 use lms::{Inquiry, MILLIS};
 use lms_configure::Change;
+use sim::device::Device as _;
 use sim::fault::Faults;
 use sim::machine::{Habits, Machine};
 use sim::wire::Wire;

@@ -4,6 +4,7 @@ use lms::command::Request;
 use lms::telegram::{Encoded, Writer};
 use lms::variant::{Baud, Mode, Unit};
 use lms::{Inquiry, MILLIS};
+use sim::device::Device as _;
 use sim::machine::{Settings, Start};
 use sim::operating::Operating;
 

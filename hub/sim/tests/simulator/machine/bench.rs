@@ -2,7 +2,8 @@
 
 use lms::{MICROS, MILLIS, Nanos, line_time};
 use sim::Arrival;
-use sim::machine::{Chunk, Machine, Part, Sent, Settings};
+use sim::device::{Chunk, Device as _, Part, Sent};
+use sim::machine::{Machine, Settings};
 use sim::room::Room;
 use sim::source::Source;
 

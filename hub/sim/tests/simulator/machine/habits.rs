@@ -8,6 +8,7 @@ use lms::telegram::{ACK, NAK};
 use lms::variant::{Baud, Variant};
 use lms::{MICROS, MILLIS, line_time};
 use lms_configure::eeprom::{PowerOn, Write};
+use sim::device::Device as _;
 use sim::machine::{Habits, Settings};
 use sim::{Arrival, Dropped};
 

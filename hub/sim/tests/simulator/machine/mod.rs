@@ -13,7 +13,8 @@ use lms::telegram::{ACK, NAK, Telegram, Writer};
 use lms::variant::{Baud, MIRROR_TURN, Mode, Unit, Variant};
 use lms::{MICROS, MILLIS, Nanos, line_time};
 use proptest::prelude::*;
-use sim::machine::{Machine, Part, Settings};
+use sim::device::{Device as _, Part};
+use sim::machine::{Machine, Settings};
 use sim::room::Room;
 use sim::source::Source;
 use sim::world::World;
@@ -53,7 +54,7 @@ fn a_start_up_at_9600_to_a_stream_at_500k() {
     let first = bench.chunks.len();
     let bytes = bench.ask(Request::Baud(Baud::B500000).encode(0).bytes());
     assert_eq!(reply(&bytes), Reply::Mode { done: true });
-    assert!(bench.chunks[first..].iter().all(|(_, chunk)| chunk.baud == Baud::B9600), "not at the old rate");
+    assert!(bench.chunks[first..].iter().all(|(_, chunk)| chunk.rate == 9_600), "not at the old rate");
     assert_eq!(bench.machine.baud(), Baud::B500000);
 
     let first = bench.sent().len();

@@ -5,6 +5,7 @@ use lms::reply::Reply;
 use lms::telegram::{ACK, Telegram, Writer};
 use lms::variant::{Baud, Unit, Variant};
 use lms::{MILLIS, Nanos};
+use sim::device::Device as _;
 use sim::machine::{Settings, Start};
 use sim::operating::Operating;
 
@@ -34,7 +35,7 @@ fn a_power_cycle_breaks_off_forgets_and_announces_itself() {
     assert_eq!((sent[1].1.telegram[4], sent[1].1.is_reply), (0x90, true));
     assert!(sent[1].0 >= next + BOOT);
     let banner = bench.chunks[before..].iter().rev().find(|(_, chunk)| !chunk.bytes.is_empty()).unwrap();
-    assert_eq!((banner.1.baud, bench.machine.baud()), (Baud::B9600, Baud::B9600));
+    assert_eq!((banner.1.rate, bench.machine.baud()), (9_600, Baud::B9600));
     let answer = bench.ask(Request::Status.encode(0).bytes());
     let Reply::Status(status) = reply(&answer) else { panic!("no status") };
     assert_eq!(

@@ -3,8 +3,9 @@
 use lms::variant::Baud;
 use lms::{MILLIS, Nanos};
 use sim::ChunkSize;
+use sim::device::Part;
 use sim::fault::{Fault, Faults};
-use sim::machine::{Machine, Part, Settings, Start};
+use sim::machine::{Machine, Settings, Start};
 use sim::operating::Operating;
 use sim::room::Room;
 use sim::source::Source;

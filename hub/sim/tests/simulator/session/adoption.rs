@@ -1,7 +1,10 @@
 //! A sensor that streams already when the session begins: left by a hub that was killed, or by another program.
 
+use line::{Control, Session as _, State};
+use lms::command::Request;
 use lms::variant::{Baud, Mode, Unit};
-use lms::{Control, MICROS, MILLIS, Settings, State};
+use lms::{MICROS, MILLIS, Settings};
+use sim::device::Device as _;
 use sim::machine::{self, Start};
 use sim::operating::Operating;
 
@@ -27,7 +30,7 @@ fn at_the_wanted_rate_it_is_taken_as_it_streams() {
         let skipped = intact.iter().position(|scan| scans.first() == Some(scan)).expect("was sent");
         assert_eq!(scans, intact[skipped..][..scans.len()], "{bench}");
         assert!(skipped <= 1 && intact.len() - skipped - scans.len() <= 1, "{bench}");
-        assert_eq!(bench.session.began_with_a_cut(), skipped == 1, "{bench}");
+        assert_eq!(bench.session.account().began_with_a_cut, skipped == 1, "{bench}");
     }
 }
 
@@ -45,6 +48,30 @@ fn at_another_rate_it_is_found_and_brought_to_the_wanted_one() {
             assert_eq!(bench.session.trouble(), None);
         }
     }
+}
+
+#[test]
+fn what_comes_at_another_rate_gives_no_scans() {
+    let mut machine = sensor(Baud::B9600);
+    let begun = make_stream(&mut machine);
+    let mut bench = Bench::new(machine, begun);
+    bench.session.seek_first(WANTED.baud);
+    // It is asked at the wanted rate and at its own, tells its status, and is deaf from then on: it cannot be stopped.
+    let asked = 2 * Request::Status.encode(0).bytes().len();
+    bench.to_sensor = Box::new(move |number, byte| (number < asked).then_some(byte));
+    // The host stands still at times, so that several scans wait where it changes its rate.
+    for pause in 1..60 {
+        bench.run(pause * 70 * MILLIS);
+        bench.stop(1_700 * MILLIS);
+    }
+    assert!(bench.session.sensor().mode.is_some() && bench.received_scans(begun).len() > 20, "{bench}");
+    assert!(bench.received.iter().all(|received| received.mode.is_none()), "{bench}");
+    assert!(!bench.states.contains(&State::Streaming), "{bench}");
+    bench.to_sensor = Box::new(|_, byte| Some(byte));
+    bench.until("streaming", 10_000 * MILLIS, Bench::is_streaming);
+    bench.until("scans", 1_000 * MILLIS, |bench| {
+        bench.received.last().is_some_and(|last| last.mode.is_some())
+    });
 }
 
 #[test]

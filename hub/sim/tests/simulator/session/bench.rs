@@ -3,13 +3,16 @@
 
 use std::collections::VecDeque;
 
+use line::State;
+use line::{Output, Session as _};
+use lms::Session;
 use lms::command::Request;
-use lms::session::{Output, Session};
 use lms::variant::{Baud, Mode, Variant};
-use lms::{MICROS, MILLIS, Nanos, Settings, State, line_time};
+use lms::{MICROS, MILLIS, Nanos, Settings, line_time};
 use sim::Arrival;
+use sim::device::{Device as _, Part};
 use sim::fault::{Fault, Faults};
-use sim::machine::{self, Machine, Part};
+use sim::machine::{self, Machine};
 use sim::noise::Mistuned;
 use sim::room::Room;
 use sim::source::Source;
@@ -230,16 +233,18 @@ impl Bench {
     fn drain(&mut self) -> (bool, Nanos) {
         let wait = loop {
             match self.session.poll_output() {
-                Output::SetBaud(baud) => {
-                    self.port = baud;
+                Output::SetRate(baud) => {
+                    self.port = self.session.baud();
+                    assert_eq!(self.port.rate(), baud);
                     self.damaged |= !self.inbox.is_empty();
                     self.inbox.clear();
                 }
                 Output::Transmit { byte, not_before } => self.transmit(byte, not_before),
-                Output::Telegram(received) => {
-                    let telegram = received.telegram.bytes().to_vec();
+                Output::Heard(received) => {
+                    let telegram = received.message.telegram.bytes().to_vec();
                     let looks = std::mem::take(&mut self.looks);
-                    let lms::session::Received { mode, reasons, first, estimated, .. } = received;
+                    let lms::session::Received { message, reasons, first, estimated, .. } = received;
+                    let mode = message.mode;
                     let at = self.now;
                     self.received.push(Received { at, telegram, mode, reasons, first, estimated, looks });
                 }
@@ -248,7 +253,8 @@ impl Bench {
             }
         };
         let tally = self.session.tally();
-        let known = tally.in_telegrams + tally.acknowledge + tally.discarded + self.session.buffered() as u64;
+        let known =
+            tally.in_telegrams + tally.acknowledge + tally.discarded + self.session.account().buffered;
         assert_eq!((tally.read, known), (self.read, self.read), "bytes vanished");
         assert_eq!(self.machine.eeprom_writes(), 0);
         self.streamed &= self.is_streaming();
@@ -314,10 +320,10 @@ impl Bench {
         if carried.is_telegram() {
             self.fault = self.fault.or(carried.fault);
         }
-        let Carried { bytes: brought, baud, idle_after, part, .. } = carried;
+        let Carried { bytes: brought, rate, idle_after, part, .. } = carried;
         let mut bytes = (self.to_host)(self.now, brought.clone());
-        if baud != self.port {
-            bytes = self.mistuned.receive((baud.rate(), self.port.rate()), &bytes, idle_after);
+        if rate != self.port.rate() {
+            bytes = self.mistuned.receive((rate, self.port.rate()), &bytes, idle_after);
         }
         bytes.truncate(self.room - self.inbox.len());
         self.damaged |= bytes != brought;
@@ -329,7 +335,7 @@ impl Bench {
                 self.damaged = false;
                 self.acknowledged.extend(brought.first().map(|&byte| (self.now, byte)));
             }
-            Some(Part::End(machine::Sent { is_reply, telegram, aborted })) => {
+            Some(Part::End(sim::device::Sent { is_reply, telegram, aborted })) => {
                 let fault = self.fault.take();
                 let damaged = std::mem::take(&mut self.damaged) || fault.is_some();
                 let streams = self.is_streaming();

@@ -1,7 +1,8 @@
 //! What a user may ask of a running session: pause, resume, resync.
 
+use line::{Control, Session as _, State};
 use lms::variant::Baud;
-use lms::{Control, MILLIS, Nanos, State, Trouble};
+use lms::{MILLIS, Nanos, Trouble};
 use sim::operating::Operating;
 
 use super::bench::{Bench, make_stream, sensor};
@@ -30,7 +31,7 @@ fn a_pause_stops_the_stream_and_a_resume_starts_it() {
         bench.run(20_000 * MILLIS);
         assert_eq!((bench.session.state(), bench.said.len()), (State::Paused, said), "{bench}");
         assert_eq!(sent_after(&bench, quiet), 0, "the sensor streams on: {bench}");
-        assert_eq!((bench.session.trouble(), bench.session.resyncs()), (None, 0));
+        assert_eq!((bench.session.trouble(), bench.session.account().resyncs), (None, 0));
         bench.control(Control::Resume);
         bench.control(Control::Resume);
         bench.until("streaming", 2_000 * MILLIS, Bench::is_streaming);
@@ -136,7 +137,7 @@ fn a_resync_begins_anew_and_is_counted() {
     bench.run(500 * MILLIS);
     let (said, begun) = (bench.said.len(), bench.now);
     bench.control(Control::Resync);
-    assert_eq!((bench.session.state(), bench.session.resyncs()), (State::Probing, 1));
+    assert_eq!((bench.session.state(), bench.session.account().resyncs), (State::Probing, 1));
     bench.until("streaming", 60 * MILLIS, Bench::is_streaming);
     bench.run(1_000 * MILLIS);
     assert_eq!(bench.said.len(), said + 2 * 7, "an adopted stream costs two questions");
@@ -148,7 +149,7 @@ fn a_resync_begins_anew_and_is_counted() {
     bench.run(500 * MILLIS);
     bench.control(Control::Resync);
     bench.until("streaming", 2_000 * MILLIS, Bench::is_streaming);
-    assert_eq!(bench.session.resyncs(), 2);
+    assert_eq!(bench.session.account().resyncs, 2);
 }
 
 #[test]
@@ -160,7 +161,7 @@ fn a_recording_is_not_controlled() {
     for control in [Control::Pause, Control::Resume, Control::Resync] {
         bench.control(control);
         bench.run(200 * MILLIS);
-        assert_eq!((bench.session.state(), bench.session.resyncs()), (State::Streaming, 0));
+        assert_eq!((bench.session.state(), bench.session.account().resyncs), (State::Streaming, 0));
     }
     assert!(bench.said.is_empty());
 }

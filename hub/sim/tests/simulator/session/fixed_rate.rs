@@ -1,7 +1,8 @@
 //! A line whose rate somebody set by hand, as that of a serial server: it is talked to at that rate and no other.
 
+use line::State;
 use lms::variant::Baud;
-use lms::{MILLIS, Settings, State, Trouble};
+use lms::{MILLIS, Settings, Trouble};
 
 use super::bench::{Bench, WANTED, make_stream, sensor};
 

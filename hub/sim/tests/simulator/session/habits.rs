@@ -1,7 +1,8 @@
 //! A sensor that overlooks requests, says NAK, answers late or twice, refuses: it streams all the same.
 
+use line::{Session as _, State};
 use lms::variant::{Baud, Mode, Variant};
-use lms::{MILLIS, State, Trouble};
+use lms::{MILLIS, Trouble};
 use sim::machine::{Habits, Settings, Start};
 use sim::operating::Operating;
 
@@ -130,7 +131,7 @@ fn a_stream_of_a_sensor_that_answers_nothing_is_taken() {
     bench.machine.set_habits(Habits::default());
     bench.until("mode known", 11_000 * MILLIS, |bench| bench.session.sensor().mode.is_some());
     bench.run(500 * MILLIS);
-    assert_eq!((bench.session.trouble(), bench.session.resyncs()), (None, 0));
+    assert_eq!((bench.session.trouble(), bench.session.account().resyncs), (None, 0));
 }
 
 #[test]

@@ -3,6 +3,7 @@
 
 use lms::variant::Baud;
 use lms::{MILLIS, Notice};
+use sim::device::Device as _;
 use sim::machine::{Habits, Settings, Start};
 use sim::operating::Operating;
 

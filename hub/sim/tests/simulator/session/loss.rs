@@ -1,5 +1,6 @@
 //! A line that loses bytes in bursts, as the paper's did: what is intact is delivered, in order and bit for bit.
 
+use line::Session as _;
 use lms::variant::Baud;
 use lms::{MILLIS, Nanos};
 use sim::fault::{Faults, Loss};
@@ -27,7 +28,7 @@ fn delivered(faults: Faults, seed: u64, span: Nanos) -> (usize, usize) {
     let (intact, scans) = (bench.intact_scans(begun), bench.received_scans(begun));
     assert!(scans == intact, "{} received, {} intact: {bench}", scans.len(), intact.len());
     let sent = bench.sent.iter().filter(|sent| sent.at > begun && !sent.is_reply).count();
-    assert_eq!(bench.session.resyncs(), 0);
+    assert_eq!(bench.session.account().resyncs, 0);
     (sent, intact.len())
 }
 

@@ -1,7 +1,8 @@
 //! How much of a stream the line loses, as a session finds out from when scans come, beside what was really sent.
 
+use line::{Control, Session as _};
 use lms::variant::Baud;
-use lms::{Control, MILLIS, Nanos};
+use lms::{MILLIS, Nanos};
 use sim::fault::{Faults, Loss};
 
 use super::bench::{Bench, sensor};
@@ -31,13 +32,13 @@ fn ten_minutes_of_the_bursts_of_the_paper() {
     });
     bench.run(600_000 * MILLIS);
     let (sent, lost) = truth(&bench, begun);
-    let counted = bench.session.scans_lost();
-    println!("{lost} of {sent} lost, {counted} counted, {} due", bench.session.scans_due());
+    let counted = bench.session.account().lost;
+    println!("{lost} of {sent} lost, {counted} counted, {} due", bench.session.account().due);
     assert!(sent > 20_000 && lost * 10 > sent * 3);
     assert!(counted.abs_diff(lost) * 100 <= sent, "{counted} instead of {lost} of {sent}: {bench}");
-    assert_eq!(bench.session.resyncs(), 0);
+    assert_eq!(bench.session.account().resyncs, 0);
     let tally = bench.session.tally();
-    let share = bench.session.bytes_damaged() as f64 / tally.read as f64;
+    let share = bench.session.account().damaged as f64 / tally.read as f64;
     assert!((0.3..0.5).contains(&share), "{share} of the bytes");
 }
 
@@ -53,7 +54,7 @@ fn slower_lines_lose_what_they_lose() {
             bytes
         });
         bench.run(minutes * 60_000 * MILLIS);
-        let ((sent, lost), counted) = (truth(&bench, begun), bench.session.scans_lost());
+        let ((sent, lost), counted) = (truth(&bench, begun), bench.session.account().lost);
         println!("{baud:?}: {counted} of {lost} of {sent}");
         assert!(
             lost > 100 && counted.abs_diff(lost) * 100 <= sent,
@@ -65,8 +66,8 @@ fn slower_lines_lose_what_they_lose() {
 #[test]
 fn a_line_that_is_well_has_lost_nothing_whatever_is_asked_of_its_sensor() {
     let mut bench = streaming(Baud::B500000);
-    let well = |bench: &Bench| (bench.session.scans_lost(), bench.session.bytes_damaged()) == (0, 0);
-    assert!(bench.session.scans_due() > 60 && well(&bench), "{bench}");
+    let well = |bench: &Bench| (bench.session.account().lost, bench.session.account().damaged) == (0, 0);
+    assert!(bench.session.account().due > 60 && well(&bench), "{bench}");
     for control in [Control::Pause, Control::Resume, Control::Resync] {
         bench.session.control(control, bench.now);
         bench.run(5_000 * MILLIS);
@@ -81,9 +82,9 @@ fn a_line_that_is_well_has_lost_nothing_whatever_is_asked_of_its_sensor() {
     bench.run(5_000 * MILLIS);
     assert!(well(&bench), "{bench}");
     // One telegram less.
-    let (begun, due) = (bench.now, bench.session.scans_due());
+    let (begun, due) = (bench.now, bench.session.account().due);
     bench.to_host = Box::new(move |at, bytes| if at < begun + 27 * MILLIS { Vec::new() } else { bytes });
     bench.run(5_000 * MILLIS);
-    assert!((1..=2).contains(&bench.session.scans_lost()), "{}", bench.session.scans_lost());
-    assert!((185..190).contains(&(bench.session.scans_due() - due)));
+    assert!((1..=2).contains(&bench.session.account().lost), "{}", bench.session.account().lost);
+    assert!((185..190).contains(&(bench.session.account().due - due)));
 }

@@ -1,9 +1,11 @@
 //! A sensor whose power goes and comes: in the middle of a scan, in the middle of the conversation, and one that needs
 //! a minute to start.
 
+use line::{Control, Session as _, State};
 use lms::command::Request;
 use lms::variant::Baud;
-use lms::{Control, MILLIS, Nanos, State, Trouble};
+use lms::{MILLIS, Nanos, Trouble};
+use sim::device::Device as _;
 use sim::machine::{Habits, Settings, Start};
 
 use super::bench::{Bench, sensor_with};
@@ -35,7 +37,11 @@ fn in_the_middle_of_a_scan() {
             slowest = slowest.max(took);
             bench.run(500 * MILLIS);
             assert!(bench.is_streaming() && bench.session.baud() == Baud::B500000, "{bench}");
-            assert_eq!((bench.session.resyncs(), bench.session.trouble()), (1, None), "{boot} {phase}");
+            assert_eq!(
+                (bench.session.account().resyncs, bench.session.trouble()),
+                (1, None),
+                "{boot} {phase}"
+            );
         }
     }
     println!("streaming within {} ms of the banner", slowest / MILLIS);
@@ -76,7 +82,7 @@ fn a_banner_that_is_heard_is_answered_at_once() {
     bench.machine.power_cycle(now);
     bench.run(300 * MILLIS);
     bench.until("asked", 100 * MILLIS, |bench| bench.said.len() > said);
-    assert_eq!(bench.session.resyncs(), 1);
+    assert_eq!(bench.session.account().resyncs, 1);
     bench.until("streaming", 3_000 * MILLIS, |bench| bench.is_streaming());
 
     let settings = Settings { start: Start::PowerOn, ..booting(60_000 * MILLIS) };

@@ -1,12 +1,14 @@
 //! Whatever happens in whatever order: nothing panics, no byte is unaccounted for, no request writes the EEPROM, and
 //! once a healthy sensor is there, its stream is. One seed reproduces a run.
 
+use line::{Control, State};
+use line::{Output, Session as _};
+use lms::Session;
 use lms::command::{EEPROM_WRITES, Request};
 use lms::reply::{self, Health};
-use lms::session::{Output, Session};
 use lms::telegram::{FRAME, REPLY, STX, Telegram, Writer};
 use lms::variant::{Baud, Mode, Unit, Variant};
-use lms::{Control, MILLIS, Nanos, Settings, State, line_time};
+use lms::{MILLIS, Nanos, Settings, line_time};
 use lms_configure::eeprom::Write;
 use sim::machine::{self, Start};
 use sim::operating::Operating;
@@ -91,16 +93,17 @@ impl Chaos {
                     self.now = self.now.max(not_before);
                     self.session.transmitted(self.now);
                 }
-                Output::SetBaud(_) => {}
-                Output::Telegram(received) => {
-                    assert!(Telegram::check(received.telegram.bytes()).is_some());
+                Output::SetRate(_) => {}
+                Output::Heard(received) => {
+                    assert!(Telegram::check(received.message.telegram.bytes()).is_some());
                     self.telegrams += 1;
                 }
                 Output::Rest(_) | Output::Wait { .. } => break,
             }
         }
         let tally = self.session.tally();
-        let known = tally.in_telegrams + tally.acknowledge + tally.discarded + self.session.buffered() as u64;
+        let known =
+            tally.in_telegrams + tally.acknowledge + tally.discarded + self.session.account().buffered;
         assert_eq!((tally.read, known), (self.read, self.read), "bytes vanished");
         assert_eq!(tally.telegrams, self.telegrams);
     }

@@ -1,6 +1,7 @@
 //! How often the host looks at the line, and how soon it has what it waits for: once a session has learned how long a
 //! telegram takes, it lets it come, and is there when it ends.
 
+use line::Session as _;
 use lms::variant::{Baud, Variant};
 use lms::{MICROS, MILLIS};
 use sim::ChunkSize;
@@ -56,7 +57,7 @@ fn what_a_killed_host_would_lose_is_not_read_before_it_is_nearly_complete() {
     let mut exposed = 0;
     for _ in 0..looks {
         bench.run(MILLIS - MILLIS / 7);
-        exposed += u32::from(bench.session.buffered() > 0);
+        exposed += u32::from(bench.session.account().buffered > 0);
     }
     // 0.6 ms and a chunk of every 26.64.
     assert!(exposed * 100 < looks * 6, "{exposed} of {looks}");

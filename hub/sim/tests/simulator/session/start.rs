@@ -1,7 +1,8 @@
 //! A sensor that is idle at one of its rates.
 
+use line::{Session as _, State};
+use lms::MILLIS;
 use lms::variant::{Baud, Mode, Unit, Variant};
-use lms::{MILLIS, State};
 
 use sim::machine::{Habits, Settings, Start};
 use sim::operating::Operating;
@@ -22,7 +23,7 @@ fn from_each_rate_to_a_stream_within_three_seconds() {
             (Some(Mode(1)), Some(Unit::Mm), Some(Variant::HALF))
         );
         assert_eq!((known.kind(), known.address), (&b"LMS200;301063;V02.30"[..], Some(0x80)));
-        assert_eq!((bench.session.trouble(), bench.session.resyncs()), (None, 0));
+        assert_eq!((bench.session.trouble(), bench.session.account().resyncs), (None, 0));
         let scans = bench.received_scans(since);
         assert!(scans.len() >= 36 && scans == bench.intact_scans(since)[..scans.len()], "{bench}");
         // A rate is changed only where it has to be.

@@ -1,5 +1,6 @@
 //! A host that does not run for a while: what waited for it is dated by the beat of the stream, not by when it was read.
 
+use line::Session as _;
 use lms::variant::{Baud, Variant};
 use lms::{MICROS, MILLIS, Nanos};
 use sim::machine::{Machine, Settings};
@@ -64,7 +65,7 @@ fn what_waited_is_dated_by_its_place_among_what_waited() {
         let (count, median) = (all.len(), median(all));
         println!("{baud:?} {variant:?}: {count} that waited, median error {} us", median / MICROS);
         assert!(count > 15 && median < MILLIS, "{count} {median}");
-        assert_eq!((bench.session.resyncs(), bench.session.scans_lost()), (0, 0));
+        assert_eq!((bench.session.account().resyncs, bench.session.account().lost), (0, 0));
     }
 }
 
@@ -85,7 +86,7 @@ fn where_the_buffer_was_full_a_stamp_is_right_or_says_that_it_is_none() {
         }
         bench.run(2_000 * MILLIS);
         let lost = bench.sent.iter().filter(|sent| sent.damaged && !sent.is_reply && !sent.aborted).count();
-        let counted = bench.session.scans_lost();
+        let counted = bench.session.account().lost;
         assert!(counted.abs_diff(lost as u64) <= 2, "{counted} of {lost} with room for {room}");
     }
 }

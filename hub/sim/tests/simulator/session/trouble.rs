@@ -1,7 +1,8 @@
 //! A sensor that refuses, a line that loses a request or a reply, a stream that stops: the session streams all the same.
 
+use line::{Session as _, State};
 use lms::variant::{Baud, Unit, Variant};
-use lms::{MILLIS, State, Trouble};
+use lms::{MILLIS, Trouble};
 use sim::machine::{Habits, Machine, Settings};
 use sim::room::Room;
 use sim::source::Source;
@@ -110,11 +111,11 @@ fn a_second_of_silence_begins_again_with_two_questions() {
     bench.to_host = Box::new(move |at, bytes| if at < cut + 1_050 * MILLIS { Vec::new() } else { bytes });
     bench.until("silent", 1_040 * MILLIS, |bench| bench.session.state() == State::Silent);
     assert!(bench.now >= cut + 970 * MILLIS, "gave up early: {bench}");
-    assert_eq!((bench.session.resyncs(), bench.session.trouble()), (1, Some(Trouble::Silence)));
+    assert_eq!((bench.session.account().resyncs, bench.session.trouble()), (1, Some(Trouble::Silence)));
     bench.until("streaming", 200 * MILLIS, Bench::is_streaming);
     bench.run(1_000 * MILLIS);
     assert!(bench.is_streaming(), "{bench}");
-    assert_eq!((bench.session.resyncs(), bench.session.trouble()), (1, None));
+    assert_eq!((bench.session.account().resyncs, bench.session.trouble()), (1, None));
     // Who it is, and how its values are split: it might be another one.
     assert_eq!(bench.said.len(), said + 2 * 7);
 }
@@ -143,7 +144,7 @@ fn a_sensor_whose_power_was_cycled() {
     bench.until("streaming", 3_000 * MILLIS, Bench::is_streaming);
     bench.run(500 * MILLIS);
     assert!(bench.is_streaming() && bench.session.baud() == Baud::B500000, "{bench}");
-    assert_eq!((bench.session.resyncs(), bench.session.trouble()), (1, None));
+    assert_eq!((bench.session.account().resyncs, bench.session.trouble()), (1, None));
 }
 
 #[test]

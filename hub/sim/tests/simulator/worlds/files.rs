@@ -153,7 +153,8 @@ fn what_is_no_world_is_refused_by_name_place_and_remedy() {
         ),
         ("[[person]]\npath = [[0, 0], [1, 1]]\nspeed_mm_s = \"fast\"", "w.toml:3:14: ", "docs/worlds.md"),
         ("[[person]]\ncentre = [0, 0]\nreach = [0, 1]", "w.toml:3:9: 0 is not between 1", "docs/worlds.md"),
-        ("[[sun]]\nsector_deg = [9, 1]", "w.toml:2:14: sector_deg", "the smaller one first"),
+        ("[[sun]]\nfrom_deg = 9\nto_deg = -1", "w.toml:3:10: from_deg", "the smaller one first"),
+        ("[[sun]]\nsector_deg = [93, 116]", "w.toml:2:14: sector_deg", "from_deg = 3.0, to_deg = 26.0"),
         ("[[sun]\n", "w.toml:1:7: ", "docs/worlds.md"),
     ] {
         let failure = refused(text);

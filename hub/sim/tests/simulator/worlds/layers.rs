@@ -193,7 +193,7 @@ fn dark_and_oblique_surfaces_far_away_are_too_weak() {
 
 #[test]
 fn the_sun_dazzles_a_sector_for_a_time() {
-    let text = format!("{WORLD}[[sun]]\nsector_deg = [90, 95]\nfrom_s = 2\nuntil_s = 4\nshare = 0.5\n");
+    let text = format!("{WORLD}[[sun]]\nfrom_deg = 0\nto_deg = 5\nfrom_s = 2\nuntil_s = 4\nshare = 0.5\n");
     let dazzled = |dazzle, end_s: u64, beams: std::ops::RangeInclusive<usize>| {
         let room = Room::new(&world(&text).with_layers(Layers { dazzle, ..NONE }), 1);
         let codes = (0..40).flat_map(|scan| {
@@ -239,7 +239,7 @@ fn reflectors_have_graded_levels_around_their_middle() {
         assert_eq!(marks.len(), 12);
         let words = look(&room, SCAN_NS).words;
         for mark in marks {
-            let near = |beam: &usize| (*beam as f64 / 2.0 - mark.angle_deg).abs() < 3.0;
+            let near = |beam: &usize| (*beam as f64 / 2.0 - 90.0 - mark.angle_deg).abs() < 3.0;
             let bright: Vec<usize> = (0..361)
                 .filter(near)
                 .filter(|&beam| words[beam] >> 13 > 0 && words[beam] & 8191 < 8183)
@@ -248,7 +248,7 @@ fn reflectors_have_graded_levels_around_their_middle() {
             let sum: f64 = bright.iter().map(|&beam| f64::from(words[beam] >> 13) * beam as f64 / 2.0).sum();
             assert!(weight > 0.0, "seed {seed}: nothing of {mark:?}");
             assert!(bright.iter().all(|&beam| (f64::from(words[beam] & 8191) - mark.range_mm).abs() < 60.0));
-            errors.push(sum / weight - mark.angle_deg);
+            errors.push(sum / weight - 90.0 - mark.angle_deg);
         }
     }
     let rms = (errors.iter().map(|error| error * error).sum::<f64>() / errors.len() as f64).sqrt();

@@ -1,15 +1,19 @@
-//! Golden size, offsets and bytes of every payload of version 1. Do not change these tests: another layout is another
-//! version. The bytes stand in `tests/vectors/v1` too, for other languages.
+//! Golden size, offsets and bytes of every payload of version 2. Do not change these tests: another layout is another
+//! version. The bytes stand in `tests/vectors/v2` too, for other languages.
+
+#[path = "v2/scan.rs"]
+mod scan;
 
 use std::mem::{offset_of, size_of};
 
 use schema::{
-    BEAMS, Background, COUNTERS, Counter, Counters, Failure, Foreground, Header, Kind, Mark, Marks, Pose,
-    Request, Response, Scan, Segment, State, Status, Verb, Zone, Zones,
+    Background, BackgroundHead, BackgroundWord, COUNTERS, Counter, Counters, Failure, Foreground,
+    ForegroundHead, ForegroundWord, Header, Kind, Mark, Marks, Pose, Request, Response, SEGMENTS, Segment,
+    Shown, State, Status, Verb, Zone, Zones,
 };
 
 /// Builds the expected bytes: `size` zeros with `fields` written over them.
-fn golden(size: usize, fields: &[(usize, &[u8])]) -> Vec<u8> {
+pub(crate) fn golden(size: usize, fields: &[(usize, &[u8])]) -> Vec<u8> {
     let mut bytes = vec![0; size];
     for &(offset, field) in fields {
         bytes[offset..offset + field.len()].copy_from_slice(field);
@@ -18,8 +22,8 @@ fn golden(size: usize, fields: &[(usize, &[u8])]) -> Vec<u8> {
 }
 
 /// The bytes that other languages read.
-fn shared(file: &str) -> Vec<u8> {
-    let path = concat!(env!("CARGO_MANIFEST_DIR"), "/../tests/vectors/v1/").to_owned() + file;
+pub(crate) fn shared(file: &str) -> Vec<u8> {
+    let path = concat!(env!("CARGO_MANIFEST_DIR"), "/../tests/vectors/v2/").to_owned() + file;
     let text = std::fs::read_to_string(&path).unwrap_or_else(|error| panic!("{path}: {error}"));
     let digits: Vec<u32> = text.chars().filter_map(|c| c.to_digit(16)).collect();
     digits.chunks(2).map(|pair| (pair[0] << 4 | pair[1]) as u8).collect()
@@ -77,50 +81,6 @@ fn header_bytes() {
     );
     assert_eq!(bytemuck::bytes_of(&header), expected);
     assert_eq!(shared("header.hex"), expected);
-}
-
-#[test]
-fn scan_layout() {
-    assert_eq!((size_of::<Scan>(), align_of::<Scan>(), BEAMS), (1216, 4, 401));
-    assert_eq!(offset_of!(Scan, count), 0);
-    assert_eq!(offset_of!(Scan, unit_mm), 2);
-    assert_eq!(offset_of!(Scan, range_bits), 3);
-    assert_eq!(offset_of!(Scan, first_angle_mdeg), 4);
-    assert_eq!(offset_of!(Scan, step_mdeg), 8);
-    assert_eq!(offset_of!(Scan, intensity_bits), 10);
-    assert_eq!(offset_of!(Scan, contents), 11);
-    assert_eq!(offset_of!(Scan, range_array), 12);
-    assert_eq!(offset_of!(Scan, upper_array), 814);
-    assert_eq!(offset_of!(Scan, pad), 1215);
-}
-
-#[test]
-fn scan_bytes() {
-    let mut scan = Scan {
-        count: 401,
-        unit_mm: 10,
-        range_bits: 13,
-        first_angle_mdeg: -40_000,
-        step_mdeg: 250,
-        intensity_bits: 3,
-        contents: 1,
-        ..Scan::default()
-    };
-    scan.range_array[0] = 0x1234;
-    scan.range_array[400] = 0x1FFF;
-    scan.upper_array[0] = 7;
-    scan.upper_array[400] = 6;
-    let expected = golden(
-        1216,
-        &[
-            (0, &[0x91, 0x01, 10, 13, 0xC0, 0x63, 0xFF, 0xFF, 250, 0, 3, 1]),
-            (12, &[0x34, 0x12]),
-            (812, &[0xFF, 0x1F, 7]),
-            (1214, &[6, 0]),
-        ],
-    );
-    assert_eq!(bytemuck::bytes_of(&scan), expected);
-    assert_eq!(shared("scan.hex"), expected);
 }
 
 #[test]
@@ -184,72 +144,80 @@ fn zones_bytes() {
 
 #[test]
 fn foreground_layout() {
-    assert_eq!((size_of::<Foreground>(), align_of::<Foreground>()), (1892, 4));
-    assert_eq!((offset_of!(Foreground, generation), offset_of!(Foreground, count)), (0, 4));
-    assert_eq!((offset_of!(Foreground, beams), offset_of!(Foreground, unit_mm)), (6, 8));
-    assert_eq!((offset_of!(Foreground, left_out), offset_of!(Foreground, segments)), (9, 10));
-    assert_eq!((offset_of!(Foreground, bit_array), offset_of!(Foreground, pad)), (12, 63));
-    assert_eq!((offset_of!(Foreground, range_array), offset_of!(Foreground, pad2)), (64, 866));
-    assert_eq!(offset_of!(Foreground, segment_array), 868);
-    assert_eq!((size_of::<Segment>(), align_of::<Segment>()), (16, 4));
+    assert_eq!((size_of::<ForegroundHead>(), align_of::<ForegroundHead>(), Foreground::HEAD), (16, 4, 16));
+    assert_eq!((size_of::<ForegroundWord>(), align_of::<ForegroundWord>()), (8, 8));
+    assert_eq!((offset_of!(ForegroundHead, generation), offset_of!(ForegroundHead, unit_um)), (0, 4));
+    assert_eq!((offset_of!(ForegroundHead, count), offset_of!(ForegroundHead, beams)), (8, 10));
+    assert_eq!((offset_of!(ForegroundHead, segments), offset_of!(ForegroundHead, left_out)), (12, 14));
+    assert_eq!((size_of::<Segment>(), align_of::<Segment>(), SEGMENTS), (16, 4, 64));
     assert_eq!((offset_of!(Segment, first), offset_of!(Segment, last)), (0, 2));
     assert_eq!((offset_of!(Segment, nearest), offset_of!(Segment, width)), (4, 6));
     assert_eq!((offset_of!(Segment, x_mm), offset_of!(Segment, y_mm)), (8, 12));
+    assert_eq!([16, 17, 401].map(Foreground::len), [1074, 1078, 1894]);
 }
 
 #[test]
 fn foreground_bytes() {
-    let mut foreground = Foreground {
+    let mut foreground = Foreground::of(401);
+    let arrays = foreground.begin(ForegroundHead {
         generation: 0x0001_0203,
+        unit_um: 10_000,
         count: 401,
         beams: 1,
-        unit_mm: 10,
-        left_out: 255,
         segments: 64,
-        ..Foreground::default()
-    };
-    foreground.bit_array[50] = 1;
-    foreground.range_array[0] = 0x1234;
-    foreground.segment_array[63] =
-        Segment { first: 400, last: 0x0105, nearest: 6, width: 7, x_mm: -2, y_mm: 8 };
+        left_out: 0x0104,
+    });
+    arrays.segments[63] = Segment { first: 400, last: 0x0105, nearest: 6, width: 7, x_mm: -2, y_mm: 8 };
+    (arrays.bits[50], arrays.ranges[0]) = (1, 0x1234);
     let expected = golden(
-        1892,
+        1894,
         &[
-            (0, &[3, 2, 1, 0, 0x91, 0x01, 1, 0, 10, 255, 64, 0]),
-            (62, &[1, 0, 0x34, 0x12]),
-            (1876, &[0x90, 0x01, 5, 1, 6, 0, 7, 0, 0xFE, 0xFF, 0xFF, 0xFF, 8]),
+            (0, &[3, 2, 1, 0, 0x10, 0x27, 0, 0, 0x91, 0x01, 1, 0, 64, 0, 4, 1]),
+            (1024, &[0x90, 0x01, 5, 1, 6, 0, 7, 0, 0xFE, 0xFF, 0xFF, 0xFF, 8]),
+            (1090, &[1, 0, 0x34, 0x12]),
         ],
     );
-    assert_eq!(bytemuck::bytes_of(&foreground), expected);
+    assert_eq!(foreground.bytes(), expected);
     assert_eq!(shared("foreground.hex"), expected);
 }
 
 #[test]
 fn background_layout() {
-    assert_eq!((size_of::<Background>(), align_of::<Background>()), (816, 4));
-    assert_eq!((offset_of!(Background, generation), offset_of!(Background, taught)), (0, 4));
-    assert_eq!((offset_of!(Background, count), offset_of!(Background, unit_mm)), (6, 8));
-    assert_eq!((offset_of!(Background, flags), offset_of!(Background, reserved)), (9, 10));
-    assert_eq!((offset_of!(Background, range_array), offset_of!(Background, pad)), (12, 814));
+    assert_eq!((size_of::<BackgroundHead>(), align_of::<BackgroundHead>(), Background::HEAD), (32, 8, 32));
+    assert_eq!((size_of::<BackgroundWord>(), align_of::<BackgroundWord>()), (8, 8));
+    assert_eq!((offset_of!(BackgroundHead, first_angle), offset_of!(BackgroundHead, step)), (0, 8));
+    assert_eq!((offset_of!(BackgroundHead, generation), offset_of!(BackgroundHead, unit_um)), (16, 20));
+    assert_eq!((offset_of!(BackgroundHead, taught), offset_of!(BackgroundHead, count)), (24, 26));
+    assert_eq!((offset_of!(BackgroundHead, flags), offset_of!(BackgroundHead, reserved)), (28, 29));
+    assert_eq!((Background::UNTAUGHT, Background::FAR, Background::len(401)), (0, 0xFFFF, 834));
 }
 
 #[test]
 fn background_bytes() {
-    let mut background = Background {
+    let head = BackgroundHead {
+        first_angle: -0.25,
+        step: -1.5,
         generation: 0x0001_0203,
+        unit_um: 10_000,
         taught: 0x0104,
-        count: 401,
-        unit_mm: 10,
         flags: Background::FROZEN,
-        ..Background::default()
+        ..BackgroundHead::default()
     };
-    background.range_array[0] = 0x1234;
-    background.range_array[400] = Background::FAR;
-    let expected =
-        golden(816, &[(0, &[3, 2, 1, 0, 4, 1, 0x91, 0x01, 10, 1, 0, 0, 0x34, 0x12]), (812, &[0xFF, 0xFF])]);
-    assert_eq!(bytemuck::bytes_of(&background), expected);
+    let mut model = Background::of(head, &[0; 401]);
+    (model.ranges_mut()[0], model.ranges_mut()[400]) = (0x1234, Background::FAR);
+    let expected = golden(
+        834,
+        &[
+            (0, &(-0.25_f64).to_le_bytes()),
+            (8, &(-1.5_f64).to_le_bytes()),
+            (16, &[3, 2, 1, 0, 0x10, 0x27, 0, 0, 4, 1, 0x91, 0x01, 1]),
+            (32, &[0x34, 0x12]),
+            (832, &[0xFF, 0xFF]),
+        ],
+    );
+    assert_eq!(model.bytes(), expected);
     assert_eq!(shared("background.hex"), expected);
-    assert_eq!(background.packed(), &expected[..814]);
+    assert_eq!(Background::read(&expected), Some(model));
 }
 
 #[test]
@@ -332,39 +300,41 @@ fn counters_in_order() {
 }
 
 #[test]
-fn request_layout() {
-    assert_eq!((size_of::<Request>(), align_of::<Request>()), (848, 2));
-    assert_eq!(offset_of!(Request, sensor_text), 0);
-    assert_eq!(offset_of!(Request, verb), 32);
-    assert_eq!(offset_of!(Request, count), 34);
-    assert_eq!(offset_of!(Request, unit_mm), 36);
-    assert_eq!(offset_of!(Request, reserved), 37);
-    assert_eq!(offset_of!(Request, range_array), 40);
-    assert_eq!(offset_of!(Request, pad), 842);
-    assert_eq!([Verb::Pause as u16, Verb::Resume as u16, Verb::Resync as u16], [1, 2, 3]);
-}
-
-#[test]
 fn request_bytes() {
-    let mut request = Request { count: 401, unit_mm: 10, ..Request::new("front", Verb::Resync) };
-    request.range_array[0] = 0x1234;
-    request.range_array[400] = 0x1FFF;
+    let verbs: Vec<_> = Verb::all().map(|verb| (verb as u16, verb.name())).collect();
+    let flow = [(1, "pause"), (2, "resume"), (3, "resync")];
+    let background = [(16, "show"), (17, "reset"), (18, "freeze"), (19, "thaw"), (20, "load")];
+    assert_eq!(verbs, [&flow[..], &background].concat());
+    let plain = golden(40, &[(0, b"front"), (32, &[3])]);
+    assert_eq!(Request::new("front", Verb::Resync).encode(), plain);
+    let head = BackgroundHead { step: 0.5, unit_um: 10_000, ..BackgroundHead::default() };
+    let request = Request::load("front", &Background::of(head, &[0x1234, 0, 0x1FFF]));
     let expected = golden(
-        848,
-        &[(0, b"front"), (32, &[3, 0, 0x91, 0x01, 10]), (40, &[0x34, 0x12]), (840, &[0xFF, 0x1F])],
+        78,
+        &[
+            (0, b"front"),
+            (32, &[20]),
+            (48, &0.5_f64.to_le_bytes()),
+            (60, &[0x10, 0x27, 0, 0, 0, 0, 3]),
+            (72, &[0x34, 0x12, 0, 0, 0xFF, 0x1F]),
+        ],
     );
-    assert_eq!(bytemuck::bytes_of(&request), expected);
+    assert_eq!(request.encode(), expected);
     assert_eq!(shared("request.hex"), expected);
+    assert_eq!(Request::decode(&expected), Some(request));
 }
 
 #[test]
 fn response_bytes() {
     assert_eq!(Response(Ok(None)).encode(), [0, 0, 0, 0]);
-    let model = Background { count: 1, taught: 1, unit_mm: 1, ..Background::default() };
-    let shown = [0, 0, 0, 0, 0, 0, 0, 0, 1, 0, 1, 0, 1, 0, 0, 0, 0, 0];
-    assert_eq!(Response(Ok(Some(model.into()))).encode(), shown);
-    let kept = Response(Ok(Some(schema::Shown { model, kept_wall_ns: Some(17) })));
-    assert_eq!(kept.encode(), [&[0, 0, 2, 0, b'1', b'7'], &shown[4..]].concat());
+    let head = BackgroundHead { step: 0.5, unit_um: 1000, taught: 1, ..BackgroundHead::default() };
+    let model = Background::of(head, &[0x1234]);
+    let bytes =
+        golden(34, &[(8, &0.5_f64.to_le_bytes()), (20, &[0xE8, 3, 0, 0, 1, 0, 1]), (32, &[0x34, 0x12])]);
+    let shown = Response(Ok(Some(model.clone().into())));
+    assert_eq!(shown.encode(), [&[0; 4], &bytes[..]].concat());
+    let kept = Response(Ok(Some(Shown { model, kept_wall_ns: Some(17) })));
+    assert_eq!(kept.encode(), [&[0, 0, 2, 0, b'1', b'7'], &bytes[..]].concat());
     let refused = Response(Err(Failure::new(Kind::Short, "busy", "wait")));
     assert_eq!(refused.encode(), b"\x4b\0\x09\0busy\nwait");
 }

@@ -1,0 +1,173 @@
+//! Samples that come in parts, until they are whole: parts in any order, some twice, some never. However much comes, and from
+//! whomever, the memory for it is bounded. Refuses to know what is in a part, and whether its sample is wanted.
+
+use schema::datagram::{Datagram, Head, PART_LONGEST};
+
+/// The samples that are not whole yet. Those that never will be make room for others, and nobody hears of them again: their
+/// numbers did not arrive.
+#[derive(Default)]
+pub(super) struct Parts {
+    unfinished: Vec<Unfinished>,
+    /// Places whose memory is used again.
+    free: Vec<Unfinished>,
+    /// Parts that came.
+    count: u64,
+}
+
+/// A sample of which a part came.
+struct Unfinished {
+    /// That of its parts, as of the first one.
+    head: Head,
+    from: u64,
+    /// The number of its part that came last, among all that came.
+    last: u64,
+    /// The length of each part that came.
+    lengths: Vec<Option<usize>>,
+    /// The parts, each in a place for the longest.
+    bytes: Vec<u8>,
+}
+
+/// Unfinished samples of one sender, sensor and topic.
+const OF_TOPIC: usize = 4;
+/// Unfinished samples of all senders: 23 MB if all of them are as long as one can be.
+const OF_ALL: usize = 64;
+
+impl Parts {
+    /// Takes a part that came `from` a sender. Once its sample is whole, writes that into `whole`, and returns its header.
+    pub(super) fn take(&mut self, part: &Datagram<'_>, from: u64, whole: &mut Vec<u8>) -> Option<Head> {
+        self.count += 1;
+        let head = Head { part: 0, ..part.head };
+        let known = self.unfinished.iter().position(|it| it.from == from && it.head == head);
+        let at = known.unwrap_or_else(|| self.begin(head, from));
+        let it = &mut self.unfinished[at];
+        it.last = self.count;
+        let number = usize::from(part.head.part);
+        let begin = PART_LONGEST * number;
+        it.bytes[begin..begin + part.payload.len()].copy_from_slice(part.payload);
+        it.lengths[number] = Some(part.payload.len());
+        if it.lengths.iter().any(Option::is_none) {
+            return None;
+        }
+        let it = self.unfinished.swap_remove(at);
+        whole.clear();
+        for (bytes, len) in it.bytes.chunks(PART_LONGEST).zip(it.lengths.iter().flatten()) {
+            whole.extend_from_slice(&bytes[..*len]);
+        }
+        self.free.push(it);
+        Some(Head { parts: 1, ..head })
+    }
+
+    /// Where the sample is from now on. It takes the place of one that says otherwise of the same number, of the one of its
+    /// topic that waits for longest, or of the one of all.
+    fn begin(&mut self, head: Head, from: u64) -> usize {
+        let topic = |it: &Unfinished| (it.from, it.head.hub, it.head.epoch, it.head.sensor, it.head.topic);
+        let of_topic = (from, head.hub, head.epoch, head.sensor, head.topic);
+        let same = self.unfinished.iter().filter(|it| topic(it) == of_topic);
+        let other =
+            self.unfinished.iter().position(|it| topic(it) == of_topic && it.head.sequence == head.sequence);
+        let is_full = same.count() == OF_TOPIC;
+        let waits = self.unfinished.iter().enumerate();
+        let oldest = waits.filter(|(_, it)| !is_full || topic(it) == of_topic).min_by_key(|(_, it)| it.last);
+        let is_full = is_full || self.unfinished.len() == OF_ALL;
+        if let Some(at) = other.or(oldest.filter(|_| is_full).map(|(at, _)| at)) {
+            self.free.push(self.unfinished.swap_remove(at));
+        }
+        let new = || Unfinished { head, from, last: 0, lengths: Vec::new(), bytes: Vec::new() };
+        let mut it = self.free.pop().unwrap_or_else(new);
+        (it.head, it.from) = (head, from);
+        let parts = usize::from(head.parts);
+        it.lengths.clear();
+        it.lengths.resize(parts, None);
+        it.bytes.resize(parts * PART_LONGEST, 0);
+        self.unfinished.push(it);
+        self.unfinished.len() - 1
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn head(sequence: u32) -> Head {
+        Head { topic: 2, hub: 5, sequence, parts: 3, ..Head::default() }
+    }
+
+    /// Takes part number `part` of `head`, which says who it is; what is whole then.
+    fn take(parts: &mut Parts, head: Head, part: u8, from: u64) -> Option<Vec<u8>> {
+        let (payload, mut whole) = ([head.sequence as u8, part].repeat(usize::from(part) + 1), vec![9]);
+        let datagram = Datagram { head: Head { part, ..head }, payload: &payload, mac: None };
+        let told = parts.take(&datagram, from, &mut whole)?;
+        assert_eq!(told, Head { parts: 1, ..head });
+        Some(whole)
+    }
+
+    const WHOLE: [u8; 12] = [7, 0, 7, 1, 7, 1, 7, 2, 7, 2, 7, 2];
+
+    #[test]
+    fn parts_in_any_order_and_some_twice_are_one_sample() {
+        for order in [&[0, 1, 2][..], &[2, 1, 0], &[1, 1, 2, 1, 0], &[2, 0, 0, 2, 1]] {
+            let mut parts = Parts::default();
+            let (last, first) = order.split_last().unwrap();
+            for part in first {
+                assert_eq!(take(&mut parts, head(7), *part, 1), None, "{order:?}");
+            }
+            assert_eq!(take(&mut parts, head(7), *last, 1).as_deref(), Some(&WHOLE[..]), "{order:?}");
+            assert!(parts.unfinished.is_empty());
+        }
+    }
+
+    #[test]
+    fn nothing_is_made_of_parts_of_two() {
+        let mut parts = Parts::default();
+        take(&mut parts, head(7), 0, 1);
+        take(&mut parts, head(7), 1, 1);
+        for (other, from) in [
+            (head(8), 1),
+            (head(7), 2),
+            (Head { hub: 6, ..head(7) }, 1),
+            (Head { epoch: 1, ..head(7) }, 1),
+            (Head { sensor: 1, ..head(7) }, 1),
+        ] {
+            assert_eq!(take(&mut parts, other, 2, from), None, "{other:?}");
+        }
+        assert!(take(&mut parts, head(7), 2, 1).is_some(), "none of them is in the way");
+        // Of one number that says two things nothing is left of the first.
+        take(&mut parts, head(9), 0, 1);
+        for other in
+            [Head { counter: 1, ..head(9) }, Head { stamp_ns: 1, ..head(9) }, Head { parts: 4, ..head(9) }]
+        {
+            assert_eq!((take(&mut parts, other, 1, 1), take(&mut parts, other, 2, 1)), (None, None));
+        }
+        assert_eq!(take(&mut parts, head(9), 1, 1), None);
+    }
+
+    #[test]
+    fn four_of_a_topic_wait_and_the_oldest_makes_room() {
+        let mut parts = Parts::default();
+        for sequence in 0..4 {
+            take(&mut parts, head(sequence), 0, 1);
+        }
+        take(&mut parts, head(0), 1, 1);
+        take(&mut parts, head(4), 0, 1);
+        assert_eq!(parts.unfinished.len(), 4);
+        assert!(take(&mut parts, head(0), 2, 1).is_some(), "it did not wait for longest");
+        take(&mut parts, head(1), 1, 1);
+        assert_eq!(take(&mut parts, head(1), 2, 1), None, "its first part is gone");
+    }
+
+    #[test]
+    fn memory_is_bounded_whoever_sends() {
+        let mut parts = Parts::default();
+        for hub in 0..1000 {
+            for sequence in 0..6 {
+                assert_eq!(take(&mut parts, Head { hub, parts: 255, ..head(sequence) }, 0, hub), None);
+            }
+        }
+        let places = parts.unfinished.iter().chain(&parts.free);
+        let bytes: usize = places.clone().map(|it| it.bytes.capacity()).sum();
+        assert!(places.count() <= 65 && bytes <= 65 * 255 * PART_LONGEST, "{bytes}");
+        take(&mut parts, head(7), 0, 1);
+        take(&mut parts, head(7), 1, 1);
+        assert!(take(&mut parts, head(7), 2, 1).is_some());
+    }
+}

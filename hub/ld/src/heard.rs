@@ -1,0 +1,74 @@
+//! What a session hands out, and what it says of itself, in plain values.
+
+use core::fmt;
+
+use line::Received;
+
+use crate::turn::Turn;
+
+/// What a session hands out.
+#[derive(Clone, Copy, Debug)]
+pub enum Heard<'a> {
+    /// Whole packets that arrived together, of at most 10 ms, without anything between them. Each packet is in one
+    /// of these, in the order in which they came.
+    Packets(Received<'a, Packets>),
+    /// A turn of the head, after its packets.
+    Turn(Turn<'a>),
+}
+
+/// What packets that arrived together say, taken together.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Packets {
+    /// How many there are.
+    pub count: usize,
+}
+
+/// Why a session is not where it should be.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Trouble {
+    /// No packets come.
+    NoPackets {
+        /// The only rate at which was listened; `None`: at all of them.
+        baud: Option<u32>,
+        /// Whether anything comes that is no packet.
+        noise: bool,
+        /// For how long already, in steps that grow.
+        seconds: u32,
+    },
+    /// One second without a packet.
+    Silence,
+    /// Packets come, but the head does not turn.
+    StandsStill,
+}
+
+impl fmt::Display for Trouble {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Trouble::NoPackets { baud, noise, seconds } => {
+                f.write_str(if *noise { "bytes but no packets at " } else { "nothing comes at " })?;
+                match baud {
+                    Some(baud) => write!(f, "{baud}")?,
+                    None => f.write_str("230400 and 921600")?,
+                }
+                let remedy =
+                    if *noise { "another model, another rate?" } else { "power, cable, other port?" };
+                write!(f, " baud for {seconds} s: {remedy}")
+            }
+            Trouble::Silence => f.write_str("no packet for one second"),
+            Trouble::StandsStill => f.write_str("packets come, but the head does not turn: is it blocked?"),
+        }
+    }
+}
+
+/// What a wait is for.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Why {
+    /// Packets would have been heard by then.
+    Listening,
+    /// The stream should have gone on.
+    Silence,
+    /// A packet is held back until the line was idle for so long.
+    Held,
+    /// Nothing is expected by any time.
+    Never,
+}

@@ -1,0 +1,146 @@
+//! The scanner's clock tied to the hub's. A packet can be late for many reasons and early for none: so the least delay of
+//! the last seconds is the truth about all packets of these seconds, also about those that waited while the host did not
+//! run. Both clocks drift against each other; by how much is learned. Knows no bytes.
+
+use line::{MILLIS, Nanos};
+
+/// The least delays of the last seconds.
+#[derive(Clone, Debug)]
+pub(crate) struct SensorClock {
+    /// The least delay of each span of [`SPAN`], oldest first from `next` on.
+    least: [Option<Delay>; SensorClock::SPANS],
+    next: usize,
+    /// When the newest span began.
+    since: Nanos,
+    /// Of all spans the one that says most.
+    best: Option<Delay>,
+    /// Nanoseconds by which the hub's clock gets ahead in each nanosecond of the scanner's.
+    drift: f64,
+}
+
+/// From a time of the scanner's clock to the hub's.
+#[derive(Clone, Copy, Debug)]
+struct Delay {
+    at: Nanos,
+    offset: i64,
+}
+
+impl Delay {
+    /// What it says of the offset at `at`, where the clocks drift.
+    fn seen_from(self, at: Nanos, drift: f64) -> i64 {
+        self.offset + (drift * (at as i64 - self.at as i64) as f64) as i64
+    }
+}
+
+impl SensorClock {
+    const SPANS: usize = 16;
+
+    pub(crate) fn new() -> Self {
+        SensorClock { least: [None; Self::SPANS], next: 0, since: 0, best: None, drift: 0.0 }
+    }
+
+    /// What happened at `at` of the scanner's clock was known at `latest` of the hub's.
+    pub(crate) fn note(&mut self, at: Nanos, latest: Nanos) {
+        let delay = Delay { at, offset: latest as i64 - at as i64 };
+        if self.best.is_none() || at.saturating_sub(self.since) >= SPAN {
+            self.next = (self.next + 1) % Self::SPANS;
+            self.least[self.next] = None;
+            self.since = at;
+            self.learn_drift();
+            let drift = self.drift;
+            self.best = self.known().min_by_key(|known| known.seen_from(at, drift));
+        }
+        let drift = self.drift;
+        let is_less =
+            |known: Option<Delay>| known.is_none_or(|known| delay.offset < known.seen_from(at, drift));
+        if is_less(self.least[self.next]) {
+            self.least[self.next] = Some(delay);
+        }
+        if is_less(self.best) {
+            self.best = Some(delay);
+        }
+    }
+
+    /// The hub's time at which it was `at` by the scanner's clock; nothing before anything was noted.
+    pub(crate) fn time(&self, at: Nanos) -> Option<Nanos> {
+        let best = self.best?;
+        Some(at.saturating_add_signed(best.seen_from(at, self.drift)))
+    }
+
+    fn known(&self) -> impl Iterator<Item = Delay> {
+        let (newer, older) = self.least.split_at(self.next + 1);
+        older.iter().chain(newer).copied().flatten()
+    }
+
+    /// The median of what pairs of an older and a newer span say: one in which the host did not run does not count.
+    fn learn_drift(&mut self) {
+        let count = self.known().count();
+        if count < ENOUGH {
+            return;
+        }
+        let mut slopes = [0.0; (Self::SPANS / 2) * Self::SPANS.div_ceil(2)];
+        let mut len = 0;
+        for older in self.known().take(count / 2) {
+            for newer in self.known().skip(count / 2) {
+                let span = newer.at.saturating_sub(older.at).max(1);
+                slopes[len] = (newer.offset - older.offset) as f64 / span as f64;
+                len += 1;
+            }
+        }
+        let slopes = &mut slopes[..len];
+        slopes.sort_unstable_by(f64::total_cmp);
+        self.drift = slopes[len / 2].clamp(-MOST_DRIFT, MOST_DRIFT);
+    }
+}
+
+/// A host that stops for so long spoils one span at most.
+const SPAN: Nanos = 500 * MILLIS;
+/// Spans that tell a drift, though one of them is spoiled.
+const ENOUGH: usize = 6;
+/// No oscillator is off by more, not even one without a crystal.
+const MOST_DRIFT: f64 = 0.02;
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// The worst error in microseconds from `from` seconds on, for a scanner whose clock runs `drift` slow, a packet each
+    /// 2 ms with a delay of at least 100 us, and a host that stops for `stall` seconds each `every` seconds.
+    fn worst_us(drift: f64, stall: f64, every: f64, from: f64) -> f64 {
+        let mut clock = SensorClock::new();
+        let mut random = fastrand::Rng::with_seed(7);
+        let mut worst = 0.0f64;
+        for n in 0..10_000u64 {
+            let hub_s = n as f64 * 0.002;
+            let sensor_s = hub_s * (1.0 - drift);
+            let late_s = 0.000_1 + random.f64() * 0.003;
+            let phase = hub_s % every;
+            let stopped = if hub_s > 1.0 && phase < stall { stall - phase } else { 0.0 };
+            let nanos = |s: f64| ((s + 1_000.0) * 1e9) as Nanos;
+            clock.note(nanos(sensor_s), nanos(hub_s + late_s.max(stopped)));
+            let told = clock.time(nanos(sensor_s)).expect("tied");
+            if hub_s > from {
+                worst = worst.max((told as f64 - nanos(hub_s) as f64).abs() / 1e3);
+            }
+        }
+        worst
+    }
+
+    #[test]
+    fn late_packets_do_not_move_it() {
+        assert!(worst_us(0.0, 0.0, 1.0, 0.5) < 500.0);
+        assert!(worst_us(0.0, 0.5, 3.0, 0.5) < 500.0);
+        assert!(worst_us(0.0, 0.9, 5.0, 0.5) < 500.0);
+    }
+
+    #[test]
+    fn clocks_that_drift_are_followed() {
+        for drift in [-0.01, -0.000_5, 0.000_5, 0.01] {
+            let worst = worst_us(drift, 0.0, 1.0, 4.0);
+            assert!(worst < 1_000.0, "{drift}: {worst}");
+            let worst = worst_us(drift, 0.5, 5.0, 4.0);
+            assert!(worst < 1_500.0, "{drift}: {worst} with stalls");
+        }
+        assert!(worst_us(0.000_5, 0.5, 4.0, 0.5) < 2_500.0);
+    }
+}

@@ -1,0 +1,318 @@
+//! A scanner behind a line, driven from outside as [`line::Session`] says. It only listens: at the model's rate, or at
+//! both in turn until packets come. Then it learns how many points there are in a second, hands out packets as they come,
+//! and turns. Refuses to know a hub, and what becomes of a turn.
+
+mod driven;
+
+use line::{MILLIS, Nanos, Received, State, line_time};
+
+use crate::arrival::Arrivals;
+use crate::framer::{Framer, Span, Tally};
+use crate::heard::{Packets, Trouble};
+use crate::model::Model;
+use crate::packet::{LEN, Packet};
+use crate::sensor_clock::SensorClock;
+use crate::sequence::{Place, Sequence};
+use crate::turn::{Closed, Progress, Turn, TurnCounts, Turns};
+
+/// What a session shall do.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Settings {
+    /// What is at the other end; `None` is sought.
+    pub model: Option<Model>,
+    /// Beams of the grid that turns are for; `None`: the model's, at most [`most_beams`](Self::most_beams).
+    pub beams: Option<usize>,
+    /// The most beams that there is room for; `None`: as many as a grid can have.
+    pub most_beams: Option<usize>,
+    /// Whether the port has one rate and not the pace of a line: a serial server on the network, a recording.
+    pub fixed_rate: bool,
+}
+
+impl Settings {
+    /// The rate at which the port is to be opened, in bits per second.
+    pub fn baud(&self) -> u32 {
+        self.model.unwrap_or(Model::Ld19).baud()
+    }
+}
+
+/// One scanner's session.
+#[derive(Clone, Debug)]
+pub struct Session {
+    settings: Settings,
+    framer: Framer,
+    arrivals: Arrivals,
+    clock: SensorClock,
+    sequence: Sequence,
+    turns: Turns,
+    phase: Phase,
+    baud: u32,
+    change_baud: bool,
+    /// The grid, once it is known, and whether it is known what this stream is.
+    beams: Option<usize>,
+    is_learned: bool,
+    /// Packets that were handed out and are not in turns yet.
+    current: Option<Current>,
+    now: Nanos,
+    last_byte: Nanos,
+    /// Until when nothing has to be read.
+    rest_until: Nanos,
+    room: usize,
+    /// The last stamp of a turn, behind which none goes.
+    last_stamp: Nanos,
+    trouble: Option<Trouble>,
+    /// Since when no packet came, and bytes read by then.
+    quiet_since: (Nanos, u64),
+    /// Bytes of streams that were in nothing, and all of those when it was last looked.
+    damaged: (u64, u64),
+    resyncs: u64,
+    cut: bool,
+}
+
+#[derive(Clone, Copy, Debug)]
+enum Phase {
+    /// No packets yet; at `next_at` another rate is tried.
+    Listening { shown: State, next_at: Nanos },
+    /// Packets come, by `silent_at` the next one; `turned_at` the last turn was over, or they began to come.
+    Hearing { turned_at: Nanos, has_turned: bool, silent_at: Nanos },
+    /// Nobody wants anything.
+    Paused,
+}
+
+/// Packets on their way into turns.
+#[derive(Clone, Copy, Debug)]
+struct Current {
+    span: Span,
+    places: [Place; MOST],
+    /// The first one that is not done, and how far it is.
+    packet: usize,
+    progress: Progress,
+}
+
+impl Session {
+    /// A session on a port that is open at the rate of `settings`.
+    pub fn new(settings: Settings, now: Nanos) -> Self {
+        Session {
+            settings,
+            framer: Framer::default(),
+            arrivals: Arrivals::default(),
+            clock: SensorClock::new(),
+            sequence: Sequence::new(),
+            turns: Turns::new(),
+            phase: Phase::Listening { shown: State::Probing, next_at: now + LISTEN },
+            baud: settings.baud(),
+            change_baud: false,
+            beams: None,
+            is_learned: false,
+            current: None,
+            now,
+            last_byte: now,
+            rest_until: 0,
+            room: 0,
+            last_stamp: 0,
+            trouble: None,
+            quiet_since: (now, 0),
+            damaged: (0, 0),
+            resyncs: 0,
+            cut: false,
+        }
+    }
+
+    /// What is at the other end, as far as that is known: of models that cannot be told apart, one.
+    pub fn model(&self) -> Option<Model> {
+        let heard = || self.sequence.points_per_second().map(Model::of_point_rate);
+        self.settings.model.or_else(heard)
+    }
+
+    /// Beams of the grid that turns are for; nothing before it is known what is at the other end.
+    pub fn beams(&self) -> Option<usize> {
+        self.beams
+    }
+
+    /// Points that the scanner measures in a second; nothing before enough packets came.
+    pub fn points_per_second(&self) -> Option<f32> {
+        self.sequence.points_per_second()
+    }
+
+    /// Why it is not where it should be.
+    pub fn trouble(&self) -> Option<Trouble> {
+        self.trouble.filter(|_| !matches!(self.phase, Phase::Paused))
+    }
+
+    /// What became of the bytes.
+    pub fn tally(&self) -> &Tally {
+        self.framer.tally()
+    }
+
+    /// How many turns there were of which kind.
+    pub fn turn_counts(&self) -> TurnCounts {
+        self.turns.counts()
+    }
+
+    /// The rates at which packets may come.
+    fn rates(&self) -> &'static [u32] {
+        const BOTH: [u32; 2] = [230_400, 921_600];
+        let at = usize::from(self.baud == BOTH[1]);
+        if self.settings.model.is_some() || self.settings.fixed_rate { &BOTH[at..=at] } else { &BOTH }
+    }
+
+    fn listen(&mut self, shown: State) {
+        self.phase = Phase::Listening { shown, next_at: self.now + LISTEN };
+        self.quiet_since = (self.now, self.framer.tally().read);
+        self.sequence.end();
+        self.turns.give_up();
+        self.is_learned = false;
+        self.current = None;
+        self.rest_until = 0;
+    }
+
+    /// Nothing was heard at this rate: tries the next one, and says for how long already.
+    fn listen_on(&mut self, shown: State) {
+        self.phase = Phase::Listening { shown, next_at: self.now + LISTEN };
+        let rates = self.rates();
+        if let Some(&next) = rates.iter().find(|&&rate| rate != self.baud) {
+            self.baud = next;
+            self.change_baud = true;
+        }
+        let (since, read) = self.quiet_since;
+        let seconds = (self.now.saturating_sub(since) / (1_000 * MILLIS)) as u32;
+        if seconds > 0 {
+            let noise = self.framer.tally().read > read + NOISE;
+            let seconds = 1 << seconds.ilog2();
+            let baud = (rates.len() == 1).then_some(self.baud);
+            self.trouble = Some(Trouble::NoPackets { baud, noise, seconds });
+        }
+    }
+
+    /// Does what is due now that all bytes were looked at: bytes that are no packets keep nobody waiting.
+    fn expire(&mut self) {
+        match self.phase {
+            Phase::Listening { shown, next_at } if self.now >= next_at => self.listen_on(shown),
+            Phase::Hearing { silent_at, .. } if self.now >= silent_at => {
+                self.resyncs += 1;
+                self.trouble = Some(Trouble::Silence);
+                self.listen(State::Silent);
+            }
+            Phase::Hearing { turned_at, .. } if self.now >= turned_at + STILL => {
+                self.trouble = Some(Trouble::StandsStill);
+            }
+            _ => {}
+        }
+    }
+
+    /// Packets came: dates them, and remembers them for turns.
+    fn receive(&mut self, span: Span) -> Received<'_, Packets> {
+        let pace = (!self.settings.fixed_rate).then_some(self.baud);
+        let packet_time = line_time(LEN, self.baud);
+        let mut places = [Place::Odd; MOST];
+        let (bytes, _) = self.framer.bytes(span).as_chunks::<LEN>();
+        for (number, bytes) in bytes.iter().enumerate() {
+            let Ok(packet) = Packet::check(bytes) else { continue };
+            let place = self.sequence.place(&packet);
+            if matches!(place, Place::First { .. }) {
+                self.clock = SensorClock::new();
+            }
+            if let Some(time) = place.time() {
+                let end = span.offset + ((number + 1) * LEN - 1) as u64;
+                self.clock.note(time, self.arrivals.latest(end, pace).saturating_sub(packet_time));
+            }
+            places[number] = place;
+        }
+        let stamp = |place: Place| place.time().and_then(|time| self.clock.time(time));
+        let first = stamp(places[0]);
+        let last_byte = span.offset + (span.packets * LEN - 1) as u64;
+        let latest = self.arrivals.latest(last_byte, pace);
+        let last = stamp(places[span.packets - 1]).map_or(latest, |at| at + packet_time);
+        let at = first.unwrap_or(last.saturating_sub(packet_time * span.packets as u64));
+        self.current = Some(Current { span, places, packet: 0, progress: Progress::default() });
+        self.cut |= self.framer.tally().packets == span.packets as u64 && self.framer.tally().discarded > 0;
+        self.hear();
+        Received {
+            bytes: self.framer.bytes(span),
+            message: Packets { count: span.packets },
+            first: at,
+            last: last.max(at),
+            estimated: first.is_none(),
+            reasons: span.reasons,
+        }
+    }
+
+    /// The stream begins or goes on.
+    fn hear(&mut self) {
+        let silent_at = self.now + SILENCE;
+        let discarded = self.framer.tally().discarded;
+        match &mut self.phase {
+            Phase::Hearing { silent_at: at, .. } => {
+                *at = silent_at;
+                self.damaged.0 += discarded - self.damaged.1;
+            }
+            Phase::Listening { .. } => {
+                self.trouble = None;
+                self.phase = Phase::Hearing { turned_at: self.now, has_turned: false, silent_at };
+            }
+            Phase::Paused => {}
+        }
+        self.damaged.1 = discarded;
+        if !self.is_learned
+            && let Some(model) = self.model().filter(|_| self.sequence.points_per_second().is_some())
+        {
+            let most = self.settings.most_beams.unwrap_or(usize::MAX);
+            let beams = self.settings.beams.unwrap_or(model.beams()).min(most);
+            (self.beams, self.is_learned) = (Some(beams), true);
+            self.turns.begin(beams);
+        }
+    }
+
+    /// Puts what was handed out into turns; one that is over.
+    fn advance_turns(&mut self) -> Option<Closed> {
+        while let Some(current) = &mut self.current {
+            let (bytes, _) = self.framer.bytes(current.span).as_chunks::<LEN>();
+            let packet = bytes.get(current.packet).and_then(|bytes| Packet::check(bytes).ok());
+            let Some(packet) = packet.filter(|_| self.is_learned) else {
+                self.current = None;
+                return None;
+            };
+            let place = current.places[current.packet];
+            let reasons = if current.packet == 0 { current.span.reasons } else { 0 };
+            let point_ns = self.sequence.point_ns();
+            let closed = self.turns.add(&packet, place, reasons, point_ns, &mut current.progress);
+            if closed.is_some() {
+                return closed;
+            }
+            current.packet += 1;
+            current.progress = Progress::default();
+        }
+        None
+    }
+
+    fn show(&mut self, closed: Closed) -> Turn<'_> {
+        let stamp = |at: Nanos| self.clock.time(at).unwrap_or(self.now);
+        let first = stamp(closed.first).max(self.last_stamp);
+        let last = stamp(closed.last).max(first);
+        self.last_stamp = first;
+        self.trouble = None;
+        if let Phase::Hearing { turned_at, has_turned, .. } = &mut self.phase {
+            (*turned_at, *has_turned) = (self.now, true);
+        }
+        Turn {
+            points: self.turns.points(&closed),
+            first,
+            last,
+            period: closed.period,
+            beams: self.beams.unwrap_or_default(),
+            points_per_second: self.sequence.points_per_second().unwrap_or_default(),
+            incomplete: closed.incomplete,
+            reasons: closed.reasons,
+        }
+    }
+}
+
+/// How long is listened at one rate before the next: a stream has a packet each 3 ms.
+const LISTEN: Nanos = 300 * MILLIS;
+/// Without a packet for so long the session begins again.
+const SILENCE: Nanos = 1_000 * MILLIS;
+/// The slowest head turns twice a second.
+const STILL: Nanos = 2_000 * MILLIS;
+/// So few bytes may be what an adapter makes of a cable that is plugged in.
+const NOISE: u64 = 64;
+/// Packets of one sample at the most: of an STL27L, which sends one each 0.56 ms.
+const MOST: usize = 17;

@@ -1,0 +1,125 @@
+//! The session as its driver sees it: what goes in, and what is wanted next.
+
+use line::{Account, Control, MILLIS, Nanos, Output, State};
+
+use super::{MOST, Phase, Session};
+use crate::heard::{Heard, Why};
+
+impl line::Session for Session {
+    type Heard<'a> = Heard<'a>;
+    type Why = Why;
+
+    fn spare(&mut self) -> &mut [u8] {
+        let spare = self.framer.spare();
+        self.room = spare.len();
+        spare
+    }
+
+    fn commit(&mut self, now: Nanos, len: usize) {
+        self.now = now;
+        self.arrivals.note(now, len);
+        self.rest_until = 0;
+        if len > 0 {
+            self.framer.commit(len);
+            self.last_byte = now;
+            if self.state() == State::Streaming && len < self.room {
+                self.rest_until = now + REST;
+            }
+        }
+    }
+
+    fn handle_timeout(&mut self, now: Nanos) {
+        self.now = now;
+        self.framer.release(now.saturating_sub(self.last_byte));
+    }
+
+    fn control(&mut self, control: Control, now: Nanos) {
+        self.now = now;
+        match (control, self.phase) {
+            (Control::Pause, _) => {
+                self.listen(State::Paused);
+                self.phase = Phase::Paused;
+            }
+            (Control::Resume, Phase::Paused) => self.listen(State::Probing),
+            (Control::Resume, _) => {}
+            (Control::Resync, _) => {
+                self.resyncs += 1;
+                self.trouble = None;
+                self.listen(State::Probing);
+            }
+        }
+    }
+
+    fn transmitted(&mut self, now: Nanos) {
+        self.now = now;
+    }
+
+    fn poll_output(&mut self) -> Output<Heard<'_>, Why> {
+        if let Some(closed) = self.advance_turns() {
+            return Output::Heard(Heard::Turn(self.show(closed)));
+        }
+        while let Some(span) = self.framer.advance(most_together(self.baud)) {
+            if !matches!(self.phase, Phase::Paused) {
+                return Output::Heard(Heard::Packets(self.receive(span)));
+            }
+        }
+        self.expire();
+        if core::mem::take(&mut self.change_baud) {
+            self.framer.clear();
+            return Output::SetRate(self.baud);
+        }
+        if self.rest_until > self.now {
+            return Output::Rest(self.rest_until);
+        }
+        let (until, reason) = match self.phase {
+            Phase::Listening { next_at, .. } => (next_at, Why::Listening),
+            Phase::Hearing { silent_at, .. } => (silent_at, Why::Silence),
+            Phase::Paused => (Nanos::MAX, Why::Never),
+        };
+        match self.framer.hold() {
+            Some(hold) if self.last_byte + hold < until => {
+                Output::Wait { until: self.last_byte + hold, reason: Why::Held }
+            }
+            _ => Output::Wait { until, reason },
+        }
+    }
+
+    fn state(&self) -> State {
+        match self.phase {
+            Phase::Listening { shown, .. } => shown,
+            Phase::Hearing { has_turned: false, .. } => State::Starting,
+            Phase::Hearing { .. } => State::Streaming,
+            Phase::Paused => State::Paused,
+        }
+    }
+
+    fn rate(&self) -> u32 {
+        self.baud
+    }
+
+    fn account(&self) -> Account {
+        let tally = self.framer.tally();
+        let (came, lost) = self.sequence.came_and_lost();
+        Account {
+            read: tally.read,
+            in_telegrams: tally.in_packets,
+            acknowledge: 0,
+            discarded: tally.discarded,
+            buffered: self.framer.buffered() as u64,
+            telegrams: tally.packets,
+            due: came + lost,
+            lost,
+            damaged: self.damaged.0,
+            resyncs: self.resyncs,
+            began_with_a_cut: self.cut,
+        }
+    }
+}
+
+/// Packets of one sample: as many as arrive in ten milliseconds.
+const fn most_together(baud: u32) -> usize {
+    if baud > 500_000 { MOST } else { 3 }
+}
+
+/// A stream is read so late after bytes of it were: a packet or nine at once, and a tenth of what a tty keeps.
+const REST: Nanos = 5 * MILLIS;

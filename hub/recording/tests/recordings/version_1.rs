@@ -1,0 +1,133 @@
+//! Recordings of version 1: telegrams are what they are today, so they are played and converted; scans are not, and nothing
+//! takes them for such.
+
+use std::fs;
+use std::path::Path;
+
+use crate::folder::{Folder, converted};
+use crate::written::{self, Known, SENSORS, Written};
+use bytemuck::bytes_of;
+use lms::measured;
+use lms::variant::{Mode, Unit};
+use recording::convert::{ConvertOptions, convert};
+use recording::{Encoding, Form, Recording};
+use schema::datagram::Packed;
+use schema::file::{ENCODING, ENCODING_V1, Foreign, Writer};
+use schema::{Header, Kind, Scan, ScanHead, Topic};
+
+const MM: Encoding = Encoding { unit: Unit::Mm, mode: Mode(1) };
+
+/// The telegrams of all sensors in the file at `path`, with their headers.
+fn telegrams(path: &Path) -> Vec<Known> {
+    let recording = Recording::open(path).unwrap();
+    let of_sensor = |sensor: &'static str| {
+        let frames: Vec<_> = recording.of(sensor).unwrap().telegrams(MM).unwrap().collect();
+        frames.into_iter().map(move |frame| Known {
+            sensor,
+            header: frame.header.unwrap(),
+            telegram: frame.telegram,
+        })
+    };
+    SENSORS.into_iter().flat_map(of_sensor).collect()
+}
+
+fn in_order_of_sensors(written: &Written) -> Vec<Known> {
+    let of_sensor = |sensor| written.telegrams.iter().filter(move |known| known.sensor == sensor).cloned();
+    SENSORS.into_iter().flat_map(of_sensor).collect()
+}
+
+/// Encoding of the channel and data of all messages.
+fn messages(bytes: &[u8]) -> Vec<(String, String, Vec<u8>)> {
+    let all = mcap::MessageStream::new(bytes).unwrap().map(Result::unwrap);
+    let message =
+        |m: mcap::Message<'_>| (m.channel.topic.clone(), m.channel.message_encoding.clone(), m.data.to_vec());
+    all.map(message).collect()
+}
+
+#[test]
+fn its_telegrams_are_all_there() {
+    let folder = Folder::new("old");
+    let (old, new) = (written::of_version_1(20, 21, &Topic::ALL), written::recording(20, 21));
+    assert_eq!(old.telegrams, new.telegrams, "both say the same");
+    let (file, copy) = (folder.file("old.mcap", &old.bytes), folder.0.join("copy.mcap"));
+    let contents = Recording::open(&file).unwrap().contents().clone();
+    assert_eq!((contents.form, contents.telegrams, contents.scans), (Form::Mcap, 40, 36));
+    assert_eq!((&contents.sensors[..], contents.mode), (&SENSORS.map(String::from)[..], Some(Mode(4))));
+    assert!(contents.damage.is_none(), "{}", contents.damage);
+    assert_eq!(telegrams(&file), in_order_of_sensors(&old));
+    // A copy has all of it as it was; its telegrams are those of any version.
+    converted(&file, &copy, None).unwrap();
+    let (kept, all) = (messages(&fs::read(&copy).unwrap()), messages(&old.bytes));
+    assert_eq!(kept.len(), all.len());
+    for ((topic, encoding, data), (its_topic, its_encoding, its_data)) in kept.iter().zip(&all) {
+        assert!((topic, data) == (its_topic, its_data), "{topic}");
+        let is_telegram = topic.ends_with("/telegram");
+        assert_eq!(encoding, if is_telegram { ENCODING } else { its_encoding }, "{topic}");
+        assert!(topic == "/imu" || its_encoding == ENCODING_V1);
+    }
+    assert_eq!(telegrams(&copy), in_order_of_sensors(&old));
+    // Its second half has its names in the index only.
+    let half = folder.file("half.mcap", &old.bytes[old.bytes.len() / 2..]);
+    let recording = Recording::open(&half).unwrap();
+    assert!(recording.contents().damage.is_headless && recording.contents().telegrams >= 16);
+    assert_eq!(recording.contents().sensors, SENSORS);
+}
+
+#[test]
+fn its_scans_are_those_of_its_telegrams() {
+    let folder = Folder::new("old-scans");
+    let payload = written::scan_of_version_1();
+    assert!(Scan::room(&payload).is_some(), "nothing but the encoding says that it is none of today");
+    let old = folder.file("old.mcap", &written::of_version_1(20, 22, &Topic::ALL).bytes);
+    let new = folder.file("new.mcap", &written::recording(20, 22).bytes);
+    let rows = |file: &Path, name: &str| {
+        let out = folder.0.join(name);
+        assert_eq!(converted(file, &out, Some("rear")).unwrap().scans, 18);
+        fs::read_to_string(out).unwrap()
+    };
+    let expected = rows(&new, "new.csv");
+    assert_eq!(expected.lines().next().unwrap().matches("range_").count(), 181);
+    assert!(rows(&old, "old.csv") == expected);
+    let ros = |file: &Path, name: &str| {
+        let output = folder.0.join(name);
+        let options =
+            ConvertOptions { input: file.to_owned(), output, ros2: true, ..ConvertOptions::default() };
+        assert_eq!(convert(&options, &Default::default(), |_, _| {}).unwrap().scans, 36);
+        messages(&fs::read(&options.output).unwrap())
+    };
+    let (from_old, from_new) = (ros(&old, "old-ros.mcap"), ros(&new, "new-ros.mcap"));
+    assert!(from_old.len() > 36 && from_old == from_new);
+}
+
+#[test]
+fn without_telegrams_there_is_nothing_to_convert() {
+    let folder = Folder::new("old-alone");
+    let old = folder.file("old.mcap", &written::of_version_1(4, 23, &[Topic::Scan, Topic::Status]).bytes);
+    let failure = converted(&old, &folder.0.join("out.csv"), Some("front")).unwrap_err();
+    assert_eq!(failure.kind, Kind::Input);
+    assert!(failure.message.starts_with("there is no scan in "), "{failure}");
+}
+
+/// Telegrams of values that no two people would split alike, beside the published scan: one of today says how to read them,
+/// and is taken; one of version 1 is not asked, and that is refused, not guessed.
+#[test]
+fn its_scans_do_not_stand_in_for_telegrams_that_cannot_be_read() {
+    let folder = Folder::new("old-mode");
+    let telegram = measured::encode(0, Unit::Mm, &[0x3FFF; 181], 0x10).bytes().to_vec();
+    let made = |encoding, scan: &[u8]| {
+        let mut writer = Writer::begin(Vec::new(), "", Default::default()).unwrap();
+        for (topic, payload) in [("front/telegram", &telegram[..]), ("front/scan", scan)] {
+            let channel = Foreign { topic, encoding, schema: ("any", "", encoding), metadata: &[] };
+            let channel = writer.channel(&channel).unwrap();
+            let message = [bytes_of(&Header::default()), payload].concat();
+            writer.message(channel, 0, 0, &message).unwrap();
+        }
+        folder.file("in.mcap", &writer.finish().unwrap())
+    };
+    let converted = |file: &Path, name: &str| converted(file, &folder.0.join(name), Some("front"));
+    let today = Scan::of(ScanHead::lms(181, -90_000, 1000, 1, 13), &[700; 181]);
+    assert_eq!(converted(&made(ENCODING, today.bytes()), "today.csv").unwrap().scans, 1);
+    let failure = converted(&made(ENCODING_V1, &written::scan_of_version_1()), "old.csv").unwrap_err();
+    assert_eq!(failure.kind, Kind::Configuration);
+    assert!(failure.message.ends_with("does not contain the measuring mode of front"), "{failure}");
+}

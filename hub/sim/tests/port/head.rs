@@ -1,0 +1,107 @@
+//! A scanner of LDROBOT on a real pty: a session that reads as the hub does hears what the truth says.
+
+use std::time::{Duration, Instant};
+
+use ld::packet::LEN;
+use ld::{Heard, Model, Session, Settings};
+use line::{Nanos, Output, Session as _, State};
+use rustix::event::{PollFd, PollFlags, Timespec, poll};
+use schema::Failure;
+use sim::fault::Faults;
+use sim::options::SimulateOptions;
+use sim::pty::now_ns;
+use sim::simulate;
+use sim::truth::Record;
+
+use crate::PATIENCE;
+use crate::host::Host;
+use crate::simulator::{Folder, Simulator};
+
+/// Drives `session` on the port of `host` until it has told `turns`; the packets that came.
+fn hear(session: &mut Session, host: &Host, turns: usize) -> Vec<[u8; LEN]> {
+    let (end, mut packets, mut told) = (Instant::now() + PATIENCE, Vec::new(), 0);
+    while told < turns {
+        assert!(Instant::now() < end, "{told} turns, {:?}", session.account());
+        let (until, flags) = loop {
+            match session.poll_output() {
+                Output::SetRate(rate) => host.set_rate(rate),
+                Output::Heard(Heard::Packets(received)) => {
+                    packets.extend(received.bytes.as_chunks::<LEN>().0)
+                }
+                Output::Heard(Heard::Turn(turn)) => {
+                    told += 1;
+                    assert!(turn.first < turn.last && turn.last < now_ns());
+                }
+                Output::Rest(until) => break (until, PollFlags::empty()),
+                Output::Wait { until, .. } => break (until, PollFlags::IN),
+                output => panic!("{output:?}"),
+            }
+        };
+        let left: Nanos = until.saturating_sub(now_ns()).min(100_000_000);
+        let timeout = Timespec { tv_sec: 0, tv_nsec: left as _ };
+        poll(&mut [PollFd::new(&host.port, flags)], Some(&timeout)).expect("a poll");
+        let len = rustix::io::read(&host.port, session.spare()).unwrap_or(0);
+        session.commit(now_ns(), len);
+        if len == 0 && now_ns() >= until {
+            session.handle_timeout(now_ns());
+        }
+    }
+    packets
+}
+
+#[test]
+fn every_model_is_heard_bit_for_bit_as_the_truth_says() {
+    for model in [Model::Ld19, Model::Stl27l] {
+        let folder = Folder::new(model.name());
+        let port = folder.path("front");
+        let simulator = Simulator::start(SimulateOptions {
+            ports: vec![port.clone()],
+            model: Some(model),
+            ..SimulateOptions::default()
+        });
+        let settings = Settings::default();
+        let host = Host::open(&port, settings.baud());
+        let mut session = Session::new(settings, now_ns());
+        let packets = hear(&mut session, &host, 20);
+        assert_eq!((session.state(), session.model()), (State::Streaming, Some(model)));
+        let (summaries, records) = simulator.end();
+        assert_eq!(summaries[0].eeprom_writes, 0);
+        let first = Record::hash(&packets[0]);
+        let first = records.iter().position(|record| record.sha256 == first).expect("was sent");
+        // A machine that kept this thread from reading for long had no room for what came then.
+        let intact = records[first..].iter().filter(|record| record.fault.is_none());
+        for (packet, record) in packets.iter().zip(intact) {
+            assert_eq!((Record::hash(packet), record.length), (record.sha256, LEN));
+            assert!(!record.is_reply);
+        }
+        let is_whole = records[first..].iter().all(|record| record.fault.is_none());
+        assert!(!is_whole || session.turn_counts().incomplete == 0, "{:?}", session.turn_counts());
+    }
+}
+
+#[test]
+fn faults_are_told_and_what_an_ld_has_not_is_refused() {
+    let folder = Folder::new("ld-faults");
+    let port = folder.path("front");
+    let of = |model| SimulateOptions { ports: vec![port.clone()], model, ..SimulateOptions::default() };
+    let faults: Faults = "truncate=0.2,power_every=0.3".parse().expect("faults");
+    let simulator = Simulator::start(SimulateOptions {
+        faults,
+        boot: Duration::from_millis(50),
+        ..of(Some(Model::Ld06))
+    });
+    let host = Host::open(&port, Model::Ld06.baud());
+    for fault in ["truncated", "power"] {
+        simulator.record_where(|record| record.fault.is_some_and(|found| found.name() == fault));
+    }
+    drop((host, simulator.end()));
+    let refused = |options: SimulateOptions| -> Failure {
+        let (_write, stop) = std::os::unix::net::UnixStream::pair().expect("a pair");
+        simulate(&options, &stop, |_| {}, |_| {}).expect_err("refused")
+    };
+    let unit = Some(lms::variant::Unit::Cm);
+    let failure = refused(SimulateOptions { unit, ..of(Some(Model::Ld06)) });
+    assert!(failure.message.contains("ld06 has no unit") && failure.kind.exit_code() == 78, "{failure}");
+    let replay = Some("/no/file".into());
+    assert_eq!(refused(SimulateOptions { replay, ..of(Some(Model::Ld06)) }).kind.exit_code(), 66);
+}

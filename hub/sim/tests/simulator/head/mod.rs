@@ -1,0 +1,146 @@
+//! Scanners of LDROBOT in simulated rooms: what a session tells of them is what they measured.
+
+mod bench;
+
+use bench::{Bench, still};
+use ld::Model;
+use line::{MILLIS, Nanos, Session as _, State};
+use sim::ld::{HeadSettings, Packets, recorded};
+use sim::world::World;
+
+const SECOND: Nanos = 1_000 * MILLIS;
+
+#[test]
+fn every_point_of_every_turn_is_where_the_head_measured_it() {
+    for model in Model::ALL {
+        let mut bench = Bench::new(HeadSettings::of(model), &still("room"), "", 7);
+        bench.run(10 * SECOND);
+        let due = 9 * model.turns_per_second() as usize;
+        assert!(bench.turns.len() >= due, "{model:?}: {} turns", bench.turns.len());
+        assert!(bench.turns.iter().all(|turn| !turn.incomplete));
+        // Half a millimetre is what a whole number hides, a hundredth of a degree what a packet does.
+        let worst = bench.judge_turns(0, 0.05, 2.0);
+        assert!(worst < 2 * MILLIS, "{model:?}: {worst}");
+        bench.judge_packets();
+        let ranges = bench
+            .turns
+            .iter()
+            .flat_map(|turn| &turn.points)
+            .filter(|point| point.range < line::grid::NO_RETURN);
+        let share =
+            ranges.count() as f64 / bench.turns.iter().map(|turn| turn.points.len()).sum::<usize>() as f64;
+        assert!((0.4..1.0).contains(&share), "{model:?}: {share}");
+    }
+}
+
+#[test]
+fn a_line_that_loses_bytes_costs_no_intact_packet_and_no_truth() {
+    for seed in 0..100 {
+        let model = Model::ALL[seed as usize % Model::ALL.len()];
+        let world = still("wall640");
+        let mut bench = Bench::new(HeadSettings { seed, ..HeadSettings::of(model) }, &world, LOSS, seed);
+        bench.run(6 * SECOND);
+        bench.judge_packets();
+        let worst = bench.judge_turns(0, 0.05, 2.0);
+        assert!(worst < 5 * MILLIS, "{seed}: {worst}");
+        let account = bench.session.account();
+        let lost = bench.sent.iter().filter(|sent| !sent.intact).count() as u64;
+        assert!(account.lost.abs_diff(lost) <= 2 + lost / 50, "{seed}: {account:?}, {lost} lost");
+        assert!(bench.turns.iter().any(|turn| turn.incomplete));
+    }
+}
+
+#[test]
+fn whatever_else_happens_on_the_line_costs_no_intact_packet_and_no_truth() {
+    for (faults, seed) in [
+        "flip=0.0005,flip_bits=4",
+        "insert=0.001,insert_burst=4",
+        "double=0.001",
+        "repeat=0.05",
+        "truncate=0.05",
+        "length=0.05",
+        "abort=0.02",
+        "flood=200,flood_every=0.3",
+        "wall=300,wall_every=0.3",
+        "loss=0.004,burst=6,insert=0.001,flip=0.0003,flip_bits=2",
+    ]
+    .into_iter()
+    .flat_map(|faults| (0..5).map(move |seed| (faults, seed)))
+    {
+        let mut bench = Bench::new(HeadSettings::of(Model::Ld19), &still("bare"), faults, seed);
+        bench.run(8 * SECOND);
+        bench.judge_packets();
+        let worst = bench.judge_turns(0, 0.05, 2.0);
+        // Here the bytes of a flood come all at once, as on no line: what came before them looks as early as the last read.
+        let early = if faults.contains("every") { 5 * MILLIS } else { 0 };
+        assert!(worst < 5 * MILLIS + early, "{faults}: {worst}");
+        let account = bench.session.account();
+        assert_eq!(account.read, account.in_telegrams + account.discarded + account.buffered);
+        assert_eq!(bench.session.state(), State::Streaming, "{faults}");
+    }
+}
+
+#[test]
+fn what_a_line_held_back_is_dated_as_it_was_measured() {
+    for model in [Model::Ld19, Model::Stl27l] {
+        let faults = "stall=0.5,stall_at=2,stall_every=2,delay=0.003";
+        let mut bench = Bench::new(HeadSettings::of(model), &still("wall640"), faults, 3);
+        bench.run(20 * SECOND);
+        let worst = bench.judge_turns(0, 0.05, 2.0);
+        assert!(worst < 5 * MILLIS, "{model:?}: {worst}");
+        assert!(bench.stamps.windows(2).all(|pair| pair[0] <= pair[1] + MILLIS));
+        bench.judge_packets();
+    }
+}
+
+#[test]
+fn a_power_cycle_is_a_silence_and_a_new_beginning() {
+    let mut bench = Bench::new(HeadSettings::of(Model::Ld19), &still("wall640"), "", 3);
+    bench.run(3 * SECOND);
+    let turns = bench.turns.len();
+    bench.cycle_power();
+    bench.run(5 * SECOND);
+    assert_eq!(bench.session.state(), State::Silent);
+    assert!(bench.turns.len() <= turns + 1);
+    bench.judge_turns(0, 0.05, 2.0);
+    bench.turns.clear();
+    bench.run(8 * SECOND);
+    assert_eq!((bench.session.state(), bench.session.account().resyncs), (State::Streaming, 1));
+    assert!(bench.turns.len() > 25, "{}", bench.turns.len());
+    bench.judge_turns(5 * SECOND, 0.05, 2.0);
+    assert_eq!(bench.session.account().lost, 0);
+}
+
+#[test]
+fn the_same_seed_says_the_same_and_what_was_recorded_is_said_again() {
+    let world: World = "demo".parse().expect("a world");
+    let said = |seed| {
+        let mut bench = Bench::new(HeadSettings { seed, ..HeadSettings::of(Model::Ld06) }, &world, "", seed);
+        bench.run(3 * SECOND);
+        bench.packets
+    };
+    let packets = said(5);
+    assert!(packets == said(5) && packets != said(6));
+    let path = std::env::temp_dir().join(format!("scanhub-head-{}", std::process::id()));
+    let mut bytes = packets[0][20..].to_vec();
+    packets.iter().for_each(|packet| bytes.extend(packet));
+    std::fs::write(&path, &bytes).expect("written");
+    let found = recorded(&path).expect("packets");
+    std::fs::write(&path, b"nothing").expect("written");
+    let none = recorded(&path).expect_err("no packets");
+    std::fs::remove_file(&path).expect("removed");
+    assert!(none.message.contains("no packet"), "{none}");
+    assert_eq!(found, packets);
+    for looped in [false, true] {
+        let source = Packets::Recorded { packets: found.clone(), looped };
+        let mut bench = Bench::of(HeadSettings::of(Model::Ld06), source, "", 1);
+        bench.run(7 * SECOND);
+        assert_eq!(bench.packets[..packets.len()], packets);
+        assert_eq!(bench.packets.len() > packets.len(), looped);
+        let turns = bench.turns.len();
+        assert!(if looped { turns > 50 } else { (25..=30).contains(&turns) }, "{turns}");
+    }
+}
+
+/// Bytes that a real line of 500 kBd lost.
+const LOSS: &str = "loss=0.00135,burst=1.89";
