@@ -55,6 +55,7 @@ pub use pose::Pose;
 pub use printable::{Printable, escape_json, json_line};
 pub use scan::{
     BEAMS, Code, Contents, Family, Intensities, Scan, ScanArrays, ScanHead, ScanWord, in_degrees,
+    in_sector_mdeg,
 };
 pub use status::{COUNTERS, Counter, Counters, State, Status};
 pub use telegram::Telegram;

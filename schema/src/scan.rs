@@ -28,6 +28,8 @@ impl Contents {
     pub const WIDE: u8 = 2;
     /// The exact angle in radians, a 32-bit float; nan where nothing was measured.
     pub const ANGLES: u8 = 4;
+    /// Those of a turn on a grid of beams.
+    pub const TURNING: u8 = Contents::UPPER | Contents::ANGLES;
     /// All that there are.
     pub const ALL: u8 = 7;
 }
@@ -313,6 +315,12 @@ impl Intensities<'_> {
 /// Returns `radians` in degrees, to a millionth: what a decimal became in radians is that decimal again.
 pub fn in_degrees(radians: f64) -> f64 {
     (radians.to_degrees() * 1e6).round() / 1e6 + 0.0
+}
+
+/// Returns `radians` in 1/1000 degree from -180,000 on, below 180,000, as sectors are given.
+pub fn in_sector_mdeg(radians: f64) -> i32 {
+    let mdeg = (1000.0 * in_degrees(radians)).round() as i64 % 360_000;
+    ((mdeg + 180_000).rem_euclid(360_000) - 180_000) as i32
 }
 
 /// Stands for the ranges among [`Contents`]: they are always there.

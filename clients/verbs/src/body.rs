@@ -5,7 +5,7 @@
 //! The observation is divided into slices of time. What is seen in all slices at about the same range is body; what is
 //! seen in only some of them came and went, and is left out.
 
-use schema::{Pose, Scan, in_degrees};
+use schema::{Pose, Scan, in_degrees, in_sector_mdeg};
 
 /// Slices of the time.
 pub(crate) const SLICES: usize = 10;
@@ -156,9 +156,7 @@ impl Body {
 
     fn beam(&self, angle: f64) -> Beam {
         let direction = self.pose.direction(angle);
-        // As sectors are given, from -180 to 180 degrees.
-        let angle_deg = (in_degrees(angle) + 180.0).rem_euclid(360.0) - 180.0;
-        let angle_mdeg = (1000.0 * angle_deg).round() as i32;
+        let angle_mdeg = in_sector_mdeg(angle);
         let (x_mm, y_mm) = (1000.0 * self.pose.x_m, 1000.0 * self.pose.y_m);
         // The greater root of |sensor + range * direction| = circle; none is not a number, and so becomes 0.
         let along = x_mm * direction.0 + y_mm * direction.1;

@@ -85,9 +85,7 @@ impl Link {
     pub fn limits(&self, all: &TopicLimits) -> TopicLimits {
         match self.scanner {
             Scanner::Lms => *all,
-            Scanner::Ld { .. } => {
-                TopicLimits { beams: self.beams(), contents: Contents::UPPER | Contents::ANGLES, ..*all }
-            }
+            Scanner::Ld { .. } => TopicLimits { beams: self.beams(), contents: Contents::TURNING, ..*all },
         }
     }
 

@@ -22,7 +22,7 @@ pub struct Turning<'a> {
 impl Turning<'_> {
     /// Returns the bytes of the scan of so many beams.
     pub const fn len(beams: usize) -> usize {
-        Scan::len(beams, Contents::UPPER | Contents::ANGLES)
+        Scan::len(beams, Contents::TURNING)
     }
 
     /// Writes the turn into `scan` on a grid of `beams`, every byte that it uses; beam 0 is measured at the sample's stamp.

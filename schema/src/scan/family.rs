@@ -51,7 +51,7 @@ impl ScanHead {
             no_return: Code::NoReturn.value(),
             beyond: Code::NoReturn.value(),
             family: family as u8,
-            contents: Contents::UPPER | Contents::ANGLES,
+            contents: Contents::TURNING,
             intensity_bits: 8,
             ..ScanHead::default()
         }

@@ -6,7 +6,7 @@ use std::f64::consts::TAU;
 use super::nearest::Nearest;
 use super::spans::Spans;
 use super::{SECTORS, Sector, Settings};
-use schema::{Pose, Scan, ScanHead, ZONES, in_degrees};
+use schema::{Pose, Scan, ScanHead, ZONES, in_sector_mdeg};
 
 /// What of a scan the table depends on.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
@@ -274,9 +274,7 @@ impl Table {
 
     /// Where the robot's own body ends along a beam.
     fn self_min_mm(&self, angle: f64) -> u64 {
-        // From -180 to 180 degrees, as sectors are given.
-        let angle_mdeg = (1000.0 * in_degrees(angle)).round() as i64 % 360_000;
-        let angle_mdeg = ((angle_mdeg + 180_000).rem_euclid(360_000) - 180_000) as i32;
+        let angle_mdeg = in_sector_mdeg(angle);
         let here = |sector: &&Sector| (sector.from_mdeg..=sector.to_mdeg).contains(&angle_mdeg);
         self.sectors.iter().filter(here).map(|sector| u64::from(sector.range_mm)).max().unwrap_or(0)
     }
